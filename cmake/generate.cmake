@@ -1,0 +1,36 @@
+# Generated sources: CAN codecs from the DBC files, machine data from the machine files.
+
+set(SALIENT_GENERATOR_SOURCES ${CMAKE_SOURCE_DIR}/tools/src/salient)
+
+# salient_generate_codec(TARGET DBC [INTEGER]): a static library with <name>.h/.c generated from DBC.
+# INTEGER leaves every floating-point conversion out.
+function(salient_generate_codec target dbc)
+    cmake_parse_arguments(ARG "INTEGER" "" "" ${ARGN})
+    get_filename_component(name ${dbc} NAME_WE)
+    set(out ${CMAKE_CURRENT_BINARY_DIR}/codec)
+    set(flags)
+    if(ARG_INTEGER)
+        set(flags --integer)
+    endif()
+    add_custom_command(
+        OUTPUT ${out}/${name}_codec.c ${out}/${name}_codec.h
+        COMMAND ${SALIENT_PYTHON} -m salient.generate_codec ${flags} ${dbc} ${out}
+        DEPENDS ${dbc} ${SALIENT_GENERATOR_SOURCES}/generate_codec.py
+        COMMENT "CAN codec from ${name}.dbc"
+        VERBATIM)
+    add_library(${target} STATIC ${out}/${name}_codec.c)
+    target_include_directories(${target} PUBLIC ${out})
+endfunction()
+
+# salient_generate_machine(NAME FILE): sets <NAME>_TABLES and <NAME>_PLANT to the C sources generated from FILE.
+function(salient_generate_machine name file)
+    set(out ${CMAKE_CURRENT_BINARY_DIR}/machine_${name})
+    add_custom_command(
+        OUTPUT ${out}/machine_tables.c ${out}/machine_plant.c
+        COMMAND ${SALIENT_PYTHON} -m salient.generate_machine ${file} ${out}
+        DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate_machine.py ${SALIENT_GENERATOR_SOURCES}/machine.py
+        COMMENT "machine ${name}"
+        VERBATIM)
+    set(${name}_TABLES ${out}/machine_tables.c PARENT_SCOPE)
+    set(${name}_PLANT ${out}/machine_plant.c PARENT_SCOPE)
+endfunction()

@@ -1,0 +1,40 @@
+/* The PWM timer of the asymmetric half bridges: two switches a phase, one compare value each.
+ *
+ * The timer counts up and down, `period_ticks` each way, so a control period is 2 * period_ticks * 5 ns.
+ * An upper switch is on while its carrier is below its compare value, with the carrier's valley in the middle of the
+ * period: a pulse of 2 * compare ticks, centred. The lower switch's carrier has its valley at the ends of the period
+ * (shifted by half a period), so a compare value gives a pulse split over both ends; two partial duties therefore
+ * interleave. Compare 0 is off for the whole period, compare >= period_ticks is on for the whole period.
+ *
+ *   both on: +Vdc    one on: 0 (freewheeling)    both off: -Vdc while current flows, else open
+ *
+ * Compare values are buffered: what is written in period k acts from the start of period k + 1.
+ */
+#ifndef HAL_PWM_H
+#define HAL_PWM_H
+
+#include <stdint.h>
+
+#include "hal.h"
+
+#define HAL_PWM_TICK_NS 5
+#define HAL_PWM_CLOCK_HZ 200000000
+
+typedef struct {
+    uint16_t upper[HAL_PHASES_MAX]; /* compare value in ticks */
+    uint16_t lower[HAL_PHASES_MAX];
+} hal_pwm_compare_t;
+
+/* Sets the period and starts the timer; the first control interrupt comes one period later. Called once. [background] */
+void hal_pwm_start(hal_t *hal, uint16_t period_ticks);
+
+/* Buffers the compare values of the next period. [interrupt] */
+void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare);
+
+/* Opens every switch now, not at the next period, and clears the buffer (the timer's break input). [both] */
+void hal_pwm_open_all(hal_t *hal);
+
+/* Control interrupts that were lost since the last call because the previous one was still running. [interrupt] */
+uint32_t hal_pwm_missed_interrupts(hal_t *hal);
+
+#endif

@@ -1,0 +1,16 @@
+/* Time since start, by a free-running timer, and the critical section. */
+#ifndef HAL_TIME_H
+#define HAL_TIME_H
+
+#include <stdint.h>
+
+#include "hal.h"
+
+/* Microseconds since start; wraps after 71 minutes. [both] */
+uint32_t hal_time_us(const hal_t *hal);
+
+/* Keeps the control interrupt out between the two calls; does not nest. [background] */
+void hal_critical_enter(hal_t *hal);
+void hal_critical_leave(hal_t *hal);
+
+#endif
