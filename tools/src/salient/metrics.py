@@ -1,0 +1,134 @@
+"""Figures of merit of the two experiments, taken from the true state that the emulator recorded.
+
+A recording is a structured array with one row a sample, at least with the fields `time_s`, `speed_rpm` and
+`torque_Nm` (shaft torque: the sum of the phases). Its rows rise in time at a constant step. Nothing here filters or
+resamples: every sample counts, so a single sample outside a band is an exit from that band.
+
+Definitions
+    band          reference +-0.5 % (BAND), its edges included
+    settling      from the speed command to the first sample after the last exit from the band; 0 when the speed never
+                  was outside, None when the last sample is outside (it has not settled within the recording)
+    recovery      the same, counted from the load step
+    overshoot     (highest speed - reference) / reference in percent, not below 0
+    speed dip     reference - lowest speed after the load step, not below 0
+    torque ripple K_t = (T_max - T_min) / T_mean, equation (28) of the paper, over every sample of RIPPLE_WINDOW_S;
+                  the samples must be 1 us apart or closer, because coarser ones can fall into step with the switching
+                  and hide the ripple
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+BAND = 0.005
+RIPPLE_WINDOW_S = (0.3, 0.4)
+RIPPLE_STEP_MAX_S = 1e-6
+
+# Times are compared with this tolerance: far below any sample step, far above the rounding of a double near 1 s.
+_TIME_TOLERANCE_S = 1e-10
+
+
+class MetricsError(ValueError):
+    """A recording from which a figure cannot honestly be taken; the message names what is wrong with it."""
+
+
+def time_to_stay_in_band_s(time_s: np.ndarray, speed_rpm: np.ndarray, reference_rpm: float, since_s: float,
+                           band: float = BAND) -> float | None:
+    """Time from `since_s` until the speed is in reference +-band (a fraction) for the rest of the recording.
+
+    Returns 0.0 when no sample from `since_s` on is outside, None when the last one is.
+    """
+    first = _index_at(time_s, since_s)
+    error_rpm = np.abs(np.asarray(speed_rpm[first:], dtype=float) - reference_rpm)
+    outside = np.flatnonzero(~(error_rpm <= band * abs(reference_rpm)))
+    if outside.size == 0:
+        return 0.0
+    inside_again = first + int(outside[-1]) + 1
+    if inside_again == len(time_s):
+        return None
+    return float(time_s[inside_again]) - since_s
+
+
+def start_metrics(recording: np.ndarray, reference_rpm: float, command_time_s: float = 0.0) -> dict[str, float | None]:
+    """Figures of a start from standstill to `reference_rpm` (> 0), commanded at `command_time_s`."""
+    _check_recording(recording)
+    speed_max_rpm = float(np.max(recording["speed_rpm"]))
+    return {
+        "settling_time_s": time_to_stay_in_band_s(recording["time_s"], recording["speed_rpm"], reference_rpm,
+                                                  command_time_s),
+        "overshoot_percent": max(0.0, (speed_max_rpm - reference_rpm) / reference_rpm * 100.0),
+        "max_speed_rpm": speed_max_rpm,
+    }
+
+
+def load_step_metrics(recording: np.ndarray, reference_rpm: float, step_time_s: float,
+                      ripple_window_s: tuple[float, float] = RIPPLE_WINDOW_S) -> dict[str, float | None]:
+    """Figures of a run at `reference_rpm` with a load step at `step_time_s`; torque over `ripple_window_s`."""
+    _check_recording(recording)
+    time_s, speed_rpm = recording["time_s"], recording["speed_rpm"]
+    speed_min_rpm = float(np.min(speed_rpm[_index_at(time_s, step_time_s):]))
+    return {
+        "speed_dip_rpm": max(0.0, reference_rpm - speed_min_rpm),
+        "recovery_time_s": time_to_stay_in_band_s(time_s, speed_rpm, reference_rpm, step_time_s),
+        "max_speed_rpm": float(np.max(speed_rpm)),
+        **torque_metrics(time_s, recording["torque_Nm"], ripple_window_s),
+    }
+
+
+def torque_metrics(time_s: np.ndarray, torque_Nm: np.ndarray, window_s: tuple[float, float]) -> dict[str, float]:
+    """Highest, lowest and mean torque and K_t over the samples with window_s[0] <= time <= window_s[1].
+
+    Raises MetricsError when the recording does not span the window or its samples are more than 1 us apart, or when
+    the mean torque is not positive, for which K_t is not defined.
+    """
+    start_s, end_s = window_s
+    step_s = sample_step_s(time_s)
+    if step_s > RIPPLE_STEP_MAX_S + _TIME_TOLERANCE_S:
+        raise MetricsError(f"torque ripple needs samples {RIPPLE_STEP_MAX_S * 1e6:g} us apart or closer, the recording"
+                           f" has {step_s * 1e6:g} us")
+    if time_s[0] > start_s + _TIME_TOLERANCE_S or time_s[-1] < end_s - step_s - _TIME_TOLERANCE_S:
+        raise MetricsError(f"torque ripple is taken from {start_s:g} s to {end_s:g} s, the recording spans"
+                           f" {time_s[0]:g} s to {time_s[-1]:g} s")
+    torque_Nm = np.asarray(torque_Nm[_index_at(time_s, start_s):_index_after(time_s, end_s)], dtype=float)
+    highest_Nm, lowest_Nm, mean_Nm = float(torque_Nm.max()), float(torque_Nm.min()), float(torque_Nm.mean())
+    if mean_Nm <= 0.0:
+        raise MetricsError(f"torque ripple needs a positive mean torque, the window has {mean_Nm:g} N m")
+    return {
+        "torque_max_Nm": highest_Nm,
+        "torque_min_Nm": lowest_Nm,
+        "torque_mean_Nm": mean_Nm,
+        "torque_ripple": (highest_Nm - lowest_Nm) / mean_Nm,
+    }
+
+
+def sample_step_s(time_s: np.ndarray) -> float:
+    """The constant step between the samples of a recording, in seconds, from its first and last time."""
+    if len(time_s) < 2:
+        raise MetricsError(f"a recording needs at least 2 samples, this one has {len(time_s)}")
+    return (float(time_s[-1]) - float(time_s[0])) / (len(time_s) - 1)
+
+
+def _check_recording(recording: np.ndarray) -> None:
+    for field in ("time_s", "speed_rpm", "torque_Nm"):
+        if field not in (recording.dtype.names or ()):
+            raise MetricsError(f"the recording has no field {field}")
+        if not np.all(np.isfinite(recording[field])):
+            raise MetricsError(f"the recording's field {field} holds a value that is not finite")
+    time_s = recording["time_s"]
+    step_s = sample_step_s(time_s)
+    steps_s = np.diff(time_s)
+    if step_s <= 0.0 or float(steps_s.min()) < 0.5 * step_s or float(steps_s.max()) > 1.5 * step_s:
+        raise MetricsError("the recording's times do not rise in equal steps")
+
+
+def _index_at(time_s: np.ndarray, when_s: float) -> int:
+    """Index of the first sample at or after `when_s`; MetricsError when there is none."""
+    index = int(np.searchsorted(time_s, when_s - _TIME_TOLERANCE_S, side="left"))
+    if index == len(time_s):
+        raise MetricsError(f"the recording ends at {time_s[-1]:g} s, before {when_s:g} s")
+    return index
+
+
+def _index_after(time_s: np.ndarray, when_s: float) -> int:
+    """Index one past the last sample at or before `when_s`."""
+    return int(np.searchsorted(time_s, when_s + _TIME_TOLERANCE_S, side="right"))
