@@ -1,0 +1,72 @@
+/* Magnetics of one phase: flux linkage, its derivatives, torque and energy as functions of rotor angle and current.
+ *
+ * All forms here are psi = Lu i + f(theta) (g(i) - Lu i), T = f'(theta) W(i), W(i) = integral of g(i) - Lu i from 0:
+ *
+ *   linear, cosine      f = (1 + cos Nr theta) / 2, g = La i
+ *   linear, trapezoid   f from 1 to 0 with flats at both ends, a straight slope and parabolic corners, g = La i
+ *   saturating          H. Le-Huy, P. Brunelle, "A versatile nonlinear switched reluctance motor model in Simulink
+ *                       using realistic and analytical magnetization characteristics", IECON 2005:
+ *                       f = 2 (Nr theta / pi)^3 - 3 (Nr theta / pi)^2 + 1 on [0, pi / Nr], even,
+ *                       g = Ls i + A (1 - e^(-b i)), A = psi_m - Ls I_m, b = (La - Ls) / A
+ *
+ * The phase angle theta is mechanical: 0 aligned, half a pitch (pi / Nr) unaligned; torque is positive from half a
+ * pitch to a whole one. One phase does not see the others' currents.
+ */
+#ifndef PLANT_MAGNETICS_H
+#define PLANT_MAGNETICS_H
+
+typedef enum { MAGNETICS_LINEAR_COSINE, MAGNETICS_LINEAR_TRAPEZOID, MAGNETICS_SATURATING } magnetics_form_t;
+
+/* What a machine file says. Fields that a form does not use are 0. */
+typedef struct {
+    magnetics_form_t form;
+    double unaligned_inductance_H;        /* Lu, > 0 */
+    double aligned_inductance_H;          /* La, > Lu; saturating: at small currents */
+    double flat_deg;                      /* trapezoid: flat at each end of half a pitch, mechanical degrees */
+    double blend_deg;                     /* trapezoid: length of each parabolic corner, mechanical degrees */
+    double saturated_inductance_H;        /* saturating: Ls, slope of the aligned curve at large currents */
+    double flux_linkage_max_Wb;           /* saturating: psi_m, aligned at I_m */
+    double current_at_flux_linkage_max_A; /* saturating: I_m */
+} magnetics_t;
+
+/* The same with everything computed beforehand that a form needs; made by magnetics_prepare. */
+typedef struct {
+    magnetics_form_t form;
+    double unaligned_inductance_H;
+    double linear_excess_H; /* (g(i) - Lu i) / i without the exponential part: La - Lu or Ls - Lu */
+    double saturating_Wb;   /* A; 0 for the linear forms */
+    double saturation_1_A;  /* b; 0 for the linear forms */
+    double pitch_rad, pitches_per_rad;
+    double electrical_per_mechanical; /* Nr */
+    double flat_rad, blend_rad, slope_1_rad, curvature_1_rad2;
+} magnetics_model_t;
+
+/* One operating point. */
+typedef struct {
+    double flux_linkage_Wb;          /* psi */
+    double incremental_inductance_H; /* d psi / d i, > 0 */
+    double flux_gradient_Wb_rad;     /* d psi / d theta, per mechanical radian; times speed: motional voltage */
+    double torque_Nm;                /* d co-energy / d theta */
+} magnetics_point_t;
+
+/* Prepares `model` for `magnetics` of a machine with `rotor_poles` poles. The values must be a checked machine file's;
+ * they are not checked again. */
+void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, unsigned rotor_poles);
+
+/* The operating point at a phase angle (any mechanical angle, rad) and a current (A, >= 0; slightly negative values
+ * continue the curves smoothly, for the search of a zero). */
+void magnetics_evaluate(const magnetics_model_t *model, double phase_angle_rad, double current_A,
+                        magnetics_point_t *point);
+
+/* Co-energy, the integral of psi over the current at a constant angle, in J. */
+double magnetics_coenergy_J(const magnetics_model_t *model, double phase_angle_rad, double current_A);
+
+/* Energy stored in the field: psi i - co-energy, in J. */
+double magnetics_field_energy_J(const magnetics_model_t *model, double phase_angle_rad, double current_A);
+
+/* How far the angle may move from phase_angle_rad in a direction (+1 or -1) before f loses smoothness (a jump of its
+ * second or third derivative), mechanical rad, > 0; a place nearer than a nanoradian counts as passed. Infinite for
+ * the cosine. An integrator that ends a step there keeps its order. */
+double magnetics_smooth_distance_rad(const magnetics_model_t *model, double phase_angle_rad, double direction);
+
+#endif
