@@ -1,0 +1,52 @@
+/* PID whose gains a BP network gives, incremental form: torque error to duty.
+ *
+ *   u(k) = u(k-1) + kp (e - e1) + ki e + kd (e - 2 e1 + e2)     (15) as in (25); printed with e(k) thrice
+ *
+ * with kp, ki, kd the network's outputs (0..1) times their scales. The error enters as e / error_scale, held within +-1,
+ * as do its first and second difference; they are the network's inputs too (the paper does not name its inputs).
+ * Learning pauses while the duty is saturated or the errors are at their limits: the gradient says nothing then, and
+ * learning from it drives the weights away.
+ */
+#ifndef CONTROL_BP_PID_H
+#define CONTROL_BP_PID_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "control/bp_network.h"
+
+typedef enum {
+    BP_PID_OFF,     /* no PID: whoever uses it falls back to hysteresis */
+    BP_PID_FIXED,   /* gains at half their scales */
+    BP_PID_FROZEN,  /* gains from the network, weights as they are */
+    BP_PID_LEARNING /* gains from the network, which learns */
+} bp_pid_mode_t;
+
+typedef struct {
+    bp_pid_mode_t mode;
+    uint32_t seed;                  /* of the initial weights */
+    int32_t error_scale_inverse_q24; /* 1/(N m), Q7.24, 0 < scale_inverse <= 64 */
+    int32_t kp_scale_q15;           /* duty per scaled error, Q16.15, 0..4 */
+    int32_t ki_scale_q15;
+    int32_t kd_scale_q15;
+    bp_network_parameters_t network;
+} bp_pid_parameters_t;
+
+typedef struct {
+    bp_network_t network;
+    int32_t error_q15;    /* e(k-1), scaled */
+    int32_t previous_q15; /* e(k-2), scaled */
+    int32_t duty_q30;     /* u, Q1.30, within +-1 */
+    int32_t gain_q15[BP_OUTPUTS]; /* kp, ki, kd in use, Q16.15; for display */
+} bp_pid_t;
+
+/* Weights from the seed, no error, duty 0. */
+void bp_pid_reset(const bp_pid_parameters_t *parameters, bp_pid_t *pid);
+
+/* Continues from another duty (Q1.15, -32768..32768) when the PID takes over a phase. */
+void bp_pid_preset(bp_pid_t *pid, int32_t duty_q15);
+
+/* One sample: duty in Q1.15, -32768..32768, from the torque error in N m, Q7.24, any value. */
+int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_t torque_error_q24);
+
+#endif

@@ -1,0 +1,58 @@
+#include "control/ditc_duty.h"
+
+#include "control/torque_map.h"
+#include "fixed/fixed.h"
+
+#define DUTY_ONE_Q15 32768
+
+/* An outgoing phase below this torque has nothing left to take off: 1/16 N m. */
+#define SPENT_TORQUE_Q24 (1 << 20)
+
+void ditc_duty_reset(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc) {
+    bp_pid_reset(&parameters->pid, &ditc->pid);
+    ditc->regulated = COMMUTATION_NONE;
+}
+
+/* Duty that brings the incoming phase to its current. */
+static int32_t incoming_duty_q15(const ditc_duty_parameters_t *parameters, const machine_tables_t *tables,
+                                 const ditc_duty_sample_t *sample, int32_t current_q9) {
+    if (sample->error_q24 > parameters->band_outer_q24) {
+        return DUTY_ONE_Q15;
+    }
+    const int32_t target_q9 = torque_map_current_q9(tables, parameters->hand_over_angle, sample->reference_q24);
+    const int32_t limited_q9 = fixed_clamp(target_q9, 0, parameters->current_limit_q9);
+    /* Q9 * Q20 to Q15. */
+    return fixed_clamp(fixed_multiply(limited_q9 - current_q9, parameters->incoming_gain_q20, 14), -DUTY_ONE_Q15,
+                       DUTY_ONE_Q15);
+}
+
+void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc, const machine_tables_t *tables,
+                    const commutation_t *commutation, const ditc_duty_sample_t *sample,
+                    int32_t duty_q15[HAL_PHASES_MAX]) {
+    for (unsigned phase = 0; phase < tables->phases; phase++) {
+        duty_q15[phase] = -DUTY_ONE_Q15;
+    }
+    const unsigned active = commutation->active;
+    if (active == COMMUTATION_NONE) {
+        return;
+    }
+
+    bool handing_over = ditc->regulated != active && ditc->regulated == commutation->outgoing &&
+                        ditc->regulated != COMMUTATION_NONE;
+    if (handing_over) {
+        duty_q15[active] = incoming_duty_q15(parameters, tables, sample, sample->current_q9[active]);
+        if (sample->torque_q24[ditc->regulated] < SPENT_TORQUE_Q24) {
+            bp_pid_preset(&ditc->pid, duty_q15[active]);
+            handing_over = false;
+        }
+    }
+    if (!handing_over) {
+        ditc->regulated = active;
+    }
+
+    const int32_t regulated_q15 = bp_pid_step(&parameters->pid, &ditc->pid, sample->error_q24);
+    duty_q15[ditc->regulated] = regulated_q15;
+    if (duty_q15[ditc->regulated] > 0 && sample->current_q9[ditc->regulated] > parameters->current_limit_q9) {
+        duty_q15[ditc->regulated] = 0;
+    }
+}

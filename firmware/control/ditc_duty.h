@@ -1,0 +1,48 @@
+/* Direct instantaneous torque control with the BP-PID's output as duty: the paper's controller at a real sampling rate.
+ *
+ * One phase is regulated: the PID turns the error of the total torque into its duty, from -1 (both switches off) over 0
+ * (freewheeling) to +1 (both on). At turn-on of the next phase the PID stays with the outgoing one, which is large in
+ * torque and slow, while the incoming phase, still without torque, is brought to the current that will carry the
+ * reference at the hand-over angle; what torque it makes meanwhile, the PID takes off the outgoing phase. When nothing
+ * is left to take off, or the outgoing phase must go, the PID moves on to the incoming phase, starting from its duty.
+ * DITC's outer band stays in force: torque missing beyond it switches the incoming phase fully on.
+ */
+#ifndef CONTROL_DITC_DUTY_H
+#define CONTROL_DITC_DUTY_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "control/bp_pid.h"
+#include "control/commutation.h"
+#include "control/machine_tables.h"
+
+typedef struct {
+    bp_pid_parameters_t pid;
+    uint32_t hand_over_angle;    /* 2^-32 pitch, 2^31..2^32-1 */
+    int32_t incoming_gain_q20;   /* duty per A of the incoming phase's current error, Q11.20 */
+    int32_t band_outer_q24;      /* N m, Q7.24 */
+    int32_t current_limit_q9;    /* A, Q7.9 */
+} ditc_duty_parameters_t;
+
+typedef struct {
+    bp_pid_t pid;
+    unsigned regulated; /* the PID's phase; COMMUTATION_NONE before the first */
+} ditc_duty_t;
+
+typedef struct {
+    const int32_t *current_q9; /* A, Q7.9, by phase */
+    const int32_t *torque_q24; /* N m, Q7.24, by phase */
+    int32_t reference_q24;     /* N m, Q7.24, >= 0 */
+    int32_t error_q24;         /* reference - sum of the torques */
+} ditc_duty_sample_t;
+
+/* Initial weights, no phase regulated. */
+void ditc_duty_reset(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc);
+
+/* One sample: duty of each phase, Q1.15, -32768..32768. */
+void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc, const machine_tables_t *tables,
+                    const commutation_t *commutation, const ditc_duty_sample_t *sample,
+                    int32_t duty_q15[HAL_PHASES_MAX]);
+
+#endif

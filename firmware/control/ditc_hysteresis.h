@@ -1,0 +1,37 @@
+/* Direct instantaneous torque control by hysteresis: three switch states a phase.
+ *
+ *   +1 both switches on (+Vdc), 0 one on (freewheeling), -1 both off (-Vdc)      (1) of the paper
+ *
+ * Rules, error = reference - torque of all phases:
+ *   active phase     +1 above +inner, 0 below -inner, -1 below -outer, unchanged between; with an outgoing phase at work
+ *                    it is the incoming one and never goes below 0 before the outgoing phase has been taken off
+ *   outgoing phase   +1 above +outer, -1 below -inner, 0 when the error returns through zero, unchanged between
+ *   other phases     -1
+ * so missing torque goes to the incoming phase first and surplus comes off the outgoing one first. A phase above the
+ * current limit is not switched on.
+ */
+#ifndef CONTROL_DITC_HYSTERESIS_H
+#define CONTROL_DITC_HYSTERESIS_H
+
+#include <stdint.h>
+
+#include "control/commutation.h"
+
+typedef struct {
+    int32_t band_inner_q24;   /* N m, Q7.24, >= 0 */
+    int32_t band_outer_q24;   /* N m, Q7.24, >= inner */
+    int32_t current_limit_q9; /* A, Q7.9 */
+} ditc_hysteresis_parameters_t;
+
+typedef struct {
+    int8_t state[HAL_PHASES_MAX]; /* +1, 0, -1 */
+} ditc_hysteresis_t;
+
+/* All phases -1. */
+void ditc_hysteresis_reset(ditc_hysteresis_t *ditc);
+
+/* One sample: new states from the torque error (N m, Q7.24) and the phase currents (A, Q7.9). */
+void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_hysteresis_t *ditc, unsigned phases,
+                          const commutation_t *commutation, int32_t torque_error_q24, const int32_t *current_q9);
+
+#endif

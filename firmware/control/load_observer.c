@@ -1,0 +1,75 @@
+#include "control/load_observer.h"
+
+#include "fixed/exponential.h"
+#include "fixed/fixed.h"
+
+/* Keeps a wild load estimate (a rotor that was turned by hand, an encoder that jumped) from taking seconds to return. */
+#define LOAD_TORQUE_LIMIT_Q24 (60 * (1 << 24))
+
+#define INNOVATION_LIMIT (1 << 22)
+
+/* 2 pi in Q3.28. */
+#define TWO_PI_Q28 1686629713
+
+load_observer_parameters_t load_observer_configure(uint32_t bandwidth_rad_s, uint32_t control_rate_hz,
+                                                   int32_t inertia_q30, int32_t friction_q30) {
+    /* Widths in the comments are for the ends of the ranges: p = 1 - q <= 0.33, p rate <= 8000. */
+    const int64_t rate = control_rate_hz; /* 17 bits */
+    const int64_t one_q31 = (int64_t)1 << 31;
+    const int64_t q_q31 = exponential_negative_q31((uint32_t)(((uint64_t)bandwidth_rad_s << 16) / control_rate_hz));
+    const int64_t p_q31 = one_q31 - q_q31;
+    const int64_t p2_q46 = (p_q31 * p_q31) >> 16;
+    const int64_t p3_q46 = ((p2_q46 >> 15) * p_q31) >> 16;
+    const int64_t q3_q31 = (((q_q31 * q_q31) >> 31) * q_q31) >> 31;
+    const int64_t inertia_rate_q30 = (int64_t)inertia_q30 * rate; /* 48 bits */
+
+    load_observer_parameters_t parameters = {.friction_q30 = friction_q30};
+    parameters.angle_gain_q30 = (int32_t)((one_q31 - q3_q31) >> 1);
+
+    /* l2 * 2 pi * 2^14, which is 2 pi 2^-32 rad to 2^-22 rad/s in Q24. */
+    const int64_t l2_q46 = ((p2_q46 * ((one_q31 + q_q31) >> 16)) >> 15) * 3 / 2 * rate; /* 46 - 2 + 17 bits */
+    parameters.speed_gain_q24 = fixed_saturate(((l2_q46 >> 24) * (TWO_PI_Q28 >> 4)) >> 32);
+
+    /* J l3 * 2 pi * 2^8, which is 2 pi 2^-32 rad to 2^-24 N m in Q16; J l3 = (J rate) (p^3 rate). */
+    const int64_t p3_rate_q30 = (p3_q46 * rate) >> 16;                                   /* 40 bits */
+    const int64_t inertia_l3_q36 = (inertia_rate_q30 >> 16) * (p3_rate_q30 >> 8);        /* 63 bits */
+    parameters.torque_gain_q16 = ((inertia_l3_q36 >> 20) * (TWO_PI_Q28 >> 16)) >> 20;
+
+    /* Ts / J * 2^-2 * 2^32 = 2^30 / (J rate). */
+    parameters.acceleration_q32 = fixed_saturate(((int64_t)1 << 60) / inertia_rate_q30);
+    /* Ts / (2 pi) * 2^10 * 2^32 = 2^42 / (2 pi rate). */
+    parameters.angle_step_q32 = (int32_t)((((int64_t)1 << 62) / TWO_PI_Q28 * 256) / rate);
+    return parameters;
+}
+
+void load_observer_reset(load_observer_t *observer, uint32_t angle) {
+    observer->angle_q64 = (uint64_t)angle << 32;
+    observer->speed_q22 = 0;
+    observer->load_torque_q24 = 0;
+}
+
+int32_t load_observer_step(const load_observer_parameters_t *parameters, load_observer_t *observer, uint32_t angle,
+                           int32_t torque_q24) {
+    const uint32_t expected = (uint32_t)((observer->angle_q64 + ((uint64_t)1 << 31)) >> 32);
+    const int32_t innovation = (int32_t)(angle - expected); /* modulo a turn */
+    const int64_t error = fixed_clamp(innovation, -INNOVATION_LIMIT, INNOVATION_LIMIT);
+
+    /* Correct. */
+    observer->angle_q64 += (uint64_t)(error * parameters->angle_gain_q30) << 2; /* Q30 to Q32 */
+    int32_t speed_q22 =
+        fixed_saturate(observer->speed_q22 + fixed_shift(error * parameters->speed_gain_q24, 24));
+    const int64_t load_q24 = observer->load_torque_q24 - fixed_shift(error * parameters->torque_gain_q16, 16);
+    observer->load_torque_q24 =
+        (int32_t)(load_q24 > LOAD_TORQUE_LIMIT_Q24    ? LOAD_TORQUE_LIMIT_Q24
+                  : load_q24 < -LOAD_TORQUE_LIMIT_Q24 ? -LOAD_TORQUE_LIMIT_Q24
+                                                      : load_q24);
+
+    /* Predict: constant acceleration over the period, so the angle moves at the mean of old and new speed. */
+    const int32_t friction_q24 = fixed_multiply(speed_q22, parameters->friction_q30, 28);
+    const int32_t net_q24 = fixed_subtract(fixed_subtract(torque_q24, friction_q24), observer->load_torque_q24);
+    const int32_t next_q22 = fixed_add(speed_q22, fixed_multiply(net_q24, parameters->acceleration_q32, 32));
+    const int64_t mean_q22 = ((int64_t)speed_q22 + next_q22) >> 1;
+    observer->angle_q64 += (uint64_t)(mean_q22 * parameters->angle_step_q32);
+    observer->speed_q22 = next_q22;
+    return innovation;
+}

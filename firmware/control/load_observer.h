@@ -1,0 +1,45 @@
+/* Observer for rotor angle, speed and load torque, from the encoder and the estimated machine torque.
+ *
+ * Model: d(angle)/dt = w, J dw/dt = T - B w - T_L, dT_L/dt = 0. A predictor with output feedback, all three poles at
+ * q = e^(-w0 Ts):
+ *
+ *   l1 = 1 - q^3,  l2 = 1.5 (1 - q)^2 (1 + q) / Ts,  l3 = (1 - q)^3 / Ts^2
+ *
+ * The paper takes T_L as known; a drive does not know it.
+ */
+#ifndef CONTROL_LOAD_OBSERVER_H
+#define CONTROL_LOAD_OBSERVER_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+typedef struct {
+    int32_t angle_gain_q30;   /* l1 */
+    int32_t speed_gain_q24;   /* l2: rad/s Q9.22 per 2^-32 turn, in Q24 */
+    int64_t torque_gain_q16;  /* J l3: N m Q7.24 per 2^-32 turn, in Q16 */
+    int32_t acceleration_q32; /* Ts / J: rad/s Q9.22 per N m Q7.24, in Q32 */
+    int32_t friction_q30;     /* B, N m s */
+    int32_t angle_step_q32;   /* Ts: 2^-32 turn per rad/s Q9.22, in Q32 */
+} load_observer_parameters_t;
+
+typedef struct {
+    uint64_t angle_q64;      /* mechanical, 2^-64 turn, wraps */
+    int32_t speed_q22;       /* rad/s, Q9.22, saturates */
+    int32_t load_torque_q24; /* N m, Q7.24, saturates at +-torque_limit */
+} load_observer_t;
+
+/* Gains for a bandwidth w0 in rad/s (100..8000), a control rate in Hz (20000..100000), an inertia in kg m^2, Q1.30
+ * (from 10^-4) and a friction in N m s, Q1.30. Integer arithmetic; relative error of each gain below 0.2 percent. */
+load_observer_parameters_t load_observer_configure(uint32_t bandwidth_rad_s, uint32_t control_rate_hz,
+                                                   int32_t inertia_q30, int32_t friction_q30);
+
+/* Starts at an angle (2^-32 turn), at rest, without load. */
+void load_observer_reset(load_observer_t *observer, uint32_t angle);
+
+/* One sample: corrects with the measured angle (2^-32 turn), then predicts one period on with the machine's torque (N m,
+ * Q7.24). Afterwards the state is the estimate for the coming sample. Returns the innovation in 2^-32 turn; what
+ * corrects is limited to +-2^22 (a thousandth of a turn), which keeps every product within 64 bits. */
+int32_t load_observer_step(const load_observer_parameters_t *parameters, load_observer_t *observer, uint32_t angle,
+                           int32_t torque_q24);
+
+#endif

@@ -1,0 +1,59 @@
+/* Fixed-point arithmetic: every operation saturates or says why it cannot overflow.
+ *
+ * Notation: Qm.n is a signed number with m integer bits and n fraction bits; `speed_q22` holds Q9.22. An unsigned
+ * format says so. Products are formed in 64 bits, rounded to nearest (halves towards plus infinity) and saturated.
+ *
+ * Right shifts of negative numbers are arithmetic: C leaves that to the compiler, the assertion below pins it.
+ */
+#ifndef FIXED_FIXED_H
+#define FIXED_FIXED_H
+
+#include <assert.h>
+#include <stdint.h>
+
+static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithmetic");
+
+/* Number of a format from a constant: evaluated by the compiler, never at run time. */
+#define FIXED_CONSTANT(numerator, denominator, fraction_bits)                                                          \
+    ((int32_t)((((int64_t)(numerator) << (fraction_bits)) + (denominator) / 2) / (denominator)))
+
+/* Nearest 32-bit number. */
+static inline int32_t fixed_saturate(int64_t value) {
+    if (value > INT32_MAX) {
+        return INT32_MAX;
+    }
+    return value < INT32_MIN ? INT32_MIN : (int32_t)value;
+}
+
+static inline int32_t fixed_clamp(int32_t value, int32_t low, int32_t high) {
+    if (value > high) {
+        return high;
+    }
+    return value < low ? low : value;
+}
+
+/* Saturating sum and difference. */
+static inline int32_t fixed_add(int32_t a, int32_t b) {
+    return fixed_saturate((int64_t)a + b);
+}
+
+static inline int32_t fixed_subtract(int32_t a, int32_t b) {
+    return fixed_saturate((int64_t)a - b);
+}
+
+/* Magnitude; INT32_MIN gives INT32_MAX. */
+static inline int32_t fixed_abs(int32_t value) {
+    return value < 0 ? fixed_subtract(0, value) : value;
+}
+
+/* value / 2^shift, rounded; shift 1..62. Cannot overflow for |value| <= 2^63 - 2^(shift-1). */
+static inline int64_t fixed_shift(int64_t value, unsigned shift) {
+    return (value + ((int64_t)1 << (shift - 1))) >> shift;
+}
+
+/* a * b / 2^shift, rounded and saturated; shift 1..62. */
+static inline int32_t fixed_multiply(int32_t a, int32_t b, unsigned shift) {
+    return fixed_saturate(fixed_shift((int64_t)a * b, shift));
+}
+
+#endif

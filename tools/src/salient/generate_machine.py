@@ -1,0 +1,101 @@
+"""Build step: the C sources of a machine, `machine_tables.c` for the firmware and `machine_plant.c` for the emulator.
+
+    python -m salient.generate_machine FILE.toml OUTDIR
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from salient.machine import Machine, MachineError, load_machine
+
+# As in firmware/control/machine_tables.h.
+TORQUE_ANGLES = 65
+TORQUE_CURRENTS = 81
+
+
+def quantise(value: float, fraction_bits: int, bits: int) -> int:
+    """Nearest integer of `value` in a signed format, saturated to `bits`."""
+    limit = 1 << (bits - 1)
+    return max(-limit, min(limit - 1, math.floor(value * (1 << fraction_bits) + 0.5)))
+
+
+def tables_source(machine: Machine) -> str:
+    """C source of the firmware's tables."""
+    half = machine.pitch_rad / 2.0
+    currents = np.arange(TORQUE_CURRENTS, dtype=float)
+    rows = []
+    for angle in np.linspace(half, 2.0 * half, TORQUE_ANGLES):
+        torque = np.maximum(machine.torque_Nm(angle, currents), 0.0)
+        # At both ends of the half pitch the slope's sign is that of the wrapped angle; the torque there is zero.
+        if angle == half or angle == 2.0 * half:
+            torque = np.zeros_like(torque)
+        rows.append("        {" + ", ".join(str(quantise(t, 8, 16)) for t in torque) + "},")
+    return "\n".join(
+        [
+            f"/* Generated from the machine file of '{machine.name}'. */",
+            '#include "control/machine_tables.h"',
+            "",
+            "const machine_tables_t machine_tables = {",
+            f"    .phases = {machine.phases},",
+            f"    .rotor_poles = {machine.rotor_poles},",
+            f"    .inertia_q30 = {quantise(machine.inertia_kg_m2, 30, 32)},",
+            f"    .friction_q30 = {quantise(machine.friction_Nm_s, 30, 32)},",
+            "    .torque_q8 = {",
+            *rows,
+            "    },",
+            "};",
+            "",
+        ]
+    )
+
+
+def plant_source(machine: Machine) -> str:
+    """C source of the emulator's machine, every number to the last bit."""
+    magnetics = [f"        .{key} = {value!r}," for key, value in machine.magnetics.items()]
+    return "\n".join(
+        [
+            f"/* Generated from the machine file of '{machine.name}'. */",
+            '#include "plant/machine.h"',
+            "",
+            "const machine_t machine_plant = {",
+            f'    .name = "{machine.name}",',
+            f"    .stator_poles = {machine.stator_poles},",
+            f"    .rotor_poles = {machine.rotor_poles},",
+            f"    .phases = {machine.phases},",
+            f"    .resistance_ohm = {machine.resistance_ohm!r},",
+            f"    .inertia_kg_m2 = {machine.inertia_kg_m2!r},",
+            f"    .friction_Nm_s = {machine.friction_Nm_s!r},",
+            f"    .supply_voltage_V = {machine.supply_voltage_V!r},",
+            "    .magnetics = {",
+            f"        .form = MAGNETICS_{machine.form.upper()},",
+            *magnetics,
+            "    },",
+            "};",
+            "",
+        ]
+    )
+
+
+def main(arguments: list[str]) -> int:
+    if len(arguments) != 2:
+        print("usage: python -m salient.generate_machine FILE.toml OUTDIR", file=sys.stderr)
+        return 2
+    try:
+        machine = load_machine(arguments[0])
+    except MachineError as error:
+        print(f"salient: {error}", file=sys.stderr)
+        return 2
+    out = Path(arguments[1])
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "machine_tables.c").write_text(tables_source(machine), encoding="utf-8")
+    (out / "machine_plant.c").write_text(plant_source(machine), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
