@@ -34,8 +34,10 @@ typedef struct {
     magnetics_form_t form;
     double unaligned_inductance_H;
     double linear_excess_H; /* (g(i) - Lu i) / i without the exponential part: La - Lu or Ls - Lu */
-    double saturating_Wb;   /* A; 0 for the linear forms */
-    double saturation_1_A;  /* b; 0 for the linear forms */
+    double saturating_Wb;   /* A; this and the next three only in the saturating form */
+    double saturation_1_A;  /* b */
+    double saturation_A;    /* 1 / b */
+    double initial_slope_H; /* A b */
     double pitch_rad, pitches_per_rad;
     double electrical_per_mechanical; /* Nr */
     double flat_rad, blend_rad, slope_1_rad, curvature_1_rad2;
@@ -64,9 +66,12 @@ double magnetics_coenergy_J(const magnetics_model_t *model, double phase_angle_r
 /* Energy stored in the field: psi i - co-energy, in J. */
 double magnetics_field_energy_J(const magnetics_model_t *model, double phase_angle_rad, double current_A);
 
+/* A place where f loses smoothness counts as passed when it is nearer than this. */
+#define MAGNETICS_SMOOTH_TOLERANCE_RAD 1e-6
+
 /* How far the angle may move from phase_angle_rad in a direction (+1 or -1) before f loses smoothness (a jump of its
- * second or third derivative), mechanical rad, > 0; a place nearer than a nanoradian counts as passed. Infinite for
- * the cosine. An integrator that ends a step there keeps its order. */
+ * second or third derivative), mechanical rad, > 0; infinite for the cosine. An integrator that ends a step there keeps
+ * its order. */
 double magnetics_smooth_distance_rad(const magnetics_model_t *model, double phase_angle_rad, double direction);
 
 #endif

@@ -71,6 +71,7 @@ typedef struct plant {
     magnetics_model_t magnetics;
     double phase_offset_rad;
     double step_max_s, step_current_A, step_angle_rad;
+    double smooth_from_rad, smooth_to_rad;
     plant_switches_t switches;
     unsigned edge_count, edge_next;
     plant_edge_t edges[PLANT_EDGES_MAX];
