@@ -1,0 +1,111 @@
+/* How clients reach the emulated bus: the local bus (transport_local.c) or SocketCAN (transport_socketcan.c).
+ *
+ * A transport only carries frames. What they mean, when they complete on the bus and what time it is, is the rig's.
+ */
+#ifndef RIG_TRANSPORT_H
+#define RIG_TRANSPORT_H
+
+#include <linux/can.h>
+#include <poll.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "hal_can.h"
+
+#define TRANSPORT_DESCRIPTORS_MAX 72
+#define TRANSPORT_ERROR_SIZE 256
+
+/* One frame as Linux has it; `size` says which. */
+typedef struct {
+    size_t size; /* CAN_MTU (classic) or CANFD_MTU (flexible data rate) */
+    union {
+        struct can_frame classic;
+        struct canfd_frame flexible;
+    };
+} transport_frame_t;
+
+/* Whose frame is sent to the clients, and how its time came about. */
+typedef enum {
+    TRANSPORT_FROM_EMULATOR,       /* the drive or the rig */
+    TRANSPORT_CLOCK,               /* RIG_CLOCK, carries its time itself */
+    TRANSPORT_FROM_CLIENT_ON_BUS,  /* completed on the emulated bus */
+    TRANSPORT_FROM_CLIENT_AT_ONCE, /* never on the emulated bus: rig, error, flexible data rate */
+} transport_origin_t;
+
+/* What a client that does not read its frames suffers. */
+typedef enum {
+    TRANSPORT_WAIT, /* time waits for it, at most two seconds; then it is disconnected */
+    TRANSPORT_DROP, /* the frames that do not fit are lost to it and counted */
+} transport_full_t;
+
+/* What the rig does with frames that come in. Clients are numbered from 1 in the order they connected. */
+typedef struct {
+    void *context;
+    bool (*may_read)(void *context, uint32_t client); /* whether the next frame of this client may be taken */
+    bool (*take)(void *context, uint32_t client, const transport_frame_t *frame); /* false: the client goes too far */
+} transport_receiver_t;
+
+typedef struct transport transport_t;
+
+/* Each transport begins with this. The functions are called through transport_* below. */
+struct transport {
+    size_t (*descriptors)(transport_t *transport, struct pollfd *list);
+    size_t (*read)(transport_t *transport, const transport_receiver_t *receiver);
+    void (*send)(transport_t *transport, uint64_t time_ns, transport_origin_t origin, const transport_frame_t *frame);
+    void (*flush)(transport_t *transport);
+    void (*close)(transport_t *transport);
+    transport_full_t full;
+    const char *failure; /* why the transport cannot go on, or NULL */
+};
+
+/* Fills in up to TRANSPORT_DESCRIPTORS_MAX entries to poll for new frames and clients; returns how many. */
+static inline size_t transport_descriptors(transport_t *transport, struct pollfd *list)
+{
+    return transport->descriptors(transport, list);
+}
+
+/* Lets new clients in and hands over what was sent, one frame of each client in turn, in the order of connection,
+ * until a whole turn brings nothing. Never waits. Returns the number of frames handed over. */
+static inline size_t transport_read(transport_t *transport, const transport_receiver_t *receiver)
+{
+    return transport->read(transport, receiver);
+}
+
+/* Sends a frame to every client, its sender included. It may stay in a batch until transport_flush. */
+static inline void transport_send(transport_t *transport, uint64_t time_ns, transport_origin_t origin,
+                                  const transport_frame_t *frame)
+{
+    transport->send(transport, time_ns, origin, frame);
+}
+
+/* Hands all batches over to the system. */
+static inline void transport_flush(transport_t *transport) { transport->flush(transport); }
+
+/* Disconnects everyone, removes what was created, frees the transport. */
+static inline void transport_close(transport_t *transport) { transport->close(transport); }
+
+/* Opens `address`, unix:PATH or socketcan:INTERFACE. NULL with a line in `error` when it cannot. */
+transport_t *transport_open(const char *address, char error[TRANSPORT_ERROR_SIZE]);
+
+/* The two kinds, by what follows the colon. */
+transport_t *transport_local_open(const char *path, char error[TRANSPORT_ERROR_SIZE]);
+transport_t *transport_socketcan_open(const char *interface, char error[TRANSPORT_ERROR_SIZE]);
+
+/* SocketCAN over a descriptor that is open already and keeps record boundaries (for tests: one end of a socket pair
+ * stands in for an interface). Takes the descriptor over. */
+transport_t *transport_socketcan_attach(int descriptor);
+
+/* Whether `received` bytes are a frame. If so, everything that means nothing is zeroed, so that equal frames are equal
+ * bytes: reserved fields and data behind the length. A classic length of 9 to 15 becomes length 8 with len8_dlc. */
+bool transport_frame_accept(transport_frame_t *frame, size_t received);
+
+/* Never on the emulated bus: flexible data rate, error frames and the rig's identifiers (0x1F0000xx, 29 bits). */
+bool transport_frame_is_rig(const transport_frame_t *frame);
+bool transport_frame_is_off_bus(const transport_frame_t *frame);
+
+/* Between the wire's form and the controller's; classic data and remote frames only. */
+void transport_frame_to_hal(const transport_frame_t *frame, hal_can_frame_t *hal);
+void transport_frame_from_hal(const hal_can_frame_t *hal, transport_frame_t *frame);
+
+#endif

@@ -1,0 +1,321 @@
+/* The local bus: an AF_UNIX SOCK_SEQPACKET socket, one record a frame: virtual time in ns (8 bytes, little endian; 0
+ * from clients), then struct can_frame or struct canfd_frame. Records of any other size, or with an impossible length
+ * or identifier, are ignored and counted. An empty record ends the connection, as closing it does.
+ */
+#define _GNU_SOURCE /* accept4, sendmmsg */
+
+#include <errno.h>
+#include <inttypes.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+#include "rig/transport.h"
+
+#define CLIENTS_MAX 64
+#define BATCH 64                             /* records a system call */
+#define SEND_BUFFER_BYTES (8 * 1024 * 1024)  /* some 10,000 records; the default queue holds 278 */
+#define FULL_TIMEOUT_MS 2000
+#define READ_TURNS_MAX 65536                 /* a client that never stops sending cannot hold up the others for ever */
+
+typedef struct {
+    uint8_t time_ns[8];
+    uint8_t frame[CANFD_MTU];
+} record_t;
+
+_Static_assert(sizeof(record_t) == 8 + CANFD_MTU, "a record has no padding");
+
+typedef struct {
+    int descriptor;
+    uint32_t number;
+    uint64_t malformed, dropped;
+} client_t;
+
+typedef struct {
+    transport_t transport;
+    int listener;
+    char path[sizeof(((struct sockaddr_un *)0)->sun_path)];
+    dev_t device; /* of the socket file, so that only our own is removed */
+    ino_t inode;
+    uint32_t clients_ever;
+    unsigned client_count;
+    client_t clients[CLIENTS_MAX]; /* in the order of connection */
+    unsigned batched;
+    struct iovec spans[BATCH];
+    struct mmsghdr messages[BATCH];
+    record_t records[BATCH];
+} local_t;
+
+static void disconnect(local_t *local, unsigned index, const char *reason)
+{
+    client_t *client = &local->clients[index];
+    if (reason) {
+        fprintf(stderr, "salient: client %" PRIu32 " of %s disconnected: %s\n", client->number, local->path, reason);
+    }
+    if (client->malformed) {
+        fprintf(stderr, "salient: client %" PRIu32 " of %s sent %" PRIu64 " records that are no frames\n",
+                client->number, local->path, client->malformed);
+    }
+    if (client->dropped) {
+        fprintf(stderr, "salient: client %" PRIu32 " of %s lost %" PRIu64 " frames that it did not read in time\n",
+                client->number, local->path, client->dropped);
+    }
+    close(client->descriptor);
+    memmove(client, client + 1, (--local->client_count - index) * sizeof *client);
+}
+
+static void local_flush(transport_t *transport);
+
+static void accept_clients(local_t *local)
+{
+    for (;;) {
+        int descriptor = accept4(local->listener, NULL, NULL, SOCK_NONBLOCK | SOCK_CLOEXEC);
+        if (descriptor < 0) {
+            return;
+        }
+        if (local->client_count == CLIENTS_MAX) {
+            fprintf(stderr, "salient: client refused: %s has %d clients already\n", local->path, CLIENTS_MAX);
+            close(descriptor);
+            continue;
+        }
+        local_flush(&local->transport); /* what is in the batch happened before this client came */
+        int bytes = SEND_BUFFER_BYTES;
+        if (setsockopt(descriptor, SOL_SOCKET, SO_SNDBUFFORCE, &bytes, sizeof bytes) != 0) {
+            setsockopt(descriptor, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes);
+        }
+        local->clients[local->client_count++] =
+            (client_t){.descriptor = descriptor, .number = ++local->clients_ever};
+    }
+}
+
+static size_t local_descriptors(transport_t *transport, struct pollfd *list)
+{
+    local_t *local = (local_t *)transport;
+    list[0] = (struct pollfd){.fd = local->listener, .events = POLLIN};
+    for (unsigned i = 0; i < local->client_count; ++i) {
+        list[1 + i] = (struct pollfd){.fd = local->clients[i].descriptor, .events = POLLIN};
+    }
+    return 1 + local->client_count;
+}
+
+typedef enum { READ_NOTHING, READ_RECORD, READ_GONE } read_result_t;
+
+/* Index of the first client with this number or a later one. Numbers outlive a disconnection, indices do not. */
+static unsigned index_from(const local_t *local, uint32_t number)
+{
+    unsigned index = 0;
+    while (index < local->client_count && local->clients[index].number < number) {
+        ++index;
+    }
+    return index;
+}
+
+static read_result_t read_one(local_t *local, unsigned index, const transport_receiver_t *receiver, size_t *taken)
+{
+    client_t *client = &local->clients[index];
+    record_t record;
+    ssize_t size = recv(client->descriptor, &record, sizeof record, MSG_DONTWAIT | MSG_TRUNC);
+    if (size < 0 && (errno == EAGAIN || errno == EINTR)) {
+        return READ_NOTHING;
+    }
+    if (size <= 0) {
+        disconnect(local, index, NULL);
+        return READ_GONE;
+    }
+    transport_frame_t frame;
+    size_t frame_size = (size_t)size - sizeof record.time_ns;
+    if ((frame_size != CAN_MTU && frame_size != CANFD_MTU) || (size_t)size < sizeof record.time_ns) {
+        ++client->malformed;
+        return READ_RECORD;
+    }
+    memcpy(&frame.flexible, record.frame, frame_size);
+    if (!transport_frame_accept(&frame, frame_size)) {
+        ++client->malformed;
+        return READ_RECORD;
+    }
+    ++*taken;
+    uint32_t number = client->number;
+    if (!receiver->take(receiver->context, number, &frame)) {
+        index = index_from(local, number); /* answering the frame may have cost any client its connection */
+        if (index < local->client_count && local->clients[index].number == number) {
+            disconnect(local, index, "too many of its frames wait for the bus");
+        }
+        return READ_GONE;
+    }
+    return READ_RECORD;
+}
+
+static size_t local_read(transport_t *transport, const transport_receiver_t *receiver)
+{
+    local_t *local = (local_t *)transport;
+    size_t taken = 0;
+    bool more = true;
+    for (unsigned turn = 0; more && turn < READ_TURNS_MAX; ++turn) {
+        more = false;
+        accept_clients(local);
+        for (unsigned i = 0; i < local->client_count;) {
+            uint32_t number = local->clients[i].number;
+            if (receiver->may_read(receiver->context, number)) {
+                more = read_one(local, i, receiver, &taken) != READ_NOTHING || more;
+            }
+            i = index_from(local, number + 1);
+        }
+    }
+    return taken;
+}
+
+/* Sends the batch to one client; false when the client is to be disconnected, with the reason, NULL when it left. */
+static bool send_batch(local_t *local, client_t *client, const char **reason)
+{
+    for (unsigned sent = 0; sent < local->batched;) {
+        int result = sendmmsg(client->descriptor, local->messages + sent, local->batched - sent,
+                              MSG_DONTWAIT | MSG_NOSIGNAL);
+        if (result > 0) {
+            sent += (unsigned)result;
+            continue;
+        }
+        if (errno == EINTR) {
+            continue;
+        }
+        *reason = NULL;
+        if (errno != EAGAIN && errno != ENOBUFS) {
+            return false;
+        }
+        if (local->transport.full == TRANSPORT_DROP) {
+            client->dropped += local->batched - sent;
+            return true;
+        }
+        struct pollfd writable = {.fd = client->descriptor, .events = POLLOUT};
+        if (poll(&writable, 1, FULL_TIMEOUT_MS) == 0) {
+            *reason = "it read nothing for two seconds";
+            return false;
+        }
+    }
+    return true;
+}
+
+static void local_flush(transport_t *transport)
+{
+    local_t *local = (local_t *)transport;
+    if (local->batched == 0) {
+        return;
+    }
+    for (unsigned i = 0; i < local->client_count;) {
+        const char *reason;
+        if (send_batch(local, &local->clients[i], &reason)) {
+            ++i;
+        } else {
+            disconnect(local, i, reason);
+        }
+    }
+    local->batched = 0;
+}
+
+static void local_send(transport_t *transport, uint64_t time_ns, transport_origin_t origin,
+                       const transport_frame_t *frame)
+{
+    (void)origin; /* every record carries its time */
+    local_t *local = (local_t *)transport;
+    if (local->client_count == 0) {
+        return;
+    }
+    record_t *record = &local->records[local->batched];
+    for (unsigned i = 0; i < sizeof record->time_ns; ++i) {
+        record->time_ns[i] = (uint8_t)(time_ns >> (8 * i));
+    }
+    memcpy(record->frame, &frame->flexible, frame->size);
+    local->spans[local->batched].iov_len = sizeof record->time_ns + frame->size;
+    if (++local->batched == BATCH) {
+        local_flush(transport);
+    }
+}
+
+static void local_close(transport_t *transport)
+{
+    local_t *local = (local_t *)transport;
+    local_flush(transport);
+    while (local->client_count > 0) {
+        disconnect(local, local->client_count - 1, NULL);
+    }
+    struct stat status;
+    if (lstat(local->path, &status) == 0 && status.st_dev == local->device && status.st_ino == local->inode) {
+        unlink(local->path);
+    }
+    close(local->listener);
+    free(local);
+}
+
+/* Frees `path` of a socket that nobody serves any more; false with a line in `error` when it is in use. */
+static bool remove_stale(const char *path, const struct sockaddr_un *address, char error[TRANSPORT_ERROR_SIZE])
+{
+    struct stat status;
+    if (lstat(path, &status) != 0) {
+        return true; /* nothing there; bind will say if the folder is missing */
+    }
+    if (!S_ISSOCK(status.st_mode)) {
+        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%s: exists and is no socket", path);
+        return false;
+    }
+    int probe = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
+    bool refused = probe >= 0 && connect(probe, (const struct sockaddr *)address, sizeof *address) != 0 &&
+                   errno == ECONNREFUSED;
+    if (probe >= 0) {
+        close(probe);
+    }
+    if (!refused) {
+        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%s: in use, something answers there", path);
+        return false;
+    }
+    unlink(path);
+    return true;
+}
+
+transport_t *transport_local_open(const char *path, char error[TRANSPORT_ERROR_SIZE])
+{
+    struct sockaddr_un address = {.sun_family = AF_UNIX};
+    if (strlen(path) >= sizeof address.sun_path) {
+        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%.60s...: the path has %zu characters, at most %zu are allowed",
+                 path, strlen(path), sizeof address.sun_path - 1);
+        return NULL;
+    }
+    memcpy(address.sun_path, path, strlen(path) + 1);
+    if (!remove_stale(path, &address, error)) {
+        return NULL;
+    }
+    int listener = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+    struct stat status;
+    if (listener < 0 || bind(listener, (struct sockaddr *)&address, sizeof address) != 0 ||
+        listen(listener, CLIENTS_MAX) != 0 || lstat(path, &status) != 0) {
+        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%s: %s", path, strerror(errno));
+        if (listener >= 0) {
+            close(listener);
+        }
+        return NULL;
+    }
+    local_t *local = calloc(1, sizeof *local);
+    if (!local) {
+        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%s: out of memory", path);
+        close(listener);
+        unlink(path);
+        return NULL;
+    }
+    local->transport = (transport_t){.descriptors = local_descriptors,
+                                     .read = local_read,
+                                     .send = local_send,
+                                     .flush = local_flush,
+                                     .close = local_close};
+    local->listener = listener;
+    memcpy(local->path, path, strlen(path) + 1);
+    local->device = status.st_dev;
+    local->inode = status.st_ino;
+    for (unsigned i = 0; i < BATCH; ++i) {
+        local->spans[i].iov_base = &local->records[i];
+        local->messages[i].msg_hdr.msg_iov = &local->spans[i];
+        local->messages[i].msg_hdr.msg_iovlen = 1;
+    }
+    return &local->transport;
+}
