@@ -1,14 +1,11 @@
-/* Exponential and cosine are computed here and not by libm, whose results differ in the last bit between processors
- * (it picks a variant with fused multiply-add where there is one): equal inputs must give equal bits anywhere. */
 #include "plant/magnetics.h"
+#include "plant/magnetics_kernel.h"
 
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
 
 #define PI 3.14159265358979323846
-/* Adding and subtracting it rounds to the nearest integer, for magnitudes below 2^51. */
-#define ROUNDING_SHIFT 0x1.8p52
 
 /* 2^(j/64) */
 static const double exponential_table[64] = {
@@ -32,15 +29,14 @@ static const double exponential_table[64] = {
     // clang-format on
 };
 
-/* e^x for -700 <= x <= 700, relative error below 3e-16; 0 below that range. x = (64 n + j) ln 2 / 64 + r, abs(r) <=
- * ln 2 / 128. */
-static double exponential(double x) {
+/* x = (64 n + j) ln 2 / 64 + r, abs(r) <= ln 2 / 128. */
+double magnetics_exponential(double x) {
     const double ln2_64_high = 0x1.62e42fef00000p-7, ln2_64_low = 0x1.473de6af278edp-40;
     if (x < -700.0) {
         return 0.0;
     }
-    const double shifted = x * 0x1.71547652b82fep+6 + ROUNDING_SHIFT;
-    const double whole = shifted - ROUNDING_SHIFT;
+    const double shifted = x * 0x1.71547652b82fep+6 + MAGNETICS_ROUNDING_SHIFT;
+    const double whole = shifted - MAGNETICS_ROUNDING_SHIFT;
     const int64_t steps = (int64_t)whole;
     const double r = (x - whole * ln2_64_high) - whole * ln2_64_low;
     const double r2 = r * r;
@@ -52,24 +48,6 @@ static double exponential(double x) {
     bits += (uint64_t)(steps >> 6) << 52;
     memcpy(&result, &bits, sizeof result);
     return result;
-}
-
-/* Sine and cosine for abs(x) <= pi, absolute error below 1e-15: series of x / 2 to orders 23 and 22, then the double
- * angle. */
-static void sine_cosine(double x, double *sine, double *cosine) {
-    const double h = 0.5 * x, z = h * h, z2 = z * z, z4 = z2 * z2;
-    const double s01 = 1.0 - z * (1.0 / 6.0), s23 = 1.0 / 120.0 - z * (1.0 / 5040.0);
-    const double s45 = 1.0 / 362880.0 - z * (1.0 / 39916800.0), s67 = 1.0 / 6227020800.0 - z * (1.0 / 1307674368000.0);
-    const double s89 = 1.0 / 355687428096000.0 - z * (1.0 / 121645100408832000.0);
-    const double sAB = 1.0 / 51090942171709440000.0 - z * (1.0 / 25852016738884976640000.0);
-    const double half_sine = h * ((s01 + z2 * s23) + z4 * ((s45 + z2 * s67) + z4 * (s89 + z2 * sAB)));
-    const double c01 = 1.0 - z * 0.5, c23 = 1.0 / 24.0 - z * (1.0 / 720.0);
-    const double c45 = 1.0 / 40320.0 - z * (1.0 / 3628800.0), c67 = 1.0 / 479001600.0 - z * (1.0 / 87178291200.0);
-    const double c89 = 1.0 / 20922789888000.0 - z * (1.0 / 6402373705728000.0);
-    const double cAB = 1.0 / 2432902008176640000.0 - z * (1.0 / 1124000727777607680000.0);
-    const double half_cosine = (c01 + z2 * c23) + z4 * ((c45 + z2 * c67) + z4 * (c89 + z2 * cAB));
-    *sine = 2.0 * half_sine * half_cosine;
-    *cosine = 1.0 - 2.0 * half_sine * half_sine;
 }
 
 void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, unsigned rotor_poles) {
@@ -87,6 +65,11 @@ void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, u
         model->saturation_1_A = (magnetics->aligned_inductance_H - saturated_H) / model->saturating_Wb;
         model->saturation_A = 1.0 / model->saturation_1_A;
         model->initial_slope_H = model->saturating_Wb * model->saturation_1_A;
+        model->decay_step_A = exp2(floor(log2(model->saturation_A / 64.0)));
+        model->decay_steps_per_A = 1.0 / model->decay_step_A;
+        for (unsigned step = 0; step < MAGNETICS_DECAY_STEPS; step++) {
+            model->decay[step] = magnetics_exponential(-model->saturation_1_A * model->decay_step_A * step);
+        }
     }
     if (magnetics->form == MAGNETICS_LINEAR_TRAPEZOID) {
         model->flat_rad = magnetics->flat_deg * PI / 180.0;
@@ -96,77 +79,16 @@ void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, u
     }
 }
 
-/* f of half a pitch: from 1 at 0 to 0 at half a pitch, and its derivative. */
-static void trapezoid(const magnetics_model_t *model, double angle_rad, double *f, double *gradient_1_rad) {
-    const double from_aligned = angle_rad - model->flat_rad;
-    const double to_unaligned = 0.5 * model->pitch_rad - model->flat_rad - angle_rad;
-    if (from_aligned <= 0.0) {
-        *f = 1.0;
-        *gradient_1_rad = 0.0;
-    } else if (to_unaligned <= 0.0) {
-        *f = 0.0;
-        *gradient_1_rad = 0.0;
-    } else if (from_aligned < model->blend_rad) {
-        *gradient_1_rad = -model->curvature_1_rad2 * from_aligned;
-        *f = 1.0 + 0.5 * *gradient_1_rad * from_aligned;
-    } else if (to_unaligned < model->blend_rad) {
-        *gradient_1_rad = -model->curvature_1_rad2 * to_unaligned;
-        *f = -0.5 * *gradient_1_rad * to_unaligned;
-    } else {
-        *gradient_1_rad = -model->slope_1_rad;
-        *f = 1.0 - model->slope_1_rad * (from_aligned - 0.5 * model->blend_rad);
-    }
-}
-
-/* f and f' (per mechanical radian) at any phase angle. */
-static void shape(const magnetics_model_t *model, double phase_angle_rad, double *f, double *gradient_1_rad) {
-    const double pitches = (phase_angle_rad * model->pitches_per_rad + ROUNDING_SHIFT) - ROUNDING_SHIFT;
-    const double wrapped_rad = phase_angle_rad - pitches * model->pitch_rad; /* -half a pitch .. half a pitch */
-    if (model->form == MAGNETICS_LINEAR_COSINE) {
-        double sine, cosine;
-        sine_cosine(model->electrical_per_mechanical * wrapped_rad, &sine, &cosine);
-        *f = 0.5 + 0.5 * cosine;
-        *gradient_1_rad = -0.5 * model->electrical_per_mechanical * sine;
-        return;
-    }
-    const double folded_rad = fabs(wrapped_rad);
-    double gradient;
-    if (model->form == MAGNETICS_SATURATING) {
-        const double x = folded_rad * (2.0 * model->pitches_per_rad); /* 0 aligned, 1 unaligned */
-        *f = 1.0 + x * x * (2.0 * x - 3.0);
-        gradient = 12.0 * model->pitches_per_rad * (x * (x - 1.0));
-    } else {
-        trapezoid(model, folded_rad, f, &gradient);
-    }
-    *gradient_1_rad = copysign(gradient, -wrapped_rad);
-}
-
 void magnetics_evaluate(const magnetics_model_t *model, double phase_angle_rad, double current_A,
                         magnetics_point_t *point) {
-    double f, gradient_1_rad;
-    shape(model, phase_angle_rad, &f, &gradient_1_rad);
-    /* excess = g(i) - Lu i, with slope and integral */
-    double excess_Wb = model->linear_excess_H * current_A;
-    double excess_H = model->linear_excess_H;
-    double excess_J = 0.5 * excess_Wb * current_A;
-    if (model->form == MAGNETICS_SATURATING) {
-        const double decay = exponential(-model->saturation_1_A * current_A);
-        const double knee_Wb = model->saturating_Wb * (1.0 - decay);
-        excess_Wb += knee_Wb;
-        excess_H += model->initial_slope_H * decay;
-        excess_J += model->saturating_Wb * current_A - knee_Wb * model->saturation_A;
-    }
-    point->flux_linkage_Wb = model->unaligned_inductance_H * current_A + f * excess_Wb;
-    point->incremental_inductance_H = model->unaligned_inductance_H + f * excess_H;
-    point->flux_gradient_Wb_rad = gradient_1_rad * excess_Wb;
-    point->torque_Nm = gradient_1_rad * excess_J;
+    magnetics_kernel(model, phase_angle_rad, current_A, point);
 }
 
 /* W(i), the integral of g(i) - Lu i. */
 static double excess_energy_J(const magnetics_model_t *model, double current_A) {
     double energy_J = 0.5 * model->linear_excess_H * current_A * current_A;
     if (model->form == MAGNETICS_SATURATING) {
-        const double decay = exponential(-model->saturation_1_A * current_A);
+        const double decay = magnetics_kernel_decay(model, current_A);
         energy_J += model->saturating_Wb * (current_A - (1.0 - decay) * model->saturation_A);
     }
     return energy_J;
@@ -174,7 +96,7 @@ static double excess_energy_J(const magnetics_model_t *model, double current_A) 
 
 double magnetics_coenergy_J(const magnetics_model_t *model, double phase_angle_rad, double current_A) {
     double f, gradient_1_rad;
-    shape(model, phase_angle_rad, &f, &gradient_1_rad);
+    magnetics_kernel_shape(model, phase_angle_rad, &f, &gradient_1_rad);
     return 0.5 * model->unaligned_inductance_H * current_A * current_A + f * excess_energy_J(model, current_A);
 }
 

@@ -15,6 +15,9 @@
 #ifndef PLANT_MAGNETICS_H
 #define PLANT_MAGNETICS_H
 
+/* Entries of the table of e^(-b i): up to 8 / b and more, slower but as exact beyond. */
+#define MAGNETICS_DECAY_STEPS 512
+
 typedef enum { MAGNETICS_LINEAR_COSINE, MAGNETICS_LINEAR_TRAPEZOID, MAGNETICS_SATURATING } magnetics_form_t;
 
 /* What a machine file says. Fields that a form does not use are 0. */
@@ -33,11 +36,13 @@ typedef struct {
 typedef struct {
     magnetics_form_t form;
     double unaligned_inductance_H;
-    double linear_excess_H; /* (g(i) - Lu i) / i without the exponential part: La - Lu or Ls - Lu */
-    double saturating_Wb;   /* A; this and the next three only in the saturating form */
-    double saturation_1_A;  /* b */
-    double saturation_A;    /* 1 / b */
-    double initial_slope_H; /* A b */
+    double linear_excess_H;                 /* (g(i) - Lu i) / i without the exponential part: La - Lu or Ls - Lu */
+    double saturating_Wb;                   /* A; from here to the table only in the saturating form */
+    double saturation_1_A;                  /* b */
+    double saturation_A;                    /* 1 / b */
+    double initial_slope_H;                 /* A b */
+    double decay_step_A, decay_steps_per_A; /* a power of two, at most 1 / (64 b) */
+    double decay[MAGNETICS_DECAY_STEPS];    /* e^(-b i) at multiples of the step */
     double pitch_rad, pitches_per_rad;
     double electrical_per_mechanical; /* Nr */
     double flat_rad, blend_rad, slope_1_rad, curvature_1_rad2;

@@ -1,4 +1,5 @@
 #include "plant/plant.h"
+#include "plant/magnetics_kernel.h"
 
 #include <math.h>
 #include <string.h>
@@ -157,14 +158,15 @@ static conducting_t find_conducting(plant_t *plant) {
     return conducting;
 }
 
-static void differentiate(const plant_t *plant, const conducting_t *conducting, const state_t *state,
-                          derivative_t *derivative) {
+/* `count` is conducting->count, apart so that the compiler can unroll for a known one. */
+MAGNETICS_INLINE void differentiate(const plant_t *plant, const conducting_t *conducting, unsigned count,
+                                    const state_t *state, derivative_t *derivative) {
     const machine_t *machine = plant->machine;
     derivative->torque_Nm = 0.0;
-    for (unsigned index = 0; index < conducting->count; index++) {
+    for (unsigned index = 0; index < count; index++) {
         magnetics_point_t point;
-        magnetics_evaluate(&plant->magnetics, state->angle_rad - conducting->angle_offset_rad[index],
-                           state->current_A[index], &point);
+        magnetics_kernel(&plant->magnetics, state->angle_rad - conducting->angle_offset_rad[index],
+                         state->current_A[index], &point);
         derivative->current_A_s[index] =
             (conducting->voltage_V[index] - machine->resistance_ohm * state->current_A[index] -
              state->speed_rad_s * point.flux_gradient_Wb_rad) /
@@ -176,26 +178,27 @@ static void differentiate(const plant_t *plant, const conducting_t *conducting, 
         machine->inertia_kg_m2;
 }
 
-static void move(const conducting_t *conducting, const state_t *from, const derivative_t *derivative,
-                 double speed_rad_s, double step_s, state_t *to) {
+MAGNETICS_INLINE void move(unsigned count, const state_t *from, const derivative_t *derivative, double speed_rad_s,
+                           double step_s, state_t *to) {
     to->angle_rad = from->angle_rad + step_s * speed_rad_s;
     to->speed_rad_s = from->speed_rad_s + step_s * derivative->acceleration_rad_s2;
-    for (unsigned index = 0; index < conducting->count; index++) {
+    for (unsigned index = 0; index < count; index++) {
         to->current_A[index] = from->current_A[index] + step_s * derivative->current_A_s[index];
     }
 }
 
 /* One classical Runge-Kutta step from `start`, whose derivative `first` is. */
-static void runge_kutta_step(const plant_t *plant, const conducting_t *conducting, const state_t *start,
-                             const derivative_t *first, double step_s, state_t *end, integrals_t *integrals) {
+MAGNETICS_INLINE void runge_kutta_step_of(const plant_t *plant, const conducting_t *conducting, unsigned count,
+                                          const state_t *start, const derivative_t *first, double step_s, state_t *end,
+                                          integrals_t *integrals) {
     state_t second_state, third_state, fourth_state;
     derivative_t second, third, fourth;
-    move(conducting, start, first, start->speed_rad_s, 0.5 * step_s, &second_state);
-    differentiate(plant, conducting, &second_state, &second);
-    move(conducting, start, &second, second_state.speed_rad_s, 0.5 * step_s, &third_state);
-    differentiate(plant, conducting, &third_state, &third);
-    move(conducting, start, &third, third_state.speed_rad_s, step_s, &fourth_state);
-    differentiate(plant, conducting, &fourth_state, &fourth);
+    move(count, start, first, start->speed_rad_s, 0.5 * step_s, &second_state);
+    differentiate(plant, conducting, count, &second_state, &second);
+    move(count, start, &second, second_state.speed_rad_s, 0.5 * step_s, &third_state);
+    differentiate(plant, conducting, count, &third_state, &third);
+    move(count, start, &third, third_state.speed_rad_s, step_s, &fourth_state);
+    differentiate(plant, conducting, count, &fourth_state, &fourth);
 
     const double sixth_s = step_s / 6.0;
     integrals->angle_rad = sixth_s * (start->speed_rad_s + 2.0 * (second_state.speed_rad_s + third_state.speed_rad_s) +
@@ -209,7 +212,7 @@ static void runge_kutta_step(const plant_t *plant, const conducting_t *conductin
     end->speed_rad_s = start->speed_rad_s + sixth_s * (first->acceleration_rad_s2 +
                                                        2.0 * (second.acceleration_rad_s2 + third.acceleration_rad_s2) +
                                                        fourth.acceleration_rad_s2);
-    for (unsigned index = 0; index < conducting->count; index++) {
+    for (unsigned index = 0; index < count; index++) {
         const double first_A = start->current_A[index], second_A = second_state.current_A[index];
         const double third_A = third_state.current_A[index], fourth_A = fourth_state.current_A[index];
         integrals->charge_As[index] = sixth_s * (first_A + 2.0 * (second_A + third_A) + fourth_A);
@@ -218,6 +221,17 @@ static void runge_kutta_step(const plant_t *plant, const conducting_t *conductin
         end->current_A[index] = first_A + sixth_s * (first->current_A_s[index] +
                                                      2.0 * (second.current_A_s[index] + third.current_A_s[index]) +
                                                      fourth.current_A_s[index]);
+    }
+}
+
+static void runge_kutta_step(const plant_t *plant, const conducting_t *conducting, const state_t *start,
+                             const derivative_t *first, double step_s, state_t *end, integrals_t *integrals) {
+    if (conducting->count == 1) {
+        runge_kutta_step_of(plant, conducting, 1, start, first, step_s, end, integrals);
+    } else if (conducting->count == 2) {
+        runge_kutta_step_of(plant, conducting, 2, start, first, step_s, end, integrals);
+    } else {
+        runge_kutta_step_of(plant, conducting, conducting->count, start, first, step_s, end, integrals);
     }
 }
 
@@ -285,7 +299,7 @@ static void sample_step(plant_t *plant, const conducting_t *conducting, const st
         return;
     }
     derivative_t last;
-    differentiate(plant, conducting, end, &last);
+    differentiate(plant, conducting, conducting->count, end, &last);
     const uint64_t time_ns = plant->time_ns;
     const double angle_rad = plant->rotor_angle_rad, speed_rad_s = plant->speed_rad_s;
     double current_A[HAL_PHASES_MAX];
@@ -398,7 +412,7 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
         for (unsigned index = 0; index < conducting.count; index++) {
             start.current_A[index] = plant->current_A[conducting.phase[index]];
         }
-        differentiate(plant, &conducting, &start, &first);
+        differentiate(plant, &conducting, conducting.count, &start, &first);
         double step_s = step_length_s(plant, &conducting, &first, length_s - at_s);
         runge_kutta_step(plant, &conducting, &start, &first, step_s, &end, &integrals);
         if (least_current_A(&conducting, &end) < 0.0) {
