@@ -14,7 +14,7 @@ function(salient_generate_codec target dbc)
     endif()
     add_custom_command(
         OUTPUT ${out}/${name}_codec.c ${out}/${name}_codec.h
-        COMMAND ${SALIENT_PYTHON} -m salient.generate_codec ${flags} ${dbc} ${out}
+        COMMAND ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m salient.generate_codec ${flags} ${dbc} ${out}
         DEPENDS ${dbc} ${SALIENT_GENERATOR_SOURCES}/generate_codec.py
         COMMENT "CAN codec from ${name}.dbc"
         VERBATIM)
@@ -27,7 +27,7 @@ function(salient_generate_machine name file)
     set(out ${CMAKE_CURRENT_BINARY_DIR}/machine_${name})
     add_custom_command(
         OUTPUT ${out}/machine_tables.c ${out}/machine_plant.c
-        COMMAND ${SALIENT_PYTHON} -m salient.generate_machine ${file} ${out}
+        COMMAND ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m salient.generate_machine ${file} ${out}
         DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate_machine.py ${SALIENT_GENERATOR_SOURCES}/machine.py
         COMMENT "machine ${name}"
         VERBATIM)

@@ -34,7 +34,8 @@ typedef struct {
     int32_t output_q15[BP_OUTPUTS]; /* 0..32768 */
 } bp_network_t;
 
-/* Initial weights: uniform in +-0.5 from a linear congruential generator, so that a seed gives the same on any machine. */
+/* Initial weights: uniform in +-0.5 from a linear congruential generator, so that a seed gives the same on any machine.
+ */
 void bp_network_reset(bp_network_t *network, uint32_t seed);
 
 /* Outputs for inputs in Q1.15, |input| <= 32767; the layers' values stay in the network for learning. */

@@ -36,8 +36,8 @@ int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_
 
     int64_t duty_q30 = pid->duty_q30;
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        pid->gain_q15[l] = from_network ? fixed_multiply(pid->network.output_q15[l], scale_q15[l], 15)
-                                        : scale_q15[l] / 2;
+        pid->gain_q15[l] =
+            from_network ? fixed_multiply(pid->network.output_q15[l], scale_q15[l], 15) : scale_q15[l] / 2;
         duty_q30 += (int64_t)pid->gain_q15[l] * term_q15[l]; /* 2^17 * 2^15 */
     }
     const bool saturated = duty_q30 > DUTY_ONE_Q30 || duty_q30 < -DUTY_ONE_Q30;

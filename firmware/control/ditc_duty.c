@@ -37,8 +37,8 @@ void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc,
         return;
     }
 
-    bool handing_over = ditc->regulated != active && ditc->regulated == commutation->outgoing &&
-                        ditc->regulated != COMMUTATION_NONE;
+    bool handing_over =
+        ditc->regulated != active && ditc->regulated == commutation->outgoing && ditc->regulated != COMMUTATION_NONE;
     if (handing_over) {
         duty_q15[active] = incoming_duty_q15(parameters, tables, sample, sample->current_q9[active]);
         if (sample->torque_q24[ditc->regulated] < SPENT_TORQUE_Q24) {

@@ -19,10 +19,10 @@
 
 typedef struct {
     bp_pid_parameters_t pid;
-    uint32_t hand_over_angle;    /* 2^-32 pitch, 2^31..2^32-1 */
-    int32_t incoming_gain_q20;   /* duty per A of the incoming phase's current error, Q11.20 */
-    int32_t band_outer_q24;      /* N m, Q7.24 */
-    int32_t current_limit_q9;    /* A, Q7.9 */
+    uint32_t hand_over_angle;  /* 2^-32 pitch, 2^31..2^32-1 */
+    int32_t incoming_gain_q20; /* duty per A of the incoming phase's current error, Q11.20 */
+    int32_t band_outer_q24;    /* N m, Q7.24 */
+    int32_t current_limit_q9;  /* A, Q7.9 */
 } ditc_duty_parameters_t;
 
 typedef struct {

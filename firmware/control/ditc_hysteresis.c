@@ -34,8 +34,7 @@ static int8_t outgoing_state(const ditc_hysteresis_parameters_t *parameters, int
 
 void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_hysteresis_t *ditc, unsigned phases,
                           const commutation_t *commutation, int32_t torque_error_q24, const int32_t *current_q9) {
-    const int outgoing_works =
-        commutation->outgoing != COMMUTATION_NONE && current_q9[commutation->outgoing] > 0;
+    const int outgoing_works = commutation->outgoing != COMMUTATION_NONE && current_q9[commutation->outgoing] > 0;
     for (unsigned phase = 0; phase < phases; phase++) {
         int8_t state = -1;
         if (phase == commutation->active) {

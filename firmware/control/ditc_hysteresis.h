@@ -3,11 +3,10 @@
  *   +1 both switches on (+Vdc), 0 one on (freewheeling), -1 both off (-Vdc)      (1) of the paper
  *
  * Rules, error = reference - torque of all phases:
- *   active phase     +1 above +inner, 0 below -inner, -1 below -outer, unchanged between; with an outgoing phase at work
- *                    it is the incoming one and never goes below 0 before the outgoing phase has been taken off
- *   outgoing phase   +1 above +outer, -1 below -inner, 0 when the error returns through zero, unchanged between
- *   other phases     -1
- * so missing torque goes to the incoming phase first and surplus comes off the outgoing one first. A phase above the
+ *   active phase     +1 above +inner, 0 below -inner, -1 below -outer, unchanged between; with an outgoing phase at
+ * work it is the incoming one and never goes below 0 before the outgoing phase has been taken off outgoing phase   +1
+ * above +outer, -1 below -inner, 0 when the error returns through zero, unchanged between other phases     -1 so
+ * missing torque goes to the incoming phase first and surplus comes off the outgoing one first. A phase above the
  * current limit is not switched on.
  */
 #ifndef CONTROL_DITC_HYSTERESIS_H

@@ -3,7 +3,8 @@
 #include "fixed/exponential.h"
 #include "fixed/fixed.h"
 
-/* Keeps a wild load estimate (a rotor that was turned by hand, an encoder that jumped) from taking seconds to return. */
+/* Keeps a wild load estimate (a rotor that was turned by hand, an encoder that jumped) from taking seconds to return.
+ */
 #define LOAD_TORQUE_LIMIT_Q24 (60 * (1 << 24))
 
 #define INNOVATION_LIMIT (1 << 22)
@@ -31,8 +32,8 @@ load_observer_parameters_t load_observer_configure(uint32_t bandwidth_rad_s, uin
     parameters.speed_gain_q24 = fixed_saturate(((l2_q46 >> 24) * (TWO_PI_Q28 >> 4)) >> 32);
 
     /* J l3 * 2 pi * 2^8, which is 2 pi 2^-32 rad to 2^-24 N m in Q16; J l3 = (J rate) (p^3 rate). */
-    const int64_t p3_rate_q30 = (p3_q46 * rate) >> 16;                                   /* 40 bits */
-    const int64_t inertia_l3_q36 = (inertia_rate_q30 >> 16) * (p3_rate_q30 >> 8);        /* 63 bits */
+    const int64_t p3_rate_q30 = (p3_q46 * rate) >> 16;                            /* 40 bits */
+    const int64_t inertia_l3_q36 = (inertia_rate_q30 >> 16) * (p3_rate_q30 >> 8); /* 63 bits */
     parameters.torque_gain_q16 = ((inertia_l3_q36 >> 20) * (TWO_PI_Q28 >> 16)) >> 20;
 
     /* Ts / J * 2^-2 * 2^32 = 2^30 / (J rate). */
@@ -56,13 +57,11 @@ int32_t load_observer_step(const load_observer_parameters_t *parameters, load_ob
 
     /* Correct. */
     observer->angle_q64 += (uint64_t)(error * parameters->angle_gain_q30) << 2; /* Q30 to Q32 */
-    int32_t speed_q22 =
-        fixed_saturate(observer->speed_q22 + fixed_shift(error * parameters->speed_gain_q24, 24));
+    int32_t speed_q22 = fixed_saturate(observer->speed_q22 + fixed_shift(error * parameters->speed_gain_q24, 24));
     const int64_t load_q24 = observer->load_torque_q24 - fixed_shift(error * parameters->torque_gain_q16, 16);
-    observer->load_torque_q24 =
-        (int32_t)(load_q24 > LOAD_TORQUE_LIMIT_Q24    ? LOAD_TORQUE_LIMIT_Q24
-                  : load_q24 < -LOAD_TORQUE_LIMIT_Q24 ? -LOAD_TORQUE_LIMIT_Q24
-                                                      : load_q24);
+    observer->load_torque_q24 = (int32_t)(load_q24 > LOAD_TORQUE_LIMIT_Q24    ? LOAD_TORQUE_LIMIT_Q24
+                                          : load_q24 < -LOAD_TORQUE_LIMIT_Q24 ? -LOAD_TORQUE_LIMIT_Q24
+                                                                              : load_q24);
 
     /* Predict: constant acceleration over the period, so the angle moves at the mean of old and new speed. */
     const int32_t friction_q24 = fixed_multiply(speed_q22, parameters->friction_q30, 28);

@@ -36,8 +36,8 @@ load_observer_parameters_t load_observer_configure(uint32_t bandwidth_rad_s, uin
 /* Starts at an angle (2^-32 turn), at rest, without load. */
 void load_observer_reset(load_observer_t *observer, uint32_t angle);
 
-/* One sample: corrects with the measured angle (2^-32 turn), then predicts one period on with the machine's torque (N m,
- * Q7.24). Afterwards the state is the estimate for the coming sample. Returns the innovation in 2^-32 turn; what
+/* One sample: corrects with the measured angle (2^-32 turn), then predicts one period on with the machine's torque (N
+ * m, Q7.24). Afterwards the state is the estimate for the coming sample. Returns the innovation in 2^-32 turn; what
  * corrects is limited to +-2^22 (a thousandth of a turn), which keeps every product within 64 bits. */
 int32_t load_observer_step(const load_observer_parameters_t *parameters, load_observer_t *observer, uint32_t angle,
                            int32_t torque_q24);

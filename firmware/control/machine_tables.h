@@ -11,10 +11,11 @@
 #define MACHINE_TORQUE_CURRENTS 81
 
 typedef struct {
-    uint8_t phases;          /* 3 or 4 */
-    uint8_t rotor_poles;     /* electrical turns a mechanical turn */
-    int32_t inertia_q30;     /* kg m^2, Q1.30 */
-    int32_t friction_q30;    /* N m s, Q1.30 */
+    uint8_t phases;           /* 3 or 4 */
+    uint8_t rotor_poles;      /* electrical turns a mechanical turn */
+    int32_t inertia_q30;      /* kg m^2, Q1.30 */
+    int32_t friction_q30;     /* N m s, Q1.30 */
+    int32_t current_rise_A_s; /* supply voltage over unaligned inductance: A/s */
     int16_t torque_q8[MACHINE_TORQUE_ANGLES][MACHINE_TORQUE_CURRENTS]; /* N m, Q7.8, saturated at 127.996 */
 } machine_tables_t;
 

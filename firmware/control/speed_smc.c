@@ -17,7 +17,8 @@ int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, 
     /* near < 2^32, decay <= 2^31: below 2^63. */
     const int64_t denominator_q22 = far_q22 + ((near_q22 * decay_q31) >> 31);
 
-    /* gain < 2^31, |x| < 2^31: below 2^62. The denominator is zero only for x = 0 with no exponent: never, near >= 1. */
+    /* gain < 2^31, |x| < 2^31: below 2^62. The denominator is zero only for x = 0 with no exponent: never, near >= 1.
+     */
     const int64_t torque_q24 = (parameters->gain_q24 * x) / (denominator_q22 > 0 ? denominator_q22 : 1);
     const int32_t magnitude_q24 = fixed_saturate(torque_q24);
     return x_q22 < 0 ? -magnitude_q24 : magnitude_q24;

@@ -14,8 +14,8 @@
  * exact to 2^-17 N m; what the map itself leaves out is stated by its test. */
 int32_t torque_map_torque_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9);
 
-/* The smallest current in A, Q7.9, that gives a torque (N m, Q7.24) at an angle of the second half pitch (2^31..2^32-1);
- * 0 for no torque, 80 A where the map does not reach it. Within 2^-9 A of the map's inverse. */
+/* The smallest current in A, Q7.9, that gives a torque (N m, Q7.24) at an angle of the second half pitch
+ * (2^31..2^32-1); 0 for no torque, 80 A where the map does not reach it. Within 2^-9 A of the map's inverse. */
 int32_t torque_map_current_q9(const machine_tables_t *tables, uint32_t phase_angle, int32_t torque_q24);
 
 #endif

@@ -22,6 +22,8 @@ static const parameter_row_t rows[PARAMETER_COUNT] = {
     [PARAMETER_TURN_ON_ANGLE_DEG] = {"turn_on_angle_deg", "deg", 7, Q(90, 1, 7), Q(360, 1, 7), Q(180, 1, 7)},
     [PARAMETER_TURN_OFF_ANGLE_DEG] = {"turn_off_angle_deg", "deg", 7, Q(180, 1, 7), Q(360, 1, 7), Q(300, 1, 7)},
     [PARAMETER_OUTGOING_OFF_ANGLE_DEG] = {"outgoing_off_angle_deg", "deg", 7, Q(180, 1, 7), Q(360, 1, 7), Q(348, 1, 7)},
+    /* Where the incoming phase is to carry the whole reference (paper controller). */
+    [PARAMETER_HAND_OVER_ANGLE_DEG] = {"hand_over_angle_deg", "deg", 7, Q(180, 1, 7), Q(300, 1, 7), Q(210, 1, 7)},
     [PARAMETER_TORQUE_BAND_INNER_NM] = {"torque_band_inner_Nm", "N m", 24, 0, Q(20, 1, 24), Q(1, 10, 24)},
     [PARAMETER_TORQUE_BAND_OUTER_NM] = {"torque_band_outer_Nm", "N m", 24, 0, Q(20, 1, 24), Q(3, 10, 24)},
     [PARAMETER_SPEED_KP] = {"speed_kp", "N m s", 16, 0, Q(1000, 1, 16), Q(2, 1, 16)},
@@ -29,17 +31,20 @@ static const parameter_row_t rows[PARAMETER_COUNT] = {
     [PARAMETER_SMC_K] = {"smc_k", "1/s", 16, 0, Q(10000, 1, 16), Q(1000, 1, 16)},
     [PARAMETER_SMC_EPSILON] = {"smc_epsilon", "", 16, Q(1, 100, 16), Q(1, 1, 16), Q(1, 2, 16)},
     [PARAMETER_SMC_DELTA] = {"smc_delta", "s", 16, 0, Q(10, 1, 16), Q(1, 1, 16)},
-    [PARAMETER_OBSERVER_BANDWIDTH_RAD_S] = {"observer_bandwidth_rad_s", "rad/s", 0, 10, 8000, 300},
+    [PARAMETER_OBSERVER_BANDWIDTH_RAD_S] = {"observer_bandwidth_rad_s", "rad/s", 0, 100, 8000, 1000},
     /* 0 off, 1 fixed gains, 2 network without learning, 3 network that learns */
     [PARAMETER_BP_MODE] = {"bp_mode", "", 0, 0, 3, 3},
+    [PARAMETER_BP_SEED] = {"bp_seed", "", 0, 0, INT32_MAX, 1},
     [PARAMETER_BP_ETA] = {"bp_eta", "", 28, 0, Q(1, 1, 28), Q(5, 100, 28)},
     [PARAMETER_BP_ALPHA] = {"bp_alpha", "", 28, 0, Q(9, 10, 28), Q(5, 100, 28)},
     [PARAMETER_BP_ERROR_SCALE_NM] = {"bp_error_scale_Nm", "N m", 24, Q(1, 10, 24), Q(40, 1, 24), Q(2, 1, 24)},
     [PARAMETER_BP_KP_MAX] = {"bp_kp_max", "1/(N m)", 15, 0, Q(2, 1, 15) - 1, Q(1, 2, 15)},
     [PARAMETER_BP_KI_MAX] = {"bp_ki_max", "1/(N m)", 15, 0, Q(2, 1, 15) - 1, Q(1, 20, 15)},
     [PARAMETER_BP_KD_MAX] = {"bp_kd_max", "1/(N m)", 15, 0, Q(2, 1, 15) - 1, Q(1, 5, 15)},
+    /* Torque missing beyond it switches the incoming phase fully on. */
+    [PARAMETER_BP_ASSIST_BAND_NM] = {"bp_assist_band_Nm", "N m", 24, 0, Q(20, 1, 24), Q(1, 1, 24)},
     /* The plant that the laws assume; the machine's tables give the defaults. */
-    [PARAMETER_INERTIA_KG_M2] = {"inertia_kg_m2", "kg m^2", 30, Q(1, 100000, 30), Q(19, 10, 30), Q(2, 100, 30)},
+    [PARAMETER_INERTIA_KG_M2] = {"inertia_kg_m2", "kg m^2", 30, Q(1, 10000, 30), Q(19, 10, 30), Q(2, 100, 30)},
     [PARAMETER_FRICTION_NM_S] = {"friction_Nm_s", "N m s", 30, 0, Q(19, 10, 30), Q(2, 100, 30)},
 };
 

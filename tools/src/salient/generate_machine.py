@@ -45,6 +45,7 @@ def tables_source(machine: Machine) -> str:
             f"    .rotor_poles = {machine.rotor_poles},",
             f"    .inertia_q30 = {quantise(machine.inertia_kg_m2, 30, 32)},",
             f"    .friction_q30 = {quantise(machine.friction_Nm_s, 30, 32)},",
+            f"    .current_rise_A_s = {quantise(machine.current_rise_A_s, 0, 32)},",
             "    .torque_q8 = {",
             *rows,
             "    },",

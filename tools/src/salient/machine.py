@@ -20,7 +20,7 @@ FORMS = ("linear_cosine", "linear_trapezoid", "saturating")
 # can carry (inertia and friction are Q1.30 there).
 _RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "winding": {"resistance_ohm": (1e-4, 100.0)},
-    "mechanics": {"inertia_kg_m2": (1e-5, 1.9), "friction_Nm_s": (0.0, 1.9)},
+    "mechanics": {"inertia_kg_m2": (1e-4, 1.9), "friction_Nm_s": (0.0, 1.9)},
     "converter": {"supply_voltage_V": (10.0, 500.0)},
 }
 _INDUCTANCES = {"unaligned_inductance_H": (1e-5, 10.0), "aligned_inductance_H": (1e-5, 10.0)}
@@ -59,6 +59,11 @@ class Machine:
     def pitch_rad(self) -> float:
         """Rotor pole pitch."""
         return 2.0 * math.pi / self.rotor_poles
+
+    @property
+    def current_rise_A_s(self) -> float:
+        """Current slope at the supply voltage with the rotor unaligned and at rest, A/s."""
+        return self.supply_voltage_V / self.magnetics["unaligned_inductance_H"]
 
     def position_factor(self, angle_rad):
         """f and df/dtheta (1/rad) at a phase angle: f is 1 aligned, 0 unaligned. NumPy arrays welcome."""

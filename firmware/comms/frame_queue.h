@@ -1,0 +1,41 @@
+/* A ring of CAN frames that wait for a transmit mailbox: first in, first out. */
+#ifndef COMMS_FRAME_QUEUE_H
+#define COMMS_FRAME_QUEUE_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#include "hal_can.h"
+
+#define FRAME_QUEUE_CAPACITY 16 /* a power of two */
+
+/* All zero is an empty queue. */
+typedef struct {
+    hal_can_frame_t frames[FRAME_QUEUE_CAPACITY];
+    uint8_t first; /* index of the oldest frame */
+    uint8_t count;
+} frame_queue_t;
+
+/* How many more frames it holds. */
+static inline unsigned frame_queue_room(const frame_queue_t *queue) {
+    return FRAME_QUEUE_CAPACITY - (unsigned)queue->count;
+}
+
+/* Appends a frame; the caller has made sure of the room. */
+static inline void frame_queue_put(frame_queue_t *queue, const hal_can_frame_t *frame) {
+    queue->frames[(unsigned)(queue->first + queue->count) % FRAME_QUEUE_CAPACITY] = *frame;
+    queue->count++;
+}
+
+/* The oldest frame; NULL when it is empty. */
+static inline const hal_can_frame_t *frame_queue_head(const frame_queue_t *queue) {
+    return queue->count == 0 ? NULL : &queue->frames[queue->first];
+}
+
+/* Removes the oldest frame of a queue that is not empty. */
+static inline void frame_queue_drop_head(frame_queue_t *queue) {
+    queue->first = (uint8_t)((queue->first + 1u) % FRAME_QUEUE_CAPACITY);
+    queue->count--;
+}
+
+#endif

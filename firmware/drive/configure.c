@@ -1,0 +1,131 @@
+#include "drive/configure.h"
+
+#include "fixed/fixed.h"
+
+/* The BP-PID's gains are set for this rate; a period twice as long moves the torque twice as far for the same duty. */
+#define GAIN_RATE_HZ 40000
+
+bool configure_rate_allowed(uint32_t control_rate_hz) {
+    return control_rate_hz == 20000 || control_rate_hz == 40000 || control_rate_hz == 50000 ||
+           control_rate_hz == 100000;
+}
+
+/* rad/s in Q9.22 from whole r/min (or r/min/s), at most 4800: pi/30 in Q37, 2^38 below 4 ns a unit. */
+static int32_t speed_q22_from_rpm(int32_t rpm) {
+    const int64_t pi_30_q37 = 14392683692;
+    return fixed_saturate(fixed_shift(rpm * pi_30_q37, 15));
+}
+
+/* 2^-32 pitch from electrical degrees in Q7; 360 degrees is held just below the full pitch. */
+static uint32_t pitch_from_degrees(int32_t degrees_q7) {
+    const uint64_t angle = ((uint64_t)(uint32_t)degrees_q7 << 32) / (360u * 128u);
+    return angle > UINT32_MAX ? UINT32_MAX : (uint32_t)angle;
+}
+
+/* A change per period in Q22 from a change per second; INT32_MAX for 0, no ramp. */
+static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
+    if (rpm_s == 0) {
+        return INT32_MAX;
+    }
+    const int64_t pi_30_q37 = 14392683692;
+    const int64_t step_q22 = fixed_shift(rpm_s * pi_30_q37, 15) / (int64_t)control_rate_hz;
+    return fixed_clamp(fixed_saturate(step_q22), 1, INT32_MAX);
+}
+
+/* Duty per scaled error from duty per N m at GAIN_RATE_HZ, both Q15. */
+static int32_t pid_scale_q15(int32_t per_Nm_q15, int32_t error_scale_q24, uint32_t control_rate_hz) {
+    const int64_t scaled_q15 = fixed_shift((int64_t)per_Nm_q15 * error_scale_q24, 24);
+    return fixed_clamp(fixed_saturate(scaled_q15 * control_rate_hz / GAIN_RATE_HZ), 0, 4 << 15);
+}
+
+static protection_parameters_t protection_from(const int32_t *values, int32_t angle_step_q32, unsigned encoder_shift) {
+    const int32_t over_speed_q22 = speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM]);
+    const uint32_t count = 1u << encoder_shift;
+    /* A period at one and a half times the highest speed, and the rounding of two readings. */
+    const uint64_t step = ((uint64_t)over_speed_q22 * (uint64_t)angle_step_q32 >> 32) * 3 / 2;
+    return (protection_parameters_t){
+        .current_trip_q9 = values[PARAMETER_CURRENT_TRIP_A],
+        .bus_over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V],
+        .bus_under_voltage_q6 = values[PARAMETER_BUS_UNDER_VOLTAGE_V],
+        .over_speed_q22 = over_speed_q22,
+        .angle_step_max = (uint32_t)step + 2u * count,
+        /* A quarter of a degree, and four counts of a coarse encoder. */
+        .angle_unmoved_max = (uint32_t)(((uint64_t)1 << 32) / 1440u) + 4u * count,
+        .angle_step_q32 = angle_step_q32,
+        .command_timeout_us = (uint32_t)values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u,
+    };
+}
+
+static bp_pid_parameters_t bp_pid_from(const int32_t *values, uint32_t control_rate_hz) {
+    const int32_t scale_q24 = values[PARAMETER_BP_ERROR_SCALE_NM];
+    return (bp_pid_parameters_t){
+        .mode = (bp_pid_mode_t)values[PARAMETER_BP_MODE],
+        .seed = (uint32_t)values[PARAMETER_BP_SEED],
+        .error_scale_inverse_q24 = fixed_saturate(((int64_t)1 << 48) / scale_q24),
+        .kp_scale_q15 = pid_scale_q15(values[PARAMETER_BP_KP_MAX], scale_q24, control_rate_hz),
+        .ki_scale_q15 = pid_scale_q15(values[PARAMETER_BP_KI_MAX], scale_q24, control_rate_hz),
+        .kd_scale_q15 = pid_scale_q15(values[PARAMETER_BP_KD_MAX], scale_q24, control_rate_hz),
+        .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
+                    .inertia_q15 = values[PARAMETER_BP_ALPHA] >> 13},
+    };
+}
+
+control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
+                                       uint32_t control_rate_hz, unsigned encoder_bits) {
+    const int32_t *values = parameters->values;
+    const int32_t inertia_q30 = values[PARAMETER_INERTIA_KG_M2];
+    const int32_t friction_q30 = values[PARAMETER_FRICTION_NM_S];
+    const int32_t torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM];
+    const int32_t current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A];
+    const unsigned encoder_shift = 32u - encoder_bits;
+
+    control_parameters_t control = {
+        .tables = tables,
+        .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
+        .period_ticks = (uint16_t)(HAL_PWM_CLOCK_HZ / (2u * control_rate_hz)),
+        .encoder_shift = (uint8_t)encoder_shift,
+        .initialise_ticks = control_rate_hz / 100u,
+        .speed_ramp_q22 = ramp_q22(values[PARAMETER_SPEED_RAMP_RPM_S], control_rate_hz),
+        .observer = load_observer_configure((uint32_t)values[PARAMETER_OBSERVER_BANDWIDTH_RAD_S], control_rate_hz,
+                                            inertia_q30, friction_q30),
+        .speed_pi =
+            {
+                .kp_q16 = values[PARAMETER_SPEED_KP],
+                .ki_step_q32 = fixed_saturate(((int64_t)values[PARAMETER_SPEED_KI] << 16) / (int64_t)control_rate_hz),
+                .torque_min_q24 = 0,
+                .torque_max_q24 = torque_max_q24,
+            },
+        .speed_smc =
+            {
+                .gain_q24 = fixed_multiply(inertia_q30, values[PARAMETER_SMC_K], 22),
+                .epsilon_q15 = values[PARAMETER_SMC_EPSILON] >> 1,
+                .delta_q12 = values[PARAMETER_SMC_DELTA] >> 4,
+                .friction_q30 = friction_q30,
+                .torque_min_q24 = -torque_max_q24,
+                .torque_max_q24 = torque_max_q24,
+            },
+        .commutation =
+            {
+                .turn_on = pitch_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
+                .turn_off = pitch_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
+                .outgoing_off = pitch_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
+            },
+        .hysteresis =
+            {
+                .band_inner_q24 = values[PARAMETER_TORQUE_BAND_INNER_NM],
+                .band_outer_q24 = values[PARAMETER_TORQUE_BAND_OUTER_NM],
+                .current_limit_q9 = current_limit_q9,
+            },
+        .duty =
+            {
+                .pid = bp_pid_from(values, control_rate_hz),
+                .hand_over_angle = pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG]),
+                /* Half of what would reach the current in one period at rest: rate / (2 * A/s), in Q20. */
+                .incoming_gain_q20 = (int32_t)(((int64_t)control_rate_hz << 19) / tables->current_rise_A_s),
+                .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
+                .current_limit_q9 = current_limit_q9,
+            },
+    };
+    control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift);
+    return control;
+}

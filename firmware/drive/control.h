@@ -1,0 +1,89 @@
+/* The control interrupt as one function of parameters, state and sample: a unit test, the host loop and an interrupt
+ * handler call the same one.
+ *
+ *   counts -> currents, angle -> observer, phase torques -> checks -> state machine -> speed law -> torque law ->
+ * compare
+ */
+#ifndef DRIVE_CONTROL_H
+#define DRIVE_CONTROL_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "comms/commands.h"
+#include "control/commutation.h"
+#include "control/ditc_duty.h"
+#include "control/ditc_hysteresis.h"
+#include "control/load_observer.h"
+#include "control/machine_tables.h"
+#include "control/speed_pi.h"
+#include "control/speed_smc.h"
+#include "drive/protection.h"
+#include "drive/state_machine.h"
+#include "hal_adc.h"
+#include "hal_pwm.h"
+
+/* Numbers are those of drive.dbc and of the parameter `controller`. */
+typedef enum {
+    DRIVE_CONTROLLER_TRADITIONAL, /* PI, hysteresis DITC */
+    DRIVE_CONTROLLER_PAPER        /* sliding mode, BP-PID, DITC by duty */
+} drive_controller_t;
+
+/* Read only in the interrupt; derived from the parameters by control_configure. */
+typedef struct {
+    const machine_tables_t *tables;
+    drive_controller_t controller;
+    uint16_t period_ticks;
+    uint8_t encoder_shift;     /* counts to 2^-32 turn */
+    uint32_t initialise_ticks; /* periods in 10 ms */
+    int32_t speed_ramp_q22;    /* rad/s a period, Q9.22; INT32_MAX: no ramp */
+    load_observer_parameters_t observer;
+    speed_pi_parameters_t speed_pi;
+    speed_smc_parameters_t speed_smc;
+    commutation_parameters_t commutation;
+    ditc_hysteresis_parameters_t hysteresis;
+    ditc_duty_parameters_t duty;
+    protection_parameters_t protection;
+} control_parameters_t;
+
+typedef struct {
+    bool started; /* the first sample has set the observer's angle */
+    load_observer_t observer;
+    int32_t speed_reference_q22; /* behind the ramp */
+    speed_pi_t speed_pi;
+    ditc_hysteresis_t hysteresis;
+    ditc_duty_t duty;
+    protection_t protection;
+    state_machine_t machine;
+} control_state_t;
+
+typedef struct {
+    hal_adc_sample_t adc;
+    uint32_t encoder_counts;
+    uint32_t missed_interrupts; /* since the last call */
+    uint32_t time_us;
+    command_t command; /* the last accepted one; request off before the first */
+} control_sample_t;
+
+/* Written every period for whoever watches; never read by the control. */
+typedef struct {
+    uint32_t angle; /* measured, 2^-32 turn */
+    int32_t speed_q22;
+    int32_t speed_reference_q22;
+    int32_t torque_reference_q24;
+    int32_t torque_q24; /* estimate, all phases */
+    int32_t load_torque_q24;
+    uint16_t current_q9[HAL_PHASES_MAX];
+    uint16_t bus_voltage_q6;
+    int32_t duty_q15; /* of the BP-PID */
+    bool voltage_saturated;
+} control_diagnostics_t;
+
+/* INITIALISE, everything at rest. */
+void control_reset(control_state_t *state);
+
+/* One control period. Returns false when every switch must be open: then *compare is all zero. [interrupt] */
+bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
+                  hal_pwm_compare_t *compare, control_diagnostics_t *diagnostics);
+
+#endif

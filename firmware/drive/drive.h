@@ -1,0 +1,41 @@
+/* The drive: what a board's main program starts, calls from its interrupt and calls from its loop. */
+#ifndef DRIVE_DRIVE_H
+#define DRIVE_DRIVE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "comms/comms.h"
+#include "drive/configure.h"
+#include "drive/control.h"
+#include "drive/parameters.h"
+#include "hal.h"
+
+/* One drive. The caller allocates it; only the functions below touch it. */
+typedef struct {
+    hal_t *hal;
+    const machine_tables_t *tables;
+    uint32_t control_rate_hz;
+    /* Of the background. */
+    parameters_t parameters;
+    uint32_t configured_changes; /* parameters.changes that control_parameters stand for */
+    comms_t comms;
+    /* Written by the background with the interrupt kept out. */
+    control_parameters_t control_parameters;
+    command_t command;
+    /* Of the interrupt; read by the background with the interrupt kept out. */
+    control_state_t control;
+    control_diagnostics_t diagnostics;
+} drive_t;
+
+/* Prepares the drive and starts the timer. False, and nothing started, for a control rate that is not allowed. Keeps
+ * hal and tables. [background, before anything else] */
+bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, const drive_config_t *config);
+
+/* One control period. [interrupt] */
+void drive_control_interrupt(drive_t *drive);
+
+/* Commands, telemetry, parameters; cheap when nothing is due. [background] */
+void drive_background(drive_t *drive);
+
+#endif

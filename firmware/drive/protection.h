@@ -1,0 +1,43 @@
+/* Checks of every control period. All are evaluated, whatever the others say; the caller latches. */
+#ifndef DRIVE_PROTECTION_H
+#define DRIVE_PROTECTION_H
+
+#include <stdint.h>
+
+typedef struct {
+    int32_t current_trip_q9;     /* A, Q7.9 */
+    int32_t bus_over_voltage_q6; /* V, Q9.6 */
+    int32_t bus_under_voltage_q6;
+    int32_t over_speed_q22;     /* rad/s, Q9.22 */
+    uint32_t angle_step_max;    /* 2^-32 turn a period: further is no rotation but a jump */
+    uint32_t angle_unmoved_max; /* 2^-32 turn that the rotor should have moved while the encoder stood still */
+    int32_t angle_step_q32;     /* period: 2^-32 turn per rad/s Q9.22, in Q32 */
+    uint32_t command_timeout_us;
+} protection_parameters_t;
+
+typedef struct {
+    uint32_t angle;      /* of the last period, 2^-32 turn */
+    int64_t unmoved_q64; /* expected movement since the encoder last moved, 2^-64 turn */
+    uint32_t overruns;   /* control interrupts lost in a row */
+} protection_t;
+
+typedef struct {
+    int32_t current_max_q9; /* of all phases */
+    int32_t bus_voltage_q6;
+    int32_t speed_q22;
+    uint32_t angle;             /* measured, 2^-32 turn */
+    uint32_t missed_interrupts; /* since the last period */
+    uint32_t command_age_us;    /* of the last accepted command */
+} protection_sample_t;
+
+/* Lost control interrupts in a row that are a fault. */
+#define PROTECTION_OVERRUNS_MAX 3
+
+/* Starts at a measured angle. */
+void protection_reset(protection_t *protection, uint32_t angle);
+
+/* Mask of the failed checks, FAULT_BIT. The caller decides which of them count in its state. */
+uint16_t protection_check(const protection_parameters_t *parameters, protection_t *protection,
+                          const protection_sample_t *sample);
+
+#endif
