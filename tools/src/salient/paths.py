@@ -1,0 +1,10 @@
+"""Where things are in the repository that this package is installed from."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[3]
+BUILD = ROOT / "build"
+MACHINES = ROOT / "tools" / "machines"
+SCENARIOS = ROOT / "tools" / "scenarios"
+DRIVE_DBC = ROOT / "firmware" / "comms" / "drive.dbc"
+RIG_DBC = ROOT / "emulator" / "rig.dbc"
