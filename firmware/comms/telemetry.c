@@ -197,9 +197,10 @@ void telemetry_cycle(telemetry_t *telemetry, const telemetry_snapshot_t *snapsho
     }
 
     uint32_t cycles = 1;
-    const uint32_t late_us = snapshot->time_us - telemetry->next_us;
+    /* Negative when the snapshot was taken a little before the cycle was due. */
+    const int32_t late_us = (int32_t)(snapshot->time_us - telemetry->next_us);
     if (late_us >= TELEMETRY_CYCLE_US) {
-        cycles += late_us / TELEMETRY_CYCLE_US;
+        cycles += (uint32_t)late_us / TELEMETRY_CYCLE_US;
     }
     telemetry->next_us += cycles * TELEMETRY_CYCLE_US;
     telemetry->cycle = (uint8_t)(telemetry->cycle + cycles);
