@@ -1,9 +1,9 @@
 """The demo's pictures: the paper's figures 5, 6 and 7 as this drive draws them, and the phase currents behind them.
 
 A picture has one column a controller, all columns on the same scales. Each function takes `recordings`, which maps a
-controller to the recording of its run (see metrics.py for the fields; one `current_<phase>_A` a phase), and the matching
-part of results.json (`ours` and `paper`: controller -> figure of merit -> value or None), and writes a PNG. Equal
-input gives equal bytes: nothing in the file names a date or a version.
+controller to the recording of its run (see metrics.py for the fields; one `current_<phase>_A` a phase), and the
+matching part of results.json (`ours` and `paper`: controller -> figure of merit -> value or None), and writes a PNG.
+Equal input gives equal bytes: nothing in the file names a date or a version.
 """
 
 from __future__ import annotations
@@ -116,19 +116,18 @@ def draw_start(path: Path, recordings: Recordings, ours: Merits, paper: Merits, 
 
 def draw_load_step_speed(path: Path, recordings: Recordings, ours: Merits, paper: Merits, step_time_s: float = 0.13,
                          reference_rpm: float = 150.0) -> None:
-    """Figure 6: 8 N m step at 150 r/min; above the whole run, below the speed around the step."""
+    """Figure 6: 8 N m step at 150 r/min; the whole run, the speed around the step, the first 10 ms after it."""
 
     def draw(figure: Figure) -> None:
-        axes = _grid(figure, recordings, rows=2, heights=(1.0, 1.25))
-        before_ms, after_ms = 5.0, _zoom_after_ms(ours)
-        deepest_rpm = max(_figure(of, "speed_dip_rpm") for of in ours.values())
+        axes = _grid(figure, recordings, rows=3, heights=(1.0, 1.15, 0.9))
+        after_ms = _zoom_after_ms(ours)
         for column, (controller, recording) in enumerate(recordings.items()):
             colour = _colour(controller)
             mine, printed = ours[controller], paper.get(controller, {})
-            whole, zoom = axes[:, column]
+            whole, around, first = axes[:, column]
             _band(whole, reference_rpm)
             _trace(whole, recording["time_s"], recording["speed_rpm"], colour)
-            whole.axvline(step_time_s, color=LOAD_COLOUR, linewidth=0.8, linestyle=(0, (1, 2)))
+            _step_line(whole, step_time_s)
             whole.annotate("8 N m", (step_time_s, 0.25 * reference_rpm), xytext=(5, 0), textcoords="offset points",
                            color=LOAD_COLOUR, fontsize=8.5, va="center")
             whole.set_xlim(0.0, float(recording["time_s"][-1]))
@@ -136,25 +135,23 @@ def draw_load_step_speed(path: Path, recordings: Recordings, ours: Merits, paper
             whole.set_title(_letter(column) + _title(controller))
             whole.set_xlabel("time / s")
 
-            part = _between(recording, step_time_s - before_ms / 1e3, step_time_s + after_ms / 1e3)
-            _band(zoom, reference_rpm)
-            _trace(zoom, (part["time_s"] - step_time_s) * 1e3, part["speed_rpm"], colour)
-            zoom.axvline(0.0, color=LOAD_COLOUR, linewidth=0.8, linestyle=(0, (1, 2)))
-            zoom.set_xlim(-before_ms, after_ms)
-            zoom.set_ylim(reference_rpm - max(1.25 * deepest_rpm, 1.5), reference_rpm + max(0.35 * deepest_rpm, 1.5))
-            zoom.set_xlabel("time after the load step / ms")
-            zoom.set_title(_step_summary(mine), color=colour, fontweight="bold")
+            for axis, from_ms, to_ms in ((around, -0.1 * after_ms, after_ms), (first, -1.0, 10.0)):
+                part = _between(recording, step_time_s + from_ms / 1e3, step_time_s + to_ms / 1e3)
+                _band(axis, reference_rpm)
+                _trace(axis, (part["time_s"] - step_time_s) * 1e3, part["speed_rpm"], colour)
+                _step_line(axis, 0.0)
+                axis.set_xlim(from_ms, to_ms)
+                axis.set_xlabel("time after the load step / ms")
+                _mark_recovery(axis, mine["recovery_time_s"], to_ms, colour)
+            around.set_title(_step_summary(mine), color=colour, fontweight="bold")
             if printed:
-                zoom.annotate(f"paper's figures: {_step_summary(printed)}", (0.97, 0.05), xycoords="axes fraction",
-                              ha="right", color=PAPER_COLOUR, bbox=_PAPER_WHITE)
-            recovery_s = mine["recovery_time_s"]
-            if recovery_s is not None and recovery_s > 0.0 and recovery_s * 1e3 < after_ms:
-                zoom.axvline(recovery_s * 1e3, color=colour, linewidth=1.0, linestyle=(0, (4, 2)))
-                zoom.annotate("back in the band", (recovery_s * 1e3, 0.92), xycoords=("data", "axes fraction"),
-                              xytext=(4, 0), textcoords="offset points", color=colour, fontsize=8.5)
-        _label_rows(axes, "speed / (r/min)", "speed / (r/min)")
+                around.set_title(f"paper's: {_step_summary(printed)}", loc="right", color=PAPER_COLOUR, fontsize=9.5)
+            first.set_title("the first 10 ms")
+        for row in axes[1:]:
+            _same_limits(row)
+        _label_rows(axes, *["speed / (r/min)"] * 3)
 
-    _save(path, draw, height_in=6.4)
+    _save(path, draw, height_in=8.8)
 
 
 def draw_load_step_torque(path: Path, recordings: Recordings, ours: Merits, paper: Merits, step_time_s: float = 0.13,
@@ -189,10 +186,10 @@ def draw_load_step_torque(path: Path, recordings: Recordings, ours: Merits, pape
             steady.set_xlim(*window_s)
             steady.set_ylim(bottom_Nm - 2.0 * margin_Nm, top_Nm + margin_Nm)
             steady.set_xlabel("time / s")
-            title = f"K$_t$ = {_figure(mine, 'torque_ripple'):.3g}"
+            steady.set_title(f"K$_t$ = {_figure(mine, 'torque_ripple'):.3g}", fontweight="bold", color=colour)
             if printed.get("torque_ripple") is not None:
-                title += f"   (paper's figure {_figure(printed, 'torque_ripple'):.3g})"
-            steady.set_title(title, fontweight="bold", color=colour)
+                steady.set_title(f"paper's: {_figure(printed, 'torque_ripple'):g}", loc="right", color=PAPER_COLOUR,
+                                 fontsize=9.5)
             steady.annotate("max {torque_max_Nm:.2f}   mean {torque_mean_Nm:.2f}   min {torque_min_Nm:.2f} N m"
                             .format_map(mine), (0.97, 0.05), xycoords="axes fraction", ha="right", color="#333333",
                             bbox=_PAPER_WHITE)
@@ -271,21 +268,36 @@ def _mark_settling(axis: Axes, reference_rpm: float, ours_s: float | None, paper
         axis.plot([ours_s], [reference_rpm], "o", color=colour, markersize=6.5, zorder=5)
     axis.annotate(text, (0.97, 0.16), xycoords="axes fraction", ha="right", color=colour, fontweight="bold")
     if paper_s is not None:
-        axis.plot([paper_s], [reference_rpm], "D", color=PAPER_COLOUR, markerfacecolor="white", markersize=6.5, zorder=4)
-        axis.annotate(f"paper's figure {paper_s:g} s", (0.97, 0.07), xycoords="axes fraction", ha="right",
+        axis.plot([paper_s], [reference_rpm], "D", color=PAPER_COLOUR, markerfacecolor="white", markersize=6.5,
+                  zorder=4)
+        axis.annotate(f"paper's: {paper_s:g} s", (0.97, 0.07), xycoords="axes fraction", ha="right",
                       color=PAPER_COLOUR)
 
 
 def _mark_highest(axis: Axes, ours: Mapping[str, float | None], paper: Mapping[str, float | None], colour: str) -> None:
     rows = [("highest", ours, colour, "bold")]
     if paper.get("max_speed_rpm") is not None:
-        rows.append(("paper's figure", paper, PAPER_COLOUR, "normal"))
+        rows.append(("paper's:", paper, PAPER_COLOUR, "normal"))
     for row, (name, of, line_colour, weight) in enumerate(rows):
         level_rpm = _figure(of, "max_speed_rpm")
         axis.axhline(level_rpm, color=line_colour, linewidth=0.9, linestyle=(0, (4, 2)))
         axis.annotate(f"{name} {level_rpm:.1f} r/min ({_figure(of, 'overshoot_percent'):+.2f} %)",
                       (0.97, 0.9 - 0.11 * row), xycoords="axes fraction", ha="right", color=line_colour,
                       fontweight=weight, bbox=_PAPER_WHITE)
+
+
+def _step_line(axis: Axes, when: float) -> None:
+    axis.axvline(when, color=LOAD_COLOUR, linewidth=0.8, linestyle=(0, (1, 2)))
+
+
+def _mark_recovery(axis: Axes, recovery_s: float | None, to_ms: float, colour: str) -> None:
+    if recovery_s is None or not 0.0 < recovery_s * 1e3 < to_ms:
+        return
+    axis.axvline(recovery_s * 1e3, color=colour, linewidth=1.0, linestyle=(0, (4, 2)))
+    near_end = recovery_s * 1e3 > 0.75 * to_ms
+    axis.annotate("back in the band", (recovery_s * 1e3, 0.92), xycoords=("data", "axes fraction"),
+                  xytext=(-4 if near_end else 4, 0), textcoords="offset points", color=colour, fontsize=8.5,
+                  ha="right" if near_end else "left")
 
 
 def _step_summary(of: Mapping[str, float | None]) -> str:
