@@ -45,8 +45,8 @@ typedef struct {
     int32_t kp_q15; /* 1/(N m), 0..65535 */
     int32_t ki_q15;
     int32_t kd_q15;
-    int32_t duty_q15;             /* -32768..32767 */
-    fault_record_t last_fault;    /* sent while state is fault */
+    int32_t duty_q15;          /* -32768..32767 */
+    fault_record_t last_fault; /* sent while state is fault */
 } telemetry_snapshot_t;
 
 typedef struct {
