@@ -13,16 +13,15 @@ void ditc_duty_reset(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc
     ditc->regulated = COMMUTATION_NONE;
 }
 
-/* Duty that brings the incoming phase to its current. */
+/* Duty that brings the incoming phase to its current: to the limit while torque is missing beyond the outer band. */
 static int32_t incoming_duty_q15(const ditc_duty_parameters_t *parameters, const machine_tables_t *tables,
                                  const ditc_duty_sample_t *sample, int32_t current_q9) {
-    if (sample->error_q24 > parameters->band_outer_q24) {
-        return DUTY_ONE_Q15;
-    }
-    const int32_t target_q9 = torque_map_current_q9(tables, parameters->hand_over_angle, sample->reference_q24);
-    const int32_t limited_q9 = fixed_clamp(target_q9, 0, parameters->current_limit_q9);
+    const int32_t limit_q9 = parameters->current_limit_q9;
+    const int32_t carrying_q9 = torque_map_current_q9(tables, parameters->hand_over_angle, sample->reference_q24);
+    const bool assists = sample->error_q24 > parameters->band_outer_q24 || carrying_q9 > limit_q9;
+    const int32_t target_q9 = assists ? limit_q9 : carrying_q9;
     /* Q9 * Q20 to Q15. */
-    return fixed_clamp(fixed_multiply(limited_q9 - current_q9, parameters->incoming_gain_q20, 14), -DUTY_ONE_Q15,
+    return fixed_clamp(fixed_multiply(target_q9 - current_q9, parameters->incoming_gain_q20, 14), -DUTY_ONE_Q15,
                        DUTY_ONE_Q15);
 }
 
@@ -37,11 +36,14 @@ void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc,
         return;
     }
 
-    bool handing_over =
-        ditc->regulated != active && ditc->regulated == commutation->outgoing && ditc->regulated != COMMUTATION_NONE;
+    if (ditc->regulated == COMMUTATION_NONE) {
+        /* From standstill: past its window a phase still has torque, the one that just entered has none. */
+        ditc->regulated = commutation->outgoing != COMMUTATION_NONE ? commutation->outgoing : active;
+    }
+    bool handing_over = ditc->regulated != active && ditc->regulated == commutation->outgoing;
     if (handing_over) {
         duty_q15[active] = incoming_duty_q15(parameters, tables, sample, sample->current_q9[active]);
-        if (sample->torque_q24[ditc->regulated] < SPENT_TORQUE_Q24) {
+        if (sample->torque_q24[ditc->regulated] < SPENT_TORQUE_Q24 && sample->error_q24 <= 0) {
             bp_pid_preset(&ditc->pid, duty_q15[active]);
             handing_over = false;
         }
@@ -51,8 +53,6 @@ void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc,
     }
 
     const int32_t regulated_q15 = bp_pid_step(&parameters->pid, &ditc->pid, sample->error_q24);
-    duty_q15[ditc->regulated] = regulated_q15;
-    if (duty_q15[ditc->regulated] > 0 && sample->current_q9[ditc->regulated] > parameters->current_limit_q9) {
-        duty_q15[ditc->regulated] = 0;
-    }
+    const bool above_limit = sample->current_q9[ditc->regulated] > parameters->current_limit_q9;
+    duty_q15[ditc->regulated] = above_limit && regulated_q15 > 0 ? 0 : regulated_q15;
 }

@@ -5,7 +5,7 @@
  * torque and slow, while the incoming phase, still without torque, is brought to the current that will carry the
  * reference at the hand-over angle; what torque it makes meanwhile, the PID takes off the outgoing phase. When nothing
  * is left to take off, or the outgoing phase must go, the PID moves on to the incoming phase, starting from its duty.
- * DITC's outer band stays in force: torque missing beyond it switches the incoming phase fully on.
+ * DITC's outer band stays in force: torque missing beyond it sends the incoming phase to the current limit.
  */
 #ifndef CONTROL_DITC_DUTY_H
 #define CONTROL_DITC_DUTY_H

@@ -1,46 +1,51 @@
 #include "control/ditc_hysteresis.h"
 
+#include <stdbool.h>
+
 void ditc_hysteresis_reset(ditc_hysteresis_t *ditc) {
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         ditc->state[phase] = -1;
     }
 }
 
-static int8_t active_state(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t error_q24,
-                           int outgoing_works) {
+static int8_t single_state(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t error_q24) {
     if (error_q24 > parameters->band_inner_q24) {
         return 1;
     }
-    if (error_q24 < -parameters->band_outer_q24 && !outgoing_works) {
+    if (error_q24 < -parameters->band_outer_q24) {
         return -1;
     }
-    if (error_q24 < -parameters->band_inner_q24 || state < 0) {
-        return 0;
+    return error_q24 < -parameters->band_inner_q24 || state < 0 ? 0 : state;
+}
+
+static int8_t incoming_state(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t error_q24) {
+    if (error_q24 > parameters->band_outer_q24) {
+        return 1;
     }
-    return state;
+    return error_q24 < 0 || state < 0 ? 0 : state;
 }
 
 static int8_t outgoing_state(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t error_q24) {
-    if (error_q24 > parameters->band_outer_q24) {
+    if (error_q24 > parameters->band_inner_q24) {
         return 1;
     }
     if (error_q24 < -parameters->band_inner_q24) {
         return -1;
     }
-    /* Assistance and removal both end when the error has come back through zero. */
-    const int returned = (state > 0 && error_q24 <= 0) || (state < 0 && error_q24 >= 0);
+    const bool returned = (state > 0 && error_q24 <= 0) || (state < 0 && error_q24 >= 0);
     return returned ? 0 : state;
 }
 
 void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_hysteresis_t *ditc, unsigned phases,
                           const commutation_t *commutation, int32_t torque_error_q24, const int32_t *current_q9) {
-    const int outgoing_works = commutation->outgoing != COMMUTATION_NONE && current_q9[commutation->outgoing] > 0;
+    const bool outgoing_works = commutation->outgoing != COMMUTATION_NONE && current_q9[commutation->outgoing] > 0;
     for (unsigned phase = 0; phase < phases; phase++) {
         int8_t state = -1;
-        if (phase == commutation->active) {
-            state = active_state(parameters, ditc->state[phase], torque_error_q24, outgoing_works);
-        } else if (phase == commutation->outgoing) {
+        if (phase == commutation->outgoing) {
             state = outgoing_state(parameters, ditc->state[phase], torque_error_q24);
+        } else if (phase == commutation->active) {
+            state = outgoing_works ? incoming_state(parameters, ditc->state[phase], torque_error_q24)
+                                   : single_state(parameters, ditc->state[phase], torque_error_q24);
         }
         if (state > 0 && current_q9[phase] > parameters->current_limit_q9) {
             state = 0;

@@ -3,11 +3,15 @@
  *   +1 both switches on (+Vdc), 0 one on (freewheeling), -1 both off (-Vdc)      (1) of the paper
  *
  * Rules, error = reference - torque of all phases:
- *   active phase     +1 above +inner, 0 below -inner, -1 below -outer, unchanged between; with an outgoing phase at
- * work it is the incoming one and never goes below 0 before the outgoing phase has been taken off outgoing phase   +1
- * above +outer, -1 below -inner, 0 when the error returns through zero, unchanged between other phases     -1 so
- * missing torque goes to the incoming phase first and surplus comes off the outgoing one first. A phase above the
- * current limit is not switched on.
+ *   one phase at work    +1 above +inner, 0 below -inner, -1 below -outer; unchanged between, 0 after -1
+ *   two phases at work   outgoing: +1 above +inner, -1 below -inner, 0 when the error has returned through zero
+ *                        incoming: +1 above +outer, 0 below zero, unchanged between
+ *   other phases         -1
+ *
+ * The outgoing phase, large in inductance, moves the torque in small steps and so gets the inner band; the incoming
+ * one, where a period at full voltage is several amperes, comes in when the outgoing one no longer suffices. The other
+ * way round (incoming first) the incoming phase is pumped to the current limit before it has any torque, and the ripple
+ * is 1.0 to 1.6 instead of 0.3 to 0.8 at 40 kHz. A phase above the current limit is not switched on.
  */
 #ifndef CONTROL_DITC_HYSTERESIS_H
 #define CONTROL_DITC_HYSTERESIS_H

@@ -84,7 +84,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
         .period_ticks = (uint16_t)(HAL_PWM_CLOCK_HZ / (2u * control_rate_hz)),
         .encoder_shift = (uint8_t)encoder_shift,
-        .initialise_ticks = control_rate_hz / 100u,
+        .initialise_ticks = control_rate_hz / 1000u,
         .speed_ramp_q22 = ramp_q22(values[PARAMETER_SPEED_RAMP_RPM_S], control_rate_hz),
         .observer = load_observer_configure((uint32_t)values[PARAMETER_OBSERVER_BANDWIDTH_RAD_S], control_rate_hz,
                                             inertia_q30, friction_q30),

@@ -35,7 +35,7 @@ typedef struct {
     drive_controller_t controller;
     uint16_t period_ticks;
     uint8_t encoder_shift;     /* counts to 2^-32 turn */
-    uint32_t initialise_ticks; /* periods in 10 ms */
+    uint32_t initialise_ticks; /* periods in 1 ms */
     int32_t speed_ramp_q22;    /* rad/s a period, Q9.22; INT32_MAX: no ramp */
     load_observer_parameters_t observer;
     speed_pi_parameters_t speed_pi;

@@ -12,8 +12,8 @@ static const parameter_row_t rows[PARAMETER_COUNT] = {
     [PARAMETER_SPEED_RAMP_RPM_S] = {"speed_ramp_rpm_s", "r/min/s", 0, 0, 1000000, 0},
     [PARAMETER_TORQUE_MAX_NM] = {"torque_max_Nm", "N m", 24, 0, Q(40, 1, 24), Q(191, 10, 24)},
     /* Chopping limit and trip. The sensors end just below 80 A: a trip above 79 A would never be seen. */
-    [PARAMETER_CURRENT_LIMIT_A] = {"current_limit_A", "A", 9, Q(1, 1, 9), Q(79, 1, 9), Q(60, 1, 9)},
-    [PARAMETER_CURRENT_TRIP_A] = {"current_trip_A", "A", 9, Q(1, 1, 9), Q(79, 1, 9), Q(70, 1, 9)},
+    [PARAMETER_CURRENT_LIMIT_A] = {"current_limit_A", "A", 9, Q(1, 1, 9), Q(79, 1, 9), Q(52, 1, 9)},
+    [PARAMETER_CURRENT_TRIP_A] = {"current_trip_A", "A", 9, Q(1, 1, 9), Q(79, 1, 9), Q(75, 1, 9)},
     [PARAMETER_BUS_OVER_VOLTAGE_V] = {"bus_over_voltage_V", "V", 6, Q(10, 1, 6), Q(510, 1, 6), Q(300, 1, 6)},
     [PARAMETER_BUS_UNDER_VOLTAGE_V] = {"bus_under_voltage_V", "V", 6, 0, Q(510, 1, 6), Q(150, 1, 6)},
     /* Speeds end at 4889 r/min, the range of Q9.22 rad/s. */
@@ -25,9 +25,9 @@ static const parameter_row_t rows[PARAMETER_COUNT] = {
     /* Where the incoming phase is to carry the whole reference (paper controller). */
     [PARAMETER_HAND_OVER_ANGLE_DEG] = {"hand_over_angle_deg", "deg", 7, Q(180, 1, 7), Q(300, 1, 7), Q(210, 1, 7)},
     [PARAMETER_TORQUE_BAND_INNER_NM] = {"torque_band_inner_Nm", "N m", 24, 0, Q(20, 1, 24), Q(1, 10, 24)},
-    [PARAMETER_TORQUE_BAND_OUTER_NM] = {"torque_band_outer_Nm", "N m", 24, 0, Q(20, 1, 24), Q(3, 10, 24)},
-    [PARAMETER_SPEED_KP] = {"speed_kp", "N m s", 16, 0, Q(1000, 1, 16), Q(2, 1, 16)},
-    [PARAMETER_SPEED_KI] = {"speed_ki", "N m", 16, 0, Q(10000, 1, 16), Q(50, 1, 16)},
+    [PARAMETER_TORQUE_BAND_OUTER_NM] = {"torque_band_outer_Nm", "N m", 24, 0, Q(20, 1, 24), Q(1, 1, 24)},
+    [PARAMETER_SPEED_KP] = {"speed_kp", "N m s", 16, 0, Q(1000, 1, 16), Q(8, 1, 16)},
+    [PARAMETER_SPEED_KI] = {"speed_ki", "N m", 16, 0, Q(10000, 1, 16), Q(400, 1, 16)},
     [PARAMETER_SMC_K] = {"smc_k", "1/s", 16, 0, Q(10000, 1, 16), Q(1000, 1, 16)},
     [PARAMETER_SMC_EPSILON] = {"smc_epsilon", "", 16, Q(1, 100, 16), Q(1, 1, 16), Q(1, 2, 16)},
     [PARAMETER_SMC_DELTA] = {"smc_delta", "s", 16, 0, Q(10, 1, 16), Q(1, 1, 16)},
@@ -39,10 +39,10 @@ static const parameter_row_t rows[PARAMETER_COUNT] = {
     [PARAMETER_BP_ALPHA] = {"bp_alpha", "", 28, 0, Q(9, 10, 28), Q(5, 100, 28)},
     [PARAMETER_BP_ERROR_SCALE_NM] = {"bp_error_scale_Nm", "N m", 24, Q(1, 10, 24), Q(40, 1, 24), Q(2, 1, 24)},
     [PARAMETER_BP_KP_MAX] = {"bp_kp_max", "1/(N m)", 15, 0, Q(2, 1, 15) - 1, Q(1, 2, 15)},
-    [PARAMETER_BP_KI_MAX] = {"bp_ki_max", "1/(N m)", 15, 0, Q(2, 1, 15) - 1, Q(1, 20, 15)},
+    [PARAMETER_BP_KI_MAX] = {"bp_ki_max", "1/(N m)", 15, 0, Q(2, 1, 15) - 1, Q(12, 100, 15)},
     [PARAMETER_BP_KD_MAX] = {"bp_kd_max", "1/(N m)", 15, 0, Q(2, 1, 15) - 1, Q(1, 5, 15)},
     /* Torque missing beyond it switches the incoming phase fully on. */
-    [PARAMETER_BP_ASSIST_BAND_NM] = {"bp_assist_band_Nm", "N m", 24, 0, Q(20, 1, 24), Q(1, 1, 24)},
+    [PARAMETER_BP_ASSIST_BAND_NM] = {"bp_assist_band_Nm", "N m", 24, 0, Q(20, 1, 24), Q(2, 1, 24)},
     /* The plant that the laws assume; the machine's tables give the defaults. */
     [PARAMETER_INERTIA_KG_M2] = {"inertia_kg_m2", "kg m^2", 30, Q(1, 10000, 30), Q(19, 10, 30), Q(2, 100, 30)},
     [PARAMETER_FRICTION_NM_S] = {"friction_Nm_s", "N m s", 30, 0, Q(19, 10, 30), Q(2, 100, 30)},

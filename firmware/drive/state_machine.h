@@ -1,6 +1,6 @@
 /* States of the drive. The switches are closed only in RUN.
  *
- *   INITIALISE --all checks passed for 10 ms--> READY <--run / off, stopped--> RUN
+ *   INITIALISE --all checks passed for 1 ms--> READY <--run / off, stopped--> RUN
  *   READY, RUN --a check fails--> FAULT --clear_fault, cause gone--> READY
  *
  * A lost command is a fault only in RUN. A drive that came back from a fault runs again only after it was asked for
@@ -34,7 +34,7 @@ typedef struct {
 void state_machine_reset(state_machine_t *machine);
 
 /* One tick. Returns true in the tick that a fault is latched, when the caller completes machine->record: fault, checks
- * and state are set. initialise_ticks: periods of 10 ms. */
+ * and state are set. initialise_ticks: periods of 1 ms. */
 bool state_machine_step(state_machine_t *machine, const state_machine_input_t *input, uint32_t initialise_ticks);
 
 #endif
