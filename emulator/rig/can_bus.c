@@ -6,8 +6,7 @@
 
 /* The arbitration field as the wire has it, first bit highest; the lowest wins. Standard: identifier, RTR, IDE 0;
  * extended: base identifier, SRR 1, IDE 1, extension, RTR. */
-static uint32_t arbitration_field(const hal_can_frame_t *frame)
-{
+static uint32_t arbitration_field(const hal_can_frame_t *frame) {
     uint32_t remote = frame->remote;
     if (!frame->extended) {
         return (frame->identifier & 0x7FFu) << 21 | remote << 20;
@@ -16,13 +15,11 @@ static uint32_t arbitration_field(const hal_can_frame_t *frame)
 }
 
 /* End of the bit `bits` after `start_ns`. */
-static uint64_t bits_later(const can_bus_t *bus, uint64_t start_ns, unsigned bits)
-{
+static uint64_t bits_later(const can_bus_t *bus, uint64_t start_ns, unsigned bits) {
     return start_ns + bits * NS_PER_S / bus->bit_rate;
 }
 
-void can_bus_init(can_bus_t *bus, uint32_t bit_rate)
-{
+void can_bus_init(can_bus_t *bus, uint32_t bit_rate) {
     memset(bus, 0, offsetof(can_bus_t, client_queue));
     bus->client_pushed = bus->client_popped = 0;
     can_length_init(&bus->lengths);
@@ -30,8 +27,7 @@ void can_bus_init(can_bus_t *bus, uint32_t bit_rate)
     bus->next_event_ns = CAN_BUS_NEVER;
 }
 
-bool can_bus_transmit(can_bus_t *bus, const hal_can_frame_t *frame)
-{
+bool can_bus_transmit(can_bus_t *bus, const hal_can_frame_t *frame) {
     for (unsigned i = 0; i < CAN_BUS_MAILBOXES; ++i) {
         if (!bus->mailbox[i].taken) {
             bus->mailbox[i].frame = *frame;
@@ -44,10 +40,11 @@ bool can_bus_transmit(can_bus_t *bus, const hal_can_frame_t *frame)
     return false;
 }
 
-size_t can_bus_client_backlog(const can_bus_t *bus) { return (size_t)(bus->client_pushed - bus->client_popped); }
+size_t can_bus_client_backlog(const can_bus_t *bus) {
+    return (size_t)(bus->client_pushed - bus->client_popped);
+}
 
-bool can_bus_push(can_bus_t *bus, const hal_can_frame_t *frame)
-{
+bool can_bus_push(can_bus_t *bus, const hal_can_frame_t *frame) {
     if (can_bus_client_backlog(bus) == CAN_BUS_CLIENT_QUEUE) {
         return false;
     }
@@ -57,8 +54,7 @@ bool can_bus_push(can_bus_t *bus, const hal_can_frame_t *frame)
 }
 
 /* The mailbox that the drive's controller would send next, or CAN_BUS_MAILBOXES. */
-static unsigned best_mailbox(const can_bus_t *bus)
-{
+static unsigned best_mailbox(const can_bus_t *bus) {
     unsigned best = CAN_BUS_MAILBOXES;
     for (unsigned i = 0; i < CAN_BUS_MAILBOXES; ++i) {
         if (!bus->mailbox[i].taken) {
@@ -77,10 +73,9 @@ static unsigned best_mailbox(const can_bus_t *bus)
     return best;
 }
 
-static void arbitrate(can_bus_t *bus, uint64_t now_ns)
-{
+static void arbitrate(can_bus_t *bus, uint64_t now_ns) {
     unsigned mailbox = best_mailbox(bus);
-    bool drive = mailbox < CAN_BUS_MAILBOXES, client = can_bus_client_backlog(bus) > 0;
+    bool drive = mailbox<CAN_BUS_MAILBOXES, client = can_bus_client_backlog(bus)> 0;
     if (!drive && !client) {
         bus->next_event_ns = CAN_BUS_NEVER;
         return;
@@ -99,8 +94,7 @@ static void arbitrate(can_bus_t *bus, uint64_t now_ns)
     bus->next_event_ns = bits_later(bus, now_ns, bus->sending_bits);
 }
 
-void can_bus_start(can_bus_t *bus, uint64_t now_ns)
-{
+void can_bus_start(can_bus_t *bus, uint64_t now_ns) {
     bus->start_requested = false;
     if (bus->sender != CAN_BUS_IDLE) {
         return;
@@ -112,8 +106,7 @@ void can_bus_start(can_bus_t *bus, uint64_t now_ns)
     }
 }
 
-bool can_bus_step(can_bus_t *bus, can_bus_delivery_t *delivery)
-{
+bool can_bus_step(can_bus_t *bus, can_bus_delivery_t *delivery) {
     if (bus->sender == CAN_BUS_IDLE) {
         arbitrate(bus, bus->next_event_ns);
         return false;

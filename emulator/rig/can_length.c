@@ -6,11 +6,12 @@
 #define UNSTUFFED_BITS 10u /* CRC delimiter, acknowledge slot and delimiter, seven bits end of frame */
 
 /* State of a run of `length` (1..5) bits of `level`. */
-static unsigned run_state(unsigned level, unsigned length) { return level * 5 + length - 1; }
+static unsigned run_state(unsigned level, unsigned length) {
+    return level * 5 + length - 1;
+}
 
 /* The state after one more bit; counts the stuff bit it causes. */
-static unsigned stuff_step(unsigned state, unsigned bit, uint8_t *stuff_bits)
-{
+static unsigned stuff_step(unsigned state, unsigned bit, uint8_t *stuff_bits) {
     unsigned level = state / 5, length = state % 5 + 1;
     length = bit == level ? length + 1 : 1;
     if (length == 5) {
@@ -20,8 +21,7 @@ static unsigned stuff_step(unsigned state, unsigned bit, uint8_t *stuff_bits)
     return run_state(bit, length);
 }
 
-void can_length_init(can_length_t *tables)
-{
+void can_length_init(can_length_t *tables) {
     for (unsigned byte = 0; byte < 256; ++byte) {
         unsigned crc = byte << 7;
         for (int bit = 0; bit < 8; ++bit) {
@@ -40,14 +40,12 @@ void can_length_init(can_length_t *tables)
     }
 }
 
-static unsigned data_bytes(const hal_can_frame_t *frame)
-{
+static unsigned data_bytes(const hal_can_frame_t *frame) {
     return frame->remote ? 0 : frame->length < 8 ? frame->length : 8;
 }
 
 /* Start of frame to length code, right-aligned; *bits is 19 or 39. */
-static uint64_t header(const hal_can_frame_t *frame, unsigned *bits)
-{
+static uint64_t header(const hal_can_frame_t *frame, unsigned *bits) {
     uint64_t remote = frame->remote, length = frame->length & 0xFu;
     if (!frame->extended) {
         *bits = 19; /* SOF, identifier, RTR, IDE 0, r0, length */
@@ -58,8 +56,7 @@ static uint64_t header(const hal_can_frame_t *frame, unsigned *bits)
     return base << 27 | UINT64_C(3) << 25 | extension << 7 | remote << 6 | length;
 }
 
-uint16_t can_length_crc(const can_length_t *tables, const hal_can_frame_t *frame)
-{
+uint16_t can_length_crc(const can_length_t *tables, const hal_can_frame_t *frame) {
     /* Leading zeros do not change a CRC that begins with zero, so the header may be cut into whole bytes. */
     unsigned bits;
     uint64_t head = header(frame, &bits);
@@ -73,8 +70,7 @@ uint16_t can_length_crc(const can_length_t *tables, const hal_can_frame_t *frame
     return (uint16_t)crc;
 }
 
-unsigned can_length_bits(const can_length_t *tables, const hal_can_frame_t *frame)
-{
+unsigned can_length_bits(const can_length_t *tables, const hal_can_frame_t *frame) {
     unsigned bits, stuff_bits = 0;
     uint64_t head = header(frame, &bits);
     unsigned crc = can_length_crc(tables, frame);

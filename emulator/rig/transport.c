@@ -6,8 +6,7 @@
 #define RIG_IDENTIFIER_MASK 0x1FFFFF00u
 #define RIG_IDENTIFIER_BASE 0x1F000000u
 
-transport_t *transport_open(const char *address, char error[TRANSPORT_ERROR_SIZE])
-{
+transport_t *transport_open(const char *address, char error[TRANSPORT_ERROR_SIZE]) {
     if (strncmp(address, "unix:", 5) == 0 && address[5] != '\0') {
         return transport_local_open(address + 5, error);
     }
@@ -18,8 +17,7 @@ transport_t *transport_open(const char *address, char error[TRANSPORT_ERROR_SIZE
     return NULL;
 }
 
-bool transport_frame_accept(transport_frame_t *frame, size_t received)
-{
+bool transport_frame_accept(transport_frame_t *frame, size_t received) {
     /* Both forms begin alike: identifier with flags, length, flags or padding. */
     canid_t id = frame->classic.can_id;
     if (!(id & (CAN_EFF_FLAG | CAN_ERR_FLAG)) && (id & CAN_EFF_MASK) > CAN_SFF_MASK) {
@@ -56,19 +54,16 @@ bool transport_frame_accept(transport_frame_t *frame, size_t received)
     return true;
 }
 
-bool transport_frame_is_rig(const transport_frame_t *frame)
-{
+bool transport_frame_is_rig(const transport_frame_t *frame) {
     canid_t id = frame->classic.can_id;
     return id & CAN_EFF_FLAG && !(id & CAN_ERR_FLAG) && (id & RIG_IDENTIFIER_MASK) == RIG_IDENTIFIER_BASE;
 }
 
-bool transport_frame_is_off_bus(const transport_frame_t *frame)
-{
+bool transport_frame_is_off_bus(const transport_frame_t *frame) {
     return frame->size != CAN_MTU || frame->classic.can_id & CAN_ERR_FLAG || transport_frame_is_rig(frame);
 }
 
-void transport_frame_to_hal(const transport_frame_t *frame, hal_can_frame_t *hal)
-{
+void transport_frame_to_hal(const transport_frame_t *frame, hal_can_frame_t *hal) {
     canid_t id = frame->classic.can_id;
     hal->extended = id & CAN_EFF_FLAG;
     hal->remote = id & CAN_RTR_FLAG;
@@ -77,8 +72,7 @@ void transport_frame_to_hal(const transport_frame_t *frame, hal_can_frame_t *hal
     memcpy(hal->data, frame->classic.data, sizeof hal->data);
 }
 
-void transport_frame_from_hal(const hal_can_frame_t *hal, transport_frame_t *frame)
-{
+void transport_frame_from_hal(const hal_can_frame_t *hal, transport_frame_t *frame) {
     frame->size = CAN_MTU;
     memset(&frame->classic, 0, sizeof frame->classic);
     frame->classic.can_id = hal->identifier | (hal->extended ? CAN_EFF_FLAG : 0) | (hal->remote ? CAN_RTR_FLAG : 0);

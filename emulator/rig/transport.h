@@ -60,30 +60,31 @@ struct transport {
 };
 
 /* Fills in up to TRANSPORT_DESCRIPTORS_MAX entries to poll for new frames and clients; returns how many. */
-static inline size_t transport_descriptors(transport_t *transport, struct pollfd *list)
-{
+static inline size_t transport_descriptors(transport_t *transport, struct pollfd *list) {
     return transport->descriptors(transport, list);
 }
 
 /* Lets new clients in and hands over what was sent, one frame of each client in turn, in the order of connection,
  * until a whole turn brings nothing. Never waits. Returns the number of frames handed over. */
-static inline size_t transport_read(transport_t *transport, const transport_receiver_t *receiver)
-{
+static inline size_t transport_read(transport_t *transport, const transport_receiver_t *receiver) {
     return transport->read(transport, receiver);
 }
 
 /* Sends a frame to every client, its sender included. It may stay in a batch until transport_flush. */
 static inline void transport_send(transport_t *transport, uint64_t time_ns, transport_origin_t origin,
-                                  const transport_frame_t *frame)
-{
+                                  const transport_frame_t *frame) {
     transport->send(transport, time_ns, origin, frame);
 }
 
 /* Hands all batches over to the system. */
-static inline void transport_flush(transport_t *transport) { transport->flush(transport); }
+static inline void transport_flush(transport_t *transport) {
+    transport->flush(transport);
+}
 
 /* Disconnects everyone, removes what was created, frees the transport. */
-static inline void transport_close(transport_t *transport) { transport->close(transport); }
+static inline void transport_close(transport_t *transport) {
+    transport->close(transport);
+}
 
 /* Opens `address`, unix:PATH or socketcan:INTERFACE. NULL with a line in `error` when it cannot. */
 transport_t *transport_open(const char *address, char error[TRANSPORT_ERROR_SIZE]);

@@ -17,10 +17,10 @@
 #include "rig/transport.h"
 
 #define CLIENTS_MAX 64
-#define BATCH 64                             /* records a system call */
-#define SEND_BUFFER_BYTES (8 * 1024 * 1024)  /* some 10,000 records; the default queue holds 278 */
+#define BATCH 64                            /* records a system call */
+#define SEND_BUFFER_BYTES (8 * 1024 * 1024) /* some 10,000 records; the default queue holds 278 */
 #define FULL_TIMEOUT_MS 2000
-#define READ_TURNS_MAX 65536                 /* a client that never stops sending cannot hold up the others for ever */
+#define READ_TURNS_MAX 65536 /* a client that never stops sending cannot hold up the others for ever */
 
 typedef struct {
     uint8_t time_ns[8];
@@ -50,8 +50,7 @@ typedef struct {
     record_t records[BATCH];
 } local_t;
 
-static void disconnect(local_t *local, unsigned index, const char *reason)
-{
+static void disconnect(local_t *local, unsigned index, const char *reason) {
     client_t *client = &local->clients[index];
     if (reason) {
         fprintf(stderr, "salient: client %" PRIu32 " of %s disconnected: %s\n", client->number, local->path, reason);
@@ -70,8 +69,7 @@ static void disconnect(local_t *local, unsigned index, const char *reason)
 
 static void local_flush(transport_t *transport);
 
-static void accept_clients(local_t *local)
-{
+static void accept_clients(local_t *local) {
     for (;;) {
         int descriptor = accept4(local->listener, NULL, NULL, SOCK_NONBLOCK | SOCK_CLOEXEC);
         if (descriptor < 0) {
@@ -87,13 +85,11 @@ static void accept_clients(local_t *local)
         if (setsockopt(descriptor, SOL_SOCKET, SO_SNDBUFFORCE, &bytes, sizeof bytes) != 0) {
             setsockopt(descriptor, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes);
         }
-        local->clients[local->client_count++] =
-            (client_t){.descriptor = descriptor, .number = ++local->clients_ever};
+        local->clients[local->client_count++] = (client_t){.descriptor = descriptor, .number = ++local->clients_ever};
     }
 }
 
-static size_t local_descriptors(transport_t *transport, struct pollfd *list)
-{
+static size_t local_descriptors(transport_t *transport, struct pollfd *list) {
     local_t *local = (local_t *)transport;
     list[0] = (struct pollfd){.fd = local->listener, .events = POLLIN};
     for (unsigned i = 0; i < local->client_count; ++i) {
@@ -105,8 +101,7 @@ static size_t local_descriptors(transport_t *transport, struct pollfd *list)
 typedef enum { READ_NOTHING, READ_RECORD, READ_GONE } read_result_t;
 
 /* Index of the first client with this number or a later one. Numbers outlive a disconnection, indices do not. */
-static unsigned index_from(const local_t *local, uint32_t number)
-{
+static unsigned index_from(const local_t *local, uint32_t number) {
     unsigned index = 0;
     while (index < local->client_count && local->clients[index].number < number) {
         ++index;
@@ -114,8 +109,7 @@ static unsigned index_from(const local_t *local, uint32_t number)
     return index;
 }
 
-static read_result_t read_one(local_t *local, unsigned index, const transport_receiver_t *receiver, size_t *taken)
-{
+static read_result_t read_one(local_t *local, unsigned index, const transport_receiver_t *receiver, size_t *taken) {
     client_t *client = &local->clients[index];
     record_t record;
     ssize_t size = recv(client->descriptor, &record, sizeof record, MSG_DONTWAIT | MSG_TRUNC);
@@ -149,8 +143,7 @@ static read_result_t read_one(local_t *local, unsigned index, const transport_re
     return READ_RECORD;
 }
 
-static size_t local_read(transport_t *transport, const transport_receiver_t *receiver)
-{
+static size_t local_read(transport_t *transport, const transport_receiver_t *receiver) {
     local_t *local = (local_t *)transport;
     size_t taken = 0;
     bool more = true;
@@ -169,11 +162,10 @@ static size_t local_read(transport_t *transport, const transport_receiver_t *rec
 }
 
 /* Sends the batch to one client; false when the client is to be disconnected, with the reason, NULL when it left. */
-static bool send_batch(local_t *local, client_t *client, const char **reason)
-{
+static bool send_batch(local_t *local, client_t *client, const char **reason) {
     for (unsigned sent = 0; sent < local->batched;) {
-        int result = sendmmsg(client->descriptor, local->messages + sent, local->batched - sent,
-                              MSG_DONTWAIT | MSG_NOSIGNAL);
+        int result =
+            sendmmsg(client->descriptor, local->messages + sent, local->batched - sent, MSG_DONTWAIT | MSG_NOSIGNAL);
         if (result > 0) {
             sent += (unsigned)result;
             continue;
@@ -198,8 +190,7 @@ static bool send_batch(local_t *local, client_t *client, const char **reason)
     return true;
 }
 
-static void local_flush(transport_t *transport)
-{
+static void local_flush(transport_t *transport) {
     local_t *local = (local_t *)transport;
     if (local->batched == 0) {
         return;
@@ -216,8 +207,7 @@ static void local_flush(transport_t *transport)
 }
 
 static void local_send(transport_t *transport, uint64_t time_ns, transport_origin_t origin,
-                       const transport_frame_t *frame)
-{
+                       const transport_frame_t *frame) {
     (void)origin; /* every record carries its time */
     local_t *local = (local_t *)transport;
     if (local->client_count == 0) {
@@ -234,8 +224,7 @@ static void local_send(transport_t *transport, uint64_t time_ns, transport_origi
     }
 }
 
-static void local_close(transport_t *transport)
-{
+static void local_close(transport_t *transport) {
     local_t *local = (local_t *)transport;
     local_flush(transport);
     while (local->client_count > 0) {
@@ -250,8 +239,7 @@ static void local_close(transport_t *transport)
 }
 
 /* Frees `path` of a socket that nobody serves any more; false with a line in `error` when it is in use. */
-static bool remove_stale(const char *path, const struct sockaddr_un *address, char error[TRANSPORT_ERROR_SIZE])
-{
+static bool remove_stale(const char *path, const struct sockaddr_un *address, char error[TRANSPORT_ERROR_SIZE]) {
     struct stat status;
     if (lstat(path, &status) != 0) {
         return true; /* nothing there; bind will say if the folder is missing */
@@ -261,8 +249,8 @@ static bool remove_stale(const char *path, const struct sockaddr_un *address, ch
         return false;
     }
     int probe = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
-    bool refused = probe >= 0 && connect(probe, (const struct sockaddr *)address, sizeof *address) != 0 &&
-                   errno == ECONNREFUSED;
+    bool refused =
+        probe >= 0 && connect(probe, (const struct sockaddr *)address, sizeof *address) != 0 && errno == ECONNREFUSED;
     if (probe >= 0) {
         close(probe);
     }
@@ -274,12 +262,12 @@ static bool remove_stale(const char *path, const struct sockaddr_un *address, ch
     return true;
 }
 
-transport_t *transport_local_open(const char *path, char error[TRANSPORT_ERROR_SIZE])
-{
+transport_t *transport_local_open(const char *path, char error[TRANSPORT_ERROR_SIZE]) {
     struct sockaddr_un address = {.sun_family = AF_UNIX};
     if (strlen(path) >= sizeof address.sun_path) {
-        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%.60s...: the path has %zu characters, at most %zu are allowed",
-                 path, strlen(path), sizeof address.sun_path - 1);
+        snprintf(error, TRANSPORT_ERROR_SIZE,
+                 "--can unix:%.60s...: the path has %zu characters, at most %zu are allowed", path, strlen(path),
+                 sizeof address.sun_path - 1);
         return NULL;
     }
     memcpy(address.sun_path, path, strlen(path) + 1);

@@ -32,20 +32,17 @@ typedef struct {
     char failure[TRANSPORT_ERROR_SIZE];
 } socketcan_t;
 
-static size_t socketcan_descriptors(transport_t *transport, struct pollfd *list)
-{
+static size_t socketcan_descriptors(transport_t *transport, struct pollfd *list) {
     list[0] = (struct pollfd){.fd = ((socketcan_t *)transport)->descriptor, .events = POLLIN};
     return 1;
 }
 
-static void fail(socketcan_t *can)
-{
+static void fail(socketcan_t *can) {
     snprintf(can->failure, sizeof can->failure, "CAN interface: %s", strerror(errno));
     can->transport.failure = can->failure;
 }
 
-static size_t socketcan_read(transport_t *transport, const transport_receiver_t *receiver)
-{
+static size_t socketcan_read(transport_t *transport, const transport_receiver_t *receiver) {
     socketcan_t *can = (socketcan_t *)transport;
     size_t taken = 0;
     while (taken < READ_MAX && receiver->may_read(receiver->context, ALL_CLIENTS)) {
@@ -69,8 +66,7 @@ static size_t socketcan_read(transport_t *transport, const transport_receiver_t 
     return taken;
 }
 
-static void send_frame(socketcan_t *can, const transport_frame_t *frame)
-{
+static void send_frame(socketcan_t *can, const transport_frame_t *frame) {
     for (int waited_ms = 0; !can->transport.failure;) {
         if (send(can->descriptor, &frame->flexible, frame->size, MSG_DONTWAIT | MSG_NOSIGNAL) >= 0) {
             return;
@@ -92,20 +88,18 @@ static void send_frame(socketcan_t *can, const transport_frame_t *frame)
     }
 }
 
-static void send_stamp(socketcan_t *can, uint64_t time_ns, uint8_t subject)
-{
+static void send_stamp(socketcan_t *can, uint64_t time_ns, uint8_t subject) {
     struct rig_rig_stamp_t stamp;
     rig_rig_stamp_set_time_ns(&stamp, (int64_t)time_ns);
     stamp.subject = subject;
-    transport_frame_t frame = {.size = CAN_MTU,
-                               .classic = {.can_id = RIG_RIG_STAMP_FRAME_ID | CAN_EFF_FLAG, .len = RIG_RIG_STAMP_LENGTH}};
+    transport_frame_t frame = {
+        .size = CAN_MTU, .classic = {.can_id = RIG_RIG_STAMP_FRAME_ID | CAN_EFF_FLAG, .len = RIG_RIG_STAMP_LENGTH}};
     rig_rig_stamp_pack(frame.classic.data, &stamp, RIG_RIG_STAMP_LENGTH);
     send_frame(can, &frame);
 }
 
 static void socketcan_send(transport_t *transport, uint64_t time_ns, transport_origin_t origin,
-                           const transport_frame_t *frame)
-{
+                           const transport_frame_t *frame) {
     socketcan_t *can = (socketcan_t *)transport;
     switch (origin) {
     case TRANSPORT_FROM_EMULATOR:
@@ -124,10 +118,11 @@ static void socketcan_send(transport_t *transport, uint64_t time_ns, transport_o
     }
 }
 
-static void socketcan_flush(transport_t *transport) { (void)transport; /* frames are sent one by one */ }
+static void socketcan_flush(transport_t *transport) {
+    (void)transport; /* frames are sent one by one */
+}
 
-static void socketcan_close(transport_t *transport)
-{
+static void socketcan_close(transport_t *transport) {
     socketcan_t *can = (socketcan_t *)transport;
     if (can->dropped) {
         fprintf(stderr, "salient: %llu frames did not fit into the CAN interface's queue\n",
@@ -137,8 +132,7 @@ static void socketcan_close(transport_t *transport)
     free(can);
 }
 
-transport_t *transport_socketcan_attach(int descriptor)
-{
+transport_t *transport_socketcan_attach(int descriptor) {
     socketcan_t *can = calloc(1, sizeof *can);
     if (!can) {
         close(descriptor);
@@ -153,8 +147,7 @@ transport_t *transport_socketcan_attach(int descriptor)
     return &can->transport;
 }
 
-transport_t *transport_socketcan_open(const char *interface, char error[TRANSPORT_ERROR_SIZE])
-{
+transport_t *transport_socketcan_open(const char *interface, char error[TRANSPORT_ERROR_SIZE]) {
     struct ifreq request = {0};
     if (strlen(interface) >= sizeof request.ifr_name) {
         snprintf(error, TRANSPORT_ERROR_SIZE, "--can socketcan:%.40s: an interface name has at most %zu characters",
@@ -177,8 +170,8 @@ transport_t *transport_socketcan_open(const char *interface, char error[TRANSPOR
         return NULL;
     }
     if (ioctl(descriptor, SIOCGIFFLAGS, &request) != 0 || !(request.ifr_flags & IFF_UP)) {
-        snprintf(error, TRANSPORT_ERROR_SIZE, "--can socketcan:%s: the interface is down (ip link set %s up)", interface,
-                 interface);
+        snprintf(error, TRANSPORT_ERROR_SIZE, "--can socketcan:%s: the interface is down (ip link set %s up)",
+                 interface, interface);
         close(descriptor);
         return NULL;
     }

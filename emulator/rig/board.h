@@ -1,0 +1,61 @@
+/* The emulated board: the registers that a port of the firmware reads and writes. The rig moves them in time.
+ *
+ * Nothing here knows the firmware; a port maps its hal_* functions to these, one to one.
+ */
+#ifndef RIG_BOARD_H
+#define RIG_BOARD_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "hal_adc.h"
+#include "hal_can.h"
+#include "hal_pwm.h"
+#include "plant/plant.h"
+#include "plant/sensors.h"
+#include "rig/can_bus.h"
+
+/* From where the firmware is being called. */
+typedef enum { BOARD_START, BOARD_INTERRUPT, BOARD_BACKGROUND } board_context_t;
+
+typedef struct {
+    uint64_t time_ns;
+    board_context_t context;
+    bool in_critical_section;
+
+    hal_adc_sample_t adc;    /* latched at the period's start */
+    uint32_t encoder_counts; /* likewise */
+    unsigned encoder_bits;   /* 8..32 */
+
+    uint16_t period_ticks; /* 0 until the timer is started */
+    hal_pwm_compare_t active, buffered;
+    uint32_t missed_interrupts; /* since last read */
+
+    hal_can_frame_t received[HAL_CAN_RECEIVE_QUEUE];
+    uint32_t received_pushed, received_popped; /* counts, not indices */
+    uint32_t receive_overflows;
+
+    plant_t *plant;
+    sensors_t *sensors;
+    can_bus_t *bus;
+} board_t;
+
+/* A board after reset at time 0: timer stopped, switches open, queues empty. encoder_bits 8..32, 0 means ideal (32).
+ * The board uses plant, sensors and bus and does not own them. */
+void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, unsigned encoder_bits);
+
+/* For the rig: a control period starts now, the plant is there. Latches the sensors; the buffered compare values
+ * become active unless the interrupt is still running (`busy`), then the interrupt is lost and counted. */
+void board_start_period(board_t *board, bool busy);
+
+/* For the rig: a frame of another node is complete. */
+void board_deliver(board_t *board, const hal_can_frame_t *frame);
+
+/* For the port; each is the hal_* function of the same name. */
+void board_pwm_start(board_t *board, uint16_t period_ticks);
+void board_pwm_open_all(board_t *board);
+uint32_t board_pwm_missed_interrupts(board_t *board);
+bool board_can_receive(board_t *board, hal_can_frame_t *frame);
+bool board_can_transmit(board_t *board, const hal_can_frame_t *frame);
+
+#endif

@@ -1,0 +1,109 @@
+/* The test bench: owns virtual time, and joins plant, board, CAN bus and clients.
+ *
+ * One thread, next event first. Events of the same instant come in this order: quantities set ahead (RIG_SET), the CAN
+ * bus, the control period, the background after an interrupt that takes time, the truth frames; then the clients. The
+ * plant is advanced exactly to the events that touch it, and to no others, so that where a client cuts the time into
+ * RIG_RUN_UNTILs does not change a bit of what happens.
+ *
+ * In lock-step time stands still until a client sends RIG_RUN_UNTIL; clients are not read while time runs. Frames for
+ * the bus that were sent while it stood still begin in the order in which their clients connected, then in the order
+ * of each client, whatever the moment they arrived; a client's frames that were sent before another client's
+ * RIG_RUN_UNTIL are taken before it. In the other paces clients are read each RIG_READ_STEP_NS of virtual time.
+ */
+#ifndef RIG_RIG_H
+#define RIG_RIG_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "plant/machine.h"
+#include "plant/plant.h"
+#include "plant/sensors.h"
+#include "rig/board.h"
+#include "rig/can_bus.h"
+#include "rig/pacing.h"
+#include "rig/quantity.h"
+#include "rig/transport.h"
+
+#define RIG_READ_STEP_NS UINT64_C(1000000)
+#define RIG_STOP_STEP_NS UINT64_C(10000000) /* virtual time between two looks whether to stop */
+#define RIG_NEVER UINT64_MAX
+#define RIG_RUNS_MAX 64           /* RIG_RUN_UNTILs that wait for their time */
+#define RIG_MOVING_BACKLOG_MAX 64 /* paces that move by themselves: clients wait while so many frames are queued */
+
+/* The firmware, seen from the emulator. Both take no virtual time, except as interrupt_time_us says. */
+typedef struct {
+    void (*control_interrupt)(void *context); /* at the start of each control period */
+    void (*background)(void *context);        /* after each interrupt */
+    void *context;
+} rig_firmware_t;
+
+/* When to end: `requested` is asked at least every RIG_STOP_STEP_NS, and when a descriptor becomes readable. */
+typedef struct {
+    int descriptors[2]; /* negative: not used */
+    bool (*requested)(void *context);
+    void *context;
+} rig_stop_t;
+
+typedef struct {
+    const machine_t *machine;
+    double initial_angle_rad;
+    unsigned encoder_bits; /* 8..32, 0 means ideal */
+    uint64_t seed;
+    uint32_t bit_rate;
+    pacing_t pacing;
+    uint64_t stop_at_ns;    /* RIG_NEVER: no end */
+    rig_stop_t stop;        /* requested NULL: never */
+    transport_t *transport; /* outlives the rig, is not closed by it */
+} rig_config_t;
+
+typedef struct {
+    uint32_t client;
+    uint32_t arrival;
+    hal_can_frame_t frame;
+} rig_staged_t;
+
+typedef struct {
+    uint64_t time_ns;
+    uint8_t sequence;
+    uint32_t client;
+} rig_run_t;
+
+/* Large (several MB): static or on the heap. */
+typedef struct {
+    plant_t plant;
+    sensors_t sensors;
+    can_bus_t bus;
+    board_t board; /* board.time_ns is the time */
+
+    /* The rest is rig.c's. */
+    rig_config_t config;
+    rig_firmware_t firmware;
+    uint64_t period_ns;
+    uint64_t control_ns, background_ns, truth_ns; /* when each is due next */
+    uint64_t truth_period_ns;
+    uint64_t interrupt_time_ns, interrupt_end_ns;
+    quantity_queue_t settings;
+    rig_run_t runs[RIG_RUNS_MAX]; /* by time, equal times in the order of arrival */
+    unsigned run_count;
+    uint64_t stop_asked_ns;
+    unsigned staged_count;
+    bool staged_mixed; /* not in the order of clients yet */
+    rig_staged_t staged[CAN_BUS_CLIENT_QUEUE];
+} rig_t;
+
+/* A bench at time 0: machine at rest, supply on, no load, no firmware. */
+void rig_init(rig_t *rig, const rig_config_t *config);
+
+/* Joins the firmware, which must have started the timer (hal_pwm_start); its first interrupt is one period away. */
+void rig_join(rig_t *rig, const rig_firmware_t *firmware);
+
+/* One round. Lock-step: takes what clients sent; runs to the time asked for, or waits up to timeout_ms (negative: for
+ * ever) when none was. Other paces: runs to the next reading point. False when it is over: asked to stop, stop_at_ns
+ * reached, or config.transport->failure. */
+bool rig_serve(rig_t *rig, int timeout_ms);
+
+/* Brings the plant (and who observes it) to the present time, and sends what is still in batches. */
+void rig_finish(rig_t *rig);
+
+#endif
