@@ -103,17 +103,17 @@ def captions(results: Mapping[str, Any]) -> dict[str, str]:
     start, step = results["experiments"]["start_600"], results["experiments"]["load_step_150"]
     return {
         "figure_5":
-            "Speed from standstill to 600 r/min. The green band is ±0.5 %, the dot is where the speed enters it for good,"
-            " the hollow diamond is the time that the paper prints. " + _each(start, "settling_time_s")
+            "Speed from standstill to 600 r/min. The green band is ±0.5 %, the dot is where the speed enters it for"
+            " good, the hollow diamond is the time that the paper prints. " + _each(start, "settling_time_s")
             + " Below, the neighbourhood of 600 r/min with the highest speed (coloured) and the paper's (grey).",
         "figure_6":
             "Speed at 150 r/min when 8 N m of load are switched on at 0.13 s: the whole run, the time around the step,"
             " and the first 10 ms after it; the scales are the same for all controllers. "
             + _each(step, "speed_dip_rpm") + " " + _each(step, "recovery_time_s"),
         "figure_7":
-            "True shaft torque around the load step (black: the load), in the steady window from 0.3 s to 0.4 s with its"
-            " extremes and its mean, and a single millisecond of it. Each column of pixels reaches from the lowest to the"
-            " highest sample in it, so no spike is lost in drawing. " + _each(step, "torque_ripple"),
+            "True shaft torque around the load step (black: the load), in the steady window from 0.3 s to 0.4 s with"
+            " its extremes and its mean, and a single millisecond of it. Each column of pixels reaches from the lowest"
+            " to the highest sample in it, so no spike is lost in drawing. " + _each(step, "torque_ripple"),
         "phase_currents":
             "Phase currents and torque over two strokes of the rotor (60 degrees) in the steady window. Where one phase"
             " hands over to the next, both carry current and the torque is hardest to hold.",

@@ -1,0 +1,261 @@
+"""salient demo: the paper's two experiments, each by every controller, over CAN.
+
+Left in the folder: results.json, report.html, figures/*.png, and in runs/<experiment>_<controller>/ what run_scenario
+leaves: the CAN log as BLF and as candump text, and the recording of the true state.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from salient import figures, metrics
+from salient.errors import UsageError
+from salient.paths import SCENARIOS
+from salient.progress import Progress
+from salient.report import ROWS, Picture, captions, printed_words_for, words_for, write_report
+from salient.results import make_results, write_results
+from salient.scenario import CONTROL_RATES_HZ, Scenario, load_scenarios, run_scenario
+from salient.simulator import executable
+
+Merits = dict[str, float | None]
+
+EXPERIMENTS = ("start_600", "load_step_150")
+DEFAULT_OUT = Path("out/demo")
+
+# As hal/hal_adc.h has it.
+ADC = {"bits": 12, "current_range_A": [0.0, 80.0]}
+
+# name of the picture's file -> title, experiment
+PICTURES = {
+    "figure_5": ("Figure 5: start to 600 r/min without load", "start_600"),
+    "figure_6": ("Figure 6: speed at 150 r/min with a load step of 8 N m", "load_step_150"),
+    "figure_7": ("Figure 7: torque at 150 r/min with a load step of 8 N m", "load_step_150"),
+    "phase_currents": ("Phase currents over two strokes", "load_step_150"),
+}
+
+_WORKERS = 2
+
+
+class DemoFailed(Exception):
+    """A run from which the figures cannot be taken; one line that names the run. Exit code 1."""
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run as it comes back from the process that made it."""
+
+    experiment: str
+    scenario: Scenario
+    merits: Merits
+    log_paths: tuple[Path, Path]
+    recording_path: Path
+
+    @property
+    def controller(self) -> str:
+        return self.scenario.controller
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of `salient demo`."""
+    parser.add_argument("--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help=f"folder (default {DEFAULT_OUT})")
+    parser.add_argument("--machine", metavar="NAME|FILE", help="machine (default saturating)")
+    parser.add_argument("--control-rate-hz", type=int, metavar="N", help="20000, 40000 (default), 50000 or 100000")
+    parser.add_argument("--encoder-bits", type=int, metavar="N", help="8 to 24, 17 by default; 0 is an ideal encoder")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of everything random (default 1)")
+
+
+def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.stdout) -> int:
+    """Runs everything, tells `stream` how far it is and what came out. Returns 0.
+
+    can: "local" for a bus of its own for each run, or "socketcan:INTERFACE", on which the runs follow each other.
+    Raises UsageError, before anything is written where that can be known, and DemoFailed.
+    """
+    scenarios = _scenarios(options)
+    out: Path = options.out
+    _prepare_folder(out)
+    with (ProcessPoolExecutor(max_workers=_WORKERS if can == "local" else 1) as workers,
+          Progress(sum(map(len, scenarios.values())) + len(PICTURES) + 1, stream) as progress):
+        runs = _run_all(workers, scenarios, out, can, progress)
+        results = make_results(_merits(runs), _conditions(scenarios))
+        pictures = _draw_all(workers, runs, results, out, progress)
+        write_results(out / "results.json", results)
+        write_report(out / "report.html", results, pictures, _commands(scenarios), _files(runs, out))
+        progress.step("report.html")
+    stream.write(f"{summary(results)}\n\nresults: {out / 'results.json'}\nreport:  {out / 'report.html'}\n")
+    return 0
+
+
+def summary(results: Mapping[str, Any]) -> str:
+    """The figures of both experiments beside the paper's, as a small table for a terminal."""
+    lines = []
+    for experiment, merits in results["experiments"].items():
+        printed = results["paper"][experiment]
+        lines += ["", f"{experiment:<30}" + "".join(f"{controller:>16}{'printed':>14}" for controller in merits)]
+        for name in next(iter(merits.values())):
+            cells = "".join(f"{words_for(name, of[name]):>16}{printed_words_for(name, printed[controller][name]):>14}"
+                            for controller, of in merits.items())
+            lines.append(f"  {_plain(ROWS[name][0]):<28}{cells}")
+    return "\n".join(lines[1:])
+
+
+# --- runs -----------------------------------------------------------------------------------------------------------
+
+def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
+    """Experiment -> one scenario for each controller, with what the options change."""
+    allowed = {"control_rate_hz": CONTROL_RATES_HZ, "encoder_bits": (0, *range(8, 25))}
+    changes = {name: value for name in ("machine", "control_rate_hz", "encoder_bits", "seed")
+               if (value := getattr(options, name)) is not None}
+    for name, values in allowed.items():
+        if name in changes and changes[name] not in values:
+            raise UsageError(f"--{name.replace('_', '-')} {changes[name]}: allowed are {', '.join(map(str, values))}")
+    if not 0 <= changes.get("seed", 0) < 2**63:
+        raise UsageError(f"--seed {changes['seed']}: allowed are 0 to {2**63 - 1}")
+    scenarios = {experiment: [replace(scenario, **changes)
+                              for scenario in load_scenarios(SCENARIOS / f"{experiment}.toml")]
+                 for experiment in EXPERIMENTS}
+    executable(scenarios["start_600"][0].machine)
+    return scenarios
+
+
+def _prepare_folder(out: Path) -> None:
+    """Makes the folder, and takes away what would look like this demo's results if it failed half-way."""
+    try:
+        (out / "figures").mkdir(parents=True, exist_ok=True)
+        for name in ("results.json", "report.html"):
+            (out / name).unlink(missing_ok=True)
+            (out / name).touch()
+            (out / name).unlink()
+    except OSError as error:
+        raise UsageError(f"--out {out}: cannot write there ({error.strerror}); give a folder that can be written"
+                         ) from error
+
+
+def _run_all(workers: Executor, scenarios: Mapping[str, Iterable[Scenario]], out: Path, can: str,
+             progress: Progress) -> list[_Run]:
+    started = {}
+    for experiment, of in scenarios.items():
+        for scenario in of:
+            folder = out / "runs" / f"{experiment}_{scenario.controller}"
+            started[f"{experiment} by {scenario.controller}"] = workers.submit(_run_one, experiment, scenario, folder,
+                                                                               can)
+    return _gather(started, progress)
+
+
+def _run_one(experiment: str, scenario: Scenario, folder: Path, can: str) -> _Run:
+    result = run_scenario(scenario, folder, can=can)
+    failure = f"{experiment} by {scenario.controller}: %s; see {result.text_log_path}"
+    if result.fault != "none":
+        raise DemoFailed(failure % f"the drive ended in fault {result.fault}")
+    try:
+        merits = _take(experiment, scenario, result.recording)
+    except metrics.MetricsError as error:
+        raise DemoFailed(failure % error) from error
+    return _Run(experiment, scenario, merits, (result.log_path, result.text_log_path), result.recording_path)
+
+
+def _take(experiment: str, scenario: Scenario, recording: np.ndarray) -> Merits:
+    reference = scenario.speed[0]
+    if experiment == "start_600":
+        return metrics.start_metrics(recording, reference.value_rpm, reference.at_s)
+    return metrics.load_step_metrics(recording, reference.value_rpm, scenario.load[0].at_s)
+
+
+def _gather(started: Mapping[str, Future], progress: Progress) -> list[Any]:
+    """The results in the order of `started`, with a step of progress as each is done; the first failure ends it."""
+    names = {future: name for name, future in started.items()}
+    try:
+        for future in as_completed(names):
+            future.result()
+            progress.step(names[future])
+    except BaseException:
+        for future in names:
+            future.cancel()
+        raise
+    return [future.result() for future in names]
+
+
+# --- what is made of them -------------------------------------------------------------------------------------------
+
+def _merits(runs: Iterable[_Run]) -> dict[str, dict[str, Merits]]:
+    experiments: dict[str, dict[str, Merits]] = {}
+    for made in runs:
+        experiments.setdefault(made.experiment, {})[made.controller] = made.merits
+    return experiments
+
+
+def _conditions(scenarios: Mapping[str, Sequence[Scenario]]) -> dict[str, Any]:
+    """What the figures hold for. The same for all runs, but for the recording's step, which is the ripple's."""
+    scenario = scenarios["load_step_150"][0]
+    return {
+        "control_rate_hz": scenario.control_rate_hz,
+        "adc": ADC,
+        "encoder": {"bits": scenario.encoder_bits or "ideal"},
+        "machine": Path(scenario.machine).stem,
+        "torque_sample_step_s": scenario.record.step_us * 1e-6,
+        "initial_angle_deg": scenario.initial_angle_deg,
+        "seed": scenario.seed,
+        "versions": {name: version(name) for name in ("salient", "python-can", "cantools", "numpy")},
+    }
+
+
+def _draw_all(workers: Executor, runs: Sequence[_Run], results: Mapping[str, Any], out: Path,
+              progress: Progress) -> list[Picture]:
+    words = captions(results)
+    pictures = [Picture(out / "figures" / f"{name}.png", title, words[name]) for name, (title, _) in PICTURES.items()]
+    _gather({f"{name}.png": workers.submit(_draw, name, out / "figures" / f"{name}.png",
+                                           [made for made in runs if made.experiment == experiment], results)
+             for name, (_, experiment) in PICTURES.items()}, progress)
+    return pictures
+
+
+def _draw(name: str, path: Path, runs: Sequence[_Run], results: Mapping[str, Any]) -> None:
+    experiment, scenario = runs[0].experiment, runs[0].scenario
+    recordings = {made.controller: np.load(made.recording_path, mmap_mode="r") for made in runs}
+    ours, paper = results["experiments"][experiment], results["paper"][experiment]
+    reference = scenario.speed[0]
+    if name == "figure_5":
+        figures.draw_start(path, recordings, ours, paper, reference.value_rpm, reference.at_s)
+    elif name == "figure_6":
+        figures.draw_load_step_speed(path, recordings, ours, paper, scenario.load[0].at_s, reference.value_rpm)
+    elif name == "figure_7":
+        figures.draw_load_step_torque(path, recordings, ours, paper, scenario.load[0].at_s)
+    else:
+        figures.draw_phase_currents(path, recordings)
+
+
+def _commands(scenarios: Mapping[str, Sequence[Scenario]]) -> list[str]:
+    one = scenarios["start_600"][0]
+    return [
+        "# everything on this page",
+        f"tools/salient demo --machine {shlex.quote(one.machine)} --control-rate-hz {one.control_rate_hz}"
+        f" --encoder-bits {one.encoder_bits} --seed {one.seed}",
+        "# one experiment, by both controllers",
+        *(f"tools/salient run tools/scenarios/{experiment}.toml" for experiment in scenarios),
+    ]
+
+
+def _files(runs: Iterable[_Run], out: Path) -> list[tuple[str, str]]:
+    files = [("results.json", "the figures of this page, for scripts")]
+    for made in runs:
+        run_of = f"{made.experiment} by {made.controller}"
+        log_path, text_log_path = made.log_paths
+        files += [
+            (log_path.relative_to(out).as_posix(), f"CAN log of {run_of}, on virtual time"),
+            (text_log_path.relative_to(out).as_posix(), "the same as text"),
+            (made.recording_path.relative_to(out).as_posix(), "the machine's true state, for numpy.load"),
+        ]
+    return files
+
+
+def _plain(words: str) -> str:
+    return words.replace("<i>", "").replace("</i>", "").replace("<sub>", "_").replace("</sub>", "")

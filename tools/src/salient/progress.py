@@ -1,0 +1,37 @@
+"""Says how far a command has come: in place on a terminal, a line a step elsewhere."""
+
+from __future__ import annotations
+
+from typing import TextIO
+
+_BAR_WIDTH = 24
+_ERASE_LINE = "\r\x1b[K"
+
+
+class Progress:
+    """Counts `total` steps on `stream`. Use as a context manager: leaving it clears what stands in place."""
+
+    def __init__(self, total: int, stream: TextIO) -> None:
+        self._total, self._done, self._stream = total, 0, stream
+        self._in_place = stream.isatty()
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._in_place:
+            self._write(_ERASE_LINE)
+
+    def step(self, what: str) -> None:
+        """One step more is done; `what` says which, in a few words."""
+        self._done += 1
+        if self._in_place:
+            filled = _BAR_WIDTH * self._done // self._total
+            bar = "#" * filled + "." * (_BAR_WIDTH - filled)
+            self._write(f"{_ERASE_LINE}[{bar}] {self._done}/{self._total} {what}")
+        else:
+            self._write(f"{self._done}/{self._total} {what}\n")
+
+    def _write(self, text: str) -> None:
+        self._stream.write(text)
+        self._stream.flush()
