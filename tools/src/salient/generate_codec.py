@@ -2,8 +2,8 @@
 
     python -m salient.generate_codec [--integer] FILE.dbc OUTDIR
 
-gives OUTDIR/FILE_codec.h and OUTDIR/FILE_codec.c, every name in them prefixed with `FILE_`. cantools' pack functions cut
-off the bits that do not fit a signal; the setters added here hold the value at the end of the signal's range instead.
+gives OUTDIR/FILE_codec.h and OUTDIR/FILE_codec.c, every name in them prefixed with `FILE_`. cantools' pack functions
+cut off the bits that do not fit a signal; the setters added here hold the value at the end of its range instead.
 The output depends on the database alone: no date, no version, no path.
 """
 
@@ -60,9 +60,13 @@ def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
                 continue
             low, high = raw_range(signal)
             field = camel_to_snake_case(signal.name)
-            unit = f", LSB {signal.scale} {signal.unit or ''}".rstrip() + (f", offset {signal.offset}" * (signal.offset != 0))
+            unit = f", LSB {signal.scale} {signal.unit or ''}".rstrip() + (
+                f", offset {signal.offset}" * (signal.offset != 0)
+            )
             prototype = f"void {message_name}_set_{field}(struct {message_name}_t *message, int64_t raw)"
-            declarations.append(f"/* {message.name}.{signal.name} = raw held within {low}..{high}{unit}. */\n{prototype};\n")
+            declarations.append(
+                f"/* {message.name}.{signal.name} = raw held within {low}..{high}{unit}. */\n{prototype};\n"
+            )
             definitions.append(
                 f"{prototype}\n{{\n"
                 f"    if (raw < {integer_literal(low)}) {{\n        raw = {integer_literal(low)};\n    }}\n"
@@ -73,8 +77,8 @@ def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
                 continue
             physical = f"void {message_name}_set_physical_{field}(struct {message_name}_t *message, double value)"
             declarations.append(
-                f"/* The same from a value in {signal.unit or 'its unit'}: rounded to the nearest raw value, held within\n"
-                f" * the range; not-a-number gives the lower end. */\n{physical};\n"
+                f"/* The same from a value in {signal.unit or 'its unit'}: rounded to the nearest raw value, held\n"
+                f" * within the range; not-a-number gives the lower end. */\n{physical};\n"
             )
             definitions.append(
                 f"{physical}\n{{\n"
@@ -89,13 +93,15 @@ def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
 def generate_codec(dbc: Path, integer: bool) -> dict[str, str]:
     """File name -> C text of the codec of `dbc`; `integer` leaves every floating-point conversion out."""
     try:
-        database = cantools.database.load_file(dbc, database_format="dbc")
+        # cantools passes over an incomplete last statement; one more statement behind it makes that an error.
+        text = dbc.read_text(encoding="cp1252") + "\nVAL_TABLE_ end_of_file ;\n"
+        database = cantools.database.load_string(text, database_format="dbc")
     except OSError as error:
         raise CodecError(f"{dbc}: {error.strerror}") from error
     except (cantools.database.UnsupportedDatabaseFormatError, cantools.Error, UnicodeDecodeError) as error:
         raise CodecError(f"{dbc}: {' '.join(str(error).split())}") from error
-    if not isinstance(database, Database):
-        raise CodecError(f"{dbc}: describes no CAN messages; a DBC file is expected")
+    if not database.messages:
+        raise CodecError(f"{dbc}: describes no CAN messages")
     prefix = camel_to_snake_case(dbc.stem)
     if not re.fullmatch(r"[a-z][a-z0-9_]*", prefix):
         raise CodecError(f"{dbc}: its name must begin a C identifier (letters, digits and _, no digit first)")
