@@ -2,7 +2,7 @@
  *
  * Layout: bytes 0 and 1 the checksum (low byte first), byte 2 the counter, data from byte 3. The checksum covers bytes
  * 2 to the end and then the data ID, low byte first, which is known to both sides and never sent: a frame that was
- * meant for something else fails. (AUTOSAR FO R22-11, Specification of E2E Protocol, chapter 6.6.)
+ * meant for something else fails. (AUTOSAR Foundation, E2E Protocol Specification, profile 5.)
  */
 #ifndef COMMS_E2E_H
 #define COMMS_E2E_H
