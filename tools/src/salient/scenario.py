@@ -30,13 +30,21 @@ from __future__ import annotations
 
 import json
 import math
-import os
+import tempfile
 import tomllib
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from salient.bench import Bench
+from salient.drive import DriveError, write_request
 from salient.errors import UsageError
+from salient.log_files import write_logs
+from salient.signals import SignalTable, drive_database
+from salient.simulator import SimulatorOptions, executable, parameter_table
 
 CONTROLLERS = ("traditional", "paper")
 CONTROL_RATES_HZ = (20_000, 40_000, 50_000, 100_000)
@@ -99,7 +107,227 @@ class RunResult:
     log_path: Path
     text_log_path: Path
     recording_path: Path | None
-    recording: Any
-    telemetry: Any
-    truth: Any
+    recording: np.ndarray | None
+    telemetry: SignalTable
+    truth: SignalTable
     fault: str
+
+
+# --- running --------------------------------------------------------------------------------------------------------
+
+_RECORDING, _LOG, _TEXT_LOG = "recording.npy", "can.blf", "can.log"
+
+
+def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: str = "host") -> RunResult:
+    """Runs a scenario in lock-step and leaves recording.npy, can.blf and can.log in out_dir, which is made if needed.
+
+    can: "local" for a bus of its own, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; parameters
+    are written first, then the commands follow. UsageError for what the drive does not know or refuses.
+    """
+    out_dir.mkdir(parents=True, exist_ok=True)
+    recording_path = out_dir / _RECORDING if scenario.record else None
+    options = SimulatorOptions(
+        machine=scenario.machine,
+        controller=scenario.controller,
+        control_rate_hz=scenario.control_rate_hz,
+        encoder_bits=scenario.encoder_bits,
+        seed=scenario.seed,
+        initial_angle_deg=scenario.initial_angle_deg,
+        record=recording_path,
+        record_step_ns=round(scenario.record.step_us * 1000) if scenario.record else 1000,
+        record_from_us=round(scenario.record.from_s * 1e6) if scenario.record else 0,
+        build=build,
+    )
+    with tempfile.TemporaryDirectory(prefix="salient-") as folder:
+        with Bench(options, f"unix:{folder}/can.sock" if can == "local" else can) as bench:
+            _write_parameters(bench, scenario.parameters)
+            for step in scenario.load:
+                bench.at(step.at_s).load_torque_Nm = step.torque_Nm
+            for step in sorted(scenario.speed, key=lambda step: step.at_s):
+                bench.advance_to(round(step.at_s * 1e9))
+                bench.drive.speed_reference_rpm = step.value_rpm
+            bench.advance_to(round(scenario.duration_s * 1e9))
+            _check_parameters_taken(bench, scenario.parameters)
+            fault = bench.drive.fault
+        write_logs(bench.log, out_dir / _LOG, out_dir / _TEXT_LOG)
+    return RunResult(
+        scenario=scenario,
+        folder=out_dir,
+        log_path=out_dir / _LOG,
+        text_log_path=out_dir / _TEXT_LOG,
+        recording_path=recording_path,
+        recording=np.load(recording_path, mmap_mode="r") if recording_path else None,
+        telemetry=bench.telemetry,
+        truth=bench.truth,
+        fault=fault,
+    )
+
+
+def _write_parameters(bench: Bench, values: dict[str, float]) -> None:
+    """Sends all writes at once, ahead of the first command; their answers are looked at in the end."""
+    for name, value in values.items():
+        try:
+            row = bench.drive.parameters.row(name)
+        except KeyError as error:
+            raise UsageError(f"parameters.{name}: {error.args[0]}") from None
+        if not row.minimum <= value <= row.maximum:
+            allowed = f"{row.minimum:g} to {row.maximum:g} {row.unit}".rstrip()
+            raise UsageError(f"parameters.{name}: {value:g}: allowed are {allowed}")
+        bench.send(write_request(row, value))
+
+
+def _check_parameters_taken(bench: Bench, values: dict[str, float]) -> None:
+    message = drive_database().get_message_by_name("PARAMETER_RESPONSE")
+    answers = [m for _, m in bench.log if m.arbitration_id == message.frame_id and not m.is_extended_id]
+    refused = [a for a in answers if message.decode(bytes(a.data))["status"] != "done"]
+    if refused or len(answers) != len(values):
+        raise DriveError(f"{len(values)} parameters written, {len(answers)} answers, {len(refused)} of them refusals")
+
+
+def summary(result: RunResult) -> dict[str, Any]:
+    """Figures of a run in general: speeds and torques over the recording (or, without one, the true state on CAN)."""
+    source: Any = result.recording
+    if source is None:
+        source = {name: result.truth[name].value for name in ("speed_rpm", "torque_Nm")}
+    speed_rpm, torque_Nm = np.asarray(source["speed_rpm"]), np.asarray(source["torque_Nm"])
+    return {
+        "max_speed_rpm": float(speed_rpm.max()),
+        "final_speed_rpm": float(speed_rpm[-1]),
+        "torque_max_Nm": float(torque_Nm.max()),
+        "torque_min_Nm": float(torque_Nm.min()),
+        "torque_mean_Nm": float(torque_Nm.mean(dtype=float)),
+        "frames": result.telemetry.count("DRIVE_STATUS"),
+        "fault": result.fault,
+    }
+
+
+def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local",
+            progress: Callable[[str], None] = lambda line: None) -> dict[str, RunResult]:
+    """Runs the scenarios of one file, each into out_dir/CONTROLLER, and writes out_dir/results.json."""
+    for scenario in scenarios:
+        executable(scenario.machine)
+        parameter_table(SimulatorOptions(machine=scenario.machine, controller=scenario.controller))
+    results = {}
+    for scenario in scenarios:
+        progress(f"{scenario.name}: {scenario.controller}, {scenario.duration_s:g} s of virtual time")
+        results[scenario.controller] = run_scenario(scenario, out_dir / scenario.controller, can)
+    content = {
+        "schema": 1,
+        "scenario": {key: value for key, value in asdict(scenarios[0]).items() if key != "controller"},
+        "controllers": {controller: summary(result) for controller, result in results.items()},
+    }
+    text = json.dumps(content, indent=2, sort_keys=True) + "\n"
+    (out_dir / "results.json").write_text(text, encoding="utf-8")
+    return results
+
+
+# --- reading --------------------------------------------------------------------------------------------------------
+
+# Key -> (smallest, largest) or the values allowed.
+_DURATION_S = (1e-3, 3600.0)
+_SEED = (0, 2**63 - 1)
+_STEPS: dict[str, dict[str, tuple[float, float]]] = {
+    "speed": {"at_s": (0.0, 3600.0), "value_rpm": (-3000.0, 3000.0)},
+    "load": {"at_s": (0.0, 3600.0), "torque_Nm": (-200.0, 200.0)},
+}
+_RECORD = {"step_us": (0.1, 1e6), "from_s": (0.0, 3600.0)}
+_TOP = ("machine", "controllers", "duration_s", "seed", "initial_angle_deg", "control_rate_hz", "encoder_bits",
+        "parameters", "speed", "load", "record")  # fmt: skip
+_ENCODER_BITS = (0, *range(8, 25))
+
+
+def load_scenarios(path: Path) -> list[Scenario]:
+    """Reads and checks a scenario file; one Scenario for each controller it names.
+
+    UsageError names file, key and what is allowed. A relative path of a machine file is taken from the scenario's
+    folder.
+    """
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UsageError(f"{path}: no such scenario file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: cannot be read: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"{path}: not TOML: {error}") from None
+    reader = _Reader(path)
+    reader.known_keys("", data, _TOP)
+    for key in ("machine", "controllers", "duration_s"):
+        if key not in data:
+            raise UsageError(f"{path}: {key}: missing")
+    if not isinstance(data["machine"], str):
+        raise UsageError(f"{path}: machine: {data['machine']!r} is not the name of a machine or of its file")
+    beside = path.parent / data["machine"]
+    machine = str(beside.resolve()) if beside.suffix == ".toml" else data["machine"]
+    record = reader.table("record", data.get("record", {}), _RECORD)
+    parameters = data.get("parameters", {})
+    if not isinstance(parameters, dict):
+        raise UsageError(f"{path}: parameters: a table [parameters] is wanted")
+    common: dict[str, Any] = {
+        "name": path.stem,
+        "machine": machine,
+        "duration_s": reader.number("duration_s", data["duration_s"], *_DURATION_S),
+        "seed": reader.whole("seed", data.get("seed", 1), *_SEED),
+        "initial_angle_deg": reader.number("initial_angle_deg", data.get("initial_angle_deg", 0.0), -360.0, 360.0),
+        "control_rate_hz": reader.one_of("control_rate_hz", data.get("control_rate_hz", 40_000), CONTROL_RATES_HZ),
+        "encoder_bits": reader.one_of("encoder_bits", data.get("encoder_bits", 17), _ENCODER_BITS),
+        "parameters": {key: reader.number(f"parameters.{key}", value) for key, value in parameters.items()},
+        "speed": tuple(SpeedStep(**step) for step in reader.steps("speed", data.get("speed", []))),
+        "load": tuple(LoadStep(**step) for step in reader.steps("load", data.get("load", []))),
+        "record": Record(**record) if "record" in data else None,
+    }
+    controllers = data["controllers"]
+    if not isinstance(controllers, list) or not controllers or len(set(map(str, controllers))) != len(controllers):
+        raise UsageError(f"{path}: controllers: a list of different ones of {', '.join(CONTROLLERS)} is wanted")
+    for controller in controllers:
+        reader.one_of("controllers", controller, CONTROLLERS)
+    executable(machine)
+    return [Scenario(controller=controller, **common) for controller in controllers]
+
+
+class _Reader:
+    """Checks values; every mistake names file and key."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def known_keys(self, section: str, table: dict, allowed: tuple[str, ...]) -> None:
+        for key in table:
+            if key not in allowed:
+                name = f"{section}.{key}" if section else key
+                raise UsageError(f"{self._path}: {name}: unknown key; allowed: {', '.join(allowed)}")
+
+    def number(self, key: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise UsageError(f"{self._path}: {key}: {value!r} is not a number")
+        if not low <= value <= high:
+            raise UsageError(f"{self._path}: {key}: {value:g}: allowed are {low:g} to {high:g}")
+        return float(value)
+
+    def whole(self, key: str, value: Any, low: int, high: int) -> int:
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise UsageError(f"{self._path}: {key}: {value!r} is not a whole number from {low} to {high}")
+        return value
+
+    def one_of(self, key: str, value: Any, allowed: tuple) -> Any:
+        if isinstance(value, bool) or value not in allowed:
+            names = ", ".join(map(str, allowed))
+            raise UsageError(f"{self._path}: {key}: {value!r}: allowed are {names}")
+        return value
+
+    def table(self, section: str, table: Any, ranges: dict[str, tuple[float, float]]) -> dict[str, float]:
+        if not isinstance(table, dict):
+            raise UsageError(f"{self._path}: {section}: a table [{section}] is wanted")
+        self.known_keys(section, table, tuple(ranges))
+        return {key: self.number(f"{section}.{key}", value, *ranges[key]) for key, value in table.items()}
+
+    def steps(self, section: str, steps: Any) -> list[dict[str, float]]:
+        if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
+            raise UsageError(f"{self._path}: {section}: tables [[{section}]] are wanted")
+        ranges = _STEPS[section]
+        checked = [self.table(section, step, ranges) for step in steps]
+        for step in checked:
+            for key in ranges:
+                if key not in step:
+                    raise UsageError(f"{self._path}: {section}.{key}: missing")
+        return checked

@@ -1,0 +1,236 @@
+"""What tools/salient does before a command: sets up what is missing, builds, hands over to the Python package.
+
+Standard library only. Everything it makes stays in build/. Its own words go to standard error.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+TOOLS = Path(__file__).resolve().parent
+ROOT = TOOLS.parent
+BUILD = ROOT / "build"
+VENV = BUILD / "venv"
+LOCK = TOOLS / "requirements.lock"
+STAMP = VENV / "salient.stamp"
+
+sys.path.insert(0, str(TOOLS / "src"))
+
+from salient.arguments import make_parser  # noqa: E402  (needs the path above)
+
+
+@dataclass(frozen=True)
+class Need:
+    """A Debian package, what it is for, and how to see that it is there."""
+
+    package: str
+    purpose: str
+    present: Callable[[], bool]
+
+
+def _tool(name: str) -> Callable[[], bool]:
+    return lambda: shutil.which(name) is not None
+
+
+def _file(*paths: str) -> Callable[[], bool]:
+    return lambda: any(Path(path).exists() for path in paths)
+
+
+def _has_ensurepip() -> bool:
+    # Debian ships ensurepip without its wheels unless python3-venv is installed.
+    code = "import ensurepip, sys, venv; ensurepip.version()"
+    return subprocess.run([_base_python(), "-c", code], capture_output=True).returncode == 0
+
+
+BUILD_NEEDS = (
+    Need("gcc", "compiler", _tool("gcc")),
+    Need("g++", "compiler of the unit tests", _tool("g++")),
+    Need("cmake", "build", _tool("cmake")),
+    Need("ninja-build", "build", _tool("ninja")),
+    Need("libgtest-dev", "unit tests", _file("/usr/include/gtest/gtest.h", "/usr/local/include/gtest/gtest.h")),
+    Need("python3-venv", "virtual environment", lambda: (VENV / "bin/python").exists() or _has_ensurepip()),
+)
+TEST_NEEDS = (
+    Need("gcc-arm-none-eabi", "compiler for Cortex-M4", _tool("arm-none-eabi-gcc")),
+    Need("qemu-system-x86", "guest with a kernel that has CAN", lambda: not _guest_packages()),
+)
+
+WITHOUT_BUILD = ("log", "monitor")
+"""Commands that only speak to a running drive."""
+
+
+def _guest_packages() -> list[str]:
+    from salient import guest
+
+    return guest.missing_packages()
+
+
+def _base_python() -> str:
+    """Python that the virtual environment is made with: the one that runs this."""
+    # tools/salient has preferred it already; its real path, because a virtual environment of the caller may be active.
+    return str(Path(sys.executable).resolve())
+
+
+def fail(line: str) -> NoReturn:
+    """One line, exit code 2."""
+    print(f"salient: {line}", file=sys.stderr)
+    sys.exit(2)
+
+
+def say(line: str) -> None:
+    """One line to whoever waits."""
+    print(f"salient: {line}", file=sys.stderr, flush=True)
+
+
+# --- Debian packages ------------------------------------------------------------------------------------------------
+
+def install_packages(needs: tuple[Need, ...], install: bool) -> None:
+    """Installs what is missing, or names it and stops."""
+    missing = [need for need in needs if not need.present()]
+    if not missing:
+        return
+    packages = [need.package for need in missing]
+    reasons = ", ".join(f"{need.package} ({need.purpose})" for need in missing)
+    if not install:
+        fail(f"missing: {reasons}; install the Debian packages {' '.join(packages)}, or leave out --no-install")
+    if shutil.which("apt-get") is None:
+        fail(f"missing: {reasons}; there is no apt-get to install them with")
+    if os.geteuid() != 0 and not _sudo_works():
+        fail(f"missing: {reasons}; installing them needs root or sudo without a password")
+    say(f"installing Debian packages: {reasons}")
+    log = BUILD / "apt.log"
+    command = ["apt-get", "install", "-y", "--no-install-recommends", *packages]
+    with log.open("ab") as output:
+        have_lists = any(Path("/var/lib/apt/lists").glob("*_Packages*"))
+        done = have_lists and _as_root(command, output)
+        if not done:
+            done = _as_root(["apt-get", "update"], output) and _as_root(command, output)
+    if not done:
+        fail(f"the Debian packages {' '.join(packages)} could not be installed: see {log.relative_to(ROOT)}")
+    still = [need.package for need in missing if not need.present()]
+    if still:
+        fail(f"{' '.join(still)}: installed, but what it should bring is not there")
+
+
+def _sudo_works() -> bool:
+    return bool(shutil.which("sudo")) and subprocess.run(["sudo", "-n", "true"], capture_output=True).returncode == 0
+
+
+def _as_root(command: list[str], output) -> bool:
+    prefix = [] if os.geteuid() == 0 else ["sudo", "-n"]
+    command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", *command]
+    return subprocess.run(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output).returncode == 0
+
+
+# --- Python packages ------------------------------------------------------------------------------------------------
+
+def make_environment(install: bool) -> None:
+    """Makes build/venv from the lock file, again when the lock file has changed."""
+    inputs = LOCK.read_bytes() + (TOOLS / "pyproject.toml").read_bytes() + str(ROOT).encode()
+    wanted = hashlib.sha256(inputs).hexdigest()
+    if STAMP.exists() and STAMP.read_text() == wanted and (VENV / "bin/python").exists():
+        return
+    if not install:
+        fail(f"missing: {VENV.relative_to(ROOT)} with the Python packages of {LOCK.relative_to(ROOT)}; "
+             "leave out --no-install")
+    say(f"installing Python packages of {LOCK.relative_to(ROOT)} into {VENV.relative_to(ROOT)} (CAN, figures, tests)")
+    log = BUILD / "pip.log"
+    python = str(VENV / "bin/python")
+    pip = [python, "-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--no-deps"]
+    # setuptools would leave its notes beside the sources.
+    notes = BUILD / "package"
+    notes.mkdir(exist_ok=True)
+    extra = BUILD / "setuptools.cfg"
+    extra.write_text(f"[egg_info]\negg_base = {notes}\n")
+    steps = (
+        [_base_python(), "-m", "venv", "--clear", str(VENV)],
+        [*pip, "--require-hashes", "-r", str(LOCK)],
+        [*pip, "--no-build-isolation", "--editable", str(TOOLS)],
+    )
+    with log.open("wb") as output:
+        for step in steps:
+            environment = {**os.environ, "DIST_EXTRA_CONFIG": str(extra)}
+            if subprocess.run(step, env=environment, stdout=output, stderr=output, cwd=BUILD).returncode != 0:
+                fail(f"the Python packages could not be installed: {_last_line(log)} (see {log.relative_to(ROOT)})")
+    STAMP.write_text(wanted)
+
+
+def _last_line(log: Path) -> str:
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1].strip() if lines else "no output"
+
+
+# --- build ----------------------------------------------------------------------------------------------------------
+
+def build(targets: list[str]) -> None:
+    """Brings the host build up to date; exit code 1 with the compiler's words when it fails."""
+    host = BUILD / "host"
+    if not (host / "bin").exists():
+        say("building")
+    log = BUILD / "build.log"
+    command = ["cmake", "--build", "--preset", "host"]
+    if targets:
+        command += ["--target", *targets]
+    steps = [command] if _is_configured(host) else [
+        ["cmake", "--preset", "host", "-DSALIENT_MACHINE_FILE="],
+        command,
+    ]
+    with log.open("wb") as output:
+        for step in steps:
+            if subprocess.run(step, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT).returncode != 0:
+                output.flush()
+                sys.stderr.write(_failures(log.read_text(errors="replace")))
+                print(f"salient: the build failed: see {log.relative_to(ROOT)}", file=sys.stderr)
+                sys.exit(1)
+
+
+def _is_configured(folder: Path) -> bool:
+    """Whether CMake was there, and without a machine file of the user's that may be gone by now."""
+    try:
+        cache = (folder / "CMakeCache.txt").read_text()
+    except OSError:
+        return False
+    return (folder / "build.ninja").exists() and re.search(r"^SALIENT_MACHINE_FILE:FILEPATH=$", cache, re.M) is not None
+
+
+def _failures(text: str) -> str:
+    """The last of the build's output, which is where the reason stands."""
+    return "\n".join(text.splitlines()[-40:]) + "\n"
+
+
+def main() -> None:
+    """Reads the command line, prepares, and becomes the command."""
+    options = make_parser().parse_args()
+    install = not options.no_install
+    os.environ["PYTHONPYCACHEPREFIX"] = str(BUILD / "pycache")
+    try:
+        BUILD.mkdir(exist_ok=True)
+        lock = (BUILD / "launcher.lock").open("w")
+    except OSError as error:
+        fail(f"{BUILD}: {error.strerror}; everything is built there")
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # two commands at once must not build over each other
+        needs = BUILD_NEEDS + (TEST_NEEDS if options.command == "test" else ())
+        if options.command in WITHOUT_BUILD:
+            needs = tuple(need for need in BUILD_NEEDS if need.package == "python3-venv")
+        install_packages(needs, install)
+        make_environment(install)
+        if options.command not in WITHOUT_BUILD:
+            machines = sorted(path.stem for path in (TOOLS / "machines").glob("*.toml"))
+            build([] if options.command == "test" else [f"salient_{name}" for name in machines])
+    python = str(VENV / "bin/python")
+    os.execv(python, [python, "-m", "salient", *sys.argv[1:]])
+
+
+if __name__ == "__main__":
+    main()

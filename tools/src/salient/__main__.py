@@ -1,0 +1,121 @@
+"""The commands, once everything that they need is there: python -m salient COMMAND ..."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from salient.arguments import make_parser
+from salient.errors import UsageError
+from salient.paths import BUILD
+
+
+def main() -> int:
+    """Runs a command; returns the exit code: 0 done, 1 what was tested failed, 2 the caller's mistake."""
+    options = make_parser().parse_args()
+    if getattr(options, "can", None) == "auto":
+        options.can = _automatic_can()
+    try:
+        return _COMMANDS[options.command](options)
+    except UsageError as error:
+        print(f"salient: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # Whoever read our output has gone, as head does; nothing more can be said there.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _automatic_can() -> str:
+    """vcan0 where it is up, else the local bus."""
+    try:
+        up = int(Path("/sys/class/net/vcan0/flags").read_text(), 16) & 1
+    except OSError:
+        up = 0
+    return "socketcan:vcan0" if up else f"unix:{BUILD}/salient.sock"
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from salient import demo
+
+    try:
+        return demo.run(options)
+    except demo.DemoFailed as error:
+        print(f"salient: {error}", file=sys.stderr)
+        return 1
+
+
+def _test(options: argparse.Namespace) -> int:
+    from salient import checks
+
+    return checks.run(options.only)
+
+
+def _sim(options: argparse.Namespace) -> int:
+    from salient.simulator import SimulatorError, SimulatorOptions
+
+    try:
+        command = SimulatorOptions(
+            machine=options.machine,
+            controller=options.controller,
+            control_rate_hz=options.control_rate_hz,
+            encoder_bits=options.encoder_bits,
+            seed=options.seed,
+            initial_angle_deg=options.initial_angle_deg,
+            pace=options.pace,
+            bit_rate=options.bit_rate,
+        ).arguments(options.can)
+    except SimulatorError as error:
+        print(f"salient: {error}", file=sys.stderr)
+        return 1
+    os.execv(command[0], command)
+
+
+def _run(options: argparse.Namespace) -> int:
+    from salient.scenario import load_scenarios, run_all
+
+    scenarios = load_scenarios(options.scenario)
+    out = options.out or Path("out") / options.scenario.stem
+    results = run_all(scenarios, out, progress=lambda line: print(line, flush=True))
+    print(f"results: {out / 'results.json'}")
+    faults = [f"{controller}: {result.fault}" for controller, result in results.items() if result.fault != "none"]
+    if faults:
+        print(f"salient: the drive ended in a fault: {', '.join(faults)}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _log(options: argparse.Namespace) -> int:
+    from salient.watch import record
+
+    return record(options.can, options.out, options.duration_s)
+
+
+def _monitor(options: argparse.Namespace) -> int:
+    from salient.watch import monitor
+
+    return monitor(options.can, options.every_s, options.duration_s)
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from salient.benchmark import run
+
+    return run(options.runs, options.json)
+
+
+_COMMANDS = {
+    "demo": _demo,
+    "test": _test,
+    "sim": _sim,
+    "run": _run,
+    "log": _log,
+    "monitor": _monitor,
+    "bench": _bench,
+}
+
+if __name__ == "__main__":
+    sys.exit(main())

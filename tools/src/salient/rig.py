@@ -1,0 +1,90 @@
+"""The test bench over CAN: its quantities, set now or at a virtual time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import can
+
+from salient.signals import rig_database
+
+if TYPE_CHECKING:
+    from salient.session import Session
+
+_AT_US_MAX = 2**32 - 1
+
+
+class RigError(Exception):
+    """The bench refused a setting; the text says which and why."""
+
+
+class Quantity:
+    """An attribute of Rig: assigning sets the quantity of that name, reading gives what was assigned last."""
+
+    def __init__(self, initial: float | None) -> None:
+        self._initial = initial
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, rig: Rig | None, owner: type | None = None):
+        if rig is None:
+            return self
+        value = rig._assigned.get(self._name, self._initial)
+        if value is None:
+            raise AttributeError(f"{self._name} is as the machine file has it until it is set")
+        return value
+
+    def __set__(self, rig: Rig, value: float) -> None:
+        rig.set(self._name, value)
+        rig._assigned[self._name] = value
+
+
+class Rig:
+    """The bench's quantities, as attributes that act now; `at` gives them at a virtual time.
+
+    rig.load_torque_Nm = 8 acts at once, rig.at(0.13).load_torque_Nm = 8 at exactly 0.13 s. RigError when the bench
+    refuses: out of range, in the past, or more than 64 settings ahead.
+    """
+
+    load_torque_Nm = Quantity(0.0)
+    """On the shaft, positive against forward motion."""
+    supply_voltage_V = Quantity(None)
+    """Of the DC link."""
+    encoder_fault = Quantity(0)
+    """0 healthy, 1 frozen at its count, 2 jumps by half a turn."""
+    interrupt_time_us = Quantity(0.0)
+    """How long the control interrupt takes; beyond a period interrupts are lost."""
+    current_sensor_gain = Quantity(1.0)
+    """1 is true."""
+    truth_period_us = Quantity(1000)
+    """How often the true state is sent; 0 never."""
+
+    def __init__(self, session: Session, at_us: int = 0) -> None:
+        self._session = session
+        self._at_us = at_us
+        self._assigned: dict[str, float] = {}
+
+    def at(self, time_s: float) -> Rig:
+        """The same bench, set at a virtual time (rounded to microseconds)."""
+        return Rig(self._session, round(time_s * 1e6))
+
+    def set(self, name: str, value: float) -> None:
+        """Sets a quantity by its name in rig.dbc."""
+        message = rig_database().get_message_by_name("RIG_SET")
+        signal = message.get_signal_by_name(name)
+        number = signal.multiplexer_ids[0]
+        if not signal.minimum <= value <= signal.maximum:
+            allowed = f"{signal.minimum:g} to {signal.maximum:g} {signal.unit or ''}".rstrip()
+            raise RigError(f"{name} {value:g}: allowed are {allowed}")
+        if not 0 <= self._at_us <= _AT_US_MAX:
+            raise RigError(f"{name} at {self._at_us} us: allowed are 0 to {_AT_US_MAX} us")
+        data = message.encode({"quantity": number, name: value, "at_us": self._at_us})
+        self._session.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
+        reply = rig_database().get_message_by_name("RIG_SET_REPLY")
+        answer = self._session.receive_until(
+            lambda m: m.arbitration_id == reply.frame_id and m.is_extended_id and m.data[0] == number
+        )
+        status = reply.decode(bytes(answer.data))["status"]
+        if status != "done":
+            raise RigError(f"{name} {value:g} at {self._at_us} us: {status}")

@@ -1,0 +1,132 @@
+"""Signals by name out of CAN frames, decoded by the DBC files, whole columns at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import can
+import cantools
+import numpy as np
+
+from salient.paths import DRIVE_DBC, RIG_DBC
+
+
+@lru_cache
+def load_database(path: Path) -> cantools.database.Database:
+    """A DBC file, loaded once."""
+    return cantools.database.load_file(path, strict=True)
+
+
+def drive_database() -> cantools.database.Database:
+    """The drive's DBC."""
+    return load_database(DRIVE_DBC)
+
+
+def rig_database() -> cantools.database.Database:
+    """The test bench's DBC."""
+    return load_database(RIG_DBC)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One signal over time: `value[i]`, in `unit`, was on the bus at virtual time `time_s[i]`."""
+
+    name: str
+    unit: str
+    time_s: np.ndarray
+    value: np.ndarray
+    choices: Mapping[int, str] | None = None
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    @property
+    def last(self) -> float:
+        """The latest value; LookupError when none came yet."""
+        if not len(self.value):
+            raise LookupError(f"{self.name}: no frame came yet")
+        return self.value[-1].item()
+
+    @property
+    def last_name(self) -> str:
+        """The latest value by its name in the DBC, for signals that have names."""
+        return (self.choices or {}).get(int(self.last), str(self.last))
+
+    def between(self, from_s: float, to_s: float) -> Signal:
+        """The part with from_s <= time < to_s."""
+        inside = (self.time_s >= from_s) & (self.time_s < to_s)
+        return Signal(self.name, self.unit, self.time_s[inside], self.value[inside], self.choices)
+
+
+class SignalTable(Mapping[str, Signal]):
+    """The signals of the messages that one node sends, filled frame by frame.
+
+    table["speed_rpm"] is the signal of that name in the message with the lowest identifier that has one;
+    table["DRIVE_FAULT_SNAPSHOT.speed_rpm"] names its message. KeyError names what there is.
+    """
+
+    def __init__(self, database: cantools.database.Database, sender: str) -> None:
+        self._messages = {}
+        self._names: dict[str, tuple[int, cantools.database.can.Signal]] = {}
+        self._times: dict[tuple[int, bool], list[int]] = {}
+        self._data: dict[tuple[int, bool], bytearray] = {}
+        for message in sorted(database.messages, key=lambda m: m.frame_id):
+            if sender not in message.senders or message.is_multiplexed():
+                continue
+            key = (message.frame_id, message.is_extended_frame)
+            self._messages[key] = message
+            self._times[key], self._data[key] = [], bytearray()
+            for signal in message.signals:
+                self._names.setdefault(signal.name, (key, signal))
+                self._names[f"{message.name}.{signal.name}"] = (key, signal)
+
+    def add(self, time_ns: int, message: can.Message) -> None:
+        """Takes a frame if it is one of the node's and has the length that the DBC gives it."""
+        key = (message.arbitration_id, message.is_extended_id)
+        times = self._times.get(key)
+        if times is None or message.is_remote_frame or message.is_fd or message.is_error_frame:
+            return
+        if len(message.data) != self._messages[key].length:
+            return
+        times.append(time_ns)
+        self._data[key] += bytes(message.data).ljust(8, b"\0")
+
+    def __getitem__(self, name: str) -> Signal:
+        if name not in self._names:
+            raise KeyError(f"no signal '{name}'; there are {', '.join(n for n in self._names if '.' not in n)}")
+        key, signal = self._names[name]
+        raw = np.frombuffer(bytes(self._data[key]), dtype="<u8")
+        choices = {int(number): str(text) for number, text in (signal.choices or {}).items()}
+        time_s = np.array(self._times[key], dtype=np.int64) * 1e-9
+        return Signal(signal.name, signal.unit or "", time_s, _physical(raw, signal), choices or None)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def count(self, message_name: str) -> int:
+        """How many frames of a message came; KeyError when the node sends none of that name."""
+        for key, message in self._messages.items():
+            if message.name == message_name:
+                return len(self._times[key])
+        raise KeyError(f"no message '{message_name}'")
+
+
+def _physical(raw: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
+    """Physical values of a little-endian signal from frames taken as 64-bit words."""
+    if signal.byte_order != "little_endian":
+        raise ValueError(f"{signal.name}: only little-endian signals are decoded")
+    field = raw >> np.uint64(signal.start)
+    if signal.length < 64:
+        field = field & np.uint64((1 << signal.length) - 1)
+    if signal.is_float:
+        return field.astype("<u4").view("<f4").astype(float)
+    if signal.is_signed:
+        shift = np.int64(64 - signal.length)
+        field = (field.astype(np.int64) << shift) >> shift
+    return field * float(signal.scale) + float(signal.offset)

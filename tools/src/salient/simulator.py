@@ -1,0 +1,163 @@
+"""Starts the host executable: a drive and its bench in one process."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import tempfile
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+from salient.drive import ParameterRow, read_parameter_table
+from salient.errors import UsageError
+from salient.machine import MachineError, load_machine, machine_path
+from salient.paths import BUILD, MACHINES, ROOT
+from salient.session import Session
+
+_END_TIMEOUT_S = 60.0
+
+
+class SimulatorError(Exception):
+    """The executable failed; the text has what it wrote."""
+
+
+@dataclass(frozen=True)
+class SimulatorOptions:
+    """What a drive and its bench are started with; the executable checks the values.
+
+    machine: a shipped machine's name or a machine file's path. encoder_bits 0: ideal. record: file for the true state
+    (.npy), every record_step_ns from record_from_us on. build: host or sanitize.
+    """
+
+    machine: str = "saturating"
+    controller: str = "traditional"
+    control_rate_hz: int = 40_000
+    encoder_bits: int = 17
+    seed: int = 1
+    initial_angle_deg: float = 0.0
+    pace: str = "lockstep"
+    bit_rate: int = 1_000_000
+    record: Path | None = None
+    record_step_ns: int = 1000
+    record_from_us: int = 0
+    build: str = "host"
+
+    def arguments(self, can: str) -> list[str]:
+        """The executable's command line on the bus `can`."""
+        line = [
+            str(executable(self.machine, self.build)), "--can", can, "--pace", self.pace,
+            "--controller", self.controller, "--control-rate-hz", str(self.control_rate_hz),
+            "--encoder-bits", str(self.encoder_bits), "--seed", str(self.seed),
+            "--initial-angle-deg", f"{self.initial_angle_deg:.17g}", "--bit-rate", str(self.bit_rate),
+        ]  # fmt: skip
+        if self.record is not None:
+            line += ["--record", str(self.record), "--record-step-ns", str(self.record_step_ns)]
+            line += ["--record-from-us", str(self.record_from_us)]
+        return line
+
+
+@lru_cache
+def executable(machine: str, build: str = "host") -> Path:
+    """The executable for a machine; the one for a foreign machine file is built first. UsageError."""
+    try:
+        path = machine_path(machine)
+        load_machine(path)
+    except MachineError as error:
+        raise UsageError(str(error)) from None
+    program = BUILD / build / "bin" / f"salient_{path.stem}"
+    if path.parent != MACHINES:
+        _build_foreign(path, program, build)
+    if not program.exists():
+        raise UsageError(f"{program.relative_to(ROOT)} is not built; any tools/salient command builds it")
+    return program
+
+
+def _build_foreign(path: Path, program: Path, build: str) -> None:
+    if (MACHINES / path.name).exists():
+        raise UsageError(f"{path}: a shipped machine is called {path.stem}; give the file another name")
+    if not path.stem.isidentifier() or not path.stem.isascii():
+        raise UsageError(f"{path}: the file's name must be letters, digits and underscores")
+    if shutil.which("cmake") is None:
+        raise UsageError("cmake is missing, and a machine file of your own needs a build")
+    log = BUILD / f"machine_{path.stem}.log"
+    with log.open("wb") as output:
+        for command in (
+            ["cmake", "--preset", build, f"-DSALIENT_MACHINE_FILE={path}"],
+            ["cmake", "--build", "--preset", build, "--target", program.name],
+        ):
+            if subprocess.run(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT).returncode != 0:
+                raise SimulatorError(f"building for {path} failed: see {log.relative_to(ROOT)}")
+
+
+class Simulator:
+    """A running executable, ended with this process or by close().
+
+    ready: what its JSON line said. UsageError when it refuses its options, SimulatorError when it fails.
+    """
+
+    def __init__(self, options: SimulatorOptions, can: str) -> None:
+        self.options = options
+        self.can = can
+        self.command = options.arguments(can)
+        self._errors = tempfile.TemporaryFile()
+        self._process = subprocess.Popen(
+            [*self.command, "--follow-stdin"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+        )
+        line = self._process.stdout.readline()
+        if not line:
+            self._raise_failure(self._process.wait())
+        self.ready = json.loads(line)
+
+    @property
+    def pid(self) -> int:
+        """Process number."""
+        return self._process.pid
+
+    @property
+    def errors(self) -> str:
+        """What it wrote to its standard error so far."""
+        self._errors.seek(0)
+        return self._errors.read().decode(errors="replace").strip()
+
+    def close(self) -> None:
+        """Lets it end: recording finished, socket removed. SimulatorError when it ends with anything but 0."""
+        if self._process.poll() is None:
+            self._process.stdin.close()
+            try:
+                self._process.wait(_END_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        self._process.stdout.close()
+        if self._process.returncode != 0:
+            self._raise_failure(self._process.returncode)
+        self._errors.close()
+
+    def __enter__(self) -> Simulator:
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.close()
+
+    def _raise_failure(self, code: int) -> None:
+        errors = self.errors
+        if code == 2:
+            raise UsageError(errors.removeprefix("salient: "))
+        raise SimulatorError(f"{self.command[0]} ended with {code}: {errors or 'it wrote nothing'}")
+
+
+@lru_cache
+def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
+    """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
+    on the bus of an experiment."""
+    with tempfile.TemporaryDirectory(prefix="salient-") as folder:
+        can = f"unix:{folder}/can.sock"
+        quiet = replace(options, record=None, pace="lockstep")
+        with Simulator(quiet, can), Session(can) as session:
+            session.rig.truth_period_us = 0
+            return read_parameter_table(session)
