@@ -1,0 +1,80 @@
+/* The plant for callers that cannot lay out a plant_t, such as Python's ctypes: only in libsalient_plant.so. Together
+ * with plant_set_switches, plant_open_all, plant_advance, plant_observe and plant_set_step_factor, whose arguments are
+ * plain, it is all of plant.h. */
+#include <stdlib.h>
+#include <string.h>
+
+#include "plant/plant.h"
+
+/* What plant_library_read gives out. */
+typedef struct {
+    double time_s;
+    double speed_rad_s;
+    double rotor_angle_rad;
+    double torque_Nm;
+    double current_A[HAL_PHASES_MAX];
+    double flux_linkage_Wb[HAL_PHASES_MAX];
+    double energy_drawn_J, energy_returned_J, energy_copper_J, energy_load_J, energy_friction_J;
+    double field_energy_J, kinetic_energy_J;
+} plant_library_state_t;
+
+plant_t *plant_library_create(const machine_t *machine, double initial_angle_rad);
+void plant_library_destroy(plant_t *plant);
+void plant_library_set_inputs(plant_t *plant, double load_torque_Nm, double bus_voltage_V);
+void plant_library_set_motion(plant_t *plant, double speed_rad_s, double rotor_angle_rad);
+void plant_library_read(const plant_t *plant, plant_library_state_t *state);
+void plant_library_evaluate(const machine_t *machine, double phase_angle_rad, double current_A,
+                            magnetics_point_t *point);
+
+/* A plant as plant_init makes it, to be given to plant_library_destroy; `machine` must outlive it. NULL without
+ * memory. */
+plant_t *plant_library_create(const machine_t *machine, double initial_angle_rad) {
+    plant_t *plant = malloc(sizeof *plant);
+    if (plant != NULL) {
+        plant_init(plant, machine, initial_angle_rad);
+    }
+    return plant;
+}
+
+void plant_library_destroy(plant_t *plant) {
+    free(plant);
+}
+
+void plant_library_set_inputs(plant_t *plant, double load_torque_Nm, double bus_voltage_V) {
+    plant->load_torque_Nm = load_torque_Nm;
+    plant->bus_voltage_V = bus_voltage_V;
+}
+
+/* Puts the rotor somewhere else at another speed, as if it had been so since plant_init: the energy ledger takes no
+ * note, so use it before the first advance. */
+void plant_library_set_motion(plant_t *plant, double speed_rad_s, double rotor_angle_rad) {
+    plant->speed_rad_s = speed_rad_s;
+    plant->rotor_angle_rad = rotor_angle_rad;
+}
+
+void plant_library_read(const plant_t *plant, plant_library_state_t *state) {
+    memset(state, 0, sizeof *state);
+    state->time_s = (double)plant->time_ns * 1e-9;
+    state->speed_rad_s = plant->speed_rad_s;
+    state->rotor_angle_rad = plant->rotor_angle_rad;
+    state->torque_Nm = plant_torque_Nm(plant);
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        state->current_A[phase] = plant->current_A[phase];
+        state->flux_linkage_Wb[phase] = plant_flux_linkage_Wb(plant, phase);
+    }
+    state->energy_drawn_J = plant->energy_drawn_J;
+    state->energy_returned_J = plant->energy_returned_J;
+    state->energy_copper_J = plant->energy_copper_J;
+    state->energy_load_J = plant->energy_load_J;
+    state->energy_friction_J = plant->energy_friction_J;
+    state->field_energy_J = plant_field_energy_J(plant);
+    state->kinetic_energy_J = plant_kinetic_energy_J(plant);
+}
+
+/* magnetics_evaluate for a machine. */
+void plant_library_evaluate(const machine_t *machine, double phase_angle_rad, double current_A,
+                            magnetics_point_t *point) {
+    magnetics_model_t model;
+    magnetics_prepare(&model, &machine->magnetics, machine->rotor_poles);
+    magnetics_evaluate(&model, phase_angle_rad, current_A, point);
+}
