@@ -1,7 +1,7 @@
 """Debian's kernel, its modules for CAN and 9p, and a busybox for the guest: downloaded once and kept under build/guest.
 
 Nothing is installed: the packages are fetched with `apt-get download`, which needs no root, and only the files
-that the guest loads are kept (about 12 MB of the kernel's 400 MB).
+that the guest loads are kept (67 MB of the kernel's 400 MB).
 """
 
 from __future__ import annotations
