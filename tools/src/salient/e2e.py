@@ -1,4 +1,4 @@
-"""End-to-end protection of frames as AUTOSAR E2E profile 5 (FO R22-11, chapter 6.6), the sender's side and a check.
+"""End-to-end protection of frames as AUTOSAR E2E profile 5, the sender's side and a check.
 
 Bytes 0 and 1 are the checksum (low byte first), byte 2 the counter, data from byte 3. The checksum is
 CRC-16/CCITT-FALSE over bytes 2 to the end and then the data ID, low byte first, which is never sent.

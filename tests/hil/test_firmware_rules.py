@@ -1,0 +1,63 @@
+"""The rules that the build enforces on the firmware bark when they are broken."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+FLOATING_POINT = "int scaled(int x);\nint scaled(int x) { return (int)((float)x * 0.5f); }\n"
+PRINTS = '#include <stdio.h>\nvoid report(int x);\nvoid report(int x) { printf("%d", x); }\n'
+INTEGERS = "int scaled(int x);\nint scaled(int x) { return x >> 1; }\n"
+
+
+def compiles_as_firmware(tmp_path: Path, source: str) -> bool:
+    file = tmp_path / "rule.c"
+    file.write_text(source)
+    result = subprocess.run(
+        ["gcc", "-std=c11", "-O2", "-mgeneral-regs-only", "-c", str(file), "-o", str(tmp_path / "rule.o")],
+        capture_output=True,
+        check=False,
+    )
+    return result.returncode == 0
+
+
+def test_the_host_build_refuses_floating_point(tmp_path):
+    assert compiles_as_firmware(tmp_path, INTEGERS)
+    assert not compiles_as_firmware(tmp_path, FLOATING_POINT)
+
+
+def test_the_host_build_of_the_firmware_uses_that_rule():
+    assert "target_compile_options(salient_firmware PRIVATE -mgeneral-regs-only)" in (
+        ROOT / "firmware/CMakeLists.txt"
+    ).read_text()
+
+
+def symbol_check(tmp_path: Path, source: str) -> subprocess.CompletedProcess:
+    file, item, archive = tmp_path / "rule.c", tmp_path / "rule.o", tmp_path / "librule.a"
+    file.write_text(source)
+    target = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=soft", "-O2", "-c"]
+    subprocess.run(["arm-none-eabi-gcc", *target, str(file), "-o", str(item)], check=True)
+    subprocess.run(["arm-none-eabi-ar", "rcs", str(archive), str(item)], check=True)
+    return subprocess.run(
+        ["cmake", "-DNM=arm-none-eabi-nm", f"-DARCHIVES={archive}", "-P", str(ROOT / "cmake/check_symbols.cmake")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(("source", "symbol"), [(FLOATING_POINT, "__aeabi_fmul"), (PRINTS, "printf")])
+def test_the_cortex_m4_build_names_the_forbidden_symbol(tmp_path, source, symbol):
+    assert shutil.which("arm-none-eabi-gcc"), "package gcc-arm-none-eabi is missing"
+    result = symbol_check(tmp_path, source)
+    assert result.returncode != 0
+    assert symbol in result.stderr
+
+
+def test_the_cortex_m4_build_accepts_integers(tmp_path):
+    assert symbol_check(tmp_path, INTEGERS).returncode == 0
