@@ -17,8 +17,9 @@ LOG_SUFFIXES = (".blf", ".log")
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """One line and exit code 2."""
-        message = re.sub(r"^argument COMMAND: invalid choice: '(.*?)' \(choose from (.*)\)", r"no command \1: allowed are \2",
-                         message).replace("'", "")
+        command = re.match(r"argument COMMAND: invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if command:
+            message = f"no command {command[1]}: allowed are {command[2]}".replace("'", "")
         message = re.sub(r"^argument ([^:]*): ", r"\1 ", message)
         print(f"salient: {message} ({self.prog} --help)", file=sys.stderr)
         sys.exit(2)
@@ -44,7 +45,8 @@ def make_parser() -> argparse.ArgumentParser:
     demo.add_argument("--seed", type=_seed, metavar="N", help="default 1")
 
     test = command("test", "every test; ends with the numbers of passed and failed")
-    test.add_argument("--only", action="append", choices=TEST_STEPS, help="one step only; may be repeated")
+    test.add_argument("--only", action="append", type=_one_of(TEST_STEPS), metavar="STEP",
+                      help=f"one step only, may be repeated: {', '.join(TEST_STEPS)}")
 
     sim = command("sim", "the drive and its bench until interrupted; prints one JSON line when ready")
     sim.add_argument("--machine", default="saturating", metavar="NAME|FILE", help="default saturating")

@@ -15,6 +15,7 @@ run with --salient-can socketcan:INTERFACE.
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections.abc import Callable, Iterator
@@ -23,7 +24,7 @@ from pathlib import Path
 import pytest
 
 from salient.bench import Bench
-from salient.paths import BUILD
+from salient.paths import BUILD, ROOT
 from salient.simulator import SimulatorOptions
 
 _benches_key = pytest.StashKey[list[Bench]]()
@@ -102,7 +103,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo):
         return
     options = [f"--salient-can={item.config.getoption('--salient-can')}"]
     options.append(f"--salient-build={item.config.getoption('--salient-build')}")
-    replay = shlex.join(["build/venv/bin/python", "-m", "pytest", item.nodeid, *options])
+    test = "::".join([os.path.relpath(item.path, ROOT), *item.nodeid.split("::")[1:]])
+    replay = shlex.join(["build/venv/bin/python", "-m", "pytest", test, *options])
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", item.nodeid).strip("_")
     for number, bench in enumerate(item.stash.get(_benches_key, [])):
         folder = Path(item.config.getoption("--salient-failures")) / name / str(number)

@@ -1,0 +1,153 @@
+"""Mistakes of the caller: one clear line that names the thing and what is allowed, and exit code 2."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from salient.paths import MACHINES, ROOT
+
+SCENARIO = """
+machine = "saturating"
+controllers = ["paper"]
+duration_s = 0.01
+"""
+
+
+def assert_mistake(result, *words: str) -> None:
+    assert result.returncode == 2, result
+    assert result.stdout == ""
+    assert re.fullmatch(r"salient: [^\n]+\n", result.stderr), result.stderr
+    for word in words:
+        assert word in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["COMMAND"]),
+        (["fly"], ["fly", "demo, test, sim, run, log, monitor, bench"]),
+        (["sim", "--pcae", "free"], ["--pcae"]),
+        (["sim", "--pace", "fast"], ["--pace fast", "lockstep, realtime, free and xN"]),
+        (["sim", "--controller", "pid"], ["--controller pid", "traditional, paper"]),
+        (["sim", "--control-rate-hz", "30000"], ["--control-rate-hz 30000", "20000, 40000, 50000, 100000"]),
+        (["sim", "--encoder-bits", "7"], ["--encoder-bits 7", "8, 9"]),
+        (["sim", "--seed", "-1"], ["--seed"]),
+        (["sim", "--can", "vcan0"], ["--can vcan0", "auto, unix:PATH and socketcan:INTERFACE"]),
+        (["sim", "--can", "socketcan:nowhere0"], ["--can socketcan:nowhere0"]),
+        (["sim", "--can", "unix:/no/such/folder/bus"], ["/no/such/folder/bus"]),
+        (["sim", "--initial-angle-deg", "400"], ["--initial-angle-deg 400", "-360 to 360"]),
+        (["sim", "--bit-rate", "5"], ["--bit-rate 5", "10000"]),
+        (["sim", "--machine", "nonesuch"], ["nonesuch", "linear_cosine, linear_trapezoid, saturating"]),
+        (["demo", "--machine", "nonesuch.toml"], ["nonesuch.toml"]),
+        (["demo", "--out", "/proc/nowhere"], ["/proc/nowhere"]),
+        (["run"], ["SCENARIO.toml"]),
+        (["run", "nonesuch.toml"], ["nonesuch.toml", "no such scenario file"]),
+        (["log", "--can", "unix:/no/such/bus"], ["unix:/no/such/bus"]),
+        (["log", "--out", "can.csv"], ["can.csv", ".blf or .log"]),
+        (["monitor", "--can", "unix:/no/such/bus"], ["unix:/no/such/bus"]),
+        (["test", "--only", "everything"], ["everything", "unit"]),
+        (["bench", "--runs", "0"], ["--runs 0"]),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, list) else None,
+)
+def test_wrong_command_line(salient, arguments, words):
+    assert_mistake(salient(*arguments), *words)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (SCENARIO + "duration = 1\n", ["duration", "unknown key", "duration_s"]),
+        (SCENARIO.replace("0.01", "-1"), ["duration_s", "-1", "0.001 to 3600"]),
+        (SCENARIO.replace("0.01", '"long"'), ["duration_s", "'long'", "not a number"]),
+        (SCENARIO.replace("paper", "pid"), ["controllers", "'pid'", "traditional, paper"]),
+        (SCENARIO.replace('["paper"]', '["paper", "paper"]'), ["controllers", "different"]),
+        (SCENARIO.replace("saturating", "nonesuch"), ["nonesuch", "saturating"]),
+        (SCENARIO.replace('machine = "saturating"', ""), ["machine", "missing"]),
+        (SCENARIO + "seed = 1.5\n", ["seed", "1.5", "whole number"]),
+        (SCENARIO + "control_rate_hz = 30000\n", ["control_rate_hz", "30000", "20000, 40000, 50000, 100000"]),
+        (SCENARIO + "[[speed]]\nat_s = 0\nvalue = 600\n", ["speed.value", "unknown key", "value_rpm"]),
+        (SCENARIO + "[[speed]]\nat_s = 0\n", ["speed.value_rpm", "missing"]),
+        (SCENARIO + "[[speed]]\nat_s = 0\nvalue_rpm = 9000\n", ["speed.value_rpm", "9000", "-3000 to 3000"]),
+        (SCENARIO + "[load]\nat_s = 0\n", ["load", "[[load]]"]),
+        (SCENARIO + "[record]\nstep_us = 0\n", ["record.step_us", "0.1"]),
+        (SCENARIO + "[parameters]\ntorque_max = 1\n", ["parameters.torque_max", "torque_max_Nm"]),
+        (SCENARIO + "[parameters]\ntorque_max_Nm = 1000\n", ["parameters.torque_max_Nm", "1000", "0 to 40 N m"]),
+        (SCENARIO + "[parameters]\ntorque_max_Nm = true\n", ["parameters.torque_max_Nm", "not a number"]),
+        (SCENARIO + "seed = \n", ["not TOML"]),
+    ],
+)
+def test_wrong_scenario(salient, tmp_path, text, words):
+    path = tmp_path / "scenario.toml"
+    path.write_text(text)
+    assert_mistake(salient("run", path, "--out", tmp_path / "out"), *words)
+
+
+def machine_file(folder: Path, name: str, old: str, new: str) -> Path:
+    text = (MACHINES / "saturating.toml").read_text()
+    assert old in text
+    path = folder / f"{name}.toml"
+    path.write_text(text.replace('name = "saturating"', f'name = "{name}"').replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("resistance_ohm", "resistence_ohm", ["winding.resistence_ohm", "unknown key", "resistance_ohm"]),
+        ("inertia_kg_m2 = 0.02", "inertia_kg_m2 = -0.02", ["mechanics.inertia_kg_m2", "-0.02"]),
+        ("stator = 6", "stator = 7", ["poles", "6/4, 8/6, 12/8"]),
+        ('form = "saturating"', 'form = "magic"', ["magnetics.form", "'magic'", "linear_cosine"]),
+        ("[converter]", "[converter", ["not TOML"]),
+    ],
+)
+def test_wrong_machine_file(salient, tmp_path, old, new, words):
+    path = machine_file(tmp_path, "mine", old, new)
+    assert_mistake(salient("sim", "--machine", path), str(path), *words)
+
+
+def test_machine_file_with_a_shipped_name(salient, tmp_path):
+    path = machine_file(tmp_path, "saturating", "stator", "stator")
+    assert_mistake(salient("sim", "--machine", path), str(path), "another name")
+
+
+def test_bus_in_use(salient, make_bench):
+    bench = make_bench()
+    assert_mistake(salient("sim", "--can", bench.address), bench.address.removeprefix("unix:"))
+
+
+def test_missing_compiler(salient, tmp_path):
+    tools = tmp_path / "bin"
+    tools.mkdir()
+    for tool in ("sh", "dirname", "readlink", "python3"):
+        (tools / tool).symlink_to(shutil.which(tool, path="/usr/bin:/bin"))
+    assert_mistake(salient("sim", "--no-install", PATH=str(tools)), "missing", "gcc (compiler)", "--no-install")
+
+
+def test_missing_python(salient, tmp_path):
+    """Without any Python that is new enough the shell part of the launcher says so by itself."""
+    text = (ROOT / "tools" / "salient").read_text()
+    copy = tmp_path / "salient"
+    copy.write_text(text.replace("/usr/bin/python3 python3", "/nonexistent/python3"))
+    copy.chmod(0o755)
+    import subprocess
+
+    result = subprocess.run([copy, "sim", "--no-install"], capture_output=True, text=True, env=os.environ)
+    assert_mistake(result, "python3", "python3-venv")
+
+
+def test_machine_file_of_ones_own(make_bench, tmp_path):
+    """A file with half the inertia is built on demand, and its motor gains speed about twice as fast."""
+    path = machine_file(tmp_path, "half_inertia", "inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.01")
+    speeds = []
+    for machine in (str(path), "saturating"):
+        bench = make_bench(machine=machine, controller="paper")
+        bench.drive.speed_reference_rpm = 3000
+        bench.run_for(0.05)
+        speeds.append(bench.truth["speed_rpm"].last)
+    assert speeds[0] / speeds[1] == pytest.approx(2.0, abs=0.3)
