@@ -98,8 +98,6 @@ static size_t local_descriptors(transport_t *transport, struct pollfd *list) {
     return 1 + local->client_count;
 }
 
-typedef enum { READ_NOTHING, READ_RECORD, READ_GONE } read_result_t;
-
 /* Index of the first client with this number or a later one. Numbers outlive a disconnection, indices do not. */
 static unsigned index_from(const local_t *local, uint32_t number) {
     unsigned index = 0;
@@ -109,27 +107,28 @@ static unsigned index_from(const local_t *local, uint32_t number) {
     return index;
 }
 
-static read_result_t read_one(local_t *local, unsigned index, const transport_receiver_t *receiver, size_t *taken) {
+/* Takes one record of a client, or its departure. */
+static void read_one(local_t *local, unsigned index, const transport_receiver_t *receiver, size_t *taken) {
     client_t *client = &local->clients[index];
     record_t record;
     ssize_t size = recv(client->descriptor, &record, sizeof record, MSG_DONTWAIT | MSG_TRUNC);
     if (size < 0 && (errno == EAGAIN || errno == EINTR)) {
-        return READ_NOTHING;
+        return;
     }
     if (size <= 0) {
         disconnect(local, index, NULL);
-        return READ_GONE;
+        return;
     }
     transport_frame_t frame;
     size_t frame_size = (size_t)size - sizeof record.time_ns;
     if ((frame_size != CAN_MTU && frame_size != CANFD_MTU) || (size_t)size < sizeof record.time_ns) {
         ++client->malformed;
-        return READ_RECORD;
+        return;
     }
     memcpy(&frame.flexible, record.frame, frame_size);
     if (!transport_frame_accept(&frame, frame_size)) {
         ++client->malformed;
-        return READ_RECORD;
+        return;
     }
     ++*taken;
     uint32_t number = client->number;
@@ -138,24 +137,35 @@ static read_result_t read_one(local_t *local, unsigned index, const transport_re
         if (index < local->client_count && local->clients[index].number == number) {
             disconnect(local, index, "too many of its frames wait for the bus");
         }
-        return READ_GONE;
     }
-    return READ_RECORD;
 }
 
 static size_t local_read(transport_t *transport, const transport_receiver_t *receiver) {
     local_t *local = (local_t *)transport;
     size_t taken = 0;
-    bool more = true;
-    for (unsigned turn = 0; more && turn < READ_TURNS_MAX; ++turn) {
-        more = false;
-        accept_clients(local);
-        for (unsigned i = 0; i < local->client_count;) {
-            uint32_t number = local->clients[i].number;
-            if (receiver->may_read(receiver->context, number)) {
-                more = read_one(local, i, receiver, &taken) != READ_NOTHING || more;
+    for (unsigned turn = 0; turn < READ_TURNS_MAX; ++turn) {
+        struct pollfd list[TRANSPORT_DESCRIPTORS_MAX];
+        uint32_t numbers[TRANSPORT_DESCRIPTORS_MAX];
+        size_t count = local_descriptors(transport, list);
+        for (size_t i = 1; i < count; ++i) {
+            numbers[i] = local->clients[i - 1].number;
+            if (!receiver->may_read(receiver->context, numbers[i])) {
+                list[i].fd = -1;
             }
-            i = index_from(local, number + 1);
+        }
+        if (poll(list, count, 0) <= 0) {
+            break;
+        }
+        for (size_t i = 1; i < count; ++i) {
+            /* Answering one client may have cost another its connection, or taken the last place for a frame. */
+            unsigned index = index_from(local, numbers[i]);
+            if (list[i].revents && index < local->client_count && local->clients[index].number == numbers[i] &&
+                receiver->may_read(receiver->context, numbers[i])) {
+                read_one(local, index, receiver, &taken);
+            }
+        }
+        if (list[0].revents) {
+            accept_clients(local);
         }
     }
     return taken;

@@ -169,10 +169,10 @@ TEST(LocalBus, ClientThatReadsNothingIsLeftBehind) {
     RigBench bench("x1000");
     auto reader = bench.connect();
     auto sleeper = bench.connect();
-    reader->set(6, 10); // three truth frames each 10 us
+    reader->set(6, 20); // three truth frames each 20 us
     uint64_t frames = 0;
     testing::internal::CaptureStderr();
-    while (bench.rig->board.time_ns < 200 * MS) {
+    while (bench.rig->board.time_ns < 400 * MS) {
         ASSERT_TRUE(rig_serve(bench.rig.get(), 0));
         frames += reader->receive().size();
     }
