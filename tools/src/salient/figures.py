@@ -92,16 +92,19 @@ def draw_start(path: Path, recordings: Recordings, ours: Merits, paper: Merits, 
 
     def draw(figure: Figure) -> None:
         axes = _grid(figure, recordings, rows=2, heights=(1.25, 1.0))
-        highest_rpm = max([_figure(of, "max_speed_rpm") for of in (*ours.values(), *paper.values())])
+        highest_rpm = max(_figure(of, "max_speed_rpm") for of in (*ours.values(), *paper.values()))
+        end_s = min(float(recording["time_s"][-1]) for recording in recordings.values()) - command_time_s
+        settled_s = [of["settling_time_s"] for of in (*ours.values(), *paper.values())]
+        shown_s = end_s if None in settled_s else min(end_s, 1.5 * max(settled_s))
         for column, (controller, recording) in enumerate(recordings.items()):
             colour = _colour(controller)
-            settled_s = ours[controller]["settling_time_s"]
             printed = paper.get(controller, {})
             for axis in axes[:, column]:
                 _band(axis, reference_rpm)
                 _trace(axis, recording["time_s"] - command_time_s, recording["speed_rpm"], colour)
-                axis.set_xlim(0.0, float(recording["time_s"][-1]) - command_time_s)
-            _mark_settling(axes[0, column], reference_rpm, settled_s, printed.get("settling_time_s"), colour)
+                axis.set_xlim(0.0, shown_s)
+            _mark_settling(axes[0, column], reference_rpm, ours[controller]["settling_time_s"],
+                           printed.get("settling_time_s"), colour)
             axes[0, column].set_title(_letter(column) + _title(controller))
             axes[0, column].set_ylim(0.0, 1.13 * reference_rpm)
             zoom = axes[1, column]
@@ -111,7 +114,7 @@ def draw_start(path: Path, recordings: Recordings, ours: Merits, paper: Merits, 
             zoom.set_xlabel("time after the speed command / s")
         _label_rows(axes, "speed / (r/min)", "speed / (r/min)")
 
-    _save(path, draw, height_in=6.4)
+    _save(path, draw, height_in=6.0, row_gap=0.24)
 
 
 def draw_load_step_speed(path: Path, recordings: Recordings, ours: Merits, paper: Merits, step_time_s: float = 0.13,
@@ -145,7 +148,8 @@ def draw_load_step_speed(path: Path, recordings: Recordings, ours: Merits, paper
                 _mark_recovery(axis, mine["recovery_time_s"], to_ms, colour)
             around.set_title(_step_summary(mine), color=colour, fontweight="bold")
             if printed:
-                around.set_title(f"paper's: {_step_summary(printed)}", loc="right", color=PAPER_COLOUR, fontsize=9.5)
+                around.set_title(f"paper's: {_step_summary(printed, short=True)}", loc="right", color=PAPER_COLOUR,
+                                 fontsize=9.5)
             first.set_title("the first 10 ms")
         for row in axes[1:]:
             _same_limits(row)
@@ -156,14 +160,13 @@ def draw_load_step_speed(path: Path, recordings: Recordings, ours: Merits, paper
 
 def draw_load_step_torque(path: Path, recordings: Recordings, ours: Merits, paper: Merits, step_time_s: float = 0.13,
                           window_s: tuple[float, float] = RIPPLE_WINDOW_S) -> None:
-    """Figure 7: torque around the step, in the steady window with its extremes and mean, and 1 ms of it."""
+    """Figure 7: torque around the step, in the steady window with its extremes and mean, and 1 ms at its highest."""
 
     def draw(figure: Figure) -> None:
         axes = _grid(figure, recordings, rows=3, heights=(1.0, 1.15, 0.8))
         top_Nm = max(_figure(of, "torque_max_Nm") for of in ours.values())
         bottom_Nm = min(_figure(of, "torque_min_Nm") for of in ours.values())
         margin_Nm = 0.12 * (top_Nm - bottom_Nm) + 0.05
-        middle_s = 0.5 * (window_s[0] + window_s[1])
         for column, (controller, recording) in enumerate(recordings.items()):
             colour = _colour(controller)
             mine, printed = ours[controller], paper.get(controller, {})
@@ -172,8 +175,8 @@ def draw_load_step_torque(path: Path, recordings: Recordings, ours: Merits, pape
             part = _between(recording, step_time_s - 0.01, step_time_s + 0.05)
             _trace(around, (part["time_s"] - step_time_s) * 1e3, part["torque_Nm"], colour, width=0.8)
             _trace(around, (part["time_s"] - step_time_s) * 1e3, part["load_torque_Nm"], LOAD_COLOUR, width=1.0)
-            around.annotate("load", (-8.0, 0.0), xytext=(0, 3), textcoords="offset points", color=LOAD_COLOUR,
-                            fontsize=8.5)
+            around.annotate("load", (0.0, 4.0), xytext=(-5, 0), textcoords="offset points", color=LOAD_COLOUR,
+                            fontsize=8.5, ha="right")
             around.set_xlim(-10.0, 50.0)
             around.set_xlabel("time after the load step / ms")
             around.set_title(_letter(column) + _title(controller))
@@ -194,12 +197,13 @@ def draw_load_step_torque(path: Path, recordings: Recordings, ours: Merits, pape
                             .format_map(mine), (0.97, 0.05), xycoords="axes fraction", ha="right", color="#333333",
                             bbox=_PAPER_WHITE)
 
-            part = _between(recording, middle_s - 0.5e-3, middle_s + 0.5e-3)
-            _trace(detail, (part["time_s"] - middle_s) * 1e3, part["torque_Nm"], colour)
+            # part is the window still.
+            highest_s = float(part["time_s"][int(np.argmax(part["torque_Nm"]))])
+            part = _between(recording, highest_s - 0.5e-3, highest_s + 0.5e-3)
+            _trace(detail, (part["time_s"] - highest_s) * 1e3, part["torque_Nm"], colour)
             detail.set_xlim(-0.5, 0.5)
-            detail.set_ylim(bottom_Nm - margin_Nm, top_Nm + margin_Nm)
-            detail.set_title("1 ms of it")
-            detail.set_xlabel(f"time from {middle_s:g} s / ms")
+            detail.set_title("1 ms around its highest torque, on a scale of its own")
+            detail.set_xlabel(f"time from {highest_s:.4f} s / ms")
         _same_limits(axes[0])
         _label_rows(axes, "torque / (N m)", "torque / (N m)", "torque / (N m)")
 
@@ -221,19 +225,20 @@ def draw_phase_currents(path: Path, recordings: Recordings, from_s: float = RIPP
             part, way_deg = part[:end], way_deg[:end]
             currents, torque = axes[:, column]
             for number, name in enumerate(_current_fields(recording)):
-                _trace(currents, way_deg, part[name], PHASE_COLOUR[number], label=f"phase {name[8].upper()}", width=1.0)
+                _trace(currents, way_deg, part[name], PHASE_COLOUR[number], label=name[8].upper(), width=1.0)
             currents.set_title(_letter(column) + _title(controller))
-            currents.legend(loc="upper right", ncols=4, handlelength=1.2, columnspacing=1.0)
+            currents.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0, ncols=4, handlelength=1.5,
+                            columnspacing=1.4)
             _trace(torque, way_deg, part["torque_Nm"], _colour(controller), width=0.8)
             for axis in (currents, torque):
                 axis.set_xlim(0.0, rotor_span_deg)
                 axis.set_xticks(np.arange(0.0, rotor_span_deg + 1.0, 15.0))
             torque.set_xlabel(f"way of the rotor from {from_s:g} s on / deg")
         for row in axes:
-            _same_limits(row, from_zero=True, headroom=0.18 if row is axes[0] else 0.0)
-        _label_rows(axes, "current / A", "torque / (N m)")
+            _same_limits(row, from_zero=True)
+        _label_rows(axes, "phase current / A", "torque / (N m)")
 
-    _save(path, draw, height_in=5.4)
+    _save(path, draw, height_in=5.2, row_gap=0.14)
 
 
 # --- pieces ---------------------------------------------------------------------------------------------------------
@@ -242,13 +247,13 @@ def _grid(figure: Figure, recordings: Recordings, rows: int, heights: tuple[floa
     return figure.subplots(rows, len(recordings), squeeze=False, gridspec_kw={"height_ratios": heights})
 
 
-def _save(path: Path, draw: Callable[[Figure], None], height_in: float) -> None:
+def _save(path: Path, draw: Callable[[Figure], None], height_in: float, row_gap: float = 0.45) -> None:
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(11.0, height_in), dpi=140)
         draw(figure)
         # Margins in inches, so that pictures of different height have the same ones.
         figure.subplots_adjust(left=0.066, right=0.985, bottom=0.55 / height_in, top=1.0 - 0.35 / height_in,
-                               hspace=0.45, wspace=0.14)
+                               hspace=row_gap, wspace=0.14)
         figure.savefig(path, metadata={"Software": None})
 
 
@@ -282,7 +287,7 @@ def _mark_highest(axis: Axes, ours: Mapping[str, float | None], paper: Mapping[s
         level_rpm = _figure(of, "max_speed_rpm")
         axis.axhline(level_rpm, color=line_colour, linewidth=0.9, linestyle=(0, (4, 2)))
         axis.annotate(f"{name} {level_rpm:.1f} r/min ({_figure(of, 'overshoot_percent'):+.2f} %)",
-                      (0.97, 0.9 - 0.11 * row), xycoords="axes fraction", ha="right", color=line_colour,
+                      (0.97, 0.66 - 0.11 * row), xycoords="axes fraction", ha="right", color=line_colour,
                       fontweight=weight, bbox=_PAPER_WHITE)
 
 
@@ -300,10 +305,12 @@ def _mark_recovery(axis: Axes, recovery_s: float | None, to_ms: float, colour: s
                   ha="right" if near_end else "left")
 
 
-def _step_summary(of: Mapping[str, float | None]) -> str:
-    recovery_s = of["recovery_time_s"]
-    back = "not back in this run" if recovery_s is None else f"back in {recovery_s * 1e3:.3g} ms"
-    return f"dip {_figure(of, 'speed_dip_rpm'):.3g} r/min, {back}"
+def _step_summary(of: Mapping[str, float | None], short: bool = False) -> str:
+    recovery_s, dip = of["recovery_time_s"], f"{_figure(of, 'speed_dip_rpm'):.3g} r/min"
+    back = "not back in this run" if recovery_s is None else f"{recovery_s * 1e3:.3g} ms"
+    if short:
+        return f"{dip}, {back}"
+    return f"dip {dip}, {back if recovery_s is None else f'back in {back}'}"
 
 
 def _zoom_after_ms(ours: Merits) -> float:
@@ -312,13 +319,11 @@ def _zoom_after_ms(ours: Merits) -> float:
     return float(np.clip(1.3 * longest_s * 1e3, 20.0, 100.0))
 
 
-def _same_limits(row: np.ndarray, from_zero: bool = False, headroom: float = 0.0) -> None:
-    low = min(axis.get_ylim()[0] for axis in row)
+def _same_limits(row: np.ndarray, from_zero: bool = False) -> None:
+    low = 0.0 if from_zero else min(axis.get_ylim()[0] for axis in row)
     high = max(axis.get_ylim()[1] for axis in row)
-    if from_zero:
-        low = min(low, 0.0)
     for axis in row:
-        axis.set_ylim(low, high + headroom * (high - low))
+        axis.set_ylim(low, high)
 
 
 def _label_rows(axes: np.ndarray, *labels: str) -> None:

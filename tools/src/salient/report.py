@@ -112,8 +112,8 @@ def captions(results: Mapping[str, Any]) -> dict[str, str]:
             + _each(step, "speed_dip_rpm") + " " + _each(step, "recovery_time_s"),
         "figure_7":
             "True shaft torque around the load step (black: the load), in the steady window from 0.3 s to 0.4 s with"
-            " its extremes and its mean, and a single millisecond of it. Each column of pixels reaches from the lowest"
-            " to the highest sample in it, so no spike is lost in drawing. " + _each(step, "torque_ripple"),
+            " its extremes and its mean, and the millisecond around its highest value. Each column of pixels reaches"
+            " from the lowest to the highest sample in it, so no spike is lost in drawing. " + _each(step, "torque_ripple"),
         "phase_currents":
             "Phase currents and torque over two strokes of the rotor (60 degrees) in the steady window. Where one phase"
             " hands over to the next, both carry current and the torque is hardest to hold.",

@@ -1,0 +1,136 @@
+"""salient demo as its user has it: what it leaves behind, twice the same, and what it says to wrong input."""
+
+import hashlib
+import io
+import json
+
+import pytest
+
+from salient import demo
+from salient.arguments import make_parser
+from salient.errors import UsageError
+from salient.progress import Progress
+from salient.results import PAPER
+
+CONTROLLERS = ("traditional", "paper")
+
+
+def options(*line):
+    return make_parser().parse_args(["demo", *map(str, line)])
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture(scope="module")
+def demo_folder(tmp_path_factory):
+    """A demo with the default options, and what it said."""
+    folder = tmp_path_factory.mktemp("demo")
+    said = io.StringIO()
+    assert demo.run(options("--out", folder), stream=said) == 0
+    (folder / "said.txt").write_text(said.getvalue(), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def figures_of_merit(demo_folder):
+    return json.loads((demo_folder / "results.json").read_text(encoding="utf-8"))["experiments"]
+
+
+def bytes_by_name(folder):
+    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "said.txt"}
+
+
+def test_everything_promised_is_there(demo_folder):
+    runs = [f"runs/{experiment}_{controller}/{name}" for experiment in demo.EXPERIMENTS for controller in CONTROLLERS
+            for name in ("can.blf", "can.log", "recording.npy")]
+    pictures = [f"figures/{name}.png" for name in demo.PICTURES]
+    assert set(bytes_by_name(demo_folder)) == {"results.json", "report.html", *runs, *pictures}
+
+
+def test_the_folder_stays_small(demo_folder):
+    assert sum(path.stat().st_size for path in demo_folder.rglob("*") if path.is_file()) < 60e6
+
+
+def test_it_tells_each_step_and_ends_with_the_figures(demo_folder):
+    said = (demo_folder / "said.txt").read_text(encoding="utf-8")
+    steps = [line for line in said.splitlines() if line[:2] in [f"{n}/" for n in range(1, 10)]]
+    assert [step.split()[0] for step in steps] == [f"{n}/9" for n in range(1, 10)]
+    assert "torque ripple K_t" in said
+    assert said.endswith(f"report:  {demo_folder / 'report.html'}\n")
+
+
+def test_the_same_again_is_the_same_to_the_byte(demo_folder, tmp_path):
+    demo.run(options("--out", tmp_path), stream=io.StringIO())
+    assert bytes_by_name(tmp_path) == bytes_by_name(demo_folder)
+
+
+def test_paper_controller_starts_as_fast_as_the_torque_limit_allows(figures_of_merit):
+    merits = figures_of_merit["start_600"]["paper"]
+    # 0.0677 s is the bound at 19.1 N m to 600 r/min; the band is entered 0.5 % earlier.
+    assert 0.0673 < merits["settling_time_s"] <= 0.072
+    assert 0.0 <= merits["overshoot_percent"] <= 0.5
+    assert 597.0 < merits["max_speed_rpm"] <= 603.0
+
+
+def test_paper_controller_recovers_from_the_load_step(figures_of_merit):
+    merits = figures_of_merit["load_step_150"]["paper"]
+    assert 0.0 < merits["recovery_time_s"] <= 0.010
+    # Lowest clairvoyant dip of the saturating machine without delay: a smaller one would be a mistake of the bench.
+    assert 0.39 < merits["speed_dip_rpm"] < 5.0
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_steady_torque_is_load_plus_friction(figures_of_merit, controller):
+    merits = figures_of_merit["load_step_150"][controller]
+    # 8 N m and 0.02 N m s at 15.71 rad/s; the rest is what still accelerates.
+    assert merits["torque_mean_Nm"] == pytest.approx(8.314, abs=0.02)
+    assert merits["torque_ripple"] == pytest.approx(
+        (merits["torque_max_Nm"] - merits["torque_min_Nm"]) / merits["torque_mean_Nm"], rel=1e-4)
+
+
+def test_ripple_of_hysteresis_is_what_its_sampling_rate_allows_and_the_papers_is_lower(figures_of_merit):
+    ripple = {controller: figures_of_merit["load_step_150"][controller]["torque_ripple"] for controller in CONTROLLERS}
+    # An independent model says about 32 kHz / 40 kHz for hysteresis.
+    assert 0.3 < ripple["traditional"] < 1.6
+    assert PAPER["load_step_150"]["paper"]["torque_ripple"] < ripple["paper"] < ripple["traditional"]
+
+
+@pytest.mark.parametrize(("line", "message"), [
+    (["--machine", "perpetuum"], "perpetuum"),
+    (["--machine", "missing/machine.toml"], "missing/machine.toml"),
+])
+def test_a_wrong_machine_is_named_before_anything_is_written(line, message, tmp_path):
+    with pytest.raises(UsageError, match=message) as raised:
+        demo.run(options("--out", tmp_path / "out", *line), stream=io.StringIO())
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_in_the_way_of_the_folder_is_named(tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(UsageError, match=r"--out .*taken: cannot write there"):
+        demo.run(options("--out", tmp_path / "taken"), stream=io.StringIO())
+
+
+# --- progress ---------------------------------------------------------------------------------------------------------
+
+def test_progress_is_a_line_a_step_without_a_terminal():
+    stream = io.StringIO()
+    with Progress(2, stream) as progress:
+        progress.step("one")
+        progress.step("two")
+    assert stream.getvalue() == "1/2 one\n2/2 two\n"
+
+
+def test_progress_stays_on_one_line_of_a_terminal_and_clears_it():
+    stream = Terminal()
+    with Progress(2, stream) as progress:
+        progress.step("one")
+        progress.step("two")
+    assert "\n" not in stream.getvalue()
+    assert "[############............] 1/2 one" in stream.getvalue()
+    assert stream.getvalue().endswith("\r\x1b[K")
