@@ -136,33 +136,30 @@ def _as_root(command: list[str], output) -> bool:
 
 def make_environment(install: bool) -> None:
     """Makes build/venv from the lock file, again when the lock file has changed."""
-    inputs = LOCK.read_bytes() + (TOOLS / "pyproject.toml").read_bytes() + str(ROOT).encode()
-    wanted = hashlib.sha256(inputs).hexdigest()
-    if STAMP.exists() and STAMP.read_text() == wanted and (VENV / "bin/python").exists():
+    packages = hashlib.sha256(LOCK.read_bytes() + str(ROOT).encode()).hexdigest()
+    ours = hashlib.sha256((TOOLS / "pyproject.toml").read_bytes()).hexdigest()
+    found = STAMP.read_text().split() if STAMP.exists() and (VENV / "bin/python").exists() else []
+    if found == [packages, ours]:
         return
-    if not install:
-        fail(f"missing: {VENV.relative_to(ROOT)} with the Python packages of {LOCK.relative_to(ROOT)}; "
-             "leave out --no-install")
-    say(f"installing Python packages of {LOCK.relative_to(ROOT)} into {VENV.relative_to(ROOT)} (CAN, figures, tests)")
-    log = BUILD / "pip.log"
-    python = str(VENV / "bin/python")
-    pip = [python, "-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--no-deps"]
+    pip = [str(VENV / "bin/python"), "-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--no-deps"]
+    steps = [[*pip, "--no-build-isolation", "--editable", str(TOOLS)]]
+    if found[:1] != [packages]:
+        where = f"{LOCK.relative_to(ROOT)} into {VENV.relative_to(ROOT)} (CAN, figures, tests)"
+        if not install:
+            fail(f"missing: the Python packages of {where}; leave out --no-install")
+        say(f"installing Python packages of {where}")
+        steps = [[_base_python(), "-m", "venv", "--clear", str(VENV)], [*pip, "--require-hashes", "-r", str(LOCK)], *steps]
     # setuptools would leave its notes beside the sources.
-    notes = BUILD / "package"
+    notes, extra = BUILD / "package", BUILD / "setuptools.cfg"
     notes.mkdir(exist_ok=True)
-    extra = BUILD / "setuptools.cfg"
     extra.write_text(f"[egg_info]\negg_base = {notes}\n")
-    steps = (
-        [_base_python(), "-m", "venv", "--clear", str(VENV)],
-        [*pip, "--require-hashes", "-r", str(LOCK)],
-        [*pip, "--no-build-isolation", "--editable", str(TOOLS)],
-    )
+    log = BUILD / "pip.log"
     with log.open("wb") as output:
         for step in steps:
             environment = {**os.environ, "DIST_EXTRA_CONFIG": str(extra)}
             if subprocess.run(step, env=environment, stdout=output, stderr=output, cwd=BUILD).returncode != 0:
                 fail(f"the Python packages could not be installed: {_last_line(log)} (see {log.relative_to(ROOT)})")
-    STAMP.write_text(wanted)
+    STAMP.write_text(f"{packages} {ours}\n")
 
 
 def _last_line(log: Path) -> str:

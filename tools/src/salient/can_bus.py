@@ -112,7 +112,8 @@ class SalientBus(can.BusABC):
     """
 
     def __init__(self, channel: str, can_filters=None, receive_own_messages: bool = False, **kwargs) -> None:
-        self._path = str(channel).removeprefix("unix:")
+        self.channel = str(channel)
+        self._path = self.channel.removeprefix("unix:")
         self.channel_info = f"salient unix:{self._path}"
         self.receive_own_messages = receive_own_messages
         self._can_protocol = CanProtocol.CAN_FD

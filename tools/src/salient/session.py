@@ -51,10 +51,14 @@ class Session:
         self._sequence = 0
         self._bus = open_bus(address)
         self._reader = VirtualTimeReader(self._bus)
-        if lockstep:
-            self._run_until(0)  # answered at once with the time it is
-        else:
-            self._receive()
+        try:
+            if lockstep:
+                self._run_until(0)  # answered at once with the time it is
+            else:
+                self._receive()
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Leaves the bus."""
