@@ -31,7 +31,7 @@ MAGNETICS_INLINE double magnetics_kernel_decay(const magnetics_model_t *model, d
     return model->decay[step] * ((1.0 + x) + x2 * ((0.5 + x * (1.0 / 6.0)) + x2 * (1.0 / 24.0 + x * (1.0 / 120.0))));
 }
 
-/* Sine and cosine for abs(x) <= pi, absolute error below 1e-15: series of x / 4, then the double angle twice. */
+/* Sine and cosine for abs(x) <= pi, absolute error below 2e-15: series of x / 4, then the double angle twice. */
 MAGNETICS_INLINE void magnetics_kernel_sine_cosine(double x, double *sine, double *cosine) {
     const double q = 0.25 * x, z = q * q, z2 = z * z, z4 = z2 * z2;
     const double quarter_sine =

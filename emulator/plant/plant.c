@@ -7,7 +7,8 @@
 /* Limits of a step at factor 1. Measured against DOP853 at tolerance 1e-12 (tests/hil/test_plant_against_scipy.py) so
  * that phase currents, torque and speed stay within 1e-6 of their range. */
 #define STEP_MAX_S 25e-6
-#define STEP_CURRENT_FRACTION 0.15 /* of the saturation current 1/b: limits the change of the incremental inductance */
+#define STEP_CURRENT_FRACTION 0.15 /* of the saturation current 1/b: limits the change of the incremental inductance   \
+                                    */
 #define STEP_ANGLE_PITCHES 0.0015
 
 /* A diode's end of conduction is located to this. */

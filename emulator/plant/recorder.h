@@ -31,7 +31,7 @@ typedef struct {
 bool recorder_open(recorder_t *recorder, const char *path, unsigned phases, char *error, size_t error_size);
 
 /* Appends the plant's state; the callback for plant_observe, context is the recorder. */
-void recorder_sample(void *recorder, const plant_t *plant);
+void recorder_sample(void *context, const plant_t *plant);
 
 /* Writes the number of rows and closes; does nothing when not open. False with a line in `error` when any write
  * failed. */

@@ -1,0 +1,112 @@
+#include "plant/recorder.h"
+
+#include <errno.h>
+#include <inttypes.h>
+#include <math.h>
+#include <stdarg.h>
+#include <string.h>
+
+#define PREAMBLE_BYTES 10
+#define BUFFER_BYTES (1 << 20)
+#define DEGREES_PER_RAD 57.29577951308232
+#define RPM_PER_RAD_S 9.549296585513721
+
+#if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "the rows are written as they lie in memory, which the header calls little endian"
+#endif
+
+typedef struct {
+    char text[RECORDER_HEADER_BYTES];
+    size_t length;
+} header_t;
+
+static void append(header_t *header, const char *format, ...) {
+    va_list arguments;
+    va_start(arguments, format);
+    const int written =
+        vsnprintf(header->text + header->length, sizeof header->text - header->length, format, arguments);
+    va_end(arguments);
+    header->length += (size_t)written;
+}
+
+/* Format: numpy.lib.format, version 1.0. The header is padded to RECORDER_HEADER_BYTES, so that it keeps its size
+ * whatever the number of rows. */
+static bool write_header(const recorder_t *recorder) {
+    header_t header = {.length = PREAMBLE_BYTES};
+    append(&header, "{'descr': [('time_s', '<f8'), ('speed_rpm', '<f4'), ('torque_Nm', '<f4'), "
+                    "('load_torque_Nm', '<f4'), ('rotor_angle_deg', '<f4')");
+    for (unsigned phase = 0; phase < recorder->phases; phase++) {
+        append(&header, ", ('current_%c_A', '<f4')", 'a' + (int)phase);
+    }
+    append(&header, "], 'fortran_order': False, 'shape': (%" PRIu64 ",), }", recorder->rows);
+    memset(header.text + header.length, ' ', sizeof header.text - header.length);
+    header.text[sizeof header.text - 1] = '\n';
+    const uint16_t dictionary_bytes = RECORDER_HEADER_BYTES - PREAMBLE_BYTES;
+    memcpy(header.text, "\x93NUMPY\x01\x00", 8);
+    memcpy(header.text + 8, &dictionary_bytes, sizeof dictionary_bytes);
+    return fwrite(header.text, sizeof header.text, 1, recorder->file) == 1;
+}
+
+static void say(const recorder_t *recorder, const char *what, int reason, char *error, size_t error_size) {
+    snprintf(error, error_size, "cannot %s recording '%s': %s", what, recorder->path, strerror(reason));
+}
+
+bool recorder_open(recorder_t *recorder, const char *path, unsigned phases, char *error, size_t error_size) {
+    memset(recorder, 0, sizeof *recorder);
+    recorder->path = path;
+    recorder->phases = phases;
+    recorder->file = fopen(path, "wb");
+    if (recorder->file == NULL) {
+        say(recorder, "create", errno, error, error_size);
+        return false;
+    }
+    setvbuf(recorder->file, NULL, _IOFBF, BUFFER_BYTES);
+    if (!write_header(recorder) || fflush(recorder->file) != 0) {
+        say(recorder, "write", errno, error, error_size);
+        fclose(recorder->file);
+        recorder->file = NULL;
+        return false;
+    }
+    return true;
+}
+
+void recorder_sample(void *context, const plant_t *plant) {
+    recorder_t *recorder = context;
+    struct {
+        double time_s;
+        float values[4 + HAL_PHASES_MAX];
+    } row;
+    const double angle_deg = plant->rotor_angle_rad * DEGREES_PER_RAD;
+    const float wrapped_deg = (float)(angle_deg - 360.0 * floor(angle_deg / 360.0));
+    row.time_s = (double)plant->time_ns * 1e-9;
+    row.values[0] = (float)(plant->speed_rad_s * RPM_PER_RAD_S);
+    row.values[1] = (float)plant_torque_Nm(plant);
+    row.values[2] = (float)plant->load_torque_Nm;
+    row.values[3] = wrapped_deg < 360.0f ? wrapped_deg : 0.0f; /* just below a turn the float rounds up to it */
+    for (unsigned phase = 0; phase < recorder->phases; phase++) {
+        row.values[4 + phase] = (float)plant->current_A[phase];
+    }
+    const size_t bytes = sizeof row.time_s + (4 + recorder->phases) * sizeof row.values[0];
+    if (recorder->write_error == 0 && fwrite(&row, bytes, 1, recorder->file) != 1) {
+        recorder->write_error = errno;
+    }
+    recorder->rows += recorder->write_error == 0;
+}
+
+bool recorder_close(recorder_t *recorder, char *error, size_t error_size) {
+    if (recorder->file == NULL) {
+        return true;
+    }
+    int reason = recorder->write_error;
+    if (reason == 0 && (fseek(recorder->file, 0, SEEK_SET) != 0 || !write_header(recorder))) {
+        reason = errno;
+    }
+    if (fclose(recorder->file) != 0 && reason == 0) {
+        reason = errno;
+    }
+    recorder->file = NULL;
+    if (reason != 0) {
+        say(recorder, "write", reason, error, error_size);
+    }
+    return reason == 0;
+}
