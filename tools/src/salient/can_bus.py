@@ -163,7 +163,10 @@ class SalientBus(can.BusABC):
             frame = record[_TIME.size :]
             if self._is_own_echo(frame):
                 continue
-            return message_of(frame, _TIME.unpack_from(record)[0], self.channel), False
+            message = message_of(frame, _TIME.unpack_from(record)[0], self.channel)
+            # Filtered here: BusABC.recv would take a frame that it filters out for the end of a timeout of 0.
+            if self._matches_filters(message):
+                return message, True
 
     def _is_own_echo(self, frame: bytes) -> bool:
         for sent in (self._sent_on_bus, self._sent_at_once):

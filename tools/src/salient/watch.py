@@ -26,11 +26,14 @@ _COLUMNS = (
 )
 
 
-def _frames(address: str, duration_s: float | None) -> Iterator[tuple[int, can.Message]]:
+def _frames(address: str, duration_s: float | None, what: str) -> Iterator[tuple[int, can.Message]]:
     """Frames until the drive ends, `duration_s` of virtual time have passed, or an interrupt."""
     end_ns = None
+    # Whoever started this may end it so; what is written must be complete then.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with open_bus(address) as bus:
         reader = VirtualTimeReader(bus)
+        print(f"{what} {address}", flush=True)
         while True:
             try:
                 timed = reader.receive(None)
@@ -47,18 +50,15 @@ def _frames(address: str, duration_s: float | None) -> Iterator[tuple[int, can.M
 
 def record(address: str, path: Path, duration_s: float | None) -> int:
     """Writes every frame on a bus to a log file, on virtual time; returns 0."""
+    open_bus(address).shutdown()  # nothing is left behind when there is no such bus
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {path}: {error.strerror}") from None
-    # The log must be complete when whoever started this ends it.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    frames = _frames(address, duration_s)
-    first = next(frames, None)  # nothing is left behind when there is no such bus
     log = open_log(path)
     count = 0
     try:
-        for timed in _chain(first, frames):
+        for timed in _frames(address, duration_s, "recording"):
             log.write(*timed)
             count += 1
     except KeyboardInterrupt:
@@ -69,18 +69,11 @@ def record(address: str, path: Path, duration_s: float | None) -> int:
     return 0
 
 
-def _chain(first: tuple[int, can.Message] | None,
-           rest: Iterator[tuple[int, can.Message]]) -> Iterator[tuple[int, can.Message]]:
-    if first is not None:
-        yield first
-        yield from rest
-
-
 def monitor(address: str, every_s: float, duration_s: float | None) -> int:
     """Prints the drive's main values every `every_s` of virtual time; returns 0."""
     telemetry = SignalTable(drive_database(), "DRIVE")
     due_ns = None
-    for time_ns, message in _frames(address, duration_s):
+    for time_ns, message in _frames(address, duration_s, "watching"):
         telemetry.add(time_ns, message)
         due_ns = time_ns + round(every_s * 1e9) if due_ns is None else due_ns
         if time_ns < due_ns:
