@@ -17,7 +17,7 @@
 #include "rig/transport.h"
 
 #define CLIENTS_MAX 64
-#define BATCH 64                            /* records a system call */
+#define BATCH 256
 #define SEND_BUFFER_BYTES (8 * 1024 * 1024) /* some 10,000 records; the default queue holds 278 */
 #define FULL_TIMEOUT_MS 2000
 #define READ_TURNS_MAX 65536 /* a client that never stops sending cannot hold up the others for ever */

@@ -192,7 +192,7 @@ options_result_t options_parse(options_t *options, int argc, char *argv[]) {
     opterr = 0;
     while ((option = getopt_long(argc, argv, ":", long_options, NULL)) != -1) {
         if (option == '?') {
-            return mistake("%s: no such option, or not one but several options; --help lists them", argv[optind - 1]);
+            return mistake("%s: not an option, or short for more than one; --help lists them", argv[optind - 1]);
         }
         if (option == ':') {
             return mistake("%s: its value is missing", argv[optind - 1]);

@@ -1,0 +1,137 @@
+"""The host executable itself, without the launcher: its command line, its socket file, how it ends."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import struct
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from salient.simulator import executable
+
+TIMEOUT_S = 20
+RUN_UNTIL_ID = 0x9F000001  # with the extended flag
+
+
+@pytest.fixture
+def program() -> str:
+    return str(executable("saturating"))
+
+
+@pytest.fixture
+def start(program: str, tmp_path: Path) -> Iterator:
+    """Starts the executable on tmp_path/bus and waits for its ready line; ends what is left."""
+    processes = []
+
+    def run(*arguments: str) -> tuple[subprocess.Popen[str], dict]:
+        process = subprocess.Popen(
+            [program, "--can", f"unix:{tmp_path}/bus", *arguments],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        processes.append(process)
+        return process, json.loads(process.stdout.readline())
+
+    yield run
+    for process in processes:
+        process.kill()
+        process.wait()
+        for pipe in (process.stdin, process.stdout, process.stderr):
+            pipe.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["--can", "unix:PATH"]),
+        (["--can"], ["--can", "missing"]),
+        (["--can", "tcp:1"], ["tcp:1", "unix:PATH and socketcan:INTERFACE"]),
+        (["--can", "unix:/no/such/folder/bus"], ["/no/such/folder/bus"]),
+        (["--can", "socketcan:nosuch0"], ["socketcan:nosuch0"]),
+        (["--can", "BUS", "--pace", "fast"], ["--pace fast", "lockstep, realtime, free and xN"]),
+        (["--can", "BUS", "--pace", "x0"], ["--pace x0", "0.01 to 1000"]),
+        (["--can", "BUS", "--controller", "pid"], ["--controller pid", "traditional and paper"]),
+        (["--can", "BUS", "--control-rate-hz", "44000"], ["44000", "20000, 40000, 50000 and 100000"]),
+        (["--can", "BUS", "--encoder-bits", "7"], ["--encoder-bits 7", "8 to 24"]),
+        (["--can", "BUS", "--seed", "-1"], ["--seed -1"]),
+        (["--can", "BUS", "--initial-angle-deg", "nan"], ["--initial-angle-deg nan", "-360 to 360"]),
+        (["--can", "BUS", "--record", "/no/such/folder/x.npy"], ["/no/such/folder/x.npy"]),
+        (["--can", "BUS", "--record-step-ns", "1000"], ["--record"]),
+        (["--can", "BUS", "--record", "x.npy", "--record-step-ns", "99"], ["--record-step-ns 99", "from 100"]),
+        (["--can", "BUS", "--bit-rate", "1000001"], ["--bit-rate 1000001", "10000 to 1000000"]),
+        (["--can", "BUS", "--pace", "lockstep", "--stop-at-s", "1"], ["--stop-at-s", "lockstep"]),
+        (["--can", "BUS", "--bogus"], ["--bogus"]),
+        (["--can", "BUS", "extra"], ["extra"]),
+    ],
+)
+def test_mistake_is_one_line_and_exit_code_2(
+    program: str, tmp_path: Path, arguments: list[str], words: list[str]
+) -> None:
+    bus = tmp_path / "bus"
+    line = [f"unix:{bus}" if argument == "BUS" else argument for argument in arguments]
+    result = subprocess.run([program, *line], capture_output=True, text=True, cwd=tmp_path, timeout=TIMEOUT_S)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert re.fullmatch(r"salient: [^\n]+\n", result.stderr), result.stderr
+    for word in words:
+        assert word in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ready_line_says_what_runs(start, tmp_path: Path) -> None:
+    process, ready = start("--pace", "lockstep", "--controller", "traditional", "--seed", "18446744073709551615")
+    assert ready == {
+        "ready": True, "can": f"unix:{tmp_path}/bus", "pid": process.pid, "machine": "saturating",
+        "controller": "traditional", "control_rate_hz": 40000, "pace": "lockstep", "seed": 18446744073709551615,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("pace", ["lockstep", "realtime", "free"])
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, "stdin"])
+def test_ends_cleanly_and_removes_its_socket(start, tmp_path: Path, pace: str, end: signal.Signals | str) -> None:
+    process, _ = start("--pace", pace, "--follow-stdin")
+    if end == "stdin":
+        process.stdin.close()
+    else:
+        process.send_signal(end)
+    assert process.wait(TIMEOUT_S) == 0
+    assert process.stderr.read() == ""
+    assert not (tmp_path / "bus").exists()
+
+
+def test_far_run_until_does_not_keep_it_from_ending(start, tmp_path: Path) -> None:
+    process, _ = start("--pace", "lockstep")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
+        client.connect(f"{tmp_path}/bus")
+        client.send(struct.pack("<QIBxxx8s", 0, RUN_UNTIL_ID, 7, b"\xff" * 6 + b"\x01"))
+        while struct.unpack_from("<QI", client.recv(80))[0] < 1_000_000:
+            pass  # time runs
+    process.terminate()
+    assert process.wait(TIMEOUT_S) == 0
+
+
+def test_socket_of_a_killed_one_is_replaced_and_a_live_one_is_not(start, program: str, tmp_path: Path) -> None:
+    process, _ = start("--pace", "lockstep")
+    process.kill()
+    process.wait()
+    assert (tmp_path / "bus").exists()
+    start("--pace", "lockstep")
+    line = [program, "--can", f"unix:{tmp_path}/bus"]
+    second = subprocess.run(line, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert second.returncode == 2
+    assert re.fullmatch(r"salient: [^\n]*in use[^\n]*\n", second.stderr)
+    assert (tmp_path / "bus").exists()
+
+
+def test_recording_is_complete_after_a_signal(start, tmp_path: Path) -> None:
+    np = pytest.importorskip("numpy")
+    file = tmp_path / "truth.npy"
+    process, _ = start("--pace", "free", "--record", str(file), "--record-from-us", "500", "--stop-at-s", "0.002")
+    assert process.wait(TIMEOUT_S) == 0
+    times = np.load(file)["time_s"]
+    np.testing.assert_allclose(times, np.arange(500, 2001) * 1e-6, atol=1e-12)
