@@ -185,7 +185,7 @@ def read_page(text):
 
 
 def test_the_page_holds_its_pictures_and_fetches_nothing(made, pictures, tmp_path):
-    text = page(tmp_path / "report.html", made, pictures, [("results.json", "the figures")])
+    text = page(tmp_path / "report.html", made, pictures, [("the figures", [("results.json", "results.json")])])
     reader = read_page(text)
     assert len(reader.images) == len(pictures)
     assert all(image.startswith("data:image/png;base64,") for image in reader.images)
@@ -204,7 +204,7 @@ def test_the_page_has_our_figures_and_the_printed_ones(made, pictures, tmp_path)
 
 def test_words_from_outside_are_escaped(made, pictures, tmp_path):
     conditions = dict(CONDITIONS, machine="<b>&odd")
-    text = page(tmp_path / "report.html", dict(made, conditions=conditions), pictures, [("a&b.json", "<i>")])
+    text = page(tmp_path / "report.html", dict(made, conditions=conditions), pictures, [("<i>", [("<u>", "a&b.json")])])
     assert "<b>&odd" not in text
     assert "&lt;b&gt;&amp;odd" in text
     read_page(text)

@@ -229,17 +229,13 @@ def _commands(scenarios: Mapping[str, Sequence[Scenario]]) -> list[str]:
     ]
 
 
-def _files(runs: Iterable[_Run], out: Path) -> list[tuple[str, str]]:
-    files = [("results.json", "the figures of this page, for scripts")]
-    for made in runs:
-        run_of = f"{made.experiment} by {made.controller}"
-        log_path, text_log_path = made.log_paths
-        files += [
-            (log_path.relative_to(out).as_posix(), f"CAN log of {run_of}, on virtual time"),
-            (text_log_path.relative_to(out).as_posix(), "the same as text"),
-            (made.recording_path.relative_to(out).as_posix(), "the machine's true state, for numpy.load"),
-        ]
-    return files
+def _files(runs: Iterable[_Run], out: Path) -> list[tuple[str, list[tuple[str, str]]]]:
+    words = ("CAN log (BLF)", "CAN log (candump text)", "true state (numpy.load)")
+    return [("The figures of this page, for scripts", [("results.json", "results.json")])] + [
+        (f"{made.experiment} by {made.controller}, on virtual time",
+         [(what, path.relative_to(out).as_posix())
+          for what, path in zip(words, (*made.log_paths, made.recording_path), strict=True)])
+        for made in runs]
 
 
 def _plain(words: str) -> str:

@@ -58,11 +58,11 @@ class Picture:
 
 
 def write_report(path: Path, results: Mapping[str, Any], pictures: Sequence[Picture], commands: Sequence[str],
-                 files: Sequence[tuple[str, str]]) -> None:
+                 files: Sequence[tuple[str, Sequence[tuple[str, str]]]]) -> None:
     """Writes the page for `results` (results.json's content).
 
-    `pictures` are inlined. `commands` are the shell lines that give this page again. `files` are (path relative to the
-    page, what it is), linked. Equal input gives equal bytes.
+    `pictures` are inlined. `commands` are the shell lines that give this page again. `files` are (what they are of,
+    [(words, path relative to the page), ...]), linked. Equal input gives equal bytes.
     """
     page = _PAGE.substitute(
         style=_STYLE,
@@ -74,8 +74,7 @@ def write_report(path: Path, results: Mapping[str, Any], pictures: Sequence[Pict
         notes="\n".join(f"<li>{escape(note)}</li>" for note in results["paper_notes"]),
         conditions=_conditions(results["conditions"]),
         commands=escape("\n".join(commands)),
-        files="\n".join(f'<li><a href="{escape(name)}">{escape(name)}</a>: {escape(what)}</li>'
-                        for name, what in files),
+        files="\n".join(f"<li>{escape(of)}: {', '.join(_link(*link) for link in links)}</li>" for of, links in files),
     )
     path.write_text(page, encoding="utf-8")
 
@@ -113,7 +112,8 @@ def captions(results: Mapping[str, Any]) -> dict[str, str]:
         "figure_7":
             "True shaft torque around the load step (black: the load), in the steady window from 0.3 s to 0.4 s with"
             " its extremes and its mean, and the millisecond around its highest value. Each column of pixels reaches"
-            " from the lowest to the highest sample in it, so no spike is lost in drawing. " + _each(step, "torque_ripple"),
+            " from the lowest to the highest sample in it, so no spike is lost in drawing. "
+            + _each(step, "torque_ripple"),
         "phase_currents":
             "Phase currents and torque over two strokes of the rotor (60 degrees) in the steady window. Where one phase"
             " hands over to the next, both carry current and the torque is hardest to hold.",
@@ -168,6 +168,10 @@ def _table(results: Mapping[str, Any], experiment: str) -> str:
     return (f"<h3>{escape(EXPERIMENT_NAME.get(experiment, experiment))}</h3>\n<table><thead><tr><th></th>{heads}</tr>"
             f"<tr><th></th>{'<th>here</th><th class=paper>printed</th>' * len(merits)}</tr></thead>\n<tbody>"
             + "\n".join(rows) + "</tbody></table>")
+
+
+def _link(words: str, target: str) -> str:
+    return f'<a href="{escape(target)}">{escape(words)}</a>'
 
 
 def _bare(words: str, unit: str) -> str:
@@ -237,9 +241,9 @@ def _conditions(conditions: Mapping[str, Any]) -> str:
 
 
 _STYLE = """
-:root { color-scheme: light; }
+:root { color-scheme: light; font-size: 16px; }
 body { margin: 0 auto; max-width: 1060px; padding: 2.2rem 1.4rem 4rem; background: #fff; color: #222;
-       font: 16px/1.55 system-ui, "Segoe UI", "Liberation Sans", "DejaVu Sans", sans-serif; }
+       font: 1rem/1.55 system-ui, "Segoe UI", "Liberation Sans", "DejaVu Sans", sans-serif; }
 h1 { font-size: 1.75rem; line-height: 1.2; margin: 0 0 .5rem; }
 h2 { font-size: 1.25rem; margin: 2.6rem 0 .6rem; padding-top: .8rem; border-top: 1px solid #ddd; }
 h3 { font-size: 1rem; margin: 1.6rem 0 .4rem; }
@@ -259,7 +263,7 @@ th, td { padding: .32rem .6rem; border-bottom: 1px solid #e6e6e6; text-align: ri
 th[scope=row] { text-align: left; font-weight: normal; }
 thead th { border-bottom: 1px solid #bbb; }
 .paper { color: #767676; }
-thead th:not(:first-child) { text-align: right; }
+thead th:first-child { text-align: left; }
 .tables table { table-layout: fixed; }
 .tables th:first-child { width: 30%; }
 .this td, .this th[scope=row] { font-weight: 600; background: #f6f6f4; }
@@ -275,7 +279,17 @@ li { max-width: 80ch; margin: .2rem 0; }
 a { color: #1e62a8; }
 @media print {
   @page { size: A4; margin: 15mm; }
-  body { max-width: none; padding: 0; font-size: 10.5pt; }
+  :root { font-size: 9pt; }
+  body { max-width: none; padding: 0; }
+  h1 { font-size: 15pt; }
+  h2 { font-size: 12pt; margin-top: 1.4rem; padding-top: .5rem; }
+  h3 { font-size: 10pt; margin-top: .9rem; }
+  th, td { padding: .18rem .4rem; }
+  .tiles { gap: .6rem; margin: .8rem 0; }
+  .tile { flex-basis: 160px; }
+  .tile b { font-size: 11pt; }
+  .tables th:first-child { width: 34%; }
+  figure { margin: .8rem 0 1rem; }
   h2, h3 { break-after: avoid; }
   pre { border-color: #ccc; }
 }
@@ -318,7 +332,7 @@ $notes
 $conditions
 
 <h2>Again</h2>
-<p>Equal commands give equal files, byte for byte, on any machine.</p>
+<p>Equal commands give equal results and CAN logs, byte for byte.</p>
 <pre>$commands</pre>
 <ul>
 $files
