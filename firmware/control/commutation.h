@@ -3,7 +3,9 @@
  * Angles of a phase in 2^-32 rotor pitch: 0 aligned, 2^31 unaligned (45 degrees of the 90 degree pitch in the paper).
  * The conduction windows of the phases follow each other without gap when turn-off - turn-on is pitch / phases, as the
  * paper's 45 and 75 degrees are; a phase that has left its window stays available until `outgoing_off`, because a hard
- * turn-off at 75 degrees leaves a hole in the torque that the next phase cannot fill in time.
+ * turn-off at 75 degrees leaves a hole in the torque that the next phase cannot fill in time. Where windows overlap
+ * (300 degrees of a four-phase pitch, say) the phase that entered last is the active one and the one before it
+ * outgoing.
  */
 #ifndef CONTROL_COMMUTATION_H
 #define CONTROL_COMMUTATION_H
@@ -16,14 +18,14 @@
 
 typedef struct {
     uint32_t turn_on;      /* 2^-32 pitch, from 2^31 */
-    uint32_t turn_off;     /* above turn_on */
+    uint32_t turn_off;     /* above turn_on; else no phase is ever active */
     uint32_t outgoing_off; /* from turn_off */
 } commutation_parameters_t;
 
 typedef struct {
     uint32_t angle[HAL_PHASES_MAX]; /* of each phase, 2^-32 pitch */
-    unsigned active;                /* in its window; the last one where windows overlap; COMMUTATION_NONE in a gap */
-    unsigned outgoing;              /* past its window, still available; COMMUTATION_NONE */
+    unsigned active;                /* in its window, the last to enter where windows overlap; COMMUTATION_NONE */
+    unsigned outgoing;              /* of the others the last to enter that is still available; COMMUTATION_NONE */
 } commutation_t;
 
 /* Angles and roles for a rotor angle in 2^-32 mechanical turn; 1 <= phases <= HAL_PHASES_MAX. */

@@ -5,7 +5,7 @@
  * Rules, error = reference - torque of all phases:
  *   one phase at work    +1 above +inner, 0 below -inner, -1 below -outer; unchanged between, 0 after -1
  *   two phases at work   outgoing: +1 above +inner, -1 below -inner, 0 when the error has returned through zero
- *                        incoming: +1 above +outer, 0 below zero, unchanged between
+ *                        incoming: +1 above +outer, 0 below zero; unchanged between, 0 after -1
  *   other phases         -1
  *
  * The outgoing phase, large in inductance, moves the torque in small steps and so gets the inner band; the incoming

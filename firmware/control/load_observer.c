@@ -1,6 +1,5 @@
 #include "control/load_observer.h"
 
-#include "fixed/exponential.h"
 #include "fixed/fixed.h"
 
 /* Keeps a wild load estimate (a rotor that was turned by hand, an encoder that jumped) from taking seconds to return.
@@ -11,16 +10,28 @@
 
 /* 2 pi in Q3.28. */
 #define TWO_PI_Q28 1686629713
+#define TWO_PI_Q9 3217
+
+/* 1 - e^-y in Q1.31 for y in Q1.31, 0..0.4: y (1 - y/2 (1 - y/3 (1 - y/4 (1 - y/5)))). A small bandwidth needs the
+ * difference itself: 1 minus the table's e^-y is off by half a percent there. Products below 2^62. */
+static int64_t decay_complement_q31(int64_t y_q31) {
+    const int64_t one_q31 = (int64_t)1 << 31;
+    int64_t series_q31 = one_q31;
+    for (int n = 5; n >= 2; n--) {
+        series_q31 = one_q31 - fixed_shift(y_q31 * series_q31, 31) / n;
+    }
+    return fixed_shift(y_q31 * series_q31, 31);
+}
 
 load_observer_parameters_t load_observer_configure(uint32_t bandwidth_rad_s, uint32_t control_rate_hz,
                                                    int32_t inertia_q30, int32_t friction_q30) {
     /* Widths in the comments are for the ends of the ranges: p = 1 - q <= 0.33, p rate <= 8000. */
     const int64_t rate = control_rate_hz; /* 17 bits */
     const int64_t one_q31 = (int64_t)1 << 31;
-    const int64_t q_q31 = exponential_negative_q31((uint32_t)(((uint64_t)bandwidth_rad_s << 16) / control_rate_hz));
-    const int64_t p_q31 = one_q31 - q_q31;
-    const int64_t p2_q46 = (p_q31 * p_q31) >> 16;
-    const int64_t p3_q46 = ((p2_q46 >> 15) * p_q31) >> 16;
+    const int64_t p_q31 = decay_complement_q31(((int64_t)bandwidth_rad_s << 31) / rate);
+    const int64_t q_q31 = one_q31 - p_q31;
+    const int64_t p2_q46 = fixed_shift(p_q31 * p_q31, 16);
+    const int64_t p3_q46 = fixed_shift(fixed_shift(p2_q46, 12) * p_q31, 19); /* Q34, 31 bits, * Q31 */
     const int64_t q3_q31 = (((q_q31 * q_q31) >> 31) * q_q31) >> 31;
     const int64_t inertia_rate_q30 = (int64_t)inertia_q30 * rate; /* 48 bits */
 
@@ -29,12 +40,12 @@ load_observer_parameters_t load_observer_configure(uint32_t bandwidth_rad_s, uin
 
     /* l2 * 2 pi * 2^14, which is 2 pi 2^-32 rad to 2^-22 rad/s in Q24. */
     const int64_t l2_q46 = ((p2_q46 * ((one_q31 + q_q31) >> 16)) >> 15) * 3 / 2 * rate; /* 46 - 2 + 17 bits */
-    parameters.speed_gain_q24 = fixed_saturate(((l2_q46 >> 24) * (TWO_PI_Q28 >> 4)) >> 32);
+    parameters.speed_gain_q24 = fixed_saturate(fixed_shift((l2_q46 >> 24) * (TWO_PI_Q28 >> 4), 32));
 
-    /* J l3 * 2 pi * 2^8, which is 2 pi 2^-32 rad to 2^-24 N m in Q16; J l3 = (J rate) (p^3 rate). */
-    const int64_t p3_rate_q30 = (p3_q46 * rate) >> 16;                            /* 40 bits */
-    const int64_t inertia_l3_q36 = (inertia_rate_q30 >> 16) * (p3_rate_q30 >> 8); /* 63 bits */
-    parameters.torque_gain_q16 = ((inertia_l3_q36 >> 20) * (TWO_PI_Q28 >> 16)) >> 20;
+    /* J l3 * 2 pi * 2^12, which is 2 pi 2^-32 rad to 2^-24 N m in Q20; J l3 = (J rate) (p^3 rate), below 2^25. */
+    const int64_t p3_rate_q24 = fixed_shift(p3_q46 * rate, 22);                                /* 34 bits */
+    const int64_t inertia_l3_q38 = fixed_shift(inertia_rate_q30, 16) * p3_rate_q24;            /* 63 bits */
+    parameters.torque_gain_q20 = fixed_shift(fixed_shift(inertia_l3_q38, 12) * TWO_PI_Q9, 23); /* 51 + 12 bits */
 
     /* Ts / J * 2^-2 * 2^32 = 2^30 / (J rate). */
     parameters.acceleration_q32 = fixed_saturate(((int64_t)1 << 60) / inertia_rate_q30);
@@ -58,7 +69,7 @@ int32_t load_observer_step(const load_observer_parameters_t *parameters, load_ob
     /* Correct. */
     observer->angle_q64 += (uint64_t)(error * parameters->angle_gain_q30) << 2; /* Q30 to Q32 */
     int32_t speed_q22 = fixed_saturate(observer->speed_q22 + fixed_shift(error * parameters->speed_gain_q24, 24));
-    const int64_t load_q24 = observer->load_torque_q24 - fixed_shift(error * parameters->torque_gain_q16, 16);
+    const int64_t load_q24 = observer->load_torque_q24 - fixed_shift(error * parameters->torque_gain_q20, 20);
     observer->load_torque_q24 = (int32_t)(load_q24 > LOAD_TORQUE_LIMIT_Q24    ? LOAD_TORQUE_LIMIT_Q24
                                           : load_q24 < -LOAD_TORQUE_LIMIT_Q24 ? -LOAD_TORQUE_LIMIT_Q24
                                                                               : load_q24);

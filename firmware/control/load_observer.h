@@ -16,7 +16,7 @@
 typedef struct {
     int32_t angle_gain_q30;   /* l1 */
     int32_t speed_gain_q24;   /* l2: rad/s Q9.22 per 2^-32 turn, in Q24 */
-    int64_t torque_gain_q16;  /* J l3: N m Q7.24 per 2^-32 turn, in Q16 */
+    int64_t torque_gain_q20;  /* J l3: N m Q7.24 per 2^-32 turn, in Q20; below 2^40 */
     int32_t acceleration_q32; /* Ts / J: rad/s Q9.22 per N m Q7.24, in Q32 */
     int32_t friction_q30;     /* B, N m s */
     int32_t angle_step_q32;   /* Ts: 2^-32 turn per rad/s Q9.22, in Q32 */
@@ -25,11 +25,11 @@ typedef struct {
 typedef struct {
     uint64_t angle_q64;      /* mechanical, 2^-64 turn, wraps */
     int32_t speed_q22;       /* rad/s, Q9.22, saturates */
-    int32_t load_torque_q24; /* N m, Q7.24, saturates at +-torque_limit */
+    int32_t load_torque_q24; /* N m, Q7.24, saturates at +-60 N m */
 } load_observer_t;
 
 /* Gains for a bandwidth w0 in rad/s (100..8000), a control rate in Hz (20000..100000), an inertia in kg m^2, Q1.30
- * (from 10^-4) and a friction in N m s, Q1.30. Integer arithmetic; relative error of each gain below 0.2 percent. */
+ * (from 10^-4) and a friction in N m s, Q1.30. Integer arithmetic; each gain within 0.1 percent and 1 LSB. */
 load_observer_parameters_t load_observer_configure(uint32_t bandwidth_rad_s, uint32_t control_rate_hz,
                                                    int32_t inertia_q30, int32_t friction_q30);
 

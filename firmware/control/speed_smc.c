@@ -8,7 +8,7 @@
 
 int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, int32_t x_q22) {
     const int64_t x = fixed_abs(x_q22);
-    /* delta |x|: Q22 * Q12 = Q34, to unsigned Q16.16; 512 * 8 = 4096 fits. */
+    /* delta |x|: Q22 * Q12 = Q34, to unsigned Q16.16; 512 * 10 = 5120 fits. */
     const uint32_t exponent_q16 = (uint32_t)((x * parameters->delta_q12) >> 18);
     const int64_t decay_q31 = exponential_negative_q31(exponent_q16);
 

@@ -19,8 +19,8 @@
 
 typedef struct {
     int32_t gain_q24;       /* J k, N m s/rad, Q7.24, > 0 */
-    int32_t epsilon_q15;    /* eps, Q1.15, 0 < eps <= 1 */
-    int32_t delta_q12;      /* delta, s/rad, Q3.12, >= 0 */
+    int32_t epsilon_q15;    /* eps, Q1.15, 0.01..1 */
+    int32_t delta_q12;      /* delta, s/rad, Q19.12, 0..10 */
     int32_t friction_q30;   /* B, N m s, Q1.30, >= 0 */
     int32_t torque_min_q24; /* N m, Q7.24 */
     int32_t torque_max_q24; /* N m, Q7.24 */

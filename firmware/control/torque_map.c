@@ -24,7 +24,7 @@ static rows_t rows_at(const machine_tables_t *tables, uint32_t distance) {
 
 /* Between two rows: entries below 2^15 in Q8 or 2^24 in Q17, times a 16-bit fraction: 64 bits. */
 static int64_t between(int32_t low, int32_t high, int32_t fraction_q16) {
-    return ((int64_t)low << 16) + (int64_t)(high - low) * fraction_q16;
+    return (int64_t)low * 65536 + (int64_t)(high - low) * fraction_q16;
 }
 
 int32_t torque_map_torque_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9) {

@@ -13,7 +13,7 @@
 
 static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithmetic");
 
-/* Number of a format from a constant: evaluated by the compiler, never at run time. */
+/* Number of a format from a constant, nearest; numerator >= 0. Evaluated by the compiler, never at run time. */
 #define FIXED_CONSTANT(numerator, denominator, fraction_bits)                                                          \
     ((int32_t)((((int64_t)(numerator) << (fraction_bits)) + (denominator) / 2) / (denominator)))
 
@@ -46,7 +46,7 @@ static inline int32_t fixed_abs(int32_t value) {
     return value < 0 ? fixed_subtract(0, value) : value;
 }
 
-/* value / 2^shift, rounded; shift 1..62. Cannot overflow for |value| <= 2^63 - 2^(shift-1). */
+/* value / 2^shift, rounded; shift 1..62. Cannot overflow for value < 2^63 - 2^(shift-1). */
 static inline int64_t fixed_shift(int64_t value, unsigned shift) {
     return (value + ((int64_t)1 << (shift - 1))) >> shift;
 }

@@ -14,7 +14,7 @@ int32_t sigmoid_symmetric_q15(int32_t x_q12);
 /* f'(x) = (1 - f^2) / 2 from f in Q1.15, |f| <= 32768; Q1.15, truncated by less than 1 LSB. */
 int32_t sigmoid_symmetric_slope_q15(int32_t f_q15);
 
-/* g(x), Q1.15, 0..32768, for x in Q19.12. Error below 5e-5. */
+/* g(x), Q1.15, 1..32768, for x in Q19.12. Error below 5e-5. */
 int32_t sigmoid_logistic_q15(int32_t x_q12);
 
 /* g'(x) = g (1 - g) from g in Q1.15, 0..32768; Q1.15, truncated by less than 1 LSB. */

@@ -1,0 +1,118 @@
+// Saturating arithmetic against 128-bit integers.
+#include <cstdint>
+#include <random>
+#include <vector>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "fixed/fixed.h"
+}
+
+namespace {
+
+__extension__ typedef __int128 wide_t;
+
+const std::vector<int32_t> CORNERS = {
+    INT32_MIN, INT32_MIN + 1, -0x40000001, -0x40000000, -65536,     -32769,        -32768,   -3, -2, -1, 0, 1, 2, 3,
+    32767,     32768,         65535,       0x3FFFFFFF,  0x40000000, INT32_MAX - 1, INT32_MAX};
+
+// Corners and random numbers of every magnitude.
+std::vector<int32_t> samples(unsigned seed, int count) {
+    std::vector<int32_t> values = CORNERS;
+    std::mt19937 random(seed);
+    for (int i = 0; i < count; i++) {
+        const auto value = int32_t(uint32_t(random()));
+        values.push_back(value >> (random() % 31));
+    }
+    return values;
+}
+
+int32_t saturated(wide_t value) {
+    return value > INT32_MAX ? INT32_MAX : value < INT32_MIN ? INT32_MIN : int32_t(value);
+}
+
+// floor(value / 2^shift + 1/2)
+wide_t halves_up(wide_t value, unsigned shift) {
+    const wide_t one = wide_t(1) << shift;
+    const wide_t sum = value + one / 2;
+    const wide_t quotient = sum / one;
+    return sum % one < 0 ? quotient - 1 : quotient;
+}
+
+TEST(FixedArithmetic, saturate_keeps_what_fits_and_holds_at_the_ends) {
+    for (const int32_t value : CORNERS) {
+        EXPECT_EQ(fixed_saturate(value), value);
+    }
+    EXPECT_EQ(fixed_saturate(int64_t(INT32_MAX) + 1), INT32_MAX);
+    EXPECT_EQ(fixed_saturate(int64_t(INT32_MIN) - 1), INT32_MIN);
+    EXPECT_EQ(fixed_saturate(INT64_MAX), INT32_MAX);
+    EXPECT_EQ(fixed_saturate(INT64_MIN), INT32_MIN);
+}
+
+TEST(FixedArithmetic, clamp_holds_at_both_limits) {
+    EXPECT_EQ(fixed_clamp(6, -5, 5), 5);
+    EXPECT_EQ(fixed_clamp(5, -5, 5), 5);
+    EXPECT_EQ(fixed_clamp(-5, -5, 5), -5);
+    EXPECT_EQ(fixed_clamp(-6, -5, 5), -5);
+    EXPECT_EQ(fixed_clamp(INT32_MIN, INT32_MIN, INT32_MAX), INT32_MIN);
+    EXPECT_EQ(fixed_clamp(7, 3, 3), 3);
+}
+
+TEST(FixedArithmetic, sum_difference_and_magnitude_saturate) {
+    const std::vector<int32_t> values = samples(1, 300);
+    for (const int32_t a : values) {
+        ASSERT_EQ(fixed_abs(a), saturated(a < 0 ? -wide_t(a) : wide_t(a)));
+        for (const int32_t b : values) {
+            ASSERT_EQ(fixed_add(a, b), saturated(wide_t(a) + b)) << a << " + " << b;
+            ASSERT_EQ(fixed_subtract(a, b), saturated(wide_t(a) - b)) << a << " - " << b;
+        }
+    }
+}
+
+TEST(FixedArithmetic, shift_rounds_halves_towards_plus_infinity) {
+    EXPECT_EQ(fixed_shift(1, 1), 1);
+    EXPECT_EQ(fixed_shift(-1, 1), 0);
+    EXPECT_EQ(fixed_shift(3, 1), 2);
+    EXPECT_EQ(fixed_shift(-3, 1), -1);
+    EXPECT_EQ(fixed_shift(-5, 2), -1);
+    EXPECT_EQ(fixed_shift(-6, 2), -1);
+    EXPECT_EQ(fixed_shift(-7, 2), -2);
+}
+
+TEST(FixedArithmetic, shift_is_right_to_the_ends_of_its_range) {
+    std::mt19937_64 random(2);
+    for (unsigned shift = 1; shift <= 62; shift++) {
+        const int64_t end = INT64_MAX - (int64_t(1) << (shift - 1));
+        for (const int64_t value : {end, end - 1, INT64_MIN, INT64_MIN + 1, int64_t(0), int64_t(1), int64_t(-1)}) {
+            ASSERT_TRUE(fixed_shift(value, shift) == halves_up(value, shift)) << value << " >> " << shift;
+        }
+        for (int i = 0; i < 2000; i++) {
+            const int64_t value = int64_t(random()) >> (1 + random() % 60);
+            const int64_t held = value > end ? end : value;
+            ASSERT_TRUE(fixed_shift(held, shift) == halves_up(held, shift)) << held << " >> " << shift;
+        }
+    }
+}
+
+TEST(FixedArithmetic, product_is_rounded_and_saturated_for_all_arguments) {
+    const std::vector<int32_t> values = samples(3, 80);
+    for (unsigned shift = 1; shift <= 62; shift++) {
+        for (const int32_t a : values) {
+            for (const int32_t b : values) {
+                ASSERT_EQ(fixed_multiply(a, b, shift), saturated(halves_up(wide_t(a) * b, shift)))
+                    << a << " * " << b << " >> " << shift;
+            }
+        }
+    }
+}
+
+TEST(FixedArithmetic, constants_are_the_nearest_numbers) {
+    EXPECT_EQ(FIXED_CONSTANT(1, 2, 15), 16384);
+    EXPECT_EQ(FIXED_CONSTANT(191, 10, 24), 320444826); // 320444825.6
+    EXPECT_EQ(FIXED_CONSTANT(1, 3, 16), 21845);        // 21845.3
+    EXPECT_EQ(FIXED_CONSTANT(2, 3, 16), 43691);        // 43690.7
+    EXPECT_EQ(FIXED_CONSTANT(0, 7, 24), 0);
+}
+
+} // namespace
