@@ -74,7 +74,8 @@ def test_mistake_is_one_line_and_exit_code_2(
 ) -> None:
     bus = tmp_path / "bus"
     line = [f"unix:{bus}" if argument == "BUS" else argument for argument in arguments]
-    result = subprocess.run([program, *line], check=False, capture_output=True, text=True, cwd=tmp_path, timeout=TIMEOUT_S)
+    command = [program, *line]
+    result = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path, timeout=TIMEOUT_S)
     assert result.returncode == 2
     assert result.stdout == ""
     assert re.fullmatch(r"salient: [^\n]+\n", result.stderr), result.stderr
