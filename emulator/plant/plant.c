@@ -4,11 +4,12 @@
 #include <math.h>
 #include <string.h>
 
-/* Limits of a step at factor 1. Measured against DOP853 at tolerance 1e-12 (tests/hil/test_plant_against_scipy.py) so
- * that phase currents, torque and speed stay within 1e-6 of their range. */
+/* Limits of a step at factor 1, chosen so that currents, torque and speed stay within 1e-6 of their range (measured
+ * against SciPy's DOP853 at a tolerance of 1e-12: 5e-7) at the speeds and currents of a drive. A whole control period
+ * at 40 kHz is one step where nothing happens in it. */
 #define STEP_MAX_S 25e-6
-#define STEP_CURRENT_FRACTION 0.15 /* of the saturation current 1/b: limits the change of the incremental inductance   \
-                                    */
+/* Of the saturation current 1/b: limits the change of the incremental inductance. */
+#define STEP_CURRENT_FRACTION 0.15
 #define STEP_ANGLE_PITCHES 0.0015
 
 /* A diode's end of conduction is located to this. */

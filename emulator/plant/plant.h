@@ -92,8 +92,8 @@ void plant_set_switches(plant_t *plant, const hal_pwm_compare_t *compare, uint16
 /* Opens all switches from now on, and forgets the edges still to come. */
 void plant_open_all(plant_t *plant);
 
-/* Advances to exactly to_ns; does nothing when that is not in the future. Costs one Runge-Kutta step per switch edge,
- * per conducting phase, or more where steps are limited. */
+/* Advances to exactly to_ns; does nothing when that is not in the future. An advance that ends
+ * within a period cuts a step in two and so changes the last bits of what follows; plant_observe does not. */
 void plant_advance(plant_t *plant, uint64_t to_ns);
 
 /* Calls sample(context, plant) at exactly first_ns + n * step_ns, n = 0, 1, ..., while plant_advance passes them, with
