@@ -99,6 +99,21 @@ def test_ripple_of_hysteresis_is_what_its_sampling_rate_allows_and_the_papers_is
     assert PAPER["load_step_150"]["paper"]["torque_ripple"] < ripple["paper"] < ripple["traditional"]
 
 
+@pytest.mark.parametrize("machine", ["linear_cosine", "linear_trapezoid"])
+def test_the_linear_machines_hold_the_same_promises(machine, tmp_path):
+    demo.run(options("--out", tmp_path, "--machine", machine), stream=io.StringIO())
+    results = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
+    assert results["conditions"]["machine"] == machine
+    start, step = results["experiments"]["start_600"]["paper"], results["experiments"]["load_step_150"]
+    assert 0.0673 < start["settling_time_s"] <= 0.072
+    assert 0.0 <= start["overshoot_percent"] <= 0.5
+    assert 0.0 < step["paper"]["recovery_time_s"] <= 0.010
+    assert PAPER["load_step_150"]["paper"]["torque_ripple"] < step["paper"]["torque_ripple"]
+    assert step["paper"]["torque_ripple"] < step["traditional"]["torque_ripple"]
+    # About 16 and 11 kHz / 40 kHz from an independent model.
+    assert 0.15 < step["traditional"]["torque_ripple"] < 0.6
+
+
 @pytest.mark.parametrize(("line", "message"), [
     (["--machine", "perpetuum"], "perpetuum"),
     (["--machine", "missing/machine.toml"], "missing/machine.toml"),

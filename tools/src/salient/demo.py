@@ -7,7 +7,9 @@ leaves: the CAN log as BLF and as candump text, and the recording of the true st
 from __future__ import annotations
 
 import argparse
+import errno
 import shlex
+import signal
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
@@ -17,15 +19,18 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
+from can import CanError
 
 from salient import figures, metrics
+from salient.drive import DriveError
 from salient.errors import UsageError
 from salient.paths import SCENARIOS
 from salient.progress import Progress
 from salient.report import ROWS, Picture, captions, printed_words_for, words_for, write_report
 from salient.results import make_results, write_results
 from salient.scenario import Scenario, load_scenarios, run_scenario
-from salient.simulator import executable
+from salient.session import SessionError
+from salient.simulator import SimulatorError, executable
 
 Merits = dict[str, float | None]
 
@@ -43,6 +48,7 @@ PICTURES = {
 }
 
 _WORKERS = 2
+_CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
 
 class DemoFailed(Exception):
@@ -74,7 +80,19 @@ def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.st
     scenarios = _scenarios(options)
     out: Path = options.out
     _prepare_folder(out)
-    with (ProcessPoolExecutor(max_workers=_WORKERS if can == "local" else 1) as workers,
+    try:
+        results = _run_and_report(scenarios, out, can, stream)
+    except OSError as error:
+        if error.errno in _CANNOT_WRITE:
+            raise _cannot_write(out, error) from error
+        raise
+    stream.write(f"{summary(results)}\n\nresults: {out / 'results.json'}\nreport:  {out / 'report.html'}\n")
+    return 0
+
+
+def _run_and_report(scenarios: Mapping[str, Sequence[Scenario]], out: Path, can: str,
+                    stream: TextIO) -> dict[str, Any]:
+    with (ProcessPoolExecutor(_WORKERS if can == "local" else 1, initializer=_leave_interrupts_to_parent) as workers,
           Progress(sum(map(len, scenarios.values())) + len(PICTURES) + 1, stream) as progress):
         runs = _run_all(workers, scenarios, out, can, progress)
         results = make_results(_merits(runs), _conditions(scenarios))
@@ -82,8 +100,12 @@ def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.st
         write_results(out / "results.json", results)
         write_report(out / "report.html", results, pictures, _commands(scenarios), _files(runs, out))
         progress.step("report.html")
-    stream.write(f"{summary(results)}\n\nresults: {out / 'results.json'}\nreport:  {out / 'report.html'}\n")
-    return 0
+    return results
+
+
+def _leave_interrupts_to_parent() -> None:
+    """For a worker: Ctrl-C reaches the whole group, and one process answering it is enough."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def summary(results: Mapping[str, Any]) -> str:
@@ -121,8 +143,11 @@ def _prepare_folder(out: Path) -> None:
             (out / name).touch()
             (out / name).unlink()
     except OSError as error:
-        raise UsageError(f"--out {out}: cannot write there ({error.strerror}); give a folder that can be written"
-                         ) from error
+        raise _cannot_write(out, error) from error
+
+
+def _cannot_write(out: Path, error: OSError) -> UsageError:
+    return UsageError(f"--out {out}: cannot write there ({error.strerror}); give a folder that can be written")
 
 
 def _run_all(workers: Executor, scenarios: Mapping[str, Iterable[Scenario]], out: Path, can: str,
@@ -137,14 +162,17 @@ def _run_all(workers: Executor, scenarios: Mapping[str, Iterable[Scenario]], out
 
 
 def _run_one(experiment: str, scenario: Scenario, folder: Path, can: str) -> _Run:
-    result = run_scenario(scenario, folder, can=can)
-    failure = f"{experiment} by {scenario.controller}: %s; see {result.text_log_path}"
+    name = f"{experiment} by {scenario.controller}"
+    try:
+        result = run_scenario(scenario, folder, can=can)
+    except (SimulatorError, SessionError, DriveError, CanError) as error:
+        raise DemoFailed(f"{name}: {error}") from error
     if result.fault != "none":
-        raise DemoFailed(failure % f"the drive ended in fault {result.fault}")
+        raise DemoFailed(f"{name}: the drive ended in fault {result.fault}; see {result.text_log_path}")
     try:
         merits = _take(experiment, scenario, result.recording)
     except metrics.MetricsError as error:
-        raise DemoFailed(failure % error) from error
+        raise DemoFailed(f"{name}: {error}; see {result.text_log_path}") from error
     return _Run(experiment, scenario, merits, (result.log_path, result.text_log_path), result.recording_path)
 
 
