@@ -6,7 +6,9 @@
  */
 #define LOAD_TORQUE_LIMIT_Q24 (60 * (1 << 24))
 
-#define INNOVATION_LIMIT (1 << 22)
+/* A 32nd of a turn. With less, an observer that starts at rest on a turning rotor slips from turn to turn for ever;
+ * with more, a jump of the encoder throws the speed so far that it reads as overspeed. */
+#define INNOVATION_LIMIT (1 << 27)
 
 /* 2 pi in Q3.28. */
 #define TWO_PI_Q28 1686629713
@@ -69,7 +71,10 @@ int32_t load_observer_step(const load_observer_parameters_t *parameters, load_ob
     /* Correct. */
     observer->angle_q64 += (uint64_t)(error * parameters->angle_gain_q30) << 2; /* Q30 to Q32 */
     int32_t speed_q22 = fixed_saturate(observer->speed_q22 + fixed_shift(error * parameters->speed_gain_q24, 24));
-    const int64_t load_q24 = observer->load_torque_q24 - fixed_shift(error * parameters->torque_gain_q20, 20);
+    /* 27 and 40 bits: the low 5 bits of the error are multiplied apart. */
+    const int64_t load_change_q39 =
+        (error >> 5) * parameters->torque_gain_q20 + (((error & 31) * parameters->torque_gain_q20) >> 5);
+    const int64_t load_q24 = observer->load_torque_q24 - fixed_shift(load_change_q39, 15);
     observer->load_torque_q24 = (int32_t)(load_q24 > LOAD_TORQUE_LIMIT_Q24    ? LOAD_TORQUE_LIMIT_Q24
                                           : load_q24 < -LOAD_TORQUE_LIMIT_Q24 ? -LOAD_TORQUE_LIMIT_Q24
                                                                               : load_q24);

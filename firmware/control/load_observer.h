@@ -33,12 +33,13 @@ typedef struct {
 load_observer_parameters_t load_observer_configure(uint32_t bandwidth_rad_s, uint32_t control_rate_hz,
                                                    int32_t inertia_q30, int32_t friction_q30);
 
-/* Starts at an angle (2^-32 turn), at rest, without load. */
+/* Starts at an angle (2^-32 turn), at rest, without load. A rotor that turns is caught within 10 / w0 (20 / w0 when it
+ * is faster than 2 w0). */
 void load_observer_reset(load_observer_t *observer, uint32_t angle);
 
 /* One sample: corrects with the measured angle (2^-32 turn), then predicts one period on with the machine's torque (N
  * m, Q7.24). Afterwards the state is the estimate for the coming sample. Returns the innovation in 2^-32 turn; what
- * corrects is limited to +-2^22 (a thousandth of a turn), which keeps every product within 64 bits. */
+ * corrects is limited to +-2^27 (a 32nd of a turn), which keeps every product within 64 bits. */
 int32_t load_observer_step(const load_observer_parameters_t *parameters, load_observer_t *observer, uint32_t angle,
                            int32_t torque_q24);
 

@@ -88,7 +88,7 @@ struct observer_t {
     void step(double measured_turn, double torque) {
         double innovation = measured_turn - angle;
         innovation -= std::round(innovation); // modulo a turn
-        innovation = std::clamp(innovation, -1.0 / 1024.0, 1.0 / 1024.0);
+        innovation = std::clamp(innovation, -1.0 / 32.0, 1.0 / 32.0);
         angle += angle_gain * innovation;
         const double corrected = speed + speed_gain * innovation;
         load_torque = std::clamp(load_torque - torque_gain * innovation, -60.0, 60.0);
