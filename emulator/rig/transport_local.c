@@ -132,6 +132,7 @@ static void read_one(local_t *local, unsigned index, const transport_receiver_t 
     }
     ++*taken;
     uint32_t number = client->number;
+    accept_clients(local); /* who connected before this frame was sent sees what comes of it */
     if (!receiver->take(receiver->context, number, &frame)) {
         index = index_from(local, number); /* answering the frame may have cost any client its connection */
         if (index < local->client_count && local->clients[index].number == number) {
