@@ -148,7 +148,8 @@ def make_environment(install: bool) -> None:
         if not install:
             fail(f"missing: the Python packages of {where}; leave out --no-install")
         say(f"installing Python packages of {where}")
-        steps = [[_base_python(), "-m", "venv", "--clear", str(VENV)], [*pip, "--require-hashes", "-r", str(LOCK)], *steps]
+        environment = [_base_python(), "-m", "venv", "--clear", str(VENV)]
+        steps = [environment, [*pip, "--require-hashes", "-r", str(LOCK)], *steps]
     # setuptools would leave its notes beside the sources.
     notes, extra = BUILD / "package", BUILD / "setuptools.cfg"
     notes.mkdir(exist_ok=True)

@@ -52,7 +52,7 @@ FRAMES = [
 ]
 
 
-@pytest.mark.parametrize("frame", FRAMES, ids=str)
+@pytest.mark.parametrize("frame", FRAMES, ids=lambda frame: f"{len(frame.data)}-bytes-{frame.arbitration_id:X}")
 def test_frame_survives_packing(frame):
     again = message_of(frame_bytes(frame), 1_234_567_891, "unix:x")
     assert again.equals(frame, timestamp_delta=None, check_channel=False)
@@ -60,7 +60,7 @@ def test_frame_survives_packing(frame):
     assert again.timestamp == pytest.approx(1.234567891, abs=1e-12)
 
 
-@pytest.mark.parametrize("frame", FRAMES, ids=str)
+@pytest.mark.parametrize("frame", FRAMES, ids=lambda frame: f"{len(frame.data)}-bytes-{frame.arbitration_id:X}")
 def test_frame_reaches_the_other_client_whole(connect, frame):
     sender, listener = connect(), connect()
     sender.send(frame)

@@ -45,7 +45,7 @@ class VirtualMessage(can.Message):
     __slots__ = ("time_ns",)
 
     def __init__(self, *args, time_ns: int = 0, **kwargs) -> None:
-        super().__init__(*args, timestamp=time_ns * 1e-9, **kwargs)
+        super().__init__(*args, timestamp=time_ns / 1e9, **kwargs)
         self.time_ns = time_ns
 
 

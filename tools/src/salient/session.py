@@ -73,7 +73,7 @@ class Session:
     @property
     def time_s(self) -> float:
         """Virtual time in seconds."""
-        return self.time_ns * 1e-9
+        return self.time_ns / 1e9
 
     @property
     def load_torque_Nm(self) -> float:

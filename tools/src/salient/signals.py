@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -45,15 +46,13 @@ class Signal:
 
     @property
     def last(self) -> float:
-        """The latest value; LookupError when none came yet."""
-        if not len(self.value):
-            raise LookupError(f"{self.name}: no frame came yet")
-        return self.value[-1].item()
+        """The latest value; not-a-number, for which no comparison holds, when none came yet."""
+        return self.value[-1].item() if len(self.value) else math.nan
 
     @property
     def last_name(self) -> str:
-        """The latest value by its name in the DBC, for signals that have names."""
-        return (self.choices or {}).get(int(self.last), str(self.last))
+        """The latest value by its name in the DBC, for signals that have names; "unknown" when none came yet."""
+        return (self.choices or {}).get(int(self.last), str(self.last)) if len(self.value) else "unknown"
 
     def between(self, from_s: float, to_s: float) -> Signal:
         """The part with from_s <= time < to_s."""
@@ -100,7 +99,7 @@ class SignalTable(Mapping[str, Signal]):
         key, signal = self._names[name]
         raw = np.frombuffer(bytes(self._data[key]), dtype="<u8")
         choices = {int(number): str(text) for number, text in (signal.choices or {}).items()}
-        time_s = np.array(self._times[key], dtype=np.int64) * 1e-9
+        time_s = np.array(self._times[key], dtype=np.int64) / 1e9
         return Signal(signal.name, signal.unit or "", time_s, _physical(raw, signal), choices or None)
 
     def __iter__(self) -> Iterator[str]:

@@ -136,7 +136,6 @@ class Simulator:
         self._process.stdout.close()
         if self._process.returncode != 0:
             self._raise_failure(self._process.returncode)
-        self._errors.close()
 
     def __enter__(self) -> Simulator:
         return self

@@ -95,5 +95,5 @@ def _is_emulators(message: can.Message) -> bool:
 
 
 def _timed(time_ns: int, message: can.Message) -> tuple[int, can.Message]:
-    message.timestamp = time_ns * 1e-9
+    message.timestamp = time_ns / 1e9
     return time_ns, message

@@ -1,0 +1,193 @@
+"""The fixture `bench` and what stands behind it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from salient.drive import DriveError
+from salient.rig import RigError
+from salient.session import Session
+from salient.signals import drive_database, rig_database
+from salient.simulator import Simulator, SimulatorOptions
+
+FAILING_TEST = """
+import pytest
+
+@pytest.mark.bench_options(controller="paper", seed=77)
+def test_that_fails(bench):
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.06)
+    assert bench.truth["speed_rpm"].last > 1e6
+"""
+
+
+@pytest.mark.both_transports
+def test_time_moves_only_when_told(bench):
+    assert bench.time_ns == 0
+    bench.run_for(0.0123)
+    assert bench.time_ns == 12_300_000
+    bench.advance_to(12_300_000)
+    assert bench.time_ns == 12_300_000
+    bench.run_for(1e-9)
+    assert bench.time_ns == 12_300_001
+
+
+@pytest.mark.both_transports
+def test_drive_runs_and_carries_a_load(bench):
+    bench.drive.speed_reference_rpm = 300
+    bench.at(0.08).load_torque_Nm = 4
+    bench.run_for(0.15)
+    assert bench.drive.state == "run"
+    assert bench.drive.fault == "none"
+    assert bench.truth["speed_rpm"].last == pytest.approx(300, abs=6)
+    assert bench.telemetry["speed_rpm"].last == pytest.approx(bench.truth["speed_rpm"].last, abs=3)
+    load = bench.truth["load_torque_Nm"]
+    assert set(load.value[load.time_s < 0.08]) == {0.0}
+    assert set(load.value[load.time_s > 0.0801]) == {4.0}
+
+
+def test_load_now(bench):
+    bench.run_for(0.0105)
+    bench.load_torque_Nm = 2.5
+    assert bench.load_torque_Nm == 2.5
+    bench.run_for(0.001)
+    assert bench.truth["load_torque_Nm"].last == 2.5
+
+
+def test_run_until(bench):
+    bench.drive.speed_reference_rpm = 300
+    reached_s = bench.run_until(lambda: bench.truth["speed_rpm"].last > 150, timeout=0.1)
+    assert 0.01 < reached_s == bench.time_s < 0.05
+    with pytest.raises(AssertionError, match="within 0.01 s, at .* s of virtual time"):
+        bench.run_until(lambda: False, timeout=0.01)
+
+
+def test_commands_keep_coming_until_silence(bench):
+    bench.drive.speed_reference_rpm = 150
+    bench.run_for(0.2)
+    times_ns = [t for t, m in bench.log if m.arbitration_id == 0x080]
+    assert len(times_ns) == 20
+    # A frame waits for the one that is on the bus, and then takes its own time: 135 bits at most, each.
+    assert all(0 < t - 10_000_000 * i < 270_000 for i, t in enumerate(times_ns))
+    bench.drive.silence()
+    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.2)
+    assert bench.drive.fault == "command_timeout"
+
+
+def test_signals(bench):
+    bench.run_for(0.0205)
+    speed = bench.truth["speed_rpm"]
+    assert (speed.name, speed.unit) == ("speed_rpm", "r/min")
+    assert np.array_equal(speed.time_s, np.arange(1, 21) / 1e3)
+    assert len(speed.between(0.005, 0.010)) == 5
+    assert bench.telemetry["DRIVE_STATUS.state"].last_name == bench.drive.state == "ready"
+    assert bench.telemetry["bus_voltage_V"].last == pytest.approx(240, abs=0.5)
+    with pytest.raises(KeyError, match="no signal 'speed'; there are .*speed_rpm"):
+        bench.telemetry["speed"]
+    none = bench.telemetry["DRIVE_FAULT_CAUSE.fault"]
+    assert (len(none), np.isnan(none.last), none.last_name) == (0, True, "unknown")
+
+
+def test_signals_agree_with_cantools(bench):
+    """Columns decoded at once, and frame by frame by cantools."""
+    bench.drive.speed_reference_rpm = -150
+    bench.run_for(0.05)
+    for table, database in ((bench.telemetry, drive_database()), (bench.truth, rig_database())):
+        for message in database.messages:
+            if message.is_multiplexed() or f"{message.name}.{message.signals[0].name}" not in table:
+                continue
+            frames = [m for _, m in bench.log
+                      if m.arbitration_id == message.frame_id and m.is_extended_id == message.is_extended_frame]
+            for signal in message.signals:
+                expected = [message.decode(bytes(m.data), decode_choices=False)[signal.name] for m in frames]
+                assert table[f"{message.name}.{signal.name}"].value == pytest.approx(expected), signal.name
+
+
+def test_refusals(bench):
+    bench.run_for(0.01)
+    with pytest.raises(RigError, match="load_torque_Nm 500: allowed are -200 to 200 N m"):
+        bench.load_torque_Nm = 500
+    with pytest.raises(RigError, match="load_torque_Nm 1 at 5000 us: in_the_past"):
+        bench.at(0.005).load_torque_Nm = 1
+    with pytest.raises(DriveError, match="speed_reference_rpm 5000: allowed are -3000 to 3000 r/min"):
+        bench.drive.speed_reference_rpm = 5000
+    with pytest.raises(DriveError, match="request 'fly': allowed are off, run, stop, clear_fault"):
+        bench.drive.ask("fly")
+
+
+def test_queue_of_settings_is_bounded(bench):
+    for i in range(64):
+        bench.at(0.1 + i * 1e-3).load_torque_Nm = 1
+    with pytest.raises(RigError, match="queue_full"):
+        bench.at(0.2).load_torque_Nm = 1
+
+
+def test_two_benches_at_once(make_bench):
+    benches = [make_bench(controller=controller) for controller in ("traditional", "paper")]
+    for bench in benches:
+        bench.drive.speed_reference_rpm = 150
+    for _ in range(10):
+        for bench in benches:
+            bench.run_for(0.005)
+    assert all(bench.truth["speed_rpm"].last == pytest.approx(150, abs=4) for bench in benches)
+
+
+def test_session_with_a_drive_that_moves_by_itself(tmp_path):
+    """A session that follows a free-running drive sees its time pass and steers it."""
+    can_bus = f"unix:{tmp_path}/can.sock"
+    with Simulator(SimulatorOptions(pace="x20"), can_bus):
+        with Session(can_bus, lockstep=False) as session:
+            session.drive.speed_reference_rpm = 150
+            session.run_until(lambda: abs(session.telemetry["speed_rpm"].last - 150) < 5, timeout=5)
+            assert session.drive.state == "run"
+
+
+def test_failure_leaves_what_explains_it(tmp_path):
+    (tmp_path / "test_failing.py").write_text(FAILING_TEST)
+    failures = tmp_path / "failures"
+    result = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--salient-failures", failures,
+         tmp_path / "test_failing.py"],
+        capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert result.returncode == 1
+    (folder,) = (path.parent for path in failures.rglob("bench.json"))
+    assert f"log, plot, seed 77: {folder}" in result.stdout
+    assert "test_failing.py::test_that_fails" in result.stdout
+    notes = json.loads((folder / "bench.json").read_text())
+    assert notes["seed"] == 77
+    assert "--seed 77" in notes["simulator"]
+    assert notes["virtual_time_s"] == pytest.approx(0.06)
+    assert "-m pytest" in notes["replay"]
+    assert (folder / "last_moments.png").read_bytes().startswith(b"\x89PNG")
+    with can.LogReader(folder / "can.blf") as log:
+        assert len(list(log)) == len((folder / "can.log").read_text().splitlines()) > 300
+
+
+def test_markers_choose_by_transport(tmp_path):
+    (tmp_path / "test_some.py").write_text(
+        "import pytest\n"
+        "@pytest.mark.both_transports\ndef test_both(): pass\n"
+        "@pytest.mark.socketcan\ndef test_interface(): pass\n"
+        "def test_local(): pass\n"
+    )
+    for can_bus, names in (("local", {"test_both", "test_local"}), ("socketcan:x", {"test_both", "test_interface"})):
+        result = subprocess.run(
+            [sys.executable, "-m", "pytest", "-v", "-p", "no:cacheprovider", f"--salient-can={can_bus}", tmp_path],
+            capture_output=True, text=True, cwd=tmp_path,
+        )  # fmt: skip
+        assert {line.split("::")[1].split()[0] for line in result.stdout.splitlines() if "PASSED" in line} == names
+
+
+def test_wrong_transport(tmp_path):
+    result = subprocess.run([sys.executable, "-m", "pytest", "--salient-can=vcan0", tmp_path], capture_output=True,
+                            text=True, cwd=Path(tmp_path))
+    assert result.returncode == 4
+    assert "--salient-can vcan0: allowed are local and socketcan:INTERFACE" in result.stderr

@@ -1,0 +1,134 @@
+"""What others do on the bus moves the counters that say so, and nothing else: the motion stays the same to the bit."""
+
+from __future__ import annotations
+
+import random
+
+import can
+import numpy as np
+import pytest
+
+from salient import e2e
+from salient.drive import command_frame
+from salient.virtual_time import open_bus
+
+COUNTERS = (
+    "wrong_length", "wrong_checksum", "wrong_counter", "out_of_range", "unknown_frame", "receive_overflow",
+    "telemetry_dropped",
+)  # fmt: skip
+COMMAND_ID = 0x080
+REQUEST_ID = 0x600
+
+
+def command(speed_rpm: float = 600.0, counter: int = 200, request: str = "run") -> can.Message:
+    """One with a good checksum whose counter is far from the true sender's."""
+    return command_frame(counter, request, speed_rpm)
+
+
+def changed(message: can.Message, **changes) -> can.Message:
+    fields = {"arbitration_id": message.arbitration_id, "is_extended_id": message.is_extended_id, "data": message.data}
+    return can.Message(**(fields | changes))
+
+
+GOOD = command()
+ATTACKS = {
+    "wrong_length": [changed(GOOD, data=bytes(GOOD.data[:n])) for n in (0, 3, 6)]
+    + [changed(GOOD, data=bytes(GOOD.data) + b"\0")],
+    "wrong_checksum": [changed(GOOD, data=bytes(b ^ (1 << i % 8) if i == j else b for i, b in enumerate(GOOD.data)))
+                       for j in range(7)],
+    "wrong_counter": [command(-3000.0)],
+    "unknown_frame": [
+        can.Message(arbitration_id=0x001, is_extended_id=False, data=bytes(8)),
+        can.Message(arbitration_id=COMMAND_ID, is_extended_id=True, data=GOOD.data),
+        can.Message(arbitration_id=1 << 18 | COMMAND_ID, is_extended_id=True, data=GOOD.data),
+        can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, is_remote_frame=True, dlc=7),
+        can.Message(arbitration_id=0x7FF, is_extended_id=False, data=b""),
+    ],
+}
+
+
+def steady(make_bench, tmp_path, name, **options):
+    """A paper drive that holds 600 r/min, its true state recorded from 0.1 s on."""
+    bench = make_bench(controller="paper", record=tmp_path / f"{name}.npy", record_step_ns=10_000,
+                       record_from_us=100_000, **options)
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.105)
+    return bench
+
+
+def finish(bench) -> tuple[np.ndarray, dict[str, float]]:
+    """Ends the run at 0.25 s; the recording, and the counters."""
+    bench.advance_to(250_000_000)
+    bench.close()
+    return np.load(bench.options.record), {name: bench.telemetry[name].last for name in COUNTERS}
+
+
+@pytest.fixture
+def undisturbed(make_bench, tmp_path):
+    recording, counters = finish(steady(make_bench, tmp_path, "undisturbed"))
+    assert not any(counters.values())
+    assert len(recording) == 15_001
+    return recording
+
+
+@pytest.mark.parametrize("counter", ATTACKS)
+def test_wrong_frames(make_bench, tmp_path, undisturbed, counter):
+    bench = steady(make_bench, tmp_path, "disturbed")
+    with open_bus(bench.address) as attacker:
+        for frame in ATTACKS[counter]:
+            attacker.send(frame)
+    recording, counters = finish(bench)
+    assert np.array_equal(recording, undisturbed)
+    assert counters == dict.fromkeys(COUNTERS, 0.0) | {counter: len(ATTACKS[counter])}
+
+
+@pytest.mark.parametrize("raw_speed", [3_000_001, -3_000_001, 2**23 - 1, -(2**23)])
+def test_out_of_range(make_bench, tmp_path, undisturbed, raw_speed):
+    """Checksum and counter are good, so that nothing but the range is wrong."""
+    bench = steady(make_bench, tmp_path, "disturbed")
+    sent = [m.data[2] for _, m in bench.log if m.arbitration_id == COMMAND_ID]
+    payload = b"\1" + raw_speed.to_bytes(3, "little", signed=True)
+    data = e2e.protect(e2e.DRIVE_COMMAND_DATA_ID, sent[-1] + 1, payload)
+    with open_bus(bench.address) as attacker:
+        attacker.send(changed(GOOD, data=data))
+    recording, counters = finish(bench)
+    assert np.array_equal(recording, undisturbed)
+    assert counters["out_of_range"] == 1
+
+
+def test_flood(make_bench, tmp_path, undisturbed):
+    """Ten clients that send 40 frames each and leave, some with frames that are none of CAN's."""
+    bench = steady(make_bench, tmp_path, "disturbed")
+    generator = random.Random(1)
+    for _ in range(10):
+        with open_bus(bench.address) as attacker:
+            for _ in range(40):
+                identifier = generator.choice([i for i in range(0x800) if i not in (COMMAND_ID, REQUEST_ID)])
+                data = generator.randbytes(generator.randrange(9))
+                attacker.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=data))
+    recording, counters = finish(bench)
+    assert np.array_equal(recording, undisturbed)
+    # Low identifiers hold up the telemetry, which is dropped by rule and counted.
+    assert counters["unknown_frame"] == 400
+    assert {name for name, count in counters.items() if count} <= {"unknown_frame", "telemetry_dropped"}
+
+
+def test_records_that_are_no_frames(make_bench, tmp_path, undisturbed):
+    bench = steady(make_bench, tmp_path, "disturbed")
+    with open_bus(bench.address) as attacker:
+        for size in (1, 7, 8, 23, 25, 79, 81, 5000):
+            attacker._socket.send(bytes(size))
+        attacker._socket.send(bytes(8) + bytes(4) + b"\xff" * 12)  # a length of 255
+    recording, counters = finish(bench)
+    assert np.array_equal(recording, undisturbed)
+    assert not any(counters.values())
+
+
+@pytest.mark.both_transports
+def test_flexible_data_rate_and_error_frames_do_not_reach_the_drive(bench):
+    bench.drive.speed_reference_rpm = 150
+    bench.run_for(0.01)
+    bench.send(can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, is_fd=True, data=bytes(64)))
+    bench.run_for(0.2)
+    assert not any(bench.telemetry[name].last for name in COUNTERS)
+    assert bench.drive.state == "run"

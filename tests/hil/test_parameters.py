@@ -1,0 +1,84 @@
+"""Parameters over CAN, in their units."""
+
+from __future__ import annotations
+
+import can
+import pytest
+
+from salient.drive import DriveError, read_parameter_table
+from salient.signals import drive_database
+
+
+def test_table(make_bench):
+    bench = make_bench()
+    rows = read_parameter_table(bench)
+    assert [row.index for row in rows] == list(range(len(rows)))
+    assert len({row.name for row in rows}) == len(rows) > 20
+    for row in rows:
+        assert row.name.isidentifier()
+        assert row.minimum <= row.default <= row.maximum, row
+        assert bench.drive.parameters[row.name] == row.default
+    torque = bench.drive.parameters.row("torque_max_Nm")
+    assert (torque.unit, torque.minimum) == ("N m", 0.0)
+    assert torque.default == pytest.approx(19.1, abs=1e-6)
+
+
+@pytest.mark.both_transports
+def test_write_and_read_back(bench):
+    parameters = bench.drive.parameters
+    for name in ("torque_max_Nm", "speed_ramp_rpm_s", "over_speed_rpm"):
+        row = parameters.row(name)
+        lsb = 2.0**-row.fraction_bits
+        for value in (row.minimum, row.maximum, (row.minimum + row.maximum) / 3):
+            parameters[name] = value
+            assert parameters[name] == pytest.approx(value, abs=lsb / 2)
+
+
+def test_out_of_range_is_refused_and_changes_nothing(bench):
+    parameters = bench.drive.parameters
+    for name, row in parameters.rows.items():
+        lsb = 2.0**-row.fraction_bits
+        for value in (row.minimum - lsb, row.maximum + lsb):
+            with pytest.raises(DriveError, match=f"^{name} .*: allowed are "):
+                parameters[name] = value
+        assert parameters[name] == row.default
+
+
+def test_what_32_bits_cannot_hold(bench):
+    with pytest.raises(DriveError, match="torque_max_Nm 1e.06: allowed are 0 to 40 N m"):
+        bench.drive.parameters["torque_max_Nm"] = 1e6
+
+
+def test_no_such_parameter(bench):
+    with pytest.raises(KeyError, match="no parameter 'torque_max'; there are .*torque_max_Nm"):
+        bench.drive.parameters["torque_max"] = 1
+
+
+def test_not_while_running(bench):
+    bench.drive.speed_reference_rpm = 150
+    bench.run_for(0.02)
+    with pytest.raises(DriveError, match="torque_max_Nm 10: not_while_running"):
+        bench.drive.parameters["torque_max_Nm"] = 10
+    assert bench.drive.parameters["torque_max_Nm"] == pytest.approx(19.1, abs=1e-6)
+
+
+def test_a_parameter_acts(make_bench):
+    """Half the torque limit, half the speed gained."""
+    speeds = []
+    for torque_Nm in (16.0, 8.0):
+        bench = make_bench(controller="paper")
+        bench.drive.parameters["torque_max_Nm"] = torque_Nm
+        bench.drive.speed_reference_rpm = 3000
+        bench.run_for(0.03)
+        speeds.append(bench.truth["speed_rpm"].last)
+    assert speeds[0] / speeds[1] == pytest.approx(2.0, abs=0.3)
+
+
+def test_unknown_operation_is_answered(bench):
+    request = can.Message(arbitration_id=0x600, is_extended_id=False, data=bytes([9, 0, 0, 0, 0, 0, 0, 0]))
+    bench.send(request)
+    answer = bench.advance_until_frame(lambda m: m.arbitration_id == 0x580, 0.01)
+    status = drive_database().decode_message("PARAMETER_RESPONSE", bytes(answer.data))["status"]
+    counted = bench.telemetry["out_of_range"]
+    bench.run_for(0.2)
+    assert status == "unknown_operation" or counted.last == 1
