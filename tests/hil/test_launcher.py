@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -135,8 +136,6 @@ def test_missing_python(salient, tmp_path):
     copy = tmp_path / "salient"
     copy.write_text(text.replace("/usr/bin/python3 python3", "/nonexistent/python3"))
     copy.chmod(0o755)
-    import subprocess
-
     result = subprocess.run([copy, "sim", "--no-install"], capture_output=True, text=True, env=os.environ)
     assert_mistake(result, "python3", "python3-venv")
 

@@ -37,6 +37,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import can
 import numpy as np
 
 from salient.bench import Bench
@@ -124,30 +125,21 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
     can: "local" for a bus of its own, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; parameters
     are written first, then the commands follow. UsageError for what the drive does not know or refuses.
     """
-    out_dir.mkdir(parents=True, exist_ok=True)
     recording_path = out_dir / _RECORDING if scenario.record else None
-    options = SimulatorOptions(
-        machine=scenario.machine,
-        controller=scenario.controller,
-        control_rate_hz=scenario.control_rate_hz,
-        encoder_bits=scenario.encoder_bits,
-        seed=scenario.seed,
-        initial_angle_deg=scenario.initial_angle_deg,
-        record=recording_path,
-        record_step_ns=round(scenario.record.step_us * 1000) if scenario.record else 1000,
-        record_from_us=round(scenario.record.from_s * 1e6) if scenario.record else 0,
-        build=build,
-    )
+    options = _simulator_options(scenario, recording_path, build)
+    writes = _parameter_writes(scenario, options)
+    out_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         with Bench(options, f"unix:{folder}/can.sock" if can == "local" else can) as bench:
-            _write_parameters(bench, scenario.parameters)
+            for write in writes:  # ahead of the first command; the answers are looked at in the end
+                bench.send(write)
             for step in scenario.load:
                 bench.at(step.at_s).load_torque_Nm = step.torque_Nm
             for step in sorted(scenario.speed, key=lambda step: step.at_s):
                 bench.advance_to(round(step.at_s * 1e9))
                 bench.drive.speed_reference_rpm = step.value_rpm
             bench.advance_to(round(scenario.duration_s * 1e9))
-            _check_parameters_taken(bench, scenario.parameters)
+            _check_parameters_taken(bench, len(writes))
             fault = bench.drive.fault
         write_logs(bench.log, out_dir / _LOG, out_dir / _TEXT_LOG)
     return RunResult(
@@ -163,25 +155,45 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
     )
 
 
-def _write_parameters(bench: Bench, values: dict[str, float]) -> None:
-    """Sends all writes at once, ahead of the first command; their answers are looked at in the end."""
-    for name, value in values.items():
-        try:
-            row = bench.drive.parameters.row(name)
-        except KeyError as error:
-            raise UsageError(f"parameters.{name}: {error.args[0]}") from None
+def _simulator_options(scenario: Scenario, recording_path: Path | None, build: str) -> SimulatorOptions:
+    record = scenario.record or Record()
+    return SimulatorOptions(
+        machine=scenario.machine,
+        controller=scenario.controller,
+        control_rate_hz=scenario.control_rate_hz,
+        encoder_bits=scenario.encoder_bits,
+        seed=scenario.seed,
+        initial_angle_deg=scenario.initial_angle_deg,
+        record=recording_path,
+        record_step_ns=round(record.step_us * 1000),
+        record_from_us=round(record.from_s * 1e6),
+        build=build,
+    )
+
+
+def _parameter_writes(scenario: Scenario, options: SimulatorOptions) -> list[can.Message]:
+    """The frames that write the scenario's parameters; UsageError for what the drive does not know or would refuse."""
+    if not scenario.parameters:
+        return []
+    rows = {row.name: row for row in parameter_table(options)}
+    writes = []
+    for name, value in scenario.parameters.items():
+        row = rows.get(name)
+        if row is None:
+            raise UsageError(f"parameters.{name}: the drive has no such parameter; allowed: {', '.join(rows)}")
         if not row.minimum <= value <= row.maximum:
             allowed = f"{row.minimum:g} to {row.maximum:g} {row.unit}".rstrip()
             raise UsageError(f"parameters.{name}: {value:g}: allowed are {allowed}")
-        bench.send(write_request(row, value))
+        writes.append(write_request(row, value))
+    return writes
 
 
-def _check_parameters_taken(bench: Bench, values: dict[str, float]) -> None:
+def _check_parameters_taken(bench: Bench, count: int) -> None:
     message = drive_database().get_message_by_name("PARAMETER_RESPONSE")
     answers = [m for _, m in bench.log if m.arbitration_id == message.frame_id and not m.is_extended_id]
     refused = [a for a in answers if message.decode(bytes(a.data))["status"] != "done"]
-    if refused or len(answers) != len(values):
-        raise DriveError(f"{len(values)} parameters written, {len(answers)} answers, {len(refused)} of them refusals")
+    if refused or len(answers) != count:
+        raise DriveError(f"{count} parameters written, {len(answers)} answers, {len(refused)} of them refusals")
 
 
 def summary(result: RunResult) -> dict[str, Any]:
@@ -204,9 +216,8 @@ def summary(result: RunResult) -> dict[str, Any]:
 def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local",
             progress: Callable[[str], None] = lambda line: None) -> dict[str, RunResult]:
     """Runs the scenarios of one file, each into out_dir/CONTROLLER, and writes out_dir/results.json."""
-    for scenario in scenarios:
-        executable(scenario.machine)
-        parameter_table(SimulatorOptions(machine=scenario.machine, controller=scenario.controller))
+    for scenario in scenarios:  # so that a mistake is named before the first run
+        _parameter_writes(scenario, _simulator_options(scenario, None, "host"))
     results = {}
     for scenario in scenarios:
         progress(f"{scenario.name}: {scenario.controller}, {scenario.duration_s:g} s of virtual time")

@@ -150,13 +150,16 @@ class Simulator:
         raise SimulatorError(f"{self.command[0]} ended with {code}: {errors or 'it wrote nothing'}")
 
 
-@lru_cache
 def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
     on the bus of an experiment."""
+    return _parameter_table(replace(options, record=None, pace="lockstep"))
+
+
+@lru_cache
+def _parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         can = f"unix:{folder}/can.sock"
-        quiet = replace(options, record=None, pace="lockstep")
-        with Simulator(quiet, can), Session(can) as session:
+        with Simulator(options, can), Session(can) as session:
             session.rig.truth_period_us = 0
             return read_parameter_table(session)
