@@ -174,7 +174,7 @@ TEST(BpNetwork, a_learning_step_moves_the_weights_as_the_twin_does) {
 
 TEST(BpNetwork, a_hundred_thousand_learning_steps_stay_bounded_and_near_the_twin) {
     std::mt19937 random(3);
-    std::normal_distribution<double> noise(0.0, 0.15);
+    std::normal_distribution<double> noise(0.0, 0.3);
     bp_network_t network;
     bp_network_reset(&network, 1);
     twins::network_t twin = twin_of(network);
@@ -199,9 +199,9 @@ TEST(BpNetwork, a_hundred_thousand_learning_steps_stay_bounded_and_near_the_twin
         worst_weight = std::max(worst_weight, largest_weight_difference(network, twin));
         for_each_weight(network, [&](int32_t w) { largest_q28 = std::max(largest_q28, std::abs(w)); });
     }
-    EXPECT_LT(worst_weight, 3e-4);
-    EXPECT_LT(worst_output, 3e-4);
-    EXPECT_GT(worst_weight, 1e-5);
+    EXPECT_LT(worst_weight, 1.5e-3);
+    EXPECT_LT(worst_output, 6e-4);
+    EXPECT_GT(worst_weight, 1e-4);
     EXPECT_LT(largest_q28 / twins::Q28, 2.6);
     EXPECT_GT(largest_weight_difference(network, start), 0.1) << "it learned nothing";
 }

@@ -1,0 +1,152 @@
+// The rule table of the hysteresis, exhaustively.
+#include <cstdint>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/ditc_hysteresis.h"
+}
+
+namespace {
+
+constexpr int32_t INNER = 1 << 20;
+constexpr int32_t OUTER = 1 << 24;
+constexpr int32_t LIMIT = 52 << 9;
+const ditc_hysteresis_parameters_t PARAMETERS = {INNER, OUTER, LIMIT};
+
+// Just inside and outside of every boundary.
+const int32_t ERRORS[] = {INT32_MIN, -OUTER - 1, -OUTER, -OUTER + 1, -INNER - 1, -INNER, -INNER + 1, -1,       0,
+                          1,         INNER - 1,  INNER,  INNER + 1,  OUTER - 1,  OUTER,  OUTER + 1,  INT32_MAX};
+
+enum role_t { SINGLE, INCOMING, OUTGOING, IDLE };
+
+// The table of ditc_hysteresis.h, read from there.
+int rule(role_t role, int state, int64_t error) {
+    switch (role) {
+    case SINGLE:
+        return error > INNER ? 1 : error < -OUTER ? -1 : error < -INNER ? 0 : state < 0 ? 0 : state;
+    case INCOMING:
+        return error > OUTER ? 1 : error < 0 ? 0 : state < 0 ? 0 : state;
+    case OUTGOING:
+        return error > INNER    ? 1
+               : error < -INNER ? -1
+               : state > 0      ? (error <= 0 ? 0 : 1)
+               : state < 0      ? (error >= 0 ? 0 : -1)
+                                : 0;
+    default:
+        return -1;
+    }
+}
+
+struct scene_t {
+    commutation_t commutation;
+    int32_t current_q9[HAL_PHASES_MAX];
+};
+
+// Phase 1 active; phase 0 outgoing where asked, with or without current.
+scene_t scene(bool outgoing, int32_t outgoing_current_q9, int32_t active_current_q9) {
+    scene_t s{};
+    s.commutation.active = 1;
+    s.commutation.outgoing = outgoing ? 0 : COMMUTATION_NONE;
+    s.current_q9[0] = outgoing_current_q9;
+    s.current_q9[1] = active_current_q9;
+    return s;
+}
+
+int8_t next_state(const scene_t &s, unsigned phase, int state, int32_t error) {
+    ditc_hysteresis_t ditc{};
+    ditc.state[phase] = int8_t(state);
+    ditc_hysteresis_step(&PARAMETERS, &ditc, 3, &s.commutation, error, s.current_q9);
+    return ditc.state[phase];
+}
+
+TEST(DitcHysteresis, follows_the_rule_table_for_every_state_error_and_role) {
+    const scene_t alone = scene(false, 0, 512), both = scene(true, 512, 512), spent = scene(true, 0, 512);
+    for (const int state : {-1, 0, 1}) {
+        for (const int32_t error : ERRORS) {
+            SCOPED_TRACE(testing::Message() << "state " << state << ", error " << error);
+            EXPECT_EQ(next_state(alone, 1, state, error), rule(SINGLE, state, error));
+            EXPECT_EQ(next_state(both, 1, state, error), rule(INCOMING, state, error));
+            EXPECT_EQ(next_state(both, 0, state, error), rule(OUTGOING, state, error));
+            // An outgoing phase whose current is gone does not count: the active one works alone.
+            EXPECT_EQ(next_state(spent, 1, state, error), rule(SINGLE, state, error));
+            EXPECT_EQ(next_state(spent, 0, state, error), rule(OUTGOING, state, error));
+            // Phases without a role.
+            EXPECT_EQ(next_state(both, 2, state, error), rule(IDLE, state, error));
+            EXPECT_EQ(next_state(alone, 0, state, error), rule(IDLE, state, error));
+        }
+    }
+}
+
+TEST(DitcHysteresis, a_phase_above_the_current_limit_freewheels_instead_of_being_switched_on) {
+    for (const int state : {-1, 0, 1}) {
+        for (const int32_t error : ERRORS) {
+            for (const int32_t current : {LIMIT, LIMIT + 1, 79 << 9}) {
+                for (const role_t role : {SINGLE, INCOMING, OUTGOING}) {
+                    const unsigned phase = role == OUTGOING ? 0 : 1;
+                    const scene_t s = role == SINGLE     ? scene(false, 0, current)
+                                      : role == INCOMING ? scene(true, 512, current)
+                                                         : scene(true, current, 512);
+                    const int expected = rule(role, state, error);
+                    EXPECT_EQ(next_state(s, phase, state, error), current > LIMIT && expected > 0 ? 0 : expected);
+                }
+            }
+        }
+    }
+}
+
+TEST(DitcHysteresis, every_phase_can_play_every_role) {
+    for (unsigned active = 0; active < HAL_PHASES_MAX; active++) {
+        for (unsigned outgoing = 0; outgoing <= HAL_PHASES_MAX; outgoing++) {
+            if (outgoing == active) {
+                continue;
+            }
+            commutation_t commutation{};
+            commutation.active = active;
+            commutation.outgoing = outgoing;
+            const int32_t current_q9[HAL_PHASES_MAX] = {100, 100, 100, 100};
+            ditc_hysteresis_t ditc;
+            ditc_hysteresis_reset(&ditc);
+            ditc_hysteresis_step(&PARAMETERS, &ditc, HAL_PHASES_MAX, &commutation, INT32_MAX, current_q9);
+            for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+                EXPECT_EQ(ditc.state[phase], phase == active || phase == outgoing ? 1 : -1);
+            }
+        }
+    }
+}
+
+TEST(DitcHysteresis, in_a_gap_of_the_commutation_all_phases_are_off_after_reset_too) {
+    commutation_t commutation{};
+    commutation.active = commutation.outgoing = COMMUTATION_NONE;
+    const int32_t current_q9[HAL_PHASES_MAX] = {100, 100, 100, 100};
+    ditc_hysteresis_t ditc;
+    ditc_hysteresis_reset(&ditc);
+    for (const int8_t state : ditc.state) {
+        EXPECT_EQ(state, -1);
+    }
+    for (const int32_t error : ERRORS) {
+        ditc_hysteresis_step(&PARAMETERS, &ditc, 4, &commutation, error, current_q9);
+        for (const int8_t state : ditc.state) {
+            EXPECT_EQ(state, -1);
+        }
+    }
+}
+
+TEST(DitcHysteresis, the_extreme_bands_do_not_overflow) {
+    const scene_t both = scene(true, 512, 512);
+    for (const int32_t inner : {0, INT32_MAX}) {
+        for (const int32_t outer : {0, INT32_MAX}) {
+            const ditc_hysteresis_parameters_t parameters = {inner, outer, LIMIT};
+            for (const int32_t error : ERRORS) {
+                ditc_hysteresis_t ditc;
+                ditc_hysteresis_reset(&ditc);
+                ditc_hysteresis_step(&parameters, &ditc, 3, &both.commutation, error, both.current_q9);
+                for (unsigned phase = 0; phase < 3; phase++) {
+                    ASSERT_LE(std::abs(ditc.state[phase]), 1);
+                }
+            }
+        }
+    }
+}
+
+} // namespace
