@@ -146,7 +146,8 @@ static conducting_t find_conducting(plant_t *plant) {
     conducting_t conducting;
     conducting.count = 0;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-        const unsigned on = ((plant->switches.upper >> phase) & 1u) + ((plant->switches.lower >> phase) & 1u);
+        const unsigned upper = plant->switches.upper, lower = plant->switches.lower;
+        const unsigned on = ((upper >> phase) & 1u) + ((lower >> phase) & 1u);
         const double voltage_V = on == 2 ? plant->bus_voltage_V : on == 1 ? 0.0 : -plant->bus_voltage_V;
         if (voltage_V <= 0.0 && plant->current_A[phase] < CURRENT_NEGLIGIBLE_A) {
             plant->current_A[phase] = 0.0;
