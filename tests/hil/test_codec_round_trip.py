@@ -12,6 +12,7 @@ import pytest
 from cantools.database.can.c_source import camel_to_snake_case
 from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
+
 from salient.generate_codec import generate_codec, main, raw_range
 
 ROOT = Path(__file__).resolve().parents[2]

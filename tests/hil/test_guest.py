@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from salient import guest
 from salient.paths import ROOT
 

@@ -202,5 +202,6 @@ def _check_magnetics(path: Path, machine: Machine) -> None:
             raise MachineError(f"{path}: magnetics.saturated_inductance_H: must not exceed unaligned_inductance_H")
         if m["saturated_inductance_H"] * m["current_at_flux_linkage_max_A"] >= m["flux_linkage_max_Wb"]:
             raise MachineError(
-                f"{path}: magnetics.flux_linkage_max_Wb: must exceed saturated_inductance_H * current_at_flux_linkage_max_A"
+                f"{path}: magnetics.flux_linkage_max_Wb: must exceed"
+                " saturated_inductance_H * current_at_flux_linkage_max_A"
             )
