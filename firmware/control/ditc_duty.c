@@ -40,16 +40,14 @@ void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc,
         /* From standstill: past its window a phase still has torque, the one that just entered has none. */
         ditc->regulated = commutation->outgoing != COMMUTATION_NONE ? commutation->outgoing : active;
     }
-    bool handing_over = ditc->regulated != active && ditc->regulated == commutation->outgoing;
-    if (handing_over) {
+    if (ditc->regulated != active) {
+        /* The PID is with the outgoing phase while that one has torque to take off. */
         duty_q15[active] = incoming_duty_q15(parameters, tables, sample, sample->current_q9[active]);
-        if (sample->torque_q24[ditc->regulated] < SPENT_TORQUE_Q24 && sample->error_q24 <= 0) {
+        const bool spent = sample->torque_q24[ditc->regulated] < SPENT_TORQUE_Q24 && sample->error_q24 <= 0;
+        if (spent || ditc->regulated != commutation->outgoing) {
             bp_pid_preset(&ditc->pid, duty_q15[active]);
-            handing_over = false;
+            ditc->regulated = active;
         }
-    }
-    if (!handing_over) {
-        ditc->regulated = active;
     }
 
     const int32_t regulated_q15 = bp_pid_step(&parameters->pid, &ditc->pid, sample->error_q24);

@@ -1,0 +1,239 @@
+// DITC by duty: who is regulated, how the phases hand over, and that every rotor position starts.
+#include <cmath>
+#include <cstdint>
+#include <random>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/ditc_duty.h"
+#include "control/torque_map.h"
+}
+
+#include "twins.h"
+
+namespace {
+
+constexpr int32_t ONE_Q15 = 32768;
+constexpr int32_t LIMIT_Q9 = 52 << 9;
+
+uint32_t electrical(double degrees) {
+    return uint32_t(std::floor(degrees / 360.0 * twins::TURN));
+}
+
+const commutation_parameters_t ANGLES = {electrical(180.0), electrical(300.0), electrical(348.0)};
+
+// Rotor angle at which phase 0 of the 6/4 machine is at an electrical angle.
+commutation_t commutation_of(double phase_0_deg) {
+    return commutation_at(&ANGLES, 3, 4, electrical(phase_0_deg) / 4u);
+}
+
+ditc_duty_parameters_t parameters_of(bp_pid_mode_t mode) {
+    ditc_duty_parameters_t parameters{};
+    parameters.pid.mode = mode;
+    parameters.pid.seed = 1;
+    parameters.pid.error_scale_inverse_q24 = 1 << 23;
+    parameters.pid.kp_scale_q15 = 32768;
+    parameters.pid.ki_scale_q15 = 7864;
+    parameters.pid.kd_scale_q15 = 13107;
+    parameters.pid.network = {1638, 1638};
+    parameters.hand_over_angle = electrical(210.0);
+    parameters.incoming_gain_q20 = 58544; // 40 kHz, 358 A/ms
+    parameters.band_outer_q24 = 2 << 24;
+    parameters.current_limit_q9 = LIMIT_Q9;
+    return parameters;
+}
+
+class DitcDuty : public testing::Test {
+  protected:
+    DitcDuty() { ditc_duty_reset(&parameters, &ditc); }
+
+    // One sample with the map's torques for the currents.
+    void step(const commutation_t &commutation, double reference_Nm) {
+        ditc_duty_sample_t sample{current_q9, torque_q24, twins::to_fixed(reference_Nm, twins::Q24), 0};
+        sample.error_q24 = sample.reference_q24;
+        for (unsigned phase = 0; phase < 3; phase++) {
+            torque_q24[phase] = torque_map_torque_q24(&machine_tables, commutation.angle[phase], current_q9[phase]);
+            sample.error_q24 -= torque_q24[phase];
+        }
+        error_q24 = sample.error_q24;
+        ditc_duty_step(&parameters, &ditc, &machine_tables, &commutation, &sample, duty_q15);
+    }
+
+    ditc_duty_parameters_t parameters = parameters_of(BP_PID_FIXED);
+    ditc_duty_t ditc{};
+    int32_t current_q9[HAL_PHASES_MAX] = {0, 0, 0, 0};
+    int32_t torque_q24[HAL_PHASES_MAX] = {0, 0, 0, 0};
+    int32_t error_q24 = 0;
+    int32_t duty_q15[HAL_PHASES_MAX] = {0, 0, 0, 0};
+};
+
+TEST_F(DitcDuty, from_standstill_every_rotor_position_drives_phases_that_can_carry_the_torque) {
+    double weakest = 1e9;
+    for (int tenth_deg = 0; tenth_deg < 3600; tenth_deg++) {
+        const commutation_t commutation = commutation_at(&ANGLES, 3, 4, electrical(tenth_deg / 10.0));
+        ditc_duty_reset(&parameters, &ditc);
+        for (int k = 0; k < 20; k++) {
+            step(commutation, 8.0);
+        }
+        double torque_Nm = 0.0;
+        for (unsigned phase = 0; phase < 3; phase++) {
+            if (duty_q15[phase] > 0) {
+                torque_Nm += torque_map_torque_q24(&machine_tables, commutation.angle[phase], LIMIT_Q9) / twins::Q24;
+            }
+        }
+        weakest = std::min(weakest, torque_Nm);
+    }
+    EXPECT_GT(weakest, 19.1) << "the rated torque, at the current limit";
+    EXPECT_LT(weakest, 25.0);
+}
+
+TEST_F(DitcDuty, the_only_phase_at_work_gets_the_pid_s_duty_and_the_others_are_off) {
+    const commutation_t commutation = commutation_of(230.0);
+    ASSERT_EQ(commutation.active, 0u);
+    ASSERT_EQ(commutation.outgoing, unsigned(COMMUTATION_NONE));
+    bp_pid_t pid;
+    bp_pid_reset(&parameters.pid, &pid);
+    for (int k = 0; k < 50; k++) {
+        current_q9[0] = (k % 30) << 9;
+        step(commutation, 5.0);
+        EXPECT_EQ(duty_q15[0], bp_pid_step(&parameters.pid, &pid, error_q24));
+        EXPECT_EQ(duty_q15[1], -ONE_Q15);
+        EXPECT_EQ(duty_q15[2], -ONE_Q15);
+    }
+}
+
+TEST_F(DitcDuty, in_a_gap_of_the_commutation_every_phase_is_off) {
+    commutation_t commutation = commutation_of(230.0);
+    commutation.active = commutation.outgoing = COMMUTATION_NONE;
+    step(commutation, 5.0);
+    for (unsigned phase = 0; phase < 3; phase++) {
+        EXPECT_EQ(duty_q15[phase], -ONE_Q15);
+    }
+    EXPECT_EQ(ditc.regulated, unsigned(COMMUTATION_NONE));
+}
+
+TEST_F(DitcDuty, from_standstill_past_its_window_a_phase_is_regulated_and_the_next_one_assists) {
+    const commutation_t commutation = commutation_of(320.0);
+    ASSERT_EQ(commutation.outgoing, 0u);
+    ASSERT_EQ(commutation.active, 1u);
+    step(commutation, 8.0);
+    EXPECT_EQ(ditc.regulated, 0u);
+    EXPECT_GT(duty_q15[0], 0);
+    EXPECT_EQ(duty_q15[1], ONE_Q15) << "torque is missing beyond the outer band: full voltage to the current limit";
+    EXPECT_EQ(duty_q15[2], -ONE_Q15);
+}
+
+TEST_F(DitcDuty, the_incoming_phase_is_brought_to_the_current_that_will_carry_the_reference) {
+    // Phase 0 outgoing with about the torque wanted: no missing torque beyond the band.
+    const commutation_t commutation = commutation_of(305.0);
+    ASSERT_EQ(commutation.active, 1u);
+    for (double reference = 0.5; reference < 14.0; reference += 0.25) {
+        ditc_duty_reset(&parameters, &ditc);
+        current_q9[0] =
+            torque_map_current_q9(&machine_tables, commutation.angle[0], twins::to_fixed(reference, twins::Q24));
+        const double carrying_A =
+            torque_map_current_q9(&machine_tables, parameters.hand_over_angle, twins::to_fixed(reference, twins::Q24)) /
+            twins::Q9;
+        const double target_A = std::min(carrying_A, LIMIT_Q9 / twins::Q9);
+        for (int current_A = 0; current_A < 60; current_A += 3) {
+            current_q9[1] = current_A << 9;
+            step(commutation, reference);
+            ASSERT_EQ(ditc.regulated, 0u);
+            const double exact =
+                std::clamp((target_A - current_A) * parameters.incoming_gain_q20 / twins::Q20, -1.0, 1.0);
+            ASSERT_NEAR(duty_q15[1] / twins::Q15, exact, 1.0 / twins::Q15) << reference << " " << current_A;
+        }
+    }
+}
+
+TEST_F(DitcDuty, the_pid_moves_on_when_the_outgoing_phase_is_spent_and_starts_from_the_incoming_duty) {
+    const commutation_t commutation = commutation_of(320.0);
+    current_q9[0] = 20 << 9;
+    current_q9[1] = 10 << 9;
+    step(commutation, 4.0);
+    ASSERT_EQ(ditc.regulated, 0u);
+    // Still torque to take off: it stays, though the error is negative.
+    step(commutation, 1.0);
+    ASSERT_LT(error_q24, 0);
+    EXPECT_EQ(ditc.regulated, 0u);
+    // No torque left, but torque missing: it stays, both build up.
+    current_q9[0] = 0;
+    step(commutation, 8.0);
+    ASSERT_GT(error_q24, 0);
+    EXPECT_EQ(ditc.regulated, 0u);
+    // No torque left and none missing.
+    current_q9[1] = 12 << 9;
+    const double reference = torque_q24[1] / twins::Q24;
+    step(commutation, 0.5 * reference);
+    ASSERT_LE(error_q24, 0);
+    EXPECT_EQ(ditc.regulated, 1u);
+    EXPECT_EQ(duty_q15[0], -ONE_Q15);
+    // It does not go back.
+    current_q9[0] = 20 << 9;
+    step(commutation, 8.0);
+    EXPECT_EQ(ditc.regulated, 1u);
+}
+
+TEST_F(DitcDuty, the_pid_moves_on_when_the_outgoing_phase_must_go_and_starts_from_the_incoming_duty) {
+    current_q9[0] = 20 << 9;
+    current_q9[1] = 8 << 9;
+    for (int k = 0; k < 30; k++) {
+        step(commutation_of(340.0), 3.0);
+    }
+    ASSERT_EQ(ditc.regulated, 0u);
+    // The same sample again, past 348 degrees. Errors held, so that the PID's increment is known.
+    parameters.pid.kp_scale_q15 = parameters.pid.ki_scale_q15 = parameters.pid.kd_scale_q15 = 0;
+    step(commutation_of(347.99), 3.0);
+    const int32_t incoming_q15 = duty_q15[1];
+    ASSERT_NE(incoming_q15, duty_q15[0]);
+    step(commutation_of(348.01), 3.0);
+    EXPECT_EQ(ditc.regulated, 1u);
+    EXPECT_NEAR(duty_q15[1], incoming_q15, 100);
+    EXPECT_EQ(duty_q15[0], -ONE_Q15);
+}
+
+TEST_F(DitcDuty, a_phase_above_the_current_limit_is_never_driven) {
+    std::mt19937 random(1);
+    for (int i = 0; i < 200000; i++) {
+        const commutation_t commutation = commutation_at(&ANGLES, 3, 4, uint32_t(random()));
+        for (int32_t &current : current_q9) {
+            current = int32_t(random() % 40951);
+        }
+        step(commutation, double(random() % 4000) / 100.0);
+        for (unsigned phase = 0; phase < 3; phase++) {
+            ASSERT_LE(std::abs(duty_q15[phase]), ONE_Q15);
+            ASSERT_TRUE(duty_q15[phase] <= 0 || current_q9[phase] <= LIMIT_Q9);
+            if (phase != ditc.regulated && phase != commutation.active) {
+                ASSERT_EQ(duty_q15[phase], -ONE_Q15);
+            }
+        }
+        ASSERT_TRUE(ditc.regulated == commutation.active || ditc.regulated == commutation.outgoing);
+    }
+}
+
+TEST_F(DitcDuty, nothing_overflows_at_the_ends_of_all_ranges) {
+    std::mt19937 random(2);
+    const int32_t ends[] = {INT32_MIN, INT32_MAX, 0, 1, -1};
+    for (const int32_t gain_q20 : {0, 1, INT32_MAX}) {
+        for (const bp_pid_mode_t mode : {BP_PID_FIXED, BP_PID_FROZEN, BP_PID_LEARNING}) {
+            parameters = parameters_of(mode);
+            parameters.incoming_gain_q20 = gain_q20;
+            ditc_duty_reset(&parameters, &ditc);
+            for (int k = 0; k < 3000; k++) {
+                const commutation_t commutation = commutation_at(&ANGLES, 3, 4, uint32_t(random()));
+                for (unsigned phase = 0; phase < 3; phase++) {
+                    current_q9[phase] = int32_t(random() % 40951);
+                    torque_q24[phase] = ends[random() % 5];
+                }
+                const ditc_duty_sample_t sample = {current_q9, torque_q24, int32_t(random() >> 1), ends[random() % 5]};
+                ditc_duty_step(&parameters, &ditc, &machine_tables, &commutation, &sample, duty_q15);
+                for (unsigned phase = 0; phase < 3; phase++) {
+                    ASSERT_LE(std::abs(duty_q15[phase]), ONE_Q15);
+                }
+            }
+        }
+    }
+}
+
+} // namespace
