@@ -10,10 +10,12 @@ bool configure_rate_allowed(uint32_t control_rate_hz) {
            control_rate_hz == 100000;
 }
 
-/* rad/s in Q9.22 from whole r/min (or r/min/s), at most 4800: pi/30 in Q37, 2^38 below 4 ns a unit. */
+/* pi / 30: r/min to rad/s. */
+#define PI_30_Q37 INT64_C(14392573551)
+
+/* rad/s in Q9.22 from whole r/min; saturates at 4889 r/min. */
 static int32_t speed_q22_from_rpm(int32_t rpm) {
-    const int64_t pi_30_q37 = 14392683692;
-    return fixed_saturate(fixed_shift(rpm * pi_30_q37, 15));
+    return fixed_saturate(fixed_shift(rpm * PI_30_Q37, 15));
 }
 
 /* 2^-32 pitch from electrical degrees in Q7; 360 degrees is held just below the full pitch. */
@@ -27,8 +29,7 @@ static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
     if (rpm_s == 0) {
         return INT32_MAX;
     }
-    const int64_t pi_30_q37 = 14392683692;
-    const int64_t step_q22 = fixed_shift(rpm_s * pi_30_q37, 15) / (int64_t)control_rate_hz;
+    const int64_t step_q22 = fixed_shift(rpm_s * PI_30_Q37, 15) / (int64_t)control_rate_hz;
     return fixed_clamp(fixed_saturate(step_q22), 1, INT32_MAX);
 }
 
@@ -121,7 +122,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                 .pid = bp_pid_from(values, control_rate_hz),
                 .hand_over_angle = pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG]),
                 /* Half of what would reach the current in one period at rest: rate / (2 * A/s), in Q20. */
-                .incoming_gain_q20 = (int32_t)(((int64_t)control_rate_hz << 19) / tables->current_rise_A_s),
+                .incoming_gain_q20 = fixed_saturate(((int64_t)control_rate_hz << 19) / tables->current_rise_A_s),
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
                 .current_limit_q9 = current_limit_q9,
             },

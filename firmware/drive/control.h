@@ -29,7 +29,7 @@ typedef enum {
     DRIVE_CONTROLLER_PAPER        /* sliding mode, BP-PID, DITC by duty */
 } drive_controller_t;
 
-/* Read only in the interrupt; derived from the parameters by control_configure. */
+/* Read only in the interrupt; derived from the parameters by configure_control. */
 typedef struct {
     const machine_tables_t *tables;
     drive_controller_t controller;
