@@ -17,7 +17,10 @@ void ditc_duty_reset(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc
 static int32_t incoming_duty_q15(const ditc_duty_parameters_t *parameters, const machine_tables_t *tables,
                                  const ditc_duty_sample_t *sample, int32_t current_q9) {
     const int32_t limit_q9 = parameters->current_limit_q9;
-    const int32_t carrying_q9 = torque_map_current_q9(tables, parameters->hand_over_angle, sample->reference_q24);
+    /* A sixteenth more than the reference, so that the outgoing phase is spent although the current falls short of its
+     * target by what a proportional control leaves. */
+    const int32_t carried_q24 = fixed_add(sample->reference_q24, sample->reference_q24 / 16);
+    const int32_t carrying_q9 = torque_map_current_q9(tables, parameters->hand_over_angle, carried_q24);
     const bool assists = sample->error_q24 > parameters->band_outer_q24 || carrying_q9 > limit_q9;
     const int32_t target_q9 = assists ? limit_q9 : carrying_q9;
     /* Q9 * Q20 to Q15. */

@@ -4,11 +4,14 @@
 
 #include <stdint.h>
 
-/* Torque of a phase over angle and current. Rows: phase angle from unaligned (row 0) to the next aligned position, 64
- * equal steps of half a rotor pitch. Columns: current from 0 to 80 A in steps of 1 A. A map, not a product of curves,
- * so that measured machines fit as well. */
-#define MACHINE_TORQUE_ANGLES 65
-#define MACHINE_TORQUE_CURRENTS 81
+/* Torque of a phase over angle and current. Rows: phase angle from unaligned (row 0) to the next aligned position, 128
+ * equal steps of half a rotor pitch. Columns: current from 0 to 80 A in steps of 2 A. A map, not a product of curves,
+ * so that measured machines fit as well. The angle is the finer axis: torque is smooth over current, but has corners
+ * over angle where poles begin to overlap. */
+#define MACHINE_TORQUE_ROW_BITS 24    /* a row is 2^24 of the 2^32 of a pitch */
+#define MACHINE_TORQUE_COLUMN_BITS 10 /* a column is 2^10 of current in Q7.9 */
+#define MACHINE_TORQUE_ANGLES 129
+#define MACHINE_TORQUE_CURRENTS 41
 
 typedef struct {
     uint8_t phases;           /* 3 or 4 */

@@ -7,7 +7,7 @@
 #include "control/machine_tables.h"
 
 /* Largest current of the map, A in Q7.9. */
-#define TORQUE_MAP_CURRENT_MAX_Q9 ((MACHINE_TORQUE_CURRENTS - 1) << 9)
+#define TORQUE_MAP_CURRENT_MAX_Q9 ((MACHINE_TORQUE_CURRENTS - 1) << MACHINE_TORQUE_COLUMN_BITS)
 
 /* Torque of one phase in N m, Q7.24. Angle of the phase: 2^-32 rotor pitch, 0 aligned, 2^31 unaligned, torque positive
  * from there on; negative in the first half by mirror symmetry. Current in A, Q7.9, held from 0 to 1 LSB below 80 A.

@@ -57,6 +57,15 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
     };
 }
 
+/* Hysteresis switches a phase on for whole periods, and off only two periods after its current passed the limit (one
+ * until the new state acts, one until it is seen): the limit leaves room for that below the trip, and a tenth to spare.
+ * The rise is the unaligned phase's; a saturated one comes close to it anywhere. */
+static int32_t hysteresis_limit_q9(const int32_t *values, int32_t current_rise_A_s, uint32_t control_rate_hz) {
+    const int64_t rise_q9 = ((int64_t)current_rise_A_s << 9) / (int64_t)control_rate_hz;
+    const int64_t limit_q9 = values[PARAMETER_CURRENT_TRIP_A] - rise_q9 * 22 / 10;
+    return fixed_clamp(fixed_saturate(limit_q9), 0, values[PARAMETER_CURRENT_LIMIT_A]);
+}
+
 static bp_pid_parameters_t bp_pid_from(const int32_t *values, uint32_t control_rate_hz) {
     const int32_t scale_q24 = values[PARAMETER_BP_ERROR_SCALE_NM];
     return (bp_pid_parameters_t){
@@ -115,7 +124,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             {
                 .band_inner_q24 = values[PARAMETER_TORQUE_BAND_INNER_NM],
                 .band_outer_q24 = values[PARAMETER_TORQUE_BAND_OUTER_NM],
-                .current_limit_q9 = current_limit_q9,
+                .current_limit_q9 = hysteresis_limit_q9(values, tables->current_rise_A_s, control_rate_hz),
             },
         .duty =
             {

@@ -17,13 +17,14 @@ extern "C" {
 namespace {
 
 constexpr uint32_t HALF_PITCH = 0x80000000u;
+constexpr double ROW = 1 << MACHINE_TORQUE_ROW_BITS, COLUMN = 1 << MACHINE_TORQUE_COLUMN_BITS;
 constexpr int32_t CURRENT_END_Q9 = TORQUE_MAP_CURRENT_MAX_Q9;
 
-// Bilinear interpolation of the same table; distance in rows from the unaligned position.
-double bilinear_Nm(double row, double current_A) {
+// Bilinear interpolation of the same table; rows from the unaligned position, columns from no current.
+double bilinear_Nm(double row, double position) {
     const int low = std::min(int(row), MACHINE_TORQUE_ANGLES - 2);
-    const int column = std::min(int(current_A), MACHINE_TORQUE_CURRENTS - 2);
-    const double u = row - low, v = current_A - column;
+    const int column = std::min(int(position), MACHINE_TORQUE_CURRENTS - 2);
+    const double u = row - low, v = position - column;
     const auto &t = machine_tables.torque_q8;
     return ((1 - u) * ((1 - v) * t[low][column] + v * t[low][column + 1]) +
             u * ((1 - v) * t[low + 1][column] + v * t[low + 1][column + 1])) /
@@ -59,7 +60,7 @@ TEST(TorqueMap, torque_is_the_bilinear_interpolation_of_the_table) {
     for (int i = 0; i < 1000000; i++) {
         const uint32_t angle = HALF_PITCH | uint32_t(random());
         const auto current_q9 = int32_t(random() % uint32_t(CURRENT_END_Q9));
-        const double exact = bilinear_Nm((angle - HALF_PITCH) / 33554432.0, current_q9 / twins::Q9);
+        const double exact = bilinear_Nm((angle - HALF_PITCH) / ROW, current_q9 / COLUMN);
         worst =
             std::max(worst, std::fabs(torque_map_torque_q24(&machine_tables, angle, current_q9) / twins::Q24 - exact));
     }
@@ -71,18 +72,19 @@ TEST(TorqueMap, torque_is_the_bilinear_interpolation_of_the_table) {
 TEST(TorqueMap, torque_is_exact_at_every_entry_of_the_table) {
     for (uint32_t row = 0; row + 1 < MACHINE_TORQUE_ANGLES; row++) {
         for (int32_t column = 0; column + 1 < MACHINE_TORQUE_CURRENTS; column++) {
-            ASSERT_EQ(torque_map_torque_q24(&machine_tables, HALF_PITCH + (row << 25), column << 9),
+            ASSERT_EQ(torque_map_torque_q24(&machine_tables, HALF_PITCH + (row << MACHINE_TORQUE_ROW_BITS),
+                                                column << MACHINE_TORQUE_COLUMN_BITS),
                       machine_tables.torque_q8[row][column] * 65536);
         }
     }
 }
 
-TEST(TorqueMap, differs_from_the_machine_s_formula_by_13_mNm_at_most) {
+TEST(TorqueMap, differs_from_the_machine_s_formula_by_22_mNm_at_most) {
     const Magnetics magnetics;
     double worst = 0.0, squares = 0.0;
     int count = 0;
-    for (uint32_t step = 0; step < 64 * 8; step++) {
-        const uint32_t angle = HALF_PITCH + (step << 22);
+    for (uint32_t step = 0; step < 128 * 8; step++) {
+        const uint32_t angle = HALF_PITCH + (step << 21);
         for (int32_t current_q9 = 0; current_q9 < CURRENT_END_Q9; current_q9 += 64) {
             const double exact = magnetics.torque_Nm(angle / twins::TURN, current_q9 / twins::Q9);
             const double error = torque_map_torque_q24(&machine_tables, angle, current_q9) / twins::Q24 - exact;
@@ -92,10 +94,10 @@ TEST(TorqueMap, differs_from_the_machine_s_formula_by_13_mNm_at_most) {
         }
     }
     const double rms = std::sqrt(squares / count);
-    EXPECT_LT(worst, 0.013);
-    EXPECT_GT(worst, 0.010);
-    EXPECT_LT(rms, 0.005);
-    EXPECT_GT(rms, 0.004);
+    EXPECT_LT(worst, 0.022);
+    EXPECT_GT(worst, 0.020);
+    EXPECT_LT(rms, 0.0042);
+    EXPECT_GT(rms, 0.0037);
 }
 
 TEST(TorqueMap, is_mirror_symmetric_about_the_unaligned_position) {
@@ -122,7 +124,7 @@ TEST(TorqueMap, current_is_held_within_the_table) {
     EXPECT_EQ(torque_map_torque_q24(&machine_tables, angle, INT32_MIN), 0);
     const int32_t end_q24 = torque_map_torque_q24(&machine_tables, angle, CURRENT_END_Q9);
     EXPECT_EQ(torque_map_torque_q24(&machine_tables, angle, INT32_MAX), end_q24);
-    EXPECT_NEAR(end_q24 / twins::Q24, machine_tables.torque_q8[32][80] / 256.0, 0.005);
+    EXPECT_NEAR(end_q24 / twins::Q24, machine_tables.torque_q8[64][40] / 256.0, 0.005);
 }
 
 TEST(TorqueMap, current_and_torque_are_each_other_s_inverse) {
@@ -145,8 +147,8 @@ TEST(TorqueMap, current_and_torque_are_each_other_s_inverse) {
 }
 
 TEST(TorqueMap, no_torque_needs_no_current_and_too_much_the_largest) {
-    for (uint32_t row = 0; row < 64; row++) {
-        const uint32_t angle = HALF_PITCH + (row << 25);
+    for (uint32_t row = 0; row + 1 < MACHINE_TORQUE_ANGLES; row++) {
+        const uint32_t angle = HALF_PITCH + (row << MACHINE_TORQUE_ROW_BITS);
         EXPECT_EQ(torque_map_current_q9(&machine_tables, angle, 0), 0);
         EXPECT_EQ(torque_map_current_q9(&machine_tables, angle, -1), 0);
         EXPECT_EQ(torque_map_current_q9(&machine_tables, angle, INT32_MIN), 0);

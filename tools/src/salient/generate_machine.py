@@ -14,8 +14,9 @@ import numpy as np
 from salient.machine import Machine, MachineError, load_machine
 
 # As in firmware/control/machine_tables.h.
-TORQUE_ANGLES = 65
-TORQUE_CURRENTS = 81
+TORQUE_ANGLES = 129
+TORQUE_CURRENTS = 41
+TORQUE_CURRENT_STEP_A = 2.0
 
 
 def quantise(value: float, fraction_bits: int, bits: int) -> int:
@@ -27,7 +28,7 @@ def quantise(value: float, fraction_bits: int, bits: int) -> int:
 def tables_source(machine: Machine) -> str:
     """C source of the firmware's tables."""
     half = machine.pitch_rad / 2.0
-    currents = np.arange(TORQUE_CURRENTS, dtype=float)
+    currents = TORQUE_CURRENT_STEP_A * np.arange(TORQUE_CURRENTS)
     rows = []
     for angle in np.linspace(half, 2.0 * half, TORQUE_ANGLES):
         torque = np.maximum(machine.torque_Nm(angle, currents), 0.0)
