@@ -1,0 +1,306 @@
+// The control interrupt as a function: what it does in each state, and that it depends on nothing but its arguments.
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <functional>
+#include <random>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "drive/configure.h"
+#include "drive/control.h"
+#include "drive/fault.h"
+}
+
+#include "twins.h"
+
+namespace {
+
+constexpr double RATE_HZ = 40000.0;
+constexpr unsigned ENCODER_BITS = 17;
+constexpr uint32_t PERIOD_US = 25;
+constexpr uint16_t BUS_COUNTS = 240 * 8;
+
+bool all_open(const hal_pwm_compare_t &compare) {
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        if (compare.upper[phase] != 0 || compare.lower[phase] != 0) {
+            return false;
+        }
+    }
+    return true;
+}
+
+// A drive on a rotor that turns as it is told.
+class Control : public testing::Test {
+  protected:
+    explicit Control(drive_controller_t controller = DRIVE_CONTROLLER_PAPER) { configure(controller); }
+
+    void configure(drive_controller_t controller) {
+        parameters_t p;
+        parameters_init(&p);
+        p.values[PARAMETER_CONTROLLER] = controller;
+        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS);
+        control_reset(&state);
+        diagnostics = control_diagnostics_t{};
+        sample = control_sample_t{};
+        sample.adc.bus_voltage_counts = BUS_COUNTS;
+        turns = 0.1;
+    }
+
+    bool step(command_request_t request, double reference_rpm = 600.0) {
+        sample.time_us += PERIOD_US;
+        sample.command.request = request;
+        sample.command.speed_reference_q22 = twins::to_fixed(twins::rad_s(reference_rpm), twins::Q22);
+        sample.command.time_us = sample.time_us;
+        return step_as_it_is();
+    }
+
+    bool step_as_it_is() {
+        turns += speed_rad_s / (2.0 * twins::PI * RATE_HZ);
+        sample.encoder_counts = uint32_t(int64_t(std::floor((turns - std::floor(turns)) * (1 << ENCODER_BITS))));
+        const bool closed = control_step(&parameters, &state, &sample, &compare, &diagnostics);
+        // Whatever happens: no switch is closed outside RUN.
+        EXPECT_EQ(closed, state.machine.state == DRIVE_STATE_RUN);
+        EXPECT_TRUE(closed || all_open(compare));
+        return closed;
+    }
+
+    void start() {
+        for (int k = 0; k < 41; k++) {
+            step(COMMAND_OFF);
+        }
+        ASSERT_EQ(state.machine.state, DRIVE_STATE_READY);
+        step(COMMAND_RUN);
+        ASSERT_EQ(state.machine.state, DRIVE_STATE_RUN);
+    }
+
+    control_parameters_t parameters;
+    control_state_t state;
+    control_diagnostics_t diagnostics;
+    control_sample_t sample;
+    hal_pwm_compare_t compare;
+    double turns = 0.1, speed_rad_s = 0.0;
+};
+
+TEST_F(Control, initialise_lasts_a_millisecond) {
+    for (int k = 0; k < 39; k++) {
+        step(COMMAND_OFF);
+        ASSERT_EQ(state.machine.state, DRIVE_STATE_INITIALISE);
+    }
+    step(COMMAND_OFF);
+    EXPECT_EQ(state.machine.state, DRIVE_STATE_READY);
+}
+
+TEST_F(Control, every_switch_is_open_until_run_is_commanded) {
+    for (int k = 0; k < 200; k++) {
+        step(k % 2 == 0 ? COMMAND_STOP : COMMAND_CLEAR_FAULT);
+        ASSERT_TRUE(all_open(compare));
+    }
+    step(COMMAND_RUN);
+    EXPECT_FALSE(all_open(compare));
+}
+
+TEST_F(Control, the_same_state_and_sample_give_the_same_bits) {
+    // A copy of everything, replayed, with other things called in between; and no memory but the state.
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER}) {
+        configure(controller);
+        start();
+        std::mt19937 random(1);
+        speed_rad_s = 15.0;
+        for (int k = 0; k < 3000; k++) {
+            for (unsigned phase = 0; phase < 3; phase++) {
+                sample.adc.phase_current_counts[phase] = uint16_t(random() % 2500);
+            }
+            // Copied bytes, so that padding is equal in both.
+            control_state_t before;
+            std::memcpy(&before, &state, sizeof state);
+            step(COMMAND_RUN, 150.0);
+            hal_pwm_compare_t replayed;
+            control_diagnostics_t garbage;
+            std::memset(&garbage, 0xA5, sizeof garbage);
+            control_step(&parameters, &before, &sample, &replayed, &garbage);
+            ASSERT_EQ(std::memcmp(&before, &state, sizeof state), 0) << k;
+            ASSERT_EQ(std::memcmp(&replayed, &compare, sizeof compare), 0) << k;
+            ASSERT_EQ(garbage.torque_reference_q24, diagnostics.torque_reference_q24);
+            ASSERT_EQ(garbage.voltage_saturated, diagnostics.voltage_saturated);
+        }
+    }
+}
+
+TEST_F(Control, counts_become_amperes_volts_and_angle_exactly) {
+    sample.adc.phase_current_counts[0] = 512;
+    sample.adc.phase_current_counts[2] = 4095;
+    step(COMMAND_OFF);
+    EXPECT_EQ(diagnostics.current_q9[0], 10 << 9);
+    EXPECT_EQ(diagnostics.current_q9[1], 0);
+    EXPECT_EQ(diagnostics.current_q9[2], 40950);
+    EXPECT_EQ(diagnostics.bus_voltage_q6, 240 << 6);
+    // The middle of the encoder's count.
+    EXPECT_EQ(diagnostics.angle, (sample.encoder_counts << 15) + (1u << 14));
+}
+
+TEST_F(Control, each_cause_opens_every_switch_in_the_tick_that_sees_it) {
+    const struct {
+        fault_t fault;
+        std::function<void()> provoke;
+    } causes[] = {
+        {FAULT_OVER_CURRENT, [this] { sample.adc.phase_current_counts[1] = 3841; }}, // 75.02 A
+        {FAULT_OVER_VOLTAGE, [this] { sample.adc.bus_voltage_counts = 301 * 8; }},
+        {FAULT_UNDER_VOLTAGE, [this] { sample.adc.bus_voltage_counts = 149 * 8; }},
+        {FAULT_ENCODER, [this] { turns += 0.01; }},
+        {FAULT_COMMAND_TIMEOUT, [this] { sample.command.time_us -= 100001; }},
+        {FAULT_INTERRUPT_OVERRUN, [this] { sample.missed_interrupts = 3; }},
+    };
+    for (const auto &cause : causes) {
+        configure(DRIVE_CONTROLLER_PAPER);
+        start();
+        for (int k = 0; k < 10; k++) {
+            step(COMMAND_RUN);
+        }
+        const int32_t torque_reference_q24 = diagnostics.torque_reference_q24;
+        EXPECT_GT(torque_reference_q24, 0);
+        cause.provoke();
+        EXPECT_FALSE(step_as_it_is()) << cause.fault;
+        EXPECT_TRUE(all_open(compare));
+        const fault_record_t &record = state.machine.record;
+        EXPECT_EQ(record.fault, cause.fault);
+        EXPECT_NE(record.checks & FAULT_BIT(cause.fault), 0);
+        EXPECT_EQ(record.state, DRIVE_STATE_RUN);
+        EXPECT_EQ(record.time_us, sample.time_us);
+        EXPECT_EQ(record.torque_reference_q24, torque_reference_q24) << "what was asked for when it happened";
+        EXPECT_EQ(record.bus_voltage_q6, sample.adc.bus_voltage_counts * 8);
+        EXPECT_EQ(diagnostics.torque_reference_q24, 0);
+    }
+}
+
+TEST_F(Control, the_largest_current_that_is_no_trip_keeps_running) {
+    start();
+    sample.adc.phase_current_counts[1] = 3840; // 75 A
+    EXPECT_TRUE(step(COMMAND_RUN));
+    sample.adc.phase_current_counts[1] = 3841;
+    EXPECT_FALSE(step(COMMAND_RUN));
+}
+
+TEST_F(Control, an_encoder_that_freezes_at_speed_is_found_within_a_millisecond) {
+    start();
+    speed_rad_s = 15.7; // 150 r/min
+    for (int k = 0; k < 4000; k++) {
+        ASSERT_TRUE(step(COMMAND_RUN, 150.0)) << k;
+    }
+    speed_rad_s = 0.0;
+    int periods = 0;
+    while (step(COMMAND_RUN, 150.0) && periods < 100) {
+        periods++;
+    }
+    EXPECT_EQ(state.machine.record.fault, FAULT_ENCODER);
+    EXPECT_LT(periods, 40);
+}
+
+TEST_F(Control, a_fault_needs_clearing_and_letting_go_before_it_runs_again) {
+    start();
+    sample.adc.phase_current_counts[0] = 4000;
+    EXPECT_FALSE(step(COMMAND_RUN));
+    sample.adc.phase_current_counts[0] = 0;
+    for (int k = 0; k < 100; k++) {
+        EXPECT_FALSE(step(COMMAND_RUN));
+    }
+    EXPECT_FALSE(step(COMMAND_CLEAR_FAULT));
+    EXPECT_EQ(state.machine.state, DRIVE_STATE_READY);
+    EXPECT_TRUE(step(COMMAND_RUN));
+}
+
+TEST_F(Control, a_fault_cleared_on_a_turning_rotor_does_not_read_as_overspeed) {
+    for (const double rpm : {150.0, 600.0, 2500.0, 3000.0}) {
+        configure(DRIVE_CONTROLLER_PAPER);
+        speed_rad_s = twins::rad_s(rpm);
+        for (int k = 0; k < 4000; k++) {
+            step(COMMAND_OFF);
+        }
+        ASSERT_EQ(state.machine.state, DRIVE_STATE_READY) << rpm;
+        EXPECT_NEAR(diagnostics.speed_q22 / twins::Q22, speed_rad_s, 0.01 * speed_rad_s);
+        sample.adc.phase_current_counts[0] = 4000;
+        step(COMMAND_OFF);
+        sample.adc.phase_current_counts[0] = 0;
+        ASSERT_EQ(state.machine.state, DRIVE_STATE_FAULT);
+        step(COMMAND_CLEAR_FAULT);
+        for (int k = 0; k < 4000; k++) {
+            step(COMMAND_OFF);
+            ASSERT_EQ(state.machine.state, DRIVE_STATE_READY)
+                << rpm << " r/min, " << k << " fault " << state.machine.record.fault;
+        }
+        EXPECT_NEAR(diagnostics.speed_q22 / twins::Q22, speed_rad_s, 0.01 * speed_rad_s);
+    }
+}
+
+TEST_F(Control, the_reference_starts_at_the_present_speed_and_follows_the_ramp) {
+    parameters.speed_ramp_q22 = twins::to_fixed(0.01, twins::Q22); // rad/s a period
+    speed_rad_s = 20.0;
+    for (int k = 0; k < 4000; k++) {
+        step(COMMAND_OFF);
+        ASSERT_EQ(diagnostics.speed_reference_q22, 0);
+    }
+    double expected = 0.0;
+    for (int k = 0; k < 1000; k++) {
+        step(COMMAND_RUN, 600.0);
+        expected = k == 0 ? diagnostics.speed_reference_q22 / twins::Q22 : expected + 0.01;
+        ASSERT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, expected, 1e-4);
+    }
+    EXPECT_NEAR(expected, 30.0, 0.1);
+    // A stop ramps down from there, whatever the command's reference says.
+    for (int k = 0; k < 500; k++) {
+        step(COMMAND_STOP, 600.0);
+        expected -= 0.01;
+        ASSERT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, expected, 1e-4);
+    }
+}
+
+TEST_F(Control, a_stop_opens_the_switches_when_the_rotor_stands) {
+    start();
+    speed_rad_s = 10.0;
+    for (int k = 0; k < 2000; k++) {
+        ASSERT_TRUE(step(COMMAND_RUN, 100.0));
+    }
+    for (int k = 0; k < 400; k++) {
+        ASSERT_TRUE(step(COMMAND_STOP)) << "still turning";
+    }
+    // It comes to rest: 10 rad/s in 50 ms.
+    int periods = 0;
+    while (step(COMMAND_STOP) && periods < 4000) {
+        speed_rad_s = std::max(0.0, speed_rad_s - 200.0 / RATE_HZ);
+        periods++;
+    }
+    EXPECT_EQ(state.machine.state, DRIVE_STATE_READY);
+    EXPECT_LE(std::fabs(diagnostics.speed_q22 / twins::Q22), 0.5);
+}
+
+TEST_F(Control, the_traditional_controller_and_the_paper_s_without_its_pid_switch_whole_periods_only) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER}) {
+        configure(controller);
+        parameters.duty.pid.mode = BP_PID_OFF;
+        start();
+        std::mt19937 random(2);
+        for (int k = 0; k < 2000; k++) {
+            for (unsigned phase = 0; phase < 3; phase++) {
+                sample.adc.phase_current_counts[phase] = uint16_t(random() % 2500);
+            }
+            ASSERT_TRUE(step(COMMAND_RUN, 100.0));
+            for (unsigned phase = 0; phase < 3; phase++) {
+                ASSERT_TRUE(compare.upper[phase] == 0 || compare.upper[phase] == parameters.period_ticks);
+                ASSERT_TRUE(compare.lower[phase] == 0 || compare.lower[phase] == parameters.period_ticks);
+                ASSERT_GE(compare.lower[phase], compare.upper[phase]);
+            }
+        }
+    }
+}
+
+TEST_F(Control, the_torque_reference_is_never_negative) {
+    start();
+    speed_rad_s = 60.0;
+    for (int k = 0; k < 4000; k++) {
+        step(COMMAND_RUN, k < 2000 ? -3000.0 : 0.0);
+        ASSERT_GE(diagnostics.torque_reference_q24, 0);
+    }
+}
+
+} // namespace
