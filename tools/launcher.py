@@ -62,6 +62,7 @@ BUILD_NEEDS = (
 )
 TEST_NEEDS = (
     Need("gcc-arm-none-eabi", "compiler for Cortex-M4", _tool("arm-none-eabi-gcc")),
+    Need("libnewlib-arm-none-eabi", "its C headers", _file("/usr/lib/arm-none-eabi/include/string.h")),
     Need("qemu-system-x86", "guest with a kernel that has CAN", lambda: not _guest_packages()),
 )
 
