@@ -1,0 +1,160 @@
+// Random parameters, sensors and commands: no undefined behaviour (built with sanitizers), and never a closed switch
+// outside RUN. Seeded; a failure names its sequence.
+#include <algorithm>
+#include <cstdint>
+#include <random>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "drive/configure.h"
+#include "drive/control.h"
+}
+
+namespace {
+
+constexpr int SEQUENCES = 6000;
+constexpr int PERIODS = 400;
+
+// Any value of the row's range; its ends and its default more often.
+int32_t any_value(const parameter_row_t *row, std::mt19937_64 &random) {
+    switch (random() % 8) {
+    case 0:
+        return row->minimum;
+    case 1:
+        return row->maximum;
+    case 2:
+    case 3:
+        return row->initial;
+    default:
+        return int32_t(row->minimum + int64_t(random() % (uint64_t(int64_t(row->maximum) - row->minimum) + 1)));
+    }
+}
+
+// The machine at hand, and one with four phases whose map is full of noise.
+machine_tables_t four_phases() {
+    machine_tables_t tables = machine_tables;
+    tables.phases = 4;
+    tables.rotor_poles = 6;
+    std::mt19937 random(1);
+    for (auto &row : tables.torque_q8) {
+        for (auto &torque : row) {
+            torque = int16_t(random() & 0x7FFF);
+        }
+    }
+    return tables;
+}
+
+// A plausible bench that goes wild now and then.
+struct bench_t {
+    uint32_t angle = 0;
+    int32_t step = 0; // 2^-32 turn a period
+    control_sample_t sample{};
+
+    void advance(std::mt19937_64 &random, const control_parameters_t &parameters, uint32_t period_us) {
+        const auto rarely = [&](unsigned one_in) { return random() % one_in == 0; };
+        step += int32_t(random() % 20001) - 10000;
+        angle += uint32_t(step);
+        if (rarely(500)) {
+            angle = uint32_t(random());
+        }
+        sample.encoder_counts = angle >> parameters.encoder_shift;
+        const uint64_t middle_q6 = (uint64_t(parameters.protection.bus_over_voltage_q6) +
+                                    uint64_t(parameters.protection.bus_under_voltage_q6)) /
+                                   2;
+        sample.adc.bus_voltage_counts =
+            uint16_t(rarely(500) ? random() % 4096 : std::min<uint64_t>(middle_q6 / 8, 4095));
+        const uint64_t highest = uint64_t(parameters.protection.current_trip_q9) / 10;
+        for (uint16_t &counts : sample.adc.phase_current_counts) {
+            counts = uint16_t(rarely(2000) ? random() % 4096 : random() % (highest + 1));
+        }
+        sample.missed_interrupts = rarely(100) ? uint32_t(random() % 3) : rarely(2000) ? uint32_t(random()) : 0;
+        sample.time_us += period_us;
+        if (rarely(2000)) {
+            sample.time_us = uint32_t(random());
+        }
+        if (rarely(20)) {
+            sample.command.time_us = sample.time_us;
+            sample.command.request = rarely(3) ? command_request_t(random() % 4) : COMMAND_RUN;
+            sample.command.speed_reference_q22 = int32_t(uint32_t(random()));
+        }
+    }
+};
+
+TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
+    static const machine_tables_t other = four_phases();
+    const uint32_t rates_hz[] = {20000, 40000, 50000, 100000};
+    uint64_t running = 0, faults = 0, cleared = 0, driven = 0;
+    for (int sequence = 0; sequence < SEQUENCES; sequence++) {
+        std::mt19937_64 random{uint64_t(sequence)};
+        const machine_tables_t *tables = sequence % 2 == 0 ? &machine_tables : &other;
+        parameters_t p;
+        parameters_init(&p);
+        for (unsigned index = 0; index < PARAMETER_COUNT; index++) {
+            ASSERT_EQ(parameters_set(&p, index, any_value(parameters_row(index), random)), PARAMETER_DONE);
+        }
+        const uint32_t rate_hz = rates_hz[random() % 4];
+        const control_parameters_t parameters = configure_control(&p, tables, rate_hz, unsigned(8 + random() % 25));
+        control_state_t state;
+        control_diagnostics_t diagnostics{};
+        control_reset(&state);
+        bench_t bench;
+        bench.angle = uint32_t(random());
+        for (int period = 0; period < PERIODS; period++) {
+            bench.advance(random, parameters, 1000000 / rate_hz);
+            const drive_state_t before = state.machine.state;
+            hal_pwm_compare_t compare;
+            const bool closed = control_step(&parameters, &state, &bench.sample, &compare, &diagnostics);
+            ASSERT_EQ(closed, state.machine.state == DRIVE_STATE_RUN) << "sequence " << sequence;
+            for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+                const bool exists = phase < tables->phases;
+                ASSERT_LE(compare.upper[phase], closed && exists ? parameters.period_ticks : 0) << sequence;
+                ASSERT_LE(compare.lower[phase], closed && exists ? parameters.period_ticks : 0) << sequence;
+                // Both on is the only way to put voltage on a phase: not above its limit.
+                if (compare.upper[phase] > 0) {
+                    driven++;
+                    ASSERT_LE(diagnostics.current_q9[phase], p.values[PARAMETER_CURRENT_LIMIT_A]) << sequence;
+                }
+            }
+            running += closed;
+            faults += before != DRIVE_STATE_FAULT && state.machine.state == DRIVE_STATE_FAULT;
+            cleared += before == DRIVE_STATE_FAULT && state.machine.state == DRIVE_STATE_READY;
+        }
+    }
+    // The sequences are not so wild that they say nothing.
+    EXPECT_GT(running, uint64_t(SEQUENCES) * PERIODS / 20);
+    EXPECT_GT(driven, running / 20);
+    EXPECT_GT(faults, uint64_t(SEQUENCES) / 4);
+    EXPECT_GT(cleared, uint64_t(SEQUENCES) / 20);
+                SEQUENCES * PERIODS);
+}
+
+TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
+    std::mt19937_64 random(77);
+    parameters_t p;
+    parameters_init(&p);
+    for (const uint32_t rate_hz : {20000u, 100000u}) {
+        for (const unsigned bits : {8u, 17u, 32u}) {
+            const control_parameters_t parameters = configure_control(&p, &machine_tables, rate_hz, bits);
+            control_state_t state;
+            control_diagnostics_t diagnostics{};
+            control_reset(&state);
+            for (int period = 0; period < 20000; period++) {
+                control_sample_t sample{};
+                for (uint16_t &counts : sample.adc.phase_current_counts) {
+                    counts = uint16_t(random() % 4096);
+                }
+                sample.adc.bus_voltage_counts = uint16_t(random() % 4096);
+                sample.encoder_counts = uint32_t(random()) >> (32 - bits);
+                sample.missed_interrupts = uint32_t(random());
+                sample.time_us = uint32_t(random());
+                sample.command = {command_request_t(random() % 4), int32_t(uint32_t(random())), uint32_t(random())};
+                hal_pwm_compare_t compare;
+                const bool closed = control_step(&parameters, &state, &sample, &compare, &diagnostics);
+                ASSERT_EQ(closed, state.machine.state == DRIVE_STATE_RUN);
+            }
+        }
+    }
+}
+
+} // namespace

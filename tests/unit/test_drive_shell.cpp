@@ -1,0 +1,237 @@
+// drive.c between a HAL that remembers and the laws: what it starts, writes, opens and passes on.
+#include <cstdint>
+#include <cstring>
+#include <deque>
+#include <vector>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "comms/e2e.h"
+#include "drive/drive.h"
+#include "hal_adc.h"
+#include "hal_can.h"
+#include "hal_encoder.h"
+#include "hal_pwm.h"
+#include "hal_time.h"
+}
+#include "drive_codec.h"
+
+struct hal {
+    hal_adc_sample_t adc{};
+    uint32_t encoder_counts = 1000;
+    uint32_t time_us = 0;
+    uint32_t missed = 0;
+    std::deque<hal_can_frame_t> to_drive;
+    std::vector<hal_can_frame_t> from_drive;
+    std::vector<uint16_t> starts;
+    unsigned writes = 0, opens = 0;
+    bool open = true;
+    bool critical = false;
+    hal_pwm_compare_t written{};
+};
+
+extern "C" {
+void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample) {
+    *sample = hal->adc;
+}
+unsigned hal_encoder_bits(const hal_t *) {
+    return 17;
+}
+uint32_t hal_encoder_read(const hal_t *hal) {
+    return hal->encoder_counts;
+}
+uint32_t hal_time_us(const hal_t *hal) {
+    return hal->time_us;
+}
+void hal_critical_enter(hal_t *hal) {
+    EXPECT_FALSE(hal->critical) << "it does not nest";
+    hal->critical = true;
+}
+void hal_critical_leave(hal_t *hal) {
+    EXPECT_TRUE(hal->critical);
+    hal->critical = false;
+}
+void hal_pwm_start(hal_t *hal, uint16_t period_ticks) {
+    EXPECT_TRUE(hal->open) << "the switches are opened before the timer starts";
+    hal->starts.push_back(period_ticks);
+}
+void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare) {
+    hal->written = *compare;
+    hal->open = false;
+    hal->writes++;
+}
+void hal_pwm_open_all(hal_t *hal) {
+    hal->open = true;
+    hal->opens++;
+}
+uint32_t hal_pwm_missed_interrupts(hal_t *hal) {
+    const uint32_t missed = hal->missed;
+    hal->missed = 0;
+    return missed;
+}
+bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {
+    if (hal->to_drive.empty()) {
+        return false;
+    }
+    *frame = hal->to_drive.front();
+    hal->to_drive.pop_front();
+    return true;
+}
+uint32_t hal_can_receive_overflows(const hal_t *) {
+    return 0;
+}
+bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
+    hal->from_drive.push_back(*frame);
+    return true;
+}
+}
+
+namespace {
+
+class Drive : public testing::Test {
+  protected:
+    void SetUp() override {
+        hal.adc.bus_voltage_counts = 240 * 8;
+        const drive_config_t config = {40000, DRIVE_CONTROLLER_PAPER};
+        ASSERT_TRUE(drive_init(&drive, &hal, &machine_tables, &config));
+    }
+
+    void periods(int count) {
+        for (int k = 0; k < count; k++) {
+            hal.time_us += 25;
+            drive_control_interrupt(&drive);
+            drive_background(&drive);
+        }
+    }
+
+    void command(command_request_t request, double reference_rpm = 600.0) {
+        drive_drive_command_t message{};
+        message.request = uint8_t(request);
+        message.speed_reference_rpm = int32_t(reference_rpm * 1000.0);
+        hal_can_frame_t frame{};
+        frame.identifier = DRIVE_DRIVE_COMMAND_FRAME_ID;
+        frame.length = DRIVE_DRIVE_COMMAND_LENGTH;
+        drive_drive_command_pack(frame.data, &message, sizeof frame.data);
+        e2e_protect(COMMANDS_DATA_ID, ++counter, frame.data, frame.length);
+        hal.to_drive.push_back(frame);
+    }
+
+    // Parameter write over the bus; the response's status.
+    int write(unsigned index, int32_t value) {
+        drive_parameter_request_t request{};
+        request.operation = DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE;
+        request.index = uint8_t(index);
+        request.value = value;
+        hal_can_frame_t frame{};
+        frame.identifier = DRIVE_PARAMETER_REQUEST_FRAME_ID;
+        frame.length = DRIVE_PARAMETER_REQUEST_LENGTH;
+        drive_parameter_request_pack(frame.data, &request, sizeof frame.data);
+        hal.to_drive.push_back(frame);
+        hal.from_drive.clear();
+        periods(2);
+        for (const hal_can_frame_t &sent : hal.from_drive) {
+            if (sent.identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID) {
+                drive_parameter_response_t response{};
+                drive_parameter_response_unpack(&response, sent.data, sent.length);
+                return response.status;
+            }
+        }
+        return -1;
+    }
+
+    hal_t hal;
+    drive_t drive;
+    uint8_t counter = 0;
+};
+
+TEST_F(Drive, starts_the_timer_once_with_the_rate_s_period_and_the_machine_s_defaults) {
+    EXPECT_EQ(hal.starts, std::vector<uint16_t>{2500});
+    EXPECT_EQ(drive.parameters.values[PARAMETER_CONTROLLER], DRIVE_CONTROLLER_PAPER);
+    EXPECT_EQ(drive.parameters.values[PARAMETER_INERTIA_KG_M2], machine_tables.inertia_q30);
+    EXPECT_EQ(drive.parameters.values[PARAMETER_FRICTION_NM_S], machine_tables.friction_q30);
+}
+
+TEST_F(Drive, refuses_a_rate_that_the_timer_cannot_make_and_starts_nothing) {
+    for (const uint32_t rate_hz : {0u, 10000u, 39999u, 200000u}) {
+        hal_t other;
+        drive_t refused;
+        const drive_config_t config = {rate_hz, DRIVE_CONTROLLER_TRADITIONAL};
+        EXPECT_FALSE(drive_init(&refused, &other, &machine_tables, &config));
+        EXPECT_TRUE(other.starts.empty());
+        EXPECT_EQ(other.writes, 0u);
+    }
+}
+
+TEST_F(Drive, opens_the_switches_every_period_until_it_runs) {
+    periods(100);
+    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(hal.writes, 0u);
+    EXPECT_GE(hal.opens, 100u);
+}
+
+TEST_F(Drive, a_command_closes_switches_and_off_opens_them) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_RUN);
+    EXPECT_FALSE(hal.open);
+    EXPECT_GT(hal.written.upper[0] + hal.written.upper[1] + hal.written.upper[2], 0);
+    command(COMMAND_OFF);
+    periods(3);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);
+}
+
+TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    ASSERT_FALSE(hal.open);
+    periods(100000 / 25 + 2);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.machine.record.fault, FAULT_COMMAND_TIMEOUT);
+}
+
+TEST_F(Drive, lost_interrupts_reach_the_protection) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    hal.missed = 3;
+    periods(1);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+}
+
+TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
+    periods(100);
+    EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 5 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_DONE_CHOICE);
+    EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
+    command(COMMAND_RUN);
+    periods(3);
+    EXPECT_EQ(drive.diagnostics.torque_reference_q24, 5 << 24);
+    EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 6 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_NOT_WHILE_RUNNING_CHOICE);
+    EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
+}
+
+TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
+    hal_t other_hal;
+    other_hal.adc.bus_voltage_counts = 240 * 8;
+    drive_t other;
+    const drive_config_t config = {20000, DRIVE_CONTROLLER_TRADITIONAL};
+    ASSERT_TRUE(drive_init(&other, &other_hal, &machine_tables, &config));
+    periods(100);
+    command(COMMAND_RUN);
+    for (int k = 0; k < 50; k++) {
+        periods(1);
+        other_hal.time_us += 50;
+        drive_control_interrupt(&other);
+        drive_background(&other);
+    }
+    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(other.control.machine.state, DRIVE_STATE_READY);
+    EXPECT_TRUE(other_hal.open);
+    EXPECT_EQ(other_hal.starts, std::vector<uint16_t>{5000});
+}
+
+} // namespace
