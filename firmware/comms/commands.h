@@ -16,7 +16,7 @@ typedef enum { COMMAND_OFF, COMMAND_RUN, COMMAND_STOP, COMMAND_CLEAR_FAULT } com
 
 typedef struct {
     command_request_t request;
-    int32_t speed_reference_q22; /* rad/s, Q9.22, within +-3000 r/min */
+    int32_t speed_reference_q22; /* rad/s, Q9.22, 0..3000 r/min */
     uint32_t time_us;            /* the drive's time when it was accepted */
 } command_t;
 

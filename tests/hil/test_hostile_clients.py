@@ -36,7 +36,7 @@ ATTACKS = {
     + [changed(GOOD, data=bytes(GOOD.data) + b"\0")],
     "wrong_checksum": [changed(GOOD, data=bytes(b ^ (1 << i % 8) if i == j else b for i, b in enumerate(GOOD.data)))
                        for j in range(7)],
-    "wrong_counter": [command(-3000.0)],
+    "wrong_counter": [command(3000.0)],
     "unknown_frame": [
         can.Message(arbitration_id=0x001, is_extended_id=False, data=bytes(8)),
         can.Message(arbitration_id=COMMAND_ID, is_extended_id=True, data=GOOD.data),
@@ -82,7 +82,7 @@ def test_wrong_frames(make_bench, tmp_path, undisturbed, counter):
     assert counters == dict.fromkeys(COUNTERS, 0.0) | {counter: len(ATTACKS[counter])}
 
 
-@pytest.mark.parametrize("raw_speed", [3_000_001, -3_000_001, 2**23 - 1, -(2**23)])
+@pytest.mark.parametrize("raw_speed", [3_000_001, -1, 2**23 - 1, -(2**23)])
 def test_out_of_range(make_bench, tmp_path, undisturbed, raw_speed):
     """Checksum and counter are good, so that nothing but the range is wrong."""
     bench = steady(make_bench, tmp_path, "disturbed")

@@ -74,7 +74,7 @@ def test_wrong_command_line(salient, arguments, words):
         (SCENARIO + "control_rate_hz = 30000\n", ["control_rate_hz", "30000", "20000, 40000, 50000, 100000"]),
         (SCENARIO + "[[speed]]\nat_s = 0\nvalue = 600\n", ["speed.value", "unknown key", "value_rpm"]),
         (SCENARIO + "[[speed]]\nat_s = 0\n", ["speed.value_rpm", "missing"]),
-        (SCENARIO + "[[speed]]\nat_s = 0\nvalue_rpm = 9000\n", ["speed.value_rpm", "9000", "-3000 to 3000"]),
+        (SCENARIO + "[[speed]]\nat_s = 0\nvalue_rpm = 9000\n", ["speed.value_rpm", "9000", "0 to 3000"]),
         (SCENARIO + "[load]\nat_s = 0\n", ["load", "[[load]]"]),
         (SCENARIO + "[record]\nstep_us = 0\n", ["record.step_us", "0.1"]),
         (SCENARIO + "[parameters]\ntorque_max = 1\n", ["parameters.torque_max", "torque_max_Nm"]),

@@ -25,8 +25,8 @@ TEST(Codec, setters_saturate_at_the_range_of_the_dbc_where_it_is_narrower) {
     drive_drive_command_t message{};
     drive_drive_command_set_speed_reference_rpm(&message, 3000001);
     EXPECT_EQ(message.speed_reference_rpm, 3000000);
-    drive_drive_command_set_speed_reference_rpm(&message, -3000001);
-    EXPECT_EQ(message.speed_reference_rpm, -3000000);
+    drive_drive_command_set_speed_reference_rpm(&message, -1);
+    EXPECT_EQ(message.speed_reference_rpm, 0);
     drive_drive_command_set_request(&message, 4);
     EXPECT_EQ(message.request, 3);
     drive_drive_heartbeat_t heartbeat{};

@@ -69,7 +69,9 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
 
     near("inner", c.hysteresis.band_inner_q24, v(PARAMETER_TORQUE_BAND_INNER_NM) * twins::Q24, 0.0);
     near("outer", c.hysteresis.band_outer_q24, v(PARAMETER_TORQUE_BAND_OUTER_NM) * twins::Q24, 0.0);
-    near("limit", c.hysteresis.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * twins::Q9, 0.0);
+    const double rise_A = machine_tables.current_rise_A_s / rate_hz; // a period of full voltage
+    const double below_trip_A = std::max(v(PARAMETER_CURRENT_TRIP_A) - 2.2 * rise_A, 0.0);
+    near("limit", c.hysteresis.current_limit_q9, std::min(v(PARAMETER_CURRENT_LIMIT_A), below_trip_A) * twins::Q9, 4.0);
     near("limit", c.duty.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * twins::Q9, 0.0);
     near("assist", c.duty.band_outer_q24, v(PARAMETER_BP_ASSIST_BAND_NM) * twins::Q24, 0.0);
     near("incoming gain", c.duty.incoming_gain_q20, 0.5 * rate_hz / machine_tables.current_rise_A_s * twins::Q20, 1.0);

@@ -238,7 +238,7 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local",
 _DURATION_S = (1e-3, 3600.0)
 _SEED = (0, 2**63 - 1)
 _STEPS: dict[str, dict[str, tuple[float, float]]] = {
-    "speed": {"at_s": (0.0, 3600.0), "value_rpm": (-3000.0, 3000.0)},
+    "speed": {"at_s": (0.0, 3600.0), "value_rpm": (0.0, 3000.0)},
     "load": {"at_s": (0.0, 3600.0), "torque_Nm": (-200.0, 200.0)},
 }
 _RECORD = {"step_us": (0.1, 1e6), "from_s": (0.0, 3600.0)}
