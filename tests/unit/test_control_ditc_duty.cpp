@@ -132,9 +132,9 @@ TEST_F(DitcDuty, the_incoming_phase_is_brought_to_the_current_that_will_carry_th
         ditc_duty_reset(&parameters, &ditc);
         current_q9[0] =
             torque_map_current_q9(&machine_tables, commutation.angle[0], twins::to_fixed(reference, twins::Q24));
-        const double carrying_A =
-            torque_map_current_q9(&machine_tables, parameters.hand_over_angle, twins::to_fixed(reference * 17 / 16, twins::Q24)) /
-            twins::Q9;
+        const double carrying_A = torque_map_current_q9(&machine_tables, parameters.hand_over_angle,
+                                                        twins::to_fixed(reference * 17 / 16, twins::Q24)) /
+                                  twins::Q9;
         const double target_A = std::min(carrying_A, LIMIT_Q9 / twins::Q9);
         for (int current_A = 0; current_A < 60; current_A += 3) {
             current_q9[1] = current_A << 9;

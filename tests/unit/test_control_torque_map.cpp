@@ -73,7 +73,7 @@ TEST(TorqueMap, torque_is_exact_at_every_entry_of_the_table) {
     for (uint32_t row = 0; row + 1 < MACHINE_TORQUE_ANGLES; row++) {
         for (int32_t column = 0; column + 1 < MACHINE_TORQUE_CURRENTS; column++) {
             ASSERT_EQ(torque_map_torque_q24(&machine_tables, HALF_PITCH + (row << MACHINE_TORQUE_ROW_BITS),
-                                                column << MACHINE_TORQUE_COLUMN_BITS),
+                                            column << MACHINE_TORQUE_COLUMN_BITS),
                       machine_tables.torque_q8[row][column] * 65536);
         }
     }
