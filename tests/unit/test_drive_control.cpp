@@ -1,4 +1,5 @@
 // The control interrupt as a function: what it does in each state, and that it depends on nothing but its arguments.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -277,7 +278,9 @@ TEST_F(Control, a_stop_opens_the_switches_when_the_rotor_stands) {
 TEST_F(Control, the_traditional_controller_and_the_paper_s_without_its_pid_switch_whole_periods_only) {
     for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER}) {
         configure(controller);
-        parameters.duty.pid.mode = BP_PID_OFF;
+        if (controller == DRIVE_CONTROLLER_PAPER) {
+            parameters.duty.pid.mode = BP_PID_OFF;
+        }
         start();
         std::mt19937 random(2);
         for (int k = 0; k < 2000; k++) {
@@ -289,9 +292,65 @@ TEST_F(Control, the_traditional_controller_and_the_paper_s_without_its_pid_switc
                 ASSERT_TRUE(compare.upper[phase] == 0 || compare.upper[phase] == parameters.period_ticks);
                 ASSERT_TRUE(compare.lower[phase] == 0 || compare.lower[phase] == parameters.period_ticks);
                 ASSERT_GE(compare.lower[phase], compare.upper[phase]);
+                // +1 both on, 0 one on, -1 both off, as the hysteresis says.
+                const int on = (compare.upper[phase] != 0) + (compare.lower[phase] != 0);
+                ASSERT_EQ(on - 1, state.hysteresis.state[phase]);
             }
         }
     }
+}
+
+TEST_F(Control, the_paper_s_controller_drives_its_regulated_phase_with_the_pid_s_duty) {
+    start();
+    int partial = 0;
+    for (int k = 0; k < 2000; k++) {
+        ASSERT_TRUE(step(COMMAND_RUN, 1.0));
+        const unsigned phase = state.duty.regulated;
+        ASSERT_LT(phase, 3u);
+        const double duty = state.duty.pid.duty_q30 / twins::Q30;
+        ASSERT_NEAR(diagnostics.duty_q15 / twins::Q15, duty, 0.51 / twins::Q15);
+        const double voltage = (double(compare.upper[phase]) + compare.lower[phase]) / parameters.period_ticks - 1.0;
+        ASSERT_NEAR(voltage, duty, 0.51 / parameters.period_ticks + 0.51 / twins::Q15) << k;
+        partial += compare.upper[phase] > 0 && compare.upper[phase] < parameters.period_ticks;
+        // The current follows the voltage, 8 A a period at most; the rotor is held.
+        uint16_t &counts = sample.adc.phase_current_counts[phase];
+        counts = uint16_t(std::clamp(counts + 400.0 * voltage, 0.0, 3000.0));
+    }
+    EXPECT_GT(partial, 10);
+}
+
+TEST_F(Control, overspeed_opens_every_switch) {
+    start();
+    int periods = 0;
+    while (state.machine.state == DRIVE_STATE_RUN && periods < 40000) {
+        speed_rad_s += 0.05;
+        step(COMMAND_RUN, 3000.0);
+        periods++;
+    }
+    EXPECT_EQ(state.machine.record.fault, FAULT_OVER_SPEED);
+    EXPECT_NEAR(speed_rad_s, twins::rad_s(3600.0), 4.0);
+}
+
+TEST_F(Control, voltage_is_saturated_while_a_phase_is_fully_on_and_never_outside_run) {
+    start();
+    int saturated = 0;
+    for (int k = 0; k < 400; k++) {
+        // Currents that are too small, then too large for the torque.
+        for (unsigned phase = 0; phase < 3; phase++) {
+            sample.adc.phase_current_counts[phase] = k < 200 ? 100 : 3000;
+        }
+        step(COMMAND_RUN, 300.0);
+        bool full = false;
+        for (unsigned phase = 0; phase < 3; phase++) {
+            full = full || compare.upper[phase] == parameters.period_ticks;
+        }
+        ASSERT_EQ(diagnostics.voltage_saturated, full) << k;
+        saturated += full;
+    }
+    EXPECT_GT(saturated, 100);
+    EXPECT_LT(saturated, 300);
+    step(COMMAND_OFF);
+    EXPECT_FALSE(diagnostics.voltage_saturated);
 }
 
 TEST_F(Control, the_torque_reference_is_never_negative) {
