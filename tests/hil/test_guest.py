@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
-from salient import guest
 from salient.paths import ROOT
-
-pytestmark = pytest.mark.skipif(not shutil.which(guest.QEMU), reason=f"needs Debian package {guest.QEMU_PACKAGE}")
 
 # Only the standard library: its imports are quick in the guest.
 SCRIPT = """
