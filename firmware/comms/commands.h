@@ -6,19 +6,11 @@
 #include <stdint.h>
 
 #include "comms/e2e.h"
+#include "drive/command.h"
 #include "hal_can.h"
 
 /* Known to both ends of DRIVE_COMMAND and part of its checksum. */
 #define COMMANDS_DATA_ID 0x5A1E
-
-/* The values of DRIVE_COMMAND.request in drive.dbc. */
-typedef enum { COMMAND_OFF, COMMAND_RUN, COMMAND_STOP, COMMAND_CLEAR_FAULT } command_request_t;
-
-typedef struct {
-    command_request_t request;
-    int32_t speed_reference_q22; /* rad/s, Q9.22, 0..3000 r/min */
-    uint32_t time_us;            /* the drive's time when it was accepted */
-} command_t;
 
 /* Since start; each holds at 65535. */
 typedef struct {

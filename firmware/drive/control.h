@@ -10,7 +10,6 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "comms/commands.h"
 #include "control/commutation.h"
 #include "control/ditc_duty.h"
 #include "control/ditc_hysteresis.h"
@@ -18,6 +17,7 @@
 #include "control/machine_tables.h"
 #include "control/speed_pi.h"
 #include "control/speed_smc.h"
+#include "drive/command.h"
 #include "drive/protection.h"
 #include "drive/state_machine.h"
 #include "hal_adc.h"

@@ -12,7 +12,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "comms/commands.h"
+#include "drive/command.h"
 #include "drive/fault.h"
 
 typedef enum { DRIVE_STATE_INITIALISE, DRIVE_STATE_READY, DRIVE_STATE_RUN, DRIVE_STATE_FAULT } drive_state_t;
