@@ -162,6 +162,19 @@ TEST(Commutation, roles_are_phases_of_the_machine_or_none_and_never_the_same_for
     }
 }
 
+TEST(Commutation, windows_begin_with_turn_on_and_end_before_turn_off_to_the_lsb) {
+    // One rotor pole: the rotor's angle is the phase's.
+    const auto roles = [](uint32_t angle) { return commutation_at(&PAPER, 1, 1, angle); };
+    EXPECT_EQ(roles(PAPER.turn_on - 1).active, unsigned(COMMUTATION_NONE));
+    EXPECT_EQ(roles(PAPER.turn_on).active, 0u);
+    EXPECT_EQ(roles(PAPER.turn_off - 1).active, 0u);
+    EXPECT_EQ(roles(PAPER.turn_off).active, unsigned(COMMUTATION_NONE));
+    EXPECT_EQ(roles(PAPER.turn_off - 1).outgoing, unsigned(COMMUTATION_NONE));
+    EXPECT_EQ(roles(PAPER.turn_off).outgoing, 0u);
+    EXPECT_EQ(roles(PAPER.outgoing_off - 1).outgoing, 0u);
+    EXPECT_EQ(roles(PAPER.outgoing_off).outgoing, unsigned(COMMUTATION_NONE));
+}
+
 TEST(Commutation, with_turn_off_before_turn_on_no_phase_is_active) {
     const commutation_parameters_t empty = parameters_of(300.0, 200.0, 200.0);
     for_many_angles(3, 4, [&](uint32_t angle) {

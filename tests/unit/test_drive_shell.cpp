@@ -214,6 +214,57 @@ TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
     EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
 }
 
+TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
+    hal.adc.phase_current_counts[0] = 100;
+    hal.adc.phase_current_counts[1] = 200;
+    hal.adc.phase_current_counts[2] = 300;
+    periods(100);
+    command(COMMAND_RUN);
+    periods(1000);
+    hal.from_drive.clear();
+    periods(400); // a whole slow cycle
+    const control_diagnostics_t &d = drive.diagnostics;
+    unsigned seen = 0;
+    for (const hal_can_frame_t &frame : hal.from_drive) {
+        if (frame.identifier == DRIVE_DRIVE_STATUS_FRAME_ID) {
+            drive_drive_status_t status{};
+            drive_drive_status_unpack(&status, frame.data, frame.length);
+            EXPECT_EQ(status.state, DRIVE_STATE_RUN);
+            EXPECT_EQ(status.controller, DRIVE_CONTROLLER_PAPER);
+            EXPECT_EQ(status.fault, FAULT_NONE);
+            seen |= 1;
+        } else if (frame.identifier == DRIVE_DRIVE_TORQUE_FRAME_ID) {
+            // The rotor stands and the currents are held, so every cycle says the same.
+            drive_drive_torque_t torque{};
+            drive_drive_torque_unpack(&torque, frame.data, frame.length);
+            EXPECT_EQ(torque.torque_reference_nm, (d.torque_reference_q24 + 32768) >> 16);
+            EXPECT_EQ(torque.torque_estimate_nm, (d.torque_q24 + 32768) >> 16);
+            EXPECT_EQ(torque.bus_voltage_v, 240 << 6);
+            seen |= 2;
+        } else if (frame.identifier == DRIVE_DRIVE_CURRENTS_FRAME_ID) {
+            drive_drive_currents_t currents{};
+            drive_drive_currents_unpack(&currents, frame.data, frame.length);
+            EXPECT_EQ(currents.current_a_a, 1000);
+            EXPECT_EQ(currents.current_b_a, 2000);
+            EXPECT_EQ(currents.current_c_a, 3000);
+            EXPECT_EQ(currents.current_d_a, 0);
+            seen |= 4;
+        } else if (frame.identifier == DRIVE_DRIVE_BP_PID_FRAME_ID) {
+            // Gains per N m: those per scaled error over the scale.
+            drive_drive_bp_pid_t pid{};
+            drive_drive_bp_pid_unpack(&pid, frame.data, frame.length);
+            const double inverse = drive.control_parameters.duty.pid.error_scale_inverse_q24 / 16777216.0;
+            EXPECT_NEAR(pid.kp_per_nm, drive.control.duty.pid.gain_q15[0] * inverse, 0.51);
+            EXPECT_NEAR(pid.ki_per_nm, drive.control.duty.pid.gain_q15[1] * inverse, 0.51);
+            EXPECT_NEAR(pid.kd_per_nm, drive.control.duty.pid.gain_q15[2] * inverse, 0.51);
+            EXPECT_NE(pid.kp_per_nm, pid.ki_per_nm);
+            EXPECT_NE(pid.ki_per_nm, pid.kd_per_nm);
+            seen |= 8;
+        }
+    }
+    EXPECT_EQ(seen, 15u);
+}
+
 TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
     hal_t other_hal;
     other_hal.adc.bus_voltage_counts = 240 * 8;
