@@ -93,9 +93,10 @@ static void regulate_torque(const control_parameters_t *parameters, control_stat
 }
 
 static void complete_record(fault_record_t *record, const control_sample_t *sample, const estimate_t *e,
-                            const control_state_t *state, const control_diagnostics_t *last) {
+                            const control_diagnostics_t *last) {
     record->time_us = sample->time_us;
-    record->speed_q22 = state->observer.speed_q22;
+    /* Of the last period: what failed may be the encoder, and its angle is in the present estimate. */
+    record->speed_q22 = last->speed_q22;
     record->torque_reference_q24 = last->torque_reference_q24;
     record->current_max_q9 = (uint16_t)e->current_max_q9;
     record->bus_voltage_q6 = (uint16_t)e->bus_voltage_q6;
@@ -127,7 +128,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
         .standing = fixed_abs(state->observer.speed_q22) < STANDING_Q22,
     };
     if (state_machine_step(machine, &input, parameters->initialise_ticks)) {
-        complete_record(&machine->record, sample, &e, state, diagnostics);
+        complete_record(&machine->record, sample, &e, diagnostics);
     }
     if (before == DRIVE_STATE_FAULT && machine->state == DRIVE_STATE_READY) {
         /* Whatever the encoder did in between, believe it anew. */

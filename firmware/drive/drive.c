@@ -81,6 +81,18 @@ static telemetry_snapshot_t snapshot(const drive_t *drive, uint32_t time_us) {
     return s;
 }
 
+/* Forgets a command whose sender fell silent long ago: the clock wraps, and then its age would look small again. Twice
+ * the timeout, so that the interrupt has seen the timeout before. */
+static void forget_stale_command(drive_t *drive, uint32_t time_us) {
+    const uint32_t age_us = time_us - drive->command.time_us;
+    if (drive->command.request != COMMAND_OFF &&
+        age_us > 2u * drive->control_parameters.protection.command_timeout_us) {
+        hal_critical_enter(drive->hal);
+        drive->command.request = COMMAND_OFF;
+        hal_critical_leave(drive->hal);
+    }
+}
+
 void drive_background(drive_t *drive) {
     const uint32_t time_us = hal_time_us(drive->hal);
     if (comms_telemetry_due(&drive->comms, time_us)) {
@@ -96,6 +108,7 @@ void drive_background(drive_t *drive) {
         drive->command = drive->comms.command;
         hal_critical_leave(drive->hal);
     }
+    forget_stale_command(drive, time_us);
     if (drive->parameters.changes != drive->configured_changes) {
         configure(drive);
     }

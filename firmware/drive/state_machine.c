@@ -25,6 +25,8 @@ static bool latch(state_machine_t *machine, uint16_t checks) {
 
 bool state_machine_step(state_machine_t *machine, const state_machine_input_t *input, uint32_t initialise_ticks) {
     const uint16_t lasting = input->checks & (uint16_t)~FAULT_BIT(FAULT_COMMAND_TIMEOUT);
+    const bool clear = input->request == COMMAND_CLEAR_FAULT && machine->asked != COMMAND_CLEAR_FAULT;
+    machine->asked = input->request;
     if (input->request != COMMAND_RUN) {
         machine->released = true;
     }
@@ -52,7 +54,7 @@ bool state_machine_step(state_machine_t *machine, const state_machine_input_t *i
         }
         break;
     case DRIVE_STATE_FAULT:
-        if (input->request == COMMAND_CLEAR_FAULT && lasting == 0) {
+        if (clear && lasting == 0) {
             machine->state = DRIVE_STATE_READY;
             machine->record = (fault_record_t){.fault = FAULT_NONE};
         }

@@ -4,7 +4,8 @@
  *   READY, RUN --a check fails--> FAULT --clear_fault, cause gone--> READY
  *
  * A lost command is a fault only in RUN. A drive that came back from a fault runs again only after it was asked for
- * something else than run: whoever holds `run` through a fault must let go first.
+ * something else than run: whoever holds `run` through a fault must let go first. Likewise `clear_fault` acts in the
+ * tick in which it is first asked: held, it does not clear what comes later or goes away later.
  */
 #ifndef DRIVE_STATE_MACHINE_H
 #define DRIVE_STATE_MACHINE_H
@@ -19,9 +20,10 @@ typedef enum { DRIVE_STATE_INITIALISE, DRIVE_STATE_READY, DRIVE_STATE_RUN, DRIVE
 
 typedef struct {
     drive_state_t state;
-    uint32_t healthy_ticks; /* in INITIALISE, since a check last failed */
-    bool released;          /* run has been let go since the last fault */
-    fault_record_t record;  /* fault FAULT_NONE outside FAULT */
+    uint32_t healthy_ticks;  /* in INITIALISE, since a check last failed */
+    bool released;           /* run has been let go since the last fault */
+    command_request_t asked; /* in the last tick */
+    fault_record_t record;   /* fault FAULT_NONE outside FAULT */
 } state_machine_t;
 
 typedef struct {

@@ -285,4 +285,22 @@ TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
     EXPECT_EQ(other_hal.starts, std::vector<uint16_t>{5000});
 }
 
+TEST_F(Drive, a_run_of_a_sender_long_silent_starts_nothing_when_the_clock_comes_round) {
+    hal.adc.bus_voltage_counts = 0; // the link is off: the drive stays in its initial state
+    command(COMMAND_OFF);
+    periods(10);
+    command(COMMAND_RUN);
+    periods(10);
+    ASSERT_EQ(drive.control.machine.state, DRIVE_STATE_INITIALISE);
+    ASSERT_EQ(drive.command.request, COMMAND_RUN);
+    periods(10000); // 0.25 s of silence
+    EXPECT_EQ(drive.command.request, COMMAND_OFF);
+
+    hal.time_us = drive.command.time_us; // 71 minutes later the command looks new
+    hal.adc.bus_voltage_counts = 240 * 8;
+    periods(200);
+    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(hal.writes, 0u);
+}
+
 } // namespace

@@ -155,6 +155,7 @@ TEST_F(StateMachine, the_first_cause_stays_whatever_fails_later) {
     EXPECT_EQ(machine.record.fault, FAULT_OVER_SPEED);
     EXPECT_EQ(machine.record.checks, FAULT_BIT(FAULT_OVER_SPEED) | FAULT_BIT(FAULT_ENCODER));
     EXPECT_EQ(machine.record.state, DRIVE_STATE_RUN);
+    step(COMMAND_OFF);
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
     EXPECT_EQ(machine.record.fault, FAULT_NONE);
 }
@@ -169,6 +170,17 @@ TEST_F(StateMachine, after_a_fault_run_must_be_let_go_before_it_counts_again) {
     EXPECT_EQ(step(COMMAND_RUN), DRIVE_STATE_FAULT);
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
     EXPECT_EQ(step(COMMAND_RUN), DRIVE_STATE_RUN);
+}
+
+TEST_F(StateMachine, a_held_clear_fault_clears_only_once) {
+    run();
+    step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT, FAULT_BIT(FAULT_OVER_VOLTAGE)), DRIVE_STATE_FAULT);
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << "the cause went away after it was asked";
+    step(COMMAND_OFF);
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT, FAULT_BIT(FAULT_ENCODER)), DRIVE_STATE_FAULT);
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << "a later fault is not covered";
 }
 
 TEST_F(StateMachine, a_fault_that_comes_back_while_run_is_held_needs_letting_go_again) {

@@ -77,7 +77,8 @@ class Drive:
         self.ask("off")
 
     def clear_fault(self) -> None:
-        """Leave the fault state, if its cause is gone."""
+        """Leave the fault state, if its cause is gone. The drive clears when this is asked anew: hence off first."""
+        self.ask("off")
         self.ask("clear_fault")
 
     def silence(self) -> None:
