@@ -86,6 +86,8 @@ def _build_foreign(path: Path, program: Path, build: str) -> None:
         for command in (
             ["cmake", "--preset", build, f"-DSALIENT_MACHINE_FILE={path}"],
             ["cmake", "--build", "--preset", build, "--target", program.name],
+            # The build folder does not keep hold of a file that may go away.
+            ["cmake", "--preset", build, "-DSALIENT_MACHINE_FILE="],
         ):
             if subprocess.run(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT).returncode != 0:
                 raise SimulatorError(f"building for {path} failed: see {log.relative_to(ROOT)}")
