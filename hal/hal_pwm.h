@@ -25,7 +25,8 @@ typedef struct {
     uint16_t lower[HAL_PHASES_MAX];
 } hal_pwm_compare_t;
 
-/* Sets the period and starts the timer; the first control interrupt comes one period later. Called once. [background] */
+/* Sets the period and starts the timer; the first control interrupt comes one period later. Called once. [background]
+ */
 void hal_pwm_start(hal_t *hal, uint16_t period_ticks);
 
 /* Buffers the compare values of the next period. [interrupt] */

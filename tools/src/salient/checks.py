@@ -79,9 +79,15 @@ def _one(passed: bool) -> Count:
 # --- steps ----------------------------------------------------------------------------------------------------------
 
 def _style() -> Count:
-    """ruff over the Python sources."""
-    return _one(_command(sys.executable, "-m", "ruff", "check", "--no-cache", "--config", ROOT / "tools/pyproject.toml",
-                         ROOT / "tools", ROOT / "tests"))
+    """ruff over the Python sources, clang-format over C and C++."""
+    config = ROOT / "tools" / "pyproject.toml"
+    count = _one(_command(sys.executable, "-m", "ruff", "check", "--no-cache", "--config", config,
+                          ROOT / "tools", ROOT / "tests"))
+    folders = [ROOT / name for name in ("firmware", "hal", "emulator", "tests")]
+    sources = sorted(path for folder in folders for path in folder.rglob("*") if path.suffix in (".c", ".h", ".cpp"))
+    clang_format = Path(sys.executable).with_name("clang-format")
+    count += _one(_command(clang_format, "--dry-run", "-Werror", *sources))
+    return count
 
 
 def _unit() -> Count:
