@@ -9,6 +9,7 @@ import pytest
 from salient import demo
 from salient.arguments import make_parser
 from salient.errors import UsageError
+from salient.paths import ROOT
 from salient.progress import Progress
 from salient.results import PAPER
 
@@ -97,6 +98,28 @@ def test_ripple_of_hysteresis_is_what_its_sampling_rate_allows_and_the_papers_is
     # An independent model says about 32 kHz / 40 kHz for hysteresis.
     assert 0.3 < ripple["traditional"] < 1.6
     assert PAPER["load_step_150"]["paper"]["torque_ripple"] < ripple["paper"] < ripple["traditional"]
+
+
+def test_the_readme_shows_the_figures_of_the_demo(figures_of_merit):
+    """Each number in the columns that are ours, to the digits that the README gives."""
+    start, step = figures_of_merit["start_600"], figures_of_merit["load_step_150"]
+    rows = {
+        "start to 600 r/min, settled within 0.5 %": {c: start[c]["settling_time_s"] for c in CONTROLLERS},
+        "overshoot": {c: start[c]["overshoot_percent"] for c in CONTROLLERS},
+        "dip of an 8 N m step at 150 r/min": {c: step[c]["speed_dip_rpm"] for c in CONTROLLERS},
+        "back within 0.5 %": {c: step[c]["recovery_time_s"] * 1e3 for c in CONTROLLERS},
+        "torque ripple K_t, 0.3 to 0.4 s": {c: step[c]["torque_ripple"] for c in CONTROLLERS},
+    }
+    table = {}
+    for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if line.startswith("|") and len(cells) == 5:
+            table[cells[0]] = {"traditional": cells[1], "paper": cells[3]}
+    for row, values in rows.items():
+        for controller, value in values.items():
+            shown = table[row][controller].split()[0]
+            digits = len(shown.partition(".")[2])
+            assert shown == f"{value:.{digits}f}", f"{row}, {controller}"
 
 
 @pytest.mark.parametrize("machine", ["linear_cosine", "linear_trapezoid"])
