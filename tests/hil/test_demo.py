@@ -95,7 +95,6 @@ def test_steady_torque_is_load_plus_friction(figures_of_merit, controller):
 
 def test_ripple_of_hysteresis_is_what_its_sampling_rate_allows_and_the_papers_is_lower(figures_of_merit):
     ripple = {controller: figures_of_merit["load_step_150"][controller]["torque_ripple"] for controller in CONTROLLERS}
-    # An independent model says about 32 kHz / 40 kHz for hysteresis.
     assert 0.3 < ripple["traditional"] < 1.6
     assert PAPER["load_step_150"]["paper"]["torque_ripple"] < ripple["paper"] < ripple["traditional"]
 
@@ -133,7 +132,6 @@ def test_the_linear_machines_hold_the_same_promises(machine, tmp_path):
     assert 0.0 < step["paper"]["recovery_time_s"] <= 0.010
     assert PAPER["load_step_150"]["paper"]["torque_ripple"] < step["paper"]["torque_ripple"]
     assert step["paper"]["torque_ripple"] < step["traditional"]["torque_ripple"]
-    # About 16 and 11 kHz / 40 kHz from an independent model.
     assert 0.15 < step["traditional"]["torque_ripple"] < 0.6
 
 

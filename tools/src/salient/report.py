@@ -38,15 +38,6 @@ ROWS = {
 }
 NEVER = {"settling_time_s": "not in this run", "recovery_time_s": "not in this run"}
 
-# What an independent floating-point model of the same drives gives (exact switching edges, 0.2 us steps or finer):
-# machine, K_t of hysteresis times its sampling rate / kHz, K_t of BP-PID duty at 20, 50 and 100 kHz, and the smallest
-# dip that any voltage could hold from 100 us after an 8 N m step at 150 r/min: best, median, worst rotor angle / r/min.
-REACHABLE = (
-    ("linear_cosine", 16.0, (0.093, 0.026, 0.014), (0.77, 1.46, 3.33)),
-    ("linear_trapezoid", 11.0, (0.19, 0.117, 0.049), (0.62, 1.92, 3.41)),
-    ("saturating", 32.0, (0.066, 0.034, 0.018), (0.77, 1.21, 2.32)),
-)
-
 
 @dataclass(frozen=True)
 class Picture:
@@ -200,29 +191,15 @@ def _why(results: Mapping[str, Any]) -> str:
 {printed["traditional"]["torque_ripple"]:g} in print. At {rate_khz:g} kHz the switches can change every
 {1000 / rate_khz:g} µs, and what is decided on one sample acts a period later; meanwhile the full supply voltage drives
 the current, and the torque with it, beyond the band. So the ripple of a hysteresis controller is set by its sampling
-rate, not by its band, and falls in inverse proportion to it: at {rate_khz:g} kHz it is far from the paper's figures
-whatever the tuning, and the 0.0197 would need a sampling rate of 0.5 to 2 MHz. It is the figure of a simulation with a
-very small step, not of a drive with an interrupt.</p>
+rate, not by its band, and falls as the rate rises (<code>--control-rate-hz</code>): at {rate_khz:g} kHz it is far from
+the paper's figures whatever the tuning. They are those of a simulation with a very small step, not of a drive with an
+interrupt.</p>
 <p>What a real sampling rate can use of the paper's idea is the BP-PID's output as the duty of the active phase, which
 grades the voltage within a period. That is the controller called paper here; its <i>K</i><sub>t</sub> is
 {ripple["paper"]:.3g}.</p>
 <p>The dip after a load step depends on the rotor angle at the step and on the delay until the voltage answers. The
 paper's 0.4 r/min needs a lucky angle and a load that is known beforehand; a dip at one angle, the one here included, is
-one sample and no property of the drive.</p>
-<h3>What can be reached, from an independent floating-point model</h3>
-<table class=reachable><thead><tr><th>machine</th><th><i>K</i><sub>t</sub>, hysteresis<br>at {rate_khz:g} kHz</th>
-<th><i>K</i><sub>t</sub>, BP-PID duty<br>at 20 / 50 / 100 kHz</th>
-<th>smallest possible dip, r/min, 100 µs delay<br>best / median / worst angle</th></tr></thead><tbody>
-{_reachable_rows(results["conditions"]["machine"], rate_khz)}
-</tbody></table>"""
-
-
-def _reachable_rows(this_machine: str, rate_khz: float) -> str:
-    return "\n".join(
-        f"<tr{' class=this' if machine == this_machine else ''}><th scope=row>{machine}</th>"
-        f"<td>{ripple_khz / rate_khz:.2f}</td><td>{' / '.join(f'{value:g}' for value in duty)}</td>"
-        f"<td>{' / '.join(f'{value:.2f}' for value in dips)}</td></tr>"
-        for machine, ripple_khz, duty, dips in REACHABLE)
+one sample and no property of the drive.</p>"""
 
 
 def _conditions(conditions: Mapping[str, Any]) -> str:
