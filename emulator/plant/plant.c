@@ -12,6 +12,10 @@
 #define STEP_CURRENT_FRACTION 0.15
 #define STEP_ANGLE_PITCHES 0.0015
 
+/* Of the shortest time constants, those of a winding at its least inductance and of the free rotor: a Runge-Kutta step
+ * loses its accuracy, and beyond 2.8 its stability, where the resistance or the friction is large. */
+#define STEP_TIME_CONSTANTS 0.05
+
 /* A diode's end of conduction is located to this. */
 #define ZERO_TOLERANCE_S 1e-13
 #define ZERO_ITERATIONS 60
@@ -34,10 +38,15 @@ void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_r
 }
 
 void plant_set_step_factor(plant_t *plant, double factor) {
-    plant->step_max_s = factor * STEP_MAX_S;
+    const machine_t *machine = plant->machine;
+    const double least_inductance_H =
+        plant->magnetics.unaligned_inductance_H + fmin(0.0, plant->magnetics.linear_excess_H);
+    const double time_constant_s =
+        fmin(least_inductance_H / machine->resistance_ohm, machine->inertia_kg_m2 / machine->friction_Nm_s);
+    plant->step_max_s = factor * fmin(STEP_MAX_S, STEP_TIME_CONSTANTS * time_constant_s);
     plant->step_angle_rad = factor * STEP_ANGLE_PITCHES * plant->magnetics.pitch_rad;
     plant->step_current_A = INFINITY;
-    if (plant->machine->magnetics.form == MAGNETICS_SATURATING) {
+    if (machine->magnetics.form == MAGNETICS_SATURATING) {
         plant->step_current_A = factor * STEP_CURRENT_FRACTION * plant->magnetics.saturation_A;
     }
 }

@@ -22,6 +22,7 @@ plant_t *plant_library_create(const machine_t *machine, double initial_angle_rad
 void plant_library_destroy(plant_t *plant);
 void plant_library_set_inputs(plant_t *plant, double load_torque_Nm, double bus_voltage_V);
 void plant_library_set_motion(plant_t *plant, double speed_rad_s, double rotor_angle_rad);
+void plant_library_set_current(plant_t *plant, unsigned phase, double current_A);
 void plant_library_read(const plant_t *plant, plant_library_state_t *state);
 void plant_library_evaluate(const machine_t *machine, double phase_angle_rad, double current_A,
                             magnetics_point_t *point);
@@ -50,6 +51,11 @@ void plant_library_set_inputs(plant_t *plant, double load_torque_Nm, double bus_
 void plant_library_set_motion(plant_t *plant, double speed_rad_s, double rotor_angle_rad) {
     plant->speed_rad_s = speed_rad_s;
     plant->rotor_angle_rad = rotor_angle_rad;
+}
+
+/* Puts a current (>= 0) into a phase of the machine; the ledger takes no note of it either. */
+void plant_library_set_current(plant_t *plant, unsigned phase, double current_A) {
+    plant->current_A[phase] = current_A;
 }
 
 void plant_library_read(const plant_t *plant, plant_library_state_t *state) {

@@ -163,6 +163,26 @@ TEST(Plant, CoastsDownByFrictionAndLoad) {
     EXPECT_NEAR(plant.energy_load_J, 3.0 * plant.rotor_angle_rad, 1e-9);
 }
 
+TEST(Plant, FastWindingAndFastRotorStayAccurate) {
+    machine_t machine = machine_of(MAGNETICS_LINEAR_COSINE);
+    machine.resistance_ohm = 100.0; // 6.8 us unaligned: a period's step would not even be stable
+    machine.inertia_kg_m2 = 1e-4;
+    machine.friction_Nm_s = 2.0; // 50 us
+    plant_t plant;
+    plant_init(&plant, &machine, M_PI / 4.0);
+    const hal_pwm_compare_t compare = compare_of({TICKS}, {TICKS});
+    plant_set_switches(&plant, &compare, TICKS);
+    for (unsigned period = 1; period <= 4; period++) {
+        plant_advance(&plant, period * PERIOD_NS);
+        const double time_s = 1e-9 * period * PERIOD_NS;
+        EXPECT_NEAR(plant.current_A[0], 2.4 * -std::expm1(-100.0 / 0.676e-3 * time_s), 2e-7 * 2.4);
+    }
+    plant_init(&plant, &machine, 0.0);
+    plant.speed_rad_s = 100.0;
+    plant_advance(&plant, 100000);
+    EXPECT_NEAR(plant.speed_rad_s, 100.0 * std::exp(-2.0), 1e-5);
+}
+
 TEST(Plant, PhaseWithoutCurrentStaysOpen) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     plant_t plant;
