@@ -243,7 +243,6 @@ thead th { border-bottom: 1px solid #bbb; }
 thead th:first-child { text-align: left; }
 .tables table { table-layout: fixed; }
 .tables th:first-child { width: 30%; }
-.this td, .this th[scope=row] { font-weight: 600; background: #f6f6f4; }
 .conditions { width: auto; }
 .conditions td { text-align: left; }
 figure { margin: 1.8rem 0 2.4rem; break-inside: avoid; }
