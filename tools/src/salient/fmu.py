@@ -204,10 +204,12 @@ def instantiation_token(machine: Machine, sources: list[Path]) -> str:
 
 
 def pack(unit: Path, description_file: Path, library: Path, platform: str, licence: Path) -> None:
-    """Writes the unit: a ZIP archive without times or owners of the files."""
+    """Writes the unit: a ZIP archive without times or owners of the files. The library gets the name that the
+    description gives it."""
+    identifier = ElementTree.parse(description_file).find("CoSimulation").get("modelIdentifier")
     members = {
         "modelDescription.xml": description_file,
-        f"binaries/{platform}/{library.name}": library,
+        f"binaries/{platform}/{identifier}{library.suffix}": library,
         "documentation/licenses/license.txt": licence,
     }
     unit.parent.mkdir(parents=True, exist_ok=True)
