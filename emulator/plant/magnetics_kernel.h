@@ -71,13 +71,14 @@ MAGNETICS_INLINE void magnetics_kernel_trapezoid(const magnetics_model_t *model,
     }
 }
 
-/* f and f' (per mechanical radian) at any phase angle. */
-MAGNETICS_INLINE void magnetics_kernel_shape(const magnetics_model_t *model, double phase_angle_rad, double *f,
-                                             double *gradient_1_rad) {
+/* f and f' (per mechanical radian) at any phase angle. `form` is the model's, apart so that a caller that knows it gets
+ * nothing of the others. */
+MAGNETICS_INLINE void magnetics_kernel_shape(const magnetics_model_t *model, magnetics_form_t form,
+                                             double phase_angle_rad, double *f, double *gradient_1_rad) {
     const double pitches =
         (phase_angle_rad * model->pitches_per_rad + MAGNETICS_ROUNDING_SHIFT) - MAGNETICS_ROUNDING_SHIFT;
     const double wrapped_rad = phase_angle_rad - pitches * model->pitch_rad; /* -half a pitch .. half a pitch */
-    if (model->form == MAGNETICS_LINEAR_COSINE) {
+    if (form == MAGNETICS_LINEAR_COSINE) {
         double sine, cosine;
         magnetics_kernel_sine_cosine(model->electrical_per_mechanical * wrapped_rad, &sine, &cosine);
         *f = 0.5 + 0.5 * cosine;
@@ -86,7 +87,7 @@ MAGNETICS_INLINE void magnetics_kernel_shape(const magnetics_model_t *model, dou
     }
     const double folded_rad = fabs(wrapped_rad);
     double gradient;
-    if (model->form == MAGNETICS_SATURATING) {
+    if (form == MAGNETICS_SATURATING) {
         const double x = folded_rad * (2.0 * model->pitches_per_rad); /* 0 aligned, 1 unaligned */
         *f = 1.0 + x * x * (2.0 * x - 3.0);
         gradient = 12.0 * model->pitches_per_rad * (x * (x - 1.0));
@@ -96,16 +97,16 @@ MAGNETICS_INLINE void magnetics_kernel_shape(const magnetics_model_t *model, dou
     *gradient_1_rad = copysign(gradient, -wrapped_rad);
 }
 
-/* See magnetics_evaluate. */
-MAGNETICS_INLINE void magnetics_kernel(const magnetics_model_t *model, double phase_angle_rad, double current_A,
-                                       magnetics_point_t *point) {
+/* See magnetics_evaluate; `form` as above. */
+MAGNETICS_INLINE void magnetics_kernel(const magnetics_model_t *model, magnetics_form_t form, double phase_angle_rad,
+                                       double current_A, magnetics_point_t *point) {
     double f, gradient_1_rad;
-    magnetics_kernel_shape(model, phase_angle_rad, &f, &gradient_1_rad);
+    magnetics_kernel_shape(model, form, phase_angle_rad, &f, &gradient_1_rad);
     /* g(i) - Lu i, its slope and its integral W(i) */
     double excess_Wb = model->linear_excess_H * current_A;
     double excess_H = model->linear_excess_H;
     double excess_J = 0.5 * excess_Wb * current_A;
-    if (model->form == MAGNETICS_SATURATING) {
+    if (form == MAGNETICS_SATURATING) {
         const double decay = magnetics_kernel_decay(model, current_A);
         const double knee_Wb = model->saturating_Wb * (1.0 - decay);
         excess_Wb += knee_Wb;

@@ -151,9 +151,9 @@ typedef struct {
     double charge_As[HAL_PHASES_MAX];
 } integrals_t;
 
-static conducting_t find_conducting(plant_t *plant) {
-    conducting_t conducting;
-    conducting.count = 0;
+/* Through a pointer, for a struct given back is copied in wide loads that wait for the narrow stores before them. */
+static void find_conducting(plant_t *plant, conducting_t *conducting) {
+    conducting->count = 0;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         const unsigned upper = plant->switches.upper, lower = plant->switches.lower;
         const unsigned on = ((upper >> phase) & 1u) + ((lower >> phase) & 1u);
@@ -162,22 +162,22 @@ static conducting_t find_conducting(plant_t *plant) {
             plant->current_A[phase] = 0.0;
             continue;
         }
-        conducting.phase[conducting.count] = phase;
-        conducting.angle_offset_rad[conducting.count] = phase * plant->phase_offset_rad;
-        conducting.voltage_V[conducting.count] = voltage_V;
-        conducting.count++;
+        conducting->phase[conducting->count] = phase;
+        conducting->angle_offset_rad[conducting->count] = phase * plant->phase_offset_rad;
+        conducting->voltage_V[conducting->count] = voltage_V;
+        conducting->count++;
     }
-    return conducting;
 }
 
-/* `count` is conducting->count, apart so that the compiler can unroll for a known one. */
-MAGNETICS_INLINE void differentiate(const plant_t *plant, const conducting_t *conducting, unsigned count,
-                                    const state_t *state, derivative_t *derivative) {
+/* `form` is the magnetics' and `count` is conducting->count, apart so that the compiler can leave out the other forms
+ * and unroll where they are known. */
+MAGNETICS_INLINE void differentiate_of(const plant_t *plant, magnetics_form_t form, const conducting_t *conducting,
+                                       unsigned count, const state_t *state, derivative_t *derivative) {
     const machine_t *machine = plant->machine;
     derivative->torque_Nm = 0.0;
     for (unsigned index = 0; index < count; index++) {
         magnetics_point_t point;
-        magnetics_kernel(&plant->magnetics, state->angle_rad - conducting->angle_offset_rad[index],
+        magnetics_kernel(&plant->magnetics, form, state->angle_rad - conducting->angle_offset_rad[index],
                          state->current_A[index], &point);
         derivative->current_A_s[index] =
             (conducting->voltage_V[index] - machine->resistance_ohm * state->current_A[index] -
@@ -190,6 +190,17 @@ MAGNETICS_INLINE void differentiate(const plant_t *plant, const conducting_t *co
         machine->inertia_kg_m2;
 }
 
+MAGNETICS_INLINE void differentiate(const plant_t *plant, const conducting_t *conducting, const state_t *state,
+                                    derivative_t *derivative) {
+    if (plant->magnetics.form == MAGNETICS_SATURATING) {
+        differentiate_of(plant, MAGNETICS_SATURATING, conducting, conducting->count, state, derivative);
+    } else if (plant->magnetics.form == MAGNETICS_LINEAR_COSINE) {
+        differentiate_of(plant, MAGNETICS_LINEAR_COSINE, conducting, conducting->count, state, derivative);
+    } else {
+        differentiate_of(plant, MAGNETICS_LINEAR_TRAPEZOID, conducting, conducting->count, state, derivative);
+    }
+}
+
 MAGNETICS_INLINE void move(unsigned count, const state_t *from, const derivative_t *derivative, double speed_rad_s,
                            double step_s, state_t *to) {
     to->angle_rad = from->angle_rad + step_s * speed_rad_s;
@@ -200,17 +211,17 @@ MAGNETICS_INLINE void move(unsigned count, const state_t *from, const derivative
 }
 
 /* One classical Runge-Kutta step from `start`, whose derivative `first` is. */
-MAGNETICS_INLINE void runge_kutta_step_of(const plant_t *plant, const conducting_t *conducting, unsigned count,
-                                          const state_t *start, const derivative_t *first, double step_s, state_t *end,
-                                          integrals_t *integrals) {
+MAGNETICS_INLINE void runge_kutta_step_of(const plant_t *plant, magnetics_form_t form, const conducting_t *conducting,
+                                          unsigned count, const state_t *start, const derivative_t *first,
+                                          double step_s, state_t *end, integrals_t *integrals) {
     state_t second_state, third_state, fourth_state;
     derivative_t second, third, fourth;
     move(count, start, first, start->speed_rad_s, 0.5 * step_s, &second_state);
-    differentiate(plant, conducting, count, &second_state, &second);
+    differentiate_of(plant, form, conducting, count, &second_state, &second);
     move(count, start, &second, second_state.speed_rad_s, 0.5 * step_s, &third_state);
-    differentiate(plant, conducting, count, &third_state, &third);
+    differentiate_of(plant, form, conducting, count, &third_state, &third);
     move(count, start, &third, third_state.speed_rad_s, step_s, &fourth_state);
-    differentiate(plant, conducting, count, &fourth_state, &fourth);
+    differentiate_of(plant, form, conducting, count, &fourth_state, &fourth);
 
     const double sixth_s = step_s / 6.0;
     integrals->angle_rad = sixth_s * (start->speed_rad_s + 2.0 * (second_state.speed_rad_s + third_state.speed_rad_s) +
@@ -236,14 +247,26 @@ MAGNETICS_INLINE void runge_kutta_step_of(const plant_t *plant, const conducting
     }
 }
 
+MAGNETICS_INLINE void runge_kutta_step_in(const plant_t *plant, magnetics_form_t form, const conducting_t *conducting,
+                                          const state_t *start, const derivative_t *first, double step_s, state_t *end,
+                                          integrals_t *integrals) {
+    if (conducting->count == 1) {
+        runge_kutta_step_of(plant, form, conducting, 1, start, first, step_s, end, integrals);
+    } else if (conducting->count == 2) {
+        runge_kutta_step_of(plant, form, conducting, 2, start, first, step_s, end, integrals);
+    } else {
+        runge_kutta_step_of(plant, form, conducting, conducting->count, start, first, step_s, end, integrals);
+    }
+}
+
 static void runge_kutta_step(const plant_t *plant, const conducting_t *conducting, const state_t *start,
                              const derivative_t *first, double step_s, state_t *end, integrals_t *integrals) {
-    if (conducting->count == 1) {
-        runge_kutta_step_of(plant, conducting, 1, start, first, step_s, end, integrals);
-    } else if (conducting->count == 2) {
-        runge_kutta_step_of(plant, conducting, 2, start, first, step_s, end, integrals);
+    if (plant->magnetics.form == MAGNETICS_SATURATING) {
+        runge_kutta_step_in(plant, MAGNETICS_SATURATING, conducting, start, first, step_s, end, integrals);
+    } else if (plant->magnetics.form == MAGNETICS_LINEAR_COSINE) {
+        runge_kutta_step_in(plant, MAGNETICS_LINEAR_COSINE, conducting, start, first, step_s, end, integrals);
     } else {
-        runge_kutta_step_of(plant, conducting, conducting->count, start, first, step_s, end, integrals);
+        runge_kutta_step_in(plant, MAGNETICS_LINEAR_TRAPEZOID, conducting, start, first, step_s, end, integrals);
     }
 }
 
@@ -311,7 +334,7 @@ static void sample_step(plant_t *plant, const conducting_t *conducting, const st
         return;
     }
     derivative_t last;
-    differentiate(plant, conducting, conducting->count, end, &last);
+    differentiate(plant, conducting, end, &last);
     const uint64_t time_ns = plant->time_ns;
     const double angle_rad = plant->rotor_angle_rad, speed_rad_s = plant->speed_rad_s;
     double current_A[HAL_PHASES_MAX];
@@ -415,7 +438,8 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
     const double length_s = (double)(to_ns - plant->time_ns) * NS_S;
     double at_s = 0.0;
     while (at_s < length_s) {
-        const conducting_t conducting = find_conducting(plant);
+        conducting_t conducting;
+        find_conducting(plant, &conducting);
         state_t start, end;
         derivative_t first;
         integrals_t integrals;
@@ -424,7 +448,7 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
         for (unsigned index = 0; index < conducting.count; index++) {
             start.current_A[index] = plant->current_A[conducting.phase[index]];
         }
-        differentiate(plant, &conducting, conducting.count, &start, &first);
+        differentiate(plant, &conducting, &start, &first);
         double step_s = step_length_s(plant, &conducting, &first, length_s - at_s);
         runge_kutta_step(plant, &conducting, &start, &first, step_s, &end, &integrals);
         if (least_current_A(&conducting, &end) < 0.0) {
