@@ -64,6 +64,7 @@ TEST_NEEDS = (
     Need("gcc-arm-none-eabi", "compiler for Cortex-M4", _tool("arm-none-eabi-gcc")),
     Need("libnewlib-arm-none-eabi", "its C headers", _file("/usr/lib/arm-none-eabi/include/string.h")),
     Need("qemu-system-x86", "guest with a kernel that has CAN", lambda: not _guest_packages()),
+    Need("ngspice", "second opinion on the emulated plant", _tool("ngspice")),
 )
 
 WITHOUT_BUILD = ("log", "monitor")
