@@ -31,6 +31,8 @@ uint8_t quantity_decode(const uint8_t data[8], quantity_setting_t *setting) {
         READ(current_sensor_gain);
     case RIG_RIG_SET_QUANTITY_TRUTH_PERIOD_US_CHOICE:
         READ(truth_period_us);
+    case RIG_RIG_SET_QUANTITY_CURRENT_NOISE_A_CHOICE:
+        READ(current_noise_a);
     default:
         return RIG_RIG_SET_REPLY_STATUS_NO_SUCH_QUANTITY_CHOICE;
     }

@@ -114,6 +114,9 @@ static void apply(rig_t *rig, const quantity_setting_t *setting) {
             rig->sensors.current_gain[phase] = setting->value;
         }
         break;
+    case RIG_RIG_SET_QUANTITY_CURRENT_NOISE_A_CHOICE:
+        rig->sensors.current_noise_A = setting->value;
+        break;
     case RIG_RIG_SET_QUANTITY_TRUTH_PERIOD_US_CHOICE:
         /* On multiples of the period, so that two logs of one bench have the same instants. */
         rig->truth_period_ns = (uint64_t)setting->value * NS_PER_US;

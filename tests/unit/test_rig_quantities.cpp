@@ -37,7 +37,8 @@ TEST_F(RigQuantities, RangesAreTheDatabases) {
     struct {
         uint8_t quantity;
         int32_t low, high;
-    } ranges[] = {{1, -2000000, 2000000}, {2, 0, 500000}, {3, 0, 2}, {4, 0, 1000000}, {5, 0, 100000}, {6, 0, 1000000}};
+    } ranges[] = {{1, -2000000, 2000000}, {2, 0, 500000},  {3, 0, 2},      {4, 0, 1000000},
+                  {5, 0, 100000},         {6, 0, 1000000}, {7, 0, 1000000}};
     for (const auto &range : ranges) {
         SCOPED_TRACE(int(range.quantity));
         EXPECT_EQ(set(range.quantity, range.low), DONE);
@@ -45,7 +46,7 @@ TEST_F(RigQuantities, RangesAreTheDatabases) {
         EXPECT_EQ(set(range.quantity, range.low - 1), OUT_OF_RANGE);
         EXPECT_EQ(set(range.quantity, range.high + 1), OUT_OF_RANGE);
     }
-    for (unsigned quantity : {0u, 7u, 128u, 255u}) {
+    for (unsigned quantity : {0u, 8u, 128u, 255u}) {
         EXPECT_EQ(set(static_cast<uint8_t>(quantity), 1), NO_SUCH_QUANTITY);
     }
 }
@@ -57,6 +58,8 @@ TEST_F(RigQuantities, ActNowOnWhatTheyName) {
     EXPECT_DOUBLE_EQ(bench.rig->plant.bus_voltage_V, 123.456);
     EXPECT_EQ(set(3, 2), DONE);
     EXPECT_EQ(bench.rig->sensors.encoder_fault, SENSORS_ENCODER_JUMP);
+    EXPECT_EQ(set(7, 2000), DONE);
+    EXPECT_DOUBLE_EQ(bench.rig->sensors.current_noise_A, 0.02);
     EXPECT_EQ(set(5, 12000), DONE);
     EXPECT_DOUBLE_EQ(bench.rig->sensors.current_gain[2], 1.2);
     EXPECT_EQ(set(1, 2000001), OUT_OF_RANGE);

@@ -57,6 +57,8 @@ class Rig:
     """How long the control interrupt takes; beyond a period interrupts are lost."""
     current_sensor_gain = Quantity(1.0)
     """1 is true."""
+    current_noise_A = Quantity(0.0)
+    """Standard deviation of every current sensor; its course depends on the seed."""
     truth_period_us = Quantity(1000)
     """How often the true state is sent; 0 never."""
 
