@@ -16,6 +16,9 @@ SHIPPED = Path(__file__).resolve().parents[2] / "machines"
 
 FORMS = ("linear_cosine", "linear_trapezoid", "saturating")
 
+# Phases by stator and rotor poles.
+_PHASES = {(6, 4): 3, (8, 6): 4, (12, 8): 3}
+
 # (minimum, maximum) of every number, both allowed. Wide enough for any machine that the number formats of the firmware
 # can carry (inertia and friction are Q1.30 there).
 _RANGES: dict[str, dict[str, tuple[float, float]]] = {
@@ -140,7 +143,7 @@ def load_machine(path: Path | str) -> Machine:
         if not isinstance(data[section], dict):
             raise MachineError(f"{path}: {section}: a table [{section}] is wanted")
 
-    stator, rotor = _poles(path, data["poles"])
+    stator, rotor, phases = _poles(path, data["poles"])
     values: dict[str, float] = {}
     for section, ranges in _RANGES.items():
         _check_keys(path, section, data[section], list(ranges))
@@ -156,7 +159,7 @@ def load_machine(path: Path | str) -> Machine:
         name=name,
         stator_poles=stator,
         rotor_poles=rotor,
-        phases=stator // 2 if stator < 12 else stator // 4,
+        phases=phases,
         form=form,
         magnetics=magnetics,
         **values,
@@ -182,12 +185,13 @@ def _number(path: Path, section: str, key: str, value, limits: tuple[float, floa
     return float(value)
 
 
-def _poles(path: Path, table: dict) -> tuple[int, int]:
+def _poles(path: Path, table: dict) -> tuple[int, int, int]:
     _check_keys(path, "poles", table, ["stator", "rotor"])
-    pair = (table["stator"], table["rotor"])
-    if pair not in ((6, 4), (8, 6), (12, 8)):
-        raise MachineError(f"{path}: poles: {pair[0]!r}/{pair[1]!r} is not one of 6/4, 8/6, 12/8")
-    return pair
+    stator, rotor = table["stator"], table["rotor"]
+    if type(stator) is int and type(rotor) is int and (stator, rotor) in _PHASES:
+        return stator, rotor, _PHASES[stator, rotor]
+    names = ", ".join(f"{s}/{r}" for s, r in _PHASES)
+    raise MachineError(f"{path}: poles: {stator!r}/{rotor!r} is not one of {names}")
 
 
 def _check_magnetics(path: Path, machine: Machine) -> None:
