@@ -1,4 +1,4 @@
-/* CAN controller: a receive queue of 64 frames and three transmit mailboxes, classic frames only. */
+/* CAN controller: a receive queue and transmit mailboxes, classic frames only. */
 #ifndef HAL_CAN_H
 #define HAL_CAN_H
 
@@ -8,6 +8,7 @@
 #include "hal.h"
 
 #define HAL_CAN_RECEIVE_QUEUE 64
+#define HAL_CAN_MAILBOXES 3
 
 typedef struct {
     uint32_t identifier; /* 11 or 29 bits, without flags */

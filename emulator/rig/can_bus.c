@@ -28,7 +28,7 @@ void can_bus_init(can_bus_t *bus, uint32_t bit_rate) {
 }
 
 bool can_bus_transmit(can_bus_t *bus, const hal_can_frame_t *frame) {
-    for (unsigned i = 0; i < CAN_BUS_MAILBOXES; ++i) {
+    for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
         if (!bus->mailbox[i].taken) {
             bus->mailbox[i].frame = *frame;
             bus->mailbox[i].taken = true;
@@ -53,14 +53,14 @@ bool can_bus_push(can_bus_t *bus, const hal_can_frame_t *frame) {
     return true;
 }
 
-/* The mailbox that the drive's controller would send next, or CAN_BUS_MAILBOXES. */
+/* The mailbox that the drive's controller would send next, or HAL_CAN_MAILBOXES. */
 static unsigned best_mailbox(const can_bus_t *bus) {
-    unsigned best = CAN_BUS_MAILBOXES;
-    for (unsigned i = 0; i < CAN_BUS_MAILBOXES; ++i) {
+    unsigned best = HAL_CAN_MAILBOXES;
+    for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
         if (!bus->mailbox[i].taken) {
             continue;
         }
-        if (best == CAN_BUS_MAILBOXES) {
+        if (best == HAL_CAN_MAILBOXES) {
             best = i;
             continue;
         }
@@ -75,7 +75,8 @@ static unsigned best_mailbox(const can_bus_t *bus) {
 
 static void arbitrate(can_bus_t *bus, uint64_t now_ns) {
     unsigned mailbox = best_mailbox(bus);
-    bool drive = mailbox<CAN_BUS_MAILBOXES, client = can_bus_client_backlog(bus)> 0;
+    bool drive = mailbox < HAL_CAN_MAILBOXES;
+    bool client = can_bus_client_backlog(bus) > 0;
     if (!drive && !client) {
         bus->next_event_ns = CAN_BUS_NEVER;
         return;

@@ -17,7 +17,6 @@
 #include "hal_can.h"
 #include "rig/can_length.h"
 
-#define CAN_BUS_MAILBOXES 3
 #define CAN_BUS_CLIENT_QUEUE 65536 /* a power of two */
 #define CAN_BUS_BIT_RATE_MIN 10000
 #define CAN_BUS_BIT_RATE_MAX 1000000
@@ -44,7 +43,7 @@ typedef struct {
         hal_can_frame_t frame;
         bool taken;
         uint64_t request; /* rises with each frame */
-    } mailbox[CAN_BUS_MAILBOXES];
+    } mailbox[HAL_CAN_MAILBOXES];
     uint64_t requests;
     hal_can_frame_t client_queue[CAN_BUS_CLIENT_QUEUE];
     uint64_t client_pushed, client_popped;

@@ -8,8 +8,6 @@
 #define HEARTBEAT_CYCLES 100
 #define FAULT_CYCLES 100
 
-#define MAILBOXES 3 /* of the controller, see hal_can.h */
-
 void telemetry_init(telemetry_t *telemetry, uint8_t phases, uint32_t control_rate_hz, uint32_t time_us) {
     *telemetry = (telemetry_t){.phases = phases, .control_rate_hz = control_rate_hz, .next_us = time_us};
 }
@@ -215,7 +213,7 @@ void telemetry_flush(telemetry_t *telemetry, hal_t *hal) {
             telemetry->heartbeat_in_mailbox = true;
             taken = 0;
         }
-        if (taken == MAILBOXES) {
+        if (taken == HAL_CAN_MAILBOXES) {
             telemetry->heartbeat_in_mailbox = false;
         }
         frame_queue_drop_head(&telemetry->queue);

@@ -10,7 +10,6 @@
 #ifndef CONTROL_LOAD_OBSERVER_H
 #define CONTROL_LOAD_OBSERVER_H
 
-#include <stdbool.h>
 #include <stdint.h>
 
 typedef struct {

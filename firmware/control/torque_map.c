@@ -1,7 +1,6 @@
 #include "control/torque_map.h"
 
 #include "fixed/fixed.h"
-#include "fixed/interpolate.h"
 
 #define HALF_PITCH 0x80000000u
 #define COLUMN (1 << MACHINE_TORQUE_COLUMN_BITS)

@@ -13,9 +13,9 @@ bool configure_rate_allowed(uint32_t control_rate_hz) {
 /* pi / 30: r/min to rad/s. */
 #define PI_30_Q37 INT64_C(14392573551)
 
-/* rad/s in Q9.22 from whole r/min; saturates at 4889 r/min. */
-static int32_t speed_q22_from_rpm(int32_t rpm) {
-    return fixed_saturate(fixed_shift(rpm * PI_30_Q37, 15));
+/* rad/s with 22 fraction bits from whole r/min, any value: Q9.22 up to 4889 r/min. */
+static int64_t speed_q22_from_rpm(int32_t rpm) {
+    return fixed_shift(rpm * PI_30_Q37, 15);
 }
 
 /* 2^-32 pitch from electrical degrees in Q7; 360 degrees is held just below the full pitch. */
@@ -29,7 +29,7 @@ static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
     if (rpm_s == 0) {
         return INT32_MAX;
     }
-    const int64_t step_q22 = fixed_shift(rpm_s * PI_30_Q37, 15) / (int64_t)control_rate_hz;
+    const int64_t step_q22 = speed_q22_from_rpm(rpm_s) / (int64_t)control_rate_hz;
     return fixed_clamp(fixed_saturate(step_q22), 1, INT32_MAX);
 }
 
@@ -40,7 +40,7 @@ static int32_t pid_scale_q15(int32_t per_Nm_q15, int32_t error_scale_q24, uint32
 }
 
 static protection_parameters_t protection_from(const int32_t *values, int32_t angle_step_q32, unsigned encoder_shift) {
-    const int32_t over_speed_q22 = speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM]);
+    const int32_t over_speed_q22 = fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM]));
     const uint32_t count = 1u << encoder_shift;
     /* A period at one and a half times the highest speed, and the rounding of two readings. */
     const uint64_t step = ((uint64_t)over_speed_q22 * (uint64_t)angle_step_q32 >> 32) * 3 / 2;

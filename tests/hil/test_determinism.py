@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from salient.scenario import CONTROLLERS, LoadStep, Record, Scenario, SpeedStep, run_all, run_scenario
+from salient.arguments import CONTROLLERS
+from salient.scenario import LoadStep, Record, Scenario, SpeedStep, run_all, run_scenario
 
 FILES = ("can.blf", "can.log", "recording.npy")
 

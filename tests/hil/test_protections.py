@@ -72,9 +72,7 @@ def test_a_fault_opens_all_switches_and_is_recorded(bench, name):
     assert (cause["fault"].last_name, cause["state"].last_name) == (case.fault, "run")
     reaction_us = cause["time_us"].last - caused_us
     assert case.reaction_us[0] <= reaction_us <= case.reaction_us[1]
-    faults = ["none", "over_current", "over_voltage", "under_voltage", "over_speed", "encoder", "command_timeout",
-              "interrupt_overrun"]
-    assert int(cause["checks"].last) >> faults.index(case.fault) & 1
+    assert int(cause["checks"].last) >> int(cause["fault"].last) & 1
     # A frozen encoder slows the observer until it is noticed.
     assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(600, abs=10)
     assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.torque_reference_Nm"].last == pytest.approx(13.3, abs=3)

@@ -10,21 +10,14 @@ extern "C" {
 #include "comms/counter.h"
 }
 #include "drive_codec.h"
+#include "frames.h"
 
 namespace {
 
 constexpr uint32_t TIMEOUT_US = 100000;
 
 hal_can_frame_t command_frame(uint8_t counter, unsigned request = COMMAND_RUN, int32_t milli_rpm = 600000) {
-    drive_drive_command_t message{};
-    message.request = uint8_t(request);
-    message.speed_reference_rpm = milli_rpm;
-    hal_can_frame_t frame{};
-    frame.identifier = DRIVE_DRIVE_COMMAND_FRAME_ID;
-    frame.length = DRIVE_DRIVE_COMMAND_LENGTH;
-    drive_drive_command_pack(frame.data, &message, sizeof frame.data);
-    e2e_protect(COMMANDS_DATA_ID, counter, frame.data, frame.length);
-    return frame;
+    return frames::command(counter, request, milli_rpm);
 }
 
 class Commands : public testing::Test {

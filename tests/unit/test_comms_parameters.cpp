@@ -9,6 +9,7 @@ extern "C" {
 #include "comms/parameter_protocol.h"
 }
 #include "drive_codec.h"
+#include "frames.h"
 
 namespace {
 
@@ -21,15 +22,7 @@ class Parameters : public testing::Test {
 
     drive_parameter_response_t ask(unsigned operation, unsigned index, unsigned part = 0, int32_t value = 0,
                                    bool writable = true) {
-        drive_parameter_request_t request{};
-        request.operation = uint8_t(operation);
-        request.index = uint8_t(index);
-        request.part = uint8_t(part);
-        request.value = value;
-        hal_can_frame_t frame{};
-        frame.identifier = DRIVE_PARAMETER_REQUEST_FRAME_ID;
-        frame.length = DRIVE_PARAMETER_REQUEST_LENGTH;
-        drive_parameter_request_pack(frame.data, &request, sizeof frame.data);
+        const hal_can_frame_t frame = frames::parameter_request(operation, index, part, value);
         hal_can_frame_t response;
         std::memset(&response, 0xA5, sizeof response);
         parameter_protocol_answer(&parameters, writable, &frame, &response);

@@ -11,6 +11,7 @@ extern "C" {
 #include "comms/comms.h"
 }
 #include "drive_codec.h"
+#include "frames.h"
 
 // The CAN side of the HAL: frames to receive, three mailboxes, and what left them.
 struct hal {
@@ -94,24 +95,11 @@ class Comms : public testing::Test {
     }
 
     static hal_can_frame_t request(unsigned operation, unsigned index, int32_t value = 0) {
-        drive_parameter_request_t message{};
-        message.operation = uint8_t(operation);
-        message.index = uint8_t(index);
-        message.value = value;
-        hal_can_frame_t frame{};
-        frame.identifier = DRIVE_PARAMETER_REQUEST_FRAME_ID;
-        frame.length = DRIVE_PARAMETER_REQUEST_LENGTH;
-        drive_parameter_request_pack(frame.data, &message, sizeof frame.data);
-        return frame;
+        return frames::parameter_request(operation, index, 0, value);
     }
 
     static hal_can_frame_t command(uint8_t counter, unsigned request_value) {
-        hal_can_frame_t frame{};
-        frame.identifier = DRIVE_DRIVE_COMMAND_FRAME_ID;
-        frame.length = DRIVE_DRIVE_COMMAND_LENGTH;
-        frame.data[3] = uint8_t(request_value);
-        e2e_protect(COMMANDS_DATA_ID, counter, frame.data, frame.length);
-        return frame;
+        return frames::command(counter, request_value, 0);
     }
 
     hal bus;

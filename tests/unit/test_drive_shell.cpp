@@ -16,6 +16,7 @@ extern "C" {
 #include "hal_time.h"
 }
 #include "drive_codec.h"
+#include "frames.h"
 
 struct hal {
     hal_adc_sample_t adc{};
@@ -106,28 +107,13 @@ class Drive : public testing::Test {
     }
 
     void command(command_request_t request, double reference_rpm = 600.0) {
-        drive_drive_command_t message{};
-        message.request = uint8_t(request);
-        message.speed_reference_rpm = int32_t(reference_rpm * 1000.0);
-        hal_can_frame_t frame{};
-        frame.identifier = DRIVE_DRIVE_COMMAND_FRAME_ID;
-        frame.length = DRIVE_DRIVE_COMMAND_LENGTH;
-        drive_drive_command_pack(frame.data, &message, sizeof frame.data);
-        e2e_protect(COMMANDS_DATA_ID, ++counter, frame.data, frame.length);
-        hal.to_drive.push_back(frame);
+        hal.to_drive.push_back(frames::command(++counter, request, int32_t(reference_rpm * 1000.0)));
     }
 
     // Parameter write over the bus; the response's status.
     int write(unsigned index, int32_t value) {
-        drive_parameter_request_t request{};
-        request.operation = DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE;
-        request.index = uint8_t(index);
-        request.value = value;
-        hal_can_frame_t frame{};
-        frame.identifier = DRIVE_PARAMETER_REQUEST_FRAME_ID;
-        frame.length = DRIVE_PARAMETER_REQUEST_LENGTH;
-        drive_parameter_request_pack(frame.data, &request, sizeof frame.data);
-        hal.to_drive.push_back(frame);
+        hal.to_drive.push_back(
+            frames::parameter_request(DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE, index, 0, value));
         hal.from_drive.clear();
         periods(2);
         for (const hal_can_frame_t &sent : hal.from_drive) {

@@ -40,15 +40,13 @@ from typing import Any
 import can
 import numpy as np
 
+from salient.arguments import CONTROL_RATES_HZ, CONTROLLERS, ENCODER_BITS
 from salient.bench import Bench
 from salient.drive import DriveError, write_request
 from salient.errors import UsageError
 from salient.log_files import write_logs
 from salient.signals import SignalTable, drive_database
 from salient.simulator import SimulatorOptions, executable, parameter_table
-
-CONTROLLERS = ("traditional", "paper")
-CONTROL_RATES_HZ = (20_000, 40_000, 50_000, 100_000)
 
 
 @dataclass(frozen=True)
@@ -244,7 +242,6 @@ _STEPS: dict[str, dict[str, tuple[float, float]]] = {
 _RECORD = {"step_us": (0.1, 1e6), "from_s": (0.0, 3600.0)}
 _TOP = ("machine", "controllers", "duration_s", "seed", "initial_angle_deg", "control_rate_hz", "encoder_bits",
         "parameters", "speed", "load", "record")  # fmt: skip
-_ENCODER_BITS = (0, *range(8, 25))
 
 
 def load_scenarios(path: Path) -> list[Scenario]:
@@ -281,7 +278,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
         "seed": reader.whole("seed", data.get("seed", 1), *_SEED),
         "initial_angle_deg": reader.number("initial_angle_deg", data.get("initial_angle_deg", 0.0), -360.0, 360.0),
         "control_rate_hz": reader.one_of("control_rate_hz", data.get("control_rate_hz", 40_000), CONTROL_RATES_HZ),
-        "encoder_bits": reader.one_of("encoder_bits", data.get("encoder_bits", 17), _ENCODER_BITS),
+        "encoder_bits": reader.one_of("encoder_bits", data.get("encoder_bits", 17), ENCODER_BITS),
         "parameters": {key: reader.number(f"parameters.{key}", value) for key, value in parameters.items()},
         "speed": tuple(SpeedStep(**step) for step in reader.steps("speed", data.get("speed", []))),
         "load": tuple(LoadStep(**step) for step in reader.steps("load", data.get("load", []))),

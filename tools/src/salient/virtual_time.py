@@ -11,18 +11,19 @@ from __future__ import annotations
 from collections import deque
 
 import can
+import cantools
 
 from salient.can_bus import is_on_bus
 from salient.errors import UsageError
+from salient.signals import drive_database, rig_database
 
 RIG_CLOCK_ID = 0x1F000002
 RIG_STAMP_ID = 0x1F000005
 _STAMP_NEXT, _STAMP_OLDEST_ON_BUS, _STAMP_OLDEST_AT_ONCE = 0, 1, 2
 
-# What only the drive or the rig sends (drive.dbc, rig.dbc). On SocketCAN a client that sends one of these between a
-# stamp and its frame would take the frame's time; a bus with two senders of one identifier is broken anyway.
-_DRIVE_IDENTIFIERS = frozenset((*range(0x180, 0x189), 0x580, 0x701))
-_RIG_SENT_IDENTIFIERS = frozenset((RIG_CLOCK_ID, 0x1F000004, RIG_STAMP_ID, 0x1F000010, 0x1F000011, 0x1F000012))
+
+def _sent_by(database: cantools.database.Database, node: str) -> frozenset[int]:
+    return frozenset(message.frame_id for message in database.messages if node in message.senders)
 
 
 def open_bus(address: str, receive_own_messages: bool = True) -> can.BusABC:
@@ -45,6 +46,10 @@ class VirtualTimeReader:
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
+        # On SocketCAN a client that sends one of these between a stamp and its frame would take the frame's time; a bus
+        # with two senders of one identifier is broken anyway.
+        self._drive_sends = _sent_by(drive_database(), "DRIVE")
+        self._rig_sends = _sent_by(rig_database(), "RIG")
         self._stamped = not hasattr(bus, "receive_own_messages")  # SocketCAN
         self._next_ns: int | None = None
         self._waiting_on_bus: deque[can.Message] = deque()
@@ -74,24 +79,21 @@ class VirtualTimeReader:
             return _timed(time_ns, waiting.popleft()) if waiting else None
         if message.is_extended_id and identifier == RIG_CLOCK_ID and len(message.data) == 7:
             return _timed(clock_of(message)[0], message)
-        if self._next_ns is not None and _is_emulators(message):
+        if self._next_ns is not None and self._is_emulators(message):
             time_ns, self._next_ns = self._next_ns, None
             return _timed(time_ns, message)
         (self._waiting_on_bus if is_on_bus(message) else self._waiting_at_once).append(message)
         return None
 
+    def _is_emulators(self, message: can.Message) -> bool:
+        if message.is_fd or message.is_error_frame or message.is_remote_frame:
+            return False
+        return message.arbitration_id in (self._rig_sends if message.is_extended_id else self._drive_sends)
+
 
 def clock_of(message: can.Message) -> tuple[int, int]:
     """Time in ns and last byte (sequence or subject) of RIG_CLOCK and RIG_STAMP, which share their layout."""
     return int.from_bytes(message.data[:6], "little"), message.data[6]
-
-
-def _is_emulators(message: can.Message) -> bool:
-    if message.is_fd or message.is_error_frame or message.is_remote_frame:
-        return False
-    if message.is_extended_id:
-        return message.arbitration_id in _RIG_SENT_IDENTIFIERS
-    return message.arbitration_id in _DRIVE_IDENTIFIERS
 
 
 def _timed(time_ns: int, message: can.Message) -> tuple[int, can.Message]:

@@ -1,0 +1,42 @@
+// Frames as a host sends them to the drive.
+#pragma once
+
+#include <cstdint>
+
+extern "C" {
+#include "comms/commands.h"
+#include "comms/e2e.h"
+#include "hal_can.h"
+}
+#include "drive_codec.h"
+
+namespace frames {
+
+// DRIVE_COMMAND with its checksum; the values are not checked.
+inline hal_can_frame_t command(uint8_t counter, unsigned request, int32_t milli_rpm) {
+    drive_drive_command_t message{};
+    message.request = uint8_t(request);
+    message.speed_reference_rpm = milli_rpm;
+    hal_can_frame_t frame{};
+    frame.identifier = DRIVE_DRIVE_COMMAND_FRAME_ID;
+    frame.length = DRIVE_DRIVE_COMMAND_LENGTH;
+    drive_drive_command_pack(frame.data, &message, sizeof frame.data);
+    e2e_protect(COMMANDS_DATA_ID, counter, frame.data, frame.length);
+    return frame;
+}
+
+// PARAMETER_REQUEST; the values are not checked.
+inline hal_can_frame_t parameter_request(unsigned operation, unsigned index, unsigned part, int32_t value) {
+    drive_parameter_request_t message{};
+    message.operation = uint8_t(operation);
+    message.index = uint8_t(index);
+    message.part = uint8_t(part);
+    message.value = value;
+    hal_can_frame_t frame{};
+    frame.identifier = DRIVE_PARAMETER_REQUEST_FRAME_ID;
+    frame.length = DRIVE_PARAMETER_REQUEST_LENGTH;
+    drive_parameter_request_pack(frame.data, &message, sizeof frame.data);
+    return frame;
+}
+
+} // namespace frames
