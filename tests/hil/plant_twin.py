@@ -42,6 +42,37 @@ class Magnetics(ctypes.Structure):
     ]
 
 
+class Converter(ctypes.Structure):
+    _fields_ = [
+        ("switch_drop_V", ctypes.c_double),
+        ("switch_resistance_ohm", ctypes.c_double),
+        ("diode_drop_V", ctypes.c_double),
+        ("diode_resistance_ohm", ctypes.c_double),
+        ("minimum_pulse_ns", ctypes.c_double),
+    ]
+
+
+class DcLink(ctypes.Structure):
+    _fields_ = [
+        ("capacitance_F", ctypes.c_double),
+        ("source_resistance_ohm", ctypes.c_double),
+        ("chopper_resistance_ohm", ctypes.c_double),
+        ("chopper_on_V", ctypes.c_double),
+        ("chopper_off_V", ctypes.c_double),
+    ]
+
+
+class SensorErrors(ctypes.Structure):
+    _fields_ = [
+        ("current_gain", ctypes.c_double),
+        ("current_offset_A", ctypes.c_double),
+        ("current_noise_A", ctypes.c_double),
+        ("current_limit_A", ctypes.c_double),
+        ("current_delay_ns", ctypes.c_double),
+        ("encoder_eccentricity_deg", ctypes.c_double),
+    ]
+
+
 class Machine(ctypes.Structure):
     _fields_ = [
         ("name", ctypes.c_char_p),
@@ -53,6 +84,9 @@ class Machine(ctypes.Structure):
         ("friction_Nm_s", ctypes.c_double),
         ("supply_voltage_V", ctypes.c_double),
         ("magnetics", Magnetics),
+        ("converter", Converter),
+        ("dc_link", DcLink),
+        ("sensors", SensorErrors),
     ]
 
 

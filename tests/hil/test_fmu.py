@@ -72,7 +72,7 @@ def native(library: ctypes.CDLL, form: str, signals: np.ndarray, step_ns: int, i
            ) -> np.ndarray:
     """The same steps through libsalient_plant.so; a row of OUTPUTS for each communication point."""
     file = load_machine(machine_path(form))
-    magnetics = Magnetics(form=FORMS.index(form), **file.magnetics)
+    magnetics = Magnetics(form=FORMS.index(form), **file.magnetics.parameters)
     machine = Machine(
         name=form.encode(),
         stator_poles=file.stator_poles,

@@ -100,7 +100,7 @@ def machine_of(form: str) -> Machine:
         inertia_kg_m2=CONSTANT_SPEED_INERTIA_KG_M2,
         friction_Nm_s=0.0,
         supply_voltage_V=shipped.supply_voltage_V,
-        magnetics=Magnetics(form=FORMS.index(shipped.form), **shipped.magnetics),
+        magnetics=Magnetics(form=FORMS.index(shipped.magnetics.form), **shipped.magnetics.parameters),
     )
 
 

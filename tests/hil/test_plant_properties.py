@@ -135,7 +135,7 @@ def machine_like(shipped: MachineFile) -> Machine:
         inertia_kg_m2=shipped.inertia_kg_m2,
         friction_Nm_s=shipped.friction_Nm_s,
         supply_voltage_V=shipped.supply_voltage_V,
-        magnetics=Magnetics(form=FORMS.index(shipped.form), **shipped.magnetics),
+        magnetics=Magnetics(form=FORMS.index(shipped.magnetics.form), **shipped.magnetics.parameters),
     )
 
 

@@ -31,7 +31,7 @@ def tables_source(machine: Machine) -> str:
     currents = TORQUE_CURRENT_STEP_A * np.arange(TORQUE_CURRENTS)
     rows = []
     for angle in np.linspace(half, 2.0 * half, TORQUE_ANGLES):
-        torque = np.maximum(machine.torque_Nm(angle, currents), 0.0)
+        torque = np.maximum(machine.magnetics.torque_Nm(angle, currents), 0.0)
         # At both ends of the half pitch the slope's sign is that of the wrapped angle; the torque there is zero.
         if angle == half or angle == 2.0 * half:
             torque = np.zeros_like(torque)
@@ -58,7 +58,9 @@ def tables_source(machine: Machine) -> str:
 
 def plant_source(machine: Machine) -> str:
     """C source of the emulator's machine, every number to the last bit."""
-    magnetics = [f"        .{key} = {value!r}," for key, value in machine.magnetics.items()]
+    def members(values: dict[str, float] | None) -> list[str]:
+        return [f"        .{key} = {value!r}," for key, value in (values or {}).items()]
+
     return "\n".join(
         [
             f"/* Generated from the machine file of '{machine.name}'. */",
@@ -74,8 +76,17 @@ def plant_source(machine: Machine) -> str:
             f"    .friction_Nm_s = {machine.friction_Nm_s!r},",
             f"    .supply_voltage_V = {machine.supply_voltage_V!r},",
             "    .magnetics = {",
-            f"        .form = MAGNETICS_{machine.form.upper()},",
-            *magnetics,
+            f"        .form = MAGNETICS_{machine.magnetics.form.upper()},",
+            *members(machine.magnetics.parameters),
+            "    },",
+            "    .converter = {",
+            *members(machine.converter),
+            "    },",
+            "    .dc_link = {",
+            *members(machine.dc_link or {"capacitance_F": 0.0}),
+            "    },",
+            "    .sensors = {",
+            *members(machine.sensors),
             "    },",
             "};",
             "",

@@ -1,8 +1,6 @@
-"""Machine files: one TOML file describes a motor to the emulator and to the firmware alike.
+"""Machine files: one TOML file describes a drive's motor, converter and sensors to the emulator and to the firmware.
 
 `load_machine` reads and checks a file; every mistake is a `MachineError` of one line that names the file and the key.
-The magnetics are those of `emulator/plant/magnetics.h`, written here a second time in NumPy because the firmware's
-tables are computed from them and the tests compare the emulator with them.
 """
 
 from __future__ import annotations
@@ -12,30 +10,51 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
+from salient.magnetics import FORMULA_KEYS, Formula
+
 SHIPPED = Path(__file__).resolve().parents[2] / "machines"
 
-FORMS = ("linear_cosine", "linear_trapezoid", "saturating")
+FORMS = tuple(FORMULA_KEYS)
 
 # Phases by stator and rotor poles.
 _PHASES = {(6, 4): 3, (8, 6): 4, (12, 8): 3}
 
+_TABLES = ("poles", "winding", "mechanics", "magnetics", "converter")
+_OPTIONAL_TABLES = ("dc_link", "sensors", "iron_loss")
+
 # (minimum, maximum) of every number, both allowed. Wide enough for any machine that the number formats of the firmware
 # can carry (inertia and friction are Q1.30 there).
-_RANGES: dict[str, dict[str, tuple[float, float]]] = {
-    "winding": {"resistance_ohm": (1e-4, 100.0)},
-    "mechanics": {"inertia_kg_m2": (1e-4, 1.9), "friction_Nm_s": (0.0, 1.9)},
-    "converter": {"supply_voltage_V": (10.0, 500.0)},
+_WINDING = {"resistance_ohm": (1e-4, 100.0)}
+_MECHANICS = {"inertia_kg_m2": (1e-4, 1.9), "friction_Nm_s": (0.0, 1.9)}
+_SUPPLY = {"supply_voltage_V": (10.0, 500.0)}
+
+# The rest may be left out, key by key: (minimum, maximum, value when left out). What they mean stands in
+# emulator/plant/machine.h. Ideal devices, ideal sensors.
+_CONVERTER: dict[str, tuple[float, float, float]] = {
+    "switch_drop_V": (0.0, 5.0, 0.0),
+    "switch_resistance_ohm": (0.0, 1.0, 0.0),
+    "diode_drop_V": (0.0, 5.0, 0.0),
+    "diode_resistance_ohm": (0.0, 1.0, 0.0),
+    "minimum_pulse_ns": (0.0, 2000.0, 0.0),
 }
-_INDUCTANCES = {"unaligned_inductance_H": (1e-5, 10.0), "aligned_inductance_H": (1e-5, 10.0)}
-_MAGNETICS: dict[str, dict[str, tuple[float, float]]] = {
-    "linear_cosine": _INDUCTANCES,
-    "linear_trapezoid": _INDUCTANCES | {"flat_deg": (0.0, 20.0), "blend_deg": (0.01, 20.0)},
-    "saturating": _INDUCTANCES
-    | {
-        "saturated_inductance_H": (1e-6, 10.0),
-        "flux_linkage_max_Wb": (1e-3, 100.0),
-        "current_at_flux_linkage_max_A": (1.0, 10000.0),
-    },
+_SENSORS: dict[str, tuple[float, float, float]] = {
+    "current_gain": (0.0, 10.0, 1.0),
+    "current_offset_A": (-10.0, 10.0, 0.0),
+    "current_noise_A": (0.0, 10.0, 0.0),
+    "current_limit_A": (0.1, 1000.0, 1000.0),
+    "current_delay_ns": (0.0, 8000.0, 0.0),
+    "encoder_eccentricity_deg": (0.0, 5.0, 0.0),
+}
+# A table that is left out: an ideal supply that takes energy back.
+_DC_LINK = {"capacitance_F": (1e-5, 1.0), "source_resistance_ohm": (0.001, 10.0)}
+_CHOPPER = {"chopper_resistance_ohm": (0.1, 1000.0), "chopper_on_V": (10.0, 510.0), "chopper_off_V": (10.0, 510.0)}
+# A table that is left out: no estimate.
+_IRON_LOSS = {
+    "turns_area_m2": (1e-6, 10.0),
+    "mass_kg": (1e-3, 1000.0),
+    "steinmetz_k": (1e-6, 10.0),
+    "steinmetz_alpha": (1.0, 2.0),
+    "steinmetz_beta": (1.5, 3.0),
 }
 
 
@@ -45,7 +64,7 @@ class MachineError(ValueError):
 
 @dataclass(frozen=True)
 class Machine:
-    """A motor, its converter's supply and its magnetics, in SI units."""
+    """A motor with its converter and sensors, in SI units."""
 
     name: str
     stator_poles: int
@@ -55,8 +74,14 @@ class Machine:
     inertia_kg_m2: float
     friction_Nm_s: float
     supply_voltage_V: float
-    form: str
-    magnetics: dict[str, float]
+    magnetics: Formula
+    converter: dict[str, float]
+    """Every key of _CONVERTER."""
+    dc_link: dict[str, float] | None
+    """None: ideal. The chopper's keys are there when it has one."""
+    sensors: dict[str, float]
+    """Every key of _SENSORS."""
+    iron_loss: dict[str, float] | None
 
     @property
     def pitch_rad(self) -> float:
@@ -66,49 +91,7 @@ class Machine:
     @property
     def current_rise_A_s(self) -> float:
         """Current slope at the supply voltage with the rotor unaligned and at rest, A/s."""
-        return self.supply_voltage_V / self.magnetics["unaligned_inductance_H"]
-
-    def position_factor(self, angle_rad):
-        """f and df/dtheta (1/rad) at a phase angle: f is 1 aligned, 0 unaligned. NumPy arrays welcome."""
-        import numpy as np
-
-        half = self.pitch_rad / 2.0
-        wrapped = np.mod(np.asarray(angle_rad, dtype=float) + half, self.pitch_rad) - half
-        distance, sign = np.abs(wrapped), np.sign(wrapped)
-        if self.form == "linear_cosine":
-            f = 0.5 * (1.0 + np.cos(self.rotor_poles * distance))
-            slope = -0.5 * self.rotor_poles * np.sin(self.rotor_poles * distance)
-        elif self.form == "saturating":
-            x = distance / half
-            f = (2.0 * x - 3.0) * x * x + 1.0
-            slope = 6.0 * x * (x - 1.0) / half
-        else:
-            flat = math.radians(self.magnetics["flat_deg"])
-            blend = math.radians(self.magnetics["blend_deg"])
-            steep = 1.0 / (half - 2.0 * flat - blend)
-            # Slope rises over one blend, stays, falls over another; f is its integral.
-            up = np.clip(distance - flat, 0.0, blend)
-            straight = np.clip(distance - flat - blend, 0.0, half - 2.0 * flat - 2.0 * blend)
-            down = np.clip(distance - (half - flat - blend), 0.0, blend)
-            f = 1.0 - steep * (up * up / (2.0 * blend) + straight + down - down * down / (2.0 * blend))
-            slope = -steep * (up - down) / blend
-        return f, slope * sign
-
-    def coenergy_factor(self, current_A):
-        """W(i) in joule: torque is df/dtheta * W(i)."""
-        import numpy as np
-
-        m, i = self.magnetics, np.asarray(current_A, dtype=float)
-        if self.form != "saturating":
-            return 0.5 * (m["aligned_inductance_H"] - m["unaligned_inductance_H"]) * i * i
-        amplitude = m["flux_linkage_max_Wb"] - m["saturated_inductance_H"] * m["current_at_flux_linkage_max_A"]
-        rate = (m["aligned_inductance_H"] - m["saturated_inductance_H"]) / amplitude
-        linear = 0.5 * (m["saturated_inductance_H"] - m["unaligned_inductance_H"]) * i * i
-        return linear + amplitude * (i + np.expm1(-rate * i) / rate)
-
-    def torque_Nm(self, angle_rad, current_A):
-        """Torque of one phase."""
-        return self.position_factor(angle_rad)[1] * self.coenergy_factor(current_A)
+        return self.supply_voltage_V / self.magnetics.unaligned_inductance_H
 
 
 def machine_path(name_or_path: str) -> Path:
@@ -135,54 +118,58 @@ def load_machine(path: Path | str) -> Machine:
     except tomllib.TOMLDecodeError as error:
         raise MachineError(f"{path}: not TOML: {error}") from None
 
-    _check_keys(path, "", data, ["name", "poles", "winding", "mechanics", "magnetics", "converter"])
+    _check_keys(path, "", data, ["name", *_TABLES], _OPTIONAL_TABLES)
     name = data["name"]
     if not isinstance(name, str) or not name.isidentifier() or not name.isascii():
         raise MachineError(f"{path}: name: {name!r} is not a plain word (letters, digits, underscore)")
-    for section in ("poles", "winding", "mechanics", "magnetics", "converter"):
-        if not isinstance(data[section], dict):
+    for section in (*_TABLES, *_OPTIONAL_TABLES):
+        if not isinstance(data.get(section, {}), dict):
             raise MachineError(f"{path}: {section}: a table [{section}] is wanted")
 
     stator, rotor, phases = _poles(path, data["poles"])
-    values: dict[str, float] = {}
-    for section, ranges in _RANGES.items():
-        _check_keys(path, section, data[section], list(ranges))
-        values |= {key: _number(path, section, key, data[section][key], ranges[key]) for key in ranges}
-
-    form = data["magnetics"].get("form")
-    if form not in FORMS:
-        raise MachineError(f"{path}: magnetics.form: {form!r} is not one of {', '.join(FORMS)}")
-    ranges = _MAGNETICS[form]
-    _check_keys(path, "magnetics", data["magnetics"], ["form", *ranges])
-    magnetics = {key: _number(path, "magnetics", key, data["magnetics"][key], ranges[key]) for key in ranges}
-    machine = Machine(
+    values = _numbers(path, "winding", data["winding"], _WINDING)
+    values |= _numbers(path, "mechanics", data["mechanics"], _MECHANICS)
+    converter = _numbers(path, "converter", data["converter"], _SUPPLY | _CONVERTER)
+    sensors = _numbers(path, "sensors", data.get("sensors", {}), _SENSORS)
+    supply_voltage_V = converter.pop("supply_voltage_V")
+    dc_link = _dc_link(path, data["dc_link"], supply_voltage_V) if "dc_link" in data else None
+    iron_loss = _numbers(path, "iron_loss", data["iron_loss"], _IRON_LOSS) if "iron_loss" in data else None
+    return Machine(
         name=name,
         stator_poles=stator,
         rotor_poles=rotor,
         phases=phases,
-        form=form,
-        magnetics=magnetics,
+        supply_voltage_V=supply_voltage_V,
+        magnetics=_magnetics(path, data["magnetics"], rotor),
+        converter=converter,
+        dc_link=dc_link,
+        sensors=sensors,
+        iron_loss=iron_loss,
         **values,
     )
-    _check_magnetics(path, machine)
-    return machine
 
 
-def _check_keys(path: Path, section: str, table: dict, wanted: list[str]) -> None:
+def _check_keys(path: Path, section: str, table: dict, needed, optional=()) -> None:
     prefix = f"{section}." if section else ""
     for key in table:
-        if key not in wanted:
-            raise MachineError(f"{path}: {prefix}{key}: unknown key; allowed: {', '.join(wanted)}")
-    for key in wanted:
+        if key not in needed and key not in optional:
+            raise MachineError(f"{path}: {prefix}{key}: unknown key; allowed: {', '.join([*needed, *optional])}")
+    for key in needed:
         if key not in table:
             raise MachineError(f"{path}: {prefix}{key}: missing")
 
 
-def _number(path: Path, section: str, key: str, value, limits: tuple[float, float]) -> float:
-    low, high = limits
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise MachineError(f"{path}: {section}.{key}: {value!r} is not a number from {low:g} to {high:g}")
-    return float(value)
+def _numbers(path: Path, section: str, table: dict, ranges: dict[str, tuple]) -> dict[str, float]:
+    """The numbers of a table; a range of three has its default, a range of two is needed."""
+    needed = [key for key, limits in ranges.items() if len(limits) == 2]
+    _check_keys(path, section, table, needed, [key for key in ranges if key not in needed])
+    values = {}
+    for key, (low, high, *default) in ranges.items():
+        value = table.get(key, *default)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+            raise MachineError(f"{path}: {section}.{key}: {value!r} is not a number from {low:g} to {high:g}")
+        values[key] = float(value)
+    return values
 
 
 def _poles(path: Path, table: dict) -> tuple[int, int, int]:
@@ -194,18 +181,23 @@ def _poles(path: Path, table: dict) -> tuple[int, int, int]:
     raise MachineError(f"{path}: poles: {stator!r}/{rotor!r} is not one of {names}")
 
 
-def _check_magnetics(path: Path, machine: Machine) -> None:
-    m = machine.magnetics
-    if m["aligned_inductance_H"] <= m["unaligned_inductance_H"]:
-        raise MachineError(f"{path}: magnetics.aligned_inductance_H: must be above unaligned_inductance_H")
-    if machine.form == "linear_trapezoid":
-        if 2.0 * (m["flat_deg"] + m["blend_deg"]) >= 180.0 / machine.rotor_poles:
-            raise MachineError(f"{path}: magnetics.blend_deg: flats and blends do not fit into half a rotor pitch")
-    if machine.form == "saturating":
-        if m["saturated_inductance_H"] > m["unaligned_inductance_H"]:
-            raise MachineError(f"{path}: magnetics.saturated_inductance_H: must not exceed unaligned_inductance_H")
-        if m["saturated_inductance_H"] * m["current_at_flux_linkage_max_A"] >= m["flux_linkage_max_Wb"]:
-            raise MachineError(
-                f"{path}: magnetics.flux_linkage_max_Wb: must exceed"
-                " saturated_inductance_H * current_at_flux_linkage_max_A"
-            )
+def _dc_link(path: Path, table: dict, supply_voltage_V: float) -> dict[str, float]:
+    has_chopper = any(key in table for key in _CHOPPER)
+    link = _numbers(path, "dc_link", table, _DC_LINK | (_CHOPPER if has_chopper else {}))
+    if has_chopper and not supply_voltage_V < link["chopper_off_V"] < link["chopper_on_V"]:
+        raise MachineError(
+            f"{path}: dc_link.chopper_off_V: must lie between converter.supply_voltage_V and dc_link.chopper_on_V"
+        )
+    return link
+
+
+def _magnetics(path: Path, table: dict, rotor_poles: int) -> Formula:
+    form = table.get("form")
+    if form not in FORMS:
+        raise MachineError(f"{path}: magnetics.form: {form!r} is not one of {', '.join(FORMS)}")
+    parameters = {key: value for key, value in table.items() if key != "form"}
+    formula = Formula(form, rotor_poles, _numbers(path, "magnetics", parameters, FORMULA_KEYS[form]))
+    mistake = formula.mistake()
+    if mistake is not None:
+        raise MachineError(f"{path}: magnetics.{mistake[0]}: {mistake[1]}")
+    return formula

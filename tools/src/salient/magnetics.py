@@ -1,0 +1,121 @@
+"""Magnetics of one phase by formula: those of `emulator/plant/magnetics.h`, written a second time in NumPy, because the
+firmware's tables are computed from them and the tests compare the emulator with them.
+
+All of them are psi = Lu i + f(theta) (g(i) - Lu i), T = f'(theta) W(i), W(i) the integral of g(i) - Lu i. Angles are
+mechanical, rad, 0 aligned; currents in A, >= 0. Every method takes arrays that broadcast against each other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+_INDUCTANCES = {"unaligned_inductance_H": (1e-5, 10.0), "aligned_inductance_H": (1e-5, 10.0)}
+
+# Keys of each form in a machine file with (minimum, maximum), both allowed.
+FORMULA_KEYS: dict[str, dict[str, tuple[float, float]]] = {
+    "linear_cosine": _INDUCTANCES,
+    "linear_trapezoid": _INDUCTANCES | {"flat_deg": (0.0, 20.0), "blend_deg": (0.01, 20.0)},
+    "saturating": _INDUCTANCES
+    | {
+        "saturated_inductance_H": (1e-6, 10.0),
+        "flux_linkage_max_Wb": (1e-3, 100.0),
+        "current_at_flux_linkage_max_A": (1.0, 10000.0),
+    },
+}
+
+
+@dataclass(frozen=True)
+class Formula:
+    """Magnetics by one of the forms of FORMULA_KEYS."""
+
+    form: str
+    rotor_poles: int
+    parameters: dict[str, float]
+
+    @property
+    def pitch_rad(self) -> float:
+        return 2.0 * math.pi / self.rotor_poles
+
+    @property
+    def unaligned_inductance_H(self) -> float:
+        """Of the unsaturated phase, d psi / d i at 0 A."""
+        return self.parameters["unaligned_inductance_H"]
+
+    def mistake(self) -> tuple[str, str] | None:
+        """A key whose value does not go with the others, and why; None when all is well."""
+        m = self.parameters
+        if m["aligned_inductance_H"] <= m["unaligned_inductance_H"]:
+            return "aligned_inductance_H", "must be above unaligned_inductance_H"
+        if self.form == "linear_trapezoid" and 2.0 * (m["flat_deg"] + m["blend_deg"]) >= 180.0 / self.rotor_poles:
+            return "blend_deg", "flats and blends do not fit into half a rotor pitch"
+        if self.form == "saturating":
+            if m["saturated_inductance_H"] > m["unaligned_inductance_H"]:
+                return "saturated_inductance_H", "must not exceed unaligned_inductance_H"
+            if m["saturated_inductance_H"] * m["current_at_flux_linkage_max_A"] >= m["flux_linkage_max_Wb"]:
+                return "flux_linkage_max_Wb", "must exceed saturated_inductance_H * current_at_flux_linkage_max_A"
+        return None
+
+    def flux_linkage_Wb(self, angle_rad, current_A):
+        """psi."""
+        i = np.asarray(current_A, dtype=float)
+        unaligned_Wb = self.unaligned_inductance_H * i
+        return unaligned_Wb + self._position_factor(angle_rad)[0] * (self._aligned_Wb(i) - unaligned_Wb)
+
+    def coenergy_J(self, angle_rad, current_A):
+        """Integral of psi over the current at a constant angle."""
+        i = np.asarray(current_A, dtype=float)
+        return 0.5 * self.unaligned_inductance_H * i * i + self._position_factor(angle_rad)[0] * self._excess_J(i)
+
+    def torque_Nm(self, angle_rad, current_A):
+        """Derivative of the co-energy by the angle."""
+        return self._position_factor(angle_rad)[1] * self._excess_J(np.asarray(current_A, dtype=float))
+
+    def _position_factor(self, angle_rad):
+        """f and df/dtheta (1/rad): f is 1 aligned, 0 unaligned."""
+        half = self.pitch_rad / 2.0
+        wrapped = np.mod(np.asarray(angle_rad, dtype=float) + half, self.pitch_rad) - half
+        distance, sign = np.abs(wrapped), np.sign(wrapped)
+        if self.form == "linear_cosine":
+            f = 0.5 * (1.0 + np.cos(self.rotor_poles * distance))
+            slope = -0.5 * self.rotor_poles * np.sin(self.rotor_poles * distance)
+        elif self.form == "saturating":
+            x = distance / half
+            f = (2.0 * x - 3.0) * x * x + 1.0
+            slope = 6.0 * x * (x - 1.0) / half
+        else:
+            flat = math.radians(self.parameters["flat_deg"])
+            blend = math.radians(self.parameters["blend_deg"])
+            steep = 1.0 / (half - 2.0 * flat - blend)
+            # Slope rises over one blend, stays, falls over another; f is its integral.
+            up = np.clip(distance - flat, 0.0, blend)
+            straight = np.clip(distance - flat - blend, 0.0, half - 2.0 * flat - 2.0 * blend)
+            down = np.clip(distance - (half - flat - blend), 0.0, blend)
+            f = 1.0 - steep * (up * up / (2.0 * blend) + straight + down - down * down / (2.0 * blend))
+            slope = -steep * (up - down) / blend
+        return f, slope * sign
+
+    def _saturation(self) -> tuple[float, float]:
+        """A in Wb and b in 1/A."""
+        m = self.parameters
+        amplitude = m["flux_linkage_max_Wb"] - m["saturated_inductance_H"] * m["current_at_flux_linkage_max_A"]
+        return amplitude, (m["aligned_inductance_H"] - m["saturated_inductance_H"]) / amplitude
+
+    def _aligned_Wb(self, i):
+        """g(i)."""
+        m = self.parameters
+        if self.form != "saturating":
+            return m["aligned_inductance_H"] * i
+        amplitude, rate = self._saturation()
+        return m["saturated_inductance_H"] * i - amplitude * np.expm1(-rate * i)
+
+    def _excess_J(self, i):
+        """W(i)."""
+        m = self.parameters
+        if self.form != "saturating":
+            return 0.5 * (m["aligned_inductance_H"] - m["unaligned_inductance_H"]) * i * i
+        amplitude, rate = self._saturation()
+        linear = 0.5 * (m["saturated_inductance_H"] - m["unaligned_inductance_H"]) * i * i
+        return linear + amplitude * (i + np.expm1(-rate * i) / rate)
