@@ -81,7 +81,7 @@ void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, u
 
 void magnetics_evaluate(const magnetics_model_t *model, double phase_angle_rad, double current_A,
                         magnetics_point_t *point) {
-    magnetics_kernel(model, model->form, phase_angle_rad, current_A, point);
+    magnetics_kernel(model, model->form, phase_angle_rad, current_A, 0.0, point);
 }
 
 /* W(i), the integral of g(i) - Lu i. */
@@ -95,9 +95,9 @@ static double excess_energy_J(const magnetics_model_t *model, double current_A) 
 }
 
 double magnetics_coenergy_J(const magnetics_model_t *model, double phase_angle_rad, double current_A) {
-    double f, gradient_1_rad;
-    magnetics_kernel_shape(model, model->form, phase_angle_rad, &f, &gradient_1_rad);
-    return 0.5 * model->unaligned_inductance_H * current_A * current_A + f * excess_energy_J(model, current_A);
+    magnetics_shape_t shape;
+    magnetics_kernel_shape(model, model->form, phase_angle_rad, 0.0, &shape);
+    return 0.5 * model->unaligned_inductance_H * current_A * current_A + shape.f * excess_energy_J(model, current_A);
 }
 
 double magnetics_field_energy_J(const magnetics_model_t *model, double phase_angle_rad, double current_A) {

@@ -54,6 +54,11 @@ typedef struct {
     double incremental_inductance_H; /* d psi / d i, > 0 */
     double flux_gradient_Wb_rad;     /* d psi / d theta, per mechanical radian; times speed: motional voltage */
     double torque_Nm;                /* d co-energy / d theta */
+    /* Second derivatives, for the integrator; d torque / d i is the flux gradient. */
+    double inductance_slope_H_A;      /* d2 psi / d i2 */
+    double inductance_gradient_H_rad; /* d2 psi / d i d theta */
+    double flux_curvature_Wb_rad2;    /* d2 psi / d theta2 */
+    double torque_gradient_Nm_rad;    /* d torque / d theta */
 } magnetics_point_t;
 
 /* Prepares `model` for `magnetics` of a machine with `rotor_poles` poles. The values must be a checked machine file's;

@@ -48,75 +48,86 @@ MAGNETICS_INLINE void magnetics_kernel_sine_cosine(double x, double *sine, doubl
     *cosine = 1.0 - 2.0 * half_sine * half_sine;
 }
 
-/* f of half a pitch, from 1 at 0 to 0 at half a pitch, and its derivative. */
-MAGNETICS_INLINE void magnetics_kernel_trapezoid(const magnetics_model_t *model, double angle_rad, double *f,
-                                                 double *gradient_1_rad) {
-    const double from_aligned = angle_rad - model->flat_rad;
-    const double to_unaligned = 0.5 * model->pitch_rad - model->flat_rad - angle_rad;
-    if (from_aligned <= 0.0) {
-        *f = 1.0;
-        *gradient_1_rad = 0.0;
-    } else if (to_unaligned <= 0.0) {
-        *f = 0.0;
-        *gradient_1_rad = 0.0;
-    } else if (from_aligned < model->blend_rad) {
-        *gradient_1_rad = -model->curvature_1_rad2 * from_aligned;
-        *f = 1.0 + 0.5 * *gradient_1_rad * from_aligned;
-    } else if (to_unaligned < model->blend_rad) {
-        *gradient_1_rad = -model->curvature_1_rad2 * to_unaligned;
-        *f = -0.5 * *gradient_1_rad * to_unaligned;
+/* f and its derivatives at some angle, per mechanical radian. */
+typedef struct {
+    double f, gradient_1_rad, curvature_1_rad2;
+} magnetics_shape_t;
+
+/* f of half a pitch, from 1 at 0 to 0 at half a pitch. The curvature jumps at the corners; `ahead_rad` is the angle a
+ * little further on in the direction of motion: it says which side of a corner is meant. */
+MAGNETICS_INLINE void magnetics_kernel_trapezoid(const magnetics_model_t *model, double angle_rad, double ahead_rad,
+                                                 magnetics_shape_t *shape) {
+    const double unaligned_rad = 0.5 * model->pitch_rad - model->flat_rad;
+    const double from_aligned = angle_rad - model->flat_rad, to_unaligned = unaligned_rad - angle_rad;
+    if (ahead_rad <= model->flat_rad || ahead_rad >= unaligned_rad) {
+        *shape = (magnetics_shape_t){ahead_rad <= model->flat_rad ? 1.0 : 0.0, 0.0, 0.0};
+    } else if (ahead_rad < model->flat_rad + model->blend_rad) {
+        shape->curvature_1_rad2 = -model->curvature_1_rad2;
+        shape->gradient_1_rad = -model->curvature_1_rad2 * from_aligned;
+        shape->f = 1.0 + 0.5 * shape->gradient_1_rad * from_aligned;
+    } else if (ahead_rad > unaligned_rad - model->blend_rad) {
+        shape->curvature_1_rad2 = model->curvature_1_rad2;
+        shape->gradient_1_rad = -model->curvature_1_rad2 * to_unaligned;
+        shape->f = -0.5 * shape->gradient_1_rad * to_unaligned;
     } else {
-        *gradient_1_rad = -model->slope_1_rad;
-        *f = 1.0 - model->slope_1_rad * (from_aligned - 0.5 * model->blend_rad);
+        shape->curvature_1_rad2 = 0.0;
+        shape->gradient_1_rad = -model->slope_1_rad;
+        shape->f = 1.0 - model->slope_1_rad * (from_aligned - 0.5 * model->blend_rad);
     }
 }
 
-/* f and f' (per mechanical radian) at any phase angle. `form` is the model's, apart so that a caller that knows it gets
- * nothing of the others. */
+/* f at any phase angle. `form` is the model's, apart so that a caller that knows it gets nothing of the others. */
 MAGNETICS_INLINE void magnetics_kernel_shape(const magnetics_model_t *model, magnetics_form_t form,
-                                             double phase_angle_rad, double *f, double *gradient_1_rad) {
+                                             double phase_angle_rad, double ahead_rad, magnetics_shape_t *shape) {
     const double pitches =
         (phase_angle_rad * model->pitches_per_rad + MAGNETICS_ROUNDING_SHIFT) - MAGNETICS_ROUNDING_SHIFT;
     const double wrapped_rad = phase_angle_rad - pitches * model->pitch_rad; /* -half a pitch .. half a pitch */
     if (form == MAGNETICS_LINEAR_COSINE) {
         double sine, cosine;
         magnetics_kernel_sine_cosine(model->electrical_per_mechanical * wrapped_rad, &sine, &cosine);
-        *f = 0.5 + 0.5 * cosine;
-        *gradient_1_rad = -0.5 * model->electrical_per_mechanical * sine;
+        shape->f = 0.5 + 0.5 * cosine;
+        shape->gradient_1_rad = -0.5 * model->electrical_per_mechanical * sine;
+        shape->curvature_1_rad2 = -0.5 * model->electrical_per_mechanical * model->electrical_per_mechanical * cosine;
         return;
     }
     const double folded_rad = fabs(wrapped_rad);
-    double gradient;
     if (form == MAGNETICS_SATURATING) {
         const double x = folded_rad * (2.0 * model->pitches_per_rad); /* 0 aligned, 1 unaligned */
-        *f = 1.0 + x * x * (2.0 * x - 3.0);
-        gradient = 12.0 * model->pitches_per_rad * (x * (x - 1.0));
+        shape->f = 1.0 + x * x * (2.0 * x - 3.0);
+        shape->gradient_1_rad = 12.0 * model->pitches_per_rad * (x * (x - 1.0));
+        shape->curvature_1_rad2 = 24.0 * model->pitches_per_rad * model->pitches_per_rad * (2.0 * x - 1.0);
     } else {
-        magnetics_kernel_trapezoid(model, folded_rad, f, &gradient);
+        magnetics_kernel_trapezoid(model, folded_rad, folded_rad + copysign(ahead_rad, ahead_rad * wrapped_rad), shape);
     }
-    *gradient_1_rad = copysign(gradient, -wrapped_rad);
+    shape->gradient_1_rad = copysign(shape->gradient_1_rad, -wrapped_rad);
 }
 
-/* See magnetics_evaluate; `form` as above. */
+/* See magnetics_evaluate; `form` and `ahead_rad` as above. */
 MAGNETICS_INLINE void magnetics_kernel(const magnetics_model_t *model, magnetics_form_t form, double phase_angle_rad,
-                                       double current_A, magnetics_point_t *point) {
-    double f, gradient_1_rad;
-    magnetics_kernel_shape(model, form, phase_angle_rad, &f, &gradient_1_rad);
-    /* g(i) - Lu i, its slope and its integral W(i) */
+                                       double current_A, double ahead_rad, magnetics_point_t *point) {
+    magnetics_shape_t shape;
+    magnetics_kernel_shape(model, form, phase_angle_rad, ahead_rad, &shape);
+    /* g(i) - Lu i, its slope and the slope of that, and its integral W(i) */
     double excess_Wb = model->linear_excess_H * current_A;
     double excess_H = model->linear_excess_H;
+    double excess_H_A = 0.0;
     double excess_J = 0.5 * excess_Wb * current_A;
     if (form == MAGNETICS_SATURATING) {
         const double decay = magnetics_kernel_decay(model, current_A);
         const double knee_Wb = model->saturating_Wb * (1.0 - decay);
         excess_Wb += knee_Wb;
         excess_H += model->initial_slope_H * decay;
+        excess_H_A = -model->saturation_1_A * (model->initial_slope_H * decay);
         excess_J += model->saturating_Wb * current_A - knee_Wb * model->saturation_A;
     }
-    point->flux_linkage_Wb = model->unaligned_inductance_H * current_A + f * excess_Wb;
-    point->incremental_inductance_H = model->unaligned_inductance_H + f * excess_H;
-    point->flux_gradient_Wb_rad = gradient_1_rad * excess_Wb;
-    point->torque_Nm = gradient_1_rad * excess_J;
+    point->flux_linkage_Wb = model->unaligned_inductance_H * current_A + shape.f * excess_Wb;
+    point->incremental_inductance_H = model->unaligned_inductance_H + shape.f * excess_H;
+    point->flux_gradient_Wb_rad = shape.gradient_1_rad * excess_Wb;
+    point->torque_Nm = shape.gradient_1_rad * excess_J;
+    point->inductance_slope_H_A = shape.f * excess_H_A;
+    point->inductance_gradient_H_rad = shape.gradient_1_rad * excess_H;
+    point->flux_curvature_Wb_rad2 = shape.curvature_1_rad2 * excess_Wb;
+    point->torque_gradient_Nm_rad = shape.curvature_1_rad2 * excess_J;
 }
 
 #endif

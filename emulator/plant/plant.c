@@ -178,7 +178,7 @@ MAGNETICS_INLINE void differentiate_of(const plant_t *plant, magnetics_form_t fo
     for (unsigned index = 0; index < count; index++) {
         magnetics_point_t point;
         magnetics_kernel(&plant->magnetics, form, state->angle_rad - conducting->angle_offset_rad[index],
-                         state->current_A[index], &point);
+                         state->current_A[index], 0.0, &point);
         derivative->current_A_s[index] =
             (conducting->voltage_V[index] - machine->resistance_ohm * state->current_A[index] -
              state->speed_rad_s * point.flux_gradient_Wb_rad) /

@@ -63,7 +63,8 @@ typedef struct plant {
     double energy_drawn_J;    /* from the link, both switches on */
     double energy_returned_J; /* to the link, both switches off */
     double energy_copper_J;
-    double energy_load_J; /* work done on the load */
+    double energy_converter_J; /* in the half bridges' devices */
+    double energy_load_J;      /* work done on the load */
     double energy_friction_J;
 
     /* The rest is plant.c's. */
