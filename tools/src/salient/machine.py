@@ -10,11 +10,13 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
+from salient.flux_map import FluxMap, FluxMapError
+from salient.flux_map_file import load_flux_map
 from salient.magnetics import FORMULA_KEYS, Formula
 
 SHIPPED = Path(__file__).resolve().parents[2] / "machines"
 
-FORMS = tuple(FORMULA_KEYS)
+FORMS = (*FORMULA_KEYS, "map")
 
 # Phases by stator and rotor poles.
 _PHASES = {(6, 4): 3, (8, 6): 4, (12, 8): 3}
@@ -74,7 +76,7 @@ class Machine:
     inertia_kg_m2: float
     friction_Nm_s: float
     supply_voltage_V: float
-    magnetics: Formula
+    magnetics: Formula | FluxMap
     converter: dict[str, float]
     """Every key of _CONVERTER."""
     dc_link: dict[str, float] | None
@@ -191,13 +193,26 @@ def _dc_link(path: Path, table: dict, supply_voltage_V: float) -> dict[str, floa
     return link
 
 
-def _magnetics(path: Path, table: dict, rotor_poles: int) -> Formula:
+def _magnetics(path: Path, table: dict, rotor_poles: int) -> Formula | FluxMap:
     form = table.get("form")
     if form not in FORMS:
         raise MachineError(f"{path}: magnetics.form: {form!r} is not one of {', '.join(FORMS)}")
+    if form == "map":
+        return _flux_map(path, table, rotor_poles)
     parameters = {key: value for key, value in table.items() if key != "form"}
     formula = Formula(form, rotor_poles, _numbers(path, "magnetics", parameters, FORMULA_KEYS[form]))
     mistake = formula.mistake()
     if mistake is not None:
         raise MachineError(f"{path}: magnetics.{mistake[0]}: {mistake[1]}")
     return formula
+
+
+def _flux_map(path: Path, table: dict, rotor_poles: int) -> FluxMap:
+    _check_keys(path, "magnetics", table, ["form", "file"])
+    name = table["file"]
+    if not isinstance(name, str) or not name.isprintable() or not name.endswith(".csv"):
+        raise MachineError(f"{path}: magnetics.file: {name!r} is not the name of a .csv file")
+    try:
+        return load_flux_map(path.parent / name, rotor_poles)
+    except FluxMapError as error:
+        raise MachineError(str(error)) from None
