@@ -26,7 +26,13 @@
 static rig_t rig;
 static drive_t drive;
 
+/* Rows of hal_pwm_compare_t: row n is what acts in the control period that starts at n + 1 periods. NULL: none. */
+static FILE *switches_file;
+
 static void control_interrupt(void *context) {
+    if (switches_file) {
+        fwrite(&rig.board.active, sizeof rig.board.active, 1, switches_file);
+    }
     drive_control_interrupt(context);
 }
 static void background(void *context) {
@@ -124,6 +130,16 @@ int main(int argc, char *argv[]) {
         return EXIT_MISTAKE;
     }
 
+    if (options.record_switches) {
+        switches_file = fopen(options.record_switches, "wb");
+        if (!switches_file) {
+            fprintf(stderr, "salient: --record-switches %s: %s\n", options.record_switches, strerror(errno));
+            recorder_close(&recorder, error, sizeof error);
+            transport_close(transport);
+            return EXIT_MISTAKE;
+        }
+    }
+
     const rig_config_t config = {
         .machine = &machine_plant,
         .initial_angle_rad = options.initial_angle_deg * RAD_PER_DEG,
@@ -165,6 +181,13 @@ int main(int argc, char *argv[]) {
     if (!recorder_close(&recorder, error, sizeof error)) {
         fprintf(stderr, "salient: %s\n", error);
         exit_code = EXIT_MISTAKE;
+    }
+    if (switches_file) {
+        const bool written = !ferror(switches_file);
+        if (fclose(switches_file) != 0 || !written) {
+            fprintf(stderr, "salient: --record-switches %s: not all could be written\n", options.record_switches);
+            exit_code = EXIT_MISTAKE;
+        }
     }
     transport_close(transport);
     return exit_code;

@@ -24,6 +24,7 @@ static const char usage[] =
     "  --record FILE.npy                  records the true state\n"
     "  --record-step-ns N                 its step, from 100 (default 1000)\n"
     "  --record-from-us N                 when it begins (default 0)\n"
+    "  --record-switches FILE             records the compare values of each control period, for other simulators\n"
     "  --bit-rate N                       of the emulated bus, 10000..1000000 bit/s (default 1000000)\n"
     "  --stop-at-s X                      ends at this virtual time; not with --pace lockstep\n"
     "  --follow-stdin                     ends when standard input does\n";
@@ -70,6 +71,7 @@ enum {
     OPTION_RECORD,
     OPTION_RECORD_STEP,
     OPTION_RECORD_FROM,
+    OPTION_RECORD_SWITCHES,
     OPTION_BIT_RATE,
     OPTION_STOP_AT,
     OPTION_FOLLOW_STDIN,
@@ -87,6 +89,7 @@ static const struct option long_options[] = {
     {"record", required_argument, NULL, OPTION_RECORD},
     {"record-step-ns", required_argument, NULL, OPTION_RECORD_STEP},
     {"record-from-us", required_argument, NULL, OPTION_RECORD_FROM},
+    {"record-switches", required_argument, NULL, OPTION_RECORD_SWITCHES},
     {"bit-rate", required_argument, NULL, OPTION_BIT_RATE},
     {"stop-at-s", required_argument, NULL, OPTION_STOP_AT},
     {"follow-stdin", no_argument, NULL, OPTION_FOLLOW_STDIN},
@@ -154,6 +157,12 @@ static options_result_t take(options_t *options, int option, const char *text) {
         if (!read_integer(text, UINT64_MAX / 1000, &options->record_from_us)) {
             return mistake("--record-from-us %s: allowed are whole numbers from 0 to %" PRIu64, text,
                            UINT64_MAX / 1000);
+        }
+        break;
+    case OPTION_RECORD_SWITCHES:
+        options->record_switches = text;
+        if (text[0] == '\0') {
+            return mistake("--record-switches: the name of a file is missing");
         }
         break;
     case OPTION_BIT_RATE:

@@ -19,6 +19,7 @@ typedef struct {
     double initial_angle_deg;
     const char *record; /* NULL: no recording */
     uint64_t record_step_ns, record_from_us;
+    const char *record_switches; /* NULL: not recorded */
     uint32_t bit_rate;
     double stop_at_s; /* 0: no end */
     bool follow_stdin;

@@ -61,6 +61,7 @@ def start(program: str, tmp_path: Path) -> Iterator:
         (["--can", "BUS", "--seed", "-1"], ["--seed -1"]),
         (["--can", "BUS", "--initial-angle-deg", "nan"], ["--initial-angle-deg nan", "-360 to 360"]),
         (["--can", "BUS", "--record", "/no/such/folder/x.npy"], ["/no/such/folder/x.npy"]),
+        (["--can", "BUS", "--record-switches", "/no/such/folder/x"], ["/no/such/folder/x"]),
         (["--can", "BUS", "--record-step-ns", "1000"], ["--record"]),
         (["--can", "BUS", "--record", "x.npy", "--record-step-ns", "99"], ["--record-step-ns 99", "from 100"]),
         (["--can", "BUS", "--bit-rate", "1000001"], ["--bit-rate 1000001", "10000 to 1000000"]),
