@@ -53,7 +53,7 @@ def test_everything_promised_is_there(demo_folder):
 
 
 def test_the_folder_stays_small(demo_folder):
-    assert sum(path.stat().st_size for path in demo_folder.rglob("*") if path.is_file()) < 60e6
+    assert sum(path.stat().st_size for path in demo_folder.rglob("*") if path.is_file()) < 80e6
 
 
 def test_it_tells_each_step_and_ends_with_the_figures(demo_folder):

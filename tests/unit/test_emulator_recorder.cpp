@@ -1,6 +1,8 @@
 #include <gtest/gtest.h>
+#include <sys/resource.h>
 
 #include <cmath>
+#include <csignal>
 #include <cstdio>
 #include <cstring>
 #include <fstream>
@@ -33,7 +35,7 @@ class Recorder : public testing::Test {
     }
     ~Recorder() override { std::remove(path.c_str()); }
 
-    static constexpr size_t ROW_BYTES = 8 + 4 * 4 + 3 * 4;
+    static constexpr size_t ROW_BYTES = 8 + 5 * 4 + 3 * 4 + 6 * 4;
     const machine_t machine;
     const std::string path;
     plant_t plant;
@@ -56,7 +58,10 @@ TEST_F(Recorder, WritesAHeaderThatNumpyReads) {
     EXPECT_EQ(dictionary.back(), '\n');
     EXPECT_EQ(dictionary.substr(0, dictionary.find_last_not_of(" \n") + 1),
               "{'descr': [('time_s', '<f8'), ('speed_rpm', '<f4'), ('torque_Nm', '<f4'), ('load_torque_Nm', '<f4'), "
-              "('rotor_angle_deg', '<f4'), ('current_a_A', '<f4'), ('current_b_A', '<f4'), ('current_c_A', '<f4')], "
+              "('rotor_angle_deg', '<f4'), ('bus_voltage_V', '<f4'), ('current_a_A', '<f4'), ('current_b_A', '<f4'), "
+              "('current_c_A', '<f4'), ('energy_drawn_J', '<f4'), ('energy_returned_J', '<f4'), "
+              "('energy_copper_J', '<f4'), ('energy_converter_J', '<f4'), ('energy_load_J', '<f4'), "
+              "('energy_friction_J', '<f4')], "
               "'fortran_order': False, 'shape': (5,), }");
 }
 
@@ -68,6 +73,13 @@ TEST_F(Recorder, RowsHoldTheStateInTheirUnits) {
     plant.rotor_angle_rad = -0.25 * M_PI;
     plant.current_A[0] = 1.0;
     plant.current_A[2] = 30.0;
+    plant.bus_voltage_V = 231.5;
+    plant.energy_drawn_J = 1024.0;
+    plant.energy_returned_J = 512.0;
+    plant.energy_copper_J = 64.0;
+    plant.energy_converter_J = 32.0;
+    plant.energy_load_J = -16.0;
+    plant.energy_friction_J = 8.0;
     recorder_sample(&recorder, &plant);
     plant.rotor_angle_rad = -1e-12; // as a float a whole turn
     recorder_sample(&recorder, &plant);
@@ -80,9 +92,11 @@ TEST_F(Recorder, RowsHoldTheStateInTheirUnits) {
     EXPECT_FLOAT_EQ(number_at<float>(bytes, row + ROW_BYTES + 12), static_cast<float>(torque_Nm));
     EXPECT_EQ(number_at<float>(bytes, row + 16), 8.0f);
     EXPECT_FLOAT_EQ(number_at<float>(bytes, row + 20), 315.0f);
-    EXPECT_EQ(number_at<float>(bytes, row + 24), 1.0f);
-    EXPECT_EQ(number_at<float>(bytes, row + 28), 0.0f);
-    EXPECT_EQ(number_at<float>(bytes, row + 32), 30.0f);
+    EXPECT_EQ(number_at<float>(bytes, row + 24), 231.5f);
+    const float currents_and_energies[] = {1.0f, 0.0f, 30.0f, 1024.0f, 512.0f, 64.0f, 32.0f, -16.0f, 8.0f};
+    for (size_t n = 0; n < std::size(currents_and_energies); n++) {
+        EXPECT_EQ(number_at<float>(bytes, row + 28 + 4 * n), currents_and_energies[n]) << n;
+    }
     EXPECT_EQ(number_at<float>(bytes, row + ROW_BYTES + 20), 0.0f);
 }
 
@@ -94,6 +108,34 @@ TEST_F(Recorder, IsThePlantsObserver) {
     ASSERT_TRUE(recorder_close(&recorder, error, sizeof error)) << error;
     const std::string bytes = contents(path);
     EXPECT_EQ(number_at<double>(bytes, RECORDER_HEADER_BYTES + 1000 * ROW_BYTES), 1e-3);
+}
+
+// More rows than the buffer holds, of a size that does not divide it: none lost, none twice.
+TEST_F(Recorder, EveryRowOfALongRunIsThereOnce) {
+    static_assert(RECORDER_BUFFER_BYTES % (8 + 5 * 4 + 4 * 4 + 6 * 4) != 0);
+    ASSERT_TRUE(recorder_open(&recorder, path.c_str(), 4, error, sizeof error)) << error;
+    const size_t rows = 3 * RECORDER_BUFFER_BYTES / (ROW_BYTES + 4);
+    for (size_t n = 0; n < rows; n++) {
+        plant.time_ns = 1000 * n;
+        recorder_sample(&recorder, &plant);
+    }
+    EXPECT_EQ(recorder.rows, rows);
+    ASSERT_TRUE(recorder_close(&recorder, error, sizeof error)) << error;
+    const std::string bytes = contents(path);
+    ASSERT_EQ(bytes.size(), RECORDER_HEADER_BYTES + rows * (ROW_BYTES + 4));
+    for (size_t n = 0; n < rows; n++) {
+        ASSERT_NEAR(number_at<double>(bytes, RECORDER_HEADER_BYTES + n * (ROW_BYTES + 4)), n * 1e-6, 1e-12);
+    }
+}
+
+TEST_F(Recorder, HeaderOfTheLongestRunOfTheMostPhasesFits) {
+    ASSERT_TRUE(recorder_open(&recorder, path.c_str(), HAL_PHASES_MAX, error, sizeof error)) << error;
+    recorder.rows = UINT64_MAX;
+    ASSERT_TRUE(recorder_close(&recorder, error, sizeof error)) << error;
+    const std::string bytes = contents(path);
+    ASSERT_EQ(bytes.size(), RECORDER_HEADER_BYTES);
+    EXPECT_NE(bytes.find("('energy_friction_J', '<f4')], 'fortran_order': False, 'shape': (18446744073709551615,), } "),
+              std::string::npos);
 }
 
 TEST_F(Recorder, UnfinishedRunHasAHeaderWithoutRows) {
@@ -118,6 +160,25 @@ TEST_F(Recorder, FullDiskIsReportedAtTheEnd) {
     }
     EXPECT_FALSE(recorder_open(&recorder, "/dev/full", 3, error, sizeof error));
     EXPECT_STREQ(error, "cannot write recording '/dev/full': No space left on device");
+}
+
+// A limit of the file's size stands for a disk that fills while the run lasts.
+TEST_F(Recorder, RowsThatCouldNotBeWrittenAreReportedAtTheEnd) {
+    struct rlimit before = {}, low = {};
+    ASSERT_EQ(getrlimit(RLIMIT_FSIZE, &before), 0);
+    const auto signal_before = std::signal(SIGXFSZ, SIG_IGN);
+    low = before;
+    low.rlim_cur = RECORDER_HEADER_BYTES + RECORDER_BUFFER_BYTES / 2;
+    ASSERT_TRUE(recorder_open(&recorder, path.c_str(), 3, error, sizeof error)) << error;
+    ASSERT_EQ(setrlimit(RLIMIT_FSIZE, &low), 0);
+    for (size_t n = 0; n < 2 * RECORDER_BUFFER_BYTES / ROW_BYTES; n++) {
+        recorder_sample(&recorder, &plant);
+    }
+    const bool closed_well = recorder_close(&recorder, error, sizeof error);
+    ASSERT_EQ(setrlimit(RLIMIT_FSIZE, &before), 0);
+    std::signal(SIGXFSZ, signal_before);
+    EXPECT_FALSE(closed_well);
+    EXPECT_EQ(std::string(error), "cannot write recording '" + path + "': File too large");
 }
 
 } // namespace
