@@ -60,7 +60,7 @@ void fmu_model_restart(fmu_model_t *model) {
 void fmu_model_advance(fmu_model_t *model, uint64_t to_ns) {
     set_switches(model);
     model->plant.load_torque_Nm = model->values.load_torque_Nm;
-    model->plant.bus_voltage_V = model->values.bus_voltage_V;
+    plant_set_supply_voltage(&model->plant, model->values.bus_voltage_V);
     plant_advance(&model->plant, to_ns);
     update_outputs(model);
 }

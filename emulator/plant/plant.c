@@ -1,48 +1,76 @@
 #include "plant/plant.h"
-#include "plant/magnetics_kernel.h"
 
 #include <math.h>
 #include <string.h>
+
+#include "plant/integrator.h"
 
 /* Limits of a step at factor 1, chosen so that currents, torque and speed stay within 1e-6 of their range (measured
  * against SciPy's DOP853 at a tolerance of 1e-12: 5e-7) at the speeds and currents of a drive. A whole control period
  * at 40 kHz is one step where nothing happens in it. */
 #define STEP_MAX_S 25e-6
 /* Of the saturation current 1/b: limits the change of the incremental inductance. */
-#define STEP_CURRENT_FRACTION 0.15
+#define STEP_CURRENT_FRACTION 0.1
 #define STEP_ANGLE_PITCHES 0.0015
 
 /* Of the shortest time constants, those of a winding at its least inductance and of the free rotor: a Runge-Kutta step
  * loses its accuracy, and beyond 2.8 its stability, where the resistance or the friction is large. */
 #define STEP_TIME_CONSTANTS 0.05
 
-/* A diode's end of conduction is located to this. */
-#define ZERO_TOLERANCE_S 1e-13
-#define ZERO_ITERATIONS 60
+/* A diode's end of conduction, and the instants at which supply and chopper begin and end, are located to this. */
+#define EVENT_TOLERANCE_S 1e-13
+#define EVENT_ITERATIONS 60
+/* The bus voltage counts as at its threshold when an event has brought it this near. */
+#define THRESHOLD_TOLERANCE_V 1e-6
 /* A freewheeling current decays without ever ending; below this it counts as ended. */
 #define CURRENT_NEGLIGIBLE_A 1e-9
 
 static const double NS_S = 1e-9;
 
+static bool has_link(const plant_t *plant) {
+    return plant->machine->dc_link.capacitance_F > 0.0;
+}
+
 void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_rad) {
     memset(plant, 0, sizeof *plant);
     plant->machine = machine;
     plant->rotor_angle_rad = initial_angle_rad;
+    plant->supply_voltage_V = machine->supply_voltage_V;
     plant->bus_voltage_V = machine->supply_voltage_V;
     magnetics_prepare(&plant->magnetics, &machine->magnetics, machine->rotor_poles);
     plant->phase_offset_rad = plant->magnetics.pitch_rad / machine->phases;
+    for (unsigned on = 0; on < 3; on++) {
+        const converter_t *converter = &machine->converter;
+        plant->drop_V[on] = on * converter->switch_drop_V + (2 - on) * converter->diode_drop_V;
+        plant->resistance_ohm[on] = machine->resistance_ohm + on * converter->switch_resistance_ohm +
+                                    (2 - on) * converter->diode_resistance_ohm;
+    }
     plant_set_step_factor(plant, 1.0);
     /* Empty: the first step computes it. */
     plant->smooth_from_rad = INFINITY;
     plant->smooth_to_rad = -INFINITY;
 }
 
+void plant_set_supply_voltage(plant_t *plant, double voltage_V) {
+    plant->supply_voltage_V = voltage_V;
+    if (!has_link(plant)) {
+        plant->bus_voltage_V = voltage_V;
+    }
+}
+
 void plant_set_step_factor(plant_t *plant, double factor) {
     const machine_t *machine = plant->machine;
     const double least_inductance_H =
         plant->magnetics.unaligned_inductance_H + fmin(0.0, plant->magnetics.linear_excess_H);
-    const double time_constant_s =
-        fmin(least_inductance_H / machine->resistance_ohm, machine->inertia_kg_m2 / machine->friction_Nm_s);
+    double time_constant_s = fmin(least_inductance_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
+                                  machine->inertia_kg_m2 / machine->friction_Nm_s);
+    if (has_link(plant)) {
+        const dc_link_t *link = &machine->dc_link;
+        time_constant_s = fmin(time_constant_s, link->source_resistance_ohm * link->capacitance_F);
+        if (link->chopper_resistance_ohm > 0.0) {
+            time_constant_s = fmin(time_constant_s, link->chopper_resistance_ohm * link->capacitance_F);
+        }
+    }
     plant->step_max_s = factor * fmin(STEP_MAX_S, STEP_TIME_CONSTANTS * time_constant_s);
     plant->step_angle_rad = factor * STEP_ANGLE_PITCHES * plant->magnetics.pitch_rad;
     plant->step_current_A = INFINITY;
@@ -51,264 +79,167 @@ void plant_set_step_factor(plant_t *plant, double factor) {
     }
 }
 
-/* --- Converter --- */
-
-/* The instants, in ticks from the period's start and up to its middle, where the pattern changes; the second half
- * mirrors the first. */
-typedef struct {
-    uint16_t tick;
-    plant_switches_t toggles;
-} half_edge_t;
-
-static void insert_half_edge(half_edge_t *edges, unsigned *count, uint16_t tick, uint8_t upper, uint8_t lower) {
-    unsigned at = *count;
-    while (at > 0 && edges[at - 1].tick > tick) {
-        edges[at] = edges[at - 1];
-        at--;
-    }
-    edges[at] = (half_edge_t){tick, {upper, lower}};
-    (*count)++;
-}
-
-static void append_edge(plant_t *plant, uint64_t time_ns, plant_switches_t toggles) {
-    plant_switches_t switches = plant->switches;
-    if (plant->edge_count > 0) {
-        plant_edge_t *last = &plant->edges[plant->edge_count - 1];
-        if (last->time_ns == time_ns) {
-            last->switches.upper ^= toggles.upper;
-            last->switches.lower ^= toggles.lower;
-            return;
-        }
-        switches = last->switches;
-    }
-    switches.upper ^= toggles.upper;
-    switches.lower ^= toggles.lower;
-    plant->edges[plant->edge_count++] = (plant_edge_t){time_ns, switches};
-}
+/* --- Switches --- */
 
 void plant_set_switches(plant_t *plant, const hal_pwm_compare_t *compare, uint16_t period_ticks) {
-    half_edge_t half_edges[2 * HAL_PHASES_MAX];
-    unsigned count = 0;
-    plant->switches = (plant_switches_t){0, 0};
-    plant->edge_count = 0;
+    half_bridge_pattern(&plant->pattern, plant->machine->phases, compare, period_ticks,
+                        plant->machine->converter.minimum_pulse_ns, plant->time_ns);
+    plant->switches = plant->pattern.first;
     plant->edge_next = 0;
-    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-        const uint16_t upper = compare->upper[phase], lower = compare->lower[phase];
-        const uint8_t bit = (uint8_t)(1u << phase);
-        if (upper >= period_ticks) {
-            plant->switches.upper |= bit;
-        } else if (upper > 0) {
-            insert_half_edge(half_edges, &count, (uint16_t)(period_ticks - upper), bit, 0);
-        }
-        if (lower > 0) {
-            plant->switches.lower |= bit;
-            if (lower < period_ticks) {
-                insert_half_edge(half_edges, &count, lower, 0, bit);
-            }
-        }
-    }
-    for (unsigned edge = 0; edge < count; edge++) {
-        append_edge(plant, plant->time_ns + (uint64_t)half_edges[edge].tick * HAL_PWM_TICK_NS,
-                    half_edges[edge].toggles);
-    }
-    for (unsigned edge = count; edge-- > 0;) {
-        append_edge(plant, plant->time_ns + (2u * (uint64_t)period_ticks - half_edges[edge].tick) * HAL_PWM_TICK_NS,
-                    half_edges[edge].toggles);
-    }
 }
 
 void plant_open_all(plant_t *plant) {
-    plant->switches = (plant_switches_t){0, 0};
-    plant->edge_count = 0;
+    plant->switches = (half_bridge_switches_t){0, 0};
+    plant->pattern.count = 0;
     plant->edge_next = 0;
 }
 
-/* --- Machine --- */
+/* --- One step --- */
 
-/* What stays the same during a step: the conducting phases. */
-typedef struct {
-    unsigned count;
-    unsigned phase[HAL_PHASES_MAX];
-    double angle_offset_rad[HAL_PHASES_MAX];
-    double voltage_V[HAL_PHASES_MAX];
-} conducting_t;
-
-typedef struct {
-    double angle_rad, speed_rad_s;
-    double current_A[HAL_PHASES_MAX]; /* by index in conducting_t */
-} state_t;
-
-typedef struct {
-    double torque_Nm, acceleration_rad_s2;
-    double current_A_s[HAL_PHASES_MAX];
-} derivative_t;
-
-/* Integrals over a step that the energy ledger needs. */
-typedef struct {
-    double angle_rad;     /* of speed */
-    double speed2_rad2_s; /* of speed squared */
-    double current2_A2s;  /* of all currents squared */
-    double charge_As[HAL_PHASES_MAX];
-} integrals_t;
-
-/* Through a pointer, for a struct given back is copied in wide loads that wait for the narrow stores before them. */
-static void find_conducting(plant_t *plant, conducting_t *conducting) {
-    conducting->count = 0;
+/* Which phases conduct, and through which devices. A phase whose current is zero and is not driven is left out, its
+ * current is exactly zero. */
+static void find_conducting(plant_t *plant, integrator_setting_t *setting) {
+    static const double link_signs[3] = {-1.0, 0.0, 1.0};
+    const unsigned upper = plant->switches.upper, lower = plant->switches.lower;
+    unsigned count = 0;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-        const unsigned upper = plant->switches.upper, lower = plant->switches.lower;
         const unsigned on = ((upper >> phase) & 1u) + ((lower >> phase) & 1u);
-        const double voltage_V = on == 2 ? plant->bus_voltage_V : on == 1 ? 0.0 : -plant->bus_voltage_V;
-        if (voltage_V <= 0.0 && plant->current_A[phase] < CURRENT_NEGLIGIBLE_A) {
+        const bool driven = link_signs[on] * plant->bus_voltage_V > plant->drop_V[on];
+        if (!driven && plant->current_A[phase] < CURRENT_NEGLIGIBLE_A) {
             plant->current_A[phase] = 0.0;
             continue;
         }
-        conducting->phase[conducting->count] = phase;
-        conducting->angle_offset_rad[conducting->count] = phase * plant->phase_offset_rad;
-        conducting->voltage_V[conducting->count] = voltage_V;
-        conducting->count++;
+        setting->phase[count] = phase;
+        setting->driven[count] = driven;
+        setting->angle_offset_rad[count] = phase * plant->phase_offset_rad;
+        setting->link_sign[count] = link_signs[on];
+        setting->drop_V[count] = plant->drop_V[on];
+        setting->resistance_ohm[count] = plant->resistance_ohm[on];
+        count++;
+    }
+    setting->count = count;
+}
+
+/* What supply and chopper do from here. At the very voltage at which the supply's rectifier begins to conduct, it is
+ * the current of the half bridges that decides. */
+static void find_link(plant_t *plant, integrator_setting_t *setting) {
+    double drawn_A = 0.0;
+    for (unsigned index = 0; index < setting->count; index++) {
+        drawn_A += setting->link_sign[index] * plant->current_A[setting->phase[index]];
+    }
+    const dc_link_t *link = &plant->machine->dc_link;
+    const double bus_V = plant->bus_voltage_V, supply_V = plant->supply_voltage_V;
+    if (link->chopper_resistance_ohm > 0.0) {
+        if (bus_V >= link->chopper_on_V) {
+            plant->chopper_on = true;
+        } else if (bus_V <= link->chopper_off_V) {
+            plant->chopper_on = false;
+        }
+        drawn_A += plant->chopper_on ? bus_V / link->chopper_resistance_ohm : 0.0;
+    }
+    setting->chopper_on = plant->chopper_on;
+    setting->source_conducts = bus_V < supply_V || (bus_V == supply_V && drawn_A >= 0.0);
+}
+
+static void find_setting(plant_t *plant, integrator_setting_t *setting) {
+    setting->machine = plant->machine;
+    setting->magnetics = &plant->magnetics;
+    setting->load_torque_Nm = plant->load_torque_Nm;
+    setting->supply_voltage_V = plant->supply_voltage_V;
+    setting->ahead_rad = copysign(2.0 * MAGNETICS_SMOOTH_TOLERANCE_RAD, plant->speed_rad_s);
+    find_conducting(plant, setting);
+    setting->link = has_link(plant);
+    setting->source_conducts = setting->chopper_on = false;
+    if (setting->link) {
+        find_link(plant, setting);
     }
 }
 
-/* `form` is the magnetics' and `count` is conducting->count, apart so that the compiler can leave out the other forms
- * and unroll where they are known. */
-MAGNETICS_INLINE void differentiate_of(const plant_t *plant, magnetics_form_t form, const conducting_t *conducting,
-                                       unsigned count, const state_t *state, derivative_t *derivative) {
-    const machine_t *machine = plant->machine;
-    derivative->torque_Nm = 0.0;
-    for (unsigned index = 0; index < count; index++) {
-        magnetics_point_t point;
-        magnetics_kernel(&plant->magnetics, form, state->angle_rad - conducting->angle_offset_rad[index],
-                         state->current_A[index], 0.0, &point);
-        derivative->current_A_s[index] =
-            (conducting->voltage_V[index] - machine->resistance_ohm * state->current_A[index] -
-             state->speed_rad_s * point.flux_gradient_Wb_rad) /
-            point.incremental_inductance_H;
-        derivative->torque_Nm += point.torque_Nm;
-    }
-    derivative->acceleration_rad_s2 =
-        (derivative->torque_Nm - machine->friction_Nm_s * state->speed_rad_s - plant->load_torque_Nm) /
-        machine->inertia_kg_m2;
-}
+/* The next bus voltage at which supply or chopper change what they do, and whether it is met rising. */
+typedef struct {
+    double rising_V, falling_V;
+} thresholds_t;
 
-MAGNETICS_INLINE void differentiate(const plant_t *plant, const conducting_t *conducting, const state_t *state,
-                                    derivative_t *derivative) {
-    if (plant->magnetics.form == MAGNETICS_SATURATING) {
-        differentiate_of(plant, MAGNETICS_SATURATING, conducting, conducting->count, state, derivative);
-    } else if (plant->magnetics.form == MAGNETICS_LINEAR_COSINE) {
-        differentiate_of(plant, MAGNETICS_LINEAR_COSINE, conducting, conducting->count, state, derivative);
+static thresholds_t thresholds_of(const integrator_setting_t *setting) {
+    const dc_link_t *link = &setting->machine->dc_link;
+    thresholds_t thresholds = {INFINITY, -INFINITY};
+    if (setting->source_conducts) {
+        thresholds.rising_V = setting->supply_voltage_V;
     } else {
-        differentiate_of(plant, MAGNETICS_LINEAR_TRAPEZOID, conducting, conducting->count, state, derivative);
+        thresholds.falling_V = setting->supply_voltage_V;
     }
+    if (setting->chopper_on) {
+        thresholds.falling_V = fmax(thresholds.falling_V, link->chopper_off_V);
+    } else if (link->chopper_resistance_ohm > 0.0) {
+        thresholds.rising_V = fmin(thresholds.rising_V, link->chopper_on_V);
+    }
+    return thresholds;
 }
 
-MAGNETICS_INLINE void move(unsigned count, const state_t *from, const derivative_t *derivative, double speed_rad_s,
-                           double step_s, state_t *to) {
-    to->angle_rad = from->angle_rad + step_s * speed_rad_s;
-    to->speed_rad_s = from->speed_rad_s + step_s * derivative->acceleration_rad_s2;
-    for (unsigned index = 0; index < count; index++) {
-        to->current_A[index] = from->current_A[index] + step_s * derivative->current_A_s[index];
-    }
-}
-
-/* One classical Runge-Kutta step from `start`, whose derivative `first` is. */
-MAGNETICS_INLINE void runge_kutta_step_of(const plant_t *plant, magnetics_form_t form, const conducting_t *conducting,
-                                          unsigned count, const state_t *start, const derivative_t *first,
-                                          double step_s, state_t *end, integrals_t *integrals) {
-    state_t second_state, third_state, fourth_state;
-    derivative_t second, third, fourth;
-    move(count, start, first, start->speed_rad_s, 0.5 * step_s, &second_state);
-    differentiate_of(plant, form, conducting, count, &second_state, &second);
-    move(count, start, &second, second_state.speed_rad_s, 0.5 * step_s, &third_state);
-    differentiate_of(plant, form, conducting, count, &third_state, &third);
-    move(count, start, &third, third_state.speed_rad_s, step_s, &fourth_state);
-    differentiate_of(plant, form, conducting, count, &fourth_state, &fourth);
-
-    const double sixth_s = step_s / 6.0;
-    integrals->angle_rad = sixth_s * (start->speed_rad_s + 2.0 * (second_state.speed_rad_s + third_state.speed_rad_s) +
-                                      fourth_state.speed_rad_s);
-    integrals->speed2_rad2_s = sixth_s * (start->speed_rad_s * start->speed_rad_s +
-                                          2.0 * (second_state.speed_rad_s * second_state.speed_rad_s +
-                                                 third_state.speed_rad_s * third_state.speed_rad_s) +
-                                          fourth_state.speed_rad_s * fourth_state.speed_rad_s);
-    integrals->current2_A2s = 0.0;
-    end->angle_rad = start->angle_rad + integrals->angle_rad;
-    end->speed_rad_s = start->speed_rad_s + sixth_s * (first->acceleration_rad_s2 +
-                                                       2.0 * (second.acceleration_rad_s2 + third.acceleration_rad_s2) +
-                                                       fourth.acceleration_rad_s2);
-    for (unsigned index = 0; index < count; index++) {
-        const double first_A = start->current_A[index], second_A = second_state.current_A[index];
-        const double third_A = third_state.current_A[index], fourth_A = fourth_state.current_A[index];
-        integrals->charge_As[index] = sixth_s * (first_A + 2.0 * (second_A + third_A) + fourth_A);
-        integrals->current2_A2s +=
-            sixth_s * (first_A * first_A + 2.0 * (second_A * second_A + third_A * third_A) + fourth_A * fourth_A);
-        end->current_A[index] = first_A + sixth_s * (first->current_A_s[index] +
-                                                     2.0 * (second.current_A_s[index] + third.current_A_s[index]) +
-                                                     fourth.current_A_s[index]);
-    }
-}
-
-MAGNETICS_INLINE void runge_kutta_step_in(const plant_t *plant, magnetics_form_t form, const conducting_t *conducting,
-                                          const state_t *start, const derivative_t *first, double step_s, state_t *end,
-                                          integrals_t *integrals) {
-    if (conducting->count == 1) {
-        runge_kutta_step_of(plant, form, conducting, 1, start, first, step_s, end, integrals);
-    } else if (conducting->count == 2) {
-        runge_kutta_step_of(plant, form, conducting, 2, start, first, step_s, end, integrals);
-    } else {
-        runge_kutta_step_of(plant, form, conducting, conducting->count, start, first, step_s, end, integrals);
-    }
-}
-
-static void runge_kutta_step(const plant_t *plant, const conducting_t *conducting, const state_t *start,
-                             const derivative_t *first, double step_s, state_t *end, integrals_t *integrals) {
-    if (plant->magnetics.form == MAGNETICS_SATURATING) {
-        runge_kutta_step_in(plant, MAGNETICS_SATURATING, conducting, start, first, step_s, end, integrals);
-    } else if (plant->magnetics.form == MAGNETICS_LINEAR_COSINE) {
-        runge_kutta_step_in(plant, MAGNETICS_LINEAR_COSINE, conducting, start, first, step_s, end, integrals);
-    } else {
-        runge_kutta_step_in(plant, MAGNETICS_LINEAR_TRAPEZOID, conducting, start, first, step_s, end, integrals);
-    }
-}
-
-static double least_current_A(const conducting_t *conducting, const state_t *state) {
-    double least_A = INFINITY;
-    for (unsigned index = 0; index < conducting->count; index++) {
-        if (conducting->voltage_V[index] <= 0.0 && state->current_A[index] < least_A) {
-            least_A = state->current_A[index];
+/* How far a state is from the end of what the setting describes: the least of the currents that are not driven, and of
+ * the bus voltage's distances (V counted as A) from its thresholds. Negative: beyond. */
+static double distance_to_event(const integrator_setting_t *setting, const integrator_state_t *state) {
+    double least = INFINITY;
+    for (unsigned index = 0; index < setting->count; index++) {
+        if (!setting->driven[index] && state->current_A[index] < least) {
+            least = state->current_A[index];
         }
     }
-    return least_A;
+    if (setting->link) {
+        const thresholds_t thresholds = thresholds_of(setting);
+        least =
+            fmin(least, fmin(thresholds.rising_V - state->bus_voltage_V, state->bus_voltage_V - thresholds.falling_V));
+    }
+    return least;
 }
 
-/* The first current of those that fall has crossed zero within `step_s`: shortens the step to that instant. Illinois
- * variant of false position on the step's result; the current is nearly linear in time, so a few steps do. */
-static double step_to_zero(const plant_t *plant, const conducting_t *conducting, const state_t *start,
-                           const derivative_t *first, double step_s, state_t *end, integrals_t *integrals) {
-    double before_s = 0.0, before_A = least_current_A(conducting, start);
-    double after_s = step_s, after_A = least_current_A(conducting, end);
+/* An event lies within `step_s`: shortens the step to that instant. Illinois variant of false position on the step's
+ * result; what falls is nearly linear in time, so a few steps do. Never nothing,
+ * so that time goes on. */
+static double step_to_event(const integrator_setting_t *setting, const integrator_state_t *start,
+                            const integrator_derivative_t *first, double step_s, integrator_state_t *end,
+                            integrator_integrals_t *integrals) {
+    double before_s = 0.0, before = fmax(distance_to_event(setting, start), 0.0);
+    double after_s = step_s, after = distance_to_event(setting, end);
     int last_side = 0;
     double at_s = step_s;
-    for (unsigned iteration = 0; iteration < ZERO_ITERATIONS; iteration++) {
+    for (unsigned iteration = 0; iteration < EVENT_ITERATIONS; iteration++) {
         const double previous_s = at_s;
-        at_s = before_s + (after_s - before_s) * (before_A / (before_A - after_A));
-        runge_kutta_step(plant, conducting, start, first, at_s, end, integrals);
-        const double at_A = least_current_A(conducting, end);
-        if (at_A == 0.0 || fabs(at_s - previous_s) < ZERO_TOLERANCE_S) {
+        at_s = fmax(before_s + (after_s - before_s) * (before / (before - after)), EVENT_TOLERANCE_S);
+        integrator_step(setting, start, first, at_s, end, integrals);
+        const double at = distance_to_event(setting, end);
+        if (at == 0.0 || fabs(at_s - previous_s) < EVENT_TOLERANCE_S) {
             break;
         }
-        if (at_A > 0.0) {
+        if (at > 0.0) {
             before_s = at_s;
-            before_A = at_A;
-            after_A *= last_side > 0 ? 0.5 : 1.0;
+            before = at;
+            after *= last_side > 0 ? 0.5 : 1.0;
             last_side = 1;
         } else {
             after_s = at_s;
-            after_A = at_A;
-            before_A *= last_side < 0 ? 0.5 : 1.0;
+            after = at;
+            before *= last_side < 0 ? 0.5 : 1.0;
             last_side = -1;
         }
     }
     return at_s;
+}
+
+/* After a step that an event ended: a current that has met zero is exactly zero, a bus voltage that has met a threshold
+ * exactly there. */
+static void settle(const integrator_setting_t *setting, integrator_state_t *end) {
+    for (unsigned index = 0; index < setting->count; index++) {
+        end->current_A[index] = fmax(end->current_A[index], 0.0);
+    }
+    if (setting->link) {
+        const thresholds_t thresholds = thresholds_of(setting);
+        if (fabs(end->bus_voltage_V - thresholds.rising_V) < THRESHOLD_TOLERANCE_V) {
+            end->bus_voltage_V = thresholds.rising_V;
+        } else if (fabs(end->bus_voltage_V - thresholds.falling_V) < THRESHOLD_TOLERANCE_V) {
+            end->bus_voltage_V = thresholds.falling_V;
+        }
+    }
 }
 
 /* --- Observation --- */
@@ -327,16 +258,17 @@ static void sample_now(plant_t *plant) {
 
 /* Samples within a step that began `start_s` after plant->time_ns, at instants before `limit_ns` and not after the
  * step's end. */
-static void sample_step(plant_t *plant, const conducting_t *conducting, const state_t *start, const derivative_t *first,
-                        const state_t *end, double start_s, double step_s, uint64_t limit_ns) {
+static void sample_step(plant_t *plant, const integrator_setting_t *setting, const integrator_state_t *start,
+                        const integrator_derivative_t *first, const integrator_state_t *end, double start_s,
+                        double step_s, uint64_t limit_ns) {
     double at_s = (double)(plant->sample_next_ns - plant->time_ns) * NS_S;
     if (plant->sample_next_ns >= limit_ns || at_s > start_s + step_s) {
         return;
     }
-    derivative_t last;
-    differentiate(plant, conducting, end, &last);
+    integrator_derivative_t last;
+    integrator_differentiate(setting, end, &last);
     const uint64_t time_ns = plant->time_ns;
-    const double angle_rad = plant->rotor_angle_rad, speed_rad_s = plant->speed_rad_s;
+    const double angle_rad = plant->rotor_angle_rad, speed_rad_s = plant->speed_rad_s, bus_V = plant->bus_voltage_V;
     double current_A[HAL_PHASES_MAX];
     memcpy(current_A, plant->current_A, sizeof current_A);
     do {
@@ -346,10 +278,14 @@ static void sample_step(plant_t *plant, const conducting_t *conducting, const st
             interpolate(x, step_s, start->angle_rad, start->speed_rad_s, end->angle_rad, end->speed_rad_s);
         plant->speed_rad_s = interpolate(x, step_s, start->speed_rad_s, first->acceleration_rad_s2, end->speed_rad_s,
                                          last.acceleration_rad_s2);
-        for (unsigned index = 0; index < conducting->count; index++) {
+        if (setting->link) {
+            plant->bus_voltage_V =
+                interpolate(x, step_s, start->bus_voltage_V, first->bus_V_s, end->bus_voltage_V, last.bus_V_s);
+        }
+        for (unsigned index = 0; index < setting->count; index++) {
             const double at_A = interpolate(x, step_s, start->current_A[index], first->current_A_s[index],
                                             end->current_A[index], last.current_A_s[index]);
-            plant->current_A[conducting->phase[index]] = at_A > 0.0 ? at_A : 0.0;
+            plant->current_A[setting->phase[index]] = at_A > 0.0 ? at_A : 0.0;
         }
         sample_now(plant);
         at_s = (double)(plant->sample_next_ns - time_ns) * NS_S;
@@ -357,6 +293,7 @@ static void sample_step(plant_t *plant, const conducting_t *conducting, const st
     plant->time_ns = time_ns;
     plant->rotor_angle_rad = angle_rad;
     plant->speed_rad_s = speed_rad_s;
+    plant->bus_voltage_V = bus_V;
     memcpy(plant->current_A, current_A, sizeof current_A);
 }
 
@@ -385,14 +322,14 @@ static void find_smooth_range(plant_t *plant) {
 }
 
 /* The longest step from here: within the limits, and not across a place where the magnetics are not smooth. */
-static double step_length_s(plant_t *plant, const conducting_t *conducting, const derivative_t *first,
+static double step_length_s(plant_t *plant, const integrator_setting_t *setting, const integrator_derivative_t *first,
                             double remaining_s) {
     const double speed_rad_s = fabs(plant->speed_rad_s);
     double limit_s = plant->step_max_s;
     if (speed_rad_s * limit_s > plant->step_angle_rad) {
         limit_s = plant->step_angle_rad / speed_rad_s;
     }
-    for (unsigned index = 0; index < conducting->count; index++) {
+    for (unsigned index = 0; index < setting->count; index++) {
         const double slope_A_s = fabs(first->current_A_s[index]);
         if (slope_A_s * limit_s > plant->step_current_A) {
             limit_s = plant->step_current_A / slope_A_s;
@@ -402,7 +339,7 @@ static double step_length_s(plant_t *plant, const conducting_t *conducting, cons
     if (remaining_s > limit_s) {
         step_s = remaining_s / ceil(remaining_s / limit_s);
     }
-    if (conducting->count == 0) {
+    if (setting->count == 0) {
         return step_s;
     }
 
@@ -419,50 +356,80 @@ static double step_length_s(plant_t *plant, const conducting_t *conducting, cons
     return step_s;
 }
 
-static void book(plant_t *plant, const conducting_t *conducting, const integrals_t *integrals) {
-    for (unsigned index = 0; index < conducting->count; index++) {
-        const double energy_J = conducting->voltage_V[index] * integrals->charge_As[index];
+static void book(plant_t *plant, const integrator_setting_t *setting, const integrator_integrals_t *integrals) {
+    const double winding_ohm = plant->machine->resistance_ohm;
+    for (unsigned index = 0; index < setting->count; index++) {
+        const double charge_As = integrals->charge_As[index], current2_A2s = integrals->current2_A2s[index];
+        const double bus_J = setting->link ? integrals->link_J[index] : plant->bus_voltage_V * charge_As;
+        const double energy_J = setting->link_sign[index] * bus_J;
         if (energy_J > 0.0) {
             plant->energy_drawn_J += energy_J;
         } else {
             plant->energy_returned_J -= energy_J;
         }
+        plant->energy_copper_J += winding_ohm * current2_A2s;
+        plant->energy_converter_J +=
+            setting->drop_V[index] * charge_As + (setting->resistance_ohm[index] - winding_ohm) * current2_A2s;
     }
-    plant->energy_copper_J += plant->machine->resistance_ohm * integrals->current2_A2s;
     plant->energy_load_J += plant->load_torque_Nm * integrals->angle_rad;
     plant->energy_friction_J += plant->machine->friction_Nm_s * integrals->speed2_rad2_s;
+}
+
+/* Through source and chopper: integrals of (supply - bus) / Rs, its square, and bus^2 / Rc. */
+static void book_link(plant_t *plant, const integrator_setting_t *setting, const integrator_integrals_t *integrals,
+                      double step_s) {
+    const dc_link_t *link = &plant->machine->dc_link;
+    if (setting->source_conducts) {
+        const double supply_V = plant->supply_voltage_V;
+        plant->energy_supplied_J += supply_V * (supply_V * step_s - integrals->bus_Vs) / link->source_resistance_ohm;
+        plant->energy_source_J += (supply_V * (supply_V * step_s - 2.0 * integrals->bus_Vs) + integrals->bus2_V2s) /
+                                  link->source_resistance_ohm;
+    }
+    if (setting->chopper_on) {
+        plant->energy_chopper_J += integrals->bus2_V2s / link->chopper_resistance_ohm;
+    }
 }
 
 /* From time_ns to `to_ns`, with the switches as they are. */
 static void integrate(plant_t *plant, uint64_t to_ns) {
     const double length_s = (double)(to_ns - plant->time_ns) * NS_S;
-    double at_s = 0.0;
-    while (at_s < length_s) {
-        conducting_t conducting;
-        find_conducting(plant, &conducting);
-        state_t start, end;
-        derivative_t first;
-        integrals_t integrals;
-        start.angle_rad = plant->rotor_angle_rad;
-        start.speed_rad_s = plant->speed_rad_s;
-        for (unsigned index = 0; index < conducting.count; index++) {
-            start.current_A[index] = plant->current_A[conducting.phase[index]];
+    integrator_setting_t setting;
+    integrator_state_t start, end;
+    bool event = true;
+    for (double at_s = 0.0; at_s < length_s;) {
+        integrator_derivative_t first;
+        integrator_integrals_t integrals;
+        if (event) {
+            find_setting(plant, &setting);
+            start.angle_rad = plant->rotor_angle_rad;
+            start.speed_rad_s = plant->speed_rad_s;
+            start.bus_voltage_V = plant->bus_voltage_V;
+            for (unsigned index = 0; index < setting.count; index++) {
+                start.current_A[index] = plant->current_A[setting.phase[index]];
+            }
         }
-        differentiate(plant, &conducting, &start, &first);
-        double step_s = step_length_s(plant, &conducting, &first, length_s - at_s);
-        runge_kutta_step(plant, &conducting, &start, &first, step_s, &end, &integrals);
-        if (least_current_A(&conducting, &end) < 0.0) {
-            step_s = step_to_zero(plant, &conducting, &start, &first, step_s, &end, &integrals);
+        integrator_differentiate(&setting, &start, &first);
+        double step_s = step_length_s(plant, &setting, &first, length_s - at_s);
+        integrator_step(&setting, &start, &first, step_s, &end, &integrals);
+        event = distance_to_event(&setting, &end) < 0.0;
+        if (event) {
+            step_s = step_to_event(&setting, &start, &first, step_s, &end, &integrals);
+            settle(&setting, &end);
         }
         if (plant->sample != NULL) {
-            sample_step(plant, &conducting, &start, &first, &end, at_s, step_s, to_ns);
+            sample_step(plant, &setting, &start, &first, &end, at_s, step_s, to_ns);
         }
-        book(plant, &conducting, &integrals);
+        book(plant, &setting, &integrals);
+        if (setting.link) {
+            book_link(plant, &setting, &integrals, step_s);
+        }
         plant->rotor_angle_rad = end.angle_rad;
         plant->speed_rad_s = end.speed_rad_s;
-        for (unsigned index = 0; index < conducting.count; index++) {
-            plant->current_A[conducting.phase[index]] = end.current_A[index] > 0.0 ? end.current_A[index] : 0.0;
+        plant->bus_voltage_V = end.bus_voltage_V;
+        for (unsigned index = 0; index < setting.count; index++) {
+            plant->current_A[setting.phase[index]] = end.current_A[index];
         }
+        start = end;
         at_s += step_s;
     }
     plant->time_ns = to_ns;
@@ -470,15 +437,16 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
 
 void plant_advance(plant_t *plant, uint64_t to_ns) {
     while (plant->time_ns < to_ns) {
-        while (plant->edge_next < plant->edge_count && plant->edges[plant->edge_next].time_ns <= plant->time_ns) {
-            plant->switches = plant->edges[plant->edge_next++].switches;
+        const half_bridge_pattern_t *pattern = &plant->pattern;
+        while (plant->edge_next < pattern->count && pattern->edges[plant->edge_next].time_ns <= plant->time_ns) {
+            plant->switches = pattern->edges[plant->edge_next++].switches;
         }
         if (plant->sample != NULL && plant->sample_next_ns == plant->time_ns) {
             sample_now(plant);
         }
         uint64_t until_ns = to_ns;
-        if (plant->edge_next < plant->edge_count && plant->edges[plant->edge_next].time_ns < to_ns) {
-            until_ns = plant->edges[plant->edge_next].time_ns;
+        if (plant->edge_next < pattern->count && pattern->edges[plant->edge_next].time_ns < to_ns) {
+            until_ns = pattern->edges[plant->edge_next].time_ns;
         }
         integrate(plant, until_ns);
     }
@@ -520,4 +488,8 @@ double plant_field_energy_J(const plant_t *plant) {
 
 double plant_kinetic_energy_J(const plant_t *plant) {
     return 0.5 * plant->machine->inertia_kg_m2 * plant->speed_rad_s * plant->speed_rad_s;
+}
+
+double plant_link_energy_J(const plant_t *plant) {
+    return 0.5 * plant->machine->dc_link.capacitance_F * plant->bus_voltage_V * plant->bus_voltage_V;
 }

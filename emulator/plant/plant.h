@@ -1,47 +1,42 @@
-/* The emulated drive train: switched reluctance machine, asymmetric half bridges, shaft.
+/* The emulated drive train: DC link, asymmetric half bridges, switched reluctance machine, shaft.
  *
  * Equations, for each phase j (sources: T. J. E. Miller, "Switched Reluctance Motors and their Control", 1993; the
  * magnetics are magnetics.h's):
  *
  *   d psi_j / dt = v_j - R i_j      with psi_j = psi(theta - j pitch / phases, i_j)
  *   J d omega / dt = sum T_j - B omega - T_load,   d theta / dt = omega
- *   v_j = +Vdc with both switches on, 0 with one, -Vdc with none while current flows; a phase without current and
- *   without positive voltage is open (its diodes block) and stays at exactly 0 A
+ *   v_j = s_j Vdc - the drops of the two devices that carry the current; s_j = +1 with both switches on (two switches),
+ *     0 with one (a switch and a diode), -1 with none (two diodes); a device drops V + r i (machine.h). A phase without
+ *     current that is not driven by a positive v_j is open (its diodes block) and stays at exactly 0 A.
+ *   C d Vdc / dt = max(0, (Vs - Vdc) / Rs) - sum s_j i_j - Vdc / Rc while the brake chopper is on. Without a
+ *     capacitor Vdc = Vs, the supply takes energy back.
  *
  * Signs: angle and speed rise in the forward direction, motoring torque is positive; load torque is positive against
  * the forward direction and does not depend on the speed (it can drive the shaft backwards). Phase 0 is aligned at
- * rotor angle 0. Phase current is never negative.
+ * rotor angle 0. Phase current is never negative. The link's current is positive out of the link.
  *
- * Left out, on purpose: mutual coupling of the phases, end effects, iron loss, hysteresis, temperature; ideal switches
- * and diodes (no drop, no dead time, no switching time); an ideal supply that takes energy back; a rigid shaft without
- * static friction.
+ * Left out, on purpose: mutual coupling of the phases and end effects; iron loss, hysteresis and eddy currents in the
+ * machine, skin effect, temperature; switching times and losses of the devices (dead time has no place in these
+ * bridges: their two switches are in series with the winding), inductance of the link, ripple of the supply's
+ * rectifier; a rigid shaft without static friction. DC link: the supply conducts in one direction only, a capacitor
+ * has no series resistance.
  *
- * Integration: Runge-Kutta of fourth order in the currents, speed and angle together. Steps end at every switch edge
- * (whole nanoseconds), at the instant a diode stops conducting (found to less than a picosecond) and where the
- * magnetics are not smooth; in between their length is limited as plant_set_step_factor says.
+ * Integration: integrator.h, in the currents, speed, angle and bus voltage together. Steps end at every switch edge
+ * (whole nanoseconds), at the instants a diode, the supply or the chopper begins or ends to conduct (found to less than
+ * a picosecond) and where the magnetics are not smooth; in between their length is limited as plant_set_step_factor
+ * says.
  */
 #ifndef PLANT_PLANT_H
 #define PLANT_PLANT_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "hal.h"
 #include "hal_pwm.h"
+#include "plant/half_bridge.h"
 #include "plant/machine.h"
 #include "plant/magnetics.h"
-
-#define PLANT_EDGES_MAX (4 * HAL_PHASES_MAX)
-
-/* Switches that are on from some instant; bit j is phase j. */
-typedef struct {
-    uint8_t upper;
-    uint8_t lower;
-} plant_switches_t;
-
-typedef struct {
-    uint64_t time_ns;
-    plant_switches_t switches; /* from this instant */
-} plant_edge_t;
 
 struct plant;
 typedef void (*plant_sample_t)(void *context, const struct plant *plant);
@@ -52,30 +47,38 @@ typedef struct plant {
     double speed_rad_s;
     double rotor_angle_rad; /* unwrapped */
     double current_A[HAL_PHASES_MAX];
+    double bus_voltage_V;
+    bool chopper_on;
 
-    /* Inputs; write at any time, they act from time_ns. */
+    /* Input; write at any time, it acts from time_ns. */
     double load_torque_Nm;
-    double bus_voltage_V; /* >= 0 */
 
-    /* Energy since plant_init. At every instant, with the change of field and kinetic energy:
-     * drawn - returned = copper + load + friction + change of plant_field_energy_J + change of plant_kinetic_energy_J
+    /* Energy since plant_init. At every instant, with the changes of the energies that are stored:
+     * drawn - returned = copper + converter + load + friction
+     *                    + change of plant_field_energy_J + change of plant_kinetic_energy_J
+     * supplied = source + chopper + drawn - returned + change of plant_link_energy_J, with a capacitor
      */
-    double energy_drawn_J;    /* from the link, both switches on */
-    double energy_returned_J; /* to the link, both switches off */
-    double energy_copper_J;
+    double energy_drawn_J;     /* from the link, both switches on */
+    double energy_returned_J;  /* to the link, both switches off */
+    double energy_copper_J;    /* in the windings */
     double energy_converter_J; /* in the half bridges' devices */
     double energy_load_J;      /* work done on the load */
     double energy_friction_J;
+    double energy_supplied_J; /* by the source; this and the next two only with a capacitor */
+    double energy_source_J;   /* in the source's resistance */
+    double energy_chopper_J;
 
     /* The rest is plant.c's. */
     const machine_t *machine;
     magnetics_model_t magnetics;
     double phase_offset_rad;
+    double drop_V[3], resistance_ohm[3]; /* of a phase with so many switches on, its winding in it */
     double step_max_s, step_current_A, step_angle_rad;
     double smooth_from_rad, smooth_to_rad;
-    plant_switches_t switches;
-    unsigned edge_count, edge_next;
-    plant_edge_t edges[PLANT_EDGES_MAX];
+    double supply_voltage_V;
+    half_bridge_switches_t switches;
+    half_bridge_pattern_t pattern;
+    unsigned edge_next;
     plant_sample_t sample;
     void *sample_context;
     uint64_t sample_next_ns, sample_step_ns;
@@ -85,8 +88,11 @@ typedef struct plant {
  * outlive the plant. */
 void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_rad);
 
-/* A new control period starts now (time_ns): the switches follow `compare` as hal_pwm.h says, edges exact to the
- * nanosecond, for 2 * period_ticks timer ticks. After that they stay as they are at the period's end until set again.
+/* The supply's voltage (>= 0) from now on: the bus voltage itself without a capacitor. */
+void plant_set_supply_voltage(plant_t *plant, double voltage_V);
+
+/* A new control period starts now (time_ns): the switches follow `compare` as half_bridge.h says, for
+ * 2 * period_ticks timer ticks. After that they stay as they are at the period's end until set again.
  * period_ticks > 0. */
 void plant_set_switches(plant_t *plant, const hal_pwm_compare_t *compare, uint16_t period_ticks);
 
@@ -118,5 +124,8 @@ double plant_flux_linkage_Wb(const plant_t *plant, unsigned phase);
 /* Energy stored in the fields of all phases, and in the moving rotor, now. */
 double plant_field_energy_J(const plant_t *plant);
 double plant_kinetic_energy_J(const plant_t *plant);
+
+/* Energy stored in the link's capacitor now; 0 without one. */
+double plant_link_energy_J(const plant_t *plant);
 
 #endif

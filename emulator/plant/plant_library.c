@@ -20,7 +20,7 @@ typedef struct {
 
 plant_t *plant_library_create(const machine_t *machine, double initial_angle_rad);
 void plant_library_destroy(plant_t *plant);
-void plant_library_set_inputs(plant_t *plant, double load_torque_Nm, double bus_voltage_V);
+void plant_library_set_inputs(plant_t *plant, double load_torque_Nm, double supply_voltage_V);
 void plant_library_set_motion(plant_t *plant, double speed_rad_s, double rotor_angle_rad);
 void plant_library_set_current(plant_t *plant, unsigned phase, double current_A);
 void plant_library_read(const plant_t *plant, plant_library_state_t *state);
@@ -41,9 +41,9 @@ void plant_library_destroy(plant_t *plant) {
     free(plant);
 }
 
-void plant_library_set_inputs(plant_t *plant, double load_torque_Nm, double bus_voltage_V) {
+void plant_library_set_inputs(plant_t *plant, double load_torque_Nm, double supply_voltage_V) {
     plant->load_torque_Nm = load_torque_Nm;
-    plant->bus_voltage_V = bus_voltage_V;
+    plant_set_supply_voltage(plant, supply_voltage_V);
 }
 
 /* Puts the rotor somewhere else at another speed, as if it had been so since plant_init: the energy ledger takes no

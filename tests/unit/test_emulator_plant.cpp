@@ -227,7 +227,7 @@ TEST(Plant, WithoutBusVoltageCurrentsOnlyDecay) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     plant_t plant;
     plant_init(&plant, &machine, 1.0);
-    plant.bus_voltage_V = 0.0;
+    plant_set_supply_voltage(&plant, 0.0);
     plant.current_A[0] = 10.0;
     const hal_pwm_compare_t compare = compare_of({TICKS, TICKS}, {TICKS, TICKS});
     plant_set_switches(&plant, &compare, TICKS);
@@ -284,7 +284,7 @@ Energies live(plant_t &plant, unsigned periods) {
         }
         plant_set_switches(&plant, &compare, TICKS);
         plant.load_torque_Nm = period > 3000 ? 4.0 : 0.0;
-        plant.bus_voltage_V = period % 1000 > 500 ? 240.0 : 210.0;
+        plant_set_supply_voltage(&plant, period % 1000 > 500 ? 240.0 : 210.0);
         plant_advance(&plant, plant.time_ns + PERIOD_NS);
     }
     const double spent_J = plant.energy_copper_J + plant.energy_load_J + plant.energy_friction_J;
