@@ -3,16 +3,21 @@
 #include <math.h>
 #include <string.h>
 
+#include "plant/magnetics_kernel.h"
+
 #define ENCODER_BITS_IDEAL 32
 #define TURN_RAD 6.28318530717958647692
 
-void sensors_init(sensors_t *sensors, unsigned encoder_bits, uint64_t seed) {
+void sensors_init(sensors_t *sensors, const sensor_errors_t *errors, unsigned encoder_bits, uint64_t seed) {
     memset(sensors, 0, sizeof *sensors);
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        sensors->current_gain[phase] = 1.0;
-    }
+    sensors->errors = *errors;
     sensors->encoder_bits = encoder_bits == 0 ? ENCODER_BITS_IDEAL : encoder_bits;
     sensors->random_state = seed;
+}
+
+void sensors_hold_currents(sensors_t *sensors, const plant_t *plant) {
+    memcpy(sensors->held_current_A, plant->current_A, sizeof sensors->held_current_A);
+    sensors->currents_held = true;
 }
 
 /* splitmix64 (G. L. Steele, D. Lea, C. H. Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014). */
@@ -46,15 +51,26 @@ static uint16_t to_code(double counts) {
     return counts >= largest ? (uint16_t)largest : (uint16_t)(counts + 0.5);
 }
 
+/* What the sensor puts out; written so that a NaN stays one. */
+static double sensed_current_A(sensors_t *sensors, double true_A) {
+    const sensor_errors_t *errors = &sensors->errors;
+    double current_A = true_A * errors->current_gain + errors->current_offset_A;
+    if (errors->current_noise_A > 0.0) {
+        current_A += errors->current_noise_A * next_gaussian(&sensors->random_state);
+    }
+    if (current_A > errors->current_limit_A) {
+        return errors->current_limit_A;
+    }
+    return current_A < -errors->current_limit_A ? -errors->current_limit_A : current_A;
+}
+
 void sensors_sample_adc(sensors_t *sensors, const plant_t *plant, hal_adc_sample_t *sample) {
     memset(sample, 0, sizeof *sample);
+    const double *true_A = sensors->currents_held ? sensors->held_current_A : plant->current_A;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-        double current_A = plant->current_A[phase] * sensors->current_gain[phase];
-        if (sensors->current_noise_A > 0.0) {
-            current_A += sensors->current_noise_A * next_gaussian(&sensors->random_state);
-        }
         sample->phase_current_counts[phase] =
-            to_code(current_A * ((double)HAL_ADC_FULL_SCALE_COUNTS / HAL_ADC_CURRENT_FULL_SCALE_A));
+            to_code(sensed_current_A(sensors, true_A[phase]) *
+                    ((double)HAL_ADC_FULL_SCALE_COUNTS / HAL_ADC_CURRENT_FULL_SCALE_A));
     }
     sample->bus_voltage_counts =
         to_code(plant->bus_voltage_V * ((double)HAL_ADC_FULL_SCALE_COUNTS / HAL_ADC_BUS_FULL_SCALE_V));
@@ -65,7 +81,12 @@ uint32_t sensors_sample_encoder(sensors_t *sensors, const plant_t *plant) {
         return sensors->encoder_last_counts;
     }
     const uint64_t counts_per_turn = UINT64_C(1) << sensors->encoder_bits;
-    const double turns = plant->rotor_angle_rad / TURN_RAD;
+    double turns = plant->rotor_angle_rad / TURN_RAD;
+    if (sensors->errors.encoder_eccentricity_deg != 0.0) {
+        double sine, cosine;
+        magnetics_kernel_sine_cosine((turns - floor(turns + 0.5)) * TURN_RAD, &sine, &cosine);
+        turns += sensors->errors.encoder_eccentricity_deg / 360.0 * sine;
+    }
     /* A tiny negative angle is rounded up to a whole turn here: the mask makes that count 0. */
     uint64_t counts = (uint64_t)((turns - floor(turns)) * (double)counts_per_turn);
     if (sensors->encoder_fault == SENSORS_ENCODER_JUMP) {

@@ -1,15 +1,27 @@
-/* Sensors between plant and firmware: converter counts of currents and bus voltage, encoder counts, their faults.
+/* Sensors between plant and firmware: converter counts of currents and bus voltage, encoder counts, their errors and
+ * their faults.
  *
- * Scales are hal_adc.h's. A code is the nearest one (half a code upwards), limited to 0..4095. Encoder counts are the
- * angle's floor, modulo a turn, for negative angles too.
+ * Current, in the order of the chain: the phase current of `current_delay_ns` before the sampling instant (the plain
+ * delay of an isolated amplifier or a filter well below its corner), times the gain, plus offset, plus Gaussian noise,
+ * limited to +-`current_limit_A` (the sensor saturates), then the converter. The bus voltage has no errors.
+ *
+ * Encoder: the angle read is theta + e sin(theta), then its floor in counts. This is a code disc whose centre is off
+ * the axis by e (in rad) times the radius at which it is read, and at theta = 0 off towards the reading head: seen from
+ * the disc's centre the head lies at -theta - e sin(theta), to first order in e; the familiar angular error of
+ * eccentricity / radius.
+ *
+ * Scales are hal_adc.h's. A code is the nearest one (half a code upwards), limited to 0..4095: the converter is
+ * unipolar, below 0 A it shows 0. Encoder counts are modulo a turn, for negative angles too.
  */
 #ifndef PLANT_SENSORS_H
 #define PLANT_SENSORS_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "hal.h"
 #include "hal_adc.h"
+#include "plant/machine.h"
 #include "plant/plant.h"
 
 /* Values are rig.dbc's. */
@@ -21,9 +33,12 @@ typedef enum {
 
 typedef struct {
     /* Settings; write at any time. */
-    double current_gain[HAL_PHASES_MAX]; /* 1 is right */
-    double current_noise_A;              /* standard deviation; 0 is off */
+    sensor_errors_t errors; /* the delay is kept by whoever calls sensors_hold_currents */
     sensors_encoder_fault_t encoder_fault;
+
+    /* What is converted instead of the plant's present currents while `currents_held`; clear it to let go. */
+    bool currents_held;
+    double held_current_A[HAL_PHASES_MAX];
 
     /* The rest is sensors.c's. */
     unsigned encoder_bits;
@@ -31,10 +46,15 @@ typedef struct {
     uint64_t random_state;
 } sensors_t;
 
-/* Healthy, noiseless sensors. encoder_bits 8..32, 0 means ideal (32). Equal seeds give equal noise. */
-void sensors_init(sensors_t *sensors, unsigned encoder_bits, uint64_t seed);
+/* Sensors with these errors and without faults. encoder_bits 8..32, 0 means ideal (32). Equal seeds give equal noise.
+ */
+void sensors_init(sensors_t *sensors, const sensor_errors_t *errors, unsigned encoder_bits, uint64_t seed);
 
-/* Converts the plant's present state: unused phases read 0. Noise moves on by one draw a phase when it is on. */
+/* Holds the plant's present currents for the next conversion: call it `errors.current_delay_ns` before that. */
+void sensors_hold_currents(sensors_t *sensors, const plant_t *plant);
+
+/* Converts the held currents, or else the plant's present ones, and its present bus voltage: unused phases read 0.
+ * Noise moves on by one draw a phase when it is on. */
 void sensors_sample_adc(sensors_t *sensors, const plant_t *plant, hal_adc_sample_t *sample);
 
 /* Latches the encoder: 0..2^bits-1. Frozen: the count latched last; jump: half a turn off as long as it is set. */

@@ -33,6 +33,14 @@ uint8_t quantity_decode(const uint8_t data[8], quantity_setting_t *setting) {
         READ(truth_period_us);
     case RIG_RIG_SET_QUANTITY_CURRENT_NOISE_A_CHOICE:
         READ(current_noise_a);
+    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_OFFSET_A_CHOICE:
+        READ(current_sensor_offset_a);
+    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_LIMIT_A_CHOICE:
+        READ(current_sensor_limit_a);
+    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_DELAY_US_CHOICE:
+        READ(current_sensor_delay_us);
+    case RIG_RIG_SET_QUANTITY_ENCODER_ECCENTRICITY_DEG_CHOICE:
+        READ(encoder_eccentricity_deg);
     default:
         return RIG_RIG_SET_REPLY_STATUS_NO_SUCH_QUANTITY_CHOICE;
     }

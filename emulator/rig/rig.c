@@ -14,14 +14,14 @@ static bool take(void *context, uint32_t client, const transport_frame_t *frame)
 
 void rig_init(rig_t *rig, const rig_config_t *config) {
     plant_init(&rig->plant, config->machine, config->initial_angle_rad);
-    sensors_init(&rig->sensors, config->encoder_bits, config->seed);
+    sensors_init(&rig->sensors, &config->machine->sensors, config->encoder_bits, config->seed);
     can_bus_init(&rig->bus, config->bit_rate);
     board_init(&rig->board, &rig->plant, &rig->sensors, &rig->bus, config->encoder_bits);
     rig->config = *config;
     rig->config.transport->full = config->pacing.kind == PACING_TIMED ? TRANSPORT_DROP : TRANSPORT_WAIT;
     rig->firmware = (rig_firmware_t){0};
     rig->period_ns = 0;
-    rig->control_ns = rig->background_ns = RIG_NEVER;
+    rig->control_ns = rig->background_ns = rig->hold_ns = RIG_NEVER;
     rig->truth_period_ns = rig->truth_ns = TRUTH_PERIOD_DEFAULT_NS;
     rig->interrupt_time_ns = rig->interrupt_end_ns = 0;
     rig->settings.count = 0;
@@ -31,11 +31,26 @@ void rig_init(rig_t *rig, const rig_config_t *config) {
     rig->staged_mixed = false;
 }
 
+static uint64_t earlier(uint64_t a, uint64_t b) {
+    return a < b ? a : b;
+}
+
+/* When the currents are held that the next period's start will convert: sooner than that by the sensors' delay, limited
+ * to a whole period. Without a delay, or with that instant passed already, the present ones will be converted. */
+static void schedule_hold(rig_t *rig) {
+    const uint64_t delay_ns = (uint64_t)(rig->sensors.errors.current_delay_ns + 0.5);
+    const uint64_t before_ns = earlier(delay_ns, rig->period_ns);
+    const bool ahead = before_ns > 0 && rig->control_ns - rig->board.time_ns >= before_ns;
+    rig->hold_ns = ahead ? rig->control_ns - before_ns : RIG_NEVER;
+    rig->sensors.currents_held = false;
+}
+
 void rig_join(rig_t *rig, const rig_firmware_t *firmware) {
     rig->firmware = *firmware;
     if (rig->board.period_ticks > 0) {
         rig->period_ns = UINT64_C(2) * rig->board.period_ticks * HAL_PWM_TICK_NS;
         rig->control_ns = rig->board.time_ns + rig->period_ns;
+        schedule_hold(rig);
     }
 }
 
@@ -44,12 +59,19 @@ static void call(rig_t *rig, board_context_t context, void (*function)(void *)) 
     function(rig->firmware.context);
 }
 
+static void hold_event(rig_t *rig) {
+    rig->hold_ns = RIG_NEVER;
+    plant_advance(&rig->plant, rig->board.time_ns);
+    sensors_hold_currents(&rig->sensors, &rig->plant);
+}
+
 static void control_event(rig_t *rig) {
     uint64_t now_ns = rig->board.time_ns;
     bool busy = now_ns < rig->interrupt_end_ns;
     plant_advance(&rig->plant, now_ns);
     board_start_period(&rig->board, busy);
     rig->control_ns = now_ns + rig->period_ns;
+    schedule_hold(rig);
     if (busy) {
         return;
     }
@@ -101,7 +123,7 @@ static void apply(rig_t *rig, const quantity_setting_t *setting) {
         break;
     case RIG_RIG_SET_QUANTITY_SUPPLY_VOLTAGE_V_CHOICE:
         plant_advance(&rig->plant, now_ns);
-        rig->plant.bus_voltage_V = setting->value;
+        plant_set_supply_voltage(&rig->plant, setting->value);
         break;
     case RIG_RIG_SET_QUANTITY_ENCODER_FAULT_CHOICE:
         rig->sensors.encoder_fault = (sensors_encoder_fault_t)setting->value;
@@ -110,12 +132,23 @@ static void apply(rig_t *rig, const quantity_setting_t *setting) {
         rig->interrupt_time_ns = (uint64_t)(setting->value * (double)NS_PER_US + 0.5);
         break;
     case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_GAIN_CHOICE:
-        for (unsigned phase = 0; phase < HAL_PHASES_MAX; ++phase) {
-            rig->sensors.current_gain[phase] = setting->value;
-        }
+        rig->sensors.errors.current_gain = setting->value;
+        break;
+    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_OFFSET_A_CHOICE:
+        rig->sensors.errors.current_offset_A = setting->value;
         break;
     case RIG_RIG_SET_QUANTITY_CURRENT_NOISE_A_CHOICE:
-        rig->sensors.current_noise_A = setting->value;
+        rig->sensors.errors.current_noise_A = setting->value;
+        break;
+    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_LIMIT_A_CHOICE:
+        rig->sensors.errors.current_limit_A = setting->value;
+        break;
+    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_DELAY_US_CHOICE:
+        rig->sensors.errors.current_delay_ns = setting->value * (double)NS_PER_US;
+        schedule_hold(rig);
+        break;
+    case RIG_RIG_SET_QUANTITY_ENCODER_ECCENTRICITY_DEG_CHOICE:
+        rig->sensors.errors.encoder_eccentricity_deg = setting->value;
         break;
     case RIG_RIG_SET_QUANTITY_TRUTH_PERIOD_US_CHOICE:
         /* On multiples of the period, so that two logs of one bench have the same instants. */
@@ -128,16 +161,13 @@ static void apply(rig_t *rig, const quantity_setting_t *setting) {
     }
 }
 
-static uint64_t earlier(uint64_t a, uint64_t b) {
-    return a < b ? a : b;
-}
-
 /* Every event up to and including until_ns, which is the time afterwards. */
 static void run_events(rig_t *rig, uint64_t until_ns) {
     for (;;) {
         uint64_t setting_ns = quantity_queue_next_ns(&rig->settings);
-        uint64_t next_ns = earlier(earlier(setting_ns, rig->bus.next_event_ns),
-                                   earlier(rig->control_ns, earlier(rig->background_ns, rig->truth_ns)));
+        uint64_t next_ns =
+            earlier(earlier(setting_ns, rig->bus.next_event_ns),
+                    earlier(earlier(rig->hold_ns, rig->control_ns), earlier(rig->background_ns, rig->truth_ns)));
         if (next_ns > until_ns) {
             break;
         }
@@ -147,6 +177,8 @@ static void run_events(rig_t *rig, uint64_t until_ns) {
             apply(rig, &setting);
         } else if (next_ns == rig->bus.next_event_ns) {
             bus_event(rig);
+        } else if (next_ns == rig->hold_ns) {
+            hold_event(rig);
         } else if (next_ns == rig->control_ns) {
             control_event(rig);
         } else if (next_ns == rig->background_ns) {

@@ -1,9 +1,9 @@
 /* The test bench: owns virtual time, and joins plant, board, CAN bus and clients.
  *
  * One thread, next event first. Events of the same instant come in this order: quantities set ahead (RIG_SET), the CAN
- * bus, the control period, the background after an interrupt that takes time, the truth frames; then the clients. The
- * plant is advanced exactly to the events that touch it, and to no others, so that where a client cuts the time into
- * RIG_RUN_UNTILs does not change a bit of what happens.
+ * bus, the sensors' hold of the currents (if they have a delay), the control period, the background after an interrupt
+ * that takes time, the truth frames; then the clients. The plant is advanced exactly to the events that touch it, and
+ * to no others, so that where a client cuts the time into RIG_RUN_UNTILs does not change a bit of what happens.
  *
  * In lock-step time stands still until a client sends RIG_RUN_UNTIL; clients are not read while time runs. Frames for
  * the bus that were sent while it stood still begin in the order in which their clients connected, then in the order
@@ -80,7 +80,7 @@ typedef struct {
     rig_config_t config;
     rig_firmware_t firmware;
     uint64_t period_ns;
-    uint64_t control_ns, background_ns, truth_ns; /* when each is due next */
+    uint64_t hold_ns, control_ns, background_ns, truth_ns; /* when each is due next */
     uint64_t truth_period_ns;
     uint64_t interrupt_time_ns, interrupt_end_ns;
     quantity_queue_t settings;

@@ -15,7 +15,7 @@ class Sensors : public testing::Test {
   protected:
     Sensors() : machine(machine_of(MAGNETICS_SATURATING)) {
         plant_init(&plant, &machine, 0.0);
-        sensors_init(&sensors, 17, 1);
+        sensors_init(&sensors, &machine.sensors, 17, 1);
     }
 
     uint16_t current_counts(double current_A) {
@@ -71,21 +71,79 @@ TEST_F(Sensors, EachPhaseIsConvertedAndUnusedOnesReadZero) {
     plant.current_A[1] = 20.0;
     plant.current_A[2] = 30.0;
     plant.current_A[3] = 30.0; // the machine has three
-    sensors.current_gain[1] = 1.5;
+    sensors.errors.current_gain = 1.5;
     hal_adc_sample_t sample;
     std::memset(&sample, 0xFF, sizeof sample);
     sensors_sample_adc(&sensors, &plant, &sample);
-    EXPECT_EQ(sample.phase_current_counts[0], 512);
+    EXPECT_EQ(sample.phase_current_counts[0], 768);
     EXPECT_EQ(sample.phase_current_counts[1], 1536);
-    EXPECT_EQ(sample.phase_current_counts[2], 1536);
+    EXPECT_EQ(sample.phase_current_counts[2], 2304);
     EXPECT_EQ(sample.phase_current_counts[3], 0);
 }
 
+TEST_F(Sensors, ErrorsAreTheMachinesUntilChanged) {
+    machine_t other = machine;
+    other.sensors = {1.25, -1.0, 0.5, 30.0, 3000.0, 0.5};
+    sensors_init(&sensors, &other.sensors, 17, 1);
+    EXPECT_EQ(std::memcmp(&sensors.errors, &other.sensors, sizeof other.sensors), 0);
+    EXPECT_EQ(current_counts(40.0), 1536) << "limited to 30 A: the noise stays below 6 deviations";
+    EXPECT_EQ(encoder_counts(0.25), 32768u + 182u) << "0.5 deg of 131072 counts a turn: 182.04";
+    sensors.errors = machine.sensors;
+    EXPECT_EQ(current_counts(40.0), 2048);
+    EXPECT_EQ(encoder_counts(0.25), 32768u);
+}
+
+TEST_F(Sensors, OffsetComesBehindTheGainAndShowsNothingBelowZero) {
+    sensors.errors.current_gain = 0.5;
+    sensors.errors.current_offset_A = 10.0;
+    EXPECT_EQ(current_counts(0.0), 512);
+    EXPECT_EQ(current_counts(40.0), 1536);
+    sensors.errors.current_offset_A = -10.0;
+    EXPECT_EQ(current_counts(40.0), 512);
+    EXPECT_EQ(current_counts(20.0), 0);
+    EXPECT_EQ(current_counts(0.0), 0);
+}
+
+TEST_F(Sensors, LimitComesBehindGainOffsetAndNoise) {
+    sensors.errors.current_limit_A = 30.0;
+    EXPECT_EQ(current_counts(29.98), 1535);
+    EXPECT_EQ(current_counts(30.0), 1536);
+    EXPECT_EQ(current_counts(79.0), 1536);
+    sensors.errors.current_gain = 2.0;
+    sensors.errors.current_offset_A = 10.0;
+    EXPECT_EQ(current_counts(9.5), 1485) << "29 A";
+    EXPECT_EQ(current_counts(10.5), 1536) << "31 A";
+    sensors.errors.current_noise_A = 0.5;
+    for (int draw = 0; draw < 1000; draw++) {
+        ASSERT_EQ(current_counts(15.0), 1536) << "40 A; 20 deviations above the limit";
+        ASSERT_LE(current_counts(10.0), 1536) << "30 A; half of the noise lies above the limit";
+    }
+}
+
+TEST_F(Sensors, HeldCurrentsAreConvertedUntilLetGoAndTheBusIsNotHeld) {
+    plant.current_A[0] = 10.0;
+    plant.current_A[1] = 20.0;
+    plant.bus_voltage_V = 240.0;
+    sensors_hold_currents(&sensors, &plant);
+    plant.current_A[0] = 30.0;
+    plant.current_A[1] = 40.0;
+    plant.bus_voltage_V = 250.0;
+    hal_adc_sample_t sample;
+    sensors_sample_adc(&sensors, &plant, &sample);
+    EXPECT_EQ(sample.phase_current_counts[0], 512);
+    EXPECT_EQ(sample.phase_current_counts[1], 1024);
+    EXPECT_EQ(sample.bus_voltage_counts, 2000);
+    sensors.currents_held = false;
+    sensors_sample_adc(&sensors, &plant, &sample);
+    EXPECT_EQ(sample.phase_current_counts[0], 1536);
+    EXPECT_EQ(sample.phase_current_counts[1], 2048);
+}
+
 TEST_F(Sensors, NoiseHasItsDeviationAndItsSeed) {
-    sensors.current_noise_A = 0.5;
+    sensors.errors.current_noise_A = 0.5;
     sensors_t same = sensors, other;
-    sensors_init(&other, 17, 2);
-    other.current_noise_A = 0.5;
+    sensors_init(&other, &machine.sensors, 17, 2);
+    other.errors.current_noise_A = 0.5;
     plant.current_A[0] = 40.0;
     double sum = 0.0, squares = 0.0;
     unsigned differ = 0;
@@ -127,12 +185,26 @@ TEST_F(Sensors, EncoderCountsDownThroughZero) {
 
 TEST_F(Sensors, EncoderHasTheBitsItWasGiven) {
     for (const unsigned bits : {8u, 24u, 32u}) {
-        sensors_init(&sensors, bits, 0);
+        sensors_init(&sensors, &machine.sensors, bits, 0);
         EXPECT_EQ(encoder_counts(0.5), UINT32_C(1) << (bits - 1));
         EXPECT_EQ(encoder_counts(-1e-12), UINT32_MAX >> (32 - bits));
     }
-    sensors_init(&sensors, 0, 0);
+    sensors_init(&sensors, &machine.sensors, 0, 0);
     EXPECT_EQ(encoder_counts(0.75), UINT32_C(0xC0000000));
+}
+
+TEST_F(Sensors, EccentricityGoesOnceRoundWithTheRotor) {
+    sensors_init(&sensors, &machine.sensors, 32, 1);
+    sensors.errors.encoder_eccentricity_deg = 0.5;
+    const double counts_per_degree = std::exp2(32) / 360.0;
+    for (int turn : {-2, 0, 1000}) {
+        for (int angle_deg = 0; angle_deg < 360; angle_deg += 5) {
+            const double expected = (angle_deg + 0.5 * std::sin(angle_deg * M_PI / 180.0)) * counts_per_degree;
+            const auto error =
+                static_cast<int32_t>(encoder_counts(turn + angle_deg / 360.0) - static_cast<uint32_t>(expected));
+            EXPECT_LE(std::abs(error), 4) << "turn " << turn << ", " << angle_deg << " deg";
+        }
+    }
 }
 
 TEST_F(Sensors, FrozenEncoderKeepsItsCountUntilHealthy) {
@@ -147,7 +219,7 @@ TEST_F(Sensors, JumpedEncoderIsHalfATurnOff) {
     sensors.encoder_fault = SENSORS_ENCODER_JUMP;
     EXPECT_EQ(encoder_counts(0.25), 98304u);
     EXPECT_EQ(encoder_counts(0.75), 32768u);
-    sensors_init(&sensors, 0, 0);
+    sensors_init(&sensors, &machine.sensors, 0, 0);
     sensors.encoder_fault = SENSORS_ENCODER_JUMP;
     EXPECT_EQ(encoder_counts(0.75), UINT32_C(0x40000000));
 }

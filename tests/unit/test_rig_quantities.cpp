@@ -37,8 +37,9 @@ TEST_F(RigQuantities, RangesAreTheDatabases) {
     struct {
         uint8_t quantity;
         int32_t low, high;
-    } ranges[] = {{1, -2000000, 2000000}, {2, 0, 500000},  {3, 0, 2},      {4, 0, 1000000},
-                  {5, 0, 100000},         {6, 0, 1000000}, {7, 0, 1000000}};
+    } ranges[] = {{1, -2000000, 2000000}, {2, 0, 500000},  {3, 0, 2},       {4, 0, 1000000},
+                  {5, 0, 100000},         {6, 0, 1000000}, {7, 0, 1000000}, {8, -100000, 100000},
+                  {9, 100, 1000000},      {10, 0, 800},    {11, 0, 50000}};
     for (const auto &range : ranges) {
         SCOPED_TRACE(int(range.quantity));
         EXPECT_EQ(set(range.quantity, range.low), DONE);
@@ -46,7 +47,7 @@ TEST_F(RigQuantities, RangesAreTheDatabases) {
         EXPECT_EQ(set(range.quantity, range.low - 1), OUT_OF_RANGE);
         EXPECT_EQ(set(range.quantity, range.high + 1), OUT_OF_RANGE);
     }
-    for (unsigned quantity : {0u, 8u, 128u, 255u}) {
+    for (unsigned quantity : {0u, 12u, 128u, 255u}) {
         EXPECT_EQ(set(static_cast<uint8_t>(quantity), 1), NO_SUCH_QUANTITY);
     }
 }
@@ -59,9 +60,17 @@ TEST_F(RigQuantities, ActNowOnWhatTheyName) {
     EXPECT_EQ(set(3, 2), DONE);
     EXPECT_EQ(bench.rig->sensors.encoder_fault, SENSORS_ENCODER_JUMP);
     EXPECT_EQ(set(7, 2000), DONE);
-    EXPECT_DOUBLE_EQ(bench.rig->sensors.current_noise_A, 0.02);
+    EXPECT_DOUBLE_EQ(bench.rig->sensors.errors.current_noise_A, 0.02);
     EXPECT_EQ(set(5, 12000), DONE);
-    EXPECT_DOUBLE_EQ(bench.rig->sensors.current_gain[2], 1.2);
+    EXPECT_DOUBLE_EQ(bench.rig->sensors.errors.current_gain, 1.2);
+    EXPECT_EQ(set(8, -5000), DONE);
+    EXPECT_DOUBLE_EQ(bench.rig->sensors.errors.current_offset_A, -0.5);
+    EXPECT_EQ(set(9, 40000), DONE);
+    EXPECT_DOUBLE_EQ(bench.rig->sensors.errors.current_limit_A, 40.0);
+    EXPECT_EQ(set(10, 312), DONE);
+    EXPECT_DOUBLE_EQ(bench.rig->sensors.errors.current_delay_ns, 3120.0);
+    EXPECT_EQ(set(11, 5000), DONE);
+    EXPECT_DOUBLE_EQ(bench.rig->sensors.errors.encoder_eccentricity_deg, 0.5);
     EXPECT_EQ(set(1, 2000001), OUT_OF_RANGE);
     EXPECT_DOUBLE_EQ(bench.rig->plant.load_torque_Nm, -8.0) << "refused settings change nothing";
 }
@@ -159,6 +168,59 @@ TEST_F(RigQuantities, TruthIsThePlants) {
     EXPECT_NEAR(state.rotor_angle_deg, plant.rotor_angle_rad * 180 / 3.14159265358979, 1e-4);
     EXPECT_NEAR(state.load_torque_nm / 256.0, -50.0, 1e-9);
     EXPECT_NEAR(state.bus_voltage_v / 64.0, 240.0, 1e-9);
+}
+
+// The code of phase 1's current. The stand-in firmware's pulse is from 4 to 21 us of each period: a delay of more than
+// 4 us shows.
+uint16_t code_of(double current_A) {
+    return static_cast<uint16_t>(current_A * 51.2 + 0.5);
+}
+
+TEST_F(RigQuantities, DelayedSampleShowsTheCurrentOfThatInstant) {
+    EXPECT_EQ(set(6, 1), DONE); // the truth each microsecond: the plant stops there
+    std::vector<double> current_A;
+    for (uint64_t time_us = 1; time_us <= 200; ++time_us) {
+        bench.run_to(*client, time_us * 1000);
+        current_A.push_back(bench.rig->plant.current_A[1]);
+    }
+    EXPECT_EQ(bench.rig->board.adc.phase_current_counts[1], code_of(current_A[199])) << "no delay";
+    for (auto [centi_us, period_end_us] : {std::pair{600, 225u}, {800, 250u}, {0, 275u}}) {
+        EXPECT_EQ(set(10, centi_us), DONE);
+        for (uint64_t time_us = current_A.size() + 1; time_us <= period_end_us; ++time_us) {
+            bench.run_to(*client, time_us * 1000);
+            current_A.push_back(bench.rig->plant.current_A[1]);
+        }
+        const uint64_t sampled_us = period_end_us - static_cast<unsigned>(centi_us) / 100;
+        EXPECT_EQ(bench.rig->board.adc.phase_current_counts[1], code_of(current_A[sampled_us - 1])) << centi_us;
+        EXPECT_EQ(code_of(current_A[sampled_us - 1]) < code_of(current_A.back()), centi_us > 0);
+        EXPECT_EQ(bench.rig->board.adc.bus_voltage_counts, 1920);
+    }
+}
+
+TEST_F(RigQuantities, DelayPassedAlreadyActsFromTheNextPeriodOn) {
+    const auto shown = [this] { return bench.rig->board.adc.phase_current_counts[1]; };
+    const auto present = [this] { return code_of(bench.rig->plant.current_A[1]); };
+    EXPECT_EQ(set(6, 0), DONE);
+    EXPECT_EQ(set(10, 800, 193), DONE) << "7 us before a period starts";
+    bench.run_to(*client, 200 * 1000);
+    EXPECT_EQ(shown(), present());
+    bench.run_to(*client, 217 * 1000);
+    ASSERT_EQ(bench.rig->plant.time_ns, 217000u) << "advanced to the instant that is sampled";
+    const uint16_t held = present();
+    bench.run_to(*client, 225 * 1000);
+    EXPECT_EQ(shown(), held);
+    EXPECT_LT(shown(), present());
+    EXPECT_EQ(set(10, 0, 248), DONE) << "what is held is let go";
+    bench.run_to(*client, 250 * 1000);
+    EXPECT_EQ(shown(), present());
+}
+
+TEST_F(RigQuantities, WithoutDelayThePlantStopsAtPeriodsOnly) {
+    EXPECT_EQ(set(6, 0), DONE);
+    EXPECT_EQ(set(10, 300), DONE);
+    EXPECT_EQ(set(10, 0), DONE);
+    bench.run_to(*client, 224 * 1000);
+    EXPECT_EQ(bench.rig->plant.time_ns, 200000u);
 }
 
 TEST_F(RigQuantities, InterruptWithinItsPeriodDelaysTheBackgroundOnly) {

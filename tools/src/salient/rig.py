@@ -55,10 +55,18 @@ class Rig:
     """0 healthy, 1 frozen at its count, 2 jumps by half a turn."""
     interrupt_time_us = Quantity(0.0)
     """How long the control interrupt takes; beyond a period interrupts are lost."""
-    current_sensor_gain = Quantity(1.0)
+    current_sensor_gain = Quantity(None)
     """1 is true."""
-    current_noise_A = Quantity(0.0)
+    current_sensor_offset_A = Quantity(None)
+    """Of every current sensor, behind its gain."""
+    current_noise_A = Quantity(None)
     """Standard deviation of every current sensor; its course depends on the seed."""
+    current_sensor_limit_A = Quantity(None)
+    """Every current sensor saturates here."""
+    current_sensor_delay_us = Quantity(None)
+    """A sample shows the current of so long before it, from the next control period on."""
+    encoder_eccentricity_deg = Quantity(None)
+    """The encoder reads angle + this * sin(angle)."""
     truth_period_us = Quantity(1000)
     """How often the true state is sent; 0 never."""
 
