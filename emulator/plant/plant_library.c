@@ -16,6 +16,9 @@ typedef struct {
     double flux_linkage_Wb[HAL_PHASES_MAX];
     double energy_drawn_J, energy_returned_J, energy_copper_J, energy_load_J, energy_friction_J;
     double field_energy_J, kinetic_energy_J;
+    double bus_voltage_V;
+    double energy_converter_J, energy_supplied_J, energy_source_J, energy_chopper_J;
+    double link_energy_J;
 } plant_library_state_t;
 
 plant_t *plant_library_create(const machine_t *machine, double initial_angle_rad);
@@ -75,6 +78,12 @@ void plant_library_read(const plant_t *plant, plant_library_state_t *state) {
     state->energy_friction_J = plant->energy_friction_J;
     state->field_energy_J = plant_field_energy_J(plant);
     state->kinetic_energy_J = plant_kinetic_energy_J(plant);
+    state->bus_voltage_V = plant->bus_voltage_V;
+    state->energy_converter_J = plant->energy_converter_J;
+    state->energy_supplied_J = plant->energy_supplied_J;
+    state->energy_source_J = plant->energy_source_J;
+    state->energy_chopper_J = plant->energy_chopper_J;
+    state->link_energy_J = plant_link_energy_J(plant);
 }
 
 /* magnetics_evaluate for a machine. */

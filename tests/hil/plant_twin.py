@@ -105,6 +105,12 @@ class State(ctypes.Structure):
         ("energy_friction_J", ctypes.c_double),
         ("field_energy_J", ctypes.c_double),
         ("kinetic_energy_J", ctypes.c_double),
+        ("bus_voltage_V", ctypes.c_double),
+        ("energy_converter_J", ctypes.c_double),
+        ("energy_supplied_J", ctypes.c_double),
+        ("energy_source_J", ctypes.c_double),
+        ("energy_chopper_J", ctypes.c_double),
+        ("link_energy_J", ctypes.c_double),
     ]
 
 
