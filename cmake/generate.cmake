@@ -28,7 +28,10 @@ function(salient_generate_machine name file)
     add_custom_command(
         OUTPUT ${out}/machine_tables.c ${out}/machine_plant.c
         COMMAND ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m salient.generate_machine ${file} ${out}
-        DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate_machine.py ${SALIENT_GENERATOR_SOURCES}/machine.py ${SALIENT_GENERATOR_SOURCES}/magnetics.py
+        DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate_machine.py ${SALIENT_GENERATOR_SOURCES}/machine.py
+                ${SALIENT_GENERATOR_SOURCES}/magnetics.py ${SALIENT_GENERATOR_SOURCES}/flux_map.py
+                ${SALIENT_GENERATOR_SOURCES}/flux_map_file.py
+        DEPFILE ${out}/machine.d # of a map: its CSV file
         COMMENT "machine ${name}"
         VERBATIM)
     set(${name}_TABLES ${out}/machine_tables.c PARENT_SCOPE)

@@ -155,6 +155,9 @@ void integrator_differentiate(const integrator_setting_t *setting, const integra
     case MAGNETICS_SATURATING:
         differentiate_in(setting, MAGNETICS_SATURATING, state, derivative);
         break;
+    case MAGNETICS_MAP:
+        differentiate_in(setting, MAGNETICS_MAP, state, derivative);
+        break;
     }
 }
 
@@ -170,6 +173,9 @@ void integrator_step(const integrator_setting_t *setting, const integrator_state
         break;
     case MAGNETICS_SATURATING:
         step_in(setting, MAGNETICS_SATURATING, start, first, step_s, end, integrals);
+        break;
+    case MAGNETICS_MAP:
+        step_in(setting, MAGNETICS_MAP, start, first, step_s, end, integrals);
         break;
     }
 }

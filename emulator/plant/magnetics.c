@@ -57,10 +57,21 @@ void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, u
     model->electrical_per_mechanical = rotor_poles;
     model->pitch_rad = 2.0 * PI / rotor_poles;
     model->pitches_per_rad = rotor_poles / (2.0 * PI);
+    model->least_inductance_H = magnetics->unaligned_inductance_H;
+    model->saturation_A = INFINITY;
+    if (magnetics->form == MAGNETICS_MAP) {
+        model->map = magnetics->map;
+        model->map_steps_1_rad = 2.0 * FLUX_MAP_ANGLE_INTERVALS * model->pitches_per_rad;
+        model->map_steps_1_A = FLUX_MAP_CURRENT_INTERVALS / magnetics->map->current_max_A;
+        model->least_inductance_H = magnetics->map->least_inductance_H;
+        model->saturation_A = magnetics->map->current_scale_A;
+        return;
+    }
     model->linear_excess_H = magnetics->aligned_inductance_H - magnetics->unaligned_inductance_H;
     if (magnetics->form == MAGNETICS_SATURATING) {
         const double saturated_H = magnetics->saturated_inductance_H;
         model->linear_excess_H = saturated_H - magnetics->unaligned_inductance_H;
+        model->least_inductance_H = fmin(saturated_H, magnetics->unaligned_inductance_H);
         model->saturating_Wb = magnetics->flux_linkage_max_Wb - saturated_H * magnetics->current_at_flux_linkage_max_A;
         model->saturation_1_A = (magnetics->aligned_inductance_H - saturated_H) / model->saturating_Wb;
         model->saturation_A = 1.0 / model->saturation_1_A;
@@ -95,6 +106,12 @@ static double excess_energy_J(const magnetics_model_t *model, double current_A) 
 }
 
 double magnetics_coenergy_J(const magnetics_model_t *model, double phase_angle_rad, double current_A) {
+    if (model->form == MAGNETICS_MAP) {
+        magnetics_point_t point;
+        double coenergy_J;
+        flux_map_kernel(model, magnetics_kernel_wrap(model, phase_angle_rad), current_A, &point, &coenergy_J);
+        return coenergy_J;
+    }
     magnetics_shape_t shape;
     magnetics_kernel_shape(model, model->form, phase_angle_rad, 0.0, &shape);
     return 0.5 * model->unaligned_inductance_H * current_A * current_A + shape.f * excess_energy_J(model, current_A);
@@ -112,7 +129,7 @@ double magnetics_smooth_distance_rad(const magnetics_model_t *model, double phas
     const double flat_end_rad = model->flat_rad, corner_end_rad = model->flat_rad + model->blend_rad;
     double places_rad[4] = {0.0, half_rad, 0.0, 0.0};
     unsigned places = 2;
-    if (model->form == MAGNETICS_LINEAR_COSINE) {
+    if (model->form == MAGNETICS_LINEAR_COSINE || model->form == MAGNETICS_MAP) {
         return INFINITY;
     }
     if (model->form == MAGNETICS_LINEAR_TRAPEZOID) {

@@ -1,6 +1,6 @@
 /* Magnetics of one phase: flux linkage, its derivatives, torque and energy as functions of rotor angle and current.
  *
- * All forms here are psi = Lu i + f(theta) (g(i) - Lu i), T = f'(theta) W(i), W(i) = integral of g(i) - Lu i from 0:
+ * The formulas are psi = Lu i + f(theta) (g(i) - Lu i), T = f'(theta) W(i), W(i) = integral of g(i) - Lu i from 0:
  *
  *   linear, cosine      f = (1 + cos Nr theta) / 2, g = La i
  *   linear, trapezoid   f from 1 to 0 with flats at both ends, a straight slope and parabolic corners, g = La i
@@ -9,43 +9,56 @@
  *                       f = 2 (Nr theta / pi)^3 - 3 (Nr theta / pi)^2 + 1 on [0, pi / Nr], even,
  *                       g = Ls i + A (1 - e^(-b i)), A = psi_m - Ls I_m, b = (La - Ls) / A
  *
+ * The fourth form is a map of psi over angle and current: flux_map.h.
+ *
  * The phase angle theta is mechanical: 0 aligned, half a pitch (pi / Nr) unaligned; torque is positive from half a
  * pitch to a whole one. One phase does not see the others' currents.
  */
 #ifndef PLANT_MAGNETICS_H
 #define PLANT_MAGNETICS_H
 
+#include "plant/flux_map.h"
+
 /* Entries of the table of e^(-b i): up to 8 / b and more, slower but as exact beyond. */
 #define MAGNETICS_DECAY_STEPS 512
 
-typedef enum { MAGNETICS_LINEAR_COSINE, MAGNETICS_LINEAR_TRAPEZOID, MAGNETICS_SATURATING } magnetics_form_t;
+typedef enum {
+    MAGNETICS_LINEAR_COSINE,
+    MAGNETICS_LINEAR_TRAPEZOID,
+    MAGNETICS_SATURATING,
+    MAGNETICS_MAP
+} magnetics_form_t;
 
 /* What a machine file says. Fields that a form does not use are 0. */
 typedef struct {
     magnetics_form_t form;
-    double unaligned_inductance_H;        /* Lu, > 0 */
+    double unaligned_inductance_H;        /* Lu, > 0; map: at 0 A */
     double aligned_inductance_H;          /* La, > Lu; saturating: at small currents */
     double flat_deg;                      /* trapezoid: flat at each end of half a pitch, mechanical degrees */
     double blend_deg;                     /* trapezoid: length of each parabolic corner, mechanical degrees */
     double saturated_inductance_H;        /* saturating: Ls, slope of the aligned curve at large currents */
     double flux_linkage_max_Wb;           /* saturating: psi_m, aligned at I_m */
     double current_at_flux_linkage_max_A; /* saturating: I_m */
+    const flux_map_t *map;                /* map; must outlive the models of it */
 } magnetics_t;
 
 /* The same with everything computed beforehand that a form needs; made by magnetics_prepare. */
 typedef struct {
     magnetics_form_t form;
     double unaligned_inductance_H;
+    double least_inductance_H;              /* of the incremental ones, at any angle and current */
+    double saturation_A;                    /* over which the incremental inductance changes; infinite: it does not */
     double linear_excess_H;                 /* (g(i) - Lu i) / i without the exponential part: La - Lu or Ls - Lu */
     double saturating_Wb;                   /* A; from here to the table only in the saturating form */
     double saturation_1_A;                  /* b */
-    double saturation_A;                    /* 1 / b */
     double initial_slope_H;                 /* A b */
     double decay_step_A, decay_steps_per_A; /* a power of two, at most 1 / (64 b) */
     double decay[MAGNETICS_DECAY_STEPS];    /* e^(-b i) at multiples of the step */
     double pitch_rad, pitches_per_rad;
     double electrical_per_mechanical; /* Nr */
     double flat_rad, blend_rad, slope_1_rad, curvature_1_rad2;
+    const flux_map_t *map;
+    double map_steps_1_rad, map_steps_1_A;
 } magnetics_model_t;
 
 /* One operating point. */
@@ -80,8 +93,8 @@ double magnetics_field_energy_J(const magnetics_model_t *model, double phase_ang
 #define MAGNETICS_SMOOTH_TOLERANCE_RAD 1e-6
 
 /* How far the angle may move from phase_angle_rad in a direction (+1 or -1) before f loses smoothness (a jump of its
- * second or third derivative), mechanical rad, > 0; infinite for the cosine. An integrator that ends a step there keeps
- * its order. */
+ * second or third derivative), mechanical rad, > 0; infinite for the cosine, and for a map, whose jumps are many and
+ * small. An integrator that ends a step there keeps its order. */
 double magnetics_smooth_distance_rad(const magnetics_model_t *model, double phase_angle_rad, double direction);
 
 #endif

@@ -1,5 +1,5 @@
 /* The inner loop of the plant: magnetics_evaluate to be inlined into the integrator, where a call costs as much as the
- * arithmetic. Only magnetics.c and plant.c include it; everybody else calls magnetics.h.
+ * arithmetic. Only magnetics.c and plant.c include it, and sensors.c for its sine; everybody else calls magnetics.h.
  *
  * Exponential and cosine are computed here and not by libm, whose results differ in the last bit between processors
  * (it picks a variant with fused multiply-add where there is one): equal inputs must give equal bits anywhere. */
@@ -9,9 +9,8 @@
 #include <math.h>
 #include <stdint.h>
 
+#include "plant/flux_map_kernel.h"
 #include "plant/magnetics.h"
-
-#define MAGNETICS_INLINE static inline __attribute__((always_inline))
 
 /* Adding and subtracting it rounds to the nearest integer, for magnitudes below 2^51. */
 #define MAGNETICS_ROUNDING_SHIFT 0x1.8p52
@@ -76,12 +75,17 @@ MAGNETICS_INLINE void magnetics_kernel_trapezoid(const magnetics_model_t *model,
     }
 }
 
+/* The same phase angle within -half a pitch .. half a pitch. */
+MAGNETICS_INLINE double magnetics_kernel_wrap(const magnetics_model_t *model, double phase_angle_rad) {
+    const double pitches =
+        (phase_angle_rad * model->pitches_per_rad + MAGNETICS_ROUNDING_SHIFT) - MAGNETICS_ROUNDING_SHIFT;
+    return phase_angle_rad - pitches * model->pitch_rad;
+}
+
 /* f at any phase angle. `form` is the model's, apart so that a caller that knows it gets nothing of the others. */
 MAGNETICS_INLINE void magnetics_kernel_shape(const magnetics_model_t *model, magnetics_form_t form,
                                              double phase_angle_rad, double ahead_rad, magnetics_shape_t *shape) {
-    const double pitches =
-        (phase_angle_rad * model->pitches_per_rad + MAGNETICS_ROUNDING_SHIFT) - MAGNETICS_ROUNDING_SHIFT;
-    const double wrapped_rad = phase_angle_rad - pitches * model->pitch_rad; /* -half a pitch .. half a pitch */
+    const double wrapped_rad = magnetics_kernel_wrap(model, phase_angle_rad);
     if (form == MAGNETICS_LINEAR_COSINE) {
         double sine, cosine;
         magnetics_kernel_sine_cosine(model->electrical_per_mechanical * wrapped_rad, &sine, &cosine);
@@ -105,6 +109,11 @@ MAGNETICS_INLINE void magnetics_kernel_shape(const magnetics_model_t *model, mag
 /* See magnetics_evaluate; `form` and `ahead_rad` as above. */
 MAGNETICS_INLINE void magnetics_kernel(const magnetics_model_t *model, magnetics_form_t form, double phase_angle_rad,
                                        double current_A, double ahead_rad, magnetics_point_t *point) {
+    if (form == MAGNETICS_MAP) {
+        double coenergy_J;
+        flux_map_kernel(model, magnetics_kernel_wrap(model, phase_angle_rad), current_A, point, &coenergy_J);
+        return;
+    }
     magnetics_shape_t shape;
     magnetics_kernel_shape(model, form, phase_angle_rad, ahead_rad, &shape);
     /* g(i) - Lu i, its slope and the slope of that, and its integral W(i) */

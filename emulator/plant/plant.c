@@ -9,7 +9,7 @@
  * against SciPy's DOP853 at a tolerance of 1e-12: 5e-7) at the speeds and currents of a drive. A whole control period
  * at 40 kHz is one step where nothing happens in it. */
 #define STEP_MAX_S 25e-6
-/* Of the saturation current 1/b: limits the change of the incremental inductance. */
+/* Of the magnetics' saturation_A: limits the change of the incremental inductance. */
 #define STEP_CURRENT_FRACTION 0.1
 #define STEP_ANGLE_PITCHES 0.0015
 
@@ -60,10 +60,9 @@ void plant_set_supply_voltage(plant_t *plant, double voltage_V) {
 
 void plant_set_step_factor(plant_t *plant, double factor) {
     const machine_t *machine = plant->machine;
-    const double least_inductance_H =
-        plant->magnetics.unaligned_inductance_H + fmin(0.0, plant->magnetics.linear_excess_H);
-    double time_constant_s = fmin(least_inductance_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
-                                  machine->inertia_kg_m2 / machine->friction_Nm_s);
+    double time_constant_s =
+        fmin(plant->magnetics.least_inductance_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
+             machine->inertia_kg_m2 / machine->friction_Nm_s);
     if (has_link(plant)) {
         const dc_link_t *link = &machine->dc_link;
         time_constant_s = fmin(time_constant_s, link->source_resistance_ohm * link->capacitance_F);
@@ -73,10 +72,7 @@ void plant_set_step_factor(plant_t *plant, double factor) {
     }
     plant->step_max_s = factor * fmin(STEP_MAX_S, STEP_TIME_CONSTANTS * time_constant_s);
     plant->step_angle_rad = factor * STEP_ANGLE_PITCHES * plant->magnetics.pitch_rad;
-    plant->step_current_A = INFINITY;
-    if (machine->magnetics.form == MAGNETICS_SATURATING) {
-        plant->step_current_A = factor * STEP_CURRENT_FRACTION * plant->magnetics.saturation_A;
-    }
+    plant->step_current_A = factor * STEP_CURRENT_FRACTION * plant->magnetics.saturation_A;
 }
 
 /* --- Switches --- */

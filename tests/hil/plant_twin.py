@@ -20,6 +20,8 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from salient.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS
+
 ROOT = Path(__file__).resolve().parents[2]
 PHASES_MAX = 4
 TICK_NS = 5
@@ -27,6 +29,15 @@ FORMS = ("linear_cosine", "linear_trapezoid", "saturating")
 
 
 # --- The plant, through its shared library ---
+
+
+class FluxMap(ctypes.Structure):
+    _fields_ = [
+        ("current_max_A", ctypes.c_double),
+        ("least_inductance_H", ctypes.c_double),
+        ("current_scale_A", ctypes.c_double),
+        ("coenergy_J", (ctypes.c_double * (ANGLE_INTERVALS + 3)) * (CURRENT_INTERVALS + 4)),
+    ]
 
 
 class Magnetics(ctypes.Structure):
@@ -39,6 +50,7 @@ class Magnetics(ctypes.Structure):
         ("saturated_inductance_H", ctypes.c_double),
         ("flux_linkage_max_Wb", ctypes.c_double),
         ("current_at_flux_linkage_max_A", ctypes.c_double),
+        ("map", ctypes.POINTER(FluxMap)),
     ]
 
 

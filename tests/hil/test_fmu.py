@@ -19,9 +19,11 @@ from fmpy.model_description import ModelDescription
 from fmpy.validation import validate_fmu
 from plant_twin import Compare, Machine, Magnetics, State, load_library
 
-from salient.machine import FORMS, load_machine, machine_path
+from salient.machine import load_machine, machine_path
+from salient.magnetics import FORMULA_KEYS
 from salient.paths import ROOT
 
+FORMS = tuple(FORMULA_KEYS)  # and the names of the shipped machines
 OUTPUTS = (
     "current_a_A",
     "current_b_A",

@@ -149,7 +149,7 @@ def deck(form: str, machine: Machine, run: Run) -> str:
         "rotor_poles": machine.rotor_poles,
         "speed_rad_s": run.speed_rad_s,
         "start_angle_deg": run.angle_deg,
-        **{name: getattr(machine.magnetics, name) for name, _ in Magnetics._fields_ if name != "form"},
+        **{name: getattr(machine.magnetics, name) for name, kind in Magnetics._fields_ if kind is ctypes.c_double},
     }
     upper_pulses, lower_pulses = gate_pulses(run)
     end_ns = len(run.compares) * run.period_ns

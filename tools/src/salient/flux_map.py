@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -63,6 +64,8 @@ class FluxMap:
     """Beyond it the flux linkage goes on straight."""
     coefficients_J: np.ndarray
     """Of the co-energy's B-splines: (CURRENT_INTERVALS + 4, ANGLE_INTERVALS + 3)."""
+    file: Path | None = None
+    """Where the points came from."""
 
     form = "map"
 

@@ -10,6 +10,7 @@ with currents of its own. A row of 0 A may be left out.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
@@ -42,9 +43,10 @@ def load_flux_map(path: Path, rotor_poles: int) -> FluxMap:
     """The model of a CSV file's map. FluxMapError, one line with the file and where possible its line, when the file
     cannot be used."""
     try:
-        return fit(_curves(_points(_text(path)), math.pi / rotor_poles), rotor_poles)
+        model = fit(_curves(_points(_text(path)), math.pi / rotor_poles), rotor_poles)
     except FluxMapError as error:
         raise FluxMapError(f"{path}: {error}") from None
+    return replace(model, file=path)
 
 
 def _text(path: Path) -> str:

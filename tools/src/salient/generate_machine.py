@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from salient.flux_map import FluxMap
 from salient.machine import Machine, MachineError, load_machine
 
 # As in firmware/control/machine_tables.h.
@@ -58,14 +59,20 @@ def tables_source(machine: Machine) -> str:
 
 def plant_source(machine: Machine) -> str:
     """C source of the emulator's machine, every number to the last bit."""
-    def members(values: dict[str, float] | None) -> list[str]:
-        return [f"        .{key} = {value!r}," for key, value in (values or {}).items()]
-
+    magnetics = machine.magnetics
+    if isinstance(magnetics, FluxMap):
+        flux_map = [*_flux_map_lines(magnetics), ""]
+        magnetics_lines = _members({"unaligned_inductance_H": magnetics.unaligned_inductance_H})
+        magnetics_lines += ["        .map = &flux_map,"]
+    else:
+        flux_map = []
+        magnetics_lines = _members(magnetics.parameters)
     return "\n".join(
         [
             f"/* Generated from the machine file of '{machine.name}'. */",
             '#include "plant/machine.h"',
             "",
+            *flux_map,
             "const machine_t machine_plant = {",
             f'    .name = "{machine.name}",',
             f"    .stator_poles = {machine.stator_poles},",
@@ -76,22 +83,40 @@ def plant_source(machine: Machine) -> str:
             f"    .friction_Nm_s = {machine.friction_Nm_s!r},",
             f"    .supply_voltage_V = {machine.supply_voltage_V!r},",
             "    .magnetics = {",
-            f"        .form = MAGNETICS_{machine.magnetics.form.upper()},",
-            *members(machine.magnetics.parameters),
+            f"        .form = MAGNETICS_{magnetics.form.upper()},",
+            *magnetics_lines,
             "    },",
             "    .converter = {",
-            *members(machine.converter),
+            *_members(machine.converter),
             "    },",
             "    .dc_link = {",
-            *members(machine.dc_link or {"capacitance_F": 0.0}),
+            *_members(machine.dc_link or {"capacitance_F": 0.0}),
             "    },",
             "    .sensors = {",
-            *members(machine.sensors),
+            *_members(machine.sensors),
             "    },",
             "};",
             "",
         ]
     )
+
+
+def _members(values: dict[str, float]) -> list[str]:
+    return [f"        .{key} = {value!r}," for key, value in values.items()]
+
+
+def _flux_map_lines(flux_map: FluxMap) -> list[str]:
+    least_inductance_H, _, _, current_scale_A = flux_map.inductance_extremes()
+    return [
+        "static const flux_map_t flux_map = {",
+        f"    .current_max_A = {flux_map.current_max_A!r},",
+        f"    .least_inductance_H = {least_inductance_H!r},",
+        f"    .current_scale_A = {current_scale_A!r},",
+        "    .coenergy_J = {",
+        *("        {" + ", ".join(map(repr, row)) + "}," for row in flux_map.coefficients_J.tolist()),
+        "    },",
+        "};",
+    ]
 
 
 def main(arguments: list[str]) -> int:
@@ -107,7 +132,15 @@ def main(arguments: list[str]) -> int:
     out.mkdir(parents=True, exist_ok=True)
     (out / "machine_tables.c").write_text(tables_source(machine), encoding="utf-8")
     (out / "machine_plant.c").write_text(plant_source(machine), encoding="utf-8")
+    outputs = " ".join(_escaped(out / name) for name in ("machine_tables.c", "machine_plant.c"))
+    inputs = _escaped(machine.magnetics.file) if isinstance(machine.magnetics, FluxMap) else ""
+    (out / "machine.d").write_text(f"{outputs}: {inputs}\n", encoding="utf-8")
     return 0
+
+
+def _escaped(path: Path) -> str:
+    """For a dependency file, as make reads it."""
+    return str(path).replace(" ", "\\ ")
 
 
 if __name__ == "__main__":
