@@ -1,9 +1,9 @@
 """The emulated plant against ngspice: one phase on its asymmetric half bridge, at constant speed.
 
-A check by a tool that is not ours: ngspice solves a circuit of switch and diode elements (spice/half_bridge.cir) with
+A check by a tool that is not ours: ngspice solves a circuit of switch and diode elements (half_bridge.cir) with
 its own integration; commutation and the end of conduction follow from the elements, the flux linkage from behavioural
-sources (spice/<form>.cir). Both sides get the numbers of the shipped machines and the same switch edges, over two
-electrical periods. The plant's speed is held by a huge inertia.
+sources (netlists: tools/src/salient/spice). Both sides get the numbers of the shipped machines and the same switch
+edges, over two electrical periods. The plant's speed is held by a huge inertia.
 
 Deviations are relative to the largest magnitude in the run. Measured with ngspice 39: current at most 3.9e-4, flux
 linkage 8.2e-5 (soft chopping of the saturating machine), without saturation 3.2e-5 and 4.7e-5; half the step of ngspice
@@ -14,19 +14,18 @@ from __future__ import annotations
 
 import ctypes
 import math
-import shutil
-import subprocess
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from plant_twin import FORMS, TICK_NS, Compares, Machine, Magnetics, Run, load_library, run_plant
 
+from salient import machine as machine_file
+from salient import ngspice
 from salient.machine import SHIPPED, load_machine
 
-SPICE = Path(__file__).resolve().parent / "spice"
 PERIOD_TICKS = 1000  # 100 kHz: hard chopping is by whole periods
 ELECTRICAL_PERIODS = 2
 SAMPLE_NS = 1000
@@ -89,8 +88,8 @@ def library() -> ctypes.CDLL:
     return load_library()
 
 
-def machine_of(form: str) -> Machine:
-    shipped = load_machine(SHIPPED / f"{form}.toml")
+def machine_of(shipped: machine_file.Machine) -> Machine:
+    """The plant's machine, its speed held."""
     return Machine(
         name=shipped.name.encode(),
         stator_poles=shipped.stator_poles,
@@ -141,46 +140,31 @@ def gate_source(name: str, pulses: Sequence[Sequence[int]]) -> list[str]:
     return [*lines, "+ )"]
 
 
-def deck(form: str, machine: Machine, run: Run) -> str:
-    """A complete netlist; the circuit itself is in the included files."""
-    numbers = {
-        "resistance_ohm": machine.resistance_ohm,
-        "supply_voltage_V": machine.supply_voltage_V,
-        "rotor_poles": machine.rotor_poles,
-        "speed_rad_s": run.speed_rad_s,
-        "start_angle_deg": run.angle_deg,
-        **{name: getattr(machine.magnetics, name) for name, kind in Magnetics._fields_ if kind is ctypes.c_double},
-    }
+def deck(machine: machine_file.Machine, run: Run) -> list[str]:
+    """A complete netlist; the phase itself is in the included files."""
     upper_pulses, lower_pulses = gate_pulses(run)
     end_ns = len(run.compares) * run.period_ns
-    lines = [
-        f"One phase, {form}",
-        *(f".param {name} = {value!r}" for name, value in numbers.items()),
+    return [
+        f"One phase, {machine.magnetics.form}",
+        *ngspice.machine_lines(machine, "half_bridge"),
         *gate_source("upper", upper_pulses),
         *gate_source("lower", lower_pulses),
-        f'.include "{SPICE / f"{form}.cir"}"',
-        f'.include "{SPICE / "half_bridge.cir"}"',
+        "Xphase dc gate_upper gate_lower turns phase",
+        f"Bturns turns 0 V = ({run.angle_deg!r} / 360 + {run.speed_rad_s!r} * time / (2 * pi)) * rotor_poles",
+        ngspice.OPTIONS,
+        ".save i(v.xphase.vcurrent) v(xphase.flux_linkage)",
         f".tran {SPICE_STEP_NS}n {end_ns}n 0 {SPICE_STEP_NS}n",
         ".end",
     ]
-    return "\n".join(lines) + "\n"
 
 
-def spice_waveforms(folder: Path, netlist: str) -> Waveforms:
+def spice_waveforms(folder: Path, netlist: list[str]) -> Waveforms:
     """At the time points that ngspice chose."""
-    if shutil.which("ngspice") is None:
-        pytest.fail("ngspice is missing: install the Debian package ngspice", pytrace=False)
-    (folder / "deck.cir").write_text(netlist)
-    command = ["ngspice", "--batch", "--no-spiceinit", "--rawfile=deck.raw", "deck.cir"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=NGSPICE_TIMEOUT_S)
-    said = done.stdout + done.stderr
-    raw = folder / "deck.raw"
-    if done.returncode != 0 or not raw.exists() or "aborted" in said:
-        pytest.fail(f"ngspice failed on {folder / 'deck.cir'}:\n{said[-2000:]}", pytrace=False)
-    header, _, values = raw.read_bytes().partition(b"Binary:\n")
-    variables = header.decode().partition("Variables:\n")[2].split()[1::3]
-    columns = dict(zip(variables, np.frombuffer(values).reshape(-1, len(variables)).T, strict=True))
-    return Waveforms(columns["time"], columns["i(vcurrent)"], columns["v(flux_linkage)"])
+    try:
+        found = ngspice.run(folder, netlist, NGSPICE_TIMEOUT_S)
+    except ngspice.NgspiceError as error:
+        pytest.fail(str(error), pytrace=False)
+    return Waveforms(found.time_s, found.values["i(v.xphase.vcurrent)"], found.values["v(xphase.flux_linkage)"])
 
 
 # --- The tests ---
@@ -205,10 +189,10 @@ def conduction_ends_s(waveforms: Waveforms) -> np.ndarray:
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_current_and_flux_linkage_agree(library: ctypes.CDLL, tmp_path: Path, pattern: str, form: str) -> None:
-    machine = machine_of(form)
+    shipped = load_machine(SHIPPED / f"{form}.toml")
+    machine = machine_of(shipped)
     run = run_of(machine, pattern)
-    netlist = deck(form, machine, run)
-    expected = spice_waveforms(tmp_path, netlist)
+    expected = spice_waveforms(tmp_path, deck(shipped, run))
     measured = plant_waveforms(library, machine, run)
 
     # Enough was compared.
@@ -231,8 +215,11 @@ def test_current_and_flux_linkage_agree(library: ctypes.CDLL, tmp_path: Path, pa
 
 def test_a_wrong_number_is_seen(library: ctypes.CDLL, tmp_path: Path) -> None:
     """The comparison is sharp: an unaligned inductance 1 % too large in ngspice alone breaks the bound."""
-    machine, wrong = machine_of("saturating"), machine_of("saturating")
-    wrong.magnetics.unaligned_inductance_H *= 1.01
+    shipped = load_machine(SHIPPED / "saturating.toml")
+    right = shipped.magnetics.parameters
+    wrong = {**right, "unaligned_inductance_H": 1.01 * right["unaligned_inductance_H"]}
+    machine = machine_of(shipped)
     run = run_of(machine, "single_pulse")
-    expected = spice_waveforms(tmp_path, deck("saturating", wrong, run))
+    netlist = deck(replace(shipped, magnetics=replace(shipped.magnetics, parameters=wrong)), run)
+    expected = spice_waveforms(tmp_path, netlist)
     assert deviation(plant_waveforms(library, machine, run), expected)["current_A"] > BOUND

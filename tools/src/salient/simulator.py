@@ -28,7 +28,8 @@ class SimulatorOptions:
     """What a drive and its bench are started with; the executable checks the values.
 
     machine: a shipped machine's name or a machine file's path. encoder_bits 0: ideal. record: file for the true state
-    (.npy), every record_step_ns from record_from_us on. build: host or sanitize.
+    (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
+    period. build: host or sanitize.
     """
 
     machine: str = "saturating"
@@ -42,6 +43,7 @@ class SimulatorOptions:
     record: Path | None = None
     record_step_ns: int = 1000
     record_from_us: int = 0
+    record_switches: Path | None = None
     build: str = "host"
 
     def arguments(self, can: str) -> list[str]:
@@ -55,6 +57,8 @@ class SimulatorOptions:
         if self.record is not None:
             line += ["--record", str(self.record), "--record-step-ns", str(self.record_step_ns)]
             line += ["--record-from-us", str(self.record_from_us)]
+        if self.record_switches is not None:
+            line += ["--record-switches", str(self.record_switches)]
         return line
 
 
@@ -155,7 +159,7 @@ class Simulator:
 def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
     on the bus of an experiment."""
-    return _parameter_table(replace(options, record=None, pace="lockstep"))
+    return _parameter_table(replace(options, record=None, record_switches=None, pace="lockstep"))
 
 
 @lru_cache
