@@ -90,7 +90,7 @@ double magnetics_coenergy_J(const magnetics_model_t *model, double phase_angle_r
 double magnetics_field_energy_J(const magnetics_model_t *model, double phase_angle_rad, double current_A);
 
 /* A place where f loses smoothness counts as passed when it is nearer than this. */
-#define MAGNETICS_SMOOTH_TOLERANCE_RAD 1e-6
+#define MAGNETICS_SMOOTH_TOLERANCE_RAD 1e-8
 
 /* How far the angle may move from phase_angle_rad in a direction (+1 or -1) before f loses smoothness (a jump of its
  * second or third derivative), mechanical rad, > 0; infinite for the cosine, and for a map, whose jumps are many and

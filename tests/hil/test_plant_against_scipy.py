@@ -1,14 +1,12 @@
 """The emulated plant against an independent integration of the same equations (plant_twin.py) on the shipped machines.
 
 Deviations are relative to the largest magnitude of the quantity in the run (speed: to its change). Measured on x86-64
-with gcc 12: at most 4.7e-7 (the start of the saturating machine), 1.8e-6 for samples within steps; a sixteenth of that
-with steps of half the length.
+with gcc 12: at most 9e-7 (the speed in the chopping of the saturating machine), also for samples within steps.
 """
 
 from __future__ import annotations
 
 import ctypes
-import itertools
 import math
 from dataclasses import replace
 
@@ -143,7 +141,7 @@ def deviation(measured: Trace, expected: Trace) -> dict[str, float]:
 
 NAMES = ("start", "chopping", "single_pulse")
 BOUND = 2e-6
-SAMPLE_BOUND = 5e-6  # cubic interpolation between the ends of a step
+SAMPLE_BOUND = 3e-6  # cubic interpolation between the ends of a step
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -197,6 +195,6 @@ def test_error_falls_with_the_fourth_power_of_the_step(library: ctypes.CDLL, for
     # Long periods, so that the step's limits decide and not the switch edges.
     machine, run = machine_of(form), single_pulse(full=40_000, driven_ns=800_000)
     expected, _ = run_reference(machine, run)
-    errors = [max(deviation(run_plant(library, machine, run, factor)[0], expected).values()) for factor in (4, 2, 1)]
-    for coarse, fine in itertools.pairwise(errors):
-        assert 10.0 < coarse / fine < 26.0, errors
+    # Over three halvings: the number of whole steps between two switch edges makes each of them irregular.
+    coarse, fine = (max(deviation(run_plant(library, machine, run, factor)[0], expected).values()) for factor in (4, 0.5))
+    assert 3.4 < math.log(coarse / fine, 8) < 4.4, (coarse, fine)

@@ -140,8 +140,8 @@ class Link : public testing::Test {
     // Of both ledgers, J.
     double missing_J() const {
         const double net_J = plant.energy_drawn_J - plant.energy_returned_J;
-        const double machine_J = net_J - plant.energy_copper_J - plant.energy_converter_J -
-                                 (plant_field_energy_J(&plant) - field_J);
+        const double machine_J =
+            net_J - plant.energy_copper_J - plant.energy_converter_J - (plant_field_energy_J(&plant) - field_J);
         const double supply_J = plant.energy_supplied_J - plant.energy_source_J - plant.energy_chopper_J - net_J -
                                 (plant_link_energy_J(&plant) - link_J);
         return std::fabs(machine_J) + std::fabs(supply_J);
