@@ -19,10 +19,11 @@ static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithme
 
 /* Nearest 32-bit number. */
 static inline int32_t fixed_saturate(int64_t value) {
-    if (value > INT32_MAX) {
-        return INT32_MAX;
+    const int32_t low_word = (int32_t)value;
+    if (low_word == value) {
+        return low_word;
     }
-    return value < INT32_MIN ? INT32_MIN : (int32_t)value;
+    return value < 0 ? INT32_MIN : INT32_MAX;
 }
 
 static inline int32_t fixed_clamp(int32_t value, int32_t low, int32_t high) {
@@ -34,11 +35,19 @@ static inline int32_t fixed_clamp(int32_t value, int32_t low, int32_t high) {
 
 /* Saturating sum and difference. */
 static inline int32_t fixed_add(int32_t a, int32_t b) {
-    return fixed_saturate((int64_t)a + b);
+    int32_t sum;
+    if (__builtin_add_overflow(a, b, &sum)) {
+        return a < 0 ? INT32_MIN : INT32_MAX;
+    }
+    return sum;
 }
 
 static inline int32_t fixed_subtract(int32_t a, int32_t b) {
-    return fixed_saturate((int64_t)a - b);
+    int32_t difference;
+    if (__builtin_sub_overflow(a, b, &difference)) {
+        return a < 0 ? INT32_MIN : INT32_MAX;
+    }
+    return difference;
 }
 
 /* Magnitude; INT32_MIN gives INT32_MAX. */
