@@ -28,8 +28,9 @@ typedef struct {
     unsigned outgoing;              /* of the others the last to enter that is still available; COMMUTATION_NONE */
 } commutation_t;
 
-/* Angles and roles for a rotor angle in 2^-32 mechanical turn; 1 <= phases <= HAL_PHASES_MAX. */
-commutation_t commutation_at(const commutation_parameters_t *parameters, unsigned phases, unsigned rotor_poles,
-                             uint32_t rotor_angle);
+/* Angles (of the first `phases`) and roles for a rotor angle in 2^-32 mechanical turn; 1 <= phases <= HAL_PHASES_MAX.
+ */
+void commutation_find(const commutation_parameters_t *parameters, unsigned phases, unsigned rotor_poles,
+                      uint32_t rotor_angle, commutation_t *commutation);
 
 #endif

@@ -36,7 +36,7 @@ static estimate_t estimate(const control_parameters_t *parameters, const control
     const unsigned shift = parameters->encoder_shift;
     e.angle = (sample->encoder_counts << shift) + (shift > 0 ? 1u << (shift - 1) : 0u);
     e.bus_voltage_q6 = sample->adc.bus_voltage_counts * BUS_VOLTAGE_Q6_PER_COUNT;
-    e.commutation = commutation_at(&parameters->commutation, tables->phases, tables->rotor_poles, e.angle);
+    commutation_find(&parameters->commutation, tables->phases, tables->rotor_poles, e.angle, &e.commutation);
     for (unsigned phase = 0; phase < tables->phases; phase++) {
         const int32_t current_q9 = sample->adc.phase_current_counts[phase] * CURRENT_Q9_PER_COUNT;
         e.current_q9[phase] = current_q9;

@@ -21,6 +21,13 @@ commutation_parameters_t parameters_of(double on_deg, double off_deg, double out
     return {electrical(on_deg), electrical(off_deg), electrical(outgoing_off_deg)};
 }
 
+commutation_t commutation_at(const commutation_parameters_t *parameters, unsigned phases, unsigned rotor_poles,
+                             uint32_t angle) {
+    commutation_t commutation{};
+    commutation_find(parameters, phases, rotor_poles, angle, &commutation);
+    return commutation;
+}
+
 // The paper's angles of a 6/4 machine, 45, 75 and 87 degrees mechanical.
 const commutation_parameters_t PAPER = parameters_of(180.0, 300.0, 348.0);
 

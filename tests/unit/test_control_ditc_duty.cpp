@@ -23,6 +23,13 @@ uint32_t electrical(double degrees) {
 
 const commutation_parameters_t ANGLES = {electrical(180.0), electrical(300.0), electrical(348.0)};
 
+commutation_t commutation_at(const commutation_parameters_t *parameters, unsigned phases, unsigned rotor_poles,
+                             uint32_t angle) {
+    commutation_t commutation{};
+    commutation_find(parameters, phases, rotor_poles, angle, &commutation);
+    return commutation;
+}
+
 // Rotor angle at which phase 0 of the 6/4 machine is at an electrical angle.
 commutation_t commutation_of(double phase_0_deg) {
     return commutation_at(&ANGLES, 3, 4, electrical(phase_0_deg) / 4u);
