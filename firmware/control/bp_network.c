@@ -49,8 +49,8 @@ void bp_network_forward(bp_network_t *network, const int32_t input_q15[BP_INPUTS
 }
 
 /* Moves the weights of one neuron: eta d (Q30) times value (Q15) is Q45, to Q28; inertia Q28 * Q15, to Q28. */
-static void move_weights(int32_t *weight_q28, int32_t *change_q28, const int32_t *value_q15, unsigned count,
-                         int64_t rate_delta_q30, int32_t inertia_q15) {
+static void move_weights(int32_t *restrict weight_q28, int32_t *restrict change_q28, const int32_t *restrict value_q15,
+                         unsigned count, int64_t rate_delta_q30, int32_t inertia_q15) {
     for (unsigned k = 0; k < count; k++) {
         const int64_t gradient_q28 = fixed_shift(rate_delta_q30 * value_q15[k], 17);
         const int64_t inertia_q28 = fixed_shift((int64_t)change_q28[k] * inertia_q15, 15);

@@ -35,13 +35,15 @@ static const int16_t symmetric_q15[STEPS + 1] = {
 };
 
 int32_t sigmoid_symmetric_q15(int32_t x_q12) {
-    const uint32_t magnitude = x_q12 < 0 ? 0u - (uint32_t)x_q12 : (uint32_t)x_q12;
+    /* -1 or 0. A branch on the sign of a neuron's sum is one that no processor can predict. */
+    const int32_t sign = x_q12 >> 31;
+    const uint32_t magnitude = ((uint32_t)x_q12 ^ (uint32_t)sign) - (uint32_t)sign;
     const uint32_t index = magnitude >> STEP_BITS_Q12;
     int32_t value = symmetric_q15[STEPS];
     if (index < STEPS) {
         value = interpolate_linear(symmetric_q15, index, magnitude & ((1u << STEP_BITS_Q12) - 1u), STEP_BITS_Q12);
     }
-    return x_q12 < 0 ? -value : value;
+    return (value ^ sign) - sign;
 }
 
 int32_t sigmoid_symmetric_slope_q15(int32_t f_q15) {
