@@ -317,26 +317,31 @@ static bool stop_requested(rig_t *rig) {
     return rig->config.stop.requested && rig->config.stop.requested(rig->config.stop.context);
 }
 
-static void wait_for_clients(rig_t *rig, int timeout_ms) {
+/* Asks when RIG_STOP_STEP_NS have passed since it last did. */
+static bool stop_requested_by_now(rig_t *rig) {
+    return rig->board.time_ns - rig->stop_asked_ns >= RIG_STOP_STEP_NS && stop_requested(rig);
+}
+
+/* True when one of the descriptors that say when to end became readable. */
+static bool wait_for_clients(rig_t *rig, int timeout_ms) {
     struct pollfd list[TRANSPORT_DESCRIPTORS_MAX + 2];
     size_t count = transport_descriptors(rig->config.transport, list);
     for (unsigned i = 0; i < 2; ++i) {
         list[count++] = (struct pollfd){.fd = rig->config.stop.descriptors[i], .events = POLLIN};
     }
-    poll(list, count, timeout_ms);
+    return poll(list, count, timeout_ms) > 0 && (list[count - 1].revents || list[count - 2].revents);
 }
 
 static bool serve_lockstep(rig_t *rig, int timeout_ms) {
     if (rig->run_count == 0) {
         transport_flush(rig->config.transport);
-        wait_for_clients(rig, timeout_ms);
-        return !stop_requested(rig);
+        return !(wait_for_clients(rig, timeout_ms) && stop_requested(rig));
     }
     submit_staged(rig);
     uint64_t target_ns = rig->runs[0].time_ns;
     while (rig->board.time_ns < target_ns) {
-        advance(rig, earlier(target_ns, rig->board.time_ns + RIG_STOP_STEP_NS));
-        if (rig->config.transport->failure || stop_requested(rig)) {
+        advance(rig, earlier(target_ns, rig->stop_asked_ns + RIG_STOP_STEP_NS));
+        if (rig->config.transport->failure || stop_requested_by_now(rig)) {
             return false;
         }
     }
@@ -353,7 +358,7 @@ static bool serve_moving(rig_t *rig) {
         return false;
     }
     pacing_wait(&rig->config.pacing, rig->board.time_ns);
-    return rig->board.time_ns - rig->stop_asked_ns < RIG_STOP_STEP_NS || !stop_requested(rig);
+    return !stop_requested_by_now(rig);
 }
 
 bool rig_serve(rig_t *rig, int timeout_ms) {

@@ -69,8 +69,10 @@ static void disconnect(local_t *local, unsigned index, const char *reason) {
 
 static void local_flush(transport_t *transport);
 
+/* Asks poll first: accept4 makes a file before it looks whether anyone waits, and is called for every frame. */
 static void accept_clients(local_t *local) {
-    for (;;) {
+    struct pollfd waiting = {.fd = local->listener, .events = POLLIN};
+    while (poll(&waiting, 1, 0) > 0) {
         int descriptor = accept4(local->listener, NULL, NULL, SOCK_NONBLOCK | SOCK_CLOEXEC);
         if (descriptor < 0) {
             return;

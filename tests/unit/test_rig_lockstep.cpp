@@ -199,6 +199,30 @@ TEST(RigLockstep, RunOfAClientThatLeftIsStillRun) {
     EXPECT_EQ(bench.rig->board.time_ns, 50 * MS);
 }
 
+TEST(RigLockstep, StopIsAskedForEachTenMillisecondsAndWhenItsDescriptorIsReadable) {
+    RigBench bench;
+    auto client = bench.connect();
+    int ends[2];
+    ASSERT_EQ(pipe(ends), 0);
+    unsigned asked = 0;
+    bench.rig->config.stop.descriptors[0] = ends[0];
+    bench.rig->config.stop.context = &asked;
+    bench.rig->config.stop.requested = [](void *context) { return ++*static_cast<unsigned *>(context) > 11; };
+    for (unsigned i = 1; i <= 100; ++i) {
+        bench.run_to(*client, i * MS);
+    }
+    EXPECT_EQ(asked, 10u) << "once in ten milliseconds, however short the runs";
+    bench.run_to(*client, 110 * MS);
+    EXPECT_EQ(asked, 11u);
+    ASSERT_TRUE(rig_serve(bench.rig.get(), 0));
+    EXPECT_EQ(asked, 11u) << "nothing passed, nothing readable";
+    ASSERT_EQ(write(ends[1], "x", 1), 1);
+    EXPECT_FALSE(rig_serve(bench.rig.get(), 0));
+    EXPECT_EQ(asked, 12u);
+    close(ends[0]);
+    close(ends[1]);
+}
+
 TEST(RigLockstep, FloodFillsTheReceiveQueueAndIsCounted) {
     RigBench bench;
     auto client = bench.connect();
