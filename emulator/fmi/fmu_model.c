@@ -18,6 +18,7 @@ static void set_switches(fmu_model_t *model) {
 static void update_outputs(fmu_model_t *model) {
     fmu_values_t *values = &model->values;
     const plant_t *plant = &model->plant;
+    values->bus_voltage_V = plant->bus_voltage_V;
     values->bus_current_A = 0.0;
     for (unsigned phase = 0; phase < model->machine.phases; phase++) {
         values->current_A[phase] = plant->current_A[phase];
@@ -30,6 +31,8 @@ static void update_outputs(fmu_model_t *model) {
     values->rotor_angle_rad = plant->rotor_angle_rad;
     values->energy_drawn_J = plant->energy_drawn_J;
     values->energy_returned_J = plant->energy_returned_J;
+    values->energy_copper_J = plant->energy_copper_J;
+    values->energy_converter_J = plant->energy_converter_J;
 }
 
 void fmu_model_reset(fmu_model_t *model) {
@@ -52,6 +55,7 @@ void fmu_model_restart(fmu_model_t *model) {
     model->machine.resistance_ohm = values->resistance_ohm;
     model->machine.inertia_kg_m2 = values->inertia_kg_m2;
     model->machine.friction_Nm_s = values->friction_Nm_s;
+    model->machine.supply_voltage_V = values->supply_voltage_V; /* the link is charged to it */
     plant_init(&model->plant, &model->machine, values->initial_angle_rad);
     model->plant.speed_rad_s = values->initial_speed_rad_s;
     update_outputs(model);
@@ -60,7 +64,7 @@ void fmu_model_restart(fmu_model_t *model) {
 void fmu_model_advance(fmu_model_t *model, uint64_t to_ns) {
     set_switches(model);
     model->plant.load_torque_Nm = model->values.load_torque_Nm;
-    plant_set_supply_voltage(&model->plant, model->values.bus_voltage_V);
+    plant_set_supply_voltage(&model->plant, model->values.supply_voltage_V);
     plant_advance(&model->plant, to_ns);
     update_outputs(model);
 }

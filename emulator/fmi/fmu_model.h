@@ -16,7 +16,7 @@ typedef struct {
 
     /* Inputs, held over a step. */
     bool upper[HAL_PHASES_MAX], lower[HAL_PHASES_MAX];
-    double load_torque_Nm, bus_voltage_V;
+    double load_torque_Nm, supply_voltage_V;
 
     /* Parameters, fixed once the first step may be taken. */
     double initial_angle_rad, initial_speed_rad_s;
@@ -25,8 +25,8 @@ typedef struct {
     /* Outputs, of the end of the last step. */
     double current_A[HAL_PHASES_MAX];
     double torque_Nm, speed_rad_s, rotor_angle_rad;
-    double bus_current_A;
-    double energy_drawn_J, energy_returned_J;
+    double bus_voltage_V, bus_current_A;
+    double energy_drawn_J, energy_returned_J, energy_copper_J, energy_converter_J;
 } fmu_values_t;
 
 typedef enum { FMU_FLOAT64, FMU_BOOLEAN } fmu_type_t;

@@ -33,6 +33,9 @@ OUTPUTS = (
     "rotor_angle_rad",
     "energy_drawn_J",
     "energy_returned_J",
+    "energy_copper_J",
+    "energy_converter_J",
+    "bus_voltage_V",
 )
 SPEED_RAD_S = 100.0
 ANGLE_RAD = 0.9
@@ -53,10 +56,10 @@ def unit_path(name: str) -> Path:
 
 def chopping(steps: int, step_s: float) -> np.ndarray:
     """Each phase conducts for a third of a pitch, its lower switch on all the while, its upper one chopping; load and
-    link voltage move in ramps."""
+    supply voltage move in ramps."""
     names = [f"{side}_{letter}" for letter in "abc" for side in ("upper", "lower")]
     dtype = [("time", np.float64), *((name, np.bool_) for name in names)]
-    signals = np.zeros(steps + 1, [*dtype, ("load_torque_Nm", np.float64), ("bus_voltage_V", np.float64)])
+    signals = np.zeros(steps + 1, [*dtype, ("load_torque_Nm", np.float64), ("supply_voltage_V", np.float64)])
     count = np.arange(steps + 1)
     signals["time"] = count * step_s
     pitches = (ANGLE_RAD + SPEED_RAD_S * signals["time"]) / (np.pi / 2.0)
@@ -66,7 +69,7 @@ def chopping(steps: int, step_s: float) -> np.ndarray:
         signals[f"lower_{letter}"] = conducts
         signals[f"upper_{letter}"] = conducts & ((count + phase) % 7 < 4)
     signals["load_torque_Nm"] = 10.0 + 400.0 * signals["time"]
-    signals["bus_voltage_V"] = 240.0 - 1000.0 * signals["time"]
+    signals["supply_voltage_V"] = 240.0 - 1000.0 * signals["time"]
     return signals
 
 
@@ -93,12 +96,13 @@ def native(library: ctypes.CDLL, form: str, signals: np.ndarray, step_ns: int, i
     for index, inputs in enumerate(signals):
         library.plant_library_read(plant, ctypes.byref(state))
         rows.append((*state.current_A[:3], state.torque_Nm, state.speed_rad_s, state.rotor_angle_rad,
-                     state.energy_drawn_J, state.energy_returned_J))
+                     state.energy_drawn_J, state.energy_returned_J, state.energy_copper_J, state.energy_converter_J,
+                     state.bus_voltage_V))
         compare = Compare()
         for phase, letter in enumerate("abc"):
             compare.upper[phase] = int(inputs[f"upper_{letter}"])
             compare.lower[phase] = int(inputs[f"lower_{letter}"])
-        library.plant_library_set_inputs(plant, inputs["load_torque_Nm"], inputs["bus_voltage_V"])
+        library.plant_library_set_inputs(plant, inputs["load_torque_Nm"], inputs["supply_voltage_V"])
         library.plant_set_switches(plant, ctypes.byref(compare), 1)
         library.plant_advance(plant, (index + 1) * step_ns)
     library.plant_library_destroy(plant)
@@ -281,7 +285,7 @@ def test_communication_points_between_nanoseconds_do_not_add_up(units):
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (lambda unit: unit.set(bus_voltage_V=-1.0), "bus_voltage_V: -1 is not a finite number from 0 to inf"),
+        (lambda unit: unit.set(supply_voltage_V=-1.0), "supply_voltage_V: -1 is not a finite number from 0 to inf"),
         (lambda unit: unit.set(load_torque_Nm=float("nan")), "load_torque_Nm: nan is not a finite number"),
         (lambda unit: unit.set(inertia_kg_m2=0.01), "not allowed between steps"),
         (lambda unit: unit.set(torque_Nm=1.0), "torque_Nm is not an input or a parameter"),
@@ -298,9 +302,9 @@ def test_communication_points_between_nanoseconds_do_not_add_up(units):
 def test_what_is_refused_is_named_and_changes_nothing(units, action, message):
     with units(1) as (unit,):
         unit.start(stop_s=1.0, **START)
-        before = unit.get("time", "load_torque_Nm", "bus_voltage_V", *OUTPUTS)
+        before = unit.get("time", "load_torque_Nm", "supply_voltage_V", *OUTPUTS)
         assert message in unit.refusal(lambda: action(unit))
-        assert unit.get("time", "load_torque_Nm", "bus_voltage_V", *OUTPUTS) == before
+        assert unit.get("time", "load_torque_Nm", "supply_voltage_V", *OUTPUTS) == before
 
 
 def test_a_description_of_another_unit_is_refused(units):

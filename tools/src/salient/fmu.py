@@ -79,7 +79,8 @@ def variables(machine: Machine) -> list[Variable]:
         ),
         Variable("load_torque_Nm", "load_torque_Nm", "input", "load, positive against the forward direction", "N.m",
                  0.0),
-        Variable("bus_voltage_V", "bus_voltage_V", "input", "link voltage", "V", machine.supply_voltage_V, 0.0),
+        Variable("supply_voltage_V", "supply_voltage_V", "input", "of the source that feeds the link", "V",
+                 machine.supply_voltage_V, 0.0),
         Variable("initial_angle_rad", "initial_angle_rad", "parameter", "rotor angle at the start", "rad", 0.0),
         Variable("initial_speed_rad_s", "initial_speed_rad_s", "parameter", "speed at the start", "rad/s", 0.0),
         Variable("resistance_ohm", "resistance_ohm", "parameter", "of one phase winding", "Ohm",
@@ -96,10 +97,15 @@ def variables(machine: Machine) -> list[Variable]:
         Variable("torque_Nm", "torque_Nm", "output", "electromagnetic torque of all phases", "N.m"),
         Variable("speed_rad_s", "speed_rad_s", "output", "speed of the shaft", "rad/s"),
         Variable("rotor_angle_rad", "rotor_angle_rad", "output", "not wrapped; phase a is aligned at 0", "rad"),
+        Variable("bus_voltage_V", "bus_voltage_V", "output",
+                 "of the link: the supply's, unless the machine file has a capacitor", "V"),
         Variable("bus_current_A", "bus_current_A", "output",
                  "drawn from the link, at the end of the last step with the switches of that step", "A"),
         Variable("energy_drawn_J", "energy_drawn_J", "output", "drawn from the link since the start", "J"),
         Variable("energy_returned_J", "energy_returned_J", "output", "returned to the link since the start", "J"),
+        Variable("energy_copper_J", "energy_copper_J", "output", "lost in the windings since the start", "J"),
+        Variable("energy_converter_J", "energy_converter_J", "output",
+                 "lost in the half bridges' devices since the start", "J"),
     ]
 
 
