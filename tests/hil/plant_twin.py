@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
+import salient.flux_map
 from salient.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -155,6 +156,15 @@ def load_library() -> ctypes.CDLL:
         function.argtypes = arguments
         function.restype = pointer if name == "plant_library_create" else None
     return plant
+
+
+def flux_map_of(model: salient.flux_map.FluxMap) -> FluxMap:
+    """What the build generates from a machine file with a map."""
+    least_inductance_H, _, _, current_scale_A = model.inductance_extremes()
+    flux_map = FluxMap(model.current_max_A, least_inductance_H, current_scale_A)
+    for row, coefficients_J in zip(flux_map.coenergy_J, model.coefficients_J.tolist(), strict=True):
+        row[:] = coefficients_J
+    return flux_map
 
 
 # --- What is run ---
@@ -390,9 +400,11 @@ def stop_at(index: int, value: float) -> Stop:
     return stop
 
 
-def run_reference(machine: Machine, run: Run, sample_ns: int = 0) -> tuple[Trace, list[tuple[int, float]]]:
+def run_reference(
+    machine: Machine, run: Run, sample_ns: int = 0, reference: Reference | None = None
+) -> tuple[Trace, list[tuple[int, float]]]:
     """The reference's states at the same instants as run_plant's, and (phase, time in ns) of each end of conduction."""
-    reference, phases = Reference(machine), range(machine.phases)
+    reference, phases = reference or Reference(machine), range(machine.phases)
     y = np.array([0.0 for _ in phases] + [run.speed_rad_s, math.radians(run.angle_deg)])
     for phase, current_A in enumerate(run.currents_A):
         f, _ = reference.shape(reference.phase_angle(y[-1], phase))

@@ -10,7 +10,7 @@ From the points to the potential, all in plain NumPy element by element (no BLAS
 
 1. over the current, at each angle: the cubic spline through the points and through (0 A, 0 Wb), with the slopes at its
    knots limited so that it rises where the points rise (J. M. Hyman, "Accurate monotonicity preserving cubic
-   interpolation", SIAM J. Sci. Stat. Comput. 4(4), 1983; the limit is Fritsch and Carlson's), read at equal steps;
+   interpolation", SIAM J. Sci. Stat. Comput. 4(4), 1983), read at equal steps;
 2. over the angle, at each of those currents: the same, with no slope at the ends, where the machine is symmetric;
 3. the twice continuous spline through that uniform grid, and its integral over the current.
 
@@ -30,6 +30,11 @@ import numpy as np
 # As in emulator/plant/flux_map.h.
 ANGLE_INTERVALS = 96
 CURRENT_INTERVALS = 64
+
+# Of the slope at a knot, times the flatter chord beside it. Up to 3 the cubic between two knots has no turning point;
+# from a quarter to 2 its slope stays above a quarter of the flattest chord: the inductance is to be > 0.
+ANGLE_LIMITS = (0.0, 3.0)
+CURRENT_LIMITS = (0.25, 2.0)
 
 # Allowed, as fractions. Measured maps repeat themselves within a percent or so; a mistake in the file is larger.
 MIRROR_TOLERANCE = 0.02  # between the halves of a whole pitch, of the map's greatest flux linkage
@@ -107,16 +112,18 @@ class FluxMap:
         return value
 
     def inductance_extremes(self) -> tuple[float, float, float, float]:
-        """(least incremental inductance in H, its angle in rad, its current in A, scale of its change in A: greatest
-        inductance by its greatest slope), looked for at four points an interval."""
+        """(least incremental inductance in H, its angle in rad, its current in A, the current in A over which
+        it changes: greatest inductance by greatest slope), looked for at four points an interval."""
         angle_rad = np.linspace(0.0, self.pitch_rad / 2.0, 4 * ANGLE_INTERVALS + 1)[:, None]
         current_A = np.linspace(0.0, self.current_max_A, 4 * CURRENT_INTERVALS + 1)
         inductance_H = self.derivative(angle_rad, current_A, 0, 2)
         slope_H_A = np.max(np.abs(self.derivative(angle_rad, current_A, 0, 3)))
         row, column = np.unravel_index(np.argmin(inductance_H), inductance_H.shape)
         scale_A = float(np.max(inductance_H) / max(slope_H_A, 1e-300))
-        # It does not change faster than the grid can say, and within the map it counts as changing.
-        scale_A = min(max(scale_A, self.current_max_A / CURRENT_INTERVALS), self.current_max_A)
+        # Not below a step of the grid, which says no more; not above four, for the slope bends at every step and an
+        # integrator that takes many of them at once loses its order.
+        step_A = self.current_max_A / CURRENT_INTERVALS
+        scale_A = min(max(scale_A, step_A), 4.0 * step_A)
         return float(inductance_H[row, column]), float(angle_rad[row, 0]), float(current_A[column]), scale_A
 
     def _spline(self, angle_rad, current_A, by_angle: int, by_current: int):
@@ -148,7 +155,7 @@ def fit(curves: Sequence[Curve], rotor_poles: int) -> FluxMap:
 
     angle_rad = np.array([curve.angle_rad for curve in curves])
     uniform_rad = np.linspace(0.0, angle_rad[-1], (2 if whole else 1) * ANGLE_INTERVALS + 1)
-    slopes = _limited(angle_rad, flux_Wb, _spline_slopes(angle_rad, flux_Wb, flat_ends=True))
+    slopes = _limited(angle_rad, flux_Wb, _spline_slopes(angle_rad, flux_Wb, flat_ends=True), ANGLE_LIMITS)
     grid_Wb = _hermite(angle_rad, flux_Wb, slopes, uniform_rad)
     if whole:
         _check_mirror(grid_Wb, uniform_rad, current_A)
@@ -178,7 +185,7 @@ def _common_current_A(curves: Sequence[Curve]) -> float:
 def _read_curve(curve: Curve, current_A: np.ndarray) -> np.ndarray:
     known_A = np.concatenate([[0.0], curve.current_A])
     known_Wb = np.concatenate([[0.0], curve.flux_linkage_Wb])
-    slopes = _limited(known_A, known_Wb, _spline_slopes(known_A, known_Wb, flat_ends=False))
+    slopes = _limited(known_A, known_Wb, _spline_slopes(known_A, known_Wb, flat_ends=False), CURRENT_LIMITS)
     return _hermite(known_A, known_Wb, slopes, current_A)
 
 
@@ -278,14 +285,14 @@ def _spline_slopes(x: np.ndarray, y: np.ndarray, *, flat_ends: bool) -> np.ndarr
     return slopes
 
 
-def _limited(x: np.ndarray, y: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Slopes with which the cubic in each interval rises or falls as its ends do: of the chords' sign, at most three
-    times the flatter chord beside; none where the chords disagree."""
+def _limited(x: np.ndarray, y: np.ndarray, slopes: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
+    """Slopes of the chords' sign and within `limits` times the flatter chord beside; none where the chords disagree."""
     chord = (y[1:] - y[:-1]) / _column(np.diff(x), y)
     left = np.concatenate([chord[:1], chord])
     right = np.concatenate([chord, chord[-1:]])
     sign = np.where(left * right > 0.0, np.sign(left), 0.0)
-    return sign * np.clip(sign * slopes, 0.0, 3.0 * np.minimum(np.abs(left), np.abs(right)))
+    flatter = np.minimum(np.abs(left), np.abs(right))
+    return sign * np.clip(sign * slopes, limits[0] * flatter, limits[1] * flatter)
 
 
 def _hermite(x: np.ndarray, y: np.ndarray, slopes: np.ndarray, at: np.ndarray) -> np.ndarray:
