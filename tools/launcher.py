@@ -64,10 +64,13 @@ TEST_NEEDS = (
     Need("gcc-arm-none-eabi", "compiler for Cortex-M4", _tool("arm-none-eabi-gcc")),
     Need("libnewlib-arm-none-eabi", "its C headers", _file("/usr/lib/arm-none-eabi/include/string.h")),
     Need("qemu-system-x86", "guest with a kernel that has CAN", lambda: not _guest_packages()),
+)
+MEASUREMENT_NEEDS = (
     Need("ngspice", "second opinion on the emulated plant", _tool("ngspice")),
+    Need("valgrind", "instruction counts", _tool("valgrind")),
 )
 
-WITHOUT_BUILD = ("log", "monitor")
+WITHOUT_BUILD = ("log", "monitor", "machine")
 """Commands that only speak to a running drive."""
 
 
@@ -221,13 +224,16 @@ def main() -> None:
     with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # two commands at once must not build over each other
         needs = BUILD_NEEDS + (TEST_NEEDS if options.command == "test" else ())
+        needs += MEASUREMENT_NEEDS if options.command in ("test", "bench") else ()
         if options.command in WITHOUT_BUILD:
             needs = tuple(need for need in BUILD_NEEDS if need.package == "python3-venv")
         install_packages(needs, install)
         make_environment(install)
         if options.command not in WITHOUT_BUILD:
             machines = sorted(path.stem for path in (TOOLS / "machines").glob("*.toml"))
-            build([] if options.command == "test" else [f"salient_{name}" for name in machines])
+            targets = [f"salient_{name}" for name in machines]
+            targets += ["plant_replay_saturating"] if options.command == "bench" else []
+            build([] if options.command == "test" else targets)
     python = str(VENV / "bin/python")
     os.execv(python, [python, "-m", "salient", *sys.argv[1:]])
 

@@ -2,8 +2,8 @@
 
 Currents, speed and angle are the state, and a run goes segment by segment from one switch edge to the next, as in the
 emulator; the right-hand side is plain Python floats (for three phases several times faster than NumPy's arrays) and
-looks only at phases that conduct. LSODA is called as odeint, whose loop over the steps is compiled, not as
-solve_ivp(method="LSODA"), whose loop is Python.
+looks only at phases that conduct. The solvers are called as odeint and ode, whose loops over the steps are compiled,
+not as solve_ivp, whose loop is Python.
 
 Equations: emulator/plant/plant.h; magnetics: magnetics.py's "saturating", here with the derivatives that the currents'
 equations need.
@@ -11,9 +11,11 @@ equations need.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from scipy.integrate import ode, odeint
@@ -39,21 +41,27 @@ def lsoda(tolerance: float) -> Solver:
     return solve
 
 
+def dopri5(tolerance: float) -> Solver:
+    """SciPy's Runge-Kutta method of order 5 by Dormand and Prince; tolerance as with lsoda."""
+    return partial(_runge_kutta, "dopri5", tolerance)
+
+
 def dop853(tolerance: float) -> Solver:
-    """SciPy's Runge-Kutta method of order 8 by Dormand and Prince."""
-
-    def solve(right_side: RightSide, y: State, from_s: float, to_s: float) -> State:
-        solver = ode(right_side).set_integrator("dop853", rtol=tolerance, atol=tolerance, nsteps=10_000)
-        end = solver.set_initial_value(y, from_s).integrate(to_s).tolist()
-        if not solver.successful():
-            raise ArithmeticError(f"DOP853 stopped at {solver.t:g} s")
-        return end
-
-    return solve
+    """The same of order 8."""
+    return partial(_runge_kutta, "dop853", tolerance)
 
 
-def _right_side(machine: Machine, load_torque_Nm: float, voltage_V: dict[int, float]) -> RightSide:
-    """voltage_V: of each phase that conducts."""
+def _runge_kutta(method: str, tolerance: float, right_side: RightSide, y: State, from_s: float, to_s: float) -> State:
+    solver = ode(right_side).set_integrator(method, rtol=tolerance, atol=tolerance, nsteps=10_000)
+    end = solver.set_initial_value(y, from_s).integrate(to_s).tolist()
+    if not solver.successful():
+        raise ArithmeticError(f"{method} stopped at {solver.t:g} s")
+    return end
+
+
+def _right_side(machine: Machine, load_torque_Nm: float, voltage_V: dict[int, float],
+                evaluations: Iterator[int]) -> RightSide:
+    """voltage_V: of each phase that conducts; evaluations: stepped at each call."""
     m = machine.magnetics.parameters
     lu, ls = m["unaligned_inductance_H"], m["saturated_inductance_H"]
     a = m["flux_linkage_max_Wb"] - ls * m["current_at_flux_linkage_max_A"]
@@ -65,6 +73,7 @@ def _right_side(machine: Machine, load_torque_Nm: float, voltage_V: dict[int, fl
     remainder, exp = math.remainder, math.exp
 
     def derivative(_: float, y: np.ndarray) -> State:
+        next(evaluations)
         *currents, speed, angle = y.tolist()  # floats are much faster than NumPy's scalars
         rates, torque = [0.0] * count, 0.0
         for phase, offset, voltage in conducting:
@@ -92,26 +101,27 @@ def run_scipy(replay: Replay, solver: Solver) -> Trajectory:
         raise ValueError(f"magnetics {machine.magnetics.form}: only saturating is written here")
     started_s = time.process_time()
     y = [*replay.current_A, replay.speed_rad_s, replay.angle_rad]
-    states = []
+    states, evaluations = [], itertools.count()
+    make = partial(_right_side, machine, replay.load_torque_Nm, evaluations=evaluations)
     for period in range(replay.periods):
         for start_ns, end_ns, on in replay.segments(period):
-            y = _segment(machine, replay.load_torque_Nm, solver, y, on, start_ns * 1e-9, end_ns * 1e-9)
+            y = _segment(make, machine.supply_voltage_V, solver, y, on, start_ns * 1e-9, end_ns * 1e-9)
         states.append(y)
     taken_s = time.process_time() - started_s
     columns = np.array(states)
     current_A, speed_rad_s, angle_rad = columns[:, :-2], columns[:, -2], columns[:, -1]
     phase_angle_rad = angle_rad[:, None] - np.arange(machine.phases) * machine.pitch_rad / machine.phases
     torque_Nm = np.sum(machine.magnetics.torque_Nm(phase_angle_rad, current_A), axis=1)
-    return Trajectory(angle_rad, speed_rad_s, torque_Nm, current_A, taken_s)
+    return Trajectory(angle_rad, speed_rad_s, torque_Nm, current_A, taken_s, next(evaluations))
 
 
-def _segment(machine: Machine, load_torque_Nm: float, solver: Solver, y: State, on: list[int], at_s: float,
-             end_s: float) -> State:
+def _segment(make: Callable[[dict[int, float]], RightSide], supply_voltage_V: float, solver: Solver, y: State,
+             on: list[int], at_s: float, end_s: float) -> State:
     """To the next switch edge; a phase whose current reaches zero at no positive voltage stays at zero."""
     while True:
-        applied = [(count - 1) * machine.supply_voltage_V for count in on]
+        applied = [(count - 1) * supply_voltage_V for count in on]
         voltage_V = {phase: volts for phase, volts in enumerate(applied) if volts > 0.0 or y[phase] > 0.0}
-        right_side = _right_side(machine, load_torque_Nm, voltage_V)
+        right_side = make(voltage_V)
         end = solver(right_side, y, at_s, end_s)
         ended = [phase for phase, volts in voltage_V.items() if volts <= 0.0 and end[phase] < 0.0]
         if not ended:

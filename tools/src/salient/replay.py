@@ -7,7 +7,6 @@ from __future__ import annotations
 import itertools
 import struct
 import subprocess
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -87,6 +86,8 @@ class Trajectory:
     current_A: np.ndarray
     """A row a period, a column a phase."""
     processor_s: float
+    evaluations: int | None = None
+    """Of the right-hand side, where they were counted."""
 
 
 def deviation(measured: Trajectory, reference: Trajectory) -> dict[str, float]:
@@ -105,27 +106,28 @@ def deviation(measured: Trajectory, reference: Trajectory) -> dict[str, float]:
     return {name: float(np.max(np.abs(difference[name])) / reach[name]) for name in reach}
 
 
-def record(machine: str = "saturating", controller: str = "paper", duration_s: float = 0.1) -> Replay:
-    """What the controller does at 40 kHz while it holds 600 r/min against 8 N m, from 0.4 s after its start on."""
-    load_torque_Nm = 8.0
-    with tempfile.TemporaryDirectory(prefix="salient-") as folder:
-        options = SimulatorOptions(
-            machine=machine,
-            controller=controller,
-            record=Path(folder) / "recording.npy",
-            record_from_us=round(2 * _SETTLE_S * 1e6),
-            record_switches=Path(folder) / "switches",
-        )
-        period_ns = 1_000_000_000 // options.control_rate_hz
-        options = replace(options, record_step_ns=period_ns)
-        with Bench(options, f"unix:{folder}/can.sock") as bench:
-            bench.rig.truth_period_us = 0
-            bench.drive.speed_reference_rpm = 600.0
-            bench.run_for(_SETTLE_S)
-            bench.load_torque_Nm = load_torque_Nm
-            bench.run_for(_SETTLE_S + duration_s)
-        start = np.load(options.record)[0]
-        compares = np.fromfile(options.record_switches, dtype="u2").reshape(-1, 2, _PHASES_MAX)
+def record(folder: Path, duration_s: float = 0.1) -> Replay:
+    """What the paper's controller does on the saturating machine at 40 kHz while it holds 600 r/min against 8 N m, from
+    0.4 s after its start on. The folder gets the recording of the true state, a row a control period from there on."""
+    machine, load_torque_Nm, control_rate_hz = "saturating", 8.0, 40_000
+    period_ns = 1_000_000_000 // control_rate_hz
+    options = SimulatorOptions(
+        machine=machine,
+        controller="paper",
+        control_rate_hz=control_rate_hz,
+        record=folder / "recording.npy",
+        record_from_us=round(2 * _SETTLE_S * 1e6),
+        record_step_ns=period_ns,
+        record_switches=folder / "switches",
+    )
+    with Bench(options, f"unix:{folder}/can.sock") as bench:
+        bench.rig.truth_period_us = 0
+        bench.drive.speed_reference_rpm = 600.0
+        bench.run_for(_SETTLE_S)
+        bench.load_torque_Nm = load_torque_Nm
+        bench.run_for(_SETTLE_S + duration_s)
+    start = np.load(options.record)[0]
+    compares = np.fromfile(options.record_switches, dtype="u2").reshape(-1, 2, _PHASES_MAX)
     phases = load_machine(machine_path(machine)).phases
     # The first row acts from the end of the first period on.
     first = round(start["time_s"] * 1e9 / period_ns) - 1

@@ -64,6 +64,11 @@ class Session:
         """Leaves the bus."""
         self._bus.shutdown()
 
+    def leave_running(self, duration_s: float) -> None:
+        """Leaves the bus, and virtual time to pass without this session; lock-step only."""
+        self._ask_to_run(self.time_ns + round(duration_s * 1e9))
+        self.close()
+
     def __enter__(self) -> Session:
         return self
 
@@ -147,14 +152,17 @@ class Session:
                 self._receive()
 
     def _run_until(self, time_ns: int) -> None:
-        self._sequence = (self._sequence + 1) % 256
-        data = time_ns.to_bytes(6, "little") + bytes([self._sequence])
-        identifier = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
-        self.send(can.Message(arbitration_id=identifier, is_extended_id=True, data=data))
+        self._ask_to_run(time_ns)
         clock = self.receive_until(
             lambda m: m.arbitration_id == RIG_CLOCK_ID and m.is_extended_id and m.data[6] == self._sequence
         )
         self.time_ns = clock_of(clock)[0]
+
+    def _ask_to_run(self, time_ns: int) -> None:
+        self._sequence = (self._sequence + 1) % 256
+        data = time_ns.to_bytes(6, "little") + bytes([self._sequence])
+        identifier = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
+        self.send(can.Message(arbitration_id=identifier, is_extended_id=True, data=data))
 
     def _receive(self) -> can.Message:
         timed = self._reader.receive(SILENCE_TIMEOUT_S)

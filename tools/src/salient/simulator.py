@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -100,13 +101,14 @@ def _build_foreign(path: Path, program: Path, build: str) -> None:
 class Simulator:
     """A running executable, ended with this process or by close().
 
+    prefix: a command that runs the executable's, as a profiler's does.
     ready: what its JSON line said. UsageError when it refuses its options, SimulatorError when it fails.
     """
 
-    def __init__(self, options: SimulatorOptions, can: str) -> None:
+    def __init__(self, options: SimulatorOptions, can: str, prefix: Sequence[str] = ()) -> None:
         self.options = options
         self.can = can
-        self.command = options.arguments(can)
+        self.command = [*prefix, *options.arguments(can)]
         self._errors = tempfile.TemporaryFile()
         self._process = subprocess.Popen(
             [*self.command, "--follow-stdin"],
