@@ -107,6 +107,12 @@ def _bench(options: argparse.Namespace) -> int:
     return run(options.runs, options.json)
 
 
+def _machine(options: argparse.Namespace) -> int:
+    from salient.machine_view import run
+
+    return run(options.machine, options.out)
+
+
 _COMMANDS = {
     "demo": _demo,
     "test": _test,
@@ -115,6 +121,7 @@ _COMMANDS = {
     "log": _log,
     "monitor": _monitor,
     "bench": _bench,
+    "machine": _machine,
 }
 
 if __name__ == "__main__":

@@ -81,6 +81,11 @@ def make_parser() -> argparse.ArgumentParser:
     bench = command("bench", "the figures of the README: speed of the whole, worth of the network")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     bench.add_argument("--runs", type=int, default=5, metavar="N", help="runs of each kind, default 5")
+
+    machine = command("machine", "check a machine file, say what is in it, draw its magnetics")
+    machine.add_argument("machine", metavar="NAME|FILE")
+    machine.add_argument("--out", type=Path, default=Path("out/machine"), metavar="DIR",
+                         help="folder of the picture (default out/machine)")
     return parser
 
 

@@ -26,20 +26,20 @@ _OPTIONAL_TABLES = ("dc_link", "sensors", "iron_loss")
 
 # (minimum, maximum) of every number, both allowed. Wide enough for any machine that the number formats of the firmware
 # can carry (inertia and friction are Q1.30 there).
-_WINDING = {"resistance_ohm": (1e-4, 100.0)}
-_MECHANICS = {"inertia_kg_m2": (1e-4, 1.9), "friction_Nm_s": (0.0, 1.9)}
-_SUPPLY = {"supply_voltage_V": (10.0, 500.0)}
+WINDING = {"resistance_ohm": (1e-4, 100.0)}
+MECHANICS = {"inertia_kg_m2": (1e-4, 1.9), "friction_Nm_s": (0.0, 1.9)}
+SUPPLY = {"supply_voltage_V": (10.0, 500.0)}
 
 # The rest may be left out, key by key: (minimum, maximum, value when left out). What they mean stands in
 # emulator/plant/machine.h. Ideal devices, ideal sensors.
-_CONVERTER: dict[str, tuple[float, float, float]] = {
+CONVERTER: dict[str, tuple[float, float, float]] = {
     "switch_drop_V": (0.0, 5.0, 0.0),
     "switch_resistance_ohm": (0.0, 1.0, 0.0),
     "diode_drop_V": (0.0, 5.0, 0.0),
     "diode_resistance_ohm": (0.0, 1.0, 0.0),
     "minimum_pulse_ns": (0.0, 2000.0, 0.0),
 }
-_SENSORS: dict[str, tuple[float, float, float]] = {
+SENSORS: dict[str, tuple[float, float, float]] = {
     "current_gain": (0.0, 10.0, 1.0),
     "current_offset_A": (-10.0, 10.0, 0.0),
     "current_noise_A": (0.0, 10.0, 0.0),
@@ -48,10 +48,10 @@ _SENSORS: dict[str, tuple[float, float, float]] = {
     "encoder_eccentricity_deg": (0.0, 5.0, 0.0),
 }
 # A table that is left out: an ideal supply that takes energy back.
-_DC_LINK = {"capacitance_F": (1e-5, 1.0), "source_resistance_ohm": (0.001, 10.0)}
-_CHOPPER = {"chopper_resistance_ohm": (0.1, 1000.0), "chopper_on_V": (10.0, 510.0), "chopper_off_V": (10.0, 510.0)}
+DC_LINK = {"capacitance_F": (1e-5, 1.0), "source_resistance_ohm": (0.001, 10.0)}
+CHOPPER = {"chopper_resistance_ohm": (0.1, 1000.0), "chopper_on_V": (10.0, 510.0), "chopper_off_V": (10.0, 510.0)}
 # A table that is left out: no estimate.
-_IRON_LOSS = {
+IRON_LOSS = {
     "turns_area_m2": (1e-6, 10.0),
     "mass_kg": (1e-3, 1000.0),
     "steinmetz_k": (1e-6, 10.0),
@@ -78,11 +78,11 @@ class Machine:
     supply_voltage_V: float
     magnetics: Formula | FluxMap
     converter: dict[str, float]
-    """Every key of _CONVERTER."""
+    """Every key of CONVERTER."""
     dc_link: dict[str, float] | None
     """None: ideal. The chopper's keys are there when it has one."""
     sensors: dict[str, float]
-    """Every key of _SENSORS."""
+    """Every key of SENSORS."""
     iron_loss: dict[str, float] | None
 
     @property
@@ -129,13 +129,13 @@ def load_machine(path: Path | str) -> Machine:
             raise MachineError(f"{path}: {section}: a table [{section}] is wanted")
 
     stator, rotor, phases = _poles(path, data["poles"])
-    values = _numbers(path, "winding", data["winding"], _WINDING)
-    values |= _numbers(path, "mechanics", data["mechanics"], _MECHANICS)
-    converter = _numbers(path, "converter", data["converter"], _SUPPLY | _CONVERTER)
-    sensors = _numbers(path, "sensors", data.get("sensors", {}), _SENSORS)
+    values = _numbers(path, "winding", data["winding"], WINDING)
+    values |= _numbers(path, "mechanics", data["mechanics"], MECHANICS)
+    converter = _numbers(path, "converter", data["converter"], SUPPLY | CONVERTER)
+    sensors = _numbers(path, "sensors", data.get("sensors", {}), SENSORS)
     supply_voltage_V = converter.pop("supply_voltage_V")
     dc_link = _dc_link(path, data["dc_link"], supply_voltage_V) if "dc_link" in data else None
-    iron_loss = _numbers(path, "iron_loss", data["iron_loss"], _IRON_LOSS) if "iron_loss" in data else None
+    iron_loss = _numbers(path, "iron_loss", data["iron_loss"], IRON_LOSS) if "iron_loss" in data else None
     return Machine(
         name=name,
         stator_poles=stator,
@@ -184,8 +184,8 @@ def _poles(path: Path, table: dict) -> tuple[int, int, int]:
 
 
 def _dc_link(path: Path, table: dict, supply_voltage_V: float) -> dict[str, float]:
-    has_chopper = any(key in table for key in _CHOPPER)
-    link = _numbers(path, "dc_link", table, _DC_LINK | (_CHOPPER if has_chopper else {}))
+    has_chopper = any(key in table for key in CHOPPER)
+    link = _numbers(path, "dc_link", table, DC_LINK | (CHOPPER if has_chopper else {}))
     if has_chopper and not supply_voltage_V < link["chopper_off_V"] < link["chopper_on_V"]:
         raise MachineError(
             f"{path}: dc_link.chopper_off_V: must lie between converter.supply_voltage_V and dc_link.chopper_on_V"
