@@ -71,7 +71,7 @@ MEASUREMENT_NEEDS = (
 )
 
 WITHOUT_BUILD = ("log", "monitor", "machine")
-"""Commands that only speak to a running drive."""
+"""Commands that need no drive built here."""
 
 
 def _guest_packages() -> list[str]:
