@@ -21,12 +21,14 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import salient.flux_map
+import salient.machine
 from salient.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS
 
 ROOT = Path(__file__).resolve().parents[2]
 PHASES_MAX = 4
 TICK_NS = 5
 FORMS = ("linear_cosine", "linear_trapezoid", "saturating")
+MAP = 3  # MAGNETICS_MAP, after the forms
 
 
 # --- The plant, through its shared library ---
@@ -165,6 +167,30 @@ def flux_map_of(model: salient.flux_map.FluxMap) -> FluxMap:
     for row, coefficients_J in zip(flux_map.coenergy_J, model.coefficients_J.tolist(), strict=True):
         row[:] = coefficients_J
     return flux_map
+
+
+def machine_from(file: salient.machine.Machine) -> Machine:
+    """The plant's machine of a machine file, as the build generates it."""
+    magnetics = file.magnetics
+    if isinstance(magnetics, salient.flux_map.FluxMap):
+        twin = Magnetics(form=MAP, map=ctypes.pointer(flux_map_of(magnetics)))
+        twin.unaligned_inductance_H = magnetics.unaligned_inductance_H
+    else:
+        twin = Magnetics(form=FORMS.index(magnetics.form), **magnetics.parameters)
+    return Machine(
+        name=file.name.encode(),
+        stator_poles=file.stator_poles,
+        rotor_poles=file.rotor_poles,
+        phases=file.phases,
+        resistance_ohm=file.resistance_ohm,
+        inertia_kg_m2=file.inertia_kg_m2,
+        friction_Nm_s=file.friction_Nm_s,
+        supply_voltage_V=file.supply_voltage_V,
+        magnetics=twin,
+        converter=Converter(**file.converter),
+        dc_link=DcLink(**(file.dc_link or {})),
+        sensors=SensorErrors(**file.sensors),
+    )
 
 
 # --- What is run ---

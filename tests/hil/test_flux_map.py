@@ -26,7 +26,7 @@ from flux_map_files import (
     write_machine,
 )
 from flux_map_reference import MapReference
-from plant_twin import Machine, Magnetics, flux_map_of, load_library, run_plant, run_reference
+from plant_twin import MAP, Machine, Magnetics, flux_map_of, load_library, run_plant, run_reference
 from test_plant_against_scipy import chopping_stroke, deviation, machine_of, single_pulse
 
 from salient.flux_map import FluxMap
@@ -34,7 +34,6 @@ from salient.flux_map_file import load_flux_map
 from salient.machine import MachineError, load_machine
 
 POLES = 4
-MAP = 3  # MAGNETICS_MAP
 GRIDS = {"regular": (REGULAR_DEG, REGULAR_A), "irregular": irregular()}
 
 

@@ -17,7 +17,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.fmi3 import FMU3Slave
 from fmpy.model_description import ModelDescription
 from fmpy.validation import validate_fmu
-from plant_twin import Compare, Machine, Magnetics, State, load_library
+from plant_twin import Compare, State, load_library, machine_from
 
 from salient.machine import load_machine, machine_path
 from salient.magnetics import FORMULA_KEYS
@@ -76,19 +76,9 @@ def chopping(steps: int, step_s: float) -> np.ndarray:
 def native(library: ctypes.CDLL, form: str, signals: np.ndarray, step_ns: int, inertia_kg_m2: float | None = None
            ) -> np.ndarray:
     """The same steps through libsalient_plant.so; a row of OUTPUTS for each communication point."""
-    file = load_machine(machine_path(form))
-    magnetics = Magnetics(form=FORMS.index(form), **file.magnetics.parameters)
-    machine = Machine(
-        name=form.encode(),
-        stator_poles=file.stator_poles,
-        rotor_poles=file.rotor_poles,
-        phases=file.phases,
-        resistance_ohm=file.resistance_ohm,
-        inertia_kg_m2=file.inertia_kg_m2 if inertia_kg_m2 is None else inertia_kg_m2,
-        friction_Nm_s=file.friction_Nm_s,
-        supply_voltage_V=file.supply_voltage_V,
-        magnetics=magnetics,
-    )
+    machine = machine_from(load_machine(machine_path(form)))
+    if inertia_kg_m2 is not None:
+        machine.inertia_kg_m2 = inertia_kg_m2
     plant = library.plant_library_create(ctypes.byref(machine), ANGLE_RAD)
     library.plant_library_set_motion(plant, SPEED_RAD_S, ANGLE_RAD)
     rows = []

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plant_twin import FORMS, TICK_NS, Compares, Machine, Magnetics, Run, load_library, run_plant
+from plant_twin import FORMS, TICK_NS, Compares, Machine, Run, load_library, machine_from, run_plant
 
 from salient import machine as machine_file
 from salient import ngspice
@@ -90,17 +90,9 @@ def library() -> ctypes.CDLL:
 
 def machine_of(shipped: machine_file.Machine) -> Machine:
     """The plant's machine, its speed held."""
-    return Machine(
-        name=shipped.name.encode(),
-        stator_poles=shipped.stator_poles,
-        rotor_poles=shipped.rotor_poles,
-        phases=shipped.phases,
-        resistance_ohm=shipped.resistance_ohm,
-        inertia_kg_m2=CONSTANT_SPEED_INERTIA_KG_M2,
-        friction_Nm_s=0.0,
-        supply_voltage_V=shipped.supply_voltage_V,
-        magnetics=Magnetics(form=FORMS.index(shipped.magnetics.form), **shipped.magnetics.parameters),
-    )
+    machine = machine_from(shipped)
+    machine.inertia_kg_m2, machine.friction_Nm_s = CONSTANT_SPEED_INERTIA_KG_M2, 0.0
+    return machine
 
 
 def plant_waveforms(library: ctypes.CDLL, machine: Machine, run: Run) -> Waveforms:
