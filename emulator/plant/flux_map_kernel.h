@@ -15,22 +15,22 @@ typedef struct {
     double linear[2], quadratic[3], cubic[4], quartic[5];
 } flux_map_weights_t;
 
-/* De Boor's recursion. */
+/* De Boor's recursion, what is symmetric in t and u written out. */
 MAGNETICS_INLINE void flux_map_weights(double t, flux_map_weights_t *weights) {
-    const double third = 1.0 / 3.0, u = 1.0 - t;
+    const double u = 1.0 - t, tu = t * u;
     double *w2 = weights->quadratic, *w3 = weights->cubic, *w4 = weights->quartic;
     weights->linear[0] = u;
     weights->linear[1] = t;
-    w2[0] = 0.5 * u * u;
-    w2[1] = 0.5 + u * t;
-    w2[2] = 0.5 * t * t;
-    w3[0] = third * (u * w2[0]);
-    w3[1] = third * ((t + 2.0) * w2[0] + (u + 1.0) * w2[1]);
-    w3[2] = third * ((t + 1.0) * w2[1] + (u + 2.0) * w2[2]);
-    w3[3] = third * (t * w2[2]);
+    w2[0] = 0.5 * (u * u);
+    w2[1] = 0.5 + tu;
+    w2[2] = 0.5 * (t * t);
+    w3[0] = (1.0 / 3.0) * (u * w2[0]);
+    w3[1] = 2.0 / 3.0 - w2[2] * (2.0 - t);
+    w3[2] = 2.0 / 3.0 - w2[0] * (2.0 - u);
+    w3[3] = (1.0 / 3.0) * (t * w2[2]);
     w4[0] = 0.25 * (u * w3[0]);
     w4[1] = 0.25 * ((t + 3.0) * w3[0] + (u + 1.0) * w3[1]);
-    w4[2] = 0.25 * ((t + 2.0) * w3[1] + (u + 2.0) * w3[2]);
+    w4[2] = 11.0 / 24.0 + tu * (0.5 + 0.25 * tu);
     w4[3] = 0.25 * ((t + 1.0) * w3[2] + (u + 3.0) * w3[3]);
     w4[4] = 0.25 * (t * w3[3]);
 }
@@ -93,16 +93,17 @@ MAGNETICS_INLINE void flux_map_kernel(const magnetics_model_t *model, double wra
         }
     }
 
-    const double s = model->map_steps_1_A, a = copysign(model->map_steps_1_rad, wrapped_rad), a2 = a * a;
+    const double a = copysign(model->map_steps_1_rad, wrapped_rad), a2 = a * a;
+    const double s = model->map_steps_1_A, s2 = s * s, sa = s * a;
     *coenergy_J = flux_map_value(&by_angle, energy);
     point->torque_Nm = a * flux_map_gradient(&by_angle, energy);
     point->torque_gradient_Nm_rad = a2 * flux_map_curvature(&by_angle, energy);
     point->flux_linkage_Wb = s * flux_map_value(&by_angle, flux);
-    point->flux_gradient_Wb_rad = s * a * flux_map_gradient(&by_angle, flux);
-    point->flux_curvature_Wb_rad2 = s * a2 * flux_map_curvature(&by_angle, flux);
-    point->incremental_inductance_H = s * s * flux_map_value(&by_angle, inductance);
-    point->inductance_gradient_H_rad = s * s * a * flux_map_gradient(&by_angle, inductance);
-    point->inductance_slope_H_A = s * s * s * flux_map_value(&by_angle, slope);
+    point->flux_gradient_Wb_rad = sa * flux_map_gradient(&by_angle, flux);
+    point->flux_curvature_Wb_rad2 = sa * a * flux_map_curvature(&by_angle, flux);
+    point->incremental_inductance_H = s2 * flux_map_value(&by_angle, inductance);
+    point->inductance_gradient_H_rad = s * sa * flux_map_gradient(&by_angle, inductance);
+    point->inductance_slope_H_A = s2 * s * flux_map_value(&by_angle, slope);
 }
 
 #endif

@@ -83,7 +83,7 @@ class FluxMap : public testing::Test {
 
 // On knots, between them and next to them; both ends.
 constexpr double ANGLES[] = {0.0, 0.001, 0.3, 1.0 - 1e-12, 1.0, 1.0 + 1e-12, 17.77, 48.0, 60.5, 95.0, 95.99, 96.0};
-constexpr double CURRENTS[] = {-0.7, 0.0, 1e-6, 0.4, 1.0 - 1e-12, 1.0, 2.5, 31.0, 40.25, 63.0, 63.999, 64.0};
+constexpr double CURRENTS[] = {-1.5, -0.7, 0.0, 1e-6, 0.4, 1.0 - 1e-12, 1.0, 2.5, 31.0, 40.25, 63.0, 63.999, 64.0};
 
 TEST_F(FluxMap, GivesEveryDerivativeOfThePotential) {
     for (const double angle_steps : ANGLES) {
