@@ -357,7 +357,7 @@ def test_a_wrong_file_is_refused_by_one_line_that_says_where(tmp_path, case):
         ('"wrong.csv"', '"wrong.mat"', ["magnetics.file", "'wrong.mat'", ".csv"]),
         ('"wrong.csv"', '"wrong.csv"\nsteps = 3', ["magnetics.steps: unknown key; allowed: form, file"]),
         ('"wrong.csv"', '"none.csv"', ["none.csv: no such file"]),
-        ('"wrong.csv"', '"folder.csv"', ["folder.csv: cannot be read"]),
+        ('"wrong.csv"', '"folder.csv"', ["folder.csv: not a file"]),
     ],
 )
 def test_a_wrong_key_is_refused_by_one_line_that_names_it(tmp_path, old, new, wanted):

@@ -236,7 +236,7 @@ def _check_model(model: FluxMap, curves: Sequence[Curve]) -> None:
         raise FluxMapError(
             f"line {line}: the curve through the points has an incremental inductance of {least_H:.3g} H near"
             f" {_degrees(angle_rad)} deg and {current_A:.3g} A; {INDUCTANCE_MIN_H:g} H is the least allowed:"
-            " the points there are too uneven"
+            " the points there are too uneven, or of another unit"
         )
     allowed_Wb = MISS_TOLERANCE * max(curve.flux_linkage_Wb[-1] for curve in curves)
     for curve in curves:

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from salient.flux_map import Curve, FluxMap, FluxMapError, fit
+from salient.text_file import TextFileError, read_text
 
 FILE_BYTES_MAX = 20_000_000
 ANGLES_MIN = 8
@@ -43,23 +44,11 @@ def load_flux_map(path: Path, rotor_poles: int) -> FluxMap:
     """The model of a CSV file's map. FluxMapError, one line with the file and where possible its line, when the file
     cannot be used."""
     try:
-        model = fit(_curves(_points(_text(path)), math.pi / rotor_poles), rotor_poles)
-    except FluxMapError as error:
+        text = read_text(path, FILE_BYTES_MAX)
+        model = fit(_curves(_points(text), math.pi / rotor_poles), rotor_poles)
+    except (FluxMapError, TextFileError) as error:
         raise FluxMapError(f"{path}: {error}") from None
     return replace(model, file=path)
-
-
-def _text(path: Path) -> str:
-    try:
-        if path.stat().st_size > FILE_BYTES_MAX:
-            raise FluxMapError(f"larger than {FILE_BYTES_MAX // 1_000_000} MB")
-        return path.read_bytes().decode("utf-8-sig")
-    except FileNotFoundError:
-        raise FluxMapError("no such file") from None
-    except OSError as error:
-        raise FluxMapError(f"cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise FluxMapError(f"not UTF-8 at byte {error.start + 1}") from None
 
 
 Point = tuple[int, float, float, float]
@@ -91,7 +80,7 @@ def _numbers(line: int, cells: list[str], header: list[str], factors: list[float
     values = []
     for cell, name, factor in zip(cells, header, factors, strict=True):
         try:
-            value = float(cell)
+            value = float(cell) if "_" not in cell else math.nan  # Python reads 0.1_2 as 0.12
         except ValueError:
             value = math.nan
         if not math.isfinite(value):

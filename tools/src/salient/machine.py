@@ -13,10 +13,14 @@ from pathlib import Path
 from salient.flux_map import FluxMap, FluxMapError
 from salient.flux_map_file import load_flux_map
 from salient.magnetics import FORMULA_KEYS, Formula
+from salient.text_file import TextFileError, read_text
 
 SHIPPED = Path(__file__).resolve().parents[2] / "machines"
 
 FORMS = (*FORMULA_KEYS, "map")
+
+FILE_BYTES_MAX = 1_000_000
+_SHOWN_MAX = 60  # characters of a wrong value in a message
 
 # Phases by stator and rotor poles.
 _PHASES = {(6, 4): 3, (8, 6): 4, (12, 8): 3}
@@ -111,19 +115,11 @@ def machine_path(name_or_path: str) -> Path:
 def load_machine(path: Path | str) -> Machine:
     """Reads and checks a machine file."""
     path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise MachineError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise MachineError(f"{path}: cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise MachineError(f"{path}: not TOML: {error}") from None
-
+    data = _read(path)
     _check_keys(path, "", data, ["name", *_TABLES], _OPTIONAL_TABLES)
     name = data["name"]
     if not isinstance(name, str) or not name.isidentifier() or not name.isascii():
-        raise MachineError(f"{path}: name: {name!r} is not a plain word (letters, digits, underscore)")
+        raise MachineError(f"{path}: name: {_shown(name)} is not a plain word (letters, digits, underscore)")
     for section in (*_TABLES, *_OPTIONAL_TABLES):
         if not isinstance(data.get(section, {}), dict):
             raise MachineError(f"{path}: {section}: a table [{section}] is wanted")
@@ -151,11 +147,32 @@ def load_machine(path: Path | str) -> Machine:
     )
 
 
+def _read(path: Path) -> dict:
+    try:
+        return tomllib.loads(read_text(path, FILE_BYTES_MAX))
+    except TextFileError as error:
+        raise MachineError(f"{path}: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise MachineError(f"{path}: not TOML: {error}") from None
+    except (ValueError, RecursionError):  # what tomllib lets through
+        raise MachineError(f"{path}: not TOML: a number too long or tables too deep") from None
+
+
+def _shown(value: object) -> str:
+    """A value or key of the user's, short and on one line."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        return "a value too long to show"
+    return text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
+
+
 def _check_keys(path: Path, section: str, table: dict, needed, optional=()) -> None:
     prefix = f"{section}." if section else ""
     for key in table:
         if key not in needed and key not in optional:
-            raise MachineError(f"{path}: {prefix}{key}: unknown key; allowed: {', '.join([*needed, *optional])}")
+            shown = key if key.isidentifier() and len(key) <= _SHOWN_MAX else _shown(key)
+            raise MachineError(f"{path}: {prefix}{shown}: unknown key; allowed: {', '.join([*needed, *optional])}")
     for key in needed:
         if key not in table:
             raise MachineError(f"{path}: {prefix}{key}: missing")
@@ -169,7 +186,7 @@ def _numbers(path: Path, section: str, table: dict, ranges: dict[str, tuple]) ->
     for key, (low, high, *default) in ranges.items():
         value = table.get(key, *default)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-            raise MachineError(f"{path}: {section}.{key}: {value!r} is not a number from {low:g} to {high:g}")
+            raise MachineError(f"{path}: {section}.{key}: {_shown(value)} is not a number from {low:g} to {high:g}")
         values[key] = float(value)
     return values
 
@@ -180,7 +197,7 @@ def _poles(path: Path, table: dict) -> tuple[int, int, int]:
     if type(stator) is int and type(rotor) is int and (stator, rotor) in _PHASES:
         return stator, rotor, _PHASES[stator, rotor]
     names = ", ".join(f"{s}/{r}" for s, r in _PHASES)
-    raise MachineError(f"{path}: poles: {stator!r}/{rotor!r} is not one of {names}")
+    raise MachineError(f"{path}: poles: {_shown(stator)}/{_shown(rotor)} is not one of {names}")
 
 
 def _dc_link(path: Path, table: dict, supply_voltage_V: float) -> dict[str, float]:
@@ -196,7 +213,7 @@ def _dc_link(path: Path, table: dict, supply_voltage_V: float) -> dict[str, floa
 def _magnetics(path: Path, table: dict, rotor_poles: int) -> Formula | FluxMap:
     form = table.get("form")
     if form not in FORMS:
-        raise MachineError(f"{path}: magnetics.form: {form!r} is not one of {', '.join(FORMS)}")
+        raise MachineError(f"{path}: magnetics.form: {_shown(form)} is not one of {', '.join(FORMS)}")
     if form == "map":
         return _flux_map(path, table, rotor_poles)
     parameters = {key: value for key, value in table.items() if key != "form"}
@@ -211,7 +228,7 @@ def _flux_map(path: Path, table: dict, rotor_poles: int) -> FluxMap:
     _check_keys(path, "magnetics", table, ["form", "file"])
     name = table["file"]
     if not isinstance(name, str) or not name.isprintable() or not name.endswith(".csv"):
-        raise MachineError(f"{path}: magnetics.file: {name!r} is not the name of a .csv file")
+        raise MachineError(f"{path}: magnetics.file: {_shown(name)} is not the name of a .csv file")
     try:
         return load_flux_map(path.parent / name, rotor_poles)
     except FluxMapError as error:
