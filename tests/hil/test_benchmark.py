@@ -3,6 +3,7 @@ for each, the instruction counts."""
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from plant_twin import FORMS, Magnetics, Run, run_reference
 from plant_twin import Machine as PlantMachine
 
 from salient import benchmark, instructions
-from salient.comparison import PEERS, PLANT, REFERENCE_TOLERANCE, compare
+from salient.comparison import PEERS, PLANT, REFERENCE_TOLERANCE
 from salient.machine import SHIPPED, load_machine
 from salient.peer_scipy import dop853, run_scipy
 from salient.replay import Replay, deviation, record, run_plant
@@ -82,9 +83,17 @@ ACCURACY = {
 }
 
 
-def test_every_solver_has_its_accuracy_and_is_compared_with_a_plant_no_less_exact(replay: Replay) -> None:
-    rows = {row["solver"]: row for row in compare(replay, runs=1)}
+def test_every_solver_has_its_accuracy_and_is_compared_with_a_plant_no_less_exact(
+    replay: Replay, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(benchmark, "record", lambda folder: replay)
+    content = json.loads(json.dumps(benchmark.compare_solvers(runs=1)))
+    rows = {row["solver"]: row for row in content["solvers"]}
     assert list(rows) == [*PLANT, *PEERS] == list(ACCURACY)
+    said = capsys.readouterr().out.splitlines()
+    for name in rows:
+        (line,) = [line for line in said if line.startswith(f"  {name} ")]
+        assert ("times faster" in line) == (rows[name].get("plant_times_faster") is not None)
     for name, (least, most) in ACCURACY.items():
         for quantity in ("current", "torque"):
             assert least < rows[name]["deviation"][quantity] < most, (name, rows[name])

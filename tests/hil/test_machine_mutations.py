@@ -483,6 +483,17 @@ def built() -> set[str]:
     return {path.name for path in (BUILD / "host" / "bin").iterdir()}
 
 
+def still_runs(words: str) -> bool:
+    """Whether any process but this one has words in its command line."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if path.parent.name != str(os.getpid()) and words in path.read_bytes().decode(errors="replace"):
+                return True
+        except OSError:
+            continue  # it has ended meanwhile
+    return False
+
+
 @pytest.mark.parametrize("case", COMMAND_CASES)
 def test_commands_end_with_one_line_and_code_2_and_build_nothing(
     salient: Callable, tmp_path: Path, case: str
@@ -505,4 +516,6 @@ def test_commands_end_with_one_line_and_code_2_and_build_nothing(
     (line,) = result.stderr.splitlines()
     assert line.startswith(f"salient: {tmp_path}/") and named in line, line
     assert not any(case in name for name in built())
+    assert case not in (BUILD / "host" / "CMakeCache.txt").read_text()
+    assert not still_runs(str(tmp_path))
     assert {entry.name for entry in tmp_path.iterdir()} <= before | {"out"}

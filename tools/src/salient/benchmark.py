@@ -98,7 +98,7 @@ def run(runs: int, json_path: Path | None) -> int:
             "processor": _processor(),
             "speed": _speed(runs),
             "instructions": _instructions(),
-            "comparison": _comparison(runs),
+            "comparison": compare_solvers(runs),
             "network": study(),
         }
     except NgspiceError as error:
@@ -144,8 +144,8 @@ def _instructions() -> dict[str, Any]:
     return figures
 
 
-def _comparison(runs: int) -> dict[str, Any]:
-    """The plant alone and its peers on what the paper's controller did."""
+def compare_solvers(runs: int) -> dict[str, Any]:
+    """The plant alone and its peers on what the paper's controller did: prints a row a solver, returns the same."""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         replay = record(Path(folder))
     per_period = instructions.of_plant(replay)

@@ -99,12 +99,13 @@ def run_scipy(replay: Replay, solver: Solver) -> Trajectory:
     machine = load_machine(machine_path(replay.machine))
     if machine.magnetics.form != "saturating":
         raise ValueError(f"magnetics {machine.magnetics.form}: only saturating is written here")
+    segments = [list(replay.segments(period)) for period in range(replay.periods)]
     started_s = time.process_time()
     y = [*replay.current_A, replay.speed_rad_s, replay.angle_rad]
     states, evaluations = [], itertools.count()
     make = partial(_right_side, machine, replay.load_torque_Nm, evaluations=evaluations)
-    for period in range(replay.periods):
-        for start_ns, end_ns, on in replay.segments(period):
+    for period in segments:
+        for start_ns, end_ns, on in period:
             y = _segment(make, machine.supply_voltage_V, solver, y, on, start_ns * 1e-9, end_ns * 1e-9)
         states.append(y)
     taken_s = time.process_time() - started_s
