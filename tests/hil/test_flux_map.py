@@ -277,6 +277,10 @@ def sampled_file(angles_deg, currents_A, change=lambda angle, current, flux: flu
     return csv_text([(angle, current, change(angle, current, flux)) for angle, current, flux in points])
 
 
+def aligned_Wb(current_A: float) -> float:
+    return float(formula("saturating").flux_linkage_Wb(0.0, current_A))
+
+
 REFUSED = {
     "not UTF-8": (GOOD.encode()[:50] + b"\xff" + GOOD.encode()[50:], ["not UTF-8 at byte 51"]),
     "too large": (b"#" * 20_000_001, ["larger than 20 MB"]),
@@ -318,11 +322,22 @@ REFUSED = {
     ),
     "a bump over the angle": (
         sampled_file(REGULAR_DEG, REGULAR_A, lambda angle, _, flux: flux * (1.4 if 20 < angle < 22 else 1.0)),
-        ["from 18.947 to 21.316 deg", "must fall", "line "],
+        ["at 21.316 deg", "at 18.947 deg", "must fall", "line "],
     ),
     "no saliency": (
         sampled_file(REGULAR_DEG, REGULAR_A, lambda _, current, __: 1e-3 * current),
-        ["unaligned", "must be below", "line 382:"],
+        ["45 deg must be below", "line 382:"],
+    ),
+    "a slow rise over the angle": (
+        sampled_file(REGULAR_DEG, REGULAR_A, lambda angle, current, flux: max(flux, 0.06 * aligned_Wb(current) * (
+            1.0 + 0.05 * (angle - 30.0)))),
+        ["at 45 deg", "at 40.263 deg", "must fall", "line 38"],
+    ),
+    "a rise in the second half": (
+        sampled_file(
+            np.linspace(0, 90, 37), REGULAR_A, lambda angle, _, flux: flux * (0.9 if 79 < angle < 81 else 1.0)
+        ),
+        ["at 77.5 deg", "at 80 deg", "must fall", "line "],
     ),
     "halves that differ": (
         sampled_file(np.linspace(0, 90, 37), REGULAR_A, lambda angle, _, flux: flux * (1.1 if angle > 45 else 1.0)),

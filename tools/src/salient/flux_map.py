@@ -190,29 +190,34 @@ def _read_curve(curve: Curve, current_A: np.ndarray) -> np.ndarray:
 
 
 def _check_fall(curves: Sequence[Curve], flux_Wb: np.ndarray, half_rad: float, current_A: np.ndarray) -> None:
-    """From aligned to unaligned the flux linkage of every current falls; else the torque has the wrong sign."""
-    aligned_Wb = flux_Wb[0]
-    for at, (before, after) in enumerate(zip(flux_Wb, flux_Wb[1:], strict=False)):
-        rise_Wb = after - before
-        if curves[at].angle_rad >= half_rad:
-            rise_Wb = -rise_Wb
-        elif curves[at + 1].angle_rad > half_rad:
-            continue  # one on either side of the unaligned position
-        column = int(np.argmax(rise_Wb - FALL_TOLERANCE * aligned_Wb))
-        if rise_Wb[column] > FALL_TOLERANCE * aligned_Wb[column]:
-            curve = curves[at + 1]
-            line = curve.lines[int(np.argmin(np.abs(curve.current_A - current_A[column])))]
+    """From aligned to unaligned the flux linkage of every current falls; else the torque has the wrong sign. A second
+    half pitch is looked at from its end."""
+    order = [at for at, curve in enumerate(curves) if curve.angle_rad <= half_rad]
+    _check_fall_in(order, curves, flux_Wb, current_A)
+    if curves[-1].angle_rad > half_rad:
+        order = [at for at, curve in enumerate(curves) if curve.angle_rad >= half_rad]
+        _check_fall_in(order[::-1], curves, flux_Wb, current_A)
+
+
+def _check_fall_in(order: Sequence[int], curves: Sequence[Curve], flux_Wb: np.ndarray, current_A: np.ndarray) -> None:
+    aligned_Wb = flux_Wb[order[0]]
+    least_Wb, least_at = aligned_Wb.copy(), np.full(len(current_A), order[0])
+    for at in order[1:]:
+        column = int(np.argmax(flux_Wb[at] - least_Wb - FALL_TOLERANCE * aligned_Wb))
+        if flux_Wb[at, column] - least_Wb[column] > FALL_TOLERANCE * aligned_Wb[column]:
+            nearer = curves[least_at[column]]
             raise FluxMapError(
-                f"line {line}: from {_degrees(curves[at].angle_rad)} to {_degrees(curve.angle_rad)} deg at"
-                f" {current_A[column]:.3g} A the flux linkage goes from {before[column]:.4g} to {after[column]:.4g} Wb;"
-                f" from aligned (0 deg) to unaligned ({_degrees(half_rad)} deg) it must fall, but for"
-                f" {FALL_TOLERANCE:.0%} of the aligned"
+                f"line {_nearest_line(curves[at], current_A[column])}: at {current_A[column]:.3g} A the flux linkage is"
+                f" {flux_Wb[at, column]:.4g} Wb at {_degrees(curves[at].angle_rad)} deg and only"
+                f" {least_Wb[column]:.4g} Wb at {_degrees(nearer.angle_rad)} deg; from aligned (0 deg) to unaligned it"
+                f" must fall, but for {FALL_TOLERANCE:.0%} of the aligned"
             )
-    unaligned = curves[int(np.argmin([abs(curve.angle_rad - half_rad) for curve in curves]))]
-    if not np.all(_read_curve(unaligned, current_A)[1:] < aligned_Wb[1:]):
+        lower = flux_Wb[at] < least_Wb
+        least_Wb[lower], least_at[lower] = flux_Wb[at, lower], at
+    if not np.all(least_Wb[1:] < aligned_Wb[1:]):
         raise FluxMapError(
-            f"line {unaligned.lines[0]}: the flux linkage at {_degrees(unaligned.angle_rad)} deg (unaligned) must be"
-            " below that at 0 deg (aligned) at every current"
+            f"line {curves[order[-1]].lines[0]}: the flux linkage at {_degrees(curves[order[-1]].angle_rad)} deg"
+            " must be below that at the aligned position at every current"
         )
 
 
@@ -231,12 +236,11 @@ def _check_mirror(grid_Wb: np.ndarray, angle_rad: np.ndarray, current_A: np.ndar
 def _check_model(model: FluxMap, curves: Sequence[Curve]) -> None:
     least_H, angle_rad, current_A, _ = model.inductance_extremes()
     if least_H < INDUCTANCE_MIN_H:
-        curve = min(curves, key=lambda curve: abs(curve.angle_rad - angle_rad))
-        line = curve.lines[int(np.argmin(np.abs(curve.current_A - current_A)))]
+        nearest = min(curves, key=lambda curve: abs(curve.angle_rad - angle_rad))
         raise FluxMapError(
-            f"line {line}: the curve through the points has an incremental inductance of {least_H:.3g} H near"
-            f" {_degrees(angle_rad)} deg and {current_A:.3g} A; {INDUCTANCE_MIN_H:g} H is the least allowed:"
-            " the points there are too uneven, or of another unit"
+            f"line {_nearest_line(nearest, current_A)}: the curve through the points has an incremental inductance of"
+            f" {least_H:.3g} H near {_degrees(angle_rad)} deg and {current_A:.3g} A; {INDUCTANCE_MIN_H:g} H is the"
+            " least allowed: the points there are too uneven, or of another unit"
         )
     allowed_Wb = MISS_TOLERANCE * max(curve.flux_linkage_Wb[-1] for curve in curves)
     for curve in curves:
@@ -249,6 +253,10 @@ def _check_model(model: FluxMap, curves: Sequence[Curve]) -> None:
                 f"line {curve.lines[at]}: the smooth model misses this point by {miss_Wb[at]:.3g} Wb, allowed is"
                 f" {MISS_TOLERANCE:.0%} of the map's greatest flux linkage: the points there are too uneven"
             )
+
+
+def _nearest_line(curve: Curve, current_A: float) -> int:
+    return curve.lines[int(np.argmin(np.abs(curve.current_A - current_A)))]
 
 
 def _degrees(angle_rad: float) -> str:
