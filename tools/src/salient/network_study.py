@@ -22,12 +22,13 @@ MODES: dict[str, tuple[int, tuple[int, ...]]] = {
 }
 
 
-def ripple(machine: str, mode: str) -> list[float]:
-    """Torque ripple K_t of the paper's controller at 150 r/min and 8 N m, by seed of the initial weights."""
+def ripple(machine: str, mode: str) -> tuple[list[float], list[str]]:
+    """Torque ripple K_t of the paper's controller at 150 r/min and 8 N m, by seed of the initial weights; and the
+    faults of the runs that ended in one, which have no ripple."""
     number, seeds = MODES[mode]
     paper = next(s for s in load_scenarios(SCENARIOS / "load_step_150.toml") if s.controller == "paper")
     first_s, last_s = RIPPLE_WINDOW_S
-    ripples = []
+    ripples, faults = [], []
     for seed in seeds:
         scenario = replace(
             paper,
@@ -37,11 +38,15 @@ def ripple(machine: str, mode: str) -> list[float]:
             parameters={"bp_mode": number, "bp_seed": seed},
         )
         with tempfile.TemporaryDirectory(prefix="salient-") as folder:
-            recording = run_scenario(scenario, Path(folder)).recording
+            result = run_scenario(scenario, Path(folder))
+            if result.fault != "none":
+                faults.append(result.fault)
+                continue
+            recording = result.recording
             assert recording is not None
             figures = torque_metrics(recording["time_s"], recording["torque_Nm"], RIPPLE_WINDOW_S)
         ripples.append(figures["torque_ripple"])
-    return ripples
+    return ripples, faults
 
 
 def study() -> list[dict[str, Any]]:
@@ -51,8 +56,11 @@ def study() -> list[dict[str, Any]]:
           f"over {len(SEEDS)} seeds")
     for machine in sorted(path.stem for path in MACHINES.glob("*.toml")):
         for mode in MODES:
-            ripples = ripple(machine, mode)
-            figures.append({"machine": machine, "mode": mode, "ripple": [round(value, 4) for value in ripples]})
-            low, high = min(ripples), max(ripples)
-            print(f"  {machine:<18}{mode:<10}{low:.4f}" + (f" to {high:.4f}" if high > low else ""), flush=True)
+            ripples, faults = ripple(machine, mode)
+            figures.append({"machine": machine, "mode": mode, "ripple": [round(value, 4) for value in ripples],
+                            "faults": faults})
+            words = [f"{min(ripples):.4f}"] if ripples else []
+            words += [f"to {max(ripples):.4f}"] if len(ripples) > 1 else []
+            words += [f"ended in a fault: {fault}" for fault in faults]
+            print(f"  {machine:<18}{mode:<10}{' '.join(words)}", flush=True)
     return figures
