@@ -6,20 +6,18 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 from salient.flux_map import FluxMap, FluxMapError
 from salient.flux_map_file import load_flux_map
 from salient.magnetics import FORMULA_KEYS, Formula
-from salient.text_file import TextFileError, read_text
+from salient.text_file import TextFileError, read_toml
 
 SHIPPED = Path(__file__).resolve().parents[2] / "machines"
 
 FORMS = (*FORMULA_KEYS, "map")
 
-FILE_BYTES_MAX = 1_000_000
 _SHOWN_MAX = 60  # characters of a wrong value in a message
 
 # Phases by stator and rotor poles.
@@ -115,7 +113,11 @@ def machine_path(name_or_path: str) -> Path:
 def load_machine(path: Path | str) -> Machine:
     """Reads and checks a machine file."""
     path = Path(path)
-    data = _read(path)
+    try:
+        data = read_toml(path)
+    except TextFileError as error:
+        raise MachineError(f"{path}: {error}") from None
+
     _check_keys(path, "", data, ["name", *_TABLES], _OPTIONAL_TABLES)
     name = data["name"]
     if not isinstance(name, str) or not name.isidentifier() or not name.isascii():
@@ -145,17 +147,6 @@ def load_machine(path: Path | str) -> Machine:
         iron_loss=iron_loss,
         **values,
     )
-
-
-def _read(path: Path) -> dict:
-    try:
-        return tomllib.loads(read_text(path, FILE_BYTES_MAX))
-    except TextFileError as error:
-        raise MachineError(f"{path}: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise MachineError(f"{path}: not TOML: {error}") from None
-    except (ValueError, RecursionError):  # what tomllib lets through
-        raise MachineError(f"{path}: not TOML: a number too long or tables too deep") from None
 
 
 def _shown(value: object) -> str:

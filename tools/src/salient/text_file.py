@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import stat
+import tomllib
 from pathlib import Path
+
+
+TOML_BYTES_MAX = 1_000_000
 
 
 class TextFileError(Exception):
@@ -25,3 +29,13 @@ def read_text(path: Path, bytes_max: int) -> str:
         raise TextFileError(f"cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise TextFileError(f"not UTF-8 at byte {error.start + 1}") from None
+
+
+def read_toml(path: Path) -> dict:
+    """The tables of a TOML file of at most TOML_BYTES_MAX."""
+    try:
+        return tomllib.loads(read_text(path, TOML_BYTES_MAX))
+    except tomllib.TOMLDecodeError as error:
+        raise TextFileError(f"not TOML: {error}") from None
+    except (ValueError, RecursionError):  # what tomllib lets through
+        raise TextFileError("not TOML: a number too long or tables too deep") from None
