@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from salient.machine import Machine, MachineError, load_machine
+from salient.machine import Machine, MachineError, load_machine, machine_path
 from salient.magnetics import Formula
 from salient.paths import BUILD
 
@@ -306,6 +306,17 @@ def test_what_is_no_readable_file_is_refused(tmp_path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(10_000_000_000)  # takes no space
     assert "larger than" in refusal(path)
+
+
+@pytest.mark.parametrize("name", ["", ".", "/", "x" * 5000, "a\nb", "a\0b", "pipe", "itself"])
+def test_what_is_no_name_of_a_machine_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    Path("itself").symlink_to("itself")
+    with pytest.raises(MachineError) as caught:
+        machine_path(name)
+    line = str(caught.value)
+    assert line.isprintable() and len(line) < LINE_MAX and "no such file" in line and "saturating" in line
 
 
 # --- Flux-linkage maps ---

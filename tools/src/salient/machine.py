@@ -100,14 +100,16 @@ class Machine:
 
 def machine_path(name_or_path: str) -> Path:
     """The file meant by a shipped machine's name or by a path; MachineError when there is none."""
-    shipped = SHIPPED / f"{name_or_path}.toml"
-    if shipped.is_file():
-        return shipped
-    path = Path(name_or_path)
-    if path.is_file():
-        return path.resolve()
+    shipped, path = SHIPPED / f"{name_or_path}.toml", Path(name_or_path)
+    try:
+        if shipped.is_file():
+            return shipped
+        if path.is_file():
+            return path.resolve()
+    except OSError:
+        pass  # a name too long for a file: there is none
     names = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.toml")))
-    raise MachineError(f"machine '{name_or_path}': no such file, and no shipped machine of that name ({names})")
+    raise MachineError(f"machine {_shown(name_or_path)}: no such file, and no shipped machine of that name ({names})")
 
 
 def load_machine(path: Path | str) -> Machine:

@@ -6,7 +6,6 @@ import stat
 import tomllib
 from pathlib import Path
 
-
 TOML_BYTES_MAX = 1_000_000
 
 
