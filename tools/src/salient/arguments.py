@@ -78,7 +78,7 @@ def make_parser() -> argparse.ArgumentParser:
     monitor.add_argument("--every-s", type=_positive, default=0.1, metavar="X", help="virtual time, default 0.1")
     monitor.add_argument("--duration-s", type=_positive, metavar="X", help="end after so much virtual time")
 
-    bench = command("bench", "the figures of the README: speed of the whole, worth of the network")
+    bench = command("bench", "the figures of the README: speed, also beside SciPy and ngspice; worth of the network")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     bench.add_argument("--runs", type=int, default=5, metavar="N", help="runs of each kind, default 5")
 
