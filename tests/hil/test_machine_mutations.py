@@ -405,6 +405,8 @@ def file_cases() -> list[tuple[str, str | bytes, str]]:
         ("aligned and unaligned swapped", csv([line.rpartition(",")[0] + "," + flux[row(9 - at // 10, at % 10)]
                                                for at, line in enumerate(ROWS)]), "line "),
         ("milliwebers under webers", csv(scaled(2, 1e3)), "line "),
+        ("kiloamperes under amperes", csv(scaled(1, 1e-3)), "aligned_inductance_H"),
+        ("microwebers under milliwebers", csv(scaled(2, 1e6), HEADER.replace("Wb", "mWb")), "line "),
         ("webers under milliwebers", csv(ROWS, HEADER.replace("Wb", "mWb")), "1e-06 H is the least"),
         ("degrees under radians", csv(ROWS, HEADER.replace("deg", "rad")), "line "),
         ("radians under degrees", csv(scaled(0, math.pi / 180)), "line "),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from salient.flux_map import FluxMap, FluxMapError
 from salient.flux_map_file import load_flux_map
-from salient.magnetics import FORMULA_KEYS, Formula
+from salient.magnetics import FORMULA_KEYS, INDUCTANCES, Formula
 from salient.text_file import TextFileError, read_toml
 
 SHIPPED = Path(__file__).resolve().parents[2] / "machines"
@@ -223,6 +223,15 @@ def _flux_map(path: Path, table: dict, rotor_poles: int) -> FluxMap:
     if not isinstance(name, str) or not name.isprintable() or not name.endswith(".csv"):
         raise MachineError(f"{path}: magnetics.file: {_shown(name)} is not the name of a .csv file")
     try:
-        return load_flux_map(path.parent / name, rotor_poles)
+        flux_map = load_flux_map(path.parent / name, rotor_poles)
     except FluxMapError as error:
         raise MachineError(str(error)) from None
+    # A unit mixed up is a factor of 1000, which takes the inductances of many machines out of the range.
+    for key, angle_rad in (("unaligned_inductance_H", flux_map.pitch_rad / 2.0), ("aligned_inductance_H", 0.0)):
+        inductance_H, (low, high) = float(flux_map.derivative(angle_rad, 0.0, 0, 2)), INDUCTANCES[key]
+        if not low <= inductance_H <= high:
+            raise MachineError(
+                f"{path.parent / name}: {key} of the map is {inductance_H:.3g}, allowed are {low:g} to {high:g};"
+                " are the columns in the header's units?"
+            )
+    return flux_map

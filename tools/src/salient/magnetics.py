@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_INDUCTANCES = {"unaligned_inductance_H": (1e-5, 10.0), "aligned_inductance_H": (1e-5, 10.0)}
+INDUCTANCES = {"unaligned_inductance_H": (1e-5, 10.0), "aligned_inductance_H": (1e-5, 10.0)}
+"""(minimum, maximum) of every machine's, both allowed; of the unsaturated phase."""
 
 # Keys of each form in a machine file with (minimum, maximum), both allowed.
 FORMULA_KEYS: dict[str, dict[str, tuple[float, float]]] = {
-    "linear_cosine": _INDUCTANCES,
-    "linear_trapezoid": _INDUCTANCES | {"flat_deg": (0.0, 20.0), "blend_deg": (0.01, 20.0)},
-    "saturating": _INDUCTANCES
+    "linear_cosine": INDUCTANCES,
+    "linear_trapezoid": INDUCTANCES | {"flat_deg": (0.0, 20.0), "blend_deg": (0.01, 20.0)},
+    "saturating": INDUCTANCES
     | {
         "saturated_inductance_H": (1e-6, 10.0),
         "flux_linkage_max_Wb": (1e-3, 100.0),
