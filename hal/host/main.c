@@ -26,7 +26,8 @@
 static rig_t rig;
 static drive_t drive;
 
-/* Rows of hal_pwm_compare_t: row n is what acts in the control period that starts at n + 1 periods. NULL: none. */
+/* Rows of hal_pwm_compare_t: row n is what acts in the control period that starts at n + 1 periods, when no
+ * interrupt was lost. NULL: none. */
 static FILE *switches_file;
 
 static void control_interrupt(void *context) {

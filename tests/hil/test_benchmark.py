@@ -122,6 +122,13 @@ def test_instructions_of_the_plant_are_the_same_twice(replay: Replay) -> None:
     assert instructions.of_plant(replay) == count
 
 
+def test_instructions_of_the_drive_are_the_same_twice_but_for_the_client_s() -> None:
+    """How a client's frames are bundled in the socket depends on the moment."""
+    first, second = (instructions.of_drive("paper", 0.01) for _ in range(2))
+    assert first["plant"] == second["plant"] and first["control laws"] == second["control laws"]
+    assert sum(second.values()) == pytest.approx(sum(first.values()), rel=2e-3)
+
+
 @pytest.mark.parametrize(("controller", "least", "most"), [("traditional", 2000.0, 4500.0), ("paper", 4500.0, 9500.0)])
 def test_instructions_of_the_drive_by_group(controller: str, least: float, most: float) -> None:
     counts = instructions.of_drive(controller, 0.02)
