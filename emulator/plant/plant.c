@@ -201,7 +201,9 @@ static double step_to_event(const integrator_setting_t *setting, const integrato
     double at_s = step_s;
     for (unsigned iteration = 0; iteration < EVENT_ITERATIONS; iteration++) {
         const double previous_s = at_s;
-        at_s = fmax(before_s + (after_s - before_s) * (before / (before - after)), EVENT_TOLERANCE_S);
+        /* From a threshold itself, as after the event before, false position would not move. */
+        const double fraction = before > 0.0 ? before / (before - after) : 0.5;
+        at_s = fmax(before_s + (after_s - before_s) * fraction, EVENT_TOLERANCE_S);
         integrator_step(setting, start, first, at_s, end, integrals);
         const double at = distance_to_event(setting, end);
         if (at == 0.0 || fabs(at_s - previous_s) < EVENT_TOLERANCE_S) {

@@ -223,6 +223,21 @@ TEST(Plant, CurrentEndsWhenTheVoltSecondsAreUsedUp) {
     }
 }
 
+// The link is at its supply's voltage, where the rectifier would begin, when the event is the end of the current: the
+// charge arrives, none of it is lost on the way.
+TEST(Plant, CurrentThatEndsWithinAStepChargesALinkAtItsSupply) {
+    machine_t machine = machine_of(MAGNETICS_SATURATING);
+    machine.dc_link.capacitance_F = 2.2e-3;
+    machine.dc_link.source_resistance_ohm = 0.2;
+    plant_t plant;
+    plant_init(&plant, &machine, 45.0 * M_PI / 180.0);
+    plant.current_A[0] = 1.0;
+    plant_advance(&plant, 25000);
+    const double charge_As = 0.67e-3 / (2.0 * 240.0);
+    EXPECT_EQ(plant.current_A[0], 0.0);
+    EXPECT_NEAR(plant.bus_voltage_V - 240.0, charge_As / 2.2e-3, 1e-3 * charge_As / 2.2e-3);
+}
+
 TEST(Plant, WithoutBusVoltageCurrentsOnlyDecay) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     plant_t plant;

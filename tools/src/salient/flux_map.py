@@ -139,7 +139,7 @@ class FluxMap:
             for across_weights in [_weights(across, 3 - by_angle)]
             for along_weight, parts in zip(_weights(along, 4 - by_current), cell, strict=True)
         )
-        scale = (ANGLE_INTERVALS / half_rad) ** by_angle * (CURRENT_INTERVALS / self.current_max_A) ** by_current
+        scale = math.prod([ANGLE_INTERVALS / half_rad] * by_angle + [CURRENT_INTERVALS / self.current_max_A] * by_current)
         return value * scale * np.where(wrapped_rad < 0.0, (-1.0) ** by_angle, 1.0)
 
 
