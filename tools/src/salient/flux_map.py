@@ -128,10 +128,11 @@ class FluxMap:
 
     def _spline(self, angle_rad, current_A, by_angle: int, by_current: int):
         """Differences before weights, as in the kernel: the coefficients are large against what is left of them."""
-        half_rad = self.pitch_rad / 2.0
+        steps_1_rad = 2.0 * ANGLE_INTERVALS / self.pitch_rad
+        steps_1_A = CURRENT_INTERVALS / self.current_max_A
         wrapped_rad = angle_rad - np.rint(angle_rad / self.pitch_rad) * self.pitch_rad
-        column, across = _interval(np.abs(wrapped_rad) * (ANGLE_INTERVALS / half_rad), ANGLE_INTERVALS)
-        row, along = _interval(current_A * (CURRENT_INTERVALS / self.current_max_A), CURRENT_INTERVALS)
+        column, across = _interval(np.abs(wrapped_rad) * steps_1_rad, ANGLE_INTERVALS)
+        row, along = _interval(current_A * steps_1_A, CURRENT_INTERVALS)
         cell = np.array([[self.coefficients_J[row + j, column + k] for k in range(4)] for j in range(5)])
         cell = np.diff(np.diff(cell, by_current, axis=0), by_angle, axis=1)
         value = sum(
@@ -139,7 +140,7 @@ class FluxMap:
             for across_weights in [_weights(across, 3 - by_angle)]
             for along_weight, parts in zip(_weights(along, 4 - by_current), cell, strict=True)
         )
-        scale = math.prod([ANGLE_INTERVALS / half_rad] * by_angle + [CURRENT_INTERVALS / self.current_max_A] * by_current)
+        scale = math.prod([steps_1_rad] * by_angle + [steps_1_A] * by_current)  # libm's powers differ in the last bit
         return value * scale * np.where(wrapped_rad < 0.0, (-1.0) ** by_angle, 1.0)
 
 
