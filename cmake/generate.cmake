@@ -30,7 +30,7 @@ function(salient_generate_machine name file)
         COMMAND ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m salient.generate_machine ${file} ${out}
         DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate_machine.py ${SALIENT_GENERATOR_SOURCES}/machine.py
                 ${SALIENT_GENERATOR_SOURCES}/magnetics.py ${SALIENT_GENERATOR_SOURCES}/flux_map.py
-                ${SALIENT_GENERATOR_SOURCES}/flux_map_file.py
+                ${SALIENT_GENERATOR_SOURCES}/flux_map_file.py ${SALIENT_GENERATOR_SOURCES}/phase_map.py
         DEPFILE ${out}/machine.d # of a map: its CSV file
         COMMENT "machine ${name}"
         VERBATIM)

@@ -1,6 +1,6 @@
 #include "control/ditc_duty.h"
 
-#include "control/torque_map.h"
+#include "control/phase_map.h"
 #include "fixed/fixed.h"
 
 #define DUTY_ONE_Q15 32768
@@ -20,7 +20,8 @@ static int32_t incoming_duty_q15(const ditc_duty_parameters_t *parameters, const
     /* A sixteenth more than the reference, so that the outgoing phase is spent although the current falls short of its
      * target by what a proportional control leaves. */
     const int32_t carried_q24 = fixed_add(sample->reference_q24, sample->reference_q24 / 16);
-    const int32_t carrying_q9 = torque_map_current_q9(tables, parameters->hand_over_angle, carried_q24);
+    const phase_map_place_t hand_over = phase_map_at(tables, parameters->hand_over_angle);
+    const int32_t carrying_q9 = phase_map_current_of_torque_q9(&hand_over, carried_q24);
     const bool assists = sample->error_q24 > parameters->band_outer_q24 || carrying_q9 > limit_q9;
     const int32_t target_q9 = assists ? limit_q9 : carrying_q9;
     /* Q9 * Q20 to Q15. */

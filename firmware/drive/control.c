@@ -1,7 +1,7 @@
 #include "drive/control.h"
 
+#include "control/phase_map.h"
 #include "control/pwm.h"
-#include "control/torque_map.h"
 #include "fixed/fixed.h"
 
 /* 80 A over 4096 counts is 10 LSB of Q7.9 a count, 512 V is 8 LSB of Q9.6 a count: exact. */
@@ -41,8 +41,11 @@ static estimate_t estimate(const control_parameters_t *parameters, const control
         const int32_t current_q9 = sample->adc.phase_current_counts[phase] * CURRENT_Q9_PER_COUNT;
         e.current_q9[phase] = current_q9;
         e.current_max_q9 = current_q9 > e.current_max_q9 ? current_q9 : e.current_max_q9;
-        e.torque_q24[phase] = torque_map_torque_q24(tables, e.commutation.angle[phase], current_q9);
-        e.torque_sum_q24 = fixed_add(e.torque_sum_q24, e.torque_q24[phase]);
+        if (current_q9 > 0) { /* most of the time a phase has none */
+            const phase_map_place_t place = phase_map_at(tables, e.commutation.angle[phase]);
+            e.torque_q24[phase] = phase_map_torque_q24(&place, current_q9);
+            e.torque_sum_q24 = fixed_add(e.torque_sum_q24, e.torque_q24[phase]);
+        }
     }
     return e;
 }

@@ -7,7 +7,7 @@
 
 extern "C" {
 #include "control/ditc_duty.h"
-#include "control/torque_map.h"
+#include "control/phase_map.h"
 }
 
 #include "twins.h"
@@ -35,6 +35,16 @@ commutation_t commutation_of(double phase_0_deg) {
     return commutation_at(&ANGLES, 3, 4, electrical(phase_0_deg) / 4u);
 }
 
+int32_t map_torque_q24(uint32_t phase_angle, int32_t current_q9) {
+    const phase_map_place_t place = phase_map_at(&machine_tables, phase_angle);
+    return phase_map_torque_q24(&place, current_q9);
+}
+
+int32_t map_current_q9(uint32_t phase_angle, int32_t torque_q24) {
+    const phase_map_place_t place = phase_map_at(&machine_tables, phase_angle);
+    return phase_map_current_of_torque_q9(&place, torque_q24);
+}
+
 ditc_duty_parameters_t parameters_of(bp_pid_mode_t mode) {
     ditc_duty_parameters_t parameters{};
     parameters.pid.mode = mode;
@@ -60,7 +70,7 @@ class DitcDuty : public testing::Test {
         ditc_duty_sample_t sample{current_q9, torque_q24, twins::to_fixed(reference_Nm, twins::Q24), 0};
         sample.error_q24 = sample.reference_q24;
         for (unsigned phase = 0; phase < 3; phase++) {
-            torque_q24[phase] = torque_map_torque_q24(&machine_tables, commutation.angle[phase], current_q9[phase]);
+            torque_q24[phase] = map_torque_q24(commutation.angle[phase], current_q9[phase]);
             sample.error_q24 -= torque_q24[phase];
         }
         error_q24 = sample.error_q24;
@@ -86,7 +96,7 @@ TEST_F(DitcDuty, from_standstill_every_rotor_position_drives_phases_that_can_car
         double torque_Nm = 0.0;
         for (unsigned phase = 0; phase < 3; phase++) {
             if (duty_q15[phase] > 0) {
-                torque_Nm += torque_map_torque_q24(&machine_tables, commutation.angle[phase], LIMIT_Q9) / twins::Q24;
+                torque_Nm += map_torque_q24(commutation.angle[phase], LIMIT_Q9) / twins::Q24;
             }
         }
         weakest = std::min(weakest, torque_Nm);
@@ -137,11 +147,9 @@ TEST_F(DitcDuty, the_incoming_phase_is_brought_to_the_current_that_will_carry_th
     ASSERT_EQ(commutation.active, 1u);
     for (double reference = 0.5; reference < 14.0; reference += 0.25) {
         ditc_duty_reset(&parameters, &ditc);
-        current_q9[0] =
-            torque_map_current_q9(&machine_tables, commutation.angle[0], twins::to_fixed(reference, twins::Q24));
-        const double carrying_A = torque_map_current_q9(&machine_tables, parameters.hand_over_angle,
-                                                        twins::to_fixed(reference * 17 / 16, twins::Q24)) /
-                                  twins::Q9;
+        current_q9[0] = map_current_q9(commutation.angle[0], twins::to_fixed(reference, twins::Q24));
+        const double carrying_A =
+            map_current_q9(parameters.hand_over_angle, twins::to_fixed(reference * 17 / 16, twins::Q24)) / twins::Q9;
         const double target_A = std::min(carrying_A, LIMIT_Q9 / twins::Q9);
         for (int current_A = 0; current_A < 60; current_A += 3) {
             current_q9[1] = current_A << 9;

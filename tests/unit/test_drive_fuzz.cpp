@@ -37,9 +37,9 @@ machine_tables_t four_phases() {
     tables.phases = 4;
     tables.rotor_poles = 6;
     std::mt19937 random(1);
-    for (auto &row : tables.torque_q8) {
+    for (auto &row : tables.torque_per_ampere.node) {
         for (auto &torque : row) {
-            torque = int16_t(random() & 0x7FFF);
+            torque = uint16_t(random());
         }
     }
     return tables;

@@ -13,11 +13,7 @@ import numpy as np
 
 from salient.flux_map import FluxMap
 from salient.machine import Machine, MachineError, load_machine
-
-# As in firmware/control/machine_tables.h.
-TORQUE_ANGLES = 129
-TORQUE_CURRENTS = 41
-TORQUE_CURRENT_STEP_A = 2.0
+from salient.phase_map import PhaseMapError, Surface, phase_map
 
 
 def quantise(value: float, fraction_bits: int, bits: int) -> int:
@@ -27,16 +23,8 @@ def quantise(value: float, fraction_bits: int, bits: int) -> int:
 
 
 def tables_source(machine: Machine) -> str:
-    """C source of the firmware's tables."""
-    half = machine.pitch_rad / 2.0
-    currents = TORQUE_CURRENT_STEP_A * np.arange(TORQUE_CURRENTS)
-    rows = []
-    for angle in np.linspace(half, 2.0 * half, TORQUE_ANGLES):
-        torque = np.maximum(machine.magnetics.torque_Nm(angle, currents), 0.0)
-        # At both ends of the half pitch the slope's sign is that of the wrapped angle; the torque there is zero.
-        if angle == half or angle == 2.0 * half:
-            torque = np.zeros_like(torque)
-        rows.append("        {" + ", ".join(str(quantise(t, 8, 16)) for t in torque) + "},")
+    """C source of the firmware's tables. PhaseMapError when they cannot hold the machine."""
+    tables = phase_map(machine.magnetics)
     return "\n".join(
         [
             f"/* Generated from the machine file of '{machine.name}'. */",
@@ -48,13 +36,31 @@ def tables_source(machine: Machine) -> str:
             f"    .inertia_q30 = {quantise(machine.inertia_kg_m2, 30, 32)},",
             f"    .friction_q30 = {quantise(machine.friction_Nm_s, 30, 32)},",
             f"    .current_rise_A_s = {quantise(machine.current_rise_A_s, 0, 32)},",
-            "    .torque_q8 = {",
-            *rows,
-            "    },",
+            f"    .row_start = {_braced(tables.row_start)},",
+            *_surface_lines("torque_per_ampere", tables.torque_per_ampere),
+            *_surface_lines("flux_per_ampere", tables.flux_per_ampere),
             "};",
             "",
         ]
     )
+
+
+def _surface_lines(name: str, surface: Surface) -> list[str]:
+    return [
+        f"    .{name} = {{",
+        f"        .fraction_bits = {surface.fraction_bits},",
+        "        .node = {",
+        *(f"            {_braced(row)}," for row in surface.node),
+        "        },",
+        "        .bend = {",
+        *(f"            {_braced(row)}," for row in surface.bend),
+        "        },",
+        "    },",
+    ]
+
+
+def _braced(values: np.ndarray) -> str:
+    return "{" + ", ".join(map(str, values.tolist())) + "}"
 
 
 def plant_source(machine: Machine) -> str:
@@ -125,12 +131,16 @@ def main(arguments: list[str]) -> int:
         return 2
     try:
         machine = load_machine(arguments[0])
+        tables = tables_source(machine)
     except MachineError as error:
         print(f"salient: {error}", file=sys.stderr)
         return 2
+    except PhaseMapError as error:
+        print(f"salient: {arguments[0]}: magnetics: {error}", file=sys.stderr)
+        return 2
     out = Path(arguments[1])
     out.mkdir(parents=True, exist_ok=True)
-    (out / "machine_tables.c").write_text(tables_source(machine), encoding="utf-8")
+    (out / "machine_tables.c").write_text(tables, encoding="utf-8")
     (out / "machine_plant.c").write_text(plant_source(machine), encoding="utf-8")
     outputs = " ".join(_escaped(out / name) for name in ("machine_tables.c", "machine_plant.c"))
     inputs = _escaped(machine.magnetics.file) if isinstance(machine.magnetics, FluxMap) else ""

@@ -1,0 +1,137 @@
+"""The firmware's tables of a phase as the generator makes them, read back in double precision: machines whose flux
+linkage is no product of a curve over the angle and one over the current, and magnetics that the tables refuse."""
+
+import math
+
+import numpy as np
+import pytest
+
+from salient.machine import SHIPPED, load_machine
+from salient.phase_map import CURRENT_A, ROW_UNITS, ROWS, PhaseMapError, phase_map
+
+POLES = 4
+HALF_RAD = math.pi / POLES
+
+
+class LocalSaturation:
+    """Poles that overlap over an arc, and saturate at a flux that goes with the overlap: at another current at every
+    angle. psi = Lu i + S o(x) (1 - e^(-b i)), b = (La - Lu) / S (1 + spread (1 - o)), of the overlap o."""
+
+    pitch_rad = 2.0 * HALF_RAD
+
+    def __init__(self, spread: float = 0.8):
+        self.spread = spread
+
+    def _overlap(self, angle_rad):
+        """Overlap and its slope: a smooth step over the angle from aligned, 15 deg wide around 17 deg."""
+        wrapped = np.mod(np.asarray(angle_rad, float) + HALF_RAD, self.pitch_rad) - HALF_RAD
+        x = (np.abs(wrapped) - math.radians(17.0)) / math.radians(4.0)
+        return 0.5 * (1.0 - np.tanh(x)), -0.5 / np.cosh(x) ** 2 / math.radians(4.0) * np.sign(wrapped)
+
+    def _rate(self, overlap):
+        return 0.0572 * (1.0 + self.spread * (1.0 - overlap)), -0.0572 * self.spread
+
+    def flux_linkage_Wb(self, angle_rad, current_A):
+        overlap, _ = self._overlap(angle_rad)
+        rate, _ = self._rate(overlap)
+        return 0.67e-3 * np.asarray(current_A) - 0.4 * overlap * np.expm1(-rate * current_A)
+
+    def torque_Nm(self, angle_rad, current_A):
+        overlap, slope = self._overlap(angle_rad)
+        rate, rate_slope = self._rate(overlap)
+        decay = np.exp(-rate * current_A)
+        risen_A = current_A - (1.0 - decay) / rate
+        by_rate = (1.0 - decay) / rate**2 - current_A * decay / rate
+        return 0.4 * slope * (risen_A + overlap * rate_slope * by_rate)
+
+
+def read_back(tables, surface, place, current_A):
+    """What firmware/control/phase_map.c makes of the tables; place from 0, unaligned, to 1, aligned."""
+    start = tables.row_start / ROW_UNITS
+    row = np.clip(np.searchsorted(start, place, side="right") - 1, 0, ROWS - 2)
+    u = ((place - start[row]) / (start[row + 1] - start[row]))[:, None]
+    rows = surface.node[row] + u * (surface.node[row + 1] - surface.node[row]) - u * (1.0 - u) * surface.bend[row]
+    value = np.empty((len(place), len(current_A)))
+    for at, current in enumerate(current_A):
+        column = int(np.searchsorted(CURRENT_A, current, side="right")) - 1
+        first = min(max(column - 1, 0), 13) if current < 32.0 else min(max(column - 1, 16), len(CURRENT_A) - 4)
+        nodes = range(first, first + 4)
+        value[:, at] = sum(
+            rows[:, a] * math.prod((current - CURRENT_A[b]) / (CURRENT_A[a] - CURRENT_A[b]) for b in nodes if b != a)
+            for a in nodes
+        )
+    return value * current_A / 2.0**surface.fraction_bits
+
+
+def differences(magnetics, current_max_A):
+    """Greatest differences of torque in N m and flux linkage in Wb between tables and machine."""
+    tables = phase_map(magnetics)
+    place = (np.arange(1999) + 0.37) / 2000.0
+    current_A = np.arange(0.3, current_max_A, 0.4)
+    half_rad = magnetics.pitch_rad / 2.0
+    angle_rad = half_rad + half_rad * place[:, None]
+    torque_Nm = read_back(tables, tables.torque_per_ampere, place, current_A)
+    flux_Wb = read_back(tables, tables.flux_per_ampere, place, current_A)
+    return (
+        np.max(np.abs(torque_Nm - magnetics.torque_Nm(angle_rad, current_A))),
+        np.max(np.abs(flux_Wb - magnetics.flux_linkage_Wb(angle_rad, current_A))),
+    )
+
+
+def test_the_torque_of_the_test_s_machine_is_the_slope_of_its_coenergy():
+    magnetics = LocalSaturation()
+    angle_rad, step_rad = HALF_RAD * np.linspace(1.05, 1.95, 50), 1e-5
+    current_A = np.linspace(0.0, 40.0, 4001)
+    coenergy_J = [
+        np.trapezoid(magnetics.flux_linkage_Wb((angle_rad + s)[:, None], current_A), current_A, axis=1)
+        for s in (-step_rad, step_rad)
+    ]
+    slope_Nm = (coenergy_J[1] - coenergy_J[0]) / (2.0 * step_rad)
+    assert np.max(np.abs(slope_Nm - magnetics.torque_Nm(angle_rad, 40.0))) < 1e-4 * np.max(slope_Nm)
+
+
+def test_a_machine_that_saturates_at_another_current_at_every_angle_is_held_within_millinewtonmetres():
+    magnetics = LocalSaturation()
+    # No product: the saturation at half overlap is not that of the aligned position, scaled.
+    halved = magnetics.flux_linkage_Wb(np.array([[0.0], [math.radians(17.0)]]), np.array([5.0, 60.0]))
+    assert halved[1, 0] / halved[0, 0] > 1.2 * halved[1, 1] / halved[0, 1]
+    torque_Nm, flux_Wb = differences(magnetics, 30.0)
+    assert 0.004 < torque_Nm < 0.006
+    assert 20e-6 < flux_Wb < 35e-6
+
+
+def test_rows_stand_closest_where_the_torque_bends_most():
+    start_deg = 45.0 * phase_map(load_machine(SHIPPED / "linear_trapezoid.toml").magnetics).row_start / ROW_UNITS
+    for corner_deg in (1.0, 3.0, 42.0, 44.0):
+        assert np.min(np.abs(start_deg - corner_deg)) < 0.003, corner_deg
+
+
+class Scaled:
+    """A machine with its torque and flux linkage multiplied."""
+
+    def __init__(self, magnetics, factor):
+        self.magnetics, self.factor, self.pitch_rad = magnetics, factor, magnetics.pitch_rad
+
+    def flux_linkage_Wb(self, angle_rad, current_A):
+        return self.factor * self.magnetics.flux_linkage_Wb(angle_rad, current_A)
+
+    def torque_Nm(self, angle_rad, current_A):
+        return self.factor * self.magnetics.torque_Nm(angle_rad, current_A)
+
+
+@pytest.mark.parametrize("factor", [0.01, 1.0, 100.0])
+def test_the_format_follows_the_machine(factor):
+    machine = load_machine(SHIPPED / "saturating.toml").magnetics
+    tables = phase_map(Scaled(machine, factor))
+    for surface in (tables.torque_per_ampere, tables.flux_per_ampere):
+        assert 32768 <= np.max(surface.node) <= 65535, "all 16 bits in use"
+        assert np.min(surface.node) >= 0
+        assert np.max(np.abs(surface.bend)) <= 32767
+
+
+def test_what_the_tables_cannot_hold_is_refused_in_one_line():
+    machine = load_machine(SHIPPED / "saturating.toml").magnetics
+    with pytest.raises(PhaseMapError, match=r"^[0-9.]+ N m/A of torque is more than the firmware's tables hold$"):
+        phase_map(Scaled(machine, 2000.0))
+    with pytest.raises(PhaseMapError, match=r"^at [0-9.]+ deg, towards aligned, the torque falls to [-0-9.]+ N m at"):
+        phase_map(LocalSaturation(spread=2.0))
