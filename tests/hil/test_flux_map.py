@@ -75,6 +75,9 @@ def test_a_map_of_the_saturating_formula_is_the_formula(sampled):
     assert 1e-6 < flux < flux_bound
     assert 1e-7 < torque < torque_bound
     assert flux_map.unaligned_inductance_H == pytest.approx(formula("saturating").unaligned_inductance_H, rel=1e-5)
+    # Nothing is extrapolated before this current: every angle reaches it.
+    reached_A = np.broadcast_to(GRIDS[grid][1], (20, 20))[:, -1]
+    assert flux_map.current_max_A == pytest.approx(min(reached_A), rel=1e-9)
 
 
 def test_finer_maps_come_nearer_to_the_formula(tmp_path):
@@ -360,6 +363,12 @@ REFUSED = {
     "halves that differ": (
         sampled_file(np.linspace(0, 90, 37), REGULAR_A, lambda angle, _, flux: flux * (1.1 if angle > 45 else 1.0)),
         ["do not mirror", "2%"],
+    ),
+    "a step over the angle that the model's grid cannot follow": (
+        sampled_file(
+            sorted([*REGULAR_DEG, 20.0, 20.1]), REGULAR_A, lambda angle, _, flux: flux * (0.5 if angle > 20.05 else 1.0)
+        ),
+        ["misses this point", "2%", "uneven", "line "],
     ),
     "a step in the current": (
         sampled_file(REGULAR_DEG, REGULAR_A, lambda _, current, flux: 0.2 * (current > 51) + 1e-9 * current + (
