@@ -2,12 +2,16 @@
 linkage is no product of a curve over the angle and one over the current, and magnetics that the tables refuse."""
 
 import math
+import shutil
 
 import numpy as np
 import pytest
 
+from salient import generate_machine
+from salient.errors import UsageError
 from salient.machine import SHIPPED, load_machine
 from salient.phase_map import CURRENT_A, ROW_UNITS, ROWS, PhaseMapError, phase_map
+from salient.simulator import executable
 
 POLES = 4
 HALF_RAD = math.pi / POLES
@@ -18,6 +22,7 @@ class LocalSaturation:
     angle. psi = Lu i + S o(x) (1 - e^(-b i)), b = (La - Lu) / S (1 + spread (1 - o)), of the overlap o."""
 
     pitch_rad = 2.0 * HALF_RAD
+    current_max_A = math.inf
 
     def __init__(self, spread: float = 0.8):
         self.spread = spread
@@ -110,7 +115,8 @@ class Scaled:
     """A machine with its torque and flux linkage multiplied."""
 
     def __init__(self, magnetics, factor):
-        self.magnetics, self.factor, self.pitch_rad = magnetics, factor, magnetics.pitch_rad
+        self.magnetics, self.factor = magnetics, factor
+        self.pitch_rad, self.current_max_A = magnetics.pitch_rad, magnetics.current_max_A
 
     def flux_linkage_Wb(self, angle_rad, current_A):
         return self.factor * self.magnetics.flux_linkage_Wb(angle_rad, current_A)
@@ -135,3 +141,40 @@ def test_what_the_tables_cannot_hold_is_refused_in_one_line():
         phase_map(Scaled(machine, 2000.0))
     with pytest.raises(PhaseMapError, match=r"^at [0-9.]+ deg, towards aligned, the torque falls to [-0-9.]+ N m at"):
         phase_map(LocalSaturation(spread=2.0))
+
+
+@pytest.fixture
+def strong_machine(tmp_path):
+    """A file of allowed numbers whose torque is beyond the tables."""
+    text = (SHIPPED / "linear_cosine.toml").read_text(encoding="utf-8")
+    text = text.replace("stator = 6", "stator = 12").replace("rotor = 4", "rotor = 8")
+    path = tmp_path / "strong.toml"
+    path.write_text(text.replace("23.6e-3", "9.0"), encoding="utf-8")
+    return path
+
+
+def test_the_build_step_names_the_file_that_it_refuses(strong_machine, tmp_path, capsys):
+    assert generate_machine.main([str(strong_machine), str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"salient: {strong_machine}: magnetics: ") and said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_refused_machine_is_named_before_anything_is_built(strong_machine):
+    with pytest.raises(UsageError, match=r"strong\.toml: magnetics: [0-9]+ N m/A of torque is more than"):
+        executable(str(strong_machine))
+
+
+def test_a_map_that_ends_early_is_levelled_where_its_straight_continuation_loses_torque(tmp_path):
+    lines = (SHIPPED / "finite_element.csv").read_text(encoding="utf-8").splitlines()
+    kept = [line for line in lines if not line[0].isdigit() or float(line.split(",")[1]) <= 20.0]
+    (tmp_path / "finite_element.csv").write_text("\n".join([*kept, ""]), encoding="utf-8")
+    shutil.copy(SHIPPED / "finite_element.toml", tmp_path)
+    magnetics = load_machine(tmp_path / "finite_element.toml").magnetics
+    half_rad = magnetics.pitch_rad / 2.0
+    angle_rad = half_rad + half_rad * np.linspace(0.0, 1.0, 100)[:, None]
+    assert magnetics.current_max_A == 20.0
+    assert np.min(np.diff(magnetics.torque_Nm(angle_rad, CURRENT_A), axis=1)) < -1.0, "what is to be levelled"
+    torque = phase_map(magnetics).torque_per_ampere.node * CURRENT_A  # N m, in units of the last place
+    assert np.all(np.diff(torque, axis=1) >= -0.5 * (CURRENT_A[1:] + CURRENT_A[:-1])), "but for rounding of T / i"
+    assert differences(magnetics, 18.0)[0] < 0.02

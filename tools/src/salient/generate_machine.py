@@ -13,7 +13,7 @@ import numpy as np
 
 from salient.flux_map import FluxMap
 from salient.machine import Machine, MachineError, load_machine
-from salient.phase_map import PhaseMapError, Surface, phase_map
+from salient.phase_map import PhaseMap, Surface, machine_phase_map
 
 
 def quantise(value: float, fraction_bits: int, bits: int) -> int:
@@ -22,9 +22,8 @@ def quantise(value: float, fraction_bits: int, bits: int) -> int:
     return max(-limit, min(limit - 1, math.floor(value * (1 << fraction_bits) + 0.5)))
 
 
-def tables_source(machine: Machine) -> str:
-    """C source of the firmware's tables. PhaseMapError when they cannot hold the machine."""
-    tables = phase_map(machine.magnetics)
+def tables_source(machine: Machine, tables: PhaseMap) -> str:
+    """C source of the firmware's tables."""
     return "\n".join(
         [
             f"/* Generated from the machine file of '{machine.name}'. */",
@@ -131,16 +130,13 @@ def main(arguments: list[str]) -> int:
         return 2
     try:
         machine = load_machine(arguments[0])
-        tables = tables_source(machine)
+        tables = machine_phase_map(arguments[0], machine)
     except MachineError as error:
         print(f"salient: {error}", file=sys.stderr)
         return 2
-    except PhaseMapError as error:
-        print(f"salient: {arguments[0]}: magnetics: {error}", file=sys.stderr)
-        return 2
     out = Path(arguments[1])
     out.mkdir(parents=True, exist_ok=True)
-    (out / "machine_tables.c").write_text(tables, encoding="utf-8")
+    (out / "machine_tables.c").write_text(tables_source(machine, tables), encoding="utf-8")
     (out / "machine_plant.c").write_text(plant_source(machine), encoding="utf-8")
     outputs = " ".join(_escaped(out / name) for name in ("machine_tables.c", "machine_plant.c"))
     inputs = _escaped(machine.magnetics.file) if isinstance(machine.magnetics, FluxMap) else ""

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from salient.errors import UsageError
 from salient.machine import CONVERTER, SENSORS, Machine, MachineError, load_machine, machine_path
+from salient.phase_map import machine_phase_map
 
 # The sensors and the firmware's tables end here.
 CURRENT_MAX_A = 80.0
@@ -27,6 +28,7 @@ def run(name_or_path: str, out: Path) -> int:
     try:
         path = machine_path(name_or_path)
         machine = load_machine(path)
+        machine_phase_map(path, machine)
     except MachineError as error:
         raise UsageError(str(error)) from None
     print("\n".join(describe(machine)))

@@ -36,6 +36,9 @@ class Formula:
     rotor_poles: int
     parameters: dict[str, float]
 
+    # A formula holds for any current.
+    current_max_A = math.inf
+
     @property
     def pitch_rad(self) -> float:
         return 2.0 * math.pi / self.rotor_poles

@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+
+from salient.machine import Machine, MachineError
 
 # As in firmware/control/machine_tables.h.
 ROWS = 33
@@ -23,10 +26,11 @@ FLUX_FRACTION_BITS = (11, 30)
 
 # Tolerances of the rows, as a fraction of the greatest torque at each of these currents.
 _LEAST_TOLERANCE, _GREATEST_TOLERANCE = 1e-6, 1.0
-_ROW_CURRENTS_A = (5.0, 10.0, 20.0, 40.0, 80.0)
+_ROW_CURRENTS = np.array([1.0, 0.5, 0.25, 0.125, 0.0625])  # of the greatest
 
-# Torque that falls with the current, or is negative between the unaligned and the aligned position, would have no
-# inverse. Taken for noise of a map, and levelled, up to this fraction of the greatest torque at the same current.
+# Torque that falls with the current, or is negative from the unaligned to the aligned position, has no inverse and is
+# levelled: as noise of a map up to this fraction of the greatest torque at the same current, and whatever it is beyond
+# the map's own greatest current, where its flux linkage only goes on straight.
 FALL_TOLERANCE = 0.01
 
 # Stands for no current where psi / i is asked there.
@@ -58,8 +62,16 @@ class PhaseMap:
     """Wb / A."""
 
 
+def machine_phase_map(path: Path | str, machine: Machine) -> PhaseMap:
+    """The tables of a machine file's machine; MachineError when they cannot hold it."""
+    try:
+        return phase_map(machine.magnetics)
+    except PhaseMapError as error:
+        raise MachineError(f"{path}: magnetics: {error}") from None
+
+
 def phase_map(magnetics) -> PhaseMap:
-    """The tables of `magnetics`: a `Formula`, a `FluxMap` or another object with their methods."""
+    """The tables of `magnetics`: a `Formula`, a `FluxMap` or another object with their methods. PhaseMapError."""
     half_rad = magnetics.pitch_rad / 2.0
     row_start = _row_starts(magnetics)
     # The rows and, between them, the places half way.
@@ -69,7 +81,7 @@ def phase_map(magnetics) -> PhaseMap:
     flux_Wb = magnetics.flux_linkage_Wb(angle_rad, CURRENT_A)
     if not np.all(np.diff(flux_Wb, axis=1) > 0.0):
         raise PhaseMapError("the flux linkage does not rise with the current everywhere up to 80 A")
-    torque_Nm = _rising_torque(angle_rad, magnetics.torque_Nm(angle_rad, CURRENT_A))
+    torque_Nm = _rising_torque(magnetics, angle_rad)
     divisor_A = np.maximum(CURRENT_A, _SMALL_A)
     flux_per_ampere = magnetics.flux_linkage_Wb(angle_rad, divisor_A) / divisor_A
     return PhaseMap(
@@ -79,17 +91,19 @@ def phase_map(magnetics) -> PhaseMap:
     )
 
 
-def _rising_torque(angle_rad: np.ndarray, torque_Nm: np.ndarray) -> np.ndarray:
+def _rising_torque(magnetics, angle_rad: np.ndarray) -> np.ndarray:
     """Torque that nowhere falls with the current, nor below zero."""
+    torque_Nm = magnetics.torque_Nm(angle_rad, CURRENT_A)
     torque_Nm = np.where(CURRENT_A > 0.0, torque_Nm, 0.0)  # not what rounding leaves there
     rising_Nm = np.maximum.accumulate(np.maximum(torque_Nm, 0.0), axis=1)
     excess_Nm = rising_Nm - torque_Nm - FALL_TOLERANCE * np.max(torque_Nm, axis=0)
+    excess_Nm = np.where(CURRENT_A <= magnetics.current_max_A, excess_Nm, 0.0)
     row, column = np.unravel_index(np.argmax(excess_Nm), excess_Nm.shape)
     if excess_Nm[row, column] > 0.0:
         raise PhaseMapError(
             f"at {math.degrees(angle_rad[row, 0]):.4g} deg, towards aligned, the torque falls to"
-            f" {torque_Nm[row, column]:.4g} N m at {CURRENT_A[column]:g} A; it must rise with the current up to"
-            f" {CURRENT_A[-1]:g} A, but for {FALL_TOLERANCE:.0%} of the greatest torque at that current"
+            f" {torque_Nm[row, column]:.4g} N m at {CURRENT_A[column]:g} A; it must rise with the current, but for"
+            f" {FALL_TOLERANCE:.0%} of the greatest torque at that current"
         )
     return rising_Nm
 
@@ -110,7 +124,7 @@ def _surface(what: str, unit: str, values: np.ndarray, fraction_bits: tuple[int,
 def _row_starts(magnetics) -> np.ndarray:
     half_rad = magnetics.pitch_rad / 2.0
     angle_rad = half_rad + half_rad * np.arange(ROW_UNITS + 1)[:, None] / ROW_UNITS
-    torque_Nm = magnetics.torque_Nm(angle_rad, np.array(_ROW_CURRENTS_A))
+    torque_Nm = magnetics.torque_Nm(angle_rad, min(CURRENT_A[-1], magnetics.current_max_A) * _ROW_CURRENTS)
     shape = torque_Nm / np.max(np.abs(torque_Nm), axis=0)
 
     least, greatest = _LEAST_TOLERANCE, _GREATEST_TOLERANCE

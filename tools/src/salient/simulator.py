@@ -15,6 +15,7 @@ from salient.drive import ParameterRow, read_parameter_table
 from salient.errors import UsageError
 from salient.machine import MachineError, load_machine, machine_path
 from salient.paths import BUILD, MACHINES, ROOT
+from salient.phase_map import machine_phase_map
 from salient.session import Session
 
 _END_TIMEOUT_S = 60.0
@@ -68,7 +69,9 @@ def executable(machine: str, build: str = "host") -> Path:
     """The executable for a machine; the one for a foreign machine file is built first. UsageError."""
     try:
         path = machine_path(machine)
-        load_machine(path)
+        checked = load_machine(path)
+        if path.parent != MACHINES:
+            machine_phase_map(path, checked)  # or the build would fail
     except MachineError as error:
         raise UsageError(str(error)) from None
     program = BUILD / build / "bin" / f"salient_{path.stem}"
