@@ -20,10 +20,8 @@ from fmpy.validation import validate_fmu
 from plant_twin import Compare, State, load_library, machine_from
 
 from salient.machine import load_machine, machine_path
-from salient.magnetics import FORMULA_KEYS
-from salient.paths import ROOT
+from salient.paths import MACHINES, ROOT
 
-FORMS = tuple(FORMULA_KEYS)  # and the names of the shipped machines
 OUTPUTS = (
     "current_a_A",
     "current_b_A",
@@ -55,7 +53,7 @@ def unit_path(name: str) -> Path:
 
 
 def chopping(steps: int, step_s: float) -> np.ndarray:
-    """Each phase conducts for a third of a pitch, its lower switch on all the while, its upper one chopping; load and
+    """Each of three phases conducts for a third of 90 degrees, its lower switch on, its upper one chopping; load and
     supply voltage move in ramps."""
     names = [f"{side}_{letter}" for letter in "abc" for side in ("upper", "lower")]
     dtype = [("time", np.float64), *((name, np.bool_) for name in names)]
@@ -162,13 +160,13 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> Callable:
 # --- Tests ---
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_the_unit_is_valid(form):
-    assert validate_fmu(str(unit_path(form))) == []
+@pytest.mark.parametrize("name", sorted(path.stem for path in MACHINES.glob("*.toml")))
+def test_the_unit_is_valid(name):
+    assert validate_fmu(str(unit_path(name))) == []
 
 
 @pytest.mark.parametrize(("form", "step_ns"), [("saturating", 5000), ("linear_cosine", 25000),
-                                               ("linear_trapezoid", 25000)])
+                                               ("linear_trapezoid", 25000), ("finite_element", 25000)])
 def test_a_run_in_fmpy_equals_the_native_run_bit_for_bit(library, form, step_ns):
     steps, step_s = 20_000_000 // step_ns, step_ns * 1e-9
     signals = chopping(steps, step_s)
