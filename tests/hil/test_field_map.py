@@ -73,15 +73,15 @@ def test_flux_linkage_rises_with_the_current_and_falls_with_the_angle_everywhere
 
 @pytest.mark.parametrize(
     ("angle_deg", "current_A", "rise"),
-    # Measured: 0.0018, 0.0037; where the corners of the poles meet, 0.018.
-    [(0, 20, (0.001, 0.003)), (30, 20, (0.002, 0.006)), (20, 5, (0.01, 0.025))],
+    # Measured: 0.0027, 0.0036; where the corners of the poles meet, 0.016.
+    [(0, 20, (0.001, 0.004)), (30, 20, (0.002, 0.006)), (20, 5, (0.01, 0.025))],
 )
 def test_half_the_mesh_changes_the_flux_linkage_by_less_than_a_percent_but_at_the_corners(angle_deg, current_A, rise):
     finer_Wb = solved(angle_deg, current_A, refinement=2)[0]
     assert rise[0] < finer_Wb / solved(angle_deg, current_A)[0] - 1.0 < rise[1]
 
 
-# Measured: within 0.7 %. Where the corners of the poles meet, at 21 deg, the map's steps blunt the torque's: 6 %.
+# Measured: within 0.7 %. Where the corners of the poles meet, at 21 deg, the map's steps blunt the torque's: 4 %.
 @pytest.mark.parametrize("angle_deg", [2.5, 10.0, 19.0, 25.0])
 @pytest.mark.parametrize("current_A", [20, 40, 80])
 def test_torque_of_the_maps_coenergy_is_that_of_maxwells_stress(angle_deg, current_A):
@@ -91,7 +91,7 @@ def test_torque_of_the_maps_coenergy_is_that_of_maxwells_stress(angle_deg, curre
     assert magnetics.torque_Nm(np.radians(angle_deg), current_A) == pytest.approx(stress_Nm, rel=0.01)
 
 
-@pytest.mark.parametrize("gap_mm", [0.4, 0.1])
+@pytest.mark.parametrize("gap_mm", [0.5, 0.1])
 def test_ideal_iron_has_the_inductance_of_the_air_gap_and_its_fringing(gap_mm):
     geometry = replace(GEOMETRY, gap=gap_mm)
     (flux_Wb, _), (double_Wb, _) = solutions(Machine(geometry, steel=IdealIron()), 0.0, [1.0, 2.0])
@@ -102,7 +102,7 @@ def test_ideal_iron_has_the_inductance_of_the_air_gap_and_its_fringing(gap_mm):
         4.0 / np.pi * gap_mm * np.log1p(np.pi * height_mm / (2.0 * gap_mm)) / geometry.stator_pole_width
         for height_mm in (2.0, 10.0)
     ]
-    # Measured: 0.109 and 0.031.
+    # Measured: 0.130 and 0.031.
     assert fringing[0] < flux_Wb / gap_inductance_H(geometry) - 1.0 < fringing[1]
 
 
@@ -126,7 +126,7 @@ def test_the_map_is_no_product_of_a_function_of_the_angle_and_one_of_the_current
     angles_rad = np.linspace(0.0, np.pi / 4.0, 61)[:, None]
     product = load_machine(MACHINES / "saturating.toml").magnetics.flux_linkage_Wb(angles_rad, np.array(CURRENTS_A))
     assert second_to_first(product) < 1e-12
-    assert 0.04 < second_to_first(table()) < 0.08  # measured: 0.056
+    assert 0.035 < second_to_first(table()) < 0.07  # measured: 0.049
 
 
 def test_the_slope_over_the_angle_has_no_noise_of_the_mesh():
@@ -134,7 +134,7 @@ def test_the_slope_over_the_angle_has_no_noise_of_the_mesh():
     # What a cubic through seven neighbours does not explain, away from where the poles' corners meet and part.
     rest = np.abs(slope - savgol_filter(slope, 7, 3, axis=0))[[*range(8, 36), *range(50, 57)]]
     noise = np.max(rest, axis=0) / np.max(np.abs(slope), axis=0)
-    assert 1e-6 < np.max(noise) < 0.004  # measured: 0.0029
+    assert 1e-6 < np.max(noise) < 0.004  # measured: 0.0023
 
 
 def test_reluctivity_is_that_of_the_curve_and_its_slope_the_derivative():

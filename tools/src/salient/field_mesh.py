@@ -31,7 +31,7 @@ class Geometry:
     shaft_radius: float = 15.0
     rotor_root_radius: float = 27.0
     rotor_radius: float = 45.0
-    gap: float = 0.4
+    gap: float = 0.5
     coil_inner_radius: float = 50.0
     coil_outer_radius: float = 72.0
     stator_root_radius: float = 73.0
@@ -39,9 +39,9 @@ class Geometry:
     stator_pole_arc: float = 20.0
     rotor_pole_arc: float = 22.0
     coil_arc: float = 10.0  # nominal, of a coil side beside its pole: 0.4 of the slot
-    stack_length: float = 120.0
+    stack_length: float = 170.0
     stacking_factor: float = 0.96
-    turns: int = 30  # of each of the two coils of a phase, in series
+    turns: int = 26  # of each of the two coils of a phase, in series
 
     @property
     def bore_radius(self) -> float:
