@@ -26,7 +26,7 @@ FLUX_FRACTION_BITS = (11, 30)
 
 # Tolerances of the rows, as a fraction of the greatest torque at each of these currents.
 _LEAST_TOLERANCE, _GREATEST_TOLERANCE = 1e-6, 1.0
-_ROW_CURRENTS = np.array([1.0, 0.5, 0.25, 0.125, 0.0625])  # of the greatest
+_ROW_CURRENTS = np.array([1.0, 0.75, 0.5, 0.25, 0.125, 0.0625])  # of the greatest
 
 # Torque that falls with the current, or is negative from the unaligned to the aligned position, has no inverse and is
 # levelled: as noise of a map up to this fraction of the greatest torque at the same current, and whatever it is beyond
