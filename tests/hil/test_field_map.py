@@ -155,3 +155,20 @@ def test_the_steinmetz_formula_is_near_the_loss_it_stands_for():
     ratio /= electrical_steel.sinusoidal_loss_W_kg(frequency_Hz, flux_density_T)
     assert 0.85 < ratio.min() < 0.95
     assert 1.0 < ratio.max() < 1.10
+
+
+@pytest.mark.parametrize("controller", ["traditional", "paper"])
+def test_the_drive_with_its_own_limits_catches_a_load_step_on_this_machine(make_bench, controller):
+    bench = make_bench(machine="finite_element", controller=controller)
+    bench.drive.speed_reference_rpm = 150
+    bench.at(0.13).load_torque_Nm = 8
+    bench.run_for(0.5)
+    assert bench.drive.fault == "none"
+    speed_rpm = bench.truth["speed_rpm"]
+    # Measured: it falls to 126 and 124 r/min.
+    assert 105 < speed_rpm.between(0.13, 0.5).value.min() < 135
+    steady_rpm = speed_rpm.between(0.3, 0.5).value
+    assert 147 < steady_rpm.min() and steady_rpm.max() < 153
+    # Chopping at 52 A, two periods late.
+    currents_A = [bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"].value.max() for phase in "abcd"]
+    assert 50 < max(currents_A) < 72
