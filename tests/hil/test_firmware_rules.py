@@ -61,3 +61,28 @@ def test_the_cortex_m4_build_names_the_forbidden_symbol(tmp_path, source, symbol
 
 def test_the_cortex_m4_build_accepts_integers(tmp_path):
     assert symbol_check(tmp_path, INTEGERS).returncode == 0
+
+
+def size_check(tmp_path: Path, bytes_of_table: int, initial: int) -> subprocess.CompletedProcess:
+    """Of a table in flash and a variable with an initial value, against a limit of 1000 bytes."""
+    file, item = tmp_path / "size.c", tmp_path / "size.o"
+    table, variable = f"const char table[{bytes_of_table}] = {{1}};\n", f"char variable[{initial}] = {{1}};\n"
+    file.write_text(table + variable + "char zero[5000];\n")
+    subprocess.run(["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-c", str(file), "-o", str(item)], check=True)
+    return subprocess.run(
+        ["cmake", "-DSIZE=arm-none-eabi-size", f"-DFILES={item}", "-DLIMIT=1000", "-P",
+         str(ROOT / "cmake/check_size.cmake")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_cortex_m4_build_stops_at_one_byte_more_than_the_flash(tmp_path):
+    fits = size_check(tmp_path, 900, 100)
+    assert fits.returncode == 0
+    assert "1000 of 1000 bytes" in fits.stdout
+    assert size_check(tmp_path, 901, 100).returncode != 0
+    too_much = size_check(tmp_path, 900, 101)
+    assert too_much.returncode != 0
+    assert "1001 bytes of flash, 1000 are allowed" in too_much.stderr
