@@ -47,7 +47,7 @@ def assert_mistake(result, *words: str) -> None:
         (["demo", "--machine", "nonesuch.toml"], ["nonesuch.toml"]),
         (["demo", "--out", "/proc/nowhere"], ["/proc/nowhere"]),
         (["run"], ["SCENARIO.toml"]),
-        (["run", "nonesuch.toml"], ["nonesuch.toml", "no such scenario file"]),
+        (["run", "nonesuch.toml"], ["nonesuch.toml", "no such file"]),
         (["log", "--can", "unix:/no/such/bus"], ["unix:/no/such/bus"]),
         (["log", "--out", "can.csv"], ["can.csv", ".blf or .log"]),
         (["monitor", "--can", "unix:/no/such/bus"], ["unix:/no/such/bus"]),
@@ -81,6 +81,8 @@ def test_wrong_command_line(salient, arguments, words):
         (SCENARIO + "[parameters]\ntorque_max_Nm = 1000\n", ["parameters.torque_max_Nm", "1000", "0 to 40 N m"]),
         (SCENARIO + "[parameters]\ntorque_max_Nm = true\n", ["parameters.torque_max_Nm", "not a number"]),
         (SCENARIO + "seed = \n", ["not TOML"]),
+        (SCENARIO + "seed = " + 5000 * "9", ["not TOML", "too long"]),
+        (SCENARIO + "seed = " + 20000 * "[", ["not TOML", "too deep"]),
     ],
 )
 def test_wrong_scenario(salient, tmp_path, text, words):

@@ -31,7 +31,6 @@ from __future__ import annotations
 import json
 import math
 import tempfile
-import tomllib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -47,6 +46,7 @@ from salient.errors import UsageError
 from salient.log_files import write_logs
 from salient.signals import SignalTable, drive_database
 from salient.simulator import SimulatorOptions, executable, parameter_table
+from salient.text_file import TextFileError, read_toml
 
 
 @dataclass(frozen=True)
@@ -251,13 +251,9 @@ def load_scenarios(path: Path) -> list[Scenario]:
     folder.
     """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UsageError(f"{path}: no such scenario file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"{path}: not TOML: {error}") from None
+        data = read_toml(path)
+    except TextFileError as error:
+        raise UsageError(f"{path}: {error}") from None
     reader = _Reader(path)
     reader.known_keys("", data, _TOP)
     for key in ("machine", "controllers", "duration_s"):
