@@ -20,6 +20,10 @@ CONDITIONS = {
     "versions": {"salient": "0"},
 }
 
+LOSSES = {"window_s": [0.3, 0.4], "input_W": 175.9, "returned_W": 62.1, "copper_W": 45.3, "converter_W": 0.0,
+          "friction_W": 4.9, "output_W": 125.7, "stored_W": -0.02, "efficiency_percent": 71.43,
+          "phase_current_rms_A": 17.38}
+
 
 def recording(reference_rpm, ripple_Nm):
     """0.5 s at 1 us: a first-order start, 8 N m from 0.13 s on with a dip, torque with a fast ripple."""
@@ -52,7 +56,7 @@ def made(runs):
         "start_600": {name: metrics.start_metrics(run, 600.0) for name, run in runs["start_600"].items()},
         "load_step_150": {name: metrics.load_step_metrics(run, 150.0, 0.13)
                           for name, run in runs["load_step_150"].items()},
-    }, CONDITIONS)
+    }, {experiment: dict.fromkeys(CONTROLLERS, LOSSES) for experiment in ("start_600", "load_step_150")}, CONDITIONS)
 
 
 def draw_all(folder, runs, made):
@@ -199,6 +203,21 @@ def test_the_page_has_our_figures_and_the_printed_ones(made, pictures, tmp_path)
         assert f"{made['experiments']['load_step_150'][controller]['torque_ripple']:.4f}" in text
     assert "0.04295" in text
     assert "0.0197" in text
+
+
+def test_the_page_shows_losses_and_the_iron_only_where_it_was_estimated(made, pictures, tmp_path):
+    text = page(tmp_path / "without.html", made, pictures)
+    assert "<td>71.4</td>" in text and "<td>17.38</td>" in text
+    assert "<td>0.0</td>" in text and "<td>-0.0</td>" not in text
+    assert "Steinmetz" not in text and "iron, an estimate" not in text
+    losses = json.loads(json.dumps(made["losses"]))
+    for controller in CONTROLLERS:
+        losses["start_600"][controller]["iron_estimate_W"] = None
+        losses["load_step_150"][controller]["iron_estimate_W"] = 4.747
+    text = page(tmp_path / "with.html", dict(made, losses=losses), pictures)
+    read_page(text)
+    assert text.count("<td>4.75</td>") == 2
+    assert "iron, an estimate" in text and "no part of the ledger" in text
 
 
 def test_words_from_outside_are_escaped(made, pictures, tmp_path):

@@ -24,6 +24,7 @@ from can import CanError
 from salient import figures, metrics
 from salient.drive import DriveError
 from salient.errors import UsageError
+from salient.machine import load_machine, machine_path
 from salient.paths import SCENARIOS
 from salient.progress import Progress
 from salient.report import ROWS, Picture, captions, printed_words_for, words_for, write_report
@@ -62,6 +63,7 @@ class _Run:
     experiment: str
     scenario: Scenario
     merits: Merits
+    losses: dict[str, Any]
     log_paths: tuple[Path, Path]
     recording_path: Path
 
@@ -95,7 +97,8 @@ def _run_and_report(scenarios: Mapping[str, Sequence[Scenario]], out: Path, can:
     with (ProcessPoolExecutor(_WORKERS if can == "local" else 1, initializer=_leave_interrupts_to_parent) as workers,
           Progress(sum(map(len, scenarios.values())) + len(PICTURES) + 1, stream) as progress):
         runs = _run_all(workers, scenarios, out, can, progress)
-        results = make_results(_merits(runs), _conditions(scenarios))
+        results = make_results(_by_experiment(runs, "merits"), _by_experiment(runs, "losses"),
+                               _conditions(scenarios))
         pictures = _draw_all(workers, runs, results, out, progress)
         write_results(out / "results.json", results)
         write_report(out / "report.html", results, pictures, _commands(scenarios), _files(runs, out))
@@ -171,9 +174,10 @@ def _run_one(experiment: str, scenario: Scenario, folder: Path, can: str) -> _Ru
         raise DemoFailed(f"{name}: the drive ended in fault {result.fault}; see {result.text_log_path}")
     try:
         merits = _take(experiment, scenario, result.recording)
+        losses = metrics.losses(result.recording, load_machine(machine_path(scenario.machine)), metrics.LOSS_WINDOW_S)
     except metrics.MetricsError as error:
         raise DemoFailed(f"{name}: {error}; see {result.text_log_path}") from error
-    return _Run(experiment, scenario, merits, (result.log_path, result.text_log_path), result.recording_path)
+    return _Run(experiment, scenario, merits, losses, (result.log_path, result.text_log_path), result.recording_path)
 
 
 def _take(experiment: str, scenario: Scenario, recording: np.ndarray) -> Merits:
@@ -199,10 +203,11 @@ def _gather(started: Mapping[str, Future], progress: Progress) -> list[Any]:
 
 # --- what is made of them -------------------------------------------------------------------------------------------
 
-def _merits(runs: Iterable[_Run]) -> dict[str, dict[str, Merits]]:
-    experiments: dict[str, dict[str, Merits]] = {}
+def _by_experiment(runs: Iterable[_Run], figures: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """One of a run's mappings by experiment and controller."""
+    experiments: dict[str, dict[str, dict[str, Any]]] = {}
     for made in runs:
-        experiments.setdefault(made.experiment, {})[made.controller] = made.merits
+        experiments.setdefault(made.experiment, {})[made.controller] = getattr(made, figures)
     return experiments
 
 

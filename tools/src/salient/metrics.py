@@ -14,15 +14,33 @@ Definitions
     torque ripple K_t = (T_max - T_min) / T_mean, equation (28) of the paper, over every sample of RIPPLE_WINDOW_S;
                   the samples must be 1 us apart or closer, because coarser ones can fall into step with the switching
                   and hide the ripple
+    mean powers   differences of the emulator's energies (fields `energy_..._J`) over a window, by its length. They
+                  close: input = copper + converter + friction + output + stored
+        input     from the DC link into the half bridges, net of what they give back
+        returned  the part of what they drew that they gave back
+        copper, converter   heat in the windings and in the half bridges' devices
+        friction, output    of the shaft; work on the load
+        stored    into magnetic fields and the rotor's speed: what differs between the ends of the window
+    efficiency    output / (output + copper + converter + friction), so that what was stored counts neither way; None
+                  when the load takes no work
+    RMS current   of all phases over every sample of the window
+    iron loss     an estimate and no part of the above (iron_loss.py)
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+
+from salient.iron_loss import iron_loss_W
+from salient.machine import Machine
 
 BAND = 0.005
 RIPPLE_WINDOW_S = (0.3, 0.4)
 RIPPLE_STEP_MAX_S = 1e-6
+# Both ends are ends of a control period at every control rate, where the recorded energies are exact (recorder.h).
+LOSS_WINDOW_S = RIPPLE_WINDOW_S
 
 # Times are compared with this tolerance: far below any sample step, far above the rounding of a double near 1 s.
 _TIME_TOLERANCE_S = 1e-10
@@ -99,6 +117,46 @@ def torque_metrics(time_s: np.ndarray, torque_Nm: np.ndarray, window_s: tuple[fl
         "torque_mean_Nm": mean_Nm,
         "torque_ripple": (highest_Nm - lowest_Nm) / mean_Nm,
     }
+
+
+def losses(recording: np.ndarray, machine: Machine, window_s: tuple[float, float]) -> dict[str, Any]:
+    """Where the power went over window_s: mean powers in W, efficiency, RMS phase current, and window_s itself.
+
+    `recording` needs the energies and currents that the emulator records. The key iron_estimate_W is there when the
+    machine file has a table [iron_loss]; it is None where the recording cannot give it. MetricsError when the
+    recording does not span the window.
+    """
+    time_s = recording["time_s"]
+    step_s = sample_step_s(time_s)
+    if time_s[0] > window_s[0] + _TIME_TOLERANCE_S or time_s[-1] < window_s[1] - step_s - _TIME_TOLERANCE_S:
+        raise MetricsError(f"losses are taken from {window_s[0]:g} s to {window_s[1]:g} s, the recording spans"
+                           f" {time_s[0]:g} s to {time_s[-1]:g} s")
+    part = recording[_index_at(time_s, window_s[0]):_index_after(time_s, window_s[1])]
+    if len(part) < 2:
+        raise MetricsError(f"losses need at least 2 samples from {window_s[0]:g} s to {window_s[1]:g} s")
+    power_W = {name: (float(part[f"energy_{name}_J"][-1]) - float(part[f"energy_{name}_J"][0]))
+               / float(part["time_s"][-1] - part["time_s"][0])
+               for name in ("drawn", "returned", "copper", "converter", "friction", "load")}
+    input_W = power_W["drawn"] - power_W["returned"]
+    lost_W = power_W["copper"] + power_W["converter"] + power_W["friction"]
+    output_W = power_W["load"]
+    square_A2 = [float(np.mean(np.square(part[name], dtype=float)))
+                 for name in part.dtype.names if name.startswith("current_")]
+    figures: dict[str, Any] = {
+        "window_s": list(window_s),
+        "input_W": input_W,
+        "returned_W": power_W["returned"],
+        "copper_W": power_W["copper"],
+        "converter_W": power_W["converter"],
+        "friction_W": power_W["friction"],
+        "output_W": output_W,
+        "stored_W": input_W - lost_W - output_W,
+        "efficiency_percent": 100.0 * output_W / (output_W + lost_W) if output_W > 0.0 else None,
+        "phase_current_rms_A": (sum(square_A2) / len(square_A2)) ** 0.5,
+    }
+    if machine.iron_loss is not None:
+        figures["iron_estimate_W"] = iron_loss_W(machine, recording, window_s)
+    return figures
 
 
 def sample_step_s(time_s: np.ndarray) -> float:

@@ -24,6 +24,8 @@ EXPERIMENT_NAME = {
     "start_600": "Start to 600 r/min, no load",
     "load_step_150": "150 r/min, load step of 8 N m at 0.13 s",
 }
+# The states that the losses are taken in.
+STEADY_STATE_NAME = {"start_600": "600 r/min, no load", "load_step_150": "150 r/min, 8 N m"}
 # name in results.json -> words, unit, decimals, factor into that unit
 ROWS = {
     "settling_time_s": ("settled within ±0.5 % after", "s", 4, 1.0),
@@ -35,6 +37,19 @@ ROWS = {
     "torque_min_Nm": ("lowest torque, 0.3 to 0.4 s", "N m", 3, 1.0),
     "torque_mean_Nm": ("mean torque, 0.3 to 0.4 s", "N m", 3, 1.0),
     "torque_ripple": ("torque ripple <i>K</i><sub>t</sub>", "", 4, 1.0),
+}
+# In results.json's losses -> words, unit, decimals
+LOSS_ROWS = {
+    "input_W": ("input, from the DC link", "W", 1),
+    "copper_W": ("windings", "W", 1),
+    "converter_W": ("switches and diodes", "W", 1),
+    "friction_W": ("friction", "W", 1),
+    "output_W": ("output, to the load", "W", 1),
+    "stored_W": ("kept in fields and speed", "W", 1),
+    "efficiency_percent": ("efficiency", "%", 1),
+    "returned_W": ("drawn and given back to the link", "W", 1),
+    "phase_current_rms_A": ("phase current, RMS", "A", 2),
+    "iron_estimate_W": ("iron, an estimate", "W", 2),
 }
 NEVER = {"settling_time_s": "not in this run", "recovery_time_s": "not in this run"}
 
@@ -60,6 +75,7 @@ def write_report(path: Path, results: Mapping[str, Any], pictures: Sequence[Pict
         headline=_headline(results),
         tiles=_tiles(results),
         tables="\n".join(_table(results, experiment) for experiment in results["experiments"]),
+        losses=_losses(results["losses"]),
         pictures="\n".join(_picture(picture) for picture in pictures),
         why=_why(results),
         notes="\n".join(f"<li>{escape(note)}</li>" for note in results["paper_notes"]),
@@ -159,6 +175,35 @@ def _table(results: Mapping[str, Any], experiment: str) -> str:
     return (f"<h3>{escape(EXPERIMENT_NAME.get(experiment, experiment))}</h3>\n<table><thead><tr><th></th>{heads}</tr>"
             f"<tr><th></th>{'<th>here</th><th class=paper>printed</th>' * len(merits)}</tr></thead>\n<tbody>"
             + "\n".join(rows) + "</tbody></table>")
+
+
+def _losses(losses: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+    """One table of all experiments, and what its words mean."""
+    columns = [(controller, of) for by_controller in losses.values() for controller, of in by_controller.items()]
+    experiments = "".join(f'<th colspan="{len(by_controller)}">{escape(STEADY_STATE_NAME.get(experiment, experiment))}'
+                          "</th>" for experiment, by_controller in losses.items())
+    controllers = "".join(f'<th style="color:{_colour(controller)}">{_name(controller)}</th>'
+                          for controller, _ in columns)
+    rows = "\n".join(
+        f'<tr><th scope="row">{words}, {unit}</th>'
+        + "".join(f"<td>{'–' if of[name] is None else f'{of[name]:z.{decimals}f}'}</td>" for _, of in columns)
+        + "</tr>"
+        for name, (words, unit, decimals) in LOSS_ROWS.items() if name in columns[0][1])
+    start_s, end_s = columns[0][1]["window_s"]
+    iron = _IRON_WORDS if "iron_estimate_W" in columns[0][1] else ""
+    return f"""<table><thead><tr><th></th>{experiments}</tr><tr><th></th>{controllers}</tr></thead>
+<tbody>
+{rows}
+</tbody></table>
+<p>Mean powers from {start_s:g} to {end_s:g} s by the emulator's energy ledger: input = windings + devices + friction +
+output + what is stored at the end and was not at the beginning. Efficiency is the output over output and losses, so
+that what is stored counts neither way; without load there is none. Devices without drops in the machine file lose
+nothing.{iron}</p>"""
+
+
+_IRON_WORDS = """ The iron's loss is estimated from the recorded currents (improved generalized Steinmetz equation, a
+stator pole's flux for all of the iron); it is no part of the ledger, the input or the efficiency, and not given for
+samples more than 1 µs apart."""
 
 
 def _link(words: str, target: str) -> str:
@@ -292,6 +337,11 @@ $tables
 </div>
 <p>“here” is measured on the emulator's true state, not on what the drive believes; “printed” is what Zhao and Deng
 print for their simulation.</p>
+
+<h2>Where the power goes</h2>
+<div class="tables">
+$losses
+</div>
 
 <h2>What it looks like</h2>
 $pictures

@@ -54,15 +54,18 @@ PAPER_NOTES = (
 
 
 def make_results(experiments: Mapping[str, Mapping[str, Mapping[str, float | None]]],
+                 losses: Mapping[str, Mapping[str, Mapping[str, Any]]],
                  conditions: Mapping[str, Any]) -> dict[str, Any]:
     """The content of results.json.
 
-    `experiments` maps experiment -> controller -> figure of merit -> value or None. Floats in it and in `conditions`
-    are rounded to SIGNIFICANT_DIGITS; the order of the keys is kept.
+    `experiments` maps experiment -> controller -> figure of merit -> value or None, `losses` experiment -> controller
+    -> what metrics.losses gives. Floats in them and in `conditions` are rounded to SIGNIFICANT_DIGITS; the order of the
+    keys is kept.
     """
     return {
         "schema": SCHEMA,
         "experiments": rounded(experiments),
+        "losses": rounded(losses),
         "paper": PAPER,
         "paper_notes": list(PAPER_NOTES),
         "conditions": rounded(conditions),

@@ -44,6 +44,8 @@ from salient.bench import Bench
 from salient.drive import DriveError, write_request
 from salient.errors import UsageError
 from salient.log_files import write_logs
+from salient.machine import load_machine, machine_path
+from salient.metrics import losses
 from salient.signals import SignalTable, drive_database
 from salient.simulator import SimulatorOptions, executable, parameter_table
 from salient.text_file import TextFileError, read_toml
@@ -95,8 +97,8 @@ class Scenario:
 class RunResult:
     """What a run left behind.
 
-    recording: structured array, one row each record.step_us (time_s, speed_rpm, torque_Nm, load_torque_Nm,
-    rotor_angle_deg, current_a_A, ...), memory-mapped from recording_path; None when nothing was recorded.
+    recording: structured array, one row each record.step_us (fields: emulator/plant/recorder.h), memory-mapped from
+    recording_path; None when nothing was recorded.
     telemetry, truth: signals by name as they went over CAN (salient.signals.SignalTable).
     fault: the drive's fault at the end, "none" when it is well.
     """
@@ -195,12 +197,15 @@ def _check_parameters_taken(bench: Bench, count: int) -> None:
 
 
 def summary(result: RunResult) -> dict[str, Any]:
-    """Figures of a run in general: speeds and torques over the recording (or, without one, the true state on CAN)."""
+    """Figures of a run in general: speeds and torques over the recording (or, without one, the true state on CAN).
+
+    With a recording also its losses (metrics.losses), from its first row to its last.
+    """
     source: Any = result.recording
     if source is None:
         source = {name: result.truth[name].value for name in ("speed_rpm", "torque_Nm")}
     speed_rpm, torque_Nm = np.asarray(source["speed_rpm"]), np.asarray(source["torque_Nm"])
-    return {
+    figures = {
         "max_speed_rpm": float(speed_rpm.max()),
         "final_speed_rpm": float(speed_rpm[-1]),
         "torque_max_Nm": float(torque_Nm.max()),
@@ -209,6 +214,10 @@ def summary(result: RunResult) -> dict[str, Any]:
         "frames": result.telemetry.count("DRIVE_STATUS"),
         "fault": result.fault,
     }
+    if result.recording is not None and len(result.recording) > 1:
+        window_s = (float(result.recording["time_s"][0]), float(result.recording["time_s"][-1]))
+        figures["losses"] = losses(result.recording, load_machine(machine_path(result.scenario.machine)), window_s)
+    return figures
 
 
 def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local",
