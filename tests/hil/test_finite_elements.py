@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from salient import electrical_steel
-from salient.field_map import ANGLE_STEP_DEG, CURRENTS_A, machine_data, solutions
-from salient.field_mesh import Geometry
-from salient.field_solver import Machine, gap_inductance_H
+from salient.finite_elements import steel as steel_data
+from salient.finite_elements.map import ANGLE_STEP_DEG, CURRENTS_A, machine_data, solutions
+from salient.finite_elements.mesh import Geometry
+from salient.finite_elements.solver import Machine, gap_inductance_H
 from salient.machine import load_machine
 from salient.paths import MACHINES
 
@@ -25,7 +25,7 @@ class IdealIron:
     """A relative permeability of a million at every flux density."""
 
     def reluctivity(self, square_T2):
-        return np.full(square_T2.shape, 1e-6 / electrical_steel.MU_0), np.zeros(square_T2.shape)
+        return np.full(square_T2.shape, 1e-6 / steel_data.MU_0), np.zeros(square_T2.shape)
 
 
 @cache
@@ -138,21 +138,21 @@ def test_the_slope_over_the_angle_has_no_noise_of_the_mesh():
 
 
 def test_reluctivity_is_that_of_the_curve_and_its_slope_the_derivative():
-    steel = electrical_steel.Laminations(1.0)
+    steel = steel_data.Laminations(1.0)
     assert steel.reluctivity(np.array([1.0, 2.25]))[0] == pytest.approx([106.201, 1108.33 / 1.5])
     square_T2 = np.linspace(0.01, 6.0, 200) + 1e-4
     nu, slope = steel.reluctivity(square_T2)
     ahead, behind = (steel.reluctivity(square_T2 + step)[0] for step in (1e-6, -1e-6))
     assert slope == pytest.approx((ahead - behind) / 2e-6, rel=1e-3, abs=1e-3)
     # Of sheets and varnish the sheets carry the flux until they are saturated.
-    assert electrical_steel.Laminations(0.9).reluctivity(np.array([0.81]))[0] == pytest.approx(106.201 / 0.9, rel=1e-4)
+    assert steel_data.Laminations(0.9).reluctivity(np.array([0.81]))[0] == pytest.approx(106.201 / 0.9, rel=1e-4)
 
 
 def test_the_steinmetz_formula_is_near_the_loss_it_stands_for():
-    k, alpha, beta = electrical_steel.steinmetz()
+    k, alpha, beta = steel_data.steinmetz()
     frequency_Hz, flux_density_T = np.meshgrid([50.0, 100.0, 400.0, 1000.0, 2000.0], [0.2, 0.5, 1.0, 1.6])
     ratio = k * frequency_Hz**alpha * flux_density_T**beta
-    ratio /= electrical_steel.sinusoidal_loss_W_kg(frequency_Hz, flux_density_T)
+    ratio /= steel_data.sinusoidal_loss_W_kg(frequency_Hz, flux_density_T)
     assert 0.85 < ratio.min() < 0.95
     assert 1.0 < ratio.max() < 1.10
 

@@ -1,6 +1,6 @@
 """Magnetostatic field of one excited phase of a switched-reluctance machine in its cross section, by finite elements.
 
-curl (nu(B^2) curl A) = J for the axial vector potential A: linear triangles (field_mesh.py), Newton-Raphson with the
+curl (nu(B^2) curl A) = J for the axial vector potential A: linear triangles (mesh.py), Newton-Raphson with the
 exact Jacobian (P. P. Silvester, R. L. Ferrari, Finite Elements for Electrical Engineers, 3rd ed., 1996, chapter 7). No
 flux leaves the stator outwards or enters the shaft. Two dimensions: the field at the ends of the stack is left out.
 """
@@ -13,9 +13,8 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
-from salient import field_mesh
-from salient.electrical_steel import MU_0, Laminations
-from salient.field_mesh import COIL_MINUS, COIL_PLUS, IRON, Geometry
+from salient.finite_elements.mesh import COIL_MINUS, COIL_PLUS, FINE_DEG, IRON, Geometry, build_mesh
+from salient.finite_elements.steel import MU_0, Laminations
 
 # Of the Newton iteration, from its first residual; the flux linkage's error is of the order of its square.
 _RESIDUAL = 1e-7
@@ -31,9 +30,9 @@ class Machine:
 
     def __init__(self, geometry: Geometry, refinement: int = 1, steel=None):
         self.geometry = geometry
-        self.mesh = field_mesh.build(geometry, refinement)
+        self.mesh = build_mesh(geometry, refinement)
         self.steel = steel or Laminations(geometry.stacking_factor)
-        self.step_deg = field_mesh.FINE_DEG / refinement
+        self.step_deg = FINE_DEG / refinement
         self.length_m = geometry.stack_length * 1e-3
         mesh = self.mesh
         self.iron = np.flatnonzero(mesh.region == IRON)

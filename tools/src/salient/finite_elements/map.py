@@ -1,9 +1,9 @@
 """The flux-linkage map of tools/machines/finite_element.csv, computed from a geometry and a magnetisation curve.
 
-    python -m salient.field_map OUT.csv
+    build/venv/bin/python -m salient.finite_elements OUT.csv
 
-The field at every position and current by field_solver.py, on the cross section of field_mesh.py (its Geometry), with
-the steel of electrical_steel.py. machine_data is what else that machine's file says of the motor. Takes about four
+The field at every position and current by solver.py, on the cross section of mesh.py (its Geometry), with
+the steel of steel.py. machine_data is what else that machine's file says of the motor. Takes about four
 minutes of one core, and uses all there are.
 """
 
@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from salient import electrical_steel
-from salient.field_mesh import COIL_PLUS, IRON, Geometry
-from salient.field_solver import Machine
+from salient.finite_elements import steel
+from salient.finite_elements.mesh import COIL_PLUS, IRON, Geometry
+from salient.finite_elements.solver import Machine
 
 ANGLE_STEP_DEG = 0.5
 
@@ -61,7 +61,7 @@ def machine_data(geometry: Geometry) -> dict[str, float]:
     """
     machine = Machine(geometry)
     mesh, turns = machine.mesh, geometry.turns_in_series
-    steel_kg_m = electrical_steel.DENSITY_KG_M3 * geometry.stacking_factor * machine.length_m
+    steel_kg_m = steel.DENSITY_KG_M3 * geometry.stacking_factor * machine.length_m
 
     side_m2 = float(mesh.area_m2[mesh.region == COIL_PLUS].sum())
     side_width_m = side_m2 / ((geometry.coil_outer_radius - geometry.coil_inner_radius) * 1e-3)
@@ -74,7 +74,7 @@ def machine_data(geometry: Geometry) -> dict[str, float]:
     square_m2 = np.sum(mesh.centre_m**2, axis=1)
     shaft_m = geometry.shaft_radius * 1e-3
     shaft_kg_m2 = 0.5 * math.pi * _SHAFT_KG_M3 * machine.length_m * shaft_m**4
-    k, alpha, beta = electrical_steel.steinmetz()
+    k, alpha, beta = steel.steinmetz()
     return {
         "resistance_ohm": _COPPER_OHM_M * turns * mean_turn_m / wire_m2,
         # The mesh is half of the machine.
@@ -96,8 +96,8 @@ def csv_text(geometry: Geometry) -> str:
     lines = [
         "# Flux linkage of one phase of an 8/6 switched-reluctance machine, computed by two-dimensional nonlinear",
         "# magnetostatic finite elements; the field at the ends of the stack is left out. Geometry: Geometry in",
-        "# field_mesh.py, steel: M-19, electrical_steel.py (both in tools/src/salient). Made by",
-        "#     python -m salient.field_map tools/machines/finite_element.csv",
+        "# mesh.py, steel: M-19, steel.py (both in tools/src/salient/finite_elements). Made by",
+        "#     build/venv/bin/python -m salient.finite_elements tools/machines/finite_element.csv",
         "angle_deg,current_A,flux_linkage_Wb",
     ]
     for angle_deg, curve_Wb in zip(angles_deg, curves_Wb, strict=True):
@@ -110,13 +110,9 @@ def csv_text(geometry: Geometry) -> str:
 
 def main(arguments: list[str]) -> int:
     if len(arguments) != 1:
-        print("usage: python -m salient.field_map OUT.csv", file=sys.stderr)
+        print("usage: python -m salient.finite_elements OUT.csv", file=sys.stderr)
         return 2
     Path(arguments[0]).write_text(csv_text(Geometry()), encoding="utf-8")
     for key, value in machine_data(Geometry()).items():
         print(f"{key} = {value:.5g}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""An 8/6 switched-reluctance machine's cross section and its mesh, for field_solver.py.
+"""An 8/6 switched-reluctance machine's cross section and its mesh, for solver.py.
 
 Half of the machine, from -90 to 90 deg about the excited pole: half a turn further the field is the same with its sign
 changed. The mesh is made of rings of nodes. On a ring the nodes' numbers run with equal steps of a nominal angle, in
@@ -90,7 +90,7 @@ class _Layer:
     fine: bool
 
 
-def build(g: Geometry, refinement: int = 1) -> Mesh:
+def build_mesh(g: Geometry, refinement: int = 1) -> Mesh:
     """The mesh, every step divided by `refinement`."""
     middle = g.rotor_radius + g.gap / 2.0
     rotor = [
