@@ -3,141 +3,155 @@
 #include "fixed/fixed.h"
 
 #define HALF_PITCH 0x80000000u
+#define COLUMN_Q9 (1 << MACHINE_COLUMN_BITS)
+#define ONE_Q14 (1 << 14)
 
-/* End of the columns of 2 A, A in Q7.9. */
-#define FINE_END_Q9 (MACHINE_FINE_COLUMNS << MACHINE_FINE_BITS)
+/* Right shift from value in Q14 of the tables' last place times current in Q9 to the format of the result. */
+#define TORQUE_SHIFT(surface) ((unsigned)(surface)->fraction_bits + 14 + 9 - 24)
+#define FLUX_SHIFT(surface) ((unsigned)(surface)->fraction_bits + 14 + 9 - 29)
 
-/* Bits that a value between nodes has more than the tables. With 10 the cubic of any four nodes, sensible or not, stays
- * below 2^31: a node with its bend is within -2^13..2^16 + 2^13, the cubic within 18 times that range. */
-#define EXTRA_BITS 10
+/* Fraction bits that a value keeps in an inverse, so that a product with a column's number and all differences of such
+ * products stay below 2^30, whatever the tables hold. */
+#define INVERSE_BITS 6
 
-/* Right shift from value times current in Q9 to the format of the result. */
-#define TORQUE_SHIFT(surface) ((unsigned)(surface)->fraction_bits + EXTRA_BITS + 9 - 24)
-#define FLUX_SHIFT(surface) ((unsigned)(surface)->fraction_bits + EXTRA_BITS + 9 - 29)
-
-phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_angle) {
+static inline phase_map_place_t place_at(const machine_tables_t *tables, uint32_t phase_angle) {
     const bool mirrored = phase_angle < HALF_PITCH;
-    const uint32_t distance = mirrored ? HALF_PITCH - phase_angle : phase_angle - HALF_PITCH;
-    const uint32_t whole = distance >> MACHINE_ROW_BITS;
-    /* The last row that starts at or before it, but for the aligned position's, where the map ends. */
-    const uint16_t *start = tables->row_start;
-    for (uint32_t step = (MACHINE_ROWS - 1) / 2; step > 0; step /= 2) {
-        start += start[step] <= whole ? step : 0;
+    uint32_t distance = mirrored ? HALF_PITCH - phase_angle : phase_angle - HALF_PITCH;
+    distance -= distance >> 31; /* the aligned position is the end of the last row */
+    /* From the row in which its part of half a pitch begins; the last row's start is beyond every distance. */
+    const machine_row_t *row = &tables->row[tables->cell_row[distance >> MACHINE_CELL_BITS]];
+    while (row[1].start <= distance) {
+        row++;
     }
-    /* Distance in the row, below width << MACHINE_ROW_BITS; at the aligned position itself equal to it. */
-    const uint32_t inside = distance - ((uint32_t)start[0] << MACHINE_ROW_BITS);
-    const uint32_t width = (uint32_t)(start[1] - start[0]);
-    const int32_t fraction_q15 = (int32_t)((inside >> (MACHINE_ROW_BITS - 15)) / width);
+    /* The reciprocal is rounded down and the distance in the row below its width: below one, and rounded at most one.
+     */
+    const uint32_t inside = distance - row->start;
+    const uint32_t fraction_q15 = (uint32_t)(((uint64_t)inside * row->reciprocal) >> 32);
+    const int32_t fraction_q14 = (int32_t)((fraction_q15 + 1) >> 1);
     return (phase_map_place_t){
         .tables = tables,
-        .row = (uint32_t)(start - tables->row_start),
-        .fraction_q15 = fraction_q15,
-        .bend_q15 = (fraction_q15 * (32768 - fraction_q15)) >> 15,
+        .first = (uint32_t)(row - tables->row) * MACHINE_COLUMNS,
+        .fraction_q14 = fraction_q14,
+        .bend_q14 = (fraction_q14 * (ONE_Q14 - fraction_q14)) >> 14,
         .mirrored = mirrored,
     };
 }
 
-/* Place among the columns, Q5.11, of a current of 0..80 A in Q7.9, and a column's current. */
-static inline int32_t position_q11(int32_t current_q9) {
-    return current_q9 < FINE_END_Q9 ? 2 * current_q9 : current_q9 + FINE_END_Q9;
-}
-
-static inline int32_t column_current_q9(int32_t column) {
-    return column < MACHINE_FINE_COLUMNS ? column << 10 : (column << 11) - FINE_END_Q9;
-}
-
-/* A column's value at the angle. Differences of 16-bit entries times at most 2^15 stay within 32 bits. */
-static inline int32_t at_angle(const phase_map_place_t *place, int32_t low, int32_t high, int32_t bend) {
-    return (low << EXTRA_BITS) + (((high - low) * place->fraction_q15) >> (15 - EXTRA_BITS)) -
-           ((bend * place->bend_q15) >> (15 - EXTRA_BITS));
-}
-
-/* Newton's form of the cubic through four columns of equal steps, t in columns from the first of them:
- * value = first + t (once + (t - 1) (twice + (t - 2) thrice)). */
+/* A surface at the angle of a place: the row's nodes and bends, and the weights of this row's nodes, the next row's and
+ * the bends. */
 typedef struct {
-    int32_t start_q11; /* position of the first column */
-    int32_t first, once, twice, thrice;
-} cubic_t;
+    const uint16_t *node;
+    const int8_t *bend;
+    int32_t low_q14, high_q14, bend_q14;
+} curve_t;
 
-/* The cubic for currents from `column` to the next: one column more on either side, or what there is of its width. */
-static inline cubic_t cubic_at(const machine_surface_t *surface, const phase_map_place_t *place, int32_t column) {
-    const int32_t first = column < MACHINE_FINE_COLUMNS
-                              ? fixed_clamp(column - 1, 0, MACHINE_FINE_COLUMNS - 3)
-                              : fixed_clamp(column - 1, MACHINE_FINE_COLUMNS, MACHINE_COLUMNS - 4);
-    const uint16_t *low = &surface->node[place->row][first];
-    const uint16_t *high = &surface->node[place->row + 1][first];
-    const int16_t *bend = &surface->bend[place->row][first];
-    const int32_t v0 = at_angle(place, low[0], high[0], bend[0]);
-    const int32_t v1 = at_angle(place, low[1], high[1], bend[1]);
-    const int32_t v2 = at_angle(place, low[2], high[2], bend[2]);
-    const int32_t v3 = at_angle(place, low[3], high[3], bend[3]);
-    return (cubic_t){
-        .start_q11 = first << 11,
-        .first = v0,
-        .once = v1 - v0,
-        .twice = (v2 - 2 * v1 + v0) / 2,
-        .thrice = (v3 - v0 - 3 * (v2 - v1)) / 6,
+static inline curve_t curve_at(const machine_surface_t *surface, const phase_map_place_t *place) {
+    return (curve_t){
+        .node = &surface->node[place->first],
+        .bend = &surface->bend[place->first],
+        .low_q14 = ONE_Q14 - place->fraction_q14,
+        .high_q14 = place->fraction_q14,
+        .bend_q14 = place->bend_q14 << surface->bend_shift,
     };
 }
 
-/* Current times value, with EXTRA_BITS + 9 fraction bits more than the tables; current 0..80 A. Truncated steps. */
-static inline int64_t product(const cubic_t *cubic, int32_t current_q9) {
-    const int32_t t_q11 = position_q11(current_q9) - cubic->start_q11;
-    int32_t value = cubic->thrice;
-    value = cubic->twice + (int32_t)(((int64_t)value * (t_q11 - 2 * 2048)) >> 11);
-    value = cubic->once + (int32_t)(((int64_t)value * (t_q11 - 2048)) >> 11);
-    value = cubic->first + (int32_t)(((int64_t)value * t_q11) >> 11);
-    return (int64_t)value * current_q9;
+/* A column's value in Q14: the nodes' part is below 2^30, the bend's within 2^27. */
+static inline int32_t column_q14(const curve_t *curve, int32_t column) {
+    const uint16_t *node = &curve->node[column];
+    return node[0] * curve->low_q14 + node[MACHINE_COLUMNS] * curve->high_q14 - curve->bend[column] * curve->bend_q14;
 }
 
-static int32_t look_up(const machine_surface_t *surface, const phase_map_place_t *place, int32_t current_q9,
-                       unsigned shift) {
+/* value >> shift, saturated; shift 1..31, for which two words need no more than this. */
+static inline int32_t shifted(int64_t value, unsigned shift) {
+    const int32_t high = (int32_t)(value >> 32);
+    const int32_t low = (int32_t)((uint32_t)value >> shift | (uint32_t)high << (32 - shift));
+    /* What does not fit in a word: more than copies of its sign. */
+    if (high >> (shift - 1) != low >> 31) {
+        return high < 0 ? INT32_MIN : INT32_MAX;
+    }
+    return low;
+}
+
+static inline int32_t look_up(const machine_surface_t *surface, const phase_map_place_t *place, int32_t current_q9,
+                              unsigned shift) {
+    const curve_t curve = curve_at(surface, place);
     const int32_t held_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
-    const cubic_t cubic = cubic_at(surface, place, position_q11(held_q9) >> 11);
-    return fixed_saturate(product(&cubic, held_q9) >> shift);
+    const int32_t column = held_q9 >> MACHINE_COLUMN_BITS;
+    const int32_t part_q31 = (held_q9 & (COLUMN_Q9 - 1)) << (31 - MACHINE_COLUMN_BITS);
+    const int32_t low_q14 = column_q14(&curve, column);
+    const int32_t high_q14 = column_q14(&curve, column + 1);
+    const int32_t value_q14 = low_q14 + 2 * (int32_t)(((int64_t)(high_q14 - low_q14) * part_q31) >> 32);
+    return shifted((int64_t)value_q14 * held_q9, shift);
 }
 
-/* Current times value at a column, as product() gives it. */
-static inline int64_t product_at(const machine_surface_t *surface, const phase_map_place_t *place, int32_t column) {
-    const int32_t value = at_angle(place, surface->node[place->row][column], surface->node[place->row + 1][column],
-                                   surface->bend[place->row][column]);
-    return (int64_t)value * column_current_q9(column);
+/* Greatest t, Q10 of a column, below one, with slope t + bend t^2 <= rest: a bit at a time, as a division that keeps
+ * its remainder. All of them below 2^29; more than rest at t = 1. */
+static inline int32_t part_q10(int32_t slope, int32_t bend, int32_t rest) {
+    int32_t part = 0;
+    for (int bit = 0; bit < MACHINE_COLUMN_BITS; bit++) {
+        /* Over a step of 2^-k, here times 2^k: slope + 2^-k bend; behind it the slope is 2^(1-k) bend more. */
+        rest *= 2;
+        bend >>= 1;
+        part *= 2;
+        if (slope + bend <= rest) {
+            rest -= slope + bend;
+            slope += 2 * bend;
+            part += 1;
+        }
+    }
+    return part;
 }
 
 /* `result` in the format that look_up() gives with the same shift. */
-static int32_t current_of(const machine_surface_t *surface, const phase_map_place_t *place, int64_t result,
+static int32_t current_of(const machine_surface_t *surface, const phase_map_place_t *place, int32_t result,
                           unsigned shift) {
     if (result <= 0) {
         return 0;
     }
-    const int64_t wanted = result << shift; /* below 2^31 << 25 */
+    const curve_t curve = curve_at(surface, place);
+    /* Value in INVERSE_BITS times the column's number. */
+    const int32_t wanted = fixed_saturate(((int64_t)result << shift) >> (14 - INVERSE_BITS + MACHINE_COLUMN_BITS));
     /* Halve the interval of columns that holds it. */
     int32_t below = 0;
     int32_t above = MACHINE_COLUMNS - 1;
-    if (product_at(surface, place, above) <= wanted) {
+    int32_t low = column_q14(&curve, below) >> (14 - INVERSE_BITS);
+    int32_t high = column_q14(&curve, above) >> (14 - INVERSE_BITS);
+    if (above * high <= wanted) {
         return PHASE_MAP_CURRENT_MAX_Q9;
     }
     while (above - below > 1) {
         const int32_t middle = (below + above) / 2;
-        if (product_at(surface, place, middle) <= wanted) {
+        const int32_t value = column_q14(&curve, middle) >> (14 - INVERSE_BITS);
+        if (middle * value <= wanted) {
             below = middle;
+            low = value;
         } else {
             above = middle;
+            high = value;
         }
     }
-    /* Then the currents in it, a bit at a time. */
-    const cubic_t cubic = cubic_at(surface, place, below);
-    int32_t found_q9 = column_current_q9(below);
-    for (int32_t step = (column_current_q9(above) - found_q9) / 2; step > 0; step /= 2) {
-        found_q9 += product(&cubic, found_q9 + step) <= wanted ? step : 0;
-    }
-    return found_q9;
+    /* In it, (below + t) (low + t (high - low)) = wanted. */
+    const int32_t part = part_q10(low + below * (high - low), high - low, wanted - below * low);
+    return (below << MACHINE_COLUMN_BITS) + part;
+}
+
+static inline int32_t torque_q24(const phase_map_place_t *place, int32_t current_q9) {
+    const machine_surface_t *surface = &place->tables->torque_per_ampere;
+    const int32_t forwards_q24 = look_up(surface, place, current_q9, TORQUE_SHIFT(surface));
+    return place->mirrored ? fixed_subtract(0, forwards_q24) : forwards_q24;
+}
+
+phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_angle) {
+    return place_at(tables, phase_angle);
 }
 
 int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9) {
-    const machine_surface_t *surface = &place->tables->torque_per_ampere;
-    const int32_t torque_q24 = look_up(surface, place, current_q9, TORQUE_SHIFT(surface));
-    return place->mirrored ? fixed_subtract(0, torque_q24) : torque_q24;
+    return torque_q24(place, current_q9);
+}
+
+int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9) {
+    const phase_map_place_t place = place_at(tables, phase_angle);
+    return torque_q24(&place, current_q9);
 }
 
 int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9) {
@@ -147,7 +161,7 @@ int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9) {
 
 int32_t phase_map_current_of_torque_q9(const phase_map_place_t *place, int32_t torque_q24) {
     const machine_surface_t *surface = &place->tables->torque_per_ampere;
-    const int64_t forwards_q24 = place->mirrored ? -(int64_t)torque_q24 : torque_q24;
+    const int32_t forwards_q24 = place->mirrored ? fixed_subtract(0, torque_q24) : torque_q24;
     return current_of(surface, place, forwards_q24, TORQUE_SHIFT(surface));
 }
 

@@ -1,8 +1,8 @@
 /* Magnetics of one phase: torque and flux linkage from angle and current, and the current for either.
  *
- * Of the machine's tables of T / i and psi / i (control/machine_tables.h): quadratic over the angle between rows, cubic
- * over the current through four columns, times the current. Within two units of the last place that the tables hold;
- * what the tables leave out of a machine is stated by the tests. */
+ * Of the machine's tables of T / i and psi / i (control/machine_tables.h): quadratic over the angle between rows,
+ * linear over the current between columns, times the current. Within three units of the last place that the tables
+ * hold; what the tables leave out of a machine is stated by the tests. */
 #ifndef CONTROL_PHASE_MAP_H
 #define CONTROL_PHASE_MAP_H
 
@@ -11,15 +11,15 @@
 
 #include "control/machine_tables.h"
 
-/* Largest current of the map, 80 A in Q7.9. */
-#define PHASE_MAP_CURRENT_MAX_Q9 ((2 * (MACHINE_COLUMNS - 1) - MACHINE_FINE_COLUMNS) << MACHINE_FINE_BITS)
+/* Largest current of the map, in Q7.9: the last before 80 A, so that there is always a column above. */
+#define PHASE_MAP_CURRENT_MAX_Q9 (((MACHINE_COLUMNS - 1) << MACHINE_COLUMN_BITS) - 1)
 
-/* An angle found in the tables: one search and one division for all that is asked there. */
+/* An angle found in the tables: one search and one multiplication for all that is asked there. */
 typedef struct {
     const machine_tables_t *tables;
-    uint32_t row;         /* at or before the angle */
-    int32_t fraction_q15; /* of the way to the next row, 0..2^15 */
-    int32_t bend_q15;     /* fraction (1 - fraction) */
+    uint32_t first;       /* node of the row at or before the angle, column 0 */
+    int32_t fraction_q14; /* of the way to the next row, 0..2^14, rounded to nearest */
+    int32_t bend_q14;     /* fraction (1 - fraction) */
     bool mirrored;        /* between aligned and unaligned, where torque is negative */
 } phase_map_place_t;
 
@@ -27,15 +27,19 @@ typedef struct {
 phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_angle);
 
 /* Torque in N m, Q7.24: positive from unaligned to aligned, negative in the other half by mirror symmetry. Current in
- * A, Q7.9, held within 0..80 A. 64-bit accumulator, truncated, saturated. */
+ * A, Q7.9, held within 0..80 A. 64-bit product, truncated, saturated. */
 int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9);
 
-/* Flux linkage in Wb, Q2.29, the same in both halves. Current, accumulator and ends as for the torque. */
+/* The same at a place that is asked only this once. */
+int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9);
+
+/* Flux linkage in Wb, Q2.29, the same in both halves. Current, product and ends as for the torque. */
 int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9);
 
-/* The current in A, Q7.9, for a torque in N m, Q7.24: the greatest that does not give more, 0 where the torque is none
- * or of the sign that the phase has not here, 80 A where the map does not reach it. By bisection of the function above:
- * no more than the torque wanted, and one unit of current more gives no less. */
+/* The current in A, Q7.9, for a torque in N m, Q7.24: the greatest of its 2 A that does not give more, 0 where the
+ * torque is none or of the sign that the phase has not here, the map's end where it does not reach the torque. T / i
+ * counts here in steps of 1/64 of the tables' last place: that much aside, the torque there is no more than wanted and
+ * one unit of current more gives no less. */
 int32_t phase_map_current_of_torque_q9(const phase_map_place_t *place, int32_t torque_q24);
 
 /* The current in A, Q7.9, for a flux linkage in Wb, Q2.29; as for the torque. */

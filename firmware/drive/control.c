@@ -42,8 +42,7 @@ static estimate_t estimate(const control_parameters_t *parameters, const control
         e.current_q9[phase] = current_q9;
         e.current_max_q9 = current_q9 > e.current_max_q9 ? current_q9 : e.current_max_q9;
         if (current_q9 > 0) { /* most of the time a phase has none */
-            const phase_map_place_t place = phase_map_at(tables, e.commutation.angle[phase]);
-            e.torque_q24[phase] = phase_map_torque_q24(&place, current_q9);
+            e.torque_q24[phase] = phase_map_torque_at_q24(tables, e.commutation.angle[phase], current_q9);
             e.torque_sum_q24 = fixed_add(e.torque_sum_q24, e.torque_q24[phase]);
         }
     }

@@ -37,10 +37,8 @@ machine_tables_t four_phases() {
     tables.phases = 4;
     tables.rotor_poles = 6;
     std::mt19937 random(1);
-    for (auto &row : tables.torque_per_ampere.node) {
-        for (auto &torque : row) {
-            torque = uint16_t(random());
-        }
+    for (auto &torque : tables.torque_per_ampere.node) {
+        torque = uint16_t(random());
     }
     return tables;
 }

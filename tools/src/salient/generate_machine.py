@@ -35,7 +35,10 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
             f"    .inertia_q30 = {quantise(machine.inertia_kg_m2, 30, 32)},",
             f"    .friction_q30 = {quantise(machine.friction_Nm_s, 30, 32)},",
             f"    .current_rise_A_s = {quantise(machine.current_rise_A_s, 0, 32)},",
-            f"    .row_start = {_braced(tables.row_start)},",
+            "    .row = {",
+            *(f"        {{{start}u, {reciprocal}u}}," for start, reciprocal in tables.rows()),
+            "    },",
+            f"    .cell_row = {{{_listed(tables.cell_row())}}},",
             *_surface_lines("torque_per_ampere", tables.torque_per_ampere),
             *_surface_lines("flux_per_ampere", tables.flux_per_ampere),
             "};",
@@ -48,18 +51,19 @@ def _surface_lines(name: str, surface: Surface) -> list[str]:
     return [
         f"    .{name} = {{",
         f"        .fraction_bits = {surface.fraction_bits},",
+        f"        .bend_shift = {surface.bend_shift},",
         "        .node = {",
-        *(f"            {_braced(row)}," for row in surface.node),
+        *(f"            {_listed(row)}," for row in surface.node),
         "        },",
         "        .bend = {",
-        *(f"            {_braced(row)}," for row in surface.bend),
+        *(f"            {_listed(row)}," for row in surface.bend),
         "        },",
         "    },",
     ]
 
 
-def _braced(values: np.ndarray) -> str:
-    return "{" + ", ".join(map(str, values.tolist())) + "}"
+def _listed(values: np.ndarray) -> str:
+    return ", ".join(map(str, values.tolist()))
 
 
 def plant_source(machine: Machine) -> str:

@@ -1,4 +1,4 @@
-"""The firmware's magnetics of a phase, sampled from a machine's: row_start and both surfaces of
+"""The firmware's magnetics of a phase, sampled from a machine's: rows, cells and both surfaces of
 firmware/control/machine_tables.h.
 
 Torque over the angle has corners where poles begin to overlap, at angles of their own in every machine. So the rows are
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,12 @@ from salient.machine import Machine, MachineError
 
 # As in firmware/control/machine_tables.h.
 ROWS = 33
-CURRENT_A = np.concatenate([np.arange(0.0, 32.0, 2.0), np.arange(32.0, 81.0, 4.0)])
+CELLS = 64
+CURRENT_A = np.arange(0.0, 81.0, 2.0)
 """Of the columns."""
 ROW_UNITS = 1 << 14  # of row_start, in half a pitch
+_HALF_PITCH = 1 << 31
+BEND_SHIFT_MAX = 8
 TORQUE_FRACTION_BITS = (6, 30)
 FLUX_FRACTION_BITS = (11, 30)
 
@@ -46,10 +50,12 @@ class Surface:
     """A `machine_surface_t`: integers with `fraction_bits` fraction bits."""
 
     fraction_bits: int
+    bend_shift: int
+    """0..BEND_SHIFT_MAX: the least with which the bends fit."""
     node: np.ndarray
     """(ROWS, columns), 0..65535."""
     bend: np.ndarray
-    """(ROWS - 1, columns), -32768..32767."""
+    """(ROWS - 1, columns), -128..127, in 2^bend_shift of a node's last place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +66,17 @@ class PhaseMap:
     """N m / A."""
     flux_per_ampere: Surface
     """Wb / A."""
+
+    def rows(self) -> list[tuple[int, int]]:
+        """Start and reciprocal of each `machine_row_t`."""
+        starts = [int(start) * (_HALF_PITCH // ROW_UNITS) for start in self.row_start]
+        widths = [following - start for start, following in pairwise(starts)]
+        return list(zip(starts, [*((1 << 47) // width for width in widths), 0], strict=True))
+
+    def cell_row(self) -> np.ndarray:
+        """(CELLS,): the row in which each of the equal parts of half a pitch begins."""
+        begins = np.arange(CELLS) * (ROW_UNITS // CELLS)
+        return np.searchsorted(self.row_start, begins, side="right") - 1
 
 
 def machine_phase_map(path: Path | str, machine: Machine) -> PhaseMap:
@@ -115,9 +132,12 @@ def _surface(what: str, unit: str, values: np.ndarray, fraction_bits: tuple[int,
     least, greatest = fraction_bits
     for bits in range(greatest, least - 1, -1):
         node = np.floor(rows * 2.0**bits + 0.5)
-        bend = np.floor(bends * 2.0**bits + 0.5)
-        if np.max(node) <= 65535 and np.max(np.abs(bend)) <= 32767:
-            return Surface(bits, node.astype(int), bend.astype(int))
+        if np.max(node) > 65535:
+            continue
+        for shift in range(BEND_SHIFT_MAX + 1):
+            bend = np.floor(bends * 2.0 ** (bits - shift) + 0.5)
+            if np.max(np.abs(bend)) <= 127:
+                return Surface(bits, shift, node.astype(int), bend.astype(int))
     raise PhaseMapError(f"{np.max(values):.4g} {unit} of {what} is more than the firmware's tables hold")
 
 
