@@ -19,43 +19,44 @@ static inline phase_map_place_t place_at(const machine_tables_t *tables, uint32_
     uint32_t distance = mirrored ? HALF_PITCH - phase_angle : phase_angle - HALF_PITCH;
     distance -= distance >> 31; /* the aligned position is the end of the last row */
     /* From the row in which its part of half a pitch begins; the last row's start is beyond every distance. */
-    const machine_row_t *row = &tables->row[tables->cell_row[distance >> MACHINE_CELL_BITS]];
-    while (row[1].start <= distance) {
+    uint32_t row = tables->cell_row[distance >> MACHINE_CELL_BITS];
+    while (tables->row[row + 1].start <= distance) {
         row++;
     }
     /* The reciprocal is rounded down and the distance in the row below its width: below one, and rounded at most one.
      */
-    const uint32_t inside = distance - row->start;
-    const uint32_t fraction_q15 = (uint32_t)(((uint64_t)inside * row->reciprocal) >> 32);
+    const uint32_t inside = distance - tables->row[row].start;
+    const uint32_t fraction_q15 = (uint32_t)(((uint64_t)inside * tables->row[row].reciprocal) >> 32);
     const int32_t fraction_q14 = (int32_t)((fraction_q15 + 1) >> 1);
     return (phase_map_place_t){
         .tables = tables,
-        .first = (uint32_t)(row - tables->row) * MACHINE_COLUMNS,
+        .first = row * MACHINE_COLUMNS,
         .fraction_q14 = fraction_q14,
         .bend_q14 = (fraction_q14 * (ONE_Q14 - fraction_q14)) >> 14,
         .mirrored = mirrored,
     };
 }
 
-/* A surface at the angle of a place: the row's nodes and bends, and the weights of this row's nodes, the next row's and
- * the bends. */
+/* A surface at the angle of a place, from a column on: its node and bend, and the weights of this row's nodes, the next
+ * row's and the bends. */
 typedef struct {
     const uint16_t *node;
     const int8_t *bend;
     int32_t low_q14, high_q14, bend_q14;
 } curve_t;
 
-static inline curve_t curve_at(const machine_surface_t *surface, const phase_map_place_t *place) {
+static inline curve_t curve_at(const machine_surface_t *surface, const phase_map_place_t *place, int32_t column) {
+    const uint32_t first = place->first + (uint32_t)column;
     return (curve_t){
-        .node = &surface->node[place->first],
-        .bend = &surface->bend[place->first],
+        .node = &surface->node[first],
+        .bend = &surface->bend[first],
         .low_q14 = ONE_Q14 - place->fraction_q14,
         .high_q14 = place->fraction_q14,
         .bend_q14 = place->bend_q14 << surface->bend_shift,
     };
 }
 
-/* A column's value in Q14: the nodes' part is below 2^30, the bend's within 2^27. */
+/* Value in Q14, so many columns on: the nodes' part is below 2^30, the bend's within 2^27. */
 static inline int32_t column_q14(const curve_t *curve, int32_t column) {
     const uint16_t *node = &curve->node[column];
     return node[0] * curve->low_q14 + node[MACHINE_COLUMNS] * curve->high_q14 - curve->bend[column] * curve->bend_q14;
@@ -74,12 +75,11 @@ static inline int32_t shifted(int64_t value, unsigned shift) {
 
 static inline int32_t look_up(const machine_surface_t *surface, const phase_map_place_t *place, int32_t current_q9,
                               unsigned shift) {
-    const curve_t curve = curve_at(surface, place);
     const int32_t held_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
-    const int32_t column = held_q9 >> MACHINE_COLUMN_BITS;
+    const curve_t curve = curve_at(surface, place, held_q9 >> MACHINE_COLUMN_BITS);
     const int32_t part_q31 = (held_q9 & (COLUMN_Q9 - 1)) << (31 - MACHINE_COLUMN_BITS);
-    const int32_t low_q14 = column_q14(&curve, column);
-    const int32_t high_q14 = column_q14(&curve, column + 1);
+    const int32_t low_q14 = column_q14(&curve, 0);
+    const int32_t high_q14 = column_q14(&curve, 1);
     const int32_t value_q14 = low_q14 + 2 * (int32_t)(((int64_t)(high_q14 - low_q14) * part_q31) >> 32);
     return shifted((int64_t)value_q14 * held_q9, shift);
 }
@@ -108,7 +108,7 @@ static int32_t current_of(const machine_surface_t *surface, const phase_map_plac
     if (result <= 0) {
         return 0;
     }
-    const curve_t curve = curve_at(surface, place);
+    const curve_t curve = curve_at(surface, place, 0);
     /* Value in INVERSE_BITS times the column's number. */
     const int32_t wanted = fixed_saturate(((int64_t)result << shift) >> (14 - INVERSE_BITS + MACHINE_COLUMN_BITS));
     /* Halve the interval of columns that holds it. */
