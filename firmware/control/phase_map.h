@@ -38,8 +38,8 @@ int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9);
 
 /* The current in A, Q7.9, for a torque in N m, Q7.24: the greatest of its 2 A that does not give more, 0 where the
  * torque is none or of the sign that the phase has not here, the map's end where it does not reach the torque. T / i
- * counts here in steps of 1/64 of the tables' last place: that much aside, the torque there is no more than wanted and
- * one unit of current more gives no less. */
+ * is counted here in steps of 1/64 of the tables' last place: but for 1/32 of it, times the current of the column
+ * above, the torque there is no more than wanted, and one unit of current more gives no less. */
 int32_t phase_map_current_of_torque_q9(const phase_map_place_t *place, int32_t torque_q24);
 
 /* The current in A, Q7.9, for a flux linkage in Wb, Q2.29; as for the torque. */
