@@ -121,18 +121,27 @@ def test_the_readme_shows_the_figures_of_the_demo(figures_of_merit):
             assert shown == f"{value:.{digits}f}", f"{row}, {controller}"
 
 
-@pytest.mark.parametrize("machine", ["linear_cosine", "linear_trapezoid"])
-def test_the_linear_machines_hold_the_same_promises(machine, tmp_path):
+# Settling times of the paper's controller: T_max over inertia decides them, and the finite-element machine is light.
+@pytest.mark.parametrize(("machine", "settles_s"), [("linear_cosine", (0.0673, 0.072)),
+                                                    ("linear_trapezoid", (0.0673, 0.072)),
+                                                    ("finite_element", (0.015, 0.04))])
+def test_the_other_machines_hold_the_same_promises(machine, settles_s, tmp_path):
     demo.run(options("--out", tmp_path, "--machine", machine), stream=io.StringIO())
     results = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     assert results["conditions"]["machine"] == machine
     start, step = results["experiments"]["start_600"]["paper"], results["experiments"]["load_step_150"]
-    assert 0.0673 < start["settling_time_s"] <= 0.072
+    assert settles_s[0] < start["settling_time_s"] <= settles_s[1]
     assert 0.0 <= start["overshoot_percent"] <= 0.5
     assert 0.0 < step["paper"]["recovery_time_s"] <= 0.010
     assert PAPER["load_step_150"]["paper"]["torque_ripple"] < step["paper"]["torque_ripple"]
     assert step["paper"]["torque_ripple"] < step["traditional"]["torque_ripple"]
-    assert 0.15 < step["traditional"]["torque_ripple"] < 0.6
+    assert 0.15 < step["traditional"]["torque_ripple"] < 0.8
+    (row,) = (line for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+              if line.startswith(f"| `{machine}`") and line.count("|") == 4)
+    shown = [cell.strip() for cell in row.split("|")[2:4]]
+    for text, controller in zip(shown, CONTROLLERS, strict=True):
+        digits = len(text.partition(".")[2])
+        assert text == f"{step[controller]['torque_ripple']:.{digits}f}", controller
 
 
 @pytest.mark.parametrize(("line", "message"), [
