@@ -2,9 +2,9 @@
 the saturating machine, the paper's controller. Firmware tables and emulator both come from the map.
 
 A single load step depends on the last bits (limit cycles of the encoder's and the duty's steps), so dip and ripple are
-averaged over rotor angles. Measured (regular; irregular grid): settling time 0.00 %; -0.03 %, dip -0.10 %; -0.15 %, mean
-torque and phase currents below 0.01 %, ripple 3.1 %; 2.4 %. At single angles the dip differs by up to 0.8 %, the ripple
-by up to 24 %.
+averaged over rotor angles. Measured (regular; irregular grid): settling time 0.00 %; -0.03 %, dip -0.10 %; -0.15 %,
+mean torque and phase currents below 0.01 %, ripple 3.1 %; 2.4 %. At single angles the dip differs by up to 0.8 %, the
+ripple by up to 24 %.
 """
 
 from __future__ import annotations
