@@ -27,8 +27,7 @@ import numpy as np
 from salient.machine import Machine
 
 SAMPLE_STEP_MAX_S = 1e-6
-"""Coarser samples miss too much of the short pulses of chopping: at 1 us the estimate of the paper's controller is 4 to
-9 % below that at 0.1 us, at 10 us 40 %."""
+"""Coarser samples miss too much of the short pulses of chopping, and the estimate comes out too low."""
 
 # Far below any sample step, far above the rounding of a double near 1 s.
 _TIME_TOLERANCE_S = 1e-10
