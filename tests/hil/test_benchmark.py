@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plant_twin import FORMS, Magnetics, Run, run_reference
-from plant_twin import Machine as PlantMachine
+from plant_twin import Run, machine_from, run_reference
 
 from salient import benchmark, instructions
 from salient.comparison import PEERS, PLANT, REFERENCE_TOLERANCE
@@ -46,18 +45,7 @@ def test_replay_is_what_the_drive_did(replay: Replay, folder: Path) -> None:
 
 def test_reference_is_the_independent_twin_s(replay: Replay) -> None:
     """Flux linkages as state, events and a pattern of its own, in plant_twin.py."""
-    shipped = load_machine(SHIPPED / "saturating.toml")
-    machine = PlantMachine(
-        name=shipped.name.encode(),
-        stator_poles=shipped.stator_poles,
-        rotor_poles=shipped.rotor_poles,
-        phases=shipped.phases,
-        resistance_ohm=shipped.resistance_ohm,
-        inertia_kg_m2=shipped.inertia_kg_m2,
-        friction_Nm_s=shipped.friction_Nm_s,
-        supply_voltage_V=shipped.supply_voltage_V,
-        magnetics=Magnetics(form=FORMS.index("saturating"), **shipped.magnetics.parameters),
-    )
+    machine = machine_from(load_machine(SHIPPED / "saturating.toml"))
     compares = list(zip(replay.upper.tolist(), replay.lower.tolist(), strict=True))
     run = Run(replay.period_ticks, compares, replay.speed_rad_s, math.degrees(replay.angle_rad),
               replay.load_torque_Nm, replay.current_A)
