@@ -190,8 +190,7 @@ static double distance_to_event(const integrator_setting_t *setting, const integ
 }
 
 /* An event lies within `step_s`: shortens the step to that instant. Illinois variant of false position on the step's
- * result; what falls is nearly linear in time, so a few steps do. Never nothing,
- * so that time goes on. */
+ * result; what falls is nearly linear in time, so a few steps do. Never a step of no length, so that time goes on. */
 static double step_to_event(const integrator_setting_t *setting, const integrator_state_t *start,
                             const integrator_derivative_t *first, double step_s, integrator_state_t *end,
                             integrator_integrals_t *integrals) {
