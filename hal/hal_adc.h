@@ -1,4 +1,4 @@
-/* Analogue inputs: 12-bit, sampled together by the timer at the start of each control period. */
+/* Analogue inputs, sampled together by the timer at the start of each control period. */
 #ifndef HAL_ADC_H
 #define HAL_ADC_H
 
@@ -6,18 +6,25 @@
 
 #include "hal.h"
 
-#define HAL_ADC_BITS 12
-#define HAL_ADC_FULL_SCALE_COUNTS 4096 /* one count above the largest code, 4095 */
+#define HAL_ADC_BITS_MIN 12
+#define HAL_ADC_BITS_MAX 16
 
-/* Current sensors are unipolar: code 0 is 0 A, 4096 counts would be 80 A (51.2 counts/A). */
+/* Full scale is one code above the largest, 2^bits. Current sensors are unipolar: code 0 is 0 A, full scale 80 A. */
 #define HAL_ADC_CURRENT_FULL_SCALE_A 80
-/* DC-link divider: 4096 counts would be 512 V (8 counts/V). */
+/* DC-link divider: code 0 is 0 V, full scale 512 V. */
 #define HAL_ADC_BUS_FULL_SCALE_V 512
+/* Torque transducer between machine and load, offset binary: mid-scale, 2^(bits-1), is 0 N m, code 0 is -64 N m. A
+ * board without one leaves its code at whatever the input floats to: only use it where a parameter says so. */
+#define HAL_ADC_LOAD_TORQUE_FULL_SCALE_NM 64
 
 typedef struct {
-    uint16_t phase_current_counts[HAL_PHASES_MAX]; /* 0..4095 */
-    uint16_t bus_voltage_counts;                   /* 0..4095 */
+    uint16_t phase_current_counts[HAL_PHASES_MAX]; /* 0..2^bits-1, as all of them */
+    uint16_t bus_voltage_counts;
+    uint16_t load_torque_counts; /* positive against the forward direction */
 } hal_adc_sample_t;
+
+/* Bits of a code, 12..16; constant. [both] */
+unsigned hal_adc_bits(const hal_t *hal);
 
 /* The conversion results of this period's sample. [interrupt] */
 void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample);

@@ -8,10 +8,12 @@
 #define ENCODER_BITS_IDEAL 32
 #define TURN_RAD 6.28318530717958647692
 
-void sensors_init(sensors_t *sensors, const sensor_errors_t *errors, unsigned encoder_bits, uint64_t seed) {
+void sensors_init(sensors_t *sensors, const sensor_errors_t *errors, unsigned encoder_bits, unsigned adc_bits,
+                  uint64_t seed) {
     memset(sensors, 0, sizeof *sensors);
     sensors->errors = *errors;
     sensors->encoder_bits = encoder_bits == 0 ? ENCODER_BITS_IDEAL : encoder_bits;
+    sensors->adc_bits = adc_bits;
     sensors->random_state = seed;
 }
 
@@ -42,12 +44,13 @@ static double next_gaussian(uint64_t *state) {
     return ((double)sum - 12.0 * 32767.5) / 65536.0;
 }
 
-/* Nearest code, half a code upwards; written so that a NaN gives 0. */
-static uint16_t to_code(double counts) {
-    if (!(counts > 0.0)) {
+/* Nearest code of a fraction of full scale, half a code upwards; written so that a NaN gives 0. */
+static uint16_t to_code(const sensors_t *sensors, double fraction) {
+    if (!(fraction > 0.0)) {
         return 0;
     }
-    const double largest = HAL_ADC_FULL_SCALE_COUNTS - 1;
+    const double full_scale = (double)(UINT32_C(1) << sensors->adc_bits);
+    const double counts = fraction * full_scale, largest = full_scale - 1.0;
     return counts >= largest ? (uint16_t)largest : (uint16_t)(counts + 0.5);
 }
 
@@ -69,14 +72,14 @@ void sensors_sample_adc(sensors_t *sensors, const plant_t *plant, hal_adc_sample
     const double *true_A = sensors->currents_held ? sensors->held_current_A : plant->current_A;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         sample->phase_current_counts[phase] =
-            to_code(sensed_current_A(sensors, true_A[phase]) *
-                    ((double)HAL_ADC_FULL_SCALE_COUNTS / HAL_ADC_CURRENT_FULL_SCALE_A));
+            to_code(sensors, sensed_current_A(sensors, true_A[phase]) * (1.0 / HAL_ADC_CURRENT_FULL_SCALE_A));
     }
-    sample->bus_voltage_counts =
-        to_code(plant->bus_voltage_V * ((double)HAL_ADC_FULL_SCALE_COUNTS / HAL_ADC_BUS_FULL_SCALE_V));
+    sample->bus_voltage_counts = to_code(sensors, plant->bus_voltage_V * (1.0 / HAL_ADC_BUS_FULL_SCALE_V));
+    sample->load_torque_counts =
+        to_code(sensors, 0.5 + plant->load_torque_Nm * (0.5 / HAL_ADC_LOAD_TORQUE_FULL_SCALE_NM));
 }
 
-uint32_t sensors_sample_encoder(sensors_t *sensors, const plant_t *plant) {
+static uint32_t latched_counts(sensors_t *sensors, const plant_t *plant) {
     if (sensors->encoder_fault == SENSORS_ENCODER_FROZEN) {
         return sensors->encoder_last_counts;
     }
@@ -94,4 +97,9 @@ uint32_t sensors_sample_encoder(sensors_t *sensors, const plant_t *plant) {
     }
     sensors->encoder_last_counts = (uint32_t)(counts & (counts_per_turn - 1));
     return sensors->encoder_last_counts;
+}
+
+void sensors_sample_encoder(sensors_t *sensors, const plant_t *plant, hal_encoder_sample_t *sample) {
+    *sample = (hal_encoder_sample_t){.edge_known = false};
+    sample->counts = latched_counts(sensors, plant);
 }

@@ -3,14 +3,15 @@
  *
  * Current, in the order of the chain: the phase current of `current_delay_ns` before the sampling instant (the plain
  * delay of an isolated amplifier or a filter well below its corner), times the gain, plus offset, plus Gaussian noise,
- * limited to +-`current_limit_A` (the sensor saturates), then the converter. The bus voltage has no errors.
+ * limited to +-`current_limit_A` (the sensor saturates), then the converter. Bus voltage and load torque have no
+ * errors; the torque transducer between machine and load shows the load's torque.
  *
  * Encoder: the angle read is theta + e sin(theta), then its floor in counts. This is a code disc whose centre is off
  * the axis by e (in rad) times the radius at which it is read, and at theta = 0 off towards the reading head: seen from
  * the disc's centre the head lies at -theta - e sin(theta), to first order in e; the familiar angular error of
  * eccentricity / radius.
  *
- * Scales are hal_adc.h's. A code is the nearest one (half a code upwards), limited to 0..4095: the converter is
+ * Scales are hal_adc.h's. A code is the nearest one (half a code upwards), limited to 0..2^bits-1: the converter is
  * unipolar, below 0 A it shows 0. Encoder counts are modulo a turn, for negative angles too.
  */
 #ifndef PLANT_SENSORS_H
@@ -21,6 +22,7 @@
 
 #include "hal.h"
 #include "hal_adc.h"
+#include "hal_encoder.h"
 #include "plant/machine.h"
 #include "plant/plant.h"
 
@@ -40,24 +42,26 @@ typedef struct {
     bool currents_held;
     double held_current_A[HAL_PHASES_MAX];
 
+    unsigned adc_bits, encoder_bits; /* read only */
+
     /* The rest is sensors.c's. */
-    unsigned encoder_bits;
     uint32_t encoder_last_counts;
     uint64_t random_state;
 } sensors_t;
 
-/* Sensors with these errors and without faults. encoder_bits 8..32, 0 means ideal (32). Equal seeds give equal noise.
- */
-void sensors_init(sensors_t *sensors, const sensor_errors_t *errors, unsigned encoder_bits, uint64_t seed);
+/* Sensors with these errors and without faults. encoder_bits 8..32, 0 means ideal (32); adc_bits 12..16. Equal seeds
+ * give equal noise. */
+void sensors_init(sensors_t *sensors, const sensor_errors_t *errors, unsigned encoder_bits, unsigned adc_bits,
+                  uint64_t seed);
 
 /* Holds the plant's present currents for the next conversion: call it `errors.current_delay_ns` before that. */
 void sensors_hold_currents(sensors_t *sensors, const plant_t *plant);
 
-/* Converts the held currents, or else the plant's present ones, and its present bus voltage: unused phases read 0.
- * Noise moves on by one draw a phase when it is on. */
+/* Converts the held currents, or else the plant's present ones, and its present bus voltage and load torque:
+ * unused phases read 0. Noise moves on by one draw a phase when it is on. */
 void sensors_sample_adc(sensors_t *sensors, const plant_t *plant, hal_adc_sample_t *sample);
 
-/* Latches the encoder: 0..2^bits-1. Frozen: the count latched last; jump: half a turn off as long as it is set. */
-uint32_t sensors_sample_encoder(sensors_t *sensors, const plant_t *plant);
+/* Latches the encoder. Frozen: the count latched last; jump: half a turn off as long as it is set. */
+void sensors_sample_encoder(sensors_t *sensors, const plant_t *plant, hal_encoder_sample_t *sample);
 
 #endif

@@ -2,9 +2,10 @@
 
 #include <string.h>
 
-void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, unsigned encoder_bits) {
+void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus) {
     memset(board, 0, sizeof *board);
-    board->encoder_bits = encoder_bits ? encoder_bits : 32;
+    board->adc_bits = sensors->adc_bits;
+    board->encoder_bits = sensors->encoder_bits;
     board->plant = plant;
     board->sensors = sensors;
     board->bus = bus;
@@ -15,7 +16,7 @@ void board_start_period(board_t *board, bool busy) {
         ++board->missed_interrupts;
     } else {
         sensors_sample_adc(board->sensors, board->plant, &board->adc);
-        board->encoder_counts = sensors_sample_encoder(board->sensors, board->plant);
+        sensors_sample_encoder(board->sensors, board->plant, &board->encoder);
         board->active = board->buffered;
     }
     plant_set_switches(board->plant, &board->active, board->period_ticks);

@@ -10,6 +10,7 @@
 
 #include "hal_adc.h"
 #include "hal_can.h"
+#include "hal_encoder.h"
 #include "hal_pwm.h"
 #include "plant/plant.h"
 #include "plant/sensors.h"
@@ -23,9 +24,10 @@ typedef struct {
     board_context_t context;
     bool in_critical_section;
 
-    hal_adc_sample_t adc;    /* latched at the period's start */
-    uint32_t encoder_counts; /* likewise */
-    unsigned encoder_bits;   /* 8..32 */
+    hal_adc_sample_t adc;         /* latched at the period's start */
+    hal_encoder_sample_t encoder; /* likewise */
+    unsigned adc_bits;            /* 12..16 */
+    unsigned encoder_bits;        /* 8..32 */
 
     uint16_t period_ticks; /* 0 until the timer is started */
     hal_pwm_compare_t active, buffered;
@@ -40,9 +42,9 @@ typedef struct {
     can_bus_t *bus;
 } board_t;
 
-/* A board after reset at time 0: timer stopped, switches open, queues empty. encoder_bits 8..32, 0 means ideal (32).
- * The board uses plant, sensors and bus and does not own them. */
-void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, unsigned encoder_bits);
+/* A board after reset at time 0: timer stopped, switches open, queues empty. It has the resolutions of `sensors`, and
+ * uses plant, sensors and bus without owning them. */
+void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus);
 
 /* For the rig: a control period starts now, the plant is there. Latches the sensors; the buffered compare values
  * become active unless the interrupt is still running (`busy`), then the interrupt is lost and counted. */

@@ -49,6 +49,7 @@ typedef struct {
     const machine_t *machine;
     double initial_angle_rad;
     unsigned encoder_bits; /* 8..32, 0 means ideal */
+    unsigned adc_bits;     /* 12..16 */
     uint64_t seed;
     uint32_t bit_rate;
     pacing_t pacing;

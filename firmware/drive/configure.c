@@ -7,7 +7,7 @@
 
 bool configure_rate_allowed(uint32_t control_rate_hz) {
     return control_rate_hz == 20000 || control_rate_hz == 40000 || control_rate_hz == 50000 ||
-           control_rate_hz == 100000;
+           control_rate_hz == 100000 || control_rate_hz == 1000000;
 }
 
 /* pi / 30: r/min to rad/s. */
@@ -81,7 +81,7 @@ static bp_pid_parameters_t bp_pid_from(const int32_t *values, uint32_t control_r
 }
 
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
-                                       uint32_t control_rate_hz, unsigned encoder_bits) {
+                                       uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits) {
     const int32_t *values = parameters->values;
     const int32_t inertia_q30 = values[PARAMETER_INERTIA_KG_M2];
     const int32_t friction_q30 = values[PARAMETER_FRICTION_NM_S];
@@ -94,6 +94,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
         .period_ticks = (uint16_t)(HAL_PWM_CLOCK_HZ / (2u * control_rate_hz)),
         .encoder_shift = (uint8_t)encoder_shift,
+        .adc_bits = (uint8_t)adc_bits,
         .initialise_ticks = control_rate_hz / 1000u,
         .speed_ramp_q22 = ramp_q22(values[PARAMETER_SPEED_RAMP_RPM_S], control_rate_hz),
         .observer = load_observer_configure((uint32_t)values[PARAMETER_OBSERVER_BANDWIDTH_RAD_S], control_rate_hz,

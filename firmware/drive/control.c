@@ -4,9 +4,9 @@
 #include "control/pwm.h"
 #include "fixed/fixed.h"
 
-/* 80 A over 4096 counts is 10 LSB of Q7.9 a count, 512 V is 8 LSB of Q9.6 a count: exact. */
-#define CURRENT_Q9_PER_COUNT (HAL_ADC_CURRENT_FULL_SCALE_A * 512 / HAL_ADC_FULL_SCALE_COUNTS)
-#define BUS_VOLTAGE_Q6_PER_COUNT (HAL_ADC_BUS_FULL_SCALE_V * 64 / HAL_ADC_FULL_SCALE_COUNTS)
+/* Of a 12-bit code: 80 A over 4096 counts is 10 LSB of Q7.9 a count, 512 V is 8 LSB of Q9.6 a count. Exact. */
+#define CURRENT_Q9_PER_COUNT (HAL_ADC_CURRENT_FULL_SCALE_A * 512 / (1 << HAL_ADC_BITS_MIN))
+#define BUS_VOLTAGE_Q6_PER_COUNT (HAL_ADC_BUS_FULL_SCALE_V * 64 / (1 << HAL_ADC_BITS_MIN))
 
 /* A stop ends below this speed: 0.5 rad/s, 5 r/min. */
 #define STANDING_Q22 (1 << 21)
@@ -29,16 +29,22 @@ typedef struct {
     int32_t torque_sum_q24;
 } estimate_t;
 
+/* A code in LSBs of which a 12-bit count has so many; finer codes are rounded to nearest, half upwards. */
+static int32_t from_code(const control_parameters_t *parameters, uint16_t code, int32_t per_count) {
+    const unsigned shift = parameters->adc_bits - (unsigned)HAL_ADC_BITS_MIN;
+    return (code * per_count + ((1 << shift) >> 1)) >> shift;
+}
+
 static estimate_t estimate(const control_parameters_t *parameters, const control_sample_t *sample) {
     const machine_tables_t *tables = parameters->tables;
     estimate_t e = {.current_max_q9 = 0};
     /* The middle of the count's interval, so that the mean error is zero; a 32-bit encoder has no interval. */
     const unsigned shift = parameters->encoder_shift;
-    e.angle = (sample->encoder_counts << shift) + (shift > 0 ? 1u << (shift - 1) : 0u);
-    e.bus_voltage_q6 = sample->adc.bus_voltage_counts * BUS_VOLTAGE_Q6_PER_COUNT;
+    e.angle = (sample->encoder.counts << shift) + (shift > 0 ? 1u << (shift - 1) : 0u);
+    e.bus_voltage_q6 = from_code(parameters, sample->adc.bus_voltage_counts, BUS_VOLTAGE_Q6_PER_COUNT);
     commutation_find(&parameters->commutation, tables->phases, tables->rotor_poles, e.angle, &e.commutation);
     for (unsigned phase = 0; phase < tables->phases; phase++) {
-        const int32_t current_q9 = sample->adc.phase_current_counts[phase] * CURRENT_Q9_PER_COUNT;
+        const int32_t current_q9 = from_code(parameters, sample->adc.phase_current_counts[phase], CURRENT_Q9_PER_COUNT);
         e.current_q9[phase] = current_q9;
         e.current_max_q9 = current_q9 > e.current_max_q9 ? current_q9 : e.current_max_q9;
         if (current_q9 > 0) { /* most of the time a phase has none */

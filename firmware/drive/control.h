@@ -21,6 +21,7 @@
 #include "drive/protection.h"
 #include "drive/state_machine.h"
 #include "hal_adc.h"
+#include "hal_encoder.h"
 #include "hal_pwm.h"
 
 /* Numbers are those of drive.dbc and of the parameter `controller`. */
@@ -35,6 +36,7 @@ typedef struct {
     drive_controller_t controller;
     uint16_t period_ticks;
     uint8_t encoder_shift;     /* counts to 2^-32 turn */
+    uint8_t adc_bits;          /* of a code, 12..16 */
     uint32_t initialise_ticks; /* periods in 1 ms */
     int32_t speed_ramp_q22;    /* rad/s a period, Q9.22; INT32_MAX: no ramp */
     load_observer_parameters_t observer;
@@ -59,7 +61,7 @@ typedef struct {
 
 typedef struct {
     hal_adc_sample_t adc;
-    uint32_t encoder_counts;
+    hal_encoder_sample_t encoder;
     uint32_t missed_interrupts; /* since the last call */
     uint32_t time_us;
     command_t command; /* the last accepted one; request off before the first */

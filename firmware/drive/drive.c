@@ -7,7 +7,8 @@
 
 static void configure(drive_t *drive) {
     const control_parameters_t control_parameters =
-        configure_control(&drive->parameters, drive->tables, drive->control_rate_hz, hal_encoder_bits(drive->hal));
+        configure_control(&drive->parameters, drive->tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
+                          hal_adc_bits(drive->hal));
     hal_critical_enter(drive->hal);
     drive->control_parameters = control_parameters;
     hal_critical_leave(drive->hal);
@@ -33,11 +34,11 @@ bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, cons
 
 void drive_control_interrupt(drive_t *drive) {
     control_sample_t sample = {
-        .encoder_counts = hal_encoder_read(drive->hal),
         .missed_interrupts = hal_pwm_missed_interrupts(drive->hal),
         .time_us = hal_time_us(drive->hal),
         .command = drive->command,
     };
+    hal_encoder_read(drive->hal, &sample.encoder);
     hal_adc_read(drive->hal, &sample.adc);
     hal_pwm_compare_t compare;
     if (control_step(&drive->control_parameters, &drive->control, &sample, &compare, &drive->diagnostics)) {

@@ -19,6 +19,10 @@ static void require(const hal_t *hal, bool interrupt, const char *function) {
     }
 }
 
+unsigned hal_adc_bits(const hal_t *hal) {
+    return hal->board->adc_bits;
+}
+
 void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample) {
     require(hal, true, __func__);
     *sample = hal->board->adc;
@@ -28,9 +32,9 @@ unsigned hal_encoder_bits(const hal_t *hal) {
     return hal->board->encoder_bits;
 }
 
-uint32_t hal_encoder_read(const hal_t *hal) {
+void hal_encoder_read(const hal_t *hal, hal_encoder_sample_t *sample) {
     require(hal, true, __func__);
-    return hal->board->encoder_counts;
+    *sample = hal->board->encoder;
 }
 
 void hal_pwm_start(hal_t *hal, uint16_t period_ticks) {

@@ -145,6 +145,7 @@ int main(int argc, char *argv[]) {
         .machine = &machine_plant,
         .initial_angle_rad = options.initial_angle_deg * RAD_PER_DEG,
         .encoder_bits = options.encoder_bits,
+        .adc_bits = options.adc_bits,
         .seed = options.seed,
         .bit_rate = options.bit_rate,
         .pacing = options.pacing,

@@ -9,6 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "hal_adc.h"
 #include "rig/can_bus.h"
 
 const char *const options_controllers[] = {"traditional", "paper", NULL};
@@ -19,6 +20,7 @@ static const char usage[] =
     "  --controller traditional|paper     (default paper)\n"
     "  --control-rate-hz N                20000, 40000, 50000 or 100000 (default 40000)\n"
     "  --encoder-bits N                   8..24, or 0 for an ideal encoder (default 17)\n"
+    "  --adc-bits N                       12..16 (default 12)\n"
     "  --seed N                           of all noise (default 1)\n"
     "  --initial-angle-deg X              rotor angle at the start, -360..360 (default 0)\n"
     "  --record FILE.npy                  records the true state\n"
@@ -66,6 +68,7 @@ enum {
     OPTION_CONTROLLER,
     OPTION_CONTROL_RATE,
     OPTION_ENCODER_BITS,
+    OPTION_ADC_BITS,
     OPTION_SEED,
     OPTION_INITIAL_ANGLE,
     OPTION_RECORD,
@@ -84,6 +87,7 @@ static const struct option long_options[] = {
     {"controller", required_argument, NULL, OPTION_CONTROLLER},
     {"control-rate-hz", required_argument, NULL, OPTION_CONTROL_RATE},
     {"encoder-bits", required_argument, NULL, OPTION_ENCODER_BITS},
+    {"adc-bits", required_argument, NULL, OPTION_ADC_BITS},
     {"seed", required_argument, NULL, OPTION_SEED},
     {"initial-angle-deg", required_argument, NULL, OPTION_INITIAL_ANGLE},
     {"record", required_argument, NULL, OPTION_RECORD},
@@ -131,6 +135,12 @@ static options_result_t take(options_t *options, int option, const char *text) {
             return mistake("--encoder-bits %s: allowed are 8 to 24, and 0 for an ideal encoder", text);
         }
         options->encoder_bits = (unsigned)integer;
+        break;
+    case OPTION_ADC_BITS:
+        if (!read_integer(text, HAL_ADC_BITS_MAX, &integer) || integer < HAL_ADC_BITS_MIN) {
+            return mistake("--adc-bits %s: allowed are %d to %d", text, HAL_ADC_BITS_MIN, HAL_ADC_BITS_MAX);
+        }
+        options->adc_bits = (unsigned)integer;
         break;
     case OPTION_SEED:
         if (!read_integer(text, UINT64_MAX, &options->seed)) {
@@ -193,6 +203,7 @@ options_result_t options_parse(options_t *options, int argc, char *argv[]) {
                            .controller_index = 1,
                            .control_rate_hz = 40000,
                            .encoder_bits = 17,
+                           .adc_bits = HAL_ADC_BITS_MIN,
                            .seed = 1,
                            .record_step_ns = 1000,
                            .bit_rate = CAN_BUS_BIT_RATE_MAX};

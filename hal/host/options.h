@@ -15,6 +15,7 @@ typedef struct {
     unsigned controller_index; /* place in OPTIONS_CONTROLLERS */
     uint32_t control_rate_hz;
     unsigned encoder_bits; /* 8..24, 0 is ideal */
+    unsigned adc_bits;     /* 12..16 */
     uint64_t seed;
     double initial_angle_deg;
     const char *record; /* NULL: no recording */

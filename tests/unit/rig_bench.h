@@ -128,7 +128,7 @@ struct StandInFirmware {
             frame.identifier = 0x180;
             frame.length = 8;
             std::memcpy(frame.data, &self->interrupts, 4);
-            std::memcpy(frame.data + 4, &self->board->encoder_counts, 4);
+            std::memcpy(frame.data + 4, &self->board->encoder.counts, 4);
             board_can_transmit(self->board, &frame);
         }
         hal_can_frame_t frame;
@@ -190,6 +190,7 @@ class RigBench {
         rig_config_t config{};
         config.machine = &machine_plant;
         config.encoder_bits = 17;
+        config.adc_bits = 12;
         config.seed = 1;
         config.bit_rate = 1000000;
         EXPECT_TRUE(pacing_parse(&config.pacing, pace));

@@ -27,7 +27,7 @@ double held(double value) {
 
 // All the conversions, for one set of parameters.
 void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bits) {
-    const control_parameters_t c = configure_control(&p, &machine_tables, uint32_t(rate_hz), encoder_bits);
+    const control_parameters_t c = configure_control(&p, &machine_tables, uint32_t(rate_hz), encoder_bits, 12);
     const auto v = [&](unsigned index) { return value_of(p, index); };
     // Within lsb LSBs of the format, or of 1 in 10^9 for what has more than 30 bits.
     const auto near = [](const char *what, double got, double exact, double lsb) {
@@ -154,7 +154,7 @@ TEST(Configure, a_machine_whose_current_hardly_rises_gets_the_largest_gain_and_n
     slow.current_rise_A_s = 1;
     parameters_t parameters;
     parameters_init(&parameters);
-    EXPECT_EQ(configure_control(&parameters, &slow, 100000, 17).duty.incoming_gain_q20, INT32_MAX);
+    EXPECT_EQ(configure_control(&parameters, &slow, 100000, 17, 12).duty.incoming_gain_q20, INT32_MAX);
 }
 
 TEST(Configure, allows_the_rates_that_the_timer_makes_exactly) {

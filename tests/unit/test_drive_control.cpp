@@ -41,7 +41,7 @@ class Control : public testing::Test {
         parameters_t p;
         parameters_init(&p);
         p.values[PARAMETER_CONTROLLER] = controller;
-        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS);
+        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, 12);
         control_reset(&state);
         diagnostics = control_diagnostics_t{};
         sample = control_sample_t{};
@@ -59,7 +59,7 @@ class Control : public testing::Test {
 
     bool step_as_it_is() {
         turns += speed_rad_s / (2.0 * twins::PI * RATE_HZ);
-        sample.encoder_counts = uint32_t(int64_t(std::floor((turns - std::floor(turns)) * (1 << ENCODER_BITS))));
+        sample.encoder.counts = uint32_t(int64_t(std::floor((turns - std::floor(turns)) * (1 << ENCODER_BITS))));
         const bool closed = control_step(&parameters, &state, &sample, &compare, &diagnostics);
         // Whatever happens: no switch is closed outside RUN.
         EXPECT_EQ(closed, state.machine.state == DRIVE_STATE_RUN);
@@ -83,6 +83,20 @@ class Control : public testing::Test {
     hal_pwm_compare_t compare;
     double turns = 0.1, speed_rad_s = 0.0;
 };
+
+TEST_F(Control, codes_of_every_resolution_become_the_nearest_current_and_voltage) {
+    for (unsigned bits = 12; bits <= 16; bits++) {
+        parameters_t p;
+        parameters_init(&p);
+        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, bits);
+        for (uint32_t code = 0; code < 1u << bits; code += 7) {
+            sample.adc.phase_current_counts[1] = sample.adc.bus_voltage_counts = uint16_t(code);
+            step(COMMAND_OFF);
+            ASSERT_EQ(diagnostics.current_q9[1], std::floor(std::ldexp(code * 80.0, 9 - int(bits)) + 0.5)) << bits;
+            ASSERT_EQ(diagnostics.bus_voltage_q6, std::floor(std::ldexp(code * 512.0, 6 - int(bits)) + 0.5)) << bits;
+        }
+    }
+}
 
 TEST_F(Control, initialise_lasts_a_millisecond) {
     for (int k = 0; k < 39; k++) {
@@ -138,7 +152,7 @@ TEST_F(Control, counts_become_amperes_volts_and_angle_exactly) {
     EXPECT_EQ(diagnostics.current_q9[2], 40950);
     EXPECT_EQ(diagnostics.bus_voltage_q6, 240 << 6);
     // The middle of the encoder's count.
-    EXPECT_EQ(diagnostics.angle, (sample.encoder_counts << 15) + (1u << 14));
+    EXPECT_EQ(diagnostics.angle, (sample.encoder.counts << 15) + (1u << 14));
 }
 
 TEST_F(Control, each_cause_opens_every_switch_in_the_tick_that_sees_it) {

@@ -56,15 +56,16 @@ struct bench_t {
         if (rarely(500)) {
             angle = uint32_t(random());
         }
-        sample.encoder_counts = angle >> parameters.encoder_shift;
+        sample.encoder.counts = angle >> parameters.encoder_shift;
         const uint64_t middle_q6 = (uint64_t(parameters.protection.bus_over_voltage_q6) +
                                     uint64_t(parameters.protection.bus_under_voltage_q6)) /
                                    2;
+        const unsigned finer = parameters.adc_bits - 12u;
         sample.adc.bus_voltage_counts =
-            uint16_t(rarely(500) ? random() % 4096 : std::min<uint64_t>(middle_q6 / 8, 4095));
+            uint16_t((rarely(500) ? random() % 4096 : std::min<uint64_t>(middle_q6 / 8, 4095)) << finer);
         const uint64_t highest = uint64_t(parameters.protection.current_trip_q9) / 10;
         for (uint16_t &counts : sample.adc.phase_current_counts) {
-            counts = uint16_t(rarely(2000) ? random() % 4096 : random() % (highest + 1));
+            counts = uint16_t((rarely(2000) ? random() % 4096 : random() % (highest + 1)) << finer);
         }
         sample.missed_interrupts = rarely(100) ? uint32_t(random() % 3) : rarely(2000) ? uint32_t(random()) : 0;
         sample.time_us += period_us;
@@ -92,7 +93,8 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
             ASSERT_EQ(parameters_set(&p, index, any_value(parameters_row(index), random)), PARAMETER_DONE);
         }
         const uint32_t rate_hz = rates_hz[random() % 4];
-        const control_parameters_t parameters = configure_control(&p, tables, rate_hz, unsigned(8 + random() % 25));
+        const control_parameters_t parameters =
+            configure_control(&p, tables, rate_hz, unsigned(8 + random() % 25), 12 + unsigned(sequence) % 5);
         control_state_t state;
         control_diagnostics_t diagnostics{};
         control_reset(&state);
@@ -132,7 +134,7 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
     parameters_init(&p);
     for (const uint32_t rate_hz : {20000u, 100000u}) {
         for (const unsigned bits : {8u, 17u, 32u}) {
-            const control_parameters_t parameters = configure_control(&p, &machine_tables, rate_hz, bits);
+            const control_parameters_t parameters = configure_control(&p, &machine_tables, rate_hz, bits, 12);
             control_state_t state;
             control_diagnostics_t diagnostics{};
             control_reset(&state);
@@ -142,7 +144,7 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
                     counts = uint16_t(random() % 4096);
                 }
                 sample.adc.bus_voltage_counts = uint16_t(random() % 4096);
-                sample.encoder_counts = uint32_t(random()) >> (32 - bits);
+                sample.encoder.counts = uint32_t(random()) >> (32 - bits);
                 sample.missed_interrupts = uint32_t(random());
                 sample.time_us = uint32_t(random());
                 sample.command = {command_request_t(random() % 4), int32_t(uint32_t(random())), uint32_t(random())};

@@ -36,11 +36,15 @@ extern "C" {
 void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample) {
     *sample = hal->adc;
 }
+unsigned hal_adc_bits(const hal_t *) {
+    return 12;
+}
 unsigned hal_encoder_bits(const hal_t *) {
     return 17;
 }
-uint32_t hal_encoder_read(const hal_t *hal) {
-    return hal->encoder_counts;
+void hal_encoder_read(const hal_t *hal, hal_encoder_sample_t *sample) {
+    *sample = {};
+    sample->counts = hal->encoder_counts;
 }
 uint32_t hal_time_us(const hal_t *hal) {
     return hal->time_us;

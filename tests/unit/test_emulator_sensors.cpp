@@ -15,7 +15,7 @@ class Sensors : public testing::Test {
   protected:
     Sensors() : machine(machine_of(MAGNETICS_SATURATING)) {
         plant_init(&plant, &machine, 0.0);
-        sensors_init(&sensors, &machine.sensors, 17, 1);
+        sensors_init(&sensors, &machine.sensors, 17, 12, 1);
     }
 
     uint16_t current_counts(double current_A) {
@@ -32,9 +32,18 @@ class Sensors : public testing::Test {
         return sample.bus_voltage_counts;
     }
 
+    uint16_t load_torque_counts(double load_torque_Nm) {
+        plant.load_torque_Nm = load_torque_Nm;
+        hal_adc_sample_t sample;
+        sensors_sample_adc(&sensors, &plant, &sample);
+        return sample.load_torque_counts;
+    }
+
     uint32_t encoder_counts(double turns) {
         plant.rotor_angle_rad = turns * 2.0 * M_PI;
-        return sensors_sample_encoder(&sensors, &plant);
+        hal_encoder_sample_t sample;
+        sensors_sample_encoder(&sensors, &plant, &sample);
+        return sample.counts;
     }
 
     const machine_t machine;
@@ -66,6 +75,31 @@ TEST_F(Sensors, BusVoltageHasItsOwnScale) {
     EXPECT_EQ(bus_counts(600.0), 4095);
 }
 
+TEST_F(Sensors, CodesHaveTheBitsTheyWereGivenOverTheSameFullScale) {
+    for (unsigned bits = 12; bits <= 16; bits++) {
+        sensors_init(&sensors, &machine.sensors, 17, bits, 1);
+        const auto code = [bits](double fraction) {
+            return static_cast<uint16_t>(std::ldexp(fraction, int(bits)) + 0.5);
+        };
+        EXPECT_EQ(current_counts(33.3), code(33.3 / 80.0)) << bits;
+        EXPECT_EQ(bus_counts(240.07), code(240.07 / 512.0)) << bits;
+        EXPECT_EQ(current_counts(1e9), (1u << bits) - 1) << bits;
+        EXPECT_EQ(load_torque_counts(8.3), code(0.5 + 8.3 / 128.0)) << bits;
+    }
+}
+
+TEST_F(Sensors, LoadTorqueIsOffsetBinaryAndLimited) {
+    EXPECT_EQ(load_torque_counts(0.0), 2048);
+    EXPECT_EQ(load_torque_counts(8.0), 2048 + 256);
+    EXPECT_EQ(load_torque_counts(-8.0), 2048 - 256);
+    EXPECT_EQ(load_torque_counts(0.49 / 32.0), 2048);
+    EXPECT_EQ(load_torque_counts(0.5 / 32.0), 2049);
+    EXPECT_EQ(load_torque_counts(64.0), 4095);
+    EXPECT_EQ(load_torque_counts(200.0), 4095);
+    EXPECT_EQ(load_torque_counts(-64.0), 0);
+    EXPECT_EQ(load_torque_counts(-200.0), 0);
+}
+
 TEST_F(Sensors, EachPhaseIsConvertedAndUnusedOnesReadZero) {
     plant.current_A[0] = 10.0;
     plant.current_A[1] = 20.0;
@@ -84,7 +118,7 @@ TEST_F(Sensors, EachPhaseIsConvertedAndUnusedOnesReadZero) {
 TEST_F(Sensors, ErrorsAreTheMachinesUntilChanged) {
     machine_t other = machine;
     other.sensors = {1.25, -1.0, 0.5, 30.0, 3000.0, 0.5};
-    sensors_init(&sensors, &other.sensors, 17, 1);
+    sensors_init(&sensors, &other.sensors, 17, 12, 1);
     EXPECT_EQ(std::memcmp(&sensors.errors, &other.sensors, sizeof other.sensors), 0);
     EXPECT_EQ(current_counts(40.0), 1536) << "limited to 30 A: the noise stays below 6 deviations";
     EXPECT_EQ(encoder_counts(0.25), 32768u + 182u) << "0.5 deg of 131072 counts a turn: 182.04";
@@ -142,7 +176,7 @@ TEST_F(Sensors, HeldCurrentsAreConvertedUntilLetGoAndTheBusIsNotHeld) {
 TEST_F(Sensors, NoiseHasItsDeviationAndItsSeed) {
     sensors.errors.current_noise_A = 0.5;
     sensors_t same = sensors, other;
-    sensors_init(&other, &machine.sensors, 17, 2);
+    sensors_init(&other, &machine.sensors, 17, 12, 2);
     other.errors.current_noise_A = 0.5;
     plant.current_A[0] = 40.0;
     double sum = 0.0, squares = 0.0;
@@ -185,16 +219,16 @@ TEST_F(Sensors, EncoderCountsDownThroughZero) {
 
 TEST_F(Sensors, EncoderHasTheBitsItWasGiven) {
     for (const unsigned bits : {8u, 24u, 32u}) {
-        sensors_init(&sensors, &machine.sensors, bits, 0);
+        sensors_init(&sensors, &machine.sensors, bits, 12, 0);
         EXPECT_EQ(encoder_counts(0.5), UINT32_C(1) << (bits - 1));
         EXPECT_EQ(encoder_counts(-1e-12), UINT32_MAX >> (32 - bits));
     }
-    sensors_init(&sensors, &machine.sensors, 0, 0);
+    sensors_init(&sensors, &machine.sensors, 0, 12, 0);
     EXPECT_EQ(encoder_counts(0.75), UINT32_C(0xC0000000));
 }
 
 TEST_F(Sensors, EccentricityGoesOnceRoundWithTheRotor) {
-    sensors_init(&sensors, &machine.sensors, 32, 1);
+    sensors_init(&sensors, &machine.sensors, 32, 12, 1);
     sensors.errors.encoder_eccentricity_deg = 0.5;
     const double counts_per_degree = std::exp2(32) / 360.0;
     for (int turn : {-2, 0, 1000}) {
@@ -219,7 +253,7 @@ TEST_F(Sensors, JumpedEncoderIsHalfATurnOff) {
     sensors.encoder_fault = SENSORS_ENCODER_JUMP;
     EXPECT_EQ(encoder_counts(0.25), 98304u);
     EXPECT_EQ(encoder_counts(0.75), 32768u);
-    sensors_init(&sensors, &machine.sensors, 0, 0);
+    sensors_init(&sensors, &machine.sensors, 0, 12, 0);
     sensors.encoder_fault = SENSORS_ENCODER_JUMP;
     EXPECT_EQ(encoder_counts(0.75), UINT32_C(0x40000000));
 }
