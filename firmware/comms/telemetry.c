@@ -4,7 +4,7 @@
 #include "comms/units.h"
 #include "drive_codec.h"
 
-#define BP_PID_CYCLES 10
+#define LAWS_CYCLES 10
 #define HEARTBEAT_CYCLES 100
 #define FAULT_CYCLES 100
 
@@ -83,6 +83,17 @@ static hal_can_frame_t bp_pid_frame(const telemetry_snapshot_t *snapshot) {
     return frame;
 }
 
+static hal_can_frame_t trim_frame(const telemetry_snapshot_t *snapshot) {
+    struct drive_drive_trim_t message = {0};
+    drive_drive_trim_set_trim_torque_nm(&message, units_torque_q8(snapshot->trim_torque_q24));
+    drive_drive_trim_set_angle_trim_nm(&message, units_torque_q8(snapshot->angle_trim_q24));
+    drive_drive_trim_set_torque_missing_nm(&message, units_torque_q8(snapshot->torque_missing_q24));
+    drive_drive_trim_set_observer_bandwidth_rad_s(&message, snapshot->observer_bandwidth_rad_s);
+    hal_can_frame_t frame = frame_of(DRIVE_DRIVE_TRIM_FRAME_ID, DRIVE_DRIVE_TRIM_LENGTH);
+    drive_drive_trim_pack(frame.data, &message, sizeof frame.data);
+    return frame;
+}
+
 static hal_can_frame_t fault_cause_frame(const fault_record_t *fault) {
     struct drive_drive_fault_cause_t message = {0};
     drive_drive_fault_cause_set_time_us(&message, fault->time_us);
@@ -148,11 +159,12 @@ static bool count_down(uint8_t *cycles_left, uint8_t period) {
 }
 
 static void put_measurements(telemetry_t *telemetry, const telemetry_snapshot_t *snapshot) {
-    hal_can_frame_t frames[5] = {status_frame(telemetry, snapshot), motion_frame(snapshot), torque_frame(snapshot),
+    hal_can_frame_t frames[6] = {status_frame(telemetry, snapshot), motion_frame(snapshot), torque_frame(snapshot),
                                  currents_frame(snapshot)};
     unsigned count = 4;
-    if (count_down(&telemetry->bp_pid_in, BP_PID_CYCLES)) {
+    if (count_down(&telemetry->laws_in, LAWS_CYCLES)) {
         frames[count++] = bp_pid_frame(snapshot);
+        frames[count++] = trim_frame(snapshot);
     }
     put_together(telemetry, frames, count);
 }

@@ -1,13 +1,13 @@
 /* What the drive reports by itself: a cycle of measurements every millisecond, slower frames between.
  *
  *   every 1 ms    DRIVE_STATUS, DRIVE_MOTION, DRIVE_TORQUE, DRIVE_CURRENTS
- *   every 10 ms   DRIVE_BP_PID
+ *   every 10 ms   DRIVE_BP_PID, DRIVE_TRIM
  *   every 100 ms  DRIVE_COMMAND_COUNTERS, DRIVE_BUS_COUNTERS, DRIVE_HEARTBEAT
  *   in fault      DRIVE_FAULT_CAUSE, DRIVE_FAULT_SNAPSHOT in the cycle after the fault and every 100 ms from there
  *
  * The first cycle after start has everything. Frames wait in a queue for one of the three mailboxes. Frames that belong
- * together (a line above; DRIVE_BP_PID goes with its cycle) are queued together or, when the queue has no room for all
- * of them, dropped together and counted: what waits stays whole and in order, what is missing shows in the cycle
+ * together (a line above; those of 10 ms go with their cycle) are queued together or, when the queue has no room for
+ * all of them, dropped together and counted: what waits stays whole and in order, what is missing shows in the cycle
  * number.
  *
  * The heartbeat has the highest identifier on the bus. While other nodes hold it back it keeps a mailbox, so there is
@@ -45,16 +45,21 @@ typedef struct {
     int32_t kp_q15; /* 1/(N m), 0..65535 */
     int32_t ki_q15;
     int32_t kd_q15;
-    int32_t duty_q15;          /* -32768..32767 */
-    fault_record_t last_fault; /* sent while state is fault */
+    int32_t duty_q15; /* -32768..32767 */
+    /* Of the salient controller, 0 by the others. */
+    int32_t trim_torque_q24;           /* what the BP-PID adds to the torque reference */
+    int32_t angle_trim_q24;            /* what the trim by rotor angle adds */
+    int32_t torque_missing_q24;        /* reference less what the voltage can reach */
+    uint16_t observer_bandwidth_rad_s; /* at this moment */
+    fault_record_t last_fault;         /* sent while state is fault */
 } telemetry_snapshot_t;
 
 typedef struct {
     uint8_t phases;
     uint32_t control_rate_hz;
-    uint32_t next_us;  /* when the next cycle is due */
-    uint8_t cycle;     /* number of the next cycle */
-    uint8_t bp_pid_in; /* cycles until each is due */
+    uint32_t next_us; /* when the next cycle is due */
+    uint8_t cycle;    /* number of the next cycle */
+    uint8_t laws_in;  /* cycles until each is due */
     uint8_t heartbeat_in;
     uint8_t fault_in;
     bool in_fault;

@@ -27,7 +27,8 @@
 /* Numbers are those of drive.dbc and of the parameter `controller`. */
 typedef enum {
     DRIVE_CONTROLLER_TRADITIONAL, /* PI, hysteresis DITC */
-    DRIVE_CONTROLLER_PAPER        /* sliding mode, BP-PID, DITC by duty */
+    DRIVE_CONTROLLER_PAPER,       /* sliding mode, BP-PID, DITC by duty */
+    DRIVE_CONTROLLER_SALIENT      /* sliding mode, torque sharing, predictive flux PWM with BP-PID trim */
 } drive_controller_t;
 
 /* Read only in the interrupt; derived from the parameters by configure_control. */

@@ -117,7 +117,7 @@ def test_refusals(bench):
         bench.load_torque_Nm = 500
     with pytest.raises(RigError, match="load_torque_Nm 1 at 5000 us: in_the_past"):
         bench.at(0.005).load_torque_Nm = 1
-    with pytest.raises(DriveError, match="speed_reference_rpm 5000: allowed are 0 to 3000 r/min"):
+    with pytest.raises(DriveError, match="speed_reference_rpm 5000: allowed are -3000 to 3000 r/min"):
         bench.drive.speed_reference_rpm = 5000
     with pytest.raises(DriveError, match="request 'fly': allowed are off, run, stop, clear_fault"):
         bench.drive.ask("fly")

@@ -82,7 +82,7 @@ def test_wrong_frames(make_bench, tmp_path, undisturbed, counter):
     assert counters == dict.fromkeys(COUNTERS, 0.0) | {counter: len(ATTACKS[counter])}
 
 
-@pytest.mark.parametrize("raw_speed", [3_000_001, -1, 2**23 - 1, -(2**23)])
+@pytest.mark.parametrize("raw_speed", [3_000_001, -3_000_001, 2**23 - 1, -(2**23)])
 def test_out_of_range(make_bench, tmp_path, undisturbed, raw_speed):
     """Checksum and counter are good, so that nothing but the range is wrong."""
     bench = steady(make_bench, tmp_path, "disturbed")

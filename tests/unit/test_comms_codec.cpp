@@ -25,13 +25,17 @@ TEST(Codec, setters_saturate_at_the_range_of_the_dbc_where_it_is_narrower) {
     drive_drive_command_t message{};
     drive_drive_command_set_speed_reference_rpm(&message, 3000001);
     EXPECT_EQ(message.speed_reference_rpm, 3000000);
-    drive_drive_command_set_speed_reference_rpm(&message, -1);
-    EXPECT_EQ(message.speed_reference_rpm, 0);
+    drive_drive_command_set_speed_reference_rpm(&message, -3000001);
+    EXPECT_EQ(message.speed_reference_rpm, -3000000);
     drive_drive_command_set_request(&message, 4);
     EXPECT_EQ(message.request, 3);
     drive_drive_heartbeat_t heartbeat{};
     drive_drive_heartbeat_set_phases(&heartbeat, 0);
     EXPECT_EQ(heartbeat.phases, 1);
+    drive_drive_heartbeat_set_control_rate_hz(&heartbeat, 1000000);
+    EXPECT_EQ(heartbeat.control_rate_hz, 1000000u);
+    drive_drive_heartbeat_set_controller(&heartbeat, 3);
+    EXPECT_EQ(heartbeat.controller, 2);
 }
 
 TEST(Codec, setters_carry_32_unsigned_bits) {

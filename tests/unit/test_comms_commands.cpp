@@ -53,6 +53,17 @@ TEST_F(Commands, a_good_command_is_taken) {
     EXPECT_EQ(commands.counters.accepted, 1);
 }
 
+TEST_F(Commands, a_reference_has_a_sign_and_is_symmetric) {
+    uint8_t counter = 0;
+    for (const int32_t milli_rpm : {1, 1000, 150000, 599999, 3000000}) {
+        ASSERT_EQ(take(command_frame(++counter, COMMAND_RUN, milli_rpm)), COMMANDS_COMMAND);
+        const int32_t forwards_q22 = command.speed_reference_q22;
+        ASSERT_EQ(take(command_frame(++counter, COMMAND_RUN, -milli_rpm)), COMMANDS_COMMAND);
+        EXPECT_GT(forwards_q22, 0);
+        EXPECT_NEAR(command.speed_reference_q22, -forwards_q22, 1) << milli_rpm; // halves round upwards
+    }
+}
+
 TEST_F(Commands, every_length_but_the_right_one_is_refused) {
     for (int length = 0; length < 16; length++) {
         hal_can_frame_t frame = command_frame(1);
@@ -130,10 +141,11 @@ TEST_F(Commands, every_request_beyond_the_last_is_refused) {
 }
 
 TEST_F(Commands, a_speed_beyond_the_range_is_refused) {
-    EXPECT_EQ(take(command_frame(1, COMMAND_RUN, 3000000)), COMMANDS_COMMAND);
-    EXPECT_EQ(take(command_frame(2, COMMAND_RUN, 0)), COMMANDS_COMMAND);
-    uint8_t counter = 2;
-    for (const int32_t milli_rpm : {3000001, -1, 8388607, -8388608}) {
+    uint8_t counter = 0;
+    for (const int32_t milli_rpm : {3000000, -3000000, 0}) {
+        EXPECT_EQ(take(command_frame(++counter, COMMAND_RUN, milli_rpm)), COMMANDS_COMMAND);
+    }
+    for (const int32_t milli_rpm : {3000001, -3000001, 8388607, -8388608}) {
         expect_refused(command_frame(++counter, COMMAND_RUN, milli_rpm), &commands.counters.out_of_range);
     }
 }

@@ -102,6 +102,14 @@ class Comms : public testing::Test {
         return frames::command(counter, request_value, 0);
     }
 
+    // The first frame with this identifier that left; zeros when none did.
+    hal_can_frame_t first(uint32_t identifier) const {
+        const auto found = std::find_if(bus.sent.begin(), bus.sent.end(),
+                                        [&](const auto &frame) { return frame.identifier == identifier; });
+        EXPECT_NE(found, bus.sent.end()) << identifier;
+        return found == bus.sent.end() ? hal_can_frame_t{} : *found;
+    }
+
     hal bus;
     comms_t comms;
     parameters_t parameters;
@@ -118,6 +126,7 @@ TEST_F(Comms, frames_come_at_their_rates) {
     EXPECT_NEAR(bus.count(DRIVE_DRIVE_TORQUE_FRAME_ID), 1003, 1);
     EXPECT_NEAR(bus.count(DRIVE_DRIVE_CURRENTS_FRAME_ID), 1003, 1);
     EXPECT_EQ(bus.count(DRIVE_DRIVE_BP_PID_FRAME_ID), 101u);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_TRIM_FRAME_ID), 101u);
     EXPECT_EQ(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_DRIVE_COMMAND_COUNTERS_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_DRIVE_BUS_COUNTERS_FRAME_ID), 11u);
@@ -126,7 +135,7 @@ TEST_F(Comms, frames_come_at_their_rates) {
 }
 
 TEST_F(Comms, signals_carry_the_snapshot) {
-    snapshot.controller = 1;
+    snapshot.controller = 2;
     snapshot.fault = 5;
     snapshot.voltage_saturated = true;
     snapshot.speed_q22 = int32_t(std::lround(-600 * 2 * M_PI / 60 * 4194304));
@@ -141,39 +150,49 @@ TEST_F(Comms, signals_carry_the_snapshot) {
     snapshot.kp_q15 = 16384;
     snapshot.kd_q15 = 70000;
     snapshot.duty_q15 = -32769;
-    run(1500);
-    ASSERT_GE(bus.sent.size(), 8u);
+    snapshot.trim_torque_q24 = -3 * (1 << 24);
+    snapshot.angle_trim_q24 = (1 << 24) / 8;
+    snapshot.torque_missing_q24 = INT32_MAX;
+    snapshot.observer_bandwidth_rad_s = 8000;
+    run(3000);
 
     drive_drive_status_t status;
-    drive_drive_status_unpack(&status, bus.sent[0].data, 8);
+    drive_drive_status_unpack(&status, first(DRIVE_DRIVE_STATUS_FRAME_ID).data, 8);
     EXPECT_EQ(status.time_us, 0u);
     EXPECT_EQ(status.state, STATE_RUN);
-    EXPECT_EQ(status.controller, 1);
+    EXPECT_EQ(status.controller, 2);
     EXPECT_EQ(status.fault, 5);
     EXPECT_EQ(status.voltage_saturated, 1);
     drive_drive_motion_t motion;
-    drive_drive_motion_unpack(&motion, bus.sent[1].data, 8);
+    drive_drive_motion_unpack(&motion, first(DRIVE_DRIVE_MOTION_FRAME_ID).data, 8);
     EXPECT_EQ(motion.speed_rpm, -600000);
     EXPECT_EQ(motion.speed_reference_rpm, 150000);
     EXPECT_EQ(motion.rotor_angle_deg, 0x4000);
     drive_drive_torque_t torque;
-    drive_drive_torque_unpack(&torque, bus.sent[2].data, 8);
+    drive_drive_torque_unpack(&torque, first(DRIVE_DRIVE_TORQUE_FRAME_ID).data, 8);
     EXPECT_EQ(torque.torque_reference_nm, 4890); // 19.1 N m is 4889.6 LSB
     EXPECT_EQ(torque.torque_estimate_nm, 32767);
     EXPECT_EQ(torque.load_torque_estimate_nm, -2048);
     EXPECT_EQ(torque.bus_voltage_v, 15360);
     drive_drive_currents_t currents;
-    drive_drive_currents_unpack(&currents, bus.sent[3].data, 8);
+    drive_drive_currents_unpack(&currents, first(DRIVE_DRIVE_CURRENTS_FRAME_ID).data, 8);
     EXPECT_EQ(currents.current_a_a, 10240);
     EXPECT_EQ(currents.current_d_a, 65535);
     drive_drive_bp_pid_t gains;
-    drive_drive_bp_pid_unpack(&gains, bus.sent[4].data, 8);
+    drive_drive_bp_pid_unpack(&gains, first(DRIVE_DRIVE_BP_PID_FRAME_ID).data, 8);
     EXPECT_EQ(gains.kp_per_nm, 16384);
     EXPECT_EQ(gains.kd_per_nm, 65535);
     EXPECT_EQ(gains.duty, -32768);
+    drive_drive_trim_t trim;
+    drive_drive_trim_unpack(&trim, first(DRIVE_DRIVE_TRIM_FRAME_ID).data, 8);
+    EXPECT_EQ(trim.trim_torque_nm, -768);
+    EXPECT_EQ(trim.angle_trim_nm, 32);
+    EXPECT_EQ(trim.torque_missing_nm, 32767);
+    EXPECT_EQ(trim.observer_bandwidth_rad_s, 8000);
     drive_drive_heartbeat_t heartbeat;
-    drive_drive_heartbeat_unpack(&heartbeat, bus.sent[7].data, 8);
+    drive_drive_heartbeat_unpack(&heartbeat, first(DRIVE_DRIVE_HEARTBEAT_FRAME_ID).data, 8);
     EXPECT_EQ(heartbeat.state, STATE_RUN);
+    EXPECT_EQ(heartbeat.controller, 2);
     EXPECT_EQ(heartbeat.phases, 3);
     EXPECT_EQ(heartbeat.control_rate_hz, 40000u);
 }
@@ -245,9 +264,9 @@ TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
 }
 
 TEST_F(Comms, dropped_frames_are_counted_exactly) {
-    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 2 counters + 1 heartbeat
+    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 2 counters + 1 heartbeat
     const unsigned waiting = unsigned(bus.mailboxes.size()) + comms.telemetry.queue.count;
-    EXPECT_EQ(comms.telemetry.dropped + waiting, 413u);
+    EXPECT_EQ(comms.telemetry.dropped + waiting, 423u);
 }
 
 TEST_F(Comms, others_above_the_heartbeat_cannot_block_telemetry) {

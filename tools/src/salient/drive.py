@@ -28,7 +28,7 @@ class DriveError(Exception):
 
 
 def command_frame(counter: int, request: str, speed_reference_rpm: float) -> can.Message:
-    """A DRIVE_COMMAND with its checksum. counter 0..255; request one of REQUESTS; 0..3000 r/min."""
+    """A DRIVE_COMMAND with its checksum. counter 0..255; request one of REQUESTS; -3000..3000 r/min."""
     message = drive_database().get_message_by_name("DRIVE_COMMAND")
     signals = {
         "checksum": 0,
@@ -56,7 +56,7 @@ class Drive:
 
     @property
     def speed_reference_rpm(self) -> float:
-        """Last one asked for, 0..3000."""
+        """Last one asked for, -3000..3000; negative is backwards, and 0 to a controller that motors forwards only."""
         return self._speed_reference_rpm
 
     @speed_reference_rpm.setter
