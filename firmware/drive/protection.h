@@ -1,4 +1,5 @@
-/* Checks of every control period. All are evaluated, whatever the others say; the caller latches. */
+/* Checks of every control period. All are evaluated, whatever the others say; the caller latches. Those of speed and
+ * encoder are the same in both directions. */
 #ifndef DRIVE_PROTECTION_H
 #define DRIVE_PROTECTION_H
 
@@ -8,7 +9,7 @@ typedef struct {
     int32_t current_trip_q9;     /* A, Q7.9 */
     int32_t bus_over_voltage_q6; /* V, Q9.6 */
     int32_t bus_under_voltage_q6;
-    int32_t over_speed_q22;     /* rad/s, Q9.22 */
+    int32_t over_speed_q22;     /* rad/s, Q9.22, of the magnitude */
     uint32_t angle_step_max;    /* 2^-32 turn a period: further is no rotation but a jump */
     uint32_t angle_unmoved_max; /* 2^-32 turn that the rotor should have moved while the encoder stood still */
     int32_t angle_step_q32;     /* period: 2^-32 turn per rad/s Q9.22, in Q32 */
@@ -24,7 +25,7 @@ typedef struct {
 typedef struct {
     int32_t current_max_q9; /* of all phases */
     int32_t bus_voltage_q6;
-    int32_t speed_q22;
+    int32_t speed_q22;          /* negative backwards */
     uint32_t angle;             /* measured, 2^-32 turn */
     uint32_t missed_interrupts; /* since the last period */
     uint32_t command_age_us;    /* of the last accepted command */

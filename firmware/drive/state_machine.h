@@ -6,6 +6,10 @@
  * A lost command is a fault only in RUN. A drive that came back from a fault runs again only after it was asked for
  * something else than run: whoever holds `run` through a fault must let go first. Likewise `clear_fault` acts in the
  * tick in which it is first asked: held, it does not clear what comes later or goes away later.
+ *
+ * Direction: the states know none. RUN goes through zero speed when the reference changes its sign. A stop stays in RUN
+ * with a reference that ramps to zero, from either side, until the rotor stands: a controller that can brake brakes,
+ * with one that cannot the rotor coasts, and with a load that keeps turning it the stop does not end; `off` does.
  */
 #ifndef DRIVE_STATE_MACHINE_H
 #define DRIVE_STATE_MACHINE_H
@@ -29,7 +33,7 @@ typedef struct {
 typedef struct {
     uint16_t checks; /* failed checks of this tick, FAULT_BIT */
     command_request_t request;
-    bool standing; /* slow enough for a stop to end */
+    bool standing; /* slow enough, in either direction, for a stop to end */
 } state_machine_input_t;
 
 /* INITIALISE. */

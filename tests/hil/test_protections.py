@@ -121,17 +121,52 @@ def test_who_holds_run_through_a_fault_must_let_go_first(bench):
     assert currents_A(bench) == [0, 0, 0]
 
 
-def test_a_driving_load_trips_over_speed(bench):
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_driving_load_trips_over_speed_in_either_direction(bench, direction):
     bench.drive.parameters["over_speed_rpm"] = 700
-    bench.drive.speed_reference_rpm = 600
+    if direction > 0:
+        bench.drive.speed_reference_rpm = 600
+    else:  # in run it would hold the load
+        bench.drive.off()
     bench.run_for(0.1)
-    bench.load_torque_Nm = -10
-    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.1)
+    bench.load_torque_Nm = -10 * direction
+    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.3)
     assert bench.drive.fault == "over_speed"
     bench.run_for(0.001)
     # 500 rad/s^2: the observer's lag and a telemetry cycle are a few r/min.
-    assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(700, abs=2)
-    assert bench.truth["speed_rpm"].last == pytest.approx(703, abs=8)
+    assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(700 * direction, abs=2)
+    assert bench.truth["speed_rpm"].last == pytest.approx(703 * direction, abs=8)
+
+
+@pytest.mark.parametrize(("fault", "reaction_us"), [(1, (50, 1000)), (2, (0, 2 * PERIOD_US))])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_an_encoder_that_freezes_or_jumps_is_noticed_in_either_direction(bench, direction, fault, reaction_us):
+    """With open switches: the load turns the rotor."""
+    bench.drive.off()
+    bench.load_torque_Nm = -10 * direction
+    bench.run_until(lambda: bench.truth["speed_rpm"].last * direction > 600, timeout=0.3)
+    assert bench.drive.state == "ready"
+    caused_us = bench.time_ns / 1000
+    bench.rig.encoder_fault = fault
+    bench.run_for(0.01)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "encoder")
+    latency_us = bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last - caused_us
+    assert reaction_us[0] <= latency_us <= reaction_us[1]
+    assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(600 * direction, abs=10)
+
+
+@pytest.mark.parametrize("controller", ["traditional", "paper"])
+def test_a_controller_that_motors_forwards_only_stands_still_at_a_negative_reference(make_bench, controller):
+    bench = make_bench(controller=controller)
+    bench.drive.speed_reference_rpm = -600
+    bench.run_for(0.1)
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+    assert bench.truth["speed_rpm"].value == pytest.approx(0, abs=0.01)
+    assert max(abs(bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"].value).max() for phase in "abc") == 0
+    bench.drive.speed_reference_rpm = 150  # and nothing was wound up meanwhile
+    bench.run_for(0.15)
+    assert bench.truth["speed_rpm"].last == pytest.approx(150, abs=1.5)
+    assert bench.truth["speed_rpm"].value.max() < 153
 
 
 def test_a_single_long_interrupt_is_no_fault(bench):

@@ -129,6 +129,45 @@ TEST_F(Protection, a_still_encoder_says_nothing_at_standstill) {
     EXPECT_EQ(protection.unmoved_q64, 0);
 }
 
+TEST_F(Protection, both_directions_give_the_same_checks_on_mirrored_random_motion) {
+    std::mt19937 random(11);
+    protection_t mirrored{};
+    protection_sample_t sample = healthy, mirror = healthy;
+    protection_reset(&mirrored, healthy.angle);
+    unsigned over_speed = 0, encoder = 0;
+    for (int k = 0; k < 200000; k++) {
+        // Often still, now and then beyond a limit.
+        const uint32_t step = random() % 4 == 0 ? random() % (ANGLE_STEP_MAX + 50) : 0;
+        sample.angle += step;
+        mirror.angle -= step;
+        if (k % 50 == 0) {
+            sample.speed_q22 = int32_t(random() % ((random() % 20 == 0 ? 380u : 10u) << 22));
+            mirror.speed_q22 = -sample.speed_q22;
+        }
+        const uint16_t checks = check(sample);
+        ASSERT_EQ(protection_check(&PARAMETERS, &mirrored, &mirror), checks) << k;
+        ASSERT_EQ(mirrored.unmoved_q64, protection.unmoved_q64) << k;
+        over_speed += (checks & FAULT_BIT(FAULT_OVER_SPEED)) != 0;
+        encoder += (checks & FAULT_BIT(FAULT_ENCODER)) != 0;
+    }
+    EXPECT_GT(over_speed, 10u);
+    EXPECT_LT(over_speed, 1000u);
+    EXPECT_GT(encoder, 1000u);
+    EXPECT_LT(encoder, 50000u);
+}
+
+TEST_F(Protection, a_reversal_at_a_count_s_edge_is_no_frozen_encoder) {
+    protection_sample_t sample = healthy;
+    // From 50 rad/s to -50 rad/s in 2000 periods, the count still while the speed is below 2 rad/s.
+    for (int k = -1000; k <= 1000; k++) {
+        sample.speed_q22 = -k * ((50 << 22) / 1000);
+        if (k < -40 || k > 40) {
+            sample.angle += sample.speed_q22 > 0 ? 100 : -100;
+        }
+        ASSERT_EQ(check(sample), 0) << k;
+    }
+}
+
 TEST_F(Protection, an_encoder_frozen_for_ever_does_not_overflow_its_account) {
     protection_sample_t sample = healthy;
     sample.speed_q22 = INT32_MAX;
