@@ -3,17 +3,21 @@
 import hashlib
 import io
 import json
+import re
 
+import numpy as np
 import pytest
 
-from salient import demo
+from salient import demo, metrics
+from salient.arguments import CONTROLLERS as ALL_CONTROLLERS
 from salient.arguments import make_parser
 from salient.errors import UsageError
-from salient.paths import ROOT
+from salient.paths import ROOT, SCENARIOS
 from salient.progress import Progress
-from salient.results import PAPER
+from salient.results import PAPER, rounded
+from salient.scenario import load_scenarios
 
-CONTROLLERS = ("traditional", "paper")
+CONTROLLERS = tuple(scenario.controller for scenario in load_scenarios(SCENARIOS / "load_step_150.toml"))
 
 
 def options(*line):
@@ -48,18 +52,37 @@ def bytes_by_name(folder):
 def test_everything_promised_is_there(demo_folder):
     runs = [f"runs/{experiment}_{controller}/{name}" for experiment in demo.EXPERIMENTS for controller in CONTROLLERS
             for name in ("can.blf", "can.log", "recording.npy")]
+    runs += [f"runs/load_step_150_{controller}/ripple_window.npy" for controller in CONTROLLERS]
     pictures = [f"figures/{name}.png" for name in demo.PICTURES]
     assert set(bytes_by_name(demo_folder)) == {"results.json", "report.html", *runs, *pictures}
 
 
 def test_the_folder_stays_small(demo_folder):
-    assert sum(path.stat().st_size for path in demo_folder.rglob("*") if path.is_file()) < 80e6
+    size = sum(path.stat().st_size for path in demo_folder.rglob("*") if path.is_file())
+    assert 8e6 * len(CONTROLLERS) < size < 16e6 * len(CONTROLLERS)
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_what_is_kept_of_the_recordings_gives_the_figures_again(demo_folder, figures_of_merit, controller):
+    merits = figures_of_merit["load_step_150"][controller]
+    folder = demo_folder / "runs" / f"load_step_150_{controller}"
+    window, whole = np.load(folder / "ripple_window.npy"), np.load(folder / "recording.npy")
+    of_window = rounded(metrics.torque_metrics(window["time_s"], window["torque_Nm"], metrics.RIPPLE_WINDOW_S))
+    assert of_window == {name: merits[name] for name in of_window}
+    assert metrics.sample_step_s(window["time_s"]) == pytest.approx(1e-6, rel=1e-9)
+    assert metrics.sample_step_s(whole["time_s"]) == pytest.approx(10e-6, rel=1e-9)
+    assert (whole["time_s"][0], whole["time_s"][-1]) == (0.0, pytest.approx(0.5, abs=1e-9))
+    # Speed is smooth: 10 us lose nothing of it that shows.
+    dip_rpm = 150.0 - whole["speed_rpm"][whole["time_s"] >= 0.13].min()
+    assert dip_rpm == pytest.approx(merits["speed_dip_rpm"], abs=2e-3)
+    assert np.array_equal(np.isin(whole, window), (whole["time_s"] > 0.3 - 1e-9) & (whole["time_s"] < 0.4 + 1e-9))
 
 
 def test_it_tells_each_step_and_ends_with_the_figures(demo_folder):
     said = (demo_folder / "said.txt").read_text(encoding="utf-8")
-    steps = [line for line in said.splitlines() if line[:2] in [f"{n}/" for n in range(1, 10)]]
-    assert [step.split()[0] for step in steps] == [f"{n}/9" for n in range(1, 10)]
+    count = len(demo.EXPERIMENTS) * len(CONTROLLERS) + len(demo.PICTURES) + 1
+    steps = [line.split()[0] for line in said.splitlines() if re.match("[0-9]+/", line)]
+    assert steps == [f"{n}/{count}" for n in range(1, count + 1)]
     assert "torque ripple K_t" in said
     assert said.endswith(f"report:  {demo_folder / 'report.html'}\n")
 
@@ -93,10 +116,44 @@ def test_steady_torque_is_load_plus_friction(figures_of_merit, controller):
         (merits["torque_max_Nm"] - merits["torque_min_Nm"]) / merits["torque_mean_Nm"], rel=1e-4)
 
 
+@pytest.mark.parametrize("controllers", [("paper",), ("paper", "traditional")])
+def test_the_scenario_files_say_which_controllers_run(controllers, tmp_path, monkeypatch):
+    for experiment in demo.EXPERIMENTS:
+        text, count = re.subn("(?m)^controllers = .*$", f"controllers = {json.dumps(controllers)}",
+                              (SCENARIOS / f"{experiment}.toml").read_text(encoding="utf-8"))
+        assert count == 1
+        (tmp_path / f"{experiment}.toml").write_text(text, encoding="utf-8")
+    monkeypatch.setattr(demo, "SCENARIOS", tmp_path)
+    demo.run(options("--out", tmp_path / "out"), stream=io.StringIO())
+    results = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))
+    for part in ("experiments", "losses"):
+        assert {experiment: tuple(of) for experiment, of in results[part].items()} == dict.fromkeys(
+            demo.EXPERIMENTS, controllers)
+
+
 def test_ripple_of_hysteresis_is_what_its_sampling_rate_allows_and_the_papers_is_lower(figures_of_merit):
-    ripple = {controller: figures_of_merit["load_step_150"][controller]["torque_ripple"] for controller in CONTROLLERS}
+    ripple = {controller: of["torque_ripple"] for controller, of in figures_of_merit["load_step_150"].items()}
     assert 0.3 < ripple["traditional"] < 1.6
     assert PAPER["load_step_150"]["paper"]["torque_ripple"] < ripple["paper"] < ripple["traditional"]
+
+
+def readme_table(first_cell):
+    """Row -> controller -> cell, of the README's table with a row that begins so. Its columns are those whose head is a
+    controller's name: what is headed otherwise is not ours."""
+    tables = re.findall(r"(?:^\|.*\n)+", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    (table,) = (table for table in tables if f"\n| {first_cell} |" in table)
+    heads, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines())
+    assert set(heads[1:]) <= {*ALL_CONTROLLERS, "printed"}
+    return {row[0]: {head: cell for head, cell in zip(heads, row, strict=True) if head in ALL_CONTROLLERS}
+            for row in rows}
+
+
+def assert_shown(shown, values):
+    """Each of the README's cells is the value by the same controller, to the digits that the cell has."""
+    assert {"traditional", "paper"} <= set(shown) <= set(values)
+    for controller, cell in shown.items():
+        number = cell.split()[0]
+        assert number == f"{values[controller]:.{len(number.partition('.')[2])}f}", controller
 
 
 def test_the_readme_shows_the_figures_of_the_demo(figures_of_merit):
@@ -109,16 +166,10 @@ def test_the_readme_shows_the_figures_of_the_demo(figures_of_merit):
         "back within 0.5 %": {c: step[c]["recovery_time_s"] * 1e3 for c in CONTROLLERS},
         "torque ripple K_t, 0.3 to 0.4 s": {c: step[c]["torque_ripple"] for c in CONTROLLERS},
     }
-    table = {}
-    for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if line.startswith("|") and len(cells) == 5:
-            table[cells[0]] = {"traditional": cells[1], "paper": cells[3]}
+    table = readme_table("overshoot")
+    assert list(table) == list(rows)
     for row, values in rows.items():
-        for controller, value in values.items():
-            shown = table[row][controller].split()[0]
-            digits = len(shown.partition(".")[2])
-            assert shown == f"{value:.{digits}f}", f"{row}, {controller}"
+        assert_shown(table[row], values)
 
 
 # Settling times of the paper's controller: T_max over inertia decides them, and the finite-element machine is light.
@@ -136,12 +187,8 @@ def test_the_other_machines_hold_the_same_promises(machine, settles_s, tmp_path)
     assert PAPER["load_step_150"]["paper"]["torque_ripple"] < step["paper"]["torque_ripple"]
     assert step["paper"]["torque_ripple"] < step["traditional"]["torque_ripple"]
     assert 0.15 < step["traditional"]["torque_ripple"] < 0.8
-    (row,) = (line for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-              if line.startswith(f"| `{machine}`") and line.count("|") == 4)
-    shown = [cell.strip() for cell in row.split("|")[2:4]]
-    for text, controller in zip(shown, CONTROLLERS, strict=True):
-        digits = len(text.partition(".")[2])
-        assert text == f"{step[controller]['torque_ripple']:.{digits}f}", controller
+    (row,) = (cells for name, cells in readme_table("`saturating`").items() if name.startswith(f"`{machine}`"))
+    assert_shown(row, {controller: of["torque_ripple"] for controller, of in step.items()})
 
 
 @pytest.mark.parametrize(("line", "message"), [

@@ -3,13 +3,15 @@
 import json
 import re
 from html.parser import HTMLParser
+from itertools import combinations
 
 import numpy as np
 import pytest
 
-from salient import figures, metrics, report, results
+from salient import demo, figures, metrics, report, results
 
-CONTROLLERS = ("traditional", "paper")
+CONTROLLERS = ("traditional", "paper", "salient")
+"""Of the pages and pictures; the paper prints nothing for the last."""
 CONDITIONS = {
     "control_rate_hz": 40_000,
     "adc": {"bits": 12, "range_A": [0.0, 80.0]},
@@ -43,7 +45,7 @@ def recording(reference_rpm, ripple_Nm):
 
 @pytest.fixture(scope="module")
 def runs():
-    ripple_Nm = {"traditional": 3.0, "paper": 0.3}
+    ripple_Nm = {"traditional": 3.0, "paper": 0.3, "salient": 0.05}
     return {
         "start_600": {controller: recording(600.0, ripple_Nm[controller]) for controller in CONTROLLERS},
         "load_step_150": {controller: recording(150.0, ripple_Nm[controller]) for controller in CONTROLLERS},
@@ -110,6 +112,34 @@ def test_extremes_leave_short_lines_alone():
     assert np.array_equal(figures.extremes(values, values)[1], values)
 
 
+# Linear RGB as dichromats see it: G. M. Machado, M. M. Oliveira, L. A. F. Fernandes, "A physiologically-based model for
+# simulation of color vision deficiency", IEEE Trans. Visualization and Computer Graphics 15(6), 2009, severity 1.
+EYES = {
+    "normal": ([1, 0, 0], [0, 1, 0], [0, 0, 1]),
+    "protanope": ([0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]),
+    "deuteranope": ([0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]),
+    "tritanope": ([1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]),
+}
+
+
+def lab(colour, eyes):
+    """CIE L*a*b* (D65) of "#rrggbb" as these eyes see it."""
+    rgb = np.array([int(colour[place:place + 2], 16) for place in (1, 3, 5)]) / 255.0
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(np.array(EYES[eyes]) @ linear, 0.0, 1.0)
+    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ seen
+    x, y, z = np.cbrt(np.maximum(xyz / (0.9505, 1.0, 1.089), 0.008856))
+    return np.array([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)])
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_colours_of_controllers_are_apart_for_all_eyes(eyes):
+    """20 is ten times a difference that is just noticed side by side."""
+    for one, other in combinations(CONTROLLERS, 2):
+        colours = figures.CONTROLLER_COLOUR[one], figures.CONTROLLER_COLOUR[other]
+        assert 20.0 < np.linalg.norm(lab(colours[0], eyes) - lab(colours[1], eyes)) < 150.0, (one, other)
+
+
 def test_equal_runs_give_equal_pictures(runs, made, pictures, tmp_path):
     for first, again in zip(pictures, draw_all(tmp_path / "again", runs, made), strict=True):
         assert first.read_bytes() == again.read_bytes(), first.name
@@ -134,9 +164,9 @@ def test_results_have_the_shape_that_scripts_rely_on(made, tmp_path):
     start = ["settling_time_s", "overshoot_percent", "max_speed_rpm"]
     step = ["speed_dip_rpm", "recovery_time_s", "max_speed_rpm", "torque_max_Nm", "torque_min_Nm", "torque_mean_Nm",
             "torque_ripple"]
-    for part in ("experiments", "paper"):
+    for part, controllers in (("experiments", CONTROLLERS), ("paper", ("traditional", "paper"))):
         assert list(read[part]) == ["start_600", "load_step_150"]
-        for controller in CONTROLLERS:
+        for controller in controllers:
             assert list(read[part]["start_600"][controller]) == start
             assert list(read[part]["load_step_150"][controller]) == step
     assert read["conditions"] == CONDITIONS
@@ -205,6 +235,37 @@ def test_the_page_has_our_figures_and_the_printed_ones(made, pictures, tmp_path)
     assert "0.0197" in text
 
 
+def of_controllers(made, controllers):
+    """The results of some of the controllers only."""
+    return made | {part: {experiment: {controller: of[controller] for controller in controllers}
+                          for experiment, of in made[part].items()} for part in ("experiments", "losses")}
+
+
+@pytest.mark.parametrize("controllers", [("traditional",), ("salient",), ("paper", "salient"),
+                                         ("salient", "traditional", "paper")])
+def test_any_controllers_in_any_order_make_a_page_and_pictures(runs, made, controllers, tmp_path):
+    some = of_controllers(made, controllers)
+    some_runs = {experiment: {controller: of[controller] for controller in controllers}
+                 for experiment, of in runs.items()}
+    text = page(tmp_path / "report.html", some, draw_all(tmp_path / "figures", some_runs, some))
+    read_page(text)
+    for controller, of in made["experiments"]["load_step_150"].items():
+        assert (f"{of['torque_ripple']:.4f}" in text) == (controller in controllers)
+    # In the tables of both experiments; nothing says "printed" of what is not.
+    assert text.count("<th class=paper>printed</th>") == 2 * len({"traditional", "paper"} & set(controllers))
+
+
+def test_the_terminal_s_table_has_a_printed_column_only_where_the_paper_prints(made):
+    lines = demo.summary(made).splitlines()
+    assert [line.split() for line in lines if line.startswith("start_600")] == [
+        ["start_600", "traditional", "printed", "paper", "printed", "salient"]]
+    (ripple,) = (line for line in lines if "K_t" in line)
+    assert ripple.split()[3:] == [f"{made['experiments']['load_step_150'][controller]['torque_ripple']:.4f}" if ours
+                                  else f"{made['paper']['load_step_150'][controller]['torque_ripple']:g}"
+                                  for controller, ours in (("traditional", True), ("traditional", False),
+                                                           ("paper", True), ("paper", False), ("salient", True))]
+
+
 def test_the_page_shows_losses_and_the_iron_only_where_it_was_estimated(made, pictures, tmp_path):
     text = page(tmp_path / "without.html", made, pictures)
     assert "<td>71.4</td>" in text and "<td>17.38</td>" in text
@@ -216,7 +277,7 @@ def test_the_page_shows_losses_and_the_iron_only_where_it_was_estimated(made, pi
         losses["load_step_150"][controller]["iron_estimate_W"] = 4.747
     text = page(tmp_path / "with.html", dict(made, losses=losses), pictures)
     read_page(text)
-    assert text.count("<td>4.75</td>") == 2
+    assert text.count("<td>4.75</td>") == len(CONTROLLERS)
     assert "iron, an estimate" in text and "no part of the ledger" in text
 
 

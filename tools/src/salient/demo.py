@@ -1,7 +1,10 @@
 """salient demo: the paper's two experiments, each by every controller, over CAN.
 
-Left in the folder: results.json, report.html, figures/*.png, and in runs/<experiment>_<controller>/ what run_scenario
-leaves: the CAN log as BLF and as candump text, and the recording of the true state.
+The controllers are those that the experiments' scenario files name. Left in the folder: results.json, report.html,
+figures/*.png, and in runs/<experiment>_<controller>/ the CAN log as BLF and as candump text and the recording of the
+true state: recording.npy has a row every 10 us, ripple_window.npy, where rows were recorded closer than that, every row
+of the window that the ripple is taken from. Figures and pictures are made from every row; `tools/salient run` leaves
+them all.
 """
 
 from __future__ import annotations
@@ -48,6 +51,10 @@ PICTURES = {
     "phase_currents": ("Phase currents over two strokes", "load_step_150"),
 }
 
+KEPT_STEP_US = 10.0
+"""Rows of recording.npy are so far apart or further; a row a microsecond of all runs would be some 100 MB."""
+RIPPLE_WINDOW_FILE = "ripple_window.npy"
+
 _WORKERS = 2
 _CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
@@ -66,6 +73,7 @@ class _Run:
     losses: dict[str, Any]
     log_paths: tuple[Path, Path]
     recording_path: Path
+    """Of every row, until _thin."""
 
     @property
     def controller(self) -> str:
@@ -100,8 +108,9 @@ def _run_and_report(scenarios: Mapping[str, Sequence[Scenario]], out: Path, can:
         results = make_results(_by_experiment(runs, "merits"), _by_experiment(runs, "losses"),
                                _conditions(scenarios))
         pictures = _draw_all(workers, runs, results, out, progress)
+        recordings = [_thin(made) for made in runs]
         write_results(out / "results.json", results)
-        write_report(out / "report.html", results, pictures, _commands(scenarios), _files(runs, out))
+        write_report(out / "report.html", results, pictures, _commands(scenarios), _files(runs, recordings, out))
         progress.step("report.html")
     return results
 
@@ -116,11 +125,13 @@ def summary(results: Mapping[str, Any]) -> str:
     lines = []
     for experiment, merits in results["experiments"].items():
         printed = results["paper"][experiment]
-        lines += ["", f"{experiment:<30}" + "".join(f"{controller:>16}{'printed':>14}" for controller in merits)]
+        heads = (f"{controller:>16}" + f"{'printed':>14}" * (controller in printed) for controller in merits)
+        lines += ["", f"{experiment:<30}" + "".join(heads)]
         for name in next(iter(merits.values())):
-            cells = "".join(f"{words_for(name, of[name]):>16}{printed_words_for(name, printed[controller][name]):>14}"
-                            for controller, of in merits.items())
-            lines.append(f"  {_plain(ROWS[name][0]):<28}{cells}")
+            cells = (f"{words_for(name, of[name]):>16}"
+                     + (f"{printed_words_for(name, printed[controller][name]):>14}" if controller in printed else "")
+                     for controller, of in merits.items())
+            lines.append(f"  {_plain(ROWS[name][0]):<28}{''.join(cells)}")
     return "\n".join(lines[1:])
 
 
@@ -257,18 +268,39 @@ def _commands(scenarios: Mapping[str, Sequence[Scenario]]) -> list[str]:
         "# everything on this page",
         f"tools/salient demo --machine {shlex.quote(one.machine)} --control-rate-hz {one.control_rate_hz}"
         f" --encoder-bits {one.encoder_bits} --seed {one.seed}",
-        "# one experiment, by both controllers",
+        "# one experiment, with every row of its recordings",
         *(f"tools/salient run tools/scenarios/{experiment}.toml" for experiment in scenarios),
     ]
 
 
-def _files(runs: Iterable[_Run], out: Path) -> list[tuple[str, list[tuple[str, str]]]]:
-    words = ("CAN log (BLF)", "CAN log (candump text)", "true state (numpy.load)")
+def _files(runs: Iterable[_Run], recordings: Iterable[list[tuple[str, Path]]],
+           out: Path) -> list[tuple[str, list[tuple[str, str]]]]:
+    """What each run leaves, as write_report wants it. recordings: of each run, from _thin."""
+    logs = ("CAN log (BLF)", "CAN log (candump text)")
     return [("The figures of this page, for scripts", [("results.json", "results.json")])] + [
         (f"{made.experiment} by {made.controller}, on virtual time",
          [(what, path.relative_to(out).as_posix())
-          for what, path in zip(words, (*made.log_paths, made.recording_path), strict=True)])
-        for made in runs]
+          for what, path in (*zip(logs, made.log_paths, strict=True), *kept)])
+        for made, kept in zip(runs, recordings, strict=True)]
+
+
+def _thin(made: _Run) -> list[tuple[str, Path]]:
+    """Leaves of a run's recording a row every KEPT_STEP_US, and all rows of the ripple's window in a file of their own
+    where that has more; says what is in which file."""
+    step_us = made.scenario.record.step_us
+    every = max(1, round(KEPT_STEP_US / step_us))
+    kept = [(f"true state each {every * step_us:g} µs (numpy.load)", made.recording_path)]
+    if every > 1:
+        rows = np.load(made.recording_path)
+        half_step_s = 0.5e-6 * step_us
+        first, end = np.searchsorted(rows["time_s"], (metrics.RIPPLE_WINDOW_S[0] - half_step_s,
+                                                      metrics.RIPPLE_WINDOW_S[1] + half_step_s))
+        window_path = made.recording_path.with_name(RIPPLE_WINDOW_FILE)
+        np.save(window_path, rows[first:end])
+        np.save(made.recording_path, rows[::every])
+        kept.append((f"each {step_us:g} µs from {metrics.RIPPLE_WINDOW_S[0]:g} to {metrics.RIPPLE_WINDOW_S[1]:g} s",
+                     window_path))
+    return kept
 
 
 def _plain(words: str) -> str:

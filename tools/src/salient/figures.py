@@ -30,11 +30,16 @@ CONTROLLER_TITLE = {
     "paper": "Paper: SMC, BP-PID in DITC",
     "salient": "Salient: observer, predictive flux PWM",
 }
-CONTROLLER_COLOUR = {"traditional": "#c4551b", "paper": "#1e62a8", "salient": "#1b7f5c"}
+# Apart by lightness or hue also for colour-blind eyes (test_report.py); everything that draws controllers uses these.
+CONTROLLER_COLOUR = {"traditional": "#c4551b", "paper": "#1e62a8", "salient": "#109a76"}
 PAPER_COLOUR = "#6f6f6f"
 LOAD_COLOUR = "#222222"
 BAND_COLOUR = "#dfe9d8"
 PHASE_COLOUR = ("#7a3fa0", "#12908e", "#d39a12", "#b03a5b")
+
+# A picture is so wide, and wider when its columns would be narrower than their words.
+_WIDTH_IN = 11.0
+_COLUMN_IN = 4.4
 
 # Behind words that may lie on a line.
 _PAPER_WHITE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
@@ -114,7 +119,7 @@ def draw_start(path: Path, recordings: Recordings, ours: Merits, paper: Merits, 
             zoom.set_xlabel("time after the speed command / s")
         _label_rows(axes, "speed / (r/min)", "speed / (r/min)")
 
-    _save(path, draw, height_in=6.0, row_gap=0.24)
+    _save(path, draw, len(recordings), height_in=6.0, row_gap=0.24)
 
 
 def draw_load_step_speed(path: Path, recordings: Recordings, ours: Merits, paper: Merits, step_time_s: float = 0.13,
@@ -148,14 +153,14 @@ def draw_load_step_speed(path: Path, recordings: Recordings, ours: Merits, paper
                 _mark_recovery(axis, mine["recovery_time_s"], to_ms, colour)
             around.set_title(_step_summary(mine), color=colour, fontweight="bold")
             if printed:
-                around.set_title(f"paper's: {_step_summary(printed, short=True)}", loc="right", color=PAPER_COLOUR,
-                                 fontsize=9.5)
+                around.annotate(f"paper's: {_step_summary(printed, short=True)}", (0.97, 0.06),
+                                xycoords="axes fraction", ha="right", color=PAPER_COLOUR, bbox=_PAPER_WHITE)
             first.set_title("the first 10 ms")
         for row in axes[1:]:
             _same_limits(row)
         _label_rows(axes, *["speed / (r/min)"] * 3)
 
-    _save(path, draw, height_in=8.8)
+    _save(path, draw, len(recordings), height_in=8.8)
 
 
 def draw_load_step_torque(path: Path, recordings: Recordings, ours: Merits, paper: Merits, step_time_s: float = 0.13,
@@ -202,12 +207,12 @@ def draw_load_step_torque(path: Path, recordings: Recordings, ours: Merits, pape
             part = _between(recording, highest_s - 0.5e-3, highest_s + 0.5e-3)
             _trace(detail, (part["time_s"] - highest_s) * 1e3, part["torque_Nm"], colour)
             detail.set_xlim(-0.5, 0.5)
-            detail.set_title("1 ms around its highest torque, on a scale of its own")
+            detail.set_title("1 ms at its highest torque, own scale")
             detail.set_xlabel(f"time from {highest_s:.4f} s / ms")
         _same_limits(axes[0])
         _label_rows(axes, "torque / (N m)", "torque / (N m)", "torque / (N m)")
 
-    _save(path, draw, height_in=8.8)
+    _save(path, draw, len(recordings), height_in=8.8)
 
 
 def draw_phase_currents(path: Path, recordings: Recordings, from_s: float = RIPPLE_WINDOW_S[0],
@@ -226,7 +231,7 @@ def draw_phase_currents(path: Path, recordings: Recordings, from_s: float = RIPP
             currents, torque = axes[:, column]
             for number, name in enumerate(_current_fields(recording)):
                 _trace(currents, way_deg, part[name], PHASE_COLOUR[number], label=name[8].upper(), width=1.0)
-            currents.set_title(_letter(column) + _title(controller))
+            currents.set_title(_letter(column) + _title(controller).partition(":")[0])
             currents.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0, ncols=4, handlelength=1.5,
                             columnspacing=1.4)
             _trace(torque, way_deg, part["torque_Nm"], _colour(controller), width=0.8)
@@ -238,7 +243,7 @@ def draw_phase_currents(path: Path, recordings: Recordings, from_s: float = RIPP
             _same_limits(row, from_zero=True)
         _label_rows(axes, "phase current / A", "torque / (N m)")
 
-    _save(path, draw, height_in=5.2, row_gap=0.14)
+    _save(path, draw, len(recordings), height_in=5.2, row_gap=0.14)
 
 
 # --- pieces ---------------------------------------------------------------------------------------------------------
@@ -247,13 +252,14 @@ def _grid(figure: Figure, recordings: Recordings, rows: int, heights: tuple[floa
     return figure.subplots(rows, len(recordings), squeeze=False, gridspec_kw={"height_ratios": heights})
 
 
-def _save(path: Path, draw: Callable[[Figure], None], height_in: float, row_gap: float = 0.45) -> None:
+def _save(path: Path, draw: Callable[[Figure], None], columns: int, height_in: float, row_gap: float = 0.45) -> None:
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=(11.0, height_in), dpi=140)
+        width_in = max(_WIDTH_IN, columns * _COLUMN_IN)
+        figure = Figure(figsize=(width_in, height_in), dpi=140)
         draw(figure)
-        # Margins in inches, so that pictures of different height have the same ones.
-        figure.subplots_adjust(left=0.066, right=0.985, bottom=0.55 / height_in, top=1.0 - 0.35 / height_in,
-                               hspace=row_gap, wspace=0.14)
+        # Margins in inches, so that pictures of different size have the same ones.
+        figure.subplots_adjust(left=0.73 / width_in, right=1.0 - 0.17 / width_in, bottom=0.55 / height_in,
+                               top=1.0 - 0.35 / height_in, hspace=row_gap, wspace=0.14)
         figure.savefig(path, metadata={"Software": None})
 
 
@@ -299,7 +305,7 @@ def _mark_recovery(axis: Axes, recovery_s: float | None, to_ms: float, colour: s
     if recovery_s is None or not 0.0 < recovery_s * 1e3 < to_ms:
         return
     axis.axvline(recovery_s * 1e3, color=colour, linewidth=1.0, linestyle=(0, (4, 2)))
-    near_end = recovery_s * 1e3 > 0.75 * to_ms
+    near_end = recovery_s * 1e3 > 0.6 * to_ms
     axis.annotate("back in the band", (recovery_s * 1e3, 0.92), xycoords=("data", "axes fraction"),
                   xytext=(-4 if near_end else 4, 0), textcoords="offset points", color=colour, fontsize=8.5,
                   ha="right" if near_end else "left")

@@ -162,19 +162,21 @@ def _tile(results: Mapping[str, Any], experiment: str, name: str, words: str) ->
 
 def _table(results: Mapping[str, Any], experiment: str) -> str:
     merits, printed = results["experiments"][experiment], results["paper"].get(experiment, {})
-    heads = "".join(f'<th colspan="2" style="color:{_colour(controller)}">{_name(controller)}'
-                    f"<small>{escape(CONTROLLER_WORDS.get(controller, ''))}</small></th>" for controller in merits)
+    heads = "".join(f'<th colspan="{1 + (controller in printed)}" style="color:{_colour(controller)}">'
+                    f"{_name(controller)}<small>{escape(CONTROLLER_WORDS.get(controller, ''))}</small></th>"
+                    for controller in merits)
+    columns = "".join("<th>here</th>" + "<th class=paper>printed</th>" * (controller in printed)
+                      for controller in merits)
     rows = []
     for name in next(iter(merits.values())):
         words, unit, _, _ = ROWS[name]
-        cells = "".join(f"<td>{_bare(words_for(name, of[name]), unit)}</td><td class=paper>"
-                        + (_bare(printed_words_for(name, printed[controller][name]), unit)
-                           if controller in printed else "–") + "</td>"
+        cells = "".join(f"<td>{_bare(words_for(name, of[name]), unit)}</td>"
+                        + (f"<td class=paper>{_bare(printed_words_for(name, printed[controller][name]), unit)}</td>"
+                           if controller in printed else "")
                         for controller, of in merits.items())
         rows.append(f'<tr><th scope="row">{words}{f", {unit}" if unit else ""}</th>{cells}</tr>')
     return (f"<h3>{escape(EXPERIMENT_NAME.get(experiment, experiment))}</h3>\n<table><thead><tr><th></th>{heads}</tr>"
-            f"<tr><th></th>{'<th>here</th><th class=paper>printed</th>' * len(merits)}</tr></thead>\n<tbody>"
-            + "\n".join(rows) + "</tbody></table>")
+            f"<tr><th></th>{columns}</tr></thead>\n<tbody>" + "\n".join(rows) + "</tbody></table>")
 
 
 def _losses(losses: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
@@ -232,19 +234,27 @@ def _why(results: Mapping[str, Any]) -> str:
     rate_khz = results["conditions"]["control_rate_hz"] / 1000
     ripple = {controller: of["torque_ripple"] for controller, of in results["experiments"]["load_step_150"].items()}
     printed = results["paper"]["load_step_150"]
-    return f"""<p>The traditional controller's <i>K</i><sub>t</sub> is {ripple["traditional"]:.3g} here, and
+    paragraphs = []
+    if "traditional" in ripple:
+        paragraphs.append(f"""The traditional controller's <i>K</i><sub>t</sub> is {ripple["traditional"]:.3g} here, and
 {printed["traditional"]["torque_ripple"]:g} in print. At {rate_khz:g} kHz the switches can change every
 {1000 / rate_khz:g} µs, and what is decided on one sample acts a period later; meanwhile the full supply voltage drives
 the current, and the torque with it, beyond the band. So the ripple of a hysteresis controller is set by its sampling
 rate, not by its band, and falls as the rate rises (<code>--control-rate-hz</code>): at {rate_khz:g} kHz it is far from
 the paper's figures whatever the tuning. They are those of a simulation with a very small step, not of a drive with an
-interrupt.</p>
-<p>What a real sampling rate can use of the paper's idea is the BP-PID's output as the duty of the active phase, which
-grades the voltage within a period. That is the controller called paper here; its <i>K</i><sub>t</sub> is
-{ripple["paper"]:.3g}.</p>
-<p>The dip after a load step depends on the rotor angle at the step and on the delay until the voltage answers. The
-paper's 0.4 r/min needs a lucky angle and a load that is known beforehand; a dip at one angle, the one here included, is
-one sample and no property of the drive.</p>"""
+interrupt.""")
+    if "paper" in ripple:
+        paragraphs.append(f"""What a real sampling rate can use of the paper's idea is the BP-PID's output as the duty
+of the active phase, which grades the voltage within a period. That is the controller called paper here; its
+<i>K</i><sub>t</sub> is {ripple["paper"]:.3g}.""")
+    if "salient" in ripple:
+        paragraphs.append(f"""The controller called salient shares the torque out among the phases along a curve that
+the voltage can follow, and gives each phase the duty that takes its flux linkage to its share within a period; the
+BP-PID's output is a trim on top. Its <i>K</i><sub>t</sub> is {ripple["salient"]:.3g}.""")
+    paragraphs.append("""The dip after a load step depends on the rotor angle at the step and on the delay until the
+voltage answers. The paper's 0.4 r/min needs a lucky angle and a load that is known beforehand; a dip at one angle, the
+one here included, is one sample and no property of the drive.""")
+    return "\n".join(f"<p>{paragraph}</p>" for paragraph in paragraphs)
 
 
 def _conditions(conditions: Mapping[str, Any]) -> str:
