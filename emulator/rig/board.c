@@ -12,11 +12,13 @@ void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *b
 }
 
 void board_start_period(board_t *board, bool busy) {
+    hal_encoder_sample_t encoder;
+    sensors_sample_encoder(board->sensors, board->plant, &encoder);
     if (busy) {
         ++board->missed_interrupts;
     } else {
         sensors_sample_adc(board->sensors, board->plant, &board->adc);
-        sensors_sample_encoder(board->sensors, board->plant, &board->encoder);
+        board->encoder = encoder;
         board->active = board->buffered;
     }
     plant_set_switches(board->plant, &board->active, board->period_ticks);
@@ -32,6 +34,14 @@ void board_deliver(board_t *board, const hal_can_frame_t *frame) {
 
 void board_pwm_start(board_t *board, uint16_t period_ticks) {
     board->period_ticks = period_ticks;
+}
+
+void board_pwm_write(board_t *board, const hal_pwm_compare_t *compare) {
+    board->buffered = *compare;
+    if (board->immediate_pwm) {
+        board->active = *compare;
+        plant_set_switches(board->plant, compare, board->period_ticks);
+    }
 }
 
 void board_pwm_open_all(board_t *board) {

@@ -30,6 +30,7 @@ typedef struct {
     unsigned encoder_bits;        /* 8..32 */
 
     uint16_t period_ticks; /* 0 until the timer is started */
+    bool immediate_pwm;    /* a setting: see board_pwm_write; false after board_init */
     hal_pwm_compare_t active, buffered;
     uint32_t missed_interrupts; /* since last read */
 
@@ -47,14 +48,18 @@ typedef struct {
 void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus);
 
 /* For the rig: a control period starts now, the plant is there. Latches the sensors; the buffered compare values
- * become active unless the interrupt is still running (`busy`), then the interrupt is lost and counted. */
+ * become active unless the interrupt is still running (`busy`), then the interrupt is lost and counted, and what the
+ * interrupt reads stays. */
 void board_start_period(board_t *board, bool busy);
 
 /* For the rig: a frame of another node is complete. */
 void board_deliver(board_t *board, const hal_can_frame_t *frame);
 
-/* For the port; each is the hal_* function of the same name. */
+/* For the port; each is the hal_* function of the same name. With `immediate_pwm` the compare values act in the present
+ * period, at whose very start the control interrupt runs, and in the next: a converter without the delay of a period,
+ * which no timer is. */
 void board_pwm_start(board_t *board, uint16_t period_ticks);
+void board_pwm_write(board_t *board, const hal_pwm_compare_t *compare);
 void board_pwm_open_all(board_t *board);
 uint32_t board_pwm_missed_interrupts(board_t *board);
 bool board_can_receive(board_t *board, hal_can_frame_t *frame);

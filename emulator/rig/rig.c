@@ -15,8 +15,10 @@ static bool take(void *context, uint32_t client, const transport_frame_t *frame)
 void rig_init(rig_t *rig, const rig_config_t *config) {
     plant_init(&rig->plant, config->machine, config->initial_angle_rad);
     sensors_init(&rig->sensors, &config->machine->sensors, config->encoder_bits, config->adc_bits, config->seed);
+    rig->sensors.encoder_edges = config->encoder_edges;
     can_bus_init(&rig->bus, config->bit_rate);
     board_init(&rig->board, &rig->plant, &rig->sensors, &rig->bus);
+    rig->board.immediate_pwm = config->immediate_pwm;
     rig->config = *config;
     rig->config.transport->full = config->pacing.kind == PACING_TIMED ? TRANSPORT_DROP : TRANSPORT_WAIT;
     rig->firmware = (rig_firmware_t){0};

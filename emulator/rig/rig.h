@@ -50,6 +50,8 @@ typedef struct {
     double initial_angle_rad;
     unsigned encoder_bits; /* 8..32, 0 means ideal */
     unsigned adc_bits;     /* 12..16 */
+    bool encoder_edges;    /* the board captures them */
+    bool immediate_pwm;    /* compare values act when they are written, not in the next period */
     uint64_t seed;
     uint32_t bit_rate;
     pacing_t pacing;

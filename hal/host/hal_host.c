@@ -44,7 +44,7 @@ void hal_pwm_start(hal_t *hal, uint16_t period_ticks) {
 
 void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare) {
     require(hal, true, __func__);
-    hal->board->buffered = *compare;
+    board_pwm_write(hal->board, compare);
 }
 
 void hal_pwm_open_all(hal_t *hal) {

@@ -31,10 +31,10 @@ static drive_t drive;
 static FILE *switches_file;
 
 static void control_interrupt(void *context) {
+    drive_control_interrupt(context);
     if (switches_file) {
         fwrite(&rig.board.active, sizeof rig.board.active, 1, switches_file);
     }
-    drive_control_interrupt(context);
 }
 static void background(void *context) {
     drive_background(context);
@@ -146,6 +146,8 @@ int main(int argc, char *argv[]) {
         .initial_angle_rad = options.initial_angle_deg * RAD_PER_DEG,
         .encoder_bits = options.encoder_bits,
         .adc_bits = options.adc_bits,
+        .encoder_edges = options.encoder_edges,
+        .immediate_pwm = options.immediate_pwm,
         .seed = options.seed,
         .bit_rate = options.bit_rate,
         .pacing = options.pacing,

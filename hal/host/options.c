@@ -18,9 +18,11 @@ static const char usage[] =
     "usage: %s --can unix:PATH|socketcan:INTERFACE [option...]\n"
     "  --pace lockstep|realtime|xN|free   how virtual time moves, xN: N times real time (default realtime)\n"
     "  --controller traditional|paper     (default paper)\n"
-    "  --control-rate-hz N                20000, 40000, 50000 or 100000 (default 40000)\n"
+    "  --control-rate-hz N                20000, 40000, 50000, 100000 or 1000000 (default 40000)\n"
     "  --encoder-bits N                   8..24, or 0 for an ideal encoder (default 17)\n"
+    "  --encoder-edges                    the board captures the encoder's edges\n"
     "  --adc-bits N                       12..16 (default 12)\n"
+    "  --immediate-pwm                    compare values act at once, not in the next period: no converter does that\n"
     "  --seed N                           of all noise (default 1)\n"
     "  --initial-angle-deg X              rotor angle at the start, -360..360 (default 0)\n"
     "  --record FILE.npy                  records the true state\n"
@@ -68,7 +70,9 @@ enum {
     OPTION_CONTROLLER,
     OPTION_CONTROL_RATE,
     OPTION_ENCODER_BITS,
+    OPTION_ENCODER_EDGES,
     OPTION_ADC_BITS,
+    OPTION_IMMEDIATE_PWM,
     OPTION_SEED,
     OPTION_INITIAL_ANGLE,
     OPTION_RECORD,
@@ -87,6 +91,8 @@ static const struct option long_options[] = {
     {"controller", required_argument, NULL, OPTION_CONTROLLER},
     {"control-rate-hz", required_argument, NULL, OPTION_CONTROL_RATE},
     {"encoder-bits", required_argument, NULL, OPTION_ENCODER_BITS},
+    {"encoder-edges", no_argument, NULL, OPTION_ENCODER_EDGES},
+    {"immediate-pwm", no_argument, NULL, OPTION_IMMEDIATE_PWM},
     {"adc-bits", required_argument, NULL, OPTION_ADC_BITS},
     {"seed", required_argument, NULL, OPTION_SEED},
     {"initial-angle-deg", required_argument, NULL, OPTION_INITIAL_ANGLE},
@@ -125,8 +131,8 @@ static options_result_t take(options_t *options, int option, const char *text) {
         return mistake("--controller %s: allowed are traditional and paper", text);
     case OPTION_CONTROL_RATE:
         if (!read_integer(text, UINT32_MAX, &integer) ||
-            (integer != 20000 && integer != 40000 && integer != 50000 && integer != 100000)) {
-            return mistake("--control-rate-hz %s: allowed are 20000, 40000, 50000 and 100000", text);
+            (integer != 20000 && integer != 40000 && integer != 50000 && integer != 100000 && integer != 1000000)) {
+            return mistake("--control-rate-hz %s: allowed are 20000, 40000, 50000, 100000 and 1000000", text);
         }
         options->control_rate_hz = (uint32_t)integer;
         break;
@@ -135,6 +141,12 @@ static options_result_t take(options_t *options, int option, const char *text) {
             return mistake("--encoder-bits %s: allowed are 8 to 24, and 0 for an ideal encoder", text);
         }
         options->encoder_bits = (unsigned)integer;
+        break;
+    case OPTION_ENCODER_EDGES:
+        options->encoder_edges = true;
+        break;
+    case OPTION_IMMEDIATE_PWM:
+        options->immediate_pwm = true;
         break;
     case OPTION_ADC_BITS:
         if (!read_integer(text, HAL_ADC_BITS_MAX, &integer) || integer < HAL_ADC_BITS_MIN) {

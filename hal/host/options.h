@@ -16,6 +16,7 @@ typedef struct {
     uint32_t control_rate_hz;
     unsigned encoder_bits; /* 8..24, 0 is ideal */
     unsigned adc_bits;     /* 12..16 */
+    bool encoder_edges, immediate_pwm;
     uint64_t seed;
     double initial_angle_deg;
     const char *record; /* NULL: no recording */

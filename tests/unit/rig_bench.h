@@ -106,6 +106,7 @@ class BusClient {
 struct StandInFirmware {
     board_t *board = nullptr;
     uint32_t interrupts = 0, backgrounds = 0, missed = 0;
+    uint16_t lower = 2500; // what it writes for phase 1
     std::vector<uint64_t> interrupt_times_ns, background_times_ns;
     std::vector<hal_can_frame_t> received;
 
@@ -114,10 +115,11 @@ struct StandInFirmware {
         ++self->interrupts;
         self->missed += board_pwm_missed_interrupts(self->board);
         self->interrupt_times_ns.push_back(self->board->time_ns);
-        std::memset(&self->board->buffered, 0, sizeof self->board->buffered);
+        hal_pwm_compare_t compare{};
         bool on = self->board->adc.phase_current_counts[1] < 512;
-        self->board->buffered.upper[1] = on ? 1700 : 0;
-        self->board->buffered.lower[1] = 2500;
+        compare.upper[1] = on ? 1700 : 0;
+        compare.lower[1] = self->lower;
+        board_pwm_write(self->board, &compare);
     }
 
     static void background(void *context) {

@@ -258,4 +258,245 @@ TEST_F(Sensors, JumpedEncoderIsHalfATurnOff) {
     EXPECT_EQ(encoder_counts(0.75), UINT32_C(0x40000000));
 }
 
+// --- Edges of the encoder ---
+
+constexpr uint64_t PERIOD_NS = 25000;
+constexpr uint16_t TICKS = 2500;
+
+// A machine that is latched each period, and what its encoder's edges should be: the same plant once more, advanced by
+// nanoseconds.
+class Edges : public testing::Test {
+  protected:
+    Edges() : machine(machine_of(MAGNETICS_SATURATING)) { start(17, 0.1, 0.0); }
+
+    void start(unsigned bits, double angle_rad, double speed_rad_s) {
+        plant_init(&plant, &machine, angle_rad);
+        plant.speed_rad_s = speed_rad_s;
+        sensors_init(&sensors, &machine.sensors, bits, 12, 1);
+        sensors.encoder_edges = true;
+        counts_per_turn = std::ldexp(1.0, int(bits));
+        worst_rad = 0.0;
+        edges = 0;
+        latch();
+    }
+
+    void latch() { sensors_sample_encoder(&sensors, &plant, &sample); }
+
+    double read_rad(const plant_t &at) const {
+        return at.rotor_angle_rad +
+               sensors.errors.encoder_eccentricity_deg * M_PI / 180.0 * std::sin(at.rotor_angle_rad) +
+               sensors.encoder_offset_deg * M_PI / 180.0;
+    }
+
+    // One period, with phases switched on for so many ticks. A new edge is compared with where the plant was then.
+    void period(std::vector<uint16_t> ticks = {}, uint64_t length_ns = PERIOD_NS) {
+        hal_pwm_compare_t compare{};
+        for (size_t phase = 0; phase < ticks.size(); phase++) {
+            compare.upper[phase] = ticks[phase];
+            compare.lower[phase] = TICKS;
+        }
+        plant_set_switches(&plant, &compare, TICKS);
+        plant_t twin = plant;
+        const uint64_t before_ns = plant.time_ns;
+        plant_advance(&plant, before_ns + length_ns);
+        latch();
+        if (!sample.edge_known || sensors.edge.time_ns <= double(before_ns)) {
+            return;
+        }
+        edges++;
+        const double edge_ns = sensors.edge.time_ns, whole_ns = std::floor(edge_ns);
+        plant_advance(&twin, uint64_t(whole_ns));
+        const double angle_rad = read_rad(twin) + twin.speed_rad_s * (edge_ns - whole_ns) * 1e-9;
+        const double boundary = sample.counts + (sample.edge_forward ? 0.0 : 1.0);
+        const double away_rad = std::remainder(angle_rad - boundary / counts_per_turn * 2.0 * M_PI, 2.0 * M_PI);
+        worst_rad = std::max(worst_rad, std::fabs(away_rad));
+        ASSERT_NEAR(sample.edge_age_ticks, (double(plant.time_ns) - edge_ns) / HAL_PWM_TICK_NS, 0.5 + 1e-6);
+        ASSERT_EQ(sample.edge_forward, twin.speed_rad_s > 0.0);
+    }
+
+    machine_t machine;
+    plant_t plant;
+    sensors_t sensors;
+    hal_encoder_sample_t sample;
+    double counts_per_turn = 0.0, worst_rad = 0.0;
+    unsigned edges = 0;
+};
+
+TEST_F(Edges, AreUnknownUntilTheFirstOneAndWithoutCapture) {
+    for (unsigned k = 0; k < 10; k++) {
+        period();
+        EXPECT_FALSE(sample.edge_known);
+        EXPECT_EQ(sample.edge_age_ticks, 0u);
+    }
+    start(17, 0.1, 10.0);
+    period();
+    EXPECT_TRUE(sample.edge_known);
+    sensors_init(&sensors, &machine.sensors, 17, 12, 1);
+    EXPECT_FALSE(sensors.encoder_edges);
+    for (unsigned k = 0; k < 10; k++) {
+        period();
+        EXPECT_FALSE(sample.edge_known);
+    }
+}
+
+TEST_F(Edges, AreWithinAHundredthOfAMicroradianUnderSwitchingAndJumpsOfTheLoad) {
+    machine.inertia_kg_m2 = 0.01; // half of the motor's
+    for (double held_rad_s : {314.0, -314.0, 3.0, -3.0}) {
+        const double direction = std::copysign(1.0, held_rad_s);
+        start(17, 0.1, held_rad_s);
+        for (unsigned k = 0; k < 4000; k++) {
+            // A load that jumps, on a dynamometer that holds the speed.
+            plant.load_torque_Nm = (k / 7 % 2 == 0 ? -8.0 : 8.0) + 10.0 * (plant.speed_rad_s - held_rad_s);
+            // Each phase for a part of its pitch, with what duty it may.
+            std::vector<uint16_t> ticks;
+            for (unsigned phase = 0; phase < 3; phase++) {
+                // Torque forwards is from half a pitch to a whole one.
+                const double pitches = direction * plant_phase_angle_rad(&plant, phase) / (M_PI / 2.0);
+                const double part = pitches - std::floor(pitches);
+                const bool on = part > 0.45 && part < 0.8;
+                ticks.push_back(on && plant.current_A[phase] < 60.0 ? uint16_t(977 + 131 * (k % 11)) : 0);
+            }
+            period(ticks);
+        }
+        EXPECT_NEAR(plant.speed_rad_s, held_rad_s, 10.0);
+        EXPECT_GT(edges, 3000u);
+        EXPECT_LT(worst_rad, 0.01e-6);
+        EXPECT_GT(worst_rad, 1e-13) << "something was compared";
+    }
+}
+
+TEST_F(Edges, AreAsExactWhereOneComesInSeveralPeriods) {
+    machine.friction_Nm_s = 0.0;
+    start(17, 0.1, 0.02); // 0.19 r/min: a count in 96 periods
+    unsigned aged = 0;
+    for (unsigned k = 0; k < 8000; k++) {
+        const uint32_t before_ticks = sample.edge_age_ticks;
+        const bool known = sample.edge_known;
+        const unsigned seen = edges;
+        period();
+        if (known && edges == seen) {
+            aged++;
+            ASSERT_EQ(sample.edge_age_ticks, before_ticks + PERIOD_NS / HAL_PWM_TICK_NS);
+        }
+    }
+    EXPECT_NEAR(edges, 8000 * 25e-6 * 0.02 / (2.0 * M_PI) * counts_per_turn, 1.0);
+    EXPECT_GT(aged, 7000u);
+    EXPECT_LT(worst_rad, 0.1e-6);
+}
+
+TEST_F(Edges, AreOfTheReadingWithItsErrors) {
+    start(17, 0.1, 100.0);
+    sensors.errors.encoder_eccentricity_deg = 2.0;
+    sensors.encoder_offset_deg = -1.5;
+    for (unsigned k = 0; k < 4000; k++) {
+        period();
+    }
+    EXPECT_GT(edges, 3990u);
+    EXPECT_LT(worst_rad, 0.1e-6);
+}
+
+TEST_F(Edges, TurnRoundWithTheRotor) {
+    // The load swings the shaft to and fro over a few counts, at last over none.
+    machine.friction_Nm_s = 0.0;
+    const double count_rad = 2.0 * M_PI / 131072.0;
+    unsigned forward = 0, backward = 0;
+    for (double amplitude_counts : {3.2, 0.6, 0.05}) {
+        // Angle about a boundary, half a swing from there; a period of the swing is 160 control periods.
+        const double swing_rad_s = 2.0 * M_PI / (160 * 25e-6);
+        start(17, (1000.0 - amplitude_counts) * count_rad, 0.0);
+        for (unsigned k = 0; k < 1600; k++) {
+            plant.load_torque_Nm =
+                machine.inertia_kg_m2 * swing_rad_s * swing_rad_s * (plant.rotor_angle_rad - 1000.0 * count_rad);
+            const unsigned seen = edges;
+            period();
+            if (edges > seen) {
+                (sample.edge_forward ? forward : backward)++;
+            }
+        }
+        EXPECT_LT(worst_rad, 0.1e-6);
+        EXPECT_GE(edges, 19u) << amplitude_counts;
+    }
+    EXPECT_GT(forward, 40u);
+    EXPECT_GT(backward, 40u);
+}
+
+TEST_F(Edges, OfARotorThatTurnsBackWithinAPeriodAreSeen) {
+    // 0.3 counts before a boundary, over it and back within one long period.
+    const double count_rad = 2.0 * M_PI / 131072.0;
+    machine.friction_Nm_s = 0.0;
+    start(17, 999.9 * count_rad, 0.0);
+    plant.speed_rad_s = 1.0;
+    plant.load_torque_Nm = machine.inertia_kg_m2 * 2.0 / 50e-6; // back there after 50 us, 0.52 counts on at most
+    latch();
+    EXPECT_EQ(sample.counts, 999u);
+    period({}, 50000);
+    EXPECT_EQ(sample.counts, 999u);
+    EXPECT_TRUE(sample.edge_known);
+    EXPECT_FALSE(sample.edge_forward) << "the last one went backwards";
+    EXPECT_EQ(edges, 1u);
+    EXPECT_LT(worst_rad, 0.1e-6);
+}
+
+TEST_F(Edges, AgeIsHeldAtItsLargestValue) {
+    start(17, 0.1, 10.0);
+    period();
+    ASSERT_TRUE(sample.edge_known);
+    plant.speed_rad_s = 0.0;
+    plant.time_ns += UINT64_C(0x7FFFFFFE) * HAL_PWM_TICK_NS - sample.edge_age_ticks * HAL_PWM_TICK_NS;
+    latch();
+    EXPECT_NEAR(sample.edge_age_ticks, 0x7FFFFFFE, 1);
+    plant.time_ns += UINT64_C(100000000000);
+    latch();
+    EXPECT_EQ(sample.edge_age_ticks, 0x7FFFFFFFu);
+    EXPECT_TRUE(sample.edge_known);
+}
+
+TEST_F(Edges, OfAFrozenEncoderDoNotComeAndWhatMovedMeanwhileIsForgotten) {
+    start(17, 0.1, 100.0);
+    period();
+    const uint32_t counts = sample.counts, age_ticks = sample.edge_age_ticks;
+    sensors.encoder_fault = SENSORS_ENCODER_FROZEN;
+    for (unsigned k = 1; k <= 10; k++) {
+        period();
+        EXPECT_EQ(sample.counts, counts);
+        EXPECT_TRUE(sample.edge_known);
+        EXPECT_EQ(sample.edge_age_ticks, age_ticks + k * PERIOD_NS / HAL_PWM_TICK_NS);
+    }
+    sensors.encoder_fault = SENSORS_ENCODER_HEALTHY;
+    plant_advance(&plant, plant.time_ns + PERIOD_NS);
+    latch();
+    EXPECT_FALSE(sample.edge_known);
+    period();
+    EXPECT_TRUE(sample.edge_known);
+    EXPECT_LT(worst_rad, 0.1e-6);
+}
+
+TEST_F(Edges, AreNotMadeByAChangeOfTheReading) {
+    start(17, 0.1, 10.0);
+    period();
+    ASSERT_TRUE(sample.edge_known);
+    plant.speed_rad_s = 0.0;
+    latch();
+    ASSERT_TRUE(sample.edge_known);
+    sensors.encoder_offset_deg = 0.1;
+    latch();
+    EXPECT_FALSE(sample.edge_known);
+    plant.speed_rad_s = 10.0;
+    period();
+    EXPECT_TRUE(sample.edge_known);
+    const uint32_t counts = sample.counts, age_ticks = sample.edge_age_ticks;
+    sensors.encoder_fault = SENSORS_ENCODER_JUMP;
+    latch();
+    EXPECT_EQ(sample.counts, counts + 65536u);
+    EXPECT_TRUE(sample.edge_known) << "the boundaries jump too";
+    EXPECT_EQ(sample.edge_age_ticks, age_ticks);
+}
+
+TEST_F(Edges, OfAnIdealEncoderAreAtTheLatch) {
+    start(32, 0.1, 10.0);
+    period();
+    EXPECT_TRUE(sample.edge_known);
+    EXPECT_LE(sample.edge_age_ticks, 1u);
+}
+
 } // namespace

@@ -247,6 +247,21 @@ TEST_F(RigQuantities, InterruptBeyondItsPeriodLosesInterruptsAndKeepsCompares) {
     EXPECT_EQ(bench.firmware.missed, 4u) << "the one that was running when the quantity changed";
 }
 
+TEST_F(RigQuantities, ComparesActInTheNextPeriodOrAtOnceOnABoardWithoutThatDelay) {
+    // The stand-in firmware has the lower switch of phase 1 on for whole periods.
+    bench.run_to(*client, 49 * 1000);
+    EXPECT_EQ(bench.rig->plant.switches.lower, 0) << "written in the period that starts at 25 us";
+    bench.run_to(*client, 51 * 1000);
+    EXPECT_EQ(bench.rig->plant.switches.lower, 2);
+    bench.rig->board.immediate_pwm = true;
+    bench.firmware.lower = 0;
+    bench.run_to(*client, 76 * 1000);
+    EXPECT_EQ(bench.rig->plant.switches.lower, 0) << "written at 75 us";
+    bench.firmware.lower = 2500;
+    bench.run_to(*client, 101 * 1000);
+    EXPECT_EQ(bench.rig->plant.switches.lower, 2);
+}
+
 TEST_F(RigQuantities, InterruptOfExactlyAPeriodStarvesTheBackground) {
     EXPECT_EQ(set(4, 2500), DONE);
     bench.run_to(*client, MS);

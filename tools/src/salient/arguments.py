@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import NoReturn
 
 CONTROLLERS = ("traditional", "paper")
-CONTROL_RATES_HZ = (20_000, 40_000, 50_000, 100_000)
+CONTROL_RATES_HZ = (20_000, 40_000, 50_000, 100_000, 1_000_000)
 ENCODER_BITS = (0, *range(8, 25))
+ADC_BITS = (12, 13, 14, 15, 16)
 LOG_SUFFIXES = (".blf", ".log")
 
 
@@ -57,9 +58,13 @@ def make_parser() -> argparse.ArgumentParser:
     sim.add_argument("--pace", type=_pace, default="realtime", help="lockstep, realtime (default), xN or free")
     sim.add_argument("--seed", type=_seed, default=1, metavar="N", help="default 1")
     sim.add_argument("--control-rate-hz", type=_one_of(CONTROL_RATES_HZ), default=40_000, metavar="N",
-                     help="20000, 40000 (default), 50000 or 100000")
+                     help="20000, 40000 (default), 50000, 100000 or 1000000")
     sim.add_argument("--encoder-bits", type=_one_of(ENCODER_BITS), default=17, metavar="N",
                      help="8 to 24, default 17; 0 is ideal")
+    sim.add_argument("--encoder-edges", action="store_true", help="the board captures the encoder's edges")
+    sim.add_argument("--adc-bits", type=_one_of(ADC_BITS), default=12, metavar="N", help="12 (default) to 16")
+    sim.add_argument("--immediate-pwm", action="store_true",
+                     help="duties act at once, not in the next control period, as no converter does")
     sim.add_argument("--initial-angle-deg", type=float, default=0.0, metavar="X", help="-360 to 360, default 0")
     sim.add_argument("--bit-rate", type=int, default=1_000_000, metavar="N", help="of the bus, default 1000000")
 

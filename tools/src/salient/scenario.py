@@ -7,6 +7,9 @@
     initial_angle_deg = 0.0
     control_rate_hz = 40000
     encoder_bits = 17                       # 0: ideal
+    encoder_edges = false                   # true: the board captures the encoder's edges
+    adc_bits = 12
+    immediate_pwm = false                   # true: duties act at once, not in the next period
 
     [parameters]                            # the drive's parameters by name, in their units
     torque_max_Nm = 19.1
@@ -39,7 +42,7 @@ from typing import Any
 import can
 import numpy as np
 
-from salient.arguments import CONTROL_RATES_HZ, CONTROLLERS, ENCODER_BITS
+from salient.arguments import ADC_BITS, CONTROL_RATES_HZ, CONTROLLERS, ENCODER_BITS
 from salient.bench import Bench
 from salient.drive import DriveError, write_request
 from salient.errors import UsageError
@@ -87,6 +90,9 @@ class Scenario:
     initial_angle_deg: float = 0.0
     control_rate_hz: int = 40_000
     encoder_bits: int = 17
+    encoder_edges: bool = False
+    adc_bits: int = 12
+    immediate_pwm: bool = False
     parameters: dict[str, float] = field(default_factory=dict)
     speed: tuple[SpeedStep, ...] = ()
     load: tuple[LoadStep, ...] = ()
@@ -162,6 +168,9 @@ def _simulator_options(scenario: Scenario, recording_path: Path | None, build: s
         controller=scenario.controller,
         control_rate_hz=scenario.control_rate_hz,
         encoder_bits=scenario.encoder_bits,
+        encoder_edges=scenario.encoder_edges,
+        adc_bits=scenario.adc_bits,
+        immediate_pwm=scenario.immediate_pwm,
         seed=scenario.seed,
         initial_angle_deg=scenario.initial_angle_deg,
         record=recording_path,
@@ -250,7 +259,7 @@ _STEPS: dict[str, dict[str, tuple[float, float]]] = {
 }
 _RECORD = {"step_us": (0.1, 1e6), "from_s": (0.0, 3600.0)}
 _TOP = ("machine", "controllers", "duration_s", "seed", "initial_angle_deg", "control_rate_hz", "encoder_bits",
-        "parameters", "speed", "load", "record")  # fmt: skip
+        "encoder_edges", "adc_bits", "immediate_pwm", "parameters", "speed", "load", "record")  # fmt: skip
 
 
 def load_scenarios(path: Path) -> list[Scenario]:
@@ -284,6 +293,9 @@ def load_scenarios(path: Path) -> list[Scenario]:
         "initial_angle_deg": reader.number("initial_angle_deg", data.get("initial_angle_deg", 0.0), -360.0, 360.0),
         "control_rate_hz": reader.one_of("control_rate_hz", data.get("control_rate_hz", 40_000), CONTROL_RATES_HZ),
         "encoder_bits": reader.one_of("encoder_bits", data.get("encoder_bits", 17), ENCODER_BITS),
+        "encoder_edges": reader.switch("encoder_edges", data.get("encoder_edges", False)),
+        "adc_bits": reader.one_of("adc_bits", data.get("adc_bits", 12), ADC_BITS),
+        "immediate_pwm": reader.switch("immediate_pwm", data.get("immediate_pwm", False)),
         "parameters": {key: reader.number(f"parameters.{key}", value) for key, value in parameters.items()},
         "speed": tuple(SpeedStep(**step) for step in reader.steps("speed", data.get("speed", []))),
         "load": tuple(LoadStep(**step) for step in reader.steps("load", data.get("load", []))),
@@ -320,6 +332,11 @@ class _Reader:
     def whole(self, key: str, value: Any, low: int, high: int) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             raise UsageError(f"{self._path}: {key}: {value!r} is not a whole number from {low} to {high}")
+        return value
+
+    def switch(self, key: str, value: Any) -> bool:
+        if not isinstance(value, bool):
+            raise UsageError(f"{self._path}: {key}: {value!r} is not true or false")
         return value
 
     def one_of(self, key: str, value: Any, allowed: tuple) -> Any:

@@ -29,7 +29,9 @@ class SimulatorError(Exception):
 class SimulatorOptions:
     """What a drive and its bench are started with; the executable checks the values.
 
-    machine: a shipped machine's name or a machine file's path. encoder_bits 0: ideal. record: file for the true state
+    machine: a shipped machine's name or a machine file's path. encoder_bits 0: ideal. encoder_edges: the board captures
+    the encoder's edges. adc_bits: 12..16. immediate_pwm: what the control writes acts at once, as with no converter
+    there is; it is for the conditions of simulations. record: file for the true state
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
     period. build: host or sanitize.
     """
@@ -38,6 +40,9 @@ class SimulatorOptions:
     controller: str = "traditional"
     control_rate_hz: int = 40_000
     encoder_bits: int = 17
+    encoder_edges: bool = False
+    adc_bits: int = 12
+    immediate_pwm: bool = False
     seed: int = 1
     initial_angle_deg: float = 0.0
     pace: str = "lockstep"
@@ -55,7 +60,12 @@ class SimulatorOptions:
             "--controller", self.controller, "--control-rate-hz", str(self.control_rate_hz),
             "--encoder-bits", str(self.encoder_bits), "--seed", str(self.seed),
             "--initial-angle-deg", f"{self.initial_angle_deg:.17g}", "--bit-rate", str(self.bit_rate),
+            "--adc-bits", str(self.adc_bits),
         ]  # fmt: skip
+        if self.encoder_edges:
+            line.append("--encoder-edges")
+        if self.immediate_pwm:
+            line.append("--immediate-pwm")
         if self.record is not None:
             line += ["--record", str(self.record), "--record-step-ns", str(self.record_step_ns)]
             line += ["--record-from-us", str(self.record_from_us)]
