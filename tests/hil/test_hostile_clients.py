@@ -36,7 +36,7 @@ ATTACKS = {
     + [changed(GOOD, data=bytes(GOOD.data) + b"\0")],
     "wrong_checksum": [changed(GOOD, data=bytes(b ^ (1 << i % 8) if i == j else b for i, b in enumerate(GOOD.data)))
                        for j in range(7)],
-    "wrong_counter": [command(3000.0)],
+    "wrong_counter": [command(3000.0), command(-3000.0, counter=100)],
     "unknown_frame": [
         can.Message(arbitration_id=0x001, is_extended_id=False, data=bytes(8)),
         can.Message(arbitration_id=COMMAND_ID, is_extended_id=True, data=GOOD.data),

@@ -18,7 +18,7 @@ CONTROLLER_NAME = {"traditional": "Traditional", "paper": "Paper", "salient": "S
 CONTROLLER_WORDS = {
     "traditional": "PI speed control and three-level hysteresis DITC",
     "paper": "sliding mode speed control, BP-PID duty in DITC",
-    "salient": "observer, sliding mode, torque sharing, predictive flux PWM with BP-PID trim",
+    "salient": "sliding mode, torque sharing, predictive flux PWM, BP-PID trim",
 }
 EXPERIMENT_NAME = {
     "start_600": "Start to 600 r/min, no load",
