@@ -110,6 +110,12 @@ def _bench(options: argparse.Namespace) -> int:
     return run(options.runs, options.json)
 
 
+def _compare(options: argparse.Namespace) -> int:
+    from salient.compare.command import run
+
+    return run(options)
+
+
 def _machine(options: argparse.Namespace) -> int:
     from salient.machine_view import run
 
@@ -124,6 +130,7 @@ _COMMANDS = {
     "log": _log,
     "monitor": _monitor,
     "bench": _bench,
+    "compare": _compare,
     "machine": _machine,
 }
 

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
+from salient.compare.options import add_options as add_compare_options
+
 CONTROLLERS = ("traditional", "paper")
 CONTROL_RATES_HZ = (20_000, 40_000, 50_000, 100_000, 1_000_000)
 ENCODER_BITS = (0, *range(8, 25))
@@ -86,6 +88,8 @@ def make_parser() -> argparse.ArgumentParser:
     bench = command("bench", "the figures of the README: speed, also beside SciPy and ngspice; worth of the network")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     bench.add_argument("--runs", type=int, default=5, metavar="N", help="runs of each kind, default 5")
+
+    add_compare_options(command("compare", "the controllers beside each other, what is wanted, and an earlier run"))
 
     machine = command("machine", "check a machine file, say what is in it, draw its magnetics")
     machine.add_argument("machine", metavar="NAME|FILE")

@@ -14,6 +14,10 @@ Definitions
     torque ripple K_t = (T_max - T_min) / T_mean, equation (28) of the paper, over every sample of RIPPLE_WINDOW_S;
                   the samples must be 1 us apart or closer, because coarser ones can fall into step with the switching
                   and hide the ripple
+    speed error   farthest that any sample of a window is from the reference, in percent of it
+    strongest line  of the torque's spectrum over a window, below SPECTRUM_TO_HZ and away from the strokes' harmonics:
+                  amplitude in percent of the mean torque. A steady drive repeats itself with every stroke, so what is
+                  left is noise, or a limit cycle
     mean powers   differences of the emulator's energies (fields `energy_..._J`) over a window, by its length. They
                   close: input = copper + converter + friction + output + stored
         input     from the DC link into the half bridges, net of what they give back
@@ -39,6 +43,10 @@ from salient.machine import Machine
 BAND = 0.005
 RIPPLE_WINDOW_S = (0.3, 0.4)
 RIPPLE_STEP_MAX_S = 1e-6
+SPECTRUM_TO_HZ = 2000.0
+# Means over so long are what the spectrum is of: whole periods of every control rate, so the switching is not in them.
+SPECTRUM_STEP_S = 100e-6
+_WINDOW_BINS = 3  # a line's width under a Hann window, to either side
 # Both ends are ends of a control period at every control rate, where the recorded energies are exact (recorder.h).
 LOSS_WINDOW_S = RIPPLE_WINDOW_S
 
@@ -117,6 +125,65 @@ def torque_metrics(time_s: np.ndarray, torque_Nm: np.ndarray, window_s: tuple[fl
         "torque_mean_Nm": mean_Nm,
         "torque_ripple": (highest_Nm - lowest_Nm) / mean_Nm,
     }
+
+
+def speed_after_step(recording: np.ndarray, reference_rpm: float, step_time_s: float) -> dict[str, float | None]:
+    """Dip, recovery and highest speed after a load step at `step_time_s`; what came before it does not count."""
+    _check_recording(recording)
+    time_s, speed_rpm = recording["time_s"], recording["speed_rpm"]
+    after_rpm = speed_rpm[_index_at(time_s, step_time_s):]
+    return {
+        "speed_dip_rpm": max(0.0, reference_rpm - float(np.min(after_rpm))),
+        "recovery_time_s": time_to_stay_in_band_s(time_s, speed_rpm, reference_rpm, step_time_s),
+        "speed_after_rpm": float(np.max(after_rpm)),
+    }
+
+
+def speed_error_percent(recording: np.ndarray, reference_rpm: float, window_s: tuple[float, float]) -> float:
+    """Farthest that the speed is from `reference_rpm` (> 0) in the window, in percent of it."""
+    time_s = recording["time_s"]
+    part_rpm = np.asarray(recording["speed_rpm"][_index_at(time_s, window_s[0]):_index_after(time_s, window_s[1])],
+                          dtype=float)
+    return 100.0 * float(np.max(np.abs(part_rpm - reference_rpm))) / reference_rpm
+
+
+def stroke_deg(machine: Machine) -> float:
+    """The rotor's way from one phase's turn to the next one's, in mechanical degrees."""
+    return 360.0 / (machine.rotor_poles * machine.phases)
+
+
+def strongest_line_percent(recording: np.ndarray, window_s: tuple[float, float], way_deg: float) -> float:
+    """Amplitude of the strongest line of the torque's spectrum that is no harmonic of the strokes, in percent of the
+    mean torque. way_deg: of a stroke (see stroke_deg).
+
+    The window is taken at its mean speed and must hold at least 4 * _WINDOW_BINS strokes, or its lines could not be
+    told from their harmonics: MetricsError; also when samples are farther apart than a tenth of SPECTRUM_STEP_S or
+    the mean torque is not positive.
+    """
+    time_s = recording["time_s"]
+    first, last = _index_at(time_s, window_s[0]), _index_after(time_s, window_s[1])
+    per_block = round(SPECTRUM_STEP_S / sample_step_s(time_s))
+    if per_block < 10:
+        raise MetricsError(f"a spectrum needs samples {SPECTRUM_STEP_S * 1e5:g} us apart or closer, the recording has"
+                           f" {sample_step_s(time_s) * 1e6:g} us")
+    blocks = (last - first) // per_block
+    torque_Nm = np.asarray(recording["torque_Nm"][first:first + blocks * per_block], dtype=float)
+    means_Nm = torque_Nm.reshape(blocks, per_block).mean(axis=1)
+    mean_Nm = float(means_Nm.mean())
+    if mean_Nm <= 0.0:
+        raise MetricsError(f"a spectrum in percent needs a positive mean torque, the window has {mean_Nm:g} N m")
+    # 6 degrees a second is one turn a minute.
+    turned_deg = 6.0 * float(np.mean(recording["speed_rpm"][first:last], dtype=float)) * blocks * SPECTRUM_STEP_S
+    strokes = abs(turned_deg) / way_deg  # in the window, and the bin of their first harmonic
+    if strokes < 4 * _WINDOW_BINS:
+        raise MetricsError(f"a spectrum between the strokes needs {4 * _WINDOW_BINS} of them, the window has"
+                           f" {strokes:.1f}")
+    window = np.hanning(blocks)
+    amplitude_Nm = 2.0 * np.abs(np.fft.rfft((means_Nm - mean_Nm) * window)) / window.sum()
+    bins = np.arange(len(amplitude_Nm))
+    off_harmonic = np.abs(bins - strokes * np.round(bins / strokes))
+    counted = (off_harmonic > _WINDOW_BINS) & (bins < SPECTRUM_TO_HZ * SPECTRUM_STEP_S * blocks)
+    return 100.0 * float(np.max(amplitude_Nm[counted])) / mean_Nm
 
 
 def losses(recording: np.ndarray, machine: Machine, window_s: tuple[float, float]) -> dict[str, Any]:

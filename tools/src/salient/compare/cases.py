@@ -1,0 +1,289 @@
+"""The runs that compare makes, by group.
+
+A group's runs fall into conditions, a row or a few of the table each; the runs of a condition differ by controller and,
+where a figure is a statistic, by sample. Runs that are asked for twice are made once (salient.compare.runs).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from salient.arguments import CONTROLLERS
+from salient.compare.measures import STEADY_S
+from salient.scenario import LoadStep, Record, Scenario, SpeedStep
+
+# The drive's parameters that conditions set, by what they do; the numbers are the drive's.
+LOAD_KNOWN = {"load_source": 1}
+NARROW_BANDS = {"torque_band_inner_Nm": 0.01, "torque_band_outer_Nm": 0.03}
+"""Of the hysteresis, for 1 MHz: the usual ones are for 40 kHz, where the torque moves by newton metres in a period."""
+PULSES = {1: {"pulses_per_period": 1}, 2: {"pulses_per_period": 2}}
+NETWORK = {"off": 0, "fixed": 1, "frozen": 2, "learning": 3}
+NETWORK_PARAMETER = {"paper": "bp_mode", "salient": "bp_trim_mode"}
+SWITCHES = {"observer": "observer_waking", "sharing": "torque_sharing", "trim": "angle_trim"}
+
+MAGNETICS = ("saturating", "linear_cosine", "linear_trapezoid")
+MACHINES = (*MAGNETICS, "finite_element")
+
+LOAD_NM = 8.0
+RIPPLE_RPM = 150.0
+STEP_AT_S = 0.13
+RIPPLE_FROM_S = 0.3
+LONG_S = 1.0
+
+IMPERFECTIONS: dict[str, dict[str, float]] = {
+    "20 mA of noise": {"current_noise_A": 0.02},
+    "0.05 deg off": {"encoder_offset_deg": 0.05},
+    "flux linkage +5 %": {"flux_linkage_gain": 1.05},
+    "resistance +20 %": {"resistance_gain": 1.2},
+    "minimum pulse 200 ns": {"minimum_pulse_ns": 200.0},
+}
+ALL_IMPERFECTIONS = {name: value for one in IMPERFECTIONS.values() for name, value in one.items()}
+
+SENSING: dict[str, dict[str, Any]] = {
+    "17 bits": {},
+    "17 bits and edge stamps": {"encoder_edges": True},
+    "ideal sensing": {"encoder_bits": 0, "adc_bits": 16},
+}
+PAPER_CONDITIONS = {"control_rate_hz": 1_000_000, "encoder_bits": 0, "adc_bits": 16, "immediate_pwm": True}
+
+ANGLES, ANGLES_QUICK = 24, 6
+STROKE_DEG = 30.0
+_STROKE_S = STROKE_DEG / (6.0 * RIPPLE_RPM)
+SEEDS = (1, 2, 3, 4, 5)
+DRIVES = 500
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run and what is taken of it.
+
+    sample: which of a condition's runs, "" for the only one. measure: of salient.compare.measures. traced: keep the
+    torque over the paper's window for a picture.
+    """
+
+    group: str
+    condition: str
+    controller: str
+    measure: str
+    scenario: Scenario
+    sample: str = ""
+    traced: bool = False
+
+
+@dataclass(frozen=True)
+class Group:
+    """A part of the comparison. shown: (figure, statistic) of its rows, of those that its runs have; the statistic is
+    "" for the figure of the only run, else median, worst, gap (the widest between angles, of STROKE_DEG) or count (of
+    the runs that failed)."""
+
+    title: str
+    cases: Callable[[bool], Iterator[Case]]
+    shown: tuple[tuple[str, str], ...]
+    long: bool = False
+
+
+def _ripple(quick: bool) -> Iterator[Case]:
+    def cases(condition: str, traced: bool = False, **fields: Any) -> Iterator[Case]:
+        yield from _held("ripple", condition, RIPPLE_RPM, RIPPLE_FROM_S, quick, traced, **fields)
+
+    for rate_hz in (40_000,) if quick else (40_000, 20_000, 100_000):
+        for machine in MACHINES:
+            for pulses in PULSES:
+                condition = f"{machine}, {_khz(rate_hz)}, {_pulses(pulses)}"
+                traced = machine == "saturating" and rate_hz == 40_000
+                yield from cases(condition, traced, machine=machine, control_rate_hz=rate_hz, pulses=pulses)
+    for machine in MAGNETICS if quick else MACHINES:
+        for pulses in PULSES:
+            yield from cases(f"{machine}, 40 kHz, {_pulses(pulses)}, all imperfections", machine=machine,
+                             pulses=pulses, bench=ALL_IMPERFECTIONS)
+    if not quick:
+        for name, bench in IMPERFECTIONS.items():
+            yield from cases(f"saturating, 40 kHz, one pulse, {name}", machine="saturating", pulses=1, bench=bench)
+
+
+def _speeds(quick: bool) -> Iterator[Case]:
+    # Loaded when they run without load: the start at 19.1 N m takes 0.42 s to 3000 r/min.
+    for machine in ("saturating",) if quick else MAGNETICS:
+        for speed_rpm, loaded_s in ((600.0, 0.2), (1500.0, 0.4), (3000.0, 0.8)):
+            yield from _held("speeds", f"{machine}, {speed_rpm:g} r/min", speed_rpm, loaded_s + 0.5, quick,
+                             loaded_s=loaded_s, machine=machine, pulses=1)
+
+
+def _start(quick: bool) -> Iterator[Case]:
+    for machine in ("saturating",) if quick else MACHINES:
+        yield from _by_controller("start", machine, "start", start_scenario(machine=machine))
+
+
+def _dip(quick: bool) -> Iterator[Case]:
+    angles = ANGLES_QUICK if quick else ANGLES
+    conditions = [("saturating", sensing) for sensing in SENSING]
+    if not quick:
+        conditions += [(machine, sensing) for machine in MAGNETICS[1:] for sensing in list(SENSING)[1:]]
+    for machine, sensing in conditions:
+        for number in range(angles):
+            step_s = STEP_AT_S + number * _STROKE_S / angles
+            scenario = _scenario(machine=machine, duration_s=step_s + 0.3, speed=(SpeedStep(0.0, RIPPLE_RPM),),
+                                 load=(LoadStep(step_s, LOAD_NM),), record=Record(10.0, 0.12), **SENSING[sensing])
+            yield from _by_controller("dip", f"{machine}, {sensing}", "load_step", scenario, f"angle {number:02}")
+
+
+def _paper_conditions(quick: bool) -> Iterator[Case]:
+    for machine in ("saturating",) if quick else MAGNETICS:
+        step = replace(step_scenario(machine=machine, **PAPER_CONDITIONS), duration_s=0.5)
+        start = start_scenario(machine=machine, **PAPER_CONDITIONS)
+        for condition, scenario, measure, bands in (("load step", step, "step_and_ripple", {}),
+                                                    ("load step, narrow bands", step, "step_and_ripple", NARROW_BANDS),
+                                                    ("start", start, "start", {})):
+            # The bands are those of the hysteresis.
+            for controller in ("traditional",) if bands else ("traditional", "paper"):
+                yield Case("paper_conditions", f"{machine}, {condition}", controller, measure,
+                           replace(scenario, controller=controller, parameters={**LOAD_KNOWN, **bands}))
+
+
+def _ablation(quick: bool) -> Iterator[Case]:
+    tables = {"exact tables": 0.0, "0.2 deg off": 0.2, "0.5 deg off": 0.5}
+    seeds = SEEDS[:2] if quick else SEEDS
+    for table, offset_deg in tables.items():
+        for controller in [one for one in CONTROLLERS if one in NETWORK_PARAMETER]:
+            changes: dict[str, dict[str, float]] = {"as it is": {}}
+            changes |= {f"BP-PID {mode}": {NETWORK_PARAMETER[controller]: number} for mode, number in NETWORK.items()}
+            if controller == "salient":
+                changes |= {f"{part} {state}": {parameter: number} for part, parameter in SWITCHES.items()
+                            for number, state in enumerate(("off", "on"))}
+            for change, parameters in changes.items():
+                for seed in seeds:
+                    # The seed moves the load step within a stroke, too.
+                    scenario = _scenario(
+                        seed=seed, duration_s=RIPPLE_FROM_S + 0.2, speed=(SpeedStep(0.0, RIPPLE_RPM),),
+                        load=(LoadStep(STEP_AT_S + (seed - 1) * _STROKE_S / len(SEEDS), LOAD_NM),),
+                        record=Record(1.0, STEP_AT_S),
+                        bench={"current_noise_A": 0.02, "encoder_offset_deg": offset_deg})
+                    yield Case("ablation", f"{change}, {table}", controller, "step_and_ripple",
+                               replace(scenario, controller=controller, parameters={"bp_seed": seed, **parameters}),
+                               f"seed {seed}")
+
+
+def _robustness(quick: bool) -> Iterator[Case]:
+    for number in range(10 if quick else DRIVES):
+        yield from _by_controller("robustness", "random drives", "robustness", random_drive(number),
+                                  f"drive {number:03}")
+
+
+def random_drive(number: int) -> Scenario:
+    """A drive and bench of the robustness study, the same for the same number: start to 150 r/min (even numbers) or
+    600 r/min, then 8 N m."""
+    draw = np.random.default_rng(number).uniform
+    bench = {
+        "flux_linkage_gain": draw(0.9, 1.1),
+        "resistance_gain": draw(0.8, 1.5),
+        "inertia_gain": math.exp(draw(math.log(0.5), math.log(3.0))),
+        "friction_gain": draw(0.0, 5.0),
+        "supply_voltage_V": draw(200.0, 280.0),
+        "encoder_offset_deg": draw(-0.1, 0.1),
+        "current_noise_A": draw(0.0, 0.04),
+    }
+    encoder_bits = int(draw(14.0, 21.0))
+    # CAN carries the bench's quantities as single floats; what is written down is what acts.
+    bench = {name: float(np.float32(value)) for name, value in bench.items()}
+    return _scenario(seed=number, duration_s=0.5 + 0.2 + STEADY_S, speed=(SpeedStep(0.0, (150.0, 600.0)[number % 2]),),
+                     load=(LoadStep(0.5, LOAD_NM),), record=Record(2.0, 0.0), encoder_bits=encoder_bits, bench=bench,
+                     initial_angle_deg=round(draw(0.0, 90.0), 3))
+
+
+GROUPS: dict[str, Group] = {
+    "ripple": Group("torque ripple at 150 r/min, 8 N m", _ripple, (("ripple", ""), ("ripple_long", ""))),
+    "speeds": Group("torque ripple over speed, 8 N m, 40 kHz, one pulse", _speeds,
+                    (("ripple", ""), ("ripple_long", ""), ("speed_error_percent", ""))),
+    "start": Group("start to 600 r/min, no load, 40 kHz", _start, (("settling_time_s", ""), ("overshoot_percent", ""))),
+    "dip": Group("load step of 8 N m at 150 r/min, over the rotor's angle, 40 kHz", _dip,
+                 (("speed_dip_rpm", "median"), ("speed_dip_rpm", "worst"), ("recovery_time_s", "median"),
+                  ("speed_after_rpm", "worst"), ("step_angle_deg", "gap"))),
+    "paper_conditions": Group("the paper's conditions: 1 MHz, no delay, exact sensing, load torque known",
+                              _paper_conditions,
+                              (("settling_time_s", ""), ("overshoot_percent", ""), ("speed_dip_rpm", ""),
+                               ("recovery_time_s", ""), ("speed_after_rpm", ""), ("torque_mean_Nm", ""),
+                               ("ripple", ""))),
+    "ablation": Group("parts switched off, 40 kHz, saturating, 20 mA of noise, five seeds", _ablation,
+                      (("ripple", "median"), ("ripple", "worst"), ("speed_dip_rpm", "median"),
+                       ("speed_dip_rpm", "worst")), long=True),
+    "robustness": Group("random drives: start to 150 or 600 r/min, then 8 N m, 40 kHz", _robustness,
+                        (("failed", "count"), ("settling_time_s", "median"), ("settling_time_s", "worst"),
+                         ("peak_current_A", "median"), ("peak_current_A", "worst"),
+                         ("highest_speed_percent", "median"), ("highest_speed_percent", "worst"),
+                         ("speed_dip_rpm", "median"), ("speed_dip_rpm", "worst"),
+                         ("speed_error_percent", "median"), ("speed_error_percent", "worst"),
+                         ("cycle_percent", "median"), ("cycle_percent", "worst")), long=True),
+}
+
+
+# --- scenarios ------------------------------------------------------------------------------------------------------
+
+def start_scenario(**fields: Any) -> Scenario:
+    """From standstill to 600 r/min without load."""
+    return _scenario(duration_s=0.5, speed=(SpeedStep(0.0, 600.0),), record=Record(10.0, 0.0), **fields)
+
+
+def step_scenario(**fields: Any) -> Scenario:
+    """The paper's load step, recorded from it on to the end of its ripple window."""
+    return _scenario(duration_s=RIPPLE_FROM_S + 0.1, speed=(SpeedStep(0.0, RIPPLE_RPM),),
+                     load=(LoadStep(STEP_AT_S, LOAD_NM),), record=Record(1.0, STEP_AT_S), **fields)
+
+
+def _scenario(**fields: Any) -> Scenario:
+    return Scenario(name="compare", **fields)
+
+
+def _held(group: str, condition: str, speed_rpm: float, from_s: float, quick: bool, traced: bool = False,
+          loaded_s: float = STEP_AT_S, pulses: int = 1, **fields: Any) -> Iterator[Case]:
+    """A speed held against LOAD_NM, recorded from from_s on."""
+    scenario = _scenario(duration_s=from_s + (0.1 if quick else LONG_S), speed=(SpeedStep(0.0, speed_rpm),),
+                         load=(LoadStep(loaded_s, LOAD_NM),), record=Record(1.0, from_s), **fields)
+    for case in _by_controller(group, condition, "ripple", scenario):
+        if case.controller == "salient":
+            case = replace(case, scenario=replace(case.scenario, parameters=PULSES[pulses]))
+        yield replace(case, traced=traced)
+
+
+def _by_controller(group: str, condition: str, measure: str, scenario: Scenario, sample: str = "") -> Iterator[Case]:
+    for controller in CONTROLLERS:
+        yield Case(group, condition, controller, measure, replace(scenario, controller=controller), sample)
+
+
+def scenario_toml(case: Case) -> str:
+    """The run as a scenario file for `tools/salient run`."""
+    scenario = case.scenario
+    lines = [f"# {case.group}: {case.condition} {case.sample}".rstrip(), f'machine = "{scenario.machine}"',
+             f'controllers = ["{scenario.controller}"]']
+    plain = Scenario(name="", duration_s=0.0)
+    tables: list[tuple[str, Mapping[str, float]]] = []
+    for key, value in vars(scenario).items():
+        if key in ("name", "machine", "controller") or value == getattr(plain, key):
+            continue
+        if isinstance(value, Mapping):
+            tables.append((f"[{key}]", value))
+        elif isinstance(value, tuple):
+            tables += [(f"[[{key}]]", vars(step)) for step in value]
+        elif isinstance(value, Record):
+            tables.append((f"[{key}]", vars(value)))
+        else:
+            lines.append(f"{key} = {_toml(value)}")
+    for head, content in tables:
+        lines += ["", head, *(f"{key} = {_toml(value)}" for key, value in content.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: bool | int | float) -> str:
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _khz(rate_hz: int) -> str:
+    return f"{rate_hz / 1000:g} kHz"
+
+
+def _pulses(pulses: int) -> str:
+    return ("one pulse", "two pulses")[pulses - 1]
