@@ -15,8 +15,8 @@ _MEASURED_ONLY = ("step_angle_deg", "torque_mean_Nm")
 
 @dataclass(frozen=True)
 class Change:
-    """A figure that differs. earlier, now: None when it never came about or its runs failed. percent: of the earlier
-    one, above 0 for the worse; None when one of them is None or the earlier one 0."""
+    """A figure that differs. earlier, now: None when it never came about or its runs failed. percent: of what the
+    earlier one is above its figure's zero, positive for the worse; None when one of them is None or that is 0."""
 
     key: Key
     words: str
@@ -57,10 +57,11 @@ def _change(row: Row, controller: str, old: Mapping[str, Any], beyond_percent: f
             return None
         worse = now is None
     else:
-        difference = now - earlier
-        if abs(difference) * figure.factor <= figure.resolution or 100.0 * abs(difference) <= beyond_percent * earlier:
+        difference, excess = now - earlier, max(0.0, earlier - figure.zero)
+        if (abs(difference) * figure.factor <= figure.resolution
+                or 100.0 * abs(difference) <= beyond_percent * excess):
             return None
-        percent = 100.0 * difference / earlier if earlier > 0.0 else None
+        percent = 100.0 * difference / excess if excess > 0.0 else None
         worse = difference > 0.0
     return Change(row.key, row.words, controller, earlier, now, percent, worse)
 

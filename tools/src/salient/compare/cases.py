@@ -24,7 +24,12 @@ NARROW_BANDS = {"torque_band_inner_Nm": 0.01, "torque_band_outer_Nm": 0.03}
 PULSES = {1: {"pulses_per_period": 1}, 2: {"pulses_per_period": 2}}
 NETWORK = {"off": 0, "fixed": 1, "frozen": 2, "learning": 3}
 NETWORK_PARAMETER = {"paper": "bp_mode", "salient": "bp_trim_mode"}
-SWITCHES = {"observer": "observer_waking", "sharing": "torque_sharing", "trim": "angle_trim"}
+SWITCHES = {
+    "observer fixed": {"observer_waking": 0}, "observer waking": {"observer_waking": 1},
+    "sharing off": {"torque_sharing": 0}, "sharing on": {"torque_sharing": 1},
+    "trim off": {"angle_trim": 0}, "trim on": {"angle_trim": 1},
+}  # fmt: skip
+"""Of the controller salient."""
 
 MAGNETICS = ("saturating", "linear_cosine", "linear_trapezoid")
 MACHINES = (*MAGNETICS, "finite_element")
@@ -111,7 +116,14 @@ def _speeds(quick: bool) -> Iterator[Case]:
     for machine in ("saturating",) if quick else MAGNETICS:
         for speed_rpm, loaded_s in ((600.0, 0.2), (1500.0, 0.4), (3000.0, 0.8)):
             yield from _held("speeds", f"{machine}, {speed_rpm:g} r/min", speed_rpm, loaded_s + 0.5, quick,
-                             loaded_s=loaded_s, machine=machine, pulses=1)
+                             loaded_s=loaded_s, machine=machine)
+
+
+def _loads(quick: bool) -> Iterator[Case]:
+    for machine in ("saturating",) if quick else MAGNETICS:
+        for load_Nm in (2.0, 15.0) if quick else (1.0, 2.0, 4.0, 8.0, 12.0, 15.0):
+            yield from _held("loads", f"{machine}, {load_Nm:g} N m", RIPPLE_RPM, RIPPLE_FROM_S, quick,
+                             load_Nm=load_Nm, machine=machine)
 
 
 def _start(quick: bool) -> Iterator[Case]:
@@ -153,8 +165,7 @@ def _ablation(quick: bool) -> Iterator[Case]:
             changes: dict[str, dict[str, float]] = {"as it is": {}}
             changes |= {f"BP-PID {mode}": {NETWORK_PARAMETER[controller]: number} for mode, number in NETWORK.items()}
             if controller == "salient":
-                changes |= {f"{part} {state}": {parameter: number} for part, parameter in SWITCHES.items()
-                            for number, state in enumerate(("off", "on"))}
+                changes |= SWITCHES
             for change, parameters in changes.items():
                 for seed in seeds:
                     # The seed moves the load step within a stroke, too.
@@ -199,6 +210,8 @@ GROUPS: dict[str, Group] = {
     "ripple": Group("torque ripple at 150 r/min, 8 N m", _ripple, (("ripple", ""), ("ripple_long", ""))),
     "speeds": Group("torque ripple over speed, 8 N m, 40 kHz, one pulse", _speeds,
                     (("ripple", ""), ("ripple_long", ""), ("speed_error_percent", ""))),
+    "loads": Group("torque ripple over load, 150 r/min, 40 kHz, one pulse", _loads,
+                   (("ripple", ""), ("ripple_long", ""))),
     "start": Group("start to 600 r/min, no load, 40 kHz", _start, (("settling_time_s", ""), ("overshoot_percent", ""))),
     "dip": Group("load step of 8 N m at 150 r/min, over the rotor's angle, 40 kHz", _dip,
                  (("speed_dip_rpm", "median"), ("speed_dip_rpm", "worst"), ("recovery_time_s", "median"),
@@ -239,10 +252,10 @@ def _scenario(**fields: Any) -> Scenario:
 
 
 def _held(group: str, condition: str, speed_rpm: float, from_s: float, quick: bool, traced: bool = False,
-          loaded_s: float = STEP_AT_S, pulses: int = 1, **fields: Any) -> Iterator[Case]:
-    """A speed held against LOAD_NM, recorded from from_s on."""
+          loaded_s: float = STEP_AT_S, load_Nm: float = LOAD_NM, pulses: int = 1, **fields: Any) -> Iterator[Case]:
+    """A speed held against a load, recorded from from_s on."""
     scenario = _scenario(duration_s=from_s + (0.1 if quick else LONG_S), speed=(SpeedStep(0.0, speed_rpm),),
-                         load=(LoadStep(loaded_s, LOAD_NM),), record=Record(1.0, from_s), **fields)
+                         load=(LoadStep(loaded_s, load_Nm),), record=Record(1.0, from_s), **fields)
     for case in _by_controller(group, condition, "ripple", scenario):
         if case.controller == "salient":
             case = replace(case, scenario=replace(case.scenario, parameters=PULSES[pulses]))

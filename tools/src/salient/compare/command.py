@@ -64,6 +64,7 @@ def _prepare_folder(out: Path) -> None:
         for path in (*(out / FAILED).glob("*.toml"), out / stored.NAME, out / "compare.html"):
             path.unlink(missing_ok=True)
         (out / stored.NAME).touch()
+        (out / stored.NAME).unlink()
     except OSError as error:
         raise UsageError(f"--out {out}: cannot write there ({error.strerror}); give a folder that can be written") \
             from None

@@ -31,13 +31,14 @@ harmonic of the strokes, in percent of the mean torque (metrics.strongest_line).
 @dataclass(frozen=True)
 class Figure:
     """How a figure is shown: words, unit, decimals, factor into that unit. Lower is better. A difference below
-    `resolution`, in the unit shown, is no change."""
+    `resolution`, in the unit shown, is no change; in percent, changes are of what is above `zero`."""
 
     words: str
     unit: str
     decimals: int
     resolution: float
     factor: float = 1.0
+    zero: float = 0.0
 
 
 FIGURES = {
@@ -48,10 +49,10 @@ FIGURES = {
     "overshoot_percent": Figure("overshoot", "%", 3, 0.005),
     "speed_dip_rpm": Figure("dip", "r/min", 2, 0.02),
     "recovery_time_s": Figure("back within 0.5 %", "ms", 2, 0.1, 1e3),
-    "speed_after_rpm": Figure("highest speed after it", "r/min", 2, 0.02),
+    "speed_after_rpm": Figure("highest speed after it", "r/min", 2, 0.02, zero=150.0),
     "torque_mean_Nm": Figure("mean torque", "N m", 3, 0.01),
     "peak_current_A": Figure("peak phase current", "A", 1, 0.5),
-    "highest_speed_percent": Figure("highest speed", "% of reference", 2, 0.02),
+    "highest_speed_percent": Figure("highest speed", "% of reference", 2, 0.02, zero=100.0),
     "cycle_percent": Figure("limit cycle", "% of torque", 3, 0.05),
     "failed": Figure("drives that fail", "", 0, 0.5),
     "step_angle_deg": Figure("rotor angles at the step", "deg", 2, 0.2),

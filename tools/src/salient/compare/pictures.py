@@ -140,7 +140,16 @@ def _traces(content: Content) -> Figure | None:
 
 
 def _over_speed(content: Content) -> Figure | None:
-    rows = [row for row in _rows(content, "speeds") if row["figure"] == "ripple"]
+    return _over(content, "speeds", "speed / (r/min)")
+
+
+def _over_load(content: Content) -> Figure | None:
+    return _over(content, "loads", "load / (N m)")
+
+
+def _over(content: Content, group: str, label: str) -> Figure | None:
+    """The ripple over the number that a condition's second part begins with, a panel a machine."""
+    rows = [row for row in _rows(content, group) if row["figure"] == "ripple"]
     by_machine: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         by_machine.setdefault(row["condition"].split(", ")[0], []).append(row)
@@ -148,17 +157,17 @@ def _over_speed(content: Content) -> Figure | None:
         return None
     figure, axes = _panels(len(by_machine), columns=3, height_in=3.0, sharey=True)
     for axis, (machine, of) in zip(axes, by_machine.items(), strict=True):
-        speeds = [float(row["condition"].split(", ")[1].split()[0]) for row in of]
+        numbers = [float(row["condition"].split(", ")[1].split()[0]) for row in of]
         for controller in _controllers(rows):
             values = [row["values"].get(controller) or np.nan for row in of]
-            axis.plot(speeds, values, _MARKER.get(controller, "o") + "-", color=_colour(controller), markersize=5)
-        wanted = [(speed, row["wanted"]) for speed, row in zip(speeds, of, strict=True) if row["wanted"] is not None]
+            axis.plot(numbers, values, _MARKER.get(controller, "o") + "-", color=_colour(controller), markersize=5)
+        wanted = [(number, row["wanted"]) for number, row in zip(numbers, of, strict=True) if row["wanted"] is not None]
         if wanted:
             axis.plot(*zip(*wanted, strict=True), "_", color=_WANTED_COLOUR, markersize=16, markeredgewidth=1.5)
         _logarithmic(axis.yaxis)
-        axis.set_xticks(speeds)
+        axis.set_xticks(numbers)
         axis.set_title(machine)
-        axis.set_xlabel("speed / (r/min)")
+        axis.set_xlabel(label)
     axes[0].set_ylabel("K$_t$ over 0.1 s")
     _legend(figure, rows)
     return figure
@@ -270,6 +279,8 @@ _PICTURES: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], 
          " of the window is drawn from its lowest to its highest sample.", _traces),
     ),
     "speeds": (("Torque ripple over speed", "Short lines: what is wanted.", _over_speed),),
+    "loads": (("Torque ripple over load", "150 r/min; the mean torque is the load and 0.31 N m of friction.",
+               _over_load),),
     "dip": (("Dip over the rotor's angle at the load step", "Dotted and dashed: median and highest dip of a drive that"
              " knew of the step, with the voltage 0 µs (ideal sensing) or 100 µs after it.", _over_angle),),
     "ablation": (("Parts switched off", "A dot a seed of weights, noise and moment of the load step.", _ablations),),
