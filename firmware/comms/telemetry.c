@@ -86,7 +86,7 @@ static hal_can_frame_t bp_pid_frame(const telemetry_snapshot_t *snapshot) {
 static hal_can_frame_t trim_frame(const telemetry_snapshot_t *snapshot) {
     struct drive_drive_trim_t message = {0};
     drive_drive_trim_set_trim_torque_nm(&message, units_torque_q8(snapshot->trim_torque_q24));
-    drive_drive_trim_set_angle_trim_nm(&message, units_torque_q8(snapshot->angle_trim_q24));
+    drive_drive_trim_set_misalignment_deg(&message, units_deviation_q20(snapshot->misalignment));
     drive_drive_trim_set_torque_missing_nm(&message, units_torque_q8(snapshot->torque_missing_q24));
     drive_drive_trim_set_observer_bandwidth_rad_s(&message, snapshot->observer_bandwidth_rad_s);
     hal_can_frame_t frame = frame_of(DRIVE_DRIVE_TRIM_FRAME_ID, DRIVE_DRIVE_TRIM_LENGTH);

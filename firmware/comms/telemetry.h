@@ -48,7 +48,7 @@ typedef struct {
     int32_t duty_q15; /* -32768..32767 */
     /* Of the salient controller, 0 by the others. */
     int32_t trim_torque_q24;           /* what the BP-PID adds to the torque reference */
-    int32_t angle_trim_q24;            /* what the trim by rotor angle adds */
+    int32_t misalignment;              /* 2^-32 turn */
     int32_t torque_missing_q24;        /* reference less what the voltage can reach */
     uint16_t observer_bandwidth_rad_s; /* at this moment */
     fault_record_t last_fault;         /* sent while state is fault */

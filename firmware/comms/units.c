@@ -25,6 +25,10 @@ uint16_t units_angle_u16(uint32_t angle) {
     return (uint16_t)((angle + 0x8000u) >> 16);
 }
 
+int32_t units_deviation_q20(int32_t angle) {
+    return (int32_t)fixed_shift(angle, 12);
+}
+
 int32_t units_torque_q8(int32_t torque_q24) {
     return (int32_t)fixed_shift(torque_q24, 16);
 }

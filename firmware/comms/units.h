@@ -3,6 +3,7 @@
  *   quantity   inside the drive               on the bus                     conversion
  *   speed      Q9.22 rad/s                    0.001 r/min (1/4 in snapshots) units_milli_rpm, units_speed_q22
  *   angle      2^-32 turn, unsigned           2^-16 turn (DBC: degrees)      units_angle_u16
+ *   deviation  2^-32 turn, signed             2^-20 turn (DBC: degrees)      units_deviation_q20
  *   torque     Q7.24 N m                      2^-8 N m                       units_torque_q8
  *   current    unsigned Q7.9 A                2^-9 A                         none
  *   voltage    unsigned Q9.6 V                2^-6 V                         none
@@ -28,6 +29,9 @@ int32_t units_quarter_rpm(int32_t milli_rpm);
 
 /* 2^-16 turn from 2^-32 turn; the last half LSB of a turn rounds to 0. */
 uint16_t units_angle_u16(uint32_t angle);
+
+/* 2^-20 turn from a small angle in 2^-32 turn: +-2^19 (the codec's setter saturates). */
+int32_t units_deviation_q20(int32_t angle);
 
 /* N m in 2^-8 from Q7.24: -32768..32768, the upper end one more than 16 bits hold (the codec's setter saturates). */
 int32_t units_torque_q8(int32_t torque_q24);

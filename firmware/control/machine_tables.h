@@ -36,6 +36,7 @@ typedef struct {
     uint8_t rotor_poles;      /* electrical turns a mechanical turn */
     int32_t inertia_q30;      /* kg m^2, Q1.30 */
     int32_t friction_q30;     /* N m s, Q1.30 */
+    int32_t resistance_q24;   /* ohm, Q7.24 */
     int32_t current_rise_A_s; /* supply voltage over unaligned inductance: A/s */
     machine_row_t row[MACHINE_ROWS];
     uint8_t cell_row[MACHINE_CELLS];     /* the row in which a part of half a pitch begins */

@@ -66,6 +66,76 @@ static int32_t hysteresis_limit_q9(const int32_t *values, int32_t current_rise_A
     return fixed_clamp(fixed_saturate(limit_q9), 0, values[PARAMETER_CURRENT_LIMIT_A]);
 }
 
+/* The schedule of the paper's observer is one bandwidth. */
+static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, uint32_t control_rate_hz,
+                                                      unsigned encoder_bits) {
+    const bool salient = values[PARAMETER_CONTROLLER] == DRIVE_CONTROLLER_SALIENT;
+    const uint32_t steady_rad_s =
+        (uint32_t)values[salient ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S];
+    const bool wakes = salient && values[PARAMETER_OBSERVER_WAKING] != 0;
+    const uint32_t wake_rad_s = wakes ? (uint32_t)values[PARAMETER_OBSERVER_WAKE_RAD_S] : steady_rad_s;
+    return observer_bandwidth_configure(wake_rad_s, steady_rad_s, encoder_bits, control_rate_hz,
+                                        values[PARAMETER_INERTIA_KG_M2]);
+}
+
+/* A trim's gain is N m per N m: the PID's output +-1 is +-limit, its error 1 the error scale. */
+static int32_t trim_scale_q15(const int32_t *values, parameter_index_t gain) {
+    const int64_t scaled_q39 = (int64_t)values[gain] * values[PARAMETER_BP_ERROR_SCALE_NM];
+    return fixed_clamp(fixed_saturate(scaled_q39 / values[PARAMETER_BP_TRIM_LIMIT_NM]), 0, 4 << 15);
+}
+
+static torque_trim_parameters_t trim_from(const int32_t *values) {
+    return (torque_trim_parameters_t){
+        .pid =
+            {
+                .mode = (bp_pid_mode_t)values[PARAMETER_BP_TRIM_MODE],
+                .seed = (uint32_t)values[PARAMETER_BP_SEED],
+                .error_scale_inverse_q24 = fixed_saturate(((int64_t)1 << 48) / values[PARAMETER_BP_ERROR_SCALE_NM]),
+                .kp_scale_q15 = trim_scale_q15(values, PARAMETER_BP_TRIM_KP_MAX),
+                .ki_scale_q15 = trim_scale_q15(values, PARAMETER_BP_TRIM_KI_MAX),
+                .kd_scale_q15 = trim_scale_q15(values, PARAMETER_BP_TRIM_KD_MAX),
+                .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
+                            .inertia_q15 = values[PARAMETER_BP_ALPHA] >> 13},
+            },
+        .limit_q24 = values[PARAMETER_BP_TRIM_LIMIT_NM],
+    };
+}
+
+static predictive_torque_parameters_t predictive_from(const int32_t *values, unsigned phases,
+                                                      uint32_t control_rate_hz) {
+    const int64_t rate = control_rate_hz;
+    const uint32_t stroke = (0u - phases) / phases + 1u; /* 2^32 / phases */
+    const uint32_t turn_on = pitch_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
+    const uint32_t turn_off = pitch_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
+    const uint32_t on_early = pitch_from_degrees(values[PARAMETER_SHARE_ON_EARLY_DEG]);
+    const uint32_t off_early = pitch_from_degrees(values[PARAMETER_SHARE_OFF_EARLY_DEG]);
+    /* Windows with an overlap of at least 2 degrees, early or not, whatever was asked for. */
+    const uint32_t least = stroke + pitch_from_degrees(2 << 7);
+    const uint32_t width = turn_off - turn_on > least ? turn_off - turn_on : least;
+    const uint32_t narrowing = off_early > on_early ? off_early - on_early : 0;
+    return (predictive_torque_parameters_t){
+        .flux =
+            {
+                .gain_q15 = values[PARAMETER_FLUX_OBSERVER_GAIN],
+                .resistance_period_q40 = fixed_saturate(((int64_t)values[PARAMETER_RESISTANCE_OHM] << 16) / rate),
+            },
+        .share =
+            {
+                .sharing = values[PARAMETER_TORQUE_SHARING] != 0,
+                .stroke = stroke,
+                .turn_on = turn_on,
+                .turn_off = turn_on + width,
+                .turn_on_early = on_early,
+                .turn_off_early = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
+            },
+        .period_q40 = (int32_t)(((int64_t)1 << 40) / rate),
+        .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
+        .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
+        .advance_q30 = (int32_t)(10 * ((int64_t)1 << 30) / rate),
+        .return_q30 = (int32_t)(((int64_t)1 << 30) / rate),
+    };
+}
+
 static bp_pid_parameters_t bp_pid_from(const int32_t *values, uint32_t control_rate_hz) {
     const int32_t scale_q24 = values[PARAMETER_BP_ERROR_SCALE_NM];
     return (bp_pid_parameters_t){
@@ -97,8 +167,10 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .adc_bits = (uint8_t)adc_bits,
         .initialise_ticks = control_rate_hz / 1000u,
         .speed_ramp_q22 = ramp_q22(values[PARAMETER_SPEED_RAMP_RPM_S], control_rate_hz),
-        .observer = load_observer_configure((uint32_t)values[PARAMETER_OBSERVER_BANDWIDTH_RAD_S], control_rate_hz,
-                                            inertia_q30, friction_q30),
+        .two_pulses = values[PARAMETER_PULSES_PER_PERIOD] == 2,
+        .load_from_transducer = values[PARAMETER_LOAD_SOURCE] != 0,
+        .observer = load_observer_model(control_rate_hz, inertia_q30, friction_q30),
+        .bandwidth = bandwidth_from(values, control_rate_hz, encoder_bits),
         .speed_pi =
             {
                 .kp_q16 = values[PARAMETER_SPEED_KP],
@@ -136,6 +208,11 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
                 .current_limit_q9 = current_limit_q9,
             },
+        .trim = trim_from(values),
+        .predictive = predictive_from(values, tables->phases, control_rate_hz),
+        .misalignment =
+            misalignment_configure(values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
+                                   control_rate_hz, inertia_q30, tables->phases, tables->rotor_poles),
     };
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift);
     return control;

@@ -13,6 +13,18 @@
 
 #define DUTY_ONE_Q15 32768
 
+/* A tick over 2 pi, in 2^-32 turn per rad/s Q9.22, Q44. */
+#define TURN_PER_TICK_Q44 INT64_C(14335402)
+
+/* Two periods at 20 kHz. */
+#define EDGE_AGE_MAX_TICKS 20000
+
+/* The transducer's codes are offset binary, +-64 N m: 2^31 of Q7.24 over all of them. */
+static int32_t load_torque_q24(const control_parameters_t *parameters, uint16_t code) {
+    const unsigned bits = parameters->adc_bits;
+    return (code - (1 << (bits - 1))) * (1 << (31 - bits));
+}
+
 void control_reset(control_state_t *state) {
     *state = (control_state_t){0};
     state_machine_reset(&state->machine);
@@ -21,12 +33,14 @@ void control_reset(control_state_t *state) {
 /* What the sensors say, in the formats of the laws. */
 typedef struct {
     uint32_t angle; /* 2^-32 turn */
+    bool from_edge; /* the angle is that of an edge and its time */
     int32_t current_q9[HAL_PHASES_MAX];
     int32_t current_max_q9;
     int32_t bus_voltage_q6;
-    commutation_t commutation;
+    commutation_t commutation; /* its angles less the phases' misalignment */
     int32_t torque_q24[HAL_PHASES_MAX];
     int32_t torque_sum_q24;
+    int32_t flux_q29[HAL_PHASES_MAX]; /* salient controller */
 } estimate_t;
 
 /* A code in LSBs of which a 12-bit count has so many; finer codes are rounded to nearest, half upwards. */
@@ -35,21 +49,42 @@ static int32_t from_code(const control_parameters_t *parameters, uint16_t code, 
     return (code * per_count + ((1 << shift) >> 1)) >> shift;
 }
 
-static estimate_t estimate(const control_parameters_t *parameters, const control_sample_t *sample) {
+/* The measured angle and whether it is an edge's; 2^-32 turn. Behind an edge the rotor turned on at the observer's
+ * speed; an edge of long ago says less than the count does. */
+static bool measure_angle(const control_parameters_t *parameters, const hal_encoder_sample_t *encoder,
+                          int32_t speed_q22, uint32_t *angle) {
+    const unsigned shift = parameters->encoder_shift;
+    if (!encoder->edge_known || encoder->edge_age_ticks > EDGE_AGE_MAX_TICKS) {
+        /* The middle of the count's interval, so that the mean error is zero; a 32-bit encoder has no interval. */
+        *angle = (encoder->counts << shift) + (shift > 0 ? 1u << (shift - 1) : 0u);
+        return false;
+    }
+    const uint32_t edge = (encoder->edge_forward ? encoder->counts : encoder->counts + 1) << shift;
+    const int64_t way_q6 = ((int64_t)speed_q22 * (int32_t)encoder->edge_age_ticks) >> 16; /* 31 + 15 bits */
+    *angle = edge + (uint32_t)fixed_shift(way_q6 * TURN_PER_TICK_Q44, 28);
+    return true;
+}
+
+static estimate_t estimate(const control_parameters_t *parameters, const control_state_t *state,
+                           const control_sample_t *sample) {
     const machine_tables_t *tables = parameters->tables;
     estimate_t e = {.current_max_q9 = 0};
-    /* The middle of the count's interval, so that the mean error is zero; a 32-bit encoder has no interval. */
-    const unsigned shift = parameters->encoder_shift;
-    e.angle = (sample->encoder.counts << shift) + (shift > 0 ? 1u << (shift - 1) : 0u);
+    e.from_edge = measure_angle(parameters, &sample->encoder, state->observer.speed_q22, &e.angle);
     e.bus_voltage_q6 = from_code(parameters, sample->adc.bus_voltage_counts, BUS_VOLTAGE_Q6_PER_COUNT);
     commutation_find(&parameters->commutation, tables->phases, tables->rotor_poles, e.angle, &e.commutation);
     for (unsigned phase = 0; phase < tables->phases; phase++) {
         const int32_t current_q9 = from_code(parameters, sample->adc.phase_current_counts[phase], CURRENT_Q9_PER_COUNT);
         e.current_q9[phase] = current_q9;
         e.current_max_q9 = current_q9 > e.current_max_q9 ? current_q9 : e.current_max_q9;
+        e.commutation.angle[phase] -=
+            (uint32_t)misalignment_offset(&parameters->misalignment, &state->misalignment, phase);
         if (current_q9 > 0) { /* most of the time a phase has none */
-            e.torque_q24[phase] = phase_map_torque_at_q24(tables, e.commutation.angle[phase], current_q9);
+            const phase_map_place_t place = phase_map_at(tables, e.commutation.angle[phase]);
+            e.torque_q24[phase] = phase_map_torque_q24(&place, current_q9);
             e.torque_sum_q24 = fixed_add(e.torque_sum_q24, e.torque_q24[phase]);
+            if (parameters->controller == DRIVE_CONTROLLER_SALIENT) {
+                e.flux_q29[phase] = phase_map_flux_q29(&place, current_q9);
+            }
         }
     }
     return e;
@@ -57,10 +92,13 @@ static estimate_t estimate(const control_parameters_t *parameters, const control
 
 /* Entering RUN: the laws start afresh, the reference from the present speed. */
 static void start_laws(const control_parameters_t *parameters, control_state_t *state) {
-    state->speed_reference_q22 = fixed_clamp(state->observer.speed_q22, 0, INT32_MAX);
+    const bool reverses = parameters->controller == DRIVE_CONTROLLER_SALIENT;
+    state->speed_reference_q22 = fixed_clamp(state->observer.speed_q22, reverses ? INT32_MIN : 0, INT32_MAX);
     speed_pi_reset(&state->speed_pi);
     ditc_hysteresis_reset(&state->hysteresis);
     ditc_duty_reset(&parameters->duty, &state->duty);
+    torque_trim_reset(&parameters->trim, &state->trim, 0);
+    predictive_torque_reset(&state->predictive);
 }
 
 static void follow_ramp(const control_parameters_t *parameters, control_state_t *state, int32_t target_q22) {
@@ -69,18 +107,20 @@ static void follow_ramp(const control_parameters_t *parameters, control_state_t 
         state->speed_reference_q22, fixed_clamp(way_q22, -parameters->speed_ramp_q22, parameters->speed_ramp_q22));
 }
 
-static int32_t regulate_speed(const control_parameters_t *parameters, control_state_t *state) {
+static int32_t regulate_speed(const control_parameters_t *parameters, control_state_t *state,
+                              const hal_adc_sample_t *adc) {
     if (parameters->controller == DRIVE_CONTROLLER_TRADITIONAL) {
         return speed_pi_step(&parameters->speed_pi, &state->speed_pi,
                              fixed_subtract(state->speed_reference_q22, state->observer.speed_q22));
     }
-    return speed_smc_step(&parameters->speed_smc, state->speed_reference_q22, state->observer.speed_q22,
-                          state->observer.load_torque_q24);
+    const int32_t load_q24 = parameters->load_from_transducer ? load_torque_q24(parameters, adc->load_torque_counts)
+                                                              : state->observer.load_torque_q24;
+    return speed_smc_step(&parameters->speed_smc, state->speed_reference_q22, state->observer.speed_q22, load_q24);
 }
 
-/* Duty of every phase for a torque reference >= 0. */
-static void regulate_torque(const control_parameters_t *parameters, control_state_t *state, const estimate_t *e,
-                            int32_t reference_q24, int32_t duty_q15[HAL_PHASES_MAX]) {
+/* Traditional and paper: duty of every phase for a torque reference >= 0. */
+static void switch_by_torque(const control_parameters_t *parameters, control_state_t *state, const estimate_t *e,
+                             int32_t reference_q24, int32_t duty_q15[HAL_PHASES_MAX]) {
     const unsigned phases = parameters->tables->phases;
     const int32_t error_q24 = fixed_subtract(reference_q24, e->torque_sum_q24);
     if (parameters->controller == DRIVE_CONTROLLER_PAPER && parameters->duty.pid.mode != BP_PID_OFF) {
@@ -100,6 +140,40 @@ static void regulate_torque(const control_parameters_t *parameters, control_stat
     }
 }
 
+/* Salient: duty of every phase for a torque reference of either sign. The observer stands at the coming sample. */
+static void predict_torque(const control_parameters_t *parameters, control_state_t *state, const estimate_t *e,
+                           int32_t reference_q24, int32_t duty_q15[HAL_PHASES_MAX]) {
+    const machine_tables_t *tables = parameters->tables;
+    const load_observer_t *observer = &state->observer;
+    const bool runs_out = state->predictive.missing_q24 != 0;
+    const int32_t slip_q22 = fixed_abs(fixed_subtract(state->speed_reference_q22, observer->speed_q22));
+    const misalignment_sample_t learned = {
+        .current_q9 = e->current_q9,
+        .angle = e->commutation.angle,
+        .torque_q24 = reference_q24,
+        .steady =
+            observer_bandwidth_steady(&state->bandwidth) && slip_q22 < fixed_abs(observer->speed_q22) / 64 && !runs_out,
+    };
+    misalignment_step(&parameters->misalignment, &state->misalignment, tables, observer, &learned);
+
+    /* From the sample to two periods behind it: to the observer's angle and one period on. */
+    const uint32_t step = (uint32_t)fixed_shift((int64_t)observer->speed_q22 * parameters->observer.angle_step_q32, 32);
+    const uint32_t ahead = ((uint32_t)(observer->angle_q64 >> 32) + step - e->angle) * tables->rotor_poles;
+    uint32_t angle[HAL_PHASES_MAX];
+    for (unsigned phase = 0; phase < tables->phases; phase++) {
+        angle[phase] = e->commutation.angle[phase] + ahead;
+    }
+    const predictive_torque_sample_t sample = {
+        .current_q9 = e->current_q9,
+        .flux_q29 = e->flux_q29,
+        .angle = angle,
+        .bus_voltage_q6 = e->bus_voltage_q6,
+        .torque_q24 = torque_trim_step(&parameters->trim, &state->trim, reference_q24, e->torque_sum_q24, runs_out),
+        .backwards = observer->speed_q22 < 0,
+    };
+    predictive_torque_step(&parameters->predictive, &state->predictive, tables, &sample, duty_q15);
+}
+
 static void complete_record(fault_record_t *record, const control_sample_t *sample, const estimate_t *e,
                             const control_diagnostics_t *last) {
     record->time_us = sample->time_us;
@@ -110,17 +184,29 @@ static void complete_record(fault_record_t *record, const control_sample_t *samp
     record->bus_voltage_q6 = (uint16_t)e->bus_voltage_q6;
 }
 
+static int32_t mean_misalignment(const control_parameters_t *parameters, const control_state_t *state) {
+    const int32_t phases = (int32_t)parameters->tables->phases;
+    int64_t sum = 0;
+    for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
+        sum += misalignment_offset(&parameters->misalignment, &state->misalignment, phase);
+    }
+    return (int32_t)sum / (phases * parameters->tables->rotor_poles);
+}
+
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   hal_pwm_compare_t *compare, control_diagnostics_t *diagnostics) {
-    const estimate_t e = estimate(parameters, sample);
+    const estimate_t e = estimate(parameters, state, sample);
     state_machine_t *machine = &state->machine;
     const drive_state_t before = machine->state;
     if (!state->started) {
         state->started = true;
         load_observer_reset(&state->observer, e.angle);
+        observer_bandwidth_reset(&state->bandwidth);
         protection_reset(&state->protection, e.angle);
     }
-    load_observer_step(&parameters->observer, &state->observer, e.angle, e.torque_sum_q24);
+    const load_observer_gains_t *gains = observer_bandwidth_step(
+        &parameters->bandwidth, &state->bandwidth, load_observer_innovation(&state->observer, e.angle), e.from_edge);
+    load_observer_step(&parameters->observer, gains, &state->observer, e.angle, e.torque_sum_q24);
 
     const protection_sample_t checked = {
         .current_max_q9 = e.current_max_q9,
@@ -141,25 +227,38 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     if (before == DRIVE_STATE_FAULT && machine->state == DRIVE_STATE_READY) {
         /* Whatever the encoder did in between, believe it anew. */
         load_observer_reset(&state->observer, e.angle);
+        observer_bandwidth_reset(&state->bandwidth);
     }
     if (before != DRIVE_STATE_RUN && machine->state == DRIVE_STATE_RUN) {
         start_laws(parameters, state);
     }
 
     const bool run = machine->state == DRIVE_STATE_RUN;
+    const bool salient = parameters->controller == DRIVE_CONTROLLER_SALIENT;
     int32_t torque_reference_q24 = 0;
     *compare = (hal_pwm_compare_t){{0}, {0}};
     bool saturated = false;
     if (run) {
         const bool stopping = sample->command.request != COMMAND_RUN;
-        follow_ramp(parameters, state, stopping ? 0 : sample->command.speed_reference_q22);
-        /* This drive motors in one direction: less torque than none is not to be had. */
-        torque_reference_q24 = fixed_clamp(regulate_speed(parameters, state), 0, INT32_MAX);
+        const int32_t asked_q22 = sample->command.speed_reference_q22;
+        follow_ramp(parameters, state, stopping || (asked_q22 < 0 && !salient) ? 0 : asked_q22);
+        torque_reference_q24 = regulate_speed(parameters, state, &sample->adc);
         int32_t duty_q15[HAL_PHASES_MAX] = {0};
-        regulate_torque(parameters, state, &e, torque_reference_q24, duty_q15);
+        if (salient) {
+            predict_torque(parameters, state, &e, torque_reference_q24, duty_q15);
+            saturated = state->predictive.missing_q24 != 0;
+        } else {
+            /* These motor in one direction: less torque than none is not to be had. */
+            torque_reference_q24 = fixed_clamp(torque_reference_q24, 0, INT32_MAX);
+            switch_by_torque(parameters, state, &e, torque_reference_q24, duty_q15);
+        }
         for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
-            pwm_set_phase(compare, phase, duty_q15[phase], parameters->period_ticks);
-            saturated = saturated || duty_q15[phase] == DUTY_ONE_Q15;
+            if (salient && parameters->two_pulses) {
+                pwm_set_phase_twice(compare, phase, duty_q15[phase], parameters->period_ticks);
+            } else {
+                pwm_set_phase(compare, phase, duty_q15[phase], parameters->period_ticks);
+            }
+            saturated = saturated || (!salient && duty_q15[phase] == DUTY_ONE_Q15);
         }
     } else {
         state->speed_reference_q22 = 0;
@@ -177,5 +276,9 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     diagnostics->bus_voltage_q6 = (uint16_t)e.bus_voltage_q6;
     diagnostics->duty_q15 = (int32_t)fixed_shift(state->duty.pid.duty_q30, 15);
     diagnostics->voltage_saturated = saturated;
+    diagnostics->trim_torque_q24 = run && salient ? state->trim.trim_q24 : 0;
+    diagnostics->misalignment = mean_misalignment(parameters, state);
+    diagnostics->torque_missing_q24 = run && salient ? state->predictive.missing_q24 : 0;
+    diagnostics->observer_bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[state->bandwidth.stage];
     return run;
 }

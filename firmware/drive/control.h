@@ -1,8 +1,8 @@
 /* The control interrupt as one function of parameters, state and sample: a unit test, the host loop and an interrupt
  * handler call the same one.
  *
- *   counts -> currents, angle -> observer, phase torques -> checks -> state machine -> speed law -> torque law ->
- * compare
+ *   counts -> currents, angle -> phase torques -> observer -> checks -> state machine -> speed law -> torque law ->
+ *   compare
  */
 #ifndef DRIVE_CONTROL_H
 #define DRIVE_CONTROL_H
@@ -15,8 +15,12 @@
 #include "control/ditc_hysteresis.h"
 #include "control/load_observer.h"
 #include "control/machine_tables.h"
+#include "control/misalignment.h"
+#include "control/observer_bandwidth.h"
+#include "control/predictive_torque.h"
 #include "control/speed_pi.h"
 #include "control/speed_smc.h"
+#include "control/torque_trim.h"
 #include "drive/command.h"
 #include "drive/protection.h"
 #include "drive/state_machine.h"
@@ -35,27 +39,37 @@ typedef enum {
 typedef struct {
     const machine_tables_t *tables;
     drive_controller_t controller;
+    bool two_pulses;           /* a period, of the salient controller */
+    bool load_from_transducer; /* the sliding mode takes the measured load torque, not the observer's */
     uint16_t period_ticks;
     uint8_t encoder_shift;     /* counts to 2^-32 turn */
     uint8_t adc_bits;          /* of a code, 12..16 */
     uint32_t initialise_ticks; /* periods in 1 ms */
     int32_t speed_ramp_q22;    /* rad/s a period, Q9.22; INT32_MAX: no ramp */
-    load_observer_parameters_t observer;
+    load_observer_model_t observer;
+    observer_bandwidth_parameters_t bandwidth;
     speed_pi_parameters_t speed_pi;
     speed_smc_parameters_t speed_smc;
     commutation_parameters_t commutation;
     ditc_hysteresis_parameters_t hysteresis;
     ditc_duty_parameters_t duty;
+    torque_trim_parameters_t trim;
+    predictive_torque_parameters_t predictive;
+    misalignment_parameters_t misalignment;
     protection_parameters_t protection;
 } control_parameters_t;
 
 typedef struct {
     bool started; /* the first sample has set the observer's angle */
     load_observer_t observer;
+    observer_bandwidth_t bandwidth;
+    misalignment_t misalignment; /* of the machine: outlives a run */
     int32_t speed_reference_q22; /* behind the ramp */
     speed_pi_t speed_pi;
     ditc_hysteresis_t hysteresis;
     ditc_duty_t duty;
+    torque_trim_t trim;
+    predictive_torque_t predictive;
     protection_t protection;
     state_machine_t machine;
 } control_state_t;
@@ -80,6 +94,11 @@ typedef struct {
     uint16_t bus_voltage_q6;
     int32_t duty_q15; /* of the BP-PID */
     bool voltage_saturated;
+    /* Of the salient controller, 0 with the others. */
+    int32_t trim_torque_q24;
+    int32_t misalignment;       /* mean of the phases, 2^-32 turn */
+    int32_t torque_missing_q24; /* reference less what the voltage allows */
+    uint16_t observer_bandwidth_rad_s;
 } control_diagnostics_t;
 
 /* INITIALISE, everything at rest. */

@@ -24,6 +24,7 @@ bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, cons
     parameters_set_default(&drive->parameters, PARAMETER_CONTROLLER, (int32_t)config->controller);
     parameters_set_default(&drive->parameters, PARAMETER_INERTIA_KG_M2, tables->inertia_q30);
     parameters_set_default(&drive->parameters, PARAMETER_FRICTION_NM_S, tables->friction_q30);
+    parameters_set_default(&drive->parameters, PARAMETER_RESISTANCE_OHM, tables->resistance_q24);
     comms_init(&drive->comms, tables->phases, config->control_rate_hz, hal_time_us(hal));
     control_reset(&drive->control);
     configure(drive);
@@ -74,6 +75,10 @@ static telemetry_snapshot_t snapshot(const drive_t *drive, uint32_t time_us) {
         .ki_q15 = gain_per_Nm_q15(drive, 1),
         .kd_q15 = gain_per_Nm_q15(drive, 2),
         .duty_q15 = d->duty_q15,
+        .trim_torque_q24 = d->trim_torque_q24,
+        .misalignment = d->misalignment,
+        .torque_missing_q24 = d->torque_missing_q24,
+        .observer_bandwidth_rad_s = d->observer_bandwidth_rad_s,
         .last_fault = machine->record,
     };
     for (unsigned phase = 0; phase < TELEMETRY_PHASES; phase++) {

@@ -7,7 +7,7 @@
 
 /* Angles are in electrical degrees of a rotor pitch as the phase sees them: 180 unaligned, 360 aligned. */
 static const parameter_row_t rows[PARAMETER_COUNT] = {
-    [PARAMETER_CONTROLLER] = {"controller", "", 0, 0, 1, 0},
+    [PARAMETER_CONTROLLER] = {"controller", "", 0, 0, 2, 0},
     /* 0: the reference steps */
     [PARAMETER_SPEED_RAMP_RPM_S] = {"speed_ramp_rpm_s", "r/min/s", 0, 0, 1000000, 0},
     [PARAMETER_TORQUE_MAX_NM] = {"torque_max_Nm", "N m", 24, 0, Q(40, 1, 24), Q(191, 10, 24)},
@@ -46,6 +46,33 @@ static const parameter_row_t rows[PARAMETER_COUNT] = {
     /* The plant that the laws assume; the machine's tables give the defaults. */
     [PARAMETER_INERTIA_KG_M2] = {"inertia_kg_m2", "kg m^2", 30, Q(1, 10000, 30), Q(19, 10, 30), Q(2, 100, 30)},
     [PARAMETER_FRICTION_NM_S] = {"friction_Nm_s", "N m s", 30, 0, Q(19, 10, 30), Q(2, 100, 30)},
+    [PARAMETER_RESISTANCE_OHM] = {"resistance_ohm", "ohm", 24, 0, Q(20, 1, 24), Q(5, 100, 24)},
+    /* Of the sliding mode: 0 the observer, 1 a transducer on the shaft. */
+    [PARAMETER_LOAD_SOURCE] = {"load_source", "", 0, 0, 1, 0},
+
+    /* From here on the salient controller. 0: its observer keeps the steady bandwidth. */
+    [PARAMETER_OBSERVER_WAKING] = {"observer_waking", "", 0, 0, 1, 1},
+    [PARAMETER_OBSERVER_WAKE_RAD_S] = {"observer_wake_rad_s", "rad/s", 0, 100, 10000, 9000},
+    [PARAMETER_OBSERVER_STEADY_RAD_S] = {"observer_steady_rad_s", "rad/s", 0, 100, 10000, 300},
+    [PARAMETER_PULSES_PER_PERIOD] = {"pulses_per_period", "", 0, 1, 2, 2},
+    /* 0: one phase at a time */
+    [PARAMETER_TORQUE_SHARING] = {"torque_sharing", "", 0, 0, 1, 1},
+    [PARAMETER_SHARE_ON_ANGLE_DEG] = {"share_on_angle_deg", "deg", 7, Q(180, 1, 7), Q(240, 1, 7), Q(184, 1, 7)},
+    [PARAMETER_SHARE_OFF_ANGLE_DEG] = {"share_off_angle_deg", "deg", 7, Q(300, 1, 7), Q(360, 1, 7), Q(356, 1, 7)},
+    /* How much earlier each where voltage runs out. */
+    [PARAMETER_SHARE_ON_EARLY_DEG] = {"share_on_early_deg", "deg", 7, 0, Q(60, 1, 7), Q(24, 1, 7)},
+    [PARAMETER_SHARE_OFF_EARLY_DEG] = {"share_off_early_deg", "deg", 7, 0, Q(60, 1, 7), Q(16, 1, 7)},
+    [PARAMETER_TORQUE_RESERVE_NM] = {"torque_reserve_Nm", "N m", 24, 0, Q(20, 1, 24), 0},
+    [PARAMETER_FLUX_OBSERVER_GAIN] = {"flux_observer_gain", "", 15, 0, Q(1, 1, 15), Q(3, 10, 15)},
+    /* 0: the misalignment known so far stays */
+    [PARAMETER_ANGLE_TRIM] = {"angle_trim", "", 0, 0, 1, 1},
+    [PARAMETER_ANGLE_TRIM_RATE_1_S] = {"angle_trim_rate_1_s", "1/s", 0, 1, 100, 12},
+    /* As bp_mode. */
+    [PARAMETER_BP_TRIM_MODE] = {"bp_trim_mode", "", 0, 0, 3, 0},
+    [PARAMETER_BP_TRIM_LIMIT_NM] = {"bp_trim_limit_Nm", "N m", 24, Q(1, 10, 24), Q(20, 1, 24), Q(3, 1, 24)},
+    [PARAMETER_BP_TRIM_KP_MAX] = {"bp_trim_kp_max", "", 15, 0, Q(2, 1, 15) - 1, Q(1, 10, 15)},
+    [PARAMETER_BP_TRIM_KI_MAX] = {"bp_trim_ki_max", "", 15, 0, Q(2, 1, 15) - 1, Q(1, 10, 15)},
+    [PARAMETER_BP_TRIM_KD_MAX] = {"bp_trim_kd_max", "", 15, 0, Q(2, 1, 15) - 1, Q(5, 100, 15)},
 };
 
 void parameters_init(parameters_t *parameters) {

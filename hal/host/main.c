@@ -163,7 +163,7 @@ int main(int argc, char *argv[]) {
     hal_t hal = {.board = &rig.board};
     const drive_config_t drive_config = {
         .control_rate_hz = options.control_rate_hz,
-        .controller = options.controller_index == 0 ? DRIVE_CONTROLLER_TRADITIONAL : DRIVE_CONTROLLER_PAPER,
+        .controller = (drive_controller_t)options.controller_index,
     };
     int exit_code = 0;
     if (drive_init(&drive, &hal, &machine_tables, &drive_config)) {

@@ -12,7 +12,7 @@
 #include "hal_adc.h"
 #include "rig/can_bus.h"
 
-const char *const options_controllers[] = {"traditional", "paper", NULL};
+const char *const options_controllers[] = {"traditional", "paper", "salient", NULL};
 
 static const char usage[] =
     "usage: %s --can unix:PATH|socketcan:INTERFACE [option...]\n"
@@ -128,7 +128,7 @@ static options_result_t take(options_t *options, int option, const char *text) {
                 return OPTIONS_RUN;
             }
         }
-        return mistake("--controller %s: allowed are traditional and paper", text);
+        return mistake("--controller %s: allowed are traditional, paper and salient", text);
     case OPTION_CONTROL_RATE:
         if (!read_integer(text, UINT32_MAX, &integer) ||
             (integer != 20000 && integer != 40000 && integer != 50000 && integer != 100000 && integer != 1000000)) {

@@ -55,7 +55,7 @@ def start(program: str, tmp_path: Path) -> Iterator:
         (["--can", "socketcan:nosuch0"], ["socketcan:nosuch0"]),
         (["--can", "BUS", "--pace", "fast"], ["--pace fast", "lockstep, realtime, free and xN"]),
         (["--can", "BUS", "--pace", "x0"], ["--pace x0", "0.01 to 1000"]),
-        (["--can", "BUS", "--controller", "pid"], ["--controller pid", "traditional and paper"]),
+        (["--can", "BUS", "--controller", "pid"], ["--controller pid", "traditional, paper and salient"]),
         (["--can", "BUS", "--control-rate-hz", "44000"], ["44000", "20000, 40000, 50000, 100000 and 1000000"]),
         (["--can", "BUS", "--encoder-bits", "7"], ["--encoder-bits 7", "8 to 24"]),
         (["--can", "BUS", "--adc-bits", "11"], ["--adc-bits 11", "12 to 16"]),

@@ -151,7 +151,7 @@ TEST_F(Comms, signals_carry_the_snapshot) {
     snapshot.kd_q15 = 70000;
     snapshot.duty_q15 = -32769;
     snapshot.trim_torque_q24 = -3 * (1 << 24);
-    snapshot.angle_trim_q24 = (1 << 24) / 8;
+    snapshot.misalignment = 1 << 20;
     snapshot.torque_missing_q24 = INT32_MAX;
     snapshot.observer_bandwidth_rad_s = 8000;
     run(3000);
@@ -186,7 +186,7 @@ TEST_F(Comms, signals_carry_the_snapshot) {
     drive_drive_trim_t trim;
     drive_drive_trim_unpack(&trim, first(DRIVE_DRIVE_TRIM_FRAME_ID).data, 8);
     EXPECT_EQ(trim.trim_torque_nm, -768);
-    EXPECT_EQ(trim.angle_trim_nm, 32);
+    EXPECT_EQ(trim.misalignment_deg, 256);
     EXPECT_EQ(trim.torque_missing_nm, 32767);
     EXPECT_EQ(trim.observer_bandwidth_rad_s, 8000);
     drive_drive_heartbeat_t heartbeat;

@@ -17,21 +17,32 @@ constexpr double INERTIA_KG_M2 = 0.02;
 constexpr double FRICTION_NM_S = 0.02;
 constexpr double RATE_HZ = 40000.0;
 
-load_observer_parameters_t configure(double bandwidth_rad_s, double rate_hz = RATE_HZ, double inertia = INERTIA_KG_M2,
-                                     double friction = FRICTION_NM_S) {
-    return load_observer_configure(uint32_t(bandwidth_rad_s), uint32_t(rate_hz), twins::to_fixed(inertia, twins::Q30),
-                                   twins::to_fixed(friction, twins::Q30));
+struct observer_parameters_t {
+    load_observer_gains_t gains;
+    load_observer_model_t model;
+};
+
+observer_parameters_t configure(double bandwidth_rad_s, double rate_hz = RATE_HZ, double inertia = INERTIA_KG_M2,
+                                double friction = FRICTION_NM_S) {
+    const int32_t inertia_q30 = twins::to_fixed(inertia, twins::Q30);
+    return {load_observer_gains(uint32_t(bandwidth_rad_s), uint32_t(rate_hz), inertia_q30),
+            load_observer_model(uint32_t(rate_hz), inertia_q30, twins::to_fixed(friction, twins::Q30))};
+}
+
+int32_t observe(const observer_parameters_t &p, load_observer_t *observer, uint32_t angle, int32_t torque_q24) {
+    load_observer_step(&p.model, &p.gains, observer, angle, torque_q24);
+    return observer->innovation;
 }
 
 // The twin of what the parameters hold after rounding.
-twins::observer_t twin_of(const load_observer_parameters_t &p) {
+twins::observer_t twin_of(const observer_parameters_t &p) {
     twins::observer_t twin{};
-    twin.angle_gain = p.angle_gain_q30 / twins::Q30;
-    twin.speed_gain = p.speed_gain_q24 / twins::Q24 * twins::TURN / twins::Q22;
-    twin.torque_gain = double(p.torque_gain_q20) / twins::Q20 * twins::TURN / twins::Q24;
-    twin.acceleration = p.acceleration_q32 / twins::Q32 * twins::Q24 / twins::Q22;
-    twin.friction = p.friction_q30 / twins::Q30;
-    twin.angle_step = p.angle_step_q32 / twins::Q32 * twins::Q22 / twins::TURN;
+    twin.angle_gain = p.gains.angle_gain_q30 / twins::Q30;
+    twin.speed_gain = p.gains.speed_gain_q24 / twins::Q24 * twins::TURN / twins::Q22;
+    twin.torque_gain = double(p.gains.torque_gain_q20) / twins::Q20 * twins::TURN / twins::Q24;
+    twin.acceleration = p.model.acceleration_q32 / twins::Q32 * twins::Q24 / twins::Q22;
+    twin.friction = p.model.friction_q30 / twins::Q30;
+    twin.angle_step = p.model.angle_step_q32 / twins::Q32 * twins::Q22 / twins::TURN;
     return twin;
 }
 
@@ -66,22 +77,24 @@ TEST(LoadObserver, gains_are_within_0_1_percent_and_1_lsb_over_the_whole_range) 
     for (const double rate_hz : {20000.0, 40000.0, 50000.0, 100000.0}) {
         for (double bandwidth = 100.0; bandwidth <= 8000.0; bandwidth = std::floor(bandwidth * 1.05) + 1.0) {
             for (const double inertia : {1e-4, 3e-4, 1e-3, 5e-3, 0.02, 0.1, 0.5, 1.9, 1.9999}) {
-                const load_observer_parameters_t p = configure(bandwidth, rate_hz, inertia);
+                const observer_parameters_t p = configure(bandwidth, rate_hz, inertia);
                 const twins::observer_t ideal = twins::observer_t::ideal(
                     bandwidth, rate_hz, twins::to_fixed(inertia, twins::Q30) / twins::Q30, FRICTION_NM_S);
                 SCOPED_TRACE(testing::Message()
                              << bandwidth << " rad/s, " << rate_hz << " Hz, " << inertia << " kg m^2");
-                ASSERT_NO_FATAL_FAILURE(expect_gain(p.angle_gain_q30, ideal.angle_gain * twins::Q30, "angle"));
-                ASSERT_NO_FATAL_FAILURE(
-                    expect_gain(p.speed_gain_q24, ideal.speed_gain * twins::Q22 / twins::TURN * twins::Q24, "speed"));
+                ASSERT_NO_FATAL_FAILURE(expect_gain(p.gains.angle_gain_q30, ideal.angle_gain * twins::Q30, "angle"));
+                ASSERT_NO_FATAL_FAILURE(expect_gain(p.gains.speed_gain_q24,
+                                                    ideal.speed_gain * twins::Q22 / twins::TURN * twins::Q24, "speed"));
+                ASSERT_NO_FATAL_FAILURE(expect_gain(double(p.gains.torque_gain_q20),
+                                                    ideal.torque_gain * twins::Q24 / twins::TURN * twins::Q20,
+                                                    "torque"));
+                ASSERT_NO_FATAL_FAILURE(expect_gain(p.model.acceleration_q32,
+                                                    ideal.acceleration * twins::Q22 / twins::Q24 * twins::Q32,
+                                                    "acceleration"));
                 ASSERT_NO_FATAL_FAILURE(expect_gain(
-                    double(p.torque_gain_q20), ideal.torque_gain * twins::Q24 / twins::TURN * twins::Q20, "torque"));
-                ASSERT_NO_FATAL_FAILURE(expect_gain(
-                    p.acceleration_q32, ideal.acceleration * twins::Q22 / twins::Q24 * twins::Q32, "acceleration"));
-                ASSERT_NO_FATAL_FAILURE(expect_gain(
-                    p.angle_step_q32, ideal.angle_step * twins::TURN / twins::Q22 * twins::Q32, "angle step"));
-                ASSERT_EQ(p.friction_q30, twins::to_fixed(FRICTION_NM_S, twins::Q30));
-                ASSERT_LT(p.torque_gain_q20, int64_t(1) << 40);
+                    p.model.angle_step_q32, ideal.angle_step * twins::TURN / twins::Q22 * twins::Q32, "angle step"));
+                ASSERT_EQ(p.model.friction_q30, twins::to_fixed(FRICTION_NM_S, twins::Q30));
+                ASSERT_LT(p.gains.torque_gain_q20, int64_t(1) << 40);
             }
         }
     }
@@ -94,7 +107,7 @@ struct differences_t {
 
 differences_t largest_differences(double bandwidth, unsigned encoder_bits, double start_turns, double start_speed,
                                   double direction) {
-    const load_observer_parameters_t parameters = configure(bandwidth);
+    const observer_parameters_t parameters = configure(bandwidth);
     twins::observer_t twin = twin_of(parameters);
     rotor_t rotor{start_turns, start_speed};
     load_observer_t observer;
@@ -107,7 +120,7 @@ differences_t largest_differences(double bandwidth, unsigned encoder_bits, doubl
             direction * (4.0 + 3.0 * std::sin(k * 0.01) + std::max(0.0, 0.2 * (40.0 - std::fabs(rotor.speed))));
         const int32_t torque_q24 = twins::to_fixed(torque, twins::Q24);
         const uint32_t measured = rotor.encoder(encoder_bits);
-        load_observer_step(&parameters, &observer, measured, torque_q24);
+        observe(parameters, &observer, measured, torque_q24);
         twin.step(measured / twins::TURN, torque_q24 / twins::Q24);
         double angle = turns_of(observer) - twin.angle;
         angle -= std::round(angle);
@@ -139,14 +152,14 @@ TEST(LoadObserver, follows_its_twin_through_half_a_second_with_a_load_step) {
 
 TEST(LoadObserver, finds_the_load_torque_and_the_speed) {
     for (const double direction : {1.0, -1.0}) {
-        const load_observer_parameters_t parameters = configure(1000.0);
+        const observer_parameters_t parameters = configure(1000.0);
         rotor_t rotor{0.3, direction * 15.7};
         load_observer_t observer;
         load_observer_reset(&observer, rotor.encoder(32));
         double torque = 0.0;
         for (int k = 0; k < 4000; k++) {
             torque = direction * 8.0 + FRICTION_NM_S * rotor.speed;
-            load_observer_step(&parameters, &observer, rotor.encoder(32), twins::to_fixed(torque, twins::Q24));
+            observe(parameters, &observer, rotor.encoder(32), twins::to_fixed(torque, twins::Q24));
             rotor.step(torque, direction * 8.0);
         }
         EXPECT_NEAR(observer.load_torque_q24 / twins::Q24, direction * 8.0, 1e-2);
@@ -156,14 +169,14 @@ TEST(LoadObserver, finds_the_load_torque_and_the_speed) {
 
 TEST(LoadObserver, answers_a_load_step_as_its_three_poles_say) {
     // Three poles at 1000 rad/s: 1 - e^-x (1 + x + x^2/2) of a step after x / 1000 s.
-    const load_observer_parameters_t parameters = configure(1000.0);
+    const observer_parameters_t parameters = configure(1000.0);
     rotor_t rotor{0.0, 100.0};
     load_observer_t observer;
     load_observer_reset(&observer, rotor.encoder(32));
     const auto run = [&](int samples, double load) {
         for (int k = 0; k < samples; k++) {
             const double torque = FRICTION_NM_S * rotor.speed;
-            load_observer_step(&parameters, &observer, rotor.encoder(32), twins::to_fixed(torque, twins::Q24));
+            observe(parameters, &observer, rotor.encoder(32), twins::to_fixed(torque, twins::Q24));
             rotor.step(torque, load);
         }
     };
@@ -181,14 +194,14 @@ TEST(LoadObserver, catches_a_turning_rotor_from_rest) {
     for (const double rate_hz : {20000.0, 40000.0, 100000.0}) {
         for (const double bandwidth : {100.0, 300.0, 1000.0, 4000.0, 8000.0}) {
             for (const double speed : {-300.0, -30.0, 15.0, 100.0, 300.0, 400.0}) {
-                const load_observer_parameters_t parameters = configure(bandwidth, rate_hz);
+                const observer_parameters_t parameters = configure(bandwidth, rate_hz);
                 rotor_t rotor{0.7, speed};
                 load_observer_t observer;
                 load_observer_reset(&observer, rotor.encoder(32));
                 double fastest = 0.0, caught_s = 0.0;
                 for (int k = 0; k < int(20.0 / bandwidth * rate_hz); k++) {
                     const double torque = FRICTION_NM_S * speed;
-                    load_observer_step(&parameters, &observer, rotor.encoder(32), twins::to_fixed(torque, twins::Q24));
+                    observe(parameters, &observer, rotor.encoder(32), twins::to_fixed(torque, twins::Q24));
                     rotor.step(torque, 0.0, rate_hz);
                     const double estimate = observer.speed_q22 / twins::Q22;
                     fastest = std::max(fastest, std::fabs(estimate));
@@ -209,7 +222,7 @@ TEST(LoadObserver, catches_a_turning_rotor_from_rest) {
 
 TEST(LoadObserver, the_angle_wraps_without_a_step_in_either_direction) {
     for (const double direction : {1.0, -1.0}) {
-        const load_observer_parameters_t parameters = configure(1000.0);
+        const observer_parameters_t parameters = configure(1000.0);
         rotor_t rotor{0.0, direction * 300.0};
         load_observer_t observer;
         load_observer_reset(&observer, rotor.encoder(32));
@@ -217,7 +230,7 @@ TEST(LoadObserver, the_angle_wraps_without_a_step_in_either_direction) {
         for (int k = 0; k < 20000; k++) { // some 24 turns
             const double torque = FRICTION_NM_S * rotor.speed;
             const int32_t innovation =
-                load_observer_step(&parameters, &observer, rotor.encoder(32), twins::to_fixed(torque, twins::Q24));
+                observe(parameters, &observer, rotor.encoder(32), twins::to_fixed(torque, twins::Q24));
             if (k > 4000) {
                 largest = std::max(largest, std::abs(innovation));
             }
@@ -228,26 +241,26 @@ TEST(LoadObserver, the_angle_wraps_without_a_step_in_either_direction) {
 }
 
 TEST(LoadObserver, a_jump_of_the_encoder_is_limited_and_forgotten) {
-    const load_observer_parameters_t parameters = configure(1000.0);
+    const observer_parameters_t parameters = configure(1000.0);
     load_observer_t observer;
     load_observer_reset(&observer, 0);
     // The innovation is reported whole, modulo a turn.
-    EXPECT_EQ(load_observer_step(&parameters, &observer, 0x40000000u, 0), 0x40000000);
+    EXPECT_EQ(observe(parameters, &observer, 0x40000000u, 0), 0x40000000);
     load_observer_reset(&observer, 0x10u);
-    EXPECT_EQ(load_observer_step(&parameters, &observer, 0xFFFFFFF0u, 0), -0x20);
+    EXPECT_EQ(observe(parameters, &observer, 0xFFFFFFF0u, 0), -0x20);
     load_observer_reset(&observer, 0);
-    EXPECT_EQ(load_observer_step(&parameters, &observer, 0x80000000u, 0), INT32_MIN);
+    EXPECT_EQ(observe(parameters, &observer, 0x80000000u, 0), INT32_MIN);
     // It corrects as a 32nd of a turn would, and the estimate comes back.
     load_observer_t other;
     load_observer_reset(&observer, 0);
     load_observer_reset(&other, 0);
-    load_observer_step(&parameters, &observer, 0x40000000u, 0);
-    load_observer_step(&parameters, &other, 1u << 27, 0);
+    observe(parameters, &observer, 0x40000000u, 0);
+    observe(parameters, &other, 1u << 27, 0);
     EXPECT_EQ(observer.angle_q64, other.angle_q64);
     EXPECT_EQ(observer.speed_q22, other.speed_q22);
     EXPECT_EQ(observer.load_torque_q24, other.load_torque_q24);
     for (int k = 0; k < 8000; k++) {
-        load_observer_step(&parameters, &observer, 0, 0);
+        observe(parameters, &observer, 0, 0);
     }
     EXPECT_NEAR(observer.speed_q22 / twins::Q22, 0.0, 1e-3);
     EXPECT_NEAR(observer.load_torque_q24 / twins::Q24, 0.0, 1e-2);
@@ -258,7 +271,7 @@ TEST(LoadObserver, every_estimate_saturates_and_none_overflows) {
     for (const double rate_hz : {20000.0, 100000.0}) {
         for (const double bandwidth : {100.0, 8000.0}) {
             for (const double inertia : {1e-4, 1.9}) {
-                const load_observer_parameters_t parameters = configure(bandwidth, rate_hz, inertia, 1.9);
+                const observer_parameters_t parameters = configure(bandwidth, rate_hz, inertia, 1.9);
                 for (const int32_t torque_q24 : {INT32_MIN, INT32_MAX, 0}) {
                     load_observer_t observer;
                     load_observer_reset(&observer, 0);
@@ -266,7 +279,7 @@ TEST(LoadObserver, every_estimate_saturates_and_none_overflows) {
                         const uint32_t angle = k < 1000   ? observer.angle_q64 / (uint64_t(1) << 32) + (1u << 30)
                                                : k < 2000 ? observer.angle_q64 / (uint64_t(1) << 32) - (1u << 30)
                                                           : uint32_t(random());
-                        load_observer_step(&parameters, &observer, angle, torque_q24);
+                        observe(parameters, &observer, angle, torque_q24);
                         ASSERT_LE(std::abs(observer.load_torque_q24), 60 << 24);
                     }
                 }
@@ -274,11 +287,11 @@ TEST(LoadObserver, every_estimate_saturates_and_none_overflows) {
         }
     }
     // Pushed forwards for ever: the speed holds at the end of Q9.22, the load at -60 N m.
-    const load_observer_parameters_t parameters = configure(1000.0);
+    const observer_parameters_t parameters = configure(1000.0);
     load_observer_t observer;
     load_observer_reset(&observer, 0);
     for (int k = 0; k < 20000; k++) {
-        load_observer_step(&parameters, &observer, uint32_t(observer.angle_q64 >> 32) + (1u << 29), 0);
+        observe(parameters, &observer, uint32_t(observer.angle_q64 >> 32) + (1u << 29), 0);
     }
     EXPECT_EQ(observer.speed_q22, INT32_MAX);
     EXPECT_EQ(observer.load_torque_q24, -(60 << 24));

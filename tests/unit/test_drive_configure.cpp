@@ -98,12 +98,17 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("timeout", c.protection.command_timeout_us, 1000.0 * v(PARAMETER_COMMAND_TIMEOUT_MS), 0.0);
 
     // The observer's gains have a test of their own; here, that the right parameters get there.
-    const load_observer_parameters_t observer =
-        load_observer_configure(uint32_t(p.values[PARAMETER_OBSERVER_BANDWIDTH_RAD_S]), uint32_t(rate_hz),
-                                p.values[PARAMETER_INERTIA_KG_M2], p.values[PARAMETER_FRICTION_NM_S]);
-    ASSERT_EQ(c.observer.angle_gain_q30, observer.angle_gain_q30);
-    ASSERT_EQ(c.observer.speed_gain_q24, observer.speed_gain_q24);
-    ASSERT_EQ(c.observer.torque_gain_q20, observer.torque_gain_q20);
+    const uint32_t rate = uint32_t(rate_hz);
+    const int32_t inertia_q30 = p.values[PARAMETER_INERTIA_KG_M2];
+    const load_observer_model_t observer = load_observer_model(rate, inertia_q30, p.values[PARAMETER_FRICTION_NM_S]);
+    const bool salient = p.values[PARAMETER_CONTROLLER] == DRIVE_CONTROLLER_SALIENT;
+    const load_observer_gains_t gains = load_observer_gains(
+        uint32_t(p.values[salient ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S]), rate,
+        inertia_q30);
+    const load_observer_gains_t &steady = c.bandwidth.gains[OBSERVER_BANDWIDTH_STAGES - 1];
+    ASSERT_EQ(steady.angle_gain_q30, gains.angle_gain_q30);
+    ASSERT_EQ(steady.speed_gain_q24, gains.speed_gain_q24);
+    ASSERT_EQ(steady.torque_gain_q20, gains.torque_gain_q20);
     ASSERT_EQ(c.observer.acceleration_q32, observer.acceleration_q32);
     ASSERT_EQ(c.observer.friction_q30, observer.friction_q30);
 }

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 from salient.compare.options import add_options as add_compare_options
 
-CONTROLLERS = ("traditional", "paper")
+CONTROLLERS = ("traditional", "paper", "salient")
 CONTROL_RATES_HZ = (20_000, 40_000, 50_000, 100_000, 1_000_000)
 ENCODER_BITS = (0, *range(8, 25))
 ADC_BITS = (12, 13, 14, 15, 16)

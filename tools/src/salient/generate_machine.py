@@ -34,6 +34,7 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
             f"    .rotor_poles = {machine.rotor_poles},",
             f"    .inertia_q30 = {quantise(machine.inertia_kg_m2, 30, 32)},",
             f"    .friction_q30 = {quantise(machine.friction_Nm_s, 30, 32)},",
+            f"    .resistance_q24 = {quantise(machine.resistance_ohm, 24, 32)},",
             f"    .current_rise_A_s = {quantise(machine.current_rise_A_s, 0, 32)},",
             "    .row = {",
             *(f"        {{{start}u, {reciprocal}u}}," for start, reciprocal in tables.rows()),
