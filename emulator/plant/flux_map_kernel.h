@@ -93,17 +93,17 @@ MAGNETICS_INLINE void flux_map_kernel(const magnetics_model_t *model, double wra
         }
     }
 
-    const double a = copysign(model->map_steps_1_rad, wrapped_rad), a2 = a * a;
-    const double s = model->map_steps_1_A, s2 = s * s, sa = s * a;
-    *coenergy_J = flux_map_value(&by_angle, energy);
-    point->torque_Nm = a * flux_map_gradient(&by_angle, energy);
-    point->torque_gradient_Nm_rad = a2 * flux_map_curvature(&by_angle, energy);
-    point->flux_linkage_Wb = s * flux_map_value(&by_angle, flux);
-    point->flux_gradient_Wb_rad = sa * flux_map_gradient(&by_angle, flux);
-    point->flux_curvature_Wb_rad2 = sa * a * flux_map_curvature(&by_angle, flux);
-    point->incremental_inductance_H = s2 * flux_map_value(&by_angle, inductance);
-    point->inductance_gradient_H_rad = s * sa * flux_map_gradient(&by_angle, inductance);
-    point->inductance_slope_H_A = s2 * s * flux_map_value(&by_angle, slope);
+    const double a = copysign(model->map_steps_1_rad, wrapped_rad), s = model->map_steps_1_A;
+    const double g = model->map_gain, ga = g * a, gs = g * s, gss = gs * s, gsa = gs * a;
+    *coenergy_J = g * flux_map_value(&by_angle, energy);
+    point->torque_Nm = ga * flux_map_gradient(&by_angle, energy);
+    point->torque_gradient_Nm_rad = ga * a * flux_map_curvature(&by_angle, energy);
+    point->flux_linkage_Wb = gs * flux_map_value(&by_angle, flux);
+    point->flux_gradient_Wb_rad = gsa * flux_map_gradient(&by_angle, flux);
+    point->flux_curvature_Wb_rad2 = gsa * a * flux_map_curvature(&by_angle, flux);
+    point->incremental_inductance_H = gss * flux_map_value(&by_angle, inductance);
+    point->inductance_gradient_H_rad = gsa * s * flux_map_gradient(&by_angle, inductance);
+    point->inductance_slope_H_A = gss * s * flux_map_value(&by_angle, slope);
 }
 
 #endif

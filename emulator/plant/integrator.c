@@ -7,7 +7,6 @@
 MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magnetics_form_t form, bool link,
                                        unsigned count, const integrator_state_t *state,
                                        integrator_derivative_t *derivative) {
-    const machine_t *machine = setting->machine;
     const double speed_rad_s = state->speed_rad_s;
     magnetics_point_t points[HAL_PHASES_MAX];
     double inverse_inductance_1_H[HAL_PHASES_MAX];
@@ -29,7 +28,7 @@ MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magn
             link_A_s += setting->link_sign[index] * current_A_s;
         }
     }
-    const double friction_Nm_s = machine->friction_Nm_s, inverse_inertia = 1.0 / machine->inertia_kg_m2;
+    const double friction_Nm_s = setting->friction_Nm_s, inverse_inertia = 1.0 / setting->inertia_kg_m2;
     const double acceleration_rad_s2 =
         (torque_Nm - friction_Nm_s * speed_rad_s - setting->load_torque_Nm) * inverse_inertia;
     derivative->acceleration_rad_s2 = acceleration_rad_s2;
@@ -37,7 +36,7 @@ MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magn
     derivative->bus_V_s = 0.0;
     derivative->bus_V_s2 = 0.0;
     if (link) {
-        const dc_link_t *dc_link = &machine->dc_link;
+        const dc_link_t *dc_link = &setting->machine->dc_link;
         double conductance_S = 0.0;
         if (setting->source_conducts) {
             conductance_S = 1.0 / dc_link->source_resistance_ohm;

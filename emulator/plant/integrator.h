@@ -21,6 +21,7 @@
 typedef struct {
     const machine_t *machine;
     const magnetics_model_t *magnetics;
+    double inertia_kg_m2, friction_Nm_s;
     double load_torque_Nm, supply_voltage_V;
     double ahead_rad; /* a little angle in the direction of motion, see magnetics_kernel_trapezoid */
     bool link;        /* there is a capacitor: the bus voltage is a state */

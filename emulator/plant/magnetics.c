@@ -62,6 +62,7 @@ void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, u
     if (magnetics->form == MAGNETICS_MAP) {
         model->map = magnetics->map;
         model->map_steps_1_rad = 2.0 * FLUX_MAP_ANGLE_INTERVALS * model->pitches_per_rad;
+        model->map_gain = 1.0;
         model->map_steps_1_A = FLUX_MAP_CURRENT_INTERVALS / magnetics->map->current_max_A;
         model->least_inductance_H = magnetics->map->least_inductance_H;
         model->saturation_A = magnetics->map->current_scale_A;
@@ -88,6 +89,15 @@ void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, u
         model->slope_1_rad = 1.0 / (0.5 * model->pitch_rad - 2.0 * model->flat_rad - model->blend_rad);
         model->curvature_1_rad2 = model->blend_rad > 0.0 ? model->slope_1_rad / model->blend_rad : 0.0;
     }
+}
+
+void magnetics_scale(magnetics_model_t *model, double gain) {
+    model->unaligned_inductance_H *= gain;
+    model->least_inductance_H *= gain;
+    model->linear_excess_H *= gain;
+    model->saturating_Wb *= gain;
+    model->initial_slope_H *= gain;
+    model->map_gain *= gain;
 }
 
 void magnetics_evaluate(const magnetics_model_t *model, double phase_angle_rad, double current_A,

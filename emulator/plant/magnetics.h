@@ -58,7 +58,7 @@ typedef struct {
     double electrical_per_mechanical; /* Nr */
     double flat_rad, blend_rad, slope_1_rad, curvature_1_rad2;
     const flux_map_t *map;
-    double map_steps_1_rad, map_steps_1_A;
+    double map_steps_1_rad, map_steps_1_A, map_gain;
 } magnetics_model_t;
 
 /* One operating point. */
@@ -77,6 +77,9 @@ typedef struct {
 /* Prepares `model` for `magnetics` of a machine with `rotor_poles` poles. The values must be a checked machine file's;
  * they are not checked again. */
 void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, unsigned rotor_poles);
+
+/* Multiplies flux linkage, and with it torque and energies, by `gain` (> 0) at every angle and current. */
+void magnetics_scale(magnetics_model_t *model, double gain);
 
 /* The operating point at a phase angle (any mechanical angle, rad) and a current (A, >= 0; slightly negative values
  * continue the curves smoothly, for the search of a zero). */

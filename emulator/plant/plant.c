@@ -37,18 +37,30 @@ void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_r
     plant->rotor_angle_rad = initial_angle_rad;
     plant->supply_voltage_V = machine->supply_voltage_V;
     plant->bus_voltage_V = machine->supply_voltage_V;
-    magnetics_prepare(&plant->magnetics, &machine->magnetics, machine->rotor_poles);
+    plant->minimum_pulse_ns = machine->converter.minimum_pulse_ns;
+    plant->step_factor = 1.0;
+    plant_set_gains(plant, &(plant_gains_t){1.0, 1.0, 1.0, 1.0});
     plant->phase_offset_rad = plant->magnetics.pitch_rad / machine->phases;
-    for (unsigned on = 0; on < 3; on++) {
-        const converter_t *converter = &machine->converter;
-        plant->drop_V[on] = on * converter->switch_drop_V + (2 - on) * converter->diode_drop_V;
-        plant->resistance_ohm[on] = machine->resistance_ohm + on * converter->switch_resistance_ohm +
-                                    (2 - on) * converter->diode_resistance_ohm;
-    }
-    plant_set_step_factor(plant, 1.0);
     /* Empty: the first step computes it. */
     plant->smooth_from_rad = INFINITY;
     plant->smooth_to_rad = -INFINITY;
+}
+
+void plant_set_gains(plant_t *plant, const plant_gains_t *gains) {
+    const machine_t *machine = plant->machine;
+    plant->gains = *gains;
+    plant->winding_ohm = gains->resistance * machine->resistance_ohm;
+    plant->inertia_kg_m2 = gains->inertia * machine->inertia_kg_m2;
+    plant->friction_Nm_s = gains->friction * machine->friction_Nm_s;
+    magnetics_prepare(&plant->magnetics, &machine->magnetics, machine->rotor_poles);
+    magnetics_scale(&plant->magnetics, gains->flux_linkage);
+    for (unsigned on = 0; on < 3; on++) {
+        const converter_t *converter = &machine->converter;
+        plant->drop_V[on] = on * converter->switch_drop_V + (2 - on) * converter->diode_drop_V;
+        plant->resistance_ohm[on] =
+            plant->winding_ohm + on * converter->switch_resistance_ohm + (2 - on) * converter->diode_resistance_ohm;
+    }
+    plant_set_step_factor(plant, plant->step_factor);
 }
 
 void plant_set_supply_voltage(plant_t *plant, double voltage_V) {
@@ -59,17 +71,17 @@ void plant_set_supply_voltage(plant_t *plant, double voltage_V) {
 }
 
 void plant_set_step_factor(plant_t *plant, double factor) {
-    const machine_t *machine = plant->machine;
     double time_constant_s =
         fmin(plant->magnetics.least_inductance_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
-             machine->inertia_kg_m2 / machine->friction_Nm_s);
+             plant->inertia_kg_m2 / plant->friction_Nm_s);
     if (has_link(plant)) {
-        const dc_link_t *link = &machine->dc_link;
+        const dc_link_t *link = &plant->machine->dc_link;
         time_constant_s = fmin(time_constant_s, link->source_resistance_ohm * link->capacitance_F);
         if (link->chopper_resistance_ohm > 0.0) {
             time_constant_s = fmin(time_constant_s, link->chopper_resistance_ohm * link->capacitance_F);
         }
     }
+    plant->step_factor = factor;
     plant->step_max_s = factor * fmin(STEP_MAX_S, STEP_TIME_CONSTANTS * time_constant_s);
     plant->step_angle_rad = factor * STEP_ANGLE_PITCHES * plant->magnetics.pitch_rad;
     plant->step_current_A = factor * STEP_CURRENT_FRACTION * plant->magnetics.saturation_A;
@@ -78,8 +90,8 @@ void plant_set_step_factor(plant_t *plant, double factor) {
 /* --- Switches --- */
 
 void plant_set_switches(plant_t *plant, const hal_pwm_compare_t *compare, uint16_t period_ticks) {
-    half_bridge_pattern(&plant->pattern, plant->machine->phases, compare, period_ticks,
-                        plant->machine->converter.minimum_pulse_ns, plant->time_ns);
+    half_bridge_pattern(&plant->pattern, plant->machine->phases, compare, period_ticks, plant->minimum_pulse_ns,
+                        plant->time_ns);
     plant->switches = plant->pattern.first;
     plant->edge_next = 0;
 }
@@ -140,6 +152,8 @@ static void find_link(plant_t *plant, integrator_setting_t *setting) {
 static void find_setting(plant_t *plant, integrator_setting_t *setting) {
     setting->machine = plant->machine;
     setting->magnetics = &plant->magnetics;
+    setting->inertia_kg_m2 = plant->inertia_kg_m2;
+    setting->friction_Nm_s = plant->friction_Nm_s;
     setting->load_torque_Nm = plant->load_torque_Nm;
     setting->supply_voltage_V = plant->supply_voltage_V;
     setting->ahead_rad = copysign(2.0 * MAGNETICS_SMOOTH_TOLERANCE_RAD, plant->speed_rad_s);
@@ -358,7 +372,7 @@ static double step_length_s(plant_t *plant, const integrator_setting_t *setting,
 }
 
 static void book(plant_t *plant, const integrator_setting_t *setting, const integrator_integrals_t *integrals) {
-    const double winding_ohm = plant->machine->resistance_ohm;
+    const double winding_ohm = plant->winding_ohm;
     for (unsigned index = 0; index < setting->count; index++) {
         const double charge_As = integrals->charge_As[index], current2_A2s = integrals->current2_A2s[index];
         const double bus_J = setting->link ? integrals->link_J[index] : plant->bus_voltage_V * charge_As;
@@ -373,7 +387,7 @@ static void book(plant_t *plant, const integrator_setting_t *setting, const inte
             setting->drop_V[index] * charge_As + (setting->resistance_ohm[index] - winding_ohm) * current2_A2s;
     }
     plant->energy_load_J += plant->load_torque_Nm * integrals->angle_rad;
-    plant->energy_friction_J += plant->machine->friction_Nm_s * integrals->speed2_rad2_s;
+    plant->energy_friction_J += plant->friction_Nm_s * integrals->speed2_rad2_s;
 }
 
 /* Through source and chopper: integrals of (supply - bus) / Rs, its square, and bus^2 / Rc. */
@@ -488,7 +502,7 @@ double plant_field_energy_J(const plant_t *plant) {
 }
 
 double plant_kinetic_energy_J(const plant_t *plant) {
-    return 0.5 * plant->machine->inertia_kg_m2 * plant->speed_rad_s * plant->speed_rad_s;
+    return 0.5 * plant->inertia_kg_m2 * plant->speed_rad_s * plant->speed_rad_s;
 }
 
 double plant_link_energy_J(const plant_t *plant) {

@@ -41,6 +41,14 @@
 struct plant;
 typedef void (*plant_sample_t)(void *context, const struct plant *plant);
 
+/* The machine's deviations from its file, as factors; 1 is as in the file. */
+typedef struct {
+    double flux_linkage; /* > 0: flux linkage and torque of every phase at the same angle and current */
+    double resistance;   /* > 0: of the windings */
+    double inertia;      /* > 0 */
+    double friction;     /* >= 0 */
+} plant_gains_t;
+
 typedef struct plant {
     /* State, valid at time_ns; read freely. */
     uint64_t time_ns;
@@ -50,8 +58,11 @@ typedef struct plant {
     double bus_voltage_V;
     bool chopper_on;
 
-    /* Input; write at any time, it acts from time_ns. */
+    /* Inputs; write at any time. The load acts from time_ns, the pulse from the next plant_set_switches. */
     double load_torque_Nm;
+    double minimum_pulse_ns;
+
+    plant_gains_t gains; /* read; plant_set_gains changes them */
 
     /* Energy since plant_init. At every instant, with the changes of the energies that are stored:
      * drawn - returned = copper + converter + load + friction
@@ -71,9 +82,10 @@ typedef struct plant {
     /* The rest is plant.c's. */
     const machine_t *machine;
     magnetics_model_t magnetics;
+    double winding_ohm, inertia_kg_m2, friction_Nm_s;
     double phase_offset_rad;
     double drop_V[3], resistance_ohm[3]; /* of a phase with so many switches on, its winding in it */
-    double step_max_s, step_current_A, step_angle_rad;
+    double step_factor, step_max_s, step_current_A, step_angle_rad;
     double smooth_from_rad, smooth_to_rad;
     double supply_voltage_V;
     half_bridge_switches_t switches;
@@ -90,6 +102,11 @@ void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_r
 
 /* The supply's voltage (>= 0) from now on: the bus voltage itself without a capacitor. */
 void plant_set_supply_voltage(plant_t *plant, double voltage_V);
+
+/* The machine is another one from now on. Angle, speed and currents stay, so the energies of fields and rotor jump by
+ * what the change makes of them, and no other term of the ledger takes note: it balances over times without a change.
+ */
+void plant_set_gains(plant_t *plant, const plant_gains_t *gains);
 
 /* A new control period starts now (time_ns): the switches follow `compare` as half_bridge.h says, for
  * 2 * period_ticks timer ticks. After that they stay as they are at the period's end until set again.

@@ -41,6 +41,18 @@ uint8_t quantity_decode(const uint8_t data[8], quantity_setting_t *setting) {
         READ(current_sensor_delay_us);
     case RIG_RIG_SET_QUANTITY_ENCODER_ECCENTRICITY_DEG_CHOICE:
         READ(encoder_eccentricity_deg);
+    case RIG_RIG_SET_QUANTITY_FLUX_LINKAGE_GAIN_CHOICE:
+        READ(flux_linkage_gain);
+    case RIG_RIG_SET_QUANTITY_RESISTANCE_GAIN_CHOICE:
+        READ(resistance_gain);
+    case RIG_RIG_SET_QUANTITY_INERTIA_GAIN_CHOICE:
+        READ(inertia_gain);
+    case RIG_RIG_SET_QUANTITY_FRICTION_GAIN_CHOICE:
+        READ(friction_gain);
+    case RIG_RIG_SET_QUANTITY_ENCODER_OFFSET_DEG_CHOICE:
+        READ(encoder_offset_deg);
+    case RIG_RIG_SET_QUANTITY_MINIMUM_PULSE_NS_CHOICE:
+        READ(minimum_pulse_ns);
     default:
         return RIG_RIG_SET_REPLY_STATUS_NO_SUCH_QUANTITY_CHOICE;
     }

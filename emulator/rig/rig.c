@@ -116,8 +116,14 @@ static void bus_event(rig_t *rig) {
     }
 }
 
+static void set_gains(rig_t *rig, const plant_gains_t *gains) {
+    plant_advance(&rig->plant, rig->board.time_ns);
+    plant_set_gains(&rig->plant, gains);
+}
+
 static void apply(rig_t *rig, const quantity_setting_t *setting) {
     uint64_t now_ns = rig->board.time_ns;
+    plant_gains_t gains = rig->plant.gains;
     switch (setting->quantity) {
     case RIG_RIG_SET_QUANTITY_LOAD_TORQUE_NM_CHOICE:
         plant_advance(&rig->plant, now_ns);
@@ -151,6 +157,28 @@ static void apply(rig_t *rig, const quantity_setting_t *setting) {
         break;
     case RIG_RIG_SET_QUANTITY_ENCODER_ECCENTRICITY_DEG_CHOICE:
         rig->sensors.errors.encoder_eccentricity_deg = setting->value;
+        break;
+    case RIG_RIG_SET_QUANTITY_FLUX_LINKAGE_GAIN_CHOICE:
+        gains.flux_linkage = setting->value;
+        set_gains(rig, &gains);
+        break;
+    case RIG_RIG_SET_QUANTITY_RESISTANCE_GAIN_CHOICE:
+        gains.resistance = setting->value;
+        set_gains(rig, &gains);
+        break;
+    case RIG_RIG_SET_QUANTITY_INERTIA_GAIN_CHOICE:
+        gains.inertia = setting->value;
+        set_gains(rig, &gains);
+        break;
+    case RIG_RIG_SET_QUANTITY_FRICTION_GAIN_CHOICE:
+        gains.friction = setting->value;
+        set_gains(rig, &gains);
+        break;
+    case RIG_RIG_SET_QUANTITY_ENCODER_OFFSET_DEG_CHOICE:
+        rig->sensors.encoder_offset_deg = setting->value;
+        break;
+    case RIG_RIG_SET_QUANTITY_MINIMUM_PULSE_NS_CHOICE:
+        rig->plant.minimum_pulse_ns = setting->value;
         break;
     case RIG_RIG_SET_QUANTITY_TRUTH_PERIOD_US_CHOICE:
         /* On multiples of the period, so that two logs of one bench have the same instants. */

@@ -104,6 +104,26 @@ TEST_F(FluxMap, GivesEveryDerivativeOfThePotential) {
     }
 }
 
+TEST_F(FluxMap, IsScaledAtEveryPoint) {
+    const magnetics_model_t once = model;
+    magnetics_scale(&model, 1.25);
+    EXPECT_DOUBLE_EQ(model.least_inductance_H, 1.25 * once.least_inductance_H);
+    for (const double angle_steps : ANGLES) {
+        for (const double current_steps : CURRENTS) {
+            const double x = angle_steps * STEP_RAD, i = current_steps * STEP_A;
+            magnetics_point_t point, scaled;
+            magnetics_evaluate(&once, x, i, &point);
+            magnetics_evaluate(&model, x, i, &scaled);
+            for (unsigned k = 0; k < sizeof point / sizeof(double); k++) {
+                const double value = reinterpret_cast<const double *>(&point)[k];
+                ASSERT_NEAR(reinterpret_cast<const double *>(&scaled)[k], 1.25 * value, 1e-14 * std::fabs(value)) << k;
+            }
+            const double coenergy_J = magnetics_coenergy_J(&once, x, i);
+            ASSERT_NEAR(magnetics_coenergy_J(&model, x, i), 1.25 * coenergy_J, 1e-14 * std::fabs(coenergy_J));
+        }
+    }
+}
+
 TEST_F(FluxMap, IsEvenAboutTheAlignedPositionAndRepeatsEveryPitch) {
     for (const double angle_steps : {0.3, 17.77, 60.5, 95.99}) {
         const double x = angle_steps * STEP_RAD;

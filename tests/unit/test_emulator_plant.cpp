@@ -285,7 +285,7 @@ double stored_J(const plant_t &plant) {
 
 // A crude controller that visits everything: motoring with two pulses a period, braking, both at changing speed.
 Energies live(plant_t &plant, unsigned periods) {
-    const double before_J = stored_J(plant);
+    const plant_t before = plant;
     for (unsigned period = 0; period < periods; period++) {
         hal_pwm_compare_t compare = {};
         const bool braking = period % 4000 > 2600;
@@ -302,9 +302,11 @@ Energies live(plant_t &plant, unsigned periods) {
         plant_set_supply_voltage(&plant, period % 1000 > 500 ? 240.0 : 210.0);
         plant_advance(&plant, plant.time_ns + PERIOD_NS);
     }
-    const double spent_J = plant.energy_copper_J + plant.energy_load_J + plant.energy_friction_J;
-    const double missing_J = plant.energy_drawn_J - plant.energy_returned_J - spent_J - (stored_J(plant) - before_J);
-    return {plant.energy_drawn_J + plant.energy_returned_J, missing_J};
+    const auto change = [&](double plant_t::*energy_J) { return plant.*energy_J - before.*energy_J; };
+    const double drawn_J = change(&plant_t::energy_drawn_J), returned_J = change(&plant_t::energy_returned_J);
+    const double spent_J =
+        change(&plant_t::energy_copper_J) + change(&plant_t::energy_load_J) + change(&plant_t::energy_friction_J);
+    return {drawn_J + returned_J, drawn_J - returned_J - spent_J - (stored_J(plant) - stored_J(before))};
 }
 
 class Life : public testing::TestWithParam<magnetics_form_t> {
@@ -336,6 +338,59 @@ TEST_P(Life, EqualInputsGiveEqualBits) {
     EXPECT_EQ(plant.rotor_angle_rad, again.rotor_angle_rad);
     EXPECT_EQ(plant.speed_rad_s, again.speed_rad_s);
     EXPECT_EQ(plant.energy_drawn_J, again.energy_drawn_J);
+}
+
+// --- Another machine than the file's ---
+
+TEST_P(Life, GainsMakeTheMachineOfSuchAFile) {
+    machine_t other = machine;
+    other.magnetics.unaligned_inductance_H *= 1.1;
+    other.magnetics.aligned_inductance_H *= 1.1;
+    other.magnetics.saturated_inductance_H *= 1.1;
+    other.magnetics.flux_linkage_max_Wb *= 1.1;
+    other.resistance_ohm *= 1.5;
+    other.inertia_kg_m2 *= 0.5;
+    other.friction_Nm_s *= 3.0;
+    plant_t of_file;
+    plant_init(&of_file, &other, 0.9);
+    const plant_gains_t gains = {1.1, 1.5, 0.5, 3.0};
+    plant_set_gains(&plant, &gains);
+    live(plant, 2000);
+    live(of_file, 2000);
+    // Equal but for rounding, which two lives of this length enlarge.
+    EXPECT_NEAR(plant.speed_rad_s, of_file.speed_rad_s, 1e-7);
+    EXPECT_NEAR(plant.rotor_angle_rad, of_file.rotor_angle_rad, 1e-9);
+    EXPECT_NEAR(plant.energy_copper_J, of_file.energy_copper_J, 1e-7);
+    EXPECT_NEAR(plant.energy_friction_J, of_file.energy_friction_J, 1e-7);
+    EXPECT_NEAR(stored_J(plant), stored_J(of_file), 1e-7);
+    EXPECT_GT(plant.energy_friction_J, 0.01);
+}
+
+TEST_P(Life, GainsOfOneLeaveEveryBit) {
+    plant_t untouched = plant;
+    const plant_gains_t other = {1.3, 0.7, 2.0, 0.0}, one = {1.0, 1.0, 1.0, 1.0};
+    plant_set_gains(&plant, &other);
+    plant_set_gains(&plant, &one);
+    EXPECT_EQ(std::memcmp(&plant, &untouched, sizeof plant), 0);
+}
+
+TEST_P(Life, EnergyIsKeptBetweenChangesOfTheMachineAndJumpsByThemAlone) {
+    live(plant, 3000);
+    for (const plant_gains_t gains : {plant_gains_t{1.1, 1.0, 1.0, 1.0}, plant_gains_t{1.1, 2.0, 0.3, 1.0},
+                                      plant_gains_t{0.7, 0.5, 1.0, 5.0}, plant_gains_t{1.0, 1.0, 3.0, 0.0}}) {
+        const double field_J = plant_field_energy_J(&plant), kinetic_J = plant_kinetic_energy_J(&plant);
+        const double before = plant.gains.inertia, flux_Wb = plant_flux_linkage_Wb(&plant, 1);
+        const double flux_before = plant.gains.flux_linkage;
+        ASSERT_GT(field_J, 1e-3);
+        ASSERT_GT(kinetic_J, 0.01);
+        plant_set_gains(&plant, &gains);
+        EXPECT_NEAR(plant_kinetic_energy_J(&plant), kinetic_J * gains.inertia / before, 1e-12 * kinetic_J);
+        EXPECT_NEAR(plant_field_energy_J(&plant), field_J * gains.flux_linkage / flux_before, 1e-12 * field_J);
+        EXPECT_NEAR(plant_flux_linkage_Wb(&plant, 1), flux_Wb * gains.flux_linkage / flux_before, 1e-12);
+        const Energies energies = live(plant, 3000);
+        EXPECT_GT(energies.turnover_J, 50.0);
+        EXPECT_LT(std::fabs(energies.missing_J), 1e-7 * energies.turnover_J);
+    }
 }
 
 // --- Observation ---

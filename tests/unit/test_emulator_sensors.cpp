@@ -241,6 +241,14 @@ TEST_F(Sensors, EccentricityGoesOnceRoundWithTheRotor) {
     }
 }
 
+TEST_F(Sensors, OffsetIsAddedToTheAngleRead) {
+    sensors.encoder_offset_deg = 0.5;
+    EXPECT_EQ(encoder_counts(0.25), 32768u + 182u) << "0.5 deg of 131072 counts a turn: 182.04";
+    sensors.encoder_offset_deg = -0.5;
+    EXPECT_EQ(encoder_counts(0.25), 32768u - 183u);
+    EXPECT_EQ(encoder_counts(0.0), 131072u - 183u);
+}
+
 TEST_F(Sensors, FrozenEncoderKeepsItsCountUntilHealthy) {
     EXPECT_EQ(encoder_counts(0.25), 32768u);
     sensors.encoder_fault = SENSORS_ENCODER_FROZEN;

@@ -37,9 +37,11 @@ TEST_F(RigQuantities, RangesAreTheDatabases) {
     struct {
         uint8_t quantity;
         int32_t low, high;
-    } ranges[] = {{1, -2000000, 2000000}, {2, 0, 500000},  {3, 0, 2},       {4, 0, 1000000},
-                  {5, 0, 100000},         {6, 0, 1000000}, {7, 0, 1000000}, {8, -100000, 100000},
-                  {9, 100, 1000000},      {10, 0, 800},    {11, 0, 50000}};
+    } ranges[] = {{1, -2000000, 2000000}, {2, 0, 500000},    {3, 0, 2},       {4, 0, 1000000},
+                  {5, 0, 100000},         {6, 0, 1000000},   {7, 0, 1000000}, {8, -100000, 100000},
+                  {9, 100, 1000000},      {10, 0, 800},      {11, 0, 50000},  {12, 2000, 50000},
+                  {13, 2000, 50000},      {14, 2000, 50000}, {15, 0, 50000},  {16, -50000, 50000},
+                  {17, 0, 2000}};
     for (const auto &range : ranges) {
         SCOPED_TRACE(int(range.quantity));
         EXPECT_EQ(set(range.quantity, range.low), DONE);
@@ -47,7 +49,7 @@ TEST_F(RigQuantities, RangesAreTheDatabases) {
         EXPECT_EQ(set(range.quantity, range.low - 1), OUT_OF_RANGE);
         EXPECT_EQ(set(range.quantity, range.high + 1), OUT_OF_RANGE);
     }
-    for (unsigned quantity : {0u, 12u, 128u, 255u}) {
+    for (unsigned quantity : {0u, 18u, 128u, 255u}) {
         EXPECT_EQ(set(static_cast<uint8_t>(quantity), 1), NO_SUCH_QUANTITY);
     }
 }
@@ -71,8 +73,37 @@ TEST_F(RigQuantities, ActNowOnWhatTheyName) {
     EXPECT_DOUBLE_EQ(bench.rig->sensors.errors.current_delay_ns, 3120.0);
     EXPECT_EQ(set(11, 5000), DONE);
     EXPECT_DOUBLE_EQ(bench.rig->sensors.errors.encoder_eccentricity_deg, 0.5);
+    EXPECT_EQ(set(12, 11000), DONE);
+    EXPECT_EQ(set(13, 12000), DONE);
+    EXPECT_EQ(set(14, 30000), DONE);
+    EXPECT_EQ(set(15, 0), DONE);
+    const plant_gains_t &gains = bench.rig->plant.gains;
+    EXPECT_DOUBLE_EQ(gains.flux_linkage, 1.1) << "one does not put back another";
+    EXPECT_DOUBLE_EQ(gains.resistance, 1.2);
+    EXPECT_DOUBLE_EQ(gains.inertia, 3.0);
+    EXPECT_DOUBLE_EQ(gains.friction, 0.0);
+    EXPECT_EQ(set(16, -2500), DONE);
+    EXPECT_DOUBLE_EQ(bench.rig->sensors.encoder_offset_deg, -0.25);
+    EXPECT_EQ(set(17, 200), DONE);
+    EXPECT_DOUBLE_EQ(bench.rig->plant.minimum_pulse_ns, 200.0);
     EXPECT_EQ(set(1, 2000001), OUT_OF_RANGE);
     EXPECT_DOUBLE_EQ(bench.rig->plant.load_torque_Nm, -8.0) << "refused settings change nothing";
+}
+
+TEST_F(RigQuantities, AnotherMachineIsOneFromItsTimeOn) {
+    // Twice the inductance: half the slope of the current, which rises in each period's pulse.
+    RigBench same;
+    auto same_client = same.connect();
+    EXPECT_EQ(set(12, 20000, 75), DONE);
+    bench.run_to(*client, 75 * 1000);
+    same.run_to(*same_client, 75 * 1000);
+    const double before_A = bench.rig->plant.current_A[1];
+    EXPECT_EQ(before_A, same.rig->plant.current_A[1]);
+    bench.run_to(*client, 100 * 1000);
+    same.run_to(*same_client, 100 * 1000);
+    const double rise_A = same.rig->plant.current_A[1] - before_A;
+    EXPECT_GT(rise_A, 0.5);
+    EXPECT_NEAR(bench.rig->plant.current_A[1] - before_A, 0.5 * rise_A, 0.02 * rise_A);
 }
 
 TEST_F(RigQuantities, ActExactlyAtTheirTime) {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import can
+from cantools.database.can import Signal
 
 from salient.signals import rig_database
 
@@ -16,6 +17,11 @@ _AT_US_MAX = 2**32 - 1
 
 class RigError(Exception):
     """The bench refused a setting; the text says which and why."""
+
+
+def quantities() -> dict[str, Signal]:
+    """The bench's quantities by name, with their ranges: the signals of RIG_SET that it chooses between."""
+    return {s.name: s for s in rig_database().get_message_by_name("RIG_SET").signals if s.multiplexer_ids}
 
 
 class Quantity:
@@ -67,6 +73,18 @@ class Rig:
     """A sample shows the current of so long before it, from the next control period on."""
     encoder_eccentricity_deg = Quantity(None)
     """The encoder reads angle + this * sin(angle)."""
+    flux_linkage_gain = Quantity(1.0)
+    """Flux linkage and torque of every phase, at the same angle and current, over the machine file's."""
+    resistance_gain = Quantity(1.0)
+    """Of every winding, over the machine file's."""
+    inertia_gain = Quantity(1.0)
+    """Over the machine file's; the speed goes on as it is."""
+    friction_gain = Quantity(1.0)
+    """Over the machine file's."""
+    encoder_offset_deg = Quantity(0.0)
+    """Added to the angle that the encoder reads, mechanical."""
+    minimum_pulse_ns = Quantity(None)
+    """A shorter pulse or gap of a switch does not happen, from the next control period on."""
     truth_period_us = Quantity(1000)
     """How often the true state is sent; 0 never."""
 
@@ -81,14 +99,14 @@ class Rig:
 
     def set(self, name: str, value: float) -> None:
         """Sets a quantity by its name in rig.dbc."""
-        message = rig_database().get_message_by_name("RIG_SET")
-        signal = message.get_signal_by_name(name)
-        number = signal.multiplexer_ids[0]
+        signal = quantities()[name]
         if not signal.minimum <= value <= signal.maximum:
             allowed = f"{signal.minimum:g} to {signal.maximum:g} {signal.unit or ''}".rstrip()
             raise RigError(f"{name} {value:g}: allowed are {allowed}")
         if not 0 <= self._at_us <= _AT_US_MAX:
             raise RigError(f"{name} at {self._at_us} us: allowed are 0 to {_AT_US_MAX} us")
+        message = rig_database().get_message_by_name("RIG_SET")
+        number = signal.multiplexer_ids[0]
         data = message.encode({"quantity": number, name: value, "at_us": self._at_us})
         self._session.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
         reply = rig_database().get_message_by_name("RIG_SET_REPLY")

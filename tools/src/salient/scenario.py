@@ -14,6 +14,10 @@
     [parameters]                            # the drive's parameters by name, in their units
     torque_max_Nm = 19.1
 
+    [bench]                                 # the bench's quantities (RIG_SET in rig.dbc), set at time 0
+    current_noise_A = 0.02
+    flux_linkage_gain = 1.05                # the machine is another one than the drive's tables say
+
     [[speed]]                               # from the first of these the drive is asked to run
     at_s = 0.0
     value_rpm = 600.0
@@ -49,6 +53,7 @@ from salient.errors import UsageError
 from salient.log_files import write_logs
 from salient.machine import load_machine, machine_path
 from salient.metrics import losses
+from salient.rig import quantities
 from salient.signals import SignalTable, drive_database
 from salient.simulator import SimulatorOptions, executable, parameter_table
 from salient.text_file import TextFileError, read_toml
@@ -94,6 +99,7 @@ class Scenario:
     adc_bits: int = 12
     immediate_pwm: bool = False
     parameters: dict[str, float] = field(default_factory=dict)
+    bench: dict[str, float] = field(default_factory=dict)
     speed: tuple[SpeedStep, ...] = ()
     load: tuple[LoadStep, ...] = ()
     record: Record | None = None
@@ -129,7 +135,8 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
     """Runs a scenario in lock-step and leaves recording.npy, can.blf and can.log in out_dir, which is made if needed.
 
     can: "local" for a bus of its own, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; parameters
-    are written first, then the commands follow. UsageError for what the drive does not know or refuses.
+    are written first, then the commands follow; the bench's quantities are set before all. UsageError for what the
+    drive does not know or refuses.
     """
     recording_path = out_dir / _RECORDING if scenario.record else None
     options = _simulator_options(scenario, recording_path, build)
@@ -137,6 +144,8 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
     out_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         with Bench(options, f"unix:{folder}/can.sock" if can == "local" else can) as bench:
+            for name, value in scenario.bench.items():
+                bench.rig.set(name, value)
             for write in writes:  # ahead of the first command; the answers are looked at in the end
                 bench.send(write)
             for step in scenario.load:
@@ -254,12 +263,12 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local",
 _DURATION_S = (1e-3, 3600.0)
 _SEED = (0, 2**63 - 1)
 _STEPS: dict[str, dict[str, tuple[float, float]]] = {
-    "speed": {"at_s": (0.0, 3600.0), "value_rpm": (0.0, 3000.0)},
+    "speed": {"at_s": (0.0, 3600.0), "value_rpm": (-3000.0, 3000.0)},
     "load": {"at_s": (0.0, 3600.0), "torque_Nm": (-200.0, 200.0)},
 }
 _RECORD = {"step_us": (0.1, 1e6), "from_s": (0.0, 3600.0)}
 _TOP = ("machine", "controllers", "duration_s", "seed", "initial_angle_deg", "control_rate_hz", "encoder_bits",
-        "encoder_edges", "adc_bits", "immediate_pwm", "parameters", "speed", "load", "record")  # fmt: skip
+        "encoder_edges", "adc_bits", "immediate_pwm", "parameters", "bench", "speed", "load", "record")  # fmt: skip
 
 
 def load_scenarios(path: Path) -> list[Scenario]:
@@ -297,6 +306,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
         "adc_bits": reader.one_of("adc_bits", data.get("adc_bits", 12), ADC_BITS),
         "immediate_pwm": reader.switch("immediate_pwm", data.get("immediate_pwm", False)),
         "parameters": {key: reader.number(f"parameters.{key}", value) for key, value in parameters.items()},
+        "bench": reader.table("bench", data.get("bench", {}), _bench_ranges()),
         "speed": tuple(SpeedStep(**step) for step in reader.steps("speed", data.get("speed", []))),
         "load": tuple(LoadStep(**step) for step in reader.steps("load", data.get("load", []))),
         "record": Record(**record) if "record" in data else None,
@@ -308,6 +318,10 @@ def load_scenarios(path: Path) -> list[Scenario]:
         reader.one_of("controllers", controller, CONTROLLERS)
     executable(machine)
     return [Scenario(controller=controller, **common) for controller in controllers]
+
+
+def _bench_ranges() -> dict[str, tuple[float, float]]:
+    return {name: (signal.minimum, signal.maximum) for name, signal in quantities().items()}
 
 
 class _Reader:

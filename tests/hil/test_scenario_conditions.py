@@ -1,0 +1,217 @@
+"""Conditions of a scenario: what the board's sensors and converter are like, and how the bench's machine differs from
+the one that the drive's tables are made from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from salient.errors import UsageError
+from salient.machine import load_machine, machine_path
+from salient.metrics import losses
+from salient.rig import quantities
+from salient.scenario import LoadStep, Record, RunResult, Scenario, SpeedStep, load_scenarios, run_scenario
+
+MACHINE = load_machine(machine_path("saturating"))
+HEAD = 'machine = "saturating"\ncontrollers = ["paper"]\nduration_s = 0.2\n'
+WINDOW_S = (0.25, 0.35)  # three strokes at 150 r/min
+
+
+def loaded(tmp_path, name: str = "run", **changes) -> RunResult:
+    """150 r/min, 8 N m from 0.1 s on, recorded each microsecond from 0.25 s to 0.35 s."""
+    settings = {
+        "name": name,
+        "duration_s": WINDOW_S[1],
+        "controller": "paper",
+        "speed": (SpeedStep(0.0, 150.0),),
+        "load": (LoadStep(0.1, 8.0),),
+        "record": Record(step_us=1.0, from_s=WINDOW_S[0]),
+    }
+    result = run_scenario(Scenario(**(settings | changes)), tmp_path / name)
+    assert result.fault == "none"
+    return result
+
+
+def mean_torque_Nm(result: RunResult) -> float:
+    return float(result.recording["torque_Nm"].mean(dtype=float))
+
+
+def ripple(result: RunResult) -> float:
+    torque_Nm = result.recording["torque_Nm"]
+    return (float(torque_Nm.max()) - float(torque_Nm.min())) / mean_torque_Nm(result)
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def test_file_says_them_all(tmp_path):
+    path = tmp_path / "conditions.toml"
+    path.write_text(HEAD + "encoder_edges = true\nadc_bits = 14\nimmediate_pwm = true\ncontrol_rate_hz = 1000000\n"
+                    "[bench]\nflux_linkage_gain = 1.05\nencoder_offset_deg = -0.2\n")
+    (scenario,) = load_scenarios(path)
+    assert (scenario.encoder_edges, scenario.adc_bits, scenario.immediate_pwm) == (True, 14, True)
+    assert scenario.control_rate_hz == 1_000_000
+    assert scenario.bench == {"flux_linkage_gain": 1.05, "encoder_offset_deg": -0.2}
+
+
+def test_file_need_not_say_them(tmp_path):
+    path = tmp_path / "conditions.toml"
+    path.write_text(HEAD)
+    (scenario,) = load_scenarios(path)
+    assert (scenario.encoder_edges, scenario.adc_bits, scenario.immediate_pwm) == (False, 12, False)
+    assert scenario.bench == {}
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("adc_bits = 11", "adc_bits: 11: allowed are 12, 13, 14, 15, 16"),
+    ("encoder_edges = 1", "encoder_edges: 1 is not true or false"),
+    ('immediate_pwm = "yes"', "immediate_pwm: 'yes' is not true or false"),
+    ("[bench]\ngain = 1", "bench.gain: unknown key; allowed: load_torque_Nm, "),
+    ("[bench]\nflux_linkage_gain = 0.1", "bench.flux_linkage_gain: 0.1: allowed are 0.2 to 5"),
+    ("[bench]\nencoder_offset_deg = 5.1", "bench.encoder_offset_deg: 5.1: allowed are -5 to 5"),
+    ("[bench]\nminimum_pulse_ns = true", "bench.minimum_pulse_ns: True is not a number"),
+    ("bench = 1", "bench: a table [bench] is wanted"),
+])  # fmt: skip
+def test_mistake_in_them_is_named(tmp_path, text, message):
+    path = tmp_path / "conditions.toml"
+    path.write_text(HEAD + text + "\n")
+    with pytest.raises(UsageError) as caught:
+        load_scenarios(path)
+    assert str(caught.value).startswith(f"{path}: {message}")
+
+
+def test_every_quantity_of_the_bench_may_be_set_from_the_start(tmp_path):
+    """At the values of a machine as its file says, and a little off them: nothing is refused, and the drive runs."""
+    values = {"supply_voltage_V": 230.0, "current_sensor_gain": 1.01, "truth_period_us": 500, "current_noise_A": 0.02,
+              "current_sensor_limit_A": 90.0, "flux_linkage_gain": 1.05, "resistance_gain": 1.2, "inertia_gain": 1.1,
+              "friction_gain": 0.9, "minimum_pulse_ns": 200.0}
+    bench = {name: values.get(name, 0.0) for name in quantities()}
+    assert values.keys() <= bench.keys()
+    result = loaded(tmp_path, bench=bench)
+    assert set(result.recording["bus_voltage_V"]) == {230.0}
+    assert np.diff(result.truth["RIG_TRUTH_MOTION.speed_rpm"].time_s) == pytest.approx(500e-6, abs=1e-9)
+
+
+# --- the machine ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gain", [0.5, 3.0])
+def test_inertia_sets_the_time_of_a_start(tmp_path, gain):
+    """The torque is at its limit of 19.1 N m, and the drive, which is told nothing, settles."""
+    reached_s = {}
+    for inertia_gain in (1.0, gain):
+        scenario = Scenario(name="start", duration_s=0.25, controller="paper", speed=(SpeedStep(0.0, 600.0),),
+                            bench={"inertia_gain": inertia_gain}, record=Record(step_us=10.0))
+        recording = run_scenario(scenario, tmp_path / str(inertia_gain)).recording
+        reached_s[inertia_gain] = recording["time_s"][np.argmax(recording["speed_rpm"] > 500.0)]
+        assert recording["speed_rpm"][-1] == pytest.approx(600.0, abs=1.0)
+    command_s = 0.001  # until the drive is ready, of both
+    assert (reached_s[gain] - command_s) / (reached_s[1.0] - command_s) == pytest.approx(gain, rel=0.03)
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.0, 5.0])
+def test_friction_is_what_the_steady_torque_is_more_than_the_load(tmp_path, gain):
+    result = loaded(tmp_path, bench={"friction_gain": gain})
+    speed_rad_s = float(result.recording["speed_rpm"].mean(dtype=float)) * math.pi / 30
+    assert mean_torque_Nm(result) == pytest.approx(8.0 + gain * MACHINE.friction_Nm_s * speed_rad_s, abs=0.02)
+
+
+@pytest.mark.parametrize("gain", [0.8, 1.0, 2.0])
+def test_resistance_is_what_the_copper_loss_is_made_with(tmp_path, gain):
+    figures = losses(loaded(tmp_path, bench={"resistance_gain": gain}).recording, MACHINE, WINDOW_S)
+    expected_W = 3 * gain * MACHINE.resistance_ohm * figures["phase_current_rms_A"] ** 2
+    assert figures["copper_W"] == pytest.approx(expected_W, rel=1e-3)
+
+
+@pytest.mark.parametrize("gain", [0.9, 1.1])
+def test_flux_linkage_is_what_the_torque_is_more_than_the_drives_tables_say(tmp_path, gain):
+    """Torque goes with flux linkage at the same current, which the drive measures."""
+    error = {}
+    for flux_linkage_gain in (1.0, gain):
+        result = loaded(tmp_path, str(flux_linkage_gain), bench={"flux_linkage_gain": flux_linkage_gain})
+        estimate_Nm = result.telemetry["torque_estimate_Nm"].between(*WINDOW_S).value.mean()
+        error[flux_linkage_gain] = mean_torque_Nm(result) / estimate_Nm
+    assert error[1.0] == pytest.approx(1.0, abs=0.01)
+    assert error[gain] == pytest.approx(gain, abs=0.015)
+
+
+def test_encoder_offset_is_in_the_angle_that_the_drive_reports(make_bench):
+    bench = make_bench(controller="paper", encoder_bits=24)
+    bench.rig.encoder_offset_deg = -0.5
+    bench.rig.truth_period_us = 0
+    bench.run_for(0.01)
+    measured_deg = bench.telemetry["DRIVE_MOTION.rotor_angle_deg"].last
+    assert (measured_deg + 180) % 360 - 180 == pytest.approx(-0.5, abs=360 / 2**16)
+
+
+def test_minimum_pulse_takes_pulses_away(tmp_path):
+    """2 us of 25: what the paper's controller asks for between is not to be had."""
+    ideal, coarse = (ripple(loaded(tmp_path, str(ns), bench={"minimum_pulse_ns": ns})) for ns in (0.0, 2000.0))
+    assert 0.03 < ideal < 0.09
+    assert 1.2 * ideal < coarse < 10 * ideal
+
+
+# --- the board --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bits", [12, 14, 16])
+def test_converter_resolves_what_its_bits_say(make_bench, bits):
+    bench = make_bench(controller="paper", adc_bits=bits)
+    bench.drive.speed_reference_rpm = 150
+    bench.at(0.1).load_torque_Nm = 8
+    bench.run_for(0.15)
+    bench.rig.truth_period_us = 1
+    start_us = round(bench.time_s * 1e6)
+    bench.run_for(0.03)
+    sampled_us = bench.telemetry["DRIVE_STATUS.time_us"].value.astype(np.int64)
+    worst_A = []
+    for phase in "abc":
+        measured_A = bench.telemetry[f"DRIVE_CURRENTS.current_{phase}_A"].value
+        chosen = sampled_us[: len(measured_A)] >= start_us + 10
+        truth = bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"]
+        truth_us = np.round(truth.time_s * 1e6).astype(np.int64)
+        index = np.searchsorted(truth_us, sampled_us[: len(measured_A)][chosen])
+        worst_A.append(np.abs(measured_A[chosen] - truth.value[index]).max())
+    half_code_A, half_lsb_A = 0.5 * 80 / 2**bits, 0.5 / 512
+    assert max(worst_A) <= half_code_A + 2 * half_lsb_A + 1e-9  # of the drive's format and of the truth's
+    assert max(worst_A) > 0.6 * half_code_A
+
+
+def test_captured_edges_leave_the_counts_as_they_are(make_bench):
+    """Angles come from the counts, whatever the board tells of edges beside them."""
+    angles = []
+    for edges in (False, True):
+        bench = make_bench(controller="paper", encoder_edges=edges)
+        bench.rig.load_torque_Nm = -1.0  # turns the shaft; the drive stays off
+        bench.run_for(0.1)
+        angles.append(bench.telemetry["DRIVE_MOTION.rotor_angle_deg"].value)
+        assert angles[-1].max() > 10
+    assert np.array_equal(*angles)
+
+
+def test_papers_own_conditions_take_its_controllers_ripple_away(tmp_path):
+    """1 MHz, no delay, exact sensing: what is left of 0.06 at 40 kHz, and of 0.8 of the hysteresis controller."""
+    conditions = {"control_rate_hz": 1_000_000, "encoder_bits": 0, "adc_bits": 16, "immediate_pwm": True}
+    assert 0.001 < ripple(loaded(tmp_path, "paper", **conditions)) < 0.01
+    assert 0.05 < ripple(loaded(tmp_path, "traditional", controller="traditional", **conditions)) < 0.25
+
+
+def test_delay_of_a_period_is_what_immediate_duties_lack(tmp_path):
+    """The hysteresis controller overshoots its band by what the torque moves in the delay."""
+    base = {"controller": "traditional", "control_rate_hz": 100_000}
+    delayed = ripple(loaded(tmp_path, "delayed", **base))
+    at_once = ripple(loaded(tmp_path, "at_once", immediate_pwm=True, **base))
+    assert 0.1 < at_once < 0.8 * delayed < 1.0
+
+
+def test_equal_conditions_leave_equal_bytes(tmp_path):
+    settings = {"bench": {"current_noise_A": 0.02, "flux_linkage_gain": 1.03}, "encoder_edges": True, "adc_bits": 14}
+    first = loaded(tmp_path, "first", **settings)
+    second = loaded(tmp_path, "second", **settings)
+    assert first.recording_path.read_bytes() == second.recording_path.read_bytes()
+    assert first.log_path.read_bytes() == second.log_path.read_bytes()
+    other = run_scenario(replace(first.scenario, seed=2), tmp_path / "other")
+    assert first.log_path.read_bytes() != other.log_path.read_bytes()
