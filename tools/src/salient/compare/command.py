@@ -16,6 +16,7 @@ from salient.errors import UsageError
 from salient.simulator import executable
 
 FAILED = "failed"
+_REPLAYS_MAX = 10  # named, of the runs that failed
 
 
 def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
@@ -41,8 +42,10 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
 
     write_page(options.out / "compare.html", made, content, compared, changed, _command(options))
     stream.write(f"{rows.table(made)}\n\n{rows.verdict(made)}\n")
-    for outcome, path in replays:
+    for outcome, path in replays[:_REPLAYS_MAX]:
         stream.write(f"{_name(outcome.case)}: {outcome.failed}; again: tools/salient run {path}\n")
+    if len(replays) > _REPLAYS_MAX:
+        stream.write(f"and {len(replays) - _REPLAYS_MAX} more in {options.out / FAILED}\n")
     if compared:
         stream.write(f"\n{compared}\n")
     stream.write(f"\nresults: {options.out / stored.NAME}\npage:    {options.out / 'compare.html'}\n")

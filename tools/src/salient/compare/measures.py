@@ -42,10 +42,11 @@ class Figure:
 
 
 FIGURES = {
-    "ripple": Figure("K_t over 0.1 s", "", 4, 0.0002),
-    "ripple_long": Figure("K_t over 1 s", "", 4, 0.0002),
+    "ripple": Figure("K_t over 0.1 s", "", 5, 0.0002),
+    "ripple_long": Figure("K_t over 1 s", "", 5, 0.0002),
+    "ripple_late": Figure("K_t after 3 s", "", 5, 0.0002),
     "speed_error_percent": Figure("speed error", "%", 3, 0.01),
-    "settling_time_s": Figure("settled within 0.5 %", "s", 4, 0.0001),
+    "settling_time_s": Figure("settled within 0.5 %", "s", 5, 0.0001),
     "overshoot_percent": Figure("overshoot", "%", 3, 0.005),
     "speed_dip_rpm": Figure("dip", "r/min", 2, 0.02),
     "recovery_time_s": Figure("back within 0.5 %", "ms", 2, 0.1, 1e3),
@@ -68,6 +69,11 @@ def take_ripple(scenario: Scenario, recording: np.ndarray) -> Figures:
     figures["speed_error_percent"] = metrics.speed_error_percent(recording, scenario.speed[-1].value_rpm,
                                                                  (first_s, last_s))
     return figures
+
+
+def take_late_ripple(scenario: Scenario, recording: np.ndarray) -> Figures:
+    """Torque over the whole recording, the end of a long run."""
+    return {"ripple_late": _ripple(recording, (scenario.record.from_s, scenario.duration_s))}
 
 
 def take_start(scenario: Scenario, recording: np.ndarray) -> Figures:
@@ -113,6 +119,7 @@ STEADY_S = 0.5
 
 MEASURES: dict[str, Callable[[Scenario, np.ndarray], Figures]] = {
     "ripple": take_ripple,
+    "late_ripple": take_late_ripple,
     "start": take_start,
     "load_step": take_load_step,
     "step_and_ripple": take_step_and_ripple,

@@ -205,20 +205,22 @@ def _over_angle(content: Content) -> Figure | None:
 # --- studies --------------------------------------------------------------------------------------------------------
 
 def _ablations(content: Content) -> Figure | None:
-    """Changes along y; columns by table; above the ripple, below the dip; a dot a seed."""
+    """Changes along y; columns by table; a row of panels a figure; a dot a seed."""
     runs = [run for run in content["runs"] if run["group"] == "ablation" and run["figures"]]
     if not runs:
         return None
     tables = list(dict.fromkeys(run["condition"].split(", ")[1] for run in runs))
     changes = list(dict.fromkeys(run["condition"].split(", ")[0] for run in runs))
-    figure, axes = _panels(2 * len(tables), columns=len(tables), height_in=0.6 + 0.26 * len(changes), sharey=True)
+    names = {"ripple": "K$_t$ over 0.1 s", "ripple_late": "K$_t$ after 3 s", "speed_dip_rpm": "dip / (r/min)"}
+    figure, axes = _panels(len(names) * len(tables), columns=len(tables), height_in=0.6 + 0.22 * len(changes),
+                           sharey=True)
     controllers = _controllers_of_runs(runs)
-    for number, (name, label) in enumerate((("ripple", "K$_t$ over 0.1 s"), ("speed_dip_rpm", "dip / (r/min)"))):
+    for number, (name, label) in enumerate(names.items()):
         for column, table in enumerate(tables):
             axis = axes[number * len(tables) + column]
             for run in runs:
                 change, its_table = run["condition"].split(", ")
-                if its_table == table:
+                if its_table == table and name in run["figures"]:
                     y = changes.index(change) + 0.2 * (controllers.index(run["controller"]) - 0.5)
                     axis.plot(run["figures"][name], y, _MARKER.get(run["controller"], "o"), alpha=0.7,
                               color=_colour(run["controller"]), markersize=4, markeredgewidth=0)
