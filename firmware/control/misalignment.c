@@ -6,7 +6,6 @@
 /* 0.01 rad in 2^-32 turn. */
 #define PROBE 6835653
 
-#define FILTER_1_S 480
 #define MEAN_1_S 10
 #define SETTLE_MS 150
 #define TORQUE_LEAST_Q24 (1 << 24)
@@ -14,13 +13,13 @@
 #define POWER_FLOOR_Q20 21
 #define OFFSET_LIMIT_Q40 (((int64_t)7 << 40) / 8)
 
-misalignment_parameters_t misalignment_configure(int32_t rate_1_s, uint32_t control_rate_hz, int32_t inertia_q30,
-                                                 unsigned phases, unsigned rotor_poles) {
+misalignment_parameters_t misalignment_configure(int32_t rate_1_s, uint32_t bandwidth_rad_s, uint32_t control_rate_hz,
+                                                 int32_t inertia_q30, unsigned phases, unsigned rotor_poles) {
     const int64_t turn_rate_hz = control_rate_hz / phases;
     return (misalignment_parameters_t){
         .probe = PROBE * rotor_poles,
         .rate_q30 = (int32_t)(((int64_t)rate_1_s << 30) / turn_rate_hz),
-        .filter_q16 = (int32_t)(((int64_t)FILTER_1_S << 16) / turn_rate_hz),
+        .filter_q16 = (int32_t)((((int64_t)bandwidth_rad_s * 8 / 5) << 16) / turn_rate_hz),
         .mean_q16 = (int32_t)(((int64_t)MEAN_1_S << 16) / turn_rate_hz) + 1,
         .inertia_rate_q8 = fixed_saturate(((int64_t)inertia_q30 * control_rate_hz) >> 22),
         .settle_ticks = control_rate_hz / 1000u * SETTLE_MS,
@@ -53,14 +52,13 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const bool steady = sample->steady && fixed_abs(sample->torque_q24) > TORQUE_LEAST_Q24;
     const int32_t disturbance_q24 = fixed_subtract(
         observer->load_torque_q24, fixed_multiply(observer->correction_q22, parameters->inertia_rate_q8, 6));
-    misalignment->steady_ticks = !steady ? 0
-                                 : misalignment->steady_ticks < parameters->settle_ticks
-                                     ? misalignment->steady_ticks + 1
-                                     : misalignment->steady_ticks;
-    const bool learns = misalignment->steady_ticks >= parameters->settle_ticks;
-    if (!learns) {
-        misalignment->disturbance_mean_q24 = disturbance_q24;
-    }
+    const bool settled = misalignment->steady_ticks >= parameters->settle_ticks;
+    misalignment->steady_ticks = !steady ? 0 : settled ? misalignment->steady_ticks : misalignment->steady_ticks + 1;
+    const bool learns = steady && settled;
+    /* Means of all since it became steady, then of the last 100 ms: what was before is another load. */
+    const int32_t phases = (int32_t)tables->phases;
+    const int32_t fresh_q16 = 65536 / ((int32_t)misalignment->steady_ticks / phases + 1);
+    const int32_t mean_q16 = fresh_q16 > parameters->mean_q16 ? fresh_q16 : parameters->mean_q16;
 
     const unsigned turn = misalignment->turn;
     misalignment->turn = turn + 1 < tables->phases ? turn + 1 : 0;
@@ -77,13 +75,12 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     }
     follow(&phase->first_q24, slope_q24, parameters->filter_q16);
     follow(&phase->second_q24, phase->first_q24, parameters->filter_q16);
-    follow(&phase->mean_q24, phase->second_q24, parameters->mean_q16);
+    follow(&phase->mean_q24, phase->second_q24, mean_q16);
     const int32_t alternating_q24 = fixed_subtract(phase->second_q24, phase->mean_q24);
     /* Its turn comes once for all phases: their sum. */
     const int32_t square_q24 = product_q24(alternating_q24, alternating_q24);
-    const int32_t phases = (int32_t)tables->phases;
-    follow(&misalignment->power_q24, fixed_saturate((int64_t)square_q24 * phases), parameters->mean_q16 / phases + 1);
-    follow(&misalignment->disturbance_mean_q24, disturbance_q24, parameters->mean_q16 / phases + 1);
+    follow(&misalignment->power_q24, fixed_saturate((int64_t)square_q24 * phases), mean_q16 / phases + 1);
+    follow(&misalignment->disturbance_mean_q24, disturbance_q24, mean_q16 / phases + 1);
     if (!learns) {
         return;
     }

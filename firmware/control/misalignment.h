@@ -12,7 +12,7 @@
  *   d delta_j / dt = rate y s_j / (mean of sum s_j^2 + 0.05 T^2 / rad^2)
  *
  * y is the load estimate with the part that the speed's correction adds, which answers within 1 / w0; s_j is sent
- * through two first-order filters of 1 / 480 s with about the same delay. A correction indexed by the rotor angle in
+ * through two first-order filters of 1 / (1.6 w0) with about the same delay. A correction indexed by the rotor angle in
  * bins can mend any error, not only a misalignment, but has 64 numbers to learn from the same signal: it took longer
  * than a load step lasts, or learned the load step. One number a phase is known to 0.01 degrees after half a second.
  *
@@ -31,7 +31,7 @@
 typedef struct {
     uint32_t probe;          /* 0.01 rad mechanical in 2^-32 pitch: s_j is a difference over twice that */
     int32_t rate_q30;        /* rate times the time between two turns of a phase, Q1.30; 0 learns nothing */
-    int32_t filter_q16;      /* 480 / s times that time, Q1.16 */
+    int32_t filter_q16;      /* 1.6 w0 times that time, Q1.16 */
     int32_t mean_q16;        /* 10 / s times that time, Q1.16 */
     int32_t inertia_rate_q8; /* J / Ts: N m per rad/s, Q23.8 */
     uint32_t settle_ticks;   /* steady periods before learning */
@@ -59,9 +59,9 @@ typedef struct {
     bool steady;               /* speed, load and voltage */
 } misalignment_sample_t;
 
-/* Rate in 1/s (0..100). */
-misalignment_parameters_t misalignment_configure(int32_t rate_1_s, uint32_t control_rate_hz, int32_t inertia_q30,
-                                                 unsigned phases, unsigned rotor_poles);
+/* Rate in 1/s (0..100), the load observer's steady bandwidth in rad/s. */
+misalignment_parameters_t misalignment_configure(int32_t rate_1_s, uint32_t bandwidth_rad_s, uint32_t control_rate_hz,
+                                                 int32_t inertia_q30, unsigned phases, unsigned rotor_poles);
 
 /* All aligned. */
 void misalignment_reset(misalignment_t *misalignment);

@@ -20,6 +20,10 @@
 #define USUAL_FACTOR 4u
 #define USUAL_1_S 40
 
+/* A pause grows to 256 ms at most, and shrinks by e in 50 ms. */
+#define PAUSE_LIMIT_Q16 (255u << 16)
+#define FORGET_1_S 20
+
 observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t widest_rad_s, uint32_t steady_rad_s,
                                                              unsigned encoder_bits, uint32_t control_rate_hz,
                                                              int32_t inertia_q30) {
@@ -27,7 +31,8 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t widest_rad
     const bool wakes = widest_rad_s > steady_rad_s;
     const uint32_t threshold_count = wakes ? count + count / 8 + THRESHOLD_IDEAL : THRESHOLD_NEVER;
     observer_bandwidth_parameters_t parameters = {
-        .rearm_ticks = control_rate_hz / 1000u,
+        .pause_ticks = control_rate_hz / 1000u,
+        .forget_q16 = (uint16_t)(65536 - (65536u * FORGET_1_S + control_rate_hz - 1) / control_rate_hz),
         .threshold_count = threshold_count,
         .threshold_edge = wakes ? THRESHOLD_EDGE : THRESHOLD_NEVER,
         .usual_share_q24 = (int32_t)(((int64_t)USUAL_1_S << 24) / control_rate_hz),
@@ -65,10 +70,17 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
     const uint32_t usual = (uint32_t)(bandwidth->usual_q8 >> 8) * USUAL_FACTOR;
     const uint32_t threshold = usual > least ? usual : least;
     const uint32_t size = (uint32_t)fixed_abs(innovation);
-    /* What is beyond the threshold counts as the threshold: one load step does not make the observer deaf. */
-    const int64_t held_q8 = (int64_t)(size < threshold ? size : threshold) << 8;
-    bandwidth->usual_q8 += ((held_q8 - bandwidth->usual_q8) * parameters->usual_share_q24) >> 24;
-    if (size > threshold && bandwidth->ticks >= parameters->rearm_ticks) {
+    if (bandwidth->stage == LAST_STAGE) {
+        /* What is beyond the threshold counts as the threshold: one load step does not make the observer deaf. */
+        const int64_t held_q8 = (int64_t)(size < threshold ? size : threshold) << 8;
+        bandwidth->usual_q8 += ((held_q8 - bandwidth->usual_q8) * parameters->usual_share_q24) >> 24;
+    }
+    bandwidth->pause_q16 = (uint32_t)(((uint64_t)bandwidth->pause_q16 * parameters->forget_q16) >> 16);
+    const uint32_t pause_ticks =
+        parameters->pause_ticks + (uint32_t)(((uint64_t)parameters->pause_ticks * bandwidth->pause_q16) >> 16);
+    if (size > threshold && bandwidth->ticks >= pause_ticks) {
+        const uint32_t doubled_q16 = 2 * bandwidth->pause_q16 + (1u << 16);
+        bandwidth->pause_q16 = doubled_q16 < PAUSE_LIMIT_Q16 ? doubled_q16 : PAUSE_LIMIT_Q16;
         bandwidth->stage = from_edge ? parameters->first_stage_edge : parameters->first_stage_count;
         bandwidth->ticks = 0;
     }

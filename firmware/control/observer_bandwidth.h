@@ -7,9 +7,10 @@
  * steady one. What the threshold is depends on what the angle is good to: 1.25 counts where it is the middle of a
  * count, 8 urad where the time of the last edge is known; a wider start with the latter, whose noise is smaller.
  *
- * A drive whose model is wrong (three times the inertia, say) would wake again and again, each time by what the last
- * one stirred up: a limit cycle. So each waking raises the threshold, to three times at first and further when the next
- * comes soon, and time (30 ms) lowers it again.
+ * A drive whose model is wrong (three times the inertia, tables half a degree off) would wake again and again, each
+ * time by what the last one stirred up: a limit cycle. Two things end it. Each waking doubles the pause before the next
+ * can come, from 1 ms to at most 256 ms, and time shrinks the pause again. And in the steady bandwidth the threshold
+ * follows four times the mean size of the innovation, so that what the model always leaves unexplained wakes nobody.
  */
 #ifndef CONTROL_OBSERVER_BANDWIDTH_H
 #define CONTROL_OBSERVER_BANDWIDTH_H
@@ -26,7 +27,8 @@ typedef struct {
     load_observer_gains_t gains[OBSERVER_BANDWIDTH_STAGES];
     uint16_t bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES];
     uint32_t end_ticks[OBSERVER_BANDWIDTH_STAGES]; /* periods since the waking at which a stage ends */
-    uint32_t rearm_ticks;                          /* periods in which nothing wakes again */
+    uint32_t pause_ticks;                          /* least pause after a waking, in periods */
+    uint16_t forget_q16;                           /* what is left of a longer one a period later */
     uint32_t threshold_count;                      /* 2^-32 turn, for the middle of a count */
     uint32_t threshold_edge;                       /* for an angle from an edge's time */
     int32_t usual_share_q24;                       /* of the mean innovation a period */
@@ -36,8 +38,9 @@ typedef struct {
 
 typedef struct {
     unsigned stage;
-    uint32_t ticks;   /* since the last waking */
-    int64_t usual_q8; /* mean size of the innovation, 2^-32 turn */
+    uint32_t ticks;     /* since the last waking */
+    uint32_t pause_q16; /* by how many least pauses the pause is longer */
+    int64_t usual_q8;   /* mean size of the innovation, 2^-32 turn */
 } observer_bandwidth_t;
 
 /* Schedule from widest to steady bandwidth in rad/s (100 <= steady <= widest <= 10000). steady == widest: never wakes.

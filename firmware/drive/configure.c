@@ -212,7 +212,8 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .predictive = predictive_from(values, tables->phases, control_rate_hz),
         .misalignment =
             misalignment_configure(values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
-                                   control_rate_hz, inertia_q30, tables->phases, tables->rotor_poles),
+                                   (uint32_t)values[PARAMETER_OBSERVER_STEADY_RAD_S], control_rate_hz, inertia_q30,
+                                   tables->phases, tables->rotor_poles),
     };
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift);
     return control;

@@ -53,7 +53,7 @@ static const parameter_row_t rows[PARAMETER_COUNT] = {
     /* From here on the salient controller. 0: its observer keeps the steady bandwidth. */
     [PARAMETER_OBSERVER_WAKING] = {"observer_waking", "", 0, 0, 1, 1},
     [PARAMETER_OBSERVER_WAKE_RAD_S] = {"observer_wake_rad_s", "rad/s", 0, 100, 10000, 9000},
-    [PARAMETER_OBSERVER_STEADY_RAD_S] = {"observer_steady_rad_s", "rad/s", 0, 100, 10000, 300},
+    [PARAMETER_OBSERVER_STEADY_RAD_S] = {"observer_steady_rad_s", "rad/s", 0, 100, 10000, 250},
     [PARAMETER_PULSES_PER_PERIOD] = {"pulses_per_period", "", 0, 1, 2, 2},
     /* 0: one phase at a time */
     [PARAMETER_TORQUE_SHARING] = {"torque_sharing", "", 0, 0, 1, 1},
@@ -63,7 +63,7 @@ static const parameter_row_t rows[PARAMETER_COUNT] = {
     [PARAMETER_SHARE_ON_EARLY_DEG] = {"share_on_early_deg", "deg", 7, 0, Q(60, 1, 7), Q(24, 1, 7)},
     [PARAMETER_SHARE_OFF_EARLY_DEG] = {"share_off_early_deg", "deg", 7, 0, Q(60, 1, 7), Q(16, 1, 7)},
     [PARAMETER_TORQUE_RESERVE_NM] = {"torque_reserve_Nm", "N m", 24, 0, Q(20, 1, 24), 0},
-    [PARAMETER_FLUX_OBSERVER_GAIN] = {"flux_observer_gain", "", 15, 0, Q(1, 1, 15), Q(3, 10, 15)},
+    [PARAMETER_FLUX_OBSERVER_GAIN] = {"flux_observer_gain", "", 15, 0, Q(1, 1, 15), Q(1, 4, 15)},
     /* 0: the misalignment known so far stays */
     [PARAMETER_ANGLE_TRIM] = {"angle_trim", "", 0, 0, 1, 1},
     [PARAMETER_ANGLE_TRIM_RATE_1_S] = {"angle_trim_rate_1_s", "1/s", 0, 1, 100, 12},
