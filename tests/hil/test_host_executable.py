@@ -97,6 +97,14 @@ def test_ready_line_says_what_runs(start, tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_takes_the_board_of_a_simulation(start) -> None:
+    board = ["--control-rate-hz", "1000000", "--encoder-bits", "0", "--adc-bits", "16", "--immediate-pwm"]
+    process, ready = start("--pace", "free", "--stop-at-s", "0.01", "--encoder-edges", *board)
+    assert ready["control_rate_hz"] == 1000000
+    assert process.wait(TIMEOUT_S) == 0
+    assert process.stderr.read() == ""
+
+
 @pytest.mark.parametrize("pace", ["lockstep", "realtime", "free"])
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, "stdin"])
 def test_ends_cleanly_and_removes_its_socket(start, tmp_path: Path, pace: str, end: signal.Signals | str) -> None:

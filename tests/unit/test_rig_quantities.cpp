@@ -293,6 +293,27 @@ TEST_F(RigQuantities, ComparesActInTheNextPeriodOrAtOnceOnABoardWithoutThatDelay
     EXPECT_EQ(bench.rig->plant.switches.lower, 2);
 }
 
+TEST_F(RigQuantities, EdgesAreCapturedWhileInterruptsAreLost) {
+    bench.rig->sensors.encoder_edges = true;
+    EXPECT_EQ(set(1, -2000000), DONE); // 200 N m turn the shaft: 1 rad/s after 100 us
+    bench.run_to(*client, 400 * 1000);
+    ASSERT_EQ(bench.rig->plant.time_ns, 400000u);
+    EXPECT_EQ(set(4, 6000), DONE); // occupied from 425 us to 485 us, lost at 450 and 475
+    bench.run_to(*client, 425 * 1000);
+    const hal_encoder_sample_t read = bench.rig->board.encoder;
+    ASSERT_TRUE(read.edge_known);
+    ASSERT_TRUE(read.edge_forward);
+    bench.run_to(*client, 475 * 1000);
+    EXPECT_EQ(bench.firmware.interrupts, 17u) << "the last one at 425 us";
+    EXPECT_EQ(bench.rig->board.encoder.counts, read.counts) << "what the running interrupt reads stays";
+    bench.run_to(*client, 500 * 1000);
+    EXPECT_EQ(bench.firmware.interrupts, 18u);
+    // 5 rad/s: a count of 48 urad each 10 us.
+    EXPECT_GE(bench.rig->board.encoder.counts, read.counts + 5);
+    EXPECT_TRUE(bench.rig->board.encoder.edge_known);
+    EXPECT_LT(bench.rig->board.encoder.edge_age_ticks * HAL_PWM_TICK_NS, 12000u);
+}
+
 TEST_F(RigQuantities, InterruptOfExactlyAPeriodStarvesTheBackground) {
     EXPECT_EQ(set(4, 2500), DONE);
     bench.run_to(*client, MS);

@@ -41,7 +41,7 @@ Merits = dict[str, float | None]
 EXPERIMENTS = ("start_600", "load_step_150")
 
 # As hal/hal_adc.h has it.
-ADC = {"bits": 12, "current_range_A": [0.0, 80.0]}
+ADC_CURRENT_RANGE_A = [0.0, 80.0]
 
 # name of the picture's file -> title, experiment
 PICTURES = {
@@ -227,8 +227,9 @@ def _conditions(scenarios: Mapping[str, Sequence[Scenario]]) -> dict[str, Any]:
     scenario = scenarios["load_step_150"][0]
     return {
         "control_rate_hz": scenario.control_rate_hz,
-        "adc": ADC,
-        "encoder": {"bits": scenario.encoder_bits or "ideal"},
+        "adc": {"bits": scenario.adc_bits, "current_range_A": ADC_CURRENT_RANGE_A},
+        "encoder": {"bits": scenario.encoder_bits or "ideal", "edges": scenario.encoder_edges},
+        "immediate_pwm": scenario.immediate_pwm,
         "machine": Path(scenario.machine).stem,
         "torque_sample_step_s": scenario.record.step_us * 1e-6,
         "initial_angle_deg": scenario.initial_angle_deg,
