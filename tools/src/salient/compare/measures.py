@@ -51,6 +51,7 @@ FIGURES = {
     "speed_dip_rpm": Figure("dip", "r/min", 2, 0.02),
     "recovery_time_s": Figure("back within 0.5 %", "ms", 2, 0.1, 1e3),
     "speed_after_rpm": Figure("highest speed after it", "r/min", 2, 0.02, zero=150.0),
+    "copper_W": Figure("copper loss before the step", "W", 2, 0.05),
     "torque_mean_Nm": Figure("mean torque", "N m", 3, 0.01),
     "peak_current_A": Figure("peak phase current", "A", 1, 0.5),
     "highest_speed_percent": Figure("highest speed", "% of reference", 2, 0.02, zero=100.0),
@@ -84,11 +85,18 @@ def take_start(scenario: Scenario, recording: np.ndarray) -> Figures:
 
 
 def take_load_step(scenario: Scenario, recording: np.ndarray) -> Figures:
-    """A load step at a steady speed, and the rotor's angle at it, in degrees of a stroke."""
-    step = metrics.speed_after_step(recording, scenario.speed[-1].value_rpm, scenario.load[0].at_s)
-    machine = load_machine(machine_path(scenario.machine))
-    at_step = recording[int(np.searchsorted(recording["time_s"], scenario.load[0].at_s - 1e-9))]
-    return {**step, "step_angle_deg": float(at_step["rotor_angle_deg"]) % metrics.stroke_deg(machine)}
+    """A load step at a steady speed; the copper loss over the stroke before it, where that was recorded; and the
+    rotor's angle at the step, in degrees of a stroke."""
+    reference_rpm, step_s = scenario.speed[-1].value_rpm, scenario.load[0].at_s
+    stroke_deg = metrics.stroke_deg(load_machine(machine_path(scenario.machine)))
+    figures = metrics.speed_after_step(recording, reference_rpm, step_s)
+    at_step = int(np.searchsorted(recording["time_s"], step_s - 1e-9))
+    before_s = step_s - stroke_deg / (6.0 * reference_rpm)
+    if recording["time_s"][0] <= before_s:
+        before = int(np.searchsorted(recording["time_s"], before_s - 1e-9))
+        copper_J = float(recording["energy_copper_J"][at_step]) - float(recording["energy_copper_J"][before])
+        figures["copper_W"] = copper_J / float(recording["time_s"][at_step] - recording["time_s"][before])
+    return {**figures, "step_angle_deg": float(recording["rotor_angle_deg"][at_step]) % stroke_deg}
 
 
 def take_step_and_ripple(scenario: Scenario, recording: np.ndarray) -> Figures:
