@@ -20,9 +20,10 @@
 #define USUAL_FACTOR 4u
 #define USUAL_1_S 40
 
-/* A pause grows to 256 ms at most, and shrinks by e in 50 ms. */
+/* A pause grows to 256 ms at most, and shrinks by e in 200 ms. */
 #define PAUSE_LIMIT_Q16 (255u << 16)
-#define FORGET_1_S 20
+#define PAUSE_GROWTH_Q16 (1u << 14)
+#define FORGET_1_S 5
 
 observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t widest_rad_s, uint32_t steady_rad_s,
                                                              unsigned encoder_bits, uint32_t control_rate_hz,
@@ -79,8 +80,10 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
     const uint32_t pause_ticks =
         parameters->pause_ticks + (uint32_t)(((uint64_t)parameters->pause_ticks * bandwidth->pause_q16) >> 16);
     if (size > threshold && bandwidth->ticks >= pause_ticks) {
-        const uint32_t doubled_q16 = 2 * bandwidth->pause_q16 + (1u << 16);
-        bandwidth->pause_q16 = doubled_q16 < PAUSE_LIMIT_Q16 ? doubled_q16 : PAUSE_LIMIT_Q16;
+        /* Out of the steady state it is a new event; within a decay it may be the rest of the last one. */
+        const uint32_t growth_q16 = bandwidth->stage == LAST_STAGE ? bandwidth->pause_q16 : bandwidth->pause_q16 / 4;
+        const uint32_t longer_q16 = bandwidth->pause_q16 + growth_q16 + PAUSE_GROWTH_Q16;
+        bandwidth->pause_q16 = longer_q16 < PAUSE_LIMIT_Q16 ? longer_q16 : PAUSE_LIMIT_Q16;
         bandwidth->stage = from_edge ? parameters->first_stage_edge : parameters->first_stage_count;
         bandwidth->ticks = 0;
     }
