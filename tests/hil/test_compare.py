@@ -206,7 +206,7 @@ def test_a_highest_speed_changes_by_what_it_is_above_the_reference():
     key = ("dip", "saturating, 17 bits", "speed_after_rpm", "worst")
     assert change_of(150.1, 150.2, key=key).percent == pytest.approx(100.0, rel=1e-6)
     assert change_of(149.9, 150.0, key=key).percent is None
-    assert change_of(150.1, 150.11, key=key) is None
+    assert change_of(150.01, 150.05, key=key) is None
 
 
 def test_never_and_a_fault_are_worse_than_any_figure():

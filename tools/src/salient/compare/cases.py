@@ -116,10 +116,12 @@ def _ripple(quick: bool) -> Iterator[Case]:
 
 def _speeds(quick: bool) -> Iterator[Case]:
     # Loaded when they run without load: the start at 19.1 N m takes 0.42 s to 3000 r/min.
-    for machine in ("saturating",) if quick else MAGNETICS:
+    machines = [("saturating", None)] if quick else [(machine, None) for machine in MAGNETICS] + [("saturating", 1)]
+    for machine, pulses in machines:
         for speed_rpm, loaded_s in ((600.0, 0.2), (1500.0, 0.4), (3000.0, 0.8)):
-            yield from _held("speeds", f"{machine}, {speed_rpm:g} r/min", speed_rpm, loaded_s + 0.5, quick,
-                             loaded_s=loaded_s, machine=machine)
+            condition = f"{machine}{f' with {_pulses(pulses)}' if pulses else ''}, {speed_rpm:g} r/min"
+            yield from _held("speeds", condition, speed_rpm, loaded_s + 0.5, quick, loaded_s=loaded_s,
+                             machine=machine, pulses=pulses)
 
 
 def _loads(quick: bool) -> Iterator[Case]:
@@ -212,9 +214,9 @@ def random_drive(number: int) -> Scenario:
 
 GROUPS: dict[str, Group] = {
     "ripple": Group("torque ripple at 150 r/min, 8 N m", _ripple, (("ripple", ""), ("ripple_long", ""))),
-    "speeds": Group("torque ripple over speed, 8 N m, 40 kHz, one pulse", _speeds,
+    "speeds": Group("torque ripple over speed, 8 N m, 40 kHz", _speeds,
                     (("ripple", ""), ("ripple_long", ""), ("speed_error_percent", ""))),
-    "loads": Group("torque ripple over load, 150 r/min, 40 kHz, one pulse", _loads,
+    "loads": Group("torque ripple over load, 150 r/min, 40 kHz", _loads,
                    (("ripple", ""), ("ripple_long", ""))),
     "start": Group("start to 600 r/min, no load, 40 kHz", _start, (("settling_time_s", ""), ("overshoot_percent", ""))),
     "dip": Group("load step of 8 N m at 150 r/min, over the rotor's angle, 40 kHz", _dip,
@@ -257,12 +259,13 @@ def _scenario(**fields: Any) -> Scenario:
 
 
 def _held(group: str, condition: str, speed_rpm: float, from_s: float, quick: bool, traced: bool = False,
-          loaded_s: float = STEP_AT_S, load_Nm: float = LOAD_NM, pulses: int = 1, **fields: Any) -> Iterator[Case]:
-    """A speed held against a load, recorded from from_s on."""
+          loaded_s: float = STEP_AT_S, load_Nm: float = LOAD_NM, pulses: int | None = None,
+          **fields: Any) -> Iterator[Case]:
+    """A speed held against a load, recorded from from_s on. pulses: None for what the drive does by itself."""
     scenario = _scenario(duration_s=from_s + (0.1 if quick else LONG_S), speed=(SpeedStep(0.0, speed_rpm),),
                          load=(LoadStep(loaded_s, load_Nm),), record=Record(1.0, from_s), **fields)
     for case in _by_controller(group, condition, "ripple", scenario):
-        if case.controller == "salient":
+        if case.controller == "salient" and pulses:
             case = replace(case, scenario=replace(case.scenario, parameters=PULSES[pulses]))
         yield replace(case, traced=traced)
 

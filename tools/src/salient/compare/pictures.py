@@ -155,7 +155,7 @@ def _over(content: Content, group: str, label: str) -> Figure | None:
         by_machine.setdefault(row["condition"].split(", ")[0], []).append(row)
     if not rows:
         return None
-    figure, axes = _panels(len(by_machine), columns=3, height_in=3.0, sharey=True)
+    figure, axes = _panels(len(by_machine), columns=4, height_in=3.0, sharey=True)
     for axis, (machine, of) in zip(axes, by_machine.items(), strict=True):
         numbers = [float(row["condition"].split(", ")[1].split()[0]) for row in of]
         for controller in _controllers(rows):
@@ -195,7 +195,7 @@ def _over_angle(content: Content) -> Figure | None:
             if row and row["bound"] is not None:
                 axis.axhline(row["bound"], color=_PRINTED_COLOUR, linewidth=1.0, linestyle=dash)
         _logarithmic(axis.yaxis)
-        axis.set_title(condition)
+        axis.set_title(condition.replace(", reserve", ",\nreserve"))
         axis.set_xlabel("rotor angle within a stroke / deg")
     axes[0].set_ylabel("dip / (r/min)")
     _legend(figure, _rows(content, "dip"))
