@@ -20,6 +20,9 @@ Figures = dict[str, float | None]
 SHORT_WINDOW_S = 0.1
 """The length of the paper's window; where a run has more, the figure over all of it stands beside."""
 
+STEADY_S = 0.5
+"""Of the end of a run of the robustness study: what the speed and the spectrum are taken over."""
+
 HOLDS_PERCENT = 100.0 * metrics.BAND
 PEAK_CURRENT_A = 90.0
 HIGHEST_SPEED_PERCENT = 105.0
@@ -122,8 +125,6 @@ def take_robustness(scenario: Scenario, recording: np.ndarray) -> Figures:
         "cycle_percent": metrics.strongest_line_percent(recording, steady_s, metrics.stroke_deg(machine)),
     }
 
-
-STEADY_S = 0.5
 
 MEASURES: dict[str, Callable[[Scenario, np.ndarray], Figures]] = {
     "ripple": take_ripple,
