@@ -314,9 +314,10 @@ def _panels(count: int, columns: int, height_in: float, sharey: bool = False) ->
 
 
 def _logarithmic(axis: Axis) -> None:
-    """With plain numbers, and not too many of them."""
+    """With plain numbers, and not too many of them for what is drawn already."""
     axis.axes.set(**{f"{axis.axis_name}scale": "log"})
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 300.0 * low else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
