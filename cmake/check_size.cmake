@@ -1,6 +1,5 @@
 # cmake -DSIZE=... -DFILES=a;b -DLIMIT=bytes -P check_size.cmake
-# Prints what code and constants take in flash and fails when it is more than LIMIT. Before linking: what the linker would
-# leave out is counted, the compiler's helpers are not.
+# Prints what code and constants take in flash and fails when it is more than LIMIT.
 execute_process(COMMAND ${SIZE} --totals ${FILES} OUTPUT_VARIABLE text COMMAND_ERROR_IS_FATAL ANY)
 if(NOT text MATCHES "\n *([0-9]+)[ \t]+([0-9]+)[ \t]+[0-9]+[ \t]+[0-9]+[ \t]+[0-9a-f]+[ \t]+\\(TOTALS\\)")
     message(FATAL_ERROR "no totals in the output of ${SIZE}:\n${text}")

@@ -37,8 +37,9 @@ int32_t misalignment_offset(const misalignment_parameters_t *parameters, const m
     return fixed_multiply(offset_q30, (int32_t)parameters->probe, 29);
 }
 
-/* value towards target by a share in Q16. */
-static void follow(int32_t *value, int32_t target, int32_t share_q16) {
+/* value towards target by a share in Q16. A function of its own: inlined, its 64-bit arithmetic is in flash five times.
+ */
+static __attribute__((noinline)) void follow(int32_t *value, int32_t target, int32_t share_q16) {
     *value = fixed_add(*value, fixed_multiply(fixed_subtract(target, *value), share_q16, 16));
 }
 
@@ -70,8 +71,9 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const int32_t current_q9 = sample->current_q9[turn];
     if (current_q9 > 0) {
         const uint32_t angle = sample->angle[turn];
-        slope_q24 = fixed_subtract(phase_map_torque_at_q24(tables, angle + parameters->probe, current_q9),
-                                   phase_map_torque_at_q24(tables, angle - parameters->probe, current_q9));
+        const phase_map_place_t ahead = phase_map_at(tables, angle + parameters->probe);
+        const phase_map_place_t behind = phase_map_at(tables, angle - parameters->probe);
+        slope_q24 = fixed_subtract(phase_map_torque_q24(&ahead, current_q9), phase_map_torque_q24(&behind, current_q9));
     }
     follow(&phase->first_q24, slope_q24, parameters->filter_q16);
     follow(&phase->second_q24, phase->first_q24, parameters->filter_q16);

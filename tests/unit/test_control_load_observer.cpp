@@ -100,6 +100,70 @@ TEST(LoadObserver, gains_are_within_0_1_percent_and_1_lsb_over_the_whole_range) 
     }
 }
 
+TEST(LoadObserver, gains_at_a_megahertz_are_within_0_1_percent_and_the_torque_s_within_2_percent) {
+    for (double bandwidth = 100.0; bandwidth <= 10000.0; bandwidth = std::floor(bandwidth * 1.05) + 1.0) {
+        for (const double inertia : {1e-4, 5e-3, 0.02, 0.5, 1.9}) {
+            const observer_parameters_t p = configure(bandwidth, 1e6, inertia);
+            const twins::observer_t ideal = twins::observer_t::ideal(
+                bandwidth, 1e6, twins::to_fixed(inertia, twins::Q30) / twins::Q30, FRICTION_NM_S);
+            SCOPED_TRACE(testing::Message() << bandwidth << " rad/s, " << inertia << " kg m^2");
+            const auto expect = [](double gain, double exact, double share) {
+                ASSERT_LE(std::fabs(gain - exact), share * exact + 1.0);
+            };
+            ASSERT_NO_FATAL_FAILURE(expect(p.gains.angle_gain_q30, ideal.angle_gain * twins::Q30, 1e-3));
+            ASSERT_NO_FATAL_FAILURE(
+                expect(p.gains.speed_gain_q24, ideal.speed_gain * twins::Q22 / twins::TURN * twins::Q24, 1e-3));
+            ASSERT_NO_FATAL_FAILURE(expect(double(p.gains.torque_gain_q20),
+                                           ideal.torque_gain * twins::Q24 / twins::TURN * twins::Q20,
+                                           bandwidth >= 1000.0 ? 1e-3 : 0.02));
+            ASSERT_NO_FATAL_FAILURE(
+                expect(p.model.angle_step_q32, ideal.angle_step * twins::TURN / twins::Q22 * twins::Q32, 1e-3));
+        }
+    }
+}
+
+TEST(LoadObserver, follows_its_twin_at_a_megahertz_with_an_ideal_encoder) {
+    for (const double bandwidth : {250.0, 9000.0}) {
+        const observer_parameters_t parameters = configure(bandwidth, 1e6);
+        twins::observer_t twin = twin_of(parameters);
+        rotor_t rotor{0.2, 15.0};
+        load_observer_t observer;
+        load_observer_reset(&observer, rotor.encoder(32));
+        twin.angle = rotor.encoder(32) / twins::TURN;
+        double speed = 0.0, load_Nm = 0.0;
+        for (int k = 0; k < 200000; k++) {
+            const double torque = 4.0 + 3.0 * std::sin(k * 4e-4), load = k < 100000 ? 0.0 : 8.0;
+            const int32_t torque_q24 = twins::to_fixed(torque, twins::Q24);
+            const uint32_t measured = rotor.encoder(32);
+            observe(parameters, &observer, measured, torque_q24);
+            twin.step(measured / twins::TURN, torque_q24 / twins::Q24);
+            speed = std::max(speed, std::fabs(observer.speed_q22 / twins::Q22 - twin.speed));
+            load_Nm = std::max(load_Nm, std::fabs(observer.load_torque_q24 / twins::Q24 - twin.load_torque));
+            rotor.step(torque, load, 1e6);
+        }
+        std::printf("DBG %g %g\n", speed, load_Nm);
+        EXPECT_LT(speed, 1e-3) << "rad/s, at " << bandwidth;
+        EXPECT_GT(speed, 0.1 / twins::Q22);
+        EXPECT_LT(load_Nm, bandwidth > 1000.0 ? 0.3 : 5e-3) << "N m, at " << bandwidth;
+    }
+}
+
+TEST(LoadObserver, tells_the_innovation_before_the_step_and_the_speed_s_correction_behind_it) {
+    const observer_parameters_t parameters = configure(1000.0);
+    for (const int32_t innovation : {1, -1, 1000, -32768, 1 << 27, -(1 << 27), (1 << 27) + 1000, INT32_MIN + 1}) {
+        load_observer_t observer;
+        load_observer_reset(&observer, 0x12345678u);
+        const uint32_t measured = 0x12345678u + uint32_t(innovation);
+        EXPECT_EQ(load_observer_innovation(&observer, measured), innovation);
+        EXPECT_EQ(observe(parameters, &observer, measured, 0), innovation);
+        const double held = std::clamp(double(innovation), -134217728.0, 134217728.0);
+        EXPECT_NEAR(observer.correction_q22, held * parameters.gains.speed_gain_q24 / twins::Q24, 0.51);
+        twins::observer_t twin = twin_of(parameters);
+        twin.step(innovation / twins::TURN, 0.0);
+        EXPECT_NEAR(observer.correction_q22 / twins::Q22, twin.correction, 1.0 / twins::Q22);
+    }
+}
+
 // What the observer estimates and what its twin does, for the same encoder readings and torques.
 struct differences_t {
     double speed_rad_s = 0.0, load_Nm = 0.0, angle_rad = 0.0;
