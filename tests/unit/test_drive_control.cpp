@@ -118,7 +118,8 @@ TEST_F(Control, every_switch_is_open_until_run_is_commanded) {
 
 TEST_F(Control, the_same_state_and_sample_give_the_same_bits) {
     // A copy of everything, replayed, with other things called in between; and no memory but the state.
-    for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER}) {
+    for (const drive_controller_t controller :
+         {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
         configure(controller);
         start();
         std::mt19937 random(1);
@@ -374,6 +375,179 @@ TEST_F(Control, the_torque_reference_is_never_negative) {
         step(COMMAND_RUN, k < 2000 ? -3000.0 : 0.0);
         ASSERT_GE(diagnostics.torque_reference_q24, 0);
     }
+}
+
+// What of the salient controller is control.c's own; its torque is tested in closed loop.
+class SalientControl : public Control {
+  protected:
+    SalientControl() : Control(DRIVE_CONTROLLER_SALIENT) {}
+
+    // Set anew with some parameters of the drive different.
+    void configure_with(drive_controller_t controller, parameter_index_t index, int32_t value, unsigned adc_bits = 12) {
+        configure(controller);
+        parameters_t p;
+        parameters_init(&p);
+        p.values[PARAMETER_CONTROLLER] = controller;
+        p.values[index] = value;
+        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, adc_bits);
+    }
+};
+
+TEST_F(SalientControl, takes_negative_references_and_the_others_take_them_as_none) {
+    for (const drive_controller_t controller :
+         {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        configure(controller);
+        start();
+        for (int k = 0; k < 100; k++) {
+            ASSERT_TRUE(step(COMMAND_RUN, -600.0));
+        }
+        const bool salient = controller == DRIVE_CONTROLLER_SALIENT;
+        EXPECT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, salient ? -twins::rad_s(600.0) : 0.0, 1e-5);
+        if (salient) {
+            EXPECT_LT(diagnostics.torque_reference_q24 / twins::Q24, -10.0);
+        } else {
+            EXPECT_EQ(diagnostics.torque_reference_q24, 0);
+        }
+    }
+}
+
+TEST_F(SalientControl, brakes_and_reverses_a_turning_rotor_with_a_torque_reference_of_the_other_sign) {
+    for (const double side : {1.0, -1.0}) {
+        configure(DRIVE_CONTROLLER_SALIENT);
+        speed_rad_s = side * 30.0;
+        for (int k = 0; k < 4000; k++) {
+            step(COMMAND_OFF);
+        }
+        // It starts from the present speed, either way.
+        parameters.speed_ramp_q22 = twins::to_fixed(0.05, twins::Q22);
+        step(COMMAND_RUN, -side * 300.0);
+        EXPECT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, side * 30.0, 0.2);
+        for (int k = 0; k < 2000; k++) {
+            ASSERT_TRUE(step(COMMAND_RUN, -side * 300.0));
+        }
+        EXPECT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, -side * twins::rad_s(300.0), 1e-5);
+        EXPECT_LT(side * diagnostics.torque_reference_q24 / twins::Q24, -19.0);
+    }
+}
+
+TEST_F(SalientControl, two_pulses_are_its_own_and_may_be_one) {
+    for (const int32_t pulses : {1, 2}) {
+        configure_with(DRIVE_CONTROLLER_SALIENT, PARAMETER_PULSES_PER_PERIOD, pulses);
+        start();
+        for (int k = 0; k < 200; k++) {
+            ASSERT_TRUE(step(COMMAND_RUN, 1.0));
+            for (unsigned phase = 0; phase < 3; phase++) {
+                const int upper = compare.upper[phase], lower = compare.lower[phase];
+                const double duty = state.predictive.duty_q15[phase] / twins::Q15;
+                ASSERT_NEAR((upper + lower) / double(parameters.period_ticks) - 1.0, duty,
+                            1.0 / parameters.period_ticks);
+                if (pulses == 2) {
+                    ASSERT_LE(std::abs(upper - lower), 1);
+                } else {
+                    ASSERT_TRUE(upper == 0 || lower == parameters.period_ticks);
+                }
+            }
+        }
+    }
+}
+
+TEST_F(SalientControl, the_load_torque_of_the_sliding_mode_is_the_transducer_s_where_a_parameter_says_so) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        for (const unsigned bits : {12u, 14u, 16u}) {
+            for (const double load_Nm : {4.0, 0.0, 12.5}) {
+                configure_with(controller, PARAMETER_LOAD_SOURCE, 1, bits);
+                sample.adc.bus_voltage_counts = uint16_t(BUS_COUNTS << (bits - 12));
+                sample.adc.load_torque_counts = uint16_t((load_Nm + 64.0) * std::ldexp(1.0, int(bits) - 7));
+                start();
+                for (int k = 0; k < 100; k++) {
+                    ASSERT_TRUE(step(COMMAND_RUN, 0.0));
+                }
+                EXPECT_NEAR(diagnostics.torque_reference_q24 / twins::Q24, load_Nm, 0.05) << bits << " bits";
+                EXPECT_NEAR(diagnostics.load_torque_q24 / twins::Q24, 0.0, 0.1) << "the observer's is another";
+            }
+        }
+    }
+    // A load of the other sign: only a controller that brakes can answer it.
+    configure_with(DRIVE_CONTROLLER_SALIENT, PARAMETER_LOAD_SOURCE, 1);
+    sample.adc.load_torque_counts = uint16_t((64.0 - 5.0) * 32.0);
+    start();
+    for (int k = 0; k < 100; k++) {
+        step(COMMAND_RUN, 0.0);
+    }
+    EXPECT_NEAR(diagnostics.torque_reference_q24 / twins::Q24, -5.0, 0.05);
+    // Without the parameter the code is not looked at.
+    configure(DRIVE_CONTROLLER_SALIENT);
+    sample.adc.load_torque_counts = 4095;
+    start();
+    for (int k = 0; k < 100; k++) {
+        step(COMMAND_RUN, 0.0);
+    }
+    EXPECT_NEAR(diagnostics.torque_reference_q24 / twins::Q24, 0.0, 0.1);
+}
+
+TEST_F(SalientControl, an_edge_s_angle_is_the_boundary_and_the_way_since_at_the_observer_s_speed) {
+    for (const double speed : {15.0, 100.0, -15.0, -100.0}) {
+        for (const uint32_t age_ticks : {0u, 1u, 3000u, 20000u}) {
+            configure(DRIVE_CONTROLLER_SALIENT);
+            speed_rad_s = speed;
+            for (int k = 0; k < 4000; k++) {
+                step(COMMAND_OFF);
+            }
+            const double known_rad_s = state.observer.speed_q22 / twins::Q22;
+            EXPECT_NEAR(known_rad_s, speed, 0.05);
+            sample.encoder.edge_known = true;
+            sample.encoder.edge_forward = speed > 0.0;
+            sample.encoder.edge_age_ticks = age_ticks;
+            step(COMMAND_OFF);
+            const double boundary = sample.encoder.counts + (speed > 0.0 ? 0.0 : 1.0);
+            const double turns_now =
+                std::ldexp(boundary, -int(ENCODER_BITS)) + known_rad_s * age_ticks * 5e-9 / (2.0 * twins::PI);
+            double difference = diagnostics.angle - (turns_now - std::floor(turns_now)) * twins::TURN;
+            difference -= std::round(difference / twins::TURN) * twins::TURN;
+            EXPECT_NEAR(difference, 0.0, 2.0 + 1e-6 * std::fabs(speed) * age_ticks) << speed << ", " << age_ticks;
+        }
+    }
+}
+
+TEST_F(SalientControl, an_edge_older_than_two_periods_at_20_kHz_or_none_leaves_the_middle_of_the_count) {
+    speed_rad_s = 15.0;
+    for (int k = 0; k < 400; k++) {
+        step(COMMAND_OFF);
+    }
+    const auto middle = [this] { return (sample.encoder.counts << 15) + (1u << 14); };
+    sample.encoder.edge_known = true;
+    sample.encoder.edge_forward = true;
+    for (const uint32_t age_ticks : {20001u, HAL_ENCODER_AGE_MAX_TICKS}) {
+        sample.encoder.edge_age_ticks = age_ticks;
+        step(COMMAND_OFF);
+        EXPECT_EQ(diagnostics.angle, middle()) << age_ticks;
+    }
+    sample.encoder.edge_age_ticks = 100;
+    step(COMMAND_OFF);
+    EXPECT_NE(diagnostics.angle, middle());
+    sample.encoder.edge_known = false;
+    step(COMMAND_OFF);
+    EXPECT_EQ(diagnostics.angle, middle());
+}
+
+TEST_F(SalientControl, trims_and_missing_torque_are_0_with_the_other_controllers) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER}) {
+        configure(controller);
+        start();
+        for (int k = 0; k < 400; k++) {
+            step(COMMAND_RUN, 3000.0);
+            ASSERT_EQ(diagnostics.trim_torque_q24, 0);
+            ASSERT_EQ(diagnostics.misalignment, 0);
+            ASSERT_EQ(diagnostics.torque_missing_q24, 0);
+        }
+    }
+    configure(DRIVE_CONTROLLER_SALIENT);
+    start();
+    step(COMMAND_RUN, 3000.0);
+    EXPECT_GT(diagnostics.torque_missing_q24, 10 << 24) << "no current yet";
+    EXPECT_TRUE(diagnostics.voltage_saturated);
+    step(COMMAND_OFF);
+    EXPECT_EQ(diagnostics.torque_missing_q24, 0);
 }
 
 } // namespace
