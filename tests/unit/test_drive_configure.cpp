@@ -15,7 +15,7 @@ extern "C" {
 
 namespace {
 
-const double RATES_HZ[] = {20000.0, 40000.0, 50000.0, 100000.0};
+const double RATES_HZ[] = {20000.0, 40000.0, 50000.0, 100000.0, 1000000.0};
 
 double value_of(const parameters_t &parameters, unsigned index) {
     return std::ldexp(double(parameters.values[index]), -int(parameters_row(index)->fraction_bits));
@@ -41,7 +41,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
 
     ASSERT_EQ(c.tables, &machine_tables);
     ASSERT_EQ(int(c.controller), p.values[PARAMETER_CONTROLLER]);
-    ASSERT_EQ(2.0 * c.period_ticks * HAL_PWM_TICK_NS * 1e-9 * rate_hz, 1.0);
+    ASSERT_EQ(2.0 * c.period_ticks * rate_hz, double(HAL_PWM_CLOCK_HZ));
     ASSERT_EQ(c.encoder_shift, 32 - encoder_bits);
     ASSERT_EQ(c.initialise_ticks, uint32_t(rate_hz / 1000.0));
 
@@ -97,6 +97,52 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(c.protection.angle_step_q32, c.observer.angle_step_q32);
     near("timeout", c.protection.command_timeout_us, 1000.0 * v(PARAMETER_COMMAND_TIMEOUT_MS), 0.0);
 
+    const auto &share = c.predictive.share;
+    const double stroke = twins::TURN / machine_tables.phases;
+    const double least = 2.0 / 360.0 * twins::TURN;
+    const double on_early = pitch(PARAMETER_SHARE_ON_EARLY_DEG);
+    const double asked_width = pitch(PARAMETER_SHARE_OFF_ANGLE_DEG) - pitch(PARAMETER_SHARE_ON_ANGLE_DEG);
+    const double width = std::max(asked_width, stroke + least);
+    const double narrowing =
+        std::min(pitch(PARAMETER_SHARE_OFF_EARLY_DEG) - on_early, width - stroke - least); // at full advance
+    ASSERT_EQ(c.two_pulses, p.values[PARAMETER_PULSES_PER_PERIOD] == 2);
+    ASSERT_EQ(c.load_from_transducer, p.values[PARAMETER_LOAD_SOURCE] == 1);
+    ASSERT_EQ(share.sharing, p.values[PARAMETER_TORQUE_SHARING] == 1);
+    near("stroke", share.stroke, 0.0, twins::TURN);
+    ASSERT_LE(std::fabs(share.stroke - stroke), 1.0);
+    ASSERT_LE(std::fabs(share.turn_on - pitch(PARAMETER_SHARE_ON_ANGLE_DEG)), 1.0);
+    ASSERT_LE(std::fabs(share.turn_off - share.turn_on - width), 4.0) << "at least 2 degrees of overlap";
+    ASSERT_LE(std::fabs(share.turn_on_early - on_early), 1.0);
+    ASSERT_LE(std::fabs(share.turn_off_early - on_early - narrowing), 4.0) << "at full advance, too";
+    near("current limit", c.predictive.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * twins::Q9, 0.0);
+    near("reserve", c.predictive.reserve_q24, v(PARAMETER_TORQUE_RESERVE_NM) * twins::Q24, 0.0);
+    near("flux gain", c.predictive.flux.gain_q15, v(PARAMETER_FLUX_OBSERVER_GAIN) * twins::Q15, 0.0);
+    const double q40 = std::ldexp(1.0, 40);
+    near("resistance", c.predictive.flux.resistance_period_q40, v(PARAMETER_RESISTANCE_OHM) / rate_hz * q40, 1.0);
+    near("period", c.predictive.period_q40, q40 / rate_hz, 1.0);
+    near("advance", c.predictive.advance_q30, 10.0 / rate_hz * twins::Q30, 1.0);
+    near("return", c.predictive.return_q30, 1.0 / rate_hz * twins::Q30, 1.0);
+
+    const auto trim_scale = [&](unsigned index) {
+        return std::min(v(index) * scale_Nm / v(PARAMETER_BP_TRIM_LIMIT_NM), 4.0) * twins::Q15;
+    };
+    ASSERT_EQ(int(c.trim.pid.mode), p.values[PARAMETER_BP_TRIM_MODE]);
+    ASSERT_EQ(int32_t(c.trim.pid.seed), p.values[PARAMETER_BP_SEED]);
+    near("trim limit", c.trim.limit_q24, v(PARAMETER_BP_TRIM_LIMIT_NM) * twins::Q24, 0.0);
+    near("trim error", c.trim.pid.error_scale_inverse_q24, twins::Q24 / scale_Nm, 1.0);
+    near("trim kp", c.trim.pid.kp_scale_q15, trim_scale(PARAMETER_BP_TRIM_KP_MAX), 1.0);
+    near("trim ki", c.trim.pid.ki_scale_q15, trim_scale(PARAMETER_BP_TRIM_KI_MAX), 1.0);
+    near("trim kd", c.trim.pid.kd_scale_q15, trim_scale(PARAMETER_BP_TRIM_KD_MAX), 1.0);
+    near("trim eta", c.trim.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * twins::Q15, 1.0);
+    near("trim alpha", c.trim.pid.network.inertia_q15, v(PARAMETER_BP_ALPHA) * twins::Q15, 1.0);
+
+    const double learn_1_s = p.values[PARAMETER_ANGLE_TRIM] == 1 ? v(PARAMETER_ANGLE_TRIM_RATE_1_S) : 0.0;
+    const double turn_rate_hz = std::floor(rate_hz / machine_tables.phases);
+    near("misalignment rate", c.misalignment.rate_q30, learn_1_s / turn_rate_hz * twins::Q30, 1.0);
+    near("inertia rate", c.misalignment.inertia_rate_q8, v(PARAMETER_INERTIA_KG_M2) * rate_hz * 256.0, 1.0);
+    ASSERT_LE(std::fabs(c.misalignment.probe - 0.01 / (2.0 * twins::PI) * twins::TURN * machine_tables.rotor_poles),
+              machine_tables.rotor_poles);
+
     // The observer's gains have a test of their own; here, that the right parameters get there.
     const uint32_t rate = uint32_t(rate_hz);
     const int32_t inertia_q30 = p.values[PARAMETER_INERTIA_KG_M2];
@@ -109,6 +155,14 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(steady.angle_gain_q30, gains.angle_gain_q30);
     ASSERT_EQ(steady.speed_gain_q24, gains.speed_gain_q24);
     ASSERT_EQ(steady.torque_gain_q20, gains.torque_gain_q20);
+    const bool wakes = salient && p.values[PARAMETER_OBSERVER_WAKING] == 1 &&
+                       p.values[PARAMETER_OBSERVER_WAKE_RAD_S] > p.values[PARAMETER_OBSERVER_STEADY_RAD_S];
+    const parameter_index_t widest = wakes     ? PARAMETER_OBSERVER_WAKE_RAD_S
+                                     : salient ? PARAMETER_OBSERVER_STEADY_RAD_S
+                                               : PARAMETER_OBSERVER_BANDWIDTH_RAD_S;
+    ASSERT_EQ(c.bandwidth.bandwidth_rad_s[0], p.values[widest]);
+    ASSERT_EQ(c.bandwidth.threshold_count == UINT32_MAX, !wakes);
+    ASSERT_EQ(c.bandwidth.threshold_edge == UINT32_MAX, !wakes);
     ASSERT_EQ(c.observer.acceleration_q32, observer.acceleration_q32);
     ASSERT_EQ(c.observer.friction_q30, observer.friction_q30);
 }
@@ -129,6 +183,9 @@ TEST(Configure, converts_both_ends_of_every_parameter) {
     for (unsigned index = 0; index < PARAMETER_COUNT; index++) {
         for (const int32_t value : {parameters_row(index)->minimum, parameters_row(index)->maximum}) {
             parameters_init(&parameters);
+            if (index > PARAMETER_LOAD_SOURCE) {
+                parameters.values[PARAMETER_CONTROLLER] = DRIVE_CONTROLLER_SALIENT;
+            }
             ASSERT_EQ(parameters_set(&parameters, index, value), PARAMETER_DONE);
             for (const double rate_hz : RATES_HZ) {
                 SCOPED_TRACE(testing::Message() << parameters_row(index)->name << " = " << value << ", " << rate_hz);
@@ -150,7 +207,7 @@ TEST(Configure, converts_random_sets_of_parameters_within_their_ranges) {
                       PARAMETER_DONE);
         }
         SCOPED_TRACE(testing::Message() << "set " << i);
-        ASSERT_NO_FATAL_FAILURE(expect_converted(parameters, RATES_HZ[random() % 4], unsigned(8 + random() % 25)));
+        ASSERT_NO_FATAL_FAILURE(expect_converted(parameters, RATES_HZ[random() % 5], unsigned(8 + random() % 25)));
     }
 }
 
@@ -163,7 +220,7 @@ TEST(Configure, a_machine_whose_current_hardly_rises_gets_the_largest_gain_and_n
 }
 
 TEST(Configure, allows_the_rates_that_the_timer_makes_exactly) {
-    for (uint32_t rate_hz = 0; rate_hz <= 200000; rate_hz += 1000) {
+    for (uint32_t rate_hz = 0; rate_hz <= 2000000; rate_hz += 1000) {
         const bool listed = std::count(std::begin(RATES_HZ), std::end(RATES_HZ), double(rate_hz)) > 0;
         EXPECT_EQ(configure_rate_allowed(rate_hz), listed) << rate_hz;
     }
