@@ -6,7 +6,8 @@ import argparse
 import math
 from pathlib import Path
 
-WORSE_PERCENT = 5.0
+WORSE_PERCENT = 10.0
+"""Of a ripple, an extreme of one run, changes of some percent are chance."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
