@@ -66,7 +66,7 @@ static const parameter_row_t rows[PARAMETER_COUNT] = {
     [PARAMETER_FLUX_OBSERVER_GAIN] = {"flux_observer_gain", "", 15, 0, Q(1, 1, 15), Q(1, 4, 15)},
     /* 0: the misalignment known so far stays */
     [PARAMETER_ANGLE_TRIM] = {"angle_trim", "", 0, 0, 1, 1},
-    [PARAMETER_ANGLE_TRIM_RATE_1_S] = {"angle_trim_rate_1_s", "1/s", 0, 1, 100, 12},
+    [PARAMETER_ANGLE_TRIM_RATE_1_S] = {"angle_trim_rate_1_s", "1/s", 0, 1, 100, 8},
     /* As bp_mode. */
     [PARAMETER_BP_TRIM_MODE] = {"bp_trim_mode", "", 0, 0, 3, 0},
     [PARAMETER_BP_TRIM_LIMIT_NM] = {"bp_trim_limit_Nm", "N m", 24, Q(1, 10, 24), Q(20, 1, 24), Q(3, 1, 24)},
