@@ -7,7 +7,7 @@ import pytest
 from salient.paths import MACHINES
 
 
-@pytest.mark.parametrize("controller", ["traditional", "paper"])
+@pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])
 @pytest.mark.parametrize(("stator", "rotor", "phases"), [(8, 6, 4), (12, 8, 3)])
 def test_starts_and_holds_speed_under_load(make_bench, tmp_path, controller, stator, rotor, phases):
     text = (MACHINES / "saturating.toml").read_text()
@@ -30,4 +30,11 @@ def test_starts_and_holds_speed_under_load(make_bench, tmp_path, controller, sta
     currents = [bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"].value.max() for phase in "abcd"]
     assert sum(current > 20 for current in currents) == phases
     assert max(currents) < 75
+    if controller == "salient":  # the others motor forwards only
+        bench.drive.speed_reference_rpm = -600
+        bench.run_for(0.3)
+        backwards = bench.truth["speed_rpm"].between(bench.time_s - 0.1, bench.time_s)
+        assert -600.5 < backwards.value.min() < backwards.value.max() < -599.5
+        assert steady.value.min() > 599.8
+        assert steady.value.max() < 600.2
     assert bench.drive.fault == "none"

@@ -169,6 +169,112 @@ def test_a_controller_that_motors_forwards_only_stands_still_at_a_negative_refer
     assert bench.truth["speed_rpm"].value.max() < 153
 
 
+@dataclass(frozen=True)
+class Motion:
+    """At which speed and load the salient controller is when something fails, and the torque it then asks for."""
+
+    speed_rpm: float
+    load_Nm: float
+    torque_Nm: float
+
+
+# Friction is 1.3 N m at 600 r/min.
+MOTIONS = {
+    "backwards": Motion(-600, -12, -13.3),
+    "braking": Motion(600, -12, -10.7),
+    "braking_backwards": Motion(-600, 12, 10.7),
+}
+
+
+def moving(make_bench, motion: Motion) -> Bench:
+    bench = make_bench(controller="salient")
+    bench.drive.speed_reference_rpm = motion.speed_rpm
+    bench.run_for(0.1)
+    bench.load_torque_Nm = motion.load_Nm
+    bench.run_for(0.05)
+    assert bench.drive.state == "run"
+    assert bench.truth["speed_rpm"].last == pytest.approx(motion.speed_rpm, abs=1)
+    return bench
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("name", CASES)
+def test_a_fault_in_any_quadrant_opens_all_switches_and_is_recorded(make_bench, motion, name):
+    case, moves = CASES[name], MOTIONS[motion]
+    bench = moving(make_bench, moves)
+    caused_us = bench.time_ns / 1000
+    case.provoke(bench)
+    bench.run_for(0.02)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", case.fault)
+    assert bench.telemetry["DRIVE_FAULT_CAUSE.fault"].last_name == case.fault
+    assert bench.telemetry["DRIVE_FAULT_CAUSE.state"].last_name == "run"
+    reaction_us = bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last - caused_us
+    assert case.reaction_us[0] <= reaction_us <= case.reaction_us[1]
+    speed_rpm = bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last
+    torque_Nm = bench.telemetry["DRIVE_FAULT_SNAPSHOT.torque_reference_Nm"].last
+    if name in ("encoder_freezes", "interrupt_overrun"):  # its observer wakes and takes the new angles for a new speed
+        assert speed_rpm == pytest.approx(moves.speed_rpm, abs=130)
+        assert abs(torque_Nm) < 19.2
+    else:
+        assert speed_rpm == pytest.approx(moves.speed_rpm, abs=1)
+        assert torque_Nm == pytest.approx(moves.torque_Nm, abs=0.5)
+    assert currents_A(bench) == [0, 0, 0]
+    bench.run_for(0.01)
+    assert currents_A(bench) == [0, 0, 0]
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_commands_that_stop_coming_open_all_switches_in_any_quadrant(make_bench, motion):
+    moves = MOTIONS[motion]
+    bench = moving(make_bench, moves)
+    bench.run_until(lambda: bench.drive.command_due_ns == bench.time_ns + 9_000_000, timeout=0.02)
+    sent_s = bench.time_s - 0.001
+    bench.drive.silence()
+    bench.run_for(0.11)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "command_timeout")
+    # The frame's own time on the bus, and a control period.
+    assert 0 < bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last - (sent_s * 1e6 + 100_000) < 500
+    assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(moves.speed_rpm, abs=1)
+    assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.torque_reference_Nm"].last == pytest.approx(moves.torque_Nm, abs=0.5)
+    assert currents_A(bench) == [0, 0, 0]
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_a_load_beyond_the_torque_limit_trips_over_speed_in_run(make_bench, motion):
+    """It overcomes a brake; against a motor it first turns the rotor the other way."""
+    bench = make_bench(controller="salient")
+    moves = MOTIONS[motion]
+    bench.drive.parameters["over_speed_rpm"] = 700
+    bench.drive.speed_reference_rpm = moves.speed_rpm
+    bench.run_for(0.1)
+    bench.load_torque_Nm = 2.5 * moves.load_Nm
+    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.4)
+    assert bench.drive.fault == "over_speed"
+    direction = -1 if moves.load_Nm > 0 else 1
+    assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(700 * direction, abs=2)
+    torque_Nm = bench.telemetry["DRIVE_FAULT_SNAPSHOT.torque_reference_Nm"].last
+    assert torque_Nm == pytest.approx(-19.1 * direction, abs=0.05)
+    bench.run_for(0.005)
+    assert currents_A(bench) == [0, 0, 0]
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_the_trip_current_is_a_parameter_in_any_quadrant(make_bench, motion):
+    bench = make_bench(controller="salient")
+    bench.drive.parameters["current_trip_A"] = 25
+    bench.drive.parameters["speed_ramp_rpm_s"] = 2000  # a start at the torque limit would trip
+    bench.drive.speed_reference_rpm = MOTIONS[motion].speed_rpm
+    bench.run_for(0.4)
+    assert bench.drive.state == "run"
+    bench.load_torque_Nm = MOTIONS[motion].load_Nm
+    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.05)
+    assert bench.drive.fault == "over_current"
+    # A period at 240 V over the unaligned inductance is 9 A.
+    assert 25 < bench.telemetry["DRIVE_FAULT_SNAPSHOT.current_max_A"].last < 34
+    bench.run_for(0.005)
+    assert currents_A(bench) == [0, 0, 0]
+
+
 def test_a_single_long_interrupt_is_no_fault(bench):
     running(bench)
     bench.rig.interrupt_time_us = 40  # beyond one period
