@@ -117,7 +117,8 @@ def test_instructions_of_the_drive_are_the_same_twice_but_for_the_client_s() -> 
     assert sum(second.values()) == pytest.approx(sum(first.values()), rel=2e-3)
 
 
-@pytest.mark.parametrize(("controller", "least", "most"), [("traditional", 2000.0, 4500.0), ("paper", 4500.0, 9500.0)])
+@pytest.mark.parametrize(("controller", "least", "most"), [
+    ("traditional", 2000.0, 4500.0), ("paper", 4500.0, 9500.0), ("salient", 7500.0, 15000.0)])
 def test_instructions_of_the_drive_by_group(controller: str, least: float, most: float) -> None:
     counts = instructions.of_drive(controller, 0.02)
     total = sum(counts.values())

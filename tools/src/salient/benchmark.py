@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from salient import comparison, instructions
+from salient.arguments import CONTROLLERS
 from salient.errors import UsageError
 from salient.network_study import study
 from salient.ngspice import NgspiceError
@@ -118,7 +119,7 @@ def _speed(runs: int) -> list[dict[str, Any]]:
     for condition, meaning in CONDITIONS.items():
         print(f"  {condition}: {meaning}")
     figures = []
-    for controller in ("traditional", "paper"):
+    for controller in CONTROLLERS:
         for condition in CONDITIONS:
             costs_s = sorted(measure(controller, condition) for _ in range(runs))
             median_s = statistics.median(costs_s)
@@ -140,7 +141,7 @@ def _instructions() -> dict[str, Any]:
     """Of the drive by controller and group."""
     print("instructions a control period, without the kernel's: the same run with one client")
     figures = {}
-    for controller in ("traditional", "paper"):
+    for controller in CONTROLLERS:
         counts = instructions.of_drive(controller, _COUNTED_S)
         total = sum(counts.values())
         figures[controller] = {group: round(count, 1) for group, count in counts.items()} | {"total": round(total, 1)}
