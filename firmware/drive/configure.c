@@ -39,7 +39,11 @@ static int32_t pid_scale_q15(int32_t per_Nm_q15, int32_t error_scale_q24, uint32
     return fixed_clamp(fixed_saturate(scaled_q15 * control_rate_hz / GAIN_RATE_HZ), 0, 4 << 15);
 }
 
-static protection_parameters_t protection_from(const int32_t *values, int32_t angle_step_q32, unsigned encoder_shift) {
+/* Of drive and load together, N m: beyond the drive's highest torque limit. */
+#define SLOWING_TORQUE_NM 40
+
+static protection_parameters_t protection_from(const int32_t *values, int32_t angle_step_q32, unsigned encoder_shift,
+                                               uint32_t control_rate_hz) {
     const int32_t over_speed_q22 = fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM]));
     const uint32_t count = 1u << encoder_shift;
     /* A period at one and a half times the highest speed, and the rounding of two readings. */
@@ -54,6 +58,8 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
         .angle_unmoved_max = (uint32_t)(((uint64_t)1 << 32) / 1440u) + 4u * count,
         .angle_step_q32 = angle_step_q32,
         .command_timeout_us = (uint32_t)values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u,
+        .slowing_q22 = fixed_saturate(((int64_t)SLOWING_TORQUE_NM << 52) / values[PARAMETER_INERTIA_KG_M2] /
+                                      (int64_t)control_rate_hz),
     };
 }
 
@@ -215,6 +221,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                                    (uint32_t)values[PARAMETER_OBSERVER_STEADY_RAD_S], control_rate_hz, inertia_q30,
                                    tables->phases, tables->rotor_poles),
     };
-    control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift);
+    control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
     return control;
 }

@@ -196,13 +196,14 @@ static int32_t mean_misalignment(const control_parameters_t *parameters, const c
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   hal_pwm_compare_t *compare, control_diagnostics_t *diagnostics) {
     const estimate_t e = estimate(parameters, state, sample);
+    const uint32_t count_angle = sample->encoder.counts << parameters->encoder_shift;
     state_machine_t *machine = &state->machine;
     const drive_state_t before = machine->state;
     if (!state->started) {
         state->started = true;
         load_observer_reset(&state->observer, e.angle);
         observer_bandwidth_reset(&state->bandwidth);
-        protection_reset(&state->protection, e.angle);
+        protection_reset(&state->protection, count_angle);
     }
     const load_observer_gains_t *gains = observer_bandwidth_step(
         &parameters->bandwidth, &state->bandwidth, load_observer_innovation(&state->observer, e.angle), e.from_edge);
@@ -212,7 +213,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
         .current_max_q9 = e.current_max_q9,
         .bus_voltage_q6 = e.bus_voltage_q6,
         .speed_q22 = state->observer.speed_q22,
-        .angle = e.angle,
+        .angle = count_angle,
         .missed_interrupts = sample->missed_interrupts,
         .command_age_us = sample->time_us - sample->command.time_us,
     };

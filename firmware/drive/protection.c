@@ -10,12 +10,17 @@ void protection_reset(protection_t *protection, uint32_t angle) {
     *protection = (protection_t){.angle = angle};
 }
 
-/* A jump, or an encoder that stands still while the observer is sure of a movement. */
+/* A jump, or an encoder that stands still while the rotor moves. The observer alone cannot tell: a fast one follows a
+ * frozen encoder to standstill before the rotor went far. No torque stops the rotor as quickly, so its speed at the
+ * last count, less what torque can have taken off since, is believed as well. */
 static int encoder_fails(const protection_parameters_t *parameters, protection_t *protection,
                          const protection_sample_t *sample) {
     const int32_t step = (int32_t)(sample->angle - protection->angle); /* modulo a turn */
     protection->angle = sample->angle;
-    const int32_t speed_q22 = fixed_abs(sample->speed_q22);
+    const int32_t observed_q22 = fixed_abs(sample->speed_q22);
+    const int32_t slowed_q22 = step != 0 ? 0 : fixed_subtract(protection->moving_q22, parameters->slowing_q22);
+    const int32_t speed_q22 = observed_q22 > slowed_q22 ? observed_q22 : slowed_q22;
+    protection->moving_q22 = speed_q22;
     if (step != 0 || speed_q22 < STANDSTILL_Q22) {
         protection->unmoved_q64 = 0;
     } else if (protection->unmoved_q64 < (int64_t)1 << 62) {

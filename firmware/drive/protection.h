@@ -14,10 +14,12 @@ typedef struct {
     uint32_t angle_unmoved_max; /* 2^-32 turn that the rotor should have moved while the encoder stood still */
     int32_t angle_step_q32;     /* period: 2^-32 turn per rad/s Q9.22, in Q32 */
     uint32_t command_timeout_us;
+    int32_t slowing_q22; /* that torque can take off the speed in a period, rad/s, Q9.22 */
 } protection_parameters_t;
 
 typedef struct {
     uint32_t angle;      /* of the last period, 2^-32 turn */
+    int32_t moving_q22;  /* least speed that the rotor can have by now, rad/s, Q9.22 */
     int64_t unmoved_q64; /* expected movement since the encoder last moved, 2^-64 turn */
     uint32_t overruns;   /* control interrupts lost in a row */
 } protection_t;
@@ -26,7 +28,7 @@ typedef struct {
     int32_t current_max_q9; /* of all phases */
     int32_t bus_voltage_q6;
     int32_t speed_q22;          /* negative backwards */
-    uint32_t angle;             /* measured, 2^-32 turn */
+    uint32_t angle;             /* of the encoder's count, 2^-32 turn */
     uint32_t missed_interrupts; /* since the last period */
     uint32_t command_age_us;    /* of the last accepted command */
 } protection_sample_t;

@@ -155,6 +155,23 @@ def test_an_encoder_that_freezes_or_jumps_is_noticed_in_either_direction(bench, 
     assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(600 * direction, abs=10)
 
 
+@pytest.mark.parametrize("edges", [False, True])
+@pytest.mark.parametrize("speed_rpm", [75, -150, 300])
+def test_an_encoder_that_freezes_at_low_speed_is_noticed_though_the_observer_follows_it(make_bench, speed_rpm, edges):
+    bench = make_bench(controller="salient", encoder_edges=edges)
+    bench.drive.speed_reference_rpm = speed_rpm
+    bench.run_for(0.2)
+    caused_us = bench.time_ns / 1000
+    bench.rig.encoder_fault = 1
+    bench.run_for(0.005)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "encoder")
+    # A quarter of a degree; the rotor may slow down meanwhile.
+    needed_us = 0.25 / (6 * abs(speed_rpm)) * 1e6
+    assert needed_us < bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last - caused_us < 1.2 * needed_us + 2 * PERIOD_US
+    bench.run_for(0.01)
+    assert currents_A(bench) == [0, 0, 0]
+
+
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
 def test_a_controller_that_motors_forwards_only_stands_still_at_a_negative_reference(make_bench, controller):
     bench = make_bench(controller=controller)

@@ -95,6 +95,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_LE(std::fabs(c.protection.angle_step_max - (1.5 * fastest + 2.0 * count)), 3.0 + 1e-6 * fastest);
     ASSERT_LE(std::fabs(c.protection.angle_unmoved_max - (twins::TURN / 1440.0 + 4.0 * count)), 1.0);
     ASSERT_EQ(c.protection.angle_step_q32, c.observer.angle_step_q32);
+    near("slowing", c.protection.slowing_q22, 40.0 / v(PARAMETER_INERTIA_KG_M2) / rate_hz * twins::Q22, 2.0);
     near("timeout", c.protection.command_timeout_us, 1000.0 * v(PARAMETER_COMMAND_TIMEOUT_MS), 0.0);
 
     const auto &share = c.predictive.share;

@@ -2,6 +2,7 @@
 #include <cmath>
 #include <cstdint>
 #include <random>
+#include <utility>
 
 #include <gtest/gtest.h>
 
@@ -14,8 +15,9 @@ namespace {
 
 constexpr uint32_t ANGLE_STEP_MAX = 1000000;
 constexpr uint32_t ANGLE_UNMOVED_MAX = 3000000;
-const protection_parameters_t PARAMETERS = {75 << 9,        300 << 6,          150 << 6, 377 << 22,
-                                            ANGLE_STEP_MAX, ANGLE_UNMOVED_MAX, 17089134, 100000};
+constexpr int32_t SLOWING_Q22 = 209715; // 40 N m on 0.02 kg m^2 in 25 us: 0.05 rad/s
+const protection_parameters_t PARAMETERS = {75 << 9,           300 << 6, 150 << 6, 377 << 22,  ANGLE_STEP_MAX,
+                                            ANGLE_UNMOVED_MAX, 17089134, 100000,   SLOWING_Q22};
 
 class Protection : public testing::Test {
   protected:
@@ -100,6 +102,26 @@ TEST_F(Protection, lost_interrupts_allow_the_encoder_as_many_more_steps) {
     sample.missed_interrupts = 2;
     sample.angle += 3 * ANGLE_STEP_MAX + 1;
     EXPECT_EQ(check(sample), FAULT_BIT(FAULT_ENCODER));
+}
+
+TEST_F(Protection, an_observer_that_follows_a_frozen_encoder_to_standstill_hides_nothing) {
+    // Slowed evenly from v, the rotor goes v^2 / 2a before it stands: 4.1 rad/s is within the limit, 4.5 beyond it.
+    for (const int32_t sign : {1, -1}) {
+        for (const auto &[speed_rad_s, fails] : {std::pair{4.1, false}, std::pair{4.5, true}, std::pair{60.0, true}}) {
+            protection_reset(&protection, healthy.angle);
+            protection_sample_t sample = healthy;
+            sample.angle++;
+            sample.speed_q22 = sign * int32_t(speed_rad_s * (1 << 22));
+            ASSERT_EQ(check(sample), 0);
+            sample.speed_q22 = 0;
+            bool failed = false;
+            for (int k = 0; k < 2000; k++) {
+                failed |= check(sample) != 0;
+            }
+            EXPECT_EQ(failed, fails) << speed_rad_s;
+            EXPECT_EQ(check(sample), 0) << "by now the rotor may stand";
+        }
+    }
 }
 
 TEST_F(Protection, an_encoder_is_frozen_when_the_rotor_should_have_moved_further_than_the_limit) {
