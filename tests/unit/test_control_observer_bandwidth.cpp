@@ -35,6 +35,7 @@ twins::bandwidth_t twin_of(const observer_bandwidth_parameters_t &p, double rate
     twin.threshold_count = p.threshold_count;
     twin.threshold_edge = p.threshold_edge;
     twin.pause_s = p.pause_ticks / rate_hz;
+    twin.kept = p.forget_q16 / twins::Q16;
     return twin;
 }
 

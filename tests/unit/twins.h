@@ -115,7 +115,7 @@ struct observer_t {
 struct bandwidth_t {
     double steady_rad_s, first_count_rad_s, first_edge_rad_s, rate_hz;
     double threshold_count, threshold_edge;
-    double pause_s;
+    double pause_s, kept;         // least pause; what a period leaves of a longer one
     double bandwidth_rad_s = 0.0; // 0 before the first step, which is awake
     double since_s = 0.0, pauses = 0.0, usual = 0.0;
     unsigned wakings = 0;
@@ -134,7 +134,7 @@ struct bandwidth_t {
         if (steady()) {
             usual += 40.0 / rate_hz * (std::min(size, threshold) - usual);
         }
-        pauses *= 1.0 - 20.0 / rate_hz;
+        pauses *= kept;
         if (size > threshold && since_s >= pause_s * (1.0 + pauses)) {
             pauses = std::min(pauses + (steady() ? pauses : pauses / 4.0) + 0.25, 255.0);
             start_rad_s = from_edge ? first_edge_rad_s : first_count_rad_s;

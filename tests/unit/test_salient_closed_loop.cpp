@@ -1,0 +1,297 @@
+// The salient controller on the emulated machine: its figures beside those of its double-precision twin, and what it
+// does where a twin is not needed to judge. Built once a shipped machine; `ctest -V` shows the table.
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <string>
+#include <vector>
+
+#include <gtest/gtest.h>
+
+#include "closed_loop.h"
+
+namespace {
+
+using closed_loop::Bench;
+using closed_loop::fixed_drive_t;
+using closed_loop::setup_t;
+using closed_loop::twin_drive_t;
+using twins::rad_s;
+
+double rpm(double speed_rad_s) {
+    return speed_rad_s * 30.0 / twins::PI;
+}
+
+// A row of the table: the figures of firmware and twin and their ratio. They may differ by a share or a remainder.
+void compare(const std::string &figure, double fixed, double twin, double share, double remainder = 0.0) {
+    std::printf("%-20s %-44s %10.4g %10.4g %7.3f\n", machine_plant.name, figure.c_str(), fixed, twin, fixed / twin);
+    EXPECT_NEAR(fixed, twin, std::max(share * twin, remainder)) << figure;
+}
+
+// 6 mN m of 8 N m and friction. The twin has no tables; theirs are off by 4 to 9 mN m (test_control_phase_map), and
+// with two pulses the ripple is so small that this is more than a tenth: measured up to 5 mN m, 11 %. With the same
+// tables in the twin the saturating machine's ratios are 1.01 instead of 1.07 and 1.11.
+constexpr double TABLES_RIPPLE = 6e-3 / 8.3;
+
+template <typename drive_t> Bench<drive_t> at_speed(const setup_t &setup, double reference_rpm, double load_Nm) {
+    Bench<drive_t> bench(setup);
+    bench.reference_rpm = reference_rpm;
+    bench.plant.speed_rad_s = rad_s(reference_rpm);
+    bench.plant.load_torque_Nm = load_Nm;
+    return bench;
+}
+
+struct ripples_t {
+    double short_window, long_window;
+};
+
+// The experiment's load step at 150 r/min.
+template <typename drive_t> ripples_t ripple_at_150(const setup_t &setup) {
+    Bench<drive_t> bench(setup);
+    bench.reference_rpm = 150.0;
+    bench.run_until(0.13);
+    bench.plant.load_torque_Nm = 8.0;
+    bench.run_until(1.3);
+    return {bench.trace.ripple(0.3, 0.4), bench.trace.ripple(0.3, 1.3)};
+}
+
+TEST(SalientClosedLoop, ripple_at_150_rpm_and_8_Nm_is_within_10_percent_or_6_mNm_of_the_twin_s) {
+    for (const double pulses : {1.0, 2.0}) {
+        setup_t setup;
+        setup.parameters[PARAMETER_PULSES_PER_PERIOD] = pulses;
+        const ripples_t fixed = ripple_at_150<fixed_drive_t>(setup), twin = ripple_at_150<twin_drive_t>(setup);
+        const std::string what = "ripple at 150 r/min, " + std::to_string(int(pulses)) + " pulse(s), ";
+        compare(what + "0.3..0.4 s", fixed.short_window, twin.short_window, 0.10, TABLES_RIPPLE);
+        compare(what + "0.3..1.3 s", fixed.long_window, twin.long_window, 0.10, TABLES_RIPPLE);
+    }
+}
+
+TEST(SalientClosedLoop, ripple_at_600_to_3000_rpm_is_within_10_percent_of_the_twin_s_where_voltage_suffices) {
+    unsigned compared = 0;
+    for (const double reference_rpm : {600.0, 1500.0, 3000.0}) {
+        Bench<fixed_drive_t> fixed = at_speed<fixed_drive_t>(setup_t{}, reference_rpm, 8.0);
+        Bench<twin_drive_t> twin = at_speed<twin_drive_t>(setup_t{}, reference_rpm, 8.0);
+        fixed.run_until(0.3);
+        if (rpm(fixed.plant.speed_rad_s) < 0.99 * reference_rpm) {
+            std::printf("%-20s voltage does not suffice at %g r/min\n", machine_plant.name, reference_rpm);
+            continue;
+        }
+        twin.run_until(0.3);
+        compare("ripple at " + std::to_string(int(reference_rpm)) + " r/min", fixed.trace.ripple(0.2, 0.3),
+                twin.trace.ripple(0.2, 0.3), 0.10);
+        compared++;
+    }
+    EXPECT_GE(compared, 2u);
+}
+
+struct start_t {
+    double settling_s, largest_rpm;
+};
+
+template <typename drive_t> start_t start_to_600() {
+    Bench<drive_t> bench((setup_t()));
+    bench.reference_rpm = 600.0;
+    bench.run_until(0.2);
+    return {bench.trace.last_exit_s(rad_s(600.0), 0.0, 0.2), rpm(bench.trace.largest_speed(0.0, 0.2))};
+}
+
+TEST(SalientClosedLoop, start_to_600_rpm_settles_as_the_twin_s_does) {
+    const start_t fixed = start_to_600<fixed_drive_t>(), twin = start_to_600<twin_drive_t>();
+    compare("settling of the start, s", fixed.settling_s, twin.settling_s, 0.02);
+    compare("largest speed of the start, r/min", fixed.largest_rpm, twin.largest_rpm, 0.001);
+    EXPECT_LT(fixed.largest_rpm, 600.0 * 1.005);
+}
+
+struct dips_t {
+    double median_rpm, largest_rpm, median_recovery_s;
+};
+
+double median(std::vector<double> values) {
+    std::sort(values.begin(), values.end());
+    return 0.5 * (values[(values.size() - 1) / 2] + values[values.size() / 2]);
+}
+
+// 8 N m at so many rotor angles of a pitch, 150 r/min.
+template <typename drive_t> dips_t dips(const setup_t &setup, unsigned angles = 24) {
+    constexpr double AFTER_S = 0.03;
+    const double pitch_s = 60.0 / 150.0 / machine_plant.rotor_poles;
+    Bench<drive_t> bench(setup);
+    bench.reference_rpm = 150.0;
+    std::vector<double> dip_rpm, recovery_s;
+    for (unsigned n = 0; n < angles; n++) {
+        bench.run_until(0.13 + n * pitch_s / angles);
+        Bench<drive_t> loaded = bench;
+        loaded.plant.load_torque_Nm = 8.0;
+        const double from_s = loaded.now_s(), to_s = from_s + AFTER_S;
+        loaded.run_until(to_s);
+        dip_rpm.push_back(150.0 - rpm(loaded.trace.least_speed(from_s, to_s)));
+        recovery_s.push_back(loaded.trace.last_exit_s(rad_s(150.0), from_s, to_s));
+    }
+    return {median(dip_rpm), *std::max_element(dip_rpm.begin(), dip_rpm.end()), median(recovery_s)};
+}
+
+TEST(SalientClosedLoop, dips_and_recoveries_of_a_load_step_are_within_10_percent_of_the_twin_s_whatever_the_encoder) {
+    setup_t counts, edges, ideal;
+    edges.edges = true;
+    ideal.encoder_bits = 32;
+    ideal.adc_bits = 16;
+    // Where in a count the load comes is chance: more angles make both medians those of the machine.
+    const struct {
+        const char *name;
+        setup_t setup;
+        unsigned angles;
+    } sensings[] = {{"17 bits", counts, 120}, {"17 bits, edges", edges, 24}, {"ideal", ideal, 24}};
+    for (const auto &sensing : sensings) {
+        const dips_t fixed = dips<fixed_drive_t>(sensing.setup, sensing.angles);
+        const dips_t twin = dips<twin_drive_t>(sensing.setup, sensing.angles);
+        const std::string of = std::string(", ") + sensing.name;
+        compare("median dip, r/min" + of, fixed.median_rpm, twin.median_rpm, 0.10);
+        compare("largest dip, r/min" + of, fixed.largest_rpm, twin.largest_rpm, 0.10);
+        compare("median recovery, s" + of, fixed.median_recovery_s, twin.median_recovery_s, 0.10);
+    }
+}
+
+TEST(SalientClosedLoop, a_torque_reserve_makes_every_dip_smaller) {
+    setup_t with, without;
+    with.edges = without.edges = true;
+    with.parameters[PARAMETER_TORQUE_RESERVE_NM] = 8.0;
+    const dips_t reserve = dips<fixed_drive_t>(with), none = dips<fixed_drive_t>(without);
+    std::printf("%-20s dips at 24 angles, r/min: reserve median %.3f largest %.3f, without %.3f %.3f\n",
+                machine_plant.name, reserve.median_rpm, reserve.largest_rpm, none.median_rpm, none.largest_rpm);
+    EXPECT_LT(reserve.median_rpm, 0.85 * none.median_rpm);
+    EXPECT_LT(reserve.largest_rpm, 0.85 * none.largest_rpm);
+    EXPECT_GT(reserve.median_rpm, 0.1 * none.median_rpm);
+}
+
+TEST(SalientClosedLoop, reverses_from_600_to_minus_600_rpm_and_back_without_fault_or_a_jerk_at_zero) {
+    Bench<fixed_drive_t> bench((setup_t()));
+    double zero_worst_Nm = 0.0, braking_least_Nm = 100.0, braking_most_Nm = 0.0;
+    double at_s = 0.0;
+    for (const double reference_rpm : {600.0, -600.0, 600.0}) {
+        bench.reference_rpm = reference_rpm;
+        const double side = reference_rpm > 0.0 ? 1.0 : -1.0, from_s = at_s;
+        double last_q24[2] = {bench.drive.diagnostics.torque_reference_q24 / twins::Q24,
+                              bench.drive.diagnostics.torque_reference_q24 / twins::Q24};
+        for (at_s += 25e-6; at_s < from_s + 0.3; at_s += 25e-6) {
+            bench.run_until(at_s);
+            ASSERT_NE(bench.drive.state.machine.state, DRIVE_STATE_FAULT) << at_s;
+            const double torque_Nm = plant_torque_Nm(&bench.plant);
+            const double speed_rpm = rpm(bench.plant.speed_rad_s);
+            const bool starting = at_s < from_s + 0.005;
+            if (!starting && std::fabs(speed_rpm) < 30.0) {
+                zero_worst_Nm = std::max(zero_worst_Nm, std::fabs(torque_Nm - last_q24[1]));
+            }
+            if (!starting && std::fabs(speed_rpm) < 300.0) {
+                braking_least_Nm = std::min(braking_least_Nm, side * torque_Nm);
+                braking_most_Nm = std::max(braking_most_Nm, side * torque_Nm);
+            }
+            last_q24[1] = last_q24[0];
+            last_q24[0] = bench.drive.diagnostics.torque_reference_q24 / twins::Q24;
+        }
+        EXPECT_NEAR(rpm(bench.plant.speed_rad_s), reference_rpm, 0.1) << "when it has settled";
+    }
+    std::printf("%-20s reversal: torque %.2f..%.2f N m below 300 r/min, %.3f N m off the reference at zero\n",
+                machine_plant.name, braking_least_Nm, braking_most_Nm, zero_worst_Nm);
+    EXPECT_LT(zero_worst_Nm, 0.2);
+    EXPECT_GT(zero_worst_Nm, 0.0);
+    EXPECT_GT(braking_least_Nm, 0.95 * braking_most_Nm);
+    EXPECT_LT(braking_most_Nm, 1.01 * 19.1);
+    EXPECT_GT(braking_most_Nm, 8.0);
+}
+
+TEST(SalientClosedLoop, a_speed_that_the_voltage_may_not_reach_is_entered_and_left_without_fault_or_jerk) {
+    for (const double load_Nm : {2.0, 8.0}) {
+        auto bench = at_speed<fixed_drive_t>(setup_t{}, 2000.0, load_Nm);
+        bench.run_until(0.1);
+        bench.watch();
+        bench.reference_rpm = 3000.0;
+        bench.run_until(0.6);
+        const double reached_rpm = rpm(bench.plant.speed_rad_s);
+        // Back by a ramp that load and friction suffice for: it leaves the region, it does not brake.
+        for (double at_s = 0.6; at_s < 1.6; at_s += 0.001) {
+            bench.reference_rpm = std::max(2000.0, reached_rpm - 1000.0 * (at_s - 0.6));
+            bench.run_until(at_s);
+        }
+        EXPECT_EQ(bench.drive.state.machine.state, DRIVE_STATE_RUN);
+        EXPECT_NEAR(rpm(bench.plant.speed_rad_s), std::max(2000.0, reached_rpm - 1000.0), 10.0) << "back";
+        const double most_rpm = rpm(bench.trace.largest_speed(0.1, 1.6));
+        const double least_rpm = rpm(bench.trace.least_speed(0.1, 1.6));
+        double fall_rpm = 0.0, highest = 0.0; // on the way up
+        for (size_t i = bench.trace.index(0.1); i < bench.trace.index(0.6); i++) {
+            highest = std::max(highest, bench.trace.speed_rad_s[i]);
+            fall_rpm = std::max(fall_rpm, rpm(highest - bench.trace.speed_rad_s[i]));
+        }
+        std::printf("%-20s 3000 r/min asked with %g N m: %.1f reached, %.1f..%.1f, falls by %.2f on the way\n",
+                    machine_plant.name, load_Nm, reached_rpm, least_rpm, most_rpm, fall_rpm);
+        EXPECT_LT(most_rpm, 3000.0 * 1.005);
+        EXPECT_GT(least_rpm, 2000.0 * 0.99);
+        EXPECT_GT(reached_rpm, 2000.0 * 1.1);
+        EXPECT_LT(fall_rpm, 30.0);
+    }
+}
+
+struct braking_t {
+    bool arrives;
+    double largest_A, strongest_Nm;
+};
+
+// To four fifths of a speed, with all of the negative torque.
+braking_t brake_from(double from_rpm, double load_Nm) {
+    auto bench = at_speed<fixed_drive_t>(setup_t{}, from_rpm, load_Nm);
+    bench.run_until(0.05);
+    bench.reference_rpm = 0.8 * from_rpm;
+    braking_t braking{};
+    for (double at_s = 0.05; at_s < 0.25; at_s += 25e-6) {
+        bench.run_until(at_s);
+        for (const double current_A : bench.plant.current_A) {
+            braking.largest_A = std::max(braking.largest_A, current_A);
+        }
+        braking.strongest_Nm = std::min(braking.strongest_Nm, plant_torque_Nm(&bench.plant));
+    }
+    braking.arrives = bench.running && std::fabs(rpm(bench.plant.speed_rad_s) - 0.8 * from_rpm) < 2.0;
+    std::printf("%-20s braking from %g r/min with %g N m: %s, largest current %.1f A, torque to %.1f N m\n",
+                machine_plant.name, from_rpm, load_Nm, braking.arrives ? "arrives" : "trips", braking.largest_A,
+                braking.strongest_Nm);
+    return braking;
+}
+
+// The machines without saturation are asked up to 1500 r/min only. At 3000 r/min flux linkage built up near the aligned
+// position is not let go before their inductance falls, and the current rises against the whole bus voltage: they trip,
+// the current then reaches 230 A and the torque -380 N m (trapezoid); the cosine's torque is -35 N m at 2000 r/min.
+TEST(SalientClosedLoop, brakes_from_3000_rpm_or_without_saturation_from_1500_rpm_within_its_limits) {
+    const bool saturates =
+        machine_plant.magnetics.form == MAGNETICS_SATURATING || machine_plant.magnetics.form == MAGNETICS_MAP;
+    for (const double from_rpm : {600.0, 1500.0, 3000.0}) {
+        for (const double load_Nm : {0.0, 8.0}) {
+            if (saturates || from_rpm <= 1500.0) {
+                const braking_t braking = brake_from(from_rpm, load_Nm);
+                EXPECT_TRUE(braking.arrives);
+                EXPECT_LT(braking.largest_A, 55.0);
+                EXPECT_GT(braking.largest_A, 30.0);
+                EXPECT_GT(braking.strongest_Nm, -22.0);
+            }
+        }
+    }
+}
+
+TEST(SalientClosedLoop, three_times_the_inertia_does_not_keep_the_observer_awake_when_all_is_steady) {
+    setup_t setup;
+    setup.plant.inertia = 3.0;
+    Bench<fixed_drive_t> bench(setup);
+    bench.reference_rpm = 150.0;
+    bench.run_until(0.4);
+    bench.plant.load_torque_Nm = 8.0;
+    bench.run_until(0.8);
+    unsigned awake = 0, periods = 0;
+    for (double at_s = 0.8; at_s < 1.3; at_s += 25e-6, periods++) {
+        bench.run_until(at_s);
+        awake += !observer_bandwidth_steady(&bench.drive.state.bandwidth);
+    }
+    const double ripple = bench.trace.ripple(0.8, 1.3);
+    std::printf("%-20s three times the inertia: awake %.2f %% of the time, ripple %.4f\n", machine_plant.name,
+                100.0 * awake / periods, ripple);
+    EXPECT_LT(awake, periods / 20);
+    EXPECT_NEAR(rpm(bench.plant.speed_rad_s), 150.0, 0.75);
+}
+
+} // namespace
