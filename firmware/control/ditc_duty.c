@@ -5,9 +5,6 @@
 
 #define DUTY_ONE_Q15 32768
 
-/* An outgoing phase below this torque has nothing left to take off: 1/16 N m. */
-#define SPENT_TORQUE_Q24 (1 << 20)
-
 void ditc_duty_reset(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc) {
     bp_pid_reset(&parameters->pid, &ditc->pid);
     ditc->regulated = COMMUTATION_NONE;
@@ -17,9 +14,9 @@ void ditc_duty_reset(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc
 static int32_t incoming_duty_q15(const ditc_duty_parameters_t *parameters, const machine_tables_t *tables,
                                  const ditc_duty_sample_t *sample, int32_t current_q9) {
     const int32_t limit_q9 = parameters->current_limit_q9;
-    /* A sixteenth more than the reference, so that the outgoing phase is spent although the current falls short of its
-     * target by what a proportional control leaves. */
-    const int32_t carried_q24 = fixed_add(sample->reference_q24, sample->reference_q24 / 16);
+    /* Q24 * Q20 to Q24. */
+    const int32_t surplus_q24 = (int32_t)(((int64_t)sample->reference_q24 * parameters->surplus_q20) >> 20);
+    const int32_t carried_q24 = fixed_add(sample->reference_q24, surplus_q24);
     const phase_map_place_t hand_over = phase_map_at(tables, parameters->hand_over_angle);
     const int32_t carrying_q9 = phase_map_current_of_torque_q9(&hand_over, carried_q24);
     const bool assists = sample->error_q24 > parameters->band_outer_q24 || carrying_q9 > limit_q9;
@@ -47,7 +44,7 @@ void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc,
     if (ditc->regulated != active) {
         /* The PID is with the outgoing phase while that one has torque to take off. */
         duty_q15[active] = incoming_duty_q15(parameters, tables, sample, sample->current_q9[active]);
-        const bool spent = sample->torque_q24[ditc->regulated] < SPENT_TORQUE_Q24 && sample->error_q24 <= 0;
+        const bool spent = sample->torque_q24[ditc->regulated] < parameters->spent_torque_q24 && sample->error_q24 <= 0;
         if (spent || ditc->regulated != commutation->outgoing) {
             bp_pid_preset(&ditc->pid, duty_q15[active]);
             ditc->regulated = active;

@@ -6,6 +6,12 @@
  * reference at the hand-over angle; what torque it makes meanwhile, the PID takes off the outgoing phase. When nothing
  * is left to take off, or the outgoing phase must go, the PID moves on to the incoming phase, starting from its duty.
  * DITC's outer band stays in force: torque missing beyond it sends the incoming phase to the current limit.
+ *
+ * The incoming phase aims at a surplus above the reference, because its proportional control falls short of the aim and
+ * the outgoing phase would never be spent. And the PID leaves an outgoing phase that still has some torque, because the
+ * last of it goes slower than the incoming phase rises: current goes with the square root of torque. How much surplus
+ * is needed falls with the sampling rate, and how much torque the PID can take over rises with it; with those of 40 kHz
+ * the torque of a machine of steep corners jumps by a ninth at 1 MHz.
  */
 #ifndef CONTROL_DITC_DUTY_H
 #define CONTROL_DITC_DUTY_H
@@ -21,6 +27,8 @@ typedef struct {
     bp_pid_parameters_t pid;
     uint32_t hand_over_angle;  /* 2^-32 pitch, 2^31..2^32-1 */
     int32_t incoming_gain_q20; /* duty per A of the incoming phase's current error, Q11.20 */
+    int32_t surplus_q20;       /* of the reference, 0..2^20-1: see above */
+    int32_t spent_torque_q24;  /* of the outgoing phase: nothing is left below it; N m, Q7.24 */
     int32_t band_outer_q24;    /* N m, Q7.24 */
     int32_t current_limit_q9;  /* A, Q7.9 */
 } ditc_duty_parameters_t;

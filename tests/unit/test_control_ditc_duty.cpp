@@ -56,6 +56,8 @@ ditc_duty_parameters_t parameters_of(bp_pid_mode_t mode) {
     parameters.pid.network = {1638, 1638};
     parameters.hand_over_angle = electrical(210.0);
     parameters.incoming_gain_q20 = 58544; // 40 kHz, 358 A/ms
+    parameters.surplus_q20 = 1 << 16;
+    parameters.spent_torque_q24 = 1 << 20;
     parameters.band_outer_q24 = 2 << 24;
     parameters.current_limit_q9 = LIMIT_Q9;
     return parameters;
@@ -190,6 +192,36 @@ TEST_F(DitcDuty, the_pid_moves_on_when_the_outgoing_phase_is_spent_and_starts_fr
     EXPECT_EQ(ditc.regulated, 1u);
 }
 
+TEST_F(DitcDuty, the_aim_of_the_incoming_phase_is_its_surplus_above_the_reference) {
+    const commutation_t commutation = commutation_of(305.0);
+    const double reference = 8.0;
+    parameters.incoming_gain_q20 = 1 << 16; // not held at the ends
+    current_q9[0] = map_current_q9(commutation.angle[0], twins::to_fixed(reference, twins::Q24));
+    for (const double surplus : {0.0, 1.0 / 400.0, 1.0 / 16.0, 1.0 / 8.0}) {
+        parameters.surplus_q20 = int32_t(surplus * twins::Q20);
+        ditc_duty_reset(&parameters, &ditc);
+        const double aim_A =
+            map_current_q9(parameters.hand_over_angle, twins::to_fixed(reference * (1.0 + surplus), twins::Q24)) /
+            twins::Q9;
+        current_q9[1] = int32_t(aim_A) << 9;
+        step(commutation, reference);
+        ASSERT_NEAR(duty_q15[1] / twins::Q15, (aim_A - std::floor(aim_A)) / 16.0, 2.0 / twins::Q15) << surplus;
+    }
+}
+
+TEST_F(DitcDuty, the_pid_leaves_an_outgoing_phase_below_the_spent_torque_and_not_at_it) {
+    const commutation_t commutation = commutation_of(320.0);
+    current_q9[0] = 6 << 9;
+    current_q9[1] = 10 << 9;
+    for (const int32_t beyond_q24 : {0, 1}) {
+        parameters.spent_torque_q24 = map_torque_q24(commutation.angle[0], current_q9[0]) + beyond_q24;
+        ditc_duty_reset(&parameters, &ditc);
+        step(commutation, 0.0);
+        ASSERT_LE(error_q24, 0);
+        EXPECT_EQ(ditc.regulated, beyond_q24 == 0 ? 0u : 1u);
+    }
+}
+
 TEST_F(DitcDuty, the_pid_moves_on_when_the_outgoing_phase_must_go_and_starts_from_the_incoming_duty) {
     current_q9[0] = 20 << 9;
     current_q9[1] = 8 << 9;
@@ -234,6 +266,8 @@ TEST_F(DitcDuty, nothing_overflows_at_the_ends_of_all_ranges) {
         for (const bp_pid_mode_t mode : {BP_PID_FIXED, BP_PID_FROZEN, BP_PID_LEARNING}) {
             parameters = parameters_of(mode);
             parameters.incoming_gain_q20 = gain_q20;
+            parameters.surplus_q20 = gain_q20 >> 11;
+            parameters.spent_torque_q24 = gain_q20;
             ditc_duty_reset(&parameters, &ditc);
             for (int k = 0; k < 3000; k++) {
                 const commutation_t commutation = commutation_at(&ANGLES, 3, 4, uint32_t(random()));

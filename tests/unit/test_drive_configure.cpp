@@ -76,6 +76,8 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("assist", c.duty.band_outer_q24, v(PARAMETER_BP_ASSIST_BAND_NM) * twins::Q24, 0.0);
     near("incoming gain", c.duty.incoming_gain_q20, 0.5 * rate_hz / machine_tables.current_rise_A_s * twins::Q20, 1.0);
 
+    near("surplus", c.duty.surplus_q20, 40000.0 / 16.0 / rate_hz * twins::Q20, 1.0);
+    near("spent torque", c.duty.spent_torque_q24, rate_hz / 40000.0 / 16.0 * twins::Q24, 1.0);
     ASSERT_EQ(int(c.duty.pid.mode), p.values[PARAMETER_BP_MODE]);
     ASSERT_EQ(int32_t(c.duty.pid.seed), p.values[PARAMETER_BP_SEED]);
     near("scale", c.duty.pid.error_scale_inverse_q24, twins::Q24 / scale_Nm, 1.0);
