@@ -5,6 +5,9 @@
 
 #define DUTY_ONE_Q15 32768
 
+/* So little torque is none, whatever the reference: 1/16 N m. */
+#define NO_TORQUE_Q24 (1 << 20)
+
 void ditc_duty_reset(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc) {
     bp_pid_reset(&parameters->pid, &ditc->pid);
     ditc->regulated = COMMUTATION_NONE;
@@ -44,7 +47,9 @@ void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc,
     if (ditc->regulated != active) {
         /* The PID is with the outgoing phase while that one has torque to take off. */
         duty_q15[active] = incoming_duty_q15(parameters, tables, sample, sample->current_q9[active]);
-        const bool spent = sample->torque_q24[ditc->regulated] < parameters->spent_torque_q24 && sample->error_q24 <= 0;
+        const int32_t eighth_q24 = fixed_clamp(sample->reference_q24 / 8, 0, parameters->spent_torque_q24);
+        const int32_t spent_q24 = eighth_q24 > NO_TORQUE_Q24 ? eighth_q24 : NO_TORQUE_Q24;
+        const bool spent = sample->torque_q24[ditc->regulated] < spent_q24 && sample->error_q24 <= 0;
         if (spent || ditc->regulated != commutation->outgoing) {
             bp_pid_preset(&ditc->pid, duty_q15[active]);
             ditc->regulated = active;

@@ -11,7 +11,8 @@
  * the outgoing phase would never be spent. And the PID leaves an outgoing phase that still has some torque, because the
  * last of it goes slower than the incoming phase rises: current goes with the square root of torque. How much surplus
  * is needed falls with the sampling rate, and how much torque the PID can take over rises with it; with those of 40 kHz
- * the torque of a machine of steep corners jumps by a ninth at 1 MHz.
+ * the torque of a machine of steep corners jumps by a ninth at 1 MHz. Spent is less than `spent_torque`, but at most an
+ * eighth of the reference, or a drive without load would let go a phase that a load step needs; and 1/16 N m always.
  */
 #ifndef CONTROL_DITC_DUTY_H
 #define CONTROL_DITC_DUTY_H
@@ -28,7 +29,7 @@ typedef struct {
     uint32_t hand_over_angle;  /* 2^-32 pitch, 2^31..2^32-1 */
     int32_t incoming_gain_q20; /* duty per A of the incoming phase's current error, Q11.20 */
     int32_t surplus_q20;       /* of the reference, 0..2^20-1: see above */
-    int32_t spent_torque_q24;  /* of the outgoing phase: nothing is left below it; N m, Q7.24 */
+    int32_t spent_torque_q24;  /* of the outgoing phase: see above; N m, Q7.24, >= 0 */
     int32_t band_outer_q24;    /* N m, Q7.24 */
     int32_t current_limit_q9;  /* A, Q7.9 */
 } ditc_duty_parameters_t;

@@ -209,17 +209,27 @@ TEST_F(DitcDuty, the_aim_of_the_incoming_phase_is_its_surplus_above_the_referenc
     }
 }
 
-TEST_F(DitcDuty, the_pid_leaves_an_outgoing_phase_below_the_spent_torque_and_not_at_it) {
+TEST_F(DitcDuty, the_pid_leaves_an_outgoing_phase_below_the_spent_torque_an_eighth_of_the_reference_or_a_sixteenth_Nm) {
     const commutation_t commutation = commutation_of(320.0);
-    current_q9[0] = 6 << 9;
-    current_q9[1] = 10 << 9;
-    for (const int32_t beyond_q24 : {0, 1}) {
-        parameters.spent_torque_q24 = map_torque_q24(commutation.angle[0], current_q9[0]) + beyond_q24;
-        ditc_duty_reset(&parameters, &ditc);
-        step(commutation, 0.0);
-        ASSERT_LE(error_q24, 0);
-        EXPECT_EQ(ditc.regulated, beyond_q24 == 0 ? 0u : 1u);
+    unsigned left = 0, held = 0;
+    for (const double spent : {0.0, 0.03, 0.0625, 0.5, 1.5}) {
+        parameters.spent_torque_q24 = twins::to_fixed(spent, twins::Q24);
+        for (double reference = 0.0; reference < 16.0; reference += 0.5) {
+            for (int current_eighth_A = 0; current_eighth_A < 80; current_eighth_A++) {
+                ditc_duty_reset(&parameters, &ditc);
+                current_q9[0] = current_eighth_A << 6;
+                current_q9[1] = 52 << 9;
+                step(commutation, reference);
+                const double limit = std::max(0.0625, std::min(reference / 8.0, spent));
+                const bool leaves = torque_q24[0] < limit * twins::Q24 && error_q24 <= 0;
+                ASSERT_EQ(ditc.regulated, leaves ? 1u : 0u) << spent << " " << reference << " " << current_eighth_A;
+                left += leaves;
+                held += !leaves && error_q24 <= 0;
+            }
+        }
     }
+    EXPECT_GT(left, 500u);
+    EXPECT_GT(held, 500u);
 }
 
 TEST_F(DitcDuty, the_pid_moves_on_when_the_outgoing_phase_must_go_and_starts_from_the_incoming_duty) {
