@@ -160,7 +160,8 @@ def _dip(quick: bool) -> Iterator[Case]:
 def _paper_conditions(quick: bool) -> Iterator[Case]:
     for machine in ("saturating",) if quick else MAGNETICS:
         step = replace(step_scenario(machine=machine, **PAPER_CONDITIONS), duration_s=0.5)
-        start = start_scenario(machine=machine, **PAPER_CONDITIONS)
+        # At 10 ms, when the parameters are written: they go over CAN first.
+        start = replace(start_scenario(machine=machine, **PAPER_CONDITIONS), speed=(SpeedStep(0.01, 600.0),))
         for condition, scenario, measure, parameters in (
             ("load step", step, "step_and_ripple", PAPER_PARAMETERS),
             ("load step, usual parameters", step, "step_and_ripple", LOAD_KNOWN),
