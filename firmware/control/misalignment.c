@@ -30,13 +30,6 @@ void misalignment_reset(misalignment_t *misalignment) {
     *misalignment = (misalignment_t){.turn = 0};
 }
 
-int32_t misalignment_offset(const misalignment_parameters_t *parameters, const misalignment_t *misalignment,
-                            unsigned phase) {
-    /* Q40 of 0.02 rad, which is two probes. */
-    const int32_t offset_q30 = (int32_t)fixed_shift(misalignment->phase[phase].offset_q40, 10);
-    return fixed_multiply(offset_q30, (int32_t)parameters->probe, 29);
-}
-
 /* value towards target by a share in Q16. A function of its own: inlined, its 64-bit arithmetic is in flash five times.
  */
 static __attribute__((noinline)) void follow(int32_t *value, int32_t target, int32_t share_q16) {
@@ -99,4 +92,6 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     phase->offset_q40 = offset_q40 > OFFSET_LIMIT_Q40    ? OFFSET_LIMIT_Q40
                         : offset_q40 < -OFFSET_LIMIT_Q40 ? -OFFSET_LIMIT_Q40
                                                          : offset_q40;
+    /* 0.02 rad are two probes. */
+    phase->offset = fixed_multiply((int32_t)fixed_shift(phase->offset_q40, 10), (int32_t)parameters->probe, 29);
 }

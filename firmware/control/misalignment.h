@@ -41,6 +41,7 @@ typedef struct {
     int32_t first_q24, second_q24, mean_q24; /* s_j filtered once, twice, and its mean: N m over 0.02 rad, Q7.24 */
     int64_t sum_q24;                         /* of y, at the phase's last turn */
     int64_t offset_q40;                      /* delta_j in 0.02 rad, within +-0.875 (1 degree) */
+    int32_t offset;                          /* the same in 2^-32 pitch, to be taken off the phase's angle */
 } misalignment_phase_t;
 
 typedef struct {
@@ -65,10 +66,6 @@ misalignment_parameters_t misalignment_configure(int32_t rate_1_s, uint32_t band
 
 /* All aligned. */
 void misalignment_reset(misalignment_t *misalignment);
-
-/* delta_j in 2^-32 pitch, to be taken off the phase's angle. */
-int32_t misalignment_offset(const misalignment_parameters_t *parameters, const misalignment_t *misalignment,
-                            unsigned phase);
 
 /* One sample, behind the load observer's. */
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,

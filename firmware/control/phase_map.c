@@ -135,23 +135,14 @@ static int32_t current_of(const machine_surface_t *surface, const phase_map_plac
     return (below << MACHINE_COLUMN_BITS) + part;
 }
 
-static inline int32_t torque_q24(const phase_map_place_t *place, int32_t current_q9) {
-    const machine_surface_t *surface = &place->tables->torque_per_ampere;
-    const int32_t forwards_q24 = look_up(surface, place, current_q9, TORQUE_SHIFT(surface));
-    return place->mirrored ? fixed_subtract(0, forwards_q24) : forwards_q24;
-}
-
 phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_angle) {
     return place_at(tables, phase_angle);
 }
 
 int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9) {
-    return torque_q24(place, current_q9);
-}
-
-int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9) {
-    const phase_map_place_t place = place_at(tables, phase_angle);
-    return torque_q24(&place, current_q9);
+    const machine_surface_t *surface = &place->tables->torque_per_ampere;
+    const int32_t forwards_q24 = look_up(surface, place, current_q9, TORQUE_SHIFT(surface));
+    return place->mirrored ? fixed_subtract(0, forwards_q24) : forwards_q24;
 }
 
 int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9) {

@@ -30,9 +30,6 @@ phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_an
  * A, Q7.9, held within 0..80 A. 64-bit product, truncated, saturated. */
 int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9);
 
-/* The same at a place that is asked only this once. */
-int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9);
-
 /* Flux linkage in Wb, Q2.29, the same in both halves. Current, product and ends as for the torque. */
 int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9);
 

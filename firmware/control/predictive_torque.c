@@ -95,6 +95,24 @@ static void move_windows(const predictive_torque_parameters_t *parameters, predi
     control->advance_q30 = fixed_clamp(control->advance_q30 + step_q30, 0, ONE_Q30);
 }
 
+/* A braking phase turns away from its aligned position: its inductance falls, and flux linkage that -Vdc cannot take
+ * off as fast makes the current rise by itself. The most that leaves the current within its limit all the way to the
+ * unaligned position. */
+static int32_t braking_flux_q29(const predictive_torque_parameters_t *parameters, const machine_tables_t *tables,
+                                uint32_t angle, uint32_t step, int32_t reach_q29) {
+    const uint32_t way = angle - HALF_PITCH;
+    int32_t most_q29 = INT32_MAX;
+    for (uint32_t eighth = 1; eighth <= 8; eighth++) {
+        const uint32_t part = way / 8 * eighth;
+        const phase_map_place_t place = phase_map_at(tables, angle - part);
+        const int32_t held_q29 = phase_map_flux_q29(&place, parameters->current_limit_q9);
+        const int32_t taken_q29 = fixed_saturate((int64_t)(part / step) * reach_q29);
+        const int32_t allowed_q29 = fixed_add(held_q29, taken_q29);
+        most_q29 = allowed_q29 < most_q29 ? allowed_q29 : most_q29;
+    }
+    return most_q29;
+}
+
 void predictive_torque_reset(predictive_torque_t *control) {
     *control = (predictive_torque_t){.advance_q30 = 0};
 }
@@ -134,6 +152,11 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         p->positive = angle >= HALF_PITCH;
         const uint32_t forward_angle = p->positive ? angle : 0u - angle;
         p->place = phase_map_at(tables, forward_angle);
+        /* What the unaligned position holds, every other one does. */
+        if (p->positive == sample->backwards && sample->step > 0 && p->highest_q29 > parameters->unaligned_flux_q29) {
+            const int32_t most_q29 = braking_flux_q29(parameters, tables, forward_angle, sample->step, reach_q29);
+            p->highest_q29 = fixed_clamp(most_q29, p->lowest_q29, p->highest_q29);
+        }
         /* Windows move ahead of the rotation: not those of a phase that brakes. */
         const torque_share_window_t *window = p->positive != sample->backwards ? &early : &late;
         p->since_on = forward_angle - window->turn_on;

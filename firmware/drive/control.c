@@ -76,8 +76,7 @@ static estimate_t estimate(const control_parameters_t *parameters, const control
         const int32_t current_q9 = from_code(parameters, sample->adc.phase_current_counts[phase], CURRENT_Q9_PER_COUNT);
         e.current_q9[phase] = current_q9;
         e.current_max_q9 = current_q9 > e.current_max_q9 ? current_q9 : e.current_max_q9;
-        e.commutation.angle[phase] -=
-            (uint32_t)misalignment_offset(&parameters->misalignment, &state->misalignment, phase);
+        e.commutation.angle[phase] -= (uint32_t)state->misalignment.phase[phase].offset;
         if (current_q9 > 0) { /* most of the time a phase has none */
             const phase_map_place_t place = phase_map_at(tables, e.commutation.angle[phase]);
             e.torque_q24[phase] = phase_map_torque_q24(&place, current_q9);
@@ -170,6 +169,7 @@ static void predict_torque(const control_parameters_t *parameters, control_state
         .bus_voltage_q6 = e->bus_voltage_q6,
         .torque_q24 = torque_trim_step(&parameters->trim, &state->trim, reference_q24, e->torque_sum_q24, runs_out),
         .backwards = observer->speed_q22 < 0,
+        .step = (uint32_t)fixed_abs((int32_t)step) * tables->rotor_poles,
     };
     predictive_torque_step(&parameters->predictive, &state->predictive, tables, &sample, duty_q15);
 }
@@ -182,15 +182,6 @@ static void complete_record(fault_record_t *record, const control_sample_t *samp
     record->torque_reference_q24 = last->torque_reference_q24;
     record->current_max_q9 = (uint16_t)e->current_max_q9;
     record->bus_voltage_q6 = (uint16_t)e->bus_voltage_q6;
-}
-
-static int32_t mean_misalignment(const control_parameters_t *parameters, const control_state_t *state) {
-    const int32_t phases = (int32_t)parameters->tables->phases;
-    int64_t sum = 0;
-    for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
-        sum += misalignment_offset(&parameters->misalignment, &state->misalignment, phase);
-    }
-    return (int32_t)sum / (phases * parameters->tables->rotor_poles);
 }
 
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
@@ -278,7 +269,6 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     diagnostics->duty_q15 = (int32_t)fixed_shift(state->duty.pid.duty_q30, 15);
     diagnostics->voltage_saturated = saturated;
     diagnostics->trim_torque_q24 = run && salient ? state->trim.trim_q24 : 0;
-    diagnostics->misalignment = mean_misalignment(parameters, state);
     diagnostics->torque_missing_q24 = run && salient ? state->predictive.missing_q24 : 0;
     diagnostics->observer_bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[state->bandwidth.stage];
     return run;

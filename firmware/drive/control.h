@@ -96,7 +96,6 @@ typedef struct {
     bool voltage_saturated;
     /* Of the salient controller, 0 with the others. */
     int32_t trim_torque_q24;
-    int32_t misalignment;       /* mean of the phases, 2^-32 turn */
     int32_t torque_missing_q24; /* reference less what the voltage allows */
     uint16_t observer_bandwidth_rad_s;
 } control_diagnostics_t;

@@ -55,6 +55,16 @@ static int32_t gain_per_Nm_q15(const drive_t *drive, unsigned gain) {
                           drive->control_parameters.duty.pid.error_scale_inverse_q24, 24);
 }
 
+/* Mean of the phases, mechanical, 2^-32 turn. */
+static int32_t misalignment(const drive_t *drive) {
+    const int32_t phases = drive->tables->phases;
+    int64_t sum = 0;
+    for (int32_t phase = 0; phase < phases; phase++) {
+        sum += drive->control.misalignment.phase[phase].offset;
+    }
+    return (int32_t)sum / (phases * drive->tables->rotor_poles);
+}
+
 static telemetry_snapshot_t snapshot(const drive_t *drive, uint32_t time_us) {
     const control_diagnostics_t *d = &drive->diagnostics;
     const state_machine_t *machine = &drive->control.machine;
@@ -76,7 +86,7 @@ static telemetry_snapshot_t snapshot(const drive_t *drive, uint32_t time_us) {
         .kd_q15 = gain_per_Nm_q15(drive, 2),
         .duty_q15 = d->duty_q15,
         .trim_torque_q24 = d->trim_torque_q24,
-        .misalignment = d->misalignment,
+        .misalignment = misalignment(drive),
         .torque_missing_q24 = d->torque_missing_q24,
         .observer_bandwidth_rad_s = d->observer_bandwidth_rad_s,
         .last_fault = machine->record,

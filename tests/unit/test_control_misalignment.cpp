@@ -66,7 +66,7 @@ class Machine {
         double missing = 0.0; // torque that the tables promise less what acts
         for (unsigned phase = 0; phase < PHASES; phase++) {
             const double assumed = position - double(phase) / PHASES;
-            const double corrected = assumed - misalignment_offset(&parameters, &state, phase) / twins::TURN;
+            const double corrected = assumed - state.phase[phase].offset / twins::TURN;
             angle[phase] = angle_of(corrected);
             const double place = corrected - std::floor(corrected);
             if (place > 0.6 && place < 0.95) {
@@ -74,7 +74,8 @@ class Machine {
             }
             const double probe = pitch_of(PROBE_RAD);
             const auto torque = [&](double at) {
-                return phase_map_torque_at_q24(&machine_tables, angle_of(at), current_q9[phase]) / twins::Q24;
+                const phase_map_place_t where = phase_map_at(&machine_tables, angle_of(at));
+                return phase_map_torque_q24(&where, current_q9[phase]) / twins::Q24;
             };
             if (current_q9[phase] > 0) {
                 slope[phase] = (torque(corrected + probe) - torque(corrected - probe)) / (2.0 * PROBE_RAD);
@@ -92,7 +93,7 @@ class Machine {
     }
 
     double offset_deg(unsigned phase) const {
-        const double pitch = misalignment_offset(&parameters, &state, phase) / twins::TURN;
+        const double pitch = state.phase[phase].offset / twins::TURN;
         return pitch / machine_tables.rotor_poles * 360.0;
     }
 
@@ -189,8 +190,7 @@ TEST(Misalignment, is_held_within_a_degree_and_overflows_nothing) {
             misalignment_step(&p, &state, &machine_tables, &observer, &sample);
         }
         for (unsigned phase = 0; phase < PHASES; phase++) {
-            const double deg =
-                misalignment_offset(&p, &state, phase) / twins::TURN / machine_tables.rotor_poles * 360.0;
+            const double deg = state.phase[phase].offset / twins::TURN / machine_tables.rotor_poles * 360.0;
             EXPECT_LE(std::fabs(deg), 1.003);
             EXPECT_GT(std::fabs(deg), 0.5);
         }

@@ -333,15 +333,6 @@ TEST(PhaseMap, current_of_a_flux_gives_it_within_a_unit_of_current_and_a_thirty_
     EXPECT_GT(worst, 0.01);
 }
 
-TEST(PhaseMap, torque_at_an_angle_is_that_of_its_place) {
-    std::mt19937 random(9);
-    for (int i = 0; i < 100000; i++) {
-        const auto angle = uint32_t(random());
-        const auto current_q9 = int32_t(random() % uint32_t(CURRENT_END_Q9 + 1));
-        ASSERT_EQ(phase_map_torque_at_q24(&machine_tables, angle, current_q9), torque_q24(angle, current_q9));
-    }
-}
-
 TEST(PhaseMap, nothing_wanted_or_of_the_wrong_sign_needs_no_current_and_too_much_the_largest) {
     std::mt19937 random(6);
     for (int i = 0; i < 1000; i++) {

@@ -537,7 +537,6 @@ TEST_F(SalientControl, trims_and_missing_torque_are_0_with_the_other_controllers
         for (int k = 0; k < 400; k++) {
             step(COMMAND_RUN, 3000.0);
             ASSERT_EQ(diagnostics.trim_torque_q24, 0);
-            ASSERT_EQ(diagnostics.misalignment, 0);
             ASSERT_EQ(diagnostics.torque_missing_q24, 0);
         }
     }
