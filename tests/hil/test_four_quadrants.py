@@ -83,6 +83,24 @@ def test_stop_brakes_to_standing_and_opens_the_switches(bench, direction, agains
     assert bench.drive.fault == "none"
 
 
+@pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.parametrize("direction", [1, -1])
+def test_brakes_from_3000_without_tripping(make_bench, machine, direction):
+    """There the speed voltage exceeds the link's, which then can no longer end a current."""
+    bench = make_bench(controller="salient", machine=machine)
+    bench.rig.truth_period_us = 100
+    bench.drive.speed_reference_rpm = 3000 * direction
+    bench.run_for(0.5)
+    bench.load_torque_Nm = -4 * direction  # it drives
+    bench.run_for(0.1)
+    assert np.abs(last_speeds_rpm(bench, 0.05) - 3000 * direction).max() < 6
+    bench.drive.stop()
+    bench.run_until(lambda: bench.drive.state == "ready", timeout=0.7)
+    assert bench.drive.fault == "none"
+    # The limit is 52 A, the trip 75 A; the trapezoid passes the limit between the angles that the drive looks ahead to.
+    assert 50 < last_currents_A(bench, 0.7).max() < (75 if machine == "linear_trapezoid" else 53)
+
+
 @pytest.mark.parametrize("machine", MACHINES[:3])
 @pytest.mark.parametrize("direction", [1, -1])
 def test_holds_300_against_and_with_a_load_and_gives_back_what_it_brakes(make_bench, tmp_path, machine, direction):
