@@ -95,22 +95,10 @@ static void move_windows(const predictive_torque_parameters_t *parameters, predi
     control->advance_q30 = fixed_clamp(control->advance_q30 + step_q30, 0, ONE_Q30);
 }
 
-/* A braking phase turns away from its aligned position: its inductance falls, and flux linkage that -Vdc cannot take
- * off as fast makes the current rise by itself. The most that leaves the current within its limit all the way to the
- * unaligned position. */
-static int32_t braking_flux_q29(const predictive_torque_parameters_t *parameters, const machine_tables_t *tables,
-                                uint32_t angle, uint32_t step, int32_t reach_q29) {
-    const uint32_t way = angle - HALF_PITCH;
-    int32_t most_q29 = INT32_MAX;
-    for (uint32_t eighth = 1; eighth <= 8; eighth++) {
-        const uint32_t part = way / 8 * eighth;
-        const phase_map_place_t place = phase_map_at(tables, angle - part);
-        const int32_t held_q29 = phase_map_flux_q29(&place, parameters->current_limit_q9);
-        const int32_t taken_q29 = fixed_saturate((int64_t)(part / step) * reach_q29);
-        const int32_t allowed_q29 = fixed_add(held_q29, taken_q29);
-        most_q29 = allowed_q29 < most_q29 ? allowed_q29 : most_q29;
-    }
-    return most_q29;
+/* What -Vdc takes away on the way to an angle, `turn` a period; 2^-32 pitch. Wb, Q2.29, saturated. */
+static int32_t removable_flux_q29(int32_t reach_q29, uint32_t way, uint32_t turn) {
+    const uint32_t periods_q8 = way / ((turn >> 8) + 1);
+    return fixed_saturate(fixed_shift((int64_t)reach_q29 * periods_q8, 8));
 }
 
 void predictive_torque_reset(predictive_torque_t *control) {
@@ -152,10 +140,10 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         p->positive = angle >= HALF_PITCH;
         const uint32_t forward_angle = p->positive ? angle : 0u - angle;
         p->place = phase_map_at(tables, forward_angle);
-        /* What the unaligned position holds, every other one does. */
-        if (p->positive == sample->backwards && sample->step > 0 && p->highest_q29 > parameters->unaligned_flux_q29) {
-            const int32_t most_q29 = braking_flux_q29(parameters, tables, forward_angle, sample->step, reach_q29);
-            p->highest_q29 = fixed_clamp(most_q29, p->lowest_q29, p->highest_q29);
+        if (p->positive == sample->backwards) { /* it brakes, on its way to unaligned */
+            const int32_t removable_q29 = removable_flux_q29(reach_q29, forward_angle - HALF_PITCH, sample->turn);
+            p->highest_q29 = fixed_clamp(p->highest_q29, p->lowest_q29,
+                                         removable_q29 > p->lowest_q29 ? removable_q29 : p->lowest_q29);
         }
         /* Windows move ahead of the rotation: not those of a phase that brakes. */
         const torque_share_window_t *window = p->positive != sample->backwards ? &early : &late;

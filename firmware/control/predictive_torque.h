@@ -13,12 +13,12 @@
  * Torque of either sign at either direction of rotation: a phase makes positive torque in the half of its pitch from
  * unaligned to aligned and negative torque in the other, where everything is asked at the mirror image.
  *
+ * A phase that brakes carries no more flux linkage than -Vdc takes away until the phase is unaligned. Where the speed
+ * voltage exceeds Vdc, its current would otherwise rise against full -Vdc as the inductance falls, beyond any limit.
+ *
  * With a reserve the two halves work against each other: positive and negative torque of at least the reserve in sum,
  * so that a load step finds flux linkage that only needs to be let go, which -Vdc does at once in any position. It
  * costs copper loss all the time.
- *
- * A phase that brakes is given no more flux linkage than -Vdc can take off again before its inductance falls: at high
- * speed its current would else rise by itself, whatever the switches do.
  *
  * Torque that stays missing moves the conduction windows towards earlier angles (torque_share.h), within 100 ms, and
  * torque that does not moves them back within a second.
@@ -38,12 +38,11 @@
 typedef struct {
     flux_observer_parameters_t flux;
     torque_share_parameters_t share;
-    int32_t period_q40;         /* Ts in s, Q-9.40 */
-    int32_t current_limit_q9;   /* A, Q7.9 */
-    int32_t unaligned_flux_q29; /* Wb at the current limit, Q2.29 */
-    int32_t reserve_q24;        /* N m, Q7.24, >= 0 */
-    int32_t advance_q30;        /* a period with torque missing, Q1.30 */
-    int32_t return_q30;         /* a period without */
+    int32_t period_q40;       /* Ts in s, Q-9.40 */
+    int32_t current_limit_q9; /* A, Q7.9 */
+    int32_t reserve_q24;      /* N m, Q7.24, >= 0 */
+    int32_t advance_q30;      /* a period with torque missing, Q1.30 */
+    int32_t return_q30;       /* a period without */
 } predictive_torque_parameters_t;
 
 typedef struct {
@@ -60,7 +59,7 @@ typedef struct {
     int32_t bus_voltage_q6;    /* V, Q9.6 */
     int32_t torque_q24;        /* reference, N m, Q7.24 */
     bool backwards;            /* the rotor turns that way */
-    uint32_t step;             /* that it turns a period, magnitude, 2^-32 pitch */
+    uint32_t turn;             /* how far in a period, 2^-32 pitch, either way */
 } predictive_torque_sample_t;
 
 /* No flux linkage, no duty, no advance. */

@@ -11,7 +11,7 @@ torque_share_window_t torque_share_window(const torque_share_parameters_t *param
     torque_share_window_t window = {.turn_on = parameters->turn_on - on_early, .stroke = parameters->stroke};
     if (parameters->sharing) {
         window.overlap = parameters->turn_off - off_early - window.turn_on - parameters->stroke;
-        /* 2^32 / (overlap / 2^15): a 32-bit division, 16 bits exact for an overlap of a 60th of a pitch. */
+        /* 2^32 / (overlap / 2^15): a 32-bit division, for which the overlap is known to 2^-17 of a pitch. */
         window.reciprocal = UINT32_MAX / (window.overlap >> 15);
     }
     return window;

@@ -1,6 +1,5 @@
 #include "drive/configure.h"
 
-#include "control/phase_map.h"
 #include "fixed/fixed.h"
 
 /* The BP-PID's gains are set for this rate; a period twice as long moves the torque twice as far for the same duty. */
@@ -108,11 +107,9 @@ static torque_trim_parameters_t trim_from(const int32_t *values) {
     };
 }
 
-static predictive_torque_parameters_t predictive_from(const int32_t *values, const machine_tables_t *tables,
+static predictive_torque_parameters_t predictive_from(const int32_t *values, unsigned phases,
                                                       uint32_t control_rate_hz) {
     const int64_t rate = control_rate_hz;
-    const uint32_t phases = tables->phases;
-    const phase_map_place_t unaligned = phase_map_at(tables, UINT32_C(1) << 31);
     const uint32_t stroke = (0u - phases) / phases + 1u; /* 2^32 / phases */
     const uint32_t turn_on = pitch_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
     const uint32_t turn_off = pitch_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
@@ -139,7 +136,6 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, con
             },
         .period_q40 = (int32_t)(((int64_t)1 << 40) / rate),
         .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
-        .unaligned_flux_q29 = phase_map_flux_q29(&unaligned, values[PARAMETER_CURRENT_LIMIT_A]),
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
         .advance_q30 = (int32_t)(10 * ((int64_t)1 << 30) / rate),
         .return_q30 = (int32_t)(((int64_t)1 << 30) / rate),
@@ -222,7 +218,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                 .current_limit_q9 = current_limit_q9,
             },
         .trim = trim_from(values),
-        .predictive = predictive_from(values, tables, control_rate_hz),
+        .predictive = predictive_from(values, tables->phases, control_rate_hz),
         .misalignment =
             misalignment_configure(values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
                                    (uint32_t)values[PARAMETER_OBSERVER_STEADY_RAD_S], control_rate_hz, inertia_q30,

@@ -169,7 +169,7 @@ static void predict_torque(const control_parameters_t *parameters, control_state
         .bus_voltage_q6 = e->bus_voltage_q6,
         .torque_q24 = torque_trim_step(&parameters->trim, &state->trim, reference_q24, e->torque_sum_q24, runs_out),
         .backwards = observer->speed_q22 < 0,
-        .step = (uint32_t)fixed_abs((int32_t)step) * tables->rotor_poles,
+        .turn = (uint32_t)fixed_abs((int32_t)step) * tables->rotor_poles,
     };
     predictive_torque_step(&parameters->predictive, &state->predictive, tables, &sample, duty_q15);
 }

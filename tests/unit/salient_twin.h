@@ -169,6 +169,7 @@ class salient_t {
         seen.torque_Nm = asked_Nm;
         seen.backwards = observer.speed < 0.0;
         const double step_turn = observer.speed * observer.angle_step;
+        seen.turn = std::fabs(step_turn) * poles;
         double ahead = observer.angle + step_turn - measured;
         ahead -= std::round(ahead);
         for (unsigned phase = 0; phase < phases; phase++) {

@@ -114,8 +114,14 @@ class Machine {
         seen.bus_V = BUS_V;
         seen.torque_Nm = reference_q24 / twins::Q24;
         seen.backwards = speed_pitch < 0.0;
-        const predictive_torque_sample_t sample = {current_q9,          flux_q29,      angle,
-                                                   int32_t(BUS_V * Q6), reference_q24, speed_pitch < 0.0};
+        seen.turn = std::fabs(speed_pitch);
+        const predictive_torque_sample_t sample = {current_q9,
+                                                   flux_q29,
+                                                   angle,
+                                                   int32_t(BUS_V * Q6),
+                                                   reference_q24,
+                                                   speed_pitch < 0.0,
+                                                   uint32_t(std::fabs(speed_pitch) * twins::TURN)};
         predictive_torque_step(&parameters, &control, &machine_tables, &sample, duty_q15);
         twin.step(seen);
         for (unsigned phase = 0; phase < PHASES; phase++) {
@@ -271,11 +277,46 @@ TEST(PredictiveTorque, a_current_above_the_limit_gets_no_voltage_whatever_is_ask
     const int32_t current_q9[HAL_PHASES_MAX] = {10 * 512 + 1, 0, 0, 0};
     const int32_t flux_q29[HAL_PHASES_MAX] = {};
     const uint32_t angle[HAL_PHASES_MAX] = {0xC0000000u, 0xC0000000u, 0x80000000u, 0};
-    const predictive_torque_sample_t sample = {current_q9, flux_q29, angle, 240 * 64, 19 << 24, false};
+    const predictive_torque_sample_t sample = {current_q9, flux_q29, angle, 240 * 64, 19 << 24, false, 0};
     int32_t duty_q15[HAL_PHASES_MAX] = {};
     predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
     EXPECT_LE(duty_q15[0], 0);
     EXPECT_EQ(duty_q15[1], 32768);
+}
+
+TEST(PredictiveTorque, a_phase_that_brakes_carries_what_the_voltage_takes_away_until_unaligned) {
+    // Asked for far more than it can give, at every angle between aligned and unaligned, two ways round.
+    for (const bool backwards : {false, true}) {
+        for (int tenths = 2; tenths < 9; tenths++) {
+            const double way = 0.05 * tenths; // to unaligned, pitch
+            const double turn = 0.02;         // fast enough for every limit to be below 79 A
+            predictive_torque_t control;
+            predictive_torque_reset(&control);
+            const predictive_torque_parameters_t p = parameters_of(0.0, 79.0);
+            const double reach = 240.0 / RATE_HZ;
+            control.flux_q29[0] = int32_t(reach * way / turn * Q29);
+            const int32_t current_q9[HAL_PHASES_MAX] = {};
+            const int32_t flux_q29[HAL_PHASES_MAX] = {control.flux_q29[0], 0, 0, 0};
+            const uint32_t angle[HAL_PHASES_MAX] = {uint32_t((backwards ? 0.5 + way : 0.5 - way) * twins::TURN), 0, 0,
+                                                    0};
+            const predictive_torque_sample_t sample = {current_q9,
+                                                       flux_q29,
+                                                       angle,
+                                                       240 * 64,
+                                                       (backwards ? 40 : -40) * (1 << 24),
+                                                       backwards,
+                                                       uint32_t(turn * twins::TURN)};
+            int32_t duty_q15[HAL_PHASES_MAX] = {};
+            predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
+            EXPECT_NEAR(duty_q15[0], 0, 200) << "at the limit already: " << way;
+            predictive_torque_sample_t still = sample;
+            still.turn = 0;
+            predictive_torque_reset(&control);
+            control.flux_q29[0] = flux_q29[0];
+            predictive_torque_step(&p, &control, &machine_tables, &still, duty_q15);
+            EXPECT_GT(duty_q15[0], 20000) << "no limit at standstill: " << way;
+        }
+    }
 }
 
 TEST(PredictiveTorque, without_reference_every_switch_is_open) {
@@ -305,8 +346,13 @@ TEST(PredictiveTorque, any_sample_gives_a_duty_within_one_and_overflows_nothing)
             }
             const int32_t references[] = {INT32_MIN, INT32_MAX, 0, int32_t(random())};
             const int32_t buses[] = {0, 1, 512 * 64 - 1, int32_t(random() % (512 * 64))};
-            const predictive_torque_sample_t sample = {current_q9,          flux_q29,      angle,
-                                                       buses[random() % 4], references[k], i % 2 == 0};
+            const predictive_torque_sample_t sample = {current_q9,
+                                                       flux_q29,
+                                                       angle,
+                                                       buses[random() % 4],
+                                                       references[k],
+                                                       i % 2 == 0,
+                                                       uint32_t(random()) >> (random() % 32)};
             predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
             for (unsigned phase = 0; phase < PHASES; phase++) {
                 ASSERT_GE(duty_q15[phase], -32768);

@@ -189,6 +189,7 @@ template <typename machine_t> struct predictive_t {
         std::array<double, MAX> current_A, table_Wb, angle; // angle two periods ahead, in pitches, any
         double bus_V, torque_Nm;
         bool backwards;
+        double turn = 0.0; // of a period, pitch
     };
 
     void step(const sample_t &sample) {
@@ -207,6 +208,9 @@ template <typename machine_t> struct predictive_t {
             const double angle = sample.angle[phase] - std::floor(sample.angle[phase]);
             p.positive = angle >= 0.5;
             p.angle = p.positive ? angle : 1.0 - angle;
+            if (p.positive == sample.backwards && sample.turn > 0.0) {
+                p.highest = std::max(std::min(p.highest, reach * (p.angle - 0.5) / sample.turn), p.lowest);
+            }
             const share_t share = p.positive != sample.backwards ? window() : late;
             p.since_on = p.angle - share.turn_on;
             const double side = p.positive ? asked : -asked;
