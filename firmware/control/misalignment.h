@@ -13,8 +13,8 @@
  *
  * y is the load estimate with the part that the speed's correction adds, which answers within 1 / w0; s_j is sent
  * through two first-order filters of 1 / (1.6 w0) with about the same delay. A correction indexed by the rotor angle in
- * bins can mend any error, not only a misalignment, but has 64 numbers to learn from the same signal: it took longer
- * than a load step lasts, or learned the load step. One number a phase is known to 0.01 degrees after half a second.
+ * bins could mend any error, not only a misalignment, but would have dozens of numbers to learn from the same signal;
+ * here it is one a phase.
  *
  * Learning pauses unless speed and load are steady, the torque is above 1 N m and voltage suffices.
  */

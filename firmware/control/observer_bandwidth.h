@@ -4,13 +4,14 @@
  * A fixed bandwidth cannot give both a small ripple (it passes the encoder's steps on to speed and torque reference)
  * and a small dip (it must see a load first). An innovation beyond a threshold wakes the observer: the bandwidth jumps
  * and decays as 3.5 / t, the schedule of an estimate that starts anew and averages over the time since, down to the
- * steady one. What the threshold is depends on what the angle is good to: 1.25 counts where it is the middle of a
+ * steady one. What the threshold is depends on what the angle is good to: 1.125 counts where it is the middle of a
  * count, 8 urad where the time of the last edge is known; a wider start with the latter, whose noise is smaller.
  *
  * A drive whose model is wrong (three times the inertia, tables half a degree off) would wake again and again, each
- * time by what the last one stirred up: a limit cycle. Two things end it. Each waking doubles the pause before the next
- * can come, from 1 ms to at most 256 ms, and time shrinks the pause again. And in the steady bandwidth the threshold
- * follows four times the mean size of the innovation, so that what the model always leaves unexplained wakes nobody.
+ * time by what the last one stirred up: a limit cycle. Two things end it. Each waking lengthens the pause before the
+ * next can come, from 1 ms to at most 256 ms, one out of the steady state to twice as long, and time shrinks the pause
+ * again. And in the steady bandwidth the threshold follows four times the mean size of the innovation, so that what the
+ * model always leaves unexplained wakes nobody.
  */
 #ifndef CONTROL_OBSERVER_BANDWIDTH_H
 #define CONTROL_OBSERVER_BANDWIDTH_H
