@@ -38,7 +38,7 @@ static void fault_handler(void) {
     semihosting_exit(EXIT_PROCESSOR_FAULT);
 }
 
-/* In assembly, so that its return is one instruction with a name: who counts instructions knows both ends. */
+/* In assembly, so that its first and its last instruction have names: who counts instructions knows both ends. */
 void control_handler(void);
 __asm__(".text\n"
         ".balign 4\n"
@@ -47,8 +47,8 @@ __asm__(".text\n"
         ".type control_handler, %function\n"
         "control_handler:\n"
         "    push {r4, lr}\n" /* r4 keeps the stack aligned to 8 bytes */
-        "    bl program_interrupt\n"
         ".size control_handler, . - control_handler\n"
+        "    bl program_interrupt\n"
         ".type control_handler_return, %function\n"
         "control_handler_return:\n"
         "    pop {r4, pc}\n"

@@ -32,7 +32,8 @@ bool instructions_open(const char *path) {
     return file != NULL;
 }
 
-/* Exceptions are taken and returned from between blocks only, so that the handler's ends are ends of blocks. */
+/* The handler's first and last instruction have names of their own. Exceptions are taken and returned from between
+ * blocks only, so that these begin a block and end one. */
 void instructions_translate(struct qemu_plugin_tb *tb) {
     const size_t size = qemu_plugin_tb_n_insns(tb);
     const char *symbol = qemu_plugin_insn_symbol(qemu_plugin_tb_get_insn(tb, 0));

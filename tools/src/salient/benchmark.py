@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from salient import comparison, instructions
+from salient import comparison, instructions, interrupt_cost
 from salient.arguments import CONTROLLERS
 from salient.errors import UsageError
 from salient.network_study import study
@@ -104,6 +104,7 @@ def run(runs: int, json_path: Path | None) -> int:
             "processor": _processor(),
             "speed": _speed(runs),
             "instructions": _instructions(),
+            "cortex_m4": _cortex_m4(),
             "comparison": compare_solvers(runs),
             "network": study(),
         }
@@ -147,6 +148,17 @@ def _instructions() -> dict[str, Any]:
         figures[controller] = {group: round(count, 1) for group, count in counts.items()} | {"total": round(total, 1)}
         shares = ", ".join(f"{group} {100 * count / total:.0f} %" for group, count in counts.items())
         print(f"  {controller:<12} {total:6.0f}: {shares}", flush=True)
+    return figures
+
+
+def _cortex_m4() -> dict[str, Any]:
+    """Of the control interrupt by controller."""
+    print("instructions a control interrupt on the Cortex-M4, compiled with -O2: the paper's two experiments")
+    figures = {}
+    for controller in CONTROLLERS:
+        made = figures[controller] = interrupt_cost.figures(interrupt_cost.count(controller))
+        print(f"  {controller:<12} typical {made['typical']:5d}  99 % up to {made['of_99_percent']:5d}"
+              f"  worst {made['worst']:5d}", flush=True)
     return figures
 
 
