@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from salient.arguments import CONTROLLERS
-from salient.interrupt_cost import count, figures
+from salient.interrupt_cost import measure
 from salient.simulator import SimulatorOptions
 
 TIMEOUT_S = 60
@@ -23,7 +23,8 @@ MEASURED = {"traditional": (1289, 2740), "paper": (3871, 4395), "salient": (3444
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_instructions_of_an_interrupt_are_what_was_measured(controller):
-    made = figures(count(controller))
+    cost = measure(controller)
+    made = cost.figures()
     typical, worst = MEASURED[controller]
     print(f"{controller}: typical {made['typical']}, 99 % up to {made['of_99_percent']}, worst {made['worst']}")
     assert 0.9 * typical < made["typical"] < 1.1 * typical
@@ -32,7 +33,16 @@ def test_instructions_of_an_interrupt_are_what_was_measured(controller):
 
 
 def test_equal_runs_take_equal_instructions():
-    assert (count("salient") == count("salient")).all()
+    first, second = (measure("salient") for _ in range(2))
+    assert (first.interrupts == second.interrupts).all()
+    assert first.functions == second.functions
+
+
+def test_the_functions_account_for_every_instruction():
+    cost = measure("paper")
+    assert cost.functions.total() == cost.interrupts.sum()
+    assert cost.functions["control_handler"] == 3 * len(cost.interrupts)
+    assert 0 < cost.functions["drive_control_interrupt"] < cost.interrupts.sum()
 
 
 @pytest.fixture

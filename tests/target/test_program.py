@@ -28,6 +28,7 @@ def program() -> list[str]:
         (["--can", "BUS", "--controller", "pid"], ["--controller pid", "traditional, paper and salient"]),
         (["--can", "BUS", "--record", "/no/such/folder/x.npy"], ["/no/such/folder/x.npy"]),
         (["--instructions", "/no/such/folder/x", "--can", "BUS"], ["--instructions /no/such/folder/x"]),
+        (["--profile", "/no/such/folder/x", "--can", "BUS"], ["--profile /no/such/folder/x"]),
         (["--can", "BUS", "--bogus"], ["--bogus"]),
     ],
 )

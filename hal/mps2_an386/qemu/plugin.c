@@ -2,8 +2,8 @@
  *
  * The QEMU plugin: opens the world when QEMU starts, and serves it whenever the drive stores to the doorbell.
  *
- * Plugin arguments: mailbox=FILE, the board's shared memory; instructions=FILE, see instructions.h; argument=TEXT, a
- * word of the host executable's command line, repeated in order.
+ * Plugin arguments: mailbox=FILE, the board's shared memory; instructions=FILE, see instructions.h; profile=FILE,
+ * see profile.h; argument=TEXT, a word of the host executable's command line, repeated in order.
  */
 #define _POSIX_C_SOURCE 200809L
 
@@ -18,6 +18,7 @@
 #include "host/bench.h"
 #include "instructions.h"
 #include "plugin_api.h"
+#include "profile.h"
 #include "world.h"
 
 #define EXPORT __attribute__((visibility("default")))
@@ -27,7 +28,7 @@ EXPORT int qemu_plugin_version = PLUGIN_API_VERSION;
 EXPORT int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, char **argv);
 
 static mailbox_t *mailbox;
-static bool counting;
+static bool counting, profiling;
 
 /* The function has other stores in images that are not optimised. */
 static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, void *context) {
@@ -38,12 +39,13 @@ static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, 
         return;
     }
     world_serve();
-    if (counting && mailbox->event == MAILBOX_EXIT) {
-        counting = false;
-        if (!instructions_close()) {
-            mailbox->exit_code = BENCH_EXIT_MISTAKE;
-        }
+    if (mailbox->event != MAILBOX_EXIT) {
+        return;
     }
+    if ((counting && !instructions_close()) || (profiling && !profile_close())) {
+        mailbox->exit_code = BENCH_EXIT_MISTAKE;
+    }
+    counting = profiling = false;
 }
 
 static void translate(qemu_plugin_id_t id, struct qemu_plugin_tb *tb) {
@@ -57,6 +59,9 @@ static void translate(qemu_plugin_id_t id, struct qemu_plugin_tb *tb) {
     }
     if (counting) {
         instructions_translate(tb);
+    }
+    if (profiling) {
+        profile_translate(tb);
     }
 }
 
@@ -83,7 +88,7 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
     static options_t options; /* the world keeps it */
     char *words[ARGUMENTS_MAX + 1] = {"salient"};
     int count = 1;
-    const char *mailbox_path = NULL, *instructions_path = NULL;
+    const char *mailbox_path = NULL, *instructions_path = NULL, *profile_path = NULL;
     for (int i = 0; i < argc; ++i) {
         char *value;
         if ((value = value_of(argv[i], "argument="))) {
@@ -96,6 +101,8 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
             mailbox_path = value;
         } else if ((value = value_of(argv[i], "instructions="))) {
             instructions_path = strdup(value);
+        } else if ((value = value_of(argv[i], "profile="))) {
+            profile_path = strdup(value);
         } else {
             fprintf(stderr, "salient: %s: not an argument of this plugin\n", argv[i]);
             exit(BENCH_EXIT_MISTAKE);
@@ -110,11 +117,10 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
     if (result != OPTIONS_RUN || !world_open(mailbox, &options)) {
         exit(result == OPTIONS_HELP ? 0 : BENCH_EXIT_MISTAKE);
     }
-    if (instructions_path) {
-        if (!instructions_open(instructions_path)) {
-            exit(BENCH_EXIT_MISTAKE);
-        }
-        counting = true;
+    counting = instructions_path;
+    profiling = profile_path;
+    if ((counting && !instructions_open(instructions_path)) || (profiling && !profile_open(profile_path))) {
+        exit(BENCH_EXIT_MISTAKE);
     }
     qemu_plugin_register_vcpu_tb_trans_cb(id, translate);
     return 0;

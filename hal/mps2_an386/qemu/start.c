@@ -37,18 +37,23 @@ static void put_option(FILE *list, const char *key, const char *value) {
 
 int main(int argc, char *argv[]) {
     if (argc < 2 || strcmp(argv[1], "--help") == 0) {
-        printf("usage: %s IMAGE.elf [--instructions FILE] OPTION...\n"
+        printf("usage: %s IMAGE.elf [--instructions FILE] [--profile FILE] OPTION...\n"
                "  IMAGE.elf            the drive, as built for the Cortex-M4\n"
                "  --instructions FILE  writes the instructions of each control interrupt, a uint32_t each\n"
+               "  --profile FILE       writes a line for each function: its instructions in all control interrupts\n"
                "  OPTION               as the host executable's; its --help lists them\n",
                argv[0]);
         return argc < 2 ? EXIT_MISTAKE : 0;
     }
-    const char *image = argv[1], *instructions = NULL;
+    const char *image = argv[1], *instructions = NULL, *profile = NULL;
     int first = 2;
-    if (argc > 3 && strcmp(argv[2], "--instructions") == 0) {
-        instructions = argv[3];
-        first = 4;
+    if (argc > first + 1 && strcmp(argv[first], "--instructions") == 0) {
+        instructions = argv[first + 1];
+        first += 2;
+    }
+    if (argc > first + 1 && strcmp(argv[first], "--profile") == 0) {
+        profile = argv[first + 1];
+        first += 2;
     }
     if (access(image, R_OK) != 0) {
         return mistake(image);
@@ -73,6 +78,9 @@ int main(int argc, char *argv[]) {
     put_option(list, "mailbox", path);
     if (instructions) {
         put_option(list, "instructions", instructions);
+    }
+    if (profile) {
+        put_option(list, "profile", profile);
     }
     for (int i = first; i < argc; ++i) {
         put_option(list, "argument", argv[i]);

@@ -37,7 +37,8 @@ class SimulatorOptions:
     there is; it is for the conditions of simulations. record: file for the true state
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
     period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a Cortex-M4 in QEMU. instructions: file
-    for the instructions of each control interrupt, uint32 little endian, on the Cortex-M4 only.
+    for the instructions of each control interrupt, uint32 little endian; profile: file for those of all by function,
+    text lines "INSTRUCTIONS FUNCTION"; both on the Cortex-M4 only.
     """
 
     machine: str = "saturating"
@@ -57,6 +58,7 @@ class SimulatorOptions:
     record_switches: Path | None = None
     build: str = "host"
     instructions: Path | None = None
+    profile: Path | None = None
 
     def arguments(self, can: str) -> list[str]:
         """The executable's command line on the bus `can`."""
@@ -83,7 +85,10 @@ class SimulatorOptions:
         if self.build not in TARGET_BUILDS:
             return [str(program)]
         line = [str(program), str(image(self.machine, self.build))]
-        return line if self.instructions is None else [*line, "--instructions", str(self.instructions)]
+        for name in ("instructions", "profile"):
+            if (path := getattr(self, name)) is not None:
+                line += [f"--{name}", str(path)]
+        return line
 
 
 @lru_cache
@@ -199,7 +204,8 @@ class Simulator:
 def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
     on the bus of an experiment."""
-    return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, pace="lockstep"))
+    return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, profile=None,
+                                    pace="lockstep"))
 
 
 @lru_cache
