@@ -185,7 +185,7 @@ TEST(Misalignment, is_held_within_a_degree_and_overflows_nothing) {
                 current_q9[phase] = on ? 79 * 512 : 0;
             }
             observer.load_torque_q24 = sign * (on ? 60 << 24 : -(60 << 24));
-            observer.correction_q22 = sign * (on ? INT32_MIN : INT32_MAX);
+            observer.correction_q22 = on == (sign > 0) ? INT32_MIN : INT32_MAX;
             const misalignment_sample_t sample = {current_q9, angle, 8 << 24, true};
             misalignment_step(&p, &state, &machine_tables, &observer, &sample);
         }

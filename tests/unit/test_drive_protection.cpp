@@ -163,7 +163,8 @@ TEST_F(Protection, both_directions_give_the_same_checks_on_mirrored_random_motio
         sample.angle += step;
         mirror.angle -= step;
         if (k % 50 == 0) {
-            sample.speed_q22 = int32_t(random() % ((random() % 20 == 0 ? 380u : 10u) << 22));
+            const uint32_t fastest_rad_s = random() % 20 == 0 ? 400 : 10;
+            sample.speed_q22 = int32_t(random() % (fastest_rad_s << 22));
             mirror.speed_q22 = -sample.speed_q22;
         }
         const uint16_t checks = check(sample);
