@@ -60,9 +60,13 @@ BUILD_NEEDS = (
     Need("libgtest-dev", "unit tests", _file("/usr/include/gtest/gtest.h", "/usr/local/include/gtest/gtest.h")),
     Need("python3-venv", "virtual environment", lambda: (VENV / "bin/python").exists() or _has_ensurepip()),
 )
-TEST_NEEDS = (
+TARGET_NEEDS = (
     Need("gcc-arm-none-eabi", "compiler for Cortex-M4", _tool("arm-none-eabi-gcc")),
     Need("libnewlib-arm-none-eabi", "its C headers", _file("/usr/lib/arm-none-eabi/include/string.h")),
+    Need("qemu-system-arm", "emulated Cortex-M4", _tool("qemu-system-arm")),
+)
+TEST_NEEDS = (
+    *TARGET_NEEDS,
     Need("qemu-system-x86", "guest with a kernel that has CAN", lambda: not _guest_packages()),
 )
 MEASUREMENT_NEEDS = (
@@ -175,17 +179,17 @@ def _last_line(log: Path) -> str:
 
 # --- build ----------------------------------------------------------------------------------------------------------
 
-def build(targets: list[str]) -> None:
-    """Brings the host build up to date; exit code 1 with the compiler's words when it fails."""
-    host = BUILD / "host"
-    if not (host / "bin").exists():
+def build(preset: str, targets: list[str]) -> None:
+    """Brings a preset's build up to date; exit code 1 with the compiler's words when it fails."""
+    folder = BUILD / preset
+    if not (folder / "bin").exists():
         say("building")
     log = BUILD / "build.log"
-    command = ["cmake", "--build", "--preset", "host"]
+    command = ["cmake", "--build", "--preset", preset]
     if targets:
         command += ["--target", *targets]
-    steps = [command] if _is_configured(host) else [
-        ["cmake", "--preset", "host", "-DSALIENT_MACHINE_FILE="],
+    steps = [command] if _is_configured(folder) else [
+        ["cmake", "--preset", preset, "-DSALIENT_MACHINE_FILE="],
         command,
     ]
     with log.open("wb") as output:
@@ -224,6 +228,10 @@ def main() -> None:
     with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # two commands at once must not build over each other
         needs = BUILD_NEEDS + (TEST_NEEDS if options.command == "test" else ())
+        # bench counts the instructions of the control interrupt there
+        target = "cortex-m4" if options.command == "bench" else getattr(options, "target", "host")
+        on_target = target != "host"
+        needs += TARGET_NEEDS if on_target else ()
         needs += MEASUREMENT_NEEDS if options.command in ("test", "bench") else ()
         if options.command in WITHOUT_BUILD:
             needs = tuple(need for need in BUILD_NEEDS if need.package == "python3-venv")
@@ -233,7 +241,10 @@ def main() -> None:
             machines = sorted(path.stem for path in (TOOLS / "machines").glob("*.toml"))
             targets = [f"salient_{name}" for name in machines]
             targets += ["plant_replay_saturating"] if options.command == "bench" else []
-            build([] if options.command == "test" else targets)
+            targets += [f"salient_target_{name}" for name in machines] if on_target else []
+            build("host", [] if options.command == "test" else targets)
+            if on_target:
+                build(target, [])
     python = str(VENV / "bin/python")
     os.execv(python, [python, "-m", "salient", *sys.argv[1:]])
 

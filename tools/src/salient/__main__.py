@@ -71,6 +71,7 @@ def _sim(options: argparse.Namespace) -> int:
             initial_angle_deg=options.initial_angle_deg,
             pace=options.pace,
             bit_rate=options.bit_rate,
+            build=options.target,
         ).arguments(options.can)
     except SimulatorError as error:
         print(f"salient: {error}", file=sys.stderr)
@@ -83,7 +84,7 @@ def _run(options: argparse.Namespace) -> int:
 
     scenarios = load_scenarios(options.scenario)
     out = options.out or Path("out") / options.scenario.stem
-    results = run_all(scenarios, out, progress=lambda line: print(line, flush=True))
+    results = run_all(scenarios, out, build=options.target, progress=lambda line: print(line, flush=True))
     print(f"results: {out / 'results.json'}")
     faults = [f"{controller}: {result.fault}" for controller, result in results.items() if result.fault != "none"]
     if faults:

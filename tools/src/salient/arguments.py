@@ -14,6 +14,8 @@ CONTROLLERS = ("traditional", "paper", "salient")
 CONTROL_RATES_HZ = (20_000, 40_000, 50_000, 100_000, 1_000_000)
 ENCODER_BITS = (0, *range(8, 25))
 ADC_BITS = (12, 13, 14, 15, 16)
+TARGETS = ("host", "cortex-m4")
+"""Where the firmware runs: in the bench's own process, or on a Cortex-M4 that QEMU emulates."""
 LOG_SUFFIXES = (".blf", ".log")
 
 
@@ -47,6 +49,8 @@ def make_parser() -> argparse.ArgumentParser:
     demo.add_argument("--encoder-bits", type=_one_of(ENCODER_BITS), metavar="N", help="default 17; 0 is ideal")
     demo.add_argument("--seed", type=_seed, metavar="N", help="default 1")
 
+    _add_target(demo)
+
     test = command("test", "every test; ends with the numbers of passed and failed")
     test.add_argument("--only", action="append", type=_one_of(TEST_STEPS), metavar="STEP",
                       help=f"one step only, may be repeated: {', '.join(TEST_STEPS)}")
@@ -70,9 +74,12 @@ def make_parser() -> argparse.ArgumentParser:
     sim.add_argument("--initial-angle-deg", type=float, default=0.0, metavar="X", help="-360 to 360, default 0")
     sim.add_argument("--bit-rate", type=int, default=1_000_000, metavar="N", help="of the bus, default 1000000")
 
+    _add_target(sim)
+
     run = command("run", "one scenario, to a folder")
     run.add_argument("scenario", type=Path, metavar="SCENARIO.toml")
     run.add_argument("--out", type=Path, metavar="DIR", help="folder (default out/NAME)")
+    _add_target(run)
 
     log = command("log", "record a running bus until it ends, or is interrupted")
     log.add_argument("--can", type=_can, default="auto", metavar="BUS", help="as with sim")
@@ -100,6 +107,11 @@ def make_parser() -> argparse.ArgumentParser:
 
 TEST_STEPS = ("style", "unit", "sanitize", "cortex-m4", "hil", "socketcan")
 """The steps of `test`, in order."""
+
+
+def _add_target(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--target", type=_one_of(TARGETS), default="host", metavar="NAME",
+                         help="host (default) or cortex-m4: the same firmware in QEMU")
 
 
 def _one_of(allowed: tuple):

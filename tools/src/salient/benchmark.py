@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from salient import comparison, instructions
+from salient import comparison, instructions, interrupt_cost
 from salient.arguments import CONTROLLERS
 from salient.errors import UsageError
 from salient.network_study import study
@@ -26,6 +26,7 @@ SIMULATED_S = 0.9
 _SETTLE_S = 0.2
 _CONTROL_RATE_HZ = 40_000
 _COUNTED_S = 0.1
+_FUNCTIONS_SHOWN = 6
 _COMMAND_TIMEOUT_MS = 1000.0
 _BEGUN_S = 1e-3
 """Of processor time: more than taking a request needs, less than what it asks for."""
@@ -104,6 +105,7 @@ def run(runs: int, json_path: Path | None) -> int:
             "processor": _processor(),
             "speed": _speed(runs),
             "instructions": _instructions(),
+            "cortex_m4": _cortex_m4(),
             "comparison": compare_solvers(runs),
             "network": study(),
         }
@@ -147,6 +149,20 @@ def _instructions() -> dict[str, Any]:
         figures[controller] = {group: round(count, 1) for group, count in counts.items()} | {"total": round(total, 1)}
         shares = ", ".join(f"{group} {100 * count / total:.0f} %" for group, count in counts.items())
         print(f"  {controller:<12} {total:6.0f}: {shares}", flush=True)
+    return figures
+
+
+def _cortex_m4() -> dict[str, Any]:
+    """Of the control interrupt by controller."""
+    print("instructions a control interrupt on the Cortex-M4, compiled with -O2: the paper's two experiments")
+    figures = {}
+    for controller in CONTROLLERS:
+        cost = interrupt_cost.measure(controller)
+        made, parts = cost.figures(), cost.by_function()
+        figures[controller] = made | {"mean_by_function": {name: round(mean, 1) for name, mean in parts.items()}}
+        print(f"  {controller:<12} typical {made['typical']:5d}  99 % up to {made['of_99_percent']:5d}"
+              f"  worst {made['worst']:5d}; of the mean: "
+              + ", ".join(f"{name} {mean:.0f}" for name, mean in list(parts.items())[:_FUNCTIONS_SHOWN]), flush=True)
     return figures
 
 

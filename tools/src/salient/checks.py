@@ -14,9 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from salient.paths import BUILD, ROOT, SCENARIOS
+from salient.simulator import TARGET_BUILDS
 
 RESULTS = BUILD / "results"
 HIL = ROOT / "tests" / "hil"
+TARGET = ROOT / "tests" / "target"
 GUEST_TIMEOUT_S = 1800
 
 
@@ -106,8 +108,13 @@ def _sanitize() -> Count:
 
 
 def _cortex_m4() -> Count:
-    """the firmware compiled for Cortex-M4, its symbols checked."""
-    return _build("cortex-m4")
+    """the firmware for Cortex-M4: compiled in three ways, its symbols and size checked, and run in QEMU."""
+    count = Count()
+    for preset in TARGET_BUILDS:
+        count += _build(preset)
+    if not count.failed:
+        count += _pytest(RESULTS / "target.xml", [TARGET], [])
+    return count
 
 
 def _hil() -> Count:

@@ -83,7 +83,8 @@ class _Run:
 def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.stdout) -> int:
     """Runs everything, tells `stream` how far it is and what came out. Returns 0.
 
-    options: out, and machine, control_rate_hz, encoder_bits and seed, each None for what the scenario files say.
+    options: out, target, and machine, control_rate_hz, encoder_bits and seed, each None for what the scenario files
+    say.
     can: "local" for a bus of its own for each run, or "socketcan:INTERFACE", on which the runs follow each other.
     Raises UsageError, before anything is written where that can be known, and DemoFailed.
     """
@@ -91,7 +92,7 @@ def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.st
     out: Path = options.out
     _prepare_folder(out)
     try:
-        results = _run_and_report(scenarios, out, can, stream)
+        results = _run_and_report(scenarios, out, can, options.target, stream)
     except OSError as error:
         if error.errno in _CANNOT_WRITE:
             raise _cannot_write(out, error) from error
@@ -100,17 +101,17 @@ def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.st
     return 0
 
 
-def _run_and_report(scenarios: Mapping[str, Sequence[Scenario]], out: Path, can: str,
+def _run_and_report(scenarios: Mapping[str, Sequence[Scenario]], out: Path, can: str, build: str,
                     stream: TextIO) -> dict[str, Any]:
     with (ProcessPoolExecutor(_WORKERS if can == "local" else 1, initializer=_leave_interrupts_to_parent) as workers,
           Progress(sum(map(len, scenarios.values())) + len(PICTURES) + 1, stream) as progress):
-        runs = _run_all(workers, scenarios, out, can, progress)
+        runs = _run_all(workers, scenarios, out, can, build, progress)
         results = make_results(_by_experiment(runs, "merits"), _by_experiment(runs, "losses"),
                                _conditions(scenarios))
         pictures = _draw_all(workers, runs, results, out, progress)
         recordings = [_thin(made) for made in runs]
         write_results(out / "results.json", results)
-        write_report(out / "report.html", results, pictures, _commands(scenarios), _files(runs, recordings, out))
+        write_report(out / "report.html", results, pictures, _commands(scenarios, build), _files(runs, recordings, out))
         progress.step("report.html")
     return results
 
@@ -144,7 +145,7 @@ def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
     scenarios = {experiment: [replace(scenario, **changes)
                               for scenario in load_scenarios(SCENARIOS / f"{experiment}.toml")]
                  for experiment in EXPERIMENTS}
-    executable(scenarios["start_600"][0].machine)
+    executable(scenarios["start_600"][0].machine, options.target)
     return scenarios
 
 
@@ -165,20 +166,20 @@ def _cannot_write(out: Path, error: OSError) -> UsageError:
 
 
 def _run_all(workers: Executor, scenarios: Mapping[str, Iterable[Scenario]], out: Path, can: str,
-             progress: Progress) -> list[_Run]:
+             build: str, progress: Progress) -> list[_Run]:
     started = {}
     for experiment, of in scenarios.items():
         for scenario in of:
             folder = out / "runs" / f"{experiment}_{scenario.controller}"
             started[f"{experiment} by {scenario.controller}"] = workers.submit(_run_one, experiment, scenario, folder,
-                                                                               can)
+                                                                               can, build)
     return _gather(started, progress)
 
 
-def _run_one(experiment: str, scenario: Scenario, folder: Path, can: str) -> _Run:
+def _run_one(experiment: str, scenario: Scenario, folder: Path, can: str, build: str) -> _Run:
     name = f"{experiment} by {scenario.controller}"
     try:
-        result = run_scenario(scenario, folder, can=can)
+        result = run_scenario(scenario, folder, can, build)
     except (SimulatorError, SessionError, DriveError, CanError) as error:
         raise DemoFailed(f"{name}: {error}") from error
     if result.fault != "none":
@@ -263,14 +264,15 @@ def _draw(name: str, path: Path, runs: Sequence[_Run], results: Mapping[str, Any
         figures.draw_phase_currents(path, recordings)
 
 
-def _commands(scenarios: Mapping[str, Sequence[Scenario]]) -> list[str]:
+def _commands(scenarios: Mapping[str, Sequence[Scenario]], build: str) -> list[str]:
+    target = "" if build == "host" else f" --target {build}"
     one = scenarios["start_600"][0]
     return [
         "# everything on this page",
         f"tools/salient demo --machine {shlex.quote(one.machine)} --control-rate-hz {one.control_rate_hz}"
-        f" --encoder-bits {one.encoder_bits} --seed {one.seed}",
+        f" --encoder-bits {one.encoder_bits} --seed {one.seed}{target}",
         "# one experiment, with every row of its recordings",
-        *(f"tools/salient run tools/scenarios/{experiment}.toml" for experiment in scenarios),
+        *(f"tools/salient run tools/scenarios/{experiment}.toml{target}" for experiment in scenarios),
     ]
 
 

@@ -25,7 +25,7 @@ import pytest
 
 from salient.bench import Bench
 from salient.paths import BUILD, ROOT
-from salient.simulator import SimulatorOptions
+from salient.simulator import TARGET_BUILDS, SimulatorOptions
 
 _benches_key = pytest.StashKey[list[Bench]]()
 
@@ -34,7 +34,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("salient")
     group.addoption("--salient-can", default="local", metavar="BUS",
                     help="local (default): a local bus for each bench; or socketcan:INTERFACE")
-    group.addoption("--salient-build", default="host", choices=("host", "sanitize"), help="which build is tested")
+    group.addoption("--salient-build", default="host", choices=("host", "sanitize", *TARGET_BUILDS),
+                    help="which build is tested")
     group.addoption("--salient-failures", default=str(BUILD / "failures"), metavar="DIR",
                     help="where failed tests leave their folders")
 

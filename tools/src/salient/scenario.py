@@ -39,7 +39,7 @@ import json
 import math
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -131,15 +131,17 @@ class RunResult:
 _RECORDING, _LOG, _TEXT_LOG = "recording.npy", "can.blf", "can.log"
 
 
-def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: str = "host") -> RunResult:
+def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: str = "host",
+                 instructions: Path | None = None, profile: Path | None = None) -> RunResult:
     """Runs a scenario in lock-step and leaves recording.npy, can.blf and can.log in out_dir, which is made if needed.
 
     can: "local" for a bus of its own, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; parameters
-    are written first, then the commands follow; the bench's quantities are set before all. UsageError for what the
-    drive does not know or refuses.
+    are written first, then the commands follow; the bench's quantities are set before all. For build, instructions,
+    profile see SimulatorOptions. UsageError for what the drive does not know or refuses.
     """
     recording_path = out_dir / _RECORDING if scenario.record else None
-    options = _simulator_options(scenario, recording_path, build)
+    options = replace(_simulator_options(scenario, recording_path, build), instructions=instructions,
+                      profile=profile)
     writes = _parameter_writes(scenario, options)
     out_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
@@ -238,15 +240,16 @@ def summary(result: RunResult) -> dict[str, Any]:
     return figures
 
 
-def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local",
+def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build: str = "host",
             progress: Callable[[str], None] = lambda line: None) -> dict[str, RunResult]:
-    """Runs the scenarios of one file, each into out_dir/CONTROLLER, and writes out_dir/results.json."""
+    """Runs the scenarios of one file, each into out_dir/CONTROLLER, and writes out_dir/results.json. build: see
+    SimulatorOptions."""
     for scenario in scenarios:  # so that a mistake is named before the first run
-        _parameter_writes(scenario, _simulator_options(scenario, None, "host"))
+        _parameter_writes(scenario, _simulator_options(scenario, None, build))
     results = {}
     for scenario in scenarios:
         progress(f"{scenario.name}: {scenario.controller}, {scenario.duration_s:g} s of virtual time")
-        results[scenario.controller] = run_scenario(scenario, out_dir / scenario.controller, can)
+        results[scenario.controller] = run_scenario(scenario, out_dir / scenario.controller, can, build)
     content = {
         "schema": 1,
         "scenario": {key: value for key, value in asdict(scenarios[0]).items() if key != "controller"},

@@ -1,4 +1,4 @@
-"""Starts the host executable: a drive and its bench in one process."""
+"""Starts a drive and its bench in one process: the host executable, or QEMU with the image for the Cortex-M4."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ from salient.session import Session
 
 _END_TIMEOUT_S = 60.0
 
+TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os")
+"""The image for the Cortex-M4 as it is meant to be, without optimisation, and optimised for size."""
+
 
 class SimulatorError(Exception):
     """The executable failed; the text has what it wrote."""
@@ -33,7 +36,9 @@ class SimulatorOptions:
     the encoder's edges. adc_bits: 12..16. immediate_pwm: what the control writes acts at once, as with no converter
     there is; it is for the conditions of simulations. record: file for the true state
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
-    period. build: host or sanitize.
+    period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a Cortex-M4 in QEMU. instructions: file
+    for the instructions of each control interrupt, uint32 little endian; profile: file for those of all by function,
+    text lines "INSTRUCTIONS FUNCTION"; both on the Cortex-M4 only.
     """
 
     machine: str = "saturating"
@@ -52,11 +57,13 @@ class SimulatorOptions:
     record_from_us: int = 0
     record_switches: Path | None = None
     build: str = "host"
+    instructions: Path | None = None
+    profile: Path | None = None
 
     def arguments(self, can: str) -> list[str]:
         """The executable's command line on the bus `can`."""
         line = [
-            str(executable(self.machine, self.build)), "--can", can, "--pace", self.pace,
+            *self._program(), "--can", can, "--pace", self.pace,
             "--controller", self.controller, "--control-rate-hz", str(self.control_rate_hz),
             "--encoder-bits", str(self.encoder_bits), "--seed", str(self.seed),
             "--initial-angle-deg", f"{self.initial_angle_deg:.17g}", "--bit-rate", str(self.bit_rate),
@@ -73,10 +80,23 @@ class SimulatorOptions:
             line += ["--record-switches", str(self.record_switches)]
         return line
 
+    def _program(self) -> list[str]:
+        program = executable(self.machine, self.build)
+        if self.build not in TARGET_BUILDS:
+            return [str(program)]
+        line = [str(program), str(image(self.machine, self.build))]
+        for name in ("instructions", "profile"):
+            if (path := getattr(self, name)) is not None:
+                line += [f"--{name}", str(path)]
+        return line
+
 
 @lru_cache
 def executable(machine: str, build: str = "host") -> Path:
-    """The executable for a machine; the one for a foreign machine file is built first. UsageError."""
+    """The executable for a machine; the one for a foreign machine file is built first. UsageError.
+
+    Of a target build: the host's program that starts QEMU with image().
+    """
     try:
         path = machine_path(machine)
         checked = load_machine(path)
@@ -84,12 +104,23 @@ def executable(machine: str, build: str = "host") -> Path:
             machine_phase_map(path, checked)  # or the build would fail
     except MachineError as error:
         raise UsageError(str(error)) from None
-    program = BUILD / build / "bin" / f"salient_{path.stem}"
-    if path.parent != MACHINES:
-        _build_foreign(path, program, build)
-    if not program.exists():
-        raise UsageError(f"{program.relative_to(ROOT)} is not built; any tools/salient command builds it")
-    return program
+    needed = {"host": f"salient_target_{path.stem}", build: f"salient_{path.stem}.elf"}
+    if build not in TARGET_BUILDS:
+        needed = {build: f"salient_{path.stem}"}
+    programs = [BUILD / preset / "bin" / name for preset, name in needed.items()]
+    for preset, program in zip(needed, programs, strict=True):
+        if path.parent != MACHINES:
+            _build_foreign(path, program, preset)
+        if not program.exists():
+            builder = "tools/salient test --only cortex-m4" if build in TARGET_BUILDS else "any tools/salient command"
+            raise UsageError(f"{program.relative_to(ROOT)} is not built; {builder} builds it")
+    return programs[0]
+
+
+def image(machine: str, build: str) -> Path:
+    """What executable() runs of a target build. UsageError."""
+    executable(machine, build)
+    return BUILD / build / "bin" / f"salient_{machine_path(machine).stem}.elf"
 
 
 def _build_foreign(path: Path, program: Path, build: str) -> None:
@@ -174,7 +205,8 @@ class Simulator:
 def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
     on the bus of an experiment."""
-    return _parameter_table(replace(options, record=None, record_switches=None, pace="lockstep"))
+    return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, profile=None,
+                                    pace="lockstep"))
 
 
 @lru_cache

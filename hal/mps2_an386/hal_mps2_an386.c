@@ -1,0 +1,79 @@
+#include "mps2_an386/hal_mps2_an386.h"
+
+#include "hal_time.h"
+
+/* The world knows this store by the function's name, so the function must stay one: not inlined, not cloned. */
+__attribute__((noipa)) void doorbell_ring(mailbox_command_t command) {
+    *(volatile uint32_t *)&board.mailbox.doorbell = command;
+}
+
+unsigned hal_adc_bits(const hal_t *hal) {
+    return hal->mailbox.adc_bits;
+}
+
+void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample) {
+    *sample = hal->mailbox.adc;
+}
+
+unsigned hal_encoder_bits(const hal_t *hal) {
+    return hal->mailbox.encoder_bits;
+}
+
+void hal_encoder_read(const hal_t *hal, hal_encoder_sample_t *sample) {
+    *sample = hal->mailbox.encoder;
+}
+
+void hal_pwm_start(hal_t *hal, uint16_t period_ticks) {
+    hal->mailbox.period_ticks = period_ticks;
+    doorbell_ring(MAILBOX_PWM_START);
+}
+
+void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare) {
+    hal->mailbox.compare = *compare;
+    hal->mailbox.compare_written = 1;
+}
+
+void hal_pwm_open_all(hal_t *hal) {
+    (void)hal;
+    doorbell_ring(MAILBOX_PWM_OPEN_ALL);
+}
+
+uint32_t hal_pwm_missed_interrupts(hal_t *hal) {
+    const uint32_t missed = hal->mailbox.missed_interrupts;
+    hal->mailbox.missed_interrupts = 0;
+    return missed;
+}
+
+bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {
+    if (hal->mailbox.receive_waiting == 0) {
+        return false;
+    }
+    doorbell_ring(MAILBOX_CAN_RECEIVE);
+    *frame = hal->mailbox.frame;
+    return hal->mailbox.accepted != 0;
+}
+
+uint32_t hal_can_receive_overflows(const hal_t *hal) {
+    return hal->mailbox.receive_overflows;
+}
+
+bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
+    hal->mailbox.frame = *frame;
+    doorbell_ring(MAILBOX_CAN_TRANSMIT);
+    return hal->mailbox.accepted != 0;
+}
+
+uint32_t hal_time_us(const hal_t *hal) {
+    return hal->mailbox.time_us;
+}
+
+/* The control interrupt is the only one there is, so all may be kept out. */
+void hal_critical_enter(hal_t *hal) {
+    (void)hal;
+    __asm__ volatile("cpsid i" ::: "memory");
+}
+
+void hal_critical_leave(hal_t *hal) {
+    (void)hal;
+    __asm__ volatile("cpsie i" ::: "memory");
+}

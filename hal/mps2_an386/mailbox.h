@@ -1,0 +1,71 @@
+/* What stands in for the registers that the board mps2-an386 has not: PWM timer, converter, encoder, CAN controller.
+ *
+ * A structure in memory that drive and world share. The drive reads registers and sends commands: it stores one to
+ * `doorbell`, and before the drive's next instruction the world has done it. So the world needs no polling and time
+ * stands still while the drive computes, as in the host executable. The layout is the same on both sides: little
+ * endian, natural alignment, no pointers.
+ */
+#ifndef MAILBOX_H
+#define MAILBOX_H
+
+#include <stdint.h>
+
+#include "hal_adc.h"
+#include "hal_can.h"
+#include "hal_encoder.h"
+#include "hal_pwm.h"
+
+/* Where the board's 16 MiB PSRAM begins, the memory that QEMU can share with its world; whole, because the board takes
+ * no other size. */
+#define MAILBOX_ADDRESS 0x21000000
+#define MAILBOX_MEMORY_BYTES (16 * 1024 * 1024)
+
+/* Changes with the structure, so that an image and a world that do not fit each other stop at the start. */
+#define MAILBOX_LAYOUT 1
+
+typedef enum {
+    MAILBOX_STARTED = 1, /* drive_init was done; then as MAILBOX_NEXT */
+    MAILBOX_REFUSED,     /* drive_init has refused; then as MAILBOX_NEXT */
+    MAILBOX_NEXT,        /* all is done that was due: time may run to the next event */
+    MAILBOX_PWM_START,   /* period_ticks */
+    MAILBOX_PWM_OPEN_ALL,
+    MAILBOX_CAN_RECEIVE,  /* gives frame and accepted: there was one */
+    MAILBOX_CAN_TRANSMIT, /* takes frame, gives accepted: a mailbox was free */
+} mailbox_command_t;
+
+/* What MAILBOX_NEXT gives back. */
+typedef enum {
+    MAILBOX_INTERRUPT = 1, /* the timer asks for the control interrupt */
+    MAILBOX_BACKGROUND,    /* the processor has time for the background */
+    MAILBOX_EXIT,          /* over: end with exit_code */
+} mailbox_event_t;
+
+typedef struct {
+    uint32_t doorbell; /* mailbox_command_t */
+
+    /* Constant from the start on. */
+    uint32_t layout; /* MAILBOX_LAYOUT */
+    uint32_t control_rate_hz;
+    uint32_t controller; /* drive_controller_t */
+    uint32_t adc_bits;
+    uint32_t encoder_bits;
+
+    uint32_t event; /* mailbox_event_t */
+    uint32_t exit_code;
+
+    uint32_t time_us;
+    hal_adc_sample_t adc;
+    hal_encoder_sample_t encoder;
+    uint32_t missed_interrupts; /* the drive sets it to 0 */
+
+    uint32_t period_ticks;
+    hal_pwm_compare_t compare;
+    uint32_t compare_written; /* the drive sets it to 1: the world takes `compare` before the next command */
+
+    uint32_t receive_waiting; /* frames */
+    uint32_t receive_overflows;
+    hal_can_frame_t frame;
+    uint32_t accepted;
+} mailbox_t;
+
+#endif

@@ -1,0 +1,127 @@
+/* SPDX-License-Identifier: GPL-2.0-or-later
+ *
+ * The QEMU plugin: opens the world when QEMU starts, and serves it whenever the drive stores to the doorbell.
+ *
+ * Plugin arguments: mailbox=FILE, the board's shared memory; instructions=FILE, see instructions.h; profile=FILE,
+ * see profile.h; argument=TEXT, a word of the host executable's command line, repeated in order.
+ */
+#define _POSIX_C_SOURCE 200809L
+
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <unistd.h>
+
+#include "host/bench.h"
+#include "instructions.h"
+#include "plugin_api.h"
+#include "profile.h"
+#include "world.h"
+
+#define EXPORT __attribute__((visibility("default")))
+#define ARGUMENTS_MAX 64
+
+EXPORT int qemu_plugin_version = PLUGIN_API_VERSION;
+EXPORT int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, char **argv);
+
+static mailbox_t *mailbox;
+static bool counting, profiling;
+
+/* The function has other stores in images that are not optimised. */
+static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, void *context) {
+    (void)vcpu;
+    (void)info;
+    (void)context;
+    if (address != MAILBOX_ADDRESS) {
+        return;
+    }
+    world_serve();
+    if (mailbox->event != MAILBOX_EXIT) {
+        return;
+    }
+    if ((counting && !instructions_close()) || (profiling && !profile_close())) {
+        mailbox->exit_code = BENCH_EXIT_MISTAKE;
+    }
+    counting = profiling = false;
+}
+
+static void translate(qemu_plugin_id_t id, struct qemu_plugin_tb *tb) {
+    (void)id;
+    for (size_t i = 0; i < qemu_plugin_tb_n_insns(tb); ++i) {
+        struct qemu_plugin_insn *insn = qemu_plugin_tb_get_insn(tb, i);
+        const char *symbol = qemu_plugin_insn_symbol(insn);
+        if (symbol && strcmp(symbol, "doorbell_ring") == 0) {
+            qemu_plugin_register_vcpu_mem_cb(insn, stored, QEMU_PLUGIN_CB_NO_REGS, QEMU_PLUGIN_MEM_W, NULL);
+        }
+    }
+    if (counting) {
+        instructions_translate(tb);
+    }
+    if (profiling) {
+        profile_translate(tb);
+    }
+}
+
+static mailbox_t *map_mailbox(const char *path) {
+    const int descriptor = open(path, O_RDWR | O_CLOEXEC);
+    void *memory = MAP_FAILED;
+    if (descriptor >= 0) {
+        memory = mmap(NULL, sizeof(mailbox_t), PROT_READ | PROT_WRITE, MAP_SHARED, descriptor, 0);
+        close(descriptor);
+    }
+    if (memory == MAP_FAILED) {
+        fprintf(stderr, "salient: mailbox %s: %s\n", path, strerror(errno));
+        exit(BENCH_EXIT_MISTAKE);
+    }
+    return memory;
+}
+
+/* The text behind `key` if the argument begins with it, else NULL. */
+static char *value_of(char *argument, const char *key) {
+    return strncmp(argument, key, strlen(key)) == 0 ? argument + strlen(key) : NULL;
+}
+
+int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, char **argv) {
+    static options_t options; /* the world keeps it */
+    char *words[ARGUMENTS_MAX + 1] = {"salient"};
+    int count = 1;
+    const char *mailbox_path = NULL, *instructions_path = NULL, *profile_path = NULL;
+    for (int i = 0; i < argc; ++i) {
+        char *value;
+        if ((value = value_of(argv[i], "argument="))) {
+            if (count == ARGUMENTS_MAX) {
+                fprintf(stderr, "salient: more than %d arguments\n", ARGUMENTS_MAX);
+                exit(BENCH_EXIT_MISTAKE);
+            }
+            words[count++] = strdup(value);
+        } else if ((value = value_of(argv[i], "mailbox="))) {
+            mailbox_path = value;
+        } else if ((value = value_of(argv[i], "instructions="))) {
+            instructions_path = strdup(value);
+        } else if ((value = value_of(argv[i], "profile="))) {
+            profile_path = strdup(value);
+        } else {
+            fprintf(stderr, "salient: %s: not an argument of this plugin\n", argv[i]);
+            exit(BENCH_EXIT_MISTAKE);
+        }
+    }
+    if (!mailbox_path || !info->system_emulation || strcmp(info->target_name, "arm") != 0) {
+        fputs("salient: this plugin needs qemu-system-arm and mailbox=FILE\n", stderr);
+        exit(BENCH_EXIT_MISTAKE);
+    }
+    mailbox = map_mailbox(mailbox_path);
+    const options_result_t result = options_parse(&options, count, words);
+    if (result != OPTIONS_RUN || !world_open(mailbox, &options)) {
+        exit(result == OPTIONS_HELP ? 0 : BENCH_EXIT_MISTAKE);
+    }
+    counting = instructions_path;
+    profiling = profile_path;
+    if ((counting && !instructions_open(instructions_path)) || (profiling && !profile_open(profile_path))) {
+        exit(BENCH_EXIT_MISTAKE);
+    }
+    qemu_plugin_register_vcpu_tb_trans_cb(id, translate);
+    return 0;
+}

@@ -1,0 +1,79 @@
+#include "mps2_an386/startup.h"
+
+#include <string.h>
+
+/* A line that the board's own peripherals do not use. */
+#define CONTROL_IRQ 31
+
+/* Armv7-M architecture reference manual, B3.4. */
+#define NVIC_ISER0 (*(volatile uint32_t *)0xE000E100)
+#define NVIC_ISPR0 (*(volatile uint32_t *)0xE000E200)
+#define NVIC_IPR(irq) (*(volatile uint8_t *)(0xE000E400 + (irq)))
+
+#define SYS_EXIT_EXTENDED 0x20
+#define ADP_STOPPED_APPLICATION_EXIT 0x20026
+#define EXIT_PROCESSOR_FAULT 70 /* sysexits.h: internal software error */
+
+/* Of the linker script. */
+extern uint32_t data_start[], data_end[], data_load[], bss_start[], bss_end[], stack_top[];
+
+noreturn void semihosting_exit(uint32_t code) {
+    const uint32_t block[2] = {ADP_STOPPED_APPLICATION_EXIT, code};
+    register uint32_t operation __asm__("r0") = SYS_EXIT_EXTENDED;
+    register const uint32_t *argument __asm__("r1") = block;
+    __asm__ volatile("bkpt 0xAB" : "+r"(operation) : "r"(argument) : "memory");
+    for (;;) {
+    }
+}
+
+noreturn void reset_handler(void);
+noreturn void reset_handler(void) {
+    memcpy(data_start, data_load, (size_t)((char *)data_end - (char *)data_start));
+    memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start));
+    program();
+}
+
+/* Every exception but the control interrupt: none is expected. */
+static void fault_handler(void) {
+    semihosting_exit(EXIT_PROCESSOR_FAULT);
+}
+
+/* In assembly, so that its first and its last instruction have names: who counts instructions knows both ends. */
+void control_handler(void);
+__asm__(".text\n"
+        ".balign 4\n"
+        ".thumb\n"
+        ".global control_handler\n"
+        ".type control_handler, %function\n"
+        "control_handler:\n"
+        "    push {r4, lr}\n" /* r4 keeps the stack aligned to 8 bytes */
+        ".size control_handler, . - control_handler\n"
+        "    bl program_interrupt\n"
+        ".type control_handler_return, %function\n"
+        "control_handler_return:\n"
+        "    pop {r4, pc}\n"
+        ".size control_handler_return, . - control_handler_return\n");
+
+void interrupt_enable(void) {
+    NVIC_IPR(CONTROL_IRQ) = 0; /* the highest that can be set */
+    NVIC_ISER0 = UINT32_C(1) << CONTROL_IRQ;
+}
+
+void interrupt_pend(void) {
+    NVIC_ISPR0 = UINT32_C(1) << CONTROL_IRQ;
+    __asm__ volatile("dsb\n\tisb" ::: "memory");
+}
+
+typedef void (*vector_t)(void);
+
+__attribute__((section(".vectors"), used)) static const struct {
+    uint32_t *stack;
+    vector_t exceptions[15];
+    vector_t interrupts[CONTROL_IRQ + 1];
+} vectors = {
+    .stack = stack_top,
+    .exceptions = {reset_handler, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
+                   fault_handler, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
+                   fault_handler, fault_handler, fault_handler},
+    .interrupts = {[CONTROL_IRQ] = control_handler},
+};

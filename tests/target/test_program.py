@@ -1,0 +1,75 @@
+"""The program that starts QEMU behaves as the host executable does: mistakes, ready line, end."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from salient.simulator import executable, image
+
+TIMEOUT_S = 20
+
+
+@pytest.fixture
+def program() -> list[str]:
+    return [str(executable("saturating", "cortex-m4")), str(image("saturating", "cortex-m4"))]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["--can", "unix:PATH"]),
+        (["--can", "unix:/no/such/folder/bus"], ["/no/such/folder/bus"]),
+        (["--can", "BUS", "--controller", "pid"], ["--controller pid", "traditional, paper and salient"]),
+        (["--can", "BUS", "--record", "/no/such/folder/x.npy"], ["/no/such/folder/x.npy"]),
+        (["--instructions", "/no/such/folder/x", "--can", "BUS"], ["--instructions /no/such/folder/x"]),
+        (["--profile", "/no/such/folder/x", "--can", "BUS"], ["--profile /no/such/folder/x"]),
+        (["--can", "BUS", "--bogus"], ["--bogus"]),
+    ],
+)
+def test_mistake_is_one_line_and_exit_code_2(program, tmp_path: Path, arguments: list[str], words: list[str]):
+    line = [f"unix:{tmp_path}/bus" if argument == "BUS" else argument for argument in arguments]
+    result = subprocess.run([*program, *line], capture_output=True, text=True, cwd=tmp_path, timeout=TIMEOUT_S)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert re.fullmatch(r"salient: [^\n]+\n", result.stderr), result.stderr
+    for word in words:
+        assert word in result.stderr
+
+
+def test_an_image_that_is_not_there_is_named(program, tmp_path: Path):
+    result = subprocess.run([program[0], "none.elf", "--can", f"unix:{tmp_path}/bus"], capture_output=True, text=True,
+                            cwd=tmp_path, timeout=TIMEOUT_S)
+    assert result.returncode == 2
+    assert result.stderr == "salient: none.elf: No such file or directory\n"
+
+
+def test_a_missing_qemu_is_named_with_its_package(program, tmp_path: Path):
+    result = subprocess.run([*program, "--can", f"unix:{tmp_path}/bus"], capture_output=True, text=True,
+                            env={"PATH": str(tmp_path)}, timeout=TIMEOUT_S)
+    assert result.returncode == 2
+    assert result.stderr == "salient: qemu-system-arm (Debian package qemu-system-arm): No such file or directory\n"
+
+
+@pytest.mark.parametrize("pace", ["lockstep", "realtime", "free"])
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, "stdin"])
+def test_ready_line_then_a_clean_end_without_the_socket(program, tmp_path: Path, pace: str, end):
+    bus = tmp_path / "with,comma"
+    process = subprocess.Popen([*program, "--can", f"unix:{bus}", "--pace", pace, "--follow-stdin"],
+                               stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    with process:
+        ready = json.loads(process.stdout.readline())
+        assert ready == {"ready": True, "can": f"unix:{bus}", "pid": process.pid, "machine": "saturating",
+                         "controller": "paper", "control_rate_hz": 40000, "pace": pace, "seed": 1}
+        if end == "stdin":
+            process.stdin.close()
+        else:
+            process.send_signal(end)
+        assert process.wait(TIMEOUT_S) == 0
+        assert process.stderr.read() == ""
+    assert not bus.exists()
