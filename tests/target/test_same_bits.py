@@ -81,7 +81,7 @@ def trace(make_bench, tmp_path: Path) -> Callable[..., tuple]:
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("name", RUNS)
-def test_host_and_cortex_m4_do_the_same_in_every_control_period(trace, record_property, name, controller, machine):
+def test_host_and_cortex_m4_do_the_same_in_every_control_period(trace, request, name, controller, machine):
     options = {"controller": controller, "machine": machine, "seed": 3, "initial_angle_deg": 12.0}
     host = trace("host", name, **options)
     periods = host[0]
@@ -93,7 +93,7 @@ def test_host_and_cortex_m4_do_the_same_in_every_control_period(trace, record_pr
         assert target[1] == host[1], f"{build}: compare values differ"
         assert target[2] == host[2], f"{build}: CAN frames differ"
         assert target[3] == host[3], f"{build}: the true state differs"
-    record_property("control_periods", periods * len(TARGET_BUILDS))
+    request.node.user_properties.append(("control_periods", periods * len(TARGET_BUILDS)))
 
 
 @pytest.mark.parametrize("board", [{"adc_bits": 16, "encoder_edges": True}, {"encoder_bits": 0, "immediate_pwm": True},
