@@ -26,8 +26,9 @@ void bp_network_reset(bp_network_t *network, uint32_t seed) {
 }
 
 /* Weighted sum in Q12, |sum| <= 6 * 8: products Q12 * Q15, summed in 64 bits. */
-static int32_t weighted_sum_q12(const int32_t *weight_q28, const int32_t *value_q15, unsigned count) {
+static inline int32_t weighted_sum_q12(const int32_t *weight_q28, const int32_t *value_q15, unsigned count) {
     int64_t sum_q27 = 0;
+#pragma GCC unroll 6
     for (unsigned k = 0; k < count; k++) {
         sum_q27 += (int64_t)(weight_q28[k] >> WEIGHT_TO_PRODUCT) * value_q15[k];
     }
@@ -48,13 +49,17 @@ void bp_network_forward(bp_network_t *network, const int32_t input_q15[BP_INPUTS
     }
 }
 
-/* Moves the weights of one neuron: eta d (Q30) times value (Q15) is Q45, to Q28; inertia Q28 * Q15, to Q28. */
-static void move_weights(int32_t *restrict weight_q28, int32_t *restrict change_q28, const int32_t *restrict value_q15,
-                         unsigned count, int64_t rate_delta_q30, int32_t inertia_q15) {
+/* Moves the weights of one neuron: eta d (Q30) times value (Q15) is Q45, to Q28; inertia Q28 * Q15, to Q28. With
+ * |eta d| < 2^32 and |value| <= 2^15 the gradient is within 2^30, with inertia <= 1 its part is within the last change:
+ * both fit in a word, only their sum may not. */
+static inline void move_weights(int32_t *restrict weight_q28, int32_t *restrict change_q28,
+                                const int32_t *restrict value_q15, unsigned count, int64_t rate_delta_q30,
+                                int32_t inertia_q15) {
+#pragma GCC unroll 6
     for (unsigned k = 0; k < count; k++) {
-        const int64_t gradient_q28 = fixed_shift(rate_delta_q30 * value_q15[k], 17);
-        const int64_t inertia_q28 = fixed_shift((int64_t)change_q28[k] * inertia_q15, 15);
-        change_q28[k] = fixed_saturate(gradient_q28 + inertia_q28);
+        const int32_t gradient_q28 = (int32_t)fixed_shift(rate_delta_q30 * value_q15[k], 17);
+        const int32_t inertia_q28 = (int32_t)fixed_shift((int64_t)change_q28[k] * inertia_q15, 15);
+        change_q28[k] = fixed_add(gradient_q28, inertia_q28);
         weight_q28[k] = fixed_add(weight_q28[k], change_q28[k]);
     }
 }
