@@ -66,16 +66,17 @@ static inline void move_weights(int32_t *restrict weight_q28, int32_t *restrict 
 
 void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *network, int32_t error_q15,
                       const int32_t sensitivity_q15[BP_OUTPUTS]) {
-    int64_t output_delta_q30[BP_OUTPUTS];
+    int32_t output_delta_q30[BP_OUTPUTS]; /* within 2^28: a slope is at most 1/4 */
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        const int64_t product_q30 = (int64_t)error_q15 * sensitivity_q15[l];
-        output_delta_q30[l] = fixed_shift(product_q30 * sigmoid_logistic_slope_q15(network->output_q15[l]), 15);
+        const int32_t product_q30 = error_q15 * sensitivity_q15[l];
+        output_delta_q30[l] =
+            (int32_t)fixed_shift((int64_t)product_q30 * sigmoid_logistic_slope_q15(network->output_q15[l]), 15);
     }
     /* The hidden layer learns through the output weights as they were in this sample: before those move. */
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         int64_t back_q42 = 0; /* 3 * 2^28 * 2^15 */
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-            back_q42 += output_delta_q30[l] * (network->output_weight_q28[l][i] >> WEIGHT_TO_PRODUCT);
+            back_q42 += (int64_t)output_delta_q30[l] * (network->output_weight_q28[l][i] >> WEIGHT_TO_PRODUCT);
         }
         const int64_t delta_q30 =
             fixed_shift(fixed_shift(back_q42, 12) * sigmoid_symmetric_slope_q15(network->hidden_q15[i]), 15);
@@ -84,6 +85,7 @@ void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *n
     }
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         move_weights(network->output_weight_q28[l], network->output_change_q28[l], network->hidden_q15, BP_HIDDEN,
-                     fixed_shift(output_delta_q30[l] * parameters->learning_rate_q15, 15), parameters->inertia_q15);
+                     (int32_t)fixed_shift((int64_t)output_delta_q30[l] * parameters->learning_rate_q15, 15),
+                     parameters->inertia_q15);
     }
 }
