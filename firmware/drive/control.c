@@ -107,9 +107,16 @@ static void start_laws(const control_parameters_t *parameters, control_state_t *
     state->speed_reference_q22 = fixed_clamp(state->observer.speed_q22, reverses ? INT32_MIN : 0, INT32_MAX);
     speed_pi_reset(&state->speed_pi);
     ditc_hysteresis_reset(&state->hysteresis);
-    ditc_duty_reset(&parameters->duty, &state->duty);
-    torque_trim_reset(&parameters->trim, &state->trim, 0);
     predictive_torque_reset(&state->predictive);
+    /* A network is the dearest to start afresh: only the one that will be asked. */
+    if (reverses) {
+        torque_trim_reset(&parameters->trim, &state->trim, 0);
+    }
+    if (parameters->controller == DRIVE_CONTROLLER_PAPER) {
+        ditc_duty_reset(&parameters->duty, &state->duty);
+    } else {
+        bp_pid_show_none(&state->duty.pid);
+    }
 }
 
 static void follow_ramp(const control_parameters_t *parameters, control_state_t *state, int32_t target_q22) {
