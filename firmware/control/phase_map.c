@@ -88,6 +88,7 @@ static inline int32_t look_up(const machine_surface_t *surface, const phase_map_
  * its remainder. All of them below 2^29; more than rest at t = 1. */
 static inline int32_t part_q10(int32_t slope, int32_t bend, int32_t rest) {
     int32_t part = 0;
+#pragma GCC unroll 10
     for (int bit = 0; bit < MACHINE_COLUMN_BITS; bit++) {
         /* Over a step of 2^-k, here times 2^k: slope + 2^-k bend; behind it the slope is 2^(1-k) bend more. */
         rest *= 2;
