@@ -121,7 +121,7 @@ static int32_t current_of(const machine_surface_t *surface, const phase_map_plac
         return PHASE_MAP_CURRENT_MAX_Q9;
     }
     while (above - below > 1) {
-        const int32_t middle = (below + above) / 2;
+        const int32_t middle = (int32_t)((uint32_t)(below + above) / 2);
         const int32_t value = column_q14(&curve, middle) >> (14 - INVERSE_BITS);
         if (middle * value <= wanted) {
             below = middle;
