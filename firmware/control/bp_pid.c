@@ -14,6 +14,13 @@ void bp_pid_preset(bp_pid_t *pid, int32_t duty_q15) {
     pid->duty_q30 = fixed_clamp(duty_q15, -32768, 32768) * 32768;
 }
 
+void bp_pid_show_none(bp_pid_t *pid) {
+    pid->duty_q30 = 0;
+    for (unsigned l = 0; l < BP_OUTPUTS; l++) {
+        pid->gain_q15[l] = 0;
+    }
+}
+
 static int32_t limited(int32_t value_q15) {
     return fixed_clamp(value_q15, -ERROR_LIMIT_Q15, ERROR_LIMIT_Q15);
 }

@@ -46,6 +46,9 @@ void bp_pid_reset(const bp_pid_parameters_t *parameters, bp_pid_t *pid);
 /* Continues from another duty (Q1.15, -32768..32768) when the PID takes over a phase. */
 void bp_pid_preset(bp_pid_t *pid, int32_t duty_q15);
 
+/* Duty and gains 0, for who displays them, of a PID that is not in use; the rest as it was until the next reset. */
+void bp_pid_show_none(bp_pid_t *pid);
+
 /* One sample: duty in Q1.15, -32768..32768, from the torque error in N m, Q7.24, any value. */
 int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_t torque_error_q24);
 

@@ -30,9 +30,8 @@ void misalignment_reset(misalignment_t *misalignment) {
     *misalignment = (misalignment_t){.turn = 0};
 }
 
-/* value towards target by a share in Q16. A function of its own: inlined, its 64-bit arithmetic is in flash five times.
- */
-static __attribute__((noinline)) void follow(int32_t *value, int32_t target, int32_t share_q16) {
+/* value towards target by a share in Q16. */
+static inline void follow(int32_t *value, int32_t target, int32_t share_q16) {
     *value = fixed_add(*value, fixed_multiply(fixed_subtract(target, *value), share_q16, 16));
 }
 

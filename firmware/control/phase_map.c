@@ -88,6 +88,7 @@ static inline int32_t look_up(const machine_surface_t *surface, const phase_map_
  * its remainder. All of them below 2^29; more than rest at t = 1. */
 static inline int32_t part_q10(int32_t slope, int32_t bend, int32_t rest) {
     int32_t part = 0;
+#pragma GCC unroll 10
     for (int bit = 0; bit < MACHINE_COLUMN_BITS; bit++) {
         /* Over a step of 2^-k, here times 2^k: slope + 2^-k bend; behind it the slope is 2^(1-k) bend more. */
         rest *= 2;
@@ -120,7 +121,7 @@ static int32_t current_of(const machine_surface_t *surface, const phase_map_plac
         return PHASE_MAP_CURRENT_MAX_Q9;
     }
     while (above - below > 1) {
-        const int32_t middle = (below + above) / 2;
+        const int32_t middle = (int32_t)((uint32_t)(below + above) / 2);
         const int32_t value = column_q14(&curve, middle) >> (14 - INVERSE_BITS);
         if (middle * value <= wanted) {
             below = middle;

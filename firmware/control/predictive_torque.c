@@ -18,6 +18,7 @@ typedef struct {
     int32_t flux_q29;        /* that it is to have */
     int32_t lowest_q29;      /* that a period of -Vdc leaves */
     int32_t highest_q29;     /* that a period of +Vdc brings */
+    bool held;               /* flux_q29 is one of the two, torque_q24 what it makes */
 } plan_t;
 
 /* Takes the flux linkage for a torque, as far as current limit and voltage allow; true when that is not all the way. */
@@ -31,8 +32,14 @@ static bool aim(const predictive_torque_parameters_t *parameters, plan_t *plan, 
         current_q9 = limited ? parameters->current_limit_q9 : current_q9;
         flux_q29 = phase_map_flux_q29(&plan->place, current_q9);
     }
-    plan->flux_q29 = fixed_clamp(flux_q29, plan->lowest_q29, plan->highest_q29);
-    if (plan->flux_q29 != flux_q29) {
+    const int32_t held_q29 = fixed_clamp(flux_q29, plan->lowest_q29, plan->highest_q29);
+    const bool held = held_q29 != flux_q29;
+    if (held && plan->held && held_q29 == plan->flux_q29) {
+        return true; /* at the same end of its reach as before: so is its torque */
+    }
+    plan->held = held;
+    plan->flux_q29 = held_q29;
+    if (held) {
         limited = true;
         current_q9 = phase_map_current_of_flux_q9(&plan->place, plan->flux_q29);
     }
@@ -137,6 +144,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         p->highest_q29 = fixed_clamp(fixed_add(freewheeling_q29, reach_q29), 0, INT32_MAX);
 
         const uint32_t angle = sample->angle[phase];
+        p->held = false;
         p->positive = angle >= HALF_PITCH;
         const uint32_t forward_angle = p->positive ? angle : 0u - angle;
         p->place = phase_map_at(tables, forward_angle);

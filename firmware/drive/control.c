@@ -65,28 +65,40 @@ static bool measure_angle(const control_parameters_t *parameters, const hal_enco
     return true;
 }
 
-static estimate_t estimate(const control_parameters_t *parameters, const control_state_t *state,
-                           const control_sample_t *sample) {
+/* Written in place, what is not needed not at all: clearing and copying it costs more than some laws do. */
+static void estimate(const control_parameters_t *parameters, const control_state_t *state,
+                     const control_sample_t *sample, estimate_t *e) {
     const machine_tables_t *tables = parameters->tables;
-    estimate_t e = {.current_max_q9 = 0};
-    e.from_edge = measure_angle(parameters, &sample->encoder, state->observer.speed_q22, &e.angle);
-    e.bus_voltage_q6 = from_code(parameters, sample->adc.bus_voltage_counts, BUS_VOLTAGE_Q6_PER_COUNT);
-    commutation_find(&parameters->commutation, tables->phases, tables->rotor_poles, e.angle, &e.commutation);
-    for (unsigned phase = 0; phase < tables->phases; phase++) {
+    const bool salient = parameters->controller == DRIVE_CONTROLLER_SALIENT;
+    const unsigned phases = tables->phases;
+    e->from_edge = measure_angle(parameters, &sample->encoder, state->observer.speed_q22, &e->angle);
+    e->bus_voltage_q6 = from_code(parameters, sample->adc.bus_voltage_counts, BUS_VOLTAGE_Q6_PER_COUNT);
+    commutation_find(&parameters->commutation, phases, tables->rotor_poles, e->angle, &e->commutation);
+    int32_t current_max_q9 = 0;
+    int32_t torque_sum_q24 = 0;
+    for (unsigned phase = 0; phase < phases; phase++) {
         const int32_t current_q9 = from_code(parameters, sample->adc.phase_current_counts[phase], CURRENT_Q9_PER_COUNT);
-        e.current_q9[phase] = current_q9;
-        e.current_max_q9 = current_q9 > e.current_max_q9 ? current_q9 : e.current_max_q9;
-        e.commutation.angle[phase] -= (uint32_t)state->misalignment.phase[phase].offset;
+        int32_t torque_q24 = 0;
+        int32_t flux_q29 = 0;
+        e->commutation.angle[phase] -= (uint32_t)state->misalignment.phase[phase].offset;
         if (current_q9 > 0) { /* most of the time a phase has none */
-            const phase_map_place_t place = phase_map_at(tables, e.commutation.angle[phase]);
-            e.torque_q24[phase] = phase_map_torque_q24(&place, current_q9);
-            e.torque_sum_q24 = fixed_add(e.torque_sum_q24, e.torque_q24[phase]);
-            if (parameters->controller == DRIVE_CONTROLLER_SALIENT) {
-                e.flux_q29[phase] = phase_map_flux_q29(&place, current_q9);
+            const phase_map_place_t place = phase_map_at(tables, e->commutation.angle[phase]);
+            torque_q24 = phase_map_torque_q24(&place, current_q9);
+            torque_sum_q24 = fixed_add(torque_sum_q24, torque_q24);
+            current_max_q9 = current_q9 > current_max_q9 ? current_q9 : current_max_q9;
+            if (salient) {
+                flux_q29 = phase_map_flux_q29(&place, current_q9);
             }
         }
+        e->current_q9[phase] = current_q9;
+        e->torque_q24[phase] = torque_q24;
+        e->flux_q29[phase] = flux_q29;
     }
-    return e;
+    for (unsigned phase = phases; phase < HAL_PHASES_MAX; phase++) {
+        e->current_q9[phase] = 0; /* for whoever watches */
+    }
+    e->current_max_q9 = current_max_q9;
+    e->torque_sum_q24 = torque_sum_q24;
 }
 
 /* Entering RUN: the laws start afresh, the reference from the present speed. */
@@ -95,9 +107,16 @@ static void start_laws(const control_parameters_t *parameters, control_state_t *
     state->speed_reference_q22 = fixed_clamp(state->observer.speed_q22, reverses ? INT32_MIN : 0, INT32_MAX);
     speed_pi_reset(&state->speed_pi);
     ditc_hysteresis_reset(&state->hysteresis);
-    ditc_duty_reset(&parameters->duty, &state->duty);
-    torque_trim_reset(&parameters->trim, &state->trim, 0);
     predictive_torque_reset(&state->predictive);
+    /* A network is the dearest to start afresh: only the one that will be asked. */
+    if (reverses) {
+        torque_trim_reset(&parameters->trim, &state->trim, 0);
+    }
+    if (parameters->controller == DRIVE_CONTROLLER_PAPER) {
+        ditc_duty_reset(&parameters->duty, &state->duty);
+    } else {
+        bp_pid_show_none(&state->duty.pid);
+    }
 }
 
 static void follow_ramp(const control_parameters_t *parameters, control_state_t *state, int32_t target_q22) {
@@ -186,7 +205,8 @@ static void complete_record(fault_record_t *record, const control_sample_t *samp
 
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   hal_pwm_compare_t *compare, control_diagnostics_t *diagnostics) {
-    const estimate_t e = estimate(parameters, state, sample);
+    estimate_t e;
+    estimate(parameters, state, sample, &e);
     const uint32_t count_angle = sample->encoder.counts << parameters->encoder_shift;
     state_machine_t *machine = &state->machine;
     const drive_state_t before = machine->state;

@@ -34,11 +34,10 @@ bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, cons
 }
 
 void drive_control_interrupt(drive_t *drive) {
-    control_sample_t sample = {
-        .missed_interrupts = hal_pwm_missed_interrupts(drive->hal),
-        .time_us = hal_time_us(drive->hal),
-        .command = drive->command,
-    };
+    control_sample_t sample; /* every member is set: clearing it first costs as much as reading it */
+    sample.missed_interrupts = hal_pwm_missed_interrupts(drive->hal);
+    sample.time_us = hal_time_us(drive->hal);
+    sample.command = drive->command;
     hal_encoder_read(drive->hal, &sample.encoder);
     hal_adc_read(drive->hal, &sample.adc);
     hal_pwm_compare_t compare;

@@ -11,6 +11,10 @@
 #include <assert.h>
 #include <stdint.h>
 
+#ifdef __ARM_FEATURE_DSP
+#include <arm_acle.h>
+#endif
+
 static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithmetic");
 
 /* Number of a format from a constant, nearest; numerator >= 0. Evaluated by the compiler, never at run time. */
@@ -20,10 +24,9 @@ static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithme
 /* Nearest 32-bit number. */
 static inline int32_t fixed_saturate(int64_t value) {
     const int32_t low_word = (int32_t)value;
-    if (low_word == value) {
-        return low_word;
-    }
-    return value < 0 ? INT32_MIN : INT32_MAX;
+    const int32_t high_word = (int32_t)(value >> 32);
+    /* Fits when the high word is only copies of the sign: without a comparison of 64 bits. */
+    return high_word == low_word >> 31 ? low_word : INT32_MAX ^ (high_word >> 31);
 }
 
 static inline int32_t fixed_clamp(int32_t value, int32_t low, int32_t high) {
@@ -33,21 +36,29 @@ static inline int32_t fixed_clamp(int32_t value, int32_t low, int32_t high) {
     return value < low ? low : value;
 }
 
-/* Saturating sum and difference. */
+/* Saturating sum and difference: one instruction each where the processor has it, of the same bits. */
 static inline int32_t fixed_add(int32_t a, int32_t b) {
+#ifdef __ARM_FEATURE_DSP
+    return __qadd(a, b);
+#else
     int32_t sum;
     if (__builtin_add_overflow(a, b, &sum)) {
         return a < 0 ? INT32_MIN : INT32_MAX;
     }
     return sum;
+#endif
 }
 
 static inline int32_t fixed_subtract(int32_t a, int32_t b) {
+#ifdef __ARM_FEATURE_DSP
+    return __qsub(a, b);
+#else
     int32_t difference;
     if (__builtin_sub_overflow(a, b, &difference)) {
         return a < 0 ? INT32_MIN : INT32_MAX;
     }
     return difference;
+#endif
 }
 
 /* Magnitude; INT32_MIN gives INT32_MAX. */

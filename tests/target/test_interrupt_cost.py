@@ -18,7 +18,7 @@ TIMEOUT_S = 60
 CONTROL_EXCEPTION = 16 + 31
 
 # Measured over the paper's two experiments at -O2, typical and worst; 10 % to either side.
-MEASURED = {"traditional": (1289, 2740), "paper": (3871, 4395), "salient": (3444, 5994)}
+MEASURED = {"traditional": (1123, 1251), "paper": (2953, 3459), "salient": (3035, 5133)}
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)

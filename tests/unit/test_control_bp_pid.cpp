@@ -234,4 +234,20 @@ TEST(BpPid, nothing_overflows_and_the_duty_stays_within_one_for_any_error_and_al
     }
 }
 
+TEST(BpPid, a_pid_put_aside_shows_no_duty_and_no_gains_and_keeps_its_weights) {
+    const bp_pid_parameters_t parameters = parameters_of(BP_PID_LEARNING);
+    bp_pid_t pid;
+    bp_pid_reset(&parameters, &pid);
+    bp_pid_step(&parameters, &pid, twins::to_fixed(0.5, twins::Q24));
+    ASSERT_NE(pid.duty_q30, 0);
+    ASSERT_NE(pid.gain_q15[0], 0);
+    const bp_network_t network = pid.network;
+    bp_pid_show_none(&pid);
+    EXPECT_EQ(pid.duty_q30, 0);
+    for (const int32_t gain_q15 : pid.gain_q15) {
+        EXPECT_EQ(gain_q15, 0);
+    }
+    EXPECT_TRUE(same_weights(network, pid.network));
+}
+
 } // namespace
