@@ -2,6 +2,13 @@
 
 set(SALIENT_GENERATOR_SOURCES ${CMAKE_SOURCE_DIR}/tools/src/salient)
 
+# All that a drive is built for: the shipped machines, and one more where it is asked for.
+if(SALIENT_MACHINE_FILE AND NOT EXISTS ${SALIENT_MACHINE_FILE})
+    message(FATAL_ERROR "SALIENT_MACHINE_FILE: ${SALIENT_MACHINE_FILE}: no such file")
+endif()
+file(GLOB SALIENT_SHIPPED_MACHINE_FILES CONFIGURE_DEPENDS ${CMAKE_SOURCE_DIR}/tools/machines/*.toml)
+set(SALIENT_MACHINE_FILES ${SALIENT_SHIPPED_MACHINE_FILES} ${SALIENT_MACHINE_FILE})
+
 # salient_generate_codec(TARGET DBC [INTEGER]): a static library with <name>.h/.c generated from DBC.
 # INTEGER leaves every floating-point conversion out.
 function(salient_generate_codec target dbc)

@@ -7,8 +7,7 @@ void commutation_find(const commutation_parameters_t *parameters, unsigned phase
     commutation->active = COMMUTATION_NONE;
     commutation->outgoing = COMMUTATION_NONE;
     const uint32_t electrical = rotor_angle * rotor_poles; /* modulo a pitch, on purpose */
-    /* 2^32 / phases as (2^32 - phases) / phases + 1, which a 32-bit division does. */
-    const uint32_t shift = (0u - phases) / phases + 1u;
+    const uint32_t shift = commutation_stroke(phases);
     uint32_t active_since = UINT32_MAX; /* angle behind turn-on */
     uint32_t outgoing_since = UINT32_MAX;
     for (unsigned phase = 0; phase < phases; phase++) {

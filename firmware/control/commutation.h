@@ -28,6 +28,12 @@ typedef struct {
     unsigned outgoing;              /* of the others the last to enter that is still available; COMMUTATION_NONE */
 } commutation_t;
 
+/* 2^32 / phases: a stroke in 2^-32 pitch, from one phase to the next. As (2^32 - phases) / phases + 1, which a 32-bit
+ * division does. phases >= 2. */
+static inline uint32_t commutation_stroke(unsigned phases) {
+    return (0u - phases) / phases + 1u;
+}
+
 /* Angles (of the first `phases`) and roles for a rotor angle in 2^-32 mechanical turn; 1 <= phases <= HAL_PHASES_MAX.
  */
 void commutation_find(const commutation_parameters_t *parameters, unsigned phases, unsigned rotor_poles,

@@ -76,9 +76,8 @@ int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle
 }
 
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
-                        load_observer_t *observer, uint32_t angle, int32_t torque_q24) {
-    observer->innovation = load_observer_innovation(observer, angle);
-    const int64_t error = fixed_clamp(observer->innovation, -INNOVATION_LIMIT, INNOVATION_LIMIT);
+                        load_observer_t *observer, int32_t innovation, int32_t torque_q24) {
+    const int64_t error = fixed_clamp(innovation, -INNOVATION_LIMIT, INNOVATION_LIMIT);
 
     /* Correct. */
     observer->angle_q64 += (uint64_t)(error * gains->angle_gain_q30) << 2; /* Q30 to Q32 */

@@ -30,7 +30,6 @@ typedef struct {
     uint64_t angle_q64;      /* mechanical, 2^-64 turn, wraps */
     int32_t speed_q22;       /* rad/s, Q9.22, saturates */
     int32_t load_torque_q24; /* N m, Q7.24, saturates at +-60 N m */
-    int32_t innovation;      /* of the last sample, 2^-32 turn */
     int32_t correction_q22;  /* of the speed in the last sample, l2 times the innovation: rad/s, Q9.22 */
 } load_observer_t;
 
@@ -46,13 +45,13 @@ load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t iner
  * is faster than 2 w0). */
 void load_observer_reset(load_observer_t *observer, uint32_t angle);
 
-/* How far a measured angle is from the expected one, 2^-32 turn, modulo a turn. */
+/* Innovation: how far a measured angle is from the expected one, 2^-32 turn, modulo a turn. */
 int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle);
 
-/* One sample: corrects with the measured angle (2^-32 turn), then predicts one period on with the machine's torque (N
+/* One sample: corrects with its innovation, then predicts one period on with the machine's torque (N
  * m, Q7.24). Afterwards angle, speed and load are the estimate for the coming sample. What corrects is limited to
  * +-2^27 (a 32nd of a turn), which keeps every product within 64 bits. */
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
-                        load_observer_t *observer, uint32_t angle, int32_t torque_q24);
+                        load_observer_t *observer, int32_t innovation, int32_t torque_q24);
 
 #endif

@@ -15,8 +15,8 @@
 /* With the middle of a count of a coarse encoder the decay begins in stage 3, 0.54 of the widest. */
 #define FIRST_STAGE_COARSE 3
 
-/* The threshold is so many times the mean size of the innovation: five times the mean of a uniform +-1/2 count is 1.25
- * counts. */
+/* The threshold is so many times the mean size of the innovation: of a uniform +-1/2 count that is one count, below
+ * the least threshold. */
 #define USUAL_FACTOR 4u
 #define USUAL_1_S 40
 
@@ -39,7 +39,6 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t widest_rad
         .usual_share_q24 = (int32_t)(((int64_t)USUAL_1_S << 24) / control_rate_hz),
         /* An encoder whose counts are finer than what an edge's time gives needs no edges. */
         .first_stage_count = threshold_count <= THRESHOLD_EDGE ? 0 : FIRST_STAGE_COARSE,
-        .first_stage_edge = 0,
     };
     uint32_t bandwidth_q8 = widest_rad_s << 8;
     for (unsigned stage = 0; stage < OBSERVER_BANDWIDTH_STAGES; stage++) {
@@ -84,7 +83,7 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
         const uint32_t growth_q16 = bandwidth->stage == LAST_STAGE ? bandwidth->pause_q16 : bandwidth->pause_q16 / 4;
         const uint32_t longer_q16 = bandwidth->pause_q16 + growth_q16 + PAUSE_GROWTH_Q16;
         bandwidth->pause_q16 = longer_q16 < PAUSE_LIMIT_Q16 ? longer_q16 : PAUSE_LIMIT_Q16;
-        bandwidth->stage = from_edge ? parameters->first_stage_edge : parameters->first_stage_count;
+        bandwidth->stage = from_edge ? 0 : parameters->first_stage_count;
         bandwidth->ticks = 0;
     }
     return &parameters->gains[bandwidth->stage];

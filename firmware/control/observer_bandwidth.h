@@ -33,8 +33,7 @@ typedef struct {
     uint32_t threshold_count;                      /* 2^-32 turn, for the middle of a count */
     uint32_t threshold_edge;                       /* for an angle from an edge's time */
     int32_t usual_share_q24;                       /* of the mean innovation a period */
-    uint8_t first_stage_count;                     /* where the decay begins: widest is stage 0 */
-    uint8_t first_stage_edge;
+    uint8_t first_stage_count; /* where the decay begins; with an edge's time in stage 0, the widest */
 } observer_bandwidth_parameters_t;
 
 typedef struct {

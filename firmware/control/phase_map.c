@@ -14,29 +14,6 @@
  * products stay below 2^30, whatever the tables hold. */
 #define INVERSE_BITS 6
 
-static inline phase_map_place_t place_at(const machine_tables_t *tables, uint32_t phase_angle) {
-    const bool mirrored = phase_angle < HALF_PITCH;
-    uint32_t distance = mirrored ? HALF_PITCH - phase_angle : phase_angle - HALF_PITCH;
-    distance -= distance >> 31; /* the aligned position is the end of the last row */
-    /* From the row in which its part of half a pitch begins; the last row's start is beyond every distance. */
-    uint32_t row = tables->cell_row[distance >> MACHINE_CELL_BITS];
-    while (tables->row[row + 1].start <= distance) {
-        row++;
-    }
-    /* The reciprocal is rounded down and the distance in the row below its width: below one, and rounded at most one.
-     */
-    const uint32_t inside = distance - tables->row[row].start;
-    const uint32_t fraction_q15 = (uint32_t)(((uint64_t)inside * tables->row[row].reciprocal) >> 32);
-    const int32_t fraction_q14 = (int32_t)((fraction_q15 + 1) >> 1);
-    return (phase_map_place_t){
-        .tables = tables,
-        .first = row * MACHINE_COLUMNS,
-        .fraction_q14 = fraction_q14,
-        .bend_q14 = (fraction_q14 * (ONE_Q14 - fraction_q14)) >> 14,
-        .mirrored = mirrored,
-    };
-}
-
 /* A surface at the angle of a place, from a column on: its node and bend, and the weights of this row's nodes, the next
  * row's and the bends. */
 typedef struct {
@@ -137,7 +114,26 @@ static int32_t current_of(const machine_surface_t *surface, const phase_map_plac
 }
 
 phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_angle) {
-    return place_at(tables, phase_angle);
+    const bool mirrored = phase_angle < HALF_PITCH;
+    uint32_t distance = mirrored ? HALF_PITCH - phase_angle : phase_angle - HALF_PITCH;
+    distance -= distance >> 31; /* the aligned position is the end of the last row */
+    /* From the row in which its part of half a pitch begins; the last row's start is beyond every distance. */
+    uint32_t row = tables->cell_row[distance >> MACHINE_CELL_BITS];
+    while (tables->row[row + 1].start <= distance) {
+        row++;
+    }
+    /* The reciprocal is rounded down and the distance in the row below its width: below one, and rounded at most one.
+     */
+    const uint32_t inside = distance - tables->row[row].start;
+    const uint32_t fraction_q15 = (uint32_t)(((uint64_t)inside * tables->row[row].reciprocal) >> 32);
+    const int32_t fraction_q14 = (int32_t)((fraction_q15 + 1) >> 1);
+    return (phase_map_place_t){
+        .tables = tables,
+        .first = row * MACHINE_COLUMNS,
+        .fraction_q14 = fraction_q14,
+        .bend_q14 = (fraction_q14 * (ONE_Q14 - fraction_q14)) >> 14,
+        .mirrored = mirrored,
+    };
 }
 
 int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9) {

@@ -128,7 +128,8 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
 
     move_windows(parameters, control, torque_q24);
     const torque_share_window_t late = torque_share_window(&parameters->share, 0);
-    const torque_share_window_t early = torque_share_window(&parameters->share, control->advance_q30 >> 15);
+    const int32_t advance_q15 = control->advance_q30 >> 15;
+    const torque_share_window_t early = advance_q15 > 0 ? torque_share_window(&parameters->share, advance_q15) : late;
 
     plan_t plan[HAL_PHASES_MAX];
     int32_t drop_q29[HAL_PHASES_MAX];

@@ -90,19 +90,34 @@ static int32_t trim_scale_q15(const int32_t *values, parameter_index_t gain) {
     return fixed_clamp(fixed_saturate(scaled_q39 / values[PARAMETER_BP_TRIM_LIMIT_NM]), 0, 4 << 15);
 }
 
+/* What both PIDs have in common: network, error scale, seed. */
+static bp_pid_parameters_t bp_pid_from(const int32_t *values, parameter_index_t mode, int32_t kp_scale_q15,
+                                       int32_t ki_scale_q15, int32_t kd_scale_q15) {
+    return (bp_pid_parameters_t){
+        .mode = (bp_pid_mode_t)values[mode],
+        .seed = (uint32_t)values[PARAMETER_BP_SEED],
+        .error_scale_inverse_q24 = fixed_saturate(((int64_t)1 << 48) / values[PARAMETER_BP_ERROR_SCALE_NM]),
+        .kp_scale_q15 = kp_scale_q15,
+        .ki_scale_q15 = ki_scale_q15,
+        .kd_scale_q15 = kd_scale_q15,
+        .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
+                    .inertia_q15 = values[PARAMETER_BP_ALPHA] >> 13},
+    };
+}
+
+static bp_pid_parameters_t duty_pid_from(const int32_t *values, uint32_t control_rate_hz) {
+    const int32_t scale_q24 = values[PARAMETER_BP_ERROR_SCALE_NM];
+    return bp_pid_from(values, PARAMETER_BP_MODE,
+                       pid_scale_q15(values[PARAMETER_BP_KP_MAX], scale_q24, control_rate_hz),
+                       pid_scale_q15(values[PARAMETER_BP_KI_MAX], scale_q24, control_rate_hz),
+                       pid_scale_q15(values[PARAMETER_BP_KD_MAX], scale_q24, control_rate_hz));
+}
+
 static torque_trim_parameters_t trim_from(const int32_t *values) {
     return (torque_trim_parameters_t){
-        .pid =
-            {
-                .mode = (bp_pid_mode_t)values[PARAMETER_BP_TRIM_MODE],
-                .seed = (uint32_t)values[PARAMETER_BP_SEED],
-                .error_scale_inverse_q24 = fixed_saturate(((int64_t)1 << 48) / values[PARAMETER_BP_ERROR_SCALE_NM]),
-                .kp_scale_q15 = trim_scale_q15(values, PARAMETER_BP_TRIM_KP_MAX),
-                .ki_scale_q15 = trim_scale_q15(values, PARAMETER_BP_TRIM_KI_MAX),
-                .kd_scale_q15 = trim_scale_q15(values, PARAMETER_BP_TRIM_KD_MAX),
-                .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
-                            .inertia_q15 = values[PARAMETER_BP_ALPHA] >> 13},
-            },
+        .pid = bp_pid_from(values, PARAMETER_BP_TRIM_MODE, trim_scale_q15(values, PARAMETER_BP_TRIM_KP_MAX),
+                           trim_scale_q15(values, PARAMETER_BP_TRIM_KI_MAX),
+                           trim_scale_q15(values, PARAMETER_BP_TRIM_KD_MAX)),
         .limit_q24 = values[PARAMETER_BP_TRIM_LIMIT_NM],
     };
 }
@@ -110,7 +125,7 @@ static torque_trim_parameters_t trim_from(const int32_t *values) {
 static predictive_torque_parameters_t predictive_from(const int32_t *values, unsigned phases,
                                                       uint32_t control_rate_hz) {
     const int64_t rate = control_rate_hz;
-    const uint32_t stroke = (0u - phases) / phases + 1u; /* 2^32 / phases */
+    const uint32_t stroke = commutation_stroke(phases);
     const uint32_t turn_on = pitch_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
     const uint32_t turn_off = pitch_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
     const uint32_t on_early = pitch_from_degrees(values[PARAMETER_SHARE_ON_EARLY_DEG]);
@@ -139,20 +154,6 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
         .advance_q30 = (int32_t)(10 * ((int64_t)1 << 30) / rate),
         .return_q30 = (int32_t)(((int64_t)1 << 30) / rate),
-    };
-}
-
-static bp_pid_parameters_t bp_pid_from(const int32_t *values, uint32_t control_rate_hz) {
-    const int32_t scale_q24 = values[PARAMETER_BP_ERROR_SCALE_NM];
-    return (bp_pid_parameters_t){
-        .mode = (bp_pid_mode_t)values[PARAMETER_BP_MODE],
-        .seed = (uint32_t)values[PARAMETER_BP_SEED],
-        .error_scale_inverse_q24 = fixed_saturate(((int64_t)1 << 48) / scale_q24),
-        .kp_scale_q15 = pid_scale_q15(values[PARAMETER_BP_KP_MAX], scale_q24, control_rate_hz),
-        .ki_scale_q15 = pid_scale_q15(values[PARAMETER_BP_KI_MAX], scale_q24, control_rate_hz),
-        .kd_scale_q15 = pid_scale_q15(values[PARAMETER_BP_KD_MAX], scale_q24, control_rate_hz),
-        .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
-                    .inertia_q15 = values[PARAMETER_BP_ALPHA] >> 13},
     };
 }
 
@@ -207,7 +208,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             },
         .duty =
             {
-                .pid = bp_pid_from(values, control_rate_hz),
+                .pid = duty_pid_from(values, control_rate_hz),
                 .hand_over_angle = pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG]),
                 /* Half of what would reach the current in one period at rest: rate / (2 * A/s), in Q20. */
                 .incoming_gain_q20 = fixed_saturate(((int64_t)control_rate_hz << 19) / tables->current_rise_A_s),

@@ -216,9 +216,10 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
         observer_bandwidth_reset(&state->bandwidth);
         protection_reset(&state->protection, count_angle);
     }
-    const load_observer_gains_t *gains = observer_bandwidth_step(
-        &parameters->bandwidth, &state->bandwidth, load_observer_innovation(&state->observer, e.angle), e.from_edge);
-    load_observer_step(&parameters->observer, gains, &state->observer, e.angle, e.torque_sum_q24);
+    const int32_t innovation = load_observer_innovation(&state->observer, e.angle);
+    const load_observer_gains_t *gains =
+        observer_bandwidth_step(&parameters->bandwidth, &state->bandwidth, innovation, e.from_edge);
+    load_observer_step(&parameters->observer, gains, &state->observer, innovation, e.torque_sum_q24);
 
     const protection_sample_t checked = {
         .current_max_q9 = e.current_max_q9,

@@ -10,8 +10,10 @@
 #include <sys/signalfd.h>
 #include <unistd.h>
 
+#include "host/output.h"
 #include "plant/machine.h"
 
+#define SWITCHES_OPTION "--record-switches"
 #define RAD_PER_DEG (3.14159265358979323846 / 180.0)
 
 /* Descriptors that end the program: signals, and standard input with --follow-stdin. */
@@ -102,9 +104,8 @@ bool bench_open(bench_t *bench, const options_t *options) {
         return false;
     }
     if (options->record_switches) {
-        bench->switches = fopen(options->record_switches, "wb");
+        bench->switches = output_open(SWITCHES_OPTION, options->record_switches);
         if (!bench->switches) {
-            fprintf(stderr, "salient: --record-switches %s: %s\n", options->record_switches, strerror(errno));
             recorder_close(&bench->recorder, error, sizeof error);
             transport_close(transport);
             return false;
@@ -173,13 +174,8 @@ int bench_close(bench_t *bench) {
         fprintf(stderr, "salient: %s\n", error);
         bench->exit_code = BENCH_EXIT_MISTAKE;
     }
-    if (bench->switches) {
-        const bool written = !ferror(bench->switches);
-        if (fclose(bench->switches) != 0 || !written) {
-            fprintf(stderr, "salient: --record-switches %s: not all could be written\n",
-                    bench->options->record_switches);
-            bench->exit_code = BENCH_EXIT_MISTAKE;
-        }
+    if (bench->switches && !output_close(bench->switches, SWITCHES_OPTION, bench->options->record_switches)) {
+        bench->exit_code = BENCH_EXIT_MISTAKE;
     }
     transport_close(bench->rig.config.transport);
     return bench->exit_code;

@@ -94,7 +94,7 @@ class salient_t {
         const observer_bandwidth_parameters_t &b = p.bandwidth;
         bandwidth.steady_rad_s = b.bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES - 1];
         bandwidth.first_count_rad_s = b.bandwidth_rad_s[b.first_stage_count];
-        bandwidth.first_edge_rad_s = b.bandwidth_rad_s[b.first_stage_edge];
+        bandwidth.first_edge_rad_s = b.bandwidth_rad_s[0];
         bandwidth.rate_hz = rate_hz;
         bandwidth.threshold_count = b.threshold_count / TURN;
         bandwidth.threshold_edge = b.threshold_edge / TURN;

@@ -30,8 +30,9 @@ observer_parameters_t configure(double bandwidth_rad_s, double rate_hz = RATE_HZ
 }
 
 int32_t observe(const observer_parameters_t &p, load_observer_t *observer, uint32_t angle, int32_t torque_q24) {
-    load_observer_step(&p.model, &p.gains, observer, angle, torque_q24);
-    return observer->innovation;
+    const int32_t innovation = load_observer_innovation(observer, angle);
+    load_observer_step(&p.model, &p.gains, observer, innovation, torque_q24);
+    return innovation;
 }
 
 // The twin of what the parameters hold after rounding.

@@ -30,7 +30,7 @@ twins::bandwidth_t twin_of(const observer_bandwidth_parameters_t &p, double rate
     twins::bandwidth_t twin{};
     twin.steady_rad_s = p.bandwidth_rad_s[LAST_STAGE];
     twin.first_count_rad_s = p.bandwidth_rad_s[p.first_stage_count];
-    twin.first_edge_rad_s = p.bandwidth_rad_s[p.first_stage_edge];
+    twin.first_edge_rad_s = p.bandwidth_rad_s[0];
     twin.rate_hz = rate_hz;
     twin.threshold_count = p.threshold_count;
     twin.threshold_edge = p.threshold_edge;

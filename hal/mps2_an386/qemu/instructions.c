@@ -1,12 +1,14 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later */
 #include "instructions.h"
 
-#include <errno.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <string.h>
 
+#include "host/output.h"
 #include "plugin_api.h"
+
+#define OPTION "--instructions"
 
 static const char *name;
 static FILE *file;
@@ -25,10 +27,7 @@ static void returns(unsigned vcpu, void *size) {
 
 bool instructions_open(const char *path) {
     name = path;
-    file = fopen(path, "wb");
-    if (!file) {
-        fprintf(stderr, "salient: --instructions %s: %s\n", path, strerror(errno));
-    }
+    file = output_open(OPTION, path);
     return file != NULL;
 }
 
@@ -47,10 +46,5 @@ void instructions_translate(struct qemu_plugin_tb *tb) {
 }
 
 bool instructions_close(void) {
-    const bool written = !ferror(file);
-    if (fclose(file) != 0 || !written) {
-        fprintf(stderr, "salient: --instructions %s: not all could be written\n", name);
-        return false;
-    }
-    return true;
+    return output_close(file, OPTION, name);
 }

@@ -1,14 +1,16 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later */
 #include "profile.h"
 
-#include <errno.h>
 #include <inttypes.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
+#include "host/output.h"
 #include "plugin_api.h"
+
+#define OPTION "--profile"
 
 #define FUNCTIONS_MAX 1024
 #define HANDLER 0 /* the handler itself, not among what blocks count */
@@ -45,7 +47,7 @@ static uint64_t *count_of(const char *symbol) {
         ++i;
     }
     if (i == FUNCTIONS_MAX) {
-        fprintf(stderr, "salient: --profile %s: more than %d functions\n", name, FUNCTIONS_MAX);
+        fprintf(stderr, "salient: %s %s: more than %d functions\n", OPTION, name, FUNCTIONS_MAX);
         abort();
     }
     if (i == function_count) {
@@ -56,10 +58,7 @@ static uint64_t *count_of(const char *symbol) {
 
 bool profile_open(const char *path) {
     name = path;
-    file = fopen(path, "w");
-    if (!file) {
-        fprintf(stderr, "salient: --profile %s: %s\n", path, strerror(errno));
-    }
+    file = output_open(OPTION, path);
     return file != NULL;
 }
 
@@ -85,10 +84,5 @@ bool profile_close(void) {
             fprintf(file, "%" PRIu64 " %s\n", functions[i].inside, functions[i].name);
         }
     }
-    const bool written = !ferror(file);
-    if (fclose(file) != 0 || !written) {
-        fprintf(stderr, "salient: --profile %s: not all could be written\n", name);
-        return false;
-    }
-    return true;
+    return output_close(file, OPTION, name);
 }

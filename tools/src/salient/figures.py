@@ -48,26 +48,30 @@ _PAPER_WHITE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 
 # the picture's pixels, so that nothing is lost between them.
 SLICES = 1500
 
-_STYLE = {
+# What all pictures of controllers have in common.
+STYLE = {
     "font.family": "DejaVu Sans",
-    "font.size": 9.5,
-    "axes.titlesize": 10.5,
     "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e6e6e6",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+}
+_STYLE = {
+    **STYLE,
+    "font.size": 9.5,
+    "axes.titlesize": 10.5,
     "axes.edgecolor": "#8a8a8a",
     "axes.linewidth": 0.8,
     "axes.labelcolor": "#333333",
-    "axes.grid": True,
-    "grid.color": "#e6e6e6",
     "grid.linewidth": 0.7,
-    "axes.axisbelow": True,
     "xtick.color": "#555555",
     "ytick.color": "#555555",
     "lines.linewidth": 1.3,
     "lines.solid_joinstyle": "round",
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
     "agg.path.chunksize": 0,
     "path.simplify": False,
 }

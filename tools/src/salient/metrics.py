@@ -90,14 +90,12 @@ def start_metrics(recording: np.ndarray, reference_rpm: float, command_time_s: f
 def load_step_metrics(recording: np.ndarray, reference_rpm: float, step_time_s: float,
                       ripple_window_s: tuple[float, float] = RIPPLE_WINDOW_S) -> dict[str, float | None]:
     """Figures of a run at `reference_rpm` with a load step at `step_time_s`; torque over `ripple_window_s`."""
-    _check_recording(recording)
-    time_s, speed_rpm = recording["time_s"], recording["speed_rpm"]
-    speed_min_rpm = float(np.min(speed_rpm[_index_at(time_s, step_time_s):]))
+    after = speed_after_step(recording, reference_rpm, step_time_s)
     return {
-        "speed_dip_rpm": max(0.0, reference_rpm - speed_min_rpm),
-        "recovery_time_s": time_to_stay_in_band_s(time_s, speed_rpm, reference_rpm, step_time_s),
-        "max_speed_rpm": float(np.max(speed_rpm)),
-        **torque_metrics(time_s, recording["torque_Nm"], ripple_window_s),
+        "speed_dip_rpm": after["speed_dip_rpm"],
+        "recovery_time_s": after["recovery_time_s"],
+        "max_speed_rpm": float(np.max(recording["speed_rpm"])),
+        **torque_metrics(recording["time_s"], recording["torque_Nm"], ripple_window_s),
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import can
@@ -19,6 +20,7 @@ class RigError(Exception):
     """The bench refused a setting; the text says which and why."""
 
 
+@lru_cache
 def quantities() -> dict[str, Signal]:
     """The bench's quantities by name, with their ranges: the signals of RIG_SET that it chooses between."""
     return {s.name: s for s in rig_database().get_message_by_name("RIG_SET").signals if s.multiplexer_ids}

@@ -22,7 +22,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from salient.arguments import CONTROLLERS
 from salient.compare.against import Change
 from salient.compare.measures import FIGURES
-from salient.figures import CONTROLLER_COLOUR
+from salient.compare.rows import in_order
+from salient.figures import CONTROLLER_COLOUR, STYLE
+from salient.results import PAPER
 
 Content = Mapping[str, Any]
 
@@ -31,19 +33,7 @@ _PRINTED_COLOUR = "#6f6f6f"
 _MARKER = {"traditional": "s", "paper": "D", "salient": "o"}
 _CHANGES_MAX = 60
 
-_STYLE = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e6e6e6",
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-}
+_STYLE = {**STYLE, "font.size": 9.0, "axes.titlesize": 9.5}
 
 
 @dataclass(frozen=True)
@@ -110,7 +100,8 @@ def _ripples(content: Content) -> Figure | None:
         axis.set_xlim(-0.5, len(places) - 0.5)
         _logarithmic(axis.yaxis)
         axis.set_title(title)
-        axis.axhline(0.0197, color=_PRINTED_COLOUR, linewidth=0.8, linestyle=(0, (4, 2)))
+        axis.axhline(PAPER["load_step_150"]["paper"]["torque_ripple"], color=_PRINTED_COLOUR, linewidth=0.8,
+                     linestyle=(0, (4, 2)))
     axes[0].set_ylabel("K$_t$ over 0.1 s")
     _legend(figure, rows)
     return figure
@@ -327,13 +318,11 @@ def _rows(content: Content, group: str) -> list[dict[str, Any]]:
 
 
 def _controllers(rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    run = {controller for row in rows for controller in row["values"]}
-    return [controller for controller in CONTROLLERS if controller in run]
+    return in_order(controller for row in rows for controller in row["values"])
 
 
 def _controllers_of_runs(runs: Iterable[Mapping[str, Any]]) -> list[str]:
-    run = {one["controller"] for one in runs}
-    return [controller for controller in CONTROLLERS if controller in run]
+    return in_order(one["controller"] for one in runs)
 
 
 def _legend(figure: Figure, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -133,8 +133,13 @@ def table(rows: Sequence[Row]) -> str:
 
 def controllers_of(rows: Iterable[Row]) -> list[str]:
     """Those that were run, in the order of CONTROLLERS."""
-    run = {controller for row in rows for controller in (*row.values, *row.failed)}
-    return [controller for controller in CONTROLLERS if controller in run]
+    return in_order(controller for row in rows for controller in (*row.values, *row.failed))
+
+
+def in_order(controllers: Iterable[str]) -> list[str]:
+    """Each once, in the order of CONTROLLERS."""
+    named = set(controllers)
+    return [controller for controller in CONTROLLERS if controller in named]
 
 
 def failed_of(rows: Iterable[Row]) -> dict[str, str]:

@@ -100,7 +100,7 @@ def _paper_conditions() -> dict[Key, Target]:
                for machine in MAGNETICS for parameters in ("", ", usual parameters") for figure in names}
     for machine in MAGNETICS:
         targets["paper_conditions", f"{machine}, load step", "ripple", ""] = Target(
-            0.0197, "paper", printed=printed["ripple"])
+            printed["ripple"]["paper"], "paper", printed=printed["ripple"])
     return targets
 
 
