@@ -18,3 +18,8 @@ void pwm_set_phase_twice(hal_pwm_compare_t *compare, unsigned phase, int32_t dut
     compare->upper[phase] = both / 2;
     compare->lower[phase] = (uint16_t)(both - both / 2);
 }
+
+void pwm_set_state(hal_pwm_compare_t *compare, unsigned phase, int state, uint16_t period_ticks) {
+    compare->upper[phase] = state > 0 ? period_ticks : 0;
+    compare->lower[phase] = state >= 0 ? period_ticks : 0;
+}

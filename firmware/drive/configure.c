@@ -24,6 +24,9 @@ static uint32_t pitch_from_degrees(int32_t degrees_q7) {
     return angle > UINT32_MAX ? UINT32_MAX : (uint32_t)angle;
 }
 
+/* What a code is worth, Q16, of a full scale of 2^16 at most: exact. */
+#define CODE_SCALE_Q16(full_scale, bits) (((uint32_t)(full_scale) << 16) >> (bits))
+
 /* A change per period in Q22 from a change per second; INT32_MAX for 0, no ramp. */
 static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
     if (rpm_s == 0) {
@@ -53,9 +56,9 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
         .bus_over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V],
         .bus_under_voltage_q6 = values[PARAMETER_BUS_UNDER_VOLTAGE_V],
         .over_speed_q22 = over_speed_q22,
-        .angle_step_max = (uint32_t)step + 2u * count,
+        .angle_step_max = fixed_saturate((int64_t)step + 2 * (int64_t)count),
         /* A quarter of a degree, and four counts of a coarse encoder. */
-        .angle_unmoved_max = (uint32_t)(((uint64_t)1 << 32) / 1440u) + 4u * count,
+        .angle_unmoved_max = (int32_t)(((uint64_t)1 << 32) / 1440u + 4u * count),
         .angle_step_q32 = angle_step_q32,
         .command_timeout_us = (uint32_t)values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u,
         .slowing_q22 = fixed_saturate(((int64_t)SLOWING_TORQUE_NM << 52) / values[PARAMETER_INERTIA_KG_M2] /
@@ -171,7 +174,10 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
         .period_ticks = (uint16_t)(HAL_PWM_CLOCK_HZ / (2u * control_rate_hz)),
         .encoder_shift = (uint8_t)encoder_shift,
+        .encoder_middle = (1u << encoder_shift) >> 1,
         .adc_bits = (uint8_t)adc_bits,
+        .current_scale_q16 = CODE_SCALE_Q16(HAL_ADC_CURRENT_FULL_SCALE_A << 9, adc_bits),
+        .voltage_scale_q16 = CODE_SCALE_Q16(HAL_ADC_BUS_FULL_SCALE_V << 6, adc_bits),
         .initialise_ticks = control_rate_hz / 1000u,
         .speed_ramp_q22 = ramp_q22(values[PARAMETER_SPEED_RAMP_RPM_S], control_rate_hz),
         .two_pulses = values[PARAMETER_PULSES_PER_PERIOD] == 2,
@@ -194,12 +200,13 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                 .torque_min_q24 = -torque_max_q24,
                 .torque_max_q24 = torque_max_q24,
             },
-        .commutation =
-            {
+        .commutation = commutation_configure(
+            &(commutation_angles_t){
                 .turn_on = pitch_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
                 .turn_off = pitch_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
                 .outgoing_off = pitch_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
             },
+            tables->phases, tables->rotor_poles),
         .hysteresis =
             {
                 .band_inner_q24 = values[PARAMETER_TORQUE_BAND_INNER_NM],

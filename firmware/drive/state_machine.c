@@ -24,6 +24,10 @@ static bool latch(state_machine_t *machine, uint16_t checks) {
 }
 
 bool state_machine_step(state_machine_t *machine, const state_machine_input_t *input, uint32_t initialise_ticks) {
+    if (machine->state == DRIVE_STATE_RUN && input->request == COMMAND_RUN && input->checks == 0) {
+        machine->asked = COMMAND_RUN; /* nearly every tick, and nothing else happens */
+        return false;
+    }
     const uint16_t lasting = input->checks & (uint16_t)~FAULT_BIT(FAULT_COMMAND_TIMEOUT);
     const bool clear = input->request == COMMAND_CLEAR_FAULT && machine->asked != COMMAND_CLEAR_FAULT;
     machine->asked = input->request;

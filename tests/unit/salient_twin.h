@@ -99,7 +99,7 @@ class salient_t {
         bandwidth.threshold_count = b.threshold_count / TURN;
         bandwidth.threshold_edge = b.threshold_edge / TURN;
         bandwidth.pause_s = b.pause_ticks / rate_hz;
-        bandwidth.kept = b.forget_q16 / Q16;
+        bandwidth.kept = b.forget_q32 / Q32;
 
         const predictive_torque_parameters_t &t = p.predictive;
         predictive.phases = phases;

@@ -21,17 +21,25 @@ uint32_t electrical(double degrees) {
     return uint32_t(std::floor(degrees / 360.0 * twins::TURN));
 }
 
-const commutation_parameters_t ANGLES = {electrical(180.0), electrical(300.0), electrical(348.0)};
+const commutation_angles_t ANGLES = {electrical(180.0), electrical(300.0), electrical(348.0)};
 
-commutation_t commutation_at(const commutation_parameters_t *parameters, unsigned phases, unsigned rotor_poles,
-                             uint32_t angle) {
-    commutation_t commutation{};
-    commutation_find(parameters, phases, rotor_poles, angle, &commutation);
+// With the angle of each phase.
+struct roles_t : commutation_t {
+    uint32_t angle[HAL_PHASES_MAX];
+};
+
+roles_t commutation_at(const commutation_angles_t *angles, unsigned phases, unsigned rotor_poles, uint32_t angle) {
+    const commutation_parameters_t parameters = commutation_configure(angles, phases, rotor_poles);
+    roles_t commutation{};
+    commutation_find(&parameters, angle, &commutation);
+    for (unsigned phase = 0; phase < phases; phase++) {
+        commutation.angle[phase] = commutation_angle(&parameters, &commutation, phase);
+    }
     return commutation;
 }
 
 // Rotor angle at which phase 0 of the 6/4 machine is at an electrical angle.
-commutation_t commutation_of(double phase_0_deg) {
+roles_t commutation_of(double phase_0_deg) {
     return commutation_at(&ANGLES, 3, 4, electrical(phase_0_deg) / 4u);
 }
 
@@ -68,7 +76,7 @@ class DitcDuty : public testing::Test {
     DitcDuty() { ditc_duty_reset(&parameters, &ditc); }
 
     // One sample with the map's torques for the currents.
-    void step(const commutation_t &commutation, double reference_Nm) {
+    void step(const roles_t &commutation, double reference_Nm) {
         ditc_duty_sample_t sample{current_q9, torque_q24, twins::to_fixed(reference_Nm, twins::Q24), 0};
         sample.error_q24 = sample.reference_q24;
         for (unsigned phase = 0; phase < 3; phase++) {
@@ -90,7 +98,7 @@ class DitcDuty : public testing::Test {
 TEST_F(DitcDuty, from_standstill_every_rotor_position_drives_phases_that_can_carry_the_torque) {
     double weakest = 1e9;
     for (int tenth_deg = 0; tenth_deg < 3600; tenth_deg++) {
-        const commutation_t commutation = commutation_at(&ANGLES, 3, 4, electrical(tenth_deg / 10.0));
+        const roles_t commutation = commutation_at(&ANGLES, 3, 4, electrical(tenth_deg / 10.0));
         ditc_duty_reset(&parameters, &ditc);
         for (int k = 0; k < 20; k++) {
             step(commutation, 8.0);
@@ -108,7 +116,7 @@ TEST_F(DitcDuty, from_standstill_every_rotor_position_drives_phases_that_can_car
 }
 
 TEST_F(DitcDuty, the_only_phase_at_work_gets_the_pid_s_duty_and_the_others_are_off) {
-    const commutation_t commutation = commutation_of(230.0);
+    const roles_t commutation = commutation_of(230.0);
     ASSERT_EQ(commutation.active, 0u);
     ASSERT_EQ(commutation.outgoing, unsigned(COMMUTATION_NONE));
     bp_pid_t pid;
@@ -123,7 +131,7 @@ TEST_F(DitcDuty, the_only_phase_at_work_gets_the_pid_s_duty_and_the_others_are_o
 }
 
 TEST_F(DitcDuty, in_a_gap_of_the_commutation_every_phase_is_off) {
-    commutation_t commutation = commutation_of(230.0);
+    roles_t commutation = commutation_of(230.0);
     commutation.active = commutation.outgoing = COMMUTATION_NONE;
     step(commutation, 5.0);
     for (unsigned phase = 0; phase < 3; phase++) {
@@ -133,7 +141,7 @@ TEST_F(DitcDuty, in_a_gap_of_the_commutation_every_phase_is_off) {
 }
 
 TEST_F(DitcDuty, from_standstill_past_its_window_a_phase_is_regulated_and_the_next_one_assists) {
-    const commutation_t commutation = commutation_of(320.0);
+    const roles_t commutation = commutation_of(320.0);
     ASSERT_EQ(commutation.outgoing, 0u);
     ASSERT_EQ(commutation.active, 1u);
     step(commutation, 8.0);
@@ -145,7 +153,7 @@ TEST_F(DitcDuty, from_standstill_past_its_window_a_phase_is_regulated_and_the_ne
 
 TEST_F(DitcDuty, the_incoming_phase_is_brought_to_the_current_that_will_carry_the_reference) {
     // Phase 0 outgoing with about the torque wanted: no missing torque beyond the band.
-    const commutation_t commutation = commutation_of(305.0);
+    const roles_t commutation = commutation_of(305.0);
     ASSERT_EQ(commutation.active, 1u);
     for (double reference = 0.5; reference < 14.0; reference += 0.25) {
         ditc_duty_reset(&parameters, &ditc);
@@ -165,7 +173,7 @@ TEST_F(DitcDuty, the_incoming_phase_is_brought_to_the_current_that_will_carry_th
 }
 
 TEST_F(DitcDuty, the_pid_moves_on_when_the_outgoing_phase_is_spent_and_starts_from_the_incoming_duty) {
-    const commutation_t commutation = commutation_of(320.0);
+    const roles_t commutation = commutation_of(320.0);
     current_q9[0] = 20 << 9;
     current_q9[1] = 10 << 9;
     step(commutation, 4.0);
@@ -193,7 +201,7 @@ TEST_F(DitcDuty, the_pid_moves_on_when_the_outgoing_phase_is_spent_and_starts_fr
 }
 
 TEST_F(DitcDuty, the_aim_of_the_incoming_phase_is_its_surplus_above_the_reference) {
-    const commutation_t commutation = commutation_of(305.0);
+    const roles_t commutation = commutation_of(305.0);
     const double reference = 8.0;
     parameters.incoming_gain_q20 = 1 << 16; // not held at the ends
     current_q9[0] = map_current_q9(commutation.angle[0], twins::to_fixed(reference, twins::Q24));
@@ -210,7 +218,7 @@ TEST_F(DitcDuty, the_aim_of_the_incoming_phase_is_its_surplus_above_the_referenc
 }
 
 TEST_F(DitcDuty, the_pid_leaves_an_outgoing_phase_below_the_spent_torque_an_eighth_of_the_reference_or_a_sixteenth_Nm) {
-    const commutation_t commutation = commutation_of(320.0);
+    const roles_t commutation = commutation_of(320.0);
     unsigned left = 0, held = 0;
     for (const double spent : {0.0, 0.03, 0.0625, 0.5, 1.5}) {
         parameters.spent_torque_q24 = twins::to_fixed(spent, twins::Q24);
@@ -253,7 +261,7 @@ TEST_F(DitcDuty, the_pid_moves_on_when_the_outgoing_phase_must_go_and_starts_fro
 TEST_F(DitcDuty, a_phase_above_the_current_limit_is_never_driven) {
     std::mt19937 random(1);
     for (int i = 0; i < 200000; i++) {
-        const commutation_t commutation = commutation_at(&ANGLES, 3, 4, uint32_t(random()));
+        const roles_t commutation = commutation_at(&ANGLES, 3, 4, uint32_t(random()));
         for (int32_t &current : current_q9) {
             current = int32_t(random() % 40951);
         }
@@ -280,7 +288,7 @@ TEST_F(DitcDuty, nothing_overflows_at_the_ends_of_all_ranges) {
             parameters.spent_torque_q24 = gain_q20;
             ditc_duty_reset(&parameters, &ditc);
             for (int k = 0; k < 3000; k++) {
-                const commutation_t commutation = commutation_at(&ANGLES, 3, 4, uint32_t(random()));
+                const roles_t commutation = commutation_at(&ANGLES, 3, 4, uint32_t(random()));
                 for (unsigned phase = 0; phase < 3; phase++) {
                     current_q9[phase] = int32_t(random() % 40951);
                     torque_q24[phase] = ends[random() % 5];

@@ -43,6 +43,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(int(c.controller), p.values[PARAMETER_CONTROLLER]);
     ASSERT_EQ(2.0 * c.period_ticks * rate_hz, double(HAL_PWM_CLOCK_HZ));
     ASSERT_EQ(c.encoder_shift, 32 - encoder_bits);
+    ASSERT_EQ(c.encoder_middle, encoder_bits == 32 ? 0u : 1u << (31 - encoder_bits));
     ASSERT_EQ(c.initialise_ticks, uint32_t(rate_hz / 1000.0));
 
     const double ramp = twins::rad_s(v(PARAMETER_SPEED_RAMP_RPM_S)) / rate_hz * twins::Q22;
@@ -62,8 +63,12 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
 
     near("turn on", c.commutation.turn_on, 0.0, twins::TURN);
     ASSERT_LE(std::fabs(c.commutation.turn_on - pitch(PARAMETER_TURN_ON_ANGLE_DEG)), 1.0);
-    ASSERT_LE(std::fabs(c.commutation.turn_off - pitch(PARAMETER_TURN_OFF_ANGLE_DEG)), 1.0);
-    ASSERT_LE(std::fabs(c.commutation.outgoing_off - pitch(PARAMETER_OUTGOING_OFF_ANGLE_DEG)), 1.0);
+    const double active = pitch(PARAMETER_TURN_OFF_ANGLE_DEG) - pitch(PARAMETER_TURN_ON_ANGLE_DEG);
+    const double available = pitch(PARAMETER_OUTGOING_OFF_ANGLE_DEG) - pitch(PARAMETER_TURN_ON_ANGLE_DEG);
+    ASSERT_LE(std::fabs(c.commutation.active_width - std::max(active, 0.0)), 2.0);
+    ASSERT_LE(std::fabs(c.commutation.available_width - std::max({active, available, 0.0})), 2.0);
+    ASSERT_EQ(c.commutation.phases, machine_tables.phases);
+    ASSERT_EQ(c.commutation.rotor_poles, machine_tables.rotor_poles);
     ASSERT_LE(std::fabs(c.duty.hand_over_angle - pitch(PARAMETER_HAND_OVER_ANGLE_DEG)), 1.0);
     ASSERT_GE(c.duty.hand_over_angle, 0x80000000u) << "the map's inverse is for the second half pitch";
 
@@ -155,9 +160,10 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
         uint32_t(p.values[salient ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S]), rate,
         inertia_q30);
     const load_observer_gains_t &steady = c.bandwidth.gains[OBSERVER_BANDWIDTH_STAGES - 1];
-    ASSERT_EQ(steady.angle_gain_q30, gains.angle_gain_q30);
+    ASSERT_EQ(steady.angle_gain_q28, gains.angle_gain_q28);
     ASSERT_EQ(steady.speed_gain_q24, gains.speed_gain_q24);
-    ASSERT_EQ(steady.torque_gain_q20, gains.torque_gain_q20);
+    ASSERT_EQ(steady.load_gain_q28, gains.load_gain_q28);
+    ASSERT_EQ(steady.load_factor_q4, gains.load_factor_q4);
     const bool wakes = salient && p.values[PARAMETER_OBSERVER_WAKING] == 1 &&
                        p.values[PARAMETER_OBSERVER_WAKE_RAD_S] > p.values[PARAMETER_OBSERVER_STEADY_RAD_S];
     const parameter_index_t widest = wakes     ? PARAMETER_OBSERVER_WAKE_RAD_S

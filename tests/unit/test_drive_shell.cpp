@@ -199,7 +199,7 @@ TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
     EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
     command(COMMAND_RUN);
     periods(3);
-    EXPECT_EQ(drive.diagnostics.torque_reference_q24, 5 << 24);
+    EXPECT_EQ(drive.control.torque_reference_q24, 5 << 24);
     EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 6 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_NOT_WHILE_RUNNING_CHOICE);
     EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
 }
@@ -213,7 +213,7 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
     periods(1000);
     hal.from_drive.clear();
     periods(400); // a whole slow cycle
-    const control_diagnostics_t &d = drive.diagnostics;
+    const control_diagnostics_t d = control_diagnose(&drive.control_parameters, &drive.control);
     unsigned seen = 0;
     for (const hal_can_frame_t &frame : hal.from_drive) {
         if (frame.identifier == DRIVE_DRIVE_STATUS_FRAME_ID) {
@@ -282,11 +282,11 @@ TEST_F(Drive, a_run_of_a_sender_long_silent_starts_nothing_when_the_clock_comes_
     command(COMMAND_RUN);
     periods(10);
     ASSERT_EQ(drive.control.machine.state, DRIVE_STATE_INITIALISE);
-    ASSERT_EQ(drive.command.request, COMMAND_RUN);
+    ASSERT_EQ(drive.sample.command.request, COMMAND_RUN);
     periods(10000); // 0.25 s of silence
-    EXPECT_EQ(drive.command.request, COMMAND_OFF);
+    EXPECT_EQ(drive.sample.command.request, COMMAND_OFF);
 
-    hal.time_us = drive.command.time_us; // 71 minutes later the command looks new
+    hal.time_us = drive.sample.command.time_us; // 71 minutes later the command looks new
     hal.adc.bus_voltage_counts = 240 * 8;
     periods(200);
     EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);

@@ -104,7 +104,7 @@ struct observer_t {
         angle += angle_gain * error;
         correction = speed_gain * error;
         const double corrected = speed + correction;
-        load_torque = std::clamp(load_torque - torque_gain * error, -60.0, 60.0);
+        load_torque = std::clamp(load_torque - torque_gain * error, -64.0, 64.0);
         speed = corrected + acceleration * (torque - friction * corrected - load_torque);
         angle += angle_step * 0.5 * (corrected + speed);
     }
