@@ -20,6 +20,9 @@ void pwm_set_phase_twice(hal_pwm_compare_t *compare, unsigned phase, int32_t dut
 }
 
 void pwm_set_state(hal_pwm_compare_t *compare, unsigned phase, int state, uint16_t period_ticks) {
-    compare->upper[phase] = state > 0 ? period_ticks : 0;
-    compare->lower[phase] = state >= 0 ? period_ticks : 0;
+    /* By the signs: without a branch. */
+    const uint32_t upper = period_ticks & (uint32_t)(-state >> 31);
+    const uint32_t lower = period_ticks & ~(uint32_t)(state >> 31);
+    compare->upper[phase] = (uint16_t)upper;
+    compare->lower[phase] = (uint16_t)lower;
 }

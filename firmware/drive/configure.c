@@ -24,8 +24,8 @@ static uint32_t pitch_from_degrees(int32_t degrees_q7) {
     return angle > UINT32_MAX ? UINT32_MAX : (uint32_t)angle;
 }
 
-/* What a code is worth, Q16, of a full scale of 2^16 at most: exact. */
-#define CODE_SCALE_Q16(full_scale, bits) (((uint32_t)(full_scale) << 16) >> (bits))
+/* What a code is worth, Q18, of a full scale below 2^16: exact. */
+#define CODE_SCALE_Q18(full_scale, bits) ((int32_t)(((int64_t)(full_scale) << 18) >> (bits)))
 
 /* A change per period in Q22 from a change per second; INT32_MAX for 0, no ramp. */
 static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
@@ -176,8 +176,8 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .encoder_shift = (uint8_t)encoder_shift,
         .encoder_middle = (1u << encoder_shift) >> 1,
         .adc_bits = (uint8_t)adc_bits,
-        .current_scale_q16 = CODE_SCALE_Q16(HAL_ADC_CURRENT_FULL_SCALE_A << 9, adc_bits),
-        .voltage_scale_q16 = CODE_SCALE_Q16(HAL_ADC_BUS_FULL_SCALE_V << 6, adc_bits),
+        .current_scale_q18 = CODE_SCALE_Q18(HAL_ADC_CURRENT_FULL_SCALE_A << 9, adc_bits),
+        .voltage_scale_q18 = CODE_SCALE_Q18(HAL_ADC_BUS_FULL_SCALE_V << 6, adc_bits),
         .initialise_ticks = control_rate_hz / 1000u,
         .speed_ramp_q22 = ramp_q22(values[PARAMETER_SPEED_RAMP_RPM_S], control_rate_hz),
         .two_pulses = values[PARAMETER_PULSES_PER_PERIOD] == 2,

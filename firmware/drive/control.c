@@ -27,24 +27,26 @@ void control_reset(control_state_t *state) {
 }
 
 /* A code in the LSBs of the scale, rounded to nearest, half upwards: below 2^16. Nothing but code 0 gives 0. */
-static int32_t from_code(uint16_t code, uint32_t scale_q16) {
-    return (int32_t)((code * scale_q16 + (1u << 15)) >> 16);
+static int32_t from_code(uint16_t code, int32_t scale_q18) {
+    return fixed_multiply_high(code << 14, scale_q18);
 }
 
-/* The measured angle and whether it is an edge's; 2^-32 turn. Behind an edge the rotor turned on at the observer's
- * speed; an edge of long ago says less than the count does. */
-static bool measure_angle(const control_parameters_t *parameters, const hal_encoder_sample_t *encoder,
-                          int32_t speed_q22, uint32_t *angle) {
+/* The measured angle. Behind an edge the rotor turned on at the observer's speed; an edge of
+ * long ago says less than the count does. */
+static void measure_angle(const control_parameters_t *parameters, const hal_encoder_sample_t *encoder,
+                          int32_t speed_q22, control_estimate_t *e) {
     const uint32_t count = encoder->counts << parameters->encoder_shift;
+    e->count_angle = count;
     if (!encoder->edge_known || encoder->edge_age_ticks > EDGE_AGE_MAX_TICKS) {
         /* The middle of the count's interval, so that the mean error is zero. */
-        *angle = count + parameters->encoder_middle;
-        return false;
+        e->angle = count + parameters->encoder_middle;
+        e->from_edge = false;
+        return;
     }
     const uint32_t edge = encoder->edge_forward ? count : count + (1u << parameters->encoder_shift);
     const int32_t turn_per_tick_q19 = fixed_multiply_high(speed_q22, TURN_PER_TICK_Q51);
-    *angle = edge + (uint32_t)fixed_shift((int64_t)turn_per_tick_q19 * (int32_t)encoder->edge_age_ticks, 19);
-    return true;
+    e->angle = edge + (uint32_t)fixed_shift((int64_t)turn_per_tick_q19 * (int32_t)encoder->edge_age_ticks, 19);
+    e->from_edge = true;
 }
 
 /* Of one phase, 2^-32 pitch, by its own pole. */
@@ -53,18 +55,16 @@ static uint32_t phase_angle(const control_parameters_t *parameters, const contro
     return commutation_angle(&parameters->commutation, &state->estimate.commutation, phase) - offset;
 }
 
-/* True when the angle is that of an edge and its time. */
-static bool estimate(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample) {
+static void estimate(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample) {
     const machine_tables_t *tables = parameters->tables;
     const bool salient = parameters->controller == DRIVE_CONTROLLER_SALIENT;
     control_estimate_t *e = &state->estimate;
-    const bool from_edge = measure_angle(parameters, &sample->encoder, state->observer.speed_q22, &e->angle);
-    e->bus_voltage_q6 = from_code(sample->adc.bus_voltage_counts, parameters->voltage_scale_q16);
+    measure_angle(parameters, &sample->encoder, state->observer.speed_q22, e);
+    e->bus_voltage_q6 = from_code(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
     commutation_find(&parameters->commutation, e->angle, &e->commutation);
     int32_t current_max_q9 = 0;
     int32_t torque_sum_q24 = 0;
-    const unsigned phases = tables->phases;
-    for (unsigned phase = 0; phase < phases; phase++) {
+    for (unsigned phase = tables->phases; phase-- > 0;) {
         const uint16_t code = sample->adc.phase_current_counts[phase];
         e->current_q9[phase] = 0;
         e->torque_q24[phase] = 0;
@@ -72,7 +72,7 @@ static bool estimate(const control_parameters_t *parameters, control_state_t *st
         if (code == 0) { /* most of the time a phase has none */
             continue;
         }
-        const int32_t current_q9 = from_code(code, parameters->current_scale_q16);
+        const int32_t current_q9 = from_code(code, parameters->current_scale_q18);
         const phase_map_place_t place = phase_map_at(tables, phase_angle(parameters, state, phase));
         const int32_t torque_q24 = phase_map_torque_q24(&place, current_q9);
         torque_sum_q24 = fixed_add(torque_sum_q24, torque_q24);
@@ -85,7 +85,6 @@ static bool estimate(const control_parameters_t *parameters, control_state_t *st
     }
     e->current_max_q9 = current_max_q9;
     e->torque_sum_q24 = torque_sum_q24;
-    return from_edge;
 }
 
 /* Entering RUN: the laws start afresh, the reference from the present speed. */
@@ -115,12 +114,9 @@ static void follow_ramp(const control_parameters_t *parameters, control_state_t 
         state->speed_reference_q22, fixed_clamp(way_q22, -parameters->speed_ramp_q22, parameters->speed_ramp_q22));
 }
 
-static int32_t regulate_speed(const control_parameters_t *parameters, control_state_t *state,
-                              const hal_adc_sample_t *adc) {
-    if (parameters->controller == DRIVE_CONTROLLER_TRADITIONAL) {
-        return speed_pi_step(&parameters->speed_pi, &state->speed_pi,
-                             fixed_subtract(state->speed_reference_q22, state->observer.speed_q22));
-    }
+/* Torque reference of the sliding mode. */
+static int32_t slide(const control_parameters_t *parameters, const control_state_t *state,
+                     const hal_adc_sample_t *adc) {
     const int32_t load_q24 = parameters->load_from_transducer ? load_torque_q24(parameters, adc->load_torque_counts)
                                                               : state->observer.load_torque_q24;
     return speed_smc_step(&parameters->speed_smc, state->speed_reference_q22, state->observer.speed_q22, load_q24);
@@ -131,31 +127,36 @@ static bool gives_duties(const control_parameters_t *parameters) {
     return parameters->controller == DRIVE_CONTROLLER_PAPER && parameters->duty.pid.mode != BP_PID_OFF;
 }
 
-/* Traditional and paper: compare values for a torque reference >= 0. */
-static void switch_by_torque(const control_parameters_t *parameters, control_state_t *state, int32_t reference_q24,
-                             hal_pwm_compare_t *compare) {
+/* Compare values by hysteresis. */
+static void switch_by_state(const control_parameters_t *parameters, control_state_t *state, int32_t reference_q24,
+                            hal_pwm_compare_t *compare) {
     const control_estimate_t *e = &state->estimate;
     const int32_t error_q24 = fixed_subtract(reference_q24, e->torque_sum_q24);
-    if (gives_duties(parameters)) {
-        const ditc_duty_sample_t sample = {
-            .current_q9 = e->current_q9,
-            .torque_q24 = e->torque_q24,
-            .reference_q24 = reference_q24,
-            .error_q24 = error_q24,
-        };
-        ditc_duty_step(&parameters->duty, &state->duty, parameters->tables, &e->commutation, &sample, state->duty_q15);
-        for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
-            pwm_set_phase(compare, phase, state->duty_q15[phase], parameters->period_ticks);
-        }
-        return;
-    }
     ditc_hysteresis_step(&parameters->hysteresis, &state->hysteresis, &e->commutation, error_q24, e->current_q9);
     /* The other phases are open. */
-    const unsigned roles[] = {e->commutation.active, e->commutation.outgoing};
-    for (unsigned n = 0; n < 2; n++) {
-        if (roles[n] != COMMUTATION_NONE) {
-            pwm_set_state(compare, roles[n], state->hysteresis.state[roles[n]], parameters->period_ticks);
-        }
+    const unsigned active = e->commutation.active;
+    const unsigned outgoing = e->commutation.outgoing;
+    if (outgoing != COMMUTATION_NONE) {
+        pwm_set_state(compare, outgoing, state->hysteresis.state[outgoing], parameters->period_ticks);
+    }
+    if (active != COMMUTATION_NONE) {
+        pwm_set_state(compare, active, state->hysteresis.state[active], parameters->period_ticks);
+    }
+}
+
+/* Compare values by the BP-PID's duty. */
+static void switch_by_duty(const control_parameters_t *parameters, control_state_t *state, int32_t reference_q24,
+                           hal_pwm_compare_t *compare) {
+    const control_estimate_t *e = &state->estimate;
+    const ditc_duty_sample_t sample = {
+        .current_q9 = e->current_q9,
+        .torque_q24 = e->torque_q24,
+        .reference_q24 = reference_q24,
+        .error_q24 = fixed_subtract(reference_q24, e->torque_sum_q24),
+    };
+    ditc_duty_step(&parameters->duty, &state->duty, parameters->tables, &e->commutation, &sample, state->duty_q15);
+    for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
+        pwm_set_phase(compare, phase, state->duty_q15[phase], parameters->period_ticks);
     }
 }
 
@@ -215,11 +216,11 @@ static void complete_record(fault_record_t *record, const control_sample_t *samp
 }
 
 /* The first sample: what the observer and the checks start from. */
-static void start(control_state_t *state, uint32_t count_angle) {
+static void start(control_state_t *state) {
     state->started = true;
     load_observer_reset(&state->observer, state->estimate.angle);
     observer_bandwidth_reset(&state->bandwidth);
-    protection_reset(&state->protection, count_angle);
+    protection_reset(&state->protection, state->estimate.count_angle);
 }
 
 /* What a change of the drive's state asks for. */
@@ -236,30 +237,30 @@ static void enter(const control_parameters_t *parameters, control_state_t *state
 
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   hal_pwm_compare_t *compare) {
-    const bool from_edge = estimate(parameters, state, sample);
+    estimate(parameters, state, sample);
     const control_estimate_t *e = &state->estimate;
-    const uint32_t count_angle = sample->encoder.counts << parameters->encoder_shift;
     if (!state->started) {
-        start(state, count_angle);
+        start(state);
     }
     const int32_t last_speed_q22 = state->observer.speed_q22;
     const int32_t innovation = load_observer_innovation(&state->observer, e->angle);
     const load_observer_gains_t *gains =
-        observer_bandwidth_step(&parameters->bandwidth, &state->bandwidth, innovation, from_edge);
+        observer_bandwidth_step(&parameters->bandwidth, &state->bandwidth, innovation, e->from_edge);
     load_observer_step(&parameters->observer, gains, &state->observer, innovation, e->torque_sum_q24);
 
     const protection_sample_t checked = {
         .current_max_q9 = e->current_max_q9,
         .bus_voltage_q6 = e->bus_voltage_q6,
         .speed_q22 = state->observer.speed_q22,
-        .angle = count_angle,
+        .angle = e->count_angle,
         .missed_interrupts = sample->missed_interrupts,
         .command_age_us = sample->time_us - sample->command.time_us,
     };
+    const command_request_t request = sample->command.request;
     const state_machine_input_t input = {
         .checks = protection_check(&parameters->protection, &state->protection, &checked),
-        .request = sample->command.request,
-        .standing = sample->command.request == COMMAND_STOP && fixed_abs(state->observer.speed_q22) < STANDING_Q22,
+        .request = request,
+        .standing = request == COMMAND_STOP && fixed_abs(state->observer.speed_q22) < STANDING_Q22,
     };
     const drive_state_t before = state->machine.state;
     if (state_machine_step(&state->machine, &input, parameters->initialise_ticks)) {
@@ -275,17 +276,25 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
         state->torque_reference_q24 = 0;
         return false;
     }
-    const bool salient = parameters->controller == DRIVE_CONTROLLER_SALIENT;
-    const int32_t asked_q22 = sample->command.request == COMMAND_RUN ? sample->command.speed_reference_q22 : 0;
-    follow_ramp(parameters, state, asked_q22 < 0 && !salient ? 0 : asked_q22);
-    const int32_t torque_q24 = regulate_speed(parameters, state, &sample->adc);
-    if (salient) {
-        state->torque_reference_q24 = torque_q24;
-        predict_torque(parameters, state, torque_q24, compare);
+    const int32_t asked_q22 = request == COMMAND_RUN ? sample->command.speed_reference_q22 : 0;
+    if (parameters->controller == DRIVE_CONTROLLER_SALIENT) {
+        follow_ramp(parameters, state, asked_q22);
+        state->torque_reference_q24 = slide(parameters, state, &sample->adc);
+        predict_torque(parameters, state, state->torque_reference_q24, compare);
+        return true;
+    }
+    /* The others motor in one direction: less torque than none is not to be had. */
+    follow_ramp(parameters, state, fixed_clamp(asked_q22, 0, INT32_MAX));
+    const bool paper = parameters->controller == DRIVE_CONTROLLER_PAPER;
+    const int32_t torque_q24 =
+        paper ? slide(parameters, state, &sample->adc)
+              : speed_pi_step(&parameters->speed_pi, &state->speed_pi,
+                              fixed_subtract(state->speed_reference_q22, state->observer.speed_q22));
+    state->torque_reference_q24 = fixed_clamp(torque_q24, 0, INT32_MAX);
+    if (paper && gives_duties(parameters)) {
+        switch_by_duty(parameters, state, state->torque_reference_q24, compare);
     } else {
-        /* These motor in one direction: less torque than none is not to be had. */
-        state->torque_reference_q24 = fixed_clamp(torque_q24, 0, INT32_MAX);
-        switch_by_torque(parameters, state, state->torque_reference_q24, compare);
+        switch_by_state(parameters, state, state->torque_reference_q24, compare);
     }
     return true;
 }

@@ -42,29 +42,31 @@ typedef struct {
     bool two_pulses;           /* a period, of the salient controller */
     bool load_from_transducer; /* the sliding mode takes the measured load torque, not the observer's */
     uint16_t period_ticks;
-    uint8_t encoder_shift;      /* counts to 2^-32 turn */
-    uint8_t adc_bits;           /* of a code, 12..16 */
-    uint32_t encoder_middle;    /* of a count, 2^-32 turn; 0 where a count is one */
-    uint32_t current_scale_q16; /* a code in A, Q7.9: 10 of a 12-bit code */
-    uint32_t voltage_scale_q16; /* a code in V, Q9.6 */
-    uint32_t initialise_ticks;  /* periods in 1 ms */
-    int32_t speed_ramp_q22;     /* rad/s a period, Q9.22; INT32_MAX: no ramp */
+    uint8_t encoder_shift;     /* counts to 2^-32 turn */
+    uint8_t adc_bits;          /* of a code, 12..16 */
+    uint32_t encoder_middle;   /* of a count, 2^-32 turn; 0 where a count is one */
+    int32_t current_scale_q18; /* a code in A, Q7.9: 10 of a 12-bit code */
+    int32_t voltage_scale_q18; /* a code in V, Q9.6 */
+    uint32_t initialise_ticks; /* periods in 1 ms */
+    int32_t speed_ramp_q22;    /* rad/s a period, Q9.22; INT32_MAX: no ramp */
     load_observer_model_t observer;
-    observer_bandwidth_parameters_t bandwidth;
-    speed_pi_parameters_t speed_pi;
-    speed_smc_parameters_t speed_smc;
     commutation_parameters_t commutation;
+    protection_parameters_t protection;
+    speed_pi_parameters_t speed_pi;
     ditc_hysteresis_parameters_t hysteresis;
+    speed_smc_parameters_t speed_smc;
     ditc_duty_parameters_t duty;
     torque_trim_parameters_t trim;
     predictive_torque_parameters_t predictive;
     misalignment_parameters_t misalignment;
-    protection_parameters_t protection;
+    observer_bandwidth_parameters_t bandwidth;
 } control_parameters_t;
 
 /* What the sensors of the last sample say, in the formats of the laws. */
 typedef struct {
-    uint32_t angle; /* 2^-32 turn */
+    uint32_t count_angle; /* where the encoder's count begins, 2^-32 turn */
+    uint32_t angle;       /* 2^-32 turn */
+    bool from_edge;       /* the angle is that of an edge and its time */
     int32_t current_q9[HAL_PHASES_MAX];
     int32_t current_max_q9;
     int32_t bus_voltage_q6;

@@ -17,9 +17,10 @@ typedef struct {
     /* Of the interrupt; read by the background with the interrupt kept out. Its command is written by the background,
      * the interrupt kept out as well. */
     control_sample_t sample;
-    control_state_t control;
     /* Written by the background with the interrupt kept out. */
     control_parameters_t control_parameters;
+    /* Of the interrupt. */
+    control_state_t control;
     /* Of the background. */
     const machine_tables_t *tables;
     uint32_t control_rate_hz;

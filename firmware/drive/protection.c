@@ -20,7 +20,7 @@ void protection_reset(protection_t *protection, uint32_t angle) {
  * as quickly, so its speed at the last count, less what torque can have taken off since, is believed as well. */
 static int32_t left_to_move(const protection_parameters_t *parameters, protection_t *protection, int32_t step,
                             int32_t observed_q22) {
-    if (step != 0) {
+    if (__builtin_expect(step != 0, 1)) {
         protection->moving_q22 = observed_q22;
         protection->unmoved = 0;
         return 0;
@@ -50,7 +50,7 @@ uint16_t protection_check(const protection_parameters_t *parameters, protection_
     protection->angle = sample->angle;
     int32_t step_max = parameters->angle_step_max;
     int32_t overruns = 0;
-    if (sample->missed_interrupts != 0) {
+    if (__builtin_expect(sample->missed_interrupts != 0, 0)) {
         overruns = fixed_saturate((int64_t)protection->overruns + sample->missed_interrupts);
         step_max = fixed_saturate(step_max * ((int64_t)sample->missed_interrupts + 1));
     }
@@ -63,7 +63,8 @@ uint16_t protection_check(const protection_parameters_t *parameters, protection_
     const int32_t still = left_to_move(parameters, protection, step, speed_q22);
     const bool late = sample->command_age_us > parameters->command_timeout_us;
     const bool lost = overruns >= PROTECTION_OVERRUNS_MAX;
-    if ((current_q9 | over_voltage_q6 | under_voltage_q6 | over_speed_q22 | jump | still) >= 0 && !late && !lost) {
+    const int32_t any = current_q9 | over_voltage_q6 | under_voltage_q6 | over_speed_q22 | jump | still;
+    if (__builtin_expect(any >= 0 && !late && !lost, 1)) {
         return 0;
     }
     uint16_t checks = 0;

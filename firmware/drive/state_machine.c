@@ -24,7 +24,7 @@ static bool latch(state_machine_t *machine, uint16_t checks) {
 }
 
 bool state_machine_step(state_machine_t *machine, const state_machine_input_t *input, uint32_t initialise_ticks) {
-    if (machine->state == DRIVE_STATE_RUN && input->request == COMMAND_RUN && input->checks == 0) {
+    if (__builtin_expect(machine->state == DRIVE_STATE_RUN && input->request == COMMAND_RUN && input->checks == 0, 1)) {
         machine->asked = COMMAND_RUN; /* nearly every tick, and nothing else happens */
         return false;
     }

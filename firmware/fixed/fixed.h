@@ -117,12 +117,12 @@ static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
 /* value / 2^shift, rounded down; shift 1..31, a constant. What does not fit is held within 2^(32-shift) of the end: the
  * high word saturates, in one instruction, and the low bits stay what they are. */
 __attribute__((always_inline)) static inline int32_t fixed_narrow(int64_t value, unsigned shift) {
-    int32_t high = (int32_t)(value >> 32);
 #if defined(__ARM_FEATURE_SAT) && defined(__OPTIMIZE__)
-    __asm__("ssat %0, %1, %0" : "+r"(high) : "I"(shift));
+    int32_t high;
+    __asm__("ssat %0, %1, %2" : "=r"(high) : "I"(shift), "r"((int32_t)(value >> 32)));
 #else
     const int32_t limit = (int32_t)(1u << (shift - 1));
-    high = fixed_clamp(high, -limit, limit - 1);
+    const int32_t high = fixed_clamp((int32_t)(value >> 32), -limit, limit - 1);
 #endif
     return (int32_t)((uint32_t)high << (32 - shift) | (uint32_t)value >> shift);
 }
