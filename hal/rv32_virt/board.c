@@ -32,10 +32,10 @@ noreturn void fault_handler(void) {
  * fourth word, where the handler begins. It keeps what a function may change and takes the request back. Aligned so
  * that it lies within a page: its end is one block of QEMU's. */
 __asm__(".macro for_each_saved access\n"
-        "    .set offset, 4\n"
+        "    .set .Loffset, 4\n"
         "    .irp register, t0, t1, t2, t3, t4, t5, t6, a0, a1, a2, a3, a4, a5, a6, a7\n"
-        "    \\access \\register, offset(sp)\n"
-        "    .set offset, offset + 4\n"
+        "    \\access \\register, .Loffset(sp)\n"
+        "    .set .Loffset, .Loffset + 4\n"
         "    .endr\n"
         ".endm\n"
 

@@ -105,7 +105,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-TEST_STEPS = ("style", "unit", "sanitize", "cortex-m4", "hil", "socketcan")
+TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "socketcan")
 """The steps of `test`, in order."""
 
 

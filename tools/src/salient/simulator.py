@@ -112,7 +112,7 @@ def executable(machine: str, build: str = "host") -> Path:
         if path.parent != MACHINES:
             _build_foreign(path, program, preset)
         if not program.exists():
-            builder = "tools/salient test --only cortex-m4" if build in TARGET_BUILDS else "any tools/salient command"
+            builder = "tools/salient test --only target" if build in TARGET_BUILDS else "any tools/salient command"
             raise UsageError(f"{program.relative_to(ROOT)} is not built; {builder} builds it")
     return programs[0]
 
