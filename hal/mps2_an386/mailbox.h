@@ -21,7 +21,7 @@
 #define MAILBOX_MEMORY_BYTES (16 * 1024 * 1024)
 
 /* Changes with the structure, so that an image and a world that do not fit each other stop at the start. */
-#define MAILBOX_LAYOUT 1
+#define MAILBOX_LAYOUT 2
 
 typedef enum {
     MAILBOX_STARTED = 1, /* drive_init was done; then as MAILBOX_NEXT */
@@ -57,6 +57,7 @@ typedef struct {
     hal_adc_sample_t adc;
     hal_encoder_sample_t encoder;
     uint32_t missed_interrupts; /* the drive sets it to 0 */
+    uint32_t elapsed_ticks;     /* what the bench says that the control interrupt takes */
 
     uint32_t period_ticks;
     hal_pwm_compare_t compare;

@@ -34,6 +34,7 @@ static void control_interrupt(void *context) {
     hal_adc_read(&host, &mailbox->adc);
     hal_encoder_read(&host, &mailbox->encoder);
     mailbox->missed_interrupts += hal_pwm_missed_interrupts(&host);
+    mailbox->elapsed_ticks = hal_pwm_elapsed_ticks(&host);
     give_event(MAILBOX_INTERRUPT);
 }
 
