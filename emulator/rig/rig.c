@@ -56,6 +56,10 @@ void rig_join(rig_t *rig, const rig_firmware_t *firmware) {
     }
 }
 
+void rig_busy_until(rig_t *rig, uint64_t time_ns) {
+    rig->interrupt_end_ns = time_ns;
+}
+
 static void call(rig_t *rig, board_context_t context, void (*function)(void *)) {
     rig->board.context = context;
     function(rig->firmware.context);

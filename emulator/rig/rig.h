@@ -101,6 +101,10 @@ void rig_init(rig_t *rig, const rig_config_t *config);
 /* Joins the firmware, which must have started the timer (hal_pwm_start); its first interrupt is one period away. */
 void rig_join(rig_t *rig, const rig_firmware_t *firmware);
 
+/* The processor serves no trigger of a control interrupt before time_ns: they are lost, as those during an interrupt.
+ */
+void rig_busy_until(rig_t *rig, uint64_t time_ns);
+
 /* One round. Lock-step: takes what clients sent; runs to the time asked for, or waits up to timeout_ms (negative: for
  * ever) when none was. Other paces: runs to the next reading point. False when it is over: asked to stop, stop_at_ns
  * reached, or config.transport->failure. */

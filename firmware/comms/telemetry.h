@@ -52,11 +52,11 @@ typedef struct {
     int32_t torque_missing_q24;        /* reference less what the voltage can reach */
     uint16_t observer_bandwidth_rad_s; /* at this moment */
     /* The control interrupt's time on the processor, HAL_PWM_TICK_NS. */
-    uint32_t used_ticks;      /* of the last one */
-    uint32_t worst_ticks;     /* of the longest since start */
-    uint32_t available_ticks; /* the control period */
-    uint32_t late_interrupts; /* since start */
-    fault_record_t last_fault;         /* sent while state is fault */
+    uint32_t used_ticks;       /* of the last one */
+    uint32_t worst_ticks;      /* of the longest since start */
+    uint32_t available_ticks;  /* the control period */
+    uint32_t late_interrupts;  /* since start */
+    fault_record_t last_fault; /* sent while state is fault */
 } telemetry_snapshot_t;
 
 typedef struct {

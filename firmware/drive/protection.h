@@ -33,9 +33,9 @@ typedef struct {
     uint32_t command_age_us;    /* of the last accepted command */
 } protection_sample_t;
 
-/* Lost control interrupts in a row that are a fault. An interrupt that is late, ending after the next trigger, loses that
- * trigger and every other one before its end: three late ones in a row are a fault, or one that is three periods late,
- * noticed by the interrupt after them. One that was in time ends the row. */
+/* Lost control interrupts in a row that are a fault. An interrupt that is late, ending after the next trigger, loses
+ * that trigger and every other one before its end: three late ones in a row are a fault, or one that is three periods
+ * late, noticed by the interrupt after them. One that was in time ends the row. */
 #define PROTECTION_OVERRUNS_MAX 3
 
 /* Starts at a measured angle. */

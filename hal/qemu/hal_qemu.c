@@ -44,10 +44,6 @@ uint32_t hal_pwm_missed_interrupts(hal_t *hal) {
     return missed;
 }
 
-uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
-    return hal->mailbox.elapsed_ticks;
-}
-
 bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {
     if (hal->mailbox.receive_waiting == 0) {
         return false;

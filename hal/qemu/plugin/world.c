@@ -3,6 +3,7 @@
 
 #include "world.h"
 
+#include <inttypes.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <ucontext.h>
@@ -17,7 +18,7 @@ static mailbox_t *mailbox;
 static bench_t bench;
 static hal_t host = {.board = &bench.rig.board}; /* the host port checks what may be called from where */
 static ucontext_t drive_context, rig_context;
-static bool refused;
+static bool refused, started;
 
 /* Back to the drive, until its next MAILBOX_NEXT. */
 static void give_event(mailbox_event_t event) {
@@ -34,7 +35,7 @@ static void control_interrupt(void *context) {
     hal_adc_read(&host, &mailbox->adc);
     hal_encoder_read(&host, &mailbox->encoder);
     mailbox->missed_interrupts += hal_pwm_missed_interrupts(&host);
-    mailbox->elapsed_ticks = hal_pwm_elapsed_ticks(&host);
+    mailbox->elapsed_ticks = hal_pwm_elapsed_ticks(&host); /* a drive that takes time puts its own there */
     give_event(MAILBOX_INTERRUPT);
 }
 
@@ -53,7 +54,13 @@ static void run_rig(void) {
     mailbox->event = MAILBOX_EXIT;
 }
 
-static void start_rig(void) {
+/* Lets the rig go on, from its start or from where it called the drive. */
+static void run_on(void) {
+    if (started) {
+        swapcontext(&drive_context, &rig_context);
+        return;
+    }
+    started = true;
     getcontext(&rig_context);
     rig_context.uc_stack.ss_sp = malloc(RIG_STACK_BYTES);
     rig_context.uc_stack.ss_size = RIG_STACK_BYTES;
@@ -66,7 +73,23 @@ static void start_rig(void) {
     swapcontext(&drive_context, &rig_context);
 }
 
-bool world_open(mailbox_t *shared, const options_t *options) {
+/* To the trigger that the drive serves; those that it did not are lost. */
+static void run_to_trigger(void) {
+    rig_t *rig = &bench.rig;
+    const uint64_t period_ns = UINT64_C(2) * HAL_PWM_TICK_NS * rig->board.period_ticks;
+    /* Its number goes round after 71 minutes at 1 MHz. */
+    const uint32_t ahead = mailbox->trigger - (uint32_t)(rig->board.time_ns / period_ns);
+    const uint64_t trigger_ns = (rig->board.time_ns / period_ns + ahead) * period_ns;
+    rig_busy_until(rig, trigger_ns);
+    run_on();
+    if (mailbox->event == MAILBOX_INTERRUPT && rig->board.time_ns != trigger_ns) {
+        fprintf(stderr, "salient: the drive serves the trigger at %" PRIu64 " ns, the bench that at %" PRIu64 " ns\n",
+                trigger_ns, rig->board.time_ns);
+        abort();
+    }
+}
+
+bool world_open(mailbox_t *shared, const options_t *options, bool timed) {
     mailbox = shared;
     if (!bench_open(&bench, options)) {
         return false;
@@ -76,6 +99,7 @@ bool world_open(mailbox_t *shared, const options_t *options) {
     mailbox->controller = options->controller_index;
     mailbox->adc_bits = hal_adc_bits(&host);
     mailbox->encoder_bits = hal_encoder_bits(&host);
+    mailbox->timed = timed;
     return true;
 }
 
@@ -87,13 +111,23 @@ void world_serve(void) {
     switch ((mailbox_command_t)mailbox->doorbell) {
     case MAILBOX_REFUSED:
         refused = true;
-        start_rig();
+        run_on();
         break;
     case MAILBOX_STARTED:
-        start_rig();
-        break;
     case MAILBOX_NEXT:
-        swapcontext(&drive_context, &rig_context);
+        if (!mailbox->timed) {
+            run_on();
+        } else if (!started) {
+            mailbox->event = MAILBOX_BACKGROUND;
+        }
+        break;
+    case MAILBOX_TRIGGER:
+        run_to_trigger();
+        break;
+    case MAILBOX_INTERRUPT_END:
+        /* The drive's counter rounds down: what ends as a trigger comes has lost it. */
+        bench.rig.board.interrupt_time_ns = (uint64_t)mailbox->elapsed_ticks * HAL_PWM_TICK_NS + 1;
+        run_on();
         break;
     case MAILBOX_PWM_START:
         hal_pwm_start(&host, (uint16_t)mailbox->period_ticks);

@@ -38,7 +38,8 @@ class SimulatorOptions:
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
     period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a Cortex-M4 in QEMU. instructions: file
     for the instructions of each control interrupt, uint32 little endian; profile: file for those of all by function,
-    text lines "INSTRUCTIONS FUNCTION"; both on the Cortex-M4 only.
+    text lines "INSTRUCTIONS FUNCTION"; instruction_ns: what an instruction takes, a power of two, or None and the drive
+    takes no time; all three on the Cortex-M4 only.
     """
 
     machine: str = "saturating"
@@ -59,6 +60,7 @@ class SimulatorOptions:
     build: str = "host"
     instructions: Path | None = None
     profile: Path | None = None
+    instruction_ns: int | None = None
 
     def arguments(self, can: str) -> list[str]:
         """The executable's command line on the bus `can`."""
@@ -85,9 +87,9 @@ class SimulatorOptions:
         if self.build not in TARGET_BUILDS:
             return [str(program)]
         line = [str(program), str(image(self.machine, self.build))]
-        for name in ("instructions", "profile"):
-            if (path := getattr(self, name)) is not None:
-                line += [f"--{name}", str(path)]
+        for name in ("instructions", "profile", "instruction_ns"):
+            if (value := getattr(self, name)) is not None:
+                line += [f"--{name.replace('_', '-')}", str(value)]
         return line
 
 
