@@ -25,7 +25,7 @@ void rig_init(rig_t *rig, const rig_config_t *config) {
     rig->period_ns = 0;
     rig->control_ns = rig->background_ns = rig->hold_ns = RIG_NEVER;
     rig->truth_period_ns = rig->truth_ns = TRUTH_PERIOD_DEFAULT_NS;
-    rig->interrupt_end_ns = 0;
+    rig->interrupt_time_ns = rig->interrupt_end_ns = 0;
     rig->settings.count = 0;
     rig->run_count = 0;
     rig->stop_asked_ns = 0;
@@ -81,12 +81,13 @@ static void control_event(rig_t *rig) {
     if (busy) {
         return;
     }
+    rig->board.interrupt_took_ns = rig->interrupt_time_ns;
     call(rig, BOARD_INTERRUPT, rig->firmware.control_interrupt);
-    if (rig->board.interrupt_time_ns == 0) {
+    if (rig->board.interrupt_took_ns == 0) {
         call(rig, BOARD_BACKGROUND, rig->firmware.background);
     } else {
         /* At the very instant of the next period's start the interrupt comes first and puts this off again. */
-        rig->interrupt_end_ns = rig->background_ns = now_ns + rig->board.interrupt_time_ns;
+        rig->interrupt_end_ns = rig->background_ns = now_ns + rig->board.interrupt_took_ns;
     }
 }
 
@@ -141,7 +142,7 @@ static void apply(rig_t *rig, const quantity_setting_t *setting) {
         rig->sensors.encoder_fault = (sensors_encoder_fault_t)setting->value;
         break;
     case RIG_RIG_SET_QUANTITY_INTERRUPT_TIME_US_CHOICE:
-        rig->board.interrupt_time_ns = (uint64_t)(setting->value * (double)NS_PER_US + 0.5);
+        rig->interrupt_time_ns = (uint64_t)(setting->value * (double)NS_PER_US + 0.5);
         break;
     case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_GAIN_CHOICE:
         rig->sensors.errors.current_gain = setting->value;

@@ -53,6 +53,8 @@ void timer_handler(void) {
     passed = 0;
     doorbell_ring(MAILBOX_TRIGGER);
     if (board.mailbox.event == MAILBOX_INTERRUPT) {
+        while (timer_elapsed_ticks() < board.mailbox.elapsed_ticks) { /* the bench holds the processor */
+        }
         board_interrupt_pend();
         board.mailbox.elapsed_ticks = timer_elapsed_ticks();
         passed = board.mailbox.elapsed_ticks / TICKS_PER_COUNT / period;

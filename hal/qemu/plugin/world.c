@@ -35,7 +35,7 @@ static void control_interrupt(void *context) {
     hal_adc_read(&host, &mailbox->adc);
     hal_encoder_read(&host, &mailbox->encoder);
     mailbox->missed_interrupts += hal_pwm_missed_interrupts(&host);
-    mailbox->elapsed_ticks = hal_pwm_elapsed_ticks(&host); /* a drive that takes time puts its own there */
+    mailbox->elapsed_ticks = hal_pwm_elapsed_ticks(&host);
     give_event(MAILBOX_INTERRUPT);
 }
 
@@ -126,7 +126,7 @@ void world_serve(void) {
         break;
     case MAILBOX_INTERRUPT_END:
         /* The drive's counter rounds down: what ends as a trigger comes has lost it. */
-        bench.rig.board.interrupt_time_ns = (uint64_t)mailbox->elapsed_ticks * HAL_PWM_TICK_NS + 1;
+        bench.rig.board.interrupt_took_ns = (uint64_t)mailbox->elapsed_ticks * HAL_PWM_TICK_NS + 1;
         run_on();
         break;
     case MAILBOX_PWM_START:

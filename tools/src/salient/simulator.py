@@ -85,6 +85,8 @@ class SimulatorOptions:
     def _program(self) -> list[str]:
         program = executable(self.machine, self.build)
         if self.build not in TARGET_BUILDS:
+            if self.instruction_ns is not None:
+                raise UsageError(f"--instruction-ns {self.instruction_ns}: only with --target cortex-m4")
             return [str(program)]
         line = [str(program), str(image(self.machine, self.build))]
         for name in ("instructions", "profile", "instruction_ns"):
@@ -208,7 +210,7 @@ def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
     on the bus of an experiment."""
     return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, profile=None,
-                                    pace="lockstep"))
+                                    instruction_ns=None, pace="lockstep"))
 
 
 @lru_cache
