@@ -98,7 +98,7 @@ bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool
     (void)writable, (void)time_us;
     static uint32_t number;
     static uint16_t reported; /* interrupts */
-    number--; /* downwards: as a time it is past, and a command of it not stale */
+    number--;                 /* downwards: as a time it is past, and a command of it not stale */
     fill(&comms->command, sizeof comms->command, number);
     parameters->changes++;
     hal_critical_enter(hal);

@@ -20,7 +20,7 @@ typedef struct {
     uint32_t memory_address;
     uint32_t memory_bytes;
     uint32_t mailbox_offset;
-    bool timer;               /* its port has a timer for a processor that takes time */
+    bool timer;               /* its port uses one: the processor may take time */
     const char *network_card; /* one that the board always has, or NULL */
 } board_description_t;
 
@@ -36,6 +36,16 @@ static const board_description_t boards[] = {
         .mailbox_offset = 0,
         .timer = true,
         .network_card = "lan9118",
+    },
+    {
+        .elf_machine = EM_RISCV,
+        .target = "riscv32",
+        .program = "qemu-system-riscv32",
+        .package = "qemu-system-misc",
+        .machine = "virt",
+        .memory_address = 0x80000000, /* all of the board's RAM; the device tree that QEMU puts there is at 16 MiB */
+        .memory_bytes = 32 * 1024 * 1024,
+        .mailbox_offset = 8 * 1024 * 1024,
     },
 };
 

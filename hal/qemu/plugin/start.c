@@ -94,12 +94,14 @@ int main(int argc, char *argv[]) {
     if (!board) {
         return EXIT_MISTAKE;
     }
-    int shift = -1;
-    if (instruction_ns && ((shift = shift_of(instruction_ns)) < 0 || !board->timer)) {
-        fprintf(stderr,
-                board->timer ? "salient: --instruction-ns %s: allowed are 1, 2, 4, 8, 16, 32 and 64\n"
-                             : "salient: --instruction-ns %s: not for an image without a timer\n",
-                instruction_ns);
+    const int shift = instruction_ns ? shift_of(instruction_ns) : 0;
+    if (shift < 0) {
+        fprintf(stderr, "salient: --instruction-ns %s: allowed are 1, 2, 4, 8, 16, 32 and 64\n", instruction_ns);
+        return EXIT_MISTAKE;
+    }
+    if (instruction_ns && !board->timer) {
+        fprintf(stderr, "salient: --instruction-ns %s: not on the board %s, whose port uses no timer\n", instruction_ns,
+                board->machine);
         return EXIT_MISTAKE;
     }
     const int memory = memfd_create("salient mailbox", 0); /* inherited by QEMU, gone with it */

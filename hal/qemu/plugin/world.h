@@ -21,6 +21,9 @@
  * one line on stderr said why. */
 bool world_open(mailbox_t *mailbox, const options_t *options, bool timed);
 
+/* Closes the bench of a drive that ended before MAILBOX_EXIT. */
+void world_abandon(void);
+
 /* Does the command that the doorbell has. After MAILBOX_EXIT there is no world any more. */
 void world_serve(void);
 

@@ -1,4 +1,4 @@
-"""Starts a drive and its bench in one process: the host executable, or QEMU with the image for the Cortex-M4."""
+"""Starts a drive and its bench in one process: the host executable, or QEMU with an image for one of its boards."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from salient.session import Session
 
 _END_TIMEOUT_S = 60.0
 
-TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os")
-"""The image for the Cortex-M4 as it is meant to be, without optimisation, and optimised for size."""
+TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os", "rv32")
+"""The image for the Cortex-M4 as it is meant to be, without optimisation, and optimised for size; that for RV32."""
 
 
 class SimulatorError(Exception):
@@ -36,10 +36,10 @@ class SimulatorOptions:
     the encoder's edges. adc_bits: 12..16. immediate_pwm: what the control writes acts at once, as with no converter
     there is; it is for the conditions of simulations. record: file for the true state
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
-    period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a Cortex-M4 in QEMU. instructions: file
+    period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a board of QEMU. instructions: file
     for the instructions of each control interrupt, uint32 little endian; profile: file for those of all by function,
-    text lines "INSTRUCTIONS FUNCTION"; instruction_ns: what an instruction takes, a power of two, or None and the drive
-    takes no time; all three on the Cortex-M4 only.
+    text lines "INSTRUCTIONS FUNCTION"; both in QEMU only. instruction_ns: what an instruction takes, one of
+    INSTRUCTION_NS, or None and the drive takes no time; on the Cortex-M4 only.
     """
 
     machine: str = "saturating"
@@ -116,7 +116,7 @@ def executable(machine: str, build: str = "host") -> Path:
         if path.parent != MACHINES:
             _build_foreign(path, program, preset)
         if not program.exists():
-            builder = "tools/salient test --only cortex-m4" if build in TARGET_BUILDS else "any tools/salient command"
+            builder = "tools/salient test --only target" if build in TARGET_BUILDS else "any tools/salient command"
             raise UsageError(f"{program.relative_to(ROOT)} is not built; {builder} builds it")
     return programs[0]
 
