@@ -64,8 +64,9 @@ typedef struct {
     hal_adc_sample_t adc;
     hal_encoder_sample_t encoder;
     uint32_t missed_interrupts; /* the drive sets it to 0 */
-    uint32_t elapsed_ticks; /* that the control interrupt takes: from the bench. `timed`: the bench's
-                                   share, which comes first, and at the end from the drive */
+    /* That the control interrupt takes, from the bench. `timed`: so long the bench holds the processor in front of it;
+     * at its end the drive puts what it took. */
+    uint32_t elapsed_ticks;
     uint32_t trigger; /* `timed`: number of the trigger that is served, 1 is a period behind the start; modulo 2^32 */
 
     uint32_t period_ticks;

@@ -1,5 +1,5 @@
-"""A Cortex-M4 that takes time: QEMU counts an instruction as so many nanoseconds, a timer of the board triggers the control
-interrupt wherever the background happens to be, and one that is too long is late.
+"""A Cortex-M4 that takes time: QEMU counts an instruction as so many nanoseconds, a timer of the board triggers the
+control interrupt wherever the background happens to be, and one that is too long is late.
 
 At 8 ns it is about a part of 170 MHz at 1.34 cycles an instruction.
 """

@@ -220,7 +220,8 @@ def _check_parameters_taken(bench: Bench, count: int) -> None:
 def summary(result: RunResult) -> dict[str, Any]:
     """Figures of a run in general: speeds and torques over the recording (or, without one, the true state on CAN).
 
-    With a recording also its losses (metrics.losses), from its first row to its last.
+    With a recording also its losses (metrics.losses), from its first row to its last; of a processor that takes time
+    also the control interrupt's longest, what it has, and how many were late.
     """
     source: Any = result.recording
     if source is None:
@@ -235,6 +236,13 @@ def summary(result: RunResult) -> dict[str, Any]:
         "frames": result.telemetry.count("DRIVE_STATUS"),
         "fault": result.fault,
     }
+    worst_us = result.telemetry["DRIVE_PROCESSOR.worst_us"].last
+    if worst_us > 0:
+        figures["processor"] = {
+            "worst_us": worst_us,
+            "available_us": result.telemetry["DRIVE_PROCESSOR.available_us"].last,
+            "late_interrupts": int(result.telemetry["DRIVE_PROCESSOR.late_interrupts"].last),
+        }
     if result.recording is not None and len(result.recording) > 1:
         window_s = (float(result.recording["time_s"][0]), float(result.recording["time_s"][-1]))
         figures["losses"] = losses(result.recording, load_machine(machine_path(result.scenario.machine)), window_s)
