@@ -29,6 +29,7 @@ def program() -> list[str]:
         (["--can", "BUS", "--record", "/no/such/folder/x.npy"], ["/no/such/folder/x.npy"]),
         (["--instructions", "/no/such/folder/x", "--can", "BUS"], ["--instructions /no/such/folder/x"]),
         (["--profile", "/no/such/folder/x", "--can", "BUS"], ["--profile /no/such/folder/x"]),
+        (["--instruction-ns", "9", "--can", "BUS"], ["--instruction-ns 9", "1, 2, 4, 8, 16, 32 and 64"]),
         (["--can", "BUS", "--bogus"], ["--bogus"]),
     ],
 )

@@ -38,7 +38,8 @@ class SimulatorOptions:
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
     period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a board of QEMU. instructions: file
     for the instructions of each control interrupt, uint32 little endian; profile: file for those of all by function,
-    text lines "INSTRUCTIONS FUNCTION"; both in QEMU only.
+    text lines "INSTRUCTIONS FUNCTION"; both in QEMU only. instruction_ns: what an instruction takes, one of
+    INSTRUCTION_NS, or None and the drive takes no time; on the Cortex-M4 only.
     """
 
     machine: str = "saturating"
@@ -59,6 +60,7 @@ class SimulatorOptions:
     build: str = "host"
     instructions: Path | None = None
     profile: Path | None = None
+    instruction_ns: int | None = None
 
     def arguments(self, can: str) -> list[str]:
         """The executable's command line on the bus `can`."""
@@ -83,11 +85,13 @@ class SimulatorOptions:
     def _program(self) -> list[str]:
         program = executable(self.machine, self.build)
         if self.build not in TARGET_BUILDS:
+            if self.instruction_ns is not None:
+                raise UsageError(f"--instruction-ns {self.instruction_ns}: only with --target cortex-m4")
             return [str(program)]
         line = [str(program), str(image(self.machine, self.build))]
-        for name in ("instructions", "profile"):
-            if (path := getattr(self, name)) is not None:
-                line += [f"--{name}", str(path)]
+        for name in ("instructions", "profile", "instruction_ns"):
+            if (value := getattr(self, name)) is not None:
+                line += [f"--{name.replace('_', '-')}", str(value)]
         return line
 
 
@@ -206,7 +210,7 @@ def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
     on the bus of an experiment."""
     return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, profile=None,
-                                    pace="lockstep"))
+                                    instruction_ns=None, pace="lockstep"))
 
 
 @lru_cache
