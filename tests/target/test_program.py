@@ -28,7 +28,8 @@ def program() -> list[str]:
         (["--can", "BUS", "--controller", "pid"], ["--controller pid", "traditional, paper and salient"]),
         (["--can", "BUS", "--record", "/no/such/folder/x.npy"], ["/no/such/folder/x.npy"]),
         (["--instructions", "/no/such/folder/x", "--can", "BUS"], ["--instructions /no/such/folder/x"]),
-        (["--profile", "/no/such/folder/x", "--can", "BUS"], ["--profile /no/such/folder/x"]),
+        (["--execution", "/no/such/folder/x", "0-1", "--can", "BUS"], ["--execution /no/such/folder/x"]),
+        (["--execution", "x", "8-8", "--can", "BUS"], ["--execution 8-8", "END-BEGIN"]),
         (["--can", "BUS", "--bogus"], ["--bogus"]),
     ],
 )

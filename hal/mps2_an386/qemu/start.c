@@ -37,23 +37,25 @@ static void put_option(FILE *list, const char *key, const char *value) {
 
 int main(int argc, char *argv[]) {
     if (argc < 2 || strcmp(argv[1], "--help") == 0) {
-        printf("usage: %s IMAGE.elf [--instructions FILE] [--profile FILE] OPTION...\n"
+        printf("usage: %s IMAGE.elf [--instructions FILE] [--execution FILE STACK] OPTION...\n"
                "  IMAGE.elf            the drive, as built for the Cortex-M4\n"
                "  --instructions FILE  writes the instructions of each control interrupt, a uint32_t each\n"
-               "  --profile FILE       writes a line for each function: its instructions in all control interrupts\n"
+               "  --execution FILE STACK  writes how often each block of instructions was executed and how far\n"
+               "                       down the stack was written to, whose end and beginning STACK are: END-BEGIN\n"
                "  OPTION               as the host executable's; its --help lists them\n",
                argv[0]);
         return argc < 2 ? EXIT_MISTAKE : 0;
     }
-    const char *image = argv[1], *instructions = NULL, *profile = NULL;
+    const char *image = argv[1], *instructions = NULL, *execution = NULL, *stack = NULL;
     int first = 2;
     if (argc > first + 1 && strcmp(argv[first], "--instructions") == 0) {
         instructions = argv[first + 1];
         first += 2;
     }
-    if (argc > first + 1 && strcmp(argv[first], "--profile") == 0) {
-        profile = argv[first + 1];
-        first += 2;
+    if (argc > first + 2 && strcmp(argv[first], "--execution") == 0) {
+        execution = argv[first + 1];
+        stack = argv[first + 2];
+        first += 3;
     }
     if (access(image, R_OK) != 0) {
         return mistake(image);
@@ -79,8 +81,9 @@ int main(int argc, char *argv[]) {
     if (instructions) {
         put_option(list, "instructions", instructions);
     }
-    if (profile) {
-        put_option(list, "profile", profile);
+    if (execution) {
+        put_option(list, "execution", execution);
+        put_option(list, "stack", stack);
     }
     for (int i = first; i < argc; ++i) {
         put_option(list, "argument", argv[i]);

@@ -132,16 +132,16 @@ _RECORDING, _LOG, _TEXT_LOG = "recording.npy", "can.blf", "can.log"
 
 
 def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: str = "host",
-                 instructions: Path | None = None, profile: Path | None = None) -> RunResult:
+                 instructions: Path | None = None, execution: Path | None = None) -> RunResult:
     """Runs a scenario in lock-step and leaves recording.npy, can.blf and can.log in out_dir, which is made if needed.
 
     can: "local" for a bus of its own, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; parameters
     are written first, then the commands follow; the bench's quantities are set before all. For build, instructions,
-    profile see SimulatorOptions. UsageError for what the drive does not know or refuses.
+    execution see SimulatorOptions. UsageError for what the drive does not know or refuses.
     """
     recording_path = out_dir / _RECORDING if scenario.record else None
     options = replace(_simulator_options(scenario, recording_path, build), instructions=instructions,
-                      profile=profile)
+                      execution=execution)
     writes = _parameter_writes(scenario, options)
     out_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:

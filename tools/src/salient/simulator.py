@@ -13,6 +13,7 @@ from pathlib import Path
 
 from salient.drive import ParameterRow, read_parameter_table
 from salient.errors import UsageError
+from salient.image import Image
 from salient.machine import MachineError, load_machine, machine_path
 from salient.paths import BUILD, MACHINES, ROOT
 from salient.phase_map import machine_phase_map
@@ -37,8 +38,8 @@ class SimulatorOptions:
     there is; it is for the conditions of simulations. record: file for the true state
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
     period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a Cortex-M4 in QEMU. instructions: file
-    for the instructions of each control interrupt, uint32 little endian; profile: file for those of all by function,
-    text lines "INSTRUCTIONS FUNCTION"; both on the Cortex-M4 only.
+    for the instructions of each control interrupt, uint32 little endian; execution: file for what the processor did,
+    as salient.execution reads it; both on a target only.
     """
 
     machine: str = "saturating"
@@ -58,7 +59,7 @@ class SimulatorOptions:
     record_switches: Path | None = None
     build: str = "host"
     instructions: Path | None = None
-    profile: Path | None = None
+    execution: Path | None = None
 
     def arguments(self, can: str) -> list[str]:
         """The executable's command line on the bus `can`."""
@@ -85,9 +86,11 @@ class SimulatorOptions:
         if self.build not in TARGET_BUILDS:
             return [str(program)]
         line = [str(program), str(image(self.machine, self.build))]
-        for name in ("instructions", "profile"):
-            if (path := getattr(self, name)) is not None:
-                line += [f"--{name}", str(path)]
+        if self.instructions is not None:
+            line += ["--instructions", str(self.instructions)]
+        if self.execution is not None:
+            end, begin = Image(image(self.machine, self.build)).stack()
+            line += ["--execution", str(self.execution), f"{end:#x}-{begin:#x}"]
         return line
 
 
@@ -205,7 +208,7 @@ class Simulator:
 def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
     on the bus of an experiment."""
-    return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, profile=None,
+    return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, execution=None,
                                     pace="lockstep"))
 
 
