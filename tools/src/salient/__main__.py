@@ -93,6 +93,12 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
+def _pil(options: argparse.Namespace) -> int:
+    from salient.pil import run
+
+    return run(options)
+
+
 def _log(options: argparse.Namespace) -> int:
     from salient.watch import record
 
@@ -128,6 +134,7 @@ _COMMANDS = {
     "test": _test,
     "sim": _sim,
     "run": _run,
+    "pil": _pil,
     "log": _log,
     "monitor": _monitor,
     "bench": _bench,

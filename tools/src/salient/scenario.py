@@ -244,12 +244,23 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build:
             progress: Callable[[str], None] = lambda line: None) -> dict[str, RunResult]:
     """Runs the scenarios of one file, each into out_dir/CONTROLLER, and writes out_dir/results.json. build: see
     SimulatorOptions."""
-    for scenario in scenarios:  # so that a mistake is named before the first run
-        _parameter_writes(scenario, _simulator_options(scenario, None, build))
+    check_parameters(scenarios, build)
     results = {}
     for scenario in scenarios:
         progress(f"{scenario.name}: {scenario.controller}, {scenario.duration_s:g} s of virtual time")
         results[scenario.controller] = run_scenario(scenario, out_dir / scenario.controller, can, build)
+    write_summaries(scenarios, results, out_dir)
+    return results
+
+
+def check_parameters(scenarios: list[Scenario], build: str) -> None:
+    """UsageError for parameters that the drive does not know or would refuse, before the first run."""
+    for scenario in scenarios:
+        _parameter_writes(scenario, _simulator_options(scenario, None, build))
+
+
+def write_summaries(scenarios: list[Scenario], results: dict[str, RunResult], out_dir: Path) -> None:
+    """Writes out_dir/results.json for the runs of one file by controller."""
     content = {
         "schema": 1,
         "scenario": {key: value for key, value in asdict(scenarios[0]).items() if key != "controller"},
@@ -257,7 +268,6 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build:
     }
     text = json.dumps(content, indent=2, sort_keys=True) + "\n"
     (out_dir / "results.json").write_text(text, encoding="utf-8")
-    return results
 
 
 # --- reading --------------------------------------------------------------------------------------------------------
