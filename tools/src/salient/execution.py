@@ -20,8 +20,6 @@ _HELPERS = ("firmware/fixed/", "/", "?")
 """What counts for the part that uses it, by the beginning of the source's path: arithmetic, and what is not in the
 repository, the compiler's and the C library's."""
 _NOT_FIRMWARE = ("hal/", "/", "?")
-EXCEPTION_FRAME_BYTES = 36
-"""What the Cortex-M4 itself puts on the stack when it takes an interrupt: eight words, and one to align them."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,7 @@ class Coverage:
 
 
 def read_execution(path: Path, image: Path) -> Execution:
-    """What a run of the image has written to path (hal/mps2_an386/qemu/execution.h)."""
+    """What a run of the image has written to path (hal/qemu/plugin/execution.h)."""
     known = _known(image)
     place_of = {instruction.address: i for i, instruction in enumerate(known.instructions)}
     executed, inside = (np.zeros(len(known.instructions) + 1, dtype=np.int64) for _ in range(2))
@@ -160,7 +158,7 @@ def read_execution(path: Path, image: Path) -> Execution:
             thread_low = min(begin, int(words[1], 16))
         else:
             interrupt_bytes = int(words[1])
-    stack = Stack(begin - thread_low, interrupt_bytes + EXCEPTION_FRAME_BYTES, known.stack_reserved)
+    stack = Stack(begin - thread_low, interrupt_bytes + known.exception_frame_bytes, known.stack_reserved)
     return Execution(image, executed.cumsum()[:-1], inside.cumsum()[:-1], stack)
 
 
@@ -172,6 +170,7 @@ class _Known:
     """None: a helper."""
     stack_begin: int
     stack_reserved: int
+    exception_frame_bytes: int
 
 
 def _known(image: Path) -> _Known:
@@ -184,7 +183,8 @@ def _read_image(path: Path, mtime_ns: int) -> _Known:
     instructions = image.instructions()
     places = image.places([instruction.address for instruction in instructions])
     ordered = [places[instruction.address] for instruction in instructions]
-    return _Known(instructions, ordered, [_part(of) for of in ordered], image.stack()[1], image.sections()[".stack"])
+    return _Known(instructions, ordered, [_part(of) for of in ordered], image.stack()[1], image.sections()[".stack"],
+                  image.exception_frame_bytes)
 
 
 def _part(places: Iterable[Place]) -> str | None:

@@ -12,9 +12,10 @@ from pathlib import Path
 from salient.errors import UsageError
 from salient.paths import ROOT
 
-_BINUTILS = {40: ("arm-none-eabi-", "binutils-arm-none-eabi"),
-             243: ("riscv64-unknown-elf-", "binutils-riscv64-unknown-elf")}  # fmt: skip
-"""By the ELF header's machine: what the tools' names begin with, and their Debian package."""
+_PROCESSORS = {40: ("arm-none-eabi-", "binutils-arm-none-eabi", 36),
+               243: ("riscv64-unknown-elf-", "binutils-riscv64-unknown-elf", 0)}  # fmt: skip
+"""By the ELF header's machine: what the tools' names begin with, their Debian package, and the bytes that the processor
+itself puts on the stack when it takes an interrupt: a Cortex-M4 eight words, and one to align them."""
 
 _INSTRUCTION = re.compile(r"\s*([0-9a-f]+):\t([a-z][a-z0-9]*(?:\.[a-z0-9]+)*)(?:\s+(.*))?$")
 _TARGET = re.compile(r"\b([0-9a-f]+) <([^>+]+)>")
@@ -43,15 +44,15 @@ class Instruction:
 
 
 class Image:
-    """path: an ELF file. UsageError when there are no tools for it."""
+    """path: an ELF file. UsageError when its processor is not known."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         with path.open("rb") as file:
             machine = int.from_bytes(file.read(20)[18:], "little")
-        if machine not in _BINUTILS:
-            raise UsageError(f"{path}: for processor {machine}; known are {', '.join(map(str, _BINUTILS))}")
-        self._prefix, self._package = _BINUTILS[machine]
+        if machine not in _PROCESSORS:
+            raise UsageError(f"{path}: for processor {machine}; known are {', '.join(map(str, _PROCESSORS))}")
+        self._prefix, self._package, self.exception_frame_bytes = _PROCESSORS[machine]
 
     def run(self, tool: str, *arguments: str, given: str | None = None) -> str:
         """The output of one of the binutils, with the image behind the arguments."""

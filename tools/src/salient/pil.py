@@ -1,5 +1,5 @@
-"""salient pil: what the processor does for a scenario. Processor in the loop: the firmware on an emulated processor, the
-emulator's machine as its world, every instruction counted.
+"""salient pil: what the processor does for a scenario. Processor in the loop: the firmware on an emulated processor,
+the emulator's machine as its world, every instruction counted.
 
 It leaves what `run` leaves, and processor.json and report.html beside results.json.
 """
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def shares_of_period(instructions: int) -> dict[int, tuple[float, float]]:
-    """What an interrupt of so many instructions takes of the period at each of RATES_HZ: lowest and highest estimate."""
+    """What an interrupt of so many instructions takes of the period at each of RATES_HZ, lowest and highest."""
     low, high = CYCLES_PER_INSTRUCTION
     return {rate: (instructions * low * rate / PROCESSOR_HZ, instructions * high * rate / PROCESSOR_HZ)
             for rate in RATES_HZ}
@@ -111,7 +111,8 @@ def _run_scenario(path: Path, out: Path, target: str) -> int:
                "controllers": {controller: as_json(cost) for controller, cost in costs.items()}}
     (out / "processor.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     write_pil_report(out, scenarios[0], content, {name: cost.interrupts for name, cost in costs.items()})
-    print(f"{words(costs)}\n\nresults: {out / 'results.json'}, {out / 'processor.json'}\nreport:  {out / 'report.html'}")
+    print(f"{words(costs)}\n\nresults: {out / 'results.json'}, {out / 'processor.json'}\n"
+          f"report:  {out / 'report.html'}")
     faults = [f"{controller}: {result.fault}" for controller, result in results.items() if result.fault != "none"]
     if faults:
         print(f"the drive ended in a fault: {', '.join(faults)}")

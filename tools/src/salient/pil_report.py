@@ -38,8 +38,8 @@ def write_pil_report(out: Path, scenario: Scenario, content: Mapping[str, Any],
     page = _PAGE.substitute(
         style=PAGE_STYLE,
         scenario=escape(scenario.name),
-        lead=escape(f"{scenario.duration_s:g} s of virtual time on the machine {Path(scenario.machine).stem}, control at"
-                    f" {content['control_rate_hz'] / 1000:g} kHz, the firmware on {content['target']} in QEMU."
+        lead=escape(f"{scenario.duration_s:g} s of virtual time on the machine {Path(scenario.machine).stem}, control"
+                    f" at {content['control_rate_hz'] / 1000:g} kHz, the firmware on {content['target']} in QEMU."
                     " Instructions are counted and exact; cycles are an estimate."),
         heads=heads,
         cost=_rows(controllers, _COST),
@@ -165,7 +165,8 @@ for its flash. It fits when the worst interrupt of this run ends before the next
 the estimate's end, else open.</p>
 <figure><img alt="Instructions of the control interrupts over time, how often how many, mean by part"
 src="data:image/png;base64,$image"><figcaption>Instructions of the control interrupts over time; how often an interrupt
-takes how many (the count is logarithmic); and the mean by the part of the firmware that they serve.</figcaption></figure>
+takes how many (the count is logarithmic); and the mean by the part of the firmware that they serve.</figcaption>
+</figure>
 
 <h2>By part</h2>
 <div class="tables"><table><thead><tr><th>instructions an interrupt, mean</th>$heads</tr></thead><tbody>

@@ -16,6 +16,7 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
+#include "boards.h"
 #include "execution.h"
 #include "host/bench.h"
 #include "instructions.h"
@@ -28,6 +29,7 @@
 EXPORT int qemu_plugin_version = PLUGIN_API_VERSION;
 EXPORT int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, char **argv);
 
+static const board_description_t *board;
 static mailbox_t *mailbox;
 static bool counting, following;
 
@@ -36,7 +38,7 @@ static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, 
     (void)vcpu;
     (void)info;
     (void)context;
-    if (address != MAILBOX_ADDRESS) {
+    if (address != board->memory_address + board->mailbox_offset) {
         return;
     }
     world_serve();
@@ -70,7 +72,7 @@ static mailbox_t *map_mailbox(const char *path) {
     const int descriptor = open(path, O_RDWR | O_CLOEXEC);
     void *memory = MAP_FAILED;
     if (descriptor >= 0) {
-        memory = mmap(NULL, sizeof(mailbox_t), PROT_READ | PROT_WRITE, MAP_SHARED, descriptor, 0);
+        memory = mmap(NULL, sizeof(mailbox_t), PROT_READ | PROT_WRITE, MAP_SHARED, descriptor, board->mailbox_offset);
         close(descriptor);
     }
     if (memory == MAP_FAILED) {
@@ -78,6 +80,15 @@ static mailbox_t *map_mailbox(const char *path) {
         exit(BENCH_EXIT_MISTAKE);
     }
     return memory;
+}
+
+static const board_description_t *board_of(const char *target) {
+    for (size_t i = 0; i < BOARD_COUNT; ++i) {
+        if (strcmp(boards[i].target, target) == 0) {
+            return &boards[i];
+        }
+    }
+    return NULL;
 }
 
 /* The text behind `key` if the argument begins with it, else NULL. */
@@ -111,8 +122,9 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
             exit(BENCH_EXIT_MISTAKE);
         }
     }
-    if (!mailbox_path || !info->system_emulation || strcmp(info->target_name, "arm") != 0) {
-        fputs("salient: this plugin needs qemu-system-arm and mailbox=FILE\n", stderr);
+    board = board_of(info->target_name);
+    if (!mailbox_path || !info->system_emulation || !board) {
+        fputs("salient: this plugin needs a board of boards.h and mailbox=FILE\n", stderr);
         exit(BENCH_EXIT_MISTAKE);
     }
     mailbox = map_mailbox(mailbox_path);

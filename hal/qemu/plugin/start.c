@@ -13,10 +13,9 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
+#include "boards.h"
 #include "host/bench.h"
-#include "mps2_an386/mailbox.h"
 
-#define QEMU "qemu-system-arm"
 #define EXIT_MISTAKE BENCH_EXIT_MISTAKE
 
 static int mistake(const char *what) {
@@ -35,10 +34,31 @@ static void put_option(FILE *list, const char *key, const char *value) {
     }
 }
 
+/* The board that an image is for; NULL: one line on stderr said why. */
+static const board_description_t *board_of(const char *image) {
+    FILE *file = fopen(image, "rb");
+    if (!file) {
+        mistake(image);
+        return NULL;
+    }
+    Elf32_Ehdr header = {0}; /* little endian, as this program's */
+    const bool whole = fread(&header, sizeof header, 1, file) == 1;
+    fclose(file);
+    if (whole && memcmp(header.e_ident, ELFMAG, SELFMAG) == 0 && header.e_ident[EI_CLASS] == ELFCLASS32) {
+        for (size_t i = 0; i < BOARD_COUNT; ++i) {
+            if (boards[i].elf_machine == header.e_machine) {
+                return &boards[i];
+            }
+        }
+    }
+    fprintf(stderr, "salient: %s: not an image of a drive for a board of QEMU\n", image);
+    return NULL;
+}
+
 int main(int argc, char *argv[]) {
     if (argc < 2 || strcmp(argv[1], "--help") == 0) {
         printf("usage: %s IMAGE.elf [--instructions FILE] [--execution FILE STACK] OPTION...\n"
-               "  IMAGE.elf            the drive, as built for the Cortex-M4\n"
+               "  IMAGE.elf            the drive, as built for a board of QEMU\n"
                "  --instructions FILE  writes the instructions of each control interrupt, a uint32_t each\n"
                "  --execution FILE STACK  writes how often each block of instructions was executed and how far\n"
                "                       down the stack was written to, whose end and beginning STACK are: END-BEGIN\n"
@@ -57,25 +77,24 @@ int main(int argc, char *argv[]) {
         stack = argv[first + 2];
         first += 3;
     }
-    if (access(image, R_OK) != 0) {
-        return mistake(image);
+    const board_description_t *board = board_of(image);
+    if (!board) {
+        return EXIT_MISTAKE;
     }
     const int memory = memfd_create("salient mailbox", 0); /* inherited by QEMU, gone with it */
-    if (memory < 0 || ftruncate(memory, MAILBOX_MEMORY_BYTES) != 0) {
+    if (memory < 0 || ftruncate(memory, board->memory_bytes) != 0) {
         return mistake("the board's memory");
     }
-    int network[2]; /* the board's network card warns when nothing is at the other end */
-    if (socketpair(AF_UNIX, SOCK_DGRAM, 0, network) != 0) {
-        return mistake("a socket pair");
-    }
-    char path[64], card[64], *object = NULL, *plugin = NULL;
-    size_t object_size, plugin_size;
+    char path[64], *machine = NULL, *object = NULL, *plugin = NULL;
+    size_t size;
     snprintf(path, sizeof path, "/proc/self/fd/%d", memory);
-    snprintf(card, sizeof card, "socket,model=lan9118,fd=%d", network[0]);
-    FILE *list = open_memstream(&object, &object_size);
-    fprintf(list, "memory-backend-file,id=psram,size=%d,share=on,mem-path=%s", MAILBOX_MEMORY_BYTES, path);
+    FILE *list = open_memstream(&machine, &size);
+    fprintf(list, "%s,memory-backend=shared", board->machine);
     fclose(list);
-    list = open_memstream(&plugin, &plugin_size);
+    list = open_memstream(&object, &size);
+    fprintf(list, "memory-backend-file,id=shared,size=%u,share=on,mem-path=%s", (unsigned)board->memory_bytes, path);
+    fclose(list);
+    list = open_memstream(&plugin, &size);
     fputs(SALIENT_PLUGIN, list);
     put_option(list, "mailbox", path);
     if (instructions) {
@@ -89,8 +108,18 @@ int main(int argc, char *argv[]) {
         put_option(list, "argument", argv[i]);
     }
     fclose(list);
-    execlp(QEMU, QEMU, "-nodefaults", "-display", "none", "-nic", card, "-machine", "mps2-an386,memory-backend=psram",
-           "-object", object, "-semihosting-config", "enable=on,target=native", "-kernel", image, "-plugin", plugin,
-           (char *)NULL);
-    return mistake(QEMU " (Debian package qemu-system-arm)");
+    char card[64] = "none";
+    if (board->network_card) { /* it warns when nothing is at the other end */
+        int network[2];
+        if (socketpair(AF_UNIX, SOCK_DGRAM, 0, network) != 0) {
+            return mistake("a socket pair");
+        }
+        snprintf(card, sizeof card, "socket,model=%s,fd=%d", board->network_card, network[0]);
+    }
+    execlp(board->program, board->program, "-nodefaults", "-display", "none", "-nic", card, "-machine", machine,
+           "-object", object, "-semihosting-config", "enable=on,target=native", "-bios", "none", "-kernel", image,
+           "-plugin", plugin, (char *)NULL);
+    char name[64];
+    snprintf(name, sizeof name, "%s (Debian package %s)", board->program, board->package);
+    return mistake(name);
 }

@@ -12,7 +12,7 @@
 #include <stdbool.h>
 
 #include "host/options.h"
-#include "mps2_an386/mailbox.h"
+#include "qemu/mailbox.h"
 
 /* Opens the bench and fills the mailbox, before the drive starts. Keeps both. False: one line on stderr said why. */
 bool world_open(mailbox_t *mailbox, const options_t *options);

@@ -1,4 +1,4 @@
-/* What stands in for the registers that the board mps2-an386 has not: PWM timer, converter, encoder, CAN controller.
+/* What stands in for the registers that a board of QEMU has not: PWM timer, converter, encoder, CAN controller.
  *
  * A structure in memory that drive and world share. The drive reads registers and sends commands: it stores one to
  * `doorbell`, and before the drive's next instruction the world has done it. So the world needs no polling and time
@@ -15,13 +15,12 @@
 #include "hal_encoder.h"
 #include "hal_pwm.h"
 
-/* Where the board's 16 MiB PSRAM begins, the memory that QEMU can share with its world; whole, because the board takes
- * no other size. */
-#define MAILBOX_ADDRESS 0x21000000
-#define MAILBOX_MEMORY_BYTES (16 * 1024 * 1024)
-
 /* Changes with the structure, so that an image and a world that do not fit each other stop at the start. */
 #define MAILBOX_LAYOUT 1
+
+/* Exit codes of a drive that ends by itself (sysexits.h). */
+#define MAILBOX_EXIT_FAULT 70  /* an exception of the processor that is not expected */
+#define MAILBOX_EXIT_LAYOUT 78 /* the world has another layout */
 
 typedef enum {
     MAILBOX_STARTED = 1, /* drive_init was done; then as MAILBOX_NEXT */

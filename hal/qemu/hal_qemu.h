@@ -1,15 +1,15 @@
-/* The port to QEMU's board mps2-an386, a Cortex-M4: the hal_* functions on the mailbox. */
-#ifndef HAL_MPS2_AN386_H
-#define HAL_MPS2_AN386_H
+/* The hal_* functions on the mailbox, for any board of QEMU; the critical section is the board's. */
+#ifndef HAL_QEMU_H
+#define HAL_QEMU_H
 
 #include "hal.h"
-#include "mps2_an386/mailbox.h"
+#include "qemu/mailbox.h"
 
 struct hal {
     mailbox_t mailbox;
 };
 
-/* The one board there is; the linker places it at MAILBOX_ADDRESS. */
+/* The one board there is; the linker places it in the memory shared with the world. */
 extern hal_t board;
 
 /* Stores a command to the doorbell. Whatever of the mailbox the compiler held in registers is read again after it. */

@@ -1,0 +1,28 @@
+/* A board of QEMU: what the drive's program (program.c) needs of it. A port has these functions, the critical section
+ * of hal_time.h, the processor's vectors or their like, and a linker script memory.ld.
+ *
+ * Who counts instructions knows the control interrupt's ends by their names: control_handler is the handler's first
+ * instruction, control_handler_return its last.
+ */
+#ifndef BOARD_H
+#define BOARD_H
+
+#include <stdint.h>
+#include <stdnoreturn.h>
+
+/* The program: the processor's reset leads here, with a stack and without variables. */
+noreturn void program_start(void);
+
+/* The control interrupt's work: the handler calls it, in the processor's interrupt context. */
+void program_interrupt(void);
+
+/* Lets board_interrupt_pend act. */
+void board_interrupt_enable(void);
+
+/* Asks for the control interrupt, as the timer would. Unless interrupts are kept out it is over when this returns. */
+void board_interrupt_pend(void);
+
+/* Ends QEMU with an exit code, 0..255. */
+noreturn void board_exit(uint32_t code);
+
+#endif
