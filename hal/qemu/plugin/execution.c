@@ -21,9 +21,10 @@ static struct {
 } blocks[BLOCKS_MAX];
 static unsigned block_count;
 
-/* `executed` goes on in the background, too; `inside` takes what it grows by in interrupts. Apart from the blocks,
- * because every interrupt goes through them twice. */
-static uint64_t executed[BLOCKS_MAX], inside[BLOCKS_MAX];
+/* `executed` goes on in the background, too; `before` is what it was when the interrupt began. Apart from the blocks,
+ * because every interrupt goes through them. */
+static uint64_t executed[BLOCKS_MAX], before[BLOCKS_MAX], inside[BLOCKS_MAX], in_worst[BLOCKS_MAX];
+static uint64_t worst; /* instructions */
 
 /* Of the stack, as far as written to; low > high: not at all. Of the interrupt: the present one. */
 typedef struct {
@@ -40,17 +41,24 @@ static FILE *file;
 
 static void entered(unsigned vcpu, void *block) {
     (void)vcpu;
-    for (unsigned i = 0; i < block_count; ++i) {
-        inside[i] -= executed[i];
-    }
+    memcpy(before, executed, block_count * sizeof before[0]); /* of a block yet to be translated both are 0 */
     ++executed[(uintptr_t)block];
     in_interrupt = true;
     by_interrupt = NOTHING_WRITTEN;
 }
 
 static void leave(void) {
+    uint64_t instructions = 0;
     for (unsigned i = 0; i < block_count; ++i) {
-        inside[i] += executed[i];
+        const uint64_t times = executed[i] - before[i];
+        inside[i] += times;
+        instructions += times * blocks[i].size;
+    }
+    if (instructions > worst) {
+        worst = instructions;
+        for (unsigned i = 0; i < block_count; ++i) {
+            in_worst[i] = executed[i] - before[i];
+        }
     }
     in_interrupt = false;
     if (by_interrupt.low <= by_interrupt.high) {
@@ -132,8 +140,8 @@ bool execution_close(void) {
         leave(); /* the program ends in the middle of one */
     }
     for (unsigned i = 0; i < block_count; ++i) {
-        fprintf(file, "block %" PRIx64 " %zu %" PRIu64 " %" PRIu64 "\n", blocks[i].address, blocks[i].size, executed[i],
-                inside[i]);
+        fprintf(file, "block %" PRIx64 " %zu %" PRIu64 " %" PRIu64 " %" PRIu64 "\n", blocks[i].address, blocks[i].size,
+                executed[i], inside[i], in_worst[i]);
     }
     fprintf(file, "stack thread %" PRIx64 "\n", by_thread.low);
     fprintf(file, "stack interrupt %" PRIu64 "\n", interrupt_bytes_max);

@@ -43,29 +43,38 @@ class Stack:
 
 @dataclass
 class Execution:
-    """How often each instruction was executed, in all and in control interrupts, in the image's order."""
+    """How often each instruction was executed, in all, in control interrupts and in the dearest of them, in the image's
+    order."""
 
     image: Path
     executed: np.ndarray
     inside: np.ndarray
+    in_worst: np.ndarray
     stack: Stack
 
     def __add__(self, other: Execution) -> Execution:
         """Both runs of one image."""
         return Execution(self.image, self.executed + other.executed, self.inside + other.inside,
-                         self.stack | other.stack)
+                         max(self.in_worst, other.in_worst, key=np.sum), self.stack | other.stack)
 
     def by_part(self) -> Counter[str]:
-        """Instructions in control interrupts by the part of the firmware that they serve.
+        """Instructions of all control interrupts by the part of the firmware that they serve.
 
         A part is a source file; what is inlined counts for the file that it was written in. Helpers (_HELPERS) count
         for their callers; where they are functions of their own, in proportion to the calls.
         """
+        return self._by_part(self.inside)
+
+    def worst_by_part(self) -> Counter[str]:
+        """The same of the dearest interrupt."""
+        return self._by_part(self.in_worst)
+
+    def _by_part(self, counts: np.ndarray) -> Counter[str]:
         known = _known(self.image)
         parts: Counter[str] = Counter()
         helpers: Counter[str] = Counter()
         callers: dict[str, Counter[tuple[str | None, str]]] = defaultdict(Counter)
-        for instruction, part, count in zip(known.instructions, known.parts, self.inside.tolist(), strict=True):
+        for instruction, part, count in zip(known.instructions, known.parts, counts.tolist(), strict=True):
             if count == 0:
                 continue
             if part is None:
@@ -144,22 +153,22 @@ def read_execution(path: Path, image: Path) -> Execution:
     """What a run of the image has written to path (hal/qemu/plugin/execution.h)."""
     known = _known(image)
     place_of = {instruction.address: i for i, instruction in enumerate(known.instructions)}
-    executed, inside = (np.zeros(len(known.instructions) + 1, dtype=np.int64) for _ in range(2))
+    counts = np.zeros((3, len(known.instructions) + 1), dtype=np.int64)
     begin = known.stack_begin
     thread_low, interrupt_bytes = begin, 0
     for line in path.read_text(encoding="utf-8").splitlines():
         kind, *words = line.split()
         if kind == "block":
             first, size = place_of[int(words[0], 16)], int(words[1])
-            for counts, count in ((executed, int(words[2])), (inside, int(words[3]))):
-                counts[first] += count
-                counts[first + size] -= count
+            times = [int(word) for word in words[2:]]
+            counts[:, first] += times
+            counts[:, first + size] -= times
         elif words[0] == "thread":
             thread_low = min(begin, int(words[1], 16))
         else:
             interrupt_bytes = int(words[1])
     stack = Stack(begin - thread_low, interrupt_bytes + known.exception_frame_bytes, known.stack_reserved)
-    return Execution(image, executed.cumsum()[:-1], inside.cumsum()[:-1], stack)
+    return Execution(image, *counts.cumsum(axis=1)[:, :-1], stack)
 
 
 @dataclass(frozen=True)

@@ -38,13 +38,17 @@ class Cost:
         return {name: count / len(self.interrupts) for name, count in self.execution.by_part().most_common()}
 
 
+def read_cost(interrupts: Path, execution: Path, machine: str, build: str) -> Cost:
+    """What a run has left in the files SimulatorOptions.instructions and execution."""
+    return Cost(np.fromfile(interrupts, "<u4"), read_execution(execution, image(machine, build)))
+
+
 def measure_run(scenario: Scenario, out_dir: Path, build: str = "cortex-m4") -> tuple[RunResult, Cost]:
     """Runs a scenario as run_scenario does, counting. build: of TARGET_BUILDS."""
     with tempfile.TemporaryDirectory(prefix="salient-") as name:
         counted, executed = Path(name) / "instructions", Path(name) / "execution"
         result = run_scenario(scenario, out_dir, build=build, instructions=counted, execution=executed)
-        return result, Cost(np.fromfile(counted, "<u4"),
-                            read_execution(executed, image(scenario.machine, build)))
+        return result, read_cost(counted, executed, scenario.machine, build)
 
 
 def measure(controller: str, build: str = "cortex-m4") -> Cost:

@@ -65,6 +65,7 @@ def as_json(cost: Cost) -> dict[str, Any]:
         "instructions": figures,
         "worst_interrupt": int(cost.interrupts.argmax()),
         "mean_by_part": {name: round(mean, 1) for name, mean in cost.mean_by_part().items()},
+        "worst_by_part": dict(cost.execution.worst_by_part().most_common()),
         "estimated_cycles_of_worst": [round(low * figures["worst"]), round(high * figures["worst"])],
         "fits_at_rate_hz": {str(rate): verdict for rate, verdict in fits(figures["worst"]).items()},
         "stack_bytes": {"background": stack.thread, "interrupt": stack.interrupt, "deepest": stack.deepest,
@@ -80,12 +81,14 @@ def words(costs: Mapping[str, Cost]) -> str:
         made, stack, covered = cost.figures(), cost.execution.stack, cost.execution.coverage().totals()
         total = covered["instructions"]
         parts = ", ".join(f"{name} {mean:.0f}" for name, mean in cost.mean_by_part().items() if mean >= 0.5)
+        worst = ", ".join(f"{name} {count}" for name, count in cost.execution.worst_by_part().most_common() if count)
         rates = ", ".join(f"{rate // 1000} kHz {verdict}" for rate, verdict in fits(made["worst"]).items())
         low, high = CYCLES_PER_INSTRUCTION
         lines += [
             f"{controller}: instructions a control interrupt: typical {made['typical']}, 99 in 100 up to"
             f" {made['of_99_percent']}, worst {made['worst']}",
-            f"  in the mean: {parts}",
+            f"  the mean: {parts}",
+            f"  the worst: {worst}",
             f"  worst in cycles, an estimate: {low * made['worst']:.0f} to {high * made['worst']:.0f}; fits at"
             f" {PROCESSOR_HZ // 1_000_000} MHz: {rates}",
             f"  stack: background {stack.thread} bytes, interrupt {stack.interrupt}, together {stack.deepest}"

@@ -46,8 +46,7 @@ def write_pil_report(out: Path, scenario: Scenario, content: Mapping[str, Any],
         rates=_rows(controllers, {f"worst fits at {int(rate) // 1000} kHz": lambda of, rate=rate:
                                   of["fits_at_rate_hz"][rate]
                                   for rate in next(iter(controllers.values()))["fits_at_rate_hz"]}),
-        parts=_rows(controllers, {part: lambda of, part=part: f"{of['mean_by_part'].get(part, 0):.1f}"
-                                  for part in _parts(controllers)}),
+        parts=_rows(controllers, {part: lambda of, part=part: _of_part(of, part) for part in _parts(controllers)}),
         stack=_rows(controllers, _STACK),
         coverage=_coverage(controllers),
         image=data,
@@ -124,6 +123,11 @@ def _parts(controllers: Mapping[str, Any]) -> list[str]:
     return [part for part in sorted(largest, key=lambda part: -largest[part]) if largest[part] >= 0.05]
 
 
+def _of_part(of: Mapping[str, Any], part: str) -> str:
+    mean, worst = (of[name].get(part, 0) for name in ("mean_by_part", "worst_by_part"))
+    return f"{mean:.1f}, {worst}" if mean >= 0.05 or worst else "–"
+
+
 def _coverage(controllers: Mapping[str, Any]) -> str:
     files = next(iter(controllers.values()))["coverage"]["files"]
     rows = {"all": None} | {file: file for file in files}
@@ -169,7 +173,7 @@ takes how many (the count is logarithmic); and the mean by the part of the firmw
 </figure>
 
 <h2>By part</h2>
-<div class="tables"><table><thead><tr><th>instructions an interrupt, mean</th>$heads</tr></thead><tbody>
+<div class="tables"><table><thead><tr><th>instructions of an interrupt: mean, worst</th>$heads</tr></thead><tbody>
 $parts
 </tbody></table></div>
 <p>A part is a source file of the firmware: what the compiler inlines counts for the file that it was written in,
