@@ -93,12 +93,6 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _pil(options: argparse.Namespace) -> int:
-    from salient.pil import run
-
-    return run(options)
-
-
 def _log(options: argparse.Namespace) -> int:
     from salient.watch import record
 
@@ -129,17 +123,23 @@ def _machine(options: argparse.Namespace) -> int:
     return run(options.machine, options.out)
 
 
+def _pil(options: argparse.Namespace) -> int:
+    from salient.pil import run
+
+    return run(options)
+
+
 _COMMANDS = {
     "demo": _demo,
     "test": _test,
     "sim": _sim,
     "run": _run,
-    "pil": _pil,
     "log": _log,
     "monitor": _monitor,
     "bench": _bench,
     "compare": _compare,
     "machine": _machine,
+    "pil": _pil,
 }
 
 if __name__ == "__main__":

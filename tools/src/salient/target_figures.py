@@ -1,0 +1,132 @@
+"""The committed figures of the target: what the firmware takes of flash, RAM and stack in each build, and what a
+control interrupt costs. `salient pil --figures` measures them again and writes the file; tests/target holds the builds
+against it."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from salient import worst_case
+from salient.arguments import CONTROLLERS
+from salient.errors import UsageError
+from salient.image import Image
+from salient.interrupt_cost import Cost, measure
+from salient.object_code import deepest_stack, size
+from salient.paths import BUILD, ROOT
+from salient.pil import CYCLES_PER_INSTRUCTION, RATES_HZ, fits
+from salient.simulator import TARGET_BUILDS, image
+
+FILE = ROOT / "tests" / "target" / "figures.toml"
+MACHINE = "saturating"
+FLASH_MAX_BYTES = 32 * 1024
+"""Of the firmware with one machine's tables; cmake/check_size.cmake holds the builds to it."""
+RAM_MAX_BYTES = 8 * 1024
+"""Variables and stack."""
+
+Figures = dict[str, dict[str, dict[str, int]]]
+
+
+def sizes(build: str) -> dict[str, int]:
+    """Bytes of a build's image and, where the build makes it, of the firmware alone (firmware.o: linked as the image
+    is, without port and C library). The stack is the most that background and interrupt can take together."""
+    whole = Image(image(MACHINE, build))
+    of = size(whole)
+    alone = firmware_object(build)
+    background, interrupt = (deepest_stack(whole, function)[0] for function in ("program_start", "control_handler"))
+    figures = {"flash": of.flash, "ram": of.ram, "stack_background": background,
+               "stack_interrupt": interrupt + whole.exception_frame_bytes}
+    return ({"firmware": size(Image(alone)).flash} if alone.exists() else {}) | figures
+
+
+def firmware_object(build: str) -> Path:
+    """The firmware linked with one machine's tables, not made by every build."""
+    return BUILD / build / "firmware" / "firmware.o"
+
+
+def cost_figures(cost: Cost, dearest: Cost) -> dict[str, int]:
+    """Of the paper's two experiments and of the dearest input known."""
+    return cost.figures() | {"searched": dearest.figures()["worst"]}
+
+
+def measured() -> tuple[Figures, dict[str, Cost], dict[str, Cost]]:
+    """All figures, and the costs that they are from: of the two experiments by controller, of the dearest inputs by
+    kind."""
+    costs = {controller: measure(controller) for controller in CONTROLLERS}
+    dearest = {kind: worst_case.replay(worst_case.read_input(worst_case.committed(kind))) for kind in worst_case.KINDS}
+    interrupts = {controller: cost_figures(cost, dearest[controller]) for controller, cost in costs.items()}
+    interrupts[worst_case.TRIM] = {"searched": dearest[worst_case.TRIM].figures()["worst"]}
+    return {"size": {build: sizes(build) for build in TARGET_BUILDS}, "interrupt": interrupts}, costs, dearest
+
+
+def read() -> Figures:
+    """The committed ones."""
+    with FILE.open("rb") as file:
+        return tomllib.load(file)
+
+
+def measure_and_write() -> int:
+    """Builds all targets, measures, writes FILE and prints the tables; 0. UsageError when a build fails."""
+    from salient.checks import build_preset
+
+    for build in TARGET_BUILDS:
+        if not build_preset(build):
+            raise UsageError(f"{build}: the build failed")
+    figures, costs, dearest = measured()
+    lines = ["# Bytes by build, instructions of a control interrupt by controller: by tools/salient pil --figures."]
+    for kind, tables in figures.items():
+        for name, values in tables.items():
+            lines += ["", f"[{kind}.{name}]", *(f"{key} = {value}" for key, value in values.items())]
+    FILE.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(f"{size_table(figures['size'])}\n\n{cost_table(figures['interrupt'])}\n\n{part_table(costs, dearest)}\n\n"
+          f"{rate_table(figures['interrupt'])}\n\nwritten to {FILE.relative_to(ROOT)}")
+    return 0
+
+
+def size_table(of: Mapping[str, Mapping[str, int]]) -> str:
+    """Bytes by build."""
+    rows = [(build, values.get("firmware", "–"), values["flash"], values["ram"], values["stack_background"],
+             values["stack_interrupt"], values["ram"] + values["stack_background"] + values["stack_interrupt"])
+            for build, values in of.items()]
+    return _table(("bytes", "firmware, one machine's tables", "image", "variables", "stack: background", "interrupt",
+                   "RAM in all"), rows)
+
+
+def cost_table(of: Mapping[str, Mapping[str, int]]) -> str:
+    """Instructions of an interrupt by controller."""
+    names = ("typical", "of_99_percent", "worst", "searched")
+    return _table(("instructions", "typical", "99 in 100 up to", "worst", "worst found"),
+                  [(kind, *(values.get(name, "–") for name in names)) for kind, values in of.items()])
+
+
+def part_table(costs: Mapping[str, Cost], dearest: Mapping[str, Cost]) -> str:
+    """Instructions by part, in the mean of the experiments and in the dearest interrupt known."""
+    parts: dict[str, list[Any]] = {}
+    columns = [cost.mean_by_part() for cost in costs.values()]
+    columns = [column for controller, mean in zip(costs, columns, strict=True)
+               for column in (mean, dearest[controller].execution.worst_by_part())]
+    names = sorted(set().union(*columns), key=lambda name: -max(column.get(name, 0) for column in columns))
+    for name in names:
+        row = [round(column.get(name, 0)) for column in columns]
+        if max(row) > 0:
+            parts[name] = [cell or "–" for cell in row]
+    heads = [f"{controller}, {what}" for controller in costs for what in ("mean", "dearest")]
+    return _table(("part", *heads), [(name, *row) for name, row in parts.items()])
+
+
+def rate_table(of: Mapping[str, Mapping[str, int]]) -> str:
+    """Which control rate the dearest interrupt known fits in."""
+    low, high = CYCLES_PER_INSTRUCTION
+    rows = []
+    for kind, values in of.items():
+        verdicts = fits(values["searched"])
+        rows.append((kind, f"{low * values['searched']:.0f} to {high * values['searched']:.0f}",
+                     *(verdicts[rate] for rate in RATES_HZ)))
+    return _table(("at 170 MHz", "cycles of the worst found", *(f"{rate // 1000} kHz" for rate in RATES_HZ)), rows)
+
+
+def _table(heads: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
+    lines = [heads, ("---",) * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(map(str, row))} |" for row in lines)
