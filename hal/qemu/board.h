@@ -2,7 +2,7 @@
  * of hal_time.h, the processor's vectors or their like, and a linker script memory.ld.
  *
  * Who counts instructions knows the control interrupt's ends by their names: control_handler is the handler's first
- * instruction, control_handler_return its last.
+ * instruction; at control_handler_return it begins its end, which has no jump before the return and lies within a page.
  */
 #ifndef BOARD_H
 #define BOARD_H
@@ -19,7 +19,7 @@ void program_interrupt(void);
 /* Lets board_interrupt_pend act. */
 void board_interrupt_enable(void);
 
-/* Asks for the control interrupt, as the timer would. Unless interrupts are kept out it is over when this returns. */
+/* Asks for the control interrupt, as the timer would; not in a critical section. It is over when this returns. */
 void board_interrupt_pend(void);
 
 /* Ends QEMU with an exit code, 0..255. */

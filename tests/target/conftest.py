@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from salient.simulator import TARGET_BUILDS
 from salient.target_figures import size_table
 
 _PROPERTY = "control_periods"
@@ -18,4 +19,4 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     compared = sum(value for report in terminalreporter.stats.get("passed", [])
                    for name, value in report.user_properties if name == _PROPERTY)
     if compared:
-        terminalreporter.write_line(f"control periods compared between host and Cortex-M4, all equal: {compared:,}")
+        terminalreporter.write_line(f"control periods of {', '.join(TARGET_BUILDS)} equal to the host's: {compared:,}")

@@ -66,7 +66,7 @@ def test_a_drive_that_ends_in_a_fault_is_exit_code_1(tmp_path, capsys):
     path = tmp_path / "fault.toml"
     path.write_text(SCENARIO + "[parameters]\ncurrent_trip_A = 2\n")
     assert pil.run(options(scenario=path, out=tmp_path / "out")) == 1
-    assert "the drive ended in a fault: traditional: over_current" in capsys.readouterr().out
+    assert "the drive ended in a fault: salient: over_current" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("given", [{}, {"search": 1.0, "figures": True}])

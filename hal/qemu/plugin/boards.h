@@ -34,6 +34,16 @@ static const board_description_t boards[] = {
         .mailbox_offset = 0,
         .network_card = "lan9118",
     },
+    {
+        .elf_machine = EM_RISCV,
+        .target = "riscv32",
+        .program = "qemu-system-riscv32",
+        .package = "qemu-system-misc",
+        .machine = "virt",
+        .memory_address = 0x80000000, /* all of the board's RAM; the device tree that QEMU puts there is at 16 MiB */
+        .memory_bytes = 32 * 1024 * 1024,
+        .mailbox_offset = 8 * 1024 * 1024,
+    },
 };
 
 #define BOARD_COUNT (sizeof boards / sizeof boards[0])

@@ -6,7 +6,7 @@
  * execution=FILE and stack=END-BEGIN, see execution.h; argument=TEXT, a word of the host executable's command line,
  * repeated in order.
  */
-#define _POSIX_C_SOURCE 200809L
+#define _DEFAULT_SOURCE /* on_exit */
 
 #include <errno.h>
 #include <fcntl.h>
@@ -49,6 +49,21 @@ static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, 
         mailbox->exit_code = BENCH_EXIT_MISTAKE;
     }
     counting = following = false;
+}
+
+/* Where the drive ended QEMU before it was told to, says why. What the bench has recorded until then is kept. */
+static void ended(int exit_code, void *context) {
+    (void)context;
+    if (mailbox->event == MAILBOX_EXIT) {
+        return;
+    }
+    if (exit_code == MAILBOX_EXIT_FAULT) {
+        fputs("salient: the drive's program ended at a fault of its processor\n", stderr);
+    } else if (exit_code == MAILBOX_EXIT_LAYOUT) {
+        fputs("salient: the drive's image has another mailbox than this program: build both from the same sources\n",
+              stderr);
+    }
+    world_abandon();
 }
 
 static void translate(qemu_plugin_id_t id, struct qemu_plugin_tb *tb) {
@@ -132,6 +147,7 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
     if (result != OPTIONS_RUN || !world_open(mailbox, &options)) {
         exit(result == OPTIONS_HELP ? 0 : BENCH_EXIT_MISTAKE);
     }
+    on_exit(ended, NULL);
     counting = instructions_path;
     following = execution_path;
     if ((counting && !instructions_open(instructions_path)) || (following && !execution_open(execution_path, stack))) {

@@ -78,6 +78,10 @@ bool world_open(mailbox_t *shared, const options_t *options) {
     return true;
 }
 
+void world_abandon(void) {
+    bench_close(&bench);
+}
+
 void world_serve(void) {
     if (mailbox->compare_written) {
         mailbox->compare_written = 0;

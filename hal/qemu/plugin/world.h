@@ -17,6 +17,9 @@
 /* Opens the bench and fills the mailbox, before the drive starts. Keeps both. False: one line on stderr said why. */
 bool world_open(mailbox_t *mailbox, const options_t *options);
 
+/* Closes the bench of a drive that ended before MAILBOX_EXIT. */
+void world_abandon(void);
+
 /* Does the command that the doorbell has. After MAILBOX_EXIT there is no world any more. */
 void world_serve(void);
 

@@ -14,8 +14,8 @@ CONTROLLERS = ("traditional", "paper", "salient")
 CONTROL_RATES_HZ = (20_000, 40_000, 50_000, 100_000, 1_000_000)
 ENCODER_BITS = (0, *range(8, 25))
 ADC_BITS = (12, 13, 14, 15, 16)
-TARGETS = ("host", "cortex-m4")
-"""Where the firmware runs: in the bench's own process, or on a Cortex-M4 that QEMU emulates."""
+TARGETS = ("host", "cortex-m4", "rv32")
+"""Where the firmware runs: in the bench's own process, or on a Cortex-M4 or RV32 that QEMU emulates."""
 LOG_SUFFIXES = (".blf", ".log")
 
 
@@ -116,13 +116,13 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-TEST_STEPS = ("style", "unit", "sanitize", "cortex-m4", "hil", "socketcan")
+TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "socketcan")
 """The steps of `test`, in order."""
 
 
 def _add_target(command: argparse.ArgumentParser) -> None:
     command.add_argument("--target", type=_one_of(TARGETS), default="host", metavar="NAME",
-                         help="host (default) or cortex-m4: the same firmware in QEMU")
+                         help="host (default), or cortex-m4 or rv32: the same firmware in QEMU")
 
 
 def _one_of(allowed: tuple):

@@ -107,8 +107,8 @@ def _sanitize() -> Count:
     return count
 
 
-def _cortex_m4() -> Count:
-    """the firmware for Cortex-M4: compiled in three ways, its symbols and size checked, and run in QEMU."""
+def _target() -> Count:
+    """the firmware for Cortex-M4 (compiled in three ways) and RV32: its symbols and size checked, run in QEMU."""
     count = Count()
     for preset in TARGET_BUILDS:
         count += _one(build_preset(preset))
@@ -134,7 +134,7 @@ STEPS = {
     "style": _style,
     "unit": _unit,
     "sanitize": _sanitize,
-    "cortex-m4": _cortex_m4,
+    "target": _target,
     "hil": _hil,
     "socketcan": _socketcan,
 }

@@ -1,4 +1,4 @@
-"""Starts a drive and its bench in one process: the host executable, or QEMU with the image for the Cortex-M4."""
+"""Starts a drive and its bench in one process: the host executable, or QEMU with an image for one of its boards."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from salient.session import Session
 
 _END_TIMEOUT_S = 60.0
 
-TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os")
-"""The image for the Cortex-M4 as it is meant to be, without optimisation, and optimised for size."""
+TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os", "rv32")
+"""The image for the Cortex-M4 as it is meant to be, without optimisation, and optimised for size; that for RV32."""
 
 
 class SimulatorError(Exception):
@@ -37,9 +37,9 @@ class SimulatorOptions:
     the encoder's edges. adc_bits: 12..16. immediate_pwm: what the control writes acts at once, as with no converter
     there is; it is for the conditions of simulations. record: file for the true state
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
-    period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a Cortex-M4 in QEMU. instructions: file
+    period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a board of QEMU. instructions: file
     for the instructions of each control interrupt, uint32 little endian; execution: file for what the processor did,
-    as salient.execution reads it; both on a target only.
+    as salient.execution reads it; both in QEMU only.
     """
 
     machine: str = "saturating"
@@ -115,7 +115,7 @@ def executable(machine: str, build: str = "host") -> Path:
         if path.parent != MACHINES:
             _build_foreign(path, program, preset)
         if not program.exists():
-            builder = "tools/salient test --only cortex-m4" if build in TARGET_BUILDS else "any tools/salient command"
+            builder = "tools/salient test --only target" if build in TARGET_BUILDS else "any tools/salient command"
             raise UsageError(f"{program.relative_to(ROOT)} is not built; {builder} builds it")
     return programs[0]
 
