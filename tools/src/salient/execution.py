@@ -16,9 +16,9 @@ from salient.image import Image, Instruction, Place
 
 PORT = "port"
 """The part that is not firmware: handler, HAL."""
-_HELPERS = ("firmware/fixed/", "/", "?")
-"""What counts for the part that uses it, by the beginning of the source's path: arithmetic, and what is not in the
-repository, the compiler's and the C library's."""
+_HELPERS = ("firmware/fixed/", "hal/rv32_virt/memory.c", "/", "?")
+"""What counts for the part that uses it, by the beginning of the source's path: arithmetic, memcpy and memset where the
+board has its own, and what is not in the repository, the compiler's and the C library's."""
 _NOT_FIRMWARE = ("hal/", "/", "?")
 
 
@@ -159,7 +159,10 @@ def read_execution(path: Path, image: Path) -> Execution:
     for line in path.read_text(encoding="utf-8").splitlines():
         kind, *words = line.split()
         if kind == "block":
-            first, size = place_of[int(words[0], 16)], int(words[1])
+            address, size = int(words[0], 16), int(words[1])
+            if address not in place_of:
+                continue  # the board's own, before the image
+            first = place_of[address]
             times = [int(word) for word in words[2:]]
             counts[:, first] += times
             counts[:, first + size] -= times

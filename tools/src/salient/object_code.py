@@ -16,10 +16,11 @@ _SOFT_FLOAT = re.compile(r"__aeabi_(c?[fd]|u?[il]2[fd]|h2f).*|__(fix|float|exten
 _LIBRARY = {"memcpy", "memset"}
 """All that the firmware may call of the C library."""
 _HEAP = re.compile(r"_?(malloc|calloc|realloc|free|sbrk)(_r)?")
-_INDIRECT = re.compile(r"(blx|bx)\s+(?!lr)|(jalr|jr)\s+(?!ra\b)")
+_INDIRECT = re.compile(r"(blx|bx)\s+(?!lr)|jalr\s")
+"""RISC-V's jr is left out: so a switch jumps through its table, as the Cortex-M4's does by tbb."""
 _PUSHED = re.compile(r"(?:push(?:\.w)?\s+|stmdb(?:\.w)?\s+sp!,\s*)\{([^}]*)\}")
 _LOWERED = re.compile(r"sub(?:\.w|w|s)?\s+sp,\s*(?:sp,\s*)?#(\d+)|str(?:d|\.w)?\s+.*\[sp, #-(\d+)\]!"
-                      r"|addi\s+sp,\s*sp,\s*-(\d+)")
+                      r"|addi?\s+sp,\s*sp,\s*-(\d+)")
 _WORD_BYTES = 4
 
 

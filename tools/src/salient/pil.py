@@ -55,26 +55,34 @@ def fits(instructions: int) -> dict[int, str]:
             for rate, (low, high) in shares_of_period(instructions).items()}
 
 
-def as_json(cost: Cost) -> dict[str, Any]:
+def estimable(target: str) -> bool:
+    """Whether CYCLES_PER_INSTRUCTION are this processor's."""
+    return target.startswith("cortex-m4")
+
+
+def as_json(cost: Cost, target: str) -> dict[str, Any]:
     """The figures of processor.json for one controller."""
     figures = cost.figures()
     stack = cost.execution.stack
     low, high = CYCLES_PER_INSTRUCTION
+    estimate = {
+        "estimated_cycles_of_worst": [round(low * figures["worst"]), round(high * figures["worst"])],
+        "fits_at_rate_hz": {str(rate): verdict for rate, verdict in fits(figures["worst"]).items()},
+    }
     return {
         "interrupts": len(cost.interrupts),
         "instructions": figures,
         "worst_interrupt": int(cost.interrupts.argmax()),
         "mean_by_part": {name: round(mean, 1) for name, mean in cost.mean_by_part().items()},
         "worst_by_part": dict(cost.execution.worst_by_part().most_common()),
-        "estimated_cycles_of_worst": [round(low * figures["worst"]), round(high * figures["worst"])],
-        "fits_at_rate_hz": {str(rate): verdict for rate, verdict in fits(figures["worst"]).items()},
+        **(estimate if estimable(target) else {}),
         "stack_bytes": {"background": stack.thread, "interrupt": stack.interrupt, "deepest": stack.deepest,
                         "reserved": stack.reserved},
         "coverage": cost.execution.coverage().as_json(),
     }
 
 
-def words(costs: Mapping[str, Cost]) -> str:
+def words(costs: Mapping[str, Cost], target: str) -> str:
     """The figures of every controller for a terminal."""
     lines = []
     for controller, cost in costs.items():
@@ -89,8 +97,8 @@ def words(costs: Mapping[str, Cost]) -> str:
             f" {made['of_99_percent']}, worst {made['worst']}",
             f"  the mean: {parts}",
             f"  the worst: {worst}",
-            f"  worst in cycles, an estimate: {low * made['worst']:.0f} to {high * made['worst']:.0f}; fits at"
-            f" {PROCESSOR_HZ // 1_000_000} MHz: {rates}",
+            *([f"  worst in cycles, an estimate: {low * made['worst']:.0f} to {high * made['worst']:.0f}; fits at"
+               f" {PROCESSOR_HZ // 1_000_000} MHz: {rates}"] if estimable(target) else []),
             f"  stack: background {stack.thread} bytes, interrupt {stack.interrupt}, together {stack.deepest}"
             f" of {stack.reserved} reserved",
             f"  object code: of {total} instructions {100 * covered['executed'] / total:.0f} % executed,"
@@ -111,10 +119,10 @@ def _run_scenario(path: Path, out: Path, target: str) -> int:
             scenario, out / scenario.controller, target)
     write_summaries(scenarios, results, out)
     content = {"schema": 1, "target": target, "control_rate_hz": scenarios[0].control_rate_hz,
-               "controllers": {controller: as_json(cost) for controller, cost in costs.items()}}
+               "controllers": {controller: as_json(cost, target) for controller, cost in costs.items()}}
     (out / "processor.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     write_pil_report(out, scenarios[0], content, {name: cost.interrupts for name, cost in costs.items()})
-    print(f"{words(costs)}\n\nresults: {out / 'results.json'}, {out / 'processor.json'}\n"
+    print(f"{words(costs, target)}\n\nresults: {out / 'results.json'}, {out / 'processor.json'}\n"
           f"report:  {out / 'report.html'}")
     faults = [f"{controller}: {result.fault}" for controller, result in results.items() if result.fault != "none"]
     if faults:
