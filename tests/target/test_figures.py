@@ -11,10 +11,20 @@ import pytest
 
 from salient import worst_case
 from salient.arguments import CONTROLLERS
+from salient.errors import UsageError
 from salient.execution import Execution
 from salient.interrupt_cost import Cost, measure
 from salient.simulator import TARGET_BUILDS
-from salient.target_figures import FLASH_MAX_BYTES, RAM_MAX_BYTES, read, size_table, sizes
+from salient.target_figures import (
+    FLASH_MAX_BYTES,
+    RAM_MAX_BYTES,
+    README,
+    read,
+    size_table,
+    sizes,
+    tables_of,
+    with_table,
+)
 
 LIMITED_BUILDS = ("cortex-m4", "cortex-m4-Os")
 """That anybody would flash."""
@@ -96,3 +106,16 @@ def test_these_runs_execute_nearly_every_instruction_of_the_laws():
     background = [of for file, of in files.items() if file.startswith("firmware/comms/")]
     assert not any(of.in_interrupts for of in background)
     assert sum(of.executed for of in background) > 0
+
+
+def test_the_tables_of_the_readme_are_the_committed_figures():
+    text = README.read_text(encoding="utf-8")
+    for table in tables_of(read()):
+        assert table in text
+
+
+def test_a_table_is_written_in_the_place_of_the_one_with_its_heads():
+    text = "a\n| x | y |\n| --- | --- |\n| 1 | 2 |\n| 3 | 4 |\n\nb\n"
+    assert with_table(text, "| x | y |\n| --- | --- |\n| 5 | 6 |") == "a\n| x | y |\n| --- | --- |\n| 5 | 6 |\n\nb\n"
+    with pytest.raises(UsageError, match="no table with the heads \\| z \\|"):
+        with_table(text, "| z |\n| --- |\n| 5 |")

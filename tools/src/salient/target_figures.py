@@ -1,6 +1,6 @@
 """The committed figures of the target: what the firmware takes of flash, RAM and stack in each build, and what a
-control interrupt costs. `salient pil --figures` measures them again and writes the file; tests/target holds the builds
-against it."""
+control interrupt costs. `salient pil --figures` measures them again and writes them here and in the README;
+tests/target holds the builds against them."""
 
 from __future__ import annotations
 
@@ -21,10 +21,14 @@ from salient.simulator import TARGET_BUILDS, image
 
 FILE = ROOT / "tests" / "target" / "figures.toml"
 MACHINE = "saturating"
+README = ROOT / "README.md"
 FLASH_MAX_BYTES = 32 * 1024
 """Of the firmware with one machine's tables; cmake/check_size.cmake holds the builds to it."""
 RAM_MAX_BYTES = 8 * 1024
 """Variables and stack."""
+
+_PART_SHOWN = 100
+"""Instructions; what takes less everywhere is added up."""
 
 Figures = dict[str, dict[str, dict[str, int]]]
 
@@ -68,7 +72,8 @@ def read() -> Figures:
 
 
 def measure_and_write() -> int:
-    """Builds all targets, measures, writes FILE and prints the tables; 0. UsageError when a build fails."""
+    """Builds all targets, measures, writes FILE and the README's tables and prints them; 0. UsageError when a build
+    fails."""
     from salient.checks import build_preset
 
     for build in TARGET_BUILDS:
@@ -80,9 +85,30 @@ def measure_and_write() -> int:
         for name, values in tables.items():
             lines += ["", f"[{kind}.{name}]", *(f"{key} = {value}" for key, value in values.items())]
     FILE.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(f"{size_table(figures['size'])}\n\n{cost_table(figures['interrupt'])}\n\n{part_table(costs, dearest)}\n\n"
-          f"{rate_table(figures['interrupt'])}\n\nwritten to {FILE.relative_to(ROOT)}")
+    tables = [*tables_of(figures), part_table(costs, dearest)]
+    text = README.read_text(encoding="utf-8")
+    for table in tables:
+        text = with_table(text, table)
+    README.write_text(text, encoding="utf-8")
+    print("\n\n".join(tables))
+    print(f"\nwritten to {FILE.relative_to(ROOT)} and {README.relative_to(ROOT)}")
     return 0
+
+
+def with_table(text: str, table: str) -> str:
+    """A Markdown text with the table in the place of the one that has the same heads. UsageError: it has none."""
+    head = table.partition("\n")[0]
+    before, found, rest = text.partition(f"{head}\n")
+    if not found:
+        raise UsageError(f"{README.name}: no table with the heads {head}")
+    lines = rest.splitlines(keepends=True)
+    length = next((i for i, line in enumerate(lines) if not line.startswith("|")), len(lines))
+    return before + table + "\n" + "".join(lines[length:])
+
+
+def tables_of(figures: Figures) -> list[str]:
+    """Those that the committed figures make."""
+    return [size_table(figures["size"]), cost_table(figures["interrupt"]), rate_table(figures["interrupt"])]
 
 
 def size_table(of: Mapping[str, Mapping[str, int]]) -> str:
@@ -90,30 +116,29 @@ def size_table(of: Mapping[str, Mapping[str, int]]) -> str:
     rows = [(build, values.get("firmware", "–"), values["flash"], values["ram"], values["stack_background"],
              values["stack_interrupt"], values["ram"] + values["stack_background"] + values["stack_interrupt"])
             for build, values in of.items()]
-    return _table(("bytes", "firmware, one machine's tables", "image", "variables", "stack: background", "interrupt",
-                   "RAM in all"), rows)
+    return _table(("bytes", "firmware with a machine's tables", "image", "variables", "stack: background",
+                   "interrupt", "RAM in all"), rows)
 
 
 def cost_table(of: Mapping[str, Mapping[str, int]]) -> str:
     """Instructions of an interrupt by controller."""
     names = ("typical", "of_99_percent", "worst", "searched")
-    return _table(("instructions", "typical", "99 in 100 up to", "worst", "worst found"),
-                  [(kind, *(values.get(name, "–") for name in names)) for kind, values in of.items()])
+    return _table(("instructions", "typical", "99 in 100 up to", "worst", "dearest known"),
+                  [(_name(kind), *(values.get(name, "–") for name in names)) for kind, values in of.items()])
 
 
 def part_table(costs: Mapping[str, Cost], dearest: Mapping[str, Cost]) -> str:
     """Instructions by part, in the mean of the experiments and in the dearest interrupt known."""
-    parts: dict[str, list[Any]] = {}
-    columns = [cost.mean_by_part() for cost in costs.values()]
-    columns = [column for controller, mean in zip(costs, columns, strict=True)
-               for column in (mean, dearest[controller].execution.worst_by_part())]
-    names = sorted(set().union(*columns), key=lambda name: -max(column.get(name, 0) for column in columns))
-    for name in names:
-        row = [round(column.get(name, 0)) for column in columns]
-        if max(row) > 0:
-            parts[name] = [cell or "–" for cell in row]
-    heads = [f"{controller}, {what}" for controller in costs for what in ("mean", "dearest")]
-    return _table(("part", *heads), [(name, *row) for name, row in parts.items()])
+    columns: list[Mapping[str, float]] = []
+    for controller, cost in costs.items():
+        columns += [cost.mean_by_part(), dearest[controller].execution.worst_by_part()]
+    largest = {name: max(column.get(name, 0) for column in columns) for name in set().union(*columns)}
+    shown = sorted((name for name, most in largest.items() if most >= _PART_SHOWN), key=lambda name: -largest[name])
+    rows = [(name, *(round(column.get(name, 0)) for column in columns)) for name in shown]
+    rows.append(("all else", *(round(sum(count for name, count in column.items() if name not in shown))
+                               for column in columns)))
+    return _table(("instructions by part", *(f"{controller}, {what}" for controller in costs
+                                             for what in ("mean", "dearest"))), rows)
 
 
 def rate_table(of: Mapping[str, Mapping[str, int]]) -> str:
@@ -122,9 +147,13 @@ def rate_table(of: Mapping[str, Mapping[str, int]]) -> str:
     rows = []
     for kind, values in of.items():
         verdicts = fits(values["searched"])
-        rows.append((kind, f"{low * values['searched']:.0f} to {high * values['searched']:.0f}",
+        rows.append((_name(kind), f"{low * values['searched']:.0f} to {high * values['searched']:.0f}",
                      *(verdicts[rate] for rate in RATES_HZ)))
-    return _table(("at 170 MHz", "cycles of the worst found", *(f"{rate // 1000} kHz" for rate in RATES_HZ)), rows)
+    return _table(("at 170 MHz", "cycles of the dearest", *(f"{rate // 1000} kHz" for rate in RATES_HZ)), rows)
+
+
+def _name(kind: str) -> str:
+    return "salient with the network" if kind == worst_case.TRIM else kind
 
 
 def _table(heads: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
