@@ -74,13 +74,13 @@ def test_the_dearest_interrupt_known_costs_what_is_committed(kind):
 
 
 def test_an_input_that_was_found_is_the_same_when_written_and_read_again(tmp_path):
-    for given in worst_case.directed(worst_case.TRIM):
+    for given in worst_case.directed(worst_case.NETWORK):
         worst_case.write_input(tmp_path / "input.toml", given)
         assert worst_case.read_input(tmp_path / "input.toml") == given
 
 
 def test_a_search_finds_dearer_interrupts_than_it_begins_with():
-    cheap = worst_case.Input("traditional", 1, 0.0, 2.0, (worst_case.Action(0.0, "off"),))
+    cheap = worst_case.Input("saturating", "traditional", 1, 0.0, 2.0, (worst_case.Action(0.0, "off"),))
     begin = worst_case.replay(cheap).figures()["worst"]
     count, found = worst_case.search("traditional", [cheap], seconds=1.0, seed=1)
     assert count > 1.2 * begin
@@ -88,7 +88,9 @@ def test_a_search_finds_dearer_interrupts_than_it_begins_with():
 
 
 def all_runs() -> Execution:
-    costs = [*map(measure_once, CONTROLLERS), *map(dearest, worst_case.KINDS)]
+    """Of one image."""
+    kinds = [kind for kind, of in worst_case.KINDS.items() if of.machine == "saturating"]
+    costs = [*map(measure_once, CONTROLLERS), *map(dearest, kinds)]
     return functools.reduce(operator.add, (cost.execution for cost in costs))
 
 

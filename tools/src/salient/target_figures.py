@@ -61,7 +61,7 @@ def measured() -> tuple[Figures, dict[str, Cost], dict[str, Cost]]:
     costs = {controller: measure(controller) for controller in CONTROLLERS}
     dearest = {kind: worst_case.replay(worst_case.read_input(worst_case.committed(kind))) for kind in worst_case.KINDS}
     interrupts = {controller: cost_figures(cost, dearest[controller]) for controller, cost in costs.items()}
-    interrupts[worst_case.TRIM] = {"searched": dearest[worst_case.TRIM].figures()["worst"]}
+    interrupts |= {kind: {"searched": cost.figures()["worst"]} for kind, cost in dearest.items() if kind not in costs}
     return {"size": {build: sizes(build) for build in TARGET_BUILDS}, "interrupt": interrupts}, costs, dearest
 
 
@@ -124,7 +124,8 @@ def cost_table(of: Mapping[str, Mapping[str, int]]) -> str:
     """Instructions of an interrupt by controller."""
     names = ("typical", "of_99_percent", "worst", "searched")
     return _table(("instructions", "typical", "99 in 100 up to", "worst", "dearest known"),
-                  [(_name(kind), *(values.get(name, "–") for name in names)) for kind, values in of.items()])
+                  [(worst_case.KINDS[kind].label, *(values.get(name, "–") for name in names))
+                   for kind, values in of.items()])
 
 
 def part_table(costs: Mapping[str, Cost], dearest: Mapping[str, Cost]) -> str:
@@ -147,13 +148,9 @@ def rate_table(of: Mapping[str, Mapping[str, int]]) -> str:
     rows = []
     for kind, values in of.items():
         verdicts = fits(values["searched"])
-        rows.append((_name(kind), f"{low * values['searched']:.0f} to {high * values['searched']:.0f}",
+        rows.append((worst_case.KINDS[kind].label, f"{low * values['searched']:.0f} to {high * values['searched']:.0f}",
                      *(verdicts[rate] for rate in RATES_HZ)))
     return _table(("at 170 MHz", "cycles of the dearest", *(f"{rate // 1000} kHz" for rate in RATES_HZ)), rows)
-
-
-def _name(kind: str) -> str:
-    return "salient with the network" if kind == worst_case.TRIM else kind
 
 
 def _table(heads: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:

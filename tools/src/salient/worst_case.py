@@ -3,6 +3,7 @@ search that changes such lists and keeps what costs more.
 
 An input is a TOML file. Its actions are rows of time in ms, what, and a value where there is one:
 
+    machine = "saturating"
     controller = "salient"
     seed = 1
     initial_angle_deg = 0.0
@@ -38,13 +39,11 @@ from salient.errors import UsageError
 from salient.interrupt_cost import Cost, read_cost
 from salient.paths import ROOT
 from salient.rig import RigError, quantities
-from salient.simulator import SimulatorOptions, image, parameter_table
+from salient.simulator import SimulatorOptions, parameter_table
 from salient.text_file import TextFileError, read_toml
 
 FOLDER = ROOT / "tests" / "target" / "worst"
-TRIM = "salient_trim"
-"""The salient controller with its optional network, which is off by default and costs as much as the paper's."""
-KINDS = (*CONTROLLERS, TRIM)
+NETWORK = "salient_network"
 
 _REQUESTS = ("stop", "off", "clear_fault")
 _CHOSEN = ("controller", "bp_mode", "bp_trim_mode")
@@ -55,6 +54,25 @@ _ACTIONS_MAX = 24
 _COMMANDS_MAX = 40
 _ELITE = 6
 _WORKERS = 2
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What an interrupt is looked for in. network: salient's optional one is on; it is off by default and costs as much
+    as the paper's. label: for tables."""
+
+    label: str
+    controller: str
+    machine: str = "saturating"
+    network: bool = False
+
+
+KINDS = {
+    **{controller: Kind(controller, controller) for controller in CONTROLLERS},
+    NETWORK: Kind("salient with the network", "salient", network=True),
+    **{f"{controller}_four_phases": Kind(f"{controller}, four phases", controller, "finite_element")
+       for controller in CONTROLLERS},
+}
 
 
 @dataclass(frozen=True)
@@ -70,6 +88,7 @@ class Action:
 class Input:
     """What is done, in the order of time; the board is the one that SimulatorOptions describes by default."""
 
+    machine: str
     controller: str
     seed: int
     initial_angle_deg: float
@@ -83,8 +102,8 @@ def read_input(path: Path) -> Input:
     """UsageError for a file that is not one."""
     try:
         data = read_toml(path)
-        return Input(data["controller"], data["seed"], data["initial_angle_deg"], data["duration_ms"],
-                     tuple(Action(*row) for row in data["actions"]))
+        return Input(data["machine"], data["controller"], data["seed"], data["initial_angle_deg"],
+                     data["duration_ms"], tuple(Action(*row) for row in data["actions"]))
     except (TextFileError, KeyError, TypeError) as error:
         raise UsageError(f"{path}: {error}") from None
 
@@ -95,7 +114,8 @@ def write_input(path: Path, found: Input) -> None:
                    for a in found.actions)
     path.write_text(
         "# The dearest control interrupt that was found; tools/salient pil --search looks for dearer ones.\n"
-        f'controller = "{found.controller}"\nseed = {found.seed}\ninitial_angle_deg = {found.initial_angle_deg!r}\n'
+        f'machine = "{found.machine}"\ncontroller = "{found.controller}"\n'
+        f"seed = {found.seed}\ninitial_angle_deg = {found.initial_angle_deg!r}\n"
         f"duration_ms = {found.duration_ms!r}\nactions = [\n{rows}]\n", encoding="utf-8")
 
 
@@ -119,8 +139,8 @@ def _worst(done: Input) -> int:
 
 
 def _board(done: Input, **options) -> SimulatorOptions:
-    return SimulatorOptions(controller=done.controller, seed=done.seed, initial_angle_deg=done.initial_angle_deg,
-                            **{"build": "cortex-m4", **options})
+    return SimulatorOptions(machine=done.machine, controller=done.controller, seed=done.seed,
+                            initial_angle_deg=done.initial_angle_deg, **{"build": "cortex-m4", **options})
 
 
 def _run(done: Input, board: SimulatorOptions) -> None:
@@ -165,9 +185,9 @@ def _rows(controller: str) -> dict[str, ParameterRow]:
 
 def directed(kind: str) -> list[Input]:
     """Inputs that are made to be dear: what is known to happen seldom and all at once. kind: of KINDS."""
-    controller = controller_of(kind)
-    backwards = -400.0 if controller == "salient" else 100.0
-    first = [Action(0.0, "parameter.bp_trim_mode", 3.0)] if kind == TRIM else []
+    of = KINDS[kind]
+    backwards = -400.0 if of.controller == "salient" else 100.0
+    first = [Action(0.0, "parameter.bp_trim_mode", 3.0)] if of.network else []
     quick = [*first, Action(0.0, "bench.inertia_gain", 0.2), Action(1.0, "speed_rpm", 600.0)]
     lists = {
         "load step": [*quick, Action(40.0, "bench.load_torque_Nm", 8.0)],
@@ -198,12 +218,7 @@ def directed(kind: str) -> list[Input]:
                                   Action(0.0, "bench.encoder_eccentricity_deg", 2.0), *quick[len(first):],
                                   Action(40.0, "bench.load_torque_Nm", 8.0)],
     }
-    return [Input(controller, 1, 7.0, 80.0, tuple(actions)) for actions in lists.values()]
-
-
-def controller_of(kind: str) -> str:
-    """Of a kind."""
-    return kind.partition("_")[0]
+    return [Input(of.machine, of.controller, 1, 7.0, 80.0, tuple(actions)) for actions in lists.values()]
 
 
 # --- search ---------------------------------------------------------------------------------------------------------
@@ -344,7 +359,6 @@ def committed(kind: str) -> Path:
 def search_and_write(seconds: float, seed: int) -> int:
     """Searches for every kind, from what is known and the directed inputs on; keeps what is dearer in FOLDER. 0."""
     for kind in KINDS:
-        image("saturating", "cortex-m4")
         known = [read_input(committed(kind))] if committed(kind).exists() else []
         before = _worst(known[0]) if known else 0
 
