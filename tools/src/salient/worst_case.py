@@ -358,6 +358,7 @@ def committed(kind: str) -> Path:
 
 def search_and_write(seconds: float, seed: int) -> int:
     """Searches for every kind, from what is known and the directed inputs on; keeps what is dearer in FOLDER. 0."""
+    wrote = False
     for kind in KINDS:
         known = [read_input(committed(kind))] if committed(kind).exists() else []
         before = _worst(known[0]) if known else 0
@@ -372,4 +373,7 @@ def search_and_write(seconds: float, seed: int) -> int:
             FOLDER.mkdir(exist_ok=True)
             write_input(committed(kind), found)
             print(f"{kind}: written to {committed(kind).relative_to(ROOT)}", flush=True)
+            wrote = True
+    if wrote:
+        print("now tools/salient pil --figures")
     return 0
