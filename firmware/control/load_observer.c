@@ -1,5 +1,6 @@
 #include "control/load_observer.h"
 
+#include "fixed/divide.h"
 #include "fixed/fixed.h"
 
 /* Keeps a wild load estimate (a rotor that was turned by hand, an encoder that jumped) from taking seconds to return:
@@ -20,7 +21,7 @@ static int64_t decay_complement_q31(int64_t y_q31) {
     const int64_t one_q31 = (int64_t)1 << 31;
     int64_t series_q31 = one_q31;
     for (int n = 5; n >= 2; n--) {
-        series_q31 = one_q31 - fixed_shift(y_q31 * series_q31, 31) / n;
+        series_q31 = one_q31 - fixed_divide(fixed_shift(y_q31 * series_q31, 31), n);
     }
     return fixed_shift(y_q31 * series_q31, 31);
 }
@@ -51,7 +52,7 @@ load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t con
     /* Widths in the comments are for the ends of the ranges: p = 1 - q <= 0.4, p rate <= 10000. */
     const int64_t rate = control_rate_hz; /* 20 bits */
     const int64_t one_q31 = (int64_t)1 << 31;
-    const int64_t p_q31 = decay_complement_q31(((int64_t)bandwidth_rad_s << 31) / rate);
+    const int64_t p_q31 = decay_complement_q31(fixed_divide((int64_t)bandwidth_rad_s << 31, rate));
     const int64_t q_q31 = one_q31 - p_q31;
     const int64_t p2_q46 = fixed_shift(p_q31 * p_q31, 16);
     const int64_t p3_q46 = fixed_shift(fixed_shift(p2_q46, 12) * p_q31, 19); /* Q34, 31 bits, * Q31 */
@@ -78,10 +79,10 @@ load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t iner
     const int64_t rate = control_rate_hz;
     return (load_observer_model_t){
         /* Ts / J * 2^-2 * 2^32 = 2^30 / (J rate). */
-        .acceleration_q32 = fixed_saturate(((int64_t)1 << 60) / (inertia_q30 * rate)),
+        .acceleration_q32 = fixed_saturate(fixed_divide((int64_t)1 << 60, inertia_q30 * rate)),
         .friction_q30 = friction_q30,
         /* Ts / (2 pi) * 2^10 * 2^32 = 2^42 / (2 pi rate). */
-        .angle_step_q32 = (int32_t)((((int64_t)1 << 62) / TWO_PI_Q28 * 256) / rate),
+        .angle_step_q32 = (int32_t)fixed_divide(((int64_t)1 << 62) / TWO_PI_Q28 * 256, rate),
     };
 }
 

@@ -21,6 +21,10 @@ typedef struct {
     control_parameters_t control_parameters;
     /* Of the interrupt. */
     control_state_t control;
+    /* The interrupt's time on the processor: nobody acts on it. What a late interrupt does is in drive/protection.h. */
+    uint32_t used_ticks;      /* from trigger to end, of the last one, HAL_PWM_TICK_NS */
+    uint32_t worst_ticks;     /* of the longest since start */
+    uint32_t late_interrupts; /* that ended after the next trigger, since start */
     /* Of the background. */
     const machine_tables_t *tables;
     uint32_t control_rate_hz;
