@@ -1,4 +1,5 @@
 // DITC by duty: who is regulated, how the phases hand over, and that every rotor position starts.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <random>
@@ -50,10 +51,10 @@ ditc_duty_parameters_t parameters_of(bp_pid_mode_t mode) {
     parameters.pid.mode = mode;
     parameters.pid.seed = 1;
     parameters.pid.error_scale_inverse_q24 = 1 << 23;
-    parameters.pid.kp_scale_q15 = 32768;
-    parameters.pid.ki_scale_q15 = 7864;
-    parameters.pid.kd_scale_q15 = 13107;
-    parameters.pid.network = {1638, 1638};
+    parameters.pid.scale_q28[0] = 32768 << 13;
+    parameters.pid.scale_q28[1] = 7864 << 13;
+    parameters.pid.scale_q28[2] = 13107 << 13;
+    parameters.pid.network = {1638, 1638 << 16};
     parameters.hand_over_angle = electrical(210.0);
     parameters.incoming_gain_q20 = 58544; // 40 kHz, 358 A/ms
     parameters.surplus_q20 = 1 << 16;
@@ -240,7 +241,7 @@ TEST_F(DitcDuty, the_pid_moves_on_when_the_outgoing_phase_must_go_and_starts_fro
     }
     ASSERT_EQ(ditc.regulated, 0u);
     // The same sample again, past 348 degrees. Errors held, so that the PID's increment is known.
-    parameters.pid.kp_scale_q15 = parameters.pid.ki_scale_q15 = parameters.pid.kd_scale_q15 = 0;
+    std::fill_n(parameters.pid.scale_q28, BP_OUTPUTS, 0);
     step(commutation_of(347.99), 3.0);
     const int32_t incoming_q15 = duty_q15[1];
     ASSERT_NE(incoming_q15, duty_q15[0]);
