@@ -46,7 +46,7 @@ void bp_network_forward(bp_network_t *network, const int32_t input_q27[BP_INPUTS
 void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *network, int32_t error_q16,
                       const int32_t sensitivity_q31[BP_OUTPUTS]) {
     const int32_t rate_q31 = parameters->learning_rate_q15 * error_q16;
-    const int32_t inertia_q31 = parameters->inertia_q31;
+    const int32_t inertia_q32 = parameters->inertia_q32;
     int32_t delta_q32[BP_OUTPUTS], input_q31[BP_INPUTS]; /* eta d3, and x */
 #pragma GCC unroll 3
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
@@ -59,8 +59,8 @@ void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *n
         bp_neuron_t *neuron = &network->hidden[i];
         const int32_t value_q27 = neuron->value_q27;
         /* The hidden layer learns through the output weights as they were in this sample: before those move. */
-        const int32_t back_q28 = triple_dot_and_move(&neuron->output, delta_q32, value_q27, inertia_q31);
+        const int32_t back_q28 = triple_dot_and_move(&neuron->output, delta_q32, value_q27, inertia_q32);
         const int32_t rate_q28 = high_product(back_q28, sigmoid_symmetric_slope_q32(value_q27)); /* eta d2 */
-        triple_move(&neuron->input, input_q31, rate_q28, inertia_q31);
+        triple_move(&neuron->input, input_q31, rate_q28, inertia_q32);
     }
 }

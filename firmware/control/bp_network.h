@@ -8,8 +8,8 @@
  *   d2_i = f'(net2_i) sum_l d3_l W3_li
  *
  * Formats: inputs and hidden activations Q4.27, outputs Q3.28; weights Q3.28 held within +-8 (saturation), their
- * increments Q4.27 held within +-16; sums of a layer Q8.23, within 6 * 8. Every product is rounded to the format of
- * its sum: see fixed/high_product.h.
+ * increments Q4.27; sums of a layer Q8.23, within 6 * 8. Every product is rounded to the format of its sum: see
+ * fixed/high_product.h. |eta d2| <= 3 / 2 * 8 / 4 = 3, so that with alpha < 1/2 an increment stays within 6.
  */
 #ifndef CONTROL_BP_NETWORK_H
 #define CONTROL_BP_NETWORK_H
@@ -24,7 +24,7 @@
 
 typedef struct {
     int32_t learning_rate_q15; /* eta, Q1.15, 0..1 */
-    int32_t inertia_q31;       /* alpha, Q0.31, 0..1 */
+    int32_t inertia_q32;       /* alpha, Q32, 0..1/2 - 2^-32 */
 } bp_network_parameters_t;
 
 /* A hidden neuron with its weights in Q3.28 and their changes in Q4.27. */

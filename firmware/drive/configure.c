@@ -99,7 +99,7 @@ static bp_pid_parameters_t bp_pid_from(const int32_t *values, parameter_index_t 
         .error_scale_inverse_q24 = fixed_saturate(((int64_t)1 << 48) / values[PARAMETER_BP_ERROR_SCALE_NM]),
         .scale_q28 = {kp_scale_q15 << 13, ki_scale_q15 << 13, kd_scale_q15 << 13},
         .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
-                    .inertia_q31 = values[PARAMETER_BP_ALPHA] << 3},
+                    .inertia_q32 = values[PARAMETER_BP_ALPHA] << 4},
     };
 }
 

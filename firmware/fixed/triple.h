@@ -17,15 +17,12 @@
 #if TRIPLE_IN_REGISTERS
 /* The direction is in r8 to r10, the values in r1 to r3, their changes in r4 to r6. */
 #define TRIPLE_MOVE(scale, inertia)                                                                                    \
-    "smmulr r8, r8, " scale "\n\t"                                                                                     \
-    "smmulr r9, r9, " scale "\n\t"                                                                                     \
-    "smmulr r10, r10, " scale "\n\t"                                                                                   \
     "smmulr r4, r4, " inertia "\n\t"                                                                                   \
     "smmulr r5, r5, " inertia "\n\t"                                                                                   \
     "smmulr r6, r6, " inertia "\n\t"                                                                                   \
-    "qdadd r4, r8, r4\n\t"                                                                                             \
-    "qdadd r5, r9, r5\n\t"                                                                                             \
-    "qdadd r6, r10, r6\n\t"                                                                                            \
+    "smmlar r4, r8, " scale ", r4\n\t"                                                                                 \
+    "smmlar r5, r9, " scale ", r5\n\t"                                                                                 \
+    "smmlar r6, r10, " scale ", r6\n\t"                                                                                \
     "qdadd r1, r1, r4\n\t"                                                                                             \
     "qdadd r2, r2, r5\n\t"                                                                                             \
     "qdadd r3, r3, r6\n\t"
@@ -72,22 +69,21 @@ static inline void triple_add_scaled(int32_t sum[3], const int32_t a[3], int32_t
 #endif
 }
 
-/* change_k = inertia change_k + scale direction_k, value_k = value_k + 2 change_k, all saturated: with one fraction bit
- * less in the changes, an inertia in Q31 is a factor of up to 1. scale direction_k / 2^32 has the format of the
- * changes; products are rounded. */
+/* change_k = inertia change_k + scale direction_k / 2^32, each product rounded, which the caller knows to fit in a
+ * word; value_k = value_k + 2 change_k, saturated. Inertia: Q32, -1/2..1/2 - 2^-32, so that what is left of a change
+ * without a scale dies out. */
 static inline void triple_move(triple_moving_t *moving, const int32_t direction[3], int32_t scale,
-                               int32_t inertia_q31) {
+                               int32_t inertia_q32) {
 #if TRIPLE_IN_REGISTERS
     register const int32_t *first __asm__("r8") = direction;
     __asm__ volatile("ldm r8, {r8, r9, r10}\n\t"
                      "ldm %1, {r1, r2, r3, r4, r5, r6}\n\t" TRIPLE_MOVE("%2", "%3") "stm %1, {r1, r2, r3, r4, r5, r6}"
                      : "+r"(first)
-                     : "r"(moving), "r"(scale), "r"(inertia_q31)
+                     : "r"(moving), "r"(scale), "r"(inertia_q32)
                      : "r1", "r2", "r3", "r4", "r5", "r6", "r9", "r10", "memory");
 #else
     for (unsigned k = 0; k < 3; k++) {
-        moving->change[k] =
-            fixed_add_twice(high_product(scale, direction[k]), high_product(moving->change[k], inertia_q31));
+        moving->change[k] = high_product_add(high_product(moving->change[k], inertia_q32), scale, direction[k]);
         moving->value[k] = fixed_add_twice(moving->value[k], moving->change[k]);
     }
 #endif
@@ -95,7 +91,7 @@ static inline void triple_move(triple_moving_t *moving, const int32_t direction[
 
 /* The same; returns the triple_dot of the direction and the values as they were before. */
 static inline int32_t triple_dot_and_move(triple_moving_t *moving, const int32_t direction[3], int32_t scale,
-                                          int32_t inertia_q31) {
+                                          int32_t inertia_q32) {
 #if TRIPLE_IN_REGISTERS
     int32_t sum;
     register const int32_t *first __asm__("r8") = direction;
@@ -105,12 +101,12 @@ static inline int32_t triple_dot_and_move(triple_moving_t *moving, const int32_t
                      "smmlar %0, r9, r2, %0\n\t"
                      "smmlar %0, r10, r3, %0\n\t" TRIPLE_MOVE("%3", "%4") "stm %2, {r1, r2, r3, r4, r5, r6}"
                      : "=&r"(sum), "+r"(first)
-                     : "r"(moving), "r"(scale), "r"(inertia_q31)
+                     : "r"(moving), "r"(scale), "r"(inertia_q32)
                      : "r1", "r2", "r3", "r4", "r5", "r6", "r9", "r10", "memory");
     return sum;
 #else
     const int32_t sum = triple_dot(direction, moving->value);
-    triple_move(moving, direction, scale, inertia_q31);
+    triple_move(moving, direction, scale, inertia_q32);
     return sum;
 #endif
 }

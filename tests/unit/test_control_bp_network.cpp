@@ -14,7 +14,7 @@ extern "C" {
 namespace {
 
 constexpr int32_t WEIGHT_END_Q28 = INT32_MAX; // 8
-const bp_network_parameters_t DEFAULTS = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q31)};
+const bp_network_parameters_t DEFAULTS = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q32)};
 
 twins::network_t twin_of(const bp_network_t &network) {
     twins::network_t twin;
@@ -168,7 +168,7 @@ TEST(BpNetwork, a_learning_step_moves_the_weights_as_the_twin_does) {
         bp_network_forward(&network, input_q27);
         twin.forward(to_double(input_q27, twins::Q27));
         bp_network_learn(&parameters, &network, error_q16, sensitivity_q31);
-        twin.learn(1.0, 0.5, error_q16 / twins::Q16, to_double(sensitivity_q31, twins::Q31));
+        twin.learn(1.0, 0.25, error_q16 / twins::Q16, to_double(sensitivity_q31, twins::Q31));
         worst = std::max(worst, largest_weight_difference(network, twin));
         largest_move = std::max(largest_move, largest_weight_difference(network, before));
     }
@@ -199,7 +199,7 @@ TEST(BpNetwork, a_hundred_thousand_learning_steps_stay_bounded_and_near_the_twin
         bp_network_forward(&network, input_q27);
         twin.forward(to_double(input_q27, twins::Q27));
         bp_network_learn(&DEFAULTS, &network, error_q16, term_q31);
-        twin.learn(DEFAULTS.learning_rate_q15 / twins::Q15, DEFAULTS.inertia_q31 / twins::Q31, error_q16 / twins::Q16,
+        twin.learn(DEFAULTS.learning_rate_q15 / twins::Q15, DEFAULTS.inertia_q32 / twins::Q32, error_q16 / twins::Q16,
                    to_double(term_q31, twins::Q31));
         worst_output = std::max(worst_output, largest_output_difference(network, twin));
         worst_weight = std::max(worst_weight, largest_weight_difference(network, twin));
@@ -214,9 +214,9 @@ TEST(BpNetwork, a_hundred_thousand_learning_steps_stay_bounded_and_near_the_twin
 
 TEST(BpNetwork, weights_saturate_and_never_wrap_under_the_wildest_learning) {
     std::mt19937 random(4);
-    const bp_network_parameters_t parameters = {32768, INT32_MAX}; // eta 1, alpha 1: every step is added to the last
-    bp_network_t network;
-    bp_network_reset(&network, 7);
+    const bp_network_parameters_t parameters = {32768, INT32_MAX}; // eta 1, alpha 1/2
+    bp_network_t network{};
+    random_weights(network, random, 8.0);
     int32_t last[BP_OUTPUTS][BP_HIDDEN];
     bool reached = false;
     for (int k = 0; k < 20000; k++) {
@@ -324,7 +324,7 @@ TEST(BpNetwork, rule_26_as_printed_grows_every_weight_by_1_plus_alpha_a_step_and
     bp_network_reset(&network, 1);
     const double start = network.hidden[0].output.value[0] / twins::Q28;
     double printed = start;
-    const bp_network_parameters_t parameters = {DEFAULTS.learning_rate_q15, twins::to_fixed(alpha, twins::Q31)};
+    const bp_network_parameters_t parameters = {DEFAULTS.learning_rate_q15, twins::to_fixed(alpha, twins::Q32)};
     const int32_t input_q27[3] = {1 << 26, 1 << 25, 1 << 24}, nothing[3] = {0, 0, 0};
     for (int k = 1; k <= 100; k++) {
         // No error, so delta is zero: all that is left of (26) as printed is dW = alpha W.

@@ -25,7 +25,7 @@ bp_pid_parameters_t parameters_of(bp_pid_mode_t mode) {
     parameters.scale_q28[0] = twins::to_fixed(1.0, twins::Q28);
     parameters.scale_q28[1] = twins::to_fixed(0.24, twins::Q28);
     parameters.scale_q28[2] = twins::to_fixed(0.4, twins::Q28);
-    parameters.network = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q31)};
+    parameters.network = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q32)};
     return parameters;
 }
 
@@ -34,7 +34,7 @@ twins::bp_pid_t twin_of(const bp_pid_parameters_t &p, const bp_pid_t &pid) {
                          p.error_scale_inverse_q24 / twins::Q24,
                          {p.scale_q28[0] / twins::Q28, p.scale_q28[1] / twins::Q28, p.scale_q28[2] / twins::Q28},
                          p.network.learning_rate_q15 / twins::Q15,
-                         p.network.inertia_q31 / twins::Q31};
+                         p.network.inertia_q32 / twins::Q32};
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         for (unsigned j = 0; j < BP_INPUTS; j++) {
             twin.network.hidden_weight[i][j] = pid.network.hidden[i].input.value[j] / twins::Q28;

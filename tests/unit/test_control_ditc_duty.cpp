@@ -54,7 +54,7 @@ ditc_duty_parameters_t parameters_of(bp_pid_mode_t mode) {
     parameters.pid.scale_q28[0] = 32768 << 13;
     parameters.pid.scale_q28[1] = 7864 << 13;
     parameters.pid.scale_q28[2] = 13107 << 13;
-    parameters.pid.network = {1638, 1638 << 16};
+    parameters.pid.network = {1638, 1638 << 17};
     parameters.hand_over_angle = electrical(210.0);
     parameters.incoming_gain_q20 = 58544; // 40 kHz, 358 A/ms
     parameters.surplus_q20 = 1 << 16;

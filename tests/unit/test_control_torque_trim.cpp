@@ -23,7 +23,7 @@ torque_trim_parameters_t parameters_of(bp_pid_mode_t mode) {
     p.pid.scale_q28[0] = twins::to_fixed(0.07, twins::Q28);
     p.pid.scale_q28[1] = twins::to_fixed(0.07, twins::Q28);
     p.pid.scale_q28[2] = twins::to_fixed(0.03, twins::Q28);
-    p.pid.network = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q31)};
+    p.pid.network = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q32)};
     p.limit_q24 = twins::to_fixed(LIMIT_NM, twins::Q24);
     return p;
 }

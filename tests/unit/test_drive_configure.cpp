@@ -85,7 +85,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("ki scale", c.duty.pid.scale_q28[1] / 8192.0, pid_scale(PARAMETER_BP_KI_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
     near("kd scale", c.duty.pid.scale_q28[2] / 8192.0, pid_scale(PARAMETER_BP_KD_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
     near("eta", c.duty.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * twins::Q15, 1.0);
-    near("alpha", c.duty.pid.network.inertia_q31, v(PARAMETER_BP_ALPHA) * twins::Q31, 1.0);
+    near("alpha", c.duty.pid.network.inertia_q32, v(PARAMETER_BP_ALPHA) * twins::Q32, 1.0);
 
     const double count = std::ldexp(1.0, 32 - int(encoder_bits));
     const double fastest = twins::rad_s(v(PARAMETER_OVER_SPEED_RPM)) / rate_hz / (2.0 * twins::PI) * twins::TURN;
@@ -137,7 +137,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("trim ki", c.trim.pid.scale_q28[1] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KI_MAX), 1.0);
     near("trim kd", c.trim.pid.scale_q28[2] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KD_MAX), 1.0);
     near("trim eta", c.trim.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * twins::Q15, 1.0);
-    near("trim alpha", c.trim.pid.network.inertia_q31, v(PARAMETER_BP_ALPHA) * twins::Q31, 1.0);
+    near("trim alpha", c.trim.pid.network.inertia_q32, v(PARAMETER_BP_ALPHA) * twins::Q32, 1.0);
 
     const double learn_1_s = p.values[PARAMETER_ANGLE_TRIM] == 1 ? v(PARAMETER_ANGLE_TRIM_RATE_1_S) : 0.0;
     const double turn_rate_hz = std::floor(rate_hz / machine_tables.phases);
