@@ -13,15 +13,16 @@ static int32_t next_weight(uint32_t *generator) {
 
 void bp_network_reset(bp_network_t *network, uint32_t seed) {
     uint32_t generator = seed;
-    *network = (bp_network_t){0};
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         for (unsigned j = 0; j < BP_INPUTS; j++) {
             network->hidden[i].input.value[j] = next_weight(&generator);
+            network->hidden[i].input.change[j] = 0;
         }
     }
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         for (unsigned i = 0; i < BP_HIDDEN; i++) {
             network->hidden[i].output.value[l] = next_weight(&generator);
+            network->hidden[i].output.change[l] = 0;
         }
     }
 }

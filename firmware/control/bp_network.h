@@ -41,7 +41,7 @@ typedef struct {
 } bp_network_t;
 
 /* Initial weights: uniform in +-0.5 from a linear congruential generator, so that a seed gives the same on any machine.
- */
+ * The layers' values are those of the next forward pass. */
 void bp_network_reset(bp_network_t *network, uint32_t seed);
 
 /* Outputs for inputs in Q4.27, -1 <= input < 1; the layers' values stay in the network for learning. */

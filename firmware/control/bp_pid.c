@@ -6,20 +6,22 @@
 #define ERROR_BITS 17 /* Q1.16 within -1..1 - 2^-16 */
 #define DUTY_BITS 24  /* Q23 within -1..1 - 2^-23, which rounds to 1 in Q15 */
 
-void bp_pid_reset(const bp_pid_parameters_t *parameters, bp_pid_t *pid) {
-    *pid = (bp_pid_t){0};
-    bp_network_reset(&pid->network, parameters->seed);
-}
-
-void bp_pid_preset(bp_pid_t *pid, int32_t duty_q15) {
-    pid->duty_q23 = fixed_clamp(duty_q15, -32768, 32768) * 256;
-}
-
 void bp_pid_show_none(bp_pid_t *pid) {
     pid->duty_q23 = 0;
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         pid->gain_q24[l] = 0;
     }
+}
+
+void bp_pid_reset(const bp_pid_parameters_t *parameters, bp_pid_t *pid) {
+    bp_network_reset(&pid->network, parameters->seed);
+    pid->error_q16 = 0;
+    pid->rise_q16 = 0;
+    bp_pid_show_none(pid);
+}
+
+void bp_pid_preset(bp_pid_t *pid, int32_t duty_q15) {
+    pid->duty_q23 = fixed_clamp(duty_q15, -32768, 32768) * 256;
 }
 
 int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_t torque_error_q24) {

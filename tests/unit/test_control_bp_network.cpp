@@ -98,7 +98,7 @@ int32_t any_q31(std::mt19937 &random) {
 }
 
 TEST(BpNetwork, initial_weights_are_within_half_and_depend_on_nothing_but_the_seed) {
-    bp_network_t first, second, other;
+    bp_network_t first{}, second{}, other{};
     bp_network_reset(&first, 1);
     bp_network_reset(&second, 1);
     bp_network_reset(&other, 2);
