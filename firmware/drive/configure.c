@@ -133,6 +133,14 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
     const uint32_t least = stroke + pitch_from_degrees(2 << 7);
     const uint32_t width = turn_off - turn_on > least ? turn_off - turn_on : least;
     const uint32_t narrowing = off_early > on_early ? off_early - on_early : 0;
+    const torque_share_parameters_t share = {
+        .sharing = values[PARAMETER_TORQUE_SHARING] != 0,
+        .stroke = stroke,
+        .turn_on = turn_on,
+        .turn_off = turn_on + width,
+        .turn_on_early = on_early,
+        .turn_off_early = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
+    };
     return (predictive_torque_parameters_t){
         .flux =
             {
@@ -140,15 +148,8 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
                 .resistance_period_q40 =
                     fixed_saturate(fixed_divide((int64_t)values[PARAMETER_RESISTANCE_OHM] << 16, rate)),
             },
-        .share =
-            {
-                .sharing = values[PARAMETER_TORQUE_SHARING] != 0,
-                .stroke = stroke,
-                .turn_on = turn_on,
-                .turn_off = turn_on + width,
-                .turn_on_early = on_early,
-                .turn_off_early = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
-            },
+        .share = share,
+        .late = torque_share_window(&share, 0),
         .period_q40 = (int32_t)fixed_divide((int64_t)1 << 40, rate),
         .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
