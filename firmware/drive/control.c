@@ -7,8 +7,6 @@
 /* A stop ends below this speed: 0.5 rad/s, 5 r/min. */
 #define STANDING_Q22 (1 << 21)
 
-#define DUTY_ONE_Q15 32768
-
 /* A tick over 2 pi, in 2^-32 turn per rad/s Q9.22, Q51. */
 #define TURN_PER_TICK_Q51 1834931565
 
@@ -55,6 +53,14 @@ static uint32_t phase_angle(const control_parameters_t *parameters, const contro
     return commutation_angle(&parameters->commutation, &state->estimate.commutation, phase) - offset;
 }
 
+/* Torque in N m, Q7.24, and flux linkage in Wb, Q2.29. As phase_map_torque_at_q24(), a function of its own. */
+__attribute__((noinline)) static int32_t torque_and_flux(const machine_tables_t *tables, uint32_t angle,
+                                                         int32_t current_q9, int32_t *flux_q29) {
+    const phase_map_place_t place = phase_map_at(tables, angle);
+    *flux_q29 = phase_map_flux_q29(&place, current_q9);
+    return phase_map_torque_q24(&place, current_q9);
+}
+
 static void estimate(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample) {
     const machine_tables_t *tables = parameters->tables;
     const bool salient = parameters->controller == DRIVE_CONTROLLER_SALIENT;
@@ -64,7 +70,8 @@ static void estimate(const control_parameters_t *parameters, control_state_t *st
     commutation_find(&parameters->commutation, e->angle, &e->commutation);
     int32_t current_max_q9 = 0;
     int32_t torque_sum_q24 = 0;
-    for (unsigned phase = tables->phases; phase-- > 0;) {
+    const unsigned phases = tables->phases;
+    for (unsigned phase = 0; phase < phases; phase++) {
         const uint16_t code = sample->adc.phase_current_counts[phase];
         e->current_q9[phase] = 0;
         e->torque_q24[phase] = 0;
@@ -72,16 +79,19 @@ static void estimate(const control_parameters_t *parameters, control_state_t *st
         if (code == 0) { /* most of the time a phase has none */
             continue;
         }
+        /* Every code's current is on the map. */
         const int32_t current_q9 = from_code(code, parameters->current_scale_q18);
-        const phase_map_place_t place = phase_map_at(tables, phase_angle(parameters, state, phase));
-        const int32_t torque_q24 = phase_map_torque_q24(&place, current_q9);
+        const uint32_t angle = phase_angle(parameters, state, phase);
+        int32_t torque_q24;
+        if (salient) {
+            torque_q24 = torque_and_flux(tables, angle, current_q9, &e->flux_q29[phase]);
+        } else {
+            torque_q24 = phase_map_torque_at_q24(tables, angle, current_q9);
+        }
         torque_sum_q24 = fixed_add(torque_sum_q24, torque_q24);
         current_max_q9 = current_q9 > current_max_q9 ? current_q9 : current_max_q9;
         e->current_q9[phase] = current_q9;
         e->torque_q24[phase] = torque_q24;
-        if (salient) {
-            e->flux_q29[phase] = phase_map_flux_q29(&place, current_q9);
-        }
     }
     e->current_max_q9 = current_max_q9;
     e->torque_sum_q24 = torque_sum_q24;
@@ -122,11 +132,6 @@ static int32_t slide(const control_parameters_t *parameters, const control_state
     return speed_smc_step(&parameters->speed_smc, state->speed_reference_q22, state->observer.speed_q22, load_q24);
 }
 
-/* The paper's torque law; else it is hysteresis. */
-static bool gives_duties(const control_parameters_t *parameters) {
-    return parameters->controller == DRIVE_CONTROLLER_PAPER && parameters->duty.pid.mode != BP_PID_OFF;
-}
-
 /* Compare values by hysteresis. */
 static void switch_by_state(const control_parameters_t *parameters, control_state_t *state, int32_t reference_q24,
                             hal_pwm_compare_t *compare) {
@@ -160,9 +165,10 @@ static void switch_by_duty(const control_parameters_t *parameters, control_state
     }
 }
 
-/* Salient: compare values for a torque reference of either sign. The observer stands at the coming sample. */
-static void predict_torque(const control_parameters_t *parameters, control_state_t *state, int32_t reference_q24,
-                           hal_pwm_compare_t *compare) {
+/* Salient: compare values for a torque reference of either sign. The observer stands at the coming sample. A function
+ * of its own: its stack and its registers would cost the other controllers. */
+__attribute__((noinline)) static void predict_torque(const control_parameters_t *parameters, control_state_t *state,
+                                                     int32_t reference_q24, hal_pwm_compare_t *compare) {
     const machine_tables_t *tables = parameters->tables;
     const load_observer_t *observer = &state->observer;
     const control_estimate_t *e = &state->estimate;
@@ -205,8 +211,8 @@ static void predict_torque(const control_parameters_t *parameters, control_state
     }
 }
 
-static void complete_record(fault_record_t *record, const control_sample_t *sample, const control_state_t *state,
-                            int32_t speed_q22) {
+__attribute__((cold)) static void complete_record(fault_record_t *record, const control_sample_t *sample,
+                                                  const control_state_t *state, int32_t speed_q22) {
     record->time_us = sample->time_us;
     /* Of the last period: what failed may be the encoder, and its angle is in the present estimate. */
     record->speed_q22 = speed_q22;
@@ -216,7 +222,7 @@ static void complete_record(fault_record_t *record, const control_sample_t *samp
 }
 
 /* The first sample: what the observer and the checks start from. */
-static void start(control_state_t *state) {
+__attribute__((cold)) static void start(control_state_t *state) {
     state->started = true;
     load_observer_reset(&state->observer, state->estimate.angle);
     observer_bandwidth_reset(&state->bandwidth);
@@ -224,7 +230,8 @@ static void start(control_state_t *state) {
 }
 
 /* What a change of the drive's state asks for. */
-static void enter(const control_parameters_t *parameters, control_state_t *state, drive_state_t before) {
+__attribute__((cold)) static void enter(const control_parameters_t *parameters, control_state_t *state,
+                                        drive_state_t before) {
     if (before == DRIVE_STATE_FAULT) {
         /* Whatever the encoder did in between, believe it anew. */
         load_observer_reset(&state->observer, state->estimate.angle);
@@ -291,47 +298,10 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
               : speed_pi_step(&parameters->speed_pi, &state->speed_pi,
                               fixed_subtract(state->speed_reference_q22, state->observer.speed_q22));
     state->torque_reference_q24 = fixed_clamp(torque_q24, 0, INT32_MAX);
-    if (paper && gives_duties(parameters)) {
+    if (control_gives_duties(parameters)) {
         switch_by_duty(parameters, state, state->torque_reference_q24, compare);
     } else {
         switch_by_state(parameters, state, state->torque_reference_q24, compare);
     }
     return true;
-}
-
-/* Whether the phases get all the voltage there is. */
-static bool voltage_saturated(const control_parameters_t *parameters, const control_state_t *state) {
-    if (parameters->controller == DRIVE_CONTROLLER_SALIENT) {
-        return state->predictive.missing_q24 != 0;
-    }
-    for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
-        if (gives_duties(parameters) ? state->duty_q15[phase] == DUTY_ONE_Q15 : state->hysteresis.state[phase] > 0) {
-            return true;
-        }
-    }
-    return false;
-}
-
-control_diagnostics_t control_diagnose(const control_parameters_t *parameters, const control_state_t *state) {
-    const control_estimate_t *e = &state->estimate;
-    const bool run = state->machine.state == DRIVE_STATE_RUN;
-    const bool salient = run && parameters->controller == DRIVE_CONTROLLER_SALIENT;
-    control_diagnostics_t diagnostics = {
-        .angle = e->angle,
-        .speed_q22 = state->observer.speed_q22,
-        .speed_reference_q22 = state->speed_reference_q22,
-        .torque_reference_q24 = state->torque_reference_q24,
-        .torque_q24 = e->torque_sum_q24,
-        .load_torque_q24 = state->observer.load_torque_q24,
-        .bus_voltage_q6 = (uint16_t)e->bus_voltage_q6,
-        .duty_q15 = (int32_t)fixed_shift(state->duty.pid.duty_q30, 15),
-        .voltage_saturated = run && voltage_saturated(parameters, state),
-        .trim_torque_q24 = salient ? state->trim.trim_q24 : 0,
-        .torque_missing_q24 = salient ? state->predictive.missing_q24 : 0,
-        .observer_bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[state->bandwidth.stage],
-    };
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        diagnostics.current_q9[phase] = (uint16_t)e->current_q9[phase];
-    }
-    return diagnostics;
 }

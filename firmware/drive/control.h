@@ -128,6 +128,11 @@ void control_reset(control_state_t *state);
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   hal_pwm_compare_t *compare);
 
+/* True when the torque law gives duties, as the paper's does; else it is hysteresis, or the salient controller. */
+static inline bool control_gives_duties(const control_parameters_t *parameters) {
+    return parameters->controller == DRIVE_CONTROLLER_PAPER && parameters->duty.pid.mode != BP_PID_OFF;
+}
+
 /* What the last period saw and did, by a state that no interrupt changes meanwhile. [both] */
 control_diagnostics_t control_diagnose(const control_parameters_t *parameters, const control_state_t *state);
 

@@ -37,14 +37,36 @@ static int32_t left_to_move(const protection_parameters_t *parameters, protectio
     return parameters->angle_unmoved_max - protection->unmoved;
 }
 
+/* What is left to each limit, negative beyond it. */
+typedef struct {
+    int32_t current_q9;
+    int32_t over_voltage_q6;
+    int32_t under_voltage_q6;
+    int32_t over_speed_q22;
+    int32_t jump;
+    int32_t still;
+    bool late;
+    bool lost;
+} margins_t;
+
 static uint16_t bit_if(bool fails, fault_t fault) {
     return fails ? FAULT_BIT(fault) : 0;
 }
 
+__attribute__((cold)) static uint16_t failed_checks(margins_t left) {
+    uint16_t checks = 0;
+    checks |= bit_if(left.current_q9 < 0, FAULT_OVER_CURRENT);
+    checks |= bit_if(left.over_voltage_q6 < 0, FAULT_OVER_VOLTAGE);
+    checks |= bit_if(left.under_voltage_q6 < 0, FAULT_UNDER_VOLTAGE);
+    checks |= bit_if(left.over_speed_q22 < 0, FAULT_OVER_SPEED);
+    checks |= bit_if((left.jump | left.still) < 0, FAULT_ENCODER);
+    checks |= bit_if(left.late, FAULT_COMMAND_TIMEOUT);
+    checks |= bit_if(left.lost, FAULT_INTERRUPT_OVERRUN);
+    return checks;
+}
+
 uint16_t protection_check(const protection_parameters_t *parameters, protection_t *protection,
                           const protection_sample_t *sample) {
-    /* What is left to each limit, negative beyond it: that none is, nearly always, shows in the sign of them all. None
-     * overflows: limits and what they limit are not negative. */
     const int32_t speed_q22 = fixed_abs(sample->speed_q22);
     const int32_t step = (int32_t)(sample->angle - protection->angle); /* modulo a turn */
     protection->angle = sample->angle;
@@ -55,25 +77,19 @@ uint16_t protection_check(const protection_parameters_t *parameters, protection_
         step_max = fixed_saturate(step_max * ((int64_t)sample->missed_interrupts + 1));
     }
     protection->overruns = overruns;
-    const int32_t current_q9 = parameters->current_trip_q9 - sample->current_max_q9;
-    const int32_t over_voltage_q6 = parameters->bus_over_voltage_q6 - sample->bus_voltage_q6;
-    const int32_t under_voltage_q6 = sample->bus_voltage_q6 - parameters->bus_under_voltage_q6;
-    const int32_t over_speed_q22 = parameters->over_speed_q22 - speed_q22;
-    const int32_t jump = step_max - fixed_abs(step);
-    const int32_t still = left_to_move(parameters, protection, step, speed_q22);
-    const bool late = sample->command_age_us > parameters->command_timeout_us;
-    const bool lost = overruns >= PROTECTION_OVERRUNS_MAX;
-    const int32_t any = current_q9 | over_voltage_q6 | under_voltage_q6 | over_speed_q22 | jump | still;
-    if (__builtin_expect(any >= 0 && !late && !lost, 1)) {
-        return 0;
-    }
-    uint16_t checks = 0;
-    checks |= bit_if(current_q9 < 0, FAULT_OVER_CURRENT);
-    checks |= bit_if(over_voltage_q6 < 0, FAULT_OVER_VOLTAGE);
-    checks |= bit_if(under_voltage_q6 < 0, FAULT_UNDER_VOLTAGE);
-    checks |= bit_if(over_speed_q22 < 0, FAULT_OVER_SPEED);
-    checks |= bit_if((jump | still) < 0, FAULT_ENCODER);
-    checks |= bit_if(late, FAULT_COMMAND_TIMEOUT);
-    checks |= bit_if(lost, FAULT_INTERRUPT_OVERRUN);
-    return checks;
+    /* None overflows: limits and what they limit are not negative. */
+    const margins_t left = {
+        .current_q9 = parameters->current_trip_q9 - sample->current_max_q9,
+        .over_voltage_q6 = parameters->bus_over_voltage_q6 - sample->bus_voltage_q6,
+        .under_voltage_q6 = sample->bus_voltage_q6 - parameters->bus_under_voltage_q6,
+        .over_speed_q22 = parameters->over_speed_q22 - speed_q22,
+        .jump = step_max - fixed_abs(step),
+        .still = left_to_move(parameters, protection, step, speed_q22),
+        .late = sample->command_age_us > parameters->command_timeout_us,
+        .lost = overruns >= PROTECTION_OVERRUNS_MAX,
+    };
+    /* That none fails, nearly always, shows in the sign of them all. */
+    const int32_t any =
+        left.current_q9 | left.over_voltage_q6 | left.under_voltage_q6 | left.over_speed_q22 | left.jump | left.still;
+    return any < 0 || left.late || left.lost ? failed_checks(left) : 0;
 }

@@ -37,8 +37,10 @@ machine_tables_t four_phases() {
     tables.phases = 4;
     tables.rotor_poles = 6;
     std::mt19937 random(1);
-    for (auto &torque : tables.torque_per_ampere.node) {
-        torque = uint16_t(random());
+    for (machine_column_t &column : tables.column) {
+        for (int16_t &torque : column.torque_node) {
+            torque = int16_t(random());
+        }
     }
     return tables;
 }
