@@ -124,7 +124,7 @@ void __wrap_hal_critical_leave(hal_t *hal) {
     (void)hal;
 }
 
-void program_interrupt(void) {
+__attribute__((used)) void program_interrupt(void) { /* by the handler, in assembly */
     drive_control_interrupt(&drive);
 }
 
