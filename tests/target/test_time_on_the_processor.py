@@ -42,7 +42,7 @@ def frames(bench: Bench) -> list[tuple]:
 
 # --- a processor that is fast enough --------------------------------------------------------------------------------
 
-# The slowest of 1, 2, 4, ... ns an instruction at which no interrupt is late.
+# At which no interrupt is late, ns an instruction.
 IN_TIME_NS = {"traditional": 8, "paper": 4, "salient": 4}
 
 # From lock-step, where the drive takes no time: its figures and how far they may be from it.
