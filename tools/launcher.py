@@ -239,6 +239,8 @@ def main() -> None:
         target = "cortex-m4" if options.command == "bench" else getattr(options, "target", "host")
         on_target = target != "host"
         needs += TARGET_NEEDS[target]
+        if getattr(options, "figures", False):  # of every target
+            needs += tuple(need for needs_of in TARGET_NEEDS.values() for need in needs_of)
         needs += MEASUREMENT_NEEDS if options.command in ("test", "bench") else ()
         if options.command in WITHOUT_BUILD:
             needs = tuple(need for need in BUILD_NEEDS if need.package == "python3-venv")

@@ -7,8 +7,8 @@ import re
 import subprocess
 from pathlib import Path
 
-import numpy as np
-
+from salient.image import Image
+from salient.interrupt_cost import read_cost
 from salient.simulator import SimulatorOptions
 
 TIMEOUT_S = 60
@@ -18,19 +18,20 @@ HANDLER_INSTRUCTIONS = 38
 
 
 def test_each_control_interrupt_is_an_exception_of_the_processor_and_counted(tmp_path: Path):
-    log, instructions, profile = tmp_path / "log", tmp_path / "instructions", tmp_path / "profile"
+    log, instructions, executed = tmp_path / "log", tmp_path / "instructions", tmp_path / "executed"
     wrapper = tmp_path / "qemu-system-riscv32"
     wrapper.write_text(f'#!/bin/sh\nPATH={os.environ["PATH"]}\nexec qemu-system-riscv32 -d int -D {log} "$@"\n')
     wrapper.chmod(0o755)
     options = SimulatorOptions(build="rv32", controller="salient", pace="free", instructions=instructions,
-                               profile=profile)
+                               execution=executed)
     subprocess.run([*options.arguments(f"unix:{tmp_path}/bus"), "--stop-at-s", "0.005"], check=True, timeout=TIMEOUT_S,
                    stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                    env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"})
-    counts = np.fromfile(instructions, "<u4")
+    cost = read_cost(instructions, executed, options.machine, options.build)
     taken = re.findall(r"async:(\d), cause:([0-9a-f]+)", log.read_text(encoding="utf-8"))
-    assert len(counts) == 200
+    assert len(cost.interrupts) == 200
     assert [(int(interrupt), int(cause, 16)) for interrupt, cause in taken] == [(1, MACHINE_SOFTWARE_INTERRUPT)] * 200
-    functions = {name: int(count) for count, name in (line.split() for line in profile.read_text().splitlines())}
-    assert functions["control_handler"] == HANDLER_INSTRUCTIONS * len(counts)
-    assert sum(functions.values()) == counts.sum()
+    assert cost.execution.inside.sum() == cost.interrupts.sum()
+    instructions_of = zip(Image(cost.execution.image).instructions(), cost.execution.inside, strict=True)
+    handler = sum(count for one, count in instructions_of if one.function.startswith("control_handler"))
+    assert handler == HANDLER_INSTRUCTIONS * len(cost.interrupts)

@@ -2,9 +2,9 @@
  *
  * The QEMU plugin: opens the world when QEMU starts, and serves it whenever the drive stores to the doorbell.
  *
- * Plugin arguments: mailbox=FILE, the board's shared memory; instructions=FILE, see instructions.h; profile=FILE,
- * see profile.h; timed=1, the processor takes time; argument=TEXT, a word of the host executable's command line,
- * repeated in order.
+ * Plugin arguments: mailbox=FILE, the board's shared memory; instructions=FILE, see instructions.h;
+ * execution=FILE and stack=END-BEGIN, see execution.h; timed=1, the processor takes time; argument=TEXT, a word of the
+ * host executable's command line, repeated in order.
  */
 #define _DEFAULT_SOURCE /* on_exit */
 
@@ -17,10 +17,10 @@
 #include <unistd.h>
 
 #include "boards.h"
+#include "execution.h"
 #include "host/bench.h"
 #include "instructions.h"
 #include "plugin_api.h"
-#include "profile.h"
 #include "world.h"
 
 #define EXPORT __attribute__((visibility("default")))
@@ -31,7 +31,7 @@ EXPORT int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int
 
 static const board_description_t *board;
 static mailbox_t *mailbox;
-static bool counting, profiling;
+static bool counting, following;
 
 /* The function has other stores in images that are not optimised. */
 static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, void *context) {
@@ -45,10 +45,10 @@ static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, 
     if (mailbox->event != MAILBOX_EXIT) {
         return;
     }
-    if ((counting && !instructions_close()) || (profiling && !profile_close())) {
+    if ((counting && !instructions_close()) || (following && !execution_close())) {
         mailbox->exit_code = BENCH_EXIT_MISTAKE;
     }
-    counting = profiling = false;
+    counting = following = false;
 }
 
 /* Where the drive ended QEMU before it was told to, says why. What the bench has recorded until then is kept. */
@@ -78,8 +78,8 @@ static void translate(qemu_plugin_id_t id, struct qemu_plugin_tb *tb) {
     if (counting) {
         instructions_translate(tb);
     }
-    if (profiling) {
-        profile_translate(tb);
+    if (following) {
+        execution_translate(tb);
     }
 }
 
@@ -115,7 +115,7 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
     static options_t options; /* the world keeps it */
     char *words[ARGUMENTS_MAX + 1] = {"salient"};
     int count = 1;
-    const char *mailbox_path = NULL, *instructions_path = NULL, *profile_path = NULL;
+    const char *mailbox_path = NULL, *instructions_path = NULL, *execution_path = NULL, *stack = "";
     bool timed = false;
     for (int i = 0; i < argc; ++i) {
         char *value;
@@ -129,8 +129,10 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
             mailbox_path = value;
         } else if ((value = value_of(argv[i], "instructions="))) {
             instructions_path = strdup(value);
-        } else if ((value = value_of(argv[i], "profile="))) {
-            profile_path = strdup(value);
+        } else if ((value = value_of(argv[i], "execution="))) {
+            execution_path = strdup(value);
+        } else if ((value = value_of(argv[i], "stack="))) {
+            stack = value;
         } else if (strcmp(argv[i], "timed=1") == 0) {
             timed = true;
         } else {
@@ -150,8 +152,8 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
     }
     on_exit(ended, NULL);
     counting = instructions_path;
-    profiling = profile_path;
-    if ((counting && !instructions_open(instructions_path)) || (profiling && !profile_open(profile_path))) {
+    following = execution_path;
+    if ((counting && !instructions_open(instructions_path)) || (following && !execution_open(execution_path, stack))) {
         exit(BENCH_EXIT_MISTAKE);
     }
     qemu_plugin_register_vcpu_tb_trans_cb(id, translate);

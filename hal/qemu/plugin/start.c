@@ -68,27 +68,31 @@ static const board_description_t *board_of(const char *image) {
 
 int main(int argc, char *argv[]) {
     if (argc < 2 || strcmp(argv[1], "--help") == 0) {
-        printf(
-            "usage: %s IMAGE.elf [--instructions FILE] [--profile FILE] [--instruction-ns N] OPTION...\n"
-            "  IMAGE.elf            the drive, as built for a board of QEMU\n"
-            "  --instructions FILE  writes the instructions of each control interrupt, a uint32_t each\n"
-            "  --profile FILE       writes a line for each function: its instructions in all control interrupts\n"
-            "  --instruction-ns N   an instruction takes so long, a power of two up to 64; without it the drive takes\n"
-            "                       no time\n"
-            "  OPTION               as the host executable's; its --help lists them\n",
-            argv[0]);
+        printf("usage: %s IMAGE.elf [--instructions FILE] [--execution FILE STACK] [--instruction-ns N] OPTION...\n"
+               "  IMAGE.elf            the drive, as built for a board of QEMU\n"
+               "  --instructions FILE  writes the instructions of each control interrupt, a uint32_t each\n"
+               "  --execution FILE STACK  writes how often each block of instructions was executed and how far\n"
+               "                       down the stack was written to, whose end and beginning STACK are: END-BEGIN\n"
+               "  --instruction-ns N   an instruction takes so long, a power of two up to 64; without it the drive\n"
+               "                       takes no time\n"
+               "  OPTION               as the host executable's; its --help lists them\n",
+               argv[0]);
         return argc < 2 ? EXIT_MISTAKE : 0;
     }
-    const char *image = argv[1], *instructions = NULL, *profile = NULL, *instruction_ns = NULL;
-    const struct {
-        const char *name, **value;
-    } own[] = {{"--instructions", &instructions}, {"--profile", &profile}, {"--instruction-ns", &instruction_ns}};
+    const char *image = argv[1], *instructions = NULL, *execution = NULL, *stack = NULL, *instruction_ns = NULL;
     int first = 2;
-    for (unsigned i = 0; i < sizeof own / sizeof own[0]; ++i) {
-        if (argc > first + 1 && strcmp(argv[first], own[i].name) == 0) {
-            *own[i].value = argv[first + 1];
-            first += 2;
-        }
+    if (argc > first + 1 && strcmp(argv[first], "--instructions") == 0) {
+        instructions = argv[first + 1];
+        first += 2;
+    }
+    if (argc > first + 2 && strcmp(argv[first], "--execution") == 0) {
+        execution = argv[first + 1];
+        stack = argv[first + 2];
+        first += 3;
+    }
+    if (argc > first + 1 && strcmp(argv[first], "--instruction-ns") == 0) {
+        instruction_ns = argv[first + 1];
+        first += 2;
     }
     const board_description_t *board = board_of(image);
     if (!board) {
@@ -123,8 +127,9 @@ int main(int argc, char *argv[]) {
     if (instructions) {
         put_option(list, "instructions", instructions);
     }
-    if (profile) {
-        put_option(list, "profile", profile);
+    if (execution) {
+        put_option(list, "execution", execution);
+        put_option(list, "stack", stack);
     }
     if (instruction_ns) {
         fputs(",timed=1", list);

@@ -125,6 +125,12 @@ def _machine(options: argparse.Namespace) -> int:
     return run(options.machine, options.out)
 
 
+def _pil(options: argparse.Namespace) -> int:
+    from salient.pil import run
+
+    return run(options)
+
+
 _COMMANDS = {
     "demo": _demo,
     "test": _test,
@@ -135,6 +141,7 @@ _COMMANDS = {
     "bench": _bench,
     "compare": _compare,
     "machine": _machine,
+    "pil": _pil,
 }
 
 if __name__ == "__main__":

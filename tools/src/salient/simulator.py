@@ -13,6 +13,7 @@ from pathlib import Path
 
 from salient.drive import ParameterRow, read_parameter_table
 from salient.errors import UsageError
+from salient.image import Image
 from salient.machine import MachineError, load_machine, machine_path
 from salient.paths import BUILD, MACHINES, ROOT
 from salient.phase_map import machine_phase_map
@@ -37,9 +38,9 @@ class SimulatorOptions:
     there is; it is for the conditions of simulations. record: file for the true state
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
     period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a board of QEMU. instructions: file
-    for the instructions of each control interrupt, uint32 little endian; profile: file for those of all by function,
-    text lines "INSTRUCTIONS FUNCTION"; both in QEMU only. instruction_ns: what an instruction takes, one of
-    INSTRUCTION_NS, or None and the drive takes no time; on the Cortex-M4 only.
+    for the instructions of each control interrupt, uint32 little endian; execution: file for what the processor did,
+    as salient.execution reads it; both in QEMU only. instruction_ns: what an instruction takes, one of INSTRUCTION_NS,
+    or None and the drive takes no time; on the Cortex-M4 only.
     """
 
     machine: str = "saturating"
@@ -59,7 +60,7 @@ class SimulatorOptions:
     record_switches: Path | None = None
     build: str = "host"
     instructions: Path | None = None
-    profile: Path | None = None
+    execution: Path | None = None
     instruction_ns: int | None = None
 
     def arguments(self, can: str) -> list[str]:
@@ -89,9 +90,13 @@ class SimulatorOptions:
                 raise UsageError(f"--instruction-ns {self.instruction_ns}: only with --target cortex-m4")
             return [str(program)]
         line = [str(program), str(image(self.machine, self.build))]
-        for name in ("instructions", "profile", "instruction_ns"):
-            if (value := getattr(self, name)) is not None:
-                line += [f"--{name.replace('_', '-')}", str(value)]
+        if self.instructions is not None:
+            line += ["--instructions", str(self.instructions)]
+        if self.execution is not None:
+            end, begin = Image(image(self.machine, self.build)).stack()
+            line += ["--execution", str(self.execution), f"{end:#x}-{begin:#x}"]
+        if self.instruction_ns is not None:
+            line += ["--instruction-ns", str(self.instruction_ns)]
         return line
 
 
@@ -209,7 +214,7 @@ class Simulator:
 def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
     on the bus of an experiment."""
-    return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, profile=None,
+    return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, execution=None,
                                     instruction_ns=None, pace="lockstep"))
 
 
