@@ -1,6 +1,7 @@
 #include "control/misalignment.h"
 
 #include "control/phase_map.h"
+#include "fixed/divide.h"
 #include "fixed/fixed.h"
 
 /* 0.01 rad in 2^-32 turn. */
@@ -18,9 +19,9 @@ misalignment_parameters_t misalignment_configure(int32_t rate_1_s, uint32_t band
     const int64_t turn_rate_hz = control_rate_hz / phases;
     return (misalignment_parameters_t){
         .probe = PROBE * rotor_poles,
-        .rate_q30 = (int32_t)(((int64_t)rate_1_s << 30) / turn_rate_hz),
-        .filter_q16 = (int32_t)((((int64_t)bandwidth_rad_s * 8 / 5) << 16) / turn_rate_hz),
-        .mean_q16 = (int32_t)(((int64_t)MEAN_1_S << 16) / turn_rate_hz) + 1,
+        .rate_q30 = (int32_t)fixed_divide((int64_t)rate_1_s << 30, turn_rate_hz),
+        .filter_q16 = (int32_t)fixed_divide((int64_t)(bandwidth_rad_s * 8u / 5u) << 16, turn_rate_hz),
+        .mean_q16 = (int32_t)fixed_divide((int64_t)MEAN_1_S << 16, turn_rate_hz) + 1,
         .inertia_rate_q8 = fixed_saturate(((int64_t)inertia_q30 * control_rate_hz) >> 22),
         .settle_ticks = control_rate_hz / 1000u * SETTLE_MS,
     };

@@ -7,6 +7,7 @@
 #define BOARDS_H
 
 #include <elf.h>
+#include <stdbool.h>
 #include <stdint.h>
 
 typedef struct {
@@ -19,6 +20,7 @@ typedef struct {
     uint32_t memory_address;
     uint32_t memory_bytes;
     uint32_t mailbox_offset;
+    bool timer;               /* its port uses one: the processor may take time */
     const char *network_card; /* one that the board always has, or NULL */
 } board_description_t;
 
@@ -32,6 +34,7 @@ static const board_description_t boards[] = {
         .memory_address = 0x21000000, /* PSRAM */
         .memory_bytes = 16 * 1024 * 1024,
         .mailbox_offset = 0,
+        .timer = true,
         .network_card = "lan9118",
     },
     {

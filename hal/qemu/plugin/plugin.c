@@ -3,8 +3,8 @@
  * The QEMU plugin: opens the world when QEMU starts, and serves it whenever the drive stores to the doorbell.
  *
  * Plugin arguments: mailbox=FILE, the board's shared memory; instructions=FILE, see instructions.h;
- * execution=FILE and stack=END-BEGIN, see execution.h; argument=TEXT, a word of the host executable's command line,
- * repeated in order.
+ * execution=FILE and stack=END-BEGIN, see execution.h; timed=1, the processor takes time; argument=TEXT, a word of the
+ * host executable's command line, repeated in order.
  */
 #define _DEFAULT_SOURCE /* on_exit */
 
@@ -116,6 +116,7 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
     char *words[ARGUMENTS_MAX + 1] = {"salient"};
     int count = 1;
     const char *mailbox_path = NULL, *instructions_path = NULL, *execution_path = NULL, *stack = "";
+    bool timed = false;
     for (int i = 0; i < argc; ++i) {
         char *value;
         if ((value = value_of(argv[i], "argument="))) {
@@ -132,6 +133,8 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
             execution_path = strdup(value);
         } else if ((value = value_of(argv[i], "stack="))) {
             stack = value;
+        } else if (strcmp(argv[i], "timed=1") == 0) {
+            timed = true;
         } else {
             fprintf(stderr, "salient: %s: not an argument of this plugin\n", argv[i]);
             exit(BENCH_EXIT_MISTAKE);
@@ -144,7 +147,7 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
     }
     mailbox = map_mailbox(mailbox_path);
     const options_result_t result = options_parse(&options, count, words);
-    if (result != OPTIONS_RUN || !world_open(mailbox, &options)) {
+    if (result != OPTIONS_RUN || !world_open(mailbox, &options, timed)) {
         exit(result == OPTIONS_HELP ? 0 : BENCH_EXIT_MISTAKE);
     }
     on_exit(ended, NULL);

@@ -16,6 +16,8 @@ ENCODER_BITS = (0, *range(8, 25))
 ADC_BITS = (12, 13, 14, 15, 16)
 TARGETS = ("host", "cortex-m4", "rv32")
 """Where the firmware runs: in the bench's own process, or on a Cortex-M4 or RV32 that QEMU emulates."""
+INSTRUCTION_NS = (1, 2, 4, 8, 16, 32, 64)
+"""What an instruction of the Cortex-M4 may take; QEMU knows powers of two."""
 LOG_SUFFIXES = (".blf", ".log")
 
 
@@ -75,11 +77,13 @@ def make_parser() -> argparse.ArgumentParser:
     sim.add_argument("--bit-rate", type=int, default=1_000_000, metavar="N", help="of the bus, default 1000000")
 
     _add_target(sim)
+    _add_instruction_ns(sim)
 
     run = command("run", "one scenario, to a folder")
     run.add_argument("scenario", type=Path, metavar="SCENARIO.toml")
     run.add_argument("--out", type=Path, metavar="DIR", help="folder (default out/NAME)")
     _add_target(run)
+    _add_instruction_ns(run)
 
     log = command("log", "record a running bus until it ends, or is interrupted")
     log.add_argument("--can", type=_can, default="auto", metavar="BUS", help="as with sim")
@@ -123,6 +127,12 @@ TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "socketcan")
 def _add_target(command: argparse.ArgumentParser) -> None:
     command.add_argument("--target", type=_one_of(TARGETS), default="host", metavar="NAME",
                          help="host (default), or cortex-m4 or rv32: the same firmware in QEMU")
+
+
+def _add_instruction_ns(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--instruction-ns", type=_one_of(INSTRUCTION_NS), metavar="N",
+                         help="what an instruction takes on the cortex-m4: 1, 2, 4, 8, 16, 32 or 64; without it "
+                         "the drive takes no time")
 
 
 def _one_of(allowed: tuple):

@@ -39,7 +39,8 @@ class SimulatorOptions:
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
     period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a board of QEMU. instructions: file
     for the instructions of each control interrupt, uint32 little endian; execution: file for what the processor did,
-    as salient.execution reads it; both in QEMU only.
+    as salient.execution reads it; both in QEMU only. instruction_ns: what an instruction takes, one of INSTRUCTION_NS,
+    or None and the drive takes no time; on the Cortex-M4 only.
     """
 
     machine: str = "saturating"
@@ -60,6 +61,7 @@ class SimulatorOptions:
     build: str = "host"
     instructions: Path | None = None
     execution: Path | None = None
+    instruction_ns: int | None = None
 
     def arguments(self, can: str) -> list[str]:
         """The executable's command line on the bus `can`."""
@@ -84,6 +86,8 @@ class SimulatorOptions:
     def _program(self) -> list[str]:
         program = executable(self.machine, self.build)
         if self.build not in TARGET_BUILDS:
+            if self.instruction_ns is not None:
+                raise UsageError(f"--instruction-ns {self.instruction_ns}: only with --target cortex-m4")
             return [str(program)]
         line = [str(program), str(image(self.machine, self.build))]
         if self.instructions is not None:
@@ -91,6 +95,8 @@ class SimulatorOptions:
         if self.execution is not None:
             end, begin = Image(image(self.machine, self.build)).stack()
             line += ["--execution", str(self.execution), f"{end:#x}-{begin:#x}"]
+        if self.instruction_ns is not None:
+            line += ["--instruction-ns", str(self.instruction_ns)]
         return line
 
 
@@ -209,7 +215,7 @@ def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
     on the bus of an experiment."""
     return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, execution=None,
-                                    pace="lockstep"))
+                                    instruction_ns=None, pace="lockstep"))
 
 
 @lru_cache
