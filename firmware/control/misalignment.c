@@ -31,9 +31,10 @@ void misalignment_reset(misalignment_t *misalignment) {
     *misalignment = (misalignment_t){.turn = 0};
 }
 
-/* value towards target by a share in Q16. */
+/* value towards target by a share in Q16, below one. */
 static inline void follow(int32_t *value, int32_t target, int32_t share_q16) {
-    *value = fixed_add(*value, fixed_multiply(fixed_subtract(target, *value), share_q16, 16));
+    const int32_t half = fixed_multiply_high(fixed_subtract(target, *value), share_q16 << 15);
+    *value = fixed_add(fixed_add(*value, half), half);
 }
 
 static int32_t product_q24(int32_t a_q24, int32_t b_q24) {
@@ -51,7 +52,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const bool learns = steady && settled;
     /* Means of all since it became steady, then of the last 100 ms: what was before is another load. */
     const int32_t phases = (int32_t)tables->phases;
-    const int32_t fresh_q16 = 65536 / ((int32_t)misalignment->steady_ticks / phases + 1);
+    const int32_t fresh_q16 = 65535 / ((int32_t)misalignment->steady_ticks / phases + 1);
     const int32_t mean_q16 = fresh_q16 > parameters->mean_q16 ? fresh_q16 : parameters->mean_q16;
 
     const unsigned turn = misalignment->turn;
@@ -60,14 +61,9 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     misalignment->sum_q24 += disturbance_q24;
     const int64_t since_q24 = phase->sum_q24;
     phase->sum_q24 = misalignment->sum_q24;
-    int32_t slope_q24 = 0;
     const int32_t current_q9 = sample->current_q9[turn];
-    if (current_q9 > 0) {
-        const uint32_t angle = sample->angle[turn];
-        const phase_map_place_t ahead = phase_map_at(tables, angle + parameters->probe);
-        const phase_map_place_t behind = phase_map_at(tables, angle - parameters->probe);
-        slope_q24 = fixed_subtract(phase_map_torque_q24(&ahead, current_q9), phase_map_torque_q24(&behind, current_q9));
-    }
+    const int32_t slope_q24 =
+        current_q9 > 0 ? phase_map_torque_slope_q24(tables, sample->angle[turn], current_q9, 2 * parameters->probe) : 0;
     follow(&phase->first_q24, slope_q24, parameters->filter_q16);
     follow(&phase->second_q24, phase->first_q24, parameters->filter_q16);
     follow(&phase->mean_q24, phase->second_q24, mean_q16);

@@ -98,11 +98,9 @@ static bp_pid_parameters_t bp_pid_from(const int32_t *values, parameter_index_t 
         .mode = (bp_pid_mode_t)values[mode],
         .seed = (uint32_t)values[PARAMETER_BP_SEED],
         .error_scale_inverse_q24 = fixed_saturate(fixed_divide((int64_t)1 << 48, values[PARAMETER_BP_ERROR_SCALE_NM])),
-        .kp_scale_q15 = kp_scale_q15,
-        .ki_scale_q15 = ki_scale_q15,
-        .kd_scale_q15 = kd_scale_q15,
+        .scale_q28 = {kp_scale_q15 << 13, ki_scale_q15 << 13, kd_scale_q15 << 13},
         .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
-                    .inertia_q15 = values[PARAMETER_BP_ALPHA] >> 13},
+                    .inertia_q32 = values[PARAMETER_BP_ALPHA] << 4},
     };
 }
 
@@ -135,6 +133,14 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
     const uint32_t least = stroke + pitch_from_degrees(2 << 7);
     const uint32_t width = turn_off - turn_on > least ? turn_off - turn_on : least;
     const uint32_t narrowing = off_early > on_early ? off_early - on_early : 0;
+    const torque_share_parameters_t share = {
+        .sharing = values[PARAMETER_TORQUE_SHARING] != 0,
+        .stroke = stroke,
+        .turn_on = turn_on,
+        .turn_off = turn_on + width,
+        .turn_on_early = on_early,
+        .turn_off_early = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
+    };
     return (predictive_torque_parameters_t){
         .flux =
             {
@@ -142,15 +148,8 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
                 .resistance_period_q40 =
                     fixed_saturate(fixed_divide((int64_t)values[PARAMETER_RESISTANCE_OHM] << 16, rate)),
             },
-        .share =
-            {
-                .sharing = values[PARAMETER_TORQUE_SHARING] != 0,
-                .stroke = stroke,
-                .turn_on = turn_on,
-                .turn_off = turn_on + width,
-                .turn_on_early = on_early,
-                .turn_off_early = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
-            },
+        .share = share,
+        .late = torque_share_window(&share, 0),
         .period_q40 = (int32_t)fixed_divide((int64_t)1 << 40, rate),
         .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
@@ -211,12 +210,12 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .duty =
             {
                 .pid = duty_pid_from(values, control_rate_hz),
-                .hand_over_angle = pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG]),
-                /* Half of what would reach the current in one period at rest: rate / (2 * A/s), in Q20. */
-                .incoming_gain_q20 =
-                    fixed_saturate(fixed_divide((int64_t)control_rate_hz << 19, tables->current_rise_A_s)),
+                .aims = ditc_duty_aims(tables, pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
+                /* Half of what would reach the current in one period at rest: rate / (2 * A/s), in Q24. */
+                .incoming_gain_q24 =
+                    fixed_saturate(fixed_divide((int64_t)control_rate_hz << 23, tables->current_rise_A_s)),
                 /* At 40 kHz a sixteenth of the reference, and 1/16 N m: see ditc_duty.h. */
-                .surplus_q20 = (int32_t)(((uint32_t)GAIN_RATE_HZ << 16) / control_rate_hz),
+                .surplus_q32 = (int32_t)(((uint32_t)GAIN_RATE_HZ << 16) / control_rate_hz << 12),
                 .spent_torque_q24 = (int32_t)fixed_divide((int64_t)control_rate_hz << 20, GAIN_RATE_HZ),
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
                 .current_limit_q9 = current_limit_q9,

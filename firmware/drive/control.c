@@ -287,7 +287,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
         diagnostics->current_q9[phase] = (uint16_t)e.current_q9[phase];
     }
     diagnostics->bus_voltage_q6 = (uint16_t)e.bus_voltage_q6;
-    diagnostics->duty_q15 = (int32_t)fixed_shift(state->duty.pid.duty_q30, 15);
+    diagnostics->duty_q15 = (state->duty.pid.duty_q23 + (1 << 7)) >> 8;
     diagnostics->voltage_saturated = saturated;
     diagnostics->trim_torque_q24 = run && salient ? state->trim.trim_q24 : 0;
     diagnostics->torque_missing_q24 = run && salient ? state->predictive.missing_q24 : 0;

@@ -57,8 +57,8 @@ void drive_control_interrupt(drive_t *drive) {
 
 /* A gain in duty per scaled error as duty per N m, both Q15. */
 static int32_t gain_per_Nm_q15(const drive_t *drive, unsigned gain) {
-    return fixed_multiply(drive->control.duty.pid.gain_q15[gain],
-                          drive->control_parameters.duty.pid.error_scale_inverse_q24, 24);
+    return fixed_multiply(drive->control.duty.pid.gain_q24[gain],
+                          drive->control_parameters.duty.pid.error_scale_inverse_q24, 33);
 }
 
 /* Mean of the phases, mechanical, 2^-32 turn. */

@@ -64,8 +64,10 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_LE(std::fabs(c.commutation.turn_on - pitch(PARAMETER_TURN_ON_ANGLE_DEG)), 1.0);
     ASSERT_LE(std::fabs(c.commutation.turn_off - pitch(PARAMETER_TURN_OFF_ANGLE_DEG)), 1.0);
     ASSERT_LE(std::fabs(c.commutation.outgoing_off - pitch(PARAMETER_OUTGOING_OFF_ANGLE_DEG)), 1.0);
-    ASSERT_LE(std::fabs(c.duty.hand_over_angle - pitch(PARAMETER_HAND_OVER_ANGLE_DEG)), 1.0);
-    ASSERT_GE(c.duty.hand_over_angle, 0x80000000u) << "the map's inverse is for the second half pitch";
+    const ditc_duty_aims_t aims = ditc_duty_aims(&machine_tables, pitch(PARAMETER_HAND_OVER_ANGLE_DEG));
+    for (unsigned k = 0; k < DITC_DUTY_AIMS; k++) {
+        ASSERT_NEAR(c.duty.aims.current_q9[k], aims.current_q9[k], 1.0) << k;
+    }
 
     near("inner", c.hysteresis.band_inner_q24, v(PARAMETER_TORQUE_BAND_INNER_NM) * twins::Q24, 0.0);
     near("outer", c.hysteresis.band_outer_q24, v(PARAMETER_TORQUE_BAND_OUTER_NM) * twins::Q24, 0.0);
@@ -74,18 +76,18 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("limit", c.hysteresis.current_limit_q9, std::min(v(PARAMETER_CURRENT_LIMIT_A), below_trip_A) * twins::Q9, 4.0);
     near("limit", c.duty.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * twins::Q9, 0.0);
     near("assist", c.duty.band_outer_q24, v(PARAMETER_BP_ASSIST_BAND_NM) * twins::Q24, 0.0);
-    near("incoming gain", c.duty.incoming_gain_q20, 0.5 * rate_hz / machine_tables.current_rise_A_s * twins::Q20, 1.0);
+    near("incoming gain", c.duty.incoming_gain_q24, 0.5 * rate_hz / machine_tables.current_rise_A_s * twins::Q24, 1.0);
 
-    near("surplus", c.duty.surplus_q20, 40000.0 / 16.0 / rate_hz * twins::Q20, 1.0);
+    near("surplus", c.duty.surplus_q32, 40000.0 / 16.0 / rate_hz * twins::Q32, 4096.0);
     near("spent torque", c.duty.spent_torque_q24, rate_hz / 40000.0 / 16.0 * twins::Q24, 1.0);
     ASSERT_EQ(int(c.duty.pid.mode), p.values[PARAMETER_BP_MODE]);
     ASSERT_EQ(int32_t(c.duty.pid.seed), p.values[PARAMETER_BP_SEED]);
     near("scale", c.duty.pid.error_scale_inverse_q24, twins::Q24 / scale_Nm, 1.0);
-    near("kp scale", c.duty.pid.kp_scale_q15, pid_scale(PARAMETER_BP_KP_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
-    near("ki scale", c.duty.pid.ki_scale_q15, pid_scale(PARAMETER_BP_KI_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
-    near("kd scale", c.duty.pid.kd_scale_q15, pid_scale(PARAMETER_BP_KD_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
+    near("kp scale", c.duty.pid.scale_q28[0] / 8192.0, pid_scale(PARAMETER_BP_KP_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
+    near("ki scale", c.duty.pid.scale_q28[1] / 8192.0, pid_scale(PARAMETER_BP_KI_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
+    near("kd scale", c.duty.pid.scale_q28[2] / 8192.0, pid_scale(PARAMETER_BP_KD_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
     near("eta", c.duty.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * twins::Q15, 1.0);
-    near("alpha", c.duty.pid.network.inertia_q15, v(PARAMETER_BP_ALPHA) * twins::Q15, 1.0);
+    near("alpha", c.duty.pid.network.inertia_q32, v(PARAMETER_BP_ALPHA) * twins::Q32, 1.0);
 
     const double count = std::ldexp(1.0, 32 - int(encoder_bits));
     const double fastest = twins::rad_s(v(PARAMETER_OVER_SPEED_RPM)) / rate_hz / (2.0 * twins::PI) * twins::TURN;
@@ -133,11 +135,11 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(int32_t(c.trim.pid.seed), p.values[PARAMETER_BP_SEED]);
     near("trim limit", c.trim.limit_q24, v(PARAMETER_BP_TRIM_LIMIT_NM) * twins::Q24, 0.0);
     near("trim error", c.trim.pid.error_scale_inverse_q24, twins::Q24 / scale_Nm, 1.0);
-    near("trim kp", c.trim.pid.kp_scale_q15, trim_scale(PARAMETER_BP_TRIM_KP_MAX), 1.0);
-    near("trim ki", c.trim.pid.ki_scale_q15, trim_scale(PARAMETER_BP_TRIM_KI_MAX), 1.0);
-    near("trim kd", c.trim.pid.kd_scale_q15, trim_scale(PARAMETER_BP_TRIM_KD_MAX), 1.0);
+    near("trim kp", c.trim.pid.scale_q28[0] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KP_MAX), 1.0);
+    near("trim ki", c.trim.pid.scale_q28[1] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KI_MAX), 1.0);
+    near("trim kd", c.trim.pid.scale_q28[2] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KD_MAX), 1.0);
     near("trim eta", c.trim.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * twins::Q15, 1.0);
-    near("trim alpha", c.trim.pid.network.inertia_q15, v(PARAMETER_BP_ALPHA) * twins::Q15, 1.0);
+    near("trim alpha", c.trim.pid.network.inertia_q32, v(PARAMETER_BP_ALPHA) * twins::Q32, 1.0);
 
     const double learn_1_s = p.values[PARAMETER_ANGLE_TRIM] == 1 ? v(PARAMETER_ANGLE_TRIM_RATE_1_S) : 0.0;
     const double turn_rate_hz = std::floor(rate_hz / machine_tables.phases);
@@ -219,7 +221,7 @@ TEST(Configure, a_machine_whose_current_hardly_rises_gets_the_largest_gain_and_n
     slow.current_rise_A_s = 1;
     parameters_t parameters;
     parameters_init(&parameters);
-    EXPECT_EQ(configure_control(&parameters, &slow, 100000, 17, 12).duty.incoming_gain_q20, INT32_MAX);
+    EXPECT_EQ(configure_control(&parameters, &slow, 100000, 17, 12).duty.incoming_gain_q24, INT32_MAX);
 }
 
 TEST(Configure, allows_the_rates_that_the_timer_makes_exactly) {

@@ -322,7 +322,7 @@ TEST_F(Control, the_paper_s_controller_drives_its_regulated_phase_with_the_pid_s
         ASSERT_TRUE(step(COMMAND_RUN, 1.0));
         const unsigned phase = state.duty.regulated;
         ASSERT_LT(phase, 3u);
-        const double duty = state.duty.pid.duty_q30 / twins::Q30;
+        const double duty = state.duty.pid.duty_q23 / twins::Q23;
         ASSERT_NEAR(diagnostics.duty_q15 / twins::Q15, duty, 0.51 / twins::Q15);
         const double voltage = (double(compare.upper[phase]) + compare.lower[phase]) / parameters.period_ticks - 1.0;
         ASSERT_NEAR(voltage, duty, 0.51 / parameters.period_ticks + 0.51 / twins::Q15) << k;

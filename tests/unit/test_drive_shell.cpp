@@ -310,9 +310,9 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
             drive_drive_bp_pid_t pid{};
             drive_drive_bp_pid_unpack(&pid, frame.data, frame.length);
             const double inverse = drive.control_parameters.duty.pid.error_scale_inverse_q24 / 16777216.0;
-            EXPECT_NEAR(pid.kp_per_nm, drive.control.duty.pid.gain_q15[0] * inverse, 0.51);
-            EXPECT_NEAR(pid.ki_per_nm, drive.control.duty.pid.gain_q15[1] * inverse, 0.51);
-            EXPECT_NEAR(pid.kd_per_nm, drive.control.duty.pid.gain_q15[2] * inverse, 0.51);
+            EXPECT_NEAR(pid.kp_per_nm, drive.control.duty.pid.gain_q24[0] / 512.0 * inverse, 0.51);
+            EXPECT_NEAR(pid.ki_per_nm, drive.control.duty.pid.gain_q24[1] / 512.0 * inverse, 0.51);
+            EXPECT_NEAR(pid.kd_per_nm, drive.control.duty.pid.gain_q24[2] / 512.0 * inverse, 0.51);
             EXPECT_NE(pid.kp_per_nm, pid.ki_per_nm);
             EXPECT_NE(pid.ki_per_nm, pid.kd_per_nm);
             seen |= 8;
