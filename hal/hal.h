@@ -1,7 +1,7 @@
 /* The seam between firmware and hardware.
  *
  * Everything here is raw: converter counts, encoder counts, timer ticks, CAN frames. Scaling, offsets and saturation
- * belong to the firmware, so that they are under test too. A port (host/, mps2_an386/, later boards) defines
+ * belong to the firmware, so that they are under test too. A port (host/, qemu/ with its boards, later others) defines
  * `struct hal` and these functions; the firmware only holds the pointer, so several drives can live in a process.
  *
  * Each function says from which context it may be called: [interrupt] the control interrupt, [background] the main

@@ -16,9 +16,10 @@ int32_t units_speed_q22(int32_t milli_rpm) {
 }
 
 int32_t units_quarter_rpm(int32_t milli_rpm) {
-    /* floor((x + 125) / 250): C divides towards zero, so the sum is made positive first. */
-    const int64_t offset = INT64_C(250) << 24;
-    return (int32_t)((milli_rpm + offset + 125) / 250 - (INT64_C(1) << 24));
+    /* floor((x + 125) / 250): C divides towards zero. */
+    const int32_t quarters = milli_rpm / 250;
+    const int32_t rest = milli_rpm % 250;
+    return quarters + (rest >= 125 ? 1 : rest < -125 ? -1 : 0);
 }
 
 uint16_t units_angle_u16(uint32_t angle) {

@@ -17,7 +17,7 @@ typedef struct {
 
 /* One sample of one phase: corrects *flux_q29 (Wb, Q2.29) and advances it to the next sample. table_q29: by the tables
  * at the measured current, 0 for none. applied_q29: the volt seconds, Wb, Q2.29, of the duty that acts in this period.
- * current_q9: A, Q7.9. Returns R i Ts in Wb, Q2.29. 64-bit products, rounded, saturated. */
+ * current_q9: A, Q7.9, 0..2^18. Returns R i Ts in Wb, Q2.29. 64-bit products, rounded; sums saturate. */
 int32_t flux_observer_step(const flux_observer_parameters_t *parameters, int32_t *flux_q29, int32_t table_q29,
                            int32_t applied_q29, int32_t current_q9);
 

@@ -1,5 +1,6 @@
 #include "control/load_observer.h"
 
+#include "fixed/divide.h"
 #include "fixed/fixed.h"
 
 /* Keeps a wild load estimate (a rotor that was turned by hand, an encoder that jumped) from taking seconds to return.
@@ -22,7 +23,7 @@ static int64_t decay_complement_q31(int64_t y_q31) {
     const int64_t one_q31 = (int64_t)1 << 31;
     int64_t series_q31 = one_q31;
     for (int n = 5; n >= 2; n--) {
-        series_q31 = one_q31 - fixed_shift(y_q31 * series_q31, 31) / n;
+        series_q31 = one_q31 - fixed_divide(fixed_shift(y_q31 * series_q31, 31), n);
     }
     return fixed_shift(y_q31 * series_q31, 31);
 }
@@ -31,7 +32,7 @@ load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t con
     /* Widths in the comments are for the ends of the ranges: p = 1 - q <= 0.4, p rate <= 10000. */
     const int64_t rate = control_rate_hz; /* 20 bits */
     const int64_t one_q31 = (int64_t)1 << 31;
-    const int64_t p_q31 = decay_complement_q31(((int64_t)bandwidth_rad_s << 31) / rate);
+    const int64_t p_q31 = decay_complement_q31(fixed_divide((int64_t)bandwidth_rad_s << 31, rate));
     const int64_t q_q31 = one_q31 - p_q31;
     const int64_t p2_q46 = fixed_shift(p_q31 * p_q31, 16);
     const int64_t p3_q46 = fixed_shift(fixed_shift(p2_q46, 12) * p_q31, 19); /* Q34, 31 bits, * Q31 */
@@ -48,7 +49,7 @@ load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t con
      * rates at which p is large: saturated above. */
     const int64_t p3_rate_q24 = fixed_shift(p3_q46 * rate, 22);         /* 35 bits */
     const int64_t inertia_rate_q14 = fixed_shift(inertia_rate_q30, 16); /* 35 bits */
-    const int64_t limit = (INT64_MAX - (1 << 12)) / (p3_rate_q24 > 0 ? p3_rate_q24 : 1);
+    const int64_t limit = fixed_divide(INT64_MAX - (1 << 12), p3_rate_q24 > 0 ? p3_rate_q24 : 1);
     const int64_t inertia_l3_q38 = (inertia_rate_q14 < limit ? inertia_rate_q14 : limit) * p3_rate_q24;
     const int64_t torque_gain_q20 = fixed_shift(fixed_shift(inertia_l3_q38, 12) * TWO_PI_Q9, 23); /* 51 + 12 bits */
     gains.torque_gain_q20 = torque_gain_q20 < TORQUE_GAIN_LIMIT_Q20 ? torque_gain_q20 : TORQUE_GAIN_LIMIT_Q20;
@@ -59,10 +60,10 @@ load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t iner
     const int64_t rate = control_rate_hz;
     return (load_observer_model_t){
         /* Ts / J * 2^-2 * 2^32 = 2^30 / (J rate). */
-        .acceleration_q32 = fixed_saturate(((int64_t)1 << 60) / (inertia_q30 * rate)),
+        .acceleration_q32 = fixed_saturate(fixed_divide((int64_t)1 << 60, inertia_q30 * rate)),
         .friction_q30 = friction_q30,
         /* Ts / (2 pi) * 2^10 * 2^32 = 2^42 / (2 pi rate). */
-        .angle_step_q32 = (int32_t)((((int64_t)1 << 62) / TWO_PI_Q28 * 256) / rate),
+        .angle_step_q32 = (int32_t)fixed_divide(((int64_t)1 << 62) / TWO_PI_Q28 * 256, rate),
     };
 }
 

@@ -23,13 +23,24 @@ typedef struct {
     uint32_t reciprocal; /* 2^47 over the width up to the next row, rounded down; of the last row 0 */
 } machine_row_t;
 
-/* Row by row. At fraction u from a row to the next: node + u (next row's node - node) - u (1 - u) 2^bend_shift bend. */
+/* A node is less MACHINE_NODE_OFFSET, so that all 16 bits serve in a signed product. */
+#define MACHINE_NODE_OFFSET 32768
+
+/* Over the angle at a current, so that the nodes of two rows lie side by side. At fraction u from a row to the next:
+ * node + u (next row's node - node) - u (1 - u) 2^bend_shift bend. */
 typedef struct {
-    uint8_t fraction_bits; /* of a node */
-    uint8_t bend_shift;    /* 0..8 */
-    uint16_t node[MACHINE_ROWS * MACHINE_COLUMNS];
-    int8_t bend[(MACHINE_ROWS - 1) * MACHINE_COLUMNS];
-} machine_surface_t;
+    int16_t torque_node[MACHINE_ROWS]; /* T / i */
+    int16_t flux_node[MACHINE_ROWS];   /* psi / i */
+    int8_t torque_bend[MACHINE_ROWS - 1];
+    int8_t flux_bend[MACHINE_ROWS - 1];
+} machine_column_t;
+
+/* A value, in Q14 of a node's last place, times current in Q7.9 and 2^15, less the low 32 bits, times 2^result_shift is
+ * the result: torque in N m, Q7.24, or flux linkage in Wb, Q2.29. */
+typedef struct {
+    uint8_t bend_shift;   /* 0..8 */
+    uint8_t result_shift; /* 0..12 */
+} machine_format_t;
 
 typedef struct {
     uint8_t phases;           /* 3 or 4 */
@@ -39,9 +50,10 @@ typedef struct {
     int32_t resistance_q24;   /* ohm, Q7.24 */
     int32_t current_rise_A_s; /* supply voltage over unaligned inductance: A/s */
     machine_row_t row[MACHINE_ROWS];
-    uint8_t cell_row[MACHINE_CELLS];     /* the row in which a part of half a pitch begins */
-    machine_surface_t torque_per_ampere; /* N m / A, fraction_bits 6..30 */
-    machine_surface_t flux_per_ampere;   /* Wb / A, fraction_bits 11..30 */
+    uint8_t cell_row[MACHINE_CELLS]; /* the row in which a part of half a pitch begins */
+    machine_format_t torque_format;
+    machine_format_t flux_format;
+    machine_column_t column[MACHINE_COLUMNS];
 } machine_tables_t;
 
 /* The machine that this image is built for. */

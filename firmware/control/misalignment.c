@@ -1,6 +1,7 @@
 #include "control/misalignment.h"
 
 #include "control/phase_map.h"
+#include "fixed/divide.h"
 #include "fixed/fixed.h"
 
 /* 0.01 rad in 2^-32 turn. */
@@ -18,9 +19,9 @@ misalignment_parameters_t misalignment_configure(int32_t rate_1_s, uint32_t band
     const int64_t turn_rate_hz = control_rate_hz / phases;
     return (misalignment_parameters_t){
         .probe = PROBE * rotor_poles,
-        .rate_q30 = (int32_t)(((int64_t)rate_1_s << 30) / turn_rate_hz),
-        .filter_q16 = (int32_t)((((int64_t)bandwidth_rad_s * 8 / 5) << 16) / turn_rate_hz),
-        .mean_q16 = (int32_t)(((int64_t)MEAN_1_S << 16) / turn_rate_hz) + 1,
+        .rate_q30 = (int32_t)fixed_divide((int64_t)rate_1_s << 30, turn_rate_hz),
+        .filter_q16 = (int32_t)fixed_divide((int64_t)(bandwidth_rad_s * 8u / 5u) << 16, turn_rate_hz),
+        .mean_q16 = (int32_t)fixed_divide((int64_t)MEAN_1_S << 16, turn_rate_hz) + 1,
         .inertia_rate_q8 = fixed_saturate(((int64_t)inertia_q30 * control_rate_hz) >> 22),
         .settle_ticks = control_rate_hz / 1000u * SETTLE_MS,
     };
@@ -30,9 +31,10 @@ void misalignment_reset(misalignment_t *misalignment) {
     *misalignment = (misalignment_t){.turn = 0};
 }
 
-/* value towards target by a share in Q16. */
+/* value towards target by a share in Q16, below one. */
 static inline void follow(int32_t *value, int32_t target, int32_t share_q16) {
-    *value = fixed_add(*value, fixed_multiply(fixed_subtract(target, *value), share_q16, 16));
+    const int32_t half = fixed_multiply_high(fixed_subtract(target, *value), share_q16 << 15);
+    *value = fixed_add(fixed_add(*value, half), half);
 }
 
 static int32_t product_q24(int32_t a_q24, int32_t b_q24) {
@@ -50,7 +52,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const bool learns = steady && settled;
     /* Means of all since it became steady, then of the last 100 ms: what was before is another load. */
     const int32_t phases = (int32_t)tables->phases;
-    const int32_t fresh_q16 = 65536 / ((int32_t)misalignment->steady_ticks / phases + 1);
+    const int32_t fresh_q16 = 65535 / ((int32_t)misalignment->steady_ticks / phases + 1);
     const int32_t mean_q16 = fresh_q16 > parameters->mean_q16 ? fresh_q16 : parameters->mean_q16;
 
     const unsigned turn = misalignment->turn;
@@ -59,14 +61,9 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     misalignment->sum_q24 += disturbance_q24;
     const int64_t since_q24 = phase->sum_q24;
     phase->sum_q24 = misalignment->sum_q24;
-    int32_t slope_q24 = 0;
     const int32_t current_q9 = sample->current_q9[turn];
-    if (current_q9 > 0) {
-        const uint32_t angle = sample->angle[turn];
-        const phase_map_place_t ahead = phase_map_at(tables, angle + parameters->probe);
-        const phase_map_place_t behind = phase_map_at(tables, angle - parameters->probe);
-        slope_q24 = fixed_subtract(phase_map_torque_q24(&ahead, current_q9), phase_map_torque_q24(&behind, current_q9));
-    }
+    const int32_t slope_q24 =
+        current_q9 > 0 ? phase_map_torque_slope_q24(tables, sample->angle[turn], current_q9, 2 * parameters->probe) : 0;
     follow(&phase->first_q24, slope_q24, parameters->filter_q16);
     follow(&phase->second_q24, phase->first_q24, parameters->filter_q16);
     follow(&phase->mean_q24, phase->second_q24, mean_q16);

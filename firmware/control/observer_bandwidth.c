@@ -1,5 +1,6 @@
 #include "control/observer_bandwidth.h"
 
+#include "fixed/divide.h"
 #include "fixed/fixed.h"
 
 #define LAST_STAGE (OBSERVER_BANDWIDTH_STAGES - 1)
@@ -36,7 +37,7 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t widest_rad
         .forget_q16 = (uint16_t)(65536 - (65536u * FORGET_1_S + control_rate_hz - 1) / control_rate_hz),
         .threshold_count = threshold_count,
         .threshold_edge = wakes ? THRESHOLD_EDGE : THRESHOLD_NEVER,
-        .usual_share_q24 = (int32_t)(((int64_t)USUAL_1_S << 24) / control_rate_hz),
+        .usual_share_q24 = (int32_t)fixed_divide((int64_t)USUAL_1_S << 24, control_rate_hz),
         /* An encoder whose counts are finer than what an edge's time gives needs no edges. */
         .first_stage_count = threshold_count <= THRESHOLD_EDGE ? 0 : FIRST_STAGE_COARSE,
     };
@@ -47,7 +48,7 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t widest_rad
         parameters.bandwidth_rad_s[stage] = (uint16_t)bandwidth_rad_s;
         parameters.gains[stage] = load_observer_gains(bandwidth_rad_s, control_rate_hz, inertia_q30);
         /* Where 3.5 / t is the middle of this bandwidth and the next: 1.1 of this stage's 3.5 / w. */
-        parameters.end_ticks[stage] = (uint32_t)((uint64_t)control_rate_hz * 385 / 100 / bandwidth_rad_s);
+        parameters.end_ticks[stage] = control_rate_hz * 385u / 100u / bandwidth_rad_s;
         bandwidth_q8 = bandwidth_q8 / 16 * 13;
     }
     return parameters;

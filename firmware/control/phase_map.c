@@ -1,159 +1,274 @@
 #include "control/phase_map.h"
 
 #include "fixed/fixed.h"
+#include "fixed/pair.h"
 
 #define HALF_PITCH 0x80000000u
 #define COLUMN_Q9 (1 << MACHINE_COLUMN_BITS)
 #define ONE_Q14 (1 << 14)
+#define ONE_Q15 (1 << 15)
 
-/* Right shift from value in Q14 of the tables' last place times current in Q9 to the format of the result. */
-#define TORQUE_SHIFT(surface) ((unsigned)(surface)->fraction_bits + 14 + 9 - 24)
-#define FLUX_SHIFT(surface) ((unsigned)(surface)->fraction_bits + 14 + 9 - 29)
+/* Value in Q14 of a column's curve at a place: the nodes' part is below 2^30, the bend's within 2^27. */
+static inline int32_t torque_value_q14(const phase_map_place_t *place, const machine_column_t *column) {
+    const int16_t *nodes = &column->torque_node[place->row];
+    return fixed_pair_multiply_add(nodes, place->weights_q14, MACHINE_NODE_OFFSET << 14) -
+           column->torque_bend[place->row] * place->torque_bend_q14;
+}
 
-/* Fraction bits that a value keeps in an inverse, so that a product with a column's number and all differences of such
- * products stay below 2^30, whatever the tables hold. */
-#define INVERSE_BITS 6
+static inline int32_t flux_value_q14(const phase_map_place_t *place, const machine_column_t *column) {
+    const int16_t *nodes = &column->flux_node[place->row];
+    return fixed_pair_multiply_add(nodes, place->weights_q14, MACHINE_NODE_OFFSET << 14) -
+           column->flux_bend[place->row] * place->flux_bend_q14;
+}
 
-/* A surface at the angle of a place, from a column on: its node and bend, and the weights of this row's nodes, the next
- * row's and the bends. */
+/* Value in Q14 times current in Q9, 0..2^10 MACHINE_COLUMNS, as far as one word holds it: below 2^29. */
+static inline int32_t product(int32_t value, int32_t current_q9) {
+    return fixed_multiply_high(value, current_q9 << 15);
+}
+
+/* Such a product in the format of the result, saturated. */
+static inline int32_t result(const machine_format_t *format, int32_t product) {
+    const int32_t shifted = (int32_t)((uint32_t)product << format->result_shift);
+    return shifted >> format->result_shift == product ? shifted : INT32_MAX ^ (product >> 31);
+}
+
+/* Product of a current and the value there, between those of two columns. */
+static inline int32_t between(int32_t low_q14, int32_t high_q14, int32_t current_q9) {
+    const int32_t part_q31 = (int32_t)((uint32_t)current_q9 << (32 - MACHINE_COLUMN_BITS) >> 1);
+    return product(low_q14 + 2 * fixed_multiply_high(high_q14 - low_q14, part_q31), current_q9);
+}
+
+/* A curve at a column: product of value and current. */
 typedef struct {
-    const uint16_t *node;
-    const int8_t *bend;
-    int32_t low_q14, high_q14, bend_q14;
-} curve_t;
+    int32_t value_q14;
+    int32_t product;
+} node_t;
 
-static inline curve_t curve_at(const machine_surface_t *surface, const phase_map_place_t *place, int32_t column) {
-    const uint32_t first = place->first + (uint32_t)column;
-    return (curve_t){
-        .node = &surface->node[first],
-        .bend = &surface->bend[first],
-        .low_q14 = ONE_Q14 - place->fraction_q14,
-        .high_q14 = place->fraction_q14,
-        .bend_q14 = place->bend_q14 << surface->bend_shift,
-    };
+static inline node_t torque_node(const phase_map_place_t *place, uint32_t column) {
+    const int32_t value = torque_value_q14(place, &place->tables->column[column]);
+    return (node_t){value, product(value, (int32_t)(column << MACHINE_COLUMN_BITS))};
 }
 
-/* Value in Q14, so many columns on: the nodes' part is below 2^30, the bend's within 2^27. */
-static inline int32_t column_q14(const curve_t *curve, int32_t column) {
-    const uint16_t *node = &curve->node[column];
-    return node[0] * curve->low_q14 + node[MACHINE_COLUMNS] * curve->high_q14 - curve->bend[column] * curve->bend_q14;
+static inline node_t flux_node(const phase_map_place_t *place, uint32_t column) {
+    const int32_t value = flux_value_q14(place, &place->tables->column[column]);
+    return (node_t){value, product(value, (int32_t)(column << MACHINE_COLUMN_BITS))};
 }
 
-/* value >> shift, saturated; shift 1..31, for which two words need no more than this. */
-static inline int32_t shifted(int64_t value, unsigned shift) {
-    const int32_t high = (int32_t)(value >> 32);
-    const int32_t low = (int32_t)((uint32_t)value >> shift | (uint32_t)high << (32 - shift));
-    /* What does not fit in a word: more than copies of its sign. */
-    if (high >> (shift - 1) != low >> 31) {
-        return high < 0 ? INT32_MIN : INT32_MAX;
-    }
-    return low;
+/* Between two columns: start + t rise - t (1 - t) bend, for t from 0 to 1. */
+typedef struct {
+    int32_t start;
+    int32_t rise;
+    int32_t bend;
+} span_t;
+
+static inline span_t span(node_t low, node_t high) {
+    /* (column + t) (low + t (high - low)) */
+    return (span_t){low.product, high.product - low.product, product(high.value_q14 - low.value_q14, COLUMN_Q9)};
 }
 
-static inline int32_t look_up(const machine_surface_t *surface, const phase_map_place_t *place, int32_t current_q9,
-                              unsigned shift) {
-    const int32_t held_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
-    const curve_t curve = curve_at(surface, place, held_q9 >> MACHINE_COLUMN_BITS);
-    const int32_t part_q31 = (held_q9 & (COLUMN_Q9 - 1)) << (31 - MACHINE_COLUMN_BITS);
-    const int32_t low_q14 = column_q14(&curve, 0);
-    const int32_t high_q14 = column_q14(&curve, 1);
-    const int32_t value_q14 = low_q14 + 2 * (int32_t)(((int64_t)(high_q14 - low_q14) * part_q31) >> 32);
-    return shifted((int64_t)value_q14 * held_q9, shift);
+/* t in Q15, below one. */
+static inline int32_t at_part(span_t s, int32_t t_q15) {
+    return s.start + 2 * fixed_multiply_high(s.rise, t_q15 << 16) -
+           4 * fixed_multiply_high(s.bend, t_q15 * (ONE_Q15 - t_q15));
 }
 
-/* Greatest t, Q10 of a column, below one, with slope t + bend t^2 <= rest: a bit at a time, as a division that keeps
- * its remainder. All of them below 2^29; more than rest at t = 1. */
-static inline int32_t part_q10(int32_t slope, int32_t bend, int32_t rest) {
-    int32_t part = 0;
-#pragma GCC unroll 10
-    for (int bit = 0; bit < MACHINE_COLUMN_BITS; bit++) {
-        /* Over a step of 2^-k, here times 2^k: slope + 2^-k bend; behind it the slope is 2^(1-k) bend more. */
-        rest *= 2;
-        bend >>= 1;
-        part *= 2;
-        if (slope + bend <= rest) {
-            rest -= slope + bend;
-            slope += 2 * bend;
-            part += 1;
-        }
-    }
-    return part;
-}
-
-/* `result` in the format that look_up() gives with the same shift. */
-static int32_t current_of(const machine_surface_t *surface, const phase_map_place_t *place, int32_t result,
-                          unsigned shift) {
-    if (result <= 0) {
+/* The t at which a span has a product: Newton's iteration from the middle. A curve that rises everywhere has a bend
+ * within its rise; then no divisor is below a quarter of the rise. */
+static inline int32_t part_q15(span_t s, int32_t wanted) {
+    if (wanted <= s.start) {
         return 0;
     }
-    const curve_t curve = curve_at(surface, place, 0);
-    /* Value in INVERSE_BITS times the column's number. */
-    const int32_t wanted = fixed_saturate(((int64_t)result << shift) >> (14 - INVERSE_BITS + MACHINE_COLUMN_BITS));
-    /* Halve the interval of columns that holds it. */
-    int32_t below = 0;
-    int32_t above = MACHINE_COLUMNS - 1;
-    int32_t low = column_q14(&curve, below) >> (14 - INVERSE_BITS);
-    int32_t high = column_q14(&curve, above) >> (14 - INVERSE_BITS);
-    if (above * high <= wanted) {
-        return PHASE_MAP_CURRENT_MAX_Q9;
+    if (wanted - s.start >= s.rise) {
+        return ONE_Q15 - 1;
     }
-    while (above - below > 1) {
-        const int32_t middle = (int32_t)((uint32_t)(below + above) / 2);
-        const int32_t value = column_q14(&curve, middle) >> (14 - INVERSE_BITS);
-        if (middle * value <= wanted) {
-            below = middle;
-            low = value;
-        } else {
-            above = middle;
-            high = value;
-        }
+    /* The rise becomes 2^13..2^14, the rest, of the same unit, has 15 bits more. */
+    const int shift = __builtin_clz((uint32_t)s.rise) - 3;
+    const int32_t rest = (wanted - s.start) << shift;
+    const int32_t rise = (s.rise << shift) >> 15;
+    const int32_t bend = (fixed_clamp(s.bend, -s.rise, s.rise) * (1 << shift)) >> 15;
+    int32_t t_q15 = (rest + bend * (1 << 13)) / rise;
+#pragma GCC unroll 2
+    for (int i = 0; i < 2; i++) {
+        t_q15 = (rest + bend * ((t_q15 * t_q15) >> 15)) / (rise - bend + ((bend * t_q15) >> 14));
     }
-    /* In it, (below + t) (low + t (high - low)) = wanted. */
-    const int32_t part = part_q10(low + below * (high - low), high - low, wanted - below * low);
-    return (below << MACHINE_COLUMN_BITS) + part;
+    return fixed_clamp(t_q15, 0, ONE_Q15 - 1);
 }
 
-phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_angle) {
-    const bool mirrored = phase_angle < HALF_PITCH;
-    uint32_t distance = mirrored ? HALF_PITCH - phase_angle : phase_angle - HALF_PITCH;
-    distance -= distance >> 31; /* the aligned position is the end of the last row */
+/* The place of a distance from the unaligned position, 0..2^31 - 1. */
+static inline phase_map_place_t place_of(const machine_tables_t *tables, uint32_t distance) {
     /* From the row in which its part of half a pitch begins; the last row's start is beyond every distance. */
-    uint32_t row = tables->cell_row[distance >> MACHINE_CELL_BITS];
-    while (tables->row[row + 1].start <= distance) {
+    const machine_row_t *row = &tables->row[tables->cell_row[distance >> MACHINE_CELL_BITS]];
+    while (row[1].start <= distance) {
         row++;
     }
     /* The reciprocal is rounded down and the distance in the row below its width: below one, and rounded at most one.
      */
-    const uint32_t inside = distance - tables->row[row].start;
-    const uint32_t fraction_q15 = (uint32_t)(((uint64_t)inside * tables->row[row].reciprocal) >> 32);
+    const uint32_t fraction_q15 = (uint32_t)(((uint64_t)(distance - row->start) * row->reciprocal) >> 32);
     const int32_t fraction_q14 = (int32_t)((fraction_q15 + 1) >> 1);
+    const int32_t bend_q14 = (fraction_q14 * (ONE_Q14 - fraction_q14)) >> 14;
     return (phase_map_place_t){
         .tables = tables,
-        .first = row * MACHINE_COLUMNS,
-        .fraction_q14 = fraction_q14,
-        .bend_q14 = (fraction_q14 * (ONE_Q14 - fraction_q14)) >> 14,
-        .mirrored = mirrored,
+        .row = (uint32_t)(row - tables->row),
+        .weights_q14 = fixed_pair(ONE_Q14 - fraction_q14, fraction_q14),
+        .torque_bend_q14 = bend_q14 << tables->torque_format.bend_shift,
+        .flux_bend_q14 = bend_q14 << tables->flux_format.bend_shift,
     };
 }
 
-int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9) {
-    const machine_surface_t *surface = &place->tables->torque_per_ampere;
-    const int32_t forwards_q24 = look_up(surface, place, current_q9, TORQUE_SHIFT(surface));
+static inline phase_map_place_t place_at(const machine_tables_t *tables, uint32_t phase_angle) {
+    const bool mirrored = phase_angle < HALF_PITCH;
+    const uint32_t distance = mirrored ? HALF_PITCH - phase_angle : phase_angle - HALF_PITCH;
+    /* The aligned position is the end of the last row. */
+    phase_map_place_t place = place_of(tables, distance - (distance >> 31));
+    place.mirrored = mirrored;
+    return place;
+}
+
+static inline int32_t torque_between_q24(const phase_map_place_t *place, const machine_column_t *c, int32_t held_q9) {
+    const int32_t there = between(torque_value_q14(place, &c[0]), torque_value_q14(place, &c[1]), held_q9);
+    const int32_t forwards_q24 = result(&place->tables->torque_format, there);
     return place->mirrored ? fixed_subtract(0, forwards_q24) : forwards_q24;
 }
 
+static inline int32_t flux_between_q29(const phase_map_place_t *place, const machine_column_t *c, int32_t held_q9) {
+    const int32_t there = between(flux_value_q14(place, &c[0]), flux_value_q14(place, &c[1]), held_q9);
+    return result(&place->tables->flux_format, there);
+}
+
+phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_angle) {
+    return place_at(tables, phase_angle);
+}
+
+int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9) {
+    const int32_t held_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
+    return torque_between_q24(place, &place->tables->column[held_q9 >> MACHINE_COLUMN_BITS], held_q9);
+}
+
 int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9) {
-    const machine_surface_t *surface = &place->tables->flux_per_ampere;
-    return look_up(surface, place, current_q9, FLUX_SHIFT(surface));
+    const int32_t held_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
+    return flux_between_q29(place, &place->tables->column[held_q9 >> MACHINE_COLUMN_BITS], held_q9);
+}
+
+int32_t phase_map_torque_slope_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,
+                                   uint32_t turn) {
+    const machine_format_t *format = &tables->torque_format;
+    const phase_map_place_t place = place_at(tables, phase_angle);
+    const uint32_t ratio_q15 = (uint32_t)(((uint64_t)tables->row[place.row].reciprocal * turn) >> 32);
+    /* Over a row's width: the nodes' difference less what u (1 - u) of the bend changes by, within 2^30 + 2^29. */
+    const int32_t bend_q14 = (ONE_Q14 - 2 * (int32_t)(place.weights_q14 >> 16)) * (1 << format->bend_shift);
+    const int32_t held_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
+    const machine_column_t *c = &tables->column[held_q9 >> MACHINE_COLUMN_BITS];
+    int32_t slope_q14[2];
+    for (int i = 0; i < 2; i++) {
+        slope_q14[i] = fixed_pair_multiply_add(&c[i].torque_node[place.row], fixed_pair(-ONE_Q14, ONE_Q14), 0) -
+                       c[i].torque_bend[place.row] * bend_q14;
+    }
+    const int32_t there = between(slope_q14[0] / 2, slope_q14[1] / 2, held_q9);
+    return fixed_saturate(((int64_t)there * ratio_q15) >> (14 - format->result_shift));
 }
 
 int32_t phase_map_current_of_torque_q9(const phase_map_place_t *place, int32_t torque_q24) {
-    const machine_surface_t *surface = &place->tables->torque_per_ampere;
+    const machine_format_t *format = &place->tables->torque_format;
     const int32_t forwards_q24 = place->mirrored ? fixed_subtract(0, torque_q24) : torque_q24;
-    return current_of(surface, place, forwards_q24, TORQUE_SHIFT(surface));
+    if (forwards_q24 <= 0) {
+        return 0;
+    }
+    const int32_t wanted = forwards_q24 >> format->result_shift;
+    /* Halve the interval of columns that holds it. */
+    uint32_t below = 0;
+    uint32_t above = MACHINE_COLUMNS - 1;
+    node_t low = torque_node(place, below);
+    node_t high = torque_node(place, above);
+    if (high.product <= wanted) {
+        return PHASE_MAP_CURRENT_MAX_Q9;
+    }
+    while (above - below > 1) {
+        const uint32_t middle = (below + above) / 2;
+        const node_t node = torque_node(place, middle);
+        if (node.product <= wanted) {
+            below = middle;
+            low = node;
+        } else {
+            above = middle;
+            high = node;
+        }
+    }
+    const int32_t t_q15 = part_q15(span(low, high), wanted);
+    return (int32_t)(below << MACHINE_COLUMN_BITS) + (t_q15 >> (15 - MACHINE_COLUMN_BITS));
 }
 
-int32_t phase_map_current_of_flux_q9(const phase_map_place_t *place, int32_t flux_q29) {
-    const machine_surface_t *surface = &place->tables->flux_per_ampere;
-    return current_of(surface, place, flux_q29, FLUX_SHIFT(surface));
+/* A torque and a range, as products and as a column. */
+typedef struct {
+    int32_t torque;
+    int32_t lowest;
+    int32_t highest;
+    uint32_t limit;
+} target_t;
+
+typedef struct {
+    node_t torque;
+    node_t flux;
+} column_t;
+
+static inline column_t column_at(const phase_map_place_t *place, uint32_t column) {
+    return (column_t){torque_node(place, column), flux_node(place, column)};
+}
+
+/* The first column is below every target. */
+static inline bool is_below(column_t c, uint32_t column, target_t target) {
+    return c.flux.product <= target.highest &&
+           ((c.torque.product <= target.torque && column <= target.limit) || c.flux.product <= target.lowest);
+}
+
+bool phase_map_reach(const machine_tables_t *tables, uint32_t phase_angle, int32_t torque_q24,
+                     const phase_map_range_t *range, phase_map_point_t *point) {
+    const phase_map_place_t place = place_of(tables, phase_angle - HALF_PITCH);
+    const machine_format_t *torque_format = &tables->torque_format;
+    const machine_format_t *flux_format = &tables->flux_format;
+    const int32_t wanted_q24 = torque_q24 > 0 ? torque_q24 : 0;
+    const target_t target = {
+        .torque = wanted_q24 >> torque_format->result_shift,
+        .lowest = range->lowest_q29 >> flux_format->result_shift,
+        .highest = range->highest_q29 >> flux_format->result_shift,
+        .limit = (uint32_t)range->current_limit_q9 >> MACHINE_COLUMN_BITS,
+    };
+
+    /* The last column below the target, from where the phase was. */
+    uint32_t column = point->column;
+    column_t low = column_at(&place, column);
+    column_t high = low;
+    if (is_below(low, column, target)) {
+        while (high = column_at(&place, column + 1),
+               column < MACHINE_COLUMNS - 2 && is_below(high, column + 1, target)) {
+            low = high;
+            column++;
+        }
+    } else {
+        do {
+            high = low;
+            low = column_at(&place, --column);
+        } while (!is_below(low, column, target));
+    }
+    point->column = column;
+
+    const span_t torque = span(low.torque, high.torque);
+    const span_t flux = span(low.flux, high.flux);
+    const int32_t limit_q15 =
+        (range->current_limit_q9 - (int32_t)(column << MACHINE_COLUMN_BITS)) * (1 << (15 - MACHINE_COLUMN_BITS));
+    int32_t t_q15 = part_q15(torque, target.torque);
+    bool reached = torque.start <= target.torque && target.torque < high.torque.product;
+    if (t_q15 > limit_q15) {
+        t_q15 = limit_q15 > 0 ? limit_q15 : 0;
+        reached = false;
+    }
+    int32_t flux_q29 = result(flux_format, at_part(flux, t_q15));
+    const bool beyond = !reached && t_q15 == ONE_Q15 - 1; /* the torque, so that the flux linkage ends what is below */
+    if (beyond || flux_q29 < range->lowest_q29 || flux_q29 > range->highest_q29) {
+        flux_q29 = flux_q29 < range->lowest_q29 ? range->lowest_q29 : range->highest_q29;
+        t_q15 = part_q15(flux, flux_q29 >> flux_format->result_shift);
+        reached = false;
+    }
+    point->flux_q29 = flux_q29;
+    point->torque_q24 = reached ? wanted_q24 : result(torque_format, at_part(torque, t_q15));
+    return reached;
 }

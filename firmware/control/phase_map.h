@@ -1,4 +1,4 @@
-/* Magnetics of one phase: torque and flux linkage from angle and current, and the current for either.
+/* Magnetics of one phase: torque and flux linkage from angle and current, and back.
  *
  * Of the machine's tables of T / i and psi / i (control/machine_tables.h): quadratic over the angle between rows,
  * linear over the current between columns, times the current. Within three units of the last place that the tables
@@ -17,29 +17,53 @@
 /* An angle found in the tables: one search and one multiplication for all that is asked there. */
 typedef struct {
     const machine_tables_t *tables;
-    uint32_t first;       /* node of the row at or before the angle, column 0 */
-    int32_t fraction_q14; /* of the way to the next row, 0..2^14, rounded to nearest */
-    int32_t bend_q14;     /* fraction (1 - fraction) */
-    bool mirrored;        /* between aligned and unaligned, where torque is negative */
+    uint32_t row;                           /* at or before the angle */
+    uint32_t weights_q14;                   /* of this row's nodes and the next row's, which make 2^14: a fixed_pair */
+    int32_t torque_bend_q14, flux_bend_q14; /* of the bends: product of the weights */
+    bool mirrored;                          /* between aligned and unaligned, where torque is negative */
 } phase_map_place_t;
 
 /* Angle of the phase: 2^-32 rotor pitch, 0 aligned, 2^31 unaligned. `tables` must outlive the place. */
 phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_angle);
 
 /* Torque in N m, Q7.24: positive from unaligned to aligned, negative in the other half by mirror symmetry. Current in
- * A, Q7.9, held within 0..80 A. 64-bit product, truncated, saturated. */
+ * A, Q7.9, held within 0..80 A. The product with the current keeps 28 bits, rounded; saturated. */
 int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9);
 
 /* Flux linkage in Wb, Q2.29, the same in both halves. Current, product and ends as for the torque. */
 int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9);
 
-/* The current in A, Q7.9, for a torque in N m, Q7.24: the greatest of its 2 A that does not give more, 0 where the
- * torque is none or of the sign that the phase has not here, the map's end where it does not reach the torque. T / i
- * is counted here in steps of 1/64 of the tables' last place: but for 1/32 of it, times the current of the column
- * above, the torque there is no more than wanted, and one unit of current more gives no less. */
+/* By how much the torque rises over so small a turn (2^-32 pitch, below 2^27), of the slope at an angle: N m, Q7.24.
+ * Current and ends as for the torque. */
+int32_t phase_map_torque_slope_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,
+                                   uint32_t turn);
+
+/* The current in A, Q7.9, for a torque in N m, Q7.24, rounded down: 0 where the torque is none or of the sign that the
+ * phase has not here, the map's end where it does not reach the torque. Within 1 mN m and a unit of current. */
 int32_t phase_map_current_of_torque_q9(const phase_map_place_t *place, int32_t torque_q24);
 
-/* The current in A, Q7.9, for a flux linkage in Wb, Q2.29; as for the torque. */
-int32_t phase_map_current_of_flux_q9(const phase_map_place_t *place, int32_t flux_q29);
+/* What a phase is to have. */
+typedef struct {
+    uint32_t column; /* of its current, 0..MACHINE_COLUMNS - 2 */
+    int32_t flux_q29;
+    int32_t torque_q24;
+} phase_map_point_t;
+
+/* What it may have. */
+typedef struct {
+    int32_t lowest_q29;       /* flux linkage in Wb, Q2.29: 0 <= lowest <= highest */
+    int32_t highest_q29;      /* which counts more than the current limit */
+    int32_t current_limit_q9; /* A, Q7.9, 0..PHASE_MAP_CURRENT_MAX_Q9 */
+} phase_map_range_t;
+
+/* The point of a torque (N m, Q7.24; below zero counts as none) at an angle in the half from 2^31, unaligned, to 2^32,
+ * or the nearest that the range leaves, whose lowest flux linkage counts most: true when that is the torque itself. At
+ * an end of the range's flux linkages the point's is that end, to the bit. The torque that the tables give for the
+ * point's flux linkage is the point's within 2 mN m.
+ *
+ * The search begins at the point's column, and where torque and flux linkage rise with the current it ends at the same
+ * point from everywhere; it is short where the current has changed little. */
+bool phase_map_reach(const machine_tables_t *tables, uint32_t phase_angle, int32_t torque_q24,
+                     const phase_map_range_t *range, phase_map_point_t *point);
 
 #endif

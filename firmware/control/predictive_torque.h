@@ -38,11 +38,12 @@
 typedef struct {
     flux_observer_parameters_t flux;
     torque_share_parameters_t share;
-    int32_t period_q40;       /* Ts in s, Q-9.40 */
-    int32_t current_limit_q9; /* A, Q7.9 */
-    int32_t reserve_q24;      /* N m, Q7.24, >= 0 */
-    int32_t advance_q30;      /* a period with torque missing, Q1.30 */
-    int32_t return_q30;       /* a period without */
+    torque_share_window_t late; /* without advance */
+    int32_t period_q40;         /* Ts in s, Q-9.40 */
+    int32_t current_limit_q9;   /* A, Q7.9 */
+    int32_t reserve_q24;        /* N m, Q7.24, >= 0 */
+    int32_t advance_q30;        /* a period with torque missing, Q1.30 */
+    int32_t return_q30;         /* a period without */
 } predictive_torque_parameters_t;
 
 typedef struct {
@@ -50,6 +51,7 @@ typedef struct {
     int32_t duty_q15[HAL_PHASES_MAX]; /* that acts from the coming sample on, Q1.15 */
     int32_t advance_q30;              /* 0..1 */
     int32_t missing_q24;              /* torque reference less what the voltage allows, N m, Q7.24 */
+    uint8_t column[HAL_PHASES_MAX];   /* of the tables, where a phase was planned to be */
 } predictive_torque_t;
 
 typedef struct {

@@ -1,5 +1,6 @@
 #include "drive/configure.h"
 
+#include "fixed/divide.h"
 #include "fixed/fixed.h"
 
 /* The BP-PID's gains are set for this rate; a period twice as long moves the torque twice as far for the same duty. */
@@ -20,7 +21,7 @@ static int64_t speed_q22_from_rpm(int32_t rpm) {
 
 /* 2^-32 pitch from electrical degrees in Q7; 360 degrees is held just below the full pitch. */
 static uint32_t pitch_from_degrees(int32_t degrees_q7) {
-    const uint64_t angle = ((uint64_t)(uint32_t)degrees_q7 << 32) / (360u * 128u);
+    const int64_t angle = fixed_divide((int64_t)degrees_q7 << 32, 360 * 128);
     return angle > UINT32_MAX ? UINT32_MAX : (uint32_t)angle;
 }
 
@@ -29,14 +30,14 @@ static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
     if (rpm_s == 0) {
         return INT32_MAX;
     }
-    const int64_t step_q22 = speed_q22_from_rpm(rpm_s) / (int64_t)control_rate_hz;
+    const int64_t step_q22 = fixed_divide(speed_q22_from_rpm(rpm_s), control_rate_hz);
     return fixed_clamp(fixed_saturate(step_q22), 1, INT32_MAX);
 }
 
 /* Duty per scaled error from duty per N m at GAIN_RATE_HZ, both Q15. */
 static int32_t pid_scale_q15(int32_t per_Nm_q15, int32_t error_scale_q24, uint32_t control_rate_hz) {
     const int64_t scaled_q15 = fixed_shift((int64_t)per_Nm_q15 * error_scale_q24, 24);
-    return fixed_clamp(fixed_saturate(scaled_q15 * control_rate_hz / GAIN_RATE_HZ), 0, 4 << 15);
+    return fixed_clamp(fixed_saturate(fixed_divide(scaled_q15 * control_rate_hz, GAIN_RATE_HZ)), 0, 4 << 15);
 }
 
 /* Of drive and load together, N m: beyond the drive's highest torque limit. */
@@ -58,8 +59,8 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
         .angle_unmoved_max = (uint32_t)(((uint64_t)1 << 32) / 1440u) + 4u * count,
         .angle_step_q32 = angle_step_q32,
         .command_timeout_us = (uint32_t)values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u,
-        .slowing_q22 = fixed_saturate(((int64_t)SLOWING_TORQUE_NM << 52) / values[PARAMETER_INERTIA_KG_M2] /
-                                      (int64_t)control_rate_hz),
+        .slowing_q22 = fixed_saturate(fixed_divide(
+            fixed_divide((int64_t)SLOWING_TORQUE_NM << 52, values[PARAMETER_INERTIA_KG_M2]), control_rate_hz)),
     };
 }
 
@@ -67,8 +68,8 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
  * until the new state acts, one until it is seen): the limit leaves room for that below the trip, and a tenth to spare.
  * The rise is the unaligned phase's; a saturated one comes close to it anywhere. */
 static int32_t hysteresis_limit_q9(const int32_t *values, int32_t current_rise_A_s, uint32_t control_rate_hz) {
-    const int64_t rise_q9 = ((int64_t)current_rise_A_s << 9) / (int64_t)control_rate_hz;
-    const int64_t limit_q9 = values[PARAMETER_CURRENT_TRIP_A] - rise_q9 * 22 / 10;
+    const int64_t rise_q9 = fixed_divide((int64_t)current_rise_A_s << 9, control_rate_hz);
+    const int64_t limit_q9 = values[PARAMETER_CURRENT_TRIP_A] - fixed_divide(rise_q9 * 22, 10);
     return fixed_clamp(fixed_saturate(limit_q9), 0, values[PARAMETER_CURRENT_LIMIT_A]);
 }
 
@@ -87,7 +88,7 @@ static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, uin
 /* A trim's gain is N m per N m: the PID's output +-1 is +-limit, its error 1 the error scale. */
 static int32_t trim_scale_q15(const int32_t *values, parameter_index_t gain) {
     const int64_t scaled_q39 = (int64_t)values[gain] * values[PARAMETER_BP_ERROR_SCALE_NM];
-    return fixed_clamp(fixed_saturate(scaled_q39 / values[PARAMETER_BP_TRIM_LIMIT_NM]), 0, 4 << 15);
+    return fixed_clamp(fixed_saturate(fixed_divide(scaled_q39, values[PARAMETER_BP_TRIM_LIMIT_NM])), 0, 4 << 15);
 }
 
 /* What both PIDs have in common: network, error scale, seed. */
@@ -96,7 +97,7 @@ static bp_pid_parameters_t bp_pid_from(const int32_t *values, parameter_index_t 
     return (bp_pid_parameters_t){
         .mode = (bp_pid_mode_t)values[mode],
         .seed = (uint32_t)values[PARAMETER_BP_SEED],
-        .error_scale_inverse_q24 = fixed_saturate(((int64_t)1 << 48) / values[PARAMETER_BP_ERROR_SCALE_NM]),
+        .error_scale_inverse_q24 = fixed_saturate(fixed_divide((int64_t)1 << 48, values[PARAMETER_BP_ERROR_SCALE_NM])),
         .scale_q28 = {kp_scale_q15 << 13, ki_scale_q15 << 13, kd_scale_q15 << 13},
         .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
                     .inertia_q32 = values[PARAMETER_BP_ALPHA] << 4},
@@ -132,26 +133,28 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
     const uint32_t least = stroke + pitch_from_degrees(2 << 7);
     const uint32_t width = turn_off - turn_on > least ? turn_off - turn_on : least;
     const uint32_t narrowing = off_early > on_early ? off_early - on_early : 0;
+    const torque_share_parameters_t share = {
+        .sharing = values[PARAMETER_TORQUE_SHARING] != 0,
+        .stroke = stroke,
+        .turn_on = turn_on,
+        .turn_off = turn_on + width,
+        .turn_on_early = on_early,
+        .turn_off_early = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
+    };
     return (predictive_torque_parameters_t){
         .flux =
             {
                 .gain_q15 = values[PARAMETER_FLUX_OBSERVER_GAIN],
-                .resistance_period_q40 = fixed_saturate(((int64_t)values[PARAMETER_RESISTANCE_OHM] << 16) / rate),
+                .resistance_period_q40 =
+                    fixed_saturate(fixed_divide((int64_t)values[PARAMETER_RESISTANCE_OHM] << 16, rate)),
             },
-        .share =
-            {
-                .sharing = values[PARAMETER_TORQUE_SHARING] != 0,
-                .stroke = stroke,
-                .turn_on = turn_on,
-                .turn_off = turn_on + width,
-                .turn_on_early = on_early,
-                .turn_off_early = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
-            },
-        .period_q40 = (int32_t)(((int64_t)1 << 40) / rate),
+        .share = share,
+        .late = torque_share_window(&share, 0),
+        .period_q40 = (int32_t)fixed_divide((int64_t)1 << 40, rate),
         .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
-        .advance_q30 = (int32_t)(10 * ((int64_t)1 << 30) / rate),
-        .return_q30 = (int32_t)(((int64_t)1 << 30) / rate),
+        .advance_q30 = (int32_t)fixed_divide(10 * ((int64_t)1 << 30), rate),
+        .return_q30 = (int32_t)fixed_divide((int64_t)1 << 30, rate),
     };
 }
 
@@ -179,7 +182,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .speed_pi =
             {
                 .kp_q16 = values[PARAMETER_SPEED_KP],
-                .ki_step_q32 = fixed_saturate(((int64_t)values[PARAMETER_SPEED_KI] << 16) / (int64_t)control_rate_hz),
+                .ki_step_q32 = fixed_saturate(fixed_divide((int64_t)values[PARAMETER_SPEED_KI] << 16, control_rate_hz)),
                 .torque_min_q24 = 0,
                 .torque_max_q24 = torque_max_q24,
             },
@@ -209,10 +212,11 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                 .pid = duty_pid_from(values, control_rate_hz),
                 .aims = ditc_duty_aims(tables, pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
                 /* Half of what would reach the current in one period at rest: rate / (2 * A/s), in Q24. */
-                .incoming_gain_q24 = fixed_saturate(((int64_t)control_rate_hz << 23) / tables->current_rise_A_s),
+                .incoming_gain_q24 =
+                    fixed_saturate(fixed_divide((int64_t)control_rate_hz << 23, tables->current_rise_A_s)),
                 /* At 40 kHz a sixteenth of the reference, and 1/16 N m: see ditc_duty.h. */
                 .surplus_q32 = (int32_t)(((uint32_t)GAIN_RATE_HZ << 16) / control_rate_hz << 12),
-                .spent_torque_q24 = (int32_t)(((int64_t)control_rate_hz << 20) / GAIN_RATE_HZ),
+                .spent_torque_q24 = (int32_t)fixed_divide((int64_t)control_rate_hz << 20, GAIN_RATE_HZ),
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
                 .current_limit_q9 = current_limit_q9,
             },

@@ -38,6 +38,9 @@ void drive_control_interrupt(drive_t *drive) {
     sample.missed_interrupts = hal_pwm_missed_interrupts(drive->hal);
     sample.time_us = hal_time_us(drive->hal);
     sample.command = drive->command;
+    if (sample.missed_interrupts != 0) {
+        drive->late_interrupts++; /* the one before this */
+    }
     hal_encoder_read(drive->hal, &sample.encoder);
     hal_adc_read(drive->hal, &sample.adc);
     hal_pwm_compare_t compare;
@@ -45,6 +48,10 @@ void drive_control_interrupt(drive_t *drive) {
         hal_pwm_write(drive->hal, &compare);
     } else {
         hal_pwm_open_all(drive->hal);
+    }
+    drive->used_ticks = hal_pwm_elapsed_ticks(drive->hal);
+    if (drive->used_ticks > drive->worst_ticks) {
+        drive->worst_ticks = drive->used_ticks;
     }
 }
 
@@ -88,6 +95,10 @@ static telemetry_snapshot_t snapshot(const drive_t *drive, uint32_t time_us) {
         .misalignment = misalignment(drive),
         .torque_missing_q24 = d->torque_missing_q24,
         .observer_bandwidth_rad_s = d->observer_bandwidth_rad_s,
+        .used_ticks = drive->used_ticks,
+        .worst_ticks = drive->worst_ticks,
+        .available_ticks = 2u * drive->control_parameters.period_ticks,
+        .late_interrupts = drive->late_interrupts,
         .last_fault = machine->record,
     };
     for (unsigned phase = 0; phase < TELEMETRY_PHASES; phase++) {

@@ -26,6 +26,10 @@ typedef struct {
     /* Of the interrupt; read by the background with the interrupt kept out. */
     control_state_t control;
     control_diagnostics_t diagnostics;
+    /* The interrupt's time on the processor: nobody acts on it. What a late interrupt does is in drive/protection.h. */
+    uint32_t used_ticks;      /* from trigger to end, of the last one, HAL_PWM_TICK_NS */
+    uint32_t worst_ticks;     /* of the longest since start */
+    uint32_t late_interrupts; /* that ended after the next trigger, since start */
 } drive_t;
 
 /* Prepares the drive and starts the timer. False, and nothing started, for a control rate that is not allowed. Keeps

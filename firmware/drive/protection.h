@@ -21,7 +21,7 @@ typedef struct {
     uint32_t angle;      /* of the last period, 2^-32 turn */
     int32_t moving_q22;  /* least speed that the rotor can have by now, rad/s, Q9.22 */
     int64_t unmoved_q64; /* expected movement since the encoder last moved, 2^-64 turn */
-    uint32_t overruns;   /* control interrupts lost in a row */
+    uint32_t overruns;   /* control interrupts lost in a row: what ran between them was late as well */
 } protection_t;
 
 typedef struct {
@@ -33,7 +33,9 @@ typedef struct {
     uint32_t command_age_us;    /* of the last accepted command */
 } protection_sample_t;
 
-/* Lost control interrupts in a row that are a fault. */
+/* Lost control interrupts in a row that are a fault. An interrupt that is late, ending after the next trigger, loses
+ * that trigger and every other one before its end: three late ones in a row are a fault, or one that is three periods
+ * late, noticed by the interrupt after them. One that was in time ends the row. */
 #define PROTECTION_OVERRUNS_MAX 3
 
 /* Starts at a measured angle. */

@@ -76,4 +76,16 @@ static inline int32_t fixed_multiply(int32_t a, int32_t b, unsigned shift) {
     return fixed_saturate(fixed_shift((int64_t)a * b, shift));
 }
 
+/* a * b / 2^32, rounded; cannot overflow. One instruction where the processor has it: a format whose products end here
+ * costs least. */
+static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
+#ifdef __ARM_FEATURE_DSP
+    int32_t high;
+    __asm__("smmulr %0, %1, %2" : "=r"(high) : "r"(a), "r"(b));
+    return high;
+#else
+    return (int32_t)fixed_shift((int64_t)a * b, 32);
+#endif
+}
+
 #endif

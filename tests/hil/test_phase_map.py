@@ -118,7 +118,7 @@ class Scaled:
         return self.factor * self.magnetics.torque_Nm(angle_rad, current_A)
 
 
-@pytest.mark.parametrize("factor", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize("factor", [0.5, 1.0, 100.0])
 def test_the_format_follows_the_machine(factor):
     machine = load_machine(SHIPPED / "saturating.toml").magnetics
     tables = phase_map(Scaled(machine, factor))
@@ -127,6 +127,15 @@ def test_the_format_follows_the_machine(factor):
         assert np.min(surface.node) >= 0
         assert 64 <= np.max(np.abs(surface.bend)) <= 127, "and of the bends all 8"
         assert 0 <= surface.bend_shift <= BEND_SHIFT_MAX
+        assert 0 <= surface.result_shift <= 12
+
+
+def test_a_weak_machine_has_the_finest_format():
+    machine = load_machine(SHIPPED / "saturating.toml").magnetics
+    tables = phase_map(Scaled(machine, 0.01))
+    for surface in (tables.torque_per_ampere, tables.flux_per_ampere):
+        assert surface.result_shift == 0
+        assert 500 < np.max(surface.node) < 5000
 
 
 def test_what_the_tables_cannot_hold_is_refused_in_one_line():

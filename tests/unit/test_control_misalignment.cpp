@@ -72,13 +72,14 @@ class Machine {
             if (place > 0.6 && place < 0.95) {
                 current_q9[phase] = 15 * 512;
             }
-            const double probe = pitch_of(PROBE_RAD);
             const auto torque = [&](double at) {
                 const phase_map_place_t where = phase_map_at(&machine_tables, angle_of(at));
                 return phase_map_torque_q24(&where, current_q9[phase]) / twins::Q24;
             };
             if (current_q9[phase] > 0) {
-                slope[phase] = (torque(corrected + probe) - torque(corrected - probe)) / (2.0 * PROBE_RAD);
+                slope[phase] =
+                    phase_map_torque_slope_q24(&machine_tables, angle[phase], current_q9[phase], 2 * parameters.probe) /
+                    twins::Q24 / (2.0 * PROBE_RAD);
                 missing += torque(corrected) - torque(assumed - pitch_of(off[phase] / 180.0 * twins::PI));
             }
         }

@@ -33,14 +33,33 @@ int32_t flux_q29(uint32_t angle, int32_t current_q9) {
     return phase_map_flux_q29(&place, current_q9);
 }
 
+// A product's last place in N m and Wb.
+const double TORQUE_PLACE = std::exp2(machine_tables.torque_format.result_shift) / twins::Q24;
+const double FLUX_PLACE = std::exp2(machine_tables.flux_format.result_shift) / Q29;
+
 constexpr int32_t column_q9(int32_t column) {
     return column << MACHINE_COLUMN_BITS;
 }
 
-// Node of a table, as the firmware counts them.
-int node(const machine_surface_t &surface, int row, int column) {
-    return surface.node[row * MACHINE_COLUMNS + column];
-}
+// One of the two surfaces that the tables hold, and what a node's last place is in a result of so many fraction bits.
+struct surface_t {
+    int16_t (machine_column_t::*nodes)[MACHINE_ROWS];
+    int8_t (machine_column_t::*bends)[MACHINE_ROWS - 1];
+    machine_format_t machine_tables_t::*format;
+    int result_bits;
+
+    int node(int row, int column) const { return (machine_tables.column[column].*nodes)[row] + MACHINE_NODE_OFFSET; }
+    double bend(int row, int column) const {
+        return std::ldexp((machine_tables.column[column].*bends)[row], (machine_tables.*format).bend_shift);
+    }
+    // Q14 times Q9 times 2^15 less 32 bits.
+    int fraction_bits() const { return result_bits + 32 - 15 - 9 - 14 - (machine_tables.*format).result_shift; }
+};
+
+constexpr surface_t TORQUE = {&machine_column_t::torque_node, &machine_column_t::torque_bend,
+                              &machine_tables_t::torque_format, 24};
+constexpr surface_t FLUX = {&machine_column_t::flux_node, &machine_column_t::flux_bend, &machine_tables_t::flux_format,
+                            29};
 
 int row_of(uint32_t distance) {
     int row = 0;
@@ -51,7 +70,7 @@ int row_of(uint32_t distance) {
 }
 
 // The same tables in double precision, an angle of the second half pitch.
-double twin(const machine_surface_t &surface, uint32_t angle, double current_A) {
+double twin(const surface_t &surface, uint32_t angle, double current_A) {
     const uint32_t distance = angle - HALF_PITCH;
     const int row = row_of(distance);
     const double start = machine_tables.row[row].start;
@@ -59,12 +78,11 @@ double twin(const machine_surface_t &surface, uint32_t angle, double current_A) 
     const int column = std::min(int(current_A / 2.0), MACHINE_COLUMNS - 2);
     double at_column[2];
     for (int i = 0; i < 2; i++) {
-        const double low = node(surface, row, column + i), high = node(surface, row + 1, column + i);
-        const double bend = std::ldexp(surface.bend[row * MACHINE_COLUMNS + column + i], surface.bend_shift);
-        at_column[i] = low + u * (high - low) - u * (1.0 - u) * bend;
+        const double low = surface.node(row, column + i), high = surface.node(row + 1, column + i);
+        at_column[i] = low + u * (high - low) - u * (1.0 - u) * surface.bend(row, column + i);
     }
     const double value = at_column[0] + (current_A / 2.0 - column) * (at_column[1] - at_column[0]);
-    return current_A * value / std::exp2(surface.fraction_bits);
+    return current_A * value / std::exp2(surface.fraction_bits());
 }
 
 class Magnetics {
@@ -109,13 +127,14 @@ TEST(PhaseMap, an_angle_s_place_is_the_nearest_fraction_of_its_row_and_never_abo
     const auto look = [&](uint32_t distance) {
         const phase_map_place_t place = phase_map_at(&machine_tables, HALF_PITCH + distance);
         const int row = row_of(distance);
-        ASSERT_EQ(place.first, uint32_t(row * MACHINE_COLUMNS));
-        ASSERT_GE(place.fraction_q14, 0);
-        ASSERT_LE(place.fraction_q14, 1 << 14);
+        ASSERT_EQ(place.row, uint32_t(row));
+        const auto fraction_q14 = int32_t(place.weights_q14 >> 16);
+        ASSERT_EQ(int32_t(place.weights_q14 & 0xFFFF) + fraction_q14, 1 << 14);
+        ASSERT_LE(fraction_q14, 1 << 14);
         const double start = machine_tables.row[row].start;
         const double u = (distance - start) / (machine_tables.row[row + 1].start - start);
-        worst = std::max(worst, std::fabs(place.fraction_q14 - std::ldexp(u, 14)));
-        greatest = std::max(greatest, place.fraction_q14);
+        worst = std::max(worst, std::fabs(fraction_q14 - std::ldexp(u, 14)));
+        greatest = std::max(greatest, fraction_q14);
     };
     for (int i = 0; i < 1000000; i++) {
         look(uint32_t(random()) >> 1);
@@ -133,19 +152,18 @@ TEST(PhaseMap, an_angle_s_place_is_the_nearest_fraction_of_its_row_and_never_abo
 
 TEST(PhaseMap, torque_and_flux_are_those_of_the_tables_within_three_of_their_last_place) {
     std::mt19937 random(1);
-    const machine_surface_t &torque = machine_tables.torque_per_ampere;
-    const machine_surface_t &flux = machine_tables.flux_per_ampere;
     double torque_worst = 0.0, flux_worst = 0.0; // last places of the tables
     for (int i = 0; i < 1000000; i++) {
         const uint32_t angle = HALF_PITCH | uint32_t(random());
         const auto current_q9 = int32_t(random() % uint32_t(CURRENT_END_Q9)) + 1;
         const double current_A = current_q9 / twins::Q9;
-        const double torque_Nm = std::min(twin(torque, angle, current_A), 128.0);
-        // But for the last place of the result.
-        const double torque_error = std::fabs(torque_q24(angle, current_q9) / twins::Q24 - torque_Nm) - 1 / twins::Q24;
-        const double flux_error = std::fabs(flux_q29(angle, current_q9) / Q29 - twin(flux, angle, current_A)) - 1 / Q29;
-        torque_worst = std::max(torque_worst, torque_error / current_A * std::exp2(torque.fraction_bits));
-        flux_worst = std::max(flux_worst, flux_error / current_A * std::exp2(flux.fraction_bits));
+        const double torque_Nm = std::min(twin(TORQUE, angle, current_A), 128.0);
+        // But for the last place of the product.
+        const double torque_error = std::fabs(torque_q24(angle, current_q9) / twins::Q24 - torque_Nm) - TORQUE_PLACE;
+        const double flux_error =
+            std::fabs(flux_q29(angle, current_q9) / Q29 - twin(FLUX, angle, current_A)) - FLUX_PLACE;
+        torque_worst = std::max(torque_worst, torque_error / current_A * std::exp2(TORQUE.fraction_bits()));
+        flux_worst = std::max(flux_worst, flux_error / current_A * std::exp2(FLUX.fraction_bits()));
     }
     // The angle within a row is rounded to 14 bits, and in one row the torque may go through all of its 16.
     EXPECT_LT(torque_worst, 3.0);
@@ -160,12 +178,10 @@ TEST(PhaseMap, torque_and_flux_are_exact_at_every_node_of_the_tables) {
         for (int32_t column = 0; column + 1 < MACHINE_COLUMNS; column++) {
             const int32_t current_q9 = column_q9(column);
             const double current_A = current_q9 / twins::Q9;
-            const machine_surface_t &torque = machine_tables.torque_per_ampere;
-            const double torque_Nm = current_A * node(torque, row, column) / std::exp2(torque.fraction_bits);
+            const double torque_Nm = current_A * TORQUE.node(row, column) / std::exp2(TORQUE.fraction_bits());
             ASSERT_NEAR(torque_q24(angle, current_q9) / twins::Q24 * (angle == 0 ? -1.0 : 1.0),
                         std::min(torque_Nm, 128.0), 1e-5);
-            const machine_surface_t &flux = machine_tables.flux_per_ampere;
-            const double flux_Wb = current_A * node(flux, row, column) / std::exp2(flux.fraction_bits);
+            const double flux_Wb = current_A * FLUX.node(row, column) / std::exp2(FLUX.fraction_bits());
             ASSERT_NEAR(flux_q29(angle, current_q9) / Q29, flux_Wb, 2e-7);
         }
     }
@@ -232,7 +248,6 @@ TEST(PhaseMap, is_mirror_symmetric_about_the_unaligned_position) {
         const phase_map_place_t place_behind = phase_map_at(&machine_tables, behind);
         ASSERT_EQ(phase_map_current_of_torque_q9(&place_behind, -torque),
                   phase_map_current_of_torque_q9(&place_ahead, torque));
-        ASSERT_EQ(phase_map_current_of_flux_q9(&place_behind, flux), phase_map_current_of_flux_q9(&place_ahead, flux));
     }
 }
 
@@ -285,16 +300,7 @@ TEST(PhaseMap, current_is_held_within_the_tables) {
     EXPECT_GT(phase_map_flux_q29(&place, CURRENT_END_Q9), int32_t(0.15 * Q29));
 }
 
-// What the inverse leaves aside, in last places of the tables: how much more the surface gives at the current found
-// than is wanted, or how much less at the next, over the current of the column above.
-double missed(const machine_surface_t &surface, double fraction_bits_of_result, int32_t wanted, int32_t found_q9,
-              int32_t at_found, int32_t at_next) {
-    const double excess = std::max({double(at_found) - wanted, double(wanted) - at_next, 0.0});
-    const double above_A = column_q9((found_q9 >> MACHINE_COLUMN_BITS) + 1) / twins::Q9;
-    return excess / std::exp2(fraction_bits_of_result) / above_A * std::exp2(surface.fraction_bits);
-}
-
-TEST(PhaseMap, current_of_a_torque_gives_it_within_a_unit_of_current_and_a_thirty_second_of_the_last_place) {
+TEST(PhaseMap, current_of_a_torque_gives_it_within_a_unit_of_current_and_a_millinewtonmetre) {
     std::mt19937 random(3);
     double worst = 0.0;
     for (int i = 0; i < 300000; i++) {
@@ -304,33 +310,12 @@ TEST(PhaseMap, current_of_a_torque_gives_it_within_a_unit_of_current_and_a_thirt
         ASSERT_GE(current_q9, 0);
         ASSERT_LE(current_q9, CURRENT_END_Q9);
         const int32_t next = current_q9 < CURRENT_END_Q9 ? phase_map_torque_q24(&place, current_q9 + 1) : INT32_MAX;
-        worst = std::max(worst, missed(machine_tables.torque_per_ampere, 24, wanted, current_q9,
-                                       phase_map_torque_q24(&place, current_q9), next));
+        const double excess =
+            std::max(double(phase_map_torque_q24(&place, current_q9)) - wanted, double(wanted) - next);
+        worst = std::max(worst, excess / twins::Q24);
     }
-    EXPECT_LT(worst, 1.0 / 32);
-    EXPECT_GT(worst, 0.01);
-}
-
-TEST(PhaseMap, current_of_a_flux_gives_it_within_a_unit_of_current_and_a_thirty_second_of_the_last_place) {
-    std::mt19937 random(4);
-    double worst = 0.0;
-    for (int i = 0; i < 300000; i++) {
-        const phase_map_place_t place = phase_map_at(&machine_tables, uint32_t(random()));
-        const int32_t wanted = int32_t(uint32_t(random()) >> 1) >> (random() % 20);
-        const int32_t current_q9 = phase_map_current_of_flux_q9(&place, wanted);
-        ASSERT_GE(current_q9, 0);
-        ASSERT_LE(current_q9, CURRENT_END_Q9);
-        const int32_t next = current_q9 < CURRENT_END_Q9 ? phase_map_flux_q29(&place, current_q9 + 1) : INT32_MAX;
-        worst = std::max(worst, missed(machine_tables.flux_per_ampere, 29, wanted, current_q9,
-                                       phase_map_flux_q29(&place, current_q9), next));
-        // And back: the current that made a flux linkage is found again.
-        const auto made_q9 = int32_t(random() % uint32_t(CURRENT_END_Q9));
-        const int32_t found_q9 = phase_map_current_of_flux_q9(&place, phase_map_flux_q29(&place, made_q9));
-        ASSERT_LE(found_q9, made_q9 + 1);
-        ASSERT_GE(found_q9, made_q9 - 1);
-    }
-    EXPECT_LT(worst, 1.0 / 32);
-    EXPECT_GT(worst, 0.01);
+    EXPECT_LT(worst, 1e-3);
+    EXPECT_GT(worst, 1e-5);
 }
 
 TEST(PhaseMap, nothing_wanted_or_of_the_wrong_sign_needs_no_current_and_too_much_the_largest) {
@@ -340,44 +325,158 @@ TEST(PhaseMap, nothing_wanted_or_of_the_wrong_sign_needs_no_current_and_too_much
         const phase_map_place_t behind = phase_map_at(&machine_tables, 1 + uint32_t(random()) % (HALF_PITCH - 1));
         for (const int32_t none : {0, -1, INT32_MIN}) {
             EXPECT_EQ(phase_map_current_of_torque_q9(&ahead, none), 0);
-            EXPECT_EQ(phase_map_current_of_flux_q9(&ahead, none), 0);
-            EXPECT_EQ(phase_map_current_of_flux_q9(&behind, none), 0);
         }
         for (const int32_t none : {0, 1, INT32_MAX}) {
             EXPECT_EQ(phase_map_current_of_torque_q9(&behind, none), 0);
         }
-        EXPECT_EQ(phase_map_current_of_flux_q9(&ahead, INT32_MAX), CURRENT_END_Q9);
     }
     const phase_map_place_t unaligned = phase_map_at(&machine_tables, HALF_PITCH);
     EXPECT_EQ(phase_map_current_of_torque_q9(&unaligned, 1), CURRENT_END_Q9);
     EXPECT_EQ(phase_map_current_of_torque_q9(&unaligned, INT32_MAX), CURRENT_END_Q9);
 }
 
+// The torque of a flux linkage: of the two currents that enclose it, drawn straight.
+double torque_of_flux_Nm(const phase_map_place_t &place, int32_t flux) {
+    int32_t below = 0, above = CURRENT_END_Q9;
+    while (above - below > 1) {
+        const int32_t middle = (below + above) / 2;
+        (phase_map_flux_q29(&place, middle) <= flux ? below : above) = middle;
+    }
+    const double low = phase_map_flux_q29(&place, below), high = phase_map_flux_q29(&place, above);
+    const double low_q24 = phase_map_torque_q24(&place, below), high_q24 = phase_map_torque_q24(&place, above);
+    return (low_q24 + (flux - low) / (high - low) * (high_q24 - low_q24)) / twins::Q24;
+}
+
+TEST(PhaseMap, the_point_that_is_reached_has_the_torque_of_its_flux_linkage_within_2_millinewtonmetres) {
+    std::mt19937 random(4);
+    double worst = 0.0;
+    int reached_count = 0, lowest_count = 0, highest_count = 0, limited_count = 0;
+    for (int i = 0; i < 300000; i++) {
+        const uint32_t angle = HALF_PITCH | uint32_t(random());
+        const phase_map_place_t place = phase_map_at(&machine_tables, angle);
+        const int32_t centre = phase_map_flux_q29(&place, int32_t(random() % (60 * 512)));
+        const int32_t reach = int32_t(0.05 * Q29) >> (random() % 8);
+        const phase_map_range_t range = {std::max(centre - reach, 0), centre + reach, 52 * 512};
+        const int32_t wanted = int32_t(random() % (60u << 24)) >> (random() % 10);
+        phase_map_point_t point = {uint32_t(random() % (MACHINE_COLUMNS - 1)), 0, 0};
+        const bool reached = phase_map_reach(&machine_tables, angle, wanted, &range, &point);
+        ASSERT_GE(point.flux_q29, range.lowest_q29);
+        ASSERT_LE(point.flux_q29, range.highest_q29);
+        const int32_t limit_q29 = phase_map_flux_q29(&place, range.current_limit_q9);
+        const double slack = 1e-6 * Q29;
+        if (reached) {
+            ASSERT_EQ(point.torque_q24, wanted);
+            reached_count++;
+        } else if (point.flux_q29 == range.lowest_q29) {
+            lowest_count++;
+        } else if (point.flux_q29 == range.highest_q29) {
+            highest_count++;
+        } else {
+            ASSERT_NEAR(point.flux_q29, limit_q29, slack) << "neither reached nor an end";
+            limited_count++;
+        }
+        ASSERT_LE(point.flux_q29, std::max<double>(range.lowest_q29, limit_q29 + slack));
+        if (point.flux_q29 < phase_map_flux_q29(&place, CURRENT_END_Q9)) {
+            const double torque_Nm = point.torque_q24 / twins::Q24;
+            worst = std::max(worst, std::fabs(torque_Nm - torque_of_flux_Nm(place, point.flux_q29)));
+            // No end where the torque is on its other side.
+            const double missing_Nm = wanted / twins::Q24 - torque_Nm;
+            if (!reached) {
+                ASSERT_TRUE(point.flux_q29 == range.lowest_q29 || missing_Nm > -2e-3);
+                ASSERT_TRUE(point.flux_q29 != range.lowest_q29 || missing_Nm < 2e-3 ||
+                            point.flux_q29 >= limit_q29 - slack);
+            }
+        }
+    }
+    EXPECT_LT(worst, 2e-3);
+    EXPECT_GT(worst, 1e-5);
+    for (const int count : {reached_count, lowest_count, highest_count, limited_count}) {
+        EXPECT_GT(count, 1000);
+    }
+}
+
+TEST(PhaseMap, a_point_is_the_same_wherever_its_search_begins) {
+    std::mt19937 random(9);
+    for (int i = 0; i < 2000; i++) {
+        // But near the ends, where the torque hardly rises.
+        const uint32_t angle = HALF_PITCH + (1u << 26) + uint32_t(random()) % (HALF_PITCH - (1u << 27));
+        const phase_map_place_t place = phase_map_at(&machine_tables, angle);
+        const int32_t centre = phase_map_flux_q29(&place, int32_t(random() % (60 * 512)));
+        const int32_t reach = int32_t(0.05 * Q29) >> (random() % 8);
+        const phase_map_range_t range = {std::max(centre - reach, 0), centre + reach, 52 * 512};
+        const int32_t wanted = int32_t(random() % (30u << 24));
+        phase_map_point_t first = {0, 0, 0};
+        const bool reached = phase_map_reach(&machine_tables, angle, wanted, &range, &first);
+        for (uint32_t column = 1; column < MACHINE_COLUMNS - 1; column++) {
+            phase_map_point_t point = {column, 0, 0};
+            ASSERT_EQ(phase_map_reach(&machine_tables, angle, wanted, &range, &point), reached);
+            ASSERT_EQ(point.column, first.column);
+            ASSERT_EQ(point.flux_q29, first.flux_q29);
+            ASSERT_EQ(point.torque_q24, first.torque_q24);
+        }
+    }
+}
+
+TEST(PhaseMap, a_slope_is_that_of_the_torque) {
+    std::mt19937 random(10);
+    constexpr uint32_t STEP = 1u << 12, TURN = 1u << 25;
+    double worst = 0.0, largest = 0.0;
+    for (int i = 0; i < 100000; i++) {
+        const uint32_t angle = uint32_t(random());
+        const uint32_t distance = angle < HALF_PITCH ? HALF_PITCH - angle : angle - HALF_PITCH;
+        const int row = row_of(distance);
+        const uint32_t width = machine_tables.row[row + 1].start - machine_tables.row[row].start;
+        if (distance - machine_tables.row[row].start < STEP || machine_tables.row[row + 1].start - distance < STEP) {
+            continue; // over a corner
+        }
+        const auto current_q9 = int32_t(random() % (40 * 512));
+        const double current_A = current_q9 / twins::Q9;
+        const auto forwards = [&](double d) { return twin(TORQUE, HALF_PITCH + uint32_t(d), current_A); };
+        const double slope_Nm = (forwards(distance + STEP) - forwards(distance - STEP)) / (2.0 * STEP) * TURN;
+        const double found_Nm = phase_map_torque_slope_q24(&machine_tables, angle, current_q9, TURN) / twins::Q24;
+        largest = std::max(largest, std::fabs(slope_Nm));
+        // The nodes are rounded, and of their difference over a narrow row more is asked for than it says.
+        const double place_Nm = current_A / std::exp2(TORQUE.fraction_bits()) * TURN / width;
+        worst = std::max(worst, std::fabs(found_Nm - slope_Nm) / (0.01 + place_Nm + 1e-3 * std::fabs(slope_Nm)));
+    }
+    EXPECT_GT(largest, 1.0);
+    EXPECT_LT(worst, 1.0);
+}
+
 TEST(PhaseMap, what_a_format_cannot_hold_saturates) {
     static machine_tables_t strong = machine_tables;
-    strong.torque_per_ampere.fraction_bits = 6;
-    strong.flux_per_ampere.fraction_bits = 11;
+    strong.torque_format.result_shift = 12;
+    strong.flux_format.result_shift = 12;
     const phase_map_place_t ahead = phase_map_at(&strong, HALF_PITCH + HALF_PITCH / 2);
     const phase_map_place_t behind = phase_map_at(&strong, HALF_PITCH / 2);
     EXPECT_EQ(phase_map_torque_q24(&ahead, CURRENT_END_Q9), INT32_MAX);
     EXPECT_EQ(phase_map_torque_q24(&behind, CURRENT_END_Q9), -INT32_MAX);
     EXPECT_EQ(phase_map_flux_q29(&ahead, CURRENT_END_Q9), INT32_MAX);
     EXPECT_LT(phase_map_current_of_torque_q9(&ahead, INT32_MAX), CURRENT_END_Q9);
-    EXPECT_LT(phase_map_current_of_flux_q9(&ahead, INT32_MAX), CURRENT_END_Q9);
+    const phase_map_range_t anything = {0, INT32_MAX, CURRENT_END_Q9};
+    phase_map_point_t point = {0, 0, 0};
+    phase_map_reach(&strong, HALF_PITCH + HALF_PITCH / 2, INT32_MAX, &anything, &point);
+    EXPECT_EQ(point.flux_q29, INT32_MAX);
 }
 
 TEST(PhaseMap, tables_full_of_noise_and_extremes_do_not_overflow) {
     std::mt19937 random(7);
     for (int tables = 0; tables < 20; tables++) {
         static machine_tables_t wild = machine_tables;
-        for (machine_surface_t *surface : {&wild.torque_per_ampere, &wild.flux_per_ampere}) {
-            surface->fraction_bits = uint8_t(tables % 2 == 0 ? 11 : 30);
-            surface->bend_shift = uint8_t(tables % 3 * 4);
-            for (uint16_t &entry : surface->node) {
-                entry = random() % 2 == 0 ? 0 : UINT16_MAX;
+        for (machine_format_t *format : {&wild.torque_format, &wild.flux_format}) {
+            format->bend_shift = uint8_t(tables % 3 * 4);
+            format->result_shift = uint8_t(tables % 2 == 0 ? 12 : 0);
+        }
+        for (machine_column_t &column : wild.column) {
+            for (auto *nodes : {&column.torque_node, &column.flux_node}) {
+                for (int16_t &entry : *nodes) {
+                    entry = random() % 2 == 0 ? INT16_MIN : INT16_MAX;
+                }
             }
-            for (int8_t &entry : surface->bend) {
-                entry = random() % 2 == 0 ? INT8_MIN : INT8_MAX;
+            for (auto *bends : {&column.torque_bend, &column.flux_bend}) {
+                for (int8_t &entry : *bends) {
+                    entry = random() % 2 == 0 ? INT8_MIN : INT8_MAX;
+                }
             }
         }
         for (int i = 0; i < 20000; i++) {
@@ -385,11 +484,20 @@ TEST(PhaseMap, tables_full_of_noise_and_extremes_do_not_overflow) {
             const auto any = int32_t(uint32_t(random())) >> (random() % 24);
             phase_map_torque_q24(&place, any);
             phase_map_flux_q29(&place, any);
-            for (const int32_t current_q9 :
-                 {phase_map_current_of_torque_q9(&place, any), phase_map_current_of_flux_q9(&place, any)}) {
-                ASSERT_GE(current_q9, 0);
-                ASSERT_LE(current_q9, CURRENT_END_Q9);
-            }
+            const int32_t current_q9 = phase_map_current_of_torque_q9(&place, any);
+            ASSERT_GE(current_q9, 0);
+            ASSERT_LE(current_q9, CURRENT_END_Q9);
+            const uint32_t angle = uint32_t(random()) | HALF_PITCH;
+            phase_map_torque_slope_q24(&wild, angle, any, 1u << 26);
+            const int32_t lowest = int32_t(uint32_t(random()) >> 1) >> (random() % 24);
+            const int32_t above = int32_t(uint32_t(random()) >> 1) >> (random() % 24);
+            const phase_map_range_t range = {lowest, above < INT32_MAX - lowest ? lowest + above : INT32_MAX,
+                                             int32_t(random() % uint32_t(CURRENT_END_Q9))};
+            phase_map_point_t point = {uint32_t(random() % (MACHINE_COLUMNS - 1)), 0, 0};
+            phase_map_reach(&wild, angle, any, &range, &point);
+            ASSERT_LE(point.column, uint32_t(MACHINE_COLUMNS - 2));
+            ASSERT_GE(point.flux_q29, range.lowest_q29);
+            ASSERT_LE(point.flux_q29, range.highest_q29);
         }
     }
 }

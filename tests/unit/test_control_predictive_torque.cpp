@@ -32,13 +32,20 @@ struct tables_t {
         const phase_map_place_t place = at(angle);
         return phase_map_flux_q29(&place, twins::to_fixed(current_A, twins::Q9)) / Q29;
     }
+    // The greatest that gives no more.
     double current_of_torque(double angle, double torque_Nm) const {
-        const phase_map_place_t place = at(angle);
-        return phase_map_current_of_torque_q9(&place, twins::to_fixed(torque_Nm, twins::Q24)) / twins::Q9;
+        return current_of([&](double current_A) { return torque(angle, current_A); }, torque_Nm);
     }
     double current_of_flux(double angle, double flux_Wb) const {
-        const phase_map_place_t place = at(angle);
-        return phase_map_current_of_flux_q9(&place, twins::to_fixed(flux_Wb, Q29)) / twins::Q9;
+        return current_of([&](double current_A) { return flux(angle, current_A); }, flux_Wb);
+    }
+    template <typename function_t> static double current_of(const function_t &gives, double wanted) {
+        int32_t below = 0, above = PHASE_MAP_CURRENT_MAX_Q9 + 1;
+        while (above - below > 1) {
+            const int32_t middle = (below + above) / 2;
+            (gives(middle / twins::Q9) <= wanted ? below : above) = middle;
+        }
+        return below / twins::Q9;
     }
 };
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from salient.flux_map import FluxMap
 from salient.machine import Machine, MachineError, load_machine
-from salient.phase_map import PhaseMap, Surface, machine_phase_map
+from salient.phase_map import CURRENT_A, NODE_OFFSET, PhaseMap, Surface, machine_phase_map
 
 
 def quantise(value: float, fraction_bits: int, bits: int) -> int:
@@ -40,26 +40,35 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
             *(f"        {{{start}u, {reciprocal}u}}," for start, reciprocal in tables.rows()),
             "    },",
             f"    .cell_row = {{{_listed(tables.cell_row())}}},",
-            *_surface_lines("torque_per_ampere", tables.torque_per_ampere),
-            *_surface_lines("flux_per_ampere", tables.flux_per_ampere),
+            *_format_lines("torque_format", tables.torque_per_ampere),
+            *_format_lines("flux_format", tables.flux_per_ampere),
+            "    .column = {",
+            *(line for column in range(len(CURRENT_A)) for line in _column_lines(tables, column)),
+            "    },",
             "};",
             "",
         ]
     )
 
 
-def _surface_lines(name: str, surface: Surface) -> list[str]:
+def _format_lines(name: str, surface: Surface) -> list[str]:
     return [
         f"    .{name} = {{",
-        f"        .fraction_bits = {surface.fraction_bits},",
         f"        .bend_shift = {surface.bend_shift},",
-        "        .node = {",
-        *(f"            {_listed(row)}," for row in surface.node),
-        "        },",
-        "        .bend = {",
-        *(f"            {_listed(row)}," for row in surface.bend),
-        "        },",
+        f"        .result_shift = {surface.result_shift},",
         "    },",
+    ]
+
+
+def _column_lines(tables: PhaseMap, column: int) -> list[str]:
+    torque, flux = tables.torque_per_ampere, tables.flux_per_ampere
+    return [
+        "        {",
+        f"            .torque_node = {{{_listed(torque.node[:, column] - NODE_OFFSET)}}},",
+        f"            .flux_node = {{{_listed(flux.node[:, column] - NODE_OFFSET)}}},",
+        f"            .torque_bend = {{{_listed(torque.bend[:, column])}}},",
+        f"            .flux_bend = {{{_listed(flux.bend[:, column])}}},",
+        "        },",
     ]
 
 

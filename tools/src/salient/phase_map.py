@@ -20,13 +20,15 @@ from salient.machine import Machine, MachineError
 # As in firmware/control/machine_tables.h.
 ROWS = 33
 CELLS = 64
+NODE_OFFSET = 32768
 CURRENT_A = np.arange(0.0, 81.0, 2.0)
 """Of the columns."""
 ROW_UNITS = 1 << 14  # of row_start, in half a pitch
 _HALF_PITCH = 1 << 31
 BEND_SHIFT_MAX = 8
-TORQUE_FRACTION_BITS = (6, 30)
-FLUX_FRACTION_BITS = (11, 30)
+# The finest are 4 uN m and 0.12 uWb an ampere, beyond which no product is finer than its result.
+TORQUE_FRACTION_BITS = (6, 18)
+FLUX_FRACTION_BITS = (11, 23)
 
 # Tolerances of the rows, as a fraction of the greatest torque at each of these currents.
 _LEAST_TOLERANCE, _GREATEST_TOLERANCE = 1e-6, 1.0
@@ -47,15 +49,22 @@ class PhaseMapError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A `machine_surface_t`: integers with `fraction_bits` fraction bits."""
+    """What an ampere gives: integers with `fraction_bits` fraction bits."""
 
     fraction_bits: int
+    result_bits: int
+    """Fraction bits of the result in the firmware."""
     bend_shift: int
     """0..BEND_SHIFT_MAX: the least with which the bends fit."""
     node: np.ndarray
     """(ROWS, columns), 0..65535."""
     bend: np.ndarray
     """(ROWS - 1, columns), -128..127, in 2^bend_shift of a node's last place."""
+
+    @property
+    def result_shift(self) -> int:
+        """Of the product of a value in Q14 and a current in Q9 times 2^15, less its low 32 bits."""
+        return self.result_bits + 32 - 15 - (self.fraction_bits + 14 + 9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +112,8 @@ def phase_map(magnetics) -> PhaseMap:
     flux_per_ampere = magnetics.flux_linkage_Wb(angle_rad, divisor_A) / divisor_A
     return PhaseMap(
         row_start,
-        _surface("torque", "N m/A", torque_Nm / divisor_A, TORQUE_FRACTION_BITS),
-        _surface("flux linkage", "Wb/A", flux_per_ampere, FLUX_FRACTION_BITS),
+        _surface("torque", "N m/A", torque_Nm / divisor_A, TORQUE_FRACTION_BITS, 24),
+        _surface("flux linkage", "Wb/A", flux_per_ampere, FLUX_FRACTION_BITS, 29),
     )
 
 
@@ -125,7 +134,7 @@ def _rising_torque(magnetics, angle_rad: np.ndarray) -> np.ndarray:
     return rising_Nm
 
 
-def _surface(what: str, unit: str, values: np.ndarray, fraction_bits: tuple[int, int]) -> Surface:
+def _surface(what: str, unit: str, values: np.ndarray, fraction_bits: tuple[int, int], result_bits: int) -> Surface:
     """Values at the rows (even) and half way (odd), in as fine a format as holds them."""
     rows, half_way = values[::2], values[1::2]
     bends = 2.0 * (rows[:-1] + rows[1:]) - 4.0 * half_way
@@ -137,7 +146,7 @@ def _surface(what: str, unit: str, values: np.ndarray, fraction_bits: tuple[int,
         for shift in range(BEND_SHIFT_MAX + 1):
             bend = np.floor(bends * 2.0 ** (bits - shift) + 0.5)
             if np.max(np.abs(bend)) <= 127:
-                return Surface(bits, shift, node.astype(int), bend.astype(int))
+                return Surface(bits, result_bits, shift, node.astype(int), bend.astype(int))
     raise PhaseMapError(f"{np.max(values):.4g} {unit} of {what} is more than the firmware's tables hold")
 
 

@@ -1,6 +1,9 @@
-#include "mps2_an386/startup.h"
+/* The board mps2-an386, a Cortex-M4: start, end, the control interrupt, the critical section. */
+#include "qemu/board.h"
 
-#include <string.h>
+#include "hal_time.h"
+#include "mps2_an386/timer.h"
+#include "qemu/hal_qemu.h"
 
 /* A line that the board's own peripherals do not use. */
 #define CONTROL_IRQ 31
@@ -12,12 +15,10 @@
 
 #define SYS_EXIT_EXTENDED 0x20
 #define ADP_STOPPED_APPLICATION_EXIT 0x20026
-#define EXIT_PROCESSOR_FAULT 70 /* sysexits.h: internal software error */
 
-/* Of the linker script. */
-extern uint32_t data_start[], data_end[], data_load[], bss_start[], bss_end[], stack_top[];
+extern uint32_t stack_top[]; /* of the linker script */
 
-noreturn void semihosting_exit(uint32_t code) {
+noreturn void board_exit(uint32_t code) {
     const uint32_t block[2] = {ADP_STOPPED_APPLICATION_EXIT, code};
     register uint32_t operation __asm__("r0") = SYS_EXIT_EXTENDED;
     register const uint32_t *argument __asm__("r1") = block;
@@ -26,16 +27,9 @@ noreturn void semihosting_exit(uint32_t code) {
     }
 }
 
-noreturn void reset_handler(void);
-noreturn void reset_handler(void) {
-    memcpy(data_start, data_load, (size_t)((char *)data_end - (char *)data_start));
-    memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start));
-    program();
-}
-
 /* Every exception but the control interrupt: none is expected. */
 static void fault_handler(void) {
-    semihosting_exit(EXIT_PROCESSOR_FAULT);
+    board_exit(MAILBOX_EXIT_FAULT);
 }
 
 /* In assembly, so that its first and its last instruction have names: who counts instructions knows both ends. */
@@ -54,26 +48,46 @@ __asm__(".text\n"
         "    pop {r4, pc}\n"
         ".size control_handler_return, . - control_handler_return\n");
 
-void interrupt_enable(void) {
+void board_interrupt_enable(void) {
     NVIC_IPR(CONTROL_IRQ) = 0; /* the highest that can be set */
     NVIC_ISER0 = UINT32_C(1) << CONTROL_IRQ;
+    if (board.mailbox.timed && board.mailbox.period_ticks > 0) {
+        NVIC_IPR(TIMER_IRQ) = 0x80; /* lower: the control interrupt comes within the timer's */
+        NVIC_ISER0 = UINT32_C(1) << TIMER_IRQ;
+        timer_start(board.mailbox.period_ticks);
+    }
 }
 
-void interrupt_pend(void) {
+void board_interrupt_pend(void) {
     NVIC_ISPR0 = UINT32_C(1) << CONTROL_IRQ;
     __asm__ volatile("dsb\n\tisb" ::: "memory");
 }
 
+uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
+    return hal->mailbox.timed ? timer_elapsed_ticks() : hal->mailbox.elapsed_ticks;
+}
+
+/* There is no interrupt but the control interrupt and the timer's that asks for it, so all may be kept out. */
+void hal_critical_enter(hal_t *hal) {
+    (void)hal;
+    __asm__ volatile("cpsid i" ::: "memory");
+}
+
+void hal_critical_leave(hal_t *hal) {
+    (void)hal;
+    __asm__ volatile("cpsie i" ::: "memory");
+}
+
 typedef void (*vector_t)(void);
 
-__attribute__((section(".vectors"), used)) static const struct {
+__attribute__((section(".first"), used)) static const struct {
     uint32_t *stack;
     vector_t exceptions[15];
     vector_t interrupts[CONTROL_IRQ + 1];
 } vectors = {
     .stack = stack_top,
-    .exceptions = {reset_handler, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
+    .exceptions = {program_start, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
                    fault_handler, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
                    fault_handler, fault_handler, fault_handler},
-    .interrupts = {[CONTROL_IRQ] = control_handler},
+    .interrupts = {[TIMER_IRQ] = timer_handler, [CONTROL_IRQ] = control_handler},
 };

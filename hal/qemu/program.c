@@ -1,10 +1,13 @@
-/* One drive on the Cortex-M4: the same firmware as on the host, its interrupt a real exception. */
+/* One drive on a board of QEMU: the same firmware as on the host, its interrupt a real exception. */
+#include <string.h>
+
 #include "control/machine_tables.h"
 #include "drive/drive.h"
-#include "mps2_an386/hal_mps2_an386.h"
-#include "mps2_an386/startup.h"
+#include "qemu/board.h"
+#include "qemu/hal_qemu.h"
 
-#define EXIT_LAYOUT 78 /* sysexits.h: configuration error */
+/* Of the linker script. */
+extern uint32_t data_start[], data_end[], data_load[], bss_start[], bss_end[];
 
 static drive_t drive;
 
@@ -12,29 +15,35 @@ void program_interrupt(void) {
     drive_control_interrupt(&drive);
 }
 
-noreturn void program(void) {
+static noreturn void run(void) {
     const mailbox_t *mailbox = &board.mailbox;
     if (mailbox->layout != MAILBOX_LAYOUT) {
-        semihosting_exit(EXIT_LAYOUT);
+        board_exit(MAILBOX_EXIT_LAYOUT);
     }
     const drive_config_t config = {
         .control_rate_hz = mailbox->control_rate_hz,
         .controller = (drive_controller_t)mailbox->controller,
     };
     const bool started = drive_init(&drive, &board, &machine_tables, &config);
-    interrupt_enable();
+    board_interrupt_enable();
     doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REFUSED);
     for (;;) {
         switch ((mailbox_event_t)mailbox->event) {
         case MAILBOX_INTERRUPT:
-            interrupt_pend();
+            board_interrupt_pend();
             break;
         case MAILBOX_BACKGROUND:
             drive_background(&drive);
             break;
         case MAILBOX_EXIT:
-            semihosting_exit(mailbox->exit_code);
+            board_exit(mailbox->exit_code);
         }
         doorbell_ring(MAILBOX_NEXT);
     }
+}
+
+noreturn void program_start(void) {
+    memcpy(data_start, data_load, (size_t)((char *)data_end - (char *)data_start));
+    memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start));
+    run();
 }

@@ -1,4 +1,4 @@
-#include "mps2_an386/hal_mps2_an386.h"
+#include "qemu/hal_qemu.h"
 
 #include "hal_time.h"
 
@@ -65,15 +65,4 @@ bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
 
 uint32_t hal_time_us(const hal_t *hal) {
     return hal->mailbox.time_us;
-}
-
-/* The control interrupt is the only one there is, so all may be kept out. */
-void hal_critical_enter(hal_t *hal) {
-    (void)hal;
-    __asm__ volatile("cpsid i" ::: "memory");
-}
-
-void hal_critical_leave(hal_t *hal) {
-    (void)hal;
-    __asm__ volatile("cpsie i" ::: "memory");
 }
