@@ -14,10 +14,11 @@ static int32_t next_weight(uint32_t *generator) {
 void bp_network_reset(bp_network_t *network, uint32_t seed) {
     uint32_t generator = seed;
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
-        for (unsigned j = 0; j < BP_INPUTS; j++) {
-            network->hidden[i].input.value[j] = next_weight(&generator);
-            network->hidden[i].input.change[j] = 0;
-        }
+        triple_moving_t *input = &network->hidden[i].input;
+        *input = (triple_moving_t){0};
+        input->value[1] = next_weight(&generator);
+        input->value[0] = next_weight(&generator);
+        input->value[2] = next_weight(&generator);
     }
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         for (unsigned i = 0; i < BP_HIDDEN; i++) {
@@ -30,31 +31,27 @@ void bp_network_reset(bp_network_t *network, uint32_t seed) {
 void bp_network_forward(bp_network_t *network, const int32_t input_q27[BP_INPUTS]) {
     /* Q28 * Q27 to Q23: within 3 * 8 and 6 * 8. */
     int32_t sum_q23[BP_OUTPUTS] = {0};
-    for (unsigned j = 0; j < BP_INPUTS; j++) {
-        network->input_q27[j] = input_q27[j];
-    }
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         bp_neuron_t *neuron = &network->hidden[i];
-        neuron->value_q27 = sigmoid_symmetric_q27(triple_dot(neuron->input.value, network->input_q27));
+        neuron->value_q27 = sigmoid_symmetric_q27(triple_dot(neuron->input.value, input_q27));
         triple_add_scaled(sum_q23, neuron->output.value, neuron->value_q27);
     }
 #pragma GCC unroll 3
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        network->output_q28[l] = sigmoid_logistic_q28(sum_q23[l]);
+        network->output_q27[l] = sigmoid_symmetric_q27(sum_q23[l]);
     }
 }
 
 void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *network, int32_t error_q16,
-                      const int32_t sensitivity_q31[BP_OUTPUTS]) {
+                      const int32_t input_q31[BP_INPUTS], const int32_t sensitivity_q31[BP_OUTPUTS]) {
     const int32_t rate_q31 = parameters->learning_rate_q15 * error_q16;
     const int32_t inertia_q32 = parameters->inertia_q32;
-    int32_t delta_q32[BP_OUTPUTS], input_q31[BP_INPUTS]; /* eta d3, and x */
+    int32_t delta_q32[BP_OUTPUTS]; /* eta d3 */
 #pragma GCC unroll 3
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         delta_q32[l] = high_product(high_product(rate_q31, sensitivity_q31[l]),
-                                    sigmoid_logistic_slope_q33(network->output_q28[l])) *
+                                    sigmoid_logistic_slope_q33(network->output_q27[l])) *
                        2;
-        input_q31[l] = network->input_q27[l] * 16;
     }
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         bp_neuron_t *neuron = &network->hidden[i];

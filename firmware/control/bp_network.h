@@ -7,7 +7,7 @@
  *   dW2_ij(k) = eta d2_i x_j + alpha dW2_ij(k-1)                (27)
  *   d2_i = f'(net2_i) sum_l d3_l W3_li
  *
- * Formats: inputs and hidden activations Q4.27, outputs Q3.28; weights Q3.28 held within +-8 (saturation), their
+ * Formats: inputs and activations Q4.27; weights Q3.28 held within +-8 (saturation), their
  * increments Q4.27; sums of a layer Q8.23, within 6 * 8. Every product is rounded to the format of its sum: see
  * fixed/high_product.h. |eta d2| <= 3 / 2 * 8 / 4 = 3, so that with alpha < 1/2 an increment stays within 6.
  */
@@ -36,20 +36,20 @@ typedef struct {
 
 typedef struct {
     bp_neuron_t hidden[BP_HIDDEN];
-    int32_t input_q27[BP_INPUTS];
-    int32_t output_q28[BP_OUTPUTS]; /* 0..2^28 */
+    int32_t output_q27[BP_OUTPUTS]; /* f(net3): O3 is the logistic function, (1 + f) / 2 */
 } bp_network_t;
 
-/* Initial weights: uniform in +-0.5 from a linear congruential generator, so that a seed gives the same on any machine.
- * The layers' values are those of the next forward pass. */
+/* Initial weights: uniform in +-0.5 from a linear congruential generator, so that a seed gives the same on any machine;
+ * drawn neuron by neuron, for its second input first, then output by output. The layers' values are those of the next
+ * forward pass. */
 void bp_network_reset(bp_network_t *network, uint32_t seed);
 
-/* Outputs for inputs in Q4.27, -1 <= input < 1; the layers' values stay in the network for learning. */
+/* Outputs for inputs in Q4.27, |input| <= 1; the layers' values stay in the network for learning. */
 void bp_network_forward(bp_network_t *network, const int32_t input_q27[BP_INPUTS]);
 
-/* One step down the gradient for the last forward pass: error e in Q1.16, -1..1, and du/dO3 in Q0.31; sgn(dy/du) is 1,
- * more voltage gives more torque. */
+/* One step down the gradient for the last forward pass: error e in Q1.16, -1..1, its inputs and du/dO3 in Q0.31;
+ * sgn(dy/du) is 1, more voltage gives more torque. */
 void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *network, int32_t error_q16,
-                      const int32_t sensitivity_q31[BP_OUTPUTS]);
+                      const int32_t input_q31[BP_INPUTS], const int32_t sensitivity_q31[BP_OUTPUTS]);
 
 #endif

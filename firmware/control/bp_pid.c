@@ -2,6 +2,7 @@
 
 #include "fixed/fixed.h"
 #include "fixed/high_product.h"
+#include "fixed/sigmoid.h"
 
 #define ERROR_BITS 17 /* Q1.16 within -1..1 - 2^-16 */
 #define DUTY_BITS 24  /* Q23 within -1..1 - 2^-23, which rounds to 1 in Q15 */
@@ -25,9 +26,9 @@ void bp_pid_preset(bp_pid_t *pid, int32_t duty_q15) {
 }
 
 int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_t torque_error_q24) {
-    static const int32_t half_q28[BP_OUTPUTS] = {1 << 27, 1 << 27, 1 << 27};
+    static const int32_t half[BP_OUTPUTS] = {0};
     const bool learning = parameters->mode == BP_PID_LEARNING;
-    const int32_t *output_q28 = half_q28;
+    const int32_t *output_q27 = half;
 
     /* Q24 * Q24 to Q16, within 2^31 * 2^30 / 2^32. */
     const int32_t error_q16 =
@@ -36,21 +37,21 @@ int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_
     const int32_t bend_q16 = rise_q16 - pid->rise_q16;
     pid->error_q16 = error_q16;
     pid->rise_q16 = rise_q16;
-    const int32_t term_q31[BP_OUTPUTS] = {
+    const int32_t term_q31[3] = {
         fixed_saturate_bits(rise_q16, ERROR_BITS) * (1 << 15),
         error_q16 * (1 << 15),
         fixed_saturate_bits(bend_q16, ERROR_BITS) * (1 << 15),
     };
     if (learning || parameters->mode == BP_PID_FROZEN) {
-        const int32_t input_q27[BP_INPUTS] = {term_q31[1] >> 4, term_q31[0] >> 4, term_q31[2] >> 4};
+        const int32_t input_q27[BP_INPUTS] = {term_q31[0] >> 4, term_q31[1] >> 4, term_q31[2] >> 4};
         bp_network_forward(&pid->network, input_q27);
-        output_q28 = pid->network.output_q28;
+        output_q27 = pid->network.output_q27;
     }
 
     int32_t sum_q23 = pid->duty_q23; /* within 1 + 3 * 4 */
 #pragma GCC unroll 3
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        pid->gain_q24[l] = high_product(output_q28[l], parameters->scale_q28[l]);
+        pid->gain_q24[l] = high_product(sigmoid_logistic_q28(output_q27[l]), parameters->scale_q28[l]);
         sum_q23 = high_product_add(sum_q23, pid->gain_q24[l], term_q31[l]);
     }
     const int32_t duty_q23 = fixed_saturate_bits(sum_q23, DUTY_BITS);
@@ -59,7 +60,7 @@ int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_
     /* Positive numbers one less than negative ones: the end of both has a complement of the same bits. */
     const bool at_limit = (error_q16 ^ error_q16 >> 31) == (1 << (ERROR_BITS - 1)) - 1;
     if (learning && sum_q23 == duty_q23 && !at_limit) {
-        bp_network_learn(&parameters->network, &pid->network, error_q16, term_q31);
+        bp_network_learn(&parameters->network, &pid->network, error_q16, term_q31, term_q31);
     }
     return (duty_q23 + (1 << 7)) >> 8;
 }

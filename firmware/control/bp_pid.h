@@ -3,9 +3,9 @@
  *   u(k) = u(k-1) + kp (e - e1) + ki e + kd (e - 2 e1 + e2)     (15) as in (25); printed with e(k) thrice
  *
  * with kp, ki, kd the network's outputs (0..1) times their scales. The error enters as e / error_scale, held within
- * +-1, as do its first and second difference; they are the network's inputs too (the paper does not name its inputs).
- * Learning pauses while the duty is saturated or the errors are at their limits: the gradient says nothing then, and
- * learning from it drives the weights away.
+ * +-1, as do its first and second difference; they are the network's inputs too, in the order of (15) (the paper does
+ * not name its inputs). Learning pauses while the duty is saturated or the errors are at their limits: the gradient
+ * says nothing then, and learning from it drives the weights away.
  */
 #ifndef CONTROL_BP_PID_H
 #define CONTROL_BP_PID_H

@@ -63,10 +63,14 @@ double largest_weight_difference(const bp_network_t &network, const twins::netwo
     return largest;
 }
 
+double output(const bp_network_t &network, unsigned l) {
+    return 0.5 + 0.5 * network.output_q27[l] / twins::Q27;
+}
+
 double largest_output_difference(const bp_network_t &network, const twins::network_t &twin) {
     double largest = 0.0;
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        largest = std::max(largest, std::fabs(network.output_q28[l] / twins::Q28 - twin.output[l]));
+        largest = std::max(largest, std::fabs(output(network, l) - twin.output[l]));
     }
     return largest;
 }
@@ -122,10 +126,10 @@ TEST(BpNetwork, initial_weights_are_within_half_and_depend_on_nothing_but_the_se
     EXPECT_NEAR(std::sqrt(squares / count), 1.0 / std::sqrt(12.0), 0.06); // uniform
     // The same on any machine: the generator's first number.
     const uint32_t generated = 1664525u + 1013904223u;
-    EXPECT_EQ(first.hidden[0].input.value[0], int32_t(generated >> 4) - (1 << 27));
+    EXPECT_EQ(first.hidden[0].input.value[1], int32_t(generated >> 4) - (1 << 27));
 }
 
-// What is left is the activations' own error, 8e-5, through up to 6 weights of the next layer.
+// What is left is the activations' own error, 8e-5 and beyond sums of 8 7e-4, through the 6 weights of the next layer.
 TEST(BpNetwork, outputs_follow_the_twin_for_small_and_for_saturated_weights) {
     std::mt19937 random(1);
     for (const double limit : {0.5, 2.6, 8.0}) {
@@ -138,11 +142,11 @@ TEST(BpNetwork, outputs_follow_the_twin_for_small_and_for_saturated_weights) {
             twins::network_t twin = twin_of(network);
             twin.forward(to_double(input_q27, twins::Q27));
             for (unsigned i = 0; i < BP_HIDDEN; i++) {
-                ASSERT_NEAR(network.hidden[i].value_q27 / twins::Q27, twin.hidden[i], 8e-5);
+                ASSERT_NEAR(network.hidden[i].value_q27 / twins::Q27, twin.hidden[i], limit < 2.7 ? 8e-5 : 7e-4);
             }
             worst = std::max(worst, largest_output_difference(network, twin));
         }
-        EXPECT_LT(worst, limit < 1.0 ? 4e-5 : limit < 3.0 ? 1.5e-4 : 3e-4);
+        EXPECT_LT(worst, limit < 1.0 ? 4e-5 : limit < 3.0 ? 1.5e-4 : 2.5e-3);
         EXPECT_GT(worst, 2e-5);
     }
 }
@@ -160,19 +164,20 @@ TEST(BpNetwork, a_learning_step_moves_the_weights_as_the_twin_does) {
                 neuron.output.change[k] = int32_t(random() % (1u << 23)) - (1 << 22);
             }
         }
-        const int32_t input_q27[BP_INPUTS] = {any_q27(random), any_q27(random), any_q27(random)};
+        const int32_t input_q31[BP_INPUTS] = {any_q31(random), any_q31(random), any_q31(random)};
+        const int32_t input_q27[BP_INPUTS] = {input_q31[0] / 16, input_q31[1] / 16, input_q31[2] / 16};
         const int32_t sensitivity_q31[BP_OUTPUTS] = {any_q31(random), any_q31(random), any_q31(random)};
         const int32_t error_q16 = any_q15(random) * 2;
         twins::network_t twin = twin_of(network);
         const twins::network_t before = twin;
         bp_network_forward(&network, input_q27);
         twin.forward(to_double(input_q27, twins::Q27));
-        bp_network_learn(&parameters, &network, error_q16, sensitivity_q31);
+        bp_network_learn(&parameters, &network, error_q16, input_q31, sensitivity_q31);
         twin.learn(1.0, 0.25, error_q16 / twins::Q16, to_double(sensitivity_q31, twins::Q31));
         worst = std::max(worst, largest_weight_difference(network, twin));
         largest_move = std::max(largest_move, largest_weight_difference(network, before));
     }
-    EXPECT_LT(worst, 6e-5);
+    EXPECT_LT(worst, 2e-4);
     EXPECT_GT(worst, 1e-5);
     EXPECT_GT(largest_move, 0.2);
 }
@@ -195,19 +200,20 @@ TEST(BpNetwork, a_hundred_thousand_learning_steps_stay_bounded_and_near_the_twin
         const int32_t error_q16 = twins::to_fixed(e, twins::Q16);
         const int32_t term_q31[3] = {twins::to_fixed(rise, twins::Q31), twins::to_fixed(e, twins::Q31),
                                      twins::to_fixed(bend, twins::Q31)};
-        const int32_t input_q27[3] = {term_q31[1] / 16, term_q31[0] / 16, term_q31[2] / 16};
+        const int32_t input_q31[3] = {term_q31[1], term_q31[0], term_q31[2]};
+        const int32_t input_q27[3] = {input_q31[0] / 16, input_q31[1] / 16, input_q31[2] / 16};
         bp_network_forward(&network, input_q27);
         twin.forward(to_double(input_q27, twins::Q27));
-        bp_network_learn(&DEFAULTS, &network, error_q16, term_q31);
+        bp_network_learn(&DEFAULTS, &network, error_q16, input_q31, term_q31);
         twin.learn(DEFAULTS.learning_rate_q15 / twins::Q15, DEFAULTS.inertia_q32 / twins::Q32, error_q16 / twins::Q16,
                    to_double(term_q31, twins::Q31));
         worst_output = std::max(worst_output, largest_output_difference(network, twin));
         worst_weight = std::max(worst_weight, largest_weight_difference(network, twin));
         for_each_weight(network, [&](int32_t w) { largest_q28 = std::max(largest_q28, std::abs(w)); });
     }
-    EXPECT_LT(worst_weight, 1.5e-4);
-    EXPECT_LT(worst_output, 1e-4);
-    EXPECT_GT(worst_weight, 3e-5);
+    EXPECT_LT(worst_weight, 1.5e-3);
+    EXPECT_LT(worst_output, 2e-4);
+    EXPECT_GT(worst_weight, 1e-4);
     EXPECT_LT(largest_q28 / twins::Q28, 2.6);
     EXPECT_GT(largest_weight_difference(network, start), 0.1) << "it learned nothing";
 }
@@ -221,7 +227,8 @@ TEST(BpNetwork, weights_saturate_and_never_wrap_under_the_wildest_learning) {
     bool reached = false;
     for (int k = 0; k < 20000; k++) {
         const int32_t sign = k / 500 % 2 == 0 ? 1 : -1;
-        const int32_t input_q27[3] = {sign * ((1 << 27) - 1), (1 << 27) - 1, any_q27(random)};
+        const int32_t input_q31[3] = {sign * INT32_MAX, INT32_MAX, any_q31(random)};
+        const int32_t input_q27[3] = {input_q31[0] / 16, input_q31[1] / 16, input_q31[2] / 16};
         const int32_t sensitivity_q31[3] = {INT32_MAX, INT32_MIN, sign * INT32_MAX};
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
             for (unsigned i = 0; i < BP_HIDDEN; i++) {
@@ -229,10 +236,10 @@ TEST(BpNetwork, weights_saturate_and_never_wrap_under_the_wildest_learning) {
             }
         }
         bp_network_forward(&network, input_q27);
-        bp_network_learn(&parameters, &network, k % 3 == 0 ? 65536 : -65536 * sign, sensitivity_q31);
+        bp_network_learn(&parameters, &network, k % 3 == 0 ? 65536 : -65536 * sign, input_q31, sensitivity_q31);
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-            ASSERT_GT(network.output_q28[l], 0);
-            ASSERT_LT(network.output_q28[l], 1 << 28);
+            ASSERT_GT(output(network, l), 0.0);
+            ASSERT_LT(output(network, l), 1.0);
             for (unsigned i = 0; i < BP_HIDDEN; i++) {
                 const int32_t now = network.hidden[i].output.value[l], change = network.hidden[i].output.change[l];
                 // In the direction of the change, whatever it is: held at the end, not beyond it.
@@ -299,15 +306,14 @@ TEST(BpNetwork, a_learning_step_lowers_the_error_it_learned_from) {
         random_weights(network, random, 1.0);
         const int32_t e = any_q15(random), rise = any_q15(random), bend = any_q15(random);
         const int32_t input_q27[3] = {e * 4096, rise * 4096, bend * 4096};
+        const int32_t input_q31[3] = {e * 65536, rise * 65536, bend * 65536};
         const int32_t term_q31[3] = {rise * 65536, e * 65536, bend * 65536};
         const auto increment = [&]() {
             bp_network_forward(&network, input_q27);
-            return (double(network.output_q28[0]) * rise + double(network.output_q28[1]) * e +
-                    double(network.output_q28[2]) * bend) /
-                   (twins::Q28 * twins::Q15);
+            return (output(network, 0) * rise + output(network, 1) * e + output(network, 2) * bend) / twins::Q15;
         };
         const double before = increment();
-        bp_network_learn(&parameters, &network, 2 * e, term_q31);
+        bp_network_learn(&parameters, &network, 2 * e, input_q31, term_q31);
         const double gain = (increment() - before) * (e > 0 ? 1.0 : -1.0);
         if (std::fabs(gain) > 1e-4) {
             (gain > 0.0 ? better : worse)++;
@@ -331,7 +337,7 @@ TEST(BpNetwork, rule_26_as_printed_grows_every_weight_by_1_plus_alpha_a_step_and
         printed += alpha * printed;
         EXPECT_NEAR(printed, start * std::pow(1.0 + alpha, k), 1e-9 * std::fabs(printed));
         bp_network_forward(&network, input_q27);
-        bp_network_learn(&parameters, &network, 0, nothing);
+        bp_network_learn(&parameters, &network, 0, input_q27, nothing);
     }
     EXPECT_GT(std::fabs(printed), 130.0 * std::fabs(start));
     EXPECT_EQ(network.hidden[0].output.value[0] / twins::Q28, start);

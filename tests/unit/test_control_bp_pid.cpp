@@ -37,7 +37,8 @@ twins::bp_pid_t twin_of(const bp_pid_parameters_t &p, const bp_pid_t &pid) {
                          p.network.inertia_q32 / twins::Q32};
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         for (unsigned j = 0; j < BP_INPUTS; j++) {
-            twin.network.hidden_weight[i][j] = pid.network.hidden[i].input.value[j] / twins::Q28;
+            // The twin's inputs begin with the error, the PID's with its difference.
+            twin.network.hidden_weight[i][j] = pid.network.hidden[i].input.value[j == 2 ? 2 : 1 - j] / twins::Q28;
         }
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
             twin.network.output_weight[l][i] = pid.network.hidden[i].output.value[l] / twins::Q28;
@@ -128,7 +129,9 @@ TEST(BpPid, fixed_gains_are_half_the_scales_and_the_network_s_are_its_outputs_ti
         bp_pid_step(&parameters, &pid, 1 << 23);
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
             if (mode == BP_PID_FROZEN || mode == BP_PID_LEARNING) {
-                EXPECT_NEAR(pid.gain_q24[l], pid.network.output_q28[l] / twins::Q32 * parameters.scale_q28[l], 0.51);
+                EXPECT_NEAR(pid.gain_q24[l],
+                            (0.5 + 0.5 * pid.network.output_q27[l] / twins::Q27) * parameters.scale_q28[l] / 16.0,
+                            0.51);
             } else {
                 EXPECT_NEAR(pid.gain_q24[l], 0.5 * parameters.scale_q28[l] / 16.0, 0.51);
             }
@@ -187,9 +190,14 @@ TEST(BpPid, the_network_s_inputs_are_the_error_and_its_first_and_second_differen
     for (const double e : errors) {
         bp_pid_step(&parameters, &pid, twins::to_fixed(e, twins::Q24));
         const auto limited = [](double v) { return std::clamp(v, -1.0, 65535.0 / 65536.0); };
-        EXPECT_NEAR(pid.network.input_q27[0] / twins::Q27, e, 1.01 / twins::Q16);
-        EXPECT_NEAR(pid.network.input_q27[1] / twins::Q27, limited(e - e1), 2.01 / twins::Q16);
-        EXPECT_NEAR(pid.network.input_q27[2] / twins::Q27, limited(e - 2.0 * e1 + e2), 4.01 / twins::Q16);
+        const double inputs[] = {limited(e - e1), e, limited(e - 2.0 * e1 + e2)};
+        for (const bp_neuron_t &neuron : pid.network.hidden) {
+            double sum = 0.0;
+            for (unsigned j = 0; j < BP_INPUTS; j++) {
+                sum += neuron.input.value[j] / twins::Q28 * inputs[j];
+            }
+            EXPECT_NEAR(neuron.value_q27 / twins::Q27, std::tanh(0.5 * sum), 1e-4);
+        }
         e2 = e1;
         e1 = e;
     }
