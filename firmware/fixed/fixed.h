@@ -88,4 +88,31 @@ static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
 #endif
 }
 
+/* sum + a * b / 2^32, the product rounded; it must not overflow. */
+static inline int32_t fixed_multiply_high_add(int32_t sum, int32_t a, int32_t b) {
+#ifdef __ARM_FEATURE_DSP
+    int32_t result;
+    __asm__("smmlar %0, %1, %2, %3" : "=r"(result) : "r"(a), "r"(b), "r"(sum));
+    return result;
+#else
+    return sum + fixed_multiply_high(a, b);
+#endif
+}
+
+/* a + 2 b, saturated, 2 b on its own before. */
+static inline int32_t fixed_add_twice(int32_t a, int32_t b) {
+    return fixed_add(a, fixed_add(b, b));
+}
+
+/* Nearest number of `bits` bits with its sign, 1..32, a constant: one instruction where the processor has it. */
+static inline int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
+#if defined __ARM_FEATURE_SAT && defined __OPTIMIZE__
+    int32_t result;
+    __asm__("ssat %0, %1, %2" : "=r"(result) : "I"(bits), "r"(value));
+    return result;
+#else
+    return fixed_clamp(value, INT32_MIN >> (32 - bits), INT32_MAX >> (32 - bits));
+#endif
+}
+
 #endif
