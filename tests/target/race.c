@@ -113,18 +113,17 @@ bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool
     return true;
 }
 
-/* What the linker puts in the place of the critical section in the image that has none. */
-void __wrap_hal_critical_enter(hal_t *hal);
-void __wrap_hal_critical_enter(hal_t *hal) {
+#ifdef NO_CRITICAL_SECTION /* the port has none in this image */
+void hal_critical_enter(hal_t *hal) {
     (void)hal;
 }
 
-void __wrap_hal_critical_leave(hal_t *hal);
-void __wrap_hal_critical_leave(hal_t *hal) {
+void hal_critical_leave(hal_t *hal) {
     (void)hal;
 }
+#endif
 
-void program_interrupt(void) {
+__attribute__((used)) void program_interrupt(void) { /* by the handler, in assembly */
     drive_control_interrupt(&drive);
 }
 

@@ -73,6 +73,14 @@ def test_the_dearest_interrupt_known_costs_what_is_committed(kind):
     assert made == pytest.approx(read()["interrupt"][kind]["searched"], rel=COUNT_TOLERANCE)
 
 
+@pytest.mark.parametrize("kind", worst_case.KINDS)
+def test_no_directed_input_is_dearer_than_the_dearest_known(kind):
+    worst = [worst_case.dearest_count(given) for given in worst_case.directed(kind)]
+    assert len(worst) >= 12
+    assert max(worst) <= (1 + COUNT_TOLERANCE) * read()["interrupt"][kind]["searched"]
+    assert max(worst) > 0.7 * read()["interrupt"][kind]["searched"]
+
+
 def test_an_input_that_was_found_is_the_same_when_written_and_read_again(tmp_path):
     for given in worst_case.directed(worst_case.NETWORK):
         worst_case.write_input(tmp_path / "input.toml", given)

@@ -10,7 +10,7 @@ import pytest
 from salient.image import Image
 from salient.object_code import deepest_stack, forbidden, indirect_calls, needed, size
 from salient.simulator import TARGET_BUILDS, image
-from salient.target_figures import firmware_object
+from salient.target_figures import firmware_alone
 
 LINKED = ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-O1", "-nostartfiles", "-ffreestanding", "-Wl,-e,begin"]
 
@@ -25,7 +25,7 @@ def test_images_have_no_floating_point_no_heap_and_no_call_by_pointer(build):
 
 @pytest.mark.parametrize("build", ["cortex-m4", "cortex-m4-Os"])
 def test_the_firmware_calls_the_hal_memcpy_and_memset_and_nothing_else(build):
-    assert needed(Image(firmware_object(build))) == set()
+    assert needed(Image(firmware_alone(build))) == set()
 
 
 def linked(tmp_path: Path, source: str, *options: str) -> Image:

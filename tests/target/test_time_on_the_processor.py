@@ -42,12 +42,12 @@ def frames(bench: Bench) -> list[tuple]:
 
 # --- a processor that is fast enough --------------------------------------------------------------------------------
 
-# The slowest of 1, 2, 4, ... ns an instruction at which no interrupt is late.
-IN_TIME_NS = {"traditional": 8, "paper": 4, "salient": 4}
+# At which no interrupt is late, ns an instruction.
+IN_TIME_NS = {"traditional": 8, "paper": 8, "salient": 4}
 
 # From lock-step, where the drive takes no time: its figures and how far they may be from it.
 START = {"settling_time_s": 2e-4, "overshoot_percent": 0.02}
-LOAD_STEP = {"speed_dip_rpm": 0.1, "recovery_time_s": 2e-3}
+LOAD_STEP = {"speed_dip_rpm": 0.3, "recovery_time_s": 2e-3}
 MEAN_TORQUE_NM = 0.01
 
 
@@ -93,7 +93,7 @@ def test_a_drive_in_time_has_no_late_interrupt_and_the_figures_of_one_that_takes
             assert timed["torque_mean_Nm"] == pytest.approx(lockstep["torque_mean_Nm"], abs=MEAN_TORQUE_NM)
             assert 0.7 < timed["torque_ripple"] / lockstep["torque_ripple"] < 1.3
         assert [processor(made[None], f"{which}_us") for which in ("used", "worst")] == [0, 0]
-        assert 0.3 * PERIOD_US < processor(bench, "used_us") <= processor(bench, "worst_us") < PERIOD_US
+        assert 0.1 * PERIOD_US < processor(bench, "used_us") <= processor(bench, "worst_us") < PERIOD_US
 
 
 def test_the_time_used_is_that_of_the_instructions_counted_and_of_the_port(make_bench, tmp_path):
@@ -133,23 +133,26 @@ def test_equal_runs_take_equal_time_to_the_bit(make_bench):
 # --- one that is not ------------------------------------------------------------------------------------------------
 
 
-def slow_processor(make_bench, controller: str) -> int:
-    """The slowest one that serves the drive at rest in time, ns an instruction: its law takes several times as long."""
-    for instruction_ns in (64, 32, 16, 8):
-        bench = make_bench(build="cortex-m4", controller=controller, instruction_ns=instruction_ns)
+def slow_processor(make_bench, controller: str) -> dict[str, int]:
+    """The slowest one, by the instructions of a period, that serves the drive at rest in time: its law takes twice as
+    many and more."""
+    for rate_hz, instruction_ns in ((40_000, 64), (50_000, 32), (40_000, 32), (50_000, 16), (40_000, 16), (50_000, 8)):
+        options = {"control_rate_hz": rate_hz, "instruction_ns": instruction_ns}
+        bench = make_bench(build="cortex-m4", controller=controller, **options)
         bench.run_for(0.11)
         # One without time for the background says nothing after its first cycle, and that says 0.
-        if processor(bench, "late_interrupts") == 0 and 0 < processor(bench, "worst_us") < 0.8 * PERIOD_US:
-            return instruction_ns
+        if processor(bench, "late_interrupts") == 0 and 0 < processor(bench, "worst_us") < 0.8e6 / rate_hz:
+            return options
     raise AssertionError("no processor is fast enough")
 
 
 @pytest.mark.parametrize("controller", ["paper", "salient"])
 def test_a_slow_processor_is_noticed_reported_and_safe_the_same_every_time(make_bench, controller):
-    instruction_ns = slow_processor(make_bench, controller)
+    slow = slow_processor(make_bench, controller)
+    period_us = 1e6 / slow["control_rate_hz"]
 
     def run() -> tuple[Bench, list[tuple]]:
-        bench = make_bench(build="cortex-m4", controller=controller, instruction_ns=instruction_ns)
+        bench = make_bench(build="cortex-m4", controller=controller, **slow)
         bench.run_for(0.01)
         assert (bench.drive.state, bench.drive.fault) == ("ready", "none")
         bench.drive.speed_reference_rpm = 600
@@ -159,10 +162,10 @@ def test_a_slow_processor_is_noticed_reported_and_safe_the_same_every_time(make_
 
     bench, first = run()
     late, worst_us = processor(bench, "late_interrupts"), processor(bench, "worst_us")
-    print(f"{controller} at {instruction_ns} ns: {late:g} late, worst {worst_us:g} us")
-    assert 2 <= late < 200
-    assert PERIOD_US < worst_us < 10 * PERIOD_US
-    assert processor(bench, "used_us") < PERIOD_US  # in fault it is in time again
+    print(f"{controller}, {slow}: {late:g} late, worst {worst_us:g} us")
+    assert 1 <= late < 200
+    assert period_us < worst_us < 10 * period_us
+    assert processor(bench, "used_us") < period_us  # in fault it is in time again
     assert bench.telemetry["DRIVE_FAULT_CAUSE.fault"].last_name == "interrupt_overrun"
     assert bench.telemetry["DRIVE_FAULT_CAUSE.state"].last_name == "run"
     assert currents_A(bench) == [0, 0, 0]

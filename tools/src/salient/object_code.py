@@ -53,7 +53,7 @@ def forbidden(image: Image) -> list[str]:
 
 
 def needed(image: Image) -> set[str]:
-    """What an object of the firmware, linked with the compiler's helpers, calls beside the HAL and _LIBRARY."""
+    """What the firmware, linked with the compiler's helpers and nothing else, calls beside the HAL and _LIBRARY."""
     names = {line.split()[-1] for line in image.run("nm", "--undefined-only").splitlines() if line.strip()}
     return {name for name in names if not name.startswith("hal_")} - _LIBRARY
 

@@ -34,20 +34,20 @@ Figures = dict[str, dict[str, dict[str, int]]]
 
 
 def sizes(build: str) -> dict[str, int]:
-    """Bytes of a build's image and, where the build makes it, of the firmware alone (firmware.o: linked as the image
-    is, without port and C library). The stack is the most that background and interrupt can take together."""
+    """Bytes of a build's image and, where the build makes it, of the firmware alone (firmware.elf: linked as the
+    image is, without port and C library). The stack is the most that background and interrupt can take together."""
     whole = Image(image(MACHINE, build))
     of = size(whole)
-    alone = firmware_object(build)
+    alone = firmware_alone(build)
     background, interrupt = (deepest_stack(whole, function)[0] for function in ("program_start", "control_handler"))
     figures = {"flash": of.flash, "ram": of.ram, "stack_background": background,
                "stack_interrupt": interrupt + whole.exception_frame_bytes}
     return ({"firmware": size(Image(alone)).flash} if alone.exists() else {}) | figures
 
 
-def firmware_object(build: str) -> Path:
-    """The firmware linked with one machine's tables, not made by every build."""
-    return BUILD / build / "firmware" / "firmware.o"
+def firmware_alone(build: str) -> Path:
+    """The firmware linked with one machine's tables and open ends to the HAL; not made by every build."""
+    return BUILD / build / "firmware" / "firmware.elf"
 
 
 def cost_figures(cost: Cost, dearest: Cost) -> dict[str, int]:

@@ -130,8 +130,8 @@ def replay(done: Input, **options) -> Cost:
         return read_cost(counted, executed, board.machine, board.build)
 
 
-def _worst(done: Input) -> int:
-    """The count of the dearest interrupt."""
+def dearest_count(done: Input) -> int:
+    """Instructions of the dearest interrupt; quicker than replay."""
     with tempfile.TemporaryDirectory(prefix="salient-") as name:
         counted = Path(name) / "instructions"
         _run(done, _board(done, instructions=counted))
@@ -240,7 +240,7 @@ def search(kind: str, begin: Iterable[Input], seconds: float, seed: int,
             while len(waiting) < _WORKERS * 4:
                 waiting.append(mutated(random_source.choice(elite)[1] if elite else directed(kind)[0], random_source))
             batch, waiting = waiting[: _WORKERS * 4], waiting[_WORKERS * 4:]
-            elite += zip(workers.map(_worst, batch), batch, strict=True)
+            elite += zip(workers.map(dearest_count, batch), batch, strict=True)
             elite = sorted(elite, key=lambda found: -found[0])[:_ELITE]
             tried += len(batch)
             progress(tried, elite[0][0])
@@ -252,7 +252,7 @@ def _pruned(worst: int, found: Input, workers: Executor) -> tuple[int, Input]:
     while True:
         shorter = [replace(found, actions=found.actions[:i] + found.actions[i + 1:])
                    for i, action in enumerate(found.actions) if not _fixed(action)]
-        for count, one in zip(workers.map(_worst, shorter), shorter, strict=True):
+        for count, one in zip(workers.map(dearest_count, shorter), shorter, strict=True):
             if count >= worst:
                 worst, found = count, one
                 break
@@ -361,7 +361,7 @@ def search_and_write(seconds: float, seed: int) -> int:
     wrote = False
     for kind in KINDS:
         known = [read_input(committed(kind))] if committed(kind).exists() else []
-        before = _worst(known[0]) if known else 0
+        before = dearest_count(known[0]) if known else 0
 
         def progress(tried: int, worst: int, kind: str = kind) -> None:
             if sys.stdout.isatty():
