@@ -35,7 +35,13 @@ void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare);
 /* Opens every switch now, not at the next period, and clears the buffer (the timer's break input). [both] */
 void hal_pwm_open_all(hal_t *hal);
 
-/* Control interrupts that were lost since the last call because the previous one was still running. [interrupt] */
+/* Control interrupts that were lost since the last call: one whose trigger came while the previous one was still
+ * running is not made up for, and its period keeps the compare values of the period before. [interrupt] */
 uint32_t hal_pwm_missed_interrupts(hal_t *hal);
+
+/* Ticks of HAL_PWM_TICK_NS since the trigger of the present control interrupt, which took its sample; rounded down to
+ * what the port's counter resolves. Goes on beyond the period, wraps after 21 s; 0 on a port whose processor takes no
+ * time. [interrupt] */
+uint32_t hal_pwm_elapsed_ticks(const hal_t *hal);
 
 #endif

@@ -60,13 +60,20 @@ BUILD_NEEDS = (
     Need("libgtest-dev", "unit tests", _file("/usr/include/gtest/gtest.h", "/usr/local/include/gtest/gtest.h")),
     Need("python3-venv", "virtual environment", lambda: (VENV / "bin/python").exists() or _has_ensurepip()),
 )
-TARGET_NEEDS = (
-    Need("gcc-arm-none-eabi", "compiler for Cortex-M4", _tool("arm-none-eabi-gcc")),
-    Need("libnewlib-arm-none-eabi", "its C headers", _file("/usr/lib/arm-none-eabi/include/string.h")),
-    Need("qemu-system-arm", "emulated Cortex-M4", _tool("qemu-system-arm")),
-)
+TARGET_NEEDS = {
+    "host": (),
+    "cortex-m4": (
+        Need("gcc-arm-none-eabi", "compiler for Cortex-M4", _tool("arm-none-eabi-gcc")),
+        Need("libnewlib-arm-none-eabi", "its C headers", _file("/usr/lib/arm-none-eabi/include/string.h")),
+        Need("qemu-system-arm", "emulated Cortex-M4", _tool("qemu-system-arm")),
+    ),
+    "rv32": (
+        Need("gcc-riscv64-unknown-elf", "compiler for RV32", _tool("riscv64-unknown-elf-gcc")),
+        Need("qemu-system-misc", "emulated RV32", _tool("qemu-system-riscv32")),
+    ),
+}
 TEST_NEEDS = (
-    *TARGET_NEEDS,
+    *(need for needs in TARGET_NEEDS.values() for need in needs),
     Need("qemu-system-x86", "guest with a kernel that has CAN", lambda: not _guest_packages()),
 )
 MEASUREMENT_NEEDS = (
@@ -231,7 +238,9 @@ def main() -> None:
         # bench counts the instructions of the control interrupt there
         target = "cortex-m4" if options.command == "bench" else getattr(options, "target", "host")
         on_target = target != "host"
-        needs += TARGET_NEEDS if on_target else ()
+        needs += TARGET_NEEDS[target]
+        if getattr(options, "figures", False):  # of every target
+            needs += tuple(need for needs_of in TARGET_NEEDS.values() for need in needs_of)
         needs += MEASUREMENT_NEEDS if options.command in ("test", "bench") else ()
         if options.command in WITHOUT_BUILD:
             needs = tuple(need for need in BUILD_NEEDS if need.package == "python3-venv")

@@ -33,6 +33,8 @@ typedef struct {
     bool immediate_pwm;    /* a setting: see board_pwm_write; false after board_init */
     hal_pwm_compare_t active, buffered;
     uint32_t missed_interrupts; /* since last read */
+    uint64_t interrupt_took_ns; /* the present control interrupt, from its trigger on: as the rig says, unless the port,
+                                   whose processor takes time of its own, says otherwise before it is over */
 
     hal_can_frame_t received[HAL_CAN_RECEIVE_QUEUE];
     uint32_t received_pushed, received_popped; /* counts, not indices */

@@ -56,6 +56,10 @@ void rig_join(rig_t *rig, const rig_firmware_t *firmware) {
     }
 }
 
+void rig_busy_until(rig_t *rig, uint64_t time_ns) {
+    rig->interrupt_end_ns = time_ns;
+}
+
 static void call(rig_t *rig, board_context_t context, void (*function)(void *)) {
     rig->board.context = context;
     function(rig->firmware.context);
@@ -77,12 +81,13 @@ static void control_event(rig_t *rig) {
     if (busy) {
         return;
     }
+    rig->board.interrupt_took_ns = rig->interrupt_time_ns;
     call(rig, BOARD_INTERRUPT, rig->firmware.control_interrupt);
-    if (rig->interrupt_time_ns == 0) {
+    if (rig->board.interrupt_took_ns == 0) {
         call(rig, BOARD_BACKGROUND, rig->firmware.background);
     } else {
         /* At the very instant of the next period's start the interrupt comes first and puts this off again. */
-        rig->interrupt_end_ns = rig->background_ns = now_ns + rig->interrupt_time_ns;
+        rig->interrupt_end_ns = rig->background_ns = now_ns + rig->board.interrupt_took_ns;
     }
 }
 

@@ -31,7 +31,7 @@
 #define RIG_RUNS_MAX 64           /* RIG_RUN_UNTILs that wait for their time */
 #define RIG_MOVING_BACKLOG_MAX 64 /* paces that move by themselves: clients wait while so many frames are queued */
 
-/* The firmware, seen from the emulator. Both take no virtual time, except as interrupt_time_us says. */
+/* The firmware, seen from the emulator. Both take no virtual time, except as board.interrupt_took_ns says. */
 typedef struct {
     void (*control_interrupt)(void *context); /* at the start of each control period */
     void (*background)(void *context);        /* after each interrupt */
@@ -85,7 +85,7 @@ typedef struct {
     uint64_t period_ns;
     uint64_t hold_ns, control_ns, background_ns, truth_ns; /* when each is due next */
     uint64_t truth_period_ns;
-    uint64_t interrupt_time_ns, interrupt_end_ns;
+    uint64_t interrupt_time_ns, interrupt_end_ns; /* triggers before the end of the last one are lost */
     quantity_queue_t settings;
     rig_run_t runs[RIG_RUNS_MAX]; /* by time, equal times in the order of arrival */
     unsigned run_count;
@@ -100,6 +100,10 @@ void rig_init(rig_t *rig, const rig_config_t *config);
 
 /* Joins the firmware, which must have started the timer (hal_pwm_start); its first interrupt is one period away. */
 void rig_join(rig_t *rig, const rig_firmware_t *firmware);
+
+/* The processor serves no trigger of a control interrupt before time_ns: they are lost, as those during an interrupt.
+ */
+void rig_busy_until(rig_t *rig, uint64_t time_ns);
 
 /* One round. Lock-step: takes what clients sent; runs to the time asked for, or waits up to timeout_ms (negative: for
  * ever) when none was. Other paces: runs to the next reading point. False when it is over: asked to stop, stop_at_ns

@@ -139,6 +139,17 @@ static hal_can_frame_t bus_counters_frame(const telemetry_t *telemetry, const co
     return frame;
 }
 
+static hal_can_frame_t processor_frame(const telemetry_snapshot_t *snapshot) {
+    struct drive_drive_processor_t message = {0};
+    drive_drive_processor_set_used_us(&message, snapshot->used_ticks);
+    drive_drive_processor_set_worst_us(&message, snapshot->worst_ticks);
+    drive_drive_processor_set_available_us(&message, snapshot->available_ticks);
+    drive_drive_processor_set_late_interrupts(&message, snapshot->late_interrupts);
+    hal_can_frame_t frame = frame_of(DRIVE_DRIVE_PROCESSOR_FRAME_ID, DRIVE_DRIVE_PROCESSOR_LENGTH);
+    drive_drive_processor_pack(frame.data, &message, sizeof frame.data);
+    return frame;
+}
+
 static hal_can_frame_t heartbeat_frame(const telemetry_t *telemetry, const telemetry_snapshot_t *snapshot) {
     struct drive_drive_heartbeat_t message = {0};
     drive_drive_heartbeat_set_state(&message, snapshot->state);
@@ -201,8 +212,9 @@ void telemetry_cycle(telemetry_t *telemetry, const telemetry_snapshot_t *snapsho
     put_fault(telemetry, snapshot);
     if (count_down(&telemetry->heartbeat_in, HEARTBEAT_CYCLES)) {
         const hal_can_frame_t frames[] = {command_counters_frame(counters),
-                                          bus_counters_frame(telemetry, counters, receive_overflows)};
-        put_together(telemetry, frames, 2);
+                                          bus_counters_frame(telemetry, counters, receive_overflows),
+                                          processor_frame(snapshot)};
+        put_together(telemetry, frames, 3);
         put_heartbeat(telemetry, snapshot);
     }
 

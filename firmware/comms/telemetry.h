@@ -2,7 +2,7 @@
  *
  *   every 1 ms    DRIVE_STATUS, DRIVE_MOTION, DRIVE_TORQUE, DRIVE_CURRENTS
  *   every 10 ms   DRIVE_BP_PID, DRIVE_TRIM
- *   every 100 ms  DRIVE_COMMAND_COUNTERS, DRIVE_BUS_COUNTERS, DRIVE_HEARTBEAT
+ *   every 100 ms  DRIVE_COMMAND_COUNTERS, DRIVE_BUS_COUNTERS, DRIVE_PROCESSOR, DRIVE_HEARTBEAT
  *   in fault      DRIVE_FAULT_CAUSE, DRIVE_FAULT_SNAPSHOT in the cycle after the fault and every 100 ms from there
  *
  * The first cycle after start has everything. Frames wait in a queue for one of the three mailboxes. Frames that belong
@@ -51,7 +51,12 @@ typedef struct {
     int32_t misalignment;              /* 2^-32 turn */
     int32_t torque_missing_q24;        /* reference less what the voltage can reach */
     uint16_t observer_bandwidth_rad_s; /* at this moment */
-    fault_record_t last_fault;         /* sent while state is fault */
+    /* The control interrupt's time on the processor, HAL_PWM_TICK_NS. */
+    uint32_t used_ticks;       /* of the last one */
+    uint32_t worst_ticks;      /* of the longest since start */
+    uint32_t available_ticks;  /* the control period */
+    uint32_t late_interrupts;  /* since start */
+    fault_record_t last_fault; /* sent while state is fault */
 } telemetry_snapshot_t;
 
 typedef struct {

@@ -7,13 +7,16 @@
  *   dW2_ij(k) = eta d2_i x_j + alpha dW2_ij(k-1)                (27)
  *   d2_i = f'(net2_i) sum_l d3_l W3_li
  *
- * Formats: inputs and activations Q1.15, weights and their increments Q3.28 held within +-8 (saturation), of which the
- * top 16 bits (Q3.12, truncated) enter products; sums in 64 bits; d3, d2 in Q1.30.
+ * Formats: inputs and activations Q4.27; weights Q3.28 held within +-8 (saturation), their
+ * increments Q4.27; sums of a layer Q8.23, within 6 * 8. Every product is rounded to the format of its sum: see
+ * fixed_multiply_high. |eta d2| <= 3 / 2 * 8 / 4 = 3, so that with alpha < 1/2 an increment stays within 6.
  */
 #ifndef CONTROL_BP_NETWORK_H
 #define CONTROL_BP_NETWORK_H
 
 #include <stdint.h>
+
+#include "fixed/triple.h"
 
 #define BP_INPUTS 3
 #define BP_HIDDEN 6
@@ -21,29 +24,32 @@
 
 typedef struct {
     int32_t learning_rate_q15; /* eta, Q1.15, 0..1 */
-    int32_t inertia_q15;       /* alpha, Q1.15, 0..1 */
+    int32_t inertia_q32;       /* alpha, Q32, 0..1/2 - 2^-32 */
 } bp_network_parameters_t;
 
+/* A hidden neuron with its weights in Q3.28 and their changes in Q4.27. */
 typedef struct {
-    int32_t hidden_weight_q28[BP_HIDDEN][BP_INPUTS];
-    int32_t output_weight_q28[BP_OUTPUTS][BP_HIDDEN];
-    int32_t hidden_change_q28[BP_HIDDEN][BP_INPUTS];
-    int32_t output_change_q28[BP_OUTPUTS][BP_HIDDEN];
-    int32_t input_q15[BP_INPUTS];
-    int32_t hidden_q15[BP_HIDDEN];
-    int32_t output_q15[BP_OUTPUTS]; /* 0..32768 */
+    int32_t value_q27;
+    triple_moving_t output; /* W3_li, by output l */
+    triple_moving_t input;  /* W2_ij, by input j */
+} bp_neuron_t;
+
+typedef struct {
+    bp_neuron_t hidden[BP_HIDDEN];
+    int32_t output_q27[BP_OUTPUTS]; /* f(net3): O3 is the logistic function, (1 + f) / 2 */
 } bp_network_t;
 
-/* Initial weights: uniform in +-0.5 from a linear congruential generator, so that a seed gives the same on any machine.
- */
+/* Initial weights: uniform in +-0.5 from a linear congruential generator, so that a seed gives the same on any machine;
+ * drawn neuron by neuron, for its second input first, then output by output. The layers' values are those of the next
+ * forward pass. */
 void bp_network_reset(bp_network_t *network, uint32_t seed);
 
-/* Outputs for inputs in Q1.15, |input| <= 32767; the layers' values stay in the network for learning. */
-void bp_network_forward(bp_network_t *network, const int32_t input_q15[BP_INPUTS]);
+/* Outputs for inputs in Q4.27, |input| <= 1; the layers' values stay in the network for learning. */
+void bp_network_forward(bp_network_t *network, const int32_t input_q27[BP_INPUTS]);
 
-/* One step down the gradient for the last forward pass: error e and du/dO3 in Q1.15, |value| <= 32768; sgn(dy/du) is 1,
- * more voltage gives more torque. */
-void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *network, int32_t error_q15,
-                      const int32_t sensitivity_q15[BP_OUTPUTS]);
+/* One step down the gradient for the last forward pass: error e in Q1.16, -1..1, its inputs and du/dO3 in Q0.31;
+ * sgn(dy/du) is 1, more voltage gives more torque. */
+void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *network, int32_t error_q16,
+                      const int32_t input_q31[BP_INPUTS], const int32_t sensitivity_q31[BP_OUTPUTS]);
 
 #endif

@@ -1,62 +1,65 @@
 #include "control/bp_pid.h"
 
 #include "fixed/fixed.h"
+#include "fixed/sigmoid.h"
 
-#define ERROR_LIMIT_Q15 32767
-#define DUTY_ONE_Q30 (1 << 30)
+#define ERROR_BITS 17 /* Q1.16 within -1..1 - 2^-16 */
+#define DUTY_BITS 24  /* Q23 within -1..1 - 2^-23, which rounds to 1 in Q15 */
+
+void bp_pid_show_none(bp_pid_t *pid) {
+    pid->duty_q23 = 0;
+    for (unsigned l = 0; l < BP_OUTPUTS; l++) {
+        pid->gain_q24[l] = 0;
+    }
+}
 
 void bp_pid_reset(const bp_pid_parameters_t *parameters, bp_pid_t *pid) {
-    *pid = (bp_pid_t){0};
     bp_network_reset(&pid->network, parameters->seed);
+    pid->error_q16 = 0;
+    pid->rise_q16 = 0;
+    bp_pid_show_none(pid);
 }
 
 void bp_pid_preset(bp_pid_t *pid, int32_t duty_q15) {
-    pid->duty_q30 = fixed_clamp(duty_q15, -32768, 32768) * 32768;
-}
-
-void bp_pid_show_none(bp_pid_t *pid) {
-    pid->duty_q30 = 0;
-    for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        pid->gain_q15[l] = 0;
-    }
-}
-
-static int32_t limited(int32_t value_q15) {
-    return fixed_clamp(value_q15, -ERROR_LIMIT_Q15, ERROR_LIMIT_Q15);
+    pid->duty_q23 = fixed_clamp(duty_q15, -32768, 32768) * 256;
 }
 
 int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_t torque_error_q24) {
-    /* Q24 * Q24 to Q15. */
-    const int32_t error_q15 = limited(fixed_multiply(torque_error_q24, parameters->error_scale_inverse_q24, 33));
-    const int32_t term_q15[BP_OUTPUTS] = {
-        limited(error_q15 - pid->error_q15),
-        error_q15,
-        limited(error_q15 - 2 * pid->error_q15 + pid->previous_q15),
+    static const int32_t half[BP_OUTPUTS] = {0};
+    const bool learning = parameters->mode == BP_PID_LEARNING;
+    const int32_t *output_q27 = half;
+
+    /* Q24 * Q24 to Q16, within 2^31 * 2^30 / 2^32. */
+    const int32_t error_q16 =
+        fixed_saturate_bits(fixed_multiply_high(torque_error_q24, parameters->error_scale_inverse_q24), ERROR_BITS);
+    const int32_t rise_q16 = error_q16 - pid->error_q16;
+    const int32_t bend_q16 = rise_q16 - pid->rise_q16;
+    pid->error_q16 = error_q16;
+    pid->rise_q16 = rise_q16;
+    const int32_t term_q31[3] = {
+        fixed_saturate_bits(rise_q16, ERROR_BITS) * (1 << 15),
+        error_q16 * (1 << 15),
+        fixed_saturate_bits(bend_q16, ERROR_BITS) * (1 << 15),
     };
-    const int32_t scale_q15[BP_OUTPUTS] = {parameters->kp_scale_q15, parameters->ki_scale_q15,
-                                           parameters->kd_scale_q15};
-    const bool from_network = parameters->mode == BP_PID_FROZEN || parameters->mode == BP_PID_LEARNING;
-    if (from_network) {
-        const int32_t input_q15[BP_INPUTS] = {error_q15, term_q15[0], term_q15[2]};
-        bp_network_forward(&pid->network, input_q15);
+    if (learning || parameters->mode == BP_PID_FROZEN) {
+        const int32_t input_q27[BP_INPUTS] = {term_q31[0] >> 4, term_q31[1] >> 4, term_q31[2] >> 4};
+        bp_network_forward(&pid->network, input_q27);
+        output_q27 = pid->network.output_q27;
     }
 
-    int64_t duty_q30 = pid->duty_q30;
+    int32_t sum_q23 = pid->duty_q23; /* within 1 + 3 * 4 */
+#pragma GCC unroll 3
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        pid->gain_q15[l] =
-            from_network ? fixed_multiply(pid->network.output_q15[l], scale_q15[l], 15) : scale_q15[l] / 2;
-        duty_q30 += (int64_t)pid->gain_q15[l] * term_q15[l]; /* 2^17 * 2^15 */
+        pid->gain_q24[l] = fixed_multiply_high(sigmoid_logistic_q28(output_q27[l]), parameters->scale_q28[l]);
+        sum_q23 = fixed_multiply_high_add(sum_q23, pid->gain_q24[l], term_q31[l]);
     }
-    const bool saturated = duty_q30 > DUTY_ONE_Q30 || duty_q30 < -DUTY_ONE_Q30;
-    pid->duty_q30 = (int32_t)(duty_q30 > DUTY_ONE_Q30    ? DUTY_ONE_Q30
-                              : duty_q30 < -DUTY_ONE_Q30 ? -DUTY_ONE_Q30
-                                                         : duty_q30);
+    const int32_t duty_q23 = fixed_saturate_bits(sum_q23, DUTY_BITS);
+    pid->duty_q23 = duty_q23;
 
-    const bool at_limit = error_q15 == ERROR_LIMIT_Q15 || error_q15 == -ERROR_LIMIT_Q15;
-    if (parameters->mode == BP_PID_LEARNING && !saturated && !at_limit) {
-        bp_network_learn(&parameters->network, &pid->network, error_q15, term_q15);
+    /* Positive numbers one less than negative ones: the end of both has a complement of the same bits. */
+    const bool at_limit = (error_q16 ^ error_q16 >> 31) == (1 << (ERROR_BITS - 1)) - 1;
+    if (learning && sum_q23 == duty_q23 && !at_limit) {
+        bp_network_learn(&parameters->network, &pid->network, error_q16, term_q31, term_q31);
     }
-    pid->previous_q15 = pid->error_q15;
-    pid->error_q15 = error_q15;
-    return (int32_t)fixed_shift(pid->duty_q30, 15);
+    return (duty_q23 + (1 << 7)) >> 8;
 }

@@ -3,9 +3,9 @@
  *   u(k) = u(k-1) + kp (e - e1) + ki e + kd (e - 2 e1 + e2)     (15) as in (25); printed with e(k) thrice
  *
  * with kp, ki, kd the network's outputs (0..1) times their scales. The error enters as e / error_scale, held within
- * +-1, as do its first and second difference; they are the network's inputs too (the paper does not name its inputs).
- * Learning pauses while the duty is saturated or the errors are at their limits: the gradient says nothing then, and
- * learning from it drives the weights away.
+ * +-1, as do its first and second difference; they are the network's inputs too, in the order of (15) (the paper does
+ * not name its inputs). Learning pauses while the duty is saturated or the errors are at their limits: the gradient
+ * says nothing then, and learning from it drives the weights away.
  */
 #ifndef CONTROL_BP_PID_H
 #define CONTROL_BP_PID_H
@@ -26,18 +26,16 @@ typedef struct {
     bp_pid_mode_t mode;
     uint32_t seed;                   /* of the initial weights */
     int32_t error_scale_inverse_q24; /* 1/(N m), Q7.24, 0 < scale_inverse <= 64 */
-    int32_t kp_scale_q15;            /* duty per scaled error, Q16.15, 0..4 */
-    int32_t ki_scale_q15;
-    int32_t kd_scale_q15;
+    int32_t scale_q28[BP_OUTPUTS];   /* of kp, ki, kd: duty per scaled error, Q3.28, 0..4 */
     bp_network_parameters_t network;
 } bp_pid_parameters_t;
 
 typedef struct {
     bp_network_t network;
-    int32_t error_q15;            /* e(k-1), scaled */
-    int32_t previous_q15;         /* e(k-2), scaled */
-    int32_t duty_q30;             /* u, Q1.30, within +-1 */
-    int32_t gain_q15[BP_OUTPUTS]; /* kp, ki, kd in use, Q16.15; for display */
+    int32_t error_q16;            /* e(k-1), scaled */
+    int32_t rise_q16;             /* e(k-1) - e(k-2), within +-2 */
+    int32_t duty_q23;             /* u, Q8.23, within +-1 */
+    int32_t gain_q24[BP_OUTPUTS]; /* kp, ki, kd in use, Q7.24, 0..4; for display */
 } bp_pid_t;
 
 /* Weights from the seed, no error, duty 0. */

@@ -24,11 +24,18 @@
 #include "control/commutation.h"
 #include "control/machine_tables.h"
 
+/* Current that carries a torque at the hand-over angle, A, Q7.9: entry 4 m + n is of 2^m (1 + n / 4) - 1 times 1/16 N
+ * m, the first of no torque, the last beyond 128 N m. */
+#define DITC_DUTY_AIMS 46
+typedef struct {
+    uint16_t current_q9[DITC_DUTY_AIMS];
+} ditc_duty_aims_t;
+
 typedef struct {
     bp_pid_parameters_t pid;
-    uint32_t hand_over_angle;  /* 2^-32 pitch, 2^31..2^32-1 */
-    int32_t incoming_gain_q20; /* duty per A of the incoming phase's current error, Q11.20 */
-    int32_t surplus_q20;       /* of the reference, 0..2^20-1: see above */
+    ditc_duty_aims_t aims;
+    int32_t incoming_gain_q24; /* duty per A of the incoming phase's current error, Q7.24 */
+    int32_t surplus_q32;       /* of the reference, 0..1/2 - 2^-32: see above */
     int32_t spent_torque_q24;  /* of the outgoing phase: see above; N m, Q7.24, >= 0 */
     int32_t band_outer_q24;    /* N m, Q7.24 */
     int32_t current_limit_q9;  /* A, Q7.9 */
@@ -45,6 +52,12 @@ typedef struct {
     int32_t reference_q24;     /* N m, Q7.24, >= 0 */
     int32_t error_q24;         /* reference - sum of the torques */
 } ditc_duty_sample_t;
+
+/* The aims of a machine for a hand-over angle of 2^31..2^32-1, 2^-32 pitch. */
+ditc_duty_aims_t ditc_duty_aims(const machine_tables_t *tables, uint32_t hand_over_angle);
+
+/* The aim for a torque >= 0 in N m, Q7.24: current in A, Q7.9, linear between the table's torques. */
+int32_t ditc_duty_aim_q9(const ditc_duty_aims_t *aims, int32_t torque_q24);
 
 /* Initial weights, no phase regulated. */
 void ditc_duty_reset(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc);

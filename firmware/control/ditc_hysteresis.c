@@ -36,20 +36,32 @@ static int8_t outgoing_state(const ditc_hysteresis_parameters_t *parameters, int
     return returned ? 0 : state;
 }
 
-void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_hysteresis_t *ditc, unsigned phases,
+static int8_t limited(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t current_q9) {
+    return state > 0 && current_q9 > parameters->current_limit_q9 ? 0 : state;
+}
+
+void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_hysteresis_t *ditc,
                           const commutation_t *commutation, int32_t torque_error_q24, const int32_t *current_q9) {
-    const bool outgoing_works = commutation->outgoing != COMMUTATION_NONE && current_q9[commutation->outgoing] > 0;
-    for (unsigned phase = 0; phase < phases; phase++) {
-        int8_t state = -1;
-        if (phase == commutation->outgoing) {
-            state = outgoing_state(parameters, ditc->state[phase], torque_error_q24);
-        } else if (phase == commutation->active) {
-            state = outgoing_works ? incoming_state(parameters, ditc->state[phase], torque_error_q24)
-                                   : single_state(parameters, ditc->state[phase], torque_error_q24);
-        }
-        if (state > 0 && current_q9[phase] > parameters->current_limit_q9) {
-            state = 0;
-        }
-        ditc->state[phase] = state;
+    const unsigned active = commutation->active;
+    const unsigned outgoing = commutation->outgoing;
+    int8_t leaves = -1;
+    bool works = false;
+    if (outgoing != COMMUTATION_NONE) {
+        leaves = limited(parameters, outgoing_state(parameters, ditc->state[outgoing], torque_error_q24),
+                         current_q9[outgoing]);
+        works = current_q9[outgoing] > 0;
+    }
+    int8_t state = -1;
+    if (active != COMMUTATION_NONE) {
+        state = works ? incoming_state(parameters, ditc->state[active], torque_error_q24)
+                      : single_state(parameters, ditc->state[active], torque_error_q24);
+        state = limited(parameters, state, current_q9[active]);
+    }
+    ditc_hysteresis_reset(ditc);
+    if (outgoing != COMMUTATION_NONE) {
+        ditc->state[outgoing] = leaves;
+    }
+    if (active != COMMUTATION_NONE) {
+        ditc->state[active] = state;
     }
 }

@@ -34,7 +34,7 @@ typedef struct {
 void ditc_hysteresis_reset(ditc_hysteresis_t *ditc);
 
 /* One sample: new states from the torque error (N m, Q7.24) and the phase currents (A, Q7.9). */
-void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_hysteresis_t *ditc, unsigned phases,
+void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_hysteresis_t *ditc,
                           const commutation_t *commutation, int32_t torque_error_q24, const int32_t *current_q9);
 
 #endif

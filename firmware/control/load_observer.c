@@ -3,15 +3,13 @@
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
-/* Keeps a wild load estimate (a rotor that was turned by hand, an encoder that jumped) from taking seconds to return.
- */
-#define LOAD_TORQUE_LIMIT_Q24 (60 * (1 << 24))
+/* Keeps a wild load estimate (a rotor that was turned by hand, an encoder that jumped) from taking seconds to return:
+ * 64 N m. */
+#define LOAD_TORQUE_LIMIT_Q24 (1 << 30)
 
 /* A 32nd of a turn. With less, an observer that starts at rest on a turning rotor slips from turn to turn for ever;
  * with more, a jump of the encoder throws the speed so far that it reads as overspeed. */
 #define INNOVATION_LIMIT (1 << 27)
-
-#define TORQUE_GAIN_LIMIT_Q20 (((int64_t)1 << 40) - 1)
 
 /* 2 pi in Q3.28. */
 #define TWO_PI_Q28 1686629713
@@ -28,6 +26,28 @@ static int64_t decay_complement_q31(int64_t y_q31) {
     return fixed_shift(y_q31 * series_q31, 31);
 }
 
+/* value / 2^fraction_bits, value of 31 bits or 0. */
+typedef struct {
+    int32_t value;
+    int fraction_bits;
+} normal_t;
+
+static normal_t normal(int64_t value, int fraction_bits) {
+    while (value > INT32_MAX) {
+        value >>= 1;
+        fraction_bits--;
+    }
+    while (value > 0 && value <= INT32_MAX / 2) {
+        value <<= 1;
+        fraction_bits++;
+    }
+    return (normal_t){(int32_t)value, fraction_bits};
+}
+
+static normal_t normal_product(normal_t a, normal_t b) {
+    return normal((int64_t)a.value * b.value, a.fraction_bits + b.fraction_bits);
+}
+
 load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t control_rate_hz, int32_t inertia_q30) {
     /* Widths in the comments are for the ends of the ranges: p = 1 - q <= 0.4, p rate <= 10000. */
     const int64_t rate = control_rate_hz; /* 20 bits */
@@ -37,22 +57,21 @@ load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t con
     const int64_t p2_q46 = fixed_shift(p_q31 * p_q31, 16);
     const int64_t p3_q46 = fixed_shift(fixed_shift(p2_q46, 12) * p_q31, 19); /* Q34, 31 bits, * Q31 */
     const int64_t q3_q31 = (((q_q31 * q_q31) >> 31) * q_q31) >> 31;
-    const int64_t inertia_rate_q30 = (int64_t)inertia_q30 * rate; /* 51 bits */
 
-    load_observer_gains_t gains = {.angle_gain_q30 = (int32_t)((one_q31 - q3_q31) >> 1)};
+    load_observer_gains_t gains = {.angle_gain_q28 = (int32_t)((one_q31 - q3_q31) >> 3)};
 
     /* l2 * 2 pi * 2^14, which is 2 pi 2^-32 rad to 2^-22 rad/s in Q24. */
     const int64_t l2_q46 = ((p2_q46 * ((one_q31 + q_q31) >> 16)) >> 15) * 3 / 2 * rate; /* 46 + 16 bits */
     gains.speed_gain_q24 = fixed_saturate(fixed_shift((l2_q46 >> 24) * (TWO_PI_Q28 >> 4), 32));
 
-    /* J l3 * 2 pi * 2^12, which is 2 pi 2^-32 rad to 2^-24 N m in Q20; J l3 = (J rate) (p^3 rate), below 2^25 for the
-     * rates at which p is large: saturated above. */
-    const int64_t p3_rate_q24 = fixed_shift(p3_q46 * rate, 22);         /* 35 bits */
-    const int64_t inertia_rate_q14 = fixed_shift(inertia_rate_q30, 16); /* 35 bits */
-    const int64_t limit = fixed_divide(INT64_MAX - (1 << 12), p3_rate_q24 > 0 ? p3_rate_q24 : 1);
-    const int64_t inertia_l3_q38 = (inertia_rate_q14 < limit ? inertia_rate_q14 : limit) * p3_rate_q24;
-    const int64_t torque_gain_q20 = fixed_shift(fixed_shift(inertia_l3_q38, 12) * TWO_PI_Q9, 23); /* 51 + 12 bits */
-    gains.torque_gain_q20 = torque_gain_q20 < TORQUE_GAIN_LIMIT_Q20 ? torque_gain_q20 : TORQUE_GAIN_LIMIT_Q20;
+    /* J l3 * 2 pi * 2^-8, which is 2 pi 2^-32 rad to 2^-24 N m; J l3 = (J rate) (p^3 rate). Each is normalised to 31
+     * bits first, then their product. */
+    normal_t load = normal_product(normal(inertia_q30 * rate, 30), normal(p3_q46 * rate, 46));
+    load = normal_product(load, normal(TWO_PI_Q28, 28 + 8));
+    /* Fraction bits beyond 28 are cut off, missing ones are the factor's: at most 2^20 a unit needs 2^17. */
+    const int missing = 28 - load.fraction_bits;
+    gains.load_gain_q28 = -(missing >= 0 ? load.value : missing > -31 ? load.value >> -missing : 0);
+    gains.load_factor_q4 = 16 << fixed_clamp(missing, 0, 26);
     return gains;
 }
 
@@ -72,31 +91,29 @@ void load_observer_reset(load_observer_t *observer, uint32_t angle) {
 }
 
 int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle) {
-    const uint32_t expected = (uint32_t)((observer->angle_q64 + ((uint64_t)1 << 31)) >> 32);
-    return (int32_t)(angle - expected);
+    const uint32_t expected = (uint32_t)(observer->angle_q64 >> 32);
+    return fixed_clamp((int32_t)(angle - expected), -INNOVATION_LIMIT, INNOVATION_LIMIT - 1);
 }
 
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
                         load_observer_t *observer, int32_t innovation, int32_t torque_q24) {
-    const int64_t error = fixed_clamp(innovation, -INNOVATION_LIMIT, INNOVATION_LIMIT);
+    const int32_t error_q4 = innovation * 16;
 
     /* Correct. */
-    observer->angle_q64 += (uint64_t)(error * gains->angle_gain_q30) << 2; /* Q30 to Q32 */
-    observer->correction_q22 = fixed_saturate(fixed_shift(error * gains->speed_gain_q24, 24));
+    int64_t angle_q64 = fixed_accumulate((int64_t)observer->angle_q64, error_q4, gains->angle_gain_q28);
+    observer->correction_q22 = fixed_narrow(fixed_product(error_q4, gains->speed_gain_q24), 28);
     const int32_t speed_q22 = fixed_add(observer->speed_q22, observer->correction_q22);
-    /* 27 and 40 bits: the low 5 bits of the error are multiplied apart. */
-    const int64_t load_change_q39 =
-        (error >> 5) * gains->torque_gain_q20 + (((error & 31) * gains->torque_gain_q20) >> 5);
-    const int64_t load_q24 = observer->load_torque_q24 - fixed_shift(load_change_q39, 15);
-    observer->load_torque_q24 = (int32_t)(load_q24 > LOAD_TORQUE_LIMIT_Q24    ? LOAD_TORQUE_LIMIT_Q24
-                                          : load_q24 < -LOAD_TORQUE_LIMIT_Q24 ? -LOAD_TORQUE_LIMIT_Q24
-                                                                              : load_q24);
+    const int32_t part_q24 = fixed_multiply_high(error_q4, gains->load_gain_q28);
+    const int32_t change_q24 = fixed_narrow(fixed_product(part_q24, gains->load_factor_q4), 4);
+    const int32_t load_q24 = fixed_add(observer->load_torque_q24, change_q24);
+    observer->load_torque_q24 = fixed_clamp(load_q24, -LOAD_TORQUE_LIMIT_Q24, LOAD_TORQUE_LIMIT_Q24 - 1);
 
     /* Predict: constant acceleration over the period, so the angle moves at the mean of old and new speed. */
-    const int32_t friction_q24 = fixed_multiply(speed_q22, model->friction_q30, 28);
+    const int32_t friction_q24 = fixed_narrow(fixed_product(speed_q22, model->friction_q30), 28);
     const int32_t net_q24 = fixed_subtract(fixed_subtract(torque_q24, friction_q24), observer->load_torque_q24);
-    const int32_t next_q22 = fixed_add(speed_q22, fixed_multiply(net_q24, model->acceleration_q32, 32));
-    const int64_t mean_q22 = ((int64_t)speed_q22 + next_q22) >> 1;
-    observer->angle_q64 += (uint64_t)(mean_q22 * model->angle_step_q32);
-    observer->speed_q22 = next_q22;
+    const int32_t rise_q22 = fixed_multiply_high(net_q24, model->acceleration_q32);
+    const int32_t mean_q22 = fixed_add(speed_q22, rise_q22 >> 1);
+    angle_q64 = fixed_accumulate(angle_q64, mean_q22, model->angle_step_q32);
+    observer->angle_q64 = (uint64_t)angle_q64;
+    observer->speed_q22 = fixed_add(speed_q22, rise_q22);
 }

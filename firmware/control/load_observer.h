@@ -14,9 +14,10 @@
 
 /* What the bandwidth sets. */
 typedef struct {
-    int32_t angle_gain_q30;  /* l1 */
-    int32_t speed_gain_q24;  /* l2: rad/s Q9.22 per 2^-32 turn, in Q24 */
-    int64_t torque_gain_q20; /* J l3: N m Q7.24 per 2^-32 turn, in Q20; below 2^40 */
+    int32_t angle_gain_q28; /* l1 */
+    int32_t speed_gain_q24; /* l2: rad/s Q9.22 per 2^-32 turn, in Q24 */
+    int32_t load_gain_q28;  /* -J l3: N m Q7.24 per 2^-32 turn, in Q28, over the factor */
+    int32_t load_factor_q4; /* 1, unless the gain needs a greater power of two */
 } load_observer_gains_t;
 
 /* What the machine and the control rate set. */
@@ -29,7 +30,7 @@ typedef struct {
 typedef struct {
     uint64_t angle_q64;      /* mechanical, 2^-64 turn, wraps */
     int32_t speed_q22;       /* rad/s, Q9.22, saturates */
-    int32_t load_torque_q24; /* N m, Q7.24, saturates at +-60 N m */
+    int32_t load_torque_q24; /* N m, Q7.24, saturates at +-64 N m */
     int32_t correction_q22;  /* of the speed in the last sample, l2 times the innovation: rad/s, Q9.22 */
 } load_observer_t;
 
@@ -45,12 +46,13 @@ load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t iner
  * is faster than 2 w0). */
 void load_observer_reset(load_observer_t *observer, uint32_t angle);
 
-/* Innovation: how far a measured angle is from the expected one, 2^-32 turn, modulo a turn. */
+/* Innovation: how far a measured angle is from the expected one, 2^-32 turn, modulo a turn; held within +-2^27 (a 32nd
+ * of a turn), so that it can be multiplied. */
 int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle);
 
-/* One sample: corrects with its innovation, then predicts one period on with the machine's torque (N
- * m, Q7.24). Afterwards angle, speed and load are the estimate for the coming sample. What corrects is limited to
- * +-2^27 (a 32nd of a turn), which keeps every product within 64 bits. */
+/* One sample: corrects with its innovation (-2^27..2^27-1), then predicts one period on with the machine's torque (N
+ * m, Q7.24). Afterwards angle, speed and load are the estimate for the coming sample. 64-bit products; the speed's
+ * correction and the friction are rounded down, the other parts to nearest; speed and load saturate. */
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
                         load_observer_t *observer, int32_t innovation, int32_t torque_q24);
 

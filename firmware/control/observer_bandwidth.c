@@ -34,10 +34,11 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t widest_rad
     const uint32_t threshold_count = wakes ? count + count / 8 + THRESHOLD_IDEAL : THRESHOLD_NEVER;
     observer_bandwidth_parameters_t parameters = {
         .pause_ticks = control_rate_hz / 1000u,
-        .forget_q16 = (uint16_t)(65536 - (65536u * FORGET_1_S + control_rate_hz - 1) / control_rate_hz),
+        .forget_q32 = (65536u - (65536u * FORGET_1_S + control_rate_hz - 1) / control_rate_hz) << 16,
         .threshold_count = threshold_count,
         .threshold_edge = wakes ? THRESHOLD_EDGE : THRESHOLD_NEVER,
-        .usual_share_q24 = (int32_t)fixed_divide((int64_t)USUAL_1_S << 24, control_rate_hz),
+        .usual_share_q32 = (int32_t)fixed_divide((int64_t)USUAL_1_S << 32, control_rate_hz),
+        .wakes = wakes,
         /* An encoder whose counts are finer than what an edge's time gives needs no edges. */
         .first_stage_count = threshold_count <= THRESHOLD_EDGE ? 0 : FIRST_STAGE_COARSE,
     };
@@ -61,35 +62,43 @@ void observer_bandwidth_reset(observer_bandwidth_t *bandwidth) {
 const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_parameters_t *parameters,
                                                      observer_bandwidth_t *bandwidth, int32_t innovation,
                                                      bool from_edge) {
+    if (!parameters->wakes) {
+        return &parameters->gains[LAST_STAGE];
+    }
     if (bandwidth->ticks < UINT32_MAX) {
         bandwidth->ticks++;
     }
     while (bandwidth->stage < LAST_STAGE && bandwidth->ticks >= parameters->end_ticks[bandwidth->stage]) {
         bandwidth->stage++;
     }
+    const bool steady = bandwidth->stage == LAST_STAGE;
     const uint32_t least = from_edge ? parameters->threshold_edge : parameters->threshold_count;
-    const uint32_t usual = (uint32_t)(bandwidth->usual_q8 >> 8) * USUAL_FACTOR;
+    const int32_t mean = (int32_t)(bandwidth->usual_q32 >> 32); /* below 2^27, as every innovation */
+    const uint32_t usual = (uint32_t)mean * USUAL_FACTOR;
     const uint32_t threshold = usual > least ? usual : least;
     const uint32_t size = (uint32_t)fixed_abs(innovation);
-    if (bandwidth->stage == LAST_STAGE) {
+    if (steady) {
         /* What is beyond the threshold counts as the threshold: one load step does not make the observer deaf. */
-        const int64_t held_q8 = (int64_t)(size < threshold ? size : threshold) << 8;
-        bandwidth->usual_q8 += ((held_q8 - bandwidth->usual_q8) * parameters->usual_share_q24) >> 24;
+        const int32_t held = (int32_t)(size < threshold ? size : threshold);
+        bandwidth->usual_q32 = fixed_accumulate(bandwidth->usual_q32, held - mean, parameters->usual_share_q32);
     }
-    bandwidth->pause_q16 = (uint32_t)(((uint64_t)bandwidth->pause_q16 * parameters->forget_q16) >> 16);
-    const uint32_t pause_ticks =
-        parameters->pause_ticks + (uint32_t)(((uint64_t)parameters->pause_ticks * bandwidth->pause_q16) >> 16);
-    if (size > threshold && bandwidth->ticks >= pause_ticks) {
-        /* Out of the steady state it is a new event; within a decay it may be the rest of the last one. */
-        const uint32_t growth_q16 = bandwidth->stage == LAST_STAGE ? bandwidth->pause_q16 : bandwidth->pause_q16 / 4;
-        const uint32_t longer_q16 = bandwidth->pause_q16 + growth_q16 + PAUSE_GROWTH_Q16;
-        bandwidth->pause_q16 = longer_q16 < PAUSE_LIMIT_Q16 ? longer_q16 : PAUSE_LIMIT_Q16;
-        bandwidth->stage = from_edge ? 0 : parameters->first_stage_count;
-        bandwidth->ticks = 0;
+    bandwidth->pause_q16 = (uint32_t)(((uint64_t)bandwidth->pause_q16 * parameters->forget_q32) >> 32);
+    if (size > threshold) {
+        const uint32_t pause_ticks =
+            parameters->pause_ticks + (uint32_t)(((uint64_t)parameters->pause_ticks * bandwidth->pause_q16) >> 16);
+        if (bandwidth->ticks >= pause_ticks) {
+            /* Out of the steady state it is a new event; within a decay it may be the rest of the last one. */
+            const uint32_t growth_q16 = steady ? bandwidth->pause_q16 : bandwidth->pause_q16 / 4;
+            const uint32_t longer_q16 = bandwidth->pause_q16 + growth_q16 + PAUSE_GROWTH_Q16;
+            bandwidth->pause_q16 = longer_q16 < PAUSE_LIMIT_Q16 ? longer_q16 : PAUSE_LIMIT_Q16;
+            bandwidth->stage = from_edge ? 0 : parameters->first_stage_count;
+            bandwidth->ticks = 0;
+        }
     }
     return &parameters->gains[bandwidth->stage];
 }
 
-bool observer_bandwidth_steady(const observer_bandwidth_t *bandwidth) {
-    return bandwidth->stage == LAST_STAGE;
+bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters,
+                               const observer_bandwidth_t *bandwidth) {
+    return !parameters->wakes || bandwidth->stage == LAST_STAGE;
 }

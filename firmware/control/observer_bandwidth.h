@@ -29,10 +29,11 @@ typedef struct {
     uint16_t bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES];
     uint32_t end_ticks[OBSERVER_BANDWIDTH_STAGES]; /* periods since the waking at which a stage ends */
     uint32_t pause_ticks;                          /* least pause after a waking, in periods */
-    uint16_t forget_q16;                           /* what is left of a longer one a period later */
+    uint32_t forget_q32;                           /* what is left of a longer one a period later */
     uint32_t threshold_count;                      /* 2^-32 turn, for the middle of a count */
     uint32_t threshold_edge;                       /* for an angle from an edge's time */
-    int32_t usual_share_q24;                       /* of the mean innovation a period */
+    int32_t usual_share_q32;                       /* of the mean innovation a period */
+    bool wakes;                                    /* false: always the steady bandwidth */
     uint8_t first_stage_count; /* where the decay begins; with an edge's time in stage 0, the widest */
 } observer_bandwidth_parameters_t;
 
@@ -40,7 +41,7 @@ typedef struct {
     unsigned stage;
     uint32_t ticks;     /* since the last waking */
     uint32_t pause_q16; /* by how many least pauses the pause is longer */
-    int64_t usual_q8;   /* mean size of the innovation, 2^-32 turn */
+    int64_t usual_q32;  /* mean size of the innovation, 2^-32 turn */
 } observer_bandwidth_t;
 
 /* Schedule from widest to steady bandwidth in rad/s (100 <= steady <= widest <= 10000). steady == widest: never wakes.
@@ -52,12 +53,14 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t widest_rad
 /* Awake at its widest: what is known at the start is nothing. */
 void observer_bandwidth_reset(observer_bandwidth_t *bandwidth);
 
-/* One sample: the gains for it. `innovation` in 2^-32 turn; from_edge: the angle was measured by an edge's time. */
+/* One sample: the gains for it. `innovation` in 2^-32 turn, -2^27..2^27-1; from_edge: the angle was measured by an
+ * edge's time. */
 const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_parameters_t *parameters,
                                                      observer_bandwidth_t *bandwidth, int32_t innovation,
                                                      bool from_edge);
 
-/* True when the decay has ended. */
-bool observer_bandwidth_steady(const observer_bandwidth_t *bandwidth);
+/* True when the decay has ended, or there is none. */
+bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters,
+                               const observer_bandwidth_t *bandwidth);
 
 #endif

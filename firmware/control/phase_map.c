@@ -120,11 +120,10 @@ static inline phase_map_place_t place_of(const machine_tables_t *tables, uint32_
 }
 
 static inline phase_map_place_t place_at(const machine_tables_t *tables, uint32_t phase_angle) {
-    const bool mirrored = phase_angle < HALF_PITCH;
-    const uint32_t distance = mirrored ? HALF_PITCH - phase_angle : phase_angle - HALF_PITCH;
-    /* The aligned position is the end of the last row. */
-    phase_map_place_t place = place_of(tables, distance - (distance >> 31));
-    place.mirrored = mirrored;
+    const int32_t past_unaligned = (int32_t)(phase_angle - HALF_PITCH);
+    /* The magnitude is held below 2^31: the aligned position is the end of the last row. */
+    phase_map_place_t place = place_of(tables, (uint32_t)fixed_abs(past_unaligned));
+    place.mirrored = past_unaligned < 0;
     return place;
 }
 
@@ -146,6 +145,11 @@ phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_an
 int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9) {
     const int32_t held_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
     return torque_between_q24(place, &place->tables->column[held_q9 >> MACHINE_COLUMN_BITS], held_q9);
+}
+
+int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9) {
+    const phase_map_place_t place = place_at(tables, phase_angle);
+    return torque_between_q24(&place, &tables->column[current_q9 >> MACHINE_COLUMN_BITS], current_q9);
 }
 
 int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9) {

@@ -18,3 +18,11 @@ void pwm_set_phase_twice(hal_pwm_compare_t *compare, unsigned phase, int32_t dut
     compare->upper[phase] = both / 2;
     compare->lower[phase] = (uint16_t)(both - both / 2);
 }
+
+void pwm_set_state(hal_pwm_compare_t *compare, unsigned phase, int state, uint16_t period_ticks) {
+    /* By the signs: without a branch. */
+    const uint32_t upper = period_ticks & (uint32_t)(-state >> 31);
+    const uint32_t lower = period_ticks & ~(uint32_t)(state >> 31);
+    compare->upper[phase] = (uint16_t)upper;
+    compare->lower[phase] = (uint16_t)lower;
+}

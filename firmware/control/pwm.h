@@ -11,6 +11,9 @@
  * off for the duty's share. So the states are (+1, 0) and (-1, 0), and each switch switches at most once a period. */
 void pwm_set_phase(hal_pwm_compare_t *compare, unsigned phase, int32_t duty_q15, uint16_t period_ticks);
 
+/* Sets one phase's compare values for a whole period in a state: +1 both switches on, 0 the lower one, -1 none. */
+void pwm_set_state(hal_pwm_compare_t *compare, unsigned phase, int state, uint16_t period_ticks);
+
 /* The same voltage in two pulses, which halves its ripple: each switch is on for (1 + duty) / 2 of the period, the
  * upper one in its middle and the lower one around its ends, and what they overlap beyond the period or leave open, a
  * quarter from either end, is the duty. Each switch still switches twice a period; the sum of both is rounded to a

@@ -19,15 +19,15 @@
 
 typedef struct {
     int32_t gain_q24;       /* J k, N m s/rad, Q7.24, > 0 */
-    int32_t epsilon_q15;    /* eps, Q1.15, 0.01..1 */
-    int32_t delta_q12;      /* delta, s/rad, Q19.12, 0..10 */
+    int32_t epsilon_q31;    /* eps, Q1.31, from 2^-15; 1 is the largest below it */
+    int32_t delta_q27;      /* delta / ln 2, octaves s/rad, Q4.27; delta 0..10 */
     int32_t friction_q30;   /* B, N m s, Q1.30, >= 0 */
     int32_t torque_min_q24; /* N m, Q7.24 */
     int32_t torque_max_q24; /* N m, Q7.24 */
 } speed_smc_parameters_t;
 
 /* J H(x) sgn(x) in N m, Q7.24, for x in rad/s, Q9.22, the whole range; saturates. Odd to the bit. Relative error below
- * 1e-4 plus 2^-20 N m (the exponential's table and the rounding of the denominator in Q9.22). */
+ * 1e-4 (the exponential's table, a denominator of 16 bits and its reciprocal), two LSBs of the gain, and 2^-20 N m. */
 int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, int32_t x_q22);
 
 /* Torque reference in N m, Q7.24, within the limits. Speed and reference in rad/s, Q9.22; load torque in N m, Q7.24. */

@@ -3,8 +3,9 @@
 #include "fixed/fixed.h"
 
 void torque_trim_reset(const torque_trim_parameters_t *parameters, torque_trim_t *trim, int32_t reference_q24) {
-    *trim = (torque_trim_t){.reference_q24 = {reference_q24, reference_q24}};
     bp_pid_reset(&parameters->pid, &trim->pid);
+    trim->reference_q24[0] = trim->reference_q24[1] = reference_q24;
+    trim->trim_q24 = 0;
 }
 
 int32_t torque_trim_step(const torque_trim_parameters_t *parameters, torque_trim_t *trim, int32_t reference_q24,

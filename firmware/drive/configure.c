@@ -25,6 +25,12 @@ static uint32_t pitch_from_degrees(int32_t degrees_q7) {
     return angle > UINT32_MAX ? UINT32_MAX : (uint32_t)angle;
 }
 
+/* What a code is worth, Q18, of a full scale below 2^16: exact. */
+#define CODE_SCALE_Q18(full_scale, bits) ((int32_t)(((int64_t)(full_scale) << 18) >> (bits)))
+
+/* Octaves in a factor of e. */
+#define LOG2_E_Q30 1549082005
+
 /* A change per period in Q22 from a change per second; INT32_MAX for 0, no ramp. */
 static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
     if (rpm_s == 0) {
@@ -54,9 +60,9 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
         .bus_over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V],
         .bus_under_voltage_q6 = values[PARAMETER_BUS_UNDER_VOLTAGE_V],
         .over_speed_q22 = over_speed_q22,
-        .angle_step_max = (uint32_t)step + 2u * count,
+        .angle_step_max = fixed_saturate((int64_t)step + 2 * (int64_t)count),
         /* A quarter of a degree, and four counts of a coarse encoder. */
-        .angle_unmoved_max = (uint32_t)(((uint64_t)1 << 32) / 1440u) + 4u * count,
+        .angle_unmoved_max = (int32_t)(((uint64_t)1 << 32) / 1440u + 4u * count),
         .angle_step_q32 = angle_step_q32,
         .command_timeout_us = (uint32_t)values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u,
         .slowing_q22 = fixed_saturate(fixed_divide(
@@ -98,11 +104,9 @@ static bp_pid_parameters_t bp_pid_from(const int32_t *values, parameter_index_t 
         .mode = (bp_pid_mode_t)values[mode],
         .seed = (uint32_t)values[PARAMETER_BP_SEED],
         .error_scale_inverse_q24 = fixed_saturate(fixed_divide((int64_t)1 << 48, values[PARAMETER_BP_ERROR_SCALE_NM])),
-        .kp_scale_q15 = kp_scale_q15,
-        .ki_scale_q15 = ki_scale_q15,
-        .kd_scale_q15 = kd_scale_q15,
+        .scale_q28 = {kp_scale_q15 << 13, ki_scale_q15 << 13, kd_scale_q15 << 13},
         .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
-                    .inertia_q15 = values[PARAMETER_BP_ALPHA] >> 13},
+                    .inertia_q32 = values[PARAMETER_BP_ALPHA] << 4},
     };
 }
 
@@ -174,7 +178,10 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
         .period_ticks = (uint16_t)(HAL_PWM_CLOCK_HZ / (2u * control_rate_hz)),
         .encoder_shift = (uint8_t)encoder_shift,
+        .encoder_middle = (1u << encoder_shift) >> 1,
         .adc_bits = (uint8_t)adc_bits,
+        .current_scale_q18 = CODE_SCALE_Q18(HAL_ADC_CURRENT_FULL_SCALE_A << 9, adc_bits),
+        .voltage_scale_q18 = CODE_SCALE_Q18(HAL_ADC_BUS_FULL_SCALE_V << 6, adc_bits),
         .initialise_ticks = control_rate_hz / 1000u,
         .speed_ramp_q22 = ramp_q22(values[PARAMETER_SPEED_RAMP_RPM_S], control_rate_hz),
         .two_pulses = values[PARAMETER_PULSES_PER_PERIOD] == 2,
@@ -191,18 +198,19 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .speed_smc =
             {
                 .gain_q24 = fixed_multiply(inertia_q30, values[PARAMETER_SMC_K], 22),
-                .epsilon_q15 = values[PARAMETER_SMC_EPSILON] >> 1,
-                .delta_q12 = values[PARAMETER_SMC_DELTA] >> 4,
+                .epsilon_q31 = fixed_saturate((int64_t)values[PARAMETER_SMC_EPSILON] << 15),
+                .delta_q27 = fixed_multiply(values[PARAMETER_SMC_DELTA], LOG2_E_Q30, 19),
                 .friction_q30 = friction_q30,
                 .torque_min_q24 = -torque_max_q24,
                 .torque_max_q24 = torque_max_q24,
             },
-        .commutation =
-            {
+        .commutation = commutation_configure(
+            &(commutation_angles_t){
                 .turn_on = pitch_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
                 .turn_off = pitch_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
                 .outgoing_off = pitch_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
             },
+            tables->phases, tables->rotor_poles),
         .hysteresis =
             {
                 .band_inner_q24 = values[PARAMETER_TORQUE_BAND_INNER_NM],
@@ -212,12 +220,12 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .duty =
             {
                 .pid = duty_pid_from(values, control_rate_hz),
-                .hand_over_angle = pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG]),
-                /* Half of what would reach the current in one period at rest: rate / (2 * A/s), in Q20. */
-                .incoming_gain_q20 =
-                    fixed_saturate(fixed_divide((int64_t)control_rate_hz << 19, tables->current_rise_A_s)),
+                .aims = ditc_duty_aims(tables, pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
+                /* Half of what would reach the current in one period at rest: rate / (2 * A/s), in Q24. */
+                .incoming_gain_q24 =
+                    fixed_saturate(fixed_divide((int64_t)control_rate_hz << 23, tables->current_rise_A_s)),
                 /* At 40 kHz a sixteenth of the reference, and 1/16 N m: see ditc_duty.h. */
-                .surplus_q20 = (int32_t)(((uint32_t)GAIN_RATE_HZ << 16) / control_rate_hz),
+                .surplus_q32 = (int32_t)(((uint32_t)GAIN_RATE_HZ << 16) / control_rate_hz << 12),
                 .spent_torque_q24 = (int32_t)fixed_divide((int64_t)control_rate_hz << 20, GAIN_RATE_HZ),
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
                 .current_limit_q9 = current_limit_q9,

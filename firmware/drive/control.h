@@ -44,34 +44,55 @@ typedef struct {
     uint16_t period_ticks;
     uint8_t encoder_shift;     /* counts to 2^-32 turn */
     uint8_t adc_bits;          /* of a code, 12..16 */
+    uint32_t encoder_middle;   /* of a count, 2^-32 turn; 0 where a count is one */
+    int32_t current_scale_q18; /* a code in A, Q7.9: 10 of a 12-bit code */
+    int32_t voltage_scale_q18; /* a code in V, Q9.6 */
     uint32_t initialise_ticks; /* periods in 1 ms */
     int32_t speed_ramp_q22;    /* rad/s a period, Q9.22; INT32_MAX: no ramp */
     load_observer_model_t observer;
-    observer_bandwidth_parameters_t bandwidth;
-    speed_pi_parameters_t speed_pi;
-    speed_smc_parameters_t speed_smc;
     commutation_parameters_t commutation;
+    protection_parameters_t protection;
+    speed_pi_parameters_t speed_pi;
     ditc_hysteresis_parameters_t hysteresis;
+    speed_smc_parameters_t speed_smc;
     ditc_duty_parameters_t duty;
     torque_trim_parameters_t trim;
     predictive_torque_parameters_t predictive;
     misalignment_parameters_t misalignment;
-    protection_parameters_t protection;
+    observer_bandwidth_parameters_t bandwidth;
 } control_parameters_t;
 
+/* What the sensors of the last sample say, in the formats of the laws. */
 typedef struct {
-    bool started; /* the first sample has set the observer's angle */
+    uint32_t count_angle; /* where the encoder's count begins, 2^-32 turn */
+    uint32_t angle;       /* 2^-32 turn */
+    bool from_edge;       /* the angle is that of an edge and its time */
+    int32_t current_q9[HAL_PHASES_MAX];
+    int32_t current_max_q9;
+    int32_t bus_voltage_q6;
+    commutation_t commutation;
+    int32_t torque_q24[HAL_PHASES_MAX];
+    int32_t torque_sum_q24;
+    int32_t flux_q29[HAL_PHASES_MAX]; /* salient controller */
+} control_estimate_t;
+
+/* What every controller needs first: the nearer, the fewer instructions. */
+typedef struct {
     load_observer_t observer;
+    control_estimate_t estimate;
     observer_bandwidth_t bandwidth;
-    misalignment_t misalignment; /* of the machine: outlives a run */
-    int32_t speed_reference_q22; /* behind the ramp */
+    protection_t protection;
+    state_machine_t machine;
+    bool started;                 /* the first sample has set the observer's angle */
+    int32_t speed_reference_q22;  /* behind the ramp */
+    int32_t torque_reference_q24; /* 0 outside RUN */
     speed_pi_t speed_pi;
     ditc_hysteresis_t hysteresis;
+    misalignment_t misalignment;      /* of the machine: outlives a run */
+    int32_t duty_q15[HAL_PHASES_MAX]; /* of a law that gives duties, in RUN */
     ditc_duty_t duty;
     torque_trim_t trim;
     predictive_torque_t predictive;
-    protection_t protection;
-    state_machine_t machine;
 } control_state_t;
 
 typedef struct {
@@ -82,7 +103,7 @@ typedef struct {
     command_t command; /* the last accepted one; request off before the first */
 } control_sample_t;
 
-/* Written every period for whoever watches; never read by the control. */
+/* For whoever watches: put together when somebody asks, which costs the interrupt nothing. */
 typedef struct {
     uint32_t angle; /* measured, 2^-32 turn */
     int32_t speed_q22;
@@ -105,6 +126,14 @@ void control_reset(control_state_t *state);
 
 /* One control period. Returns false when every switch must be open: then *compare is all zero. [interrupt] */
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
-                  hal_pwm_compare_t *compare, control_diagnostics_t *diagnostics);
+                  hal_pwm_compare_t *compare);
+
+/* True when the torque law gives duties, as the paper's does; else it is hysteresis, or the salient controller. */
+static inline bool control_gives_duties(const control_parameters_t *parameters) {
+    return parameters->controller == DRIVE_CONTROLLER_PAPER && parameters->duty.pid.mode != BP_PID_OFF;
+}
+
+/* What the last period saw and did, by a state that no interrupt changes meanwhile. [both] */
+control_diagnostics_t control_diagnose(const control_parameters_t *parameters, const control_state_t *state);
 
 #endif

@@ -34,24 +34,30 @@ bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, cons
 }
 
 void drive_control_interrupt(drive_t *drive) {
-    control_sample_t sample; /* every member is set: clearing it first costs as much as reading it */
-    sample.missed_interrupts = hal_pwm_missed_interrupts(drive->hal);
-    sample.time_us = hal_time_us(drive->hal);
-    sample.command = drive->command;
-    hal_encoder_read(drive->hal, &sample.encoder);
-    hal_adc_read(drive->hal, &sample.adc);
+    control_sample_t *sample = &drive->sample;
+    sample->missed_interrupts = hal_pwm_missed_interrupts(drive->hal);
+    sample->time_us = hal_time_us(drive->hal);
+    if (sample->missed_interrupts != 0) {
+        drive->late_interrupts++; /* the one before this */
+    }
+    hal_encoder_read(drive->hal, &sample->encoder);
+    hal_adc_read(drive->hal, &sample->adc);
     hal_pwm_compare_t compare;
-    if (control_step(&drive->control_parameters, &drive->control, &sample, &compare, &drive->diagnostics)) {
+    if (control_step(&drive->control_parameters, &drive->control, sample, &compare)) {
         hal_pwm_write(drive->hal, &compare);
     } else {
         hal_pwm_open_all(drive->hal);
+    }
+    drive->used_ticks = hal_pwm_elapsed_ticks(drive->hal);
+    if (drive->used_ticks > drive->worst_ticks) {
+        drive->worst_ticks = drive->used_ticks;
     }
 }
 
 /* A gain in duty per scaled error as duty per N m, both Q15. */
 static int32_t gain_per_Nm_q15(const drive_t *drive, unsigned gain) {
-    return fixed_multiply(drive->control.duty.pid.gain_q15[gain],
-                          drive->control_parameters.duty.pid.error_scale_inverse_q24, 24);
+    return fixed_multiply(drive->control.duty.pid.gain_q24[gain],
+                          drive->control_parameters.duty.pid.error_scale_inverse_q24, 33);
 }
 
 /* Mean of the phases, mechanical, 2^-32 turn. */
@@ -65,33 +71,37 @@ static int32_t misalignment(const drive_t *drive) {
 }
 
 static telemetry_snapshot_t snapshot(const drive_t *drive, uint32_t time_us) {
-    const control_diagnostics_t *d = &drive->diagnostics;
+    const control_diagnostics_t d = control_diagnose(&drive->control_parameters, &drive->control);
     const state_machine_t *machine = &drive->control.machine;
     telemetry_snapshot_t s = {
         .time_us = time_us,
         .state = (uint8_t)machine->state,
         .controller = (uint8_t)drive->control_parameters.controller,
         .fault = (uint8_t)machine->record.fault,
-        .voltage_saturated = d->voltage_saturated,
-        .speed_q22 = d->speed_q22,
-        .speed_reference_q22 = d->speed_reference_q22,
-        .rotor_angle = d->angle,
-        .torque_reference_q24 = d->torque_reference_q24,
-        .torque_estimate_q24 = d->torque_q24,
-        .load_torque_estimate_q24 = d->load_torque_q24,
-        .bus_voltage_q6 = d->bus_voltage_q6,
+        .voltage_saturated = d.voltage_saturated,
+        .speed_q22 = d.speed_q22,
+        .speed_reference_q22 = d.speed_reference_q22,
+        .rotor_angle = d.angle,
+        .torque_reference_q24 = d.torque_reference_q24,
+        .torque_estimate_q24 = d.torque_q24,
+        .load_torque_estimate_q24 = d.load_torque_q24,
+        .bus_voltage_q6 = d.bus_voltage_q6,
         .kp_q15 = gain_per_Nm_q15(drive, 0),
         .ki_q15 = gain_per_Nm_q15(drive, 1),
         .kd_q15 = gain_per_Nm_q15(drive, 2),
-        .duty_q15 = d->duty_q15,
-        .trim_torque_q24 = d->trim_torque_q24,
+        .duty_q15 = d.duty_q15,
+        .trim_torque_q24 = d.trim_torque_q24,
         .misalignment = misalignment(drive),
-        .torque_missing_q24 = d->torque_missing_q24,
-        .observer_bandwidth_rad_s = d->observer_bandwidth_rad_s,
+        .torque_missing_q24 = d.torque_missing_q24,
+        .observer_bandwidth_rad_s = d.observer_bandwidth_rad_s,
+        .used_ticks = drive->used_ticks,
+        .worst_ticks = drive->worst_ticks,
+        .available_ticks = 2u * drive->control_parameters.period_ticks,
+        .late_interrupts = drive->late_interrupts,
         .last_fault = machine->record,
     };
     for (unsigned phase = 0; phase < TELEMETRY_PHASES; phase++) {
-        s.current_q9[phase] = d->current_q9[phase];
+        s.current_q9[phase] = d.current_q9[phase];
     }
     return s;
 }
@@ -99,11 +109,11 @@ static telemetry_snapshot_t snapshot(const drive_t *drive, uint32_t time_us) {
 /* Forgets a command whose sender fell silent long ago: the clock wraps, and then its age would look small again. Twice
  * the timeout, so that the interrupt has seen the timeout before. */
 static void forget_stale_command(drive_t *drive, uint32_t time_us) {
-    const uint32_t age_us = time_us - drive->command.time_us;
-    if (drive->command.request != COMMAND_OFF &&
+    const uint32_t age_us = time_us - drive->sample.command.time_us;
+    if (drive->sample.command.request != COMMAND_OFF &&
         age_us > 2u * drive->control_parameters.protection.command_timeout_us) {
         hal_critical_enter(drive->hal);
-        drive->command.request = COMMAND_OFF;
+        drive->sample.command.request = COMMAND_OFF;
         hal_critical_leave(drive->hal);
     }
 }
@@ -120,7 +130,7 @@ void drive_background(drive_t *drive) {
     const bool writable = drive->control.machine.state != DRIVE_STATE_RUN;
     if (comms_background(&drive->comms, drive->hal, &drive->parameters, writable, time_us)) {
         hal_critical_enter(drive->hal);
-        drive->command = drive->comms.command;
+        drive->sample.command = drive->comms.command;
         hal_critical_leave(drive->hal);
     }
     forget_stale_command(drive, time_us);

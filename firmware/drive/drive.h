@@ -14,18 +14,23 @@
 /* One drive. The caller allocates it; only the functions below touch it. */
 typedef struct {
     hal_t *hal;
+    /* Of the interrupt; read by the background with the interrupt kept out. Its command is written by the background,
+     * the interrupt kept out as well. */
+    control_sample_t sample;
+    /* Written by the background with the interrupt kept out. */
+    control_parameters_t control_parameters;
+    /* Of the interrupt. */
+    control_state_t control;
+    /* The interrupt's time on the processor: nobody acts on it. What a late interrupt does is in drive/protection.h. */
+    uint32_t used_ticks;      /* from trigger to end, of the last one, HAL_PWM_TICK_NS */
+    uint32_t worst_ticks;     /* of the longest since start */
+    uint32_t late_interrupts; /* that ended after the next trigger, since start */
+    /* Of the background. */
     const machine_tables_t *tables;
     uint32_t control_rate_hz;
-    /* Of the background. */
     parameters_t parameters;
     uint32_t configured_changes; /* parameters.changes that control_parameters stand for */
     comms_t comms;
-    /* Written by the background with the interrupt kept out. */
-    control_parameters_t control_parameters;
-    command_t command;
-    /* Of the interrupt; read by the background with the interrupt kept out. */
-    control_state_t control;
-    control_diagnostics_t diagnostics;
 } drive_t;
 
 /* Prepares the drive and starts the timer. False, and nothing started, for a control rate that is not allowed. Keeps

@@ -1,47 +1,95 @@
 #include "drive/protection.h"
 
+#include <stdbool.h>
+
 #include "drive/fault.h"
 #include "fixed/fixed.h"
 
 /* Below this speed a still encoder says nothing: 1 rad/s. */
 #define STANDSTILL_Q22 (1 << 22)
 
+/* Beyond any limit. */
+#define UNMOVED_HELD (1 << 30)
+
 void protection_reset(protection_t *protection, uint32_t angle) {
     *protection = (protection_t){.angle = angle};
 }
 
-/* A jump, or an encoder that stands still while the rotor moves. The observer alone cannot tell: a fast one follows a
- * frozen encoder to standstill before the rotor went far. No torque stops the rotor as quickly, so its speed at the
- * last count, less what torque can have taken off since, is believed as well. */
-static int encoder_fails(const protection_parameters_t *parameters, protection_t *protection,
-                         const protection_sample_t *sample) {
-    const int32_t step = (int32_t)(sample->angle - protection->angle); /* modulo a turn */
-    protection->angle = sample->angle;
-    const int32_t observed_q22 = fixed_abs(sample->speed_q22);
-    const int32_t slowed_q22 = step != 0 ? 0 : fixed_subtract(protection->moving_q22, parameters->slowing_q22);
+/* An encoder that stands still while the rotor moves: what is left to the limit, negative beyond it. The observer alone
+ * cannot tell: a fast one follows a frozen encoder to standstill before the rotor went far. No torque stops the rotor
+ * as quickly, so its speed at the last count, less what torque can have taken off since, is believed as well. */
+static int32_t left_to_move(const protection_parameters_t *parameters, protection_t *protection, int32_t step,
+                            int32_t observed_q22) {
+    if (__builtin_expect(step != 0, 1)) {
+        protection->moving_q22 = observed_q22;
+        protection->unmoved = 0;
+        return 0;
+    }
+    const int32_t slowed_q22 = fixed_subtract(protection->moving_q22, parameters->slowing_q22);
     const int32_t speed_q22 = observed_q22 > slowed_q22 ? observed_q22 : slowed_q22;
     protection->moving_q22 = speed_q22;
-    if (step != 0 || speed_q22 < STANDSTILL_Q22) {
-        protection->unmoved_q64 = 0;
-    } else if (protection->unmoved_q64 < (int64_t)1 << 62) {
-        /* 2^31 * 2^26 a period: a few dozen periods to 2^62. */
-        protection->unmoved_q64 += (int64_t)speed_q22 * parameters->angle_step_q32;
+    if (speed_q22 < STANDSTILL_Q22) {
+        protection->unmoved = 0;
+    } else if (protection->unmoved < UNMOVED_HELD) {
+        /* A period at the highest speed and 20 kHz is below 2^25. */
+        protection->unmoved += fixed_multiply_high(speed_q22, parameters->angle_step_q32);
     }
-    const uint64_t step_limit = (uint64_t)parameters->angle_step_max * (sample->missed_interrupts + 1u);
-    return (uint64_t)fixed_abs(step) > step_limit || (protection->unmoved_q64 >> 32) > parameters->angle_unmoved_max;
+    return parameters->angle_unmoved_max - protection->unmoved;
+}
+
+/* What is left to each limit, negative beyond it. */
+typedef struct {
+    int32_t current_q9;
+    int32_t over_voltage_q6;
+    int32_t under_voltage_q6;
+    int32_t over_speed_q22;
+    int32_t jump;
+    int32_t still;
+    bool late;
+    bool lost;
+} margins_t;
+
+static uint16_t bit_if(bool fails, fault_t fault) {
+    return fails ? FAULT_BIT(fault) : 0;
+}
+
+__attribute__((cold)) static uint16_t failed_checks(margins_t left) {
+    uint16_t checks = 0;
+    checks |= bit_if(left.current_q9 < 0, FAULT_OVER_CURRENT);
+    checks |= bit_if(left.over_voltage_q6 < 0, FAULT_OVER_VOLTAGE);
+    checks |= bit_if(left.under_voltage_q6 < 0, FAULT_UNDER_VOLTAGE);
+    checks |= bit_if(left.over_speed_q22 < 0, FAULT_OVER_SPEED);
+    checks |= bit_if((left.jump | left.still) < 0, FAULT_ENCODER);
+    checks |= bit_if(left.late, FAULT_COMMAND_TIMEOUT);
+    checks |= bit_if(left.lost, FAULT_INTERRUPT_OVERRUN);
+    return checks;
 }
 
 uint16_t protection_check(const protection_parameters_t *parameters, protection_t *protection,
                           const protection_sample_t *sample) {
-    protection->overruns = sample->missed_interrupts == 0 ? 0 : protection->overruns + sample->missed_interrupts;
-
-    uint16_t checks = 0;
-    checks |= sample->current_max_q9 > parameters->current_trip_q9 ? FAULT_BIT(FAULT_OVER_CURRENT) : 0;
-    checks |= sample->bus_voltage_q6 > parameters->bus_over_voltage_q6 ? FAULT_BIT(FAULT_OVER_VOLTAGE) : 0;
-    checks |= sample->bus_voltage_q6 < parameters->bus_under_voltage_q6 ? FAULT_BIT(FAULT_UNDER_VOLTAGE) : 0;
-    checks |= fixed_abs(sample->speed_q22) > parameters->over_speed_q22 ? FAULT_BIT(FAULT_OVER_SPEED) : 0;
-    checks |= encoder_fails(parameters, protection, sample) ? FAULT_BIT(FAULT_ENCODER) : 0;
-    checks |= sample->command_age_us > parameters->command_timeout_us ? FAULT_BIT(FAULT_COMMAND_TIMEOUT) : 0;
-    checks |= protection->overruns >= PROTECTION_OVERRUNS_MAX ? FAULT_BIT(FAULT_INTERRUPT_OVERRUN) : 0;
-    return checks;
+    const int32_t speed_q22 = fixed_abs(sample->speed_q22);
+    const int32_t step = (int32_t)(sample->angle - protection->angle); /* modulo a turn */
+    protection->angle = sample->angle;
+    int32_t step_max = parameters->angle_step_max;
+    int32_t overruns = 0;
+    if (__builtin_expect(sample->missed_interrupts != 0, 0)) {
+        overruns = fixed_saturate((int64_t)protection->overruns + sample->missed_interrupts);
+        step_max = fixed_saturate(step_max * ((int64_t)sample->missed_interrupts + 1));
+    }
+    protection->overruns = overruns;
+    /* None overflows: limits and what they limit are not negative. */
+    const margins_t left = {
+        .current_q9 = parameters->current_trip_q9 - sample->current_max_q9,
+        .over_voltage_q6 = parameters->bus_over_voltage_q6 - sample->bus_voltage_q6,
+        .under_voltage_q6 = sample->bus_voltage_q6 - parameters->bus_under_voltage_q6,
+        .over_speed_q22 = parameters->over_speed_q22 - speed_q22,
+        .jump = step_max - fixed_abs(step),
+        .still = left_to_move(parameters, protection, step, speed_q22),
+        .late = sample->command_age_us > parameters->command_timeout_us,
+        .lost = overruns >= PROTECTION_OVERRUNS_MAX,
+    };
+    /* That none fails, nearly always, shows in the sign of them all. */
+    const int32_t any =
+        left.current_q9 | left.over_voltage_q6 | left.under_voltage_q6 | left.over_speed_q22 | left.jump | left.still;
+    return any < 0 || left.late || left.lost ? failed_checks(left) : 0;
 }

@@ -9,19 +9,19 @@ typedef struct {
     int32_t current_trip_q9;     /* A, Q7.9 */
     int32_t bus_over_voltage_q6; /* V, Q9.6 */
     int32_t bus_under_voltage_q6;
-    int32_t over_speed_q22;     /* rad/s, Q9.22, of the magnitude */
-    uint32_t angle_step_max;    /* 2^-32 turn a period: further is no rotation but a jump */
-    uint32_t angle_unmoved_max; /* 2^-32 turn that the rotor should have moved while the encoder stood still */
-    int32_t angle_step_q32;     /* period: 2^-32 turn per rad/s Q9.22, in Q32 */
+    int32_t over_speed_q22;    /* rad/s, Q9.22, of the magnitude */
+    int32_t angle_step_max;    /* 2^-32 turn a period: further is no rotation but a jump */
+    int32_t angle_unmoved_max; /* 2^-32 turn that the rotor should have moved while the encoder stood still; < 2^30 */
+    int32_t angle_step_q32;    /* period: 2^-32 turn per rad/s Q9.22, in Q32 */
     uint32_t command_timeout_us;
     int32_t slowing_q22; /* that torque can take off the speed in a period, rad/s, Q9.22 */
 } protection_parameters_t;
 
 typedef struct {
-    uint32_t angle;      /* of the last period, 2^-32 turn */
-    int32_t moving_q22;  /* least speed that the rotor can have by now, rad/s, Q9.22 */
-    int64_t unmoved_q64; /* expected movement since the encoder last moved, 2^-64 turn */
-    uint32_t overruns;   /* control interrupts lost in a row */
+    uint32_t angle;     /* of the last period, 2^-32 turn */
+    int32_t moving_q22; /* least speed that the rotor can have by now, rad/s, Q9.22 */
+    int32_t unmoved;    /* expected movement since the encoder last moved, 2^-32 turn; held above 2^30 */
+    int32_t overruns;   /* control interrupts lost in a row: what ran between them was late as well */
 } protection_t;
 
 typedef struct {
@@ -33,7 +33,9 @@ typedef struct {
     uint32_t command_age_us;    /* of the last accepted command */
 } protection_sample_t;
 
-/* Lost control interrupts in a row that are a fault. */
+/* Lost control interrupts in a row that are a fault. An interrupt that is late, ending after the next trigger, loses
+ * that trigger and every other one before its end: three late ones in a row are a fault, or one that is three periods
+ * late, noticed by the interrupt after them. One that was in time ends the row. */
 #define PROTECTION_OVERRUNS_MAX 3
 
 /* Starts at a measured angle. */

@@ -23,7 +23,9 @@ static bool latch(state_machine_t *machine, uint16_t checks) {
     return true;
 }
 
-bool state_machine_step(state_machine_t *machine, const state_machine_input_t *input, uint32_t initialise_ticks) {
+/* A tick in which something may happen. */
+__attribute__((cold)) static bool decide(state_machine_t *machine, const state_machine_input_t *input,
+                                         uint32_t initialise_ticks) {
     const uint16_t lasting = input->checks & (uint16_t)~FAULT_BIT(FAULT_COMMAND_TIMEOUT);
     const bool clear = input->request == COMMAND_CLEAR_FAULT && machine->asked != COMMAND_CLEAR_FAULT;
     machine->asked = input->request;
@@ -61,4 +63,12 @@ bool state_machine_step(state_machine_t *machine, const state_machine_input_t *i
         break;
     }
     return false;
+}
+
+bool state_machine_step(state_machine_t *machine, const state_machine_input_t *input, uint32_t initialise_ticks) {
+    if (machine->state == DRIVE_STATE_RUN && input->request == COMMAND_RUN && input->checks == 0) {
+        machine->asked = COMMAND_RUN; /* nearly every tick of a run */
+        return false;
+    }
+    return decide(machine, input, initialise_ticks);
 }

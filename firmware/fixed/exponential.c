@@ -13,18 +13,16 @@ static const uint32_t power_q30[(1u << STEP_BITS) + 1] = {
     560640218,  554601009,  548626854,  542717053,  536870912,
 };
 
-uint32_t exponential_negative_q31(uint32_t x_q16) {
-    /* e^-x = 2^-y with y = x log2(e): whole octaves are shifts, the rest comes from the table. */
-    const uint64_t log2_e_q30 = 1549082005u;
-    const uint64_t y_q46 = (uint64_t)x_q16 * log2_e_q30; /* below 2^32 * 2^31 */
-    const uint32_t octaves = (uint32_t)(y_q46 >> 46);
-    if (octaves >= 31) {
+uint32_t exponential_octaves_q31(uint32_t octaves_q17) {
+    /* Whole octaves are shifts, the rest comes from the table. */
+    const uint32_t octaves = octaves_q17 >> 17;
+    if (octaves >= 32) {
         return 0;
     }
-    const uint32_t index = (uint32_t)(y_q46 >> (46 - STEP_BITS)) & ((1u << STEP_BITS) - 1u);
-    const uint32_t fraction_q16 = (uint32_t)(y_q46 >> (46 - STEP_BITS - 16)) & 0xFFFFu;
+    const uint32_t index = (octaves_q17 >> (17 - STEP_BITS)) & ((1u << STEP_BITS) - 1u);
+    const uint32_t fraction_q11 = octaves_q17 & ((1u << (17 - STEP_BITS)) - 1u);
     const uint32_t high = power_q30[index];
-    const uint32_t fall = high - power_q30[index + 1]; /* below 2^24: times 2^16 needs 64 bits */
-    const uint32_t value_q30 = high - (uint32_t)(((uint64_t)fall * fraction_q16) >> 16);
-    return octaves == 0 ? value_q30 << 1 : value_q30 >> (octaves - 1);
+    const uint32_t fall = high - power_q30[index + 1]; /* below 2^24; its last four bits say nothing */
+    const uint32_t value_q30 = high - (((fall >> 4) * fraction_q11) >> 7);
+    return value_q30 << 1 >> octaves;
 }

@@ -22,11 +22,14 @@ static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithme
     ((int32_t)((((int64_t)(numerator) << (fraction_bits)) + (denominator) / 2) / (denominator)))
 
 /* Nearest 32-bit number. */
-static inline int32_t fixed_saturate(int64_t value) {
+__attribute__((always_inline)) static inline int32_t fixed_saturate(int64_t value) {
     const int32_t low_word = (int32_t)value;
     const int32_t high_word = (int32_t)(value >> 32);
     /* Fits when the high word is only copies of the sign: without a comparison of 64 bits. */
-    return high_word == low_word >> 31 ? low_word : INT32_MAX ^ (high_word >> 31);
+    if (__builtin_expect(high_word == low_word >> 31, 1)) {
+        return low_word;
+    }
+    return INT32_MAX ^ (high_word >> 31);
 }
 
 static inline int32_t fixed_clamp(int32_t value, int32_t low, int32_t high) {
@@ -63,7 +66,30 @@ static inline int32_t fixed_subtract(int32_t a, int32_t b) {
 
 /* Magnitude; INT32_MIN gives INT32_MAX. */
 static inline int32_t fixed_abs(int32_t value) {
-    return value < 0 ? fixed_subtract(0, value) : value;
+    const int32_t sign = value >> 31; /* -1 or 0: -v is ~v + 1 */
+    return fixed_subtract(value ^ sign, sign);
+}
+
+/* a * b, exact. As an instruction, because the compiler widens a factor of several products once, and then multiplies
+ * words of 64 bits. */
+static inline int64_t fixed_product(int32_t a, int32_t b) {
+#ifdef __ARM_FEATURE_DSP
+    int64_t product;
+    __asm__("smull %Q0, %R0, %1, %2" : "=r"(product) : "r"(a), "r"(b));
+    return product;
+#else
+    return (int64_t)a * b;
+#endif
+}
+
+/* sum + a * b; wraps. */
+static inline int64_t fixed_accumulate(int64_t sum, int32_t a, int32_t b) {
+#ifdef __ARM_FEATURE_DSP
+    __asm__("smlal %Q0, %R0, %1, %2" : "+r"(sum) : "r"(a), "r"(b));
+    return sum;
+#else
+    return (int64_t)((uint64_t)sum + (uint64_t)((int64_t)a * b));
+#endif
 }
 
 /* value / 2^shift, rounded; shift 1..62. Cannot overflow for value < 2^63 - 2^(shift-1). */
@@ -86,6 +112,40 @@ static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
 #else
     return (int32_t)fixed_shift((int64_t)a * b, 32);
 #endif
+}
+
+/* sum + a * b / 2^32, the product rounded; it must not overflow. */
+static inline int32_t fixed_multiply_high_add(int32_t sum, int32_t a, int32_t b) {
+#ifdef __ARM_FEATURE_DSP
+    int32_t result;
+    __asm__("smmlar %0, %1, %2, %3" : "=r"(result) : "r"(a), "r"(b), "r"(sum));
+    return result;
+#else
+    return sum + fixed_multiply_high(a, b);
+#endif
+}
+
+/* a + 2 b, saturated, 2 b on its own before. */
+static inline int32_t fixed_add_twice(int32_t a, int32_t b) {
+    return fixed_add(a, fixed_add(b, b));
+}
+
+/* Nearest number of `bits` bits with its sign, 1..32, a constant: one instruction where the processor has it. */
+__attribute__((always_inline)) static inline int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
+#if defined __ARM_FEATURE_SAT && defined __OPTIMIZE__
+    int32_t result;
+    __asm__("ssat %0, %1, %2" : "=r"(result) : "I"(bits), "r"(value));
+    return result;
+#else
+    return fixed_clamp(value, INT32_MIN >> (32 - bits), INT32_MAX >> (32 - bits));
+#endif
+}
+
+/* value / 2^shift, rounded down; shift 1..31, a constant. What does not fit is held within 2^(32-shift) of the end: the
+ * high word saturates, in one instruction, and the low bits stay what they are. */
+__attribute__((always_inline)) static inline int32_t fixed_narrow(int64_t value, unsigned shift) {
+    const int32_t high = fixed_saturate_bits((int32_t)(value >> 32), shift);
+    return (int32_t)((uint32_t)high << (32 - shift) | (uint32_t)value >> shift);
 }
 
 #endif

@@ -8,16 +8,40 @@
 
 #include <stdint.h>
 
-/* f(x), Q1.15, |f| <= 32767, for x in Q19.12, the whole range; odd to the bit. Error below 6e-5 (2 LSB). */
-int32_t sigmoid_symmetric_q15(int32_t x_q12);
+#include "fixed/fixed.h"
+#include "fixed/pair.h"
 
-/* f'(x) = (1 - f^2) / 2 from f in Q1.15, |f| <= 32768; Q1.15, truncated by less than 1 LSB. */
-int32_t sigmoid_symmetric_slope_q15(int32_t f_q15);
+#define SIGMOID_RANGE_BITS 26 /* over 0..8 in Q23, and as many below */
+#define SIGMOID_STEP_BITS 19  /* of 1/16 each */
+#define SIGMOID_STEPS (1 << (SIGMOID_RANGE_BITS - SIGMOID_STEP_BITS))
+#define SIGMOID_FRACTION_BITS 12 /* of a step: with the table's 15 the fraction bits of the result */
 
-/* g(x), Q1.15, 1..32768, for x in Q19.12. Error below 5e-5. */
-int32_t sigmoid_logistic_q15(int32_t x_q12);
+extern const int16_t sigmoid_symmetric_q15[2 * SIGMOID_STEPS + 1];
 
-/* g'(x) = g (1 - g) from g in Q1.15, 0..32768; Q1.15, truncated by less than 1 LSB. */
-int32_t sigmoid_logistic_slope_q15(int32_t g_q15);
+/* f(x), Q4.27, |f| < 1 - 2^-11, for x in Q8.23, the whole range, held within +-8. Error below 8e-5 within that, below
+ * 7e-4 beyond. */
+static inline int32_t sigmoid_symmetric_q27(int32_t x_q23) {
+    const int32_t within_q23 = fixed_saturate_bits(x_q23, SIGMOID_RANGE_BITS + 1);
+    const int16_t *entry = &sigmoid_symmetric_q15[SIGMOID_STEPS] + (within_q23 >> SIGMOID_STEP_BITS);
+    const int32_t fraction =
+        within_q23 >> (SIGMOID_STEP_BITS - SIGMOID_FRACTION_BITS) & ((1 << SIGMOID_FRACTION_BITS) - 1);
+    return fixed_pair_multiply_add(entry, fixed_pair((1 << SIGMOID_FRACTION_BITS) - fraction, fraction), 0);
+}
+
+/* f'(x) = (1 - f^2) / 2 from f in Q4.27, |f| <= 1 - 2^-15; Q32, 0..1/2, within 2^-22 of it. */
+static inline int32_t sigmoid_symmetric_slope_q32(int32_t f_q27) {
+    /* f^2 in Q22 is in Q32 when halved and shifted by 10; 1/2 would have no place there. */
+    return INT32_MAX - fixed_multiply_high(f_q27, f_q27) * (1 << 9);
+}
+
+/* g(x), Q3.28, from f(x) in Q4.27: half the error. */
+static inline int32_t sigmoid_logistic_q28(int32_t f_q27) {
+    return (1 << 27) + f_q27;
+}
+
+/* g'(x) = g (1 - g) = (1 - f^2) / 4 from f(x) in Q4.27, as f'; Q33, 0..1/4. */
+static inline int32_t sigmoid_logistic_slope_q33(int32_t f_q27) {
+    return sigmoid_symmetric_slope_q32(f_q27);
+}
 
 #endif

@@ -1,6 +1,6 @@
 /* The bench of a drive's program: bus, recordings and rig as the options want them, the ready line, the end.
  *
- * What the programs share that put a firmware on the rig: the host executable in its own process, the Cortex-M4 inside
+ * What the programs share that put a firmware on the rig: the host executable in its own process, a target inside
  * QEMU. What goes wrong is one line on stderr.
  */
 #ifndef BENCH_H

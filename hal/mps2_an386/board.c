@@ -2,7 +2,8 @@
 #include "qemu/board.h"
 
 #include "hal_time.h"
-#include "qemu/mailbox.h"
+#include "mps2_an386/timer.h"
+#include "qemu/hal_qemu.h"
 
 /* A line that the board's own peripherals do not use. */
 #define CONTROL_IRQ 31
@@ -50,6 +51,11 @@ __asm__(".text\n"
 void board_interrupt_enable(void) {
     NVIC_IPR(CONTROL_IRQ) = 0; /* the highest that can be set */
     NVIC_ISER0 = UINT32_C(1) << CONTROL_IRQ;
+    if (board.mailbox.timed && board.mailbox.period_ticks > 0) {
+        NVIC_IPR(TIMER_IRQ) = 0x80; /* lower: the control interrupt comes within the timer's */
+        NVIC_ISER0 = UINT32_C(1) << TIMER_IRQ;
+        timer_start(board.mailbox.period_ticks);
+    }
 }
 
 void board_interrupt_pend(void) {
@@ -57,7 +63,11 @@ void board_interrupt_pend(void) {
     __asm__ volatile("dsb\n\tisb" ::: "memory");
 }
 
-/* The control interrupt is the only one there is, so all may be kept out. */
+uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
+    return hal->mailbox.timed ? timer_elapsed_ticks() : hal->mailbox.elapsed_ticks;
+}
+
+/* There is no interrupt but the control interrupt and the timer's that asks for it, so all may be kept out. */
 void hal_critical_enter(hal_t *hal) {
     (void)hal;
     __asm__ volatile("cpsid i" ::: "memory");
@@ -79,5 +89,5 @@ __attribute__((section(".first"), used)) static const struct {
     .exceptions = {program_start, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
                    fault_handler, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
                    fault_handler, fault_handler, fault_handler},
-    .interrupts = {[CONTROL_IRQ] = control_handler},
+    .interrupts = {[TIMER_IRQ] = timer_handler, [CONTROL_IRQ] = control_handler},
 };

@@ -1,8 +1,8 @@
 /* A board of QEMU: what the drive's program (program.c) needs of it. A port has these functions, the critical section
- * of hal_time.h, the processor's vectors or their like, and a linker script memory.ld.
+ * of hal_time.h, hal_pwm_elapsed_ticks, the processor's vectors or their like, and a linker script memory.ld.
  *
  * Who counts instructions knows the control interrupt's ends by their names: control_handler is the handler's first
- * instruction, control_handler_return its last.
+ * instruction; at control_handler_return it begins its end, which has no jump before the return and lies within a page.
  */
 #ifndef BOARD_H
 #define BOARD_H
@@ -16,10 +16,10 @@ noreturn void program_start(void);
 /* The control interrupt's work: the handler calls it, in the processor's interrupt context. */
 void program_interrupt(void);
 
-/* Lets board_interrupt_pend act. */
+/* Lets board_interrupt_pend act, and starts the timer on a processor that takes time. The period is in the mailbox. */
 void board_interrupt_enable(void);
 
-/* Asks for the control interrupt, as the timer would. Unless interrupts are kept out it is over when this returns. */
+/* Asks for the control interrupt, as the timer would; not in a critical section. It is over when this returns. */
 void board_interrupt_pend(void);
 
 /* Ends QEMU with an exit code, 0..255. */

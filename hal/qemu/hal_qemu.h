@@ -1,4 +1,5 @@
-/* The hal_* functions on the mailbox, for any board of QEMU; the critical section is the board's. */
+/* The hal_* functions on the mailbox, for any board of QEMU; the critical section and the time on the
+ * processor are the board's. */
 #ifndef HAL_QEMU_H
 #define HAL_QEMU_H
 

@@ -4,6 +4,11 @@
  * `doorbell`, and before the drive's next instruction the world has done it. So the world needs no polling and time
  * stands still while the drive computes, as in the host executable. The layout is the same on both sides: little
  * endian, natural alignment, no pointers.
+ *
+ * When `timed` is set the processor takes time instead, and has a timer of the board for the control period. The
+ * timer's handler sends MAILBOX_TRIGGER before and MAILBOX_INTERRUPT_END behind the control interrupt, and only these
+ * move the world: to the trigger, and to the interrupt's end. Background and MAILBOX_NEXT take the world as it was left
+ * there.
  */
 #ifndef MAILBOX_H
 #define MAILBOX_H
@@ -16,7 +21,7 @@
 #include "hal_pwm.h"
 
 /* Changes with the structure, so that an image and a world that do not fit each other stop at the start. */
-#define MAILBOX_LAYOUT 1
+#define MAILBOX_LAYOUT 3
 
 /* Exit codes of a drive that ends by itself (sysexits.h). */
 #define MAILBOX_EXIT_FAULT 70  /* an exception of the processor that is not expected */
@@ -28,8 +33,10 @@ typedef enum {
     MAILBOX_NEXT,        /* all is done that was due: time may run to the next event */
     MAILBOX_PWM_START,   /* period_ticks */
     MAILBOX_PWM_OPEN_ALL,
-    MAILBOX_CAN_RECEIVE,  /* gives frame and accepted: there was one */
-    MAILBOX_CAN_TRANSMIT, /* takes frame, gives accepted: a mailbox was free */
+    MAILBOX_CAN_RECEIVE,   /* gives frame and accepted: there was one */
+    MAILBOX_CAN_TRANSMIT,  /* takes frame, gives accepted: a mailbox was free */
+    MAILBOX_TRIGGER,       /* takes trigger, gives an event: MAILBOX_INTERRUPT or MAILBOX_EXIT */
+    MAILBOX_INTERRUPT_END, /* takes elapsed_ticks, gives an event: MAILBOX_BACKGROUND or MAILBOX_EXIT */
 } mailbox_command_t;
 
 /* What MAILBOX_NEXT gives back. */
@@ -48,6 +55,7 @@ typedef struct {
     uint32_t controller; /* drive_controller_t */
     uint32_t adc_bits;
     uint32_t encoder_bits;
+    uint32_t timed; /* 1: the processor takes time, 0: it takes none */
 
     uint32_t event; /* mailbox_event_t */
     uint32_t exit_code;
@@ -56,6 +64,10 @@ typedef struct {
     hal_adc_sample_t adc;
     hal_encoder_sample_t encoder;
     uint32_t missed_interrupts; /* the drive sets it to 0 */
+    /* That the control interrupt takes, from the bench. `timed`: so long the bench holds the processor in front of it;
+     * at its end the drive puts what it took. */
+    uint32_t elapsed_ticks;
+    uint32_t trigger; /* `timed`: number of the trigger that is served, 1 is a period behind the start; modulo 2^32 */
 
     uint32_t period_ticks;
     hal_pwm_compare_t compare;

@@ -11,8 +11,7 @@ extern uint32_t data_start[], data_end[], data_load[], bss_start[], bss_end[];
 
 static drive_t drive;
 
-/* The handler calls it from assembly, which the linker's optimiser does not read. */
-__attribute__((used)) void program_interrupt(void) {
+__attribute__((used)) void program_interrupt(void) { /* by the handler, in assembly */
     drive_control_interrupt(&drive);
 }
 

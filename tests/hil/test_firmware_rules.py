@@ -11,8 +11,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 FLOATING_POINT = "int scaled(int x);\nint scaled(int x) { return (int)((float)x * 0.5f); }\n"
-PRINTS = '#include <stdio.h>\nvoid report(int x);\nvoid report(int x) { printf("%d", x); }\n'
-INTEGERS = "int scaled(int x);\nint scaled(int x) { return x >> 1; }\n"
+PRINTS = 'int printf(const char *, ...);\nvoid report(int x);\nvoid report(int x) { printf("%d", x); }\n'
+INTEGERS = "int scaled(int x);\nint scaled(int x) { return (int)(((long long)x << 20) / (x + 3)); }\n"
 
 
 def compiles_as_firmware(tmp_path: Path, source: str) -> bool:
@@ -37,30 +37,45 @@ def test_the_host_build_of_the_firmware_uses_that_rule():
     ).read_text()
 
 
-def symbol_check(tmp_path: Path, source: str) -> subprocess.CompletedProcess:
+TARGETS = {
+    "arm-none-eabi": ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=soft"],
+    "riscv64-unknown-elf": ["-march=rv32imac", "-mabi=ilp32"],
+}
+
+
+def symbol_check(tmp_path: Path, compiler: str, source: str) -> subprocess.CompletedProcess:
+    assert shutil.which(f"{compiler}-gcc"), f"package gcc-{compiler} is missing"
     file, item, archive = tmp_path / "rule.c", tmp_path / "rule.o", tmp_path / "librule.a"
     file.write_text(source)
-    target = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=soft", "-O2", "-c"]
-    subprocess.run(["arm-none-eabi-gcc", *target, str(file), "-o", str(item)], check=True)
-    subprocess.run(["arm-none-eabi-ar", "rcs", str(archive), str(item)], check=True)
+    target = [*TARGETS[compiler], "-O2", "-c"]
+    subprocess.run([f"{compiler}-gcc", *target, str(file), "-o", str(item)], check=True)
+    subprocess.run([f"{compiler}-ar", "rcs", str(archive), str(item)], check=True)
     return subprocess.run(
-        ["cmake", "-DNM=arm-none-eabi-nm", f"-DARCHIVES={archive}", "-P", str(ROOT / "cmake/check_symbols.cmake")],
+        ["cmake", f"-DNM={compiler}-nm", f"-DARCHIVES={archive}", "-P", str(ROOT / "cmake/check_symbols.cmake")],
         capture_output=True,
         text=True,
         check=False,
     )
 
 
-@pytest.mark.parametrize(("source", "symbol"), [(FLOATING_POINT, "__aeabi_fmul"), (PRINTS, "printf")])
-def test_the_cortex_m4_build_names_the_forbidden_symbol(tmp_path, source, symbol):
-    assert shutil.which("arm-none-eabi-gcc"), "package gcc-arm-none-eabi is missing"
-    result = symbol_check(tmp_path, source)
+@pytest.mark.parametrize(
+    ("compiler", "source", "symbol"),
+    [
+        ("arm-none-eabi", FLOATING_POINT, "__aeabi_fmul"),
+        ("arm-none-eabi", PRINTS, "printf"),
+        ("riscv64-unknown-elf", FLOATING_POINT, "__mulsf3"),
+        ("riscv64-unknown-elf", PRINTS, "printf"),
+    ],
+)
+def test_the_build_for_a_target_names_the_forbidden_symbol(tmp_path, compiler, source, symbol):
+    result = symbol_check(tmp_path, compiler, source)
     assert result.returncode != 0
     assert symbol in result.stderr
 
 
-def test_the_cortex_m4_build_accepts_integers(tmp_path):
-    assert symbol_check(tmp_path, INTEGERS).returncode == 0
+@pytest.mark.parametrize("compiler", TARGETS)
+def test_the_build_for_a_target_accepts_integers(tmp_path, compiler):
+    assert symbol_check(tmp_path, compiler, INTEGERS).returncode == 0
 
 
 def size_check(tmp_path: Path, bytes_of_table: int, initial: int) -> subprocess.CompletedProcess:

@@ -292,13 +292,47 @@ def test_the_trip_current_is_a_parameter_in_any_quadrant(make_bench, motion):
     assert currents_A(bench) == [0, 0, 0]
 
 
-def test_a_single_long_interrupt_is_no_fault(bench):
+@pytest.mark.parametrize("late", [1, 2])
+def test_fewer_late_interrupts_in_a_row_than_three_are_counted_and_no_fault(bench, late):
     running(bench)
-    bench.rig.interrupt_time_us = 40  # beyond one period
-    bench.rig.at(bench.time_s + 30e-6).interrupt_time_us = 0
-    bench.run_for(0.01)
+    bench.rig.interrupt_time_us = 40  # beyond one period: each loses a trigger
+    bench.rig.at(bench.time_s + late * 2 * PERIOD_US * 1e-6 - 20e-6).interrupt_time_us = 0
+    bench.run_for(0.11)
     assert bench.drive.state == "run"
     assert bench.truth["speed_rpm"].last == pytest.approx(600, abs=3)
+    processor = {s: bench.telemetry[f"DRIVE_PROCESSOR.{s}"].last
+                 for s in ("used_us", "worst_us", "available_us", "late_interrupts")}
+    assert processor == {"used_us": 0, "worst_us": 40, "available_us": PERIOD_US, "late_interrupts": late}
+
+
+def test_three_late_interrupts_in_a_row_are_a_fault_noticed_by_the_next(bench):
+    running(bench)
+    caused_us = bench.time_ns / 1000
+    bench.rig.interrupt_time_us = 40
+    bench.rig.at(bench.time_s + (3 * 2 * PERIOD_US - 20) * 1e-6).interrupt_time_us = 0
+    bench.run_for(0.11)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "interrupt_overrun")
+    assert bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last - caused_us == (1 + 3 * 2) * PERIOD_US
+    assert bench.telemetry["DRIVE_PROCESSOR.late_interrupts"].last == 3
+    assert currents_A(bench) == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("interrupt_us", "is_late"), [(PERIOD_US - 0.01, False), (PERIOD_US, False),
+                                                       (PERIOD_US + 0.01, True)])
+def test_an_interrupt_is_late_when_it_ends_after_the_next_trigger(bench, interrupt_us, is_late):
+    running(bench)
+    bench.rig.interrupt_time_us = interrupt_us
+    bench.run_for(0.05)
+    bench.rig.interrupt_time_us = 0  # one of exactly a period leaves no time for the background to report
+    bench.run_for(0.2)
+    assert bench.telemetry["DRIVE_PROCESSOR.worst_us"].last == pytest.approx(interrupt_us, abs=1e-9)
+    if is_late:
+        assert (bench.drive.state, bench.drive.fault) == ("fault", "interrupt_overrun")
+        assert bench.telemetry["DRIVE_PROCESSOR.late_interrupts"].last == 1000  # one in every second period
+    else:
+        assert bench.drive.state == "run"
+        assert bench.telemetry["DRIVE_PROCESSOR.late_interrupts"].last == 0
+        assert bench.truth["speed_rpm"].last == pytest.approx(600, abs=3)
 
 
 def test_the_first_of_two_causes_is_kept(bench):

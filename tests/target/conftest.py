@@ -1,14 +1,22 @@
-"""Says in the end how many control periods were found equal."""
+"""Says in the end how many control periods were found equal, and what the builds take of flash and RAM."""
 
 from __future__ import annotations
 
 import pytest
 
+from salient.simulator import TARGET_BUILDS
+from salient.target_figures import size_table
+
 _PROPERTY = "control_periods"
+_SIZE = "size"
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    reports = [report for outcome in ("passed", "failed") for report in terminalreporter.stats.get(outcome, [])]
+    made = dict(value for report in reports for name, value in report.user_properties if name == _SIZE)
+    if made:
+        terminalreporter.write_line(f"\n{size_table(made)}\n")
     compared = sum(value for report in terminalreporter.stats.get("passed", [])
                    for name, value in report.user_properties if name == _PROPERTY)
     if compared:
-        terminalreporter.write_line(f"control periods compared between host and Cortex-M4, all equal: {compared:,}")
+        terminalreporter.write_line(f"control periods of {', '.join(TARGET_BUILDS)} equal to the host's: {compared:,}")

@@ -28,7 +28,9 @@ def program() -> list[str]:
         (["--can", "BUS", "--controller", "pid"], ["--controller pid", "traditional, paper and salient"]),
         (["--can", "BUS", "--record", "/no/such/folder/x.npy"], ["/no/such/folder/x.npy"]),
         (["--instructions", "/no/such/folder/x", "--can", "BUS"], ["--instructions /no/such/folder/x"]),
-        (["--profile", "/no/such/folder/x", "--can", "BUS"], ["--profile /no/such/folder/x"]),
+        (["--execution", "/no/such/folder/x", "0-1", "--can", "BUS"], ["--execution /no/such/folder/x"]),
+        (["--execution", "x", "8-8", "--can", "BUS"], ["--execution 8-8", "END-BEGIN"]),
+        (["--instruction-ns", "9", "--can", "BUS"], ["--instruction-ns 9", "1, 2, 4, 8, 16, 32 and 64"]),
         (["--can", "BUS", "--bogus"], ["--bogus"]),
     ],
 )
@@ -49,11 +51,21 @@ def test_an_image_that_is_not_there_is_named(program, tmp_path: Path):
     assert result.stderr == "salient: none.elf: No such file or directory\n"
 
 
-def test_a_missing_qemu_is_named_with_its_package(program, tmp_path: Path):
+def test_a_file_that_is_no_image_is_named(program, tmp_path: Path):
+    result = subprocess.run([program[0], program[0], "--can", f"unix:{tmp_path}/bus"], capture_output=True, text=True,
+                            timeout=TIMEOUT_S)
+    assert result.returncode == 2
+    assert result.stderr == f"salient: {program[0]}: not an image of a drive for a board of QEMU\n"
+
+
+@pytest.mark.parametrize(("build", "qemu", "package"), [("cortex-m4", "qemu-system-arm", "qemu-system-arm"),
+                                                        ("rv32", "qemu-system-riscv32", "qemu-system-misc")])
+def test_a_missing_qemu_is_named_with_its_package(tmp_path: Path, build: str, qemu: str, package: str):
+    program = [executable("saturating", build), image("saturating", build)]
     result = subprocess.run([*program, "--can", f"unix:{tmp_path}/bus"], capture_output=True, text=True,
                             env={"PATH": str(tmp_path)}, timeout=TIMEOUT_S)
     assert result.returncode == 2
-    assert result.stderr == "salient: qemu-system-arm (Debian package qemu-system-arm): No such file or directory\n"
+    assert result.stderr == f"salient: {qemu} (Debian package {package}): No such file or directory\n"
 
 
 @pytest.mark.parametrize("pace", ["lockstep", "realtime", "free"])

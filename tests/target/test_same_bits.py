@@ -1,16 +1,19 @@
-"""The same firmware, the same bits: what the host executable and the Cortex-M4 do, control period by control period.
+"""The same firmware, the same bits: what the host executable, the Cortex-M4 and RV32 do, period by period.
 
 Compared are the compare values of every control period, every CAN frame with its time, and the recorded true state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from salient.arguments import CONTROLLERS
+from salient.arguments import CONTROLLERS, TARGETS
 from salient.bench import Bench
 from salient.simulator import TARGET_BUILDS
 
@@ -61,19 +64,39 @@ def tour(bench: Bench) -> None:
 RUNS = {run.__name__: run for run in (start_600, load_step_150, tour)}
 
 
-@pytest.fixture
-def trace(make_bench, tmp_path: Path) -> Callable[..., tuple]:
-    """What a drive does in a run: compare values, frames, true state; and in how many control periods."""
+@dataclass(frozen=True)
+class Trace:
+    """What a drive did in a run."""
 
-    def run(build: str, name: str, **options) -> tuple[int, bytes, list, bytes]:
-        switches, recording = tmp_path / f"{build}.switches", tmp_path / f"{build}.npy"
-        bench = make_bench(build=build, record=recording, record_step_ns=10_000, record_switches=switches, **options)
+    compare_values: bytes
+    frames: list
+    true_state: bytes
+
+    @property
+    def periods(self) -> int:
+        """Control periods."""
+        return len(self.compare_values) // ROW_BYTES
+
+
+@pytest.fixture
+def traces(make_bench, tmp_path: Path) -> Callable[..., dict[str, Trace]]:
+    """What drives do in a run, by build; several at a time."""
+
+    def trace(name: str, number: int, **options) -> Trace:
+        switches, recording = tmp_path / f"{number}.switches", tmp_path / f"{number}.npy"
+        bench = make_bench(can=f"unix:{tmp_path}/{number}.sock", record=recording, record_step_ns=10_000,
+                           record_switches=switches, **options)
         RUNS[name](bench)
         frames = [(time, message.arbitration_id, message.is_extended_id, bytes(message.data))
                   for time, message in bench.log]
         bench.close()
-        rows = switches.read_bytes()
-        return len(rows) // ROW_BYTES, rows, frames, recording.read_bytes()
+        return Trace(switches.read_bytes(), frames, recording.read_bytes())
+
+    def run(builds: Sequence[str], name: str, **options) -> dict[str, Trace]:
+        # Each is a process of its own, whose world no other's speed matters to.
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            made = pool.map(lambda each: trace(name, each[0], build=each[1], **options), enumerate(builds))
+            return dict(zip(builds, made, strict=True))
 
     return run
 
@@ -81,29 +104,30 @@ def trace(make_bench, tmp_path: Path) -> Callable[..., tuple]:
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("name", RUNS)
-def test_host_and_cortex_m4_do_the_same_in_every_control_period(trace, request, name, controller, machine):
-    options = {"controller": controller, "machine": machine, "seed": 3, "initial_angle_deg": 12.0}
-    host = trace("host", name, **options)
-    periods = host[0]
-    assert 15_000 < periods < 30_000
-    assert any(host[1])  # it did switch
+def test_host_and_targets_do_the_same_in_every_control_period(traces, request, name, controller, machine):
+    made = traces(("host", *TARGET_BUILDS), name, controller=controller, machine=machine, seed=3,
+                  initial_angle_deg=12.0)
+    host = made["host"]
+    assert 15_000 < host.periods < 30_000
+    assert any(host.compare_values)  # it did switch
     for build in TARGET_BUILDS:
-        target = trace(build, name, **options)
-        assert target[0] == periods
-        assert target[1] == host[1], f"{build}: compare values differ"
-        assert target[2] == host[2], f"{build}: CAN frames differ"
-        assert target[3] == host[3], f"{build}: the true state differs"
-    request.node.user_properties.append(("control_periods", periods * len(TARGET_BUILDS)))
+        assert made[build].periods == host.periods
+        for what in ("compare_values", "frames", "true_state"):
+            assert getattr(made[build], what) == getattr(host, what), f"{build}: {what} differ"
+    request.node.user_properties.append(("control_periods", host.periods * len(TARGET_BUILDS)))
 
 
 @pytest.mark.parametrize("board", [{"adc_bits": 16, "encoder_edges": True}, {"encoder_bits": 0, "immediate_pwm": True},
                                    {"control_rate_hz": 100_000, "encoder_bits": 24}])
-def test_another_board_is_the_same_on_both(trace, board):
-    host = trace("host", "load_step_150", controller="salient", **board)
-    assert trace("cortex-m4", "load_step_150", controller="salient", **board) == host
+def test_another_board_is_the_same_on_all(traces, board):
+    made = traces(TARGETS, "load_step_150", controller="salient", **board)
+    for build in TARGETS:
+        assert made[build] == made["host"], build
 
 
-def test_another_seed_is_another_run(trace):
+def test_another_seed_is_another_run(traces):
     """So that the equality above says something."""
-    first, second = (trace("cortex-m4", "tour", controller="paper", seed=seed) for seed in (1, 2))
-    assert first[1] != second[1] and first[2] != second[2] and first[3] != second[3]
+    first, second = (traces(["cortex-m4"], "tour", controller="paper", seed=seed)["cortex-m4"] for seed in (1, 2))
+    assert first.compare_values != second.compare_values
+    assert first.frames != second.frames
+    assert first.true_state != second.true_state

@@ -49,12 +49,11 @@ struct setup_t {
 struct fixed_drive_t {
     control_parameters_t parameters;
     control_state_t state{};
-    control_diagnostics_t diagnostics{};
 
     explicit fixed_drive_t(const setup_t &setup) : parameters(setup.configured()) { control_reset(&state); }
 
     bool step(const control_sample_t &sample, hal_pwm_compare_t *compare) {
-        return control_step(&parameters, &state, &sample, compare, &diagnostics);
+        return control_step(&parameters, &state, &sample, compare);
     }
 };
 

@@ -107,6 +107,7 @@ struct StandInFirmware {
     board_t *board = nullptr;
     uint32_t interrupts = 0, backgrounds = 0, missed = 0;
     uint16_t lower = 2500; // what it writes for phase 1
+    uint64_t takes_ns = 0; // its interrupt, when it says so itself
     std::vector<uint64_t> interrupt_times_ns, background_times_ns;
     std::vector<hal_can_frame_t> received;
 
@@ -120,6 +121,9 @@ struct StandInFirmware {
         compare.upper[1] = on ? 1700 : 0;
         compare.lower[1] = self->lower;
         board_pwm_write(self->board, &compare);
+        if (self->takes_ns > 0) {
+            self->board->interrupt_took_ns = self->takes_ns;
+        }
     }
 
     static void background(void *context) {

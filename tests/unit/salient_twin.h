@@ -89,8 +89,9 @@ class salient_t {
     salient_t(const control_parameters_t &p, const machine_t &plant, double control_rate_hz)
         : machine(plant), phases(plant.phases), poles(plant.rotor_poles), rate_hz(control_rate_hz),
           inertia_kg_m2(plant.inertia_kg_m2), friction_Nm_s(plant.friction_Nm_s), encoder_bits(32 - p.encoder_shift),
-          adc_bits(p.adc_bits), epsilon(p.speed_smc.epsilon_q15 / Q15), delta_s(p.speed_smc.delta_q12 / Q12),
-          gain_Nm_s(p.speed_smc.gain_q24 / Q24), torque_max_Nm(p.speed_smc.torque_max_q24 / Q24) {
+          adc_bits(p.adc_bits), epsilon(std::ldexp(p.speed_smc.epsilon_q31, -31)),
+          delta_s(std::ldexp(p.speed_smc.delta_q27, -27) * std::log(2.0)), gain_Nm_s(p.speed_smc.gain_q24 / Q24),
+          torque_max_Nm(p.speed_smc.torque_max_q24 / Q24) {
         const observer_bandwidth_parameters_t &b = p.bandwidth;
         bandwidth.steady_rad_s = b.bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES - 1];
         bandwidth.first_count_rad_s = b.bandwidth_rad_s[b.first_stage_count];
@@ -99,7 +100,7 @@ class salient_t {
         bandwidth.threshold_count = b.threshold_count / TURN;
         bandwidth.threshold_edge = b.threshold_edge / TURN;
         bandwidth.pause_s = b.pause_ticks / rate_hz;
-        bandwidth.kept = b.forget_q16 / Q16;
+        bandwidth.kept = b.forget_q32 / Q32;
 
         const predictive_torque_parameters_t &t = p.predictive;
         predictive.phases = phases;

@@ -130,6 +130,7 @@ TEST_F(Comms, frames_come_at_their_rates) {
     EXPECT_EQ(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_DRIVE_COMMAND_COUNTERS_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_DRIVE_BUS_COUNTERS_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_PROCESSOR_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 0u);
     EXPECT_EQ(comms.telemetry.dropped, 0);
 }
@@ -154,6 +155,10 @@ TEST_F(Comms, signals_carry_the_snapshot) {
     snapshot.misalignment = 1 << 20;
     snapshot.torque_missing_q24 = INT32_MAX;
     snapshot.observer_bandwidth_rad_s = 8000;
+    snapshot.used_ticks = 3000;
+    snapshot.worst_ticks = 4999;
+    snapshot.available_ticks = 5000;
+    snapshot.late_interrupts = 70000;
     run(3000);
 
     drive_drive_status_t status;
@@ -189,6 +194,12 @@ TEST_F(Comms, signals_carry_the_snapshot) {
     EXPECT_EQ(trim.misalignment_deg, 256);
     EXPECT_EQ(trim.torque_missing_nm, 32767);
     EXPECT_EQ(trim.observer_bandwidth_rad_s, 8000);
+    drive_drive_processor_t processor;
+    drive_drive_processor_unpack(&processor, first(DRIVE_DRIVE_PROCESSOR_FRAME_ID).data, 8);
+    EXPECT_EQ(processor.used_us, 3000);
+    EXPECT_EQ(processor.worst_us, 4999);
+    EXPECT_EQ(processor.available_us, 5000);
+    EXPECT_EQ(processor.late_interrupts, 65535);
     drive_drive_heartbeat_t heartbeat;
     drive_drive_heartbeat_unpack(&heartbeat, first(DRIVE_DRIVE_HEARTBEAT_FRAME_ID).data, 8);
     EXPECT_EQ(heartbeat.state, STATE_RUN);
@@ -264,9 +275,9 @@ TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
 }
 
 TEST_F(Comms, dropped_frames_are_counted_exactly) {
-    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 2 counters + 1 heartbeat
+    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 2 counters + 1 PROCESSOR + 1 heartbeat
     const unsigned waiting = unsigned(bus.mailboxes.size()) + comms.telemetry.queue.count;
-    EXPECT_EQ(comms.telemetry.dropped + waiting, 423u);
+    EXPECT_EQ(comms.telemetry.dropped + waiting, 424u);
 }
 
 TEST_F(Comms, others_above_the_heartbeat_cannot_block_telemetry) {

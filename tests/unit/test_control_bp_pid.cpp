@@ -1,4 +1,5 @@
 // The BP-PID against its double-precision twin, and when it learns.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -21,33 +22,39 @@ bp_pid_parameters_t parameters_of(bp_pid_mode_t mode) {
     parameters.mode = mode;
     parameters.seed = 1;
     parameters.error_scale_inverse_q24 = twins::to_fixed(0.5, twins::Q24); // 2 N m
-    parameters.kp_scale_q15 = twins::to_fixed(1.0, twins::Q15);
-    parameters.ki_scale_q15 = twins::to_fixed(0.24, twins::Q15);
-    parameters.kd_scale_q15 = twins::to_fixed(0.4, twins::Q15);
-    parameters.network = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q15)};
+    parameters.scale_q28[0] = twins::to_fixed(1.0, twins::Q28);
+    parameters.scale_q28[1] = twins::to_fixed(0.24, twins::Q28);
+    parameters.scale_q28[2] = twins::to_fixed(0.4, twins::Q28);
+    parameters.network = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q32)};
     return parameters;
 }
 
 twins::bp_pid_t twin_of(const bp_pid_parameters_t &p, const bp_pid_t &pid) {
     twins::bp_pid_t twin{twins::bp_pid_t::mode_t(p.mode),
                          p.error_scale_inverse_q24 / twins::Q24,
-                         {p.kp_scale_q15 / twins::Q15, p.ki_scale_q15 / twins::Q15, p.kd_scale_q15 / twins::Q15},
+                         {p.scale_q28[0] / twins::Q28, p.scale_q28[1] / twins::Q28, p.scale_q28[2] / twins::Q28},
                          p.network.learning_rate_q15 / twins::Q15,
-                         p.network.inertia_q15 / twins::Q15};
+                         p.network.inertia_q32 / twins::Q32};
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         for (unsigned j = 0; j < BP_INPUTS; j++) {
-            twin.network.hidden_weight[i][j] = pid.network.hidden_weight_q28[i][j] / twins::Q28;
+            // The twin's inputs begin with the error, the PID's with its difference.
+            twin.network.hidden_weight[i][j] = pid.network.hidden[i].input.value[j == 2 ? 2 : 1 - j] / twins::Q28;
         }
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-            twin.network.output_weight[l][i] = pid.network.output_weight_q28[l][i] / twins::Q28;
+            twin.network.output_weight[l][i] = pid.network.hidden[i].output.value[l] / twins::Q28;
         }
     }
     return twin;
 }
 
 bool same_weights(const bp_network_t &a, const bp_network_t &b) {
-    return std::memcmp(a.hidden_weight_q28, b.hidden_weight_q28, sizeof a.hidden_weight_q28) == 0 &&
-           std::memcmp(a.output_weight_q28, b.output_weight_q28, sizeof a.output_weight_q28) == 0;
+    for (unsigned i = 0; i < BP_HIDDEN; i++) {
+        if (std::memcmp(&a.hidden[i].input, &b.hidden[i].input, sizeof a.hidden[i].input) != 0 ||
+            std::memcmp(&a.hidden[i].output, &b.hidden[i].output, sizeof a.hidden[i].output) != 0) {
+            return false;
+        }
+    }
+    return true;
 }
 
 // Torque answers the duty with a lag, the reference moves: errors as in a drive. Returns the largest difference of the
@@ -68,7 +75,7 @@ double largest_difference(bp_pid_mode_t mode, int samples, double *largest_gain_
         largest = std::max(largest, std::fabs(duty - twin.step(error_q24 / twins::Q24)));
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
             *largest_gain_difference =
-                std::max(*largest_gain_difference, std::fabs(pid.gain_q15[l] / twins::Q15 - twin.gain[l]));
+                std::max(*largest_gain_difference, std::fabs(pid.gain_q24[l] / twins::Q24 - twin.gain[l]));
         }
         torque += 0.3 * (8.0 * duty - torque);
     }
@@ -100,9 +107,9 @@ TEST(BpPid, follows_its_twin_while_it_learns) {
 TEST(BpPid, a_step_of_the_error_gives_the_increments_of_the_incremental_form) {
     bp_pid_parameters_t parameters = parameters_of(BP_PID_FIXED);
     parameters.error_scale_inverse_q24 = 1 << 24;
-    parameters.kp_scale_q15 = 2 * 8192;
-    parameters.ki_scale_q15 = 2 * 1024;
-    parameters.kd_scale_q15 = 2 * 2048;
+    parameters.scale_q28[0] = 2 * 8192 << 13;
+    parameters.scale_q28[1] = 2 * 1024 << 13;
+    parameters.scale_q28[2] = 2 * 2048 << 13;
     bp_pid_t pid;
     bp_pid_reset(&parameters, &pid);
     const int32_t error_q24 = 1 << 22; // 1/4
@@ -117,15 +124,16 @@ TEST(BpPid, a_step_of_the_error_gives_the_increments_of_the_incremental_form) {
 TEST(BpPid, fixed_gains_are_half_the_scales_and_the_network_s_are_its_outputs_times_the_scales) {
     for (const bp_pid_mode_t mode : {BP_PID_OFF, BP_PID_FIXED, BP_PID_FROZEN, BP_PID_LEARNING}) {
         const bp_pid_parameters_t parameters = parameters_of(mode);
-        const int32_t scale_q15[] = {parameters.kp_scale_q15, parameters.ki_scale_q15, parameters.kd_scale_q15};
         bp_pid_t pid;
         bp_pid_reset(&parameters, &pid);
         bp_pid_step(&parameters, &pid, 1 << 23);
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
             if (mode == BP_PID_FROZEN || mode == BP_PID_LEARNING) {
-                EXPECT_NEAR(pid.gain_q15[l], pid.network.output_q15[l] / twins::Q15 * scale_q15[l], 0.51);
+                EXPECT_NEAR(pid.gain_q24[l],
+                            (0.5 + 0.5 * pid.network.output_q27[l] / twins::Q27) * parameters.scale_q28[l] / 16.0,
+                            0.51);
             } else {
-                EXPECT_EQ(pid.gain_q15[l], scale_q15[l] / 2);
+                EXPECT_NEAR(pid.gain_q24[l], 0.5 * parameters.scale_q28[l] / 16.0, 0.51);
             }
         }
     }
@@ -156,12 +164,12 @@ TEST(BpPid, learning_pauses_while_the_duty_or_the_error_is_at_its_limit) {
         EXPECT_TRUE(same_weights(pid.network, before));
         // The duty at its end, the error within.
         bp_pid_preset(&pid, sign * DUTY_ONE_Q15);
-        pid.error_q15 = pid.previous_q15 = 0;
+        pid.error_q16 = pid.rise_q16 = 0;
         EXPECT_EQ(bp_pid_step(&parameters, &pid, sign * (1 << 24)), sign * DUTY_ONE_Q15);
         EXPECT_TRUE(same_weights(pid.network, before));
         // The same error with room for the duty.
         bp_pid_preset(&pid, 0);
-        pid.error_q15 = pid.previous_q15 = 0;
+        pid.error_q16 = pid.rise_q16 = 0;
         bp_pid_step(&parameters, &pid, sign * (1 << 24));
         EXPECT_FALSE(same_weights(pid.network, before));
         // Out of saturation: it learns while it comes back.
@@ -181,10 +189,15 @@ TEST(BpPid, the_network_s_inputs_are_the_error_and_its_first_and_second_differen
     double e1 = 0.0, e2 = 0.0;
     for (const double e : errors) {
         bp_pid_step(&parameters, &pid, twins::to_fixed(e, twins::Q24));
-        const auto limited = [](double v) { return std::clamp(v, -32767.0 / 32768.0, 32767.0 / 32768.0); };
-        EXPECT_NEAR(pid.network.input_q15[0] / twins::Q15, e, 1.01 / twins::Q15);
-        EXPECT_NEAR(pid.network.input_q15[1] / twins::Q15, limited(e - e1), 2.01 / twins::Q15);
-        EXPECT_NEAR(pid.network.input_q15[2] / twins::Q15, limited(e - 2.0 * e1 + e2), 4.01 / twins::Q15);
+        const auto limited = [](double v) { return std::clamp(v, -1.0, 65535.0 / 65536.0); };
+        const double inputs[] = {limited(e - e1), e, limited(e - 2.0 * e1 + e2)};
+        for (const bp_neuron_t &neuron : pid.network.hidden) {
+            double sum = 0.0;
+            for (unsigned j = 0; j < BP_INPUTS; j++) {
+                sum += neuron.input.value[j] / twins::Q28 * inputs[j];
+            }
+            EXPECT_NEAR(neuron.value_q27 / twins::Q27, std::tanh(0.5 * sum), 1e-4);
+        }
         e2 = e1;
         e1 = e;
     }
@@ -216,11 +229,11 @@ TEST(BpPid, nothing_overflows_and_the_duty_stays_within_one_for_any_error_and_al
     const int32_t errors[] = {INT32_MIN, INT32_MAX, 1, -1, 0};
     for (const bp_pid_mode_t mode : {BP_PID_OFF, BP_PID_FIXED, BP_PID_FROZEN, BP_PID_LEARNING}) {
         for (const int32_t inverse_q24 : {1, 1 << 24, 64 << 24}) {
-            for (const int32_t scale_q15 : {0, 1, 4 << 15}) {
+            for (const int32_t scale_q28 : {0, 1, 1 << 30}) {
                 bp_pid_parameters_t parameters = parameters_of(mode);
                 parameters.error_scale_inverse_q24 = inverse_q24;
-                parameters.kp_scale_q15 = parameters.ki_scale_q15 = parameters.kd_scale_q15 = scale_q15;
-                parameters.network = {32768, 32768};
+                std::fill_n(parameters.scale_q28, BP_OUTPUTS, scale_q28);
+                parameters.network = {32768, INT32_MAX};
                 bp_pid_t pid;
                 bp_pid_reset(&parameters, &pid);
                 for (int k = 0; k < 2000; k++) {
@@ -239,13 +252,13 @@ TEST(BpPid, a_pid_put_aside_shows_no_duty_and_no_gains_and_keeps_its_weights) {
     bp_pid_t pid;
     bp_pid_reset(&parameters, &pid);
     bp_pid_step(&parameters, &pid, twins::to_fixed(0.5, twins::Q24));
-    ASSERT_NE(pid.duty_q30, 0);
-    ASSERT_NE(pid.gain_q15[0], 0);
+    ASSERT_NE(pid.duty_q23, 0);
+    ASSERT_NE(pid.gain_q24[0], 0);
     const bp_network_t network = pid.network;
     bp_pid_show_none(&pid);
-    EXPECT_EQ(pid.duty_q30, 0);
-    for (const int32_t gain_q15 : pid.gain_q15) {
-        EXPECT_EQ(gain_q15, 0);
+    EXPECT_EQ(pid.duty_q23, 0);
+    for (const int32_t gain_q24 : pid.gain_q24) {
+        EXPECT_EQ(gain_q24, 0);
     }
     EXPECT_TRUE(same_weights(network, pid.network));
 }

@@ -56,7 +56,7 @@ scene_t scene(bool outgoing, int32_t outgoing_current_q9, int32_t active_current
 int8_t next_state(const scene_t &s, unsigned phase, int state, int32_t error) {
     ditc_hysteresis_t ditc{};
     ditc.state[phase] = int8_t(state);
-    ditc_hysteresis_step(&PARAMETERS, &ditc, 3, &s.commutation, error, s.current_q9);
+    ditc_hysteresis_step(&PARAMETERS, &ditc, &s.commutation, error, s.current_q9);
     return ditc.state[phase];
 }
 
@@ -107,7 +107,7 @@ TEST(DitcHysteresis, every_phase_can_play_every_role) {
             const int32_t current_q9[HAL_PHASES_MAX] = {100, 100, 100, 100};
             ditc_hysteresis_t ditc;
             ditc_hysteresis_reset(&ditc);
-            ditc_hysteresis_step(&PARAMETERS, &ditc, HAL_PHASES_MAX, &commutation, INT32_MAX, current_q9);
+            ditc_hysteresis_step(&PARAMETERS, &ditc, &commutation, INT32_MAX, current_q9);
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
                 EXPECT_EQ(ditc.state[phase], phase == active || phase == outgoing ? 1 : -1);
             }
@@ -125,7 +125,7 @@ TEST(DitcHysteresis, in_a_gap_of_the_commutation_all_phases_are_off_after_reset_
         EXPECT_EQ(state, -1);
     }
     for (const int32_t error : ERRORS) {
-        ditc_hysteresis_step(&PARAMETERS, &ditc, 4, &commutation, error, current_q9);
+        ditc_hysteresis_step(&PARAMETERS, &ditc, &commutation, error, current_q9);
         for (const int8_t state : ditc.state) {
             EXPECT_EQ(state, -1);
         }
@@ -140,7 +140,7 @@ TEST(DitcHysteresis, the_extreme_bands_do_not_overflow) {
             for (const int32_t error : ERRORS) {
                 ditc_hysteresis_t ditc;
                 ditc_hysteresis_reset(&ditc);
-                ditc_hysteresis_step(&parameters, &ditc, 3, &both.commutation, error, both.current_q9);
+                ditc_hysteresis_step(&parameters, &ditc, &both.commutation, error, both.current_q9);
                 for (unsigned phase = 0; phase < 3; phase++) {
                     ASSERT_LE(std::abs(ditc.state[phase]), 1);
                 }

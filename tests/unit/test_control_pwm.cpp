@@ -61,6 +61,20 @@ TEST(Pwm, the_ends_and_zero_are_exact) {
     expect(INT32_MIN, 0, 0);
 }
 
+TEST(Pwm, a_state_is_the_whole_period_s_duty_of_the_same_voltage) {
+    for (const int state : {-1, 0, 1}) {
+        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+            hal_pwm_compare_t by_state = {{11, 12, 13, 14}, {21, 22, 23, 24}}, by_duty = by_state;
+            pwm_set_state(&by_state, phase, state, 2500);
+            pwm_set_phase(&by_duty, phase, state * 32768, 2500);
+            for (unsigned other = 0; other < HAL_PHASES_MAX; other++) {
+                EXPECT_EQ(by_state.upper[other], by_duty.upper[other]);
+                EXPECT_EQ(by_state.lower[other], by_duty.lower[other]);
+            }
+        }
+    }
+}
+
 TEST(Pwm, voltage_never_falls_when_the_duty_rises) {
     double last = -1.0;
     for (int32_t duty_q15 = -32768; duty_q15 <= 32768; duty_q15++) {

@@ -20,10 +20,10 @@ torque_trim_parameters_t parameters_of(bp_pid_mode_t mode) {
     p.pid.mode = mode;
     p.pid.seed = 1;
     p.pid.error_scale_inverse_q24 = twins::to_fixed(0.5, twins::Q24); // 2 N m
-    p.pid.kp_scale_q15 = twins::to_fixed(0.07, twins::Q15);
-    p.pid.ki_scale_q15 = twins::to_fixed(0.07, twins::Q15);
-    p.pid.kd_scale_q15 = twins::to_fixed(0.03, twins::Q15);
-    p.pid.network = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q15)};
+    p.pid.scale_q28[0] = twins::to_fixed(0.07, twins::Q28);
+    p.pid.scale_q28[1] = twins::to_fixed(0.07, twins::Q28);
+    p.pid.scale_q28[2] = twins::to_fixed(0.03, twins::Q28);
+    p.pid.network = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q32)};
     p.limit_q24 = twins::to_fixed(LIMIT_NM, twins::Q24);
     return p;
 }
@@ -32,8 +32,8 @@ twins::trim_t twin_of(const torque_trim_parameters_t &p) {
     twins::trim_t twin{};
     twin.pid.mode = twins::bp_pid_t::FIXED;
     twin.pid.error_scale_inverse = p.pid.error_scale_inverse_q24 / twins::Q24;
-    twin.pid.scale = {p.pid.kp_scale_q15 / twins::Q15, p.pid.ki_scale_q15 / twins::Q15,
-                      p.pid.kd_scale_q15 / twins::Q15};
+    twin.pid.scale = {p.pid.scale_q28[0] / twins::Q28, p.pid.scale_q28[1] / twins::Q28,
+                      p.pid.scale_q28[2] / twins::Q28};
     twin.limit_Nm = p.limit_q24 / twins::Q24;
     return twin;
 }

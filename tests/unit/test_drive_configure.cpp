@@ -43,6 +43,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(int(c.controller), p.values[PARAMETER_CONTROLLER]);
     ASSERT_EQ(2.0 * c.period_ticks * rate_hz, double(HAL_PWM_CLOCK_HZ));
     ASSERT_EQ(c.encoder_shift, 32 - encoder_bits);
+    ASSERT_EQ(c.encoder_middle, encoder_bits == 32 ? 0u : 1u << (31 - encoder_bits));
     ASSERT_EQ(c.initialise_ticks, uint32_t(rate_hz / 1000.0));
 
     const double ramp = twins::rad_s(v(PARAMETER_SPEED_RAMP_RPM_S)) / rate_hz * twins::Q22;
@@ -54,18 +55,24 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("torque max", c.speed_pi.torque_max_q24, v(PARAMETER_TORQUE_MAX_NM) * twins::Q24, 0.0);
 
     near("smc gain", c.speed_smc.gain_q24, v(PARAMETER_INERTIA_KG_M2) * v(PARAMETER_SMC_K) * twins::Q24, 0.51);
-    near("epsilon", c.speed_smc.epsilon_q15, v(PARAMETER_SMC_EPSILON) * twins::Q15, 0.51);
-    near("delta", c.speed_smc.delta_q12, v(PARAMETER_SMC_DELTA) * twins::Q12, 1.0);
+    near("epsilon", c.speed_smc.epsilon_q31, std::ldexp(v(PARAMETER_SMC_EPSILON), 31), 1.01);
+    near("delta", c.speed_smc.delta_q27, std::ldexp(v(PARAMETER_SMC_DELTA) / std::log(2.0), 27), 1.01);
     near("friction", c.speed_smc.friction_q30, v(PARAMETER_FRICTION_NM_S) * twins::Q30, 0.0);
     ASSERT_EQ(c.speed_smc.torque_min_q24, -c.speed_smc.torque_max_q24);
     near("torque max", c.speed_smc.torque_max_q24, v(PARAMETER_TORQUE_MAX_NM) * twins::Q24, 0.0);
 
     near("turn on", c.commutation.turn_on, 0.0, twins::TURN);
     ASSERT_LE(std::fabs(c.commutation.turn_on - pitch(PARAMETER_TURN_ON_ANGLE_DEG)), 1.0);
-    ASSERT_LE(std::fabs(c.commutation.turn_off - pitch(PARAMETER_TURN_OFF_ANGLE_DEG)), 1.0);
-    ASSERT_LE(std::fabs(c.commutation.outgoing_off - pitch(PARAMETER_OUTGOING_OFF_ANGLE_DEG)), 1.0);
-    ASSERT_LE(std::fabs(c.duty.hand_over_angle - pitch(PARAMETER_HAND_OVER_ANGLE_DEG)), 1.0);
-    ASSERT_GE(c.duty.hand_over_angle, 0x80000000u) << "the map's inverse is for the second half pitch";
+    const double active = pitch(PARAMETER_TURN_OFF_ANGLE_DEG) - pitch(PARAMETER_TURN_ON_ANGLE_DEG);
+    const double available = pitch(PARAMETER_OUTGOING_OFF_ANGLE_DEG) - pitch(PARAMETER_TURN_ON_ANGLE_DEG);
+    ASSERT_LE(std::fabs(c.commutation.active_width - std::max(active, 0.0)), 2.0);
+    ASSERT_LE(std::fabs(c.commutation.available_width - std::max({active, available, 0.0})), 2.0);
+    ASSERT_EQ(c.commutation.phases, machine_tables.phases);
+    ASSERT_EQ(c.commutation.rotor_poles, machine_tables.rotor_poles);
+    const ditc_duty_aims_t aims = ditc_duty_aims(&machine_tables, pitch(PARAMETER_HAND_OVER_ANGLE_DEG));
+    for (unsigned k = 0; k < DITC_DUTY_AIMS; k++) {
+        ASSERT_NEAR(c.duty.aims.current_q9[k], aims.current_q9[k], 1.0) << k;
+    }
 
     near("inner", c.hysteresis.band_inner_q24, v(PARAMETER_TORQUE_BAND_INNER_NM) * twins::Q24, 0.0);
     near("outer", c.hysteresis.band_outer_q24, v(PARAMETER_TORQUE_BAND_OUTER_NM) * twins::Q24, 0.0);
@@ -74,18 +81,18 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("limit", c.hysteresis.current_limit_q9, std::min(v(PARAMETER_CURRENT_LIMIT_A), below_trip_A) * twins::Q9, 4.0);
     near("limit", c.duty.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * twins::Q9, 0.0);
     near("assist", c.duty.band_outer_q24, v(PARAMETER_BP_ASSIST_BAND_NM) * twins::Q24, 0.0);
-    near("incoming gain", c.duty.incoming_gain_q20, 0.5 * rate_hz / machine_tables.current_rise_A_s * twins::Q20, 1.0);
+    near("incoming gain", c.duty.incoming_gain_q24, 0.5 * rate_hz / machine_tables.current_rise_A_s * twins::Q24, 1.0);
 
-    near("surplus", c.duty.surplus_q20, 40000.0 / 16.0 / rate_hz * twins::Q20, 1.0);
+    near("surplus", c.duty.surplus_q32, 40000.0 / 16.0 / rate_hz * twins::Q32, 4096.0);
     near("spent torque", c.duty.spent_torque_q24, rate_hz / 40000.0 / 16.0 * twins::Q24, 1.0);
     ASSERT_EQ(int(c.duty.pid.mode), p.values[PARAMETER_BP_MODE]);
     ASSERT_EQ(int32_t(c.duty.pid.seed), p.values[PARAMETER_BP_SEED]);
     near("scale", c.duty.pid.error_scale_inverse_q24, twins::Q24 / scale_Nm, 1.0);
-    near("kp scale", c.duty.pid.kp_scale_q15, pid_scale(PARAMETER_BP_KP_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
-    near("ki scale", c.duty.pid.ki_scale_q15, pid_scale(PARAMETER_BP_KI_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
-    near("kd scale", c.duty.pid.kd_scale_q15, pid_scale(PARAMETER_BP_KD_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
+    near("kp scale", c.duty.pid.scale_q28[0] / 8192.0, pid_scale(PARAMETER_BP_KP_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
+    near("ki scale", c.duty.pid.scale_q28[1] / 8192.0, pid_scale(PARAMETER_BP_KI_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
+    near("kd scale", c.duty.pid.scale_q28[2] / 8192.0, pid_scale(PARAMETER_BP_KD_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
     near("eta", c.duty.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * twins::Q15, 1.0);
-    near("alpha", c.duty.pid.network.inertia_q15, v(PARAMETER_BP_ALPHA) * twins::Q15, 1.0);
+    near("alpha", c.duty.pid.network.inertia_q32, v(PARAMETER_BP_ALPHA) * twins::Q32, 1.0);
 
     const double count = std::ldexp(1.0, 32 - int(encoder_bits));
     const double fastest = twins::rad_s(v(PARAMETER_OVER_SPEED_RPM)) / rate_hz / (2.0 * twins::PI) * twins::TURN;
@@ -133,11 +140,11 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(int32_t(c.trim.pid.seed), p.values[PARAMETER_BP_SEED]);
     near("trim limit", c.trim.limit_q24, v(PARAMETER_BP_TRIM_LIMIT_NM) * twins::Q24, 0.0);
     near("trim error", c.trim.pid.error_scale_inverse_q24, twins::Q24 / scale_Nm, 1.0);
-    near("trim kp", c.trim.pid.kp_scale_q15, trim_scale(PARAMETER_BP_TRIM_KP_MAX), 1.0);
-    near("trim ki", c.trim.pid.ki_scale_q15, trim_scale(PARAMETER_BP_TRIM_KI_MAX), 1.0);
-    near("trim kd", c.trim.pid.kd_scale_q15, trim_scale(PARAMETER_BP_TRIM_KD_MAX), 1.0);
+    near("trim kp", c.trim.pid.scale_q28[0] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KP_MAX), 1.0);
+    near("trim ki", c.trim.pid.scale_q28[1] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KI_MAX), 1.0);
+    near("trim kd", c.trim.pid.scale_q28[2] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KD_MAX), 1.0);
     near("trim eta", c.trim.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * twins::Q15, 1.0);
-    near("trim alpha", c.trim.pid.network.inertia_q15, v(PARAMETER_BP_ALPHA) * twins::Q15, 1.0);
+    near("trim alpha", c.trim.pid.network.inertia_q32, v(PARAMETER_BP_ALPHA) * twins::Q32, 1.0);
 
     const double learn_1_s = p.values[PARAMETER_ANGLE_TRIM] == 1 ? v(PARAMETER_ANGLE_TRIM_RATE_1_S) : 0.0;
     const double turn_rate_hz = std::floor(rate_hz / machine_tables.phases);
@@ -155,9 +162,10 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
         uint32_t(p.values[salient ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S]), rate,
         inertia_q30);
     const load_observer_gains_t &steady = c.bandwidth.gains[OBSERVER_BANDWIDTH_STAGES - 1];
-    ASSERT_EQ(steady.angle_gain_q30, gains.angle_gain_q30);
+    ASSERT_EQ(steady.angle_gain_q28, gains.angle_gain_q28);
     ASSERT_EQ(steady.speed_gain_q24, gains.speed_gain_q24);
-    ASSERT_EQ(steady.torque_gain_q20, gains.torque_gain_q20);
+    ASSERT_EQ(steady.load_gain_q28, gains.load_gain_q28);
+    ASSERT_EQ(steady.load_factor_q4, gains.load_factor_q4);
     const bool wakes = salient && p.values[PARAMETER_OBSERVER_WAKING] == 1 &&
                        p.values[PARAMETER_OBSERVER_WAKE_RAD_S] > p.values[PARAMETER_OBSERVER_STEADY_RAD_S];
     const parameter_index_t widest = wakes     ? PARAMETER_OBSERVER_WAKE_RAD_S
@@ -219,7 +227,7 @@ TEST(Configure, a_machine_whose_current_hardly_rises_gets_the_largest_gain_and_n
     slow.current_rise_A_s = 1;
     parameters_t parameters;
     parameters_init(&parameters);
-    EXPECT_EQ(configure_control(&parameters, &slow, 100000, 17, 12).duty.incoming_gain_q20, INT32_MAX);
+    EXPECT_EQ(configure_control(&parameters, &slow, 100000, 17, 12).duty.incoming_gain_q24, INT32_MAX);
 }
 
 TEST(Configure, allows_the_rates_that_the_timer_makes_exactly) {

@@ -37,8 +37,10 @@ machine_tables_t four_phases() {
     tables.phases = 4;
     tables.rotor_poles = 6;
     std::mt19937 random(1);
-    for (auto &torque : tables.torque_per_ampere.node) {
-        torque = uint16_t(random());
+    for (machine_column_t &column : tables.column) {
+        for (int16_t &torque : column.torque_node) {
+            torque = int16_t(random());
+        }
     }
     return tables;
 }
@@ -96,7 +98,6 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
         const control_parameters_t parameters =
             configure_control(&p, tables, rate_hz, unsigned(8 + random() % 25), 12 + unsigned(sequence) % 5);
         control_state_t state;
-        control_diagnostics_t diagnostics{};
         control_reset(&state);
         bench_t bench;
         bench.angle = uint32_t(random());
@@ -104,7 +105,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
             bench.advance(random, parameters, 1000000 / rate_hz);
             const drive_state_t before = state.machine.state;
             hal_pwm_compare_t compare;
-            const bool closed = control_step(&parameters, &state, &bench.sample, &compare, &diagnostics);
+            const bool closed = control_step(&parameters, &state, &bench.sample, &compare);
             ASSERT_EQ(closed, state.machine.state == DRIVE_STATE_RUN) << "sequence " << sequence;
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
                 const bool exists = phase < tables->phases;
@@ -113,7 +114,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
                 // Both on at a time is the only way to put voltage on a phase: not above its limit.
                 if (compare.upper[phase] + compare.lower[phase] > parameters.period_ticks) {
                     driven++;
-                    ASSERT_LE(diagnostics.current_q9[phase], p.values[PARAMETER_CURRENT_LIMIT_A]) << sequence;
+                    ASSERT_LE(state.estimate.current_q9[phase], p.values[PARAMETER_CURRENT_LIMIT_A]) << sequence;
                 }
             }
             running += closed;
@@ -136,7 +137,6 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
         for (const unsigned bits : {8u, 17u, 32u}) {
             const control_parameters_t parameters = configure_control(&p, &machine_tables, rate_hz, bits, 12);
             control_state_t state;
-            control_diagnostics_t diagnostics{};
             control_reset(&state);
             for (int period = 0; period < 20000; period++) {
                 control_sample_t sample{};
@@ -149,7 +149,7 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
                 sample.time_us = uint32_t(random());
                 sample.command = {command_request_t(random() % 4), int32_t(uint32_t(random())), uint32_t(random())};
                 hal_pwm_compare_t compare;
-                const bool closed = control_step(&parameters, &state, &sample, &compare, &diagnostics);
+                const bool closed = control_step(&parameters, &state, &sample, &compare);
                 ASSERT_EQ(closed, state.machine.state == DRIVE_STATE_RUN);
             }
         }

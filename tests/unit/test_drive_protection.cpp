@@ -148,7 +148,7 @@ TEST_F(Protection, a_still_encoder_says_nothing_at_standstill) {
     for (int k = 0; k < 200000; k++) {
         ASSERT_EQ(check(sample), 0);
     }
-    EXPECT_EQ(protection.unmoved_q64, 0);
+    EXPECT_EQ(protection.unmoved, 0);
 }
 
 TEST_F(Protection, both_directions_give_the_same_checks_on_mirrored_random_motion) {
@@ -169,7 +169,7 @@ TEST_F(Protection, both_directions_give_the_same_checks_on_mirrored_random_motio
         }
         const uint16_t checks = check(sample);
         ASSERT_EQ(protection_check(&PARAMETERS, &mirrored, &mirror), checks) << k;
-        ASSERT_EQ(mirrored.unmoved_q64, protection.unmoved_q64) << k;
+        ASSERT_EQ(mirrored.unmoved, protection.unmoved) << k;
         over_speed += (checks & FAULT_BIT(FAULT_OVER_SPEED)) != 0;
         encoder += (checks & FAULT_BIT(FAULT_ENCODER)) != 0;
     }
@@ -196,7 +196,7 @@ TEST_F(Protection, an_encoder_frozen_for_ever_does_not_overflow_its_account) {
     sample.speed_q22 = INT32_MAX;
     for (int k = 0; k < 1000; k++) {
         check(sample);
-        ASSERT_GE(protection.unmoved_q64, 0);
+        ASSERT_GE(protection.unmoved, 0);
     }
     EXPECT_EQ(check(sample), FAULT_BIT(FAULT_ENCODER) | FAULT_BIT(FAULT_OVER_SPEED));
 }

@@ -23,6 +23,7 @@ struct hal {
     uint32_t encoder_counts = 1000;
     uint32_t time_us = 0;
     uint32_t missed = 0;
+    uint32_t elapsed_ticks = 0;
     std::deque<hal_can_frame_t> to_drive;
     std::vector<hal_can_frame_t> from_drive;
     std::vector<uint16_t> starts;
@@ -74,6 +75,9 @@ uint32_t hal_pwm_missed_interrupts(hal_t *hal) {
     const uint32_t missed = hal->missed;
     hal->missed = 0;
     return missed;
+}
+uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
+    return hal->elapsed_ticks;
 }
 bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {
     if (hal->to_drive.empty()) {
@@ -193,13 +197,75 @@ TEST_F(Drive, lost_interrupts_reach_the_protection) {
     EXPECT_EQ(drive.control.machine.record.fault, FAULT_INTERRUPT_OVERRUN);
 }
 
+TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {
+    const auto late = [this](int count) {
+        for (int k = 0; k < count; k++) {
+            hal.missed = 1;
+            hal.time_us += 25;
+            periods(1);
+        }
+    };
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    late(2);
+    periods(1);
+    late(2);
+    EXPECT_FALSE(hal.open);
+    EXPECT_EQ(drive.late_interrupts, 4u);
+    late(1);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+    EXPECT_EQ(drive.control.machine.record.checks, FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
+    EXPECT_EQ(drive.late_interrupts, 5u);
+}
+
+TEST_F(Drive, an_interrupt_that_loses_three_triggers_is_one_late_interrupt_and_a_fault) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    hal.missed = 3;
+    hal.time_us += 75;
+    periods(1);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+    EXPECT_EQ(drive.late_interrupts, 1u);
+}
+
+TEST_F(Drive, its_time_on_the_processor_is_kept_reported_and_acted_upon_by_nobody) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    hal.elapsed_ticks = 70000; // far beyond the period, and yet no trigger was lost
+    periods(1);
+    hal.elapsed_ticks = 1234;
+    hal.from_drive.clear();
+    periods(4000 + 40);
+    EXPECT_EQ(drive.used_ticks, 1234u);
+    EXPECT_EQ(drive.worst_ticks, 70000u);
+    EXPECT_EQ(drive.late_interrupts, 0u);
+    unsigned seen = 0;
+    for (const hal_can_frame_t &frame : hal.from_drive) {
+        if (frame.identifier == DRIVE_DRIVE_PROCESSOR_FRAME_ID) {
+            drive_drive_processor_t processor{};
+            drive_drive_processor_unpack(&processor, frame.data, frame.length);
+            EXPECT_EQ(processor.used_us, 1234);
+            EXPECT_EQ(processor.worst_us, 65535) << "held at its end";
+            EXPECT_EQ(processor.available_us, 5000);
+            EXPECT_EQ(processor.late_interrupts, 0);
+            seen++;
+        }
+    }
+    EXPECT_EQ(seen, 1u);
+}
+
 TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
     periods(100);
     EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 5 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_DONE_CHOICE);
     EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
     command(COMMAND_RUN);
     periods(3);
-    EXPECT_EQ(drive.diagnostics.torque_reference_q24, 5 << 24);
+    EXPECT_EQ(drive.control.torque_reference_q24, 5 << 24);
     EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 6 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_NOT_WHILE_RUNNING_CHOICE);
     EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
 }
@@ -213,7 +279,7 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
     periods(1000);
     hal.from_drive.clear();
     periods(400); // a whole slow cycle
-    const control_diagnostics_t &d = drive.diagnostics;
+    const control_diagnostics_t d = control_diagnose(&drive.control_parameters, &drive.control);
     unsigned seen = 0;
     for (const hal_can_frame_t &frame : hal.from_drive) {
         if (frame.identifier == DRIVE_DRIVE_STATUS_FRAME_ID) {
@@ -244,9 +310,9 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
             drive_drive_bp_pid_t pid{};
             drive_drive_bp_pid_unpack(&pid, frame.data, frame.length);
             const double inverse = drive.control_parameters.duty.pid.error_scale_inverse_q24 / 16777216.0;
-            EXPECT_NEAR(pid.kp_per_nm, drive.control.duty.pid.gain_q15[0] * inverse, 0.51);
-            EXPECT_NEAR(pid.ki_per_nm, drive.control.duty.pid.gain_q15[1] * inverse, 0.51);
-            EXPECT_NEAR(pid.kd_per_nm, drive.control.duty.pid.gain_q15[2] * inverse, 0.51);
+            EXPECT_NEAR(pid.kp_per_nm, drive.control.duty.pid.gain_q24[0] / 512.0 * inverse, 0.51);
+            EXPECT_NEAR(pid.ki_per_nm, drive.control.duty.pid.gain_q24[1] / 512.0 * inverse, 0.51);
+            EXPECT_NEAR(pid.kd_per_nm, drive.control.duty.pid.gain_q24[2] / 512.0 * inverse, 0.51);
             EXPECT_NE(pid.kp_per_nm, pid.ki_per_nm);
             EXPECT_NE(pid.ki_per_nm, pid.kd_per_nm);
             seen |= 8;
@@ -282,11 +348,11 @@ TEST_F(Drive, a_run_of_a_sender_long_silent_starts_nothing_when_the_clock_comes_
     command(COMMAND_RUN);
     periods(10);
     ASSERT_EQ(drive.control.machine.state, DRIVE_STATE_INITIALISE);
-    ASSERT_EQ(drive.command.request, COMMAND_RUN);
+    ASSERT_EQ(drive.sample.command.request, COMMAND_RUN);
     periods(10000); // 0.25 s of silence
-    EXPECT_EQ(drive.command.request, COMMAND_OFF);
+    EXPECT_EQ(drive.sample.command.request, COMMAND_OFF);
 
-    hal.time_us = drive.command.time_us; // 71 minutes later the command looks new
+    hal.time_us = drive.sample.command.time_us; // 71 minutes later the command looks new
     hal.adc.bus_voltage_counts = 240 * 8;
     periods(200);
     EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);

@@ -1,5 +1,7 @@
 // Saturating arithmetic against 128-bit integers.
+#include <cmath>
 #include <cstdint>
+#include <cstdlib>
 #include <random>
 #include <vector>
 
@@ -68,6 +70,44 @@ TEST(FixedArithmetic, sum_difference_and_magnitude_saturate) {
             ASSERT_EQ(fixed_subtract(a, b), saturated(wide_t(a) - b)) << a << " - " << b;
         }
     }
+}
+
+TEST(FixedArithmetic, products_are_whole_wrap_in_a_sum_and_are_rounded_in_the_high_word) {
+    const std::vector<int32_t> values = samples(7, 300);
+    for (const int32_t a : values) {
+        for (const int32_t b : values) {
+            const wide_t product = wide_t(a) * b;
+            ASSERT_EQ(fixed_product(a, b), int64_t(product));
+            ASSERT_EQ(fixed_multiply_high(a, b), int32_t(halves_up(product, 32))) << a << " * " << b;
+            for (const int64_t sum : {int64_t(0), int64_t(-1), INT64_MAX, INT64_MIN}) {
+                ASSERT_EQ(fixed_accumulate(sum, a, b), int64_t(uint64_t(sum) + uint64_t(int64_t(product))));
+            }
+        }
+    }
+}
+
+TEST(FixedArithmetic, narrow_rounds_down_what_fits_and_holds_the_rest_within_the_last_bits_of_the_end) {
+    const auto expect = [](int64_t value, unsigned shift, int32_t narrowed) {
+        const wide_t exact = (wide_t(value) - (value < 0 ? (wide_t(1) << shift) - 1 : 0)) / (wide_t(1) << shift);
+        if (saturated(exact) == exact) {
+            ASSERT_EQ(narrowed, exact) << value << " >> " << shift;
+        } else {
+            ASSERT_LE(std::abs(double(narrowed) - double(saturated(exact))), std::ldexp(1.0, int(32 - shift)));
+        }
+    };
+    const std::vector<int32_t> values = samples(8, 300);
+    for (const int32_t a : values) {
+        for (const int32_t b : values) {
+            const int64_t value = int64_t(a) * b;
+            expect(value, 1, fixed_narrow(value, 1));
+            expect(value, 4, fixed_narrow(value, 4));
+            expect(value, 14, fixed_narrow(value, 14));
+            expect(value, 28, fixed_narrow(value, 28));
+            expect(value, 31, fixed_narrow(value, 31));
+        }
+    }
+    EXPECT_GT(fixed_narrow(INT64_MAX, 28), INT32_MAX - 16);
+    EXPECT_LT(fixed_narrow(INT64_MIN, 28), INT32_MIN + 16);
 }
 
 TEST(FixedArithmetic, shift_rounds_halves_towards_plus_infinity) {

@@ -278,6 +278,28 @@ TEST_F(RigQuantities, InterruptBeyondItsPeriodLosesInterruptsAndKeepsCompares) {
     EXPECT_EQ(bench.firmware.missed, 4u) << "the one that was running when the quantity changed";
 }
 
+TEST_F(RigQuantities, TheInterruptIsToldItsTimeAndMayBeLonger) {
+    EXPECT_EQ(set(4, 1000), DONE); // 10 us of 25
+    bench.run_to(*client, 30 * 1000);
+    EXPECT_EQ(bench.rig->board.interrupt_took_ns, 10000u);
+    bench.firmware.takes_ns = 25001; // a processor that takes time of its own: until 75.001 us
+    bench.run_to(*client, 75 * 1000);
+    EXPECT_EQ(bench.firmware.missed, 0u);
+    EXPECT_EQ(bench.rig->board.missed_interrupts, 1u);
+    bench.firmware.takes_ns = 25000; // ends with its period
+    bench.run_to(*client, 125 * 1000);
+    EXPECT_EQ(bench.firmware.interrupt_times_ns, (std::vector<uint64_t>{25000, 50000, 100000, 125000}));
+    EXPECT_EQ(bench.firmware.background_times_ns, (std::vector<uint64_t>{35000, 75001}));
+    EXPECT_EQ(bench.firmware.missed, 1u);
+}
+
+TEST_F(RigQuantities, TriggersThatTheProcessorDoesNotServeAreLost) {
+    rig_busy_until(bench.rig.get(), 75000);
+    bench.run_to(*client, 100 * 1000);
+    EXPECT_EQ(bench.firmware.interrupt_times_ns, (std::vector<uint64_t>{75000, 100000}));
+    EXPECT_EQ(bench.firmware.missed, 2u);
+}
+
 TEST_F(RigQuantities, ComparesActInTheNextPeriodOrAtOnceOnABoardWithoutThatDelay) {
     // The stand-in firmware has the lower switch of phase 1 on for whole periods.
     bench.run_to(*client, 49 * 1000);

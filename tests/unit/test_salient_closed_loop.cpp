@@ -170,8 +170,8 @@ TEST(SalientClosedLoop, reverses_from_600_to_minus_600_rpm_and_back_without_faul
     for (const double reference_rpm : {600.0, -600.0, 600.0}) {
         bench.reference_rpm = reference_rpm;
         const double side = reference_rpm > 0.0 ? 1.0 : -1.0, from_s = at_s;
-        double last_q24[2] = {bench.drive.diagnostics.torque_reference_q24 / twins::Q24,
-                              bench.drive.diagnostics.torque_reference_q24 / twins::Q24};
+        double last_q24[2] = {bench.drive.state.torque_reference_q24 / twins::Q24,
+                              bench.drive.state.torque_reference_q24 / twins::Q24};
         for (at_s += 25e-6; at_s < from_s + 0.3; at_s += 25e-6) {
             bench.run_until(at_s);
             ASSERT_NE(bench.drive.state.machine.state, DRIVE_STATE_FAULT) << at_s;
@@ -186,7 +186,7 @@ TEST(SalientClosedLoop, reverses_from_600_to_minus_600_rpm_and_back_without_faul
                 braking_most_Nm = std::max(braking_most_Nm, side * torque_Nm);
             }
             last_q24[1] = last_q24[0];
-            last_q24[0] = bench.drive.diagnostics.torque_reference_q24 / twins::Q24;
+            last_q24[0] = bench.drive.state.torque_reference_q24 / twins::Q24;
         }
         EXPECT_NEAR(rpm(bench.plant.speed_rad_s), reference_rpm, 0.1) << "when it has settled";
     }
@@ -281,7 +281,7 @@ TEST(SalientClosedLoop, three_times_the_inertia_does_not_keep_the_observer_awake
     unsigned awake = 0, periods = 0;
     for (double at_s = 0.8; at_s < 1.3; at_s += 25e-6, periods++) {
         bench.run_until(at_s);
-        awake += !observer_bandwidth_steady(&bench.drive.state.bandwidth);
+        awake += !observer_bandwidth_steady(&bench.drive.parameters.bandwidth, &bench.drive.state.bandwidth);
     }
     const double ripple = bench.trace.ripple(0.8, 1.3);
     std::printf("%-20s three times the inertia: awake %.2f %% of the time, ripple %.4f\n", machine_plant.name,

@@ -18,7 +18,9 @@ constexpr double Q15 = 32768.0;
 constexpr double Q16 = 65536.0;
 constexpr double Q20 = 1048576.0;
 constexpr double Q22 = 4194304.0;
+constexpr double Q23 = 8388608.0;
 constexpr double Q24 = 16777216.0;
+constexpr double Q27 = 134217728.0;
 constexpr double Q28 = 268435456.0;
 constexpr double Q30 = 1073741824.0;
 constexpr double Q31 = 2147483648.0;
@@ -104,7 +106,7 @@ struct observer_t {
         angle += angle_gain * error;
         correction = speed_gain * error;
         const double corrected = speed + correction;
-        load_torque = std::clamp(load_torque - torque_gain * error, -60.0, 60.0);
+        load_torque = std::clamp(load_torque - torque_gain * error, -64.0, 64.0);
         speed = corrected + acceleration * (torque - friction * corrected - load_torque);
         angle += angle_step * 0.5 * (corrected + speed);
     }
@@ -404,7 +406,7 @@ struct bp_pid_t {
     double error_scale_inverse;
     std::array<double, 3> scale; // kp, ki, kd
     double eta, alpha;
-    double scaled_limit = 32767.0 / 32768.0;
+    double scaled_limit = 65535.0 / 65536.0;
     network_t network{};
     double error = 0.0, previous = 0.0, duty = 0.0;
     std::array<double, 3> gain{};

@@ -34,6 +34,17 @@ static void put_option(FILE *list, const char *key, const char *value) {
     }
 }
 
+/* 2^shift is the number; -1: it is none that is allowed. */
+static int shift_of(const char *number) {
+    static const char *const powers[] = {"1", "2", "4", "8", "16", "32", "64"};
+    for (int shift = 0; shift < (int)(sizeof powers / sizeof powers[0]); ++shift) {
+        if (strcmp(number, powers[shift]) == 0) {
+            return shift;
+        }
+    }
+    return -1;
+}
+
 /* The board that an image is for; NULL: one line on stderr said why. */
 static const board_description_t *board_of(const char *image) {
     FILE *file = fopen(image, "rb");
@@ -57,26 +68,44 @@ static const board_description_t *board_of(const char *image) {
 
 int main(int argc, char *argv[]) {
     if (argc < 2 || strcmp(argv[1], "--help") == 0) {
-        printf("usage: %s IMAGE.elf [--instructions FILE] [--profile FILE] OPTION...\n"
+        printf("usage: %s IMAGE.elf [--instructions FILE] [--execution FILE STACK] [--instruction-ns N] OPTION...\n"
                "  IMAGE.elf            the drive, as built for a board of QEMU\n"
                "  --instructions FILE  writes the instructions of each control interrupt, a uint32_t each\n"
-               "  --profile FILE       writes a line for each function: its instructions in all control interrupts\n"
+               "  --execution FILE STACK  writes how often each block of instructions was executed and how far\n"
+               "                       down the stack was written to, whose end and beginning STACK are: END-BEGIN\n"
+               "  --instruction-ns N   an instruction takes so long, a power of two up to 64; without it the drive\n"
+               "                       takes no time\n"
                "  OPTION               as the host executable's; its --help lists them\n",
                argv[0]);
         return argc < 2 ? EXIT_MISTAKE : 0;
     }
-    const char *image = argv[1], *instructions = NULL, *profile = NULL;
+    const char *image = argv[1], *instructions = NULL, *execution = NULL, *stack = NULL, *instruction_ns = NULL;
     int first = 2;
     if (argc > first + 1 && strcmp(argv[first], "--instructions") == 0) {
         instructions = argv[first + 1];
         first += 2;
     }
-    if (argc > first + 1 && strcmp(argv[first], "--profile") == 0) {
-        profile = argv[first + 1];
+    if (argc > first + 2 && strcmp(argv[first], "--execution") == 0) {
+        execution = argv[first + 1];
+        stack = argv[first + 2];
+        first += 3;
+    }
+    if (argc > first + 1 && strcmp(argv[first], "--instruction-ns") == 0) {
+        instruction_ns = argv[first + 1];
         first += 2;
     }
     const board_description_t *board = board_of(image);
     if (!board) {
+        return EXIT_MISTAKE;
+    }
+    const int shift = instruction_ns ? shift_of(instruction_ns) : 0;
+    if (shift < 0) {
+        fprintf(stderr, "salient: --instruction-ns %s: allowed are 1, 2, 4, 8, 16, 32 and 64\n", instruction_ns);
+        return EXIT_MISTAKE;
+    }
+    if (instruction_ns && !board->timer) {
+        fprintf(stderr, "salient: --instruction-ns %s: not on the board %s, whose port uses no timer\n", instruction_ns,
+                board->machine);
         return EXIT_MISTAKE;
     }
     const int memory = memfd_create("salient mailbox", 0); /* inherited by QEMU, gone with it */
@@ -98,8 +127,12 @@ int main(int argc, char *argv[]) {
     if (instructions) {
         put_option(list, "instructions", instructions);
     }
-    if (profile) {
-        put_option(list, "profile", profile);
+    if (execution) {
+        put_option(list, "execution", execution);
+        put_option(list, "stack", stack);
+    }
+    if (instruction_ns) {
+        fputs(",timed=1", list);
     }
     for (int i = first; i < argc; ++i) {
         put_option(list, "argument", argv[i]);
@@ -113,9 +146,12 @@ int main(int argc, char *argv[]) {
         }
         snprintf(card, sizeof card, "socket,model=%s,fd=%d", board->network_card, network[0]);
     }
+    /* The clock of the board's timers counts instructions, and nothing else. */
+    char clock[64];
+    snprintf(clock, sizeof clock, "shift=%d,align=off,sleep=off", shift);
     execlp(board->program, board->program, "-nodefaults", "-display", "none", "-nic", card, "-machine", machine,
            "-object", object, "-semihosting-config", "enable=on,target=native", "-bios", "none", "-kernel", image,
-           "-plugin", plugin, (char *)NULL);
+           "-plugin", plugin, instruction_ns ? "-icount" : (char *)NULL, clock, (char *)NULL);
     char name[64];
     snprintf(name, sizeof name, "%s (Debian package %s)", board->program, board->package);
     return mistake(name);

@@ -72,6 +72,7 @@ def _sim(options: argparse.Namespace) -> int:
             pace=options.pace,
             bit_rate=options.bit_rate,
             build=options.target,
+            instruction_ns=options.instruction_ns,
         ).arguments(options.can)
     except SimulatorError as error:
         print(f"salient: {error}", file=sys.stderr)
@@ -84,7 +85,8 @@ def _run(options: argparse.Namespace) -> int:
 
     scenarios = load_scenarios(options.scenario)
     out = options.out or Path("out") / options.scenario.stem
-    results = run_all(scenarios, out, build=options.target, progress=lambda line: print(line, flush=True))
+    results = run_all(scenarios, out, build=options.target, instruction_ns=options.instruction_ns,
+                      progress=lambda line: print(line, flush=True))
     print(f"results: {out / 'results.json'}")
     faults = [f"{controller}: {result.fault}" for controller, result in results.items() if result.fault != "none"]
     if faults:
@@ -123,6 +125,12 @@ def _machine(options: argparse.Namespace) -> int:
     return run(options.machine, options.out)
 
 
+def _pil(options: argparse.Namespace) -> int:
+    from salient.pil import run
+
+    return run(options)
+
+
 _COMMANDS = {
     "demo": _demo,
     "test": _test,
@@ -133,6 +141,7 @@ _COMMANDS = {
     "bench": _bench,
     "compare": _compare,
     "machine": _machine,
+    "pil": _pil,
 }
 
 if __name__ == "__main__":

@@ -14,8 +14,10 @@ CONTROLLERS = ("traditional", "paper", "salient")
 CONTROL_RATES_HZ = (20_000, 40_000, 50_000, 100_000, 1_000_000)
 ENCODER_BITS = (0, *range(8, 25))
 ADC_BITS = (12, 13, 14, 15, 16)
-TARGETS = ("host", "cortex-m4")
-"""Where the firmware runs: in the bench's own process, or on a Cortex-M4 that QEMU emulates."""
+TARGETS = ("host", "cortex-m4", "rv32")
+"""Where the firmware runs: in the bench's own process, or on a Cortex-M4 or RV32 that QEMU emulates."""
+INSTRUCTION_NS = (1, 2, 4, 8, 16, 32, 64)
+"""What an instruction of the Cortex-M4 may take; QEMU knows powers of two."""
 LOG_SUFFIXES = (".blf", ".log")
 
 
@@ -75,11 +77,13 @@ def make_parser() -> argparse.ArgumentParser:
     sim.add_argument("--bit-rate", type=int, default=1_000_000, metavar="N", help="of the bus, default 1000000")
 
     _add_target(sim)
+    _add_instruction_ns(sim)
 
     run = command("run", "one scenario, to a folder")
     run.add_argument("scenario", type=Path, metavar="SCENARIO.toml")
     run.add_argument("--out", type=Path, metavar="DIR", help="folder (default out/NAME)")
     _add_target(run)
+    _add_instruction_ns(run)
 
     log = command("log", "record a running bus until it ends, or is interrupted")
     log.add_argument("--can", type=_can, default="auto", metavar="BUS", help="as with sim")
@@ -102,16 +106,33 @@ def make_parser() -> argparse.ArgumentParser:
     machine.add_argument("machine", metavar="NAME|FILE")
     machine.add_argument("--out", type=Path, default=Path("out/machine"), metavar="DIR",
                          help="folder of the picture (default out/machine)")
+
+    pil = command("pil", "processor in the loop: a scenario on the target, and what the processor did")
+    pil.add_argument("scenario", type=Path, nargs="?", metavar="SCENARIO.toml")
+    pil.add_argument("--out", type=Path, metavar="DIR", help="folder (default out/pil_NAME)")
+    pil.add_argument("--target", type=_one_of(TARGETS[1:]), default=TARGETS[1], metavar="NAME",
+                     help=f"{', '.join(TARGETS[1:])} (default {TARGETS[1]})")
+    pil.add_argument("--search", type=_positive, metavar="SECONDS",
+                     help="instead: look for dearer interrupts than those known, so long for each controller")
+    pil.add_argument("--seed", type=_seed, default=1, metavar="N", help="of the search, default 1")
+    pil.add_argument("--figures", action="store_true",
+                     help="instead: measure the committed figures of the target again and write them")
     return parser
 
 
-TEST_STEPS = ("style", "unit", "sanitize", "cortex-m4", "hil", "socketcan")
+TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "socketcan")
 """The steps of `test`, in order."""
 
 
 def _add_target(command: argparse.ArgumentParser) -> None:
     command.add_argument("--target", type=_one_of(TARGETS), default="host", metavar="NAME",
-                         help="host (default) or cortex-m4: the same firmware in QEMU")
+                         help="host (default), or cortex-m4 or rv32: the same firmware in QEMU")
+
+
+def _add_instruction_ns(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--instruction-ns", type=_one_of(INSTRUCTION_NS), metavar="N",
+                         help="what an instruction takes on the cortex-m4: 1, 2, 4, 8, 16, 32 or 64; without it "
+                         "the drive takes no time")
 
 
 def _one_of(allowed: tuple):

@@ -26,7 +26,7 @@ SIMULATED_S = 0.9
 _SETTLE_S = 0.2
 _CONTROL_RATE_HZ = 40_000
 _COUNTED_S = 0.1
-_FUNCTIONS_SHOWN = 6
+_PARTS_SHOWN = 6
 _COMMAND_TIMEOUT_MS = 1000.0
 _BEGUN_S = 1e-3
 """Of processor time: more than taking a request needs, less than what it asks for."""
@@ -158,11 +158,11 @@ def _cortex_m4() -> dict[str, Any]:
     figures = {}
     for controller in CONTROLLERS:
         cost = interrupt_cost.measure(controller)
-        made, parts = cost.figures(), cost.by_function()
-        figures[controller] = made | {"mean_by_function": {name: round(mean, 1) for name, mean in parts.items()}}
+        made, parts = cost.figures(), cost.mean_by_part()
+        figures[controller] = made | {"mean_by_part": {name: round(mean, 1) for name, mean in parts.items()}}
         print(f"  {controller:<12} typical {made['typical']:5d}  99 % up to {made['of_99_percent']:5d}"
               f"  worst {made['worst']:5d}; of the mean: "
-              + ", ".join(f"{name} {mean:.0f}" for name, mean in list(parts.items())[:_FUNCTIONS_SHOWN]), flush=True)
+              + ", ".join(f"{name} {mean:.0f}" for name, mean in list(parts.items())[:_PARTS_SHOWN]), flush=True)
     return figures
 
 

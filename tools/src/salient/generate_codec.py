@@ -50,9 +50,18 @@ def c_type(signal: Signal) -> str:
     return f"{'' if signal.is_signed else 'u'}int{bits}_t"
 
 
+_HELD = {
+    f"held{bits}": "/* raw, or the end of low..high that it is beyond. In each setter it would take half a\n"
+    " * kilobyte of flash. */\n"
+    f"static __attribute__((noinline)) int{bits}_t held{bits}(int64_t raw, int{bits}_t low, int{bits}_t high)\n{{\n"
+    f"    return raw < low ? low : raw > high ? high : (int{bits}_t)raw;\n}}\n"
+    for bits in (32, 64)
+}
+
+
 def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
     """Declarations and definitions of the saturating setters of all integer signals."""
-    declarations, definitions = [], []
+    declarations, definitions, used = [], [], set()
     for message in database.messages:
         message_name = f"{prefix}_{camel_to_snake_case(message.name)}"
         for signal in message.signals:
@@ -67,11 +76,11 @@ def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
             declarations.append(
                 f"/* {message.name}.{signal.name} = raw held within {low}..{high}{unit}. */\n{prototype};\n"
             )
+            held = "held32" if low >= -(2**31) and high < 2**31 else "held64"
+            used.add(held)
             definitions.append(
-                f"{prototype}\n{{\n"
-                f"    if (raw < {integer_literal(low)}) {{\n        raw = {integer_literal(low)};\n    }}\n"
-                f"    if (raw > {integer_literal(high)}) {{\n        raw = {integer_literal(high)};\n    }}\n"
-                f"    message->{field} = ({c_type(signal)})raw;\n}}\n"
+                f"{prototype}\n{{\n    message->{field} = ({c_type(signal)}){held}(raw, {integer_literal(low)}, "
+                f"{integer_literal(high)});\n}}\n"
             )
             if integer:
                 continue
@@ -87,7 +96,7 @@ def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
                 f"    raw = raw > {float(low)!r} ? raw : {float(low)!r};\n"
                 f"    {message_name}_set_{field}(message, llround(raw));\n}}\n"
             )
-    return "\n".join(declarations), "\n".join(definitions)
+    return "\n".join(declarations), "\n".join([*(_HELD[held] for held in sorted(used)), *definitions])
 
 
 def generate_codec(dbc: Path, integer: bool) -> dict[str, str]:

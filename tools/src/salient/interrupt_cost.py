@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import tempfile
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from salient.execution import Execution, read_execution
 from salient.paths import SCENARIOS
-from salient.scenario import load_scenarios, run_scenario
+from salient.scenario import RunResult, Scenario, load_scenarios, run_scenario
+from salient.simulator import image
 
 EXPERIMENTS = ("start_600", "load_step_150")
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Instructions from the handler's first to its return: of each interrupt, and of all by function, each without what
-    it calls and with what is inlined in it."""
+    """interrupts: instructions of each, from the handler's first to its return. execution: of the same runs."""
 
     interrupts: np.ndarray
-    functions: Counter[str]
+    execution: Execution
+
+    def __add__(self, other: Cost) -> Cost:
+        """Both runs of one image."""
+        return Cost(np.concatenate((self.interrupts, other.interrupts)), self.execution + other.execution)
 
     def figures(self) -> dict[str, int]:
         """Typical (half of the interrupts take no more), of 99 in 100, and worst."""
@@ -29,22 +33,29 @@ class Cost:
                 "of_99_percent": int(np.percentile(self.interrupts, 99, method="inverted_cdf")),
                 "worst": int(self.interrupts.max())}
 
-    def by_function(self) -> dict[str, float]:
-        """Instructions an interrupt in the mean, the largest first."""
-        return {name: count / len(self.interrupts) for name, count in self.functions.most_common()}
+    def mean_by_part(self) -> dict[str, float]:
+        """Instructions an interrupt in the mean, the largest first (Execution.by_part)."""
+        return {name: count / len(self.interrupts) for name, count in self.execution.by_part().most_common()}
+
+
+def read_cost(interrupts: Path, execution: Path, machine: str, build: str) -> Cost:
+    """What a run has left in the files SimulatorOptions.instructions and execution."""
+    return Cost(np.fromfile(interrupts, "<u4"), read_execution(execution, image(machine, build)))
+
+
+def measure_run(scenario: Scenario, out_dir: Path, build: str = "cortex-m4") -> tuple[RunResult, Cost]:
+    """Runs a scenario as run_scenario does, counting. build: of TARGET_BUILDS."""
+    with tempfile.TemporaryDirectory(prefix="salient-") as name:
+        counted, executed = Path(name) / "instructions", Path(name) / "execution"
+        result = run_scenario(scenario, out_dir, build=build, instructions=counted, execution=executed)
+        return result, read_cost(counted, executed, scenario.machine, build)
 
 
 def measure(controller: str, build: str = "cortex-m4") -> Cost:
     """Of the paper's two experiments, one behind the other. build: of TARGET_BUILDS."""
-    interrupts, functions = [], Counter()
+    costs = []
     for experiment in EXPERIMENTS:
         (scenario,) = (one for one in load_scenarios(SCENARIOS / f"{experiment}.toml") if one.controller == controller)
-        with tempfile.TemporaryDirectory(prefix="salient-") as name:
-            folder = Path(name)
-            run_scenario(scenario, folder / "run", build=build, instructions=folder / "instructions",
-                         profile=folder / "profile")
-            interrupts.append(np.fromfile(folder / "instructions", "<u4"))
-            for line in (folder / "profile").read_text(encoding="utf-8").splitlines():
-                count, function = line.split(" ", 1)
-                functions[function] += int(count)
-    return Cost(np.concatenate(interrupts), functions)
+        with tempfile.TemporaryDirectory(prefix="salient-") as folder:
+            costs.append(measure_run(scenario, Path(folder), build)[1])
+    return costs[0] + costs[1]

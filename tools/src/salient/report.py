@@ -71,7 +71,7 @@ def write_report(path: Path, results: Mapping[str, Any], pictures: Sequence[Pict
     [(words, path relative to the page), ...]), linked. Equal input gives equal bytes.
     """
     page = _PAGE.substitute(
-        style=_STYLE,
+        style=STYLE,
         headline=_headline(results),
         tiles=_tiles(results),
         tables="\n".join(_table(results, experiment) for experiment in results["experiments"]),
@@ -272,7 +272,8 @@ def _conditions(conditions: Mapping[str, Any]) -> str:
     return "<table class=conditions><tbody>" + "\n".join(rows("", conditions)) + "</tbody></table>"
 
 
-_STYLE = """
+# Of every page that a command writes.
+STYLE = """
 :root { color-scheme: light; font-size: 16px; }
 body { margin: 0 auto; max-width: 1060px; padding: 2.2rem 1.4rem 4rem; background: #fff; color: #222;
        font: 1rem/1.55 system-ui, "Segoe UI", "Liberation Sans", "DejaVu Sans", sans-serif; }

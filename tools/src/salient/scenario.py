@@ -132,16 +132,17 @@ _RECORDING, _LOG, _TEXT_LOG = "recording.npy", "can.blf", "can.log"
 
 
 def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: str = "host",
-                 instructions: Path | None = None, profile: Path | None = None) -> RunResult:
+                 instructions: Path | None = None, execution: Path | None = None,
+                 instruction_ns: int | None = None) -> RunResult:
     """Runs a scenario in lock-step and leaves recording.npy, can.blf and can.log in out_dir, which is made if needed.
 
     can: "local" for a bus of its own, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; parameters
     are written first, then the commands follow; the bench's quantities are set before all. For build, instructions,
-    profile see SimulatorOptions. UsageError for what the drive does not know or refuses.
+    execution, instruction_ns see SimulatorOptions. UsageError for what the drive does not know or refuses.
     """
     recording_path = out_dir / _RECORDING if scenario.record else None
     options = replace(_simulator_options(scenario, recording_path, build), instructions=instructions,
-                      profile=profile)
+                      execution=execution, instruction_ns=instruction_ns)
     writes = _parameter_writes(scenario, options)
     out_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
@@ -219,7 +220,8 @@ def _check_parameters_taken(bench: Bench, count: int) -> None:
 def summary(result: RunResult) -> dict[str, Any]:
     """Figures of a run in general: speeds and torques over the recording (or, without one, the true state on CAN).
 
-    With a recording also its losses (metrics.losses), from its first row to its last.
+    With a recording also its losses (metrics.losses), from its first row to its last; of a processor that takes time
+    also the control interrupt's longest, what it has, and how many were late.
     """
     source: Any = result.recording
     if source is None:
@@ -234,6 +236,13 @@ def summary(result: RunResult) -> dict[str, Any]:
         "frames": result.telemetry.count("DRIVE_STATUS"),
         "fault": result.fault,
     }
+    worst_us = result.telemetry["DRIVE_PROCESSOR.worst_us"].last
+    if worst_us > 0:
+        figures["processor"] = {
+            "worst_us": worst_us,
+            "available_us": result.telemetry["DRIVE_PROCESSOR.available_us"].last,
+            "late_interrupts": int(result.telemetry["DRIVE_PROCESSOR.late_interrupts"].last),
+        }
     if result.recording is not None and len(result.recording) > 1:
         window_s = (float(result.recording["time_s"][0]), float(result.recording["time_s"][-1]))
         figures["losses"] = losses(result.recording, load_machine(machine_path(result.scenario.machine)), window_s)
@@ -241,15 +250,28 @@ def summary(result: RunResult) -> dict[str, Any]:
 
 
 def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build: str = "host",
+            instruction_ns: int | None = None,
             progress: Callable[[str], None] = lambda line: None) -> dict[str, RunResult]:
-    """Runs the scenarios of one file, each into out_dir/CONTROLLER, and writes out_dir/results.json. build: see
-    SimulatorOptions."""
-    for scenario in scenarios:  # so that a mistake is named before the first run
-        _parameter_writes(scenario, _simulator_options(scenario, None, build))
+    """Runs the scenarios of one file, each into out_dir/CONTROLLER, and writes out_dir/results.json. build,
+    instruction_ns: see SimulatorOptions."""
+    check_parameters(scenarios, build)
     results = {}
     for scenario in scenarios:
         progress(f"{scenario.name}: {scenario.controller}, {scenario.duration_s:g} s of virtual time")
-        results[scenario.controller] = run_scenario(scenario, out_dir / scenario.controller, can, build)
+        results[scenario.controller] = run_scenario(scenario, out_dir / scenario.controller, can, build,
+                                                    instruction_ns=instruction_ns)
+    write_summaries(scenarios, results, out_dir)
+    return results
+
+
+def check_parameters(scenarios: list[Scenario], build: str) -> None:
+    """UsageError for parameters that the drive does not know or would refuse, before the first run."""
+    for scenario in scenarios:
+        _parameter_writes(scenario, _simulator_options(scenario, None, build))
+
+
+def write_summaries(scenarios: list[Scenario], results: dict[str, RunResult], out_dir: Path) -> None:
+    """Writes out_dir/results.json for the runs of one file by controller."""
     content = {
         "schema": 1,
         "scenario": {key: value for key, value in asdict(scenarios[0]).items() if key != "controller"},
@@ -257,7 +279,6 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build:
     }
     text = json.dumps(content, indent=2, sort_keys=True) + "\n"
     (out_dir / "results.json").write_text(text, encoding="utf-8")
-    return results
 
 
 # --- reading --------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Starts a drive and its bench in one process: the host executable, or QEMU with the image for the Cortex-M4."""
+"""Starts a drive and its bench in one process: the host executable, or QEMU with an image for one of its boards."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 
 from salient.drive import ParameterRow, read_parameter_table
 from salient.errors import UsageError
+from salient.image import Image
 from salient.machine import MachineError, load_machine, machine_path
 from salient.paths import BUILD, MACHINES, ROOT
 from salient.phase_map import machine_phase_map
@@ -20,8 +21,8 @@ from salient.session import Session
 
 _END_TIMEOUT_S = 60.0
 
-TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os")
-"""The image for the Cortex-M4 as it is meant to be, without optimisation, and optimised for size."""
+TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os", "rv32")
+"""The image for the Cortex-M4 as it is meant to be, without optimisation, and optimised for size; that for RV32."""
 
 
 class SimulatorError(Exception):
@@ -36,9 +37,10 @@ class SimulatorOptions:
     the encoder's edges. adc_bits: 12..16. immediate_pwm: what the control writes acts at once, as with no converter
     there is; it is for the conditions of simulations. record: file for the true state
     (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
-    period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a Cortex-M4 in QEMU. instructions: file
-    for the instructions of each control interrupt, uint32 little endian; profile: file for those of all by function,
-    text lines "INSTRUCTIONS FUNCTION"; both on the Cortex-M4 only.
+    period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a board of QEMU. instructions: file
+    for the instructions of each control interrupt, uint32 little endian; execution: file for what the processor did,
+    as salient.execution reads it; both in QEMU only. instruction_ns: what an instruction takes, one of INSTRUCTION_NS,
+    or None and the drive takes no time; on the Cortex-M4 only.
     """
 
     machine: str = "saturating"
@@ -58,7 +60,8 @@ class SimulatorOptions:
     record_switches: Path | None = None
     build: str = "host"
     instructions: Path | None = None
-    profile: Path | None = None
+    execution: Path | None = None
+    instruction_ns: int | None = None
 
     def arguments(self, can: str) -> list[str]:
         """The executable's command line on the bus `can`."""
@@ -83,11 +86,17 @@ class SimulatorOptions:
     def _program(self) -> list[str]:
         program = executable(self.machine, self.build)
         if self.build not in TARGET_BUILDS:
+            if self.instruction_ns is not None:
+                raise UsageError(f"--instruction-ns {self.instruction_ns}: only with --target cortex-m4")
             return [str(program)]
         line = [str(program), str(image(self.machine, self.build))]
-        for name in ("instructions", "profile"):
-            if (path := getattr(self, name)) is not None:
-                line += [f"--{name}", str(path)]
+        if self.instructions is not None:
+            line += ["--instructions", str(self.instructions)]
+        if self.execution is not None:
+            end, begin = Image(image(self.machine, self.build)).stack()
+            line += ["--execution", str(self.execution), f"{end:#x}-{begin:#x}"]
+        if self.instruction_ns is not None:
+            line += ["--instruction-ns", str(self.instruction_ns)]
         return line
 
 
@@ -112,7 +121,7 @@ def executable(machine: str, build: str = "host") -> Path:
         if path.parent != MACHINES:
             _build_foreign(path, program, preset)
         if not program.exists():
-            builder = "tools/salient test --only cortex-m4" if build in TARGET_BUILDS else "any tools/salient command"
+            builder = "tools/salient test --only target" if build in TARGET_BUILDS else "any tools/salient command"
             raise UsageError(f"{program.relative_to(ROOT)} is not built; {builder} builds it")
     return programs[0]
 
@@ -205,8 +214,8 @@ class Simulator:
 def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
     """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
     on the bus of an experiment."""
-    return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, profile=None,
-                                    pace="lockstep"))
+    return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, execution=None,
+                                    instruction_ns=None, pace="lockstep"))
 
 
 @lru_cache

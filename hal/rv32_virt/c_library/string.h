@@ -1,0 +1,10 @@
+/* Of C's string.h, what the firmware uses: Debian's compiler for RISC-V comes without a C library. */
+#ifndef STRING_H
+#define STRING_H
+
+#include <stddef.h>
+
+void *memcpy(void *restrict to, const void *restrict from, size_t size);
+void *memset(void *to, int value, size_t size);
+
+#endif

@@ -1,0 +1,159 @@
+/* What background and control interrupt share, torn or whole.
+ *
+ * Stands in for the laws, the bus and the program around drive.c: the background configures, commands and takes a
+ * snapshot in every round, with the same number in every member of what it writes; the interrupt writes the same number
+ * into every member of what a snapshot reads. Members that differ were torn. drive.c, the critical section and the
+ * timer are the drive's own.
+ *
+ * Each 400 interrupts a frame says how often since start: uint16 little endian, interrupts, torn parameters, torn
+ * commands, torn snapshots. The processor must take time.
+ */
+#include <stddef.h>
+#include <string.h>
+
+#include "drive/drive.h"
+#include "hal_time.h"
+#include "qemu/board.h"
+#include "qemu/hal_qemu.h"
+
+#define FRAME_ID 0x7A0
+#define INTERRUPTS_PER_FRAME 400
+
+/* Of the linker script. */
+extern uint32_t bss_start[], bss_end[];
+
+const machine_tables_t machine_tables = {.phases = 3, .rotor_poles = 4};
+
+static drive_t drive;
+static uint16_t interrupts, torn_parameters, torn_commands, torn_snapshots;
+
+static void fill(void *object, size_t bytes, uint32_t number) {
+    uint32_t *word = object;
+    for (size_t i = 0; i < bytes / sizeof *word; i++) {
+        word[i] = number;
+    }
+}
+
+static uint16_t torn(const void *object, size_t bytes) {
+    const uint32_t *word = object;
+    for (size_t i = 1; i < bytes / sizeof *word; i++) {
+        if (word[i] != word[0]) {
+            return 1;
+        }
+    }
+    return 0;
+}
+
+bool configure_rate_allowed(uint32_t control_rate_hz) {
+    return control_rate_hz == 40000;
+}
+
+/* The first set has the timer's period in every half word; a later one is long enough as a timeout, too. */
+control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
+                                       uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits) {
+    (void)tables, (void)control_rate_hz, (void)encoder_bits, (void)adc_bits;
+    static control_parameters_t set;
+    fill(&set, sizeof set, UINT32_C(2500) * 0x10001 + (parameters->changes & 0xFFF) * 0x10001);
+    return set;
+}
+
+void control_reset(control_state_t *state) {
+    (void)state;
+}
+
+bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
+                  hal_pwm_compare_t *compare) {
+    (void)compare;
+    interrupts++;
+    torn_parameters += torn(parameters, sizeof *parameters);
+    torn_commands += torn(&sample->command, sizeof sample->command);
+    fill(state, sizeof(control_diagnostics_t), interrupts * 0x10001u);
+    return false;
+}
+
+/* Word by word, as the interrupt wrote them. */
+control_diagnostics_t control_diagnose(const control_parameters_t *parameters, const control_state_t *state) {
+    (void)parameters;
+    control_diagnostics_t diagnostics;
+    memcpy(&diagnostics, state, sizeof diagnostics);
+    return diagnostics;
+}
+
+void comms_init(comms_t *comms, uint8_t phases, uint32_t control_rate_hz, uint32_t time_us) {
+    (void)phases, (void)control_rate_hz, (void)time_us;
+    comms->telemetry.next_us = 0; /* always due */
+}
+
+void comms_telemetry(comms_t *comms, hal_t *hal, const telemetry_snapshot_t *snapshot) {
+    (void)comms, (void)hal;
+    const uint32_t number = snapshot->rotor_angle;
+    const uint32_t first[] = {(uint32_t)snapshot->speed_q22,
+                              (uint32_t)snapshot->speed_reference_q22,
+                              (uint32_t)snapshot->torque_reference_q24,
+                              (uint32_t)snapshot->torque_estimate_q24,
+                              (uint32_t)snapshot->load_torque_estimate_q24,
+                              (uint32_t)snapshot->duty_q15,
+                              (uint32_t)snapshot->trim_torque_q24,
+                              (uint32_t)snapshot->torque_missing_q24,
+                              snapshot->bus_voltage_q6 * 0x10001u,
+                              snapshot->current_q9[0] * 0x10001u,
+                              snapshot->current_q9[3] * 0x10001u,
+                              number};
+    torn_snapshots += torn(first, sizeof first);
+}
+
+bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, uint32_t time_us) {
+    (void)writable, (void)time_us;
+    static uint32_t number;
+    static uint16_t reported; /* interrupts */
+    number--;                 /* downwards: as a time it is past, and a command of it not stale */
+    fill(&comms->command, sizeof comms->command, number);
+    parameters->changes++;
+    hal_critical_enter(hal);
+    const uint16_t counts[4] = {interrupts, torn_parameters, torn_commands, torn_snapshots};
+    hal_critical_leave(hal);
+    if (counts[0] - reported >= INTERRUPTS_PER_FRAME) {
+        reported = counts[0];
+        hal_can_frame_t frame = {.identifier = FRAME_ID, .length = sizeof counts};
+        memcpy(frame.data, counts, sizeof counts);
+        hal_can_transmit(hal, &frame);
+    }
+    return true;
+}
+
+#ifdef NO_CRITICAL_SECTION /* the port has none in this image */
+void hal_critical_enter(hal_t *hal) {
+    (void)hal;
+}
+
+void hal_critical_leave(hal_t *hal) {
+    (void)hal;
+}
+#endif
+
+__attribute__((used)) void program_interrupt(void) { /* by the handler, in assembly */
+    drive_control_interrupt(&drive);
+}
+
+/* Rounds of different lengths, so that the interrupt comes at every place of one. */
+static void dally(void) {
+    static uint32_t random;
+    random = random * UINT32_C(1664525) + UINT32_C(1013904223);
+    for (uint32_t i = random >> 23; i > 0; i--) {
+        __asm__ volatile("");
+    }
+}
+
+noreturn void program_start(void) {
+    memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start)); /* there are no other variables */
+    const drive_config_t config = {.control_rate_hz = board.mailbox.control_rate_hz};
+    const bool started = drive_init(&drive, &board, &machine_tables, &config);
+    board_interrupt_enable();
+    doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REFUSED);
+    while (board.mailbox.event != MAILBOX_EXIT) {
+        drive_background(&drive);
+        dally();
+        doorbell_ring(MAILBOX_NEXT);
+    }
+    board_exit(board.mailbox.exit_code);
+}

@@ -1,0 +1,98 @@
+"""A drive's image that cannot go on ends QEMU with an exit code and one line that says why, on every board."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from salient.paths import BUILD, ROOT
+from salient.simulator import executable
+
+TIMEOUT_S = 30
+EXIT_FAULT, EXIT_LAYOUT = 70, 78
+
+COMPILERS = {
+    "mps2_an386": ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-nostartfiles"],
+    "rv32_virt": ["riscv64-unknown-elf-gcc", "-march=rv32imac", "-misa-spec=2.2", "-mabi=ilp32", "-nostartfiles",
+                  "-nolibc", f"-I{ROOT}/hal/rv32_virt/c_library"],
+}
+
+DRIVE = """
+#include "control/machine_tables.h"
+#include "drive/drive.h"
+#include "hal_pwm.h"
+
+const machine_tables_t machine_tables;
+
+bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, const drive_config_t *config) {
+    hal_pwm_start(hal, 2500);
+    return true;
+}
+
+void drive_control_interrupt(drive_t *drive) {
+    static int calls;
+    if (++calls == 10) {
+        __builtin_trap();
+    }
+}
+
+void drive_background(drive_t *drive) {
+}
+"""
+"""In the place of the firmware: it comes as far as its tenth control interrupt."""
+
+
+@pytest.fixture(params=COMPILERS)
+def make_image(request, tmp_path: Path) -> Callable[[int], Path]:
+    """Makes an image of DRIVE with the board's program, of a mailbox that calls itself `layout`."""
+    hal = ROOT / "hal"
+
+    def make(layout: int) -> Path:
+        mailbox = tmp_path / "qemu" / "mailbox.h"
+        mailbox.parent.mkdir()
+        text, count = re.subn("(#define MAILBOX_LAYOUT) [0-9]+", rf"\1 {layout}", (hal / "qemu/mailbox.h").read_text())
+        assert count == 1
+        mailbox.write_text(text)
+        drive, image = tmp_path / "drive.c", tmp_path / "image.elf"
+        drive.write_text(DRIVE)
+        folders = [tmp_path, hal, ROOT / "firmware", BUILD / "cortex-m4" / "firmware" / "codec"]
+        sources = [*sorted((hal / "qemu").glob("*.c")), *sorted((hal / request.param).glob("*.c"))]
+        scripts = [hal / request.param / "memory.ld", hal / "qemu" / "sections.ld"]
+        command = [*COMPILERS[request.param], "-std=c11", "-O1", "-ffreestanding", *(f"-I{one}" for one in folders),
+                   *map(str, sources), str(drive), *(f"-Wl,-T,{one}" for one in scripts), "-o", str(image)]
+        subprocess.run(command, check=True, timeout=TIMEOUT_S)
+        return image
+
+    return make
+
+
+def layout_of_world() -> int:
+    return int(re.search("#define MAILBOX_LAYOUT ([0-9]+)", (ROOT / "hal/qemu/mailbox.h").read_text())[1])
+
+
+def run(image: Path, folder: Path) -> subprocess.CompletedProcess:
+    command = [executable("saturating", "cortex-m4"), image, "--can", f"unix:{folder}/bus", "--pace", "free",
+               "--stop-at-s", "1", "--record", folder / "state.npy"]
+    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL)
+
+
+def test_a_fault_of_the_processor_is_said_and_what_was_recorded_is_kept(make_image, tmp_path: Path):
+    result = run(make_image(layout_of_world()), tmp_path)
+    assert result.returncode == EXIT_FAULT
+    assert result.stderr == "salient: the drive's program ended at a fault of its processor\n"
+    assert not (tmp_path / "bus").exists()
+    assert 240 <= len(np.load(tmp_path / "state.npy")) <= 252  # a row a microsecond, ten periods of 25 us
+
+
+def test_an_image_of_another_mailbox_is_refused(make_image, tmp_path: Path):
+    result = run(make_image(layout_of_world() + 1), tmp_path)
+    assert result.returncode == EXIT_LAYOUT
+    assert result.stdout == ""
+    assert result.stderr == ("salient: the drive's image has another mailbox than this program: "
+                             "build both from the same sources\n")
+    assert not (tmp_path / "bus").exists()

@@ -1,0 +1,37 @@
+"""On RV32, too, the control interrupt is an exception of the processor, and its instructions are counted."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+from salient.image import Image
+from salient.interrupt_cost import read_cost
+from salient.simulator import SimulatorOptions
+
+TIMEOUT_S = 60
+MACHINE_SOFTWARE_INTERRUPT = 3
+HANDLER_INSTRUCTIONS = 38
+"""Of its own: the stack's pointer, 16 registers kept and given back, the request taken back, a call, the return."""
+
+
+def test_each_control_interrupt_is_an_exception_of_the_processor_and_counted(tmp_path: Path):
+    log, instructions, executed = tmp_path / "log", tmp_path / "instructions", tmp_path / "executed"
+    wrapper = tmp_path / "qemu-system-riscv32"
+    wrapper.write_text(f'#!/bin/sh\nPATH={os.environ["PATH"]}\nexec qemu-system-riscv32 -d int -D {log} "$@"\n')
+    wrapper.chmod(0o755)
+    options = SimulatorOptions(build="rv32", controller="salient", pace="free", instructions=instructions,
+                               execution=executed)
+    subprocess.run([*options.arguments(f"unix:{tmp_path}/bus"), "--stop-at-s", "0.005"], check=True, timeout=TIMEOUT_S,
+                   stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                   env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"})
+    cost = read_cost(instructions, executed, options.machine, options.build)
+    taken = re.findall(r"async:(\d), cause:([0-9a-f]+)", log.read_text(encoding="utf-8"))
+    assert len(cost.interrupts) == 200
+    assert [(int(interrupt), int(cause, 16)) for interrupt, cause in taken] == [(1, MACHINE_SOFTWARE_INTERRUPT)] * 200
+    assert cost.execution.inside.sum() == cost.interrupts.sum()
+    instructions_of = zip(Image(cost.execution.image).instructions(), cost.execution.inside, strict=True)
+    handler = sum(count for one, count in instructions_of if one.function.startswith("control_handler"))
+    assert handler == HANDLER_INSTRUCTIONS * len(cost.interrupts)

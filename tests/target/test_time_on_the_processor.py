@@ -1,0 +1,256 @@
+"""A Cortex-M4 that takes time: QEMU counts an instruction as so many nanoseconds, a timer of the board triggers the
+control interrupt wherever the background happens to be, and one that is too long is late.
+
+At 8 ns it is about a part of 170 MHz at 1.34 cycles an instruction.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from salient.arguments import CONTROLLERS
+from salient.bench import Bench
+from salient.errors import UsageError
+from salient.metrics import load_step_metrics, start_metrics, torque_metrics
+from salient.paths import BUILD
+from salient.session import Session
+from salient.simulator import TARGET_BUILDS, Simulator, SimulatorOptions, executable
+
+PERIOD_US = 25.0
+COUNT_US = 0.04
+"""Of the board's timers."""
+
+
+def processor(bench: Bench, signal: str) -> float:
+    return bench.telemetry[f"DRIVE_PROCESSOR.{signal}"].last
+
+
+def currents_A(bench: Bench) -> list[float]:
+    return [bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"].last for phase in "abc"]
+
+
+def frames(bench: Bench) -> list[tuple]:
+    return [(time, message.arbitration_id, bytes(message.data)) for time, message in bench.log]
+
+
+# --- a processor that is fast enough --------------------------------------------------------------------------------
+
+# At which no interrupt is late, ns an instruction.
+IN_TIME_NS = {"traditional": 8, "paper": 8, "salient": 4}
+
+# From lock-step, where the drive takes no time: its figures and how far they may be from it.
+START = {"settling_time_s": 2e-4, "overshoot_percent": 0.02}
+LOAD_STEP = {"speed_dip_rpm": 0.3, "recovery_time_s": 2e-3}
+MEAN_TORQUE_NM = 0.01
+
+
+def start_600(make_bench, tmp_path: Path, **options) -> tuple[Bench, dict]:
+    recording = tmp_path / f"start_{options['build']}_{options.get('instruction_ns')}.npy"
+    bench = make_bench(record=recording, **options)
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.25)
+    bench.close()
+    return bench, start_metrics(np.load(recording), 600)
+
+
+def load_step_150(make_bench, tmp_path: Path, **options) -> tuple[Bench, dict]:
+    recording = tmp_path / f"step_{options['build']}_{options.get('instruction_ns')}.npy"
+    bench = make_bench(record=recording, **options)
+    bench.at(0.13).load_torque_Nm = 8
+    bench.drive.speed_reference_rpm = 150
+    bench.run_for(0.4)
+    bench.close()
+    recorded = np.load(recording)
+    window = torque_metrics(recorded["time_s"], recorded["torque_Nm"], (0.3, 0.4))
+    return bench, {**load_step_metrics(recorded, 150, 0.13), **window}
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_a_drive_in_time_has_no_late_interrupt_and_the_figures_of_one_that_takes_no_time(make_bench, tmp_path,
+                                                                                          controller):
+    for experiment, bounds in ((start_600, START), (load_step_150, LOAD_STEP)):
+        made, figures = {}, {}
+        for instruction_ns in (None, IN_TIME_NS[controller]):
+            bench, figures[instruction_ns] = experiment(make_bench, tmp_path, build="cortex-m4", controller=controller,
+                                                        instruction_ns=instruction_ns)
+            made[instruction_ns] = bench
+            assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+            assert processor(bench, "late_interrupts") == 0
+            assert processor(bench, "available_us") == PERIOD_US
+        lockstep, timed = figures.values()
+        bench = made[IN_TIME_NS[controller]]
+        print(controller, experiment.__name__, lockstep, timed, f"worst {processor(bench, 'worst_us'):g} us")
+        for name, bound in bounds.items():
+            assert timed[name] == pytest.approx(lockstep[name], abs=bound), name
+        if experiment is load_step_150:
+            assert timed["torque_mean_Nm"] == pytest.approx(lockstep["torque_mean_Nm"], abs=MEAN_TORQUE_NM)
+            assert 0.7 < timed["torque_ripple"] / lockstep["torque_ripple"] < 1.3
+        assert [processor(made[None], f"{which}_us") for which in ("used", "worst")] == [0, 0]
+        assert 0.1 * PERIOD_US < processor(bench, "used_us") <= processor(bench, "worst_us") < PERIOD_US
+
+
+def test_the_time_used_is_that_of_the_instructions_counted_and_of_the_port(make_bench, tmp_path):
+    counts = tmp_path / "instructions"
+    bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8, instructions=counts)
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.2)
+    bench.close()
+    counted_us = np.fromfile(counts, "<u4").max() * 8e-3
+    # The timer's handler before, and less what follows hal_pwm_elapsed_ticks.
+    port_us = processor(bench, "worst_us") - counted_us
+    print(f"counted {counted_us:.3f} us, port {port_us:.3f} us")
+    assert 0.1 < port_us < 0.6
+
+
+@pytest.mark.parametrize("rate_hz", [20_000, 50_000])
+def test_the_timer_keeps_other_control_periods_as_well(make_bench, rate_hz):
+    bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8, control_rate_hz=rate_hz)
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.25)
+    assert processor(bench, "available_us") == 1e6 / rate_hz
+    assert processor(bench, "late_interrupts") == 0
+    assert bench.truth["speed_rpm"].last == pytest.approx(300, abs=3)
+
+
+def test_equal_runs_take_equal_time_to_the_bit(make_bench):
+    def run() -> list[tuple]:
+        bench = make_bench(build="cortex-m4", controller="paper", instruction_ns=4, seed=3)
+        bench.rig.set("current_noise_A", 0.05)
+        bench.drive.speed_reference_rpm = 300
+        bench.run_for(0.15)
+        return frames(bench)
+
+    assert run() == run()
+
+
+# --- one that is not ------------------------------------------------------------------------------------------------
+
+
+def slow_processor(make_bench, controller: str) -> dict[str, int]:
+    """The slowest one, by the instructions of a period, that serves the drive at rest in time: its law takes twice as
+    many and more."""
+    for rate_hz, instruction_ns in ((40_000, 64), (50_000, 32), (40_000, 32), (50_000, 16), (40_000, 16), (50_000, 8)):
+        options = {"control_rate_hz": rate_hz, "instruction_ns": instruction_ns}
+        bench = make_bench(build="cortex-m4", controller=controller, **options)
+        bench.run_for(0.11)
+        # One without time for the background says nothing after its first cycle, and that says 0.
+        if processor(bench, "late_interrupts") == 0 and 0 < processor(bench, "worst_us") < 0.8e6 / rate_hz:
+            return options
+    raise AssertionError("no processor is fast enough")
+
+
+@pytest.mark.parametrize("controller", ["paper", "salient"])
+def test_a_slow_processor_is_noticed_reported_and_safe_the_same_every_time(make_bench, controller):
+    slow = slow_processor(make_bench, controller)
+    period_us = 1e6 / slow["control_rate_hz"]
+
+    def run() -> tuple[Bench, list[tuple]]:
+        bench = make_bench(build="cortex-m4", controller=controller, **slow)
+        bench.run_for(0.01)
+        assert (bench.drive.state, bench.drive.fault) == ("ready", "none")
+        bench.drive.speed_reference_rpm = 600
+        bench.run_for(0.25)
+        assert (bench.drive.state, bench.drive.fault) == ("fault", "interrupt_overrun")
+        return bench, frames(bench)
+
+    bench, first = run()
+    late, worst_us = processor(bench, "late_interrupts"), processor(bench, "worst_us")
+    print(f"{controller}, {slow}: {late:g} late, worst {worst_us:g} us")
+    assert 1 <= late < 200
+    assert period_us < worst_us < 10 * period_us
+    assert processor(bench, "used_us") < period_us  # in fault it is in time again
+    assert bench.telemetry["DRIVE_FAULT_CAUSE.fault"].last_name == "interrupt_overrun"
+    assert bench.telemetry["DRIVE_FAULT_CAUSE.state"].last_name == "run"
+    assert currents_A(bench) == [0, 0, 0]
+    assert run()[1] == first
+
+
+def test_an_overrun_under_load_opens_every_switch(make_bench):
+    """The bench holds the processor for 20 us in front of an interrupt that is in time without."""
+    bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8)
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.1)
+    bench.load_torque_Nm = 12
+    bench.run_for(0.05)
+    assert bench.drive.state == "run"
+    assert max(currents_A(bench)) > 20
+    assert processor(bench, "late_interrupts") == 0
+    caused_us = bench.time_ns / 1000
+    bench.rig.interrupt_time_us = 20
+    bench.run_for(0.003)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "interrupt_overrun")
+    # Late are those at 0, 2 and 4 periods, and the one at 6 knows.
+    assert 6 * PERIOD_US <= bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last - caused_us <= 8 * PERIOD_US
+    assert currents_A(bench) == [0, 0, 0]
+    bench.rig.interrupt_time_us = 0
+    bench.load_torque_Nm = 0
+    bench.run_for(0.2)
+    assert currents_A(bench) == [0, 0, 0]
+    assert 3 <= processor(bench, "late_interrupts") < 130
+    assert PERIOD_US < processor(bench, "worst_us") < 20 + PERIOD_US
+    bench.drive.off()
+    bench.drive.clear_fault()
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.1)
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+
+
+def test_what_the_bench_holds_the_processor_for_adds_to_its_own_time(make_bench):
+    bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8)
+    used_us = {}
+    for held_us in (0, 10):
+        bench.rig.interrupt_time_us = held_us
+        bench.run_for(0.11)
+        used_us[held_us] = processor(bench, "used_us")
+    # It is held until 10 us behind the trigger, and the port has used some of that already.
+    assert used_us[0] + 9.5 < used_us[10] < used_us[0] + 10 + COUNT_US
+    assert processor(bench, "late_interrupts") == 0
+
+
+def test_instructions_that_take_time_are_for_the_cortex_m4():
+    with pytest.raises(UsageError, match="--instruction-ns 8: only with --target cortex-m4"):
+        SimulatorOptions(instruction_ns=8).arguments("unix:bus")
+    with pytest.raises(UsageError, match="--instruction-ns 8: not on the board virt, whose port uses no timer"):
+        Simulator(SimulatorOptions(build="rv32", instruction_ns=8), "unix:bus")
+
+
+# --- the interrupt comes anywhere -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def race(tmp_path: Path) -> Callable[[str, str], tuple[int, ...]]:
+    """Runs race.c for 0.4 s: interrupts, torn parameter sets, commands, snapshots."""
+
+    def run(build: str, kind: str) -> tuple[int, ...]:
+        can = f"unix:{tmp_path}/{build}_{kind}"
+        command = [str(executable("saturating", build)), str(BUILD / build / "bin" / f"race_{kind}.elf"),
+                   "--instruction-ns", "8", "--can", can, "--pace", "lockstep", "--follow-stdin"]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            assert json.loads(process.stdout.readline())["ready"]
+            with Session(can) as session:
+                session.run_for(0.4)
+                counts = [bytes(message.data) for _, message in session.log if message.arbitration_id == 0x7A0]
+            process.stdin.close()
+        assert process.returncode == 0
+        return struct.unpack("<4H", counts[-1])
+
+    return run
+
+
+@pytest.mark.parametrize("build", [build for build in TARGET_BUILDS if build.startswith("cortex-m4")])
+def test_what_interrupt_and_background_share_is_torn_without_the_critical_section_and_never_with_it(race, build):
+    """A command is three words, which one instruction stores, and QEMU interrupts none: it tears on neither."""
+    interrupts, *torn = race(build, "no_critical_section")
+    print(f"{build}: {torn} torn in {interrupts} interrupts without")
+    assert interrupts > 5000
+    assert torn[0] > 100 and torn[1] == 0 and torn[2] > 100
+    interrupts, *torn = race(build, "critical_section")
+    assert interrupts > 5000
+    assert torn == [0, 0, 0]
