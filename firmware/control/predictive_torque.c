@@ -185,9 +185,12 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
             owed_q24 = fixed_add(owed_q24, fixed_subtract(p->point.torque_q24, wanted_q24));
         } else {
             const int32_t all_q24 = fixed_add(owed_q24, wanted_q24);
-            /* Behind the incoming phase comes none, or one before its turn-on. */
-            const bool gets = owed_q24 <= 0 || n + 1 == phases ||
-                              (positive ? sample->angle[next] : ~sample->angle[next]) - window->turn_on >= HALF_PITCH;
+            /* Past its turn-on, and behind it comes none or one before its own. */
+            const bool gets =
+                owed_q24 <= 0 ||
+                (p->since_on < HALF_PITCH &&
+                 (n + 1 == phases ||
+                  (positive ? sample->angle[next] : ~sample->angle[next]) - window->turn_on >= HALF_PITCH));
             aim(&means, p, gets ? all_q24 : wanted_q24);
             owed_q24 = fixed_subtract(all_q24, p->point.torque_q24);
         }
