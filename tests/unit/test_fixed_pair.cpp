@@ -1,0 +1,38 @@
+// Two products of 16 bits at once, against 64 bits.
+#include <algorithm>
+#include <cstdint>
+#include <random>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "fixed/pair.h"
+}
+
+namespace {
+
+TEST(FixedPair, is_the_sum_of_both_products_wherever_that_fits) {
+    std::mt19937 random(1);
+    const auto any = [&] {
+        const int16_t ends[] = {INT16_MIN, INT16_MIN + 1, -1, 0, 1, INT16_MAX};
+        return random() % 4 == 0 ? ends[random() % 6] : int16_t(random());
+    };
+    int compared = 0;
+    for (int i = 0; i < 1000000; i++) {
+        const int16_t value[3] = {any(), any(), any()};
+        const int16_t *two = &value[random() % 2]; // aligned to a word or not
+        const int16_t first = any(), second = any();
+        const int32_t sum = random() % 4 == 0 ? 0 : int32_t(uint32_t(random()));
+        const int64_t exact = sum + int64_t(two[0]) * first + int64_t(two[1]) * second;
+        const int64_t products = exact - sum;
+        if (std::max(exact, products) > INT32_MAX || std::min(exact, sum + int64_t(two[0]) * first) < INT32_MIN ||
+            sum + int64_t(two[0]) * first > INT32_MAX) {
+            continue;
+        }
+        ASSERT_EQ(fixed_pair_multiply_add(two, fixed_pair(first, second), sum), exact);
+        compared++;
+    }
+    EXPECT_GT(compared, 300000);
+}
+
+} // namespace
