@@ -138,7 +138,7 @@ def _of_part(of: Mapping[str, Any], part: str) -> str:
 
 def _coverage(controllers: Mapping[str, Any]) -> str:
     files = next(iter(controllers.values()))["coverage"]["files"]
-    rows = {"all": None} | {file: file for file in files}
+    rows = {"all": None} | {file if file.startswith("firmware/") else Path(file).name: file for file in files}
 
     def cell(of: Mapping[str, Any], file: str | None) -> str:
         part = of["coverage"] if file is None else of["coverage"]["files"][file]
@@ -147,7 +147,7 @@ def _coverage(controllers: Mapping[str, Any]) -> str:
 
     count = {file: (next(iter(controllers.values()))["coverage"] if file is None else files[file])["instructions"]
              for file in rows.values()}
-    return _rows(controllers, {f"{words}: {count[file]} instructions": lambda of, file=file: cell(of, file)
+    return _rows(controllers, {f"{words}: {count[file]}": lambda of, file=file: cell(of, file)
                                for words, file in rows.items()})
 
 
@@ -197,7 +197,7 @@ $stack
 </tbody></table></div>
 
 <h2>Coverage of the object code</h2>
-<div class="tables"><table><thead><tr><th>executed at all, executed in interrupts</th>$heads</tr></thead><tbody>
+<div class="tables"><table><thead><tr><th>source: its instructions; executed at all, in interrupts</th>$heads</tr></thead><tbody>
 $coverage
 </tbody></table></div>
 <p>Which lines were missed is in processor.json.</p>

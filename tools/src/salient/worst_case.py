@@ -203,6 +203,10 @@ def directed(kind: str) -> list[Input]:
         "voltage runs out": [*quick[:-1], Action(0.0, "bench.supply_voltage_V", 160.0),
                              Action(1.0, "speed_rpm", 2000.0)],
         "reversal": [*quick, Action(30.0, "speed_rpm", backwards), Action(60.0, "speed_rpm", 600.0)],
+        "noisy reversal with a torque reserve": [
+            *first, Action(0.0, "bench.inertia_gain", 0.2), Action(0.0, "bench.current_noise_A", 5.0),
+            Action(0.3, "parameter.torque_reserve_Nm", 18.0), Action(1.0, "speed_rpm", 3000.0),
+            Action(10.0, "speed_rpm", 5.0 * backwards), Action(13.0, "bench.flux_linkage_gain", 2.5)],
         "encoder jumps": [*quick, Action(40.0, "bench.encoder_fault", 2.0), Action(45.0, "bench.encoder_fault", 0.0),
                           Action(46.0, "off"), Action(46.5, "clear_fault"), Action(47.0, "speed_rpm", 600.0)],
         "run, fault, run": [*quick, Action(20.0, "off"), Action(20.3, "speed_rpm", 600.0), Action(30.0, "off"),
