@@ -33,7 +33,8 @@ void bp_network_forward(bp_network_t *network, const int32_t input_q27[BP_INPUTS
     int32_t sum_q23[BP_OUTPUTS] = {0};
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         bp_neuron_t *neuron = &network->hidden[i];
-        neuron->value_q27 = sigmoid_symmetric_q27(triple_dot(neuron->input.value, input_q27));
+        neuron->value_q27 =
+            sigmoid_symmetric_q27(triple_dot(neuron->input.value, input_q27[0], input_q27[1], input_q27[2]));
         triple_add_scaled(sum_q23, neuron->output.value, neuron->value_q27);
     }
 #pragma GCC unroll 3
@@ -49,8 +50,8 @@ void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *n
     int32_t delta_q32[BP_OUTPUTS]; /* eta d3 */
 #pragma GCC unroll 3
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        delta_q32[l] = high_product(high_product(rate_q31, sensitivity_q31[l]),
-                                    sigmoid_logistic_slope_q33(network->output_q27[l])) *
+        delta_q32[l] = fixed_multiply_high(fixed_multiply_high(rate_q31, sensitivity_q31[l]),
+                                           sigmoid_logistic_slope_q33(network->output_q27[l])) *
                        2;
     }
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
@@ -58,7 +59,7 @@ void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *n
         const int32_t value_q27 = neuron->value_q27;
         /* The hidden layer learns through the output weights as they were in this sample: before those move. */
         const int32_t back_q28 = triple_dot_and_move(&neuron->output, delta_q32, value_q27, inertia_q32);
-        const int32_t rate_q28 = high_product(back_q28, sigmoid_symmetric_slope_q32(value_q27)); /* eta d2 */
+        const int32_t rate_q28 = fixed_multiply_high(back_q28, sigmoid_symmetric_slope_q32(value_q27)); /* eta d2 */
         triple_move(&neuron->input, input_q31, rate_q28, inertia_q32);
     }
 }

@@ -9,7 +9,7 @@
  *
  * Formats: inputs and activations Q4.27; weights Q3.28 held within +-8 (saturation), their
  * increments Q4.27; sums of a layer Q8.23, within 6 * 8. Every product is rounded to the format of its sum: see
- * fixed/high_product.h. |eta d2| <= 3 / 2 * 8 / 4 = 3, so that with alpha < 1/2 an increment stays within 6.
+ * fixed_multiply_high. |eta d2| <= 3 / 2 * 8 / 4 = 3, so that with alpha < 1/2 an increment stays within 6.
  */
 #ifndef CONTROL_BP_NETWORK_H
 #define CONTROL_BP_NETWORK_H

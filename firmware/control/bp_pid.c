@@ -1,7 +1,6 @@
 #include "control/bp_pid.h"
 
 #include "fixed/fixed.h"
-#include "fixed/high_product.h"
 #include "fixed/sigmoid.h"
 
 #define ERROR_BITS 17 /* Q1.16 within -1..1 - 2^-16 */
@@ -32,7 +31,7 @@ int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_
 
     /* Q24 * Q24 to Q16, within 2^31 * 2^30 / 2^32. */
     const int32_t error_q16 =
-        fixed_saturate_bits(high_product(torque_error_q24, parameters->error_scale_inverse_q24), ERROR_BITS);
+        fixed_saturate_bits(fixed_multiply_high(torque_error_q24, parameters->error_scale_inverse_q24), ERROR_BITS);
     const int32_t rise_q16 = error_q16 - pid->error_q16;
     const int32_t bend_q16 = rise_q16 - pid->rise_q16;
     pid->error_q16 = error_q16;
@@ -51,8 +50,8 @@ int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_
     int32_t sum_q23 = pid->duty_q23; /* within 1 + 3 * 4 */
 #pragma GCC unroll 3
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        pid->gain_q24[l] = high_product(sigmoid_logistic_q28(output_q27[l]), parameters->scale_q28[l]);
-        sum_q23 = high_product_add(sum_q23, pid->gain_q24[l], term_q31[l]);
+        pid->gain_q24[l] = fixed_multiply_high(sigmoid_logistic_q28(output_q27[l]), parameters->scale_q28[l]);
+        sum_q23 = fixed_multiply_high_add(sum_q23, pid->gain_q24[l], term_q31[l]);
     }
     const int32_t duty_q23 = fixed_saturate_bits(sum_q23, DUTY_BITS);
     pid->duty_q23 = duty_q23;

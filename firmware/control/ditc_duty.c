@@ -2,7 +2,6 @@
 
 #include "control/phase_map.h"
 #include "fixed/fixed.h"
-#include "fixed/high_product.h"
 
 #define DUTY_ONE_Q15 32768
 #define AIM_UNIT_BITS 20 /* 1/16 N m in Q24 */
@@ -17,11 +16,18 @@ void ditc_duty_reset(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc
 
 ditc_duty_aims_t ditc_duty_aims(const machine_tables_t *tables, uint32_t hand_over_angle) {
     const phase_map_place_t hand_over = phase_map_at(tables, hand_over_angle);
-    ditc_duty_aims_t aims;
-    for (unsigned k = 0; k < DITC_DUTY_AIMS; k++) {
-        const uint32_t torque_q24 = ((4u + k % 4u) << (k / 4u + AIM_UNIT_BITS - 2u)) - (1u << AIM_UNIT_BITS);
-        aims.current_q9[k] = (uint16_t)phase_map_current_of_torque_q9(
-            &hand_over, torque_q24 < INT32_MAX ? (int32_t)torque_q24 : INT32_MAX);
+    ditc_duty_aims_t aims = {{0}};
+    for (unsigned k = 1; k < DITC_DUTY_AIMS; k++) {
+        const uint32_t end_q24 = ((4u + k % 4u) << (k / 4u + AIM_UNIT_BITS - 2u)) - (1u << AIM_UNIT_BITS);
+        const int32_t torque_q24 = end_q24 < INT32_MAX ? (int32_t)end_q24 : INT32_MAX;
+        /* The greatest current that gives no more. */
+        uint32_t current_q9 = 0;
+        for (uint32_t bit = 1u << 15; bit > 0; bit >>= 1) {
+            if (phase_map_torque_q24(&hand_over, (int32_t)(current_q9 | bit)) <= torque_q24) {
+                current_q9 |= bit;
+            }
+        }
+        aims.current_q9[k] = (uint16_t)fixed_clamp((int32_t)current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
     }
     return aims;
 }
@@ -39,13 +45,13 @@ int32_t ditc_duty_aim_q9(const ditc_duty_aims_t *aims, int32_t torque_q24) {
 static int32_t incoming_duty_q15(const ditc_duty_parameters_t *parameters, const ditc_duty_sample_t *sample,
                                  int32_t current_q9) {
     const int32_t limit_q9 = parameters->current_limit_q9;
-    const int32_t surplus_q24 = high_product(sample->reference_q24, parameters->surplus_q32);
+    const int32_t surplus_q24 = fixed_multiply_high(sample->reference_q24, parameters->surplus_q32);
     const int32_t carrying_q9 = ditc_duty_aim_q9(&parameters->aims, fixed_add(sample->reference_q24, surplus_q24));
     const bool assists = sample->error_q24 > parameters->band_outer_q24 || carrying_q9 > limit_q9;
     const int32_t target_q9 = assists ? limit_q9 : carrying_q9;
     /* Q23 * Q24 to Q15: currents of 0..128 A differ by less than 2^30. */
-    return fixed_clamp(high_product((target_q9 - current_q9) * (1 << 14), parameters->incoming_gain_q24), -DUTY_ONE_Q15,
-                       DUTY_ONE_Q15);
+    return fixed_clamp(fixed_multiply_high((target_q9 - current_q9) * (1 << 14), parameters->incoming_gain_q24),
+                       -DUTY_ONE_Q15, DUTY_ONE_Q15);
 }
 
 void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc, const machine_tables_t *tables,

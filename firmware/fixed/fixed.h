@@ -114,16 +114,37 @@ static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
 #endif
 }
 
+/* sum + a * b / 2^32, the product rounded; it must not overflow. */
+static inline int32_t fixed_multiply_high_add(int32_t sum, int32_t a, int32_t b) {
+#ifdef __ARM_FEATURE_DSP
+    int32_t result;
+    __asm__("smmlar %0, %1, %2, %3" : "=r"(result) : "r"(a), "r"(b), "r"(sum));
+    return result;
+#else
+    return sum + fixed_multiply_high(a, b);
+#endif
+}
+
+/* a + 2 b, saturated, 2 b on its own before. */
+static inline int32_t fixed_add_twice(int32_t a, int32_t b) {
+    return fixed_add(a, fixed_add(b, b));
+}
+
+/* Nearest number of `bits` bits with its sign, 1..32, a constant: one instruction where the processor has it. */
+__attribute__((always_inline)) static inline int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
+#if defined __ARM_FEATURE_SAT && defined __OPTIMIZE__
+    int32_t result;
+    __asm__("ssat %0, %1, %2" : "=r"(result) : "I"(bits), "r"(value));
+    return result;
+#else
+    return fixed_clamp(value, INT32_MIN >> (32 - bits), INT32_MAX >> (32 - bits));
+#endif
+}
+
 /* value / 2^shift, rounded down; shift 1..31, a constant. What does not fit is held within 2^(32-shift) of the end: the
  * high word saturates, in one instruction, and the low bits stay what they are. */
 __attribute__((always_inline)) static inline int32_t fixed_narrow(int64_t value, unsigned shift) {
-#if defined(__ARM_FEATURE_SAT) && defined(__OPTIMIZE__)
-    int32_t high;
-    __asm__("ssat %0, %1, %2" : "=r"(high) : "I"(shift), "r"((int32_t)(value >> 32)));
-#else
-    const int32_t limit = (int32_t)(1u << (shift - 1));
-    const int32_t high = fixed_clamp((int32_t)(value >> 32), -limit, limit - 1);
-#endif
+    const int32_t high = fixed_saturate_bits((int32_t)(value >> 32), shift);
     return (int32_t)((uint32_t)high << (32 - shift) | (uint32_t)value >> shift);
 }
 

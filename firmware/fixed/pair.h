@@ -18,6 +18,9 @@ static inline int32_t fixed_pair_multiply_add(const int16_t value[2], uint32_t p
 #ifdef __ARM_FEATURE_DSP
     int16x2_t both;
     __builtin_memcpy(&both, value, sizeof both);
+    if (__builtin_constant_p(sum) && sum == 0) {
+        return __smuad(both, (int16x2_t)pair);
+    }
     return __smlad(both, (int16x2_t)pair, sum);
 #else
     return sum + value[0] * (int16_t)(pair & 0xFFFFu) + value[1] * (int16_t)(pair >> 16);

@@ -9,7 +9,7 @@
 #include <stdint.h>
 
 #include "fixed/fixed.h"
-#include "fixed/high_product.h"
+#include "fixed/pair.h"
 
 #define SIGMOID_RANGE_BITS 26 /* over 0..8 in Q23, and as many below */
 #define SIGMOID_STEP_BITS 19  /* of 1/16 each */
@@ -25,22 +25,13 @@ static inline int32_t sigmoid_symmetric_q27(int32_t x_q23) {
     const int16_t *entry = &sigmoid_symmetric_q15[SIGMOID_STEPS] + (within_q23 >> SIGMOID_STEP_BITS);
     const int32_t fraction =
         within_q23 >> (SIGMOID_STEP_BITS - SIGMOID_FRACTION_BITS) & ((1 << SIGMOID_FRACTION_BITS) - 1);
-    const int32_t rest = (1 << SIGMOID_FRACTION_BITS) - fraction;
-#ifdef __ARM_FEATURE_SIMD32
-    /* Both entries in one word, and both products in one instruction. */
-    int16x2_t entries;
-    __builtin_memcpy(&entries, entry, sizeof entries);
-    return __smuad(entries, rest | fraction << 16);
-#else
-    return entry[0] * rest + entry[1] * fraction;
-#endif
+    return fixed_pair_multiply_add(entry, fixed_pair((1 << SIGMOID_FRACTION_BITS) - fraction, fraction), 0);
 }
 
 /* f'(x) = (1 - f^2) / 2 from f in Q4.27, |f| <= 1 - 2^-15; Q32, 0..1/2, within 2^-22 of it. */
 static inline int32_t sigmoid_symmetric_slope_q32(int32_t f_q27) {
-    /* The complement of f^2 in its 22 bits, which is at most 1 - 2^-22, in Q32: so f' of 1/2 has no overflow. */
-    const uint32_t square_q22 = (uint32_t)high_product(f_q27, f_q27);
-    return (int32_t)(~(square_q22 << 10) >> 1);
+    /* f^2 in Q22 is in Q32 when halved and shifted by 10; 1/2 would have no place there. */
+    return INT32_MAX - fixed_multiply_high(f_q27, f_q27) * (1 << 9);
 }
 
 /* g(x), Q3.28, from f(x) in Q4.27: half the error. */

@@ -1,11 +1,11 @@
 /* Three numbers at a time: what the processor loads, or loads and stores, with one instruction. The same bits as the C
- * beside it; products as in fixed/high_product.h. */
+ * beside it; products as fixed_multiply_high has them. */
 #ifndef FIXED_TRIPLE_H
 #define FIXED_TRIPLE_H
 
 #include <stdint.h>
 
-#include "fixed/high_product.h"
+#include "fixed/fixed.h"
 
 /* Registers of its own choice are what the compiler has left only when it optimises. */
 #if defined __ARM_FEATURE_DSP && defined __OPTIMIZE__
@@ -35,20 +35,19 @@ typedef struct {
 } triple_moving_t;
 
 /* sum_k a_k b_k / 2^32, each product rounded; the caller knows every partial sum to fit in a word. */
-static inline int32_t triple_dot(const int32_t a[3], const int32_t b[3]) {
+static inline int32_t triple_dot(const int32_t a[3], int32_t b0, int32_t b1, int32_t b2) {
 #if TRIPLE_IN_REGISTERS
     int32_t sum;
     __asm__("ldm %1, {r1, r2, r3}\n\t"
-            "ldm %2, {r4, r5, r6}\n\t"
-            "smmulr %0, r1, r4\n\t"
-            "smmlar %0, r2, r5, %0\n\t"
-            "smmlar %0, r3, r6, %0"
-            : "=r"(sum)
-            : "r"(a), "r"(b), "m"(*(const int32_t(*)[3])a), "m"(*(const int32_t(*)[3])b)
-            : "r1", "r2", "r3", "r4", "r5", "r6");
+            "smmulr %0, r1, %2\n\t"
+            "smmlar %0, r2, %3, %0\n\t"
+            "smmlar %0, r3, %4, %0"
+            : "=&r"(sum)
+            : "r"(a), "r"(b0), "r"(b1), "r"(b2), "m"(*(const int32_t(*)[3])a)
+            : "r1", "r2", "r3");
     return sum;
 #else
-    return high_product_add(high_product_add(high_product(a[0], b[0]), a[1], b[1]), a[2], b[2]);
+    return fixed_multiply_high_add(fixed_multiply_high_add(fixed_multiply_high(a[0], b0), a[1], b1), a[2], b2);
 #endif
 }
 
@@ -64,7 +63,7 @@ static inline void triple_add_scaled(int32_t sum[3], const int32_t a[3], int32_t
             : "r1", "r2", "r3");
 #else
     for (unsigned k = 0; k < 3; k++) {
-        sum[k] = high_product_add(sum[k], a[k], scale);
+        sum[k] = fixed_multiply_high_add(sum[k], a[k], scale);
     }
 #endif
 }
@@ -83,7 +82,8 @@ static inline void triple_move(triple_moving_t *moving, const int32_t direction[
                      : "r1", "r2", "r3", "r4", "r5", "r6", "r9", "r10", "memory");
 #else
     for (unsigned k = 0; k < 3; k++) {
-        moving->change[k] = high_product_add(high_product(moving->change[k], inertia_q32), scale, direction[k]);
+        moving->change[k] =
+            fixed_multiply_high_add(fixed_multiply_high(moving->change[k], inertia_q32), scale, direction[k]);
         moving->value[k] = fixed_add_twice(moving->value[k], moving->change[k]);
     }
 #endif
@@ -105,7 +105,7 @@ static inline int32_t triple_dot_and_move(triple_moving_t *moving, const int32_t
                      : "r1", "r2", "r3", "r4", "r5", "r6", "r9", "r10", "memory");
     return sum;
 #else
-    const int32_t sum = triple_dot(direction, moving->value);
+    const int32_t sum = triple_dot(moving->value, direction[0], direction[1], direction[2]);
     triple_move(moving, direction, scale, inertia_q32);
     return sum;
 #endif

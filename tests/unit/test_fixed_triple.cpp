@@ -27,19 +27,19 @@ long double rounded_product(int32_t a, int32_t b) {
     return std::floor(((long double)a * b + 2147483648.0L) / 4294967296.0L);
 }
 
-TEST(HighProduct, is_the_nearest_of_its_format_halves_upwards) {
+TEST(MultiplyHigh, is_the_nearest_of_its_format_halves_upwards) {
     std::mt19937 random(1);
     for (int i = 0; i < 200000; i++) {
         const int32_t a = any(random), b = any(random), sum = any(random) / 2;
-        ASSERT_EQ(high_product(a, b), rounded_product(a, b)) << a << " " << b;
-        ASSERT_EQ(high_product_add(sum, a, b), sum + rounded_product(a, b)) << a << " " << b;
+        ASSERT_EQ(fixed_multiply_high(a, b), rounded_product(a, b)) << a << " " << b;
+        ASSERT_EQ(fixed_multiply_high_add(sum, a, b), sum + rounded_product(a, b)) << a << " " << b;
     }
-    EXPECT_EQ(high_product(1 << 16, 1 << 15), 1);
-    EXPECT_EQ(high_product(-(1 << 16), 1 << 15), 0);
-    EXPECT_EQ(high_product(INT32_MIN, INT32_MIN), 1 << 30);
+    EXPECT_EQ(fixed_multiply_high(1 << 16, 1 << 15), 1);
+    EXPECT_EQ(fixed_multiply_high(-(1 << 16), 1 << 15), 0);
+    EXPECT_EQ(fixed_multiply_high(INT32_MIN, INT32_MIN), 1 << 30);
 }
 
-TEST(HighProduct, a_sum_with_the_double_saturates_twice) {
+TEST(MultiplyHigh, a_sum_with_the_double_saturates_twice) {
     std::mt19937 random(2);
     for (int i = 0; i < 200000; i++) {
         const int32_t a = any(random), b = any(random);
@@ -47,7 +47,7 @@ TEST(HighProduct, a_sum_with_the_double_saturates_twice) {
     }
 }
 
-TEST(HighProduct, numbers_are_held_within_any_number_of_bits) {
+TEST(MultiplyHigh, numbers_are_held_within_any_number_of_bits) {
     for (unsigned bits = 1; bits <= 32; bits++) {
         const int64_t end = int64_t(1) << (bits - 1);
         for (const int64_t value : {-end - 1, -end, -end + 1, int64_t(-1), int64_t(0), end - 2, end - 1, end}) {
@@ -68,7 +68,7 @@ TEST(Triple, dot_and_scaled_sum_round_each_product) {
             sum[k] = any(random) / 2;
         }
         const int32_t scale = any(random) / 2;
-        ASSERT_EQ(triple_dot(a, b),
+        ASSERT_EQ(triple_dot(a, b[0], b[1], b[2]),
                   rounded_product(a[0], b[0]) + rounded_product(a[1], b[1]) + rounded_product(a[2], b[2]));
         int32_t added[3] = {sum[0], sum[1], sum[2]};
         triple_add_scaled(added, a, scale);
@@ -92,7 +92,8 @@ TEST(Triple, moves_by_inertia_and_direction_and_tells_the_dot_from_before) {
         const int32_t scale = any(random), inertia_q32 = any(random);
         triple_moving_t moved = start, told = start;
         triple_move(&moved, direction, scale, inertia_q32);
-        ASSERT_EQ(triple_dot_and_move(&told, direction, scale, inertia_q32), triple_dot(direction, start.value));
+        ASSERT_EQ(triple_dot_and_move(&told, direction, scale, inertia_q32),
+                  triple_dot(start.value, direction[0], direction[1], direction[2]));
         for (unsigned k = 0; k < 3; k++) {
             const auto change = rounded_product(start.change[k], inertia_q32) + rounded_product(scale, direction[k]);
             ASSERT_EQ(moved.change[k], change);
