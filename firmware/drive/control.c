@@ -19,9 +19,10 @@ static int32_t load_torque_q24(const control_parameters_t *parameters, uint16_t 
     return (code - (1 << (bits - 1))) * (1 << (31 - bits));
 }
 
-void control_reset(control_state_t *state) {
+void control_reset(const control_parameters_t *parameters, control_state_t *state) {
     *state = (control_state_t){0};
     state_machine_reset(&state->machine);
+    control_prepare(parameters, state);
 }
 
 /* A code in the LSBs of the scale, rounded to nearest, half upwards: below 2^16. Nothing but code 0 gives 0. */
@@ -107,15 +108,11 @@ static void estimate(const control_parameters_t *parameters, control_state_t *st
     }
 }
 
-/* Entering RUN: the laws start afresh, the reference from the present speed. */
-static void start_laws(const control_parameters_t *parameters, control_state_t *state) {
-    const bool reverses = parameters->controller == DRIVE_CONTROLLER_SALIENT;
-    state->speed_reference_q22 = fixed_clamp(state->observer.speed_q22, reverses ? INT32_MIN : 0, INT32_MAX);
+void control_prepare(const control_parameters_t *parameters, control_state_t *state) {
     speed_pi_reset(&state->speed_pi);
     ditc_hysteresis_reset(&state->hysteresis);
     predictive_torque_reset(&state->predictive);
-    /* A network is the dearest to start afresh: only the one that will be asked. */
-    if (reverses) {
+    if (parameters->controller == DRIVE_CONTROLLER_SALIENT) {
         torque_trim_reset(&parameters->trim, &state->trim, 0);
     }
     if (parameters->controller == DRIVE_CONTROLLER_PAPER) {
@@ -247,8 +244,13 @@ __attribute__((cold)) static void enter(const control_parameters_t *parameters, 
         load_observer_reset(&state->observer, state->estimate.angle);
         observer_bandwidth_reset(&state->bandwidth);
     }
+    if (before == DRIVE_STATE_RUN) {
+        control_prepare(parameters, state);
+    }
     if (state->machine.state == DRIVE_STATE_RUN) {
-        start_laws(parameters, state);
+        /* From the present speed. */
+        const bool reverses = parameters->controller == DRIVE_CONTROLLER_SALIENT;
+        state->speed_reference_q22 = fixed_clamp(state->observer.speed_q22, reverses ? INT32_MIN : 0, INT32_MAX);
     }
 }
 
