@@ -8,6 +8,10 @@
 #define ONE_Q14 (1 << 14)
 #define ONE_Q15 (1 << 15)
 
+/* Of an inverse: the torque begins as a parabola, the flux linkage is nearly straight between columns. */
+#define TORQUE_STEPS 2
+#define FLUX_STEPS 1
+
 /* Value in Q14 of a column's curve at a place: the nodes' part is below 2^30, the bend's within 2^27. */
 static inline int32_t torque_value_q14(const phase_map_place_t *place, const machine_column_t *column) {
     const int16_t *nodes = &column->torque_node[place->row];
@@ -72,9 +76,9 @@ static inline int32_t at_part(span_t s, int32_t t_q15) {
            4 * fixed_multiply_high(s.bend, t_q15 * (ONE_Q15 - t_q15));
 }
 
-/* The t at which a span has a product: Newton's iteration from the middle. A curve that rises everywhere has a bend
- * within its rise; then no divisor is below a quarter of the rise. */
-static inline int32_t part_q15(span_t s, int32_t wanted) {
+/* The t at which a span has a product: so many steps of Newton's iteration behind the first, from the middle. A curve
+ * that rises everywhere has a bend within its rise; then no divisor is below a quarter of the rise. */
+static inline int32_t part_q15(span_t s, int32_t wanted, int steps) {
     if (wanted <= s.start) {
         return 0;
     }
@@ -88,7 +92,7 @@ static inline int32_t part_q15(span_t s, int32_t wanted) {
     const int32_t bend = (fixed_clamp(s.bend, -s.rise, s.rise) * (1 << shift)) >> 15;
     int32_t t_q15 = (rest + bend * (1 << 13)) / rise;
 #pragma GCC unroll 2
-    for (int i = 0; i < 2; i++) {
+    for (int i = 0; i < steps; i++) {
         t_q15 = (rest + bend * ((t_q15 * t_q15) >> 15)) / (rise - bend + ((bend * t_q15) >> 14));
     }
     return fixed_clamp(t_q15, 0, ONE_Q15 - 1);
@@ -109,7 +113,7 @@ static inline phase_map_place_t place_of(const machine_tables_t *tables, uint32_
     return (phase_map_place_t){
         .tables = tables,
         .row = (uint32_t)(row - tables->row),
-        .weights_q14 = fixed_pair(ONE_Q14 - fraction_q14, fraction_q14),
+        .weights_q14 = (uint32_t)(ONE_Q14 - fraction_q14) | (uint32_t)fraction_q14 << 16,
         .torque_bend_q14 = bend_q14 << tables->torque_format.bend_shift,
         .flux_bend_q14 = bend_q14 << tables->flux_format.bend_shift,
     };
@@ -197,7 +201,7 @@ int32_t phase_map_current_of_torque_q9(const phase_map_place_t *place, int32_t t
             high = node;
         }
     }
-    const int32_t t_q15 = part_q15(span(low, high), wanted);
+    const int32_t t_q15 = part_q15(span(low, high), wanted, TORQUE_STEPS);
     return (int32_t)(below << MACHINE_COLUMN_BITS) + (t_q15 >> (15 - MACHINE_COLUMN_BITS));
 }
 
@@ -218,10 +222,10 @@ static inline column_t column_at(const phase_map_place_t *place, uint32_t column
     return (column_t){torque_node(place, column), flux_node(place, column)};
 }
 
-/* The first column is below every target. */
+/* Whether a column, which is not the last, is below the target. The first one is below every target. */
 static inline bool is_below(column_t c, uint32_t column, target_t target) {
-    return c.flux.product <= target.highest &&
-           ((c.torque.product <= target.torque && column <= target.limit) || c.flux.product <= target.lowest);
+    return c.flux.product <= target.highest && ((c.torque.product <= target.torque && column <= target.limit) ||
+                                                (c.flux.product <= target.lowest && column < MACHINE_COLUMNS - 1));
 }
 
 bool phase_map_reach(const machine_tables_t *tables, uint32_t phase_angle, int32_t torque_q24,
@@ -242,8 +246,7 @@ bool phase_map_reach(const machine_tables_t *tables, uint32_t phase_angle, int32
     column_t low = column_at(&place, column);
     column_t high = low;
     if (is_below(low, column, target)) {
-        while (high = column_at(&place, column + 1),
-               column < MACHINE_COLUMNS - 2 && is_below(high, column + 1, target)) {
+        while (high = column_at(&place, column + 1), is_below(high, column + 1, target)) {
             low = high;
             column++;
         }
@@ -257,22 +260,25 @@ bool phase_map_reach(const machine_tables_t *tables, uint32_t phase_angle, int32
 
     const span_t torque = span(low.torque, high.torque);
     const span_t flux = span(low.flux, high.flux);
+    int32_t t_q15 = part_q15(torque, target.torque, TORQUE_STEPS);
+    bool reached = torque.start <= target.torque && target.torque < high.torque.product;
+    const bool beyond = target.torque >= high.torque.product; /* the flux linkage ends what is below, or the limit */
     const int32_t limit_q15 =
         (range->current_limit_q9 - (int32_t)(column << MACHINE_COLUMN_BITS)) * (1 << (15 - MACHINE_COLUMN_BITS));
-    int32_t t_q15 = part_q15(torque, target.torque);
-    bool reached = torque.start <= target.torque && target.torque < high.torque.product;
-    if (t_q15 > limit_q15) {
+    bool limited = t_q15 > limit_q15;
+    if (limited) {
         t_q15 = limit_q15 > 0 ? limit_q15 : 0;
-        reached = false;
     }
-    int32_t flux_q29 = result(flux_format, at_part(flux, t_q15));
-    const bool beyond = !reached && t_q15 == ONE_Q15 - 1; /* the torque, so that the flux linkage ends what is below */
-    if (beyond || flux_q29 < range->lowest_q29 || flux_q29 > range->highest_q29) {
-        flux_q29 = flux_q29 < range->lowest_q29 ? range->lowest_q29 : range->highest_q29;
-        t_q15 = part_q15(flux, flux_q29 >> flux_format->result_shift);
-        reached = false;
+    const int32_t there = at_part(flux, t_q15);
+    if (there > target.lowest && there <= target.highest && (limited || !beyond)) {
+        reached = reached && !limited;
+        point->flux_q29 = result(flux_format, there);
+        point->torque_q24 = reached ? wanted_q24 : result(torque_format, at_part(torque, t_q15));
+        return reached;
     }
-    point->flux_q29 = flux_q29;
-    point->torque_q24 = reached ? wanted_q24 : result(torque_format, at_part(torque, t_q15));
-    return reached;
+    const bool to_lowest = there <= target.lowest;
+    t_q15 = part_q15(flux, to_lowest ? target.lowest : target.highest, FLUX_STEPS);
+    point->flux_q29 = to_lowest ? range->lowest_q29 : range->highest_q29;
+    point->torque_q24 = result(torque_format, at_part(torque, t_q15));
+    return false;
 }

@@ -7,7 +7,9 @@
  *
  * A phase can only be moved by +-Vdc Ts. Where a reference is out of that reach, the phase goes as far as it can, and
  * the torque that is then missing (or too much) is given to the others in DITC's order: what is missing first to the
- * incoming phase, then to the active, then to the outgoing one; what is too much is taken off the outgoing one first.
+ * incoming phase, then to the active, then to the outgoing one; what is too much is taken off the phases behind it, and
+ * what these cannot let go off the outgoing one first. So the phases are planned from the outgoing to the incoming one,
+ * each at once with what the others leave to it.
  * Every phase stays in the states (+1, 0) or (-1, 0).
  *
  * Torque of either sign at either direction of rotation: a phase makes positive torque in the half of its pitch from

@@ -61,33 +61,31 @@ __attribute__((noinline)) static int32_t torque_and_flux(const machine_tables_t 
     return phase_map_torque_q24(&place, current_q9);
 }
 
-static void estimate(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample) {
+/* Currents and torques, and the flux linkages where they are asked for: of a constant, so that who does not ask has
+ * nothing of it in the loop. */
+__attribute__((always_inline)) static inline void estimate_phases(const control_parameters_t *parameters,
+                                                                  control_state_t *state, const hal_adc_sample_t *adc,
+                                                                  bool with_flux) {
     const machine_tables_t *tables = parameters->tables;
-    const bool salient = parameters->controller == DRIVE_CONTROLLER_SALIENT;
     control_estimate_t *e = &state->estimate;
-    measure_angle(parameters, &sample->encoder, state->observer.speed_q22, e);
-    e->bus_voltage_q6 = from_code(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
-    commutation_find(&parameters->commutation, e->angle, &e->commutation);
     int32_t current_max_q9 = 0;
     int32_t torque_sum_q24 = 0;
     const unsigned phases = tables->phases;
     for (unsigned phase = 0; phase < phases; phase++) {
-        const uint16_t code = sample->adc.phase_current_counts[phase];
+        const uint16_t code = adc->phase_current_counts[phase];
         e->current_q9[phase] = 0;
         e->torque_q24[phase] = 0;
-        e->flux_q29[phase] = 0;
+        if (with_flux) {
+            e->flux_q29[phase] = 0;
+        }
         if (code == 0) { /* most of the time a phase has none */
             continue;
         }
         /* Every code's current is on the map. */
         const int32_t current_q9 = from_code(code, parameters->current_scale_q18);
         const uint32_t angle = phase_angle(parameters, state, phase);
-        int32_t torque_q24;
-        if (salient) {
-            torque_q24 = torque_and_flux(tables, angle, current_q9, &e->flux_q29[phase]);
-        } else {
-            torque_q24 = phase_map_torque_at_q24(tables, angle, current_q9);
-        }
+        const int32_t torque_q24 = with_flux ? torque_and_flux(tables, angle, current_q9, &e->flux_q29[phase])
+                                             : phase_map_torque_at_q24(tables, angle, current_q9);
         torque_sum_q24 = fixed_add(torque_sum_q24, torque_q24);
         current_max_q9 = current_q9 > current_max_q9 ? current_q9 : current_max_q9;
         e->current_q9[phase] = current_q9;
@@ -95,6 +93,18 @@ static void estimate(const control_parameters_t *parameters, control_state_t *st
     }
     e->current_max_q9 = current_max_q9;
     e->torque_sum_q24 = torque_sum_q24;
+}
+
+static void estimate(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample) {
+    control_estimate_t *e = &state->estimate;
+    measure_angle(parameters, &sample->encoder, state->observer.speed_q22, e);
+    e->bus_voltage_q6 = from_code(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
+    commutation_find(&parameters->commutation, e->angle, &e->commutation);
+    if (parameters->controller == DRIVE_CONTROLLER_SALIENT) {
+        estimate_phases(parameters, state, &sample->adc, true);
+    } else {
+        estimate_phases(parameters, state, &sample->adc, false);
+    }
 }
 
 /* Entering RUN: the laws start afresh, the reference from the present speed. */
