@@ -166,7 +166,7 @@ static void switch_by_duty(const control_parameters_t *parameters, control_state
         .reference_q24 = reference_q24,
         .error_q24 = fixed_subtract(reference_q24, e->torque_sum_q24),
     };
-    ditc_duty_step(&parameters->duty, &state->duty, parameters->tables, &e->commutation, &sample, state->duty_q15);
+    ditc_duty_step(&parameters->duty, &state->duty, &e->commutation, &sample, state->duty_q15);
     for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
         pwm_set_phase(compare, phase, state->duty_q15[phase], parameters->period_ticks);
     }
