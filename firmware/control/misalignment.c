@@ -79,8 +79,8 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const int32_t torque_square_q24 = product_q24(sample->torque_q24, sample->torque_q24);
     const int32_t power_q24 =
         fixed_add(misalignment->power_q24, fixed_multiply(torque_square_q24, POWER_FLOOR_Q20, 20));
-    /* All of y since the phase's last turn. */
-    const int32_t mean_q24 = (int32_t)((misalignment->sum_q24 - since_q24) / phases);
+    /* All of y since the phase's last turn: of at most four periods, each within a word. */
+    const int32_t mean_q24 = 4 * ((int32_t)((misalignment->sum_q24 - since_q24) >> 2) / phases);
     const int32_t error_q24 = fixed_subtract(mean_q24, misalignment->disturbance_mean_q24);
     /* Q24 * Q24 to Q30, by Q20: Q10. */
     const int32_t step_q10 = fixed_multiply(error_q24, alternating_q24, 18) / ((power_q24 >> 4) + 1);

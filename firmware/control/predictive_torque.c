@@ -18,7 +18,6 @@ typedef struct {
     bool positive;            /* in that half itself, not its mirror image */
     bool brakes;              /* on its way to unaligned */
     uint32_t since_on;        /* angle past turn-on; beyond 2^31: before it */
-    int32_t wanted_q24;       /* its share of the torque, magnitude */
     int32_t freewheeling_q29; /* flux linkage that a period without voltage leaves */
     phase_map_range_t range;  /* from what a period of -Vdc leaves to what one of +Vdc brings, or less */
     phase_map_point_t point;  /* that it is to reach, torque by magnitude */
@@ -140,11 +139,23 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     /* Phases in the order in which they entered, those of the opposed half before those of the reference's: by index,
      * or backwards, since each follows the one before by a stroke. */
     const bool positive = torque_q24 >= 0;
-    const uint32_t turned = (positive != sample->backwards ? HALF_PITCH : 0) ^ (sample->backwards ? UINT32_MAX : 0);
-    uint32_t first_rank = 0, incoming_rank = HALF_PITCH;
-    unsigned first = 0, incoming = HAL_PHASES_MAX;
+    const bool backwards = sample->backwards;
+    const uint32_t turned = (positive != backwards ? HALF_PITCH : 0) ^ (backwards ? UINT32_MAX : 0);
+    uint32_t first_rank = 0;
+    unsigned phase = 0;
+    for (unsigned n = 0; n < phases; n++) {
+        const uint32_t rank = sample->angle[n] ^ turned;
+        if (rank >= first_rank) {
+            first_rank = rank;
+            phase = n;
+        }
+    }
+
+    /* What a phase cannot do is owed: too much is taken off those behind it, what is missing the incoming one gets. */
+    const means_t means = {tables, reach_q29, sample->turn};
+    int32_t owed_q24 = 0; /* in the direction of the reference */
     plan_t plan[HAL_PHASES_MAX];
-    for (unsigned phase = 0; phase < phases; phase++) {
+    for (unsigned n = 0; n < phases; n++) {
         plan_t *p = &plan[phase];
         int32_t *flux_q29 = &control->flux_q29[phase];
         /* Q15 * Q29 to Q29. */
@@ -157,55 +168,40 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
             .highest_q29 = not_below_none(fixed_add(p->freewheeling_q29, reach_q29)),
             .current_limit_q9 = parameters->current_limit_q9,
         };
+        p->point.column = control->column[phase];
         const uint32_t angle = sample->angle[phase];
         p->positive = angle >= HALF_PITCH;
         p->angle = p->positive ? angle : ~angle; /* as far from aligned as that, to a unit */
-        p->brakes = p->positive == sample->backwards;
-        p->point.column = control->column[phase];
+        p->brakes = p->positive == backwards;
         /* Windows move ahead of the rotation: not those of a phase that brakes. */
         const torque_share_window_t *window = p->brakes ? late : early;
         p->since_on = p->angle - window->turn_on;
         const int32_t half_q24 = p->positive ? forwards_q24 : backwards_q24;
-        p->wanted_q24 = half_q24 > 0 ? share_of(half_q24, torque_share_q15(window, p->angle)) : 0;
+        const int32_t wanted_q24 = half_q24 > 0 ? share_of(half_q24, torque_share_q15(window, p->angle)) : 0;
 
-        const uint32_t rank = angle ^ turned;
-        if (rank >= first_rank) {
-            first_rank = rank;
-            first = phase;
-        }
-        if (rank < incoming_rank && p->since_on < HALF_PITCH) {
-            incoming_rank = rank;
-            incoming = phase;
-        }
-    }
-
-    /* What a phase cannot do is owed: too much is taken off those behind it, what is missing the incoming one gets. */
-    const means_t means = {tables, reach_q29, sample->turn};
-    int32_t owed_q24 = 0; /* in the direction of the reference */
-    unsigned phase = first;
-    for (unsigned n = 0; n < phases; n++) {
-        plan_t *p = &plan[phase];
+        const unsigned next = backwards ? (phase > 0 ? phase : phases) - 1 : phase + 1 < phases ? phase + 1 : 0;
         if (p->positive != positive) {
-            aim(&means, p, p->wanted_q24);
-            owed_q24 = fixed_add(owed_q24, fixed_subtract(p->point.torque_q24, p->wanted_q24));
+            aim(&means, p, wanted_q24);
+            owed_q24 = fixed_add(owed_q24, fixed_subtract(p->point.torque_q24, wanted_q24));
         } else {
-            const bool gets = owed_q24 < 0 || phase == incoming;
-            const int32_t all_q24 = fixed_add(owed_q24, p->wanted_q24);
-            aim(&means, p, gets ? all_q24 : p->wanted_q24);
+            const int32_t all_q24 = fixed_add(owed_q24, wanted_q24);
+            /* Past its turn-on, and behind it comes none or one before its own. */
+            const bool gets =
+                owed_q24 <= 0 ||
+                (p->since_on < HALF_PITCH &&
+                 (n + 1 == phases ||
+                  (positive ? sample->angle[next] : ~sample->angle[next]) - window->turn_on >= HALF_PITCH));
+            aim(&means, p, gets ? all_q24 : wanted_q24);
             owed_q24 = fixed_subtract(all_q24, p->point.torque_q24);
         }
-        if (sample->backwards) {
-            phase = phase > 0 ? phase - 1 : phases - 1;
-        } else {
-            phase = phase + 1 < phases ? phase + 1 : 0;
-        }
+        phase = next;
     }
     int32_t missing_q24 = positive ? owed_q24 : fixed_subtract(0, owed_q24);
     if (missing_q24 != 0) {
-        missing_q24 = hand_over(&means, plan, sample->backwards, positive, missing_q24);
+        missing_q24 = hand_over(&means, plan, backwards, positive, missing_q24);
         /* The opposed half only lets go, of what it has for the reserve. */
         if (opposed_q24 > 0 && (missing_q24 > 0) == positive) {
-            missing_q24 = hand_over(&means, plan, sample->backwards, !positive, missing_q24);
+            missing_q24 = hand_over(&means, plan, backwards, !positive, missing_q24);
         }
     }
     control->missing_q24 = missing_q24;
