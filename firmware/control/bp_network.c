@@ -14,16 +14,19 @@ static int32_t next_weight(uint32_t *generator) {
 void bp_network_reset(bp_network_t *network, uint32_t seed) {
     uint32_t generator = seed;
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
-        triple_moving_t *input = &network->hidden[i].input;
-        *input = (triple_moving_t){0};
-        input->value[1] = next_weight(&generator);
-        input->value[0] = next_weight(&generator);
-        input->value[2] = next_weight(&generator);
+        bp_neuron_t *neuron = &network->hidden[i];
+        neuron->input.value[1] = next_weight(&generator);
+        neuron->input.value[0] = next_weight(&generator);
+        neuron->input.value[2] = next_weight(&generator);
+#pragma GCC unroll 3
+        for (unsigned k = 0; k < 3; k++) {
+            neuron->input.change[k] = 0;
+            neuron->output.change[k] = 0;
+        }
     }
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         for (unsigned i = 0; i < BP_HIDDEN; i++) {
             network->hidden[i].output.value[l] = next_weight(&generator);
-            network->hidden[i].output.change[l] = 0;
         }
     }
 }

@@ -54,10 +54,9 @@ static int32_t incoming_duty_q15(const ditc_duty_parameters_t *parameters, const
                        -DUTY_ONE_Q15, DUTY_ONE_Q15);
 }
 
-void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc, const machine_tables_t *tables,
-                    const commutation_t *commutation, const ditc_duty_sample_t *sample,
-                    int32_t duty_q15[HAL_PHASES_MAX]) {
-    for (unsigned phase = 0; phase < tables->phases; phase++) {
+void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc, const commutation_t *commutation,
+                    const ditc_duty_sample_t *sample, int32_t duty_q15[HAL_PHASES_MAX]) {
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         duty_q15[phase] = -DUTY_ONE_Q15;
     }
     const unsigned active = commutation->active;

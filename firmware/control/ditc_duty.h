@@ -63,8 +63,7 @@ int32_t ditc_duty_aim_q9(const ditc_duty_aims_t *aims, int32_t torque_q24);
 void ditc_duty_reset(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc);
 
 /* One sample: duty of each phase, Q1.15, -32768..32768. */
-void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc, const machine_tables_t *tables,
-                    const commutation_t *commutation, const ditc_duty_sample_t *sample,
-                    int32_t duty_q15[HAL_PHASES_MAX]);
+void ditc_duty_step(const ditc_duty_parameters_t *parameters, ditc_duty_t *ditc, const commutation_t *commutation,
+                    const ditc_duty_sample_t *sample, int32_t duty_q15[HAL_PHASES_MAX]);
 
 #endif

@@ -6,9 +6,10 @@
 
 #include "hal_pwm.h"
 
-/* Sets one phase's two compare values for a duty in Q1.15, -32768..32768 (held), rounded to a tick of period_ticks
- * (at most 32767): 0..+1 lower switch on, upper switch on for the duty's share; -1..0 upper switch off, lower switch
- * off for the duty's share. So the states are (+1, 0) and (-1, 0), and each switch switches at most once a period. */
+/* Sets one phase's two compare values for a duty in Q1.15, -32768..32768, which every law keeps to, rounded to a tick
+ * of period_ticks (at most 32767): 0..+1 lower switch on, upper switch on for the duty's share; -1..0 upper switch off,
+ * lower switch off for the duty's share. So the states are (+1, 0) and (-1, 0), and each switch switches at most once a
+ * period. */
 void pwm_set_phase(hal_pwm_compare_t *compare, unsigned phase, int32_t duty_q15, uint16_t period_ticks);
 
 /* Sets one phase's compare values for a whole period in a state: +1 both switches on, 0 the lower one, -1 none. */

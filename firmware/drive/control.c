@@ -19,9 +19,10 @@ static int32_t load_torque_q24(const control_parameters_t *parameters, uint16_t 
     return (code - (1 << (bits - 1))) * (1 << (31 - bits));
 }
 
-void control_reset(control_state_t *state) {
+void control_reset(const control_parameters_t *parameters, control_state_t *state) {
     *state = (control_state_t){0};
     state_machine_reset(&state->machine);
+    control_prepare(parameters, state);
 }
 
 /* A code in the LSBs of the scale, rounded to nearest, half upwards: below 2^16. Nothing but code 0 gives 0. */
@@ -29,8 +30,8 @@ static int32_t from_code(uint16_t code, int32_t scale_q18) {
     return fixed_multiply_high(code << 14, scale_q18);
 }
 
-/* The measured angle. Behind an edge the rotor turned on at the observer's speed; an edge of
- * long ago says less than the count does. */
+/* The measured angle. Behind an edge the rotor turned on at the observer's speed; an edge of long ago says less than the
+ * count does. */
 static void measure_angle(const control_parameters_t *parameters, const hal_encoder_sample_t *encoder,
                           int32_t speed_q22, control_estimate_t *e) {
     const uint32_t count = encoder->counts << parameters->encoder_shift;
@@ -61,33 +62,31 @@ __attribute__((noinline)) static int32_t torque_and_flux(const machine_tables_t 
     return phase_map_torque_q24(&place, current_q9);
 }
 
-static void estimate(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample) {
+/* Currents and torques, and the flux linkages where they are asked for: of a constant, so that who does not ask has
+ * nothing of it in the loop. */
+__attribute__((always_inline)) static inline void estimate_phases(const control_parameters_t *parameters,
+                                                                  control_state_t *state, const hal_adc_sample_t *adc,
+                                                                  bool with_flux) {
     const machine_tables_t *tables = parameters->tables;
-    const bool salient = parameters->controller == DRIVE_CONTROLLER_SALIENT;
     control_estimate_t *e = &state->estimate;
-    measure_angle(parameters, &sample->encoder, state->observer.speed_q22, e);
-    e->bus_voltage_q6 = from_code(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
-    commutation_find(&parameters->commutation, e->angle, &e->commutation);
     int32_t current_max_q9 = 0;
     int32_t torque_sum_q24 = 0;
     const unsigned phases = tables->phases;
     for (unsigned phase = 0; phase < phases; phase++) {
-        const uint16_t code = sample->adc.phase_current_counts[phase];
+        const uint16_t code = adc->phase_current_counts[phase];
         e->current_q9[phase] = 0;
         e->torque_q24[phase] = 0;
-        e->flux_q29[phase] = 0;
+        if (with_flux) {
+            e->flux_q29[phase] = 0;
+        }
         if (code == 0) { /* most of the time a phase has none */
             continue;
         }
         /* Every code's current is on the map. */
         const int32_t current_q9 = from_code(code, parameters->current_scale_q18);
         const uint32_t angle = phase_angle(parameters, state, phase);
-        int32_t torque_q24;
-        if (salient) {
-            torque_q24 = torque_and_flux(tables, angle, current_q9, &e->flux_q29[phase]);
-        } else {
-            torque_q24 = phase_map_torque_at_q24(tables, angle, current_q9);
-        }
+        const int32_t torque_q24 = with_flux ? torque_and_flux(tables, angle, current_q9, &e->flux_q29[phase])
+                                             : phase_map_torque_at_q24(tables, angle, current_q9);
         torque_sum_q24 = fixed_add(torque_sum_q24, torque_q24);
         current_max_q9 = current_q9 > current_max_q9 ? current_q9 : current_max_q9;
         e->current_q9[phase] = current_q9;
@@ -97,15 +96,23 @@ static void estimate(const control_parameters_t *parameters, control_state_t *st
     e->torque_sum_q24 = torque_sum_q24;
 }
 
-/* Entering RUN: the laws start afresh, the reference from the present speed. */
-static void start_laws(const control_parameters_t *parameters, control_state_t *state) {
-    const bool reverses = parameters->controller == DRIVE_CONTROLLER_SALIENT;
-    state->speed_reference_q22 = fixed_clamp(state->observer.speed_q22, reverses ? INT32_MIN : 0, INT32_MAX);
+static void estimate(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample) {
+    control_estimate_t *e = &state->estimate;
+    measure_angle(parameters, &sample->encoder, state->observer.speed_q22, e);
+    e->bus_voltage_q6 = from_code(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
+    commutation_find(&parameters->commutation, e->angle, &e->commutation);
+    if (parameters->controller == DRIVE_CONTROLLER_SALIENT) {
+        estimate_phases(parameters, state, &sample->adc, true);
+    } else {
+        estimate_phases(parameters, state, &sample->adc, false);
+    }
+}
+
+void control_prepare(const control_parameters_t *parameters, control_state_t *state) {
     speed_pi_reset(&state->speed_pi);
     ditc_hysteresis_reset(&state->hysteresis);
     predictive_torque_reset(&state->predictive);
-    /* A network is the dearest to start afresh: only the one that will be asked. */
-    if (reverses) {
+    if (parameters->controller == DRIVE_CONTROLLER_SALIENT) {
         torque_trim_reset(&parameters->trim, &state->trim, 0);
     }
     if (parameters->controller == DRIVE_CONTROLLER_PAPER) {
@@ -159,7 +166,7 @@ static void switch_by_duty(const control_parameters_t *parameters, control_state
         .reference_q24 = reference_q24,
         .error_q24 = fixed_subtract(reference_q24, e->torque_sum_q24),
     };
-    ditc_duty_step(&parameters->duty, &state->duty, parameters->tables, &e->commutation, &sample, state->duty_q15);
+    ditc_duty_step(&parameters->duty, &state->duty, &e->commutation, &sample, state->duty_q15);
     for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
         pwm_set_phase(compare, phase, state->duty_q15[phase], parameters->period_ticks);
     }
@@ -237,8 +244,13 @@ __attribute__((cold)) static void enter(const control_parameters_t *parameters, 
         load_observer_reset(&state->observer, state->estimate.angle);
         observer_bandwidth_reset(&state->bandwidth);
     }
+    if (before == DRIVE_STATE_RUN) {
+        control_prepare(parameters, state);
+    }
     if (state->machine.state == DRIVE_STATE_RUN) {
-        start_laws(parameters, state);
+        /* From the present speed. */
+        const bool reverses = parameters->controller == DRIVE_CONTROLLER_SALIENT;
+        state->speed_reference_q22 = fixed_clamp(state->observer.speed_q22, reverses ? INT32_MIN : 0, INT32_MAX);
     }
 }
 

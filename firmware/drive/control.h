@@ -121,8 +121,12 @@ typedef struct {
     uint16_t observer_bandwidth_rad_s;
 } control_diagnostics_t;
 
-/* INITIALISE, everything at rest. */
-void control_reset(control_state_t *state);
+/* INITIALISE, everything at rest, the laws prepared. */
+void control_reset(const control_parameters_t *parameters, control_state_t *state);
+
+/* The laws start afresh at the next RUN: whenever parameters change, which they do outside of RUN. control_step does it
+ * itself on leaving RUN. Apart from entering RUN, because a network takes as long to start as it does to learn. */
+void control_prepare(const control_parameters_t *parameters, control_state_t *state);
 
 /* One control period. Returns false when every switch must be open: then *compare is all zero. [interrupt] */
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,

@@ -11,6 +11,7 @@ static void configure(drive_t *drive) {
                           hal_adc_bits(drive->hal));
     hal_critical_enter(drive->hal);
     drive->control_parameters = control_parameters;
+    control_prepare(&drive->control_parameters, &drive->control); /* parameters change outside of RUN only */
     hal_critical_leave(drive->hal);
     drive->configured_changes = drive->parameters.changes;
 }
@@ -26,8 +27,8 @@ bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, cons
     parameters_set_default(&drive->parameters, PARAMETER_FRICTION_NM_S, tables->friction_q30);
     parameters_set_default(&drive->parameters, PARAMETER_RESISTANCE_OHM, tables->resistance_q24);
     comms_init(&drive->comms, tables->phases, config->control_rate_hz, hal_time_us(hal));
-    control_reset(&drive->control);
     configure(drive);
+    control_reset(&drive->control_parameters, &drive->control);
     hal_pwm_open_all(hal);
     hal_pwm_start(hal, drive->control_parameters.period_ticks);
     return true;

@@ -19,7 +19,7 @@ typedef struct {
     control_sample_t sample;
     /* Written by the background with the interrupt kept out. */
     control_parameters_t control_parameters;
-    /* Of the interrupt. */
+    /* Of the interrupt; the background prepares its laws for new parameters, the interrupt kept out. */
     control_state_t control;
     /* The interrupt's time on the processor: nobody acts on it. What a late interrupt does is in drive/protection.h. */
     uint32_t used_ticks;      /* from trigger to end, of the last one, HAL_PWM_TICK_NS */

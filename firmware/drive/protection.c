@@ -45,8 +45,8 @@ typedef struct {
     int32_t over_speed_q22;
     int32_t jump;
     int32_t still;
-    bool late;
-    bool lost;
+    int32_t late; /* or -1 */
+    int32_t lost;
 } margins_t;
 
 static uint16_t bit_if(bool fails, fault_t fault) {
@@ -60,8 +60,8 @@ __attribute__((cold)) static uint16_t failed_checks(margins_t left) {
     checks |= bit_if(left.under_voltage_q6 < 0, FAULT_UNDER_VOLTAGE);
     checks |= bit_if(left.over_speed_q22 < 0, FAULT_OVER_SPEED);
     checks |= bit_if((left.jump | left.still) < 0, FAULT_ENCODER);
-    checks |= bit_if(left.late, FAULT_COMMAND_TIMEOUT);
-    checks |= bit_if(left.lost, FAULT_INTERRUPT_OVERRUN);
+    checks |= bit_if(left.late < 0, FAULT_COMMAND_TIMEOUT);
+    checks |= bit_if(left.lost < 0, FAULT_INTERRUPT_OVERRUN);
     return checks;
 }
 
@@ -72,9 +72,11 @@ uint16_t protection_check(const protection_parameters_t *parameters, protection_
     protection->angle = sample->angle;
     int32_t step_max = parameters->angle_step_max;
     int32_t overruns = 0;
+    int32_t lost = 0;
     if (__builtin_expect(sample->missed_interrupts != 0, 0)) {
         overruns = fixed_saturate((int64_t)protection->overruns + sample->missed_interrupts);
         step_max = fixed_saturate(step_max * ((int64_t)sample->missed_interrupts + 1));
+        lost = PROTECTION_OVERRUNS_MAX - 1 - overruns;
     }
     protection->overruns = overruns;
     /* None overflows: limits and what they limit are not negative. */
@@ -85,11 +87,11 @@ uint16_t protection_check(const protection_parameters_t *parameters, protection_
         .over_speed_q22 = parameters->over_speed_q22 - speed_q22,
         .jump = step_max - fixed_abs(step),
         .still = left_to_move(parameters, protection, step, speed_q22),
-        .late = sample->command_age_us > parameters->command_timeout_us,
-        .lost = overruns >= PROTECTION_OVERRUNS_MAX,
+        .late = -(int32_t)(sample->command_age_us > parameters->command_timeout_us),
+        .lost = lost,
     };
     /* That none fails, nearly always, shows in the sign of them all. */
-    const int32_t any =
-        left.current_q9 | left.over_voltage_q6 | left.under_voltage_q6 | left.over_speed_q22 | left.jump | left.still;
-    return any < 0 || left.late || left.lost ? failed_checks(left) : 0;
+    const int32_t any = left.current_q9 | left.over_voltage_q6 | left.under_voltage_q6 | left.over_speed_q22 |
+                        left.jump | left.still | left.late | left.lost;
+    return any < 0 ? failed_checks(left) : 0;
 }

@@ -57,8 +57,12 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     return set;
 }
 
-void control_reset(control_state_t *state) {
-    (void)state;
+void control_reset(const control_parameters_t *parameters, control_state_t *state) {
+    (void)parameters, (void)state;
+}
+
+void control_prepare(const control_parameters_t *parameters, control_state_t *state) {
+    (void)parameters, (void)state;
 }
 
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,

@@ -86,7 +86,7 @@ class DitcDuty : public testing::Test {
             sample.error_q24 -= torque_q24[phase];
         }
         error_q24 = sample.error_q24;
-        ditc_duty_step(&parameters, &ditc, &machine_tables, &commutation, &sample, duty_q15);
+        ditc_duty_step(&parameters, &ditc, &commutation, &sample, duty_q15);
     }
 
     ditc_duty_parameters_t parameters = parameters_of(BP_PID_FIXED);
@@ -324,7 +324,7 @@ TEST_F(DitcDuty, nothing_overflows_at_the_ends_of_all_ranges) {
                     torque_q24[phase] = ends[random() % 5];
                 }
                 const ditc_duty_sample_t sample = {current_q9, torque_q24, int32_t(random() >> 1), ends[random() % 5]};
-                ditc_duty_step(&parameters, &ditc, &machine_tables, &commutation, &sample, duty_q15);
+                ditc_duty_step(&parameters, &ditc, &commutation, &sample, duty_q15);
                 for (unsigned phase = 0; phase < 3; phase++) {
                     ASSERT_LE(std::abs(duty_q15[phase]), ONE_Q15);
                 }

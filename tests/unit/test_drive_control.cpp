@@ -42,7 +42,7 @@ class Control : public testing::Test {
         parameters_init(&p);
         p.values[PARAMETER_CONTROLLER] = controller;
         parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, 12);
-        control_reset(&state);
+        control_reset(&parameters, &state);
         diagnostics = control_diagnostics_t{};
         sample = control_sample_t{};
         sample.adc.bus_voltage_counts = BUS_COUNTS;

@@ -98,7 +98,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
         const control_parameters_t parameters =
             configure_control(&p, tables, rate_hz, unsigned(8 + random() % 25), 12 + unsigned(sequence) % 5);
         control_state_t state;
-        control_reset(&state);
+        control_reset(&parameters, &state);
         bench_t bench;
         bench.angle = uint32_t(random());
         for (int period = 0; period < PERIODS; period++) {
@@ -137,7 +137,7 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
         for (const unsigned bits : {8u, 17u, 32u}) {
             const control_parameters_t parameters = configure_control(&p, &machine_tables, rate_hz, bits, 12);
             control_state_t state;
-            control_reset(&state);
+            control_reset(&parameters, &state);
             for (int period = 0; period < 20000; period++) {
                 control_sample_t sample{};
                 for (uint16_t &counts : sample.adc.phase_current_counts) {
