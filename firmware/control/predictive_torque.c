@@ -54,7 +54,14 @@ static void aim(const means_t *means, plan_t *plan, int32_t torque_q24) {
         point->torque_q24 = 0;
         return;
     }
-    if (torque_q24 > 0 && plan->brakes) {
+    if (torque_q24 <= 0) {
+        /* The least: where the tables have no torque at any current, none alone would be anything up to the most. */
+        phase_map_range_t least = *range;
+        least.highest_q29 = least.lowest_q29;
+        (void)phase_map_reach(means->tables, plan->angle, torque_q24, &least, point);
+        return;
+    }
+    if (plan->brakes) {
         const int32_t removable_q29 = removable_flux_q29(means->reach_q29, plan->angle - HALF_PITCH, means->turn);
         range->highest_q29 = fixed_clamp(removable_q29, range->lowest_q29, range->highest_q29);
     }
