@@ -47,8 +47,8 @@ void bp_network_reset(bp_network_t *network, uint32_t seed);
 /* Outputs for inputs in Q4.27, |input| <= 1; the layers' values stay in the network for learning. */
 void bp_network_forward(bp_network_t *network, const int32_t input_q27[BP_INPUTS]);
 
-/* One step down the gradient for the last forward pass: error e in Q1.16, -1..1, its inputs and du/dO3 in Q0.31;
- * sgn(dy/du) is 1, more voltage gives more torque. */
+/* One step down the gradient for the last forward pass: error e in Q1.16, -1..1 - 2^-16, its inputs and du/dO3 in
+ * Q0.31; sgn(dy/du) is 1, more voltage gives more torque. */
 void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *network, int32_t error_q16,
                       const int32_t input_q31[BP_INPUTS], const int32_t sensitivity_q31[BP_OUTPUTS]);
 
