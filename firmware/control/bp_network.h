@@ -7,9 +7,9 @@
  *   dW2_ij(k) = eta d2_i x_j + alpha dW2_ij(k-1)                (27)
  *   d2_i = f'(net2_i) sum_l d3_l W3_li
  *
- * Formats: inputs and activations Q4.27; weights Q3.28 held within +-8 (saturation), their
- * increments Q4.27; sums of a layer Q8.23, within 6 * 8. Every product is rounded to the format of its sum: see
- * fixed_multiply_high. |eta d2| <= 3 / 2 * 8 / 4 = 3, so that with alpha < 1/2 an increment stays within 6.
+ * Formats: inputs and activations Q4.27; weights Q3.28 held within +-8 (saturation), their increments Q4.27; sums of a
+ * layer Q8.23, within 6 * 8. Every product is rounded to the format of its sum (fixed_multiply_high). With f' <= 1/2,
+ * d3 <= 1/4 and eta <= 1, eta d2 is within 3 * 8 / 8, and with alpha < 1/2 an increment within 6.
  */
 #ifndef CONTROL_BP_NETWORK_H
 #define CONTROL_BP_NETWORK_H
@@ -47,8 +47,8 @@ void bp_network_reset(bp_network_t *network, uint32_t seed);
 /* Outputs for inputs in Q4.27, |input| <= 1; the layers' values stay in the network for learning. */
 void bp_network_forward(bp_network_t *network, const int32_t input_q27[BP_INPUTS]);
 
-/* One step down the gradient for the last forward pass: error e in Q1.16, -1..1, its inputs and du/dO3 in Q0.31;
- * sgn(dy/du) is 1, more voltage gives more torque. */
+/* One step down the gradient for the last forward pass: error e in Q1.16, -1..1 - 2^-16, its inputs and du/dO3 in
+ * Q0.31; sgn(dy/du) is 1, more voltage gives more torque. */
 void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *network, int32_t error_q16,
                       const int32_t input_q31[BP_INPUTS], const int32_t sensitivity_q31[BP_OUTPUTS]);
 

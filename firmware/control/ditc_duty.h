@@ -24,8 +24,8 @@
 #include "control/commutation.h"
 #include "control/machine_tables.h"
 
-/* Current that carries a torque at the hand-over angle, A, Q7.9: entry 4 m + n is of 2^m (1 + n / 4) - 1 times 1/16 N
- * m, the first of no torque, the last beyond 128 N m. */
+/* Current that carries a torque at the hand-over angle, A, Q7.9: entry 4 m + n is of 2^m (1 + n / 4) - 1 sixteenths of
+ * a N m, the first of no torque, the last of the largest in Q7.24. */
 #define DITC_DUTY_AIMS 46
 typedef struct {
     uint16_t current_q9[DITC_DUTY_AIMS];

@@ -7,7 +7,7 @@
 
 #include "fixed/fixed.h"
 
-/* Registers of its own choice are what the compiler has left only when it optimises. */
+/* The instructions name up to nine registers, which the compiler can spare only when it optimises. */
 #if defined __ARM_FEATURE_DSP && defined __OPTIMIZE__
 #define TRIPLE_IN_REGISTERS 1
 #else

@@ -236,7 +236,7 @@ TEST(BpNetwork, weights_saturate_and_never_wrap_under_the_wildest_learning) {
             }
         }
         bp_network_forward(&network, input_q27);
-        bp_network_learn(&parameters, &network, k % 3 == 0 ? 65536 : -65536 * sign, input_q31, sensitivity_q31);
+        bp_network_learn(&parameters, &network, k % 3 == 0 ? 65535 : -65535 * sign, input_q31, sensitivity_q31);
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
             ASSERT_GT(output(network, l), 0.0);
             ASSERT_LT(output(network, l), 1.0);
