@@ -234,10 +234,12 @@ bool phase_map_reach(const machine_tables_t *tables, uint32_t phase_angle, int32
     const machine_format_t *torque_format = &tables->torque_format;
     const machine_format_t *flux_format = &tables->flux_format;
     const int32_t wanted_q24 = torque_q24 > 0 ? torque_q24 : 0;
+    /* Where the tables have no torque at any current, none would be the most as well. */
+    const int32_t highest_q29 = torque_q24 > 0 ? range->highest_q29 : range->lowest_q29;
     const target_t target = {
         .torque = wanted_q24 >> torque_format->result_shift,
         .lowest = range->lowest_q29 >> flux_format->result_shift,
-        .highest = range->highest_q29 >> flux_format->result_shift,
+        .highest = highest_q29 >> flux_format->result_shift,
         .limit = (uint32_t)range->current_limit_q9 >> MACHINE_COLUMN_BITS,
     };
 
@@ -278,7 +280,7 @@ bool phase_map_reach(const machine_tables_t *tables, uint32_t phase_angle, int32
     }
     const bool to_lowest = there <= target.lowest;
     t_q15 = part_q15(flux, to_lowest ? target.lowest : target.highest, FLUX_STEPS);
-    point->flux_q29 = to_lowest ? range->lowest_q29 : range->highest_q29;
+    point->flux_q29 = to_lowest ? range->lowest_q29 : highest_q29;
     point->torque_q24 = result(torque_format, at_part(torque, t_q15));
     return false;
 }

@@ -63,8 +63,8 @@ typedef struct {
 
 /* The point of a torque (N m, Q7.24; below zero counts as none) at an angle in the half from 2^31, unaligned, to 2^32,
  * or the nearest that the range leaves, whose lowest flux linkage counts most: true when that is the torque itself. At
- * an end of the range's flux linkages the point's is that end, to the bit. The torque that the tables give for the
- * point's flux linkage is the point's within 2 mN m.
+ * an end of the range's flux linkages the point's is that end, to the bit; no torque is the lowest. The torque that the
+ * tables give for the point's flux linkage is the point's within 2 mN m.
  *
  * The search begins at the point's column, and where torque and flux linkage rise with the current it ends at the same
  * point from everywhere; it is short where the current has changed little. */

@@ -7,9 +7,7 @@
  *
  * A phase can only be moved by +-Vdc Ts. Where a reference is out of that reach, the phase goes as far as it can, and
  * the torque that is then missing (or too much) is given to the others in DITC's order: what is missing first to the
- * incoming phase, then to the active, then to the outgoing one; what is too much is taken off the phases behind it, and
- * what these cannot let go off the outgoing one first. So the phases are planned from the outgoing to the incoming one,
- * each at once with what the others leave to it.
+ * incoming phase, then to the active, then to the outgoing one; what is too much is taken off the outgoing one first.
  * Every phase stays in the states (+1, 0) or (-1, 0).
  *
  * Torque of either sign at either direction of rotation: a phase makes positive torque in the half of its pitch from
@@ -52,7 +50,7 @@ typedef struct {
     int32_t flux_q29[HAL_PHASES_MAX]; /* predicted for the coming sample, Wb, Q2.29 */
     int32_t duty_q15[HAL_PHASES_MAX]; /* that acts from the coming sample on, Q1.15 */
     int32_t advance_q30;              /* 0..1 */
-    int32_t missing_q24;              /* torque reference less what the voltage allows, N m, Q7.24 */
+    int32_t missing_q24;              /* torque reference less what the voltage allows, beyond 1/64 N m; N m, Q7.24 */
     uint8_t column[HAL_PHASES_MAX];   /* of the tables, where a phase was planned to be */
 } predictive_torque_t;
 

@@ -30,8 +30,8 @@ static int32_t from_code(uint16_t code, int32_t scale_q18) {
     return fixed_multiply_high(code << 14, scale_q18);
 }
 
-/* The measured angle. Behind an edge the rotor turned on at the observer's speed; an edge of long ago says less than the
- * count does. */
+/* The measured angle. Behind an edge the rotor turned on at the observer's speed; an edge of long ago says less than
+ * the count does. */
 static void measure_angle(const control_parameters_t *parameters, const hal_encoder_sample_t *encoder,
                           int32_t speed_q22, control_estimate_t *e) {
     const uint32_t count = encoder->counts << parameters->encoder_shift;

@@ -50,7 +50,7 @@ typedef struct {
 } margins_t;
 
 static uint16_t bit_if(bool fails, fault_t fault) {
-    return fails ? FAULT_BIT(fault) : 0;
+    return (uint16_t)(fails ? FAULT_BIT(fault) : 0);
 }
 
 __attribute__((cold)) static uint16_t failed_checks(margins_t left) {

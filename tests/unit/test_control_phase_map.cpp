@@ -395,6 +395,22 @@ TEST(PhaseMap, the_point_that_is_reached_has_the_torque_of_its_flux_linkage_with
     }
 }
 
+TEST(PhaseMap, no_torque_is_the_least_flux_linkage_also_where_no_current_makes_torque) {
+    std::mt19937 random(11);
+    for (int i = 0; i < 20000; i++) {
+        // Every other one at the aligned position or close to it.
+        const uint32_t angle = i % 2 == 0 ? ~(uint32_t(random()) >> (8 + i % 24)) : HALF_PITCH | uint32_t(random());
+        const phase_map_place_t place = phase_map_at(&machine_tables, angle);
+        const int32_t lowest = phase_map_flux_q29(&place, 512 + int32_t(random() % (40 * 512)));
+        const phase_map_range_t range = {lowest, lowest + int32_t(0.05 * Q29), 52 * 512};
+        for (const int32_t wanted : {0, -(1 << 24)}) {
+            phase_map_point_t point = {uint32_t(random() % (MACHINE_COLUMNS - 1)), 0, 0};
+            phase_map_reach(&machine_tables, angle, wanted, &range, &point);
+            ASSERT_EQ(point.flux_q29, lowest) << angle;
+        }
+    }
+}
+
 TEST(PhaseMap, a_point_is_the_same_wherever_its_search_begins) {
     std::mt19937 random(9);
     for (int i = 0; i < 2000; i++) {

@@ -197,7 +197,8 @@ $stack
 </tbody></table></div>
 
 <h2>Coverage of the object code</h2>
-<div class="tables"><table><thead><tr><th>source: its instructions; executed at all, in interrupts</th>$heads</tr></thead><tbody>
+<div class="tables"><table>
+<thead><tr><th>source: its instructions; executed at all, in interrupts</th>$heads</tr></thead><tbody>
 $coverage
 </tbody></table></div>
 <p>Which lines were missed is in processor.json.</p>
