@@ -43,7 +43,7 @@ def frames(bench: Bench) -> list[tuple]:
 # --- a processor that is fast enough --------------------------------------------------------------------------------
 
 # At which no interrupt is late, ns an instruction.
-IN_TIME_NS = {"traditional": 8, "paper": 8, "salient": 4}
+IN_TIME_NS = 8
 
 # From lock-step, where the drive takes no time: its figures and how far they may be from it.
 START = {"settling_time_s": 2e-4, "overshoot_percent": 0.02}
@@ -77,7 +77,7 @@ def test_a_drive_in_time_has_no_late_interrupt_and_the_figures_of_one_that_takes
                                                                                           controller):
     for experiment, bounds in ((start_600, START), (load_step_150, LOAD_STEP)):
         made, figures = {}, {}
-        for instruction_ns in (None, IN_TIME_NS[controller]):
+        for instruction_ns in (None, IN_TIME_NS):
             bench, figures[instruction_ns] = experiment(make_bench, tmp_path, build="cortex-m4", controller=controller,
                                                         instruction_ns=instruction_ns)
             made[instruction_ns] = bench
@@ -85,7 +85,7 @@ def test_a_drive_in_time_has_no_late_interrupt_and_the_figures_of_one_that_takes
             assert processor(bench, "late_interrupts") == 0
             assert processor(bench, "available_us") == PERIOD_US
         lockstep, timed = figures.values()
-        bench = made[IN_TIME_NS[controller]]
+        bench = made[IN_TIME_NS]
         print(controller, experiment.__name__, lockstep, timed, f"worst {processor(bench, 'worst_us'):g} us")
         for name, bound in bounds.items():
             assert timed[name] == pytest.approx(lockstep[name], abs=bound), name
@@ -173,7 +173,7 @@ def test_a_slow_processor_is_noticed_reported_and_safe_the_same_every_time(make_
 
 
 def test_an_overrun_under_load_opens_every_switch(make_bench):
-    """The bench holds the processor for 20 us in front of an interrupt that is in time without."""
+    """The bench holds the processor for 24 us in front of an interrupt that is in time without."""
     bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8)
     bench.drive.speed_reference_rpm = 600
     bench.run_for(0.1)
@@ -183,7 +183,7 @@ def test_an_overrun_under_load_opens_every_switch(make_bench):
     assert max(currents_A(bench)) > 20
     assert processor(bench, "late_interrupts") == 0
     caused_us = bench.time_ns / 1000
-    bench.rig.interrupt_time_us = 20
+    bench.rig.interrupt_time_us = 24
     bench.run_for(0.003)
     assert (bench.drive.state, bench.drive.fault) == ("fault", "interrupt_overrun")
     # Late are those at 0, 2 and 4 periods, and the one at 6 knows.
@@ -194,7 +194,7 @@ def test_an_overrun_under_load_opens_every_switch(make_bench):
     bench.run_for(0.2)
     assert currents_A(bench) == [0, 0, 0]
     assert 3 <= processor(bench, "late_interrupts") < 130
-    assert PERIOD_US < processor(bench, "worst_us") < 20 + PERIOD_US
+    assert PERIOD_US < processor(bench, "worst_us") < 24 + PERIOD_US
     bench.drive.off()
     bench.drive.clear_fault()
     bench.drive.speed_reference_rpm = 600
@@ -250,7 +250,7 @@ def test_what_interrupt_and_background_share_is_torn_without_the_critical_sectio
     interrupts, *torn = race(build, "no_critical_section")
     print(f"{build}: {torn} torn in {interrupts} interrupts without")
     assert interrupts > 5000
-    assert torn[0] > 100 and torn[1] == 0 and torn[2] > 100
+    assert torn[0] > 100 and torn[1] == 0 and torn[2] > 10
     interrupts, *torn = race(build, "critical_section")
     assert interrupts > 5000
     assert torn == [0, 0, 0]
