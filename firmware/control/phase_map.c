@@ -175,36 +175,6 @@ int32_t phase_map_torque_slope_q24(const machine_tables_t *tables, uint32_t phas
     return fixed_saturate(((int64_t)there * ratio_q15) >> (14 - format->result_shift));
 }
 
-int32_t phase_map_current_of_torque_q9(const phase_map_place_t *place, int32_t torque_q24) {
-    const machine_format_t *format = &place->tables->torque_format;
-    const int32_t forwards_q24 = place->mirrored ? fixed_subtract(0, torque_q24) : torque_q24;
-    if (forwards_q24 <= 0) {
-        return 0;
-    }
-    const int32_t wanted = forwards_q24 >> format->result_shift;
-    /* Halve the interval of columns that holds it. */
-    uint32_t below = 0;
-    uint32_t above = MACHINE_COLUMNS - 1;
-    node_t low = torque_node(place, below);
-    node_t high = torque_node(place, above);
-    if (high.product <= wanted) {
-        return PHASE_MAP_CURRENT_MAX_Q9;
-    }
-    while (above - below > 1) {
-        const uint32_t middle = (below + above) / 2;
-        const node_t node = torque_node(place, middle);
-        if (node.product <= wanted) {
-            below = middle;
-            low = node;
-        } else {
-            above = middle;
-            high = node;
-        }
-    }
-    const int32_t t_q15 = part_q15(span(low, high), wanted, TORQUE_STEPS);
-    return (int32_t)(below << MACHINE_COLUMN_BITS) + (t_q15 >> (15 - MACHINE_COLUMN_BITS));
-}
-
 /* A torque and a range, as products and as a column. */
 typedef struct {
     int32_t torque;

@@ -43,10 +43,6 @@ int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9);
 int32_t phase_map_torque_slope_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,
                                    uint32_t turn);
 
-/* The current in A, Q7.9, for a torque in N m, Q7.24, rounded down: 0 where the torque is none or of the sign that the
- * phase has not here, the map's end where it does not reach the torque. Within 1 mN m and a unit of current. */
-int32_t phase_map_current_of_torque_q9(const phase_map_place_t *place, int32_t torque_q24);
-
 /* What a phase is to have. */
 typedef struct {
     uint32_t column; /* of its current, 0..MACHINE_COLUMNS - 2 */

@@ -51,8 +51,12 @@ int32_t map_torque_q24(uint32_t phase_angle, int32_t current_q9) {
 }
 
 int32_t map_current_q9(uint32_t phase_angle, int32_t torque_q24) {
-    const phase_map_place_t place = phase_map_at(&machine_tables, phase_angle);
-    return phase_map_current_of_torque_q9(&place, torque_q24);
+    int32_t below = 0, above = PHASE_MAP_CURRENT_MAX_Q9;
+    while (above - below > 1) {
+        const int32_t middle = (below + above) / 2;
+        (map_torque_q24(phase_angle, middle) <= torque_q24 ? below : above) = middle;
+    }
+    return below;
 }
 
 ditc_duty_parameters_t parameters_of(bp_pid_mode_t mode) {

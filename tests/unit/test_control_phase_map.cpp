@@ -244,10 +244,6 @@ TEST(PhaseMap, is_mirror_symmetric_about_the_unaligned_position) {
         const int32_t torque = torque_q24(ahead, current_q9), flux = flux_q29(ahead, current_q9);
         ASSERT_EQ(torque_q24(behind, current_q9), -torque);
         ASSERT_EQ(flux_q29(behind, current_q9), flux);
-        const phase_map_place_t place_ahead = phase_map_at(&machine_tables, ahead);
-        const phase_map_place_t place_behind = phase_map_at(&machine_tables, behind);
-        ASSERT_EQ(phase_map_current_of_torque_q9(&place_behind, -torque),
-                  phase_map_current_of_torque_q9(&place_ahead, torque));
     }
 }
 
@@ -298,41 +294,6 @@ TEST(PhaseMap, current_is_held_within_the_tables) {
     }
     EXPECT_GT(phase_map_torque_q24(&place, CURRENT_END_Q9), 30 << 24);
     EXPECT_GT(phase_map_flux_q29(&place, CURRENT_END_Q9), int32_t(0.15 * Q29));
-}
-
-TEST(PhaseMap, current_of_a_torque_gives_it_within_a_unit_of_current_and_a_millinewtonmetre) {
-    std::mt19937 random(3);
-    double worst = 0.0;
-    for (int i = 0; i < 300000; i++) {
-        const phase_map_place_t place = phase_map_at(&machine_tables, HALF_PITCH | uint32_t(random()));
-        const int32_t wanted = int32_t(random() % (60u << 24)) >> (random() % 20);
-        const int32_t current_q9 = phase_map_current_of_torque_q9(&place, wanted);
-        ASSERT_GE(current_q9, 0);
-        ASSERT_LE(current_q9, CURRENT_END_Q9);
-        const int32_t next = current_q9 < CURRENT_END_Q9 ? phase_map_torque_q24(&place, current_q9 + 1) : INT32_MAX;
-        const double excess =
-            std::max(double(phase_map_torque_q24(&place, current_q9)) - wanted, double(wanted) - next);
-        worst = std::max(worst, excess / twins::Q24);
-    }
-    EXPECT_LT(worst, 1e-3);
-    EXPECT_GT(worst, 1e-5);
-}
-
-TEST(PhaseMap, nothing_wanted_or_of_the_wrong_sign_needs_no_current_and_too_much_the_largest) {
-    std::mt19937 random(6);
-    for (int i = 0; i < 1000; i++) {
-        const phase_map_place_t ahead = phase_map_at(&machine_tables, HALF_PITCH | uint32_t(random()));
-        const phase_map_place_t behind = phase_map_at(&machine_tables, 1 + uint32_t(random()) % (HALF_PITCH - 1));
-        for (const int32_t none : {0, -1, INT32_MIN}) {
-            EXPECT_EQ(phase_map_current_of_torque_q9(&ahead, none), 0);
-        }
-        for (const int32_t none : {0, 1, INT32_MAX}) {
-            EXPECT_EQ(phase_map_current_of_torque_q9(&behind, none), 0);
-        }
-    }
-    const phase_map_place_t unaligned = phase_map_at(&machine_tables, HALF_PITCH);
-    EXPECT_EQ(phase_map_current_of_torque_q9(&unaligned, 1), CURRENT_END_Q9);
-    EXPECT_EQ(phase_map_current_of_torque_q9(&unaligned, INT32_MAX), CURRENT_END_Q9);
 }
 
 // The torque of a flux linkage: of the two currents that enclose it, drawn straight.
@@ -468,7 +429,6 @@ TEST(PhaseMap, what_a_format_cannot_hold_saturates) {
     EXPECT_EQ(phase_map_torque_q24(&ahead, CURRENT_END_Q9), INT32_MAX);
     EXPECT_EQ(phase_map_torque_q24(&behind, CURRENT_END_Q9), -INT32_MAX);
     EXPECT_EQ(phase_map_flux_q29(&ahead, CURRENT_END_Q9), INT32_MAX);
-    EXPECT_LT(phase_map_current_of_torque_q9(&ahead, INT32_MAX), CURRENT_END_Q9);
     const phase_map_range_t anything = {0, INT32_MAX, CURRENT_END_Q9};
     phase_map_point_t point = {0, 0, 0};
     phase_map_reach(&strong, HALF_PITCH + HALF_PITCH / 2, INT32_MAX, &anything, &point);
@@ -500,9 +460,6 @@ TEST(PhaseMap, tables_full_of_noise_and_extremes_do_not_overflow) {
             const auto any = int32_t(uint32_t(random())) >> (random() % 24);
             phase_map_torque_q24(&place, any);
             phase_map_flux_q29(&place, any);
-            const int32_t current_q9 = phase_map_current_of_torque_q9(&place, any);
-            ASSERT_GE(current_q9, 0);
-            ASSERT_LE(current_q9, CURRENT_END_Q9);
             const uint32_t angle = uint32_t(random()) | HALF_PITCH;
             phase_map_torque_slope_q24(&wild, angle, any, 1u << 26);
             const int32_t lowest = int32_t(uint32_t(random()) >> 1) >> (random() % 24);
