@@ -8,6 +8,7 @@
 #define PROBE 6835653
 
 #define MEAN_1_S 10
+#define SHARE_MAX_Q16 65535 /* below one */
 #define SETTLE_MS 150
 #define TORQUE_LEAST_Q24 (1 << 24)
 /* 0.05 * 0.02^2, of T^2. */
@@ -20,7 +21,8 @@ misalignment_parameters_t misalignment_configure(int32_t rate_1_s, uint32_t band
     return (misalignment_parameters_t){
         .probe = PROBE * rotor_poles,
         .rate_q30 = (int32_t)fixed_divide((int64_t)rate_1_s << 30, turn_rate_hz),
-        .filter_q16 = (int32_t)fixed_divide((int64_t)(bandwidth_rad_s * 8u / 5u) << 16, turn_rate_hz),
+        .filter_q16 = fixed_clamp((int32_t)fixed_divide((int64_t)(bandwidth_rad_s * 8u / 5u) << 16, turn_rate_hz), 0,
+                                  SHARE_MAX_Q16),
         .mean_q16 = (int32_t)fixed_divide((int64_t)MEAN_1_S << 16, turn_rate_hz) + 1,
         .inertia_rate_q8 = fixed_saturate(((int64_t)inertia_q30 * control_rate_hz) >> 22),
         .settle_ticks = control_rate_hz / 1000u * SETTLE_MS,
@@ -52,7 +54,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const bool learns = steady && settled;
     /* Means of all since it became steady, then of the last 100 ms: what was before is another load. */
     const int32_t phases = (int32_t)tables->phases;
-    const int32_t fresh_q16 = 65535 / ((int32_t)misalignment->steady_ticks / phases + 1);
+    const int32_t fresh_q16 = SHARE_MAX_Q16 / ((int32_t)misalignment->steady_ticks / phases + 1);
     const int32_t mean_q16 = fresh_q16 > parameters->mean_q16 ? fresh_q16 : parameters->mean_q16;
 
     const unsigned turn = misalignment->turn;

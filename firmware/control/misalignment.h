@@ -31,7 +31,7 @@
 typedef struct {
     uint32_t probe;          /* 0.01 rad mechanical in 2^-32 pitch: s_j is what the torque rises over twice that */
     int32_t rate_q30;        /* rate times the time between two turns of a phase, Q1.30; 0 learns nothing */
-    int32_t filter_q16;      /* 1.6 w0 times that time, Q1.16 */
+    int32_t filter_q16;      /* 1.6 w0 times that time, Q1.16, below one */
     int32_t mean_q16;        /* 10 / s times that time, Q1.16 */
     int32_t inertia_rate_q8; /* J / Ts: N m per rad/s, Q23.8 */
     uint32_t settle_ticks;   /* steady periods before learning */

@@ -82,7 +82,7 @@ static inline int32_t part_q15(span_t s, int32_t wanted, int steps) {
     if (wanted <= s.start) {
         return 0;
     }
-    if (wanted - s.start >= s.rise) {
+    if (fixed_subtract(wanted, s.start) >= s.rise) {
         return ONE_Q15 - 1;
     }
     /* The rise becomes 2^13..2^14, the rest, of the same unit, has 15 bits more. */

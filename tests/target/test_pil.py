@@ -45,8 +45,8 @@ def test_pil_leaves_what_run_leaves_and_figures_of_the_processor_that_hang_toget
     printed = capsys.readouterr().out
     for controller, of in content["controllers"].items():
         assert of["interrupts"] == 1200
-        assert 500 < of["instructions"]["typical"] < of["instructions"]["worst"] < 10_000
-        assert 500 < sum(of["mean_by_part"].values()) < of["instructions"]["worst"]
+        assert 300 < of["instructions"]["typical"] < of["instructions"]["worst"] < 10_000
+        assert 300 < sum(of["mean_by_part"].values()) < of["instructions"]["worst"]
         assert abs(sum(of["worst_by_part"].values()) - of["instructions"]["worst"]) <= len(of["worst_by_part"])
         assert of["stack_bytes"]["deepest"] == of["stack_bytes"]["background"] + of["stack_bytes"]["interrupt"]
         assert 0.3 < of["coverage"]["executed"] / of["coverage"]["instructions"] < 1

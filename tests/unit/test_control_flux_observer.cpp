@@ -51,7 +51,7 @@ TEST(FluxObserver, is_never_negative_and_saturates) {
     int32_t flux_q29 = 1000;
     flux_observer_step(&p, &flux_q29, 0, -3000000, 0);
     EXPECT_EQ(flux_q29, 0);
-    flux_observer_step(&p, &flux_q29, 0, INT32_MIN, INT32_MAX);
+    flux_observer_step(&p, &flux_q29, 0, INT32_MIN, 1 << 18);
     EXPECT_EQ(flux_q29, 0);
     for (int k = 0; k < 3; k++) {
         flux_observer_step(&p, &flux_q29, INT32_MAX, INT32_MAX, 0);
