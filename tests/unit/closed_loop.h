@@ -50,7 +50,9 @@ struct fixed_drive_t {
     control_parameters_t parameters;
     control_state_t state{};
 
-    explicit fixed_drive_t(const setup_t &setup) : parameters(setup.configured()) { control_reset(&parameters, &state); }
+    explicit fixed_drive_t(const setup_t &setup) : parameters(setup.configured()) {
+        control_reset(&parameters, &state);
+    }
 
     bool step(const control_sample_t &sample, hal_pwm_compare_t *compare) {
         return control_step(&parameters, &state, &sample, compare);
