@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from salient import benchmark
 from salient.arguments import CONTROLLERS
 from salient.image import Image
 from salient.interrupt_cost import Cost, measure, read_cost
@@ -114,3 +115,7 @@ def test_each_control_interrupt_is_an_exception_of_the_processor(run_qemu, tmp_p
     cost = run_qemu("exceptions", "-d", "int", "-D", log)
     taken = re.findall(r"taking pending \w+ exception (\d+)", log.read_text(encoding="utf-8"))
     assert taken == [str(CONTROL_EXCEPTION)] * len(cost.interrupts)
+
+
+def test_the_speed_of_the_loop_can_be_measured():
+    assert benchmark.measure("paper", "cortex-m4") > 0.0

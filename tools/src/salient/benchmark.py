@@ -38,6 +38,7 @@ CONDITIONS = {
     "one client": "telemetry to one client each millisecond",
     "no client": "nobody on the bus, the last command stands",
     "recording": "as with one client, and the true state on the bus each millisecond and to a file each microsecond",
+    "cortex-m4": "as with one client, the firmware on a Cortex-M4 in QEMU",
 }
 
 
@@ -50,6 +51,7 @@ def measure(controller: str, condition: str) -> float:
             controller=controller,
             control_rate_hz=_CONTROL_RATE_HZ,
             record=Path(folder) / "recording.npy" if recording else None,
+            build="cortex-m4" if condition == "cortex-m4" else "host",
         )
         can = f"unix:{folder}/can.sock"
         with Simulator(options, can) as simulator:
