@@ -1,6 +1,6 @@
 set(CMAKE_SYSTEM_NAME Generic)
 set(CMAKE_SYSTEM_PROCESSOR cortex-m4)
-set(SALIENT_BOARD mps2_an386) # a folder of hal/
+set(SALIENT_BOARD mps2_an386) # a folder of hal/qemu/
 set(CMAKE_C_COMPILER arm-none-eabi-gcc)
 set(SALIENT_SIZE arm-none-eabi-size)
 set(CMAKE_TRY_COMPILE_TARGET_TYPE STATIC_LIBRARY)

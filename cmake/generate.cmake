@@ -1,13 +1,19 @@
 # Generated sources: CAN codecs from the DBC files, machine data from the machine files.
 
 set(SALIENT_GENERATOR_SOURCES ${CMAKE_SOURCE_DIR}/tools/src/salient)
+set(SALIENT_GENERATOR ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m)
 
-# All that a drive is built for: the shipped machines, and one more where it is asked for.
+# Machines that drives are built for: the bundled ones, and one more on request.
 if(SALIENT_MACHINE_FILE AND NOT EXISTS ${SALIENT_MACHINE_FILE})
     message(FATAL_ERROR "SALIENT_MACHINE_FILE: ${SALIENT_MACHINE_FILE}: no such file")
 endif()
-file(GLOB SALIENT_SHIPPED_MACHINE_FILES CONFIGURE_DEPENDS ${CMAKE_SOURCE_DIR}/tools/machines/*.toml)
-set(SALIENT_MACHINE_FILES ${SALIENT_SHIPPED_MACHINE_FILES} ${SALIENT_MACHINE_FILE})
+file(GLOB bundled CONFIGURE_DEPENDS ${CMAKE_SOURCE_DIR}/tools/machines/*.toml)
+list(TRANSFORM bundled REPLACE ".*/([^/]*)\\.toml$" "\\1" OUTPUT_VARIABLE SALIENT_BUNDLED_MACHINES)
+set(SALIENT_MACHINES ${SALIENT_BUNDLED_MACHINES})
+if(SALIENT_MACHINE_FILE)
+    get_filename_component(name ${SALIENT_MACHINE_FILE} NAME_WE)
+    list(APPEND SALIENT_MACHINES ${name})
+endif()
 
 # salient_generate_codec(TARGET DBC [INTEGER]): a static library with <name>.h/.c generated from DBC.
 # INTEGER leaves every floating-point conversion out.
@@ -21,26 +27,39 @@ function(salient_generate_codec target dbc)
     endif()
     add_custom_command(
         OUTPUT ${out}/${name}_codec.c ${out}/${name}_codec.h
-        COMMAND ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m salient.generate_codec ${flags} ${dbc} ${out}
-        DEPENDS ${dbc} ${SALIENT_GENERATOR_SOURCES}/generate_codec.py
+        COMMAND ${SALIENT_GENERATOR} salient.generate.codec ${flags} ${dbc} ${out}
+        DEPENDS ${dbc} ${SALIENT_GENERATOR_SOURCES}/generate/codec.py
         COMMENT "CAN codec from ${name}.dbc"
         VERBATIM)
     add_library(${target} STATIC ${out}/${name}_codec.c)
     target_include_directories(${target} PUBLIC ${out})
 endfunction()
 
-# salient_generate_machine(NAME FILE): sets <NAME>_TABLES and <NAME>_PLANT to the C sources generated from FILE.
-function(salient_generate_machine name file)
-    set(out ${CMAKE_CURRENT_BINARY_DIR}/machine_${name})
-    add_custom_command(
-        OUTPUT ${out}/machine_tables.c ${out}/machine_plant.c
-        COMMAND ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m salient.generate_machine ${file} ${out}
-        DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate_machine.py ${SALIENT_GENERATOR_SOURCES}/machine.py
-                ${SALIENT_GENERATOR_SOURCES}/magnetics.py ${SALIENT_GENERATOR_SOURCES}/flux_map.py
-                ${SALIENT_GENERATOR_SOURCES}/flux_map_file.py ${SALIENT_GENERATOR_SOURCES}/phase_map.py
-        DEPFILE ${out}/machine.d # of a map: its CSV file
-        COMMENT "machine ${name}"
-        VERBATIM)
-    set(${name}_TABLES ${out}/machine_tables.c PARENT_SCOPE)
-    set(${name}_PLANT ${out}/machine_plant.c PARENT_SCOPE)
+# salient_add_machines(): for each machine file the object libraries <name>_tables (firmware/control/machine_tables.h)
+# and <name>_plant (emulator/plant/machine.h), generated and compiled once for all programs of the build.
+function(salient_add_machines)
+    file(GLOB generator_sources CONFIGURE_DEPENDS ${SALIENT_GENERATOR_SOURCES}/machine/*.py)
+    foreach(name ${SALIENT_MACHINES})
+        set(file ${CMAKE_SOURCE_DIR}/tools/machines/${name}.toml)
+        if(NOT name IN_LIST SALIENT_BUNDLED_MACHINES)
+            set(file ${SALIENT_MACHINE_FILE})
+        endif()
+        set(out ${CMAKE_BINARY_DIR}/machine/${name})
+        add_custom_command(
+            OUTPUT ${out}/machine_tables.c ${out}/machine_plant.c
+            COMMAND ${SALIENT_GENERATOR} salient.generate.machine ${file} ${out}
+            DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate/machine.py ${generator_sources}
+            DEPFILE ${out}/machine.d # of a map: its CSV file
+            COMMENT "machine ${name}"
+            VERBATIM)
+        add_library(${name}_tables OBJECT ${out}/machine_tables.c)
+        target_include_directories(${name}_tables PRIVATE ${CMAKE_SOURCE_DIR}/firmware)
+        if(CMAKE_SYSTEM_NAME STREQUAL "Linux")
+            add_library(${name}_plant OBJECT ${out}/machine_plant.c)
+            target_include_directories(${name}_plant PRIVATE ${CMAKE_SOURCE_DIR}/emulator)
+            # A functional mock-up unit exports nothing but the functions of its standard.
+            set_target_properties(${name}_plant PROPERTIES C_VISIBILITY_PRESET hidden)
+            add_dependencies(${name}_plant ${name}_tables) # one run of the generator
+        endif()
+    endforeach()
 endfunction()

@@ -1,10 +1,10 @@
 set(CMAKE_SYSTEM_NAME Generic)
 set(CMAKE_SYSTEM_PROCESSOR rv32)
-set(SALIENT_BOARD rv32_virt) # a folder of hal/
+set(SALIENT_BOARD rv32_virt) # a folder of hal/qemu/
 set(CMAKE_C_COMPILER riscv64-unknown-elf-gcc) # for RV32 as well
 set(CMAKE_TRY_COMPILE_TARGET_TYPE STATIC_LIBRARY)
 # Debian's compiler comes without a C library: what the firmware uses of one is a few lines.
-set(c_library ${CMAKE_CURRENT_LIST_DIR}/../hal/rv32_virt/c_library)
+set(c_library ${CMAKE_CURRENT_LIST_DIR}/../hal/qemu/rv32_virt/c_library)
 # Soft float on purpose: floating point left in the firmware shows as a call to a helper (check_symbols.cmake). By this
 # version of the specification the instructions of control registers belong to the base, and the compiler finds its
 # library for rv32imac.

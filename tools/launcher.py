@@ -26,7 +26,7 @@ STAMP = VENV / "salient.stamp"
 
 sys.path.insert(0, str(TOOLS / "src"))
 
-from salient.arguments import make_parser  # noqa: E402  (needs the path above)
+from salient.cli import make_parser  # noqa: E402  (needs the path above)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ WITHOUT_BUILD = ("log", "monitor", "machine")
 
 
 def _guest_packages() -> list[str]:
-    from salient import guest
+    from salient.vm import run as guest
 
     return guest.missing_packages()
 
@@ -249,7 +249,7 @@ def main() -> None:
         if options.command not in WITHOUT_BUILD:
             machines = sorted(path.stem for path in (TOOLS / "machines").glob("*.toml"))
             targets = [f"salient_{name}" for name in machines]
-            targets += ["plant_replay_saturating"] if options.command == "bench" else []
+            targets += ["plant_benchmark_saturating"] if options.command == "bench" else []
             targets += [f"salient_target_{name}" for name in machines] if on_target else []
             build("host", [] if options.command == "test" else targets)
             if on_target:

@@ -1,7 +1,7 @@
 #include "drive/control.h"
 
 #include "control/phase_map.h"
-#include "control/pwm.h"
+#include "control/modulator.h"
 #include "fixed/fixed.h"
 
 /* A stop ends below this speed: 0.5 rad/s, 5 r/min. */

@@ -11,11 +11,11 @@ import can
 import numpy as np
 import pytest
 
-from salient.drive import DriveError
-from salient.rig import RigError
-from salient.session import Session
-from salient.signals import drive_database, rig_database
-from salient.simulator import Simulator, SimulatorOptions
+from salient.bench.drive import DriveError
+from salient.bench.emulator import Simulator, SimulatorOptions
+from salient.bench.rig import RigError
+from salient.bench.session import Session
+from salient.bus.signals import drive_database, rig_database
 
 FAILING_TEST = """
 import pytest

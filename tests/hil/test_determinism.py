@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from salient.arguments import CONTROLLERS
-from salient.scenario import LoadStep, Record, Scenario, SpeedStep, run_all, run_scenario
+from salient.cli import CONTROLLERS
+from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, run_all, run_scenario
 
 FILES = ("can.blf", "can.log", "recording.npy")
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from salient.bench import Bench
+from salient.bench.bench import Bench
 
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
 

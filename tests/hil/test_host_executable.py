@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from salient.simulator import executable
+from salient.bench.emulator import executable
 
 TIMEOUT_S = 20
 RUN_UNTIL_ID = 0x9F000001  # with the extended flag

@@ -8,9 +8,9 @@ import can
 import numpy as np
 import pytest
 
-from salient import e2e
-from salient.drive import command_frame
-from salient.virtual_time import open_bus
+from salient.bench.drive import command_frame
+from salient.bus import e2e
+from salient.bus.clock import open_bus
 
 COUNTERS = (
     "wrong_length", "wrong_checksum", "wrong_counter", "out_of_range", "unknown_frame", "receive_overflow",

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from flux_map_files import REGULAR_A, REGULAR_DEG, csv_text, formula, irregular, rows, write_machine
 
-from salient.metrics import RIPPLE_WINDOW_S, load_step_metrics, start_metrics
+from salient.experiments.metrics import RIPPLE_WINDOW_S, load_step_metrics, start_metrics
+from salient.experiments.scenario import Scenario, load_scenarios, run_scenario
 from salient.paths import SCENARIOS
-from salient.scenario import Scenario, load_scenarios, run_scenario
 
 ANGLES_DEG = range(0, 90, 10)
 GRIDS = {"map_regular": (REGULAR_DEG, REGULAR_A), "map_irregular": irregular()}

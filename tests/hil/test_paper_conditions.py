@@ -2,9 +2,9 @@
 
 import pytest
 
-from salient.compare.cases import GROUPS
-from salient.compare.measures import MEASURES
-from salient.scenario import run_scenario
+from salient.experiments.compare.cases import GROUPS
+from salient.experiments.compare.metrics import MEASURES
+from salient.experiments.scenario import run_scenario
 
 CASES = {(case.condition, case.controller): case for case in GROUPS["paper_conditions"].cases(False)}
 

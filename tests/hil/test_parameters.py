@@ -5,8 +5,8 @@ from __future__ import annotations
 import can
 import pytest
 
-from salient.drive import DriveError, read_parameter_table
-from salient.signals import drive_database
+from salient.bench.drive import DriveError, read_parameter_table
+from salient.bus.signals import drive_database
 
 
 def test_table(make_bench):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from salient.bench import Bench
+from salient.bench.bench import Bench
 
 PERIOD_US = 25.0
 

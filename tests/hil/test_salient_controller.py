@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from salient.bench import Bench
-from salient.drive import DriveError
-from salient.metrics import speed_after_step, start_metrics, torque_metrics
+from salient.bench.bench import Bench
+from salient.bench.drive import DriveError
+from salient.experiments.metrics import speed_after_step, start_metrics, torque_metrics
 
 MakeBench = Callable[..., Bench]
 Range = tuple[float, float]

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from salient.bench.rig import quantities
 from salient.errors import UsageError
-from salient.machine import load_machine, machine_path
-from salient.metrics import losses
-from salient.rig import quantities
-from salient.scenario import LoadStep, Record, RunResult, Scenario, SpeedStep, load_scenarios, run_scenario
+from salient.experiments.metrics import losses
+from salient.experiments.scenario import LoadStep, Record, RunResult, Scenario, SpeedStep, load_scenarios, run_scenario
+from salient.machine.file import load_machine, machine_path
 
 MACHINE = load_machine(machine_path("saturating"))
 HEAD = 'machine = "saturating"\ncontrollers = ["paper"]\nduration_s = 0.2\n'

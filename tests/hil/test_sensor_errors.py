@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from salient.bench import Bench
+from salient.bench.bench import Bench
 from salient.paths import MACHINES
 
 # Half a code of the ADC, and half a bit of the truth frames, A.

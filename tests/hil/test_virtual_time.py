@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import can
 
-from salient.virtual_time import RIG_CLOCK_ID, RIG_STAMP_ID, VirtualTimeReader
+from salient.bus.clock import RIG_CLOCK_ID, RIG_STAMP_ID, VirtualTimeReader
 
 NEXT, OLDEST_ON_BUS, OLDEST_AT_ONCE = 0, 1, 2
 RUN_UNTIL_ID = 0x1F000001

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from salient.simulator import TARGET_BUILDS
-from salient.target_figures import size_table
+from salient.bench.emulator import TARGET_BUILDS
+from salient.target.baseline import size_table
 
 _PROPERTY = "control_periods"
 _SIZE = "size"

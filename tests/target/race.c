@@ -11,7 +11,7 @@
 #include <stddef.h>
 #include <string.h>
 
-#include "drive/drive.h"
+#include "drive.h"
 #include "hal_time.h"
 #include "qemu/board.h"
 #include "qemu/hal_qemu.h"

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from salient.bench.emulator import executable
 from salient.paths import BUILD, ROOT
-from salient.simulator import executable
 
 TIMEOUT_S = 30
 EXIT_FAULT, EXIT_LAYOUT = 70, 78
@@ -19,12 +19,12 @@ EXIT_FAULT, EXIT_LAYOUT = 70, 78
 COMPILERS = {
     "mps2_an386": ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-nostartfiles"],
     "rv32_virt": ["riscv64-unknown-elf-gcc", "-march=rv32imac", "-misa-spec=2.2", "-mabi=ilp32", "-nostartfiles",
-                  "-nolibc", f"-I{ROOT}/hal/rv32_virt/c_library"],
+                  "-nolibc", f"-I{ROOT}/hal/qemu/rv32_virt/c_library"],
 }
 
 DRIVE = """
 #include "control/machine_tables.h"
-#include "drive/drive.h"
+#include "drive.h"
 #include "hal_pwm.h"
 
 const machine_tables_t machine_tables;

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from salient.simulator import executable, image
+from salient.bench.emulator import executable, image
 
 TIMEOUT_S = 20
 

@@ -7,9 +7,9 @@ import re
 import subprocess
 from pathlib import Path
 
-from salient.image import Image
-from salient.interrupt_cost import read_cost
-from salient.simulator import SimulatorOptions
+from salient.bench.emulator import SimulatorOptions
+from salient.elf import Image
+from salient.target.isr_profile import read_cost
 
 TIMEOUT_S = 60
 MACHINE_SOFTWARE_INTERRUPT = 3

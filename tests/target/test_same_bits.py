@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from salient.arguments import CONTROLLERS, TARGETS
-from salient.bench import Bench
-from salient.simulator import TARGET_BUILDS
+from salient.bench.bench import Bench
+from salient.bench.emulator import TARGET_BUILDS
+from salient.cli import CONTROLLERS, TARGETS
 
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
 ROW_BYTES = 16

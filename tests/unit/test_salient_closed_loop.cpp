@@ -8,7 +8,7 @@
 
 #include <gtest/gtest.h>
 
-#include "closed_loop.h"
+#include "support/closed_loop.h"
 
 namespace {
 

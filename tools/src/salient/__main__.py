@@ -7,7 +7,7 @@ import os
 import sys
 from pathlib import Path
 
-from salient.arguments import make_parser
+from salient.cli import make_parser
 from salient.errors import UsageError
 from salient.paths import BUILD
 
@@ -40,7 +40,7 @@ def _automatic_can() -> str:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from salient import demo
+    from salient.experiments import demo
 
     try:
         return demo.run(options)
@@ -50,13 +50,13 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _test(options: argparse.Namespace) -> int:
-    from salient import checks
+    from salient import test_runner as checks
 
     return checks.run(options.only)
 
 
 def _sim(options: argparse.Namespace) -> int:
-    from salient.simulator import SimulatorError, SimulatorOptions
+    from salient.bench.emulator import SimulatorError, SimulatorOptions
 
     try:
         command = SimulatorOptions(
@@ -81,7 +81,7 @@ def _sim(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from salient.scenario import load_scenarios, run_all
+    from salient.experiments.scenario import load_scenarios, run_all
 
     scenarios = load_scenarios(options.scenario)
     out = options.out or Path("out") / options.scenario.stem
@@ -96,37 +96,37 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _log(options: argparse.Namespace) -> int:
-    from salient.watch import record
+    from salient.bus.monitor import record
 
     return record(options.can, options.out, options.duration_s)
 
 
 def _monitor(options: argparse.Namespace) -> int:
-    from salient.watch import monitor
+    from salient.bus.monitor import monitor
 
     return monitor(options.can, options.every_s, options.duration_s)
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from salient.benchmark import run
+    from salient.benchmark.command import run
 
     return run(options.runs, options.json)
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from salient.compare.command import run
+    from salient.experiments.compare.command import run
 
     return run(options)
 
 
 def _machine(options: argparse.Namespace) -> int:
-    from salient.machine_view import run
+    from salient.machine.report import run
 
     return run(options.machine, options.out)
 
 
 def _pil(options: argparse.Namespace) -> int:
-    from salient.pil import run
+    from salient.target.pil import run
 
     return run(options)
 

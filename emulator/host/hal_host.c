@@ -1,0 +1,101 @@
+#include "host/hal_host.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+
+#include "hal_adc.h"
+#include "hal_can.h"
+#include "hal_encoder.h"
+#include "hal_pwm.h"
+#include "hal_time.h"
+
+/* Ends the program when the firmware calls a function from a context that the HAL does not allow. */
+static void require(const hal_t *hal, bool interrupt, const char *function) {
+    if ((hal->board->context == BOARD_INTERRUPT) != interrupt) {
+        fprintf(stderr, "salient: firmware called %s from %s, allowed is %s\n", function,
+                interrupt ? "the background" : "the control interrupt",
+                interrupt ? "the control interrupt" : "the background");
+        abort();
+    }
+}
+
+unsigned hal_adc_bits(const hal_t *hal) {
+    return hal->board->adc_bits;
+}
+
+void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample) {
+    require(hal, true, __func__);
+    *sample = hal->board->adc;
+}
+
+unsigned hal_encoder_bits(const hal_t *hal) {
+    return hal->board->encoder_bits;
+}
+
+void hal_encoder_read(const hal_t *hal, hal_encoder_sample_t *sample) {
+    require(hal, true, __func__);
+    *sample = hal->board->encoder;
+}
+
+void hal_pwm_start(hal_t *hal, uint16_t period_ticks) {
+    require(hal, false, __func__);
+    board_pwm_start(hal->board, period_ticks);
+}
+
+void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare) {
+    require(hal, true, __func__);
+    board_pwm_write(hal->board, compare);
+}
+
+void hal_pwm_open_all(hal_t *hal) {
+    board_pwm_open_all(hal->board);
+}
+
+uint32_t hal_pwm_missed_interrupts(hal_t *hal) {
+    require(hal, true, __func__);
+    return board_pwm_missed_interrupts(hal->board);
+}
+
+/* The firmware's code takes no virtual time; what the bench says that it takes counts from the start. */
+uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
+    require(hal, true, __func__);
+    return (uint32_t)(hal->board->interrupt_took_ns / HAL_PWM_TICK_NS);
+}
+
+bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {
+    require(hal, false, __func__);
+    return board_can_receive(hal->board, frame);
+}
+
+uint32_t hal_can_receive_overflows(const hal_t *hal) {
+    require(hal, false, __func__);
+    return hal->board->receive_overflows;
+}
+
+bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
+    require(hal, false, __func__);
+    return board_can_transmit(hal->board, frame);
+}
+
+uint32_t hal_time_us(const hal_t *hal) {
+    return (uint32_t)(hal->board->time_ns / 1000);
+}
+
+/* One thread: the interrupt cannot come while the background runs. What is left is to see that the calls pair up. */
+void hal_critical_enter(hal_t *hal) {
+    require(hal, false, __func__);
+    if (hal->board->in_critical_section) {
+        fputs("salient: firmware called hal_critical_enter twice, it does not nest\n", stderr);
+        abort();
+    }
+    hal->board->in_critical_section = true;
+}
+
+void hal_critical_leave(hal_t *hal) {
+    require(hal, false, __func__);
+    if (!hal->board->in_critical_section) {
+        fputs("salient: firmware called hal_critical_leave without hal_critical_enter\n", stderr);
+        abort();
+    }
+    hal->board->in_critical_section = false;
+}

@@ -1,0 +1,40 @@
+/* One drive on its bench: the firmware, the host port and the emulator in one process and one thread. */
+#include "control/machine_tables.h"
+#include "drive.h"
+#include "host/hal_host.h"
+#include "host/simulation.h"
+
+/* Large; they live as long as the process. */
+static bench_t bench;
+static drive_t drive;
+
+static void control_interrupt(void *context) {
+    drive_control_interrupt(context);
+}
+
+static void background(void *context) {
+    drive_background(context);
+}
+
+int main(int argc, char *argv[]) {
+    options_t options;
+    options_result_t result = options_parse(&options, argc, argv);
+    if (result != OPTIONS_RUN) {
+        return result == OPTIONS_HELP ? 0 : BENCH_EXIT_MISTAKE;
+    }
+    if (!bench_open(&bench, &options)) {
+        return BENCH_EXIT_MISTAKE;
+    }
+    hal_t hal = {.board = &bench.rig.board};
+    const drive_config_t drive_config = {
+        .control_rate_hz = options.control_rate_hz,
+        .controller = (drive_controller_t)options.controller_index,
+    };
+    if (drive_init(&drive, &hal, &machine_tables, &drive_config)) {
+        bench_run(&bench, &(rig_firmware_t){
+                              .control_interrupt = control_interrupt, .background = background, .context = &drive});
+    } else {
+        bench_refused(&bench);
+    }
+    return bench_close(&bench);
+}

@@ -1,0 +1,182 @@
+#define _POSIX_C_SOURCE 200809L
+
+#include "host/simulation.h"
+
+#include <errno.h>
+#include <inttypes.h>
+#include <poll.h>
+#include <signal.h>
+#include <string.h>
+#include <sys/signalfd.h>
+#include <unistd.h>
+
+#include "host/output.h"
+#include "plant/machine.h"
+
+#define SWITCHES_OPTION "--record-switches"
+#define RAD_PER_DEG (3.14159265358979323846 / 180.0)
+
+/* Descriptors that end the program: signals, and standard input with --follow-stdin. */
+enum { STOP_SIGNAL, STOP_STDIN };
+
+static bool stop_requested(void *context) {
+    const rig_stop_t *stop = context;
+    struct pollfd list[2];
+    for (unsigned i = 0; i < 2; ++i) {
+        list[i] = (struct pollfd){.fd = stop->descriptors[i], .events = POLLIN};
+    }
+    if (poll(list, 2, 0) <= 0) {
+        return false;
+    }
+    if (list[STOP_SIGNAL].revents) {
+        return true;
+    }
+    char discarded[4096]; /* what is written to standard input means nothing, only its end does */
+    ssize_t size = read(STDIN_FILENO, discarded, sizeof discarded);
+    return size == 0 || (size < 0 && errno != EAGAIN && errno != EINTR);
+}
+
+/* Signals become readable instead of interrupting; false when that is not possible. */
+static bool stop_init(rig_stop_t *stop, bool follow_stdin) {
+    sigset_t signals;
+    sigemptyset(&signals);
+    sigaddset(&signals, SIGINT);
+    sigaddset(&signals, SIGTERM);
+    sigaddset(&signals, SIGHUP);
+    signal(SIGPIPE, SIG_IGN);
+    *stop = (rig_stop_t){.requested = stop_requested, .context = stop};
+    stop->descriptors[STOP_STDIN] = follow_stdin ? STDIN_FILENO : -1;
+    stop->descriptors[STOP_SIGNAL] = -1;
+    if (sigprocmask(SIG_BLOCK, &signals, NULL) != 0) {
+        return false;
+    }
+    stop->descriptors[STOP_SIGNAL] = signalfd(-1, &signals, SFD_CLOEXEC | SFD_NONBLOCK);
+    return stop->descriptors[STOP_SIGNAL] >= 0;
+}
+
+static void print_json_string(const char *text) {
+    putchar('"');
+    for (; *text; ++text) {
+        unsigned char character = (unsigned char)*text;
+        if (character == '"' || character == '\\') {
+            printf("\\%c", character);
+        } else if (character < 0x20) {
+            printf("\\u%04x", character);
+        } else {
+            putchar(character);
+        }
+    }
+    putchar('"');
+}
+
+static void print_ready(const options_t *options) {
+    printf("{\"ready\": true, \"can\": ");
+    print_json_string(options->can);
+    printf(", \"pid\": %ld, \"machine\": ", (long)getpid());
+    print_json_string(machine_plant.name);
+    printf(", \"controller\": ");
+    print_json_string(options->controller);
+    printf(", \"control_rate_hz\": %" PRIu32 ", \"pace\": ", options->control_rate_hz);
+    print_json_string(options->pace);
+    printf(", \"seed\": %" PRIu64 "}\n", options->seed);
+    fflush(stdout);
+}
+
+bool bench_open(bench_t *bench, const options_t *options) {
+    bench->options = options;
+    bench->exit_code = 0;
+    bench->switches = NULL;
+    bench->recorder = (recorder_t){0};
+    if (!stop_init(&bench->stop, options->follow_stdin)) {
+        fprintf(stderr, "salient: signals: %s\n", strerror(errno));
+        return false;
+    }
+    char error[TRANSPORT_ERROR_SIZE];
+    transport_t *transport = transport_open(options->can, error);
+    if (!transport) {
+        fprintf(stderr, "salient: %s\n", error);
+        return false;
+    }
+    if (options->record &&
+        !recorder_open(&bench->recorder, options->record, machine_plant.phases, error, sizeof error)) {
+        fprintf(stderr, "salient: %s\n", error);
+        transport_close(transport);
+        return false;
+    }
+    if (options->record_switches) {
+        bench->switches = output_open(SWITCHES_OPTION, options->record_switches);
+        if (!bench->switches) {
+            recorder_close(&bench->recorder, error, sizeof error);
+            transport_close(transport);
+            return false;
+        }
+    }
+
+    const rig_config_t config = {
+        .machine = &machine_plant,
+        .initial_angle_rad = options->initial_angle_deg * RAD_PER_DEG,
+        .encoder_bits = options->encoder_bits,
+        .adc_bits = options->adc_bits,
+        .encoder_edges = options->encoder_edges,
+        .immediate_pwm = options->immediate_pwm,
+        .seed = options->seed,
+        .bit_rate = options->bit_rate,
+        .pacing = options->pacing,
+        .stop_at_ns = options->stop_at_s > 0 ? (uint64_t)(options->stop_at_s * 1e9 + 0.5) : RIG_NEVER,
+        .stop = bench->stop,
+        .transport = transport,
+    };
+    rig_init(&bench->rig, &config);
+    if (options->record) {
+        plant_observe(&bench->rig.plant, options->record_from_us * 1000, options->record_step_ns, recorder_sample,
+                      &bench->recorder);
+    }
+    return true;
+}
+
+static void control_interrupt(void *context) {
+    bench_t *bench = context;
+    bench->firmware.control_interrupt(bench->firmware.context);
+    if (bench->switches) {
+        fwrite(&bench->rig.board.active, sizeof bench->rig.board.active, 1, bench->switches);
+    }
+}
+
+static void background(void *context) {
+    bench_t *bench = context;
+    bench->firmware.background(bench->firmware.context);
+}
+
+void bench_run(bench_t *bench, const rig_firmware_t *firmware) {
+    bench->firmware = *firmware;
+    rig_join(&bench->rig,
+             &(rig_firmware_t){.control_interrupt = control_interrupt, .background = background, .context = bench});
+    print_ready(bench->options);
+    while (rig_serve(&bench->rig, -1)) {
+    }
+    rig_finish(&bench->rig);
+    const transport_t *transport = bench->rig.config.transport;
+    if (transport->failure) {
+        fprintf(stderr, "salient: %s\n", transport->failure);
+        bench->exit_code = BENCH_EXIT_MISTAKE;
+    }
+}
+
+void bench_refused(bench_t *bench) {
+    fprintf(stderr, "salient: the drive refuses machine %s at %" PRIu32 " Hz\n", machine_plant.name,
+            bench->options->control_rate_hz);
+    bench->exit_code = BENCH_EXIT_MISTAKE;
+}
+
+int bench_close(bench_t *bench) {
+    char error[TRANSPORT_ERROR_SIZE];
+    if (!recorder_close(&bench->recorder, error, sizeof error)) {
+        fprintf(stderr, "salient: %s\n", error);
+        bench->exit_code = BENCH_EXIT_MISTAKE;
+    }
+    if (bench->switches && !output_close(bench->switches, SWITCHES_OPTION, bench->options->record_switches)) {
+        bench->exit_code = BENCH_EXIT_MISTAKE;
+    }
+    transport_close(bench->rig.config.transport);
+    return bench->exit_code;
+}

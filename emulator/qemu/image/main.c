@@ -1,0 +1,49 @@
+/* One drive on a board of QEMU: the same firmware as on the host, its interrupt a real exception. */
+#include <string.h>
+
+#include "control/machine_tables.h"
+#include "drive.h"
+#include "qemu/board.h"
+#include "qemu/hal_qemu.h"
+
+/* Of the linker script. */
+extern uint32_t data_start[], data_end[], data_load[], bss_start[], bss_end[];
+
+static drive_t drive;
+
+__attribute__((used)) void program_interrupt(void) { /* by the handler, in assembly */
+    drive_control_interrupt(&drive);
+}
+
+static noreturn void run(void) {
+    const mailbox_t *mailbox = &board.mailbox;
+    if (mailbox->layout != MAILBOX_LAYOUT) {
+        board_exit(MAILBOX_EXIT_LAYOUT);
+    }
+    const drive_config_t config = {
+        .control_rate_hz = mailbox->control_rate_hz,
+        .controller = (drive_controller_t)mailbox->controller,
+    };
+    const bool started = drive_init(&drive, &board, &machine_tables, &config);
+    board_interrupt_enable();
+    doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REFUSED);
+    for (;;) {
+        switch ((mailbox_event_t)mailbox->event) {
+        case MAILBOX_INTERRUPT:
+            board_interrupt_pend();
+            break;
+        case MAILBOX_BACKGROUND:
+            drive_background(&drive);
+            break;
+        case MAILBOX_EXIT:
+            board_exit(mailbox->exit_code);
+        }
+        doorbell_ring(MAILBOX_NEXT);
+    }
+}
+
+noreturn void program_start(void) {
+    memcpy(data_start, data_load, (size_t)((char *)data_end - (char *)data_start));
+    memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start));
+    run();
+}

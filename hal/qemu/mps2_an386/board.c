@@ -1,0 +1,93 @@
+/* The board mps2-an386, a Cortex-M4: start, end, the control interrupt, the critical section. */
+#include "qemu/board.h"
+
+#include "hal_time.h"
+#include "qemu/mps2_an386/timer.h"
+#include "qemu/hal_qemu.h"
+
+/* A line that the board's own peripherals do not use. */
+#define CONTROL_IRQ 31
+
+/* Armv7-M architecture reference manual, B3.4. */
+#define NVIC_ISER0 (*(volatile uint32_t *)0xE000E100)
+#define NVIC_ISPR0 (*(volatile uint32_t *)0xE000E200)
+#define NVIC_IPR(irq) (*(volatile uint8_t *)(0xE000E400 + (irq)))
+
+#define SYS_EXIT_EXTENDED 0x20
+#define ADP_STOPPED_APPLICATION_EXIT 0x20026
+
+extern uint32_t stack_top[]; /* of the linker script */
+
+noreturn void board_exit(uint32_t code) {
+    const uint32_t block[2] = {ADP_STOPPED_APPLICATION_EXIT, code};
+    register uint32_t operation __asm__("r0") = SYS_EXIT_EXTENDED;
+    register const uint32_t *argument __asm__("r1") = block;
+    __asm__ volatile("bkpt 0xAB" : "+r"(operation) : "r"(argument) : "memory");
+    for (;;) {
+    }
+}
+
+/* Every exception but the control interrupt: none is expected. */
+static void fault_handler(void) {
+    board_exit(MAILBOX_EXIT_FAULT);
+}
+
+/* In assembly, so that its first and its last instruction have names: who counts instructions knows both ends. */
+void control_handler(void);
+__asm__(".text\n"
+        ".balign 4\n"
+        ".thumb\n"
+        ".global control_handler\n"
+        ".type control_handler, %function\n"
+        "control_handler:\n"
+        "    push {r4, lr}\n" /* r4 keeps the stack aligned to 8 bytes */
+        ".size control_handler, . - control_handler\n"
+        "    bl program_interrupt\n"
+        ".type control_handler_return, %function\n"
+        "control_handler_return:\n"
+        "    pop {r4, pc}\n"
+        ".size control_handler_return, . - control_handler_return\n");
+
+void board_interrupt_enable(void) {
+    NVIC_IPR(CONTROL_IRQ) = 0; /* the highest that can be set */
+    NVIC_ISER0 = UINT32_C(1) << CONTROL_IRQ;
+    if (board.mailbox.timed && board.mailbox.period_ticks > 0) {
+        NVIC_IPR(TIMER_IRQ) = 0x80; /* lower: the control interrupt comes within the timer's */
+        NVIC_ISER0 = UINT32_C(1) << TIMER_IRQ;
+        timer_start(board.mailbox.period_ticks);
+    }
+}
+
+void board_interrupt_pend(void) {
+    NVIC_ISPR0 = UINT32_C(1) << CONTROL_IRQ;
+    __asm__ volatile("dsb\n\tisb" ::: "memory");
+}
+
+uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
+    return hal->mailbox.timed ? timer_elapsed_ticks() : hal->mailbox.elapsed_ticks;
+}
+
+/* There is no interrupt but the control interrupt and the timer's that asks for it, so all may be kept out. */
+void hal_critical_enter(hal_t *hal) {
+    (void)hal;
+    __asm__ volatile("cpsid i" ::: "memory");
+}
+
+void hal_critical_leave(hal_t *hal) {
+    (void)hal;
+    __asm__ volatile("cpsie i" ::: "memory");
+}
+
+typedef void (*vector_t)(void);
+
+__attribute__((section(".first"), used)) static const struct {
+    uint32_t *stack;
+    vector_t exceptions[15];
+    vector_t interrupts[CONTROL_IRQ + 1];
+} vectors = {
+    .stack = stack_top,
+    .exceptions = {program_start, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
+                   fault_handler, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
+                   fault_handler, fault_handler, fault_handler},
+    .interrupts = {[TIMER_IRQ] = timer_handler, [CONTROL_IRQ] = control_handler},
+};

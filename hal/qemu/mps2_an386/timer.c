@@ -1,0 +1,66 @@
+#include "qemu/mps2_an386/timer.h"
+
+#include "hal_pwm.h"
+#include "qemu/board.h"
+#include "qemu/hal_qemu.h"
+
+/* Timers of the CMSDK, at 25 MHz; they count down. Arm DDI 0479, 4.3. */
+typedef struct {
+    uint32_t control;
+    uint32_t value;
+    uint32_t reload;
+    uint32_t interrupt_clear;
+} cmsdk_timer_t;
+
+#define TRIGGER ((volatile cmsdk_timer_t *)0x40000000)
+#define COUNTER ((volatile cmsdk_timer_t *)0x40001000)
+#define CONTROL_ENABLE 1u
+#define CONTROL_INTERRUPT 8u
+#define TICKS_PER_COUNT (40 / HAL_PWM_TICK_NS)
+
+static uint32_t period;       /* counts */
+static uint32_t trigger_time; /* of the trigger served last, counts */
+static uint32_t passed;       /* triggers behind that one which came before the control interrupt's end */
+
+/* Counts, upwards, modulo 2^32. */
+static uint32_t now(void) {
+    return ~COUNTER->value;
+}
+
+void timer_start(uint32_t period_ticks) {
+    period = 2u * period_ticks / TICKS_PER_COUNT;
+    TRIGGER->reload = TRIGGER->value = period - 1u; /* 0 is one of its counts */
+    COUNTER->reload = COUNTER->value = UINT32_MAX;
+    COUNTER->control = CONTROL_ENABLE;
+    /* Before the other starts: so a trigger is never behind its place in the grid that now() is held against. */
+    trigger_time = now();
+    TRIGGER->control = CONTROL_ENABLE | CONTROL_INTERRUPT;
+}
+
+uint32_t timer_elapsed_ticks(void) {
+    return (now() - trigger_time) * TICKS_PER_COUNT;
+}
+
+/* The counter says which trigger it is, because one that came while interrupts were kept out hides those before it. */
+void timer_handler(void) {
+    TRIGGER->interrupt_clear = 1;
+    const uint32_t periods = (now() - trigger_time) / period;
+    if (periods <= passed) {
+        return;
+    }
+    trigger_time += periods * period;
+    board.mailbox.trigger += periods;
+    passed = 0;
+    doorbell_ring(MAILBOX_TRIGGER);
+    if (board.mailbox.event == MAILBOX_INTERRUPT) {
+        while (timer_elapsed_ticks() < board.mailbox.elapsed_ticks) { /* the bench holds the processor */
+        }
+        board_interrupt_pend();
+        board.mailbox.elapsed_ticks = timer_elapsed_ticks();
+        passed = board.mailbox.elapsed_ticks / TICKS_PER_COUNT / period;
+        doorbell_ring(MAILBOX_INTERRUPT_END);
+    }
+    if (board.mailbox.event == MAILBOX_EXIT) { /* at once: the background may have no time left to see it */
+        board_exit(board.mailbox.exit_code);
+    }
+}

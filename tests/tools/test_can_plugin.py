@@ -1,0 +1,205 @@
+"""The python-can interface "salient", as any python-can program meets it."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import subprocess
+import sys
+
+import can
+import pytest
+
+from salient.bus.interface import SalientBus, frame_bytes, message_of
+
+TIMEOUT_S = 10.0
+
+
+@pytest.fixture
+def connect(make_bench):
+    """A drive on a local bus, and a function that opens clients of it."""
+    bench = make_bench()
+    clients = []
+
+    def open_client(**options) -> can.BusABC:
+        clients.append(can.Bus(interface="salient", channel=bench.address, **options))
+        return clients[-1]
+
+    open_client.bench = bench
+    yield open_client
+    for client in clients:
+        client.shutdown()
+
+
+def received(bus: can.BusABC, wanted: can.Message) -> can.Message:
+    """The next frame with the identifier of `wanted`."""
+    while True:
+        message = bus.recv(TIMEOUT_S)
+        assert message is not None
+        if message.arbitration_id == wanted.arbitration_id and message.is_extended_id == wanted.is_extended_id:
+            return message
+
+
+FRAMES = [
+    can.Message(arbitration_id=0x123, is_extended_id=False, data=b""),
+    can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(range(8))),
+    can.Message(arbitration_id=0x080 | 1 << 18, is_extended_id=True, data=b"\xff"),
+    can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True, dlc=3),
+    can.Message(arbitration_id=0x123, is_extended_id=False, is_fd=True, bitrate_switch=True, data=bytes(range(64))),
+    can.Message(arbitration_id=0x123, is_extended_id=True, is_fd=True, error_state_indicator=True, data=b""),
+    can.Message(arbitration_id=0x123, is_extended_id=False, dlc=15, data=bytes(8)),
+    can.Message(arbitration_id=0x020, is_error_frame=True, is_extended_id=False, dlc=8, data=bytes(8)),
+]
+
+
+@pytest.mark.parametrize("frame", FRAMES, ids=lambda frame: f"{len(frame.data)}-bytes-{frame.arbitration_id:X}")
+def test_frame_survives_packing(frame):
+    again = message_of(frame_bytes(frame), 1_234_567_891, "unix:x")
+    assert again.equals(frame, timestamp_delta=None, check_channel=False)
+    assert again.time_ns == 1_234_567_891
+    assert again.timestamp == pytest.approx(1.234567891, abs=1e-12)
+
+
+@pytest.mark.parametrize("frame", FRAMES, ids=lambda frame: f"{len(frame.data)}-bytes-{frame.arbitration_id:X}")
+def test_frame_reaches_the_other_client_whole(connect, frame):
+    sender, listener = connect(), connect()
+    sender.send(frame)
+    connect.bench.run_for(0.001)
+    assert received(listener, frame).equals(frame, timestamp_delta=None, check_channel=False)
+
+
+def test_own_frames_only_where_asked_for(connect):
+    silent, curious = connect(), connect(receive_own_messages=True)
+    for bus in (silent, curious):
+        bus.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\1"))
+    connect.bench.run_for(0.001)
+    assert len([m for m in drained(silent) if m.arbitration_id == 0x123]) == 1
+    assert len([m for m in drained(curious) if m.arbitration_id == 0x123]) == 2
+
+
+def drained(bus: can.BusABC) -> list[can.Message]:
+    """What has come so far; in lock-step nothing comes after the clock has been answered."""
+    messages = []
+    while (message := bus.recv(0)) is not None:
+        messages.append(message)
+    return messages
+
+
+def test_time_is_when_the_frame_completed(connect):
+    """At 1 Mbit/s a frame takes its number of bits in microseconds; 8 bytes take 111 to 135 of them, stuffed or not."""
+    bus = connect(receive_own_messages=True)
+    connect.bench.run_for(0.0105)
+    drained(bus)
+    for _ in range(2):
+        bus.send(can.Message(arbitration_id=0x001, is_extended_id=False, data=b"\xaa" * 8))
+    connect.bench.run_for(0.001)
+    first, second = (m.time_ns for m in drained(bus) if m.arbitration_id == 0x001)
+    assert 10_500_000 + 108_000 <= first <= 10_500_000 + 2 * 135_000
+    assert 108_000 <= second - first <= 135_000
+
+
+def test_filters(connect):
+    bus = connect(can_filters=[{"can_id": 0x181, "can_mask": 0x7FF, "extended": False}])
+    connect.bench.run_for(0.01)
+    messages = drained(bus)
+    assert len(messages) >= 9
+    assert {m.arbitration_id for m in messages} == {0x181}
+
+
+def test_end_of_the_drive_is_seen(connect):
+    bus = connect()
+    connect.bench.simulator.close()
+    with pytest.raises(can.CanOperationError, match="can0.sock: the drive has ended"):
+        for _ in range(1000):
+            bus.recv(TIMEOUT_S)
+    with pytest.raises(can.CanOperationError, match="can0.sock: the drive has ended"):
+        bus.send(can.Message(arbitration_id=1))
+
+
+def test_no_drive_there(tmp_path):
+    with pytest.raises(can.CanInitializationError, match="no drive answers there"):
+        SalientBus(f"unix:{tmp_path}/nothing")
+
+
+def test_asyncio_notifier(connect):
+    bus = connect()
+
+    async def first_heartbeat() -> can.Message:
+        reader = can.AsyncBufferedReader()
+        with can.Notifier(bus, [reader], loop=asyncio.get_running_loop()):
+            connect.bench.run_for(0.002)
+            while (message := await asyncio.wait_for(reader.get_message(), TIMEOUT_S)).arbitration_id != 0x701:
+                pass
+            return message
+
+    assert asyncio.run(first_heartbeat()).dlc == 8
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".blf", ".log"])
+def test_python_can_logger(connect, tmp_path, suffix):
+    """The stock logger of python-can records a bus; here until the drive ends."""
+    path = tmp_path / f"log{suffix}"
+    bench = connect.bench
+    command = [sys.executable, "-u", "-m", "can.logger", "-i", "salient", "-c", bench.address, "-f", str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as logger:
+        for line in logger.stdout:
+            if line.startswith("Connected to SalientBus"):
+                break
+        bench.run_for(0.02)
+        bench.simulator.close()
+        logger.stdout.read()
+        logger.wait()
+    with can.LogReader(path) as log:
+        identifiers = [m.arbitration_id for m in log]
+    assert identifiers.count(0x180) == bench.telemetry.count("DRIVE_STATUS") == 20
+    assert 0x1F000010 in identifiers
+
+
+@pytest.mark.parametrize("suffix", [".blf", ".log"])
+def test_salient_log(connect, tmp_path, suffix):
+    """tools/salient log gives every frame with its virtual time."""
+    path = tmp_path / f"log{suffix}"
+    bench = connect.bench
+    bench.run_for(0.001)
+    seen = len(bench.log)
+    command = [sys.executable, "-u", "-m", "salient", "log", "--can", bench.address, "--out", str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as logger:
+        assert logger.stdout.readline() == f"recording {bench.address}\n"
+        bench.run_for(0.02)
+        bench.simulator.close()
+        assert logger.stdout.read() == f"{len(bench.log) - seen} frames: {path}\n"
+        assert logger.wait() == 0
+    with can.LogReader(path) as log:
+        logged = [(m.timestamp, m.arbitration_id, bytes(m.data)) for m in log]
+    expected = [(t * 1e-9, m.arbitration_id, bytes(m.data)) for t, m in bench.log[seen:]]
+    assert [entry[1:] for entry in logged] == [entry[1:] for entry in expected]
+    # candump text has microseconds
+    assert max(abs(a[0] - b[0]) for a, b in zip(logged, expected, strict=True)) < (1e-9 if suffix == ".blf" else 1e-6)
+
+
+def test_salient_log_is_complete_when_interrupted(connect, tmp_path):
+    path = tmp_path / "log.blf"
+    bench = connect.bench
+    command = [sys.executable, "-u", "-m", "salient", "log", "--can", bench.address, "--out", str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as logger:
+        logger.stdout.readline()
+        bench.run_for(0.02)
+        logger.send_signal(signal.SIGTERM)
+        assert logger.wait() == 0
+    with can.LogReader(path) as log:
+        times = [m.timestamp for m in log]
+    assert times == sorted(times)
+
+
+def test_salient_monitor(connect):
+    bench = connect.bench
+    command = [sys.executable, "-u", "-m", "salient", "monitor", "--can", bench.address, "--every-s", "0.02"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as monitor:
+        assert monitor.stdout.readline() == f"watching {bench.address}\n"
+        bench.drive.speed_reference_rpm = 600
+        bench.run_for(0.2)
+        bench.simulator.close()
+        lines = monitor.stdout.read().splitlines()
+        assert monitor.wait() == 0
+    assert 8 <= len(lines) <= 10
+    assert all("state        run" in line and "reference    600.00 r/min" in line for line in lines[1:])

@@ -1,0 +1,341 @@
+"""salient compare: what it runs, what it says of it, and what it says of an earlier run."""
+
+import io
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from salient.cli import CONTROLLERS, make_parser
+from salient.errors import UsageError
+from salient.experiments.compare import baseline, cases, command, results_file, table
+from salient.experiments.compare.cases import GROUPS, Case, random_drive, scenario_toml, start_scenario
+from salient.experiments.compare.metrics import FIGURES, failures
+from salient.experiments.compare.runner import Outcome, run_all
+from salient.experiments.compare.targets import TARGETS, Target
+from salient.experiments.scenario import load_scenarios
+
+ALL_CASES = {name: list(group.cases(False)) for name, group in GROUPS.items()}
+
+
+def compare(*line):
+    """Exit code and what was said."""
+    said = io.StringIO()
+    code = command.run(make_parser().parse_args(["compare", *map(str, line)]), stream=said)
+    return code, said.getvalue()
+
+
+def outcome(controller="paper", sample="", failed="", condition="saturating", group="start", **figures):
+    case = Case(group, condition, controller, "start", start_scenario(controller=controller), sample)
+    return Outcome(case, figures, failed)
+
+
+@pytest.fixture(scope="module")
+def start_folder(tmp_path_factory):
+    """What the quick start leaves, by two jobs; and what it said."""
+    folder = tmp_path_factory.mktemp("compare")
+    code, said = compare("start", "--quick", "--jobs", 2, "--out", folder)
+    assert code == 0
+    return folder, said
+
+
+# --- what is run ----------------------------------------------------------------------------------------------------
+
+def test_every_target_stands_beside_a_row():
+    there = {(case.group, case.condition) for of in ALL_CASES.values() for case in of}
+    for group, condition, figure, statistic in TARGETS:
+        assert (group, condition) in there
+        assert (figure, statistic) in GROUPS[group].shown
+
+
+def test_every_controller_runs_in_every_group_but_where_it_cannot():
+    for name, of in ALL_CASES.items():
+        wanted = {"paper_conditions": {"traditional", "paper"}, "ablation": set(CONTROLLERS) - {"traditional"}}
+        assert {case.controller for case in of} == wanted.get(name, set(CONTROLLERS))
+
+
+def test_the_quick_runs_are_some_of_the_groups_conditions():
+    for name, group in GROUPS.items():
+        quick = list(group.cases(True))
+        assert 0 < len(quick) < len(ALL_CASES[name])
+        assert {case.condition for case in quick} <= {case.condition for case in ALL_CASES[name]}
+
+
+def test_the_load_steps_of_the_dip_are_spread_over_one_stroke():
+    steps_s = sorted({case.scenario.load[0].at_s for case in ALL_CASES["dip"]})
+    assert len(steps_s) == 24
+    assert np.diff(steps_s) * 6.0 * 150.0 == pytest.approx(30.0 / 24)
+
+
+def test_random_drives_cover_their_ranges_and_come_again():
+    drives = [random_drive(number) for number in range(cases.DRIVES)]
+    assert drives[:5] == [random_drive(number) for number in range(5)]
+    assert {drive.encoder_bits for drive in drives} == set(range(14, 21))
+    for name, low, high in (("flux_linkage_gain", 0.9, 1.1), ("resistance_gain", 0.8, 1.5), ("inertia_gain", 0.5, 3.0),
+                            ("friction_gain", 0.0, 5.0), ("supply_voltage_V", 200.0, 280.0),
+                            ("encoder_offset_deg", -0.1, 0.1), ("current_noise_A", 0.0, 0.04)):
+        values = [drive.bench[name] for drive in drives]
+        assert low - 1e-6 <= min(values) < low + 0.02 * (high - low)
+        assert high - 0.02 * (high - low) < max(values) <= high + 1e-6
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_written_scenario_is_the_one_that_ran(group, tmp_path):
+    for case in ALL_CASES[group][:: max(1, len(ALL_CASES[group]) // 20)]:
+        path = tmp_path / "compare.toml"
+        path.write_text(scenario_toml(case))
+        assert load_scenarios(path) == [case.scenario]
+
+
+def test_a_drive_that_ends_in_a_fault_is_named_and_replayed(tmp_path):
+    scenario = replace(start_scenario(controller="paper"), duration_s=0.1, parameters={"over_speed_rpm": 300.0})
+    case = Case("start", "saturating", "paper", "start", scenario)
+    (made,) = run_all([case], 1, io.StringIO())
+    assert (made.figures, made.failed) == ({}, "fault over_speed")
+    (row, *_) = table.make_rows([made])
+    assert row.failed == {"paper": "fault over_speed"} and row.values == {}
+    assert "paper: fault over_speed" in table.table([row])
+    ((_, path),) = command._write_failed(tmp_path, [made])
+    assert path.name == "start_saturating_paper.toml"
+    assert load_scenarios(path) == [replace(scenario, name=path.stem)]
+
+
+def test_a_run_asked_for_twice_is_made_once():
+    said = io.StringIO()
+    case = Case("start", "saturating", "paper", "start", replace(start_scenario(controller="paper"), duration_s=0.01))
+    first, second = run_all([case, replace(case, condition="again")], 2, said)
+    assert first.figures == second.figures and second.case.condition == "again"
+    assert said.getvalue() == "1/1 start: saturating by paper\n"
+
+
+def test_a_drive_fails_the_robustness_study_by_each_of_its_limits():
+    well = {"settling_time_s": 0.1, "speed_error_percent": 0.1, "peak_current_A": 60.0, "highest_speed_percent": 101.0,
+            "cycle_percent": 0.1}
+    assert failures(well) == []
+    beyond = {"settling_time_s": None, "speed_error_percent": 0.51, "peak_current_A": 90.1,
+              "highest_speed_percent": 105.1, "cycle_percent": 1.01}
+    for name, value in beyond.items():
+        assert len(failures(well | {name: value})) == 1
+    assert len(failures(beyond)) == 5
+
+
+# --- the table ------------------------------------------------------------------------------------------------------
+
+def test_rows_have_medians_and_worst_and_what_never_came_about_is_beyond_all():
+    outcomes = [outcome(group="dip", condition="saturating, 17 bits", sample=f"angle {number}", speed_dip_rpm=dip,
+                        recovery_time_s=recovery_s)
+                for number, (dip, recovery_s) in enumerate([(1.0, 0.001), (2.0, None), (4.0, 0.003)])]
+    made = {row.key[2:]: row for row in table.make_rows(outcomes)}
+    assert made["speed_dip_rpm", "median"].values == {"paper": 2.0}
+    assert made["speed_dip_rpm", "worst"].values == {"paper": 4.0}
+    assert made["recovery_time_s", "median"].values == {"paper": 0.003}
+    lines = table.table(list(made.values())).splitlines()
+    assert re.fullmatch(r" +median back within 0.5 %, ms +3\.00 +370 / 1", lines[5])
+
+
+def test_the_widest_gap_between_angles_goes_over_the_end_of_the_stroke():
+    outcomes = [outcome(group="dip", condition="saturating, 17 bits", sample=str(angle), step_angle_deg=angle)
+                for angle in (29.0, 6.0, 12.0, 18.0)]
+    (row,) = table.make_rows(outcomes)
+    assert row.values == {"paper": 11.0}
+
+
+def test_runs_without_figures_are_counted_and_starred():
+    outcomes = [outcome(group="dip", condition="saturating, 17 bits", sample="a", speed_dip_rpm=1.0),
+                outcome(group="dip", condition="saturating, 17 bits", sample="b", failed="fault over_current")]
+    row = table.make_rows(outcomes)[0]
+    assert row.values == {"paper": 1.0} and row.failed == {"paper": "1 of 2: fault over_current"}
+    text = table.table([row])
+    assert "1.00*" in text and "paper: 1 of 2: fault over_current" in text
+
+
+@pytest.mark.parametrize(("values", "failed", "reached"), [
+    ({"paper": 1.0}, {}, True),
+    ({"paper": 1.0001}, {}, False),
+    ({"paper": None}, {}, False),
+    ({}, {"paper": "fault"}, False),
+    ({"paper": 0.5}, {"paper": "1 of 2: fault"}, False),
+    ({"traditional": 0.5}, {}, None),
+])  # fmt: skip
+def test_what_is_wanted_is_reached_by_its_controller_in_all_runs_or_not(values, failed, reached):
+    row = table.Row(("start", "saturating", "overshoot_percent", ""), values, failed, Target(1.0, "paper"))
+    assert row.reached is reached
+
+
+def test_a_missed_figure_is_shown_with_its_reason():
+    row = table.Row(("start", "saturating", "overshoot_percent", ""), {"paper": 2.0}, {},
+                   Target(1.0, "paper", reason="The observer lags."))
+    text = table.table([row])
+    assert "NOT REACHED" in text and "The observer lags." in text
+    assert table.verdict([row]) == "0 of 1 wanted figures reached"
+
+
+# --- an earlier run -------------------------------------------------------------------------------------------------
+
+KEY = ("dip", "saturating, 17 bits", "speed_dip_rpm", "median")
+
+
+def change_of(earlier, now, beyond_percent=5.0, earlier_failed=None, now_failed=None, key=KEY):
+    """The change from one value of the paper's controller to another, None for none."""
+    def row(value, failed):
+        values = {} if value == "none" else {"paper": value}
+        return table.Row(key, values, {"paper": failed} if failed else {}, Target())
+
+    old = results_file.content([row(earlier, earlier_failed)], [], False)
+    found, both = baseline.changes([row(now, now_failed)], old, beyond_percent)
+    assert both == 1
+    return found[0] if found else None
+
+
+def test_a_change_within_the_threshold_or_the_resolution_is_none():
+    assert change_of(2.0, 2.099) is None
+    assert change_of(2.0, 1.901) is None
+    assert change_of(0.1, 0.119) is None  # 19 %, but 0.02 r/min
+    assert change_of(None, None) is None
+
+
+def test_a_change_beyond_it_is_better_or_worse():
+    worse, better = change_of(2.0, 2.11), change_of(2.0, 1.89)
+    assert worse.worse and worse.percent == pytest.approx(5.5)
+    assert not better.worse and better.percent == pytest.approx(-5.5)
+    assert change_of(2.0, 2.11, beyond_percent=6.0) is None
+
+
+def test_a_highest_speed_changes_by_what_it_is_above_the_reference():
+    key = ("dip", "saturating, 17 bits", "speed_after_rpm", "worst")
+    assert change_of(150.1, 150.2, key=key).percent == pytest.approx(100.0, rel=1e-6)
+    assert change_of(149.9, 150.0, key=key).percent is None
+    assert change_of(150.01, 150.05, key=key) is None
+
+
+def test_never_and_a_fault_are_worse_than_any_figure():
+    assert change_of(2.0, None).worse and not change_of(None, 2.0).worse
+    assert change_of(2.0, "none", now_failed="fault").worse
+    assert not change_of("none", 9.0, earlier_failed="fault").worse
+    assert change_of("none", "none", earlier_failed="fault", now_failed="fault") is None
+
+
+def test_the_same_drive_is_no_change_and_a_doctored_earlier_run_is_told_apart(start_folder, tmp_path):
+    folder, _ = start_folder
+    code, said = compare("start", "--quick", "--jobs", 1, "--out", tmp_path / "again", "--against", folder)
+    assert code == 0
+    figures = 2 * len(CONTROLLERS)
+    assert f"0 worse, 0 better, {figures} within 10 % of {figures} figures" in said
+    # Equal bytes, whatever the number of jobs.
+    assert (tmp_path / "again/compare.json").read_bytes() == (folder / "compare.json").read_bytes()
+
+    doctored = json.loads((folder / "compare.json").read_text())
+    for row in doctored["rows"]:
+        if row["figure"] == "settling_time_s":
+            row["values"]["paper"] *= 0.9
+            row["values"]["traditional"] *= 1.2
+    earlier = tmp_path / "earlier.json"
+    earlier.write_text(json.dumps(doctored))
+    code, said = compare("start", "--quick", "--out", tmp_path / "worse", "--against", earlier)
+    assert code == 1
+    assert f"1 worse, 1 better, {figures - 2} within 10 % of {figures} figures" in said
+    assert re.search(r"WORSE  start, saturating, paper: settled .* 0\.06\d\d\d -> 0\.06\d\d\d \(\+11\.1 %\)", said)
+    assert re.search(r"better  start, saturating, traditional: .* \(-16\.7 %\)", said)
+    page = (tmp_path / "worse/compare.html").read_text(encoding="utf-8")
+    assert "WORSE  start" in page and page.count("data:image/png;base64,") == 1
+    code, _ = compare("start", "--quick", "--out", tmp_path / "lenient", "--against", earlier, "--worse-percent", 20)
+    assert code == 0
+
+
+@pytest.mark.parametrize(("content", "words"), [
+    (None, "No such file"),
+    ("{", "no JSON"),
+    ("[]", "schema 1"),
+    ('{"schema": 2, "rows": []}', "schema 1"),
+    ('{"schema": 1, "quick": true, "rows": []}', "made with --quick"),
+])  # fmt: skip
+def test_what_is_no_earlier_run_is_named(tmp_path, content, words):
+    path = tmp_path / "earlier.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(UsageError, match=f"--against .*earlier.json: .*{words}"):
+        compare("start", "--out", tmp_path / "out", "--against", path)
+    assert not (tmp_path / "out").exists()
+
+
+# --- what is left behind --------------------------------------------------------------------------------------------
+
+def test_the_figures_of_a_start_are_those_of_the_drive(start_folder):
+    folder, said = start_folder
+    content = json.loads((folder / "compare.json").read_text())
+    assert content["quick"] is True
+    values = {row["figure"]: row["values"] for row in content["rows"]}
+    assert 0.0677 < values["settling_time_s"]["paper"] < 0.0697
+    assert 0.0677 < values["settling_time_s"]["traditional"] < 0.0720
+    assert 0.0 <= values["overshoot_percent"]["paper"] < 0.05
+    assert 0.1 < values["overshoot_percent"]["traditional"] < 0.3
+    assert "0.18 / 0.07" in said
+    assert [run["controller"] for run in content["runs"]] == list(CONTROLLERS)
+
+
+def test_the_page_is_whole_and_fetches_nothing(tmp_path):
+    # One of each kind of picture, from short runs.
+    code, said = compare("ripple", "speeds", "--quick", "--out", tmp_path)
+    assert code == 0 and "compare.html" in said
+    page = (tmp_path / "compare.html").read_text(encoding="utf-8")
+    assert page.count('src="data:image/png;base64,') == 3 == page.count("<img")
+    assert not re.search(r"https?://|<script|<link", page)
+    for case in (*GROUPS["ripple"].cases(True), *GROUPS["speeds"].cases(True)):
+        assert case.condition in page
+    content = json.loads((tmp_path / "compare.json").read_text())
+    ripple = {row["condition"]: row["values"] for row in content["rows"] if row["figure"] == "ripple"}
+    assert 0.5 < ripple["saturating, 40 kHz, one pulse"]["traditional"] < 1.0
+    assert 0.04 < ripple["saturating, 40 kHz, one pulse"]["paper"] < 0.08
+    traces = {(trace["controller"], trace["condition"]): trace for trace in content["traces"]}
+    torque_Nm = np.array(traces["paper", "saturating, 40 kHz, one pulse"]["torque_Nm"])
+    assert np.ptp(torque_Nm) / 8.314 == pytest.approx(ripple["saturating, 40 kHz, one pulse"]["paper"], rel=0.01)
+
+
+def test_the_pictures_of_the_studies_are_drawn(tmp_path):
+    code, _ = compare("dip", "ablation", "robustness", "--quick", "--out", tmp_path)
+    assert code == 0
+    page = (tmp_path / "compare.html").read_text(encoding="utf-8")
+    assert page.count('src="data:image/png;base64,') == 3
+    content = json.loads((tmp_path / "compare.json").read_text())
+    values = {(row["group"], row["figure"], row["statistic"]): row["values"] for row in content["rows"]
+              if row["group"] != "ablation"}
+    # Six load steps over a stroke of 30 degrees.
+    assert 5.0 <= values["dip", "step_angle_deg", "gap"]["paper"] < 5.3
+    assert 0.0 <= values["robustness", "failed", "count"]["paper"] <= 10.0
+    assert 40.0 < values["robustness", "peak_current_A", "worst"]["paper"] < 90.0
+
+
+def test_the_groups_are_listed():
+    code, said = compare("--list")
+    assert code == 0
+    assert [line.split()[0] for line in said.splitlines()] == list(GROUPS)
+    assert [line.split()[0] for line in said.splitlines() if "only when named" in line] == ["ablation", "robustness"]
+
+
+def test_a_group_that_is_none_is_named():
+    with pytest.raises(UsageError, match="no group dips: allowed are ripple, speeds"):
+        compare("dips")
+
+
+@pytest.mark.parametrize(("line", "words"), [
+    (("--jobs", "0"), "--jobs 0: allowed are whole numbers from 1"),
+    (("--worse-percent", "much"), "--worse-percent much: allowed are numbers from 0"),
+])  # fmt: skip
+def test_a_wrong_option_is_named(line, words, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        compare(*line)
+    assert words in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_is_named_before_anything_runs(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="--out .*: cannot write there"):
+        compare("start", "--out", tmp_path / "file" / "out")
+
+
+def test_every_figure_shown_has_words():
+    for group in GROUPS.values():
+        for figure, _ in group.shown:
+            assert FIGURES[figure].words

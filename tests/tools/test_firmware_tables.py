@@ -1,0 +1,183 @@
+"""The firmware's tables of a phase as the generator makes them, read back in double precision: machines whose flux
+linkage is no product of a curve over the angle and one over the current, and magnetics that the tables refuse."""
+
+import math
+import shutil
+
+import numpy as np
+import pytest
+
+from salient.bench.emulator import executable
+from salient.errors import UsageError
+from salient.generate import machine as generate_machine
+from salient.machine.file import SHIPPED, load_machine
+from salient.machine.firmware_tables import BEND_SHIFT_MAX, CURRENT_A, ROW_UNITS, ROWS, PhaseMapError, phase_map
+
+POLES = 4
+HALF_RAD = math.pi / POLES
+
+
+class LocalSaturation:
+    """Poles that overlap over an arc, and saturate at a flux that goes with the overlap: at another current at every
+    angle. psi = Lu i + S o(x) (1 - e^(-b i)), b = (La - Lu) / S (1 + spread (1 - o)), of the overlap o."""
+
+    pitch_rad = 2.0 * HALF_RAD
+    current_max_A = math.inf
+
+    def __init__(self, spread: float = 0.8):
+        self.spread = spread
+
+    def _overlap(self, angle_rad):
+        """Overlap and its slope: a smooth step over the angle from aligned, 15 deg wide around 17 deg."""
+        wrapped = np.mod(np.asarray(angle_rad, float) + HALF_RAD, self.pitch_rad) - HALF_RAD
+        x = (np.abs(wrapped) - math.radians(17.0)) / math.radians(4.0)
+        return 0.5 * (1.0 - np.tanh(x)), -0.5 / np.cosh(x) ** 2 / math.radians(4.0) * np.sign(wrapped)
+
+    def _rate(self, overlap):
+        return 0.0572 * (1.0 + self.spread * (1.0 - overlap)), -0.0572 * self.spread
+
+    def flux_linkage_Wb(self, angle_rad, current_A):
+        overlap, _ = self._overlap(angle_rad)
+        rate, _ = self._rate(overlap)
+        return 0.67e-3 * np.asarray(current_A) - 0.4 * overlap * np.expm1(-rate * current_A)
+
+    def torque_Nm(self, angle_rad, current_A):
+        overlap, slope = self._overlap(angle_rad)
+        rate, rate_slope = self._rate(overlap)
+        decay = np.exp(-rate * current_A)
+        risen_A = current_A - (1.0 - decay) / rate
+        by_rate = (1.0 - decay) / rate**2 - current_A * decay / rate
+        return 0.4 * slope * (risen_A + overlap * rate_slope * by_rate)
+
+
+def read_back(tables, surface, place, current_A):
+    """What firmware/control/phase_map.c makes of the tables; place from 0, unaligned, to 1, aligned."""
+    start = tables.row_start / ROW_UNITS
+    row = np.clip(np.searchsorted(start, place, side="right") - 1, 0, ROWS - 2)
+    u = ((place - start[row]) / (start[row + 1] - start[row]))[:, None]
+    bends = surface.bend[row] * 2.0**surface.bend_shift
+    rows = surface.node[row] + u * (surface.node[row + 1] - surface.node[row]) - u * (1.0 - u) * bends
+    value = np.array([np.interp(current_A, CURRENT_A, at_angle) for at_angle in rows])
+    return value * current_A / 2.0**surface.fraction_bits
+
+
+def differences(magnetics, current_max_A):
+    """Greatest differences of torque in N m and flux linkage in Wb between tables and machine."""
+    tables = phase_map(magnetics)
+    place = (np.arange(1999) + 0.37) / 2000.0
+    current_A = np.arange(0.3, current_max_A, 0.4)
+    half_rad = magnetics.pitch_rad / 2.0
+    angle_rad = half_rad + half_rad * place[:, None]
+    torque_Nm = read_back(tables, tables.torque_per_ampere, place, current_A)
+    flux_Wb = read_back(tables, tables.flux_per_ampere, place, current_A)
+    return (
+        np.max(np.abs(torque_Nm - magnetics.torque_Nm(angle_rad, current_A))),
+        np.max(np.abs(flux_Wb - magnetics.flux_linkage_Wb(angle_rad, current_A))),
+    )
+
+
+def test_the_torque_of_the_test_s_machine_is_the_slope_of_its_coenergy():
+    magnetics = LocalSaturation()
+    angle_rad, step_rad = HALF_RAD * np.linspace(1.05, 1.95, 50), 1e-5
+    current_A = np.linspace(0.0, 40.0, 4001)
+    coenergy_J = [
+        np.trapezoid(magnetics.flux_linkage_Wb((angle_rad + s)[:, None], current_A), current_A, axis=1)
+        for s in (-step_rad, step_rad)
+    ]
+    slope_Nm = (coenergy_J[1] - coenergy_J[0]) / (2.0 * step_rad)
+    assert np.max(np.abs(slope_Nm - magnetics.torque_Nm(angle_rad, 40.0))) < 1e-4 * np.max(slope_Nm)
+
+
+def test_a_machine_that_saturates_at_another_current_at_every_angle_is_held_within_21_millinewtonmetres():
+    magnetics = LocalSaturation()
+    # No product: the saturation at half overlap is not that of the aligned position, scaled.
+    halved = magnetics.flux_linkage_Wb(np.array([[0.0], [math.radians(17.0)]]), np.array([5.0, 60.0]))
+    assert halved[1, 0] / halved[0, 0] > 1.2 * halved[1, 1] / halved[0, 1]
+    torque_Nm, flux_Wb = differences(magnetics, 30.0)
+    assert 0.016 < torque_Nm < 0.021
+    assert 110e-6 < flux_Wb < 140e-6
+
+
+def test_rows_stand_closest_where_the_torque_bends_most():
+    start_deg = 45.0 * phase_map(load_machine(SHIPPED / "linear_trapezoid.toml").magnetics).row_start / ROW_UNITS
+    for corner_deg in (1.0, 3.0, 42.0, 44.0):
+        assert np.min(np.abs(start_deg - corner_deg)) < 0.003, corner_deg
+
+
+class Scaled:
+    """A machine with its torque and flux linkage multiplied."""
+
+    def __init__(self, magnetics, factor):
+        self.magnetics, self.factor = magnetics, factor
+        self.pitch_rad, self.current_max_A = magnetics.pitch_rad, magnetics.current_max_A
+
+    def flux_linkage_Wb(self, angle_rad, current_A):
+        return self.factor * self.magnetics.flux_linkage_Wb(angle_rad, current_A)
+
+    def torque_Nm(self, angle_rad, current_A):
+        return self.factor * self.magnetics.torque_Nm(angle_rad, current_A)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 100.0])
+def test_the_format_follows_the_machine(factor):
+    machine = load_machine(SHIPPED / "saturating.toml").magnetics
+    tables = phase_map(Scaled(machine, factor))
+    for surface in (tables.torque_per_ampere, tables.flux_per_ampere):
+        assert 32768 <= np.max(surface.node) <= 65535, "all 16 bits in use"
+        assert np.min(surface.node) >= 0
+        assert 64 <= np.max(np.abs(surface.bend)) <= 127, "and of the bends all 8"
+        assert 0 <= surface.bend_shift <= BEND_SHIFT_MAX
+        assert 0 <= surface.result_shift <= 12
+
+
+def test_a_weak_machine_has_the_finest_format():
+    machine = load_machine(SHIPPED / "saturating.toml").magnetics
+    tables = phase_map(Scaled(machine, 0.01))
+    for surface in (tables.torque_per_ampere, tables.flux_per_ampere):
+        assert surface.result_shift == 0
+        assert 500 < np.max(surface.node) < 5000
+
+
+def test_what_the_tables_cannot_hold_is_refused_in_one_line():
+    machine = load_machine(SHIPPED / "saturating.toml").magnetics
+    with pytest.raises(PhaseMapError, match=r"^[0-9.]+ N m/A of torque is more than the firmware's tables hold$"):
+        phase_map(Scaled(machine, 2000.0))
+    with pytest.raises(PhaseMapError, match=r"^at [0-9.]+ deg, towards aligned, the torque falls to [-0-9.]+ N m at"):
+        phase_map(LocalSaturation(spread=2.0))
+
+
+@pytest.fixture
+def strong_machine(tmp_path):
+    """A file of allowed numbers whose torque is beyond the tables."""
+    text = (SHIPPED / "linear_cosine.toml").read_text(encoding="utf-8")
+    text = text.replace("stator = 6", "stator = 12").replace("rotor = 4", "rotor = 8")
+    path = tmp_path / "strong.toml"
+    path.write_text(text.replace("23.6e-3", "9.0"), encoding="utf-8")
+    return path
+
+
+def test_the_build_step_names_the_file_that_it_refuses(strong_machine, tmp_path, capsys):
+    assert generate_machine.main([str(strong_machine), str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"salient: {strong_machine}: magnetics: ") and said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_refused_machine_is_named_before_anything_is_built(strong_machine):
+    with pytest.raises(UsageError, match=r"strong\.toml: magnetics: [0-9]+ N m/A of torque is more than"):
+        executable(str(strong_machine))
+
+
+def test_a_map_that_ends_early_is_levelled_where_its_straight_continuation_loses_torque(tmp_path):
+    lines = (SHIPPED / "finite_element.csv").read_text(encoding="utf-8").splitlines()
+    kept = [line for line in lines if not line[0].isdigit() or float(line.split(",")[1]) <= 20.0]
+    (tmp_path / "finite_element.csv").write_text("\n".join([*kept, ""]), encoding="utf-8")
+    shutil.copy(SHIPPED / "finite_element.toml", tmp_path)
+    magnetics = load_machine(tmp_path / "finite_element.toml").magnetics
+    half_rad = magnetics.pitch_rad / 2.0
+    angle_rad = half_rad + half_rad * np.linspace(0.0, 1.0, 100)[:, None]
+    assert magnetics.current_max_A == 20.0
+    assert np.min(np.diff(magnetics.torque_Nm(angle_rad, CURRENT_A), axis=1)) < -1.0, "what is to be levelled"
+    torque = phase_map(magnetics).torque_per_ampere.node * CURRENT_A  # N m, in units of the last place
+    assert np.all(np.diff(torque, axis=1) >= -0.5 * (CURRENT_A[1:] + CURRENT_A[:-1])), "but for rounding of T / i"
+    assert differences(magnetics, 18.0)[0] < 0.02

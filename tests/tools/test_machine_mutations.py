@@ -1,0 +1,534 @@
+"""Machine files and flux-linkage maps gone wrong in every way we could think of: refused by one line that names the
+file and the key or the row, never by a traceback, and never built. What a mutation leaves valid is checked to be a
+machine.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import random
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from salient.machine.file import Machine, MachineError, load_machine, machine_path
+from salient.machine.magnetics import Formula
+from salient.paths import BUILD
+
+SEED = 20
+LINE_MAX = 600  # characters of a refusal besides the path: a screen, not a flood
+
+NAME = "mutant"
+POLES = {"stator": "6", "rotor": "4"}
+# Every table that a machine file may have, every number written out.
+GOOD_TABLES = {
+    "poles": POLES,
+    "winding": {"resistance_ohm": "0.05"},
+    "mechanics": {"inertia_kg_m2": "0.02", "friction_Nm_s": "0.02"},
+    "magnetics": {
+        "form": '"saturating"',
+        "unaligned_inductance_H": "0.67e-3",
+        "aligned_inductance_H": "23.6e-3",
+        "saturated_inductance_H": "0.15e-3",
+        "flux_linkage_max_Wb": "0.486",
+        "current_at_flux_linkage_max_A": "450.0",
+    },
+    "converter": {
+        "supply_voltage_V": "240.0",
+        "switch_drop_V": "1.0",
+        "switch_resistance_ohm": "0.01",
+        "diode_drop_V": "0.9",
+        "diode_resistance_ohm": "0.005",
+        "minimum_pulse_ns": "500.0",
+    },
+    "dc_link": {
+        "capacitance_F": "2e-3",
+        "source_resistance_ohm": "0.1",
+        "chopper_resistance_ohm": "20.0",
+        "chopper_on_V": "280.0",
+        "chopper_off_V": "270.0",
+    },
+    "sensors": {
+        "current_gain": "1.01",
+        "current_offset_A": "0.1",
+        "current_noise_A": "0.02",
+        "current_limit_A": "80.0",
+        "current_delay_ns": "1000.0",
+        "encoder_eccentricity_deg": "0.1",
+    },
+    "iron_loss": {
+        "turns_area_m2": "0.5",
+        "mass_kg": "6.0",
+        "steinmetz_k": "0.003",
+        "steinmetz_alpha": "1.4",
+        "steinmetz_beta": "1.8",
+    },
+}
+MAY_BE_LEFT_OUT = {(table, key) for table in ("converter", "sensors") for key in GOOD_TABLES[table]}
+MAY_BE_LEFT_OUT -= {("converter", "supply_voltage_V")}
+
+
+def toml(tables: dict[str, dict[str, str]], name: str = f'"{NAME}"') -> str:
+    lines = [f"name = {name}"]
+    for table, keys in tables.items():
+        lines += ["", f"[{table}]", *(f"{key} = {value}" for key, value in keys.items())]
+    return "\n".join(lines) + "\n"
+
+
+GOOD = toml(GOOD_TABLES)
+MAP_MACHINE = toml({**GOOD_TABLES, "magnetics": {"form": '"map"', "file": f'"{NAME}.csv"'}})
+
+FORMULA = Formula("saturating", 4, {key: float(value) for key, value in GOOD_TABLES["magnetics"].items()
+                                    if key != "form"})  # fmt: skip
+ANGLES_DEG = np.linspace(0.0, 45.0, 10)
+CURRENTS_A = np.linspace(8.0, 80.0, 10)
+HEADER = "angle_deg,current_A,flux_linkage_Wb"
+ROWS = [
+    f"{angle:g},{current:g},{float(FORMULA.flux_linkage_Wb(math.radians(angle), current)):.6g}"
+    for angle in ANGLES_DEG
+    for current in CURRENTS_A
+]
+
+
+def csv(rows: list[str], header: str = HEADER) -> str:
+    return "\n".join([header, *rows]) + "\n"
+
+
+GOOD_MAP = csv(ROWS)
+
+
+# --- The checks ---
+
+
+def write(folder: Path, machine: str | bytes, flux_map: str | bytes | None = None) -> Path:
+    path = folder / f"{NAME}.toml"
+    path.write_bytes(machine.encode() if isinstance(machine, str) else machine)
+    if flux_map is not None:
+        (folder / f"{NAME}.csv").write_bytes(flux_map.encode() if isinstance(flux_map, str) else flux_map)
+    return path
+
+
+def refusal(path: Path) -> str | None:
+    """What load_machine says about a file, without the path; None when it takes it. Anything but a MachineError of one
+    line that begins with the file at fault fails."""
+    try:
+        machine = load_machine(path)
+    except MachineError as error:
+        text = str(error)
+    else:
+        assert_is_a_machine(machine)
+        return None
+    at_fault = re.match(rf"({re.escape(str(path))}|{re.escape(str(path.parent))}/.*\.csv): ", text)
+    assert at_fault, text
+    text = text[at_fault.end() :]
+    assert text and text.isprintable() and len(text) < LINE_MAX, text
+    return text
+
+
+def assert_is_a_machine(machine: Machine) -> None:
+    """Finite numbers of the right sign, and magnetics that are those of a reluctance machine."""
+    assert machine.name.isidentifier()
+    assert (machine.stator_poles, machine.rotor_poles, machine.phases) in ((6, 4, 3), (8, 6, 4), (12, 8, 3))
+    numbers = dataclasses.asdict(dataclasses.replace(machine, magnetics=None))
+    for table in ("converter", "dc_link", "sensors", "iron_loss"):
+        numbers |= {f"{table}.{key}": value for key, value in (numbers.pop(table) or {}).items()}
+    for key, value in numbers.items():
+        if isinstance(value, float):
+            assert math.isfinite(value) and (value >= 0.0 or key == "sensors.current_offset_A"), (key, value)
+    assert machine.resistance_ohm > 0.0 and machine.inertia_kg_m2 > 0.0 and machine.supply_voltage_V > 0.0
+    current_A = np.linspace(1.0, 80.0, 30)
+    angle_rad = np.linspace(0.0, machine.pitch_rad / 2.0, 40)[:, None]
+    flux_Wb = machine.magnetics.flux_linkage_Wb(angle_rad, current_A)
+    assert np.all(np.isfinite(flux_Wb)) and np.all(flux_Wb > 0.0)
+    assert np.all(np.diff(flux_Wb, axis=1) > 0.0), "rises with the current"
+    assert np.all(flux_Wb[0] > flux_Wb[-1]), "more aligned than unaligned"
+    between_rad = machine.pitch_rad * 0.75
+    assert np.all(machine.magnetics.torque_Nm(between_rad, current_A) > 0.0), "motoring torque towards aligned"
+
+
+# --- Machine files ---
+
+TOO_LONG = "a whole number of 5000 digits"  # Python reads none above 4300, and says so as no other mistake
+WRONG_VALUES = {
+    "text": '"0.05"',
+    "empty text": '""',
+    "truth": "true",
+    "array": "[0.05]",
+    "table": "{ value = 0.05 }",
+    "date": "2024-02-29",
+    "nan": "nan",
+    "infinite": "inf",
+    "minus infinite": "-inf",
+    "negative": "-1e3",
+    "huge": "1e30",
+    "beyond a double": "1e999",
+    "a whole number of 400 digits": "9" * 400,
+    TOO_LONG: "9" * 5000,
+    "a hexadecimal of 5000 digits": "0x" + "f" * 5000,
+    "a long text": '"' + "x" * 5000 + '"',
+    "a text of two lines": '"a\\nb"',
+}
+ZERO_ALLOWED = {("mechanics", "friction_Nm_s"), ("sensors", "current_gain")} | MAY_BE_LEFT_OUT
+ZERO_ALLOWED -= {("sensors", "current_limit_A")}
+
+Case = tuple[str, str, str]
+"""(what was done, machine file, what the refusal must name)."""
+
+
+def with_value(table: str, key: str, value: str) -> str:
+    return toml({**GOOD_TABLES, table: {**GOOD_TABLES[table], key: value}})
+
+
+def key_cases() -> list[Case]:
+    cases: list[Case] = []
+    for table, keys in GOOD_TABLES.items():
+        for key in keys:
+            name = table if table == "poles" else f"{table}.{key}"
+            others = {other: value for other, value in keys.items() if other != key}
+            if (table, key) not in MAY_BE_LEFT_OUT:
+                cases.append((f"{name} removed", toml({**GOOD_TABLES, table: others}), f"{table}.{key}"))
+            renamed = toml({**GOOD_TABLES, table: {f"{key}s" if old == key else old: v for old, v in keys.items()}})
+            cases.append((f"{name} renamed", renamed, f"{table}.{key}"))
+            line = f"{key} = {keys[key]}\n"
+            cases.append((f"{name} twice", GOOD.replace(line, line + line, 1), "line "))
+            wrong = WRONG_VALUES | ({} if (table, key) in ZERO_ALLOWED else {"zero": "0"})
+            cases += [(f"{name} {what}", with_value(table, key, value), "not TOML" if what == TOO_LONG else name)
+                      for what, value in wrong.items()]  # fmt: skip
+    return cases
+
+
+def table_cases() -> list[Case]:
+    cases: list[Case] = []
+    for table in GOOD_TABLES:
+        without = {name: keys for name, keys in GOOD_TABLES.items() if name != table}
+        if table not in ("dc_link", "sensors", "iron_loss"):
+            cases.append((f"[{table}] removed", toml(without), table))
+        cases += [
+            (f"[{table}] renamed", toml({**without, f"{table}s": GOOD_TABLES[table]}), f"{table}s"),
+            (f"[{table}] twice", GOOD + f"[{table}]\n", "line "),
+            (f"[{table}] in brackets of an array", GOOD.replace(f"[{table}]", f"[[{table}]]"), table),
+            (f"[{table}] a number", f"{table} = 1\n" + toml(without), table),
+            (f"[{table}] open", GOOD.replace(f"[{table}]", f"[{table}"), "line "),
+        ]
+    return cases
+
+
+def other_cases() -> list[Case]:
+    return [
+        ("empty", "", "name"),
+        ("only blanks", " \n\t\n", "name"),
+        ("name removed", toml(GOOD_TABLES).split("\n", 1)[1], "name"),
+        *((f"name {value[:20]}", toml(GOOD_TABLES, value), "name")
+          for value in ("3", "true", '""', '"a b"', '"../x"', '"1a"', '"m\\u00fcller"', '"a\\nb"', f'"{"-" * 5000}"')),
+        ("a key of two lines", GOOD.replace("resistance_ohm", '"a\\nb"', 1), "winding"),
+        ("a key of 5000 letters", GOOD.replace("resistance_ohm", "x" * 5000, 1), "winding"),
+        ("a table of two lines", GOOD + '["a\\nb"]\n', "unknown key"),
+        ("arrays in arrays", "a = " + "[" * 20_000, "not TOML"),
+        ("tables in tables", "[" + "a." * 20_000 + "a]\n", "unknown key"),
+        ("poles of no machine", with_value("poles", "rotor", "5"), "poles"),
+        ("poles the other way round", toml({**GOOD_TABLES, "poles": {"stator": "4", "rotor": "6"}}), "poles"),
+        ("poles with a point", with_value("poles", "stator", "6.0"), "poles"),
+        ("inductances the wrong way round", with_value("magnetics", "aligned_inductance_H", "0.5e-3"),
+         "magnetics.aligned_inductance_H"),
+        ("saturated above unaligned", with_value("magnetics", "saturated_inductance_H", "0.7e-3"),
+         "magnetics.saturated_inductance_H"),
+        ("no flux left for the knee", with_value("magnetics", "flux_linkage_max_Wb", "0.05"),
+         "magnetics.flux_linkage_max_Wb"),
+        ("millihenries as henries", with_value("magnetics", "aligned_inductance_H", "23.6"),
+         "magnetics.aligned_inductance_H"),
+        ("milliohms as ohms", with_value("winding", "resistance_ohm", "500.0"), "winding.resistance_ohm"),
+        ("kilovolts as volts", with_value("converter", "supply_voltage_V", "0.24"), "converter.supply_voltage_V"),
+        ("microfarads as farads", with_value("dc_link", "capacitance_F", "2000"), "dc_link.capacitance_F"),
+        ("chopper below the supply", with_value("dc_link", "chopper_off_V", "230"), "dc_link.chopper_off_V"),
+        ("chopper the wrong way round", with_value("dc_link", "chopper_on_V", "265"), "dc_link.chopper_off_V"),
+        ("keys of another form", with_value("magnetics", "flat_deg", "1.0"), "magnetics.flat_deg"),
+        ("another form with these keys", with_value("magnetics", "form", '"linear_cosine"'), "magnetics.saturated"),
+        ("a map without its file", toml({**GOOD_TABLES, "magnetics": {"form": '"map"'}}), "magnetics.file"),
+        ("a decimal comma", with_value("winding", "resistance_ohm", "0,05"), "line "),
+        ("a NUL byte", GOOD.replace("0.05", "0.05\0"), "line "),
+    ]  # fmt: skip
+
+
+MACHINE_CASES = key_cases() + table_cases() + other_cases()
+
+
+def test_the_unmutated_files_are_machines(tmp_path: Path) -> None:
+    assert refusal(write(tmp_path, GOOD)) is None
+    assert refusal(write(tmp_path, MAP_MACHINE, GOOD_MAP)) is None
+
+
+def test_every_mutation_of_a_key_or_table_is_refused_by_one_line_that_names_it(tmp_path: Path) -> None:
+    assert len(MACHINE_CASES) > 600
+    said = {what: (refusal(write(tmp_path, text)), named) for what, text, named in MACHINE_CASES}
+    wrong = {what: text for what, (text, named) in said.items() if text is None or named not in text}
+    assert not wrong, wrong
+
+
+def test_a_machine_file_cut_anywhere_is_refused_or_still_a_machine(tmp_path: Path) -> None:
+    said = [refusal(write(tmp_path, GOOD.encode()[:end])) for end in range(len(GOOD))]
+    # Behind the last needed table, [converter] supply_voltage_V, only a cut number can stay valid.
+    needed = GOOD.index("switch_drop_V")
+    assert all(said[:needed - 5])
+    assert sum(text is not None for text in said) > needed
+
+
+@pytest.mark.parametrize("good", [GOOD, MAP_MACHINE], ids=["formula", "map"])
+def test_flipped_bytes_of_a_machine_file_are_refused_or_still_a_machine(tmp_path: Path, good: str) -> None:
+    chance = random.Random(SEED)
+    refused = 0
+    for _ in range(600):
+        data = bytearray(good.encode())
+        data[chance.randrange(len(data))] = chance.choice([0, 0xFF, 0x80, *range(9, 127)])
+        refused += refusal(write(tmp_path, bytes(data), GOOD_MAP)) is not None
+    assert 300 < refused < 600
+
+
+def test_what_is_no_readable_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / f"{NAME}.toml"
+    assert "no such file" in refusal(path)
+    path.mkdir()
+    assert "not a file" in refusal(path)
+    path.rmdir()
+    os.mkfifo(path)
+    assert "not a file" in refusal(path)
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    assert "not a file" in refusal(path)
+    path.unlink()
+    path.symlink_to(path)
+    assert "cannot be read" in refusal(path)
+    path.unlink()
+    with path.open("wb") as file:
+        file.truncate(10_000_000_000)  # takes no space
+    assert "larger than" in refusal(path)
+
+
+@pytest.mark.parametrize("name", ["", ".", "/", "x" * 5000, "a\nb", "a\0b", "pipe", "itself"])
+def test_what_is_no_name_of_a_machine_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    Path("itself").symlink_to("itself")
+    with pytest.raises(MachineError) as caught:
+        machine_path(name)
+    line = str(caught.value)
+    assert line.isprintable() and len(line) < LINE_MAX and "no such file" in line and "saturating" in line
+
+
+# --- Flux-linkage maps ---
+
+
+def row(angle: int, current: int) -> int:
+    """Place of a row in ROWS."""
+    return angle * len(CURRENTS_A) + current
+
+
+def changed(at: int, text: str) -> list[str]:
+    return [*ROWS[:at], text, *ROWS[at + 1 :]]
+
+
+def scaled(column: int, factor: float) -> list[str]:
+    cells = [line.split(",") for line in ROWS]
+    for line in cells:
+        line[column] = repr(float(line[column]) * factor)
+    return [",".join(line) for line in cells]
+
+
+def row_cases(chance: random.Random) -> list[tuple[str, str, str]]:
+    """(what was done, map, what the refusal must name): in each of some rows that chance picks, what a row may be."""
+    cases = []
+    for at in sorted(chance.sample(range(1, len(ROWS) - 1), 12)):
+        angle, current, flux = ROWS[at].split(",")
+        line = f"line {at + 2}:"
+        texts = {
+            "column missing": f"{angle},{current}",
+            "column more": f"{angle},{current},{flux},1",
+            "only the angle": angle,
+            "semicolons": f"{angle};{current};{flux}",
+            "decimal comma": f"{angle},{current},{flux.replace('.', ',')}",
+            "empty cell": f"{angle},,{flux}",
+            "text": f"{angle},{current},much",
+            "unit behind the number": f"{angle},{current},{flux} Wb",
+            "nan": f"{angle},{current},nan",
+            "infinite": f"{angle},inf,{flux}",
+            "negative flux linkage": f"{angle},{current},-{flux}",
+            "negative current": f"{angle},-{current},{flux}",
+            "negative angle": f"-1,{current},{flux}",
+            "no flux linkage": f"{angle},{current},0",
+            "beyond a double": f"{angle},{current},1e999",
+            "formula": f"{angle},{current},=0.1+0.1",
+            "digits apart": f"{angle},{current},0.1_2",
+            "NUL byte": f"{angle},{current},{flux}\0",
+            "quoted": f'"{angle}","{current}","{flux}"',
+        }
+        cases += [(f"row {at}: {what}", csv(changed(at, text)), line) for what, text in texts.items()]
+        cases.append((f"row {at} twice", csv([*ROWS[: at + 1], *ROWS[at:]]), "line "))
+        swapped = [*ROWS[: at - 1], ROWS[at], ROWS[at - 1], *ROWS[at + 1 :]]
+        cases.append((f"row {at} before the one above", csv(swapped), "line "))
+    return cases
+
+
+def file_cases() -> list[tuple[str, str | bytes, str]]:
+    blocks = [ROWS[start : start + len(CURRENTS_A)] for start in range(0, len(ROWS), len(CURRENTS_A))]
+
+    def of(order: list[int]) -> str:
+        return csv([line for block in order for line in blocks[block]])
+
+    every = list(range(len(blocks)))
+    flux = [line.split(",")[2] for line in ROWS]
+    return [
+        ("empty", "", "no header"),
+        ("only a header", csv([]), "angles"),
+        ("only comments", "# nothing\n# at all\n", "no header"),
+        ("no header", "\n".join(ROWS), "line 1:"),
+        *((f"header {header}", csv(ROWS, header), "line 1:") for header in (
+            "angle,current,flux", "angle_deg,current_A", "current_A,angle_deg,flux_linkage_Wb", HEADER.upper(),
+            "angle_deg;current_A;flux_linkage_Wb", "angle_deg,current_mA,flux_linkage_Wb",
+            "angle_turns,current_A,flux_linkage_Wb", HEADER + ",torque_Nm", HEADER.replace(",", '","'))),
+        ("header twice", csv([HEADER, *ROWS]), "line 2:"),
+        ("header in the middle", csv([*ROWS[:30], HEADER, *ROWS[30:]]), "line 32:"),
+        ("angles falling", of(every[::-1]), "line "),
+        ("two angles swapped", of([0, 1, 3, 2, *every[4:]]), "line "),
+        ("an angle twice", of([0, 1, 1, *every[2:]]), "line "),
+        ("first angle missing", of(every[1:]), "line 2:"),
+        ("last angle missing", of(every[:-1]), "line "),
+        ("five angles", of([0, 2, 4, 6, 9]), "angles"),
+        ("five currents", csv(ROWS[1::2]), "line "),
+        ("an angle without its upper half", csv([*ROWS[:35], *ROWS[40:]]), "line "),
+        ("current by current", csv(sorted(ROWS, key=lambda line: float(line.split(",")[1]))), "line "),
+        ("flux linkage without saliency", csv([line.rpartition(",")[0] + "," + flux[at % 10]
+                                               for at, line in enumerate(ROWS)]), "line "),
+        ("aligned and unaligned swapped", csv([line.rpartition(",")[0] + "," + flux[row(9 - at // 10, at % 10)]
+                                               for at, line in enumerate(ROWS)]), "line "),
+        ("milliwebers under webers", csv(scaled(2, 1e3)), "line "),
+        ("kiloamperes under amperes", csv(scaled(1, 1e-3)), "aligned_inductance_H"),
+        ("microwebers under milliwebers", csv(scaled(2, 1e6), HEADER.replace("Wb", "mWb")), "line "),
+        ("webers under milliwebers", csv(ROWS, HEADER.replace("Wb", "mWb")), "1e-06 H is the least"),
+        ("degrees under radians", csv(ROWS, HEADER.replace("deg", "rad")), "line "),
+        ("radians under degrees", csv(scaled(0, math.pi / 180)), "line "),
+        ("electrical degrees", csv(scaled(0, 4.0)), "line "),
+        ("milliamperes under amperes", csv(scaled(1, 1e3)), "line "),
+        ("invalid UTF-8", GOOD_MAP.encode()[:200] + b"\xff\xfe" + GOOD_MAP.encode()[200:], "not UTF-8"),
+        ("UTF-16", GOOD_MAP.encode("utf-16"), "not UTF-8"),
+        ("zeros", b"\0" * 5000, "line 1:"),
+        ("noise", random.Random(SEED).randbytes(5000), "not UTF-8"),
+        ("a spreadsheet", b"PK\x03\x04" + b"[Content_Types].xml" * 20, "line 1:"),
+        ("one line of a megabyte", "x," * 500_000, "line 1:"),
+    ]  # fmt: skip
+
+
+def test_every_mutation_of_a_map_is_refused_by_one_line_that_names_its_row(tmp_path: Path) -> None:
+    cases = row_cases(random.Random(SEED)) + file_cases()
+    assert len(cases) > 250
+    said = {what: (refusal(write(tmp_path, MAP_MACHINE, text)), named) for what, text, named in cases}
+    wrong = {what: text for what, (text, named) in said.items() if text is None or named not in text}
+    assert not wrong, wrong
+
+
+def test_a_map_cut_anywhere_is_refused_or_still_a_machine(tmp_path: Path) -> None:
+    data = GOOD_MAP.encode()
+    last_angle = GOOD_MAP.rindex("\n45,8,")
+    for end in range(0, last_angle, 13):
+        assert refusal(write(tmp_path, MAP_MACHINE, data[:end])) is not None, end
+    said = [refusal(write(tmp_path, MAP_MACHINE, data[:end])) for end in range(last_angle, len(data))]
+    assert sum(text is not None for text in said) > 0.5 * len(said)
+
+
+def test_flipped_bytes_of_a_map_are_refused_or_still_a_machine(tmp_path: Path) -> None:
+    chance = random.Random(SEED)
+    refused = 0
+    for _ in range(300):
+        data = bytearray(GOOD_MAP.encode())
+        data[chance.randrange(len(data))] = chance.choice([0, 0xFF, 0x80, *range(9, 127)])
+        refused += refusal(write(tmp_path, MAP_MACHINE, bytes(data))) is not None
+    assert 150 < refused < 300
+
+
+def test_rows_left_out_by_chance_are_refused_or_still_a_machine(tmp_path: Path) -> None:
+    chance = random.Random(SEED)
+    said = []
+    for _ in range(60):
+        left = sorted(chance.sample(range(len(ROWS)), chance.randrange(60, len(ROWS))))
+        said.append(refusal(write(tmp_path, MAP_MACHINE, csv([ROWS[at] for at in left]))))
+    assert 5 < sum(text is not None for text in said) < 60
+
+
+@pytest.mark.parametrize(
+    "file",
+    ["nosuch.csv", "../nosuch.csv", "/nosuch/x.csv", "folder.csv", "pipe.csv", "zeros.csv", "itself.csv", "sparse.csv",
+     "mutant.toml", "", "x.txt", "x" * 300 + ".csv", "a\\u0000b.csv", "a\\nb.csv", "3"],
+)  # fmt: skip
+def test_what_is_no_readable_map_is_refused(tmp_path: Path, file: str) -> None:
+    (tmp_path / "folder.csv").mkdir()
+    os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "zeros.csv").symlink_to("/dev/zero")
+    (tmp_path / "itself.csv").symlink_to(tmp_path / "itself.csv")
+    with (tmp_path / "sparse.csv").open("wb") as sparse:
+        sparse.truncate(10_000_000_000)
+    text = toml({**GOOD_TABLES, "magnetics": {"form": '"map"', "file": f'"{file}"'}})
+    with pytest.raises(MachineError) as caught:
+        load_machine(write(tmp_path, text))
+    line = str(caught.value)
+    named = tmp_path / file if file.endswith(".csv") and file.isprintable() and "\\" not in file else "magnetics.file"
+    assert str(named) in line and line.isprintable(), line
+
+
+# --- Through the commands ---
+
+COMMAND_CASES: dict[str, tuple[str, str | None, str]] = {
+    "key_renamed": (GOOD.replace("inertia_kg_m2", "inertia"), None, "mechanics.inertia"),
+    "value_nan": (GOOD.replace("0.05", "nan", 1), None, "winding.resistance_ohm"),
+    "nested": ("a = " + "[" * 20_000, None, "not TOML"),
+    "file_cut": (GOOD[: GOOD.index("[converter]")], None, "converter: missing"),
+    "file_binary": ("\0" * 100, None, "line 1"),
+    "map_missing": (MAP_MACHINE, None, "no such file"),
+    "map_row_text": (MAP_MACHINE, csv(changed(17, "5,64,much")), "line 19"),
+    "map_other_unit": (MAP_MACHINE, csv(scaled(2, 1e3)), "Wb"),
+    "map_cut": (MAP_MACHINE, csv(ROWS[:-10]), "line "),
+}
+
+
+def built() -> set[str]:
+    return {path.name for path in (BUILD / "host" / "bin").iterdir()}
+
+
+def still_runs(words: str) -> bool:
+    """Whether any process but this one has words in its command line."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if path.parent.name != str(os.getpid()) and words in path.read_bytes().decode(errors="replace"):
+                return True
+        except OSError:
+            continue  # it has ended meanwhile
+    return False
+
+
+@pytest.mark.parametrize("case", COMMAND_CASES)
+def test_commands_end_with_one_line_and_code_2_and_build_nothing(
+    salient: Callable, tmp_path: Path, case: str
+) -> None:
+    text, flux_map, named = COMMAND_CASES[case]
+    write(tmp_path, text, flux_map)
+    path = tmp_path / f"{case}.toml"
+    (tmp_path / f"{NAME}.toml").rename(path)
+    (tmp_path / "scenario.toml").write_text(
+        f'machine = "{path}"\ncontrollers = ["paper"]\nduration_s = 0.01\n'
+    )
+    before = {entry.name for entry in tmp_path.iterdir()}
+    command = (
+        ["sim", "--machine", path, "--can", f"unix:{tmp_path}/bus"],
+        ["run", tmp_path / "scenario.toml", "--out", tmp_path / "out"],
+        ["demo", "--machine", path, "--out", tmp_path / "out"],
+    )[list(COMMAND_CASES).index(case) % 3]
+    result = salient(*command)
+    assert (result.returncode, result.stdout) == (2, ""), result
+    (line,) = result.stderr.splitlines()
+    assert line.startswith(f"salient: {tmp_path}/") and named in line, line
+    assert not any(case in name for name in built())
+    assert case not in (BUILD / "host" / "CMakeCache.txt").read_text()
+    assert not still_runs(str(tmp_path))
+    assert {entry.name for entry in tmp_path.iterdir()} <= before | {"out"}

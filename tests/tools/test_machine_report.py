@@ -1,0 +1,58 @@
+"""salient machine, and the reference of the machine file that users read."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+
+from salient.machine import file as machine
+from salient.machine import magnetics
+from salient.machine.report import describe
+from salient.paths import MACHINES
+
+READ_ME = (MACHINES / "README.md").read_text(encoding="utf-8")
+
+
+def test_every_key_of_a_machine_file_is_in_the_reference_and_no_other():
+    tables = [machine.WINDING, machine.MECHANICS, machine.SUPPLY, machine.CONVERTER, machine.SENSORS, machine.DC_LINK,
+              machine.CHOPPER, machine.IRON_LOSS, *magnetics.FORMULA_KEYS.values()]
+    keys = {key for table in tables for key in table} | {"name", "stator", "rotor", "form", "file"}
+    table = READ_ME.partition("## Keys")[2].partition("## Flux-linkage maps")[0]
+    rows = [row.split("|")[2] for row in table.splitlines() if row.startswith("| ") and "---" not in row]
+    assert set(re.findall(r"`(\w+)`", "".join(rows))) == keys
+
+
+def test_every_shipped_machine_is_in_the_reference_and_no_other():
+    table = READ_ME.partition("| shipped |")[2].partition("## Keys")[0]
+    rows = [row.split("|")[1] for row in table.splitlines() if row.startswith("| `")]
+    assert set(re.findall(r"`(\w+)`", "".join(rows))) == {path.stem for path in MACHINES.glob("*.toml")}
+
+
+def test_a_shipped_machine_is_described_and_drawn(salient, tmp_path):
+    result = salient("machine", "saturating", "--out", tmp_path / "view")
+    assert result.returncode == 0, result.stderr
+    # Check values of the machine's source.
+    assert "6/4 poles, 3 phases" in result.stdout
+    assert "23.60 mH aligned, 0.67 mH unaligned" in result.stdout
+    assert "1.82 N m at 10 A, 6.17 N m at 20 A, 11.9 N m at 30 A, 25.3 N m at 50 A" in result.stdout
+    picture = tmp_path / "view" / "saturating.png"
+    assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 20_000
+
+
+def test_what_a_file_says_of_converter_and_sensors_is_described():
+    for path in MACHINES.glob("*.toml"):
+        data = tomllib.loads(path.read_text())
+        text = "\n".join(describe(machine.load_machine(path)))
+        stated = {**data["converter"], **data.get("sensors", {})}
+        del stated["supply_voltage_V"]
+        assert all(f"{key} {value:g}" in text for key, value in stated.items())
+        assert ("converter   ideal" in text) == (len(data["converter"]) == 1)
+
+
+def test_a_file_that_is_wrong_is_one_line_and_exit_code_2(salient, tmp_path):
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text((MACHINES / "saturating.toml").read_text().replace("stator = 6", "stator = 5"))
+    result = salient("machine", wrong, "--out", tmp_path / "view")
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1 and "poles: 5/4" in result.stderr and str(wrong) in result.stderr
+    assert not (tmp_path / "view").exists()

@@ -1,0 +1,76 @@
+"""`python -m salient.vm.run` gives a command a real vcan0, the host's files and a way back for output and exit code."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from salient.paths import ROOT
+
+# Only the standard library: its imports are quick in the guest.
+SCRIPT = """
+import os, socket, struct, sys
+from pathlib import Path
+
+sender, receiver = (socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) for _ in range(2))
+for can in (sender, receiver):
+    can.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+    can.bind(("vcan0",))
+    can.settimeout(20)
+standard = struct.pack("=IB3x8s", 0x123, 3, b"abc")
+extended = struct.pack("=IB3x8s", 0x1F000001 | socket.CAN_EFF_FLAG, 8, b"12345678")
+flexible = struct.pack("=IBB2x64s", 0x1ABCDEF0 | socket.CAN_EFF_FLAG, 64, 5, bytes(range(64)))
+# Flags: 1 bit rate switch, 4 FD format, which the kernel sets.
+for frame in (standard, extended, flexible):
+    sender.send(frame)
+    assert receiver.recv(72) == frame, frame
+
+assert Path.cwd() == Path(sys.argv[1]) and os.environ["SALIENT_TEST"] == "it's\\nhere"
+try:
+    (Path.cwd() / "README.md").touch()
+    raise SystemExit("the repository is writable")
+except OSError:
+    pass
+Path(sys.argv[2]).write_text("written in the guest")
+print(sys.argv[3])
+print("to stderr", file=sys.stderr)
+sys.exit(7)
+"""
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "salient.vm.run", "--force-guest", *arguments],
+        cwd=ROOT,
+        env={**os.environ, "SALIENT_TEST": "it's\nhere"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_command_has_vcan0_and_files_and_its_output_and_exit_code_come_back(tmp_path: Path) -> None:
+    result_file = tmp_path / "result, of the guest"
+    python = os.path.realpath(sys.executable)  # the virtual environment may be in a folder that the guest does not see
+    odd = "a  b'c\"$d"
+    outcome = run("--write", str(tmp_path), "--", python, "-I", "-c", SCRIPT, str(ROOT), str(result_file), odd)
+    assert outcome.returncode == 7, outcome.stderr
+    assert outcome.stdout == odd + "\n"
+    assert outcome.stderr.splitlines()[-1] == "to stderr"
+    assert result_file.read_text() == "written in the guest"
+
+
+def test_time_limit_ends_the_guest_with_one_line() -> None:
+    outcome = run("--timeout-s", "0.1", "--", "true")  # far less than the kernel needs
+    assert outcome.returncode == 1
+    assert outcome.stderr.splitlines()[-1] == (
+        "salient guest: the command did not end within --timeout-s 0.1: guest killed"
+    )
+
+
+def test_folder_that_is_none_is_named() -> None:
+    outcome = run("--write", "/no/such/folder", "--", "true")
+    assert outcome.returncode == 2
+    assert "--write /no/such/folder: not a folder" in outcome.stderr

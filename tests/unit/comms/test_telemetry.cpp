@@ -1,0 +1,411 @@
+// The bus side as a whole: cycles, three mailboxes, what is dropped, what never is, and bounded work.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <deque>
+#include <vector>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "comms/comms.h"
+}
+#include "drive_codec.h"
+#include "support/frames.h"
+
+// The CAN side of the HAL: frames to receive, three mailboxes, and what left them.
+struct hal {
+    std::deque<hal_can_frame_t> received;
+    std::vector<hal_can_frame_t> mailboxes;
+    std::vector<hal_can_frame_t> sent;
+    uint32_t overflows = 0;
+    unsigned received_calls = 0;
+
+    // The bus carries the mailbox that wins arbitration, if its identifier is below `limit`: others hold the bus there.
+    bool carry(uint32_t limit = 0x800) {
+        const auto lowest = std::min_element(mailboxes.begin(), mailboxes.end(),
+                                             [](const auto &a, const auto &b) { return a.identifier < b.identifier; });
+        if (lowest == mailboxes.end() || lowest->identifier >= limit) {
+            return false;
+        }
+        sent.push_back(*lowest);
+        mailboxes.erase(lowest);
+        return true;
+    }
+
+    unsigned count(uint32_t identifier) const {
+        return unsigned(
+            std::count_if(sent.begin(), sent.end(), [&](const auto &frame) { return frame.identifier == identifier; }));
+    }
+};
+
+extern "C" {
+bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {
+    hal->received_calls++;
+    if (hal->received.empty()) {
+        return false;
+    }
+    *frame = hal->received.front();
+    hal->received.pop_front();
+    return true;
+}
+
+uint32_t hal_can_receive_overflows(const hal_t *hal) {
+    return hal->overflows;
+}
+
+bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
+    if (hal->mailboxes.size() == 3) {
+        return false;
+    }
+    hal->mailboxes.push_back(*frame);
+    return true;
+}
+}
+
+namespace {
+
+constexpr uint8_t STATE_RUN = DRIVE_DRIVE_STATUS_STATE_RUN_CHOICE;
+constexpr uint8_t STATE_FAULT = DRIVE_DRIVE_STATUS_STATE_FAULT_CHOICE;
+constexpr uint32_t STEP_US = 25;
+constexpr uint32_t FRAME_US = 125; // a frame on the bus, rounded to steps
+
+class Comms : public testing::Test {
+  protected:
+    Comms() {
+        parameters_init(&parameters);
+        comms_init(&comms, 3, 40000, 0);
+        snapshot.state = STATE_RUN;
+    }
+
+    // The drive's background and the bus, until `until_us`; other nodes hold the bus for identifiers from `limit` on.
+    void run(uint32_t until_us, uint32_t limit = 0x800) {
+        for (; time_us < until_us; time_us += STEP_US) {
+            if (time_us % FRAME_US == 0) {
+                bus.carry(limit);
+            }
+            if (comms_telemetry_due(&comms, time_us)) {
+                snapshot.time_us = time_us;
+                comms_telemetry(&comms, &bus, &snapshot);
+            }
+            if (comms_background(&comms, &bus, &parameters, true, time_us)) {
+                accepted.push_back(comms.command);
+            }
+        }
+    }
+
+    static hal_can_frame_t request(unsigned operation, unsigned index, int32_t value = 0) {
+        return frames::parameter_request(operation, index, 0, value);
+    }
+
+    static hal_can_frame_t command(uint8_t counter, unsigned request_value) {
+        return frames::command(counter, request_value, 0);
+    }
+
+    // The first frame with this identifier that left; zeros when none did.
+    hal_can_frame_t first(uint32_t identifier) const {
+        const auto found = std::find_if(bus.sent.begin(), bus.sent.end(),
+                                        [&](const auto &frame) { return frame.identifier == identifier; });
+        EXPECT_NE(found, bus.sent.end()) << identifier;
+        return found == bus.sent.end() ? hal_can_frame_t{} : *found;
+    }
+
+    hal bus;
+    comms_t comms;
+    parameters_t parameters;
+    telemetry_snapshot_t snapshot{};
+    uint32_t time_us = 0;
+    std::vector<command_t> accepted;
+};
+
+TEST_F(Comms, frames_come_at_their_rates) {
+    run(1003000);
+    // 1003 cycles; the last may still be on its way
+    EXPECT_NEAR(bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 1003, 1);
+    EXPECT_NEAR(bus.count(DRIVE_DRIVE_MOTION_FRAME_ID), 1003, 1);
+    EXPECT_NEAR(bus.count(DRIVE_DRIVE_TORQUE_FRAME_ID), 1003, 1);
+    EXPECT_NEAR(bus.count(DRIVE_DRIVE_CURRENTS_FRAME_ID), 1003, 1);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_BP_PID_FRAME_ID), 101u);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_TRIM_FRAME_ID), 101u);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_COMMAND_COUNTERS_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_BUS_COUNTERS_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_PROCESSOR_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 0u);
+    EXPECT_EQ(comms.telemetry.dropped, 0);
+}
+
+TEST_F(Comms, signals_carry_the_snapshot) {
+    snapshot.controller = 2;
+    snapshot.fault = 5;
+    snapshot.voltage_saturated = true;
+    snapshot.speed_q22 = int32_t(std::lround(-600 * 2 * M_PI / 60 * 4194304));
+    snapshot.speed_reference_q22 = int32_t(std::lround(150 * 2 * M_PI / 60 * 4194304));
+    snapshot.rotor_angle = 0x40000000;
+    snapshot.torque_reference_q24 = int32_t(19.1 * (1 << 24));
+    snapshot.torque_estimate_q24 = INT32_MAX;
+    snapshot.load_torque_estimate_q24 = -8 * (1 << 24);
+    snapshot.bus_voltage_q6 = 240 * 64;
+    snapshot.current_q9[0] = 20 * 512;
+    snapshot.current_q9[3] = 65535;
+    snapshot.kp_q15 = 16384;
+    snapshot.kd_q15 = 70000;
+    snapshot.duty_q15 = -32769;
+    snapshot.trim_torque_q24 = -3 * (1 << 24);
+    snapshot.misalignment = 1 << 20;
+    snapshot.torque_missing_q24 = INT32_MAX;
+    snapshot.observer_bandwidth_rad_s = 8000;
+    snapshot.used_ticks = 3000;
+    snapshot.worst_ticks = 4999;
+    snapshot.available_ticks = 5000;
+    snapshot.late_interrupts = 70000;
+    run(3000);
+
+    drive_drive_status_t status;
+    drive_drive_status_unpack(&status, first(DRIVE_DRIVE_STATUS_FRAME_ID).data, 8);
+    EXPECT_EQ(status.time_us, 0u);
+    EXPECT_EQ(status.state, STATE_RUN);
+    EXPECT_EQ(status.controller, 2);
+    EXPECT_EQ(status.fault, 5);
+    EXPECT_EQ(status.voltage_saturated, 1);
+    drive_drive_motion_t motion;
+    drive_drive_motion_unpack(&motion, first(DRIVE_DRIVE_MOTION_FRAME_ID).data, 8);
+    EXPECT_EQ(motion.speed_rpm, -600000);
+    EXPECT_EQ(motion.speed_reference_rpm, 150000);
+    EXPECT_EQ(motion.rotor_angle_deg, 0x4000);
+    drive_drive_torque_t torque;
+    drive_drive_torque_unpack(&torque, first(DRIVE_DRIVE_TORQUE_FRAME_ID).data, 8);
+    EXPECT_EQ(torque.torque_reference_nm, 4890); // 19.1 N m is 4889.6 LSB
+    EXPECT_EQ(torque.torque_estimate_nm, 32767);
+    EXPECT_EQ(torque.load_torque_estimate_nm, -2048);
+    EXPECT_EQ(torque.bus_voltage_v, 15360);
+    drive_drive_currents_t currents;
+    drive_drive_currents_unpack(&currents, first(DRIVE_DRIVE_CURRENTS_FRAME_ID).data, 8);
+    EXPECT_EQ(currents.current_a_a, 10240);
+    EXPECT_EQ(currents.current_d_a, 65535);
+    drive_drive_bp_pid_t gains;
+    drive_drive_bp_pid_unpack(&gains, first(DRIVE_DRIVE_BP_PID_FRAME_ID).data, 8);
+    EXPECT_EQ(gains.kp_per_nm, 16384);
+    EXPECT_EQ(gains.kd_per_nm, 65535);
+    EXPECT_EQ(gains.duty, -32768);
+    drive_drive_trim_t trim;
+    drive_drive_trim_unpack(&trim, first(DRIVE_DRIVE_TRIM_FRAME_ID).data, 8);
+    EXPECT_EQ(trim.trim_torque_nm, -768);
+    EXPECT_EQ(trim.misalignment_deg, 256);
+    EXPECT_EQ(trim.torque_missing_nm, 32767);
+    EXPECT_EQ(trim.observer_bandwidth_rad_s, 8000);
+    drive_drive_processor_t processor;
+    drive_drive_processor_unpack(&processor, first(DRIVE_DRIVE_PROCESSOR_FRAME_ID).data, 8);
+    EXPECT_EQ(processor.used_us, 3000);
+    EXPECT_EQ(processor.worst_us, 4999);
+    EXPECT_EQ(processor.available_us, 5000);
+    EXPECT_EQ(processor.late_interrupts, 65535);
+    drive_drive_heartbeat_t heartbeat;
+    drive_drive_heartbeat_unpack(&heartbeat, first(DRIVE_DRIVE_HEARTBEAT_FRAME_ID).data, 8);
+    EXPECT_EQ(heartbeat.state, STATE_RUN);
+    EXPECT_EQ(heartbeat.controller, 2);
+    EXPECT_EQ(heartbeat.phases, 3);
+    EXPECT_EQ(heartbeat.control_rate_hz, 40000u);
+}
+
+TEST_F(Comms, a_fault_is_reported_with_the_next_cycle_and_every_100_ms) {
+    run(10500);
+    snapshot.state = STATE_FAULT;
+    snapshot.last_fault.time_us = 10400;
+    snapshot.last_fault.fault = FAULT_OVER_CURRENT;
+    snapshot.last_fault.state = STATE_RUN;
+    snapshot.last_fault.checks = 0x0022;
+    snapshot.last_fault.speed_q22 = -1000 * 439231;
+    snapshot.last_fault.bus_voltage_q6 = 15360;
+    snapshot.last_fault.current_max_q9 = 36000;
+    snapshot.last_fault.torque_reference_q24 = 1 << 24;
+    run(12000);
+    ASSERT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 1u);
+    ASSERT_EQ(bus.count(DRIVE_DRIVE_FAULT_SNAPSHOT_FRAME_ID), 1u);
+    for (const auto &frame : bus.sent) {
+        if (frame.identifier == DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID) {
+            drive_drive_fault_cause_t cause;
+            drive_drive_fault_cause_unpack(&cause, frame.data, 8);
+            EXPECT_EQ(cause.time_us, 10400u);
+            EXPECT_EQ(cause.fault, 1);
+            EXPECT_EQ(cause.state, STATE_RUN);
+            EXPECT_EQ(cause.checks, 0x0022);
+        } else if (frame.identifier == DRIVE_DRIVE_FAULT_SNAPSHOT_FRAME_ID) {
+            drive_drive_fault_snapshot_t values;
+            drive_drive_fault_snapshot_unpack(&values, frame.data, 8);
+            EXPECT_EQ(values.speed_rpm, -4000); // 1000 r/min in quarters
+            EXPECT_EQ(values.bus_voltage_v, 15360);
+            EXPECT_EQ(values.current_max_a, 36000);
+            EXPECT_EQ(values.torque_reference_nm, 256);
+        }
+    }
+    run(211900);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 3u);
+    snapshot.last_fault.time_us = 211900; // cleared and another between two cycles
+    run(213000);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
+    snapshot.state = STATE_RUN;
+    run(500000);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
+}
+
+TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
+    run(50500, 0); // nothing leaves: three frames in mailboxes, a full queue
+    const uint16_t dropped = comms.telemetry.dropped;
+    EXPECT_GT(dropped, 0);
+    run(60000);
+    const std::vector<hal_can_frame_t> &sent = bus.sent;
+    drive_drive_status_t status;
+    std::vector<int> cycles;
+    for (size_t i = 0; i < sent.size(); i++) {
+        if (sent[i].identifier == DRIVE_DRIVE_STATUS_FRAME_ID && i + 3 < sent.size()) {
+            drive_drive_status_unpack(&status, sent[i].data, 8);
+            cycles.push_back(status.cycle);
+        }
+    }
+    for (const uint32_t identifier :
+         {DRIVE_DRIVE_MOTION_FRAME_ID, DRIVE_DRIVE_TORQUE_FRAME_ID, DRIVE_DRIVE_CURRENTS_FRAME_ID}) {
+        EXPECT_NEAR(bus.count(identifier), bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 1);
+    }
+    ASSERT_GE(cycles.size(), 4u);
+    EXPECT_EQ(cycles[0], 0); // the oldest
+    EXPECT_EQ(cycles[1], 1);
+    EXPECT_GE(cycles.back(), 57); // and the present again
+    EXPECT_EQ(comms.telemetry.dropped, dropped) << "nothing is dropped once the bus is free";
+}
+
+TEST_F(Comms, dropped_frames_are_counted_exactly) {
+    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 2 counters + 1 PROCESSOR + 1 heartbeat
+    const unsigned waiting = unsigned(bus.mailboxes.size()) + comms.telemetry.queue.count;
+    EXPECT_EQ(comms.telemetry.dropped + waiting, 424u);
+}
+
+TEST_F(Comms, others_above_the_heartbeat_cannot_block_telemetry) {
+    run(1990500, 0x700);
+    EXPECT_NEAR(bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 1991, 1);
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 0u);
+    EXPECT_EQ(comms.telemetry.dropped, 19); // the heartbeats behind the one that waits
+    run(2200000);
+    EXPECT_GE(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 2u);
+    EXPECT_EQ(comms.telemetry.dropped, 19);
+}
+
+TEST_F(Comms, missed_cycles_show_in_the_cycle_number_and_the_grid_stays) {
+    run(2500);
+    time_us = 7600; // the background was held up
+    run(9500);
+    std::vector<std::pair<int, uint32_t>> cycles;
+    for (const auto &frame : bus.sent) {
+        if (frame.identifier == DRIVE_DRIVE_STATUS_FRAME_ID) {
+            drive_drive_status_t status;
+            drive_drive_status_unpack(&status, frame.data, 8);
+            cycles.emplace_back(status.cycle, status.time_us);
+        }
+    }
+    const std::vector<std::pair<int, uint32_t>> expected = {{0, 0},    {1, 1000}, {2, 2000},
+                                                            {3, 7600}, {8, 8000}, {9, 9000}};
+    EXPECT_EQ(cycles, expected);
+}
+
+TEST_F(Comms, a_snapshot_taken_just_before_the_cycle_is_due_keeps_the_grid) {
+    for (uint32_t cycle = 0; cycle < 10; cycle++) {
+        ASSERT_TRUE(comms_telemetry_due(&comms, cycle * 1000));
+        snapshot.time_us = cycle * 1000 - 20;
+        comms_telemetry(&comms, &bus, &snapshot);
+        ASSERT_FALSE(comms_telemetry_due(&comms, cycle * 1000 + 999));
+    }
+}
+
+TEST_F(Comms, cycles_go_on_across_the_wrap_of_the_clock) {
+    const uint32_t start = UINT32_MAX - 2499;
+    comms_init(&comms, 3, 40000, start);
+    for (uint32_t elapsed = 0; elapsed < 10000; elapsed += STEP_US) {
+        bus.carry();
+        if (comms_telemetry_due(&comms, start + elapsed)) {
+            snapshot.time_us = start + elapsed;
+            comms_telemetry(&comms, &bus, &snapshot);
+        }
+        comms_background(&comms, &bus, &parameters, true, start + elapsed);
+    }
+    EXPECT_EQ(bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 10u);
+}
+
+TEST_F(Comms, every_command_is_seen_in_order) {
+    for (unsigned i = 0; i < 4; i++) {
+        bus.received.push_back(command(uint8_t(i), i));
+    }
+    run(1000);
+    ASSERT_EQ(accepted.size(), 4u);
+    for (unsigned i = 0; i < 4; i++) {
+        EXPECT_EQ(accepted[i].request, i);
+    }
+    EXPECT_LT(accepted[0].time_us, accepted[1].time_us);
+}
+
+TEST_F(Comms, one_call_looks_at_a_bounded_number_of_frames) {
+    bus.received.assign(HAL_CAN_RECEIVE_QUEUE, hal_can_frame_t{0x123, false, false, 8, {}});
+    comms_background(&comms, &bus, &parameters, true, 0);
+    EXPECT_EQ(bus.received.size(), size_t(HAL_CAN_RECEIVE_QUEUE - COMMS_FRAMES_PER_CALL));
+    EXPECT_EQ(comms.commands.counters.unknown_frame, COMMS_FRAMES_PER_CALL);
+}
+
+TEST_F(Comms, no_parameter_response_is_lost_when_the_bus_is_blocked) {
+    for (unsigned i = 0; i < 60; i++) {
+        bus.received.push_back(request(DRIVE_PARAMETER_REQUEST_OPERATION_READ_CHOICE, i % PARAMETER_COUNT));
+    }
+    run(20000, 0);
+    EXPECT_EQ(bus.received.size(), size_t(60 - FRAME_QUEUE_CAPACITY)) << "requests without room for an answer wait";
+    run(100000);
+    EXPECT_TRUE(bus.received.empty());
+    unsigned answered = 0;
+    for (const auto &frame : bus.sent) {
+        if (frame.identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID) {
+            EXPECT_EQ(frame.data[1], answered % PARAMETER_COUNT);
+            answered++;
+        }
+    }
+    EXPECT_EQ(answered, 60u);
+}
+
+TEST_F(Comms, parameters_can_be_written_over_the_bus) {
+    bus.received.push_back(request(DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE, PARAMETER_COMMAND_TIMEOUT_MS, 20));
+    run(3000);
+    EXPECT_EQ(parameters.values[PARAMETER_COMMAND_TIMEOUT_MS], 20);
+    bus.received.push_back(command(10, COMMAND_RUN));
+    run(10000);
+    ASSERT_EQ(accepted.size(), 1u);
+    run(40000);
+    bus.received.push_back(command(200, COMMAND_RUN)); // the sender was silent for longer than 20 ms
+    run(41000);
+    EXPECT_EQ(accepted.size(), 2u);
+}
+
+TEST_F(Comms, counters_are_reported) {
+    bus.received.push_back(hal_can_frame_t{0x123, false, false, 8, {}});
+    bus.received.push_back(hal_can_frame_t{DRIVE_DRIVE_COMMAND_FRAME_ID, false, false, 6, {}});
+    bus.received.push_back(hal_can_frame_t{DRIVE_DRIVE_COMMAND_FRAME_ID, false, false, 7, {}});
+    bus.received.push_back(command(1, COMMAND_STOP));
+    bus.received.push_back(command(1, COMMAND_STOP));
+    bus.received.push_back(command(2, 4));
+    bus.overflows = 70000;
+    run(105000);
+    drive_drive_command_counters_t refused{};
+    drive_drive_bus_counters_t counters{};
+    for (const auto &frame : bus.sent) {
+        if (frame.identifier == DRIVE_DRIVE_COMMAND_COUNTERS_FRAME_ID) {
+            drive_drive_command_counters_unpack(&refused, frame.data, 8);
+        } else if (frame.identifier == DRIVE_DRIVE_BUS_COUNTERS_FRAME_ID) {
+            drive_drive_bus_counters_unpack(&counters, frame.data, 8);
+        }
+    }
+    EXPECT_EQ(refused.wrong_length, 1);
+    EXPECT_EQ(refused.wrong_checksum, 1);
+    EXPECT_EQ(refused.wrong_counter, 1);
+    EXPECT_EQ(refused.out_of_range, 1);
+    EXPECT_EQ(counters.unknown_frame, 1);
+    EXPECT_EQ(counters.command_accepted, 1);
+    EXPECT_EQ(counters.receive_overflow, 65535);
+    EXPECT_EQ(counters.telemetry_dropped, 0);
+}
+
+} // namespace

@@ -1,0 +1,135 @@
+// The speed PI against its double-precision twin.
+#include <cmath>
+#include <cstdint>
+#include <random>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/speed_pi.h"
+}
+
+#include "support/reference_models.h"
+
+namespace {
+
+constexpr double RATE_HZ = 40000.0;
+constexpr double LSB_NM = 1.0 / twins::Q24;
+
+speed_pi_parameters_t parameters_of(double kp, double ki, double torque_min_Nm, double torque_max_Nm) {
+    return {twins::to_fixed(kp, twins::Q16), twins::to_fixed(ki / RATE_HZ, twins::Q32),
+            twins::to_fixed(torque_min_Nm, twins::Q24), twins::to_fixed(torque_max_Nm, twins::Q24)};
+}
+
+// The twin of what the parameters hold after rounding.
+twins::pi_t twin_of(const speed_pi_parameters_t &parameters) {
+    return {parameters.kp_q16 / twins::Q16, parameters.ki_step_q32 / twins::Q32, parameters.torque_min_q24 / twins::Q24,
+            parameters.torque_max_q24 / twins::Q24};
+}
+
+TEST(SpeedPi, follows_its_twin_in_closed_loops_with_random_references_and_loads) {
+    std::mt19937 random(1);
+    std::uniform_real_distribution<double> unit(0.0, 1.0);
+    double worst = 0.0;
+    for (int run = 0; run < 40; run++) {
+        const double low = run % 2 == 0 ? 0.0 : -19.1;
+        const speed_pi_parameters_t parameters =
+            parameters_of(20.0 * unit(random), 1000.0 * unit(random), low, 5.0 + 30.0 * unit(random));
+        twins::pi_t twin = twin_of(parameters);
+        speed_pi_t pi;
+        speed_pi_reset(&pi);
+        double speed = 0.0, reference = 0.0, load = 0.0;
+        for (int k = 0; k < 8000; k++) {
+            if (k % 1000 == 0) {
+                reference = 300.0 * unit(random);
+                load = 10.0 * unit(random);
+            }
+            const int32_t error_q22 = twins::to_fixed(reference - speed, twins::Q22);
+            const double torque = speed_pi_step(&parameters, &pi, error_q22) / twins::Q24;
+            worst = std::max(worst, std::fabs(torque - twin.step(error_q22 / twins::Q22)));
+            ASSERT_GE(torque, parameters.torque_min_q24 / twins::Q24);
+            ASSERT_LE(torque, parameters.torque_max_q24 / twins::Q24);
+            speed += (torque - 0.02 * speed - load) / 0.02 / RATE_HZ;
+        }
+    }
+    // Proportional part and integral are rounded down to an LSB each.
+    EXPECT_LE(worst, 2.01 * LSB_NM);
+    EXPECT_GT(worst, LSB_NM);
+}
+
+TEST(SpeedPi, integral_is_exact_over_a_million_samples) {
+    const speed_pi_parameters_t parameters = parameters_of(0.0, 400.0, -100.0, 100.0);
+    speed_pi_t pi;
+    speed_pi_reset(&pi);
+    __extension__ typedef __int128 wide_t;
+    wide_t sum = 0;
+    std::mt19937 random(2);
+    for (int k = 0; k < 1000000; k++) {
+        const auto error_q22 = int32_t(uint32_t(random())) / 4096 + (k % 2000 < 1000 ? 1 : -1);
+        sum += wide_t(error_q22) * parameters.ki_step_q32;
+        speed_pi_step(&parameters, &pi, error_q22);
+        ASSERT_TRUE(pi.integral_q54 == sum) << k;
+    }
+}
+
+TEST(SpeedPi, does_not_wind_up_while_the_torque_is_at_a_limit) {
+    const speed_pi_parameters_t parameters = parameters_of(8.0, 400.0, -19.1, 19.1);
+    for (const int sign : {1, -1}) {
+        speed_pi_t pi;
+        speed_pi_reset(&pi);
+        const int32_t limit_q24 = sign > 0 ? parameters.torque_max_q24 : parameters.torque_min_q24;
+        for (int k = 0; k < 40000; k++) {
+            ASSERT_EQ(speed_pi_step(&parameters, &pi, sign * (60 << 22)), limit_q24);
+        }
+        EXPECT_EQ(pi.integral_q54, 0) << "a second at the limit left something behind";
+        // Hence the torque leaves the limit as soon as the error does.
+        EXPECT_EQ(speed_pi_step(&parameters, &pi, sign * (1 << 22)), sign * twins::to_fixed(8.0, twins::Q24));
+    }
+}
+
+TEST(SpeedPi, the_integral_alone_stops_at_the_limits) {
+    const speed_pi_parameters_t parameters = parameters_of(0.0, 10000.0, -3.0, 7.0);
+    speed_pi_t pi;
+    speed_pi_reset(&pi);
+    int32_t torque_q24 = 0;
+    for (int k = 0; k < 1000; k++) {
+        torque_q24 = speed_pi_step(&parameters, &pi, 10 << 22);
+        ASSERT_LE(pi.integral_q54, int64_t(7) << 54);
+    }
+    EXPECT_EQ(torque_q24, 7 << 24);
+    for (int k = 0; k < 1000; k++) {
+        torque_q24 = speed_pi_step(&parameters, &pi, -(10 << 22));
+        ASSERT_GE(pi.integral_q54, -(int64_t(3) << 54));
+    }
+    EXPECT_EQ(torque_q24, -(3 << 24));
+}
+
+TEST(SpeedPi, a_lowered_limit_takes_the_integral_along) {
+    speed_pi_parameters_t parameters = parameters_of(1.0, 400.0, 0.0, 20.0);
+    speed_pi_t pi{int64_t(20) << 54};
+    parameters.torque_max_q24 = 5 << 24;
+    EXPECT_EQ(speed_pi_step(&parameters, &pi, 1), 5 << 24);
+    EXPECT_EQ(speed_pi_step(&parameters, &pi, -1), 5 << 24);
+    EXPECT_LE(pi.integral_q54, int64_t(5) << 54);
+}
+
+TEST(SpeedPi, nothing_overflows_at_the_ends_of_all_ranges) {
+    std::mt19937 random(3);
+    const int32_t errors[] = {INT32_MIN, INT32_MAX, 0, 1, -1};
+    for (const int32_t kp_q16 : {0, 1, 1000 << 16}) {
+        for (const int32_t ki_step_q32 : {0, 1, INT32_MAX}) {
+            for (const int32_t limit_q24 : {1, 1 << 24, 127 << 24}) {
+                const speed_pi_parameters_t parameters = {kp_q16, ki_step_q32, -limit_q24, limit_q24};
+                speed_pi_t pi;
+                speed_pi_reset(&pi);
+                for (int k = 0; k < 500; k++) {
+                    const int32_t torque_q24 = speed_pi_step(&parameters, &pi, errors[random() % 5]);
+                    ASSERT_LE(std::abs(int64_t(torque_q24)), limit_q24);
+                    ASSERT_LE(std::abs(pi.integral_q54), int64_t(limit_q24) << 30);
+                }
+            }
+        }
+    }
+}
+
+} // namespace

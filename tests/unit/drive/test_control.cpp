@@ -1,0 +1,549 @@
+// The control interrupt as a function: what it does in each state, and that it depends on nothing but its arguments.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <functional>
+#include <random>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "drive/configure.h"
+#include "drive/control.h"
+#include "drive/fault.h"
+}
+
+#include "support/reference_models.h"
+
+namespace {
+
+constexpr double RATE_HZ = 40000.0;
+constexpr unsigned ENCODER_BITS = 17;
+constexpr uint32_t PERIOD_US = 25;
+constexpr uint16_t BUS_COUNTS = 240 * 8;
+
+bool all_open(const hal_pwm_compare_t &compare) {
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        if (compare.upper[phase] != 0 || compare.lower[phase] != 0) {
+            return false;
+        }
+    }
+    return true;
+}
+
+// A drive on a rotor that turns as it is told.
+class Control : public testing::Test {
+  protected:
+    explicit Control(drive_controller_t controller = DRIVE_CONTROLLER_PAPER) { configure(controller); }
+
+    void configure(drive_controller_t controller) {
+        parameters_t p;
+        parameters_init(&p);
+        p.values[PARAMETER_CONTROLLER] = controller;
+        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, 12);
+        control_reset(&parameters, &state);
+        diagnostics = control_diagnostics_t{};
+        sample = control_sample_t{};
+        sample.adc.bus_voltage_counts = BUS_COUNTS;
+        turns = 0.1;
+    }
+
+    bool step(command_request_t request, double reference_rpm = 600.0) {
+        sample.time_us += PERIOD_US;
+        sample.command.request = request;
+        sample.command.speed_reference_q22 = twins::to_fixed(twins::rad_s(reference_rpm), twins::Q22);
+        sample.command.time_us = sample.time_us;
+        return step_as_it_is();
+    }
+
+    bool step_as_it_is() {
+        turns += speed_rad_s / (2.0 * twins::PI * RATE_HZ);
+        sample.encoder.counts = uint32_t(int64_t(std::floor((turns - std::floor(turns)) * (1 << ENCODER_BITS))));
+        const bool closed = control_step(&parameters, &state, &sample, &compare);
+        diagnostics = control_diagnose(&parameters, &state);
+        // Whatever happens: no switch is closed outside RUN.
+        EXPECT_EQ(closed, state.machine.state == DRIVE_STATE_RUN);
+        EXPECT_TRUE(closed || all_open(compare));
+        return closed;
+    }
+
+    void start() {
+        for (int k = 0; k < 41; k++) {
+            step(COMMAND_OFF);
+        }
+        ASSERT_EQ(state.machine.state, DRIVE_STATE_READY);
+        step(COMMAND_RUN);
+        ASSERT_EQ(state.machine.state, DRIVE_STATE_RUN);
+    }
+
+    control_parameters_t parameters;
+    control_state_t state;
+    control_diagnostics_t diagnostics;
+    control_sample_t sample;
+    hal_pwm_compare_t compare;
+    double turns = 0.1, speed_rad_s = 0.0;
+};
+
+TEST_F(Control, codes_of_every_resolution_become_the_nearest_current_and_voltage) {
+    for (unsigned bits = 12; bits <= 16; bits++) {
+        parameters_t p;
+        parameters_init(&p);
+        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, bits);
+        for (uint32_t code = 0; code < 1u << bits; code += 7) {
+            sample.adc.phase_current_counts[1] = sample.adc.bus_voltage_counts = uint16_t(code);
+            step(COMMAND_OFF);
+            ASSERT_EQ(diagnostics.current_q9[1], std::floor(std::ldexp(code * 80.0, 9 - int(bits)) + 0.5)) << bits;
+            ASSERT_EQ(diagnostics.bus_voltage_q6, std::floor(std::ldexp(code * 512.0, 6 - int(bits)) + 0.5)) << bits;
+        }
+    }
+}
+
+TEST_F(Control, initialise_lasts_a_millisecond) {
+    for (int k = 0; k < 39; k++) {
+        step(COMMAND_OFF);
+        ASSERT_EQ(state.machine.state, DRIVE_STATE_INITIALISE);
+    }
+    step(COMMAND_OFF);
+    EXPECT_EQ(state.machine.state, DRIVE_STATE_READY);
+}
+
+TEST_F(Control, every_switch_is_open_until_run_is_commanded) {
+    for (int k = 0; k < 200; k++) {
+        step(k % 2 == 0 ? COMMAND_STOP : COMMAND_CLEAR_FAULT);
+        ASSERT_TRUE(all_open(compare));
+    }
+    step(COMMAND_RUN);
+    EXPECT_FALSE(all_open(compare));
+}
+
+TEST_F(Control, the_same_state_and_sample_give_the_same_bits) {
+    // A copy of everything, replayed, with other things called in between; and no memory but the state.
+    for (const drive_controller_t controller :
+         {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        configure(controller);
+        start();
+        std::mt19937 random(1);
+        speed_rad_s = 15.0;
+        for (int k = 0; k < 3000; k++) {
+            for (unsigned phase = 0; phase < 3; phase++) {
+                sample.adc.phase_current_counts[phase] = uint16_t(random() % 2500);
+            }
+            // Copied bytes, so that padding is equal in both.
+            control_state_t before;
+            std::memcpy(&before, &state, sizeof state);
+            step(COMMAND_RUN, 150.0);
+            hal_pwm_compare_t replayed;
+            control_step(&parameters, &before, &sample, &replayed);
+            ASSERT_EQ(std::memcmp(&before, &state, sizeof state), 0) << k;
+            ASSERT_EQ(std::memcmp(&replayed, &compare, sizeof compare), 0) << k;
+        }
+    }
+}
+
+TEST_F(Control, counts_become_amperes_volts_and_angle_exactly) {
+    sample.adc.phase_current_counts[0] = 512;
+    sample.adc.phase_current_counts[2] = 4095;
+    step(COMMAND_OFF);
+    EXPECT_EQ(diagnostics.current_q9[0], 10 << 9);
+    EXPECT_EQ(diagnostics.current_q9[1], 0);
+    EXPECT_EQ(diagnostics.current_q9[2], 40950);
+    EXPECT_EQ(diagnostics.bus_voltage_q6, 240 << 6);
+    // The middle of the encoder's count.
+    EXPECT_EQ(diagnostics.angle, (sample.encoder.counts << 15) + (1u << 14));
+}
+
+TEST_F(Control, each_cause_opens_every_switch_in_the_tick_that_sees_it) {
+    const struct {
+        fault_t fault;
+        std::function<void()> provoke;
+    } causes[] = {
+        {FAULT_OVER_CURRENT, [this] { sample.adc.phase_current_counts[1] = 3841; }}, // 75.02 A
+        {FAULT_OVER_VOLTAGE, [this] { sample.adc.bus_voltage_counts = 301 * 8; }},
+        {FAULT_UNDER_VOLTAGE, [this] { sample.adc.bus_voltage_counts = 149 * 8; }},
+        {FAULT_ENCODER, [this] { turns += 0.01; }},
+        {FAULT_COMMAND_TIMEOUT, [this] { sample.command.time_us -= 100001; }},
+        {FAULT_INTERRUPT_OVERRUN, [this] { sample.missed_interrupts = 3; }},
+    };
+    for (const auto &cause : causes) {
+        configure(DRIVE_CONTROLLER_PAPER);
+        start();
+        for (int k = 0; k < 10; k++) {
+            step(COMMAND_RUN);
+        }
+        const int32_t torque_reference_q24 = diagnostics.torque_reference_q24;
+        EXPECT_GT(torque_reference_q24, 0);
+        cause.provoke();
+        EXPECT_FALSE(step_as_it_is()) << cause.fault;
+        EXPECT_TRUE(all_open(compare));
+        const fault_record_t &record = state.machine.record;
+        EXPECT_EQ(record.fault, cause.fault);
+        EXPECT_NE(record.checks & FAULT_BIT(cause.fault), 0);
+        EXPECT_EQ(record.state, DRIVE_STATE_RUN);
+        EXPECT_EQ(record.time_us, sample.time_us);
+        EXPECT_EQ(record.torque_reference_q24, torque_reference_q24) << "what was asked for when it happened";
+        EXPECT_EQ(record.bus_voltage_q6, sample.adc.bus_voltage_counts * 8);
+        EXPECT_EQ(diagnostics.torque_reference_q24, 0);
+    }
+}
+
+TEST_F(Control, the_largest_current_that_is_no_trip_keeps_running) {
+    start();
+    sample.adc.phase_current_counts[1] = 3840; // 75 A
+    EXPECT_TRUE(step(COMMAND_RUN));
+    sample.adc.phase_current_counts[1] = 3841;
+    EXPECT_FALSE(step(COMMAND_RUN));
+}
+
+TEST_F(Control, an_encoder_that_freezes_at_speed_is_found_within_a_millisecond) {
+    start();
+    speed_rad_s = 15.7; // 150 r/min
+    for (int k = 0; k < 4000; k++) {
+        ASSERT_TRUE(step(COMMAND_RUN, 150.0)) << k;
+    }
+    speed_rad_s = 0.0;
+    int periods = 0;
+    while (step(COMMAND_RUN, 150.0) && periods < 100) {
+        periods++;
+    }
+    EXPECT_EQ(state.machine.record.fault, FAULT_ENCODER);
+    EXPECT_LT(periods, 40);
+}
+
+TEST_F(Control, a_fault_needs_clearing_and_letting_go_before_it_runs_again) {
+    start();
+    sample.adc.phase_current_counts[0] = 4000;
+    EXPECT_FALSE(step(COMMAND_RUN));
+    sample.adc.phase_current_counts[0] = 0;
+    for (int k = 0; k < 100; k++) {
+        EXPECT_FALSE(step(COMMAND_RUN));
+    }
+    EXPECT_FALSE(step(COMMAND_CLEAR_FAULT));
+    EXPECT_EQ(state.machine.state, DRIVE_STATE_READY);
+    EXPECT_TRUE(step(COMMAND_RUN));
+}
+
+TEST_F(Control, a_fault_cleared_on_a_turning_rotor_does_not_read_as_overspeed) {
+    for (const double rpm : {150.0, 600.0, 2500.0, 3000.0}) {
+        configure(DRIVE_CONTROLLER_PAPER);
+        speed_rad_s = twins::rad_s(rpm);
+        for (int k = 0; k < 4000; k++) {
+            step(COMMAND_OFF);
+        }
+        ASSERT_EQ(state.machine.state, DRIVE_STATE_READY) << rpm;
+        EXPECT_NEAR(diagnostics.speed_q22 / twins::Q22, speed_rad_s, 0.01 * speed_rad_s);
+        sample.adc.phase_current_counts[0] = 4000;
+        step(COMMAND_OFF);
+        sample.adc.phase_current_counts[0] = 0;
+        ASSERT_EQ(state.machine.state, DRIVE_STATE_FAULT);
+        step(COMMAND_CLEAR_FAULT);
+        for (int k = 0; k < 4000; k++) {
+            step(COMMAND_OFF);
+            ASSERT_EQ(state.machine.state, DRIVE_STATE_READY)
+                << rpm << " r/min, " << k << " fault " << state.machine.record.fault;
+        }
+        EXPECT_NEAR(diagnostics.speed_q22 / twins::Q22, speed_rad_s, 0.01 * speed_rad_s);
+    }
+}
+
+TEST_F(Control, the_reference_starts_at_the_present_speed_and_follows_the_ramp) {
+    parameters.speed_ramp_q22 = twins::to_fixed(0.01, twins::Q22); // rad/s a period
+    speed_rad_s = 20.0;
+    for (int k = 0; k < 4000; k++) {
+        step(COMMAND_OFF);
+        ASSERT_EQ(diagnostics.speed_reference_q22, 0);
+    }
+    double expected = 0.0;
+    for (int k = 0; k < 1000; k++) {
+        step(COMMAND_RUN, 600.0);
+        expected = k == 0 ? diagnostics.speed_reference_q22 / twins::Q22 : expected + 0.01;
+        ASSERT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, expected, 1e-4);
+    }
+    EXPECT_NEAR(expected, 30.0, 0.1);
+    // A stop ramps down from there, whatever the command's reference says.
+    for (int k = 0; k < 500; k++) {
+        step(COMMAND_STOP, 600.0);
+        expected -= 0.01;
+        ASSERT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, expected, 1e-4);
+    }
+}
+
+TEST_F(Control, a_stop_opens_the_switches_when_the_rotor_stands) {
+    start();
+    speed_rad_s = 10.0;
+    for (int k = 0; k < 2000; k++) {
+        ASSERT_TRUE(step(COMMAND_RUN, 100.0));
+    }
+    for (int k = 0; k < 400; k++) {
+        ASSERT_TRUE(step(COMMAND_STOP)) << "still turning";
+    }
+    // It comes to rest: 10 rad/s in 50 ms.
+    int periods = 0;
+    while (step(COMMAND_STOP) && periods < 4000) {
+        speed_rad_s = std::max(0.0, speed_rad_s - 200.0 / RATE_HZ);
+        periods++;
+    }
+    EXPECT_EQ(state.machine.state, DRIVE_STATE_READY);
+    EXPECT_LE(std::fabs(diagnostics.speed_q22 / twins::Q22), 0.5);
+}
+
+TEST_F(Control, the_traditional_controller_and_the_paper_s_without_its_pid_switch_whole_periods_only) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER}) {
+        configure(controller);
+        if (controller == DRIVE_CONTROLLER_PAPER) {
+            parameters.duty.pid.mode = BP_PID_OFF;
+        }
+        start();
+        std::mt19937 random(2);
+        for (int k = 0; k < 2000; k++) {
+            for (unsigned phase = 0; phase < 3; phase++) {
+                sample.adc.phase_current_counts[phase] = uint16_t(random() % 2500);
+            }
+            ASSERT_TRUE(step(COMMAND_RUN, 100.0));
+            for (unsigned phase = 0; phase < 3; phase++) {
+                ASSERT_TRUE(compare.upper[phase] == 0 || compare.upper[phase] == parameters.period_ticks);
+                ASSERT_TRUE(compare.lower[phase] == 0 || compare.lower[phase] == parameters.period_ticks);
+                ASSERT_GE(compare.lower[phase], compare.upper[phase]);
+                // +1 both on, 0 one on, -1 both off, as the hysteresis says.
+                const int on = (compare.upper[phase] != 0) + (compare.lower[phase] != 0);
+                ASSERT_EQ(on - 1, state.hysteresis.state[phase]);
+            }
+        }
+    }
+}
+
+TEST_F(Control, the_paper_s_controller_drives_its_regulated_phase_with_the_pid_s_duty) {
+    start();
+    int partial = 0;
+    for (int k = 0; k < 2000; k++) {
+        ASSERT_TRUE(step(COMMAND_RUN, 1.0));
+        const unsigned phase = state.duty.regulated;
+        ASSERT_LT(phase, 3u);
+        const double duty = state.duty.pid.duty_q23 / twins::Q23;
+        ASSERT_NEAR(diagnostics.duty_q15 / twins::Q15, duty, 0.51 / twins::Q15);
+        const double voltage = (double(compare.upper[phase]) + compare.lower[phase]) / parameters.period_ticks - 1.0;
+        ASSERT_NEAR(voltage, duty, 0.51 / parameters.period_ticks + 0.51 / twins::Q15) << k;
+        partial += compare.upper[phase] > 0 && compare.upper[phase] < parameters.period_ticks;
+        // The current follows the voltage, 8 A a period at most; the rotor is held.
+        uint16_t &counts = sample.adc.phase_current_counts[phase];
+        counts = uint16_t(std::clamp(counts + 400.0 * voltage, 0.0, 3000.0));
+    }
+    EXPECT_GT(partial, 10);
+}
+
+TEST_F(Control, overspeed_opens_every_switch) {
+    start();
+    int periods = 0;
+    while (state.machine.state == DRIVE_STATE_RUN && periods < 40000) {
+        speed_rad_s += 0.05;
+        step(COMMAND_RUN, 3000.0);
+        periods++;
+    }
+    EXPECT_EQ(state.machine.record.fault, FAULT_OVER_SPEED);
+    EXPECT_NEAR(speed_rad_s, twins::rad_s(3600.0), 4.0);
+}
+
+TEST_F(Control, voltage_is_saturated_while_a_phase_is_fully_on_and_never_outside_run) {
+    start();
+    int saturated = 0;
+    for (int k = 0; k < 400; k++) {
+        // Currents that are too small, then too large for the torque.
+        for (unsigned phase = 0; phase < 3; phase++) {
+            sample.adc.phase_current_counts[phase] = k < 200 ? 100 : 3000;
+        }
+        step(COMMAND_RUN, 300.0);
+        bool full = false;
+        for (unsigned phase = 0; phase < 3; phase++) {
+            full = full || compare.upper[phase] == parameters.period_ticks;
+        }
+        ASSERT_EQ(diagnostics.voltage_saturated, full) << k;
+        saturated += full;
+    }
+    EXPECT_GT(saturated, 100);
+    EXPECT_LT(saturated, 300);
+    step(COMMAND_OFF);
+    EXPECT_FALSE(diagnostics.voltage_saturated);
+}
+
+TEST_F(Control, the_torque_reference_is_never_negative) {
+    start();
+    speed_rad_s = 60.0;
+    for (int k = 0; k < 4000; k++) {
+        step(COMMAND_RUN, k < 2000 ? -3000.0 : 0.0);
+        ASSERT_GE(diagnostics.torque_reference_q24, 0);
+    }
+}
+
+// What of the salient controller is control.c's own; its torque is tested in closed loop.
+class SalientControl : public Control {
+  protected:
+    SalientControl() : Control(DRIVE_CONTROLLER_SALIENT) {}
+
+    // Set anew with some parameters of the drive different.
+    void configure_with(drive_controller_t controller, parameter_index_t index, int32_t value, unsigned adc_bits = 12) {
+        configure(controller);
+        parameters_t p;
+        parameters_init(&p);
+        p.values[PARAMETER_CONTROLLER] = controller;
+        p.values[index] = value;
+        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, adc_bits);
+    }
+};
+
+TEST_F(SalientControl, takes_negative_references_and_the_others_take_them_as_none) {
+    for (const drive_controller_t controller :
+         {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        configure(controller);
+        start();
+        for (int k = 0; k < 100; k++) {
+            ASSERT_TRUE(step(COMMAND_RUN, -600.0));
+        }
+        const bool salient = controller == DRIVE_CONTROLLER_SALIENT;
+        EXPECT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, salient ? -twins::rad_s(600.0) : 0.0, 1e-5);
+        if (salient) {
+            EXPECT_LT(diagnostics.torque_reference_q24 / twins::Q24, -10.0);
+        } else {
+            EXPECT_EQ(diagnostics.torque_reference_q24, 0);
+        }
+    }
+}
+
+TEST_F(SalientControl, brakes_and_reverses_a_turning_rotor_with_a_torque_reference_of_the_other_sign) {
+    for (const double side : {1.0, -1.0}) {
+        configure(DRIVE_CONTROLLER_SALIENT);
+        speed_rad_s = side * 30.0;
+        for (int k = 0; k < 4000; k++) {
+            step(COMMAND_OFF);
+        }
+        // It starts from the present speed, either way.
+        parameters.speed_ramp_q22 = twins::to_fixed(0.05, twins::Q22);
+        step(COMMAND_RUN, -side * 300.0);
+        EXPECT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, side * 30.0, 0.2);
+        for (int k = 0; k < 2000; k++) {
+            ASSERT_TRUE(step(COMMAND_RUN, -side * 300.0));
+        }
+        EXPECT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, -side * twins::rad_s(300.0), 1e-5);
+        EXPECT_LT(side * diagnostics.torque_reference_q24 / twins::Q24, -19.0);
+    }
+}
+
+TEST_F(SalientControl, two_pulses_are_its_own_and_may_be_one) {
+    for (const int32_t pulses : {1, 2}) {
+        configure_with(DRIVE_CONTROLLER_SALIENT, PARAMETER_PULSES_PER_PERIOD, pulses);
+        start();
+        for (int k = 0; k < 200; k++) {
+            ASSERT_TRUE(step(COMMAND_RUN, 1.0));
+            for (unsigned phase = 0; phase < 3; phase++) {
+                const int upper = compare.upper[phase], lower = compare.lower[phase];
+                const double duty = state.predictive.duty_q15[phase] / twins::Q15;
+                ASSERT_NEAR((upper + lower) / double(parameters.period_ticks) - 1.0, duty,
+                            1.0 / parameters.period_ticks);
+                if (pulses == 2) {
+                    ASSERT_LE(std::abs(upper - lower), 1);
+                } else {
+                    ASSERT_TRUE(upper == 0 || lower == parameters.period_ticks);
+                }
+            }
+        }
+    }
+}
+
+TEST_F(SalientControl, the_load_torque_of_the_sliding_mode_is_the_transducer_s_where_a_parameter_says_so) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        for (const unsigned bits : {12u, 14u, 16u}) {
+            for (const double load_Nm : {4.0, 0.0, 12.5}) {
+                configure_with(controller, PARAMETER_LOAD_SOURCE, 1, bits);
+                sample.adc.bus_voltage_counts = uint16_t(BUS_COUNTS << (bits - 12));
+                sample.adc.load_torque_counts = uint16_t((load_Nm + 64.0) * std::ldexp(1.0, int(bits) - 7));
+                start();
+                for (int k = 0; k < 100; k++) {
+                    ASSERT_TRUE(step(COMMAND_RUN, 0.0));
+                }
+                EXPECT_NEAR(diagnostics.torque_reference_q24 / twins::Q24, load_Nm, 0.05) << bits << " bits";
+                EXPECT_NEAR(diagnostics.load_torque_q24 / twins::Q24, 0.0, 0.1) << "the observer's is another";
+            }
+        }
+    }
+    // A load of the other sign: only a controller that brakes can answer it.
+    configure_with(DRIVE_CONTROLLER_SALIENT, PARAMETER_LOAD_SOURCE, 1);
+    sample.adc.load_torque_counts = uint16_t((64.0 - 5.0) * 32.0);
+    start();
+    for (int k = 0; k < 100; k++) {
+        step(COMMAND_RUN, 0.0);
+    }
+    EXPECT_NEAR(diagnostics.torque_reference_q24 / twins::Q24, -5.0, 0.05);
+    // Without the parameter the code is not looked at.
+    configure(DRIVE_CONTROLLER_SALIENT);
+    sample.adc.load_torque_counts = 4095;
+    start();
+    for (int k = 0; k < 100; k++) {
+        step(COMMAND_RUN, 0.0);
+    }
+    EXPECT_NEAR(diagnostics.torque_reference_q24 / twins::Q24, 0.0, 0.1);
+}
+
+TEST_F(SalientControl, an_edge_s_angle_is_the_boundary_and_the_way_since_at_the_observer_s_speed) {
+    for (const double speed : {15.0, 100.0, -15.0, -100.0}) {
+        for (const uint32_t age_ticks : {0u, 1u, 3000u, 20000u}) {
+            configure(DRIVE_CONTROLLER_SALIENT);
+            speed_rad_s = speed;
+            for (int k = 0; k < 4000; k++) {
+                step(COMMAND_OFF);
+            }
+            const double known_rad_s = state.observer.speed_q22 / twins::Q22;
+            EXPECT_NEAR(known_rad_s, speed, 0.05);
+            sample.encoder.edge_known = true;
+            sample.encoder.edge_forward = speed > 0.0;
+            sample.encoder.edge_age_ticks = age_ticks;
+            step(COMMAND_OFF);
+            const double boundary = sample.encoder.counts + (speed > 0.0 ? 0.0 : 1.0);
+            const double turns_now =
+                std::ldexp(boundary, -int(ENCODER_BITS)) + known_rad_s * age_ticks * 5e-9 / (2.0 * twins::PI);
+            double difference = diagnostics.angle - (turns_now - std::floor(turns_now)) * twins::TURN;
+            difference -= std::round(difference / twins::TURN) * twins::TURN;
+            EXPECT_NEAR(difference, 0.0, 2.0 + 1e-6 * std::fabs(speed) * age_ticks) << speed << ", " << age_ticks;
+        }
+    }
+}
+
+TEST_F(SalientControl, an_edge_older_than_two_periods_at_20_kHz_or_none_leaves_the_middle_of_the_count) {
+    speed_rad_s = 15.0;
+    for (int k = 0; k < 400; k++) {
+        step(COMMAND_OFF);
+    }
+    const auto middle = [this] { return (sample.encoder.counts << 15) + (1u << 14); };
+    sample.encoder.edge_known = true;
+    sample.encoder.edge_forward = true;
+    for (const uint32_t age_ticks : {20001u, HAL_ENCODER_AGE_MAX_TICKS}) {
+        sample.encoder.edge_age_ticks = age_ticks;
+        step(COMMAND_OFF);
+        EXPECT_EQ(diagnostics.angle, middle()) << age_ticks;
+    }
+    sample.encoder.edge_age_ticks = 100;
+    step(COMMAND_OFF);
+    EXPECT_NE(diagnostics.angle, middle());
+    sample.encoder.edge_known = false;
+    step(COMMAND_OFF);
+    EXPECT_EQ(diagnostics.angle, middle());
+}
+
+TEST_F(SalientControl, trims_and_missing_torque_are_0_with_the_other_controllers) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER}) {
+        configure(controller);
+        start();
+        for (int k = 0; k < 400; k++) {
+            step(COMMAND_RUN, 3000.0);
+            ASSERT_EQ(diagnostics.trim_torque_q24, 0);
+            ASSERT_EQ(diagnostics.torque_missing_q24, 0);
+        }
+    }
+    configure(DRIVE_CONTROLLER_SALIENT);
+    start();
+    step(COMMAND_RUN, 3000.0);
+    EXPECT_GT(diagnostics.torque_missing_q24, 10 << 24) << "no current yet";
+    EXPECT_TRUE(diagnostics.voltage_saturated);
+    step(COMMAND_OFF);
+    EXPECT_EQ(diagnostics.torque_missing_q24, 0);
+}
+
+} // namespace

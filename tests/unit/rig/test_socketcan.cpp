@@ -1,0 +1,93 @@
+// The SocketCAN transport's frames and stamps. One end of a socket pair stands in for the interface; the real one is
+// used by the tests that run where there is PF_CAN.
+#include "support/rig_bench.h"
+
+namespace {
+
+constexpr uint64_t MS = 1000000;
+
+class SocketCan : public testing::Test {
+  protected:
+    void SetUp() override {
+        int pair[2];
+        ASSERT_EQ(socketpair(AF_UNIX, SOCK_SEQPACKET, 0, pair), 0);
+        int bytes = 4 << 20;
+        setsockopt(pair[0], SOL_SOCKET, SO_SNDBUFFORCE, &bytes, sizeof bytes);
+        bench = std::make_unique<RigBench>(transport_socketcan_attach(pair[0]), "lockstep");
+        peer = pair[1];
+    }
+    void TearDown() override { close(peer); }
+
+    void send(canid_t identifier, const std::vector<uint8_t> &data) {
+        can_frame frame{};
+        frame.can_id = identifier;
+        frame.len = static_cast<uint8_t>(data.size());
+        std::copy(data.begin(), data.end(), frame.data);
+        ASSERT_EQ(::send(peer, &frame, sizeof frame, 0), ssize_t{sizeof frame});
+    }
+
+    void run_until(uint64_t time_ns) {
+        std::vector<uint8_t> data(7);
+        std::memcpy(data.data(), &time_ns, 6);
+        send(RIG_RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG, data);
+        bench->serve();
+    }
+
+    // Puts a time to each frame on the interface, as rig.dbc says a logger does.
+    std::vector<std::pair<uint64_t, uint32_t>> timed(const std::vector<uint32_t> &sent_on_bus,
+                                                     const std::vector<uint32_t> &sent_at_once) {
+        std::vector<std::pair<uint64_t, uint32_t>> result;
+        uint64_t next_ns = 0;
+        size_t on_bus = 0, at_once = 0;
+        can_frame frame;
+        while (recv(peer, &frame, sizeof frame, MSG_DONTWAIT) == sizeof frame) {
+            uint32_t identifier = frame.can_id & CAN_EFF_MASK;
+            uint64_t time_ns = 0;
+            std::memcpy(&time_ns, frame.data, 6);
+            if (identifier == RIG_RIG_STAMP_FRAME_ID) {
+                if (frame.data[6] == RIG_RIG_STAMP_SUBJECT_NEXT_CHOICE) {
+                    next_ns = time_ns;
+                } else if (frame.data[6] == RIG_RIG_STAMP_SUBJECT_OLDEST_ON_BUS_CHOICE) {
+                    result.emplace_back(time_ns, sent_on_bus.at(on_bus++));
+                } else {
+                    result.emplace_back(time_ns, sent_at_once.at(at_once++));
+                }
+            } else {
+                result.emplace_back(identifier == RIG_RIG_CLOCK_FRAME_ID ? time_ns : next_ns, identifier);
+            }
+        }
+        return result;
+    }
+
+    std::unique_ptr<RigBench> bench;
+    int peer = -1;
+};
+
+TEST_F(SocketCan, StampsGiveTheSameListAsTheLocalBus) {
+    send(0x100, {1, 2});
+    send(RIG_RIG_SET_FRAME_ID | CAN_EFF_FLAG, {1, 0, 0, 1, 0, 0, 0, 0});
+    send(0x200, {3});
+    run_until(10 * MS);
+    auto here = timed({0x100, 0x200}, {RIG_RIG_SET_FRAME_ID, RIG_RIG_RUN_UNTIL_FRAME_ID});
+
+    RigBench local;
+    auto client = local.connect();
+    client->send(0x100, {1, 2});
+    client->send(RIG_RIG_SET_FRAME_ID | CAN_EFF_FLAG, {1, 0, 0, 1, 0, 0, 0, 0});
+    client->send(0x200, {3});
+    std::vector<std::pair<uint64_t, uint32_t>> there;
+    for (const auto &record : local.run_to(*client, 10 * MS)) {
+        there.emplace_back(record.time_ns, record.identifier());
+    }
+    EXPECT_EQ(here, there);
+    EXPECT_GT(here.size(), 30u);
+}
+
+TEST_F(SocketCan, InterfaceThatGoesAwayEndsTheRig) {
+    close(peer);
+    peer = -1;
+    EXPECT_FALSE(rig_serve(bench->rig.get(), 0));
+    ASSERT_NE(bench->transport->failure, nullptr);
+}
+
+} // namespace

@@ -1,0 +1,208 @@
+// A bench in one process: the emulated machine and its sensors, and a drive that is the firmware's control interrupt or
+// the double-precision twin. True torque and speed every microsecond, and the figures of a run.
+#ifndef TESTS_UNIT_CLOSED_LOOP_H
+#define TESTS_UNIT_CLOSED_LOOP_H
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <map>
+#include <vector>
+
+extern "C" {
+#include "drive/configure.h"
+#include "drive/control.h"
+#include "plant/machine.h"
+#include "plant/plant.h"
+#include "plant/sensors.h"
+}
+
+#include "support/salient_reference.h"
+#include "support/reference_models.h"
+
+namespace closed_loop {
+
+struct setup_t {
+    uint32_t rate_hz = 40000;
+    unsigned encoder_bits = 17, adc_bits = 12; // 32 and 16: ideal
+    bool edges = false;
+    double rotor_deg = 0.0;
+    std::map<parameter_index_t, double> parameters; // those that differ, in their units
+    plant_gains_t plant{1.0, 1.0, 1.0, 1.0};
+
+    control_parameters_t configured() const {
+        parameters_t values;
+        parameters_init(&values);
+        parameters_set_default(&values, PARAMETER_CONTROLLER, DRIVE_CONTROLLER_SALIENT);
+        parameters_set_default(&values, PARAMETER_INERTIA_KG_M2, machine_tables.inertia_q30);
+        parameters_set_default(&values, PARAMETER_FRICTION_NM_S, machine_tables.friction_q30);
+        parameters_set_default(&values, PARAMETER_RESISTANCE_OHM, machine_tables.resistance_q24);
+        for (const auto &[index, value] : parameters) {
+            values.values[index] = twins::to_fixed(value, std::ldexp(1.0, parameters_row(index)->fraction_bits));
+        }
+        return configure_control(&values, &machine_tables, rate_hz, encoder_bits, adc_bits);
+    }
+};
+
+// The firmware.
+struct fixed_drive_t {
+    control_parameters_t parameters;
+    control_state_t state{};
+
+    explicit fixed_drive_t(const setup_t &setup) : parameters(setup.configured()) {
+        control_reset(&parameters, &state);
+    }
+
+    bool step(const control_sample_t &sample, hal_pwm_compare_t *compare) {
+        return control_step(&parameters, &state, &sample, compare);
+    }
+};
+
+// The twin, with the timer's ticks.
+struct twin_drive_t {
+    twins::salient_t twin;
+    unsigned phases;
+    bool two_pulses;
+    double period_ticks;
+
+    explicit twin_drive_t(const setup_t &setup) : twin_drive_t(setup, setup.configured()) {}
+
+    bool step(const control_sample_t &sample, hal_pwm_compare_t *compare) {
+        const bool run = sample.command.request == COMMAND_RUN;
+        const auto duties = twin.step(sample, run);
+        *compare = hal_pwm_compare_t{};
+        for (unsigned phase = 0; phase < phases && run; phase++) {
+            const double duty = duties[phase];
+            if (two_pulses) {
+                const int both = int(std::lround((1.0 + duty) * period_ticks));
+                compare->upper[phase] = uint16_t(both / 2);
+                compare->lower[phase] = uint16_t(both - both / 2);
+            } else {
+                compare->upper[phase] = uint16_t(duty >= 0.0 ? std::lround(duty * period_ticks) : 0);
+                compare->lower[phase] = uint16_t(duty >= 0.0 ? period_ticks : std::lround((1.0 + duty) * period_ticks));
+            }
+        }
+        return run;
+    }
+
+  private:
+    twin_drive_t(const setup_t &setup, const control_parameters_t &p)
+        : twin(p, machine_plant, setup.rate_hz), phases(machine_plant.phases), two_pulses(p.two_pulses),
+          period_ticks(p.period_ticks) {}
+};
+
+// Truth from a microsecond on.
+struct trace_t {
+    uint64_t first_us = 0;
+    std::vector<double> torque_Nm, speed_rad_s;
+
+    size_t index(double time_s) const {
+        const auto us = uint64_t(std::llround(time_s * 1e6));
+        return std::min(size_t(us > first_us ? us - first_us : 0), torque_Nm.size());
+    }
+
+    double mean_torque_Nm(double from_s, double to_s) const {
+        double sum = 0.0;
+        for (size_t i = index(from_s); i < index(to_s); i++) {
+            sum += torque_Nm[i];
+        }
+        return sum / double(index(to_s) - index(from_s));
+    }
+
+    // (largest - least) / mean.
+    double ripple(double from_s, double to_s) const {
+        const auto [least, largest] =
+            std::minmax_element(torque_Nm.begin() + long(index(from_s)), torque_Nm.begin() + long(index(to_s)));
+        return (*largest - *least) / mean_torque_Nm(from_s, to_s);
+    }
+
+    // Last time beyond +-0.5 % of a speed, from from_s on; 0 when never.
+    double last_exit_s(double speed, double from_s, double to_s) const {
+        for (size_t i = index(to_s); i > index(from_s); i--) {
+            if (std::fabs(speed_rad_s[i - 1] - speed) > 0.005 * std::fabs(speed)) {
+                return double(i - index(from_s)) * 1e-6;
+            }
+        }
+        return 0.0;
+    }
+
+    double least_speed(double from_s, double to_s) const {
+        return *std::min_element(speed_rad_s.begin() + long(index(from_s)), speed_rad_s.begin() + long(index(to_s)));
+    }
+    double largest_speed(double from_s, double to_s) const {
+        return *std::max_element(speed_rad_s.begin() + long(index(from_s)), speed_rad_s.begin() + long(index(to_s)));
+    }
+};
+
+template <typename drive_t> class Bench {
+  public:
+    explicit Bench(const setup_t &setup) : drive(setup), rate_hz(setup.rate_hz) {
+        plant_init(&plant, &machine_plant, setup.rotor_deg * twins::PI / 180.0);
+        plant_set_gains(&plant, &setup.plant);
+        sensors_init(&sensors, &machine_plant.sensors, setup.encoder_bits, setup.adc_bits, 1);
+        sensors.encoder_edges = setup.edges;
+        watch();
+    }
+
+    // Goes on apart from the original from here.
+    Bench(const Bench &other)
+        : plant(other.plant), sensors(other.sensors), drive(other.drive), reference_rpm(other.reference_rpm),
+          running(other.running), rate_hz(other.rate_hz), buffered(other.buffered) {
+        watch();
+    }
+    Bench &operator=(const Bench &) = delete;
+
+    void run_until(double time_s) {
+        const uint64_t period_ns = 1000000000u / rate_hz;
+        const auto ticks = uint16_t(HAL_PWM_CLOCK_HZ / (2u * rate_hz));
+        const auto to_ns = uint64_t(std::llround(time_s * 1e9));
+        while (plant.time_ns + period_ns <= to_ns) {
+            plant_advance(&plant, plant.time_ns + period_ns);
+            control_sample_t sample{};
+            sensors_sample_encoder(&sensors, &plant, &sample.encoder);
+            sensors_sample_adc(&sensors, &plant, &sample.adc);
+            sample.time_us = uint32_t(plant.time_ns / 1000);
+            sample.command.time_us = sample.time_us;
+            // Behind the initialisation.
+            sample.command.request = plant.time_ns > 1100000 ? COMMAND_RUN : COMMAND_OFF;
+            sample.command.speed_reference_q22 = twins::to_fixed(twins::rad_s(reference_rpm), twins::Q22);
+            plant_set_switches(&plant, &buffered, ticks);
+            running = drive.step(sample, &buffered);
+            if (!running) {
+                buffered = hal_pwm_compare_t{};
+                plant_open_all(&plant);
+            }
+        }
+    }
+
+    // Forgets what was seen.
+    void watch() {
+        trace = trace_t{};
+        trace.first_us = (plant.time_ns + 999) / 1000;
+        plant_observe(&plant, trace.first_us * 1000, 1000, observe, &trace);
+    }
+
+    double now_s() const { return double(plant.time_ns) * 1e-9; }
+
+    plant_t plant;
+    sensors_t sensors;
+    drive_t drive;
+    double reference_rpm = 0.0;
+    bool running = false;
+    trace_t trace;
+
+  private:
+    uint32_t rate_hz;
+    hal_pwm_compare_t buffered{};
+
+    static void observe(void *context, const plant_t *plant) {
+        auto *trace = static_cast<trace_t *>(context);
+        trace->torque_Nm.push_back(plant_torque_Nm(plant));
+        trace->speed_rad_s.push_back(plant->speed_rad_s);
+    }
+};
+
+} // namespace closed_loop
+
+#endif

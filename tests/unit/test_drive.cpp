@@ -1,0 +1,362 @@
+// drive.c between a HAL that remembers and the laws: what it starts, writes, opens and passes on.
+#include <cstdint>
+#include <cstring>
+#include <deque>
+#include <vector>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "comms/e2e.h"
+#include "drive.h"
+#include "hal_adc.h"
+#include "hal_can.h"
+#include "hal_encoder.h"
+#include "hal_pwm.h"
+#include "hal_time.h"
+}
+#include "drive_codec.h"
+#include "support/frames.h"
+
+struct hal {
+    hal_adc_sample_t adc{};
+    uint32_t encoder_counts = 1000;
+    uint32_t time_us = 0;
+    uint32_t missed = 0;
+    uint32_t elapsed_ticks = 0;
+    std::deque<hal_can_frame_t> to_drive;
+    std::vector<hal_can_frame_t> from_drive;
+    std::vector<uint16_t> starts;
+    unsigned writes = 0, opens = 0;
+    bool open = true;
+    bool critical = false;
+    hal_pwm_compare_t written{};
+};
+
+extern "C" {
+void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample) {
+    *sample = hal->adc;
+}
+unsigned hal_adc_bits(const hal_t *) {
+    return 12;
+}
+unsigned hal_encoder_bits(const hal_t *) {
+    return 17;
+}
+void hal_encoder_read(const hal_t *hal, hal_encoder_sample_t *sample) {
+    *sample = {};
+    sample->counts = hal->encoder_counts;
+}
+uint32_t hal_time_us(const hal_t *hal) {
+    return hal->time_us;
+}
+void hal_critical_enter(hal_t *hal) {
+    EXPECT_FALSE(hal->critical) << "it does not nest";
+    hal->critical = true;
+}
+void hal_critical_leave(hal_t *hal) {
+    EXPECT_TRUE(hal->critical);
+    hal->critical = false;
+}
+void hal_pwm_start(hal_t *hal, uint16_t period_ticks) {
+    EXPECT_TRUE(hal->open) << "the switches are opened before the timer starts";
+    hal->starts.push_back(period_ticks);
+}
+void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare) {
+    hal->written = *compare;
+    hal->open = false;
+    hal->writes++;
+}
+void hal_pwm_open_all(hal_t *hal) {
+    hal->open = true;
+    hal->opens++;
+}
+uint32_t hal_pwm_missed_interrupts(hal_t *hal) {
+    const uint32_t missed = hal->missed;
+    hal->missed = 0;
+    return missed;
+}
+uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
+    return hal->elapsed_ticks;
+}
+bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {
+    if (hal->to_drive.empty()) {
+        return false;
+    }
+    *frame = hal->to_drive.front();
+    hal->to_drive.pop_front();
+    return true;
+}
+uint32_t hal_can_receive_overflows(const hal_t *) {
+    return 0;
+}
+bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
+    hal->from_drive.push_back(*frame);
+    return true;
+}
+}
+
+namespace {
+
+class Drive : public testing::Test {
+  protected:
+    void SetUp() override {
+        hal.adc.bus_voltage_counts = 240 * 8;
+        const drive_config_t config = {40000, DRIVE_CONTROLLER_PAPER};
+        ASSERT_TRUE(drive_init(&drive, &hal, &machine_tables, &config));
+    }
+
+    void periods(int count) {
+        for (int k = 0; k < count; k++) {
+            hal.time_us += 25;
+            drive_control_interrupt(&drive);
+            drive_background(&drive);
+        }
+    }
+
+    void command(command_request_t request, double reference_rpm = 600.0) {
+        hal.to_drive.push_back(frames::command(++counter, request, int32_t(reference_rpm * 1000.0)));
+    }
+
+    // Parameter write over the bus; the response's status.
+    int write(unsigned index, int32_t value) {
+        hal.to_drive.push_back(
+            frames::parameter_request(DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE, index, 0, value));
+        hal.from_drive.clear();
+        periods(2);
+        for (const hal_can_frame_t &sent : hal.from_drive) {
+            if (sent.identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID) {
+                drive_parameter_response_t response{};
+                drive_parameter_response_unpack(&response, sent.data, sent.length);
+                return response.status;
+            }
+        }
+        return -1;
+    }
+
+    hal_t hal;
+    drive_t drive;
+    uint8_t counter = 0;
+};
+
+TEST_F(Drive, starts_the_timer_once_with_the_rate_s_period_and_the_machine_s_defaults) {
+    EXPECT_EQ(hal.starts, std::vector<uint16_t>{2500});
+    EXPECT_EQ(drive.parameters.values[PARAMETER_CONTROLLER], DRIVE_CONTROLLER_PAPER);
+    EXPECT_EQ(drive.parameters.values[PARAMETER_INERTIA_KG_M2], machine_tables.inertia_q30);
+    EXPECT_EQ(drive.parameters.values[PARAMETER_FRICTION_NM_S], machine_tables.friction_q30);
+}
+
+TEST_F(Drive, refuses_a_rate_that_the_timer_cannot_make_and_starts_nothing) {
+    for (const uint32_t rate_hz : {0u, 10000u, 39999u, 200000u}) {
+        hal_t other;
+        drive_t refused;
+        const drive_config_t config = {rate_hz, DRIVE_CONTROLLER_TRADITIONAL};
+        EXPECT_FALSE(drive_init(&refused, &other, &machine_tables, &config));
+        EXPECT_TRUE(other.starts.empty());
+        EXPECT_EQ(other.writes, 0u);
+    }
+}
+
+TEST_F(Drive, opens_the_switches_every_period_until_it_runs) {
+    periods(100);
+    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(hal.writes, 0u);
+    EXPECT_GE(hal.opens, 100u);
+}
+
+TEST_F(Drive, a_command_closes_switches_and_off_opens_them) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_RUN);
+    EXPECT_FALSE(hal.open);
+    EXPECT_GT(hal.written.upper[0] + hal.written.upper[1] + hal.written.upper[2], 0);
+    command(COMMAND_OFF);
+    periods(3);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);
+}
+
+TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    ASSERT_FALSE(hal.open);
+    periods(100000 / 25 + 2);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.machine.record.fault, FAULT_COMMAND_TIMEOUT);
+}
+
+TEST_F(Drive, lost_interrupts_reach_the_protection) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    hal.missed = 3;
+    periods(1);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+}
+
+TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {
+    const auto late = [this](int count) {
+        for (int k = 0; k < count; k++) {
+            hal.missed = 1;
+            hal.time_us += 25;
+            periods(1);
+        }
+    };
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    late(2);
+    periods(1);
+    late(2);
+    EXPECT_FALSE(hal.open);
+    EXPECT_EQ(drive.late_interrupts, 4u);
+    late(1);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+    EXPECT_EQ(drive.control.machine.record.checks, FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
+    EXPECT_EQ(drive.late_interrupts, 5u);
+}
+
+TEST_F(Drive, an_interrupt_that_loses_three_triggers_is_one_late_interrupt_and_a_fault) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    hal.missed = 3;
+    hal.time_us += 75;
+    periods(1);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+    EXPECT_EQ(drive.late_interrupts, 1u);
+}
+
+TEST_F(Drive, its_time_on_the_processor_is_kept_reported_and_acted_upon_by_nobody) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    hal.elapsed_ticks = 70000; // far beyond the period, and yet no trigger was lost
+    periods(1);
+    hal.elapsed_ticks = 1234;
+    hal.from_drive.clear();
+    periods(4000 + 40);
+    EXPECT_EQ(drive.used_ticks, 1234u);
+    EXPECT_EQ(drive.worst_ticks, 70000u);
+    EXPECT_EQ(drive.late_interrupts, 0u);
+    unsigned seen = 0;
+    for (const hal_can_frame_t &frame : hal.from_drive) {
+        if (frame.identifier == DRIVE_DRIVE_PROCESSOR_FRAME_ID) {
+            drive_drive_processor_t processor{};
+            drive_drive_processor_unpack(&processor, frame.data, frame.length);
+            EXPECT_EQ(processor.used_us, 1234);
+            EXPECT_EQ(processor.worst_us, 65535) << "held at its end";
+            EXPECT_EQ(processor.available_us, 5000);
+            EXPECT_EQ(processor.late_interrupts, 0);
+            seen++;
+        }
+    }
+    EXPECT_EQ(seen, 1u);
+}
+
+TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
+    periods(100);
+    EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 5 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_DONE_CHOICE);
+    EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
+    command(COMMAND_RUN);
+    periods(3);
+    EXPECT_EQ(drive.control.torque_reference_q24, 5 << 24);
+    EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 6 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_NOT_WHILE_RUNNING_CHOICE);
+    EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
+}
+
+TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
+    hal.adc.phase_current_counts[0] = 100;
+    hal.adc.phase_current_counts[1] = 200;
+    hal.adc.phase_current_counts[2] = 300;
+    periods(100);
+    command(COMMAND_RUN);
+    periods(1000);
+    hal.from_drive.clear();
+    periods(400); // a whole slow cycle
+    const control_diagnostics_t d = control_diagnose(&drive.control_parameters, &drive.control);
+    unsigned seen = 0;
+    for (const hal_can_frame_t &frame : hal.from_drive) {
+        if (frame.identifier == DRIVE_DRIVE_STATUS_FRAME_ID) {
+            drive_drive_status_t status{};
+            drive_drive_status_unpack(&status, frame.data, frame.length);
+            EXPECT_EQ(status.state, DRIVE_STATE_RUN);
+            EXPECT_EQ(status.controller, DRIVE_CONTROLLER_PAPER);
+            EXPECT_EQ(status.fault, FAULT_NONE);
+            seen |= 1;
+        } else if (frame.identifier == DRIVE_DRIVE_TORQUE_FRAME_ID) {
+            // The rotor stands and the currents are held, so every cycle says the same.
+            drive_drive_torque_t torque{};
+            drive_drive_torque_unpack(&torque, frame.data, frame.length);
+            EXPECT_EQ(torque.torque_reference_nm, (d.torque_reference_q24 + 32768) >> 16);
+            EXPECT_EQ(torque.torque_estimate_nm, (d.torque_q24 + 32768) >> 16);
+            EXPECT_EQ(torque.bus_voltage_v, 240 << 6);
+            seen |= 2;
+        } else if (frame.identifier == DRIVE_DRIVE_CURRENTS_FRAME_ID) {
+            drive_drive_currents_t currents{};
+            drive_drive_currents_unpack(&currents, frame.data, frame.length);
+            EXPECT_EQ(currents.current_a_a, 1000);
+            EXPECT_EQ(currents.current_b_a, 2000);
+            EXPECT_EQ(currents.current_c_a, 3000);
+            EXPECT_EQ(currents.current_d_a, 0);
+            seen |= 4;
+        } else if (frame.identifier == DRIVE_DRIVE_BP_PID_FRAME_ID) {
+            // Gains per N m: those per scaled error over the scale.
+            drive_drive_bp_pid_t pid{};
+            drive_drive_bp_pid_unpack(&pid, frame.data, frame.length);
+            const double inverse = drive.control_parameters.duty.pid.error_scale_inverse_q24 / 16777216.0;
+            EXPECT_NEAR(pid.kp_per_nm, drive.control.duty.pid.gain_q24[0] / 512.0 * inverse, 0.51);
+            EXPECT_NEAR(pid.ki_per_nm, drive.control.duty.pid.gain_q24[1] / 512.0 * inverse, 0.51);
+            EXPECT_NEAR(pid.kd_per_nm, drive.control.duty.pid.gain_q24[2] / 512.0 * inverse, 0.51);
+            EXPECT_NE(pid.kp_per_nm, pid.ki_per_nm);
+            EXPECT_NE(pid.ki_per_nm, pid.kd_per_nm);
+            seen |= 8;
+        }
+    }
+    EXPECT_EQ(seen, 15u);
+}
+
+TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
+    hal_t other_hal;
+    other_hal.adc.bus_voltage_counts = 240 * 8;
+    drive_t other;
+    const drive_config_t config = {20000, DRIVE_CONTROLLER_TRADITIONAL};
+    ASSERT_TRUE(drive_init(&other, &other_hal, &machine_tables, &config));
+    periods(100);
+    command(COMMAND_RUN);
+    for (int k = 0; k < 50; k++) {
+        periods(1);
+        other_hal.time_us += 50;
+        drive_control_interrupt(&other);
+        drive_background(&other);
+    }
+    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(other.control.machine.state, DRIVE_STATE_READY);
+    EXPECT_TRUE(other_hal.open);
+    EXPECT_EQ(other_hal.starts, std::vector<uint16_t>{5000});
+}
+
+TEST_F(Drive, a_run_of_a_sender_long_silent_starts_nothing_when_the_clock_comes_round) {
+    hal.adc.bus_voltage_counts = 0; // the link is off: the drive stays in its initial state
+    command(COMMAND_OFF);
+    periods(10);
+    command(COMMAND_RUN);
+    periods(10);
+    ASSERT_EQ(drive.control.machine.state, DRIVE_STATE_INITIALISE);
+    ASSERT_EQ(drive.sample.command.request, COMMAND_RUN);
+    periods(10000); // 0.25 s of silence
+    EXPECT_EQ(drive.sample.command.request, COMMAND_OFF);
+
+    hal.time_us = drive.sample.command.time_us; // 71 minutes later the command looks new
+    hal.adc.bus_voltage_counts = 240 * 8;
+    periods(200);
+    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(hal.writes, 0u);
+}
+
+} // namespace

@@ -1,0 +1,1 @@
+"""The test bench: emulator process, session, drive and rig, pytest fixtures."""

@@ -1,0 +1,81 @@
+"""A drive and a rig on a bus of their own, in lock-step: what the pytest fixture `bench` gives.
+
+    bench.drive.speed_reference_rpm = 600
+    bench.at(0.13).load_torque_Nm = 8
+    bench.run_for(0.2)
+    assert bench.truth["speed_rpm"].last == pytest.approx(600, abs=3)
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+from salient.bench.emulator import Simulator, SimulatorOptions, parameter_table
+from salient.bench.session import Session
+from salient.bus.log import write_logs
+
+LAST_MOMENTS_S = 0.05
+
+
+class Bench(Session):
+    """A session with a simulator of its own.
+
+    options: see SimulatorOptions; can: "unix:PATH" or "socketcan:INTERFACE", one bench at a time on an interface.
+    """
+
+    def __init__(self, options: SimulatorOptions, can: str) -> None:
+        self.options = options
+        self.simulator = Simulator(options, can)
+        try:
+            super().__init__(can, parameter_table=lambda: parameter_table(options))
+        except BaseException:
+            self.simulator.close()
+            raise
+
+    def close(self) -> None:
+        """Ends session and simulator; SimulatorError when the simulator did not end well."""
+        try:
+            super().close()
+        finally:
+            self.simulator.close()
+
+    def save(self, folder: Path, replay: str) -> None:
+        """Leaves what explains a failure: log (BLF and candump text), plot of the last moments, seed and options, and
+        the command that replays it."""
+        folder.mkdir(parents=True, exist_ok=True)
+        write_logs(self.log, folder / "can.blf", folder / "can.log")
+        notes = {
+            "virtual_time_s": self.time_s,
+            "seed": self.options.seed,
+            "simulator": shlex.join(self.simulator.command),
+            "replay": replay,
+            "stderr": self.simulator.errors,
+        }
+        (folder / "bench.json").write_text(json.dumps(notes, indent=2) + "\n", encoding="utf-8")
+        plot_last_moments(self, folder / "last_moments.png")
+
+
+def plot_last_moments(session: Session, path: Path) -> None:
+    """Speed, torque and phase currents, true and as the drive has them, over the last LAST_MOMENTS_S."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    panels = (
+        [("telemetry", "DRIVE_MOTION.speed_reference_rpm"), ("telemetry", "speed_rpm"), ("truth", "speed_rpm")],
+        [("telemetry", "torque_reference_Nm"), ("telemetry", "torque_estimate_Nm"), ("truth", "torque_Nm"),
+         ("truth", "load_torque_Nm")],
+        [("truth", f"current_{phase}_A") for phase in "abcd"],
+    )  # fmt: skip
+    figure = Figure(figsize=(10, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, panel in zip(figure.subplots(len(panels), 1, sharex=True), panels, strict=True):
+        for source, name in panel:
+            signal = getattr(session, source)[name].between(session.time_s - LAST_MOMENTS_S, session.time_s + 1e-9)
+            axes.plot(signal.time_s, signal.value, label=f"{source} {signal.name}", marker=".", markersize=3)
+            axes.set_ylabel(signal.unit)
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
+        axes.grid(alpha=0.3)
+    axes.set_xlabel("virtual time, s")
+    figure.savefig(path, dpi=90)

@@ -1,0 +1,230 @@
+"""The drive over CAN, as its user has it: commands, parameters, state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, MutableMapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import can
+
+from salient.bus import e2e
+from salient.bus.signals import drive_database
+
+if TYPE_CHECKING:
+    from salient.bench.session import Session
+
+REQUESTS = {"off": 0, "run": 1, "stop": 2, "clear_fault": 3}
+COMMAND_PERIOD_NS = 10_000_000
+"""Commands are repeated so often, in virtual time; the drive stops when they stop coming."""
+
+_ANSWER_TIMEOUT_S = 0.1
+_TEXT_PARTS_MAX = 64
+_OPERATIONS = ("read", "write", "minimum", "maximum", "default", "fraction_bits", "name", "unit")
+
+
+class DriveError(Exception):
+    """The drive refused or did not answer; the text says what."""
+
+
+def command_frame(counter: int, request: str, speed_reference_rpm: float) -> can.Message:
+    """A DRIVE_COMMAND with its checksum. counter 0..255; request one of REQUESTS; -3000..3000 r/min."""
+    message = drive_database().get_message_by_name("DRIVE_COMMAND")
+    signals = {
+        "checksum": 0,
+        "counter": counter,
+        "request": REQUESTS[request],
+        "speed_reference_rpm": speed_reference_rpm,
+    }
+    payload = message.encode(signals)[e2e.HEADER_BYTES :]
+    data = e2e.protect(e2e.DRIVE_COMMAND_DATA_ID, counter, payload)
+    return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=data)
+
+
+class Drive:
+    """Commands a drive. Assigning speed_reference_rpm asks it to run; the command is sent at once and then every
+    COMMAND_PERIOD_NS as the session's time moves, until `silence`. Nothing is sent before the first request.
+    """
+
+    def __init__(self, session: Session, parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
+        self._session = session
+        self._request: str | None = None
+        self._speed_reference_rpm = 0.0
+        self._counter = 0
+        self.command_due_ns: int | None = None
+        self.parameters = Parameters(session, parameter_table)
+
+    @property
+    def speed_reference_rpm(self) -> float:
+        """Last one asked for, -3000..3000; negative is backwards, and 0 to a controller that motors forwards only."""
+        return self._speed_reference_rpm
+
+    @speed_reference_rpm.setter
+    def speed_reference_rpm(self, value: float) -> None:
+        signal = drive_database().get_message_by_name("DRIVE_COMMAND").get_signal_by_name("speed_reference_rpm")
+        if not signal.minimum <= value <= signal.maximum:
+            allowed = f"{signal.minimum:g} to {signal.maximum:g} r/min"
+            raise DriveError(f"speed_reference_rpm {value:g}: allowed are {allowed}")
+        self._speed_reference_rpm = float(value)
+        self.ask("run")
+
+    def stop(self) -> None:
+        """Ramp to zero, then open the switches."""
+        self.ask("stop")
+
+    def off(self) -> None:
+        """Open all switches now."""
+        self.ask("off")
+
+    def clear_fault(self) -> None:
+        """Leave the fault state, if its cause is gone. The drive clears when this is asked anew: hence off first."""
+        self.ask("off")
+        self.ask("clear_fault")
+
+    def silence(self) -> None:
+        """Send no more commands until the next request."""
+        self.command_due_ns = None
+
+    def ask(self, request: str) -> None:
+        """off, run, stop or clear_fault; sends it at once."""
+        if request not in REQUESTS:
+            raise DriveError(f"request '{request}': allowed are {', '.join(REQUESTS)}")
+        self._request = request
+        self.send_command()
+
+    def send_command(self) -> None:
+        """Repeats the present request now; the next is due a period later."""
+        if self._request is None:
+            raise DriveError("nothing was asked of the drive yet")
+        self._session.send(command_frame(self._counter, self._request, self._speed_reference_rpm))
+        self._counter = (self._counter + 1) % 256
+        self.command_due_ns = self._session.time_ns + COMMAND_PERIOD_NS
+
+    @property
+    def state(self) -> str:
+        """initialise, ready, run or fault, by its latest telemetry."""
+        return self._session.telemetry["DRIVE_STATUS.state"].last_name
+
+    @property
+    def fault(self) -> str:
+        """Name of the latched fault, or none, by its latest telemetry."""
+        return self._session.telemetry["DRIVE_STATUS.fault"].last_name
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One parameter as the drive describes it; limits and default in its unit."""
+
+    index: int
+    name: str
+    unit: str
+    fraction_bits: int
+    minimum: float
+    maximum: float
+    default: float
+
+
+class Parameters(MutableMapping[str, float]):
+    """The drive's parameters by name, read and written in their units.
+
+    The drive is asked for its table at the first use, unless `table` gives it. KeyError: no such name. DriveError: the
+    drive refuses the value.
+    """
+
+    def __init__(self, session: Session, table: Callable[[], list[ParameterRow]] | None = None) -> None:
+        self._session = session
+        self._table = table
+        self._loaded: dict[str, ParameterRow] | None = None
+
+    @property
+    def rows(self) -> dict[str, ParameterRow]:
+        """Descriptions by name, in the drive's order."""
+        if self._loaded is None:
+            rows = self._table() if self._table else read_parameter_table(self._session)
+            self._loaded = {row.name: row for row in rows}
+        return self._loaded
+
+    def row(self, name: str) -> ParameterRow:
+        """Description of one parameter; KeyError lists the names there are."""
+        if name not in self.rows:
+            raise KeyError(f"no parameter '{name}'; there are {', '.join(self.rows)}")
+        return self.rows[name]
+
+    def __getitem__(self, name: str) -> float:
+        row = self.row(name)
+        return _ask(self._session, "read", row.index)[1] / 2**row.fraction_bits
+
+    def __setitem__(self, name: str, value: float) -> None:
+        row = self.row(name)
+        status, _ = _ask(self._session, "write", row.index, value=raw_value(row, value))
+        if status == "out_of_range":
+            raise DriveError(f"{name} {value:g}: allowed are {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
+        if status != "done":
+            raise DriveError(f"{name} {value:g}: {status}")
+
+    def __delitem__(self, name: str) -> None:
+        raise TypeError("a drive's parameters cannot be deleted")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+def raw_value(row: ParameterRow, value: float) -> int:
+    """The integer that stands for a physical value; DriveError when 32 bits cannot hold it."""
+    raw = round(value * 2**row.fraction_bits)
+    if not -(2**31) <= raw < 2**31:
+        raise DriveError(f"{row.name} {value:g}: allowed are {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
+    return raw
+
+
+def read_parameter_table(session: Session) -> list[ParameterRow]:
+    """Asks the drive for all of its parameters; takes some 0.1 s of virtual time."""
+    rows: list[ParameterRow] = []
+    while True:
+        index = len(rows)
+        status, fraction_bits = _ask(session, "fraction_bits", index)
+        if status != "done":
+            return rows
+        limits = (_ask(session, what, index)[1] / 2**fraction_bits for what in ("minimum", "maximum", "default"))
+        name, unit = (_ask_text(session, what, index) for what in ("name", "unit"))
+        rows.append(ParameterRow(index, name, unit, fraction_bits, *limits))
+
+
+def write_request(row: ParameterRow, value: float) -> can.Message:
+    """The PARAMETER_REQUEST that writes a value."""
+    return _request("write", row.index, 0, raw_value(row, value))
+
+
+def _request(operation: str, index: int, part: int, value: int) -> can.Message:
+    message = drive_database().get_message_by_name("PARAMETER_REQUEST")
+    signals = {"operation": _OPERATIONS.index(operation), "index": index, "part": part, "value": value}
+    return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=message.encode(signals))
+
+
+def _ask(session: Session, operation: str, index: int, part: int = 0, value: int = 0) -> tuple[str, int]:
+    """(status, value) of the drive's answer; lets virtual time pass until it comes."""
+    session.send(_request(operation, index, part, value))
+    answer = drive_database().get_message_by_name("PARAMETER_RESPONSE")
+    head = bytes([_OPERATIONS.index(operation), index, part])
+    try:
+        response = session.advance_until_frame(
+            lambda m: m.arbitration_id == answer.frame_id and not m.is_extended_id and bytes(m.data[:3]) == head,
+            _ANSWER_TIMEOUT_S,
+        )
+    except TimeoutError:
+        raise DriveError(f"no answer to PARAMETER_REQUEST {operation} {index} within {_ANSWER_TIMEOUT_S} s") from None
+    signals = answer.decode(bytes(response.data))
+    return str(signals["status"]), int(signals["value"])
+
+
+def _ask_text(session: Session, operation: str, index: int) -> str:
+    text = b""
+    for part in range(_TEXT_PARTS_MAX):
+        four = _ask(session, operation, index, part)[1].to_bytes(4, "little", signed=True)
+        text += four.rstrip(b"\0")
+        if four.endswith(b"\0"):
+            break
+    return text.decode("ascii")

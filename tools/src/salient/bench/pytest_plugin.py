@@ -1,0 +1,119 @@
+"""pytest plugin: the fixtures `bench` and `make_bench`.
+
+    @pytest.mark.bench_options(machine="linear_cosine", controller="paper", seed=7)
+    def test_something(bench):
+        bench.drive.speed_reference_rpm = 600
+        bench.run_for(0.1)
+
+`bench` is one drive with its rig; `make_bench(**options)` starts as many as a test wants, one after the other or (on
+local buses) at once. The options are those of SimulatorOptions. A failed test leaves its logs, a plot of the last
+moments, seed and replay command in a folder that the failure message names.
+
+Marks: `both_transports`, the test is also run over real SocketCAN; `socketcan`, the test needs an interface and is only
+run with --salient-can socketcan:INTERFACE.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from salient.bench.bench import Bench
+from salient.bench.emulator import TARGET_BUILDS, SimulatorOptions
+from salient.paths import BUILD, ROOT
+
+_benches_key = pytest.StashKey[list[Bench]]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("salient")
+    group.addoption("--salient-can", default="local", metavar="BUS",
+                    help="local (default): a local bus for each bench; or socketcan:INTERFACE")
+    group.addoption("--salient-build", default="host", choices=("host", "sanitize", *TARGET_BUILDS),
+                    help="which build is tested")
+    group.addoption("--salient-failures", default=str(BUILD / "failures"), metavar="DIR",
+                    help="where failed tests leave their folders")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    can = config.getoption("--salient-can")
+    if can != "local" and not re.fullmatch(r"socketcan:\S+", can):
+        raise pytest.UsageError(f"--salient-can {can}: allowed are local and socketcan:INTERFACE")
+    config.addinivalue_line("markers", "bench_options(**options): SimulatorOptions of the fixture bench")
+    config.addinivalue_line("markers", "both_transports: the test is also run over SocketCAN")
+    config.addinivalue_line("markers", "socketcan: the test needs --salient-can socketcan:INTERFACE")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """On an interface only what is meant for it is run, and the rest everywhere else."""
+    on_interface = config.getoption("--salient-can") != "local"
+    chosen, left = [], []
+    for item in items:
+        needs = item.get_closest_marker("socketcan") is not None
+        also = item.get_closest_marker("both_transports") is not None
+        (chosen if (needs or also if on_interface else not needs) else left).append(item)
+    if left:
+        config.hook.pytest_deselected(items=left)
+        items[:] = chosen
+
+
+@pytest.fixture
+def make_bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[..., Bench]]:
+    """Starts benches: make_bench(machine=..., controller=..., seed=...). `can` gives a bus other than the run's."""
+    benches: list[Bench] = []
+    request.node.stash[_benches_key] = benches
+    bus = request.config.getoption("--salient-can")
+    build = request.config.getoption("--salient-build")
+
+    def make(can: str | None = None, **options) -> Bench:
+        options.setdefault("build", build)
+        if can is None and bus != "local":
+            can = bus
+        bench = Bench(SimulatorOptions(**options), can or f"unix:{tmp_path}/can{len(benches)}.sock")
+        benches.append(bench)
+        return bench
+
+    yield make
+    errors = []
+    for bench in benches:
+        try:
+            bench.close()
+        except Exception as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]
+
+
+@pytest.fixture
+def bench(request: pytest.FixtureRequest, make_bench: Callable[..., Bench]) -> Bench:
+    """One drive and its rig at virtual time 0; the mark bench_options chooses what they are."""
+    mark = request.node.get_closest_marker("bench_options")
+    return make_bench(**(mark.kwargs if mark else {}))
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo):
+    outcome = yield
+    report = outcome.get_result()
+    if call.when != "call" or not report.failed:
+        return
+    options = [f"--salient-can={item.config.getoption('--salient-can')}"]
+    options.append(f"--salient-build={item.config.getoption('--salient-build')}")
+    test = "::".join([os.path.relpath(item.path, ROOT), *item.nodeid.split("::")[1:]])
+    replay = shlex.join(["build/venv/bin/python", "-m", "pytest", test, *options])
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", item.nodeid).strip("_")
+    for number, bench in enumerate(item.stash.get(_benches_key, [])):
+        folder = Path(item.config.getoption("--salient-failures")) / name / str(number)
+        try:
+            bench.save(folder, replay)
+        except Exception as error:  # the failure itself must still be seen
+            report.sections.append(("salient bench", f"nothing saved in {folder}: {error!r}"))
+            continue
+        report.sections.append(
+            ("salient bench", f"log, plot, seed {bench.options.seed}: {folder}\nreplay: {replay}")
+        )

@@ -1,0 +1,177 @@
+"""A session with a drive and its bench on one bus: time, commands, signals, the log.
+
+    from salient.bench.session import Session
+    session = Session("unix:build/salient.sock", lockstep=False)
+    session.drive.speed_reference_rpm = 600
+    session.run_for(1.0)
+    print(session.telemetry["speed_rpm"].last)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import can
+
+from salient.bench.drive import Drive, ParameterRow
+from salient.bench.rig import Rig
+from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
+from salient.bus.signals import SignalTable, drive_database, rig_database
+
+SILENCE_TIMEOUT_S = 60.0
+"""Of the wall clock: how long an emulator may say nothing at all before it counts as hanging."""
+
+_POLL_STEP_NS = 500_000
+
+
+class SessionError(Exception):
+    """The emulator does not answer."""
+
+
+class Session:
+    """One client's view of a bus.
+
+    lockstep: this session makes time move (the emulator's pace is lockstep). Otherwise time moves by itself, and the
+    session follows it by the times of the frames that come.
+
+    time_ns: virtual time. log: every (time_ns, message) since the session began, in the bus's order. telemetry, truth:
+    signals of the drive and of the bench by name.
+    """
+
+    def __init__(self, address: str, lockstep: bool = True,
+                 parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
+        self.address = address
+        self.time_ns = 0
+        self.log: list[tuple[int, can.Message]] = []
+        self.telemetry = SignalTable(drive_database(), "DRIVE")
+        self.truth = SignalTable(rig_database(), "RIG")
+        self.drive = Drive(self, parameter_table)
+        self.rig = Rig(self)
+        self._lockstep = lockstep
+        self._sequence = 0
+        self._bus = open_bus(address)
+        self._reader = VirtualTimeReader(self._bus)
+        try:
+            if lockstep:
+                self._run_until(0)  # answered at once with the time it is
+            else:
+                self._receive()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Leaves the bus."""
+        self._bus.shutdown()
+
+    def leave_running(self, duration_s: float) -> None:
+        """Leaves the bus, and virtual time to pass without this session; lock-step only."""
+        self._ask_to_run(self.time_ns + round(duration_s * 1e9))
+        self.close()
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.close()
+
+    @property
+    def time_s(self) -> float:
+        """Virtual time in seconds."""
+        return self.time_ns / 1e9
+
+    @property
+    def load_torque_Nm(self) -> float:
+        """Shorthand for rig.load_torque_Nm."""
+        return self.rig.load_torque_Nm
+
+    @load_torque_Nm.setter
+    def load_torque_Nm(self, value: float) -> None:
+        self.rig.load_torque_Nm = value
+
+    def at(self, time_s: float) -> Rig:
+        """The bench's quantities at a virtual time: session.at(0.13).load_torque_Nm = 8."""
+        return self.rig.at(time_s)
+
+    def run_for(self, duration_s: float) -> None:
+        """Lets virtual time pass; commands go out as they fall due."""
+        self.advance_to(self.time_ns + round(duration_s * 1e9))
+
+    def run_until(self, condition: Callable[[], bool], timeout: float, step_s: float = 1e-3) -> float:
+        """Lets virtual time pass in steps until the condition holds; returns the time in seconds.
+
+        AssertionError when it does not hold within `timeout` seconds of virtual time.
+        """
+        deadline_ns = self.time_ns + round(timeout * 1e9)
+        while not condition():
+            if self.time_ns >= deadline_ns:
+                raise AssertionError(f"condition not met within {timeout:g} s, at {self.time_s:g} s of virtual time")
+            self.advance_to(min(deadline_ns, self.time_ns + round(step_s * 1e9)))
+        return self.time_s
+
+    def advance_to(self, time_ns: int) -> None:
+        """Lets virtual time pass until `time_ns`; commands go out as they fall due, one due just then included."""
+        while True:
+            due_ns = self.drive.command_due_ns
+            stop_ns = time_ns if due_ns is None else min(time_ns, due_ns)
+            if stop_ns > self.time_ns:
+                self._advance(stop_ns)
+            if due_ns is not None and due_ns <= self.time_ns:
+                self.drive.send_command()
+            if self.time_ns >= time_ns:
+                return
+
+    def advance_until_frame(self, wanted: Callable[[can.Message], bool], timeout_s: float) -> can.Message:
+        """Lets virtual time pass until a frame comes that is wanted; TimeoutError after timeout_s."""
+        deadline_ns = self.time_ns + round(timeout_s * 1e9)
+        seen = len(self.log)
+        while self.time_ns < deadline_ns:
+            self.advance_to(min(deadline_ns, self.time_ns + _POLL_STEP_NS))
+            for _, message in self.log[seen:]:
+                if wanted(message):
+                    return message
+            seen = len(self.log)
+        raise TimeoutError(f"no such frame within {timeout_s:g} s")
+
+    def receive_until(self, wanted: Callable[[can.Message], bool]) -> can.Message:
+        """Receives, while time stands still in lock-step, until a frame comes that is wanted."""
+        while True:
+            message = self._receive()
+            if wanted(message):
+                return message
+
+    def send(self, message: can.Message) -> None:
+        """Sends a frame of any kind."""
+        self._bus.send(message, timeout=SILENCE_TIMEOUT_S)
+
+    def _advance(self, time_ns: int) -> None:
+        if self._lockstep:
+            self._run_until(time_ns)
+        else:
+            while self.time_ns < time_ns:
+                self._receive()
+
+    def _run_until(self, time_ns: int) -> None:
+        self._ask_to_run(time_ns)
+        clock = self.receive_until(
+            lambda m: m.arbitration_id == RIG_CLOCK_ID and m.is_extended_id and m.data[6] == self._sequence
+        )
+        self.time_ns = clock_of(clock)[0]
+
+    def _ask_to_run(self, time_ns: int) -> None:
+        self._sequence = (self._sequence + 1) % 256
+        data = time_ns.to_bytes(6, "little") + bytes([self._sequence])
+        identifier = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
+        self.send(can.Message(arbitration_id=identifier, is_extended_id=True, data=data))
+
+    def _receive(self) -> can.Message:
+        timed = self._reader.receive(SILENCE_TIMEOUT_S)
+        if timed is None:
+            raise SessionError(f"{self.address}: nothing came for {SILENCE_TIMEOUT_S:g} s")
+        time_ns, message = timed
+        if not self._lockstep:
+            self.time_ns = max(self.time_ns, time_ns)
+        self.log.append(timed)
+        self.telemetry.add(time_ns, message)
+        self.truth.add(time_ns, message)
+        return message

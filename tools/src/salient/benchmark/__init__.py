@@ -1,0 +1,1 @@
+"""Speed of emulator and firmware."""

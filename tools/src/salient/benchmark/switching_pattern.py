@@ -1,0 +1,172 @@
+"""A switching pattern recorded from a controlled drive, for replaying it without one: by the emulated plant alone, and
+by other simulators of the same machine, so that all of them do the same work.
+"""
+
+from __future__ import annotations
+
+import itertools
+import struct
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from salient.bench.bench import Bench
+from salient.bench.emulator import SimulatorOptions
+from salient.errors import UsageError
+from salient.machine.file import load_machine, machine_path
+from salient.paths import BUILD, ROOT
+
+TICK_NS = 5
+"""HAL_PWM_TICK_NS of hal/hal_pwm.h."""
+
+_PHASES_MAX = 4
+_SETTLE_S = 0.2
+_STATE = np.dtype([("angle_rad", "f8"), ("speed_rad_s", "f8"), ("torque_Nm", "f8"), ("current_A", "f8", _PHASES_MAX)])
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Compare values of each control period (rows; upper and lower, a column a phase) of 2 * period_ticks ticks, and
+    the machine's state where the first begins."""
+
+    machine: str
+    period_ticks: int
+    upper: np.ndarray
+    lower: np.ndarray
+    angle_rad: float
+    speed_rad_s: float
+    load_torque_Nm: float
+    current_A: tuple[float, ...]
+
+    @property
+    def periods(self) -> int:
+        return len(self.upper)
+
+    @property
+    def phases(self) -> int:
+        return self.upper.shape[1]
+
+    @property
+    def period_ns(self) -> int:
+        return 2 * self.period_ticks * TICK_NS
+
+    @property
+    def duration_s(self) -> float:
+        return self.periods * self.period_ns * 1e-9
+
+    def first(self, periods: int) -> Replay:
+        """Only its first periods."""
+        return replace(self, upper=self.upper[:periods], lower=self.lower[:periods])
+
+    def segments(self, period: int) -> Iterator[tuple[int, int, list[int]]]:
+        """(start, end, switches on per phase: 0 to 2) in ns from the period's start, between the edges of its pulses as
+        hal/hal_pwm.h defines them: the upper's around the period's middle, the lower's split over its two ends."""
+        ticks = self.period_ticks
+        upper = np.minimum(self.upper[period], ticks).tolist()
+        lower = np.minimum(self.lower[period], ticks).tolist()
+        instants = {0, 2 * ticks}
+        for up, low in zip(upper, lower, strict=True):
+            instants |= {ticks - up, ticks + up, low, 2 * ticks - low}
+        for start, end in itertools.pairwise(sorted(instants)):
+            from_middle = abs((start + end) / 2 - ticks)
+            on = [(from_middle < up) + (ticks - from_middle < low) for up, low in zip(upper, lower, strict=True)]
+            yield start * TICK_NS, end * TICK_NS, on
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """States at the end of each control period, and the processor seconds that it took to compute them."""
+
+    angle_rad: np.ndarray
+    speed_rad_s: np.ndarray
+    torque_Nm: np.ndarray
+    current_A: np.ndarray
+    """A row a period, a column a phase."""
+    processor_s: float
+    evaluations: int | None = None
+    """Of the right-hand side, where they were counted."""
+
+
+def deviation(measured: Trajectory, reference: Trajectory) -> dict[str, float]:
+    """Largest deviation of currents, torque and speed over the whole run, relative to the largest magnitude of the
+    quantity in the reference, of the speed to its range there."""
+    reach = {
+        "current": np.max(np.abs(reference.current_A)),
+        "torque": np.max(np.abs(reference.torque_Nm)),
+        "speed": np.ptp(reference.speed_rad_s),
+    }
+    difference = {
+        "current": measured.current_A - reference.current_A,
+        "torque": measured.torque_Nm - reference.torque_Nm,
+        "speed": measured.speed_rad_s - reference.speed_rad_s,
+    }
+    return {name: float(np.max(np.abs(difference[name])) / reach[name]) for name in reach}
+
+
+def record(folder: Path, duration_s: float = 0.1) -> Replay:
+    """What the paper's controller does on the saturating machine at 40 kHz while it holds 600 r/min against 8 N m, from
+    0.4 s after its start on. The folder gets the recording of the true state, a row a control period from there on."""
+    machine, load_torque_Nm, control_rate_hz = "saturating", 8.0, 40_000
+    period_ns = 1_000_000_000 // control_rate_hz
+    options = SimulatorOptions(
+        machine=machine,
+        controller="paper",
+        control_rate_hz=control_rate_hz,
+        record=folder / "recording.npy",
+        record_from_us=round(2 * _SETTLE_S * 1e6),
+        record_step_ns=period_ns,
+        record_switches=folder / "switches",
+    )
+    with Bench(options, f"unix:{folder}/can.sock") as bench:
+        bench.rig.truth_period_us = 0
+        bench.drive.speed_reference_rpm = 600.0
+        bench.run_for(_SETTLE_S)
+        bench.load_torque_Nm = load_torque_Nm
+        bench.run_for(_SETTLE_S + duration_s)
+    start = np.load(options.record)[0]
+    compares = np.fromfile(options.record_switches, dtype="u2").reshape(-1, 2, _PHASES_MAX)
+    phases = load_machine(machine_path(machine)).phases
+    # The first row acts from the end of the first period on.
+    first = round(start["time_s"] * 1e9 / period_ns) - 1
+    rows = compares[first : first + round(duration_s * 1e9 / period_ns), :, :phases].astype(int)
+    return Replay(
+        machine=machine,
+        period_ticks=period_ns // (2 * TICK_NS),
+        upper=rows[:, 0],
+        lower=rows[:, 1],
+        angle_rad=float(np.radians(start["rotor_angle_deg"], dtype=float)),
+        speed_rad_s=float(start["speed_rpm"]) * np.pi / 30.0,
+        load_torque_Nm=load_torque_Nm,
+        current_A=tuple(float(start[f"current_{'abcd'[phase]}_A"]) for phase in range(phases)),
+    )
+
+
+def program(machine: str) -> Path:
+    """The plant of a shipped machine alone; UsageError when it is not built."""
+    path = BUILD / "host" / "bin" / f"plant_benchmark_{machine}"
+    if not path.exists():
+        raise UsageError(f"{path.relative_to(ROOT)} is not built; tools/salient bench builds it")
+    return path
+
+
+def program_input(replay: Replay, passes: int, step_factor: float = 1.0) -> bytes:
+    """What plant_benchmark_<machine> reads (emulator/plant_benchmark/main.c)."""
+    current_A = [*replay.current_A, *[0.0] * (_PHASES_MAX - replay.phases)]
+    state = (replay.angle_rad, replay.speed_rad_s, replay.load_torque_Nm, *current_A, step_factor)
+    head = struct.pack("8d4I", *state, replay.period_ticks, replay.periods, passes, 0)
+    compares = np.zeros((replay.periods, 2, _PHASES_MAX), dtype="u2")
+    compares[:, 0, : replay.phases], compares[:, 1, : replay.phases] = replay.upper, replay.lower
+    return head + compares.tobytes()
+
+
+def run_plant(replay: Replay, passes: int, step_factor: float = 1.0) -> Trajectory:
+    """By the emulated plant alone; processor_s is the shortest of the passes."""
+    done = subprocess.run([program(replay.machine)], input=program_input(replay, passes, step_factor),
+                          stdout=subprocess.PIPE, check=True)
+    times_s = np.frombuffer(done.stdout[: 8 * passes])
+    states = np.frombuffer(done.stdout[8 * passes :], dtype=_STATE)
+    return Trajectory(states["angle_rad"], states["speed_rad_s"], states["torque_Nm"],
+                      states["current_A"][:, : replay.phases], float(np.min(times_s)))

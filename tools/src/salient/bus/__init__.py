@@ -1,0 +1,1 @@
+"""CAN: interface to the local bus, signals, end-to-end protection, logs, virtual time, monitor."""

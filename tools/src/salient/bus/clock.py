@@ -1,0 +1,101 @@
+"""Frames with their exact virtual time, from either transport.
+
+The local bus carries the time in every record. SocketCAN carries none; there the emulator sends RIG_STAMP frames:
+before each frame of its own one with subject "next", and when a client's frame (which is on the interface already)
+completes on the emulated bus or was taken at once, one that says so. The reader puts frame and stamp together and
+leaves the stamps out, so both transports give the same list of (time, frame), in the same order.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import can
+import cantools
+
+from salient.bus.interface import is_on_bus
+from salient.bus.signals import drive_database, rig_database
+from salient.errors import UsageError
+
+RIG_CLOCK_ID = 0x1F000002
+RIG_STAMP_ID = 0x1F000005
+_STAMP_NEXT, _STAMP_OLDEST_ON_BUS, _STAMP_OLDEST_AT_ONCE = 0, 1, 2
+
+
+def _sent_by(database: cantools.database.Database, node: str) -> frozenset[int]:
+    return frozenset(message.frame_id for message in database.messages if node in message.senders)
+
+
+def open_bus(address: str, receive_own_messages: bool = True) -> can.BusABC:
+    """Opens "unix:PATH" or "socketcan:INTERFACE"; UsageError when nothing is there."""
+    kind, _, name = address.partition(":")
+    try:
+        if kind == "unix" and name:
+            return can.Bus(interface="salient", channel=address, receive_own_messages=receive_own_messages)
+        if kind == "socketcan" and name:
+            return can.Bus(interface="socketcan", channel=name, fd=True, receive_own_messages=receive_own_messages)
+    except can.CanInitializationError as error:
+        raise UsageError(str(error)) from None
+    except OSError as error:
+        raise UsageError(f"--can {address}: {error.strerror}") from None
+    raise UsageError(f"--can {address}: allowed are unix:PATH and socketcan:INTERFACE")
+
+
+class VirtualTimeReader:
+    """Reads a bus that was opened with receive_own_messages=True."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        # On SocketCAN a client that sends one of these between a stamp and its frame would take the frame's time; a bus
+        # with two senders of one identifier is broken anyway.
+        self._drive_sends = _sent_by(drive_database(), "DRIVE")
+        self._rig_sends = _sent_by(rig_database(), "RIG")
+        self._stamped = not hasattr(bus, "receive_own_messages")  # SocketCAN
+        self._next_ns: int | None = None
+        self._waiting_on_bus: deque[can.Message] = deque()
+        self._waiting_at_once: deque[can.Message] = deque()
+
+    def receive(self, timeout: float | None) -> tuple[int, can.Message] | None:
+        """The next (virtual time in ns, message), or None when nothing came within `timeout` seconds."""
+        while True:
+            message = self._bus.recv(timeout)
+            if message is None:
+                return None
+            if not self._stamped:
+                return message.time_ns, message
+            timed = self._put_together(message)
+            if timed is not None:
+                return timed
+
+    def _put_together(self, message: can.Message) -> tuple[int, can.Message] | None:
+        identifier = message.arbitration_id
+        if message.is_extended_id and identifier == RIG_STAMP_ID and len(message.data) == 7:
+            time_ns, subject = clock_of(message)
+            if subject == _STAMP_NEXT:
+                self._next_ns = time_ns
+                return None
+            waiting = self._waiting_on_bus if subject == _STAMP_OLDEST_ON_BUS else self._waiting_at_once
+            # Nothing waits when the frame was on the interface before this reader was.
+            return _timed(time_ns, waiting.popleft()) if waiting else None
+        if message.is_extended_id and identifier == RIG_CLOCK_ID and len(message.data) == 7:
+            return _timed(clock_of(message)[0], message)
+        if self._next_ns is not None and self._is_emulators(message):
+            time_ns, self._next_ns = self._next_ns, None
+            return _timed(time_ns, message)
+        (self._waiting_on_bus if is_on_bus(message) else self._waiting_at_once).append(message)
+        return None
+
+    def _is_emulators(self, message: can.Message) -> bool:
+        if message.is_fd or message.is_error_frame or message.is_remote_frame:
+            return False
+        return message.arbitration_id in (self._rig_sends if message.is_extended_id else self._drive_sends)
+
+
+def clock_of(message: can.Message) -> tuple[int, int]:
+    """Time in ns and last byte (sequence or subject) of RIG_CLOCK and RIG_STAMP, which share their layout."""
+    return int.from_bytes(message.data[:6], "little"), message.data[6]
+
+
+def _timed(time_ns: int, message: can.Message) -> tuple[int, can.Message]:
+    message.timestamp = time_ns / 1e9
+    return time_ns, message

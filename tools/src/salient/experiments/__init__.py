@@ -1,0 +1,1 @@
+"""Scenarios, the paper's experiments, metrics, plots and reports."""

@@ -1,0 +1,315 @@
+"""The runs that compare makes, by group.
+
+A group's runs fall into conditions, a row or a few of the table each; the runs of a condition differ by controller and,
+where a figure is a statistic, by sample. Runs that are asked for twice are made once (compare/runner.py).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from salient.cli import CONTROLLERS
+from salient.experiments.compare.metrics import STEADY_S
+from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
+
+# The drive's parameters that conditions set, by what they do; the numbers are the drive's.
+LOAD_KNOWN = {"load_source": 1}
+PULSES = {1: {"pulses_per_period": 1}, 2: {"pulses_per_period": 2}}
+NETWORK = {"off": 0, "fixed": 1, "frozen": 2, "learning": 3}
+NETWORK_PARAMETER = {"paper": "bp_mode", "salient": "bp_trim_mode"}
+RESERVE = {"torque_reserve_Nm": 8.0}
+SWITCHES = {
+    "observer fixed": {"observer_waking": 0}, "observer waking": {"observer_waking": 1},
+    "sharing off": {"torque_sharing": 0}, "sharing on": {"torque_sharing": 1},
+    "trim off": {"angle_trim": 0}, "trim on": {"angle_trim": 1},
+}  # fmt: skip
+"""Of the controller salient."""
+
+MAGNETICS = ("saturating", "linear_cosine", "linear_trapezoid")
+MACHINES = (*MAGNETICS, "finite_element")
+
+LOAD_NM = 8.0
+RIPPLE_RPM = 150.0
+STEP_AT_S = 0.13
+RIPPLE_FROM_S = 0.3
+LONG_S = 1.0
+LATE_S = 3.0
+"""By then what learns has learnt: 90 strokes at 150 r/min."""
+
+IMPERFECTIONS: dict[str, dict[str, float]] = {
+    "20 mA of noise": {"current_noise_A": 0.02},
+    "0.05 deg off": {"encoder_offset_deg": 0.05},
+    "flux linkage +5 %": {"flux_linkage_gain": 1.05},
+    "resistance +20 %": {"resistance_gain": 1.2},
+    "minimum pulse 200 ns": {"minimum_pulse_ns": 200.0},
+}
+ALL_IMPERFECTIONS = {name: value for one in IMPERFECTIONS.values() for name, value in one.items()}
+
+SENSING: dict[str, dict[str, Any]] = {
+    "17 bits": {},
+    "17 bits and edge stamps": {"encoder_edges": True},
+    "ideal sensing": {"encoder_bits": 0, "adc_bits": 16},
+}
+PAPER_CONDITIONS = {"control_rate_hz": 1_000_000, "encoder_bits": 0, "adc_bits": 16, "immediate_pwm": True}
+PAPER_PARAMETERS = {**LOAD_KNOWN, "observer_bandwidth_rad_s": 8000, "torque_band_inner_Nm": 0.01,
+                    "torque_band_outer_Nm": 0.02, "outgoing_off_angle_deg": 356}
+"""For those conditions. The observer is not told the load: while it finds it, it believes a speed that is too high;
+exact sensing lets it be fast. The bands' defaults are for 40 kHz, where the torque moves by newton metres in a period.
+And a phase that must go at 87 degrees (348) with what current it has leaves a hole that shows at this scale; at 89 it
+has none left."""
+
+ANGLES, ANGLES_QUICK = 24, 6
+STROKE_DEG = 30.0
+_STROKE_S = STROKE_DEG / (6.0 * RIPPLE_RPM)
+SEEDS = (1, 2, 3, 4, 5)
+DRIVES = 500
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run and what is taken of it.
+
+    sample: which of a condition's runs, "" for the only one. measure: of compare/metrics.py. traced: keep the
+    torque over the paper's window for a picture.
+    """
+
+    group: str
+    condition: str
+    controller: str
+    measure: str
+    scenario: Scenario
+    sample: str = ""
+    traced: bool = False
+
+
+@dataclass(frozen=True)
+class Group:
+    """A part of the comparison. shown: (figure, statistic) of its rows, of those that its runs have; the statistic is
+    "" for the figure of the only run, else median, worst, gap (the widest between angles, of STROKE_DEG) or count (of
+    the runs that failed)."""
+
+    title: str
+    cases: Callable[[bool], Iterator[Case]]
+    shown: tuple[tuple[str, str], ...]
+    long: bool = False
+
+
+def _ripple(quick: bool) -> Iterator[Case]:
+    def cases(condition: str, traced: bool = False, **fields: Any) -> Iterator[Case]:
+        yield from _held("ripple", condition, RIPPLE_RPM, RIPPLE_FROM_S, quick, traced, **fields)
+
+    for rate_hz in (40_000,) if quick else (40_000, 20_000, 100_000):
+        for machine in MACHINES:
+            for pulses in PULSES:
+                condition = f"{machine}, {_khz(rate_hz)}, {_pulses(pulses)}"
+                traced = machine == "saturating" and rate_hz == 40_000
+                yield from cases(condition, traced, machine=machine, control_rate_hz=rate_hz, pulses=pulses)
+    for machine in MAGNETICS if quick else MACHINES:
+        for pulses in PULSES:
+            yield from cases(f"{machine}, 40 kHz, {_pulses(pulses)}, all imperfections", machine=machine,
+                             pulses=pulses, bench=ALL_IMPERFECTIONS)
+    if not quick:
+        for name, bench in IMPERFECTIONS.items():
+            yield from cases(f"saturating, 40 kHz, one pulse, {name}", machine="saturating", pulses=1, bench=bench)
+
+
+def _speeds(quick: bool) -> Iterator[Case]:
+    # Loaded when they run without load: the start at 19.1 N m takes 0.42 s to 3000 r/min.
+    machines = [("saturating", None)] if quick else [(machine, None) for machine in MAGNETICS] + [("saturating", 1)]
+    for machine, pulses in machines:
+        for speed_rpm, loaded_s in ((600.0, 0.2), (1500.0, 0.4), (3000.0, 0.8)):
+            condition = f"{machine}{f' with {_pulses(pulses)}' if pulses else ''}, {speed_rpm:g} r/min"
+            yield from _held("speeds", condition, speed_rpm, loaded_s + 0.5, quick, loaded_s=loaded_s,
+                             machine=machine, pulses=pulses)
+
+
+def _loads(quick: bool) -> Iterator[Case]:
+    for machine in ("saturating",) if quick else MAGNETICS:
+        for load_Nm in (2.0, 15.0) if quick else (1.0, 2.0, 4.0, 8.0, 12.0, 15.0):
+            yield from _held("loads", f"{machine}, {load_Nm:g} N m", RIPPLE_RPM, RIPPLE_FROM_S, quick,
+                             load_Nm=load_Nm, machine=machine)
+
+
+def _start(quick: bool) -> Iterator[Case]:
+    for machine in ("saturating",) if quick else MACHINES:
+        yield from _by_controller("start", machine, "start", start_scenario(machine=machine))
+
+
+def _dip(quick: bool) -> Iterator[Case]:
+    angles = ANGLES_QUICK if quick else ANGLES
+    conditions = [("saturating", sensing) for sensing in SENSING]
+    if not quick:
+        conditions += [(machine, sensing) for machine in MAGNETICS[1:] for sensing in list(SENSING)[1:]]
+    for machine, sensing in conditions:
+        for number in range(angles):
+            step_s = STEP_AT_S + number * _STROKE_S / angles
+            scenario = _scenario(machine=machine, duration_s=step_s + 0.3, speed=(SpeedStep(0.0, RIPPLE_RPM),),
+                                 load=(LoadStep(step_s, LOAD_NM),), record=Record(10.0, 0.09), **SENSING[sensing])
+            sample = f"angle {number:02}"
+            yield from _by_controller("dip", f"{machine}, {sensing}", "load_step", scenario, sample)
+            if machine == "saturating" and sensing != "17 bits" and not quick:
+                yield Case("dip", f"{machine}, {sensing}, reserve of 8 N m", "salient", "load_step",
+                           replace(scenario, controller="salient", parameters=RESERVE), sample)
+
+
+def _paper_conditions(quick: bool) -> Iterator[Case]:
+    for machine in ("saturating",) if quick else MAGNETICS:
+        step = replace(step_scenario(machine=machine, **PAPER_CONDITIONS), duration_s=0.5)
+        # At 10 ms, when the parameters are written: they go over CAN first.
+        start = replace(start_scenario(machine=machine, **PAPER_CONDITIONS), speed=(SpeedStep(0.01, 600.0),))
+        for condition, scenario, measure, parameters in (
+            ("load step", step, "step_and_ripple", PAPER_PARAMETERS),
+            ("load step, usual parameters", step, "step_and_ripple", LOAD_KNOWN),
+            ("start", start, "start", PAPER_PARAMETERS)):
+            for controller in ("traditional", "paper"):
+                yield Case("paper_conditions", f"{machine}, {condition}", controller, measure,
+                           replace(scenario, controller=controller, parameters=parameters))
+
+
+def _ablation(quick: bool) -> Iterator[Case]:
+    tables = {"exact tables": 0.0, "0.2 deg off": 0.2, "0.5 deg off": 0.5}
+    changes = [(controller, f"BP-PID {mode}", {parameter: number})
+               for controller, parameter in NETWORK_PARAMETER.items() for mode, number in NETWORK.items()]
+    changes += [("salient", change, parameters) for change, parameters in SWITCHES.items()]
+    for table, offset_deg in list(tables.items())[-1 if quick else 0:]:
+        for controller, change, parameters in changes:
+            for seed in SEEDS[:1] if quick else SEEDS:
+                # The seed moves the load step within a stroke, too.
+                step = _scenario(controller=controller, seed=seed, duration_s=RIPPLE_FROM_S + 0.1,
+                                 speed=(SpeedStep(0.0, RIPPLE_RPM),),
+                                 load=(LoadStep(STEP_AT_S + (seed - 1) * _STROKE_S / len(SEEDS), LOAD_NM),),
+                                 record=Record(1.0, STEP_AT_S), parameters={"bp_seed": seed, **parameters},
+                                 bench={"current_noise_A": 0.02, "encoder_offset_deg": offset_deg})
+                late = replace(step, duration_s=LATE_S, record=Record(1.0, LATE_S - 0.1))
+                for measure, scenario in (("step_and_ripple", step), ("late_ripple", late)):
+                    yield Case("ablation", f"{change}, {table}", controller, measure, scenario, f"seed {seed}")
+
+
+def _robustness(quick: bool) -> Iterator[Case]:
+    for number in range(10 if quick else DRIVES):
+        yield from _by_controller("robustness", "random drives", "robustness", random_drive(number),
+                                  f"drive {number:03}")
+
+
+def random_drive(number: int) -> Scenario:
+    """A drive and bench of the robustness study, the same for the same number: start to 150 r/min (even numbers) or
+    600 r/min, then 8 N m."""
+    draw = np.random.default_rng(number).uniform
+    bench = {
+        "flux_linkage_gain": draw(0.9, 1.1),
+        "resistance_gain": draw(0.8, 1.5),
+        "inertia_gain": math.exp(draw(math.log(0.5), math.log(3.0))),
+        "friction_gain": draw(0.0, 5.0),
+        "supply_voltage_V": draw(200.0, 280.0),
+        "encoder_offset_deg": draw(-0.1, 0.1),
+        "current_noise_A": draw(0.0, 0.04),
+    }
+    encoder_bits = int(draw(14.0, 21.0))
+    # CAN carries the bench's quantities as single floats; what is written down is what acts.
+    bench = {name: float(np.float32(value)) for name, value in bench.items()}
+    return _scenario(seed=number, duration_s=0.5 + 0.2 + STEADY_S, speed=(SpeedStep(0.0, (150.0, 600.0)[number % 2]),),
+                     load=(LoadStep(0.5, LOAD_NM),), record=Record(2.0, 0.0), encoder_bits=encoder_bits, bench=bench,
+                     initial_angle_deg=round(draw(0.0, 90.0), 3))
+
+
+GROUPS: dict[str, Group] = {
+    "ripple": Group("torque ripple at 150 r/min, 8 N m", _ripple, (("ripple", ""), ("ripple_long", ""))),
+    "speeds": Group("torque ripple over speed, 8 N m, 40 kHz", _speeds,
+                    (("ripple", ""), ("ripple_long", ""), ("speed_error_percent", ""))),
+    "loads": Group("torque ripple over load, 150 r/min, 40 kHz", _loads,
+                   (("ripple", ""), ("ripple_long", ""))),
+    "start": Group("start to 600 r/min, no load, 40 kHz", _start, (("settling_time_s", ""), ("overshoot_percent", ""))),
+    "dip": Group("load step of 8 N m at 150 r/min, over the rotor's angle, 40 kHz", _dip,
+                 (("speed_dip_rpm", "median"), ("speed_dip_rpm", "worst"), ("recovery_time_s", "median"),
+                  ("speed_after_rpm", "worst"), ("copper_W", "median"), ("step_angle_deg", "gap"))),
+    "paper_conditions": Group("the paper's conditions: 1 MHz, no delay, exact sensing, load torque known",
+                              _paper_conditions,
+                              (("settling_time_s", ""), ("overshoot_percent", ""), ("speed_dip_rpm", ""),
+                               ("recovery_time_s", ""), ("speed_after_rpm", ""), ("torque_mean_Nm", ""),
+                               ("ripple", ""))),
+    "ablation": Group("parts switched off, 40 kHz, saturating, 20 mA of noise, five seeds", _ablation,
+                      (("ripple", "median"), ("ripple", "worst"), ("ripple_late", "median"),
+                       ("ripple_late", "worst"), ("speed_dip_rpm", "median"),
+                       ("speed_dip_rpm", "worst")), long=True),
+    "robustness": Group("random drives: start to 150 or 600 r/min, then 8 N m, 40 kHz", _robustness,
+                        (("failed", "count"), ("settling_time_s", "median"), ("settling_time_s", "worst"),
+                         ("peak_current_A", "median"), ("peak_current_A", "worst"),
+                         ("highest_speed_percent", "median"), ("highest_speed_percent", "worst"),
+                         ("speed_dip_rpm", "median"), ("speed_dip_rpm", "worst"),
+                         ("speed_error_percent", "median"), ("speed_error_percent", "worst"),
+                         ("cycle_percent", "median"), ("cycle_percent", "worst")), long=True),
+}
+
+
+# --- scenarios ------------------------------------------------------------------------------------------------------
+
+def start_scenario(**fields: Any) -> Scenario:
+    """From standstill to 600 r/min without load."""
+    return _scenario(duration_s=0.5, speed=(SpeedStep(0.0, 600.0),), record=Record(10.0, 0.0), **fields)
+
+
+def step_scenario(**fields: Any) -> Scenario:
+    """The paper's load step, recorded from it on to the end of its ripple window."""
+    return _scenario(duration_s=RIPPLE_FROM_S + 0.1, speed=(SpeedStep(0.0, RIPPLE_RPM),),
+                     load=(LoadStep(STEP_AT_S, LOAD_NM),), record=Record(1.0, STEP_AT_S), **fields)
+
+
+def _scenario(**fields: Any) -> Scenario:
+    return Scenario(name="compare", **fields)
+
+
+def _held(group: str, condition: str, speed_rpm: float, from_s: float, quick: bool, traced: bool = False,
+          loaded_s: float = STEP_AT_S, load_Nm: float = LOAD_NM, pulses: int | None = None,
+          **fields: Any) -> Iterator[Case]:
+    """A speed held against a load, recorded from from_s on. pulses: None for what the drive does by itself."""
+    scenario = _scenario(duration_s=from_s + (0.1 if quick else LONG_S), speed=(SpeedStep(0.0, speed_rpm),),
+                         load=(LoadStep(loaded_s, load_Nm),), record=Record(1.0, from_s), **fields)
+    for case in _by_controller(group, condition, "ripple", scenario):
+        if case.controller == "salient" and pulses:
+            case = replace(case, scenario=replace(case.scenario, parameters=PULSES[pulses]))
+        yield replace(case, traced=traced)
+
+
+def _by_controller(group: str, condition: str, measure: str, scenario: Scenario, sample: str = "") -> Iterator[Case]:
+    for controller in CONTROLLERS:
+        yield Case(group, condition, controller, measure, replace(scenario, controller=controller), sample)
+
+
+def scenario_toml(case: Case) -> str:
+    """The run as a scenario file for `tools/salient run`."""
+    scenario = case.scenario
+    lines = [f"# {case.group}: {case.condition} {case.sample}".rstrip(), f'machine = "{scenario.machine}"',
+             f'controllers = ["{scenario.controller}"]']
+    plain = Scenario(name="", duration_s=0.0)
+    tables: list[tuple[str, Mapping[str, float]]] = []
+    for key, value in vars(scenario).items():
+        if key in ("name", "machine", "controller") or value == getattr(plain, key):
+            continue
+        if isinstance(value, Mapping):
+            tables.append((f"[{key}]", value))
+        elif isinstance(value, tuple):
+            tables += [(f"[[{key}]]", vars(step)) for step in value]
+        elif isinstance(value, Record):
+            tables.append((f"[{key}]", vars(value)))
+        else:
+            lines.append(f"{key} = {_toml(value)}")
+    for head, content in tables:
+        lines += ["", head, *(f"{key} = {_toml(value)}" for key, value in content.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: bool | int | float) -> str:
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _khz(rate_hz: int) -> str:
+    return f"{rate_hz / 1000:g} kHz"
+
+
+def _pulses(pulses: int) -> str:
+    return ("one pulse", "two pulses")[pulses - 1]

@@ -1,0 +1,336 @@
+"""The pictures of compare.html, drawn from the content of compare.json (results_file.py). Equal content gives equal
+bytes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from salient.cli import CONTROLLERS
+from salient.experiments.compare.baseline import Change
+from salient.experiments.compare.metrics import FIGURES
+from salient.experiments.compare.table import in_order
+from salient.experiments.plots import CONTROLLER_COLOUR, STYLE
+from salient.experiments.results import PAPER
+
+Content = Mapping[str, Any]
+
+_WANTED_COLOUR = "#222222"
+_PRINTED_COLOUR = "#6f6f6f"
+_MARKER = {"traditional": "s", "paper": "D", "salient": "o"}
+_CHANGES_MAX = 60
+
+_STYLE = {**STYLE, "font.size": 9.0, "axes.titlesize": 9.5}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """png: the file's bytes."""
+
+    title: str
+    caption: str
+    png: bytes
+
+
+def group_pictures(group: str, content: Content) -> list[Picture]:
+    """The pictures of a group; none for a group that is a table only, or has nothing to draw."""
+    made = []
+    for title, caption, draw in _PICTURES.get(group, ()):
+        png = _draw(draw, content)
+        if png is not None:
+            made.append(Picture(title, caption, png))
+    return made
+
+
+def changes_picture(changes: Sequence[Change]) -> Picture | None:
+    """The changes against an earlier run, the largest ones first; None when none can be drawn."""
+    drawn = sorted((change for change in changes if change.percent is not None), key=lambda one: -abs(one.percent))
+    drawn = drawn[:_CHANGES_MAX]
+    if not drawn:
+        return None
+    png = _draw(lambda content: _changes(drawn), {})
+    caption = "Each line is a figure that changed by more than the threshold: to the right it got worse."
+    return png and Picture("Against the earlier run", caption, png)
+
+
+# --- ripple ---------------------------------------------------------------------------------------------------------
+
+def _ripples(content: Content) -> Figure | None:
+    """Panels by rate and imperfections, machines along x, a marker a controller and number of pulses."""
+    rows = [row for row in _rows(content, "ripple") if row["figure"] == "ripple"]
+    panels: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        parts = row["condition"].split(", ")
+        title = ", ".join([parts[1], *parts[3:]])
+        if len(parts) < 4 or parts[3] == "all imperfections":
+            panels.setdefault(title, []).append(row)
+        else:
+            panels.setdefault("40 kHz, one imperfection, saturating", []).append(row)
+    if not panels:
+        return None
+    figure, axes = _panels(len(panels), columns=2, height_in=3.2, sharey=True)
+    for axis, (title, of) in zip(axes, panels.items(), strict=True):
+        single = "one imperfection" in title
+        places = list(dict.fromkeys(_place(row, single) for row in of))
+        for row in of:
+            two = "two pulses" in row["condition"]
+            for controller, value in row["values"].items():
+                if value is None or two and controller != "salient":
+                    continue
+                x = places.index(_place(row, single)) + 0.16 * (CONTROLLERS.index(controller) - 1) + 0.12 * two
+                axis.plot(x, value, _MARKER.get(controller, "o"), color=_colour(controller), markersize=6,
+                          markerfacecolor="white" if two else _colour(controller))
+            if row["wanted"] is not None:
+                x = places.index(_place(row, single)) + 0.16 + 0.12 * two
+                axis.plot([x - 0.09, x + 0.09], [row["wanted"]] * 2, color=_WANTED_COLOUR, linewidth=1.4)
+        axis.set_xticks(range(len(places)), places, rotation=20 if single else 0, ha="right" if single else "center")
+        axis.set_xlim(-0.5, len(places) - 0.5)
+        _logarithmic(axis.yaxis)
+        axis.set_title(title)
+        axis.axhline(PAPER["load_step_150"]["paper"]["torque_ripple"], color=_PRINTED_COLOUR, linewidth=0.8,
+                     linestyle=(0, (4, 2)))
+    axes[0].set_ylabel("K$_t$ over 0.1 s")
+    _legend(figure, rows)
+    return figure
+
+
+def _place(row: Mapping[str, Any], single: bool) -> str:
+    parts = row["condition"].split(", ")
+    return parts[-1] if single else parts[0].replace("_", "\n")
+
+
+def _traces(content: Content) -> Figure | None:
+    """Torque over the paper's window, a panel a controller and number of pulses, each on a scale of its own."""
+    traces = [trace for trace in content["traces"]
+              if trace["controller"] == "salient" or "one pulse" in trace["condition"]]
+    if not traces:
+        return None
+    figure, axes = _panels(len(traces), columns=1, height_in=1.7)
+    for axis, trace in zip(axes, traces, strict=True):
+        torque_Nm = np.asarray(trace["torque_Nm"])
+        axis.plot(trace["time_s"], torque_Nm, color=_colour(trace["controller"]), linewidth=0.7)
+        pulses = f", {trace['condition'].split(', ')[2]}" if trace["controller"] == "salient" else ""
+        axis.set_title(f"{trace['controller']}{pulses}: {torque_Nm.min():.3f} to {torque_Nm.max():.3f} N m")
+        axis.set_ylabel("N m")
+        axis.set_xlim(trace["time_s"][0], trace["time_s"][-1])
+    axes[-1].set_xlabel("time / s")
+    return figure
+
+
+def _over_speed(content: Content) -> Figure | None:
+    return _over(content, "speeds", "speed / (r/min)")
+
+
+def _over_load(content: Content) -> Figure | None:
+    return _over(content, "loads", "load / (N m)")
+
+
+def _over(content: Content, group: str, label: str) -> Figure | None:
+    """The ripple over the number that a condition's second part begins with, a panel a machine."""
+    rows = [row for row in _rows(content, group) if row["figure"] == "ripple"]
+    by_machine: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        by_machine.setdefault(row["condition"].split(", ")[0], []).append(row)
+    if not rows:
+        return None
+    figure, axes = _panels(len(by_machine), columns=4, height_in=3.0, sharey=True)
+    for axis, (machine, of) in zip(axes, by_machine.items(), strict=True):
+        numbers = [float(row["condition"].split(", ")[1].split()[0]) for row in of]
+        for controller in _controllers(rows):
+            values = [row["values"].get(controller) or np.nan for row in of]
+            axis.plot(numbers, values, _MARKER.get(controller, "o") + "-", color=_colour(controller), markersize=5)
+        wanted = [(number, row["wanted"]) for number, row in zip(numbers, of, strict=True) if row["wanted"] is not None]
+        if wanted:
+            axis.plot(*zip(*wanted, strict=True), "_", color=_WANTED_COLOUR, markersize=16, markeredgewidth=1.5)
+        _logarithmic(axis.yaxis)
+        axis.set_xticks(numbers)
+        axis.set_title(machine)
+        axis.set_xlabel(label)
+    axes[0].set_ylabel("K$_t$ over 0.1 s")
+    _legend(figure, rows)
+    return figure
+
+
+# --- load step ------------------------------------------------------------------------------------------------------
+
+def _over_angle(content: Content) -> Figure | None:
+    runs = [run for run in content["runs"] if run["group"] == "dip" and run["figures"]]
+    conditions = list(dict.fromkeys(run["condition"] for run in runs))
+    if not conditions:
+        return None
+    limits = {(row["condition"], row["statistic"]): row for row in _rows(content, "dip")
+              if row["figure"] == "speed_dip_rpm"}
+    figure, axes = _panels(len(conditions), columns=3, height_in=2.9, sharey=True)
+    for axis, condition in zip(axes, conditions, strict=True):
+        for controller in _controllers_of_runs(runs):
+            points = sorted((run["figures"]["step_angle_deg"], run["figures"]["speed_dip_rpm"]) for run in runs
+                            if run["condition"] == condition and run["controller"] == controller)
+            if points:
+                axis.plot(*zip(*points, strict=True), _MARKER.get(controller, "o") + "-", color=_colour(controller),
+                          markersize=3.5, linewidth=1.0)
+        for statistic, dash in (("median", (0, (1, 2))), ("worst", (0, (5, 2)))):
+            row = limits.get((condition, statistic))
+            if row and row["bound"] is not None:
+                axis.axhline(row["bound"], color=_PRINTED_COLOUR, linewidth=1.0, linestyle=dash)
+        _logarithmic(axis.yaxis)
+        axis.set_title(condition.replace(", reserve", ",\nreserve"))
+        axis.set_xlabel("rotor angle within a stroke / deg")
+    axes[0].set_ylabel("dip / (r/min)")
+    _legend(figure, _rows(content, "dip"))
+    return figure
+
+
+# --- studies --------------------------------------------------------------------------------------------------------
+
+def _ablations(content: Content) -> Figure | None:
+    """Changes along y; columns by table; a row of panels a figure; a dot a seed."""
+    runs = [run for run in content["runs"] if run["group"] == "ablation" and run["figures"]]
+    if not runs:
+        return None
+    tables = list(dict.fromkeys(run["condition"].split(", ")[1] for run in runs))
+    changes = list(dict.fromkeys(run["condition"].split(", ")[0] for run in runs))
+    names = {"ripple": "K$_t$ over 0.1 s", "ripple_late": "K$_t$ after 3 s", "speed_dip_rpm": "dip / (r/min)"}
+    figure, axes = _panels(len(names) * len(tables), columns=len(tables), height_in=0.6 + 0.22 * len(changes),
+                           sharey=True)
+    controllers = _controllers_of_runs(runs)
+    for number, (name, label) in enumerate(names.items()):
+        for column, table in enumerate(tables):
+            axis = axes[number * len(tables) + column]
+            for run in runs:
+                change, its_table = run["condition"].split(", ")
+                if its_table == table and name in run["figures"]:
+                    y = changes.index(change) + 0.2 * (controllers.index(run["controller"]) - 0.5)
+                    axis.plot(run["figures"][name], y, _MARKER.get(run["controller"], "o"), alpha=0.7,
+                              color=_colour(run["controller"]), markersize=4, markeredgewidth=0)
+            axis.set_yticks(range(len(changes)), changes)
+            axis.set_ylim(len(changes) - 0.5, -0.5)
+            _logarithmic(axis.xaxis)
+            axis.set_title(table)
+            axis.set_xlabel(label)
+    _legend(figure, _rows(content, "ablation"))
+    return figure
+
+
+def _distributions(content: Content) -> Figure | None:
+    """How many of the drives stay below a value, a panel a figure, with its limit."""
+    runs = [run for run in content["runs"] if run["group"] == "robustness" and run["figures"]]
+    rows = {row["figure"]: row for row in _rows(content, "robustness") if row["statistic"] == "worst"}
+    if not runs or not rows:
+        return None
+    figure, axes = _panels(len(rows), columns=3, height_in=2.5, sharey=True)
+    for axis, (name, row) in zip(axes, rows.items(), strict=True):
+        of = FIGURES[name]
+        for controller in _controllers_of_runs(runs):
+            values = [run["figures"][name] for run in runs if run["controller"] == controller]
+            numbers = sorted(value * of.factor for value in values if value is not None)
+            axis.step(numbers, 100.0 * np.arange(1, len(numbers) + 1) / len(values), color=_colour(controller),
+                      where="post", linewidth=1.3)
+        if row["wanted"] is not None:
+            axis.axvline(row["wanted"] * of.factor, color=_WANTED_COLOUR, linewidth=1.2, linestyle=(0, (5, 2)))
+        if name in ("speed_error_percent", "cycle_percent", "speed_dip_rpm"):
+            _logarithmic(axis.xaxis)
+        axis.set_xlabel(f"{of.words}, {of.unit}")
+    for axis in axes[::3]:
+        axis.set_ylabel("drives, %")
+    _legend(figure, list(rows.values()))
+    return figure
+
+
+def _changes(changes: Sequence[Change]) -> Figure:
+    figure, (axis,) = _panels(1, columns=1, height_in=0.8 + 0.2 * len(changes))
+    for y, change in enumerate(changes):
+        colour = "#b3261e" if change.worse else "#1b7f5c"
+        axis.plot([0.0, change.percent], [y, y], color=colour, linewidth=2.0)
+        axis.plot(change.percent, y, "o", color=colour, markersize=4)
+    axis.set_yticks(range(len(changes)), [f"{change.key[1]}, {change.controller}: {change.words}"
+                                          for change in changes], fontsize=7.5)
+    axis.set_ylim(len(changes) - 0.5, -0.5)
+    axis.axvline(0.0, color="#555555", linewidth=0.8)
+    axis.set_xlabel("change, %")
+    return figure
+
+
+_PICTURES: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...]] = {
+    "ripple": (
+        ("Torque ripple by machine and rate",
+         "K_t of the true torque, sampled every microsecond. Hollow: two pulses a period. Short lines: what is wanted;"
+         " dashed: what the paper prints for its own controller.", _ripples),
+        ("Torque over the paper's window", "Saturating machine, 40 kHz; each panel on a scale of its own. Every slice"
+         " of the window is drawn from its lowest to its highest sample.", _traces),
+    ),
+    "speeds": (("Torque ripple over speed", "Short lines: what is wanted.", _over_speed),),
+    "loads": (("Torque ripple over load", "150 r/min; the mean torque is the load and 0.31 N m of friction.",
+               _over_load),),
+    "dip": (("Dip over the rotor's angle at the load step", "Dotted and dashed: median and highest dip of a drive that"
+             " knew of the step, with the voltage 0 µs (ideal sensing) or 100 µs after it.", _over_angle),),
+    "ablation": (("Parts switched off", "A dot a seed of weights, noise and moment of the load step.", _ablations),),
+    "robustness": (("Random drives", "How many of the drives stay below a value; dashed: the limit.", _distributions),),
+}  # fmt: skip
+
+
+# --- pieces ---------------------------------------------------------------------------------------------------------
+
+def _draw(draw: Callable[[Content], Figure | None], content: Content) -> bytes | None:
+    with matplotlib.rc_context(_STYLE):
+        figure = draw(content)
+        if figure is None:
+            return None
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=130, metadata={"Software": None})
+        return file.getvalue()
+
+
+def _panels(count: int, columns: int, height_in: float, sharey: bool = False) -> tuple[Figure, list[Axes]]:
+    """`count` panels in rows of `columns`, each row height_in high."""
+    columns = min(columns, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(11.0, 0.4 + height_in * rows), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False, sharey=sharey).flat)
+    for axis in axes[count:]:
+        axis.remove()
+    return figure, axes[:count]
+
+
+def _logarithmic(axis: Axis) -> None:
+    """With plain numbers, and not too many of them for what is drawn already."""
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 300.0 * low else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _rows(content: Content, group: str) -> list[dict[str, Any]]:
+    return [row for row in content["rows"] if row["group"] == group]
+
+
+def _controllers(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    return in_order(controller for row in rows for controller in row["values"])
+
+
+def _controllers_of_runs(runs: Iterable[Mapping[str, Any]]) -> list[str]:
+    return in_order(one["controller"] for one in runs)
+
+
+def _legend(figure: Figure, rows: Sequence[Mapping[str, Any]]) -> None:
+    controllers = _controllers(rows)
+    handles = [Line2D([], [], color=_colour(one), marker=_MARKER.get(one, "o"), linestyle="")
+               for one in controllers]
+    figure.legend(handles, controllers, loc="outside upper right", ncols=len(controllers))
+
+
+def _colour(controller: str) -> str:
+    return CONTROLLER_COLOUR.get(controller, "#444444")

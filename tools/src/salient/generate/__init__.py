@@ -1,0 +1,1 @@
+"""Generators that the build runs: CAN codec, machine data, functional mock-up unit."""

@@ -1,0 +1,160 @@
+"""Writes the C codec of a CAN database: cantools' pack and unpack functions, and setters that saturate.
+
+    python -m salient.generate.codec [--integer] FILE.dbc OUTDIR
+
+gives OUTDIR/FILE_codec.h and OUTDIR/FILE_codec.c, every name in them prefixed with `FILE_`. cantools' pack functions
+cut off the bits that do not fit a signal; the setters added here hold the value at the end of its range instead.
+The output depends on the database alone: no date, no version, no path.
+"""
+
+import argparse
+import math
+import re
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import cantools
+from cantools.database.can.c_source import camel_to_snake_case, generate
+from cantools.database.can.database import Database
+from cantools.database.can.signal import Signal
+
+INT64_MAX = 2**63 - 1
+
+
+class CodecError(Exception):
+    """The database cannot be used; the message names it and says why, in one line."""
+
+
+def raw_range(signal: Signal) -> tuple[int, int]:
+    """Smallest and largest raw value of an integer signal: what the bits hold, narrowed to the range the DBC states."""
+    bits = signal.length
+    low, high = (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if signal.is_signed else (0, (1 << bits) - 1)
+    scale, offset = Fraction(str(signal.scale)), Fraction(str(signal.offset))
+    ends = [(Fraction(str(end)) - offset) / scale for end in (signal.minimum, signal.maximum) if end is not None]
+    if len(ends) == 2:
+        low, high = max(low, math.ceil(min(ends))), min(high, math.floor(max(ends)))
+    if low > high:
+        raise CodecError(f"signal {signal.name}: its range holds no value that its {bits} bits can carry")
+    return low, min(high, INT64_MAX)
+
+
+def integer_literal(value: int) -> str:
+    """C literal of a 64-bit integer; the most negative one has no literal of its own."""
+    return f"(-{-value - 1}ll - 1)" if value < 0 else f"{value}ll"
+
+
+def c_type(signal: Signal) -> str:
+    """The type of a signal's field in cantools' structures."""
+    bits = next(width for width in (8, 16, 32, 64) if signal.length <= width)
+    return f"{'' if signal.is_signed else 'u'}int{bits}_t"
+
+
+_HELD = {
+    f"held{bits}": "/* raw, or the end of low..high that it is beyond. In each setter it would take half a\n"
+    " * kilobyte of flash. */\n"
+    f"static __attribute__((noinline)) int{bits}_t held{bits}(int64_t raw, int{bits}_t low, int{bits}_t high)\n{{\n"
+    f"    return raw < low ? low : raw > high ? high : (int{bits}_t)raw;\n}}\n"
+    for bits in (32, 64)
+}
+
+
+def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
+    """Declarations and definitions of the saturating setters of all integer signals."""
+    declarations, definitions, used = [], [], set()
+    for message in database.messages:
+        message_name = f"{prefix}_{camel_to_snake_case(message.name)}"
+        for signal in message.signals:
+            if signal.is_float:
+                continue
+            low, high = raw_range(signal)
+            field = camel_to_snake_case(signal.name)
+            unit = f", LSB {signal.scale} {signal.unit or ''}".rstrip() + (
+                f", offset {signal.offset}" * (signal.offset != 0)
+            )
+            prototype = f"void {message_name}_set_{field}(struct {message_name}_t *message, int64_t raw)"
+            declarations.append(
+                f"/* {message.name}.{signal.name} = raw held within {low}..{high}{unit}. */\n{prototype};\n"
+            )
+            held = "held32" if low >= -(2**31) and high < 2**31 else "held64"
+            used.add(held)
+            definitions.append(
+                f"{prototype}\n{{\n    message->{field} = ({c_type(signal)}){held}(raw, {integer_literal(low)}, "
+                f"{integer_literal(high)});\n}}\n"
+            )
+            if integer:
+                continue
+            physical = f"void {message_name}_set_physical_{field}(struct {message_name}_t *message, double value)"
+            declarations.append(
+                f"/* The same from a value in {signal.unit or 'its unit'}: rounded to the nearest raw value, held\n"
+                f" * within the range; not-a-number gives the lower end. */\n{physical};\n"
+            )
+            definitions.append(
+                f"{physical}\n{{\n"
+                f"    double raw = (value - {float(signal.offset)!r}) / {float(signal.scale)!r};\n"
+                f"    raw = raw < {float(high)!r} ? raw : (isnan(raw) ? {float(low)!r} : {float(high)!r});\n"
+                f"    raw = raw > {float(low)!r} ? raw : {float(low)!r};\n"
+                f"    {message_name}_set_{field}(message, llround(raw));\n}}\n"
+            )
+    return "\n".join(declarations), "\n".join([*(_HELD[held] for held in sorted(used)), *definitions])
+
+
+def generate_codec(dbc: Path, integer: bool) -> dict[str, str]:
+    """File name -> C text of the codec of `dbc`; `integer` leaves every floating-point conversion out."""
+    try:
+        # cantools passes over an incomplete last statement; one more statement behind it makes that an error.
+        text = dbc.read_text(encoding="cp1252") + "\nVAL_TABLE_ end_of_file ;\n"
+        database = cantools.database.load_string(text, database_format="dbc")
+    except OSError as error:
+        raise CodecError(f"{dbc}: {error.strerror}") from error
+    except (cantools.database.UnsupportedDatabaseFormatError, cantools.Error, UnicodeDecodeError) as error:
+        raise CodecError(f"{dbc}: {' '.join(str(error).split())}") from error
+    if not database.messages:
+        raise CodecError(f"{dbc}: describes no CAN messages")
+    prefix = camel_to_snake_case(dbc.stem)
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", prefix):
+        raise CodecError(f"{dbc}: its name must begin a C identifier (letters, digits and _, no digit first)")
+    name = f"{prefix}_codec"
+    header, source, _, _ = generate(
+        database, prefix, f"{name}.h", f"{name}.c", "", floating_point_numbers=not integer, use_round=not integer
+    )
+    try:
+        declarations, definitions = setters(database, prefix, integer)
+    except CodecError as error:
+        raise CodecError(f"{dbc}: {error}") from error
+
+    generated_from = f"file was generated from {dbc.name}."
+    header = re.sub(r"file was generated by cantools version .*", generated_from, header)
+    source = re.sub(r"file was generated by cantools version .*", generated_from, source)
+    # cantools' include guard is <PREFIX>_H, which a hand-written <prefix>.h has a better right to.
+    header = re.sub(rf"\b{prefix.upper()}_H\b", f"{name.upper()}_H", header)
+    closing = "\n#ifdef __cplusplus\n}\n"
+    head, found, tail = header.rpartition(closing)
+    if not found:
+        raise CodecError(f"{dbc}: cantools' header has no closing extern block; the pinned version 41.0.2 is expected")
+    return {f"{name}.h": f"{head}\n{declarations}{found}{tail}", f"{name}.c": f"{source.rstrip()}\n\n{definitions}"}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Exit code 0, or 2 after one line on stderr when the database or the folder cannot be used."""
+    parser = argparse.ArgumentParser(prog="salient.generate.codec", description="C codec of a CAN database (DBC)")
+    parser.add_argument("--integer", action="store_true", help="no floating-point conversions")
+    parser.add_argument("dbc", type=Path, metavar="DBC")
+    parser.add_argument("folder", type=Path, metavar="OUTDIR")
+    options = parser.parse_args(arguments)
+    try:
+        files = generate_codec(options.dbc, options.integer)
+        options.folder.mkdir(parents=True, exist_ok=True)
+        for name, text in files.items():
+            (options.folder / name).write_text(text, encoding="utf-8")
+    except CodecError as error:
+        print(f"salient.generate.codec: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"salient.generate.codec: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,171 @@
+"""Build step: the C sources of a machine, `machine_tables.c` for the firmware and `machine_plant.c` for the emulator.
+
+    python -m salient.generate.machine FILE.toml OUTDIR
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from salient.machine.file import Machine, MachineError, load_machine
+from salient.machine.firmware_tables import CURRENT_A, NODE_OFFSET, PhaseMap, Surface, machine_phase_map
+from salient.machine.flux_map import FluxMap
+
+
+def quantise(value: float, fraction_bits: int, bits: int) -> int:
+    """Nearest integer of `value` in a signed format, saturated to `bits`."""
+    limit = 1 << (bits - 1)
+    return max(-limit, min(limit - 1, math.floor(value * (1 << fraction_bits) + 0.5)))
+
+
+def tables_source(machine: Machine, tables: PhaseMap) -> str:
+    """C source of the firmware's tables."""
+    return "\n".join(
+        [
+            f"/* Generated from the machine file of '{machine.name}'. */",
+            '#include "control/machine_tables.h"',
+            "",
+            "const machine_tables_t machine_tables = {",
+            f"    .phases = {machine.phases},",
+            f"    .rotor_poles = {machine.rotor_poles},",
+            f"    .inertia_q30 = {quantise(machine.inertia_kg_m2, 30, 32)},",
+            f"    .friction_q30 = {quantise(machine.friction_Nm_s, 30, 32)},",
+            f"    .resistance_q24 = {quantise(machine.resistance_ohm, 24, 32)},",
+            f"    .current_rise_A_s = {quantise(machine.current_rise_A_s, 0, 32)},",
+            "    .row = {",
+            *(f"        {{{start}u, {reciprocal}u}}," for start, reciprocal in tables.rows()),
+            "    },",
+            f"    .cell_row = {{{_listed(tables.cell_row())}}},",
+            *_format_lines("torque_format", tables.torque_per_ampere),
+            *_format_lines("flux_format", tables.flux_per_ampere),
+            "    .column = {",
+            *(line for column in range(len(CURRENT_A)) for line in _column_lines(tables, column)),
+            "    },",
+            "};",
+            "",
+        ]
+    )
+
+
+def _format_lines(name: str, surface: Surface) -> list[str]:
+    return [
+        f"    .{name} = {{",
+        f"        .bend_shift = {surface.bend_shift},",
+        f"        .result_shift = {surface.result_shift},",
+        "    },",
+    ]
+
+
+def _column_lines(tables: PhaseMap, column: int) -> list[str]:
+    torque, flux = tables.torque_per_ampere, tables.flux_per_ampere
+    return [
+        "        {",
+        f"            .torque_node = {{{_listed(torque.node[:, column] - NODE_OFFSET)}}},",
+        f"            .flux_node = {{{_listed(flux.node[:, column] - NODE_OFFSET)}}},",
+        f"            .torque_bend = {{{_listed(torque.bend[:, column])}}},",
+        f"            .flux_bend = {{{_listed(flux.bend[:, column])}}},",
+        "        },",
+    ]
+
+
+def _listed(values: np.ndarray) -> str:
+    return ", ".join(map(str, values.tolist()))
+
+
+def plant_source(machine: Machine) -> str:
+    """C source of the emulator's machine, every number to the last bit."""
+    magnetics = machine.magnetics
+    if isinstance(magnetics, FluxMap):
+        flux_map = [*_flux_map_lines(magnetics), ""]
+        magnetics_lines = _members({"unaligned_inductance_H": magnetics.unaligned_inductance_H})
+        magnetics_lines += ["        .map = &flux_map,"]
+    else:
+        flux_map = []
+        magnetics_lines = _members(magnetics.parameters)
+    return "\n".join(
+        [
+            f"/* Generated from the machine file of '{machine.name}'. */",
+            '#include "plant/machine.h"',
+            "",
+            *flux_map,
+            "const machine_t machine_plant = {",
+            f'    .name = "{machine.name}",',
+            f"    .stator_poles = {machine.stator_poles},",
+            f"    .rotor_poles = {machine.rotor_poles},",
+            f"    .phases = {machine.phases},",
+            f"    .resistance_ohm = {machine.resistance_ohm!r},",
+            f"    .inertia_kg_m2 = {machine.inertia_kg_m2!r},",
+            f"    .friction_Nm_s = {machine.friction_Nm_s!r},",
+            f"    .supply_voltage_V = {machine.supply_voltage_V!r},",
+            "    .magnetics = {",
+            f"        .form = MAGNETICS_{magnetics.form.upper()},",
+            *magnetics_lines,
+            "    },",
+            "    .converter = {",
+            *_members(machine.converter),
+            "    },",
+            "    .dc_link = {",
+            *_members(machine.dc_link or {"capacitance_F": 0.0}),
+            "    },",
+            "    .sensors = {",
+            *_members(machine.sensors),
+            "    },",
+            "};",
+            "",
+        ]
+    )
+
+
+def _members(values: dict[str, float]) -> list[str]:
+    return [f"        .{key} = {value!r}," for key, value in values.items()]
+
+
+def _flux_map_lines(flux_map: FluxMap) -> list[str]:
+    least_inductance_H, _, _, current_scale_A = flux_map.inductance_extremes()
+    return [
+        "static const flux_map_t flux_map = {",
+        f"    .current_max_A = {flux_map.current_max_A!r},",
+        f"    .least_inductance_H = {least_inductance_H!r},",
+        f"    .current_scale_A = {current_scale_A!r},",
+        "    .coenergy_J = {",
+        *("        {" + ", ".join(map(repr, row)) + "}," for row in flux_map.coefficients_J.tolist()),
+        "    },",
+        "};",
+    ]
+
+
+def main(arguments: list[str]) -> int:
+    if len(arguments) != 2:
+        print("usage: python -m salient.generate.machine FILE.toml OUTDIR", file=sys.stderr)
+        return 2
+    try:
+        machine = load_machine(arguments[0])
+        tables = machine_phase_map(arguments[0], machine)
+    except MachineError as error:
+        print(f"salient: {error}", file=sys.stderr)
+        return 2
+    out = Path(arguments[1])
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "machine_tables.c").write_text(tables_source(machine, tables), encoding="utf-8")
+    (out / "machine_plant.c").write_text(plant_source(machine), encoding="utf-8")
+    outputs = " ".join(_escaped(out / name) for name in ("machine_tables.c", "machine_plant.c"))
+    # Never empty: CMake drops a dependency file without inputs, and Ninja would regenerate on every build.
+    inputs = [Path(arguments[0]).resolve()]
+    if isinstance(machine.magnetics, FluxMap):
+        inputs.append(machine.magnetics.file)
+    dependencies = f"{outputs}: {' '.join(map(_escaped, inputs))}\n"
+    (out / "machine.d").write_text(dependencies, encoding="utf-8")
+    return 0
+
+
+def _escaped(path: Path) -> str:
+    """For a dependency file, as make reads it."""
+    return str(path).replace(" ", "\\ ")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

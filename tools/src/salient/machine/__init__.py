@@ -1,0 +1,1 @@
+"""Machine files, magnetics and what is derived from them."""

@@ -1,0 +1,154 @@
+"""Reads a flux-linkage map from a CSV file.
+
+Lines that start with # and blank lines say nothing. Then a header, `angle_deg,current_A,flux_linkage_Wb` (or angle_rad,
+or flux_linkage_mWb: the units stand in the names), then one row a point, angle by angle rising, the currents rising
+within an angle. Angles are the phase's mechanical ones, 0 aligned, from there to half a rotor pitch (unaligned), or to
+a whole pitch; a whole one is averaged with its mirror image. The grid may be irregular: angles at any distance, each
+with currents of its own. A row of 0 A may be left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from salient.machine.flux_map import Curve, FluxMap, FluxMapError, fit
+from salient.toml_file import TextFileError, read_text
+
+FILE_BYTES_MAX = 20_000_000
+ANGLES_MIN = 8
+CURRENTS_MIN = 6  # at each angle, 0 A not counted
+CURRENT_MAX_A = 10_000.0
+FLUX_LINKAGE_MAX_Wb = 100.0
+
+# The ends of the angles count as reached when they are as near as this, and are then put there.
+ANGLE_TOLERANCE_DEG = 0.01
+
+# Nearer points say nothing about a slope.
+ANGLE_STEP_MIN_DEG = 0.02
+CURRENT_STEP_MIN_A = 0.001
+
+# Factors to rad, A and Wb of the names that each column may have.
+_COLUMNS = (
+    {"angle_deg": math.pi / 180.0, "angle_rad": 1.0},
+    {"current_A": 1.0},
+    {"flux_linkage_Wb": 1.0, "flux_linkage_mWb": 1e-3},
+)
+
+
+def load_flux_map(path: Path, rotor_poles: int) -> FluxMap:
+    """The model of a CSV file's map. FluxMapError, one line with the file and where possible its line, when the file
+    cannot be used."""
+    try:
+        text = read_text(path, FILE_BYTES_MAX)
+        model = fit(_curves(_points(text), math.pi / rotor_poles), rotor_poles)
+    except (FluxMapError, TextFileError) as error:
+        raise FluxMapError(f"{path}: {error}") from None
+    return replace(model, file=path)
+
+
+Point = tuple[int, float, float, float]
+"""Line, angle in rad, current in A, flux linkage in Wb."""
+
+
+def _points(text: str) -> list[Point]:
+    rows = [
+        (line, [cell.strip() for cell in row.split(",")])
+        for line, row in enumerate(text.split("\n"), start=1)
+        if row.strip() and not row.lstrip().startswith("#")
+    ]
+    if not rows:
+        raise FluxMapError("no header; allowed: " + _header_names())
+    line, header = rows[0]
+    if len(header) != len(_COLUMNS) or any(name not in allowed for name, allowed in zip(header, _COLUMNS, strict=True)):
+        raise FluxMapError(f"line {line}: {','.join(header)!r:.100} is no header; allowed: {_header_names()}")
+    factors = [allowed[name] for name, allowed in zip(header, _COLUMNS, strict=True)]
+    return [(line, *_numbers(line, cells, header, factors)) for line, cells in rows[1:]]
+
+
+def _header_names() -> str:
+    return ",".join("|".join(allowed) for allowed in _COLUMNS)
+
+
+def _numbers(line: int, cells: list[str], header: list[str], factors: list[float]) -> list[float]:
+    if len(cells) != len(header):
+        raise FluxMapError(f"line {line}: {len(cells)} columns; wanted are {len(header)}: {','.join(header)}")
+    values = []
+    for cell, name, factor in zip(cells, header, factors, strict=True):
+        try:
+            value = float(cell) if "_" not in cell else math.nan  # Python reads 0.1_2 as 0.12
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise FluxMapError(f"line {line}: {name}: {cell!r:.40} is not a finite number")
+        if value < 0.0:
+            raise FluxMapError(f"line {line}: {name}: {cell:.40} is negative; allowed is 0 and more")
+        values.append(value * factor)
+    return values
+
+
+def _curves(points: list[Point], half_rad: float) -> list[Curve]:
+    """The points angle by angle, every rule of the file checked that needs no model."""
+    for (_, before_rad, *_), (line, angle_rad, *_) in zip(points, points[1:], strict=False):
+        if angle_rad != before_rad and math.degrees(angle_rad - before_rad) < ANGLE_STEP_MIN_DEG:
+            raise FluxMapError(
+                f"line {line}: the angle goes from {math.degrees(before_rad):.5g} to {math.degrees(angle_rad):.5g} deg;"
+                f" the angles must rise, by {ANGLE_STEP_MIN_DEG:g} deg at least, all currents of an angle together"
+            )
+    groups = [list(group) for _, group in groupby(points, key=lambda point: point[1])]
+    if len(groups) < ANGLES_MIN:
+        raise FluxMapError(f"{len(groups)} angles; at least {ANGLES_MIN} are needed")
+    ends_rad = _ends_rad(groups, half_rad)
+    return [_curve(group, ends_rad.get(at, group[0][1])) for at, group in enumerate(groups)]
+
+
+def _ends_rad(groups: list[list[Point]], half_rad: float) -> dict[int, float]:
+    """The exact first and last angle by their place."""
+    half_deg = math.degrees(half_rad)
+    first_deg, last_deg = math.degrees(groups[0][0][1]), math.degrees(groups[-1][0][1])
+    if first_deg > ANGLE_TOLERANCE_DEG:
+        raise FluxMapError(f"line {groups[0][0][0]}: the angles begin at {first_deg:.5g} deg; 0 (aligned) is wanted")
+    for pitches in (1, 2):
+        if abs(last_deg - pitches * half_deg) <= ANGLE_TOLERANCE_DEG:
+            return {0: 0.0, len(groups) - 1: pitches * half_rad}
+    raise FluxMapError(
+        f"line {groups[-1][-1][0]}: the angles end at {last_deg:.5g} deg; wanted is half a rotor pitch"
+        f" ({half_deg:.5g} deg, unaligned) or a whole one ({2.0 * half_deg:.5g} deg)"
+    )
+
+
+def _curve(points: list[Point], angle_rad: float) -> Curve:
+    angle = f"at {math.degrees(angle_rad):.5g} deg"
+    line = points[-1][0]
+    if points[0][2] == 0.0:
+        zero_line, _, _, flux_Wb = points[0]
+        if flux_Wb != 0.0:
+            raise FluxMapError(f"line {zero_line}: the flux linkage at 0 A is {flux_Wb:.4g} Wb; it must be 0")
+        points = points[1:]
+    if len(points) < CURRENTS_MIN:
+        raise FluxMapError(
+            f"line {line}: {len(points)} currents above 0 A {angle}; at least {CURRENTS_MIN} are needed"
+        )
+    last_A, last_Wb = 0.0, 0.0
+    for line, _, current_A, flux_Wb in points:
+        if current_A < last_A + CURRENT_STEP_MIN_A:
+            raise FluxMapError(
+                f"line {line}: {angle} {current_A:g} A comes after {last_A:g} A; the currents must rise, by"
+                f" {CURRENT_STEP_MIN_A:g} A at least"
+            )
+        if flux_Wb <= last_Wb:
+            raise FluxMapError(
+                f"line {line}: {angle} the flux linkage goes from {last_Wb:.6g} Wb at {last_A:g} A to {flux_Wb:.6g} Wb"
+                f" at {current_A:g} A; it must rise with the current"
+            )
+        if current_A > CURRENT_MAX_A:
+            raise FluxMapError(f"line {line}: {current_A:g} A; {CURRENT_MAX_A:g} A is the most allowed")
+        if flux_Wb > FLUX_LINKAGE_MAX_Wb:
+            raise FluxMapError(f"line {line}: {flux_Wb:g} Wb; {FLUX_LINKAGE_MAX_Wb:g} Wb is the most allowed")
+        last_A, last_Wb = current_A, flux_Wb
+    lines, _, current_A, flux_Wb = zip(*points, strict=True)
+    return Curve(angle_rad, np.array(current_A), np.array(flux_Wb), lines)

@@ -1,0 +1,105 @@
+"""salient machine: is a machine file right, what is in it, and what do its magnetics look like?"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from salient.errors import UsageError
+from salient.machine.file import CONVERTER, SENSORS, Machine, MachineError, load_machine, machine_path
+from salient.machine.firmware_tables import machine_phase_map
+
+# The sensors and the firmware's tables end here.
+CURRENT_MAX_A = 80.0
+SHOWN_A = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0)
+SHOWN_PITCHES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+
+
+def run(name_or_path: str, out: Path) -> int:
+    """Checks the file, prints what it says and draws its magnetics to a picture; returns 0. UsageError."""
+    try:
+        path = machine_path(name_or_path)
+        machine = load_machine(path)
+        machine_phase_map(path, machine)
+    except MachineError as error:
+        raise UsageError(str(error)) from None
+    print("\n".join(describe(machine)))
+    picture = out / f"{machine.name}.png"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        draw(machine).savefig(picture, dpi=110, metadata={"Software": None})
+    except OSError as error:
+        raise UsageError(f"--out {out}: {error.strerror}") from None
+    print(f"picture: {picture}")
+    return 0
+
+
+def describe(machine: Machine) -> list[str]:
+    """The lines of a data sheet."""
+    magnetics, half = machine.magnetics, machine.pitch_rad / 2.0
+    small_A = 1e-3
+    aligned_H = float(magnetics.flux_linkage_Wb(0.0, small_A)) / small_A
+    angles = np.linspace(half, 2.0 * half, 361)[:, None]
+    torques_Nm = magnetics.torque_Nm(angles, np.array(SHOWN_A))
+    lines = [
+        f"{machine.name}: {machine.stator_poles}/{machine.rotor_poles} poles, {machine.phases} phases,"
+        f" magnetics {magnetics.form}",
+        f"  winding     {machine.resistance_ohm:g} ohm; {aligned_H * 1e3:.2f} mH aligned,"
+        f" {magnetics.unaligned_inductance_H * 1e3:.2f} mH unaligned, not saturated",
+        f"  shaft       {machine.inertia_kg_m2:g} kg m^2, {machine.friction_Nm_s:g} N m s",
+        f"  supply      {machine.supply_voltage_V:g} V"
+        + (f" behind {machine.dc_link['source_resistance_ohm']:g} ohm, link {machine.dc_link['capacitance_F'] * 1e6:g}"
+           " uF" if machine.dc_link else ", takes energy back"),
+        "  torque      greatest of one phase: "
+        + ", ".join(f"{torque:.3g} N m at {i:g} A" for torque, i in zip(torques_Nm.max(axis=0), SHOWN_A, strict=True)),
+    ]
+    for title, values, ranges in (("converter", machine.converter, CONVERTER), ("sensors", machine.sensors, SENSORS)):
+        stated = [f"{key} {value:g}" for key, value in values.items() if value != ranges[key][2]]
+        lines.append(f"  {title:<11} {', '.join(stated) if stated else 'ideal'}")
+    return lines
+
+
+def draw(machine: Machine) -> Figure:
+    """Flux linkage over current, torque over angle."""
+    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _draw_flux(left, machine)
+    _draw_torque(right, machine)
+    figure.suptitle(f"{machine.name}: magnetics of one phase ({machine.magnetics.form})", x=0.01, ha="left")
+    return figure
+
+
+def _draw_flux(axes: Axes, machine: Machine) -> None:
+    current_A = np.linspace(0.0, CURRENT_MAX_A, 321)
+    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(SHOWN_PITCHES)))
+    for pitches, colour in zip(SHOWN_PITCHES, colours, strict=True):
+        angle_rad = pitches * machine.pitch_rad
+        flux_Wb = machine.magnetics.flux_linkage_Wb(angle_rad, current_A)
+        axes.plot(current_A, flux_Wb, color=colour)
+        place = {0.0: " aligned", 0.5: " unaligned"}.get(pitches, "")
+        axes.annotate(f"{math.degrees(angle_rad):.0f} deg{place}", (current_A[-1], flux_Wb[-1]), color=colour,
+                      xytext=(3, 0), textcoords="offset points", va="center", fontsize=8)
+    axes.set(xlabel="current / A", ylabel="flux linkage / Wb", xlim=(0.0, 1.3 * CURRENT_MAX_A), ylim=(0.0, None))
+    axes.set_title("flux linkage by angle", loc="left", fontsize=10)
+    axes.grid(color="#e6e6e6")
+
+
+def _draw_torque(axes: Axes, machine: Machine) -> None:
+    angle_rad = np.linspace(0.0, machine.pitch_rad, 721)
+    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(SHOWN_A)))
+    for current_A, colour in zip(SHOWN_A, colours, strict=True):
+        torque_Nm = machine.magnetics.torque_Nm(angle_rad, current_A)
+        axes.plot(np.degrees(angle_rad), torque_Nm, color=colour, label=f"{current_A:g} A")
+    axes.set(xlabel="angle of the phase / deg (0 aligned)", ylabel="torque / N m",
+             xlim=(0.0, math.degrees(machine.pitch_rad)))
+    axes.set_title("torque by current", loc="left", fontsize=10)
+    axes.legend(frameon=False, fontsize=8)
+    axes.grid(color="#e6e6e6")

@@ -1,0 +1,1 @@
+"""Reference models of the plant on other solvers: SciPy and ngspice."""

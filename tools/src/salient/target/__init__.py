@@ -1,0 +1,1 @@
+"""Firmware on the emulated targets: instruction counts, traces, static checks."""

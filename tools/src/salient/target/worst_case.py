@@ -1,0 +1,383 @@
+"""The dearest control interrupt, looked for: what is done to a drive and its bench, as a list of timed actions, and a
+search that changes such lists and keeps what costs more.
+
+An input is a TOML file. Its actions are rows of time in ms, what, and a value where there is one:
+
+    machine = "saturating"
+    controller = "salient"
+    seed = 1
+    initial_angle_deg = 0.0
+    duration_ms = 60.0
+    actions = [
+        [0.0, "speed_rpm", 600.0],             # asks the drive to run
+        [0.0, "parameter.smc_k", 2000.0],      # of the drive, in its unit
+        [20.5, "bench.load_torque_Nm", 8.0],   # a quantity of RIG_SET in rig.dbc
+        [30.0, "commands", 20.0],              # so many at once
+        [40.0, "stop"],                        # or off, clear_fault, silence
+    ]
+"""
+
+from __future__ import annotations
+
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from salient.bench.bench import Bench
+from salient.bench.drive import ParameterRow, write_request
+from salient.bench.emulator import SimulatorOptions, parameter_table
+from salient.bench.rig import RigError, quantities
+from salient.cli import CONTROLLERS
+from salient.errors import UsageError
+from salient.paths import ROOT
+from salient.target.isr_profile import Cost, read_cost
+from salient.toml_file import TextFileError, read_toml
+
+FOLDER = ROOT / "tests" / "target" / "worst_case"
+NETWORK = "salient_network"
+
+_REQUESTS = ("stop", "off", "clear_fault")
+_CHOSEN = ("controller", "bp_mode", "bp_trim_mode")
+"""Parameters that make another controller of it: the kind says them."""
+_DURATION_MS = (2.0, 120.0)
+_TIME_STEP_MS = 0.025
+_ACTIONS_MAX = 24
+_COMMANDS_MAX = 40
+_ELITE = 6
+_WORKERS = 2
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What an interrupt is looked for in. network: salient's optional one is on; it is off by default and costs as much
+    as the paper's. label: for tables."""
+
+    label: str
+    controller: str
+    machine: str = "saturating"
+    network: bool = False
+
+
+KINDS = {
+    **{controller: Kind(controller, controller) for controller in CONTROLLERS},
+    NETWORK: Kind("salient with the network", "salient", network=True),
+    **{f"{controller}_four_phases": Kind(f"{controller}, four phases", controller, "finite_element")
+       for controller in CONTROLLERS},
+}
+
+
+@dataclass(frozen=True)
+class Action:
+    """value: None for what has none."""
+
+    at_ms: float
+    what: str
+    value: float | None = None
+
+
+@dataclass(frozen=True)
+class Input:
+    """What is done, in the order of time; the board is the one that SimulatorOptions describes by default."""
+
+    machine: str
+    controller: str
+    seed: int
+    initial_angle_deg: float
+    duration_ms: float
+    actions: tuple[Action, ...]
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+def read_input(path: Path) -> Input:
+    """UsageError for a file that is not one."""
+    try:
+        data = read_toml(path)
+        return Input(data["machine"], data["controller"], data["seed"], data["initial_angle_deg"],
+                     data["duration_ms"], tuple(Action(*row) for row in data["actions"]))
+    except (TextFileError, KeyError, TypeError) as error:
+        raise UsageError(f"{path}: {error}") from None
+
+
+def write_input(path: Path, found: Input) -> None:
+    """As read_input reads it, numbers in full."""
+    rows = "".join(f'    [{a.at_ms!r}, "{a.what}"' + ("" if a.value is None else f", {a.value!r}") + "],\n"
+                   for a in found.actions)
+    path.write_text(
+        "# The dearest control interrupt that was found; tools/salient pil --search looks for dearer ones.\n"
+        f'machine = "{found.machine}"\ncontroller = "{found.controller}"\n'
+        f"seed = {found.seed}\ninitial_angle_deg = {found.initial_angle_deg!r}\n"
+        f"duration_ms = {found.duration_ms!r}\nactions = [\n{rows}]\n", encoding="utf-8")
+
+
+# --- running --------------------------------------------------------------------------------------------------------
+
+def replay(done: Input, **options) -> Cost:
+    """What the interrupts cost. options: of SimulatorOptions, where it is another board or build."""
+    with tempfile.TemporaryDirectory(prefix="salient-") as name:
+        counted, executed = Path(name) / "instructions", Path(name) / "execution"
+        board = _board(done, instructions=counted, execution=executed, **options)
+        _run(done, board)
+        return read_cost(counted, executed, board.machine, board.build)
+
+
+def dearest_count(done: Input) -> int:
+    """Instructions of the dearest interrupt; quicker than replay."""
+    with tempfile.TemporaryDirectory(prefix="salient-") as name:
+        counted = Path(name) / "instructions"
+        _run(done, _board(done, instructions=counted))
+        return int(np.fromfile(counted, "<u4").max())
+
+
+def _board(done: Input, **options) -> SimulatorOptions:
+    return SimulatorOptions(machine=done.machine, controller=done.controller, seed=done.seed,
+                            initial_angle_deg=done.initial_angle_deg, **{"build": "cortex-m4", **options})
+
+
+def _run(done: Input, board: SimulatorOptions) -> None:
+    rows = _rows(done.controller)
+    with tempfile.TemporaryDirectory(prefix="salient-") as folder, Bench(board, f"unix:{folder}/can.sock") as bench:
+        bench.rig.truth_period_us = 0
+        for action in done.actions:
+            bench.advance_to(round(action.at_ms * 1e6))
+            _do(bench, rows, action)
+        bench.advance_to(round(done.duration_ms * 1e6))
+
+
+def _do(bench: Bench, rows: dict[str, ParameterRow], action: Action) -> None:
+    what, value = action.what, action.value
+    scope, _, name = what.partition(".")
+    if what == "speed_rpm":
+        bench.drive.speed_reference_rpm = value
+    elif scope == "bench":
+        try:
+            bench.rig.set(name, value)
+        except RigError:
+            pass  # what the bench refuses has no effect
+    elif scope == "parameter":
+        bench.send(write_request(rows[name], value))  # so has what the drive refuses
+    elif what == "commands":
+        for _ in range(int(value) if bench.drive.command_due_ns is not None else 0):
+            bench.drive.send_command()
+    elif what == "silence":
+        bench.drive.silence()
+    elif what in _REQUESTS:
+        bench.drive.ask(what)
+    else:
+        raise UsageError(f"{what}: no such action")
+
+
+@lru_cache
+def _rows(controller: str) -> dict[str, ParameterRow]:
+    return {row.name: row for row in parameter_table(SimulatorOptions(controller=controller))}
+
+
+# --- directed -------------------------------------------------------------------------------------------------------
+
+def directed(kind: str) -> list[Input]:
+    """Inputs that are made to be dear: what is known to happen seldom and all at once. kind: of KINDS."""
+    of = KINDS[kind]
+    backwards = -400.0 if of.controller == "salient" else 100.0
+    first = [Action(0.0, "parameter.bp_trim_mode", 3.0)] if of.network else []
+    quick = [*first, Action(0.0, "bench.inertia_gain", 0.2), Action(1.0, "speed_rpm", 600.0)]
+    lists = {
+        "load step": [*quick, Action(40.0, "bench.load_torque_Nm", 8.0)],
+        "noise at its end": [*quick, Action(5.0, "bench.current_noise_A", 10.0),
+                             Action(20.0, "bench.load_torque_Nm", 15.0)],
+        "every phase conducts": [*quick, Action(5.0, "bench.current_sensor_offset_A", 10.0),
+                                 Action(20.0, "bench.load_torque_Nm", 15.0)],
+        "every phase conducts, noisy": [*quick, Action(5.0, "bench.current_sensor_offset_A", 5.0),
+                                        Action(5.0, "bench.current_noise_A", 5.0),
+                                        Action(20.0, "bench.load_torque_Nm", 15.0)],
+        "voltage dips": [*quick, Action(30.0, "bench.load_torque_Nm", 8.0),
+                         Action(40.0, "bench.supply_voltage_V", 155.0), Action(50.0, "bench.supply_voltage_V", 290.0)],
+        "voltage runs out": [*quick[:-1], Action(0.0, "bench.supply_voltage_V", 160.0),
+                             Action(1.0, "speed_rpm", 2000.0)],
+        "reversal": [*quick, Action(30.0, "speed_rpm", backwards), Action(60.0, "speed_rpm", 600.0)],
+        "noisy reversal with a torque reserve": [
+            *first, Action(0.0, "bench.inertia_gain", 0.2), Action(0.0, "bench.current_noise_A", 5.0),
+            Action(0.3, "parameter.torque_reserve_Nm", 18.0), Action(1.0, "speed_rpm", 3000.0),
+            Action(10.0, "speed_rpm", 5.0 * backwards), Action(13.0, "bench.flux_linkage_gain", 2.5)],
+        "encoder jumps": [*quick, Action(40.0, "bench.encoder_fault", 2.0), Action(45.0, "bench.encoder_fault", 0.0),
+                          Action(46.0, "off"), Action(46.5, "clear_fault"), Action(47.0, "speed_rpm", 600.0)],
+        "run, fault, run": [*quick, Action(20.0, "off"), Action(20.3, "speed_rpm", 600.0), Action(30.0, "off"),
+                            Action(30.3, "speed_rpm", 900.0), Action(40.0, "bench.interrupt_time_us", 80.0),
+                            Action(41.0, "bench.interrupt_time_us", 0.0), Action(42.0, "off"),
+                            Action(42.5, "clear_fault"), Action(43.0, "speed_rpm", 600.0)],
+        "commands in a burst": [*quick, Action(20.0, "commands", 40.0), Action(30.0, "bench.load_torque_Nm", 8.0),
+                                Action(30.0, "commands", 40.0)],
+        "parameters while it runs": [*quick, Action(20.0, "parameter.torque_max_Nm", 40.0),
+                                     Action(25.0, "parameter.current_limit_A", 79.0),
+                                     Action(30.0, "bench.load_torque_Nm", 20.0)],
+        "misaligned, eccentric": [*first, Action(0.0, "bench.encoder_offset_deg", 3.0),
+                                  Action(0.0, "bench.encoder_eccentricity_deg", 2.0), *quick[len(first):],
+                                  Action(40.0, "bench.load_torque_Nm", 8.0)],
+    }
+    return [Input(of.machine, of.controller, 1, 7.0, 80.0, tuple(actions)) for actions in lists.values()]
+
+
+# --- search ---------------------------------------------------------------------------------------------------------
+
+def search(kind: str, begin: Iterable[Input], seconds: float, seed: int,
+           progress: Callable[[int, int], None] = lambda tried, worst: None) -> tuple[int, Input]:
+    """The highest count that was found and its input: from `begin`, changed at random, the best few changed again.
+
+    seconds: of the wall clock, so that what is found depends on the computer; what it costs does not. The seed decides
+    the order of changes.
+    """
+    random_source = random.Random(f"{kind} {seed}")
+    elite: list[tuple[int, Input]] = []
+    waiting = list(begin)
+    tried = 0
+    end_s = time.monotonic() + seconds
+    with ProcessPoolExecutor(_WORKERS, initializer=_leave_interrupts_to_parent) as workers:
+        while waiting or time.monotonic() < end_s:
+            while len(waiting) < _WORKERS * 4:
+                waiting.append(mutated(random_source.choice(elite)[1] if elite else directed(kind)[0], random_source))
+            batch, waiting = waiting[: _WORKERS * 4], waiting[_WORKERS * 4:]
+            elite += zip(workers.map(dearest_count, batch), batch, strict=True)
+            elite = sorted(elite, key=lambda found: -found[0])[:_ELITE]
+            tried += len(batch)
+            progress(tried, elite[0][0])
+        return _pruned(*elite[0], workers)
+
+
+def _pruned(worst: int, found: Input, workers: Executor) -> tuple[int, Input]:
+    """Without the actions that its cost does not need, so that one sees what it is that costs."""
+    while True:
+        shorter = [replace(found, actions=found.actions[:i] + found.actions[i + 1:])
+                   for i, action in enumerate(found.actions) if not _fixed(action)]
+        for count, one in zip(workers.map(dearest_count, shorter), shorter, strict=True):
+            if count >= worst:
+                worst, found = count, one
+                break
+        else:
+            return worst, found
+
+
+def _leave_interrupts_to_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def mutated(given: Input, source: random.Random) -> Input:
+    """One to three changes: an action more, less, or at another time or value; angle, seed or duration."""
+    made = given
+    for _ in range(source.randint(1, 3)):
+        made = source.choice((_added, _added, _removed, _changed, _changed, _moved, _begun_elsewhere))(made, source)
+    ordered = tuple(sorted(made.actions, key=lambda action: action.at_ms))
+    return replace(made, actions=ordered)
+
+
+def _added(given: Input, source: random.Random) -> Input:
+    if len(given.actions) >= _ACTIONS_MAX:
+        return _removed(given, source)
+    names = [f"bench.{name}" for name in quantities() if name not in ("truth_period_us",)]
+    names += [f"parameter.{name}" for name in _rows(given.controller) if name not in _CHOSEN]
+    names += ["speed_rpm", "commands", "silence", *_REQUESTS] * 4
+    action = Action(_time(given, source), source.choice(names))
+    return replace(given, actions=(*given.actions, _with_value(given, action, source)))
+
+
+def _removed(given: Input, source: random.Random) -> Input:
+    loose = [i for i, action in enumerate(given.actions) if not _fixed(action)]
+    if not loose:
+        return given
+    gone = source.choice(loose)
+    return replace(given, actions=given.actions[:gone] + given.actions[gone + 1:])
+
+
+def _changed(given: Input, source: random.Random) -> Input:
+    return _replaced(given, source, lambda action: _with_value(given, action, source))
+
+
+def _moved(given: Input, source: random.Random) -> Input:
+    return _replaced(given, source, lambda action: replace(action, at_ms=_time(given, source)))
+
+
+def _begun_elsewhere(given: Input, source: random.Random) -> Input:
+    what = source.randrange(3)
+    if what == 0:
+        return replace(given, initial_angle_deg=round(source.uniform(0.0, 360.0), 2))
+    if what == 1:
+        return replace(given, seed=source.randrange(1000))
+    last = max((action.at_ms for action in given.actions), default=0.0)
+    low, high = max(_DURATION_MS[0], last + 1.0), _DURATION_MS[1]
+    return replace(given, duration_ms=round(source.uniform(low, max(low, high)), 1))
+
+
+def _replaced(given: Input, source: random.Random, change: Callable[[Action], Action]) -> Input:
+    loose = [i for i, action in enumerate(given.actions) if not _fixed(action)]
+    if not loose:
+        return given
+    at = source.choice(loose)
+    return replace(given, actions=(*given.actions[:at], change(given.actions[at]), *given.actions[at + 1:]))
+
+
+def _fixed(action: Action) -> bool:
+    return action.what.partition(".")[2] in _CHOSEN
+
+
+def _time(given: Input, source: random.Random) -> float:
+    return round(source.randrange(round(given.duration_ms / _TIME_STEP_MS)) * _TIME_STEP_MS, 3)
+
+
+def _with_value(given: Input, action: Action, source: random.Random) -> Action:
+    """With a value of its range: anywhere, at an end, or near the present one."""
+    scope, _, name = action.what.partition(".")
+    if action.what == "speed_rpm":
+        low, high = -3000.0, 3000.0
+    elif action.what == "commands":
+        low, high = 1.0, _COMMANDS_MAX
+    elif scope == "bench":
+        low, high = float(quantities()[name].minimum), float(quantities()[name].maximum)
+    elif scope == "parameter":
+        row = _rows(given.controller)[name]
+        low, high = row.minimum, row.maximum
+    else:
+        return action
+    if action.value is not None and source.random() < 0.5:
+        value = min(high, max(low, action.value + source.gauss(0.0, 0.1) * max(abs(action.value), 0.01 * (high - low))))
+    elif source.random() < 0.3:
+        value = source.choice((low, high))
+    else:
+        value = low + (high - low) * source.random() ** 2  # most ranges reach far beyond what is of use
+    return replace(action, value=float(f"{value:.6g}"))
+
+
+# --- the command ----------------------------------------------------------------------------------------------------
+
+def committed(kind: str) -> Path:
+    """The file of the dearest input known."""
+    return FOLDER / f"{kind}.toml"
+
+
+def search_and_write(seconds: float, seed: int) -> int:
+    """Searches for every kind, from what is known and the directed inputs on; keeps what is dearer in FOLDER. 0."""
+    wrote = False
+    for kind in KINDS:
+        known = [read_input(committed(kind))] if committed(kind).exists() else []
+        before = dearest_count(known[0]) if known else 0
+
+        def progress(tried: int, worst: int, kind: str = kind) -> None:
+            if sys.stdout.isatty():
+                print(f"\r{kind}: {tried} inputs tried, worst {worst}", end="", flush=True)
+
+        worst, found = search(kind, [*known, *directed(kind)], seconds, seed, progress)
+        print(f"{chr(13) * sys.stdout.isatty()}{kind}: worst {worst}, known were {before}", flush=True)
+        if worst > before or len(found.actions) < len(known[0].actions):
+            FOLDER.mkdir(exist_ok=True)
+            write_input(committed(kind), found)
+            print(f"{kind}: written to {committed(kind).relative_to(ROOT)}", flush=True)
+            wrote = True
+    if wrote:
+        print("now tools/salient pil --figures")
+    return 0

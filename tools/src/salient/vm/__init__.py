@@ -1,0 +1,1 @@
+"""A virtual machine with a kernel that has CAN."""
