@@ -62,14 +62,14 @@ def test_flash_and_ram_are_within_their_limits(build):
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_an_interrupt_of_the_two_experiments_costs_what_is_committed(controller):
     made, committed = measure_once(controller).figures(), read()["interrupt"][controller]
-    assert made["typical"] <= made["of_99_percent"] <= made["worst_case"] <= committed["searched"]
+    assert made["typical"] <= made["of_99_percent"] <= made["worst"] <= committed["searched"]
     for name, value in made.items():
         assert value == pytest.approx(committed[name], rel=COUNT_TOLERANCE), name
 
 
 @pytest.mark.parametrize("kind", worst_case.KINDS)
 def test_the_dearest_interrupt_known_costs_what_is_committed(kind):
-    made = dearest(kind).figures()["worst_case"]
+    made = dearest(kind).figures()["worst"]
     assert made == pytest.approx(read()["interrupt"][kind]["searched"], rel=COUNT_TOLERANCE)
 
 
@@ -89,10 +89,10 @@ def test_an_input_that_was_found_is_the_same_when_written_and_read_again(tmp_pat
 
 def test_a_search_finds_dearer_interrupts_than_it_begins_with():
     cheap = worst_case.Input("saturating", "traditional", 1, 0.0, 2.0, (worst_case.Action(0.0, "off"),))
-    begin = worst_case.replay(cheap).figures()["worst_case"]
+    begin = worst_case.replay(cheap).figures()["worst"]
     count, found = worst_case.search("traditional", [cheap], seconds=1.0, seed=1)
     assert count > 1.2 * begin
-    assert worst_case.replay(found).figures()["worst_case"] == count
+    assert worst_case.replay(found).figures()["worst"] == count
 
 
 def all_runs() -> Execution:

@@ -52,7 +52,7 @@ def firmware_alone(build: str) -> Path:
 
 def cost_figures(cost: Cost, dearest: Cost) -> dict[str, int]:
     """Of the paper's two experiments and of the dearest input known."""
-    return cost.figures() | {"searched": dearest.figures()["worst_case"]}
+    return cost.figures() | {"searched": dearest.figures()["worst"]}
 
 
 def measured() -> tuple[Figures, dict[str, Cost], dict[str, Cost]]:
@@ -61,7 +61,7 @@ def measured() -> tuple[Figures, dict[str, Cost], dict[str, Cost]]:
     costs = {controller: measure(controller) for controller in CONTROLLERS}
     dearest = {kind: worst_case.replay(worst_case.read_input(worst_case.committed(kind))) for kind in worst_case.KINDS}
     interrupts = {controller: cost_figures(cost, dearest[controller]) for controller, cost in costs.items()}
-    interrupts |= {kind: {"searched": cost.figures()["worst_case"]} for kind, cost in dearest.items() if kind not in costs}
+    interrupts |= {kind: {"searched": cost.figures()["worst"]} for kind, cost in dearest.items() if kind not in costs}
     return {"size": {build: sizes(build) for build in TARGET_BUILDS}, "interrupt": interrupts}, costs, dearest
 
 
@@ -122,8 +122,8 @@ def size_table(of: Mapping[str, Mapping[str, int]]) -> str:
 
 def cost_table(of: Mapping[str, Mapping[str, int]]) -> str:
     """Instructions of an interrupt by controller."""
-    names = ("typical", "of_99_percent", "worst_case", "searched")
-    return _table(("instructions", "typical", "99 in 100 up to", "worst_case", "dearest known"),
+    names = ("typical", "of_99_percent", "worst", "searched")
+    return _table(("instructions", "typical", "99 in 100 up to", "worst", "dearest known"),
                   [(worst_case.KINDS[kind].label, *(values.get(name, "–") for name in names))
                    for kind, values in of.items()])
 

@@ -31,7 +31,7 @@ class Cost:
         """Typical (half of the interrupts take no more), of 99 in 100, and worst."""
         return {"typical": int(np.percentile(self.interrupts, 50, method="inverted_cdf")),
                 "of_99_percent": int(np.percentile(self.interrupts, 99, method="inverted_cdf")),
-                "worst_case": int(self.interrupts.max())}
+                "worst": int(self.interrupts.max())}
 
     def mean_by_part(self) -> dict[str, float]:
         """Instructions an interrupt in the mean, the largest first (Execution.by_part)."""

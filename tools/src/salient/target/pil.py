@@ -66,8 +66,8 @@ def as_json(cost: Cost, target: str) -> dict[str, Any]:
     stack = cost.execution.stack
     low, high = CYCLES_PER_INSTRUCTION
     estimate = {
-        "estimated_cycles_of_worst": [round(low * figures["worst_case"]), round(high * figures["worst"])],
-        "fits_at_rate_hz": {str(rate): verdict for rate, verdict in fits(figures["worst_case"]).items()},
+        "estimated_cycles_of_worst": [round(low * figures["worst"]), round(high * figures["worst"])],
+        "fits_at_rate_hz": {str(rate): verdict for rate, verdict in fits(figures["worst"]).items()},
     }
     return {
         "interrupts": len(cost.interrupts),
@@ -90,7 +90,7 @@ def words(costs: Mapping[str, Cost], target: str) -> str:
         total = covered["instructions"]
         parts = ", ".join(f"{name} {mean:.0f}" for name, mean in cost.mean_by_part().items() if mean >= 0.5)
         worst = ", ".join(f"{name} {count}" for name, count in cost.execution.worst_by_part().most_common() if count)
-        rates = ", ".join(f"{rate // 1000} kHz {verdict}" for rate, verdict in fits(made["worst_case"]).items())
+        rates = ", ".join(f"{rate // 1000} kHz {verdict}" for rate, verdict in fits(made["worst"]).items())
         low, high = CYCLES_PER_INSTRUCTION
         lines += [
             f"{controller}: instructions a control interrupt: typical {made['typical']}, 99 in 100 up to"

@@ -95,7 +95,7 @@ _COST = {
     "control interrupts": lambda of: f"{of['interrupts']}",
     "instructions, typical": lambda of: f"{of['instructions']['typical']}",
     "99 in 100 up to": lambda of: f"{of['instructions']['of_99_percent']}",
-    "worst_case": lambda of: f"{of['instructions']['worst']}",
+    "worst": lambda of: f"{of['instructions']['worst']}",
 }
 _STACK = {
     "background": lambda of: f"{of['stack_bytes']['background']}",
