@@ -1,4 +1,4 @@
-"""What the tests here share. The fixtures `bench` and `make_bench` come from the package's own plugin."""
+"""Shared fixtures and the distribution of tests over processes. `bench` and `make_bench` come from the package."""
 
 from __future__ import annotations
 
@@ -13,9 +13,20 @@ from salient.paths import ROOT
 LAUNCHER_TIMEOUT_S = 300
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """With `pytest -n N --dist loadgroup`, tests that share a fixture of a module run in one process, which makes it
+    once. A mark xdist_group of the test's own comes first."""
+    for item in items:
+        definitions = item._fixtureinfo.name2fixturedefs.values()
+        shared = [definition for definition in (found[-1] for found in definitions if found)
+                  if definition.scope == "module" and definition.baseid]
+        if shared and item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+
+
 @pytest.fixture
 def salient(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs tools/salient with the given arguments and gives back exit code and output."""
+    """Runs tools/salient with the given arguments and returns exit code and output."""
 
     def run(*arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
         command = [str(ROOT / "tools" / "salient"), *map(str, arguments)]

@@ -120,7 +120,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "socketcan")
+TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "plant", "tools", "socketcan")
 """The steps of `test`, in order."""
 
 

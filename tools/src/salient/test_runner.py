@@ -1,4 +1,4 @@
-"""salient test: every test there is, in steps, and one line in the end: N passed, N failed."""
+"""salient test: runs the tests in steps and ends with a line of totals: N passed, N failed."""
 
 from __future__ import annotations
 
@@ -9,22 +9,27 @@ import subprocess
 import sys
 import tempfile
 import time
-import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 from salient.bench.emulator import TARGET_BUILDS
 from salient.paths import BUILD, ROOT, SCENARIOS
 
 RESULTS = BUILD / "results"
 TESTS = ROOT / "tests"
-HIL = TESTS / "hil"
-GUEST_TIMEOUT_S = 1800
+CONFIGURATION = ROOT / "tools" / "pyproject.toml"
+SOURCE_FOLDERS = ("firmware", "hal", "emulator", "tests")
+CHECKED_FOR_SPELLING = ("firmware", "hal", "emulator", "tools", "tests", "cmake", "CMakeLists.txt", ".ci", ".github")
+VM_TIMEOUT_S = 1800
+CORES = len(os.sched_getaffinity(0))
 
 
 @dataclass
 class Count:
-    """Of tests."""
+    """Passed and failed tests."""
 
     passed: int = 0
     failed: int = 0
@@ -39,27 +44,27 @@ class Count:
 
 
 def run(only: list[str] | None) -> int:
-    """Runs the steps (all, or those named); returns 0 when everything passed, else 1."""
+    """Runs all steps, or only the named ones; returns 0 when everything passed, else 1."""
     total = Count()
     for name, step in STEPS.items():
         if only and name not in only:
             continue
-        _say(f"--- {name}: {(step.__doc__ or '').splitlines()[0]}")
+        _print(f"--- {name}: {(step.__doc__ or '').splitlines()[0]}")
         started_s = time.monotonic()
         RESULTS.mkdir(parents=True, exist_ok=True)
         count = step()
-        _say(f"--- {name}: {count} ({time.monotonic() - started_s:.0f} s)")
+        _print(f"--- {name}: {count} ({time.monotonic() - started_s:.0f} s)")
         total += count
-    _say(str(total))
+    _print(str(total))
     return 1 if total.failed or not total.passed else 0
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     print(line, flush=True)
 
 
-def _command(*command: str | Path, quiet: bool = True, **environment: str) -> bool:
-    """Runs a command in the repository; its output is shown when it fails, or as it comes. True when it ends with 0."""
+def _succeeds(*command: str | Path, quiet: bool = True, **environment: str) -> bool:
+    """Runs a command in the repository's root; quiet: its output is shown only when it fails."""
     done = subprocess.run(
         [str(part) for part in command],
         cwd=ROOT,
@@ -81,14 +86,15 @@ def _one(passed: bool) -> Count:
 # --- steps ----------------------------------------------------------------------------------------------------------
 
 def _style() -> Count:
-    """ruff over the Python sources, clang-format over C and C++."""
-    config = ROOT / "tools" / "pyproject.toml"
-    count = _one(_command(sys.executable, "-m", "ruff", "check", "--no-cache", "--config", config,
-                          ROOT / "tools", ROOT / "tests"))
-    folders = [ROOT / name for name in ("firmware", "hal", "emulator", "tests")]
-    sources = sorted(path for folder in folders for path in folder.rglob("*") if path.suffix in (".c", ".h", ".cpp"))
-    clang_format = Path(sys.executable).with_name("clang-format")
-    count += _one(_command(clang_format, "--dry-run", "-Werror", *sources))
+    """ruff, mypy, clang-format, clang-tidy and British spelling."""
+    count = _one(_succeeds(_tool("ruff"), "check", "--no-cache", "--config", CONFIGURATION, "tools", "tests"))
+    count += _one(_succeeds(_tool("mypy"), "--config-file", CONFIGURATION, "--no-error-summary"))
+    sources = _sources(*SOURCE_FOLDERS, suffixes=(".c", ".h", ".cpp"))
+    count += _one(_succeeds(_tool("clang-format"), "--dry-run", "-Werror", *sources))
+    count += _one(_clang_tidy())
+    documents = sorted(ROOT.glob("*.md"))
+    count += _one(_succeeds(_tool("codespell"), "--toml", CONFIGURATION, *documents,
+                            *(name for name in CHECKED_FOR_SPELLING if (ROOT / name).exists())))
     return count
 
 
@@ -98,7 +104,7 @@ def _unit() -> Count:
 
 
 def _sanitize() -> Count:
-    """the same with AddressSanitizer and UndefinedBehaviorSanitizer, and the paper's experiments."""
+    """the same with AddressSanitizer and UndefinedBehaviorSanitizer, and the experiments of the paper."""
     built = _one(build_preset("sanitize"))
     if built.failed:
         return built
@@ -108,26 +114,38 @@ def _sanitize() -> Count:
 
 
 def _target() -> Count:
-    """the firmware for Cortex-M4 (compiled in three ways) and RV32: its symbols and size checked, run in QEMU."""
+    """the firmware for Cortex-M4 (compiled in three ways) and RV32: symbols and size checked, run in QEMU."""
     count = Count()
     for preset in TARGET_BUILDS:
         count += _one(build_preset(preset))
     if not count.failed:
-        count += _pytest(RESULTS / "target.xml", [TESTS / "target"], [])
+        count += _pytest("target", TESTS / "target")
     return count
 
 
 def _hil() -> Count:
-    """the drive through CAN on local buses, the plant against other solvers, the tools."""
-    return _pytest(RESULTS / "hil.xml", [HIL, TESTS / "plant", TESTS / "tools"], [])
+    """the drive through CAN on local buses."""
+    return _pytest("hil", TESTS / "hil")
+
+
+def _plant() -> Count:
+    """the emulated plant compared with reference solvers."""
+    return _pytest("plant", TESTS / "plant")
+
+
+def _tools() -> Count:
+    """launcher, commands, reports and the commands of the documentation."""
+    return _pytest("tools", TESTS / "tools")
 
 
 def _socketcan() -> Count:
-    """the drive through a real SocketCAN interface, here or in a guest."""
+    """the drive through a real SocketCAN interface, here or in a VM."""
     mark = re.compile(r"mark\.(both_transports|socketcan)\b")
-    files = [path for path in sorted(HIL.glob("test_*.py")) if mark.search(path.read_text(encoding="utf-8"))]
-    guest = [sys.executable, "-m", "salient.vm.run", "--timeout-s", str(GUEST_TIMEOUT_S), "--"]
-    return _pytest(RESULTS / "socketcan.xml", files, ["--salient-can=socketcan:vcan0"], guest)
+    files = [path for path in sorted((TESTS / "hil").glob("test_*.py"))
+             if mark.search(path.read_text(encoding="utf-8"))]
+    vm = [sys.executable, "-m", "salient.vm.run", "--timeout-s", str(VM_TIMEOUT_S), "--"]
+    # One after the other: there is one interface.
+    return _pytest("socketcan", *files, options=["--salient-can=socketcan:vcan0"], prefix=vm, processes=0)
 
 
 STEPS = {
@@ -136,16 +154,40 @@ STEPS = {
     "sanitize": _sanitize,
     "target": _target,
     "hil": _hil,
+    "plant": _plant,
+    "tools": _tools,
     "socketcan": _socketcan,
 }
 
 
-# --- how ------------------------------------------------------------------------------------------------------------
+# --- parts of steps -------------------------------------------------------------------------------------------------
 
 def build_preset(preset: str) -> bool:
-    """Configures and builds a preset; what it wrote is shown when it fails."""
-    machine = ["-DSALIENT_MACHINE_FILE="]
-    return _command("cmake", "--preset", preset, *machine) and _command("cmake", "--build", "--preset", preset)
+    """Configures and builds a preset; the output is shown when it fails."""
+    return (_succeeds("cmake", "--preset", preset, "-DSALIENT_MACHINE_FILE=")
+            and _succeeds("cmake", "--build", "--preset", preset))
+
+
+def _tool(name: str) -> Path:
+    """Program of the virtual environment."""
+    return Path(sys.executable).with_name(name)
+
+
+def _sources(*folders: str, suffixes: tuple[str, ...]) -> list[Path]:
+    return sorted(path for folder in folders for path in (ROOT / folder).rglob("*") if path.suffix in suffixes)
+
+
+def _clang_tidy() -> bool:
+    """The C sources that the host build compiles, with the compiler's own headers: the wheel brings none."""
+    headers = subprocess.run(["gcc", "-print-file-name=include"], capture_output=True, text=True).stdout.strip()
+    command = [_tool("clang-tidy"), "-p", BUILD / "host", "--quiet", f"--extra-arg=-isystem{headers}",
+               "--extra-arg=-Wno-ignored-optimization-argument"]
+    compiled = (BUILD / "host" / "compile_commands.json").read_text(encoding="utf-8")
+    sources = [path for path in _sources("firmware", "hal", "emulator", suffixes=(".c",))
+               if f'"file": "{path}"' in compiled]
+    with ThreadPoolExecutor(CORES) as pool:
+        passed = list(pool.map(lambda part: _succeeds(*command, *part), (sources[at::CORES] for at in range(CORES))))
+    return bool(sources) and all(passed)
 
 
 def _ctest(preset: str) -> Count:
@@ -154,8 +196,8 @@ def _ctest(preset: str) -> Count:
     shutil.rmtree(results, ignore_errors=True)
     results.mkdir(parents=True)
     overview = results / "ctest-overview"
-    _command("ctest", "--test-dir", BUILD / preset, "--output-on-failure", "--parallel", str(os.cpu_count() or 1),
-             "--output-junit", overview, GTEST_OUTPUT=f"xml:{results}/", UBSAN_OPTIONS="print_stacktrace=1")
+    _succeeds("ctest", "--preset", preset, "--parallel", str(CORES), "--output-junit", overview,
+              GTEST_OUTPUT=f"xml:{results}/")
     count = Count()
     if not overview.exists():
         return Count(failed=1)
@@ -172,7 +214,7 @@ def _ctest(preset: str) -> Count:
 
 
 def _read_report(path: Path) -> Count:
-    """A JUnit file of GoogleTest or pytest. What was skipped counts as failed: nothing is left out silently."""
+    """Reads a JUnit file of GoogleTest or pytest. A skipped test counts as failed: nothing is left out silently."""
     try:
         root = ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError):
@@ -196,17 +238,22 @@ def _experiments(build: str) -> Count:
                 except Exception as error:
                     fault = str(error)
             if fault != "none":
-                _say(f"{path.stem} by {scenario.controller}: {fault}")
+                _print(f"{path.stem} by {scenario.controller}: {fault}")
             count += _one(fault == "none")
     return count
 
 
-def _pytest(report: Path, files: list[Path], options: list[str], prefix: list[str] | None = None) -> Count:
+def _pytest(name: str, *files: Path, options: Sequence[str] = (), prefix: Sequence[str] = (),
+            processes: int = CORES) -> Count:
+    """Runs pytest in parallel processes; tests of one xdist_group (tests/conftest.py) share a process."""
+    report = RESULTS / f"{name}.xml"
     report.unlink(missing_ok=True)
-    good = _command(*(prefix or []), sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", ROOT,
-                    f"--junitxml={report}", *options, *files, quiet=False)
+    if processes:
+        options = ["-n", str(processes), "--dist", "loadgroup", *options]
+    good = _succeeds(*prefix, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", ROOT,
+                     f"--junitxml={report}", *options, *files, quiet=False)
     count = _read_report(report)
-    # Something went wrong around the tests: a crash, an error at the end of the session.
+    # Failures outside of the tests: a crash, an error at the end of the session.
     if not good and not count.failed:
         count += Count(failed=1)
     return count
