@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from salient.__main__ import main
 from salient.paths import ROOT
 
-LAUNCHER_TIMEOUT_S = 300
+# The reference model of the plant serves the tests of the benchmark, too.
+sys.path.append(str(ROOT / "tests" / "plant"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -31,6 +34,22 @@ def salient(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     def run(*arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
         command = [str(ROOT / "tools" / "salient"), *map(str, arguments)]
         return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, stdin=subprocess.DEVNULL,
-                              env=environment or None, timeout=LAUNCHER_TIMEOUT_S)
+                              env=environment or None)
+
+    return run
+
+
+@pytest.fixture
+def salient_without_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+                          ) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs a command in this process, without the preparation by tools/salient (1 s of processor time)."""
+
+    def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+        words = [*map(str, arguments)]
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["salient", *words])
+        capsys.readouterr()
+        code = main()
+        return subprocess.CompletedProcess(words, code, *capsys.readouterr())
 
     return run

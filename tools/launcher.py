@@ -1,10 +1,11 @@
-"""What tools/salient does before a command: sets up what is missing, builds, hands over to the Python package.
+"""Preparation of a tools/salient command: installs missing packages, builds, and runs the Python package.
 
-Standard library only. Everything it makes stays in build/. Its own words go to standard error.
+Standard library only. All results stay in build/; messages go to standard error.
 """
 
 from __future__ import annotations
 
+import argparse
 import fcntl
 import hashlib
 import os
@@ -15,7 +16,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import BinaryIO, NoReturn
 
 TOOLS = Path(__file__).resolve().parent
 ROOT = TOOLS.parent
@@ -30,8 +31,8 @@ from salient.cli import make_parser  # noqa: E402  (needs the path above)
 
 
 @dataclass(frozen=True)
-class Need:
-    """A Debian package, what it is for, and how to see that it is there."""
+class Dependency:
+    """A Debian package, its purpose, and a check of its presence."""
 
     package: str
     purpose: str
@@ -47,83 +48,85 @@ def _file(*paths: str) -> Callable[[], bool]:
 
 
 def _has_ensurepip() -> bool:
-    # Debian ships ensurepip without its wheels unless python3-venv is installed.
+    # Debian packages ensurepip without its wheels unless python3-venv is installed.
     code = "import ensurepip, sys, venv; ensurepip.version()"
     return subprocess.run([_base_python(), "-c", code], capture_output=True).returncode == 0
 
 
-BUILD_NEEDS = (
-    Need("gcc", "compiler", _tool("gcc")),
-    Need("g++", "compiler of the unit tests", _tool("g++")),
-    Need("cmake", "build", _tool("cmake")),
-    Need("ninja-build", "build", _tool("ninja")),
-    Need("libgtest-dev", "unit tests", _file("/usr/include/gtest/gtest.h", "/usr/local/include/gtest/gtest.h")),
-    Need("python3-venv", "virtual environment", lambda: (VENV / "bin/python").exists() or _has_ensurepip()),
+BUILD_DEPENDENCIES = (
+    Dependency("gcc", "compiler", _tool("gcc")),
+    Dependency("g++", "compiler of the unit tests", _tool("g++")),
+    Dependency("cmake", "build", _tool("cmake")),
+    Dependency("ninja-build", "build", _tool("ninja")),
+    Dependency("libgtest-dev", "unit tests", _file("/usr/include/gtest/gtest.h", "/usr/local/include/gtest/gtest.h")),
+    Dependency("python3-venv", "virtual environment", lambda: (VENV / "bin/python").exists() or _has_ensurepip()),
 )
-TARGET_NEEDS = {
+TARGET_DEPENDENCIES = {
     "host": (),
     "cortex-m4": (
-        Need("gcc-arm-none-eabi", "compiler for Cortex-M4", _tool("arm-none-eabi-gcc")),
-        Need("libnewlib-arm-none-eabi", "its C headers", _file("/usr/lib/arm-none-eabi/include/string.h")),
-        Need("qemu-system-arm", "emulated Cortex-M4", _tool("qemu-system-arm")),
+        Dependency("gcc-arm-none-eabi", "compiler for Cortex-M4", _tool("arm-none-eabi-gcc")),
+        Dependency("libnewlib-arm-none-eabi", "its C headers", _file("/usr/lib/arm-none-eabi/include/string.h")),
+        Dependency("qemu-system-arm", "emulated Cortex-M4", _tool("qemu-system-arm")),
     ),
     "rv32": (
-        Need("gcc-riscv64-unknown-elf", "compiler for RV32", _tool("riscv64-unknown-elf-gcc")),
-        Need("qemu-system-misc", "emulated RV32", _tool("qemu-system-riscv32")),
+        Dependency("gcc-riscv64-unknown-elf", "compiler for RV32", _tool("riscv64-unknown-elf-gcc")),
+        Dependency("qemu-system-misc", "emulated RV32", _tool("qemu-system-riscv32")),
     ),
 }
-TEST_NEEDS = (
-    *(need for needs in TARGET_NEEDS.values() for need in needs),
-    Need("qemu-system-x86", "guest with a kernel that has CAN", lambda: not _guest_packages()),
+TEST_DEPENDENCIES = (
+    *(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group),
+    Dependency("qemu-system-x86", "VM with a kernel that has CAN", lambda: not _vm_packages()),
 )
-MEASUREMENT_NEEDS = (
-    Need("ngspice", "second opinion on the emulated plant", _tool("ngspice")),
-    Need("valgrind", "instruction counts", _tool("valgrind")),
+MEASUREMENT_DEPENDENCIES = (
+    Dependency("ngspice", "reference solver for the emulated plant", _tool("ngspice")),
+    Dependency("valgrind", "instruction counts", _tool("valgrind")),
 )
 
 WITHOUT_BUILD = ("log", "monitor", "machine")
-"""Commands that need no drive built here."""
+"""Commands that need no drive."""
+BENCHMARK = ("bench",)
+"""The command that measures."""
 
 
-def _guest_packages() -> list[str]:
-    from salient.vm import run as guest
+def _vm_packages() -> list[str]:
+    from salient.vm import run as vm
 
-    return guest.missing_packages()
+    return vm.missing_packages()
 
 
 def _base_python() -> str:
-    """Python that the virtual environment is made with: the one that runs this."""
-    # tools/salient has preferred it already; its real path, because a virtual environment of the caller may be active.
+    """The Python that makes the virtual environment: the one that tools/salient has chosen."""
+    # Resolved, because a virtual environment of the caller may be active.
     return str(Path(sys.executable).resolve())
 
 
 def fail(line: str) -> NoReturn:
-    """One line, exit code 2."""
+    """Prints one line and ends with exit code 2."""
     print(f"salient: {line}", file=sys.stderr)
     sys.exit(2)
 
 
-def say(line: str) -> None:
-    """One line to whoever waits."""
+def print_status(line: str) -> None:
+    """Prints one line to standard error."""
     print(f"salient: {line}", file=sys.stderr, flush=True)
 
 
 # --- Debian packages ------------------------------------------------------------------------------------------------
 
-def install_packages(needs: tuple[Need, ...], install: bool) -> None:
-    """Installs what is missing, or names it and stops."""
-    missing = [need for need in needs if not need.present()]
+def install_packages(dependencies: tuple[Dependency, ...], install: bool) -> None:
+    """Installs missing Debian packages, or names them and ends."""
+    missing = [dependency for dependency in dependencies if not dependency.present()]
     if not missing:
         return
-    packages = [need.package for need in missing]
-    reasons = ", ".join(f"{need.package} ({need.purpose})" for need in missing)
+    packages = [dependency.package for dependency in missing]
+    reasons = ", ".join(f"{dependency.package} ({dependency.purpose})" for dependency in missing)
     if not install:
         fail(f"missing: {reasons}; install the Debian packages {' '.join(packages)}, or leave out --no-install")
     if shutil.which("apt-get") is None:
         fail(f"missing: {reasons}; there is no apt-get to install them with")
     if os.geteuid() != 0 and not _sudo_works():
         fail(f"missing: {reasons}; installing them needs root or sudo without a password")
-    say(f"installing Debian packages: {reasons}")
+    print_status(f"installing Debian packages: {reasons}")
     log = BUILD / "apt.log"
     command = ["apt-get", "install", "-y", "--no-install-recommends", *packages]
     with log.open("ab") as output:
@@ -133,16 +136,16 @@ def install_packages(needs: tuple[Need, ...], install: bool) -> None:
             done = _as_root(["apt-get", "update"], output) and _as_root(command, output)
     if not done:
         fail(f"the Debian packages {' '.join(packages)} could not be installed: see {log.relative_to(ROOT)}")
-    still = [need.package for need in missing if not need.present()]
+    still = [dependency.package for dependency in missing if not dependency.present()]
     if still:
-        fail(f"{' '.join(still)}: installed, but what it should bring is not there")
+        fail(f"{' '.join(still)}: installed, but the expected files are missing")
 
 
 def _sudo_works() -> bool:
     return bool(shutil.which("sudo")) and subprocess.run(["sudo", "-n", "true"], capture_output=True).returncode == 0
 
 
-def _as_root(command: list[str], output) -> bool:
+def _as_root(command: list[str], output: BinaryIO) -> bool:
     prefix = [] if os.geteuid() == 0 else ["sudo", "-n"]
     command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", *command]
     return subprocess.run(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output).returncode == 0
@@ -160,37 +163,46 @@ def make_environment(install: bool) -> None:
     pip = [str(VENV / "bin/python"), "-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--no-deps"]
     steps = [[*pip, "--no-build-isolation", "--editable", str(TOOLS)]]
     if found[:1] != [packages]:
-        where = f"{LOCK.relative_to(ROOT)} into {VENV.relative_to(ROOT)} (CAN, figures, tests)"
+        where = f"{LOCK.relative_to(ROOT)} into {VENV.relative_to(ROOT)} (CAN, plots, tests)"
         if not install:
             fail(f"missing: the Python packages of {where}; leave out --no-install")
-        say(f"installing Python packages of {where}")
+        print_status(f"installing Python packages of {where}")
         environment = [_base_python(), "-m", "venv", "--clear", str(VENV)]
         steps = [environment, [*pip, "--require-hashes", "-r", str(LOCK)], *steps]
-    # setuptools would leave its notes beside the sources.
-    notes, extra = BUILD / "package", BUILD / "setuptools.cfg"
-    notes.mkdir(exist_ok=True)
-    extra.write_text(f"[egg_info]\negg_base = {notes}\n")
+    # By default setuptools writes its metadata next to the sources.
+    metadata, extra = BUILD / "package", BUILD / "setuptools.cfg"
+    metadata.mkdir(exist_ok=True)
+    extra.write_text(f"[egg_info]\negg_base = {metadata}\n")
     log = BUILD / "pip.log"
     with log.open("wb") as output:
         for step in steps:
             environment = {**os.environ, "DIST_EXTRA_CONFIG": str(extra)}
             if subprocess.run(step, env=environment, stdout=output, stderr=output, cwd=BUILD).returncode != 0:
-                fail(f"the Python packages could not be installed: {_last_line(log)} (see {log.relative_to(ROOT)})")
+                fail(f"the Python packages could not be installed: {_pip_failure(log)} (see {log.relative_to(ROOT)})")
     STAMP.write_text(f"{packages} {ours}\n")
 
 
-def _last_line(log: Path) -> str:
-    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    return lines[-1].strip() if lines else "no output"
+def _pip_failure(log: Path) -> str:
+    """The cause in pip's output. An index that cannot be reached shows as warnings about retries; the last line then
+    only says that no version was found."""
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    for line in lines:
+        retry = re.search(r"Retry\(total=0,.* after connection broken by '\w+\((.*)\)': /\S*$", line)
+        if retry:
+            # '<connection object>: Failed to establish a new connection: [Errno -2] Name or service not known'
+            cause = re.sub(r"^.*>: ", "", retry[1]).strip("'\")")
+            return f"the package index cannot be reached: {cause}"
+    errors = [line for line in lines if line.startswith("ERROR:")]
+    return errors[0].removeprefix("ERROR: ") if errors else (lines or ["no output"])[-1]
 
 
 # --- build ----------------------------------------------------------------------------------------------------------
 
 def build(preset: str, targets: list[str]) -> None:
-    """Brings a preset's build up to date; exit code 1 with the compiler's words when it fails."""
+    """Brings the build of a preset up to date; ends with exit code 1 and the compiler's output when it fails."""
     folder = BUILD / preset
     if not (folder / "bin").exists():
-        say("building")
+        print_status("building")
     log = BUILD / "build.log"
     command = ["cmake", "--build", "--preset", preset]
     if targets:
@@ -209,21 +221,41 @@ def build(preset: str, targets: list[str]) -> None:
 
 
 def _is_configured(folder: Path) -> bool:
-    """Whether CMake was there, and without a machine file of the user's that may be gone by now."""
+    """True for a folder that CMake has configured without a machine file of the user, which may be gone by now."""
     try:
         cache = (folder / "CMakeCache.txt").read_text()
     except OSError:
         return False
-    return (folder / "build.ninja").exists() and re.search(r"^SALIENT_MACHINE_FILE:FILEPATH=$", cache, re.M) is not None
+    without_file = re.search(r"^SALIENT_MACHINE_FILE:FILEPATH=$", cache, re.MULTILINE) is not None
+    return without_file and (folder / "build.ninja").exists()
 
 
 def _failures(text: str) -> str:
-    """The last of the build's output, which is where the reason stands."""
+    """The last lines of the build's output, which contain the reason."""
     return "\n".join(text.splitlines()[-40:]) + "\n"
 
 
+def needs_build(options: argparse.Namespace) -> bool:
+    """False for commands that need no drive."""
+    return options.command not in WITHOUT_BUILD and not getattr(options, "list", False)
+
+
+def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, ...]:
+    """Debian packages that a command needs."""
+    if not needs_build(options):
+        return tuple(dependency for dependency in BUILD_DEPENDENCIES if dependency.package == "python3-venv")
+    found = BUILD_DEPENDENCIES + TARGET_DEPENDENCIES[target]
+    if options.command == "test":
+        found += TEST_DEPENDENCIES
+    if getattr(options, "figures", False):  # measured on every target
+        found += tuple(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group)
+    if options.command in ("test", *BENCHMARK):
+        found += MEASUREMENT_DEPENDENCIES
+    return found
+
+
 def main() -> None:
-    """Reads the command line, prepares, and becomes the command."""
+    """Reads the command line, prepares, and executes the command in place of this process."""
     options = make_parser().parse_args()
     install = not options.no_install
     os.environ["PYTHONPYCACHEPREFIX"] = str(BUILD / "pycache")
@@ -233,26 +265,18 @@ def main() -> None:
     except OSError as error:
         fail(f"{BUILD}: {error.strerror}; everything is built there")
     with lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # two commands at once must not build over each other
-        needs = BUILD_NEEDS + (TEST_NEEDS if options.command == "test" else ())
-        # bench counts the instructions of the control interrupt there
-        target = "cortex-m4" if options.command == "bench" else getattr(options, "target", "host")
-        on_target = target != "host"
-        needs += TARGET_NEEDS[target]
-        if getattr(options, "figures", False):  # of every target
-            needs += tuple(need for needs_of in TARGET_NEEDS.values() for need in needs_of)
-        needs += MEASUREMENT_NEEDS if options.command in ("test", "bench") else ()
-        if options.command in WITHOUT_BUILD:
-            needs = tuple(need for need in BUILD_NEEDS if need.package == "python3-venv")
-        install_packages(needs, install)
+        fcntl.flock(lock, fcntl.LOCK_EX)  # concurrent commands must not build into each other
+        # The benchmark counts the instructions of the control interrupt on the Cortex-M4.
+        target = "cortex-m4" if options.command in BENCHMARK else getattr(options, "target", "host")
+        install_packages(dependencies(options, target), install)
         make_environment(install)
-        if options.command not in WITHOUT_BUILD:
+        if needs_build(options):
             machines = sorted(path.stem for path in (TOOLS / "machines").glob("*.toml"))
             targets = [f"salient_{name}" for name in machines]
-            targets += ["plant_benchmark_saturating"] if options.command == "bench" else []
-            targets += [f"salient_target_{name}" for name in machines] if on_target else []
+            targets += ["plant_benchmark_saturating"] if options.command in BENCHMARK else []
+            targets += [f"salient_target_{name}" for name in machines] if target != "host" else []
             build("host", [] if options.command == "test" else targets)
-            if on_target:
+            if target != "host":
                 build(target, [])
     python = str(VENV / "bin/python")
     os.execv(python, [python, "-m", "salient", *sys.argv[1:]])

@@ -6,6 +6,8 @@ import pytest
 
 from salient.paths import MACHINES
 
+pytestmark = pytest.mark.xdist_group("machine_builds")
+
 
 @pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])
 @pytest.mark.parametrize(("stator", "rotor", "phases"), [(8, 6, 4), (12, 8, 3)])

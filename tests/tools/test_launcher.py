@@ -85,10 +85,10 @@ def test_wrong_command_line(salient, arguments, words):
         (SCENARIO + "seed = " + 20000 * "[", ["not TOML", "too deep"]),
     ],
 )
-def test_wrong_scenario(salient, tmp_path, text, words):
+def test_wrong_scenario(salient_without_build, tmp_path, text, words):
     path = tmp_path / "scenario.toml"
     path.write_text(text)
-    assert_mistake(salient("run", path, "--out", tmp_path / "out"), *words)
+    assert_mistake(salient_without_build("run", path, "--out", tmp_path / "out"), *words)
 
 
 def machine_file(folder: Path, name: str, old: str, new: str) -> Path:
@@ -110,9 +110,9 @@ def machine_file(folder: Path, name: str, old: str, new: str) -> Path:
         ("[converter]", "[converter", ["not TOML"]),
     ],
 )
-def test_wrong_machine_file(salient, tmp_path, old, new, words):
+def test_wrong_machine_file(salient_without_build, tmp_path, old, new, words):
     path = machine_file(tmp_path, "mine", old, new)
-    assert_mistake(salient("sim", "--machine", path), str(path), *words)
+    assert_mistake(salient_without_build("sim", "--machine", path), str(path), *words)
 
 
 def test_machine_file_with_a_shipped_name(salient, tmp_path):
@@ -143,6 +143,7 @@ def test_missing_python(salient, tmp_path):
     assert_mistake(result, "python3", "python3-venv")
 
 
+@pytest.mark.xdist_group("machine_builds")
 def test_machine_file_of_ones_own(make_bench, tmp_path):
     """A file with half the inertia is built on demand, and its motor gains speed about twice as fast."""
     path = machine_file(tmp_path, "half_inertia", "inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.01")

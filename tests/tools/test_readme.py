@@ -1,8 +1,9 @@
-"""The README's commands work as they stand.
+"""Documented commands work as written.
 
-Every fenced block marked `sh` is run in order, but for those that hold `tools/salient demo` or `tools/salient test`,
-which are run by whoever runs this. A block that starts `tools/salient sim` keeps running while the later ones are run,
-as it would in a terminal of its own. The bus has a path of the test's own, so that two of them can run at once.
+In every README.md and in CONTRIBUTING.md, the fenced blocks marked `sh` are run, those of a section in order and in the
+root of the repository. A block that starts `tools/salient sim` keeps running until the end of its section, as it would
+in a second terminal. Blocks marked `sh untested` are not run: a debugger, builds and measurements of minutes, the tests
+themselves. Buses get a path in the test's folder, so that tests can run in parallel.
 """
 
 from __future__ import annotations
@@ -12,33 +13,60 @@ import os
 import re
 import signal
 import subprocess
+from pathlib import Path
+
+import pytest
 
 from salient.paths import ROOT
 
-BLOCK_TIMEOUT_S = 120
+BUS = "/tmp/salient.sock"
+FOLDERS = ("firmware", "hal", "emulator", "tools", "tests")
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md",
+             *sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("README.md"))]
+# The suite itself, and every experiment with its report (tests/tools/test_demo.py).
+NOT_TO_BE_RUN = re.compile(r"^tools/salient (test|demo)\b", re.MULTILINE)
 
 
-def blocks() -> list[str]:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    found = re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-    return [block for block in found if "tools/salient demo" not in block and "tools/salient test" not in block]
+def sections(path: Path) -> list[tuple[str, list[str]]]:
+    """(title, blocks marked `sh`) of each section that has any."""
+    found: list[tuple[str, list[str]]] = [(path.name, [])]
+    fence: str | None = None
+    for line in path.read_text(encoding="utf-8").splitlines(keepends=True):
+        if line.startswith("```"):
+            fence = line[3:].strip() if fence is None else None
+            if fence == "sh":
+                found[-1][1].append("")
+        elif fence == "sh":
+            found[-1][1][-1] += line
+        elif fence is None and line.startswith("#"):
+            found.append((line.strip("# \n"), []))
+    return [(title, blocks) for title, blocks in found if blocks]
 
 
-def test_commands_of_the_readme(tmp_path):
-    simulators = []
-    bus = "/tmp/salient.sock"
-    assert any("tools/salient sim" in block and bus in block for block in blocks())
+CASES = [pytest.param(blocks, id=f"{path.relative_to(ROOT)}: {title}")
+         for path in DOCUMENTS if path.exists() for title, blocks in sections(path)]
+
+
+def test_the_main_readme_has_commands_and_a_drive_to_watch() -> None:
+    blocks = [block for _, blocks in sections(ROOT / "README.md") for block in blocks]
+    assert any("tools/salient sim" in block and BUS in block for block in blocks)
+
+
+@pytest.mark.parametrize("blocks", CASES)
+def test_commands_of_a_section(tmp_path: Path, blocks: list[str]) -> None:
+    simulators: list[subprocess.Popen[str]] = []
     try:
-        for block in blocks():
-            shell = ["bash", "-euo", "pipefail", "-c", block.replace(bus, f"{tmp_path}/salient.sock")]
+        for block in blocks:
+            assert not NOT_TO_BE_RUN.search(block), f"mark it `sh untested`:\n{block}"
+            shell = ["bash", "-euo", "pipefail", "-c", block.replace(BUS, f"{tmp_path}/salient.sock")]
             if re.search(r"^tools/salient sim\b", block, re.MULTILINE):
                 simulator = subprocess.Popen(shell, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                              text=True, start_new_session=True)
                 simulators.append(simulator)
+                assert simulator.stdout is not None
                 assert json.loads(simulator.stdout.readline())["ready"], block
                 continue
-            result = subprocess.run(shell, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True,
-                                    timeout=BLOCK_TIMEOUT_S)
+            result = subprocess.run(shell, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True)
             assert result.returncode == 0, f"{block}\n{result.stdout}\n{result.stderr}"
     finally:
         for simulator in simulators:
