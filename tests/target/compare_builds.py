@@ -1,8 +1,11 @@
-"""Compares the drives of two builds bit by bit: `build/venv/bin/python tests/target/compare_builds.py OTHER [OPTION ...]`.
+"""Compares the drives of two checkouts bit by bit:
 
-OTHER is a checkout whose builds host, cortex-m4 and rv32 are complete. Each machine and controller runs the runs of
-test_same_bits.py on each build; compared are the compare values of every control period, the recorded true state, and
-the CAN payloads of each identifier in sequence. Exit code 0 when nothing differs but identifiers named with --redefined.
+    build/venv/bin/python tests/target/compare_builds.py OTHER [--builds NAME ...] [--redefined IDENTIFIER ...]
+
+OTHER is a checkout whose builds host, cortex-m4 and rv32 are complete. Each machine and controller makes the runs of
+test_same_bits.py on each build. Compared are the compare values of every control period, the recorded true state, and
+the CAN payloads of each identifier in sequence. Exit code 1 when anything differs but the identifiers that --redefined
+names.
 """
 
 from __future__ import annotations
@@ -26,17 +29,16 @@ def digest_of_run(name: str, build: str, machine: str, controller: str) -> dict[
     from test_same_bits import ROW_BYTES, RUNS
 
     from salient.bench.bench import Bench
+    from salient.bench.emulator import SimulatorOptions
 
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         switches, recording = Path(folder) / "switches", Path(folder) / "recording.npy"
-        bench = make_bench(Bench, f"unix:{folder}/can.sock", record=recording, record_step_ns=10_000,
-                           record_switches=switches, build=build, machine=machine, controller=controller, seed=3,
-                           initial_angle_deg=12.0)
-        with bench:
+        options = SimulatorOptions(record=recording, record_step_ns=10_000, record_switches=switches, build=build,
+                                   machine=machine, controller=controller, seed=3, initial_angle_deg=12.0)
+        with Bench(options, f"unix:{folder}/can.sock") as bench:
             RUNS[name](bench)
         payloads: dict[str, Any] = {}
         for _, message in bench.log:
-            # Frames that clients sent are in the log as well; only received ones say what the drive and the rig did.
             entry = payloads.setdefault(f"{message.arbitration_id:#x}", [0, hashlib.sha256()])
             entry[0] += 1
             entry[1].update(bytes(message.data))
@@ -46,12 +48,6 @@ def digest_of_run(name: str, build: str, machine: str, controller: str) -> dict[
             "true_state": hashlib.sha256(recording.read_bytes()).hexdigest(),
             "payloads": {identifier: [count, sha.hexdigest()] for identifier, (count, sha) in payloads.items()},
         }
-
-
-def make_bench(bench_type, can: str, **options):
-    from salient.bench.emulator import SimulatorOptions
-
-    return bench_type(SimulatorOptions(**options), can)
 
 
 def run_all(options: argparse.Namespace) -> None:
@@ -75,11 +71,12 @@ def digests_of(build: Path, arguments: list[str]) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description="Compares the drives of two checkouts bit by bit.")
     parser.add_argument("other", type=Path, help="checkout to compare with")
     parser.add_argument("--builds", nargs="+", choices=BUILDS, default=BUILDS)
     parser.add_argument("--runs", nargs="+", help="default: all of test_same_bits.py")
-    parser.add_argument("--redefined", nargs="+", default=[], metavar="ID", help="identifiers that may differ, as 0x185")
+    parser.add_argument("--redefined", nargs="+", default=[], metavar="0x185",
+                        help="identifiers that may differ")
     parser.add_argument("--print", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.print:
