@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 import subprocess
 import sys
 
@@ -153,53 +152,3 @@ def test_python_can_logger(connect, tmp_path, suffix):
         identifiers = [m.arbitration_id for m in log]
     assert identifiers.count(0x180) == bench.telemetry.count("DRIVE_STATUS") == 20
     assert 0x1F000010 in identifiers
-
-
-@pytest.mark.parametrize("suffix", [".blf", ".log"])
-def test_salient_log(connect, tmp_path, suffix):
-    """tools/salient log gives every frame with its virtual time."""
-    path = tmp_path / f"log{suffix}"
-    bench = connect.bench
-    bench.run_for(0.001)
-    seen = len(bench.log)
-    command = [sys.executable, "-u", "-m", "salient", "log", "--can", bench.address, "--out", str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as logger:
-        assert logger.stdout.readline() == f"recording {bench.address}\n"
-        bench.run_for(0.02)
-        bench.simulator.close()
-        assert logger.stdout.read() == f"{len(bench.log) - seen} frames: {path}\n"
-        assert logger.wait() == 0
-    with can.LogReader(path) as log:
-        logged = [(m.timestamp, m.arbitration_id, bytes(m.data)) for m in log]
-    expected = [(t * 1e-9, m.arbitration_id, bytes(m.data)) for t, m in bench.log[seen:]]
-    assert [entry[1:] for entry in logged] == [entry[1:] for entry in expected]
-    # candump text has microseconds
-    assert max(abs(a[0] - b[0]) for a, b in zip(logged, expected, strict=True)) < (1e-9 if suffix == ".blf" else 1e-6)
-
-
-def test_salient_log_is_complete_when_interrupted(connect, tmp_path):
-    path = tmp_path / "log.blf"
-    bench = connect.bench
-    command = [sys.executable, "-u", "-m", "salient", "log", "--can", bench.address, "--out", str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as logger:
-        logger.stdout.readline()
-        bench.run_for(0.02)
-        logger.send_signal(signal.SIGTERM)
-        assert logger.wait() == 0
-    with can.LogReader(path) as log:
-        times = [m.timestamp for m in log]
-    assert times == sorted(times)
-
-
-def test_salient_monitor(connect):
-    bench = connect.bench
-    command = [sys.executable, "-u", "-m", "salient", "monitor", "--can", bench.address, "--every-s", "0.02"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as monitor:
-        assert monitor.stdout.readline() == f"watching {bench.address}\n"
-        bench.drive.speed_reference_rpm = 600
-        bench.run_for(0.2)
-        bench.simulator.close()
-        lines = monitor.stdout.read().splitlines()
-        assert monitor.wait() == 0
-    assert 8 <= len(lines) <= 10
-    assert all("state        run" in line and "reference    600.00 r/min" in line for line in lines[1:])

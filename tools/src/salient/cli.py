@@ -108,14 +108,15 @@ def make_parser() -> argparse.ArgumentParser:
                          help="folder of the picture (default out/machine)")
 
     pil = command("pil", "processor in the loop: a scenario on the target, and what the processor did")
-    pil.add_argument("scenario", type=Path, nargs="?", metavar="SCENARIO.toml")
+    task = pil.add_mutually_exclusive_group(required=True)
+    task.add_argument("scenario", type=Path, nargs="?", metavar="SCENARIO.toml")
     pil.add_argument("--out", type=Path, metavar="DIR", help="folder (default out/pil_NAME)")
     pil.add_argument("--target", type=_one_of(TARGETS[1:]), default=TARGETS[1], metavar="NAME",
                      help=f"{', '.join(TARGETS[1:])} (default {TARGETS[1]})")
-    pil.add_argument("--search", type=_positive, metavar="SECONDS",
+    task.add_argument("--search", type=_positive, metavar="SECONDS",
                      help="instead: look for dearer interrupts than those known, so long for each controller")
     pil.add_argument("--seed", type=_seed, default=1, metavar="N", help="of the search, default 1")
-    pil.add_argument("--figures", action="store_true",
+    task.add_argument("--figures", action="store_true",
                      help="instead: measure the committed figures of the target again and write them")
     return parser
 

@@ -14,9 +14,11 @@ import socket
 import struct
 import time
 from collections import deque
+from typing import Any
 
 import can
 from can import CanProtocol
+from can.typechecking import CanFilters
 
 CAN_EFF_FLAG = 0x80000000
 CAN_RTR_FLAG = 0x40000000
@@ -26,7 +28,7 @@ CANFD_ESI = 0x02
 CANFD_FDF = 0x04
 
 RIG_IDENTIFIERS = range(0x1F000000, 0x1F000100)
-"""29-bit identifiers of the test bench (rig.dbc); such frames never are on the emulated bus."""
+"""29-bit identifiers of the test bench (rig.dbc); these frames bypass the emulated bus."""
 
 _TIME = struct.Struct("<Q")
 # can_frame: identifier, length, 2 bytes unused, raw length code 9..15 of an 8-byte frame, data
@@ -36,7 +38,9 @@ _FLEXIBLE = struct.Struct("<IBBxx64s")
 _RECEIVE_BYTES = 128
 _SOCKET_BUFFER_BYTES = 8 * 1024 * 1024
 _ECHOES_MAX = 4096
-_SO_RCVBUFFORCE = 33  # not in Python's socket module
+_SO_RCVBUFFORCE = 33  # missing in Python's socket module
+_READY_POLL_S = 0.05
+_CLOSE_TIMEOUT_S = 1.0
 
 
 class VirtualMessage(can.Message):
@@ -44,13 +48,13 @@ class VirtualMessage(can.Message):
 
     __slots__ = ("time_ns",)
 
-    def __init__(self, *args, time_ns: int = 0, **kwargs) -> None:
-        super().__init__(*args, timestamp=time_ns / 1e9, **kwargs)
+    def __init__(self, *, time_ns: int = 0, **fields: Any) -> None:
+        super().__init__(timestamp=time_ns / 1e9, **fields)
         self.time_ns = time_ns
 
 
 def frame_bytes(message: can.Message) -> bytes:
-    """The message as struct can_frame or canfd_frame; everything without meaning is zero."""
+    """The message as struct can_frame or canfd_frame; unused bytes are zero."""
     identifier = message.arbitration_id
     if message.is_extended_id:
         identifier |= CAN_EFF_FLAG
@@ -69,7 +73,7 @@ def frame_bytes(message: can.Message) -> bytes:
 
 
 def message_of(frame: bytes, time_ns: int, channel: str, is_rx: bool = True) -> VirtualMessage:
-    """The other way round; ValueError when `frame` has neither size."""
+    """Inverse of frame_bytes; ValueError when `frame` has neither size."""
     if len(frame) == _CLASSIC.size:
         identifier, length, raw_length, data = _CLASSIC.unpack(frame)
         flexible, flags = False, 0
@@ -97,29 +101,69 @@ def message_of(frame: bytes, time_ns: int, channel: str, is_rx: bool = True) -> 
 
 
 def is_on_bus(message: can.Message) -> bool:
-    """Whether the frame takes its turn on the emulated bus: classic data and remote frames that are not the rig's."""
+    """True for frames that arbitrate on the emulated bus: classic data and remote frames that are not the rig's."""
     if message.is_fd or message.is_error_frame:
         return False
     return not (message.is_extended_id and message.arbitration_id in RIG_IDENTIFIERS)
 
 
-class SalientBus(can.BusABC):
-    """Client of one emulated bus. recv gives VirtualMessage.
+def wait_until_ready(channel: str, timeout_s: float = 10.0) -> None:
+    """Waits until a drive serves "unix:PATH"; can.CanInitializationError when none does within `timeout_s` seconds of
+    the wall clock."""
+    deadline_s = time.monotonic() + timeout_s
+    while True:
+        try:
+            SalientBus(channel).shutdown()
+            return
+        except can.CanInitializationError:
+            if time.monotonic() >= deadline_s:
+                raise
+        time.sleep(_READY_POLL_S)
 
-    channel: "unix:PATH" (or PATH). receive_own_messages: also give back what this client sent, once it has completed
-    on the emulated bus. Flexible data rate, remote and error frames pass. When the emulator ends, send and recv raise
-    can.CanOperationError that names the channel.
+
+def closed_in_order(channel: str) -> bool:
+    """After the end of a connection to "unix:PATH": True when the emulator removed its socket, as it does in an orderly
+    shutdown; False when it left the socket, because it was killed or crashed.
+
+    The emulator disconnects its clients before it removes the socket. A connection that is still accepted in between
+    ends when that is done.
+    """
+    path = channel.removeprefix("unix:")
+    while True:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+            probe.settimeout(_CLOSE_TIMEOUT_S)
+            try:
+                probe.connect(path)
+                if probe.recv(_RECEIVE_BYTES):
+                    return True  # another emulator serves the path already
+            except ConnectionRefusedError:
+                return False
+            except ConnectionResetError:
+                continue
+            except FileNotFoundError:
+                return True
+            except OSError:
+                return False
+
+
+class SalientBus(can.BusABC):
+    """Client of one emulated bus. recv returns VirtualMessage.
+
+    channel: "unix:PATH" (or PATH). receive_own_messages: also receive the frames that this client sent, once they have
+    completed on the emulated bus. Flexible data rate, remote and error frames pass. When the emulator ends, send and
+    recv raise can.CanOperationError that names the channel.
     """
 
-    def __init__(self, channel: str, can_filters=None, receive_own_messages: bool = False, **kwargs) -> None:
+    def __init__(self, channel: str, can_filters: CanFilters | None = None,
+                 receive_own_messages: bool = False, **options: Any) -> None:
         self.channel = str(channel)
         self._path = self.channel.removeprefix("unix:")
         self.channel_info = f"salient unix:{self._path}"
         self.receive_own_messages = receive_own_messages
         self._can_protocol = CanProtocol.CAN_FD
-        # What this client sent and has not seen come back; the two kinds overtake each other.
+        # Frames sent whose echo is outstanding. The order is kept within each queue, not between the two.
         self._sent_on_bus: deque[bytes] = deque(maxlen=_ECHOES_MAX)
-        self._sent_at_once: deque[bytes] = deque(maxlen=_ECHOES_MAX)
+        self._sent_immediate: deque[bytes] = deque(maxlen=_ECHOES_MAX)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             _enlarge_receive_buffer(self._socket)
@@ -129,10 +173,10 @@ class SalientBus(can.BusABC):
             self._is_shutdown = True
             raise can.CanInitializationError(f"unix:{self._path}: no drive answers there ({error.strerror})") from error
         self._socket.setblocking(False)
-        super().__init__(channel=channel, can_filters=can_filters, **kwargs)
+        super().__init__(channel=channel, can_filters=can_filters, **options)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Sends a frame; waits up to `timeout` seconds (None: for ever) while the emulator does not take any."""
+        """Sends a frame; waits up to `timeout` seconds (None: indefinitely) while the emulator accepts none."""
         frame = frame_bytes(msg)
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
@@ -142,11 +186,11 @@ class SalientBus(can.BusABC):
             except BlockingIOError:
                 left = None if deadline is None else max(0.0, deadline - time.monotonic())
                 if not select.select([], [self._socket], [], left)[1]:
-                    raise can.CanTimeoutError(f"{self.channel_info}: the emulator takes no frames") from None
+                    raise can.CanTimeoutError(f"{self.channel_info}: the emulator accepts no frames") from None
             except OSError as error:
                 raise self._gone() from error
         if not self.receive_own_messages:
-            (self._sent_on_bus if is_on_bus(msg) else self._sent_at_once).append(frame)
+            (self._sent_on_bus if is_on_bus(msg) else self._sent_immediate).append(frame)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         while True:
@@ -164,15 +208,15 @@ class SalientBus(can.BusABC):
             if self._is_own_echo(frame):
                 continue
             message = message_of(frame, _TIME.unpack_from(record)[0], self.channel)
-            # Filtered here: BusABC.recv would take a frame that it filters out for the end of a timeout of 0.
+            # Filtered here: with a timeout of 0, BusABC.recv would treat a frame that it filters out as the timeout.
             if self._matches_filters(message):
                 return message, True
 
     def _is_own_echo(self, frame: bytes) -> bool:
-        for sent in (self._sent_on_bus, self._sent_at_once):
+        for sent in (self._sent_on_bus, self._sent_immediate):
             if frame in sent:
                 while sent.popleft() != frame:
-                    pass  # its echo was lost: this client did not read in time
+                    pass  # the echo was lost: this client did not read in time
                 return True
         return False
 
@@ -189,7 +233,7 @@ class SalientBus(can.BusABC):
 
 
 def _enlarge_receive_buffer(client: socket.socket) -> None:
-    """As large as the system lets us; the emulator holds the frames on its side when this is not enough."""
+    """Requests the largest buffer that the system permits; frames beyond it queue in the emulator."""
     try:
         client.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _SOCKET_BUFFER_BYTES)
     except OSError:

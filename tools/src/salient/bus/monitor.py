@@ -1,4 +1,4 @@
-"""Commands that only listen: log and monitor."""
+"""Listen-only commands: log and monitor."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import can
 
 from salient.bus.clock import VirtualTimeReader, open_bus
+from salient.bus.interface import closed_in_order
 from salient.bus.log import open_log
 from salient.bus.signals import SignalTable, drive_database
 from salient.errors import UsageError
@@ -20,24 +21,79 @@ _COLUMNS = (
     ("speed", "speed_rpm", "{:>9.2f}"),
     ("reference", "DRIVE_MOTION.speed_reference_rpm", "{:>9.2f}"),
     ("torque", "torque_estimate_Nm", "{:>8.2f}"),
-    ("asked", "torque_reference_Nm", "{:>8.2f}"),
+    ("reference", "torque_reference_Nm", "{:>8.2f}"),
     ("load", "load_torque_estimate_Nm", "{:>8.2f}"),
-    ("bus", "DRIVE_TORQUE.bus_voltage_V", "{:>8.1f}"),
+    ("DC link", "DRIVE_TORQUE.bus_voltage_V", "{:>8.1f}"),
 )
+"""Title, signal and number format, in the order of a line."""
 
 
-def _frames(address: str, duration_s: float | None, what: str) -> Iterator[tuple[int, can.Message]]:
-    """Frames until the drive ends, `duration_s` of virtual time have passed, or an interrupt."""
+class _BusClosed(Exception):
+    """The emulator closed the bus while this command was listening."""
+
+
+def record(address: str, path: Path, duration_s: float | None) -> int:
+    """Writes every frame on a bus to a log file, on virtual time.
+
+    Ends when `duration_s` of virtual time have passed, on an interrupt, or when the bus closes; the file is complete in
+    every case. Returns the exit code: 1 when the bus closed early (see _report_closed), else 0.
+    """
+    open_bus(address).shutdown()  # fails before a file is created when there is no such bus
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"--out {path}: {error.strerror}") from None
+    log = open_log(path)
+    count, closed = 0, False
+    try:
+        for timed in _frames(address, duration_s, "recording"):
+            log.write(*timed)
+            count += 1
+    except KeyboardInterrupt:
+        pass
+    except _BusClosed:
+        closed = True
+    finally:
+        log.close()
+    print(f"{count} frames: {path}", flush=True)
+    return _report_closed(address, duration_s) if closed else 0
+
+
+def monitor(address: str, every_s: float, duration_s: float | None) -> int:
+    """Prints the main signals of the drive every `every_s` of virtual time; ends as `record` does, with its exit
+    code."""
+    telemetry = SignalTable(drive_database(), "DRIVE")
+    due_ns = None
+    try:
+        for time_ns, message in _frames(address, duration_s, "monitoring"):
+            telemetry.add(time_ns, message)
+            due_ns = time_ns + round(every_s * 1e9) if due_ns is None else due_ns
+            if time_ns < due_ns:
+                continue
+            if telemetry.count("DRIVE_TORQUE"):
+                sys.stdout.write(_line(time_ns, telemetry) + "\n")
+                sys.stdout.flush()
+            telemetry = SignalTable(drive_database(), "DRIVE")
+            due_ns += round(every_s * 1e9)
+    except _BusClosed:
+        return _report_closed(address, duration_s)
+    return 0
+
+
+def _frames(address: str, duration_s: float | None, activity: str) -> Iterator[tuple[int, can.Message]]:
+    """Frames until `duration_s` of virtual time have passed or an interrupt; _BusClosed when the bus closes first."""
     end_ns = None
-    # Whoever started this may end it so; what is written must be complete then.
+    # A termination request ends the command like an interrupt, so that its output is complete.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with open_bus(address) as bus:
         reader = VirtualTimeReader(bus)
-        print(f"{what} {address}", flush=True)
+        print(f"{activity} {address}", flush=True)
         while True:
             try:
                 timed = reader.receive(None)
-            except (can.CanOperationError, KeyboardInterrupt):
+            except can.CanOperationError:
+                raise _BusClosed from None
+            except KeyboardInterrupt:
                 return
             if timed is None:
                 continue
@@ -48,47 +104,20 @@ def _frames(address: str, duration_s: float | None, what: str) -> Iterator[tuple
             yield timed
 
 
-def record(address: str, path: Path, duration_s: float | None) -> int:
-    """Writes every frame on a bus to a log file, on virtual time; returns 0."""
-    open_bus(address).shutdown()  # nothing is left behind when there is no such bus
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"--out {path}: {error.strerror}") from None
-    log = open_log(path)
-    count = 0
-    try:
-        for timed in _frames(address, duration_s, "recording"):
-            log.write(*timed)
-            count += 1
-    except KeyboardInterrupt:
-        pass
-    finally:
-        log.close()
-    print(f"{count} frames: {path}")
-    return 0
-
-
-def monitor(address: str, every_s: float, duration_s: float | None) -> int:
-    """Prints the drive's main values every `every_s` of virtual time; returns 0."""
-    telemetry = SignalTable(drive_database(), "DRIVE")
-    due_ns = None
-    for time_ns, message in _frames(address, duration_s, "watching"):
-        telemetry.add(time_ns, message)
-        due_ns = time_ns + round(every_s * 1e9) if due_ns is None else due_ns
-        if time_ns < due_ns:
-            continue
-        if telemetry.count("DRIVE_TORQUE"):
-            sys.stdout.write(_line(time_ns, telemetry) + "\n")
-            sys.stdout.flush()
-        telemetry = SignalTable(drive_database(), "DRIVE")
-        due_ns += round(every_s * 1e9)
-    return 0
+def _report_closed(address: str, duration_s: float | None) -> int:
+    """Prints in one line how the bus closed. Returns 0 when the drive was stopped in order and no duration was
+    requested, else 1: the emulator was killed or crashed, or the requested duration is incomplete."""
+    in_order = closed_in_order(address)
+    cause = "the drive was stopped" if in_order else "the emulator was killed or crashed"
+    early = "" if duration_s is None else f" before --duration-s {duration_s:g} had passed"
+    print(f"salient: {address}: the drive's bus closed{early}: {cause}", file=sys.stderr, flush=True)
+    return 0 if in_order and duration_s is None else 1
 
 
 def _line(time_ns: int, telemetry: SignalTable) -> str:
     cells = [f"{time_ns * 1e-9:10.4f} s"]
-    for title, name, form in _COLUMNS:
+    for title, name, number_format in _COLUMNS:
         value = telemetry[name]
-        cells.append(f"{title} {form.format(value.last_name if value.choices else value.last)} {value.unit}".rstrip())
+        shown = number_format.format(value.last_name if value.choices else value.last)
+        cells.append(f"{title} {shown} {value.unit}".rstrip())
     return "  ".join(cells)

@@ -1,0 +1,117 @@
+"""tools/salient log and monitor: what they record and print, and how they end."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import can
+import pytest
+
+
+@pytest.fixture
+def listen(make_bench):
+    """A drive on a local bus, and a function that starts a listening command on it and waits for its first line."""
+    bench = make_bench()
+    commands = []
+
+    def start(command, *options, activity):
+        line = [sys.executable, "-u", "-m", "salient", command, "--can", bench.address, *map(str, options)]
+        process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        commands.append(process)
+        assert process.stdout.readline() == f"{activity} {bench.address}\n"
+        return process
+
+    start.bench = bench
+    yield start
+    for process in commands:
+        process.kill()
+        process.communicate()
+
+
+def finish(process):
+    """Standard output, standard error and exit code."""
+    output, errors = process.communicate()
+    return output, errors, process.returncode
+
+
+def kill(bench):
+    """Ends the emulator without an orderly shutdown."""
+    bench.simulator._process.kill()
+    bench.simulator._process.wait()
+    bench.simulator._process.returncode = 0  # expected here: closing the bench is no failure
+
+
+@pytest.mark.parametrize("suffix", [".blf", ".log"])
+def test_log_holds_every_frame_with_its_virtual_time(listen, tmp_path, suffix):
+    path = tmp_path / f"log{suffix}"
+    bench = listen.bench
+    bench.run_for(0.001)
+    seen = len(bench.log)
+    logger = listen("log", "--out", path, activity="recording")
+    bench.run_for(0.02)
+    bench.simulator.close()
+    assert finish(logger) == (f"{len(bench.log) - seen} frames: {path}\n",
+                              f"salient: {bench.address}: the drive's bus closed: the drive was stopped\n", 0)
+    with can.LogReader(path) as log:
+        logged = [(m.timestamp, m.arbitration_id, bytes(m.data)) for m in log]
+    expected = [(t * 1e-9, m.arbitration_id, bytes(m.data)) for t, m in bench.log[seen:]]
+    assert [entry[1:] for entry in logged] == [entry[1:] for entry in expected]
+    # The candump format has a resolution of one microsecond.
+    assert max(abs(a[0] - b[0]) for a, b in zip(logged, expected, strict=True)) < (1e-9 if suffix == ".blf" else 1e-6)
+
+
+def test_log_is_complete_when_interrupted(listen, tmp_path):
+    path = tmp_path / "log.blf"
+    logger = listen("log", "--out", path, activity="recording")
+    listen.bench.run_for(0.02)
+    logger.send_signal(signal.SIGTERM)
+    assert finish(logger)[1:] == ("", 0)
+    with can.LogReader(path) as log:
+        times = [m.timestamp for m in log]
+    assert times == sorted(times)
+
+
+def test_monitor_prints_one_line_per_interval(listen):
+    bench = listen.bench
+    monitor = listen("monitor", "--every-s", "0.02", activity="monitoring")
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.2)
+    bench.simulator.close()
+    output, errors, code = finish(monitor)
+    lines = output.splitlines()
+    assert code == 0
+    assert errors == f"salient: {bench.address}: the drive's bus closed: the drive was stopped\n"
+    assert 8 <= len(lines) <= 10
+    assert all("state        run" in line and "reference    600.00 r/min" in line for line in lines[1:])
+
+
+@pytest.mark.parametrize(("command", "activity"), [("log", "recording"), ("monitor", "monitoring")])
+def test_requested_duration_ends_the_command(listen, tmp_path, command, activity):
+    options = ["--out", tmp_path / "can.log"] if command == "log" else []
+    process = listen(command, *options, "--duration-s", "0.01", activity=activity)
+    listen.bench.run_for(0.02)
+    assert finish(process)[1:] == ("", 0)
+
+
+@pytest.mark.parametrize(("command", "activity"), [("log", "recording"), ("monitor", "monitoring")])
+def test_killed_emulator_is_reported(listen, tmp_path, command, activity):
+    bench = listen.bench
+    options = ["--out", tmp_path / "can.log"] if command == "log" else []
+    process = listen(command, *options, activity=activity)
+    bench.run_for(0.02)
+    kill(bench)
+    output, errors, code = finish(process)
+    assert (errors, code) == (
+        f"salient: {bench.address}: the drive's bus closed: the emulator was killed or crashed\n", 1)
+    if command == "log":
+        assert output == f"{len((tmp_path / 'can.log').read_text().splitlines())} frames: {tmp_path / 'can.log'}\n"
+
+
+def test_drive_stopped_before_the_requested_duration_is_reported(listen):
+    process = listen("monitor", "--duration-s", "10", activity="monitoring")
+    listen.bench.run_for(0.02)
+    listen.bench.simulator.close()
+    assert finish(process)[1:] == (f"salient: {listen.bench.address}: the drive's bus closed before --duration-s 10 had"
+                                   " passed: the drive was stopped\n", 1)
