@@ -4,10 +4,10 @@
 
 #include "fixed/sigmoid.h"
 
-static_assert(BP_INPUTS == 3 && BP_OUTPUTS == 3, "inputs and outputs are taken three at a time");
+static_assert(BP_INPUTS == 3 && BP_OUTPUTS == 3, "inputs and outputs are processed as vectors of three");
 
 static int32_t next_weight(uint32_t *generator) {
-    *generator = *generator * 1664525u + 1013904223u; /* Numerical Recipes, modulo 2^32 */
+    *generator = *generator * 1664525u + 1013904223u; /* W. H. Press et al., "Numerical Recipes", ranqd1; modulo 2^32 */
     return (int32_t)(*generator >> 4) - (1 << 27);    /* 28 bits, centred: +-0.5 in Q28 */
 }
 
@@ -20,8 +20,8 @@ void bp_network_reset(bp_network_t *network, uint32_t seed) {
         neuron->input.value[2] = next_weight(&generator);
 #pragma GCC unroll 3
         for (unsigned k = 0; k < 3; k++) {
-            neuron->input.change[k] = 0;
-            neuron->output.change[k] = 0;
+            neuron->input.increment[k] = 0;
+            neuron->output.increment[k] = 0;
         }
     }
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
@@ -32,13 +32,13 @@ void bp_network_reset(bp_network_t *network, uint32_t seed) {
 }
 
 void bp_network_forward(bp_network_t *network, const int32_t input_q27[BP_INPUTS]) {
-    /* Q28 * Q27 to Q23: within 3 * 8 and 6 * 8. */
+    /* Q28 * Q27 to Q23; sums within 3 * 8 and 6 * 8. */
     int32_t sum_q23[BP_OUTPUTS] = {0};
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         bp_neuron_t *neuron = &network->hidden[i];
-        neuron->value_q27 =
-            sigmoid_symmetric_q27(triple_dot(neuron->input.value, input_q27[0], input_q27[1], input_q27[2]));
-        triple_add_scaled(sum_q23, neuron->output.value, neuron->value_q27);
+        neuron->activation_q27 =
+            sigmoid_symmetric_q27(vec3_dot(neuron->input.value, input_q27[0], input_q27[1], input_q27[2]));
+        vec3_add_scaled(sum_q23, neuron->output.value, neuron->activation_q27);
     }
 #pragma GCC unroll 3
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
@@ -49,7 +49,7 @@ void bp_network_forward(bp_network_t *network, const int32_t input_q27[BP_INPUTS
 void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *network, int32_t error_q16,
                       const int32_t input_q31[BP_INPUTS], const int32_t sensitivity_q31[BP_OUTPUTS]) {
     const int32_t rate_q31 = parameters->learning_rate_q15 * error_q16;
-    const int32_t inertia_q32 = parameters->inertia_q32;
+    const int32_t momentum_q32 = parameters->momentum_q32;
     int32_t delta_q32[BP_OUTPUTS]; /* eta d3 */
 #pragma GCC unroll 3
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
@@ -59,10 +59,11 @@ void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *n
     }
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         bp_neuron_t *neuron = &network->hidden[i];
-        const int32_t value_q27 = neuron->value_q27;
-        /* The hidden layer learns through the output weights as they were in this sample: before those move. */
-        const int32_t back_q28 = triple_dot_and_move(&neuron->output, delta_q32, value_q27, inertia_q32);
-        const int32_t rate_q28 = fixed_multiply_high(back_q28, sigmoid_symmetric_slope_q32(value_q27)); /* eta d2 */
-        triple_move(&neuron->input, input_q31, rate_q28, inertia_q32);
+        const int32_t activation_q27 = neuron->activation_q27;
+        /* The hidden layer learns through the output weights before their update. */
+        const int32_t back_q28 = vec3_dot_and_momentum_step(&neuron->output, delta_q32, activation_q27, momentum_q32);
+        const int32_t rate_q28 =
+            fixed_multiply_high(back_q28, sigmoid_symmetric_slope_q32(activation_q27)); /* eta d2 */
+        vec3_momentum_step(&neuron->input, input_q31, rate_q28, momentum_q32);
     }
 }

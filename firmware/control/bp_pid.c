@@ -1,12 +1,13 @@
 #include "control/bp_pid.h"
 
 #include "fixed/fixed.h"
+#include "fixed/formats.h"
 #include "fixed/sigmoid.h"
 
-#define ERROR_BITS 17 /* Q1.16 within -1..1 - 2^-16 */
-#define DUTY_BITS 24  /* Q23 within -1..1 - 2^-23, which rounds to 1 in Q15 */
+#define ERROR_BITS 17 /* Q16, saturated to -1..1 - 2^-16 */
+#define DUTY_BITS 24  /* Q23, saturated to -1..1 - 2^-23, which rounds to 1 in Q15 */
 
-void bp_pid_show_none(bp_pid_t *pid) {
+void bp_pid_clear_telemetry(bp_pid_t *pid) {
     pid->duty_q23 = 0;
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         pid->gain_q24[l] = 0;
@@ -16,30 +17,30 @@ void bp_pid_show_none(bp_pid_t *pid) {
 void bp_pid_reset(const bp_pid_parameters_t *parameters, bp_pid_t *pid) {
     bp_network_reset(&pid->network, parameters->seed);
     pid->error_q16 = 0;
-    pid->rise_q16 = 0;
-    bp_pid_show_none(pid);
+    pid->error_difference_q16 = 0;
+    bp_pid_clear_telemetry(pid);
 }
 
 void bp_pid_preset(bp_pid_t *pid, int32_t duty_q15) {
-    pid->duty_q23 = fixed_clamp(duty_q15, -32768, 32768) * 256;
+    pid->duty_q23 = fixed_clamp(duty_q15, -ONE_Q15, ONE_Q15) * 256;
 }
 
 int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_t torque_error_q24) {
-    static const int32_t half[BP_OUTPUTS] = {0};
+    static const int32_t half_output_q27[BP_OUTPUTS] = {0}; /* f = 0: g = 1/2 */
     const bool learning = parameters->mode == BP_PID_LEARNING;
-    const int32_t *output_q27 = half;
+    const int32_t *output_q27 = half_output_q27;
 
-    /* Q24 * Q24 to Q16, within 2^31 * 2^30 / 2^32. */
+    /* Q24 * Q24 to Q16: below 2^31 * 2^30 / 2^32. */
     const int32_t error_q16 =
         fixed_saturate_bits(fixed_multiply_high(torque_error_q24, parameters->error_scale_inverse_q24), ERROR_BITS);
-    const int32_t rise_q16 = error_q16 - pid->error_q16;
-    const int32_t bend_q16 = rise_q16 - pid->rise_q16;
+    const int32_t error_difference_q16 = error_q16 - pid->error_q16;
+    const int32_t second_difference_q16 = error_difference_q16 - pid->error_difference_q16;
     pid->error_q16 = error_q16;
-    pid->rise_q16 = rise_q16;
+    pid->error_difference_q16 = error_difference_q16;
     const int32_t term_q31[3] = {
-        fixed_saturate_bits(rise_q16, ERROR_BITS) * (1 << 15),
+        fixed_saturate_bits(error_difference_q16, ERROR_BITS) * (1 << 15),
         error_q16 * (1 << 15),
-        fixed_saturate_bits(bend_q16, ERROR_BITS) * (1 << 15),
+        fixed_saturate_bits(second_difference_q16, ERROR_BITS) * (1 << 15),
     };
     if (learning || parameters->mode == BP_PID_FROZEN) {
         const int32_t input_q27[BP_INPUTS] = {term_q31[0] >> 4, term_q31[1] >> 4, term_q31[2] >> 4};
@@ -56,7 +57,7 @@ int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_
     const int32_t duty_q23 = fixed_saturate_bits(sum_q23, DUTY_BITS);
     pid->duty_q23 = duty_q23;
 
-    /* Positive numbers one less than negative ones: the end of both has a complement of the same bits. */
+    /* Saturated at 2^16 - 1 or -2^16, whose complement is 2^16 - 1. */
     const bool at_limit = (error_q16 ^ error_q16 >> 31) == (1 << (ERROR_BITS - 1)) - 1;
     if (learning && sum_q23 == duty_q23 && !at_limit) {
         bp_network_learn(&parameters->network, &pid->network, error_q16, term_q31, term_q31);

@@ -1,7 +1,6 @@
 #include "control/commutation.h"
 
-/* 2^32 / phases: a stroke in 2^-32 pitch, from one phase to the next. As (2^32 - phases) / phases + 1, which a 32-bit
- * division does. */
+/* 2^32 / phases as (2^32 - phases) / phases + 1, for a 32-bit division. */
 uint32_t commutation_stroke(unsigned phases) {
     return (0u - phases) / phases + 1u;
 }
@@ -17,27 +16,27 @@ commutation_parameters_t commutation_configure(const commutation_angles_t *angle
         .rotor_poles = rotor_poles,
         .stroke = stroke,
         .turn_on = turn_on,
-        /* Three strokes are one unit short of a pitch: a window of a stroke is not to leave that one open. */
+        /* Three strokes are one LSB short of a revolution: a window of one stroke is widened to close that gap. */
         .active_width = active == stroke ? stroke + 1 : active,
         .available_width = available > active ? available : active,
     };
 }
 
 void commutation_find(const commutation_parameters_t *parameters, uint32_t rotor_angle, commutation_t *commutation) {
-    const uint32_t electrical = rotor_angle * parameters->rotor_poles; /* modulo a pitch, on purpose */
+    const uint32_t electrical = rotor_angle * parameters->rotor_poles; /* wraps modulo an electrical revolution */
     commutation->electrical = electrical;
-    /* Strokes since phase 0 was turned on: the phase that was turned on last, and its angle behind that. */
-    const uint32_t since_first = electrical - parameters->turn_on;
-    const unsigned last = (unsigned)(((uint64_t)since_first * parameters->phases) >> 32);
-    const uint32_t since = since_first - last * parameters->stroke;
-    if (since < parameters->active_width) {
-        commutation->active = last;
+    /* Complete strokes since turn-on of phase 0: the phase turned on last, and its angle past turn-on. */
+    const uint32_t since_phase_0_on = electrical - parameters->turn_on;
+    const unsigned newest = (unsigned)(((uint64_t)since_phase_0_on * parameters->phases) >> 32);
+    const uint32_t since_on = since_phase_0_on - newest * parameters->stroke;
+    if (since_on < parameters->active_width) {
+        commutation->active = newest;
         commutation->outgoing = COMMUTATION_NONE;
-        if (since + parameters->stroke < parameters->available_width) { /* at most two strokes: no overflow */
-            commutation->outgoing = (last > 0 ? last : parameters->phases) - 1;
+        if (since_on + parameters->stroke < parameters->available_width) { /* at most two strokes: no overflow */
+            commutation->outgoing = (newest > 0 ? newest : parameters->phases) - 1;
         }
     } else {
         commutation->active = COMMUTATION_NONE;
-        commutation->outgoing = since < parameters->available_width ? last : COMMUTATION_NONE;
+        commutation->outgoing = since_on < parameters->available_width ? newest : COMMUTATION_NONE;
     }
 }

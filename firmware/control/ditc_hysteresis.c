@@ -32,11 +32,11 @@ static int8_t outgoing_state(const ditc_hysteresis_parameters_t *parameters, int
     if (error_q24 < -parameters->band_inner_q24) {
         return -1;
     }
-    const bool returned = (state > 0 && error_q24 <= 0) || (state < 0 && error_q24 >= 0);
-    return returned ? 0 : state;
+    const bool crossed_zero = (state > 0 && error_q24 <= 0) || (state < 0 && error_q24 >= 0);
+    return crossed_zero ? 0 : state;
 }
 
-static int8_t limited(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t current_q9) {
+static int8_t limit_current(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t current_q9) {
     return state > 0 && current_q9 > parameters->current_limit_q9 ? 0 : state;
 }
 
@@ -44,24 +44,24 @@ void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_h
                           const commutation_t *commutation, int32_t torque_error_q24, const int32_t *current_q9) {
     const unsigned active = commutation->active;
     const unsigned outgoing = commutation->outgoing;
-    int8_t leaves = -1;
-    bool works = false;
+    int8_t outgoing_state_next = -1;
+    bool outgoing_conducts = false;
     if (outgoing != COMMUTATION_NONE) {
-        leaves = limited(parameters, outgoing_state(parameters, ditc->state[outgoing], torque_error_q24),
-                         current_q9[outgoing]);
-        works = current_q9[outgoing] > 0;
+        outgoing_state_next = limit_current(
+            parameters, outgoing_state(parameters, ditc->state[outgoing], torque_error_q24), current_q9[outgoing]);
+        outgoing_conducts = current_q9[outgoing] > 0;
     }
-    int8_t state = -1;
+    int8_t active_state_next = -1;
     if (active != COMMUTATION_NONE) {
-        state = works ? incoming_state(parameters, ditc->state[active], torque_error_q24)
-                      : single_state(parameters, ditc->state[active], torque_error_q24);
-        state = limited(parameters, state, current_q9[active]);
+        active_state_next = outgoing_conducts ? incoming_state(parameters, ditc->state[active], torque_error_q24)
+                                              : single_state(parameters, ditc->state[active], torque_error_q24);
+        active_state_next = limit_current(parameters, active_state_next, current_q9[active]);
     }
     ditc_hysteresis_reset(ditc);
     if (outgoing != COMMUTATION_NONE) {
-        ditc->state[outgoing] = leaves;
+        ditc->state[outgoing] = outgoing_state_next;
     }
     if (active != COMMUTATION_NONE) {
-        ditc->state[active] = state;
+        ditc->state[active] = active_state_next;
     }
 }

@@ -1,17 +1,21 @@
-/* Direct instantaneous torque control by hysteresis: three switch states a phase.
+/* Direct instantaneous torque control (DITC) by hysteresis: three switch states per phase, (1) of the paper.
  *
- *   +1 both switches on (+Vdc), 0 one on (freewheeling), -1 both off (-Vdc)      (1) of the paper
+ *   +1 both switches on (+Vdc), 0 one switch on (freewheeling), -1 both off (-Vdc)
  *
- * Rules, error = reference - torque of all phases:
- *   one phase at work    +1 above +inner, 0 below -inner, -1 below -outer; unchanged between, 0 after -1
- *   two phases at work   outgoing: +1 above +inner, -1 below -inner, 0 when the error has returned through zero
+ * Rules, error = reference - total torque of all phases:
+ *   single phase         +1 above +inner, 0 below -inner, -1 below -outer; unchanged between, 0 after -1
+ *   two phases           outgoing: +1 above +inner, -1 below -inner, 0 when the error has returned through zero
  *                        incoming: +1 above +outer, 0 below zero; unchanged between, 0 after -1
  *   other phases         -1
  *
- * The outgoing phase, large in inductance, moves the torque in small steps and so gets the inner band; the incoming
- * one, where a period at full voltage is several amperes, comes in when the outgoing one no longer suffices. The other
- * way round (incoming first) the incoming phase is pumped to the current limit before it has any torque, and the ripple
- * is 1.0 to 1.6 instead of 0.3 to 0.8 at 40 kHz. A phase above the current limit is not switched on.
+ * DITC: R. B. Inderka, R. W. De Doncker, "DITC - direct instantaneous torque control of switched reluctance drives",
+ * IEEE Trans. Ind. Appl. 39(4), 2003. Assignment of the bands, chosen here: the outgoing phase, whose inductance is
+ * large, moves the torque in small steps and has the inner band; the incoming phase, whose current rises several
+ * amperes per period, supports it when its torque no longer suffices. With the bands exchanged, the incoming phase is
+ * driven to the current limit before it has torque, and the torque ripple is 1.0 to 1.6 instead of 0.3 to 0.8 at 40
+ * kHz.
+ *
+ * A phase above the current limit is not switched on: 0 instead of +1. Comparisons only, nothing overflows.
  */
 #ifndef CONTROL_DITC_HYSTERESIS_H
 #define CONTROL_DITC_HYSTERESIS_H
@@ -33,7 +37,7 @@ typedef struct {
 /* All phases -1. */
 void ditc_hysteresis_reset(ditc_hysteresis_t *ditc);
 
-/* One sample: new states from the torque error (N m, Q7.24) and the phase currents (A, Q7.9). */
+/* One sample: new states from the torque error (N m, Q7.24, any value) and the phase currents (A, Q7.9). */
 void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_hysteresis_t *ditc,
                           const commutation_t *commutation, int32_t torque_error_q24, const int32_t *current_q9);
 

@@ -3,20 +3,20 @@
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
-/* Keeps a wild load estimate (a rotor that was turned by hand, an encoder that jumped) from taking seconds to return:
- * 64 N m. */
+/* 64 N m: without a limit, an estimate disturbed by a rotor turned by hand or by a jump of the encoder would take
+ * seconds to recover. */
 #define LOAD_TORQUE_LIMIT_Q24 (1 << 30)
 
-/* A 32nd of a turn. With less, an observer that starts at rest on a turning rotor slips from turn to turn for ever;
- * with more, a jump of the encoder throws the speed so far that it reads as overspeed. */
+/* 1/32 rev. A smaller limit lets an observer that starts at speed 0 on a spinning rotor slip whole revolutions
+ * indefinitely; a larger one lets a jump of the encoder move the speed estimate into overspeed. */
 #define INNOVATION_LIMIT (1 << 27)
 
 /* 2 pi in Q3.28. */
 #define TWO_PI_Q28 1686629713
 #define TWO_PI_Q9 3217
 
-/* 1 - e^-y in Q1.31 for y in Q1.31, 0..0.5: y (1 - y/2 (1 - y/3 (1 - y/4 (1 - y/5)))). A small bandwidth needs the
- * difference itself: 1 minus the table's e^-y is off by half a percent there. Products below 2^62. */
+/* 1 - e^-y in Q1.31 for y in Q1.31, 0..0.5, by its series y (1 - y/2 (1 - y/3 (1 - y/4 (1 - y/5)))). At small
+ * bandwidths the difference 1 - exp2_negative_q31() would be wrong by half a percent. Products below 2^62. */
 static int64_t decay_complement_q31(int64_t y_q31) {
     const int64_t one_q31 = (int64_t)1 << 31;
     int64_t series_q31 = one_q31;
@@ -26,7 +26,7 @@ static int64_t decay_complement_q31(int64_t y_q31) {
     return fixed_shift(y_q31 * series_q31, 31);
 }
 
-/* value / 2^fraction_bits, value of 31 bits or 0. */
+/* Number value / 2^fraction_bits, normalised: value in 2^30..2^31 - 1, or 0. */
 typedef struct {
     int32_t value;
     int fraction_bits;
@@ -49,7 +49,7 @@ static normal_t normal_product(normal_t a, normal_t b) {
 }
 
 load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t control_rate_hz, int32_t inertia_q30) {
-    /* Widths in the comments are for the ends of the ranges: p = 1 - q <= 0.4, p rate <= 10000. */
+    /* Widths are those at the ends of the ranges: p = 1 - q <= 0.4, p rate <= 10000. */
     const int64_t rate = control_rate_hz; /* 20 bits */
     const int64_t one_q31 = (int64_t)1 << 31;
     const int64_t p_q31 = decay_complement_q31(fixed_divide((int64_t)bandwidth_rad_s << 31, rate));
@@ -60,18 +60,18 @@ load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t con
 
     load_observer_gains_t gains = {.angle_gain_q28 = (int32_t)((one_q31 - q3_q31) >> 3)};
 
-    /* l2 * 2 pi * 2^14, which is 2 pi 2^-32 rad to 2^-22 rad/s in Q24. */
+    /* l2 2 pi 2^14: from 2 pi 2^-32 rad to 2^-22 rad/s, in Q24. */
     const int64_t l2_q46 = ((p2_q46 * ((one_q31 + q_q31) >> 16)) >> 15) * 3 / 2 * rate; /* 46 + 16 bits */
     gains.speed_gain_q24 = fixed_saturate(fixed_shift((l2_q46 >> 24) * (TWO_PI_Q28 >> 4), 32));
 
-    /* J l3 * 2 pi * 2^-8, which is 2 pi 2^-32 rad to 2^-24 N m; J l3 = (J rate) (p^3 rate). Each is normalised to 31
-     * bits first, then their product. */
+    /* J l3 2 pi 2^-8: from 2 pi 2^-32 rad to 2^-24 N m; J l3 = (J rate) (p^3 rate). Factors and products are normalised
+     * to 31 bits. */
     normal_t load = normal_product(normal(inertia_q30 * rate, 30), normal(p3_q46 * rate, 46));
     load = normal_product(load, normal(TWO_PI_Q28, 28 + 8));
-    /* Fraction bits beyond 28 are cut off, missing ones are the factor's: at most 2^20 a unit needs 2^17. */
-    const int missing = 28 - load.fraction_bits;
-    gains.load_gain_q28 = -(missing >= 0 ? load.value : missing > -31 ? load.value >> -missing : 0);
-    gains.load_factor_q4 = 16 << fixed_clamp(missing, 0, 26);
+    /* More than 28 fraction bits are cut off, fewer become the factor: at most 2^20 per unit, for which it is 2^17. */
+    const int exponent = 28 - load.fraction_bits;
+    gains.load_gain_q28 = -(exponent >= 0 ? load.value : exponent > -31 ? load.value >> -exponent : 0);
+    gains.load_factor_q4 = 16 << fixed_clamp(exponent, 0, 26);
     return gains;
 }
 
@@ -91,29 +91,29 @@ void load_observer_reset(load_observer_t *observer, uint32_t angle) {
 }
 
 int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle) {
-    const uint32_t expected = (uint32_t)(observer->angle_q64 >> 32);
-    return fixed_clamp((int32_t)(angle - expected), -INNOVATION_LIMIT, INNOVATION_LIMIT - 1);
+    const uint32_t predicted = (uint32_t)(observer->angle_q64 >> 32);
+    return fixed_clamp((int32_t)(angle - predicted), -INNOVATION_LIMIT, INNOVATION_LIMIT - 1);
 }
 
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
                         load_observer_t *observer, int32_t innovation, int32_t torque_q24) {
-    const int32_t error_q4 = innovation * 16;
+    const int32_t innovation_q4 = innovation * 16;
 
     /* Correct. */
-    int64_t angle_q64 = fixed_accumulate((int64_t)observer->angle_q64, error_q4, gains->angle_gain_q28);
-    observer->correction_q22 = fixed_narrow(fixed_product(error_q4, gains->speed_gain_q24), 28);
-    const int32_t speed_q22 = fixed_add(observer->speed_q22, observer->correction_q22);
-    const int32_t part_q24 = fixed_multiply_high(error_q4, gains->load_gain_q28);
-    const int32_t change_q24 = fixed_narrow(fixed_product(part_q24, gains->load_factor_q4), 4);
-    const int32_t load_q24 = fixed_add(observer->load_torque_q24, change_q24);
+    int64_t angle_q64 = fixed_accumulate((int64_t)observer->angle_q64, innovation_q4, gains->angle_gain_q28);
+    observer->speed_correction_q22 = fixed_shift_saturate(fixed_product(innovation_q4, gains->speed_gain_q24), 28);
+    const int32_t speed_q22 = fixed_add(observer->speed_q22, observer->speed_correction_q22);
+    const int32_t unscaled_q24 = fixed_multiply_high(innovation_q4, gains->load_gain_q28);
+    const int32_t load_correction_q24 = fixed_shift_saturate(fixed_product(unscaled_q24, gains->load_factor_q4), 4);
+    const int32_t load_q24 = fixed_add(observer->load_torque_q24, load_correction_q24);
     observer->load_torque_q24 = fixed_clamp(load_q24, -LOAD_TORQUE_LIMIT_Q24, LOAD_TORQUE_LIMIT_Q24 - 1);
 
-    /* Predict: constant acceleration over the period, so the angle moves at the mean of old and new speed. */
-    const int32_t friction_q24 = fixed_narrow(fixed_product(speed_q22, model->friction_q30), 28);
+    /* Predict: acceleration is constant over the period, so the angle advances at the mean of old and new speed. */
+    const int32_t friction_q24 = fixed_shift_saturate(fixed_product(speed_q22, model->friction_q30), 28);
     const int32_t net_q24 = fixed_subtract(fixed_subtract(torque_q24, friction_q24), observer->load_torque_q24);
-    const int32_t rise_q22 = fixed_multiply_high(net_q24, model->acceleration_q32);
-    const int32_t mean_q22 = fixed_add(speed_q22, rise_q22 >> 1);
-    angle_q64 = fixed_accumulate(angle_q64, mean_q22, model->angle_step_q32);
+    const int32_t speed_change_q22 = fixed_multiply_high(net_q24, model->acceleration_q32);
+    const int32_t mean_speed_q22 = fixed_add(speed_q22, speed_change_q22 >> 1);
+    angle_q64 = fixed_accumulate(angle_q64, mean_speed_q22, model->angle_step_q32);
     observer->angle_q64 = (uint64_t)angle_q64;
-    observer->speed_q22 = fixed_add(speed_q22, rise_q22);
+    observer->speed_q22 = fixed_add(speed_q22, speed_change_q22);
 }

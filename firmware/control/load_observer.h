@@ -1,58 +1,66 @@
-/* Observer for rotor angle, speed and load torque, from the encoder and the estimated machine torque.
+/* Load observer: rotor angle, speed and load torque from the encoder and the estimated machine torque.
  *
- * Model: d(angle)/dt = w, J dw/dt = T - B w - T_L, dT_L/dt = 0. A predictor with output feedback, all three poles at
- * q = e^(-w0 Ts):
+ * Luenberger observer (D. G. Luenberger, "An introduction to observers", IEEE Trans. Autom. Control 16(6), 1971) of
  *
- *   l1 = 1 - q^3,  l2 = 1.5 (1 - q)^2 (1 + q) / Ts,  l3 = (1 - q)^3 / Ts^2
+ *   d(angle)/dt = w,   J dw/dt = T - B w - T_L,   dT_L/dt = 0
  *
- * The paper takes T_L as known; a drive does not know it.
+ * Each sample corrects with its innovation e, angle += l1 e, w += l2 e, T_L -= J l3 e, and predicts the next sample.
+ * Three equal real poles at q = e^(-w0 Ts) give
+ *
+ *   l1 = 1 - q^3,   l2 = 1.5 (1 - q)^2 (1 + q) / Ts,   l3 = (1 - q)^3 / Ts^2
+ *
+ * Derived here for B = 0, by equating coefficients of the characteristic polynomial:
+ *   z^3 + (l1 + l2 Ts + l3 Ts^2 / 2 - 3) z^2 + (3 - 2 l1 - l2 Ts + l3 Ts^2 / 2) z + l1 - 1 = (z - q)^3
+ *
+ * The paper assumes T_L to be known, which it is not in a drive.
  */
 #ifndef CONTROL_LOAD_OBSERVER_H
 #define CONTROL_LOAD_OBSERVER_H
 
 #include <stdint.h>
 
-/* What the bandwidth sets. */
+/* Set by the bandwidth. */
 typedef struct {
     int32_t angle_gain_q28; /* l1 */
-    int32_t speed_gain_q24; /* l2: rad/s Q9.22 per 2^-32 turn, in Q24 */
-    int32_t load_gain_q28;  /* -J l3: N m Q7.24 per 2^-32 turn, in Q28, over the factor */
-    int32_t load_factor_q4; /* 1, unless the gain needs a greater power of two */
+    int32_t speed_gain_q24; /* l2: rad/s Q9.22 per 2^-32 rev, in Q24 */
+    int32_t load_gain_q28;  /* -J l3 / factor: N m Q7.24 per 2^-32 rev, in Q28 */
+    int32_t load_factor_q4; /* 1, or the power of two that the range of the gain needs */
 } load_observer_gains_t;
 
-/* What the machine and the control rate set. */
+/* Set by machine and control rate. */
 typedef struct {
     int32_t acceleration_q32; /* Ts / J: rad/s Q9.22 per N m Q7.24, in Q32 */
-    int32_t friction_q30;     /* B, N m s */
-    int32_t angle_step_q32;   /* Ts: 2^-32 turn per rad/s Q9.22, in Q32 */
+    int32_t friction_q30;     /* B, N m s, Q1.30 */
+    int32_t angle_step_q32;   /* Ts: 2^-32 rev per rad/s Q9.22, in Q32 */
 } load_observer_model_t;
 
 typedef struct {
-    uint64_t angle_q64;      /* mechanical, 2^-64 turn, wraps */
-    int32_t speed_q22;       /* rad/s, Q9.22, saturates */
-    int32_t load_torque_q24; /* N m, Q7.24, saturates at +-64 N m */
-    int32_t correction_q22;  /* of the speed in the last sample, l2 times the innovation: rad/s, Q9.22 */
+    uint64_t angle_q64;           /* mechanical, 2^-64 rev, wraps */
+    int32_t speed_q22;            /* rad/s, Q9.22, saturates */
+    int32_t load_torque_q24;      /* N m, Q7.24, saturates at +-64 N m */
+    int32_t speed_correction_q22; /* l2 e of the last sample, rad/s, Q9.22 */
 } load_observer_t;
 
 /* Gains for a bandwidth w0 in rad/s (100..10000), a control rate in Hz (20000..1000000) and an inertia in kg m^2, Q1.30
- * (from 10^-4). Integer arithmetic; each gain within 0.1 percent and 1 LSB where w0 is at least a thousandth of the
- * rate, the torque's within 2 percent down to a ten thousandth. */
+ * (from 10^-4). Error of each gain: 0.1 percent and 1 LSB for w0 >= rate / 1000; of the load gain 2 percent down to
+ * rate / 10000. 64-bit integer arithmetic. */
 load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t control_rate_hz, int32_t inertia_q30);
 
-/* The model for a control rate, an inertia and a friction in N m s, Q1.30. */
+/* Model for a control rate in Hz, an inertia in kg m^2, Q1.30, and a viscous friction in N m s, Q1.30. */
 load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t inertia_q30, int32_t friction_q30);
 
-/* Starts at an angle (2^-32 turn), at rest, without load. A rotor that turns is caught within 10 / w0 (20 / w0 when it
- * is faster than 2 w0). */
+/* Estimate: given angle (2^-32 rev), speed 0, load torque 0. The estimate converges to a spinning rotor within 10 / w0
+ * (20 / w0 above 2 w0 rad/s). */
 void load_observer_reset(load_observer_t *observer, uint32_t angle);
 
-/* Innovation: how far a measured angle is from the expected one, 2^-32 turn, modulo a turn; held within +-2^27 (a 32nd
- * of a turn), so that it can be multiplied. */
+/* Innovation: measured angle less predicted angle, 2^-32 rev, modulo a revolution, saturated to -2^27..2^27 - 1 (1/32
+ * rev). Unsaturated, a jump of the encoder would show as overspeed. */
 int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle);
 
-/* One sample: corrects with its innovation (-2^27..2^27-1), then predicts one period on with the machine's torque (N
- * m, Q7.24). Afterwards angle, speed and load are the estimate for the coming sample. 64-bit products; the speed's
- * correction and the friction are rounded down, the other parts to nearest; speed and load saturate. */
+/* One sample: corrects with its innovation (-2^27..2^27 - 1), then predicts one period ahead with the machine torque (N
+ * m, Q7.24). Afterwards angle, speed and load torque are the estimate for the coming sample. 64-bit products and angle
+ * accumulator; speed correction and friction torque are rounded down, the other terms to nearest; speed and load torque
+ * saturate. */
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
                         load_observer_t *observer, int32_t innovation, int32_t torque_q24);
 

@@ -1,62 +1,69 @@
-/* What the firmware knows of its machine: generated from the machine file at build time. */
+/* Data of the machine, generated from the machine file at build time. */
 #ifndef CONTROL_MACHINE_TABLES_H
 #define CONTROL_MACHINE_TABLES_H
 
 #include <stdint.h>
 
-/* Magnetics of a phase over angle and current, from unaligned to the next aligned position and from 0 to 80 A.
+/* Magnetics of a phase: torque and flux linkage per ampere, T / i and psi / i, over angle and current, from the
+ * unaligned to the next aligned position and from 0 to 80 A. T / i is nearly linear in the current and psi / i of an
+ * unsaturated machine constant, so that linear interpolation between columns suffices.
  *
- * Rows: angles that the generator chooses where this machine's torque bends most, because corners over the angle, where
- * poles begin to overlap, are what equal steps miss. Columns: currents in equal steps of 2 A, 2^10 of current in Q7.9.
- * Held is what an ampere gives, T / i and psi / i: nearly straight over the current, constant for a linear machine's
- * flux linkage, so that a straight line between columns does. Maps, not products of curves, so that measured machines
- * fit as well. */
+ * Rows: angles, chosen by the generator where the torque curve of the machine has the largest curvature: equidistant
+ * rows would miss the corners where poles begin to overlap. Columns: currents in equal steps of 2 A, 2^10 in Q7.9.
+ *
+ * At fraction u from row r to r + 1 and fraction t from column c to c + 1, T = i value_T, psi = i value_psi,
+ *
+ *   value(r, c, u, t) = (1 - t) f(c) + t f(c + 1)
+ *   f(c) = node[r] + u (node[r + 1] - node[r]) - u (1 - u) 2^curvature_shift curvature[r],   of column c
+ *
+ * Worked example: node[r] = 1000, node[r + 1] = 1400, curvature[r] = 50, curvature_shift = 1, u = 1/2:
+ * f = 1000 + 200 - 1/4 * 2 * 50 = 1175. A column c + 1 with f = 1275 and t = 1/4 gives value = 1200. In LSBs of a node
+ * (MACHINE_NODE_OFFSET already added), whose weight machine_format_t defines. */
 #define MACHINE_ROWS 33
 #define MACHINE_COLUMNS 41     /* 0, 2, .. 80 A */
 #define MACHINE_COLUMN_BITS 10 /* of current in Q7.9 */
-#define MACHINE_CELLS 64       /* equal parts of half a pitch, 2^25 of the 2^32 of a pitch */
-#define MACHINE_CELL_BITS 25
+#define MACHINE_ANGLE_BINS 64  /* equal parts of half an electrical revolution, 2^25 each */
+#define MACHINE_ANGLE_BIN_BITS 25
 
-/* A row. Starts rise from 0, unaligned, to 2^31, aligned, in steps of at least 2^17. */
+/* Row. Starts ascend from 0, unaligned, to 2^31, aligned, by at least 2^17. */
 typedef struct {
-    uint32_t start;      /* 2^-32 pitch past the unaligned position */
-    uint32_t reciprocal; /* 2^47 over the width up to the next row, rounded down; of the last row 0 */
+    uint32_t start;      /* 2^-32 electrical rev past the unaligned position */
+    uint32_t reciprocal; /* 2^47 / width up to the next row, rounded down; 0 in the last row */
 } machine_row_t;
 
-/* A node is less MACHINE_NODE_OFFSET, so that all 16 bits serve in a signed product. */
+/* Nodes, 0..65535, are stored less this offset, as factors of signed 16-bit products. */
 #define MACHINE_NODE_OFFSET 32768
 
-/* Over the angle at a current, so that the nodes of two rows lie side by side. At fraction u from a row to the next:
- * node + u (next row's node - node) - u (1 - u) 2^bend_shift bend. */
+/* Column: the nodes of two adjacent rows are adjacent in memory, for a dual 16-bit product. */
 typedef struct {
     int16_t torque_node[MACHINE_ROWS]; /* T / i */
     int16_t flux_node[MACHINE_ROWS];   /* psi / i */
-    int8_t torque_bend[MACHINE_ROWS - 1];
-    int8_t flux_bend[MACHINE_ROWS - 1];
+    int8_t torque_curvature[MACHINE_ROWS - 1];
+    int8_t flux_curvature[MACHINE_ROWS - 1];
 } machine_column_t;
 
-/* A value, in Q14 of a node's last place, times current in Q7.9 and 2^15, less the low 32 bits, times 2^result_shift is
- * the result: torque in N m, Q7.24, or flux linkage in Wb, Q2.29. */
+/* Weight of a node's LSB: result = (value_q14 * current_q9 * 2^15 / 2^32) * 2^result_shift, with value_q14 the value in
+ * 2^-14 node LSBs; torque in N m, Q7.24, or flux linkage in Wb, Q2.29. */
 typedef struct {
-    uint8_t bend_shift;   /* 0..8 */
-    uint8_t result_shift; /* 0..12 */
+    uint8_t curvature_shift; /* 0..8 */
+    uint8_t result_shift;    /* 0..12 */
 } machine_format_t;
 
 typedef struct {
-    uint8_t phases;           /* 3 or 4 */
-    uint8_t rotor_poles;      /* electrical turns a mechanical turn */
-    int32_t inertia_q30;      /* kg m^2, Q1.30 */
-    int32_t friction_q30;     /* N m s, Q1.30 */
-    int32_t resistance_q24;   /* ohm, Q7.24 */
-    int32_t current_rise_A_s; /* supply voltage over unaligned inductance: A/s */
+    uint8_t phases;                /* 3 or 4 */
+    uint8_t rotor_poles;           /* electrical revolutions per mechanical revolution */
+    int32_t inertia_q30;           /* kg m^2, Q1.30 */
+    int32_t friction_q30;          /* N m s, Q1.30 */
+    int32_t resistance_q24;        /* ohm, Q7.24 */
+    int32_t current_slew_rate_A_s; /* di/dt at the unaligned position: supply voltage / inductance */
     machine_row_t row[MACHINE_ROWS];
-    uint8_t cell_row[MACHINE_CELLS]; /* the row in which a part of half a pitch begins */
+    uint8_t angle_bin_row[MACHINE_ANGLE_BINS]; /* row in which each angle bin begins */
     machine_format_t torque_format;
     machine_format_t flux_format;
     machine_column_t column[MACHINE_COLUMNS];
 } machine_tables_t;
 
-/* The machine that this image is built for. */
+/* The machine that this firmware is built for. */
 extern const machine_tables_t machine_tables;
 
 #endif

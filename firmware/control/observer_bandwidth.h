@@ -1,17 +1,23 @@
-/* Bandwidth of the load observer over time: narrow while the model explains what the encoder shows, wide when it does
- * not.
+/* Bandwidth scheduling of the load observer: narrow in the steady state, wide after a disturbance.
  *
- * A fixed bandwidth cannot give both a small ripple (it passes the encoder's steps on to speed and torque reference)
- * and a small dip (it must see a load first). An innovation beyond a threshold wakes the observer: the bandwidth jumps
- * and decays as 3.5 / t, the schedule of an estimate that starts anew and averages over the time since, down to the
- * steady one. What the threshold is depends on what the angle is good to: 1.125 counts where it is the middle of a
- * count, 8 urad where the time of the last edge is known; a wider start with the latter, whose noise is smaller.
+ *   w0(t) = min(transient, max(steady, 3.5 / t)),   t = time since the last trigger
  *
- * A drive whose model is wrong (three times the inertia, tables half a degree off) would wake again and again, each
- * time by what the last one stirred up: a limit cycle. Two things end it. Each waking lengthens the pause before the
- * next can come, from 1 ms to at most 256 ms, one out of the steady state to twice as long, and time shrinks the pause
- * again. And in the steady bandwidth the threshold follows four times the mean size of the innovation, so that what the
- * model always leaves unexplained wakes nobody.
+ * A fixed bandwidth cannot have both a small ripple (it passes the encoder's quantisation on to speed and torque
+ * reference) and a small speed drop after a load step (the load must be detected first). An innovation beyond a
+ * threshold triggers the transient bandwidth, which then decays as that of an estimator which restarts with the trigger
+ * and weights all samples since equally. Derived here from that estimator, the expanding-memory polynomial filter of
+ * degree 2 (N. Morrison, "Introduction to Sequential Smoothing and Prediction", McGraw-Hill, 1969): its gains 9/t,
+ * 36/t^2, 60/t^3 would be those of a triple pole, 3 w0, 3 w0^2, w0^3, at w0 t = 3.0, 3.46, 3.91: 3.44 in the geometric
+ * mean.
+ *
+ * The threshold depends on the resolution of the angle: 1.125 counts for the middle of a count, 8 urad where the time
+ * of the last edge is known. The latter has less noise, so its transient bandwidth is wider.
+ *
+ * With a wrong model (three times the inertia, tables half a degree off) each transient would trigger the next: a limit
+ * cycle. Two measures suppress it. Each trigger lengthens the retrigger hold-off, the minimum time to the next trigger,
+ * from 1 ms to at most 256 ms (a trigger in the steady state doubles it); it decays back exponentially. And in the
+ * steady state the threshold is at least four times the mean magnitude of the innovation, so that what the model never
+ * explains does not trigger.
  */
 #ifndef CONTROL_OBSERVER_BANDWIDTH_H
 #define CONTROL_OBSERVER_BANDWIDTH_H
@@ -21,45 +27,45 @@
 
 #include "control/load_observer.h"
 
-/* Stages of the decay, each 13/16 of the one before, the last the steady one. */
+/* Stages of the decay, each with 13/16 of the bandwidth before, the last with the steady bandwidth. */
 #define OBSERVER_BANDWIDTH_STAGES 18
 
 typedef struct {
     load_observer_gains_t gains[OBSERVER_BANDWIDTH_STAGES];
     uint16_t bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES];
-    uint32_t end_ticks[OBSERVER_BANDWIDTH_STAGES]; /* periods since the waking at which a stage ends */
-    uint32_t pause_ticks;                          /* least pause after a waking, in periods */
-    uint32_t forget_q32;                           /* what is left of a longer one a period later */
-    uint32_t threshold_count;                      /* 2^-32 turn, for the middle of a count */
-    uint32_t threshold_edge;                       /* for an angle from an edge's time */
-    int32_t usual_share_q32;                       /* of the mean innovation a period */
-    bool wakes;                                    /* false: always the steady bandwidth */
-    uint8_t first_stage_count; /* where the decay begins; with an edge's time in stage 0, the widest */
+    uint32_t end_ticks[OBSERVER_BANDWIDTH_STAGES]; /* end of each stage, periods since the trigger */
+    uint32_t retrigger_holdoff_ticks;              /* minimum hold-off after a trigger, periods */
+    uint32_t holdoff_decay_q32;       /* decay factor of the hold-off extension per period, unsigned Q0.32 */
+    uint32_t threshold_count;         /* 2^-32 rev, for the middle of a count */
+    uint32_t threshold_edge;          /* 2^-32 rev, for an angle from the time of an edge */
+    int32_t mean_innovation_gain_q32; /* low-pass gain of the mean innovation per period, Q0.32 */
+    bool adaptive;                    /* false: always the steady bandwidth */
+    uint8_t trigger_stage_count;      /* first stage after a trigger by a count; by an edge stage 0 */
 } observer_bandwidth_parameters_t;
 
 typedef struct {
     unsigned stage;
-    uint32_t ticks;     /* since the last waking */
-    uint32_t pause_q16; /* by how many least pauses the pause is longer */
-    int64_t usual_q32;  /* mean size of the innovation, 2^-32 turn */
+    uint32_t ticks;                 /* periods since the last trigger, saturates */
+    uint32_t holdoff_extension_q16; /* hold-off beyond the minimum, in minimum hold-offs, Q8.16 */
+    int64_t mean_innovation_q32;    /* mean magnitude of the innovation, 2^-32 rev, Q27.32 */
 } observer_bandwidth_t;
 
-/* Schedule from widest to steady bandwidth in rad/s (100 <= steady <= widest <= 10000). steady == widest: never wakes.
- */
-observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t widest_rad_s, uint32_t steady_rad_s,
+/* Schedule from transient to steady bandwidth in rad/s (100 <= steady <= transient <= 10000); equal ones switch the
+ * scheduling off. encoder_bits 10..32, control rate in Hz, inertia in kg m^2, Q1.30. */
+observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t transient_rad_s, uint32_t steady_rad_s,
                                                              unsigned encoder_bits, uint32_t control_rate_hz,
                                                              int32_t inertia_q30);
 
-/* Awake at its widest: what is known at the start is nothing. */
+/* Starts at the transient bandwidth: the initial estimate is unknown. */
 void observer_bandwidth_reset(observer_bandwidth_t *bandwidth);
 
-/* One sample: the gains for it. `innovation` in 2^-32 turn, -2^27..2^27-1; from_edge: the angle was measured by an
- * edge's time. */
+/* One sample: returns its gains. `innovation` in 2^-32 rev, -2^27..2^27 - 1; from_edge: the angle was measured from the
+ * time of an edge. 64-bit products, rounded down. */
 const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_parameters_t *parameters,
                                                      observer_bandwidth_t *bandwidth, int32_t innovation,
                                                      bool from_edge);
 
-/* True when the decay has ended, or there is none. */
+/* True at the steady bandwidth, always without scheduling. */
 bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters,
                                const observer_bandwidth_t *bandwidth);
 

@@ -1,27 +1,32 @@
-/* Predictive torque control: each phase gets the voltage that brings its flux linkage to where it makes its share of
- * the torque at the end of the coming period.
+/* Predictive torque control: deadbeat flux-linkage control of each phase, following a torque sharing function.
  *
- *   sample k          flux linkage now, and at k + 1 by the voltage that already acts (flux_observer)
- *   reference         at the angle of k + 2: share of the torque -> current -> flux linkage, by the machine's tables
+ *   sample k          flux linkage now, and at k + 1 under the voltage that already acts (flux_observer.h)
+ *   target            at the angle of k + 2: share of the torque -> current -> flux linkage (phase_map.h)
  *   voltage           duty = (psi*(k+2) - psi(k+1) + R i Ts) / (Vdc Ts), acts from k + 1 to k + 2
  *
- * A phase can only be moved by +-Vdc Ts. Where a reference is out of that reach, the phase goes as far as it can, and
- * the torque that is then missing (or too much) is given to the others in DITC's order: what is missing first to the
- * incoming phase, then to the active, then to the outgoing one; what is too much is taken off the outgoing one first.
- * Every phase stays in the states (+1, 0) or (-1, 0).
+ * Deadbeat flux control: B. H. Kenny, R. D. Lorenz, "Stator- and rotor-flux-based deadbeat direct torque control of
+ * induction machines", IEEE Trans. Ind. Appl. 39(4), 2003. For a phase of a switched reluctance machine derived here:
+ * psi(k+2) = psi(k+1) + Ts (duty Vdc - R i), solved for the duty with psi(k+2) = psi*. Torque sharing:
+ * torque_sharing.h.
  *
- * Torque of either sign at either direction of rotation: a phase makes positive torque in the half of its pitch from
- * unaligned to aligned and negative torque in the other, where everything is asked at the mirror image.
+ * In one period a flux linkage changes by at most +-Vdc Ts. When that does not reach the target, the torque shortfall
+ * (or excess) is redistributed to the other phases in the order of DITC (ditc_hysteresis.h): a shortfall to the
+ * incoming phase first, then to the active, then to the outgoing one; an excess is taken from the outgoing phase first.
+ * Switch states are those of DITC: every duty alternates between +1 and 0 or between -1 and 0.
  *
- * A phase that brakes carries no more flux linkage than -Vdc takes away until the phase is unaligned. Where the speed
- * voltage exceeds Vdc, its current would otherwise rise against full -Vdc as the inductance falls, beyond any limit.
+ * Four quadrants: a phase makes positive torque between unaligned and aligned position, negative torque in the other
+ * half of the electrical revolution, where all quantities are evaluated at the mirrored angle.
  *
- * With a reserve the two halves work against each other: positive and negative torque of at least the reserve in sum,
- * so that a load step finds flux linkage that only needs to be let go, which -Vdc does at once in any position. It
- * costs copper loss all the time.
+ * Braking: a phase that moves towards the unaligned position carries at most the flux linkage that -Vdc removes before
+ * it is unaligned, Vdc Ts * (angle to unaligned) / (angle step per period). Otherwise, where the motional EMF exceeds
+ * Vdc, its current would rise beyond any limit against full -Vdc, as the inductance falls.
  *
- * Torque that stays missing moves the conduction windows towards earlier angles (torque_share.h), within 100 ms, and
- * torque that does not moves them back within a second.
+ * Torque reserve: the halves are loaded against each other so that positive and negative torque add up to at least the
+ * reserve. A load step then only needs the removal of flux linkage, which -Vdc does immediately at any position. The
+ * cost is continuous copper loss.
+ *
+ * Window advance: a torque shortfall moves the conduction windows to earlier angles (torque_sharing.h), fully within
+ * 100 ms; without shortfall they return within 1 s.
  */
 #ifndef CONTROL_PREDICTIVE_TORQUE_H
 #define CONTROL_PREDICTIVE_TORQUE_H
@@ -32,43 +37,43 @@
 #include "control/flux_observer.h"
 #include "control/machine_tables.h"
 #include "control/phase_map.h"
-#include "control/torque_share.h"
+#include "control/torque_sharing.h"
 #include "hal.h"
 
 typedef struct {
     flux_observer_parameters_t flux;
-    torque_share_parameters_t share;
-    torque_share_window_t late; /* without advance */
-    int32_t period_q40;         /* Ts in s, Q-9.40 */
-    int32_t current_limit_q9;   /* A, Q7.9 */
-    int32_t reserve_q24;        /* N m, Q7.24, >= 0 */
-    int32_t advance_q30;        /* a period with torque missing, Q1.30 */
-    int32_t return_q30;         /* a period without */
+    torque_sharing_parameters_t sharing;
+    torque_sharing_window_t base_window; /* without advance */
+    int32_t period_q40;                  /* Ts in s, Q-9.40 */
+    int32_t current_limit_q9;            /* A, Q7.9 */
+    int32_t reserve_q24;                 /* N m, Q7.24, >= 0 */
+    int32_t advance_step_q30;            /* per period with torque shortfall, Q1.30 */
+    int32_t retract_step_q30;            /* per period without, Q1.30 */
 } predictive_torque_parameters_t;
 
 typedef struct {
     int32_t flux_q29[HAL_PHASES_MAX]; /* predicted for the coming sample, Wb, Q2.29 */
-    int32_t duty_q15[HAL_PHASES_MAX]; /* that acts from the coming sample on, Q1.15 */
-    int32_t advance_q30;              /* 0..1 */
-    int32_t missing_q24;              /* torque reference less what the voltage allows, beyond 1/64 N m; N m, Q7.24 */
-    uint8_t column[HAL_PHASES_MAX];   /* of the tables, where a phase was planned to be */
+    int32_t duty_q15[HAL_PHASES_MAX]; /* acts from the coming sample on, Q1.15 */
+    int32_t advance_q30;              /* of the windows, Q1.30, 0..1 */
+    int32_t torque_shortfall_q24;     /* reference less planned torque, N m, Q7.24; 0 within 1/64 N m */
+    uint8_t column[HAL_PHASES_MAX];   /* table column of the planned operating point */
 } predictive_torque_t;
 
 typedef struct {
     const int32_t *current_q9; /* A, Q7.9, by phase, at the sample */
-    const int32_t *flux_q29;   /* Wb, Q2.29, by the tables, by phase, at the sample */
-    const uint32_t *angle;     /* of each phase two periods after the sample, 2^-32 pitch */
-    int32_t bus_voltage_q6;    /* V, Q9.6 */
+    const int32_t *flux_q29;   /* from the tables, Wb, Q2.29, by phase, at the sample */
+    const uint32_t *angle;     /* two periods after the sample, 2^-32 electrical rev, by phase */
+    int32_t bus_voltage_q6;    /* DC-link voltage, V, Q9.6 */
     int32_t torque_q24;        /* reference, N m, Q7.24 */
-    bool backwards;            /* the rotor turns that way */
-    uint32_t turn;             /* how far in a period, 2^-32 pitch, either way */
+    bool reverse;              /* negative direction of rotation */
+    uint32_t angle_step;       /* magnitude of the rotation per period, 2^-32 electrical rev */
 } predictive_torque_sample_t;
 
-/* No flux linkage, no duty, no advance. */
+/* Flux linkages, duties and advance 0. */
 void predictive_torque_reset(predictive_torque_t *control);
 
-/* One sample: duty of each phase, Q1.15, -32768..32768. Saturating everywhere; the division's quotient is within 2^-14
- * of full duty. */
+/* One sample: duty of each phase, Q1.15, -32768..32768. All sums saturate; 32-bit products are rounded to nearest, the
+ * error of the quotient is below 2^-14 of full duty. */
 void predictive_torque_step(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
                             const machine_tables_t *tables, const predictive_torque_sample_t *sample,
                             int32_t duty_q15[HAL_PHASES_MAX]);

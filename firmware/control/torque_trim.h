@@ -1,8 +1,11 @@
-/* Trim of the torque reference by the BP-PID: what the predictive control leaves of the torque error.
+/* Torque trim: correction of the torque reference by the BP-PID, for the torque error that predictive control leaves.
  *
- * The error is the reference before the trim, of two samples ago (a period to compute, a period to act), less the
- * estimate: with the reference behind the trim, or not delayed, the integral drifts. The trim stays within +-limit. It
- * holds while voltage runs out: the error is not its own then.
+ *   output(k) = reference(k) + trim(k),   trim(k) = limit * BP-PID(reference(k-2) - torque(k))
+ *
+ * Derived here: a reference acts two samples later (one period to compute, one to act), so that the untrimmed reference
+ * of two samples ago is the torque due now. With the trimmed or an undelayed reference in its place the integral part
+ * drifts. The trim is constant while the voltage is limited, because the error is then not one that the trim can
+ * remove.
  */
 #ifndef CONTROL_TORQUE_TRIM_H
 #define CONTROL_TORQUE_TRIM_H
@@ -13,22 +16,22 @@
 #include "control/bp_pid.h"
 
 typedef struct {
-    bp_pid_parameters_t pid; /* its output +-1 is +-limit; BP_PID_OFF: no trim */
+    bp_pid_parameters_t pid; /* output +-1 is +-limit; BP_PID_OFF: no trim */
     int32_t limit_q24;       /* N m, Q7.24, >= 0 */
 } torque_trim_parameters_t;
 
 typedef struct {
     bp_pid_t pid;
-    int32_t reference_q24[2]; /* of the last sample and the one before */
+    int32_t reference_q24[2]; /* untrimmed, of the last sample and of the one before, N m, Q7.24 */
     int32_t trim_q24;         /* N m, Q7.24 */
 } torque_trim_t;
 
-/* No trim, initial weights; starts at a reference in N m, Q7.24. */
+/* Trim 0, initial weights; past references: the given one, N m, Q7.24. */
 void torque_trim_reset(const torque_trim_parameters_t *parameters, torque_trim_t *trim, int32_t reference_q24);
 
-/* One sample: the reference with its trim, N m, Q7.24, saturated. `torque_q24` is the estimate of the machine's torque
- * at the sample; hold: voltage ran out. */
+/* One sample: trimmed reference in N m, Q7.24. Reference and estimated torque at the sample in N m, Q7.24, any value;
+ * voltage_limited keeps the trim constant. Sums saturate, the 64-bit product is rounded to nearest. */
 int32_t torque_trim_step(const torque_trim_parameters_t *parameters, torque_trim_t *trim, int32_t reference_q24,
-                         int32_t torque_q24, bool hold);
+                         int32_t torque_q24, bool voltage_limited);
 
 #endif

@@ -73,8 +73,8 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
 /* Hysteresis switches a phase on for whole periods, and off only two periods after its current passed the limit (one
  * until the new state acts, one until it is seen): the limit leaves room for that below the trip, and a tenth to spare.
  * The rise is the unaligned phase's; a saturated one comes close to it anywhere. */
-static int32_t hysteresis_limit_q9(const int32_t *values, int32_t current_rise_A_s, uint32_t control_rate_hz) {
-    const int64_t rise_q9 = fixed_divide((int64_t)current_rise_A_s << 9, control_rate_hz);
+static int32_t hysteresis_limit_q9(const int32_t *values, int32_t current_slew_rate_A_s, uint32_t control_rate_hz) {
+    const int64_t rise_q9 = fixed_divide((int64_t)current_slew_rate_A_s << 9, control_rate_hz);
     const int64_t limit_q9 = values[PARAMETER_CURRENT_TRIP_A] - fixed_divide(rise_q9 * 22, 10);
     return fixed_clamp(fixed_saturate(limit_q9), 0, values[PARAMETER_CURRENT_LIMIT_A]);
 }
@@ -85,9 +85,9 @@ static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, uin
     const bool salient = values[PARAMETER_CONTROLLER] == DRIVE_CONTROLLER_SALIENT;
     const uint32_t steady_rad_s =
         (uint32_t)values[salient ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S];
-    const bool wakes = salient && values[PARAMETER_OBSERVER_WAKING] != 0;
-    const uint32_t wake_rad_s = wakes ? (uint32_t)values[PARAMETER_OBSERVER_WAKE_RAD_S] : steady_rad_s;
-    return observer_bandwidth_configure(wake_rad_s, steady_rad_s, encoder_bits, control_rate_hz,
+    const bool adaptive = salient && values[PARAMETER_OBSERVER_WAKING] != 0;
+    const uint32_t transient_rad_s = adaptive ? (uint32_t)values[PARAMETER_OBSERVER_WAKE_RAD_S] : steady_rad_s;
+    return observer_bandwidth_configure(transient_rad_s, steady_rad_s, encoder_bits, control_rate_hz,
                                         values[PARAMETER_INERTIA_KG_M2]);
 }
 
@@ -106,7 +106,7 @@ static bp_pid_parameters_t bp_pid_from(const int32_t *values, parameter_index_t 
         .error_scale_inverse_q24 = fixed_saturate(fixed_divide((int64_t)1 << 48, values[PARAMETER_BP_ERROR_SCALE_NM])),
         .scale_q28 = {kp_scale_q15 << 13, ki_scale_q15 << 13, kd_scale_q15 << 13},
         .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
-                    .inertia_q32 = values[PARAMETER_BP_ALPHA] << 4},
+                    .momentum_q32 = values[PARAMETER_BP_ALPHA] << 4},
     };
 }
 
@@ -139,13 +139,13 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
     const uint32_t least = stroke + pitch_from_degrees(2 << 7);
     const uint32_t width = turn_off - turn_on > least ? turn_off - turn_on : least;
     const uint32_t narrowing = off_early > on_early ? off_early - on_early : 0;
-    const torque_share_parameters_t share = {
-        .sharing = values[PARAMETER_TORQUE_SHARING] != 0,
+    const torque_sharing_parameters_t share = {
+        .overlapping = values[PARAMETER_TORQUE_SHARING] != 0,
         .stroke = stroke,
         .turn_on = turn_on,
         .turn_off = turn_on + width,
-        .turn_on_early = on_early,
-        .turn_off_early = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
+        .turn_on_advance = on_early,
+        .turn_off_advance = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
     };
     return (predictive_torque_parameters_t){
         .flux =
@@ -154,13 +154,13 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
                 .resistance_period_q40 =
                     fixed_saturate(fixed_divide((int64_t)values[PARAMETER_RESISTANCE_OHM] << 16, rate)),
             },
-        .share = share,
-        .late = torque_share_window(&share, 0),
+        .sharing = share,
+        .base_window = torque_sharing_window(&share, 0),
         .period_q40 = (int32_t)fixed_divide((int64_t)1 << 40, rate),
         .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
-        .advance_q30 = (int32_t)fixed_divide(10 * ((int64_t)1 << 30), rate),
-        .return_q30 = (int32_t)fixed_divide((int64_t)1 << 30, rate),
+        .advance_step_q30 = (int32_t)fixed_divide(10 * ((int64_t)1 << 30), rate),
+        .retract_step_q30 = (int32_t)fixed_divide((int64_t)1 << 30, rate),
     };
 }
 
@@ -215,18 +215,18 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             {
                 .band_inner_q24 = values[PARAMETER_TORQUE_BAND_INNER_NM],
                 .band_outer_q24 = values[PARAMETER_TORQUE_BAND_OUTER_NM],
-                .current_limit_q9 = hysteresis_limit_q9(values, tables->current_rise_A_s, control_rate_hz),
+                .current_limit_q9 = hysteresis_limit_q9(values, tables->current_slew_rate_A_s, control_rate_hz),
             },
         .duty =
             {
                 .pid = duty_pid_from(values, control_rate_hz),
-                .aims = ditc_duty_aims(tables, pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
+                .current_setpoints = pwm_ditc_setpoints(tables, pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
                 /* Half of what would reach the current in one period at rest: rate / (2 * A/s), in Q24. */
                 .incoming_gain_q24 =
-                    fixed_saturate(fixed_divide((int64_t)control_rate_hz << 23, tables->current_rise_A_s)),
-                /* At 40 kHz a sixteenth of the reference, and 1/16 N m: see ditc_duty.h. */
-                .surplus_q32 = (int32_t)(((uint32_t)GAIN_RATE_HZ << 16) / control_rate_hz << 12),
-                .spent_torque_q24 = (int32_t)fixed_divide((int64_t)control_rate_hz << 20, GAIN_RATE_HZ),
+                    fixed_saturate(fixed_divide((int64_t)control_rate_hz << 23, tables->current_slew_rate_A_s)),
+                /* At 40 kHz a sixteenth of the reference, and 1/16 N m: see pwm_ditc.h. */
+                .overshoot_margin_q32 = (int32_t)(((uint32_t)GAIN_RATE_HZ << 16) / control_rate_hz << 12),
+                .depleted_torque_q24 = (int32_t)fixed_divide((int64_t)control_rate_hz << 20, GAIN_RATE_HZ),
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
                 .current_limit_q9 = current_limit_q9,
             },

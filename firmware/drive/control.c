@@ -57,7 +57,7 @@ static uint32_t phase_angle(const control_parameters_t *parameters, const contro
 /* Torque in N m, Q7.24, and flux linkage in Wb, Q2.29. As phase_map_torque_at_q24(), a function of its own. */
 __attribute__((noinline)) static int32_t torque_and_flux(const machine_tables_t *tables, uint32_t angle,
                                                          int32_t current_q9, int32_t *flux_q29) {
-    const phase_map_place_t place = phase_map_at(tables, angle);
+    const phase_map_lookup_t place = phase_map_lookup(tables, angle);
     *flux_q29 = phase_map_flux_q29(&place, current_q9);
     return phase_map_torque_q24(&place, current_q9);
 }
@@ -116,9 +116,9 @@ void control_prepare(const control_parameters_t *parameters, control_state_t *st
         torque_trim_reset(&parameters->trim, &state->trim, 0);
     }
     if (parameters->controller == DRIVE_CONTROLLER_PAPER) {
-        ditc_duty_reset(&parameters->duty, &state->duty);
+        pwm_ditc_reset(&parameters->duty, &state->duty);
     } else {
-        bp_pid_show_none(&state->duty.pid);
+        bp_pid_clear_telemetry(&state->duty.pid);
     }
 }
 
@@ -160,13 +160,13 @@ static void switch_by_state(const control_parameters_t *parameters, control_stat
 static void switch_by_duty(const control_parameters_t *parameters, control_state_t *state, int32_t reference_q24,
                            hal_pwm_compare_t *compare) {
     const control_estimate_t *e = &state->estimate;
-    const ditc_duty_sample_t sample = {
+    const pwm_ditc_sample_t sample = {
         .current_q9 = e->current_q9,
         .torque_q24 = e->torque_q24,
         .reference_q24 = reference_q24,
         .error_q24 = fixed_subtract(reference_q24, e->torque_sum_q24),
     };
-    ditc_duty_step(&parameters->duty, &state->duty, &e->commutation, &sample, state->duty_q15);
+    pwm_ditc_step(&parameters->duty, &state->duty, &e->commutation, &sample, state->duty_q15);
     for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
         pwm_set_phase(compare, phase, state->duty_q15[phase], parameters->period_ticks);
     }
@@ -179,7 +179,7 @@ __attribute__((noinline)) static void predict_torque(const control_parameters_t 
     const machine_tables_t *tables = parameters->tables;
     const load_observer_t *observer = &state->observer;
     const control_estimate_t *e = &state->estimate;
-    const bool runs_out = state->predictive.missing_q24 != 0;
+    const bool runs_out = state->predictive.torque_shortfall_q24 != 0;
     const int32_t slip_q22 = fixed_abs(fixed_subtract(state->speed_reference_q22, observer->speed_q22));
     /* From the sample to two periods behind it: to the observer's angle and one period on. */
     const int32_t step = fixed_multiply_high(observer->speed_q22, parameters->observer.angle_step_q32);
@@ -205,8 +205,8 @@ __attribute__((noinline)) static void predict_torque(const control_parameters_t 
         .angle = angle_ahead,
         .bus_voltage_q6 = e->bus_voltage_q6,
         .torque_q24 = torque_trim_step(&parameters->trim, &state->trim, reference_q24, e->torque_sum_q24, runs_out),
-        .backwards = observer->speed_q22 < 0,
-        .turn = (uint32_t)fixed_abs(step) * parameters->commutation.rotor_poles,
+        .reverse = observer->speed_q22 < 0,
+        .angle_step = (uint32_t)fixed_abs(step) * parameters->commutation.rotor_poles,
     };
     predictive_torque_step(&parameters->predictive, &state->predictive, tables, &sample, state->duty_q15);
     for (unsigned phase = 0; phase < tables->phases; phase++) {

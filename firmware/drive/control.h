@@ -11,7 +11,7 @@
 #include <stdint.h>
 
 #include "control/commutation.h"
-#include "control/ditc_duty.h"
+#include "control/pwm_ditc.h"
 #include "control/ditc_hysteresis.h"
 #include "control/load_observer.h"
 #include "control/machine_tables.h"
@@ -55,7 +55,7 @@ typedef struct {
     speed_pi_parameters_t speed_pi;
     ditc_hysteresis_parameters_t hysteresis;
     speed_smc_parameters_t speed_smc;
-    ditc_duty_parameters_t duty;
+    pwm_ditc_parameters_t duty;
     torque_trim_parameters_t trim;
     predictive_torque_parameters_t predictive;
     misalignment_parameters_t misalignment;
@@ -90,7 +90,7 @@ typedef struct {
     ditc_hysteresis_t hysteresis;
     misalignment_t misalignment;      /* of the machine: outlives a run */
     int32_t duty_q15[HAL_PHASES_MAX]; /* of a law that gives duties, in RUN */
-    ditc_duty_t duty;
+    pwm_ditc_t duty;
     torque_trim_t trim;
     predictive_torque_t predictive;
 } control_state_t;

@@ -5,7 +5,7 @@
 /* Whether the phases get all the voltage there is. */
 static bool voltage_saturated(const control_parameters_t *parameters, const control_state_t *state) {
     if (parameters->controller == DRIVE_CONTROLLER_SALIENT) {
-        return state->predictive.missing_q24 != 0;
+        return state->predictive.torque_shortfall_q24 != 0;
     }
     for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
         if (control_gives_duties(parameters) ? state->duty_q15[phase] == DUTY_ONE_Q15
@@ -31,7 +31,7 @@ control_diagnostics_t control_diagnose(const control_parameters_t *parameters, c
         .duty_q15 = (state->duty.pid.duty_q23 + (1 << 7)) >> 8,
         .voltage_saturated = run && voltage_saturated(parameters, state),
         .trim_torque_q24 = salient ? state->trim.trim_q24 : 0,
-        .torque_missing_q24 = salient ? state->predictive.missing_q24 : 0,
+        .torque_missing_q24 = salient ? state->predictive.torque_shortfall_q24 : 0,
         .observer_bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[state->bandwidth.stage],
     };
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {

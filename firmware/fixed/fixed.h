@@ -1,7 +1,8 @@
-/* Fixed-point arithmetic: every operation saturates or says why it cannot overflow.
+/* Fixed-point arithmetic: every operation saturates or states why it cannot overflow.
  *
  * Notation: Qm.n is a signed number with m integer bits and n fraction bits; `speed_q22` holds Q9.22. An unsigned
- * format says so. Products are formed in 64 bits, rounded to nearest (halves towards plus infinity) and saturated.
+ * format is called unsigned. Unless a function states otherwise, products are formed in 64 bits, rounded to nearest
+ * (halves towards plus infinity) and saturated.
  *
  * Right shifts of negative numbers are arithmetic: C leaves that to the compiler, the assertion below pins it.
  */
@@ -17,15 +18,15 @@
 
 static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithmetic");
 
-/* Number of a format from a constant, nearest; numerator >= 0. Evaluated by the compiler, never at run time. */
+/* numerator / denominator in a format, rounded to nearest; numerator >= 0. A constant expression. */
 #define FIXED_CONSTANT(numerator, denominator, fraction_bits)                                                          \
     ((int32_t)((((int64_t)(numerator) << (fraction_bits)) + (denominator) / 2) / (denominator)))
 
-/* Nearest 32-bit number. */
+/* Saturates to 32 bits. */
 __attribute__((always_inline)) static inline int32_t fixed_saturate(int64_t value) {
     const int32_t low_word = (int32_t)value;
     const int32_t high_word = (int32_t)(value >> 32);
-    /* Fits when the high word is only copies of the sign: without a comparison of 64 bits. */
+    /* The value fits when the high word is only copies of the sign bit. */
     if (__builtin_expect(high_word == low_word >> 31, 1)) {
         return low_word;
     }
@@ -39,7 +40,7 @@ static inline int32_t fixed_clamp(int32_t value, int32_t low, int32_t high) {
     return value < low ? low : value;
 }
 
-/* Saturating sum and difference: one instruction each where the processor has it, of the same bits. */
+/* Saturating sum and difference: one instruction each on a processor with DSP extension, with identical results. */
 static inline int32_t fixed_add(int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
     return __qadd(a, b);
@@ -64,14 +65,14 @@ static inline int32_t fixed_subtract(int32_t a, int32_t b) {
 #endif
 }
 
-/* Magnitude; INT32_MIN gives INT32_MAX. */
+/* Magnitude; saturates: INT32_MAX for INT32_MIN. */
 static inline int32_t fixed_abs(int32_t value) {
     const int32_t sign = value >> 31; /* -1 or 0: -v is ~v + 1 */
     return fixed_subtract(value ^ sign, sign);
 }
 
-/* a * b, exact. As an instruction, because the compiler widens a factor of several products once, and then multiplies
- * words of 64 bits. */
+/* a * b, exact. Written as an instruction because the compiler otherwise sign-extends a factor of several products once
+ * and multiplies 64-bit words. */
 static inline int64_t fixed_product(int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
     int64_t product;
@@ -92,7 +93,7 @@ static inline int64_t fixed_accumulate(int64_t sum, int32_t a, int32_t b) {
 #endif
 }
 
-/* value / 2^shift, rounded; shift 1..62. Cannot overflow for value < 2^63 - 2^(shift-1). */
+/* value / 2^shift, rounded to nearest; shift 1..62. Cannot overflow for value < 2^63 - 2^(shift-1). */
 static inline int64_t fixed_shift(int64_t value, unsigned shift) {
     return (value + ((int64_t)1 << (shift - 1))) >> shift;
 }
@@ -102,8 +103,8 @@ static inline int32_t fixed_multiply(int32_t a, int32_t b, unsigned shift) {
     return fixed_saturate(fixed_shift((int64_t)a * b, shift));
 }
 
-/* a * b / 2^32, rounded; cannot overflow. One instruction where the processor has it: a format whose products end here
- * costs least. */
+/* a * b / 2^32, rounded to nearest; cannot overflow. One instruction (SMMULR) on a processor with DSP extension, hence
+ * the choice of many formats such that their products end here. */
 static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
     int32_t high;
@@ -114,7 +115,7 @@ static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
 #endif
 }
 
-/* sum + a * b / 2^32, the product rounded; it must not overflow. */
+/* sum + a * b / 2^32, the product rounded to nearest; the caller ensures that the sum fits. */
 static inline int32_t fixed_multiply_high_add(int32_t sum, int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
     int32_t result;
@@ -125,12 +126,12 @@ static inline int32_t fixed_multiply_high_add(int32_t sum, int32_t a, int32_t b)
 #endif
 }
 
-/* a + 2 b, saturated, 2 b on its own before. */
+/* a + 2 b; first 2 b saturates, then the sum. */
 static inline int32_t fixed_add_twice(int32_t a, int32_t b) {
     return fixed_add(a, fixed_add(b, b));
 }
 
-/* Nearest number of `bits` bits with its sign, 1..32, a constant: one instruction where the processor has it. */
+/* Saturates to `bits` bits including the sign, 1..32, a constant: one instruction (SSAT) where the processor has it. */
 __attribute__((always_inline)) static inline int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
 #if defined __ARM_FEATURE_SAT && defined __OPTIMIZE__
     int32_t result;
@@ -141,9 +142,9 @@ __attribute__((always_inline)) static inline int32_t fixed_saturate_bits(int32_t
 #endif
 }
 
-/* value / 2^shift, rounded down; shift 1..31, a constant. What does not fit is held within 2^(32-shift) of the end: the
- * high word saturates, in one instruction, and the low bits stay what they are. */
-__attribute__((always_inline)) static inline int32_t fixed_narrow(int64_t value, unsigned shift) {
+/* value / 2^shift, rounded down; shift 1..31, a constant. Saturates to within 2^(32-shift) of INT32_MIN or INT32_MAX:
+ * only the high word saturates, in one instruction, the low bits of the result pass unchanged. */
+__attribute__((always_inline)) static inline int32_t fixed_shift_saturate(int64_t value, unsigned shift) {
     const int32_t high = fixed_saturate_bits((int32_t)(value >> 32), shift);
     return (int32_t)((uint32_t)high << (32 - shift) | (uint32_t)value >> shift);
 }

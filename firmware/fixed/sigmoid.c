@@ -1,7 +1,8 @@
 #include "fixed/sigmoid.h"
 
-/* 32768 (f(x) - f''(x) h^2 / 16) at x = k h, k = -128..128, h = 1/16: chords between points lifted by half of what they
- * sag below the curve are off by that half at either end and in the middle. */
+/* 32768 (f(x) - f''(x) h^2 / 16) at x = k h, k = -128..128, h = 1/16. The error of linear interpolation is up to
+ * -f'' h^2 / 8 in the middle of an interval; nodes shifted by half of that have errors of equal size, half as large, at
+ * the nodes and in the middle. */
 const int16_t sigmoid_symmetric_q15[2 * SIGMOID_STEPS + 1] = {
     -32746, -32745, -32743, -32741, -32740, -32738, -32736, -32734, -32732, -32729, -32727, -32724, -32722, -32719,
     -32715, -32712, -32708, -32704, -32700, -32696, -32691, -32686, -32681, -32676, -32670, -32663, -32657, -32649,

@@ -1,4 +1,4 @@
-// The BP network against its double-precision twin, the twin against the gradient, and the paper's (26) as printed.
+// The BP network against its reference model, the model against the gradient, and the paper's (26) as published.
 #include <cmath>
 #include <cstdint>
 #include <random>
@@ -13,24 +13,26 @@ extern "C" {
 
 namespace {
 
+using namespace fixed_point;
 constexpr int32_t WEIGHT_END_Q28 = INT32_MAX; // 8
-const bp_network_parameters_t DEFAULTS = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q32)};
+const bp_network_parameters_t DEFAULTS = {.learning_rate_q15 = to_fixed(0.05, Q15),
+                                          .momentum_q32 = to_fixed(0.05, Q32)};
 
-twins::network_t twin_of(const bp_network_t &network) {
-    twins::network_t twin;
+reference_model::network_t model_of(const bp_network_t &network) {
+    reference_model::network_t model;
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         for (unsigned j = 0; j < BP_INPUTS; j++) {
-            twin.hidden_weight[i][j] = network.hidden[i].input.value[j] / twins::Q28;
-            twin.hidden_change[i][j] = network.hidden[i].input.change[j] / twins::Q27;
+            model.hidden_weight[i][j] = network.hidden[i].input.value[j] / Q28;
+            model.hidden_increment[i][j] = network.hidden[i].input.increment[j] / Q27;
         }
     }
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         for (unsigned i = 0; i < BP_HIDDEN; i++) {
-            twin.output_weight[l][i] = network.hidden[i].output.value[l] / twins::Q28;
-            twin.output_change[l][i] = network.hidden[i].output.change[l] / twins::Q27;
+            model.output_weight[l][i] = network.hidden[i].output.value[l] / Q28;
+            model.output_increment[l][i] = network.hidden[i].output.increment[l] / Q27;
         }
     }
-    return twin;
+    return model;
 }
 
 template <typename visitor_t> void for_each_weight(const bp_network_t &network, visitor_t visit) {
@@ -46,36 +48,34 @@ template <typename visitor_t> void for_each_weight(const bp_network_t &network, 
     }
 }
 
-double largest_weight_difference(const bp_network_t &network, const twins::network_t &twin) {
+double largest_weight_difference(const bp_network_t &network, const reference_model::network_t &model) {
     double largest = 0.0;
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         for (unsigned j = 0; j < BP_INPUTS; j++) {
-            largest =
-                std::max(largest, std::fabs(network.hidden[i].input.value[j] / twins::Q28 - twin.hidden_weight[i][j]));
+            largest = std::max(largest, std::fabs(network.hidden[i].input.value[j] / Q28 - model.hidden_weight[i][j]));
         }
     }
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         for (unsigned i = 0; i < BP_HIDDEN; i++) {
-            largest =
-                std::max(largest, std::fabs(network.hidden[i].output.value[l] / twins::Q28 - twin.output_weight[l][i]));
+            largest = std::max(largest, std::fabs(network.hidden[i].output.value[l] / Q28 - model.output_weight[l][i]));
         }
     }
     return largest;
 }
 
 double output(const bp_network_t &network, unsigned l) {
-    return 0.5 + 0.5 * network.output_q27[l] / twins::Q27;
+    return 0.5 + 0.5 * network.output_q27[l] / Q27;
 }
 
-double largest_output_difference(const bp_network_t &network, const twins::network_t &twin) {
+double largest_output_difference(const bp_network_t &network, const reference_model::network_t &model) {
     double largest = 0.0;
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        largest = std::max(largest, std::fabs(output(network, l) - twin.output[l]));
+        largest = std::max(largest, std::fabs(output(network, l) - model.output[l]));
     }
     return largest;
 }
 
-twins::network_t::inputs_t to_double(const int32_t (&value)[3], double one) {
+reference_model::network_t::inputs_t to_double(const int32_t (&value)[3], double one) {
     return {value[0] / one, value[1] / one, value[2] / one};
 }
 
@@ -83,8 +83,8 @@ void random_weights(bp_network_t &network, std::mt19937 &random, double limit) {
     std::uniform_real_distribution<double> weight(-limit, limit);
     for (bp_neuron_t &neuron : network.hidden) {
         for (unsigned k = 0; k < 3; k++) {
-            neuron.input.value[k] = twins::to_fixed(weight(random), twins::Q28);
-            neuron.output.value[k] = twins::to_fixed(weight(random), twins::Q28);
+            neuron.input.value[k] = to_fixed(weight(random), Q28);
+            neuron.output.value[k] = to_fixed(weight(random), Q28);
         }
     }
 }
@@ -101,7 +101,7 @@ int32_t any_q31(std::mt19937 &random) {
     return any_q15(random) * 65536;
 }
 
-TEST(BpNetwork, initial_weights_are_within_half_and_depend_on_nothing_but_the_seed) {
+TEST(BpNetwork, initial_weights_are_within_one_half_and_depend_only_on_the_seed) {
     bp_network_t first{}, second{}, other{};
     bp_network_reset(&first, 1);
     bp_network_reset(&second, 1);
@@ -110,8 +110,8 @@ TEST(BpNetwork, initial_weights_are_within_half_and_depend_on_nothing_but_the_se
     int count = 0, same = 0;
     for_each_weight(first, [&](int32_t w) {
         EXPECT_LE(std::abs(w), 1 << 27);
-        sum += w / twins::Q28;
-        squares += std::pow(w / twins::Q28, 2.0);
+        sum += w / Q28;
+        squares += std::pow(w / Q28, 2.0);
         count++;
     });
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
@@ -129,8 +129,9 @@ TEST(BpNetwork, initial_weights_are_within_half_and_depend_on_nothing_but_the_se
     EXPECT_EQ(first.hidden[0].input.value[1], int32_t(generated >> 4) - (1 << 27));
 }
 
-// What is left is the activations' own error, 8e-5 and beyond sums of 8 7e-4, through the 6 weights of the next layer.
-TEST(BpNetwork, outputs_follow_the_twin_for_small_and_for_saturated_weights) {
+// The difference is the error of the activations, 8e-5 (7e-4 for sums beyond 8), through the 6 weights of the next
+// layer.
+TEST(BpNetwork, outputs_equal_the_reference_model_for_small_and_for_saturated_weights) {
     std::mt19937 random(1);
     for (const double limit : {0.5, 2.6, 8.0}) {
         double worst = 0.0;
@@ -139,88 +140,89 @@ TEST(BpNetwork, outputs_follow_the_twin_for_small_and_for_saturated_weights) {
             random_weights(network, random, limit);
             const int32_t input_q27[BP_INPUTS] = {any_q27(random), any_q27(random), any_q27(random)};
             bp_network_forward(&network, input_q27);
-            twins::network_t twin = twin_of(network);
-            twin.forward(to_double(input_q27, twins::Q27));
+            reference_model::network_t model = model_of(network);
+            model.forward(to_double(input_q27, Q27));
             for (unsigned i = 0; i < BP_HIDDEN; i++) {
-                ASSERT_NEAR(network.hidden[i].value_q27 / twins::Q27, twin.hidden[i], limit < 2.7 ? 8e-5 : 7e-4);
+                ASSERT_NEAR(network.hidden[i].activation_q27 / Q27, model.hidden[i], limit < 2.7 ? 8e-5 : 7e-4);
             }
-            worst = std::max(worst, largest_output_difference(network, twin));
+            worst = std::max(worst, largest_output_difference(network, model));
         }
         EXPECT_LT(worst, limit < 1.0 ? 4e-5 : limit < 3.0 ? 1.5e-4 : 2.5e-3);
         EXPECT_GT(worst, 2e-5);
     }
 }
 
-TEST(BpNetwork, a_learning_step_moves_the_weights_as_the_twin_does) {
+TEST(BpNetwork, a_learning_step_changes_the_weights_as_the_reference_model_does) {
     std::mt19937 random(2);
-    const bp_network_parameters_t parameters = {32768, 1 << 30};
-    double worst = 0.0, largest_move = 0.0;
+    const bp_network_parameters_t parameters = {.learning_rate_q15 = 32768, .momentum_q32 = 1 << 30};
+    double worst = 0.0, largest_update = 0.0;
     for (int run = 0; run < 20000; run++) {
         bp_network_t network{};
         random_weights(network, random, 2.6);
         for (bp_neuron_t &neuron : network.hidden) {
             for (unsigned k = 0; k < 3; k++) {
-                neuron.input.change[k] = int32_t(random() % (1u << 23)) - (1 << 22);
-                neuron.output.change[k] = int32_t(random() % (1u << 23)) - (1 << 22);
+                neuron.input.increment[k] = int32_t(random() % (1u << 23)) - (1 << 22);
+                neuron.output.increment[k] = int32_t(random() % (1u << 23)) - (1 << 22);
             }
         }
         const int32_t input_q31[BP_INPUTS] = {any_q31(random), any_q31(random), any_q31(random)};
         const int32_t input_q27[BP_INPUTS] = {input_q31[0] / 16, input_q31[1] / 16, input_q31[2] / 16};
         const int32_t sensitivity_q31[BP_OUTPUTS] = {any_q31(random), any_q31(random), any_q31(random)};
         const int32_t error_q16 = any_q15(random) * 2;
-        twins::network_t twin = twin_of(network);
-        const twins::network_t before = twin;
+        reference_model::network_t model = model_of(network);
+        const reference_model::network_t before = model;
         bp_network_forward(&network, input_q27);
-        twin.forward(to_double(input_q27, twins::Q27));
+        model.forward(to_double(input_q27, Q27));
         bp_network_learn(&parameters, &network, error_q16, input_q31, sensitivity_q31);
-        twin.learn(1.0, 0.25, error_q16 / twins::Q16, to_double(sensitivity_q31, twins::Q31));
-        worst = std::max(worst, largest_weight_difference(network, twin));
-        largest_move = std::max(largest_move, largest_weight_difference(network, before));
+        model.learn(1.0, 0.25, error_q16 / Q16, to_double(sensitivity_q31, Q31));
+        worst = std::max(worst, largest_weight_difference(network, model));
+        largest_update = std::max(largest_update, largest_weight_difference(network, before));
     }
     EXPECT_LT(worst, 2e-4);
     EXPECT_GT(worst, 1e-5);
-    EXPECT_GT(largest_move, 0.2);
+    EXPECT_GT(largest_update, 0.2);
 }
 
-TEST(BpNetwork, a_hundred_thousand_learning_steps_stay_bounded_and_near_the_twin) {
+TEST(BpNetwork, a_hundred_thousand_learning_steps_stay_bounded_and_near_the_reference_model) {
     std::mt19937 random(3);
     std::normal_distribution<double> noise(0.0, 0.3);
     bp_network_t network;
     bp_network_reset(&network, 1);
-    twins::network_t twin = twin_of(network);
-    const twins::network_t start = twin;
+    reference_model::network_t model = model_of(network);
+    const reference_model::network_t start = model;
     double e1 = 0.0, e2 = 0.0, worst_weight = 0.0, worst_output = 0.0;
     int32_t largest_q28 = 0;
     for (int k = 0; k < 100000; k++) {
         const double e = std::clamp(0.8 * e1 + noise(random), -0.9999, 0.9999);
-        const double rise = std::clamp(e - e1, -0.9999, 0.9999);
-        const double bend = std::clamp(e - 2.0 * e1 + e2, -0.9999, 0.9999);
+        const double first_difference = std::clamp(e - e1, -0.9999, 0.9999);
+        const double second_difference = std::clamp(e - 2.0 * e1 + e2, -0.9999, 0.9999);
         e2 = e1;
         e1 = e;
-        const int32_t error_q16 = twins::to_fixed(e, twins::Q16);
-        const int32_t term_q31[3] = {twins::to_fixed(rise, twins::Q31), twins::to_fixed(e, twins::Q31),
-                                     twins::to_fixed(bend, twins::Q31)};
+        const int32_t error_q16 = to_fixed(e, Q16);
+        const int32_t term_q31[3] = {to_fixed(first_difference, Q31), to_fixed(e, Q31),
+                                     to_fixed(second_difference, Q31)};
         const int32_t input_q31[3] = {term_q31[1], term_q31[0], term_q31[2]};
         const int32_t input_q27[3] = {input_q31[0] / 16, input_q31[1] / 16, input_q31[2] / 16};
         bp_network_forward(&network, input_q27);
-        twin.forward(to_double(input_q27, twins::Q27));
+        model.forward(to_double(input_q27, Q27));
         bp_network_learn(&DEFAULTS, &network, error_q16, input_q31, term_q31);
-        twin.learn(DEFAULTS.learning_rate_q15 / twins::Q15, DEFAULTS.inertia_q32 / twins::Q32, error_q16 / twins::Q16,
-                   to_double(term_q31, twins::Q31));
-        worst_output = std::max(worst_output, largest_output_difference(network, twin));
-        worst_weight = std::max(worst_weight, largest_weight_difference(network, twin));
+        model.learn(DEFAULTS.learning_rate_q15 / Q15, DEFAULTS.momentum_q32 / Q32, error_q16 / Q16,
+                    to_double(term_q31, Q31));
+        worst_output = std::max(worst_output, largest_output_difference(network, model));
+        worst_weight = std::max(worst_weight, largest_weight_difference(network, model));
         for_each_weight(network, [&](int32_t w) { largest_q28 = std::max(largest_q28, std::abs(w)); });
     }
     EXPECT_LT(worst_weight, 1.5e-3);
     EXPECT_LT(worst_output, 2e-4);
     EXPECT_GT(worst_weight, 1e-4);
-    EXPECT_LT(largest_q28 / twins::Q28, 2.6);
+    EXPECT_LT(largest_q28 / Q28, 2.6);
     EXPECT_GT(largest_weight_difference(network, start), 0.1) << "it learned nothing";
 }
 
-TEST(BpNetwork, weights_saturate_and_never_wrap_under_the_wildest_learning) {
+TEST(BpNetwork, weights_saturate_and_never_wrap_under_extreme_learning) {
     std::mt19937 random(4);
-    const bp_network_parameters_t parameters = {32768, INT32_MAX}; // eta 1, alpha 1/2
+    const bp_network_parameters_t parameters = {.learning_rate_q15 = 32768,
+                                                .momentum_q32 = INT32_MAX}; // eta 1, alpha 1/2
     bp_network_t network{};
     random_weights(network, random, 8.0);
     int32_t last[BP_OUTPUTS][BP_HIDDEN];
@@ -241,76 +243,79 @@ TEST(BpNetwork, weights_saturate_and_never_wrap_under_the_wildest_learning) {
             ASSERT_GT(output(network, l), 0.0);
             ASSERT_LT(output(network, l), 1.0);
             for (unsigned i = 0; i < BP_HIDDEN; i++) {
-                const int32_t now = network.hidden[i].output.value[l], change = network.hidden[i].output.change[l];
-                // In the direction of the change, whatever it is: held at the end, not beyond it.
-                ASSERT_TRUE(change >= 0 ? now >= last[l][i] : now <= last[l][i]);
+                const int32_t now = network.hidden[i].output.value[l],
+                              increment = network.hidden[i].output.increment[l];
+                // In the direction of the increment: saturated, not wrapped.
+                ASSERT_TRUE(increment >= 0 ? now >= last[l][i] : now <= last[l][i]);
                 reached = reached || now == WEIGHT_END_Q28 || now == INT32_MIN;
             }
         }
     }
-    EXPECT_TRUE(reached) << "the sequence is too tame to say anything";
+    EXPECT_TRUE(reached) << "no weight reached saturation";
 }
 
 // E = e^2 / 2, y = y0 + du, so dE/dW = -e d(du)/dW with sgn(dy/du) = 1: (26) and (27) with alpha 0 must be -eta dE/dW.
-TEST(BpNetwork, the_mended_rules_26_and_27_are_the_gradient_of_the_error_through_the_pid) {
+TEST(BpNetwork, the_corrected_rules_26_and_27_are_the_gradient_of_the_error_through_the_pid) {
     std::mt19937 random(5);
     std::uniform_real_distribution<double> unit(-1.0, 1.0);
     const double step = 1e-6;
     for (int run = 0; run < 200; run++) {
         bp_network_t start{};
         random_weights(start, random, 2.0);
-        const twins::network_t at = twin_of(start);
+        const reference_model::network_t at = model_of(start);
         const double e = unit(random), e1 = unit(random), e2 = unit(random);
-        const twins::network_t::outputs_t term = {e - e1, e, e - 2.0 * e1 + e2}; // (25)
-        const twins::network_t::inputs_t input = {e, e - e1, e - 2.0 * e1 + e2};
-        const auto increment = [&](twins::network_t network) {
+        const reference_model::network_t::outputs_t term = {e - e1, e, e - 2.0 * e1 + e2}; // (25)
+        const reference_model::network_t::inputs_t input = {e, e - e1, e - 2.0 * e1 + e2};
+        const auto increment = [&](reference_model::network_t network) {
             network.forward(input);
             return network.output[0] * term[0] + network.output[1] * term[1] + network.output[2] * term[2];
         };
-        twins::network_t learned = at;
+        reference_model::network_t learned = at;
         learned.forward(input);
         learned.learn(1.0, 0.0, e, term);
-        const auto expect_gradient = [&](double &(*weight)(twins::network_t &, unsigned, unsigned), unsigned row,
-                                         unsigned column) {
-            twins::network_t up = at, down = at;
+        const auto expect_gradient = [&](double &(*weight)(reference_model::network_t &, unsigned, unsigned),
+                                         unsigned row, unsigned column) {
+            reference_model::network_t up = at, down = at;
             weight(up, row, column) += step;
             weight(down, row, column) -= step;
             const double slope = -e * (increment(up) - increment(down)) / (2.0 * step);
-            twins::network_t origin = at;
+            reference_model::network_t origin = at;
             ASSERT_NEAR(weight(learned, row, column) - weight(origin, row, column), -slope, 1e-8);
         };
         for (unsigned i = 0; i < BP_HIDDEN; i++) {
             for (unsigned j = 0; j < BP_INPUTS; j++) {
-                ASSERT_NO_FATAL_FAILURE(expect_gradient(
-                    [](twins::network_t &n, unsigned r, unsigned c) -> double & { return n.hidden_weight[r][c]; }, i,
-                    j));
+                ASSERT_NO_FATAL_FAILURE(expect_gradient([](reference_model::network_t &n, unsigned r,
+                                                           unsigned c) -> double & { return n.hidden_weight[r][c]; },
+                                                        i, j));
             }
         }
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
             for (unsigned i = 0; i < BP_HIDDEN; i++) {
-                ASSERT_NO_FATAL_FAILURE(expect_gradient(
-                    [](twins::network_t &n, unsigned r, unsigned c) -> double & { return n.output_weight[r][c]; }, l,
-                    i));
+                ASSERT_NO_FATAL_FAILURE(expect_gradient([](reference_model::network_t &n, unsigned r,
+                                                           unsigned c) -> double & { return n.output_weight[r][c]; },
+                                                        l, i));
             }
         }
     }
 }
 
-TEST(BpNetwork, a_learning_step_lowers_the_error_it_learned_from) {
+TEST(BpNetwork, a_learning_step_reduces_the_error_it_learned_from) {
     // One PID sample on a plant y = u: with the weights after the step, the same sample's error is smaller.
     std::mt19937 random(6);
-    const bp_network_parameters_t parameters = {twins::to_fixed(0.1, twins::Q15), 0};
+    const bp_network_parameters_t parameters = {to_fixed(0.1, Q15), 0};
     int better = 0, worse = 0;
     for (int run = 0; run < 2000; run++) {
         bp_network_t network{};
         random_weights(network, random, 1.0);
-        const int32_t e = any_q15(random), rise = any_q15(random), bend = any_q15(random);
-        const int32_t input_q27[3] = {e * 4096, rise * 4096, bend * 4096};
-        const int32_t input_q31[3] = {e * 65536, rise * 65536, bend * 65536};
-        const int32_t term_q31[3] = {rise * 65536, e * 65536, bend * 65536};
+        const int32_t e = any_q15(random), first_difference = any_q15(random), second_difference = any_q15(random);
+        const int32_t input_q27[3] = {e * 4096, first_difference * 4096, second_difference * 4096};
+        const int32_t input_q31[3] = {e * 65536, first_difference * 65536, second_difference * 65536};
+        const int32_t term_q31[3] = {first_difference * 65536, e * 65536, second_difference * 65536};
         const auto increment = [&]() {
             bp_network_forward(&network, input_q27);
-            return (output(network, 0) * rise + output(network, 1) * e + output(network, 2) * bend) / twins::Q15;
+            return (output(network, 0) * first_difference + output(network, 1) * e +
+                    output(network, 2) * second_difference) /
+                   Q15;
         };
         const double before = increment();
         bp_network_learn(&parameters, &network, 2 * e, input_q31, term_q31);
@@ -323,24 +328,24 @@ TEST(BpNetwork, a_learning_step_lowers_the_error_it_learned_from) {
     EXPECT_EQ(worse, 0);
 }
 
-// Erratum: (26) is printed with alpha W_li(k-1) where (22) has alpha dW_li(k-1).
-TEST(BpNetwork, rule_26_as_printed_grows_every_weight_by_1_plus_alpha_a_step_and_the_mended_one_does_not) {
+// Erratum: (26) is published with alpha W_li(k-1) where (22) has alpha dW_li(k-1).
+TEST(BpNetwork, rule_26_as_published_grows_every_weight_by_1_plus_alpha_per_step_and_the_corrected_one_does_not) {
     const double alpha = 0.05;
     bp_network_t network;
     bp_network_reset(&network, 1);
-    const double start = network.hidden[0].output.value[0] / twins::Q28;
-    double printed = start;
-    const bp_network_parameters_t parameters = {DEFAULTS.learning_rate_q15, twins::to_fixed(alpha, twins::Q32)};
+    const double start = network.hidden[0].output.value[0] / Q28;
+    double published = start;
+    const bp_network_parameters_t parameters = {DEFAULTS.learning_rate_q15, to_fixed(alpha, Q32)};
     const int32_t input_q27[3] = {1 << 26, 1 << 25, 1 << 24}, nothing[3] = {0, 0, 0};
     for (int k = 1; k <= 100; k++) {
-        // No error, so delta is zero: all that is left of (26) as printed is dW = alpha W.
-        printed += alpha * printed;
-        EXPECT_NEAR(printed, start * std::pow(1.0 + alpha, k), 1e-9 * std::fabs(printed));
+        // No error, so delta is zero: all that is left of (26) as published is dW = alpha W.
+        published += alpha * published;
+        EXPECT_NEAR(published, start * std::pow(1.0 + alpha, k), 1e-9 * std::fabs(published));
         bp_network_forward(&network, input_q27);
         bp_network_learn(&parameters, &network, 0, input_q27, nothing);
     }
-    EXPECT_GT(std::fabs(printed), 130.0 * std::fabs(start));
-    EXPECT_EQ(network.hidden[0].output.value[0] / twins::Q28, start);
+    EXPECT_GT(std::fabs(published), 130.0 * std::fabs(start));
+    EXPECT_EQ(network.hidden[0].output.value[0] / Q28, start);
 }
 
 } // namespace

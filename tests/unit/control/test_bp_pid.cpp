@@ -1,4 +1,4 @@
-// The BP-PID against its double-precision twin, and when it learns.
+// The BP-PID against its reference model, and when it learns.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -9,42 +9,38 @@
 
 extern "C" {
 #include "control/bp_pid.h"
+#include "fixed/formats.h"
 }
 
-#include "support/reference_models.h"
+#include "support/reference_builders.h"
 
 namespace {
 
-constexpr int32_t DUTY_ONE_Q15 = 32768;
-
+using namespace fixed_point;
 bp_pid_parameters_t parameters_of(bp_pid_mode_t mode) {
     bp_pid_parameters_t parameters{};
     parameters.mode = mode;
     parameters.seed = 1;
-    parameters.error_scale_inverse_q24 = twins::to_fixed(0.5, twins::Q24); // 2 N m
-    parameters.scale_q28[0] = twins::to_fixed(1.0, twins::Q28);
-    parameters.scale_q28[1] = twins::to_fixed(0.24, twins::Q28);
-    parameters.scale_q28[2] = twins::to_fixed(0.4, twins::Q28);
-    parameters.network = {twins::to_fixed(0.05, twins::Q15), twins::to_fixed(0.05, twins::Q32)};
+    parameters.error_scale_inverse_q24 = to_fixed(0.5, Q24); // 2 N m
+    parameters.scale_q28[0] = to_fixed(1.0, Q28);
+    parameters.scale_q28[1] = to_fixed(0.24, Q28);
+    parameters.scale_q28[2] = to_fixed(0.4, Q28);
+    parameters.network = {.learning_rate_q15 = to_fixed(0.05, Q15), .momentum_q32 = to_fixed(0.05, Q32)};
     return parameters;
 }
 
-twins::bp_pid_t twin_of(const bp_pid_parameters_t &p, const bp_pid_t &pid) {
-    twins::bp_pid_t twin{twins::bp_pid_t::mode_t(p.mode),
-                         p.error_scale_inverse_q24 / twins::Q24,
-                         {p.scale_q28[0] / twins::Q28, p.scale_q28[1] / twins::Q28, p.scale_q28[2] / twins::Q28},
-                         p.network.learning_rate_q15 / twins::Q15,
-                         p.network.inertia_q32 / twins::Q32};
+reference_model::bp_pid_t model_of(const bp_pid_parameters_t &p, const bp_pid_t &pid) {
+    reference_model::bp_pid_t model = reference_model::model_of(p);
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
         for (unsigned j = 0; j < BP_INPUTS; j++) {
-            // The twin's inputs begin with the error, the PID's with its difference.
-            twin.network.hidden_weight[i][j] = pid.network.hidden[i].input.value[j == 2 ? 2 : 1 - j] / twins::Q28;
+            // The first input of the model is the error, of the PID its difference.
+            model.network.hidden_weight[i][j] = pid.network.hidden[i].input.value[j == 2 ? 2 : 1 - j] / Q28;
         }
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-            twin.network.output_weight[l][i] = pid.network.hidden[i].output.value[l] / twins::Q28;
+            model.network.output_weight[l][i] = pid.network.hidden[i].output.value[l] / Q28;
         }
     }
-    return twin;
+    return model;
 }
 
 bool same_weights(const bp_network_t &a, const bp_network_t &b) {
@@ -57,46 +53,46 @@ bool same_weights(const bp_network_t &a, const bp_network_t &b) {
     return true;
 }
 
-// Torque answers the duty with a lag, the reference moves: errors as in a drive. Returns the largest difference of the
-// duties of PID and twin, both fed the PID's errors.
+// The torque follows the duty with a lag, the reference varies: errors as in a drive. Returns the largest difference of
+// the duties of PID and model for the same errors.
 double largest_difference(bp_pid_mode_t mode, int samples, double *largest_gain_difference) {
     const bp_pid_parameters_t parameters = parameters_of(mode);
     bp_pid_t pid;
     bp_pid_reset(&parameters, &pid);
-    twins::bp_pid_t twin = twin_of(parameters, pid);
+    reference_model::bp_pid_t model = model_of(parameters, pid);
     std::mt19937 random(1);
     std::normal_distribution<double> noise(0.0, 0.02);
     double torque = 0.0, largest = 0.0;
     *largest_gain_difference = 0.0;
     for (int k = 0; k < samples; k++) {
         const double reference = 4.0 + 3.0 * std::sin(k * 0.003) + (k / 700 % 2 == 0 ? 0.5 : -0.5);
-        const int32_t error_q24 = twins::to_fixed(reference - torque + noise(random), twins::Q24);
-        const double duty = bp_pid_step(&parameters, &pid, error_q24) / twins::Q15;
-        largest = std::max(largest, std::fabs(duty - twin.step(error_q24 / twins::Q24)));
+        const int32_t error_q24 = to_fixed(reference - torque + noise(random), Q24);
+        const double duty = bp_pid_step(&parameters, &pid, error_q24) / Q15;
+        largest = std::max(largest, std::fabs(duty - model.step(error_q24 / Q24)));
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
             *largest_gain_difference =
-                std::max(*largest_gain_difference, std::fabs(pid.gain_q24[l] / twins::Q24 - twin.gain[l]));
+                std::max(*largest_gain_difference, std::fabs(pid.gain_q24[l] / Q24 - model.gain[l]));
         }
         torque += 0.3 * (8.0 * duty - torque);
     }
     return largest;
 }
 
-TEST(BpPid, follows_its_twin_with_fixed_gains) {
+TEST(BpPid, follows_its_reference_model_with_fixed_gains) {
     double gain = 0.0;
     const double largest = largest_difference(BP_PID_FIXED, 20000, &gain);
     EXPECT_LT(largest, 3e-4);
-    EXPECT_LT(gain, 1.0 / twins::Q15);
+    EXPECT_LT(gain, 1.0 / Q15);
 }
 
-TEST(BpPid, follows_its_twin_with_the_frozen_network) {
+TEST(BpPid, follows_its_reference_model_with_the_frozen_network) {
     double gain = 0.0;
     const double largest = largest_difference(BP_PID_FROZEN, 20000, &gain);
     EXPECT_LT(largest, 5e-4);
     EXPECT_LT(gain, 2e-4);
 }
 
-TEST(BpPid, follows_its_twin_while_it_learns) {
+TEST(BpPid, follows_its_reference_model_while_it_learns) {
     double gain = 0.0;
     const double largest = largest_difference(BP_PID_LEARNING, 20000, &gain);
     EXPECT_LT(largest, 5e-4);
@@ -130,8 +126,7 @@ TEST(BpPid, fixed_gains_are_half_the_scales_and_the_network_s_are_its_outputs_ti
         for (unsigned l = 0; l < BP_OUTPUTS; l++) {
             if (mode == BP_PID_FROZEN || mode == BP_PID_LEARNING) {
                 EXPECT_NEAR(pid.gain_q24[l],
-                            (0.5 + 0.5 * pid.network.output_q27[l] / twins::Q27) * parameters.scale_q28[l] / 16.0,
-                            0.51);
+                            (0.5 + 0.5 * pid.network.output_q27[l] / Q27) * parameters.scale_q28[l] / 16.0, 0.51);
             } else {
                 EXPECT_NEAR(pid.gain_q24[l], 0.5 * parameters.scale_q28[l] / 16.0, 0.51);
             }
@@ -139,7 +134,7 @@ TEST(BpPid, fixed_gains_are_half_the_scales_and_the_network_s_are_its_outputs_ti
     }
 }
 
-TEST(BpPid, only_the_learning_mode_changes_weights) {
+TEST(BpPid, only_learning_mode_changes_weights) {
     std::mt19937 random(2);
     for (const bp_pid_mode_t mode : {BP_PID_OFF, BP_PID_FIXED, BP_PID_FROZEN, BP_PID_LEARNING}) {
         const bp_pid_parameters_t parameters = parameters_of(mode);
@@ -153,7 +148,7 @@ TEST(BpPid, only_the_learning_mode_changes_weights) {
     }
 }
 
-TEST(BpPid, learning_pauses_while_the_duty_or_the_error_is_at_its_limit) {
+TEST(BpPid, learning_is_suspended_while_duty_or_error_is_saturated) {
     const bp_pid_parameters_t parameters = parameters_of(BP_PID_LEARNING);
     for (const int32_t sign : {1, -1}) {
         bp_pid_t pid;
@@ -162,19 +157,19 @@ TEST(BpPid, learning_pauses_while_the_duty_or_the_error_is_at_its_limit) {
         // The error beyond its scale: 3 N m of 2.
         bp_pid_step(&parameters, &pid, sign * (3 << 24));
         EXPECT_TRUE(same_weights(pid.network, before));
-        // The duty at its end, the error within.
-        bp_pid_preset(&pid, sign * DUTY_ONE_Q15);
-        pid.error_q16 = pid.rise_q16 = 0;
-        EXPECT_EQ(bp_pid_step(&parameters, &pid, sign * (1 << 24)), sign * DUTY_ONE_Q15);
+        // Duty saturated, error not.
+        bp_pid_preset(&pid, sign * ONE_Q15);
+        pid.error_q16 = pid.error_difference_q16 = 0;
+        EXPECT_EQ(bp_pid_step(&parameters, &pid, sign * (1 << 24)), sign * ONE_Q15);
         EXPECT_TRUE(same_weights(pid.network, before));
-        // The same error with room for the duty.
+        // The same error, duty not saturated.
         bp_pid_preset(&pid, 0);
-        pid.error_q16 = pid.rise_q16 = 0;
+        pid.error_q16 = pid.error_difference_q16 = 0;
         bp_pid_step(&parameters, &pid, sign * (1 << 24));
         EXPECT_FALSE(same_weights(pid.network, before));
-        // Out of saturation: it learns while it comes back.
+        // Leaving saturation: it learns.
         before = pid.network;
-        bp_pid_preset(&pid, sign * DUTY_ONE_Q15);
+        bp_pid_preset(&pid, sign * ONE_Q15);
         bp_pid_step(&parameters, &pid, -sign * (1 << 24));
         EXPECT_FALSE(same_weights(pid.network, before));
     }
@@ -188,29 +183,29 @@ TEST(BpPid, the_network_s_inputs_are_the_error_and_its_first_and_second_differen
     const double errors[] = {0.25, 0.5, -0.125, -0.9};
     double e1 = 0.0, e2 = 0.0;
     for (const double e : errors) {
-        bp_pid_step(&parameters, &pid, twins::to_fixed(e, twins::Q24));
+        bp_pid_step(&parameters, &pid, to_fixed(e, Q24));
         const auto limited = [](double v) { return std::clamp(v, -1.0, 65535.0 / 65536.0); };
         const double inputs[] = {limited(e - e1), e, limited(e - 2.0 * e1 + e2)};
         for (const bp_neuron_t &neuron : pid.network.hidden) {
             double sum = 0.0;
             for (unsigned j = 0; j < BP_INPUTS; j++) {
-                sum += neuron.input.value[j] / twins::Q28 * inputs[j];
+                sum += neuron.input.value[j] / Q28 * inputs[j];
             }
-            EXPECT_NEAR(neuron.value_q27 / twins::Q27, std::tanh(0.5 * sum), 1e-4);
+            EXPECT_NEAR(neuron.activation_q27 / Q27, std::tanh(0.5 * sum), 1e-4);
         }
         e2 = e1;
         e1 = e;
     }
 }
 
-TEST(BpPid, a_preset_duty_is_continued_without_a_bump) {
+TEST(BpPid, a_preset_duty_gives_a_bumpless_transfer) {
     for (const bp_pid_mode_t mode : {BP_PID_FIXED, BP_PID_FROZEN, BP_PID_LEARNING}) {
         const bp_pid_parameters_t parameters = parameters_of(mode);
         for (const int32_t duty_q15 : {-32768, -20000, -1, 0, 1, 12345, 32767, 32768}) {
             bp_pid_t pid;
             bp_pid_reset(&parameters, &pid);
             bp_pid_preset(&pid, duty_q15);
-            // Without an error nothing moves it.
+            // Without an error it is constant.
             for (int k = 0; k < 3; k++) {
                 ASSERT_EQ(bp_pid_step(&parameters, &pid, 0), duty_q15);
             }
@@ -218,13 +213,13 @@ TEST(BpPid, a_preset_duty_is_continued_without_a_bump) {
         bp_pid_t pid;
         bp_pid_reset(&parameters, &pid);
         bp_pid_preset(&pid, INT32_MAX);
-        EXPECT_EQ(bp_pid_step(&parameters, &pid, 0), DUTY_ONE_Q15);
+        EXPECT_EQ(bp_pid_step(&parameters, &pid, 0), ONE_Q15);
         bp_pid_preset(&pid, INT32_MIN);
-        EXPECT_EQ(bp_pid_step(&parameters, &pid, 0), -DUTY_ONE_Q15);
+        EXPECT_EQ(bp_pid_step(&parameters, &pid, 0), -ONE_Q15);
     }
 }
 
-TEST(BpPid, nothing_overflows_and_the_duty_stays_within_one_for_any_error_and_all_ends_of_the_parameters) {
+TEST(BpPid, nothing_overflows_and_the_duty_stays_within_one_for_any_error_and_extreme_parameters) {
     std::mt19937 random(3);
     const int32_t errors[] = {INT32_MIN, INT32_MAX, 1, -1, 0};
     for (const bp_pid_mode_t mode : {BP_PID_OFF, BP_PID_FIXED, BP_PID_FROZEN, BP_PID_LEARNING}) {
@@ -233,29 +228,29 @@ TEST(BpPid, nothing_overflows_and_the_duty_stays_within_one_for_any_error_and_al
                 bp_pid_parameters_t parameters = parameters_of(mode);
                 parameters.error_scale_inverse_q24 = inverse_q24;
                 std::fill_n(parameters.scale_q28, BP_OUTPUTS, scale_q28);
-                parameters.network = {32768, INT32_MAX};
+                parameters.network = {.learning_rate_q15 = 32768, .momentum_q32 = INT32_MAX};
                 bp_pid_t pid;
                 bp_pid_reset(&parameters, &pid);
                 for (int k = 0; k < 2000; k++) {
                     const int32_t error =
                         random() % 4 == 0 ? errors[random() % 5] : int32_t(uint32_t(random())) >> (random() % 20);
                     const int32_t duty = bp_pid_step(&parameters, &pid, error);
-                    ASSERT_LE(std::abs(duty), DUTY_ONE_Q15);
+                    ASSERT_LE(std::abs(duty), ONE_Q15);
                 }
             }
         }
     }
 }
 
-TEST(BpPid, a_pid_put_aside_shows_no_duty_and_no_gains_and_keeps_its_weights) {
+TEST(BpPid, clearing_telemetry_zeroes_duty_and_gains_and_keeps_the_weights) {
     const bp_pid_parameters_t parameters = parameters_of(BP_PID_LEARNING);
     bp_pid_t pid;
     bp_pid_reset(&parameters, &pid);
-    bp_pid_step(&parameters, &pid, twins::to_fixed(0.5, twins::Q24));
+    bp_pid_step(&parameters, &pid, to_fixed(0.5, Q24));
     ASSERT_NE(pid.duty_q23, 0);
     ASSERT_NE(pid.gain_q24[0], 0);
     const bp_network_t network = pid.network;
-    bp_pid_show_none(&pid);
+    bp_pid_clear_telemetry(&pid);
     EXPECT_EQ(pid.duty_q23, 0);
     for (const int32_t gain_q24 : pid.gain_q24) {
         EXPECT_EQ(gain_q24, 0);

@@ -1,4 +1,4 @@
-// The rule table of the hysteresis, exhaustively.
+// The rule table of hysteresis DITC, exhaustively.
 #include <cstdint>
 
 #include <gtest/gtest.h>
@@ -12,7 +12,8 @@ namespace {
 constexpr int32_t INNER = 1 << 20;
 constexpr int32_t OUTER = 1 << 24;
 constexpr int32_t LIMIT = 52 << 9;
-const ditc_hysteresis_parameters_t PARAMETERS = {INNER, OUTER, LIMIT};
+const ditc_hysteresis_parameters_t PARAMETERS = {
+    .band_inner_q24 = INNER, .band_outer_q24 = OUTER, .current_limit_q9 = LIMIT};
 
 // Just inside and outside of every boundary.
 const int32_t ERRORS[] = {INT32_MIN, -OUTER - 1, -OUTER, -OUTER + 1, -INNER - 1, -INNER, -INNER + 1, -1,       0,
@@ -20,7 +21,7 @@ const int32_t ERRORS[] = {INT32_MIN, -OUTER - 1, -OUTER, -OUTER + 1, -INNER - 1,
 
 enum role_t { SINGLE, INCOMING, OUTGOING, IDLE };
 
-// The table of ditc_hysteresis.h, read from there.
+// The rule table of ditc_hysteresis.h.
 int rule(role_t role, int state, int64_t error) {
     switch (role) {
     case SINGLE:
@@ -43,7 +44,7 @@ struct scene_t {
     int32_t current_q9[HAL_PHASES_MAX];
 };
 
-// Phase 1 active; phase 0 outgoing where asked, with or without current.
+// Phase 1 active; phase 0 outgoing if requested, with or without current.
 scene_t scene(bool outgoing, int32_t outgoing_current_q9, int32_t active_current_q9) {
     scene_t s{};
     s.commutation.active = 1;
@@ -61,16 +62,16 @@ int8_t next_state(const scene_t &s, unsigned phase, int state, int32_t error) {
 }
 
 TEST(DitcHysteresis, follows_the_rule_table_for_every_state_error_and_role) {
-    const scene_t alone = scene(false, 0, 512), both = scene(true, 512, 512), spent = scene(true, 0, 512);
+    const scene_t alone = scene(false, 0, 512), both = scene(true, 512, 512), depleted = scene(true, 0, 512);
     for (const int state : {-1, 0, 1}) {
         for (const int32_t error : ERRORS) {
             SCOPED_TRACE(testing::Message() << "state " << state << ", error " << error);
             EXPECT_EQ(next_state(alone, 1, state, error), rule(SINGLE, state, error));
             EXPECT_EQ(next_state(both, 1, state, error), rule(INCOMING, state, error));
             EXPECT_EQ(next_state(both, 0, state, error), rule(OUTGOING, state, error));
-            // An outgoing phase whose current is gone does not count: the active one works alone.
-            EXPECT_EQ(next_state(spent, 1, state, error), rule(SINGLE, state, error));
-            EXPECT_EQ(next_state(spent, 0, state, error), rule(OUTGOING, state, error));
+            // An outgoing phase without current does not count: the active one is single.
+            EXPECT_EQ(next_state(depleted, 1, state, error), rule(SINGLE, state, error));
+            EXPECT_EQ(next_state(depleted, 0, state, error), rule(OUTGOING, state, error));
             // Phases without a role.
             EXPECT_EQ(next_state(both, 2, state, error), rule(IDLE, state, error));
             EXPECT_EQ(next_state(alone, 0, state, error), rule(IDLE, state, error));
@@ -95,7 +96,7 @@ TEST(DitcHysteresis, a_phase_above_the_current_limit_freewheels_instead_of_being
     }
 }
 
-TEST(DitcHysteresis, every_phase_can_play_every_role) {
+TEST(DitcHysteresis, every_phase_can_have_every_role) {
     for (unsigned active = 0; active < HAL_PHASES_MAX; active++) {
         for (unsigned outgoing = 0; outgoing <= HAL_PHASES_MAX; outgoing++) {
             if (outgoing == active) {
@@ -115,7 +116,7 @@ TEST(DitcHysteresis, every_phase_can_play_every_role) {
     }
 }
 
-TEST(DitcHysteresis, in_a_gap_of_the_commutation_all_phases_are_off_after_reset_too) {
+TEST(DitcHysteresis, in_a_commutation_gap_and_after_reset_all_phases_are_off) {
     commutation_t commutation{};
     commutation.active = commutation.outgoing = COMMUTATION_NONE;
     const int32_t current_q9[HAL_PHASES_MAX] = {100, 100, 100, 100};
@@ -132,11 +133,12 @@ TEST(DitcHysteresis, in_a_gap_of_the_commutation_all_phases_are_off_after_reset_
     }
 }
 
-TEST(DitcHysteresis, the_extreme_bands_do_not_overflow) {
+TEST(DitcHysteresis, extreme_bands_do_not_overflow) {
     const scene_t both = scene(true, 512, 512);
     for (const int32_t inner : {0, INT32_MAX}) {
         for (const int32_t outer : {0, INT32_MAX}) {
-            const ditc_hysteresis_parameters_t parameters = {inner, outer, LIMIT};
+            const ditc_hysteresis_parameters_t parameters = {
+                .band_inner_q24 = inner, .band_outer_q24 = outer, .current_limit_q9 = LIMIT};
             for (const int32_t error : ERRORS) {
                 ditc_hysteresis_t ditc;
                 ditc_hysteresis_reset(&ditc);

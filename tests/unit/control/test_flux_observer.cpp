@@ -1,4 +1,4 @@
-// Flux linkage from voltage and current, against the double-precision twin.
+// Flux linkage from voltage and current, against the reference model.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -14,33 +14,32 @@ extern "C" {
 
 namespace {
 
-constexpr double Q29 = 536870912.0, Q40 = 1099511627776.0;
+using namespace fixed_point;
 constexpr double PERIOD_S = 25e-6, RESISTANCE_OHM = 0.05;
 
 flux_observer_parameters_t parameters_of(double gain, double resistance_ohm = RESISTANCE_OHM) {
-    return {twins::to_fixed(gain, twins::Q15), twins::to_fixed(resistance_ohm * PERIOD_S, Q40)};
+    return {to_fixed(gain, Q15), to_fixed(resistance_ohm * PERIOD_S, Q40)};
 }
 
-TEST(FluxObserver, follows_its_twin_within_20_nWb) {
+TEST(FluxObserver, follows_its_reference_model_within_20_nWb) {
     for (const double gain : {0.0, 0.01, 0.25, 1.0}) {
         const flux_observer_parameters_t p = parameters_of(gain);
         std::mt19937 random(1);
         std::uniform_real_distribution<double> uniform(0.0, 1.0);
         int32_t flux_q29 = 0;
-        double twin = 0.0, worst = 0.0;
+        double model = 0.0, worst = 0.0;
         for (int k = 0; k < 4000; k++) {
             // A phase that is driven up and down, and tables with some error.
-            const int32_t applied_q29 =
-                twins::to_fixed(6e-3 * (2.0 * uniform(random) - 1.0 + 0.3 * std::sin(k * 0.02)), Q29);
-            const int32_t table_q29 = twins::to_fixed(std::max(0.0, twin * (0.95 + 0.1 * uniform(random))), Q29);
+            const int32_t applied_q29 = to_fixed(6e-3 * (2.0 * uniform(random) - 1.0 + 0.3 * std::sin(k * 0.02)), Q29);
+            const int32_t table_q29 = to_fixed(std::max(0.0, model * (0.95 + 0.1 * uniform(random))), Q29);
             const int32_t current_q9 = int32_t(random() % (60 * 512));
-            const double drop = current_q9 / twins::Q9 * p.resistance_period_q40 / Q40;
+            const double drop = current_q9 / Q9 * p.resistance_period_q40 / Q40;
             const int32_t drop_q29 = flux_observer_step(&p, &flux_q29, table_q29, applied_q29, current_q9);
-            twin = twins::flux_step(twin, p.gain_q15 / twins::Q15, table_q29 / Q29, applied_q29 / Q29, drop);
+            model = reference_model::flux_step(model, p.gain_q15 / Q15, table_q29 / Q29, applied_q29 / Q29, drop);
             ASSERT_NEAR(drop_q29 / Q29, drop, 0.51 / Q29);
-            worst = std::max(worst, std::fabs(flux_q29 / Q29 - twin));
+            worst = std::max(worst, std::fabs(flux_q29 / Q29 - model));
         }
-        // Without correction the roundings add up as a walk does.
+        // Without correction the rounding errors add up as a random walk.
         EXPECT_LT(worst, gain > 0.0 ? 20e-9 : 200e-9) << gain;
         EXPECT_GT(worst, 0.0);
     }
@@ -71,7 +70,7 @@ TEST(FluxObserver, an_error_decays_by_the_gain_each_sample) {
     }
 }
 
-TEST(FluxObserver, drop_at_the_largest_resistance_and_current_is_exact) {
+TEST(FluxObserver, resistive_drop_at_the_largest_resistance_and_current_is_exact) {
     const flux_observer_parameters_t p = parameters_of(0.0, 20.0);
     int32_t flux_q29 = INT32_MAX;
     const int32_t drop_q29 = flux_observer_step(&p, &flux_q29, 0, 0, 79 * 512);

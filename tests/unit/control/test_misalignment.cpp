@@ -1,4 +1,4 @@
-// Learning where each phase's torque is: against the double-precision twin, on a machine whose phases are off.
+// Learning the misalignment of each phase, against the reference model, on a machine with displaced phases.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -12,10 +12,11 @@ extern "C" {
 #include "drive/configure.h"
 }
 
-#include "support/reference_models.h"
+#include "support/reference_builders.h"
 
 namespace {
 
+using namespace fixed_point;
 constexpr uint32_t RATE_HZ = 40000;
 constexpr unsigned PHASES = 3;
 constexpr double PROBE_RAD = 0.01;
@@ -31,31 +32,21 @@ misalignment_parameters_t parameters_of(int32_t rate_1_s) {
     return configure_control(&p, &machine_tables, RATE_HZ, 17, 12).misalignment;
 }
 
-double pitch_of(double rad) {
-    return rad / (2.0 * twins::PI) * machine_tables.rotor_poles;
-}
-
-uint32_t angle_of(double pitches) {
-    return uint32_t(int64_t(std::floor((pitches - std::floor(pitches)) * twins::TURN)));
+double electrical_rev_of(double rad) {
+    return rad / (2.0 * PI) * machine_tables.rotor_poles;
 }
 
 double degrees(double rad) {
-    return rad * 180.0 / twins::PI;
+    return rad * 180.0 / PI;
 }
 
-// Phases that work one after the other at a constant current, whose torque is really that of an angle some degrees off.
-// The load observer sees the difference with two lags of about its bandwidth; its correction is left out here.
+// Phases that conduct one after the other at constant current and whose torque is displaced by some degrees. The load
+// observer is modelled as two lags of about its bandwidth, without its speed correction.
 class Machine {
   public:
     explicit Machine(int32_t rate_1_s, const offsets_t &off_deg) : parameters(parameters_of(rate_1_s)), off(off_deg) {
         misalignment_reset(&state);
-        const double turn_rate_hz = double(RATE_HZ) / PHASES;
-        twin.phases = PHASES;
-        twin.rate_hz = RATE_HZ;
-        twin.rate_1_s = parameters.rate_q30 / twins::Q30 * turn_rate_hz;
-        twin.filter_1_s = parameters.filter_q16 / twins::Q16 * turn_rate_hz;
-        twin.mean_1_s = parameters.mean_q16 / twins::Q16 * turn_rate_hz;
-        twin.settle_s = double(parameters.settle_ticks) / RATE_HZ;
+        model = reference_model::model_of(parameters, PHASES, RATE_HZ);
     }
 
     void step(double torque_Nm, double load_Nm, bool steady) {
@@ -63,68 +54,69 @@ class Machine {
         int32_t current_q9[HAL_PHASES_MAX] = {};
         uint32_t angle[HAL_PHASES_MAX] = {};
         std::array<double, PHASES> slope{};
-        double missing = 0.0; // torque that the tables promise less what acts
+        double torque_error = 0.0; // torque from the tables less true torque
         for (unsigned phase = 0; phase < PHASES; phase++) {
             const double assumed = position - double(phase) / PHASES;
-            const double corrected = assumed - state.phase[phase].offset / twins::TURN;
-            angle[phase] = angle_of(corrected);
-            const double place = corrected - std::floor(corrected);
-            if (place > 0.6 && place < 0.95) {
+            const double corrected = assumed - state.phase[phase].offset / REV;
+            angle[phase] = angle_from_rev(corrected);
+            const double wrapped = corrected - std::floor(corrected);
+            if (wrapped > 0.6 && wrapped < 0.95) {
                 current_q9[phase] = 15 * 512;
             }
-            const auto torque = [&](double at) {
-                const phase_map_place_t where = phase_map_at(&machine_tables, angle_of(at));
-                return phase_map_torque_q24(&where, current_q9[phase]) / twins::Q24;
+            const auto torque = [&](double rev) {
+                const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, angle_from_rev(rev));
+                return phase_map_torque_q24(&lookup, current_q9[phase]) / Q24;
             };
             if (current_q9[phase] > 0) {
-                slope[phase] =
-                    phase_map_torque_slope_q24(&machine_tables, angle[phase], current_q9[phase], 2 * parameters.probe) /
-                    twins::Q24 / (2.0 * PROBE_RAD);
-                missing += torque(corrected) - torque(assumed - pitch_of(off[phase] / 180.0 * twins::PI));
+                slope[phase] = phase_map_torque_slope_q24(&machine_tables, angle[phase], current_q9[phase],
+                                                          2 * parameters.probe_angle) /
+                               Q24 / (2.0 * PROBE_RAD);
+                torque_error += torque(corrected) - torque(assumed - electrical_rev_of(off[phase] / 180.0 * PI));
             }
         }
-        lag[0] += twin.filter_1_s / RATE_HZ * (missing - lag[0]);
-        lag[1] += twin.filter_1_s / RATE_HZ * (lag[0] - lag[1]);
+        lag[0] += model.filter_1_s / RATE_HZ * (torque_error - lag[0]);
+        lag[1] += model.filter_1_s / RATE_HZ * (lag[0] - lag[1]);
         load_observer_t observer{};
-        observer.load_torque_q24 = twins::to_fixed(load_Nm + lag[1], twins::Q24);
-        const misalignment_sample_t sample = {current_q9, angle, twins::to_fixed(torque_Nm, twins::Q24), steady};
+        observer.load_torque_q24 = to_fixed(load_Nm + lag[1], Q24);
+        const misalignment_sample_t sample = {
+            .current_q9 = current_q9, .angle = angle, .torque_q24 = to_fixed(torque_Nm, Q24), .steady = steady};
         misalignment_step(&parameters, &state, &machine_tables, &observer, &sample);
-        twin.step(observer.load_torque_q24 / twins::Q24, steady, torque_Nm,
-                  [&](unsigned phase) { return slope[phase]; });
+        model.step(observer.load_torque_q24 / Q24, steady, torque_Nm, [&](unsigned phase) { return slope[phase]; });
     }
 
     double offset_deg(unsigned phase) const {
-        const double pitch = state.phase[phase].offset / twins::TURN;
-        return pitch / machine_tables.rotor_poles * 360.0;
+        const double electrical_rev = state.phase[phase].offset / REV;
+        return electrical_rev / machine_tables.rotor_poles * 360.0;
     }
 
     misalignment_parameters_t parameters;
     misalignment_t state{};
-    twins::misalignment_t twin{};
+    reference_model::misalignment_t model{};
     offsets_t off;
     double position = 0.0;
     std::array<double, 2> lag{};
 };
 
-TEST(Misalignment, every_phase_s_is_learned_to_0_02_degrees_in_a_second_and_a_half_as_the_twin_does) {
+TEST(Misalignment, that_of_every_phase_is_learned_to_0_02_degrees_in_1_5_s_as_by_the_reference_model) {
     for (const offsets_t &off : {offsets_t{0.2, 0.2, 0.2}, offsets_t{-0.3, 0.1, 0.2}, offsets_t{0.0, 0.5, 0.0}}) {
         Machine machine(12, off);
         double worst = 0.0;
         for (int k = 0; k < int(1.5 * RATE_HZ); k++) {
             machine.step(8.0, 8.0, true);
             for (unsigned phase = 0; phase < PHASES; phase++) {
-                worst = std::max(worst, std::fabs(machine.offset_deg(phase) - degrees(machine.twin.offset_rad[phase])));
+                worst =
+                    std::max(worst, std::fabs(machine.offset_deg(phase) - degrees(machine.model.offset_rad[phase])));
             }
         }
         for (unsigned phase = 0; phase < PHASES; phase++) {
             EXPECT_NEAR(machine.offset_deg(phase), off[phase], 0.02 + 0.05 * std::fabs(off[phase])) << phase;
         }
-        EXPECT_LT(worst, 0.01) << "degrees between fixed point and twin";
+        EXPECT_LT(worst, 0.01) << "degrees between firmware and model";
         EXPECT_GT(worst, 1e-6);
     }
 }
 
-TEST(Misalignment, nothing_is_learned_while_unsteady_or_below_1_Nm_or_before_it_has_settled) {
+TEST(Misalignment, is_not_learned_while_unsteady_below_1_Nm_or_before_settling) {
     Machine unsteady(12, {0.3, 0.3, 0.3}), idle(12, {0.3, 0.3, 0.3}), settling(12, {0.3, 0.3, 0.3});
     for (int k = 0; k < int(RATE_HZ); k++) {
         unsteady.step(8.0, 8.0, false);
@@ -138,7 +130,7 @@ TEST(Misalignment, nothing_is_learned_while_unsteady_or_below_1_Nm_or_before_it_
     }
 }
 
-TEST(Misalignment, what_is_learned_stays_while_unsteady_and_without_a_rate) {
+TEST(Misalignment, is_kept_while_unsteady_and_with_a_learning_rate_of_zero) {
     Machine machine(12, {0.3, -0.2, 0.1});
     for (int k = 0; k < int(RATE_HZ); k++) {
         machine.step(8.0, 8.0, true);
@@ -161,7 +153,7 @@ TEST(Misalignment, what_is_learned_stays_while_unsteady_and_without_a_rate) {
     EXPECT_EQ(parameters_of(0).rate_q30, 0) << "switched off";
 }
 
-TEST(Misalignment, an_aligned_machine_learns_less_than_0_01_degrees_from_a_load_that_is_not_its_torque) {
+TEST(Misalignment, an_aligned_machine_learns_less_than_0_01_degrees_from_a_load_unlike_its_torque) {
     Machine machine(12, {0.0, 0.0, 0.0});
     for (int k = 0; k < int(RATE_HZ); k++) {
         machine.step(8.0, 5.0, true);
@@ -171,7 +163,7 @@ TEST(Misalignment, an_aligned_machine_learns_less_than_0_01_degrees_from_a_load_
     }
 }
 
-TEST(Misalignment, is_held_within_a_degree_and_overflows_nothing) {
+TEST(Misalignment, is_limited_to_a_degree_and_overflows_nothing) {
     const misalignment_parameters_t p = parameters_of(100);
     for (const int32_t sign : {1, -1}) {
         misalignment_t state;
@@ -186,12 +178,13 @@ TEST(Misalignment, is_held_within_a_degree_and_overflows_nothing) {
                 current_q9[phase] = on ? 79 * 512 : 0;
             }
             observer.load_torque_q24 = sign * (on ? 60 << 24 : -(60 << 24));
-            observer.correction_q22 = on == (sign > 0) ? INT32_MIN : INT32_MAX;
-            const misalignment_sample_t sample = {current_q9, angle, 8 << 24, true};
+            observer.speed_correction_q22 = on == (sign > 0) ? INT32_MIN : INT32_MAX;
+            const misalignment_sample_t sample = {
+                .current_q9 = current_q9, .angle = angle, .torque_q24 = 8 << 24, .steady = true};
             misalignment_step(&p, &state, &machine_tables, &observer, &sample);
         }
         for (unsigned phase = 0; phase < PHASES; phase++) {
-            const double deg = state.phase[phase].offset / twins::TURN / machine_tables.rotor_poles * 360.0;
+            const double deg = state.phase[phase].offset / REV / machine_tables.rotor_poles * 360.0;
             EXPECT_LE(std::fabs(deg), 1.003);
             EXPECT_GT(std::fabs(deg), 0.5);
         }

@@ -1,5 +1,5 @@
-// Predictive control of the torque by flux linkage against the double-precision twin, which asks the same tables: what
-// differs is arithmetic, not the machine. Then what holds for any machine.
+// Predictive torque control against its reference model with the same tables, so that only the arithmetic differs, and
+// properties that hold for any machine.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -12,201 +12,180 @@ extern "C" {
 #include "drive/configure.h"
 }
 
-#include "support/reference_models.h"
+#include "support/reference_builders.h"
 
 namespace {
 
-constexpr double Q29 = 536870912.0, Q40 = 1099511627776.0, Q6 = 64.0;
+using namespace fixed_point;
 constexpr unsigned PHASES = 3;
 constexpr uint32_t RATE_HZ = 40000;
 constexpr double BUS_V = 240.0;
 
-// The firmware's tables with numbers instead of formats. Angles in pitches.
+// Phase map of the firmware in doubles. Angles in electrical revolutions.
 struct tables_t {
-    static phase_map_place_t at(double angle) { return phase_map_at(&machine_tables, uint32_t(angle * twins::TURN)); }
+    static phase_map_lookup_t at(double angle) { return phase_map_lookup(&machine_tables, uint32_t(angle * REV)); }
     double torque(double angle, double current_A) const {
-        const phase_map_place_t place = at(angle);
-        return phase_map_torque_q24(&place, twins::to_fixed(current_A, twins::Q9)) / twins::Q24;
+        const phase_map_lookup_t lookup = at(angle);
+        return phase_map_torque_q24(&lookup, to_fixed(current_A, Q9)) / Q24;
     }
     double flux(double angle, double current_A) const {
-        const phase_map_place_t place = at(angle);
-        return phase_map_flux_q29(&place, twins::to_fixed(current_A, twins::Q9)) / Q29;
+        const phase_map_lookup_t lookup = at(angle);
+        return phase_map_flux_q29(&lookup, to_fixed(current_A, Q9)) / Q29;
     }
-    // The greatest that gives no more.
+    // Largest current whose torque does not exceed it.
     double current_of_torque(double angle, double torque_Nm) const {
         return current_of([&](double current_A) { return torque(angle, current_A); }, torque_Nm);
     }
     double current_of_flux(double angle, double flux_Wb) const {
         return current_of([&](double current_A) { return flux(angle, current_A); }, flux_Wb);
     }
-    template <typename function_t> static double current_of(const function_t &gives, double wanted) {
+    template <typename function_t> static double current_of(const function_t &function, double target) {
         int32_t below = 0, above = PHASE_MAP_CURRENT_MAX_Q9 + 1;
         while (above - below > 1) {
             const int32_t middle = (below + above) / 2;
-            (gives(middle / twins::Q9) <= wanted ? below : above) = middle;
+            (function(middle / Q9) <= target ? below : above) = middle;
         }
-        return below / twins::Q9;
+        return below / Q9;
     }
 };
 
-using twin_t = twins::predictive_t<tables_t>;
 const tables_t TABLES;
 
 predictive_torque_parameters_t parameters_of(double reserve_Nm = 0.0, double current_limit_A = 52.0,
                                              bool sharing = true) {
     parameters_t p;
     parameters_init(&p);
-    p.values[PARAMETER_TORQUE_RESERVE_NM] = twins::to_fixed(reserve_Nm, twins::Q24);
-    p.values[PARAMETER_CURRENT_LIMIT_A] = twins::to_fixed(current_limit_A, twins::Q9);
+    p.values[PARAMETER_TORQUE_RESERVE_NM] = to_fixed(reserve_Nm, Q24);
+    p.values[PARAMETER_CURRENT_LIMIT_A] = to_fixed(current_limit_A, Q9);
     p.values[PARAMETER_TORQUE_SHARING] = sharing;
     return configure_control(&p, &machine_tables, RATE_HZ, 17, 12).predictive;
 }
 
-twin_t twin_of(const predictive_torque_parameters_t &p) {
-    twin_t twin{};
-    twin.machine = &TABLES;
-    twin.phases = PHASES;
-    twin.period_s = p.period_q40 / Q40;
-    twin.resistance_ohm = p.flux.resistance_period_q40 / Q40 / twin.period_s;
-    twin.flux_gain = p.flux.gain_q15 / twins::Q15;
-    twin.current_limit_A = p.current_limit_q9 / twins::Q9;
-    twin.reserve_Nm = p.reserve_q24 / twins::Q24;
-    twin.sharing = p.share.sharing;
-    const double stroke = p.share.stroke / twins::TURN;
-    const auto window = [&](double on, double off) { return twins::share_t{on, stroke, off - on - stroke}; };
-    const double on = p.share.turn_on / twins::TURN, off = p.share.turn_off / twins::TURN;
-    twin.late = window(on, off);
-    if (!p.share.sharing) {
-        twin.late.overlap = 0.0;
-    }
-    twin.early = window(on - p.share.turn_on_early / twins::TURN, off - p.share.turn_off_early / twins::TURN);
-    return twin;
-}
-
-// A machine that does what its tables say: exact flux linkages, currents by the tables, 12-bit codes.
+// A machine that equals its tables: exact flux linkages, currents from the tables, 12-bit ADC.
 class Machine {
   public:
-    explicit Machine(const predictive_torque_parameters_t &p) : parameters(p), twin(twin_of(p)) {
+    explicit Machine(const predictive_torque_parameters_t &p)
+        : parameters(p), model(reference_model::model_of(p, &TABLES, PHASES)) {
         predictive_torque_reset(&control);
     }
 
-    // One period with a rotor speed in pitches a period and a torque reference; duties of firmware and twin. Feeds the
-    // machine with the firmware's, which act a period later.
-    void step(double speed_pitch, double reference_Nm) {
+    // One period at a speed in electrical revolutions per period and a torque reference: duties of firmware and model.
+    // Those of the firmware act on the machine one period later.
+    void step(double speed_rev, double reference_Nm) {
         int32_t current_q9[HAL_PHASES_MAX] = {}, flux_q29[HAL_PHASES_MAX] = {};
         uint32_t angle[HAL_PHASES_MAX] = {};
-        twin_t::sample_t seen{};
+        reference_model::predictive_t<tables_t>::sample_t seen{};
         torque_Nm = opposed_Nm = 0.0;
         for (unsigned phase = 0; phase < PHASES; phase++) {
-            const double here = wrapped(position - double(phase) / PHASES);
-            const double mirrored = here >= 0.5 ? here : 1.0 - here;
+            const double angle_rev = wrapped(position - double(phase) / PHASES);
+            const double mirrored = angle_rev >= 0.5 ? angle_rev : 1.0 - angle_rev;
             const double current_A = flux[phase] > 0.0 ? TABLES.current_of_flux(mirrored, flux[phase]) : 0.0;
             const double magnitude_Nm = TABLES.torque(mirrored, current_A);
-            torque_Nm += here >= 0.5 ? magnitude_Nm : -magnitude_Nm;
-            opposed_Nm += here >= 0.5 ? 0.0 : magnitude_Nm;
-            // A converter's code: 10 of Q9.
-            current_q9[phase] = int32_t(std::floor(current_A * twins::Q9 / 10.0 + 0.5)) * 10;
-            const phase_map_place_t place = tables_t::at(here);
-            flux_q29[phase] = phase_map_flux_q29(&place, current_q9[phase]);
-            angle[phase] = uint32_t(wrapped(here + 2.0 * speed_pitch) * twins::TURN);
-            seen.current_A[phase] = current_q9[phase] / twins::Q9;
+            torque_Nm += angle_rev >= 0.5 ? magnitude_Nm : -magnitude_Nm;
+            opposed_Nm += angle_rev >= 0.5 ? 0.0 : magnitude_Nm;
+            // An ADC count is 10 LSB of Q9.
+            current_q9[phase] = int32_t(std::floor(current_A * Q9 / 10.0 + 0.5)) * 10;
+            const phase_map_lookup_t lookup = tables_t::at(angle_rev);
+            flux_q29[phase] = phase_map_flux_q29(&lookup, current_q9[phase]);
+            angle[phase] = uint32_t(wrapped(angle_rev + 2.0 * speed_rev) * REV);
+            seen.current_A[phase] = current_q9[phase] / Q9;
             seen.table_Wb[phase] = flux_q29[phase] / Q29;
-            seen.angle[phase] = aimed[phase] = angle[phase] / twins::TURN;
-            // Until the next sample the duty that was decided a period ago acts.
+            seen.angle[phase] = planned_angle[phase] = angle[phase] / REV;
+            // Until the next sample the duty of the previous period acts.
             const double drop = current_A * 0.05 / RATE_HZ;
             flux[phase] = std::max(flux[phase] + acting[phase] * BUS_V / RATE_HZ - drop, 0.0);
         }
-        position = wrapped(position + speed_pitch);
-        const int32_t reference_q24 = twins::to_fixed(reference_Nm, twins::Q24);
+        position = wrapped(position + speed_rev);
+        const int32_t reference_q24 = to_fixed(reference_Nm, Q24);
         seen.bus_V = BUS_V;
-        seen.torque_Nm = reference_q24 / twins::Q24;
-        seen.backwards = speed_pitch < 0.0;
-        seen.turn = std::fabs(speed_pitch);
-        const predictive_torque_sample_t sample = {current_q9,
-                                                   flux_q29,
-                                                   angle,
-                                                   int32_t(BUS_V * Q6),
-                                                   reference_q24,
-                                                   speed_pitch < 0.0,
-                                                   uint32_t(std::fabs(speed_pitch) * twins::TURN)};
+        seen.torque_Nm = reference_q24 / Q24;
+        seen.reverse = speed_rev < 0.0;
+        seen.angle_step = std::fabs(speed_rev);
+        const predictive_torque_sample_t sample = {.current_q9 = current_q9,
+                                                   .flux_q29 = flux_q29,
+                                                   .angle = angle,
+                                                   .bus_voltage_q6 = int32_t(BUS_V * Q6),
+                                                   .torque_q24 = reference_q24,
+                                                   .reverse = speed_rev < 0.0,
+                                                   .angle_step = uint32_t(std::fabs(speed_rev) * REV)};
         predictive_torque_step(&parameters, &control, &machine_tables, &sample, duty_q15);
-        twin.step(seen);
+        model.step(seen);
         for (unsigned phase = 0; phase < PHASES; phase++) {
-            acting[phase] = duty_q15[phase] / twins::Q15;
+            acting[phase] = duty_q15[phase] / Q15;
         }
     }
 
-    // Of the torques that the duties lead to, N m. Duties themselves say less: without flux linkage -1 and 0 are the
-    // same, and at the end of its window a phase gives hardly any torque, whatever its current.
+    // Largest difference of the torques that the duties lead to, N m. Duties are less significant: without flux linkage
+    // -1 and 0 are equivalent, and at the end of its window a phase has hardly any torque at any current.
     double difference_Nm() const {
         double worst = 0.0;
         for (unsigned phase = 0; phase < PHASES; phase++) {
-            const double fixed = torque_after(phase, duty_q15[phase] / twins::Q15);
-            worst = std::max(worst, std::fabs(fixed - torque_after(phase, twin.duty[phase])));
+            const double fixed = torque_after(phase, duty_q15[phase] / Q15);
+            worst = std::max(worst, std::fabs(fixed - torque_after(phase, model.duty[phase])));
         }
         return worst;
     }
 
     predictive_torque_parameters_t parameters;
     predictive_torque_t control;
-    twin_t twin;
+    reference_model::predictive_t<tables_t> model;
     int32_t duty_q15[HAL_PHASES_MAX] = {};
     double flux[PHASES] = {}, acting[PHASES] = {};
-    double position = 0.3, torque_Nm = 0.0, opposed_Nm = 0.0; // opposed: of the phases that brake
+    double position = 0.3, torque_Nm = 0.0, opposed_Nm = 0.0; // opposed_Nm: of the braking phases
 
   private:
-    // Magnitude, when the duty has acted.
+    // Magnitude of the torque after the duty has acted.
     double torque_after(unsigned phase, double duty) const {
-        const double ahead = wrapped(aimed[phase]);
-        const double mirrored = ahead >= 0.5 ? ahead : 1.0 - ahead;
+        const double planned = wrapped(planned_angle[phase]);
+        const double mirrored = planned >= 0.5 ? planned : 1.0 - planned;
         const double flux_Wb = control.flux_q29[phase] / Q29 + duty * BUS_V / RATE_HZ;
         return flux_Wb > 0.0 ? TABLES.torque(mirrored, TABLES.current_of_flux(mirrored, flux_Wb)) : 0.0;
     }
 
-    double aimed[PHASES] = {};
+    double planned_angle[PHASES] = {};
 
-    static double wrapped(double pitches) { return pitches - std::floor(pitches); }
+    static double wrapped(double rev) { return rev - std::floor(rev); }
 };
 
-// Pitches a period.
+// Electrical revolutions per period.
 double speed_of(double rpm) {
     return rpm / 60.0 * machine_tables.rotor_poles / RATE_HZ;
 }
 
-// The twin goes on from where the firmware is, so that a difference is one of this period. Where a clamp is hit in the
-// one and just not in the other, the torque handed over differs a little, too.
-TEST(PredictiveTorque, duties_are_the_twin_s_in_four_quadrants_with_and_without_reserve_and_sharing) {
+// Each period starts with the state of the firmware in both, so that differences do not accumulate. Where only one of
+// the two reaches a constraint, the redistributed torque differs slightly.
+TEST(PredictiveTorque, duties_equal_the_reference_model_in_four_quadrants_with_and_without_reserve_and_overlap) {
     for (const double reserve_Nm : {0.0, 8.0}) {
         for (const bool sharing : {true, false}) {
             for (const double rpm : {150.0, 1500.0, 3000.0, -150.0, -1500.0, -3000.0}) {
                 for (const double torque_Nm : {0.0, 0.5, 8.0, 19.0, -0.5, -8.0, -19.0}) {
                     Machine machine(parameters_of(reserve_Nm, 52.0, sharing));
-                    double worst = 0.0, sum = 0.0, missing = 0.0;
+                    double worst = 0.0, sum = 0.0, shortfall = 0.0;
                     for (int k = 0; k < 1500; k++) {
                         for (unsigned phase = 0; phase < PHASES; phase++) {
-                            machine.twin.flux[phase] = machine.control.flux_q29[phase] / Q29;
-                            machine.twin.duty[phase] = machine.control.duty_q15[phase] / twins::Q15;
+                            machine.model.flux[phase] = machine.control.flux_q29[phase] / Q29;
+                            machine.model.duty[phase] = machine.control.duty_q15[phase] / Q15;
                         }
-                        machine.twin.advance = machine.control.advance_q30 / twins::Q30;
-                        machine.twin.missing = machine.control.missing_q24 / twins::Q24;
+                        machine.model.advance = machine.control.advance_q30 / Q30;
+                        machine.model.torque_shortfall = machine.control.torque_shortfall_q24 / Q24;
                         machine.step(speed_of(rpm), torque_Nm * (1.0 + 0.2 * std::sin(k * 0.01)));
                         worst = std::max(worst, machine.difference_Nm());
                         sum += machine.difference_Nm();
-                        missing = std::max(missing,
-                                           std::fabs(machine.control.missing_q24 / twins::Q24 - machine.twin.missing));
+                        shortfall = std::max(shortfall, std::fabs(machine.control.torque_shortfall_q24 / Q24 -
+                                                                  machine.model.torque_shortfall));
                     }
                     SCOPED_TRACE(testing::Message() << reserve_Nm << " N m reserve, sharing " << sharing << ", " << rpm
                                                     << " r/min, " << torque_Nm << " N m");
                     EXPECT_LT(worst, 0.03);
                     EXPECT_LT(sum / 1500, 0.005);
-                    EXPECT_LT(missing, 0.03);
+                    EXPECT_LT(shortfall, 0.03);
                 }
             }
         }
     }
 }
 
-TEST(PredictiveTorque, makes_the_torque_that_is_asked_two_periods_later_in_four_quadrants) {
+TEST(PredictiveTorque, produces_the_reference_torque_two_periods_later_in_four_quadrants) {
     for (const double rpm : {150.0, 600.0, -150.0, -600.0}) {
         for (const double torque_Nm : {0.5, 2.0, 8.0, -0.5, -2.0, -8.0}) {
             Machine machine(parameters_of());
@@ -215,13 +194,13 @@ TEST(PredictiveTorque, makes_the_torque_that_is_asked_two_periods_later_in_four_
                 machine.step(speed_of(rpm), torque_Nm);
                 worst = k >= 200 ? std::max(worst, std::fabs(machine.torque_Nm - torque_Nm)) : worst;
             }
-            // An LSB of a current is 0.02 A; rounded shares, and what the voltage does not reach at the hand-over.
+            // LSB of a current, 0.02 A, rounding of the shares, and the voltage limit during commutation.
             EXPECT_LT(worst, 0.02 + 0.02 * std::fabs(torque_Nm)) << rpm << " r/min, " << torque_Nm << " N m";
         }
     }
 }
 
-TEST(PredictiveTorque, a_reserve_adds_opposed_torque_and_leaves_the_sum_as_it_is) {
+TEST(PredictiveTorque, a_reserve_adds_opposed_torque_and_keeps_the_total) {
     for (const double reserve_Nm : {0.0, 8.0}) {
         Machine machine(parameters_of(reserve_Nm));
         double worst = 0.0, least_opposed_Nm = 100.0, most_opposed_Nm = 0.0;
@@ -240,7 +219,7 @@ TEST(PredictiveTorque, a_reserve_adds_opposed_torque_and_leaves_the_sum_as_it_is
     }
 }
 
-TEST(PredictiveTorque, advances_while_torque_is_missing_within_100_ms_and_returns_within_a_second) {
+TEST(PredictiveTorque, advances_within_100_ms_during_a_shortfall_and_returns_within_a_second) {
     Machine machine(parameters_of());
     int up = 0;
     while (machine.control.advance_q30 < 1 << 30 && up < 2 * int(RATE_HZ)) {
@@ -249,7 +228,7 @@ TEST(PredictiveTorque, advances_while_torque_is_missing_within_100_ms_and_return
     }
     EXPECT_GE(up, int(RATE_HZ) / 10);
     EXPECT_LT(up, int(RATE_HZ) / 5) << "voltage does not suffice in most periods";
-    EXPECT_GT(machine.control.missing_q24, 0);
+    EXPECT_GT(machine.control.torque_shortfall_q24, 0);
     int down = 0;
     while (machine.control.advance_q30 > 0 && down < 2 * int(RATE_HZ)) {
         machine.step(speed_of(150.0), 1.0);
@@ -258,70 +237,77 @@ TEST(PredictiveTorque, advances_while_torque_is_missing_within_100_ms_and_return
     EXPECT_NEAR(down, int(RATE_HZ), 0.02 * RATE_HZ);
 }
 
-TEST(PredictiveTorque, no_phase_passes_its_current_limit_by_more_than_a_percent_and_what_is_missing_is_told) {
+TEST(PredictiveTorque, no_phase_exceeds_its_current_limit_by_more_than_2_percent_and_the_shortfall_is_reported) {
     const double limit_A = 10.0;
     Machine machine(parameters_of(0.0, limit_A));
-    double largest = 0.0, missing = 0.0;
+    double largest = 0.0, shortfall = 0.0;
     for (int k = 0; k < 4000; k++) {
         machine.step(speed_of(150.0), 15.0);
         for (unsigned phase = 0; phase < PHASES; phase++) {
-            double here = machine.position - phase / 3.0;
-            here -= std::floor(here);
-            largest = std::max(largest, TABLES.current_of_flux(here >= 0.5 ? here : 1.0 - here, machine.flux[phase]));
+            double angle_rev = machine.position - phase / 3.0;
+            angle_rev -= std::floor(angle_rev);
+            largest = std::max(
+                largest, TABLES.current_of_flux(angle_rev >= 0.5 ? angle_rev : 1.0 - angle_rev, machine.flux[phase]));
         }
-        missing = k > 200 ? std::max(missing, machine.control.missing_q24 / twins::Q24) : missing;
+        shortfall = k > 200 ? std::max(shortfall, machine.control.torque_shortfall_q24 / Q24) : shortfall;
     }
     EXPECT_GT(largest, 0.97 * limit_A);
     EXPECT_LT(largest, 1.02 * limit_A);
-    EXPECT_GT(missing, 1.0);
-    EXPECT_LT(missing, 15.0);
+    EXPECT_GT(shortfall, 1.0);
+    EXPECT_LT(shortfall, 15.0);
 }
 
-TEST(PredictiveTorque, a_current_above_the_limit_gets_no_voltage_whatever_is_asked) {
+TEST(PredictiveTorque, a_phase_above_the_current_limit_gets_no_positive_voltage_at_any_reference) {
     const predictive_torque_parameters_t p = parameters_of(0.0, 10.0);
     predictive_torque_t control;
     predictive_torque_reset(&control);
     const int32_t current_q9[HAL_PHASES_MAX] = {10 * 512 + 1, 0, 0, 0};
     const int32_t flux_q29[HAL_PHASES_MAX] = {};
     const uint32_t angle[HAL_PHASES_MAX] = {0xC0000000u, 0xC0000000u, 0x80000000u, 0};
-    const predictive_torque_sample_t sample = {current_q9, flux_q29, angle, 240 * 64, 19 << 24, false, 0};
+    const predictive_torque_sample_t sample = {.current_q9 = current_q9,
+                                               .flux_q29 = flux_q29,
+                                               .angle = angle,
+                                               .bus_voltage_q6 = 240 * 64,
+                                               .torque_q24 = 19 << 24,
+                                               .reverse = false,
+                                               .angle_step = 0};
     int32_t duty_q15[HAL_PHASES_MAX] = {};
     predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
     EXPECT_LE(duty_q15[0], 0);
     EXPECT_EQ(duty_q15[1], 32768);
 }
 
-TEST(PredictiveTorque, a_phase_that_brakes_carries_what_the_voltage_takes_away_until_unaligned) {
-    // Asked for far more than it can give, at every angle between aligned and unaligned, two ways round.
-    for (const bool backwards : {false, true}) {
+TEST(PredictiveTorque, a_braking_phase_carries_only_the_flux_linkage_that_the_voltage_removes_before_unaligned) {
+    // References far beyond its torque, angles between aligned and unaligned, both directions of rotation.
+    for (const bool reverse : {false, true}) {
         for (int tenths = 2; tenths < 9; tenths++) {
-            const double way = 0.05 * tenths; // to unaligned, pitch
-            const double turn = 0.02;         // fast enough for every limit to be below 79 A
+            const double travel_rev = 0.05 * tenths; // to unaligned
+            const double step_rev = 0.02;            // fast enough for every limit to be below 79 A
             predictive_torque_t control;
             predictive_torque_reset(&control);
             const predictive_torque_parameters_t p = parameters_of(0.0, 79.0);
-            const double reach = 240.0 / RATE_HZ;
-            control.flux_q29[0] = int32_t(reach * way / turn * Q29);
+            const double flux_step = 240.0 / RATE_HZ;
+            control.flux_q29[0] = int32_t(flux_step * travel_rev / step_rev * Q29);
             const int32_t current_q9[HAL_PHASES_MAX] = {};
             const int32_t flux_q29[HAL_PHASES_MAX] = {control.flux_q29[0], 0, 0, 0};
-            const uint32_t angle[HAL_PHASES_MAX] = {uint32_t((backwards ? 0.5 + way : 0.5 - way) * twins::TURN), 0, 0,
-                                                    0};
-            const predictive_torque_sample_t sample = {current_q9,
-                                                       flux_q29,
-                                                       angle,
-                                                       240 * 64,
-                                                       (backwards ? 40 : -40) * (1 << 24),
-                                                       backwards,
-                                                       uint32_t(turn * twins::TURN)};
+            const uint32_t angle[HAL_PHASES_MAX] = {uint32_t((reverse ? 0.5 + travel_rev : 0.5 - travel_rev) * REV), 0,
+                                                    0, 0};
+            const predictive_torque_sample_t sample = {.current_q9 = current_q9,
+                                                       .flux_q29 = flux_q29,
+                                                       .angle = angle,
+                                                       .bus_voltage_q6 = 240 * 64,
+                                                       .torque_q24 = (reverse ? 40 : -40) * (1 << 24),
+                                                       .reverse = reverse,
+                                                       .angle_step = uint32_t(step_rev * REV)};
             int32_t duty_q15[HAL_PHASES_MAX] = {};
             predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
-            EXPECT_NEAR(duty_q15[0], 0, 200) << "at the limit already: " << way;
+            EXPECT_NEAR(duty_q15[0], 0, 200) << "at the limit already: " << travel_rev;
             predictive_torque_sample_t still = sample;
-            still.turn = 0;
+            still.angle_step = 0;
             predictive_torque_reset(&control);
             control.flux_q29[0] = flux_q29[0];
             predictive_torque_step(&p, &control, &machine_tables, &still, duty_q15);
-            EXPECT_GT(duty_q15[0], 20000) << "no limit at standstill: " << way;
+            EXPECT_GT(duty_q15[0], 20000) << "no limit at standstill: " << travel_rev;
         }
     }
 }
@@ -337,7 +323,11 @@ TEST(PredictiveTorque, without_reference_every_switch_is_open) {
     }
 }
 
-TEST(PredictiveTorque, any_sample_gives_a_duty_within_one_and_overflows_nothing) {
+uint32_t random_angle_step(std::mt19937 &random) {
+    return uint32_t(random()) >> (random() % 32);
+}
+
+TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing) {
     std::mt19937 random(7);
     for (int i = 0; i < 20000; i++) {
         predictive_torque_parameters_t p = parameters_of(i % 3 == 0 ? 20.0 : 0.0);
@@ -352,14 +342,14 @@ TEST(PredictiveTorque, any_sample_gives_a_duty_within_one_and_overflows_nothing)
                 angle[phase] = uint32_t(random());
             }
             const int32_t references[] = {INT32_MIN, INT32_MAX, 0, int32_t(random())};
-            const int32_t buses[] = {0, 1, 512 * 64 - 1, int32_t(random() % (512 * 64))};
-            const predictive_torque_sample_t sample = {current_q9,
-                                                       flux_q29,
-                                                       angle,
-                                                       buses[random() % 4],
-                                                       references[k],
-                                                       i % 2 == 0,
-                                                       uint32_t(random()) >> (random() % 32)};
+            const int32_t voltages[] = {0, 1, 512 * 64 - 1, int32_t(random() % (512 * 64))};
+            const predictive_torque_sample_t sample = {.current_q9 = current_q9,
+                                                       .flux_q29 = flux_q29,
+                                                       .angle = angle,
+                                                       .bus_voltage_q6 = voltages[random() % 4],
+                                                       .torque_q24 = references[k],
+                                                       .reverse = i % 2 == 0,
+                                                       .angle_step = random_angle_step(random)};
             predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
             for (unsigned phase = 0; phase < PHASES; phase++) {
                 ASSERT_GE(duty_q15[phase], -32768);

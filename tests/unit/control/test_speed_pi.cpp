@@ -1,4 +1,4 @@
-// The speed PI against its double-precision twin.
+// The speed PI against its reference model.
 #include <cmath>
 #include <cstdint>
 #include <random>
@@ -9,25 +9,22 @@ extern "C" {
 #include "control/speed_pi.h"
 }
 
-#include "support/reference_models.h"
+#include "support/reference_builders.h"
 
 namespace {
 
+using namespace fixed_point;
 constexpr double RATE_HZ = 40000.0;
-constexpr double LSB_NM = 1.0 / twins::Q24;
+constexpr double LSB_NM = 1.0 / Q24;
 
 speed_pi_parameters_t parameters_of(double kp, double ki, double torque_min_Nm, double torque_max_Nm) {
-    return {twins::to_fixed(kp, twins::Q16), twins::to_fixed(ki / RATE_HZ, twins::Q32),
-            twins::to_fixed(torque_min_Nm, twins::Q24), twins::to_fixed(torque_max_Nm, twins::Q24)};
+    return {.kp_q16 = to_fixed(kp, Q16),
+            .ki_step_q32 = to_fixed(ki / RATE_HZ, Q32),
+            .torque_min_q24 = to_fixed(torque_min_Nm, Q24),
+            .torque_max_q24 = to_fixed(torque_max_Nm, Q24)};
 }
 
-// The twin of what the parameters hold after rounding.
-twins::pi_t twin_of(const speed_pi_parameters_t &parameters) {
-    return {parameters.kp_q16 / twins::Q16, parameters.ki_step_q32 / twins::Q32, parameters.torque_min_q24 / twins::Q24,
-            parameters.torque_max_q24 / twins::Q24};
-}
-
-TEST(SpeedPi, follows_its_twin_in_closed_loops_with_random_references_and_loads) {
+TEST(SpeedPi, follows_its_reference_model_in_closed_loops_with_random_references_and_loads) {
     std::mt19937 random(1);
     std::uniform_real_distribution<double> unit(0.0, 1.0);
     double worst = 0.0;
@@ -35,7 +32,7 @@ TEST(SpeedPi, follows_its_twin_in_closed_loops_with_random_references_and_loads)
         const double low = run % 2 == 0 ? 0.0 : -19.1;
         const speed_pi_parameters_t parameters =
             parameters_of(20.0 * unit(random), 1000.0 * unit(random), low, 5.0 + 30.0 * unit(random));
-        twins::pi_t twin = twin_of(parameters);
+        reference_model::pi_t model = reference_model::model_of(parameters);
         speed_pi_t pi;
         speed_pi_reset(&pi);
         double speed = 0.0, reference = 0.0, load = 0.0;
@@ -44,11 +41,11 @@ TEST(SpeedPi, follows_its_twin_in_closed_loops_with_random_references_and_loads)
                 reference = 300.0 * unit(random);
                 load = 10.0 * unit(random);
             }
-            const int32_t error_q22 = twins::to_fixed(reference - speed, twins::Q22);
-            const double torque = speed_pi_step(&parameters, &pi, error_q22) / twins::Q24;
-            worst = std::max(worst, std::fabs(torque - twin.step(error_q22 / twins::Q22)));
-            ASSERT_GE(torque, parameters.torque_min_q24 / twins::Q24);
-            ASSERT_LE(torque, parameters.torque_max_q24 / twins::Q24);
+            const int32_t error_q22 = to_fixed(reference - speed, Q22);
+            const double torque = speed_pi_step(&parameters, &pi, error_q22) / Q24;
+            worst = std::max(worst, std::fabs(torque - model.step(error_q22 / Q22)));
+            ASSERT_GE(torque, parameters.torque_min_q24 / Q24);
+            ASSERT_LE(torque, parameters.torque_max_q24 / Q24);
             speed += (torque - 0.02 * speed - load) / 0.02 / RATE_HZ;
         }
     }
@@ -81,13 +78,13 @@ TEST(SpeedPi, does_not_wind_up_while_the_torque_is_at_a_limit) {
         for (int k = 0; k < 40000; k++) {
             ASSERT_EQ(speed_pi_step(&parameters, &pi, sign * (60 << 22)), limit_q24);
         }
-        EXPECT_EQ(pi.integral_q54, 0) << "a second at the limit left something behind";
+        EXPECT_EQ(pi.integral_q54, 0) << "a second at the limit left an integral";
         // Hence the torque leaves the limit as soon as the error does.
-        EXPECT_EQ(speed_pi_step(&parameters, &pi, sign * (1 << 22)), sign * twins::to_fixed(8.0, twins::Q24));
+        EXPECT_EQ(speed_pi_step(&parameters, &pi, sign * (1 << 22)), sign * to_fixed(8.0, Q24));
     }
 }
 
-TEST(SpeedPi, the_integral_alone_stops_at_the_limits) {
+TEST(SpeedPi, the_integral_is_clamped_to_the_limits) {
     const speed_pi_parameters_t parameters = parameters_of(0.0, 10000.0, -3.0, 7.0);
     speed_pi_t pi;
     speed_pi_reset(&pi);
@@ -104,7 +101,7 @@ TEST(SpeedPi, the_integral_alone_stops_at_the_limits) {
     EXPECT_EQ(torque_q24, -(3 << 24));
 }
 
-TEST(SpeedPi, a_lowered_limit_takes_the_integral_along) {
+TEST(SpeedPi, lowering_a_limit_clamps_the_integral) {
     speed_pi_parameters_t parameters = parameters_of(1.0, 400.0, 0.0, 20.0);
     speed_pi_t pi{int64_t(20) << 54};
     parameters.torque_max_q24 = 5 << 24;
@@ -119,7 +116,10 @@ TEST(SpeedPi, nothing_overflows_at_the_ends_of_all_ranges) {
     for (const int32_t kp_q16 : {0, 1, 1000 << 16}) {
         for (const int32_t ki_step_q32 : {0, 1, INT32_MAX}) {
             for (const int32_t limit_q24 : {1, 1 << 24, 127 << 24}) {
-                const speed_pi_parameters_t parameters = {kp_q16, ki_step_q32, -limit_q24, limit_q24};
+                const speed_pi_parameters_t parameters = {.kp_q16 = kp_q16,
+                                                          .ki_step_q32 = ki_step_q32,
+                                                          .torque_min_q24 = -limit_q24,
+                                                          .torque_max_q24 = limit_q24};
                 speed_pi_t pi;
                 speed_pi_reset(&pi);
                 for (int k = 0; k < 500; k++) {

@@ -35,9 +35,11 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     };
     const double scale_Nm = v(PARAMETER_BP_ERROR_SCALE_NM);
     const auto pid_scale = [&](unsigned index) {
-        return std::min(v(index) * scale_Nm * rate_hz / 40000.0, 4.0) * twins::Q15;
+        return std::min(v(index) * scale_Nm * rate_hz / 40000.0, 4.0) * fixed_point::Q15;
     };
-    const auto pitch = [&](unsigned index) { return std::min(v(index) / 360.0 * twins::TURN, twins::TURN - 1.0); };
+    const auto pitch = [&](unsigned index) {
+        return std::min(v(index) / 360.0 * fixed_point::REV, fixed_point::REV - 1.0);
+    };
 
     ASSERT_EQ(c.tables, &machine_tables);
     ASSERT_EQ(int(c.controller), p.values[PARAMETER_CONTROLLER]);
@@ -46,22 +48,22 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(c.encoder_middle, encoder_bits == 32 ? 0u : 1u << (31 - encoder_bits));
     ASSERT_EQ(c.initialise_ticks, uint32_t(rate_hz / 1000.0));
 
-    const double ramp = twins::rad_s(v(PARAMETER_SPEED_RAMP_RPM_S)) / rate_hz * twins::Q22;
+    const double ramp = fixed_point::rad_s(v(PARAMETER_SPEED_RAMP_RPM_S)) / rate_hz * fixed_point::Q22;
     near("speed ramp", c.speed_ramp_q22, ramp == 0.0 ? INT32_MAX : std::max(ramp, 1.0), 1.0);
 
-    near("kp", c.speed_pi.kp_q16, v(PARAMETER_SPEED_KP) * twins::Q16, 0.0);
-    near("ki", c.speed_pi.ki_step_q32, v(PARAMETER_SPEED_KI) / rate_hz * twins::Q32, 1.0);
+    near("kp", c.speed_pi.kp_q16, v(PARAMETER_SPEED_KP) * fixed_point::Q16, 0.0);
+    near("ki", c.speed_pi.ki_step_q32, v(PARAMETER_SPEED_KI) / rate_hz * fixed_point::Q32, 1.0);
     ASSERT_EQ(c.speed_pi.torque_min_q24, 0);
-    near("torque max", c.speed_pi.torque_max_q24, v(PARAMETER_TORQUE_MAX_NM) * twins::Q24, 0.0);
+    near("torque max", c.speed_pi.torque_max_q24, v(PARAMETER_TORQUE_MAX_NM) * fixed_point::Q24, 0.0);
 
-    near("smc gain", c.speed_smc.gain_q24, v(PARAMETER_INERTIA_KG_M2) * v(PARAMETER_SMC_K) * twins::Q24, 0.51);
+    near("smc gain", c.speed_smc.gain_q24, v(PARAMETER_INERTIA_KG_M2) * v(PARAMETER_SMC_K) * fixed_point::Q24, 0.51);
     near("epsilon", c.speed_smc.epsilon_q31, std::ldexp(v(PARAMETER_SMC_EPSILON), 31), 1.01);
     near("delta", c.speed_smc.delta_q27, std::ldexp(v(PARAMETER_SMC_DELTA) / std::log(2.0), 27), 1.01);
-    near("friction", c.speed_smc.friction_q30, v(PARAMETER_FRICTION_NM_S) * twins::Q30, 0.0);
+    near("friction", c.speed_smc.friction_q30, v(PARAMETER_FRICTION_NM_S) * fixed_point::Q30, 0.0);
     ASSERT_EQ(c.speed_smc.torque_min_q24, -c.speed_smc.torque_max_q24);
-    near("torque max", c.speed_smc.torque_max_q24, v(PARAMETER_TORQUE_MAX_NM) * twins::Q24, 0.0);
+    near("torque max", c.speed_smc.torque_max_q24, v(PARAMETER_TORQUE_MAX_NM) * fixed_point::Q24, 0.0);
 
-    near("turn on", c.commutation.turn_on, 0.0, twins::TURN);
+    near("turn on", c.commutation.turn_on, 0.0, fixed_point::REV);
     ASSERT_LE(std::fabs(c.commutation.turn_on - pitch(PARAMETER_TURN_ON_ANGLE_DEG)), 1.0);
     const double active = pitch(PARAMETER_TURN_OFF_ANGLE_DEG) - pitch(PARAMETER_TURN_ON_ANGLE_DEG);
     const double available = pitch(PARAMETER_OUTGOING_OFF_ANGLE_DEG) - pitch(PARAMETER_TURN_ON_ANGLE_DEG);
@@ -69,47 +71,51 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_LE(std::fabs(c.commutation.available_width - std::max({active, available, 0.0})), 2.0);
     ASSERT_EQ(c.commutation.phases, machine_tables.phases);
     ASSERT_EQ(c.commutation.rotor_poles, machine_tables.rotor_poles);
-    const ditc_duty_aims_t aims = ditc_duty_aims(&machine_tables, pitch(PARAMETER_HAND_OVER_ANGLE_DEG));
-    for (unsigned k = 0; k < DITC_DUTY_AIMS; k++) {
-        ASSERT_NEAR(c.duty.aims.current_q9[k], aims.current_q9[k], 1.0) << k;
+    const pwm_ditc_setpoints_t aims = pwm_ditc_setpoints(&machine_tables, pitch(PARAMETER_HAND_OVER_ANGLE_DEG));
+    for (unsigned k = 0; k < PWM_DITC_SETPOINTS; k++) {
+        ASSERT_NEAR(c.duty.current_setpoints.current_q9[k], aims.current_q9[k], 1.0) << k;
     }
 
-    near("inner", c.hysteresis.band_inner_q24, v(PARAMETER_TORQUE_BAND_INNER_NM) * twins::Q24, 0.0);
-    near("outer", c.hysteresis.band_outer_q24, v(PARAMETER_TORQUE_BAND_OUTER_NM) * twins::Q24, 0.0);
-    const double rise_A = machine_tables.current_rise_A_s / rate_hz; // a period of full voltage
+    near("inner", c.hysteresis.band_inner_q24, v(PARAMETER_TORQUE_BAND_INNER_NM) * fixed_point::Q24, 0.0);
+    near("outer", c.hysteresis.band_outer_q24, v(PARAMETER_TORQUE_BAND_OUTER_NM) * fixed_point::Q24, 0.0);
+    const double rise_A = machine_tables.current_slew_rate_A_s / rate_hz; // a period of full voltage
     const double below_trip_A = std::max(v(PARAMETER_CURRENT_TRIP_A) - 2.2 * rise_A, 0.0);
-    near("limit", c.hysteresis.current_limit_q9, std::min(v(PARAMETER_CURRENT_LIMIT_A), below_trip_A) * twins::Q9, 4.0);
-    near("limit", c.duty.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * twins::Q9, 0.0);
-    near("assist", c.duty.band_outer_q24, v(PARAMETER_BP_ASSIST_BAND_NM) * twins::Q24, 0.0);
-    near("incoming gain", c.duty.incoming_gain_q24, 0.5 * rate_hz / machine_tables.current_rise_A_s * twins::Q24, 1.0);
+    near("limit", c.hysteresis.current_limit_q9, std::min(v(PARAMETER_CURRENT_LIMIT_A), below_trip_A) * fixed_point::Q9,
+         4.0);
+    near("limit", c.duty.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * fixed_point::Q9, 0.0);
+    near("assist", c.duty.band_outer_q24, v(PARAMETER_BP_ASSIST_BAND_NM) * fixed_point::Q24, 0.0);
+    near("incoming gain", c.duty.incoming_gain_q24,
+         0.5 * rate_hz / machine_tables.current_slew_rate_A_s * fixed_point::Q24, 1.0);
 
-    near("surplus", c.duty.surplus_q32, 40000.0 / 16.0 / rate_hz * twins::Q32, 4096.0);
-    near("spent torque", c.duty.spent_torque_q24, rate_hz / 40000.0 / 16.0 * twins::Q24, 1.0);
+    near("surplus", c.duty.overshoot_margin_q32, 40000.0 / 16.0 / rate_hz * fixed_point::Q32, 4096.0);
+    near("spent torque", c.duty.depleted_torque_q24, rate_hz / 40000.0 / 16.0 * fixed_point::Q24, 1.0);
     ASSERT_EQ(int(c.duty.pid.mode), p.values[PARAMETER_BP_MODE]);
     ASSERT_EQ(int32_t(c.duty.pid.seed), p.values[PARAMETER_BP_SEED]);
-    near("scale", c.duty.pid.error_scale_inverse_q24, twins::Q24 / scale_Nm, 1.0);
+    near("scale", c.duty.pid.error_scale_inverse_q24, fixed_point::Q24 / scale_Nm, 1.0);
     near("kp scale", c.duty.pid.scale_q28[0] / 8192.0, pid_scale(PARAMETER_BP_KP_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
     near("ki scale", c.duty.pid.scale_q28[1] / 8192.0, pid_scale(PARAMETER_BP_KI_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
     near("kd scale", c.duty.pid.scale_q28[2] / 8192.0, pid_scale(PARAMETER_BP_KD_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
-    near("eta", c.duty.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * twins::Q15, 1.0);
-    near("alpha", c.duty.pid.network.inertia_q32, v(PARAMETER_BP_ALPHA) * twins::Q32, 1.0);
+    near("eta", c.duty.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * fixed_point::Q15, 1.0);
+    near("alpha", c.duty.pid.network.momentum_q32, v(PARAMETER_BP_ALPHA) * fixed_point::Q32, 1.0);
 
     const double count = std::ldexp(1.0, 32 - int(encoder_bits));
-    const double fastest = twins::rad_s(v(PARAMETER_OVER_SPEED_RPM)) / rate_hz / (2.0 * twins::PI) * twins::TURN;
-    near("trip", c.protection.current_trip_q9, v(PARAMETER_CURRENT_TRIP_A) * twins::Q9, 0.0);
+    const double fastest =
+        fixed_point::rad_s(v(PARAMETER_OVER_SPEED_RPM)) / rate_hz / (2.0 * fixed_point::PI) * fixed_point::REV;
+    near("trip", c.protection.current_trip_q9, v(PARAMETER_CURRENT_TRIP_A) * fixed_point::Q9, 0.0);
     near("over-voltage", c.protection.bus_over_voltage_q6, v(PARAMETER_BUS_OVER_VOLTAGE_V) * 64.0, 0.0);
     near("under-voltage", c.protection.bus_under_voltage_q6, v(PARAMETER_BUS_UNDER_VOLTAGE_V) * 64.0, 0.0);
-    near("over-speed", c.protection.over_speed_q22, twins::rad_s(v(PARAMETER_OVER_SPEED_RPM)) * twins::Q22, 0.6);
-    near("step", c.protection.angle_step_max, 0.0, twins::TURN);
+    near("over-speed", c.protection.over_speed_q22, fixed_point::rad_s(v(PARAMETER_OVER_SPEED_RPM)) * fixed_point::Q22,
+         0.6);
+    near("step", c.protection.angle_step_max, 0.0, fixed_point::REV);
     ASSERT_LE(std::fabs(c.protection.angle_step_max - (1.5 * fastest + 2.0 * count)), 3.0 + 1e-6 * fastest);
-    ASSERT_LE(std::fabs(c.protection.angle_unmoved_max - (twins::TURN / 1440.0 + 4.0 * count)), 1.0);
+    ASSERT_LE(std::fabs(c.protection.angle_unmoved_max - (fixed_point::REV / 1440.0 + 4.0 * count)), 1.0);
     ASSERT_EQ(c.protection.angle_step_q32, c.observer.angle_step_q32);
-    near("slowing", c.protection.slowing_q22, 40.0 / v(PARAMETER_INERTIA_KG_M2) / rate_hz * twins::Q22, 2.0);
+    near("slowing", c.protection.slowing_q22, 40.0 / v(PARAMETER_INERTIA_KG_M2) / rate_hz * fixed_point::Q22, 2.0);
     near("timeout", c.protection.command_timeout_us, 1000.0 * v(PARAMETER_COMMAND_TIMEOUT_MS), 0.0);
 
     const auto &share = c.predictive.share;
-    const double stroke = twins::TURN / machine_tables.phases;
-    const double least = 2.0 / 360.0 * twins::TURN;
+    const double stroke = fixed_point::REV / machine_tables.phases;
+    const double least = 2.0 / 360.0 * fixed_point::REV;
     const double on_early = pitch(PARAMETER_SHARE_ON_EARLY_DEG);
     const double asked_width = pitch(PARAMETER_SHARE_OFF_ANGLE_DEG) - pitch(PARAMETER_SHARE_ON_ANGLE_DEG);
     const double width = std::max(asked_width, stroke + least);
@@ -118,39 +124,40 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(c.two_pulses, p.values[PARAMETER_PULSES_PER_PERIOD] == 2);
     ASSERT_EQ(c.load_from_transducer, p.values[PARAMETER_LOAD_SOURCE] == 1);
     ASSERT_EQ(share.sharing, p.values[PARAMETER_TORQUE_SHARING] == 1);
-    near("stroke", share.stroke, 0.0, twins::TURN);
+    near("stroke", share.stroke, 0.0, fixed_point::REV);
     ASSERT_LE(std::fabs(share.stroke - stroke), 1.0);
     ASSERT_LE(std::fabs(share.turn_on - pitch(PARAMETER_SHARE_ON_ANGLE_DEG)), 1.0);
     ASSERT_LE(std::fabs(share.turn_off - share.turn_on - width), 4.0) << "at least 2 degrees of overlap";
-    ASSERT_LE(std::fabs(share.turn_on_early - on_early), 1.0);
-    ASSERT_LE(std::fabs(share.turn_off_early - on_early - narrowing), 4.0) << "at full advance, too";
-    near("current limit", c.predictive.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * twins::Q9, 0.0);
-    near("reserve", c.predictive.reserve_q24, v(PARAMETER_TORQUE_RESERVE_NM) * twins::Q24, 0.0);
-    near("flux gain", c.predictive.flux.gain_q15, v(PARAMETER_FLUX_OBSERVER_GAIN) * twins::Q15, 0.0);
+    ASSERT_LE(std::fabs(share.turn_on_advance - on_early), 1.0);
+    ASSERT_LE(std::fabs(share.turn_off_advance - on_early - narrowing), 4.0) << "at full advance, too";
+    near("current limit", c.predictive.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * fixed_point::Q9, 0.0);
+    near("reserve", c.predictive.reserve_q24, v(PARAMETER_TORQUE_RESERVE_NM) * fixed_point::Q24, 0.0);
+    near("flux gain", c.predictive.flux.gain_q15, v(PARAMETER_FLUX_OBSERVER_GAIN) * fixed_point::Q15, 0.0);
     const double q40 = std::ldexp(1.0, 40);
     near("resistance", c.predictive.flux.resistance_period_q40, v(PARAMETER_RESISTANCE_OHM) / rate_hz * q40, 1.0);
     near("period", c.predictive.period_q40, q40 / rate_hz, 1.0);
-    near("advance", c.predictive.advance_q30, 10.0 / rate_hz * twins::Q30, 1.0);
-    near("return", c.predictive.return_q30, 1.0 / rate_hz * twins::Q30, 1.0);
+    near("advance", c.predictive.advance_q30, 10.0 / rate_hz * fixed_point::Q30, 1.0);
+    near("return", c.predictive.retract_step_q30, 1.0 / rate_hz * fixed_point::Q30, 1.0);
 
     const auto trim_scale = [&](unsigned index) {
-        return std::min(v(index) * scale_Nm / v(PARAMETER_BP_TRIM_LIMIT_NM), 4.0) * twins::Q15;
+        return std::min(v(index) * scale_Nm / v(PARAMETER_BP_TRIM_LIMIT_NM), 4.0) * fixed_point::Q15;
     };
     ASSERT_EQ(int(c.trim.pid.mode), p.values[PARAMETER_BP_TRIM_MODE]);
     ASSERT_EQ(int32_t(c.trim.pid.seed), p.values[PARAMETER_BP_SEED]);
-    near("trim limit", c.trim.limit_q24, v(PARAMETER_BP_TRIM_LIMIT_NM) * twins::Q24, 0.0);
-    near("trim error", c.trim.pid.error_scale_inverse_q24, twins::Q24 / scale_Nm, 1.0);
+    near("trim limit", c.trim.limit_q24, v(PARAMETER_BP_TRIM_LIMIT_NM) * fixed_point::Q24, 0.0);
+    near("trim error", c.trim.pid.error_scale_inverse_q24, fixed_point::Q24 / scale_Nm, 1.0);
     near("trim kp", c.trim.pid.scale_q28[0] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KP_MAX), 1.0);
     near("trim ki", c.trim.pid.scale_q28[1] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KI_MAX), 1.0);
     near("trim kd", c.trim.pid.scale_q28[2] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KD_MAX), 1.0);
-    near("trim eta", c.trim.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * twins::Q15, 1.0);
-    near("trim alpha", c.trim.pid.network.inertia_q32, v(PARAMETER_BP_ALPHA) * twins::Q32, 1.0);
+    near("trim eta", c.trim.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * fixed_point::Q15, 1.0);
+    near("trim alpha", c.trim.pid.network.momentum_q32, v(PARAMETER_BP_ALPHA) * fixed_point::Q32, 1.0);
 
     const double learn_1_s = p.values[PARAMETER_ANGLE_TRIM] == 1 ? v(PARAMETER_ANGLE_TRIM_RATE_1_S) : 0.0;
     const double turn_rate_hz = std::floor(rate_hz / machine_tables.phases);
-    near("misalignment rate", c.misalignment.rate_q30, learn_1_s / turn_rate_hz * twins::Q30, 1.0);
+    near("misalignment rate", c.misalignment.rate_q30, learn_1_s / turn_rate_hz * fixed_point::Q30, 1.0);
     near("inertia rate", c.misalignment.inertia_rate_q8, v(PARAMETER_INERTIA_KG_M2) * rate_hz * 256.0, 1.0);
-    ASSERT_LE(std::fabs(c.misalignment.probe - 0.01 / (2.0 * twins::PI) * twins::TURN * machine_tables.rotor_poles),
+    ASSERT_LE(std::fabs(c.misalignment.probe_angle -
+                        0.01 / (2.0 * fixed_point::PI) * fixed_point::REV * machine_tables.rotor_poles),
               machine_tables.rotor_poles);
 
     // The observer's gains have a test of their own; here, that the right parameters get there.
@@ -224,7 +231,7 @@ TEST(Configure, converts_random_sets_of_parameters_within_their_ranges) {
 
 TEST(Configure, a_machine_whose_current_hardly_rises_gets_the_largest_gain_and_not_a_wrapped_one) {
     static machine_tables_t slow = machine_tables;
-    slow.current_rise_A_s = 1;
+    slow.current_slew_rate_A_s = 1;
     parameters_t parameters;
     parameters_init(&parameters);
     EXPECT_EQ(configure_control(&parameters, &slow, 100000, 17, 12).duty.incoming_gain_q24, INT32_MAX);

@@ -52,13 +52,13 @@ class Control : public testing::Test {
     bool step(command_request_t request, double reference_rpm = 600.0) {
         sample.time_us += PERIOD_US;
         sample.command.request = request;
-        sample.command.speed_reference_q22 = twins::to_fixed(twins::rad_s(reference_rpm), twins::Q22);
+        sample.command.speed_reference_q22 = fixed_point::to_fixed(fixed_point::rad_s(reference_rpm), fixed_point::Q22);
         sample.command.time_us = sample.time_us;
         return step_as_it_is();
     }
 
     bool step_as_it_is() {
-        turns += speed_rad_s / (2.0 * twins::PI * RATE_HZ);
+        turns += speed_rad_s / (2.0 * fixed_point::PI * RATE_HZ);
         sample.encoder.counts = uint32_t(int64_t(std::floor((turns - std::floor(turns)) * (1 << ENCODER_BITS))));
         const bool closed = control_step(&parameters, &state, &sample, &compare);
         diagnostics = control_diagnose(&parameters, &state);
@@ -226,12 +226,12 @@ TEST_F(Control, a_fault_needs_clearing_and_letting_go_before_it_runs_again) {
 TEST_F(Control, a_fault_cleared_on_a_turning_rotor_does_not_read_as_overspeed) {
     for (const double rpm : {150.0, 600.0, 2500.0, 3000.0}) {
         configure(DRIVE_CONTROLLER_PAPER);
-        speed_rad_s = twins::rad_s(rpm);
+        speed_rad_s = fixed_point::rad_s(rpm);
         for (int k = 0; k < 4000; k++) {
             step(COMMAND_OFF);
         }
         ASSERT_EQ(state.machine.state, DRIVE_STATE_READY) << rpm;
-        EXPECT_NEAR(diagnostics.speed_q22 / twins::Q22, speed_rad_s, 0.01 * speed_rad_s);
+        EXPECT_NEAR(diagnostics.speed_q22 / fixed_point::Q22, speed_rad_s, 0.01 * speed_rad_s);
         sample.adc.phase_current_counts[0] = 4000;
         step(COMMAND_OFF);
         sample.adc.phase_current_counts[0] = 0;
@@ -242,12 +242,12 @@ TEST_F(Control, a_fault_cleared_on_a_turning_rotor_does_not_read_as_overspeed) {
             ASSERT_EQ(state.machine.state, DRIVE_STATE_READY)
                 << rpm << " r/min, " << k << " fault " << state.machine.record.fault;
         }
-        EXPECT_NEAR(diagnostics.speed_q22 / twins::Q22, speed_rad_s, 0.01 * speed_rad_s);
+        EXPECT_NEAR(diagnostics.speed_q22 / fixed_point::Q22, speed_rad_s, 0.01 * speed_rad_s);
     }
 }
 
 TEST_F(Control, the_reference_starts_at_the_present_speed_and_follows_the_ramp) {
-    parameters.speed_ramp_q22 = twins::to_fixed(0.01, twins::Q22); // rad/s a period
+    parameters.speed_ramp_q22 = fixed_point::to_fixed(0.01, fixed_point::Q22); // rad/s a period
     speed_rad_s = 20.0;
     for (int k = 0; k < 4000; k++) {
         step(COMMAND_OFF);
@@ -256,15 +256,15 @@ TEST_F(Control, the_reference_starts_at_the_present_speed_and_follows_the_ramp) 
     double expected = 0.0;
     for (int k = 0; k < 1000; k++) {
         step(COMMAND_RUN, 600.0);
-        expected = k == 0 ? diagnostics.speed_reference_q22 / twins::Q22 : expected + 0.01;
-        ASSERT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, expected, 1e-4);
+        expected = k == 0 ? diagnostics.speed_reference_q22 / fixed_point::Q22 : expected + 0.01;
+        ASSERT_NEAR(diagnostics.speed_reference_q22 / fixed_point::Q22, expected, 1e-4);
     }
     EXPECT_NEAR(expected, 30.0, 0.1);
     // A stop ramps down from there, whatever the command's reference says.
     for (int k = 0; k < 500; k++) {
         step(COMMAND_STOP, 600.0);
         expected -= 0.01;
-        ASSERT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, expected, 1e-4);
+        ASSERT_NEAR(diagnostics.speed_reference_q22 / fixed_point::Q22, expected, 1e-4);
     }
 }
 
@@ -284,7 +284,7 @@ TEST_F(Control, a_stop_opens_the_switches_when_the_rotor_stands) {
         periods++;
     }
     EXPECT_EQ(state.machine.state, DRIVE_STATE_READY);
-    EXPECT_LE(std::fabs(diagnostics.speed_q22 / twins::Q22), 0.5);
+    EXPECT_LE(std::fabs(diagnostics.speed_q22 / fixed_point::Q22), 0.5);
 }
 
 TEST_F(Control, the_traditional_controller_and_the_paper_s_without_its_pid_switch_whole_periods_only) {
@@ -319,10 +319,10 @@ TEST_F(Control, the_paper_s_controller_drives_its_regulated_phase_with_the_pid_s
         ASSERT_TRUE(step(COMMAND_RUN, 1.0));
         const unsigned phase = state.duty.regulated;
         ASSERT_LT(phase, 3u);
-        const double duty = state.duty.pid.duty_q23 / twins::Q23;
-        ASSERT_NEAR(diagnostics.duty_q15 / twins::Q15, duty, 0.51 / twins::Q15);
+        const double duty = state.duty.pid.duty_q23 / fixed_point::Q23;
+        ASSERT_NEAR(diagnostics.duty_q15 / fixed_point::Q15, duty, 0.51 / fixed_point::Q15);
         const double voltage = (double(compare.upper[phase]) + compare.lower[phase]) / parameters.period_ticks - 1.0;
-        ASSERT_NEAR(voltage, duty, 0.51 / parameters.period_ticks + 0.51 / twins::Q15) << k;
+        ASSERT_NEAR(voltage, duty, 0.51 / parameters.period_ticks + 0.51 / fixed_point::Q15) << k;
         partial += compare.upper[phase] > 0 && compare.upper[phase] < parameters.period_ticks;
         // The current follows the voltage, 8 A a period at most; the rotor is held.
         uint16_t &counts = sample.adc.phase_current_counts[phase];
@@ -340,7 +340,7 @@ TEST_F(Control, overspeed_opens_every_switch) {
         periods++;
     }
     EXPECT_EQ(state.machine.record.fault, FAULT_OVER_SPEED);
-    EXPECT_NEAR(speed_rad_s, twins::rad_s(3600.0), 4.0);
+    EXPECT_NEAR(speed_rad_s, fixed_point::rad_s(3600.0), 4.0);
 }
 
 TEST_F(Control, voltage_is_saturated_while_a_phase_is_fully_on_and_never_outside_run) {
@@ -399,9 +399,10 @@ TEST_F(SalientControl, takes_negative_references_and_the_others_take_them_as_non
             ASSERT_TRUE(step(COMMAND_RUN, -600.0));
         }
         const bool salient = controller == DRIVE_CONTROLLER_SALIENT;
-        EXPECT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, salient ? -twins::rad_s(600.0) : 0.0, 1e-5);
+        EXPECT_NEAR(diagnostics.speed_reference_q22 / fixed_point::Q22, salient ? -fixed_point::rad_s(600.0) : 0.0,
+                    1e-5);
         if (salient) {
-            EXPECT_LT(diagnostics.torque_reference_q24 / twins::Q24, -10.0);
+            EXPECT_LT(diagnostics.torque_reference_q24 / fixed_point::Q24, -10.0);
         } else {
             EXPECT_EQ(diagnostics.torque_reference_q24, 0);
         }
@@ -416,14 +417,14 @@ TEST_F(SalientControl, brakes_and_reverses_a_turning_rotor_with_a_torque_referen
             step(COMMAND_OFF);
         }
         // It starts from the present speed, either way.
-        parameters.speed_ramp_q22 = twins::to_fixed(0.05, twins::Q22);
+        parameters.speed_ramp_q22 = fixed_point::to_fixed(0.05, fixed_point::Q22);
         step(COMMAND_RUN, -side * 300.0);
-        EXPECT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, side * 30.0, 0.2);
+        EXPECT_NEAR(diagnostics.speed_reference_q22 / fixed_point::Q22, side * 30.0, 0.2);
         for (int k = 0; k < 2000; k++) {
             ASSERT_TRUE(step(COMMAND_RUN, -side * 300.0));
         }
-        EXPECT_NEAR(diagnostics.speed_reference_q22 / twins::Q22, -side * twins::rad_s(300.0), 1e-5);
-        EXPECT_LT(side * diagnostics.torque_reference_q24 / twins::Q24, -19.0);
+        EXPECT_NEAR(diagnostics.speed_reference_q22 / fixed_point::Q22, -side * fixed_point::rad_s(300.0), 1e-5);
+        EXPECT_LT(side * diagnostics.torque_reference_q24 / fixed_point::Q24, -19.0);
     }
 }
 
@@ -435,7 +436,7 @@ TEST_F(SalientControl, two_pulses_are_its_own_and_may_be_one) {
             ASSERT_TRUE(step(COMMAND_RUN, 1.0));
             for (unsigned phase = 0; phase < 3; phase++) {
                 const int upper = compare.upper[phase], lower = compare.lower[phase];
-                const double duty = state.predictive.duty_q15[phase] / twins::Q15;
+                const double duty = state.predictive.duty_q15[phase] / fixed_point::Q15;
                 ASSERT_NEAR((upper + lower) / double(parameters.period_ticks) - 1.0, duty,
                             1.0 / parameters.period_ticks);
                 if (pulses == 2) {
@@ -459,8 +460,8 @@ TEST_F(SalientControl, the_load_torque_of_the_sliding_mode_is_the_transducer_s_w
                 for (int k = 0; k < 100; k++) {
                     ASSERT_TRUE(step(COMMAND_RUN, 0.0));
                 }
-                EXPECT_NEAR(diagnostics.torque_reference_q24 / twins::Q24, load_Nm, 0.05) << bits << " bits";
-                EXPECT_NEAR(diagnostics.load_torque_q24 / twins::Q24, 0.0, 0.1) << "the observer's is another";
+                EXPECT_NEAR(diagnostics.torque_reference_q24 / fixed_point::Q24, load_Nm, 0.05) << bits << " bits";
+                EXPECT_NEAR(diagnostics.load_torque_q24 / fixed_point::Q24, 0.0, 0.1) << "the observer's is another";
             }
         }
     }
@@ -471,7 +472,7 @@ TEST_F(SalientControl, the_load_torque_of_the_sliding_mode_is_the_transducer_s_w
     for (int k = 0; k < 100; k++) {
         step(COMMAND_RUN, 0.0);
     }
-    EXPECT_NEAR(diagnostics.torque_reference_q24 / twins::Q24, -5.0, 0.05);
+    EXPECT_NEAR(diagnostics.torque_reference_q24 / fixed_point::Q24, -5.0, 0.05);
     // Without the parameter the code is not looked at.
     configure(DRIVE_CONTROLLER_SALIENT);
     sample.adc.load_torque_counts = 4095;
@@ -479,7 +480,7 @@ TEST_F(SalientControl, the_load_torque_of_the_sliding_mode_is_the_transducer_s_w
     for (int k = 0; k < 100; k++) {
         step(COMMAND_RUN, 0.0);
     }
-    EXPECT_NEAR(diagnostics.torque_reference_q24 / twins::Q24, 0.0, 0.1);
+    EXPECT_NEAR(diagnostics.torque_reference_q24 / fixed_point::Q24, 0.0, 0.1);
 }
 
 TEST_F(SalientControl, an_edge_s_angle_is_the_boundary_and_the_way_since_at_the_observer_s_speed) {
@@ -490,7 +491,7 @@ TEST_F(SalientControl, an_edge_s_angle_is_the_boundary_and_the_way_since_at_the_
             for (int k = 0; k < 4000; k++) {
                 step(COMMAND_OFF);
             }
-            const double known_rad_s = state.observer.speed_q22 / twins::Q22;
+            const double known_rad_s = state.observer.speed_q22 / fixed_point::Q22;
             EXPECT_NEAR(known_rad_s, speed, 0.05);
             sample.encoder.edge_known = true;
             sample.encoder.edge_forward = speed > 0.0;
@@ -498,9 +499,9 @@ TEST_F(SalientControl, an_edge_s_angle_is_the_boundary_and_the_way_since_at_the_
             step(COMMAND_OFF);
             const double boundary = sample.encoder.counts + (speed > 0.0 ? 0.0 : 1.0);
             const double turns_now =
-                std::ldexp(boundary, -int(ENCODER_BITS)) + known_rad_s * age_ticks * 5e-9 / (2.0 * twins::PI);
-            double difference = diagnostics.angle - (turns_now - std::floor(turns_now)) * twins::TURN;
-            difference -= std::round(difference / twins::TURN) * twins::TURN;
+                std::ldexp(boundary, -int(ENCODER_BITS)) + known_rad_s * age_ticks * 5e-9 / (2.0 * fixed_point::PI);
+            double difference = diagnostics.angle - (turns_now - std::floor(turns_now)) * fixed_point::REV;
+            difference -= std::round(difference / fixed_point::REV) * fixed_point::REV;
             EXPECT_NEAR(difference, 0.0, 2.0 + 1e-6 * std::fabs(speed) * age_ticks) << speed << ", " << age_ticks;
         }
     }

@@ -42,7 +42,7 @@ wide_t halves_up(wide_t value, unsigned shift) {
     return sum % one < 0 ? quotient - 1 : quotient;
 }
 
-TEST(FixedArithmetic, saturate_keeps_what_fits_and_holds_at_the_ends) {
+TEST(FixedArithmetic, saturate_keeps_what_fits_and_clips_the_rest) {
     for (const int32_t value : CORNERS) {
         EXPECT_EQ(fixed_saturate(value), value);
     }
@@ -52,7 +52,7 @@ TEST(FixedArithmetic, saturate_keeps_what_fits_and_holds_at_the_ends) {
     EXPECT_EQ(fixed_saturate(INT64_MIN), INT32_MIN);
 }
 
-TEST(FixedArithmetic, clamp_holds_at_both_limits) {
+TEST(FixedArithmetic, clamp_limits_at_both_ends) {
     EXPECT_EQ(fixed_clamp(6, -5, 5), 5);
     EXPECT_EQ(fixed_clamp(5, -5, 5), 5);
     EXPECT_EQ(fixed_clamp(-5, -5, 5), -5);
@@ -72,7 +72,7 @@ TEST(FixedArithmetic, sum_difference_and_magnitude_saturate) {
     }
 }
 
-TEST(FixedArithmetic, products_are_whole_wrap_in_a_sum_and_are_rounded_in_the_high_word) {
+TEST(FixedArithmetic, products_are_exact_accumulation_wraps_and_the_high_word_is_rounded) {
     const std::vector<int32_t> values = samples(7, 300);
     for (const int32_t a : values) {
         for (const int32_t b : values) {
@@ -86,28 +86,28 @@ TEST(FixedArithmetic, products_are_whole_wrap_in_a_sum_and_are_rounded_in_the_hi
     }
 }
 
-TEST(FixedArithmetic, narrow_rounds_down_what_fits_and_holds_the_rest_within_the_last_bits_of_the_end) {
-    const auto expect = [](int64_t value, unsigned shift, int32_t narrowed) {
+TEST(FixedArithmetic, shift_saturate_rounds_down_what_fits_and_saturates_the_rest_to_within_its_last_bits) {
+    const auto expect = [](int64_t value, unsigned shift, int32_t result) {
         const wide_t exact = (wide_t(value) - (value < 0 ? (wide_t(1) << shift) - 1 : 0)) / (wide_t(1) << shift);
         if (saturated(exact) == exact) {
-            ASSERT_EQ(narrowed, exact) << value << " >> " << shift;
+            ASSERT_EQ(result, exact) << value << " >> " << shift;
         } else {
-            ASSERT_LE(std::abs(double(narrowed) - double(saturated(exact))), std::ldexp(1.0, int(32 - shift)));
+            ASSERT_LE(std::abs(double(result) - double(saturated(exact))), std::ldexp(1.0, int(32 - shift)));
         }
     };
     const std::vector<int32_t> values = samples(8, 300);
     for (const int32_t a : values) {
         for (const int32_t b : values) {
             const int64_t value = int64_t(a) * b;
-            expect(value, 1, fixed_narrow(value, 1));
-            expect(value, 4, fixed_narrow(value, 4));
-            expect(value, 14, fixed_narrow(value, 14));
-            expect(value, 28, fixed_narrow(value, 28));
-            expect(value, 31, fixed_narrow(value, 31));
+            expect(value, 1, fixed_shift_saturate(value, 1));
+            expect(value, 4, fixed_shift_saturate(value, 4));
+            expect(value, 14, fixed_shift_saturate(value, 14));
+            expect(value, 28, fixed_shift_saturate(value, 28));
+            expect(value, 31, fixed_shift_saturate(value, 31));
         }
     }
-    EXPECT_GT(fixed_narrow(INT64_MAX, 28), INT32_MAX - 16);
-    EXPECT_LT(fixed_narrow(INT64_MIN, 28), INT32_MIN + 16);
+    EXPECT_GT(fixed_shift_saturate(INT64_MAX, 28), INT32_MAX - 16);
+    EXPECT_LT(fixed_shift_saturate(INT64_MIN, 28), INT32_MIN + 16);
 }
 
 TEST(FixedArithmetic, shift_rounds_halves_towards_plus_infinity) {
@@ -120,7 +120,7 @@ TEST(FixedArithmetic, shift_rounds_halves_towards_plus_infinity) {
     EXPECT_EQ(fixed_shift(-7, 2), -2);
 }
 
-TEST(FixedArithmetic, shift_is_right_to_the_ends_of_its_range) {
+TEST(FixedArithmetic, shift_is_exact_to_the_ends_of_its_range) {
     std::mt19937_64 random(2);
     for (unsigned shift = 1; shift <= 62; shift++) {
         const int64_t end = INT64_MAX - (int64_t(1) << (shift - 1));
@@ -129,8 +129,8 @@ TEST(FixedArithmetic, shift_is_right_to_the_ends_of_its_range) {
         }
         for (int i = 0; i < 2000; i++) {
             const int64_t value = int64_t(random()) >> (1 + random() % 60);
-            const int64_t held = value > end ? end : value;
-            ASSERT_TRUE(fixed_shift(held, shift) == halves_up(held, shift)) << held << " >> " << shift;
+            const int64_t clipped = value > end ? end : value;
+            ASSERT_TRUE(fixed_shift(clipped, shift) == halves_up(clipped, shift)) << clipped << " >> " << shift;
         }
     }
 }

@@ -1,4 +1,4 @@
-// Division of 64 bits against the compiler's.
+// 64-bit division against that of the compiler.
 #include <cstdint>
 #include <limits>
 #include <random>
@@ -11,12 +11,12 @@ extern "C" {
 
 namespace {
 
-constexpr int64_t LEAST = std::numeric_limits<int64_t>::min();
-constexpr int64_t GREATEST = std::numeric_limits<int64_t>::max();
+constexpr int64_t MINIMUM = std::numeric_limits<int64_t>::min();
+constexpr int64_t MAXIMUM = std::numeric_limits<int64_t>::max();
 
-TEST(Divide, is_that_of_c_at_the_ends_of_both_ranges) {
-    const int64_t numerators[] = {LEAST, LEAST + 1, -GREATEST / 2, -3, -2, -1, 0, 1, 2, 3, GREATEST / 2, GREATEST};
-    const int64_t denominators[] = {1, 2, 3, 10, int64_t{1} << 32, GREATEST - 1, GREATEST};
+TEST(Divide, equals_c_division_at_the_ends_of_both_ranges) {
+    const int64_t numerators[] = {MINIMUM, MINIMUM + 1, -MAXIMUM / 2, -3, -2, -1, 0, 1, 2, 3, MAXIMUM / 2, MAXIMUM};
+    const int64_t denominators[] = {1, 2, 3, 10, int64_t{1} << 32, MAXIMUM - 1, MAXIMUM};
     for (const int64_t numerator : numerators) {
         for (const int64_t denominator : denominators) {
             EXPECT_EQ(fixed_divide(numerator, denominator), numerator / denominator) << numerator << "/" << denominator;
@@ -24,7 +24,7 @@ TEST(Divide, is_that_of_c_at_the_ends_of_both_ranges) {
     }
 }
 
-TEST(Divide, is_that_of_c_for_numbers_of_every_length) {
+TEST(Divide, equals_c_division_for_numbers_of_every_length) {
     std::mt19937_64 random(1);
     for (int i = 0; i < 200000; ++i) {
         const auto numerator = static_cast<int64_t>(random()) >> (random() % 64);

@@ -20,7 +20,7 @@ void expect_nearest(const int16_t (&table)[2], uint32_t fraction, unsigned fract
     ASSERT_LE(value, std::max(table[0], table[1]));
 }
 
-TEST(Interpolate, is_the_nearest_between_the_widest_entries_for_every_fraction) {
+TEST(Interpolate, is_rounded_to_nearest_between_extreme_entries_for_every_fraction) {
     for (const auto &[low, high] : {std::pair{INT16_MIN, INT16_MAX}, {INT16_MAX, INT16_MIN}, {0, 1}, {-1, 0}, {5, 5}}) {
         const int16_t table[2] = {int16_t(low), int16_t(high)};
         for (uint32_t fraction = 0; fraction < 65536; fraction++) {
@@ -29,7 +29,7 @@ TEST(Interpolate, is_the_nearest_between_the_widest_entries_for_every_fraction) 
     }
 }
 
-TEST(Interpolate, is_the_nearest_for_random_entries_and_all_fraction_widths) {
+TEST(Interpolate, is_rounded_to_nearest_for_random_entries_and_all_fraction_widths) {
     std::mt19937 random(1);
     for (int i = 0; i < 200000; i++) {
         const int16_t table[2] = {int16_t(random()), int16_t(random())};
@@ -38,7 +38,7 @@ TEST(Interpolate, is_the_nearest_for_random_entries_and_all_fraction_widths) {
     }
 }
 
-TEST(Interpolate, meets_the_entries_at_fraction_zero) {
+TEST(Interpolate, equals_the_entry_at_fraction_zero) {
     const int16_t table[4] = {-32768, 12, 32767, -7};
     for (uint32_t index = 0; index < 3; index++) {
         EXPECT_EQ(interpolate_linear(table, index, 0, 7), table[index]);

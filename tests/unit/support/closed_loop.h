@@ -1,5 +1,5 @@
-// A bench in one process: the emulated machine and its sensors, and a drive that is the firmware's control interrupt or
-// the double-precision twin. True torque and speed every microsecond, and the figures of a run.
+// Closed loop in one process: emulated machine, sensors and a drive, which is either the firmware's control interrupt
+// or the reference model. Records true torque and speed every microsecond and computes metrics from them.
 #ifndef TESTS_UNIT_CLOSED_LOOP_H
 #define TESTS_UNIT_CLOSED_LOOP_H
 
@@ -19,7 +19,6 @@ extern "C" {
 }
 
 #include "support/salient_reference.h"
-#include "support/reference_models.h"
 
 namespace closed_loop {
 
@@ -28,7 +27,7 @@ struct setup_t {
     unsigned encoder_bits = 17, adc_bits = 12; // 32 and 16: ideal
     bool edges = false;
     double rotor_deg = 0.0;
-    std::map<parameter_index_t, double> parameters; // those that differ, in their units
+    std::map<parameter_index_t, double> parameters; // other than default, in their units
     plant_gains_t plant{1.0, 1.0, 1.0, 1.0};
 
     control_parameters_t configured() const {
@@ -39,7 +38,7 @@ struct setup_t {
         parameters_set_default(&values, PARAMETER_FRICTION_NM_S, machine_tables.friction_q30);
         parameters_set_default(&values, PARAMETER_RESISTANCE_OHM, machine_tables.resistance_q24);
         for (const auto &[index, value] : parameters) {
-            values.values[index] = twins::to_fixed(value, std::ldexp(1.0, parameters_row(index)->fraction_bits));
+            values.values[index] = fixed_point::to_fixed(value, std::ldexp(1.0, parameters_row(index)->fraction_bits));
         }
         return configure_control(&values, &machine_tables, rate_hz, encoder_bits, adc_bits);
     }
@@ -59,18 +58,18 @@ struct fixed_drive_t {
     }
 };
 
-// The twin, with the timer's ticks.
-struct twin_drive_t {
-    twins::salient_t twin;
+// The reference model, with duties rounded to ticks of the PWM timer.
+struct reference_drive_t {
+    reference_model::salient_t model;
     unsigned phases;
     bool two_pulses;
     double period_ticks;
 
-    explicit twin_drive_t(const setup_t &setup) : twin_drive_t(setup, setup.configured()) {}
+    explicit reference_drive_t(const setup_t &setup) : reference_drive_t(setup, setup.configured()) {}
 
     bool step(const control_sample_t &sample, hal_pwm_compare_t *compare) {
         const bool run = sample.command.request == COMMAND_RUN;
-        const auto duties = twin.step(sample, run);
+        const auto duties = model.step(sample, run);
         *compare = hal_pwm_compare_t{};
         for (unsigned phase = 0; phase < phases && run; phase++) {
             const double duty = duties[phase];
@@ -87,12 +86,12 @@ struct twin_drive_t {
     }
 
   private:
-    twin_drive_t(const setup_t &setup, const control_parameters_t &p)
-        : twin(p, machine_plant, setup.rate_hz), phases(machine_plant.phases), two_pulses(p.two_pulses),
+    reference_drive_t(const setup_t &setup, const control_parameters_t &p)
+        : model(p, machine_plant, setup.rate_hz), phases(machine_plant.phases), two_pulses(p.two_pulses),
           period_ticks(p.period_ticks) {}
 };
 
-// Truth from a microsecond on.
+// Ground truth, one value per microsecond from first_us on.
 struct trace_t {
     uint64_t first_us = 0;
     std::vector<double> torque_Nm, speed_rad_s;
@@ -110,14 +109,14 @@ struct trace_t {
         return sum / double(index(to_s) - index(from_s));
     }
 
-    // (largest - least) / mean.
+    // (maximum - minimum) / mean.
     double ripple(double from_s, double to_s) const {
-        const auto [least, largest] =
+        const auto [minimum, maximum] =
             std::minmax_element(torque_Nm.begin() + long(index(from_s)), torque_Nm.begin() + long(index(to_s)));
-        return (*largest - *least) / mean_torque_Nm(from_s, to_s);
+        return (*maximum - *minimum) / mean_torque_Nm(from_s, to_s);
     }
 
-    // Last time beyond +-0.5 % of a speed, from from_s on; 0 when never.
+    // Time from from_s to the last sample outside +-0.5 % of a speed; 0 when all are inside.
     double last_exit_s(double speed, double from_s, double to_s) const {
         for (size_t i = index(to_s); i > index(from_s); i--) {
             if (std::fabs(speed_rad_s[i - 1] - speed) > 0.005 * std::fabs(speed)) {
@@ -127,10 +126,10 @@ struct trace_t {
         return 0.0;
     }
 
-    double least_speed(double from_s, double to_s) const {
+    double min_speed(double from_s, double to_s) const {
         return *std::min_element(speed_rad_s.begin() + long(index(from_s)), speed_rad_s.begin() + long(index(to_s)));
     }
-    double largest_speed(double from_s, double to_s) const {
+    double max_speed(double from_s, double to_s) const {
         return *std::max_element(speed_rad_s.begin() + long(index(from_s)), speed_rad_s.begin() + long(index(to_s)));
     }
 };
@@ -138,18 +137,18 @@ struct trace_t {
 template <typename drive_t> class Bench {
   public:
     explicit Bench(const setup_t &setup) : drive(setup), rate_hz(setup.rate_hz) {
-        plant_init(&plant, &machine_plant, setup.rotor_deg * twins::PI / 180.0);
+        plant_init(&plant, &machine_plant, setup.rotor_deg * fixed_point::PI / 180.0);
         plant_set_gains(&plant, &setup.plant);
         sensors_init(&sensors, &machine_plant.sensors, setup.encoder_bits, setup.adc_bits, 1);
         sensors.encoder_edges = setup.edges;
-        watch();
+        restart_trace();
     }
 
-    // Goes on apart from the original from here.
+    // Copies state and continues independently; the trace starts empty.
     Bench(const Bench &other)
         : plant(other.plant), sensors(other.sensors), drive(other.drive), reference_rpm(other.reference_rpm),
           running(other.running), rate_hz(other.rate_hz), buffered(other.buffered) {
-        watch();
+        restart_trace();
     }
     Bench &operator=(const Bench &) = delete;
 
@@ -164,9 +163,10 @@ template <typename drive_t> class Bench {
             sensors_sample_adc(&sensors, &plant, &sample.adc);
             sample.time_us = uint32_t(plant.time_ns / 1000);
             sample.command.time_us = sample.time_us;
-            // Behind the initialisation.
+            // After the initialisation.
             sample.command.request = plant.time_ns > 1100000 ? COMMAND_RUN : COMMAND_OFF;
-            sample.command.speed_reference_q22 = twins::to_fixed(twins::rad_s(reference_rpm), twins::Q22);
+            sample.command.speed_reference_q22 =
+                fixed_point::to_fixed(fixed_point::rad_s(reference_rpm), fixed_point::Q22);
             plant_set_switches(&plant, &buffered, ticks);
             running = drive.step(sample, &buffered);
             if (!running) {
@@ -176,8 +176,8 @@ template <typename drive_t> class Bench {
         }
     }
 
-    // Forgets what was seen.
-    void watch() {
+    // Discards the trace and records from now on.
+    void restart_trace() {
         trace = trace_t{};
         trace.first_us = (plant.time_ns + 999) / 1000;
         plant_observe(&plant, trace.first_us * 1000, 1000, observe, &trace);

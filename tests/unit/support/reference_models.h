@@ -1,48 +1,27 @@
-// Double-precision twins of the fixed-point laws, written from their equations: what the tests compare the firmware
-// with. A twin knows no formats, no rounding and no saturation but those that are part of the law.
-#ifndef TESTS_UNIT_TWINS_H
-#define TESTS_UNIT_TWINS_H
+// Reference models: the control laws in double precision, written from their equations, which the tests compare the
+// firmware with. A model has no formats, no rounding and no saturation other than those of the law itself.
+#ifndef TESTS_UNIT_REFERENCE_MODELS_H
+#define TESTS_UNIT_REFERENCE_MODELS_H
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdint>
 
-namespace twins {
+#include "support/fixed_point.h"
 
-constexpr double PI = 3.14159265358979323846;
-constexpr double TURN = 4294967296.0; // 2^-32 turn or pitch
-constexpr double Q9 = 512.0;
-constexpr double Q12 = 4096.0;
-constexpr double Q15 = 32768.0;
-constexpr double Q16 = 65536.0;
-constexpr double Q20 = 1048576.0;
-constexpr double Q22 = 4194304.0;
-constexpr double Q23 = 8388608.0;
-constexpr double Q24 = 16777216.0;
-constexpr double Q27 = 134217728.0;
-constexpr double Q28 = 268435456.0;
-constexpr double Q30 = 1073741824.0;
-constexpr double Q31 = 2147483648.0;
-constexpr double Q32 = 4294967296.0;
+namespace reference_model {
 
-// Nearest number of a format, saturated as int32_t.
-inline int32_t to_fixed(double value, double one) {
-    return int32_t(std::clamp(std::floor(value * one + 0.5), -2147483648.0, 2147483647.0));
-}
+using fixed_point::PI;
 
-inline double rad_s(double rpm) {
-    return rpm * 2.0 * PI / 60.0;
-}
-
-// H k x / |x| of the mended reaching law, rad/s^2 for rad/s.
+// H sgn(x) of the corrected reaching law, rad/s^2 for rad/s.
 inline double reaching_rad_s2(double gain_1_s, double epsilon, double delta_s, double x) {
     const double magnitude = std::fabs(x);
     return gain_1_s * x / (epsilon * magnitude + ((1.0 - epsilon) * magnitude + 1.0) * std::exp(-delta_s * magnitude));
 }
 
-// H sgn(x) of the paper's (10) as printed.
-inline double printed_reaching_rad_s2(double x) {
+// H sgn(x) of the paper's (10) as published.
+inline double published_reaching_rad_s2(double x) {
     if (x == 0.0) {
         return 0.0;
     }
@@ -50,7 +29,7 @@ inline double printed_reaching_rad_s2(double x) {
     return std::copysign(1.0 / (0.5 + (0.5 + 1.0 / magnitude) * std::exp(magnitude)), x);
 }
 
-// Proportional and integral with the anti-windup of speed_pi.h.
+// PI with the anti-windup of speed_pi.h.
 struct pi_t {
     double kp, ki_step, low, high;
     double integral = 0.0;
@@ -58,33 +37,33 @@ struct pi_t {
     double step(double error) {
         const double sum = kp * error + integral;
         const double limited = std::clamp(sum, low, high);
-        const bool pushes_further = (sum > limited && error > 0.0) || (sum < limited && error < 0.0);
-        if (!pushes_further) {
+        const bool winds_up = (sum > limited && error > 0.0) || (sum < limited && error < 0.0);
+        if (!winds_up) {
             integral = std::clamp(integral + ki_step * error, low, high);
         }
         return limited;
     }
 };
 
-// Angle, speed and load torque from encoder and torque; angle in turns, unbounded.
+// Load observer; angle in revolutions, unbounded.
 struct observer_t {
-    double angle_gain, speed_gain, torque_gain; // per turn of innovation
+    double angle_gain, speed_gain, torque_gain; // per revolution of innovation
     double acceleration;                        // rad/s per N m
     double friction;                            // N m s
-    double angle_step;                          // turns per rad/s
+    double angle_step;                          // revolutions per rad/s
     double angle = 0.0, speed = 0.0, load_torque = 0.0;
-    double correction = 0.0; // of the speed, in the last step
+    double speed_correction = 0.0; // of the last step
 
-    // The same estimate with other gains.
-    void tune(const observer_t &gains) {
+    // Changes the gains and keeps the estimate.
+    void set_gains(const observer_t &gains) {
         angle_gain = gains.angle_gain;
         speed_gain = gains.speed_gain;
         torque_gain = gains.torque_gain;
     }
 
-    // Modulo a turn.
-    double innovation(double measured_turn) const {
-        const double difference = measured_turn - angle;
+    // Modulo a revolution.
+    double innovation(double measured_rev) const {
+        const double difference = measured_rev - angle;
         return difference - std::round(difference);
     }
 
@@ -101,48 +80,49 @@ struct observer_t {
         return observer;
     }
 
-    void step(double measured_turn, double torque) {
-        const double error = std::clamp(innovation(measured_turn), -1.0 / 32.0, 1.0 / 32.0);
+    void step(double measured_rev, double torque) {
+        const double error = std::clamp(innovation(measured_rev), -1.0 / 32.0, 1.0 / 32.0);
         angle += angle_gain * error;
-        correction = speed_gain * error;
-        const double corrected = speed + correction;
+        speed_correction = speed_gain * error;
+        const double corrected = speed + speed_correction;
         load_torque = std::clamp(load_torque - torque_gain * error, -64.0, 64.0);
         speed = corrected + acceleration * (torque - friction * corrected - load_torque);
         angle += angle_step * 0.5 * (corrected + speed);
     }
 };
 
-// Schedule of the observer's bandwidth: 3.5 / t since the last waking, between the steady one and the widest. Angles in
-// turns. The thresholds are the drive's.
+// Bandwidth schedule of the load observer: 3.5 / t since the last trigger, between steady and transient bandwidth.
+// Angles in revolutions. The thresholds are those of the firmware.
 struct bandwidth_t {
-    double steady_rad_s, first_count_rad_s, first_edge_rad_s, rate_hz;
+    double steady_rad_s, count_trigger_rad_s, edge_trigger_rad_s, rate_hz;
     double threshold_count, threshold_edge;
-    double pause_s, kept;         // least pause; what a period leaves of a longer one
-    double bandwidth_rad_s = 0.0; // 0 before the first step, which is awake
-    double since_s = 0.0, pauses = 0.0, usual = 0.0;
-    unsigned wakings = 0;
+    double holdoff_s, holdoff_decay; // minimum hold-off; decay factor of its extension per period
+    double bandwidth_rad_s = 0.0;    // 0 before the first step, which is transient
+    double since_s = 0.0, holdoff_extension = 0.0, mean_innovation = 0.0;
+    unsigned triggers = 0;
 
     bool steady() const { return bandwidth_rad_s <= steady_rad_s; }
 
     double step(double innovation, bool from_edge) {
-        const double widest_rad_s = first_edge_rad_s;
+        const double transient_rad_s = edge_trigger_rad_s;
         since_s += 1.0 / rate_hz;
         if (bandwidth_rad_s == 0.0) {
-            start_rad_s = widest_rad_s;
+            start_rad_s = transient_rad_s;
         }
         bandwidth_rad_s = std::max(std::min(start_rad_s, 3.5 / since_s), steady_rad_s);
-        const double threshold = std::max(4.0 * usual, from_edge ? threshold_edge : threshold_count);
-        const double size = std::fabs(innovation);
+        const double threshold = std::max(4.0 * mean_innovation, from_edge ? threshold_edge : threshold_count);
+        const double magnitude = std::fabs(innovation);
         if (steady()) {
-            usual += 40.0 / rate_hz * (std::min(size, threshold) - usual);
+            mean_innovation += 40.0 / rate_hz * (std::min(magnitude, threshold) - mean_innovation);
         }
-        pauses *= kept;
-        if (size > threshold && since_s >= pause_s * (1.0 + pauses)) {
-            pauses = std::min(pauses + (steady() ? pauses : pauses / 4.0) + 0.25, 255.0);
-            start_rad_s = from_edge ? first_edge_rad_s : first_count_rad_s;
+        holdoff_extension *= holdoff_decay;
+        if (magnitude > threshold && since_s >= holdoff_s * (1.0 + holdoff_extension)) {
+            holdoff_extension =
+                std::min(holdoff_extension + (steady() ? holdoff_extension : holdoff_extension / 4.0) + 0.25, 255.0);
+            start_rad_s = from_edge ? edge_trigger_rad_s : count_trigger_rad_s;
             since_s = 0.0;
             bandwidth_rad_s = start_rad_s;
-            wakings++;
+            triggers++;
         }
         return bandwidth_rad_s;
     }
@@ -151,9 +131,9 @@ struct bandwidth_t {
     double start_rad_s = 0.0;
 };
 
-// Share of the torque over the angle in pitches, from 0.5 unaligned to 1 aligned.
-struct share_t {
-    double turn_on, stroke, overlap; // pitches; overlap 0: one phase at a time
+// Torque sharing function over the angle in electrical revolutions, from 0.5 unaligned to 1 aligned.
+struct torque_sharing_t {
+    double turn_on, stroke, overlap; // electrical rev; overlap 0: one phase at a time
 
     static double cubic(double x) { return x * x * (3.0 - 2.0 * x); }
 
@@ -169,98 +149,100 @@ struct share_t {
     }
 };
 
-// One sample of one phase's flux linkage; what R i takes in a period is `drop`.
+// One sample of the flux observer of a phase; `drop` is R i Ts.
 inline double flux_step(double flux, double gain, double table, double applied, double drop) {
     return std::max(flux + gain * (table - flux) + applied - drop, 0.0);
 }
 
-// Flux linkages that give a torque at the end of the coming period. A machine_t says what its phases do, angles in
-// pitches from 0.5 (unaligned) to 1: torque(angle, A), flux(angle, A), current_of_torque(angle, N m) and
-// current_of_flux(angle, Wb).
+// Predictive torque control. machine_t models a phase, angles in electrical revolutions from 0.5 (unaligned) to 1:
+// torque(angle, A), flux(angle, A), current_of_torque(angle, N m) and current_of_flux(angle, Wb).
 template <typename machine_t> struct predictive_t {
-    static constexpr unsigned MAX = 4;
+    static constexpr unsigned PHASES_MAX = 4;
     const machine_t *machine;
     unsigned phases;
     double period_s, resistance_ohm, flux_gain, current_limit_A, reserve_Nm;
-    share_t late, early; // windows without and with full advance
+    torque_sharing_t base_window, advanced_window; // without and with full advance
     bool sharing = true;
-    std::array<double, MAX> flux{}, duty{};
-    double advance = 0.0, missing = 0.0;
+    std::array<double, PHASES_MAX> flux{}, duty{};
+    double advance = 0.0, torque_shortfall = 0.0;
 
     struct sample_t {
-        std::array<double, MAX> current_A, table_Wb, angle; // angle two periods ahead, in pitches, any
+        std::array<double, PHASES_MAX> current_A, table_Wb, angle; // angle two periods ahead, electrical rev, unbounded
         double bus_V, torque_Nm;
-        bool backwards;
-        double turn = 0.0; // of a period, pitch
+        bool reverse;
+        double angle_step = 0.0; // magnitude per period, electrical rev
     };
 
     void step(const sample_t &sample) {
-        const double reach = sample.bus_V * period_s;
-        const double asked = sample.torque_Nm;
-        const double opposed = std::max(reserve_Nm - std::fabs(asked), 0.0);
-        move_windows(asked);
-        std::array<double, MAX> drop{};
+        const double flux_step_max = sample.bus_V * period_s;
+        const double reference = sample.torque_Nm;
+        const double opposed = std::max(reserve_Nm - std::fabs(reference), 0.0);
+        move_windows(reference);
+        std::array<double, PHASES_MAX> drop{};
         bool limited = false;
         for (unsigned phase = 0; phase < phases; phase++) {
             plan_t &p = plan[phase];
             drop[phase] = resistance_ohm * period_s * sample.current_A[phase];
-            flux[phase] = flux_step(flux[phase], flux_gain, sample.table_Wb[phase], duty[phase] * reach, drop[phase]);
-            p.lowest = std::max(flux[phase] - drop[phase] - reach, 0.0);
-            p.highest = std::max(flux[phase] - drop[phase] + reach, 0.0);
+            flux[phase] =
+                flux_step(flux[phase], flux_gain, sample.table_Wb[phase], duty[phase] * flux_step_max, drop[phase]);
+            p.flux_min = std::max(flux[phase] - drop[phase] - flux_step_max, 0.0);
+            p.flux_max = std::max(flux[phase] - drop[phase] + flux_step_max, 0.0);
             const double angle = sample.angle[phase] - std::floor(sample.angle[phase]);
             p.positive = angle >= 0.5;
             p.angle = p.positive ? angle : 1.0 - angle;
-            if (p.positive == sample.backwards && sample.turn > 0.0) {
-                p.highest = std::max(std::min(p.highest, reach * (p.angle - 0.5) / sample.turn), p.lowest);
+            if (p.positive == sample.reverse && sample.angle_step > 0.0) {
+                p.flux_max =
+                    std::max(std::min(p.flux_max, flux_step_max * (p.angle - 0.5) / sample.angle_step), p.flux_min);
             }
-            const share_t share = p.positive != sample.backwards ? window() : late;
+            const torque_sharing_t share = p.positive != sample.reverse ? window() : base_window;
             p.since_on = p.angle - share.turn_on;
-            const double side = p.positive ? asked : -asked;
-            limited |= aim(p, (std::max(side, 0.0) + opposed) * share.at(p.angle));
+            const double side = p.positive ? reference : -reference;
+            limited |= plan_torque(p, (std::max(side, 0.0) + opposed) * share.at(p.angle));
         }
-        missing = 0.0;
+        torque_shortfall = 0.0;
         if (limited) {
-            const bool positive = asked >= 0.0;
-            missing = asked;
+            const bool positive = reference >= 0.0;
+            torque_shortfall = reference;
             for (unsigned phase = 0; phase < phases; phase++) {
-                missing -= plan[phase].positive ? plan[phase].torque : -plan[phase].torque;
+                torque_shortfall -= plan[phase].positive ? plan[phase].torque : -plan[phase].torque;
             }
-            hand_over(positive, sample.backwards, true);
-            hand_over(!positive, sample.backwards, false);
+            redistribute_torque(positive, sample.reverse, true);
+            redistribute_torque(!positive, sample.reverse, false);
         }
         for (unsigned phase = 0; phase < phases; phase++) {
-            const double highest = sample.current_A[phase] > current_limit_A ? 0.0 : 1.0;
-            const double wanted = (plan[phase].flux - flux[phase] + drop[phase]) / reach;
-            duty[phase] = plan[phase].flux > 0.0 ? std::clamp(wanted, -1.0, highest) : -1.0;
+            const double duty_max = sample.current_A[phase] > current_limit_A ? 0.0 : 1.0;
+            const double unclamped = (plan[phase].flux - flux[phase] + drop[phase]) / flux_step_max;
+            duty[phase] = plan[phase].flux > 0.0 ? std::clamp(unclamped, -1.0, duty_max) : -1.0;
         }
     }
 
   private:
     struct plan_t {
-        double angle, since_on, torque, flux, lowest, highest;
+        double angle, since_on, torque, flux, flux_min, flux_max;
         bool positive;
     };
-    std::array<plan_t, MAX> plan{};
+    std::array<plan_t, PHASES_MAX> plan{};
 
-    share_t window() const {
-        const double turn_on = late.turn_on + advance * (early.turn_on - late.turn_on);
-        return {turn_on, late.stroke, sharing ? late.overlap + advance * (early.overlap - late.overlap) : 0.0};
+    torque_sharing_t window() const {
+        const double turn_on = base_window.turn_on + advance * (advanced_window.turn_on - base_window.turn_on);
+        return {turn_on, base_window.stroke,
+                sharing ? base_window.overlap + advance * (advanced_window.overlap - base_window.overlap) : 0.0};
     }
 
-    // Torque that stays missing: 0.05 N m and a 64th of what is asked for.
-    void move_windows(double asked) {
-        const bool runs_out = std::fabs(missing) > 0.05 + std::fabs(asked) / 64.0;
-        advance = std::clamp(advance + (runs_out ? 10.0 : -1.0) * period_s, 0.0, 1.0);
+    // Shortfall that advances the windows: above 0.05 N m and 1/64 of the reference.
+    void move_windows(double reference) {
+        const bool voltage_limited = std::fabs(torque_shortfall) > 0.05 + std::fabs(reference) / 64.0;
+        advance = std::clamp(advance + (voltage_limited ? 10.0 : -1.0) * period_s, 0.0, 1.0);
     }
 
-    bool aim(plan_t &p, double torque) const {
+    bool plan_torque(plan_t &p, double torque) const {
         torque = std::max(torque, 0.0);
         double current = torque > 0.0 ? machine->current_of_torque(p.angle, torque) : 0.0;
         bool limited = current > current_limit_A;
         current = std::min(current, current_limit_A);
-        const double wanted = current > 0.0 ? machine->flux(p.angle, current) : 0.0;
-        p.flux = std::clamp(wanted, p.lowest, p.highest);
-        if (p.flux != wanted) {
+        const double target = current > 0.0 ? machine->flux(p.angle, current) : 0.0;
+        p.flux = std::clamp(target, p.flux_min, p.flux_max);
+        if (p.flux != target) {
             limited = true;
             current = machine->current_of_flux(p.angle, p.flux);
         }
@@ -268,62 +250,63 @@ template <typename machine_t> struct predictive_t {
         return limited;
     }
 
-    // The half of the reference may take more or less, the other one only lets go.
-    void hand_over(bool positive, bool backwards, bool may_take) {
-        std::array<unsigned, MAX> order{};
+    // The half of the reference takes shortfall and excess, the other one only excess.
+    void redistribute_torque(bool positive, bool reverse, bool may_increase) {
+        std::array<unsigned, PHASES_MAX> order{};
         unsigned count = 0;
         for (unsigned phase = 0; phase < phases; phase++) {
             if (plan[phase].positive == positive && plan[phase].since_on >= 0.0) {
                 order[count++] = phase;
             }
         }
-        const bool more = (missing > 0.0) == positive;
-        if (more && !may_take) {
+        const bool increase = (torque_shortfall > 0.0) == positive;
+        if (increase && !may_increase) {
             return;
         }
-        const bool incoming_is_least = positive != backwards;
+        const bool incoming_is_least = positive != reverse;
         std::sort(order.begin(), order.begin() + count, [&](unsigned a, unsigned b) {
             const bool less = plan[a].since_on < plan[b].since_on;
-            return less == (incoming_is_least == more);
+            return less == (incoming_is_least == increase);
         });
-        for (unsigned n = 0; n < count && missing != 0.0; n++) {
+        for (unsigned n = 0; n < count && torque_shortfall != 0.0; n++) {
             plan_t &p = plan[order[n]];
             const double before = p.torque;
-            aim(p, before + (positive ? missing : -missing));
-            missing -= positive ? p.torque - before : before - p.torque;
+            plan_torque(p, before + (positive ? torque_shortfall : -torque_shortfall));
+            torque_shortfall -= positive ? p.torque - before : before - p.torque;
         }
     }
 };
 
-// Misalignment of each phase from the load that the observer sees and the tables' slope; one phase a period.
+// Misalignment of each phase from the disturbance that the load observer sees and the slope of the tables; one phase
+// per period.
 struct misalignment_t {
-    static constexpr unsigned MAX = 4;
+    static constexpr unsigned PHASES_MAX = 4;
     unsigned phases;
     double rate_1_s, filter_1_s, rate_hz;
     double settle_s = 0.15, mean_1_s = 10.0;
-    std::array<double, MAX> offset_rad{};
+    std::array<double, PHASES_MAX> offset_rad{};
 
-    // disturbance: load with what the speed's correction adds, N m. slope: dT / dtheta of the phase whose turn it is.
+    // disturbance: load torque less J / Ts times the speed correction, N m. slope(phase): dT / dtheta, N m / rad.
     template <typename slope_t> void step(double disturbance, bool steady, double torque, const slope_t &slope) {
-        const double turn_s = phases / rate_hz;
+        const double update_s = phases / rate_hz;
         const bool settled = steady_ticks >= std::floor(settle_s * rate_hz);
         steady_ticks = !steady || std::fabs(torque) <= 1.0 ? 0.0 : settled ? steady_ticks : steady_ticks + 1.0;
-        const bool learns = steady_ticks > 0.0 && settled;
-        const double share = std::max(mean_1_s * turn_s, 1.0 / (std::floor(steady_ticks / phases) + 1.0));
-        const unsigned phase = turn;
-        turn = (turn + 1) % phases;
+        const bool learning = steady_ticks > 0.0 && settled;
+        const double mean_gain = std::max(mean_1_s * update_s, 1.0 / (std::floor(steady_ticks / phases) + 1.0));
+        const unsigned phase = phase_index;
+        phase_index = (phase_index + 1) % phases;
         sum += disturbance;
         const double mean = (sum - last_sum[phase]) / phases;
         last_sum[phase] = sum;
-        first[phase] += filter_1_s * turn_s * (slope(phase) - first[phase]);
-        second[phase] += filter_1_s * turn_s * (first[phase] - second[phase]);
-        slope_mean[phase] += share * (second[phase] - slope_mean[phase]);
-        const double alternating = second[phase] - slope_mean[phase];
-        power += share / phases * (alternating * alternating * phases - power);
-        disturbance_mean += share / phases * (disturbance - disturbance_mean);
-        if (learns) {
+        slope_lag1[phase] += filter_1_s * update_s * (slope(phase) - slope_lag1[phase]);
+        slope_lag2[phase] += filter_1_s * update_s * (slope_lag1[phase] - slope_lag2[phase]);
+        slope_mean[phase] += mean_gain * (slope_lag2[phase] - slope_mean[phase]);
+        const double alternating = slope_lag2[phase] - slope_mean[phase];
+        power += mean_gain / phases * (alternating * alternating * phases - power);
+        disturbance_mean += mean_gain / phases * (disturbance - disturbance_mean);
+        if (learning) {
             offset_rad[phase] +=
-                rate_1_s * turn_s * (mean - disturbance_mean) * alternating / (power + 0.05 * torque * torque);
+                rate_1_s * update_s * (mean - disturbance_mean) * alternating / (power + 0.05 * torque * torque);
             offset_rad[phase] = std::clamp(offset_rad[phase], -0.0175, 0.0175);
         }
     }
@@ -331,19 +314,19 @@ struct misalignment_t {
     double steady_ticks = 0.0;
 
   private:
-    std::array<double, MAX> first{}, second{}, slope_mean{}, last_sum{};
+    std::array<double, PHASES_MAX> slope_lag1{}, slope_lag2{}, slope_mean{}, last_sum{};
     double sum = 0.0, power = 0.0, disturbance_mean = 0.0;
-    unsigned turn = 0;
+    unsigned phase_index = 0;
 };
 
-// (16) to (27), misprints mended.
+// BP network, (16) to (27) of the paper with errata corrected.
 struct network_t {
     static constexpr unsigned INPUTS = 3, HIDDEN = 6, OUTPUTS = 3;
     using inputs_t = std::array<double, INPUTS>;
     using outputs_t = std::array<double, OUTPUTS>;
 
-    std::array<std::array<double, INPUTS>, HIDDEN> hidden_weight{}, hidden_change{};
-    std::array<std::array<double, HIDDEN>, OUTPUTS> output_weight{}, output_change{};
+    std::array<std::array<double, INPUTS>, HIDDEN> hidden_weight{}, hidden_increment{};
+    std::array<std::array<double, HIDDEN>, OUTPUTS> output_weight{}, output_increment{};
     inputs_t input{};
     std::array<double, HIDDEN> hidden{};
     outputs_t output{};
@@ -382,24 +365,24 @@ struct network_t {
             }
             const double delta = back * 0.5 * (1.0 - hidden[i] * hidden[i]);
             for (unsigned j = 0; j < INPUTS; j++) {
-                move(hidden_weight[i][j], hidden_change[i][j], eta * delta * input[j], alpha);
+                update(hidden_weight[i][j], hidden_increment[i][j], eta * delta * input[j], alpha);
             }
         }
         for (unsigned l = 0; l < OUTPUTS; l++) {
             for (unsigned i = 0; i < HIDDEN; i++) {
-                move(output_weight[l][i], output_change[l][i], eta * output_delta[l] * hidden[i], alpha);
+                update(output_weight[l][i], output_increment[l][i], eta * output_delta[l] * hidden[i], alpha);
             }
         }
     }
 
   private:
-    void move(double &weight, double &change, double gradient, double alpha) const {
-        change = gradient + alpha * change;
-        weight = std::clamp(weight + change, -weight_limit, weight_limit);
+    void update(double &weight, double &increment, double gradient, double alpha) const {
+        increment = gradient + alpha * increment;
+        weight = std::clamp(weight + increment, -weight_limit, weight_limit);
     }
 };
 
-// Incremental PID with the network's gains, as bp_pid.h. `scaled_limit` is the largest scaled error.
+// Incremental PID with the gains of the network, bp_pid.h. `scaled_limit`: largest scaled error.
 struct bp_pid_t {
     enum mode_t { FIXED = 1, FROZEN = 2, LEARNING = 3 };
     mode_t mode;
@@ -413,9 +396,9 @@ struct bp_pid_t {
     bool learned = false;
 
     double step(double torque_error) {
-        const auto limited = [this](double value) { return std::clamp(value, -scaled_limit, scaled_limit); };
-        const double e = limited(torque_error * error_scale_inverse);
-        const network_t::outputs_t term = {limited(e - error), e, limited(e - 2.0 * error + previous)};
+        const auto clamped = [this](double value) { return std::clamp(value, -scaled_limit, scaled_limit); };
+        const double e = clamped(torque_error * error_scale_inverse);
+        const network_t::outputs_t term = {clamped(e - error), e, clamped(e - 2.0 * error + previous)};
         if (mode != FIXED) {
             network.forward({e, term[0], term[2]});
         }
@@ -435,23 +418,23 @@ struct bp_pid_t {
     }
 };
 
-// The reference with what a BP-PID adds for the error of two samples ago.
+// Torque trim: the reference plus the output of a BP-PID for the error of the torque due now.
 struct trim_t {
     bp_pid_t pid;
     double limit_Nm;
     std::array<double, 2> reference_Nm{};
     double trim_Nm = 0.0;
 
-    double step(double reference, double torque, bool hold) {
+    double step(double reference, double torque, bool voltage_limited) {
         const double due = reference_Nm[1];
         reference_Nm = {reference, reference_Nm[0]};
-        if (!hold) {
+        if (!voltage_limited) {
             trim_Nm = limit_Nm * pid.step(due - torque);
         }
         return reference + trim_Nm;
     }
 };
 
-} // namespace twins
+} // namespace reference_model
 
 #endif

@@ -35,11 +35,11 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
             f"    .inertia_q30 = {quantise(machine.inertia_kg_m2, 30, 32)},",
             f"    .friction_q30 = {quantise(machine.friction_Nm_s, 30, 32)},",
             f"    .resistance_q24 = {quantise(machine.resistance_ohm, 24, 32)},",
-            f"    .current_rise_A_s = {quantise(machine.current_rise_A_s, 0, 32)},",
+            f"    .current_slew_rate_A_s = {quantise(machine.current_rise_A_s, 0, 32)},",
             "    .row = {",
             *(f"        {{{start}u, {reciprocal}u}}," for start, reciprocal in tables.rows()),
             "    },",
-            f"    .cell_row = {{{_listed(tables.cell_row())}}},",
+            f"    .angle_bin_row = {{{_listed(tables.cell_row())}}},",
             *_format_lines("torque_format", tables.torque_per_ampere),
             *_format_lines("flux_format", tables.flux_per_ampere),
             "    .column = {",
@@ -54,7 +54,7 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
 def _format_lines(name: str, surface: Surface) -> list[str]:
     return [
         f"    .{name} = {{",
-        f"        .bend_shift = {surface.bend_shift},",
+        f"        .curvature_shift = {surface.bend_shift},",
         f"        .result_shift = {surface.result_shift},",
         "    },",
     ]
@@ -66,8 +66,8 @@ def _column_lines(tables: PhaseMap, column: int) -> list[str]:
         "        {",
         f"            .torque_node = {{{_listed(torque.node[:, column] - NODE_OFFSET)}}},",
         f"            .flux_node = {{{_listed(flux.node[:, column] - NODE_OFFSET)}}},",
-        f"            .torque_bend = {{{_listed(torque.bend[:, column])}}},",
-        f"            .flux_bend = {{{_listed(flux.bend[:, column])}}},",
+        f"            .torque_curvature = {{{_listed(torque.bend[:, column])}}},",
+        f"            .flux_curvature = {{{_listed(flux.bend[:, column])}}},",
         "        },",
     ]
 

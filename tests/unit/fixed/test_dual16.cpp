@@ -1,4 +1,4 @@
-// Two products of 16 bits at once, against 64 bits.
+// Dual 16-bit multiply-accumulate against 64-bit arithmetic.
 #include <algorithm>
 #include <cstdint>
 #include <random>
@@ -6,12 +6,12 @@
 #include <gtest/gtest.h>
 
 extern "C" {
-#include "fixed/pair.h"
+#include "fixed/dual16.h"
 }
 
 namespace {
 
-TEST(FixedPair, is_the_sum_of_both_products_wherever_that_fits) {
+TEST(Dual16, is_exact_wherever_the_sum_fits) {
     std::mt19937 random(1);
     const auto any = [&] {
         const int16_t ends[] = {INT16_MIN, INT16_MIN + 1, -1, 0, 1, INT16_MAX};
@@ -20,7 +20,7 @@ TEST(FixedPair, is_the_sum_of_both_products_wherever_that_fits) {
     int compared = 0;
     for (int i = 0; i < 1000000; i++) {
         const int16_t value[3] = {any(), any(), any()};
-        const int16_t *two = &value[random() % 2]; // aligned to a word or not
+        const int16_t *two = &value[random() % 2]; // aligned to 32 bits or not
         const int16_t first = any(), second = any();
         const int32_t sum = random() % 4 == 0 ? 0 : int32_t(uint32_t(random()));
         const int64_t exact = sum + int64_t(two[0]) * first + int64_t(two[1]) * second;
@@ -29,7 +29,7 @@ TEST(FixedPair, is_the_sum_of_both_products_wherever_that_fits) {
             sum + int64_t(two[0]) * first > INT32_MAX) {
             continue;
         }
-        ASSERT_EQ(fixed_pair_multiply_add(two, fixed_pair(first, second), sum), exact);
+        ASSERT_EQ(dual16_multiply_add(two, dual16_pack(first, second), sum), exact);
         compared++;
     }
     EXPECT_GT(compared, 300000);

@@ -1,0 +1,115 @@
+// Reference models with the parameters of the firmware, after their rounding.
+#ifndef TESTS_UNIT_REFERENCE_BUILDERS_H
+#define TESTS_UNIT_REFERENCE_BUILDERS_H
+
+extern "C" {
+#include "control/bp_pid.h"
+#include "control/load_observer.h"
+#include "control/misalignment.h"
+#include "control/observer_bandwidth.h"
+#include "control/predictive_torque.h"
+#include "control/speed_pi.h"
+#include "control/torque_sharing.h"
+#include "control/torque_trim.h"
+}
+
+#include "support/reference_models.h"
+
+namespace reference_model {
+
+inline pi_t model_of(const speed_pi_parameters_t &p) {
+    using namespace fixed_point;
+    return {.kp = p.kp_q16 / Q16,
+            .ki_step = p.ki_step_q32 / Q32,
+            .low = p.torque_min_q24 / Q24,
+            .high = p.torque_max_q24 / Q24};
+}
+
+// J l3, N m Q7.24 per 2^-32 rev.
+inline double load_gain(const load_observer_gains_t &gains) {
+    return -gains.load_gain_q28 / fixed_point::Q28 * gains.load_factor_q4 / 16.0;
+}
+
+inline observer_t model_of(const load_observer_gains_t &gains, const load_observer_model_t &model) {
+    using namespace fixed_point;
+    observer_t observer{};
+    observer.angle_gain = gains.angle_gain_q28 / Q28;
+    observer.speed_gain = gains.speed_gain_q24 / Q24 * REV / Q22;
+    observer.torque_gain = load_gain(gains) * REV / Q24;
+    observer.acceleration = model.acceleration_q32 / Q32 * Q24 / Q22;
+    observer.friction = model.friction_q30 / Q30;
+    observer.angle_step = model.angle_step_q32 / Q32 * Q22 / REV;
+    return observer;
+}
+
+inline bandwidth_t model_of(const observer_bandwidth_parameters_t &p, double rate_hz) {
+    bandwidth_t bandwidth{};
+    bandwidth.steady_rad_s = p.bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES - 1];
+    bandwidth.count_trigger_rad_s = p.bandwidth_rad_s[p.trigger_stage_count];
+    bandwidth.edge_trigger_rad_s = p.bandwidth_rad_s[0];
+    bandwidth.rate_hz = rate_hz;
+    bandwidth.threshold_count = p.threshold_count / fixed_point::REV;
+    bandwidth.threshold_edge = p.threshold_edge / fixed_point::REV;
+    bandwidth.holdoff_s = p.retrigger_holdoff_ticks / rate_hz;
+    bandwidth.holdoff_decay = p.holdoff_decay_q32 / fixed_point::Q32;
+    return bandwidth;
+}
+
+inline misalignment_t model_of(const misalignment_parameters_t &p, unsigned phases, double rate_hz) {
+    const double update_rate_hz = rate_hz / phases;
+    misalignment_t misalignment{};
+    misalignment.phases = phases;
+    misalignment.rate_hz = rate_hz;
+    misalignment.rate_1_s = p.rate_q30 / fixed_point::Q30 * update_rate_hz;
+    misalignment.filter_1_s = p.filter_q16 / fixed_point::Q16 * update_rate_hz;
+    misalignment.mean_1_s = p.mean_q16 / fixed_point::Q16 * update_rate_hz;
+    misalignment.settle_s = p.settle_ticks / rate_hz;
+    return misalignment;
+}
+
+inline torque_sharing_t model_of(const torque_sharing_parameters_t &p, double advance) {
+    using fixed_point::REV;
+    const double on = p.turn_on / REV - advance * p.turn_on_advance / REV;
+    const double off = p.turn_off / REV - advance * p.turn_off_advance / REV;
+    const double stroke = p.stroke / REV;
+    return {.turn_on = on, .stroke = stroke, .overlap = p.overlapping ? off - on - stroke : 0.0};
+}
+
+template <typename machine_t>
+predictive_t<machine_t> model_of(const predictive_torque_parameters_t &p, const machine_t *machine, unsigned phases) {
+    using namespace fixed_point;
+    predictive_t<machine_t> model{};
+    model.machine = machine;
+    model.phases = phases;
+    model.period_s = p.period_q40 / Q40;
+    model.resistance_ohm = p.flux.resistance_period_q40 / Q40 / model.period_s;
+    model.flux_gain = p.flux.gain_q15 / Q15;
+    model.current_limit_A = p.current_limit_q9 / Q9;
+    model.reserve_Nm = p.reserve_q24 / Q24;
+    model.sharing = p.sharing.overlapping;
+    model.base_window = model_of(p.sharing, 0.0);
+    model.advanced_window = model_of(p.sharing, 1.0);
+    return model;
+}
+
+inline bp_pid_t model_of(const bp_pid_parameters_t &p) {
+    using namespace fixed_point;
+    bp_pid_t model{};
+    model.mode = bp_pid_t::mode_t(p.mode);
+    model.error_scale_inverse = p.error_scale_inverse_q24 / Q24;
+    model.scale = {p.scale_q28[0] / Q28, p.scale_q28[1] / Q28, p.scale_q28[2] / Q28};
+    model.eta = p.network.learning_rate_q15 / Q15;
+    model.alpha = p.network.momentum_q32 / Q32;
+    return model;
+}
+
+inline trim_t model_of(const torque_trim_parameters_t &p) {
+    trim_t model{};
+    model.pid = model_of(p.pid);
+    model.limit_Nm = p.limit_q24 / fixed_point::Q24;
+    return model;
+}
+
+} // namespace reference_model
+
+#endif
