@@ -44,7 +44,7 @@ void drive_control_interrupt(drive_t *drive) {
     hal_encoder_read(drive->hal, &sample->encoder);
     hal_adc_read(drive->hal, &sample->adc);
     hal_pwm_compare_t compare;
-    if (control_step(&drive->control_parameters, &drive->control, sample, &compare)) {
+    if (control_step(&drive->control_parameters, &drive->control, sample, &drive->command, &compare)) {
         hal_pwm_write(drive->hal, &compare);
     } else {
         hal_pwm_open_all(drive->hal);
@@ -73,7 +73,7 @@ static int32_t misalignment(const drive_t *drive) {
 
 static telemetry_snapshot_t snapshot(const drive_t *drive, uint32_t time_us) {
     const control_diagnostics_t d = control_diagnose(&drive->control_parameters, &drive->control);
-    const state_machine_t *machine = &drive->control.machine;
+    const state_machine_t *machine = &drive->control.state_machine;
     telemetry_snapshot_t s = {
         .time_us = time_us,
         .state = (uint8_t)machine->state,
@@ -110,11 +110,11 @@ static telemetry_snapshot_t snapshot(const drive_t *drive, uint32_t time_us) {
 /* Forgets a command whose sender fell silent long ago: the clock wraps, and then its age would look small again. Twice
  * the timeout, so that the interrupt has seen the timeout before. */
 static void forget_stale_command(drive_t *drive, uint32_t time_us) {
-    const uint32_t age_us = time_us - drive->sample.command.time_us;
-    if (drive->sample.command.request != COMMAND_OFF &&
+    const uint32_t age_us = time_us - drive->command.time_us;
+    if (drive->command.request != COMMAND_OFF &&
         age_us > 2u * drive->control_parameters.protection.command_timeout_us) {
         hal_critical_enter(drive->hal);
-        drive->sample.command.request = COMMAND_OFF;
+        drive->command.request = COMMAND_OFF;
         hal_critical_leave(drive->hal);
     }
 }
@@ -128,10 +128,10 @@ void drive_background(drive_t *drive) {
         comms_telemetry(&drive->comms, drive->hal, &s);
     }
     /* Enumerations are read in one access: the interrupt may change the state, not tear it. */
-    const bool writable = drive->control.machine.state != DRIVE_STATE_RUN;
+    const bool writable = drive->control.state_machine.state != DRIVE_STATE_RUN;
     if (comms_background(&drive->comms, drive->hal, &drive->parameters, writable, time_us)) {
         hal_critical_enter(drive->hal);
-        drive->sample.command = drive->comms.command;
+        drive->command = drive->comms.command;
         hal_critical_leave(drive->hal);
     }
     forget_stale_command(drive, time_us);

@@ -14,10 +14,10 @@
 /* One drive. The caller allocates it; only the functions below touch it. */
 typedef struct {
     hal_t *hal;
-    /* Of the interrupt; read by the background with the interrupt kept out. Its command is written by the background,
-     * the interrupt kept out as well. */
+    /* Of the interrupt; read by the background with the interrupt kept out. */
     control_sample_t sample;
     /* Written by the background with the interrupt kept out. */
+    command_t command; /* the last accepted one */
     control_parameters_t control_parameters;
     /* Of the interrupt; the background prepares its laws for new parameters, the interrupt kept out. */
     control_state_t control;

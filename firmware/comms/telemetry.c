@@ -99,7 +99,7 @@ static hal_can_frame_t fault_cause_frame(const fault_record_t *fault) {
     drive_drive_fault_cause_set_time_us(&message, fault->time_us);
     drive_drive_fault_cause_set_fault(&message, fault->fault);
     drive_drive_fault_cause_set_state(&message, fault->state);
-    drive_drive_fault_cause_set_checks(&message, fault->checks);
+    drive_drive_fault_cause_set_checks(&message, (uint16_t)fault->fault_mask);
     hal_can_frame_t frame = frame_of(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID, DRIVE_DRIVE_FAULT_CAUSE_LENGTH);
     drive_drive_fault_cause_pack(frame.data, &message, sizeof frame.data);
     return frame;
@@ -108,7 +108,7 @@ static hal_can_frame_t fault_cause_frame(const fault_record_t *fault) {
 static hal_can_frame_t fault_snapshot_frame(const fault_record_t *fault) {
     struct drive_drive_fault_snapshot_t message = {0};
     drive_drive_fault_snapshot_set_speed_rpm(&message, units_quarter_rpm(units_milli_rpm(fault->speed_q22)));
-    drive_drive_fault_snapshot_set_bus_voltage_v(&message, fault->bus_voltage_q6);
+    drive_drive_fault_snapshot_set_bus_voltage_v(&message, fault->dc_link_voltage_q6);
     drive_drive_fault_snapshot_set_current_max_a(&message, fault->current_max_q9);
     drive_drive_fault_snapshot_set_torque_reference_nm(&message, units_torque_q8(fault->torque_reference_q24));
     hal_can_frame_t frame = frame_of(DRIVE_DRIVE_FAULT_SNAPSHOT_FRAME_ID, DRIVE_DRIVE_FAULT_SNAPSHOT_LENGTH);

@@ -3,12 +3,43 @@
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
-/* The BP-PID's gains are set for this rate; a period twice as long moves the torque twice as far for the same duty. */
+/* Reference rate of the BP-PID gains: the torque change per period scales with the period. */
 #define GAIN_RATE_HZ 40000
 
 bool configure_rate_allowed(uint32_t control_rate_hz) {
     return control_rate_hz == 20000 || control_rate_hz == 40000 || control_rate_hz == 50000 ||
            control_rate_hz == 100000 || control_rate_hz == 1000000;
+}
+
+/* Laws and features of a controller. */
+typedef struct {
+    speed_law_t speed_law;
+    torque_law_t torque_law;
+    bool four_quadrant;         /* false: motors forwards only */
+    bool schedules_bandwidth;   /* of the observer; false: fixed bandwidth */
+    bool may_interleave_pulses; /* by the parameter `pulses_per_period` */
+} controller_t;
+
+/* The only place that distinguishes the controllers. */
+static controller_t controller_from(const int32_t *values) {
+    switch ((drive_controller_t)values[PARAMETER_CONTROLLER]) {
+    case DRIVE_CONTROLLER_SALIENT:
+        return (controller_t){
+            .speed_law = SPEED_LAW_SMC,
+            .torque_law = TORQUE_LAW_PREDICTIVE,
+            .four_quadrant = true,
+            .schedules_bandwidth = true,
+            .may_interleave_pulses = true,
+        };
+    case DRIVE_CONTROLLER_PAPER:
+        return (controller_t){
+            .speed_law = SPEED_LAW_SMC,
+            .torque_law = values[PARAMETER_BP_MODE] == BP_PID_OFF ? TORQUE_LAW_HYSTERESIS : TORQUE_LAW_DUTY,
+        };
+    case DRIVE_CONTROLLER_TRADITIONAL:
+    default:
+        return (controller_t){.speed_law = SPEED_LAW_PI, .torque_law = TORQUE_LAW_HYSTERESIS};
+    }
 }
 
 /* pi / 30: r/min to rad/s. */
@@ -19,19 +50,19 @@ static int64_t speed_q22_from_rpm(int32_t rpm) {
     return fixed_shift(rpm * PI_30_Q37, 15);
 }
 
-/* 2^-32 pitch from electrical degrees in Q7; 360 degrees is held just below the full pitch. */
-static uint32_t pitch_from_degrees(int32_t degrees_q7) {
+/* 2^-32 electrical revolution from electrical degrees in Q7; 360 degrees saturate just below one revolution. */
+static uint32_t angle_from_degrees(int32_t degrees_q7) {
     const int64_t angle = fixed_divide((int64_t)degrees_q7 << 32, 360 * 128);
     return angle > UINT32_MAX ? UINT32_MAX : (uint32_t)angle;
 }
 
-/* What a code is worth, Q18, of a full scale below 2^16: exact. */
-#define CODE_SCALE_Q18(full_scale, bits) ((int32_t)(((int64_t)(full_scale) << 18) >> (bits)))
+/* Value of one count in Q18 for a full scale below 2^16; exact. */
+#define COUNT_SCALE_Q18(full_scale, bits) ((int32_t)(((int64_t)(full_scale) << 18) >> (bits)))
 
-/* Octaves in a factor of e. */
+/* log2(e). */
 #define LOG2_E_Q30 1549082005
 
-/* A change per period in Q22 from a change per second; INT32_MAX for 0, no ramp. */
+/* Speed change per period, rad/s Q9.22, at least 1 LSB, from r/min per second; 0, no ramp, becomes INT32_MAX. */
 static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
     if (rpm_s == 0) {
         return INT32_MAX;
@@ -46,58 +77,56 @@ static int32_t pid_scale_q15(int32_t per_Nm_q15, int32_t error_scale_q24, uint32
     return fixed_clamp(fixed_saturate(fixed_divide(scaled_q15 * control_rate_hz, GAIN_RATE_HZ)), 0, 4 << 15);
 }
 
-/* Of drive and load together, N m: beyond the drive's highest torque limit. */
-#define SLOWING_TORQUE_NM 40
+/* Braking torque of drive and load together, N m: above the drive's largest torque limit. */
+#define BRAKING_TORQUE_MAX_NM 40
 
 static protection_parameters_t protection_from(const int32_t *values, int32_t angle_step_q32, unsigned encoder_shift,
                                                uint32_t control_rate_hz) {
     const int32_t over_speed_q22 = fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM]));
     const uint32_t count = 1u << encoder_shift;
-    /* A period at one and a half times the highest speed, and the rounding of two readings. */
+    /* One period at 1.5 times the speed limit, and the quantisation of two readings. */
     const uint64_t step = ((uint64_t)over_speed_q22 * (uint64_t)angle_step_q32 >> 32) * 3 / 2;
     return (protection_parameters_t){
         .current_trip_q9 = values[PARAMETER_CURRENT_TRIP_A],
-        .bus_over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V],
-        .bus_under_voltage_q6 = values[PARAMETER_BUS_UNDER_VOLTAGE_V],
+        .dc_link_over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V],
+        .dc_link_under_voltage_q6 = values[PARAMETER_BUS_UNDER_VOLTAGE_V],
         .over_speed_q22 = over_speed_q22,
         .angle_step_max = fixed_saturate((int64_t)step + 2 * (int64_t)count),
         /* A quarter of a degree, and four counts of a coarse encoder. */
-        .angle_unmoved_max = (int32_t)(((uint64_t)1 << 32) / 1440u + 4u * count),
+        .undetected_travel_max = (int32_t)(((uint64_t)1 << 32) / 1440u + 4u * count),
         .angle_step_q32 = angle_step_q32,
         .command_timeout_us = (uint32_t)values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u,
-        .slowing_q22 = fixed_saturate(fixed_divide(
-            fixed_divide((int64_t)SLOWING_TORQUE_NM << 52, values[PARAMETER_INERTIA_KG_M2]), control_rate_hz)),
+        .deceleration_max_q22 = fixed_saturate(fixed_divide(
+            fixed_divide((int64_t)BRAKING_TORQUE_MAX_NM << 52, values[PARAMETER_INERTIA_KG_M2]), control_rate_hz)),
     };
 }
 
-/* Hysteresis switches a phase on for whole periods, and off only two periods after its current passed the limit (one
- * until the new state acts, one until it is seen): the limit leaves room for that below the trip, and a tenth to spare.
- * The rise is the unaligned phase's; a saturated one comes close to it anywhere. */
+/* Hysteresis switches a phase on for whole periods, and off only two periods after its current exceeds the limit (one
+ * until the sample, one until the new state acts): the limit stays 2.2 periods of current rise below the trip. The rise
+ * is that of the unaligned position; a saturated phase comes close to it at any angle. */
 static int32_t hysteresis_limit_q9(const int32_t *values, int32_t current_slew_rate_A_s, uint32_t control_rate_hz) {
     const int64_t rise_q9 = fixed_divide((int64_t)current_slew_rate_A_s << 9, control_rate_hz);
     const int64_t limit_q9 = values[PARAMETER_CURRENT_TRIP_A] - fixed_divide(rise_q9 * 22, 10);
     return fixed_clamp(fixed_saturate(limit_q9), 0, values[PARAMETER_CURRENT_LIMIT_A]);
 }
 
-/* The schedule of the paper's observer is one bandwidth. */
-static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, uint32_t control_rate_hz,
-                                                      unsigned encoder_bits) {
-    const bool salient = values[PARAMETER_CONTROLLER] == DRIVE_CONTROLLER_SALIENT;
+static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, bool schedules_bandwidth,
+                                                      uint32_t control_rate_hz, unsigned encoder_bits) {
     const uint32_t steady_rad_s =
-        (uint32_t)values[salient ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S];
-    const bool adaptive = salient && values[PARAMETER_OBSERVER_WAKING] != 0;
+        (uint32_t)values[schedules_bandwidth ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S];
+    const bool adaptive = schedules_bandwidth && values[PARAMETER_OBSERVER_WAKING] != 0;
     const uint32_t transient_rad_s = adaptive ? (uint32_t)values[PARAMETER_OBSERVER_WAKE_RAD_S] : steady_rad_s;
     return observer_bandwidth_configure(transient_rad_s, steady_rad_s, encoder_bits, control_rate_hz,
                                         values[PARAMETER_INERTIA_KG_M2]);
 }
 
-/* A trim's gain is N m per N m: the PID's output +-1 is +-limit, its error 1 the error scale. */
+/* The gain of the torque trim is in N m per N m: the PID's output 1 is the limit, its error 1 the error scale. */
 static int32_t trim_scale_q15(const int32_t *values, parameter_index_t gain) {
     const int64_t scaled_q39 = (int64_t)values[gain] * values[PARAMETER_BP_ERROR_SCALE_NM];
     return fixed_clamp(fixed_saturate(fixed_divide(scaled_q39, values[PARAMETER_BP_TRIM_LIMIT_NM])), 0, 4 << 15);
 }
 
-/* What both PIDs have in common: network, error scale, seed. */
+/* Parameters of a BP-PID; network, error scale and seed are common to both of them. */
 static bp_pid_parameters_t bp_pid_from(const int32_t *values, parameter_index_t mode, int32_t kp_scale_q15,
                                        int32_t ki_scale_q15, int32_t kd_scale_q15) {
     return (bp_pid_parameters_t){
@@ -131,12 +160,12 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
                                                       uint32_t control_rate_hz) {
     const int64_t rate = control_rate_hz;
     const uint32_t stroke = commutation_stroke(phases);
-    const uint32_t turn_on = pitch_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
-    const uint32_t turn_off = pitch_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
-    const uint32_t on_early = pitch_from_degrees(values[PARAMETER_SHARE_ON_EARLY_DEG]);
-    const uint32_t off_early = pitch_from_degrees(values[PARAMETER_SHARE_OFF_EARLY_DEG]);
-    /* Windows with an overlap of at least 2 degrees, early or not, whatever was asked for. */
-    const uint32_t least = stroke + pitch_from_degrees(2 << 7);
+    const uint32_t turn_on = angle_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
+    const uint32_t turn_off = angle_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
+    const uint32_t on_early = angle_from_degrees(values[PARAMETER_SHARE_ON_EARLY_DEG]);
+    const uint32_t off_early = angle_from_degrees(values[PARAMETER_SHARE_OFF_EARLY_DEG]);
+    /* Windows overlap by at least 2 degrees, advanced or not; smaller settings are widened. */
+    const uint32_t least = stroke + angle_from_degrees(2 << 7);
     const uint32_t width = turn_off - turn_on > least ? turn_off - turn_on : least;
     const uint32_t narrowing = off_early > on_early ? off_early - on_early : 0;
     const torque_sharing_parameters_t share = {
@@ -172,22 +201,26 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     const int32_t torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM];
     const int32_t current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A];
     const unsigned encoder_shift = 32u - encoder_bits;
+    const controller_t controller = controller_from(values);
 
     control_parameters_t control = {
         .tables = tables,
         .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
+        .speed_law = controller.speed_law,
+        .torque_law = controller.torque_law,
+        .speed_reference_min_q22 = controller.four_quadrant ? INT32_MIN : 0,
+        .interleaved_pwm = controller.may_interleave_pulses && values[PARAMETER_PULSES_PER_PERIOD] == 2,
+        .load_from_transducer = values[PARAMETER_LOAD_SOURCE] != 0,
         .period_ticks = (uint16_t)(HAL_PWM_CLOCK_HZ / (2u * control_rate_hz)),
         .encoder_shift = (uint8_t)encoder_shift,
         .encoder_middle = (1u << encoder_shift) >> 1,
         .adc_bits = (uint8_t)adc_bits,
-        .current_scale_q18 = CODE_SCALE_Q18(HAL_ADC_CURRENT_FULL_SCALE_A << 9, adc_bits),
-        .voltage_scale_q18 = CODE_SCALE_Q18(HAL_ADC_BUS_FULL_SCALE_V << 6, adc_bits),
+        .current_scale_q18 = COUNT_SCALE_Q18(HAL_ADC_CURRENT_FULL_SCALE_A << 9, adc_bits),
+        .voltage_scale_q18 = COUNT_SCALE_Q18(HAL_ADC_BUS_FULL_SCALE_V << 6, adc_bits),
         .initialise_ticks = control_rate_hz / 1000u,
         .speed_ramp_q22 = ramp_q22(values[PARAMETER_SPEED_RAMP_RPM_S], control_rate_hz),
-        .two_pulses = values[PARAMETER_PULSES_PER_PERIOD] == 2,
-        .load_from_transducer = values[PARAMETER_LOAD_SOURCE] != 0,
         .observer = load_observer_model(control_rate_hz, inertia_q30, friction_q30),
-        .bandwidth = bandwidth_from(values, control_rate_hz, encoder_bits),
+        .bandwidth = bandwidth_from(values, controller.schedules_bandwidth, control_rate_hz, encoder_bits),
         .speed_pi =
             {
                 .kp_q16 = values[PARAMETER_SPEED_KP],
@@ -201,14 +234,14 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                 .epsilon_q31 = fixed_saturate((int64_t)values[PARAMETER_SMC_EPSILON] << 15),
                 .delta_q27 = fixed_multiply(values[PARAMETER_SMC_DELTA], LOG2_E_Q30, 19),
                 .friction_q30 = friction_q30,
-                .torque_min_q24 = -torque_max_q24,
+                .torque_min_q24 = controller.four_quadrant ? -torque_max_q24 : 0,
                 .torque_max_q24 = torque_max_q24,
             },
         .commutation = commutation_configure(
             &(commutation_angles_t){
-                .turn_on = pitch_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
-                .turn_off = pitch_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
-                .outgoing_off = pitch_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
+                .turn_on = angle_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
+                .turn_off = angle_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
+                .outgoing_off = angle_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
             },
             tables->phases, tables->rotor_poles),
         .hysteresis =
@@ -220,11 +253,12 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .duty =
             {
                 .pid = duty_pid_from(values, control_rate_hz),
-                .current_setpoints = pwm_ditc_setpoints(tables, pitch_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
-                /* Half of what would reach the current in one period at rest: rate / (2 * A/s), in Q24. */
+                .current_setpoints =
+                    pwm_ditc_setpoints(tables, angle_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
+                /* Half of the deadbeat gain at standstill: rate / (2 * A/s), in Q24. */
                 .incoming_gain_q24 =
                     fixed_saturate(fixed_divide((int64_t)control_rate_hz << 23, tables->current_slew_rate_A_s)),
-                /* At 40 kHz a sixteenth of the reference, and 1/16 N m: see pwm_ditc.h. */
+                /* 1/16 of the reference and 1/16 N m at 40 kHz: see pwm_ditc.h. */
                 .overshoot_margin_q32 = (int32_t)(((uint32_t)GAIN_RATE_HZ << 16) / control_rate_hz << 12),
                 .depleted_torque_q24 = (int32_t)fixed_divide((int64_t)control_rate_hz << 20, GAIN_RATE_HZ),
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],

@@ -1,8 +1,13 @@
-/* The control interrupt as one function of parameters, state and sample: a unit test, the host loop and an interrupt
- * handler call the same one.
+/* The control interrupt as one function of parameters, state, sample and command: unit tests, the host port and the
+ * interrupt handler of a target call the same function. control_step in control.c lists its steps:
  *
- *   counts -> currents, angle -> phase torques -> observer -> checks -> state machine -> speed law -> torque law ->
- *   compare
+ *   measure         counts -> currents, DC-link voltage, rotor angle, phase torques, flux linkages    measure.h
+ *   observe         rotor angle, speed and load torque                                                observe.h
+ *   protect         fault mask of the failed checks                                                   protection.h
+ *   supervise       drive state, fault record; every switch is open outside RUN                       supervise.h
+ *   speed control   speed reference -> torque reference                                               speed_control.h
+ *   torque control  torque reference -> duties                                                        torque_control.h
+ *   modulate        duties -> compare values                                                          modulator.h
  */
 #ifndef DRIVE_CONTROL_H
 #define DRIVE_CONTROL_H
@@ -11,13 +16,13 @@
 #include <stdint.h>
 
 #include "control/commutation.h"
-#include "control/pwm_ditc.h"
 #include "control/ditc_hysteresis.h"
 #include "control/load_observer.h"
 #include "control/machine_tables.h"
 #include "control/misalignment.h"
 #include "control/observer_bandwidth.h"
 #include "control/predictive_torque.h"
+#include "control/pwm_ditc.h"
 #include "control/speed_pi.h"
 #include "control/speed_smc.h"
 #include "control/torque_trim.h"
@@ -28,33 +33,43 @@
 #include "hal_encoder.h"
 #include "hal_pwm.h"
 
-/* Numbers are those of drive.dbc and of the parameter `controller`. */
-typedef enum {
-    DRIVE_CONTROLLER_TRADITIONAL, /* PI, hysteresis DITC */
-    DRIVE_CONTROLLER_PAPER,       /* sliding mode, BP-PID, DITC by duty */
-    DRIVE_CONTROLLER_SALIENT      /* sliding mode, torque sharing, predictive flux PWM with BP-PID trim */
-} drive_controller_t;
+/* Numbers are those of drive.dbc and of the parameter `controller`. What each consists of is in configure.c. */
+typedef enum { DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT } drive_controller_t;
 
-/* Read only in the interrupt; derived from the parameters by configure_control. */
+typedef enum {
+    SPEED_LAW_PI,
+    SPEED_LAW_SMC /* sliding mode */
+} speed_law_t;
+
+typedef enum {
+    TORQUE_LAW_HYSTERESIS, /* DITC by hysteresis */
+    TORQUE_LAW_DUTY,       /* DITC with the duty of a BP-PID */
+    TORQUE_LAW_PREDICTIVE  /* torque sharing, predictive flux control, BP-PID trim */
+} torque_law_t;
+
+/* Constant while the drive runs; derived from the user's parameters by configure_control. */
 typedef struct {
     const machine_tables_t *tables;
-    drive_controller_t controller;
-    bool two_pulses;           /* a period, of the salient controller */
-    bool load_from_transducer; /* the sliding mode takes the measured load torque, not the observer's */
+    drive_controller_t controller; /* for telemetry; the laws below are its parts */
+    speed_law_t speed_law;
+    torque_law_t torque_law;
+    int32_t speed_reference_min_q22; /* rad/s, Q9.22: 0 for a single-quadrant controller, else INT32_MIN */
+    bool interleaved_pwm;            /* two voltage pulses per period */
+    bool load_from_transducer;       /* load torque of the sliding mode: measured; false: of the observer */
     uint16_t period_ticks;
-    uint8_t encoder_shift;     /* counts to 2^-32 turn */
-    uint8_t adc_bits;          /* of a code, 12..16 */
-    uint32_t encoder_middle;   /* of a count, 2^-32 turn; 0 where a count is one */
-    int32_t current_scale_q18; /* a code in A, Q7.9: 10 of a 12-bit code */
-    int32_t voltage_scale_q18; /* a code in V, Q9.6 */
-    uint32_t initialise_ticks; /* periods in 1 ms */
-    int32_t speed_ramp_q22;    /* rad/s a period, Q9.22; INT32_MAX: no ramp */
+    uint8_t encoder_shift;     /* counts to 2^-32 rev */
+    uint8_t adc_bits;          /* resolution, 12..16 */
+    uint32_t encoder_middle;   /* half a count, 2^-32 rev; 0 at 32 bits */
+    int32_t current_scale_q18; /* A Q7.9 per count, in Q18: 10 at 12 bits */
+    int32_t voltage_scale_q18; /* V Q9.6 per count, in Q18 */
+    uint32_t initialise_ticks; /* control periods in 1 ms */
+    int32_t speed_ramp_q22;    /* rad/s per period, Q9.22; INT32_MAX: no ramp */
     load_observer_model_t observer;
     commutation_parameters_t commutation;
     protection_parameters_t protection;
     speed_pi_parameters_t speed_pi;
-    ditc_hysteresis_parameters_t hysteresis;
     speed_smc_parameters_t speed_smc;
+    ditc_hysteresis_parameters_t hysteresis;
     pwm_ditc_parameters_t duty;
     torque_trim_parameters_t trim;
     predictive_torque_parameters_t predictive;
@@ -62,48 +77,49 @@ typedef struct {
     observer_bandwidth_parameters_t bandwidth;
 } control_parameters_t;
 
-/* What the sensors of the last sample say, in the formats of the laws. */
-typedef struct {
-    uint32_t count_angle; /* where the encoder's count begins, 2^-32 turn */
-    uint32_t angle;       /* 2^-32 turn */
-    bool from_edge;       /* the angle is that of an edge and its time */
-    int32_t current_q9[HAL_PHASES_MAX];
-    int32_t current_max_q9;
-    int32_t bus_voltage_q6;
-    commutation_t commutation;
-    int32_t torque_q24[HAL_PHASES_MAX];
-    int32_t torque_sum_q24;
-    int32_t flux_q29[HAL_PHASES_MAX]; /* salient controller */
-} control_estimate_t;
-
-/* What every controller needs first: the nearer, the fewer instructions. */
-typedef struct {
-    load_observer_t observer;
-    control_estimate_t estimate;
-    observer_bandwidth_t bandwidth;
-    protection_t protection;
-    state_machine_t machine;
-    bool started;                 /* the first sample has set the observer's angle */
-    int32_t speed_reference_q22;  /* behind the ramp */
-    int32_t torque_reference_q24; /* 0 outside RUN */
-    speed_pi_t speed_pi;
-    ditc_hysteresis_t hysteresis;
-    misalignment_t misalignment;      /* of the machine: outlives a run */
-    int32_t duty_q15[HAL_PHASES_MAX]; /* of a law that gives duties, in RUN */
-    pwm_ditc_t duty;
-    torque_trim_t trim;
-    predictive_torque_t predictive;
-} control_state_t;
-
+/* Inputs of one control period as the HAL delivers them. */
 typedef struct {
     hal_adc_sample_t adc;
     hal_encoder_sample_t encoder;
-    uint32_t missed_interrupts; /* since the last call */
+    uint32_t missed_interrupts; /* since the previous period */
     uint32_t time_us;
-    command_t command; /* the last accepted one; request off before the first */
 } control_sample_t;
 
-/* For whoever watches: put together when somebody asks, which costs the interrupt nothing. */
+/* A sample in the formats of the control laws, and the torque and flux linkage that it implies. */
+typedef struct {
+    uint32_t encoder_angle;      /* start of the encoder count, 2^-32 rev */
+    uint32_t angle;              /* rotor, 2^-32 rev */
+    bool angle_from_edge;        /* extrapolated from the time of an encoder edge; false: middle of the count */
+    int32_t predicted_speed_q22; /* observer's prediction for this sample, rad/s, Q9.22 */
+    int32_t dc_link_voltage_q6;  /* V, Q9.6 */
+    commutation_t commutation;
+    int32_t current_max_q9;                   /* largest phase current, A, Q7.9 */
+    int32_t torque_sum_q24;                   /* machine torque, N m, Q7.24, saturated */
+    int32_t current_q9[HAL_PHASES_MAX];       /* A, Q7.9 */
+    int32_t torque_q24[HAL_PHASES_MAX];       /* N m, Q7.24 */
+    int32_t flux_linkage_q29[HAL_PHASES_MAX]; /* Wb, Q2.29, with predictive torque control only */
+} control_measurement_t;
+
+typedef struct {
+    bool started; /* the first sample has initialised observer and protection */
+    load_observer_t observer;
+    observer_bandwidth_t bandwidth;
+    protection_t protection;
+    state_machine_t state_machine;
+    int32_t speed_reference_q22;  /* after the ramp; 0 outside RUN */
+    int32_t torque_reference_q24; /* 0 outside RUN */
+    speed_pi_t speed_pi;
+    int32_t duty_q15[HAL_PHASES_MAX]; /* of the last period in RUN, -32768..32768 */
+    ditc_hysteresis_t hysteresis;
+    pwm_ditc_t duty;
+    torque_trim_t trim;
+    predictive_torque_t predictive;
+    misalignment_t misalignment; /* a property of the machine: survives the end of a run */
+    /* Last measurement, for telemetry: no step reads it here, each one receives the measurement as an argument. */
+    control_measurement_t measurement;
+} control_state_t;
+
+/* Telemetry values, computed on request in the background. */
 typedef struct {
     uint32_t angle; /* measured, 2^-32 turn */
     int32_t speed_q22;
@@ -121,23 +137,19 @@ typedef struct {
     uint16_t observer_bandwidth_rad_s;
 } control_diagnostics_t;
 
-/* INITIALISE, everything at rest, the laws prepared. */
+/* State INITIALISE, rotor at standstill, controllers reset. */
 void control_reset(const control_parameters_t *parameters, control_state_t *state);
 
-/* The laws start afresh at the next RUN: whenever parameters change, which they do outside of RUN. control_step does it
- * itself on leaving RUN. Apart from entering RUN, because a network takes as long to start as it does to learn. */
+/* Resets the controllers for the next run. Required after a change of parameters, which is possible outside RUN only;
+ * leaving RUN does it too. Not part of entering RUN because initialising a network takes as long as a learning step. */
 void control_prepare(const control_parameters_t *parameters, control_state_t *state);
 
-/* One control period. Returns false when every switch must be open: then *compare is all zero. [interrupt] */
+/* One control period. command: the last accepted one, COMMAND_OFF before the first. Returns false when every switch
+ * must be open; then *compare is all zero. [interrupt] */
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
-                  hal_pwm_compare_t *compare);
+                  const command_t *command, hal_pwm_compare_t *compare);
 
-/* True when the torque law gives duties, as the paper's does; else it is hysteresis, or the salient controller. */
-static inline bool control_gives_duties(const control_parameters_t *parameters) {
-    return parameters->controller == DRIVE_CONTROLLER_PAPER && parameters->duty.pid.mode != BP_PID_OFF;
-}
-
-/* What the last period saw and did, by a state that no interrupt changes meanwhile. [both] */
+/* Result of the last period; the interrupt must not change the state meanwhile. [both] */
 control_diagnostics_t control_diagnose(const control_parameters_t *parameters, const control_state_t *state);
 
 #endif

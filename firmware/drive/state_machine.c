@@ -1,74 +1,64 @@
 #include "drive/state_machine.h"
 
-void state_machine_reset(state_machine_t *machine) {
-    *machine = (state_machine_t){.state = DRIVE_STATE_INITIALISE};
+void state_machine_reset(state_machine_t *state_machine) {
+    *state_machine = (state_machine_t){.state = DRIVE_STATE_INITIALISE};
 }
 
-static fault_t first_fault(uint16_t checks) {
+static fault_t lowest_fault(uint64_t fault_mask) {
     fault_t fault = FAULT_NONE;
-    while (fault < FAULT_COUNT && (checks & FAULT_BIT(fault)) == 0) {
+    while (fault < FAULT_COUNT && (fault_mask & FAULT_BIT(fault)) == 0) {
         fault++;
     }
     return fault;
 }
 
-static bool latch(state_machine_t *machine, uint16_t checks) {
-    machine->record = (fault_record_t){
-        .fault = first_fault(checks),
-        .checks = checks,
-        .state = (uint8_t)machine->state,
+static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {
+    state_machine->record = (fault_record_t){
+        .fault = lowest_fault(fault_mask),
+        .fault_mask = fault_mask,
+        .state = (uint8_t)state_machine->state,
     };
-    machine->state = DRIVE_STATE_FAULT;
-    machine->released = false;
+    state_machine->state = DRIVE_STATE_FAULT;
+    state_machine->rearmed = false;
     return true;
 }
 
-/* A tick in which something may happen. */
-__attribute__((cold)) static bool decide(state_machine_t *machine, const state_machine_input_t *input,
-                                         uint32_t initialise_ticks) {
-    const uint16_t lasting = input->checks & (uint16_t)~FAULT_BIT(FAULT_COMMAND_TIMEOUT);
-    const bool clear = input->request == COMMAND_CLEAR_FAULT && machine->asked != COMMAND_CLEAR_FAULT;
-    machine->asked = input->request;
+bool state_machine_step(state_machine_t *state_machine, const state_machine_input_t *input, uint32_t initialise_ticks) {
+    const uint64_t all_but_timeout = input->fault_mask & ~FAULT_BIT(FAULT_COMMAND_TIMEOUT);
+    const bool request_changed = input->request != state_machine->last_request;
+    state_machine->last_request = input->request;
     if (input->request != COMMAND_RUN) {
-        machine->released = true;
+        state_machine->rearmed = true;
     }
-    switch (machine->state) {
+    switch (state_machine->state) {
     case DRIVE_STATE_INITIALISE:
-        machine->healthy_ticks = lasting == 0 ? machine->healthy_ticks + 1 : 0;
-        if (machine->healthy_ticks >= initialise_ticks) {
-            machine->state = DRIVE_STATE_READY;
+        state_machine->fault_free_ticks = all_but_timeout == 0 ? state_machine->fault_free_ticks + 1 : 0;
+        if (state_machine->fault_free_ticks >= initialise_ticks) {
+            state_machine->state = DRIVE_STATE_READY;
         }
         break;
     case DRIVE_STATE_READY:
-        if (lasting != 0) {
-            return latch(machine, lasting);
+        if (all_but_timeout != 0) {
+            return latch_fault(state_machine, all_but_timeout);
         }
-        if (input->request == COMMAND_RUN && input->checks == 0 && machine->released) {
-            machine->state = DRIVE_STATE_RUN;
+        if (input->request == COMMAND_RUN && input->fault_mask == 0 && state_machine->rearmed) {
+            state_machine->state = DRIVE_STATE_RUN;
         }
         break;
     case DRIVE_STATE_RUN:
-        if (input->checks != 0) {
-            return latch(machine, input->checks);
+        if (input->fault_mask != 0) {
+            return latch_fault(state_machine, input->fault_mask);
         }
-        if (input->request == COMMAND_OFF || (input->request == COMMAND_STOP && input->standing)) {
-            machine->state = DRIVE_STATE_READY;
+        if (input->request == COMMAND_OFF || (input->request == COMMAND_STOP && input->at_standstill)) {
+            state_machine->state = DRIVE_STATE_READY;
         }
         break;
     case DRIVE_STATE_FAULT:
-        if (clear && lasting == 0) {
-            machine->state = DRIVE_STATE_READY;
-            machine->record = (fault_record_t){.fault = FAULT_NONE};
+        if (input->request == COMMAND_CLEAR_FAULT && request_changed && all_but_timeout == 0) {
+            state_machine->state = DRIVE_STATE_READY;
+            state_machine->record = (fault_record_t){.fault = FAULT_NONE};
         }
         break;
     }
     return false;
-}
-
-bool state_machine_step(state_machine_t *machine, const state_machine_input_t *input, uint32_t initialise_ticks) {
-    if (machine->state == DRIVE_STATE_RUN && input->request == COMMAND_RUN && input->checks == 0) {
-        machine->asked = COMMAND_RUN; /* nearly every tick of a run */
-        return false;
-    }
-    return decide(machine, input, initialise_ticks);
 }

@@ -3,13 +3,15 @@
  *   INITIALISE --all checks passed for 1 ms--> READY <--run / off, stopped--> RUN
  *   READY, RUN --a check fails--> FAULT --clear_fault, cause gone--> READY
  *
- * A lost command is a fault only in RUN. A drive that came back from a fault runs again only after it was asked for
- * something else than run: whoever holds `run` through a fault must let go first. Likewise `clear_fault` acts in the
- * tick in which it is first asked: held, it does not clear what comes later or goes away later.
+ * A command timeout is a fault only in RUN. After a fault the drive runs again only once the run request has been
+ * withdrawn: a run request that persists through the fault does not restart it. Likewise `clear_fault` acts only in the
+ * tick in which the request changes to it: a request that persists clears neither a later fault nor one whose cause
+ * disappears later.
  *
- * Direction: the states know none. RUN goes through zero speed when the reference changes its sign. A stop stays in RUN
- * with a reference that ramps to zero, from either side, until the rotor stands: a controller that can brake brakes,
- * with one that cannot the rotor coasts, and with a load that keeps turning it the stop does not end; `off` does.
+ * The states are independent of the direction of rotation. RUN passes through zero speed when the reference changes its
+ * sign. A stop remains in RUN with a reference that ramps to zero, from either side, until the rotor is at standstill:
+ * a four-quadrant controller brakes, with a single-quadrant one the rotor coasts. Under a load that keeps the rotor
+ * turning the stop does not end; `off` does.
  */
 #ifndef DRIVE_STATE_MACHINE_H
 #define DRIVE_STATE_MACHINE_H
@@ -24,23 +26,23 @@ typedef enum { DRIVE_STATE_INITIALISE, DRIVE_STATE_READY, DRIVE_STATE_RUN, DRIVE
 
 typedef struct {
     drive_state_t state;
-    uint32_t healthy_ticks;  /* in INITIALISE, since a check last failed */
-    bool released;           /* run has been let go since the last fault */
-    command_request_t asked; /* in the last tick */
-    fault_record_t record;   /* fault FAULT_NONE outside FAULT */
+    uint32_t fault_free_ticks;      /* in INITIALISE, since the last failed check */
+    bool rearmed;                   /* the run request has been withdrawn since the last fault */
+    command_request_t last_request; /* of the previous tick */
+    fault_record_t record;          /* in FAULT; fault FAULT_NONE in every other state */
 } state_machine_t;
 
 typedef struct {
-    uint16_t checks; /* failed checks of this tick, FAULT_BIT */
+    uint64_t fault_mask; /* failed checks of this tick, FAULT_BIT */
     command_request_t request;
-    bool standing; /* slow enough, in either direction, for a stop to end */
+    bool at_standstill; /* the speed, in either direction, allows a stop to end */
 } state_machine_input_t;
 
-/* INITIALISE. */
-void state_machine_reset(state_machine_t *machine);
+/* State INITIALISE, no fault. */
+void state_machine_reset(state_machine_t *state_machine);
 
-/* One tick. Returns true in the tick that a fault is latched, when the caller completes machine->record: fault, checks
- * and state are set. initialise_ticks: periods of 1 ms. */
-bool state_machine_step(state_machine_t *machine, const state_machine_input_t *input, uint32_t initialise_ticks);
+/* One tick. initialise_ticks: control periods in 1 ms. Returns true in the tick that latches a fault: fault, fault_mask
+ * and state of the record are set, the caller completes the others. */
+bool state_machine_step(state_machine_t *state_machine, const state_machine_input_t *input, uint32_t initialise_ticks);
 
 #endif

@@ -66,11 +66,11 @@ void control_prepare(const control_parameters_t *parameters, control_state_t *st
 }
 
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
-                  hal_pwm_compare_t *compare) {
-    (void)compare;
+                  const command_t *command, hal_pwm_compare_t *compare) {
+    (void)sample, (void)compare;
     interrupts++;
     torn_parameters += torn(parameters, sizeof *parameters);
-    torn_commands += torn(&sample->command, sizeof sample->command);
+    torn_commands += torn(command, sizeof *command);
     fill(state, sizeof(control_diagnostics_t), interrupts * 0x10001u);
     return false;
 }

@@ -102,7 +102,7 @@ class Drive : public testing::Test {
   protected:
     void SetUp() override {
         hal.adc.bus_voltage_counts = 240 * 8;
-        const drive_config_t config = {40000, DRIVE_CONTROLLER_PAPER};
+        const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
         ASSERT_TRUE(drive_init(&drive, &hal, &machine_tables, &config));
     }
 
@@ -150,7 +150,7 @@ TEST_F(Drive, refuses_a_rate_that_the_timer_cannot_make_and_starts_nothing) {
     for (const uint32_t rate_hz : {0u, 10000u, 39999u, 200000u}) {
         hal_t other;
         drive_t refused;
-        const drive_config_t config = {rate_hz, DRIVE_CONTROLLER_TRADITIONAL};
+        const drive_config_t config = {.control_rate_hz = rate_hz, .controller = DRIVE_CONTROLLER_TRADITIONAL};
         EXPECT_FALSE(drive_init(&refused, &other, &machine_tables, &config));
         EXPECT_TRUE(other.starts.empty());
         EXPECT_EQ(other.writes, 0u);
@@ -159,7 +159,7 @@ TEST_F(Drive, refuses_a_rate_that_the_timer_cannot_make_and_starts_nothing) {
 
 TEST_F(Drive, opens_the_switches_every_period_until_it_runs) {
     periods(100);
-    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
     EXPECT_EQ(hal.writes, 0u);
     EXPECT_GE(hal.opens, 100u);
 }
@@ -168,13 +168,13 @@ TEST_F(Drive, a_command_closes_switches_and_off_opens_them) {
     periods(100);
     command(COMMAND_RUN);
     periods(3);
-    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
     EXPECT_FALSE(hal.open);
     EXPECT_GT(hal.written.upper[0] + hal.written.upper[1] + hal.written.upper[2], 0);
     command(COMMAND_OFF);
     periods(3);
     EXPECT_TRUE(hal.open);
-    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
 }
 
 TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
@@ -184,7 +184,7 @@ TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
     ASSERT_FALSE(hal.open);
     periods(100000 / 25 + 2);
     EXPECT_TRUE(hal.open);
-    EXPECT_EQ(drive.control.machine.record.fault, FAULT_COMMAND_TIMEOUT);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_COMMAND_TIMEOUT);
 }
 
 TEST_F(Drive, lost_interrupts_reach_the_protection) {
@@ -194,7 +194,7 @@ TEST_F(Drive, lost_interrupts_reach_the_protection) {
     hal.missed = 3;
     periods(1);
     EXPECT_TRUE(hal.open);
-    EXPECT_EQ(drive.control.machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
 }
 
 TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {
@@ -215,8 +215,8 @@ TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {
     EXPECT_EQ(drive.late_interrupts, 4u);
     late(1);
     EXPECT_TRUE(hal.open);
-    EXPECT_EQ(drive.control.machine.record.fault, FAULT_INTERRUPT_OVERRUN);
-    EXPECT_EQ(drive.control.machine.record.checks, FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+    EXPECT_EQ(drive.control.state_machine.record.fault_mask, FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
     EXPECT_EQ(drive.late_interrupts, 5u);
 }
 
@@ -228,7 +228,7 @@ TEST_F(Drive, an_interrupt_that_loses_three_triggers_is_one_late_interrupt_and_a
     hal.time_us += 75;
     periods(1);
     EXPECT_TRUE(hal.open);
-    EXPECT_EQ(drive.control.machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
     EXPECT_EQ(drive.late_interrupts, 1u);
 }
 
@@ -325,7 +325,7 @@ TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
     hal_t other_hal;
     other_hal.adc.bus_voltage_counts = 240 * 8;
     drive_t other;
-    const drive_config_t config = {20000, DRIVE_CONTROLLER_TRADITIONAL};
+    const drive_config_t config = {.control_rate_hz = 20000, .controller = DRIVE_CONTROLLER_TRADITIONAL};
     ASSERT_TRUE(drive_init(&other, &other_hal, &machine_tables, &config));
     periods(100);
     command(COMMAND_RUN);
@@ -335,8 +335,8 @@ TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
         drive_control_interrupt(&other);
         drive_background(&other);
     }
-    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_RUN);
-    EXPECT_EQ(other.control.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(other.control.state_machine.state, DRIVE_STATE_READY);
     EXPECT_TRUE(other_hal.open);
     EXPECT_EQ(other_hal.starts, std::vector<uint16_t>{5000});
 }
@@ -347,15 +347,15 @@ TEST_F(Drive, a_run_of_a_sender_long_silent_starts_nothing_when_the_clock_comes_
     periods(10);
     command(COMMAND_RUN);
     periods(10);
-    ASSERT_EQ(drive.control.machine.state, DRIVE_STATE_INITIALISE);
-    ASSERT_EQ(drive.sample.command.request, COMMAND_RUN);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_INITIALISE);
+    ASSERT_EQ(drive.command.request, COMMAND_RUN);
     periods(10000); // 0.25 s of silence
-    EXPECT_EQ(drive.sample.command.request, COMMAND_OFF);
+    EXPECT_EQ(drive.command.request, COMMAND_OFF);
 
-    hal.time_us = drive.sample.command.time_us; // 71 minutes later the command looks new
+    hal.time_us = drive.command.time_us; // 71 minutes later the command looks new
     hal.adc.bus_voltage_counts = 240 * 8;
     periods(200);
-    EXPECT_EQ(drive.control.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
     EXPECT_EQ(hal.writes, 0u);
 }
 

@@ -50,6 +50,7 @@ struct bench_t {
     uint32_t angle = 0;
     int32_t step = 0; // 2^-32 turn a period
     control_sample_t sample{};
+    command_t command{};
 
     void advance(std::mt19937_64 &random, const control_parameters_t &parameters, uint32_t period_us) {
         const auto rarely = [&](unsigned one_in) { return random() % one_in == 0; };
@@ -59,8 +60,8 @@ struct bench_t {
             angle = uint32_t(random());
         }
         sample.encoder.counts = angle >> parameters.encoder_shift;
-        const uint64_t middle_q6 = (uint64_t(parameters.protection.bus_over_voltage_q6) +
-                                    uint64_t(parameters.protection.bus_under_voltage_q6)) /
+        const uint64_t middle_q6 = (uint64_t(parameters.protection.dc_link_over_voltage_q6) +
+                                    uint64_t(parameters.protection.dc_link_under_voltage_q6)) /
                                    2;
         const unsigned finer = parameters.adc_bits - 12u;
         sample.adc.bus_voltage_counts =
@@ -75,9 +76,9 @@ struct bench_t {
             sample.time_us = uint32_t(random());
         }
         if (rarely(20)) {
-            sample.command.time_us = sample.time_us;
-            sample.command.request = rarely(3) ? command_request_t(random() % 4) : COMMAND_RUN;
-            sample.command.speed_reference_q22 = int32_t(uint32_t(random()));
+            command.time_us = sample.time_us;
+            command.request = rarely(3) ? command_request_t(random() % 4) : COMMAND_RUN;
+            command.speed_reference_q22 = int32_t(uint32_t(random()));
         }
     }
 };
@@ -103,10 +104,10 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
         bench.angle = uint32_t(random());
         for (int period = 0; period < PERIODS; period++) {
             bench.advance(random, parameters, 1000000 / rate_hz);
-            const drive_state_t before = state.machine.state;
+            const drive_state_t before = state.state_machine.state;
             hal_pwm_compare_t compare;
-            const bool closed = control_step(&parameters, &state, &bench.sample, &compare);
-            ASSERT_EQ(closed, state.machine.state == DRIVE_STATE_RUN) << "sequence " << sequence;
+            const bool closed = control_step(&parameters, &state, &bench.sample, &bench.command, &compare);
+            ASSERT_EQ(closed, state.state_machine.state == DRIVE_STATE_RUN) << "sequence " << sequence;
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
                 const bool exists = phase < tables->phases;
                 ASSERT_LE(compare.upper[phase], closed && exists ? parameters.period_ticks : 0) << sequence;
@@ -114,12 +115,12 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
                 // Both on at a time is the only way to put voltage on a phase: not above its limit.
                 if (compare.upper[phase] + compare.lower[phase] > parameters.period_ticks) {
                     driven++;
-                    ASSERT_LE(state.estimate.current_q9[phase], p.values[PARAMETER_CURRENT_LIMIT_A]) << sequence;
+                    ASSERT_LE(state.measurement.current_q9[phase], p.values[PARAMETER_CURRENT_LIMIT_A]) << sequence;
                 }
             }
             running += closed;
-            faults += before != DRIVE_STATE_FAULT && state.machine.state == DRIVE_STATE_FAULT;
-            cleared += before == DRIVE_STATE_FAULT && state.machine.state == DRIVE_STATE_READY;
+            faults += before != DRIVE_STATE_FAULT && state.state_machine.state == DRIVE_STATE_FAULT;
+            cleared += before == DRIVE_STATE_FAULT && state.state_machine.state == DRIVE_STATE_READY;
         }
     }
     // The sequences are not so wild that they say nothing.
@@ -147,10 +148,12 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
                 sample.encoder.counts = uint32_t(random()) >> (32 - bits);
                 sample.missed_interrupts = uint32_t(random());
                 sample.time_us = uint32_t(random());
-                sample.command = {command_request_t(random() % 4), int32_t(uint32_t(random())), uint32_t(random())};
+                const command_t command = {.request = command_request_t(random() % 4),
+                                           .speed_reference_q22 = int32_t(uint32_t(random())),
+                                           .time_us = uint32_t(random())};
                 hal_pwm_compare_t compare;
-                const bool closed = control_step(&parameters, &state, &sample, &compare);
-                ASSERT_EQ(closed, state.machine.state == DRIVE_STATE_RUN);
+                const bool closed = control_step(&parameters, &state, &sample, &command, &compare);
+                ASSERT_EQ(closed, state.state_machine.state == DRIVE_STATE_RUN);
             }
         }
     }

@@ -176,7 +176,7 @@ TEST(SalientClosedLoop, reverses_from_600_to_minus_600_rpm_and_back_without_faul
                               bench.drive.state.torque_reference_q24 / Q24};
         for (at_s += 25e-6; at_s < from_s + 0.3; at_s += 25e-6) {
             bench.run_until(at_s);
-            ASSERT_NE(bench.drive.state.machine.state, DRIVE_STATE_FAULT) << at_s;
+            ASSERT_NE(bench.drive.state.state_machine.state, DRIVE_STATE_FAULT) << at_s;
             const double torque_Nm = plant_torque_Nm(&bench.plant);
             const double speed_rpm = rpm(bench.plant.speed_rad_s);
             const bool starting = at_s < from_s + 0.005;
@@ -214,7 +214,7 @@ TEST(SalientClosedLoop, a_speed_beyond_the_voltage_limit_is_approached_and_left_
             bench.reference_rpm = std::max(2000.0, reached_rpm - 1000.0 * (at_s - 0.6));
             bench.run_until(at_s);
         }
-        EXPECT_EQ(bench.drive.state.machine.state, DRIVE_STATE_RUN);
+        EXPECT_EQ(bench.drive.state.state_machine.state, DRIVE_STATE_RUN);
         EXPECT_NEAR(rpm(bench.plant.speed_rad_s), std::max(2000.0, reached_rpm - 1000.0), 10.0) << "back";
         const double most_rpm = rpm(bench.trace.max_speed(0.1, 1.6));
         const double least_rpm = rpm(bench.trace.min_speed(0.1, 1.6));

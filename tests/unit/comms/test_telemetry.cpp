@@ -214,9 +214,9 @@ TEST_F(Comms, a_fault_is_reported_with_the_next_cycle_and_every_100_ms) {
     snapshot.last_fault.time_us = 10400;
     snapshot.last_fault.fault = FAULT_OVER_CURRENT;
     snapshot.last_fault.state = STATE_RUN;
-    snapshot.last_fault.checks = 0x0022;
+    snapshot.last_fault.fault_mask = 0x0022;
     snapshot.last_fault.speed_q22 = -1000 * 439231;
-    snapshot.last_fault.bus_voltage_q6 = 15360;
+    snapshot.last_fault.dc_link_voltage_q6 = 15360;
     snapshot.last_fault.current_max_q9 = 36000;
     snapshot.last_fault.torque_reference_q24 = 1 << 24;
     run(12000);

@@ -41,8 +41,16 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
         return std::min(v(index) / 360.0 * fixed_point::REV, fixed_point::REV - 1.0);
     };
 
+    const bool salient = p.values[PARAMETER_CONTROLLER] == DRIVE_CONTROLLER_SALIENT;
+
     ASSERT_EQ(c.tables, &machine_tables);
     ASSERT_EQ(int(c.controller), p.values[PARAMETER_CONTROLLER]);
+    const bool traditional = p.values[PARAMETER_CONTROLLER] == DRIVE_CONTROLLER_TRADITIONAL;
+    ASSERT_EQ(c.speed_law, traditional ? SPEED_LAW_PI : SPEED_LAW_SMC);
+    ASSERT_EQ(c.torque_law, salient                                                    ? TORQUE_LAW_PREDICTIVE
+                            : traditional || p.values[PARAMETER_BP_MODE] == BP_PID_OFF ? TORQUE_LAW_HYSTERESIS
+                                                                                       : TORQUE_LAW_DUTY);
+    ASSERT_EQ(c.speed_reference_min_q22, salient ? INT32_MIN : 0);
     ASSERT_EQ(2.0 * c.period_ticks * rate_hz, double(HAL_PWM_CLOCK_HZ));
     ASSERT_EQ(c.encoder_shift, 32 - encoder_bits);
     ASSERT_EQ(c.encoder_middle, encoder_bits == 32 ? 0u : 1u << (31 - encoder_bits));
@@ -60,7 +68,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("epsilon", c.speed_smc.epsilon_q31, std::ldexp(v(PARAMETER_SMC_EPSILON), 31), 1.01);
     near("delta", c.speed_smc.delta_q27, std::ldexp(v(PARAMETER_SMC_DELTA) / std::log(2.0), 27), 1.01);
     near("friction", c.speed_smc.friction_q30, v(PARAMETER_FRICTION_NM_S) * fixed_point::Q30, 0.0);
-    ASSERT_EQ(c.speed_smc.torque_min_q24, -c.speed_smc.torque_max_q24);
+    ASSERT_EQ(c.speed_smc.torque_min_q24, salient ? -c.speed_smc.torque_max_q24 : 0);
     near("torque max", c.speed_smc.torque_max_q24, v(PARAMETER_TORQUE_MAX_NM) * fixed_point::Q24, 0.0);
 
     near("turn on", c.commutation.turn_on, 0.0, fixed_point::REV);
@@ -102,18 +110,19 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const double fastest =
         fixed_point::rad_s(v(PARAMETER_OVER_SPEED_RPM)) / rate_hz / (2.0 * fixed_point::PI) * fixed_point::REV;
     near("trip", c.protection.current_trip_q9, v(PARAMETER_CURRENT_TRIP_A) * fixed_point::Q9, 0.0);
-    near("over-voltage", c.protection.bus_over_voltage_q6, v(PARAMETER_BUS_OVER_VOLTAGE_V) * 64.0, 0.0);
-    near("under-voltage", c.protection.bus_under_voltage_q6, v(PARAMETER_BUS_UNDER_VOLTAGE_V) * 64.0, 0.0);
+    near("over-voltage", c.protection.dc_link_over_voltage_q6, v(PARAMETER_BUS_OVER_VOLTAGE_V) * 64.0, 0.0);
+    near("under-voltage", c.protection.dc_link_under_voltage_q6, v(PARAMETER_BUS_UNDER_VOLTAGE_V) * 64.0, 0.0);
     near("over-speed", c.protection.over_speed_q22, fixed_point::rad_s(v(PARAMETER_OVER_SPEED_RPM)) * fixed_point::Q22,
          0.6);
     near("step", c.protection.angle_step_max, 0.0, fixed_point::REV);
     ASSERT_LE(std::fabs(c.protection.angle_step_max - (1.5 * fastest + 2.0 * count)), 3.0 + 1e-6 * fastest);
-    ASSERT_LE(std::fabs(c.protection.angle_unmoved_max - (fixed_point::REV / 1440.0 + 4.0 * count)), 1.0);
+    ASSERT_LE(std::fabs(c.protection.undetected_travel_max - (fixed_point::REV / 1440.0 + 4.0 * count)), 1.0);
     ASSERT_EQ(c.protection.angle_step_q32, c.observer.angle_step_q32);
-    near("slowing", c.protection.slowing_q22, 40.0 / v(PARAMETER_INERTIA_KG_M2) / rate_hz * fixed_point::Q22, 2.0);
+    near("slowing", c.protection.deceleration_max_q22, 40.0 / v(PARAMETER_INERTIA_KG_M2) / rate_hz * fixed_point::Q22,
+         2.0);
     near("timeout", c.protection.command_timeout_us, 1000.0 * v(PARAMETER_COMMAND_TIMEOUT_MS), 0.0);
 
-    const auto &share = c.predictive.share;
+    const auto &share = c.predictive.sharing;
     const double stroke = fixed_point::REV / machine_tables.phases;
     const double least = 2.0 / 360.0 * fixed_point::REV;
     const double on_early = pitch(PARAMETER_SHARE_ON_EARLY_DEG);
@@ -121,9 +130,9 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const double width = std::max(asked_width, stroke + least);
     const double narrowing =
         std::min(pitch(PARAMETER_SHARE_OFF_EARLY_DEG) - on_early, width - stroke - least); // at full advance
-    ASSERT_EQ(c.two_pulses, p.values[PARAMETER_PULSES_PER_PERIOD] == 2);
+    ASSERT_EQ(c.interleaved_pwm, salient && p.values[PARAMETER_PULSES_PER_PERIOD] == 2);
     ASSERT_EQ(c.load_from_transducer, p.values[PARAMETER_LOAD_SOURCE] == 1);
-    ASSERT_EQ(share.sharing, p.values[PARAMETER_TORQUE_SHARING] == 1);
+    ASSERT_EQ(share.overlapping, p.values[PARAMETER_TORQUE_SHARING] == 1);
     near("stroke", share.stroke, 0.0, fixed_point::REV);
     ASSERT_LE(std::fabs(share.stroke - stroke), 1.0);
     ASSERT_LE(std::fabs(share.turn_on - pitch(PARAMETER_SHARE_ON_ANGLE_DEG)), 1.0);
@@ -136,7 +145,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const double q40 = std::ldexp(1.0, 40);
     near("resistance", c.predictive.flux.resistance_period_q40, v(PARAMETER_RESISTANCE_OHM) / rate_hz * q40, 1.0);
     near("period", c.predictive.period_q40, q40 / rate_hz, 1.0);
-    near("advance", c.predictive.advance_q30, 10.0 / rate_hz * fixed_point::Q30, 1.0);
+    near("advance", c.predictive.advance_step_q30, 10.0 / rate_hz * fixed_point::Q30, 1.0);
     near("return", c.predictive.retract_step_q30, 1.0 / rate_hz * fixed_point::Q30, 1.0);
 
     const auto trim_scale = [&](unsigned index) {
@@ -164,7 +173,6 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const uint32_t rate = uint32_t(rate_hz);
     const int32_t inertia_q30 = p.values[PARAMETER_INERTIA_KG_M2];
     const load_observer_model_t observer = load_observer_model(rate, inertia_q30, p.values[PARAMETER_FRICTION_NM_S]);
-    const bool salient = p.values[PARAMETER_CONTROLLER] == DRIVE_CONTROLLER_SALIENT;
     const load_observer_gains_t gains = load_observer_gains(
         uint32_t(p.values[salient ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S]), rate,
         inertia_q30);

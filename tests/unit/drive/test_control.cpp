@@ -1,4 +1,4 @@
-// The control interrupt as a function: what it does in each state, and that it depends on nothing but its arguments.
+// The control interrupt as a function of its arguments: outputs in each state, repeatability, faults.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -32,7 +32,7 @@ bool all_open(const hal_pwm_compare_t &compare) {
     return true;
 }
 
-// A drive on a rotor that turns as it is told.
+// A drive on a rotor whose speed the test prescribes.
 class Control : public testing::Test {
   protected:
     explicit Control(drive_controller_t controller = DRIVE_CONTROLLER_PAPER) { configure(controller); }
@@ -45,25 +45,36 @@ class Control : public testing::Test {
         control_reset(&parameters, &state);
         diagnostics = control_diagnostics_t{};
         sample = control_sample_t{};
+        command = command_t{};
         sample.adc.bus_voltage_counts = BUS_COUNTS;
         turns = 0.1;
     }
 
-    bool step(command_request_t request, double reference_rpm = 600.0) {
-        sample.time_us += PERIOD_US;
-        sample.command.request = request;
-        sample.command.speed_reference_q22 = fixed_point::to_fixed(fixed_point::rad_s(reference_rpm), fixed_point::Q22);
-        sample.command.time_us = sample.time_us;
-        return step_as_it_is();
+    // Reset with one parameter changed.
+    void configure_with(drive_controller_t controller, parameter_index_t index, int32_t value, unsigned adc_bits = 12) {
+        configure(controller);
+        parameters_t p;
+        parameters_init(&p);
+        p.values[PARAMETER_CONTROLLER] = controller;
+        p.values[index] = value;
+        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, adc_bits);
     }
 
-    bool step_as_it_is() {
+    bool step(command_request_t request, double reference_rpm = 600.0) {
+        sample.time_us += PERIOD_US;
+        command.request = request;
+        command.speed_reference_q22 = fixed_point::to_fixed(fixed_point::rad_s(reference_rpm), fixed_point::Q22);
+        command.time_us = sample.time_us;
+        return step_unchanged();
+    }
+
+    bool step_unchanged() {
         turns += speed_rad_s / (2.0 * fixed_point::PI * RATE_HZ);
         sample.encoder.counts = uint32_t(int64_t(std::floor((turns - std::floor(turns)) * (1 << ENCODER_BITS))));
-        const bool closed = control_step(&parameters, &state, &sample, &compare);
+        const bool closed = control_step(&parameters, &state, &sample, &command, &compare);
         diagnostics = control_diagnose(&parameters, &state);
-        // Whatever happens: no switch is closed outside RUN.
-        EXPECT_EQ(closed, state.machine.state == DRIVE_STATE_RUN);
+        // No switch is ever closed outside RUN.
+        EXPECT_EQ(closed, state.state_machine.state == DRIVE_STATE_RUN);
         EXPECT_TRUE(closed || all_open(compare));
         return closed;
     }
@@ -72,20 +83,21 @@ class Control : public testing::Test {
         for (int k = 0; k < 41; k++) {
             step(COMMAND_OFF);
         }
-        ASSERT_EQ(state.machine.state, DRIVE_STATE_READY);
+        ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
         step(COMMAND_RUN);
-        ASSERT_EQ(state.machine.state, DRIVE_STATE_RUN);
+        ASSERT_EQ(state.state_machine.state, DRIVE_STATE_RUN);
     }
 
     control_parameters_t parameters;
     control_state_t state;
     control_diagnostics_t diagnostics;
     control_sample_t sample;
+    command_t command;
     hal_pwm_compare_t compare;
     double turns = 0.1, speed_rad_s = 0.0;
 };
 
-TEST_F(Control, codes_of_every_resolution_become_the_nearest_current_and_voltage) {
+TEST_F(Control, counts_of_every_resolution_become_the_nearest_current_and_voltage) {
     for (unsigned bits = 12; bits <= 16; bits++) {
         parameters_t p;
         parameters_init(&p);
@@ -102,10 +114,10 @@ TEST_F(Control, codes_of_every_resolution_become_the_nearest_current_and_voltage
 TEST_F(Control, initialise_lasts_a_millisecond) {
     for (int k = 0; k < 39; k++) {
         step(COMMAND_OFF);
-        ASSERT_EQ(state.machine.state, DRIVE_STATE_INITIALISE);
+        ASSERT_EQ(state.state_machine.state, DRIVE_STATE_INITIALISE);
     }
     step(COMMAND_OFF);
-    EXPECT_EQ(state.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY);
 }
 
 TEST_F(Control, every_switch_is_open_until_run_is_commanded) {
@@ -118,7 +130,7 @@ TEST_F(Control, every_switch_is_open_until_run_is_commanded) {
 }
 
 TEST_F(Control, the_same_state_and_sample_give_the_same_bits) {
-    // A copy of everything, replayed, with other things called in between; and no memory but the state.
+    // A copy of the state, stepped again with the same inputs: there is no other memory.
     for (const drive_controller_t controller :
          {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
         configure(controller);
@@ -134,7 +146,7 @@ TEST_F(Control, the_same_state_and_sample_give_the_same_bits) {
             std::memcpy(&before, &state, sizeof state);
             step(COMMAND_RUN, 150.0);
             hal_pwm_compare_t replayed;
-            control_step(&parameters, &before, &sample, &replayed);
+            control_step(&parameters, &before, &sample, &command, &replayed);
             ASSERT_EQ(std::memcmp(&before, &state, sizeof state), 0) << k;
             ASSERT_EQ(std::memcmp(&replayed, &compare, sizeof compare), 0) << k;
         }
@@ -162,7 +174,7 @@ TEST_F(Control, each_cause_opens_every_switch_in_the_tick_that_sees_it) {
         {FAULT_OVER_VOLTAGE, [this] { sample.adc.bus_voltage_counts = 301 * 8; }},
         {FAULT_UNDER_VOLTAGE, [this] { sample.adc.bus_voltage_counts = 149 * 8; }},
         {FAULT_ENCODER, [this] { turns += 0.01; }},
-        {FAULT_COMMAND_TIMEOUT, [this] { sample.command.time_us -= 100001; }},
+        {FAULT_COMMAND_TIMEOUT, [this] { command.time_us -= 100001; }},
         {FAULT_INTERRUPT_OVERRUN, [this] { sample.missed_interrupts = 3; }},
     };
     for (const auto &cause : causes) {
@@ -174,15 +186,15 @@ TEST_F(Control, each_cause_opens_every_switch_in_the_tick_that_sees_it) {
         const int32_t torque_reference_q24 = diagnostics.torque_reference_q24;
         EXPECT_GT(torque_reference_q24, 0);
         cause.provoke();
-        EXPECT_FALSE(step_as_it_is()) << cause.fault;
+        EXPECT_FALSE(step_unchanged()) << cause.fault;
         EXPECT_TRUE(all_open(compare));
-        const fault_record_t &record = state.machine.record;
+        const fault_record_t &record = state.state_machine.record;
         EXPECT_EQ(record.fault, cause.fault);
-        EXPECT_NE(record.checks & FAULT_BIT(cause.fault), 0);
+        EXPECT_NE(record.fault_mask & FAULT_BIT(cause.fault), 0);
         EXPECT_EQ(record.state, DRIVE_STATE_RUN);
         EXPECT_EQ(record.time_us, sample.time_us);
-        EXPECT_EQ(record.torque_reference_q24, torque_reference_q24) << "what was asked for when it happened";
-        EXPECT_EQ(record.bus_voltage_q6, sample.adc.bus_voltage_counts * 8);
+        EXPECT_EQ(record.torque_reference_q24, torque_reference_q24) << "of the previous period";
+        EXPECT_EQ(record.dc_link_voltage_q6, sample.adc.bus_voltage_counts * 8);
         EXPECT_EQ(diagnostics.torque_reference_q24, 0);
     }
 }
@@ -195,7 +207,7 @@ TEST_F(Control, the_largest_current_that_is_no_trip_keeps_running) {
     EXPECT_FALSE(step(COMMAND_RUN));
 }
 
-TEST_F(Control, an_encoder_that_freezes_at_speed_is_found_within_a_millisecond) {
+TEST_F(Control, an_encoder_that_freezes_at_speed_is_detected_within_a_millisecond) {
     start();
     speed_rad_s = 15.7; // 150 r/min
     for (int k = 0; k < 4000; k++) {
@@ -206,11 +218,11 @@ TEST_F(Control, an_encoder_that_freezes_at_speed_is_found_within_a_millisecond) 
     while (step(COMMAND_RUN, 150.0) && periods < 100) {
         periods++;
     }
-    EXPECT_EQ(state.machine.record.fault, FAULT_ENCODER);
+    EXPECT_EQ(state.state_machine.record.fault, FAULT_ENCODER);
     EXPECT_LT(periods, 40);
 }
 
-TEST_F(Control, a_fault_needs_clearing_and_letting_go_before_it_runs_again) {
+TEST_F(Control, a_restart_after_a_fault_requires_clearing_and_a_withdrawn_run_request) {
     start();
     sample.adc.phase_current_counts[0] = 4000;
     EXPECT_FALSE(step(COMMAND_RUN));
@@ -219,28 +231,28 @@ TEST_F(Control, a_fault_needs_clearing_and_letting_go_before_it_runs_again) {
         EXPECT_FALSE(step(COMMAND_RUN));
     }
     EXPECT_FALSE(step(COMMAND_CLEAR_FAULT));
-    EXPECT_EQ(state.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY);
     EXPECT_TRUE(step(COMMAND_RUN));
 }
 
-TEST_F(Control, a_fault_cleared_on_a_turning_rotor_does_not_read_as_overspeed) {
+TEST_F(Control, clearing_a_fault_on_a_turning_rotor_causes_no_over_speed_fault) {
     for (const double rpm : {150.0, 600.0, 2500.0, 3000.0}) {
         configure(DRIVE_CONTROLLER_PAPER);
         speed_rad_s = fixed_point::rad_s(rpm);
         for (int k = 0; k < 4000; k++) {
             step(COMMAND_OFF);
         }
-        ASSERT_EQ(state.machine.state, DRIVE_STATE_READY) << rpm;
+        ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY) << rpm;
         EXPECT_NEAR(diagnostics.speed_q22 / fixed_point::Q22, speed_rad_s, 0.01 * speed_rad_s);
         sample.adc.phase_current_counts[0] = 4000;
         step(COMMAND_OFF);
         sample.adc.phase_current_counts[0] = 0;
-        ASSERT_EQ(state.machine.state, DRIVE_STATE_FAULT);
+        ASSERT_EQ(state.state_machine.state, DRIVE_STATE_FAULT);
         step(COMMAND_CLEAR_FAULT);
         for (int k = 0; k < 4000; k++) {
             step(COMMAND_OFF);
-            ASSERT_EQ(state.machine.state, DRIVE_STATE_READY)
-                << rpm << " r/min, " << k << " fault " << state.machine.record.fault;
+            ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY)
+                << rpm << " r/min, " << k << " fault " << state.state_machine.record.fault;
         }
         EXPECT_NEAR(diagnostics.speed_q22 / fixed_point::Q22, speed_rad_s, 0.01 * speed_rad_s);
     }
@@ -268,7 +280,7 @@ TEST_F(Control, the_reference_starts_at_the_present_speed_and_follows_the_ramp) 
     }
 }
 
-TEST_F(Control, a_stop_opens_the_switches_when_the_rotor_stands) {
+TEST_F(Control, a_stop_opens_the_switches_at_standstill) {
     start();
     speed_rad_s = 10.0;
     for (int k = 0; k < 2000; k++) {
@@ -277,22 +289,19 @@ TEST_F(Control, a_stop_opens_the_switches_when_the_rotor_stands) {
     for (int k = 0; k < 400; k++) {
         ASSERT_TRUE(step(COMMAND_STOP)) << "still turning";
     }
-    // It comes to rest: 10 rad/s in 50 ms.
+    // Deceleration to standstill: 10 rad/s in 50 ms.
     int periods = 0;
     while (step(COMMAND_STOP) && periods < 4000) {
         speed_rad_s = std::max(0.0, speed_rad_s - 200.0 / RATE_HZ);
         periods++;
     }
-    EXPECT_EQ(state.machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY);
     EXPECT_LE(std::fabs(diagnostics.speed_q22 / fixed_point::Q22), 0.5);
 }
 
-TEST_F(Control, the_traditional_controller_and_the_paper_s_without_its_pid_switch_whole_periods_only) {
+TEST_F(Control, hysteresis_control_switches_whole_periods_only) {
     for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER}) {
-        configure(controller);
-        if (controller == DRIVE_CONTROLLER_PAPER) {
-            parameters.duty.pid.mode = BP_PID_OFF;
-        }
+        configure_with(controller, PARAMETER_BP_MODE, BP_PID_OFF);
         start();
         std::mt19937 random(2);
         for (int k = 0; k < 2000; k++) {
@@ -304,7 +313,7 @@ TEST_F(Control, the_traditional_controller_and_the_paper_s_without_its_pid_switc
                 ASSERT_TRUE(compare.upper[phase] == 0 || compare.upper[phase] == parameters.period_ticks);
                 ASSERT_TRUE(compare.lower[phase] == 0 || compare.lower[phase] == parameters.period_ticks);
                 ASSERT_GE(compare.lower[phase], compare.upper[phase]);
-                // +1 both on, 0 one on, -1 both off, as the hysteresis says.
+                // States of the hysteresis: +1 both on, 0 one on, -1 both off.
                 const int on = (compare.upper[phase] != 0) + (compare.lower[phase] != 0);
                 ASSERT_EQ(on - 1, state.hysteresis.state[phase]);
             }
@@ -312,7 +321,7 @@ TEST_F(Control, the_traditional_controller_and_the_paper_s_without_its_pid_switc
     }
 }
 
-TEST_F(Control, the_paper_s_controller_drives_its_regulated_phase_with_the_pid_s_duty) {
+TEST_F(Control, the_paper_controller_applies_the_duty_of_the_pid_to_the_regulated_phase) {
     start();
     int partial = 0;
     for (int k = 0; k < 2000; k++) {
@@ -334,12 +343,12 @@ TEST_F(Control, the_paper_s_controller_drives_its_regulated_phase_with_the_pid_s
 TEST_F(Control, overspeed_opens_every_switch) {
     start();
     int periods = 0;
-    while (state.machine.state == DRIVE_STATE_RUN && periods < 40000) {
+    while (state.state_machine.state == DRIVE_STATE_RUN && periods < 40000) {
         speed_rad_s += 0.05;
         step(COMMAND_RUN, 3000.0);
         periods++;
     }
-    EXPECT_EQ(state.machine.record.fault, FAULT_OVER_SPEED);
+    EXPECT_EQ(state.state_machine.record.fault, FAULT_OVER_SPEED);
     EXPECT_NEAR(speed_rad_s, fixed_point::rad_s(3600.0), 4.0);
 }
 
@@ -374,23 +383,13 @@ TEST_F(Control, the_torque_reference_is_never_negative) {
     }
 }
 
-// What of the salient controller is control.c's own; its torque is tested in closed loop.
+// Steps of the control interrupt with the salient controller; its torque is tested in closed loop.
 class SalientControl : public Control {
   protected:
     SalientControl() : Control(DRIVE_CONTROLLER_SALIENT) {}
-
-    // Set anew with some parameters of the drive different.
-    void configure_with(drive_controller_t controller, parameter_index_t index, int32_t value, unsigned adc_bits = 12) {
-        configure(controller);
-        parameters_t p;
-        parameters_init(&p);
-        p.values[PARAMETER_CONTROLLER] = controller;
-        p.values[index] = value;
-        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, adc_bits);
-    }
 };
 
-TEST_F(SalientControl, takes_negative_references_and_the_others_take_them_as_none) {
+TEST_F(SalientControl, only_the_salient_controller_follows_a_negative_reference) {
     for (const drive_controller_t controller :
          {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
         configure(controller);
@@ -416,7 +415,7 @@ TEST_F(SalientControl, brakes_and_reverses_a_turning_rotor_with_a_torque_referen
         for (int k = 0; k < 4000; k++) {
             step(COMMAND_OFF);
         }
-        // It starts from the present speed, either way.
+        // The ramp starts at the present speed in either direction.
         parameters.speed_ramp_q22 = fixed_point::to_fixed(0.05, fixed_point::Q22);
         step(COMMAND_RUN, -side * 300.0);
         EXPECT_NEAR(diagnostics.speed_reference_q22 / fixed_point::Q22, side * 30.0, 0.2);
@@ -428,7 +427,7 @@ TEST_F(SalientControl, brakes_and_reverses_a_turning_rotor_with_a_torque_referen
     }
 }
 
-TEST_F(SalientControl, two_pulses_are_its_own_and_may_be_one) {
+TEST_F(SalientControl, the_number_of_pulses_per_period_is_a_parameter) {
     for (const int32_t pulses : {1, 2}) {
         configure_with(DRIVE_CONTROLLER_SALIENT, PARAMETER_PULSES_PER_PERIOD, pulses);
         start();
@@ -449,7 +448,7 @@ TEST_F(SalientControl, two_pulses_are_its_own_and_may_be_one) {
     }
 }
 
-TEST_F(SalientControl, the_load_torque_of_the_sliding_mode_is_the_transducer_s_where_a_parameter_says_so) {
+TEST_F(SalientControl, the_sliding_mode_uses_the_load_torque_source_of_the_parameter) {
     for (const drive_controller_t controller : {DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
         for (const unsigned bits : {12u, 14u, 16u}) {
             for (const double load_Nm : {4.0, 0.0, 12.5}) {
@@ -461,7 +460,8 @@ TEST_F(SalientControl, the_load_torque_of_the_sliding_mode_is_the_transducer_s_w
                     ASSERT_TRUE(step(COMMAND_RUN, 0.0));
                 }
                 EXPECT_NEAR(diagnostics.torque_reference_q24 / fixed_point::Q24, load_Nm, 0.05) << bits << " bits";
-                EXPECT_NEAR(diagnostics.load_torque_q24 / fixed_point::Q24, 0.0, 0.1) << "the observer's is another";
+                EXPECT_NEAR(diagnostics.load_torque_q24 / fixed_point::Q24, 0.0, 0.1)
+                    << "the observer does not use the transducer";
             }
         }
     }
@@ -473,7 +473,7 @@ TEST_F(SalientControl, the_load_torque_of_the_sliding_mode_is_the_transducer_s_w
         step(COMMAND_RUN, 0.0);
     }
     EXPECT_NEAR(diagnostics.torque_reference_q24 / fixed_point::Q24, -5.0, 0.05);
-    // Without the parameter the code is not looked at.
+    // Without the parameter the transducer is not used.
     configure(DRIVE_CONTROLLER_SALIENT);
     sample.adc.load_torque_counts = 4095;
     start();
@@ -483,7 +483,7 @@ TEST_F(SalientControl, the_load_torque_of_the_sliding_mode_is_the_transducer_s_w
     EXPECT_NEAR(diagnostics.torque_reference_q24 / fixed_point::Q24, 0.0, 0.1);
 }
 
-TEST_F(SalientControl, an_edge_s_angle_is_the_boundary_and_the_way_since_at_the_observer_s_speed) {
+TEST_F(SalientControl, the_angle_after_an_edge_is_extrapolated_at_the_observed_speed) {
     for (const double speed : {15.0, 100.0, -15.0, -100.0}) {
         for (const uint32_t age_ticks : {0u, 1u, 3000u, 20000u}) {
             configure(DRIVE_CONTROLLER_SALIENT);
@@ -507,7 +507,7 @@ TEST_F(SalientControl, an_edge_s_angle_is_the_boundary_and_the_way_since_at_the_
     }
 }
 
-TEST_F(SalientControl, an_edge_older_than_two_periods_at_20_kHz_or_none_leaves_the_middle_of_the_count) {
+TEST_F(SalientControl, without_a_recent_edge_the_angle_is_the_middle_of_the_count) {
     speed_rad_s = 15.0;
     for (int k = 0; k < 400; k++) {
         step(COMMAND_OFF);
@@ -528,7 +528,7 @@ TEST_F(SalientControl, an_edge_older_than_two_periods_at_20_kHz_or_none_leaves_t
     EXPECT_EQ(diagnostics.angle, middle());
 }
 
-TEST_F(SalientControl, trims_and_missing_torque_are_0_with_the_other_controllers) {
+TEST_F(SalientControl, trim_and_missing_torque_are_0_with_the_other_controllers) {
     for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER}) {
         configure(controller);
         start();

@@ -53,8 +53,8 @@ struct fixed_drive_t {
         control_reset(&parameters, &state);
     }
 
-    bool step(const control_sample_t &sample, hal_pwm_compare_t *compare) {
-        return control_step(&parameters, &state, &sample, compare);
+    bool step(const control_sample_t &sample, const command_t &command, hal_pwm_compare_t *compare) {
+        return control_step(&parameters, &state, &sample, &command, compare);
     }
 };
 
@@ -62,18 +62,18 @@ struct fixed_drive_t {
 struct reference_drive_t {
     reference_model::salient_t model;
     unsigned phases;
-    bool two_pulses;
+    bool interleaved_pwm;
     double period_ticks;
 
     explicit reference_drive_t(const setup_t &setup) : reference_drive_t(setup, setup.configured()) {}
 
-    bool step(const control_sample_t &sample, hal_pwm_compare_t *compare) {
-        const bool run = sample.command.request == COMMAND_RUN;
-        const auto duties = model.step(sample, run);
+    bool step(const control_sample_t &sample, const command_t &command, hal_pwm_compare_t *compare) {
+        const bool run = command.request == COMMAND_RUN;
+        const auto duties = model.step(sample, command);
         *compare = hal_pwm_compare_t{};
         for (unsigned phase = 0; phase < phases && run; phase++) {
             const double duty = duties[phase];
-            if (two_pulses) {
+            if (interleaved_pwm) {
                 const int both = int(std::lround((1.0 + duty) * period_ticks));
                 compare->upper[phase] = uint16_t(both / 2);
                 compare->lower[phase] = uint16_t(both - both / 2);
@@ -87,7 +87,7 @@ struct reference_drive_t {
 
   private:
     reference_drive_t(const setup_t &setup, const control_parameters_t &p)
-        : model(p, machine_plant, setup.rate_hz), phases(machine_plant.phases), two_pulses(p.two_pulses),
+        : model(p, machine_plant, setup.rate_hz), phases(machine_plant.phases), interleaved_pwm(p.interleaved_pwm),
           period_ticks(p.period_ticks) {}
 };
 
@@ -162,13 +162,13 @@ template <typename drive_t> class Bench {
             sensors_sample_encoder(&sensors, &plant, &sample.encoder);
             sensors_sample_adc(&sensors, &plant, &sample.adc);
             sample.time_us = uint32_t(plant.time_ns / 1000);
-            sample.command.time_us = sample.time_us;
-            // After the initialisation.
-            sample.command.request = plant.time_ns > 1100000 ? COMMAND_RUN : COMMAND_OFF;
-            sample.command.speed_reference_q22 =
-                fixed_point::to_fixed(fixed_point::rad_s(reference_rpm), fixed_point::Q22);
+            const command_t command = {
+                .request = plant.time_ns > 1100000 ? COMMAND_RUN : COMMAND_OFF, // after the initialisation
+                .speed_reference_q22 = fixed_point::to_fixed(fixed_point::rad_s(reference_rpm), fixed_point::Q22),
+                .time_us = sample.time_us,
+            };
             plant_set_switches(&plant, &buffered, ticks);
-            running = drive.step(sample, &buffered);
+            running = drive.step(sample, command, &buffered);
             if (!running) {
                 buffered = hal_pwm_compare_t{};
                 plant_open_all(&plant);

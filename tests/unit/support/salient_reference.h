@@ -102,7 +102,8 @@ class salient_t {
     }
 
     // One period: duty of each phase.
-    std::array<double, HAL_PHASES_MAX> step(const control_sample_t &sample, bool run) {
+    std::array<double, HAL_PHASES_MAX> step(const control_sample_t &sample, const command_t &command) {
+        const bool run = command.request == COMMAND_RUN;
         bool from_edge = false;
         const double measured = measure_rev(sample.encoder, &from_edge);
         if (!initialised) {
@@ -127,7 +128,7 @@ class salient_t {
             return {-1.0, -1.0, -1.0, -1.0};
         }
 
-        const double reference_rad_s = sample.command.speed_reference_q22 / Q22;
+        const double reference_rad_s = command.speed_reference_q22 / Q22;
         const double slip_rad_s = reference_rad_s - observer.speed;
         const double reference_Nm = std::clamp(gain_Nm_s * reaching_rad_s2(1.0, epsilon, delta_s, slip_rad_s) +
                                                    observer.load_torque + friction_Nm_s * observer.speed,

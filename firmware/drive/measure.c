@@ -1,0 +1,68 @@
+#include "drive/measure.h"
+
+#include "control/phase_map.h"
+#include "fixed/compiler.h"
+#include "fixed/fixed.h"
+
+/* 5 ns / (2 pi): rotation per tick, 2^-32 rev per rad/s Q9.22, in Q51. */
+#define ANGLE_PER_TICK_Q51 1834931565
+
+/* The count is the better measurement once an edge is older than this: two periods at 20 kHz. */
+#define EDGE_AGE_MAX_TICKS 20000
+
+/* Product of counts and scale, rounded to nearest, halves upwards; below 2^16. */
+static int32_t scale_counts(uint16_t counts, int32_t scale_q18) {
+    return fixed_multiply_high(counts << 14, scale_q18);
+}
+
+static void measure_angle(const control_parameters_t *parameters, const load_observer_t *observer,
+                          const hal_encoder_sample_t *encoder, control_measurement_t *measured) {
+    const uint32_t count_start = encoder->counts << parameters->encoder_shift;
+    measured->encoder_angle = count_start;
+    measured->predicted_speed_q22 = observer->speed_q22;
+    measured->angle_from_edge = encoder->edge_known && encoder->edge_age_ticks <= EDGE_AGE_MAX_TICKS;
+    if (!measured->angle_from_edge) {
+        /* The middle of the count: its mean error is zero. */
+        measured->angle = count_start + parameters->encoder_middle;
+        return;
+    }
+    const uint32_t edge = encoder->edge_forward ? count_start : count_start + (1u << parameters->encoder_shift);
+    const int32_t angle_per_tick_q19 = fixed_multiply_high(observer->speed_q22, ANGLE_PER_TICK_Q51);
+    measured->angle = edge + (uint32_t)fixed_shift((int64_t)angle_per_tick_q19 * (int32_t)encoder->edge_age_ticks, 19);
+}
+
+NOINLINE static int32_t look_up_torque_and_flux(const machine_tables_t *tables, uint32_t angle, int32_t current_q9,
+                                                int32_t *flux_linkage_q29) {
+    const phase_map_lookup_t place = phase_map_lookup(tables, angle);
+    *flux_linkage_q29 = phase_map_flux_q29(&place, current_q9);
+    return phase_map_torque_q24(&place, current_q9);
+}
+
+void measure(const control_parameters_t *parameters, const load_observer_t *observer,
+             const misalignment_t *misalignment, const control_sample_t *sample, control_measurement_t *measured) {
+    measure_angle(parameters, observer, &sample->encoder, measured);
+    measured->dc_link_voltage_q6 = scale_counts(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
+    commutation_find(&parameters->commutation, measured->angle, &measured->commutation);
+    const machine_tables_t *tables = parameters->tables;
+    const unsigned phases = tables->phases;
+    const bool with_flux = parameters->torque_law == TORQUE_LAW_PREDICTIVE;
+    int32_t current_max_q9 = 0;
+    int32_t torque_sum_q24 = 0;
+    for (unsigned phase = 0; phase < phases; phase++) {
+        const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], parameters->current_scale_q18);
+        measured->current_q9[phase] = current_q9;
+        measured->torque_q24[phase] = 0;
+        measured->flux_linkage_q29[phase] = 0;
+        if (current_q9 > 0) { /* false for most phases at any time */
+            const uint32_t angle = measured_phase_angle(parameters, misalignment, measured, phase);
+            const int32_t torque_q24 =
+                with_flux ? look_up_torque_and_flux(tables, angle, current_q9, &measured->flux_linkage_q29[phase])
+                          : phase_map_torque_at_q24(tables, angle, current_q9);
+            measured->torque_q24[phase] = torque_q24;
+            torque_sum_q24 = fixed_add(torque_sum_q24, torque_q24);
+            current_max_q9 = current_q9 > current_max_q9 ? current_q9 : current_max_q9;
+        }
+    }
+    measured->current_max_q9 = current_max_q9;
+    measured->torque_sum_q24 = torque_sum_q24;
+}

@@ -1,0 +1,13 @@
+/* Observation step of the control interrupt: rotor angle, speed and load torque. */
+#ifndef DRIVE_OBSERVE_H
+#define DRIVE_OBSERVE_H
+
+#include "drive/control.h"
+
+/* Corrects the observer with a measurement and predicts the coming sample; the bandwidth follows the innovation. */
+void observe(const control_parameters_t *parameters, control_state_t *state, const control_measurement_t *measured);
+
+/* Restarts the observer at the measured angle, at standstill, with its maximum bandwidth. */
+void observe_reset(control_state_t *state, const control_measurement_t *measured);
+
+#endif

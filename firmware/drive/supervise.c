@@ -1,0 +1,56 @@
+#include "drive/supervise.h"
+
+#include "drive/observe.h"
+#include "fixed/compiler.h"
+#include "fixed/fixed.h"
+
+/* A stop ends below this speed: 0.5 rad/s, 5 r/min. */
+#define STANDSTILL_Q22 (1 << 21)
+
+static void complete_record(fault_record_t *record, const control_state_t *state, const control_sample_t *sample,
+                            const control_measurement_t *measured) {
+    record->time_us = sample->time_us;
+    /* The estimate without this sample: the encoder may be the cause of the fault. */
+    record->speed_q22 = measured->predicted_speed_q22;
+    record->torque_reference_q24 = state->torque_reference_q24; /* of the previous period */
+    record->current_max_q9 = (uint16_t)measured->current_max_q9;
+    record->dc_link_voltage_q6 = (uint16_t)measured->dc_link_voltage_q6;
+}
+
+static void leave_state(const control_parameters_t *parameters, control_state_t *state,
+                        const control_measurement_t *measured, drive_state_t left) {
+    if (left == DRIVE_STATE_FAULT) {
+        observe_reset(state, measured); /* its estimate may stem from a faulty encoder */
+    }
+    if (left == DRIVE_STATE_RUN) {
+        control_prepare(parameters, state);
+        state->speed_reference_q22 = 0;
+        state->torque_reference_q24 = 0;
+    }
+}
+
+static void enter_state(const control_parameters_t *parameters, control_state_t *state, drive_state_t entered) {
+    if (entered == DRIVE_STATE_RUN) { /* the ramp starts at the present speed */
+        state->speed_reference_q22 =
+            fixed_clamp(state->observer.speed_q22, parameters->speed_reference_min_q22, INT32_MAX);
+    }
+}
+
+bool supervise(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
+               const command_t *command, const control_measurement_t *measured, uint64_t fault_mask) {
+    state_machine_t *state_machine = &state->state_machine;
+    const state_machine_input_t input = {
+        .fault_mask = fault_mask,
+        .request = command->request,
+        .at_standstill = fixed_abs(state->observer.speed_q22) < STANDSTILL_Q22,
+    };
+    const drive_state_t before = state_machine->state;
+    if (state_machine_step(state_machine, &input, parameters->initialise_ticks)) {
+        complete_record(&state_machine->record, state, sample, measured);
+    }
+    if (state_machine->state != before) {
+        leave_state(parameters, state, measured, before);
+        enter_state(parameters, state, state_machine->state);
+    }
+    return state_machine->state == DRIVE_STATE_RUN;
+}

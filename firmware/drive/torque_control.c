@@ -1,0 +1,116 @@
+#include "drive/torque_control.h"
+
+#include "control/modulator.h"
+#include "drive/measure.h"
+#include "fixed/compiler.h"
+#include "fixed/fixed.h"
+
+void torque_control_reset(const control_parameters_t *parameters, control_state_t *state) {
+    ditc_hysteresis_reset(&state->hysteresis);
+    predictive_torque_reset(&state->predictive);
+    bp_pid_clear_telemetry(&state->duty.pid);
+    switch (parameters->torque_law) {
+    case TORQUE_LAW_HYSTERESIS:
+        break;
+    case TORQUE_LAW_DUTY:
+        pwm_ditc_reset(&parameters->duty, &state->duty);
+        break;
+    case TORQUE_LAW_PREDICTIVE:
+        torque_trim_reset(&parameters->trim, &state->trim, 0);
+        break;
+    }
+}
+
+static void hysteresis_control(const control_parameters_t *parameters, control_state_t *state,
+                               const control_measurement_t *measured) {
+    const int32_t error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24);
+    ditc_hysteresis_step(&parameters->hysteresis, &state->hysteresis, &measured->commutation, error_q24,
+                         measured->current_q9);
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        state->duty_q15[phase] = state->hysteresis.state[phase] * MODULATOR_DUTY_ONE_Q15;
+    }
+}
+
+static void duty_control(const control_parameters_t *parameters, control_state_t *state,
+                         const control_measurement_t *measured) {
+    const pwm_ditc_sample_t sample = {
+        .current_q9 = measured->current_q9,
+        .torque_q24 = measured->torque_q24,
+        .reference_q24 = state->torque_reference_q24,
+        .error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24),
+    };
+    pwm_ditc_step(&parameters->duty, &state->duty, &measured->commutation, &sample, state->duty_q15);
+}
+
+/* The misalignment is observable only while speed, load and voltage are steady. */
+static void adapt_misalignment(const control_parameters_t *parameters, control_state_t *state,
+                               const control_measurement_t *measured, const uint32_t *phase_angle,
+                               bool voltage_limited) {
+    const load_observer_t *observer = &state->observer;
+    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(state->speed_reference_q22, observer->speed_q22));
+    const misalignment_sample_t sample = {
+        .current_q9 = measured->current_q9,
+        .angle = phase_angle,
+        .torque_q24 = state->torque_reference_q24,
+        .steady = observer_bandwidth_steady(&parameters->bandwidth, &state->bandwidth) &&
+                  speed_error_q22 < fixed_abs(observer->speed_q22) / 64 && !voltage_limited,
+    };
+    misalignment_step(&parameters->misalignment, &state->misalignment, parameters->tables, observer, &sample);
+}
+
+NOINLINE static void predictive_control(const control_parameters_t *parameters, control_state_t *state,
+                                        const control_measurement_t *measured) {
+    const load_observer_t *observer = &state->observer;
+    const uint32_t rotor_poles = parameters->commutation.rotor_poles;
+    const bool voltage_limited = state->predictive.torque_shortfall_q24 != 0; /* in the previous period */
+    /* The duties act from one to two periods after the sample: the observer has predicted the first period. */
+    const int32_t step = fixed_multiply_high(observer->speed_q22, parameters->observer.angle_step_q32);
+    const uint32_t angle_in_two_periods = (uint32_t)(observer->angle_q64 >> 32) + (uint32_t)step;
+    const uint32_t advance = (angle_in_two_periods - measured->angle) * rotor_poles;
+    uint32_t phase_angle[HAL_PHASES_MAX];
+    uint32_t phase_angle_ahead[HAL_PHASES_MAX];
+    for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
+        phase_angle[phase] = measured_phase_angle(parameters, &state->misalignment, measured, phase);
+        phase_angle_ahead[phase] = phase_angle[phase] + advance;
+    }
+    adapt_misalignment(parameters, state, measured, phase_angle, voltage_limited);
+    const int32_t trimmed_q24 = torque_trim_step(&parameters->trim, &state->trim, state->torque_reference_q24,
+                                                 measured->torque_sum_q24, voltage_limited);
+    const predictive_torque_sample_t sample = {
+        .current_q9 = measured->current_q9,
+        .flux_q29 = measured->flux_linkage_q29,
+        .angle = phase_angle_ahead,
+        .bus_voltage_q6 = measured->dc_link_voltage_q6,
+        .torque_q24 = trimmed_q24,
+        .reverse = observer->speed_q22 < 0,
+        .angle_step = (uint32_t)fixed_abs(step) * rotor_poles,
+    };
+    predictive_torque_step(&parameters->predictive, &state->predictive, parameters->tables, &sample, state->duty_q15);
+}
+
+void torque_control(const control_parameters_t *parameters, control_state_t *state,
+                    const control_measurement_t *measured) {
+    switch (parameters->torque_law) {
+    case TORQUE_LAW_HYSTERESIS:
+        hysteresis_control(parameters, state, measured);
+        break;
+    case TORQUE_LAW_DUTY:
+        duty_control(parameters, state, measured);
+        break;
+    case TORQUE_LAW_PREDICTIVE:
+        predictive_control(parameters, state, measured);
+        break;
+    }
+}
+
+bool torque_control_voltage_saturated(const control_parameters_t *parameters, const control_state_t *state) {
+    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
+        return state->predictive.torque_shortfall_q24 != 0;
+    }
+    for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
+        if (state->duty_q15[phase] == MODULATOR_DUTY_ONE_Q15) {
+            return true;
+        }
+    }
+    return false;
+}

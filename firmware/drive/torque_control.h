@@ -1,0 +1,19 @@
+/* Torque control step of the control interrupt: duties from the torque reference. */
+#ifndef DRIVE_TORQUE_CONTROL_H
+#define DRIVE_TORQUE_CONTROL_H
+
+#include <stdbool.h>
+
+#include "drive/control.h"
+
+/* Resets the torque controllers for the next run. */
+void torque_control_reset(const control_parameters_t *parameters, control_state_t *state);
+
+/* Sets the duties of all phases by the configured law. The observer has predicted the coming sample before. */
+void torque_control(const control_parameters_t *parameters, control_state_t *state,
+                    const control_measurement_t *measured);
+
+/* True when the last period in RUN was limited by the DC-link voltage. [both] */
+bool torque_control_voltage_saturated(const control_parameters_t *parameters, const control_state_t *state);
+
+#endif
