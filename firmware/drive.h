@@ -1,6 +1,6 @@
 /* The drive: what a board's main program starts, calls from its interrupt and calls from its loop. */
-#ifndef DRIVE_DRIVE_H
-#define DRIVE_DRIVE_H
+#ifndef DRIVE_H
+#define DRIVE_H
 
 #include <stdbool.h>
 #include <stdint.h>

@@ -6,10 +6,10 @@
 #include "comms/units.h"
 #include "drive_codec.h"
 
-static_assert(COMMAND_OFF == DRIVE_DRIVE_COMMAND_REQUEST_OFF_CHOICE, "as in drive.dbc");
-static_assert(COMMAND_RUN == DRIVE_DRIVE_COMMAND_REQUEST_RUN_CHOICE, "as in drive.dbc");
-static_assert(COMMAND_STOP == DRIVE_DRIVE_COMMAND_REQUEST_STOP_CHOICE, "as in drive.dbc");
-static_assert(COMMAND_CLEAR_FAULT == DRIVE_DRIVE_COMMAND_REQUEST_CLEAR_FAULT_CHOICE, "as in drive.dbc");
+static_assert(COMMAND_OFF == DRIVE_COMMAND_REQUEST_OFF_CHOICE, "as in drive.dbc");
+static_assert(COMMAND_RUN == DRIVE_COMMAND_REQUEST_RUN_CHOICE, "as in drive.dbc");
+static_assert(COMMAND_STOP == DRIVE_COMMAND_REQUEST_STOP_CHOICE, "as in drive.dbc");
+static_assert(COMMAND_CLEAR_FAULT == DRIVE_COMMAND_REQUEST_CLEAR_FAULT_CHOICE, "as in drive.dbc");
 
 /* The only bits of a frame to the drive that no signal covers: they must be zero, so that they can get a meaning. */
 #define PARAMETER_REQUEST_RESERVED_BYTE 3
@@ -33,7 +33,7 @@ static commands_frame_t refuse(uint16_t *counter) {
 static commands_frame_t take_command(commands_t *commands, const hal_can_frame_t *frame, uint32_t time_us,
                                      command_t *command) {
     commands_counters_t *counters = &commands->counters;
-    if (frame->length != DRIVE_DRIVE_COMMAND_LENGTH) {
+    if (frame->length != DRIVE_COMMAND_LENGTH) {
         return refuse(&counters->wrong_length);
     }
     switch (e2e_check(&commands->receiver, frame->data, frame->length)) {
@@ -48,10 +48,10 @@ static commands_frame_t take_command(commands_t *commands, const hal_can_frame_t
     }
     commands->heard_us = time_us;
 
-    struct drive_drive_command_t message;
-    drive_drive_command_unpack(&message, frame->data, frame->length);
-    if (!drive_drive_command_request_is_in_range(message.request) ||
-        !drive_drive_command_speed_reference_rpm_is_in_range(message.speed_reference_rpm)) {
+    struct drive_command_t message;
+    drive_command_unpack(&message, frame->data, frame->length);
+    if (!drive_command_request_is_in_range(message.request) ||
+        !drive_command_speed_reference_rpm_is_in_range(message.speed_reference_rpm)) {
         return refuse(&counters->out_of_range);
     }
     counter_add(&counters->accepted, 1);
@@ -67,7 +67,7 @@ commands_frame_t commands_take(commands_t *commands, const hal_can_frame_t *fram
     if (frame->extended || frame->remote) {
         return refuse(&counters->unknown_frame);
     }
-    if (frame->identifier == DRIVE_DRIVE_COMMAND_FRAME_ID) {
+    if (frame->identifier == DRIVE_COMMAND_FRAME_ID) {
         return take_command(commands, frame, time_us, command);
     }
     if (frame->identifier == DRIVE_PARAMETER_REQUEST_FRAME_ID) {

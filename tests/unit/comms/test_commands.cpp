@@ -68,7 +68,7 @@ TEST_F(Commands, every_length_but_the_right_one_is_refused) {
     for (int length = 0; length < 16; length++) {
         hal_can_frame_t frame = command_frame(1);
         frame.length = uint8_t(length);
-        if (length != DRIVE_DRIVE_COMMAND_LENGTH) {
+        if (length != DRIVE_COMMAND_LENGTH) {
             expect_refused(frame, &commands.counters.wrong_length);
         }
         frame.identifier = DRIVE_PARAMETER_REQUEST_FRAME_ID;
@@ -84,7 +84,7 @@ TEST_F(Commands, every_unknown_standard_identifier_is_refused) {
         hal_can_frame_t frame = command_frame(1);
         frame.identifier = identifier;
         frame.length = 8;
-        if (identifier != DRIVE_DRIVE_COMMAND_FRAME_ID && identifier != DRIVE_PARAMETER_REQUEST_FRAME_ID) {
+        if (identifier != DRIVE_COMMAND_FRAME_ID && identifier != DRIVE_PARAMETER_REQUEST_FRAME_ID) {
             expect_refused(frame, &commands.counters.unknown_frame);
         }
     }
@@ -95,13 +95,13 @@ TEST_F(Commands, extended_frames_are_refused_whatever_their_low_bits) {
     for (int i = 0; i < 10000; i++) {
         hal_can_frame_t frame = command_frame(1);
         frame.extended = true;
-        frame.identifier = i == 0 ? DRIVE_DRIVE_COMMAND_FRAME_ID : random() & 0x1FFFFFFFu;
+        frame.identifier = i == 0 ? DRIVE_COMMAND_FRAME_ID : random() & 0x1FFFFFFFu;
         expect_refused(frame, &commands.counters.unknown_frame);
     }
 }
 
 TEST_F(Commands, remote_frames_are_refused) {
-    for (const uint32_t identifier : {DRIVE_DRIVE_COMMAND_FRAME_ID, DRIVE_PARAMETER_REQUEST_FRAME_ID, 0x123u}) {
+    for (const uint32_t identifier : {DRIVE_COMMAND_FRAME_ID, DRIVE_PARAMETER_REQUEST_FRAME_ID, 0x123u}) {
         hal_can_frame_t frame = command_frame(1);
         frame.remote = true;
         frame.identifier = identifier;
@@ -111,7 +111,7 @@ TEST_F(Commands, remote_frames_are_refused) {
 
 TEST_F(Commands, a_damaged_command_is_refused) {
     take(command_frame(1));
-    for (unsigned bit = 0; bit < 8 * DRIVE_DRIVE_COMMAND_LENGTH; bit++) {
+    for (unsigned bit = 0; bit < 8 * DRIVE_COMMAND_LENGTH; bit++) {
         hal_can_frame_t frame = command_frame(2);
         frame.data[bit / 8] = uint8_t(frame.data[bit / 8] ^ (1u << bit % 8));
         expect_refused(frame, &commands.counters.wrong_checksum);
@@ -193,8 +193,8 @@ TEST_F(Commands, random_frames_are_refused) {
     unsigned accepted = 0;
     for (int i = 0; i < 100000; i++) {
         hal_can_frame_t frame{};
-        frame.identifier = DRIVE_DRIVE_COMMAND_FRAME_ID;
-        frame.length = DRIVE_DRIVE_COMMAND_LENGTH;
+        frame.identifier = DRIVE_COMMAND_FRAME_ID;
+        frame.length = DRIVE_COMMAND_LENGTH;
         for (uint8_t &byte : frame.data) {
             byte = uint8_t(random());
         }

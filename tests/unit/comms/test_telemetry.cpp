@@ -65,8 +65,8 @@ bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
 
 namespace {
 
-constexpr uint8_t STATE_RUN = DRIVE_DRIVE_STATUS_STATE_RUN_CHOICE;
-constexpr uint8_t STATE_FAULT = DRIVE_DRIVE_STATUS_STATE_FAULT_CHOICE;
+constexpr uint8_t STATE_RUN = DRIVE_STATUS_STATE_RUN_CHOICE;
+constexpr uint8_t STATE_FAULT = DRIVE_STATUS_STATE_FAULT_CHOICE;
 constexpr uint32_t STEP_US = 25;
 constexpr uint32_t FRAME_US = 125; // a frame on the bus, rounded to steps
 
@@ -121,17 +121,17 @@ class Comms : public testing::Test {
 TEST_F(Comms, frames_come_at_their_rates) {
     run(1003000);
     // 1003 cycles; the last may still be on its way
-    EXPECT_NEAR(bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 1003, 1);
-    EXPECT_NEAR(bus.count(DRIVE_DRIVE_MOTION_FRAME_ID), 1003, 1);
-    EXPECT_NEAR(bus.count(DRIVE_DRIVE_TORQUE_FRAME_ID), 1003, 1);
-    EXPECT_NEAR(bus.count(DRIVE_DRIVE_CURRENTS_FRAME_ID), 1003, 1);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_BP_PID_FRAME_ID), 101u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_TRIM_FRAME_ID), 101u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 11u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_COMMAND_COUNTERS_FRAME_ID), 11u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_BUS_COUNTERS_FRAME_ID), 11u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_PROCESSOR_FRAME_ID), 11u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 0u);
+    EXPECT_NEAR(bus.count(DRIVE_STATUS_FRAME_ID), 1003, 1);
+    EXPECT_NEAR(bus.count(DRIVE_MOTION_FRAME_ID), 1003, 1);
+    EXPECT_NEAR(bus.count(DRIVE_TORQUE_FRAME_ID), 1003, 1);
+    EXPECT_NEAR(bus.count(DRIVE_CURRENTS_FRAME_ID), 1003, 1);
+    EXPECT_EQ(bus.count(DRIVE_BP_PID_FRAME_ID), 101u);
+    EXPECT_EQ(bus.count(DRIVE_TRIM_FRAME_ID), 101u);
+    EXPECT_EQ(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_COMMAND_COUNTERS_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_BUS_COUNTERS_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_PROCESSOR_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 0u);
     EXPECT_EQ(comms.telemetry.dropped, 0);
 }
 
@@ -161,47 +161,47 @@ TEST_F(Comms, signals_carry_the_snapshot) {
     snapshot.late_interrupts = 70000;
     run(3000);
 
-    drive_drive_status_t status;
-    drive_drive_status_unpack(&status, first(DRIVE_DRIVE_STATUS_FRAME_ID).data, 8);
+    drive_status_t status;
+    drive_status_unpack(&status, first(DRIVE_STATUS_FRAME_ID).data, 8);
     EXPECT_EQ(status.time_us, 0u);
     EXPECT_EQ(status.state, STATE_RUN);
     EXPECT_EQ(status.controller, 2);
     EXPECT_EQ(status.fault, 5);
     EXPECT_EQ(status.voltage_saturated, 1);
-    drive_drive_motion_t motion;
-    drive_drive_motion_unpack(&motion, first(DRIVE_DRIVE_MOTION_FRAME_ID).data, 8);
+    drive_motion_t motion;
+    drive_motion_unpack(&motion, first(DRIVE_MOTION_FRAME_ID).data, 8);
     EXPECT_EQ(motion.speed_rpm, -600000);
     EXPECT_EQ(motion.speed_reference_rpm, 150000);
     EXPECT_EQ(motion.rotor_angle_deg, 0x4000);
-    drive_drive_torque_t torque;
-    drive_drive_torque_unpack(&torque, first(DRIVE_DRIVE_TORQUE_FRAME_ID).data, 8);
+    drive_torque_t torque;
+    drive_torque_unpack(&torque, first(DRIVE_TORQUE_FRAME_ID).data, 8);
     EXPECT_EQ(torque.torque_reference_nm, 4890); // 19.1 N m is 4889.6 LSB
     EXPECT_EQ(torque.torque_estimate_nm, 32767);
     EXPECT_EQ(torque.load_torque_estimate_nm, -2048);
     EXPECT_EQ(torque.bus_voltage_v, 15360);
-    drive_drive_currents_t currents;
-    drive_drive_currents_unpack(&currents, first(DRIVE_DRIVE_CURRENTS_FRAME_ID).data, 8);
+    drive_currents_t currents;
+    drive_currents_unpack(&currents, first(DRIVE_CURRENTS_FRAME_ID).data, 8);
     EXPECT_EQ(currents.current_a_a, 10240);
     EXPECT_EQ(currents.current_d_a, 65535);
-    drive_drive_bp_pid_t gains;
-    drive_drive_bp_pid_unpack(&gains, first(DRIVE_DRIVE_BP_PID_FRAME_ID).data, 8);
+    drive_bp_pid_t gains;
+    drive_bp_pid_unpack(&gains, first(DRIVE_BP_PID_FRAME_ID).data, 8);
     EXPECT_EQ(gains.kp_per_nm, 16384);
     EXPECT_EQ(gains.kd_per_nm, 65535);
     EXPECT_EQ(gains.duty, -32768);
-    drive_drive_trim_t trim;
-    drive_drive_trim_unpack(&trim, first(DRIVE_DRIVE_TRIM_FRAME_ID).data, 8);
+    drive_trim_t trim;
+    drive_trim_unpack(&trim, first(DRIVE_TRIM_FRAME_ID).data, 8);
     EXPECT_EQ(trim.trim_torque_nm, -768);
     EXPECT_EQ(trim.misalignment_deg, 256);
     EXPECT_EQ(trim.torque_missing_nm, 32767);
     EXPECT_EQ(trim.observer_bandwidth_rad_s, 8000);
-    drive_drive_processor_t processor;
-    drive_drive_processor_unpack(&processor, first(DRIVE_DRIVE_PROCESSOR_FRAME_ID).data, 8);
+    drive_processor_t processor;
+    drive_processor_unpack(&processor, first(DRIVE_PROCESSOR_FRAME_ID).data, 8);
     EXPECT_EQ(processor.used_us, 3000);
     EXPECT_EQ(processor.worst_us, 4999);
     EXPECT_EQ(processor.available_us, 5000);
     EXPECT_EQ(processor.late_interrupts, 65535);
-    drive_drive_heartbeat_t heartbeat;
-    drive_drive_heartbeat_unpack(&heartbeat, first(DRIVE_DRIVE_HEARTBEAT_FRAME_ID).data, 8);
+    drive_heartbeat_t heartbeat;
+    drive_heartbeat_unpack(&heartbeat, first(DRIVE_HEARTBEAT_FRAME_ID).data, 8);
     EXPECT_EQ(heartbeat.state, STATE_RUN);
     EXPECT_EQ(heartbeat.controller, 2);
     EXPECT_EQ(heartbeat.phases, 3);
@@ -220,19 +220,19 @@ TEST_F(Comms, a_fault_is_reported_with_the_next_cycle_and_every_100_ms) {
     snapshot.last_fault.current_max_q9 = 36000;
     snapshot.last_fault.torque_reference_q24 = 1 << 24;
     run(12000);
-    ASSERT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 1u);
-    ASSERT_EQ(bus.count(DRIVE_DRIVE_FAULT_SNAPSHOT_FRAME_ID), 1u);
+    ASSERT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 1u);
+    ASSERT_EQ(bus.count(DRIVE_FAULT_SNAPSHOT_FRAME_ID), 1u);
     for (const auto &frame : bus.sent) {
-        if (frame.identifier == DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID) {
-            drive_drive_fault_cause_t cause;
-            drive_drive_fault_cause_unpack(&cause, frame.data, 8);
+        if (frame.identifier == DRIVE_FAULT_CAUSE_FRAME_ID) {
+            drive_fault_cause_t cause;
+            drive_fault_cause_unpack(&cause, frame.data, 8);
             EXPECT_EQ(cause.time_us, 10400u);
             EXPECT_EQ(cause.fault, 1);
             EXPECT_EQ(cause.state, STATE_RUN);
             EXPECT_EQ(cause.checks, 0x0022);
-        } else if (frame.identifier == DRIVE_DRIVE_FAULT_SNAPSHOT_FRAME_ID) {
-            drive_drive_fault_snapshot_t values;
-            drive_drive_fault_snapshot_unpack(&values, frame.data, 8);
+        } else if (frame.identifier == DRIVE_FAULT_SNAPSHOT_FRAME_ID) {
+            drive_fault_snapshot_t values;
+            drive_fault_snapshot_unpack(&values, frame.data, 8);
             EXPECT_EQ(values.speed_rpm, -4000); // 1000 r/min in quarters
             EXPECT_EQ(values.bus_voltage_v, 15360);
             EXPECT_EQ(values.current_max_a, 36000);
@@ -240,13 +240,13 @@ TEST_F(Comms, a_fault_is_reported_with_the_next_cycle_and_every_100_ms) {
         }
     }
     run(211900);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 3u);
+    EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 3u);
     snapshot.last_fault.time_us = 211900; // cleared and another between two cycles
     run(213000);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
+    EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
     snapshot.state = STATE_RUN;
     run(500000);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
+    EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
 }
 
 TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
@@ -255,17 +255,16 @@ TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
     EXPECT_GT(dropped, 0);
     run(60000);
     const std::vector<hal_can_frame_t> &sent = bus.sent;
-    drive_drive_status_t status;
+    drive_status_t status;
     std::vector<int> cycles;
     for (size_t i = 0; i < sent.size(); i++) {
-        if (sent[i].identifier == DRIVE_DRIVE_STATUS_FRAME_ID && i + 3 < sent.size()) {
-            drive_drive_status_unpack(&status, sent[i].data, 8);
+        if (sent[i].identifier == DRIVE_STATUS_FRAME_ID && i + 3 < sent.size()) {
+            drive_status_unpack(&status, sent[i].data, 8);
             cycles.push_back(status.cycle);
         }
     }
-    for (const uint32_t identifier :
-         {DRIVE_DRIVE_MOTION_FRAME_ID, DRIVE_DRIVE_TORQUE_FRAME_ID, DRIVE_DRIVE_CURRENTS_FRAME_ID}) {
-        EXPECT_NEAR(bus.count(identifier), bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 1);
+    for (const uint32_t identifier : {DRIVE_MOTION_FRAME_ID, DRIVE_TORQUE_FRAME_ID, DRIVE_CURRENTS_FRAME_ID}) {
+        EXPECT_NEAR(bus.count(identifier), bus.count(DRIVE_STATUS_FRAME_ID), 1);
     }
     ASSERT_GE(cycles.size(), 4u);
     EXPECT_EQ(cycles[0], 0); // the oldest
@@ -282,11 +281,11 @@ TEST_F(Comms, dropped_frames_are_counted_exactly) {
 
 TEST_F(Comms, others_above_the_heartbeat_cannot_block_telemetry) {
     run(1990500, 0x700);
-    EXPECT_NEAR(bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 1991, 1);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 0u);
+    EXPECT_NEAR(bus.count(DRIVE_STATUS_FRAME_ID), 1991, 1);
+    EXPECT_EQ(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 0u);
     EXPECT_EQ(comms.telemetry.dropped, 19); // the heartbeats behind the one that waits
     run(2200000);
-    EXPECT_GE(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 2u);
+    EXPECT_GE(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 2u);
     EXPECT_EQ(comms.telemetry.dropped, 19);
 }
 
@@ -296,9 +295,9 @@ TEST_F(Comms, missed_cycles_show_in_the_cycle_number_and_the_grid_stays) {
     run(9500);
     std::vector<std::pair<int, uint32_t>> cycles;
     for (const auto &frame : bus.sent) {
-        if (frame.identifier == DRIVE_DRIVE_STATUS_FRAME_ID) {
-            drive_drive_status_t status;
-            drive_drive_status_unpack(&status, frame.data, 8);
+        if (frame.identifier == DRIVE_STATUS_FRAME_ID) {
+            drive_status_t status;
+            drive_status_unpack(&status, frame.data, 8);
             cycles.emplace_back(status.cycle, status.time_us);
         }
     }
@@ -327,7 +326,7 @@ TEST_F(Comms, cycles_go_on_across_the_wrap_of_the_clock) {
         }
         comms_background(&comms, &bus, &parameters, true, start + elapsed);
     }
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 10u);
+    EXPECT_EQ(bus.count(DRIVE_STATUS_FRAME_ID), 10u);
 }
 
 TEST_F(Comms, every_command_is_seen_in_order) {
@@ -382,20 +381,20 @@ TEST_F(Comms, parameters_can_be_written_over_the_bus) {
 
 TEST_F(Comms, counters_are_reported) {
     bus.received.push_back(hal_can_frame_t{0x123, false, false, 8, {}});
-    bus.received.push_back(hal_can_frame_t{DRIVE_DRIVE_COMMAND_FRAME_ID, false, false, 6, {}});
-    bus.received.push_back(hal_can_frame_t{DRIVE_DRIVE_COMMAND_FRAME_ID, false, false, 7, {}});
+    bus.received.push_back(hal_can_frame_t{DRIVE_COMMAND_FRAME_ID, false, false, 6, {}});
+    bus.received.push_back(hal_can_frame_t{DRIVE_COMMAND_FRAME_ID, false, false, 7, {}});
     bus.received.push_back(command(1, COMMAND_STOP));
     bus.received.push_back(command(1, COMMAND_STOP));
     bus.received.push_back(command(2, 4));
     bus.overflows = 70000;
     run(105000);
-    drive_drive_command_counters_t refused{};
-    drive_drive_bus_counters_t counters{};
+    drive_command_counters_t refused{};
+    drive_bus_counters_t counters{};
     for (const auto &frame : bus.sent) {
-        if (frame.identifier == DRIVE_DRIVE_COMMAND_COUNTERS_FRAME_ID) {
-            drive_drive_command_counters_unpack(&refused, frame.data, 8);
-        } else if (frame.identifier == DRIVE_DRIVE_BUS_COUNTERS_FRAME_ID) {
-            drive_drive_bus_counters_unpack(&counters, frame.data, 8);
+        if (frame.identifier == DRIVE_COMMAND_COUNTERS_FRAME_ID) {
+            drive_command_counters_unpack(&refused, frame.data, 8);
+        } else if (frame.identifier == DRIVE_BUS_COUNTERS_FRAME_ID) {
+            drive_bus_counters_unpack(&counters, frame.data, 8);
         }
     }
     EXPECT_EQ(refused.wrong_length, 1);
