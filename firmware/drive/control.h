@@ -28,13 +28,6 @@
 #include "hal_encoder.h"
 #include "hal_pwm.h"
 
-/* Numbers are those of drive.dbc and of the parameter `controller`. */
-typedef enum {
-    DRIVE_CONTROLLER_TRADITIONAL, /* PI, hysteresis DITC */
-    DRIVE_CONTROLLER_PAPER,       /* sliding mode, BP-PID, DITC by duty */
-    DRIVE_CONTROLLER_SALIENT      /* sliding mode, torque sharing, predictive flux PWM with BP-PID trim */
-} drive_controller_t;
-
 /* Read only in the interrupt; derived from the parameters by configure_control. */
 typedef struct {
     const machine_tables_t *tables;
@@ -103,24 +96,6 @@ typedef struct {
     command_t command; /* the last accepted one; request off before the first */
 } control_sample_t;
 
-/* For whoever watches: put together when somebody asks, which costs the interrupt nothing. */
-typedef struct {
-    uint32_t angle; /* measured, 2^-32 turn */
-    int32_t speed_q22;
-    int32_t speed_reference_q22;
-    int32_t torque_reference_q24;
-    int32_t torque_q24; /* estimate, all phases */
-    int32_t load_torque_q24;
-    uint16_t current_q9[HAL_PHASES_MAX];
-    uint16_t bus_voltage_q6;
-    int32_t duty_q15; /* of the BP-PID */
-    bool voltage_saturated;
-    /* Of the salient controller, 0 with the others. */
-    int32_t trim_torque_q24;
-    int32_t torque_missing_q24; /* reference less what the voltage allows */
-    uint16_t observer_bandwidth_rad_s;
-} control_diagnostics_t;
-
 /* INITIALISE, everything at rest, the laws prepared. */
 void control_reset(const control_parameters_t *parameters, control_state_t *state);
 
@@ -136,8 +111,5 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
 static inline bool control_gives_duties(const control_parameters_t *parameters) {
     return parameters->controller == DRIVE_CONTROLLER_PAPER && parameters->duty.pid.mode != BP_PID_OFF;
 }
-
-/* What the last period saw and did, by a state that no interrupt changes meanwhile. [both] */
-control_diagnostics_t control_diagnose(const control_parameters_t *parameters, const control_state_t *state);
 
 #endif

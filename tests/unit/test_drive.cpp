@@ -279,7 +279,7 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
     periods(1000);
     hal.from_drive.clear();
     periods(400); // a whole slow cycle
-    const control_diagnostics_t d = control_diagnose(&drive.control_parameters, &drive.control);
+    const control_state_t &control = drive.control;
     unsigned seen = 0;
     for (const hal_can_frame_t &frame : hal.from_drive) {
         if (frame.identifier == DRIVE_STATUS_FRAME_ID) {
@@ -293,8 +293,8 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
             // The rotor stands and the currents are held, so every cycle says the same.
             drive_torque_t torque{};
             drive_torque_unpack(&torque, frame.data, frame.length);
-            EXPECT_EQ(torque.torque_reference_nm, (d.torque_reference_q24 + 32768) >> 16);
-            EXPECT_EQ(torque.torque_estimate_nm, (d.torque_q24 + 32768) >> 16);
+            EXPECT_EQ(torque.torque_reference_nm, (control.torque_reference_q24 + 32768) >> 16);
+            EXPECT_EQ(torque.torque_estimate_nm, (control.estimate.torque_sum_q24 + 32768) >> 16);
             EXPECT_EQ(torque.bus_voltage_v, 240 << 6);
             seen |= 2;
         } else if (frame.identifier == DRIVE_CURRENTS_FRAME_ID) {

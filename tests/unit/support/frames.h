@@ -21,7 +21,7 @@ inline hal_can_frame_t command(uint8_t counter, unsigned request, int32_t milli_
     frame.identifier = DRIVE_COMMAND_FRAME_ID;
     frame.length = DRIVE_COMMAND_LENGTH;
     drive_command_pack(frame.data, &message, sizeof frame.data);
-    e2e_protect(COMMANDS_DATA_ID, counter, frame.data, frame.length);
+    e2e_protect(DRIVE_COMMAND_E2E_DATA_ID, counter, frame.data, frame.length);
     return frame;
 }
 
