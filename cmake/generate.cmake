@@ -3,6 +3,9 @@
 set(SALIENT_GENERATOR_SOURCES ${CMAKE_SOURCE_DIR}/tools/src/salient)
 set(SALIENT_GENERATOR ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m)
 
+set(SALIENT_CODEC_GENERATOR generate/codec.py generate/enumerations.py generate/telemetry.py generate/error.py
+    bus/database_hash.py)
+
 # Machines that drives are built for: the bundled ones, and one more on request.
 if(SALIENT_MACHINE_FILE AND NOT EXISTS ${SALIENT_MACHINE_FILE})
     message(FATAL_ERROR "SALIENT_MACHINE_FILE: ${SALIENT_MACHINE_FILE}: no such file")
@@ -15,23 +18,32 @@ if(SALIENT_MACHINE_FILE)
     list(APPEND SALIENT_MACHINES ${name})
 endif()
 
-# salient_generate_codec(TARGET DBC [INTEGER]): a static library with <name>.h/.c generated from DBC.
-# INTEGER leaves every floating-point conversion out.
+# salient_generate_codec(TARGET DBC [INTEGER] [NODE name]): a static library with <name>_codec.h/.c generated from DBC.
+# INTEGER leaves every floating-point conversion out. NODE adds <name>_enumerations.h, and <name>_telemetry.h/.c with the
+# cyclic messages of that node.
 function(salient_generate_codec target dbc)
-    cmake_parse_arguments(ARG "INTEGER" "" "" ${ARGN})
+    cmake_parse_arguments(ARG "INTEGER" "NODE" "" ${ARGN})
     get_filename_component(name ${dbc} NAME_WE)
     set(out ${CMAKE_CURRENT_BINARY_DIR}/codec)
+    set(outputs ${out}/${name}_codec.c ${out}/${name}_codec.h)
+    set(sources ${out}/${name}_codec.c)
     set(flags)
     if(ARG_INTEGER)
-        set(flags --integer)
+        list(APPEND flags --integer)
     endif()
+    if(ARG_NODE)
+        list(APPEND flags --node ${ARG_NODE})
+        list(APPEND outputs ${out}/${name}_enumerations.h ${out}/${name}_telemetry.c ${out}/${name}_telemetry.h)
+        list(APPEND sources ${out}/${name}_telemetry.c)
+    endif()
+    list(TRANSFORM SALIENT_CODEC_GENERATOR PREPEND ${SALIENT_GENERATOR_SOURCES}/ OUTPUT_VARIABLE generator)
     add_custom_command(
-        OUTPUT ${out}/${name}_codec.c ${out}/${name}_codec.h
+        OUTPUT ${outputs}
         COMMAND ${SALIENT_GENERATOR} salient.generate.codec ${flags} ${dbc} ${out}
-        DEPENDS ${dbc} ${SALIENT_GENERATOR_SOURCES}/generate/codec.py
+        DEPENDS ${dbc} ${generator}
         COMMENT "CAN codec from ${name}.dbc"
         VERBATIM)
-    add_library(${target} STATIC ${out}/${name}_codec.c)
+    add_library(${target} STATIC ${sources})
     target_include_directories(${target} PUBLIC ${out})
 endfunction()
 

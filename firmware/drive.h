@@ -1,6 +1,6 @@
-/* The drive: what a board's main program starts, calls from its interrupt and calls from its loop. */
-#ifndef DRIVE_DRIVE_H
-#define DRIVE_DRIVE_H
+/* The drive: called by a board's main program, its interrupt and its loop. */
+#ifndef DRIVE_H
+#define DRIVE_H
 
 #include <stdbool.h>
 #include <stdint.h>
@@ -11,36 +11,37 @@
 #include "drive/parameters.h"
 #include "hal.h"
 
-/* One drive. The caller allocates it; only the functions below touch it. */
+/* One drive. The caller allocates it; only the functions below and telemetry_collect() access it. */
 typedef struct {
     hal_t *hal;
-    /* Of the interrupt; read by the background with the interrupt kept out. */
+    /* Written by the interrupt; read by the background with the interrupt masked. */
     control_sample_t sample;
-    /* Written by the background with the interrupt kept out. */
-    command_t command; /* the last accepted one */
+    /* Last accepted command; this and the next are written by the background with the interrupt masked. */
+    command_t command;
     control_parameters_t control_parameters;
-    /* Of the interrupt; the background prepares its laws for new parameters, the interrupt kept out. */
+    /* Written by the interrupt; the background prepares the control laws for new parameters with the interrupt masked.
+     */
     control_state_t control;
-    /* The interrupt's time on the processor: nobody acts on it. What a late interrupt does is in drive/protection.h. */
-    uint32_t used_ticks;      /* from trigger to end, of the last one, HAL_PWM_TICK_NS */
-    uint32_t worst_ticks;     /* of the longest since start */
-    uint32_t late_interrupts; /* that ended after the next trigger, since start */
-    /* Of the background. */
+    /* Execution time of the interrupt, for telemetry only; overruns are handled by drive/protection.h. */
+    uint32_t used_ticks;      /* last interrupt, from trigger to end, HAL_PWM_TICK_NS */
+    uint32_t worst_ticks;     /* maximum since start */
+    uint32_t late_interrupts; /* interrupts that ended after the next trigger, since start */
+    /* Used by the background only. */
     const machine_tables_t *tables;
     uint32_t control_rate_hz;
     parameters_t parameters;
-    uint32_t configured_changes; /* parameters.changes that control_parameters stand for */
+    uint32_t applied_revision; /* parameters.revision from which control_parameters are derived */
     comms_t comms;
 } drive_t;
 
-/* Prepares the drive and starts the timer. False, and nothing started, for a control rate that is not allowed. Keeps
- * hal and tables. [background, before anything else] */
+/* Prepares the drive and starts the timer. Returns false, and starts nothing, for a control rate that the timer cannot
+ * make. hal and tables must outlive the drive. [background, before anything else] */
 bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, const drive_config_t *config);
 
 /* One control period. [interrupt] */
 void drive_control_interrupt(drive_t *drive);
 
-/* Commands, telemetry, parameters; cheap when nothing is due. [background] */
+/* Commands, telemetry, parameters; returns immediately when nothing is due. [background] */
 void drive_background(drive_t *drive);
 
 #endif

@@ -6,57 +6,57 @@
 
 /* One signal of RIG_SET: range check and conversion are the generated codec's. */
 #define READ(signal)                                                                                                   \
-    in_range = rig_rig_set_##signal##_is_in_range(message.signal);                                                     \
-    setting->value = rig_rig_set_##signal##_decode(message.signal);                                                    \
+    in_range = rig_set_##signal##_is_in_range(message.signal);                                                         \
+    setting->value = rig_set_##signal##_decode(message.signal);                                                        \
     break
 
 uint8_t quantity_decode(const uint8_t data[8], quantity_setting_t *setting) {
-    struct rig_rig_set_t message;
+    struct rig_set_t message;
     memset(&message, 0, sizeof message);
-    rig_rig_set_unpack(&message, data, RIG_RIG_SET_LENGTH);
+    rig_set_unpack(&message, data, RIG_SET_LENGTH);
     setting->quantity = message.quantity;
     setting->at_us = message.at_us;
     setting->value = 0.0;
     bool in_range = false;
     switch (message.quantity) {
-    case RIG_RIG_SET_QUANTITY_LOAD_TORQUE_NM_CHOICE:
+    case RIG_SET_QUANTITY_LOAD_TORQUE_NM_CHOICE:
         READ(load_torque_nm);
-    case RIG_RIG_SET_QUANTITY_SUPPLY_VOLTAGE_V_CHOICE:
+    case RIG_SET_QUANTITY_SUPPLY_VOLTAGE_V_CHOICE:
         READ(supply_voltage_v);
-    case RIG_RIG_SET_QUANTITY_ENCODER_FAULT_CHOICE:
+    case RIG_SET_QUANTITY_ENCODER_FAULT_CHOICE:
         READ(encoder_fault);
-    case RIG_RIG_SET_QUANTITY_INTERRUPT_TIME_US_CHOICE:
+    case RIG_SET_QUANTITY_INTERRUPT_TIME_US_CHOICE:
         READ(interrupt_time_us);
-    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_GAIN_CHOICE:
+    case RIG_SET_QUANTITY_CURRENT_SENSOR_GAIN_CHOICE:
         READ(current_sensor_gain);
-    case RIG_RIG_SET_QUANTITY_TRUTH_PERIOD_US_CHOICE:
+    case RIG_SET_QUANTITY_TRUTH_PERIOD_US_CHOICE:
         READ(truth_period_us);
-    case RIG_RIG_SET_QUANTITY_CURRENT_NOISE_A_CHOICE:
+    case RIG_SET_QUANTITY_CURRENT_NOISE_A_CHOICE:
         READ(current_noise_a);
-    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_OFFSET_A_CHOICE:
+    case RIG_SET_QUANTITY_CURRENT_SENSOR_OFFSET_A_CHOICE:
         READ(current_sensor_offset_a);
-    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_LIMIT_A_CHOICE:
+    case RIG_SET_QUANTITY_CURRENT_SENSOR_LIMIT_A_CHOICE:
         READ(current_sensor_limit_a);
-    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_DELAY_US_CHOICE:
+    case RIG_SET_QUANTITY_CURRENT_SENSOR_DELAY_US_CHOICE:
         READ(current_sensor_delay_us);
-    case RIG_RIG_SET_QUANTITY_ENCODER_ECCENTRICITY_DEG_CHOICE:
+    case RIG_SET_QUANTITY_ENCODER_ECCENTRICITY_DEG_CHOICE:
         READ(encoder_eccentricity_deg);
-    case RIG_RIG_SET_QUANTITY_FLUX_LINKAGE_GAIN_CHOICE:
+    case RIG_SET_QUANTITY_FLUX_LINKAGE_GAIN_CHOICE:
         READ(flux_linkage_gain);
-    case RIG_RIG_SET_QUANTITY_RESISTANCE_GAIN_CHOICE:
+    case RIG_SET_QUANTITY_RESISTANCE_GAIN_CHOICE:
         READ(resistance_gain);
-    case RIG_RIG_SET_QUANTITY_INERTIA_GAIN_CHOICE:
+    case RIG_SET_QUANTITY_INERTIA_GAIN_CHOICE:
         READ(inertia_gain);
-    case RIG_RIG_SET_QUANTITY_FRICTION_GAIN_CHOICE:
+    case RIG_SET_QUANTITY_FRICTION_GAIN_CHOICE:
         READ(friction_gain);
-    case RIG_RIG_SET_QUANTITY_ENCODER_OFFSET_DEG_CHOICE:
+    case RIG_SET_QUANTITY_ENCODER_OFFSET_DEG_CHOICE:
         READ(encoder_offset_deg);
-    case RIG_RIG_SET_QUANTITY_MINIMUM_PULSE_NS_CHOICE:
+    case RIG_SET_QUANTITY_MINIMUM_PULSE_NS_CHOICE:
         READ(minimum_pulse_ns);
     default:
-        return RIG_RIG_SET_REPLY_STATUS_NO_SUCH_QUANTITY_CHOICE;
+        return RIG_SET_REPLY_STATUS_NO_SUCH_QUANTITY_CHOICE;
     }
-    return in_range ? RIG_RIG_SET_REPLY_STATUS_DONE_CHOICE : RIG_RIG_SET_REPLY_STATUS_OUT_OF_RANGE_CHOICE;
+    return in_range ? RIG_SET_REPLY_STATUS_DONE_CHOICE : RIG_SET_REPLY_STATUS_OUT_OF_RANGE_CHOICE;
 }
 
 bool quantity_queue_add(quantity_queue_t *queue, uint64_t at_ns, const quantity_setting_t *setting) {

@@ -9,7 +9,7 @@
 #define QUANTITY_NEVER UINT64_MAX
 
 typedef struct {
-    uint8_t quantity; /* RIG_RIG_SET_QUANTITY_*_CHOICE */
+    uint8_t quantity; /* RIG_SET_QUANTITY_*_CHOICE */
     uint32_t at_us;   /* 0 is now */
     double value;     /* in the DBC's unit */
 } quantity_setting_t;
@@ -22,7 +22,7 @@ typedef struct {
     unsigned count;
 } quantity_queue_t;
 
-/* Reads RIG_SET; the result is a RIG_RIG_SET_REPLY_STATUS_*_CHOICE: done, no_such_quantity or out_of_range. quantity
+/* Reads RIG_SET; the result is a RIG_SET_REPLY_STATUS_*_CHOICE: done, no_such_quantity or out_of_range. quantity
  * and at_us are always read, for the answer. */
 uint8_t quantity_decode(const uint8_t data[8], quantity_setting_t *setting);
 

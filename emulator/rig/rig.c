@@ -130,62 +130,62 @@ static void apply(rig_t *rig, const quantity_setting_t *setting) {
     uint64_t now_ns = rig->board.time_ns;
     plant_gains_t gains = rig->plant.gains;
     switch (setting->quantity) {
-    case RIG_RIG_SET_QUANTITY_LOAD_TORQUE_NM_CHOICE:
+    case RIG_SET_QUANTITY_LOAD_TORQUE_NM_CHOICE:
         plant_advance(&rig->plant, now_ns);
         rig->plant.load_torque_Nm = setting->value;
         break;
-    case RIG_RIG_SET_QUANTITY_SUPPLY_VOLTAGE_V_CHOICE:
+    case RIG_SET_QUANTITY_SUPPLY_VOLTAGE_V_CHOICE:
         plant_advance(&rig->plant, now_ns);
         plant_set_supply_voltage(&rig->plant, setting->value);
         break;
-    case RIG_RIG_SET_QUANTITY_ENCODER_FAULT_CHOICE:
+    case RIG_SET_QUANTITY_ENCODER_FAULT_CHOICE:
         rig->sensors.encoder_fault = (sensors_encoder_fault_t)setting->value;
         break;
-    case RIG_RIG_SET_QUANTITY_INTERRUPT_TIME_US_CHOICE:
+    case RIG_SET_QUANTITY_INTERRUPT_TIME_US_CHOICE:
         rig->interrupt_time_ns = (uint64_t)(setting->value * (double)NS_PER_US + 0.5);
         break;
-    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_GAIN_CHOICE:
+    case RIG_SET_QUANTITY_CURRENT_SENSOR_GAIN_CHOICE:
         rig->sensors.errors.current_gain = setting->value;
         break;
-    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_OFFSET_A_CHOICE:
+    case RIG_SET_QUANTITY_CURRENT_SENSOR_OFFSET_A_CHOICE:
         rig->sensors.errors.current_offset_A = setting->value;
         break;
-    case RIG_RIG_SET_QUANTITY_CURRENT_NOISE_A_CHOICE:
+    case RIG_SET_QUANTITY_CURRENT_NOISE_A_CHOICE:
         rig->sensors.errors.current_noise_A = setting->value;
         break;
-    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_LIMIT_A_CHOICE:
+    case RIG_SET_QUANTITY_CURRENT_SENSOR_LIMIT_A_CHOICE:
         rig->sensors.errors.current_limit_A = setting->value;
         break;
-    case RIG_RIG_SET_QUANTITY_CURRENT_SENSOR_DELAY_US_CHOICE:
+    case RIG_SET_QUANTITY_CURRENT_SENSOR_DELAY_US_CHOICE:
         rig->sensors.errors.current_delay_ns = setting->value * (double)NS_PER_US;
         schedule_hold(rig);
         break;
-    case RIG_RIG_SET_QUANTITY_ENCODER_ECCENTRICITY_DEG_CHOICE:
+    case RIG_SET_QUANTITY_ENCODER_ECCENTRICITY_DEG_CHOICE:
         rig->sensors.errors.encoder_eccentricity_deg = setting->value;
         break;
-    case RIG_RIG_SET_QUANTITY_FLUX_LINKAGE_GAIN_CHOICE:
+    case RIG_SET_QUANTITY_FLUX_LINKAGE_GAIN_CHOICE:
         gains.flux_linkage = setting->value;
         set_gains(rig, &gains);
         break;
-    case RIG_RIG_SET_QUANTITY_RESISTANCE_GAIN_CHOICE:
+    case RIG_SET_QUANTITY_RESISTANCE_GAIN_CHOICE:
         gains.resistance = setting->value;
         set_gains(rig, &gains);
         break;
-    case RIG_RIG_SET_QUANTITY_INERTIA_GAIN_CHOICE:
+    case RIG_SET_QUANTITY_INERTIA_GAIN_CHOICE:
         gains.inertia = setting->value;
         set_gains(rig, &gains);
         break;
-    case RIG_RIG_SET_QUANTITY_FRICTION_GAIN_CHOICE:
+    case RIG_SET_QUANTITY_FRICTION_GAIN_CHOICE:
         gains.friction = setting->value;
         set_gains(rig, &gains);
         break;
-    case RIG_RIG_SET_QUANTITY_ENCODER_OFFSET_DEG_CHOICE:
+    case RIG_SET_QUANTITY_ENCODER_OFFSET_DEG_CHOICE:
         rig->sensors.encoder_offset_deg = setting->value;
         break;
-    case RIG_RIG_SET_QUANTITY_MINIMUM_PULSE_NS_CHOICE:
+    case RIG_SET_QUANTITY_MINIMUM_PULSE_NS_CHOICE:
         rig->plant.minimum_pulse_ns = setting->value;
         break;
-    case RIG_RIG_SET_QUANTITY_TRUTH_PERIOD_US_CHOICE:
+    case RIG_SET_QUANTITY_TRUTH_PERIOD_US_CHOICE:
         /* On multiples of the period, so that two logs of one bench have the same instants. */
         rig->truth_period_ns = (uint64_t)setting->value * NS_PER_US;
         rig->truth_ns =
@@ -229,11 +229,11 @@ static void run_events(rig_t *rig, uint64_t until_ns) {
 }
 
 static void send_clock(rig_t *rig, uint8_t sequence) {
-    struct rig_rig_clock_t clock = {.sequence = sequence};
-    rig_rig_clock_set_time_ns(&clock, (int64_t)rig->board.time_ns);
-    transport_frame_t frame = {
-        .size = CAN_MTU, .classic = {.can_id = RIG_RIG_CLOCK_FRAME_ID | CAN_EFF_FLAG, .len = RIG_RIG_CLOCK_LENGTH}};
-    rig_rig_clock_pack(frame.classic.data, &clock, RIG_RIG_CLOCK_LENGTH);
+    struct rig_clock_t clock = {.sequence = sequence};
+    rig_clock_set_time_ns(&clock, (int64_t)rig->board.time_ns);
+    transport_frame_t frame = {.size = CAN_MTU,
+                               .classic = {.can_id = RIG_CLOCK_FRAME_ID | CAN_EFF_FLAG, .len = RIG_CLOCK_LENGTH}};
+    rig_clock_pack(frame.classic.data, &clock, RIG_CLOCK_LENGTH);
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_CLOCK, &frame);
 }
 
@@ -251,8 +251,8 @@ static void advance(rig_t *rig, uint64_t until_ns) {
 }
 
 static void take_run_until(rig_t *rig, uint32_t client, const uint8_t *data) {
-    struct rig_rig_run_until_t message;
-    rig_rig_run_until_unpack(&message, data, RIG_RIG_RUN_UNTIL_LENGTH);
+    struct rig_run_until_t message;
+    rig_run_until_unpack(&message, data, RIG_RUN_UNTIL_LENGTH);
     if (message.time_ns <= rig->board.time_ns || rig->run_count == RIG_RUNS_MAX) {
         send_clock(rig, message.sequence);
         return;
@@ -268,20 +268,19 @@ static void take_set(rig_t *rig, const uint8_t *data) {
     quantity_setting_t setting;
     uint8_t status = quantity_decode(data, &setting);
     uint64_t at_ns = setting.at_us * NS_PER_US;
-    if (status == RIG_RIG_SET_REPLY_STATUS_DONE_CHOICE) {
+    if (status == RIG_SET_REPLY_STATUS_DONE_CHOICE) {
         if (setting.at_us == 0 || at_ns == rig->board.time_ns) {
             apply(rig, &setting);
         } else if (at_ns < rig->board.time_ns) {
-            status = RIG_RIG_SET_REPLY_STATUS_IN_THE_PAST_CHOICE;
+            status = RIG_SET_REPLY_STATUS_IN_THE_PAST_CHOICE;
         } else if (!quantity_queue_add(&rig->settings, at_ns, &setting)) {
-            status = RIG_RIG_SET_REPLY_STATUS_QUEUE_FULL_CHOICE;
+            status = RIG_SET_REPLY_STATUS_QUEUE_FULL_CHOICE;
         }
     }
-    struct rig_rig_set_reply_t reply = {.quantity = setting.quantity, .status = status, .at_us = setting.at_us};
+    struct rig_set_reply_t reply = {.quantity = setting.quantity, .status = status, .at_us = setting.at_us};
     transport_frame_t frame = {
-        .size = CAN_MTU,
-        .classic = {.can_id = RIG_RIG_SET_REPLY_FRAME_ID | CAN_EFF_FLAG, .len = RIG_RIG_SET_REPLY_LENGTH}};
-    rig_rig_set_reply_pack(frame.classic.data, &reply, RIG_RIG_SET_REPLY_LENGTH);
+        .size = CAN_MTU, .classic = {.can_id = RIG_SET_REPLY_FRAME_ID | CAN_EFF_FLAG, .len = RIG_SET_REPLY_LENGTH}};
+    rig_set_reply_pack(frame.classic.data, &reply, RIG_SET_REPLY_LENGTH);
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_EMULATOR, &frame);
 }
 
@@ -315,9 +314,9 @@ static bool take(void *context, uint32_t client, const transport_frame_t *frame)
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_CLIENT_AT_ONCE, frame);
     if (frame->size == CAN_MTU && transport_frame_is_rig(frame) && !(frame->classic.can_id & CAN_RTR_FLAG)) {
         canid_t identifier = frame->classic.can_id & CAN_EFF_MASK;
-        if (identifier == RIG_RIG_RUN_UNTIL_FRAME_ID && frame->classic.len == RIG_RIG_RUN_UNTIL_LENGTH) {
+        if (identifier == RIG_RUN_UNTIL_FRAME_ID && frame->classic.len == RIG_RUN_UNTIL_LENGTH) {
             take_run_until(rig, client, frame->classic.data);
-        } else if (identifier == RIG_RIG_SET_FRAME_ID && frame->classic.len == RIG_RIG_SET_LENGTH) {
+        } else if (identifier == RIG_SET_FRAME_ID && frame->classic.len == RIG_SET_LENGTH) {
             take_set(rig, frame->classic.data);
         }
     }

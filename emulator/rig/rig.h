@@ -10,8 +10,8 @@
  * of each client, whatever the moment they arrived; a client's frames that were sent before another client's
  * RIG_RUN_UNTIL are taken before it. In the other paces clients are read each RIG_READ_STEP_NS of virtual time.
  */
-#ifndef RIG_RIG_H
-#define RIG_RIG_H
+#ifndef RIG_H
+#define RIG_H
 
 #include <stdbool.h>
 #include <stdint.h>

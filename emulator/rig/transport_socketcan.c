@@ -89,12 +89,12 @@ static void send_frame(socketcan_t *can, const transport_frame_t *frame) {
 }
 
 static void send_stamp(socketcan_t *can, uint64_t time_ns, uint8_t subject) {
-    struct rig_rig_stamp_t stamp;
-    rig_rig_stamp_set_time_ns(&stamp, (int64_t)time_ns);
+    struct rig_stamp_t stamp;
+    rig_stamp_set_time_ns(&stamp, (int64_t)time_ns);
     stamp.subject = subject;
-    transport_frame_t frame = {
-        .size = CAN_MTU, .classic = {.can_id = RIG_RIG_STAMP_FRAME_ID | CAN_EFF_FLAG, .len = RIG_RIG_STAMP_LENGTH}};
-    rig_rig_stamp_pack(frame.classic.data, &stamp, RIG_RIG_STAMP_LENGTH);
+    transport_frame_t frame = {.size = CAN_MTU,
+                               .classic = {.can_id = RIG_STAMP_FRAME_ID | CAN_EFF_FLAG, .len = RIG_STAMP_LENGTH}};
+    rig_stamp_pack(frame.classic.data, &stamp, RIG_STAMP_LENGTH);
     send_frame(can, &frame);
 }
 
@@ -103,17 +103,17 @@ static void socketcan_send(transport_t *transport, uint64_t time_ns, transport_o
     socketcan_t *can = (socketcan_t *)transport;
     switch (origin) {
     case TRANSPORT_FROM_EMULATOR:
-        send_stamp(can, time_ns, RIG_RIG_STAMP_SUBJECT_NEXT_CHOICE);
+        send_stamp(can, time_ns, RIG_STAMP_SUBJECT_NEXT_CHOICE);
         send_frame(can, frame);
         break;
     case TRANSPORT_CLOCK:
         send_frame(can, frame);
         break;
     case TRANSPORT_FROM_CLIENT_ON_BUS:
-        send_stamp(can, time_ns, RIG_RIG_STAMP_SUBJECT_OLDEST_ON_BUS_CHOICE);
+        send_stamp(can, time_ns, RIG_STAMP_SUBJECT_OLDEST_ON_BUS_CHOICE);
         break;
     case TRANSPORT_FROM_CLIENT_AT_ONCE:
-        send_stamp(can, time_ns, RIG_RIG_STAMP_SUBJECT_OLDEST_AT_ONCE_CHOICE);
+        send_stamp(can, time_ns, RIG_STAMP_SUBJECT_OLDEST_AT_ONCE_CHOICE);
         break;
     }
 }

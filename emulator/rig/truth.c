@@ -17,22 +17,22 @@ static uint8_t *begin(transport_frame_t *frame, canid_t identifier) {
 }
 
 void truth_pack(const plant_t *plant, transport_frame_t frames[TRUTH_FRAMES]) {
-    struct rig_rig_truth_motion_t motion;
-    motion.speed_rpm = rig_rig_truth_motion_speed_rpm_encode(plant->speed_rad_s * RPM_PER_RAD_S);
-    motion.torque_nm = rig_rig_truth_motion_torque_nm_encode(plant_torque_Nm(plant));
-    rig_rig_truth_motion_pack(begin(&frames[0], RIG_RIG_TRUTH_MOTION_FRAME_ID), &motion, 8);
+    struct rig_truth_motion_t motion;
+    motion.speed_rpm = rig_truth_motion_speed_rpm_encode(plant->speed_rad_s * RPM_PER_RAD_S);
+    motion.torque_nm = rig_truth_motion_torque_nm_encode(plant_torque_Nm(plant));
+    rig_truth_motion_pack(begin(&frames[0], RIG_TRUTH_MOTION_FRAME_ID), &motion, 8);
 
-    struct rig_rig_truth_currents_t currents;
-    rig_rig_truth_currents_set_physical_current_a_a(&currents, plant->current_A[0]);
-    rig_rig_truth_currents_set_physical_current_b_a(&currents, plant->current_A[1]);
-    rig_rig_truth_currents_set_physical_current_c_a(&currents, plant->current_A[2]);
-    rig_rig_truth_currents_set_physical_current_d_a(&currents, plant->current_A[3]);
-    rig_rig_truth_currents_pack(begin(&frames[1], RIG_RIG_TRUTH_CURRENTS_FRAME_ID), &currents, 8);
+    struct rig_truth_currents_t currents;
+    rig_truth_currents_set_physical_current_a_a(&currents, plant->current_A[0]);
+    rig_truth_currents_set_physical_current_b_a(&currents, plant->current_A[1]);
+    rig_truth_currents_set_physical_current_c_a(&currents, plant->current_A[2]);
+    rig_truth_currents_set_physical_current_d_a(&currents, plant->current_A[3]);
+    rig_truth_currents_pack(begin(&frames[1], RIG_TRUTH_CURRENTS_FRAME_ID), &currents, 8);
 
     double angle_deg = fmod(plant->rotor_angle_rad * DEG_PER_RAD, 360.0);
-    struct rig_rig_truth_bench_t bench;
-    bench.rotor_angle_deg = rig_rig_truth_bench_rotor_angle_deg_encode(angle_deg < 0.0 ? angle_deg + 360.0 : angle_deg);
-    rig_rig_truth_bench_set_physical_load_torque_nm(&bench, plant->load_torque_Nm);
-    rig_rig_truth_bench_set_physical_bus_voltage_v(&bench, plant->bus_voltage_V);
-    rig_rig_truth_bench_pack(begin(&frames[2], RIG_RIG_TRUTH_BENCH_FRAME_ID), &bench, 8);
+    struct rig_truth_bench_t bench;
+    bench.rotor_angle_deg = rig_truth_bench_rotor_angle_deg_encode(angle_deg < 0.0 ? angle_deg + 360.0 : angle_deg);
+    rig_truth_bench_set_physical_load_torque_nm(&bench, plant->load_torque_Nm);
+    rig_truth_bench_set_physical_bus_voltage_v(&bench, plant->bus_voltage_V);
+    rig_truth_bench_pack(begin(&frames[2], RIG_TRUTH_BENCH_FRAME_ID), &bench, 8);
 }

@@ -1,5 +1,5 @@
-/* Which received frames the drive believes. Every frame passes all checks or changes nothing but the counter of the
- * check that refused it. */
+/* Validation of received frames. A frame either passes all checks or changes nothing but the counter of the check that
+ * rejected it. */
 #ifndef COMMS_COMMANDS_H
 #define COMMS_COMMANDS_H
 
@@ -9,37 +9,34 @@
 #include "drive/command.h"
 #include "hal_can.h"
 
-/* Known to both ends of DRIVE_COMMAND and part of its checksum. */
-#define COMMANDS_DATA_ID 0x5A1E
-
-/* Since start; each holds at 65535. */
+/* Numbers of frames since start; each counter saturates at 65535. */
 typedef struct {
     uint16_t accepted;
-    uint16_t unknown_frame;  /* no identifier of ours, a 29-bit one, or a remote frame */
-    uint16_t wrong_length;   /* an identifier of ours with another length than the DBC's */
-    uint16_t wrong_checksum; /* of a command */
-    uint16_t wrong_counter;  /* of a command: repeated or out of sequence */
-    uint16_t out_of_range;   /* a value beyond the DBC's range, or a reserved byte that is not zero */
+    uint16_t unknown_frame;  /* unknown or 29-bit identifier, or remote frame */
+    uint16_t wrong_length;   /* known identifier with another length than the DBC's */
+    uint16_t wrong_checksum; /* command with a wrong checksum */
+    uint16_t wrong_counter;  /* command repeated or out of sequence */
+    uint16_t out_of_range;   /* value beyond the DBC's range, or a reserved byte that is not zero */
 } commands_counters_t;
 
 typedef struct {
     e2e_receiver_t receiver;
-    uint32_t heard_us; /* when the receiver accepted a frame last */
+    uint32_t last_received_us; /* time of the last frame that the receiver accepted */
     commands_counters_t counters;
 } commands_t;
 
-typedef enum { COMMANDS_REFUSED, COMMANDS_COMMAND, COMMANDS_PARAMETER_REQUEST } commands_frame_t;
+typedef enum { COMMANDS_REJECTED, COMMANDS_COMMAND, COMMANDS_PARAMETER_REQUEST } commands_frame_t;
 
-/* Counters zero; the first good command is accepted whatever its counter. */
+/* Clears the counters; the first valid command is accepted with any sequence counter. */
 void commands_init(commands_t *commands);
 
-/* Lets a sender that fell silent for longer than timeout_us start again with any counter. Call it at least once in 35
- * minutes, half a turn of the clock. [background] */
-void commands_watch(commands_t *commands, uint32_t time_us, uint32_t timeout_us);
+/* Restarts the receiver after more than timeout_us without a command, so that a sender may start again with any
+ * counter. Call it at least once in 35 minutes, half the period of the clock. [background] */
+void commands_check_timeout(commands_t *commands, uint32_t time_us, uint32_t timeout_us);
 
-/* Checks a received frame. COMMANDS_COMMAND: *command is written. COMMANDS_PARAMETER_REQUEST: a well-formed request,
- * not looked into. COMMANDS_REFUSED: counted, *command left alone. [background] */
-commands_frame_t commands_take(commands_t *commands, const hal_can_frame_t *frame, uint32_t time_us,
-                               command_t *command);
+/* Checks a received frame. COMMANDS_COMMAND: *command is written. COMMANDS_PARAMETER_REQUEST: a request of the right
+ * length, its contents not checked. COMMANDS_REJECTED: counted, *command unchanged. [background] */
+commands_frame_t commands_receive(commands_t *commands, const hal_can_frame_t *frame, uint32_t time_us,
+                                  command_t *command);
 
 #endif

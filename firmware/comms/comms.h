@@ -1,14 +1,14 @@
-/* The drive's side of the bus: commands and parameter requests in, telemetry and parameter responses out.
+/* CAN interface of the drive: receives commands and parameter requests, sends telemetry and parameter responses.
  *
- * All of it runs in the background. A caller's loop, cheap when nothing is due:
+ * All functions run in the background. The caller's loop:
  *
  *     const uint32_t time_us = hal_time_us(hal);
  *     if (comms_telemetry_due(&comms, time_us)) {
- *         ... fill a telemetry_snapshot_t, with the control interrupt kept out ...
- *         comms_telemetry(&comms, hal, &snapshot);
+ *         ... collect a drive_telemetry_t, with the control interrupt masked ...
+ *         comms_telemetry(&comms, hal, &values);
  *     }
  *     if (comms_background(&comms, hal, &parameters, writable, time_us)) {
- *         ... carry out comms.command ...
+ *         ... execute comms.command ...
  *     }
  */
 #ifndef COMMS_COMMS_H
@@ -23,36 +23,37 @@
 #include "drive/parameters.h"
 #include "hal_can.h"
 
-/* Received frames that one call looks at, at most. The shortest frame takes 47 us at 1 Mbit/s, so even a full bus
- * brings fewer than this between two calls at the slowest control rate. */
+/* Maximum number of received frames that one call processes. The shortest frame takes 47 us at 1 Mbit/s, so even a
+ * fully loaded bus delivers fewer than this between two calls at the lowest control rate. */
 #define COMMS_FRAMES_PER_CALL 4
 
 typedef struct {
     commands_t commands;
     telemetry_t telemetry;
     frame_queue_t responses; /* to parameter requests */
-    command_t command;       /* the command accepted last */
+    command_t command;       /* last accepted command */
 } comms_t;
 
-/* phases 1..4; the first telemetry cycle is due at time_us. */
-void comms_init(comms_t *comms, uint8_t phases, uint32_t control_rate_hz, uint32_t time_us);
+/* The first telemetry cycle is due at time_us. */
+void comms_init(comms_t *comms, uint32_t time_us);
 
-/* Sends what waits and takes at most COMMS_FRAMES_PER_CALL received frames. True: a command was accepted and stands in
- * comms->command; receiving stops there, so that the caller sees every command, in order.
+/* Sends waiting frames and processes at most COMMS_FRAMES_PER_CALL received frames. Returns true when a command was
+ * accepted, in comms->command; reception stops there, so that the caller sees every command, in order.
  *
- * Telemetry goes first, parameter responses when none of it waits. No response is ever dropped: with the queue of
- * responses full nothing is received. That state cannot keep commands out, because PARAMETER_REQUEST loses arbitration
- * against everything the drive waits to send before its heartbeat: responses leave before more requests arrive.
+ * Telemetry is sent first, parameter responses when no telemetry waits. No response is ever dropped: while the queue of
+ * responses is full nothing is received. That state cannot block commands, because PARAMETER_REQUEST loses arbitration
+ * to all frames of the drive but those of the group `background`: responses leave before more requests arrive.
  *
  * `writable`: parameters may be written now. [background] */
 bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, uint32_t time_us);
 
-/* Whether comms_telemetry is due. [background] */
+/* True when comms_telemetry is due. [background] */
 static inline bool comms_telemetry_due(const comms_t *comms, uint32_t time_us) {
     return telemetry_due(&comms->telemetry, time_us);
 }
 
-/* Queues one cycle of telemetry and sends what the mailboxes take. [background] */
-void comms_telemetry(comms_t *comms, hal_t *hal, const telemetry_snapshot_t *snapshot);
+/* Queues one cycle of telemetry and fills the free mailboxes; writes values->bus_counters.telemetry_dropped.
+ * [background] */
+void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values);
 
 #endif

@@ -1,10 +1,10 @@
-/* Event counters that stop at their end instead of starting again at zero. */
+/* Event counters that saturate instead of wrapping to zero. */
 #ifndef COMMS_COUNTER_H
 #define COMMS_COUNTER_H
 
 #include <stdint.h>
 
-/* Adds events; holds at 65535. */
+/* Adds events; saturates at 65535. */
 static inline void counter_add(uint16_t *counter, unsigned events) {
     const unsigned room = (unsigned)UINT16_MAX - *counter;
     *counter = (uint16_t)(*counter + (events < room ? events : room));

@@ -7,8 +7,8 @@ uint16_t e2e_crc16(uint16_t crc, const uint8_t *bytes, size_t length) {
     for (size_t i = 0; i < length; i++) {
         crc = (uint16_t)(crc ^ (unsigned)bytes[i] << 8);
         for (int bit = 0; bit < 8; bit++) {
-            const unsigned subtracted = crc & 0x8000u ? POLYNOMIAL : 0u;
-            crc = (uint16_t)((unsigned)crc << 1 ^ subtracted);
+            const unsigned subtrahend = crc & 0x8000u ? POLYNOMIAL : 0u;
+            crc = (uint16_t)((unsigned)crc << 1 ^ subtrahend);
         }
     }
     return crc;

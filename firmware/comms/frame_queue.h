@@ -16,24 +16,24 @@ typedef struct {
     uint8_t count;
 } frame_queue_t;
 
-/* How many more frames it holds. */
-static inline unsigned frame_queue_room(const frame_queue_t *queue) {
+/* Number of free places. */
+static inline unsigned frame_queue_free(const frame_queue_t *queue) {
     return FRAME_QUEUE_CAPACITY - (unsigned)queue->count;
 }
 
-/* Appends a frame; the caller has made sure of the room. */
-static inline void frame_queue_put(frame_queue_t *queue, const hal_can_frame_t *frame) {
+/* Appends a frame to a queue that is not full. */
+static inline void frame_queue_push(frame_queue_t *queue, const hal_can_frame_t *frame) {
     queue->frames[(unsigned)(queue->first + queue->count) % FRAME_QUEUE_CAPACITY] = *frame;
     queue->count++;
 }
 
-/* The oldest frame; NULL when it is empty. */
-static inline const hal_can_frame_t *frame_queue_head(const frame_queue_t *queue) {
+/* The oldest frame; NULL when the queue is empty. */
+static inline const hal_can_frame_t *frame_queue_peek(const frame_queue_t *queue) {
     return queue->count == 0 ? NULL : &queue->frames[queue->first];
 }
 
 /* Removes the oldest frame of a queue that is not empty. */
-static inline void frame_queue_drop_head(frame_queue_t *queue) {
+static inline void frame_queue_pop(frame_queue_t *queue) {
     queue->first = (uint8_t)((queue->first + 1u) % FRAME_QUEUE_CAPACITY);
     queue->count--;
 }

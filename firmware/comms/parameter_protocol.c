@@ -2,9 +2,6 @@
 
 #include "drive_codec.h"
 
-#define OPERATION(name) DRIVE_PARAMETER_REQUEST_OPERATION_##name##_CHOICE
-#define STATUS(name) DRIVE_PARAMETER_RESPONSE_STATUS_##name##_CHOICE
-
 #define CHARACTERS_PER_PART 4
 
 static int32_t text_part(const char *text, unsigned part) {
@@ -21,56 +18,50 @@ static int32_t text_part(const char *text, unsigned part) {
     return (int32_t)value;
 }
 
-static uint8_t write_value(parameters_t *parameters, bool writable, unsigned index, int32_t value) {
-    if (!writable) {
-        return STATUS(NOT_WHILE_RUNNING);
-    }
-    return parameters_set(parameters, index, value) == PARAMETER_DONE ? STATUS(DONE) : STATUS(OUT_OF_RANGE);
-}
+void parameter_protocol_respond(parameters_t *parameters, bool writable, const hal_can_frame_t *frame,
+                                hal_can_frame_t *response_frame) {
+    struct drive_parameter_request_t request;
+    drive_parameter_request_unpack(&request, frame->data, frame->length);
+    struct drive_parameter_response_t response = {
+        .operation = request.operation, .index = request.index, .part = request.part, .status = PARAMETER_STATUS_DONE};
 
-void parameter_protocol_answer(parameters_t *parameters, bool writable, const hal_can_frame_t *request,
-                               hal_can_frame_t *response) {
-    struct drive_parameter_request_t asked;
-    drive_parameter_request_unpack(&asked, request->data, request->length);
-    struct drive_parameter_response_t answer = {
-        .operation = asked.operation, .index = asked.index, .part = asked.part, .status = STATUS(DONE)};
-
-    if (asked.operation > OPERATION(UNIT)) {
-        answer.status = STATUS(UNKNOWN_OPERATION);
-    } else if (asked.index >= PARAMETER_COUNT) {
-        answer.status = STATUS(NO_SUCH_PARAMETER);
+    if (request.operation >= PARAMETER_OPERATION_COUNT) {
+        response.status = PARAMETER_STATUS_UNKNOWN_OPERATION;
+    } else if (request.index >= PARAMETER_COUNT) {
+        response.status = PARAMETER_STATUS_NO_SUCH_PARAMETER;
     } else {
-        const parameter_row_t *row = parameters_row(asked.index);
-        switch (asked.operation) {
-        case OPERATION(WRITE):
-            answer.status = write_value(parameters, writable, asked.index, asked.value);
-            answer.value = parameters->values[asked.index];
+        const parameter_row_t *row = parameters_row(request.index);
+        switch ((parameter_operation_t)request.operation) {
+        case PARAMETER_OPERATION_WRITE:
+            response.status = (uint8_t)(writable ? parameters_set(parameters, request.index, request.value)
+                                                 : PARAMETER_STATUS_NOT_WHILE_RUNNING);
+            response.value = parameters->values[request.index];
             break;
-        case OPERATION(MINIMUM):
-            answer.value = row->minimum;
+        case PARAMETER_OPERATION_MINIMUM:
+            response.value = row->minimum;
             break;
-        case OPERATION(MAXIMUM):
-            answer.value = row->maximum;
+        case PARAMETER_OPERATION_MAXIMUM:
+            response.value = row->maximum;
             break;
-        case OPERATION(DEFAULT):
-            answer.value = parameters->defaults[asked.index];
+        case PARAMETER_OPERATION_DEFAULT:
+            response.value = parameters->defaults[request.index];
             break;
-        case OPERATION(FRACTION_BITS):
-            answer.value = row->fraction_bits;
+        case PARAMETER_OPERATION_FRACTION_BITS:
+            response.value = row->fraction_bits;
             break;
-        case OPERATION(NAME):
-            answer.value = text_part(row->name, asked.part);
+        case PARAMETER_OPERATION_NAME:
+            response.value = text_part(row->name, request.part);
             break;
-        case OPERATION(UNIT):
-            answer.value = text_part(row->unit, asked.part);
+        case PARAMETER_OPERATION_UNIT:
+            response.value = text_part(row->unit, request.part);
             break;
-        case OPERATION(READ):
+        case PARAMETER_OPERATION_READ:
         default:
-            answer.value = parameters->values[asked.index];
+            response.value = parameters->values[request.index];
             break;
         }
     }
-    *response =
+    *response_frame =
         (hal_can_frame_t){.identifier = DRIVE_PARAMETER_RESPONSE_FRAME_ID, .length = DRIVE_PARAMETER_RESPONSE_LENGTH};
-    drive_parameter_response_pack(response->data, &answer, sizeof response->data);
+    drive_parameter_response_pack(response_frame->data, &response, sizeof response_frame->data);
 }

@@ -1,4 +1,4 @@
-/* Parameters over CAN: PARAMETER_REQUEST in, PARAMETER_RESPONSE out. */
+/* Parameter access over CAN: one PARAMETER_RESPONSE to each PARAMETER_REQUEST. */
 #ifndef COMMS_PARAMETER_PROTOCOL_H
 #define COMMS_PARAMETER_PROTOCOL_H
 
@@ -7,11 +7,11 @@
 #include "drive/parameters.h"
 #include "hal_can.h"
 
-/* Carries out the request and writes its answer. The answer repeats operation, index and part; a refused request
- * changes nothing. After a write its value is the one that now holds, accepted or not. Text comes four ASCII characters
- * at a time, the first in the lowest byte; a part beyond the end of the text is all zeros. `writable`: writes are
- * allowed now. request must have come through commands_take. [background] */
-void parameter_protocol_answer(parameters_t *parameters, bool writable, const hal_can_frame_t *request,
-                               hal_can_frame_t *response);
+/* Executes a request and writes its response. The response repeats operation, index and part; a rejected request
+ * changes nothing. After a write the response has the value now in effect, accepted or not. Text is transferred four
+ * ASCII characters at a time, the first in the lowest byte; a part beyond the end of the text is all zeros. `writable`:
+ * writes are permitted now. frame must have passed commands_receive. [background] */
+void parameter_protocol_respond(parameters_t *parameters, bool writable, const hal_can_frame_t *frame,
+                                hal_can_frame_t *response_frame);
 
 #endif

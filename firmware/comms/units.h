@@ -1,4 +1,4 @@
-/* The drive's internal formats and the LSBs of drive.dbc: every conversion between the two is here.
+/* Conversions between the drive's internal formats and the LSBs of drive.dbc.
  *
  *   quantity   inside the drive               on the bus                     conversion
  *   speed      Q9.22 rad/s                    0.001 r/min (1/4 in snapshots) units_milli_rpm, units_speed_q22
@@ -10,7 +10,7 @@
  *   gains      unsigned Q1.15 1/(N m)         2^-15 1/(N m)                  none
  *   duty       Q1.15                          2^-15                          none
  *
- * All round to the nearest, halves towards plus infinity.
+ * All conversions round to nearest, halves towards plus infinity.
  */
 #ifndef COMMS_UNITS_H
 #define COMMS_UNITS_H
@@ -20,7 +20,7 @@
 /* 0.001 r/min from rad/s in Q9.22; never saturates (+-4889240), within 0.501 LSB. 64-bit accumulator. */
 int32_t units_milli_rpm(int32_t speed_q22);
 
-/* rad/s in Q9.22 from 0.001 r/min; saturates beyond +-4889239 (the ends of Q9.22), else within 0.61 LSB. 64-bit
+/* rad/s in Q9.22 from 0.001 r/min; saturates beyond +-4889239 (the ends of Q9.22), otherwise within 0.61 LSB. 64-bit
  * accumulator, no overflow for any argument. */
 int32_t units_speed_q22(int32_t milli_rpm);
 
@@ -30,10 +30,11 @@ int32_t units_quarter_rpm(int32_t milli_rpm);
 /* 2^-16 turn from 2^-32 turn; the last half LSB of a turn rounds to 0. */
 uint16_t units_angle_u16(uint32_t angle);
 
-/* 2^-20 turn from a small angle in 2^-32 turn: +-2^19 (the codec's setter saturates). */
+/* 2^-20 turn from a small angle in 2^-32 turn: +-2^19 (drive_telemetry_pack_trim saturates). */
 int32_t units_deviation_q20(int32_t angle);
 
-/* N m in 2^-8 from Q7.24: -32768..32768, the upper end one more than 16 bits hold (the codec's setter saturates). */
+/* N m in 2^-8 from Q7.24: -32768..32768; the upper end exceeds 16 bits by one (the drive_telemetry_pack functions
+ * saturate). */
 int32_t units_torque_q8(int32_t torque_q24);
 
 #endif

@@ -10,8 +10,7 @@
 
 #include <stdint.h>
 
-/* The values of DRIVE_COMMAND.request in drive.dbc. */
-typedef enum { COMMAND_OFF, COMMAND_RUN, COMMAND_STOP, COMMAND_CLEAR_FAULT } command_request_t;
+#include "drive_enumerations.h"
 
 typedef struct {
     command_request_t request;

@@ -33,9 +33,6 @@
 #include "hal_encoder.h"
 #include "hal_pwm.h"
 
-/* Numbers are those of drive.dbc and of the parameter `controller`. What each consists of is in configure.c. */
-typedef enum { DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT } drive_controller_t;
-
 typedef enum {
     SPEED_LAW_PI,
     SPEED_LAW_SMC /* sliding mode */
@@ -119,24 +116,6 @@ typedef struct {
     control_measurement_t measurement;
 } control_state_t;
 
-/* Telemetry values, computed on request in the background. */
-typedef struct {
-    uint32_t angle; /* measured, 2^-32 turn */
-    int32_t speed_q22;
-    int32_t speed_reference_q22;
-    int32_t torque_reference_q24;
-    int32_t torque_q24; /* estimate, all phases */
-    int32_t load_torque_q24;
-    uint16_t current_q9[HAL_PHASES_MAX];
-    uint16_t bus_voltage_q6;
-    int32_t duty_q15; /* of the BP-PID */
-    bool voltage_saturated;
-    /* Of the salient controller, 0 with the others. */
-    int32_t trim_torque_q24;
-    int32_t torque_missing_q24; /* reference less what the voltage allows */
-    uint16_t observer_bandwidth_rad_s;
-} control_diagnostics_t;
-
 /* State INITIALISE, rotor at standstill, controllers reset. */
 void control_reset(const control_parameters_t *parameters, control_state_t *state);
 
@@ -149,7 +128,5 @@ void control_prepare(const control_parameters_t *parameters, control_state_t *st
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare);
 
-/* Result of the last period; the interrupt must not change the state meanwhile. [both] */
-control_diagnostics_t control_diagnose(const control_parameters_t *parameters, const control_state_t *state);
 
 #endif

@@ -1,20 +1,10 @@
-/* Faults that the drive detects, and the record of one. Fault numbers are those of drive.dbc. */
+/* Record of a fault. The faults and their numbers are those of drive.dbc. */
 #ifndef DRIVE_FAULT_H
 #define DRIVE_FAULT_H
 
 #include <stdint.h>
 
-typedef enum {
-    FAULT_NONE,
-    FAULT_OVER_CURRENT,
-    FAULT_OVER_VOLTAGE,
-    FAULT_UNDER_VOLTAGE,
-    FAULT_OVER_SPEED,
-    FAULT_ENCODER,
-    FAULT_COMMAND_TIMEOUT,
-    FAULT_INTERRUPT_OVERRUN,
-    FAULT_COUNT
-} fault_t;
+#include "drive_enumerations.h"
 
 /* Bit of a fault in a fault mask, which has 64 bits: bit number = fault number. */
 #define FAULT_BIT(fault) (UINT64_C(1) << (fault))

@@ -22,8 +22,6 @@
 #include "drive/command.h"
 #include "drive/fault.h"
 
-typedef enum { DRIVE_STATE_INITIALISE, DRIVE_STATE_READY, DRIVE_STATE_RUN, DRIVE_STATE_FAULT } drive_state_t;
-
 typedef struct {
     drive_state_t state;
     uint32_t fault_free_ticks;      /* in INITIALISE, since the last failed check */

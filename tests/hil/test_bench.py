@@ -89,7 +89,7 @@ def test_signals(bench):
     assert len(speed.between(0.005, 0.010)) == 5
     assert bench.telemetry["DRIVE_STATUS.state"].last_name == bench.drive.state == "ready"
     assert bench.telemetry["bus_voltage_V"].last == pytest.approx(240, abs=0.5)
-    with pytest.raises(KeyError, match="no signal 'speed'; there are .*speed_rpm"):
+    with pytest.raises(KeyError, match="no signal 'speed'; the signals are .*speed_rpm"):
         bench.telemetry["speed"]
     none = bench.telemetry["DRIVE_FAULT_CAUSE.fault"]
     assert (len(none), np.isnan(none.last), none.last_name) == (0, True, "unknown")
@@ -117,9 +117,9 @@ def test_refusals(bench):
         bench.load_torque_Nm = 500
     with pytest.raises(RigError, match="load_torque_Nm 1 at 5000 us: in_the_past"):
         bench.at(0.005).load_torque_Nm = 1
-    with pytest.raises(DriveError, match="speed_reference_rpm 5000: allowed are -3000 to 3000 r/min"):
+    with pytest.raises(DriveError, match="speed_reference_rpm 5000: must be -3000 to 3000 r/min"):
         bench.drive.speed_reference_rpm = 5000
-    with pytest.raises(DriveError, match="request 'fly': allowed are off, run, stop, clear_fault"):
+    with pytest.raises(DriveError, match="request 'fly': must be off, run, stop or clear_fault"):
         bench.drive.ask("fly")
 
 

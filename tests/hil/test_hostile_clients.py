@@ -1,4 +1,4 @@
-"""What others do on the bus moves the counters that say so, and nothing else: the motion stays the same to the bit."""
+"""Invalid frames from other nodes increment their counters and change nothing else: the motion is bit-identical."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ import pytest
 from salient.bench.drive import command_frame
 from salient.bus import e2e
 from salient.bus.clock import open_bus
+from salient.bus.signals import drive_database
 
 COUNTERS = (
     "wrong_length", "wrong_checksum", "wrong_counter", "out_of_range", "unknown_frame", "receive_overflow",
     "telemetry_dropped",
 )  # fmt: skip
-COMMAND_ID = 0x080
-REQUEST_ID = 0x600
+COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
+COMMAND_ID = COMMAND.frame_id
+REQUEST_ID = drive_database().get_message_by_name("PARAMETER_REQUEST").frame_id
 
 
 def command(speed_rpm: float = 600.0, counter: int = 200, request: str = "run") -> can.Message:
-    """One with a good checksum whose counter is far from the true sender's."""
+    """A command with a valid checksum and a counter out of sequence."""
     return command_frame(counter, request, speed_rpm)
 
 
@@ -48,7 +50,7 @@ ATTACKS = {
 
 
 def steady(make_bench, tmp_path, name, **options):
-    """A paper drive that holds 600 r/min, its true state recorded from 0.1 s on."""
+    """A paper drive at 600 r/min, its true state recorded from 0.1 s on."""
     bench = make_bench(controller="paper", record=tmp_path / f"{name}.npy", record_step_ns=10_000,
                        record_from_us=100_000, **options)
     bench.drive.speed_reference_rpm = 600
@@ -84,11 +86,11 @@ def test_wrong_frames(make_bench, tmp_path, undisturbed, counter):
 
 @pytest.mark.parametrize("raw_speed", [3_000_001, -3_000_001, 2**23 - 1, -(2**23)])
 def test_out_of_range(make_bench, tmp_path, undisturbed, raw_speed):
-    """Checksum and counter are good, so that nothing but the range is wrong."""
+    """Checksum and counter are valid: only the range is wrong."""
     bench = steady(make_bench, tmp_path, "disturbed")
     sent = [m.data[2] for _, m in bench.log if m.arbitration_id == COMMAND_ID]
     payload = b"\1" + raw_speed.to_bytes(3, "little", signed=True)
-    data = e2e.protect(e2e.DRIVE_COMMAND_DATA_ID, sent[-1] + 1, payload)
+    data = e2e.protect(e2e.data_id(COMMAND), sent[-1] + 1, payload)
     with open_bus(bench.address) as attacker:
         attacker.send(changed(GOOD, data=data))
     recording, counters = finish(bench)
@@ -97,7 +99,7 @@ def test_out_of_range(make_bench, tmp_path, undisturbed, raw_speed):
 
 
 def test_flood(make_bench, tmp_path, undisturbed):
-    """Ten clients that send 40 frames each and leave, some with frames that are none of CAN's."""
+    """Ten clients that send 40 frames each and leave."""
     bench = steady(make_bench, tmp_path, "disturbed")
     generator = random.Random(1)
     for _ in range(10):
@@ -108,7 +110,7 @@ def test_flood(make_bench, tmp_path, undisturbed):
                 attacker.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=data))
     recording, counters = finish(bench)
     assert np.array_equal(recording, undisturbed)
-    # Low identifiers hold up the telemetry, which is dropped by rule and counted.
+    # Low identifiers delay the telemetry, which is dropped by rule and counted.
     assert counters["unknown_frame"] == 400
     assert {name for name, count in counters.items() if count} <= {"unknown_frame", "telemetry_dropped"}
 

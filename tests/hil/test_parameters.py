@@ -7,6 +7,7 @@ import pytest
 
 from salient.bench.drive import DriveError, read_parameter_table
 from salient.bus.signals import drive_database
+from salient.generate.parameters import read_table
 
 
 def test_table(make_bench):
@@ -34,23 +35,36 @@ def test_write_and_read_back(bench):
             assert parameters[name] == pytest.approx(value, abs=lsb / 2)
 
 
-def test_out_of_range_is_refused_and_changes_nothing(bench):
+def test_the_drive_has_the_table_of_the_reference_page(bench):
+    machine_defined = {"controller", "inertia_kg_m2", "friction_Nm_s", "resistance_ohm"}
+    table = read_table()
+    rows = list(bench.drive.parameters.rows.values())
+    assert [(r.index, r.name, r.unit, r.fraction_bits) for r in rows] == [
+        (r.index, r.name, r.unit, r.fraction_bits) for r in table
+    ]
+    for row, definition in zip(rows, table, strict=True):
+        lsb = 2.0**-row.fraction_bits
+        assert (row.minimum, row.maximum) == (definition.minimum * lsb, definition.maximum * lsb), row.name
+        assert row.default == definition.default * lsb or row.name in machine_defined, row.name
+
+
+def test_out_of_range_is_rejected_and_changes_nothing(bench):
     parameters = bench.drive.parameters
     for name, row in parameters.rows.items():
         lsb = 2.0**-row.fraction_bits
         for value in (row.minimum - lsb, row.maximum + lsb):
-            with pytest.raises(DriveError, match=f"^{name} .*: allowed are "):
+            with pytest.raises(DriveError, match=f"^{name} .*: must be "):
                 parameters[name] = value
         assert parameters[name] == row.default
 
 
-def test_what_32_bits_cannot_hold(bench):
-    with pytest.raises(DriveError, match="torque_max_Nm 1e.06: allowed are 0 to 40 N m"):
+def test_a_value_beyond_32_bits_is_rejected(bench):
+    with pytest.raises(DriveError, match="torque_max_Nm 1e.06: must be 0 to 40 N m"):
         bench.drive.parameters["torque_max_Nm"] = 1e6
 
 
-def test_no_such_parameter(bench):
-    with pytest.raises(KeyError, match="no parameter 'torque_max'; there are .*torque_max_Nm"):
+def test_an_unknown_parameter_is_named(bench):
+    with pytest.raises(KeyError, match="no parameter 'torque_max'; the parameters are .*torque_max_Nm"):
         bench.drive.parameters["torque_max"] = 1
 
 

@@ -8,6 +8,7 @@
  * Each 400 interrupts a frame says how often since start: uint16 little endian, interrupts, torn parameters, torn
  * commands, torn snapshots. The processor must take time.
  */
+#include <assert.h>
 #include <stddef.h>
 #include <string.h>
 
@@ -15,6 +16,7 @@
 #include "hal_time.h"
 #include "qemu/board.h"
 #include "qemu/hal_qemu.h"
+#include "telemetry_collect.h"
 
 #define FRAME_ID 0x7A0
 #define INTERRUPTS_PER_FRAME 400
@@ -53,7 +55,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                                        uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits) {
     (void)tables, (void)control_rate_hz, (void)encoder_bits, (void)adc_bits;
     static control_parameters_t set;
-    fill(&set, sizeof set, UINT32_C(2500) * 0x10001 + (parameters->changes & 0xFFF) * 0x10001);
+    fill(&set, sizeof set, UINT32_C(2500) * 0x10001 + (parameters->revision & 0xFFF) * 0x10001);
     return set;
 }
 
@@ -71,39 +73,26 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     interrupts++;
     torn_parameters += torn(parameters, sizeof *parameters);
     torn_commands += torn(command, sizeof *command);
-    fill(state, sizeof(control_diagnostics_t), interrupts * 0x10001u);
+    fill(state, sizeof(drive_telemetry_t), interrupts * 0x10001u);
     return false;
 }
 
+static_assert(sizeof(drive_telemetry_t) <= sizeof(control_state_t), "what a snapshot reads");
+
 /* Word by word, as the interrupt wrote them. */
-control_diagnostics_t control_diagnose(const control_parameters_t *parameters, const control_state_t *state) {
-    (void)parameters;
-    control_diagnostics_t diagnostics;
-    memcpy(&diagnostics, state, sizeof diagnostics);
-    return diagnostics;
+void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t *telemetry) {
+    (void)time_us;
+    memcpy(telemetry, &from->control, sizeof *telemetry);
 }
 
-void comms_init(comms_t *comms, uint8_t phases, uint32_t control_rate_hz, uint32_t time_us) {
-    (void)phases, (void)control_rate_hz, (void)time_us;
+void comms_init(comms_t *comms, uint32_t time_us) {
+    (void)time_us;
     comms->telemetry.next_us = 0; /* always due */
 }
 
-void comms_telemetry(comms_t *comms, hal_t *hal, const telemetry_snapshot_t *snapshot) {
+void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values) {
     (void)comms, (void)hal;
-    const uint32_t number = snapshot->rotor_angle;
-    const uint32_t first[] = {(uint32_t)snapshot->speed_q22,
-                              (uint32_t)snapshot->speed_reference_q22,
-                              (uint32_t)snapshot->torque_reference_q24,
-                              (uint32_t)snapshot->torque_estimate_q24,
-                              (uint32_t)snapshot->load_torque_estimate_q24,
-                              (uint32_t)snapshot->duty_q15,
-                              (uint32_t)snapshot->trim_torque_q24,
-                              (uint32_t)snapshot->torque_missing_q24,
-                              snapshot->bus_voltage_q6 * 0x10001u,
-                              snapshot->current_q9[0] * 0x10001u,
-                              snapshot->current_q9[3] * 0x10001u,
-                              number};
-    torn_snapshots += torn(first, sizeof first);
+    torn_snapshots += torn(values, sizeof *values);
 }
 
 bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, uint32_t time_us) {
@@ -112,7 +101,7 @@ bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool
     static uint16_t reported; /* interrupts */
     number--;                 /* downwards: as a time it is past, and a command of it not stale */
     fill(&comms->command, sizeof comms->command, number);
-    parameters->changes++;
+    parameters->revision++;
     hal_critical_enter(hal);
     const uint16_t counts[4] = {interrupts, torn_parameters, torn_commands, torn_snapshots};
     hal_critical_leave(hal);

@@ -1,5 +1,5 @@
 """The generated C codec against cantools in Python: random frames of both databases, packed on one side and unpacked on
-the other; and the texts of drive.dbc against the enumerations of the firmware."""
+the other; enumerations, telemetry and hash of drive.dbc."""
 
 import ctypes
 import math
@@ -13,12 +13,15 @@ from cantools.database.can.c_source import camel_to_snake_case
 from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
 
+from salient.bus.database_hash import database_hash
 from salient.generate.codec import generate_codec, main, raw_range
+from salient.generate.error import CodecError
+from salient.generate.telemetry import is_bit_field, message_c_name, short_name
 
 ROOT = Path(__file__).resolve().parents[2]
 DATABASES = {
-    "drive": (ROOT / "firmware" / "comms" / "drive.dbc", True),
-    "rig": (ROOT / "emulator" / "rig" / "rig.dbc", False),
+    "drive": (ROOT / "firmware" / "comms" / "drive.dbc", True, "DRIVE"),
+    "rig": (ROOT / "emulator" / "rig" / "rig.dbc", False, None),
 }
 SEED = 20130328
 FRAMES = 300
@@ -35,16 +38,15 @@ class Codec:
     """A database in both languages: `database` in Python, `library` compiled from the generated C."""
 
     def __init__(self, name: str, folder: Path) -> None:
-        dbc, integer = DATABASES[name]
         self.name = name
-        self.database = cantools.database.load_file(dbc)
-        for file, text in generate_codec(dbc, integer).items():
+        self.database = cantools.database.load_file(DATABASES[name][0])
+        for file, text in generate_codec(*DATABASES[name]).items():
             (folder / file).write_text(text)
         library = folder / f"lib{name}_codec.so"
-        source = folder / f"{name}_codec.c"
+        sources = sorted(folder.glob("*.c"))
         warnings = ["-Wall", "-Wextra", "-Werror"]
         subprocess.run(
-            ["gcc", "-std=c11", "-O1", "-fPIC", "-shared", *warnings, "-o", library, source, "-lm"], check=True
+            ["gcc", "-std=c11", "-O1", "-fPIC", "-shared", *warnings, "-o", library, *sources, "-lm"], check=True
         )
         self.library = ctypes.CDLL(str(library))
         self.structures = {
@@ -57,7 +59,7 @@ class Codec:
         }
 
     def function(self, message: Message, action: str) -> ctypes._CFuncPtr:
-        return getattr(self.library, f"{self.name}_{camel_to_snake_case(message.name)}_{action}")
+        return getattr(self.library, f"{message_c_name(message, self.name)}_{action}")
 
     def unpack(self, message: Message, data: bytes) -> ctypes.Structure:
         structure = self.structures[message.name]()
@@ -134,8 +136,8 @@ def test_setters_saturate(codec: Codec) -> None:
             wide = [rng.randint(-(2**63), 2**63 - 1) for _ in range(20)]
             for raw in (-(2**63), low - 1, low, high, high + 1, 2**63 - 1, *wide):
                 codec.set_raw(message, structure, signal, raw)
-                held = getattr(structure, camel_to_snake_case(signal.name))
-                assert held == min(max(raw, low), high), f"{message.name}.{signal.name} from {raw}"
+                value = getattr(structure, camel_to_snake_case(signal.name))
+                assert value == min(max(raw, low), high), f"{message.name}.{signal.name} from {raw}"
 
 
 def test_setters_of_physical_values_round_and_saturate(tmp_path: Path) -> None:
@@ -154,32 +156,36 @@ def test_setters_of_physical_values_round_and_saturate(tmp_path: Path) -> None:
                 setter(ctypes.byref(structure), ctypes.c_double(value))
                 # 2**-8: a double has 53 bits, the widest signal 48, so that much of an LSB is lost in the scale.
                 assert abs(getattr(structure, field) - min(max(value / signal.scale, low), high)) <= 0.5 + 2**-8
-            for value, held in ((math.inf, high), (-math.inf, low), (1e300, high), (-1e300, low), (math.nan, low)):
+            for value, end in ((math.inf, high), (-math.inf, low), (1e300, high), (-1e300, low), (math.nan, low)):
                 setter(ctypes.byref(structure), ctypes.c_double(value))
-                assert getattr(structure, field) == held, f"{message.name}.{signal.name} from {value}"
+                assert getattr(structure, field) == end, f"{message.name}.{signal.name} from {value}"
 
 
 def test_identifiers_and_lengths(codec: Codec, tmp_path: Path) -> None:
-    prefix = codec.name.upper()
     checks = []
     for message in codec.database.messages:
-        name = f"{prefix}_{camel_to_snake_case(message.name).upper()}"
+        name = message_c_name(message, codec.name).upper()
         checks += [
             f'static_assert({name}_FRAME_ID == {message.frame_id}u, "");',
             f'static_assert({name}_LENGTH == {message.length}u, "");',
             f'static_assert({name}_IS_EXTENDED == {int(message.is_extended_frame)}, "");',
         ]
-    dbc, integer = DATABASES[codec.name]
-    for file, text in generate_codec(dbc, integer).items():
+    checks.append(f'static_assert({codec.name.upper()}_DBC_HASH == {database_hash(codec.database)}u, "");')
+    for file, text in generate_codec(*DATABASES[codec.name]).items():
         (tmp_path / file).write_text(text)
     compile_c(tmp_path, [f"{codec.name}_codec.h"], checks, [tmp_path])
 
 
 def test_generated_text_depends_on_the_database_alone(codec: Codec, tmp_path: Path) -> None:
-    dbc, integer = DATABASES[codec.name]
+    dbc, *options = DATABASES[codec.name]
     copy = tmp_path / dbc.name
     copy.write_bytes(dbc.read_bytes())
-    assert generate_codec(copy, integer) == generate_codec(dbc, integer)
+    assert generate_codec(copy, *options) == generate_codec(dbc, *options)
+
+
+def test_names_have_the_prefix_once(codec: Codec) -> None:
+    twice = f"{codec.name}_{codec.name}_"
+    assert not any(twice in text.lower() for text in generate_codec(*DATABASES[codec.name]).values())
 
 
 def compile_c(folder: Path, headers: list[str], statements: list[str], include: list[Path]) -> None:
@@ -193,23 +199,155 @@ def compile_c(folder: Path, headers: list[str], statements: list[str], include: 
 
 
 @pytest.mark.parametrize(
-    ("signal", "prefix", "count"),
-    [("fault", "FAULT", "FAULT_COUNT"), ("state", "DRIVE_STATE", None), ("controller", "DRIVE_CONTROLLER", None)],
+    ("signal", "type_name", "prefix"),
+    [
+        ("fault", "fault_t", "FAULT"),
+        ("state", "drive_state_t", "DRIVE_STATE"),
+        ("controller", "drive_controller_t", "DRIVE_CONTROLLER"),
+        ("request", "command_request_t", "COMMAND"),
+        ("operation", "parameter_operation_t", "PARAMETER_OPERATION"),
+        ("status", "parameter_status_t", "PARAMETER_STATUS"),
+    ],
 )
 def test_texts_of_the_dbc_are_the_enumerations_of_the_firmware(
-    tmp_path: Path, signal: str, prefix: str, count: str | None
+    tmp_path: Path, signal: str, type_name: str, prefix: str
 ) -> None:
     database = cantools.database.load_file(DATABASES["drive"][0])
     found = [s.choices for m in database.messages for s in m.signals if s.name == signal]
     texts = {number: str(text) for number, text in found[0].items()}
     assert all({number: str(text) for number, text in choices.items()} == texts for choices in found)
     checks = [f'static_assert({prefix}_{text.upper()} == {number}, "");' for number, text in texts.items()]
-    if count:
-        checks.append(f'static_assert({count} == {len(texts)}, "a number without a text");')
-    headers = ["drive/fault.h", "drive/state_machine.h", "drive/control.h"]
+    checks.append(f'static_assert({prefix}_COUNT == {len(texts)}, "a number without a text");')
+    checks.append(f"extern {type_name} value;")
     for file, text in generate_codec(*DATABASES["drive"]).items():
         (tmp_path / file).write_text(text)
-    compile_c(tmp_path, headers, checks, [ROOT / "firmware", ROOT / "hal", tmp_path])
+    compile_c(tmp_path, ["drive_enumerations.h"], checks, [tmp_path])
+
+
+def test_value_tables_of_one_enumeration_must_be_equal(tmp_path: Path) -> None:
+    dbc = tmp_path / "drive.dbc"
+    text = DATABASES["drive"][0].read_text(encoding="cp1252")
+    dbc.write_text(text.replace('VAL_ 1793 state 0 "initialise"', 'VAL_ 1793 state 0 "start"'), encoding="cp1252")
+    with pytest.raises(CodecError, match="drive.dbc: signal state: its value table differs"):
+        generate_codec(dbc, True, "DRIVE")
+
+
+# --- the cyclic messages of the drive ---------------------------------------------------------------------------------
+
+
+class Telemetry(Codec):
+    """`structure`: drive_telemetry_t in Python, by the DBC."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__("drive", folder)
+        groups = list(self.database.dbc.attribute_definitions["TelemetryGroup"].choices)
+        self.messages = [m for m in self.database.messages if m.cycle_time and "DRIVE" in m.senders]
+        self.messages.sort(key=lambda m: (self.attribute(m, "TelemetryGroup"), m.frame_id))
+        assert len(groups) > max(self.attribute(m, "TelemetryGroup") for m in self.messages)
+        fields = []
+        for message in self.messages:
+            members = [
+                (camel_to_snake_case(s.name), ctypes.c_int32 if s.is_signed else ctypes.c_uint32)
+                for s in message.signals
+            ]
+            inner = type(message.name, (ctypes.Structure,), {"_fields_": members})
+            fields.append((short_name(message, "drive"), ctypes.c_uint64 if is_bit_field(message) else inner))
+        self.structure = type("drive_telemetry_t", (ctypes.Structure,), {"_fields_": fields})
+
+    @staticmethod
+    def attribute(message: Message, name: str) -> int:
+        attribute = message.dbc.attributes.get(name)
+        return 0 if attribute is None else int(attribute.value)
+
+    def pack_telemetry(self, message: Message, telemetry: ctypes.Structure) -> bytes:
+        data = ctypes.create_string_buffer(b"\xa5" * 8, 8)
+        getattr(self.library, f"drive_telemetry_pack_{short_name(message, 'drive')}")(ctypes.byref(telemetry), data)
+        return data.raw[: message.length]
+
+
+@pytest.fixture(scope="module")
+def telemetry(tmp_path_factory: pytest.TempPathFactory) -> Telemetry:
+    return Telemetry(tmp_path_factory.mktemp("telemetry"))
+
+
+def test_telemetry_is_packed_with_saturation(telemetry: Telemetry) -> None:
+    rng = random.Random(SEED)
+    for message in telemetry.messages:
+        for _ in range(FRAMES):
+            values = telemetry.structure()
+            expected = {}
+            if is_bit_field(message):
+                bits = rng.getrandbits(64)
+                setattr(values, short_name(message, "drive"), bits)
+                expected = {s.name: bits >> s.start & 1 for s in message.signals}
+            else:
+                member = getattr(values, short_name(message, "drive"))
+                for signal in message.signals:
+                    low, high = raw_range(signal)
+                    ends = (-(2**31), 2**31 - 1) if signal.is_signed else (0, 2**32 - 1)
+                    raw = rng.choice((*ends, rng.randint(*ends), rng.randint(low, high)))
+                    setattr(member, camel_to_snake_case(signal.name), raw)
+                    expected[signal.name] = min(max(raw, low), high)
+            data = telemetry.pack_telemetry(message, values)
+            assert data == message.encode(expected, scaling=False), f"{message.name}, seed {SEED}"
+
+
+def test_the_schedule_is_that_of_the_dbc(telemetry: Telemetry) -> None:
+    class Row(ctypes.Structure):
+        _fields_ = [
+            ("pack", ctypes.c_void_p), ("identifier", ctypes.c_uint32), ("length", ctypes.c_uint8),
+            ("group", ctypes.c_uint8), ("if_active", ctypes.c_bool), ("period", ctypes.c_uint16),
+            ("delay", ctypes.c_uint16),
+        ]  # fmt: skip
+
+    table = (Row * len(telemetry.messages)).in_dll(telemetry.library, "drive_telemetry_messages")
+    for row, message in zip(table, telemetry.messages, strict=True):
+        assert (row.identifier, row.length) == (message.frame_id, message.length)
+        assert row.group == telemetry.attribute(message, "TelemetryGroup")
+        assert row.if_active == (message.send_type == "cyclicIfActive")
+        assert (row.period, row.delay) == (message.cycle_time, telemetry.attribute(message, "GenMsgStartDelayTime"))
+    periods = {m.name: m.cycle_time for m in telemetry.messages}
+    assert [name for name, period in periods.items() if period == 1] == [
+        "DRIVE_STATUS", "DRIVE_MOTION", "DRIVE_TORQUE", "DRIVE_CURRENTS",
+    ]  # fmt: skip
+    assert {name for name, period in periods.items() if period == 10} == {"DRIVE_BP_PID", "DRIVE_TRIM"}
+
+
+def test_every_fault_has_its_bit_in_the_fault_mask(telemetry: Telemetry) -> None:
+    faults = telemetry.database.get_message_by_name("DRIVE_STATUS").get_signal_by_name("fault").choices
+    mask = telemetry.database.get_message_by_name("DRIVE_FAULT_MASK")
+    assert {s.start: s.name for s in mask.signals} == {n: str(name) for n, name in faults.items() if n}
+
+
+def test_everything_in_the_drive_s_dbc_is_explained(telemetry: Telemetry) -> None:
+    for message in telemetry.database.messages:
+        assert message.comment, message.name
+        for signal in message.signals:
+            assert signal.comment, f"{message.name}.{signal.name}"
+            unit = signal.name.rpartition("_")[2]
+            assert signal.unit or unit not in ("rpm", "Nm", "A", "V", "us", "deg", "s", "hz"), signal.name
+            assert signal.choices or signal.length > 1, f"{message.name}.{signal.name}: names of its values"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "equal"),
+    [
+        ('CM_ BO_ 385 "Speed and rotor position.";', 'CM_ BO_ 385 "Motion.";', True),
+        ('BA_ "GenMsgCycleTime" BO_ 388 10;', 'BA_ "GenMsgCycleTime" BO_ 388 20;', True),
+        ('SG_ duty : 48|16@1- (0.000030517578125,0)', 'SG_ duty : 48|16@1- (0.00006103515625,0)', False),
+        ('SG_ state : 0|8@1+', 'SG_ state : 40|8@1+', False),
+        ('"interrupt_overrun";\nVAL_ 1793 controller', '"overrun";\nVAL_ 1793 controller', False),
+        ('SG_ duty :', 'SG_ output :', False),
+    ],
+)  # fmt: skip
+def test_hash_changes_with_the_meaning_of_a_frame(old: str, new: str, equal: bool) -> None:
+    text = DATABASES["drive"][0].read_text(encoding="cp1252")
+    assert old in text
+    hashes = [
+        database_hash(cantools.database.load_string(t, database_format="dbc", strict=False))
+        for t in (text, text.replace(old, new))
+    ]
+    assert (hashes[0] == hashes[1]) is equal
 
 
 @pytest.mark.parametrize(
@@ -222,7 +360,7 @@ def test_texts_of_the_dbc_are_the_enumerations_of_the_firmware(
             'VERSION ""\nBU_: A\nBO_ 1 X: 1 A\n SG_ a : 0|8@1+ (1,0) [0|0] "" A\n SG_ b : 4|4@1+ (1,0) [0|0] "" A\n',
             "overlap",
         ),
-        ('VERSION ""\nBU_: A\nBO_ 1 X: 1 A\n SG_ a : 0|8@1+ (1,0) [300|400] "" A\n', "signal a: its range"),
+        ('VERSION ""\nBU_: A\nBO_ 1 X: 1 A\n SG_ a : 0|8@1+ (1,0) [300|400] "" A\n', "signal a: no value of its range"),
     ],
 )
 def test_a_bad_database_gives_one_line_and_exit_code_2(

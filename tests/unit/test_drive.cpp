@@ -246,9 +246,9 @@ TEST_F(Drive, its_time_on_the_processor_is_kept_reported_and_acted_upon_by_nobod
     EXPECT_EQ(drive.late_interrupts, 0u);
     unsigned seen = 0;
     for (const hal_can_frame_t &frame : hal.from_drive) {
-        if (frame.identifier == DRIVE_DRIVE_PROCESSOR_FRAME_ID) {
-            drive_drive_processor_t processor{};
-            drive_drive_processor_unpack(&processor, frame.data, frame.length);
+        if (frame.identifier == DRIVE_PROCESSOR_FRAME_ID) {
+            drive_processor_t processor{};
+            drive_processor_unpack(&processor, frame.data, frame.length);
             EXPECT_EQ(processor.used_us, 1234);
             EXPECT_EQ(processor.worst_us, 65535) << "held at its end";
             EXPECT_EQ(processor.available_us, 5000);
@@ -279,36 +279,36 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
     periods(1000);
     hal.from_drive.clear();
     periods(400); // a whole slow cycle
-    const control_diagnostics_t d = control_diagnose(&drive.control_parameters, &drive.control);
+    const control_state_t &control = drive.control;
     unsigned seen = 0;
     for (const hal_can_frame_t &frame : hal.from_drive) {
-        if (frame.identifier == DRIVE_DRIVE_STATUS_FRAME_ID) {
-            drive_drive_status_t status{};
-            drive_drive_status_unpack(&status, frame.data, frame.length);
+        if (frame.identifier == DRIVE_STATUS_FRAME_ID) {
+            drive_status_t status{};
+            drive_status_unpack(&status, frame.data, frame.length);
             EXPECT_EQ(status.state, DRIVE_STATE_RUN);
             EXPECT_EQ(status.controller, DRIVE_CONTROLLER_PAPER);
             EXPECT_EQ(status.fault, FAULT_NONE);
             seen |= 1;
-        } else if (frame.identifier == DRIVE_DRIVE_TORQUE_FRAME_ID) {
+        } else if (frame.identifier == DRIVE_TORQUE_FRAME_ID) {
             // The rotor stands and the currents are held, so every cycle says the same.
-            drive_drive_torque_t torque{};
-            drive_drive_torque_unpack(&torque, frame.data, frame.length);
-            EXPECT_EQ(torque.torque_reference_nm, (d.torque_reference_q24 + 32768) >> 16);
-            EXPECT_EQ(torque.torque_estimate_nm, (d.torque_q24 + 32768) >> 16);
+            drive_torque_t torque{};
+            drive_torque_unpack(&torque, frame.data, frame.length);
+            EXPECT_EQ(torque.torque_reference_nm, (control.torque_reference_q24 + 32768) >> 16);
+            EXPECT_EQ(torque.torque_estimate_nm, (control.measurement.torque_sum_q24 + 32768) >> 16);
             EXPECT_EQ(torque.bus_voltage_v, 240 << 6);
             seen |= 2;
-        } else if (frame.identifier == DRIVE_DRIVE_CURRENTS_FRAME_ID) {
-            drive_drive_currents_t currents{};
-            drive_drive_currents_unpack(&currents, frame.data, frame.length);
+        } else if (frame.identifier == DRIVE_CURRENTS_FRAME_ID) {
+            drive_currents_t currents{};
+            drive_currents_unpack(&currents, frame.data, frame.length);
             EXPECT_EQ(currents.current_a_a, 1000);
             EXPECT_EQ(currents.current_b_a, 2000);
             EXPECT_EQ(currents.current_c_a, 3000);
             EXPECT_EQ(currents.current_d_a, 0);
             seen |= 4;
-        } else if (frame.identifier == DRIVE_DRIVE_BP_PID_FRAME_ID) {
+        } else if (frame.identifier == DRIVE_BP_PID_FRAME_ID) {
             // Gains per N m: those per scaled error over the scale.
-            drive_drive_bp_pid_t pid{};
-            drive_drive_bp_pid_unpack(&pid, frame.data, frame.length);
+            drive_bp_pid_t pid{};
+            drive_bp_pid_unpack(&pid, frame.data, frame.length);
             const double inverse = drive.control_parameters.duty.pid.error_scale_inverse_q24 / 16777216.0;
             EXPECT_NEAR(pid.kp_per_nm, drive.control.duty.pid.gain_q24[0] / 512.0 * inverse, 0.51);
             EXPECT_NEAR(pid.ki_per_nm, drive.control.duty.pid.gain_q24[1] / 512.0 * inverse, 0.51);

@@ -25,7 +25,7 @@ int32_t any_value(const parameter_row_t *row, std::mt19937_64 &random) {
         return row->maximum;
     case 2:
     case 3:
-        return row->initial;
+        return row->default_value;
     default:
         return int32_t(row->minimum + int64_t(random() % (uint64_t(int64_t(row->maximum) - row->minimum) + 1)));
     }
@@ -93,7 +93,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
         parameters_t p;
         parameters_init(&p);
         for (unsigned index = 0; index < PARAMETER_COUNT; index++) {
-            ASSERT_EQ(parameters_set(&p, index, any_value(parameters_row(index), random)), PARAMETER_DONE);
+            ASSERT_EQ(parameters_set(&p, index, any_value(parameters_row(index), random)), PARAMETER_STATUS_DONE);
         }
         const uint32_t rate_hz = rates_hz[random() % 4];
         const control_parameters_t parameters =

@@ -13,41 +13,38 @@ extern "C" {
 
 namespace {
 
-enum { READ, WRITE, MINIMUM, MAXIMUM, DEFAULT, FRACTION_BITS, NAME, UNIT };
-enum { DONE, NO_SUCH_PARAMETER, OUT_OF_RANGE, NOT_WHILE_RUNNING, UNKNOWN_OPERATION };
-
 class Parameters : public testing::Test {
   protected:
     Parameters() { parameters_init(&parameters); }
 
-    drive_parameter_response_t ask(unsigned operation, unsigned index, unsigned part = 0, int32_t value = 0,
-                                   bool writable = true) {
+    drive_parameter_response_t request(unsigned operation, unsigned index, unsigned part = 0, int32_t value = 0,
+                                       bool writable = true) {
         const hal_can_frame_t frame = frames::parameter_request(operation, index, part, value);
-        hal_can_frame_t response;
-        std::memset(&response, 0xA5, sizeof response);
-        parameter_protocol_answer(&parameters, writable, &frame, &response);
-        EXPECT_EQ(response.identifier, DRIVE_PARAMETER_RESPONSE_FRAME_ID);
-        EXPECT_EQ(response.length, 8);
-        EXPECT_FALSE(response.extended);
-        EXPECT_FALSE(response.remote);
-        drive_parameter_response_t answer{};
-        drive_parameter_response_unpack(&answer, response.data, sizeof response.data);
-        EXPECT_EQ(answer.operation, operation);
-        EXPECT_EQ(answer.index, index);
-        EXPECT_EQ(answer.part, part);
-        return answer;
+        hal_can_frame_t response_frame;
+        std::memset(&response_frame, 0xA5, sizeof response_frame);
+        parameter_protocol_respond(&parameters, writable, &frame, &response_frame);
+        EXPECT_EQ(response_frame.identifier, DRIVE_PARAMETER_RESPONSE_FRAME_ID);
+        EXPECT_EQ(response_frame.length, 8);
+        EXPECT_FALSE(response_frame.extended);
+        EXPECT_FALSE(response_frame.remote);
+        drive_parameter_response_t response{};
+        drive_parameter_response_unpack(&response, response_frame.data, sizeof response_frame.data);
+        EXPECT_EQ(response.operation, operation);
+        EXPECT_EQ(response.index, index);
+        EXPECT_EQ(response.part, part);
+        return response;
     }
 
     std::string text(unsigned operation, unsigned index) {
         std::string result;
         for (unsigned part = 0; part < 256; part++) {
-            const auto answer = ask(operation, index, part);
-            EXPECT_EQ(answer.status, DONE);
-            if (answer.value == 0) {
+            const auto response = request(operation, index, part);
+            EXPECT_EQ(response.status, PARAMETER_STATUS_DONE);
+            if (response.value == 0) {
                 break;
             }
             char characters[5] = {};
-            std::memcpy(characters, &answer.value, 4);
+            std::memcpy(characters, &response.value, 4);
             result += characters;
         }
         return result;
@@ -68,9 +65,9 @@ TEST_F(Parameters, every_row_is_sound) {
         ASSERT_NE(row->unit, nullptr);
         EXPECT_LE(row->fraction_bits, 30);
         EXPECT_LT(row->minimum, row->maximum);
-        EXPECT_LE(row->minimum, row->initial);
-        EXPECT_LE(row->initial, row->maximum);
-        EXPECT_EQ(parameters.values[i], row->initial);
+        EXPECT_LE(row->minimum, row->default_value);
+        EXPECT_LE(row->default_value, row->maximum);
+        EXPECT_EQ(parameters.values[i], row->default_value);
     }
 }
 
@@ -83,42 +80,42 @@ TEST_F(Parameters, defaults_are_a_consistent_set) {
     EXPECT_LT(value[PARAMETER_TORQUE_BAND_INNER_NM], value[PARAMETER_TORQUE_BAND_OUTER_NM]);
 }
 
-TEST_F(Parameters, limits_are_allowed_and_one_beyond_is_refused) {
+TEST_F(Parameters, limits_are_allowed_and_one_beyond_is_rejected) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         const parameter_row_t *row = parameters_row(i);
         SCOPED_TRACE(row->name);
         for (const int32_t allowed : {row->minimum, row->maximum}) {
-            const uint32_t changes = parameters.changes;
-            EXPECT_EQ(parameters_set(&parameters, i, allowed), PARAMETER_DONE);
+            const uint32_t revision = parameters.revision;
+            EXPECT_EQ(parameters_set(&parameters, i, allowed), PARAMETER_STATUS_DONE);
             EXPECT_EQ(parameters.values[i], allowed);
-            EXPECT_EQ(parameters.changes, changes + 1);
+            EXPECT_EQ(parameters.revision, revision + 1);
         }
-        for (const int64_t refused : {int64_t(row->minimum) - 1, int64_t(row->maximum) + 1}) {
-            if (refused != int32_t(refused)) {
+        for (const int64_t rejected : {int64_t(row->minimum) - 1, int64_t(row->maximum) + 1}) {
+            if (rejected != int32_t(rejected)) {
                 continue; // the limit is that of the 32 bits
             }
             const parameters_t before = parameters;
-            EXPECT_EQ(parameters_set(&parameters, i, int32_t(refused)), PARAMETER_OUT_OF_RANGE);
+            EXPECT_EQ(parameters_set(&parameters, i, int32_t(rejected)), PARAMETER_STATUS_OUT_OF_RANGE);
             EXPECT_EQ(std::memcmp(&before, &parameters, sizeof before), 0);
         }
     }
 }
 
-TEST_F(Parameters, no_such_index) {
+TEST_F(Parameters, an_unknown_index_is_rejected) {
     const parameters_t before = parameters;
     int32_t value = 42;
     for (const unsigned index : {unsigned(PARAMETER_COUNT), 255u, ~0u}) {
-        EXPECT_EQ(parameters_set(&parameters, index, 0), PARAMETER_NO_SUCH);
-        EXPECT_EQ(parameters_get(&parameters, index, &value), PARAMETER_NO_SUCH);
+        EXPECT_EQ(parameters_set(&parameters, index, 0), PARAMETER_STATUS_NO_SUCH_PARAMETER);
+        EXPECT_EQ(parameters_get(&parameters, index, &value), PARAMETER_STATUS_NO_SUCH_PARAMETER);
     }
     EXPECT_EQ(value, 42);
     EXPECT_EQ(std::memcmp(&before, &parameters, sizeof before), 0);
 }
 
-TEST_F(Parameters, a_default_of_the_machine_is_held_within_the_limits) {
+TEST_F(Parameters, a_default_of_the_machine_is_clamped_to_the_limits) {
     parameters_set_default(&parameters, PARAMETER_INERTIA_KG_M2, 12345678);
     EXPECT_EQ(parameters.values[PARAMETER_INERTIA_KG_M2], 12345678);
-    EXPECT_EQ(ask(DEFAULT, PARAMETER_INERTIA_KG_M2).value, 12345678);
+    EXPECT_EQ(request(PARAMETER_OPERATION_DEFAULT, PARAMETER_INERTIA_KG_M2).value, 12345678);
     parameters_set_default(&parameters, PARAMETER_INERTIA_KG_M2, INT32_MAX);
     EXPECT_EQ(parameters.values[PARAMETER_INERTIA_KG_M2], parameters_row(PARAMETER_INERTIA_KG_M2)->maximum);
 }
@@ -128,17 +125,17 @@ TEST_F(Parameters, protocol_reads_everything_of_every_row) {
         const parameter_row_t *row = parameters_row(i);
         SCOPED_TRACE(row->name);
         parameters_set(&parameters, i, row->maximum);
-        for (const auto &[operation, expected] : {std::pair<unsigned, int32_t>{READ, row->maximum},
-                                                  {MINIMUM, row->minimum},
-                                                  {MAXIMUM, row->maximum},
-                                                  {DEFAULT, row->initial},
-                                                  {FRACTION_BITS, row->fraction_bits}}) {
-            const auto answer = ask(operation, i);
-            EXPECT_EQ(answer.status, DONE);
-            EXPECT_EQ(answer.value, expected) << "operation " << operation;
+        for (const auto &[operation, expected] : {std::pair<unsigned, int32_t>{PARAMETER_OPERATION_READ, row->maximum},
+                                                  {PARAMETER_OPERATION_MINIMUM, row->minimum},
+                                                  {PARAMETER_OPERATION_MAXIMUM, row->maximum},
+                                                  {PARAMETER_OPERATION_DEFAULT, row->default_value},
+                                                  {PARAMETER_OPERATION_FRACTION_BITS, row->fraction_bits}}) {
+            const auto response = request(operation, i);
+            EXPECT_EQ(response.status, PARAMETER_STATUS_DONE);
+            EXPECT_EQ(response.value, expected) << "operation " << operation;
         }
-        EXPECT_EQ(text(NAME, i), row->name);
-        EXPECT_EQ(text(UNIT, i), row->unit);
+        EXPECT_EQ(text(PARAMETER_OPERATION_NAME, i), row->name);
+        EXPECT_EQ(text(PARAMETER_OPERATION_UNIT, i), row->unit);
     }
 }
 
@@ -146,34 +143,35 @@ TEST_F(Parameters, protocol_never_reads_past_a_text) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         for (unsigned part = 0; part < 256; part++) {
             const size_t length = std::strlen(parameters_row(i)->name);
-            EXPECT_EQ(ask(NAME, i, part).value != 0, part * 4 < length) << i << " part " << part;
+            EXPECT_EQ(request(PARAMETER_OPERATION_NAME, i, part).value != 0, part * 4 < length)
+                << i << " part " << part;
         }
     }
 }
 
-TEST_F(Parameters, protocol_writes_and_answers_the_value_that_holds) {
-    auto answer = ask(WRITE, PARAMETER_COMMAND_TIMEOUT_MS, 0, 250);
-    EXPECT_EQ(answer.status, DONE);
-    EXPECT_EQ(answer.value, 250);
-    answer = ask(WRITE, PARAMETER_COMMAND_TIMEOUT_MS, 0, 1001);
-    EXPECT_EQ(answer.status, OUT_OF_RANGE);
-    EXPECT_EQ(answer.value, 250);
-    answer = ask(WRITE, PARAMETER_COMMAND_TIMEOUT_MS, 0, 300, false);
-    EXPECT_EQ(answer.status, NOT_WHILE_RUNNING);
-    EXPECT_EQ(answer.value, 250);
-    EXPECT_EQ(ask(READ, PARAMETER_COMMAND_TIMEOUT_MS, 0, 0, false).value, 250);
+TEST_F(Parameters, protocol_writes_and_responses_the_value_that_holds) {
+    auto response = request(PARAMETER_OPERATION_WRITE, PARAMETER_COMMAND_TIMEOUT_MS, 0, 250);
+    EXPECT_EQ(response.status, PARAMETER_STATUS_DONE);
+    EXPECT_EQ(response.value, 250);
+    response = request(PARAMETER_OPERATION_WRITE, PARAMETER_COMMAND_TIMEOUT_MS, 0, 1001);
+    EXPECT_EQ(response.status, PARAMETER_STATUS_OUT_OF_RANGE);
+    EXPECT_EQ(response.value, 250);
+    response = request(PARAMETER_OPERATION_WRITE, PARAMETER_COMMAND_TIMEOUT_MS, 0, 300, false);
+    EXPECT_EQ(response.status, PARAMETER_STATUS_NOT_WHILE_RUNNING);
+    EXPECT_EQ(response.value, 250);
+    EXPECT_EQ(request(PARAMETER_OPERATION_READ, PARAMETER_COMMAND_TIMEOUT_MS, 0, 0, false).value, 250);
 }
 
-TEST_F(Parameters, every_operation_with_every_index_is_answered_and_only_a_good_write_changes_anything) {
+TEST_F(Parameters, every_operation_with_every_index_is_answered_and_only_a_good_write_revision_anything) {
     for (unsigned operation = 0; operation < 256; operation++) {
         for (unsigned index = 0; index < 256; index++) {
             const parameters_t before = parameters;
-            const auto answer = ask(operation, index, 0, INT32_MIN);
-            const int expected = operation > UNIT           ? UNKNOWN_OPERATION
-                                 : index >= PARAMETER_COUNT ? NO_SUCH_PARAMETER
-                                 : operation == WRITE       ? OUT_OF_RANGE
-                                                            : DONE;
-            ASSERT_EQ(answer.status, expected) << operation << ", " << index;
+            const auto response = request(operation, index, 0, INT32_MIN);
+            const int expected = operation > PARAMETER_OPERATION_UNIT     ? PARAMETER_STATUS_UNKNOWN_OPERATION
+                                 : index >= PARAMETER_COUNT               ? PARAMETER_STATUS_NO_SUCH_PARAMETER
+                                 : operation == PARAMETER_OPERATION_WRITE ? PARAMETER_STATUS_OUT_OF_RANGE
+                                                                          : PARAMETER_STATUS_DONE;
+            ASSERT_EQ(response.status, expected) << operation << ", " << index;
             ASSERT_EQ(std::memcmp(&before, &parameters, sizeof before), 0);
         }
     }

@@ -1,4 +1,4 @@
-// The bus side as a whole: cycles, three mailboxes, what is dropped, what never is, and bounded work.
+// Telemetry and reception as a whole: schedule, three mailboxes, dropped frames, and bounded work per call.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -9,6 +9,9 @@
 
 extern "C" {
 #include "comms/comms.h"
+#include "telemetry_collect.h"
+
+extern const machine_tables_t machine_tables;
 }
 #include "drive_codec.h"
 #include "support/frames.h"
@@ -21,7 +24,8 @@ struct hal {
     uint32_t overflows = 0;
     unsigned received_calls = 0;
 
-    // The bus carries the mailbox that wins arbitration, if its identifier is below `limit`: others hold the bus there.
+    // Transmits the mailbox that wins arbitration if its identifier is below `limit`; other nodes occupy the bus from
+    // there.
     bool carry(uint32_t limit = 0x800) {
         const auto lowest = std::min_element(mailboxes.begin(), mailboxes.end(),
                                              [](const auto &a, const auto &b) { return a.identifier < b.identifier; });
@@ -65,17 +69,25 @@ bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
 
 namespace {
 
-constexpr uint8_t STATE_RUN = DRIVE_DRIVE_STATUS_STATE_RUN_CHOICE;
-constexpr uint8_t STATE_FAULT = DRIVE_DRIVE_STATUS_STATE_FAULT_CHOICE;
 constexpr uint32_t STEP_US = 25;
 constexpr uint32_t FRAME_US = 125; // a frame on the bus, rounded to steps
 
 class Comms : public testing::Test {
   protected:
     Comms() {
+        drive.hal = &bus;
+        drive.tables = drive.control_parameters.tables = &machine_tables;
+        drive.control_rate_hz = 40000;
+        drive.control.state_machine.state = DRIVE_STATE_RUN;
         parameters_init(&parameters);
-        comms_init(&comms, 3, 40000, 0);
-        snapshot.state = STATE_RUN;
+        comms_init(&comms, 0);
+    }
+
+    // One cycle of telemetry from the drive's state.
+    void report(uint32_t at_us) {
+        drive_telemetry_t values;
+        telemetry_collect(&drive, at_us, &values);
+        comms_telemetry(&comms, &bus, &values);
     }
 
     // The drive's background and the bus, until `until_us`; other nodes hold the bus for identifiers from `limit` on.
@@ -85,8 +97,7 @@ class Comms : public testing::Test {
                 bus.carry(limit);
             }
             if (comms_telemetry_due(&comms, time_us)) {
-                snapshot.time_us = time_us;
-                comms_telemetry(&comms, &bus, &snapshot);
+                report(time_us);
             }
             if (comms_background(&comms, &bus, &parameters, true, time_us)) {
                 accepted.push_back(comms.command);
@@ -111,9 +122,9 @@ class Comms : public testing::Test {
     }
 
     hal bus;
-    comms_t comms;
-    parameters_t parameters;
-    telemetry_snapshot_t snapshot{};
+    drive_t drive{};
+    comms_t &comms = drive.comms;
+    parameters_t &parameters = drive.parameters;
     uint32_t time_us = 0;
     std::vector<command_t> accepted;
 };
@@ -121,88 +132,94 @@ class Comms : public testing::Test {
 TEST_F(Comms, frames_come_at_their_rates) {
     run(1003000);
     // 1003 cycles; the last may still be on its way
-    EXPECT_NEAR(bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 1003, 1);
-    EXPECT_NEAR(bus.count(DRIVE_DRIVE_MOTION_FRAME_ID), 1003, 1);
-    EXPECT_NEAR(bus.count(DRIVE_DRIVE_TORQUE_FRAME_ID), 1003, 1);
-    EXPECT_NEAR(bus.count(DRIVE_DRIVE_CURRENTS_FRAME_ID), 1003, 1);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_BP_PID_FRAME_ID), 101u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_TRIM_FRAME_ID), 101u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 11u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_COMMAND_COUNTERS_FRAME_ID), 11u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_BUS_COUNTERS_FRAME_ID), 11u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_PROCESSOR_FRAME_ID), 11u);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 0u);
+    EXPECT_NEAR(bus.count(DRIVE_STATUS_FRAME_ID), 1003, 1);
+    EXPECT_NEAR(bus.count(DRIVE_MOTION_FRAME_ID), 1003, 1);
+    EXPECT_NEAR(bus.count(DRIVE_TORQUE_FRAME_ID), 1003, 1);
+    EXPECT_NEAR(bus.count(DRIVE_CURRENTS_FRAME_ID), 1003, 1);
+    EXPECT_EQ(bus.count(DRIVE_BP_PID_FRAME_ID), 101u);
+    EXPECT_EQ(bus.count(DRIVE_TRIM_FRAME_ID), 101u);
+    EXPECT_EQ(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_COMMAND_COUNTERS_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_BUS_COUNTERS_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_PROCESSOR_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_IDENTITY_FRAME_ID), 10u);
+    EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 0u);
+    EXPECT_EQ(bus.count(DRIVE_FAULT_MASK_FRAME_ID), 0u);
     EXPECT_EQ(comms.telemetry.dropped, 0);
 }
 
-TEST_F(Comms, signals_carry_the_snapshot) {
-    snapshot.controller = 2;
-    snapshot.fault = 5;
-    snapshot.voltage_saturated = true;
-    snapshot.speed_q22 = int32_t(std::lround(-600 * 2 * M_PI / 60 * 4194304));
-    snapshot.speed_reference_q22 = int32_t(std::lround(150 * 2 * M_PI / 60 * 4194304));
-    snapshot.rotor_angle = 0x40000000;
-    snapshot.torque_reference_q24 = int32_t(19.1 * (1 << 24));
-    snapshot.torque_estimate_q24 = INT32_MAX;
-    snapshot.load_torque_estimate_q24 = -8 * (1 << 24);
-    snapshot.bus_voltage_q6 = 240 * 64;
-    snapshot.current_q9[0] = 20 * 512;
-    snapshot.current_q9[3] = 65535;
-    snapshot.kp_q15 = 16384;
-    snapshot.kd_q15 = 70000;
-    snapshot.duty_q15 = -32769;
-    snapshot.trim_torque_q24 = -3 * (1 << 24);
-    snapshot.misalignment = 1 << 20;
-    snapshot.torque_missing_q24 = INT32_MAX;
-    snapshot.observer_bandwidth_rad_s = 8000;
-    snapshot.used_ticks = 3000;
-    snapshot.worst_ticks = 4999;
-    snapshot.available_ticks = 5000;
-    snapshot.late_interrupts = 70000;
+TEST_F(Comms, signals_carry_the_state_of_the_drive) {
+    control_parameters_t &p = drive.control_parameters;
+    control_state_t &control = drive.control;
+    p.controller = DRIVE_CONTROLLER_SALIENT;
+    control.state_machine.record.fault = FAULT_ENCODER;
+    control.observer.speed_q22 = int32_t(std::lround(-600 * 2 * M_PI / 60 * 4194304));
+    control.speed_reference_q22 = int32_t(std::lround(150 * 2 * M_PI / 60 * 4194304));
+    control.measurement.angle = 0x40000000;
+    control.torque_reference_q24 = int32_t(19.1 * (1 << 24));
+    control.measurement.torque_sum_q24 = INT32_MAX;
+    control.observer.load_torque_q24 = -8 * (1 << 24);
+    control.measurement.dc_link_voltage_q6 = 240 * 64;
+    control.measurement.current_q9[0] = 20 * 512;
+    control.measurement.current_q9[3] = 65535;
+    p.duty.pid.error_scale_inverse_q24 = 1 << 24;
+    control.duty.pid.gain_q24[0] = 16384 << 9;
+    control.duty.pid.gain_q24[2] = 70000 << 9;
+    control.duty.pid.duty_q23 = -32769 * 256;
+    control.trim.trim_q24 = -3 * (1 << 24);
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+        control.misalignment.phase[phase].offset = (1 << 20) * machine_tables.rotor_poles;
+    }
+    control.predictive.torque_shortfall_q24 = INT32_MAX;
+    p.bandwidth.bandwidth_rad_s[control.bandwidth.stage] = 8000;
+    drive.used_ticks = 3000;
+    drive.worst_ticks = 4999;
+    p.period_ticks = 2500;
+    drive.late_interrupts = 70000;
     run(3000);
 
-    drive_drive_status_t status;
-    drive_drive_status_unpack(&status, first(DRIVE_DRIVE_STATUS_FRAME_ID).data, 8);
+    drive_status_t status;
+    drive_status_unpack(&status, first(DRIVE_STATUS_FRAME_ID).data, 8);
     EXPECT_EQ(status.time_us, 0u);
-    EXPECT_EQ(status.state, STATE_RUN);
+    EXPECT_EQ(status.state, DRIVE_STATE_RUN);
     EXPECT_EQ(status.controller, 2);
     EXPECT_EQ(status.fault, 5);
     EXPECT_EQ(status.voltage_saturated, 1);
-    drive_drive_motion_t motion;
-    drive_drive_motion_unpack(&motion, first(DRIVE_DRIVE_MOTION_FRAME_ID).data, 8);
+    drive_motion_t motion;
+    drive_motion_unpack(&motion, first(DRIVE_MOTION_FRAME_ID).data, 8);
     EXPECT_EQ(motion.speed_rpm, -600000);
     EXPECT_EQ(motion.speed_reference_rpm, 150000);
     EXPECT_EQ(motion.rotor_angle_deg, 0x4000);
-    drive_drive_torque_t torque;
-    drive_drive_torque_unpack(&torque, first(DRIVE_DRIVE_TORQUE_FRAME_ID).data, 8);
+    drive_torque_t torque;
+    drive_torque_unpack(&torque, first(DRIVE_TORQUE_FRAME_ID).data, 8);
     EXPECT_EQ(torque.torque_reference_nm, 4890); // 19.1 N m is 4889.6 LSB
     EXPECT_EQ(torque.torque_estimate_nm, 32767);
     EXPECT_EQ(torque.load_torque_estimate_nm, -2048);
     EXPECT_EQ(torque.bus_voltage_v, 15360);
-    drive_drive_currents_t currents;
-    drive_drive_currents_unpack(&currents, first(DRIVE_DRIVE_CURRENTS_FRAME_ID).data, 8);
+    drive_currents_t currents;
+    drive_currents_unpack(&currents, first(DRIVE_CURRENTS_FRAME_ID).data, 8);
     EXPECT_EQ(currents.current_a_a, 10240);
     EXPECT_EQ(currents.current_d_a, 65535);
-    drive_drive_bp_pid_t gains;
-    drive_drive_bp_pid_unpack(&gains, first(DRIVE_DRIVE_BP_PID_FRAME_ID).data, 8);
+    drive_bp_pid_t gains;
+    drive_bp_pid_unpack(&gains, first(DRIVE_BP_PID_FRAME_ID).data, 8);
     EXPECT_EQ(gains.kp_per_nm, 16384);
     EXPECT_EQ(gains.kd_per_nm, 65535);
     EXPECT_EQ(gains.duty, -32768);
-    drive_drive_trim_t trim;
-    drive_drive_trim_unpack(&trim, first(DRIVE_DRIVE_TRIM_FRAME_ID).data, 8);
+    drive_trim_t trim;
+    drive_trim_unpack(&trim, first(DRIVE_TRIM_FRAME_ID).data, 8);
     EXPECT_EQ(trim.trim_torque_nm, -768);
     EXPECT_EQ(trim.misalignment_deg, 256);
     EXPECT_EQ(trim.torque_missing_nm, 32767);
     EXPECT_EQ(trim.observer_bandwidth_rad_s, 8000);
-    drive_drive_processor_t processor;
-    drive_drive_processor_unpack(&processor, first(DRIVE_DRIVE_PROCESSOR_FRAME_ID).data, 8);
+    drive_processor_t processor;
+    drive_processor_unpack(&processor, first(DRIVE_PROCESSOR_FRAME_ID).data, 8);
     EXPECT_EQ(processor.used_us, 3000);
     EXPECT_EQ(processor.worst_us, 4999);
     EXPECT_EQ(processor.available_us, 5000);
     EXPECT_EQ(processor.late_interrupts, 65535);
-    drive_drive_heartbeat_t heartbeat;
-    drive_drive_heartbeat_unpack(&heartbeat, first(DRIVE_DRIVE_HEARTBEAT_FRAME_ID).data, 8);
-    EXPECT_EQ(heartbeat.state, STATE_RUN);
+    drive_heartbeat_t heartbeat;
+    drive_heartbeat_unpack(&heartbeat, first(DRIVE_HEARTBEAT_FRAME_ID).data, 8);
+    EXPECT_EQ(heartbeat.state, DRIVE_STATE_RUN);
     EXPECT_EQ(heartbeat.controller, 2);
     EXPECT_EQ(heartbeat.phases, 3);
     EXPECT_EQ(heartbeat.control_rate_hz, 40000u);
@@ -210,43 +227,53 @@ TEST_F(Comms, signals_carry_the_snapshot) {
 
 TEST_F(Comms, a_fault_is_reported_with_the_next_cycle_and_every_100_ms) {
     run(10500);
-    snapshot.state = STATE_FAULT;
-    snapshot.last_fault.time_us = 10400;
-    snapshot.last_fault.fault = FAULT_OVER_CURRENT;
-    snapshot.last_fault.state = STATE_RUN;
-    snapshot.last_fault.fault_mask = 0x0022;
-    snapshot.last_fault.speed_q22 = -1000 * 439231;
-    snapshot.last_fault.dc_link_voltage_q6 = 15360;
-    snapshot.last_fault.current_max_q9 = 36000;
-    snapshot.last_fault.torque_reference_q24 = 1 << 24;
+    drive.control.state_machine.state = DRIVE_STATE_FAULT;
+    fault_record_t &record = drive.control.state_machine.record;
+    record.time_us = 10400;
+    record.fault = FAULT_OVER_CURRENT;
+    record.state = DRIVE_STATE_RUN;
+    record.fault_mask = 0x0022;
+    record.speed_q22 = -1000 * 439231;
+    record.dc_link_voltage_q6 = 15360;
+    record.current_max_q9 = 36000;
+    record.torque_reference_q24 = 1 << 24;
     run(12000);
-    ASSERT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 1u);
-    ASSERT_EQ(bus.count(DRIVE_DRIVE_FAULT_SNAPSHOT_FRAME_ID), 1u);
+    ASSERT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 1u);
+    ASSERT_EQ(bus.count(DRIVE_FAULT_SNAPSHOT_FRAME_ID), 1u);
+    ASSERT_EQ(bus.count(DRIVE_FAULT_MASK_FRAME_ID), 1u);
     for (const auto &frame : bus.sent) {
-        if (frame.identifier == DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID) {
-            drive_drive_fault_cause_t cause;
-            drive_drive_fault_cause_unpack(&cause, frame.data, 8);
+        if (frame.identifier == DRIVE_FAULT_CAUSE_FRAME_ID) {
+            drive_fault_cause_t cause;
+            drive_fault_cause_unpack(&cause, frame.data, 8);
             EXPECT_EQ(cause.time_us, 10400u);
             EXPECT_EQ(cause.fault, 1);
-            EXPECT_EQ(cause.state, STATE_RUN);
+            EXPECT_EQ(cause.state, DRIVE_STATE_RUN);
             EXPECT_EQ(cause.checks, 0x0022);
-        } else if (frame.identifier == DRIVE_DRIVE_FAULT_SNAPSHOT_FRAME_ID) {
-            drive_drive_fault_snapshot_t values;
-            drive_drive_fault_snapshot_unpack(&values, frame.data, 8);
+        } else if (frame.identifier == DRIVE_FAULT_SNAPSHOT_FRAME_ID) {
+            drive_fault_snapshot_t values;
+            drive_fault_snapshot_unpack(&values, frame.data, 8);
             EXPECT_EQ(values.speed_rpm, -4000); // 1000 r/min in quarters
             EXPECT_EQ(values.bus_voltage_v, 15360);
             EXPECT_EQ(values.current_max_a, 36000);
             EXPECT_EQ(values.torque_reference_nm, 256);
+        } else if (frame.identifier == DRIVE_FAULT_MASK_FRAME_ID) {
+            drive_fault_mask_t mask;
+            drive_fault_mask_unpack(&mask, frame.data, 8);
+            EXPECT_EQ(mask.over_current, 1);
+            EXPECT_EQ(mask.encoder, 1);
+            EXPECT_EQ(mask.over_voltage + mask.under_voltage + mask.over_speed + mask.command_timeout +
+                          mask.interrupt_overrun,
+                      0);
         }
     }
     run(211900);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 3u);
-    snapshot.last_fault.time_us = 211900; // cleared and another between two cycles
+    EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 3u);
+    record.time_us = 211900; // cleared and another between two cycles
     run(213000);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
-    snapshot.state = STATE_RUN;
+    EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
+    drive.control.state_machine.state = DRIVE_STATE_RUN;
     run(500000);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
+    EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
 }
 
 TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
@@ -255,17 +282,16 @@ TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
     EXPECT_GT(dropped, 0);
     run(60000);
     const std::vector<hal_can_frame_t> &sent = bus.sent;
-    drive_drive_status_t status;
+    drive_status_t status;
     std::vector<int> cycles;
     for (size_t i = 0; i < sent.size(); i++) {
-        if (sent[i].identifier == DRIVE_DRIVE_STATUS_FRAME_ID && i + 3 < sent.size()) {
-            drive_drive_status_unpack(&status, sent[i].data, 8);
+        if (sent[i].identifier == DRIVE_STATUS_FRAME_ID && i + 3 < sent.size()) {
+            drive_status_unpack(&status, sent[i].data, 8);
             cycles.push_back(status.cycle);
         }
     }
-    for (const uint32_t identifier :
-         {DRIVE_DRIVE_MOTION_FRAME_ID, DRIVE_DRIVE_TORQUE_FRAME_ID, DRIVE_DRIVE_CURRENTS_FRAME_ID}) {
-        EXPECT_NEAR(bus.count(identifier), bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 1);
+    for (const uint32_t identifier : {DRIVE_MOTION_FRAME_ID, DRIVE_TORQUE_FRAME_ID, DRIVE_CURRENTS_FRAME_ID}) {
+        EXPECT_NEAR(bus.count(identifier), bus.count(DRIVE_STATUS_FRAME_ID), 1);
     }
     ASSERT_GE(cycles.size(), 4u);
     EXPECT_EQ(cycles[0], 0); // the oldest
@@ -275,19 +301,48 @@ TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
 }
 
 TEST_F(Comms, dropped_frames_are_counted_exactly) {
-    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 2 counters + 1 PROCESSOR + 1 heartbeat
+    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 2 counters + 1 PROCESSOR + 1 identity + 1 heartbeat
     const unsigned waiting = unsigned(bus.mailboxes.size()) + comms.telemetry.queue.count;
-    EXPECT_EQ(comms.telemetry.dropped + waiting, 424u);
+    EXPECT_EQ(comms.telemetry.dropped + waiting, 425u);
 }
 
 TEST_F(Comms, others_above_the_heartbeat_cannot_block_telemetry) {
     run(1990500, 0x700);
-    EXPECT_NEAR(bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 1991, 1);
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 0u);
-    EXPECT_EQ(comms.telemetry.dropped, 19); // the heartbeats behind the one that waits
+    EXPECT_NEAR(bus.count(DRIVE_STATUS_FRAME_ID), 1991, 1);
+    EXPECT_EQ(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 0u);
+    EXPECT_EQ(comms.telemetry.dropped, 19 + 20); // heartbeats and identities after the heartbeat that waits
     run(2200000);
-    EXPECT_GE(bus.count(DRIVE_DRIVE_HEARTBEAT_FRAME_ID), 2u);
-    EXPECT_EQ(comms.telemetry.dropped, 19);
+    EXPECT_GE(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 2u);
+    EXPECT_EQ(comms.telemetry.dropped, 19 + 20);
+    EXPECT_GE(bus.count(DRIVE_IDENTITY_FRAME_ID), 1u);
+}
+
+TEST_F(Comms, the_identity_is_sent_in_the_middle_of_a_slow_cycle) {
+    run(106000);
+    std::vector<int> cycles;
+    int cycle = -1;
+    for (const auto &frame : bus.sent) {
+        if (frame.identifier == DRIVE_STATUS_FRAME_ID) {
+            cycle = frame.data[7];
+        } else if (frame.identifier == DRIVE_IDENTITY_FRAME_ID) {
+            cycles.push_back(cycle);
+            drive_identity_t identity;
+            drive_identity_unpack(&identity, frame.data, 8);
+            EXPECT_EQ(identity.firmware_major, SALIENT_VERSION_MAJOR);
+            EXPECT_EQ(identity.firmware_minor, SALIENT_VERSION_MINOR);
+            EXPECT_EQ(identity.firmware_patch, SALIENT_VERSION_PATCH);
+            EXPECT_EQ(identity.dbc_hash, DRIVE_DBC_HASH);
+        }
+    }
+    EXPECT_EQ(cycles, (std::vector<int>{5, 105}));
+}
+
+TEST_F(Comms, no_mailbox_is_lost_to_a_second_background_frame) {
+    run(99500, 0); // nothing leaves
+    run(500000, 0x700);
+    EXPECT_LE(std::count_if(bus.mailboxes.begin(), bus.mailboxes.end(),
+                            [](const auto &frame) { return frame.identifier >= 0x700; }),
+              1);
 }
 
 TEST_F(Comms, missed_cycles_show_in_the_cycle_number_and_the_grid_stays) {
@@ -296,9 +351,9 @@ TEST_F(Comms, missed_cycles_show_in_the_cycle_number_and_the_grid_stays) {
     run(9500);
     std::vector<std::pair<int, uint32_t>> cycles;
     for (const auto &frame : bus.sent) {
-        if (frame.identifier == DRIVE_DRIVE_STATUS_FRAME_ID) {
-            drive_drive_status_t status;
-            drive_drive_status_unpack(&status, frame.data, 8);
+        if (frame.identifier == DRIVE_STATUS_FRAME_ID) {
+            drive_status_t status;
+            drive_status_unpack(&status, frame.data, 8);
             cycles.emplace_back(status.cycle, status.time_us);
         }
     }
@@ -307,27 +362,25 @@ TEST_F(Comms, missed_cycles_show_in_the_cycle_number_and_the_grid_stays) {
     EXPECT_EQ(cycles, expected);
 }
 
-TEST_F(Comms, a_snapshot_taken_just_before_the_cycle_is_due_keeps_the_grid) {
+TEST_F(Comms, values_collected_just_before_the_cycle_is_due_keep_the_grid) {
     for (uint32_t cycle = 0; cycle < 10; cycle++) {
         ASSERT_TRUE(comms_telemetry_due(&comms, cycle * 1000));
-        snapshot.time_us = cycle * 1000 - 20;
-        comms_telemetry(&comms, &bus, &snapshot);
+        report(cycle * 1000 - 20);
         ASSERT_FALSE(comms_telemetry_due(&comms, cycle * 1000 + 999));
     }
 }
 
 TEST_F(Comms, cycles_go_on_across_the_wrap_of_the_clock) {
     const uint32_t start = UINT32_MAX - 2499;
-    comms_init(&comms, 3, 40000, start);
+    comms_init(&comms, start);
     for (uint32_t elapsed = 0; elapsed < 10000; elapsed += STEP_US) {
         bus.carry();
         if (comms_telemetry_due(&comms, start + elapsed)) {
-            snapshot.time_us = start + elapsed;
-            comms_telemetry(&comms, &bus, &snapshot);
+            report(start + elapsed);
         }
         comms_background(&comms, &bus, &parameters, true, start + elapsed);
     }
-    EXPECT_EQ(bus.count(DRIVE_DRIVE_STATUS_FRAME_ID), 10u);
+    EXPECT_EQ(bus.count(DRIVE_STATUS_FRAME_ID), 10u);
 }
 
 TEST_F(Comms, every_command_is_seen_in_order) {
@@ -342,7 +395,7 @@ TEST_F(Comms, every_command_is_seen_in_order) {
     EXPECT_LT(accepted[0].time_us, accepted[1].time_us);
 }
 
-TEST_F(Comms, one_call_looks_at_a_bounded_number_of_frames) {
+TEST_F(Comms, one_call_processes_a_bounded_number_of_frames) {
     bus.received.assign(HAL_CAN_RECEIVE_QUEUE, hal_can_frame_t{0x123, false, false, 8, {}});
     comms_background(&comms, &bus, &parameters, true, 0);
     EXPECT_EQ(bus.received.size(), size_t(HAL_CAN_RECEIVE_QUEUE - COMMS_FRAMES_PER_CALL));
@@ -382,20 +435,20 @@ TEST_F(Comms, parameters_can_be_written_over_the_bus) {
 
 TEST_F(Comms, counters_are_reported) {
     bus.received.push_back(hal_can_frame_t{0x123, false, false, 8, {}});
-    bus.received.push_back(hal_can_frame_t{DRIVE_DRIVE_COMMAND_FRAME_ID, false, false, 6, {}});
-    bus.received.push_back(hal_can_frame_t{DRIVE_DRIVE_COMMAND_FRAME_ID, false, false, 7, {}});
+    bus.received.push_back(hal_can_frame_t{DRIVE_COMMAND_FRAME_ID, false, false, 6, {}});
+    bus.received.push_back(hal_can_frame_t{DRIVE_COMMAND_FRAME_ID, false, false, 7, {}});
     bus.received.push_back(command(1, COMMAND_STOP));
     bus.received.push_back(command(1, COMMAND_STOP));
     bus.received.push_back(command(2, 4));
     bus.overflows = 70000;
     run(105000);
-    drive_drive_command_counters_t refused{};
-    drive_drive_bus_counters_t counters{};
+    drive_command_counters_t refused{};
+    drive_bus_counters_t counters{};
     for (const auto &frame : bus.sent) {
-        if (frame.identifier == DRIVE_DRIVE_COMMAND_COUNTERS_FRAME_ID) {
-            drive_drive_command_counters_unpack(&refused, frame.data, 8);
-        } else if (frame.identifier == DRIVE_DRIVE_BUS_COUNTERS_FRAME_ID) {
-            drive_drive_bus_counters_unpack(&counters, frame.data, 8);
+        if (frame.identifier == DRIVE_COMMAND_COUNTERS_FRAME_ID) {
+            drive_command_counters_unpack(&refused, frame.data, 8);
+        } else if (frame.identifier == DRIVE_BUS_COUNTERS_FRAME_ID) {
+            drive_bus_counters_unpack(&counters, frame.data, 8);
         }
     }
     EXPECT_EQ(refused.wrong_length, 1);

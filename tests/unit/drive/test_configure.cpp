@@ -212,7 +212,7 @@ TEST(Configure, converts_both_ends_of_every_parameter) {
             if (index > PARAMETER_LOAD_SOURCE) {
                 parameters.values[PARAMETER_CONTROLLER] = DRIVE_CONTROLLER_SALIENT;
             }
-            ASSERT_EQ(parameters_set(&parameters, index, value), PARAMETER_DONE);
+            ASSERT_EQ(parameters_set(&parameters, index, value), PARAMETER_STATUS_DONE);
             for (const double rate_hz : RATES_HZ) {
                 SCOPED_TRACE(testing::Message() << parameters_row(index)->name << " = " << value << ", " << rate_hz);
                 ASSERT_NO_FATAL_FAILURE(expect_converted(parameters, rate_hz, 17));
@@ -230,7 +230,7 @@ TEST(Configure, converts_random_sets_of_parameters_within_their_ranges) {
             const parameter_row_t *row = parameters_row(index);
             const uint64_t width = uint64_t(int64_t(row->maximum) - row->minimum) + 1;
             ASSERT_EQ(parameters_set(&parameters, index, int32_t(row->minimum + int64_t(random() % width))),
-                      PARAMETER_DONE);
+                      PARAMETER_STATUS_DONE);
         }
         SCOPED_TRACE(testing::Message() << "set " << i);
         ASSERT_NO_FATAL_FAILURE(expect_converted(parameters, RATES_HZ[random() % 5], unsigned(8 + random() % 25)));
@@ -259,8 +259,8 @@ TEST(Configure, every_default_is_within_its_range_and_every_name_fits) {
         ASSERT_NE(row->name, nullptr) << index;
         EXPECT_LE(std::string(row->name).size(), size_t(PARAMETER_NAME_MAX));
         EXPECT_LT(row->minimum, row->maximum) << row->name;
-        EXPECT_GE(row->initial, row->minimum) << row->name;
-        EXPECT_LE(row->initial, row->maximum) << row->name;
+        EXPECT_GE(row->default_value, row->minimum) << row->name;
+        EXPECT_LE(row->default_value, row->maximum) << row->name;
         EXPECT_LE(row->fraction_bits, 30) << row->name;
     }
 }

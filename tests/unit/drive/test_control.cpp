@@ -12,6 +12,11 @@ extern "C" {
 #include "drive/configure.h"
 #include "drive/control.h"
 #include "drive/fault.h"
+#include "telemetry_collect.h"
+
+uint32_t hal_can_receive_overflows(const hal_t *) {
+    return 0;
+}
 }
 
 #include "support/reference_models.h"
@@ -32,6 +37,17 @@ bool all_open(const hal_pwm_compare_t &compare) {
     return true;
 }
 
+// Values of the last period.
+struct diagnostics_t {
+    uint32_t angle; // 2^-32 rev
+    int32_t speed_q22, speed_reference_q22;
+    int32_t torque_reference_q24, torque_q24, load_torque_q24;
+    int32_t current_q9[HAL_PHASES_MAX], bus_voltage_q6;
+    int32_t duty_q15;
+    bool voltage_saturated;
+    int32_t trim_torque_q24, torque_missing_q24; // multiples of 2^-8 N m
+};
+
 // A drive on a rotor whose speed the test prescribes.
 class Control : public testing::Test {
   protected:
@@ -43,7 +59,7 @@ class Control : public testing::Test {
         p.values[PARAMETER_CONTROLLER] = controller;
         parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, 12);
         control_reset(&parameters, &state);
-        diagnostics = control_diagnostics_t{};
+        diagnostics = diagnostics_t{};
         sample = control_sample_t{};
         command = command_t{};
         sample.adc.bus_voltage_counts = BUS_COUNTS;
@@ -72,11 +88,40 @@ class Control : public testing::Test {
         turns += speed_rad_s / (2.0 * fixed_point::PI * RATE_HZ);
         sample.encoder.counts = uint32_t(int64_t(std::floor((turns - std::floor(turns)) * (1 << ENCODER_BITS))));
         const bool closed = control_step(&parameters, &state, &sample, &command, &compare);
-        diagnostics = control_diagnose(&parameters, &state);
+        diagnostics = diagnose();
         // No switch is ever closed outside RUN.
         EXPECT_EQ(closed, state.state_machine.state == DRIVE_STATE_RUN);
         EXPECT_TRUE(closed || all_open(compare));
         return closed;
+    }
+
+    // From the state and, where telemetry_collect computes a value, from telemetry.
+    diagnostics_t diagnose() {
+        telemetry_drive.tables = &machine_tables;
+        telemetry_drive.control_parameters = parameters;
+        telemetry_drive.control = state;
+        drive_telemetry_t telemetry;
+        telemetry_collect(&telemetry_drive, sample.time_us, &telemetry);
+        diagnostics_t values = {
+            .angle = state.measurement.angle,
+            .speed_q22 = state.observer.speed_q22,
+            .speed_reference_q22 = state.speed_reference_q22,
+            .torque_reference_q24 = state.torque_reference_q24,
+            .torque_q24 = state.measurement.torque_sum_q24,
+            .load_torque_q24 = state.observer.load_torque_q24,
+            .current_q9 = {},
+            .bus_voltage_q6 = int32_t(telemetry.torque.bus_voltage_v),
+            .duty_q15 = telemetry.bp_pid.duty,
+            .voltage_saturated = telemetry.status.voltage_saturated != 0,
+            .trim_torque_q24 = telemetry.trim.trim_torque_nm * (1 << 16),
+            .torque_missing_q24 = telemetry.trim.torque_missing_nm * (1 << 16),
+        };
+        const uint32_t currents[] = {telemetry.currents.current_a_a, telemetry.currents.current_b_a,
+                                     telemetry.currents.current_c_a, telemetry.currents.current_d_a};
+        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+            values.current_q9[phase] = int32_t(currents[phase]);
+        }
+        return values;
     }
 
     void start() {
@@ -90,7 +135,8 @@ class Control : public testing::Test {
 
     control_parameters_t parameters;
     control_state_t state;
-    control_diagnostics_t diagnostics;
+    diagnostics_t diagnostics;
+    drive_t telemetry_drive{}; // as telemetry_collect reads it
     control_sample_t sample;
     command_t command;
     hal_pwm_compare_t compare;

@@ -222,7 +222,7 @@ TEST(LocalBus, AnyoneMayLeaveAtAnyTime) {
             other->send_bytes(&nothing, 0); // an empty record ends the connection
         }
         auto records = bench.run_to(*keeper, (i + 1) * MS);
-        ASSERT_EQ(records.back().identifier(), RIG_RIG_CLOCK_FRAME_ID);
+        ASSERT_EQ(records.back().identifier(), RIG_CLOCK_FRAME_ID);
     }
 }
 

@@ -8,7 +8,7 @@ constexpr uint64_t MS = 1000000;
 std::vector<BusRecord> without_clock(const std::vector<BusRecord> &records) {
     std::vector<BusRecord> result;
     for (const auto &record : records) {
-        if (record.identifier() != RIG_RIG_CLOCK_FRAME_ID && record.identifier() != RIG_RIG_RUN_UNTIL_FRAME_ID) {
+        if (record.identifier() != RIG_CLOCK_FRAME_ID && record.identifier() != RIG_RUN_UNTIL_FRAME_ID) {
             result.push_back(record);
         }
     }
@@ -29,9 +29,9 @@ TEST(RigLockstep, TimeStandsStillUntilAsked) {
     bench.serve();
     auto records = client->receive();
     ASSERT_FALSE(records.empty());
-    EXPECT_EQ(records.front().identifier(), RIG_RIG_RUN_UNTIL_FRAME_ID) << "the client sees its own frame";
+    EXPECT_EQ(records.front().identifier(), RIG_RUN_UNTIL_FRAME_ID) << "the client sees its own frame";
     EXPECT_EQ(records.front().time_ns, 0u);
-    EXPECT_EQ(records.back().identifier(), RIG_RIG_CLOCK_FRAME_ID);
+    EXPECT_EQ(records.back().identifier(), RIG_CLOCK_FRAME_ID);
     EXPECT_EQ(records.back().time_ns, 10 * MS);
     EXPECT_EQ(records.back().frame.data[6], 77);
     EXPECT_EQ(bench.firmware.interrupts, 400u) << "first one after 25 us, the last at 10 ms itself";
@@ -50,7 +50,7 @@ TEST(RigLockstep, PastIsAnsweredAtOnceWithTheTimeItIs) {
     auto records = client->receive();
     ASSERT_EQ(records.size(), 4u);
     for (int i : {1, 3}) {
-        EXPECT_EQ(records[i].identifier(), RIG_RIG_CLOCK_FRAME_ID);
+        EXPECT_EQ(records[i].identifier(), RIG_CLOCK_FRAME_ID);
         EXPECT_EQ(records[i].time_ns, 5 * MS);
         EXPECT_EQ(records[i].frame.data[6], 9 + i / 2);
     }
@@ -158,7 +158,7 @@ TEST(RigLockstep, TwoTimekeepersAreEachAnsweredAtTheirTime) {
     bench.serve();
     std::vector<std::pair<uint64_t, int>> clocks;
     for (const auto &record : first->receive()) {
-        if (record.identifier() == RIG_RIG_CLOCK_FRAME_ID) {
+        if (record.identifier() == RIG_CLOCK_FRAME_ID) {
             clocks.emplace_back(record.time_ns, record.frame.data[6]);
         }
     }
@@ -255,7 +255,7 @@ TEST(RigLockstep, EndlessQueueOfFramesCostsTheClientItsConnection) {
     EXPECT_FALSE(connected);
     EXPECT_NE(testing::internal::GetCapturedStderr().find("client 2"), std::string::npos);
     client->receive();
-    EXPECT_EQ(bench.run_to(*client, MS).back().identifier(), RIG_RIG_CLOCK_FRAME_ID);
+    EXPECT_EQ(bench.run_to(*client, MS).back().identifier(), RIG_CLOCK_FRAME_ID);
 }
 
 } // namespace

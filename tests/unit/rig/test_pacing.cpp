@@ -41,7 +41,7 @@ TEST(Pacing, MovingTimeStillAnswersRunUntilAtItsTime) {
     }
     uint64_t answered_ns = 0;
     for (const auto &record : client->receive()) {
-        if (record.identifier() == RIG_RIG_CLOCK_FRAME_ID) {
+        if (record.identifier() == RIG_CLOCK_FRAME_ID) {
             answered_ns = record.time_ns;
         }
     }

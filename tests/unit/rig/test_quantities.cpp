@@ -18,7 +18,7 @@ class RigQuantities : public testing::Test {
             return -1;
         }
         const auto &reply = records[1];
-        EXPECT_EQ(reply.identifier(), RIG_RIG_SET_REPLY_FRAME_ID);
+        EXPECT_EQ(reply.identifier(), RIG_SET_REPLY_FRAME_ID);
         EXPECT_EQ(reply.time_ns, bench.rig->board.time_ns);
         EXPECT_EQ(reply.frame.data[0], quantity);
         uint32_t answered_us;
@@ -141,10 +141,10 @@ TEST_F(RigQuantities, PastPresentAndFullQueue) {
 
 TEST_F(RigQuantities, WrongLengthRemoteAndForeignRigFramesAreOnlyRelayed) {
     auto other = bench.connect();
-    client->send(RIG_RIG_SET_FRAME_ID | CAN_EFF_FLAG, {1, 0, 0, 1});
-    client->send(RIG_RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG, {0, 0, 0, 1, 0, 0, 0, 0});
-    client->send(RIG_RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG | CAN_RTR_FLAG, {0, 0, 0, 1, 0, 0, 0});
-    client->send(RIG_RIG_CLOCK_FRAME_ID | CAN_EFF_FLAG, {0, 0, 0, 1, 0, 0, 0});
+    client->send(RIG_SET_FRAME_ID | CAN_EFF_FLAG, {1, 0, 0, 1});
+    client->send(RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG, {0, 0, 0, 1, 0, 0, 0, 0});
+    client->send(RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG | CAN_RTR_FLAG, {0, 0, 0, 1, 0, 0, 0});
+    client->send(RIG_CLOCK_FRAME_ID | CAN_EFF_FLAG, {0, 0, 0, 1, 0, 0, 0});
     client->send(0x1F0000FFu | CAN_EFF_FLAG, {1});
     bench.serve();
     EXPECT_EQ(client->receive().size(), 5u);
@@ -158,7 +158,7 @@ TEST_F(RigQuantities, TruthComesOnMultiplesOfItsPeriod) {
     auto truth_times = [this](uint64_t until_ns) {
         std::vector<uint64_t> times;
         for (const auto &record : bench.run_to(*client, until_ns)) {
-            if (record.identifier() == RIG_RIG_TRUTH_MOTION_FRAME_ID) {
+            if (record.identifier() == RIG_TRUTH_MOTION_FRAME_ID) {
                 times.push_back(record.time_ns);
             }
         }
@@ -174,19 +174,19 @@ TEST_F(RigQuantities, TruthComesOnMultiplesOfItsPeriod) {
 TEST_F(RigQuantities, TruthIsThePlants) {
     EXPECT_EQ(set(1, -500000), DONE); // drives the shaft
     auto records = bench.run_to(*client, 4 * MS);
-    rig_rig_truth_motion_t motion{};
-    rig_rig_truth_currents_t currents{};
-    rig_rig_truth_bench_t state{};
+    rig_truth_motion_t motion{};
+    rig_truth_currents_t currents{};
+    rig_truth_bench_t state{};
     for (const auto &record : records) {
         if (record.time_ns != 4 * MS) {
             continue;
         }
-        if (record.identifier() == RIG_RIG_TRUTH_MOTION_FRAME_ID) {
-            rig_rig_truth_motion_unpack(&motion, record.frame.data, 8);
-        } else if (record.identifier() == RIG_RIG_TRUTH_CURRENTS_FRAME_ID) {
-            rig_rig_truth_currents_unpack(&currents, record.frame.data, 8);
-        } else if (record.identifier() == RIG_RIG_TRUTH_BENCH_FRAME_ID) {
-            rig_rig_truth_bench_unpack(&state, record.frame.data, 8);
+        if (record.identifier() == RIG_TRUTH_MOTION_FRAME_ID) {
+            rig_truth_motion_unpack(&motion, record.frame.data, 8);
+        } else if (record.identifier() == RIG_TRUTH_CURRENTS_FRAME_ID) {
+            rig_truth_currents_unpack(&currents, record.frame.data, 8);
+        } else if (record.identifier() == RIG_TRUTH_BENCH_FRAME_ID) {
+            rig_truth_bench_unpack(&state, record.frame.data, 8);
         }
     }
     const plant_t &plant = bench.rig->plant;

@@ -29,7 +29,7 @@ class SocketCan : public testing::Test {
     void run_until(uint64_t time_ns) {
         std::vector<uint8_t> data(7);
         std::memcpy(data.data(), &time_ns, 6);
-        send(RIG_RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG, data);
+        send(RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG, data);
         bench->serve();
     }
 
@@ -44,16 +44,16 @@ class SocketCan : public testing::Test {
             uint32_t identifier = frame.can_id & CAN_EFF_MASK;
             uint64_t time_ns = 0;
             std::memcpy(&time_ns, frame.data, 6);
-            if (identifier == RIG_RIG_STAMP_FRAME_ID) {
-                if (frame.data[6] == RIG_RIG_STAMP_SUBJECT_NEXT_CHOICE) {
+            if (identifier == RIG_STAMP_FRAME_ID) {
+                if (frame.data[6] == RIG_STAMP_SUBJECT_NEXT_CHOICE) {
                     next_ns = time_ns;
-                } else if (frame.data[6] == RIG_RIG_STAMP_SUBJECT_OLDEST_ON_BUS_CHOICE) {
+                } else if (frame.data[6] == RIG_STAMP_SUBJECT_OLDEST_ON_BUS_CHOICE) {
                     result.emplace_back(time_ns, sent_on_bus.at(on_bus++));
                 } else {
                     result.emplace_back(time_ns, sent_at_once.at(at_once++));
                 }
             } else {
-                result.emplace_back(identifier == RIG_RIG_CLOCK_FRAME_ID ? time_ns : next_ns, identifier);
+                result.emplace_back(identifier == RIG_CLOCK_FRAME_ID ? time_ns : next_ns, identifier);
             }
         }
         return result;
@@ -65,15 +65,15 @@ class SocketCan : public testing::Test {
 
 TEST_F(SocketCan, StampsGiveTheSameListAsTheLocalBus) {
     send(0x100, {1, 2});
-    send(RIG_RIG_SET_FRAME_ID | CAN_EFF_FLAG, {1, 0, 0, 1, 0, 0, 0, 0});
+    send(RIG_SET_FRAME_ID | CAN_EFF_FLAG, {1, 0, 0, 1, 0, 0, 0, 0});
     send(0x200, {3});
     run_until(10 * MS);
-    auto here = timed({0x100, 0x200}, {RIG_RIG_SET_FRAME_ID, RIG_RIG_RUN_UNTIL_FRAME_ID});
+    auto here = timed({0x100, 0x200}, {RIG_SET_FRAME_ID, RIG_RUN_UNTIL_FRAME_ID});
 
     RigBench local;
     auto client = local.connect();
     client->send(0x100, {1, 2});
-    client->send(RIG_RIG_SET_FRAME_ID | CAN_EFF_FLAG, {1, 0, 0, 1, 0, 0, 0, 0});
+    client->send(RIG_SET_FRAME_ID | CAN_EFF_FLAG, {1, 0, 0, 1, 0, 0, 0, 0});
     client->send(0x200, {3});
     std::vector<std::pair<uint64_t, uint32_t>> there;
     for (const auto &record : local.run_to(*client, 10 * MS)) {

@@ -14,14 +14,14 @@ namespace frames {
 
 // DRIVE_COMMAND with its checksum; the values are not checked.
 inline hal_can_frame_t command(uint8_t counter, unsigned request, int32_t milli_rpm) {
-    drive_drive_command_t message{};
+    drive_command_t message{};
     message.request = uint8_t(request);
     message.speed_reference_rpm = milli_rpm;
     hal_can_frame_t frame{};
-    frame.identifier = DRIVE_DRIVE_COMMAND_FRAME_ID;
-    frame.length = DRIVE_DRIVE_COMMAND_LENGTH;
-    drive_drive_command_pack(frame.data, &message, sizeof frame.data);
-    e2e_protect(COMMANDS_DATA_ID, counter, frame.data, frame.length);
+    frame.identifier = DRIVE_COMMAND_FRAME_ID;
+    frame.length = DRIVE_COMMAND_LENGTH;
+    drive_command_pack(frame.data, &message, sizeof frame.data);
+    e2e_protect(DRIVE_COMMAND_E2E_DATA_ID, counter, frame.data, frame.length);
     return frame;
 }
 

@@ -63,7 +63,7 @@ class BusClient {
             data.push_back(static_cast<uint8_t>(time_ns >> (8 * i)));
         }
         data.push_back(sequence);
-        return send(RIG_RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG, data);
+        return send(RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG, data);
     }
 
     bool set(uint8_t quantity, int32_t raw, uint32_t at_us = 0) {
@@ -73,7 +73,7 @@ class BusClient {
         for (int i = 0; i < 4; ++i) {
             data.push_back(static_cast<uint8_t>(at_us >> (8 * i)));
         }
-        return send(RIG_RIG_SET_FRAME_ID | CAN_EFF_FLAG, data);
+        return send(RIG_SET_FRAME_ID | CAN_EFF_FLAG, data);
     }
 
     // Everything that has arrived.

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from salient.compare_options import add_options as add_compare_options
+from salient.version import VERSION
 
 CONTROLLERS = ("traditional", "paper", "salient")
 CONTROL_RATES_HZ = (20_000, 40_000, 50_000, 100_000, 1_000_000)
@@ -35,6 +36,7 @@ class _Parser(argparse.ArgumentParser):
 def make_parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     parser = _Parser(prog="tools/salient", description="Salient: a switched-reluctance drive and its bench.")
+    parser.add_argument("--version", action="version", version=f"salient {VERSION}")
     parser.add_argument("--no-install", action="store_true", help="name what is missing instead of installing it")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
 

@@ -1,4 +1,4 @@
-"""The drive over CAN, as its user has it: commands, parameters, state."""
+"""The drive over CAN as its user sees it: commands, parameters, state."""
 
 from __future__ import annotations
 
@@ -9,41 +9,41 @@ from typing import TYPE_CHECKING
 import can
 
 from salient.bus import e2e
-from salient.bus.signals import drive_database
+from salient.bus.signals import drive_database, value_numbers
 
 if TYPE_CHECKING:
     from salient.bench.session import Session
 
-REQUESTS = {"off": 0, "run": 1, "stop": 2, "clear_fault": 3}
-COMMAND_PERIOD_NS = 10_000_000
-"""Commands are repeated so often, in virtual time; the drive stops when they stop coming."""
+_COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
+REQUESTS = value_numbers(drive_database(), "DRIVE_COMMAND", "request")
+COMMAND_PERIOD_NS = _COMMAND.cycle_time * 1_000_000
+"""Period of the commands in virtual time; the drive stops when they are no longer sent."""
 
-_ANSWER_TIMEOUT_S = 0.1
+_RESPONSE_TIMEOUT_S = 0.1
 _TEXT_PARTS_MAX = 64
-_OPERATIONS = ("read", "write", "minimum", "maximum", "default", "fraction_bits", "name", "unit")
+_OPERATIONS = value_numbers(drive_database(), "PARAMETER_REQUEST", "operation")
 
 
 class DriveError(Exception):
-    """The drive refused or did not answer; the text says what."""
+    """The drive rejected a request or did not respond; the message has the reason."""
 
 
 def command_frame(counter: int, request: str, speed_reference_rpm: float) -> can.Message:
     """A DRIVE_COMMAND with its checksum. counter 0..255; request one of REQUESTS; -3000..3000 r/min."""
-    message = drive_database().get_message_by_name("DRIVE_COMMAND")
     signals = {
         "checksum": 0,
         "counter": counter,
         "request": REQUESTS[request],
         "speed_reference_rpm": speed_reference_rpm,
     }
-    payload = message.encode(signals)[e2e.HEADER_BYTES :]
-    data = e2e.protect(e2e.DRIVE_COMMAND_DATA_ID, counter, payload)
-    return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=data)
+    payload = _COMMAND.encode(signals)[e2e.HEADER_BYTES :]
+    data = e2e.protect(e2e.data_id(_COMMAND), counter, payload)
+    return can.Message(arbitration_id=_COMMAND.frame_id, is_extended_id=False, data=data)
 
 
 class Drive:
-    """Commands a drive. Assigning speed_reference_rpm asks it to run; the command is sent at once and then every
-    COMMAND_PERIOD_NS as the session's time moves, until `silence`. Nothing is sent before the first request.
+    """Commands a drive. Assigning speed_reference_rpm requests run; the command is sent immediately and then every
+    COMMAND_PERIOD_NS as the session's time advances, until `silence`. Nothing is sent before the first request.
     """
 
     def __init__(self, session: Session, parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
@@ -56,15 +56,15 @@ class Drive:
 
     @property
     def speed_reference_rpm(self) -> float:
-        """Last one asked for, -3000..3000; negative is backwards, and 0 to a controller that motors forwards only."""
+        """Last requested value, -3000..3000; negative is reverse, and 0 to a controller that drives forward only."""
         return self._speed_reference_rpm
 
     @speed_reference_rpm.setter
     def speed_reference_rpm(self, value: float) -> None:
-        signal = drive_database().get_message_by_name("DRIVE_COMMAND").get_signal_by_name("speed_reference_rpm")
+        signal = _COMMAND.get_signal_by_name("speed_reference_rpm")
         if not signal.minimum <= value <= signal.maximum:
-            allowed = f"{signal.minimum:g} to {signal.maximum:g} r/min"
-            raise DriveError(f"speed_reference_rpm {value:g}: allowed are {allowed}")
+            limits = f"{signal.minimum:g} to {signal.maximum:g} {signal.unit}"
+            raise DriveError(f"speed_reference_rpm {value:g}: must be {limits}")
         self._speed_reference_rpm = float(value)
         self.ask("run")
 
@@ -77,7 +77,7 @@ class Drive:
         self.ask("off")
 
     def clear_fault(self) -> None:
-        """Leave the fault state, if its cause is gone. The drive clears when this is asked anew: hence off first."""
+        """Leave the fault state, if its cause has gone. The drive clears when the request changes: hence off first."""
         self.ask("off")
         self.ask("clear_fault")
 
@@ -86,16 +86,17 @@ class Drive:
         self.command_due_ns = None
 
     def ask(self, request: str) -> None:
-        """off, run, stop or clear_fault; sends it at once."""
+        """Request off, run, stop or clear_fault; sends it immediately."""
         if request not in REQUESTS:
-            raise DriveError(f"request '{request}': allowed are {', '.join(REQUESTS)}")
+            *most, last = REQUESTS
+            raise DriveError(f"request '{request}': must be {', '.join(most)} or {last}")
         self._request = request
         self.send_command()
 
     def send_command(self) -> None:
         """Repeats the present request now; the next is due a period later."""
         if self._request is None:
-            raise DriveError("nothing was asked of the drive yet")
+            raise DriveError("no request to repeat")
         self._session.send(command_frame(self._counter, self._request, self._speed_reference_rpm))
         self._counter = (self._counter + 1) % 256
         self.command_due_ns = self._session.time_ns + COMMAND_PERIOD_NS
@@ -113,7 +114,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One parameter as the drive describes it; limits and default in its unit."""
+    """One parameter as described by the drive; limits and default in its unit."""
 
     index: int
     name: str
@@ -127,8 +128,8 @@ class ParameterRow:
 class Parameters(MutableMapping[str, float]):
     """The drive's parameters by name, read and written in their units.
 
-    The drive is asked for its table at the first use, unless `table` gives it. KeyError: no such name. DriveError: the
-    drive refuses the value.
+    The table is read from the drive at the first use, unless `table` returns it. KeyError: unknown name. DriveError:
+    value rejected by the drive.
     """
 
     def __init__(self, session: Session, table: Callable[[], list[ParameterRow]] | None = None) -> None:
@@ -145,20 +146,20 @@ class Parameters(MutableMapping[str, float]):
         return self._loaded
 
     def row(self, name: str) -> ParameterRow:
-        """Description of one parameter; KeyError lists the names there are."""
+        """Description of one parameter; KeyError lists the names."""
         if name not in self.rows:
-            raise KeyError(f"no parameter '{name}'; there are {', '.join(self.rows)}")
+            raise KeyError(f"no parameter '{name}'; the parameters are {', '.join(self.rows)}")
         return self.rows[name]
 
     def __getitem__(self, name: str) -> float:
         row = self.row(name)
-        return _ask(self._session, "read", row.index)[1] / 2**row.fraction_bits
+        return _access(self._session, "read", row.index)[1] / 2**row.fraction_bits
 
     def __setitem__(self, name: str, value: float) -> None:
         row = self.row(name)
-        status, _ = _ask(self._session, "write", row.index, value=raw_value(row, value))
+        status, _ = _access(self._session, "write", row.index, value=raw_value(row, value))
         if status == "out_of_range":
-            raise DriveError(f"{name} {value:g}: allowed are {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
+            raise DriveError(f"{name} {value:g}: must be {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
         if status != "done":
             raise DriveError(f"{name} {value:g}: {status}")
 
@@ -173,23 +174,23 @@ class Parameters(MutableMapping[str, float]):
 
 
 def raw_value(row: ParameterRow, value: float) -> int:
-    """The integer that stands for a physical value; DriveError when 32 bits cannot hold it."""
+    """Raw integer of a physical value; DriveError when it exceeds 32 bits."""
     raw = round(value * 2**row.fraction_bits)
     if not -(2**31) <= raw < 2**31:
-        raise DriveError(f"{row.name} {value:g}: allowed are {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
+        raise DriveError(f"{row.name} {value:g}: must be {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
     return raw
 
 
 def read_parameter_table(session: Session) -> list[ParameterRow]:
-    """Asks the drive for all of its parameters; takes some 0.1 s of virtual time."""
+    """Reads the descriptions of all parameters from the drive; takes some 0.1 s of virtual time."""
     rows: list[ParameterRow] = []
     while True:
         index = len(rows)
-        status, fraction_bits = _ask(session, "fraction_bits", index)
+        status, fraction_bits = _access(session, "fraction_bits", index)
         if status != "done":
             return rows
-        limits = (_ask(session, what, index)[1] / 2**fraction_bits for what in ("minimum", "maximum", "default"))
-        name, unit = (_ask_text(session, what, index) for what in ("name", "unit"))
+        limits = (_access(session, what, index)[1] / 2**fraction_bits for what in ("minimum", "maximum", "default"))
+        name, unit = (_read_text(session, what, index) for what in ("name", "unit"))
         rows.append(ParameterRow(index, name, unit, fraction_bits, *limits))
 
 
@@ -200,30 +201,31 @@ def write_request(row: ParameterRow, value: float) -> can.Message:
 
 def _request(operation: str, index: int, part: int, value: int) -> can.Message:
     message = drive_database().get_message_by_name("PARAMETER_REQUEST")
-    signals = {"operation": _OPERATIONS.index(operation), "index": index, "part": part, "value": value}
+    signals = {"operation": _OPERATIONS[operation], "index": index, "part": part, "value": value}
     return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=message.encode(signals))
 
 
-def _ask(session: Session, operation: str, index: int, part: int = 0, value: int = 0) -> tuple[str, int]:
-    """(status, value) of the drive's answer; lets virtual time pass until it comes."""
+def _access(session: Session, operation: str, index: int, part: int = 0, value: int = 0) -> tuple[str, int]:
+    """(status, value) of the drive's response; lets virtual time pass until it arrives."""
     session.send(_request(operation, index, part, value))
-    answer = drive_database().get_message_by_name("PARAMETER_RESPONSE")
-    head = bytes([_OPERATIONS.index(operation), index, part])
+    message = drive_database().get_message_by_name("PARAMETER_RESPONSE")
+    head = bytes([_OPERATIONS[operation], index, part])
     try:
         response = session.advance_until_frame(
-            lambda m: m.arbitration_id == answer.frame_id and not m.is_extended_id and bytes(m.data[:3]) == head,
-            _ANSWER_TIMEOUT_S,
+            lambda m: m.arbitration_id == message.frame_id and not m.is_extended_id and bytes(m.data[:3]) == head,
+            _RESPONSE_TIMEOUT_S,
         )
     except TimeoutError:
-        raise DriveError(f"no answer to PARAMETER_REQUEST {operation} {index} within {_ANSWER_TIMEOUT_S} s") from None
-    signals = answer.decode(bytes(response.data))
+        text = f"no response to PARAMETER_REQUEST {operation} {index} within {_RESPONSE_TIMEOUT_S} s"
+        raise DriveError(text) from None
+    signals = message.decode(bytes(response.data))
     return str(signals["status"]), int(signals["value"])
 
 
-def _ask_text(session: Session, operation: str, index: int) -> str:
+def _read_text(session: Session, operation: str, index: int) -> str:
     text = b""
     for part in range(_TEXT_PARTS_MAX):
-        four = _ask(session, operation, index, part)[1].to_bytes(4, "little", signed=True)
+        four = _access(session, operation, index, part)[1].to_bytes(4, "little", signed=True)
         text += four.rstrip(b"\0")
         if four.endswith(b"\0"):
             break

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 
 import can
@@ -16,12 +17,14 @@ import can
 from salient.bench.drive import Drive, ParameterRow
 from salient.bench.rig import Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
+from salient.bus.database_hash import database_hash
 from salient.bus.signals import SignalTable, drive_database, rig_database
 
 SILENCE_TIMEOUT_S = 60.0
 """Of the wall clock: how long an emulator may say nothing at all before it counts as hanging."""
 
 _POLL_STEP_NS = 500_000
+_IDENTITY = drive_database().get_message_by_name("DRIVE_IDENTITY")
 
 
 class SessionError(Exception):
@@ -49,6 +52,7 @@ class Session:
         self.rig = Rig(self)
         self._lockstep = lockstep
         self._sequence = 0
+        self._identity_checked = False
         self._bus = open_bus(address)
         self._reader = VirtualTimeReader(self._bus)
         try:
@@ -173,5 +177,22 @@ class Session:
             self.time_ns = max(self.time_ns, time_ns)
         self.log.append(timed)
         self.telemetry.add(time_ns, message)
+        if not self._identity_checked and message.arbitration_id == _IDENTITY.frame_id and not message.is_extended_id:
+            self._check_identity(message)
         self.truth.add(time_ns, message)
         return message
+
+    def _check_identity(self, message: can.Message) -> None:
+        """One line on stderr, once, when the drive's frames are not those of our DBC."""
+        if message.is_remote_frame or message.is_error_frame or len(message.data) != _IDENTITY.length:
+            return
+        self._identity_checked = True
+        identity = _IDENTITY.decode(bytes(message.data))
+        expected = database_hash(drive_database())
+        if identity["dbc_hash"] != expected:
+            version = ".".join(str(identity[f"firmware_{part}"]) for part in ("major", "minor", "patch"))
+            print(
+                f"salient: {self.address}: firmware {version} was built from another drive.dbc "
+                f"(hash {identity['dbc_hash']:08x}, here {expected:08x}): signals may be decoded wrongly",
+                file=sys.stderr,
+            )

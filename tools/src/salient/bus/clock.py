@@ -1,9 +1,10 @@
 """Frames with their exact virtual time, from either transport.
 
 The local bus carries the time in every record. SocketCAN carries none; there the emulator sends RIG_STAMP frames:
-before each frame of its own one with subject "next", and when a client's frame (which is on the interface already)
-completes on the emulated bus or was taken at once, one that says so. The reader puts frame and stamp together and
-leaves the stamps out, so both transports give the same list of (time, frame), in the same order.
+before each of its frames one with the subject "next", and, when a client's frame (which is on the interface already)
+completes on the emulated bus or is accepted without it, one with the subject "oldest_on_bus" or "oldest_at_once". The
+reader joins frame and stamp and removes the stamps, so both transports yield the same list of (time, frame), in the
+same order.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ import can
 import cantools
 
 from salient.bus.interface import is_on_bus
-from salient.bus.signals import drive_database, rig_database
+from salient.bus.signals import drive_database, rig_database, value_numbers
 from salient.errors import UsageError
 
-RIG_CLOCK_ID = 0x1F000002
-RIG_STAMP_ID = 0x1F000005
-_STAMP_NEXT, _STAMP_OLDEST_ON_BUS, _STAMP_OLDEST_AT_ONCE = 0, 1, 2
+RIG_CLOCK_ID = rig_database().get_message_by_name("RIG_CLOCK").frame_id
+RIG_STAMP_ID = rig_database().get_message_by_name("RIG_STAMP").frame_id
+_SUBJECTS = value_numbers(rig_database(), "RIG_STAMP", "subject")
 
 
 def _sent_by(database: cantools.database.Database, node: str) -> frozenset[int]:
@@ -27,7 +28,7 @@ def _sent_by(database: cantools.database.Database, node: str) -> frozenset[int]:
 
 
 def open_bus(address: str, receive_own_messages: bool = True) -> can.BusABC:
-    """Opens "unix:PATH" or "socketcan:INTERFACE"; UsageError when nothing is there."""
+    """Opens "unix:PATH" or "socketcan:INTERFACE"; UsageError when it does not exist."""
     kind, _, name = address.partition(":")
     try:
         if kind == "unix" and name:
@@ -38,7 +39,7 @@ def open_bus(address: str, receive_own_messages: bool = True) -> can.BusABC:
         raise UsageError(str(error)) from None
     except OSError as error:
         raise UsageError(f"--can {address}: {error.strerror}") from None
-    raise UsageError(f"--can {address}: allowed are unix:PATH and socketcan:INTERFACE")
+    raise UsageError(f"--can {address}: must be unix:PATH or socketcan:INTERFACE")
 
 
 class VirtualTimeReader:
@@ -56,26 +57,26 @@ class VirtualTimeReader:
         self._waiting_at_once: deque[can.Message] = deque()
 
     def receive(self, timeout: float | None) -> tuple[int, can.Message] | None:
-        """The next (virtual time in ns, message), or None when nothing came within `timeout` seconds."""
+        """The next (virtual time in ns, message), or None after `timeout` seconds without one."""
         while True:
             message = self._bus.recv(timeout)
             if message is None:
                 return None
             if not self._stamped:
                 return message.time_ns, message
-            timed = self._put_together(message)
+            timed = self._join(message)
             if timed is not None:
                 return timed
 
-    def _put_together(self, message: can.Message) -> tuple[int, can.Message] | None:
+    def _join(self, message: can.Message) -> tuple[int, can.Message] | None:
         identifier = message.arbitration_id
         if message.is_extended_id and identifier == RIG_STAMP_ID and len(message.data) == 7:
             time_ns, subject = clock_of(message)
-            if subject == _STAMP_NEXT:
+            if subject == _SUBJECTS["next"]:
                 self._next_ns = time_ns
                 return None
-            waiting = self._waiting_on_bus if subject == _STAMP_OLDEST_ON_BUS else self._waiting_at_once
-            # Nothing waits when the frame was on the interface before this reader was.
+            waiting = self._waiting_on_bus if subject == _SUBJECTS["oldest_on_bus"] else self._waiting_at_once
+            # Nothing waits when the frame preceded this reader on the interface.
             return _timed(time_ns, waiting.popleft()) if waiting else None
         if message.is_extended_id and identifier == RIG_CLOCK_ID and len(message.data) == 7:
             return _timed(clock_of(message)[0], message)

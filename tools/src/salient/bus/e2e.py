@@ -1,19 +1,25 @@
-"""End-to-end protection of frames as AUTOSAR E2E profile 5, the sender's side and a check.
+"""End-to-end protection of frames as AUTOSAR E2E profile 5: the sender's side and a check.
 
 Bytes 0 and 1 are the checksum (low byte first), byte 2 the counter, data from byte 3. The checksum is
-CRC-16/CCITT-FALSE over bytes 2 to the end and then the data ID, low byte first, which is never sent.
+CRC-16/CCITT-FALSE over bytes 2 to the end and then the data ID, low byte first, which is not transmitted.
 """
 
 from __future__ import annotations
 
 import binascii
 
+from cantools.database.can.message import Message
+
 HEADER_BYTES = 3
-DRIVE_COMMAND_DATA_ID = 0x5A1E
+
+
+def data_id(message: Message) -> int:
+    """Data ID of a protected message: its attribute E2EDataId in the DBC."""
+    return int(message.dbc.attributes["E2EDataId"].value)
 
 
 def checksum(data_id: int, frame: bytes) -> int:
-    """CRC of a frame whose first two bytes are not looked at."""
+    """CRC of a frame; its first two bytes are ignored."""
     return binascii.crc_hqx(frame[2:] + data_id.to_bytes(2, "little"), 0xFFFF)
 
 
@@ -24,5 +30,5 @@ def protect(data_id: int, counter: int, payload: bytes) -> bytes:
 
 
 def check(data_id: int, frame: bytes) -> bool:
-    """Whether the checksum is right; a frame shorter than the header is not."""
+    """True when the checksum is correct; false for a frame shorter than the header."""
     return len(frame) >= HEADER_BYTES and int.from_bytes(frame[:2], "little") == checksum(data_id, frame)

@@ -1,4 +1,4 @@
-"""Signals by name out of CAN frames, decoded by the DBC files, whole columns at a time."""
+"""Signals by name from CAN frames, decoded by the DBC files, whole columns at a time."""
 
 from __future__ import annotations
 
@@ -31,6 +31,12 @@ def rig_database() -> cantools.database.Database:
     return load_database(RIG_DBC)
 
 
+def value_numbers(database: cantools.database.Database, message: str, signal: str) -> dict[str, int]:
+    """Raw value by name of a signal with a value table, in the order of the values."""
+    choices = database.get_message_by_name(message).get_signal_by_name(signal).choices or {}
+    return {str(text): int(number) for number, text in sorted(choices.items())}
+
+
 @dataclass(frozen=True)
 class Signal:
     """One signal over time: `value[i]`, in `unit`, was on the bus at virtual time `time_s[i]`."""
@@ -46,12 +52,12 @@ class Signal:
 
     @property
     def last(self) -> float:
-        """The latest value; not-a-number, for which no comparison holds, when none came yet."""
+        """The latest value; not-a-number, for which no comparison is true, before the first."""
         return self.value[-1].item() if len(self.value) else math.nan
 
     @property
     def last_name(self) -> str:
-        """The latest value by its name in the DBC, for signals that have names; "unknown" when none came yet."""
+        """The latest value by its name in the DBC, for signals with named values; "unknown" before the first."""
         return (self.choices or {}).get(int(self.last), str(self.last)) if len(self.value) else "unknown"
 
     def between(self, from_s: float, to_s: float) -> Signal:
@@ -64,7 +70,7 @@ class SignalTable(Mapping[str, Signal]):
     """The signals of the messages that one node sends, filled frame by frame.
 
     table["speed_rpm"] is the signal of that name in the message with the lowest identifier that has one;
-    table["DRIVE_FAULT_SNAPSHOT.speed_rpm"] names its message. KeyError names what there is.
+    table["DRIVE_FAULT_SNAPSHOT.speed_rpm"] names its message. KeyError lists the signals.
     """
 
     def __init__(self, database: cantools.database.Database, sender: str) -> None:
@@ -83,7 +89,7 @@ class SignalTable(Mapping[str, Signal]):
                 self._names[f"{message.name}.{signal.name}"] = (key, signal)
 
     def add(self, time_ns: int, message: can.Message) -> None:
-        """Takes a frame if it is one of the node's and has the length that the DBC gives it."""
+        """Adds a frame if the node sends it and its length is that of the DBC."""
         key = (message.arbitration_id, message.is_extended_id)
         times = self._times.get(key)
         if times is None or message.is_remote_frame or message.is_fd or message.is_error_frame:
@@ -95,7 +101,7 @@ class SignalTable(Mapping[str, Signal]):
 
     def __getitem__(self, name: str) -> Signal:
         if name not in self._names:
-            raise KeyError(f"no signal '{name}'; there are {', '.join(n for n in self._names if '.' not in n)}")
+            raise KeyError(f"no signal '{name}'; the signals are {', '.join(n for n in self._names if '.' not in n)}")
         key, signal = self._names[name]
         raw = np.frombuffer(bytes(self._data[key]), dtype="<u8")
         choices = {int(number): str(text) for number, text in (signal.choices or {}).items()}
@@ -109,7 +115,7 @@ class SignalTable(Mapping[str, Signal]):
         return len(self._names)
 
     def count(self, message_name: str) -> int:
-        """How many frames of a message came; KeyError when the node sends none of that name."""
+        """Number of frames of a message; KeyError when the node sends none of that name."""
         for key, message in self._messages.items():
             if message.name == message_name:
                 return len(self._times[key])
@@ -117,7 +123,7 @@ class SignalTable(Mapping[str, Signal]):
 
 
 def _physical(raw: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
-    """Physical values of a little-endian signal from frames taken as 64-bit words."""
+    """Physical values of a little-endian signal from frames as 64-bit words."""
     if signal.byte_order != "little_endian":
         raise ValueError(f"{signal.name}: only little-endian signals are decoded")
     field = raw >> np.uint64(signal.start)

@@ -1,10 +1,12 @@
 """Writes the C codec of a CAN database: cantools' pack and unpack functions, and setters that saturate.
 
-    python -m salient.generate.codec [--integer] FILE.dbc OUTDIR
+    python -m salient.generate.codec [--integer] [--node NODE] FILE.dbc OUTDIR
 
-gives OUTDIR/FILE_codec.h and OUTDIR/FILE_codec.c, every name in them prefixed with `FILE_`. cantools' pack functions
-cut off the bits that do not fit a signal; the setters added here hold the value at the end of its range instead.
-The output depends on the database alone: no date, no version, no path.
+writes OUTDIR/FILE_codec.h and OUTDIR/FILE_codec.c, every name in them with the prefix `FILE_` once: message FILE_STATUS
+is `struct file_status_t`. cantools' pack functions truncate a value to the bits of its signal; the setters added here
+saturate at the ends of its range. With --node also OUTDIR/FILE_enumerations.h and OUTDIR/FILE_telemetry.h and .c: the
+named value tables, and the messages that the node sends cyclically. The output depends on the database alone: it has
+no date, version or path.
 """
 
 import argparse
@@ -19,15 +21,16 @@ from cantools.database.can.c_source import camel_to_snake_case, generate
 from cantools.database.can.database import Database
 from cantools.database.can.signal import Signal
 
+from salient.bus.database_hash import database_hash
+from salient.generate.enumerations import enumerations_header
+from salient.generate.error import CodecError
+from salient.generate.telemetry import message_c_name, telemetry
+
 INT64_MAX = 2**63 - 1
 
 
-class CodecError(Exception):
-    """The database cannot be used; the message names it and says why, in one line."""
-
-
 def raw_range(signal: Signal) -> tuple[int, int]:
-    """Smallest and largest raw value of an integer signal: what the bits hold, narrowed to the range the DBC states."""
+    """Smallest and largest raw value of an integer signal: the range of its bits, narrowed to the range in the DBC."""
     bits = signal.length
     low, high = (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if signal.is_signed else (0, (1 << bits) - 1)
     scale, offset = Fraction(str(signal.scale)), Fraction(str(signal.offset))
@@ -35,7 +38,7 @@ def raw_range(signal: Signal) -> tuple[int, int]:
     if len(ends) == 2:
         low, high = max(low, math.ceil(min(ends))), min(high, math.floor(max(ends)))
     if low > high:
-        raise CodecError(f"signal {signal.name}: its range holds no value that its {bits} bits can carry")
+        raise CodecError(f"signal {signal.name}: no value of its range fits {bits} bits")
     return low, min(high, INT64_MAX)
 
 
@@ -50,10 +53,10 @@ def c_type(signal: Signal) -> str:
     return f"{'' if signal.is_signed else 'u'}int{bits}_t"
 
 
-_HELD = {
-    f"held{bits}": "/* raw, or the end of low..high that it is beyond. In each setter it would take half a\n"
-    " * kilobyte of flash. */\n"
-    f"static __attribute__((noinline)) int{bits}_t held{bits}(int64_t raw, int{bits}_t low, int{bits}_t high)\n{{\n"
+_SATURATE = {
+    f"saturate{bits}": "/* raw, limited to low..high. Kept out of line: inlined into each setter it takes 500 bytes\n"
+    " * more flash. */\n"
+    f"static __attribute__((noinline)) int{bits}_t saturate{bits}(int64_t raw, int{bits}_t low, int{bits}_t high)\n{{\n"
     f"    return raw < low ? low : raw > high ? high : (int{bits}_t)raw;\n}}\n"
     for bits in (32, 64)
 }
@@ -63,7 +66,7 @@ def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
     """Declarations and definitions of the saturating setters of all integer signals."""
     declarations, definitions, used = [], [], set()
     for message in database.messages:
-        message_name = f"{prefix}_{camel_to_snake_case(message.name)}"
+        message_name = message_c_name(message, prefix)
         for signal in message.signals:
             if signal.is_float:
                 continue
@@ -74,20 +77,20 @@ def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
             )
             prototype = f"void {message_name}_set_{field}(struct {message_name}_t *message, int64_t raw)"
             declarations.append(
-                f"/* {message.name}.{signal.name} = raw held within {low}..{high}{unit}. */\n{prototype};\n"
+                f"/* {message.name}.{signal.name} = raw, saturated to {low}..{high}{unit}. */\n{prototype};\n"
             )
-            held = "held32" if low >= -(2**31) and high < 2**31 else "held64"
-            used.add(held)
+            saturate = "saturate32" if low >= -(2**31) and high < 2**31 else "saturate64"
+            used.add(saturate)
             definitions.append(
-                f"{prototype}\n{{\n    message->{field} = ({c_type(signal)}){held}(raw, {integer_literal(low)}, "
+                f"{prototype}\n{{\n    message->{field} = ({c_type(signal)}){saturate}(raw, {integer_literal(low)}, "
                 f"{integer_literal(high)});\n}}\n"
             )
             if integer:
                 continue
             physical = f"void {message_name}_set_physical_{field}(struct {message_name}_t *message, double value)"
             declarations.append(
-                f"/* The same from a value in {signal.unit or 'its unit'}: rounded to the nearest raw value, held\n"
-                f" * within the range; not-a-number gives the lower end. */\n{physical};\n"
+                f"/* The same from a value in {signal.unit or 'its unit'}: rounded to the nearest raw value,\n"
+                f" * saturated; not-a-number gives the lower end. */\n{physical};\n"
             )
             definitions.append(
                 f"{physical}\n{{\n"
@@ -96,13 +99,14 @@ def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
                 f"    raw = raw > {float(low)!r} ? raw : {float(low)!r};\n"
                 f"    {message_name}_set_{field}(message, llround(raw));\n}}\n"
             )
-    return "\n".join(declarations), "\n".join([*(_HELD[held] for held in sorted(used)), *definitions])
+    return "\n".join(declarations), "\n".join([*(_SATURATE[name] for name in sorted(used)), *definitions])
 
 
-def generate_codec(dbc: Path, integer: bool) -> dict[str, str]:
-    """File name -> C text of the codec of `dbc`; `integer` leaves every floating-point conversion out."""
+def generate_codec(dbc: Path, integer: bool, node: str | None = None) -> dict[str, str]:
+    """File name -> C text of the codec of `dbc`; `integer` leaves every floating-point conversion out. `node`: with
+    the enumerations and what this node sends cyclically."""
     try:
-        # cantools passes over an incomplete last statement; one more statement behind it makes that an error.
+        # cantools passes over an incomplete last statement; one more statement after it makes that an error.
         text = dbc.read_text(encoding="cp1252") + "\nVAL_TABLE_ end_of_file ;\n"
         database = cantools.database.load_string(text, database_format="dbc")
     except OSError as error:
@@ -118,32 +122,65 @@ def generate_codec(dbc: Path, integer: bool) -> dict[str, str]:
     header, source, _, _ = generate(
         database, prefix, f"{name}.h", f"{name}.c", "", floating_point_numbers=not integer, use_round=not integer
     )
+    files = {}
     try:
         declarations, definitions = setters(database, prefix, integer)
+        if node is not None:
+            files[f"{prefix}_enumerations.h"] = enumerations_header(database, prefix, dbc.name)
+            files[f"{prefix}_telemetry.h"], files[f"{prefix}_telemetry.c"] = telemetry(
+                database, prefix, dbc.name, node
+            )
     except CodecError as error:
         raise CodecError(f"{dbc}: {error}") from error
 
-    generated_from = f"file was generated from {dbc.name}."
-    header = re.sub(r"file was generated by cantools version .*", generated_from, header)
-    source = re.sub(r"file was generated by cantools version .*", generated_from, source)
+    header, source = (_prefix_once(database, prefix, dbc.name, text) for text in (header, source))
     # cantools' include guard is <PREFIX>_H, which a hand-written <prefix>.h has a better right to.
     header = re.sub(rf"\b{prefix.upper()}_H\b", f"{name.upper()}_H", header)
     closing = "\n#ifdef __cplusplus\n}\n"
     head, found, tail = header.rpartition(closing)
     if not found:
         raise CodecError(f"{dbc}: cantools' header has no closing extern block; the pinned version 41.0.2 is expected")
-    return {f"{name}.h": f"{head}\n{declarations}{found}{tail}", f"{name}.c": f"{source.rstrip()}\n\n{definitions}"}
+    constants = _constants(database, prefix)
+    files[f"{name}.h"] = f"{head}\n{constants}\n{declarations}{found}{tail}"
+    files[f"{name}.c"] = f"{source.rstrip()}\n\n{definitions}"
+    return files
+
+
+def _prefix_once(database: Database, prefix: str, dbc_name: str, text: str) -> str:
+    """cantools' text without its version, and without its second prefix where the message's name has the first."""
+    if len({message_c_name(message, prefix) for message in database.messages}) != len(database.messages):
+        raise CodecError(f"{dbc_name}: two messages have the same name without the prefix {prefix}_")
+    text = re.sub(r"file was generated by cantools version .*", f"file was generated from {dbc_name}.", text)
+    text = re.sub(rf"\b{prefix}_{prefix}_", f"{prefix}_", text)
+    return re.sub(rf"\b{prefix.upper()}_{prefix.upper()}_", f"{prefix.upper()}_", text)
+
+
+def _constants(database: Database, prefix: str) -> str:
+    """Constants of the database that are no signals: its hash, data IDs of the end-to-end protection."""
+    lines = [
+        "/* Hash of the database in normal form, as tools compute it. */",
+        f"#define {prefix.upper()}_DBC_HASH {database_hash(database):#010x}u",
+    ]
+    for message in database.messages:
+        if "E2EDataId" in message.dbc.attributes:
+            lines += [
+                f"/* Data ID of {message.name}: part of its checksum, not transmitted. */",
+                f"#define {message_c_name(message, prefix).upper()}_E2E_DATA_ID "
+                f"{int(message.dbc.attributes['E2EDataId'].value):#06x}u",
+            ]
+    return "\n".join(lines) + "\n"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Exit code 0, or 2 after one line on stderr when the database or the folder cannot be used."""
     parser = argparse.ArgumentParser(prog="salient.generate.codec", description="C codec of a CAN database (DBC)")
     parser.add_argument("--integer", action="store_true", help="no floating-point conversions")
+    parser.add_argument("--node", help="also enumerations, and the cyclic messages of this node")
     parser.add_argument("dbc", type=Path, metavar="DBC")
     parser.add_argument("folder", type=Path, metavar="OUTDIR")
     options = parser.parse_args(arguments)
     try:
-        files = generate_codec(options.dbc, options.integer)
+        files = generate_codec(options.dbc, options.integer, options.node)
         options.folder.mkdir(parents=True, exist_ok=True)
         for name, text in files.items():
             (options.folder / name).write_text(text, encoding="utf-8")

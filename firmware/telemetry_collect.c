@@ -1,0 +1,100 @@
+#include "telemetry_collect.h"
+
+#include "comms/units.h"
+#include "drive/torque_control.h"
+#include "drive_codec.h"
+#include "fixed/fixed.h"
+
+/* Gain of the BP-PID in duty per N m, Q15, from duty per scaled error. */
+static uint32_t gain_per_Nm_q15(const drive_t *drive, unsigned gain) {
+    return (uint32_t)fixed_multiply(drive->control.duty.pid.gain_q24[gain],
+                                    drive->control_parameters.duty.pid.error_scale_inverse_q24, 33);
+}
+
+/* Mean of the phases, mechanical, 2^-32 turn. */
+static int32_t misalignment(const drive_t *drive) {
+    const int32_t phases = drive->tables->phases;
+    int64_t sum = 0;
+    for (int32_t phase = 0; phase < phases; phase++) {
+        sum += drive->control.misalignment.phase[phase].offset;
+    }
+    return (int32_t)sum / (phases * drive->tables->rotor_poles);
+}
+
+void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry) {
+    const control_parameters_t *parameters = &drive->control_parameters;
+    const control_state_t *control = &drive->control;
+    const control_measurement_t *measured = &control->measurement;
+    const fault_record_t *record = &control->state_machine.record;
+    const commands_counters_t *counters = &drive->comms.commands.counters;
+    const bool run = control->state_machine.state == DRIVE_STATE_RUN;
+    const bool salient = run && parameters->controller == DRIVE_CONTROLLER_SALIENT;
+
+    telemetry->status.time_us = time_us;
+    telemetry->status.state = control->state_machine.state;
+    telemetry->status.controller = parameters->controller;
+    telemetry->status.fault = record->fault;
+    telemetry->status.voltage_saturated = run && torque_control_voltage_saturated(parameters, control);
+    telemetry->status.cycle = drive->comms.telemetry.cycle;
+
+    telemetry->motion.speed_rpm = units_milli_rpm(control->observer.speed_q22);
+    telemetry->motion.speed_reference_rpm = units_milli_rpm(control->speed_reference_q22);
+    telemetry->motion.rotor_angle_deg = units_angle_u16(measured->angle);
+
+    telemetry->torque.torque_reference_nm = units_torque_q8(control->torque_reference_q24);
+    telemetry->torque.torque_estimate_nm = units_torque_q8(measured->torque_sum_q24);
+    telemetry->torque.load_torque_estimate_nm = units_torque_q8(control->observer.load_torque_q24);
+    telemetry->torque.bus_voltage_v = (uint32_t)measured->dc_link_voltage_q6;
+
+    telemetry->currents.current_a_a = (uint32_t)measured->current_q9[0];
+    telemetry->currents.current_b_a = (uint32_t)measured->current_q9[1];
+    telemetry->currents.current_c_a = (uint32_t)measured->current_q9[2];
+    telemetry->currents.current_d_a = (uint32_t)measured->current_q9[3];
+
+    telemetry->bp_pid.kp_per_nm = gain_per_Nm_q15(drive, 0);
+    telemetry->bp_pid.ki_per_nm = gain_per_Nm_q15(drive, 1);
+    telemetry->bp_pid.kd_per_nm = gain_per_Nm_q15(drive, 2);
+    telemetry->bp_pid.duty = (control->duty.pid.duty_q23 + (1 << 7)) >> 8;
+
+    telemetry->trim.trim_torque_nm = salient ? units_torque_q8(control->trim.trim_q24) : 0;
+    telemetry->trim.misalignment_deg = units_deviation_q20(misalignment(drive));
+    telemetry->trim.torque_missing_nm = salient ? units_torque_q8(control->predictive.torque_shortfall_q24) : 0;
+    telemetry->trim.observer_bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[control->bandwidth.stage];
+
+    telemetry->fault_cause.time_us = record->time_us;
+    telemetry->fault_cause.fault = record->fault;
+    telemetry->fault_cause.state = record->state;
+    telemetry->fault_cause.checks = (uint16_t)record->fault_mask;
+
+    telemetry->fault_snapshot.speed_rpm = units_quarter_rpm(units_milli_rpm(record->speed_q22));
+    telemetry->fault_snapshot.bus_voltage_v = record->dc_link_voltage_q6;
+    telemetry->fault_snapshot.current_max_a = record->current_max_q9;
+    telemetry->fault_snapshot.torque_reference_nm = units_torque_q8(record->torque_reference_q24);
+
+    telemetry->fault_mask = record->fault_mask;
+
+    telemetry->command_counters.wrong_length = counters->wrong_length;
+    telemetry->command_counters.wrong_checksum = counters->wrong_checksum;
+    telemetry->command_counters.wrong_counter = counters->wrong_counter;
+    telemetry->command_counters.out_of_range = counters->out_of_range;
+
+    telemetry->bus_counters.unknown_frame = counters->unknown_frame;
+    telemetry->bus_counters.receive_overflow = hal_can_receive_overflows(drive->hal);
+    telemetry->bus_counters.command_accepted = counters->accepted;
+
+    telemetry->processor.used_us = drive->used_ticks;
+    telemetry->processor.worst_us = drive->worst_ticks;
+    telemetry->processor.available_us = 2u * parameters->period_ticks;
+    telemetry->processor.late_interrupts = drive->late_interrupts;
+
+    telemetry->identity.firmware_major = SALIENT_VERSION_MAJOR;
+    telemetry->identity.firmware_minor = SALIENT_VERSION_MINOR;
+    telemetry->identity.firmware_patch = SALIENT_VERSION_PATCH;
+    telemetry->identity.dbc_hash = DRIVE_DBC_HASH;
+
+    telemetry->heartbeat.state = control->state_machine.state;
+    telemetry->heartbeat.fault = record->fault;
+    telemetry->heartbeat.controller = parameters->controller;
+    telemetry->heartbeat.phases = drive->tables->phases;
+    telemetry->heartbeat.control_rate_hz = drive->control_rate_hz;
+}

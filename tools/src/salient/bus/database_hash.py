@@ -1,0 +1,30 @@
+"""Hash of a CAN database: a drive sends the one of its own DBC, so that tools notice another."""
+
+from __future__ import annotations
+
+import json
+import zlib
+
+from cantools.database.can.database import Database
+from cantools.database.can.signal import Signal
+
+
+def database_hash(database: Database) -> int:
+    """CRC-32 of the messages and signals in normal form: sorted, without comments, attributes and layout of the file.
+
+    Two databases of equal hash decode every frame to the same names, values and units.
+    """
+    messages = [
+        [m.frame_id, m.is_extended_frame, m.name, m.length, sorted(m.senders), sorted(map(_normal, m.signals))]
+        for m in sorted(database.messages, key=lambda m: (m.frame_id, m.is_extended_frame))
+    ]
+    return zlib.crc32(json.dumps(messages, separators=(",", ":")).encode())
+
+
+def _normal(signal: Signal) -> list:
+    numbers = [None if x is None else float(x) for x in (signal.scale, signal.offset, signal.minimum, signal.maximum)]
+    choices = sorted((int(number), str(text)) for number, text in (signal.choices or {}).items())
+    return [
+        signal.name, signal.start, signal.length, signal.byte_order, signal.is_signed, signal.is_float,
+        signal.is_multiplexer, signal.multiplexer_ids or [], repr(numbers), signal.unit or "", choices,
+    ]  # fmt: skip

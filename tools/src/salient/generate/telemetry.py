@@ -1,0 +1,172 @@
+"""The cyclic messages of a node in C: a structure of all their signals, functions that pack it, and the schedule.
+
+The schedule is that of the database: GenMsgCycleTime and GenMsgStartDelayTime in ms; GenMsgSendType cyclicIfActive
+marks messages that are sent only while their cause lasts; the enumeration TelemetryGroup names the messages that are
+queued together.
+"""
+
+from __future__ import annotations
+
+import math
+
+from cantools.database.can.c_source import camel_to_snake_case
+from cantools.database.can.database import Database
+from cantools.database.can.message import Message
+from cantools.database.can.signal import Signal
+
+from salient.generate.error import CodecError
+
+
+def telemetry(database: Database, prefix: str, dbc_name: str, node: str) -> tuple[str, str]:
+    """Texts of <prefix>_telemetry.h and <prefix>_telemetry.c: what `node` sends cyclically."""
+    messages = [m for m in database.messages if node in m.senders and m.cycle_time]
+    if not messages:
+        raise CodecError(f"node {node} sends no cyclic message: GenMsgCycleTime is required")
+    groups = list(database.dbc.attribute_definitions["TelemetryGroup"].choices)
+    messages.sort(key=lambda m: (groups.index(_group(m, groups)), m.frame_id))
+    cycle_ms = math.gcd(*(m.cycle_time for m in messages), *map(_delay_ms, messages))
+    return _header(messages, groups, prefix, dbc_name, cycle_ms), _source(messages, prefix, dbc_name, cycle_ms)
+
+
+def short_name(message: Message, prefix: str) -> str:
+    """Name of a message within its node: DRIVE_STATUS is status."""
+    return camel_to_snake_case(message.name).removeprefix(f"{prefix}_")
+
+
+def _group(message: Message, groups: list[str]) -> str:
+    attribute = message.dbc.attributes.get("TelemetryGroup")
+    return groups[0] if attribute is None else groups[int(attribute.value)]
+
+
+def _delay_ms(message: Message) -> int:
+    attribute = message.dbc.attributes.get("GenMsgStartDelayTime")
+    return 0 if attribute is None else int(attribute.value)
+
+
+def is_bit_field(message: Message) -> bool:
+    """True for a message of one-bit signals only, which is one 64-bit member: bit n of it is bit n of the frame."""
+    return len(message.signals) > 1 and all(
+        s.length == 1 and s.byte_order == "little_endian" and not s.is_signed for s in message.signals
+    )
+
+
+def _member_type(signal: Signal) -> str:
+    return f"{'' if signal.is_signed else 'u'}int{32 if signal.length <= 32 else 64}_t"
+
+
+def _header(messages: list[Message], groups: list[str], prefix: str, dbc_name: str, cycle_ms: int) -> str:
+    guard, upper = f"{prefix.upper()}_TELEMETRY_H", prefix.upper()
+    members = []
+    for message in messages:
+        name = short_name(message, prefix)
+        if is_bit_field(message):
+            members.append(f"    uint64_t {name}; /* {message.name}: bit n is the signal at bit n */")
+            continue
+        members.append("    struct {")
+        for signal in message.signals:
+            lsb = f"LSB {signal.scale} {signal.unit or ''}".rstrip()
+            members.append(f"        {_member_type(signal)} {camel_to_snake_case(signal.name)}; /* {lsb} */")
+        members.append(f"    }} {name}; /* {message.name} */")
+    packers = [
+        f"void {prefix}_telemetry_pack_{short_name(m, prefix)}(const {prefix}_telemetry_t *telemetry, uint8_t data[8]);"
+        for m in messages
+    ]
+    indices = [f"    {upper}_TELEMETRY_{short_name(m, prefix).upper()}," for m in messages]
+    group_names = [f"    {upper}_TELEMETRY_GROUP_{group.upper()}," for group in groups]
+    return f"""/* Cyclic messages of {dbc_name}; generated. */
+#ifndef {guard}
+#define {guard}
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+/* Greatest common divisor of all cycle and delay times. */
+#define {upper}_TELEMETRY_CYCLE_MS {cycle_ms}
+
+/* All signals of the cyclic messages in the LSBs of the bus. A member is wider than its signal wherever a value can be
+ * out of the signal's range: the pack functions saturate. */
+typedef struct {{
+{chr(10).join(members)}
+}} {prefix}_telemetry_t;
+
+/* One function per message: packs its signals, saturated to their ranges, into the bytes of its frame. */
+{chr(10).join(packers)}
+
+/* Messages that are queued together. */
+typedef enum {{
+{chr(10).join(group_names)}
+}} {prefix}_telemetry_group_t;
+
+/* Messages in the order of transmission: by group, within a group by identifier. */
+enum {{
+{chr(10).join(indices)}
+    {upper}_TELEMETRY_MESSAGES
+}};
+
+typedef struct {{
+    void (*pack)(const {prefix}_telemetry_t *telemetry, uint8_t data[8]);
+    uint32_t identifier;
+    uint8_t length;
+    uint8_t group;   /* {prefix}_telemetry_group_t */
+    bool if_active;  /* sent only while its cause lasts (cyclicIfActive) */
+    uint16_t period; /* {upper}_TELEMETRY_CYCLE_MS */
+    uint16_t delay;  /* of the first frame after start, {upper}_TELEMETRY_CYCLE_MS */
+}} {prefix}_telemetry_message_t;
+
+extern const {prefix}_telemetry_message_t {prefix}_telemetry_messages[{upper}_TELEMETRY_MESSAGES];
+
+#ifdef __cplusplus
+}}
+#endif
+
+#endif
+"""
+
+
+def _source(messages: list[Message], prefix: str, dbc_name: str, cycle_ms: int) -> str:
+    upper = prefix.upper()
+    functions, rows = [], []
+    for message in messages:
+        name = short_name(message, prefix)
+        codec_name = message_c_name(message, prefix)
+        head = f"void {prefix}_telemetry_pack_{name}(const {prefix}_telemetry_t *telemetry, uint8_t data[8])\n{{\n"
+        if is_bit_field(message):
+            mask = sum(1 << s.start for s in message.signals)
+            functions.append(
+                f"{head}    uint64_t bits = telemetry->{name} & {mask:#x}u;\n"
+                f"    for (unsigned i = 0; i < {message.length}u; i++) {{\n"
+                f"        data[i] = (uint8_t)bits;\n        bits >>= 8;\n    }}\n}}\n"
+            )
+        else:
+            setters = []
+            for signal in message.signals:
+                field = camel_to_snake_case(signal.name)
+                setters.append(f"    {codec_name}_set_{field}(&message, telemetry->{name}.{field});\n")
+            functions.append(
+                f"{head}    struct {codec_name}_t message;\n{''.join(setters)}"
+                f"    (void){codec_name}_pack(data, &message, 8u);\n}}\n"
+            )
+        delay, period = _delay_ms(message) // cycle_ms, message.cycle_time // cycle_ms
+        group = int(message.dbc.attributes["TelemetryGroup"].value) if "TelemetryGroup" in message.dbc.attributes else 0
+        active = str(message.send_type == "cyclicIfActive").lower()
+        rows.append(
+            f"    {{{prefix}_telemetry_pack_{name}, {message.frame_id:#x}u, {message.length}u, {group}u, {active}, "
+            f"{period}u, {delay}u}},"
+        )
+    return (
+        f'/* Cyclic messages of {dbc_name}; generated. */\n#include "{prefix}_telemetry.h"\n\n'
+        f'#include "{prefix}_codec.h"\n\n'
+        + "\n".join(functions)
+        + f"\nconst {prefix}_telemetry_message_t {prefix}_telemetry_messages[{upper}_TELEMETRY_MESSAGES] = {{\n"
+        + "\n".join(rows)
+        + "\n};\n"
+    )
+
+
+def message_c_name(message: Message, prefix: str) -> str:
+    """Name of a message in C: the prefix of the database once, whether or not the message's name has it."""
+    return f"{prefix}_{short_name(message, prefix)}"

@@ -1,0 +1,8 @@
+"""Version of firmware and tools: that of the CMake project. Standard library only, and imported by itself when the
+package is built."""
+
+import re
+from pathlib import Path
+
+_PROJECT = Path(__file__).resolve().parents[3] / "CMakeLists.txt"
+VERSION = re.search(r"^project\(salient VERSION ([0-9.]+)", _PROJECT.read_text(encoding="utf-8"), re.MULTILINE)[1]
