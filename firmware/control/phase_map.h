@@ -10,6 +10,7 @@
 #include <stdint.h>
 
 #include "control/machine_tables.h"
+#include "fixed/compiler.h"
 
 /* Largest current of the map, in Q7.9: the last before 80 A, so that there is always a column above. */
 #define PHASE_MAP_CURRENT_MAX_Q9 (((MACHINE_COLUMNS - 1) << MACHINE_COLUMN_BITS) - 1)
@@ -32,7 +33,7 @@ int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9)
 
 /* The same where only the torque is asked for. Current 0..PHASE_MAP_CURRENT_MAX_Q9. A function of its own on purpose:
  * in its caller, together with what other calls ask, it takes more registers than there are. */
-__attribute__((noinline)) int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle,
+NOINLINE int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle,
                                                           int32_t current_q9);
 
 /* Flux linkage in Wb, Q2.29, the same in both halves. Current, product and ends as for the torque. */

@@ -11,6 +11,8 @@
 #include <assert.h>
 #include <stdint.h>
 
+#include "fixed/compiler.h"
+
 #ifdef __ARM_FEATURE_DSP
 #include <arm_acle.h>
 #endif
@@ -22,11 +24,11 @@ static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithme
     ((int32_t)((((int64_t)(numerator) << (fraction_bits)) + (denominator) / 2) / (denominator)))
 
 /* Nearest 32-bit number. */
-__attribute__((always_inline)) static inline int32_t fixed_saturate(int64_t value) {
+ALWAYS_INLINE int32_t fixed_saturate(int64_t value) {
     const int32_t low_word = (int32_t)value;
     const int32_t high_word = (int32_t)(value >> 32);
     /* Fits when the high word is only copies of the sign: without a comparison of 64 bits. */
-    if (__builtin_expect(high_word == low_word >> 31, 1)) {
+    if (LIKELY(high_word == low_word >> 31)) {
         return low_word;
     }
     return INT32_MAX ^ (high_word >> 31);
@@ -131,7 +133,7 @@ static inline int32_t fixed_add_twice(int32_t a, int32_t b) {
 }
 
 /* Nearest number of `bits` bits with its sign, 1..32, a constant: one instruction where the processor has it. */
-__attribute__((always_inline)) static inline int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
+ALWAYS_INLINE int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
 #if defined __ARM_FEATURE_SAT && defined __OPTIMIZE__
     int32_t result;
     __asm__("ssat %0, %1, %2" : "=r"(result) : "I"(bits), "r"(value));
@@ -143,7 +145,7 @@ __attribute__((always_inline)) static inline int32_t fixed_saturate_bits(int32_t
 
 /* value / 2^shift, rounded down; shift 1..31, a constant. What does not fit is held within 2^(32-shift) of the end: the
  * high word saturates, in one instruction, and the low bits stay what they are. */
-__attribute__((always_inline)) static inline int32_t fixed_narrow(int64_t value, unsigned shift) {
+ALWAYS_INLINE int32_t fixed_narrow(int64_t value, unsigned shift) {
     const int32_t high = fixed_saturate_bits((int32_t)(value >> 32), shift);
     return (int32_t)((uint32_t)high << (32 - shift) | (uint32_t)value >> shift);
 }
