@@ -19,7 +19,6 @@ void bp_network_reset(bp_network_t *network, uint32_t seed) {
         neuron->input.value[1] = next_weight(&generator);
         neuron->input.value[0] = next_weight(&generator);
         neuron->input.value[2] = next_weight(&generator);
-        UNROLL(3)
         for (unsigned k = 0; k < 3; k++) {
             neuron->input.change[k] = 0;
             neuron->output.change[k] = 0;

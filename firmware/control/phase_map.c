@@ -1,6 +1,5 @@
 #include "control/phase_map.h"
 
-#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "fixed/pair.h"
 
@@ -92,7 +91,6 @@ static inline int32_t part_q15(span_t s, int32_t wanted, int steps) {
     const int32_t rise = (s.rise << shift) >> 15;
     const int32_t bend = (fixed_clamp(s.bend, -s.rise, s.rise) * (1 << shift)) >> 15;
     int32_t t_q15 = (rest + bend * (1 << 13)) / rise;
-    UNROLL(2)
     for (int i = 0; i < steps; i++) {
         t_q15 = (rest + bend * ((t_q15 * t_q15) >> 15)) / (rise - bend + ((bend * t_q15) >> 14));
     }

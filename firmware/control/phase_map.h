@@ -31,10 +31,9 @@ phase_map_place_t phase_map_at(const machine_tables_t *tables, uint32_t phase_an
  * A, Q7.9, held within 0..80 A. The product with the current keeps 28 bits, rounded; saturated. */
 int32_t phase_map_torque_q24(const phase_map_place_t *place, int32_t current_q9);
 
-/* The same where only the torque is asked for. Current 0..PHASE_MAP_CURRENT_MAX_Q9. A function of its own on purpose:
- * in its caller, together with what other calls ask, it takes more registers than there are. */
-NOINLINE int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle,
-                                                          int32_t current_q9);
+/* The same where only the torque is asked for. Current 0..PHASE_MAP_CURRENT_MAX_Q9. Kept out of line: see
+ * fixed/compiler.h. */
+NOINLINE int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9);
 
 /* Flux linkage in Wb, Q2.29, the same in both halves. Current, product and ends as for the torque. */
 int32_t phase_map_flux_q29(const phase_map_place_t *place, int32_t current_q9);

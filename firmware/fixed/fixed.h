@@ -24,11 +24,11 @@ static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithme
     ((int32_t)((((int64_t)(numerator) << (fraction_bits)) + (denominator) / 2) / (denominator)))
 
 /* Nearest 32-bit number. */
-ALWAYS_INLINE int32_t fixed_saturate(int64_t value) {
+static inline int32_t fixed_saturate(int64_t value) {
     const int32_t low_word = (int32_t)value;
     const int32_t high_word = (int32_t)(value >> 32);
     /* Fits when the high word is only copies of the sign: without a comparison of 64 bits. */
-    if (LIKELY(high_word == low_word >> 31)) {
+    if (high_word == low_word >> 31) {
         return low_word;
     }
     return INT32_MAX ^ (high_word >> 31);
