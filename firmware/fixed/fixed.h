@@ -11,11 +11,8 @@
 #include <assert.h>
 #include <stdint.h>
 
+#include "fixed/arm_dsp.h"
 #include "fixed/compiler.h"
-
-#ifdef __ARM_FEATURE_DSP
-#include <arm_acle.h>
-#endif
 
 static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithmetic");
 
@@ -76,9 +73,7 @@ static inline int32_t fixed_abs(int32_t value) {
  * words of 64 bits. */
 static inline int64_t fixed_product(int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
-    int64_t product;
-    __asm__("smull %Q0, %R0, %1, %2" : "=r"(product) : "r"(a), "r"(b));
-    return product;
+    return arm_smull(a, b);
 #else
     return (int64_t)a * b;
 #endif
@@ -87,8 +82,7 @@ static inline int64_t fixed_product(int32_t a, int32_t b) {
 /* sum + a * b; wraps. */
 static inline int64_t fixed_accumulate(int64_t sum, int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
-    __asm__("smlal %Q0, %R0, %1, %2" : "+r"(sum) : "r"(a), "r"(b));
-    return sum;
+    return arm_smlal(sum, a, b);
 #else
     return (int64_t)((uint64_t)sum + (uint64_t)((int64_t)a * b));
 #endif
@@ -108,9 +102,7 @@ static inline int32_t fixed_multiply(int32_t a, int32_t b, unsigned shift) {
  * costs least. */
 static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
-    int32_t high;
-    __asm__("smmulr %0, %1, %2" : "=r"(high) : "r"(a), "r"(b));
-    return high;
+    return arm_smmulr(a, b);
 #else
     return (int32_t)fixed_shift((int64_t)a * b, 32);
 #endif
@@ -119,9 +111,7 @@ static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
 /* sum + a * b / 2^32, the product rounded; it must not overflow. */
 static inline int32_t fixed_multiply_high_add(int32_t sum, int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
-    int32_t result;
-    __asm__("smmlar %0, %1, %2, %3" : "=r"(result) : "r"(a), "r"(b), "r"(sum));
-    return result;
+    return arm_smmlar(sum, a, b);
 #else
     return sum + fixed_multiply_high(a, b);
 #endif
@@ -135,9 +125,7 @@ static inline int32_t fixed_add_twice(int32_t a, int32_t b) {
 /* Nearest number of `bits` bits with its sign, 1..32, a constant: one instruction where the processor has it. */
 ALWAYS_INLINE int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
 #if defined __ARM_FEATURE_SAT && defined __OPTIMIZE__
-    int32_t result;
-    __asm__("ssat %0, %1, %2" : "=r"(result) : "I"(bits), "r"(value));
-    return result;
+    return ARM_SSAT(value, bits);
 #else
     return fixed_clamp(value, INT32_MIN >> (32 - bits), INT32_MAX >> (32 - bits));
 #endif

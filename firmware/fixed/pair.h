@@ -4,9 +4,7 @@
 
 #include <stdint.h>
 
-#ifdef __ARM_FEATURE_DSP
-#include <arm_acle.h>
-#endif
+#include "fixed/arm_dsp.h"
 
 /* Two factors, each -32768..32767, for fixed_pair_multiply_add(). */
 static inline uint32_t fixed_pair(int32_t first, int32_t second) {
