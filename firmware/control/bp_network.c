@@ -2,6 +2,7 @@
 
 #include <assert.h>
 
+#include "fixed/compiler.h"
 #include "fixed/sigmoid.h"
 
 static_assert(BP_INPUTS == 3 && BP_OUTPUTS == 3, "inputs and outputs are processed as vectors of three");
@@ -18,7 +19,6 @@ void bp_network_reset(bp_network_t *network, uint32_t seed) {
         neuron->input.value[1] = next_weight(&generator);
         neuron->input.value[0] = next_weight(&generator);
         neuron->input.value[2] = next_weight(&generator);
-#pragma GCC unroll 3
         for (unsigned k = 0; k < 3; k++) {
             neuron->input.increment[k] = 0;
             neuron->output.increment[k] = 0;
@@ -40,7 +40,7 @@ void bp_network_forward(bp_network_t *network, const int32_t input_q27[BP_INPUTS
             sigmoid_symmetric_q27(vec3_dot(neuron->input.value, input_q27[0], input_q27[1], input_q27[2]));
         vec3_add_scaled(sum_q23, neuron->output.value, neuron->activation_q27);
     }
-#pragma GCC unroll 3
+    UNROLL(3)
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         network->output_q27[l] = sigmoid_symmetric_q27(sum_q23[l]);
     }
@@ -51,7 +51,7 @@ void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *n
     const int32_t rate_q31 = parameters->learning_rate_q15 * error_q16;
     const int32_t momentum_q32 = parameters->momentum_q32;
     int32_t delta_q32[BP_OUTPUTS]; /* eta d3 */
-#pragma GCC unroll 3
+    UNROLL(3)
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         delta_q32[l] = fixed_multiply_high(fixed_multiply_high(rate_q31, sensitivity_q31[l]),
                                            sigmoid_logistic_slope_q33(network->output_q27[l])) *

@@ -1,5 +1,6 @@
 #include "control/bp_pid.h"
 
+#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "fixed/formats.h"
 #include "fixed/sigmoid.h"
@@ -49,7 +50,7 @@ int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_
     }
 
     int32_t sum_q23 = pid->duty_q23; /* within 1 + 3 * 4 */
-#pragma GCC unroll 3
+    UNROLL(3)
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
         pid->gain_q24[l] = fixed_multiply_high(sigmoid_logistic_q28(output_q27[l]), parameters->scale_q28[l]);
         sum_q23 = fixed_multiply_high_add(sum_q23, pid->gain_q24[l], term_q31[l]);

@@ -90,7 +90,6 @@ static inline int32_t solve_span_q15(span_t s, int32_t target, int steps) {
     const int32_t rise = (s.rise << shift) >> 15;
     const int32_t curvature = (fixed_clamp(s.curvature, -s.rise, s.rise) * (1 << shift)) >> 15;
     int32_t t_q15 = (numerator + curvature * (1 << 13)) / rise;
-#pragma GCC unroll 2
     for (int i = 0; i < steps; i++) {
         t_q15 = (numerator + curvature * ((t_q15 * t_q15) >> 15)) / (rise - curvature + ((curvature * t_q15) >> 14));
     }

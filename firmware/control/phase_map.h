@@ -12,6 +12,7 @@
 #include <stdint.h>
 
 #include "control/machine_tables.h"
+#include "fixed/compiler.h"
 
 /* Largest current of the map, A, Q7.9: 1 LSB below 80 A, so that there is always a column above. */
 #define PHASE_MAP_CURRENT_MAX_Q9 (((MACHINE_COLUMNS - 1) << MACHINE_COLUMN_BITS) - 1)
@@ -33,10 +34,9 @@ phase_map_lookup_t phase_map_lookup(const machine_tables_t *tables, uint32_t pha
  * result saturates. */
 int32_t phase_map_torque_q24(const phase_map_lookup_t *lookup, int32_t current_q9);
 
-/* Torque as above, in one call, for a current of 0..PHASE_MAP_CURRENT_MAX_Q9. Kept out of line: inlined, it would use
- * more registers than its caller has. */
-__attribute__((noinline)) int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle,
-                                                          int32_t current_q9);
+/* Torque as above, in one call, for a current of 0..PHASE_MAP_CURRENT_MAX_Q9. Kept out of line: see fixed/compiler.h.
+ */
+NOINLINE int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9);
 
 /* Flux linkage in Wb, Q2.29, equal in both halves. Current, rounding and saturation as for the torque. */
 int32_t phase_map_flux_q29(const phase_map_lookup_t *lookup, int32_t current_q9);

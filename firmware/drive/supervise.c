@@ -1,7 +1,6 @@
 #include "drive/supervise.h"
 
 #include "drive/observe.h"
-#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
 /* A stop ends below this speed: 0.5 rad/s, 5 r/min. */

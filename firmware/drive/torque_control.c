@@ -26,6 +26,7 @@ static void hysteresis_control(const control_parameters_t *parameters, control_s
     const int32_t error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24);
     ditc_hysteresis_step(&parameters->hysteresis, &state->hysteresis, &measured->commutation, error_q24,
                          measured->current_q9);
+    UNROLL(4)
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         state->duty_q15[phase] = state->hysteresis.state[phase] * MODULATOR_DUTY_ONE_Q15;
     }
@@ -58,8 +59,8 @@ static void adapt_misalignment(const control_parameters_t *parameters, control_s
     misalignment_step(&parameters->misalignment, &state->misalignment, parameters->tables, observer, &sample);
 }
 
-NOINLINE static void predictive_control(const control_parameters_t *parameters, control_state_t *state,
-                                        const control_measurement_t *measured) {
+static void predictive_control(const control_parameters_t *parameters, control_state_t *state,
+                               const control_measurement_t *measured) {
     const load_observer_t *observer = &state->observer;
     const uint32_t rotor_poles = parameters->commutation.rotor_poles;
     const bool voltage_limited = state->predictive.torque_shortfall_q24 != 0; /* in the previous period */

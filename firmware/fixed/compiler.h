@@ -1,6 +1,19 @@
+/* Compiler extensions of the firmware, each defined here only. Gains are instructions of a control interrupt in the two
+ * experiments of tools/scenarios, median, on a Cortex-M4 by GCC 12.2 at -O2 with link-time optimisation (2026-11). An
+ * extension without a gain is not used. */
 #ifndef FIXED_COMPILER_H
 #define FIXED_COMPILER_H
-#define COLD __attribute__((cold))
+
+/* Keeps a function out of its caller where both together need more registers than the processor has. The phase map's
+ * look-ups: 11 instructions with traditional and paper, 20 with salient. */
 #define NOINLINE __attribute__((noinline))
-#define LIKELY(condition) __builtin_expect((condition), 1)
+
+/* For a function whose argument must be a constant, the operand of an instruction. */
+#define ALWAYS_INLINE __attribute__((always_inline)) static inline
+
+/* Unrolls the loop that follows; iterations is a number. Sums of the BP network and its PID: 29 instructions forward,
+ * 12 learning, 16 in the PID. Duties of hysteresis control: 11. */
+#define UNROLL(iterations) COMPILER_PRAGMA(GCC unroll iterations)
+#define COMPILER_PRAGMA(text) _Pragma(#text)
+
 #endif

@@ -4,9 +4,7 @@
 
 #include <stdint.h>
 
-#ifdef __ARM_FEATURE_DSP
-#include <arm_acle.h>
-#endif
+#include "fixed/arm_dsp.h"
 
 /* Two factors, each -32768..32767, packed for dual16_multiply_add(): `low` in bits 0..15, `high` in bits 16..31. */
 static inline uint32_t dual16_pack(int32_t low, int32_t high) {

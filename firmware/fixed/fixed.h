@@ -12,9 +12,8 @@
 #include <assert.h>
 #include <stdint.h>
 
-#ifdef __ARM_FEATURE_DSP
-#include <arm_acle.h>
-#endif
+#include "fixed/arm_dsp.h"
+#include "fixed/compiler.h"
 
 static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithmetic");
 
@@ -23,11 +22,11 @@ static_assert((-3 >> 1) == -2, "right shift of a negative number must be arithme
     ((int32_t)((((int64_t)(numerator) << (fraction_bits)) + (denominator) / 2) / (denominator)))
 
 /* Saturates to 32 bits. */
-__attribute__((always_inline)) static inline int32_t fixed_saturate(int64_t value) {
+static inline int32_t fixed_saturate(int64_t value) {
     const int32_t low_word = (int32_t)value;
     const int32_t high_word = (int32_t)(value >> 32);
     /* The value fits when the high word is only copies of the sign bit. */
-    if (__builtin_expect(high_word == low_word >> 31, 1)) {
+    if (high_word == low_word >> 31) {
         return low_word;
     }
     return INT32_MAX ^ (high_word >> 31);
@@ -75,9 +74,7 @@ static inline int32_t fixed_abs(int32_t value) {
  * and multiplies 64-bit words. */
 static inline int64_t fixed_product(int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
-    int64_t product;
-    __asm__("smull %Q0, %R0, %1, %2" : "=r"(product) : "r"(a), "r"(b));
-    return product;
+    return arm_smull(a, b);
 #else
     return (int64_t)a * b;
 #endif
@@ -86,8 +83,7 @@ static inline int64_t fixed_product(int32_t a, int32_t b) {
 /* sum + a * b; wraps. */
 static inline int64_t fixed_accumulate(int64_t sum, int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
-    __asm__("smlal %Q0, %R0, %1, %2" : "+r"(sum) : "r"(a), "r"(b));
-    return sum;
+    return arm_smlal(sum, a, b);
 #else
     return (int64_t)((uint64_t)sum + (uint64_t)((int64_t)a * b));
 #endif
@@ -107,9 +103,7 @@ static inline int32_t fixed_multiply(int32_t a, int32_t b, unsigned shift) {
  * the choice of many formats such that their products end here. */
 static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
-    int32_t high;
-    __asm__("smmulr %0, %1, %2" : "=r"(high) : "r"(a), "r"(b));
-    return high;
+    return arm_smmulr(a, b);
 #else
     return (int32_t)fixed_shift((int64_t)a * b, 32);
 #endif
@@ -118,9 +112,7 @@ static inline int32_t fixed_multiply_high(int32_t a, int32_t b) {
 /* sum + a * b / 2^32, the product rounded to nearest; the caller ensures that the sum fits. */
 static inline int32_t fixed_multiply_high_add(int32_t sum, int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP
-    int32_t result;
-    __asm__("smmlar %0, %1, %2, %3" : "=r"(result) : "r"(a), "r"(b), "r"(sum));
-    return result;
+    return arm_smmlar(sum, a, b);
 #else
     return sum + fixed_multiply_high(a, b);
 #endif
@@ -132,11 +124,9 @@ static inline int32_t fixed_add_twice(int32_t a, int32_t b) {
 }
 
 /* Saturates to `bits` bits including the sign, 1..32, a constant: one instruction (SSAT) where the processor has it. */
-__attribute__((always_inline)) static inline int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
+ALWAYS_INLINE int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
 #if defined __ARM_FEATURE_SAT && defined __OPTIMIZE__
-    int32_t result;
-    __asm__("ssat %0, %1, %2" : "=r"(result) : "I"(bits), "r"(value));
-    return result;
+    return ARM_SSAT(value, bits);
 #else
     return fixed_clamp(value, INT32_MIN >> (32 - bits), INT32_MAX >> (32 - bits));
 #endif
@@ -144,7 +134,7 @@ __attribute__((always_inline)) static inline int32_t fixed_saturate_bits(int32_t
 
 /* value / 2^shift, rounded down; shift 1..31, a constant. Saturates to within 2^(32-shift) of INT32_MIN or INT32_MAX:
  * only the high word saturates, in one instruction, the low bits of the result pass unchanged. */
-__attribute__((always_inline)) static inline int32_t fixed_shift_saturate(int64_t value, unsigned shift) {
+ALWAYS_INLINE int32_t fixed_shift_saturate(int64_t value, unsigned shift) {
     const int32_t high = fixed_saturate_bits((int32_t)(value >> 32), shift);
     return (int32_t)((uint32_t)high << (32 - shift) | (uint32_t)value >> shift);
 }
