@@ -10,16 +10,18 @@ void scheduler_init(scheduler_t *scheduler, uint64_t *clock_ns, const scheduler_
 void scheduler_run(scheduler_t *scheduler, uint64_t until_ns) {
     for (;;) {
         unsigned next = 0;
+        uint64_t due_ns = scheduler->due_ns[0];
         for (unsigned event = 1; event < EVENT_COUNT; ++event) {
-            if (scheduler->due_ns[event] < scheduler->due_ns[next]) {
+            if (scheduler->due_ns[event] < due_ns) {
+                due_ns = scheduler->due_ns[event];
                 next = event;
             }
         }
-        if (scheduler->due_ns[next] > until_ns) {
+        if (due_ns > until_ns) {
             break;
         }
-        const uint64_t now_ns = *scheduler->clock_ns = scheduler->due_ns[next];
-        scheduler->handlers[next](scheduler->context, now_ns);
+        *scheduler->clock_ns = due_ns;
+        scheduler->handlers[next](scheduler->context, due_ns);
     }
     *scheduler->clock_ns = until_ns;
 }

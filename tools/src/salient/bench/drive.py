@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import can
 
+from salient.bench.client import Client, KnownAttributes
 from salient.bus import e2e
 from salient.bus.signals import drive_database
-
-if TYPE_CHECKING:
-    from salient.bench.session import Session
 
 REQUESTS = {"off": 0, "run": 1, "stop": 2, "clear_fault": 3}
 COMMAND_PERIOD_NS = 10_000_000
@@ -41,17 +38,20 @@ def command_frame(counter: int, request: str, speed_reference_rpm: float) -> can
     return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=data)
 
 
-class Drive:
+class Drive(KnownAttributes):
     """Commands a drive. Assigning speed_reference_rpm asks it to run; the command is sent at once and then every
     COMMAND_PERIOD_NS as the session's time moves, until `silence`. Nothing is sent before the first request.
     """
 
-    def __init__(self, session: Session, parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
+    command_due_ns: int | None
+    parameters: Parameters
+
+    def __init__(self, session: Client, parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
         self._session = session
         self._request: str | None = None
         self._speed_reference_rpm = 0.0
         self._counter = 0
-        self.command_due_ns: int | None = None
+        self.command_due_ns = None
         self.parameters = Parameters(session, parameter_table)
 
     @property
@@ -131,7 +131,7 @@ class Parameters(MutableMapping[str, float]):
     drive refuses the value.
     """
 
-    def __init__(self, session: Session, table: Callable[[], list[ParameterRow]] | None = None) -> None:
+    def __init__(self, session: Client, table: Callable[[], list[ParameterRow]] | None = None) -> None:
         self._session = session
         self._table = table
         self._loaded: dict[str, ParameterRow] | None = None
@@ -180,7 +180,7 @@ def raw_value(row: ParameterRow, value: float) -> int:
     return raw
 
 
-def read_parameter_table(session: Session) -> list[ParameterRow]:
+def read_parameter_table(session: Client) -> list[ParameterRow]:
     """Asks the drive for all of its parameters; takes some 0.1 s of virtual time."""
     rows: list[ParameterRow] = []
     while True:
@@ -204,7 +204,7 @@ def _request(operation: str, index: int, part: int, value: int) -> can.Message:
     return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=message.encode(signals))
 
 
-def _ask(session: Session, operation: str, index: int, part: int = 0, value: int = 0) -> tuple[str, int]:
+def _ask(session: Client, operation: str, index: int, part: int = 0, value: int = 0) -> tuple[str, int]:
     """(status, value) of the drive's answer; lets virtual time pass until it comes."""
     session.send(_request(operation, index, part, value))
     answer = drive_database().get_message_by_name("PARAMETER_RESPONSE")
@@ -220,7 +220,7 @@ def _ask(session: Session, operation: str, index: int, part: int = 0, value: int
     return str(signals["status"]), int(signals["value"])
 
 
-def _ask_text(session: Session, operation: str, index: int) -> str:
+def _ask_text(session: Client, operation: str, index: int) -> str:
     text = b""
     for part in range(_TEXT_PARTS_MAX):
         four = _ask(session, operation, index, part)[1].to_bytes(4, "little", signed=True)
