@@ -268,7 +268,7 @@ TEST_F(BenchVariables, InterruptBeyondItsPeriodLosesInterruptsAndKeepsCompares) 
     bench.run_to(*client, 99999);
     EXPECT_EQ(bench.firmware.interrupt_times_ns, (std::vector<uint64_t>{25000}));
     EXPECT_EQ(bench.firmware.background_times_ns, (std::vector<uint64_t>{85000}));
-    EXPECT_EQ(bench.rig->board.missed_interrupts, 2u);
+    EXPECT_EQ(bench.rig->board.missed_triggers, 2u);
     EXPECT_EQ(bench.rig->board.active.lower[1], 0) << "written in a period that has not ended for the firmware";
     bench.run_to(*client, 100000);
     EXPECT_EQ(bench.firmware.missed, 2u);
@@ -285,7 +285,7 @@ TEST_F(BenchVariables, InterruptHasTheGivenTimeAndMayTakeLonger) {
     bench.firmware.takes_ns = 25001; // a processor whose instructions take time: until 75.001 us
     bench.run_to(*client, 75 * 1000);
     EXPECT_EQ(bench.firmware.missed, 0u);
-    EXPECT_EQ(bench.rig->board.missed_interrupts, 1u);
+    EXPECT_EQ(bench.rig->board.missed_triggers, 1u);
     bench.firmware.takes_ns = 25000; // ends with its period
     bench.run_to(*client, 125 * 1000);
     EXPECT_EQ(bench.firmware.interrupt_times_ns, (std::vector<uint64_t>{25000, 50000, 100000, 125000}));

@@ -114,7 +114,7 @@ struct StandInFirmware {
     static void interrupt(void *context) {
         auto *self = static_cast<StandInFirmware *>(context);
         ++self->interrupts;
-        self->missed += board_pwm_missed_interrupts(self->board);
+        self->missed += board_missed_triggers(self->board);
         self->interrupt_times_ns.push_back(self->board->time_ns);
         hal_pwm_compare_t compare{};
         bool on = self->board->adc.phase_current_counts[1] < 512;
