@@ -32,7 +32,7 @@ typedef struct {
     uint16_t period_ticks; /* 0 until the timer is started */
     bool immediate_pwm;    /* a setting: see board_pwm_write; false after board_init */
     hal_pwm_compare_t active, buffered;
-    uint32_t missed_triggers; /* since last read */
+    uint32_t missed_triggers;   /* since last read */
     uint64_t interrupt_took_ns; /* the present control interrupt, from its trigger on: as the rig says, unless the port,
                                    whose processor takes time of its own, says otherwise before it is over */
 
