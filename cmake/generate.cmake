@@ -47,6 +47,23 @@ function(salient_generate_codec target dbc)
     target_include_directories(${target} PUBLIC ${out})
 endfunction()
 
+# salient_generate_bench_variables(TARGET DBC): an interface library with bench_variables.h, the table of the bench
+# variables in DBC.
+function(salient_generate_bench_variables target dbc)
+    set(out ${CMAKE_CURRENT_BINARY_DIR}/${target})
+    add_custom_command(
+        OUTPUT ${out}/bench_variables.h
+        COMMAND ${SALIENT_GENERATOR} salient.generate.bench_variables ${dbc} ${out}
+        DEPENDS ${dbc} ${SALIENT_GENERATOR_SOURCES}/generate/bench_variables.py
+                ${SALIENT_GENERATOR_SOURCES}/generate/codec.py
+        COMMENT "bench variables"
+        VERBATIM)
+    add_custom_target(${target}_header DEPENDS ${out}/bench_variables.h)
+    add_library(${target} INTERFACE)
+    add_dependencies(${target} ${target}_header)
+    target_include_directories(${target} INTERFACE ${out})
+endfunction()
+
 # salient_add_machines(): for each machine file the object libraries <name>_tables (firmware/control/machine_tables.h)
 # and <name>_plant (emulator/plant/machine.h), generated and compiled once for all programs of the build.
 function(salient_add_machines)

@@ -1,6 +1,7 @@
 #include "drive.h"
 
 #include "hal_encoder.h"
+#include "hal_interrupt.h"
 #include "hal_time.h"
 #include "telemetry_collect.h"
 
@@ -35,7 +36,7 @@ bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, cons
 
 void drive_control_interrupt(drive_t *drive) {
     control_sample_t *sample = &drive->sample;
-    sample->missed_interrupts = hal_pwm_missed_interrupts(drive->hal);
+    sample->missed_interrupts = hal_interrupt_missed_triggers(drive->hal);
     sample->time_us = hal_time_us(drive->hal);
     if (sample->missed_interrupts != 0) {
         drive->late_interrupts++; /* the previous one */
@@ -48,7 +49,7 @@ void drive_control_interrupt(drive_t *drive) {
     } else {
         hal_pwm_open_all(drive->hal);
     }
-    drive->used_ticks = hal_pwm_elapsed_ticks(drive->hal);
+    drive->used_ticks = hal_interrupt_elapsed_ticks(drive->hal);
     if (drive->used_ticks > drive->worst_ticks) {
         drive->worst_ticks = drive->used_ticks;
     }

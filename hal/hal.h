@@ -1,18 +1,24 @@
-/* The seam between firmware and hardware.
+/* Hardware abstraction layer: the interface between firmware and hardware.
  *
- * Everything here is raw: converter counts, encoder counts, timer ticks, CAN frames. Scaling, offsets and saturation
- * belong to the firmware, so that they are under test too. A port (host/, qemu/ with its boards, later others) defines
- * `struct hal` and these functions; the firmware only holds the pointer, so several drives can live in a process.
+ * All values are raw: ADC counts, encoder counts, timer ticks, CAN frames. Scaling, offsets and saturation belong to
+ * the firmware, so that they are under test too.
  *
- * Each function says from which context it may be called: [interrupt] the control interrupt, [background] the main
- * loop, [both]. The control interrupt pre-empts the background, never the other way round.
+ * A port defines `struct hal` and every function of hal_adc.h, hal_can.h, hal_encoder.h, hal_interrupt.h, hal_pwm.h and
+ * hal_time.h. It calls drive_control_interrupt once per control period, from an interrupt that the PWM timer triggers,
+ * and drive_background from its main loop. The firmware only holds a pointer to the port's structure, so several drives
+ * can share a process. Ports: emulator/host (the emulated board), hal/qemu (boards of QEMU).
+ *
+ * Each function states the context from which it may be called: [interrupt] the control interrupt, [background] the
+ * main loop, [both]. The control interrupt pre-empts the background, never the reverse.
+ *
+ * Not there yet: non-volatile memory (parameters are lost at power-off) and a watchdog.
  */
 #ifndef HAL_H
 #define HAL_H
 
 typedef struct hal hal_t;
 
-/* Most phases any port wires up; a drive uses the first `phases` of its machine. */
+/* Maximum number of phases of a port; a drive uses the first `phases` of its machine. */
 #define HAL_PHASES_MAX 4
 
 #endif

@@ -9,21 +9,22 @@
 #define HAL_ADC_BITS_MIN 12
 #define HAL_ADC_BITS_MAX 16
 
-/* Full scale is one code above the largest, 2^bits. Current sensors are unipolar: code 0 is 0 A, full scale 80 A. */
+/* Full scale is 2^bits counts, one above the largest. Current sensors are unipolar: 0 counts are 0 A, full scale 80 A.
+ */
 #define HAL_ADC_CURRENT_FULL_SCALE_A 80
-/* DC-link divider: code 0 is 0 V, full scale 512 V. */
+/* DC-link voltage divider: 0 counts are 0 V, full scale 512 V. */
 #define HAL_ADC_BUS_FULL_SCALE_V 512
-/* Torque transducer between machine and load, offset binary: mid-scale, 2^(bits-1), is 0 N m, code 0 is -64 N m. A
- * board without one leaves its code at whatever the input floats to: only use it where a parameter says so. */
+/* Torque transducer between machine and load, offset binary: mid-scale, 2^(bits-1), is 0 N m, 0 counts are -64 N m. A
+ * board without a transducer leaves the input floating: only use it where a parameter enables it. */
 #define HAL_ADC_LOAD_TORQUE_FULL_SCALE_NM 64
 
 typedef struct {
-    uint16_t phase_current_counts[HAL_PHASES_MAX]; /* 0..2^bits-1, as all of them */
+    uint16_t phase_current_counts[HAL_PHASES_MAX]; /* 0..2^bits-1, as all counts */
     uint16_t bus_voltage_counts;
     uint16_t load_torque_counts; /* positive against the forward direction */
 } hal_adc_sample_t;
 
-/* Bits of a code, 12..16; constant. [both] */
+/* Resolution in bits, 12..16; constant. [both] */
 unsigned hal_adc_bits(const hal_t *hal);
 
 /* The conversion results of this period's sample. [interrupt] */

@@ -18,7 +18,7 @@ typedef struct {
     uint8_t data[8];
 } hal_can_frame_t;
 
-/* Takes the oldest received frame; false when there is none. [background] */
+/* Removes and returns the oldest received frame; false when there is none. [background] */
 bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame);
 
 /* Frames lost because the receive queue was full, since start. [background] */

@@ -1,4 +1,4 @@
-/* The PWM timer of the asymmetric half bridges: two switches a phase, one compare value each.
+/* PWM timer of the asymmetric half bridges: two switches per phase, one compare value each.
  *
  * The timer counts up and down, `period_ticks` each way, so a control period is 2 * period_ticks * 5 ns.
  * An upper switch is on while its carrier is below its compare value, with the carrier's valley in the middle of the
@@ -34,14 +34,5 @@ void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare);
 
 /* Opens every switch now, not at the next period, and clears the buffer (the timer's break input). [both] */
 void hal_pwm_open_all(hal_t *hal);
-
-/* Control interrupts that were lost since the last call: one whose trigger came while the previous one was still
- * running is not made up for, and its period keeps the compare values of the period before. [interrupt] */
-uint32_t hal_pwm_missed_interrupts(hal_t *hal);
-
-/* Ticks of HAL_PWM_TICK_NS since the trigger of the present control interrupt, which took its sample; rounded down to
- * what the port's counter resolves. Goes on beyond the period, wraps after 21 s; 0 on a port whose processor takes no
- * time. [interrupt] */
-uint32_t hal_pwm_elapsed_ticks(const hal_t *hal);
 
 #endif

@@ -6,13 +6,14 @@
 #include "hal_adc.h"
 #include "hal_can.h"
 #include "hal_encoder.h"
+#include "hal_interrupt.h"
 #include "hal_pwm.h"
 #include "hal_time.h"
 
-/* Ends the program when the firmware calls a function from a context that the HAL does not allow. */
+/* Aborts when the firmware calls a function from a context that the HAL does not allow. */
 static void require(const hal_t *hal, bool interrupt, const char *function) {
     if ((hal->board->context == BOARD_INTERRUPT) != interrupt) {
-        fprintf(stderr, "salient: firmware called %s from %s, allowed is %s\n", function,
+        fprintf(stderr, "salient: firmware called %s from %s, must be from %s\n", function,
                 interrupt ? "the background" : "the control interrupt",
                 interrupt ? "the control interrupt" : "the background");
         abort();
@@ -51,13 +52,13 @@ void hal_pwm_open_all(hal_t *hal) {
     board_pwm_open_all(hal->board);
 }
 
-uint32_t hal_pwm_missed_interrupts(hal_t *hal) {
+uint32_t hal_interrupt_missed_triggers(hal_t *hal) {
     require(hal, true, __func__);
-    return board_pwm_missed_interrupts(hal->board);
+    return board_missed_triggers(hal->board);
 }
 
-/* The firmware's code takes no virtual time; what the bench says that it takes counts from the start. */
-uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
+/* The firmware's code takes no virtual time; the execution time that the bench sets counts from the start. */
+uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
     require(hal, true, __func__);
     return (uint32_t)(hal->board->interrupt_took_ns / HAL_PWM_TICK_NS);
 }
@@ -81,11 +82,11 @@ uint32_t hal_time_us(const hal_t *hal) {
     return (uint32_t)(hal->board->time_ns / 1000);
 }
 
-/* One thread: the interrupt cannot come while the background runs. What is left is to see that the calls pair up. */
+/* One thread: the interrupt cannot pre-empt the background. Only the pairing of the calls is checked. */
 void hal_critical_enter(hal_t *hal) {
     require(hal, false, __func__);
     if (hal->board->in_critical_section) {
-        fputs("salient: firmware called hal_critical_enter twice, it does not nest\n", stderr);
+        fputs("salient: firmware called hal_critical_enter twice; it does not nest\n", stderr);
         abort();
     }
     hal->board->in_critical_section = true;

@@ -5,7 +5,7 @@
 #include "host/simulation.h"
 
 /* Large; they live as long as the process. */
-static bench_t bench;
+static simulation_t simulation;
 static drive_t drive;
 
 static void control_interrupt(void *context) {
@@ -20,21 +20,22 @@ int main(int argc, char *argv[]) {
     options_t options;
     options_result_t result = options_parse(&options, argc, argv);
     if (result != OPTIONS_RUN) {
-        return result == OPTIONS_HELP ? 0 : BENCH_EXIT_MISTAKE;
+        return result == OPTIONS_HELP ? 0 : EXIT_USAGE;
     }
-    if (!bench_open(&bench, &options)) {
-        return BENCH_EXIT_MISTAKE;
+    if (!simulation_open(&simulation, &options)) {
+        return EXIT_USAGE;
     }
-    hal_t hal = {.board = &bench.rig.board};
+    hal_t hal = {.board = &simulation.rig.board};
     const drive_config_t drive_config = {
         .control_rate_hz = options.control_rate_hz,
         .controller = (drive_controller_t)options.controller_index,
     };
     if (drive_init(&drive, &hal, &machine_tables, &drive_config)) {
-        bench_run(&bench, &(rig_firmware_t){
-                              .control_interrupt = control_interrupt, .background = background, .context = &drive});
+        simulation_run(
+            &simulation,
+            &(rig_firmware_t){.control_interrupt = control_interrupt, .background = background, .context = &drive});
     } else {
-        bench_refused(&bench);
+        simulation_rejected(&simulation);
     }
-    return bench_close(&bench);
+    return simulation_close(&simulation);
 }

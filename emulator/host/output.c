@@ -14,7 +14,7 @@ FILE *output_open(const char *option, const char *path) {
 bool output_close(FILE *file, const char *option, const char *path) {
     const bool written = !ferror(file);
     if (fclose(file) != 0 || !written) {
-        fprintf(stderr, "salient: %s %s: not all could be written\n", option, path);
+        fprintf(stderr, "salient: %s %s: write failed\n", option, path);
         return false;
     }
     return true;

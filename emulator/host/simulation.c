@@ -31,7 +31,7 @@ static bool stop_requested(void *context) {
     if (list[STOP_SIGNAL].revents) {
         return true;
     }
-    char discarded[4096]; /* what is written to standard input means nothing, only its end does */
+    char discarded[4096]; /* only the end of standard input has a meaning */
     ssize_t size = read(STDIN_FILENO, discarded, sizeof discarded);
     return size == 0 || (size < 0 && errno != EAGAIN && errno != EINTR);
 }
@@ -82,12 +82,12 @@ static void print_ready(const options_t *options) {
     fflush(stdout);
 }
 
-bool bench_open(bench_t *bench, const options_t *options) {
-    bench->options = options;
-    bench->exit_code = 0;
-    bench->switches = NULL;
-    bench->recorder = (recorder_t){0};
-    if (!stop_init(&bench->stop, options->follow_stdin)) {
+bool simulation_open(simulation_t *simulation, const options_t *options) {
+    simulation->options = options;
+    simulation->exit_code = 0;
+    simulation->switches = NULL;
+    simulation->recorder = (recorder_t){0};
+    if (!stop_init(&simulation->stop, options->follow_stdin)) {
         fprintf(stderr, "salient: signals: %s\n", strerror(errno));
         return false;
     }
@@ -98,15 +98,15 @@ bool bench_open(bench_t *bench, const options_t *options) {
         return false;
     }
     if (options->record &&
-        !recorder_open(&bench->recorder, options->record, machine_plant.phases, error, sizeof error)) {
+        !recorder_open(&simulation->recorder, options->record, machine_plant.phases, error, sizeof error)) {
         fprintf(stderr, "salient: %s\n", error);
         transport_close(transport);
         return false;
     }
     if (options->record_switches) {
-        bench->switches = output_open(SWITCHES_OPTION, options->record_switches);
-        if (!bench->switches) {
-            recorder_close(&bench->recorder, error, sizeof error);
+        simulation->switches = output_open(SWITCHES_OPTION, options->record_switches);
+        if (!simulation->switches) {
+            recorder_close(&simulation->recorder, error, sizeof error);
             transport_close(transport);
             return false;
         }
@@ -123,60 +123,62 @@ bool bench_open(bench_t *bench, const options_t *options) {
         .bit_rate = options->bit_rate,
         .pacing = options->pacing,
         .stop_at_ns = options->stop_at_s > 0 ? (uint64_t)(options->stop_at_s * 1e9 + 0.5) : RIG_NEVER,
-        .stop = bench->stop,
+        .stop = simulation->stop,
         .transport = transport,
     };
-    rig_init(&bench->rig, &config);
+    rig_init(&simulation->rig, &config);
     if (options->record) {
-        plant_observe(&bench->rig.plant, options->record_from_us * 1000, options->record_step_ns, recorder_sample,
-                      &bench->recorder);
+        plant_observe(&simulation->rig.plant, options->record_from_us * 1000, options->record_step_ns, recorder_sample,
+                      &simulation->recorder);
     }
     return true;
 }
 
 static void control_interrupt(void *context) {
-    bench_t *bench = context;
-    bench->firmware.control_interrupt(bench->firmware.context);
-    if (bench->switches) {
-        fwrite(&bench->rig.board.active, sizeof bench->rig.board.active, 1, bench->switches);
+    simulation_t *simulation = context;
+    simulation->firmware.control_interrupt(simulation->firmware.context);
+    if (simulation->switches) {
+        fwrite(&simulation->rig.board.active, sizeof simulation->rig.board.active, 1, simulation->switches);
     }
 }
 
 static void background(void *context) {
-    bench_t *bench = context;
-    bench->firmware.background(bench->firmware.context);
+    simulation_t *simulation = context;
+    simulation->firmware.background(simulation->firmware.context);
 }
 
-void bench_run(bench_t *bench, const rig_firmware_t *firmware) {
-    bench->firmware = *firmware;
-    rig_join(&bench->rig,
-             &(rig_firmware_t){.control_interrupt = control_interrupt, .background = background, .context = bench});
-    print_ready(bench->options);
-    while (rig_serve(&bench->rig, -1)) {
+void simulation_run(simulation_t *simulation, const rig_firmware_t *firmware) {
+    simulation->firmware = *firmware;
+    rig_join(
+        &simulation->rig,
+        &(rig_firmware_t){.control_interrupt = control_interrupt, .background = background, .context = simulation});
+    print_ready(simulation->options);
+    while (rig_serve(&simulation->rig, -1)) {
     }
-    rig_finish(&bench->rig);
-    const transport_t *transport = bench->rig.config.transport;
+    rig_finish(&simulation->rig);
+    const transport_t *transport = simulation->rig.config.transport;
     if (transport->failure) {
         fprintf(stderr, "salient: %s\n", transport->failure);
-        bench->exit_code = BENCH_EXIT_MISTAKE;
+        simulation->exit_code = EXIT_USAGE;
     }
 }
 
-void bench_refused(bench_t *bench) {
-    fprintf(stderr, "salient: the drive refuses machine %s at %" PRIu32 " Hz\n", machine_plant.name,
-            bench->options->control_rate_hz);
-    bench->exit_code = BENCH_EXIT_MISTAKE;
+void simulation_rejected(simulation_t *simulation) {
+    fprintf(stderr, "salient: drive_init rejected machine %s at %" PRIu32 " Hz\n", machine_plant.name,
+            simulation->options->control_rate_hz);
+    simulation->exit_code = EXIT_USAGE;
 }
 
-int bench_close(bench_t *bench) {
+int simulation_close(simulation_t *simulation) {
     char error[TRANSPORT_ERROR_SIZE];
-    if (!recorder_close(&bench->recorder, error, sizeof error)) {
+    if (!recorder_close(&simulation->recorder, error, sizeof error)) {
         fprintf(stderr, "salient: %s\n", error);
-        bench->exit_code = BENCH_EXIT_MISTAKE;
+        simulation->exit_code = EXIT_USAGE;
     }
-    if (bench->switches && !output_close(bench->switches, SWITCHES_OPTION, bench->options->record_switches)) {
-        bench->exit_code = BENCH_EXIT_MISTAKE;
+    if (simulation->switches &&
+        !output_close(simulation->switches, SWITCHES_OPTION, simulation->options->record_switches)) {
+        simulation->exit_code = EXIT_USAGE;
     }
-    transport_close(bench->rig.config.transport);
-    return bench->exit_code;
+    transport_close(simulation->rig.config.transport);
+    return simulation->exit_code;
 }

@@ -1,10 +1,11 @@
-/* The bench of a drive's program: bus, recordings and rig as the options want them, the ready line, the end.
+/* Simulation of a drive on its bench: opens bus, recordings and rig from the options, prints the ready line, serves,
+ * closes.
  *
- * What the programs share that put a firmware on the rig: the host executable in its own process, a target inside
- * QEMU. What goes wrong is one line on stderr.
+ * Shared by the programs that join a firmware with the rig: the host executable in one process, a target inside QEMU.
+ * Each error is one line on stderr.
  */
-#ifndef BENCH_H
-#define BENCH_H
+#ifndef HOST_SIMULATION_H
+#define HOST_SIMULATION_H
 
 #include <stdbool.h>
 #include <stdio.h>
@@ -13,32 +14,32 @@
 #include "plant/recorder.h"
 #include "rig/rig.h"
 
-#define BENCH_EXIT_MISTAKE 2
+#define EXIT_USAGE 2 /* exit code after an invalid argument or a resource that cannot be opened */
 
-/* Large: static or on the heap. rig is for the port; the rest is bench.c's. */
+/* Large: static or on the heap. rig is for the port; the other members are private to simulation.c. */
 typedef struct {
     rig_t rig;
     const options_t *options;
     recorder_t recorder;
     rig_stop_t stop;
     rig_firmware_t firmware;
-    /* Rows of hal_pwm_compare_t: row n is what acts in the control period that starts at n + 1 periods, when no
-     * interrupt was lost. NULL: none. */
+    /* Rows of hal_pwm_compare_t: row n acts in the control period that starts at n + 1 periods, when no trigger was
+     * missed. NULL: not recorded. */
     FILE *switches;
     int exit_code;
-} bench_t;
+} simulation_t;
 
-/* Opens everything, with the rig at time 0. Signals that end a program are blocked from now on in this thread and those
- * it starts: the rig ends at them. Keeps options. False, with nothing left open: something cannot be had. */
-bool bench_open(bench_t *bench, const options_t *options);
+/* Opens everything, with the rig at time 0. Blocks the signals that end a program, in this thread and those it starts:
+ * the rig ends at them. Keeps options. False, with nothing left open, when something cannot be opened. */
+bool simulation_open(simulation_t *simulation, const options_t *options);
 
-/* Joins the firmware, which has started the timer, says that all is ready, and serves until it is over. */
-void bench_run(bench_t *bench, const rig_firmware_t *firmware);
+/* Joins the firmware, which has started the timer, prints the ready line, and serves until the end. */
+void simulation_run(simulation_t *simulation, const rig_firmware_t *firmware);
 
-/* Says that the drive refused to start: instead of bench_run. */
-void bench_refused(bench_t *bench);
+/* Reports that drive_init has rejected the configuration: instead of simulation_run. */
+void simulation_rejected(simulation_t *simulation);
 
-/* Closes everything; gives back the program's exit code, 0 or BENCH_EXIT_MISTAKE. */
-int bench_close(bench_t *bench);
+/* Closes everything; returns the program's exit code, 0 or EXIT_USAGE. */
+int simulation_close(simulation_t *simulation);
 
 #endif

@@ -1,9 +1,9 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later
  *
- * The QEMU plugin: opens the world when QEMU starts, and serves it whenever the drive stores to the doorbell.
+ * The QEMU plugin: opens the co-simulation when QEMU starts, and serves each store of the drive to the doorbell.
  *
  * Plugin arguments: mailbox=FILE, the board's shared memory; instructions=FILE, see instructions.h;
- * execution=FILE and stack=END-BEGIN, see execution.h; timed=1, the processor takes time; argument=TEXT, a word of the
+ * execution=FILE and stack=END-BEGIN, see trace.h; timed=1, instructions take time; argument=TEXT, a word of the
  * host executable's command line, repeated in order.
  */
 #define _DEFAULT_SOURCE /* on_exit */
@@ -16,12 +16,12 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-#include "qemu/boards.h"
-#include "qemu/trace.h"
 #include "host/simulation.h"
+#include "qemu/boards.h"
+#include "qemu/cosimulation.h"
 #include "qemu/instructions.h"
 #include "qemu/plugin_api.h"
-#include "qemu/cosimulation.h"
+#include "qemu/trace.h"
 
 #define EXPORT __attribute__((visibility("default")))
 #define ARGUMENTS_MAX 64
@@ -31,9 +31,9 @@ EXPORT int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int
 
 static const board_description_t *board;
 static mailbox_t *mailbox;
-static bool counting, following;
+static bool counting, tracing;
 
-/* The function has other stores in images that are not optimised. */
+/* The function has further stores in images that are not optimised. */
 static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, void *context) {
     (void)vcpu;
     (void)info;
@@ -41,29 +41,30 @@ static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, 
     if (address != board->memory_address + board->mailbox_offset) {
         return;
     }
-    world_serve();
+    cosimulation_serve();
     if (mailbox->event != MAILBOX_EXIT) {
         return;
     }
-    if ((counting && !instructions_close()) || (following && !execution_close())) {
-        mailbox->exit_code = BENCH_EXIT_MISTAKE;
+    if ((counting && !instructions_close()) || (tracing && !trace_close())) {
+        mailbox->exit_code = EXIT_USAGE;
     }
-    counting = following = false;
+    counting = tracing = false;
 }
 
-/* Where the drive ended QEMU before it was told to, says why. What the bench has recorded until then is kept. */
+/* Reports the cause when the drive ended QEMU before MAILBOX_EXIT, and keeps the recordings made until then. */
 static void ended(int exit_code, void *context) {
     (void)context;
     if (mailbox->event == MAILBOX_EXIT) {
         return;
     }
     if (exit_code == MAILBOX_EXIT_FAULT) {
-        fputs("salient: the drive's program ended at a fault of its processor\n", stderr);
+        fputs("salient: the drive's program stopped on an unexpected CPU exception\n", stderr);
     } else if (exit_code == MAILBOX_EXIT_LAYOUT) {
-        fputs("salient: the drive's image has another mailbox than this program: build both from the same sources\n",
+        fputs("salient: the drive's image and this program have different mailbox layouts: build both from the same "
+              "sources\n",
               stderr);
     }
-    world_abandon();
+    cosimulation_abandon();
 }
 
 static void translate(qemu_plugin_id_t id, struct qemu_plugin_tb *tb) {
@@ -78,8 +79,8 @@ static void translate(qemu_plugin_id_t id, struct qemu_plugin_tb *tb) {
     if (counting) {
         instructions_translate(tb);
     }
-    if (following) {
-        execution_translate(tb);
+    if (tracing) {
+        trace_translate(tb);
     }
 }
 
@@ -92,7 +93,7 @@ static mailbox_t *map_mailbox(const char *path) {
     }
     if (memory == MAP_FAILED) {
         fprintf(stderr, "salient: mailbox %s: %s\n", path, strerror(errno));
-        exit(BENCH_EXIT_MISTAKE);
+        exit(EXIT_USAGE);
     }
     return memory;
 }
@@ -106,23 +107,23 @@ static const board_description_t *board_of(const char *target) {
     return NULL;
 }
 
-/* The text behind `key` if the argument begins with it, else NULL. */
+/* The text after `key` if the argument begins with it, else NULL. */
 static char *value_of(char *argument, const char *key) {
     return strncmp(argument, key, strlen(key)) == 0 ? argument + strlen(key) : NULL;
 }
 
 int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, char **argv) {
-    static options_t options; /* the world keeps it */
+    static options_t options; /* the co-simulation keeps it */
     char *words[ARGUMENTS_MAX + 1] = {"salient"};
     int count = 1;
-    const char *mailbox_path = NULL, *instructions_path = NULL, *execution_path = NULL, *stack = "";
+    const char *mailbox_path = NULL, *instructions_path = NULL, *trace_path = NULL, *stack = "";
     bool timed = false;
     for (int i = 0; i < argc; ++i) {
         char *value;
         if ((value = value_of(argv[i], "argument="))) {
             if (count == ARGUMENTS_MAX) {
                 fprintf(stderr, "salient: more than %d arguments\n", ARGUMENTS_MAX);
-                exit(BENCH_EXIT_MISTAKE);
+                exit(EXIT_USAGE);
             }
             words[count++] = strdup(value);
         } else if ((value = value_of(argv[i], "mailbox="))) {
@@ -130,31 +131,31 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
         } else if ((value = value_of(argv[i], "instructions="))) {
             instructions_path = strdup(value);
         } else if ((value = value_of(argv[i], "execution="))) {
-            execution_path = strdup(value);
+            trace_path = strdup(value);
         } else if ((value = value_of(argv[i], "stack="))) {
             stack = value;
         } else if (strcmp(argv[i], "timed=1") == 0) {
             timed = true;
         } else {
-            fprintf(stderr, "salient: %s: not an argument of this plugin\n", argv[i]);
-            exit(BENCH_EXIT_MISTAKE);
+            fprintf(stderr, "salient: %s: unrecognised plugin argument\n", argv[i]);
+            exit(EXIT_USAGE);
         }
     }
     board = board_of(info->target_name);
     if (!mailbox_path || !info->system_emulation || !board) {
         fputs("salient: this plugin needs a board of boards.h and mailbox=FILE\n", stderr);
-        exit(BENCH_EXIT_MISTAKE);
+        exit(EXIT_USAGE);
     }
     mailbox = map_mailbox(mailbox_path);
     const options_result_t result = options_parse(&options, count, words);
-    if (result != OPTIONS_RUN || !world_open(mailbox, &options, timed)) {
-        exit(result == OPTIONS_HELP ? 0 : BENCH_EXIT_MISTAKE);
+    if (result != OPTIONS_RUN || !cosimulation_open(mailbox, &options, timed)) {
+        exit(result == OPTIONS_HELP ? 0 : EXIT_USAGE);
     }
     on_exit(ended, NULL);
     counting = instructions_path;
-    following = execution_path;
-    if ((counting && !instructions_open(instructions_path)) || (following && !execution_open(execution_path, stack))) {
-        exit(BENCH_EXIT_MISTAKE);
+    tracing = trace_path;
+    if ((counting && !instructions_open(instructions_path)) || (tracing && !trace_open(trace_path, stack))) {
+        exit(EXIT_USAGE);
     }
     qemu_plugin_register_vcpu_tb_trans_cb(id, translate);
     return 0;

@@ -13,14 +13,12 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
-#include "qemu/boards.h"
 #include "host/simulation.h"
-
-#define EXIT_MISTAKE BENCH_EXIT_MISTAKE
+#include "qemu/boards.h"
 
 static int mistake(const char *what) {
     fprintf(stderr, "salient: %s: %s\n", what, strerror(errno));
-    return EXIT_MISTAKE;
+    return EXIT_USAGE;
 }
 
 /* ,KEY=VALUE as QEMU reads it: a comma in the value is written twice. */
@@ -77,7 +75,7 @@ int main(int argc, char *argv[]) {
                "                       takes no time\n"
                "  OPTION               as the host executable's; its --help lists them\n",
                argv[0]);
-        return argc < 2 ? EXIT_MISTAKE : 0;
+        return argc < 2 ? EXIT_USAGE : 0;
     }
     const char *image = argv[1], *instructions = NULL, *execution = NULL, *stack = NULL, *instruction_ns = NULL;
     int first = 2;
@@ -96,17 +94,17 @@ int main(int argc, char *argv[]) {
     }
     const board_description_t *board = board_of(image);
     if (!board) {
-        return EXIT_MISTAKE;
+        return EXIT_USAGE;
     }
     const int shift = instruction_ns ? shift_of(instruction_ns) : 0;
     if (shift < 0) {
         fprintf(stderr, "salient: --instruction-ns %s: allowed are 1, 2, 4, 8, 16, 32 and 64\n", instruction_ns);
-        return EXIT_MISTAKE;
+        return EXIT_USAGE;
     }
     if (instruction_ns && !board->timer) {
         fprintf(stderr, "salient: --instruction-ns %s: not on the board %s, whose port uses no timer\n", instruction_ns,
                 board->machine);
-        return EXIT_MISTAKE;
+        return EXIT_USAGE;
     }
     const int memory = memfd_create("salient mailbox", 0); /* inherited by QEMU, gone with it */
     if (memory < 0 || ftruncate(memory, board->memory_bytes) != 0) {

@@ -103,7 +103,7 @@ static unsigned number_of(uint64_t address, size_t size) {
     return i;
 }
 
-bool execution_open(const char *path, const char *stack) {
+bool trace_open(const char *path, const char *stack) {
     name = path;
     char rest;
     if (sscanf(stack, "%" SCNx64 "-%" SCNx64 "%c", &stack_end, &stack_begin, &rest) != 2 || stack_end >= stack_begin) {
@@ -117,7 +117,7 @@ bool execution_open(const char *path, const char *stack) {
 
 /* As in instructions.c, the handler's two ends are blocks that begin and end with them. They count themselves, so that
  * it does not matter which of a block's callbacks QEMU calls first. */
-void execution_translate(struct qemu_plugin_tb *tb) {
+void trace_translate(struct qemu_plugin_tb *tb) {
     const size_t size = qemu_plugin_tb_n_insns(tb);
     struct qemu_plugin_insn *first = qemu_plugin_tb_get_insn(tb, 0);
     const char *symbol = qemu_plugin_insn_symbol(first);
@@ -135,7 +135,7 @@ void execution_translate(struct qemu_plugin_tb *tb) {
     }
 }
 
-bool execution_close(void) {
+bool trace_close(void) {
     if (in_interrupt) {
         leave(); /* the program ends in the middle of one */
     }

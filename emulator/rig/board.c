@@ -15,7 +15,7 @@ void board_start_period(board_t *board, bool busy) {
     hal_encoder_sample_t encoder;
     sensors_sample_encoder(board->sensors, board->plant, &encoder);
     if (busy) {
-        ++board->missed_interrupts;
+        ++board->missed_triggers;
     } else {
         sensors_sample_adc(board->sensors, board->plant, &board->adc);
         board->encoder = encoder;
@@ -50,9 +50,9 @@ void board_pwm_open_all(board_t *board) {
     plant_open_all(board->plant);
 }
 
-uint32_t board_pwm_missed_interrupts(board_t *board) {
-    uint32_t missed = board->missed_interrupts;
-    board->missed_interrupts = 0;
+uint32_t board_missed_triggers(board_t *board) {
+    uint32_t missed = board->missed_triggers;
+    board->missed_triggers = 0;
     return missed;
 }
 

@@ -32,7 +32,7 @@ typedef struct {
     uint16_t period_ticks; /* 0 until the timer is started */
     bool immediate_pwm;    /* a setting: see board_pwm_write; false after board_init */
     hal_pwm_compare_t active, buffered;
-    uint32_t missed_interrupts; /* since last read */
+    uint32_t missed_triggers;   /* since last read */
     uint64_t interrupt_took_ns; /* the present control interrupt, from its trigger on: as the rig says, unless the port,
                                    whose processor takes time of its own, says otherwise before it is over */
 
@@ -63,7 +63,7 @@ void board_deliver(board_t *board, const hal_can_frame_t *frame);
 void board_pwm_start(board_t *board, uint16_t period_ticks);
 void board_pwm_write(board_t *board, const hal_pwm_compare_t *compare);
 void board_pwm_open_all(board_t *board);
-uint32_t board_pwm_missed_interrupts(board_t *board);
+uint32_t board_missed_triggers(board_t *board);
 bool board_can_receive(board_t *board, hal_can_frame_t *frame);
 bool board_can_transmit(board_t *board, const hal_can_frame_t *frame);
 

@@ -1,14 +1,15 @@
-/* The test bench: owns virtual time, and joins plant, board, CAN bus and clients.
+/* The test bench: joins plant, board, CAN bus and clients on one virtual clock.
  *
- * One thread, next event first. Events of the same instant come in this order: quantities set ahead (RIG_SET), the CAN
- * bus, the sensors' hold of the currents (if they have a delay), the control period, the background after an interrupt
- * that takes time, the truth frames; then the clients. The plant is advanced exactly to the events that touch it, and
- * to no others, so that where a client cuts the time into RIG_RUN_UNTILs does not change a bit of what happens.
+ * One thread, next event first (scheduler.h). Events of the same instant come in the order of scheduler_event_t, then
+ * the clients. The plant is advanced exactly to the events that touch it, and to no others, so that the way a client
+ * divides time into RIG_RUN_UNTILs does not change a bit of the result.
  *
- * In lock-step time stands still until a client sends RIG_RUN_UNTIL; clients are not read while time runs. Frames for
+ * In lock-step, time stands still until a client sends RIG_RUN_UNTIL; clients are not read while time runs. Frames for
  * the bus that were sent while it stood still begin in the order in which their clients connected, then in the order
  * of each client, whatever the moment they arrived; a client's frames that were sent before another client's
- * RIG_RUN_UNTIL are taken before it. In the other paces clients are read each RIG_READ_STEP_NS of virtual time.
+ * RIG_RUN_UNTIL are taken before it. The RIG_RUN_UNTIL of a client that has disconnected is abandoned, within
+ * RIG_STOP_STEP_NS, when another client is connected; without one it runs to its end. In the other paces clients are
+ * read each RIG_READ_STEP_NS of virtual time.
  */
 #ifndef RIG_H
 #define RIG_H
@@ -22,14 +23,15 @@
 #include "rig/board.h"
 #include "rig/can_bus.h"
 #include "rig/pacing.h"
-#include "rig/quantity.h"
+#include "rig/scheduler.h"
+#include "rig/stimulus_queue.h"
 #include "rig/transport.h"
 
 #define RIG_READ_STEP_NS UINT64_C(1000000)
-#define RIG_STOP_STEP_NS UINT64_C(10000000) /* virtual time between two looks whether to stop */
-#define RIG_NEVER UINT64_MAX
+#define RIG_STOP_STEP_NS UINT64_C(10000000) /* virtual time between two checks for a stop request */
+#define RIG_NEVER SCHEDULER_NEVER
 #define RIG_RUNS_MAX 64           /* RIG_RUN_UNTILs that wait for their time */
-#define RIG_MOVING_BACKLOG_MAX 64 /* paces that move by themselves: clients wait while so many frames are queued */
+#define RIG_MOVING_BACKLOG_MAX 64 /* all paces but lock-step: clients wait while this many frames are queued */
 
 /* The firmware, seen from the emulator. Both take no virtual time, except as board.interrupt_took_ns says. */
 typedef struct {
@@ -38,7 +40,7 @@ typedef struct {
     void *context;
 } rig_firmware_t;
 
-/* When to end: `requested` is asked at least every RIG_STOP_STEP_NS, and when a descriptor becomes readable. */
+/* When to end: `requested` is called at least every RIG_STOP_STEP_NS, and when a descriptor becomes readable. */
 typedef struct {
     int descriptors[2]; /* negative: not used */
     bool (*requested)(void *context);
@@ -50,7 +52,7 @@ typedef struct {
     double initial_angle_rad;
     unsigned encoder_bits; /* 8..32, 0 means ideal */
     unsigned adc_bits;     /* 12..16 */
-    bool encoder_edges;    /* the board captures them */
+    bool encoder_edges;    /* the board captures the encoder's edges */
     bool immediate_pwm;    /* compare values act when they are written, not in the next period */
     uint64_t seed;
     uint32_t bit_rate;
@@ -79,38 +81,38 @@ typedef struct {
     can_bus_t bus;
     board_t board; /* board.time_ns is the time */
 
-    /* The rest is rig.c's. */
+    /* Private to the rig's files. */
     rig_config_t config;
     rig_firmware_t firmware;
-    uint64_t period_ns;
-    uint64_t hold_ns, control_ns, background_ns, truth_ns; /* when each is due next */
+    scheduler_t scheduler;
+    uint64_t period_ns;                           /* control_period.c */
+    uint64_t interrupt_time_ns, interrupt_end_ns; /* triggers before the end of the last interrupt are lost */
     uint64_t truth_period_ns;
-    uint64_t interrupt_time_ns, interrupt_end_ns; /* triggers before the end of the last one are lost */
-    quantity_queue_t settings;
-    rig_run_t runs[RIG_RUNS_MAX]; /* by time, equal times in the order of arrival */
+    stimulus_queue_t stimuli;
+    rig_run_t runs[RIG_RUNS_MAX]; /* server.c, by time, equal times in the order of arrival */
     unsigned run_count;
-    uint64_t stop_asked_ns;
+    uint64_t stop_checked_ns;
     unsigned staged_count;
     bool staged_mixed; /* not in the order of clients yet */
     rig_staged_t staged[CAN_BUS_CLIENT_QUEUE];
 } rig_t;
 
-/* A bench at time 0: machine at rest, supply on, no load, no firmware. */
+/* A bench at time 0: machine at rest, supply on, no load, no firmware. The rig must not be moved afterwards. */
 void rig_init(rig_t *rig, const rig_config_t *config);
 
 /* Joins the firmware, which must have started the timer (hal_pwm_start); its first interrupt is one period away. */
 void rig_join(rig_t *rig, const rig_firmware_t *firmware);
 
-/* The processor serves no trigger of a control interrupt before time_ns: they are lost, as those during an interrupt.
- */
+/* The processor serves no trigger of a control interrupt before time_ns: they are lost, like those during an
+ * interrupt. */
 void rig_busy_until(rig_t *rig, uint64_t time_ns);
 
-/* One round. Lock-step: takes what clients sent; runs to the time asked for, or waits up to timeout_ms (negative: for
- * ever) when none was. Other paces: runs to the next reading point. False when it is over: asked to stop, stop_at_ns
- * reached, or config.transport->failure. */
+/* One round. Lock-step: takes the clients' frames; runs to the earliest requested time, or waits up to timeout_ms
+ * (negative: indefinitely) when none is requested. Other paces: runs to the next reading point. False at the end: stop
+ * requested, stop_at_ns reached, or config.transport->failure. */
 bool rig_serve(rig_t *rig, int timeout_ms);
 
-/* Brings the plant (and who observes it) to the present time, and sends what is still in batches. */
+/* Advances the plant, and its observer, to the present time and sends the frames that are still in batches. */
 void rig_finish(rig_t *rig);
 
 #endif

@@ -13,12 +13,12 @@ transport_t *transport_open(const char *address, char error[TRANSPORT_ERROR_SIZE
     if (strncmp(address, "socketcan:", 10) == 0 && address[10] != '\0') {
         return transport_socketcan_open(address + 10, error);
     }
-    snprintf(error, TRANSPORT_ERROR_SIZE, "--can %.120s: allowed are unix:PATH and socketcan:INTERFACE", address);
+    snprintf(error, TRANSPORT_ERROR_SIZE, "--can %.120s: must be unix:PATH or socketcan:INTERFACE", address);
     return NULL;
 }
 
 bool transport_frame_accept(transport_frame_t *frame, size_t received) {
-    /* Both forms begin alike: identifier with flags, length, flags or padding. */
+    /* Both forms begin with the same fields: identifier with flags, length, flags or padding. */
     canid_t id = frame->classic.can_id;
     if (!(id & (CAN_EFF_FLAG | CAN_ERR_FLAG)) && (id & CAN_EFF_MASK) > CAN_SFF_MASK) {
         return false;

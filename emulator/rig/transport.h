@@ -1,6 +1,6 @@
-/* How clients reach the emulated bus: the local bus (transport_local.c) or SocketCAN (transport_socketcan.c).
+/* Connection of clients to the emulated bus: the local bus (transport_local.c) or SocketCAN (transport_socketcan.c).
  *
- * A transport only carries frames. What they mean, when they complete on the bus and what time it is, is the rig's.
+ * A transport only carries frames. Their meaning, their timing on the bus and the clock belong to the rig.
  */
 #ifndef RIG_TRANSPORT_H
 #define RIG_TRANSPORT_H
@@ -16,7 +16,7 @@
 #define TRANSPORT_DESCRIPTORS_MAX 72
 #define TRANSPORT_ERROR_SIZE 256
 
-/* One frame as Linux has it; `size` says which. */
+/* One frame in Linux's layout; `size` selects the member. */
 typedef struct {
     size_t size; /* CAN_MTU (classic) or CANFD_MTU (flexible data rate) */
     union {
@@ -25,25 +25,26 @@ typedef struct {
     };
 } transport_frame_t;
 
-/* Whose frame is sent to the clients, and how its time came about. */
+/* Origin of a frame that is sent to the clients; it determines how the frame's time is conveyed. */
 typedef enum {
     TRANSPORT_FROM_EMULATOR,       /* the drive or the rig */
     TRANSPORT_CLOCK,               /* RIG_CLOCK, carries its time itself */
     TRANSPORT_FROM_CLIENT_ON_BUS,  /* completed on the emulated bus */
-    TRANSPORT_FROM_CLIENT_AT_ONCE, /* never on the emulated bus: rig, error, flexible data rate */
+    TRANSPORT_FROM_CLIENT_OFF_BUS, /* never on the emulated bus: rig, error, flexible data rate */
 } transport_origin_t;
 
-/* What a client that does not read its frames suffers. */
+/* Treatment of a client whose queue is full. */
 typedef enum {
-    TRANSPORT_WAIT, /* time waits for it, at most two seconds; then it is disconnected */
-    TRANSPORT_DROP, /* the frames that do not fit are lost to it and counted */
+    TRANSPORT_WAIT,          /* time waits until the client reads or leaves */
+    TRANSPORT_WAIT_FOR_READ, /* time waits as long as the client reads; one that does not is disconnected */
+    TRANSPORT_DROP,          /* the frames that do not fit are lost to it and counted */
 } transport_full_t;
 
-/* What the rig does with frames that come in. Clients are numbered from 1 in the order they connected. */
+/* Receiver of the clients' frames: the rig. Clients are numbered from 1 in the order they connected. */
 typedef struct {
     void *context;
-    bool (*may_read)(void *context, uint32_t client); /* whether the next frame of this client may be taken */
-    bool (*take)(void *context, uint32_t client, const transport_frame_t *frame); /* false: the client goes too far */
+    bool (*may_read)(void *context, uint32_t client); /* the client's next frame may be taken */
+    bool (*take)(void *context, uint32_t client, const transport_frame_t *frame); /* false: disconnect */
 } transport_receiver_t;
 
 typedef struct transport transport_t;
@@ -55,8 +56,12 @@ struct transport {
     void (*send)(transport_t *transport, uint64_t time_ns, transport_origin_t origin, const transport_frame_t *frame);
     void (*flush)(transport_t *transport);
     void (*close)(transport_t *transport);
+    bool (*connected)(transport_t *transport, uint32_t client);
+    bool (*in_use)(transport_t *transport);
     transport_full_t full;
-    const char *failure; /* why the transport cannot go on, or NULL */
+    bool (*give_up)(void *context); /* true: the program is to end, wait for no client; NULL: never */
+    void *give_up_context;
+    const char *failure; /* reason why the transport cannot continue, or NULL */
 };
 
 /* Fills in up to TRANSPORT_DESCRIPTORS_MAX entries to poll for new frames and clients; returns how many. */
@@ -64,8 +69,8 @@ static inline size_t transport_descriptors(transport_t *transport, struct pollfd
     return transport->descriptors(transport, list);
 }
 
-/* Lets new clients in and hands over what was sent, one frame of each client in turn, in the order of connection,
- * until a whole turn brings nothing. Never waits. Returns the number of frames handed over. */
+/* Accepts new clients and hands over their frames, one frame of each client in turn, in the order of connection,
+ * until a whole turn yields none. Never waits. Returns the number of frames handed over. */
 static inline size_t transport_read(transport_t *transport, const transport_receiver_t *receiver) {
     return transport->read(transport, receiver);
 }
@@ -81,12 +86,23 @@ static inline void transport_flush(transport_t *transport) {
     transport->flush(transport);
 }
 
-/* Disconnects everyone, removes what was created, frees the transport. */
+/* False when the client has left, even when frames that it sent before are still unread. Always true on a transport
+ * that does not know its clients. */
+static inline bool transport_connected(transport_t *transport, uint32_t client) {
+    return transport->connected(transport, client);
+}
+
+/* True when a client is connected that has not left, or a new one waits to be accepted. */
+static inline bool transport_in_use(transport_t *transport) {
+    return transport->in_use(transport);
+}
+
+/* Disconnects all clients, removes what was created, frees the transport. */
 static inline void transport_close(transport_t *transport) {
     transport->close(transport);
 }
 
-/* Opens `address`, unix:PATH or socketcan:INTERFACE. NULL with a line in `error` when it cannot. */
+/* Opens `address`, unix:PATH or socketcan:INTERFACE. NULL with a line in `error` on failure. */
 transport_t *transport_open(const char *address, char error[TRANSPORT_ERROR_SIZE]);
 
 /* The two kinds, by what follows the colon. */
@@ -97,8 +113,8 @@ transport_t *transport_socketcan_open(const char *interface, char error[TRANSPOR
  * stands in for an interface). Takes the descriptor over. */
 transport_t *transport_socketcan_attach(int descriptor);
 
-/* Whether `received` bytes are a frame. If so, everything that means nothing is zeroed, so that equal frames are equal
- * bytes: reserved fields and data behind the length. A classic length of 9 to 15 becomes length 8 with len8_dlc. */
+/* True when `received` bytes are a frame. Fields without meaning are then zeroed, so that equal frames are equal bytes:
+ * reserved fields and data beyond the length. A classic length of 9 to 15 becomes length 8 with len8_dlc. */
 bool transport_frame_accept(transport_frame_t *frame, size_t received);
 
 /* Never on the emulated bus: flexible data rate, error frames and the rig's identifiers (0x1F0000xx, 29 bits). */

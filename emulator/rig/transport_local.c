@@ -6,12 +6,16 @@
 
 #include <errno.h>
 #include <inttypes.h>
+#include <linux/sockios.h>
+#include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/un.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "rig/transport.h"
@@ -19,8 +23,13 @@
 #define CLIENTS_MAX 64
 #define BATCH 256
 #define SEND_BUFFER_BYTES (8 * 1024 * 1024) /* some 10,000 records; the default queue holds 278 */
-#define FULL_TIMEOUT_MS 2000
-#define READ_TURNS_MAX 65536 /* a client that never stops sending cannot hold up the others for ever */
+#define READ_TURNS_MAX 65536 /* a client that never stops sending cannot hold up the others indefinitely */
+
+/* Waiting for a client whose queue is full: rounds of a sleep of WAIT_SLEEP_MS, which the client's first read of a
+ * quarter of the queue may end early, and of WAIT_BUSY_NS of this process's own processor time. */
+#define WAIT_SLEEP_MS 10
+#define WAIT_BUSY_NS INT64_C(1000000)
+#define WAIT_ROUNDS 200 /* of TRANSPORT_WAIT_FOR_READ, without a read */
 
 typedef struct {
     uint8_t time_ns[8];
@@ -39,7 +48,7 @@ typedef struct {
     transport_t transport;
     int listener;
     char path[sizeof(((struct sockaddr_un *)0)->sun_path)];
-    dev_t device; /* of the socket file, so that only our own is removed */
+    dev_t device; /* identifies the socket file, so that no other is removed */
     ino_t inode;
     uint32_t clients_ever;
     unsigned client_count;
@@ -56,7 +65,7 @@ static void disconnect(local_t *local, unsigned index, const char *reason) {
         fprintf(stderr, "salient: client %" PRIu32 " of %s disconnected: %s\n", client->number, local->path, reason);
     }
     if (client->malformed) {
-        fprintf(stderr, "salient: client %" PRIu32 " of %s sent %" PRIu64 " records that are no frames\n",
+        fprintf(stderr, "salient: client %" PRIu32 " of %s sent %" PRIu64 " records that are not frames\n",
                 client->number, local->path, client->malformed);
     }
     if (client->dropped) {
@@ -69,7 +78,7 @@ static void disconnect(local_t *local, unsigned index, const char *reason) {
 
 static void local_flush(transport_t *transport);
 
-/* Asks poll first: accept4 makes a file before it looks whether anyone waits, and is called for every frame. */
+/* Polls first: accept4 allocates a file before it checks for a waiting client, and is called for every frame. */
 static void accept_clients(local_t *local) {
     struct pollfd waiting = {.fd = local->listener, .events = POLLIN};
     while (poll(&waiting, 1, 0) > 0) {
@@ -78,11 +87,11 @@ static void accept_clients(local_t *local) {
             return;
         }
         if (local->client_count == CLIENTS_MAX) {
-            fprintf(stderr, "salient: client refused: %s has %d clients already\n", local->path, CLIENTS_MAX);
+            fprintf(stderr, "salient: client rejected: %s already has %d clients\n", local->path, CLIENTS_MAX);
             close(descriptor);
             continue;
         }
-        local_flush(&local->transport); /* what is in the batch happened before this client came */
+        local_flush(&local->transport); /* the batch holds frames from before this client connected */
         int bytes = SEND_BUFFER_BYTES;
         if (setsockopt(descriptor, SOL_SOCKET, SO_SNDBUFFORCE, &bytes, sizeof bytes) != 0) {
             setsockopt(descriptor, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes);
@@ -107,6 +116,29 @@ static unsigned index_from(const local_t *local, uint32_t number) {
         ++index;
     }
     return index;
+}
+
+/* Without requested events, poll reports a hang-up or an error only. */
+static bool hung_up(const client_t *client) {
+    struct pollfd state = {.fd = client->descriptor};
+    return poll(&state, 1, 0) > 0;
+}
+
+static bool local_connected(transport_t *transport, uint32_t number) {
+    const local_t *local = (local_t *)transport;
+    const unsigned index = index_from(local, number);
+    return index < local->client_count && local->clients[index].number == number && !hung_up(&local->clients[index]);
+}
+
+static bool local_in_use(transport_t *transport) {
+    const local_t *local = (local_t *)transport;
+    for (unsigned i = 0; i < local->client_count; ++i) {
+        if (!hung_up(&local->clients[i])) {
+            return true;
+        }
+    }
+    struct pollfd waiting = {.fd = local->listener, .events = POLLIN};
+    return poll(&waiting, 1, 0) > 0;
 }
 
 /* Takes one record of a client, or its departure. */
@@ -134,9 +166,9 @@ static void read_one(local_t *local, unsigned index, const transport_receiver_t 
     }
     ++*taken;
     uint32_t number = client->number;
-    accept_clients(local); /* who connected before this frame was sent sees what comes of it */
+    accept_clients(local); /* clients that connected before this frame was sent receive its results */
     if (!receiver->take(receiver->context, number, &frame)) {
-        index = index_from(local, number); /* answering the frame may have cost any client its connection */
+        index = index_from(local, number); /* answering the frame may have disconnected any client */
         if (index < local->client_count && local->clients[index].number == number) {
             disconnect(local, index, "too many of its frames wait for the bus");
         }
@@ -160,7 +192,7 @@ static size_t local_read(transport_t *transport, const transport_receiver_t *rec
             break;
         }
         for (size_t i = 1; i < count; ++i) {
-            /* Answering one client may have cost another its connection, or taken the last place for a frame. */
+            /* Answering one client may have disconnected another, or taken the last free entry of the bus queue. */
             unsigned index = index_from(local, numbers[i]);
             if (list[i].revents && index < local->client_count && local->clients[index].number == numbers[i] &&
                 receiver->may_read(receiver->context, numbers[i])) {
@@ -172,6 +204,47 @@ static size_t local_read(transport_t *transport, const transport_receiver_t *rec
         }
     }
     return taken;
+}
+
+static int64_t processor_time_ns(void) {
+    struct timespec used;
+    clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &used);
+    return (int64_t)used.tv_sec * 1000000000 + used.tv_nsec;
+}
+
+/* Bytes that the client has not read yet. */
+static int unread_bytes(const client_t *client) {
+    int bytes = 0;
+    ioctl(client->descriptor, SIOCOUTQ, &bytes);
+    return bytes;
+}
+
+/* Waits until the client's queue has room. False when TRANSPORT_WAIT_FOR_READ ends: the client has read nothing in
+ * WAIT_ROUNDS rounds.
+ *
+ * The busy part of a round makes that independent of the computer's load: where processes compete for the processor,
+ * this one's millisecond of processor time arrives as late as the client's. */
+static bool wait_for_room(const local_t *local, const client_t *client) {
+    int unread = unread_bytes(client);
+    for (unsigned rounds = 0; rounds < WAIT_ROUNDS;) {
+        struct pollfd writable = {.fd = client->descriptor, .events = POLLOUT};
+        if (poll(&writable, 1, WAIT_SLEEP_MS) != 0) {
+            return true;
+        }
+        if (local->transport.give_up && local->transport.give_up(local->transport.give_up_context)) {
+            return true;
+        }
+        if (local->transport.full == TRANSPORT_WAIT) {
+            continue;
+        }
+        for (const int64_t start_ns = processor_time_ns(); processor_time_ns() - start_ns < WAIT_BUSY_NS;) {
+            sched_yield();
+        }
+        const int still_unread = unread_bytes(client);
+        rounds = still_unread < unread ? 0 : rounds + 1;
+        unread = still_unread;
+    }
+    return false;
 }
 
 /* Sends the batch to one client; false when the client is to be disconnected, with the reason, NULL when it left. */
@@ -190,13 +263,14 @@ static bool send_batch(local_t *local, client_t *client, const char **reason) {
         if (errno != EAGAIN && errno != ENOBUFS) {
             return false;
         }
-        if (local->transport.full == TRANSPORT_DROP) {
+        transport_t *transport = &local->transport;
+        if (transport->full == TRANSPORT_DROP ||
+            (transport->give_up && transport->give_up(transport->give_up_context))) {
             client->dropped += local->batched - sent;
             return true;
         }
-        struct pollfd writable = {.fd = client->descriptor, .events = POLLOUT};
-        if (poll(&writable, 1, FULL_TIMEOUT_MS) == 0) {
-            *reason = "it read nothing for two seconds";
+        if (!wait_for_room(local, client)) {
+            *reason = "its queue is full and it does not read";
             return false;
         }
     }
@@ -251,14 +325,14 @@ static void local_close(transport_t *transport) {
     free(local);
 }
 
-/* Frees `path` of a socket that nobody serves any more; false with a line in `error` when it is in use. */
+/* Removes a socket without a server from `path`; false with a line in `error` when the path is in use. */
 static bool remove_stale(const char *path, const struct sockaddr_un *address, char error[TRANSPORT_ERROR_SIZE]) {
     struct stat status;
     if (lstat(path, &status) != 0) {
-        return true; /* nothing there; bind will say if the folder is missing */
+        return true; /* nothing there; bind reports a missing folder */
     }
     if (!S_ISSOCK(status.st_mode)) {
-        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%s: exists and is no socket", path);
+        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%s: exists and is not a socket", path);
         return false;
     }
     int probe = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
@@ -268,7 +342,7 @@ static bool remove_stale(const char *path, const struct sockaddr_un *address, ch
         close(probe);
     }
     if (!refused) {
-        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%s: in use, something answers there", path);
+        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%s: in use by another server", path);
         return false;
     }
     unlink(path);
@@ -278,9 +352,8 @@ static bool remove_stale(const char *path, const struct sockaddr_un *address, ch
 transport_t *transport_local_open(const char *path, char error[TRANSPORT_ERROR_SIZE]) {
     struct sockaddr_un address = {.sun_family = AF_UNIX};
     if (strlen(path) >= sizeof address.sun_path) {
-        snprintf(error, TRANSPORT_ERROR_SIZE,
-                 "--can unix:%.60s...: the path has %zu characters, at most %zu are allowed", path, strlen(path),
-                 sizeof address.sun_path - 1);
+        snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%.60s...: the path has %zu characters, must be at most %zu",
+                 path, strlen(path), sizeof address.sun_path - 1);
         return NULL;
     }
     memcpy(address.sun_path, path, strlen(path) + 1);
@@ -308,7 +381,9 @@ transport_t *transport_local_open(const char *path, char error[TRANSPORT_ERROR_S
                                      .read = local_read,
                                      .send = local_send,
                                      .flush = local_flush,
-                                     .close = local_close};
+                                     .close = local_close,
+                                     .connected = local_connected,
+                                     .in_use = local_in_use};
     local->listener = listener;
     memcpy(local->path, path, strlen(path) + 1);
     local->device = status.st_dev;

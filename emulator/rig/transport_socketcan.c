@@ -21,20 +21,32 @@
 #include "rig_codec.h"
 
 #define BUFFER_BYTES (8 * 1024 * 1024)
-#define FULL_TIMEOUT_MS 2000
-#define ALL_CLIENTS 1 /* the interface does not say who sent a frame */
+#define FULL_WAITS 2000 /* of 1 ms */
+#define ALL_CLIENTS 1   /* the interface does not report the sender of a frame */
 #define READ_MAX 65536
 
 typedef struct {
     transport_t transport;
     int descriptor;
-    uint64_t dropped, refused;
+    uint64_t dropped, rejected;
     char failure[TRANSPORT_ERROR_SIZE];
 } socketcan_t;
 
 static size_t socketcan_descriptors(transport_t *transport, struct pollfd *list) {
     list[0] = (struct pollfd){.fd = ((socketcan_t *)transport)->descriptor, .events = POLLIN};
     return 1;
+}
+
+/* The interface does not report which clients there are. */
+static bool socketcan_connected(transport_t *transport, uint32_t client) {
+    (void)transport;
+    (void)client;
+    return true;
+}
+
+static bool socketcan_in_use(transport_t *transport) {
+    (void)transport;
+    return true;
 }
 
 static void fail(socketcan_t *can) {
@@ -59,7 +71,7 @@ static size_t socketcan_read(transport_t *transport, const transport_receiver_t 
             continue;
         }
         ++taken;
-        if (!receiver->take(receiver->context, ALL_CLIENTS, &frame) && can->refused++ == 0) {
+        if (!receiver->take(receiver->context, ALL_CLIENTS, &frame) && can->rejected++ == 0) {
             fprintf(stderr, "salient: frames on the CAN interface are lost: too many wait for the emulated bus\n");
         }
     }
@@ -67,7 +79,7 @@ static size_t socketcan_read(transport_t *transport, const transport_receiver_t 
 }
 
 static void send_frame(socketcan_t *can, const transport_frame_t *frame) {
-    for (int waited_ms = 0; !can->transport.failure;) {
+    for (unsigned waits = 0; !can->transport.failure;) {
         if (send(can->descriptor, &frame->flexible, frame->size, MSG_DONTWAIT | MSG_NOSIGNAL) >= 0) {
             return;
         }
@@ -78,23 +90,23 @@ static void send_frame(socketcan_t *can, const transport_frame_t *frame) {
             fail(can);
             return;
         }
-        if (can->transport.full == TRANSPORT_DROP || waited_ms >= FULL_TIMEOUT_MS) {
+        if (can->transport.full == TRANSPORT_DROP || waits >= FULL_WAITS) {
             ++can->dropped;
             return;
         }
         /* A full device queue (ENOBUFS) does not show in poll. */
         nanosleep(&(struct timespec){.tv_nsec = 1000000}, NULL);
-        ++waited_ms;
+        ++waits;
     }
 }
 
-static void send_stamp(socketcan_t *can, uint64_t time_ns, uint8_t subject) {
-    struct rig_stamp_t stamp;
-    rig_stamp_set_time_ns(&stamp, (int64_t)time_ns);
-    stamp.subject = subject;
-    transport_frame_t frame = {.size = CAN_MTU,
-                               .classic = {.can_id = RIG_STAMP_FRAME_ID | CAN_EFF_FLAG, .len = RIG_STAMP_LENGTH}};
-    rig_stamp_pack(frame.classic.data, &stamp, RIG_STAMP_LENGTH);
+static void send_timestamp(socketcan_t *can, uint64_t time_ns, uint8_t subject) {
+    struct rig_stamp_t timestamp;
+    rig_stamp_set_time_ns(&timestamp, (int64_t)time_ns);
+    timestamp.subject = subject;
+    transport_frame_t frame = {
+        .size = CAN_MTU, .classic = {.can_id = RIG_STAMP_FRAME_ID | CAN_EFF_FLAG, .len = RIG_STAMP_LENGTH}};
+    rig_stamp_pack(frame.classic.data, &timestamp, RIG_STAMP_LENGTH);
     send_frame(can, &frame);
 }
 
@@ -103,17 +115,17 @@ static void socketcan_send(transport_t *transport, uint64_t time_ns, transport_o
     socketcan_t *can = (socketcan_t *)transport;
     switch (origin) {
     case TRANSPORT_FROM_EMULATOR:
-        send_stamp(can, time_ns, RIG_STAMP_SUBJECT_NEXT_CHOICE);
+        send_timestamp(can, time_ns, RIG_STAMP_SUBJECT_NEXT_CHOICE);
         send_frame(can, frame);
         break;
     case TRANSPORT_CLOCK:
         send_frame(can, frame);
         break;
     case TRANSPORT_FROM_CLIENT_ON_BUS:
-        send_stamp(can, time_ns, RIG_STAMP_SUBJECT_OLDEST_ON_BUS_CHOICE);
+        send_timestamp(can, time_ns, RIG_STAMP_SUBJECT_OLDEST_ON_BUS_CHOICE);
         break;
-    case TRANSPORT_FROM_CLIENT_AT_ONCE:
-        send_stamp(can, time_ns, RIG_STAMP_SUBJECT_OLDEST_AT_ONCE_CHOICE);
+    case TRANSPORT_FROM_CLIENT_OFF_BUS:
+        send_timestamp(can, time_ns, RIG_STAMP_SUBJECT_OLDEST_AT_ONCE_CHOICE);
         break;
     }
 }
@@ -142,7 +154,9 @@ transport_t *transport_socketcan_attach(int descriptor) {
                                    .read = socketcan_read,
                                    .send = socketcan_send,
                                    .flush = socketcan_flush,
-                                   .close = socketcan_close};
+                                   .close = socketcan_close,
+                                   .connected = socketcan_connected,
+                                   .in_use = socketcan_in_use};
     can->descriptor = descriptor;
     return &can->transport;
 }

@@ -1,5 +1,6 @@
-/* A board of QEMU: what the drive's program (program.c) needs of it. A port has these functions, the critical section
- * of hal_time.h, hal_pwm_elapsed_ticks, the processor's vectors or their like, and a linker script memory.ld.
+/* Functions of a QEMU board for the drive's program (emulator/qemu/image/main.c). A board has these, the critical
+ * section of hal_time.h, hal_interrupt_elapsed_ticks, the processor's vectors or their like, and a linker script
+ * memory.ld.
  *
  * Who counts instructions knows the control interrupt's ends by their names: control_handler is the handler's first
  * instruction; at control_handler_return it begins its end, which has no jump before the return and lies within a page.

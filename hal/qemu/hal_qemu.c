@@ -1,8 +1,9 @@
 #include "qemu/hal_qemu.h"
 
+#include "hal_interrupt.h"
 #include "hal_time.h"
 
-/* The world knows this store by the function's name, so the function must stay one: not inlined, not cloned. */
+/* The plugin identifies this store by the function's name: the function must be neither inlined nor cloned. */
 __attribute__((noipa)) void doorbell_ring(mailbox_command_t command) {
     *(volatile uint32_t *)&board.mailbox.doorbell = command;
 }
@@ -38,9 +39,9 @@ void hal_pwm_open_all(hal_t *hal) {
     doorbell_ring(MAILBOX_PWM_OPEN_ALL);
 }
 
-uint32_t hal_pwm_missed_interrupts(hal_t *hal) {
-    const uint32_t missed = hal->mailbox.missed_interrupts;
-    hal->mailbox.missed_interrupts = 0;
+uint32_t hal_interrupt_missed_triggers(hal_t *hal) {
+    const uint32_t missed = hal->mailbox.missed_triggers;
+    hal->mailbox.missed_triggers = 0;
     return missed;
 }
 

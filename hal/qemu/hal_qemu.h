@@ -10,7 +10,7 @@ struct hal {
     mailbox_t mailbox;
 };
 
-/* The one board there is; the linker places it in the memory shared with the world. */
+/* The one board there is; the linker places it in the memory shared with the co-simulation host. */
 extern hal_t board;
 
 /* Stores a command to the doorbell. Whatever of the mailbox the compiler held in registers is read again after it. */

@@ -13,7 +13,7 @@ import pytest
 
 from salient.bench.drive import DriveError
 from salient.bench.emulator import Simulator, SimulatorOptions
-from salient.bench.rig import RigError
+from salient.bench.rig import RigError, bench_variables
 from salient.bench.session import Session
 from salient.bus.signals import drive_database, rig_database
 
@@ -113,7 +113,7 @@ def test_signals_agree_with_cantools(bench):
 
 def test_refusals(bench):
     bench.run_for(0.01)
-    with pytest.raises(RigError, match="load_torque_Nm 500: allowed are -200 to 200 N m"):
+    with pytest.raises(RigError, match="load_torque_Nm 500: must be -200 to 200 N m"):
         bench.load_torque_Nm = 500
     with pytest.raises(RigError, match="load_torque_Nm 1 at 5000 us: in_the_past"):
         bench.at(0.005).load_torque_Nm = 1
@@ -192,3 +192,44 @@ def test_wrong_transport(tmp_path):
                             text=True, cwd=Path(tmp_path))
     assert result.returncode == 4
     assert "--salient-can vcan0: allowed are local and socketcan:INTERFACE" in result.stderr
+
+
+@pytest.mark.parametrize("name", ["phase_a_open", "load_torque", "Load_torque_Nm", "_load_torque_Nm"])
+def test_unknown_bench_variable_is_rejected_with_those_there_are(bench, name):
+    for rig in (bench.rig, bench.at(0.1)):
+        with pytest.raises(AttributeError, match=f"no attribute '{name}'; there are .*load_torque_Nm.*truth_period_us"):
+            setattr(rig, name, 8)
+        with pytest.raises(AttributeError, match=f"no attribute '{name}'"):
+            getattr(rig, name)
+
+
+def test_misspelt_attribute_is_rejected_with_those_there_are(bench):
+    with pytest.raises(AttributeError, match="no attribute 'load_torque'; there are .*load_torque_Nm"):
+        bench.load_torque = 8
+    with pytest.raises(AttributeError, match="no attribute 'speed_rpm'; there are .*speed_reference_rpm"):
+        bench.drive.speed_rpm = 600
+    with pytest.raises(AttributeError, match="no attribute 'stop'"):
+        bench.drive.stop = True  # a method
+
+
+def test_bench_variables_are_those_of_the_database(bench):
+    """Each with a description and a range; those with a start value have it, the others the machine file's."""
+    variables = bench_variables()
+    assert set(variables) <= set(dir(bench.rig))
+    assert all(signal.comment and signal.minimum < signal.maximum for signal in variables.values())
+    assert bench.rig.encoder_fault == 0
+    assert bench.rig.truth_period_us == 1000
+    assert bench.rig.inertia_gain == 1.0
+    with pytest.raises(AttributeError, match="machine file"):
+        bench.rig.supply_voltage_V  # noqa: B018
+    bench.rig.supply_voltage_V = 200
+    assert bench.rig.supply_voltage_V == 200
+    for name, signal in variables.items():
+        setattr(bench.rig, name, signal.minimum)
+        assert name in bench.rig.describe()
+
+
+def test_every_message_and_signal_of_the_bench_has_a_comment():
+    for message in rig_database().messages:
+        assert message.comment, message.name
+        assert [signal.name for signal in message.signals if not signal.comment] == []

@@ -50,7 +50,7 @@ def start(program: str, tmp_path: Path) -> Iterator:
     [
         ([], ["--can", "unix:PATH"]),
         (["--can"], ["--can", "missing"]),
-        (["--can", "tcp:1"], ["tcp:1", "unix:PATH and socketcan:INTERFACE"]),
+        (["--can", "tcp:1"], ["tcp:1", "unix:PATH or socketcan:INTERFACE"]),
         (["--can", "unix:/no/such/folder/bus"], ["/no/such/folder/bus"]),
         (["--can", "socketcan:nosuch0"], ["socketcan:nosuch0"]),
         (["--can", "BUS", "--pace", "fast"], ["--pace fast", "lockstep, realtime, free and xN"]),

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from salient.bench.rig import quantities
+from salient.bench.rig import bench_variables
 from salient.errors import UsageError
 from salient.experiments.metrics import losses
 from salient.experiments.scenario import LoadStep, Record, RunResult, Scenario, SpeedStep, load_scenarios, run_scenario
@@ -88,7 +88,7 @@ def test_every_quantity_of_the_bench_may_be_set_from_the_start(tmp_path):
     values = {"supply_voltage_V": 230.0, "current_sensor_gain": 1.01, "truth_period_us": 500, "current_noise_A": 0.02,
               "current_sensor_limit_A": 90.0, "flux_linkage_gain": 1.05, "resistance_gain": 1.2, "inertia_gain": 1.1,
               "friction_gain": 0.9, "minimum_pulse_ns": 200.0}
-    bench = {name: values.get(name, 0.0) for name in quantities()}
+    bench = {name: values.get(name, 0.0) for name in bench_variables()}
     assert values.keys() <= bench.keys()
     result = loaded(tmp_path, bench=bench)
     assert set(result.recording["bus_voltage_V"]) == {230.0}

@@ -142,7 +142,7 @@ noreturn void program_start(void) {
     const drive_config_t config = {.control_rate_hz = board.mailbox.control_rate_hz};
     const bool started = drive_init(&drive, &board, &machine_tables, &config);
     board_interrupt_enable();
-    doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REFUSED);
+    doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REJECTED);
     while (board.mailbox.event != MAILBOX_EXIT) {
         drive_background(&drive);
         dally();

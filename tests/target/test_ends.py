@@ -84,7 +84,7 @@ def run(image: Path, folder: Path) -> subprocess.CompletedProcess:
 def test_a_fault_of_the_processor_is_said_and_what_was_recorded_is_kept(make_image, tmp_path: Path):
     result = run(make_image(layout_of_world()), tmp_path)
     assert result.returncode == EXIT_FAULT
-    assert result.stderr == "salient: the drive's program ended at a fault of its processor\n"
+    assert result.stderr == "salient: the drive's program stopped on an unexpected CPU exception\n"
     assert not (tmp_path / "bus").exists()
     assert 240 <= len(np.load(tmp_path / "state.npy")) <= 252  # a row a microsecond, ten periods of 25 us
 
@@ -93,6 +93,6 @@ def test_an_image_of_another_mailbox_is_refused(make_image, tmp_path: Path):
     result = run(make_image(layout_of_world() + 1), tmp_path)
     assert result.returncode == EXIT_LAYOUT
     assert result.stdout == ""
-    assert result.stderr == ("salient: the drive's image has another mailbox than this program: "
+    assert result.stderr == ("salient: the drive's image and this program have different mailbox layouts: "
                              "build both from the same sources\n")
     assert not (tmp_path / "bus").exists()

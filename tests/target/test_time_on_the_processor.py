@@ -103,7 +103,7 @@ def test_the_time_used_is_that_of_the_instructions_counted_and_of_the_port(make_
     bench.run_for(0.2)
     bench.close()
     counted_us = np.fromfile(counts, "<u4").max() * 8e-3
-    # The timer's handler before, and less what follows hal_pwm_elapsed_ticks.
+    # The timer's handler before, and less what follows hal_interrupt_elapsed_ticks.
     port_us = processor(bench, "worst_us") - counted_us
     print(f"counted {counted_us:.3f} us, port {port_us:.3f} us")
     assert 0.1 < port_us < 0.6

@@ -12,6 +12,7 @@ extern "C" {
 #include "hal_adc.h"
 #include "hal_can.h"
 #include "hal_encoder.h"
+#include "hal_interrupt.h"
 #include "hal_pwm.h"
 #include "hal_time.h"
 }
@@ -71,12 +72,12 @@ void hal_pwm_open_all(hal_t *hal) {
     hal->open = true;
     hal->opens++;
 }
-uint32_t hal_pwm_missed_interrupts(hal_t *hal) {
+uint32_t hal_interrupt_missed_triggers(hal_t *hal) {
     const uint32_t missed = hal->missed;
     hal->missed = 0;
     return missed;
 }
-uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
+uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
     return hal->elapsed_ticks;
 }
 bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {

@@ -26,7 +26,7 @@ static noreturn void run(void) {
     };
     const bool started = drive_init(&drive, &board, &machine_tables, &config);
     board_interrupt_enable();
-    doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REFUSED);
+    doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REJECTED);
     for (;;) {
         switch ((mailbox_event_t)mailbox->event) {
         case MAILBOX_INTERRUPT:

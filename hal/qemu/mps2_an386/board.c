@@ -1,9 +1,10 @@
 /* The board mps2-an386, a Cortex-M4: start, end, the control interrupt, the critical section. */
 #include "qemu/board.h"
 
+#include "hal_interrupt.h"
 #include "hal_time.h"
-#include "qemu/mps2_an386/timer.h"
 #include "qemu/hal_qemu.h"
+#include "qemu/mps2_an386/timer.h"
 
 /* A line that the board's own peripherals do not use. */
 #define CONTROL_IRQ 31
@@ -32,7 +33,7 @@ static void fault_handler(void) {
     board_exit(MAILBOX_EXIT_FAULT);
 }
 
-/* In assembly, so that its first and its last instruction have names: who counts instructions knows both ends. */
+/* In assembly, so that its first and its last instruction have names: the instruction counter recognises both ends. */
 void control_handler(void);
 __asm__(".text\n"
         ".balign 4\n"
@@ -63,11 +64,11 @@ void board_interrupt_pend(void) {
     __asm__ volatile("dsb\n\tisb" ::: "memory");
 }
 
-uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
+uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
     return hal->mailbox.timed ? timer_elapsed_ticks() : hal->mailbox.elapsed_ticks;
 }
 
-/* There is no interrupt but the control interrupt and the timer's that asks for it, so all may be kept out. */
+/* There is no interrupt but the control interrupt and the timer's that asks for it, so all interrupts may be masked. */
 void hal_critical_enter(hal_t *hal) {
     (void)hal;
     __asm__ volatile("cpsid i" ::: "memory");

@@ -20,7 +20,7 @@ typedef struct {
 
 static uint32_t period;       /* counts */
 static uint32_t trigger_time; /* of the trigger served last, counts */
-static uint32_t passed;       /* triggers behind that one which came before the control interrupt's end */
+static uint32_t passed;       /* triggers after that one and before the control interrupt's end */
 
 /* Counts, upwards, modulo 2^32. */
 static uint32_t now(void) {
@@ -32,7 +32,7 @@ void timer_start(uint32_t period_ticks) {
     TRIGGER->reload = TRIGGER->value = period - 1u; /* 0 is one of its counts */
     COUNTER->reload = COUNTER->value = UINT32_MAX;
     COUNTER->control = CONTROL_ENABLE;
-    /* Before the other starts: so a trigger is never behind its place in the grid that now() is held against. */
+    /* Before the other starts, so that no trigger is later than its multiple of the period as counted by now(). */
     trigger_time = now();
     TRIGGER->control = CONTROL_ENABLE | CONTROL_INTERRUPT;
 }
@@ -41,7 +41,7 @@ uint32_t timer_elapsed_ticks(void) {
     return (now() - trigger_time) * TICKS_PER_COUNT;
 }
 
-/* The counter says which trigger it is, because one that came while interrupts were kept out hides those before it. */
+/* The counter identifies the trigger: one that came while interrupts were masked hides those before it. */
 void timer_handler(void) {
     TRIGGER->interrupt_clear = 1;
     const uint32_t periods = (now() - trigger_time) / period;
@@ -53,14 +53,14 @@ void timer_handler(void) {
     passed = 0;
     doorbell_ring(MAILBOX_TRIGGER);
     if (board.mailbox.event == MAILBOX_INTERRUPT) {
-        while (timer_elapsed_ticks() < board.mailbox.elapsed_ticks) { /* the bench holds the processor */
+        while (timer_elapsed_ticks() < board.mailbox.elapsed_ticks) { /* delay set by the bench */
         }
         board_interrupt_pend();
         board.mailbox.elapsed_ticks = timer_elapsed_ticks();
         passed = board.mailbox.elapsed_ticks / TICKS_PER_COUNT / period;
         doorbell_ring(MAILBOX_INTERRUPT_END);
     }
-    if (board.mailbox.event == MAILBOX_EXIT) { /* at once: the background may have no time left to see it */
+    if (board.mailbox.event == MAILBOX_EXIT) { /* here: the background may have no time left to see it */
         board_exit(board.mailbox.exit_code);
     }
 }

@@ -1,6 +1,7 @@
 /* The board virt with an RV32IMAC: start, end, the control interrupt, the critical section. */
 #include "qemu/board.h"
 
+#include "hal_interrupt.h"
 #include "hal_time.h"
 #include "qemu/hal_qemu.h"
 
@@ -82,12 +83,12 @@ void board_interrupt_pend(void) {
     }
 }
 
-/* No timer is used: the processor takes no time, but for what the bench says. */
-uint32_t hal_pwm_elapsed_ticks(const hal_t *hal) {
+/* No timer is used: instructions take no time, except as set by the bench. */
+uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
     return hal->mailbox.elapsed_ticks;
 }
 
-/* The control interrupt is the only one there is, so all may be kept out. */
+/* The control interrupt is the only one there is, so all interrupts may be masked. */
 void hal_critical_enter(hal_t *hal) {
     (void)hal;
     __asm__ volatile("csrci mstatus, " MSTATUS_MIE ::: "memory");

@@ -1,7 +1,11 @@
-// The local bus against clients of every kind.
+// The local bus with well-behaved, malformed and stalled clients.
 #include <sys/stat.h>
 
+#include <atomic>
+#include <chrono>
 #include <fstream>
+#include <functional>
+#include <thread>
 
 #include "support/rig_bench.h"
 
@@ -19,9 +23,9 @@ std::string open_error(const std::string &address) {
     return error;
 }
 
-TEST(LocalBus, AddressThatCannotBeIsNamedInOneLine) {
+TEST(LocalBus, InvalidAddressIsNamedInOneLine) {
     EXPECT_NE(open_error("tcp:1").find("tcp:1"), std::string::npos);
-    EXPECT_NE(open_error("unix:").find("allowed are unix:PATH"), std::string::npos);
+    EXPECT_NE(open_error("unix:").find("must be unix:PATH or socketcan:INTERFACE"), std::string::npos);
     EXPECT_NE(open_error("unix:/no/such/folder/bus").find("/no/such/folder/bus"), std::string::npos);
     EXPECT_NE(open_error("unix:" + std::string(200, 'x')).find("at most 107"), std::string::npos);
     EXPECT_NE(open_error("socketcan:" + std::string(40, 'x')).find("at most 15"), std::string::npos);
@@ -31,17 +35,17 @@ TEST(LocalBus, AddressThatCannotBeIsNamedInOneLine) {
     }
 }
 
-TEST(LocalBus, SocketInUseIsRefusedAndLeftAlone) {
+TEST(LocalBus, SocketInUseIsRejectedAndLeftUntouched) {
     RigBench bench;
     EXPECT_NE(open_error("unix:" + bench.path).find("in use"), std::string::npos);
     auto client = bench.connect();
     EXPECT_FALSE(bench.run_to(*client, MS).empty());
 }
 
-TEST(LocalBus, StaleSocketIsReplacedAFileIsNot) {
+TEST(LocalBus, StaleSocketIsReplacedButAFileIsNot) {
     char folder[] = "/tmp/rig_bench_XXXXXX";
     std::string path = std::string(mkdtemp(folder)) + "/bus";
-    // A socket whose server is gone, as after a kill.
+    // A socket without a server, as after a kill.
     int stale = socket(AF_UNIX, SOCK_SEQPACKET, 0);
     sockaddr_un address{};
     address.sun_family = AF_UNIX;
@@ -52,12 +56,12 @@ TEST(LocalBus, StaleSocketIsReplacedAFileIsNot) {
     struct stat status;
     EXPECT_NE(lstat(path.c_str(), &status), 0) << "removed when closed";
     std::ofstream(path) << "precious";
-    EXPECT_NE(open_error("unix:" + path).find("no socket"), std::string::npos);
+    EXPECT_NE(open_error("unix:" + path).find("not a socket"), std::string::npos);
     EXPECT_EQ(lstat(path.c_str(), &status), 0);
     std::filesystem::remove_all(folder);
 }
 
-TEST(LocalBus, EveryClientSeesEveryFrameItsOwnIncluded) {
+TEST(LocalBus, EveryClientReceivesEveryFrameIncludingItsOwn) {
     RigBench bench;
     auto first = bench.connect();
     auto second = bench.connect();
@@ -73,7 +77,7 @@ TEST(LocalBus, EveryClientSeesEveryFrameItsOwnIncluded) {
     EXPECT_EQ(echoes, 1u);
 }
 
-TEST(LocalBus, WhoComesLaterSeesNothingFromBefore) {
+TEST(LocalBus, ClientReceivesNothingFromBeforeItsConnection) {
     RigBench bench;
     auto first = bench.connect();
     bench.run_to(*first, 5 * MS);
@@ -84,36 +88,36 @@ TEST(LocalBus, WhoComesLaterSeesNothingFromBefore) {
     EXPECT_GE(records.front().time_ns, 5 * MS);
 }
 
-TEST(LocalBus, RecordsThatAreNoFramesAreIgnoredAndCounted) {
+TEST(LocalBus, RecordsThatAreNotFramesAreIgnoredAndCounted) {
     testing::internal::CaptureStderr();
     {
         RigBench bench;
         auto client = bench.connect();
-        auto hostile = bench.connect();
+        auto malformed = bench.connect();
         std::vector<uint8_t> bytes(9000, 0xFF);
         for (size_t size : {1, 7, 8, 9, 23, 25, 79, 81, 9000}) {
-            hostile->send_bytes(bytes.data(), size);
+            malformed->send_bytes(bytes.data(), size);
         }
         uint8_t record[8 + CAN_MTU] = {};
         record[8] = 0x00;
         record[9] = 0x08; // identifier 0x800 without the extended flag
-        hostile->send_bytes(record, sizeof record);
+        malformed->send_bytes(record, sizeof record);
         record[9] = 0;
         record[12] = 16; // length
-        hostile->send_bytes(record, sizeof record);
+        malformed->send_bytes(record, sizeof record);
         uint8_t flexible[8 + CANFD_MTU] = {};
         flexible[12] = 65;
-        hostile->send_bytes(flexible, sizeof flexible);
+        malformed->send_bytes(flexible, sizeof flexible);
         for (const auto &entry : bench.run_to(*client, 5 * MS)) {
             EXPECT_NE(entry.identifier(), 0u);
         }
         EXPECT_TRUE(bench.firmware.received.empty());
-        EXPECT_FALSE(hostile->receive().empty()) << "still connected";
-        hostile->send(0x123);
+        EXPECT_FALSE(malformed->receive().empty()) << "still connected";
+        malformed->send(0x123);
         bench.run_to(*client, 6 * MS);
         EXPECT_EQ(bench.firmware.received.size(), 1u);
     }
-    EXPECT_NE(testing::internal::GetCapturedStderr().find("sent 12 records that are no frames"), std::string::npos);
+    EXPECT_NE(testing::internal::GetCapturedStderr().find("sent 12 records that are not frames"), std::string::npos);
 }
 
 TEST(LocalBus, FlexibleAndErrorFramesAreRelayedAndNotDelivered) {
@@ -129,7 +133,7 @@ TEST(LocalBus, FlexibleAndErrorFramesAreRelayedAndNotDelivered) {
     client->send(CAN_ERR_FLAG | 4, {1, 2, 3, 4, 5, 6, 7, 8});
     bench.serve();
     auto records = other->receive();
-    ASSERT_EQ(records.size(), 2u) << "at once, time stands still";
+    ASSERT_EQ(records.size(), 2u) << "without time passing";
     EXPECT_EQ(records[0].size, size_t{CANFD_MTU});
     EXPECT_EQ(std::memcmp(&records[0].frame, flexible + 8, CANFD_MTU), 0);
     EXPECT_EQ(records[1].frame.can_id, CAN_ERR_FLAG | 4u);
@@ -140,7 +144,7 @@ TEST(LocalBus, FlexibleAndErrorFramesAreRelayedAndNotDelivered) {
 TEST(LocalBus, RemoteAndRawLengthsArrive) {
     RigBench bench;
     auto client = bench.connect();
-    client->send(0x123 | CAN_RTR_FLAG, {1, 2, 3}); // its data means nothing
+    client->send(0x123 | CAN_RTR_FLAG, {1, 2, 3}); // its data is ignored
     for (uint8_t raw = 9; raw <= 15; ++raw) {
         uint8_t record[8 + CAN_MTU] = {};
         record[8] = raw;
@@ -164,11 +168,11 @@ TEST(LocalBus, RemoteAndRawLengthsArrive) {
     }
 }
 
-TEST(LocalBus, ClientThatReadsNothingIsLeftBehind) {
-    // Paced: its frames are dropped, and neither the others nor time wait.
+TEST(LocalBus, FramesOfAStalledClientAreDroppedInATimedPace) {
+    // Neither time nor the other clients wait.
     RigBench bench("x1000");
     auto reader = bench.connect();
-    auto sleeper = bench.connect();
+    auto stalled = bench.connect();
     reader->set(6, 20); // three truth frames each 20 us
     uint64_t frames = 0;
     testing::internal::CaptureStderr();
@@ -176,13 +180,87 @@ TEST(LocalBus, ClientThatReadsNothingIsLeftBehind) {
         ASSERT_TRUE(rig_serve(bench.rig.get(), 0));
         frames += reader->receive().size();
     }
-    sleeper.reset();
+    stalled.reset();
     ASSERT_TRUE(rig_serve(bench.rig.get(), 0));
     EXPECT_GT(frames, 59000u);
     EXPECT_NE(testing::internal::GetCapturedStderr().find("client 2"), std::string::npos);
 }
 
-TEST(LocalBus, SixtyFourClientsAndNoMore) {
+TEST(LocalBus, StalledClientIsDisconnectedInTheFreePace) {
+    // One that reads at any rate is not: time waits for it.
+    RigBench bench("free");
+    auto reader = bench.connect();
+    auto stalled = bench.connect();
+    reader->set(6, 20); // three truth frames each 20 us
+    uint64_t frames = 0;
+    testing::internal::CaptureStderr();
+    while (bench.rig->board.time_ns < 400 * MS) {
+        ASSERT_TRUE(rig_serve(bench.rig.get(), 0));
+        frames += reader->receive().size();
+    }
+    EXPECT_GT(frames, 59000u);
+    EXPECT_NE(testing::internal::GetCapturedStderr().find("client 2 of " + bench.path + " disconnected"),
+              std::string::npos);
+    while (!stalled->gone && !stalled->receive().empty()) {
+    }
+    EXPECT_TRUE(stalled->gone);
+}
+
+// In a thread: serves until `until_ns`, while the test's thread reads.
+void serve_in_thread(RigBench &bench, uint64_t until_ns, const std::function<void()> &meanwhile) {
+    std::atomic<bool> done = false;
+    std::thread server([&] {
+        while (bench.rig->board.time_ns < until_ns && rig_serve(bench.rig.get(), 0)) {
+        }
+        done = true;
+    });
+    while (!done) {
+        meanwhile();
+    }
+    server.join();
+}
+
+TEST(LocalBus, TimeWaitsForAClientThatReads) {
+    // Each pause lasts until the queue is full and time waits; lock-step waits for any client, the free pace for one
+    // that reads.
+    for (const char *pace : {"lockstep", "free"}) {
+        SCOPED_TRACE(pace);
+        RigBench bench(pace);
+        auto client = bench.connect();
+        client->set(6, 20);
+        client->run_until(400 * MS);
+        uint64_t frames = 0, last_ns = 0;
+        serve_in_thread(bench, 400 * MS, [&] {
+            std::this_thread::sleep_for(std::chrono::milliseconds(20));
+            for (const auto &record : client->receive()) {
+                frames += 1;
+                EXPECT_GE(record.time_ns, last_ns);
+                last_ns = record.time_ns;
+            }
+        });
+        frames += client->receive().size();
+        EXPECT_GT(frames, 60000u) << "20,000 truths of three frames: none is lost";
+        EXPECT_FALSE(client->gone);
+    }
+}
+
+TEST(LocalBus, StopRequestEndsTheWaitForAStalledClient) {
+    RigBench bench;
+    std::atomic<bool> stop = false;
+    bench.rig->config.stop.context = &stop;
+    bench.rig->config.stop.requested = [](void *context) { return static_cast<std::atomic<bool> *>(context)->load(); };
+    auto client = bench.connect();
+    client->set(6, 20);
+    client->run_until(100'000 * MS);
+    serve_in_thread(bench, 100'000 * MS, [&] {
+        std::this_thread::sleep_for(std::chrono::milliseconds(100));
+        stop = true;
+    });
+    EXPECT_LT(bench.rig->board.time_ns, 100'000 * MS);
+    EXPECT_FALSE(client->gone);
+}
+
+TEST(LocalBus, SixtyFourClientsAndNotMore) {
     RigBench bench;
     std::vector<std::unique_ptr<BusClient>> clients;
     testing::internal::CaptureStderr();
@@ -197,27 +275,27 @@ TEST(LocalBus, SixtyFourClientsAndNoMore) {
     EXPECT_TRUE(clients[64]->gone);
 }
 
-TEST(LocalBus, AnyoneMayLeaveAtAnyTime) {
-    // All kinds of departures between all kinds of traffic; the keeper's time goes on.
+TEST(LocalBus, ClientsMayLeaveAtAnyTime) {
+    // Every kind of departure between every kind of traffic; the keeper's time continues.
     RigBench bench;
     auto keeper = bench.connect();
     for (unsigned i = 0; i < 200; ++i) {
-        auto guest = bench.connect();
+        auto visitor = bench.connect();
         auto other = bench.connect();
         if (i & 1) {
-            guest->send(0x100, {1});
+            visitor->send(0x100, {1});
         }
         if (i & 2) {
-            guest->set(1, 100);
+            visitor->set(1, 100);
         }
         if (i & 4) {
-            guest->run_until((i + 1) * MS);
+            visitor->run_until((i + 1) * MS);
         }
         if (i & 8) {
-            guest.reset();
+            visitor.reset();
         }
         if (i & 16) {
-            guest = nullptr;
+            visitor = nullptr;
             uint8_t nothing = 0;
             other->send_bytes(&nothing, 0); // an empty record ends the connection
         }

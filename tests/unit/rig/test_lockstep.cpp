@@ -1,4 +1,5 @@
-// Lock-step: time stands still until it is asked for, and nothing depends on when or in which pieces it is.
+// Lock-step: time stands still until a client requests it; results depend neither on the wall clock nor on the way time
+// is divided into requests.
 #include "support/rig_bench.h"
 
 namespace {
@@ -15,7 +16,7 @@ std::vector<BusRecord> without_clock(const std::vector<BusRecord> &records) {
     return result;
 }
 
-TEST(RigLockstep, TimeStandsStillUntilAsked) {
+TEST(RigLockstep, TimeStandsStillUntilRequested) {
     RigBench bench;
     auto client = bench.connect();
     client->send(0x123, {1});
@@ -40,7 +41,7 @@ TEST(RigLockstep, TimeStandsStillUntilAsked) {
     }
 }
 
-TEST(RigLockstep, PastIsAnsweredAtOnceWithTheTimeItIs) {
+TEST(RigLockstep, PastTimeIsAnsweredWithThePresentTime) {
     RigBench bench;
     auto client = bench.connect();
     bench.run_to(*client, 5 * MS);
@@ -56,7 +57,7 @@ TEST(RigLockstep, PastIsAnsweredAtOnceWithTheTimeItIs) {
     }
 }
 
-// The same commands: alone, in pieces, with a second client that listens or floods rig frames to nobody.
+// The same commands: alone, in pieces, with a second client that only listens.
 std::vector<BusRecord> experiment(unsigned pieces, bool listener) {
     RigBench bench;
     auto client = bench.connect();
@@ -80,17 +81,17 @@ std::vector<BusRecord> experiment(unsigned pieces, bool listener) {
     return all;
 }
 
-TEST(RigLockstep, SameInputsGiveTheSameFramesHoweverTimeIsCut) {
+TEST(RigLockstep, SameInputsGiveTheSameFramesForAnyDivisionOfTime) {
     auto reference = experiment(1, false);
     ASSERT_GT(reference.size(), 100u);
     EXPECT_EQ(reference, experiment(1, false));
     EXPECT_EQ(reference, experiment(30, false));
-    EXPECT_EQ(reference, experiment(7, true)); // 30 ms / 7 is on no grid of the rig
+    EXPECT_EQ(reference, experiment(7, true)); // 30 ms / 7 is not a multiple of any period of the rig
     EXPECT_EQ(reference, experiment(1000, true));
 }
 
-TEST(RigLockstep, WhatArrivesWhileTimeRunsWaitsUntilItStands) {
-    // The frame behind RUN_UNTIL is in the socket before time runs, yet begins only when it stands again.
+TEST(RigLockstep, FramesThatArriveWhileTimeRunsWaitUntilItStandsStill) {
+    // The frame after RUN_UNTIL is in the socket before time runs, yet begins only when time stands still again.
     RigBench bench;
     auto client = bench.connect();
     client->run_until(10 * MS);
@@ -108,7 +109,7 @@ TEST(RigLockstep, WhatArrivesWhileTimeRunsWaitsUntilItStands) {
     EXPECT_LT(completed_ns, 10 * MS + 200000);
 }
 
-TEST(RigLockstep, OrderOnTheBusIsThatOfConnectionNotOfArrival) {
+TEST(RigLockstep, OrderOnTheBusFollowsConnectionNotArrival) {
     std::vector<BusRecord> logs[2];
     for (int order : {0, 1}) {
         RigBench bench;
@@ -141,7 +142,7 @@ TEST(RigLockstep, FramesSentBeforeAnothersRunUntilAreTakenBeforeIt) {
     bench.run_to(*keeper, MS);
     other->set(1, 12345);
     other->send(0x321);
-    auto late = bench.connect(); // connected and heard before the time it asks nothing of
+    auto late = bench.connect(); // connected and read before time runs, without a request for time
     late->send(0x322);
     bench.run_to(*keeper, 2 * MS);
     EXPECT_DOUBLE_EQ(bench.rig->plant.load_torque_Nm, 1.2345);
@@ -149,7 +150,7 @@ TEST(RigLockstep, FramesSentBeforeAnothersRunUntilAreTakenBeforeIt) {
     EXPECT_EQ(late->receive().back().time_ns, 2 * MS);
 }
 
-TEST(RigLockstep, TwoTimekeepersAreEachAnsweredAtTheirTime) {
+TEST(RigLockstep, TwoTimekeepersAreAnsweredAtTheirTimes) {
     RigBench bench;
     auto first = bench.connect();
     auto second = bench.connect();
@@ -167,12 +168,12 @@ TEST(RigLockstep, TwoTimekeepersAreEachAnsweredAtTheirTime) {
     EXPECT_EQ(clocks[1], std::make_pair(uint64_t{3 * MS}, 1));
 }
 
-TEST(RigLockstep, ClientThatLeavesInTheMiddleChangesNothingForTheOthers) {
+TEST(RigLockstep, ClientThatLeavesChangesNothingForTheOthers) {
     auto reference = [] {
         RigBench bench;
         auto client = bench.connect();
-        auto guest = bench.connect();
-        guest->send(0x155, {1});
+        auto visitor = bench.connect();
+        visitor->send(0x155, {1});
         auto log = bench.run_to(*client, 10 * MS);
         auto rest = bench.run_to(*client, 20 * MS);
         log.insert(log.end(), rest.begin(), rest.end());
@@ -180,9 +181,9 @@ TEST(RigLockstep, ClientThatLeavesInTheMiddleChangesNothingForTheOthers) {
     }();
     RigBench bench;
     auto client = bench.connect();
-    auto guest = bench.connect();
-    guest->send(0x155, {1});
-    guest.reset(); // what it sent is still on its way
+    auto visitor = bench.connect();
+    visitor->send(0x155, {1});
+    visitor.reset(); // its frame is still unread
     auto log = bench.run_to(*client, 10 * MS);
     auto rest = bench.run_to(*client, 20 * MS);
     log.insert(log.end(), rest.begin(), rest.end());
@@ -190,7 +191,7 @@ TEST(RigLockstep, ClientThatLeavesInTheMiddleChangesNothingForTheOthers) {
     EXPECT_EQ(bench.firmware.received.size(), 1u);
 }
 
-TEST(RigLockstep, RunOfAClientThatLeftIsStillRun) {
+TEST(RigLockstep, RunOfAClientThatLeftContinuesWithoutOtherClients) {
     RigBench bench;
     auto client = bench.connect();
     client->run_until(50 * MS);
@@ -199,26 +200,67 @@ TEST(RigLockstep, RunOfAClientThatLeftIsStillRun) {
     EXPECT_EQ(bench.rig->board.time_ns, 50 * MS);
 }
 
-TEST(RigLockstep, StopIsAskedForEachTenMillisecondsAndWhenItsDescriptorIsReadable) {
+TEST(RigLockstep, RunOfAClientThatLeftIsAbandonedForAnotherClient) {
+    RigBench bench;
+    auto client = bench.connect();
+    ASSERT_TRUE(rig_serve(bench.rig.get(), 0));
+    client->run_until(1000'000 * MS);
+    client->run_until(2000'000 * MS); // unread when the client leaves
+    client.reset();
+    auto other = bench.connect();
+    other->run_until(0, 3);
+    bench.serve();
+    EXPECT_LE(bench.rig->board.time_ns, RIG_STOP_STEP_NS);
+    unsigned answers = 0;
+    for (const auto &record : other->receive()) {
+        answers += record.identifier() == RIG_CLOCK_FRAME_ID && record.frame.data[6] == 3;
+    }
+    EXPECT_EQ(answers, 1u);
+    const uint64_t now_ns = bench.rig->board.time_ns;
+    bench.run_to(*other, now_ns + 5 * MS);
+}
+
+TEST(RigLockstep, RunOfAClientThatLeftIsAbandonedForAConnectedClient) {
+    RigBench bench;
+    auto other = bench.connect();
+    auto client = bench.connect();
+    other->run_until(30 * MS, 1);
+    client->run_until(1000'000 * MS);
+    ASSERT_TRUE(rig_serve(bench.rig.get(), 0)); // both are taken, time runs to 30 ms
+    client.reset();
+    other->receive();
+    bench.run_to(*other, 40 * MS);
+}
+
+TEST(RigLockstep, RunIsNotAbandonedWhileItsClientLives) {
+    RigBench bench;
+    auto client = bench.connect();
+    client->run_until(100 * MS);
+    auto other = bench.connect();
+    ASSERT_TRUE(rig_serve(bench.rig.get(), 0));
+    EXPECT_EQ(bench.rig->board.time_ns, 100 * MS);
+}
+
+TEST(RigLockstep, StopIsCheckedEachTenMillisecondsAndWhenItsDescriptorIsReadable) {
     RigBench bench;
     auto client = bench.connect();
     int ends[2];
     ASSERT_EQ(pipe(ends), 0);
-    unsigned asked = 0;
+    unsigned checks = 0;
     bench.rig->config.stop.descriptors[0] = ends[0];
-    bench.rig->config.stop.context = &asked;
+    bench.rig->config.stop.context = &checks;
     bench.rig->config.stop.requested = [](void *context) { return ++*static_cast<unsigned *>(context) > 11; };
     for (unsigned i = 1; i <= 100; ++i) {
         bench.run_to(*client, i * MS);
     }
-    EXPECT_EQ(asked, 10u) << "once in ten milliseconds, however short the runs";
+    EXPECT_EQ(checks, 10u) << "once in ten milliseconds, however short the runs";
     bench.run_to(*client, 110 * MS);
-    EXPECT_EQ(asked, 11u);
+    EXPECT_EQ(checks, 11u);
     ASSERT_TRUE(rig_serve(bench.rig.get(), 0));
-    EXPECT_EQ(asked, 11u) << "nothing passed, nothing readable";
+    EXPECT_EQ(checks, 11u) << "no time passed, no descriptor readable";
     ASSERT_EQ(write(ends[1], "x", 1), 1);
     EXPECT_FALSE(rig_serve(bench.rig.get(), 0));
-    EXPECT_EQ(asked, 12u);
+    EXPECT_EQ(checks, 12u);
     close(ends[0]);
     close(ends[1]);
 }
@@ -238,7 +280,7 @@ TEST(RigLockstep, FloodFillsTheReceiveQueueAndIsCounted) {
     EXPECT_EQ(bench.firmware.received.size(), size_t{HAL_CAN_RECEIVE_QUEUE});
 }
 
-TEST(RigLockstep, EndlessQueueOfFramesCostsTheClientItsConnection) {
+TEST(RigLockstep, ClientThatFloodsTheBusQueueIsDisconnected) {
     RigBench bench;
     auto client = bench.connect();
     auto flooder = bench.connect();

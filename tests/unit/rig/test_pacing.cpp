@@ -48,7 +48,7 @@ TEST(Pacing, MovingTimeStillAnswersRunUntilAtItsTime) {
     EXPECT_EQ(answered_ns, 3456789u);
 }
 
-TEST(Pacing, FloodHoldsUpTheFlooderAndNoOneElse) {
+TEST(Pacing, FloodDelaysOnlyItsSender) {
     RigBench bench("free");
     auto flooder = bench.connect();
     auto other = bench.connect();

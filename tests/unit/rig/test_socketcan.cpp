@@ -1,5 +1,5 @@
-// The SocketCAN transport's frames and stamps. One end of a socket pair stands in for the interface; the real one is
-// used by the tests that run where there is PF_CAN.
+// Frames and timestamps of the SocketCAN transport. One end of a socket pair stands in for the interface; the real one
+// is used by the tests that run where there is PF_CAN.
 #include "support/rig_bench.h"
 
 namespace {
@@ -14,16 +14,16 @@ class SocketCan : public testing::Test {
         int bytes = 4 << 20;
         setsockopt(pair[0], SOL_SOCKET, SO_SNDBUFFORCE, &bytes, sizeof bytes);
         bench = std::make_unique<RigBench>(transport_socketcan_attach(pair[0]), "lockstep");
-        peer = pair[1];
+        client = pair[1];
     }
-    void TearDown() override { close(peer); }
+    void TearDown() override { close(client); }
 
     void send(canid_t identifier, const std::vector<uint8_t> &data) {
         can_frame frame{};
         frame.can_id = identifier;
         frame.len = static_cast<uint8_t>(data.size());
         std::copy(data.begin(), data.end(), frame.data);
-        ASSERT_EQ(::send(peer, &frame, sizeof frame, 0), ssize_t{sizeof frame});
+        ASSERT_EQ(::send(client, &frame, sizeof frame, 0), ssize_t{sizeof frame});
     }
 
     void run_until(uint64_t time_ns) {
@@ -33,14 +33,14 @@ class SocketCan : public testing::Test {
         bench->serve();
     }
 
-    // Puts a time to each frame on the interface, as rig.dbc says a logger does.
+    // Assigns a time to each frame on the interface, as rig.dbc specifies for a logger.
     std::vector<std::pair<uint64_t, uint32_t>> timed(const std::vector<uint32_t> &sent_on_bus,
-                                                     const std::vector<uint32_t> &sent_at_once) {
+                                                     const std::vector<uint32_t> &sent_off_bus) {
         std::vector<std::pair<uint64_t, uint32_t>> result;
         uint64_t next_ns = 0;
-        size_t on_bus = 0, at_once = 0;
+        size_t on_bus = 0, off_bus = 0;
         can_frame frame;
-        while (recv(peer, &frame, sizeof frame, MSG_DONTWAIT) == sizeof frame) {
+        while (recv(client, &frame, sizeof frame, MSG_DONTWAIT) == sizeof frame) {
             uint32_t identifier = frame.can_id & CAN_EFF_MASK;
             uint64_t time_ns = 0;
             std::memcpy(&time_ns, frame.data, 6);
@@ -50,7 +50,7 @@ class SocketCan : public testing::Test {
                 } else if (frame.data[6] == RIG_STAMP_SUBJECT_OLDEST_ON_BUS_CHOICE) {
                     result.emplace_back(time_ns, sent_on_bus.at(on_bus++));
                 } else {
-                    result.emplace_back(time_ns, sent_at_once.at(at_once++));
+                    result.emplace_back(time_ns, sent_off_bus.at(off_bus++));
                 }
             } else {
                 result.emplace_back(identifier == RIG_CLOCK_FRAME_ID ? time_ns : next_ns, identifier);
@@ -60,10 +60,10 @@ class SocketCan : public testing::Test {
     }
 
     std::unique_ptr<RigBench> bench;
-    int peer = -1;
+    int client = -1;
 };
 
-TEST_F(SocketCan, StampsGiveTheSameListAsTheLocalBus) {
+TEST_F(SocketCan, TimestampsGiveTheSameListAsTheLocalBus) {
     send(0x100, {1, 2});
     send(RIG_SET_FRAME_ID | CAN_EFF_FLAG, {1, 0, 0, 1, 0, 0, 0, 0});
     send(0x200, {3});
@@ -84,8 +84,8 @@ TEST_F(SocketCan, StampsGiveTheSameListAsTheLocalBus) {
 }
 
 TEST_F(SocketCan, InterfaceThatGoesAwayEndsTheRig) {
-    close(peer);
-    peer = -1;
+    close(client);
+    client = -1;
     EXPECT_FALSE(rig_serve(bench->rig.get(), 0));
     ASSERT_NE(bench->transport->failure, nullptr);
 }

@@ -1,5 +1,5 @@
-// A rig on a local bus of its own, with a stand-in firmware that uses every part of the board, and clients that speak
-// the bus's records. One thread: clients send, then the rig is served, then clients read.
+// A rig on its own local bus, with a stand-in firmware that uses every part of the board, and clients that exchange the
+// bus's records. One thread: clients send, then the rig is served, then clients read.
 #ifndef RIG_BENCH_H
 #define RIG_BENCH_H
 
@@ -66,9 +66,9 @@ class BusClient {
         return send(RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG, data);
     }
 
-    bool set(uint8_t quantity, int32_t raw, uint32_t at_us = 0) {
+    bool set(uint8_t variable, int32_t raw, uint32_t at_us = 0) {
         auto value = static_cast<uint32_t>(raw);
-        std::vector<uint8_t> data{quantity, static_cast<uint8_t>(value), static_cast<uint8_t>(value >> 8),
+        std::vector<uint8_t> data{variable, static_cast<uint8_t>(value), static_cast<uint8_t>(value >> 8),
                                   static_cast<uint8_t>(value >> 16)};
         for (int i = 0; i < 4; ++i) {
             data.push_back(static_cast<uint8_t>(at_us >> (8 * i)));
@@ -106,15 +106,15 @@ class BusClient {
 struct StandInFirmware {
     board_t *board = nullptr;
     uint32_t interrupts = 0, backgrounds = 0, missed = 0;
-    uint16_t lower = 2500; // what it writes for phase 1
-    uint64_t takes_ns = 0; // its interrupt, when it says so itself
+    uint16_t lower = 2500; // compare value of phase 1
+    uint64_t takes_ns = 0; // execution time of its interrupt; 0: as the bench sets it
     std::vector<uint64_t> interrupt_times_ns, background_times_ns;
     std::vector<hal_can_frame_t> received;
 
     static void interrupt(void *context) {
         auto *self = static_cast<StandInFirmware *>(context);
         ++self->interrupts;
-        self->missed += board_pwm_missed_interrupts(self->board);
+        self->missed += board_missed_triggers(self->board);
         self->interrupt_times_ns.push_back(self->board->time_ns);
         hal_pwm_compare_t compare{};
         bool on = self->board->adc.phase_current_counts[1] < 512;
@@ -158,7 +158,7 @@ class RigBench {
         init(pace, stop_at_ns);
     }
 
-    // Over any transport, which the bench takes over.
+    // On any transport, which the bench then owns.
     RigBench(transport_t *other, const char *pace) : transport(other) { init(pace, RIG_NEVER); }
 
     ~RigBench() {
@@ -170,7 +170,7 @@ class RigBench {
 
     std::unique_ptr<BusClient> connect() const { return std::make_unique<BusClient>(path); }
 
-    // Serves until nothing more is asked.
+    // Serves until no request is left.
     void serve() {
         uint64_t before_ns;
         do {

@@ -25,6 +25,9 @@ class Bench(Session):
     options: see SimulatorOptions; can: "unix:PATH" or "socketcan:INTERFACE", one bench at a time on an interface.
     """
 
+    options: SimulatorOptions
+    simulator: Simulator
+
     def __init__(self, options: SimulatorOptions, can: str) -> None:
         self.options = options
         self.simulator = Simulator(options, can)

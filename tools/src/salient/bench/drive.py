@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import can
 
+from salient.bench.client import Client, KnownAttributes
 from salient.bus import e2e
 from salient.bus.signals import drive_database, value_numbers
-
-if TYPE_CHECKING:
-    from salient.bench.session import Session
 
 _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
 REQUESTS = value_numbers(drive_database(), "DRIVE_COMMAND", "request")
@@ -41,17 +38,20 @@ def command_frame(counter: int, request: str, speed_reference_rpm: float) -> can
     return can.Message(arbitration_id=_COMMAND.frame_id, is_extended_id=False, data=data)
 
 
-class Drive:
+class Drive(KnownAttributes):
     """Commands a drive. Assigning speed_reference_rpm requests run; the command is sent immediately and then every
     COMMAND_PERIOD_NS as the session's time advances, until `silence`. Nothing is sent before the first request.
     """
 
-    def __init__(self, session: Session, parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
+    command_due_ns: int | None
+    parameters: Parameters
+
+    def __init__(self, session: Client, parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
         self._session = session
         self._request: str | None = None
         self._speed_reference_rpm = 0.0
         self._counter = 0
-        self.command_due_ns: int | None = None
+        self.command_due_ns = None
         self.parameters = Parameters(session, parameter_table)
 
     @property
@@ -132,7 +132,7 @@ class Parameters(MutableMapping[str, float]):
     value rejected by the drive.
     """
 
-    def __init__(self, session: Session, table: Callable[[], list[ParameterRow]] | None = None) -> None:
+    def __init__(self, session: Client, table: Callable[[], list[ParameterRow]] | None = None) -> None:
         self._session = session
         self._table = table
         self._loaded: dict[str, ParameterRow] | None = None
@@ -181,7 +181,7 @@ def raw_value(row: ParameterRow, value: float) -> int:
     return raw
 
 
-def read_parameter_table(session: Session) -> list[ParameterRow]:
+def read_parameter_table(session: Client) -> list[ParameterRow]:
     """Reads the descriptions of all parameters from the drive; takes some 0.1 s of virtual time."""
     rows: list[ParameterRow] = []
     while True:
@@ -205,7 +205,7 @@ def _request(operation: str, index: int, part: int, value: int) -> can.Message:
     return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=message.encode(signals))
 
 
-def _access(session: Session, operation: str, index: int, part: int = 0, value: int = 0) -> tuple[str, int]:
+def _access(session: Client, operation: str, index: int, part: int = 0, value: int = 0) -> tuple[str, int]:
     """(status, value) of the drive's response; lets virtual time pass until it arrives."""
     session.send(_request(operation, index, part, value))
     message = drive_database().get_message_by_name("PARAMETER_RESPONSE")
@@ -222,7 +222,7 @@ def _access(session: Session, operation: str, index: int, part: int = 0, value: 
     return str(signals["status"]), int(signals["value"])
 
 
-def _read_text(session: Session, operation: str, index: int) -> str:
+def _read_text(session: Client, operation: str, index: int) -> str:
     text = b""
     for part in range(_TEXT_PARTS_MAX):
         four = _access(session, operation, index, part)[1].to_bytes(4, "little", signed=True)

@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import can
 
+from salient.bench.client import KnownAttributes
 from salient.bench.drive import Drive, ParameterRow
 from salient.bench.rig import Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
@@ -31,7 +32,7 @@ class SessionError(Exception):
     """The emulator does not answer."""
 
 
-class Session:
+class Session(KnownAttributes):
     """One client's view of a bus.
 
     lockstep: this session makes time move (the emulator's pace is lockstep). Otherwise time moves by itself, and the
@@ -41,11 +42,19 @@ class Session:
     signals of the drive and of the bench by name.
     """
 
+    address: str
+    time_ns: int
+    log: list[tuple[int, can.Message]]
+    telemetry: SignalTable
+    truth: SignalTable
+    drive: Drive
+    rig: Rig
+
     def __init__(self, address: str, lockstep: bool = True,
                  parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
         self.address = address
         self.time_ns = 0
-        self.log: list[tuple[int, can.Message]] = []
+        self.log = []
         self.telemetry = SignalTable(drive_database(), "DRIVE")
         self.truth = SignalTable(rig_database(), "RIG")
         self.drive = Drive(self, parameter_table)
@@ -69,7 +78,7 @@ class Session:
         self._bus.shutdown()
 
     def leave_running(self, duration_s: float) -> None:
-        """Leaves the bus, and virtual time to pass without this session; lock-step only."""
+        """Leaves the bus, and virtual time to pass without this session, until another client comes; lock-step only."""
         self._ask_to_run(self.time_ns + round(duration_s * 1e9))
         self.close()
 
@@ -94,7 +103,7 @@ class Session:
         self.rig.load_torque_Nm = value
 
     def at(self, time_s: float) -> Rig:
-        """The bench's quantities at a virtual time: session.at(0.13).load_torque_Nm = 8."""
+        """The bench variables at a virtual time: session.at(0.13).load_torque_Nm = 8."""
         return self.rig.at(time_s)
 
     def run_for(self, duration_s: float) -> None:

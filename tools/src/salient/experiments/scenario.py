@@ -14,7 +14,7 @@
     [parameters]                            # the drive's parameters by name, in their units
     torque_max_Nm = 19.1
 
-    [bench]                                 # the bench's quantities (RIG_SET in rig.dbc), set at time 0
+    [bench]                                 # the bench variables (RIG_SET in rig.dbc), set at time 0
     current_noise_A = 0.02
     flux_linkage_gain = 1.05                # the machine is another one than the drive's tables say
 
@@ -49,7 +49,7 @@ import numpy as np
 from salient.bench.bench import Bench
 from salient.bench.drive import DriveError, write_request
 from salient.bench.emulator import SimulatorOptions, executable, parameter_table
-from salient.bench.rig import quantities
+from salient.bench.rig import bench_variables
 from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database
 from salient.cli import ADC_BITS, CONTROL_RATES_HZ, CONTROLLERS, ENCODER_BITS
@@ -137,7 +137,7 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
     """Runs a scenario in lock-step and leaves recording.npy, can.blf and can.log in out_dir, which is made if needed.
 
     can: "local" for a bus of its own, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; parameters
-    are written first, then the commands follow; the bench's quantities are set before all. For build, instructions,
+    are written first, then the commands follow; the bench variables are set before all. For build, instructions,
     execution, instruction_ns see SimulatorOptions. UsageError for what the drive does not know or refuses.
     """
     recording_path = out_dir / _RECORDING if scenario.record else None
@@ -345,7 +345,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
 
 
 def _bench_ranges() -> dict[str, tuple[float, float]]:
-    return {name: (signal.minimum, signal.maximum) for name, signal in quantities().items()}
+    return {name: (signal.minimum, signal.maximum) for name, signal in bench_variables().items()}
 
 
 class _Reader:

@@ -15,8 +15,8 @@ from salient.elf import Image
 from salient.errors import UsageError
 from salient.paths import BUILD, ROOT
 from salient.target import worst_case
+from salient.target.control_period import CYCLES_PER_INSTRUCTION, RATES_HZ, fits
 from salient.target.isr_profile import Cost, measure
-from salient.target.pil import CYCLES_PER_INSTRUCTION, RATES_HZ, fits
 from salient.target.static_checks import deepest_stack, size
 
 FILE = ROOT / "tests" / "target" / "baseline.toml"

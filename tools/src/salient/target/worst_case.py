@@ -35,7 +35,7 @@ import numpy as np
 from salient.bench.bench import Bench
 from salient.bench.drive import ParameterRow, write_request
 from salient.bench.emulator import SimulatorOptions, parameter_table
-from salient.bench.rig import RigError, quantities
+from salient.bench.rig import RigError, bench_variables
 from salient.cli import CONTROLLERS
 from salient.errors import UsageError
 from salient.paths import ROOT
@@ -280,7 +280,7 @@ def mutated(given: Input, source: random.Random) -> Input:
 def _added(given: Input, source: random.Random) -> Input:
     if len(given.actions) >= _ACTIONS_MAX:
         return _removed(given, source)
-    names = [f"bench.{name}" for name in quantities() if name not in ("truth_period_us",)]
+    names = [f"bench.{name}" for name in bench_variables() if name not in ("truth_period_us",)]
     names += [f"parameter.{name}" for name in _rows(given.controller) if name not in _CHOSEN]
     names += ["speed_rpm", "commands", "silence", *_REQUESTS] * 4
     action = Action(_time(given, source), source.choice(names))
@@ -338,7 +338,7 @@ def _with_value(given: Input, action: Action, source: random.Random) -> Action:
     elif action.what == "commands":
         low, high = 1.0, _COMMANDS_MAX
     elif scope == "bench":
-        low, high = float(quantities()[name].minimum), float(quantities()[name].maximum)
+        low, high = float(bench_variables()[name].minimum), float(bench_variables()[name].maximum)
     elif scope == "parameter":
         row = _rows(given.controller)[name]
         low, high = row.minimum, row.maximum

@@ -1,17 +1,17 @@
-// What RIG_SET changes, when, and what it answers; the truth frames; the interrupt that takes time.
+// RIG_SET: its effect, its time and its reply; the truth frames; the interrupt that takes time.
 #include "support/rig_bench.h"
 
 namespace {
 
 constexpr uint64_t MS = 1000000;
 
-class RigQuantities : public testing::Test {
+class BenchVariables : public testing::Test {
   protected:
     void SetUp() override { client = bench.connect(); }
 
-    // Sends RIG_SET and gives back the answer's status.
-    int set(uint8_t quantity, int32_t raw, uint32_t at_us = 0) {
-        client->set(quantity, raw, at_us);
+    // Sends RIG_SET and returns the status of the reply.
+    int set(uint8_t variable, int32_t raw, uint32_t at_us = 0) {
+        client->set(variable, raw, at_us);
         bench.serve();
         auto records = client->receive();
         if (records.size() != 2) {
@@ -20,7 +20,7 @@ class RigQuantities : public testing::Test {
         const auto &reply = records[1];
         EXPECT_EQ(reply.identifier(), RIG_SET_REPLY_FRAME_ID);
         EXPECT_EQ(reply.time_ns, bench.rig->board.time_ns);
-        EXPECT_EQ(reply.frame.data[0], quantity);
+        EXPECT_EQ(reply.frame.data[0], variable);
         uint32_t answered_us;
         std::memcpy(&answered_us, reply.frame.data + 4, 4);
         EXPECT_EQ(answered_us, at_us);
@@ -31,11 +31,11 @@ class RigQuantities : public testing::Test {
     std::unique_ptr<BusClient> client;
 };
 
-enum { DONE, NO_SUCH_QUANTITY, OUT_OF_RANGE, IN_THE_PAST, QUEUE_FULL };
+enum { DONE, NO_SUCH_VARIABLE, OUT_OF_RANGE, IN_THE_PAST, QUEUE_FULL };
 
-TEST_F(RigQuantities, RangesAreTheDatabases) {
+TEST_F(BenchVariables, RangesAreThoseOfTheDatabase) {
     struct {
-        uint8_t quantity;
+        uint8_t variable;
         int32_t low, high;
     } ranges[] = {{1, -2000000, 2000000}, {2, 0, 500000},    {3, 0, 2},       {4, 0, 1000000},
                   {5, 0, 100000},         {6, 0, 1000000},   {7, 0, 1000000}, {8, -100000, 100000},
@@ -43,18 +43,18 @@ TEST_F(RigQuantities, RangesAreTheDatabases) {
                   {13, 2000, 50000},      {14, 2000, 50000}, {15, 0, 50000},  {16, -50000, 50000},
                   {17, 0, 2000}};
     for (const auto &range : ranges) {
-        SCOPED_TRACE(int(range.quantity));
-        EXPECT_EQ(set(range.quantity, range.low), DONE);
-        EXPECT_EQ(set(range.quantity, range.high), DONE);
-        EXPECT_EQ(set(range.quantity, range.low - 1), OUT_OF_RANGE);
-        EXPECT_EQ(set(range.quantity, range.high + 1), OUT_OF_RANGE);
+        SCOPED_TRACE(int(range.variable));
+        EXPECT_EQ(set(range.variable, range.low), DONE);
+        EXPECT_EQ(set(range.variable, range.high), DONE);
+        EXPECT_EQ(set(range.variable, range.low - 1), OUT_OF_RANGE);
+        EXPECT_EQ(set(range.variable, range.high + 1), OUT_OF_RANGE);
     }
-    for (unsigned quantity : {0u, 18u, 128u, 255u}) {
-        EXPECT_EQ(set(static_cast<uint8_t>(quantity), 1), NO_SUCH_QUANTITY);
+    for (unsigned variable : {0u, 18u, 128u, 255u}) {
+        EXPECT_EQ(set(static_cast<uint8_t>(variable), 1), NO_SUCH_VARIABLE);
     }
 }
 
-TEST_F(RigQuantities, ActNowOnWhatTheyName) {
+TEST_F(BenchVariables, ActImmediatelyOnTheirTarget) {
     EXPECT_EQ(set(1, -80000), DONE);
     EXPECT_DOUBLE_EQ(bench.rig->plant.load_torque_Nm, -8.0);
     EXPECT_EQ(set(2, 123456), DONE);
@@ -78,7 +78,7 @@ TEST_F(RigQuantities, ActNowOnWhatTheyName) {
     EXPECT_EQ(set(14, 30000), DONE);
     EXPECT_EQ(set(15, 0), DONE);
     const plant_gains_t &gains = bench.rig->plant.gains;
-    EXPECT_DOUBLE_EQ(gains.flux_linkage, 1.1) << "one does not put back another";
+    EXPECT_DOUBLE_EQ(gains.flux_linkage, 1.1) << "a gain leaves the others unchanged";
     EXPECT_DOUBLE_EQ(gains.resistance, 1.2);
     EXPECT_DOUBLE_EQ(gains.inertia, 3.0);
     EXPECT_DOUBLE_EQ(gains.friction, 0.0);
@@ -87,10 +87,10 @@ TEST_F(RigQuantities, ActNowOnWhatTheyName) {
     EXPECT_EQ(set(17, 200), DONE);
     EXPECT_DOUBLE_EQ(bench.rig->plant.minimum_pulse_ns, 200.0);
     EXPECT_EQ(set(1, 2000001), OUT_OF_RANGE);
-    EXPECT_DOUBLE_EQ(bench.rig->plant.load_torque_Nm, -8.0) << "refused settings change nothing";
+    EXPECT_DOUBLE_EQ(bench.rig->plant.load_torque_Nm, -8.0) << "a rejected value changes nothing";
 }
 
-TEST_F(RigQuantities, AnotherMachineIsOneFromItsTimeOn) {
+TEST_F(BenchVariables, GainOfTheMachineActsFromItsTimeOn) {
     // Twice the inductance: half the slope of the current, which rises in each period's pulse.
     RigBench same;
     auto same_client = same.connect();
@@ -106,8 +106,8 @@ TEST_F(RigQuantities, AnotherMachineIsOneFromItsTimeOn) {
     EXPECT_NEAR(bench.rig->plant.current_A[1] - before_A, 0.5 * rise_A, 0.02 * rise_A);
 }
 
-TEST_F(RigQuantities, ActExactlyAtTheirTime) {
-    EXPECT_EQ(set(6, 0), DONE); // nothing else may split the plant's steps
+TEST_F(BenchVariables, ActExactlyAtTheirTime) {
+    EXPECT_EQ(set(6, 0), DONE); // no other event may split the plant's steps
     EXPECT_EQ(set(1, 80000, 4321), DONE);
     bench.run_to(*client, 4320999);
     EXPECT_EQ(bench.rig->plant.load_torque_Nm, 0.0);
@@ -116,7 +116,7 @@ TEST_F(RigQuantities, ActExactlyAtTheirTime) {
     EXPECT_EQ(bench.rig->plant.time_ns, 4321000u);
 }
 
-TEST_F(RigQuantities, SameTimeInOrderOfArrivalAndTimesInOrder) {
+TEST_F(BenchVariables, ActInTheOrderOfTheirTimesThenOfArrival) {
     EXPECT_EQ(set(1, 30000, 3000), DONE);
     EXPECT_EQ(set(1, 20000, 2000), DONE);
     EXPECT_EQ(set(1, 40000, 3000), DONE);
@@ -126,20 +126,20 @@ TEST_F(RigQuantities, SameTimeInOrderOfArrivalAndTimesInOrder) {
     EXPECT_EQ(bench.rig->plant.load_torque_Nm, 4.0);
 }
 
-TEST_F(RigQuantities, PastPresentAndFullQueue) {
+TEST_F(BenchVariables, PastIsRejectedPresentActsAndTheQueueIsLimited) {
     bench.run_to(*client, 2 * MS);
     EXPECT_EQ(set(1, 10000, 1999), IN_THE_PAST);
     EXPECT_EQ(bench.rig->plant.load_torque_Nm, 0.0);
     EXPECT_EQ(set(1, 10000, 2000), DONE) << "this very instant";
     EXPECT_EQ(bench.rig->plant.load_torque_Nm, 1.0);
-    for (unsigned i = 0; i < QUANTITY_QUEUE; ++i) {
+    for (unsigned i = 0; i < STIMULUS_QUEUE; ++i) {
         ASSERT_EQ(set(1, static_cast<int32_t>(i), 3000 + i), DONE);
     }
     EXPECT_EQ(set(1, 0, 5000), QUEUE_FULL);
-    EXPECT_EQ(set(1, 0), DONE) << "now needs no place";
+    EXPECT_EQ(set(1, 0), DONE) << "an immediate change needs no queue entry";
 }
 
-TEST_F(RigQuantities, WrongLengthRemoteAndForeignRigFramesAreOnlyRelayed) {
+TEST_F(BenchVariables, WrongLengthRemoteAndForeignRigFramesAreOnlyRelayed) {
     auto other = bench.connect();
     client->send(RIG_SET_FRAME_ID | CAN_EFF_FLAG, {1, 0, 0, 1});
     client->send(RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG, {0, 0, 0, 1, 0, 0, 0, 0});
@@ -154,7 +154,7 @@ TEST_F(RigQuantities, WrongLengthRemoteAndForeignRigFramesAreOnlyRelayed) {
     EXPECT_TRUE(bench.firmware.received.empty());
 }
 
-TEST_F(RigQuantities, TruthComesOnMultiplesOfItsPeriod) {
+TEST_F(BenchVariables, TruthComesOnMultiplesOfItsPeriod) {
     auto truth_times = [this](uint64_t until_ns) {
         std::vector<uint64_t> times;
         for (const auto &record : bench.run_to(*client, until_ns)) {
@@ -171,7 +171,7 @@ TEST_F(RigQuantities, TruthComesOnMultiplesOfItsPeriod) {
     EXPECT_TRUE(truth_times(10 * MS).empty());
 }
 
-TEST_F(RigQuantities, TruthIsThePlants) {
+TEST_F(BenchVariables, TruthIsTheStateOfThePlant) {
     EXPECT_EQ(set(1, -500000), DONE); // drives the shaft
     auto records = bench.run_to(*client, 4 * MS);
     rig_truth_motion_t motion{};
@@ -201,20 +201,20 @@ TEST_F(RigQuantities, TruthIsThePlants) {
     EXPECT_NEAR(state.bus_voltage_v / 64.0, 240.0, 1e-9);
 }
 
-// The code of phase 1's current. The stand-in firmware's pulse is from 4 to 21 us of each period: a delay of more than
-// 4 us shows.
-uint16_t code_of(double current_A) {
+// ADC counts of phase 1's current. The stand-in firmware's pulse is from 4 to 21 us of each period: a delay of more
+// than 4 us shows.
+uint16_t counts_of(double current_A) {
     return static_cast<uint16_t>(current_A * 51.2 + 0.5);
 }
 
-TEST_F(RigQuantities, DelayedSampleShowsTheCurrentOfThatInstant) {
+TEST_F(BenchVariables, DelayedSampleShowsTheCurrentOfThatInstant) {
     EXPECT_EQ(set(6, 1), DONE); // the truth each microsecond: the plant stops there
     std::vector<double> current_A;
     for (uint64_t time_us = 1; time_us <= 200; ++time_us) {
         bench.run_to(*client, time_us * 1000);
         current_A.push_back(bench.rig->plant.current_A[1]);
     }
-    EXPECT_EQ(bench.rig->board.adc.phase_current_counts[1], code_of(current_A[199])) << "no delay";
+    EXPECT_EQ(bench.rig->board.adc.phase_current_counts[1], counts_of(current_A[199])) << "no delay";
     for (auto [centi_us, period_end_us] : {std::pair{600, 225u}, {800, 250u}, {0, 275u}}) {
         EXPECT_EQ(set(10, centi_us), DONE);
         for (uint64_t time_us = current_A.size() + 1; time_us <= period_end_us; ++time_us) {
@@ -222,15 +222,15 @@ TEST_F(RigQuantities, DelayedSampleShowsTheCurrentOfThatInstant) {
             current_A.push_back(bench.rig->plant.current_A[1]);
         }
         const uint64_t sampled_us = period_end_us - static_cast<unsigned>(centi_us) / 100;
-        EXPECT_EQ(bench.rig->board.adc.phase_current_counts[1], code_of(current_A[sampled_us - 1])) << centi_us;
-        EXPECT_EQ(code_of(current_A[sampled_us - 1]) < code_of(current_A.back()), centi_us > 0);
+        EXPECT_EQ(bench.rig->board.adc.phase_current_counts[1], counts_of(current_A[sampled_us - 1])) << centi_us;
+        EXPECT_EQ(counts_of(current_A[sampled_us - 1]) < counts_of(current_A.back()), centi_us > 0);
         EXPECT_EQ(bench.rig->board.adc.bus_voltage_counts, 1920);
     }
 }
 
-TEST_F(RigQuantities, DelayPassedAlreadyActsFromTheNextPeriodOn) {
+TEST_F(BenchVariables, DelayPassedAlreadyActsFromTheNextPeriodOn) {
     const auto shown = [this] { return bench.rig->board.adc.phase_current_counts[1]; };
-    const auto present = [this] { return code_of(bench.rig->plant.current_A[1]); };
+    const auto present = [this] { return counts_of(bench.rig->plant.current_A[1]); };
     EXPECT_EQ(set(6, 0), DONE);
     EXPECT_EQ(set(10, 800, 193), DONE) << "7 us before a period starts";
     bench.run_to(*client, 200 * 1000);
@@ -246,7 +246,7 @@ TEST_F(RigQuantities, DelayPassedAlreadyActsFromTheNextPeriodOn) {
     EXPECT_EQ(shown(), present());
 }
 
-TEST_F(RigQuantities, WithoutDelayThePlantStopsAtPeriodsOnly) {
+TEST_F(BenchVariables, WithoutDelayThePlantStopsAtPeriodsOnly) {
     EXPECT_EQ(set(6, 0), DONE);
     EXPECT_EQ(set(10, 300), DONE);
     EXPECT_EQ(set(10, 0), DONE);
@@ -254,7 +254,7 @@ TEST_F(RigQuantities, WithoutDelayThePlantStopsAtPeriodsOnly) {
     EXPECT_EQ(bench.rig->plant.time_ns, 200000u);
 }
 
-TEST_F(RigQuantities, InterruptWithinItsPeriodDelaysTheBackgroundOnly) {
+TEST_F(BenchVariables, InterruptWithinItsPeriodDelaysTheBackgroundOnly) {
     EXPECT_EQ(set(4, 1000), DONE); // 10 us of 25
     bench.run_to(*client, MS);
     EXPECT_EQ(bench.firmware.interrupts, 40u);
@@ -263,29 +263,29 @@ TEST_F(RigQuantities, InterruptWithinItsPeriodDelaysTheBackgroundOnly) {
     EXPECT_EQ(bench.firmware.background_times_ns[0], 35000u);
 }
 
-TEST_F(RigQuantities, InterruptBeyondItsPeriodLosesInterruptsAndKeepsCompares) {
+TEST_F(BenchVariables, InterruptBeyondItsPeriodLosesInterruptsAndKeepsCompares) {
     EXPECT_EQ(set(4, 6000), DONE); // 60 us: occupied from 25 to 85, lost at 50 and 75, next at 100
     bench.run_to(*client, 99999);
     EXPECT_EQ(bench.firmware.interrupt_times_ns, (std::vector<uint64_t>{25000}));
     EXPECT_EQ(bench.firmware.background_times_ns, (std::vector<uint64_t>{85000}));
-    EXPECT_EQ(bench.rig->board.missed_interrupts, 2u);
+    EXPECT_EQ(bench.rig->board.missed_triggers, 2u);
     EXPECT_EQ(bench.rig->board.active.lower[1], 0) << "written in a period that has not ended for the firmware";
     bench.run_to(*client, 100000);
     EXPECT_EQ(bench.firmware.missed, 2u);
     EXPECT_EQ(bench.rig->board.active.lower[1], 2500);
     EXPECT_EQ(set(4, 0), DONE);
     bench.run_to(*client, MS);
-    EXPECT_EQ(bench.firmware.missed, 4u) << "the one that was running when the quantity changed";
+    EXPECT_EQ(bench.firmware.missed, 4u) << "the one that was running when the variable changed";
 }
 
-TEST_F(RigQuantities, TheInterruptIsToldItsTimeAndMayBeLonger) {
+TEST_F(BenchVariables, InterruptHasTheGivenTimeAndMayTakeLonger) {
     EXPECT_EQ(set(4, 1000), DONE); // 10 us of 25
     bench.run_to(*client, 30 * 1000);
     EXPECT_EQ(bench.rig->board.interrupt_took_ns, 10000u);
-    bench.firmware.takes_ns = 25001; // a processor that takes time of its own: until 75.001 us
+    bench.firmware.takes_ns = 25001; // a processor whose instructions take time: until 75.001 us
     bench.run_to(*client, 75 * 1000);
     EXPECT_EQ(bench.firmware.missed, 0u);
-    EXPECT_EQ(bench.rig->board.missed_interrupts, 1u);
+    EXPECT_EQ(bench.rig->board.missed_triggers, 1u);
     bench.firmware.takes_ns = 25000; // ends with its period
     bench.run_to(*client, 125 * 1000);
     EXPECT_EQ(bench.firmware.interrupt_times_ns, (std::vector<uint64_t>{25000, 50000, 100000, 125000}));
@@ -293,14 +293,14 @@ TEST_F(RigQuantities, TheInterruptIsToldItsTimeAndMayBeLonger) {
     EXPECT_EQ(bench.firmware.missed, 1u);
 }
 
-TEST_F(RigQuantities, TriggersThatTheProcessorDoesNotServeAreLost) {
+TEST_F(BenchVariables, TriggersThatTheProcessorDoesNotServeAreMissed) {
     rig_busy_until(bench.rig.get(), 75000);
     bench.run_to(*client, 100 * 1000);
     EXPECT_EQ(bench.firmware.interrupt_times_ns, (std::vector<uint64_t>{75000, 100000}));
     EXPECT_EQ(bench.firmware.missed, 2u);
 }
 
-TEST_F(RigQuantities, ComparesActInTheNextPeriodOrAtOnceOnABoardWithoutThatDelay) {
+TEST_F(BenchVariables, CompareValuesActInTheNextPeriodOrImmediatelyOnABoardWithoutThatDelay) {
     // The stand-in firmware has the lower switch of phase 1 on for whole periods.
     bench.run_to(*client, 49 * 1000);
     EXPECT_EQ(bench.rig->plant.switches.lower, 0) << "written in the period that starts at 25 us";
@@ -315,7 +315,7 @@ TEST_F(RigQuantities, ComparesActInTheNextPeriodOrAtOnceOnABoardWithoutThatDelay
     EXPECT_EQ(bench.rig->plant.switches.lower, 2);
 }
 
-TEST_F(RigQuantities, EdgesAreCapturedWhileInterruptsAreLost) {
+TEST_F(BenchVariables, EdgesAreCapturedWhileTriggersAreMissed) {
     bench.rig->sensors.encoder_edges = true;
     EXPECT_EQ(set(1, -2000000), DONE); // 200 N m turn the shaft: 1 rad/s after 100 us
     bench.run_to(*client, 400 * 1000);
@@ -336,7 +336,7 @@ TEST_F(RigQuantities, EdgesAreCapturedWhileInterruptsAreLost) {
     EXPECT_LT(bench.rig->board.encoder.edge_age_ticks * HAL_PWM_TICK_NS, 12000u);
 }
 
-TEST_F(RigQuantities, InterruptOfExactlyAPeriodStarvesTheBackground) {
+TEST_F(BenchVariables, InterruptOfExactlyAPeriodStarvesTheBackground) {
     EXPECT_EQ(set(4, 2500), DONE);
     bench.run_to(*client, MS);
     EXPECT_EQ(bench.firmware.interrupts, 40u);

@@ -1,0 +1,38 @@
+#include "rig/bus_events.h"
+
+#include "rig/truth.h"
+
+void bus_start(rig_t *rig) {
+    if (rig->bus.start_requested) {
+        can_bus_start(&rig->bus, rig->board.time_ns);
+        rig->scheduler.due_ns[EVENT_CAN] = rig->bus.next_event_ns;
+    }
+}
+
+void bus_event(void *context, uint64_t now_ns) {
+    rig_t *rig = context;
+    can_bus_delivery_t delivery;
+    const bool complete = can_bus_step(&rig->bus, &delivery);
+    rig->scheduler.due_ns[EVENT_CAN] = rig->bus.next_event_ns;
+    if (!complete) {
+        return;
+    }
+    transport_frame_t frame;
+    transport_frame_from_hal(&delivery.frame, &frame);
+    transport_send(rig->config.transport, now_ns,
+                   delivery.from_drive ? TRANSPORT_FROM_EMULATOR : TRANSPORT_FROM_CLIENT_ON_BUS, &frame);
+    if (!delivery.from_drive) {
+        board_deliver(&rig->board, &delivery.frame);
+    }
+}
+
+void truth_event(void *context, uint64_t now_ns) {
+    rig_t *rig = context;
+    transport_frame_t frames[TRUTH_FRAMES];
+    rig->scheduler.due_ns[EVENT_TRUTH] += rig->truth_period_ns;
+    plant_advance(&rig->plant, now_ns);
+    truth_pack(&rig->plant, frames);
+    for (unsigned i = 0; i < TRUTH_FRAMES; ++i) {
+        transport_send(rig->config.transport, now_ns, TRANSPORT_FROM_EMULATOR, &frames[i]);
+    }
+}

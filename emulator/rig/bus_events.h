@@ -1,0 +1,16 @@
+/* The emulated CAN bus on the rig's clock, and frames on their way to board and clients. */
+#ifndef RIG_BUS_EVENTS_H
+#define RIG_BUS_EVENTS_H
+
+#include <stdint.h>
+
+#include "rig/rig.h"
+
+/* Starts the bus when a frame was queued while it was idle. Required after everything that may queue frames. */
+void bus_start(rig_t *rig);
+
+/* Handlers of EVENT_CAN and EVENT_TRUTH; context is the rig. */
+void bus_event(void *context, uint64_t now_ns);
+void truth_event(void *context, uint64_t now_ns);
+
+#endif

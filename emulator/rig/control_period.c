@@ -1,0 +1,61 @@
+#include "rig/control_period.h"
+
+#include "rig/bus_events.h"
+
+void control_period_schedule_hold(rig_t *rig) {
+    const uint64_t control_ns = rig->scheduler.due_ns[EVENT_CONTROL];
+    const uint64_t delay_ns = (uint64_t)(rig->sensors.errors.current_delay_ns + 0.5);
+    const uint64_t before_ns = delay_ns < rig->period_ns ? delay_ns : rig->period_ns;
+    const bool ahead = before_ns > 0 && control_ns - rig->board.time_ns >= before_ns;
+    rig->scheduler.due_ns[EVENT_CURRENT_HOLD] = ahead ? control_ns - before_ns : SCHEDULER_NEVER;
+    rig->sensors.currents_held = false;
+}
+
+void control_period_begin(rig_t *rig) {
+    if (rig->board.period_ticks > 0) {
+        rig->period_ns = UINT64_C(2) * rig->board.period_ticks * HAL_PWM_TICK_NS;
+        rig->scheduler.due_ns[EVENT_CONTROL] = rig->board.time_ns + rig->period_ns;
+        control_period_schedule_hold(rig);
+    }
+}
+
+static void call(rig_t *rig, board_context_t context, void (*function)(void *)) {
+    rig->board.context = context;
+    function(rig->firmware.context);
+}
+
+void control_period_hold_event(void *context, uint64_t now_ns) {
+    rig_t *rig = context;
+    rig->scheduler.due_ns[EVENT_CURRENT_HOLD] = SCHEDULER_NEVER;
+    plant_advance(&rig->plant, now_ns);
+    sensors_hold_currents(&rig->sensors, &rig->plant);
+}
+
+void control_period_start_event(void *context, uint64_t now_ns) {
+    rig_t *rig = context;
+    const bool busy = now_ns < rig->interrupt_end_ns;
+    plant_advance(&rig->plant, now_ns);
+    board_start_period(&rig->board, busy);
+    rig->scheduler.due_ns[EVENT_CONTROL] = now_ns + rig->period_ns;
+    control_period_schedule_hold(rig);
+    if (busy) {
+        return;
+    }
+    rig->board.interrupt_took_ns = rig->interrupt_time_ns;
+    call(rig, BOARD_INTERRUPT, rig->firmware.control_interrupt);
+    if (rig->board.interrupt_took_ns == 0) {
+        call(rig, BOARD_BACKGROUND, rig->firmware.background);
+    } else {
+        /* When that is the start of the next period, the interrupt comes first and postpones the background again. */
+        rig->interrupt_end_ns = rig->scheduler.due_ns[EVENT_BACKGROUND] = now_ns + rig->board.interrupt_took_ns;
+    }
+    bus_start(rig);
+}
+
+void control_period_background_event(void *context, uint64_t now_ns) {
+    rig_t *rig = context;
+    rig->scheduler.due_ns[EVENT_BACKGROUND] = SCHEDULER_NEVER;
+    plant_advance(&rig->plant, now_ns);
+    call(rig, BOARD_BACKGROUND, rig->firmware.background);
+    bus_start(rig);
+}

@@ -1,0 +1,18 @@
+/* Timing of the control interrupt, which the PWM timer triggers at the start of each control period. */
+#ifndef HAL_INTERRUPT_H
+#define HAL_INTERRUPT_H
+
+#include <stdint.h>
+
+#include "hal.h"
+
+/* Triggers missed since the last call: a trigger that comes while the previous control interrupt is still running is
+ * not made up for, and its period keeps the compare values of the period before. [interrupt] */
+uint32_t hal_interrupt_missed_triggers(hal_t *hal);
+
+/* Ticks of HAL_PWM_TICK_NS from the trigger of the present control interrupt, which took its sample, rounded down to
+ * the resolution of the port's counter. Continues beyond the period, wraps after 21 s; 0 on a port whose instructions
+ * take no time. [interrupt] */
+uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal);
+
+#endif

@@ -1,0 +1,43 @@
+"""A client of a bus as Drive and Rig need it, and attributes that catch misspelt assignments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+import can
+
+
+class Client(Protocol):
+    """Sends and receives frames in virtual time; Session is one."""
+
+    time_ns: int
+
+    def send(self, message: can.Message) -> None:
+        """Sends a frame."""
+
+    def receive_until(self, wanted: Callable[[can.Message], bool]) -> can.Message:
+        """Receives, without time passing in lock-step, until a frame meets the condition."""
+
+    def advance_until_frame(self, wanted: Callable[[can.Message], bool], timeout_s: float) -> can.Message:
+        """Lets virtual time pass until a frame meets the condition; TimeoutError after timeout_s."""
+
+
+def unknown_attribute(name: str, known: Iterable[str]) -> AttributeError:
+    """The error for an attribute that does not exist; its text lists those that do."""
+    return AttributeError(f"no attribute '{name}'; there are {', '.join(sorted(known))}")
+
+
+class KnownAttributes:
+    """Base of classes to whose objects only properties and annotated attributes can be assigned.
+
+    AttributeError for any other name, so that a misspelt one does not pass unnoticed. Names with a leading underscore
+    are free.
+    """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        cls = type(self)
+        annotated = {n for base in cls.__mro__ for n in vars(base).get("__annotations__", ()) if n[0] != "_"}
+        if not (name.startswith("_") or name in annotated or hasattr(getattr(cls, name, None), "__set__")):
+            raise unknown_attribute(name, annotated | {n for n in dir(cls) if not n.startswith("_")})
+        super().__setattr__(name, value)
