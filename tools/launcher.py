@@ -1,6 +1,6 @@
-"""What tools/salient does before a command: sets up what is missing, builds, hands over to the Python package.
+"""First part of tools/salient: installs what is missing, builds, and hands over to the Python package.
 
-Standard library only. Everything it makes stays in build/. Its own words go to standard error.
+Standard library only. All its files are in build/, all its messages go to standard error.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ STAMP = VENV / "salient.stamp"
 
 sys.path.insert(0, str(TOOLS / "src"))
 
-from salient.cli import make_parser  # noqa: E402  (needs the path above)
+from salient.builder import run_commands  # noqa: E402  (needs the path above)
+from salient.cli import make_parser  # noqa: E402
 
 
 @dataclass(frozen=True)
 class Need:
-    """A Debian package, what it is for, and how to see that it is there."""
+    """A Debian package, its purpose, and a test for its presence."""
 
     package: str
     purpose: str
@@ -47,7 +48,7 @@ def _file(*paths: str) -> Callable[[], bool]:
 
 
 def _has_ensurepip() -> bool:
-    # Debian ships ensurepip without its wheels unless python3-venv is installed.
+    # ensurepip of Debian has no wheels unless python3-venv is installed.
     code = "import ensurepip, sys, venv; ensurepip.version()"
     return subprocess.run([_base_python(), "-c", code], capture_output=True).returncode == 0
 
@@ -74,15 +75,15 @@ TARGET_NEEDS = {
 }
 TEST_NEEDS = (
     *(need for needs in TARGET_NEEDS.values() for need in needs),
-    Need("qemu-system-x86", "guest with a kernel that has CAN", lambda: not _guest_packages()),
+    Need("qemu-system-x86", "VM with a kernel that has CAN", lambda: not _guest_packages()),
 )
 MEASUREMENT_NEEDS = (
-    Need("ngspice", "second opinion on the emulated plant", _tool("ngspice")),
+    Need("ngspice", "reference solver for the emulated plant", _tool("ngspice")),
     Need("valgrind", "instruction counts", _tool("valgrind")),
 )
 
 WITHOUT_BUILD = ("log", "monitor", "machine")
-"""Commands that need no drive built here."""
+"""Commands that require no build."""
 
 
 def _guest_packages() -> list[str]:
@@ -92,7 +93,7 @@ def _guest_packages() -> list[str]:
 
 
 def _base_python() -> str:
-    """Python that the virtual environment is made with: the one that runs this."""
+    """The Python of the virtual environment: the present one."""
     # tools/salient has preferred it already; its real path, because a virtual environment of the caller may be active.
     return str(Path(sys.executable).resolve())
 
@@ -104,14 +105,14 @@ def fail(line: str) -> NoReturn:
 
 
 def say(line: str) -> None:
-    """One line to whoever waits."""
+    """One line of progress."""
     print(f"salient: {line}", file=sys.stderr, flush=True)
 
 
 # --- Debian packages ------------------------------------------------------------------------------------------------
 
 def install_packages(needs: tuple[Need, ...], install: bool) -> None:
-    """Installs what is missing, or names it and stops."""
+    """Installs missing packages, or names them and stops."""
     missing = [need for need in needs if not need.present()]
     if not missing:
         return
@@ -135,7 +136,7 @@ def install_packages(needs: tuple[Need, ...], install: bool) -> None:
         fail(f"the Debian packages {' '.join(packages)} could not be installed: see {log.relative_to(ROOT)}")
     still = [need.package for need in missing if not need.present()]
     if still:
-        fail(f"{' '.join(still)}: installed, but what it should bring is not there")
+        fail(f"{' '.join(still)}: installed, but its files are not found")
 
 
 def _sudo_works() -> bool:
@@ -166,7 +167,7 @@ def make_environment(install: bool) -> None:
         say(f"installing Python packages of {where}")
         environment = [_base_python(), "-m", "venv", "--clear", str(VENV)]
         steps = [environment, [*pip, "--require-hashes", "-r", str(LOCK)], *steps]
-    # setuptools would leave its notes beside the sources.
+    # setuptools would write its metadata next to the sources.
     notes, extra = BUILD / "package", BUILD / "setuptools.cfg"
     notes.mkdir(exist_ok=True)
     extra.write_text(f"[egg_info]\negg_base = {notes}\n")
@@ -186,11 +187,10 @@ def _last_line(log: Path) -> str:
 
 # --- build ----------------------------------------------------------------------------------------------------------
 
-def build(preset: str, targets: list[str]) -> None:
-    """Brings a preset's build up to date; exit code 1 with the compiler's words when it fails."""
+def build(preset: str, targets: list[str]) -> bool:
+    """Brings the build of a preset up to date, True when that took more than a moment; exit code 1 with the messages of
+    the compiler when it fails."""
     folder = BUILD / preset
-    if not (folder / "bin").exists():
-        say("building")
     log = BUILD / "build.log"
     command = ["cmake", "--build", "--preset", preset]
     if targets:
@@ -199,17 +199,21 @@ def build(preset: str, targets: list[str]) -> None:
         ["cmake", "--preset", preset, "-DSALIENT_MACHINE_FILE="],
         command,
     ]
-    with log.open("wb") as output:
-        for step in steps:
-            if subprocess.run(step, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT).returncode != 0:
-                output.flush()
-                sys.stderr.write(_failures(log.read_text(errors="replace")))
-                print(f"salient: the build failed: see {log.relative_to(ROOT)}", file=sys.stderr)
-                sys.exit(1)
+    notices: list[str] = []
+
+    def notice() -> None:
+        notices.append(f"building {folder.relative_to(ROOT)}")
+        say(notices[-1])
+
+    if not run_commands(steps, ROOT, log, notice):
+        sys.stderr.write(_failures(log.read_text(errors="replace")))
+        print(f"salient: the build failed: see {log.relative_to(ROOT)}", file=sys.stderr)
+        sys.exit(1)
+    return bool(notices)
 
 
 def _is_configured(folder: Path) -> bool:
-    """Whether CMake was there, and without a machine file of the user's that may be gone by now."""
+    """CMake has configured the folder, and without a machine file of the user, which may be gone."""
     try:
         cache = (folder / "CMakeCache.txt").read_text()
     except OSError:
@@ -218,12 +222,12 @@ def _is_configured(folder: Path) -> bool:
 
 
 def _failures(text: str) -> str:
-    """The last of the build's output, which is where the reason stands."""
+    """The last lines of the output of a build, which have the reason."""
     return "\n".join(text.splitlines()[-40:]) + "\n"
 
 
 def main() -> None:
-    """Reads the command line, prepares, and becomes the command."""
+    """Reads the command line, prepares the command and runs it in this process."""
     options = make_parser().parse_args()
     install = not options.no_install
     os.environ["PYTHONPYCACHEPREFIX"] = str(BUILD / "pycache")
@@ -233,15 +237,16 @@ def main() -> None:
     except OSError as error:
         fail(f"{BUILD}: {error.strerror}; everything is built there")
     with lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # two commands at once must not build over each other
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one build at a time
         needs = BUILD_NEEDS + (TEST_NEEDS if options.command == "test" else ())
-        # bench counts the instructions of the control interrupt there
-        target = "cortex-m4" if options.command == "bench" else getattr(options, "target", "host")
+        # benchmark counts the instructions of the control interrupt there; pil has a --target of other values
+        target = "cortex-m4" if options.command == "benchmark" else getattr(options, "build", "host")
+        target = getattr(options, "target", target)
         on_target = target != "host"
         needs += TARGET_NEEDS[target]
         if getattr(options, "figures", False):  # of every target
             needs += tuple(need for needs_of in TARGET_NEEDS.values() for need in needs_of)
-        needs += MEASUREMENT_NEEDS if options.command in ("test", "bench") else ()
+        needs += MEASUREMENT_NEEDS if options.command in ("test", "benchmark") else ()
         if options.command in WITHOUT_BUILD:
             needs = tuple(need for need in BUILD_NEEDS if need.package == "python3-venv")
         install_packages(needs, install)
@@ -249,11 +254,14 @@ def main() -> None:
         if options.command not in WITHOUT_BUILD:
             machines = sorted(path.stem for path in (TOOLS / "machines").glob("*.toml"))
             targets = [f"salient_{name}" for name in machines]
-            targets += ["plant_benchmark_saturating"] if options.command == "bench" else []
+            targets += ["plant_benchmark_saturating"] if options.command == "benchmark" else []
             targets += [f"salient_target_{name}" for name in machines] if on_target else []
-            build("host", [] if options.command == "test" else targets)
+            was_slow = build("host", [] if options.command == "test" else targets)
             if on_target:
-                build(target, [])
+                was_slow |= build(target, [])
+            # For a reader; a script waits for the JSON line.
+            if options.command == "sim" and (was_slow or sys.stderr.isatty()):
+                say("starting the drive")
     python = str(VENV / "bin/python")
     os.execv(python, [python, "-m", "salient", *sys.argv[1:]])
 

@@ -11,8 +11,9 @@ import can
 import numpy as np
 import pytest
 
+from salient.bench.config import BenchConfig
 from salient.bench.drive import DriveError
-from salient.bench.emulator import Simulator, SimulatorOptions
+from salient.bench.emulator import EmulatorProcess
 from salient.bench.rig import RigError
 from salient.bench.session import Session
 from salient.bus.signals import drive_database, rig_database
@@ -143,7 +144,7 @@ def test_two_benches_at_once(make_bench):
 def test_session_with_a_drive_that_moves_by_itself(tmp_path):
     """A session that follows a free-running drive sees its time pass and steers it."""
     can_bus = f"unix:{tmp_path}/can.sock"
-    with Simulator(SimulatorOptions(pace="x20"), can_bus):
+    with EmulatorProcess(BenchConfig(pace="x20"), can_bus):
         with Session(can_bus, lockstep=False) as session:
             session.drive.speed_reference_rpm = 150
             session.run_until(lambda: abs(session.telemetry["speed_rpm"].last - 150) < 5, timeout=5)
