@@ -188,8 +188,8 @@ def _last_line(log: Path) -> str:
 # --- build ----------------------------------------------------------------------------------------------------------
 
 def build(preset: str, targets: list[str]) -> bool:
-    """Brings the build of a preset up to date, True when that took more than a moment; exit code 1 with the messages of
-    the compiler when it fails."""
+    """Brings the build of a preset up to date, True when it was not; exit code 1 with the messages of the compiler when
+    it fails."""
     folder = BUILD / preset
     log = BUILD / "build.log"
     command = ["cmake", "--build", "--preset", preset]
@@ -256,11 +256,11 @@ def main() -> None:
             targets = [f"salient_{name}" for name in machines]
             targets += ["plant_benchmark_saturating"] if options.command == "benchmark" else []
             targets += [f"salient_target_{name}" for name in machines] if on_target else []
-            was_slow = build("host", [] if options.command == "test" else targets)
+            was_built = build("host", [] if options.command == "test" else targets)
             if on_target:
-                was_slow |= build(target, [])
+                was_built |= build(target, [])
             # For a reader; a script waits for the JSON line.
-            if options.command == "sim" and (was_slow or sys.stderr.isatty()):
+            if options.command == "sim" and (was_built or sys.stderr.isatty()):
                 say("starting the drive")
     python = str(VENV / "bin/python")
     os.execv(python, [python, "-m", "salient", *sys.argv[1:]])

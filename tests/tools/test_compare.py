@@ -316,13 +316,13 @@ def test_the_groups_are_listed():
 
 
 def test_a_group_that_is_none_is_named():
-    with pytest.raises(UsageError, match="no group dips: allowed are ripple, speeds"):
+    with pytest.raises(UsageError, match="no group dips: must be one of ripple, speeds"):
         compare("dips")
 
 
 @pytest.mark.parametrize(("line", "words"), [
-    (("--jobs", "0"), "--jobs 0: allowed are whole numbers from 1"),
-    (("--worse-percent", "much"), "--worse-percent much: allowed are numbers from 0"),
+    (("--jobs", "0"), "--jobs 0: must be a whole number from 1"),
+    (("--worse-percent", "much"), "--worse-percent much: must be a number from 0"),
 ])  # fmt: skip
 def test_a_wrong_option_is_named(line, words, capsys):
     with pytest.raises(SystemExit, match="2"):

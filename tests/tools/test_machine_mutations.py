@@ -1,6 +1,5 @@
-"""Machine files and flux-linkage maps gone wrong in every way we could think of: refused by one line that names the
-file and the key or the row, never by a traceback, and never built. What a mutation leaves valid is checked to be a
-machine.
+"""Mutated machine files and flux-linkage maps: rejected by one line that names the file and the key or the row, never by
+a traceback, and never built. A mutation that is still valid is checked to be a machine.
 """
 
 from __future__ import annotations
@@ -530,5 +529,6 @@ def test_commands_end_with_one_line_and_code_2_and_build_nothing(
     assert line.startswith(f"salient: {tmp_path}/") and named in line, line
     assert not any(case in name for name in built())
     assert case not in (BUILD / "host" / "CMakeCache.txt").read_text()
+    assert not any(case in note.read_text() for note in BUILD.glob("machine-*/machine_file"))
     assert not still_runs(str(tmp_path))
     assert {entry.name for entry in tmp_path.iterdir()} <= before | {"out"}

@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-_QUIET_S = 1.0
+_WORK = re.compile(rb"-- |\[[0-9]+/[0-9]+\] (?!Re-checking globbed)")
+"""Lines of CMake or Ninja when a folder is not up to date."""
 
 
 def run_commands(commands: Sequence[Sequence[str]], folder: Path, log: Path, notice: Callable[[], None]) -> bool:
     """Runs commands in a folder until one fails; their output goes to the log. True when all ended with 0.
 
-    notice: called when they take longer than a moment.
+    notice: called once when there is anything to build.
     """
     noticed = False
-    with log.open("wb") as output:
+    with log.open("wb", buffering=0) as output:
         for command in commands:
-            process = subprocess.Popen(command, cwd=folder, stdin=subprocess.DEVNULL, stdout=output,
-                                       stderr=subprocess.STDOUT)
-            while True:
-                try:
-                    code = process.wait(None if noticed else _QUIET_S)
-                    break
-                except subprocess.TimeoutExpired:
-                    notice()
-                    noticed = True
-                except BaseException:
-                    process.terminate()
-                    process.wait()
-                    raise
-            if code != 0:
+            with subprocess.Popen(command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                                  stderr=subprocess.STDOUT) as process:
+                for line in process.stdout:
+                    output.write(line)
+                    if not noticed and _WORK.match(line):
+                        notice()
+                        noticed = True
+            if process.returncode != 0:
                 return False
     return True

@@ -78,7 +78,7 @@ def make_parser() -> argparse.ArgumentParser:
     benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
                         "ngspice; effect of the network")
     benchmark.add_argument("--json", type=Path, metavar="FILE", help="also write the results to a file")
-    benchmark.add_argument("--runs", type=int, default=5, metavar="N", help="runs of each kind (default 5)")
+    benchmark.add_argument("--runs", type=_count, default=5, metavar="N", help="runs of each kind (default 5)")
 
     _add_compare_options(command("compare", "the controllers compared with each other, their targets and an earlier "
                                  "run"))
@@ -141,7 +141,7 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="fewer machines, rates and angles: some 20 s")
     parser.add_argument("--out", type=Path, default=Path("out/compare"), metavar="DIR",
                         help="folder (default out/compare)")
-    parser.add_argument("--jobs", type=_jobs, metavar="N", help="simultaneous runs (default: number of cores)")
+    parser.add_argument("--jobs", type=_count, metavar="N", help="simultaneous runs (default: number of cores)")
     parser.add_argument("--baseline", type=Path, metavar="DIR|FILE",
                         help="folder or compare.json of an earlier run: list the changes, exit code 1 when one is for "
                         "the worse")
@@ -158,7 +158,7 @@ def _one_of(allowed: Iterable[str]) -> Callable[[str], str]:
     return convert
 
 
-def _jobs(text: str) -> int:
+def _count(text: str) -> int:
     if not re.fullmatch("[0-9]{1,4}", text) or not 1 <= int(text) <= 1024:
         raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 1 to 1024")
     return int(text)

@@ -107,10 +107,10 @@ def _build_custom(path: Path, names: dict[str, str]) -> list[Path]:
         (folder / "machine_file").write_text(str(path), encoding="utf-8")
         commands = []
         for preset, name in names.items():
-            commands += [
-                ["cmake", "--preset", preset, "-B", str(folder / preset), f"-DSALIENT_MACHINE_FILE={path}"],
-                ["cmake", "--build", str(folder / preset), "--target", name],
-            ]
+            if not (folder / preset / "build.ninja").exists():
+                commands.append(["cmake", "--preset", preset, "-B", str(folder / preset),
+                                 f"-DSALIENT_MACHINE_FILE={path}"])
+            commands.append(["cmake", "--build", str(folder / preset), "--target", name])
         log = folder / "build.log"
 
         def notice() -> None:

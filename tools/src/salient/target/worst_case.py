@@ -373,7 +373,7 @@ def _with_value(given: Input, action: Action, source: random.Random) -> Action:
         low, high = 1.0, _COMMANDS_MAX
     elif scope == "bench":
         low, high = float(quantities()[name].minimum), float(quantities()[name].maximum)
-    elif scope == "parameter" and name in rows:
+    elif scope == "parameter":
         row = _rows(given.controller)[name]
         low, high = row.minimum, row.maximum
     else:
