@@ -44,6 +44,12 @@ def test_time_moves_only_when_told(bench):
     assert bench.time_ns == 12_300_001
 
 
+def test_default_controller_is_salient(bench):
+    assert bench.simulator.ready["controller"] == "salient"
+    bench.run_for(0.005)
+    assert bench.telemetry["DRIVE_STATUS.controller"].last_name == "salient"
+
+
 @pytest.mark.both_transports
 def test_drive_runs_and_carries_a_load(bench):
     bench.drive.speed_reference_rpm = 300

@@ -29,6 +29,11 @@ class EmulatorError(Exception):
     """The executable failed; the text has its standard error."""
 
 
+_BUILDERS = {"host": "any tools/salient command",
+             "debug": "cmake --preset debug && cmake --build --preset debug"}
+_TESTS = "tools/salient test"
+
+
 # --- programs -------------------------------------------------------------------------------------------------------
 
 @lru_cache
@@ -85,9 +90,7 @@ def _programs(machine: str, build: str) -> list[Path]:
     programs = [BUILD / preset / "bin" / name for preset, name in names.items()]
     for program in programs:
         if not program.exists():
-            builder = {"host": "any tools/salient command", "debug": "cmake --build --preset debug"}
-            raise UsageError(f"{program.relative_to(ROOT)} is not built; "
-                             f"{builder.get(build, 'tools/salient test')} builds it")
+            raise UsageError(f"{program.relative_to(ROOT)} is not built; {_BUILDERS.get(build, _TESTS)} builds it")
     return programs
 
 
