@@ -36,7 +36,6 @@ _TESTS = "tools/salient test"
 
 # --- programs -------------------------------------------------------------------------------------------------------
 
-@lru_cache
 def executable(machine: str, build: str = "host") -> Path:
     """The executable for a machine and a build (BenchConfig.build); that for a user's machine file is built first.
 
@@ -46,7 +45,6 @@ def executable(machine: str, build: str = "host") -> Path:
     return _programs(machine, build)[0]
 
 
-@lru_cache
 def image(machine: str, build: str) -> Path:
     """The image that executable() runs for a target build. UsageError as executable()."""
     return _programs(machine, build)[1]
