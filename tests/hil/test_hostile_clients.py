@@ -12,6 +12,8 @@ from salient.bench.drive import command_frame
 from salient.bus import e2e
 from salient.bus.clock import open_bus
 
+pytestmark = pytest.mark.bench_options(controller="traditional")
+
 COUNTERS = (
     "wrong_length", "wrong_checksum", "wrong_counter", "out_of_range", "unknown_frame", "receive_overflow",
     "telemetry_dropped",

@@ -62,7 +62,7 @@ class Rig:
     encoder_fault = Quantity(0)
     """0 healthy, 1 frozen at its count, 2 jumps by half a turn."""
     interrupt_time_us = Quantity(0.0)
-    """How long the control interrupt takes, on a processor that takes time (SimulatorOptions.instruction_ns) beside its
+    """How long the control interrupt takes, on a processor that takes time (BenchConfig.instruction_ns) beside its
     own; beyond a period interrupts are lost."""
     current_sensor_gain = Quantity(None)
     """1 is true."""
