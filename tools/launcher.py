@@ -27,7 +27,8 @@ STAMP = VENV / "salient.stamp"
 
 sys.path.insert(0, str(TOOLS / "src"))
 
-from salient.cli import make_parser  # noqa: E402  (needs the path above)
+from salient.builder import run_commands  # noqa: E402  (needs the path above)
+from salient.cli import make_parser  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,6 @@ MEASUREMENT_DEPENDENCIES = (
 
 WITHOUT_BUILD = ("log", "monitor", "machine")
 """Commands that need no drive."""
-BENCHMARK = ("bench",)
-"""The command that measures."""
 
 
 def _vm_packages() -> list[str]:
@@ -198,11 +197,10 @@ def _pip_failure(log: Path) -> str:
 
 # --- build ----------------------------------------------------------------------------------------------------------
 
-def build(preset: str, targets: list[str]) -> None:
-    """Brings the build of a preset up to date; ends with exit code 1 and the compiler's output when it fails."""
+def build(preset: str, targets: list[str]) -> bool:
+    """Brings the build of a preset up to date, True when it was not; ends with exit code 1 and the compiler's output
+    when it fails."""
     folder = BUILD / preset
-    if not (folder / "bin").exists():
-        print_status("building")
     log = BUILD / "build.log"
     command = ["cmake", "--build", "--preset", preset]
     if targets:
@@ -211,13 +209,17 @@ def build(preset: str, targets: list[str]) -> None:
         ["cmake", "--preset", preset, "-DSALIENT_MACHINE_FILE="],
         command,
     ]
-    with log.open("wb") as output:
-        for step in steps:
-            if subprocess.run(step, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT).returncode != 0:
-                output.flush()
-                sys.stderr.write(_failures(log.read_text(errors="replace")))
-                print(f"salient: the build failed: see {log.relative_to(ROOT)}", file=sys.stderr)
-                sys.exit(1)
+    notices: list[str] = []
+
+    def notice() -> None:
+        notices.append(f"building {folder.relative_to(ROOT)}")
+        print_status(notices[-1])
+
+    if not run_commands(steps, ROOT, log, notice):
+        sys.stderr.write(_failures(log.read_text(errors="replace")))
+        print(f"salient: the build failed: see {log.relative_to(ROOT)}", file=sys.stderr)
+        sys.exit(1)
+    return bool(notices)
 
 
 def _is_configured(folder: Path) -> bool:
@@ -249,7 +251,7 @@ def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, 
         found += TEST_DEPENDENCIES
     if getattr(options, "figures", False):  # measured on every target
         found += tuple(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group)
-    if options.command in ("test", *BENCHMARK):
+    if options.command in ("test", "benchmark"):
         found += MEASUREMENT_DEPENDENCIES
     return found
 
@@ -267,17 +269,21 @@ def main() -> None:
     with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # concurrent commands must not build into each other
         # The benchmark counts the instructions of the control interrupt on the Cortex-M4.
-        target = "cortex-m4" if options.command in BENCHMARK else getattr(options, "target", "host")
+        target = "cortex-m4" if options.command == "benchmark" else getattr(options, "build", "host")
+        target = getattr(options, "target", target)  # pil
         install_packages(dependencies(options, target), install)
         make_environment(install)
         if needs_build(options):
             machines = sorted(path.stem for path in (TOOLS / "machines").glob("*.toml"))
             targets = [f"salient_{name}" for name in machines]
-            targets += ["plant_benchmark_saturating"] if options.command in BENCHMARK else []
+            targets += ["plant_benchmark_saturating"] if options.command == "benchmark" else []
             targets += [f"salient_target_{name}" for name in machines] if target != "host" else []
-            build("host", [] if options.command == "test" else targets)
+            was_built = build("host", [] if options.command == "test" else targets)
             if target != "host":
-                build(target, [])
+                was_built |= build(target, [])
+            # For a reader; a script waits for the JSON line.
+            if options.command == "sim" and (was_built or sys.stderr.isatty()):
+                print_status("starting the drive")
     python = str(VENV / "bin/python")
     os.execv(python, [python, "-m", "salient", *sys.argv[1:]])
 

@@ -1,10 +1,17 @@
 /* One drive on its bench: the firmware, the host port and the emulator in one process and one thread. */
+#include <assert.h>
+
 #include "control/machine_tables.h"
 #include "drive.h"
 #include "host/hal_host.h"
 #include "host/simulation.h"
 
-/* Large; they live as long as the process. */
+static_assert((int)DRIVE_CONTROLLER_TRADITIONAL == OPTIONS_CONTROLLER_TRADITIONAL &&
+                  (int)DRIVE_CONTROLLER_PAPER == OPTIONS_CONTROLLER_PAPER &&
+                  (int)DRIVE_CONTROLLER_SALIENT == OPTIONS_CONTROLLER_SALIENT,
+              "the record and the drive number the controllers differently");
+
+/* Large: static. */
 static simulation_t simulation;
 static drive_t drive;
 

@@ -1,38 +1,45 @@
-/* The command line of the host executable. */
+/* The command line of the host executable. Names, ranges, defaults and usage text of the options are a table generated
+ * from tools/src/salient/bench/config.py. */
 #ifndef OPTIONS_H
 #define OPTIONS_H
 
-#include <stdbool.h>
+#include <stddef.h>
 #include <stdint.h>
 
-#include "rig/pacing.h"
+#include "options_table.h"
+
+typedef enum {
+    OPTION_KIND_FLAG, /* bool; has no value */
+    OPTION_KIND_INTEGER32,
+    OPTION_KIND_INTEGER64,
+    OPTION_KIND_NUMBER, /* double */
+    OPTION_KIND_WORD,   /* one of words; parsed is its index */
+    OPTION_KIND_FILE,   /* name of a file, not checked further */
+    OPTION_KIND_BUS,    /* unix:PATH or socketcan:INTERFACE, PATH and INTERFACE not checked */
+    OPTION_KIND_PACE,   /* parsed is a pacing_t */
+} option_kind_t;
 
 typedef struct {
-    const char *can;           /* unix:PATH or socketcan:INTERFACE, not checked further */
-    const char *pace;          /* as given */
-    pacing_t pacing;           /* as read */
-    const char *controller;    /* as given */
-    unsigned controller_index; /* place in OPTIONS_CONTROLLERS */
-    uint32_t control_rate_hz;
-    unsigned encoder_bits; /* 8..24, 0 is ideal */
-    unsigned adc_bits;     /* 12..16 */
-    bool encoder_edges, immediate_pwm;
-    uint64_t seed;
-    double initial_angle_deg;
-    const char *record; /* NULL: no recording */
-    uint64_t record_step_ns, record_from_us;
-    const char *record_switches; /* NULL: not recorded */
-    uint32_t bit_rate;
-    double stop_at_s; /* 0: no end */
-    bool follow_stdin;
-} options_t;
+    const char *name; /* without -- */
+    option_kind_t kind;
+    size_t offset;             /* of its member of options_t */
+    size_t parsed_offset;      /* of a word and a pace: of the member with the meaning */
+    const char *allowed;       /* ends a sentence that begins with "must be" */
+    uint64_t minimum, maximum; /* of integers */
+    const uint32_t *choices;   /* of integers; NULL: all between minimum and maximum */
+    unsigned choice_count;     /* of integers */
+    double low, high;          /* of a number */
+    const char *const *words;  /* of a word; ended by NULL */
+} option_t;
 
-extern const char *const options_controllers[]; /* ended by NULL */
+extern const option_t options_table[OPTION_COUNT];
+extern const options_t options_defaults;
+extern const char options_usage[]; /* a format; its %s is the program's name */
 
 typedef enum { OPTIONS_RUN, OPTIONS_HELP, OPTIONS_ERROR } options_result_t;
 
-/* Reads the command line. OPTIONS_HELP was asked for and printed; OPTIONS_ERROR: one line on stderr has named the
- * option, its value and what is allowed. */
+/* Reads the command line. OPTIONS_HELP: the usage text was requested and written; OPTIONS_ERROR: one line on stderr
+ * names the option, its value and the values allowed. */
 options_result_t options_parse(options_t *options, int argc, char *argv[]);
 
 #endif

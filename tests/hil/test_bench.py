@@ -1,20 +1,25 @@
-"""The fixture `bench` and what stands behind it."""
+"""The fixture `bench` and the classes that it is made of."""
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from signal import SIGCONT, SIGKILL, SIGSTOP
 
 import can
 import numpy as np
 import pytest
 
+from salient.bench import session as session_module
+from salient.bench.config import BenchConfig
 from salient.bench.drive import DriveError
-from salient.bench.emulator import Simulator, SimulatorOptions
+from salient.bench.emulator import EmulatorError, EmulatorProcess
 from salient.bench.rig import RigError, bench_variables
-from salient.bench.session import Session
+from salient.bench.session import Session, SessionError
 from salient.bus.signals import drive_database, rig_database
 
 FAILING_TEST = """
@@ -37,6 +42,12 @@ def test_time_moves_only_when_told(bench):
     assert bench.time_ns == 12_300_000
     bench.run_for(1e-9)
     assert bench.time_ns == 12_300_001
+
+
+def test_default_controller_is_salient(bench):
+    assert bench.simulator.ready["controller"] == "salient"
+    bench.run_for(0.005)
+    assert bench.telemetry["DRIVE_STATUS.controller"].last_name == "salient"
 
 
 @pytest.mark.both_transports
@@ -143,11 +154,49 @@ def test_two_benches_at_once(make_bench):
 def test_session_with_a_drive_that_moves_by_itself(tmp_path):
     """A session that follows a free-running drive sees its time pass and steers it."""
     can_bus = f"unix:{tmp_path}/can.sock"
-    with Simulator(SimulatorOptions(pace="x20"), can_bus):
+    with EmulatorProcess(BenchConfig(pace="x20"), can_bus):
         with Session(can_bus, lockstep=False) as session:
             session.drive.speed_reference_rpm = 150
             session.run_until(lambda: abs(session.telemetry["speed_rpm"].last - 150) < 5, timeout=5)
             assert session.drive.state == "run"
+
+
+def stop_until_checked(process: EmulatorProcess, checks: int) -> Callable[[], bool]:
+    """Stops a process as a debugger does; it runs on when a session has checked its life that often."""
+    os.kill(process.pid, SIGSTOP)
+    remaining = iter(range(checks))
+
+    def is_alive() -> bool:
+        if next(remaining, None) is None:
+            os.kill(process.pid, SIGCONT)
+        return process.is_alive
+
+    return is_alive
+
+
+def test_a_session_waits_for_an_emulator_at_a_breakpoint(bench, monkeypatch):
+    monkeypatch.setattr(session_module, "_ALIVE_CHECK_S", 0.01)
+    monkeypatch.setattr(bench, "_is_alive", stop_until_checked(bench.simulator, checks=10))
+    bench.run_for(0.01)
+    assert bench.time_ns == 10_000_000
+
+
+def test_a_session_fails_when_the_emulator_dies(make_bench, monkeypatch):
+    monkeypatch.setattr(session_module, "_ALIVE_CHECK_S", 0.01)
+    bench = make_bench()
+    process = bench.simulator
+
+    def kill_and_check() -> bool:
+        os.kill(process.pid, SIGKILL)
+        return process.is_alive
+
+    os.kill(process.pid, SIGSTOP)
+    monkeypatch.setattr(bench, "_is_alive", kill_and_check)
+    with pytest.raises((SessionError, can.CanError), match="has ended"):
+        bench.run_for(0.01)
+    with pytest.raises(EmulatorError, match="ended with -9"):
+        bench.close()
+    process._process.returncode = 0  # the fixture closes it again
 
 
 def test_failure_leaves_what_explains_it(tmp_path):
@@ -191,7 +240,7 @@ def test_wrong_transport(tmp_path):
     result = subprocess.run([sys.executable, "-m", "pytest", "--salient-can=vcan0", tmp_path], capture_output=True,
                             text=True, cwd=Path(tmp_path))
     assert result.returncode == 4
-    assert "--salient-can vcan0: allowed are local and socketcan:INTERFACE" in result.stderr
+    assert "--salient-can vcan0: must be local or socketcan:INTERFACE" in result.stderr
 
 
 @pytest.mark.parametrize("name", ["phase_a_open", "load_torque", "Load_torque_Nm", "_load_torque_Nm"])

@@ -1,4 +1,4 @@
-"""The host executable itself, without the launcher: its command line, its socket file, how it ends."""
+"""The host executable without the launcher: command line, socket file, end."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from salient.bench.config import DEFAULTS, FLAG, OPTIONS, flag_of
 from salient.bench.emulator import executable
 
 TIMEOUT_S = 20
@@ -26,7 +27,7 @@ def program() -> str:
 
 @pytest.fixture
 def start(program: str, tmp_path: Path) -> Iterator:
-    """Starts the executable on tmp_path/bus and waits for its ready line; ends what is left."""
+    """Starts the executable on tmp_path/bus and waits for its ready line; ends what is left running."""
     processes = []
 
     def run(*arguments: str) -> tuple[subprocess.Popen[str], dict]:
@@ -49,14 +50,14 @@ def start(program: str, tmp_path: Path) -> Iterator:
     ("arguments", "words"),
     [
         ([], ["--can", "unix:PATH"]),
-        (["--can"], ["--can", "missing"]),
-        (["--can", "tcp:1"], ["tcp:1", "unix:PATH or socketcan:INTERFACE"]),
+        (["--can"], ["--can", "requires a value"]),
+        (["--can", "tcp:1"], ["tcp:1", "must be unix:PATH or socketcan:INTERFACE"]),
         (["--can", "unix:/no/such/folder/bus"], ["/no/such/folder/bus"]),
         (["--can", "socketcan:nosuch0"], ["socketcan:nosuch0"]),
-        (["--can", "BUS", "--pace", "fast"], ["--pace fast", "lockstep, realtime, free and xN"]),
+        (["--can", "BUS", "--pace", "fast"], ["--pace fast", "must be lockstep, realtime, free or xN"]),
         (["--can", "BUS", "--pace", "x0"], ["--pace x0", "0.01 to 1000"]),
-        (["--can", "BUS", "--controller", "pid"], ["--controller pid", "traditional, paper and salient"]),
-        (["--can", "BUS", "--control-rate-hz", "44000"], ["44000", "20000, 40000, 50000, 100000 and 1000000"]),
+        (["--can", "BUS", "--controller", "pid"], ["--controller pid", "must be traditional, paper or salient"]),
+        (["--can", "BUS", "--control-rate-hz", "44000"], ["44000", "must be 20000, 40000, 50000, 100000 or 1000000"]),
         (["--can", "BUS", "--encoder-bits", "7"], ["--encoder-bits 7", "8 to 24"]),
         (["--can", "BUS", "--adc-bits", "11"], ["--adc-bits 11", "12 to 16"]),
         (["--can", "BUS", "--adc-bits", "17"], ["--adc-bits 17", "12 to 16"]),
@@ -67,11 +68,13 @@ def start(program: str, tmp_path: Path) -> Iterator:
         (["--can", "BUS", "--record", "/no/such/folder/x.npy"], ["/no/such/folder/x.npy"]),
         (["--can", "BUS", "--record-switches", "/no/such/folder/x"], ["/no/such/folder/x"]),
         (["--can", "BUS", "--record-step-ns", "1000"], ["--record"]),
-        (["--can", "BUS", "--record", "x.npy", "--record-step-ns", "99"], ["--record-step-ns 99", "from 100"]),
+        (["--can", "BUS", "--record", "x.npy", "--record-step-ns", "99"],
+         ["--record-step-ns 99", "100 to 1000000000"]),
         (["--can", "BUS", "--bit-rate", "1000001"], ["--bit-rate 1000001", "10000 to 1000000"]),
         (["--can", "BUS", "--pace", "lockstep", "--stop-at-s", "1"], ["--stop-at-s", "lockstep"]),
-        (["--can", "BUS", "--bogus"], ["--bogus"]),
-        (["--can", "BUS", "extra"], ["extra"]),
+        (["--can", "BUS", "--record", ""], ["--record", "requires a value"]),
+        (["--can", "BUS", "--bogus"], ["--bogus", "unrecognised"]),
+        (["--can", "BUS", "extra"], ["extra", "unrecognised argument"]),
     ],
 )
 def test_mistake_is_one_line_and_exit_code_2(
@@ -89,7 +92,46 @@ def test_mistake_is_one_line_and_exit_code_2(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ready_line_says_what_runs(start, tmp_path: Path) -> None:
+def test_usage_text_has_every_option_and_controller(program: str) -> None:
+    result = subprocess.run([program, "--help"], check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert (result.returncode, result.stderr) == (0, "")
+    described = re.findall(r"^  (--[a-z-]+)", result.stdout, re.MULTILINE)
+    assert described == [flag_of(name) for name, option in OPTIONS.items() if option.argument]
+    assert "traditional, paper or salient (default salient)" in result.stdout
+
+
+def test_defaults_are_those_of_the_record(start, tmp_path: Path) -> None:
+    """An executable without options and one with every default written out leave the same recording."""
+    recordings = []
+    for name in ("without", "with"):
+        file = tmp_path / f"{name}.npy"
+        written = [] if name == "without" else [
+            word for field, option in OPTIONS.items()
+            if option.argument and option.kind != FLAG and field not in ("can", "pace") and DEFAULTS[field] is not None
+            for word in (flag_of(field), str(DEFAULTS[field]))
+        ]  # fmt: skip
+        process, ready = start("--pace", "free", "--stop-at-s", "0.005", "--record", str(file), *written)
+        assert (ready["controller"], ready["seed"]) == ("salient", 1)
+        assert process.wait(TIMEOUT_S) == 0
+        recordings.append(file.read_bytes())
+    assert recordings[0] == recordings[1]
+
+
+@pytest.mark.parametrize(("pace", "is_valid"), [
+    ("x0.01", True), ("x1000", True), ("x.5", True), ("x0.009", False), ("x1000.1", False), ("x", False), ("1", False),
+])  # fmt: skip
+def test_paces_are_those_of_the_record(program: str, tmp_path: Path, pace: str, is_valid: bool) -> None:
+    line = [program, "--can", f"unix:{tmp_path}/bus", "--pace", pace, "--stop-at-s", "0.000001"]
+    result = subprocess.run(line, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert result.returncode == (0 if is_valid else 2), result.stderr
+    if is_valid:
+        assert OPTIONS["pace"].parse(pace) == pace
+    else:
+        with pytest.raises(ValueError, match="must be lockstep"):
+            OPTIONS["pace"].parse(pace)
+
+
+def test_ready_line_has_the_conditions(start, tmp_path: Path) -> None:
     process, ready = start("--pace", "lockstep", "--controller", "traditional", "--seed", "18446744073709551615")
     assert ready == {
         "ready": True, "can": f"unix:{tmp_path}/bus", "pid": process.pid, "machine": "saturating",
@@ -97,7 +139,7 @@ def test_ready_line_says_what_runs(start, tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_takes_the_board_of_a_simulation(start) -> None:
+def test_accepts_the_conditions_of_a_simulation(start) -> None:
     board = ["--control-rate-hz", "1000000", "--encoder-bits", "0", "--adc-bits", "16", "--immediate-pwm"]
     process, ready = start("--pace", "free", "--stop-at-s", "0.01", "--encoder-edges", *board)
     assert ready["control_rate_hz"] == 1000000

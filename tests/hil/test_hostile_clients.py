@@ -13,6 +13,8 @@ from salient.bus import e2e
 from salient.bus.clock import open_bus
 from salient.bus.signals import drive_database
 
+pytestmark = pytest.mark.bench_options(controller="traditional")
+
 COUNTERS = (
     "wrong_length", "wrong_checksum", "wrong_counter", "out_of_range", "unknown_frame", "receive_overflow",
     "telemetry_dropped",

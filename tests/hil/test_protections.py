@@ -10,6 +10,8 @@ import pytest
 
 from salient.bench.bench import Bench
 
+pytestmark = pytest.mark.bench_options(controller="traditional")
+
 PERIOD_US = 25.0
 
 

@@ -12,6 +12,8 @@ import pytest
 from salient.bench.bench import Bench
 from salient.paths import MACHINES
 
+pytestmark = pytest.mark.bench_options(controller="traditional")
+
 # Half a code of the ADC, and half a bit of the truth frames, A.
 RESOLUTION_A = 0.5 * 80 / 4096 + 0.5 / 512
 

@@ -8,7 +8,7 @@ import pytest
 
 def currents_A(make_bench, seed: int, noise_A: float) -> np.ndarray:
     """What the drive measures of its idle phases over 0.1 s, and then holds 150 r/min under load."""
-    bench = make_bench(seed=seed)
+    bench = make_bench(controller="traditional", seed=seed)
     bench.rig.current_noise_A = noise_A
     bench.run_for(0.1)
     measured = bench.telemetry["DRIVE_CURRENTS.current_a_A"].value

@@ -25,8 +25,8 @@ def k_i():
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    scenario = Scenario("losses", 0.2, controller="paper", speed=(SpeedStep(0.0, 300.0),), load=(LoadStep(0.03, 8.0),),
-                        record=Record(step_us=1.0))
+    scenario = Scenario(name="losses", duration_s=0.2, controller="paper", speed=(SpeedStep(0.0, 300.0),),
+                        load=(LoadStep(0.03, 8.0),), record=Record(step_us=1.0))
     return run_scenario(scenario, tmp_path_factory.mktemp("losses")).recording
 
 

@@ -23,7 +23,8 @@ import pytest
 from reference_plant import FORMS, TICK_NS, Compares, Machine, Run, load_library, machine_from, run_plant
 
 from salient.machine import file as machine_file
-from salient.machine.file import SHIPPED, load_machine
+from salient.machine.file import load_machine
+from salient.paths import MACHINES
 from salient.reference import ngspice
 
 PERIOD_TICKS = 1000  # 100 kHz: hard chopping is by whole periods
@@ -181,7 +182,7 @@ def conduction_ends_s(waveforms: Waveforms) -> np.ndarray:
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_current_and_flux_linkage_agree(library: ctypes.CDLL, tmp_path: Path, pattern: str, form: str) -> None:
-    shipped = load_machine(SHIPPED / f"{form}.toml")
+    shipped = load_machine(MACHINES / f"{form}.toml")
     machine = machine_of(shipped)
     run = run_of(machine, pattern)
     expected = spice_waveforms(tmp_path, deck(shipped, run))
@@ -207,7 +208,7 @@ def test_current_and_flux_linkage_agree(library: ctypes.CDLL, tmp_path: Path, pa
 
 def test_a_wrong_number_is_seen(library: ctypes.CDLL, tmp_path: Path) -> None:
     """The comparison is sharp: an unaligned inductance 1 % too large in ngspice alone breaks the bound."""
-    shipped = load_machine(SHIPPED / "saturating.toml")
+    shipped = load_machine(MACHINES / "saturating.toml")
     right = shipped.magnetics.parameters
     wrong = {**right, "unaligned_inductance_H": 1.01 * right["unaligned_inductance_H"]}
     machine = machine_of(shipped)

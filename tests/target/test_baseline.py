@@ -9,8 +9,7 @@ from functools import lru_cache
 
 import pytest
 
-from salient.bench.emulator import TARGET_BUILDS
-from salient.cli import CONTROLLERS
+from salient.bench.config import CONTROLLERS, TARGET_BUILDS
 from salient.errors import UsageError
 from salient.target import worst_case
 from salient.target.baseline import (

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from salient.bench.emulator import SimulatorOptions
+from salient.bench.config import CONTROLLERS, BenchConfig
+from salient.bench.emulator import command_line
 from salient.benchmark import command as benchmark
-from salient.cli import CONTROLLERS
 from salient.elf import Image
 from salient.target.isr_profile import Cost, measure, read_cost
 
@@ -65,11 +65,10 @@ def run_qemu(tmp_path: Path):
         wrapper.write_text("#!/bin/sh\n" + f"PATH={os.environ['PATH']}\n"
                            + f'exec qemu-system-arm {" ".join(map(str, qemu_options))} "$@"\n')
         wrapper.chmod(0o755)
-        options = SimulatorOptions(build="cortex-m4", controller="salient", pace="free",
-                                   instructions=folder / "instructions", execution=folder / "execution")
-        command = [*options.arguments(f"unix:{folder}/bus"), "--stop-at-s", "0.005"]
-        subprocess.run(command, check=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                       env={**os.environ, "PATH": f"{folder}:{os.environ['PATH']}"})
+        options = BenchConfig(build="cortex-m4", controller="salient", pace="free", can=f"unix:{folder}/bus",
+                              stop_at_s=0.005, instructions=folder / "instructions", execution=folder / "execution")
+        subprocess.run(command_line(options), check=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL,
+                       stdout=subprocess.DEVNULL, env={**os.environ, "PATH": f"{folder}:{os.environ['PATH']}"})
         return read_cost(options.instructions, options.execution, options.machine, options.build)
 
     return run

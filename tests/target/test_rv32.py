@@ -7,7 +7,8 @@ import re
 import subprocess
 from pathlib import Path
 
-from salient.bench.emulator import SimulatorOptions
+from salient.bench.config import BenchConfig
+from salient.bench.emulator import command_line
 from salient.elf import Image
 from salient.target.isr_profile import read_cost
 
@@ -22,9 +23,9 @@ def test_each_control_interrupt_is_an_exception_of_the_processor_and_counted(tmp
     wrapper = tmp_path / "qemu-system-riscv32"
     wrapper.write_text(f'#!/bin/sh\nPATH={os.environ["PATH"]}\nexec qemu-system-riscv32 -d int -D {log} "$@"\n')
     wrapper.chmod(0o755)
-    options = SimulatorOptions(build="rv32", controller="salient", pace="free", instructions=instructions,
-                               execution=executed)
-    subprocess.run([*options.arguments(f"unix:{tmp_path}/bus"), "--stop-at-s", "0.005"], check=True, timeout=TIMEOUT_S,
+    options = BenchConfig(build="rv32", controller="salient", pace="free", can=f"unix:{tmp_path}/bus", stop_at_s=0.005,
+                          instructions=instructions, execution=executed)
+    subprocess.run(command_line(options), check=True, timeout=TIMEOUT_S,
                    stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                    env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"})
     cost = read_cost(instructions, executed, options.machine, options.build)

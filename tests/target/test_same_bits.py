@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from salient.bench.bench import Bench
-from salient.bench.emulator import TARGET_BUILDS
-from salient.cli import CONTROLLERS, TARGETS
+from salient.bench.config import CONTROLLERS, TARGET_BUILDS, TARGETS
 
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
 ROW_BYTES = 16

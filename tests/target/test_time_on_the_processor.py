@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from salient.bench.bench import Bench
-from salient.bench.emulator import TARGET_BUILDS, Simulator, SimulatorOptions, executable
+from salient.bench.config import CONTROLLERS, TARGET_BUILDS, BenchConfig
+from salient.bench.emulator import EmulatorProcess, command_line, executable
 from salient.bench.session import Session
-from salient.cli import CONTROLLERS
 from salient.errors import UsageError
 from salient.experiments.metrics import load_step_metrics, start_metrics, torque_metrics
 from salient.paths import BUILD
@@ -216,9 +216,9 @@ def test_what_the_bench_holds_the_processor_for_adds_to_its_own_time(make_bench)
 
 def test_instructions_that_take_time_are_for_the_cortex_m4():
     with pytest.raises(UsageError, match="--instruction-ns 8: only with --target cortex-m4"):
-        SimulatorOptions(instruction_ns=8).arguments("unix:bus")
+        command_line(BenchConfig(instruction_ns=8))
     with pytest.raises(UsageError, match="--instruction-ns 8: not on the board virt, whose port uses no timer"):
-        Simulator(SimulatorOptions(build="rv32", instruction_ns=8), "unix:bus")
+        EmulatorProcess(BenchConfig(build="rv32", instruction_ns=8), "unix:bus")
 
 
 # --- the interrupt comes anywhere -----------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
-"""What tools/salient bench claims, but for the times: the peers solve the plant's problem, the accuracy that it prints
-for each, the instruction counts."""
+"""What tools/salient benchmark claims, but for the times: the peers solve the plant's problem, the accuracy that it
+prints for each, the instruction counts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from salient.benchmark import callgrind as instructions
 from salient.benchmark import command as benchmark
 from salient.benchmark.solvers import PEERS, PLANT, REFERENCE_TOLERANCE
 from salient.benchmark.switching_pattern import Replay, deviation, record, run_plant
-from salient.machine.file import SHIPPED, load_machine
+from salient.machine.file import load_machine
+from salient.paths import MACHINES
 from salient.reference.scipy_plant import dop853, run_scipy
 
 PERIODS = 800  # 20 ms, two strokes and a half
@@ -46,7 +47,7 @@ def test_replay_is_what_the_drive_did(replay: Replay, folder: Path) -> None:
 
 def test_reference_is_the_independent_twin_s(replay: Replay) -> None:
     """Flux linkages as state, events and a pattern of its own, in plant_twin.py."""
-    machine = machine_from(load_machine(SHIPPED / "saturating.toml"))
+    machine = machine_from(load_machine(MACHINES / "saturating.toml"))
     compares = list(zip(replay.upper.tolist(), replay.lower.tolist(), strict=True))
     run = Run(replay.period_ticks, compares, replay.speed_rad_s, math.degrees(replay.angle_rad),
               replay.load_torque_Nm, replay.current_A)

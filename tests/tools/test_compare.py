@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from salient.cli import CONTROLLERS, make_parser
+from salient.bench.config import CONTROLLERS
+from salient.cli import make_parser
 from salient.errors import UsageError
 from salient.experiments.compare import baseline, cases, command, results_file, table
 from salient.experiments.compare.cases import GROUPS, Case, random_drive, scenario_toml, start_scenario
@@ -219,7 +220,7 @@ def test_never_and_a_fault_are_worse_than_any_figure():
 
 def test_the_same_drive_is_no_change_and_a_doctored_earlier_run_is_told_apart(start_folder, tmp_path):
     folder, _ = start_folder
-    code, said = compare("start", "--quick", "--jobs", 1, "--out", tmp_path / "again", "--against", folder)
+    code, said = compare("start", "--quick", "--jobs", 1, "--out", tmp_path / "again", "--baseline", folder)
     assert code == 0
     figures = 2 * len(CONTROLLERS)
     assert f"0 worse, 0 better, {figures} within 10 % of {figures} figures" in said
@@ -233,14 +234,14 @@ def test_the_same_drive_is_no_change_and_a_doctored_earlier_run_is_told_apart(st
             row["values"]["traditional"] *= 1.2
     earlier = tmp_path / "earlier.json"
     earlier.write_text(json.dumps(doctored))
-    code, said = compare("start", "--quick", "--out", tmp_path / "worse", "--against", earlier)
+    code, said = compare("start", "--quick", "--out", tmp_path / "worse", "--baseline", earlier)
     assert code == 1
     assert f"1 worse, 1 better, {figures - 2} within 10 % of {figures} figures" in said
     assert re.search(r"WORSE  start, saturating, paper: settled .* 0\.06\d\d\d -> 0\.06\d\d\d \(\+11\.1 %\)", said)
     assert re.search(r"better  start, saturating, traditional: .* \(-16\.7 %\)", said)
     page = (tmp_path / "worse/compare.html").read_text(encoding="utf-8")
     assert "WORSE  start" in page and page.count("data:image/png;base64,") == 1
-    code, _ = compare("start", "--quick", "--out", tmp_path / "lenient", "--against", earlier, "--worse-percent", 20)
+    code, _ = compare("start", "--quick", "--out", tmp_path / "lenient", "--baseline", earlier, "--worse-percent", 20)
     assert code == 0
 
 
@@ -255,8 +256,8 @@ def test_what_is_no_earlier_run_is_named(tmp_path, content, words):
     path = tmp_path / "earlier.json"
     if content is not None:
         path.write_text(content)
-    with pytest.raises(UsageError, match=f"--against .*earlier.json: .*{words}"):
-        compare("start", "--out", tmp_path / "out", "--against", path)
+    with pytest.raises(UsageError, match=f"--baseline .*earlier.json: .*{words}"):
+        compare("start", "--out", tmp_path / "out", "--baseline", path)
     assert not (tmp_path / "out").exists()
 
 
@@ -315,13 +316,13 @@ def test_the_groups_are_listed():
 
 
 def test_a_group_that_is_none_is_named():
-    with pytest.raises(UsageError, match="no group dips: allowed are ripple, speeds"):
+    with pytest.raises(UsageError, match="no group dips: must be one of ripple, speeds"):
         compare("dips")
 
 
 @pytest.mark.parametrize(("line", "words"), [
-    (("--jobs", "0"), "--jobs 0: allowed are whole numbers from 1"),
-    (("--worse-percent", "much"), "--worse-percent much: allowed are numbers from 0"),
+    (("--jobs", "0"), "--jobs 0: must be a whole number from 1"),
+    (("--worse-percent", "much"), "--worse-percent much: must be a number from 0"),
 ])  # fmt: skip
 def test_a_wrong_option_is_named(line, words, capsys):
     with pytest.raises(SystemExit, match="2"):

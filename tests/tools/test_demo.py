@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from salient.cli import CONTROLLERS as ALL_CONTROLLERS
+from salient.bench.config import CONTROLLERS as ALL_CONTROLLERS
 from salient.cli import make_parser
 from salient.errors import UsageError
 from salient.experiments import demo, metrics

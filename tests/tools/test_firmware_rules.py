@@ -1,4 +1,4 @@
-"""The rules that the build enforces on the firmware bark when they are broken."""
+"""The checks of the build reject firmware that breaks a rule: no floating point, no C library, limited flash."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_the_host_build_refuses_floating_point(tmp_path):
     assert not compiles_as_firmware(tmp_path, FLOATING_POINT)
 
 
-def test_the_host_build_of_the_firmware_uses_that_rule():
+def test_the_host_build_of_the_firmware_has_that_option():
     assert "target_compile_options(salient_firmware PRIVATE -mgeneral-regs-only)" in (
         ROOT / "firmware/CMakeLists.txt"
     ).read_text()
@@ -79,7 +79,7 @@ def test_the_build_for_a_target_accepts_integers(tmp_path, compiler):
 
 
 def size_check(tmp_path: Path, bytes_of_table: int, initial: int) -> subprocess.CompletedProcess:
-    """Of a table in flash and a variable with an initial value, against a limit of 1000 bytes."""
+    """Checks a table in flash and a variable with an initial value against a limit of 1000 bytes."""
     file, item = tmp_path / "size.c", tmp_path / "size.o"
     table, variable = f"const char table[{bytes_of_table}] = {{1}};\n", f"char variable[{initial}] = {{1}};\n"
     file.write_text(table + variable + "char zero[5000];\n")

@@ -10,8 +10,9 @@ import pytest
 from salient.bench.emulator import executable
 from salient.errors import UsageError
 from salient.generate import machine as generate_machine
-from salient.machine.file import SHIPPED, load_machine
+from salient.machine.file import load_machine
 from salient.machine.firmware_tables import BEND_SHIFT_MAX, CURRENT_A, ROW_UNITS, ROWS, PhaseMapError, phase_map
+from salient.paths import MACHINES
 
 POLES = 4
 HALF_RAD = math.pi / POLES
@@ -99,7 +100,7 @@ def test_a_machine_that_saturates_at_another_current_at_every_angle_is_held_with
 
 
 def test_rows_stand_closest_where_the_torque_bends_most():
-    start_deg = 45.0 * phase_map(load_machine(SHIPPED / "linear_trapezoid.toml").magnetics).row_start / ROW_UNITS
+    start_deg = 45.0 * phase_map(load_machine(MACHINES / "linear_trapezoid.toml").magnetics).row_start / ROW_UNITS
     for corner_deg in (1.0, 3.0, 42.0, 44.0):
         assert np.min(np.abs(start_deg - corner_deg)) < 0.003, corner_deg
 
@@ -120,7 +121,7 @@ class Scaled:
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 100.0])
 def test_the_format_follows_the_machine(factor):
-    machine = load_machine(SHIPPED / "saturating.toml").magnetics
+    machine = load_machine(MACHINES / "saturating.toml").magnetics
     tables = phase_map(Scaled(machine, factor))
     for surface in (tables.torque_per_ampere, tables.flux_per_ampere):
         assert 32768 <= np.max(surface.node) <= 65535, "all 16 bits in use"
@@ -131,7 +132,7 @@ def test_the_format_follows_the_machine(factor):
 
 
 def test_a_weak_machine_has_the_finest_format():
-    machine = load_machine(SHIPPED / "saturating.toml").magnetics
+    machine = load_machine(MACHINES / "saturating.toml").magnetics
     tables = phase_map(Scaled(machine, 0.01))
     for surface in (tables.torque_per_ampere, tables.flux_per_ampere):
         assert surface.result_shift == 0
@@ -139,7 +140,7 @@ def test_a_weak_machine_has_the_finest_format():
 
 
 def test_what_the_tables_cannot_hold_is_refused_in_one_line():
-    machine = load_machine(SHIPPED / "saturating.toml").magnetics
+    machine = load_machine(MACHINES / "saturating.toml").magnetics
     with pytest.raises(PhaseMapError, match=r"^[0-9.]+ N m/A of torque is more than the firmware's tables hold$"):
         phase_map(Scaled(machine, 2000.0))
     with pytest.raises(PhaseMapError, match=r"^at [0-9.]+ deg, towards aligned, the torque falls to [-0-9.]+ N m at"):
@@ -149,7 +150,7 @@ def test_what_the_tables_cannot_hold_is_refused_in_one_line():
 @pytest.fixture
 def strong_machine(tmp_path):
     """A file of allowed numbers whose torque is beyond the tables."""
-    text = (SHIPPED / "linear_cosine.toml").read_text(encoding="utf-8")
+    text = (MACHINES / "linear_cosine.toml").read_text(encoding="utf-8")
     text = text.replace("stator = 6", "stator = 12").replace("rotor = 4", "rotor = 8")
     path = tmp_path / "strong.toml"
     path.write_text(text.replace("23.6e-3", "9.0"), encoding="utf-8")
@@ -169,10 +170,10 @@ def test_a_refused_machine_is_named_before_anything_is_built(strong_machine):
 
 
 def test_a_map_that_ends_early_is_levelled_where_its_straight_continuation_loses_torque(tmp_path):
-    lines = (SHIPPED / "finite_element.csv").read_text(encoding="utf-8").splitlines()
+    lines = (MACHINES / "finite_element.csv").read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines if not line[0].isdigit() or float(line.split(",")[1]) <= 20.0]
     (tmp_path / "finite_element.csv").write_text("\n".join([*kept, ""]), encoding="utf-8")
-    shutil.copy(SHIPPED / "finite_element.toml", tmp_path)
+    shutil.copy(MACHINES / "finite_element.toml", tmp_path)
     magnetics = load_machine(tmp_path / "finite_element.toml").magnetics
     half_rad = magnetics.pitch_rad / 2.0
     angle_rad = half_rad + half_rad * np.linspace(0.0, 1.0, 100)[:, None]

@@ -1,4 +1,4 @@
-"""Mistakes of the caller: one clear line that names the thing and what is allowed, and exit code 2."""
+"""Mistakes of the caller: one line that names the mistake and the values allowed, and exit code 2."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from salient.paths import MACHINES, ROOT
+from salient.paths import BUILD, MACHINES, ROOT
 
 SCENARIO = """
 machine = "saturating"
@@ -31,14 +32,15 @@ def assert_mistake(result, *words: str) -> None:
     ("arguments", "words"),
     [
         ([], ["COMMAND"]),
-        (["fly"], ["fly", "demo, test, sim, run, log, monitor, bench"]),
-        (["sim", "--pcae", "free"], ["--pcae"]),
-        (["sim", "--pace", "fast"], ["--pace fast", "lockstep, realtime, free and xN"]),
-        (["sim", "--controller", "pid"], ["--controller pid", "traditional, paper"]),
+        (["fly"], ["fly", "must be one of demo, test, sim, run, log, monitor, benchmark"]),
+        (["sim", "--pcae", "free"], ["unrecognised argument --pcae"]),
+        (["sim", "--pace", "fast"], ["--pace fast", "lockstep, realtime, free or xN"]),
+        (["sim", "--controller", "pid"], ["--controller pid", "traditional, paper or salient"]),
         (["sim", "--control-rate-hz", "30000"], ["--control-rate-hz 30000", "20000, 40000, 50000, 100000"]),
-        (["sim", "--encoder-bits", "7"], ["--encoder-bits 7", "8, 9"]),
-        (["sim", "--seed", "-1"], ["--seed"]),
-        (["sim", "--can", "vcan0"], ["--can vcan0", "auto, unix:PATH and socketcan:INTERFACE"]),
+        (["sim", "--encoder-bits", "7"], ["--encoder-bits 7", "0 or 8 to 24"]),
+        (["sim", "--seed", "-1"], ["--seed -1", "whole number from 0"]),
+        (["sim", "--seed"], ["--seed", "requires a value"]),
+        (["sim", "--can", "vcan0"], ["--can vcan0", "unix:PATH or socketcan:INTERFACE"]),
         (["sim", "--can", "socketcan:nowhere0"], ["--can socketcan:nowhere0"]),
         (["sim", "--can", "unix:/no/such/folder/bus"], ["/no/such/folder/bus"]),
         (["sim", "--initial-angle-deg", "400"], ["--initial-angle-deg 400", "-360 to 360"]),
@@ -52,7 +54,8 @@ def assert_mistake(result, *words: str) -> None:
         (["log", "--out", "can.csv"], ["can.csv", ".blf or .log"]),
         (["monitor", "--can", "unix:/no/such/bus"], ["unix:/no/such/bus"]),
         (["test", "--only", "everything"], ["everything", "unit"]),
-        (["bench", "--runs", "0"], ["--runs 0"]),
+        (["bench"], ["bench", "benchmark"]),
+        (["benchmark", "--runs", "0"], ["--runs 0"]),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, list) else None,
 )
@@ -65,8 +68,8 @@ def test_wrong_command_line(salient, arguments, words):
     [
         (SCENARIO + "duration = 1\n", ["duration", "unknown key", "duration_s"]),
         (SCENARIO.replace("0.01", "-1"), ["duration_s", "-1", "0.001 to 3600"]),
-        (SCENARIO.replace("0.01", '"long"'), ["duration_s", "'long'", "not a number"]),
-        (SCENARIO.replace("paper", "pid"), ["controllers", "'pid'", "traditional, paper"]),
+        (SCENARIO.replace("0.01", '"long"'), ["duration_s", "'long'", "must be a number"]),
+        (SCENARIO.replace("paper", "pid"), ["controllers", "'pid'", "traditional, paper or salient"]),
         (SCENARIO.replace('["paper"]', '["paper", "paper"]'), ["controllers", "different"]),
         (SCENARIO.replace("saturating", "nonesuch"), ["nonesuch", "saturating"]),
         (SCENARIO.replace('machine = "saturating"', ""), ["machine", "missing"]),
@@ -79,7 +82,7 @@ def test_wrong_command_line(salient, arguments, words):
         (SCENARIO + "[record]\nstep_us = 0\n", ["record.step_us", "0.1"]),
         (SCENARIO + "[parameters]\ntorque_max = 1\n", ["parameters.torque_max", "torque_max_Nm"]),
         (SCENARIO + "[parameters]\ntorque_max_Nm = 1000\n", ["parameters.torque_max_Nm", "1000", "0 to 40 N m"]),
-        (SCENARIO + "[parameters]\ntorque_max_Nm = true\n", ["parameters.torque_max_Nm", "not a number"]),
+        (SCENARIO + "[parameters]\ntorque_max_Nm = true\n", ["parameters.torque_max_Nm", "must be a number"]),
         (SCENARIO + "seed = \n", ["not TOML"]),
         (SCENARIO + "seed = " + 5000 * "9", ["not TOML", "too long"]),
         (SCENARIO + "seed = " + 20000 * "[", ["not TOML", "too deep"]),
@@ -115,9 +118,9 @@ def test_wrong_machine_file(salient_without_build, tmp_path, old, new, words):
     assert_mistake(salient_without_build("sim", "--machine", path), str(path), *words)
 
 
-def test_machine_file_with_a_shipped_name(salient, tmp_path):
+def test_machine_file_with_the_name_of_a_bundled_machine(salient, tmp_path):
     path = machine_file(tmp_path, "saturating", "stator", "stator")
-    assert_mistake(salient("sim", "--machine", path), str(path), "another name")
+    assert_mistake(salient("sim", "--machine", path), str(path), "rename the file")
 
 
 def test_bus_in_use(salient, make_bench):
@@ -134,7 +137,7 @@ def test_missing_compiler(salient, tmp_path):
 
 
 def test_missing_python(salient, tmp_path):
-    """Without any Python that is new enough the shell part of the launcher says so by itself."""
+    """Without a Python that is new enough the shell part of the launcher reports it."""
     text = (ROOT / "tools" / "salient").read_text()
     copy = tmp_path / "salient"
     copy.write_text(text.replace("/usr/bin/python3 python3", "/nonexistent/python3"))
@@ -144,8 +147,24 @@ def test_missing_python(salient, tmp_path):
 
 
 @pytest.mark.xdist_group("machine_builds")
-def test_machine_file_of_ones_own(make_bench, tmp_path):
-    """A file with half the inertia is built on demand, and its motor gains speed about twice as fast."""
+def test_two_processes_build_for_machine_files_of_the_user_simultaneously(tmp_path):
+    """Each of two files by two processes, one build per file."""
+    files = [machine_file(tmp_path, name, "inertia_kg_m2 = 0.02", f"inertia_kg_m2 = {inertia}")
+             for name, inertia in (("light", 0.01), ("heavy", 0.03))]
+    code = "import sys; from salient.bench.emulator import executable; print(executable(sys.argv[1]))"
+    processes = [subprocess.Popen([sys.executable, "-c", code, file], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                                  text=True) for file in files * 2]
+    outputs = [process.communicate() for process in processes]
+    assert [process.returncode for process in processes] == [0] * 4, outputs
+    programs = [Path(output.strip()) for output, _ in outputs]
+    assert programs[:2] == programs[2:] and programs[0].parents[2] != programs[1].parents[2]
+    assert all(program.exists() and program.is_relative_to(BUILD) for program in programs)
+    assert [sum("building the drive for" in errors for _, errors in outputs[at::2]) for at in (0, 1)] == [1, 1]
+
+
+@pytest.mark.xdist_group("machine_builds")
+def test_machine_file_of_the_user(make_bench, tmp_path):
+    """A file with half the inertia is built on demand, and its motor accelerates about twice as fast."""
     path = machine_file(tmp_path, "half_inertia", "inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.01")
     speeds = []
     for machine in (str(path), "saturating"):

@@ -1,6 +1,5 @@
-"""Machine files and flux-linkage maps gone wrong in every way we could think of: refused by one line that names the
-file and the key or the row, never by a traceback, and never built. What a mutation leaves valid is checked to be a
-machine.
+"""Mutated machine files and flux-linkage maps: rejected by one line that names the file and the key or the row, never
+by a traceback, and never built. A mutation that is still valid is checked to be a machine.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from salient.machine.magnetics import Formula
 from salient.paths import BUILD
 
 SEED = 20
-LINE_MAX = 600  # characters of a refusal besides the path: a screen, not a flood
+LINE_MAX = 600  # characters of a rejection without the path
 
 NAME = "mutant"
 POLES = {"stator": "6", "rotor": "4"}
-# Every table that a machine file may have, every number written out.
+# Every table and key that a machine file may have.
 GOOD_TABLES = {
     "poles": POLES,
     "winding": {"resistance_ohm": "0.05"},
@@ -113,8 +112,8 @@ def write(folder: Path, machine: str | bytes, flux_map: str | bytes | None = Non
     return path
 
 
-def refusal(path: Path) -> str | None:
-    """What load_machine says about a file, without the path; None when it takes it. Anything but a MachineError of one
+def rejection(path: Path) -> str | None:
+    """The error of load_machine without the path; None when it accepts the file. Anything but a MachineError of one
     line that begins with the file at fault fails."""
     try:
         machine = load_machine(path)
@@ -153,7 +152,7 @@ def assert_is_a_machine(machine: Machine) -> None:
 
 # --- Machine files ---
 
-TOO_LONG = "a whole number of 5000 digits"  # Python reads none above 4300, and says so as no other mistake
+TOO_LONG = "a whole number of 5000 digits"  # Python reads at most 4300 and raises another error
 WRONG_VALUES = {
     "text": '"0.05"',
     "empty text": '""',
@@ -177,7 +176,7 @@ ZERO_ALLOWED = {("mechanics", "friction_Nm_s"), ("sensors", "current_gain")} | M
 ZERO_ALLOWED -= {("sensors", "current_limit_A")}
 
 Case = tuple[str, str, str]
-"""(what was done, machine file, what the refusal must name)."""
+"""(what was done, machine file, what the rejection must name)."""
 
 
 def with_value(table: str, key: str, value: str) -> str:
@@ -258,58 +257,58 @@ MACHINE_CASES = key_cases() + table_cases() + other_cases()
 
 
 def test_the_unmutated_files_are_machines(tmp_path: Path) -> None:
-    assert refusal(write(tmp_path, GOOD)) is None
-    assert refusal(write(tmp_path, MAP_MACHINE, GOOD_MAP)) is None
+    assert rejection(write(tmp_path, GOOD)) is None
+    assert rejection(write(tmp_path, MAP_MACHINE, GOOD_MAP)) is None
 
 
-def test_every_mutation_of_a_key_or_table_is_refused_by_one_line_that_names_it(tmp_path: Path) -> None:
+def test_every_mutation_of_a_key_or_table_is_rejected_by_one_line_that_names_it(tmp_path: Path) -> None:
     assert len(MACHINE_CASES) > 600
-    said = {what: (refusal(write(tmp_path, text)), named) for what, text, named in MACHINE_CASES}
-    wrong = {what: text for what, (text, named) in said.items() if text is None or named not in text}
+    messages = {what: (rejection(write(tmp_path, text)), named) for what, text, named in MACHINE_CASES}
+    wrong = {what: text for what, (text, named) in messages.items() if text is None or named not in text}
     assert not wrong, wrong
 
 
-def test_a_machine_file_cut_anywhere_is_refused_or_still_a_machine(tmp_path: Path) -> None:
-    said = [refusal(write(tmp_path, GOOD.encode()[:end])) for end in range(len(GOOD))]
-    # Behind the last needed table, [converter] supply_voltage_V, only a cut number can stay valid.
+def test_a_machine_file_cut_anywhere_is_rejected_or_still_a_machine(tmp_path: Path) -> None:
+    messages = [rejection(write(tmp_path, GOOD.encode()[:end])) for end in range(len(GOOD))]
+    # After the last required key, [converter] supply_voltage_V, only a cut number can stay valid.
     needed = GOOD.index("switch_drop_V")
-    assert all(said[:needed - 5])
-    assert sum(text is not None for text in said) > needed
+    assert all(messages[:needed - 5])
+    assert sum(text is not None for text in messages) > needed
 
 
 @pytest.mark.parametrize("good", [GOOD, MAP_MACHINE], ids=["formula", "map"])
-def test_flipped_bytes_of_a_machine_file_are_refused_or_still_a_machine(tmp_path: Path, good: str) -> None:
+def test_flipped_bytes_of_a_machine_file_are_rejected_or_still_a_machine(tmp_path: Path, good: str) -> None:
     chance = random.Random(SEED)
-    refused = 0
+    rejected = 0
     for _ in range(600):
         data = bytearray(good.encode())
         data[chance.randrange(len(data))] = chance.choice([0, 0xFF, 0x80, *range(9, 127)])
-        refused += refusal(write(tmp_path, bytes(data), GOOD_MAP)) is not None
-    assert 300 < refused < 600
+        rejected += rejection(write(tmp_path, bytes(data), GOOD_MAP)) is not None
+    assert 300 < rejected < 600
 
 
-def test_what_is_no_readable_file_is_refused(tmp_path: Path) -> None:
+def test_an_unreadable_file_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / f"{NAME}.toml"
-    assert "no such file" in refusal(path)
+    assert "no such file" in rejection(path)
     path.mkdir()
-    assert "not a file" in refusal(path)
+    assert "not a file" in rejection(path)
     path.rmdir()
     os.mkfifo(path)
-    assert "not a file" in refusal(path)
+    assert "not a file" in rejection(path)
     path.unlink()
     path.symlink_to("/dev/zero")
-    assert "not a file" in refusal(path)
+    assert "not a file" in rejection(path)
     path.unlink()
     path.symlink_to(path)
-    assert "cannot be read" in refusal(path)
+    assert "cannot be read" in rejection(path)
     path.unlink()
     with path.open("wb") as file:
         file.truncate(10_000_000_000)  # takes no space
-    assert "larger than" in refusal(path)
+    assert "larger than" in rejection(path)
 
 
 @pytest.mark.parametrize("name", ["", ".", "/", "x" * 5000, "a\nb", "a\0b", "pipe", "itself"])
-def test_what_is_no_name_of_a_machine_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_an_unknown_machine_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
     Path("itself").symlink_to("itself")
@@ -339,7 +338,7 @@ def scaled(column: int, factor: float) -> list[str]:
 
 
 def row_cases(chance: random.Random) -> list[tuple[str, str, str]]:
-    """(what was done, map, what the refusal must name): in each of some rows that chance picks, what a row may be."""
+    """(what was done, map, what the rejection must name): the kinds of mistakes, each in some rows picked at random."""
     cases = []
     for at in sorted(chance.sample(range(1, len(ROWS) - 1), 12)):
         angle, current, flux = ROWS[at].split(",")
@@ -421,40 +420,40 @@ def file_cases() -> list[tuple[str, str | bytes, str]]:
     ]  # fmt: skip
 
 
-def test_every_mutation_of_a_map_is_refused_by_one_line_that_names_its_row(tmp_path: Path) -> None:
+def test_every_mutation_of_a_map_is_rejected_by_one_line_that_names_its_row(tmp_path: Path) -> None:
     cases = row_cases(random.Random(SEED)) + file_cases()
     assert len(cases) > 250
-    said = {what: (refusal(write(tmp_path, MAP_MACHINE, text)), named) for what, text, named in cases}
-    wrong = {what: text for what, (text, named) in said.items() if text is None or named not in text}
+    messages = {what: (rejection(write(tmp_path, MAP_MACHINE, text)), named) for what, text, named in cases}
+    wrong = {what: text for what, (text, named) in messages.items() if text is None or named not in text}
     assert not wrong, wrong
 
 
-def test_a_map_cut_anywhere_is_refused_or_still_a_machine(tmp_path: Path) -> None:
+def test_a_map_cut_anywhere_is_rejected_or_still_a_machine(tmp_path: Path) -> None:
     data = GOOD_MAP.encode()
     last_angle = GOOD_MAP.rindex("\n45,8,")
     for end in range(0, last_angle, 13):
-        assert refusal(write(tmp_path, MAP_MACHINE, data[:end])) is not None, end
-    said = [refusal(write(tmp_path, MAP_MACHINE, data[:end])) for end in range(last_angle, len(data))]
-    assert sum(text is not None for text in said) > 0.5 * len(said)
+        assert rejection(write(tmp_path, MAP_MACHINE, data[:end])) is not None, end
+    messages = [rejection(write(tmp_path, MAP_MACHINE, data[:end])) for end in range(last_angle, len(data))]
+    assert sum(text is not None for text in messages) > 0.5 * len(messages)
 
 
-def test_flipped_bytes_of_a_map_are_refused_or_still_a_machine(tmp_path: Path) -> None:
+def test_flipped_bytes_of_a_map_are_rejected_or_still_a_machine(tmp_path: Path) -> None:
     chance = random.Random(SEED)
-    refused = 0
+    rejected = 0
     for _ in range(300):
         data = bytearray(GOOD_MAP.encode())
         data[chance.randrange(len(data))] = chance.choice([0, 0xFF, 0x80, *range(9, 127)])
-        refused += refusal(write(tmp_path, MAP_MACHINE, bytes(data))) is not None
-    assert 150 < refused < 300
+        rejected += rejection(write(tmp_path, MAP_MACHINE, bytes(data))) is not None
+    assert 150 < rejected < 300
 
 
-def test_rows_left_out_by_chance_are_refused_or_still_a_machine(tmp_path: Path) -> None:
+def test_rows_left_out_by_chance_are_rejected_or_still_a_machine(tmp_path: Path) -> None:
     chance = random.Random(SEED)
-    said = []
+    messages = []
     for _ in range(60):
         left = sorted(chance.sample(range(len(ROWS)), chance.randrange(60, len(ROWS))))
-        said.append(refusal(write(tmp_path, MAP_MACHINE, csv([ROWS[at] for at in left]))))
-    assert 5 < sum(text is not None for text in said) < 60
+        messages.append(rejection(write(tmp_path, MAP_MACHINE, csv([ROWS[at] for at in left]))))
+    assert 5 < sum(text is not None for text in messages) < 60
 
 
 @pytest.mark.parametrize(
@@ -462,7 +461,7 @@ def test_rows_left_out_by_chance_are_refused_or_still_a_machine(tmp_path: Path) 
     ["nosuch.csv", "../nosuch.csv", "/nosuch/x.csv", "folder.csv", "pipe.csv", "zeros.csv", "itself.csv", "sparse.csv",
      "mutant.toml", "", "x.txt", "x" * 300 + ".csv", "a\\u0000b.csv", "a\\nb.csv", "3"],
 )  # fmt: skip
-def test_what_is_no_readable_map_is_refused(tmp_path: Path, file: str) -> None:
+def test_an_unreadable_map_is_rejected(tmp_path: Path, file: str) -> None:
     (tmp_path / "folder.csv").mkdir()
     os.mkfifo(tmp_path / "pipe.csv")
     (tmp_path / "zeros.csv").symlink_to("/dev/zero")
@@ -497,13 +496,13 @@ def built() -> set[str]:
 
 
 def still_runs(words: str) -> bool:
-    """Whether any process but this one has words in its command line."""
+    """Another process than this one has words in its command line."""
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
             if path.parent.name != str(os.getpid()) and words in path.read_bytes().decode(errors="replace"):
                 return True
         except OSError:
-            continue  # it has ended meanwhile
+            continue  # it has ended
     return False
 
 
@@ -530,5 +529,6 @@ def test_commands_end_with_one_line_and_code_2_and_build_nothing(
     assert line.startswith(f"salient: {tmp_path}/") and named in line, line
     assert not any(case in name for name in built())
     assert case not in (BUILD / "host" / "CMakeCache.txt").read_text()
+    assert not any(case in note.read_text() for note in BUILD.glob("machine-*/machine_file"))
     assert not still_runs(str(tmp_path))
     assert {entry.name for entry in tmp_path.iterdir()} <= before | {"out"}

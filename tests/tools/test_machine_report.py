@@ -6,7 +6,6 @@ import re
 import tomllib
 
 from salient.machine import file as machine
-from salient.machine import magnetics
 from salient.machine.report import describe
 from salient.paths import MACHINES
 
@@ -14,9 +13,9 @@ READ_ME = (MACHINES / "README.md").read_text(encoding="utf-8")
 
 
 def test_every_key_of_a_machine_file_is_in_the_reference_and_no_other():
-    tables = [machine.WINDING, machine.MECHANICS, machine.SUPPLY, machine.CONVERTER, machine.SENSORS, machine.DC_LINK,
-              machine.CHOPPER, machine.IRON_LOSS, *magnetics.FORMULA_KEYS.values()]
-    keys = {key for table in tables for key in table} | {"name", "stator", "rotor", "form", "file"}
+    tables = [machine.Poles, machine.Winding, machine.Mechanics, machine.Converter, machine.DcLink, machine.Sensors,
+              machine.IronLoss, *machine.MAGNETICS.values()]
+    keys = {key for table in tables for key in table.model_fields} | {"name"}
     table = READ_ME.partition("## Keys")[2].partition("## Flux-linkage maps")[0]
     rows = [row.split("|")[2] for row in table.splitlines() if row.startswith("| ") and "---" not in row]
     assert set(re.findall(r"`(\w+)`", "".join(rows))) == keys

@@ -1,4 +1,5 @@
-"""`python -m salient.vm.run` gives a command a real vcan0, the host's files and a way back for output and exit code."""
+"""`python -m salient.vm.run` runs a command in a VM with a real vcan0 and the files of the host, and returns its output
+and exit code."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from pathlib import Path
 
 from salient.paths import ROOT
 
-# Only the standard library: its imports are quick in the guest.
+# Standard library only, because imports are slow in the VM.
 SCRIPT = """
 import os, socket, struct, sys
 from pathlib import Path
@@ -51,9 +52,9 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_command_has_vcan0_and_files_and_its_output_and_exit_code_come_back(tmp_path: Path) -> None:
-    result_file = tmp_path / "result, of the guest"
-    python = os.path.realpath(sys.executable)  # the virtual environment may be in a folder that the guest does not see
+def test_a_command_has_vcan0_and_files_and_returns_output_and_exit_code(tmp_path: Path) -> None:
+    result_file = tmp_path / "result, of the VM"
+    python = os.path.realpath(sys.executable)  # the virtual environment may be in a folder that the VM does not mount
     odd = "a  b'c\"$d"
     outcome = run("--write", str(tmp_path), "--", python, "-I", "-c", SCRIPT, str(ROOT), str(result_file), odd)
     assert outcome.returncode == 7, outcome.stderr
@@ -62,7 +63,7 @@ def test_command_has_vcan0_and_files_and_its_output_and_exit_code_come_back(tmp_
     assert result_file.read_text() == "written in the guest"
 
 
-def test_time_limit_ends_the_guest_with_one_line() -> None:
+def test_the_time_limit_ends_the_vm_with_one_line() -> None:
     outcome = run("--timeout-s", "0.1", "--", "true")  # far less than the kernel needs
     assert outcome.returncode == 1
     assert outcome.stderr.splitlines()[-1] == (
@@ -70,7 +71,7 @@ def test_time_limit_ends_the_guest_with_one_line() -> None:
     )
 
 
-def test_folder_that_is_none_is_named() -> None:
+def test_a_missing_folder_is_named() -> None:
     outcome = run("--write", "/no/such/folder", "--", "true")
     assert outcome.returncode == 2
     assert "--write /no/such/folder: not a folder" in outcome.stderr

@@ -1,4 +1,4 @@
-"""The commands, once everything that they need is there: python -m salient COMMAND ..."""
+"""The commands, for an installed package: python -m salient COMMAND ..."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import os
 import sys
 from pathlib import Path
 
+from salient.bench.config import OPTIONS, BenchConfig
 from salient.cli import make_parser
 from salient.errors import UsageError
 from salient.paths import BUILD
 
 
 def main() -> int:
-    """Runs a command; returns the exit code: 0 done, 1 what was tested failed, 2 the caller's mistake."""
+    """Runs a command; returns the exit code: 0 done, 1 the thing tested failed, 2 a mistake of the caller."""
     options = make_parser().parse_args()
     if getattr(options, "can", None) == "auto":
         options.can = _automatic_can()
@@ -25,13 +26,13 @@ def main() -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        # Whoever read our output has gone, as head does; nothing more can be said there.
+        # The reader of the output has closed it, as head does.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
 
 
 def _automatic_can() -> str:
-    """vcan0 where it is up, else the local bus."""
+    """vcan0 when it is up, else the local bus."""
     try:
         up = int(Path("/sys/class/net/vcan0/flags").read_text(), 16) & 1
     except OSError:
@@ -56,25 +57,11 @@ def _test(options: argparse.Namespace) -> int:
 
 
 def _sim(options: argparse.Namespace) -> int:
-    from salient.bench.emulator import SimulatorError, SimulatorOptions
+    from salient.bench.emulator import EmulatorError, command_line
 
     try:
-        command = SimulatorOptions(
-            machine=options.machine,
-            controller=options.controller,
-            control_rate_hz=options.control_rate_hz,
-            encoder_bits=options.encoder_bits,
-            encoder_edges=options.encoder_edges,
-            adc_bits=options.adc_bits,
-            immediate_pwm=options.immediate_pwm,
-            seed=options.seed,
-            initial_angle_deg=options.initial_angle_deg,
-            pace=options.pace,
-            bit_rate=options.bit_rate,
-            build=options.target,
-            instruction_ns=options.instruction_ns,
-        ).arguments(options.can)
-    except SimulatorError as error:
+        command = command_line(BenchConfig(**{name: value for name, value in vars(options).items() if name in OPTIONS}))
+    except EmulatorError as error:
         print(f"salient: {error}", file=sys.stderr)
         return 1
     os.execv(command[0], command)
@@ -85,7 +72,7 @@ def _run(options: argparse.Namespace) -> int:
 
     scenarios = load_scenarios(options.scenario)
     out = options.out or Path("out") / options.scenario.stem
-    results = run_all(scenarios, out, build=options.target, instruction_ns=options.instruction_ns,
+    results = run_all(scenarios, out, build=options.build, instruction_ns=options.instruction_ns,
                       progress=lambda line: print(line, flush=True))
     print(f"results: {out / 'results.json'}")
     faults = [f"{controller}: {result.fault}" for controller, result in results.items() if result.fault != "none"]
@@ -107,7 +94,7 @@ def _monitor(options: argparse.Namespace) -> int:
     return monitor(options.can, options.every_s, options.duration_s)
 
 
-def _bench(options: argparse.Namespace) -> int:
+def _benchmark(options: argparse.Namespace) -> int:
     from salient.benchmark.command import run
 
     return run(options.runs, options.json)
@@ -138,7 +125,7 @@ _COMMANDS = {
     "run": _run,
     "log": _log,
     "monitor": _monitor,
-    "bench": _bench,
+    "benchmark": _benchmark,
     "compare": _compare,
     "machine": _machine,
     "pil": _pil,

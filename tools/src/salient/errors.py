@@ -1,5 +1,5 @@
-"""What a user did wrong, as opposed to what went wrong."""
+"""Mistakes of the user, as opposed to failures."""
 
 
 class UsageError(Exception):
-    """A mistake of the caller; the text is one line that names the offending thing and what is allowed. Exit code 2."""
+    """A mistake of the caller; the text is one line that names the mistake and the values allowed. Exit code 2."""

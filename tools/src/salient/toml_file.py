@@ -1,24 +1,38 @@
-"""Reads a text file that somebody else wrote: never waits, never takes more than it may."""
+"""Reads TOML files of users: bounded in size and time, checked by a model, every mistake one line.
+
+A model is a subclass of Table whose fields have the types made here: number, whole, one_of, SWITCH, or another Table.
+"""
 
 from __future__ import annotations
 
+import re
 import stat
 import tomllib
 from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, WrapValidator
+from pydantic_core import PydanticCustomError
+
+from salient.bench import config
+from salient.bench.config import OPTIONS, either
 
 TOML_BYTES_MAX = 1_000_000
 
+_SHOWN_MAX = 60  # characters of a wrong value in a message
+
 
 class TextFileError(Exception):
-    """A file that cannot be read; the text is the rest of a line that begins with its path."""
+    """A file that cannot be used; the text is the rest of a line that begins with its path."""
 
 
 def read_text(path: Path, bytes_max: int) -> str:
-    """The whole file, UTF-8 with or without a mark at its start."""
+    """The whole file, UTF-8 with or without a byte order mark."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise TextFileError("not a file")  # a pipe would make us wait, a device may never end
+            raise TextFileError("not a file")  # a pipe may block, a device may have no end
         if status.st_size > bytes_max:
             raise TextFileError(f"larger than {bytes_max // 1_000_000} MB")
         return path.read_bytes().decode("utf-8-sig")
@@ -36,5 +50,123 @@ def read_toml(path: Path) -> dict:
         return tomllib.loads(read_text(path, TOML_BYTES_MAX))
     except tomllib.TOMLDecodeError as error:
         raise TextFileError(f"not TOML: {error}") from None
-    except (ValueError, RecursionError):  # what tomllib lets through
+    except (ValueError, RecursionError):  # of tomllib itself
         raise TextFileError("not TOML: a number too long or tables too deep") from None
+
+
+# --- types ----------------------------------------------------------------------------------------------------------
+
+class Table(BaseModel):
+    """A table of a file: no other keys than its fields, no conversions."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+def number(low: float, high: float) -> Any:
+    """A finite number from low to high, an integer or not."""
+    return checked(Annotated[float, Field(ge=low, le=high, allow_inf_nan=False)], f"a number from {low:g} to {high:g}")
+
+
+def any_number() -> Any:
+    """A finite number."""
+    return checked(Annotated[float, Field(allow_inf_nan=False)], "a number")
+
+
+def whole(low: int, high: int) -> Any:
+    """An integer from low to high."""
+    return checked(Annotated[int, Field(ge=low, le=high)], f"a whole number from {low} to {high}")
+
+
+def one_of(choices: tuple) -> Any:
+    """One of some words or integers; 17.0 and true are not integers."""
+    return checked(type(choices[0]), either(choices), lambda value: value in choices)
+
+
+def option(name: str) -> Any:
+    """The type of an option of the test bench."""
+    record = OPTIONS[name]
+    if record.choices:
+        return checked(type(record.choices[0]), record.allowed, lambda value: value in record.choices)
+    if record.kind == config.INTEGER:
+        return whole(int(record.minimum), int(record.maximum))
+    if record.kind == config.NUMBER:
+        return number(record.minimum, record.maximum)
+    return checked(bool if record.kind == config.FLAG else str, record.allowed)
+
+
+def checked(kind: Any, allowed: str, accepts=lambda value: True) -> Any:
+    """A type whose mistakes all have the same text: "must be" and what is allowed."""
+
+    def check(value: Any, validate: Any) -> Any:
+        try:
+            result = validate(value)
+            if accepts(result):
+                return result
+        except ValidationError:
+            pass
+        raise PydanticCustomError("must_be", "{text}", {"text": f"must be {allowed}"})
+
+    return Annotated[kind, WrapValidator(check)]
+
+
+# --- checking -------------------------------------------------------------------------------------------------------
+
+_Model = TypeVar("_Model", bound=Table)
+
+
+def validate(model: type[_Model], data: object, section: str = "") -> _Model:
+    """The data as a model; TextFileError: key, value and what is allowed. section: the key of the data in the file."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise TextFileError(_one_line(error, model, section)) from None
+
+
+def shown(value: object) -> str:
+    """A value or key of a file, short and on one line."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        return "a value too long to show"
+    return text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
+
+
+def _one_line(error: ValidationError, model: type[Table], section: str) -> str:
+    """The first mistake; an unknown key before others, because a misspelt key is missing as well."""
+    found = min(error.errors(include_url=False), key=lambda each: each["type"] != "extra_forbidden")
+    place = [part for part in found["loc"] if isinstance(part, str)]
+    *parents, last = [*([section] if section else []), *place] or [""]
+    is_plain = re.fullmatch(r"\w+", last, re.ASCII) and len(last) <= _SHOWN_MAX
+    key = ".".join([*parents, last if is_plain else shown(last)])
+    if found["type"] == "missing":
+        return f"{key}: missing"
+    if found["type"] == "extra_forbidden":
+        return f"{key}: unknown key; must be one of {', '.join(_keys(model, place[:-1]))}"
+    if found["type"] == "must_be":
+        return f"{key}: {shown(found['input'])}: {found['msg']}"
+    if found["type"] in ("model_type", "dict_type"):
+        in_array = bool(found["loc"]) and isinstance(found["loc"][-1], int)
+        return f"{key}: must be {f'tables [[{key}]]' if in_array else f'a table [{key}]'}"
+    if found["type"] == "list_type":
+        tables = _table_in(_annotation(model, place)) is not None
+        return f"{key}: must be {f'tables [[{key}]]' if tables else 'an array'}"
+    return f"{key}: {shown(found['input'])}: {found['msg']}"
+
+
+def _annotation(model: Any, place: list[str]) -> Any:
+    """The type at a place of a model."""
+    for part in place:
+        model = _table_in(model).model_fields[part].annotation
+    return model
+
+
+def _keys(model: Any, place: list[str]) -> list[str]:
+    """The keys of the table at a place of a model."""
+    return list(_table_in(_annotation(model, place)).model_fields)
+
+
+def _table_in(annotation: Any) -> Any:
+    """The Table of an annotation such as list[Table] or Table | None."""
+    if get_origin(annotation) in (list, tuple, Union, UnionType):
+        return next((found for part in get_args(annotation) if (found := _table_in(part)) is not None), None)
+    return annotation if isinstance(annotation, type) and issubclass(annotation, Table) else None

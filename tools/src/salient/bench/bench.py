@@ -1,4 +1,4 @@
-"""A drive and a rig on a bus of their own, in lock-step: what the pytest fixture `bench` gives.
+"""A drive and its test bench on a bus for them alone, in lock-step: the value of the pytest fixture `bench`.
 
     bench.drive.speed_reference_rpm = 600
     bench.at(0.13).load_torque_Nm = 8
@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
-from salient.bench.emulator import Simulator, SimulatorOptions, parameter_table
+from salient.bench.config import BenchConfig
+from salient.bench.emulator import EmulatorProcess, parameter_table
 from salient.bench.session import Session
 from salient.bus.log import write_logs
 
@@ -20,33 +22,35 @@ LAST_MOMENTS_S = 0.05
 
 
 class Bench(Session):
-    """A session with a simulator of its own.
+    """A session with an emulator that it starts and ends.
 
-    options: see SimulatorOptions; can: "unix:PATH" or "socketcan:INTERFACE", one bench at a time on an interface.
+    config: its pace is not used, a bench is in lock-step. can: "unix:PATH" or "socketcan:INTERFACE", one bench at
+    a time on an interface. options: the configuration. simulator: the process.
     """
 
-    options: SimulatorOptions
-    simulator: Simulator
+    options: BenchConfig
+    simulator: EmulatorProcess
 
-    def __init__(self, options: SimulatorOptions, can: str) -> None:
-        self.options = options
-        self.simulator = Simulator(options, can)
+    def __init__(self, config: BenchConfig, can: str) -> None:
+        self.options = replace(config, pace="lockstep")
+        self.simulator = EmulatorProcess(self.options, can)
         try:
-            super().__init__(can, parameter_table=lambda: parameter_table(options))
+            super().__init__(can, parameter_table=lambda: parameter_table(config),
+                             is_alive=lambda: self.simulator.is_alive)
         except BaseException:
             self.simulator.close()
             raise
 
     def close(self) -> None:
-        """Ends session and simulator; SimulatorError when the simulator did not end well."""
+        """Ends session and emulator; EmulatorError when the exit code of the emulator is not 0."""
         try:
             super().close()
         finally:
             self.simulator.close()
 
     def save(self, folder: Path, replay: str) -> None:
-        """Leaves what explains a failure: log (BLF and candump text), plot of the last moments, seed and options, and
-        the command that replays it."""
+        """Writes the evidence of a failure: log (BLF and candump text), plot of the last moments, seed and command
+        line, and the command that replays it."""
         folder.mkdir(parents=True, exist_ok=True)
         write_logs(self.log, folder / "can.blf", folder / "can.log")
         notes = {
@@ -61,7 +65,7 @@ class Bench(Session):
 
 
 def plot_last_moments(session: Session, path: Path) -> None:
-    """Speed, torque and phase currents, true and as the drive has them, over the last LAST_MOMENTS_S."""
+    """Speed, torque and phase currents, true and in the telemetry, over the last LAST_MOMENTS_S."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,167 +1,150 @@
-"""Starts a drive and its bench in one process: the host executable, or QEMU with an image for one of its boards."""
+"""Starts a drive and its test bench in one process: the host executable, or QEMU with an image for a board."""
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import json
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
+from salient.bench.config import TARGET_BUILDS, BenchConfig
 from salient.bench.drive import ParameterRow, read_parameter_table
 from salient.bench.session import Session
+from salient.builder import run_commands
 from salient.elf import Image
 from salient.errors import UsageError
 from salient.machine.file import MachineError, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
 from salient.paths import BUILD, MACHINES, ROOT
 
-_END_TIMEOUT_S = 60.0
 
-TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os", "rv32")
-"""The image for the Cortex-M4 as it is meant to be, without optimisation, and optimised for size; that for RV32."""
-
-
-class SimulatorError(Exception):
-    """The executable failed; the text has what it wrote."""
+class EmulatorError(Exception):
+    """The executable failed; the text has its standard error."""
 
 
-@dataclass(frozen=True)
-class SimulatorOptions:
-    """What a drive and its bench are started with; the executable checks the values.
-
-    machine: a shipped machine's name or a machine file's path. encoder_bits 0: ideal. encoder_edges: the board captures
-    the encoder's edges. adc_bits: 12..16. immediate_pwm: what the control writes acts at once, as with no converter
-    there is; it is for the conditions of simulations. record: file for the true state
-    (.npy), every record_step_ns from record_from_us on. record_switches: file for the compare values of each control
-    period. build: host or sanitize, or one of TARGET_BUILDS for the firmware on a board of QEMU. instructions: file
-    for the instructions of each control interrupt, uint32 little endian; execution: file for what the processor did,
-    as salient.target.trace reads it; both in QEMU only. instruction_ns: time of an instruction, one of INSTRUCTION_NS,
-    or None and the drive takes no time; on the Cortex-M4 only.
-    """
-
-    machine: str = "saturating"
-    controller: str = "traditional"
-    control_rate_hz: int = 40_000
-    encoder_bits: int = 17
-    encoder_edges: bool = False
-    adc_bits: int = 12
-    immediate_pwm: bool = False
-    seed: int = 1
-    initial_angle_deg: float = 0.0
-    pace: str = "lockstep"
-    bit_rate: int = 1_000_000
-    record: Path | None = None
-    record_step_ns: int = 1000
-    record_from_us: int = 0
-    record_switches: Path | None = None
-    build: str = "host"
-    instructions: Path | None = None
-    execution: Path | None = None
-    instruction_ns: int | None = None
-
-    def arguments(self, can: str) -> list[str]:
-        """The executable's command line on the bus `can`."""
-        line = [
-            *self._program(), "--can", can, "--pace", self.pace,
-            "--controller", self.controller, "--control-rate-hz", str(self.control_rate_hz),
-            "--encoder-bits", str(self.encoder_bits), "--seed", str(self.seed),
-            "--initial-angle-deg", f"{self.initial_angle_deg:.17g}", "--bit-rate", str(self.bit_rate),
-            "--adc-bits", str(self.adc_bits),
-        ]  # fmt: skip
-        if self.encoder_edges:
-            line.append("--encoder-edges")
-        if self.immediate_pwm:
-            line.append("--immediate-pwm")
-        if self.record is not None:
-            line += ["--record", str(self.record), "--record-step-ns", str(self.record_step_ns)]
-            line += ["--record-from-us", str(self.record_from_us)]
-        if self.record_switches is not None:
-            line += ["--record-switches", str(self.record_switches)]
-        return line
-
-    def _program(self) -> list[str]:
-        program = executable(self.machine, self.build)
-        if self.build not in TARGET_BUILDS:
-            if self.instruction_ns is not None:
-                raise UsageError(f"--instruction-ns {self.instruction_ns}: only with --target cortex-m4")
-            return [str(program)]
-        line = [str(program), str(image(self.machine, self.build))]
-        if self.instructions is not None:
-            line += ["--instructions", str(self.instructions)]
-        if self.execution is not None:
-            end, begin = Image(image(self.machine, self.build)).stack()
-            line += ["--execution", str(self.execution), f"{end:#x}-{begin:#x}"]
-        if self.instruction_ns is not None:
-            line += ["--instruction-ns", str(self.instruction_ns)]
-        return line
+_BUILDERS = {"host": "any tools/salient command",
+             "debug": "cmake --preset debug && cmake --build --preset debug"}
+_TESTS = "tools/salient test"
 
 
-@lru_cache
+# --- programs -------------------------------------------------------------------------------------------------------
+
 def executable(machine: str, build: str = "host") -> Path:
-    """The executable for a machine; the one for a foreign machine file is built first. UsageError.
+    """The executable for a machine and a build (BenchConfig.build); that for a user's machine file is built first.
 
-    Of a target build: the host's program that starts QEMU with image().
+    For a target build it is the program that starts QEMU with image(). UsageError: no such machine, a mistake in its
+    file, or the executable of a bundled machine is not built.
     """
-    try:
-        path = machine_path(machine)
-        checked = load_machine(path)
-        if path.parent != MACHINES:
-            machine_phase_map(path, checked)  # or the build would fail
-    except MachineError as error:
-        raise UsageError(str(error)) from None
-    needed = {"host": f"salient_target_{path.stem}", build: f"salient_{path.stem}.elf"}
-    if build not in TARGET_BUILDS:
-        needed = {build: f"salient_{path.stem}"}
-    programs = [BUILD / preset / "bin" / name for preset, name in needed.items()]
-    for preset, program in zip(needed, programs, strict=True):
-        if path.parent != MACHINES:
-            _build_foreign(path, program, preset)
-        if not program.exists():
-            builder = "tools/salient test --only target" if build in TARGET_BUILDS else "any tools/salient command"
-            raise UsageError(f"{program.relative_to(ROOT)} is not built; {builder} builds it")
-    return programs[0]
+    return _programs(machine, build)[0]
 
 
 def image(machine: str, build: str) -> Path:
-    """What executable() runs of a target build. UsageError."""
-    executable(machine, build)
-    return BUILD / build / "bin" / f"salient_{machine_path(machine).stem}.elf"
+    """The image that executable() runs for a target build. UsageError as executable()."""
+    return _programs(machine, build)[1]
 
 
-def _build_foreign(path: Path, program: Path, build: str) -> None:
+def command_line(config: BenchConfig) -> list[str]:
+    """The command line that starts a test bench. UsageError: as executable(), and options that exclude each other."""
+    program = str(executable(config.machine, config.build))
+    if config.build not in TARGET_BUILDS:
+        if config.instruction_ns is not None:
+            raise UsageError(f"--instruction-ns {config.instruction_ns}: only with --target cortex-m4")
+        return [program, *config.arguments()]
+    elf = image(config.machine, config.build)
+    line = [program, str(elf)]
+    if config.instructions is not None:
+        line += ["--instructions", str(config.instructions)]
+    if config.execution is not None:
+        end, begin = Image(elf).stack()
+        line += ["--execution", str(config.execution), f"{end:#x}-{begin:#x}"]
+    if config.instruction_ns is not None:
+        line += ["--instruction-ns", str(config.instruction_ns)]
+    return [*line, *config.arguments()]
+
+
+@lru_cache
+def _programs(machine: str, build: str) -> list[Path]:
+    """The program to start, and for a target build the image."""
+    try:
+        path = machine_path(machine)
+        checked = load_machine(path)
+        is_bundled = path.parent == MACHINES
+        if not is_bundled:
+            machine_phase_map(path, checked)  # or the build would fail
+    except MachineError as error:
+        raise UsageError(str(error)) from None
+    names = {build: f"salient_{path.stem}"}
+    if build in TARGET_BUILDS:
+        names = {"host": f"salient_target_{path.stem}", build: f"salient_{path.stem}.elf"}
+    if not is_bundled:
+        return _build_custom(path, names)
+    programs = [BUILD / preset / "bin" / name for preset, name in names.items()]
+    for program in programs:
+        if not program.exists():
+            raise UsageError(f"{program.relative_to(ROOT)} is not built; {_BUILDERS.get(build, _TESTS)} builds it")
+    return programs
+
+
+def _build_custom(path: Path, names: dict[str, str]) -> list[Path]:
+    """Builds the programs (preset: name) for a user's machine file in a folder of the file, one process at a time."""
     if (MACHINES / path.name).exists():
-        raise UsageError(f"{path}: a shipped machine is called {path.stem}; give the file another name")
+        raise UsageError(f"{path}: a bundled machine has the name {path.stem}; rename the file")
     if not path.stem.isidentifier() or not path.stem.isascii():
-        raise UsageError(f"{path}: the file's name must be letters, digits and underscores")
+        raise UsageError(f"{path}: the name of the file must be letters, digits and underscores")
     if shutil.which("cmake") is None:
-        raise UsageError("cmake is missing, and a machine file of your own needs a build")
-    log = BUILD / f"machine_{path.stem}.log"
-    with log.open("wb") as output:
-        for command in (
-            ["cmake", "--preset", build, f"-DSALIENT_MACHINE_FILE={path}"],
-            ["cmake", "--build", "--preset", build, "--target", program.name],
-            # The build folder does not keep hold of a file that may go away.
-            ["cmake", "--preset", build, "-DSALIENT_MACHINE_FILE="],
-        ):
-            if subprocess.run(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT).returncode != 0:
-                raise SimulatorError(f"building for {path} failed: see {log.relative_to(ROOT)}")
+        raise UsageError("cmake is missing; a machine file of your own requires a build")
+    _remove_orphans()
+    folder = BUILD / f"machine-{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        (folder / "machine_file").write_text(str(path), encoding="utf-8")
+        commands = []
+        for preset, name in names.items():
+            if not (folder / preset / "build.ninja").exists():
+                commands.append(["cmake", "--preset", preset, "-B", str(folder / preset),
+                                 f"-DSALIENT_MACHINE_FILE={path}"])
+            commands.append(["cmake", "--build", str(folder / preset), "--target", name])
+        log = folder / "build.log"
+
+        def notice() -> None:
+            print(f"salient: building the drive for {path}", file=sys.stderr, flush=True)
+
+        if not run_commands(commands, ROOT, log, notice):
+            raise EmulatorError(f"building the drive for {path} failed: see {log.relative_to(ROOT)}")
+    return [folder / preset / "bin" / name for preset, name in names.items()]
 
 
-class Simulator:
+def _remove_orphans() -> None:
+    """Removes the builds of machine files that are gone."""
+    for note in BUILD.glob("machine-*/machine_file"):
+        try:
+            if not Path(note.read_text(encoding="utf-8")).exists():
+                shutil.rmtree(note.parent, ignore_errors=True)
+        except OSError:
+            continue  # another process removes it
+
+
+# --- process --------------------------------------------------------------------------------------------------------
+
+class EmulatorProcess:
     """A running executable, ended with this process or by close().
 
-    prefix: a command that runs the executable's, as a profiler's does.
-    ready: what its JSON line said. UsageError when it refuses its options, SimulatorError when it fails.
+    prefix: a command that runs the executable's, such as a profiler.
+    config: with the bus that it is on. command: its command line. ready: its JSON line. UsageError when it refuses its
+    options, EmulatorError when it fails.
     """
 
-    def __init__(self, options: SimulatorOptions, can: str, prefix: Sequence[str] = ()) -> None:
-        self.options = options
-        self.can = can
-        self.command = [*prefix, *options.arguments(can)]
+    def __init__(self, config: BenchConfig, can: str, prefix: Sequence[str] = ()) -> None:
+        self.config = replace(config, can=can)
+        self.command = [*prefix, *command_line(self.config)]
         self._errors = tempfile.TemporaryFile()
         self._process = subprocess.Popen(
             [*self.command, "--follow-stdin"],
@@ -180,25 +163,26 @@ class Simulator:
         return self._process.pid
 
     @property
+    def is_alive(self) -> bool:
+        """It has not ended; one that a debugger has stopped is alive."""
+        return self._process.poll() is None
+
+    @property
     def errors(self) -> str:
-        """What it wrote to its standard error so far."""
+        """Its standard error so far."""
         self._errors.seek(0)
         return self._errors.read().decode(errors="replace").strip()
 
     def close(self) -> None:
-        """Lets it end: recording finished, socket removed. SimulatorError when it ends with anything but 0."""
-        if self._process.poll() is None:
+        """Ends it and waits: recording finished, socket removed. EmulatorError when its exit code is not 0."""
+        if self.is_alive:
             self._process.stdin.close()
-            try:
-                self._process.wait(_END_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+            self._process.wait()
         self._process.stdout.close()
         if self._process.returncode != 0:
             self._raise_failure(self._process.returncode)
 
-    def __enter__(self) -> Simulator:
+    def __enter__(self) -> EmulatorProcess:
         return self
 
     def __exit__(self, *exception) -> None:
@@ -208,20 +192,21 @@ class Simulator:
         errors = self.errors
         if code == 2:
             raise UsageError(errors.removeprefix("salient: "))
-        raise SimulatorError(f"{self.command[0]} ended with {code}: {errors or 'it wrote nothing'}")
+        raise EmulatorError(f"{self.command[0]} ended with {code}: {errors or 'its standard error is empty'}")
 
 
-def parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
-    """The parameters of the drive that these options start, asked from a drive of its own, so that asking takes no time
-    on the bus of an experiment."""
-    return _parameter_table(replace(options, record=None, record_switches=None, instructions=None, execution=None,
-                                    instruction_ns=None, pace="lockstep"))
+def parameter_table(config: BenchConfig) -> list[ParameterRow]:
+    """The parameters of the drive of a test bench, read from a second drive, so that reading takes no time on the bus
+    of an experiment."""
+    return _parameter_table(replace(config, can="auto", pace="lockstep", record=None, record_step_ns=1000,
+                                    record_from_us=0, record_switches=None, instructions=None, execution=None,
+                                    instruction_ns=None))
 
 
 @lru_cache
-def _parameter_table(options: SimulatorOptions) -> list[ParameterRow]:
+def _parameter_table(config: BenchConfig) -> list[ParameterRow]:
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         can = f"unix:{folder}/can.sock"
-        with Simulator(options, can), Session(can) as session:
+        with EmulatorProcess(config, can) as process, Session(can, is_alive=lambda: process.is_alive) as session:
             session.rig.truth_period_us = 0
             return read_parameter_table(session)

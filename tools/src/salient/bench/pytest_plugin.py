@@ -5,12 +5,12 @@
         bench.drive.speed_reference_rpm = 600
         bench.run_for(0.1)
 
-`bench` is one drive with its rig; `make_bench(**options)` starts as many as a test wants, one after the other or (on
-local buses) at once. The options are those of SimulatorOptions. A failed test leaves its logs, a plot of the last
-moments, seed and replay command in a folder that the failure message names.
+`bench` is one drive with its test bench; `make_bench(**options)` starts any number of them, one after the other or (on
+local buses) simultaneously. The options are the fields of BenchConfig. A failed test leaves its logs, a plot of the
+last moments, seed and replay command in a folder that the failure message names.
 
-Marks: `both_transports`, the test is also run over real SocketCAN; `socketcan`, the test needs an interface and is only
-run with --salient-can socketcan:INTERFACE.
+Marks: `both_transports`, the test is also run over real SocketCAN; `socketcan`, the test requires an interface and is
+only run with --salient-can socketcan:INTERFACE.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 import pytest
 
 from salient.bench.bench import Bench
-from salient.bench.emulator import TARGET_BUILDS, SimulatorOptions
+from salient.bench.config import HOST_BUILDS, TARGET_BUILDS, BenchConfig
 from salient.paths import BUILD, ROOT
 
 _benches_key = pytest.StashKey[list[Bench]]()
@@ -34,37 +34,38 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("salient")
     group.addoption("--salient-can", default="local", metavar="BUS",
                     help="local (default): a local bus for each bench; or socketcan:INTERFACE")
-    group.addoption("--salient-build", default="host", choices=("host", "sanitize", *TARGET_BUILDS),
-                    help="which build is tested")
+    group.addoption("--salient-build", default="host", choices=(*HOST_BUILDS, *TARGET_BUILDS),
+                    help="build under test (default host)")
     group.addoption("--salient-failures", default=str(BUILD / "failures"), metavar="DIR",
-                    help="where failed tests leave their folders")
+                    help="parent of the folders that failed tests leave")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     can = config.getoption("--salient-can")
     if can != "local" and not re.fullmatch(r"socketcan:\S+", can):
-        raise pytest.UsageError(f"--salient-can {can}: allowed are local and socketcan:INTERFACE")
-    config.addinivalue_line("markers", "bench_options(**options): SimulatorOptions of the fixture bench")
+        raise pytest.UsageError(f"--salient-can {can}: must be local or socketcan:INTERFACE")
+    config.addinivalue_line("markers", "bench_options(**options): fields of BenchConfig for the fixture bench")
     config.addinivalue_line("markers", "both_transports: the test is also run over SocketCAN")
-    config.addinivalue_line("markers", "socketcan: the test needs --salient-can socketcan:INTERFACE")
+    config.addinivalue_line("markers", "socketcan: the test requires --salient-can socketcan:INTERFACE")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """On an interface only what is meant for it is run, and the rest everywhere else."""
+    """Deselects tests that are not for the transport of this run."""
     on_interface = config.getoption("--salient-can") != "local"
-    chosen, left = [], []
+    selected, deselected = [], []
     for item in items:
-        needs = item.get_closest_marker("socketcan") is not None
-        also = item.get_closest_marker("both_transports") is not None
-        (chosen if (needs or also if on_interface else not needs) else left).append(item)
-    if left:
-        config.hook.pytest_deselected(items=left)
-        items[:] = chosen
+        interface_only = item.get_closest_marker("socketcan") is not None
+        both = item.get_closest_marker("both_transports") is not None
+        is_selected = interface_only or both if on_interface else not interface_only
+        (selected if is_selected else deselected).append(item)
+    if deselected:
+        config.hook.pytest_deselected(items=deselected)
+        items[:] = selected
 
 
 @pytest.fixture
 def make_bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[..., Bench]]:
-    """Starts benches: make_bench(machine=..., controller=..., seed=...). `can` gives a bus other than the run's."""
+    """Starts benches: make_bench(machine=..., controller=..., seed=...). can: a bus other than that of the run."""
     benches: list[Bench] = []
     request.node.stash[_benches_key] = benches
     bus = request.config.getoption("--salient-can")
@@ -74,7 +75,7 @@ def make_bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Calla
         options.setdefault("build", build)
         if can is None and bus != "local":
             can = bus
-        bench = Bench(SimulatorOptions(**options), can or f"unix:{tmp_path}/can{len(benches)}.sock")
+        bench = Bench(BenchConfig(**options), can or f"unix:{tmp_path}/can{len(benches)}.sock")
         benches.append(bench)
         return bench
 
@@ -91,7 +92,7 @@ def make_bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Calla
 
 @pytest.fixture
 def bench(request: pytest.FixtureRequest, make_bench: Callable[..., Bench]) -> Bench:
-    """One drive and its rig at virtual time 0; the mark bench_options chooses what they are."""
+    """One drive and its test bench at virtual time 0, with the options of the mark bench_options."""
     mark = request.node.get_closest_marker("bench_options")
     return make_bench(**(mark.kwargs if mark else {}))
 
@@ -111,7 +112,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo):
         folder = Path(item.config.getoption("--salient-failures")) / name / str(number)
         try:
             bench.save(folder, replay)
-        except Exception as error:  # the failure itself must still be seen
+        except Exception as error:  # must not hide the failure of the test
             report.sections.append(("salient bench", f"nothing saved in {folder}: {error!r}"))
             continue
         report.sections.append(

@@ -1,4 +1,4 @@
-"""A session with a drive and its bench on one bus: time, commands, signals, the log.
+"""A session with a drive and its test bench on one bus: time, commands, signals, the log.
 
     from salient.bench.session import Session
     session = Session("unix:build/salient.sock", lockstep=False)
@@ -21,25 +21,26 @@ from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bu
 from salient.bus.database_hash import database_hash
 from salient.bus.signals import SignalTable, drive_database, rig_database
 
-SILENCE_TIMEOUT_S = 60.0
-"""Of the wall clock: how long an emulator may say nothing at all before it counts as hanging."""
+_ALIVE_CHECK_S = 1.0
+"""Wall time between two checks that the emulator is alive; a debugger may stop it for any time."""
 
 _POLL_STEP_NS = 500_000
 _IDENTITY = drive_database().get_message_by_name("DRIVE_IDENTITY")
 
 
 class SessionError(Exception):
-    """The emulator does not answer."""
+    """The emulator has ended."""
 
 
 class Session(KnownAttributes):
     """One client's view of a bus.
 
-    lockstep: this session makes time move (the emulator's pace is lockstep). Otherwise time moves by itself, and the
-    session follows it by the times of the frames that come.
+    lockstep: this session moves time (the pace of the emulator is lockstep). Otherwise time moves by itself, and the
+    session follows it by the times of received frames. is_alive: the emulator has not ended; without it the end of the
+    emulator is seen on a local bus only. A session waits for the emulator for any wall time, as at a breakpoint.
 
-    time_ns: virtual time. log: every (time_ns, message) since the session began, in the bus's order. telemetry, truth:
-    signals of the drive and of the bench by name.
+    time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. telemetry, truth:
+    signals of the drive and of the test bench by name.
     """
 
     address: str
@@ -51,7 +52,8 @@ class Session(KnownAttributes):
     rig: Rig
 
     def __init__(self, address: str, lockstep: bool = True,
-                 parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
+                 parameter_table: Callable[[], list[ParameterRow]] | None = None,
+                 is_alive: Callable[[], bool] = lambda: True) -> None:
         self.address = address
         self.time_ns = 0
         self.log = []
@@ -60,13 +62,14 @@ class Session(KnownAttributes):
         self.drive = Drive(self, parameter_table)
         self.rig = Rig(self)
         self._lockstep = lockstep
+        self._is_alive = is_alive
         self._sequence = 0
         self._identity_checked = False
         self._bus = open_bus(address)
         self._reader = VirtualTimeReader(self._bus)
         try:
             if lockstep:
-                self._run_until(0)  # answered at once with the time it is
+                self._run_until(0)  # the answer has the present time
             else:
                 self._receive()
         except BaseException:
@@ -78,7 +81,7 @@ class Session(KnownAttributes):
         self._bus.shutdown()
 
     def leave_running(self, duration_s: float) -> None:
-        """Leaves the bus, and virtual time to pass without this session, until another client comes; lock-step only."""
+        """Leaves the bus after a request to run on for duration_s of virtual time; lock-step only."""
         self._ask_to_run(self.time_ns + round(duration_s * 1e9))
         self.close()
 
@@ -134,28 +137,36 @@ class Session(KnownAttributes):
             if self.time_ns >= time_ns:
                 return
 
-    def advance_until_frame(self, wanted: Callable[[can.Message], bool], timeout_s: float) -> can.Message:
-        """Lets virtual time pass until a frame comes that is wanted; TimeoutError after timeout_s."""
+    def advance_until_frame(self, matches: Callable[[can.Message], bool], timeout_s: float) -> can.Message:
+        """Lets virtual time pass until a frame matches; TimeoutError after timeout_s of virtual time."""
         deadline_ns = self.time_ns + round(timeout_s * 1e9)
         seen = len(self.log)
         while self.time_ns < deadline_ns:
             self.advance_to(min(deadline_ns, self.time_ns + _POLL_STEP_NS))
             for _, message in self.log[seen:]:
-                if wanted(message):
+                if matches(message):
                     return message
             seen = len(self.log)
-        raise TimeoutError(f"no such frame within {timeout_s:g} s")
+        raise TimeoutError(f"no matching frame within {timeout_s:g} s")
 
-    def receive_until(self, wanted: Callable[[can.Message], bool]) -> can.Message:
-        """Receives, while time stands still in lock-step, until a frame comes that is wanted."""
+    def receive_until(self, matches: Callable[[can.Message], bool]) -> can.Message:
+        """Receives until a frame matches; in lock-step virtual time does not pass."""
         while True:
             message = self._receive()
-            if wanted(message):
+            if matches(message):
                 return message
 
     def send(self, message: can.Message) -> None:
-        """Sends a frame of any kind."""
-        self._bus.send(message, timeout=SILENCE_TIMEOUT_S)
+        """Sends a frame of any kind; waits while the emulator takes none."""
+        while True:
+            try:
+                return self._bus.send(message, timeout=_ALIVE_CHECK_S)
+            except can.CanTimeoutError:
+                self._check_alive()
+
+    def _check_alive(self) -> None:
+        if not self._is_alive():
+            raise SessionError(f"{self.address}: the emulator has ended")
 
     def _advance(self, time_ns: int) -> None:
         if self._lockstep:
@@ -178,9 +189,8 @@ class Session(KnownAttributes):
         self.send(can.Message(arbitration_id=identifier, is_extended_id=True, data=data))
 
     def _receive(self) -> can.Message:
-        timed = self._reader.receive(SILENCE_TIMEOUT_S)
-        if timed is None:
-            raise SessionError(f"{self.address}: nothing came for {SILENCE_TIMEOUT_S:g} s")
+        while (timed := self._reader.receive(_ALIVE_CHECK_S)) is None:
+            self._check_alive()
         time_ns, message = timed
         if not self._lockstep:
             self.time_ns = max(self.time_ns, time_ns)

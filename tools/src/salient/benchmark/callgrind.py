@@ -11,7 +11,8 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from salient.bench.emulator import Simulator, SimulatorOptions
+from salient.bench.config import BenchConfig
+from salient.bench.emulator import EmulatorProcess
 from salient.bench.session import Session
 from salient.benchmark.switching_pattern import Replay, program, program_input
 from salient.errors import UsageError
@@ -41,7 +42,7 @@ def of_plant(replay: Replay) -> float:
 def of_drive(controller: str, span_s: float) -> dict[str, float]:
     """Instructions a control period by group of plant and firmware at 40 kHz, saturating machine, 600 r/min against
     8 N m, telemetry to one client: what span_s more of the same run take."""
-    options = SimulatorOptions(controller=controller)
+    options = BenchConfig(controller=controller, pace="lockstep")
     more = _count_drive(options, _SETTLE_S + span_s)
     more.subtract(_count_drive(options, _SETTLE_S))
     periods = round(span_s * options.control_rate_hz)
@@ -56,11 +57,11 @@ def _count_plant(replay: Replay, passes: int) -> int:
     return _counted(run).total()
 
 
-def _count_drive(options: SimulatorOptions, loaded_s: float) -> Counts:
+def _count_drive(options: BenchConfig, loaded_s: float) -> Counts:
     def run(prefix: list[str]) -> None:
         with tempfile.TemporaryDirectory(prefix="salient-") as folder:
             can = f"unix:{folder}/can.sock"
-            with Simulator(options, can, prefix), Session(can) as session:
+            with EmulatorProcess(options, can, prefix), Session(can) as session:
                 session.rig.truth_period_us = 0
                 session.drive.speed_reference_rpm = 600.0
                 session.run_for(_SETTLE_S)

@@ -1,5 +1,5 @@
-"""salient bench: the figures of the README, measured again: what a simulated second costs, by itself and beside other
-simulators, and what the network gives."""
+"""salient benchmark: the figures of the README, measured again: what a simulated second costs, by itself and beside
+other simulators, and what the network gives."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from salient.bench.emulator import Simulator, SimulatorError, SimulatorOptions, parameter_table
+from salient.bench.config import CONTROLLERS, BenchConfig
+from salient.bench.emulator import EmulatorError, EmulatorProcess, parameter_table
 from salient.bench.session import Session
 from salient.benchmark import callgrind as instructions
 from salient.benchmark import solvers as comparison
 from salient.benchmark.switching_pattern import record
-from salient.cli import CONTROLLERS
 from salient.errors import UsageError
 from salient.experiments.network_ablation import study
 from salient.progress import Progress
@@ -51,14 +51,15 @@ def measure(controller: str, condition: str) -> float:
     machine, control at 40 kHz; condition: of CONDITIONS."""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         recording = condition == "recording"
-        options = SimulatorOptions(
+        options = BenchConfig(
             controller=controller,
             control_rate_hz=_CONTROL_RATE_HZ,
+            pace="lockstep",
             record=Path(folder) / "recording.npy" if recording else None,
             build="cortex-m4" if condition == "cortex-m4" else "host",
         )
         can = f"unix:{folder}/can.sock"
-        with Simulator(options, can) as simulator:
+        with EmulatorProcess(options, can) as simulator:
             with Session(can, parameter_table=lambda: parameter_table(options)) as session:
                 session.drive.parameters["command_timeout_ms"] = _COMMAND_TIMEOUT_MS
                 session.rig.truth_period_us = 1000 if recording else 0
@@ -75,7 +76,7 @@ def measure(controller: str, condition: str) -> float:
 
 
 def _until_reached(pid: int, can: str, end_s: float, before_s: float) -> float:
-    """Processor seconds used when virtual time, running by itself, has come to end_s; SimulatorError when it did not or
+    """Processor seconds used when virtual time, running by itself, has come to end_s; EmulatorError when it did not or
     the drive stopped on the way."""
     for _ in range(round(_BEGIN_TIMEOUT_S / _POLL_S)):
         if _processor_s(pid) > before_s + _BEGUN_S:
@@ -92,7 +93,7 @@ def _until_reached(pid: int, can: str, end_s: float, before_s: float) -> float:
         session.run_for(2e-3)
         speed_rpm = session.telemetry["speed_rpm"].last
         if reached_s < end_s - 1e-9 or not 590.0 < speed_rpm < 610.0:
-            raise SimulatorError(f"the drive did not run on by itself: {speed_rpm:g} r/min at {reached_s:g} s")
+            raise EmulatorError(f"the drive did not run on by itself: {speed_rpm:g} r/min at {reached_s:g} s")
         return after_s
 
 
@@ -114,8 +115,6 @@ def _processor_s(pid: int) -> float:
 
 def run(runs: int, json_path: Path | None) -> int:
     """Measures everything `runs` times, prints best and median; returns 0."""
-    if runs < 1:
-        raise UsageError(f"--runs {runs}: allowed are whole numbers from 1")
     if json_path is not None:
         try:
             json_path.touch()  # a path that cannot be written is better known before the measurement

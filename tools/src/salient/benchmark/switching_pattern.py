@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from salient.bench.bench import Bench
-from salient.bench.emulator import SimulatorOptions
+from salient.bench.config import BenchConfig
 from salient.errors import UsageError
 from salient.machine.file import load_machine, machine_path
 from salient.paths import BUILD, ROOT
@@ -111,7 +111,7 @@ def record(folder: Path, duration_s: float = 0.1) -> Replay:
     0.4 s after its start on. The folder gets the recording of the true state, a row a control period from there on."""
     machine, load_torque_Nm, control_rate_hz = "saturating", 8.0, 40_000
     period_ns = 1_000_000_000 // control_rate_hz
-    options = SimulatorOptions(
+    options = BenchConfig(
         machine=machine,
         controller="paper",
         control_rate_hz=control_rate_hz,
@@ -148,7 +148,7 @@ def program(machine: str) -> Path:
     """The plant of a shipped machine alone; UsageError when it is not built."""
     path = BUILD / "host" / "bin" / f"plant_benchmark_{machine}"
     if not path.exists():
-        raise UsageError(f"{path.relative_to(ROOT)} is not built; tools/salient bench builds it")
+        raise UsageError(f"{path.relative_to(ROOT)} is not built; tools/salient benchmark builds it")
     return path
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from can import CanError
 
 from salient.bench.drive import DriveError
-from salient.bench.emulator import SimulatorError, executable
+from salient.bench.emulator import EmulatorError, executable
 from salient.bench.session import SessionError
 from salient.errors import UsageError
 from salient.experiments import metrics
@@ -84,8 +84,8 @@ class _Run:
 def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.stdout) -> int:
     """Runs everything, tells `stream` how far it is and what came out. Returns 0.
 
-    options: out, target, and machine, control_rate_hz, encoder_bits and seed, each None for what the scenario files
-    say.
+    options: out, build, and machine, control_rate_hz, encoder_bits and seed, each None for the value of the scenario
+    files.
     can: "local" for a bus of its own for each run, or "socketcan:INTERFACE", on which the runs follow each other.
     Raises UsageError, before anything is written where that can be known, and DemoFailed.
     """
@@ -93,7 +93,7 @@ def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.st
     out: Path = options.out
     _prepare_folder(out)
     try:
-        results = _run_and_report(scenarios, out, can, options.target, stream)
+        results = _run_and_report(scenarios, out, can, options.build, stream)
     except OSError as error:
         if error.errno in _CANNOT_WRITE:
             raise _cannot_write(out, error) from error
@@ -146,7 +146,7 @@ def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
     scenarios = {experiment: [replace(scenario, **changes)
                               for scenario in load_scenarios(SCENARIOS / f"{experiment}.toml")]
                  for experiment in EXPERIMENTS}
-    executable(scenarios["start_600"][0].machine, options.target)
+    executable(scenarios["start_600"][0].machine, options.build)
     return scenarios
 
 
@@ -181,7 +181,7 @@ def _run_one(experiment: str, scenario: Scenario, folder: Path, can: str, build:
     name = f"{experiment} by {scenario.controller}"
     try:
         result = run_scenario(scenario, folder, can, build)
-    except (SimulatorError, SessionError, DriveError, CanError) as error:
+    except (EmulatorError, SessionError, DriveError, CanError) as error:
         raise DemoFailed(f"{name}: {error}") from error
     if result.fault != "none":
         raise DemoFailed(f"{name}: the drive ended in fault {result.fault}; see {result.text_log_path}")

@@ -1,24 +1,19 @@
-"""Scenarios: what is asked of a drive over a stretch of virtual time, from a TOML file to recording, log and summary.
+"""Scenarios: references and loads of a drive over virtual time, from a TOML file to recording, log and summary.
 
-    machine = "saturating"                  # a shipped machine's name or the path of a machine file
+    machine = "saturating"                  # name of a bundled machine or path of a machine file
     controllers = ["traditional", "paper"]  # one run each
     duration_s = 0.4
-    seed = 1                                # optional, as everything below
-    initial_angle_deg = 0.0
-    control_rate_hz = 40000
-    encoder_bits = 17                       # 0: ideal
-    encoder_edges = false                   # true: the board captures the encoder's edges
-    adc_bits = 12
-    immediate_pwm = false                   # true: duties act at once, not in the next period
+    seed = 1                                # optional, as everything below; other fields of
+    control_rate_hz = 40000                 # salient.bench.config.Conditions likewise
 
-    [parameters]                            # the drive's parameters by name, in their units
+    [parameters]                            # parameters of the drive by name, in their units
     torque_max_Nm = 19.1
 
-    [bench]                                 # the bench variables (RIG_SET in rig.dbc), set at time 0
+    [bench]                                 # variables of the rig (RIG_SET in rig.dbc), set at time 0
     current_noise_A = 0.02
-    flux_linkage_gain = 1.05                # the machine is another one than the drive's tables say
+    flux_linkage_gain = 1.05                # the machine differs from the tables of the drive
 
-    [[speed]]                               # from the first of these the drive is asked to run
+    [[speed]]                               # the first one requests the drive to run
     at_s = 0.0
     value_rpm = 600.0
 
@@ -26,42 +21,43 @@
     at_s = 0.13
     torque_Nm = 8.0
 
-    [record]                                # the true state, for figures; without it nothing is recorded
+    [record]                                # the true state; without the table nothing is recorded
     step_us = 1.0
     from_s = 0.0
 
-`load_scenarios` gives one Scenario for each controller, `run_scenario` runs one.
+`load_scenarios` returns one Scenario per controller, `run_scenario` runs one.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import can
 import numpy as np
+from pydantic import create_model
 
 from salient.bench.bench import Bench
+from salient.bench.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
 from salient.bench.drive import DriveError, write_request
-from salient.bench.emulator import SimulatorOptions, executable, parameter_table
+from salient.bench.emulator import executable, parameter_table
 from salient.bench.rig import bench_variables
 from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database
-from salient.cli import ADC_BITS, CONTROL_RATES_HZ, CONTROLLERS, ENCODER_BITS
 from salient.errors import UsageError
 from salient.experiments.metrics import losses
 from salient.machine.file import load_machine, machine_path
-from salient.toml_file import TextFileError, read_toml
+from salient.toml_file import Table, TextFileError, any_number, number, one_of, option, read_toml, validate
 
 
 @dataclass(frozen=True)
 class SpeedStep:
-    """From at_s on the drive is asked for value_rpm."""
+    """Speed reference from at_s on."""
 
     at_s: float
     value_rpm: float
@@ -69,7 +65,7 @@ class SpeedStep:
 
 @dataclass(frozen=True)
 class LoadStep:
-    """From at_s on the bench loads the shaft with torque_Nm, positive against forward motion."""
+    """Load torque on the shaft from at_s on, positive against forward motion."""
 
     at_s: float
     torque_Nm: float
@@ -77,27 +73,18 @@ class LoadStep:
 
 @dataclass(frozen=True)
 class Record:
-    """The true state every step_us microseconds from from_s on."""
+    """Recording of the true state every step_us microseconds from from_s on."""
 
     step_us: float = 1.0
     from_s: float = 0.0
 
 
-@dataclass(frozen=True)
-class Scenario:
+@dataclass(frozen=True, kw_only=True)
+class Scenario(Conditions):
     """One run of one drive. Times in seconds of virtual time, not negative."""
 
     name: str
     duration_s: float
-    machine: str = "saturating"
-    controller: str = "traditional"
-    seed: int = 1
-    initial_angle_deg: float = 0.0
-    control_rate_hz: int = 40_000
-    encoder_bits: int = 17
-    encoder_edges: bool = False
-    adc_bits: int = 12
-    immediate_pwm: bool = False
     parameters: dict[str, float] = field(default_factory=dict)
     bench: dict[str, float] = field(default_factory=dict)
     speed: tuple[SpeedStep, ...] = ()
@@ -107,12 +94,12 @@ class Scenario:
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run left behind.
+    """Results of a run.
 
-    recording: structured array, one row each record.step_us (fields: emulator/plant/recorder.h), memory-mapped from
+    recording: structured array, one row per record.step_us (fields: emulator/plant/recorder.h), memory-mapped from
     recording_path; None when nothing was recorded.
-    telemetry, truth: signals by name as they went over CAN (salient.bus.signals.SignalTable).
-    fault: the drive's fault at the end, "none" when it is well.
+    telemetry, truth: signals by name as received over CAN (salient.bus.signals.SignalTable).
+    fault: the fault of the drive at the end, "none" without one.
     """
 
     scenario: Scenario
@@ -134,22 +121,22 @@ _RECORDING, _LOG, _TEXT_LOG = "recording.npy", "can.blf", "can.log"
 def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: str = "host",
                  instructions: Path | None = None, execution: Path | None = None,
                  instruction_ns: int | None = None) -> RunResult:
-    """Runs a scenario in lock-step and leaves recording.npy, can.blf and can.log in out_dir, which is made if needed.
+    """Runs a scenario in lock-step and writes recording.npy, can.blf and can.log to out_dir, which is made if needed.
 
-    can: "local" for a bus of its own, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; parameters
-    are written first, then the commands follow; the bench variables are set before all. For build, instructions,
-    execution, instruction_ns see SimulatorOptions. UsageError for what the drive does not know or refuses.
+    can: "local" for a new local bus, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; the variables
+    of the rig are set first, then parameters are written, then commands follow. build, instructions, execution,
+    instruction_ns: see BenchConfig. UsageError: a parameter that the drive does not know or refuses.
     """
     recording_path = out_dir / _RECORDING if scenario.record else None
-    options = replace(_simulator_options(scenario, recording_path, build), instructions=instructions,
-                      execution=execution, instruction_ns=instruction_ns)
-    writes = _parameter_writes(scenario, options)
+    config = replace(_bench_config(scenario, recording_path, build), instructions=instructions,
+                     execution=execution, instruction_ns=instruction_ns)
+    writes = _parameter_writes(scenario, config)
     out_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
-        with Bench(options, f"unix:{folder}/can.sock" if can == "local" else can) as bench:
+        with Bench(config, f"unix:{folder}/can.sock" if can == "local" else can) as bench:
             for name, value in scenario.bench.items():
                 bench.rig.set(name, value)
-            for write in writes:  # ahead of the first command; the answers are looked at in the end
+            for write in writes:  # before the first command; the answers are checked at the end
                 bench.send(write)
             for step in scenario.load:
                 bench.at(step.at_s).load_torque_Nm = step.torque_Nm
@@ -173,18 +160,10 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
     )
 
 
-def _simulator_options(scenario: Scenario, recording_path: Path | None, build: str) -> SimulatorOptions:
+def _bench_config(scenario: Scenario, recording_path: Path | None, build: str) -> BenchConfig:
     record = scenario.record or Record()
-    return SimulatorOptions(
-        machine=scenario.machine,
-        controller=scenario.controller,
-        control_rate_hz=scenario.control_rate_hz,
-        encoder_bits=scenario.encoder_bits,
-        encoder_edges=scenario.encoder_edges,
-        adc_bits=scenario.adc_bits,
-        immediate_pwm=scenario.immediate_pwm,
-        seed=scenario.seed,
-        initial_angle_deg=scenario.initial_angle_deg,
+    return BenchConfig(
+        **{name: getattr(scenario, name) for name in CONDITIONS},
         record=recording_path,
         record_step_ns=round(record.step_us * 1000),
         record_from_us=round(record.from_s * 1e6),
@@ -192,19 +171,19 @@ def _simulator_options(scenario: Scenario, recording_path: Path | None, build: s
     )
 
 
-def _parameter_writes(scenario: Scenario, options: SimulatorOptions) -> list[can.Message]:
-    """The frames that write the scenario's parameters; UsageError for what the drive does not know or would refuse."""
+def _parameter_writes(scenario: Scenario, config: BenchConfig) -> list[can.Message]:
+    """The frames that write the parameters of a scenario; UsageError: the drive does not know or would refuse one."""
     if not scenario.parameters:
         return []
-    rows = {row.name: row for row in parameter_table(options)}
+    rows = {row.name: row for row in parameter_table(config)}
     writes = []
     for name, value in scenario.parameters.items():
         row = rows.get(name)
         if row is None:
-            raise UsageError(f"parameters.{name}: the drive has no such parameter; allowed: {', '.join(rows)}")
+            raise UsageError(f"parameters.{name}: unknown parameter; must be one of {', '.join(rows)}")
         if not row.minimum <= value <= row.maximum:
             allowed = f"{row.minimum:g} to {row.maximum:g} {row.unit}".rstrip()
-            raise UsageError(f"parameters.{name}: {value:g}: allowed are {allowed}")
+            raise UsageError(f"parameters.{name}: {value:g}: must be a number from {allowed}")
         writes.append(write_request(row, value))
     return writes
 
@@ -218,10 +197,10 @@ def _check_parameters_taken(bench: Bench, count: int) -> None:
 
 
 def summary(result: RunResult) -> dict[str, Any]:
-    """Figures of a run in general: speeds and torques over the recording (or, without one, the true state on CAN).
+    """Metrics of any run: speeds and torques over the recording (or, without one, the true state on CAN).
 
-    With a recording also its losses (metrics.losses), from its first row to its last; of a processor that takes time
-    also the control interrupt's longest, what it has, and how many were late.
+    With a recording also the losses over it (metrics.losses); with instruction timing also the longest control
+    interrupt, the time available to it, and the number of late ones.
     """
     source: Any = result.recording
     if source is None:
@@ -253,7 +232,7 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build:
             instruction_ns: int | None = None,
             progress: Callable[[str], None] = lambda line: None) -> dict[str, RunResult]:
     """Runs the scenarios of one file, each into out_dir/CONTROLLER, and writes out_dir/results.json. build,
-    instruction_ns: see SimulatorOptions."""
+    instruction_ns: see BenchConfig."""
     check_parameters(scenarios, build)
     results = {}
     for scenario in scenarios:
@@ -265,9 +244,9 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build:
 
 
 def check_parameters(scenarios: list[Scenario], build: str) -> None:
-    """UsageError for parameters that the drive does not know or would refuse, before the first run."""
+    """UsageError before the first run: a parameter that the drive does not know or would refuse."""
     for scenario in scenarios:
-        _parameter_writes(scenario, _simulator_options(scenario, None, build))
+        _parameter_writes(scenario, _bench_config(scenario, None, build))
 
 
 def write_summaries(scenarios: list[Scenario], results: dict[str, RunResult], out_dir: Path) -> None:
@@ -283,119 +262,73 @@ def write_summaries(scenarios: list[Scenario], results: dict[str, RunResult], ou
 
 # --- reading --------------------------------------------------------------------------------------------------------
 
-# Key -> (smallest, largest) or the values allowed.
-_DURATION_S = (1e-3, 3600.0)
-_SEED = (0, 2**63 - 1)
-_STEPS: dict[str, dict[str, tuple[float, float]]] = {
-    "speed": {"at_s": (0.0, 3600.0), "value_rpm": (-3000.0, 3000.0)},
-    "load": {"at_s": (0.0, 3600.0), "torque_Nm": (-200.0, 200.0)},
-}
-_RECORD = {"step_us": (0.1, 1e6), "from_s": (0.0, 3600.0)}
-_TOP = ("machine", "controllers", "duration_s", "seed", "initial_angle_deg", "control_rate_hz", "encoder_bits",
-        "encoder_edges", "adc_bits", "immediate_pwm", "parameters", "bench", "speed", "load", "record")  # fmt: skip
+_TIME_S = number(0.0, 3600.0)
+
+
+class _SpeedTable(Table):
+    at_s: _TIME_S
+    value_rpm: number(-3000.0, 3000.0)
+
+
+class _LoadTable(Table):
+    at_s: _TIME_S
+    torque_Nm: number(-200.0, 200.0)
+
+
+class _RecordTable(Table):
+    step_us: number(0.1, 1e6) = Record.step_us
+    from_s: _TIME_S = Record.from_s
+
+
+@lru_cache
+def _scenario_file() -> type[Table]:
+    """The model of a file; the ranges of [bench] are those of rig.dbc."""
+    bench = create_model("bench", __base__=Table, **{name: (number(signal.minimum, signal.maximum), None)
+                                                     for name, signal in bench_variables().items()})
+    options = {name: (option(name), DEFAULTS[name]) for name in CONDITIONS if name not in ("machine", "controller")}
+    return create_model(
+        "scenario", __base__=Table,
+        machine=(option("machine"), ...),
+        controllers=(list[one_of(CONTROLLERS)], ...),
+        duration_s=(number(1e-3, 3600.0), ...),
+        **options,
+        parameters=(dict[str, any_number()], {}),
+        bench=(bench, bench()),
+        speed=(list[_SpeedTable], []),
+        load=(list[_LoadTable], []),
+        record=(_RecordTable, None),
+    )  # fmt: skip
 
 
 def load_scenarios(path: Path) -> list[Scenario]:
-    """Reads and checks a scenario file; one Scenario for each controller it names.
+    """Reads and checks a scenario file; returns one Scenario for each controller that it names.
 
-    UsageError names file, key and what is allowed. A relative path of a machine file is taken from the scenario's
-    folder.
+    UsageError names file, key and the values allowed. The relative path of a machine file starts at the folder of the
+    scenario.
     """
     try:
         data = read_toml(path)
+        file = validate(_scenario_file(), data)
+        _check_controllers(file.controllers)
     except TextFileError as error:
         raise UsageError(f"{path}: {error}") from None
-    reader = _Reader(path)
-    reader.known_keys("", data, _TOP)
-    for key in ("machine", "controllers", "duration_s"):
-        if key not in data:
-            raise UsageError(f"{path}: {key}: missing")
-    if not isinstance(data["machine"], str):
-        raise UsageError(f"{path}: machine: {data['machine']!r} is not the name of a machine or of its file")
-    beside = path.parent / data["machine"]
-    machine = str(beside.resolve()) if beside.suffix == ".toml" else data["machine"]
-    record = reader.table("record", data.get("record", {}), _RECORD)
-    parameters = data.get("parameters", {})
-    if not isinstance(parameters, dict):
-        raise UsageError(f"{path}: parameters: a table [parameters] is wanted")
-    common: dict[str, Any] = {
+    relative = path.parent / file.machine
+    machine = str(relative.resolve()) if relative.suffix == ".toml" else file.machine
+    executable(machine)
+    common: dict[str, Any] = {name: getattr(file, name) for name in CONDITIONS if name in type(file).model_fields}
+    common |= {
         "name": path.stem,
         "machine": machine,
-        "duration_s": reader.number("duration_s", data["duration_s"], *_DURATION_S),
-        "seed": reader.whole("seed", data.get("seed", 1), *_SEED),
-        "initial_angle_deg": reader.number("initial_angle_deg", data.get("initial_angle_deg", 0.0), -360.0, 360.0),
-        "control_rate_hz": reader.one_of("control_rate_hz", data.get("control_rate_hz", 40_000), CONTROL_RATES_HZ),
-        "encoder_bits": reader.one_of("encoder_bits", data.get("encoder_bits", 17), ENCODER_BITS),
-        "encoder_edges": reader.switch("encoder_edges", data.get("encoder_edges", False)),
-        "adc_bits": reader.one_of("adc_bits", data.get("adc_bits", 12), ADC_BITS),
-        "immediate_pwm": reader.switch("immediate_pwm", data.get("immediate_pwm", False)),
-        "parameters": {key: reader.number(f"parameters.{key}", value) for key, value in parameters.items()},
-        "bench": reader.table("bench", data.get("bench", {}), _bench_ranges()),
-        "speed": tuple(SpeedStep(**step) for step in reader.steps("speed", data.get("speed", []))),
-        "load": tuple(LoadStep(**step) for step in reader.steps("load", data.get("load", []))),
-        "record": Record(**record) if "record" in data else None,
+        "duration_s": file.duration_s,
+        "parameters": file.parameters,
+        "bench": {name: getattr(file.bench, name) for name in data.get("bench", {})},  # set in the order of the file
+        "speed": tuple(SpeedStep(**step.model_dump()) for step in file.speed),
+        "load": tuple(LoadStep(**step.model_dump()) for step in file.load),
+        "record": None if file.record is None else Record(**file.record.model_dump()),
     }
-    controllers = data["controllers"]
-    if not isinstance(controllers, list) or not controllers or len(set(map(str, controllers))) != len(controllers):
-        raise UsageError(f"{path}: controllers: a list of different ones of {', '.join(CONTROLLERS)} is wanted")
-    for controller in controllers:
-        reader.one_of("controllers", controller, CONTROLLERS)
-    executable(machine)
-    return [Scenario(controller=controller, **common) for controller in controllers]
+    return [Scenario(controller=controller, **common) for controller in file.controllers]
 
 
-def _bench_ranges() -> dict[str, tuple[float, float]]:
-    return {name: (signal.minimum, signal.maximum) for name, signal in bench_variables().items()}
-
-
-class _Reader:
-    """Checks values; every mistake names file and key."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def known_keys(self, section: str, table: dict, allowed: tuple[str, ...]) -> None:
-        for key in table:
-            if key not in allowed:
-                name = f"{section}.{key}" if section else key
-                raise UsageError(f"{self._path}: {name}: unknown key; allowed: {', '.join(allowed)}")
-
-    def number(self, key: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise UsageError(f"{self._path}: {key}: {value!r} is not a number")
-        if not low <= value <= high:
-            raise UsageError(f"{self._path}: {key}: {value:g}: allowed are {low:g} to {high:g}")
-        return float(value)
-
-    def whole(self, key: str, value: Any, low: int, high: int) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise UsageError(f"{self._path}: {key}: {value!r} is not a whole number from {low} to {high}")
-        return value
-
-    def switch(self, key: str, value: Any) -> bool:
-        if not isinstance(value, bool):
-            raise UsageError(f"{self._path}: {key}: {value!r} is not true or false")
-        return value
-
-    def one_of(self, key: str, value: Any, allowed: tuple) -> Any:
-        if isinstance(value, bool) or value not in allowed:
-            names = ", ".join(map(str, allowed))
-            raise UsageError(f"{self._path}: {key}: {value!r}: allowed are {names}")
-        return value
-
-    def table(self, section: str, table: Any, ranges: dict[str, tuple[float, float]]) -> dict[str, float]:
-        if not isinstance(table, dict):
-            raise UsageError(f"{self._path}: {section}: a table [{section}] is wanted")
-        self.known_keys(section, table, tuple(ranges))
-        return {key: self.number(f"{section}.{key}", value, *ranges[key]) for key, value in table.items()}
-
-    def steps(self, section: str, steps: Any) -> list[dict[str, float]]:
-        if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
-            raise UsageError(f"{self._path}: {section}: tables [[{section}]] are wanted")
-        ranges = _STEPS[section]
-        checked = [self.table(section, step, ranges) for step in steps]
-        for step in checked:
-            for key in ranges:
-                if key not in step:
-                    raise UsageError(f"{self._path}: {section}.{key}: missing")
-        return checked
+def _check_controllers(controllers: list[str]) -> None:
+    if not controllers or len(set(controllers)) != len(controllers):
+        raise TextFileError(f"controllers: must be a list of different values, each {either(CONTROLLERS)}")

@@ -1,10 +1,10 @@
 """Reads a flux-linkage map from a CSV file.
 
-Lines that start with # and blank lines say nothing. Then a header, `angle_deg,current_A,flux_linkage_Wb` (or angle_rad,
-or flux_linkage_mWb: the units stand in the names), then one row a point, angle by angle rising, the currents rising
-within an angle. Angles are the phase's mechanical ones, 0 aligned, from there to half a rotor pitch (unaligned), or to
-a whole pitch; a whole one is averaged with its mirror image. The grid may be irregular: angles at any distance, each
-with currents of its own. A row of 0 A may be left out.
+Lines that start with # and blank lines are ignored. The first other line is a header,
+`angle_deg,current_A,flux_linkage_Wb` (or angle_rad, or flux_linkage_mWb: the names have the units). Then follow rows of
+one point, the angles rising, the currents rising within an angle. Angles are mechanical angles of the phase, from 0
+(aligned) to half a rotor pitch (unaligned) or to a whole pitch; a whole one is averaged with its mirror image. The grid
+may be irregular: angles at any distance, each with different currents. A row of 0 A may be left out.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ CURRENTS_MIN = 6  # at each angle, 0 A not counted
 CURRENT_MAX_A = 10_000.0
 FLUX_LINKAGE_MAX_Wb = 100.0
 
-# The ends of the angles count as reached when they are as near as this, and are then put there.
+# The first and last angle are moved to the exact ends of the range when they are within this distance.
 ANGLE_TOLERANCE_DEG = 0.01
 
-# Nearer points say nothing about a slope.
+# Closer points do not determine a slope.
 ANGLE_STEP_MIN_DEG = 0.02
 CURRENT_STEP_MIN_A = 0.001
 
-# Factors to rad, A and Wb of the names that each column may have.
+# Factors to rad, A and Wb by the names that each column may have.
 _COLUMNS = (
     {"angle_deg": math.pi / 180.0, "angle_rad": 1.0},
     {"current_A": 1.0},
@@ -41,8 +41,7 @@ _COLUMNS = (
 
 
 def load_flux_map(path: Path, rotor_poles: int) -> FluxMap:
-    """The model of a CSV file's map. FluxMapError, one line with the file and where possible its line, when the file
-    cannot be used."""
+    """The model of a CSV file's map. FluxMapError: one line with the file and where possible its line."""
     try:
         text = read_text(path, FILE_BYTES_MAX)
         model = fit(_curves(_points(text), math.pi / rotor_poles), rotor_poles)
@@ -62,10 +61,10 @@ def _points(text: str) -> list[Point]:
         if row.strip() and not row.lstrip().startswith("#")
     ]
     if not rows:
-        raise FluxMapError("no header; allowed: " + _header_names())
+        raise FluxMapError(f"no header; must be {_header_names()}")
     line, header = rows[0]
     if len(header) != len(_COLUMNS) or any(name not in allowed for name, allowed in zip(header, _COLUMNS, strict=True)):
-        raise FluxMapError(f"line {line}: {','.join(header)!r:.100} is no header; allowed: {_header_names()}")
+        raise FluxMapError(f"line {line}: {','.join(header)!r:.100}: the header must be {_header_names()}")
     factors = [allowed[name] for name, allowed in zip(header, _COLUMNS, strict=True)]
     return [(line, *_numbers(line, cells, header, factors)) for line, cells in rows[1:]]
 
@@ -76,7 +75,7 @@ def _header_names() -> str:
 
 def _numbers(line: int, cells: list[str], header: list[str], factors: list[float]) -> list[float]:
     if len(cells) != len(header):
-        raise FluxMapError(f"line {line}: {len(cells)} columns; wanted are {len(header)}: {','.join(header)}")
+        raise FluxMapError(f"line {line}: {len(cells)} columns; must be {len(header)}: {','.join(header)}")
     values = []
     for cell, name, factor in zip(cells, header, factors, strict=True):
         try:
@@ -84,15 +83,15 @@ def _numbers(line: int, cells: list[str], header: list[str], factors: list[float
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise FluxMapError(f"line {line}: {name}: {cell!r:.40} is not a finite number")
+            raise FluxMapError(f"line {line}: {name}: {cell!r:.40}: must be a finite number")
         if value < 0.0:
-            raise FluxMapError(f"line {line}: {name}: {cell:.40} is negative; allowed is 0 and more")
+            raise FluxMapError(f"line {line}: {name}: {cell:.40}: must not be negative")
         values.append(value * factor)
     return values
 
 
 def _curves(points: list[Point], half_rad: float) -> list[Curve]:
-    """The points angle by angle, every rule of the file checked that needs no model."""
+    """One curve per angle, after all checks of the file that require no model."""
     for (_, before_rad, *_), (line, angle_rad, *_) in zip(points, points[1:], strict=False):
         if angle_rad != before_rad and math.degrees(angle_rad - before_rad) < ANGLE_STEP_MIN_DEG:
             raise FluxMapError(
@@ -101,22 +100,22 @@ def _curves(points: list[Point], half_rad: float) -> list[Curve]:
             )
     groups = [list(group) for _, group in groupby(points, key=lambda point: point[1])]
     if len(groups) < ANGLES_MIN:
-        raise FluxMapError(f"{len(groups)} angles; at least {ANGLES_MIN} are needed")
+        raise FluxMapError(f"{len(groups)} angles; must be at least {ANGLES_MIN}")
     ends_rad = _ends_rad(groups, half_rad)
     return [_curve(group, ends_rad.get(at, group[0][1])) for at, group in enumerate(groups)]
 
 
 def _ends_rad(groups: list[list[Point]], half_rad: float) -> dict[int, float]:
-    """The exact first and last angle by their place."""
+    """The exact first and last angle by their index."""
     half_deg = math.degrees(half_rad)
     first_deg, last_deg = math.degrees(groups[0][0][1]), math.degrees(groups[-1][0][1])
     if first_deg > ANGLE_TOLERANCE_DEG:
-        raise FluxMapError(f"line {groups[0][0][0]}: the angles begin at {first_deg:.5g} deg; 0 (aligned) is wanted")
+        raise FluxMapError(f"line {groups[0][0][0]}: the angles begin at {first_deg:.5g} deg; must be 0 (aligned)")
     for pitches in (1, 2):
         if abs(last_deg - pitches * half_deg) <= ANGLE_TOLERANCE_DEG:
             return {0: 0.0, len(groups) - 1: pitches * half_rad}
     raise FluxMapError(
-        f"line {groups[-1][-1][0]}: the angles end at {last_deg:.5g} deg; wanted is half a rotor pitch"
+        f"line {groups[-1][-1][0]}: the angles end at {last_deg:.5g} deg; must be half a rotor pitch"
         f" ({half_deg:.5g} deg, unaligned) or a whole one ({2.0 * half_deg:.5g} deg)"
     )
 
@@ -131,7 +130,7 @@ def _curve(points: list[Point], angle_rad: float) -> Curve:
         points = points[1:]
     if len(points) < CURRENTS_MIN:
         raise FluxMapError(
-            f"line {line}: {len(points)} currents above 0 A {angle}; at least {CURRENTS_MIN} are needed"
+            f"line {line}: {len(points)} currents above 0 A {angle}; must be at least {CURRENTS_MIN}"
         )
     last_A, last_Wb = 0.0, 0.0
     for line, _, current_A, flux_Wb in points:
@@ -146,9 +145,9 @@ def _curve(points: list[Point], angle_rad: float) -> Curve:
                 f" at {current_A:g} A; it must rise with the current"
             )
         if current_A > CURRENT_MAX_A:
-            raise FluxMapError(f"line {line}: {current_A:g} A; {CURRENT_MAX_A:g} A is the most allowed")
+            raise FluxMapError(f"line {line}: {current_A:g} A: must be at most {CURRENT_MAX_A:g} A")
         if flux_Wb > FLUX_LINKAGE_MAX_Wb:
-            raise FluxMapError(f"line {line}: {flux_Wb:g} Wb; {FLUX_LINKAGE_MAX_Wb:g} Wb is the most allowed")
+            raise FluxMapError(f"line {line}: {flux_Wb:g} Wb: must be at most {FLUX_LINKAGE_MAX_Wb:g} Wb")
         last_A, last_Wb = current_A, flux_Wb
     lines, _, current_A, flux_Wb = zip(*points, strict=True)
     return Curve(angle_rad, np.array(current_A), np.array(flux_Wb), lines)

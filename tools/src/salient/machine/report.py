@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from salient.errors import UsageError
-from salient.machine.file import CONVERTER, SENSORS, Machine, MachineError, load_machine, machine_path
+from salient.machine.file import Converter, Machine, MachineError, Sensors, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
 
 # The sensors and the firmware's tables end here.
@@ -61,8 +61,8 @@ def describe(machine: Machine) -> list[str]:
         "  torque      greatest of one phase: "
         + ", ".join(f"{torque:.3g} N m at {i:g} A" for torque, i in zip(torques_Nm.max(axis=0), SHOWN_A, strict=True)),
     ]
-    for title, values, ranges in (("converter", machine.converter, CONVERTER), ("sensors", machine.sensors, SENSORS)):
-        stated = [f"{key} {value:g}" for key, value in values.items() if value != ranges[key][2]]
+    for title, values, table in (("converter", machine.converter, Converter), ("sensors", machine.sensors, Sensors)):
+        stated = [f"{key} {value:g}" for key, value in values.items() if value != table.model_fields[key].default]
         lines.append(f"  {title:<11} {', '.join(stated) if stated else 'ideal'}")
     return lines
 

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from salient.bench.emulator import TARGET_BUILDS, image
-from salient.cli import CONTROLLERS
+from salient.bench.config import CONTROLLERS, TARGET_BUILDS
+from salient.bench.emulator import image
 from salient.elf import Image
 from salient.errors import UsageError
 from salient.paths import BUILD, ROOT

@@ -39,7 +39,7 @@ class Cost:
 
 
 def read_cost(interrupts: Path, execution: Path, machine: str, build: str) -> Cost:
-    """What a run has left in the files SimulatorOptions.instructions and execution."""
+    """What a run has left in the files BenchConfig.instructions and execution."""
     return Cost(np.fromfile(interrupts, "<u4"), read_execution(execution, image(machine, build)))
 
 

@@ -23,7 +23,7 @@ def run(options: argparse.Namespace) -> int:
     """Does what the options ask for; returns 0, or 1 when a drive ended in a fault."""
     asked = [name for name in ("scenario", "search", "figures") if getattr(options, name)]
     if len(asked) != 1:
-        raise UsageError("pil: one of SCENARIO.toml, --search SECONDS and --figures is wanted")
+        raise UsageError("pil: requires one of SCENARIO.toml, --search SECONDS and --figures")
     if options.figures:
         from salient.target.baseline import measure_and_write
 

@@ -33,19 +33,21 @@ from pathlib import Path
 import numpy as np
 
 from salient.bench.bench import Bench
+from salient.bench.config import CONTROLLERS, BenchConfig
 from salient.bench.drive import ParameterRow, write_request
-from salient.bench.emulator import SimulatorOptions, parameter_table
+from salient.bench.emulator import parameter_table
 from salient.bench.rig import RigError, bench_variables
-from salient.cli import CONTROLLERS
 from salient.errors import UsageError
 from salient.paths import ROOT
 from salient.target.isr_profile import Cost, read_cost
-from salient.toml_file import TextFileError, read_toml
+from salient.toml_file import Table, TextFileError, any_number, checked, number, option, read_toml, validate
 
 FOLDER = ROOT / "tests" / "target" / "worst_case"
 NETWORK = "salient_network"
 
 _REQUESTS = ("stop", "off", "clear_fault")
+_WITHOUT_VALUE = ("silence", *_REQUESTS)
+_WITH_VALUE = ("speed_rpm", "commands")
 _CHOSEN = ("controller", "bp_mode", "bp_trim_mode")
 """Parameters that make another controller of it: the kind says them."""
 _DURATION_MS = (2.0, 120.0)
@@ -86,7 +88,7 @@ class Action:
 
 @dataclass(frozen=True)
 class Input:
-    """What is done, in the order of time; the board is the one that SimulatorOptions describes by default."""
+    """What is done, in the order of time; the board is the one that BenchConfig describes by default."""
 
     machine: str
     controller: str
@@ -98,14 +100,46 @@ class Input:
 
 # --- files ----------------------------------------------------------------------------------------------------------
 
+class _InputFile(Table):
+    machine: option("machine")
+    controller: option("controller")
+    seed: option("seed")
+    initial_angle_deg: option("initial_angle_deg")
+    duration_ms: number(0.0, 3.6e6)
+    actions: list[list]
+
+
+class _ActionRow(Table):
+    at_ms: number(0.0, 3.6e6)
+    what: checked(str, "the name of an action", lambda what: _is_action(what))
+    value: any_number() = None
+
+
 def read_input(path: Path) -> Input:
-    """UsageError for a file that is not one."""
+    """Reads and checks a file; UsageError names file, key and the values allowed."""
     try:
-        data = read_toml(path)
-        return Input(data["machine"], data["controller"], data["seed"], data["initial_angle_deg"],
-                     data["duration_ms"], tuple(Action(*row) for row in data["actions"]))
-    except (TextFileError, KeyError, TypeError) as error:
+        file = validate(_InputFile, read_toml(path))
+        actions = tuple(_read_action(at, row) for at, row in enumerate(file.actions, start=1))
+    except TextFileError as error:
         raise UsageError(f"{path}: {error}") from None
+    return Input(file.machine, file.controller, file.seed, file.initial_angle_deg, file.duration_ms, actions)
+
+
+def _read_action(row_number: int, row: list) -> Action:
+    section = f"actions row {row_number}"
+    if len(row) > len(_ActionRow.model_fields):
+        raise TextFileError(f"{section}: must be time in ms, action and value")
+    action = validate(_ActionRow, dict(zip(_ActionRow.model_fields, row, strict=False)), section)
+    needs_value = action.what in _WITH_VALUE or "." in action.what
+    if needs_value != (action.value is not None):
+        raise TextFileError(f"{section}: {action.what}: {'requires a' if needs_value else 'has no'} value")
+    return Action(action.at_ms, action.what, action.value)
+
+
+def _is_action(what: str) -> bool:
+    """The drive knows its parameters; they are checked when they are written."""
+    scope, _, name = what.partition(".")
+    return what in (*_WITH_VALUE, *_WITHOUT_VALUE) or scope == "parameter" or scope == "bench" and name in bench_variables()
 
 
 def write_input(path: Path, found: Input) -> None:
@@ -122,7 +156,7 @@ def write_input(path: Path, found: Input) -> None:
 # --- running --------------------------------------------------------------------------------------------------------
 
 def replay(done: Input, **options) -> Cost:
-    """What the interrupts cost. options: of SimulatorOptions, where it is another board or build."""
+    """What the interrupts cost. options: of BenchConfig, where it is another board or build."""
     with tempfile.TemporaryDirectory(prefix="salient-") as name:
         counted, executed = Path(name) / "instructions", Path(name) / "execution"
         board = _board(done, instructions=counted, execution=executed, **options)
@@ -138,12 +172,12 @@ def dearest_count(done: Input) -> int:
         return int(np.fromfile(counted, "<u4").max())
 
 
-def _board(done: Input, **options) -> SimulatorOptions:
-    return SimulatorOptions(machine=done.machine, controller=done.controller, seed=done.seed,
+def _board(done: Input, **options) -> BenchConfig:
+    return BenchConfig(machine=done.machine, controller=done.controller, seed=done.seed,
                             initial_angle_deg=done.initial_angle_deg, **{"build": "cortex-m4", **options})
 
 
-def _run(done: Input, board: SimulatorOptions) -> None:
+def _run(done: Input, board: BenchConfig) -> None:
     rows = _rows(done.controller)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder, Bench(board, f"unix:{folder}/can.sock") as bench:
         bench.rig.truth_period_us = 0
@@ -163,7 +197,7 @@ def _do(bench: Bench, rows: dict[str, ParameterRow], action: Action) -> None:
             bench.rig.set(name, value)
         except RigError:
             pass  # what the bench refuses has no effect
-    elif scope == "parameter":
+    elif scope == "parameter" and name in rows:
         bench.send(write_request(rows[name], value))  # so has what the drive refuses
     elif what == "commands":
         for _ in range(int(value) if bench.drive.command_due_ns is not None else 0):
@@ -178,7 +212,7 @@ def _do(bench: Bench, rows: dict[str, ParameterRow], action: Action) -> None:
 
 @lru_cache
 def _rows(controller: str) -> dict[str, ParameterRow]:
-    return {row.name: row for row in parameter_table(SimulatorOptions(controller=controller))}
+    return {row.name: row for row in parameter_table(BenchConfig(controller=controller))}
 
 
 # --- directed -------------------------------------------------------------------------------------------------------

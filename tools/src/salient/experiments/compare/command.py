@@ -20,20 +20,20 @@ _REPLAYS_MAX = 10  # named, of the runs that failed
 
 
 def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
-    """Measures, prints the table, writes the files. Returns 0; 1 when --against says that a figure got worse."""
+    """Measures, prints the table, writes the files. Returns 0; 1 when a figure got worse than in --baseline."""
     if options.list:
         for name, group in GROUPS.items():
             stream.write(f"{name:<18}{group.title}{' (long: only when named)' if group.long else ''}\n")
         return 0
     cases = _cases(options.groups, options.quick)
-    earlier = None if options.against is None else results_file.read(options.against, options.quick)
+    earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
     _prepare_folder(options.out)
     for machine in {case.scenario.machine for case in cases}:
         executable(machine)
     outcomes = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr)
     made = table.make_rows(outcomes)
     changed, both = ([], 0) if earlier is None else baseline.changes(made, earlier, options.worse_percent)
-    compared = earlier and baseline.summary(changed, both, str(options.against), options.worse_percent)
+    compared = earlier and baseline.summary(changed, both, str(options.baseline), options.worse_percent)
     content = results_file.content(made, outcomes, options.quick)
     results_file.write(options.out / results_file.NAME, content)
     replays = _write_failed(options.out / FAILED, outcomes)
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
 def _cases(groups: Sequence[str], quick: bool) -> list[Case]:
     for name in groups:
         if name not in GROUPS:
-            raise UsageError(f"no group {name}: allowed are {', '.join(GROUPS)}")
+            raise UsageError(f"no group {name}: must be one of {', '.join(GROUPS)}")
     return [case for name, group in GROUPS.items() if name in groups or not groups and not group.long
             for case in group.cases(quick)]
 

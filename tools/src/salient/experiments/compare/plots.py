@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from salient.cli import CONTROLLERS
+from salient.bench.config import CONTROLLERS
 from salient.experiments.compare.baseline import Change
 from salient.experiments.compare.metrics import FIGURES
 from salient.experiments.compare.table import in_order

@@ -73,11 +73,11 @@ def read(path: Path, quick: bool) -> dict[str, Any]:
     try:
         stored = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise UsageError(f"--against {file}: {error.strerror}") from None
+        raise UsageError(f"--baseline {file}: {error.strerror}") from None
     except ValueError:
-        raise UsageError(f"--against {file}: no JSON; give the folder or the {NAME} of an earlier run") from None
+        raise UsageError(f"--baseline {file}: no JSON; give the folder or the {NAME} of an earlier run") from None
     if not isinstance(stored, dict) or stored.get("schema") != SCHEMA or not isinstance(stored.get("rows"), list):
-        raise UsageError(f"--against {file}: no {NAME} of schema {SCHEMA}")
+        raise UsageError(f"--baseline {file}: no {NAME} of schema {SCHEMA}")
     if stored.get("quick") != quick:
-        raise UsageError(f"--against {file}: made {'with' if not quick else 'without'} --quick; compare like with like")
+        raise UsageError(f"--baseline {file}: made {'with' if not quick else 'without'} --quick, unlike this run")
     return stored

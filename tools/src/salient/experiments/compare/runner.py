@@ -13,7 +13,7 @@ from typing import Any, TextIO
 from can import CanError
 
 from salient.bench.drive import DriveError
-from salient.bench.emulator import SimulatorError
+from salient.bench.emulator import EmulatorError
 from salient.bench.session import SessionError
 from salient.experiments.compare.cases import RIPPLE_FROM_S, Case
 from salient.experiments.compare.metrics import MEASURES, SHORT_WINDOW_S, Figures, failures
@@ -76,7 +76,7 @@ def _run(case: Case) -> tuple[Figures, str, Any]:
             if result.fault != "none":
                 return {}, f"fault {result.fault}", None
             figures = rounded(MEASURES[case.measure](case.scenario, result.recording))
-        except (SimulatorError, SessionError, DriveError, CanError, MetricsError) as error:
+        except (EmulatorError, SessionError, DriveError, CanError, MetricsError) as error:
             return {}, str(error), None
         failed = "; ".join(failures(figures)) if case.measure == "robustness" else ""
         return figures, failed, _trace(result.recording) if case.traced else None

@@ -1,0 +1,212 @@
+"""The configuration of a test bench: every option of the drive and its emulator, written once.
+
+From the record BenchConfig follow
+- the options of `sim`, `demo` and `run` (salient.cli),
+- the keys of a scenario and of a worst-case input (salient.toml_file makes their types),
+- the keywords of the pytest fixtures `bench` and `make_bench`,
+- the command line of the host executable (salient.generate.options writes its table in C).
+
+Standard library only: the launcher imports this module before anything is installed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+CONTROLLERS = ("traditional", "paper", "salient")
+"""Numbered as drive_controller_t of the firmware."""
+HOST_BUILDS = ("host", "debug", "sanitize")
+TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os", "rv32")
+"""Images for boards of QEMU: Cortex-M4 with -O2, -O0 and -Os, and RV32."""
+TARGETS = ("host", "cortex-m4", "rv32")
+"""Builds that a command offers: the process of the emulator, or QEMU."""
+PACES = ("lockstep", "realtime", "free")
+PACE_FACTOR_MIN, PACE_FACTOR_MAX = 0.01, 1000.0
+"""PACING_FACTOR_MIN and PACING_FACTOR_MAX of emulator/rig/pacing.h."""
+BUSES = "unix:PATH or socketcan:INTERFACE"
+
+FLAG, INTEGER, NUMBER, WORD, FILE, BUS, PACE = "flag", "integer", "number", "word", "file", "bus", "pace"
+MACHINE = "machine"
+"""Kinds of options."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """The part of a field that its name, type and default do not state.
+
+    choices: the values allowed; without choices minimum and maximum bound an integer or number, both included.
+    commands: the commands of tools/salient that have the option. flag: its name there, when it is not the field's.
+    argument: the host executable has it as well.
+    """
+
+    kind: str
+    help: str
+    metavar: str = ""
+    choices: tuple = ()
+    minimum: int | float = 0
+    maximum: int | float = 0
+    commands: tuple[str, ...] = ()
+    flag: str = ""
+    argument: bool = True
+
+    @property
+    def allowed(self) -> str:
+        """The values allowed, as the end of a sentence that begins with "must be"."""
+        if self.choices:
+            runs = _runs(self.choices)
+            return f"a whole number from {runs[0]}" if len(runs) == 1 else either(runs)
+        return {
+            FLAG: "true or false",
+            INTEGER: f"a whole number from {self.minimum} to {self.maximum}",
+            NUMBER: f"a number from {_plain(self.minimum)} to {_plain(self.maximum)}",
+            FILE: "the name of a file",
+            MACHINE: "the name of a machine or the path of a machine file",
+            BUS: BUSES,
+            PACE: either([*PACES, f"xN with N from {PACE_FACTOR_MIN:g} to {PACE_FACTOR_MAX:g}"]),
+        }[self.kind]
+
+    def parse(self, text: str) -> Any:
+        """The value that a text on a command line means; ValueError: it is not allowed."""
+        if self.kind == INTEGER and re.fullmatch("[0-9]{1,20}", text):
+            value = int(text)
+            if value in self.choices if self.choices else self.minimum <= value <= self.maximum:
+                return value
+        elif self.kind == NUMBER and re.fullmatch(r"[-+0-9.eE]+", text):
+            value = float(text)
+            if self.minimum <= value <= self.maximum:
+                return value
+        elif self.kind == WORD and text in self.choices:
+            return text
+        elif self.kind == BUS and re.fullmatch(r"(unix|socketcan):.+", text):
+            return text
+        elif self.kind == PACE and (text in PACES or _is_pace_factor(text)):
+            return text
+        elif self.kind in (FILE, MACHINE) and text:
+            return Path(text) if self.kind == FILE else text
+        raise ValueError(f"must be {self.allowed}")
+
+
+def either(values) -> str:
+    """A, B or C."""
+    *first, last = map(str, values)
+    return f"{', '.join(first)} or {last}" if first else last
+
+
+def _plain(number: float) -> str:
+    """Without an exponent."""
+    return f"{number:.9f}".rstrip("0").rstrip(".")
+
+
+def _runs(choices: tuple) -> list[str]:
+    """The choices, three or more consecutive integers as a range."""
+    parts: list[list] = []
+    for choice in choices:
+        if parts and isinstance(choice, int) and choice == parts[-1][-1] + 1:
+            parts[-1].append(choice)
+        else:
+            parts.append([choice])
+    return [text for part in parts
+            for text in ([f"{part[0]} to {part[-1]}"] if len(part) > 2 else map(str, part))]
+
+
+def _is_pace_factor(text: str) -> bool:
+    return bool(re.fullmatch(r"x[0-9]*\.?[0-9]+", text)) and PACE_FACTOR_MIN <= float(text[1:]) <= PACE_FACTOR_MAX
+
+
+def _option(default: Any, kind: str, text: str, **details: Any) -> Any:
+    return dataclasses.field(default=default, metadata={"option": Option(kind, text, **details)})
+
+
+_CONDITION = ("sim", "demo")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """The drive and the conditions under which it runs: the options that a scenario has, too."""
+
+    machine: str = _option("saturating", MACHINE, "machine", metavar="NAME|FILE", commands=_CONDITION, argument=False)
+    controller: str = _option("salient", WORD, "controller at the start", metavar="NAME", choices=CONTROLLERS,
+                              commands=("sim",))
+    control_rate_hz: int = _option(40_000, INTEGER, "rate of the control interrupt in Hz", metavar="N",
+                                   choices=(20_000, 40_000, 50_000, 100_000, 1_000_000), commands=_CONDITION)
+    encoder_bits: int = _option(17, INTEGER, "resolution of the encoder, 0 for an ideal one", metavar="N",
+                                choices=(0, *range(8, 25)), commands=_CONDITION)
+    encoder_edges: bool = _option(False, FLAG, "the board captures the edges of the encoder", commands=("sim",))
+    adc_bits: int = _option(12, INTEGER, "resolution of the analogue-to-digital converters", metavar="N",
+                            choices=(12, 13, 14, 15, 16), commands=("sim",))
+    immediate_pwm: bool = _option(False, FLAG, "compare values act in the period that writes them, as in simulations "
+                                  "and no converter", commands=("sim",))
+    seed: int = _option(1, INTEGER, "seed of all noise", metavar="N", maximum=2**64 - 1, commands=_CONDITION)
+    initial_angle_deg: float = _option(0.0, NUMBER, "rotor angle at the start", metavar="X", minimum=-360.0,
+                                       maximum=360.0, commands=("sim",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchConfig(Conditions):
+    """A drive and its test bench.
+
+    can: the bus, "auto" until a command or a fixture has chosen one. build: a CMake preset, of HOST_BUILDS or
+    TARGET_BUILDS. instructions, execution, instruction_ns: in QEMU only, the last on the Cortex-M4 only; instructions
+    gets the instruction count of each control interrupt (uint32, little endian), execution what salient.target.trace
+    reads. instruction_ns None: the firmware takes no simulated time.
+    """
+
+    can: str = _option("auto", BUS, "CAN bus", metavar="BUS", commands=("sim",))
+    pace: str = _option("realtime", PACE, "speed of virtual time", metavar="PACE",
+                        commands=("sim",))
+    bit_rate: int = _option(1_000_000, INTEGER, "bit rate of the emulated bus", metavar="N", minimum=10_000,
+                            maximum=1_000_000, commands=("sim",))
+    record: Path | None = _option(None, FILE, "records the true state", metavar="FILE.npy")
+    record_step_ns: int = _option(1000, INTEGER, "step of the recording", metavar="N", minimum=100,
+                                  maximum=1_000_000_000)
+    record_from_us: int = _option(0, INTEGER, "virtual time at which the recording begins", metavar="N",
+                                  maximum=(2**64 - 1) // 1000)
+    record_switches: Path | None = _option(None, FILE, "records the compare values of each control period, for other "
+                                           "simulators", metavar="FILE")
+    stop_at_s: float | None = _option(None, NUMBER, "virtual time at which it ends; not with --pace lockstep",
+                                      metavar="X", minimum=1e-6, maximum=281_474.0)
+    follow_stdin: bool = _option(False, FLAG, "ends when standard input does")
+    build: str = _option("host", WORD, "processor that runs the firmware: the host, or one that QEMU emulates",
+                         metavar="NAME", choices=TARGETS, commands=("sim", "demo", "run"), flag="target",
+                         argument=False)
+    instructions: Path | None = _option(None, FILE, "instruction counts", argument=False)
+    execution: Path | None = _option(None, FILE, "execution trace", argument=False)
+    instruction_ns: int | None = _option(None, INTEGER, "time of an instruction on the cortex-m4; without it the "
+                                         "firmware takes no time", metavar="N", choices=(1, 2, 4, 8, 16, 32, 64),
+                                         commands=("sim", "run"), argument=False)
+
+    def arguments(self) -> list[str]:
+        """The options of the host executable that differ from its defaults."""
+        line = []
+        for name, option in OPTIONS.items():
+            value = getattr(self, name)
+            if not option.argument or value == DEFAULTS[name]:
+                continue
+            line.append(flag_of(name))
+            if option.kind != FLAG:
+                line.append(f"{value:.17g}" if option.kind == NUMBER else str(value))
+        return line
+
+
+OPTIONS: dict[str, Option] = {field.name: field.metadata["option"] for field in dataclasses.fields(BenchConfig)}
+"""The options of a test bench by the name of their field."""
+DEFAULTS: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(BenchConfig)}
+CONDITIONS = tuple(field.name for field in dataclasses.fields(Conditions))
+
+
+def flag_of(name: str) -> str:
+    """The option of a field on a command line."""
+    return "--" + (OPTIONS[name].flag or name).replace("_", "-")
+
+
+def description(name: str) -> str:
+    """Meaning, values allowed and default, for a usage text."""
+    option, default = OPTIONS[name], DEFAULTS[name]
+    if option.kind == FLAG or option.kind == FILE:
+        return option.help
+    shown = _plain(default) if option.kind == NUMBER and default is not None else default
+    return f"{option.help}: {option.allowed}" + ("" if default is None or option.kind == BUS else f" (default {shown})")
