@@ -18,8 +18,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/compare"), metavar="DIR",
                         help="folder (default out/compare)")
     parser.add_argument("--jobs", type=_jobs, metavar="N", help="runs at a time (default as many as there are cores)")
-    parser.add_argument("--against", type=Path, metavar="DIR|FILE",
-                        help="an earlier run's folder or compare.json: say what changed, exit code 1 if for the worse")
+    parser.add_argument("--baseline", type=Path, metavar="DIR|FILE",
+                        help="folder or compare.json of an earlier run: report changes, exit code 1 if worse")
     parser.add_argument("--worse-percent", type=_percent, default=WORSE_PERCENT, metavar="X",
                         help=f"a change beyond this counts (default {WORSE_PERCENT:g})")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from salient.bench.drive import ParameterRow, read_parameter_table
 from salient.bench.session import Session
-from salient.elf import Image
+from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.machine.file import MachineError, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
@@ -93,7 +93,7 @@ class SimulatorOptions:
         if self.instructions is not None:
             line += ["--instructions", str(self.instructions)]
         if self.execution is not None:
-            end, begin = Image(image(self.machine, self.build)).stack()
+            end, begin = ElfImage(image(self.machine, self.build)).stack()
             line += ["--execution", str(self.execution), f"{end:#x}-{begin:#x}"]
         if self.instruction_ns is not None:
             line += ["--instruction-ns", str(self.instruction_ns)]
