@@ -9,7 +9,7 @@ from pathlib import Path
 
 from salient.paths import ROOT
 
-# Only the standard library: its imports are quick in the guest.
+# Only the standard library: its imports are quick in the VM.
 SCRIPT = """
 import os, socket, struct, sys
 from pathlib import Path
@@ -33,7 +33,7 @@ try:
     raise SystemExit("the repository is writable")
 except OSError:
     pass
-Path(sys.argv[2]).write_text("written in the guest")
+Path(sys.argv[2]).write_text("written in the VM")
 print(sys.argv[3])
 print("to stderr", file=sys.stderr)
 sys.exit(7)
@@ -42,7 +42,7 @@ sys.exit(7)
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "salient.vm.run", "--force-guest", *arguments],
+        [sys.executable, "-m", "salient.vm.run", "--force-vm", *arguments],
         cwd=ROOT,
         env={**os.environ, "SALIENT_TEST": "it's\nhere"},
         capture_output=True,
@@ -52,21 +52,21 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_command_has_vcan0_and_files_and_its_output_and_exit_code_come_back(tmp_path: Path) -> None:
-    result_file = tmp_path / "result, of the guest"
-    python = os.path.realpath(sys.executable)  # the virtual environment may be in a folder that the guest does not see
+    result_file = tmp_path / "result, of the VM"
+    python = os.path.realpath(sys.executable)  # the virtual environment may be in a folder that the VM does not see
     odd = "a  b'c\"$d"
     outcome = run("--write", str(tmp_path), "--", python, "-I", "-c", SCRIPT, str(ROOT), str(result_file), odd)
     assert outcome.returncode == 7, outcome.stderr
     assert outcome.stdout == odd + "\n"
     assert outcome.stderr.splitlines()[-1] == "to stderr"
-    assert result_file.read_text() == "written in the guest"
+    assert result_file.read_text() == "written in the VM"
 
 
 def test_time_limit_ends_the_guest_with_one_line() -> None:
     outcome = run("--timeout-s", "0.1", "--", "true")  # far less than the kernel needs
     assert outcome.returncode == 1
     assert outcome.stderr.splitlines()[-1] == (
-        "salient guest: the command did not end within --timeout-s 0.1: guest killed"
+        "salient vm: the command did not end within --timeout-s 0.1: VM killed"
     )
 
 

@@ -1,5 +1,5 @@
-"""Switching-pattern playback: a pattern recorded from a controlled drive, played back on the plant alone and on reference
-solvers of the same machine, so that all of them compute the same trajectory.
+"""Switching-pattern playback: a pattern recorded from a controlled drive, played back on the plant alone and on
+reference solvers of the same machine, so that all of them compute the same trajectory.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _STATE = np.dtype([("angle_rad", "f8"), ("speed_rad_s", "f8"), ("torque_Nm", "f8
 
 @dataclass(frozen=True)
 class SwitchingPattern:
-    """Compare values of each control period of 2 * period_ticks ticks (rows: periods, columns: phases, for the upper and
-    the lower switches), and the initial state of the machine."""
+    """Compare values of each control period of 2 * period_ticks ticks (rows: periods, columns: phases, for upper and
+    lower switches), and the initial state of the machine."""
 
     machine: str
     period_ticks: int
