@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from salient.experiments.compare.metrics import METRICS
-from salient.experiments.compare.table import Key, Row, format_value
+from salient.experiments.compare.table import Row, format_value
+from salient.experiments.compare.targets import Key
 
 _INFORMATIVE = ("step_angle_deg", "torque_mean_Nm")
 """Metrics of which neither direction is better."""
