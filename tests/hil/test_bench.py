@@ -154,11 +154,10 @@ def test_two_benches_at_once(make_bench):
 def test_session_with_a_drive_that_moves_by_itself(tmp_path):
     """A session that follows a free-running drive sees its time pass and steers it."""
     can_bus = f"unix:{tmp_path}/can.sock"
-    with EmulatorProcess(BenchConfig(pace="x20"), can_bus):
-        with Session(can_bus, lockstep=False) as session:
-            session.drive.speed_reference_rpm = 150
-            session.run_until(lambda: abs(session.telemetry["speed_rpm"].last - 150) < 5, timeout=5)
-            assert session.drive.state == "run"
+    with EmulatorProcess(BenchConfig(pace="x20"), can_bus), Session(can_bus, lockstep=False) as session:
+        session.drive.speed_reference_rpm = 150
+        session.run_until(lambda: abs(session.telemetry["speed_rpm"].last - 150) < 5, timeout=5)
+        assert session.drive.state == "run"
 
 
 def stop_until_checked(process: EmulatorProcess, checks: int) -> Callable[[], bool]:

@@ -1,5 +1,5 @@
-"""The committed figures of the target are those of the builds, and the firmware keeps to its limits. When a change is
-meant, tools/salient pil --figures writes them anew."""
+"""The builds match the committed baseline, and the firmware is within its limits. tools/salient pil --figures updates
+the baseline after an intended change."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from salient.target.baseline import (
     tables_of,
     with_table,
 )
-from salient.target.isr_profile import Cost, measure
-from salient.target.trace import Execution
+from salient.target.isr_profile import IsrProfile, measure
+from salient.target.trace import Trace
 
 LIMITED_BUILDS = ("cortex-m4", "cortex-m4-Os")
-"""That anybody would flash."""
+"""Builds intended for a device."""
 FLASH_TOLERANCE_BYTES = 64
 RAM_TOLERANCE_BYTES = 32
 COUNT_TOLERANCE = 0.01
@@ -35,80 +35,80 @@ measure_once = lru_cache(measure)
 
 
 @lru_cache
-def dearest(kind: str) -> Cost:
-    return worst_case.replay(worst_case.read_input(worst_case.committed(kind)))
+def known_worst_case(variant: str) -> IsrProfile:
+    return worst_case.profile(worst_case.read_input(worst_case.committed(variant)))
 
 
 @pytest.mark.parametrize("build", TARGET_BUILDS)
-def test_sizes_are_those_committed(request, build):
-    made, committed = sizes(build), read()["size"][build]
-    request.node.user_properties.append(("size", (build, made)))
-    assert made.keys() == committed.keys()
-    for name, value in made.items():
+def test_sizes_match_the_baseline(request, build):
+    measured, committed = sizes(build), read()["size"][build]
+    request.node.user_properties.append(("size", (build, measured)))
+    assert measured.keys() == committed.keys()
+    for name, value in measured.items():
         tolerance = FLASH_TOLERANCE_BYTES if name in ("firmware", "flash") else RAM_TOLERANCE_BYTES
-        table = size_table({"made": made, "committed": committed})
+        table = size_table({"measured": measured, "committed": committed})
         assert abs(value - committed[name]) <= tolerance, f"{name}\n{table}"
 
 
 @pytest.mark.parametrize("build", LIMITED_BUILDS)
 def test_flash_and_ram_are_within_their_limits(build):
-    made = sizes(build)
-    assert 20_000 < made["firmware"] <= FLASH_MAX_BYTES
-    ram = made["ram"] + made["stack_background"] + made["stack_interrupt"]
+    measured = sizes(build)
+    assert 20_000 < measured["firmware"] <= FLASH_MAX_BYTES
+    ram = measured["ram"] + measured["stack_background"] + measured["stack_interrupt"]
     assert 3_000 < ram <= RAM_MAX_BYTES
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_an_interrupt_of_the_two_experiments_costs_what_is_committed(controller):
-    made, committed = measure_once(controller).figures(), read()["interrupt"][controller]
-    assert made["typical"] <= made["of_99_percent"] <= made["worst"] <= committed["searched"]
-    for name, value in made.items():
+def test_isr_profile_of_the_experiments_matches_the_baseline(controller):
+    measured, committed = measure_once(controller).metrics(), read()["interrupt"][controller]
+    assert measured["median"] <= measured["p99"] <= measured["max"] <= committed["worst_case"]
+    for name, value in measured.items():
         assert value == pytest.approx(committed[name], rel=COUNT_TOLERANCE), name
 
 
-@pytest.mark.parametrize("kind", worst_case.KINDS)
-def test_the_dearest_interrupt_known_costs_what_is_committed(kind):
-    made = dearest(kind).figures()["worst"]
-    assert made == pytest.approx(read()["interrupt"][kind]["searched"], rel=COUNT_TOLERANCE)
+@pytest.mark.parametrize("variant", worst_case.VARIANTS)
+def test_known_worst_case_matches_the_baseline(variant):
+    measured = known_worst_case(variant).metrics()["max"]
+    assert measured == pytest.approx(read()["interrupt"][variant]["worst_case"], rel=COUNT_TOLERANCE)
 
 
-@pytest.mark.parametrize("kind", worst_case.KINDS)
-def test_no_directed_input_is_dearer_than_the_dearest_known(kind):
-    worst = [worst_case.dearest_count(given) for given in worst_case.directed(kind)]
-    assert len(worst) >= 12
-    assert max(worst) <= (1 + COUNT_TOLERANCE) * read()["interrupt"][kind]["searched"]
-    assert max(worst) > 0.7 * read()["interrupt"][kind]["searched"]
+@pytest.mark.parametrize("variant", worst_case.VARIANTS)
+def test_no_directed_input_exceeds_the_known_worst_case(variant):
+    longest = [worst_case.longest_interrupt(given) for given in worst_case.directed(variant)]
+    assert len(longest) >= 12
+    assert max(longest) <= (1 + COUNT_TOLERANCE) * read()["interrupt"][variant]["worst_case"]
+    assert max(longest) > 0.7 * read()["interrupt"][variant]["worst_case"]
 
 
-def test_an_input_that_was_found_is_the_same_when_written_and_read_again(tmp_path):
+def test_written_input_is_read_back_unchanged(tmp_path):
     for given in worst_case.directed(worst_case.NETWORK):
         worst_case.write_input(tmp_path / "input.toml", given)
         assert worst_case.read_input(tmp_path / "input.toml") == given
 
 
-def test_a_search_finds_dearer_interrupts_than_it_begins_with():
-    cheap = worst_case.Input("saturating", "traditional", 1, 0.0, 2.0, (worst_case.Action(0.0, "off"),))
-    begin = worst_case.replay(cheap).figures()["worst"]
-    count, found = worst_case.search("traditional", [cheap], seconds=1.0, seed=1)
-    assert count > 1.2 * begin
-    assert worst_case.replay(found).figures()["worst"] == count
+def test_search_finds_longer_interrupts_than_it_starts_with():
+    short = worst_case.Input("saturating", "traditional", 1, 0.0, 2.0, (worst_case.Action(0.0, "off"),))
+    initial = worst_case.profile(short).metrics()["max"]
+    count, found = worst_case.search("traditional", [short], seconds=1.0, seed=1)
+    assert count > 1.2 * initial
+    assert worst_case.profile(found).metrics()["max"] == count
 
 
-def all_runs() -> Execution:
-    """Of one image."""
-    kinds = [kind for kind, of in worst_case.KINDS.items() if of.machine == "saturating"]
-    costs = [*map(measure_once, CONTROLLERS), *map(dearest, kinds)]
-    return functools.reduce(operator.add, (cost.execution for cost in costs))
+def all_runs() -> Trace:
+    """Trace of all runs of the same ELF image."""
+    variants = [variant for variant, of in worst_case.VARIANTS.items() if of.machine == "saturating"]
+    profiles = [*map(measure_once, CONTROLLERS), *map(known_worst_case, variants)]
+    return functools.reduce(operator.add, (profile.trace for profile in profiles))
 
 
-def test_no_run_takes_more_stack_than_the_image_says_and_none_much_less():
+def test_stack_depth_is_just_below_the_static_bound():
     bound, stack = sizes("cortex-m4"), all_runs().stack
     assert 0.7 * bound["stack_background"] < stack.thread <= bound["stack_background"]
     assert 0.7 * bound["stack_interrupt"] < stack.interrupt <= bound["stack_interrupt"]
     assert bound["stack_background"] + bound["stack_interrupt"] <= stack.reserved
 
 
-def test_these_runs_execute_nearly_every_instruction_of_the_laws():
+def test_runs_execute_nearly_every_instruction_of_the_control_laws():
     files = all_runs().coverage().files
     laws = [of for file, of in files.items() if file.startswith(("firmware/control/", "firmware/fixed/"))]
     assert 0.94 < sum(of.executed for of in laws) / sum(of.instructions for of in laws) <= 1
@@ -117,14 +117,14 @@ def test_these_runs_execute_nearly_every_instruction_of_the_laws():
     assert sum(of.executed for of in background) > 0
 
 
-def test_the_tables_of_the_readme_are_the_committed_figures():
+def test_readme_tables_match_the_baseline():
     text = README.read_text(encoding="utf-8")
     for table in tables_of(read()):
         assert table in text
 
 
-def test_a_table_is_written_in_the_place_of_the_one_with_its_heads():
+def test_table_replaces_the_one_with_equal_column_titles():
     text = "a\n| x | y |\n| --- | --- |\n| 1 | 2 |\n| 3 | 4 |\n\nb\n"
     assert with_table(text, "| x | y |\n| --- | --- |\n| 5 | 6 |") == "a\n| x | y |\n| --- | --- |\n| 5 | 6 |\n\nb\n"
-    with pytest.raises(UsageError, match="no table with the heads \\| z \\|"):
+    with pytest.raises(UsageError, match="no table with the column titles \\| z \\|"):
         with_table(text, "| z |\n| --- |\n| 5 |")

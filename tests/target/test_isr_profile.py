@@ -1,4 +1,4 @@
-"""What a control interrupt costs on the Cortex-M4, and that it is one: counted by QEMU, the same on every computer."""
+"""Instructions of the control interrupt on the Cortex-M4, counted by QEMU, are exact and reproducible."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import pytest
 from salient.bench.config import CONTROLLERS, BenchConfig
 from salient.bench.emulator import command_line
 from salient.benchmark import command as benchmark
-from salient.elf import Image
-from salient.target.isr_profile import Cost, measure, read_cost
+from salient.elf import ElfImage
+from salient.target.isr_profile import IsrProfile, measure, read_profile
 
 TIMEOUT_S = 60
 CONTROL_EXCEPTION = 16 + 31
 
 
-def test_equal_runs_take_equal_instructions():
+def test_equal_runs_execute_equal_instructions():
     first, second = (measure("salient") for _ in range(2))
     assert (first.interrupts == second.interrupts).all()
-    assert first.execution.by_part() == second.execution.by_part()
+    assert first.trace.by_module() == second.trace.by_module()
 
 
 LAWS = {
@@ -34,31 +34,31 @@ LAWS = {
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_the_parts_account_for_every_instruction_and_are_those_of_the_controller(controller):
-    cost = measure(controller)
-    parts = cost.execution.by_part()
-    assert abs(parts.total() - int(cost.interrupts.sum())) <= len(parts)  # each is rounded
-    taken = {name for name, mean in cost.mean_by_part().items() if mean > 5}
-    foreign = set().union(*LAWS.values()) - LAWS[controller]
-    assert taken >= LAWS[controller] | {"control", "load_observer", "protection", "state_machine", "pwm"}
-    assert not taken & foreign
+def test_modules_account_for_every_instruction_and_belong_to_the_controller(controller):
+    profile = measure(controller)
+    modules = profile.trace.by_module()
+    assert abs(modules.total() - int(profile.interrupts.sum())) <= len(modules)  # each is rounded
+    executed = {name for name, mean in profile.mean_by_module().items() if mean > 5}
+    others = set().union(*LAWS.values()) - LAWS[controller]
+    assert executed >= LAWS[controller] | {"control", "load_observer", "protection", "state_machine", "pwm"}
+    assert not executed & others
 
 
-def test_arithmetic_counts_for_the_laws_also_where_it_is_functions_of_its_own():
-    cost = measure("paper", "cortex-m4-Os")
-    functions = {one.function for one in Image(cost.execution.image).instructions()}
+def test_arithmetic_that_is_not_inlined_counts_for_its_callers():
+    profile = measure("paper", "cortex-m4-Os")
+    functions = {one.function for one in ElfImage(profile.trace.image).instructions()}
     assert {"exp2_negative_q31", "memcpy"} <= functions
-    parts = cost.execution.by_part()
-    assert abs(parts.total() - int(cost.interrupts.sum())) <= len(parts)
-    assert not set(parts) & {"fixed", "exp2", "sigmoid", "interpolate", "libgcc2", "memcpy-armv7m"}
-    assert 0.1 < parts["bp_network"] / parts.total() < 0.6
+    modules = profile.trace.by_module()
+    assert abs(modules.total() - int(profile.interrupts.sum())) <= len(modules)
+    assert not set(modules) & {"fixed", "exp2", "sigmoid", "interpolate", "libgcc2", "memcpy-armv7m"}
+    assert 0.1 < modules["bp_network"] / modules.total() < 0.6
 
 
 @pytest.fixture
 def run_qemu(tmp_path: Path):
-    """Runs a drive for a while with options of QEMU's own before ours; gives back what it cost."""
+    """Runs a drive with additional options of QEMU; returns its profile."""
 
-    def run(name: str, *qemu_options: str | Path) -> Cost:
+    def run(name: str, *qemu_options: str | Path) -> IsrProfile:
         folder = tmp_path / name
         folder.mkdir()
         wrapper = folder / "qemu-system-arm"
@@ -69,26 +69,26 @@ def run_qemu(tmp_path: Path):
                               stop_at_s=0.005, instructions=folder / "instructions", execution=folder / "execution")
         subprocess.run(command_line(options), check=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL,
                        stdout=subprocess.DEVNULL, env={**os.environ, "PATH": f"{folder}:{os.environ['PATH']}"})
-        return read_cost(options.instructions, options.execution, options.machine, options.build)
+        return read_profile(options.instructions, options.execution, options.machine, options.build)
 
     return run
 
 
-def test_counts_are_the_same_when_every_block_is_one_instruction(run_qemu):
+def test_counts_are_independent_of_the_translation_block_size(run_qemu):
     whole, single = run_qemu("whole"), run_qemu("single", "-singlestep")
     assert len(whole.interrupts) == 200
     assert (whole.interrupts == single.interrupts).all()
-    assert (whole.execution.inside == single.execution.inside).all()
-    assert (whole.execution.in_worst == single.execution.in_worst).all()
-    # The counts are written in the middle of the last block, when all of it is counted.
-    assert 0 <= (whole.execution.executed - single.execution.executed).sum() <= 1
-    assert whole.execution.stack == single.execution.stack
+    assert (whole.trace.inside == single.trace.inside).all()
+    assert (whole.trace.in_longest == single.trace.in_longest).all()
+    # The counts are written within the last block, which is counted in full by then.
+    assert 0 <= (whole.trace.executed - single.trace.executed).sum() <= 1
+    assert whole.trace.stack == single.trace.stack
 
 
-def test_counts_are_those_of_the_trace_in_all_and_by_instruction(run_qemu, tmp_path):
-    """QEMU's own log of what it runs, an instruction a line with its address, between the handler's two ends."""
+def test_counts_match_the_log_of_qemu_by_instruction(run_qemu, tmp_path):
+    """QEMU's log has one line per instruction with its address; compared between the handler's entry and return."""
     log = tmp_path / "trace"
-    cost = run_qemu("traced", "-singlestep", "-d", "exec,nochain", "-D", log)
+    profile = run_qemu("traced", "-singlestep", "-d", "exec,nochain", "-D", log)
     lengths, length, addresses = [], None, Counter()
     with log.open(encoding="utf-8", errors="replace") as lines:
         for line in lines:
@@ -103,17 +103,17 @@ def test_counts_are_those_of_the_trace_in_all_and_by_instruction(run_qemu, tmp_p
             if trace[2] == "control_handler_return":
                 lengths.append(length)
                 length = None
-    assert lengths == list(cost.interrupts)
-    instructions = Image(cost.execution.image).instructions()
-    counted = {one.address: count for one, count in zip(instructions, cost.execution.inside, strict=True) if count}
+    assert lengths == list(profile.interrupts)
+    instructions = ElfImage(profile.trace.image).instructions()
+    counted = {one.address: count for one, count in zip(instructions, profile.trace.inside, strict=True) if count}
     assert counted == addresses
 
 
-def test_each_control_interrupt_is_an_exception_of_the_processor(run_qemu, tmp_path):
+def test_each_control_interrupt_is_a_processor_exception(run_qemu, tmp_path):
     log = tmp_path / "log_of_exceptions"
-    cost = run_qemu("exceptions", "-d", "int", "-D", log)
+    profile = run_qemu("exceptions", "-d", "int", "-D", log)
     taken = re.findall(r"taking pending \w+ exception (\d+)", log.read_text(encoding="utf-8"))
-    assert taken == [str(CONTROL_EXCEPTION)] * len(cost.interrupts)
+    assert taken == [str(CONTROL_EXCEPTION)] * len(profile.interrupts)
 
 
 def test_the_speed_of_the_loop_can_be_measured():

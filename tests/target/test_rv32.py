@@ -1,4 +1,4 @@
-"""On RV32, too, the control interrupt is an exception of the processor, and its instructions are counted."""
+"""On RV32 the control interrupt is a processor exception, and its instructions are counted."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from pathlib import Path
 
 from salient.bench.config import BenchConfig
 from salient.bench.emulator import command_line
-from salient.elf import Image
-from salient.target.isr_profile import read_cost
+from salient.elf import ElfImage
+from salient.target.isr_profile import read_profile
 
 TIMEOUT_S = 60
 MACHINE_SOFTWARE_INTERRUPT = 3
 HANDLER_INSTRUCTIONS = 38
-"""Of its own: the stack's pointer, 16 registers kept and given back, the request taken back, a call, the return."""
+"""Instructions of the handler: stack pointer, 16 registers saved and restored, request cleared, a call, the return."""
 
 
-def test_each_control_interrupt_is_an_exception_of_the_processor_and_counted(tmp_path: Path):
+def test_each_control_interrupt_is_a_processor_exception_and_counted(tmp_path: Path):
     log, instructions, executed = tmp_path / "log", tmp_path / "instructions", tmp_path / "executed"
     wrapper = tmp_path / "qemu-system-riscv32"
     wrapper.write_text(f'#!/bin/sh\nPATH={os.environ["PATH"]}\nexec qemu-system-riscv32 -d int -D {log} "$@"\n')
@@ -28,11 +28,11 @@ def test_each_control_interrupt_is_an_exception_of_the_processor_and_counted(tmp
     subprocess.run(command_line(options), check=True, timeout=TIMEOUT_S,
                    stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                    env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"})
-    cost = read_cost(instructions, executed, options.machine, options.build)
+    profile = read_profile(instructions, executed, options.machine, options.build)
     taken = re.findall(r"async:(\d), cause:([0-9a-f]+)", log.read_text(encoding="utf-8"))
-    assert len(cost.interrupts) == 200
+    assert len(profile.interrupts) == 200
     assert [(int(interrupt), int(cause, 16)) for interrupt, cause in taken] == [(1, MACHINE_SOFTWARE_INTERRUPT)] * 200
-    assert cost.execution.inside.sum() == cost.interrupts.sum()
-    instructions_of = zip(Image(cost.execution.image).instructions(), cost.execution.inside, strict=True)
+    assert profile.trace.inside.sum() == profile.interrupts.sum()
+    instructions_of = zip(ElfImage(profile.trace.image).instructions(), profile.trace.inside, strict=True)
     handler = sum(count for one, count in instructions_of if one.function.startswith("control_handler"))
-    assert handler == HANDLER_INSTRUCTIONS * len(cost.interrupts)
+    assert handler == HANDLER_INSTRUCTIONS * len(profile.interrupts)

@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 
 from salient.bench.emulator import TARGET_BUILDS, image
-from salient.elf import Image
+from salient.elf import ElfImage
 from salient.target.baseline import firmware_alone
-from salient.target.static_checks import deepest_stack, forbidden, indirect_calls, needed, size
+from salient.target.static_checks import deepest_stack, forbidden, indirect_calls, size, undefined_symbols
 
 LINKED = ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-O1", "-nostartfiles", "-ffreestanding", "-Wl,-e,begin"]
 
 
 @pytest.mark.parametrize("build", TARGET_BUILDS)
 def test_images_have_no_floating_point_no_heap_and_no_call_by_pointer(build):
-    whole = Image(image("saturating", build))
+    whole = ElfImage(image("saturating", build))
     assert len(whole.instructions()) > 5000
     assert forbidden(whole) == []
     assert indirect_calls(whole) == []
@@ -25,14 +25,14 @@ def test_images_have_no_floating_point_no_heap_and_no_call_by_pointer(build):
 
 @pytest.mark.parametrize("build", ["cortex-m4", "cortex-m4-Os"])
 def test_the_firmware_calls_the_hal_memcpy_and_memset_and_nothing_else(build):
-    assert needed(Image(firmware_alone(build))) == set()
+    assert undefined_symbols(ElfImage(firmware_alone(build))) == set()
 
 
-def linked(tmp_path: Path, source: str, *options: str) -> Image:
+def linked(tmp_path: Path, source: str, *options: str) -> ElfImage:
     (tmp_path / "x.c").write_text(source)
     result = tmp_path / "x.elf"
     subprocess.run([*LINKED, *options, str(tmp_path / "x.c"), "-o", str(result)], check=True)
-    return Image(result)
+    return ElfImage(result)
 
 
 def test_floating_point_by_the_unit_is_found(tmp_path):
@@ -50,7 +50,7 @@ def test_a_call_of_another_function_of_the_c_library_is_found(tmp_path):
     (tmp_path / "x.c").write_text("#include <string.h>\nunsigned begin(const char *a) { return strlen(a) + 1; }")
     subprocess.run(["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-c", str(tmp_path / "x.c"), "-o",
                     str(tmp_path / "x.o")], check=True)
-    assert needed(Image(tmp_path / "x.o")) == {"strlen"}
+    assert undefined_symbols(ElfImage(tmp_path / "x.o")) == {"strlen"}
 
 
 def test_a_call_by_pointer_is_found(tmp_path):

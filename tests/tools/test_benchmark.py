@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from reference_plant import Run, machine_from, run_reference
 
-from salient.benchmark import callgrind as instructions
+from salient.benchmark import callgrind
 from salient.benchmark import command as benchmark
-from salient.benchmark.solvers import PEERS, PLANT, REFERENCE_TOLERANCE
-from salient.benchmark.switching_pattern import Replay, deviation, record, run_plant
+from salient.benchmark.solvers import PLANT, REFERENCE_SOLVERS, REFERENCE_TOLERANCE
+from salient.benchmark.switching_pattern import SwitchingPattern, deviation, record, run_plant
 from salient.machine.file import load_machine
 from salient.paths import MACHINES
 from salient.reference.scipy_plant import dop853, run_scipy
@@ -28,15 +28,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def replay(folder: Path) -> Replay:
+def pattern(folder: Path) -> SwitchingPattern:
     return record(folder, duration_s=PERIODS * 25e-6)
 
 
-def test_replay_is_what_the_drive_did(replay: Replay, folder: Path) -> None:
+def test_switching_pattern_reproduces_the_drive(pattern: SwitchingPattern, folder: Path) -> None:
     recording = np.load(folder / "recording.npy")
-    assert replay.periods == PERIODS and len(recording) == PERIODS + 1
-    replayed = run_plant(replay, passes=1)
-    for phase in range(replay.phases):
+    assert pattern.periods == PERIODS and len(recording) == PERIODS + 1
+    replayed = run_plant(pattern, passes=1)
+    for phase in range(pattern.phases):
         recorded = recording[f"current_{'abcd'[phase]}_A"][1:]
         assert np.max(recorded) > 20.0, "every phase is to have carried current"
         assert np.max(np.abs(replayed.current_A[:, phase] - recorded)) < 2e-5 * np.max(recorded)
@@ -45,15 +45,15 @@ def test_replay_is_what_the_drive_did(replay: Replay, folder: Path) -> None:
     assert abs(np.mean(replayed.torque_Nm) - load_and_friction_Nm) < 0.1
 
 
-def test_reference_is_the_independent_twin_s(replay: Replay) -> None:
+def test_reference_agrees_with_the_independent_model(pattern: SwitchingPattern) -> None:
     """Flux linkages as state, events and a pattern of its own, in plant_twin.py."""
     machine = machine_from(load_machine(MACHINES / "saturating.toml"))
-    compares = list(zip(replay.upper.tolist(), replay.lower.tolist(), strict=True))
-    run = Run(replay.period_ticks, compares, replay.speed_rad_s, math.degrees(replay.angle_rad),
-              replay.load_torque_Nm, replay.current_A)
+    compares = list(zip(pattern.upper.tolist(), pattern.lower.tolist(), strict=True))
+    run = Run(pattern.period_ticks, compares, pattern.speed_rad_s, math.degrees(pattern.angle_rad),
+              pattern.load_torque_Nm, pattern.current_A)
     twin, ends = run_reference(machine, run)
     assert len(ends) >= 1, "the run is to contain an end of conduction"
-    reference = run_scipy(replay, dop853(REFERENCE_TOLERANCE))
+    reference = run_scipy(pattern, dop853(REFERENCE_TOLERANCE))
     assert np.max(np.abs(reference.current_A.T - twin["currents"][:, 1:])) < 1e-9
     assert np.max(np.abs(reference.torque_Nm - twin["torque"][1:])) < 1e-9
     assert np.max(np.abs(reference.speed_rad_s - twin["speed"][1:])) < 1e-10
@@ -74,12 +74,12 @@ ACCURACY = {
 
 
 def test_every_solver_has_its_accuracy_and_is_compared_with_a_plant_no_less_exact(
-    replay: Replay, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    pattern: SwitchingPattern, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(benchmark, "record", lambda folder: replay)
+    monkeypatch.setattr(benchmark, "record", lambda folder: pattern)
     content = json.loads(json.dumps(benchmark.compare_solvers(runs=1)))
     rows = {row["solver"]: row for row in content["solvers"]}
-    assert list(rows) == [*PLANT, *PEERS] == list(ACCURACY)
+    assert list(rows) == [*PLANT, *REFERENCE_SOLVERS] == list(ACCURACY)
     said = capsys.readouterr().out.splitlines()
     for name in rows:
         (line,) = [line for line in said if line.startswith(f"  {name} ")]
@@ -87,7 +87,7 @@ def test_every_solver_has_its_accuracy_and_is_compared_with_a_plant_no_less_exac
     for name, (least, most) in ACCURACY.items():
         for quantity in ("current", "torque"):
             assert least < rows[name]["deviation"][quantity] < most, (name, rows[name])
-    for name in PEERS:
+    for name in REFERENCE_SOLVERS:
         row = rows[name]
         if row["compared_with"] is not None:
             plant = rows[row["compared_with"]]
@@ -99,22 +99,22 @@ def test_every_solver_has_its_accuracy_and_is_compared_with_a_plant_no_less_exac
     assert 10.0 < lsoda[0] < lsoda[1] < lsoda[2] < 300.0
 
 
-def test_deviation_is_relative_to_the_reference(replay: Replay) -> None:
-    reference = run_plant(replay, passes=1)
+def test_deviation_is_relative_to_the_reference(pattern: SwitchingPattern) -> None:
+    reference = run_plant(pattern, passes=1)
     off = type(reference)(reference.angle_rad, reference.speed_rad_s + 0.25 * np.ptp(reference.speed_rad_s),
                           1.5 * reference.torque_Nm, 0.9 * reference.current_A, 0.0)
     assert deviation(off, reference) == pytest.approx({"current": 0.1, "torque": 0.5, "speed": 0.25})
 
 
-def test_instructions_of_the_plant_are_the_same_twice(replay: Replay) -> None:
-    count = instructions.of_plant(replay)
+def test_instructions_of_the_plant_are_the_same_twice(pattern: SwitchingPattern) -> None:
+    count = callgrind.of_plant(pattern)
     assert 2000.0 < count < 6000.0
-    assert instructions.of_plant(replay) == count
+    assert callgrind.of_plant(pattern) == count
 
 
 def test_instructions_of_the_drive_are_the_same_twice_but_for_the_client_s() -> None:
     """How a client's frames are bundled in the socket depends on the moment."""
-    first, second = (instructions.of_drive("paper", 0.01) for _ in range(2))
+    first, second = (callgrind.of_drive("paper", 0.01) for _ in range(2))
     assert first["plant"] == second["plant"] and first["control laws"] == second["control laws"]
     assert sum(second.values()) == pytest.approx(sum(first.values()), rel=2e-3)
 
@@ -122,7 +122,7 @@ def test_instructions_of_the_drive_are_the_same_twice_but_for_the_client_s() -> 
 @pytest.mark.parametrize(("controller", "least", "most"), [
     ("traditional", 2000.0, 4500.0), ("paper", 4500.0, 9500.0), ("salient", 7500.0, 15000.0)])
 def test_instructions_of_the_drive_by_group(controller: str, least: float, most: float) -> None:
-    counts = instructions.of_drive(controller, 0.02)
+    counts = callgrind.of_drive(controller, 0.02)
     total = sum(counts.values())
     assert least < total < most, counts
     assert 0.3 < counts["plant"] / total < 0.8, counts
@@ -153,7 +153,7 @@ fl=(4)
 fn=(2)
 1 30
 """
-    assert instructions.read_counts(text) == {"plant": 110, "control laws": 20, "other": 30}
+    assert callgrind.read_counts(text) == {"plant": 110, "control laws": 20, "other": 30}
 
 
 @pytest.mark.parametrize("condition", [name for name in benchmark.CONDITIONS if name != "cortex-m4"])

@@ -1,4 +1,4 @@
-"""salient compare: what it runs, what it says of it, and what it says of an earlier run."""
+"""salient compare: its runs, its table, and the comparison with a baseline."""
 
 import io
 import json
@@ -13,8 +13,8 @@ from salient.cli import make_parser
 from salient.errors import UsageError
 from salient.experiments.compare import baseline, cases, command, results_file, table
 from salient.experiments.compare.cases import GROUPS, Case, random_drive, scenario_toml, start_scenario
-from salient.experiments.compare.metrics import FIGURES, failures
-from salient.experiments.compare.runner import Outcome, run_all
+from salient.experiments.compare.metrics import METRICS, failures
+from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS, Target
 from salient.experiments.scenario import load_scenarios
 
@@ -22,55 +22,55 @@ ALL_CASES = {name: list(group.cases(False)) for name, group in GROUPS.items()}
 
 
 def compare(*line):
-    """Exit code and what was said."""
-    said = io.StringIO()
-    code = command.run(make_parser().parse_args(["compare", *map(str, line)]), stream=said)
-    return code, said.getvalue()
+    """Exit code and output."""
+    output = io.StringIO()
+    code = command.run(make_parser().parse_args(["compare", *map(str, line)]), stream=output)
+    return code, output.getvalue()
 
 
-def outcome(controller="paper", sample="", failed="", condition="saturating", group="start", **figures):
+def run_metrics(controller="paper", sample="", failed="", condition="saturating", group="start", **values):
     case = Case(group, condition, controller, "start", start_scenario(controller=controller), sample)
-    return Outcome(case, figures, failed)
+    return RunMetrics(case, values, failed)
 
 
 @pytest.fixture(scope="module")
 def start_folder(tmp_path_factory):
-    """What the quick start leaves, by two jobs; and what it said."""
+    """Folder and output of the quick group start with two jobs."""
     folder = tmp_path_factory.mktemp("compare")
-    code, said = compare("start", "--quick", "--jobs", 2, "--out", folder)
+    code, output = compare("start", "--quick", "--jobs", 2, "--out", folder)
     assert code == 0
-    return folder, said
+    return folder, output
 
 
-# --- what is run ----------------------------------------------------------------------------------------------------
+# --- runs -----------------------------------------------------------------------------------------------------------
 
-def test_every_target_stands_beside_a_row():
-    there = {(case.group, case.condition) for of in ALL_CASES.values() for case in of}
-    for group, condition, figure, statistic in TARGETS:
-        assert (group, condition) in there
-        assert (figure, statistic) in GROUPS[group].shown
+def test_every_target_belongs_to_a_row():
+    conditions = {(case.group, case.condition) for of in ALL_CASES.values() for case in of}
+    for group, condition, metric, statistic in TARGETS:
+        assert (group, condition) in conditions
+        assert (metric, statistic) in GROUPS[group].columns
 
 
-def test_every_controller_runs_in_every_group_but_where_it_cannot():
+def test_every_controller_runs_in_every_group_that_it_supports():
     for name, of in ALL_CASES.items():
-        wanted = {"paper_conditions": {"traditional", "paper"}, "ablation": set(CONTROLLERS) - {"traditional"}}
-        assert {case.controller for case in of} == wanted.get(name, set(CONTROLLERS))
+        expected = {"paper_conditions": {"traditional", "paper"}, "ablation": set(CONTROLLERS) - {"traditional"}}
+        assert {case.controller for case in of} == expected.get(name, set(CONTROLLERS))
 
 
-def test_the_quick_runs_are_some_of_the_groups_conditions():
+def test_quick_runs_are_a_subset_of_the_conditions():
     for name, group in GROUPS.items():
         quick = list(group.cases(True))
         assert 0 < len(quick) < len(ALL_CASES[name])
         assert {case.condition for case in quick} <= {case.condition for case in ALL_CASES[name]}
 
 
-def test_the_load_steps_of_the_dip_are_spread_over_one_stroke():
+def test_load_steps_are_equally_spaced_over_one_stroke():
     steps_s = sorted({case.scenario.load[0].at_s for case in ALL_CASES["dip"]})
     assert len(steps_s) == 24
     assert np.diff(steps_s) * 6.0 * 150.0 == pytest.approx(30.0 / 24)
 
 
-def test_random_drives_cover_their_ranges_and_come_again():
+def test_random_drives_cover_their_ranges_and_are_reproducible():
     drives = [random_drive(number) for number in range(cases.DRIVES)]
     assert drives[:5] == [random_drive(number) for number in range(5)]
     assert {drive.encoder_bits for drive in drives} == set(range(14, 21))
@@ -83,70 +83,70 @@ def test_random_drives_cover_their_ranges_and_come_again():
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_a_written_scenario_is_the_one_that_ran(group, tmp_path):
+def test_written_scenario_equals_the_one_that_ran(group, tmp_path):
     for case in ALL_CASES[group][:: max(1, len(ALL_CASES[group]) // 20)]:
         path = tmp_path / "compare.toml"
         path.write_text(scenario_toml(case))
         assert load_scenarios(path) == [case.scenario]
 
 
-def test_a_drive_that_ends_in_a_fault_is_named_and_replayed(tmp_path):
+def test_run_that_ends_in_a_fault_is_reported_and_reproducible(tmp_path):
     scenario = replace(start_scenario(controller="paper"), duration_s=0.1, parameters={"over_speed_rpm": 300.0})
     case = Case("start", "saturating", "paper", "start", scenario)
-    (made,) = run_all([case], 1, io.StringIO())
-    assert (made.figures, made.failed) == ({}, "fault over_speed")
-    (row, *_) = table.make_rows([made])
+    (run,) = run_all([case], 1, io.StringIO())
+    assert (run.metrics, run.failed) == ({}, "fault over_speed")
+    (row, *_) = table.make_rows([run])
     assert row.failed == {"paper": "fault over_speed"} and row.values == {}
     assert "paper: fault over_speed" in table.table([row])
-    ((_, path),) = command._write_failed(tmp_path, [made])
+    ((_, path),) = command._write_failed(tmp_path, [run])
     assert path.name == "start_saturating_paper.toml"
     assert load_scenarios(path) == [replace(scenario, name=path.stem)]
 
 
-def test_a_run_asked_for_twice_is_made_once():
-    said = io.StringIO()
+def test_identical_runs_are_executed_once():
+    progress = io.StringIO()
     case = Case("start", "saturating", "paper", "start", replace(start_scenario(controller="paper"), duration_s=0.01))
-    first, second = run_all([case, replace(case, condition="again")], 2, said)
-    assert first.figures == second.figures and second.case.condition == "again"
-    assert said.getvalue() == "1/1 start: saturating by paper\n"
+    first, second = run_all([case, replace(case, condition="again")], 2, progress)
+    assert first.metrics == second.metrics and second.case.condition == "again"
+    assert progress.getvalue() == "1/1 start: saturating by paper\n"
 
 
-def test_a_drive_fails_the_robustness_study_by_each_of_its_limits():
-    well = {"settling_time_s": 0.1, "speed_error_percent": 0.1, "peak_current_A": 60.0, "highest_speed_percent": 101.0,
+def test_each_limit_of_the_robustness_study_fails_a_drive():
+    good = {"settling_time_s": 0.1, "speed_error_percent": 0.1, "peak_current_A": 60.0, "highest_speed_percent": 101.0,
             "cycle_percent": 0.1}
-    assert failures(well) == []
+    assert failures(good) == []
     beyond = {"settling_time_s": None, "speed_error_percent": 0.51, "peak_current_A": 90.1,
               "highest_speed_percent": 105.1, "cycle_percent": 1.01}
     for name, value in beyond.items():
-        assert len(failures(well | {name: value})) == 1
+        assert len(failures(good | {name: value})) == 1
     assert len(failures(beyond)) == 5
 
 
-# --- the table ------------------------------------------------------------------------------------------------------
+# --- table ----------------------------------------------------------------------------------------------------------
 
-def test_rows_have_medians_and_worst_and_what_never_came_about_is_beyond_all():
-    outcomes = [outcome(group="dip", condition="saturating, 17 bits", sample=f"angle {number}", speed_dip_rpm=dip,
+def test_rows_have_median_and_maximum_and_a_missing_event_sorts_above_all():
+    runs = [run_metrics(group="dip", condition="saturating, 17 bits", sample=f"angle {number}", speed_dip_rpm=dip,
                         recovery_time_s=recovery_s)
                 for number, (dip, recovery_s) in enumerate([(1.0, 0.001), (2.0, None), (4.0, 0.003)])]
-    made = {row.key[2:]: row for row in table.make_rows(outcomes)}
-    assert made["speed_dip_rpm", "median"].values == {"paper": 2.0}
-    assert made["speed_dip_rpm", "worst"].values == {"paper": 4.0}
-    assert made["recovery_time_s", "median"].values == {"paper": 0.003}
-    lines = table.table(list(made.values())).splitlines()
-    assert re.fullmatch(r" +median back within 0.5 %, ms +3\.00 +370 / 1", lines[5])
+    rows = {row.key[2:]: row for row in table.make_rows(runs)}
+    assert rows["speed_dip_rpm", "median"].values == {"paper": 2.0}
+    assert rows["speed_dip_rpm", "worst"].values == {"paper": 4.0}
+    assert rows["recovery_time_s", "median"].values == {"paper": 0.003}
+    lines = table.table(list(rows.values())).splitlines()
+    assert re.fullmatch(r" +median recovery time to 0.5 %, ms +3\.00 +370 / 1", lines[5])
 
 
-def test_the_widest_gap_between_angles_goes_over_the_end_of_the_stroke():
-    outcomes = [outcome(group="dip", condition="saturating, 17 bits", sample=str(angle), step_angle_deg=angle)
+def test_widest_gap_between_angles_wraps_around_the_stroke():
+    runs = [run_metrics(group="dip", condition="saturating, 17 bits", sample=str(angle), step_angle_deg=angle)
                 for angle in (29.0, 6.0, 12.0, 18.0)]
-    (row,) = table.make_rows(outcomes)
+    (row,) = table.make_rows(runs)
     assert row.values == {"paper": 11.0}
 
 
-def test_runs_without_figures_are_counted_and_starred():
-    outcomes = [outcome(group="dip", condition="saturating, 17 bits", sample="a", speed_dip_rpm=1.0),
-                outcome(group="dip", condition="saturating, 17 bits", sample="b", failed="fault over_current")]
-    row = table.make_rows(outcomes)[0]
+def test_failed_runs_are_counted_and_marked_by_an_asterisk():
+    runs = [run_metrics(group="dip", condition="saturating, 17 bits", sample="a", speed_dip_rpm=1.0),
+                run_metrics(group="dip", condition="saturating, 17 bits", sample="b", failed="fault over_current")]
+    row = table.make_rows(runs)[0]
     assert row.values == {"paper": 1.0} and row.failed == {"paper": "1 of 2: fault over_current"}
     text = table.table([row])
     assert "1.00*" in text and "paper: 1 of 2: fault over_current" in text
@@ -160,85 +160,105 @@ def test_runs_without_figures_are_counted_and_starred():
     ({"paper": 0.5}, {"paper": "1 of 2: fault"}, False),
     ({"traditional": 0.5}, {}, None),
 ])  # fmt: skip
-def test_what_is_wanted_is_reached_by_its_controller_in_all_runs_or_not(values, failed, reached):
+def test_target_is_reached_only_if_all_runs_of_its_controller_comply(values, failed, reached):
     row = table.Row(("start", "saturating", "overshoot_percent", ""), values, failed, Target(1.0, "paper"))
     assert row.reached is reached
 
 
-def test_a_missed_figure_is_shown_with_its_reason():
+def test_target_is_not_judged_on_fewer_samples_than_it_is_defined_over():
+    target = Target(1.0, "paper", samples=24, sample_unit="angles")
+    key = ("dip", "saturating, 17 bits", "speed_dip_rpm", "median")
+    few, all_angles = (table.Row(key, {"paper": 1.21}, {}, target, samples) for samples in (6, 24))
+    assert few.reached is None and all_angles.reached is False
+    assert table.status(few) == "not judged (6 of 24 angles)"
+    assert "1.21" in table.table([few]) and "NOT REACHED" not in table.table([few])
+    assert table.summary([few, all_angles]) == "0 of 1 targets reached, 1 not judged (too few samples)"
+
+
+def test_missed_target_is_shown_with_its_reason():
     row = table.Row(("start", "saturating", "overshoot_percent", ""), {"paper": 2.0}, {},
                    Target(1.0, "paper", reason="The observer lags."))
     text = table.table([row])
     assert "NOT REACHED" in text and "The observer lags." in text
-    assert table.verdict([row]) == "0 of 1 wanted figures reached"
+    assert table.summary([row]) == "0 of 1 targets reached"
 
 
-# --- an earlier run -------------------------------------------------------------------------------------------------
+# --- baseline ------------------------------------------------------------------------------------------------------
 
 KEY = ("dip", "saturating, 17 bits", "speed_dip_rpm", "median")
 
 
-def change_of(earlier, now, beyond_percent=5.0, earlier_failed=None, now_failed=None, key=KEY):
+def change_of(before, now, beyond_percent=5.0, before_failed=None, now_failed=None, key=KEY):
     """The change from one value of the paper's controller to another, None for none."""
     def row(value, failed):
         values = {} if value == "none" else {"paper": value}
         return table.Row(key, values, {"paper": failed} if failed else {}, Target())
 
-    old = results_file.content([row(earlier, earlier_failed)], [], False)
+    old = results_file.content([row(before, before_failed)], [], False)
     found, both = baseline.changes([row(now, now_failed)], old, beyond_percent)
     assert both == 1
     return found[0] if found else None
 
 
-def test_a_change_within_the_threshold_or_the_resolution_is_none():
+def test_change_within_the_threshold_or_the_resolution_is_ignored():
     assert change_of(2.0, 2.099) is None
     assert change_of(2.0, 1.901) is None
     assert change_of(0.1, 0.119) is None  # 19 %, but 0.02 r/min
     assert change_of(None, None) is None
 
 
-def test_a_change_beyond_it_is_better_or_worse():
+def test_change_beyond_the_threshold_is_better_or_worse():
     worse, better = change_of(2.0, 2.11), change_of(2.0, 1.89)
     assert worse.worse and worse.percent == pytest.approx(5.5)
     assert not better.worse and better.percent == pytest.approx(-5.5)
     assert change_of(2.0, 2.11, beyond_percent=6.0) is None
 
 
-def test_a_highest_speed_changes_by_what_it_is_above_the_reference():
+def test_maximum_speed_is_judged_by_its_excess_over_the_reference():
     key = ("dip", "saturating, 17 bits", "speed_after_rpm", "worst")
-    assert change_of(150.1, 150.2, key=key).percent == pytest.approx(100.0, rel=1e-6)
-    assert change_of(149.9, 150.0, key=key).percent is None
+    assert change_of(150.1, 150.2, key=key).excess_percent == pytest.approx(100.0, rel=1e-6)
+    assert change_of(149.9, 150.0, key=key).excess_percent is None
     assert change_of(150.01, 150.05, key=key) is None
 
 
-def test_never_and_a_fault_are_worse_than_any_figure():
+def test_printed_percentage_refers_to_the_same_metric_in_the_baseline():
+    assert baseline.change_text(change_of(2.0, 2.5)).endswith(": median speed drop, r/min 2.00 -> 2.50 (+25.0 %)")
+    key = ("dip", "saturating, 17 bits", "speed_after_rpm", "worst")
+    change = change_of(150.1, 150.2, key=key)
+    assert change.percent == pytest.approx(100.0 * 0.1 / 150.1)
+    assert baseline.change_text(change).endswith(
+        " 150.10 -> 150.20 (+0.07 %; +100.0 % of the excess over 150)")
+
+
+def test_missing_event_and_fault_are_worse_than_any_value():
     assert change_of(2.0, None).worse and not change_of(None, 2.0).worse
     assert change_of(2.0, "none", now_failed="fault").worse
-    assert not change_of("none", 9.0, earlier_failed="fault").worse
-    assert change_of("none", "none", earlier_failed="fault", now_failed="fault") is None
+    assert not change_of("none", 9.0, before_failed="fault").worse
+    assert change_of("none", "none", before_failed="fault", now_failed="fault") is None
 
 
-def test_the_same_drive_is_no_change_and_a_doctored_earlier_run_is_told_apart(start_folder, tmp_path):
+def test_same_drive_has_no_change_and_a_modified_baseline_is_detected(start_folder, tmp_path):
     folder, _ = start_folder
-    code, said = compare("start", "--quick", "--jobs", 1, "--out", tmp_path / "again", "--baseline", folder)
+    code, output = compare("start", "--quick", "--jobs", 1, "--out", tmp_path / "again", "--baseline", folder)
     assert code == 0
-    figures = 2 * len(CONTROLLERS)
-    assert f"0 worse, 0 better, {figures} within 10 % of {figures} figures" in said
-    # Equal bytes, whatever the number of jobs.
+    metrics = 2 * len(CONTROLLERS)
+    assert f"0 worse, 0 better, {metrics} of {metrics} metrics unchanged (within 10 %)" in output
+    # Equal bytes, independent of the number of jobs.
     assert (tmp_path / "again/compare.json").read_bytes() == (folder / "compare.json").read_bytes()
 
-    doctored = json.loads((folder / "compare.json").read_text())
-    for row in doctored["rows"]:
+    modified = json.loads((folder / "compare.json").read_text())
+    for row in modified["rows"]:
         if row["figure"] == "settling_time_s":
             row["values"]["paper"] *= 0.9
             row["values"]["traditional"] *= 1.2
     earlier = tmp_path / "earlier.json"
-    earlier.write_text(json.dumps(doctored))
-    code, said = compare("start", "--quick", "--out", tmp_path / "worse", "--baseline", earlier)
+    earlier.write_text(json.dumps(modified))
+    code, output = compare("start", "--quick", "--out", tmp_path / "worse", "--baseline", earlier)
     assert code == 1
-    assert f"1 worse, 1 better, {figures - 2} within 10 % of {figures} figures" in said
-    assert re.search(r"WORSE  start, saturating, paper: settled .* 0\.06\d\d\d -> 0\.06\d\d\d \(\+11\.1 %\)", said)
-    assert re.search(r"better  start, saturating, traditional: .* \(-16\.7 %\)", said)
+    assert f"1 worse, 1 better, {metrics - 2} of {metrics} metrics unchanged (within 10 %)" in output
+    assert re.search(r"WORSE  start, saturating, paper: settling time .* 0\.06\d\d\d -> 0\.06\d\d\d \(\+11\.1 %\)",
+                     output)
+    assert re.search(r"better  start, saturating, traditional: .* \(-16\.7 %\)", output)
     page = (tmp_path / "worse/compare.html").read_text(encoding="utf-8")
     assert "WORSE  start" in page and page.count("data:image/png;base64,") == 1
     code, _ = compare("start", "--quick", "--out", tmp_path / "lenient", "--baseline", earlier, "--worse-percent", 20)
@@ -247,12 +267,12 @@ def test_the_same_drive_is_no_change_and_a_doctored_earlier_run_is_told_apart(st
 
 @pytest.mark.parametrize(("content", "words"), [
     (None, "No such file"),
-    ("{", "no JSON"),
+    ("{", "not JSON"),
     ("[]", "schema 1"),
     ('{"schema": 2, "rows": []}', "schema 1"),
     ('{"schema": 1, "quick": true, "rows": []}', "made with --quick"),
 ])  # fmt: skip
-def test_what_is_no_earlier_run_is_named(tmp_path, content, words):
+def test_invalid_baseline_is_reported(tmp_path, content, words):
     path = tmp_path / "earlier.json"
     if content is not None:
         path.write_text(content)
@@ -261,10 +281,10 @@ def test_what_is_no_earlier_run_is_named(tmp_path, content, words):
     assert not (tmp_path / "out").exists()
 
 
-# --- what is left behind --------------------------------------------------------------------------------------------
+# --- output files --------------------------------------------------------------------------------------------------
 
-def test_the_figures_of_a_start_are_those_of_the_drive(start_folder):
-    folder, said = start_folder
+def test_metrics_of_a_start_are_those_of_the_drive(start_folder):
+    folder, output = start_folder
     content = json.loads((folder / "compare.json").read_text())
     assert content["quick"] is True
     values = {row["figure"]: row["values"] for row in content["rows"]}
@@ -272,14 +292,14 @@ def test_the_figures_of_a_start_are_those_of_the_drive(start_folder):
     assert 0.0677 < values["settling_time_s"]["traditional"] < 0.0720
     assert 0.0 <= values["overshoot_percent"]["paper"] < 0.05
     assert 0.1 < values["overshoot_percent"]["traditional"] < 0.3
-    assert "0.18 / 0.07" in said
+    assert "0.18 / 0.07" in output
     assert [run["controller"] for run in content["runs"]] == list(CONTROLLERS)
 
 
-def test_the_page_is_whole_and_fetches_nothing(tmp_path):
-    # One of each kind of picture, from short runs.
-    code, said = compare("ripple", "speeds", "--quick", "--out", tmp_path)
-    assert code == 0 and "compare.html" in said
+def test_page_is_complete_and_self_contained(tmp_path):
+    # One plot of each kind, from short runs.
+    code, output = compare("ripple", "speeds", "--quick", "--out", tmp_path)
+    assert code == 0 and "compare.html" in output
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
     assert page.count('src="data:image/png;base64,') == 3 == page.count("<img")
     assert not re.search(r"https?://|<script|<link", page)
@@ -294,29 +314,32 @@ def test_the_page_is_whole_and_fetches_nothing(tmp_path):
     assert np.ptp(torque_Nm) / 8.314 == pytest.approx(ripple["saturating, 40 kHz, one pulse"]["paper"], rel=0.01)
 
 
-def test_the_pictures_of_the_studies_are_drawn(tmp_path):
-    code, _ = compare("dip", "ablation", "robustness", "--quick", "--out", tmp_path)
+def test_studies_have_plots_and_quick_targets_are_not_judged(tmp_path):
+    code, output = compare("dip", "ablation", "robustness", "--quick", "--out", tmp_path)
     assert code == 0
+    assert "not judged (6 of 24 angles)" in output and "not judged (10 of 500 drives)" in output
+    assert "REACHED" not in output and "0 of 0 targets reached, " in output
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
-    assert page.count('src="data:image/png;base64,') == 3
+    assert page.count('src="data:image/png;base64,') == 3 and "not judged (6 of 24 angles)" in page
     content = json.loads((tmp_path / "compare.json").read_text())
     values = {(row["group"], row["figure"], row["statistic"]): row["values"] for row in content["rows"]
               if row["group"] != "ablation"}
+    assert all(row["reached"] is None for row in content["rows"])
     # Six load steps over a stroke of 30 degrees.
     assert 5.0 <= values["dip", "step_angle_deg", "gap"]["paper"] < 5.3
     assert 0.0 <= values["robustness", "failed", "count"]["paper"] <= 10.0
     assert 40.0 < values["robustness", "peak_current_A", "worst"]["paper"] < 90.0
 
 
-def test_the_groups_are_listed():
-    code, said = compare("--list")
+def test_groups_are_listed():
+    code, output = compare("--list")
     assert code == 0
-    assert [line.split()[0] for line in said.splitlines()] == list(GROUPS)
-    assert [line.split()[0] for line in said.splitlines() if "only when named" in line] == ["ablation", "robustness"]
+    assert [line.split()[0] for line in output.splitlines()] == list(GROUPS)
+    assert [line.split()[0] for line in output.splitlines() if "only when named" in line] == ["ablation", "robustness"]
 
 
-def test_a_group_that_is_none_is_named():
-    with pytest.raises(UsageError, match="no group dips: must be one of ripple, speeds"):
+def test_unknown_group_is_reported():
+    with pytest.raises(UsageError, match="unknown group dips: must be one of ripple, speeds"):
         compare("dips")
 
 
@@ -324,19 +347,19 @@ def test_a_group_that_is_none_is_named():
     (("--jobs", "0"), "--jobs 0: must be a whole number from 1"),
     (("--worse-percent", "much"), "--worse-percent much: must be a number from 0"),
 ])  # fmt: skip
-def test_a_wrong_option_is_named(line, words, capsys):
+def test_invalid_option_is_reported(line, words, capsys):
     with pytest.raises(SystemExit, match="2"):
         compare(*line)
     assert words in capsys.readouterr().err
 
 
-def test_a_folder_that_cannot_be_written_is_named_before_anything_runs(tmp_path):
+def test_unwritable_folder_is_reported_before_anything_runs(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match="--out .*: cannot write there"):
         compare("start", "--out", tmp_path / "file" / "out")
 
 
-def test_every_figure_shown_has_words():
+def test_every_metric_of_a_row_has_a_label():
     for group in GROUPS.values():
-        for figure, _ in group.shown:
-            assert FIGURES[figure].words
+        for metric, _ in group.columns:
+            assert METRICS[metric].label

@@ -177,7 +177,7 @@ def test_finer_samples_will_do():
     (step_run(seconds=0.35), "spans 0 s to 0.35 s"),
     (step_run(seconds=0.1, from_s=0.35), "spans 0.35 s"),
     (step_run(torque_Nm=0.0), "positive mean torque"),
-    (step_run(torque_Nm=np.nan), "torque_Nm holds a value that is not finite"),
+    (step_run(torque_Nm=np.nan), "torque_Nm has a value that is not finite"),
     (step_run(seconds=0.0), "at least 2 samples"),
     (step_run()[["time_s", "speed_rpm"]], "no field torque_Nm"),
     (step_run(seconds=0.1), "ends at 0.1 s, before 0.13 s"),

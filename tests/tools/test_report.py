@@ -1,4 +1,4 @@
-"""Pictures, results.json and the report page from made-up recordings: nothing hidden or fetched, equal bytes."""
+"""Plots, results.json and the report page from synthetic recordings: complete, self-contained, equal bytes."""
 
 import json
 import re
@@ -8,11 +8,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from salient.experiments import demo, metrics, report, results
-from salient.experiments import plots as figures
+from salient.experiments import demo, metrics, plots, report, results
+from salient.pages import CONTROLLER_COLOUR, Plot
 
 CONTROLLERS = ("traditional", "paper", "salient")
-"""Of the pages and pictures; the paper prints nothing for the last."""
+"""Controllers of pages and plots; the paper has no values for the last."""
 CONDITIONS = {
     "control_rate_hz": 40_000,
     "adc": {"bits": 12, "range_A": [0.0, 80.0]},
@@ -29,7 +29,7 @@ LOSSES = {"window_s": [0.3, 0.4], "input_W": 175.9, "returned_W": 62.1, "copper_
 
 
 def recording(reference_rpm, ripple_Nm):
-    """0.5 s at 1 us: a first-order start, 8 N m from 0.13 s on with a dip, torque with a fast ripple."""
+    """0.5 s at 1 us: a first-order start, 8 N m from 0.13 s with a speed drop, torque with a fast ripple."""
     names = ("speed_rpm", "torque_Nm", "load_torque_Nm", "rotor_angle_deg", "current_a_A", "current_b_A", "current_c_A")
     rows = np.zeros(500_001, dtype=[("time_s", "<f8")] + [(name, "<f4") for name in names])
     time_s = rows["time_s"] = np.arange(len(rows)) * 1e-6
@@ -39,8 +39,8 @@ def recording(reference_rpm, ripple_Nm):
     rows["torque_Nm"] = rows["load_torque_Nm"] + 0.314 + ripple_Nm * np.sin(2 * np.pi * 9_700.0 * time_s)
     rows["rotor_angle_deg"] = (reference_rpm * 6.0 * time_s) % 360.0
     for phase, name in enumerate(names[-3:]):
-        way_deg = (reference_rpm * 6.0 * time_s - 30.0 * phase) % 90.0
-        rows[name] = np.where((way_deg > 45.0) & (way_deg < 80.0), 15.0, 0.0)
+        angle_deg = (reference_rpm * 6.0 * time_s - 30.0 * phase) % 90.0
+        rows[name] = np.where((angle_deg > 45.0) & (angle_deg < 80.0), 15.0, 0.0)
     return rows
 
 
@@ -54,7 +54,7 @@ def runs():
 
 
 @pytest.fixture(scope="module")
-def made(runs):
+def content(runs):
     return results.make_results({
         "start_600": {name: metrics.start_metrics(run, 600.0) for name, run in runs["start_600"].items()},
         "load_step_150": {name: metrics.load_step_metrics(run, 150.0, 0.13)
@@ -62,55 +62,56 @@ def made(runs):
     }, {experiment: dict.fromkeys(CONTROLLERS, LOSSES) for experiment in ("start_600", "load_step_150")}, CONDITIONS)
 
 
-def draw_all(folder, runs, made):
+def plot_all(folder, runs, content):
     folder.mkdir()
     paths = [folder / f"{name}.png" for name in ("figure_5", "figure_6", "figure_7", "phase_currents")]
-    ours, paper = made["experiments"], made["paper"]
-    figures.draw_start(paths[0], runs["start_600"], ours["start_600"], paper["start_600"])
+    ours, paper = content["experiments"], content["paper"]
+    plots.plot_start(paths[0], runs["start_600"], ours["start_600"], paper["start_600"])
     step = runs["load_step_150"], ours["load_step_150"], paper["load_step_150"]
-    figures.draw_load_step_speed(paths[1], *step)
-    figures.draw_load_step_torque(paths[2], *step)
-    figures.draw_phase_currents(paths[3], runs["load_step_150"])
+    plots.plot_load_step_speed(paths[1], *step)
+    plots.plot_load_step_torque(paths[2], *step)
+    plots.plot_phase_currents(paths[3], runs["load_step_150"])
     return paths
 
 
 @pytest.fixture(scope="module")
-def pictures(runs, made, tmp_path_factory):
-    return draw_all(tmp_path_factory.mktemp("drawn") / "figures", runs, made)
+def plot_files(runs, content, tmp_path_factory):
+    return plot_all(tmp_path_factory.mktemp("plots") / "figures", runs, content)
 
 
-def page(path, made, pictures, files=()):
-    captions = report.captions(made)
-    report.write_report(path, made, [report.Picture(picture, picture.stem, captions[picture.stem])
-                                     for picture in pictures], ["tools/salient demo"], files)
+def page(path, content, plot_files, files=()):
+    captions = report.captions(content)
+    report.write_report(path, content,
+                        [Plot(file.stem, captions[file.stem], file.read_bytes()) for file in plot_files],
+                        ["tools/salient demo"], files)
     return path.read_text(encoding="utf-8")
 
 
-# --- drawing without hiding -------------------------------------------------------------------------------------------
+# --- plots --------------------------------------------------------------------------------------------------------
 
-def test_extremes_keep_a_single_sample_spike_wherever_it_is():
+def test_extremes_keep_a_spike_of_a_single_sample_at_any_position():
     time = np.arange(400_000, dtype=float)
     for spike in (0, 1, 12_345, 399_998, 399_999):
         values = np.zeros(len(time))
         values[spike] = -7.0
-        drawn_time, drawn = figures.extremes(time, values)
-        assert drawn.min() == -7.0
-        assert drawn_time[drawn.argmin()] == spike
+        plotted_time, plotted = plots.extremes(time, values)
+        assert plotted.min() == -7.0
+        assert plotted_time[plotted.argmin()] == spike
 
 
-def test_extremes_reach_lowest_and_highest_of_every_slice_in_time_order():
+def test_extremes_contain_minimum_and_maximum_of_every_slice_in_time_order():
     values = np.random.default_rng(1).standard_normal(50_000)
-    time, drawn = figures.extremes(np.arange(50_000), values, slices=100)
-    assert len(drawn) == 200
+    time, plotted = plots.extremes(np.arange(50_000), values, slices=100)
+    assert len(plotted) == 200
     assert np.all(np.diff(time) >= 0)
     slices = values.reshape(100, 500)
-    assert np.array_equal(drawn.reshape(100, 2).min(axis=1), slices.min(axis=1))
-    assert np.array_equal(drawn.reshape(100, 2).max(axis=1), slices.max(axis=1))
+    assert np.array_equal(plotted.reshape(100, 2).min(axis=1), slices.min(axis=1))
+    assert np.array_equal(plotted.reshape(100, 2).max(axis=1), slices.max(axis=1))
 
 
-def test_extremes_leave_short_lines_alone():
+def test_extremes_return_short_lines_unchanged():
     values = np.arange(3000.0)
-    assert np.array_equal(figures.extremes(values, values)[1], values)
+    assert np.array_equal(plots.extremes(values, values)[1], values)
 
 
 # Linear RGB as dichromats see it: G. M. Machado, M. M. Oliveira, L. A. F. Fernandes, "A physiologically-based model for
@@ -124,7 +125,7 @@ EYES = {
 
 
 def lab(colour, eyes):
-    """CIE L*a*b* (D65) of "#rrggbb" as these eyes see it."""
+    """CIE L*a*b* (D65) of "#rrggbb" as perceived with this colour vision."""
     rgb = np.array([int(colour[place:place + 2], 16) for place in (1, 3, 5)]) / 255.0
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     seen = np.clip(np.array(EYES[eyes]) @ linear, 0.0, 1.0)
@@ -134,32 +135,32 @@ def lab(colour, eyes):
 
 
 @pytest.mark.parametrize("eyes", EYES)
-def test_colours_of_controllers_are_apart_for_all_eyes(eyes):
-    """20 is ten times a difference that is just noticed side by side."""
+def test_colours_of_controllers_are_distinguishable_with_any_colour_vision(eyes):
+    """20 is ten times the just noticeable difference."""
     for one, other in combinations(CONTROLLERS, 2):
-        colours = figures.CONTROLLER_COLOUR[one], figures.CONTROLLER_COLOUR[other]
+        colours = CONTROLLER_COLOUR[one], CONTROLLER_COLOUR[other]
         assert 20.0 < np.linalg.norm(lab(colours[0], eyes) - lab(colours[1], eyes)) < 150.0, (one, other)
 
 
-def test_equal_runs_give_equal_pictures(runs, made, pictures, tmp_path):
-    for first, again in zip(pictures, draw_all(tmp_path / "again", runs, made), strict=True):
+def test_equal_runs_give_equal_plots(runs, content, plot_files, tmp_path):
+    for first, again in zip(plot_files, plot_all(tmp_path / "again", runs, content), strict=True):
         assert first.read_bytes() == again.read_bytes(), first.name
 
 
-def test_a_run_that_never_settles_and_never_recovers_is_drawn(runs, made, tmp_path):
-    ours = json.loads(json.dumps(made["experiments"]))
+def test_run_without_settling_and_recovery_is_plotted(runs, content, tmp_path):
+    ours = json.loads(json.dumps(content["experiments"]))
     for controller in CONTROLLERS:
         ours["start_600"][controller]["settling_time_s"] = None
         ours["load_step_150"][controller]["recovery_time_s"] = None
-    changed = dict(made, experiments=ours)
-    text = page(tmp_path / "report.html", changed, draw_all(tmp_path / "figures", runs, changed))
+    changed = dict(content, experiments=ours)
+    text = page(tmp_path / "report.html", changed, plot_all(tmp_path / "figures", runs, changed))
     assert "not in this run" in text
 
 
 # --- results.json -----------------------------------------------------------------------------------------------------
 
-def test_results_have_the_shape_that_scripts_rely_on(made, tmp_path):
-    results.write_results(tmp_path / "results.json", made)
+def test_results_have_the_keys_that_scripts_rely_on(content, tmp_path):
+    results.write_results(tmp_path / "results.json", content)
     read = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     assert read["schema"] == 1
     start = ["settling_time_s", "overshoot_percent", "max_speed_rpm"]
@@ -173,19 +174,19 @@ def test_results_have_the_shape_that_scripts_rely_on(made, tmp_path):
     assert read["conditions"] == CONDITIONS
 
 
-def test_results_quote_the_paper_as_printed():
+def test_results_quote_the_published_values():
     assert results.PAPER["load_step_150"]["traditional"]["torque_ripple"] == 0.04295
     assert results.PAPER["load_step_150"]["traditional"]["torque_mean_Nm"] == 8.45
     assert results.PAPER["load_step_150"]["paper"]["torque_ripple"] == 0.0197
     assert results.PAPER["start_600"]["paper"]["settling_time_s"] == 0.07
 
 
-def test_rounding_keeps_six_digits_and_everything_that_is_no_float():
+def test_rounding_keeps_six_digits_and_all_other_types():
     given = {"a": 1.23456789e-7, "b": [149.99999999, 3], "c": None, "d": "x", "e": {"f": 0.1 + 0.2}}
     assert results.rounded(given) == {"a": 1.23457e-7, "b": [150.0, 3], "c": None, "d": "x", "e": {"f": 0.3}}
 
 
-def test_a_figure_that_is_no_number_is_not_written(tmp_path):
+def test_not_a_number_is_not_written(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
         results.write_results(tmp_path / "results.json", {"a": float("nan")})
 
@@ -193,7 +194,7 @@ def test_a_figure_that_is_no_number_is_not_written(tmp_path):
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 class _Reader(HTMLParser):
-    """Collects what a page refers to, and checks that its elements nest."""
+    """Collects the references of a page, and checks that its elements nest."""
 
     VOID = ("meta", "img", "br", "link", "hr")
 
@@ -219,76 +220,77 @@ def read_page(text):
     return reader
 
 
-def test_the_page_holds_its_pictures_and_fetches_nothing(made, pictures, tmp_path):
-    text = page(tmp_path / "report.html", made, pictures, [("the figures", [("results.json", "results.json")])])
+def test_page_embeds_its_plots_and_is_self_contained(content, plot_files, tmp_path):
+    text = page(tmp_path / "report.html", content, plot_files, [("the figures", [("results.json", "results.json")])])
     reader = read_page(text)
-    assert len(reader.images) == len(pictures)
+    assert len(reader.images) == len(plot_files)
     assert all(image.startswith("data:image/png;base64,") for image in reader.images)
     assert reader.links == ["results.json"]
     assert not re.search(r"https?://|@import|<script|url\(", text)
 
 
-def test_the_page_has_our_figures_and_the_printed_ones(made, pictures, tmp_path):
-    text = page(tmp_path / "report.html", made, pictures)
+def test_page_has_our_metrics_and_the_published_values(content, plot_files, tmp_path):
+    text = page(tmp_path / "report.html", content, plot_files)
     for controller in CONTROLLERS:
-        assert f"{made['experiments']['load_step_150'][controller]['torque_ripple']:.4f}" in text
+        assert f"{content['experiments']['load_step_150'][controller]['torque_ripple']:.4f}" in text
     assert "0.04295" in text
     assert "0.0197" in text
 
 
-def of_controllers(made, controllers):
-    """The results of some of the controllers only."""
-    return made | {part: {experiment: {controller: of[controller] for controller in controllers}
-                          for experiment, of in made[part].items()} for part in ("experiments", "losses")}
+def of_controllers(content, controllers):
+    """The results of a subset of the controllers."""
+    return content | {part: {experiment: {controller: of[controller] for controller in controllers}
+                          for experiment, of in content[part].items()} for part in ("experiments", "losses")}
 
 
 @pytest.mark.parametrize("controllers", [("traditional",), ("salient",), ("paper", "salient"),
                                          ("salient", "traditional", "paper")])
-def test_any_controllers_in_any_order_make_a_page_and_pictures(runs, made, controllers, tmp_path):
-    some = of_controllers(made, controllers)
+def test_page_and_plots_accept_any_controllers_in_any_order(runs, content, controllers, tmp_path):
+    some = of_controllers(content, controllers)
     some_runs = {experiment: {controller: of[controller] for controller in controllers}
                  for experiment, of in runs.items()}
-    text = page(tmp_path / "report.html", some, draw_all(tmp_path / "figures", some_runs, some))
+    text = page(tmp_path / "report.html", some, plot_all(tmp_path / "figures", some_runs, some))
     read_page(text)
-    for controller, of in made["experiments"]["load_step_150"].items():
+    for controller, of in content["experiments"]["load_step_150"].items():
         assert (f"{of['torque_ripple']:.4f}" in text) == (controller in controllers)
-    # In the tables of both experiments; nothing says "printed" of what is not.
-    assert text.count("<th class=paper>printed</th>") == 2 * len({"traditional", "paper"} & set(controllers))
+    # In the tables of both experiments, for controllers with published values only.
+    assert text.count("<th class=published>published</th>") == 2 * len({"traditional", "paper"} & set(controllers))
 
 
-def test_the_terminal_s_table_has_a_printed_column_only_where_the_paper_prints(made):
-    lines = demo.summary(made).splitlines()
+def test_summary_has_a_published_column_only_for_published_values(content):
+    lines = demo.summary(content).splitlines()
     assert [line.split() for line in lines if line.startswith("start_600")] == [
-        ["start_600", "traditional", "printed", "paper", "printed", "salient"]]
+        ["start_600", "traditional", "published", "paper", "published", "salient"]]
     (ripple,) = (line for line in lines if "K_t" in line)
-    assert ripple.split()[3:] == [f"{made['experiments']['load_step_150'][controller]['torque_ripple']:.4f}" if ours
-                                  else f"{made['paper']['load_step_150'][controller]['torque_ripple']:g}"
+    assert ripple.split()[3:] == [f"{content['experiments']['load_step_150'][controller]['torque_ripple']:.4f}" if ours
+                                  else f"{content['paper']['load_step_150'][controller]['torque_ripple']:g}"
                                   for controller, ours in (("traditional", True), ("traditional", False),
                                                            ("paper", True), ("paper", False), ("salient", True))]
 
 
-def test_the_page_shows_losses_and_the_iron_only_where_it_was_estimated(made, pictures, tmp_path):
-    text = page(tmp_path / "without.html", made, pictures)
+def test_page_shows_losses_and_iron_loss_only_where_estimated(content, plot_files, tmp_path):
+    text = page(tmp_path / "without.html", content, plot_files)
     assert "<td>71.4</td>" in text and "<td>17.38</td>" in text
     assert "<td>0.0</td>" in text and "<td>-0.0</td>" not in text
     assert "Steinmetz" not in text and "iron, an estimate" not in text
-    losses = json.loads(json.dumps(made["losses"]))
+    losses = json.loads(json.dumps(content["losses"]))
     for controller in CONTROLLERS:
         losses["start_600"][controller]["iron_estimate_W"] = None
         losses["load_step_150"][controller]["iron_estimate_W"] = 4.747
-    text = page(tmp_path / "with.html", dict(made, losses=losses), pictures)
+    text = page(tmp_path / "with.html", dict(content, losses=losses), plot_files)
     read_page(text)
     assert text.count("<td>4.75</td>") == len(CONTROLLERS)
-    assert "iron, an estimate" in text and "no part of the ledger" in text
+    assert "iron, an estimate" in text and "not part of the energy balance" in text
 
 
-def test_words_from_outside_are_escaped(made, pictures, tmp_path):
+def test_text_of_the_user_is_escaped(content, plot_files, tmp_path):
     conditions = dict(CONDITIONS, machine="<b>&odd")
-    text = page(tmp_path / "report.html", dict(made, conditions=conditions), pictures, [("<i>", [("<u>", "a&b.json")])])
+    text = page(tmp_path / "report.html", dict(content, conditions=conditions), plot_files,
+                [("<i>", [("<u>", "a&b.json")])])
     assert "<b>&odd" not in text
     assert "&lt;b&gt;&amp;odd" in text
     read_page(text)
 
 
-def test_equal_results_give_an_equal_page(made, pictures, tmp_path):
-    assert page(tmp_path / "a.html", made, pictures) == page(tmp_path / "b.html", made, pictures)
+def test_equal_results_give_equal_pages(content, plot_files, tmp_path):
+    assert page(tmp_path / "a.html", content, plot_files) == page(tmp_path / "b.html", content, plot_files)

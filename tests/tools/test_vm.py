@@ -34,7 +34,7 @@ try:
     raise SystemExit("the repository is writable")
 except OSError:
     pass
-Path(sys.argv[2]).write_text("written in the guest")
+Path(sys.argv[2]).write_text("written in the VM")
 print(sys.argv[3])
 print("to stderr", file=sys.stderr)
 sys.exit(7)
@@ -43,7 +43,7 @@ sys.exit(7)
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "salient.vm.run", "--force-guest", *arguments],
+        [sys.executable, "-m", "salient.vm.run", "--force-vm", *arguments],
         cwd=ROOT,
         env={**os.environ, "SALIENT_TEST": "it's\nhere"},
         capture_output=True,
@@ -60,14 +60,14 @@ def test_a_command_has_vcan0_and_files_and_returns_output_and_exit_code(tmp_path
     assert outcome.returncode == 7, outcome.stderr
     assert outcome.stdout == odd + "\n"
     assert outcome.stderr.splitlines()[-1] == "to stderr"
-    assert result_file.read_text() == "written in the guest"
+    assert result_file.read_text() == "written in the VM"
 
 
 def test_the_time_limit_ends_the_vm_with_one_line() -> None:
     outcome = run("--timeout-s", "0.1", "--", "true")  # far less than the kernel needs
     assert outcome.returncode == 1
     assert outcome.stderr.splitlines()[-1] == (
-        "salient guest: the command did not end within --timeout-s 0.1: guest killed"
+        "salient vm: the command did not end within --timeout-s 0.1: VM killed"
     )
 
 

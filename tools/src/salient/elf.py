@@ -1,5 +1,5 @@
-"""What is in an image of the firmware: its instructions, the source they come from, symbols and sections. Read by the
-binutils of the processor that it is for."""
+"""Content of an ELF image of the firmware: instructions, their source locations, symbols and sections, read with the
+binutils of its processor."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from salient.paths import ROOT
 
 _PROCESSORS = {40: ("arm-none-eabi-", "binutils-arm-none-eabi", 36),
                243: ("riscv64-unknown-elf-", "binutils-riscv64-unknown-elf", 0)}  # fmt: skip
-"""By the ELF header's machine: what the tools' names begin with, their Debian package, and the bytes that the processor
-itself puts on the stack when it takes an interrupt: a Cortex-M4 eight words, and one to align them."""
+"""By the machine of the ELF header: prefix of the tools' names, their Debian package, size of the exception frame in
+bytes (Cortex-M4: eight words, and one for alignment)."""
 
 _INSTRUCTION = re.compile(r"\s*([0-9a-f]+):\t([a-z][a-z0-9]*(?:\.[a-z0-9]+)*)(?:\s+(.*))?$")
 _TARGET = re.compile(r"\b([0-9a-f]+) <([^>+]+)>")
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where an instruction was written. file: from the repository's root if it is in there, "?" where it is not known;
-    line 0 where that is not known."""
+class SourceLocation:
+    """Source of an instruction. file: relative to the repository's root if it is inside, "?" if unknown; line: 0 if
+    unknown."""
 
     function: str
     file: str
@@ -33,8 +33,8 @@ class Place:
 
 @dataclass(frozen=True)
 class Instruction:
-    """operands: as the disassembler writes them. function: of the linker's symbol. goes_to: the function whose first
-    instruction it calls or jumps to by name."""
+    """operands: in the syntax of the disassembler. function: name of the linker's symbol. goes_to: the function that it
+    calls, or whose first instruction it jumps to."""
 
     address: int
     mnemonic: str
@@ -43,19 +43,19 @@ class Instruction:
     goes_to: str | None
 
 
-class Image:
-    """path: an ELF file. UsageError when its processor is not known."""
+class ElfImage:
+    """path: an ELF file. UsageError when its processor is unknown."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         with path.open("rb") as file:
             machine = int.from_bytes(file.read(20)[18:], "little")
         if machine not in _PROCESSORS:
-            raise UsageError(f"{path}: for processor {machine}; known are {', '.join(map(str, _PROCESSORS))}")
+            raise UsageError(f"{path}: ELF machine {machine}: must be one of {', '.join(map(str, _PROCESSORS))}")
         self._prefix, self._package, self.exception_frame_bytes = _PROCESSORS[machine]
 
     def run(self, tool: str, *arguments: str, given: str | None = None) -> str:
-        """The output of one of the binutils, with the image behind the arguments."""
+        """Output of one of the binutils, called with the arguments followed by the image."""
         try:
             return subprocess.run([self._prefix + tool, *arguments, str(self.path)], input=given, text=True, check=True,
                                   stdout=subprocess.PIPE).stdout
@@ -63,22 +63,22 @@ class Image:
             raise UsageError(f"{self._prefix}{tool} is missing: install the Debian package {self._package}") from None
 
     def symbols(self) -> dict[str, int]:
-        """Addresses by name."""
+        """Addresses of the symbols by name."""
         rows = (line.split() for line in self.run("nm").splitlines())
         return {row[2]: int(row[0], 16) for row in rows if len(row) == 3}
 
     def sections(self) -> dict[str, int]:
-        """Bytes by name."""
+        """Sizes of the sections in bytes by name."""
         rows = (line.split() for line in self.run("objdump", "-h").splitlines())
         return {row[1]: int(row[2], 16) for row in rows if len(row) == 7 and row[0].isdigit()}
 
     def stack(self) -> tuple[int, int]:
-        """Address of its end, above the variables, and the one that it begins below."""
+        """Lowest address of the stack, after the variables, and the address below which it starts."""
         symbols = self.symbols()
         return symbols["bss_end"], symbols["stack_top"]
 
     def instructions(self) -> list[Instruction]:
-        """Of all functions, by address."""
+        """Instructions of all functions, by address."""
         rows = (line.split() for line in self.run("readelf", "-sW").splitlines())
         functions = {row[7] for row in rows if len(row) == 8 and row[3] == "FUNC"}
         found, function = [], ""
@@ -92,22 +92,22 @@ class Image:
                 found.append(Instruction(int(address, 16), mnemonic, operands, function, goes_to))
         return found
 
-    def places(self, addresses: list[int]) -> dict[int, list[Place]]:
-        """Of each address the function that the instruction was written in, then those that it is inlined in."""
+    def locations(self, addresses: list[int]) -> dict[int, list[SourceLocation]]:
+        """By address: the location in which the instruction is written, then those into which it is inlined."""
         given = "".join(f"{address:#x}\n" for address in addresses)
         lines = self.run("addr2line", "-a", "-f", "-i", "-e", given=given).splitlines()
-        places: dict[int, list[Place]] = {}
-        of: list[Place] = []
+        locations: dict[int, list[SourceLocation]] = {}
+        of: list[SourceLocation] = []
         i = 0
         while i < len(lines):
             if lines[i].startswith("0x"):
-                of = places.setdefault(int(lines[i], 16), [])
+                of = locations.setdefault(int(lines[i], 16), [])
                 i += 1
             else:
                 file, _, line = lines[i + 1].partition(" (")[0].rpartition(":")
-                of.append(Place(lines[i], _short(file), int(line) if line.isdigit() else 0))
+                of.append(SourceLocation(lines[i], _short(file), int(line) if line.isdigit() else 0))
                 i += 2
-        return places
+        return locations
 
 
 @lru_cache

@@ -79,11 +79,7 @@ class Option:
             value = float(text)
             if self.minimum <= value <= self.maximum:
                 return value
-        elif self.kind == WORD and text in self.choices:
-            return text
-        elif self.kind == BUS and re.fullmatch(r"(unix|socketcan):.+", text):
-            return text
-        elif self.kind == PACE and (text in PACES or _is_pace_factor(text)):
+        elif (self.kind == WORD and text in self.choices) or (self.kind == BUS and re.fullmatch(r"(unix|socketcan):.+", text)) or (self.kind == PACE and (text in PACES or _is_pace_factor(text))):
             return text
         elif self.kind in (FILE, MACHINE) and text:
             return Path(text) if self.kind == FILE else text

@@ -18,7 +18,6 @@ from salient.bench.config import TARGET_BUILDS, BenchConfig
 from salient.bench.drive import ParameterRow, read_parameter_table
 from salient.bench.session import Session
 from salient.builder import run_commands
-from salient.elf import Image
 from salient.errors import UsageError
 from salient.machine.file import MachineError, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
@@ -62,7 +61,7 @@ def command_line(config: BenchConfig) -> list[str]:
     if config.instructions is not None:
         line += ["--instructions", str(config.instructions)]
     if config.execution is not None:
-        end, begin = Image(elf).stack()
+        end, begin = ElfImage(elf).stack()
         line += ["--execution", str(config.execution), f"{end:#x}-{begin:#x}"]
     if config.instruction_ns is not None:
         line += ["--instruction-ns", str(config.instruction_ns)]

@@ -1,5 +1,5 @@
-"""Instructions that a program takes, counted by valgrind's callgrind and grouped by the folder of the source: a measure
-of cost that no load of the computer changes. What the kernel does for the program is not counted.
+"""Instructions of a program in user space, counted by valgrind's callgrind and grouped by source folder: a measure of
+speed that is independent of the load of the computer.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from salient.bench.config import BenchConfig
 from salient.bench.emulator import EmulatorProcess
 from salient.bench.session import Session
-from salient.benchmark.switching_pattern import Replay, program, program_input
+from salient.benchmark.switching_pattern import SwitchingPattern, program, program_input
 from salient.errors import UsageError
 from salient.paths import ROOT
 
@@ -25,23 +25,23 @@ GROUPS = {
     "CAN": ("firmware/comms/", "emulator/rig/can_", "emulator/rig/transport", "emulator/rig/truth", "/codec/"),
     "rig": ("emulator/rig/",),
 }
-"""Groups by what the source's path contains, the first that fits; all else is "other": the C library."""
+"""Group -> parts of source paths; the first match counts, everything else is "other", mostly the C library."""
 
-Counts = Counter
+Counts = Counter[str]
 """Instructions by group."""
 
 _SETTLE_S = 0.2
 
 
-def of_plant(replay: Replay) -> float:
-    """Instructions a control period of the plant alone: what one more pass through the pattern takes."""
-    counts = [_count_plant(replay, passes) for passes in (1, 2)]
-    return (counts[1] - counts[0]) / replay.periods
+def of_plant(pattern: SwitchingPattern) -> float:
+    """Instructions per control period of the plant alone: the increment of one more pass through the pattern."""
+    counts = [_count_plant(pattern, passes) for passes in (1, 2)]
+    return (counts[1] - counts[0]) / pattern.periods
 
 
 def of_drive(controller: str, span_s: float) -> dict[str, float]:
-    """Instructions a control period by group of plant and firmware at 40 kHz, saturating machine, 600 r/min against
-    8 N m, telemetry to one client: what span_s more of the same run take."""
+    """Instructions per control period by group of plant and firmware at 40 kHz, saturating machine, 600 r/min, 8 N m,
+    telemetry to one client: the increment of span_s more of the same run."""
     options = BenchConfig(controller=controller, pace="lockstep")
     more = _count_drive(options, _SETTLE_S + span_s)
     more.subtract(_count_drive(options, _SETTLE_S))
@@ -49,9 +49,9 @@ def of_drive(controller: str, span_s: float) -> dict[str, float]:
     return {group: more[group] / periods for group in (*GROUPS, "other")}
 
 
-def _count_plant(replay: Replay, passes: int) -> int:
+def _count_plant(pattern: SwitchingPattern, passes: int) -> int:
     def run(prefix: list[str]) -> None:
-        subprocess.run([*prefix, str(program(replay.machine))], input=program_input(replay, passes),
+        subprocess.run([*prefix, str(program(pattern.machine))], input=program_input(pattern, passes),
                        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True)
 
     return _counted(run).total()
@@ -72,7 +72,7 @@ def _count_drive(options: BenchConfig, loaded_s: float) -> Counts:
 
 
 def _counted(run: Callable[[list[str]], None]) -> Counts:
-    """Calls run with what comes before the program's own command line."""
+    """Calls `run` with the command line of the profiler, which precedes that of the program."""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         out = Path(folder) / "callgrind.out"
         try:
@@ -83,7 +83,7 @@ def _counted(run: Callable[[list[str]], None]) -> Counts:
 
 
 def read_counts(text: str) -> Counts:
-    """Instructions by group of a file that callgrind wrote; format: https://valgrind.org/docs/manual/cl-format.html"""
+    """Instructions by group from a file of callgrind; format: https://valgrind.org/docs/manual/cl-format.html"""
     names: dict[str, str] = {}
     counts: Counts = Counter()
     function, group, skip = "other", "other", False
@@ -95,11 +95,11 @@ def read_counts(text: str) -> Counts:
             if kind == "fl":
                 function = group = _group(names[number])
             elif kind in ("fi", "fe"):
-                # Inlined from somewhere else; the compiler's own headers count as the function they are inlined in.
+                # Inlined from another file; headers of the compiler count for the function that they are inlined into.
                 inlined = _group(names[number])
                 group = function if inlined == "other" else inlined
         elif line.startswith("calls="):
-            skip = True  # the next line is what the callee took
+            skip = True  # the next line is the cost of the callee
         elif re.match(r"[+\-*\d]", line):
             if not skip:
                 counts[group] += int(line.split()[-1])

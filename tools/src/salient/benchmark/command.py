@@ -1,5 +1,4 @@
-"""salient benchmark: the figures of the README, measured again: what a simulated second costs, by itself and beside
-other simulators, and what the network gives."""
+"""salient benchmark: speed of emulator and firmware, with reference solvers, and the ablation of the network."""
 
 from __future__ import annotations
 
@@ -15,40 +14,39 @@ from typing import Any
 from salient.bench.config import CONTROLLERS, BenchConfig
 from salient.bench.emulator import EmulatorError, EmulatorProcess, parameter_table
 from salient.bench.session import Session
-from salient.benchmark import callgrind as instructions
-from salient.benchmark import solvers as comparison
+from salient.benchmark import callgrind, solvers
 from salient.benchmark.switching_pattern import record
 from salient.errors import UsageError
-from salient.experiments.network_ablation import study
+from salient.experiments.network_ablation import run_ablation
 from salient.progress import Progress
 from salient.reference.ngspice import NgspiceError
-from salient.target import isr_profile as interrupt_cost
+from salient.target import isr_profile
 
 SIMULATED_S = 0.9
 _SETTLE_S = 0.2
 _CONTROL_RATE_HZ = 40_000
 _COUNTED_S = 0.1
-_PARTS_SHOWN = 6
+_MODULES_SHOWN = 6
 _COMMAND_TIMEOUT_MS = 1000.0
-_BEGUN_S = 1e-3
-"""Of processor time: more than taking a request needs, less than what it asks for."""
+_STARTED_S = 1e-3
+"""Processor time: more than receiving a request takes, less than executing it."""
 _POLL_S = 1e-4
-_BEGIN_TIMEOUT_S = 60.0
-"""Of the wall clock."""
+_START_TIMEOUT_S = 60.0
+"""Wall-clock time."""
 _ASLEEP_POLLS = 20
 """Consecutive polls that find the process waiting: its virtual time stands still."""
 
 CONDITIONS = {
-    "one client": "telemetry to one client each millisecond",
-    "no client": "nobody on the bus, the last command stands",
-    "recording": "as with one client, and the true state on the bus each millisecond and to a file each microsecond",
+    "one client": "telemetry to one client every millisecond",
+    "no client": "no client on the bus, the last command stays in effect",
+    "recording": "as with one client, and the true state on the bus every millisecond and to a file every microsecond",
     "cortex-m4": "as with one client, the firmware on a Cortex-M4 in QEMU",
 }
 
 
 def measure(controller: str, condition: str) -> float:
-    """Processor seconds of the executable for SIMULATED_S of a drive that holds 600 r/min against 8 N m: saturating
-    machine, control at 40 kHz; condition: of CONDITIONS."""
+    """Processor time in s of the executable for SIMULATED_S of a drive at 600 r/min and 8 N m: saturating machine,
+    control at 40 kHz. condition: key of CONDITIONS."""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         recording = condition == "recording"
         options = BenchConfig(
@@ -76,10 +74,10 @@ def measure(controller: str, condition: str) -> float:
 
 
 def _until_reached(pid: int, can: str, end_s: float, before_s: float) -> float:
-    """Processor seconds used when virtual time, running by itself, has come to end_s; EmulatorError when it did not or
-    the drive stopped on the way."""
-    for _ in range(round(_BEGIN_TIMEOUT_S / _POLL_S)):
-        if _processor_s(pid) > before_s + _BEGUN_S:
+    """Processor time in s when virtual time, running without a client, has reached end_s; EmulatorError when it
+    has not or the drive stopped."""
+    for _ in range(round(_START_TIMEOUT_S / _POLL_S)):
+        if _processor_s(pid) > before_s + _STARTED_S:
             break
         time.sleep(_POLL_S)
     # A client that connects now would end the run of the one that left.
@@ -93,23 +91,23 @@ def _until_reached(pid: int, can: str, end_s: float, before_s: float) -> float:
         session.run_for(2e-3)
         speed_rpm = session.telemetry["speed_rpm"].last
         if reached_s < end_s - 1e-9 or not 590.0 < speed_rpm < 610.0:
-            raise EmulatorError(f"the drive did not run on by itself: {speed_rpm:g} r/min at {reached_s:g} s")
+            raise EmulatorError(f"the drive stopped without a client: {speed_rpm:g} r/min at {reached_s:g} s")
         return after_s
 
 
 def _asleep(pid: int) -> bool:
-    """True when every thread of a process waits; SimulatorError when the process has ended."""
+    """True when every thread of a process waits; EmulatorError when the process has ended."""
     try:
         states = [path.read_text().rpartition(")")[2].split()[0] for path in Path(f"/proc/{pid}/task").glob("*/stat")]
     except OSError:
         return False  # a thread ended in between
     if not states or "Z" in states:
-        raise SimulatorError("the drive ended before its time")
+        raise EmulatorError("the drive ended before its time")
     return set(states) == {"S"}
 
 
 def _processor_s(pid: int) -> float:
-    """Processor time that a process used so far: the clock that clock_getcpuclockid(3) gives for it on Linux."""
+    """Processor time of a process, from the clock of clock_getcpuclockid(3) on Linux."""
     return time.clock_gettime((~pid << 3) | 2)
 
 
@@ -117,7 +115,7 @@ def run(runs: int, json_path: Path | None) -> int:
     """Measures everything `runs` times, prints best and median; returns 0."""
     if json_path is not None:
         try:
-            json_path.touch()  # a path that cannot be written is better known before the measurement
+            json_path.touch()  # reports an unwritable path before the measurement
         except OSError as error:
             raise UsageError(f"--json {json_path}: {error.strerror}") from None
     try:
@@ -128,7 +126,7 @@ def run(runs: int, json_path: Path | None) -> int:
             "instructions": _instructions(),
             "cortex_m4": _cortex_m4(),
             "comparison": compare_solvers(runs),
-            "network": study(),
+            "network": run_ablation(),
         }
     except NgspiceError as error:
         raise UsageError(str(error)) from None
@@ -141,12 +139,12 @@ def _speed(runs: int) -> list[dict[str, Any]]:
     print("simulated seconds per second of one core: saturating machine, control at 40 kHz, 600 r/min, 8 N m")
     for condition, meaning in CONDITIONS.items():
         print(f"  {condition}: {meaning}")
-    figures = []
+    results = []
     for controller in CONTROLLERS:
         for condition in CONDITIONS:
             costs_s = sorted(measure(controller, condition) for _ in range(runs))
             median_s = statistics.median(costs_s)
-            figures.append({
+            results.append({
                 "controller": controller,
                 "condition": condition,
                 "best": round(SIMULATED_S / costs_s[0], 1),
@@ -154,65 +152,65 @@ def _speed(runs: int) -> list[dict[str, Any]]:
                 "ns_per_control_period": round(median_s / SIMULATED_S / _CONTROL_RATE_HZ * 1e9),
                 "runs": runs,
             })
-            print(f"  {controller:<12} {condition:<11} best {figures[-1]['best']:6.1f}"
-                  f"  median {figures[-1]['median']:6.1f}  {figures[-1]['ns_per_control_period']} ns a control period",
+            print(f"  {controller:<12} {condition:<11} best {results[-1]['best']:6.1f}"
+                  f"  median {results[-1]['median']:6.1f}  {results[-1]['ns_per_control_period']} ns a control period",
                   flush=True)
-    return figures
+    return results
 
 
 def _instructions() -> dict[str, Any]:
-    """Of the drive by controller and group."""
-    print("instructions a control period, without the kernel's: the same run with one client")
-    figures = {}
+    """Instructions per control period by controller and group of sources."""
+    print("instructions per control period in user space: the same run with one client")
+    results = {}
     for controller in CONTROLLERS:
-        counts = instructions.of_drive(controller, _COUNTED_S)
+        counts = callgrind.of_drive(controller, _COUNTED_S)
         total = sum(counts.values())
-        figures[controller] = {group: round(count, 1) for group, count in counts.items()} | {"total": round(total, 1)}
+        results[controller] = {group: round(count, 1) for group, count in counts.items()} | {"total": round(total, 1)}
         shares = ", ".join(f"{group} {100 * count / total:.0f} %" for group, count in counts.items())
         print(f"  {controller:<12} {total:6.0f}: {shares}", flush=True)
-    return figures
+    return results
 
 
 def _cortex_m4() -> dict[str, Any]:
-    """Of the control interrupt by controller."""
-    print("instructions a control interrupt on the Cortex-M4, compiled with -O2: the paper's two experiments")
-    figures = {}
+    """ISR profile by controller."""
+    print("instructions per control interrupt on the Cortex-M4, compiled with -O2: the paper's two experiments")
+    results = {}
     for controller in CONTROLLERS:
-        cost = interrupt_cost.measure(controller)
-        made, parts = cost.figures(), cost.mean_by_part()
-        figures[controller] = made | {"mean_by_part": {name: round(mean, 1) for name, mean in parts.items()}}
-        print(f"  {controller:<12} typical {made['typical']:5d}  99 % up to {made['of_99_percent']:5d}"
-              f"  worst {made['worst']:5d}; of the mean: "
-              + ", ".join(f"{name} {mean:.0f}" for name, mean in list(parts.items())[:_PARTS_SHOWN]), flush=True)
-    return figures
+        profile = isr_profile.measure(controller)
+        metrics, modules = profile.metrics(), profile.mean_by_module()
+        results[controller] = metrics | {"mean_by_module": {name: round(mean, 1) for name, mean in modules.items()}}
+        print(f"  {controller:<12} median {metrics['median']:5d}  p99 {metrics['p99']:5d}  max {metrics['max']:5d};"
+              " mean by module: "
+              + ", ".join(f"{name} {mean:.0f}" for name, mean in list(modules.items())[:_MODULES_SHOWN]), flush=True)
+    return results
 
 
 def compare_solvers(runs: int) -> dict[str, Any]:
-    """The plant alone and its peers on what the paper's controller did: prints a row a solver, returns the same."""
+    """Plant alone and reference solvers on a recorded switching pattern: prints and returns one row each."""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
-        replay = record(Path(folder))
-    per_period = instructions.of_plant(replay)
-    with Progress(1 + len(comparison.PLANT) + len(comparison.PEERS), sys.stderr) as progress:
-        rows = comparison.compare(replay, runs, progress.step)
-    print(f"the plant alone beside other simulators: saturating machine, {replay.duration_s:g} s of what the paper's "
-          "controller switched at 600 r/min, 8 N m")
-    print("  simulated seconds a second of one core; right-hand sides a control period; largest deviation from DOP853 "
-          "at 1e-12, of current and torque relative to their largest magnitude, of speed to its range")
+        pattern = record(Path(folder))
+    per_period = callgrind.of_plant(pattern)
+    with Progress(1 + len(solvers.PLANT) + len(solvers.REFERENCE_SOLVERS), sys.stderr) as progress:
+        rows = solvers.compare(pattern, runs, progress.step)
+    print(f"the plant alone and reference solvers: saturating machine, {pattern.duration_s:g} s of the"
+          " switching pattern of the paper's controller at 600 r/min, 8 N m")
+    print("  simulated seconds per second of one core; right-hand sides per control period; largest deviation from "
+          "DOP853 at 1e-12, of current and torque relative to their largest magnitude, of speed to its range")
     print("  SciPy's solvers are compiled, their right-hand sides are Python; ngspice and the plant are compiled")
     for row in rows:
         deviations = "  ".join(f"{name} {value:.1e}" for name, value in row["deviation"].items())
         evaluations = f"{row['evaluations_per_period']:.0f}" if row["evaluations_per_period"] else ""
-        print(f"  {row['solver']:<21}{row['simulated_s_per_s']:9.4g}{evaluations:>5}  {deviations}{_verdict(row)}")
-    print(f"  the plant takes {per_period:.0f} instructions a control period")
-    return {"duration_s": replay.duration_s, "plant_instructions_per_period": round(per_period, 1), "solvers": rows}
+        print(f"  {row['solver']:<21}{row['simulated_s_per_s']:9.4g}{evaluations:>5}  {deviations}{_comparison(row)}")
+    print(f"  the plant takes {per_period:.0f} instructions per control period")
+    return {"duration_s": pattern.duration_s, "plant_instructions_per_period": round(per_period, 1), "solvers": rows}
 
 
-def _verdict(row: dict[str, Any]) -> str:
+def _comparison(row: dict[str, Any]) -> str:
     if "plant_times_faster" not in row:
         return ""
     if row["plant_times_faster"] is None:
-        return "  more exact than the plant"
-    return f"  {row['compared_with']} is {row['plant_times_faster']:.3g} times faster and no less exact"
+        return "  more accurate than the plant"
+    return f"  {row['compared_with']} is {row['plant_times_faster']:.3g} times faster and at least as accurate"
 
 
 def _processor() -> str:

@@ -1,5 +1,5 @@
-"""A switching pattern recorded from a controlled drive, for replaying it without one: by the emulated plant alone, and
-by other simulators of the same machine, so that all of them do the same work.
+"""Switching-pattern playback: a pattern recorded from a controlled drive, played back on the plant alone and on
+reference solvers of the same machine, so that all of them compute the same trajectory.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _STATE = np.dtype([("angle_rad", "f8"), ("speed_rad_s", "f8"), ("torque_Nm", "f8
 
 
 @dataclass(frozen=True)
-class Replay:
-    """Compare values of each control period (rows; upper and lower, a column a phase) of 2 * period_ticks ticks, and
-    the machine's state where the first begins."""
+class SwitchingPattern:
+    """Compare values of each control period of 2 * period_ticks ticks (rows: periods, columns: phases, for upper and
+    lower switches), and the initial state of the machine."""
 
     machine: str
     period_ticks: int
@@ -57,8 +57,8 @@ class Replay:
     def duration_s(self) -> float:
         return self.periods * self.period_ns * 1e-9
 
-    def first(self, periods: int) -> Replay:
-        """Only its first periods."""
+    def first(self, periods: int) -> SwitchingPattern:
+        """The first `periods` control periods."""
         return replace(self, upper=self.upper[:periods], lower=self.lower[:periods])
 
     def segments(self, period: int) -> Iterator[tuple[int, int, list[int]]]:
@@ -78,22 +78,22 @@ class Replay:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """States at the end of each control period, and the processor seconds that it took to compute them."""
+    """States at the end of each control period, and the processor time of the solver."""
 
     angle_rad: np.ndarray
     speed_rad_s: np.ndarray
     torque_Nm: np.ndarray
     current_A: np.ndarray
-    """A row a period, a column a phase."""
+    """Rows: periods, columns: phases."""
     processor_s: float
     evaluations: int | None = None
-    """Of the right-hand side, where they were counted."""
+    """Number of evaluations of the right-hand side, if counted."""
 
 
 def deviation(measured: Trajectory, reference: Trajectory) -> dict[str, float]:
     """Largest deviation of currents, torque and speed over the whole run, relative to the largest magnitude of the
     quantity in the reference, of the speed to its range there."""
-    reach = {
+    scale = {
         "current": np.max(np.abs(reference.current_A)),
         "torque": np.max(np.abs(reference.torque_Nm)),
         "speed": np.ptp(reference.speed_rad_s),
@@ -103,12 +103,12 @@ def deviation(measured: Trajectory, reference: Trajectory) -> dict[str, float]:
         "torque": measured.torque_Nm - reference.torque_Nm,
         "speed": measured.speed_rad_s - reference.speed_rad_s,
     }
-    return {name: float(np.max(np.abs(difference[name])) / reach[name]) for name in reach}
+    return {name: float(np.max(np.abs(difference[name])) / scale[name]) for name in scale}
 
 
-def record(folder: Path, duration_s: float = 0.1) -> Replay:
-    """What the paper's controller does on the saturating machine at 40 kHz while it holds 600 r/min against 8 N m, from
-    0.4 s after its start on. The folder gets the recording of the true state, a row a control period from there on."""
+def record(folder: Path, duration_s: float = 0.1) -> SwitchingPattern:
+    """Records the paper's controller on the saturating machine at 40 kHz, 600 r/min and 8 N m, from 0.4 s after the
+    start. The recording of the true state, one row per control period, is written to `folder`."""
     machine, load_torque_Nm, control_rate_hz = "saturating", 8.0, 40_000
     period_ns = 1_000_000_000 // control_rate_hz
     options = BenchConfig(
@@ -129,10 +129,10 @@ def record(folder: Path, duration_s: float = 0.1) -> Replay:
     start = np.load(options.record)[0]
     compares = np.fromfile(options.record_switches, dtype="u2").reshape(-1, 2, _PHASES_MAX)
     phases = load_machine(machine_path(machine)).phases
-    # The first row acts from the end of the first period on.
+    # The first row takes effect at the end of the first period.
     first = round(start["time_s"] * 1e9 / period_ns) - 1
     rows = compares[first : first + round(duration_s * 1e9 / period_ns), :, :phases].astype(int)
-    return Replay(
+    return SwitchingPattern(
         machine=machine,
         period_ticks=period_ns // (2 * TICK_NS),
         upper=rows[:, 0],
@@ -145,28 +145,28 @@ def record(folder: Path, duration_s: float = 0.1) -> Replay:
 
 
 def program(machine: str) -> Path:
-    """The plant of a shipped machine alone; UsageError when it is not built."""
+    """Executable of the plant alone for a bundled machine; UsageError when it is not built."""
     path = BUILD / "host" / "bin" / f"plant_benchmark_{machine}"
     if not path.exists():
         raise UsageError(f"{path.relative_to(ROOT)} is not built; tools/salient benchmark builds it")
     return path
 
 
-def program_input(replay: Replay, passes: int, step_factor: float = 1.0) -> bytes:
-    """What plant_benchmark_<machine> reads (emulator/plant_benchmark/main.c)."""
-    current_A = [*replay.current_A, *[0.0] * (_PHASES_MAX - replay.phases)]
-    state = (replay.angle_rad, replay.speed_rad_s, replay.load_torque_Nm, *current_A, step_factor)
-    head = struct.pack("8d4I", *state, replay.period_ticks, replay.periods, passes, 0)
-    compares = np.zeros((replay.periods, 2, _PHASES_MAX), dtype="u2")
-    compares[:, 0, : replay.phases], compares[:, 1, : replay.phases] = replay.upper, replay.lower
+def program_input(pattern: SwitchingPattern, passes: int, step_factor: float = 1.0) -> bytes:
+    """Input of plant_benchmark_<machine> (emulator/plant_benchmark/main.c)."""
+    current_A = [*pattern.current_A, *[0.0] * (_PHASES_MAX - pattern.phases)]
+    state = (pattern.angle_rad, pattern.speed_rad_s, pattern.load_torque_Nm, *current_A, step_factor)
+    head = struct.pack("8d4I", *state, pattern.period_ticks, pattern.periods, passes, 0)
+    compares = np.zeros((pattern.periods, 2, _PHASES_MAX), dtype="u2")
+    compares[:, 0, : pattern.phases], compares[:, 1, : pattern.phases] = pattern.upper, pattern.lower
     return head + compares.tobytes()
 
 
-def run_plant(replay: Replay, passes: int, step_factor: float = 1.0) -> Trajectory:
-    """By the emulated plant alone; processor_s is the shortest of the passes."""
-    done = subprocess.run([program(replay.machine)], input=program_input(replay, passes, step_factor),
+def run_plant(pattern: SwitchingPattern, passes: int, step_factor: float = 1.0) -> Trajectory:
+    """Plays the pattern back on the plant alone; processor_s is the shortest of the passes."""
+    done = subprocess.run([program(pattern.machine)], input=program_input(pattern, passes, step_factor),
                           stdout=subprocess.PIPE, check=True)
     times_s = np.frombuffer(done.stdout[: 8 * passes])
     states = np.frombuffer(done.stdout[8 * passes :], dtype=_STATE)
     return Trajectory(states["angle_rad"], states["speed_rad_s"], states["torque_Nm"],
-                      states["current_A"][:, : replay.phases], float(np.min(times_s)))
+                      states["current_A"][:, : pattern.phases], float(np.min(times_s)))

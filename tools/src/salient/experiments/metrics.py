@@ -1,34 +1,34 @@
-"""Figures of merit of the two experiments, taken from the true state that the emulator recorded.
+"""Metrics of the two experiments, from the true state that the emulator recorded.
 
-A recording is a structured array with one row a sample, at least with the fields `time_s`, `speed_rpm` and
-`torque_Nm` (shaft torque: the sum of the phases). Its rows rise in time at a constant step. Nothing here filters or
-resamples: every sample counts, so a single sample outside a band is an exit from that band.
+A recording is a structured array with one row per sample, at least with the fields `time_s`, `speed_rpm` and
+`torque_Nm` (shaft torque: the sum of the phases). The time increases by a constant step. Nothing is filtered or
+resampled: every sample counts, so a single sample outside a band is an exit from that band.
 
 Definitions
     band          reference +-0.5 % (BAND), its edges included
-    settling      from the speed command to the first sample after the last exit from the band; 0 when the speed never
-                  was outside, None when the last sample is outside (it has not settled within the recording)
+    settling      from the speed command to the first sample after the last exit from the band; 0 when the speed is
+                  never outside, None when the last sample is outside (not settled within the recording)
     recovery      the same, counted from the load step
-    overshoot     (highest speed - reference) / reference in percent, not below 0
-    speed dip     reference - lowest speed after the load step, not below 0
+    overshoot     (maximum speed - reference) / reference in percent, not below 0
+    speed drop    reference - minimum speed after the load step, not below 0
     torque ripple K_t = (T_max - T_min) / T_mean, equation (28) of the paper, over every sample of RIPPLE_WINDOW_S;
-                  the samples must be 1 us apart or closer, because coarser ones can fall into step with the switching
-                  and hide the ripple
-    speed error   farthest that any sample of a window is from the reference, in percent of it
+                  the samples must be 1 us apart or closer, because coarser ones can alias with the switching and hide
+                  the ripple
+    speed error   maximum deviation from the reference within a window, in percent of the reference
     strongest line  of the torque's spectrum over a window, below SPECTRUM_TO_HZ and away from the strokes' harmonics:
-                  amplitude in percent of the mean torque. A steady drive repeats itself with every stroke, so what is
-                  left is noise, or a limit cycle
-    mean powers   differences of the emulator's energies (fields `energy_..._J`) over a window, by its length. They
-                  close: input = copper + converter + friction + output + stored
-        input     from the DC link into the half bridges, net of what they give back
-        returned  the part of what they drew that they gave back
+                  amplitude in percent of the mean torque. The torque of a steady drive is periodic with the strokes;
+                  other lines are noise or a limit cycle
+    mean powers   differences of the emulator's energies (fields `energy_..._J`) over a window, divided by its length.
+                  They balance: input = copper + converter + friction + output + stored
+        input     from the DC link into the half bridges, net of the returned power
+        returned  from the half bridges back into the DC link
         copper, converter   heat in the windings and in the half bridges' devices
         friction, output    of the shaft; work on the load
-        stored    into magnetic fields and the rotor's speed: what differs between the ends of the window
-    efficiency    output / (output + copper + converter + friction), so that what was stored counts neither way; None
-                  when the load takes no work
+        stored    into magnetic fields and the rotor: difference between the ends of the window
+    efficiency    output / (output + copper + converter + friction), independent of stored energy; None when the load
+                  takes no power
     RMS current   of all phases over every sample of the window
-    iron loss     an estimate and no part of the above (iron_loss.py)
+    iron loss     an estimate, separate from the above (iron_loss.py)
 """
 
 from __future__ import annotations
@@ -44,10 +44,12 @@ BAND = 0.005
 RIPPLE_WINDOW_S = (0.3, 0.4)
 RIPPLE_STEP_MAX_S = 1e-6
 SPECTRUM_TO_HZ = 2000.0
-# Means over so long are what the spectrum is of: whole periods of every control rate, so the switching is not in them.
+# The spectrum is that of means over this time, a multiple of the period at every control rate, which removes the
+# switching.
 SPECTRUM_STEP_S = 100e-6
 _WINDOW_BINS = 3  # a line's width under a Hann window, to either side
-# Both ends are ends of a control period at every control rate, where the recorded energies are exact (recorder.h).
+# Both ends coincide with ends of a control period at every control rate, where the recorded energies are exact
+# (recorder.h).
 LOSS_WINDOW_S = RIPPLE_WINDOW_S
 
 # Times are compared with this tolerance: far below any sample step, far above the rounding of a double near 1 s.
@@ -55,14 +57,14 @@ _TIME_TOLERANCE_S = 1e-10
 
 
 class MetricsError(ValueError):
-    """A recording from which a figure cannot honestly be taken; the message names what is wrong with it."""
+    """A recording without the data of a metric; the message names the defect."""
 
 
 def time_to_stay_in_band_s(time_s: np.ndarray, speed_rpm: np.ndarray, reference_rpm: float, since_s: float,
                            band: float = BAND) -> float | None:
     """Time from `since_s` until the speed is in reference +-band (a fraction) for the rest of the recording.
 
-    Returns 0.0 when no sample from `since_s` on is outside, None when the last one is.
+    Returns 0.0 when no sample from `since_s` is outside, None when the last one is.
     """
     first = _index_at(time_s, since_s)
     error_rpm = np.abs(np.asarray(speed_rpm[first:], dtype=float) - reference_rpm)
@@ -76,7 +78,7 @@ def time_to_stay_in_band_s(time_s: np.ndarray, speed_rpm: np.ndarray, reference_
 
 
 def start_metrics(recording: np.ndarray, reference_rpm: float, command_time_s: float = 0.0) -> dict[str, float | None]:
-    """Figures of a start from standstill to `reference_rpm` (> 0), commanded at `command_time_s`."""
+    """Metrics of a start from standstill to `reference_rpm` (> 0), commanded at `command_time_s`."""
     _check_recording(recording)
     speed_max_rpm = float(np.max(recording["speed_rpm"]))
     return {
@@ -89,7 +91,7 @@ def start_metrics(recording: np.ndarray, reference_rpm: float, command_time_s: f
 
 def load_step_metrics(recording: np.ndarray, reference_rpm: float, step_time_s: float,
                       ripple_window_s: tuple[float, float] = RIPPLE_WINDOW_S) -> dict[str, float | None]:
-    """Figures of a run at `reference_rpm` with a load step at `step_time_s`; torque over `ripple_window_s`."""
+    """Metrics of a run at `reference_rpm` with a load step at `step_time_s`; torque over `ripple_window_s`."""
     after = speed_after_step(recording, reference_rpm, step_time_s)
     return {
         "speed_dip_rpm": after["speed_dip_rpm"],
@@ -100,7 +102,7 @@ def load_step_metrics(recording: np.ndarray, reference_rpm: float, step_time_s: 
 
 
 def torque_metrics(time_s: np.ndarray, torque_Nm: np.ndarray, window_s: tuple[float, float]) -> dict[str, float]:
-    """Highest, lowest and mean torque and K_t over the samples with window_s[0] <= time <= window_s[1].
+    """Maximum, minimum and mean torque and K_t over the samples with window_s[0] <= time <= window_s[1].
 
     Raises MetricsError when the recording does not span the window or its samples are more than 1 us apart, or when
     the mean torque is not positive, for which K_t is not defined.
@@ -114,19 +116,19 @@ def torque_metrics(time_s: np.ndarray, torque_Nm: np.ndarray, window_s: tuple[fl
         raise MetricsError(f"torque ripple is taken from {start_s:g} s to {end_s:g} s, the recording spans"
                            f" {time_s[0]:g} s to {time_s[-1]:g} s")
     torque_Nm = np.asarray(torque_Nm[_index_at(time_s, start_s):_index_after(time_s, end_s)], dtype=float)
-    highest_Nm, lowest_Nm, mean_Nm = float(torque_Nm.max()), float(torque_Nm.min()), float(torque_Nm.mean())
+    max_Nm, min_Nm, mean_Nm = float(torque_Nm.max()), float(torque_Nm.min()), float(torque_Nm.mean())
     if mean_Nm <= 0.0:
         raise MetricsError(f"torque ripple needs a positive mean torque, the window has {mean_Nm:g} N m")
     return {
-        "torque_max_Nm": highest_Nm,
-        "torque_min_Nm": lowest_Nm,
+        "torque_max_Nm": max_Nm,
+        "torque_min_Nm": min_Nm,
         "torque_mean_Nm": mean_Nm,
-        "torque_ripple": (highest_Nm - lowest_Nm) / mean_Nm,
+        "torque_ripple": (max_Nm - min_Nm) / mean_Nm,
     }
 
 
 def speed_after_step(recording: np.ndarray, reference_rpm: float, step_time_s: float) -> dict[str, float | None]:
-    """Dip, recovery and highest speed after a load step at `step_time_s`; what came before it does not count."""
+    """Speed drop, recovery time and maximum speed after a load step at `step_time_s`; earlier samples do not count."""
     _check_recording(recording)
     time_s, speed_rpm = recording["time_s"], recording["speed_rpm"]
     after_rpm = speed_rpm[_index_at(time_s, step_time_s):]
@@ -138,7 +140,7 @@ def speed_after_step(recording: np.ndarray, reference_rpm: float, step_time_s: f
 
 
 def speed_error_percent(recording: np.ndarray, reference_rpm: float, window_s: tuple[float, float]) -> float:
-    """Farthest that the speed is from `reference_rpm` (> 0) in the window, in percent of it."""
+    """Maximum deviation of the speed from `reference_rpm` (> 0) in the window, in percent of the reference."""
     time_s = recording["time_s"]
     part_rpm = np.asarray(recording["speed_rpm"][_index_at(time_s, window_s[0]):_index_after(time_s, window_s[1])],
                           dtype=float)
@@ -146,17 +148,17 @@ def speed_error_percent(recording: np.ndarray, reference_rpm: float, window_s: t
 
 
 def stroke_deg(machine: Machine) -> float:
-    """The rotor's way from one phase's turn to the next one's, in mechanical degrees."""
+    """Rotor angle between the turn-on of consecutive phases, in mechanical degrees."""
     return 360.0 / (machine.rotor_poles * machine.phases)
 
 
-def strongest_line_percent(recording: np.ndarray, window_s: tuple[float, float], way_deg: float) -> float:
-    """Amplitude of the strongest line of the torque's spectrum that is no harmonic of the strokes, in percent of the
-    mean torque. way_deg: of a stroke (see stroke_deg).
+def strongest_line_percent(recording: np.ndarray, window_s: tuple[float, float], stroke_angle_deg: float) -> float:
+    """Amplitude of the strongest line of the torque's spectrum that is not a harmonic of the strokes, in percent of
+    the mean torque. stroke_angle_deg: see stroke_deg.
 
-    The window is taken at its mean speed and must hold at least 4 * _WINDOW_BINS strokes, or its lines could not be
-    told from their harmonics: MetricsError; also when samples are farther apart than a tenth of SPECTRUM_STEP_S or
-    the mean torque is not positive.
+    The strokes follow from the mean speed of the window. MetricsError when the window has fewer than 4 * _WINDOW_BINS
+    strokes, which would not separate lines from harmonics, when samples are more than a tenth of SPECTRUM_STEP_S
+    apart, or when the mean torque is not positive.
     """
     time_s = recording["time_s"]
     first, last = _index_at(time_s, window_s[0]), _index_after(time_s, window_s[1])
@@ -170,9 +172,9 @@ def strongest_line_percent(recording: np.ndarray, window_s: tuple[float, float],
     mean_Nm = float(means_Nm.mean())
     if mean_Nm <= 0.0:
         raise MetricsError(f"a spectrum in percent needs a positive mean torque, the window has {mean_Nm:g} N m")
-    # 6 degrees a second is one turn a minute.
-    turned_deg = 6.0 * float(np.mean(recording["speed_rpm"][first:last], dtype=float)) * blocks * SPECTRUM_STEP_S
-    strokes = abs(turned_deg) / way_deg  # in the window, and the bin of their first harmonic
+    # 1 r/min is 6 degrees per second.
+    travel_deg = 6.0 * float(np.mean(recording["speed_rpm"][first:last], dtype=float)) * blocks * SPECTRUM_STEP_S
+    strokes = abs(travel_deg) / stroke_angle_deg  # in the window; also the bin of their first harmonic
     if strokes < 4 * _WINDOW_BINS:
         raise MetricsError(f"a spectrum between the strokes needs {4 * _WINDOW_BINS} of them, the window has"
                            f" {strokes:.1f}")
@@ -185,11 +187,11 @@ def strongest_line_percent(recording: np.ndarray, window_s: tuple[float, float],
 
 
 def losses(recording: np.ndarray, machine: Machine, window_s: tuple[float, float]) -> dict[str, Any]:
-    """Where the power went over window_s: mean powers in W, efficiency, RMS phase current, and window_s itself.
+    """Power balance over window_s: mean powers in W, efficiency, RMS phase current, and window_s itself.
 
-    `recording` needs the energies and currents that the emulator records. The key iron_estimate_W is there when the
-    machine file has a table [iron_loss]; it is None where the recording cannot give it. MetricsError when the
-    recording does not span the window.
+    `recording` needs the energies and currents that the emulator records. The key iron_estimate_W exists when the
+    machine file has a table [iron_loss]; its value is None when the recording is too coarse or too short. MetricsError
+    when the recording does not span the window.
     """
     time_s = recording["time_s"]
     step_s = sample_step_s(time_s)
@@ -206,8 +208,8 @@ def losses(recording: np.ndarray, machine: Machine, window_s: tuple[float, float
     lost_W = power_W["copper"] + power_W["converter"] + power_W["friction"]
     output_W = power_W["load"]
     square_A2 = [float(np.mean(np.square(part[name], dtype=float)))
-                 for name in part.dtype.names if name.startswith("current_")]
-    figures: dict[str, Any] = {
+                 for name in part.dtype.names or () if name.startswith("current_")]
+    powers: dict[str, Any] = {
         "window_s": list(window_s),
         "input_W": input_W,
         "returned_W": power_W["returned"],
@@ -220,8 +222,8 @@ def losses(recording: np.ndarray, machine: Machine, window_s: tuple[float, float
         "phase_current_rms_A": (sum(square_A2) / len(square_A2)) ** 0.5,
     }
     if machine.iron_loss is not None:
-        figures["iron_estimate_W"] = iron_loss_W(machine, recording, window_s)
-    return figures
+        powers["iron_estimate_W"] = iron_loss_W(machine, recording, window_s)
+    return powers
 
 
 def sample_step_s(time_s: np.ndarray) -> float:
@@ -236,12 +238,12 @@ def _check_recording(recording: np.ndarray) -> None:
         if field not in (recording.dtype.names or ()):
             raise MetricsError(f"the recording has no field {field}")
         if not np.all(np.isfinite(recording[field])):
-            raise MetricsError(f"the recording's field {field} holds a value that is not finite")
+            raise MetricsError(f"the recording's field {field} has a value that is not finite")
     time_s = recording["time_s"]
     step_s = sample_step_s(time_s)
     steps_s = np.diff(time_s)
     if step_s <= 0.0 or float(steps_s.min()) < 0.5 * step_s or float(steps_s.max()) > 1.5 * step_s:
-        raise MetricsError("the recording's times do not rise in equal steps")
+        raise MetricsError("the recording's times do not increase in equal steps")
 
 
 def _index_at(time_s: np.ndarray, when_s: float) -> int:

@@ -1,4 +1,4 @@
-"""What the BP network is worth: the load-step experiment with the network in each of its modes."""
+"""Ablation of the BP network: the load-step experiment with the network in each of its modes."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from salient.paths import MACHINES, SCENARIOS
 
 SEEDS = (1, 2, 3, 4, 5)
 
-# Values of the parameter bp_mode, and the seeds of the initial weights that matter to it.
+# Value of the parameter bp_mode, and the seeds of the initial weights.
 MODES: dict[str, tuple[int, tuple[int, ...]]] = {
     "off": (0, (1,)),  # hysteresis instead of the PID
-    "fixed": (1, (1,)),  # gains in the middle of their range
-    "frozen": (2, SEEDS),  # gains from the network, its weights as they began
+    "fixed": (1, (1,)),  # gains at the middle of their range
+    "frozen": (2, SEEDS),  # gains from the network with its initial weights
     "learning": (3, SEEDS),
 }
 
 
 def ripple(machine: str, mode: str) -> tuple[list[float], list[str]]:
-    """Torque ripple K_t of the paper's controller at 150 r/min and 8 N m, by seed of the initial weights; and the
-    faults of the runs that ended in one, which have no ripple."""
+    """Torque ripple K_t of the paper's controller at 150 r/min and 8 N m, one value per seed of the initial weights;
+    and the faults of the runs that ended in one and have no ripple."""
     number, seeds = MODES[mode]
     paper = next(s for s in load_scenarios(SCENARIOS / "load_step_150.toml") if s.controller == "paper")
     first_s, last_s = RIPPLE_WINDOW_S
@@ -44,23 +44,23 @@ def ripple(machine: str, mode: str) -> tuple[list[float], list[str]]:
                 continue
             recording = result.recording
             assert recording is not None
-            figures = torque_metrics(recording["time_s"], recording["torque_Nm"], RIPPLE_WINDOW_S)
-        ripples.append(figures["torque_ripple"])
+            metrics = torque_metrics(recording["time_s"], recording["torque_Nm"], RIPPLE_WINDOW_S)
+        ripples.append(metrics["torque_ripple"])
     return ripples, faults
 
 
-def study() -> list[dict[str, Any]]:
-    """Prints a line a machine and mode as it comes; returns the same."""
-    figures = []
-    print("torque ripple of the paper's controller by mode of its network, 40 kHz, 150 r/min, 8 N m; lowest to highest "
-          f"over {len(SEEDS)} seeds")
+def run_ablation() -> list[dict[str, Any]]:
+    """Prints one line per machine and mode as it is measured; returns the results."""
+    results = []
+    print("torque ripple of the paper's controller by network mode, 40 kHz, 150 r/min, 8 N m; minimum to "
+          f"maximum over {len(SEEDS)} seeds")
     for machine in sorted(path.stem for path in MACHINES.glob("*.toml")):
         for mode in MODES:
             ripples, faults = ripple(machine, mode)
-            figures.append({"machine": machine, "mode": mode, "ripple": [round(value, 4) for value in ripples],
+            results.append({"machine": machine, "mode": mode, "ripple": [round(value, 4) for value in ripples],
                             "faults": faults})
-            words = [f"{min(ripples):.4f}"] if ripples else []
-            words += [f"to {max(ripples):.4f}"] if len(ripples) > 1 else []
-            words += [f"ended in a fault: {fault}" for fault in faults]
-            print(f"  {machine:<18}{mode:<10}{' '.join(words)}", flush=True)
-    return figures
+            parts = [f"{min(ripples):.4f}"] if ripples else []
+            parts += [f"to {max(ripples):.4f}"] if len(ripples) > 1 else []
+            parts += [f"ended in a fault: {fault}" for fault in faults]
+            print(f"  {machine:<18}{mode:<10}{' '.join(parts)}", flush=True)
+    return results

@@ -1,9 +1,9 @@
-"""The demo's pictures: the paper's figures 5, 6 and 7 as this drive draws them, and the phase currents behind them.
+"""Plots of the demo: the paper's figures 5, 6 and 7 with this drive's results, and the phase currents.
 
-A picture has one column a controller, all columns on the same scales. Each function takes `recordings`, which maps a
-controller to the recording of its run (see metrics.py for the fields; one `current_<phase>_A` a phase), and the
-matching part of results.json (`ours` and `paper`: controller -> figure of merit -> value or None), and writes a PNG.
-Equal input gives equal bytes: nothing in the file names a date or a version.
+A plot has one column per controller, all columns with the same scales. Each function takes `recordings`, which maps a
+controller to the recording of its run (see metrics.py for the fields; one `current_<phase>_A` per phase), and the
+matching part of results.json (`ours` and `paper`: controller -> metric -> value or None), and writes a PNG. Equal input
+gives equal bytes: the file contains neither date nor version.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -21,35 +22,34 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from salient.experiments.metrics import BAND, RIPPLE_WINDOW_S
+from salient.pages import controller_colour
 
 Recordings = Mapping[str, np.ndarray]
-Merits = Mapping[str, Mapping[str, float | None]]
+Metrics = Mapping[str, Mapping[str, float | None]]
 
 CONTROLLER_TITLE = {
     "traditional": "Traditional: PI, hysteresis DITC",
     "paper": "Paper: SMC, BP-PID in DITC",
     "salient": "Salient: observer, predictive flux PWM",
 }
-# Apart by lightness or hue also for colour-blind eyes (test_report.py); everything that draws controllers uses these.
-CONTROLLER_COLOUR = {"traditional": "#c4551b", "paper": "#1e62a8", "salient": "#109a76"}
 PAPER_COLOUR = "#6f6f6f"
 LOAD_COLOUR = "#222222"
 BAND_COLOUR = "#dfe9d8"
 PHASE_COLOUR = ("#7a3fa0", "#12908e", "#d39a12", "#b03a5b")
 
-# A picture is so wide, and wider when its columns would be narrower than their words.
 _WIDTH_IN = 11.0
 _COLUMN_IN = 4.4
+"""Minimum width of a column, for its titles; more columns than fit make the plot wider."""
 
-# Behind words that may lie on a line.
-_PAPER_WHITE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
+# Background of text that may overlap a line.
+_TEXT_BOX = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
 
-# A line is drawn through the lowest and the highest sample of each of this many slices of the visible time: finer than
-# the picture's pixels, so that nothing is lost between them.
+# Lines are drawn through the minimum and the maximum of each of this many slices of the visible time: finer than the
+# pixels of the plot, so that no extreme is lost.
 SLICES = 1500
 
-# What all pictures of controllers have in common.
-STYLE = {
+# Common to all plots of controllers.
+STYLE: Any = {
     "font.family": "DejaVu Sans",
     "axes.titlelocation": "left",
     "axes.spines.top": False,
@@ -60,7 +60,7 @@ STYLE = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
 }
-_STYLE = {
+_STYLE: Any = {
     **STYLE,
     "font.size": 9.5,
     "axes.titlesize": 10.5,
@@ -78,64 +78,65 @@ _STYLE = {
 
 
 def extremes(time: np.ndarray, values: np.ndarray, slices: int = SLICES) -> tuple[np.ndarray, np.ndarray]:
-    """A line of at most 2 * slices points through the lowest and the highest sample of each slice, in time order.
+    """A line of at most 2 * slices points through the minimum and the maximum of each slice, in time order.
 
-    Slices hold equal numbers of samples. Drawn, it covers what the line through all samples covers, to within the
-    width of a slice. Short inputs (not more than 2 * slices samples) come back as they are.
+    Slices hold equal numbers of samples. The plotted line covers the same area as the line through all samples, to
+    within the width of a slice. Inputs of at most 2 * slices samples are returned unchanged.
     """
     count = len(values)
     if count <= 2 * slices:
         return np.asarray(time), np.asarray(values)
     bounds = np.linspace(0, count, slices + 1).astype(int)
-    picked = np.empty(2 * slices, dtype=int)
+    indices = np.empty(2 * slices, dtype=int)
     for index, (first, end) in enumerate(pairwise(bounds)):
         part = values[first:end]
         low, high = first + int(np.argmin(part)), first + int(np.argmax(part))
-        picked[2 * index], picked[2 * index + 1] = min(low, high), max(low, high)
-    return np.asarray(time[picked]), np.asarray(values[picked])
+        indices[2 * index], indices[2 * index + 1] = min(low, high), max(low, high)
+    return np.asarray(time[indices]), np.asarray(values[indices])
 
 
-def draw_start(path: Path, recordings: Recordings, ours: Merits, paper: Merits, reference_rpm: float = 600.0,
+def plot_start(path: Path, recordings: Recordings, ours: Metrics, paper: Metrics, reference_rpm: float = 600.0,
                command_time_s: float = 0.0) -> None:
-    """Figure 5: start without load; above the whole start, below the neighbourhood of the reference."""
+    """Figure 5: start without load; top: the whole start, bottom: detail around the reference."""
 
     def draw(figure: Figure) -> None:
         axes = _grid(figure, recordings, rows=2, heights=(1.25, 1.0))
-        highest_rpm = max(_figure(of, "max_speed_rpm") for of in (*ours.values(), *paper.values()))
+        max_rpm = max(_value(of, "max_speed_rpm") for of in (*ours.values(), *paper.values()))
         end_s = min(float(recording["time_s"][-1]) for recording in recordings.values()) - command_time_s
         settled_s = [of["settling_time_s"] for of in (*ours.values(), *paper.values())]
-        shown_s = end_s if None in settled_s else min(end_s, 1.5 * max(settled_s))
+        known_s = [time_s for time_s in settled_s if time_s is not None]
+        shown_s = end_s if len(known_s) < len(settled_s) else min(end_s, 1.5 * max(known_s))
         for column, (controller, recording) in enumerate(recordings.items()):
-            colour = _colour(controller)
-            printed = paper.get(controller, {})
+            colour = controller_colour(controller)
+            published = paper.get(controller, {})
             for axis in axes[:, column]:
                 _band(axis, reference_rpm)
                 _trace(axis, recording["time_s"] - command_time_s, recording["speed_rpm"], colour)
                 axis.set_xlim(0.0, shown_s)
             _mark_settling(axes[0, column], reference_rpm, ours[controller]["settling_time_s"],
-                           printed.get("settling_time_s"), colour)
+                           published.get("settling_time_s"), colour)
             axes[0, column].set_title(_letter(column) + _title(controller))
             axes[0, column].set_ylim(0.0, 1.13 * reference_rpm)
             zoom = axes[1, column]
-            zoom.set_title("around the reference")
-            zoom.set_ylim(0.985 * reference_rpm, max(highest_rpm, 1.008 * reference_rpm) + 0.008 * reference_rpm)
-            _mark_highest(zoom, ours[controller], printed, colour)
+            zoom.set_title("detail around the reference")
+            zoom.set_ylim(0.985 * reference_rpm, max(max_rpm, 1.008 * reference_rpm) + 0.008 * reference_rpm)
+            _mark_maximum(zoom, ours[controller], published, colour)
             zoom.set_xlabel("time after the speed command / s")
         _label_rows(axes, "speed / (r/min)", "speed / (r/min)")
 
     _save(path, draw, len(recordings), height_in=6.0, row_gap=0.24)
 
 
-def draw_load_step_speed(path: Path, recordings: Recordings, ours: Merits, paper: Merits, step_time_s: float = 0.13,
+def plot_load_step_speed(path: Path, recordings: Recordings, ours: Metrics, paper: Metrics, step_time_s: float = 0.13,
                          reference_rpm: float = 150.0) -> None:
-    """Figure 6: 8 N m step at 150 r/min; the whole run, the speed around the step, the first 10 ms after it."""
+    """Figure 6: 8 N m load step at 150 r/min; the whole run, the speed around the step, the first 10 ms after it."""
 
     def draw(figure: Figure) -> None:
         axes = _grid(figure, recordings, rows=3, heights=(1.0, 1.15, 0.9))
         after_ms = _zoom_after_ms(ours)
         for column, (controller, recording) in enumerate(recordings.items()):
-            colour = _colour(controller)
-            mine, printed = ours[controller], paper.get(controller, {})
+            colour = controller_colour(controller)
+            mine, published = ours[controller], paper.get(controller, {})
             whole, around, first = axes[:, column]
             _band(whole, reference_rpm)
             _trace(whole, recording["time_s"], recording["speed_rpm"], colour)
@@ -156,9 +157,9 @@ def draw_load_step_speed(path: Path, recordings: Recordings, ours: Merits, paper
                 axis.set_xlabel("time after the load step / ms")
                 _mark_recovery(axis, mine["recovery_time_s"], to_ms, colour)
             around.set_title(_step_summary(mine), color=colour, fontweight="bold")
-            if printed:
-                around.annotate(f"paper's: {_step_summary(printed, short=True)}", (0.97, 0.06),
-                                xycoords="axes fraction", ha="right", color=PAPER_COLOUR, bbox=_PAPER_WHITE)
+            if published:
+                around.annotate(f"published: {_step_summary(published, short=True)}", (0.97, 0.06),
+                                xycoords="axes fraction", ha="right", color=PAPER_COLOUR, bbox=_TEXT_BOX)
             first.set_title("the first 10 ms")
         for row in axes[1:]:
             _same_limits(row)
@@ -167,18 +168,18 @@ def draw_load_step_speed(path: Path, recordings: Recordings, ours: Merits, paper
     _save(path, draw, len(recordings), height_in=8.8)
 
 
-def draw_load_step_torque(path: Path, recordings: Recordings, ours: Merits, paper: Merits, step_time_s: float = 0.13,
+def plot_load_step_torque(path: Path, recordings: Recordings, ours: Metrics, paper: Metrics, step_time_s: float = 0.13,
                           window_s: tuple[float, float] = RIPPLE_WINDOW_S) -> None:
-    """Figure 7: torque around the step, in the steady window with its extremes and mean, and 1 ms at its highest."""
+    """Figure 7: torque around the step, in the steady window with extremes and mean, and 1 ms around its maximum."""
 
     def draw(figure: Figure) -> None:
         axes = _grid(figure, recordings, rows=3, heights=(1.0, 1.15, 0.8))
-        top_Nm = max(_figure(of, "torque_max_Nm") for of in ours.values())
-        bottom_Nm = min(_figure(of, "torque_min_Nm") for of in ours.values())
+        top_Nm = max(_value(of, "torque_max_Nm") for of in ours.values())
+        bottom_Nm = min(_value(of, "torque_min_Nm") for of in ours.values())
         margin_Nm = 0.12 * (top_Nm - bottom_Nm) + 0.05
         for column, (controller, recording) in enumerate(recordings.items()):
-            colour = _colour(controller)
-            mine, printed = ours[controller], paper.get(controller, {})
+            colour = controller_colour(controller)
+            mine, published = ours[controller], paper.get(controller, {})
             around, steady, detail = axes[:, column]
 
             part = _between(recording, step_time_s - 0.01, step_time_s + 0.05)
@@ -193,56 +194,56 @@ def draw_load_step_torque(path: Path, recordings: Recordings, ours: Merits, pape
             part = _between(recording, *window_s)
             _trace(steady, part["time_s"], part["torque_Nm"], colour, width=0.8)
             for name in ("torque_max_Nm", "torque_mean_Nm", "torque_min_Nm"):
-                steady.axhline(_figure(mine, name), color=LOAD_COLOUR, linewidth=0.9,
+                steady.axhline(_value(mine, name), color=LOAD_COLOUR, linewidth=0.9,
                                linestyle="-" if name == "torque_mean_Nm" else (0, (4, 2)))
             steady.set_xlim(*window_s)
             steady.set_ylim(bottom_Nm - 2.0 * margin_Nm, top_Nm + margin_Nm)
             steady.set_xlabel("time / s")
-            steady.set_title(f"K$_t$ = {_figure(mine, 'torque_ripple'):.3g}", fontweight="bold", color=colour)
-            if printed.get("torque_ripple") is not None:
-                steady.set_title(f"paper's: {_figure(printed, 'torque_ripple'):g}", loc="right", color=PAPER_COLOUR,
+            steady.set_title(f"K$_t$ = {_value(mine, 'torque_ripple'):.3g}", fontweight="bold", color=colour)
+            if published.get("torque_ripple") is not None:
+                steady.set_title(f"published: {_value(published, 'torque_ripple'):g}", loc="right", color=PAPER_COLOUR,
                                  fontsize=9.5)
             steady.annotate("max {torque_max_Nm:.2f}   mean {torque_mean_Nm:.2f}   min {torque_min_Nm:.2f} N m"
                             .format_map(mine), (0.97, 0.05), xycoords="axes fraction", ha="right", color="#333333",
-                            bbox=_PAPER_WHITE)
+                            bbox=_TEXT_BOX)
 
-            # part is the window still.
-            highest_s = float(part["time_s"][int(np.argmax(part["torque_Nm"]))])
-            part = _between(recording, highest_s - 0.5e-3, highest_s + 0.5e-3)
-            _trace(detail, (part["time_s"] - highest_s) * 1e3, part["torque_Nm"], colour)
+            # `part` is still the steady window.
+            peak_s = float(part["time_s"][int(np.argmax(part["torque_Nm"]))])
+            part = _between(recording, peak_s - 0.5e-3, peak_s + 0.5e-3)
+            _trace(detail, (part["time_s"] - peak_s) * 1e3, part["torque_Nm"], colour)
             detail.set_xlim(-0.5, 0.5)
-            detail.set_title("1 ms at its highest torque, own scale")
-            detail.set_xlabel(f"time from {highest_s:.4f} s / ms")
+            detail.set_title("1 ms around the maximum torque, separate scale")
+            detail.set_xlabel(f"time from {peak_s:.4f} s / ms")
         _same_limits(axes[0])
         _label_rows(axes, "torque / (N m)", "torque / (N m)", "torque / (N m)")
 
     _save(path, draw, len(recordings), height_in=8.8)
 
 
-def draw_phase_currents(path: Path, recordings: Recordings, from_s: float = RIPPLE_WINDOW_S[0],
+def plot_phase_currents(path: Path, recordings: Recordings, from_s: float = RIPPLE_WINDOW_S[0],
                         rotor_span_deg: float = 60.0) -> None:
-    """Phase currents and torque against the rotor's way from `from_s` on, over `rotor_span_deg` (two strokes)."""
+    """Phase currents and torque over the rotor angle from `from_s`, for `rotor_span_deg` (two strokes)."""
 
     def draw(figure: Figure) -> None:
         axes = _grid(figure, recordings, rows=2, heights=(1.2, 0.8))
         for column, (controller, recording) in enumerate(recordings.items()):
             part = recording[_index(recording, from_s):]
-            way_deg = np.unwrap(np.asarray(part["rotor_angle_deg"], dtype=float), period=360.0)
-            way_deg -= way_deg[0]
-            beyond = np.flatnonzero(way_deg > rotor_span_deg)
-            end = int(beyond[0]) + 1 if beyond.size else len(way_deg)
-            part, way_deg = part[:end], way_deg[:end]
+            travel_deg = np.unwrap(np.asarray(part["rotor_angle_deg"], dtype=float), period=360.0)
+            travel_deg -= travel_deg[0]
+            beyond = np.flatnonzero(travel_deg > rotor_span_deg)
+            end = int(beyond[0]) + 1 if beyond.size else len(travel_deg)
+            part, travel_deg = part[:end], travel_deg[:end]
             currents, torque = axes[:, column]
             for number, name in enumerate(_current_fields(recording)):
-                _trace(currents, way_deg, part[name], PHASE_COLOUR[number], label=name[8].upper(), width=1.0)
+                _trace(currents, travel_deg, part[name], PHASE_COLOUR[number], label=name[8].upper(), width=1.0)
             currents.set_title(_letter(column) + _title(controller).partition(":")[0])
             currents.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0, ncols=4, handlelength=1.5,
                             columnspacing=1.4)
-            _trace(torque, way_deg, part["torque_Nm"], _colour(controller), width=0.8)
+            _trace(torque, travel_deg, part["torque_Nm"], controller_colour(controller), width=0.8)
             for axis in (currents, torque):
                 axis.set_xlim(0.0, rotor_span_deg)
                 axis.set_xticks(np.arange(0.0, rotor_span_deg + 1.0, 15.0))
-            torque.set_xlabel(f"way of the rotor from {from_s:g} s on / deg")
+            torque.set_xlabel(f"rotor angle from {from_s:g} s / deg")
         for row in axes:
             _same_limits(row, from_zero=True)
         _label_rows(axes, "phase current / A", "torque / (N m)")
@@ -250,7 +251,7 @@ def draw_phase_currents(path: Path, recordings: Recordings, from_s: float = RIPP
     _save(path, draw, len(recordings), height_in=5.2, row_gap=0.14)
 
 
-# --- pieces ---------------------------------------------------------------------------------------------------------
+# --- helpers --------------------------------------------------------------------------------------------------------
 
 def _grid(figure: Figure, recordings: Recordings, rows: int, heights: tuple[float, ...]) -> np.ndarray:
     return figure.subplots(rows, len(recordings), squeeze=False, gridspec_kw={"height_ratios": heights})
@@ -261,7 +262,7 @@ def _save(path: Path, draw: Callable[[Figure], None], columns: int, height_in: f
         width_in = max(_WIDTH_IN, columns * _COLUMN_IN)
         figure = Figure(figsize=(width_in, height_in), dpi=140)
         draw(figure)
-        # Margins in inches, so that pictures of different size have the same ones.
+        # Margins in inches, equal for plots of different size.
         figure.subplots_adjust(left=0.73 / width_in, right=1.0 - 0.17 / width_in, bottom=0.55 / height_in,
                                top=1.0 - 0.35 / height_in, hspace=row_gap, wspace=0.14)
         figure.savefig(path, metadata={"Software": None})
@@ -278,27 +279,27 @@ def _band(axis: Axes, reference_rpm: float) -> None:
 
 
 def _mark_settling(axis: Axes, reference_rpm: float, ours_s: float | None, paper_s: float | None, colour: str) -> None:
-    text = "not settled in this run" if ours_s is None else f"settled after {ours_s:.3g} s"
+    text = "not settled in this run" if ours_s is None else f"settling time {ours_s:.3g} s"
     if ours_s is not None:
         axis.plot([ours_s], [reference_rpm], "o", color=colour, markersize=6.5, zorder=5)
     axis.annotate(text, (0.97, 0.16), xycoords="axes fraction", ha="right", color=colour, fontweight="bold")
     if paper_s is not None:
         axis.plot([paper_s], [reference_rpm], "D", color=PAPER_COLOUR, markerfacecolor="white", markersize=6.5,
                   zorder=4)
-        axis.annotate(f"paper's: {paper_s:g} s", (0.97, 0.07), xycoords="axes fraction", ha="right",
+        axis.annotate(f"published: {paper_s:g} s", (0.97, 0.07), xycoords="axes fraction", ha="right",
                       color=PAPER_COLOUR)
 
 
-def _mark_highest(axis: Axes, ours: Mapping[str, float | None], paper: Mapping[str, float | None], colour: str) -> None:
-    rows = [("highest", ours, colour, "bold")]
+def _mark_maximum(axis: Axes, ours: Mapping[str, float | None], paper: Mapping[str, float | None], colour: str) -> None:
+    rows = [("max.", ours, colour, "bold")]
     if paper.get("max_speed_rpm") is not None:
-        rows.append(("paper's:", paper, PAPER_COLOUR, "normal"))
+        rows.append(("published", paper, PAPER_COLOUR, "normal"))
     for row, (name, of, line_colour, weight) in enumerate(rows):
-        level_rpm = _figure(of, "max_speed_rpm")
+        level_rpm = _value(of, "max_speed_rpm")
         axis.axhline(level_rpm, color=line_colour, linewidth=0.9, linestyle=(0, (4, 2)))
-        axis.annotate(f"{name} {level_rpm:.1f} r/min ({_figure(of, 'overshoot_percent'):+.2f} %)",
+        axis.annotate(f"{name} {level_rpm:.1f} r/min ({_value(of, 'overshoot_percent'):+.2f} %)",
                       (0.97, 0.66 - 0.11 * row), xycoords="axes fraction", ha="right", color=line_colour,
-                      fontweight=weight, bbox=_PAPER_WHITE)
+                      fontweight=weight, bbox=_TEXT_BOX)
 
 
 def _step_line(axis: Axes, when: float) -> None:
@@ -310,21 +311,21 @@ def _mark_recovery(axis: Axes, recovery_s: float | None, to_ms: float, colour: s
         return
     axis.axvline(recovery_s * 1e3, color=colour, linewidth=1.0, linestyle=(0, (4, 2)))
     near_end = recovery_s * 1e3 > 0.6 * to_ms
-    axis.annotate("back in the band", (recovery_s * 1e3, 0.92), xycoords=("data", "axes fraction"),
+    axis.annotate("recovered", (recovery_s * 1e3, 0.92), xycoords=("data", "axes fraction"),
                   xytext=(-4 if near_end else 4, 0), textcoords="offset points", color=colour, fontsize=8.5,
                   ha="right" if near_end else "left")
 
 
 def _step_summary(of: Mapping[str, float | None], short: bool = False) -> str:
-    recovery_s, dip = of["recovery_time_s"], f"{_figure(of, 'speed_dip_rpm'):.3g} r/min"
-    back = "not back in this run" if recovery_s is None else f"{recovery_s * 1e3:.3g} ms"
+    recovery_s, drop = of["recovery_time_s"], f"{_value(of, 'speed_dip_rpm'):.3g} r/min"
+    recovery = "no recovery in this run" if recovery_s is None else f"{recovery_s * 1e3:.3g} ms"
     if short:
-        return f"{dip}, {back}"
-    return f"dip {dip}, {back if recovery_s is None else f'back in {back}'}"
+        return f"{drop}, {recovery}"
+    return f"drop {drop}, {recovery if recovery_s is None else f'recovery {recovery}'}"
 
 
-def _zoom_after_ms(ours: Merits) -> float:
-    """Long enough for every recovery, within 20 to 100 ms."""
+def _zoom_after_ms(ours: Metrics) -> float:
+    """Time range that includes every recovery, limited to 20 to 100 ms."""
     longest_s = max((of["recovery_time_s"] or 0.1) for of in ours.values())
     return float(np.clip(1.3 * longest_s * 1e3, 20.0, 100.0))
 
@@ -350,16 +351,12 @@ def _index(recording: np.ndarray, when_s: float) -> int:
 
 
 def _current_fields(recording: np.ndarray) -> list[str]:
-    return [name for name in recording.dtype.names if name.startswith("current_") and name.endswith("_A")]
+    return [name for name in recording.dtype.names or () if name.startswith("current_") and name.endswith("_A")]
 
 
-def _figure(of: Mapping[str, float | None], name: str) -> float:
+def _value(of: Mapping[str, float | None], name: str) -> float:
     value = of[name]
     return float("nan") if value is None else value
-
-
-def _colour(controller: str) -> str:
-    return CONTROLLER_COLOUR.get(controller, "#444444")
 
 
 def _title(controller: str) -> str:

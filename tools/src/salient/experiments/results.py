@@ -1,4 +1,4 @@
-"""results.json: this drive's figures beside the paper's, and the conditions they were obtained under."""
+"""results.json: this drive's metrics, the paper's published values, and the conditions of both."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 
 SCHEMA = 1
 
-# Floats are written with this many significant digits: more than any of the figures means, few enough to be read.
+# Significant digits of floats: more than the precision of any metric, few enough to be readable.
 SIGNIFICANT_DIGITS = 6
 
-# The figures as the paper prints them, section 3 with tables 1 and 2; None where it prints none.
+# The published values, section 3 with tables 1 and 2; None where the paper gives none.
 PAPER: dict[str, dict[str, dict[str, float | None]]] = {
     "start_600": {
         "traditional": {"settling_time_s": 0.18, "overshoot_percent": 3.3, "max_speed_rpm": 620.0},
@@ -40,16 +40,16 @@ PAPER: dict[str, dict[str, dict[str, float | None]]] = {
     },
 }
 
-# Where the printed figures need a word; kept beside them, because they are quoted as printed.
+# Remarks on published values, which are quoted unchanged.
 PAPER_NOTES = (
-    "Recovery of the traditional controller: the paper prints that the speed is steady at 0.5 s, which is 0.37 s after"
+    "Recovery of the traditional controller: the paper states that the speed is steady at 0.5 s, which is 0.37 s after"
     " the step at 0.13 s.",
     "Torque ripple of the paper's controller: its own Table 2 gives (8.40 - 8.24) / 8.32 = 0.0192, not 0.0197.",
     "Mean torque of the traditional controller: a steady mean must be load plus friction,"
-    " 8 + 0.02 * 15.71 = 8.314 N m; 8.45 N m is no steady mean.",
-    "Minimum torque of the traditional controller: the text says 8.2 N m, Table 2 says 8.287 N m; Table 2 is quoted.",
-    "The paper does not say how it defines settled, nor its sampling time, hysteresis bands, network settings and the"
-    " rotor angle of the load step.",
+    " 8 + 0.02 * 15.71 = 8.314 N m; 8.45 N m is not a steady mean.",
+    "Minimum torque of the traditional controller: 8.2 N m in the text, 8.287 N m in Table 2; Table 2 is quoted.",
+    "The paper gives neither its definition of settling nor the sampling time, the hysteresis bands, the network"
+    " settings and the rotor angle of the load step.",
 )
 
 
@@ -58,9 +58,9 @@ def make_results(experiments: Mapping[str, Mapping[str, Mapping[str, float | Non
                  conditions: Mapping[str, Any]) -> dict[str, Any]:
     """The content of results.json.
 
-    `experiments` maps experiment -> controller -> figure of merit -> value or None, `losses` experiment -> controller
-    -> what metrics.losses gives. Floats in them and in `conditions` are rounded to SIGNIFICANT_DIGITS; the order of the
-    keys is kept.
+    `experiments` maps experiment -> controller -> metric -> value or None, `losses` experiment -> controller -> result
+    of metrics.losses. Floats in them and in `conditions` are rounded to SIGNIFICANT_DIGITS; the order of the
+    keys is preserved.
     """
     return {
         "schema": SCHEMA,
@@ -78,7 +78,7 @@ def write_results(path: Path, results: Mapping[str, Any]) -> None:
 
 
 def rounded(value: Any) -> Any:
-    """`value` with every float in it, however deep in mappings and lists, at SIGNIFICANT_DIGITS digits."""
+    """`value` with all floats, also in nested mappings and lists, rounded to SIGNIFICANT_DIGITS digits."""
     if isinstance(value, float):
         return float(f"{value:.{SIGNIFICANT_DIGITS}g}")
     if isinstance(value, Mapping):

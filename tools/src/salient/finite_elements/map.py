@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,8 @@ _FILL_FACTOR = 0.45
 _SHAFT_KG_M3 = 7850.0
 
 
-def solutions(machine: Machine, angle_deg: float, currents_A=CURRENTS_A) -> Iterator[tuple[float, float]]:
+def solutions(machine: Machine, angle_deg: float,
+              currents_A: Sequence[float] = CURRENTS_A) -> Iterator[tuple[float, float]]:
     """(flux linkage in Wb, torque in N m by Maxwell's stress) at one position and each of the rising currents."""
     position = machine.at(angle_deg)
     before_A, at_A, before, potential = 0.0, 0.0, None, None

@@ -111,7 +111,7 @@ def build_mesh(g: Geometry, refinement: int = 1) -> Mesh:
         _Layer(g.stator_root_radius, g.stator_radius, 5, False),
     ]
     nodes: list[np.ndarray] = []
-    parts: list[tuple] = []
+    parts: list[tuple[np.ndarray, ...]] = []
     rotor_rings = _mesh_part(rotor, _RotorPart(g), refinement, nodes, parts, in_rotor=True)
     stator_rings = _mesh_part(stator, _StatorPart(g), refinement, nodes, parts, in_rotor=False)
     triangles, weights, region, in_rotor = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -173,7 +173,8 @@ class _StatorPart:
         return region
 
 
-def _mesh_part(layers: list[_Layer], part, refinement: int, nodes: list, parts: list, *, in_rotor: bool) -> list:
+def _mesh_part(layers: list[_Layer], part: _RotorPart | _StatorPart, refinement: int, nodes: list[np.ndarray],
+               parts: list[tuple[np.ndarray, ...]], *, in_rotor: bool) -> list[np.ndarray]:
     """Appends the rings' nodes (x and y in mm) and the triangles between them; returns the rings."""
     radii = [layers[0].inner]
     fine = [layers[0].fine]
@@ -205,7 +206,7 @@ def _mesh_part(layers: list[_Layer], part, refinement: int, nodes: list, parts: 
     return rings
 
 
-def _true_angle(nominal: np.ndarray, part, radius: float) -> np.ndarray:
+def _true_angle(nominal: np.ndarray, part: _RotorPart | _StatorPart, radius: float) -> np.ndarray:
     """Nominal angles stretched between the sides of the poles so that these are parallel, deg."""
     axis = part.pitch * np.rint(nominal / part.pitch)
     from_axis = nominal - axis

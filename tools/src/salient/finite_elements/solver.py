@@ -28,7 +28,7 @@ class FieldError(RuntimeError):
 class Machine:
     """The mesh and everything that does not change with position and current. `steel` gives the reluctivity of IRON."""
 
-    def __init__(self, geometry: Geometry, refinement: int = 1, steel=None):
+    def __init__(self, geometry: Geometry, refinement: int = 1, steel: Laminations | None = None):
         self.geometry = geometry
         self.mesh = build_mesh(geometry, refinement)
         self.steel = steel or Laminations(geometry.stacking_factor)
@@ -160,7 +160,7 @@ def _unknowns(machine: Machine, steps: int) -> tuple[np.ndarray, np.ndarray, int
         unknown[ring[-1]] = count
         sign[ring[-1]] = -1.0
         count += len(ring) - 1
-    # The stator's first ring is the rotor's last, so many steps on; each half turn changes the sign.
+    # The stator's first ring is the rotor's last, shifted by `steps`; each half turn changes the sign.
     columns = len(stator[0]) - 1
     turns, place = np.divmod(np.arange(columns + 1) - steps, columns)
     unknown[stator[0]] = unknown[rotor[-1][place]]

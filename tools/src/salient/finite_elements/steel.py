@@ -1,4 +1,4 @@
-"""M-19, a non-oriented silicon steel of 0.36 mm sheets: what the field computation and the loss estimate need to know.
+"""M-19, a non-oriented silicon steel of 0.36 mm sheets: data for the field computation and the loss estimate.
 
 Magnetisation: DC curve of M-19 as in the material library of FEMM 4.2 ("M-19 Steel"; D. C. Meeker, Finite Element
 Method Magnetics), read at the flux densities below.
@@ -13,6 +13,7 @@ drives its poles to.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -62,7 +63,7 @@ class Laminations:
         return nu, (self._slope(flux_density_T) - nu) / (2.0 * square_T2)
 
 
-def sinusoidal_loss_W_kg(frequency_Hz, flux_density_T):
+def sinusoidal_loss_W_kg(frequency_Hz: Any, flux_density_T: Any) -> Any:
     """Specific loss at a sinusoidal flux density of that amplitude."""
     hysteresis = _HYSTERESIS_J_M3 * frequency_Hz**_FREQUENCY_EXPONENT * flux_density_T**_FLUX_DENSITY_EXPONENT
     eddy = _EDDY_J_S_M3 * 2.0 * (math.pi * frequency_Hz * flux_density_T) ** 2

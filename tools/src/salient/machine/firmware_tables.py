@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -96,7 +97,7 @@ def machine_phase_map(path: Path | str, machine: Machine) -> PhaseMap:
         raise MachineError(f"{path}: magnetics: {error}") from None
 
 
-def phase_map(magnetics) -> PhaseMap:
+def phase_map(magnetics: Any) -> PhaseMap:
     """The tables of `magnetics`: a `Formula`, a `FluxMap` or another object with their methods. PhaseMapError."""
     half_rad = magnetics.pitch_rad / 2.0
     row_start = _row_starts(magnetics)
@@ -117,13 +118,13 @@ def phase_map(magnetics) -> PhaseMap:
     )
 
 
-def _rising_torque(magnetics, angle_rad: np.ndarray) -> np.ndarray:
+def _rising_torque(magnetics: Any, angle_rad: np.ndarray) -> np.ndarray:
     """Torque that nowhere falls with the current, nor below zero."""
     torque_Nm = magnetics.torque_Nm(angle_rad, CURRENT_A)
     torque_Nm = np.where(CURRENT_A > 0.0, torque_Nm, 0.0)  # not what rounding leaves there
     rising_Nm = np.maximum.accumulate(np.maximum(torque_Nm, 0.0), axis=1)
     excess_Nm = rising_Nm - torque_Nm - FALL_TOLERANCE * np.max(torque_Nm, axis=0)
-    excess_Nm = np.where(CURRENT_A <= magnetics.current_max_A, excess_Nm, 0.0)
+    excess_Nm = np.where(magnetics.current_max_A >= CURRENT_A, excess_Nm, 0.0)
     row, column = np.unravel_index(np.argmax(excess_Nm), excess_Nm.shape)
     if excess_Nm[row, column] > 0.0:
         raise PhaseMapError(
@@ -150,7 +151,7 @@ def _surface(what: str, unit: str, values: np.ndarray, fraction_bits: tuple[int,
     raise PhaseMapError(f"{np.max(values):.4g} {unit} of {what} is more than the firmware's tables hold")
 
 
-def _row_starts(magnetics) -> np.ndarray:
+def _row_starts(magnetics: Any) -> np.ndarray:
     half_rad = magnetics.pitch_rad / 2.0
     angle_rad = half_rad + half_rad * np.arange(ROW_UNITS + 1)[:, None] / ROW_UNITS
     torque_Nm = magnetics.torque_Nm(angle_rad, min(CURRENT_A[-1], magnetics.current_max_A) * _ROW_CURRENTS)
@@ -158,6 +159,7 @@ def _row_starts(magnetics) -> np.ndarray:
 
     least, greatest = _LEAST_TOLERANCE, _GREATEST_TOLERANCE
     starts = _rows_within(shape, greatest)
+    assert starts is not None  # a single row satisfies the greatest tolerance
     while greatest > 1.1 * least:
         tolerance = math.sqrt(least * greatest)
         found = _rows_within(shape, tolerance)

@@ -24,8 +24,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 # As in emulator/plant/flux_map.h.
 ANGLE_INTERVALS = 96
@@ -83,19 +85,19 @@ class FluxMap:
         """Of the unsaturated phase, d psi / d i at 0 A."""
         return float(self.derivative(self.pitch_rad / 2.0, 0.0, 0, 2))
 
-    def flux_linkage_Wb(self, angle_rad, current_A):
+    def flux_linkage_Wb(self, angle_rad: ArrayLike, current_A: ArrayLike) -> np.ndarray:
         """psi."""
         return self.derivative(angle_rad, current_A, 0, 1)
 
-    def coenergy_J(self, angle_rad, current_A):
+    def coenergy_J(self, angle_rad: ArrayLike, current_A: ArrayLike) -> np.ndarray:
         """Integral of psi over the current at a constant angle."""
         return self.derivative(angle_rad, current_A, 0, 0)
 
-    def torque_Nm(self, angle_rad, current_A):
+    def torque_Nm(self, angle_rad: ArrayLike, current_A: ArrayLike) -> np.ndarray:
         """Derivative of the co-energy by the angle."""
         return self.derivative(angle_rad, current_A, 1, 0)
 
-    def derivative(self, angle_rad, current_A, by_angle: int, by_current: int):
+    def derivative(self, angle_rad: ArrayLike, current_A: ArrayLike, by_angle: int, by_current: int) -> np.ndarray:
         """A derivative of the co-energy, by the angle (0 to 2 times) and the current (0 to 3 times)."""
         angle_rad, current_A = np.broadcast_arrays(
             np.asarray(angle_rad, dtype=float), np.asarray(current_A, dtype=float)
@@ -126,8 +128,9 @@ class FluxMap:
         scale_A = min(max(scale_A, step_A), 4.0 * step_A)
         return float(inductance_H[row, column]), float(angle_rad[row, 0]), float(current_A[column]), scale_A
 
-    def _spline(self, angle_rad, current_A, by_angle: int, by_current: int):
-        """Differences before weights, as in the kernel: the coefficients are large against what is left of them."""
+    def _spline(self, angle_rad: np.ndarray, current_A: np.ndarray, by_angle: int, by_current: int) -> np.ndarray:
+        """Takes differences before weighting, as the emulator does: the coefficients are large compared with their
+        differences."""
         steps_1_rad = 2.0 * ANGLE_INTERVALS / self.pitch_rad
         steps_1_A = CURRENT_INTERVALS / self.current_max_A
         wrapped_rad = angle_rad - np.rint(angle_rad / self.pitch_rad) * self.pitch_rad
@@ -330,13 +333,13 @@ def _integral(coefficients: np.ndarray, step: float) -> np.ndarray:
     return summed - (summed[0] + 11.0 * summed[1] + 11.0 * summed[2] + summed[3]) / 24.0
 
 
-def _interval(position, intervals: int):
+def _interval(position: np.ndarray, intervals: int) -> tuple[np.ndarray, np.ndarray]:
     """Number of the interval and the place in it, 0 to 1; outside, the first and last intervals go on."""
     number = np.clip(np.floor(position).astype(int), 0, intervals - 1)
     return number, position - number
 
 
-def _weights(t, degree: int) -> list:
+def _weights(t: np.ndarray, degree: int) -> list[Any]:
     """The degree + 1 uniform B-splines that are not zero at place t of an interval (de Boor's recursion)."""
     weights = [np.ones_like(t)]
     for d in range(1, degree + 1):

@@ -15,7 +15,7 @@ and ends where it is at that level again; loops may hold loops.
 What the estimate leaves out: the flux density is that of a stator pole, psi / turns_area_m2, and stands for all of the
 iron, though yoke and rotor see other waveforms; the bias of the loops (a pole's flux does not change its sign), which
 Steinmetz's numbers do not know; relaxation while the flux is constant; leakage. The iron does not act back on the
-electrical side: it is no part of the emulator's energy ledger.
+electrical side: it is not part of the emulator's energy balance.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ def iron_loss_W(machine: Machine, recording: np.ndarray, window_s: tuple[float, 
         return None
     part = slice(before[-1], end)
     losses_W_kg = []
-    for phase, current in enumerate(name for name in recording.dtype.names if name.startswith("current_")):
+    for phase, current in enumerate(name for name in recording.dtype.names or () if name.startswith("current_")):
         flux_Wb = machine.magnetics.flux_linkage_Wb(angle_rad[part] - phase * machine.pitch_rad / machine.phases,
                                                     recording[current][part])
         losses_W_kg.append(specific_loss_W_kg(time_s[part], flux_Wb / steinmetz["turns_area_m2"],
                                               steinmetz["steinmetz_k"], steinmetz["steinmetz_alpha"],
                                               steinmetz["steinmetz_beta"]))
-    return steinmetz["mass_kg"] * sum(losses_W_kg) / machine.phases
+    return float(steinmetz["mass_kg"] * sum(losses_W_kg) / machine.phases)
 
 
 def specific_loss_W_kg(time_s: np.ndarray, flux_density_T: np.ndarray, k: float, alpha: float, beta: float) -> float:

@@ -1,7 +1,7 @@
-"""Magnetics of one phase by formula: those of `emulator/plant/magnetics.h`, written a second time in NumPy, because the
-firmware's tables are computed from them and the tests compare the emulator with them.
+"""Magnetics of one phase by formula: those of `emulator/plant/magnetics.h`, implemented independently in NumPy: the
+firmware's tables are computed from them, and the tests compare the emulator with them.
 
-All of them are psi = Lu i + f(theta) (g(i) - Lu i), T = f'(theta) W(i), W(i) the integral of g(i) - Lu i. Angles are
+Form: psi = Lu i + f(theta) (g(i) - Lu i), T = f'(theta) W(i), W(i) the integral of g(i) - Lu i. Angles are
 mechanical, rad, 0 aligned; currents in A, >= 0. Every method takes arrays that broadcast against each other.
 """
 
@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 INDUCTANCES = {"unaligned_inductance_H": (1e-5, 10.0), "aligned_inductance_H": (1e-5, 10.0)}
 """(minimum, maximum) of every machine's, both allowed; of the unsaturated phase."""
@@ -49,7 +50,7 @@ class Formula:
         return self.parameters["unaligned_inductance_H"]
 
     def mistake(self) -> tuple[str, str] | None:
-        """A key whose value does not go with the others, and why; None when all is well."""
+        """A key whose value contradicts the others, and why; None if consistent."""
         m = self.parameters
         if m["aligned_inductance_H"] <= m["unaligned_inductance_H"]:
             return "aligned_inductance_H", "must be above unaligned_inductance_H"
@@ -62,22 +63,22 @@ class Formula:
                 return "flux_linkage_max_Wb", "must exceed saturated_inductance_H * current_at_flux_linkage_max_A"
         return None
 
-    def flux_linkage_Wb(self, angle_rad, current_A):
+    def flux_linkage_Wb(self, angle_rad: ArrayLike, current_A: ArrayLike) -> np.ndarray:
         """psi."""
         i = np.asarray(current_A, dtype=float)
         unaligned_Wb = self.unaligned_inductance_H * i
         return unaligned_Wb + self._position_factor(angle_rad)[0] * (self._aligned_Wb(i) - unaligned_Wb)
 
-    def coenergy_J(self, angle_rad, current_A):
+    def coenergy_J(self, angle_rad: ArrayLike, current_A: ArrayLike) -> np.ndarray:
         """Integral of psi over the current at a constant angle."""
         i = np.asarray(current_A, dtype=float)
         return 0.5 * self.unaligned_inductance_H * i * i + self._position_factor(angle_rad)[0] * self._excess_J(i)
 
-    def torque_Nm(self, angle_rad, current_A):
+    def torque_Nm(self, angle_rad: ArrayLike, current_A: ArrayLike) -> np.ndarray:
         """Derivative of the co-energy by the angle."""
         return self._position_factor(angle_rad)[1] * self._excess_J(np.asarray(current_A, dtype=float))
 
-    def _position_factor(self, angle_rad):
+    def _position_factor(self, angle_rad: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """f and df/dtheta (1/rad): f is 1 aligned, 0 unaligned."""
         half = self.pitch_rad / 2.0
         wrapped = np.mod(np.asarray(angle_rad, dtype=float) + half, self.pitch_rad) - half
@@ -107,7 +108,7 @@ class Formula:
         amplitude = m["flux_linkage_max_Wb"] - m["saturated_inductance_H"] * m["current_at_flux_linkage_max_A"]
         return amplitude, (m["aligned_inductance_H"] - m["saturated_inductance_H"]) / amplitude
 
-    def _aligned_Wb(self, i):
+    def _aligned_Wb(self, i: np.ndarray) -> np.ndarray:
         """g(i)."""
         m = self.parameters
         if self.form != "saturating":
@@ -115,7 +116,7 @@ class Formula:
         amplitude, rate = self._saturation()
         return m["saturated_inductance_H"] * i - amplitude * np.expm1(-rate * i)
 
-    def _excess_J(self, i):
+    def _excess_J(self, i: np.ndarray) -> np.ndarray:
         """W(i)."""
         m = self.parameters
         if self.form != "saturating":

@@ -1,4 +1,4 @@
-"""salient machine: is a machine file right, what is in it, and what do its magnetics look like?"""
+"""salient machine: checks a machine file, prints its data sheet, plots its magnetics."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from salient.errors import UsageError
 from salient.machine.file import Converter, Machine, MachineError, Sensors, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
 
-# The sensors and the firmware's tables end here.
+# Range of the current sensors and of the firmware's tables.
 CURRENT_MAX_A = 80.0
 SHOWN_A = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0)
 SHOWN_PITCHES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 
 
 def run(name_or_path: str, out: Path) -> int:
-    """Checks the file, prints what it says and draws its magnetics to a picture; returns 0. UsageError."""
+    """Checks the file, prints its data sheet and plots its magnetics; returns 0. UsageError."""
     try:
         path = machine_path(name_or_path)
         machine = load_machine(path)
@@ -32,13 +32,13 @@ def run(name_or_path: str, out: Path) -> int:
     except MachineError as error:
         raise UsageError(str(error)) from None
     print("\n".join(describe(machine)))
-    picture = out / f"{machine.name}.png"
+    plot_path = out / f"{machine.name}.png"
     try:
         out.mkdir(parents=True, exist_ok=True)
-        draw(machine).savefig(picture, dpi=110, metadata={"Software": None})
+        plot(machine).savefig(plot_path, dpi=110, metadata={"Software": None})
     except OSError as error:
         raise UsageError(f"--out {out}: {error.strerror}") from None
-    print(f"picture: {picture}")
+    print(f"plot: {plot_path}")
     return 0
 
 
@@ -56,9 +56,9 @@ def describe(machine: Machine) -> list[str]:
         f" {magnetics.unaligned_inductance_H * 1e3:.2f} mH unaligned, not saturated",
         f"  shaft       {machine.inertia_kg_m2:g} kg m^2, {machine.friction_Nm_s:g} N m s",
         f"  supply      {machine.supply_voltage_V:g} V"
-        + (f" behind {machine.dc_link['source_resistance_ohm']:g} ohm, link {machine.dc_link['capacitance_F'] * 1e6:g}"
+        + (f" through {machine.dc_link['source_resistance_ohm']:g} ohm, link {machine.dc_link['capacitance_F'] * 1e6:g}"
            " uF" if machine.dc_link else ", takes energy back"),
-        "  torque      greatest of one phase: "
+        "  torque      maximum of one phase: "
         + ", ".join(f"{torque:.3g} N m at {i:g} A" for torque, i in zip(torques_Nm.max(axis=0), SHOWN_A, strict=True)),
     ]
     for title, values, table in (("converter", machine.converter, Converter), ("sensors", machine.sensors, Sensors)):
@@ -67,17 +67,17 @@ def describe(machine: Machine) -> list[str]:
     return lines
 
 
-def draw(machine: Machine) -> Figure:
+def plot(machine: Machine) -> Figure:
     """Flux linkage over current, torque over angle."""
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _draw_flux(left, machine)
-    _draw_torque(right, machine)
+    _plot_flux(left, machine)
+    _plot_torque(right, machine)
     figure.suptitle(f"{machine.name}: magnetics of one phase ({machine.magnetics.form})", x=0.01, ha="left")
     return figure
 
 
-def _draw_flux(axes: Axes, machine: Machine) -> None:
+def _plot_flux(axes: Axes, machine: Machine) -> None:
     current_A = np.linspace(0.0, CURRENT_MAX_A, 321)
     colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(SHOWN_PITCHES)))
     for pitches, colour in zip(SHOWN_PITCHES, colours, strict=True):
@@ -92,7 +92,7 @@ def _draw_flux(axes: Axes, machine: Machine) -> None:
     axes.grid(color="#e6e6e6")
 
 
-def _draw_torque(axes: Axes, machine: Machine) -> None:
+def _plot_torque(axes: Axes, machine: Machine) -> None:
     angle_rad = np.linspace(0.0, machine.pitch_rad, 721)
     colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(SHOWN_A)))
     for current_A, colour in zip(SHOWN_A, colours, strict=True):

@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 from scipy.integrate import ode, odeint
 
-from salient.benchmark.switching_pattern import Replay, Trajectory
+from salient.benchmark.switching_pattern import SwitchingPattern, Trajectory
 from salient.machine.file import Machine, load_machine, machine_path
 
 _ZERO_TOLERANCE_A = 1e-10
@@ -94,16 +94,16 @@ def _right_side(machine: Machine, load_torque_Nm: float, voltage_V: dict[int, fl
     return derivative
 
 
-def run_scipy(replay: Replay, solver: Solver) -> Trajectory:
+def run_scipy(pattern: SwitchingPattern, solver: Solver) -> Trajectory:
     """The saturating machine through a recorded pattern; ValueError for a machine of another form."""
-    machine = load_machine(machine_path(replay.machine))
+    machine = load_machine(machine_path(pattern.machine))
     if machine.magnetics.form != "saturating":
         raise ValueError(f"magnetics {machine.magnetics.form}: only saturating is written here")
-    segments = [list(replay.segments(period)) for period in range(replay.periods)]
+    segments = [list(pattern.segments(period)) for period in range(pattern.periods)]
     started_s = time.process_time()
-    y = [*replay.current_A, replay.speed_rad_s, replay.angle_rad]
+    y = [*pattern.current_A, pattern.speed_rad_s, pattern.angle_rad]
     states, evaluations = [], itertools.count()
-    make = partial(_right_side, machine, replay.load_torque_Nm, evaluations=evaluations)
+    make = partial(_right_side, machine, pattern.load_torque_Nm, evaluations=evaluations)
     for period in segments:
         for start_ns, end_ns, on in period:
             y = _segment(make, machine.supply_voltage_V, solver, y, on, start_ns * 1e-9, end_ns * 1e-9)

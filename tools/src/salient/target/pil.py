@@ -1,7 +1,6 @@
-"""salient pil: what the processor does for a scenario. Processor in the loop: the firmware on an emulated processor,
-the emulator's machine as its world, every instruction counted.
+"""salient pil, processor in the loop: a scenario with the firmware on an emulated processor, every instruction counted.
 
-It leaves what `run` leaves, and processor.json and report.html beside results.json.
+Writes the files of `run`, and processor.json and report.html next to results.json.
 """
 
 from __future__ import annotations
@@ -12,18 +11,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from salient.errors import UsageError
 from salient.experiments.scenario import RunResult, check_parameters, load_scenarios, write_summaries
 from salient.target.control_period import CYCLES_PER_INSTRUCTION, PROCESSOR_HZ, estimable, fits
-from salient.target.isr_profile import Cost, measure_run
+from salient.target.isr_profile import IsrProfile, measure_run
 from salient.target.pil_report import write_pil_report
 
 
 def run(options: argparse.Namespace) -> int:
-    """Does what the options ask for; returns 0, or 1 when a drive ended in a fault."""
-    asked = [name for name in ("scenario", "search", "figures") if getattr(options, name)]
-    if len(asked) != 1:
-        raise UsageError("pil: requires one of SCENARIO.toml, --search SECONDS and --figures")
+    """Runs the scenario, the search or the measurement of the baseline, of which the command line has exactly one.
+    Returns 0, or 1 when a drive ended in a fault."""
     if options.figures:
         from salient.target.baseline import measure_and_write
 
@@ -35,48 +31,49 @@ def run(options: argparse.Namespace) -> int:
     return _run_scenario(options.scenario, options.out or Path("out") / f"pil_{options.scenario.stem}", options.target)
 
 
-def as_json(cost: Cost, target: str) -> dict[str, Any]:
-    """The figures of processor.json for one controller."""
-    figures = cost.figures()
-    stack = cost.execution.stack
+def as_json(profile: IsrProfile, target: str) -> dict[str, Any]:
+    """Content of processor.json for one controller."""
+    metrics = profile.metrics()
+    stack = profile.trace.stack
     low, high = CYCLES_PER_INSTRUCTION
     estimate = {
-        "estimated_cycles_of_worst": [round(low * figures["worst"]), round(high * figures["worst"])],
-        "fits_at_rate_hz": {str(rate): verdict for rate, verdict in fits(figures["worst"]).items()},
+        "estimated_cycles_of_max": [round(low * metrics["max"]), round(high * metrics["max"])],
+        "fits_at_rate_hz": {str(rate): verdict for rate, verdict in fits(metrics["max"]).items()},
     }
     return {
-        "interrupts": len(cost.interrupts),
-        "instructions": figures,
-        "worst_interrupt": int(cost.interrupts.argmax()),
-        "mean_by_part": {name: round(mean, 1) for name, mean in cost.mean_by_part().items()},
-        "worst_by_part": dict(cost.execution.worst_by_part().most_common()),
+        "interrupts": len(profile.interrupts),
+        "instructions": metrics,
+        "longest_interrupt": int(profile.interrupts.argmax()),
+        "mean_by_module": {name: round(mean, 1) for name, mean in profile.mean_by_module().items()},
+        "max_by_module": dict(profile.trace.longest_by_module().most_common()),
         **(estimate if estimable(target) else {}),
         "stack_bytes": {"background": stack.thread, "interrupt": stack.interrupt, "deepest": stack.deepest,
                         "reserved": stack.reserved},
-        "coverage": cost.execution.coverage().as_json(),
+        "coverage": profile.trace.coverage().as_json(),
     }
 
 
-def words(costs: Mapping[str, Cost], target: str) -> str:
-    """The figures of every controller for a terminal."""
+def summary(profiles: Mapping[str, IsrProfile], target: str) -> str:
+    """The metrics of every controller for a terminal."""
     lines = []
-    for controller, cost in costs.items():
-        made, stack, covered = cost.figures(), cost.execution.stack, cost.execution.coverage().totals()
+    for controller, profile in profiles.items():
+        metrics, stack, covered = profile.metrics(), profile.trace.stack, profile.trace.coverage().totals()
         total = covered["instructions"]
-        parts = ", ".join(f"{name} {mean:.0f}" for name, mean in cost.mean_by_part().items() if mean >= 0.5)
-        worst = ", ".join(f"{name} {count}" for name, count in cost.execution.worst_by_part().most_common() if count)
-        rates = ", ".join(f"{rate // 1000} kHz {verdict}" for rate, verdict in fits(made["worst"]).items())
+        means = ", ".join(f"{name} {mean:.0f}" for name, mean in profile.mean_by_module().items() if mean >= 0.5)
+        longest = ", ".join(f"{name} {count}" for name, count in profile.trace.longest_by_module().most_common()
+                            if count)
+        rates = ", ".join(f"{rate // 1000} kHz {verdict}" for rate, verdict in fits(metrics["max"]).items())
         low, high = CYCLES_PER_INSTRUCTION
         lines += [
-            f"{controller}: instructions a control interrupt: typical {made['typical']}, 99 in 100 up to"
-            f" {made['of_99_percent']}, worst {made['worst']}",
-            f"  the mean: {parts}",
-            f"  the worst: {worst}",
-            *([f"  worst in cycles, an estimate: {low * made['worst']:.0f} to {high * made['worst']:.0f}; fits at"
+            f"{controller}: instructions per control interrupt: median {metrics['median']}, p99 {metrics['p99']},"
+            f" max {metrics['max']}",
+            f"  mean by module: {means}",
+            f"  longest by module: {longest}",
+            *([f"  longest in cycles, estimate: {low * metrics['max']:.0f} to {high * metrics['max']:.0f}; fits at"
                f" {PROCESSOR_HZ // 1_000_000} MHz: {rates}"] if estimable(target) else []),
-            f"  stack: background {stack.thread} bytes, interrupt {stack.interrupt}, together {stack.deepest}"
+            f"  stack: background {stack.thread} bytes, interrupt {stack.interrupt}, total {stack.deepest}"
             f" of {stack.reserved} reserved",
-            f"  object code: of {total} instructions {100 * covered['executed'] / total:.0f} % executed,"
+            f"  machine code: of {total} instructions {100 * covered['executed'] / total:.0f} % executed,"
             f" {100 * covered['in_interrupts'] / total:.0f} % in interrupts",
         ]
     return "\n".join(lines)
@@ -86,18 +83,18 @@ def _run_scenario(path: Path, out: Path, target: str) -> int:
     scenarios = load_scenarios(path)
     check_parameters(scenarios, target)
     results: dict[str, RunResult] = {}
-    costs: dict[str, Cost] = {}
+    profiles: dict[str, IsrProfile] = {}
     for scenario in scenarios:
         print(f"{scenario.name}: {scenario.controller} on {target}, {scenario.duration_s:g} s of virtual time",
               flush=True)
-        results[scenario.controller], costs[scenario.controller] = measure_run(
+        results[scenario.controller], profiles[scenario.controller] = measure_run(
             scenario, out / scenario.controller, target)
     write_summaries(scenarios, results, out)
     content = {"schema": 1, "target": target, "control_rate_hz": scenarios[0].control_rate_hz,
-               "controllers": {controller: as_json(cost, target) for controller, cost in costs.items()}}
+               "controllers": {controller: as_json(profile, target) for controller, profile in profiles.items()}}
     (out / "processor.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    write_pil_report(out, scenarios[0], content, {name: cost.interrupts for name, cost in costs.items()})
-    print(f"{words(costs, target)}\n\nresults: {out / 'results.json'}, {out / 'processor.json'}\n"
+    write_pil_report(out, scenarios[0], content, {name: profile.interrupts for name, profile in profiles.items()})
+    print(f"{summary(profiles, target)}\n\nresults: {out / 'results.json'}, {out / 'processor.json'}\n"
           f"report:  {out / 'report.html'}")
     faults = [f"{controller}: {result.fault}" for controller, result in results.items() if result.fault != "none"]
     if faults:

@@ -1,5 +1,4 @@
-"""What can be said of an image or object of the firmware without running it: size, what it must not contain, and the
-most stack that it can take."""
+"""Static checks of an ELF image or object of the firmware: size, forbidden instructions and symbols, stack bound."""
 
 from __future__ import annotations
 
@@ -7,17 +6,17 @@ import re
 from collections import defaultdict
 from dataclasses import dataclass
 
-from salient.elf import Image, Instruction
+from salient.elf import ElfImage, Instruction
 
 _FLOATING_POINT = re.compile(r"v[a-z]|f(?!ence)[a-z]+\.|f[ls]w\b")
-"""Mnemonics of the Cortex-M4's unit, and of RISC-V's."""
+"""Floating-point mnemonics of the Cortex-M4 and of RISC-V."""
 _SOFT_FLOAT = re.compile(r"__aeabi_(c?[fd]|u?[il]2[fd]|h2f).*|__(fix|float|extend|trunc)\w+"
                          r"|__(add|sub|mul|div|neg|eq|ne|lt|le|gt|ge|unord|cmp|pow)[sdt]f\d?\w?")  # fmt: skip
 _LIBRARY = {"memcpy", "memset"}
-"""All that the firmware may call of the C library."""
+"""The only functions of the C library that the firmware may call."""
 _HEAP = re.compile(r"_?(malloc|calloc|realloc|free|sbrk)(_r)?")
 _INDIRECT = re.compile(r"(blx|bx)\s+(?!lr)|jalr\s")
-"""RISC-V's jr is left out: so a switch jumps through its table, as the Cortex-M4's does by tbb."""
+"""Without RISC-V's jr, which implements the jump table of a switch, as tbb does on the Cortex-M4."""
 _PUSHED = re.compile(r"(?:push(?:\.w)?\s+|stmdb(?:\.w)?\s+sp!,\s*)\{([^}]*)\}")
 _LOWERED = re.compile(r"sub(?:\.w|w|s)?\s+sp,\s*(?:sp,\s*)?#(\d+)|str(?:d|\.w)?\s+.*\[sp, #-(\d+)\]!"
                       r"|addi?\s+sp,\s*sp,\s*-(\d+)")
@@ -32,8 +31,8 @@ class Size:
     ram: int
 
 
-def size(image: Image) -> Size:
-    """Of an image or object."""
+def size(image: ElfImage) -> Size:
+    """Size of an image or object."""
     rows = [line.split() for line in image.run("size", "-A").splitlines()]
     sections = {row[0]: int(row[1]) for row in rows if len(row) == 3 and row[1].isdigit()}
 
@@ -44,29 +43,29 @@ def size(image: Image) -> Size:
     return Size(flash=total(".text", ".rodata", ".ARM.exidx", ".srodata") + data, ram=data + total(".bss", ".sbss"))
 
 
-def forbidden(image: Image) -> list[str]:
-    """What an image has and must not: floating point in hardware or software, a heap."""
+def forbidden(image: ElfImage) -> list[str]:
+    """Forbidden content of an image: hardware or software floating point, a heap."""
     symbols = image.symbols()
     return ([f"{one.function}: {one.mnemonic} {one.operands}".strip() for one in image.instructions()
              if _FLOATING_POINT.match(one.mnemonic)]
             + [name for name in symbols if _SOFT_FLOAT.fullmatch(name) or _HEAP.fullmatch(name)])
 
 
-def needed(image: Image) -> set[str]:
-    """What the firmware, linked with the compiler's helpers and nothing else, calls beside the HAL and _LIBRARY."""
+def undefined_symbols(image: ElfImage) -> set[str]:
+    """Undefined symbols of the firmware, linked with the compiler's helpers only, besides the HAL and _LIBRARY."""
     names = {line.split()[-1] for line in image.run("nm", "--undefined-only").splitlines() if line.strip()}
     return {name for name in names if not name.startswith("hal_")} - _LIBRARY
 
 
-def indirect_calls(image: Image) -> list[str]:
-    """Calls and jumps whose target is in a register."""
+def indirect_calls(image: ElfImage) -> list[str]:
+    """Calls and jumps with the target in a register."""
     return [f"{one.function}: {one.mnemonic} {one.operands}" for one in image.instructions()
             if _INDIRECT.match(f"{one.mnemonic} {one.operands}")]
 
 
-def deepest_stack(image: Image, function: str) -> tuple[int, list[str]]:
-    """Bytes that a function of an image takes of the stack at most, with all that it calls, and the way
-    there. An upper bound: a function counts with everything that it ever pushes, whichever way through it is taken.
+def deepest_stack(image: ElfImage, function: str) -> tuple[int, list[str]]:
+    """Upper bound of the stack of a function and its callees, in bytes, and the call path that reaches it. Each
+    function counts with everything that it pushes on any path.
 
     ValueError for recursion, which has no bound.
     """
@@ -84,9 +83,9 @@ def deepest_stack(image: Image, function: str) -> tuple[int, list[str]]:
         if name in above:
             raise ValueError(f"recursion: {' > '.join((*above, name))}")
         if name not in known:
-            below, way = max((depth(callee, (*above, name)) for callee in sorted(calls[name])),
+            below, path = max((depth(callee, (*above, name)) for callee in sorted(calls[name])),
                              default=(0, []), key=lambda found: found[0])
-            known[name] = frames[name] + below, [name, *way]
+            known[name] = frames[name] + below, [name, *path]
         return known[name]
 
     return depth(function, ())

@@ -1,5 +1,5 @@
-"""What the processor did in a run: instructions by the part of the firmware that they serve, coverage of the object
-code, depth of the stack. Read from what the target writes on --execution, and from its image."""
+"""Execution trace of a run on a target: instructions by module of the firmware, coverage of the machine code, stack
+depth. Read from the file of --execution and from the ELF image."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from salient.elf import Image, Instruction, Place
+from salient.elf import ElfImage, Instruction, SourceLocation
 
 PORT = "port"
-"""The part that is not firmware: handler, HAL."""
+"""Module name of everything outside the firmware: handler, HAL."""
 _HELPERS = ("firmware/fixed/", "hal/qemu/rv32_virt/memory.c", "/", "?")
-"""What counts for the part that uses it, by the beginning of the source's path: arithmetic, memcpy and memset where the
-board has its own, and what is not in the repository, the compiler's and the C library's."""
+"""Code that counts for its caller, by prefix of the source path: arithmetic, memcpy and memset of boards that define
+them, and code from outside the repository (compiler and C library)."""
 _NOT_FIRMWARE = ("hal/", "/", "?")
 
 
 @dataclass(frozen=True)
 class Stack:
-    """Bytes. thread: deepest of the background; interrupt: deepest of a control interrupt, with the processor's frame;
-    reserved: what the linker script leaves at least. Depths are those of bytes that were written to."""
+    """Bytes. thread: depth of the background; interrupt: depth of a control interrupt, with the exception frame;
+    reserved: minimum of the linker script. Depths count bytes that were written to."""
 
     thread: int
     interrupt: int
@@ -33,91 +33,92 @@ class Stack:
 
     @property
     def deepest(self) -> int:
-        """When the interrupt comes where the background is deepest."""
+        """Depth when the interrupt occurs at the deepest point of the background."""
         return self.thread + self.interrupt
 
     def __or__(self, other: Stack) -> Stack:
-        """The deeper of both runs of one image."""
+        """Maximum depths of two runs of the same image."""
         return Stack(max(self.thread, other.thread), max(self.interrupt, other.interrupt), self.reserved)
 
 
 @dataclass
-class Execution:
-    """How often each instruction was executed, in all, in control interrupts and in the dearest of them, in the image's
-    order."""
+class Trace:
+    """Number of executions of each instruction, in the order of the image: in all, in control interrupts, and in the
+    longest of them."""
 
     image: Path
     executed: np.ndarray
     inside: np.ndarray
-    in_worst: np.ndarray
+    in_longest: np.ndarray
     stack: Stack
 
-    def __add__(self, other: Execution) -> Execution:
-        """Both runs of one image."""
-        return Execution(self.image, self.executed + other.executed, self.inside + other.inside,
-                         max(self.in_worst, other.in_worst, key=np.sum), self.stack | other.stack)
+    def __add__(self, other: Trace) -> Trace:
+        """Both runs of the same image."""
+        return Trace(self.image, self.executed + other.executed, self.inside + other.inside,
+                     max(self.in_longest, other.in_longest, key=np.sum), self.stack | other.stack)
 
-    def by_part(self) -> Counter[str]:
-        """Instructions of all control interrupts by the part of the firmware that they serve.
+    def by_module(self) -> Counter[str]:
+        """Instructions of all control interrupts by module of the firmware.
 
-        A part is a source file; what is inlined counts for the file that it was written in. Helpers (_HELPERS) count
-        for their callers; where they are functions of their own, in proportion to the calls.
+        A module is a source file; inlined code counts for the file in which it is written. Helpers (_HELPERS) count for
+        their callers; those that are not inlined, in proportion to the calls.
         """
-        return self._by_part(self.inside)
+        return self._by_module(self.inside)
 
-    def worst_by_part(self) -> Counter[str]:
-        """The same of the dearest interrupt."""
-        return self._by_part(self.in_worst)
+    def longest_by_module(self) -> Counter[str]:
+        """Instructions of the longest control interrupt by module."""
+        return self._by_module(self.in_longest)
 
-    def _by_part(self, counts: np.ndarray) -> Counter[str]:
+    def _by_module(self, counts: np.ndarray) -> Counter[str]:
         known = _known(self.image)
-        parts: Counter[str] = Counter()
-        helpers: Counter[str] = Counter()
+        modules: Counter[str] = Counter()
+        helpers: defaultdict[str, float] = defaultdict(float)
         callers: dict[str, Counter[tuple[str | None, str]]] = defaultdict(Counter)
-        for instruction, part, count in zip(known.instructions, known.parts, counts.tolist(), strict=True):
+        for instruction, module, count in zip(known.instructions, known.modules, counts.tolist(), strict=True):
             if count == 0:
                 continue
-            if part is None:
+            if module is None:
                 helpers[instruction.function] += count
             else:
-                parts[part] += count
+                modules[module] += count
             if instruction.goes_to and instruction.goes_to != instruction.function:
-                callers[instruction.goes_to][part, instruction.function] += count
-        exact: defaultdict[str, float] = defaultdict(float, parts)
+                callers[instruction.goes_to][module, instruction.function] += count
+        exact: defaultdict[str, float] = defaultdict(float, modules)
         while helpers:
             function, count = helpers.popitem()
             calls = callers[function]
             if not calls:
                 exact[PORT] += count
-            for (part, caller), times in calls.items():
+            for (module, caller), times in calls.items():
                 share = count * times / calls.total()
-                if part is None:
+                if module is None:
                     helpers[caller] += share
                 else:
-                    exact[part] += share
-        return Counter({part: round(count) for part, count in exact.items()})
+                    exact[module] += share
+        return Counter({module: round(count) for module, count in exact.items()})
 
     def coverage(self) -> Coverage:
-        """Of the firmware, generated sources included; port and libraries are left out."""
+        """Coverage of the firmware with its generated sources, without port and libraries."""
         known = _known(self.image)
         files: dict[str, FileCoverage] = {}
-        for places, executed, inside in zip(known.places, self.executed.tolist(), self.inside.tolist(), strict=True):
-            place = places[0]
-            if not place.file.startswith(_NOT_FIRMWARE):
-                of = files.setdefault(place.file, FileCoverage())
+        for locations, executed, inside in zip(known.locations, self.executed.tolist(), self.inside.tolist(),
+                                               strict=True):
+            location = locations[0]
+            if not location.file.startswith(_NOT_FIRMWARE):
+                of = files.setdefault(location.file, FileCoverage())
                 of.instructions += 1
                 of.executed += executed > 0
                 of.in_interrupts += inside > 0
-                of.lines.add(place.line)
+                of.lines.add(location.line)
                 if executed:
-                    of.lines_executed.add(place.line)
+                    of.lines_executed.add(location.line)
         return Coverage(dict(sorted(files.items())))
 
 
 @dataclass
 class FileCoverage:
-    """Of a source file: its instructions in the image, how many of them were executed, in all and in interrupts, and
-    the lines that they are of. What is inlined counts for the file that it was written in, each time."""
+    """Coverage of a source file: its instructions in the image, those executed in all and in interrupts, and their
+    lines. Inlined code counts for the file in which it is written, once per copy."""
 
     instructions: int = 0
     executed: int = 0
@@ -126,33 +127,33 @@ class FileCoverage:
     lines_executed: set[int] = field(default_factory=set)
 
     def missed_lines(self) -> list[int]:
-        """Lines none of whose instructions was executed."""
+        """Lines without an executed instruction."""
         return sorted(self.lines - self.lines_executed - {0})
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """By source file."""
+    """Coverage by source file."""
 
     files: Mapping[str, FileCoverage]
 
     def totals(self) -> dict[str, int]:
-        """Instructions of the firmware, those executed, those executed in interrupts."""
+        """Number of instructions of the firmware: all, executed, executed in interrupts."""
         return {name: sum(getattr(of, name) for of in self.files.values())
                 for name in ("instructions", "executed", "in_interrupts")}
 
     def as_json(self) -> dict[str, Any]:
-        """For a results file."""
+        """Content for a results file."""
         return {**self.totals(),
                 "files": {file: {"instructions": of.instructions, "executed": of.executed,
                                  "in_interrupts": of.in_interrupts, "missed_lines": of.missed_lines()}
                           for file, of in self.files.items()}}
 
 
-def read_execution(path: Path, image: Path) -> Execution:
-    """What a run of the image has written to path (emulator/qemu/trace.h)."""
+def read_trace(path: Path, image: Path) -> Trace:
+    """Reads the trace of a run of the ELF image; format: emulator/qemu/trace.h."""
     known = _known(image)
-    place_of = {instruction.address: i for i, instruction in enumerate(known.instructions)}
+    index_of = {instruction.address: i for i, instruction in enumerate(known.instructions)}
     counts = np.zeros((3, len(known.instructions) + 1), dtype=np.int64)
     begin = known.stack_begin
     thread_low, interrupt_bytes = begin, 0
@@ -160,9 +161,9 @@ def read_execution(path: Path, image: Path) -> Execution:
         kind, *words = line.split()
         if kind == "block":
             address, size = int(words[0], 16), int(words[1])
-            if address not in place_of:
-                continue  # the board's own, before the image
-            first = place_of[address]
+            if address not in index_of:
+                continue  # boot code of the board, outside the image
+            first = index_of[address]
             times = [int(word) for word in words[2:]]
             counts[:, first] += times
             counts[:, first + size] -= times
@@ -171,15 +172,16 @@ def read_execution(path: Path, image: Path) -> Execution:
         else:
             interrupt_bytes = int(words[1])
     stack = Stack(begin - thread_low, interrupt_bytes + known.exception_frame_bytes, known.stack_reserved)
-    return Execution(image, *counts.cumsum(axis=1)[:, :-1], stack)
+    executed, inside, in_longest = counts.cumsum(axis=1)[:, :-1]
+    return Trace(image, executed, inside, in_longest, stack)
 
 
 @dataclass(frozen=True)
 class _Known:
     instructions: list[Instruction]
-    places: list[list[Place]]
-    parts: list[str | None]
-    """None: a helper."""
+    locations: list[list[SourceLocation]]
+    modules: list[str | None]
+    """None for helpers."""
     stack_begin: int
     stack_reserved: int
     exception_frame_bytes: int
@@ -191,16 +193,16 @@ def _known(image: Path) -> _Known:
 
 @lru_cache
 def _read_image(path: Path, mtime_ns: int) -> _Known:
-    image = Image(path)
+    image = ElfImage(path)
     instructions = image.instructions()
-    places = image.places([instruction.address for instruction in instructions])
-    ordered = [places[instruction.address] for instruction in instructions]
-    return _Known(instructions, ordered, [_part(of) for of in ordered], image.stack()[1], image.sections()[".stack"],
+    locations = image.locations([instruction.address for instruction in instructions])
+    ordered = [locations[instruction.address] for instruction in instructions]
+    return _Known(instructions, ordered, [_module(of) for of in ordered], image.stack()[1], image.sections()[".stack"],
                   image.exception_frame_bytes)
 
 
-def _part(places: Iterable[Place]) -> str | None:
-    for place in places:
-        if not place.file.startswith(_HELPERS):
-            return PORT if place.file.startswith("hal/") else Path(place.file).stem
+def _module(locations: Iterable[SourceLocation]) -> str | None:
+    for location in locations:
+        if not location.file.startswith(_HELPERS):
+            return PORT if location.file.startswith("hal/") else Path(location.file).stem
     return None

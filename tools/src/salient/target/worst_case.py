@@ -1,7 +1,7 @@
-"""The dearest control interrupt, looked for: what is done to a drive and its bench, as a list of timed actions, and a
-search that changes such lists and keeps what costs more.
+"""Worst-case search for the control interrupt: an input is a list of timed actions on a drive and its bench; a random
+search mutates inputs and keeps those whose longest interrupt takes more instructions.
 
-An input is a TOML file. Its actions are rows of time in ms, what, and a value where there is one:
+An input is a TOML file. An action is time in ms, name, and a value for actions that have one:
 
     machine = "saturating"
     controller = "salient"
@@ -9,10 +9,10 @@ An input is a TOML file. Its actions are rows of time in ms, what, and a value w
     initial_angle_deg = 0.0
     duration_ms = 60.0
     actions = [
-        [0.0, "speed_rpm", 600.0],             # asks the drive to run
-        [0.0, "parameter.smc_k", 2000.0],      # of the drive, in its unit
-        [20.5, "bench.load_torque_Nm", 8.0],   # a quantity of RIG_SET in rig.dbc
-        [30.0, "commands", 20.0],              # so many at once
+        [0.0, "speed_rpm", 600.0],             # run command
+        [0.0, "parameter.smc_k", 2000.0],      # parameter of the drive, in its unit
+        [20.5, "bench.load_torque_Nm", 8.0],   # rig variable of RIG_SET in rig.dbc
+        [30.0, "commands", 20.0],              # burst of that many commands
         [40.0, "stop"],                        # or off, clear_fault, silence
     ]
 """
@@ -29,6 +29,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,7 @@ from salient.bench.emulator import parameter_table
 from salient.bench.rig import RigError, bench_variables
 from salient.errors import UsageError
 from salient.paths import ROOT
-from salient.target.isr_profile import Cost, read_cost
+from salient.target.isr_profile import IsrProfile, read_profile
 from salient.toml_file import Table, TextFileError, any_number, checked, number, option, read_toml, validate
 
 FOLDER = ROOT / "tests" / "target" / "worst_case"
@@ -48,8 +49,8 @@ NETWORK = "salient_network"
 _REQUESTS = ("stop", "off", "clear_fault")
 _WITHOUT_VALUE = ("silence", *_REQUESTS)
 _WITH_VALUE = ("speed_rpm", "commands")
-_CHOSEN = ("controller", "bp_mode", "bp_trim_mode")
-"""Parameters that make another controller of it: the kind says them."""
+_FIXED_PARAMETERS = ("controller", "bp_mode", "bp_trim_mode")
+"""Parameters that select another controller; the variant determines them."""
 _DURATION_MS = (2.0, 120.0)
 _TIME_STEP_MS = 0.025
 _ACTIONS_MAX = 24
@@ -59,9 +60,9 @@ _WORKERS = 2
 
 
 @dataclass(frozen=True)
-class Kind:
-    """What an interrupt is looked for in. network: salient's optional one is on; it is off by default and costs as much
-    as the paper's. label: for tables."""
+class Variant:
+    """A configuration with a separate worst case. network: the optional network of salient is on; it is off by default
+    and takes as many instructions as that of the paper. label: for tables."""
 
     label: str
     controller: str
@@ -69,17 +70,17 @@ class Kind:
     network: bool = False
 
 
-KINDS = {
-    **{controller: Kind(controller, controller) for controller in CONTROLLERS},
-    NETWORK: Kind("salient with the network", "salient", network=True),
-    **{f"{controller}_four_phases": Kind(f"{controller}, four phases", controller, "finite_element")
+VARIANTS = {
+    **{controller: Variant(controller, controller) for controller in CONTROLLERS},
+    NETWORK: Variant("salient with the network", "salient", network=True),
+    **{f"{controller}_four_phases": Variant(f"{controller}, four phases", controller, "finite_element")
        for controller in CONTROLLERS},
 }
 
 
 @dataclass(frozen=True)
 class Action:
-    """value: None for what has none."""
+    """value: None for actions without one."""
 
     at_ms: float
     what: str
@@ -88,7 +89,7 @@ class Action:
 
 @dataclass(frozen=True)
 class Input:
-    """What is done, in the order of time; the board is the one that BenchConfig describes by default."""
+    """Actions in order of time; the board is that of the default BenchConfig."""
 
     machine: str
     controller: str
@@ -139,15 +140,15 @@ def _read_action(row_number: int, row: list) -> Action:
 def _is_action(what: str) -> bool:
     """The drive knows its parameters; they are checked when they are written."""
     scope, _, name = what.partition(".")
-    return what in (*_WITH_VALUE, *_WITHOUT_VALUE) or scope == "parameter" or scope == "bench" and name in bench_variables()
+    return what in (*_WITH_VALUE, *_WITHOUT_VALUE) or scope == "parameter" or (scope == "bench" and name in bench_variables())
 
 
 def write_input(path: Path, found: Input) -> None:
-    """As read_input reads it, numbers in full."""
+    """Writes an input in the format of read_input, with all digits of its numbers."""
     rows = "".join(f'    [{a.at_ms!r}, "{a.what}"' + ("" if a.value is None else f", {a.value!r}") + "],\n"
                    for a in found.actions)
     path.write_text(
-        "# The dearest control interrupt that was found; tools/salient pil --search looks for dearer ones.\n"
+        "# Known worst case of the control interrupt; tools/salient pil --search searches for longer ones.\n"
         f'machine = "{found.machine}"\ncontroller = "{found.controller}"\n'
         f"seed = {found.seed}\ninitial_angle_deg = {found.initial_angle_deg!r}\n"
         f"duration_ms = {found.duration_ms!r}\nactions = [\n{rows}]\n", encoding="utf-8")
@@ -155,40 +156,41 @@ def write_input(path: Path, found: Input) -> None:
 
 # --- running --------------------------------------------------------------------------------------------------------
 
-def replay(done: Input, **options) -> Cost:
-    """What the interrupts cost. options: of BenchConfig, where it is another board or build."""
+def profile(given: Input, **options: Any) -> IsrProfile:
+    """Profile of the interrupts of an input. options: of BenchConfig, for another board or build."""
     with tempfile.TemporaryDirectory(prefix="salient-") as name:
-        counted, executed = Path(name) / "instructions", Path(name) / "execution"
-        board = _board(done, instructions=counted, execution=executed, **options)
-        _run(done, board)
-        return read_cost(counted, executed, board.machine, board.build)
+        instructions, trace = Path(name) / "instructions", Path(name) / "trace"
+        board = _board(given, instructions=instructions, execution=trace, **options)
+        _run(given, board)
+        return read_profile(instructions, trace, board.machine, board.build)
 
 
-def dearest_count(done: Input) -> int:
-    """Instructions of the dearest interrupt; quicker than replay."""
+def longest_interrupt(given: Input) -> int:
+    """Instructions of the longest interrupt; faster than profile."""
     with tempfile.TemporaryDirectory(prefix="salient-") as name:
-        counted = Path(name) / "instructions"
-        _run(done, _board(done, instructions=counted))
-        return int(np.fromfile(counted, "<u4").max())
+        instructions = Path(name) / "instructions"
+        _run(given, _board(given, instructions=instructions))
+        return int(np.fromfile(instructions, "<u4").max())
 
 
-def _board(done: Input, **options) -> BenchConfig:
-    return BenchConfig(machine=done.machine, controller=done.controller, seed=done.seed,
-                            initial_angle_deg=done.initial_angle_deg, **{"build": "cortex-m4", **options})
+def _board(given: Input, **options: Any) -> BenchConfig:
+    fields: dict[str, Any] = {"build": "cortex-m4", **options}
+    return BenchConfig(machine=given.machine, controller=given.controller, seed=given.seed,
+                            initial_angle_deg=given.initial_angle_deg, **fields)
 
 
-def _run(done: Input, board: BenchConfig) -> None:
-    rows = _rows(done.controller)
+def _run(given: Input, board: BenchConfig) -> None:
+    rows = _rows(given.controller)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder, Bench(board, f"unix:{folder}/can.sock") as bench:
         bench.rig.truth_period_us = 0
-        for action in done.actions:
+        for action in given.actions:
             bench.advance_to(round(action.at_ms * 1e6))
             _do(bench, rows, action)
-        bench.advance_to(round(done.duration_ms * 1e6))
+        bench.advance_to(round(given.duration_ms * 1e6))
 
 
 def _do(bench: Bench, rows: dict[str, ParameterRow], action: Action) -> None:
-    what, value = action.what, action.value
+    what, value = action.what, 0.0 if action.value is None else action.value
     scope, _, name = what.partition(".")
     if what == "speed_rpm":
         bench.drive.speed_reference_rpm = value
@@ -196,9 +198,9 @@ def _do(bench: Bench, rows: dict[str, ParameterRow], action: Action) -> None:
         try:
             bench.rig.set(name, value)
         except RigError:
-            pass  # what the bench refuses has no effect
-    elif scope == "parameter" and name in rows:
-        bench.send(write_request(rows[name], value))  # so has what the drive refuses
+            pass  # a rejected value has no effect
+    elif scope == "parameter":
+        bench.send(write_request(rows[name], value))  # the drive may reject it, too
     elif what == "commands":
         for _ in range(int(value) if bench.drive.command_due_ns is not None else 0):
             bench.drive.send_command()
@@ -207,7 +209,7 @@ def _do(bench: Bench, rows: dict[str, ParameterRow], action: Action) -> None:
     elif what in _REQUESTS:
         bench.drive.ask(what)
     else:
-        raise UsageError(f"{what}: no such action")
+        raise UsageError(f"{what}: unknown action")
 
 
 @lru_cache
@@ -217,30 +219,30 @@ def _rows(controller: str) -> dict[str, ParameterRow]:
 
 # --- directed -------------------------------------------------------------------------------------------------------
 
-def directed(kind: str) -> list[Input]:
-    """Inputs that are made to be dear: what is known to happen seldom and all at once. kind: of KINDS."""
-    of = KINDS[kind]
-    backwards = -400.0 if of.controller == "salient" else 100.0
+def directed(variant: str) -> list[Input]:
+    """Hand-written inputs with combinations of rare events. variant: key of VARIANTS."""
+    of = VARIANTS[variant]
+    reverse_rpm = -400.0 if of.controller == "salient" else 100.0
     first = [Action(0.0, "parameter.bp_trim_mode", 3.0)] if of.network else []
     quick = [*first, Action(0.0, "bench.inertia_gain", 0.2), Action(1.0, "speed_rpm", 600.0)]
     lists = {
         "load step": [*quick, Action(40.0, "bench.load_torque_Nm", 8.0)],
-        "noise at its end": [*quick, Action(5.0, "bench.current_noise_A", 10.0),
+        "maximum noise": [*quick, Action(5.0, "bench.current_noise_A", 10.0),
                              Action(20.0, "bench.load_torque_Nm", 15.0)],
         "every phase conducts": [*quick, Action(5.0, "bench.current_sensor_offset_A", 10.0),
                                  Action(20.0, "bench.load_torque_Nm", 15.0)],
         "every phase conducts, noisy": [*quick, Action(5.0, "bench.current_sensor_offset_A", 5.0),
                                         Action(5.0, "bench.current_noise_A", 5.0),
                                         Action(20.0, "bench.load_torque_Nm", 15.0)],
-        "voltage dips": [*quick, Action(30.0, "bench.load_torque_Nm", 8.0),
+        "voltage sags": [*quick, Action(30.0, "bench.load_torque_Nm", 8.0),
                          Action(40.0, "bench.supply_voltage_V", 155.0), Action(50.0, "bench.supply_voltage_V", 290.0)],
-        "voltage runs out": [*quick[:-1], Action(0.0, "bench.supply_voltage_V", 160.0),
+        "voltage limit": [*quick[:-1], Action(0.0, "bench.supply_voltage_V", 160.0),
                              Action(1.0, "speed_rpm", 2000.0)],
-        "reversal": [*quick, Action(30.0, "speed_rpm", backwards), Action(60.0, "speed_rpm", 600.0)],
+        "reversal": [*quick, Action(30.0, "speed_rpm", reverse_rpm), Action(60.0, "speed_rpm", 600.0)],
         "noisy reversal with a torque reserve": [
             *first, Action(0.0, "bench.inertia_gain", 0.2), Action(0.0, "bench.current_noise_A", 5.0),
             Action(0.3, "parameter.torque_reserve_Nm", 18.0), Action(1.0, "speed_rpm", 3000.0),
-            Action(10.0, "speed_rpm", 5.0 * backwards), Action(13.0, "bench.flux_linkage_gain", 2.5)],
+            Action(10.0, "speed_rpm", 5.0 * reverse_rpm), Action(13.0, "bench.flux_linkage_gain", 2.5)],
         "encoder jumps": [*quick, Action(40.0, "bench.encoder_fault", 2.0), Action(45.0, "bench.encoder_fault", 0.0),
                           Action(46.0, "off"), Action(46.5, "clear_fault"), Action(47.0, "speed_rpm", 600.0)],
         "run, fault, run": [*quick, Action(20.0, "off"), Action(20.3, "speed_rpm", 600.0), Action(30.0, "off"),
@@ -249,7 +251,7 @@ def directed(kind: str) -> list[Input]:
                             Action(42.5, "clear_fault"), Action(43.0, "speed_rpm", 600.0)],
         "commands in a burst": [*quick, Action(20.0, "commands", 40.0), Action(30.0, "bench.load_torque_Nm", 8.0),
                                 Action(30.0, "commands", 40.0)],
-        "parameters while it runs": [*quick, Action(20.0, "parameter.torque_max_Nm", 40.0),
+        "parameters while running": [*quick, Action(20.0, "parameter.torque_max_Nm", 40.0),
                                      Action(25.0, "parameter.current_limit_A", 79.0),
                                      Action(30.0, "bench.load_torque_Nm", 20.0)],
         "misaligned, eccentric": [*first, Action(0.0, "bench.encoder_offset_deg", 3.0),
@@ -261,14 +263,15 @@ def directed(kind: str) -> list[Input]:
 
 # --- search ---------------------------------------------------------------------------------------------------------
 
-def search(kind: str, begin: Iterable[Input], seconds: float, seed: int,
-           progress: Callable[[int, int], None] = lambda tried, worst: None) -> tuple[int, Input]:
-    """The highest count that was found and its input: from `begin`, changed at random, the best few changed again.
+def search(variant: str, begin: Iterable[Input], seconds: float, seed: int,
+           progress: Callable[[int, int], None] = lambda tried, longest: None) -> tuple[int, Input]:
+    """Searches for the longest interrupt; returns its instructions and its input. Starts from `begin` and mutates the
+    best inputs at random.
 
-    seconds: of the wall clock, so that what is found depends on the computer; what it costs does not. The seed decides
-    the order of changes.
+    seconds: of the wall clock, so the result depends on the computer; the instruction count of an input does not. The
+    seed determines the sequence of mutations.
     """
-    random_source = random.Random(f"{kind} {seed}")
+    random_source = random.Random(f"{variant} {seed}")
     elite: list[tuple[int, Input]] = []
     waiting = list(begin)
     tried = 0
@@ -276,26 +279,27 @@ def search(kind: str, begin: Iterable[Input], seconds: float, seed: int,
     with ProcessPoolExecutor(_WORKERS, initializer=_leave_interrupts_to_parent) as workers:
         while waiting or time.monotonic() < end_s:
             while len(waiting) < _WORKERS * 4:
-                waiting.append(mutated(random_source.choice(elite)[1] if elite else directed(kind)[0], random_source))
+                parent = random_source.choice(elite)[1] if elite else directed(variant)[0]
+                waiting.append(mutated(parent, random_source))
             batch, waiting = waiting[: _WORKERS * 4], waiting[_WORKERS * 4:]
-            elite += zip(workers.map(dearest_count, batch), batch, strict=True)
+            elite += zip(workers.map(longest_interrupt, batch), batch, strict=True)
             elite = sorted(elite, key=lambda found: -found[0])[:_ELITE]
             tried += len(batch)
             progress(tried, elite[0][0])
         return _pruned(*elite[0], workers)
 
 
-def _pruned(worst: int, found: Input, workers: Executor) -> tuple[int, Input]:
-    """Without the actions that its cost does not need, so that one sees what it is that costs."""
+def _pruned(longest: int, found: Input, workers: Executor) -> tuple[int, Input]:
+    """Removes the actions that do not contribute, which shows the cause."""
     while True:
         shorter = [replace(found, actions=found.actions[:i] + found.actions[i + 1:])
                    for i, action in enumerate(found.actions) if not _fixed(action)]
-        for count, one in zip(workers.map(dearest_count, shorter), shorter, strict=True):
-            if count >= worst:
-                worst, found = count, one
+        for count, one in zip(workers.map(longest_interrupt, shorter), shorter, strict=True):
+            if count >= longest:
+                longest, found = count, one
                 break
         else:
-            return worst, found
+            return longest, found
 
 
 def _leave_interrupts_to_parent() -> None:
@@ -303,30 +307,30 @@ def _leave_interrupts_to_parent() -> None:
 
 
 def mutated(given: Input, source: random.Random) -> Input:
-    """One to three changes: an action more, less, or at another time or value; angle, seed or duration."""
-    made = given
+    """One to three mutations: adds, removes, moves or changes an action, or changes angle, seed or duration."""
+    result = given
     for _ in range(source.randint(1, 3)):
-        made = source.choice((_added, _added, _removed, _changed, _changed, _moved, _begun_elsewhere))(made, source)
-    ordered = tuple(sorted(made.actions, key=lambda action: action.at_ms))
-    return replace(made, actions=ordered)
+        result = source.choice(_MUTATIONS)(result, source)
+    ordered = tuple(sorted(result.actions, key=lambda action: action.at_ms))
+    return replace(result, actions=ordered)
 
 
 def _added(given: Input, source: random.Random) -> Input:
     if len(given.actions) >= _ACTIONS_MAX:
         return _removed(given, source)
     names = [f"bench.{name}" for name in bench_variables() if name not in ("truth_period_us",)]
-    names += [f"parameter.{name}" for name in _rows(given.controller) if name not in _CHOSEN]
+    names += [f"parameter.{name}" for name in _rows(given.controller) if name not in _FIXED_PARAMETERS]
     names += ["speed_rpm", "commands", "silence", *_REQUESTS] * 4
     action = Action(_time(given, source), source.choice(names))
     return replace(given, actions=(*given.actions, _with_value(given, action, source)))
 
 
 def _removed(given: Input, source: random.Random) -> Input:
-    loose = [i for i, action in enumerate(given.actions) if not _fixed(action)]
-    if not loose:
+    removable = [i for i, action in enumerate(given.actions) if not _fixed(action)]
+    if not removable:
         return given
-    gone = source.choice(loose)
-    return replace(given, actions=given.actions[:gone] + given.actions[gone + 1:])
+    index = source.choice(removable)
+    return replace(given, actions=given.actions[:index] + given.actions[index + 1:])
 
 
 def _changed(given: Input, source: random.Random) -> Input:
@@ -337,7 +341,7 @@ def _moved(given: Input, source: random.Random) -> Input:
     return _replaced(given, source, lambda action: replace(action, at_ms=_time(given, source)))
 
 
-def _begun_elsewhere(given: Input, source: random.Random) -> Input:
+def _restarted(given: Input, source: random.Random) -> Input:
     what = source.randrange(3)
     if what == 0:
         return replace(given, initial_angle_deg=round(source.uniform(0.0, 360.0), 2))
@@ -349,15 +353,18 @@ def _begun_elsewhere(given: Input, source: random.Random) -> Input:
 
 
 def _replaced(given: Input, source: random.Random, change: Callable[[Action], Action]) -> Input:
-    loose = [i for i, action in enumerate(given.actions) if not _fixed(action)]
-    if not loose:
+    removable = [i for i, action in enumerate(given.actions) if not _fixed(action)]
+    if not removable:
         return given
-    at = source.choice(loose)
-    return replace(given, actions=(*given.actions[:at], change(given.actions[at]), *given.actions[at + 1:]))
+    index = source.choice(removable)
+    return replace(given, actions=(*given.actions[:index], change(given.actions[index]), *given.actions[index + 1:]))
+
+
+_MUTATIONS = (_added, _added, _removed, _changed, _changed, _moved, _restarted)
 
 
 def _fixed(action: Action) -> bool:
-    return action.what.partition(".")[2] in _CHOSEN
+    return action.what.partition(".")[2] in _FIXED_PARAMETERS
 
 
 def _time(given: Input, source: random.Random) -> float:
@@ -365,7 +372,7 @@ def _time(given: Input, source: random.Random) -> float:
 
 
 def _with_value(given: Input, action: Action, source: random.Random) -> Action:
-    """With a value of its range: anywhere, at an end, or near the present one."""
+    """Sets a value of the action's range: random, at an end, or near the present one."""
     scope, _, name = action.what.partition(".")
     if action.what == "speed_rpm":
         low, high = -3000.0, 3000.0
@@ -383,35 +390,36 @@ def _with_value(given: Input, action: Action, source: random.Random) -> Action:
     elif source.random() < 0.3:
         value = source.choice((low, high))
     else:
-        value = low + (high - low) * source.random() ** 2  # most ranges reach far beyond what is of use
+        value = low + (high - low) * source.random() ** 2  # most ranges extend far beyond useful values
     return replace(action, value=float(f"{value:.6g}"))
 
 
 # --- the command ----------------------------------------------------------------------------------------------------
 
-def committed(kind: str) -> Path:
-    """The file of the dearest input known."""
-    return FOLDER / f"{kind}.toml"
+def committed(variant: str) -> Path:
+    """The file of the known worst case."""
+    return FOLDER / f"{variant}.toml"
 
 
 def search_and_write(seconds: float, seed: int) -> int:
-    """Searches for every kind, from what is known and the directed inputs on; keeps what is dearer in FOLDER. 0."""
+    """Searches every variant, starting from the known worst case and the directed inputs; writes longer ones to FOLDER.
+    Returns 0."""
     wrote = False
-    for kind in KINDS:
-        known = [read_input(committed(kind))] if committed(kind).exists() else []
-        before = dearest_count(known[0]) if known else 0
+    for variant in VARIANTS:
+        known = [read_input(committed(variant))] if committed(variant).exists() else []
+        before = longest_interrupt(known[0]) if known else 0
 
-        def progress(tried: int, worst: int, kind: str = kind) -> None:
+        def progress(tried: int, longest: int, variant: str = variant) -> None:
             if sys.stdout.isatty():
-                print(f"\r{kind}: {tried} inputs tried, worst {worst}", end="", flush=True)
+                print(f"\r{variant}: {tried} inputs tried, longest {longest}", end="", flush=True)
 
-        worst, found = search(kind, [*known, *directed(kind)], seconds, seed, progress)
-        print(f"{chr(13) * sys.stdout.isatty()}{kind}: worst {worst}, known were {before}", flush=True)
-        if worst > before or len(found.actions) < len(known[0].actions):
+        longest, found = search(variant, [*known, *directed(variant)], seconds, seed, progress)
+        print(f"{chr(13) * sys.stdout.isatty()}{variant}: longest {longest}, before {before}", flush=True)
+        if longest > before or len(found.actions) < len(known[0].actions):
             FOLDER.mkdir(exist_ok=True)
-            write_input(committed(kind), found)
-            print(f"{kind}: written to {committed(kind).relative_to(ROOT)}", flush=True)
+            write_input(committed(variant), found)
+            print(f"{variant}: written to {committed(variant).relative_to(ROOT)}", flush=True)
             wrote = True
     if wrote:
-        print("now tools/salient pil --figures")
+        print("update the baseline with: tools/salient pil --figures")
     return 0

@@ -1,5 +1,5 @@
 #!/bin/busybox sh
-# First process of the guest, run from the initramfs. It brings up vcan0, mounts the host's folders under /host and runs
+# First process of the VM, run from the initramfs. It brings up vcan0, mounts the host's folders under /host and runs
 # the host's command there. When it fails before the command's exit code is sent, the kernel panics and QEMU ends.
 set -e
 /bin/busybox --install -s /bin
@@ -10,7 +10,7 @@ mount -t sysfs sysfs /sys
 mount -t devtmpfs devtmpfs /dev
 for module in /modules/*.ko; do insmod "$module"; done
 
-# The caches may be loose: while the guest runs, nobody else writes into the folders that it may write.
+# The caches may be loose: while the VM runs, the host does not write into its writable folders.
 share() { # tag, ro or rw, path on the host
     mkdir -p "/host$3"
     mount -t 9p -o "trans=virtio,version=9p2000.L,msize=512000,cache=loose,$2" "$1" "/host$3"
@@ -37,7 +37,7 @@ while read -r tag mode path; do share "$tag" "$mode" "$path"; done </job/shares
 ip link set lo up
 ip link add dev vcan0 type vcan
 ip link set vcan0 mtu 72 up # 72: flexible data rate
-hostname salient-guest
+hostname salient-vm
 
 # The ports show up a moment after their driver.
 for port in 1 2 3; do
@@ -59,7 +59,7 @@ cp /job/command.sh /host/run/command.sh
 code=0
 chroot /host /bin/sh /run/command.sh </dev/null >/out 2>/err || code=$?
 
-# What the command left running would keep the pipes open.
+# Processes that the command left running would keep the pipes open.
 for process in /proc/[0-9]*; do
     case " 1 $out $err " in
     *" ${process#/proc/} "*) ;;

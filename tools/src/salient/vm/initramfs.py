@@ -1,4 +1,4 @@
-"""The guest's initramfs: a cpio archive in the "newc" format.
+"""The VM's initramfs: a cpio archive in the "newc" format.
 
 Format: Linux, Documentation/driver-api/early-userspace/buffer-format.rst.
 """
@@ -16,7 +16,7 @@ class Cpio:
         self._entries = 0
 
     def add_folder(self, name: str) -> None:
-        """`name` is relative to the root of the guest, without a leading slash."""
+        """`name` is relative to the root of the VM, without a leading slash."""
         self._add(name, stat.S_IFDIR | 0o755, b"")
 
     def add_file(self, name: str, content: bytes, *, executable: bool = False) -> None:

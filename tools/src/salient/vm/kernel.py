@@ -1,7 +1,7 @@
-"""Debian's kernel, its modules for CAN and 9p, and a busybox for the guest: downloaded once and kept under build/guest.
+"""Debian's kernel, its modules for CAN and 9p, and a busybox for the VM: downloaded once and kept under build/vm.
 
 Nothing is installed: the packages are fetched with `apt-get download`, which needs no root, and only the files
-that the guest loads are kept (67 MB of the kernel's 400 MB).
+that the VM loads are kept (67 MB of the kernel's 400 MB).
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ BUSYBOX_PACKAGE = "busybox-static"
 MODULES = ("virtio_pci", "virtio_console", "9pnet_virtio", "9p", "vcan", "can-raw", "can-bcm", "can-isotp")
 
 
-class GuestError(Exception):
-    """The guest cannot be prepared or run. The message is one line for the user."""
+class VmError(Exception):
+    """The VM cannot be prepared or run. The message is one line for the user."""
 
 
 @dataclass(frozen=True)
-class GuestFiles:
+class VmFiles:
     """What QEMU boots from. `modules` are in the order in which they must be loaded."""
 
     kernel: Path
@@ -34,25 +34,25 @@ class GuestFiles:
     busybox: Path
 
 
-def find(folder: Path) -> GuestFiles | None:
+def find(folder: Path) -> VmFiles | None:
     """The files kept in `folder`, or None when they have not been prepared yet."""
     if not folder.is_dir():
         return None
-    return GuestFiles(folder / "kernel", tuple(sorted((folder / "modules").glob("*.ko"))), folder / "busybox")
+    return VmFiles(folder / "kernel", tuple(sorted((folder / "modules").glob("*.ko"))), folder / "busybox")
 
 
-def prepare(folder: Path) -> GuestFiles:
-    """Download and unpack into `folder`. Raises GuestError with what went wrong."""
+def prepare(folder: Path) -> VmFiles:
+    """Download and unpack into `folder`. Raises VmError with what went wrong."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="unpack-", dir=folder.parent) as name:
         scratch = Path(name)
         print(
-            f"salient guest: downloading {KERNEL_PACKAGE} and {BUSYBOX_PACKAGE} (about 70 MB, once, into {folder}): "
-            "this host has no usable vcan0, a guest with Debian's kernel has",
+            f"salient vm: downloading {KERNEL_PACKAGE} and {BUSYBOX_PACKAGE} (about 70 MB, once, into {folder}): "
+            "this host has no usable vcan0, a VM with Debian's kernel has",
             file=sys.stderr,
         )
         _download(scratch)
-        print("salient guest: unpacking the kernel", file=sys.stderr)
+        print("salient vm: unpacking the kernel", file=sys.stderr)
         for package in scratch.glob("*.deb"):
             _run(["dpkg-deb", "-x", str(package), str(scratch / "root")])
         ready = scratch / "ready"
@@ -71,8 +71,8 @@ def _download(folder: Path) -> None:
     """`apt-get download` into `folder`; with package lists of its own where the host's are missing or too old."""
     try:
         _apt_get_download(folder, [])
-    except GuestError:
-        print("salient guest: fetching apt's package lists, the host's are missing or old", file=sys.stderr)
+    except VmError:
+        print("salient vm: fetching apt's package lists, the host's are missing or old", file=sys.stderr)
         (folder / "lists" / "partial").mkdir(parents=True)
         private = [
             "-o", f"Dir::State::lists={folder / 'lists'}",
@@ -96,7 +96,7 @@ def _apt_get_download(folder: Path, options: list[str]) -> None:
         depends = ""
     kernel = re.search(r"Depends: (linux-image-\S+)", depends)
     if not kernel:
-        raise GuestError(f"apt knows no package {KERNEL_PACKAGE}: the guest needs a Debian host")
+        raise VmError(f"apt knows no package {KERNEL_PACKAGE}: the VM needs a Debian host")
     _run(
         ["apt-get", *options, "-o", "APT::Sandbox::User=", "download", kernel[1], BUSYBOX_PACKAGE],
         working_folder=folder,
@@ -108,7 +108,7 @@ def _keep(root: Path, ready: Path) -> None:
     (ready / "modules").mkdir(parents=True)
     kernels = list((root / "boot").glob("vmlinuz-*"))
     if len(kernels) != 1:
-        raise GuestError(f"package {KERNEL_PACKAGE} holds {len(kernels)} kernels, expected 1")
+        raise VmError(f"package {KERNEL_PACKAGE} holds {len(kernels)} kernels, expected 1")
     (ready / "kernel").write_bytes(_uncompressed(kernels[0].read_bytes()))
     shutil.move(root / "bin" / "busybox", ready / "busybox")
     found = {_module_name(path.stem): path for path in (root / "lib" / "modules").rglob("*.ko")}
@@ -117,7 +117,7 @@ def _keep(root: Path, ready: Path) -> None:
 
 
 def _uncompressed(image: bytes) -> bytes:
-    """The ELF file within a bzImage, which QEMU boots as well: to unpack it in the guest takes 3 of 7 s.
+    """The ELF file within a bzImage, which QEMU boots as well: to unpack it in the VM takes 3 of 7 s.
 
     Layout: Linux, Documentation/x86/boot.rst (setup_sects, payload_offset, payload_length). An image whose payload is
     not xz is returned as it is.
@@ -142,7 +142,7 @@ def _load_order(found: dict[str, Path]) -> list[Path]:
     def add(name: str) -> None:
         path = found.get(_module_name(name))
         if path is None:
-            raise GuestError(f"package {KERNEL_PACKAGE} has no module {name}")
+            raise VmError(f"package {KERNEL_PACKAGE} has no module {name}")
         if path in order:
             return
         depends = re.search(rb"\0depends=([^\0]*)\0", path.read_bytes())
@@ -160,6 +160,6 @@ def _run(command: list[str], working_folder: Path | None = None) -> None:
     try:
         subprocess.run(command, cwd=working_folder, stdout=sys.stderr, check=True)
     except FileNotFoundError:
-        raise GuestError(f"{command[0]} is missing: the guest needs a Debian host") from None
+        raise VmError(f"{command[0]} is missing: the VM needs a Debian host") from None
     except subprocess.CalledProcessError as error:
-        raise GuestError(f"{command[0]} failed with exit code {error.returncode}") from None
+        raise VmError(f"{command[0]} failed with exit code {error.returncode}") from None

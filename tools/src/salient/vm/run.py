@@ -1,13 +1,13 @@
-"""Run a command where SocketCAN has a vcan0: on this host if its kernel has one, else in a QEMU guest.
+"""Run a command where SocketCAN has a vcan0: on this host if its kernel has one, else in a QEMU VM.
 
-    python -m salient.vm.run [--timeout-s N] [--write DIR] [--force-guest] [--no-install] -- COMMAND [ARGUMENT ...]
+    python -m salient.vm.run [--timeout-s N] [--write DIR] [--force-vm] [--no-install] -- COMMAND [ARGUMENT ...]
 
-The guest runs Debian's kernel in QEMU without KVM (KVM hangs on some virtual machines), some 20 times slower than the
+The VM runs Debian's kernel in QEMU without KVM (KVM hangs on some virtual machines), some 20 times slower than the
 host. It sees the host's files at their own paths, read-only except the repository's build folder and each --write DIR.
 /tmp, /var/tmp, /run and /dev/shm are its own and empty; there is no network but the loopback. The command gets the
 host's environment and working folder and an empty standard input; its output and exit code are passed on.
 
-Exit codes: the command's own; 1 when the guest failed or took longer than --timeout-s; 2 for the caller's mistake.
+Exit codes: the command's own; 1 when the VM failed or took longer than --timeout-s; 2 for a usage error.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from typing import BinaryIO
 
 from salient.errors import UsageError
 from salient.paths import BUILD, ROOT
-from salient.vm import kernel as guest_kernel
+from salient.vm import kernel
 from salient.vm.initramfs import Cpio
-from salient.vm.kernel import GuestError, GuestFiles
+from salient.vm.kernel import VmError, VmFiles
 
-GUEST_FOLDER = BUILD / "guest"
-KERNEL_FOLDER = GUEST_FOLDER / "debian"
+VM_FOLDER = BUILD / "vm"
+KERNEL_FOLDER = VM_FOLDER / "debian"
 INTERFACE = "vcan0"
 QEMU = "qemu-system-x86_64"
 QEMU_PACKAGE = "qemu-system-x86"
 HIDDEN_FOLDERS = ("/tmp", "/var/tmp", "/run", "/var/run", "/dev", "/proc", "/sys")
-"""The guest has its own; of the host's only the shared folders inside them are seen."""
+"""The VM has its own; of the host's only the shared folders inside them are seen."""
 CANFD_MTU = 72
 
 
 def host_has_vcan() -> bool:
-    """Whether a socket on this host can use vcan0 with flexible data rate; as root it is made where it is missing."""
+    """True when a socket on this host can use vcan0 with flexible data rate; root creates a missing vcan0."""
     if not hasattr(socket, "AF_CAN"):
         return False
     try:
@@ -61,43 +61,43 @@ def host_has_vcan() -> bool:
 def missing_packages() -> list[str]:
     """The Debian packages that must be installed before `python -m salient.vm.run` works here; empty when none.
 
-    Where root can make vcan0 on this host, it is made: only then is it known that no guest is needed.
+    Where root can make vcan0 on this host, it is made: only then is it known that no VM is needed.
     """
     if host_has_vcan() or shutil.which(QEMU):
         return []
     return [QEMU_PACKAGE]
 
 
-def run_in_guest(
+def run_in_vm(
     command: list[str], *, write: Sequence[Path] = (), timeout_s: float = 600.0, install: bool = True
 ) -> int:
-    """Boot the guest, run `command` there and return its exit code.
+    """Boot the VM, run `command` there and return its exit code.
 
     `write`: folders of the host, besides the build folder, that the command may write to.
     `install`: whether Debian's kernel may be downloaded where it is missing.
-    Raises GuestError when the guest cannot be started, ends by itself or takes longer than `timeout_s`, UsageError when
+    Raises VmError when the VM cannot be started, ends by itself or takes longer than `timeout_s`, UsageError when
     it does not see the working folder.
     """
     if platform.machine() != "x86_64":
-        raise GuestError(f"the guest runs the programs of this host and needs x86_64, not {platform.machine()}")
+        raise VmError(f"the VM runs the programs of this host and needs x86_64, not {platform.machine()}")
     if not shutil.which(QEMU):
-        raise GuestError(f"{QEMU} is missing: install the Debian package {QEMU_PACKAGE}")
-    files = guest_kernel.find(KERNEL_FOLDER)
+        raise VmError(f"{QEMU} is missing: install the Debian package {QEMU_PACKAGE}")
+    files = kernel.find(KERNEL_FOLDER)
     if files is None:
         if not install:
-            raise GuestError(f"{KERNEL_FOLDER} is missing: call without --no-install to download Debian's kernel")
-        files = guest_kernel.prepare(KERNEL_FOLDER)
+            raise VmError(f"{KERNEL_FOLDER} is missing: call without --no-install to download Debian's kernel")
+        files = kernel.prepare(KERNEL_FOLDER)
     shares = [(ROOT, "ro"), (BUILD.resolve(), "rw"), *((folder.resolve(), "rw") for folder in write)]
     working_folder = Path.cwd()
     if not _is_visible(working_folder, [path for path, _ in shares]):
-        raise UsageError(f"{working_folder} is not visible in the guest: call from the repository or another folder")
-    with tempfile.TemporaryDirectory(prefix="run-", dir=GUEST_FOLDER) as name:
+        raise UsageError(f"{working_folder} is not visible in the VM: call from the repository or another folder")
+    with tempfile.TemporaryDirectory(prefix="run-", dir=VM_FOLDER) as name:
         scratch = Path(name)
         (scratch / "initramfs").write_bytes(_initramfs(files, shares, command, working_folder))
         exit_code = _run_qemu(files.kernel, shares, scratch, timeout_s)
         if exit_code is None:
-            shutil.copy(scratch / "console.log", GUEST_FOLDER / "console.log")
-            raise GuestError(f"the guest ended without an exit code: see {GUEST_FOLDER / 'console.log'}")
+            shutil.copy(scratch / "console.log", VM_FOLDER / "console.log")
+            raise VmError(f"the VM ended without an exit code: see {VM_FOLDER / 'console.log'}")
     return exit_code
 
 
@@ -124,7 +124,7 @@ def _make_interface() -> bool:
         except FileNotFoundError:
             worked = False
     if worked:
-        print(f"salient guest: made {INTERFACE} on this host", file=sys.stderr)
+        print(f"salient vm: made {INTERFACE} on this host", file=sys.stderr)
     return worked
 
 
@@ -134,7 +134,7 @@ def _is_visible(path: Path, shared: list[Path]) -> bool:
     return not any(path.is_relative_to(hidden) for hidden in HIDDEN_FOLDERS)
 
 
-def _initramfs(files: GuestFiles, shares: list[tuple[Path, str]], command: list[str], working_folder: Path) -> bytes:
+def _initramfs(files: VmFiles, shares: list[tuple[Path, str]], command: list[str], working_folder: Path) -> bytes:
     archive = Cpio()
     for folder in ("bin", "dev", "host", "job", "modules"):
         archive.add_folder(folder)
@@ -149,7 +149,7 @@ def _initramfs(files: GuestFiles, shares: list[tuple[Path, str]], command: list[
 
 
 def _script(command: list[str], working_folder: Path) -> str:
-    """The command with the host's environment, for /bin/sh. The host's TMPDIR is not in the guest."""
+    """The command with the host's environment, for /bin/sh. The host's TMPDIR is not in the VM."""
     variables = {key: value for key, value in os.environ.items() if re.fullmatch(r"[A-Za-z_]\w*", key, re.ASCII)}
     variables["TMPDIR"] = "/tmp"
     exports = [f"export {key}={shlex.quote(value)}" for key, value in variables.items()]
@@ -163,7 +163,7 @@ def _tag(number: int) -> str:
 def _run_qemu(kernel: Path, shares: list[tuple[Path, str]], scratch: Path, timeout_s: float) -> int | None:
     """The command's exit code, or None when QEMU ended before it was known."""
     arguments = [
-        "setpriv", "--pdeathsig", "KILL",  # a guest must not outlive this process
+        "setpriv", "--pdeathsig", "KILL",  # a VM must not outlive this process
         QEMU, "-nodefaults", "-no-user-config", "-no-reboot", "-display", "none",
         # Measured: importing numpy, python-can and cantools takes 7 s; with two processors and mitigations, 13 s.
         "-machine", "pc", "-accel", "tcg", "-cpu", "max", "-smp", "1", "-m", "2G",
@@ -182,12 +182,13 @@ def _run_qemu(kernel: Path, shares: list[tuple[Path, str]], scratch: Path, timeo
     code_file = scratch / "exit_code"
     pumps: list[threading.Thread] = []
     pipes = [os.pipe(), os.pipe()]
-    for name, path in (
+    for name, target in (
         ("out", f"/dev/fd/{pipes[0][1]}"),
         ("err", f"/dev/fd/{pipes[1][1]}"),
         ("code", str(code_file)),
     ):
-        arguments += ["-chardev", f"file,id={name},path={_escaped(path)}", "-device", f"virtserialport,chardev={name}"]
+        arguments += ["-chardev", f"file,id={name},path={_escaped(target)}",
+                      "-device", f"virtserialport,chardev={name}"]
 
     qemu = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, pass_fds=[write for _, write in pipes])
     try:
@@ -196,9 +197,9 @@ def _run_qemu(kernel: Path, shares: list[tuple[Path, str]], scratch: Path, timeo
             pumps.append(threading.Thread(target=_pump, args=(read, sink)))
             pumps[-1].start()
         if qemu.wait(timeout_s):
-            raise GuestError(f"{QEMU} failed with exit code {qemu.returncode}")
+            raise VmError(f"{QEMU} failed with exit code {qemu.returncode}")
     except subprocess.TimeoutExpired:
-        raise GuestError(f"the command did not end within --timeout-s {timeout_s:g}: guest killed") from None
+        raise VmError(f"the command did not end within --timeout-s {timeout_s:g}: VM killed") from None
     finally:
         qemu.kill()
         qemu.wait()
@@ -215,7 +216,7 @@ def _pump(read: int, sink: BinaryIO) -> None:
                 sink.write(data)
                 sink.flush()
             except BrokenPipeError:
-                pass  # nobody reads; the command may still finish
+                pass  # no reader any more; the command may still finish
 
 
 def _escaped(value: Path | str) -> str:
@@ -225,9 +226,9 @@ def _escaped(value: Path | str) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m salient.vm.run", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--timeout-s", type=float, default=600.0, help="time limit of the guest (default 600)")
+    parser.add_argument("--timeout-s", type=float, default=600.0, help="time limit of the VM (default 600)")
     parser.add_argument("--write", type=Path, action="append", default=[], metavar="DIR", help="writable there too")
-    parser.add_argument("--force-guest", action="store_true", help="use the guest even where the host has a vcan0")
+    parser.add_argument("--force-vm", action="store_true", help="use the VM even where the host has a vcan0")
     parser.add_argument("--no-install", action="store_true", help="stop instead of downloading Debian's kernel")
     parser.add_argument("command", nargs="+", metavar="COMMAND", help="after --")
     options = parser.parse_args()
@@ -236,19 +237,19 @@ def main() -> int:
             parser.error(f"--write {folder}: not a folder")
     if not options.timeout_s > 0:
         parser.error(f"--timeout-s {options.timeout_s:g}: must be above 0")
-    if not options.force_guest and host_has_vcan():
+    if not options.force_vm and host_has_vcan():
         try:
             os.execvp(options.command[0], options.command)
         except OSError as error:
-            print(f"salient guest: {options.command[0]}: {error.strerror}", file=sys.stderr)
+            print(f"salient vm: {options.command[0]}: {error.strerror}", file=sys.stderr)
             return 127
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that QEMU is ended, too
     try:
-        return run_in_guest(
+        return run_in_vm(
             options.command, write=options.write, timeout_s=options.timeout_s, install=not options.no_install
         )
-    except (GuestError, UsageError) as error:
-        print(f"salient guest: {error}", file=sys.stderr)
+    except (VmError, UsageError) as error:
+        print(f"salient vm: {error}", file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
     except KeyboardInterrupt:
         return 128 + signal.SIGINT

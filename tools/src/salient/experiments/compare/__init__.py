@@ -1,1 +1,1 @@
-"""salient compare: the controllers beside each other, beside what is wanted of them, and beside an earlier run."""
+"""salient compare: the controllers side by side, with targets, theoretical limits, published values and a baseline."""

@@ -1,4 +1,4 @@
-"""This run beside an earlier one: which figures got better and which worse."""
+"""Comparison of a run with a baseline, an earlier run: which metrics got better and which worse."""
 
 from __future__ import annotations
 
@@ -6,34 +6,43 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from salient.experiments.compare.metrics import FIGURES
-from salient.experiments.compare.table import Key, Row, shown
+from salient.experiments.compare.metrics import METRICS
+from salient.experiments.compare.table import Row, format_value
+from salient.experiments.compare.targets import Key
 
-_MEASURED_ONLY = ("step_angle_deg", "torque_mean_Nm")
-"""Figures that are no merit: neither way is better."""
+_INFORMATIVE = ("step_angle_deg", "torque_mean_Nm")
+"""Metrics of which neither direction is better."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """A figure that differs. earlier, now: None when it never came about or its runs failed. percent: of what the
-    earlier one is above its figure's zero, positive for the worse; None when one of them is None or that is 0."""
+    """A metric that differs from the baseline.
+
+    before, now: None when the event did not occur or the runs failed.
+    percent: change relative to the same metric in the baseline, positive for worse; None when a value is missing or the
+    baseline is 0.
+    excess_percent: change relative to the excess of the baseline over the metric's reference, None without excess. The
+    threshold applies to it. It equals percent for metrics whose reference is 0.
+    """
 
     key: Key
-    words: str
+    label: str
     controller: str
-    earlier: float | None
+    before: float | None
     now: float | None
     percent: float | None
+    excess_percent: float | None
     worse: bool
 
 
-def changes(rows: Sequence[Row], earlier: Mapping[str, Any], beyond_percent: float) -> tuple[list[Change], int]:
-    """The figures that differ by more than beyond_percent and their resolution, and how many were in both runs."""
-    stored = {(row["group"], row["condition"], row["figure"], row["statistic"]): row for row in earlier["rows"]}
+def changes(rows: Sequence[Row], baseline: Mapping[str, Any], beyond_percent: float) -> tuple[list[Change], int]:
+    """The metrics that differ by more than beyond_percent and their resolution, and the number of metrics in both
+    runs. baseline: content of its compare.json."""
+    stored = {(row["group"], row["condition"], row["figure"], row["statistic"]): row for row in baseline["rows"]}
     found, both = [], 0
     for row in rows:
         old = stored.get(row.key)
-        if old is None or row.key[2] in _MEASURED_ONLY:
+        if old is None or row.key[2] in _INFORMATIVE:
             continue
         for controller in {**row.values, **row.failed}:
             if controller not in old["values"] and controller not in old["failed"]:
@@ -46,40 +55,46 @@ def changes(rows: Sequence[Row], earlier: Mapping[str, Any], beyond_percent: flo
 
 
 def _change(row: Row, controller: str, old: Mapping[str, Any], beyond_percent: float) -> Change | None:
-    earlier, now = old["values"].get(controller), row.values.get(controller)
-    whole = (controller not in old["failed"], controller not in row.failed)
-    figure = FIGURES[row.key[2]]
-    percent = None
-    if whole[0] != whole[1]:
-        worse = whole[0]  # a run that fails is worse than any figure
-    elif earlier is None or now is None:
-        if earlier is now:
+    before, now = old["values"].get(controller), row.values.get(controller)
+    complete_before, complete_now = controller not in old["failed"], controller not in row.failed
+    metric = METRICS[row.key[2]]
+    percent = excess_percent = None
+    if complete_before != complete_now:
+        worse = complete_before  # a failed run is worse than any value
+    elif before is None or now is None:
+        if before is now:
             return None
         worse = now is None
     else:
-        difference, excess = now - earlier, max(0.0, earlier - figure.zero)
-        if (abs(difference) * figure.factor <= figure.resolution
+        difference, excess = now - before, max(0.0, before - metric.reference)
+        if (abs(difference) * metric.factor <= metric.resolution
                 or 100.0 * abs(difference) <= beyond_percent * excess):
             return None
-        percent = 100.0 * difference / excess if excess > 0.0 else None
+        percent = 100.0 * difference / before if before > 0.0 else None
+        excess_percent = 100.0 * difference / excess if excess > 0.0 else None
         worse = difference > 0.0
-    return Change(row.key, row.words, controller, earlier, now, percent, worse)
+    return Change(row.key, row.label, controller, before, now, percent, excess_percent, worse)
 
 
 def summary(found: Sequence[Change], both: int, name: str, beyond_percent: float) -> str:
-    """The changes as text, the worse ones first."""
+    """The changes as text, worse ones first."""
     worse = [change for change in found if change.worse]
     better = [change for change in found if not change.worse]
-    lines = [f"against {name}: {len(worse)} worse, {len(better)} better, {both - len(found)} within"
-             f" {beyond_percent:g} % of {both} figures"]
+    lines = [f"baseline {name}: {len(worse)} worse, {len(better)} better, {both - len(found)} of {both} metrics"
+             f" unchanged (within {beyond_percent:g} %)"]
     for title, part in (("WORSE", worse), ("better", better)):
-        lines += [f"  {title}  {change_words(change)}" for change in part]
+        lines += [f"  {title}  {change_text(change)}" for change in part]
     return "\n".join(lines)
 
 
-def change_words(change: Change) -> str:
-    """A change in a line."""
-    group, condition, figure, _ = change.key
+def change_text(change: Change) -> str:
+    """A change in one line. Percentages refer to the same metric in the baseline; a metric with a reference other than
+    0 also shows the change of its excess."""
+    group, condition, name, _ = change.key
+    metric = METRICS[name]
     percent = "" if change.percent is None else f" ({change.percent:+.1f} %)"
-    return (f"{group}, {condition}, {change.controller}: {change.words}"
-            f" {shown(figure, change.earlier)} -> {shown(figure, change.now)}{percent}")
+    if metric.reference and change.percent is not None and change.excess_percent is not None:
+        percent = (f" ({change.percent:+.2f} %; {change.excess_percent:+.1f} % of the excess over"
+                   f" {metric.reference * metric.factor:g})")
+    return (f"{group}, {condition}, {change.controller}: {change.label}"
+            f" {format_value(name, change.before)} -> {format_value(name, change.now)}{percent}")

@@ -1,7 +1,7 @@
-"""The runs that compare makes, by group.
+"""The runs of a comparison, by group.
 
-A group's runs fall into conditions, a row or a few of the table each; the runs of a condition differ by controller and,
-where a figure is a statistic, by sample. Runs that are asked for twice are made once (compare/runner.py).
+A group consists of conditions, each with one or more rows of the table; the runs of a condition differ by controller
+and, where a metric is a statistic, by sample. Identical runs are executed once (compare/runner.py).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from salient.bench.config import CONTROLLERS
 from salient.experiments.compare.metrics import STEADY_S
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 
-# The drive's parameters that conditions set, by what they do; the numbers are the drive's.
+# Parameters of the drive that conditions set, by meaning; the numbers are those of firmware/PARAMETERS.md.
 LOAD_KNOWN = {"load_source": 1}
 PULSES = {1: {"pulses_per_period": 1}, 2: {"pulses_per_period": 2}}
 NETWORK = {"off": 0, "fixed": 1, "frozen": 2, "learning": 3}
@@ -28,7 +28,7 @@ SWITCHES = {
     "sharing off": {"torque_sharing": 0}, "sharing on": {"torque_sharing": 1},
     "trim off": {"angle_trim": 0}, "trim on": {"angle_trim": 1},
 }  # fmt: skip
-"""Of the controller salient."""
+"""Optional parts of the controller salient, by condition."""
 
 MAGNETICS = ("saturating", "linear_cosine", "linear_trapezoid")
 MACHINES = (*MAGNETICS, "finite_element")
@@ -39,7 +39,7 @@ STEP_AT_S = 0.13
 RIPPLE_FROM_S = 0.3
 LONG_S = 1.0
 LATE_S = 3.0
-"""By then what learns has learnt: 90 strokes at 150 r/min."""
+"""Adaptation has converged by then: 90 strokes at 150 r/min."""
 
 IMPERFECTIONS: dict[str, dict[str, float]] = {
     "20 mA of noise": {"current_noise_A": 0.02},
@@ -58,10 +58,10 @@ SENSING: dict[str, dict[str, Any]] = {
 PAPER_CONDITIONS = {"control_rate_hz": 1_000_000, "encoder_bits": 0, "adc_bits": 16, "immediate_pwm": True}
 PAPER_PARAMETERS = {**LOAD_KNOWN, "observer_bandwidth_rad_s": 8000, "torque_band_inner_Nm": 0.01,
                     "torque_band_outer_Nm": 0.02, "outgoing_off_angle_deg": 356}
-"""For those conditions. The observer is not told the load: while it finds it, it believes a speed that is too high;
-exact sensing lets it be fast. The bands' defaults are for 40 kHz, where the torque moves by newton metres in a period.
-And a phase that must go at 87 degrees (348) with what current it has leaves a hole that shows at this scale; at 89 it
-has none left."""
+"""Parameters for the paper's conditions. The speed observer does not know the load torque and overestimates the speed
+until it has converged; exact sensing permits a high bandwidth. The default bands are for 40 kHz, where the torque
+changes by newton metres per period. A phase switched off at its default angle of 87 degrees (348 electrical) still
+carries current and leaves a torque dip that is visible at this scale; at 89 degrees the current has decayed."""
 
 ANGLES, ANGLES_QUICK = 24, 6
 STROKE_DEG = 30.0
@@ -72,16 +72,16 @@ DRIVES = 500
 
 @dataclass(frozen=True)
 class Case:
-    """One run and what is taken of it.
+    """One run and its metrics.
 
-    sample: which of a condition's runs, "" for the only one. measure: of compare/metrics.py. traced: keep the
-    torque over the paper's window for a picture.
+    extractor: key of compare/metrics.EXTRACTORS. sample: distinguishes the runs of a condition, "" for a single run.
+    traced: keep the torque over the paper's window for a plot.
     """
 
     group: str
     condition: str
     controller: str
-    measure: str
+    extractor: str
     scenario: Scenario
     sample: str = ""
     traced: bool = False
@@ -89,19 +89,22 @@ class Case:
 
 @dataclass(frozen=True)
 class Group:
-    """A part of the comparison. shown: (figure, statistic) of its rows, of those that its runs have; the statistic is
-    "" for the figure of the only run, else median, worst, gap (the widest between angles, of STROKE_DEG) or count (of
-    the runs that failed)."""
+    """A part of the comparison.
+
+    columns: (metric, statistic) of its rows, as far as its runs have them. The statistic is "" for a single run, else
+    median, worst (maximum), gap (widest between angles, modulo STROKE_DEG) or count (of failed runs). long: runs only
+    when named.
+    """
 
     title: str
     cases: Callable[[bool], Iterator[Case]]
-    shown: tuple[tuple[str, str], ...]
+    columns: tuple[tuple[str, str], ...]
     long: bool = False
 
 
 def _ripple(quick: bool) -> Iterator[Case]:
     def cases(condition: str, traced: bool = False, **fields: Any) -> Iterator[Case]:
-        yield from _held("ripple", condition, RIPPLE_RPM, RIPPLE_FROM_S, quick, traced, **fields)
+        yield from _steady("ripple", condition, RIPPLE_RPM, RIPPLE_FROM_S, quick, traced, **fields)
 
     for rate_hz in (40_000,) if quick else (40_000, 20_000, 100_000):
         for machine in MACHINES:
@@ -119,19 +122,19 @@ def _ripple(quick: bool) -> Iterator[Case]:
 
 
 def _speeds(quick: bool) -> Iterator[Case]:
-    # Loaded when they run without load: the start at 19.1 N m takes 0.42 s to 3000 r/min.
+    # The load step follows the acceleration: at 19.1 N m the start to 3000 r/min takes 0.42 s.
     machines = [("saturating", None)] if quick else [(machine, None) for machine in MAGNETICS] + [("saturating", 1)]
     for machine, pulses in machines:
         for speed_rpm, loaded_s in ((600.0, 0.2), (1500.0, 0.4), (3000.0, 0.8)):
             condition = f"{machine}{f' with {_pulses(pulses)}' if pulses else ''}, {speed_rpm:g} r/min"
-            yield from _held("speeds", condition, speed_rpm, loaded_s + 0.5, quick, loaded_s=loaded_s,
+            yield from _steady("speeds", condition, speed_rpm, loaded_s + 0.5, quick, loaded_s=loaded_s,
                              machine=machine, pulses=pulses)
 
 
 def _loads(quick: bool) -> Iterator[Case]:
     for machine in ("saturating",) if quick else MAGNETICS:
         for load_Nm in (2.0, 15.0) if quick else (1.0, 2.0, 4.0, 8.0, 12.0, 15.0):
-            yield from _held("loads", f"{machine}, {load_Nm:g} N m", RIPPLE_RPM, RIPPLE_FROM_S, quick,
+            yield from _steady("loads", f"{machine}, {load_Nm:g} N m", RIPPLE_RPM, RIPPLE_FROM_S, quick,
                              load_Nm=load_Nm, machine=machine)
 
 
@@ -160,14 +163,14 @@ def _dip(quick: bool) -> Iterator[Case]:
 def _paper_conditions(quick: bool) -> Iterator[Case]:
     for machine in ("saturating",) if quick else MAGNETICS:
         step = replace(step_scenario(machine=machine, **PAPER_CONDITIONS), duration_s=0.5)
-        # At 10 ms, when the parameters are written: they go over CAN first.
+        # At 10 ms, after the parameters have been written over CAN.
         start = replace(start_scenario(machine=machine, **PAPER_CONDITIONS), speed=(SpeedStep(0.01, 600.0),))
-        for condition, scenario, measure, parameters in (
+        for condition, scenario, extractor, parameters in (
             ("load step", step, "step_and_ripple", PAPER_PARAMETERS),
             ("load step, usual parameters", step, "step_and_ripple", LOAD_KNOWN),
             ("start", start, "start", PAPER_PARAMETERS)):
             for controller in ("traditional", "paper"):
-                yield Case("paper_conditions", f"{machine}, {condition}", controller, measure,
+                yield Case("paper_conditions", f"{machine}, {condition}", controller, extractor,
                            replace(scenario, controller=controller, parameters=parameters))
 
 
@@ -179,15 +182,15 @@ def _ablation(quick: bool) -> Iterator[Case]:
     for table, offset_deg in list(tables.items())[-1 if quick else 0:]:
         for controller, change, parameters in changes:
             for seed in SEEDS[:1] if quick else SEEDS:
-                # The seed moves the load step within a stroke, too.
+                # The seed also selects the angle of the load step within a stroke.
                 step = _scenario(controller=controller, seed=seed, duration_s=RIPPLE_FROM_S + 0.1,
                                  speed=(SpeedStep(0.0, RIPPLE_RPM),),
                                  load=(LoadStep(STEP_AT_S + (seed - 1) * _STROKE_S / len(SEEDS), LOAD_NM),),
                                  record=Record(1.0, STEP_AT_S), parameters={"bp_seed": seed, **parameters},
                                  bench={"current_noise_A": 0.02, "encoder_offset_deg": offset_deg})
                 late = replace(step, duration_s=LATE_S, record=Record(1.0, LATE_S - 0.1))
-                for measure, scenario in (("step_and_ripple", step), ("late_ripple", late)):
-                    yield Case("ablation", f"{change}, {table}", controller, measure, scenario, f"seed {seed}")
+                for extractor, scenario in (("step_and_ripple", step), ("late_ripple", late)):
+                    yield Case("ablation", f"{change}, {table}", controller, extractor, scenario, f"seed {seed}")
 
 
 def _robustness(quick: bool) -> Iterator[Case]:
@@ -197,7 +200,7 @@ def _robustness(quick: bool) -> Iterator[Case]:
 
 
 def random_drive(number: int) -> Scenario:
-    """A drive and bench of the robustness study, the same for the same number: start to 150 r/min (even numbers) or
+    """A drive and bench of the robustness study, reproducible by number: start to 150 r/min (even numbers) or
     600 r/min, then 8 N m."""
     draw = np.random.default_rng(number).uniform
     bench = {
@@ -210,7 +213,7 @@ def random_drive(number: int) -> Scenario:
         "current_noise_A": draw(0.0, 0.04),
     }
     encoder_bits = int(draw(14.0, 21.0))
-    # CAN carries the bench's quantities as single floats; what is written down is what acts.
+    # CAN carries rig variables as single-precision floats; rounded here so that the scenario holds what is applied.
     bench = {name: float(np.float32(value)) for name, value in bench.items()}
     return _scenario(seed=number, duration_s=0.5 + 0.2 + STEADY_S, speed=(SpeedStep(0.0, (150.0, 600.0)[number % 2]),),
                      load=(LoadStep(0.5, LOAD_NM),), record=Record(2.0, 0.0), encoder_bits=encoder_bits, bench=bench,
@@ -254,7 +257,7 @@ def start_scenario(**fields: Any) -> Scenario:
 
 
 def step_scenario(**fields: Any) -> Scenario:
-    """The paper's load step, recorded from it on to the end of its ripple window."""
+    """The paper's load step, recorded from the step to the end of the ripple window."""
     return _scenario(duration_s=RIPPLE_FROM_S + 0.1, speed=(SpeedStep(0.0, RIPPLE_RPM),),
                      load=(LoadStep(STEP_AT_S, LOAD_NM),), record=Record(1.0, STEP_AT_S), **fields)
 
@@ -263,10 +266,10 @@ def _scenario(**fields: Any) -> Scenario:
     return Scenario(name="compare", **fields)
 
 
-def _held(group: str, condition: str, speed_rpm: float, from_s: float, quick: bool, traced: bool = False,
+def _steady(group: str, condition: str, speed_rpm: float, from_s: float, quick: bool, traced: bool = False,
           loaded_s: float = STEP_AT_S, load_Nm: float = LOAD_NM, pulses: int | None = None,
           **fields: Any) -> Iterator[Case]:
-    """A speed held against a load, recorded from from_s on. pulses: None for what the drive does by itself."""
+    """Constant speed against a load, recorded from from_s. pulses: None for the default parameters."""
     scenario = _scenario(duration_s=from_s + (0.1 if quick else LONG_S), speed=(SpeedStep(0.0, speed_rpm),),
                          load=(LoadStep(loaded_s, load_Nm),), record=Record(1.0, from_s), **fields)
     for case in _by_controller(group, condition, "ripple", scenario):
@@ -275,9 +278,9 @@ def _held(group: str, condition: str, speed_rpm: float, from_s: float, quick: bo
         yield replace(case, traced=traced)
 
 
-def _by_controller(group: str, condition: str, measure: str, scenario: Scenario, sample: str = "") -> Iterator[Case]:
+def _by_controller(group: str, condition: str, extractor: str, scenario: Scenario, sample: str = "") -> Iterator[Case]:
     for controller in CONTROLLERS:
-        yield Case(group, condition, controller, measure, replace(scenario, controller=controller), sample)
+        yield Case(group, condition, controller, extractor, replace(scenario, controller=controller), sample)
 
 
 def scenario_toml(case: Case) -> str:

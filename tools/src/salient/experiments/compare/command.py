@@ -1,4 +1,4 @@
-"""salient compare: measures the groups asked for and leaves compare.json, compare.html and the failed runs."""
+"""salient compare: runs the selected groups; writes compare.json, compare.html and scenarios of the failed runs."""
 
 from __future__ import annotations
 
@@ -13,55 +13,57 @@ from salient.bench.emulator import executable
 from salient.errors import UsageError
 from salient.experiments.compare import baseline, results_file, table
 from salient.experiments.compare.cases import GROUPS, Case, scenario_toml
-from salient.experiments.compare.runner import Outcome, run_all
+from salient.experiments.compare.runner import RunMetrics, run_all
 
 FAILED = "failed"
-_REPLAYS_MAX = 10  # named, of the runs that failed
+_FAILED_LISTED_MAX = 10
 
 
 def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
-    """Measures, prints the table, writes the files. Returns 0; 1 when a figure got worse than in --baseline."""
+    """Runs the cases, prints the table, writes the files. Returns 0, or 1 when a metric is worse than in --baseline."""
     if options.list:
-        for name, group in GROUPS.items():
-            stream.write(f"{name:<18}{group.title}{' (long: only when named)' if group.long else ''}\n")
+        stream.writelines(f"{name:<18}{group.title}{' (long: runs only when named)' if group.long else ''}\n" for name, group in GROUPS.items())
         return 0
     cases = _cases(options.groups, options.quick)
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
     _prepare_folder(options.out)
     for machine in {case.scenario.machine for case in cases}:
         executable(machine)
-    outcomes = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr)
-    made = table.make_rows(outcomes)
-    changed, both = ([], 0) if earlier is None else baseline.changes(made, earlier, options.worse_percent)
-    compared = earlier and baseline.summary(changed, both, str(options.baseline), options.worse_percent)
-    content = results_file.content(made, outcomes, options.quick)
+    runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr)
+    rows = table.make_rows(runs)
+    changes: list[baseline.Change] = []
+    change_summary = None
+    if earlier is not None:
+        changes, both = baseline.changes(rows, earlier, options.worse_percent)
+        change_summary = baseline.summary(changes, both, str(options.baseline), options.worse_percent)
+    content = results_file.content(rows, runs, options.quick)
     results_file.write(options.out / results_file.NAME, content)
-    replays = _write_failed(options.out / FAILED, outcomes)
+    failed = _write_failed(options.out / FAILED, runs)
 
-    from salient.experiments.compare.html import write_page  # draws; not needed before
+    from salient.experiments.compare.html import write_page  # imports Matplotlib, which takes a second
 
-    write_page(options.out / "compare.html", made, content, compared, changed, _command(options))
-    stream.write(f"{table.table(made)}\n\n{table.verdict(made)}\n")
-    for outcome, path in replays[:_REPLAYS_MAX]:
-        stream.write(f"{_name(outcome.case)}: {outcome.failed}; again: tools/salient run {path}\n")
-    if len(replays) > _REPLAYS_MAX:
-        stream.write(f"and {len(replays) - _REPLAYS_MAX} more in {options.out / FAILED}\n")
-    if compared:
-        stream.write(f"\n{compared}\n")
+    write_page(options.out / "compare.html", rows, content, change_summary, changes, _command(options))
+    stream.write(f"{table.table(rows)}\n\n{table.summary(rows)}\n")
+    for run, path in failed[:_FAILED_LISTED_MAX]:
+        stream.write(f"{_name(run.case)}: {run.failed}; reproduce with: tools/salient run {path}\n")
+    if len(failed) > _FAILED_LISTED_MAX:
+        stream.write(f"and {len(failed) - _FAILED_LISTED_MAX} more in {options.out / FAILED}\n")
+    if change_summary:
+        stream.write(f"\n{change_summary}\n")
     stream.write(f"\nresults: {options.out / results_file.NAME}\npage:    {options.out / 'compare.html'}\n")
-    return 1 if any(change.worse for change in changed) else 0
+    return 1 if any(change.worse for change in changes) else 0
 
 
 def _cases(groups: Sequence[str], quick: bool) -> list[Case]:
     for name in groups:
         if name not in GROUPS:
-            raise UsageError(f"no group {name}: must be one of {', '.join(GROUPS)}")
-    return [case for name, group in GROUPS.items() if name in groups or not groups and not group.long
+            raise UsageError(f"unknown group {name}: must be one of {', '.join(GROUPS)}")
+    return [case for name, group in GROUPS.items() if name in groups or (not groups and not group.long)
             for case in group.cases(quick)]
 
 
 def _prepare_folder(out: Path) -> None:
-    """Makes the folder, and takes away what an earlier run left there."""
+    """Creates the folder and removes the files of an earlier run."""
     try:
         (out / FAILED).mkdir(parents=True, exist_ok=True)
         for path in (*(out / FAILED).glob("*.toml"), out / results_file.NAME, out / "compare.html"):
@@ -69,20 +71,20 @@ def _prepare_folder(out: Path) -> None:
         (out / results_file.NAME).touch()
         (out / results_file.NAME).unlink()
     except OSError as error:
-        raise UsageError(f"--out {out}: cannot write there ({error.strerror}); give a folder that can be written") \
+        raise UsageError(f"--out {out}: cannot write there ({error.strerror}); choose a writable folder") \
             from None
 
 
-def _write_failed(folder: Path, outcomes: Sequence[Outcome]) -> list[tuple[Outcome, Path]]:
-    """A scenario file for each run that failed, which replays it."""
-    replays = []
-    for outcome in outcomes:
-        if not outcome.failed:
+def _write_failed(folder: Path, runs: Sequence[RunMetrics]) -> list[tuple[RunMetrics, Path]]:
+    """Writes a scenario file for each failed run, which reproduces it."""
+    written = []
+    for run in runs:
+        if not run.failed:
             continue
-        path = folder / f"{'_'.join(_name(outcome.case).replace(',', '').split())}.toml"
-        path.write_text(scenario_toml(outcome.case), encoding="utf-8")
-        replays.append((outcome, path))
-    return replays
+        path = folder / f"{'_'.join(_name(run.case).replace(',', '').split())}.toml"
+        path.write_text(scenario_toml(run.case), encoding="utf-8")
+        written.append((run, path))
+    return written
 
 
 def _name(case: Case) -> str:

@@ -1,11 +1,9 @@
-"""The pictures of compare.html, drawn from the content of compare.json (results_file.py). Equal content gives equal
-bytes."""
+"""Plots of compare.html, from the content of compare.json (results_file.py). Equal content gives equal bytes."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
@@ -21,55 +19,48 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from salient.bench.config import CONTROLLERS
 from salient.experiments.compare.baseline import Change
-from salient.experiments.compare.metrics import FIGURES
+from salient.experiments.compare.metrics import METRICS
 from salient.experiments.compare.table import in_order
-from salient.experiments.plots import CONTROLLER_COLOUR, STYLE
+from salient.experiments.plots import STYLE
 from salient.experiments.results import PAPER
+from salient.pages import Plot, controller_colour
 
 Content = Mapping[str, Any]
 
-_WANTED_COLOUR = "#222222"
-_PRINTED_COLOUR = "#6f6f6f"
+_TARGET_COLOUR = "#222222"
+_PUBLISHED_COLOUR = "#6f6f6f"
 _MARKER = {"traditional": "s", "paper": "D", "salient": "o"}
 _CHANGES_MAX = 60
 
-_STYLE = {**STYLE, "font.size": 9.0, "axes.titlesize": 9.5}
+_STYLE: Any = {**STYLE, "font.size": 9.0, "axes.titlesize": 9.5}
 
 
-@dataclass(frozen=True)
-class Picture:
-    """png: the file's bytes."""
-
-    title: str
-    caption: str
-    png: bytes
-
-
-def group_pictures(group: str, content: Content) -> list[Picture]:
-    """The pictures of a group; none for a group that is a table only, or has nothing to draw."""
-    made = []
-    for title, caption, draw in _PICTURES.get(group, ()):
-        png = _draw(draw, content)
+def group_plots(group: str, content: Content) -> list[Plot]:
+    """The plots of a group; none for a group with tables only or without data."""
+    plots = []
+    for title, caption, draw in _PLOTS.get(group, ()):
+        png = _png(draw, content)
         if png is not None:
-            made.append(Picture(title, caption, png))
-    return made
+            plots.append(Plot(title, caption, png))
+    return plots
 
 
-def changes_picture(changes: Sequence[Change]) -> Picture | None:
-    """The changes against an earlier run, the largest ones first; None when none can be drawn."""
-    drawn = sorted((change for change in changes if change.percent is not None), key=lambda one: -abs(one.percent))
-    drawn = drawn[:_CHANGES_MAX]
-    if not drawn:
+def changes_plot(changes: Sequence[Change]) -> Plot | None:
+    """The changes from the baseline, the largest ones first; None when no change has a percentage."""
+    shown = [(change, change.excess_percent) for change in changes if change.excess_percent is not None]
+    shown = sorted(shown, key=lambda one: -abs(one[1]))[:_CHANGES_MAX]
+    if not shown:
         return None
-    png = _draw(lambda content: _changes(drawn), {})
-    caption = "Each line is a figure that changed by more than the threshold: to the right it got worse."
-    return png and Picture("Against the earlier run", caption, png)
+    png = _png(lambda content: _changes(shown), {})
+    caption = ("Each line is a metric that changed by more than the threshold, relative to its value in the baseline"
+               " (maximum speeds: to their excess over the reference); to the right: worse.")
+    return Plot("Changes from the baseline", caption, png) if png else None
 
 
 # --- ripple ---------------------------------------------------------------------------------------------------------
 
 def _ripples(content: Content) -> Figure | None:
-    """Panels by rate and imperfections, machines along x, a marker a controller and number of pulses."""
+    """Panels by rate and imperfections, machines along x, one marker per controller and number of pulses."""
     rows = [row for row in _rows(content, "ripple") if row["figure"] == "ripple"]
     panels: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
@@ -84,36 +75,36 @@ def _ripples(content: Content) -> Figure | None:
     figure, axes = _panels(len(panels), columns=2, height_in=3.2, sharey=True)
     for axis, (title, of) in zip(axes, panels.items(), strict=True):
         single = "one imperfection" in title
-        places = list(dict.fromkeys(_place(row, single) for row in of))
+        ticks = list(dict.fromkeys(_tick(row, single) for row in of))
         for row in of:
             two = "two pulses" in row["condition"]
             for controller, value in row["values"].items():
-                if value is None or two and controller != "salient":
+                if value is None or (two and controller != "salient"):
                     continue
-                x = places.index(_place(row, single)) + 0.16 * (CONTROLLERS.index(controller) - 1) + 0.12 * two
-                axis.plot(x, value, _MARKER.get(controller, "o"), color=_colour(controller), markersize=6,
-                          markerfacecolor="white" if two else _colour(controller))
+                x = ticks.index(_tick(row, single)) + 0.16 * (CONTROLLERS.index(controller) - 1) + 0.12 * two
+                axis.plot(x, value, _MARKER.get(controller, "o"), color=controller_colour(controller), markersize=6,
+                          markerfacecolor="white" if two else controller_colour(controller))
             if row["wanted"] is not None:
-                x = places.index(_place(row, single)) + 0.16 + 0.12 * two
-                axis.plot([x - 0.09, x + 0.09], [row["wanted"]] * 2, color=_WANTED_COLOUR, linewidth=1.4)
-        axis.set_xticks(range(len(places)), places, rotation=20 if single else 0, ha="right" if single else "center")
-        axis.set_xlim(-0.5, len(places) - 0.5)
+                x = ticks.index(_tick(row, single)) + 0.16 + 0.12 * two
+                axis.plot([x - 0.09, x + 0.09], [row["wanted"]] * 2, color=_TARGET_COLOUR, linewidth=1.4)
+        axis.set_xticks(range(len(ticks)), ticks, rotation=20 if single else 0, ha="right" if single else "center")
+        axis.set_xlim(-0.5, len(ticks) - 0.5)
         _logarithmic(axis.yaxis)
         axis.set_title(title)
-        axis.axhline(PAPER["load_step_150"]["paper"]["torque_ripple"], color=_PRINTED_COLOUR, linewidth=0.8,
+        axis.axhline(PAPER["load_step_150"]["paper"]["torque_ripple"], color=_PUBLISHED_COLOUR, linewidth=0.8,
                      linestyle=(0, (4, 2)))
     axes[0].set_ylabel("K$_t$ over 0.1 s")
     _legend(figure, rows)
     return figure
 
 
-def _place(row: Mapping[str, Any], single: bool) -> str:
+def _tick(row: Mapping[str, Any], single: bool) -> str:
     parts = row["condition"].split(", ")
     return parts[-1] if single else parts[0].replace("_", "\n")
 
 
 def _traces(content: Content) -> Figure | None:
-    """Torque over the paper's window, a panel a controller and number of pulses, each on a scale of its own."""
+    """Torque over the paper's window, one panel per controller and number of pulses, each with its own scale."""
     traces = [trace for trace in content["traces"]
               if trace["controller"] == "salient" or "one pulse" in trace["condition"]]
     if not traces:
@@ -121,7 +112,7 @@ def _traces(content: Content) -> Figure | None:
     figure, axes = _panels(len(traces), columns=1, height_in=1.7)
     for axis, trace in zip(axes, traces, strict=True):
         torque_Nm = np.asarray(trace["torque_Nm"])
-        axis.plot(trace["time_s"], torque_Nm, color=_colour(trace["controller"]), linewidth=0.7)
+        axis.plot(trace["time_s"], torque_Nm, color=controller_colour(trace["controller"]), linewidth=0.7)
         pulses = f", {trace['condition'].split(', ')[2]}" if trace["controller"] == "salient" else ""
         axis.set_title(f"{trace['controller']}{pulses}: {torque_Nm.min():.3f} to {torque_Nm.max():.3f} N m")
         axis.set_ylabel("N m")
@@ -139,7 +130,7 @@ def _over_load(content: Content) -> Figure | None:
 
 
 def _over(content: Content, group: str, label: str) -> Figure | None:
-    """The ripple over the number that a condition's second part begins with, a panel a machine."""
+    """Ripple over the number at the start of a condition's second part, one panel per machine."""
     rows = [row for row in _rows(content, group) if row["figure"] == "ripple"]
     by_machine: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
@@ -151,10 +142,12 @@ def _over(content: Content, group: str, label: str) -> Figure | None:
         numbers = [float(row["condition"].split(", ")[1].split()[0]) for row in of]
         for controller in _controllers(rows):
             values = [row["values"].get(controller) or np.nan for row in of]
-            axis.plot(numbers, values, _MARKER.get(controller, "o") + "-", color=_colour(controller), markersize=5)
-        wanted = [(number, row["wanted"]) for number, row in zip(numbers, of, strict=True) if row["wanted"] is not None]
-        if wanted:
-            axis.plot(*zip(*wanted, strict=True), "_", color=_WANTED_COLOUR, markersize=16, markeredgewidth=1.5)
+            axis.plot(numbers, values, _MARKER.get(controller, "o") + "-", color=controller_colour(controller),
+                      markersize=5)
+        targets = [(number, row["wanted"]) for number, row in zip(numbers, of, strict=True)
+                   if row["wanted"] is not None]
+        if targets:
+            axis.plot(*zip(*targets, strict=True), "_", color=_TARGET_COLOUR, markersize=16, markeredgewidth=1.5)
         _logarithmic(axis.yaxis)
         axis.set_xticks(numbers)
         axis.set_title(machine)
@@ -179,16 +172,16 @@ def _over_angle(content: Content) -> Figure | None:
             points = sorted((run["figures"]["step_angle_deg"], run["figures"]["speed_dip_rpm"]) for run in runs
                             if run["condition"] == condition and run["controller"] == controller)
             if points:
-                axis.plot(*zip(*points, strict=True), _MARKER.get(controller, "o") + "-", color=_colour(controller),
-                          markersize=3.5, linewidth=1.0)
+                axis.plot(*zip(*points, strict=True), _MARKER.get(controller, "o") + "-",
+                          color=controller_colour(controller), markersize=3.5, linewidth=1.0)
         for statistic, dash in (("median", (0, (1, 2))), ("worst", (0, (5, 2)))):
             row = limits.get((condition, statistic))
             if row and row["bound"] is not None:
-                axis.axhline(row["bound"], color=_PRINTED_COLOUR, linewidth=1.0, linestyle=dash)
+                axis.axhline(row["bound"], color=_PUBLISHED_COLOUR, linewidth=1.0, linestyle=dash)
         _logarithmic(axis.yaxis)
         axis.set_title(condition.replace(", reserve", ",\nreserve"))
         axis.set_xlabel("rotor angle within a stroke / deg")
-    axes[0].set_ylabel("dip / (r/min)")
+    axes[0].set_ylabel("speed drop / (r/min)")
     _legend(figure, _rows(content, "dip"))
     return figure
 
@@ -196,13 +189,13 @@ def _over_angle(content: Content) -> Figure | None:
 # --- studies --------------------------------------------------------------------------------------------------------
 
 def _ablations(content: Content) -> Figure | None:
-    """Changes along y; columns by table; a row of panels a figure; a dot a seed."""
+    """Changes along y; columns of panels by table, rows by metric; one dot per seed."""
     runs = [run for run in content["runs"] if run["group"] == "ablation" and run["figures"]]
     if not runs:
         return None
     tables = list(dict.fromkeys(run["condition"].split(", ")[1] for run in runs))
     changes = list(dict.fromkeys(run["condition"].split(", ")[0] for run in runs))
-    names = {"ripple": "K$_t$ over 0.1 s", "ripple_late": "K$_t$ after 3 s", "speed_dip_rpm": "dip / (r/min)"}
+    names = {"ripple": "K$_t$ over 0.1 s", "ripple_late": "K$_t$ after 3 s", "speed_dip_rpm": "speed drop / (r/min)"}
     figure, axes = _panels(len(names) * len(tables), columns=len(tables), height_in=0.6 + 0.22 * len(changes),
                            sharey=True)
     controllers = _controllers_of_runs(runs)
@@ -214,7 +207,7 @@ def _ablations(content: Content) -> Figure | None:
                 if its_table == table and name in run["figures"]:
                     y = changes.index(change) + 0.2 * (controllers.index(run["controller"]) - 0.5)
                     axis.plot(run["figures"][name], y, _MARKER.get(run["controller"], "o"), alpha=0.7,
-                              color=_colour(run["controller"]), markersize=4, markeredgewidth=0)
+                              color=controller_colour(run["controller"]), markersize=4, markeredgewidth=0)
             axis.set_yticks(range(len(changes)), changes)
             axis.set_ylim(len(changes) - 0.5, -0.5)
             _logarithmic(axis.xaxis)
@@ -225,65 +218,65 @@ def _ablations(content: Content) -> Figure | None:
 
 
 def _distributions(content: Content) -> Figure | None:
-    """How many of the drives stay below a value, a panel a figure, with its limit."""
+    """Cumulative distribution over the drives, one panel per metric, with its limit."""
     runs = [run for run in content["runs"] if run["group"] == "robustness" and run["figures"]]
     rows = {row["figure"]: row for row in _rows(content, "robustness") if row["statistic"] == "worst"}
     if not runs or not rows:
         return None
     figure, axes = _panels(len(rows), columns=3, height_in=2.5, sharey=True)
     for axis, (name, row) in zip(axes, rows.items(), strict=True):
-        of = FIGURES[name]
+        of = METRICS[name]
         for controller in _controllers_of_runs(runs):
             values = [run["figures"][name] for run in runs if run["controller"] == controller]
             numbers = sorted(value * of.factor for value in values if value is not None)
-            axis.step(numbers, 100.0 * np.arange(1, len(numbers) + 1) / len(values), color=_colour(controller),
-                      where="post", linewidth=1.3)
+            axis.step(numbers, 100.0 * np.arange(1, len(numbers) + 1) / len(values),
+                      color=controller_colour(controller), where="post", linewidth=1.3)
         if row["wanted"] is not None:
-            axis.axvline(row["wanted"] * of.factor, color=_WANTED_COLOUR, linewidth=1.2, linestyle=(0, (5, 2)))
+            axis.axvline(row["wanted"] * of.factor, color=_TARGET_COLOUR, linewidth=1.2, linestyle=(0, (5, 2)))
         if name in ("speed_error_percent", "cycle_percent", "speed_dip_rpm"):
             _logarithmic(axis.xaxis)
-        axis.set_xlabel(f"{of.words}, {of.unit}")
+        axis.set_xlabel(f"{of.label}, {of.unit}")
     for axis in axes[::3]:
         axis.set_ylabel("drives, %")
     _legend(figure, list(rows.values()))
     return figure
 
 
-def _changes(changes: Sequence[Change]) -> Figure:
+def _changes(changes: Sequence[tuple[Change, float]]) -> Figure:
     figure, (axis,) = _panels(1, columns=1, height_in=0.8 + 0.2 * len(changes))
-    for y, change in enumerate(changes):
+    for y, (change, percent) in enumerate(changes):
         colour = "#b3261e" if change.worse else "#1b7f5c"
-        axis.plot([0.0, change.percent], [y, y], color=colour, linewidth=2.0)
-        axis.plot(change.percent, y, "o", color=colour, markersize=4)
-    axis.set_yticks(range(len(changes)), [f"{change.key[1]}, {change.controller}: {change.words}"
-                                          for change in changes], fontsize=7.5)
+        axis.plot([0.0, percent], [y, y], color=colour, linewidth=2.0)
+        axis.plot(percent, y, "o", color=colour, markersize=4)
+    axis.set_yticks(range(len(changes)), [f"{change.key[1]}, {change.controller}: {change.label}"
+                                          for change, _ in changes], fontsize=7.5)
     axis.set_ylim(len(changes) - 0.5, -0.5)
     axis.axvline(0.0, color="#555555", linewidth=0.8)
     axis.set_xlabel("change, %")
     return figure
 
 
-_PICTURES: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...]] = {
+_PLOTS: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...]] = {
     "ripple": (
         ("Torque ripple by machine and rate",
-         "K_t of the true torque, sampled every microsecond. Hollow: two pulses a period. Short lines: what is wanted;"
-         " dashed: what the paper prints for its own controller.", _ripples),
-        ("Torque over the paper's window", "Saturating machine, 40 kHz; each panel on a scale of its own. Every slice"
-         " of the window is drawn from its lowest to its highest sample.", _traces),
+         "K_t of the true torque, sampled every microsecond. Hollow: two pulses a period. Short lines: target;"
+         " dashed: published value of the paper's controller.", _ripples),
+        ("Torque over the paper's window", "Saturating machine, 40 kHz; each panel with its own scale. Every slice of"
+         " the window spans from its minimum to its maximum.", _traces),
     ),
-    "speeds": (("Torque ripple over speed", "Short lines: what is wanted.", _over_speed),),
-    "loads": (("Torque ripple over load", "150 r/min; the mean torque is the load and 0.31 N m of friction.",
+    "speeds": (("Torque ripple over speed", "Short lines: target.", _over_speed),),
+    "loads": (("Torque ripple over load", "150 r/min; the mean torque is the load plus 0.31 N m of friction.",
                _over_load),),
-    "dip": (("Dip over the rotor's angle at the load step", "Dotted and dashed: median and highest dip of a drive that"
-             " knew of the step, with the voltage 0 µs (ideal sensing) or 100 µs after it.", _over_angle),),
-    "ablation": (("Parts switched off", "A dot a seed of weights, noise and moment of the load step.", _ablations),),
-    "robustness": (("Random drives", "How many of the drives stay below a value; dashed: the limit.", _distributions),),
+    "dip": (("Speed drop over the rotor angle at the load step", "Dotted and dashed: theoretical limit of median and"
+             " maximum (non-causal controller, voltage 0 µs (ideal sensing) or 100 µs after the step).", _over_angle),),
+    "ablation": (("Parts switched off", "One dot per seed of weights, noise and time of the load step.", _ablations),),
+    "robustness": (("Random drives", "Share of the drives below a value; dashed: the limit.", _distributions),),
 }  # fmt: skip
 
 
-# --- pieces ---------------------------------------------------------------------------------------------------------
+# --- helpers --------------------------------------------------------------------------------------------------------
 
-def _draw(draw: Callable[[Content], Figure | None], content: Content) -> bytes | None:
+def _png(draw: Callable[[Content], Figure | None], content: Content) -> bytes | None:
     with matplotlib.rc_context(_STYLE):
         figure = draw(content)
         if figure is None:
@@ -305,8 +298,9 @@ def _panels(count: int, columns: int, height_in: float, sharey: bool = False) ->
 
 
 def _logarithmic(axis: Axis) -> None:
-    """With plain numbers, and not too many of them for what is drawn already."""
-    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+    """Logarithmic scale with plain numbers; 2 and 5 are labelled only over short ranges."""
+    axes = axis.axes
+    (axes.set_xscale if axis is axes.xaxis else axes.set_yscale)("log")
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 300.0 * low else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -327,10 +321,6 @@ def _controllers_of_runs(runs: Iterable[Mapping[str, Any]]) -> list[str]:
 
 def _legend(figure: Figure, rows: Sequence[Mapping[str, Any]]) -> None:
     controllers = _controllers(rows)
-    handles = [Line2D([], [], color=_colour(one), marker=_MARKER.get(one, "o"), linestyle="")
+    handles = [Line2D([], [], color=controller_colour(one), marker=_MARKER.get(one, "o"), linestyle="")
                for one in controllers]
     figure.legend(handles, controllers, loc="outside upper right", ncols=len(controllers))
-
-
-def _colour(controller: str) -> str:
-    return CONTROLLER_COLOUR.get(controller, "#444444")

@@ -1,16 +1,19 @@
-"""compare.json: what a comparison measured, for scripts and for later comparisons.
+"""compare.json: the metrics of a comparison, for scripts and as a baseline of later comparisons.
 
     {"schema": 1,
-     "quick": whether it was made with --quick, whose statistics are of fewer runs,
-     "rows": [{"group", "condition", "figure", "statistic",         # what it is; the four name a row
-               "values": {CONTROLLER: number or null},              # null: never came about
-               "failed": {CONTROLLER: why figures are missing},
-               "wanted", "wanted_of", "bound", "printed": {CONTROLLER: number or null}, "reached"}],  # null: none
+     "quick": true when made with --quick, whose statistics are of fewer runs,
+     "rows": [{"group", "condition", "figure", "statistic",         # these four identify a row; figure: the metric
+               "values": {CONTROLLER: number or null},              # null: the event did not occur
+               "failed": {CONTROLLER: why metrics are missing},
+               "wanted": target, "wanted_of": its controller,       # null: no target
+               "bound": theoretical limit,                          # null: none
+               "printed": {CONTROLLER: published value or null},
+               "reached": true or false}],                          # null: not judged
      "runs": [{"group", "condition", "controller", "sample", "figures": {FIGURE: number or null}, "failed"}],
      "traces": [{"condition", "controller", "time_s": [...], "torque_Nm": [...]}]}
 
-Figures are in the units that end their names, ratios without one. Equal drives give equal bytes, whatever the number of
-jobs.
+Units are the suffixes of the metrics' names, ratios have none. Equal runs give equal bytes, independent of the number
+of jobs.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from salient.errors import UsageError
-from salient.experiments.compare.runner import Outcome
+from salient.experiments.compare.runner import RunMetrics
 from salient.experiments.compare.table import Row
 from salient.experiments.results import rounded
 
@@ -29,34 +32,33 @@ SCHEMA = 1
 NAME = "compare.json"
 
 
-def content(rows: Sequence[Row], outcomes: Sequence[Outcome], quick: bool) -> dict[str, Any]:
-    """What the file holds."""
+def content(rows: Sequence[Row], runs: Sequence[RunMetrics], quick: bool) -> dict[str, Any]:
+    """The content of the file."""
     return {
         "schema": SCHEMA,
         "quick": quick,
         "rows": [_row(row) for row in rows],
-        "runs": [{"group": outcome.case.group, "condition": outcome.case.condition,
-                  "controller": outcome.case.controller, "sample": outcome.case.sample, "figures": outcome.figures,
-                  "failed": outcome.failed} for outcome in outcomes],
-        "traces": [{"condition": outcome.case.condition, "controller": outcome.case.controller,
-                    "time_s": outcome.trace[0], "torque_Nm": outcome.trace[1]}
-                   for outcome in outcomes if outcome.trace],
+        "runs": [{"group": run.case.group, "condition": run.case.condition, "controller": run.case.controller,
+                  "sample": run.case.sample, "figures": run.metrics, "failed": run.failed} for run in runs],
+        "traces": [{"condition": run.case.condition, "controller": run.case.controller,
+                    "time_s": run.trace[0], "torque_Nm": run.trace[1]} for run in runs if run.trace],
     }
 
 
 def _row(row: Row) -> dict[str, Any]:
-    group, condition, figure, statistic = row.key
+    group, condition, metric, statistic = row.key
     target = row.target
-    return rounded({
-        "group": group, "condition": condition, "figure": figure, "statistic": statistic,
+    content: dict[str, Any] = rounded({
+        "group": group, "condition": condition, "figure": metric, "statistic": statistic,
         "values": row.values, "failed": row.failed,
-        "wanted": target.wanted, "wanted_of": None if target.wanted is None else target.controller,
-        "bound": target.bound, "printed": target.printed, "reached": row.reached,
+        "wanted": target.limit, "wanted_of": None if target.limit is None else target.controller,
+        "bound": target.bound, "printed": target.published, "reached": row.reached,
     })  # fmt: skip
+    return content
 
 
 def write(path: Path, stored: Mapping[str, Any]) -> None:
-    """One line a row, run or trace, so that a difference can be read."""
+    """Writes one line per row, run or trace, for readable diffs."""
     parts = []
     for key, value in stored.items():
         if isinstance(value, list):
@@ -68,16 +70,16 @@ def write(path: Path, stored: Mapping[str, Any]) -> None:
 
 
 def read(path: Path, quick: bool) -> dict[str, Any]:
-    """An earlier run, from its folder or file; UsageError when it is none, or one of other runs."""
+    """A baseline from its folder or file; UsageError when the file is invalid or its runs are not comparable."""
     file = path / NAME if path.is_dir() else path
     try:
         stored = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise UsageError(f"--baseline {file}: {error.strerror}") from None
     except ValueError:
-        raise UsageError(f"--baseline {file}: no JSON; give the folder or the {NAME} of an earlier run") from None
+        raise UsageError(f"--baseline {file}: not JSON; pass the folder or the {NAME} of an earlier run") from None
     if not isinstance(stored, dict) or stored.get("schema") != SCHEMA or not isinstance(stored.get("rows"), list):
-        raise UsageError(f"--baseline {file}: no {NAME} of schema {SCHEMA}")
+        raise UsageError(f"--baseline {file}: not a {NAME} of schema {SCHEMA}")
     if stored.get("quick") != quick:
-        raise UsageError(f"--baseline {file}: made {'with' if not quick else 'without'} --quick, unlike this run")
+        raise UsageError(f"--baseline {file}: made {'without' if quick else 'with'} --quick; both runs must agree")
     return stored

@@ -1,4 +1,4 @@
-"""Makes the runs, several at a time, and keeps of each what the comparison needs."""
+"""Executes the runs of a comparison in parallel and extracts their metrics."""
 
 from __future__ import annotations
 
@@ -16,38 +16,39 @@ from salient.bench.drive import DriveError
 from salient.bench.emulator import EmulatorError
 from salient.bench.session import SessionError
 from salient.experiments.compare.cases import RIPPLE_FROM_S, Case
-from salient.experiments.compare.metrics import MEASURES, SHORT_WINDOW_S, Figures, failures
+from salient.experiments.compare.metrics import EXTRACTORS, SHORT_WINDOW_S, Metrics, failures
 from salient.experiments.metrics import MetricsError
 from salient.experiments.results import rounded
 from salient.experiments.scenario import run_scenario
 from salient.progress import Progress
 
-_LINES_MAX = 20  # of progress, where it cannot be shown in place
+_PROGRESS_LINES_MAX = 20
+"""Without a terminal, which would show the progress in place."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What came of a case. failed: why there are no figures, or what they did not keep to; "" when all is well.
-    trace: (times in s, torques in N m) through the extremes of many short slices, None when not asked for."""
+class RunMetrics:
+    """Metrics of a case. failed: why there are none, or the limits that they violate; "" for a good run. trace: (times
+    in s, torques in N m) through the extremes of short slices, None unless case.traced."""
 
     case: Case
-    figures: Figures
+    metrics: Metrics
     failed: str
     trace: tuple[list[float], list[float]] | None = None
 
 
-def run_all(cases: Sequence[Case], jobs: int, stream: TextIO) -> list[Outcome]:
-    """Outcomes in the order of `cases`, whatever the number of jobs; how far it is goes to `stream`.
+def run_all(cases: Sequence[Case], jobs: int, stream: TextIO) -> list[RunMetrics]:
+    """Metrics in the order of `cases`, independent of the number of jobs; prints the progress on `stream`.
 
-    A run that ends in a fault, or from which a figure cannot be taken, says so in its outcome. UsageError for what the
-    drive does not know.
+    A run that ends in a fault, or whose metrics cannot be computed, is marked as failed. UsageError for parameters that
+    the drive does not have.
     """
-    kinds: dict[str, int] = {}  # what is run -> its first case
-    first_of = [kinds.setdefault(repr((case.measure, case.traced, case.scenario)), number)
+    first_cases: dict[str, int] = {}  # description of the run -> number of its first case
+    first_of = [first_cases.setdefault(repr((case.extractor, case.traced, case.scenario)), number)
                 for number, case in enumerate(cases)]
-    numbers = sorted(kinds.values())
-    lines = len(numbers) if stream.isatty() else min(len(numbers), _LINES_MAX)
-    results: dict[int, tuple[Figures, str, Any]] = {}
+    numbers = sorted(first_cases.values())
+    lines = len(numbers) if stream.isatty() else min(len(numbers), _PROGRESS_LINES_MAX)
+    results: dict[int, tuple[Metrics, str, Any]] = {}
     with (ProcessPoolExecutor(jobs, initializer=_leave_interrupts_to_parent) as workers,
           Progress(lines, stream) as progress):
         futures = {workers.submit(_run, cases[number]): number for number in numbers}
@@ -61,25 +62,25 @@ def run_all(cases: Sequence[Case], jobs: int, stream: TextIO) -> list[Outcome]:
             for future in futures:
                 future.cancel()
             raise
-    return [Outcome(case, *results[first]) for case, first in zip(cases, first_of, strict=True)]
+    return [RunMetrics(case, *results[first]) for case, first in zip(cases, first_of, strict=True)]
 
 
 def _leave_interrupts_to_parent() -> None:
-    """For a worker: Ctrl-C reaches the whole group, and one process answering it is enough."""
+    """Initialiser of workers: Ctrl-C reaches the whole process group; only the parent handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _run(case: Case) -> tuple[Figures, str, Any]:
+def _run(case: Case) -> tuple[Metrics, str, Any]:
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         try:
             result = run_scenario(case.scenario, Path(folder))
             if result.fault != "none":
                 return {}, f"fault {result.fault}", None
-            figures = rounded(MEASURES[case.measure](case.scenario, result.recording))
+            metrics: Metrics = rounded(EXTRACTORS[case.extractor](case.scenario, result.recording))
         except (EmulatorError, SessionError, DriveError, CanError, MetricsError) as error:
             return {}, str(error), None
-        failed = "; ".join(failures(figures)) if case.measure == "robustness" else ""
-        return figures, failed, _trace(result.recording) if case.traced else None
+        failed = "; ".join(failures(metrics)) if case.extractor == "robustness" else ""
+        return metrics, failed, _trace(result.recording) if case.traced else None
 
 
 def _trace(recording: Any) -> tuple[list[float], list[float]]:
