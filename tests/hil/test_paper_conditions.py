@@ -3,41 +3,41 @@
 import pytest
 
 from salient.experiments.compare.cases import GROUPS
-from salient.experiments.compare.metrics import MEASURES
+from salient.experiments.compare.metrics import EXTRACTORS
 from salient.experiments.scenario import run_scenario
 
 CASES = {(case.condition, case.controller): case for case in GROUPS["paper_conditions"].cases(False)}
 
 
-def figures(condition, controller, folder):
+def metrics_of(condition, controller, folder):
     case = CASES[condition, controller]
     result = run_scenario(case.scenario, folder)
     assert result.fault == "none"
-    return MEASURES[case.measure](case.scenario, result.recording)
+    return EXTRACTORS[case.extractor](case.scenario, result.recording)
 
 
 @pytest.mark.parametrize(("machine", "least", "most"), [
     ("saturating", 0.0015, 0.004), ("linear_cosine", 0.003, 0.006), ("linear_trapezoid", 0.006, 0.010)])
 def test_the_papers_controller_has_less_than_the_printed_ripple(machine, least, most, tmp_path):
-    assert least < figures(f"{machine}, load step", "paper", tmp_path)["ripple"] < most < 0.0197
+    assert least < metrics_of(f"{machine}, load step", "paper", tmp_path)["ripple"] < most < 0.0197
 
 
 @pytest.mark.parametrize(("machine", "least", "most"), [
     ("saturating", 0.011, 0.017), ("linear_cosine", 0.006, 0.010), ("linear_trapezoid", 0.006, 0.010)])
 def test_hysteresis_with_bands_for_the_rate_has_less_than_the_printed_ripple_too(machine, least, most, tmp_path):
-    assert least < figures(f"{machine}, load step", "traditional", tmp_path)["ripple"] < most < 0.043
+    assert least < metrics_of(f"{machine}, load step", "traditional", tmp_path)["ripple"] < most < 0.043
 
 
 def test_a_known_load_leaves_the_dip_that_the_rotors_angle_costs_and_an_unaware_observer_adds_to_it(tmp_path):
-    step = figures("saturating, load step", "paper", tmp_path / "step")
+    step = metrics_of("saturating, load step", "paper", tmp_path / "step")
     assert 0.4 < step["speed_dip_rpm"] < 1.95
     assert 0.0 < step["recovery_time_s"] < 0.0017
     assert 149.99 < step["speed_after_rpm"] < 150.05
-    slow = figures("saturating, load step, usual parameters", "paper", tmp_path / "slow")
+    slow = metrics_of("saturating, load step, usual parameters", "paper", tmp_path / "slow")
     assert 2.5 < slow["speed_dip_rpm"] < 3.0
 
 
 def test_the_start_settles_as_printed_and_with_less_overshoot(tmp_path):
-    start = figures("saturating, start", "paper", tmp_path)
+    start = metrics_of("saturating, start", "paper", tmp_path)
     assert 0.0677 < start["settling_time_s"] < 0.0700
     assert start["overshoot_percent"] < 0.01

@@ -29,11 +29,11 @@ def digest_of_run(name: str, build: str, machine: str, controller: str) -> dict[
     from test_same_bits import ROW_BYTES, RUNS
 
     from salient.bench.bench import Bench
-    from salient.bench.emulator import SimulatorOptions
+    from salient.bench.config import BenchConfig
 
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         switches, recording = Path(folder) / "switches", Path(folder) / "recording.npy"
-        options = SimulatorOptions(record=recording, record_step_ns=10_000, record_switches=switches, build=build,
+        options = BenchConfig(record=recording, record_step_ns=10_000, record_switches=switches, build=build,
                                    machine=machine, controller=controller, seed=3, initial_angle_deg=12.0)
         with Bench(options, f"unix:{folder}/can.sock") as bench:
             RUNS[name](bench)

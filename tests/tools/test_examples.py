@@ -8,7 +8,8 @@ import sys
 
 import pytest
 
-from salient.bench.emulator import Simulator, SimulatorOptions
+from salient.bench.config import BenchConfig
+from salient.bench.emulator import EmulatorProcess
 from salient.bus.clock import open_bus
 from salient.bus.signals import SignalTable, drive_database
 from salient.paths import ROOT
@@ -28,7 +29,7 @@ def channel(tmp_path):
 
 def test_read_telemetry_waits_for_the_drive_and_prints_decoded_frames(channel):
     example = start("read_telemetry.py", channel)
-    with Simulator(SimulatorOptions(pace="realtime"), channel):
+    with EmulatorProcess(BenchConfig(pace="realtime"), channel):
         output, errors = example.communicate()
     assert (errors, example.returncode) == ("", 0)
     lines = output.splitlines()
@@ -39,7 +40,7 @@ def test_read_telemetry_waits_for_the_drive_and_prints_decoded_frames(channel):
 def test_run_600_rpm_runs_the_drive_and_switches_it_off(channel):
     telemetry = SignalTable(drive_database(), "DRIVE")
     # One tenth of real time: the time-out of commands stays far from what a loaded computer may miss.
-    with Simulator(SimulatorOptions(pace="x0.1"), channel):
+    with EmulatorProcess(BenchConfig(pace="x0.1"), channel):
         example = start("run_600_rpm.py", channel, "0.3")
         output, errors = example.communicate()
         with open_bus(channel) as bus:
