@@ -49,11 +49,12 @@ static void enqueue_group(telemetry_t *telemetry, drive_telemetry_group_t group,
     }
 }
 
-static void enqueue_background(telemetry_t *telemetry, const drive_telemetry_t *values) {
+static void enqueue_background(telemetry_t *telemetry, drive_telemetry_group_t group, bool room,
+                               const drive_telemetry_t *values) {
     const drive_telemetry_message_t *due[DRIVE_TELEMETRY_MESSAGES];
-    const unsigned count = due_messages(telemetry, DRIVE_TELEMETRY_GROUP_BACKGROUND, due);
+    const unsigned count = due_messages(telemetry, group, due);
     for (unsigned i = 0; i < count; i++) {
-        if (telemetry->background_queued || telemetry->background_in_mailbox ||
+        if (telemetry->background_queued || telemetry->background_in_mailbox || !room ||
             frame_queue_free(&telemetry->queue) == 0) {
             counter_add(&telemetry->dropped, 1);
         } else {
@@ -79,12 +80,14 @@ static void follow_fault(telemetry_t *telemetry, const drive_telemetry_t *values
 }
 
 void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
+    const bool backlog = frame_queue_peek(&telemetry->queue) != NULL;
     follow_fault(telemetry, values);
     enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_MEASUREMENTS, values);
     enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_FAULT, values);
     values->bus_counters.telemetry_dropped = telemetry->dropped;
     enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_COUNTERS, values);
-    enqueue_background(telemetry, values);
+    enqueue_background(telemetry, DRIVE_TELEMETRY_GROUP_BACKGROUND, true, values);
+    enqueue_background(telemetry, DRIVE_TELEMETRY_GROUP_IDLE, !backlog, values);
 
     uint32_t cycles = 1;
     /* Negative when the values were collected a little before the cycle was due. */
@@ -100,7 +103,7 @@ static bool is_background(const hal_can_frame_t *frame) {
     for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
         const drive_telemetry_message_t *message = &drive_telemetry_messages[i];
         if (message->identifier == frame->identifier) {
-            return message->group == DRIVE_TELEMETRY_GROUP_BACKGROUND;
+            return message->group == DRIVE_TELEMETRY_GROUP_BACKGROUND || message->group == DRIVE_TELEMETRY_GROUP_IDLE;
         }
     }
     return false;

@@ -9,8 +9,9 @@
  * order, what is missing shows in the cycle number. Frames of the group `fault` are sent only in state fault: in the
  * cycle after the fault, and periodically from there.
  *
- * The frames of the group `background` have the highest identifiers on the bus. While other nodes hold one back it
- * keeps a mailbox, so there is never more than one: others are dropped and counted until it is known to have left.
+ * The frames of the groups `background` and `idle` have the highest identifiers on the bus. While other nodes hold one
+ * back it keeps a mailbox, so there is never more than one: others are dropped and counted until it is known to have
+ * left. A frame of `idle` is dropped, too, in a cycle that begins with frames of an earlier one in the queue.
  */
 #ifndef COMMS_TELEMETRY_H
 #define COMMS_TELEMETRY_H
@@ -30,7 +31,7 @@ typedef struct {
     uint16_t countdown[DRIVE_TELEMETRY_MESSAGES]; /* cycles until each message is due */
     bool in_fault;
     uint32_t fault_time_us;     /* of the fault reported last */
-    bool background_queued;     /* a frame of the group `background` is in the queue */
+    bool background_queued;     /* a frame of `background` or `idle` is in the queue */
     bool background_in_mailbox; /* one may be in a mailbox */
     uint16_t dropped;           /* frames, since start; saturates at 65535 */
     frame_queue_t queue;

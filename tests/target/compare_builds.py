@@ -54,7 +54,7 @@ def run_all(options: argparse.Namespace) -> None:
     """Prints the digests of every run as JSON."""
     from test_same_bits import MACHINES, RUNS
 
-    from salient.cli import CONTROLLERS
+    from salient.bench.config import CONTROLLERS
 
     runs = [(name, build, machine, controller) for name in options.runs or RUNS for build in options.builds
             for machine in MACHINES for controller in CONTROLLERS]

@@ -176,12 +176,14 @@ class BenchConfig(Conditions):
                                          commands=("sim", "run"), argument=False)
 
     def arguments(self) -> list[str]:
-        """The options of the host executable that differ from its defaults."""
+        """The options of the host executable, each with its value: a command line in a log is complete."""
         line = []
         for name, option in OPTIONS.items():
             value = getattr(self, name)
-            if not option.argument or value == DEFAULTS[name]:
+            if not option.argument or value is None or value is False:
                 continue
+            if name in ("record_step_ns", "record_from_us") and self.record is None:
+                continue  # the executable rejects them without a recording
             line.append(flag_of(name))
             if option.kind != FLAG:
                 line.append(f"{value:.17g}" if option.kind == NUMBER else str(value))
