@@ -152,6 +152,7 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     control_parameters_t &p = drive.control_parameters;
     control_state_t &control = drive.control;
     p.controller = DRIVE_CONTROLLER_SALIENT;
+    p.torque_law = TORQUE_LAW_PREDICTIVE;
     control.state_machine.record.fault = FAULT_ENCODER;
     control.observer.speed_q22 = int32_t(std::lround(-600 * 2 * M_PI / 60 * 4194304));
     control.speed_reference_q22 = int32_t(std::lround(150 * 2 * M_PI / 60 * 4194304));
