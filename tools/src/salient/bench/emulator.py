@@ -18,6 +18,7 @@ from salient.bench.config import TARGET_BUILDS, BenchConfig
 from salient.bench.drive import ParameterRow, read_parameter_table
 from salient.bench.session import Session
 from salient.builder import run_commands
+from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.machine.file import MachineError, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
