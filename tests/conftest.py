@@ -12,13 +12,13 @@ import pytest
 from salient.__main__ import main
 from salient.paths import ROOT
 
-# The reference model of the plant serves the tests of the benchmark, too.
+# Tests of the benchmark use the reference model of the plant, too.
 sys.path.append(str(ROOT / "tests" / "plant"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """With `pytest -n N --dist loadgroup`, tests that share a fixture of a module run in one process, which makes it
-    once. A mark xdist_group of the test's own comes first."""
+    once. A test's explicit mark xdist_group has priority."""
     for item in items:
         definitions = item._fixtureinfo.name2fixturedefs.values()
         shared = [definition for definition in (found[-1] for found in definitions if found)
@@ -45,11 +45,11 @@ def salient_without_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     """Runs a command in this process, without the preparation by tools/salient (1 s of processor time)."""
 
     def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-        words = [*map(str, arguments)]
+        argv = [*map(str, arguments)]
         monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["salient", *words])
+        monkeypatch.setattr(sys, "argv", ["salient", *argv])
         capsys.readouterr()
         code = main()
-        return subprocess.CompletedProcess(words, code, *capsys.readouterr())
+        return subprocess.CompletedProcess(argv, code, *capsys.readouterr())
 
     return run

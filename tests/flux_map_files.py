@@ -1,4 +1,4 @@
-"""Machine files with a flux-linkage map, sampled from the formulas of the shipped machines."""
+"""Machine files with a flux-linkage map, sampled from the formulas of the bundled machines."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from salient.machine.magnetics import Formula
 from salient.paths import MACHINES
 
 HALF_DEG = 45.0
-GREATEST_A = 100.0
+CURRENT_MAX_A = 100.0
 REGULAR_DEG = np.linspace(0.0, HALF_DEG, 20)
-REGULAR_A = np.linspace(GREATEST_A / 20, GREATEST_A, 20)
+REGULAR_A = np.linspace(CURRENT_MAX_A / 20, CURRENT_MAX_A, 20)
 
 
 def formula(name: str) -> Formula:
-    """The magnetics of a shipped machine."""
+    """Magnetics of a bundled machine."""
     magnetics = load_machine(MACHINES / f"{name}.toml").magnetics
     assert isinstance(magnetics, Formula)
     return magnetics
 
 
 def irregular(angles: int = 20, currents: int = 20) -> tuple[np.ndarray, list[np.ndarray]]:
-    """As a bench leaves them: angles up to 60 % of their distance off, and currents of its own at each angle, denser
-    where the iron saturates, each up to 20 % off; the last within 4 % of the greatest."""
+    """Grid as measured on a bench: angles off by up to 60 % of their spacing; separate currents at each angle, denser
+    where the iron saturates, off by up to 20 %, the last within 4 % of the maximum."""
     rng = np.random.default_rng(7)
     inner = np.linspace(0.0, HALF_DEG, angles)[1:-1]
     angles_deg = np.array([0.0, *(inner + HALF_DEG / (angles - 1) * rng.uniform(-0.3, 0.3, len(inner))), HALF_DEG])
-    even_A = GREATEST_A * np.linspace(0.0, 1.0, currents + 1)[1:] ** 1.5
+    even_A = CURRENT_MAX_A * np.linspace(0.0, 1.0, currents + 1)[1:] ** 1.5
     currents_A = []
     for _ in angles_deg:
         values_A = even_A * rng.uniform(0.9, 1.1, currents)
-        values_A[-1] = GREATEST_A * rng.uniform(1.0, 1.04)
+        values_A[-1] = CURRENT_MAX_A * rng.uniform(1.0, 1.04)
         currents_A.append(np.sort(values_A))
     return angles_deg, currents_A
 
 
 def rows(magnetics: Formula, angles_deg: Sequence[float], currents_A: Sequence) -> list[tuple[float, float, float]]:
-    """(angle in deg, current in A, flux linkage in Wb) of each point; currents_A: for all angles, or for each."""
+    """Points (angle in deg, current in A, flux linkage in Wb); currents_A: for all angles, or per angle."""
     return [
         (float(angle_deg), float(current_A), float(magnetics.flux_linkage_Wb(math.radians(angle_deg), current_A)))
         for at, angle_deg in enumerate(angles_deg)
@@ -57,7 +57,7 @@ def csv_text(points: Sequence[tuple[float, float, float]]) -> str:
 def write_machine(
     folder: Path, name: str, csv: str | bytes, change: Callable[[str], str] = lambda text: text
 ) -> Path:
-    """The saturating machine with a map in place of its formula: NAME.csv and NAME.toml; the machine file's path."""
+    """Writes NAME.csv and NAME.toml, the saturating machine with a map instead of its formula; returns the path."""
     text = (MACHINES / "saturating.toml").read_text(encoding="utf-8")
     before, rest = text.split("[magnetics]\n")
     _, after = rest.split("\n[", 1)

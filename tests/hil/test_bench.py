@@ -1,4 +1,4 @@
-"""The fixture `bench` and the classes that it is made of."""
+"""The fixture `bench` and its classes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_that_fails(bench):
 
 
 @pytest.mark.both_transports
-def test_time_moves_only_when_told(bench):
+def test_time_advances_only_on_request(bench):
     assert bench.time_ns == 0
     bench.run_for(0.0123)
     assert bench.time_ns == 12_300_000
@@ -64,7 +64,7 @@ def test_drive_runs_and_carries_a_load(bench):
     assert set(load.value[load.time_s > 0.0801]) == {4.0}
 
 
-def test_load_now(bench):
+def test_load_acts_immediately(bench):
     bench.run_for(0.0105)
     bench.load_torque_Nm = 2.5
     assert bench.load_torque_Nm == 2.5
@@ -72,7 +72,7 @@ def test_load_now(bench):
     assert bench.truth["load_torque_Nm"].last == 2.5
 
 
-def test_run_until(bench):
+def test_run_until_stops_at_the_condition_or_the_timeout(bench):
     bench.drive.speed_reference_rpm = 300
     reached_s = bench.run_until(lambda: bench.truth["speed_rpm"].last > 150, timeout=0.1)
     assert 0.01 < reached_s == bench.time_s < 0.05
@@ -80,19 +80,19 @@ def test_run_until(bench):
         bench.run_until(lambda: False, timeout=0.01)
 
 
-def test_commands_keep_coming_until_silence(bench):
+def test_commands_are_sent_cyclically_until_silence(bench):
     bench.drive.speed_reference_rpm = 150
     bench.run_for(0.2)
     times_ns = [t for t, m in bench.log if m.arbitration_id == 0x080]
     assert len(times_ns) == 20
-    # A frame waits for the one that is on the bus, and then takes its own time: 135 bits at most, each.
+    # A frame waits for the one on the bus and then takes its transmission time: at most 135 bits each.
     assert all(0 < t - 10_000_000 * i < 270_000 for i, t in enumerate(times_ns))
     bench.drive.silence()
     bench.run_until(lambda: bench.drive.state == "fault", timeout=0.2)
     assert bench.drive.fault == "command_timeout"
 
 
-def test_signals(bench):
+def test_signals_have_units_times_and_names(bench):
     bench.run_for(0.0205)
     speed = bench.truth["speed_rpm"]
     assert (speed.name, speed.unit) == ("speed_rpm", "r/min")
@@ -107,9 +107,9 @@ def test_signals(bench):
 
 
 def test_signals_agree_with_cantools(bench):
-    """Columns decoded at once, and frame by frame by cantools."""
+    """Vectorised decoding equals frame-by-frame decoding by cantools."""
     bench.drive.speed_reference_rpm = 150
-    bench.load_torque_Nm = -3  # so that negative numbers are among them
+    bench.load_torque_Nm = -3  # negative values are covered
     bench.run_for(0.05)
     for table, database in ((bench.telemetry, drive_database()), (bench.truth, rig_database())):
         for message in database.messages:
@@ -122,7 +122,7 @@ def test_signals_agree_with_cantools(bench):
                 assert table[f"{message.name}.{signal.name}"].value == pytest.approx(expected), signal.name
 
 
-def test_refusals(bench):
+def test_invalid_values_are_rejected(bench):
     bench.run_for(0.01)
     with pytest.raises(RigError, match="load_torque_Nm 500: must be -200 to 200 N m"):
         bench.load_torque_Nm = 500
@@ -141,7 +141,7 @@ def test_queue_of_settings_is_bounded(bench):
         bench.at(0.2).load_torque_Nm = 1
 
 
-def test_two_benches_at_once(make_bench):
+def test_two_benches_run_independently(make_bench):
     benches = [make_bench(controller=controller) for controller in ("traditional", "paper")]
     for bench in benches:
         bench.drive.speed_reference_rpm = 150
@@ -151,8 +151,8 @@ def test_two_benches_at_once(make_bench):
     assert all(bench.truth["speed_rpm"].last == pytest.approx(150, abs=4) for bench in benches)
 
 
-def test_session_with_a_drive_that_moves_by_itself(tmp_path):
-    """A session that follows a free-running drive sees its time pass and steers it."""
+def test_session_follows_a_free_running_drive(tmp_path):
+    """A session follows the time of a free-running drive and commands it."""
     can_bus = f"unix:{tmp_path}/can.sock"
     with EmulatorProcess(BenchConfig(pace="x20"), can_bus), Session(can_bus, lockstep=False) as session:
         session.drive.speed_reference_rpm = 150
@@ -161,7 +161,7 @@ def test_session_with_a_drive_that_moves_by_itself(tmp_path):
 
 
 def stop_until_checked(process: EmulatorProcess, checks: int) -> Callable[[], bool]:
-    """Stops a process as a debugger does; it runs on when a session has checked its life that often."""
+    """Stops a process as a debugger does; it continues after the given number of liveness checks by a session."""
     os.kill(process.pid, SIGSTOP)
     remaining = iter(range(checks))
 
@@ -173,14 +173,14 @@ def stop_until_checked(process: EmulatorProcess, checks: int) -> Callable[[], bo
     return is_alive
 
 
-def test_a_session_waits_for_an_emulator_at_a_breakpoint(bench, monkeypatch):
+def test_session_waits_for_an_emulator_at_a_breakpoint(bench, monkeypatch):
     monkeypatch.setattr(session_module, "_ALIVE_CHECK_S", 0.01)
     monkeypatch.setattr(bench, "_is_alive", stop_until_checked(bench.simulator, checks=10))
     bench.run_for(0.01)
     assert bench.time_ns == 10_000_000
 
 
-def test_a_session_fails_when_the_emulator_dies(make_bench, monkeypatch):
+def test_session_fails_when_the_emulator_is_killed(make_bench, monkeypatch):
     monkeypatch.setattr(session_module, "_ALIVE_CHECK_S", 0.01)
     bench = make_bench()
     process = bench.simulator
@@ -198,7 +198,7 @@ def test_a_session_fails_when_the_emulator_dies(make_bench, monkeypatch):
     process._process.returncode = 0  # the fixture closes it again
 
 
-def test_failure_leaves_what_explains_it(tmp_path):
+def test_failure_leaves_log_plot_seed_and_replay_command(tmp_path):
     (tmp_path / "test_failing.py").write_text(FAILING_TEST)
     failures = tmp_path / "failures"
     result = subprocess.run(
@@ -220,7 +220,7 @@ def test_failure_leaves_what_explains_it(tmp_path):
         assert len(list(log)) == len((folder / "can.log").read_text().splitlines()) > 300
 
 
-def test_markers_choose_by_transport(tmp_path):
+def test_markers_select_by_transport(tmp_path):
     (tmp_path / "test_some.py").write_text(
         "import pytest\n"
         "@pytest.mark.both_transports\ndef test_both(): pass\n"
@@ -235,7 +235,7 @@ def test_markers_choose_by_transport(tmp_path):
         assert {line.split("::")[1].split()[0] for line in result.stdout.splitlines() if "PASSED" in line} == names
 
 
-def test_wrong_transport(tmp_path):
+def test_invalid_transport_is_rejected(tmp_path):
     result = subprocess.run([sys.executable, "-m", "pytest", "--salient-can=vcan0", tmp_path], capture_output=True,
                             text=True, cwd=Path(tmp_path))
     assert result.returncode == 4
@@ -243,7 +243,7 @@ def test_wrong_transport(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["phase_a_open", "load_torque", "Load_torque_Nm", "_load_torque_Nm"])
-def test_unknown_bench_variable_is_rejected_with_those_there_are(bench, name):
+def test_unknown_bench_variable_is_rejected_with_the_valid_names(bench, name):
     for rig in (bench.rig, bench.at(0.1)):
         with pytest.raises(AttributeError, match=f"no attribute '{name}'; there are .*load_torque_Nm.*truth_period_us"):
             setattr(rig, name, 8)
@@ -251,7 +251,7 @@ def test_unknown_bench_variable_is_rejected_with_those_there_are(bench, name):
             getattr(rig, name)
 
 
-def test_misspelt_attribute_is_rejected_with_those_there_are(bench):
+def test_misspelt_attribute_is_rejected_with_the_valid_names(bench):
     with pytest.raises(AttributeError, match="no attribute 'load_torque'; there are .*load_torque_Nm"):
         bench.load_torque = 8
     with pytest.raises(AttributeError, match="no attribute 'speed_rpm'; there are .*speed_reference_rpm"):
@@ -261,7 +261,7 @@ def test_misspelt_attribute_is_rejected_with_those_there_are(bench):
 
 
 def test_bench_variables_are_those_of_the_database(bench):
-    """Each with a description and a range; those with a start value have it, the others the machine file's."""
+    """Every variable has a description and a range, and starts from its initial value or from the machine file."""
     variables = bench_variables()
     assert set(variables) <= set(dir(bench.rig))
     assert all(signal.comment and signal.minimum < signal.maximum for signal in variables.values())

@@ -1,4 +1,4 @@
-"""Equal runs leave equal bytes, whatever the load, the folder and the transport."""
+"""Equal runs give identical files, independent of computer load, folder and transport."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FILES = ("can.blf", "can.log", "recording.npy")
 
 
 def scenario(controller: str, **changes) -> Scenario:
-    """A start, a load step and a change of speed in a twentieth of a second, with parameters."""
+    """A start, a load step and a change of speed within 50 ms, with modified parameters."""
     settings = {
         "name": "short",
         "duration_s": 0.05,
@@ -34,7 +34,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_equal_runs_leave_equal_files(tmp_path, controller):
+def test_equal_runs_give_identical_files(tmp_path, controller):
     results = []
     for name in ("first", "second_with_a_longer_name"):
         run_all([scenario(controller)], tmp_path / name)
@@ -43,8 +43,8 @@ def test_equal_runs_leave_equal_files(tmp_path, controller):
     assert json.loads(results[0][1])["controllers"][controller]["fault"] == "none"
 
 
-def test_another_angle_is_another_run(tmp_path):
-    """So that the equality above says something."""
+def test_different_initial_angles_give_different_runs(tmp_path):
+    """Shows that the comparison above can fail."""
     for angle in (12.0, 13.0):
         run_scenario(scenario("paper", initial_angle_deg=angle), tmp_path / str(angle))
     first, second = contents(tmp_path / "12.0"), contents(tmp_path / "13.0")
@@ -52,8 +52,8 @@ def test_another_angle_is_another_run(tmp_path):
 
 
 def test_scheduled_steps_act_at_their_times(tmp_path):
-    """The load at exactly 25.1 ms: a sample at that instant still is without it, the next one has it. A later speed is
-    asked for at its time, and then takes its time on the bus."""
+    """The load acts at exactly 25.1 ms: a sample at that instant is without it, the next one has it. A later speed is
+    commanded at its time, and arrives after its transmission time on the bus."""
     result = run_scenario(scenario("paper"), tmp_path)
     recording = result.recording
     loaded_s = recording["time_s"][recording["load_torque_Nm"] > 5.9]
@@ -62,8 +62,8 @@ def test_scheduled_steps_act_at_their_times(tmp_path):
     assert 0.0333 < reference.time_s[reference.value > 150.0][0] < 0.0353
 
 
-def test_where_time_is_cut_changes_nothing(make_bench):
-    """One long step of the clock or many short ones: the same frames at the same times."""
+def test_division_of_time_into_steps_changes_nothing(make_bench):
+    """One long step of the clock or many short ones give the same frames at the same times."""
     logs = []
     for steps in (1, 50):
         bench = make_bench(controller="paper")
@@ -76,7 +76,7 @@ def test_where_time_is_cut_changes_nothing(make_bench):
 
 @pytest.mark.socketcan
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_both_transports_leave_equal_files(tmp_path, request, controller):
+def test_both_transports_give_identical_files(tmp_path, request, controller):
     interface = request.config.getoption("--salient-can")
     for name, can in (("local", "local"), ("socketcan", interface)):
         run_scenario(scenario(controller), tmp_path / name, can)

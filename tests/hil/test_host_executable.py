@@ -1,4 +1,4 @@
-"""The host executable without the launcher: command line, socket file, end."""
+"""The host executable without the launcher: command line, socket file, termination."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from salient.bench.config import DEFAULTS, FLAG, OPTIONS, flag_of
 from salient.bench.emulator import executable
 
 TIMEOUT_S = 20
-RUN_UNTIL_ID = 0x9F000001  # with the extended flag
+RUN_UNTIL_ID = 0x9F000001  # includes the extended flag
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def program() -> str:
 
 @pytest.fixture
 def start(program: str, tmp_path: Path) -> Iterator:
-    """Starts the executable on tmp_path/bus and waits for its ready line; ends what is left running."""
+    """Starts the executable on tmp_path/bus and waits for its ready line; ends remaining processes."""
     processes = []
 
     def run(*arguments: str) -> tuple[subprocess.Popen[str], dict]:
@@ -47,7 +47,7 @@ def start(program: str, tmp_path: Path) -> Iterator:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "expected_texts"),
     [
         ([], ["--can", "unix:PATH"]),
         (["--can"], ["--can", "requires a value"]),
@@ -77,8 +77,8 @@ def start(program: str, tmp_path: Path) -> Iterator:
         (["--can", "BUS", "extra"], ["extra", "unrecognised argument"]),
     ],
 )
-def test_mistake_is_one_line_and_exit_code_2(
-    program: str, tmp_path: Path, arguments: list[str], words: list[str]
+def test_usage_error_is_one_line_and_exit_code_2(
+    program: str, tmp_path: Path, arguments: list[str], expected_texts: list[str]
 ) -> None:
     bus = tmp_path / "bus"
     line = [f"unix:{bus}" if argument == "BUS" else argument for argument in arguments]
@@ -87,8 +87,8 @@ def test_mistake_is_one_line_and_exit_code_2(
     assert result.returncode == 2
     assert result.stdout == ""
     assert re.fullmatch(r"salient: [^\n]+\n", result.stderr), result.stderr
-    for word in words:
-        assert word in result.stderr
+    for expected in expected_texts:
+        assert expected in result.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -100,15 +100,15 @@ def test_usage_text_has_every_option_and_controller(program: str) -> None:
     assert "traditional, paper or salient (default salient)" in result.stdout
 
 
-def test_defaults_are_those_of_the_record(start, tmp_path: Path) -> None:
+def test_defaults_are_those_of_bench_config(start, tmp_path: Path) -> None:
     """An executable without options and one with every default written out leave the same recording."""
     recordings = []
     for name in ("without", "with"):
         file = tmp_path / f"{name}.npy"
         written = [] if name == "without" else [
-            word for field, option in OPTIONS.items()
+            expected for field, option in OPTIONS.items()
             if option.argument and option.kind != FLAG and field not in ("can", "pace") and DEFAULTS[field] is not None
-            for word in (flag_of(field), str(DEFAULTS[field]))
+            for expected in (flag_of(field), str(DEFAULTS[field]))
         ]  # fmt: skip
         process, ready = start("--pace", "free", "--stop-at-s", "0.005", "--record", str(file), *written)
         assert (ready["controller"], ready["seed"]) == ("salient", 1)
@@ -120,7 +120,7 @@ def test_defaults_are_those_of_the_record(start, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("pace", "is_valid"), [
     ("x0.01", True), ("x1000", True), ("x.5", True), ("x0.009", False), ("x1000.1", False), ("x", False), ("1", False),
 ])  # fmt: skip
-def test_paces_are_those_of_the_record(program: str, tmp_path: Path, pace: str, is_valid: bool) -> None:
+def test_paces_are_those_of_bench_config(program: str, tmp_path: Path, pace: str, is_valid: bool) -> None:
     line = [program, "--can", f"unix:{tmp_path}/bus", "--pace", pace, "--stop-at-s", "0.000001"]
     result = subprocess.run(line, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert result.returncode == (0 if is_valid else 2), result.stderr
@@ -131,7 +131,7 @@ def test_paces_are_those_of_the_record(program: str, tmp_path: Path, pace: str, 
             OPTIONS["pace"].parse(pace)
 
 
-def test_ready_line_has_the_conditions(start, tmp_path: Path) -> None:
+def test_ready_line_contains_the_conditions(start, tmp_path: Path) -> None:
     process, ready = start("--pace", "lockstep", "--controller", "traditional", "--seed", "18446744073709551615")
     assert ready == {
         "ready": True, "can": f"unix:{tmp_path}/bus", "pid": process.pid, "machine": "saturating",
@@ -160,18 +160,18 @@ def test_ends_cleanly_and_removes_its_socket(start, tmp_path: Path, pace: str, e
     assert not (tmp_path / "bus").exists()
 
 
-def test_far_run_until_does_not_keep_it_from_ending(start, tmp_path: Path) -> None:
+def test_distant_run_until_does_not_prevent_termination(start, tmp_path: Path) -> None:
     process, _ = start("--pace", "lockstep")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
         client.connect(f"{tmp_path}/bus")
         client.send(struct.pack("<QIBxxx8s", 0, RUN_UNTIL_ID, 7, b"\xff" * 6 + b"\x01"))
         while struct.unpack_from("<QI", client.recv(80))[0] < 1_000_000:
-            pass  # time runs
+            pass  # free-running
     process.terminate()
     assert process.wait(TIMEOUT_S) == 0
 
 
-def test_socket_of_a_killed_one_is_replaced_and_a_live_one_is_not(start, program: str, tmp_path: Path) -> None:
+def test_stale_socket_is_replaced_and_a_live_one_is_not(start, program: str, tmp_path: Path) -> None:
     process, _ = start("--pace", "lockstep")
     process.kill()
     process.wait()

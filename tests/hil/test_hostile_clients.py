@@ -61,7 +61,7 @@ def steady(make_bench, tmp_path, name, **options):
 
 
 def finish(bench) -> tuple[np.ndarray, dict[str, float]]:
-    """Ends the run at 0.25 s; the recording, and the counters."""
+    """Ends the run at 0.25 s; returns the recording and the counters."""
     bench.advance_to(250_000_000)
     bench.close()
     return np.load(bench.options.record), {name: bench.telemetry[name].last for name in COUNTERS}
@@ -76,7 +76,7 @@ def undisturbed(make_bench, tmp_path):
 
 
 @pytest.mark.parametrize("counter", ATTACKS)
-def test_wrong_frames(make_bench, tmp_path, undisturbed, counter):
+def test_invalid_frames_are_counted_and_change_nothing(make_bench, tmp_path, undisturbed, counter):
     bench = steady(make_bench, tmp_path, "disturbed")
     with open_bus(bench.address) as attacker:
         for frame in ATTACKS[counter]:
@@ -87,7 +87,7 @@ def test_wrong_frames(make_bench, tmp_path, undisturbed, counter):
 
 
 @pytest.mark.parametrize("raw_speed", [3_000_001, -3_000_001, 2**23 - 1, -(2**23)])
-def test_out_of_range(make_bench, tmp_path, undisturbed, raw_speed):
+def test_commands_out_of_range_are_counted_and_change_nothing(make_bench, tmp_path, undisturbed, raw_speed):
     """Checksum and counter are valid: only the range is wrong."""
     bench = steady(make_bench, tmp_path, "disturbed")
     sent = [m.data[2] for _, m in bench.log if m.arbitration_id == COMMAND_ID]
@@ -100,7 +100,7 @@ def test_out_of_range(make_bench, tmp_path, undisturbed, raw_speed):
     assert counters["out_of_range"] == 1
 
 
-def test_flood(make_bench, tmp_path, undisturbed):
+def test_flood_delays_telemetry_but_not_the_drive(make_bench, tmp_path, undisturbed):
     """Ten clients that send 40 frames each and leave."""
     bench = steady(make_bench, tmp_path, "disturbed")
     generator = random.Random(1)
@@ -117,7 +117,7 @@ def test_flood(make_bench, tmp_path, undisturbed):
     assert {name for name, count in counters.items() if count} <= {"unknown_frame", "telemetry_dropped"}
 
 
-def test_records_that_are_no_frames(make_bench, tmp_path, undisturbed):
+def test_records_that_are_not_frames_are_discarded(make_bench, tmp_path, undisturbed):
     bench = steady(make_bench, tmp_path, "disturbed")
     with open_bus(bench.address) as attacker:
         for size in (1, 7, 8, 23, 25, 79, 81, 5000):

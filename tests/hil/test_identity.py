@@ -1,4 +1,4 @@
-"""The identity of a drive: version, hash of its DBC, and the tools' reaction to another one."""
+"""The identity of a drive: version, hash of its DBC, and the tools' reaction to a mismatch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from salient.bus.signals import drive_database
 from salient.version import VERSION
 
 
-def test_the_drive_reports_version_and_hash(bench, capsys):
+def test_drive_reports_version_and_hash(bench, capsys):
     bench.run_for(0.22)
     parts = [bench.telemetry[f"firmware_{part}"].last for part in ("major", "minor", "patch")]
     assert ".".join(f"{part:g}" for part in parts) == VERSION
@@ -18,8 +18,8 @@ def test_the_drive_reports_version_and_hash(bench, capsys):
     assert "drive.dbc" not in capsys.readouterr().err
 
 
-def test_the_identity_is_sent_between_the_slow_frames(bench):
-    """5 ms after the cycles with all other frames, after the four frames of 1 ms."""
+def test_identity_is_sent_between_the_slow_frames(bench):
+    """Sent 5 ms after the cycles with all other frames, after the four 1 ms frames."""
     bench.run_for(0.11)
     identifiers = {m.frame_id: m.name for m in drive_database().messages}
     sent = [(time_ns, identifiers[m.arbitration_id]) for time_ns, m in bench.log
@@ -32,7 +32,7 @@ def test_the_identity_is_sent_between_the_slow_frames(bench):
         ]  # fmt: skip
 
 
-def test_a_session_reports_another_dbc_once(bench, capsys, monkeypatch):
+def test_session_reports_a_mismatched_dbc_once(bench, capsys, monkeypatch):
     monkeypatch.setattr(salient.bench.session, "database_hash", lambda database: 0x12345678)
     with Session(bench.address) as session:
         session.run_for(0.3)

@@ -1,7 +1,7 @@
-"""The closed-loop drive of a machine by a map against the drive of the formula that the map samples: 20 x 20 points of
-the saturating machine, the paper's controller. Firmware tables and emulator both come from the map.
+"""The closed-loop drive of a machine defined by a map compared with that of the sampled formula: 20 x 20 points of the
+saturating machine, the paper's controller. Firmware tables and emulator are both generated from the map.
 
-A single load step depends on the last bits (limit cycles of the encoder's and the duty's steps), so dip and ripple are
+A single load step depends on the last bits (limit cycles of encoder and duty quantisation), so dip and ripple are
 averaged over rotor angles. Measured (regular; irregular grid): settling time 0.00 %; -0.03 %, dip -0.10 %; -0.15 %,
 mean torque and phase currents below 0.01 %, ripple 3.1 %; 2.4 %. At single angles the dip differs by up to 0.8 %, the
 ripple by up to 24 %.
@@ -28,14 +28,14 @@ GRIDS = {"map_regular": (REGULAR_DEG, REGULAR_A), "map_irregular": irregular()}
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one machine: of a start, and of a load step at each of ANGLES_DEG."""
+    """Recordings of one machine: a start, and a load step at each of ANGLES_DEG."""
 
     settling_time_s: float
     dips_rpm: np.ndarray
     torques_Nm: np.ndarray
     ripples: np.ndarray
     currents_A: np.ndarray
-    """RMS of each phase over the ripple's window, of all load steps."""
+    """RMS current of each phase over the ripple window of all load steps."""
 
 
 def paper_scenario(name: str) -> Scenario:
@@ -71,7 +71,7 @@ def of_formula(tmp_path_factory) -> Figures:
 
 
 @pytest.mark.parametrize("grid", GRIDS)
-def test_the_drive_of_a_map_is_the_drive_of_its_formula(grid, of_formula, tmp_path):
+def test_drive_of_a_map_performs_as_the_drive_of_its_formula(grid, of_formula, tmp_path):
     points = rows(formula("saturating"), *GRIDS[grid])
     of_map = figures_of(str(write_machine(tmp_path, grid, csv_text(points))), tmp_path)
     for name in ("settling_time_s", "dips_rpm", "torques_Nm", "ripples", "currents_A"):
@@ -87,4 +87,4 @@ def test_the_drive_of_a_map_is_the_drive_of_its_formula(grid, of_formula, tmp_pa
     assert of_map.currents_A == pytest.approx(of_formula.currents_A, rel=2e-3)
     assert np.mean(of_map.ripples) == pytest.approx(np.mean(of_formula.ripples), rel=0.1)
     assert of_map.ripples == pytest.approx(of_formula.ripples, rel=0.35)
-    assert not np.array_equal(of_map.ripples, of_formula.ripples)  # it is another machine, to the last bits
+    assert not np.array_equal(of_map.ripples, of_formula.ripples)  # not bit-identical: the machines differ

@@ -1,4 +1,4 @@
-"""One machine file makes another drive: other pole numbers, three or four phases, no change to a C file."""
+"""Machines with other pole numbers and three or four phases need a machine file only, no change of C code."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_starts_and_holds_speed_under_load(make_bench, tmp_path, controller, sta
     currents = [bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"].value.max() for phase in "abcd"]
     assert sum(current > 20 for current in currents) == phases
     assert max(currents) < 75
-    if controller == "salient":  # the others motor forwards only
+    if controller == "salient":  # the other controllers are single-quadrant
         bench.drive.speed_reference_rpm = -600
         bench.run_for(0.3)
         backwards = bench.truth["speed_rpm"].between(bench.time_s - 0.1, bench.time_s)

@@ -1,4 +1,4 @@
-"""The paper's own conditions: what its controllers do at 1 MHz without delay, with exact sensing and a known load."""
+"""The controllers under the paper's conditions: 1 MHz without delay, exact sensing, known load."""
 
 import pytest
 
@@ -18,17 +18,17 @@ def metrics_of(condition, controller, folder):
 
 @pytest.mark.parametrize(("machine", "least", "most"), [
     ("saturating", 0.0015, 0.004), ("linear_cosine", 0.003, 0.006), ("linear_trapezoid", 0.006, 0.010)])
-def test_the_papers_controller_has_less_than_the_printed_ripple(machine, least, most, tmp_path):
+def test_paper_controller_has_less_than_the_published_ripple(machine, least, most, tmp_path):
     assert least < metrics_of(f"{machine}, load step", "paper", tmp_path)["ripple"] < most < 0.0197
 
 
 @pytest.mark.parametrize(("machine", "least", "most"), [
     ("saturating", 0.011, 0.017), ("linear_cosine", 0.006, 0.010), ("linear_trapezoid", 0.006, 0.010)])
-def test_hysteresis_with_bands_for_the_rate_has_less_than_the_printed_ripple_too(machine, least, most, tmp_path):
+def test_hysteresis_with_bands_for_the_rate_has_less_than_the_published_ripple(machine, least, most, tmp_path):
     assert least < metrics_of(f"{machine}, load step", "traditional", tmp_path)["ripple"] < most < 0.043
 
 
-def test_a_known_load_leaves_the_dip_that_the_rotors_angle_costs_and_an_unaware_observer_adds_to_it(tmp_path):
+def test_known_load_leaves_the_dip_of_the_rotor_angle_and_an_observed_load_increases_it(tmp_path):
     step = metrics_of("saturating, load step", "paper", tmp_path / "step")
     assert 0.4 < step["speed_dip_rpm"] < 1.95
     assert 0.0 < step["recovery_time_s"] < 0.0017
@@ -37,7 +37,7 @@ def test_a_known_load_leaves_the_dip_that_the_rotors_angle_costs_and_an_unaware_
     assert 2.5 < slow["speed_dip_rpm"] < 3.0
 
 
-def test_the_start_settles_as_printed_and_with_less_overshoot(tmp_path):
+def test_start_settles_as_published_with_less_overshoot(tmp_path):
     start = metrics_of("saturating, start", "paper", tmp_path)
     assert 0.0677 < start["settling_time_s"] < 0.0700
     assert start["overshoot_percent"] < 0.01

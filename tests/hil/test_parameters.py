@@ -10,7 +10,7 @@ from salient.bus.signals import drive_database
 from salient.generate.parameters import read_table
 
 
-def test_table(make_bench):
+def test_table_is_complete_and_drive_has_its_defaults(make_bench):
     bench = make_bench()
     rows = read_parameter_table(bench)
     assert [row.index for row in rows] == list(range(len(rows)))
@@ -25,7 +25,7 @@ def test_table(make_bench):
 
 
 @pytest.mark.both_transports
-def test_write_and_read_back(bench):
+def test_written_value_is_read_back(bench):
     parameters = bench.drive.parameters
     for name in ("torque_max_Nm", "speed_ramp_rpm_s", "over_speed_rpm"):
         row = parameters.row(name)
@@ -35,7 +35,7 @@ def test_write_and_read_back(bench):
             assert parameters[name] == pytest.approx(value, abs=lsb / 2)
 
 
-def test_the_drive_has_the_table_of_the_reference_page(bench):
+def test_drive_has_the_table_of_the_reference_page(bench):
     machine_defined = {"controller", "inertia_kg_m2", "friction_Nm_s", "resistance_ohm"}
     table = read_table()
     rows = list(bench.drive.parameters.rows.values())
@@ -48,7 +48,7 @@ def test_the_drive_has_the_table_of_the_reference_page(bench):
         assert row.default == definition.default * lsb or row.name in machine_defined, row.name
 
 
-def test_out_of_range_is_rejected_and_changes_nothing(bench):
+def test_value_out_of_range_is_rejected_and_changes_nothing(bench):
     parameters = bench.drive.parameters
     for name, row in parameters.rows.items():
         lsb = 2.0**-row.fraction_bits
@@ -58,17 +58,17 @@ def test_out_of_range_is_rejected_and_changes_nothing(bench):
         assert parameters[name] == row.default
 
 
-def test_a_value_beyond_32_bits_is_rejected(bench):
+def test_value_beyond_32_bits_is_rejected(bench):
     with pytest.raises(DriveError, match="torque_max_Nm 1e.06: must be 0 to 40 N m"):
         bench.drive.parameters["torque_max_Nm"] = 1e6
 
 
-def test_an_unknown_parameter_is_named(bench):
+def test_unknown_parameter_is_named(bench):
     with pytest.raises(KeyError, match="no parameter 'torque_max'; the parameters are .*torque_max_Nm"):
         bench.drive.parameters["torque_max"] = 1
 
 
-def test_not_while_running(bench):
+def test_write_while_running_is_rejected(bench):
     bench.drive.speed_reference_rpm = 150
     bench.run_for(0.02)
     with pytest.raises(DriveError, match="torque_max_Nm 10: not_while_running"):
@@ -76,8 +76,8 @@ def test_not_while_running(bench):
     assert bench.drive.parameters["torque_max_Nm"] == pytest.approx(19.1, abs=1e-6)
 
 
-def test_a_parameter_acts(make_bench):
-    """Half the torque limit, half the speed gained."""
+def test_parameter_takes_effect(make_bench):
+    """Half the torque limit gives half the acceleration."""
     speeds = []
     for torque_Nm in (16.0, 8.0):
         bench = make_bench(controller="paper")

@@ -1,5 +1,5 @@
-"""Every protection, provoked on the bench and watched through CAN: what trips, how soon, with what record; that all
-switches open, and that the drive comes back only on command, with the cause gone, after run was let go."""
+"""Every protection, provoked on the test bench and observed through CAN: fault, reaction time and record; all switches
+open, and the drive restarts only on command, without the cause, after the run request was withdrawn."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ PERIOD_US = 25.0
 
 @dataclass(frozen=True)
 class Case:
-    """provoke and cure set the bench; reaction_us: from the cause to the latched fault, bounds included. trips: the
-    checks that must have failed in that tick."""
+    """provoke and cure set the bench; reaction_us: inclusive bounds of the time from the cause to the latched fault."""
 
     fault: str
     provoke: Callable[[Bench], None]
@@ -26,24 +25,25 @@ class Case:
     reaction_us: tuple[float, float]
 
 
-def quantity(name: str, value: float) -> Callable[[Bench], None]:
+def set_variable(name: str, value: float) -> Callable[[Bench], None]:
     return lambda bench: setattr(bench.rig, name, value)
 
 
 CASES = {
-    # The current doubles for the drive: above 75 A with what a load of 16 N m takes.
-    "over_current": Case("over_current", quantity("current_sensor_gain", 3.0), quantity("current_sensor_gain", 1.0),
-                         (0, 2 * PERIOD_US)),
-    "over_voltage": Case("over_voltage", quantity("supply_voltage_V", 301.0), quantity("supply_voltage_V", 240.0),
-                         (0, 2 * PERIOD_US)),
-    "under_voltage": Case("under_voltage", quantity("supply_voltage_V", 149.0), quantity("supply_voltage_V", 240.0),
+    # Measured current three times the true one: above the 75 A trip under the load of running().
+    "over_current": Case("over_current", set_variable("current_sensor_gain", 3.0),
+                         set_variable("current_sensor_gain", 1.0), (0, 2 * PERIOD_US)),
+    "over_voltage": Case("over_voltage", set_variable("supply_voltage_V", 301.0),
+                         set_variable("supply_voltage_V", 240.0), (0, 2 * PERIOD_US)),
+    "under_voltage": Case("under_voltage", set_variable("supply_voltage_V", 149.0),
+                          set_variable("supply_voltage_V", 240.0), (0, 2 * PERIOD_US)),
+    "encoder_jumps": Case("encoder", set_variable("encoder_fault", 2), set_variable("encoder_fault", 0),
                           (0, 2 * PERIOD_US)),
-    "encoder_jumps": Case("encoder", quantity("encoder_fault", 2), quantity("encoder_fault", 0), (0, 2 * PERIOD_US)),
-    # A quarter of a degree without a count, at 600 r/min 70 us, while the observer still believes in the speed.
-    "encoder_freezes": Case("encoder", quantity("encoder_fault", 1), quantity("encoder_fault", 0), (50, 1000)),
-    # Three interrupts lost: two at once by one that takes 70 us, the third by the next.
-    "interrupt_overrun": Case("interrupt_overrun", quantity("interrupt_time_us", 70.0),
-                              quantity("interrupt_time_us", 0.0), (50, 10 * PERIOD_US)),
+    # A quarter of a degree without a count: 70 us at 600 r/min, while the observer still predicts the speed.
+    "encoder_freezes": Case("encoder", set_variable("encoder_fault", 1), set_variable("encoder_fault", 0), (50, 1000)),
+    # Three missed triggers: two by the first interrupt of 70 us, the third by the next.
+    "interrupt_overrun": Case("interrupt_overrun", set_variable("interrupt_time_us", 70.0),
+                              set_variable("interrupt_time_us", 0.0), (50, 10 * PERIOD_US)),
 }
 
 
@@ -62,7 +62,7 @@ def currents_A(bench: Bench) -> list[float]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_fault_opens_all_switches_and_is_recorded(bench, name):
+def test_fault_opens_all_switches_and_is_recorded(bench, name):
     case = CASES[name]
     running(bench)
     caused_us = bench.time_ns / 1000
@@ -75,18 +75,18 @@ def test_a_fault_opens_all_switches_and_is_recorded(bench, name):
     reaction_us = cause["time_us"].last - caused_us
     assert case.reaction_us[0] <= reaction_us <= case.reaction_us[1]
     assert int(cause["checks"].last) >> int(cause["fault"].last) & 1
-    # A frozen encoder slows the observer until it is noticed.
+    # A frozen encoder lowers the observed speed until it is detected.
     assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(600, abs=10)
     assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.torque_reference_Nm"].last == pytest.approx(13.3, abs=3)
 
-    # -Vdc takes the current of every phase to zero, and nothing brings it back.
+    # -Vdc drives every phase current to zero, where it stays.
     assert currents_A(bench) == [0, 0, 0]
     bench.run_for(0.01)
     assert currents_A(bench) == [0, 0, 0]
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_fault_is_cleared_on_command_when_its_cause_is_gone_and_not_before(bench, name):
+def test_fault_is_cleared_on_command_only_after_its_cause_is_gone(bench, name):
     case = CASES[name]
     running(bench)
     bench.load_torque_Nm = 0
@@ -95,14 +95,14 @@ def test_a_fault_is_cleared_on_command_when_its_cause_is_gone_and_not_before(ben
     assert bench.drive.state == "fault"
 
     if name == "over_current":
-        case.cure(bench)  # no current, no sensor error: the cause is gone with the current
-    elif not name.startswith("encoder"):  # a still encoder is plausible again once the observer has come to rest
+        case.cure(bench)  # the cause is gone with the current
+    elif not name.startswith("encoder"):  # a constant count is plausible again once the observed speed is zero
         bench.drive.clear_fault()
         bench.run_for(0.005)
         assert bench.drive.state == "fault"
 
     case.cure(bench)
-    bench.run_for(0.5)  # clear_fault keeps being sent, but was asked too early
+    bench.run_for(0.5)  # clear_fault is still sent, but was first requested too early
     assert bench.drive.state == "fault"
     bench.drive.clear_fault()
     bench.run_for(0.005)
@@ -113,7 +113,7 @@ def test_a_fault_is_cleared_on_command_when_its_cause_is_gone_and_not_before(ben
     assert bench.truth["speed_rpm"].last == pytest.approx(600, abs=3)
 
 
-def test_who_holds_run_through_a_fault_must_let_go_first(bench):
+def test_run_request_held_through_a_fault_must_be_withdrawn_first(bench):
     running(bench)
     bench.rig.supply_voltage_V = 320
     bench.run_for(0.01)
@@ -124,11 +124,11 @@ def test_who_holds_run_through_a_fault_must_let_go_first(bench):
 
 
 @pytest.mark.parametrize("direction", [1, -1])
-def test_a_driving_load_trips_over_speed_in_either_direction(bench, direction):
+def test_driving_load_trips_over_speed_in_either_direction(bench, direction):
     bench.drive.parameters["over_speed_rpm"] = 700
     if direction > 0:
         bench.drive.speed_reference_rpm = 600
-    else:  # in run it would hold the load
+    else:  # in run the drive would hold the load
         bench.drive.off()
     bench.run_for(0.1)
     bench.load_torque_Nm = -10 * direction
@@ -142,8 +142,8 @@ def test_a_driving_load_trips_over_speed_in_either_direction(bench, direction):
 
 @pytest.mark.parametrize(("fault", "reaction_us"), [(1, (50, 1000)), (2, (0, 2 * PERIOD_US))])
 @pytest.mark.parametrize("direction", [1, -1])
-def test_an_encoder_that_freezes_or_jumps_is_noticed_in_either_direction(bench, direction, fault, reaction_us):
-    """With open switches: the load turns the rotor."""
+def test_frozen_or_jumping_encoder_is_detected_in_either_direction(bench, direction, fault, reaction_us):
+    """With open switches; the load drives the rotor."""
     bench.drive.off()
     bench.load_torque_Nm = -10 * direction
     bench.run_until(lambda: bench.truth["speed_rpm"].last * direction > 600, timeout=0.3)
@@ -159,7 +159,7 @@ def test_an_encoder_that_freezes_or_jumps_is_noticed_in_either_direction(bench, 
 
 @pytest.mark.parametrize("edges", [False, True])
 @pytest.mark.parametrize("speed_rpm", [75, -150, 300])
-def test_an_encoder_that_freezes_at_low_speed_is_noticed_though_the_observer_follows_it(make_bench, speed_rpm, edges):
+def test_frozen_encoder_is_detected_at_low_speed_although_the_observer_follows_it(make_bench, speed_rpm, edges):
     bench = make_bench(controller="salient", encoder_edges=edges)
     bench.drive.speed_reference_rpm = speed_rpm
     bench.run_for(0.2)
@@ -167,7 +167,7 @@ def test_an_encoder_that_freezes_at_low_speed_is_noticed_though_the_observer_fol
     bench.rig.encoder_fault = 1
     bench.run_for(0.005)
     assert (bench.drive.state, bench.drive.fault) == ("fault", "encoder")
-    # A quarter of a degree; the rotor may slow down meanwhile.
+    # Time for a quarter of a degree; the rotor may slow down meanwhile.
     needed_us = 0.25 / (6 * abs(speed_rpm)) * 1e6
     assert needed_us < bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last - caused_us < 1.2 * needed_us + 2 * PERIOD_US
     bench.run_for(0.01)
@@ -175,14 +175,14 @@ def test_an_encoder_that_freezes_at_low_speed_is_noticed_though_the_observer_fol
 
 
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
-def test_a_controller_that_motors_forwards_only_stands_still_at_a_negative_reference(make_bench, controller):
+def test_single_quadrant_controller_stays_at_standstill_at_a_negative_reference(make_bench, controller):
     bench = make_bench(controller=controller)
     bench.drive.speed_reference_rpm = -600
     bench.run_for(0.1)
     assert (bench.drive.state, bench.drive.fault) == ("run", "none")
     assert bench.truth["speed_rpm"].value == pytest.approx(0, abs=0.01)
     assert max(abs(bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"].value).max() for phase in "abc") == 0
-    bench.drive.speed_reference_rpm = 150  # and nothing was wound up meanwhile
+    bench.drive.speed_reference_rpm = 150  # no integrator wind-up in between
     bench.run_for(0.15)
     assert bench.truth["speed_rpm"].last == pytest.approx(150, abs=1.5)
     assert bench.truth["speed_rpm"].value.max() < 153
@@ -190,7 +190,7 @@ def test_a_controller_that_motors_forwards_only_stands_still_at_a_negative_refer
 
 @dataclass(frozen=True)
 class Motion:
-    """At which speed and load the salient controller is when something fails, and the torque it then asks for."""
+    """Speed, load and torque reference of the salient controller at the time of the fault."""
 
     speed_rpm: float
     load_Nm: float
@@ -218,7 +218,7 @@ def moving(make_bench, motion: Motion) -> Bench:
 
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("name", CASES)
-def test_a_fault_in_any_quadrant_opens_all_switches_and_is_recorded(make_bench, motion, name):
+def test_fault_in_any_quadrant_opens_all_switches_and_is_recorded(make_bench, motion, name):
     case, moves = CASES[name], MOTIONS[motion]
     bench = moving(make_bench, moves)
     caused_us = bench.time_ns / 1000
@@ -231,7 +231,7 @@ def test_a_fault_in_any_quadrant_opens_all_switches_and_is_recorded(make_bench, 
     assert case.reaction_us[0] <= reaction_us <= case.reaction_us[1]
     speed_rpm = bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last
     torque_Nm = bench.telemetry["DRIVE_FAULT_SNAPSHOT.torque_reference_Nm"].last
-    if name in ("encoder_freezes", "interrupt_overrun"):  # its observer wakes and takes the new angles for a new speed
+    if name in ("encoder_freezes", "interrupt_overrun"):  # the observer follows the wrong angles
         assert speed_rpm == pytest.approx(moves.speed_rpm, abs=130)
         assert abs(torque_Nm) < 19.2
     else:
@@ -243,7 +243,7 @@ def test_a_fault_in_any_quadrant_opens_all_switches_and_is_recorded(make_bench, 
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_commands_that_stop_coming_open_all_switches_in_any_quadrant(make_bench, motion):
+def test_command_timeout_opens_all_switches_in_any_quadrant(make_bench, motion):
     moves = MOTIONS[motion]
     bench = moving(make_bench, moves)
     bench.run_until(lambda: bench.drive.command_due_ns == bench.time_ns + 9_000_000, timeout=0.02)
@@ -251,7 +251,7 @@ def test_commands_that_stop_coming_open_all_switches_in_any_quadrant(make_bench,
     bench.drive.silence()
     bench.run_for(0.11)
     assert (bench.drive.state, bench.drive.fault) == ("fault", "command_timeout")
-    # The frame's own time on the bus, and a control period.
+    # Transmission time of the frame, and a control period.
     assert 0 < bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last - (sent_s * 1e6 + 100_000) < 500
     assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(moves.speed_rpm, abs=1)
     assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.torque_reference_Nm"].last == pytest.approx(moves.torque_Nm, abs=0.5)
@@ -259,8 +259,8 @@ def test_commands_that_stop_coming_open_all_switches_in_any_quadrant(make_bench,
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_a_load_beyond_the_torque_limit_trips_over_speed_in_run(make_bench, motion):
-    """It overcomes a brake; against a motor it first turns the rotor the other way."""
+def test_load_beyond_the_torque_limit_trips_over_speed_in_run(make_bench, motion):
+    """The load accelerates a braking drive; it first reverses a motoring one."""
     bench = make_bench(controller="salient")
     moves = MOTIONS[motion]
     bench.drive.parameters["over_speed_rpm"] = 700
@@ -278,7 +278,7 @@ def test_a_load_beyond_the_torque_limit_trips_over_speed_in_run(make_bench, moti
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_the_trip_current_is_a_parameter_in_any_quadrant(make_bench, motion):
+def test_trip_current_parameter_acts_in_any_quadrant(make_bench, motion):
     bench = make_bench(controller="salient")
     bench.drive.parameters["current_trip_A"] = 25
     bench.drive.parameters["speed_ramp_rpm_s"] = 2000  # a start at the torque limit would trip
@@ -295,9 +295,9 @@ def test_the_trip_current_is_a_parameter_in_any_quadrant(make_bench, motion):
 
 
 @pytest.mark.parametrize("late", [1, 2])
-def test_fewer_late_interrupts_in_a_row_than_three_are_counted_and_no_fault(bench, late):
+def test_fewer_than_three_consecutive_overruns_are_counted_without_a_fault(bench, late):
     running(bench)
-    bench.rig.interrupt_time_us = 40  # beyond one period: each loses a trigger
+    bench.rig.interrupt_time_us = 40  # longer than one period: each misses a trigger
     bench.rig.at(bench.time_s + late * 2 * PERIOD_US * 1e-6 - 20e-6).interrupt_time_us = 0
     bench.run_for(0.11)
     assert bench.drive.state == "run"
@@ -307,7 +307,7 @@ def test_fewer_late_interrupts_in_a_row_than_three_are_counted_and_no_fault(benc
     assert processor == {"used_us": 0, "worst_us": 40, "available_us": PERIOD_US, "late_interrupts": late}
 
 
-def test_three_late_interrupts_in_a_row_are_a_fault_noticed_by_the_next(bench):
+def test_three_consecutive_overruns_are_a_fault_detected_by_the_next_interrupt(bench):
     running(bench)
     caused_us = bench.time_ns / 1000
     bench.rig.interrupt_time_us = 40
@@ -321,11 +321,11 @@ def test_three_late_interrupts_in_a_row_are_a_fault_noticed_by_the_next(bench):
 
 @pytest.mark.parametrize(("interrupt_us", "is_late"), [(PERIOD_US - 0.01, False), (PERIOD_US, False),
                                                        (PERIOD_US + 0.01, True)])
-def test_an_interrupt_is_late_when_it_ends_after_the_next_trigger(bench, interrupt_us, is_late):
+def test_interrupt_overruns_when_it_ends_after_the_next_trigger(bench, interrupt_us, is_late):
     running(bench)
     bench.rig.interrupt_time_us = interrupt_us
     bench.run_for(0.05)
-    bench.rig.interrupt_time_us = 0  # one of exactly a period leaves no time for the background to report
+    bench.rig.interrupt_time_us = 0  # a full period would leave no time for the background
     bench.run_for(0.2)
     assert bench.telemetry["DRIVE_PROCESSOR.worst_us"].last == pytest.approx(interrupt_us, abs=1e-9)
     if is_late:
@@ -337,7 +337,7 @@ def test_an_interrupt_is_late_when_it_ends_after_the_next_trigger(bench, interru
         assert bench.truth["speed_rpm"].last == pytest.approx(600, abs=3)
 
 
-def test_the_first_of_two_causes_is_kept(bench):
+def test_first_of_two_faults_is_latched(bench):
     running(bench)
     bench.rig.supply_voltage_V = 320
     bench.run_for(0.002)
@@ -347,7 +347,7 @@ def test_the_first_of_two_causes_is_kept(bench):
     assert bench.telemetry["DRIVE_FAULT_CAUSE.fault"].last_name == "over_voltage"
 
 
-def test_stop_comes_to_rest_and_opens_the_switches(bench):
+def test_stop_reaches_standstill_and_opens_the_switches(bench):
     bench.drive.speed_reference_rpm = 150
     bench.run_for(0.1)
     bench.load_torque_Nm = 2
@@ -360,7 +360,7 @@ def test_stop_comes_to_rest_and_opens_the_switches(bench):
     bench.load_torque_Nm = 0
 
 
-def test_a_speed_ramp_is_followed(bench):
+def test_speed_ramp_is_followed(bench):
     bench.drive.parameters["speed_ramp_rpm_s"] = 2000
     bench.drive.speed_reference_rpm = 600
     bench.run_for(0.2)

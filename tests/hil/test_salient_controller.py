@@ -1,8 +1,8 @@
-"""The salient controller as a user of the drive sees it over CAN, driving forwards: start, load step, ripple, its
-options, what it learns and how it knows itself. Four quadrants are in test_four_quadrants.py.
+"""The salient controller over CAN, forward motoring: start, load step, ripple, options, learned misalignment, observer.
+Four quadrants are in test_four_quadrants.py.
 
-The figures in the bounds were measured with the settings that the drive comes with; tools/salient compare has them over
-rotor angles, speeds, loads and imperfections.
+The bounds come from measurements with default parameters; tools/salient compare covers rotor angles, speeds, loads and
+imperfections.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ MakeBench = Callable[..., Bench]
 Range = tuple[float, float]
 
 STEP_S = 0.13
-"""When the load comes."""
+"""Time of the load step."""
 STROKE_S = 30 / (6 * 150)
-"""A stroke of a 6/4 machine at 150 r/min."""
+"""Duration of a stroke of a 6/4 machine at 150 r/min."""
 
 
 @pytest.fixture
 def run_recorded(make_bench: MakeBench, tmp_path: Path):
-    """Runs `steps` on a bench of these options, recorded from `from_s` on; gives back the recording and the bench."""
+    """Runs `steps` on a bench of these options, recorded from `from_s` on; returns the recording and the bench."""
     runs = 0
 
     def run(steps: Callable[[Bench], None], from_s: float = 0.0, step_us: float = 1.0, **options):
@@ -64,7 +64,7 @@ def within(bounds: Range, value: float) -> bool:
 
 
 def mean_dip_rpm(run_recorded, parameters: dict[str, float] | None = None, **options) -> float:
-    """Of load steps at six angles of a stroke."""
+    """Speed drops of load steps at six angles of a stroke."""
     dips = []
     for number in range(6):
         step_s = STEP_S + number * STROKE_S / 6
@@ -90,26 +90,26 @@ MACHINES = {
     "saturating": Figures((0.068, 0.0705), (1.8, 3.0), (0.0015, 0.003), (0.006, 0.0100), (0.004, 0.0065)),
     "linear_cosine": Figures((0.068, 0.0705), (1.6, 2.8), (0.0013, 0.003), (0.005, 0.0100), (0.003, 0.0065)),
     "linear_trapezoid": Figures((0.068, 0.0705), (1.9, 3.2), (0.0015, 0.003), (0.004, 0.0100), (0.0025, 0.0065)),
-    # A fifth of the inertia, and a converter with minimum pulses and drops that the drive does not know.
+    # A fifth of the inertia, and a converter with minimum pulses and device drops that the drive does not model.
     "finite_element": Figures((0.030, 0.033), (6.0, 11.0), (0.005, 0.011), (0.010, 0.022), (0.0045, 0.0095)),
 }
 
 
 @pytest.mark.parametrize("machine", MACHINES)
-def test_starts_to_600_at_the_torque_limit_without_overshoot(run_recorded, machine):
+def test_starts_to_600_rpm_at_the_torque_limit_without_overshoot(run_recorded, machine):
     def steps(bench: Bench) -> None:
         bench.drive.speed_reference_rpm = 600
         bench.run_for(0.12)
 
     recording, _ = run_recorded(steps, step_us=10.0, machine=machine)
-    figures = start_metrics(recording, 600)
-    assert within(MACHINES[machine].settling_s, figures["settling_time_s"])
-    assert 600.0 < figures["max_speed_rpm"] < 600.1
+    result = start_metrics(recording, 600)
+    assert within(MACHINES[machine].settling_s, result["settling_time_s"])
+    assert 600.0 < result["max_speed_rpm"] < 600.1
 
 
 @pytest.mark.parametrize("pulses", [1, 2])
 @pytest.mark.parametrize("machine", MACHINES)
-def test_catches_8_Nm_at_150_and_carries_them_evenly(run_recorded, machine, pulses):
+def test_8_Nm_load_step_at_150_rpm_is_compensated_with_low_ripple(run_recorded, machine, pulses):
     expected = MACHINES[machine]
     recording, _ = run_recorded(loaded_150(0.4, {"pulses_per_period": pulses}), 0.1, machine=machine)
     after = speed_after_step(recording, 150, STEP_S)
@@ -122,13 +122,13 @@ def test_catches_8_Nm_at_150_and_carries_them_evenly(run_recorded, machine, puls
     assert torque["torque_mean_Nm"] == pytest.approx(8 + friction_Nm * 150 * np.pi / 30, abs=0.02)
 
 
-def test_edge_times_of_the_encoder_make_the_dip_smaller(run_recorded):
+def test_encoder_edge_timestamps_reduce_the_dip(run_recorded):
     without, with_edges = (mean_dip_rpm(run_recorded, encoder_edges=edges) for edges in (False, True))
     assert 2.4 < without < 3.5
     assert 1.5 < with_edges < 2.3
 
 
-def test_a_torque_reserve_makes_the_dip_smaller_and_costs_copper_loss(run_recorded):
+def test_torque_reserve_reduces_the_dip_and_increases_copper_loss(run_recorded):
     def copper_W(reserve_Nm: float) -> float:
         def steps(bench: Bench) -> None:
             bench.drive.parameters["torque_reserve_Nm"] = reserve_Nm
@@ -147,14 +147,14 @@ def test_a_torque_reserve_makes_the_dip_smaller_and_costs_copper_loss(run_record
     assert within((55.0, 80.0), losses[1])
 
 
-# --- voltage runs out -------------------------------------------------------------------------------------------------
+# --- voltage limit ----------------------------------------------------------------------------------------------------
 
 
 def highest_current_A(recording: np.ndarray) -> float:
     return max(float(recording[name].max()) for name in recording.dtype.names if name.startswith("current_"))
 
 
-def test_3000_with_8_Nm_is_held_where_voltage_just_suffices(run_recorded):
+def test_3000_rpm_with_8_Nm_is_held_where_voltage_just_suffices(run_recorded):
     def steps(bench: Bench) -> None:
         bench.drive.speed_reference_rpm = 3000
         bench.at(0.6).load_torque_Nm = 8
@@ -166,7 +166,7 @@ def test_3000_with_8_Nm_is_held_where_voltage_just_suffices(run_recorded):
     assert highest_current_A(recording) < 52
 
 
-def test_enters_and_leaves_the_region_where_voltage_runs_out_without_a_jerk(run_recorded):
+def test_enters_and_leaves_voltage_limited_operation_smoothly(run_recorded):
     def steps(bench: Bench) -> None:
         bench.drive.speed_reference_rpm = 3000
         bench.at(0.6).load_torque_Nm = 14
@@ -176,12 +176,12 @@ def test_enters_and_leaves_the_region_where_voltage_runs_out_without_a_jerk(run_
     recording, bench = run_recorded(steps, step_us=10.0, machine="linear_cosine")
     speed_rpm, torque_Nm, time_s = recording["speed_rpm"], recording["torque_Nm"], recording["time_s"]
     assert 2990 < speed_rpm[time_s < 0.6][-1] < 3000.5
-    assert 2100 < speed_rpm[time_s < 1.2][-1] < 2330  # there is not more than 14 N m
+    assert 2100 < speed_rpm[time_s < 1.2][-1] < 2330  # 14 N m is the maximum at this speed
     missing_Nm = bench.telemetry["torque_missing_Nm"].between(0.8, 1.2)
     assert 3.0 < missing_Nm.value.max() < 12.0
     assert missing_Nm.value.min() >= 0.0
     assert bench.telemetry["torque_missing_Nm"].last == 0.0
-    # Back it goes at the torque limit, never slower on the way, and arrives without overshoot.
+    # Acceleration back is at the torque limit throughout, without overshoot.
     back_rpm = speed_rpm[time_s >= 1.2]
     assert np.diff(back_rpm[:10_000:100]).min() > 0.0
     assert 2999 < back_rpm[-1] <= back_rpm.max() < 3000.5
@@ -197,7 +197,7 @@ def misalignment_deg(bench: Bench) -> float:
 
 
 @pytest.mark.parametrize("offset_deg", [0.3, -0.3])
-def test_learns_how_the_encoder_is_misaligned_and_the_ripple_falls(run_recorded, offset_deg):
+def test_encoder_misalignment_is_learned_and_the_ripple_falls(run_recorded, offset_deg):
     def ripple(from_s: float, to_s: float) -> tuple[float, Bench]:
         def steps(bench: Bench) -> None:
             bench.rig.encoder_offset_deg = offset_deg
@@ -216,14 +216,14 @@ def test_learns_how_the_encoder_is_misaligned_and_the_ripple_falls(run_recorded,
     assert within((0.004, 0.008), late)
 
 
-def test_no_misalignment_is_learned_when_that_is_switched_off(make_bench):
+def test_no_misalignment_is_learned_when_learning_is_off(make_bench):
     bench = make_bench(controller="salient")
     bench.rig.encoder_offset_deg = 0.3
     loaded_150(0.8, {"angle_trim": 0})(bench)
     assert set(bench.telemetry["misalignment_deg"].value) == {0.0}
 
 
-def test_learns_no_misalignment_where_there_is_none(make_bench):
+def test_no_misalignment_is_learned_where_there_is_none(make_bench):
     bench = make_bench(controller="salient")
     loaded_150(1.5)(bench)
     assert np.abs(bench.telemetry["misalignment_deg"].value).max() < 0.02
@@ -249,12 +249,12 @@ def test_misalignment_is_kept_over_stop_and_run(make_bench):
 
 
 @pytest.mark.parametrize(("inertia_gain", "encoder_bits"), [(1.0, 17), (0.5, 17), (3.0, 17), (1.0, 14)])
-def test_a_steady_run_does_not_wake_the_observer(make_bench, inertia_gain, encoder_bits):
+def test_observer_bandwidth_stays_narrow_in_steady_state(make_bench, inertia_gain, encoder_bits):
     bench = make_bench(controller="salient", encoder_bits=encoder_bits)
     bench.rig.inertia_gain = inertia_gain
     loaded_150(2.0)(bench)
     bandwidth = bench.telemetry["DRIVE_TRIM.observer_bandwidth_rad_s"]
-    assert bandwidth.between(0.0, 0.2).value.max() > 1000  # the load step woke it
+    assert bandwidth.between(0.0, 0.2).value.max() > 1000  # the load step raised it
     steady = bench.drive.parameters["observer_steady_rad_s"]
     assert set(bandwidth.between(1.0, 2.0).value) == {steady}
     speed_rpm = bench.truth["speed_rpm"].between(1.0, 2.0).value
@@ -264,7 +264,7 @@ def test_a_steady_run_does_not_wake_the_observer(make_bench, inertia_gain, encod
 # --- controllers ------------------------------------------------------------------------------------------------------
 
 
-def test_the_controller_is_changed_between_runs_over_can(bench):
+def test_controller_is_changed_over_can_between_runs(bench):
     # Standard deviation of the true torque under a steady load, N m.
     unevenness_Nm = {"traditional": (0.4, 1.2), "paper": (0.03, 0.15), "salient": (0.001, 0.015)}
     numbers = {"traditional": 0, "paper": 1, "salient": 2}
@@ -281,7 +281,7 @@ def test_the_controller_is_changed_between_runs_over_can(bench):
         assert 149.2 < speed_rpm.min() < speed_rpm.max() < 150.8
         torque_Nm = bench.truth["torque_Nm"].between(bench.time_s - 0.1, bench.time_s).value
         assert within(unevenness_Nm[name], float(torque_Nm.std()))
-        bench.load_torque_Nm = 2  # the others do not brake
+        bench.load_torque_Nm = 2  # the other controllers do not brake
         bench.drive.stop()
         bench.run_until(lambda: bench.drive.state == "ready", timeout=1.0)
         bench.load_torque_Nm = 0

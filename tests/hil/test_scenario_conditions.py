@@ -47,7 +47,7 @@ def ripple(result: RunResult) -> float:
 # --- reading ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_file_sets_every_condition(tmp_path):
+def test_file_sets_every_condition(tmp_path):
     path = tmp_path / "conditions.toml"
     path.write_text(HEAD + "encoder_edges = true\nadc_bits = 14\nimmediate_pwm = true\ncontrol_rate_hz = 1000000\n"
                     "[bench]\nflux_linkage_gain = 1.05\nencoder_offset_deg = -0.2\n")
@@ -75,7 +75,7 @@ def test_conditions_are_optional(tmp_path):
     ("[bench]\nminimum_pulse_ns = true", "bench.minimum_pulse_ns: True: must be a number from 0 to 2000"),
     ("bench = 1", "bench: must be a table [bench]"),
 ])  # fmt: skip
-def test_a_mistake_in_a_condition_is_named(tmp_path, text, message):
+def test_invalid_condition_is_named(tmp_path, text, message):
     path = tmp_path / "conditions.toml"
     path.write_text(HEAD + text + "\n")
     with pytest.raises(UsageError) as caught:
@@ -83,8 +83,8 @@ def test_a_mistake_in_a_condition_is_named(tmp_path, text, message):
     assert str(caught.value).startswith(f"{path}: {message}")
 
 
-def test_every_quantity_of_the_bench_may_be_set_from_the_start(tmp_path):
-    """Near the values of the machine file no quantity is refused, and the drive runs."""
+def test_every_bench_variable_may_be_set_from_the_start(tmp_path):
+    """Every bench variable is accepted near the value of the machine file, and the drive runs."""
     values = {"supply_voltage_V": 230.0, "current_sensor_gain": 1.01, "truth_period_us": 500, "current_noise_A": 0.02,
               "current_sensor_limit_A": 90.0, "flux_linkage_gain": 1.05, "resistance_gain": 1.2, "inertia_gain": 1.1,
               "friction_gain": 0.9, "minimum_pulse_ns": 200.0}
@@ -99,8 +99,8 @@ def test_every_quantity_of_the_bench_may_be_set_from_the_start(tmp_path):
 
 
 @pytest.mark.parametrize("gain", [0.5, 3.0])
-def test_inertia_sets_the_time_of_a_start(tmp_path, gain):
-    """The torque is at its limit of 19.1 N m, and the drive, whose tables have another inertia, settles."""
+def test_settling_time_is_proportional_to_inertia(tmp_path, gain):
+    """The torque is at its limit of 19.1 N m, and the drive settles although its tables have another inertia."""
     reached_s = {}
     for inertia_gain in (1.0, gain):
         scenario = Scenario(name="start", duration_s=0.25, controller="paper", speed=(SpeedStep(0.0, 600.0),),
@@ -108,12 +108,12 @@ def test_inertia_sets_the_time_of_a_start(tmp_path, gain):
         recording = run_scenario(scenario, tmp_path / str(inertia_gain)).recording
         reached_s[inertia_gain] = recording["time_s"][np.argmax(recording["speed_rpm"] > 500.0)]
         assert recording["speed_rpm"][-1] == pytest.approx(600.0, abs=1.0)
-    command_s = 0.001  # until the drive is ready, of both
+    command_s = 0.001  # time until the drive is ready, in both runs
     assert (reached_s[gain] - command_s) / (reached_s[1.0] - command_s) == pytest.approx(gain, rel=0.03)
 
 
 @pytest.mark.parametrize("gain", [0.0, 1.0, 5.0])
-def test_friction_is_the_difference_of_steady_torque_and_load(tmp_path, gain):
+def test_friction_is_the_difference_between_steady_torque_and_load(tmp_path, gain):
     result = loaded(tmp_path, bench={"friction_gain": gain})
     speed_rad_s = float(result.recording["speed_rpm"].mean(dtype=float)) * math.pi / 30
     assert mean_torque_Nm(result) == pytest.approx(8.0 + gain * MACHINE.friction_Nm_s * speed_rad_s, abs=0.02)
@@ -121,9 +121,9 @@ def test_friction_is_the_difference_of_steady_torque_and_load(tmp_path, gain):
 
 @pytest.mark.parametrize("gain", [0.8, 1.0, 2.0])
 def test_copper_loss_is_in_proportion_to_resistance(tmp_path, gain):
-    figures = losses(loaded(tmp_path, bench={"resistance_gain": gain}).recording, MACHINE, WINDOW_S)
-    expected_W = 3 * gain * MACHINE.resistance_ohm * figures["phase_current_rms_A"] ** 2
-    assert figures["copper_W"] == pytest.approx(expected_W, rel=1e-3)
+    result = losses(loaded(tmp_path, bench={"resistance_gain": gain}).recording, MACHINE, WINDOW_S)
+    expected_W = 3 * gain * MACHINE.resistance_ohm * result["phase_current_rms_A"] ** 2
+    assert result["copper_W"] == pytest.approx(expected_W, rel=1e-3)
 
 
 @pytest.mark.parametrize("gain", [0.9, 1.1])
@@ -138,7 +138,7 @@ def test_torque_exceeds_the_estimate_of_the_drive_by_the_flux_linkage_gain(tmp_p
     assert error[gain] == pytest.approx(gain, abs=0.015)
 
 
-def test_encoder_offset_is_in_the_angle_that_the_drive_reports(make_bench):
+def test_encoder_offset_appears_in_the_angle_reported_by_the_drive(make_bench):
     bench = make_bench(controller="paper", encoder_bits=24)
     bench.rig.encoder_offset_deg = -0.5
     bench.rig.truth_period_us = 0
@@ -148,7 +148,7 @@ def test_encoder_offset_is_in_the_angle_that_the_drive_reports(make_bench):
 
 
 def test_minimum_pulse_suppresses_pulses(tmp_path):
-    """2 us of 25: the paper's controller has no duties between."""
+    """2 us of 25 us: the paper's controller has no duties in between."""
     ideal, coarse = (ripple(loaded(tmp_path, str(ns), bench={"minimum_pulse_ns": ns})) for ns in (0.0, 2000.0))
     assert 0.03 < ideal < 0.09
     assert 1.2 * ideal < coarse < 10 * ideal
@@ -158,7 +158,7 @@ def test_minimum_pulse_suppresses_pulses(tmp_path):
 
 
 @pytest.mark.parametrize("bits", [12, 14, 16])
-def test_converter_has_the_resolution_of_its_bits(make_bench, bits):
+def test_adc_has_the_resolution_of_its_bits(make_bench, bits):
     bench = make_bench(controller="paper", adc_bits=bits)
     bench.drive.speed_reference_rpm = 150
     bench.at(0.1).load_torque_Nm = 8
@@ -176,16 +176,16 @@ def test_converter_has_the_resolution_of_its_bits(make_bench, bits):
         index = np.searchsorted(truth_us, sampled_us[: len(measured_A)][chosen])
         worst_A.append(np.abs(measured_A[chosen] - truth.value[index]).max())
     half_code_A, half_lsb_A = 0.5 * 80 / 2**bits, 0.5 / 512
-    assert max(worst_A) <= half_code_A + 2 * half_lsb_A + 1e-9  # of the drive's format and of the truth's
+    assert max(worst_A) <= half_code_A + 2 * half_lsb_A + 1e-9  # LSB of the drive's format and of the true-state frames
     assert max(worst_A) > 0.6 * half_code_A
 
 
-def test_captured_edges_leave_the_counts_as_they_are(make_bench):
-    """Angles come from the counts, with captured edges or without."""
+def test_captured_edges_leave_the_counts_unchanged(make_bench):
+    """Angles follow from the counts, with or without captured edges."""
     angles = []
     for edges in (False, True):
         bench = make_bench(controller="paper", encoder_edges=edges)
-        bench.rig.load_torque_Nm = -1.0  # turns the shaft; the drive stays off
+        bench.rig.load_torque_Nm = -1.0  # rotates the shaft; the drive stays off
         bench.run_for(0.1)
         angles.append(bench.telemetry["DRIVE_MOTION.rotor_angle_deg"].value)
         assert angles[-1].max() > 10
@@ -193,13 +193,13 @@ def test_captured_edges_leave_the_counts_as_they_are(make_bench):
 
 
 def test_conditions_of_the_paper_remove_the_ripple_of_its_controllers(tmp_path):
-    """1 MHz, no delay, exact sensing: the remainder of 0.06 at 40 kHz, and of 0.8 with the hysteresis controller."""
+    """1 MHz, no delay, exact sensing; at 40 kHz the ripple is 0.06, and 0.8 with the hysteresis controller."""
     conditions = {"control_rate_hz": 1_000_000, "encoder_bits": 0, "adc_bits": 16, "immediate_pwm": True}
     assert 0.001 < ripple(loaded(tmp_path, "paper", **conditions)) < 0.01
     assert 0.05 < ripple(loaded(tmp_path, "traditional", controller="traditional", **conditions)) < 0.25
 
 
-def test_immediate_duties_lack_the_delay_of_a_period(tmp_path):
+def test_immediate_duties_avoid_the_delay_of_a_period(tmp_path):
     """The hysteresis controller overshoots its band by the change of torque in the delay."""
     base = {"controller": "traditional", "control_rate_hz": 100_000}
     delayed = ripple(loaded(tmp_path, "delayed", **base))
@@ -207,7 +207,7 @@ def test_immediate_duties_lack_the_delay_of_a_period(tmp_path):
     assert 0.1 < immediate < 0.8 * delayed < 1.0
 
 
-def test_equal_conditions_leave_equal_bytes(tmp_path):
+def test_equal_conditions_give_identical_files(tmp_path):
     settings = {"bench": {"current_noise_A": 0.02, "flux_linkage_gain": 1.03}, "encoder_edges": True, "adc_bits": 14}
     first = loaded(tmp_path, "first", **settings)
     second = loaded(tmp_path, "second", **settings)

@@ -1,5 +1,5 @@
-"""Imperfect sensors, in the closed loop and through CAN alone: what each does to what the drive measures, to the ADC's
-resolution, and that the drive starts and carries its load with it; and where it cannot know better."""
+"""Imperfect sensors in the closed loop, through CAN alone: the effect of each error on the measured values, to the
+resolution of the ADC; start and loaded run with each error; errors that the drive cannot detect."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from salient.paths import MACHINES
 
 pytestmark = pytest.mark.bench_options(controller="traditional")
 
-# Half a code of the ADC, and half a bit of the truth frames, A.
+# Half an LSB of the ADC, and half an LSB of the true-state frames, A.
 RESOLUTION_A = 0.5 * 80 / 4096 + 0.5 / 512
 
 ECCENTRICITY_DEG = 0.5
-# An angle error of e sin(theta) is one of the speed of e cos(theta) times the speed: what of the true speed is left for
-# a drive that holds the measured one.
+# An angle error of e sin(theta) is a relative speed error of e cos(theta): deviation of the true speed when the drive
+# holds the measured one.
 ECCENTRIC_SPEED_RPM = 150 * math.radians(ECCENTRICITY_DEG)
 
 SENSORS = """
@@ -35,10 +35,10 @@ encoder_eccentricity_deg = 0.5
 
 @dataclass(frozen=True)
 class Case:
-    """The rig's quantities; speed_error_rpm: how far the true speed may be off, besides the controller's own ripple.
-    parameters: what the drive is set to."""
+    """Rig variables; speed_error_rpm: tolerance of the true speed in addition to the controller's ripple; parameters of
+    the drive."""
 
-    quantities: dict[str, float]
+    variables: dict[str, float]
     speed_error_rpm: float = 0.0
     parameters: dict[str, float] = field(default_factory=dict)
 
@@ -52,11 +52,11 @@ CASES = {
     "eccentricity": Case({"encoder_eccentricity_deg": ECCENTRICITY_DEG}, ECCENTRIC_SPEED_RPM),
 }
 CASES["all"] = Case(
-    CASES["offset"].quantities
-    | CASES["gain"].quantities
-    | CASES["limit"].quantities
-    | CASES["delay"].quantities
-    | CASES["eccentricity"].quantities
+    CASES["offset"].variables
+    | CASES["gain"].variables
+    | CASES["limit"].variables
+    | CASES["delay"].variables
+    | CASES["eccentricity"].variables
     | {"current_noise_A": 0.03},
     CASES["eccentricity"].speed_error_rpm,
     CASES["limit"].parameters,
@@ -64,7 +64,7 @@ CASES["all"] = Case(
 
 
 def set_up(bench: Bench, case: Case) -> None:
-    for name, value in case.quantities.items():
+    for name, value in case.variables.items():
         setattr(bench.rig, name, value)
     for name, value in case.parameters.items():
         bench.drive.parameters[name] = value
@@ -78,7 +78,7 @@ def start_loaded(bench: Bench) -> None:
 
 
 def watch_closely(bench: Bench, duration_s: float) -> float:
-    """Runs with the truth of every microsecond, of which a sampling instant less a delay is one; when that began."""
+    """Runs with true-state frames every microsecond, to cover sampling instants less the delay; returns the start."""
     bench.rig.truth_period_us = 1
     start_s = bench.time_s
     bench.run_for(duration_s)
@@ -87,7 +87,7 @@ def watch_closely(bench: Bench, duration_s: float) -> float:
 
 
 def at_samples(bench: Bench, start_s: float, measured: str, true: str, delay_us: int = 0) -> tuple[np.ndarray, ...]:
-    """A signal as the drive measured it in each telemetry cycle since start_s, and its truth delay_us before that."""
+    """A signal as measured by the drive in each telemetry cycle since start_s, and its true value delay_us earlier."""
     sampled_us = bench.telemetry["DRIVE_STATUS.time_us"].value.astype(np.int64)
     values = bench.telemetry[measured].value
     sampled_us = sampled_us[: len(values)]
@@ -100,7 +100,7 @@ def at_samples(bench: Bench, start_s: float, measured: str, true: str, delay_us:
 
 
 def currents_A(bench: Bench, start_s: float, delay_us: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Of all phases one after the other: as measured, and true."""
+    """Measured and true currents, phases concatenated."""
     pairs = [at_samples(bench, start_s, f"DRIVE_CURRENTS.current_{phase}_A", f"RIG_TRUTH_CURRENTS.current_{phase}_A",
                         delay_us) for phase in "abc"]
     measured, true = (np.concatenate(columns) for columns in zip(*pairs, strict=True))
@@ -110,7 +110,7 @@ def currents_A(bench: Bench, start_s: float, delay_us: int = 0) -> tuple[np.ndar
 
 
 def angle_error_deg(bench: Bench, start_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Measured less true rotor angle within half a turn, and the true one."""
+    """Measured less true rotor angle, wrapped to half a revolution, and the true angle."""
     measured, true = at_samples(bench, start_s, "DRIVE_MOTION.rotor_angle_deg", "RIG_TRUTH_BENCH.rotor_angle_deg")
     return (measured - true + 180) % 360 - 180, true
 
@@ -121,10 +121,10 @@ def test_starts_and_holds_speed_under_load(make_bench, controller, name):
     case = CASES[name]
     bench = make_bench(controller=controller)
     set_up(bench, case)
-    bench.rig.truth_period_us = 25  # the currents between the switchings too
+    bench.rig.truth_period_us = 25  # also the currents between switching edges
     start_loaded(bench)
     settled_s = bench.time_s
-    bench.run_for(0.4)  # a whole turn
+    bench.run_for(0.4)  # a whole revolution
     assert (bench.drive.state, bench.drive.fault) == ("run", "none")
     speed_rpm = bench.truth["speed_rpm"].between(settled_s, bench.time_s).value
     bound_rpm = 0.6 + 1.1 * case.speed_error_rpm
@@ -135,21 +135,21 @@ def test_starts_and_holds_speed_under_load(make_bench, controller, name):
 
 
 @pytest.mark.bench_options(controller="paper")
-@pytest.mark.parametrize(("quantity", "value", "wrong"), [
+@pytest.mark.parametrize(("variable", "value", "wrong"), [
     ("current_sensor_offset_A", 0.5, lambda true_A: true_A + 0.5),
     ("current_sensor_offset_A", -0.5, lambda true_A: np.maximum(true_A - 0.5, 0.0)),
     ("current_sensor_gain", 1.05, lambda true_A: 1.05 * true_A),
     ("current_sensor_limit_A", 35.0, lambda true_A: np.minimum(true_A, 35.0)),
 ])  # fmt: skip
-def test_measured_currents_are_wrong_by_what_was_injected(bench, quantity, value, wrong):
+def test_measured_currents_have_the_injected_error(bench, variable, value, wrong):
     start_loaded(bench)
-    with pytest.raises(AttributeError, match=f"{quantity} is as the machine file has it"):
-        getattr(bench.rig, quantity)
+    with pytest.raises(AttributeError, match=f"{variable} is as the machine file has it"):
+        getattr(bench.rig, variable)
     before_s = watch_closely(bench, 0.03)
     measured_A, true_A = currents_A(bench, before_s)
     assert np.abs(measured_A - true_A).max() <= RESOLUTION_A
 
-    setattr(bench.rig, quantity, value)
+    setattr(bench.rig, variable, value)
     start_s = watch_closely(bench, 0.03)
     measured_A, true_A = currents_A(bench, start_s)
     assert np.abs(measured_A - wrong(true_A)).max() <= 1.05 * RESOLUTION_A
@@ -157,8 +157,8 @@ def test_measured_currents_are_wrong_by_what_was_injected(bench, quantity, value
 
 
 @pytest.mark.parametrize("delay_us", [1, 3, 8])
-def test_measured_currents_are_those_of_the_delay_before(bench, delay_us):
-    """By the traditional controller, which has 240 V on a phase for whole periods, also where they meet."""
+def test_measured_currents_lag_by_the_sensor_delay(bench, delay_us):
+    """With the traditional controller, which applies 240 V to a phase for whole periods."""
     start_loaded(bench)
     bench.rig.current_sensor_delay_us = delay_us
     start_s = watch_closely(bench, 0.03)
@@ -170,20 +170,20 @@ def test_measured_currents_are_those_of_the_delay_before(bench, delay_us):
 
 
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
-def test_eccentric_encoder_is_wrong_once_a_turn_and_the_speed_follows(make_bench, controller):
+def test_eccentric_encoder_errs_once_per_revolution_and_the_speed_follows(make_bench, controller):
     bench = make_bench(controller=controller)
     bench.rig.encoder_eccentricity_deg = ECCENTRICITY_DEG
     start_loaded(bench)
     bench.rig.truth_period_us = 25
     start_s = bench.time_s
-    bench.run_for(0.4)  # a whole turn
+    bench.run_for(0.4)  # a whole revolution
     error_deg, true_deg = angle_error_deg(bench, start_s)
     assert true_deg.max() - true_deg.min() > 355
     expected_deg = ECCENTRICITY_DEG * np.sin(np.radians(true_deg))
-    # Half a count of the encoder, and a bit of the telemetry.
+    # Half a count of the encoder, and an LSB of the telemetry.
     assert np.abs(error_deg - expected_deg).max() < 0.5 * 360 / 2**17 + 360 / 2**16
 
-    # What is held is the measured speed, omega (1 + e cos theta).
+    # The controller holds the measured speed, omega (1 + e cos theta).
     speed_rpm = bench.truth["RIG_TRUTH_MOTION.speed_rpm"].between(start_s + 1e-5, bench.time_s).value
     angle_rad = np.radians(bench.truth["rotor_angle_deg"].between(start_s + 1e-5, bench.time_s).value)
     cosine_rpm = 2 * np.mean((speed_rpm - speed_rpm.mean()) * np.cos(angle_rad))
@@ -193,8 +193,8 @@ def test_eccentric_encoder_is_wrong_once_a_turn_and_the_speed_follows(make_bench
 
 
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
-def test_sensor_that_saturates_below_the_current_limit_blinds_the_drive(make_bench, controller):
-    """Limit and trip are parameters of the drive (52 A, 75 A): a sensor that ends at 40 A shows neither."""
+def test_sensor_that_saturates_below_the_current_limit_hides_the_overcurrent(make_bench, controller):
+    """Limit and trip are parameters of the drive (52 A, 75 A): a sensor that saturates at 40 A reaches neither."""
     bench = make_bench(controller=controller)
     bench.rig.current_sensor_limit_A = 40.0
     bench.rig.truth_period_us = 25
@@ -208,7 +208,7 @@ def test_sensor_that_saturates_below_the_current_limit_blinds_the_drive(make_ben
 
 
 @pytest.mark.bench_options(controller="paper")
-def test_trip_below_the_sensors_limit_protects(bench):
+def test_trip_below_the_sensor_limit_protects(bench):
     bench.rig.current_sensor_limit_A = 40.0
     bench.drive.parameters["current_trip_A"] = 39.0
     bench.rig.truth_period_us = 25
@@ -216,10 +216,10 @@ def test_trip_below_the_sensors_limit_protects(bench):
     bench.run_for(0.02)
     assert (bench.drive.state, bench.drive.fault) == ("fault", "over_current")
     true_A = max(bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"].value.max() for phase in "abc")
-    assert 39 < true_A < 39 + 2 * 240 / 0.67e-3 * 25e-6  # what two periods add at the least inductance
+    assert 39 < true_A < 39 + 2 * 240 / 0.67e-3 * 25e-6  # rise of two periods at the minimum inductance
 
 
-def test_equal_runs_are_equal_with_every_error_on(make_bench):
+def test_equal_runs_are_identical_with_every_error_on(make_bench):
     logs = []
     for seed in (1, 1, 2):
         bench = make_bench(controller="paper", seed=seed)
@@ -231,7 +231,7 @@ def test_equal_runs_are_equal_with_every_error_on(make_bench):
 
 
 @pytest.mark.xdist_group("machine_builds")
-def test_machine_file_gives_the_errors_and_the_rig_takes_them_away(make_bench, tmp_path):
+def test_machine_file_sets_the_errors_and_the_rig_clears_them(make_bench, tmp_path):
     file = tmp_path / "poor_sensors.toml"
     text = (MACHINES / "saturating.toml").read_text().replace('name = "saturating"', 'name = "poor_sensors"')
     file.write_text(text + SENSORS)

@@ -1,4 +1,4 @@
-"""Noise of the current sensors: off unless asked for, and decided by the seed alone."""
+"""Noise of the current sensors: off by default, and determined by the seed alone."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 
 def currents_A(make_bench, seed: int, noise_A: float) -> np.ndarray:
-    """What the drive measures of its idle phases over 0.1 s, and then holds 150 r/min under load."""
+    """Measured currents of idle phases over 0.1 s, followed by 150 r/min under load."""
     bench = make_bench(controller="traditional", seed=seed)
     bench.rig.current_noise_A = noise_A
     bench.run_for(0.1)
@@ -21,15 +21,15 @@ def currents_A(make_bench, seed: int, noise_A: float) -> np.ndarray:
     return measured
 
 
-def test_noise_is_off_unless_asked_for(make_bench):
+def test_noise_is_off_by_default(make_bench):
     assert not currents_A(make_bench, seed=1, noise_A=0.0).any()
 
 
-def test_equal_seeds_give_equal_noise_and_others_another(make_bench):
+def test_noise_depends_on_the_seed_alone(make_bench):
     first, again, other = (currents_A(make_bench, seed, noise_A=0.04) for seed in (1, 1, 2))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
-    # The converter is unipolar: of a standard deviation of 2 LSB around 0 A the upper half is seen.
+    # The ADC is unipolar: of noise with a standard deviation of 2 LSB around 0 A only the upper half appears.
     for measured in (first, other):
         assert 0.008 < measured.mean() < 0.024
         assert 0.04 < measured.max() < 0.2

@@ -1,4 +1,4 @@
-"""The reader gives the same list of (time, frame) whether times come in records or in RIG_STAMP frames."""
+"""The reader returns the same list of (time, frame) with times from records and from RIG_STAMP frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TRUTH_ID = 0x1F000010
 
 
 class Interface:
-    """Stands in for a SocketCAN bus: gives the frames that it is made with."""
+    """Replaces a SocketCAN bus: returns the given frames."""
 
     def __init__(self, *frames: can.Message) -> None:
         self._frames = list(frames)
@@ -43,22 +43,22 @@ def read(*frames: can.Message) -> list[tuple[int, int, bytes]]:
     return result
 
 
-def test_frames_of_the_emulator_take_the_time_before_them():
+def test_frames_of_the_emulator_have_the_preceding_timestamp():
     assert read(stamp(10, NEXT), frame(0x180, 1), stamp(20, NEXT), frame(TRUTH_ID, 2, extended=True)) == [
         (10, 0x180, b"\1"),
         (20, TRUTH_ID, b"\2"),
     ]
 
 
-def test_frames_of_clients_come_when_they_completed():
-    """A command is on the interface before the time at which it completes on the emulated bus."""
+def test_frames_of_clients_arrive_at_their_completion():
+    """A command is on the interface before it completes on the emulated bus."""
     assert read(
         frame(0x80, 1), frame(0x600, 2), stamp(5, NEXT), frame(0x180, 3),
         stamp(7, OLDEST_ON_BUS), stamp(9, OLDEST_ON_BUS),
     ) == [(5, 0x180, b"\3"), (7, 0x80, b"\1"), (9, 0x600, b"\2")]
 
 
-def test_rig_frames_overtake_those_for_the_bus():
+def test_rig_frames_overtake_frames_for_the_emulated_bus():
     assert read(
         frame(0x80, 1), rig(RUN_UNTIL_ID, 100, 4), stamp(0, OLDEST_AT_ONCE), stamp(50, OLDEST_ON_BUS),
         rig(RIG_CLOCK_ID, 100, 4),
@@ -69,21 +69,21 @@ def test_rig_frames_overtake_those_for_the_bus():
     ]  # fmt: skip
 
 
-def test_flexible_data_rate_never_is_on_the_emulated_bus():
+def test_flexible_data_rate_frames_bypass_the_emulated_bus():
     assert read(frame(0x80, 1, is_fd=True), frame(0x80, 2), stamp(1, OLDEST_ON_BUS), stamp(2, OLDEST_AT_ONCE)) == [
         (1, 0x80, b"\2"),
         (2, 0x80, b"\1"),
     ]
 
 
-def test_client_between_a_stamp_and_its_frame():
+def test_client_frame_between_a_timestamp_and_its_frame_is_handled():
     assert read(stamp(10, NEXT), frame(0x80, 1), frame(0x180, 2), stamp(11, OLDEST_ON_BUS)) == [
         (10, 0x180, b"\2"),
         (11, 0x80, b"\1"),
     ]
 
 
-def test_stamps_of_frames_before_the_reader_came():
+def test_timestamps_of_frames_before_the_reader_connected_are_ignored():
     assert read(stamp(1, OLDEST_ON_BUS), stamp(2, OLDEST_AT_ONCE), frame(0x80, 1), stamp(3, OLDEST_ON_BUS)) == [
         (3, 0x80, b"\1")
     ]

@@ -1,9 +1,9 @@
-"""Many runs of many machines at once: the reference of plant_twin.py with one lane of NumPy arrays for each run.
+"""Vectorised reference: the model of reference_plant.py for many machines and runs, one lane of NumPy arrays per run.
 
 SciPy's DOP853 costs a Python call a stage; here its tableau and its error estimate (the attributes of the public class)
-step all lanes together, each at its own step length. As in plant_twin.py the state is flux linkages, speed and angle,
-formulas are written from their sources, and steps end at switch edges, where a flux linkage reaches zero and where the
-magnetics are not smooth. test_plant_properties.py compares some lanes with plant_twin.run_reference.
+step all lanes together, each at its own step length. As in reference_plant.py the state is flux linkages, speed
+and angle, formulas follow their sources, and steps end at switch edges, where a flux linkage reaches zero and where the
+magnetics are not smooth. test_plant_properties.py compares some lanes with reference_plant.run_reference.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from reference_plant import FORMS, PHASES_MAX, Machine, Reference, Run, Trace, pattern
 from scipy.integrate import DOP853
 
-TOLERANCE = 1e-12  # of a step, relative to the reach of the state
+TOLERANCE = 1e-12  # per step, relative to the magnitude of the state
 EVENT_TOLERANCE_S = 1e-16
 CORNER_TOLERANCE_RAD = 1e-9
 SPEED, ANGLE = PHASES_MAX, PHASES_MAX + 1  # columns of the state, after the flux linkages
@@ -23,7 +23,7 @@ Array = np.ndarray
 
 
 class Machines:
-    """Machine data of all lanes, a row each. The lanes are in the order of FORMS, so that each form is a slice."""
+    """Machine data of all lanes, one row per lane. The lanes are in the order of FORMS, so each form is a slice."""
 
     def __init__(self, machines: Sequence[Machine]) -> None:
         forms = [machine.magnetics.form for machine in machines]
@@ -52,9 +52,9 @@ class Machines:
 
     def shape(self, angle: Array) -> tuple[Array, Array]:
         """f and df/dtheta of all phases at rotor angles (lanes)."""
-        turn = angle[:, None] - self.offset
-        turn = turn - 2 * self.half_pitch * np.round(turn / (2 * self.half_pitch))
-        x, sign = np.abs(turn), np.sign(turn)
+        wrapped = angle[:, None] - self.offset
+        wrapped = wrapped - 2 * self.half_pitch * np.round(wrapped / (2 * self.half_pitch))
+        x, sign = np.abs(wrapped), np.sign(wrapped)
         f, slope = np.empty_like(x), np.empty_like(x)
 
         at = self.slices["linear_cosine"]
@@ -86,7 +86,7 @@ class Machines:
         return (1 - f) * self.lu * current + f * g
 
     def current(self, f: Array, flux: Array) -> Array:
-        """The inverse of flux(); Newton from the left of the root rises to it, for flux() is concave."""
+        """Inverse of flux(); Newton's method from the left converges monotonically, because flux() is concave."""
         current = flux / ((1 - f) * self.lu + f * self.la)
         knee = self.slices["saturating"]
         i, target, f = current[knee], flux[knee], f[knee]
@@ -100,7 +100,7 @@ class Machines:
         return current
 
     def torque(self, slope: Array, current: Array) -> Array:
-        """Sum over the phases of the angle's derivative of the co-energy."""
+        """Sum over the phases of the derivative of the co-energy by the angle."""
         energy = (self.la - self.lu) * current**2 / 2
         knee = self.slices["saturating"]
         i = current[knee]
@@ -108,16 +108,16 @@ class Machines:
         return np.sum(slope * energy, axis=1)
 
     def smooth_range(self, angle: Array) -> tuple[Array, Array]:
-        """The nearest rotor angles backwards and forwards at which f of some phase is not smooth."""
+        """The nearest smaller and larger rotor angles at which f of some phase is not smooth."""
         pitch = 2 * self.half_pitch
-        ahead, behind = (self.corners - angle[:, None]) % pitch, (angle[:, None] - self.corners) % pitch
-        ahead[~(ahead > CORNER_TOLERANCE_RAD)] = np.inf
-        behind[~(behind > CORNER_TOLERANCE_RAD)] = np.inf
-        return angle - behind.min(axis=1), angle + ahead.min(axis=1)
+        following, previous = (self.corners - angle[:, None]) % pitch, (angle[:, None] - self.corners) % pitch
+        following[~(following > CORNER_TOLERANCE_RAD)] = np.inf
+        previous[~(previous > CORNER_TOLERANCE_RAD)] = np.inf
+        return angle - previous.min(axis=1), angle + following.min(axis=1)
 
 
 class Schedule:
-    """What the converter applies in each lane: pieces of constant voltage, each of whole nanoseconds."""
+    """Converter voltages of each lane: pieces of constant voltage of whole nanoseconds."""
 
     def __init__(self, machines: Sequence[Machine], runs: Sequence[Run]) -> None:
         lanes = []
@@ -132,7 +132,7 @@ class Schedule:
         longest = max(map(len, lanes))
         self.count = np.array([len(pieces) for pieces in lanes])
         self.length_s = np.zeros((len(lanes), longest))
-        self.period_end = np.zeros((len(lanes), longest), dtype=int)  # number of the period that ends here, 0: none
+        self.period_end = np.zeros((len(lanes), longest), dtype=int)  # period that ends here; 0: none
         self.volts = np.zeros((len(lanes), longest, PHASES_MAX))
         for lane, pieces in enumerate(lanes):
             for index, (length_ns, ends, volts) in enumerate(pieces):
@@ -142,8 +142,7 @@ class Schedule:
 
 
 def run_lanes(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
-    """The state at the start of each period and at the end, for runs of equally many periods; the machines sorted by
-    their form."""
+    """States at the start of each period and at the end, for runs of equal length; machines sorted by form."""
     lanes = len(runs)
     everything = np.arange(lanes)
     model, schedule = Machines(machines), Schedule(machines, runs)
@@ -171,10 +170,10 @@ def run_lanes(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
         result[:, ANGLE] = y[:, SPEED]
         return result
 
-    at = np.zeros(lanes, dtype=int)  # piece
-    passed_s = np.zeros(lanes)  # of the piece
-    longest_s = np.full(lanes, 1e-6)  # that the error allows
-    # The search of an event within a step: its bracket, the distances from the event there, and the last trial.
+    at = np.zeros(lanes, dtype=int)  # index of the piece
+    passed_s = np.zeros(lanes)  # elapsed time of the piece
+    longest_s = np.full(lanes, 1e-6)  # step length that the error allows
+    # Search for an event within a step: bracket, distances from the event at its ends, last trial.
     searching = np.zeros(lanes, dtype=bool)
     low_s, high_s, low, high, last_s = (np.zeros(lanes) for _ in range(5))
     side = np.zeros(lanes, dtype=int)
@@ -186,7 +185,7 @@ def run_lanes(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
         volts = schedule.volts[everything, piece]
         conducts = model.present & ((volts > 0) | (y[:, :PHASES_MAX] > 0))
         falls = conducts & (volts < 0)
-        behind, ahead = model.smooth_range(y[:, ANGLE])
+        previous, following = model.smooth_range(y[:, ANGLE])
         left_s = schedule.length_s[everything, piece] - passed_s
         with np.errstate(invalid="ignore", divide="ignore"):
             trial_s = low_s + (high_s - low_s) * low / (low - high)
@@ -208,11 +207,11 @@ def run_lanes(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
         error = np.divide(h * fifth, scale, out=np.zeros(lanes), where=scale > 0) / TOLERANCE
         advice_s = h * np.clip(0.9 * np.maximum(error, 1e-12) ** -0.125, 0.2, 5.0)
 
-        # Distance from the nearest event, in rad and in 1e-6 V s per V: negative when a step goes beyond.
+        # Distance from the nearest event, in rad and in 1e-6 V s per V: negative when a step goes past it.
         fluxes = np.where(falls, end[:, :PHASES_MAX], np.inf).min(axis=1) / (1e-6 * supply)
-        distance = np.minimum(fluxes, np.minimum(ahead - end[:, ANGLE], end[:, ANGLE] - behind))
+        distance = np.minimum(fluxes, np.minimum(following - end[:, ANGLE], end[:, ANGLE] - previous))
         distance_start = np.where(falls, y[:, :PHASES_MAX], np.inf).min(axis=1) / (1e-6 * supply)
-        distance_start = np.minimum(distance_start, np.minimum(ahead - y[:, ANGLE], y[:, ANGLE] - behind))
+        distance_start = np.minimum(distance_start, np.minimum(following - y[:, ANGLE], y[:, ANGLE] - previous))
         beyond = distance < 0
         found = searching & ((np.abs(h - last_s) < EVENT_TOLERANCE_S) | (distance == 0))
         good = running & (error <= 1) & (found | ~(searching | beyond))
@@ -222,7 +221,7 @@ def run_lanes(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
 
         longest_s = np.where(good & ~found, np.maximum(advice_s, 1e-9), longest_s)
         longest_s = np.where(failed, np.minimum(advice_s, 0.5 * h), longest_s)
-        # Illinois: an end of the bracket that stays twice counts half.
+        # Illinois method: the value at an end of the bracket that is retained twice is halved.
         up = goes_on & (distance > 0)
         down = goes_on & ~up
         high = np.where(up & (side > 0), 0.5 * high, high)

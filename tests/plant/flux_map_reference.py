@@ -1,5 +1,5 @@
-"""The reference of plant_twin.py for a machine with a map: SciPy evaluates the B-splines, and the current is found by
-inverting the flux linkage."""
+"""The model of reference_plant.py for a machine with a map: SciPy evaluates the B-splines, and the current follows from
+the inverse of the flux linkage."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS, FluxMap
 
 
 class MapReference(Reference):
-    """What `Reference` calls the shape is the angle here, with the side of the aligned position that it is on."""
+    """The shape of `Reference` is here the angle and the side of the aligned position."""
 
     def __init__(self, machine: Machine, flux_map: FluxMap) -> None:
         self.machine = machine
@@ -20,30 +20,30 @@ class MapReference(Reference):
         self.half_pitch = math.pi / machine.rotor_poles
         self.phase_offset = 2 * self.half_pitch / machine.phases
         self.corners = []
-        self.greatest = flux_map.current_max_A
-        step_A, step_rad = self.greatest / CURRENT_INTERVALS, self.half_pitch / ANGLE_INTERVALS
+        self.current_max_A = flux_map.current_max_A
+        step_A, step_rad = self.current_max_A / CURRENT_INTERVALS, self.half_pitch / ANGLE_INTERVALS
         knots_A = [step_A * n for n in range(-4, CURRENT_INTERVALS + 5)]
         knots_rad = [step_rad * n for n in range(-3, ANGLE_INTERVALS + 4)]
         self.spline = NdBSpline((knots_A, knots_rad), flux_map.coefficients_J, k=(4, 3))
 
     def shape(self, angle: float) -> tuple[float, tuple[float, float]]:
-        turn = math.remainder(angle, 2 * self.half_pitch)
-        x = min(abs(turn), self.half_pitch)
-        return x, (x, math.copysign(1.0, turn))
+        wrapped = math.remainder(angle, 2 * self.half_pitch)
+        x = min(abs(wrapped), self.half_pitch)
+        return x, (x, math.copysign(1.0, wrapped))
 
     def energy(self, x: float, current: float, by_current: int, by_angle: int) -> float:
         return float(self.spline((current, x), nu=(by_current, by_angle)))
 
     def flux(self, x: float, current: float) -> float:
-        within = min(current, self.greatest)
+        within = min(current, self.current_max_A)
         straight = (current - within) * self.energy(x, within, 2, 0) if current > within else 0.0
         return self.energy(x, within, 1, 0) + straight
 
     def current(self, x: float, flux: float) -> float:
-        """Newton with the secant through 0 to begin with; psi rises with the current."""
+        """Newton's method, started on the secant through 0; psi rises with the current."""
         current = flux / self.energy(x, 0.0, 2, 0)
         for _ in range(60):
-            step = (flux - self.flux(x, current)) / self.energy(x, min(current, self.greatest), 2, 0)
+            step = (flux - self.flux(x, current)) / self.energy(x, min(current, self.current_max_A), 2, 0)
             current += step
             if abs(step) <= 1e-13 * (1 + abs(current)):
                 return current
@@ -51,7 +51,7 @@ class MapReference(Reference):
 
     def torque(self, slope: tuple[float, float], current: float) -> float:
         x, side = slope
-        within = min(current, self.greatest)
+        within = min(current, self.current_max_A)
         beyond = current - within
         torque = self.energy(x, within, 0, 1)
         if beyond > 0:

@@ -161,7 +161,7 @@ def load_library() -> ctypes.CDLL:
 
 
 def flux_map_of(model: salient.machine.flux_map.FluxMap) -> FluxMap:
-    """What the build generates from a machine file with a map."""
+    """The map structure that the build generates from a machine file."""
     least_inductance_H, _, _, current_scale_A = model.inductance_extremes()
     flux_map = FluxMap(model.current_max_A, least_inductance_H, current_scale_A)
     for row, coefficients_J in zip(flux_map.coenergy_J, model.coefficients_J.tolist(), strict=True):
@@ -170,13 +170,13 @@ def flux_map_of(model: salient.machine.flux_map.FluxMap) -> FluxMap:
 
 
 def machine_from(file: salient.machine.file.Machine) -> Machine:
-    """The plant's machine of a machine file, as the build generates it."""
+    """The plant's machine structure for a machine file, as the build generates it."""
     magnetics = file.magnetics
     if isinstance(magnetics, salient.machine.flux_map.FluxMap):
-        twin = Magnetics(form=MAP, map=ctypes.pointer(flux_map_of(magnetics)))
-        twin.unaligned_inductance_H = magnetics.unaligned_inductance_H
+        model = Magnetics(form=MAP, map=ctypes.pointer(flux_map_of(magnetics)))
+        model.unaligned_inductance_H = magnetics.unaligned_inductance_H
     else:
-        twin = Magnetics(form=FORMS.index(magnetics.form), **magnetics.parameters)
+        model = Magnetics(form=FORMS.index(magnetics.form), **magnetics.parameters)
     return Machine(
         name=file.name.encode(),
         stator_poles=file.stator_poles,
@@ -186,24 +186,24 @@ def machine_from(file: salient.machine.file.Machine) -> Machine:
         inertia_kg_m2=file.inertia_kg_m2,
         friction_Nm_s=file.friction_Nm_s,
         supply_voltage_V=file.supply_voltage_V,
-        magnetics=twin,
+        magnetics=model,
         converter=Converter(**file.converter),
         dc_link=DcLink(**(file.dc_link or {})),
         sensors=SensorErrors(**file.sensors),
     )
 
 
-# --- What is run ---
+# --- Runs ---
 
 
-Compares = tuple[Sequence[int], Sequence[int]]  # (upper, lower), a value for each phase
+Compares = tuple[Sequence[int], Sequence[int]]  # (upper, lower), one value per phase
 Trace = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Run:
-    """Compare values per control period of 2 * `period_ticks` timer ticks, and the state in which the machine starts
-    (currents of all phases; none given: 0 A)."""
+    """Compare values per control period of 2 * `period_ticks` timer ticks, and the initial state of the machine
+    (currents of all phases, default 0 A)."""
 
     period_ticks: int
     compares: Sequence[Compares]
@@ -253,8 +253,7 @@ def set_switches(library: ctypes.CDLL, plant: int, compares: Compares, period_ti
 def run_plant(
     library: ctypes.CDLL, machine: Machine, run: Run, factor: float = 1.0, sample_ns: int = 0
 ) -> tuple[Trace, State]:
-    """The plant's states at the start of each period and at the end, or with sample_ns its observed samples; and the
-    state in which it ends."""
+    """States at the start of each period and at the end, or with sample_ns observed samples; and the final state."""
     state = State()
     states: list[tuple[float, ...]] = []
 
@@ -284,7 +283,7 @@ def run_plant(
 
 
 class Reference:
-    """Flux linkages, speed and angle of the machine; formulas written anew from their sources."""
+    """Flux linkages, speed and angle of the machine; formulas written independently from their sources."""
 
     def __init__(self, machine: Machine) -> None:
         magnetics = machine.magnetics
@@ -316,16 +315,16 @@ class Reference:
         )
 
     def next_corner(self, angle: float, direction: int) -> float:
-        """The next rotor angle in a direction (1 or -1) at which f of some phase is not smooth: DOP853 is not to step
-        over it. Infinite for the cosine."""
+        """The next rotor angle in a direction (1 or -1) at which f of some phase is not smooth: DOP853 must not
+        step over it. Infinite for the cosine."""
         pitch = 2 * self.half_pitch
         ahead = [direction * (corner - angle) % pitch for corner in self.corners]
         return angle + direction * min((distance for distance in ahead if distance > 1e-9), default=math.inf)
 
     def shape(self, angle: float) -> tuple[float, float]:
         """f and df/dtheta; f is even and periodic, so half a pitch is enough."""
-        turn = math.remainder(angle, 2 * self.half_pitch)
-        x, sign = abs(turn), math.copysign(1.0, turn)
+        wrapped = math.remainder(angle, 2 * self.half_pitch)
+        x, sign = abs(wrapped), math.copysign(1.0, wrapped)
         if self.form == "linear_cosine":
             k = math.pi / self.half_pitch
             return math.cos(k * x / 2) ** 2, -sign * k / 2 * math.sin(k * x)
@@ -349,7 +348,7 @@ class Reference:
         return (1 - f) * self.lu * current + f * g
 
     def current(self, f: float, flux: float) -> float:
-        """The inverse of flux(); Newton from the left of the root rises to it, for flux() is concave."""
+        """Inverse of flux(); Newton's method from the left converges monotonically, because flux() is concave."""
         current = flux / ((1 - f) * self.lu + f * self.la)
         if self.form != "saturating":
             return current
@@ -362,7 +361,7 @@ class Reference:
         return current
 
     def torque(self, slope: float, current: float) -> float:
-        """The angle's derivative of the co-energy, the integral of flux() over the current."""
+        """Derivative by the angle of the co-energy, the integral of flux() over the current."""
         if self.form != "saturating":
             return slope * (self.la - self.lu) * current**2 / 2
         knee = self.a * (current + math.expm1(-self.b * current) / self.b)
@@ -408,7 +407,7 @@ def pattern(run: Run, upper: Sequence[int], lower: Sequence[int]) -> Iterator[tu
         instants |= {min(value, ticks), 2 * ticks - min(value, ticks)}
     ordered = sorted(instants)
     for start, end in itertools.pairwise(ordered):
-        carrier = abs((start + end) / 2 - ticks)  # of the uppers: its valley is the middle of the period
+        carrier = abs((start + end) / 2 - ticks)  # of the upper switches: valley in the middle of the period
         on = [(carrier < up) + (ticks - carrier < low) for up, low in zip(upper, lower, strict=True)]
         yield start * TICK_NS, end * TICK_NS, on
 
@@ -469,7 +468,7 @@ def run_reference(
                 solution = solve(t_span=(at_s, until_s), events=corners + falling)
                 event_times = solution.t_events[len(corners) :]
                 if any(len(times) for times in solution.t_events[: len(corners)]):
-                    # The step that found the corner has looked beyond it: again, up to the corner.
+                    # The step that found the corner used values past it: repeated, up to the corner.
                     solution = solve(t_span=(at_s, solution.t[-1]), events=falling or None)
                     event_times = solution.t_events or []
                 assert solution.success, solution.message

@@ -1,7 +1,7 @@
-"""Devices that drop voltage, and a DC link that regeneration pumps up: the plant against an independent integration.
+"""Device drops and a DC link charged by regeneration: the plant compared with an independent integration.
 
-The reference has plant_twin.py's magnetics in flux linkages; SciPy's DOP853 integrates them with speed, angle and bus
-voltage from event to event: a flux linkage that reaches zero, the supply's rectifier, the chopper's comparator.
+The reference has the magnetics of reference_plant.py; SciPy's DOP853 integrates flux linkages, speed, angle and
+DC-link voltage from event to event: a flux linkage that reaches zero, the supply's rectifier, the chopper's comparator.
 Measured on x86-64 with gcc 12: at most 1.5e-7 of the largest magnitude.
 """
 
@@ -58,8 +58,7 @@ def law(period: int, angle_deg: float, currents_A: list[float], rising: list[boo
 
 
 def run_plant(library: ctypes.CDLL, machine: Machine) -> tuple[Run, np.ndarray, State]:
-    """The run as the plant lived it, with its pattern; rows: speed, angle, bus voltage, currents at each period's
-    start."""
+    """Run of the plant, with its pattern; rows: speed, angle, DC-link voltage, currents at each period's start."""
     compares: list[Compares] = []
     run = Run(FULL, compares, speed_rad_s=60.0, angle_deg=50.0, load_torque_Nm=3.0)
     rows, rising, state = [], [True] * PHASES, State()
@@ -79,7 +78,7 @@ def run_plant(library: ctypes.CDLL, machine: Machine) -> tuple[Run, np.ndarray, 
 
 
 class LinkReference:
-    """State: flux linkages, speed, angle, bus voltage."""
+    """State: flux linkages, speed, angle, DC-link voltage."""
 
     def __init__(self, machine: Machine, run: Run) -> None:
         self.magnetics, self.machine, self.run = Reference(machine), machine, run
@@ -158,7 +157,7 @@ def library() -> ctypes.CDLL:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_motoring_and_braking_on_a_link_agree(library: ctypes.CDLL, form: str) -> None:
+def test_motoring_and_braking_on_a_dc_link_agree(library: ctypes.CDLL, form: str) -> None:
     machine = drive_with_link(form)
     run, measured, state = run_plant(library, machine)
     reference = LinkReference(machine, run)
@@ -167,18 +166,18 @@ def test_motoring_and_braking_on_a_link_agree(library: ctypes.CDLL, form: str) -
         for start_ns, end_ns, on in pattern(run, upper, lower):
             reference.advance(on, (end_ns - start_ns) * 1e-9)
         expected.append(reference.row())
-    wanted = np.array(expected)
+    expected_rows = np.array(expected)
 
-    # Enough happened: the link sagged and was pumped up, the chopper worked, the supply rested meanwhile.
-    bus_V = wanted[:, 2]
+    # The run covers a sagging and a charged DC link, an active chopper, and a blocking supply.
+    bus_V = expected_rows[:, 2]
     assert np.min(bus_V) < 238.0 and np.max(bus_V) > 255.0
     assert reference.chopped_s > 1e-4
     assert 0.001 < reference.sourced_s < PERIODS * run.period_ns * 1e-9 - 0.001
     assert state.energy_returned_J > state.energy_chopper_J > 0.1
 
-    reach = np.max(np.abs(wanted), axis=0)
-    reach[0] = np.ptp(wanted[:, 0])
-    reach[2] = np.ptp(bus_V)
-    reach[3:] = np.max(reach[3:])
-    worst = np.max(np.abs(measured - wanted), axis=0) / reach
+    magnitude = np.max(np.abs(expected_rows), axis=0)
+    magnitude[0] = np.ptp(expected_rows[:, 0])
+    magnitude[2] = np.ptp(bus_V)
+    magnitude[3:] = np.max(magnitude[3:])
+    worst = np.max(np.abs(measured - expected_rows), axis=0) / magnitude
     assert np.max(worst) < BOUND, worst

@@ -1,5 +1,5 @@
-"""The flux-linkage map that is computed here: the committed one is what its generator makes, and the finite elements
-behind it agree with finer ones, with Maxwell's stress, with an air gap on paper and with the machine's symmetries."""
+"""The bundled finite-element map: the committed file is the output of its generator, and the finite elements agree with
+finer meshes, with Maxwell's stress tensor, with an analytic air gap and with the symmetries of the machine."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def solved(angle_deg: float, current_A: float, refinement: int = 1) -> tuple[flo
 
 @cache
 def table() -> np.ndarray:
-    """Flux linkage in Wb, a row an angle."""
+    """Flux linkage in Wb, one row per angle."""
     rows = np.loadtxt(MACHINES / "finite_element.csv", delimiter=",", skiprows=5)
     angles_deg = ANGLE_STEP_DEG * np.arange(len(rows) // len(CURRENTS_A))
     assert np.array_equal(rows[:, 0], np.repeat(angles_deg, len(CURRENTS_A)))
@@ -52,12 +52,12 @@ def table() -> np.ndarray:
 @pytest.mark.parametrize(
     ("angle_deg", "current_A"), [(0, 1), (0, 80), (6.5, 20), (13, 40), (20.5, 10), (21, 80), (27.5, 32), (30, 6)]
 )
-def test_points_of_the_committed_map_are_computed_again_to_their_last_digit(angle_deg, current_A):
+def test_recomputed_points_equal_the_committed_map_to_the_last_digit(angle_deg, current_A):
     committed_Wb = table()[round(angle_deg / ANGLE_STEP_DEG), CURRENTS_A.index(current_A)]
     assert solved(angle_deg, current_A)[0] == pytest.approx(committed_Wb, rel=5.1e-6)
 
 
-def test_the_machine_file_is_what_follows_from_the_geometry():
+def test_machine_file_follows_from_the_geometry():
     data = tomllib.loads((MACHINES / "finite_element.toml").read_text())
     assert (data["poles"]["stator"], data["poles"]["rotor"]) == (GEOMETRY.stator_poles, GEOMETRY.rotor_poles)
     stated = data["winding"] | data["mechanics"] | data["iron_loss"]
@@ -76,15 +76,15 @@ def test_flux_linkage_rises_with_the_current_and_falls_with_the_angle_everywhere
     # Measured: 0.0027, 0.0036; where the corners of the poles meet, 0.016.
     [(0, 20, (0.001, 0.004)), (30, 20, (0.002, 0.006)), (20, 5, (0.01, 0.025))],
 )
-def test_half_the_mesh_changes_the_flux_linkage_by_less_than_a_percent_but_at_the_corners(angle_deg, current_A, rise):
+def test_half_the_mesh_size_changes_flux_linkage_by_less_than_a_percent_except_at_corners(angle_deg, current_A, rise):
     finer_Wb = solved(angle_deg, current_A, refinement=2)[0]
     assert rise[0] < finer_Wb / solved(angle_deg, current_A)[0] - 1.0 < rise[1]
 
 
-# Measured: within 0.7 %. Where the corners of the poles meet, at 21 deg, the map's steps blunt the torque's: 4 %.
+# Measured: within 0.7 %. Where the corners of the poles meet, at 21 deg, the grid of the map smooths the torque: 4 %.
 @pytest.mark.parametrize("angle_deg", [2.5, 10.0, 19.0, 25.0])
 @pytest.mark.parametrize("current_A", [20, 40, 80])
-def test_torque_of_the_maps_coenergy_is_that_of_maxwells_stress(angle_deg, current_A):
+def test_torque_of_the_co_energy_is_that_of_maxwells_stress_tensor(angle_deg, current_A):
     magnetics = load_machine(MACHINES / "finite_element.toml").magnetics
     stress_Nm = solved(angle_deg, current_A)[1]
     assert stress_Nm < -0.5
@@ -96,8 +96,8 @@ def test_ideal_iron_has_the_inductance_of_the_air_gap_and_its_fringing(gap_mm):
     geometry = replace(GEOMETRY, gap=gap_mm)
     (flux_Wb, _), (double_Wb, _) = solutions(Machine(geometry, steel=IdealIron()), 0.0, [1.0, 2.0])
     assert double_Wb == pytest.approx(2.0 * flux_Wb, rel=1e-9)
-    # Field lines from the sides of the pole in quarters of circles, as if the rotor went on for 2 mm or for 10 mm: for
-    # each side mu_0 times the integral of dx / (gap + pi x / 2).
+    # Fringing field lines from the sides of the pole as quarter circles, with 2 mm or 10 mm of rotor: for each side
+    # mu_0 times the integral of dx / (gap + pi x / 2).
     fringing = [
         4.0 / np.pi * gap_mm * np.log1p(np.pi * height_mm / (2.0 * gap_mm)) / geometry.stator_pole_width
         for height_mm in (2.0, 10.0)
@@ -106,7 +106,7 @@ def test_ideal_iron_has_the_inductance_of_the_air_gap_and_its_fringing(gap_mm):
     assert fringing[0] < flux_Wb / gap_inductance_H(geometry) - 1.0 < fringing[1]
 
 
-def test_the_field_has_the_symmetries_of_the_machine():
+def test_field_has_the_symmetries_of_the_machine():
     flux_Wb, torque_Nm = solved(12.0, 30.0)
     for angle_deg, sign in ((-12.0, -1.0), (60.0 - 12.0, -1.0), (60.0 + 12.0, 1.0), (180.0 + 12.0, 1.0)):
         same_Wb, same_Nm = solved(angle_deg, 30.0)
@@ -117,7 +117,7 @@ def test_the_field_has_the_symmetries_of_the_machine():
         assert abs(solved(angle_deg, 30.0)[1]) < 1e-7
 
 
-def test_the_map_is_no_product_of_a_function_of_the_angle_and_one_of_the_current():
+def test_map_is_not_separable_in_angle_and_current():
     def second_to_first(flux_Wb):
         # Without the unaligned flux linkage, which the formulas add to their product.
         singular = np.linalg.svd(flux_Wb - flux_Wb[-1], compute_uv=False)
@@ -129,26 +129,26 @@ def test_the_map_is_no_product_of_a_function_of_the_angle_and_one_of_the_current
     assert 0.035 < second_to_first(table()) < 0.07  # measured: 0.049
 
 
-def test_the_slope_over_the_angle_has_no_noise_of_the_mesh():
+def test_slope_over_the_angle_is_free_of_mesh_noise():
     slope = np.diff(table(), axis=0)
-    # What a cubic through seven neighbours does not explain, away from where the poles' corners meet and part.
+    # Residual of a cubic through seven neighbours, away from the angles at which pole corners meet.
     rest = np.abs(slope - savgol_filter(slope, 7, 3, axis=0))[[*range(8, 36), *range(50, 57)]]
     noise = np.max(rest, axis=0) / np.max(np.abs(slope), axis=0)
     assert 1e-6 < np.max(noise) < 0.004  # measured: 0.0023
 
 
-def test_reluctivity_is_that_of_the_curve_and_its_slope_the_derivative():
+def test_reluctivity_matches_the_curve_and_its_slope_is_the_derivative():
     steel = steel_data.Laminations(1.0)
     assert steel.reluctivity(np.array([1.0, 2.25]))[0] == pytest.approx([106.201, 1108.33 / 1.5])
     square_T2 = np.linspace(0.01, 6.0, 200) + 1e-4
     nu, slope = steel.reluctivity(square_T2)
-    ahead, behind = (steel.reluctivity(square_T2 + step)[0] for step in (1e-6, -1e-6))
-    assert slope == pytest.approx((ahead - behind) / 2e-6, rel=1e-3, abs=1e-3)
-    # Of sheets and varnish the sheets carry the flux until they are saturated.
+    right, left = (steel.reluctivity(square_T2 + step)[0] for step in (1e-6, -1e-6))
+    assert slope == pytest.approx((right - left) / 2e-6, rel=1e-3, abs=1e-3)
+    # In the lamination stack the steel carries the flux until it saturates.
     assert steel_data.Laminations(0.9).reluctivity(np.array([0.81]))[0] == pytest.approx(106.201 / 0.9, rel=1e-4)
 
 
-def test_the_steinmetz_formula_is_near_the_loss_it_stands_for():
+def test_steinmetz_formula_approximates_the_measured_loss():
     k, alpha, beta = steel_data.steinmetz()
     frequency_Hz, flux_density_T = np.meshgrid([50.0, 100.0, 400.0, 1000.0, 2000.0], [0.2, 0.5, 1.0, 1.6])
     ratio = k * frequency_Hz**alpha * flux_density_T**beta
@@ -158,7 +158,7 @@ def test_the_steinmetz_formula_is_near_the_loss_it_stands_for():
 
 
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
-def test_the_drive_with_its_own_limits_catches_a_load_step_on_this_machine(make_bench, controller):
+def test_drive_with_default_limits_compensates_a_load_step_on_this_machine(make_bench, controller):
     bench = make_bench(machine="finite_element", controller=controller)
     bench.drive.speed_reference_rpm = 150
     bench.at(0.13).load_torque_Nm = 8

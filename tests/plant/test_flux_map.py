@@ -1,9 +1,9 @@
 """Machines by a flux-linkage map: from the CSV file to the emulator.
 
-Maps are sampled from the shipped formulas, so that what the model makes of them can be measured. Of the saturating
-machine to 100 A, 20 x 20 points, relative to the greatest value there (regular grid; irregular grid): flux linkage
+Maps are sampled from the bundled formulas, so that the error of the model can be measured. Saturating machine to
+100 A, 20 x 20 points, relative to the maximum value (regular grid; irregular grid): flux linkage
 1.3e-4; 8.2e-5, torque 5.3e-6; 2.6e-4. The plant with such a map against SciPy's DOP853: at most 9e-7 of the range;
-energy ledger while chopping: 5e-8 of the energy drawn.
+energy balance while chopping: 5e-8 of the energy drawn.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flux_map_files import (
-    GREATEST_A,
+    CURRENT_MAX_A,
     HALF_DEG,
     REGULAR_A,
     REGULAR_DEG,
@@ -56,7 +56,7 @@ def sampled(request, tmp_path_factory) -> tuple[str, FluxMap]:
 
 
 def worst(flux_map: FluxMap, name: str, up_to_A: float) -> tuple[float, float]:
-    """Largest deviation of flux linkage and of torque from a formula, by the formula's greatest values."""
+    """Largest deviation of flux linkage and of torque from a formula, relative to the maximum values of the formula."""
     angle_rad = np.radians(np.linspace(0.0, 2.0 * HALF_DEG, 721))[:, None]
     current_A = np.linspace(0.0, up_to_A, 301)
     deviations = []
@@ -67,33 +67,33 @@ def worst(flux_map: FluxMap, name: str, up_to_A: float) -> tuple[float, float]:
     return deviations[0], deviations[1]
 
 
-def test_a_map_of_the_saturating_formula_is_the_formula(sampled):
+def test_map_of_the_saturating_formula_reproduces_the_formula(sampled):
     grid, flux_map = sampled
-    flux, torque = worst(flux_map, "saturating", GREATEST_A)
-    print(f"{grid}: flux linkage {flux:.2g}, torque {torque:.2g} of the greatest")
+    flux, torque = worst(flux_map, "saturating", CURRENT_MAX_A)
+    print(f"{grid}: flux linkage {flux:.2g}, torque {torque:.2g} of the maximum")
     flux_bound, torque_bound = {"regular": (2e-4, 1e-5), "irregular": (2e-4, 5e-4)}[grid]
     assert 1e-6 < flux < flux_bound
     assert 1e-7 < torque < torque_bound
     assert flux_map.unaligned_inductance_H == pytest.approx(formula("saturating").unaligned_inductance_H, rel=1e-5)
-    # Nothing is extrapolated before this current: every angle reaches it.
+    # Every angle has points up to this current, so nothing is extrapolated below it.
     reached_A = np.broadcast_to(GRIDS[grid][1], (20, 20))[:, -1]
     assert flux_map.current_max_A == pytest.approx(min(reached_A), rel=1e-9)
 
 
-def test_finer_maps_come_nearer_to_the_formula(tmp_path):
+def test_finer_maps_converge_to_the_formula(tmp_path):
     deviations = []
     for count in (10, 20, 40):
         angles_deg = np.linspace(0.0, HALF_DEG, count + 1)
-        currents_A = np.linspace(GREATEST_A / count, GREATEST_A, count)
+        currents_A = np.linspace(CURRENT_MAX_A / count, CURRENT_MAX_A, count)
         flux_map = load(tmp_path, csv_text(rows(formula("linear_cosine"), angles_deg, currents_A)))
-        deviations.append(worst(flux_map, "linear_cosine", GREATEST_A)[1])
+        deviations.append(worst(flux_map, "linear_cosine", CURRENT_MAX_A)[1])
     assert deviations[0] > 4.0 * deviations[1] > 16.0 * deviations[2], deviations
     assert deviations[2] < 1e-5
 
 
-def test_a_map_with_sharp_corners_does_not_ring(tmp_path):
+def test_map_with_sharp_corners_does_not_ring(tmp_path):
     """The trapezoid's torque jumps within 2 degrees; 2.4 degrees between the points are too coarse for it, but between
-    the corners the torque stays near its plateau, and nowhere is it of the wrong sign."""
+    the corners the torque stays near its plateau, and its sign is right everywhere."""
     magnetics = formula("linear_trapezoid")
     flux_map = load(tmp_path, csv_text(rows(magnetics, REGULAR_DEG, REGULAR_A)))
     torque_Nm = -flux_map.torque_Nm(np.radians(np.linspace(0.0, HALF_DEG, 901)), 20.0)
@@ -104,15 +104,15 @@ def test_a_map_with_sharp_corners_does_not_ring(tmp_path):
     assert np.all(np.abs(middle_Nm / plateau_Nm - 1.0) < 0.02)
 
 
-def test_noise_on_the_map_stays_of_its_size(tmp_path):
-    """0.2 % of noise on every point of a coarse irregular map is about twice as much of the aligned flux linkage in the
-    model from the first current (3 A) on, and some five times as much of the torque, which is a derivative."""
+def test_noise_on_the_map_is_not_amplified(tmp_path):
+    """0.2 % of noise on every point of a coarse irregular map gives about 0.4 % of the aligned flux linkage in the
+    model from the first current (3 A) on, and about 1 % of the torque."""
     rng = np.random.default_rng(3)
     angles_deg, currents_A = irregular(12, 10)
     points = rows(formula("saturating"), angles_deg, currents_A)
     noisy = [(angle, current, flux * (1.0 + 0.002 * rng.uniform(-1.0, 1.0))) for angle, current, flux in points]
     clean, rough = load(tmp_path, csv_text(points)), load(tmp_path, csv_text(noisy))
-    angle_rad, current_A = np.radians(np.linspace(0.0, HALF_DEG, 181))[:, None], np.linspace(3.0, GREATEST_A, 200)
+    angle_rad, current_A = np.radians(np.linspace(0.0, HALF_DEG, 181))[:, None], np.linspace(3.0, CURRENT_MAX_A, 200)
     flux_Wb, torque_Nm = clean.flux_linkage_Wb(angle_rad, current_A), clean.torque_Nm(angle_rad, current_A)
     flux_noise = np.abs(rough.flux_linkage_Wb(angle_rad, current_A) - flux_Wb) / flux_Wb[0]
     torque_noise = np.abs(rough.torque_Nm(angle_rad, current_A) - torque_Nm) / np.max(np.abs(torque_Nm))
@@ -121,32 +121,32 @@ def test_noise_on_the_map_stays_of_its_size(tmp_path):
     assert rough.inductance_extremes()[0] > 0.0
 
 
-def test_every_derivative_is_that_of_one_potential(sampled):
+def test_all_derivatives_are_those_of_one_potential(sampled):
     _, flux_map = sampled
     rng = np.random.default_rng(5)
     angle_rad = np.radians(rng.uniform(-HALF_DEG, 3.0 * HALF_DEG, 400))
-    current_A = rng.uniform(0.5, 1.3 * GREATEST_A, 400)
+    current_A = rng.uniform(0.5, 1.3 * CURRENT_MAX_A, 400)
     for by_angle, by_current in [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0), (1, 2), (2, 1)]:
         value = flux_map.derivative(angle_rad, current_A, by_angle, by_current)
         if by_angle > 0:
             turn_rad = 1e-5
-            ahead, behind = (
+            right, left = (
                 flux_map.derivative(angle_rad + sign * turn_rad, current_A, by_angle - 1, by_current)
                 for sign in (1, -1)
             )
-            quotient = (ahead - behind) / (2.0 * turn_rad)
+            quotient = (right - left) / (2.0 * turn_rad)
         else:
             more_A = 1e-4
-            ahead, behind = (
+            right, left = (
                 flux_map.derivative(angle_rad, current_A + sign * more_A, by_angle, by_current - 1) for sign in (1, -1)
             )
-            quotient = (ahead - behind) / (2.0 * more_A)
+            quotient = (right - left) / (2.0 * more_A)
         assert np.max(np.abs(quotient - value)) < 2e-5 * np.max(np.abs(value)), (by_angle, by_current)
 
 
-def test_the_shipped_map_is_met_at_every_point_and_pulls_the_right_way():
-    """The finite elements' points within 1e-4 of the greatest flux linkage (5e-5 measured), and no torque away from the
-    aligned position but for 1e-3 of the greatest."""
+def test_bundled_map_is_met_at_every_point_and_its_torque_has_the_right_sign():
+    """The finite elements' points within 1e-4 of the maximum flux linkage (5e-5 measured); torque away from the aligned
+    position is at most 1e-3 of the maximum."""
     machine = load_machine(MACHINES / "finite_element.toml")
     flux_map = machine.magnetics
     lines = (MACHINES / "finite_element.csv").read_text(encoding="utf-8").splitlines()
@@ -170,7 +170,7 @@ def library() -> ctypes.CDLL:
 
 
 class Point(ctypes.Structure):
-    """magnetics_point_t, and of which derivative of the co-energy each member is: by angle, by current."""
+    """magnetics_point_t; orders of the derivative of the co-energy for each member: by angle, by current."""
 
     ORDERS = {
         "flux_linkage_Wb": (0, 1),
@@ -185,15 +185,15 @@ class Point(ctypes.Structure):
     _fields_ = [(name, ctypes.c_double) for name in ORDERS]
 
 
-def test_kernel_and_numpy_agree_to_the_rounding(sampled, library):
+def test_kernel_and_numpy_agree_to_rounding(sampled, library):
     _, flux_map = sampled
-    model = ctypes.create_string_buffer(1 << 16)  # a magnetics_model_t and more
+    model = ctypes.create_string_buffer(1 << 16)  # includes a magnetics_model_t
     magnetics = Magnetics(form=MAP, map=ctypes.pointer(flux_map_of(flux_map)))
     library.magnetics_prepare(model, ctypes.byref(magnetics), ctypes.c_uint(POLES))
     library.magnetics_coenergy_J.restype = ctypes.c_double
     rng = np.random.default_rng(11)
     angle_rad = np.radians(rng.uniform(-4.0 * HALF_DEG, 4.0 * HALF_DEG, 2000))
-    current_A = rng.uniform(-0.5, 1.2 * GREATEST_A, 2000)
+    current_A = rng.uniform(-0.5, 1.2 * CURRENT_MAX_A, 2000)
     measured, coenergy_J, point = {name: [] for name in Point.ORDERS}, [], Point()
     for angle, current in zip(angle_rad, current_A, strict=True):
         arguments = (model, ctypes.c_double(angle), ctypes.c_double(current))
@@ -205,7 +205,7 @@ def test_kernel_and_numpy_agree_to_the_rounding(sampled, library):
     for name, orders in Point.ORDERS.items():
         expected = flux_map.derivative(angle_rad, current_A, *orders)
         assert np.max(np.abs(expected)) > 0.0
-        # Twice over the angle: what is left of differences that are 1e-4 of the co-energy.
+        # Second derivative by the angle: rounding of differences that are 1e-4 of the co-energy.
         bound = 4e-12 if orders[0] == 2 else 1e-12
         assert np.max(np.abs(np.array(measured[name]) - expected)) < bound * np.max(np.abs(expected)), name
 
@@ -224,7 +224,7 @@ def plant_machine(flux_map: FluxMap) -> Machine:
 
 
 @pytest.mark.parametrize("stroke", [chopping_stroke, single_pulse])
-def test_the_plant_agrees_with_an_independent_integration(sampled, library, stroke):
+def test_plant_agrees_with_an_independent_integration(sampled, library, stroke):
     _, flux_map = sampled
     machine, run = plant_machine(flux_map), stroke()
     expected, ends = run_reference(machine, run, reference=MapReference(machine, flux_map))
@@ -236,7 +236,7 @@ def test_the_plant_agrees_with_an_independent_integration(sampled, library, stro
     assert max(deviations.values()) < 4e-6, deviations
 
 
-def test_the_energy_ledger_closes_while_chopping(sampled, library):
+def test_energy_balance_closes_while_chopping(sampled, library):
     _, flux_map = sampled
     machine, run = plant_machine(flux_map), chopping_stroke()
     _, state = run_plant(library, machine, run)
@@ -254,7 +254,7 @@ def test_the_energy_ledger_closes_while_chopping(sampled, library):
 GOOD = csv_text(rows(formula("saturating"), REGULAR_DEG, REGULAR_A))
 
 
-def test_other_units_line_ends_comments_and_a_mark_at_the_start_are_the_same_map(tmp_path):
+def test_units_line_endings_comments_and_a_byte_order_mark_give_the_same_map(tmp_path):
     points = rows(formula("saturating"), REGULAR_DEG, REGULAR_A)
     expected = load(tmp_path, GOOD)
     lines = [f"{math.radians(angle)!r},{current!r},{1000.0 * flux!r}" for angle, current, flux in points]
@@ -264,8 +264,8 @@ def test_other_units_line_ends_comments_and_a_mark_at_the_start_are_the_same_map
     assert np.allclose(load(tmp_path, text.encode()).coefficients_J, expected.coefficients_J, rtol=1e-9, atol=1e-12)
 
 
-def test_a_whole_pitch_is_averaged_with_its_mirror_image(tmp_path):
-    """Half a percent more on one side and half a percent less on the other is the map without them."""
+def test_map_over_a_whole_pitch_is_averaged_with_its_mirror_image(tmp_path):
+    """Opposite errors of half a percent on the two sides cancel."""
     magnetics = formula("saturating")
     whole_deg = np.concatenate([REGULAR_DEG, 2.0 * HALF_DEG - REGULAR_DEG[-2::-1]])
     even = rows(magnetics, whole_deg, REGULAR_A)
@@ -273,7 +273,7 @@ def test_a_whole_pitch_is_averaged_with_its_mirror_image(tmp_path):
         (angle, current, flux * (1.0 + 0.005 * math.sin(math.pi * angle / HALF_DEG))) for angle, current, flux in even
     ]
     expected = load(tmp_path, GOOD)
-    angle_rad, current_A = np.radians(np.linspace(0.0, HALF_DEG, 91))[:, None], np.linspace(1.0, GREATEST_A, 50)
+    angle_rad, current_A = np.radians(np.linspace(0.0, HALF_DEG, 91))[:, None], np.linspace(1.0, CURRENT_MAX_A, 50)
     for points in (even, uneven):
         flux_map = load(tmp_path, csv_text(points))
         difference_Wb = flux_map.flux_linkage_Wb(angle_rad, current_A) - expected.flux_linkage_Wb(angle_rad, current_A)
@@ -281,14 +281,14 @@ def test_a_whole_pitch_is_averaged_with_its_mirror_image(tmp_path):
 
 
 def edited(line: int, text: str | None) -> str:
-    """The good file with another text in a line (1 is the header), or without the line."""
+    """The valid file with another text in a line (1 is the header), or without the line."""
     lines = GOOD.split("\n")
     lines[line - 1 : line] = [] if text is None else [text]
     return "\n".join(lines)
 
 
 def scaled(line: int, factor: float) -> str:
-    """The good file with the flux linkage of one line times a factor."""
+    """The valid file with the flux linkage of one line multiplied by a factor."""
     angle, current, flux = GOOD.split("\n")[line - 1].split(",")
     return edited(line, f"{angle},{current},{float(flux) * factor!r}")
 
@@ -302,7 +302,7 @@ def aligned_Wb(current_A: float) -> float:
     return float(formula("saturating").flux_linkage_Wb(0.0, current_A))
 
 
-REFUSED = {
+REJECTED = {
     "not UTF-8": (GOOD.encode()[:50] + b"\xff" + GOOD.encode()[50:], ["not UTF-8 at byte 51"]),
     "too large": (b"#" * 20_000_001, ["larger than 20 MB"]),
     "empty": ("", ["no header", "angle_deg|angle_rad,current_A,flux_linkage_Wb|flux_linkage_mWb"]),
@@ -378,21 +378,21 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_wrong_file_is_refused_by_one_line_that_says_where(tmp_path, case):
-    text, wanted = REFUSED[case]
+@pytest.mark.parametrize("case", REJECTED)
+def test_invalid_file_is_rejected_by_one_line_with_the_position(tmp_path, case):
+    text, expected_texts = REJECTED[case]
     path = write_machine(tmp_path, "wrong", text)
-    with pytest.raises(MachineError) as refusal:
+    with pytest.raises(MachineError) as rejection:
         load_machine(path)
-    message = str(refusal.value)
+    message = str(rejection.value)
     assert "\n" not in message
     assert message.startswith(f"{tmp_path / 'wrong.csv'}: "), message
-    for words in wanted:
-        assert words in message, message
+    for expected in expected_texts:
+        assert expected in message, message
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "wanted"),
+    ("old", "new", "expected_texts"),
     [
         ('file = "wrong.csv"\n', "", ["magnetics.file: missing"]),
         ('"wrong.csv"', "7", ["magnetics.file: 7 is not the name of a .csv file"]),
@@ -402,17 +402,17 @@ def test_a_wrong_file_is_refused_by_one_line_that_says_where(tmp_path, case):
         ('"wrong.csv"', '"folder.csv"', ["folder.csv: not a file"]),
     ],
 )
-def test_a_wrong_key_is_refused_by_one_line_that_names_it(tmp_path, old, new, wanted):
+def test_invalid_key_is_rejected_by_one_line_that_names_it(tmp_path, old, new, expected_texts):
     (tmp_path / "folder.csv").mkdir()
     path = write_machine(tmp_path, "wrong", GOOD, lambda text: text.replace(old, new))
-    with pytest.raises(MachineError) as refusal:
+    with pytest.raises(MachineError) as rejection:
         load_machine(path)
-    message = str(refusal.value)
+    message = str(rejection.value)
     assert "\n" not in message
-    for words in wanted:
-        assert words in message, message
+    for expected in expected_texts:
+        assert expected in message, message
 
 
-def test_a_map_remembers_its_file(tmp_path):
+def test_map_records_its_file(tmp_path):
     path = write_machine(tmp_path, "here", GOOD)
     assert load_flux_map(tmp_path / "here.csv", POLES).file == load_machine(path).magnetics.file

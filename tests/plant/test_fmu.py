@@ -1,4 +1,4 @@
-"""The functional mock-up units: valid, bit for bit the plant that they carry, strict about what is asked of them."""
+"""The functional mock-up units: valid, bit-identical to the plant, strict about invalid calls."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def unit_path(name: str) -> Path:
     return Path(os.environ.get("SALIENT_BUILD", ROOT / "build" / "host")) / "fmu" / f"{name}.fmu"
 
 
-# --- What is run ---
+# --- Runs ---
 
 
 def chopping(steps: int, step_s: float) -> np.ndarray:
@@ -73,7 +73,7 @@ def chopping(steps: int, step_s: float) -> np.ndarray:
 
 def native(library: ctypes.CDLL, form: str, signals: np.ndarray, step_ns: int, inertia_kg_m2: float | None = None
            ) -> np.ndarray:
-    """The same steps through libsalient_plant.so; a row of OUTPUTS for each communication point."""
+    """The same steps through libsalient_plant.so; one row of OUTPUTS per communication point."""
     machine = machine_from(load_machine(machine_path(form)))
     if inertia_kg_m2 is not None:
         machine.inertia_kg_m2 = inertia_kg_m2
@@ -98,7 +98,7 @@ def native(library: ctypes.CDLL, form: str, signals: np.ndarray, step_ns: int, i
 
 
 class Unit:
-    """An instance of a unit, stepped by hand."""
+    """An instance of a unit, stepped explicitly."""
 
     def __init__(self, folder: str, description: ModelDescription, name: str) -> None:
         self.messages: list[str] = []
@@ -129,8 +129,8 @@ class Unit:
         self.set(**{name: inputs[name] for name in inputs.dtype.names if name != "time"})
         self.fmu.doStep(float(inputs["time"]), step_s)
 
-    def refusal(self, action: Callable[[], object]) -> str:
-        """What the log says when `action` is refused."""
+    def rejection(self, action: Callable[[], object]) -> str:
+        """Log message of a rejected `action`."""
         self.messages.clear()
         with pytest.raises(FMICallException):
             action()
@@ -140,7 +140,7 @@ class Unit:
 
 @pytest.fixture(scope="module")
 def units(tmp_path_factory: pytest.TempPathFactory) -> Callable:
-    """Instances of one unpacked unit."""
+    """Creates instances of one unpacked unit."""
     path = unit_path("saturating")
     folder = extract(str(path), str(tmp_path_factory.mktemp("unit")))
     description = read_model_description(str(path))
@@ -151,7 +151,7 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> Callable:
         components = [unit.fmu.component for unit in made]
         yield made
         for unit, component in zip(made, components, strict=True):
-            # Not FMPy's freeInstance, which unloads the library that the others still use.
+            # FMPy's freeInstance would unload the library that other instances still use.
             unit.fmu.fmi3FreeInstance(component)
 
     return make
@@ -161,16 +161,16 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> Callable:
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in MACHINES.glob("*.toml")))
-def test_the_unit_is_valid(name):
+def test_unit_is_valid(name):
     assert validate_fmu(str(unit_path(name))) == []
 
 
 @pytest.mark.parametrize(("form", "step_ns"), [("saturating", 5000), ("linear_cosine", 25000),
                                                ("linear_trapezoid", 25000), ("finite_element", 25000)])
-def test_a_run_in_fmpy_equals_the_native_run_bit_for_bit(library, form, step_ns):
+def test_run_in_fmpy_is_bit_identical_to_the_native_run(library, form, step_ns):
     steps, step_s = 20_000_000 // step_ns, step_ns * 1e-9
     signals = chopping(steps, step_s)
-    # FMPy takes inputs at and interpolates to the communication points that it has computed itself.
+    # FMPy applies inputs at, and interpolates to, the communication points that it has computed.
     signals["time"] = [index * step_s for index in range(steps + 1)]
     seen = simulate_fmu(str(unit_path(form)), stop_time=steps * step_s, output_interval=step_s, input=signals,
                         output=OUTPUTS, start_values=START, validate=False)
@@ -180,7 +180,7 @@ def test_a_run_in_fmpy_equals_the_native_run_bit_for_bit(library, form, step_ns)
         assert np.array_equal(seen[name], expected[:, column]), name
 
 
-def test_two_instances_at_once_do_not_disturb_each_other(library, units):
+def test_simultaneous_instances_are_independent(library, units):
     step_ns, steps = 25000, 400
     signals = chopping(steps, step_ns * 1e-9)
     other = signals.copy()
@@ -198,7 +198,7 @@ def test_two_instances_at_once_do_not_disturb_each_other(library, units):
     assert np.array_equal(seen[1], native(library, "saturating", other, step_ns, inertia_kg_m2=0.001))
 
 
-def test_a_kept_state_leads_to_the_same_bits_again_in_any_instance(units):
+def test_restored_state_continues_bit_identically_in_any_instance(units):
     step_s = 5e-6
     signals = chopping(600, step_s)
     with units(2) as (first, second):
@@ -218,7 +218,7 @@ def test_a_kept_state_leads_to_the_same_bits_again_in_any_instance(units):
     assert ends[0][0] == pytest.approx(601 * step_s)
 
 
-def test_reset_forgets_everything(units):
+def test_reset_restores_the_initial_state(units):
     signals = chopping(50, 5e-6)
     with units(2) as (used, fresh):
         used.start(**START, resistance_ohm=1.0)
@@ -261,7 +261,7 @@ def test_before_the_first_step_the_outputs_follow_the_parameters(units):
         assert unit.get("rotor_angle_rad", "speed_rad_s", "current_a_A") == (0.25, -3.0, 0.0)
 
 
-def test_communication_points_between_nanoseconds_do_not_add_up(units):
+def test_rounding_of_communication_points_to_nanoseconds_does_not_accumulate(units):
     step_s = 1.0 / 48000.0
     with units(1) as (unit,):
         unit.start(initial_speed_rad_s=100.0, friction_Nm_s=0.0)
@@ -287,15 +287,15 @@ def test_communication_points_between_nanoseconds_do_not_add_up(units):
         (lambda unit: unit.fmu.exitInitializationMode(), "fmi3ExitInitializationMode: not allowed between steps"),
     ],
 )
-def test_what_is_refused_is_named_and_changes_nothing(units, action, message):
+def test_rejected_calls_are_named_and_change_nothing(units, action, message):
     with units(1) as (unit,):
         unit.start(stop_s=1.0, **START)
         before = unit.get("time", "load_torque_Nm", "supply_voltage_V", *OUTPUTS)
-        assert message in unit.refusal(lambda: action(unit))
+        assert message in unit.rejection(lambda: action(unit))
         assert unit.get("time", "load_torque_Nm", "supply_voltage_V", *OUTPUTS) == before
 
 
-def test_a_description_of_another_unit_is_refused(units):
+def test_description_of_another_unit_is_rejected(units):
     with units(1) as (unit,):
         unit.fmu.guid = "0" * 64
         messages: list[bytes] = []
@@ -305,7 +305,7 @@ def test_a_description_of_another_unit_is_refused(units):
 
 
 def test_the_build_of_a_unit_is_deterministic(tmp_path):
-    """Packed anew from what it was packed from, whatever the file's name and age, its bytes are the same."""
+    """Packing the same inputs again gives the same bytes, independent of file name and time."""
     unit = unit_path("saturating")
     folder = Path(extract(str(unit), str(tmp_path / "unit")))
     (binary,) = folder.glob("binaries/*/*.so")

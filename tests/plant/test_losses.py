@@ -41,9 +41,9 @@ def stored_J(row):
     return float(energy_J)
 
 
-# --- the ledger -------------------------------------------------------------------------------------------------------
+# --- energy balance ---------------------------------------------------------------------------------------------------
 
-def test_recorded_energies_close_with_what_is_stored_within_a_hundred_microjoules(recording):
+def test_recorded_energies_balance_the_stored_energy_within_100_microjoules(recording):
     of = losses(recording, MACHINE, WINDOW_S)
     first, last = np.searchsorted(recording["time_s"], np.array(WINDOW_S) - 1e-10)
     assert of["stored_W"] * 0.1 == pytest.approx(stored_J(recording[last]) - stored_J(recording[first]), abs=1e-4)
@@ -69,7 +69,7 @@ def test_iron_loss_is_absent_without_its_table_and_changes_nothing_else(recordin
     assert iron_loss_W(iron, recording[::10], WINDOW_S) is None
 
 
-def test_a_window_outside_the_recording_is_refused(recording):
+def test_window_outside_the_recording_is_rejected(recording):
     with pytest.raises(MetricsError, match="losses are taken from 0.1 s to 0.3 s"):
         losses(recording, MACHINE, (0.1, 0.3))
 
@@ -77,7 +77,7 @@ def test_a_window_outside_the_recording_is_refused(recording):
 # --- iron loss --------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(("frequency_Hz", "peak_T"), [(50.0, 1.5), (400.0, 0.3)])
-def test_a_sine_costs_what_steinmetz_says_whatever_the_sampling(frequency_Hz, peak_T):
+def test_loss_of_a_sine_is_that_of_steinmetz_at_any_sampling(frequency_Hz, peak_T):
     for samples in (500, 5000):
         time_s = np.linspace(0.0, 1.0 / frequency_Hz, samples + 1)
         flux_T = 0.7 + peak_T * np.sin(2.0 * np.pi * frequency_Hz * time_s + 0.3)
@@ -85,7 +85,7 @@ def test_a_sine_costs_what_steinmetz_says_whatever_the_sampling(frequency_Hz, pe
             K * frequency_Hz**ALPHA * peak_T**BETA, rel=1e-4)
 
 
-def test_a_triangle_costs_its_closed_form():
+def test_loss_of_a_triangle_is_its_closed_form():
     time_s = np.linspace(0.0, 0.02, 401)
     flux_T = np.interp(time_s, [0.0, 0.01, 0.02], [-1.0, 1.0, -1.0])
     assert specific_loss_W_kg(time_s, flux_T, K, ALPHA, BETA) == pytest.approx(
@@ -93,17 +93,17 @@ def test_a_triangle_costs_its_closed_form():
 
 
 @pytest.mark.parametrize("parts", [1, 7])
-def test_a_minor_loop_counts_by_its_own_swing(parts):
-    """0 to 1 T with a turn from 0.6 back to 0.4 T, at 100 T/s, and down at once: the turn is a loop of 0.2 T."""
+def test_minor_loop_contributes_by_its_amplitude(parts):
+    """0 to 1 T at 100 T/s with a reversal from 0.6 to 0.4 T, then down without one: the reversal is a loop of 0.2 T."""
     corner_s, corner_T = np.array([0.0, 0.006, 0.008, 0.014, 0.024]), np.array([0.0, 0.6, 0.4, 1.0, 0.0])
-    place = np.arange(4 * parts + 1) / parts
-    time_s, flux_T = np.interp(place, range(5), corner_s), np.interp(place, range(5), corner_T)
+    position = np.arange(4 * parts + 1) / parts
+    time_s, flux_T = np.interp(position, range(5), corner_s), np.interp(position, range(5), corner_T)
     slope = 100.0**ALPHA
     by_hand = k_i() * slope * (0.020 * 1.0 + 0.004 * 0.2 ** (BETA - ALPHA)) / 0.024
     assert specific_loss_W_kg(time_s, flux_T, K, ALPHA, BETA) == pytest.approx(by_hand, rel=1e-6)
 
 
-def test_loops_within_loops_are_found():
+def test_nested_loops_are_found():
     values = np.array([0.0, 10.0, 3.0, 8.0, 5.0, 9.0, 0.0])
     found = split_loops(values, np.abs(np.diff(values)))
     assert found == [(3.0, 6.0), (6.0, 12.0), (10.0, 20.0)]

@@ -1,13 +1,13 @@
 """The emulated plant against ngspice: one phase on its asymmetric half bridge, at constant speed.
 
-A check by a tool that is not ours: ngspice solves a circuit of switch and diode elements (half_bridge.cir) with
+An independent check: ngspice solves a circuit of switch and diode elements (half_bridge.cir) with
 its own integration; commutation and the end of conduction follow from the elements, the flux linkage from behavioural
-sources (netlists: tools/src/salient/spice). Both sides get the numbers of the shipped machines and the same switch
+sources (netlists: tools/src/salient/spice). Both sides have the data of the bundled machines and the same switch
 edges, over two electrical periods. The plant's speed is held by a huge inertia.
 
 Deviations are relative to the largest magnitude in the run. Measured with ngspice 39: current at most 3.9e-4, flux
-linkage 8.2e-5 (soft chopping of the saturating machine), without saturation 3.2e-5 and 4.7e-5; half the step of ngspice
-changes little of it, less diode resistance does: it is the drop of the diodes, which the emulator has not.
+linkage 8.2e-5 (soft chopping of the saturating machine), without saturation 3.2e-5 and 4.7e-5; halving the step of
+ngspice changes it little, a smaller diode resistance does: it is caused by the diode drop, absent in the emulator.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ PERIOD_TICKS = 1000  # 100 kHz: hard chopping is by whole periods
 ELECTRICAL_PERIODS = 2
 SAMPLE_NS = 1000
 SPICE_STEP_NS = 200
-RAMP_NS = 1  # of a gate signal, ends at the edge; the switch acts there
+RAMP_NS = 1  # transition of a gate signal, ends at the edge, where the switch acts
 NGSPICE_TIMEOUT_S = 60
 CONSTANT_SPEED_INERTIA_KG_M2 = 1e9
 
 BOUND = 1e-3
-MINIMUM_PULSES = {"single_pulse": 2, "hard_chopping": 200, "soft_chopping": 600}  # of the upper switch
+MINIMUM_PULSES = {"single_pulse": 2, "hard_chopping": 200, "soft_chopping": 600}  # pulses of the upper switch
 PATTERNS = tuple(MINIMUM_PULSES)
 
 
 @dataclass(frozen=True)
 class Waveforms:
-    """Of one phase, all of the same length."""
+    """Waveforms of one phase, all of the same length."""
 
     time_s: np.ndarray
     current_A: np.ndarray
     flux_linkage_Wb: np.ndarray
 
 
-# --- What is run ---
+# --- Runs ---
 
 
 def compare_values(pattern: str, period: int, angle_deg: float) -> tuple[int, int]:
@@ -89,9 +89,9 @@ def library() -> ctypes.CDLL:
     return load_library()
 
 
-def machine_of(shipped: machine_file.Machine) -> Machine:
-    """The plant's machine, its speed held."""
-    machine = machine_from(shipped)
+def machine_of(bundled: machine_file.Machine) -> Machine:
+    """The plant's machine at constant speed."""
+    machine = machine_from(bundled)
     machine.inertia_kg_m2, machine.friction_Nm_s = CONSTANT_SPEED_INERTIA_KG_M2, 0.0
     return machine
 
@@ -164,7 +164,7 @@ def spice_waveforms(folder: Path, netlist: list[str]) -> Waveforms:
 
 
 def deviation(measured: Waveforms, expected: Waveforms) -> dict[str, float]:
-    """Largest deviation of each quantity from ngspice's over the whole time, relative to its largest magnitude."""
+    """Largest deviation of each quantity from that of ngspice over the whole run, relative to its largest magnitude."""
     worst = {}
     for name in ("current_A", "flux_linkage_Wb"):
         values = getattr(expected, name)
@@ -182,13 +182,13 @@ def conduction_ends_s(waveforms: Waveforms) -> np.ndarray:
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_current_and_flux_linkage_agree(library: ctypes.CDLL, tmp_path: Path, pattern: str, form: str) -> None:
-    shipped = load_machine(MACHINES / f"{form}.toml")
-    machine = machine_of(shipped)
+    bundled = load_machine(MACHINES / f"{form}.toml")
+    machine = machine_of(bundled)
     run = run_of(machine, pattern)
-    expected = spice_waveforms(tmp_path, deck(shipped, run))
+    expected = spice_waveforms(tmp_path, deck(bundled, run))
     measured = plant_waveforms(library, machine, run)
 
-    # Enough was compared.
+    # The comparison covers enough samples.
     turn_rad = run.speed_rad_s * measured.time_s[-1]
     assert turn_rad >= ELECTRICAL_PERIODS * 2 * math.pi / machine.rotor_poles
     assert expected.time_s[-1] == pytest.approx(measured.time_s[-1], abs=1e-12)
@@ -206,13 +206,13 @@ def test_current_and_flux_linkage_agree(library: ctypes.CDLL, tmp_path: Path, pa
     assert max(worst.values()) < BOUND, worst
 
 
-def test_a_wrong_number_is_seen(library: ctypes.CDLL, tmp_path: Path) -> None:
-    """The comparison is sharp: an unaligned inductance 1 % too large in ngspice alone breaks the bound."""
-    shipped = load_machine(MACHINES / "saturating.toml")
-    right = shipped.magnetics.parameters
+def test_wrong_inductance_is_detected(library: ctypes.CDLL, tmp_path: Path) -> None:
+    """The comparison is sensitive: an unaligned inductance 1 % too large in ngspice alone exceeds the bound."""
+    bundled = load_machine(MACHINES / "saturating.toml")
+    right = bundled.magnetics.parameters
     wrong = {**right, "unaligned_inductance_H": 1.01 * right["unaligned_inductance_H"]}
-    machine = machine_of(shipped)
+    machine = machine_of(bundled)
     run = run_of(machine, "single_pulse")
-    netlist = deck(replace(shipped, magnetics=replace(shipped.magnetics, parameters=wrong)), run)
+    netlist = deck(replace(bundled, magnetics=replace(bundled.magnetics, parameters=wrong)), run)
     expected = spice_waveforms(tmp_path, netlist)
     assert deviation(plant_waveforms(library, machine, run), expected)["current_A"] > BOUND

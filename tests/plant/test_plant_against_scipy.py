@@ -1,4 +1,5 @@
-"""The emulated plant against an independent integration of the same equations (plant_twin.py) on the shipped machines.
+"""The emulated plant compared with an independent integration of the same equations (reference_plant.py), bundled
+machines.
 
 Deviations are relative to the largest magnitude of the quantity in the run (speed: to its change). Measured on x86-64
 with gcc 12: at most 9e-7 (the speed in the chopping of the saturating machine), also for samples within steps.
@@ -66,9 +67,8 @@ def machine_of(form: str, inertia_kg_m2: float = 0.02) -> Machine:
 
 
 def start_from_standstill(library: ctypes.CDLL, machine: Machine) -> Run:
-    """Several strokes from rest, phases on from 45 to 75 degrees, current kept near 35 A by a hysteresis at 40 kHz.
-    What the law decided on the plant is recorded, so that both sides then run the same pattern. With a light rotor
-    40 ms are enough."""
+    """Several strokes from rest, phases on from 45 to 75 degrees, current held near 35 A by hysteresis at 40 kHz.
+    The switching pattern is recorded on the plant and applied to both sides. A light rotor makes 40 ms sufficient."""
     full, low_A, high_A = 2500, 32.0, 38.0
     run = Run(full, [], speed_rad_s=0.0, angle_deg=50.0, load_torque_Nm=1.0)
     compares: list[Compares] = []
@@ -114,7 +114,7 @@ def chopping_stroke() -> Run:
 
 
 def single_pulse(full: int = 2500, driven_ns: int = 850_000) -> Run:
-    """One pulse of 12 degrees from 45 on, at 2390 r/min, then the diodes until their current ends."""
+    """One pulse of 12 degrees from 45 degrees on, at 2390 r/min, then the diodes until the current ends."""
     driven = driven_ns // (2 * full * TICK_NS)
     compares = [([full, 0, 0], [full, 0, 0])] * driven + [([0] * PHASES, [0] * PHASES)] * (2 * driven)
     return Run(full, compares, speed_rad_s=250.0, angle_deg=45.0, load_torque_Nm=2.0)
@@ -157,7 +157,7 @@ def test_currents_torque_and_speed_agree(library: ctypes.CDLL, name: str, form: 
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_conduction_ends_within_the_nanosecond(library: ctypes.CDLL, form: str) -> None:
+def test_conduction_ends_at_the_same_nanosecond(library: ctypes.CDLL, form: str) -> None:
     machine, state, run = machine_of(form), State(), single_pulse()
     _, ends = run_reference(machine, run)
     ((phase, end_ns),) = ends
@@ -180,7 +180,7 @@ def test_conduction_ends_within_the_nanosecond(library: ctypes.CDLL, form: str) 
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("name", ("chopping", "single_pulse"))
-def test_samples_within_steps_agree_and_disturb_nothing(library: ctypes.CDLL, name: str, form: str) -> None:
+def test_samples_within_steps_agree_and_leave_the_run_unchanged(library: ctypes.CDLL, name: str, form: str) -> None:
     machine, run = run_of(library, name, form)
     expected, _ = run_reference(machine, run, sample_ns=1000)
     measured, watched = run_plant(library, machine, run, sample_ns=1000)
@@ -192,7 +192,7 @@ def test_samples_within_steps_agree_and_disturb_nothing(library: ctypes.CDLL, na
 
 @pytest.mark.parametrize("form", FORMS)
 def test_error_falls_with_the_fourth_power_of_the_step(library: ctypes.CDLL, form: str) -> None:
-    # Long periods, so that the step's limits decide and not the switch edges.
+    # Long periods, so that the step limits determine the step, not the switch edges.
     machine, run = machine_of(form), single_pulse(full=40_000, driven_ns=800_000)
     expected, _ = run_reference(machine, run)
     # Over three halvings: the number of whole steps between two switch edges makes each of them irregular.

@@ -1,8 +1,8 @@
 """Properties of the emulated plant over random machines, speeds, switching patterns, loads and initial states.
 
-Random cases are compared with an independent integration (plant_lanes.py: DOP853 at a tolerance of 1e-12). Deviations
+Random cases are compared with an independent integration (batch_plant.py: DOP853 at a tolerance of 1e-12). Deviations
 are relative to the largest magnitude of the quantity in the case; that of the speed to its change, that of the angle to
-what the largest speed would make of it. Measured on x86-64 with gcc 12: at most 8.2e-6 over 5400 cases of six seeds
+the angle travelled at the largest speed. Measured on x86-64 with gcc 12: at most 8.2e-6 over 5400 cases of six seeds
 (a speed that hardly changes; currents, torques and fluxes 6e-6), 4e-9 in the median.
 
 Every case is drawn from (seed, number) alone: SALIENT_PLANT_SEED gives another seed, and a failure names the case.
@@ -55,8 +55,8 @@ class Case:
 
 
 def random_machine(draw: np.random.Generator, form: str) -> Machine:
-    """A machine for some rated current and supply; what else it is follows from times that are drawn, so that any
-    combination is a machine that somebody could build."""
+    """A machine for a random rated current and supply; its other data follow from random time constants, so that any
+    combination is a plausible machine."""
 
     def spread(low: float, high: float) -> float:
         return float(math.exp(draw.uniform(math.log(low), math.log(high))))
@@ -119,7 +119,7 @@ def random_pattern(
 
 
 def case_of(number: int, ticks: int = 0) -> Case:
-    """With `ticks` given that long a period, and no switch edges within it."""
+    """With `ticks`: the length of a period, without switch edges within it."""
     draw = np.random.default_rng([SEED, number])
     form = FORMS[number * len(FORMS) // CASES]
     machine = random_machine(draw, form)
@@ -153,21 +153,21 @@ def library() -> ctypes.CDLL:
 
 @pytest.fixture(scope="module")
 def cases() -> list[tuple[Case, Trace]]:
-    """The cases with what the reference says of them."""
+    """The cases with the results of the reference."""
     print(f"seed {SEED}")
     drawn = [case_of(number) for number in range(CASES)]
     expected = run_lanes([case.machine for case in drawn], [case.run for case in drawn])
     return list(zip(drawn, expected, strict=True))
 
 
-def test_lanes_are_scipys_integration(cases: list[tuple[Case, Trace]]) -> None:
+def test_batch_reference_agrees_with_scipy(cases: list[tuple[Case, Trace]]) -> None:
     for case, lane in cases[:: CASES // 6]:
         expected, _ = run_reference(case.machine, case.run)
         worst = deviation(lane, expected)
         assert max(worst.values()) < 1e-9, f"{worst}\n{case}"
 
 
-def test_plant_agrees(library: ctypes.CDLL, cases: list[tuple[Case, Trace]]) -> None:
+def test_plant_agrees_with_the_batch_reference(library: ctypes.CDLL, cases: list[tuple[Case, Trace]]) -> None:
     wrong = []
     for case, expected in cases:
         worst = deviation(run_plant(library, case.machine, case.run)[0], expected)
@@ -177,7 +177,7 @@ def test_plant_agrees(library: ctypes.CDLL, cases: list[tuple[Case, Trace]]) -> 
 
 
 def test_error_falls_with_the_fourth_power_of_the_step(library: ctypes.CDLL) -> None:
-    # Periods of 200 us with whole pulses, so that the step's limits decide and not the switch edges.
+    # Periods of 200 us with whole pulses, so that the step limits determine the step, not the switch edges.
     drawn = [case_of(number, ticks=20_000) for number in range(0, CASES, 6)]
     ratios = []
     expected = run_lanes([case.machine for case in drawn], [case.run for case in drawn])

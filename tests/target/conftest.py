@@ -1,4 +1,4 @@
-"""Says in the end how many control periods were found equal, and what the builds take of flash and RAM."""
+"""Reports at the end the number of control periods found equal, and the flash and RAM use of the builds."""
 
 from __future__ import annotations
 

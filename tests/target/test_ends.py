@@ -1,4 +1,4 @@
-"""A drive's image that cannot go on ends QEMU with an exit code and one line that says why, on every board."""
+"""An image that cannot continue ends QEMU with an exit code and one line with the reason, on every board."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ void drive_control_interrupt(drive_t *drive) {
 void drive_background(drive_t *drive) {
 }
 """
-"""In the place of the firmware: it comes as far as its tenth control interrupt."""
+"""Replaces the firmware: traps in its tenth control interrupt."""
 
 
 @pytest.fixture(params=COMPILERS)
 def make_image(request, tmp_path: Path) -> Callable[[int], Path]:
-    """Makes an image of DRIVE with the board's program, of a mailbox that calls itself `layout`."""
+    """Makes an image of DRIVE with the board's program, with the mailbox layout identifier `layout`."""
     hal = ROOT / "hal"
 
     def make(layout: int) -> Path:
@@ -81,15 +81,15 @@ def run(image: Path, folder: Path) -> subprocess.CompletedProcess:
     return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL)
 
 
-def test_a_fault_of_the_processor_is_said_and_what_was_recorded_is_kept(make_image, tmp_path: Path):
+def test_cpu_exception_is_reported_and_the_recording_is_kept(make_image, tmp_path: Path):
     result = run(make_image(layout_of_world()), tmp_path)
     assert result.returncode == EXIT_FAULT
     assert result.stderr == "salient: the drive's program stopped on an unexpected CPU exception\n"
     assert not (tmp_path / "bus").exists()
-    assert 240 <= len(np.load(tmp_path / "state.npy")) <= 252  # a row a microsecond, ten periods of 25 us
+    assert 240 <= len(np.load(tmp_path / "state.npy")) <= 252  # one row per microsecond, ten periods of 25 us
 
 
-def test_an_image_of_another_mailbox_is_refused(make_image, tmp_path: Path):
+def test_image_with_another_mailbox_layout_is_rejected(make_image, tmp_path: Path):
     result = run(make_image(layout_of_world() + 1), tmp_path)
     assert result.returncode == EXIT_LAYOUT
     assert result.stdout == ""

@@ -80,7 +80,7 @@ def test_counts_are_independent_of_the_translation_block_size(run_qemu):
     assert (whole.interrupts == single.interrupts).all()
     assert (whole.trace.inside == single.trace.inside).all()
     assert (whole.trace.in_longest == single.trace.in_longest).all()
-    # The counts are written within the last block, which is counted in full by then.
+    # The counts are written within the last block, which is already counted in full.
     assert 0 <= (whole.trace.executed - single.trace.executed).sum() <= 1
     assert whole.trace.stack == single.trace.stack
 
@@ -116,5 +116,5 @@ def test_each_control_interrupt_is_a_processor_exception(run_qemu, tmp_path):
     assert taken == [str(CONTROL_EXCEPTION)] * len(profile.interrupts)
 
 
-def test_the_speed_of_the_loop_can_be_measured():
+def test_speed_of_the_target_loop_can_be_measured():
     assert benchmark.measure("paper", "cortex-m4") > 0.0

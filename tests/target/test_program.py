@@ -1,4 +1,4 @@
-"""The program that starts QEMU behaves as the host executable does: mistakes, ready line, end."""
+"""The program that starts QEMU behaves as the host executable does: usage errors, ready line, termination."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def program() -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "expected_texts"),
     [
         ([], ["--can", "unix:PATH"]),
         (["--can", "unix:/no/such/folder/bus"], ["/no/such/folder/bus"]),
@@ -34,24 +34,26 @@ def program() -> list[str]:
         (["--can", "BUS", "--bogus"], ["--bogus"]),
     ],
 )
-def test_mistake_is_one_line_and_exit_code_2(program, tmp_path: Path, arguments: list[str], words: list[str]):
+def test_usage_error_is_one_line_and_exit_code_2(
+    program, tmp_path: Path, arguments: list[str], expected_texts: list[str]
+):
     line = [f"unix:{tmp_path}/bus" if argument == "BUS" else argument for argument in arguments]
     result = subprocess.run([*program, *line], capture_output=True, text=True, cwd=tmp_path, timeout=TIMEOUT_S)
     assert result.returncode == 2
     assert result.stdout == ""
     assert re.fullmatch(r"salient: [^\n]+\n", result.stderr), result.stderr
-    for word in words:
-        assert word in result.stderr
+    for expected in expected_texts:
+        assert expected in result.stderr
 
 
-def test_an_image_that_is_not_there_is_named(program, tmp_path: Path):
+def test_missing_image_is_named(program, tmp_path: Path):
     result = subprocess.run([program[0], "none.elf", "--can", f"unix:{tmp_path}/bus"], capture_output=True, text=True,
                             cwd=tmp_path, timeout=TIMEOUT_S)
     assert result.returncode == 2
     assert result.stderr == "salient: none.elf: No such file or directory\n"
 
 
-def test_a_file_that_is_no_image_is_named(program, tmp_path: Path):
+def test_file_that_is_not_an_image_is_named(program, tmp_path: Path):
     result = subprocess.run([program[0], program[0], "--can", f"unix:{tmp_path}/bus"], capture_output=True, text=True,
                             timeout=TIMEOUT_S)
     assert result.returncode == 2
@@ -60,7 +62,7 @@ def test_a_file_that_is_no_image_is_named(program, tmp_path: Path):
 
 @pytest.mark.parametrize(("build", "qemu", "package"), [("cortex-m4", "qemu-system-arm", "qemu-system-arm"),
                                                         ("rv32", "qemu-system-riscv32", "qemu-system-misc")])
-def test_a_missing_qemu_is_named_with_its_package(tmp_path: Path, build: str, qemu: str, package: str):
+def test_missing_qemu_is_reported_with_its_package(tmp_path: Path, build: str, qemu: str, package: str):
     program = [executable("saturating", build), image("saturating", build)]
     result = subprocess.run([*program, "--can", f"unix:{tmp_path}/bus"], capture_output=True, text=True,
                             env={"PATH": str(tmp_path)}, timeout=TIMEOUT_S)

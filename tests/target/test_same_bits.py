@@ -1,4 +1,4 @@
-"""The same firmware, the same bits: what the host executable, the Cortex-M4 and RV32 do, period by period.
+"""The firmware is bit-identical on the host, the Cortex-M4 and RV32, in every control period.
 
 Compared are the compare values of every control period, every CAN frame with its time, and the recorded true state.
 """
@@ -18,7 +18,7 @@ from salient.bench.config import CONTROLLERS, TARGET_BUILDS, TARGETS
 
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
 ROW_BYTES = 16
-"""Of recorded compare values: two for each of four phases."""
+"""Columns of recorded compare values: two for each of four phases."""
 
 
 def start_600(bench: Bench) -> None:
@@ -65,7 +65,7 @@ RUNS = {run.__name__: run for run in (start_600, load_step_150, tour)}
 
 @dataclass(frozen=True)
 class Trace:
-    """What a drive did in a run."""
+    """Recorded behaviour of a drive in a run."""
 
     compare_values: bytes
     frames: list
@@ -73,13 +73,13 @@ class Trace:
 
     @property
     def periods(self) -> int:
-        """Control periods."""
+        """Number of control periods."""
         return len(self.compare_values) // ROW_BYTES
 
 
 @pytest.fixture
 def traces(make_bench, tmp_path: Path) -> Callable[..., dict[str, Trace]]:
-    """What drives do in a run, by build; several at a time."""
+    """Recorded behaviour in a run, by build; builds run in parallel."""
 
     def trace(name: str, number: int, **options) -> Trace:
         switches, recording = tmp_path / f"{number}.switches", tmp_path / f"{number}.npy"
@@ -92,7 +92,7 @@ def traces(make_bench, tmp_path: Path) -> Callable[..., dict[str, Trace]]:
         return Trace(switches.read_bytes(), frames, recording.read_bytes())
 
     def run(builds: Sequence[str], name: str, **options) -> dict[str, Trace]:
-        # Each is a process of its own, whose world no other's speed matters to.
+        # Each drive is a separate process in virtual time, so parallel runs cannot influence each other.
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
             made = pool.map(lambda each: trace(name, each[0], build=each[1], **options), enumerate(builds))
             return dict(zip(builds, made, strict=True))
@@ -103,12 +103,12 @@ def traces(make_bench, tmp_path: Path) -> Callable[..., dict[str, Trace]]:
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("name", RUNS)
-def test_host_and_targets_do_the_same_in_every_control_period(traces, request, name, controller, machine):
+def test_host_and_targets_agree_in_every_control_period(traces, request, name, controller, machine):
     made = traces(("host", *TARGET_BUILDS), name, controller=controller, machine=machine, seed=3,
                   initial_angle_deg=12.0)
     host = made["host"]
     assert 15_000 < host.periods < 30_000
-    assert any(host.compare_values)  # it did switch
+    assert any(host.compare_values)  # the drive switched
     for build in TARGET_BUILDS:
         assert made[build].periods == host.periods
         for what in ("compare_values", "frames", "true_state"):
@@ -118,14 +118,14 @@ def test_host_and_targets_do_the_same_in_every_control_period(traces, request, n
 
 @pytest.mark.parametrize("board", [{"adc_bits": 16, "encoder_edges": True}, {"encoder_bits": 0, "immediate_pwm": True},
                                    {"control_rate_hz": 100_000, "encoder_bits": 24}])
-def test_another_board_is_the_same_on_all(traces, board):
+def test_other_board_options_agree_on_host_and_targets(traces, board):
     made = traces(TARGETS, "load_step_150", controller="salient", **board)
     for build in TARGETS:
         assert made[build] == made["host"], build
 
 
-def test_another_seed_is_another_run(traces):
-    """So that the equality above says something."""
+def test_different_seeds_give_different_runs(traces):
+    """Shows that the comparison above can fail."""
     first, second = (traces(["cortex-m4"], "tour", controller="paper", seed=seed)["cortex-m4"] for seed in (1, 2))
     assert first.compare_values != second.compare_values
     assert first.frames != second.frames

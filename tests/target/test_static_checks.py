@@ -1,4 +1,4 @@
-"""What the images and objects of the firmware do not contain, and that who looks would find it."""
+"""Images and objects of the firmware contain nothing forbidden, and the checks detect what is forbidden."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LINKED = ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-O1", "-nostartfil
 
 
 @pytest.mark.parametrize("build", TARGET_BUILDS)
-def test_images_have_no_floating_point_no_heap_and_no_call_by_pointer(build):
+def test_images_have_no_floating_point_no_heap_and_no_indirect_calls(build):
     whole = ElfImage(image("saturating", build))
     assert len(whole.instructions()) > 5000
     assert forbidden(whole) == []
@@ -24,7 +24,7 @@ def test_images_have_no_floating_point_no_heap_and_no_call_by_pointer(build):
 
 
 @pytest.mark.parametrize("build", ["cortex-m4", "cortex-m4-Os"])
-def test_the_firmware_calls_the_hal_memcpy_and_memset_and_nothing_else(build):
+def test_firmware_calls_only_the_hal_memcpy_and_memset(build):
     assert undefined_symbols(ElfImage(firmware_alone(build))) == set()
 
 
@@ -35,25 +35,25 @@ def linked(tmp_path: Path, source: str, *options: str) -> ElfImage:
     return ElfImage(result)
 
 
-def test_floating_point_by_the_unit_is_found(tmp_path):
+def test_hardware_floating_point_is_detected(tmp_path):
     made = linked(tmp_path, "float begin(float a, float b) { return a * b; }", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard")
     assert any("vmul.f32" in line for line in forbidden(made))
 
 
-def test_floating_point_by_helpers_and_a_heap_are_found(tmp_path):
+def test_software_floating_point_and_heap_are_detected(tmp_path):
     source = "#include <stdlib.h>\nvoid *_sbrk(int n) { return 0; }\n"
     made = linked(tmp_path, source + "void *begin(double a) { return malloc((unsigned)(a * 3)); }", "-mfloat-abi=soft")
     assert {"__aeabi_dmul", "__aeabi_d2uiz", "malloc"} <= set(forbidden(made))
 
 
-def test_a_call_of_another_function_of_the_c_library_is_found(tmp_path):
+def test_call_of_any_other_c_library_function_is_detected(tmp_path):
     (tmp_path / "x.c").write_text("#include <string.h>\nunsigned begin(const char *a) { return strlen(a) + 1; }")
     subprocess.run(["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-c", str(tmp_path / "x.c"), "-o",
                     str(tmp_path / "x.o")], check=True)
     assert undefined_symbols(ElfImage(tmp_path / "x.o")) == {"strlen"}
 
 
-def test_a_call_by_pointer_is_found(tmp_path):
+def test_indirect_call_is_detected(tmp_path):
     made = linked(tmp_path, "int begin(int (*f)(int)) { return f(1) + 1; }")
     assert [line.split(":")[0] for line in indirect_calls(made)] == ["begin"]
 
@@ -63,12 +63,12 @@ def test_a_call_by_pointer_is_found(tmp_path):
     "int b(int); __attribute__((noipa)) int begin(int n) { return b(n - 1) + 1; }\n"
     "__attribute__((noipa)) int b(int n) { return n ? begin(n) + 2 : 0; }",
 ])
-def test_recursion_is_refused(tmp_path, source):
+def test_recursion_is_rejected(tmp_path, source):
     with pytest.raises(ValueError, match="begin"):
         deepest_stack(linked(tmp_path, source), "begin")
 
 
-def test_the_deepest_stack_is_that_of_the_deepest_way(tmp_path):
+def test_stack_depth_is_that_of_the_deepest_call_path(tmp_path):
     source = """
     __attribute__((noipa)) void use(char *p) { *p = 1; }
     __attribute__((noipa)) void shallow(void) { char a[16]; use(a); }

@@ -1,7 +1,7 @@
-"""A Cortex-M4 that takes time: QEMU counts an instruction as so many nanoseconds, a timer of the board triggers the
-control interrupt wherever the background happens to be, and one that is too long is late.
+"""A Cortex-M4 with instruction timing: every instruction takes a fixed time in QEMU, a timer of the board triggers the
+control interrupt at any point of the background, and an interrupt that is too long overruns.
 
-At 8 ns it is about a part of 170 MHz at 1.34 cycles an instruction.
+8 ns are about a part of 170 MHz at 1.34 cycles per instruction.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from salient.paths import BUILD
 
 PERIOD_US = 25.0
 COUNT_US = 0.04
-"""Of the board's timers."""
+"""Count of the board's timers."""
 
 
 def processor(bench: Bench, signal: str) -> float:
@@ -40,12 +40,12 @@ def frames(bench: Bench) -> list[tuple]:
     return [(time, message.arbitration_id, bytes(message.data)) for time, message in bench.log]
 
 
-# --- a processor that is fast enough --------------------------------------------------------------------------------
+# --- without overruns -----------------------------------------------------------------------------------------------
 
-# At which no interrupt is late, ns an instruction.
+# No overruns at these, ns per instruction.
 IN_TIME_NS = 8
 
-# From lock-step, where the drive takes no time: its figures and how far they may be from it.
+# Metrics in lock-step, where firmware takes no time, and their tolerances.
 START = {"settling_time_s": 2e-4, "overshoot_percent": 0.02}
 LOAD_STEP = {"speed_dip_rpm": 0.3, "recovery_time_s": 2e-3}
 MEAN_TORQUE_NM = 0.01
@@ -73,18 +73,18 @@ def load_step_150(make_bench, tmp_path: Path, **options) -> tuple[Bench, dict]:
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_a_drive_in_time_has_no_late_interrupt_and_the_figures_of_one_that_takes_no_time(make_bench, tmp_path,
+def test_timed_drive_meets_every_deadline_and_has_the_metrics_of_an_untimed_one(make_bench, tmp_path,
                                                                                           controller):
     for experiment, bounds in ((start_600, START), (load_step_150, LOAD_STEP)):
-        made, figures = {}, {}
+        made, measured = {}, {}
         for instruction_ns in (None, IN_TIME_NS):
-            bench, figures[instruction_ns] = experiment(make_bench, tmp_path, build="cortex-m4", controller=controller,
+            bench, measured[instruction_ns] = experiment(make_bench, tmp_path, build="cortex-m4", controller=controller,
                                                         instruction_ns=instruction_ns)
             made[instruction_ns] = bench
             assert (bench.drive.state, bench.drive.fault) == ("run", "none")
             assert processor(bench, "late_interrupts") == 0
             assert processor(bench, "available_us") == PERIOD_US
-        lockstep, timed = figures.values()
+        lockstep, timed = measured.values()
         bench = made[IN_TIME_NS]
         print(controller, experiment.__name__, lockstep, timed, f"worst {processor(bench, 'worst_us'):g} us")
         for name, bound in bounds.items():
@@ -96,21 +96,21 @@ def test_a_drive_in_time_has_no_late_interrupt_and_the_figures_of_one_that_takes
         assert 0.1 * PERIOD_US < processor(bench, "used_us") <= processor(bench, "worst_us") < PERIOD_US
 
 
-def test_the_time_used_is_that_of_the_instructions_counted_and_of_the_port(make_bench, tmp_path):
+def test_reported_isr_time_is_that_of_the_counted_instructions_and_of_the_port(make_bench, tmp_path):
     counts = tmp_path / "instructions"
     bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8, instructions=counts)
     bench.drive.speed_reference_rpm = 600
     bench.run_for(0.2)
     bench.close()
     counted_us = np.fromfile(counts, "<u4").max() * 8e-3
-    # The timer's handler before, and less what follows hal_interrupt_elapsed_ticks.
+    # Plus the entry of the timer's handler, less the code after hal_interrupt_elapsed_ticks.
     port_us = processor(bench, "worst_us") - counted_us
     print(f"counted {counted_us:.3f} us, port {port_us:.3f} us")
     assert 0.1 < port_us < 0.6
 
 
 @pytest.mark.parametrize("rate_hz", [20_000, 50_000])
-def test_the_timer_keeps_other_control_periods_as_well(make_bench, rate_hz):
+def test_timer_keeps_other_control_periods(make_bench, rate_hz):
     bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8, control_rate_hz=rate_hz)
     bench.drive.speed_reference_rpm = 300
     bench.run_for(0.25)
@@ -119,7 +119,7 @@ def test_the_timer_keeps_other_control_periods_as_well(make_bench, rate_hz):
     assert bench.truth["speed_rpm"].last == pytest.approx(300, abs=3)
 
 
-def test_equal_runs_take_equal_time_to_the_bit(make_bench):
+def test_equal_runs_have_bit_identical_timing(make_bench):
     def run() -> list[tuple]:
         bench = make_bench(build="cortex-m4", controller="paper", instruction_ns=4, seed=3)
         bench.rig.set("current_noise_A", 0.05)
@@ -130,24 +130,24 @@ def test_equal_runs_take_equal_time_to_the_bit(make_bench):
     assert run() == run()
 
 
-# --- one that is not ------------------------------------------------------------------------------------------------
+# --- with overruns --------------------------------------------------------------------------------------------------
 
 
 def slow_processor(make_bench, controller: str) -> dict[str, int]:
-    """The slowest one, by the instructions of a period, that serves the drive at rest in time: its law takes twice as
-    many and more."""
+    """The slowest processor that meets the deadline of the drive at rest; the control law takes more than twice the
+    instructions."""
     for rate_hz, instruction_ns in ((40_000, 64), (50_000, 32), (40_000, 32), (50_000, 16), (40_000, 16), (50_000, 8)):
         options = {"control_rate_hz": rate_hz, "instruction_ns": instruction_ns}
         bench = make_bench(build="cortex-m4", controller=controller, **options)
         bench.run_for(0.11)
-        # One without time for the background says nothing after its first cycle, and that says 0.
+        # Without time for the background the only telemetry cycle is the first, which reports 0.
         if processor(bench, "late_interrupts") == 0 and 0 < processor(bench, "worst_us") < 0.8e6 / rate_hz:
             return options
     raise AssertionError("no processor is fast enough")
 
 
 @pytest.mark.parametrize("controller", ["paper", "salient"])
-def test_a_slow_processor_is_noticed_reported_and_safe_the_same_every_time(make_bench, controller):
+def test_slow_processor_is_detected_reported_and_safe_reproducibly(make_bench, controller):
     slow = slow_processor(make_bench, controller)
     period_us = 1e6 / slow["control_rate_hz"]
 
@@ -161,19 +161,19 @@ def test_a_slow_processor_is_noticed_reported_and_safe_the_same_every_time(make_
         return bench, frames(bench)
 
     bench, first = run()
-    late, worst_us = processor(bench, "late_interrupts"), processor(bench, "worst_us")
-    print(f"{controller}, {slow}: {late:g} late, worst {worst_us:g} us")
-    assert 1 <= late < 200
+    overruns, worst_us = processor(bench, "late_interrupts"), processor(bench, "worst_us")
+    print(f"{controller}, {slow}: {overruns:g} overruns, longest {worst_us:g} us")
+    assert 1 <= overruns < 200
     assert period_us < worst_us < 10 * period_us
-    assert processor(bench, "used_us") < period_us  # in fault it is in time again
+    assert processor(bench, "used_us") < period_us  # in fault the deadlines are met again
     assert bench.telemetry["DRIVE_FAULT_CAUSE.fault"].last_name == "interrupt_overrun"
     assert bench.telemetry["DRIVE_FAULT_CAUSE.state"].last_name == "run"
     assert currents_A(bench) == [0, 0, 0]
     assert run()[1] == first
 
 
-def test_an_overrun_under_load_opens_every_switch(make_bench):
-    """The bench holds the processor for 24 us in front of an interrupt that is in time without."""
+def test_overrun_under_load_opens_every_switch(make_bench):
+    """The bench delays by 24 us an interrupt that otherwise meets its deadline."""
     bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8)
     bench.drive.speed_reference_rpm = 600
     bench.run_for(0.1)
@@ -186,7 +186,7 @@ def test_an_overrun_under_load_opens_every_switch(make_bench):
     bench.rig.interrupt_time_us = 24
     bench.run_for(0.003)
     assert (bench.drive.state, bench.drive.fault) == ("fault", "interrupt_overrun")
-    # Late are those at 0, 2 and 4 periods, and the one at 6 knows.
+    # The interrupts at 0, 2 and 4 periods overrun, the one at 6 detects it.
     assert 6 * PERIOD_US <= bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last - caused_us <= 8 * PERIOD_US
     assert currents_A(bench) == [0, 0, 0]
     bench.rig.interrupt_time_us = 0
@@ -202,26 +202,26 @@ def test_an_overrun_under_load_opens_every_switch(make_bench):
     assert (bench.drive.state, bench.drive.fault) == ("run", "none")
 
 
-def test_what_the_bench_holds_the_processor_for_adds_to_its_own_time(make_bench):
+def test_interrupt_time_of_the_bench_adds_to_the_processor_time(make_bench):
     bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8)
     used_us = {}
     for held_us in (0, 10):
         bench.rig.interrupt_time_us = held_us
         bench.run_for(0.11)
         used_us[held_us] = processor(bench, "used_us")
-    # It is held until 10 us behind the trigger, and the port has used some of that already.
+    # The processor is held until 10 us after the trigger; the port has already used part of that.
     assert used_us[0] + 9.5 < used_us[10] < used_us[0] + 10 + COUNT_US
     assert processor(bench, "late_interrupts") == 0
 
 
-def test_instructions_that_take_time_are_for_the_cortex_m4():
+def test_instruction_timing_is_available_on_the_cortex_m4_only():
     with pytest.raises(UsageError, match="--instruction-ns 8: only with --target cortex-m4"):
         command_line(BenchConfig(instruction_ns=8))
     with pytest.raises(UsageError, match="--instruction-ns 8: not on the board virt, whose port uses no timer"):
         EmulatorProcess(BenchConfig(build="rv32", instruction_ns=8), "unix:bus")
 
 
-# --- the interrupt comes anywhere -----------------------------------------------------------------------------------
+# --- pre-emption ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -245,8 +245,8 @@ def race(tmp_path: Path) -> Callable[[str, str], tuple[int, ...]]:
 
 
 @pytest.mark.parametrize("build", [build for build in TARGET_BUILDS if build.startswith("cortex-m4")])
-def test_what_interrupt_and_background_share_is_torn_without_the_critical_section_and_never_with_it(race, build):
-    """A command is three words, which one instruction stores, and QEMU interrupts none: it tears on neither."""
+def test_shared_data_is_torn_without_the_critical_section_and_never_with_it(race, build):
+    """A command is three words stored by one instruction, which QEMU does not interrupt: never torn in either build."""
     interrupts, *torn = race(build, "no_critical_section")
     print(f"{build}: {torn} torn in {interrupts} interrupts without")
     assert interrupts > 5000

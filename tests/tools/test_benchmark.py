@@ -1,5 +1,5 @@
-"""What tools/salient benchmark claims, but for the times: the peers solve the plant's problem, the accuracy that it
-prints for each, the instruction counts."""
+"""Results of tools/salient benchmark except the times: the reference solvers solve the problem of the plant, with the
+reported accuracy; the instruction counts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from salient.machine.file import load_machine
 from salient.paths import MACHINES
 from salient.reference.scipy_plant import dop853, run_scipy
 
-PERIODS = 800  # 20 ms, two strokes and a half
+PERIODS = 800  # 20 ms, two and a half strokes
 
 
 @pytest.fixture(scope="module")
@@ -46,18 +46,18 @@ def test_switching_pattern_reproduces_the_drive(pattern: SwitchingPattern, folde
 
 
 def test_reference_agrees_with_the_independent_model(pattern: SwitchingPattern) -> None:
-    """Flux linkages as state, events and a pattern of its own, in plant_twin.py."""
+    """reference_plant.py has flux linkages as state, events, and an independent switching pattern."""
     machine = machine_from(load_machine(MACHINES / "saturating.toml"))
     compares = list(zip(pattern.upper.tolist(), pattern.lower.tolist(), strict=True))
     run = Run(pattern.period_ticks, compares, pattern.speed_rad_s, math.degrees(pattern.angle_rad),
               pattern.load_torque_Nm, pattern.current_A)
-    twin, ends = run_reference(machine, run)
+    independent, ends = run_reference(machine, run)
     assert len(ends) >= 1, "the run is to contain an end of conduction"
     reference = run_scipy(pattern, dop853(REFERENCE_TOLERANCE))
-    assert np.max(np.abs(reference.current_A.T - twin["currents"][:, 1:])) < 1e-9
-    assert np.max(np.abs(reference.torque_Nm - twin["torque"][1:])) < 1e-9
-    assert np.max(np.abs(reference.speed_rad_s - twin["speed"][1:])) < 1e-10
-    assert np.max(np.abs(reference.angle_rad - twin["angle"][1:])) < 1e-11
+    assert np.max(np.abs(reference.current_A.T - independent["currents"][:, 1:])) < 1e-9
+    assert np.max(np.abs(reference.torque_Nm - independent["torque"][1:])) < 1e-9
+    assert np.max(np.abs(reference.speed_rad_s - independent["speed"][1:])) < 1e-10
+    assert np.max(np.abs(reference.angle_rad - independent["angle"][1:])) < 1e-11
 
 
 # Largest deviation of current and torque from the reference: (at least, at most).
@@ -73,16 +73,16 @@ ACCURACY = {
 }
 
 
-def test_every_solver_has_its_accuracy_and_is_compared_with_a_plant_no_less_exact(
+def test_every_solver_reports_its_accuracy_and_is_compared_with_a_plant_at_least_as_accurate(
     pattern: SwitchingPattern, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(benchmark, "record", lambda folder: pattern)
     content = json.loads(json.dumps(benchmark.compare_solvers(runs=1)))
     rows = {row["solver"]: row for row in content["solvers"]}
     assert list(rows) == [*PLANT, *REFERENCE_SOLVERS] == list(ACCURACY)
-    said = capsys.readouterr().out.splitlines()
+    output = capsys.readouterr().out.splitlines()
     for name in rows:
-        (line,) = [line for line in said if line.startswith(f"  {name} ")]
+        (line,) = [line for line in output if line.startswith(f"  {name} ")]
         assert ("times faster" in line) == (rows[name].get("plant_times_faster") is not None)
     for name, (least, most) in ACCURACY.items():
         for quantity in ("current", "torque"):
@@ -94,7 +94,7 @@ def test_every_solver_has_its_accuracy_and_is_compared_with_a_plant_no_less_exac
             assert all(plant["deviation"][key] <= value for key, value in row["deviation"].items())
             assert row["plant_times_faster"] == row["processor_s"] / plant["processor_s"]
     assert rows["SciPy LSODA, 1e-6"]["compared_with"] == rows["ngspice, 1 us"]["compared_with"] == "plant"
-    # A step at least for each of 4 to 5 segments a period, and no fewer evaluations for a smaller tolerance.
+    # At least one step for each of 4 to 5 segments per period, and no fewer evaluations for a smaller tolerance.
     lsoda = [rows[f"SciPy LSODA, 1e-{digits}"]["evaluations_per_period"] for digits in (6, 9, 12)]
     assert 10.0 < lsoda[0] < lsoda[1] < lsoda[2] < 300.0
 
@@ -106,14 +106,14 @@ def test_deviation_is_relative_to_the_reference(pattern: SwitchingPattern) -> No
     assert deviation(off, reference) == pytest.approx({"current": 0.1, "torque": 0.5, "speed": 0.25})
 
 
-def test_instructions_of_the_plant_are_the_same_twice(pattern: SwitchingPattern) -> None:
+def test_instruction_counts_of_the_plant_are_reproducible(pattern: SwitchingPattern) -> None:
     count = callgrind.of_plant(pattern)
     assert 2000.0 < count < 6000.0
     assert callgrind.of_plant(pattern) == count
 
 
-def test_instructions_of_the_drive_are_the_same_twice_but_for_the_client_s() -> None:
-    """How a client's frames are bundled in the socket depends on the moment."""
+def test_instruction_counts_of_the_drive_are_reproducible_except_for_the_client() -> None:
+    """The bundling of a client's frames in the socket depends on timing."""
     first, second = (callgrind.of_drive("paper", 0.01) for _ in range(2))
     assert first["plant"] == second["plant"] and first["control laws"] == second["control laws"]
     assert sum(second.values()) == pytest.approx(sum(first.values()), rel=2e-3)
@@ -121,7 +121,7 @@ def test_instructions_of_the_drive_are_the_same_twice_but_for_the_client_s() -> 
 
 @pytest.mark.parametrize(("controller", "least", "most"), [
     ("traditional", 2000.0, 4500.0), ("paper", 4500.0, 9500.0), ("salient", 7500.0, 15000.0)])
-def test_instructions_of_the_drive_by_group(controller: str, least: float, most: float) -> None:
+def test_instructions_of_the_drive_are_grouped(controller: str, least: float, most: float) -> None:
     counts = callgrind.of_drive(controller, 0.02)
     total = sum(counts.values())
     assert least < total < most, counts
@@ -133,7 +133,7 @@ def test_instructions_of_the_drive_by_group(controller: str, least: float, most:
     assert 0.0 <= counts["other"] / total < 0.03, counts
 
 
-def test_counts_of_a_callgrind_file_go_to_the_source_they_were_inlined_from() -> None:
+def test_callgrind_counts_are_attributed_to_the_source_they_were_inlined_from() -> None:
     text = """events: Ir
 fl=(1) /x/emulator/plant/plant.c
 fn=(1) plant_advance

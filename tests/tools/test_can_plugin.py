@@ -1,4 +1,4 @@
-"""The python-can interface "salient", as any python-can program meets it."""
+"""The python-can interface "salient", used as by any python-can program."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TIMEOUT_S = 10.0
 
 @pytest.fixture
 def connect(make_bench):
-    """A drive on a local bus, and a function that opens clients of it."""
+    """Starts a drive on a local bus; returns a function that opens clients."""
     bench = make_bench()
     clients = []
 
@@ -30,12 +30,12 @@ def connect(make_bench):
         client.shutdown()
 
 
-def received(bus: can.BusABC, wanted: can.Message) -> can.Message:
-    """The next frame with the identifier of `wanted`."""
+def received(bus: can.BusABC, expected: can.Message) -> can.Message:
+    """The next frame with the identifier of `expected`."""
     while True:
         message = bus.recv(TIMEOUT_S)
         assert message is not None
-        if message.arbitration_id == wanted.arbitration_id and message.is_extended_id == wanted.is_extended_id:
+        if message.arbitration_id == expected.arbitration_id and message.is_extended_id == expected.is_extended_id:
             return message
 
 
@@ -52,7 +52,7 @@ FRAMES = [
 
 
 @pytest.mark.parametrize("frame", FRAMES, ids=lambda frame: f"{len(frame.data)}-bytes-{frame.arbitration_id:X}")
-def test_frame_survives_packing(frame):
+def test_packed_frame_is_unpacked_unchanged(frame):
     again = message_of(frame_bytes(frame), 1_234_567_891, "unix:x")
     assert again.equals(frame, timestamp_delta=None, check_channel=False)
     assert again.time_ns == 1_234_567_891
@@ -60,14 +60,14 @@ def test_frame_survives_packing(frame):
 
 
 @pytest.mark.parametrize("frame", FRAMES, ids=lambda frame: f"{len(frame.data)}-bytes-{frame.arbitration_id:X}")
-def test_frame_reaches_the_other_client_whole(connect, frame):
+def test_frame_reaches_the_other_client_unchanged(connect, frame):
     sender, listener = connect(), connect()
     sender.send(frame)
     connect.bench.run_for(0.001)
     assert received(listener, frame).equals(frame, timestamp_delta=None, check_channel=False)
 
 
-def test_own_frames_only_where_asked_for(connect):
+def test_own_frames_are_received_only_if_enabled(connect):
     silent, curious = connect(), connect(receive_own_messages=True)
     for bus in (silent, curious):
         bus.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\1"))
@@ -77,15 +77,15 @@ def test_own_frames_only_where_asked_for(connect):
 
 
 def drained(bus: can.BusABC) -> list[can.Message]:
-    """What has come so far; in lock-step nothing comes after the clock has been answered."""
+    """Frames received so far; in lock-step none follow the response of the clock."""
     messages = []
     while (message := bus.recv(0)) is not None:
         messages.append(message)
     return messages
 
 
-def test_time_is_when_the_frame_completed(connect):
-    """At 1 Mbit/s a frame takes its number of bits in microseconds; 8 bytes take 111 to 135 of them, stuffed or not."""
+def test_timestamp_is_the_completion_of_the_frame(connect):
+    """At 1 Mbit/s a bit takes one microsecond; a frame of 8 bytes has 111 to 135 bits, depending on stuffing."""
     bus = connect(receive_own_messages=True)
     connect.bench.run_for(0.0105)
     drained(bus)
@@ -97,7 +97,7 @@ def test_time_is_when_the_frame_completed(connect):
     assert 108_000 <= second - first <= 135_000
 
 
-def test_filters(connect):
+def test_filters_select_by_identifier(connect):
     bus = connect(can_filters=[{"can_id": 0x181, "can_mask": 0x7FF, "extended": False}])
     connect.bench.run_for(0.01)
     messages = drained(bus)
@@ -105,7 +105,7 @@ def test_filters(connect):
     assert {m.arbitration_id for m in messages} == {0x181}
 
 
-def test_end_of_the_drive_is_seen(connect):
+def test_end_of_the_drive_is_reported(connect):
     bus = connect()
     connect.bench.simulator.close()
     with pytest.raises(can.CanOperationError, match="can0.sock: the drive has ended"):
@@ -115,12 +115,12 @@ def test_end_of_the_drive_is_seen(connect):
         bus.send(can.Message(arbitration_id=1))
 
 
-def test_no_drive_there(tmp_path):
+def test_absent_drive_is_reported(tmp_path):
     with pytest.raises(can.CanInitializationError, match="no drive answers there"):
         SalientBus(f"unix:{tmp_path}/nothing")
 
 
-def test_asyncio_notifier(connect):
+def test_asyncio_notifier_receives_frames(connect):
     bus = connect()
 
     async def first_heartbeat() -> can.Message:
@@ -135,8 +135,8 @@ def test_asyncio_notifier(connect):
 
 
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".log"])
-def test_python_can_logger(connect, tmp_path, suffix):
-    """The stock logger of python-can records a bus; here until the drive ends."""
+def test_python_can_logger_records_the_bus(connect, tmp_path, suffix):
+    """The standard logger of python-can records a bus until the drive ends."""
     path = tmp_path / f"log{suffix}"
     bench = connect.bench
     command = [sys.executable, "-u", "-m", "can.logger", "-i", "salient", "-c", bench.address, "-f", str(path)]

@@ -86,7 +86,7 @@ def codec(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def random_raw(signal: Signal, rng: random.Random) -> int | float:
-    """A raw value of the signal's range, its ends more often than chance."""
+    """A raw value of the signal's range, with its ends overrepresented."""
     if signal.is_float:
         return ctypes.c_float(rng.uniform(-1e4, 1e4)).value
     low, high = raw_range(signal)
@@ -94,7 +94,7 @@ def random_raw(signal: Signal, rng: random.Random) -> int | float:
 
 
 def random_frames(codec: Codec) -> list[tuple[Message, dict[str, int | float]]]:
-    """FRAMES of every message: raw values of the signals that are there (a multiplexed frame has some of them)."""
+    """FRAMES frames of every message: raw values of the signals present (a multiplexed frame has a subset)."""
     rng = random.Random(SEED)
     frames = []
     for message in codec.database.messages:
@@ -107,14 +107,14 @@ def random_frames(codec: Codec) -> list[tuple[Message, dict[str, int | float]]]:
     return frames
 
 
-def test_python_packs_and_c_unpacks(codec: Codec) -> None:
+def test_c_unpacks_frames_packed_by_python(codec: Codec) -> None:
     for message, values in random_frames(codec):
         structure = codec.unpack(message, message.encode(values, scaling=False))
         for name, raw in values.items():
             assert getattr(structure, camel_to_snake_case(name)) == raw, f"{message.name}.{name}, seed {SEED}"
 
 
-def test_c_packs_and_python_unpacks(codec: Codec) -> None:
+def test_python_unpacks_frames_packed_by_c(codec: Codec) -> None:
     for message, values in random_frames(codec):
         structure = codec.structures[message.name]()
         for name, raw in values.items():
@@ -154,14 +154,14 @@ def test_setters_of_physical_values_round_and_saturate(tmp_path: Path) -> None:
             samples = [(rng.randint(low, high) + rng.uniform(-0.49, 0.49)) * signal.scale for _ in range(50)]
             for value in samples:
                 setter(ctypes.byref(structure), ctypes.c_double(value))
-                # 2**-8: a double has 53 bits, the widest signal 48, so that much of an LSB is lost in the scale.
+                # 2**-8: a double has 53 bits, the widest signal 48, so that part of an LSB is lost in the scale.
                 assert abs(getattr(structure, field) - min(max(value / signal.scale, low), high)) <= 0.5 + 2**-8
             for value, end in ((math.inf, high), (-math.inf, low), (1e300, high), (-1e300, low), (math.nan, low)):
                 setter(ctypes.byref(structure), ctypes.c_double(value))
                 assert getattr(structure, field) == end, f"{message.name}.{signal.name} from {value}"
 
 
-def test_identifiers_and_lengths(codec: Codec, tmp_path: Path) -> None:
+def test_identifiers_and_lengths_are_those_of_the_database(codec: Codec, tmp_path: Path) -> None:
     checks = []
     for message in codec.database.messages:
         name = message_c_name(message, codec.name).upper()
@@ -176,20 +176,20 @@ def test_identifiers_and_lengths(codec: Codec, tmp_path: Path) -> None:
     compile_c(tmp_path, [f"{codec.name}_codec.h"], checks, [tmp_path])
 
 
-def test_generated_text_depends_on_the_database_alone(codec: Codec, tmp_path: Path) -> None:
+def test_generated_code_depends_on_the_database_alone(codec: Codec, tmp_path: Path) -> None:
     dbc, *options = DATABASES[codec.name]
     copy = tmp_path / dbc.name
     copy.write_bytes(dbc.read_bytes())
     assert generate_codec(copy, *options) == generate_codec(dbc, *options)
 
 
-def test_names_have_the_prefix_once(codec: Codec) -> None:
+def test_names_do_not_repeat_the_prefix(codec: Codec) -> None:
     twice = f"{codec.name}_{codec.name}_"
     assert not any(twice in text.lower() for text in generate_codec(*DATABASES[codec.name]).values())
 
 
 def compile_c(folder: Path, headers: list[str], statements: list[str], include: list[Path]) -> None:
-    """Compiles headers and statements, as a check that the compiler makes."""
+    """Compiles headers and statements, for checks by the compiler."""
     source = folder / "check.c"
     lines = ["#include <assert.h>", *(f'#include "{header}"' for header in headers), *statements]
     source.write_text("\n".join(lines) + "\n")
@@ -209,7 +209,7 @@ def compile_c(folder: Path, headers: list[str], statements: list[str], include: 
         ("status", "parameter_status_t", "PARAMETER_STATUS"),
     ],
 )
-def test_texts_of_the_dbc_are_the_enumerations_of_the_firmware(
+def test_value_tables_of_the_dbc_are_the_enumerations_of_the_firmware(
     tmp_path: Path, signal: str, type_name: str, prefix: str
 ) -> None:
     database = cantools.database.load_file(DATABASES["drive"][0])
@@ -236,7 +236,7 @@ def test_value_tables_of_one_enumeration_must_be_equal(tmp_path: Path) -> None:
 
 
 class Telemetry(Codec):
-    """`structure`: drive_telemetry_t in Python, by the DBC."""
+    """`structure`: drive_telemetry_t in Python, from the DBC."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__("drive", folder)
@@ -292,7 +292,7 @@ def test_telemetry_is_packed_with_saturation(telemetry: Telemetry) -> None:
             assert data == message.encode(expected, scaling=False), f"{message.name}, seed {SEED}"
 
 
-def test_the_schedule_is_that_of_the_dbc(telemetry: Telemetry) -> None:
+def test_schedule_is_that_of_the_dbc(telemetry: Telemetry) -> None:
     class Row(ctypes.Structure):
         _fields_ = [
             ("pack", ctypes.c_void_p), ("identifier", ctypes.c_uint32), ("length", ctypes.c_uint8),
@@ -319,7 +319,7 @@ def test_every_fault_has_its_bit_in_the_fault_mask(telemetry: Telemetry) -> None
     assert {s.start: s.name for s in mask.signals} == {n: str(name) for n, name in faults.items() if n}
 
 
-def test_everything_in_the_drive_s_dbc_is_explained(telemetry: Telemetry) -> None:
+def test_every_message_and_signal_of_drive_dbc_has_a_comment(telemetry: Telemetry) -> None:
     for message in telemetry.database.messages:
         assert message.comment, message.name
         for signal in message.signals:
@@ -363,7 +363,7 @@ def test_hash_changes_with_the_meaning_of_a_frame(old: str, new: str, equal: boo
         ('VERSION ""\nBU_: A\nBO_ 1 X: 1 A\n SG_ a : 0|8@1+ (1,0) [300|400] "" A\n', "signal a: no value of its range"),
     ],
 )
-def test_a_bad_database_gives_one_line_and_exit_code_2(
+def test_invalid_database_is_one_line_and_exit_code_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str | None, complaint: str
 ) -> None:
     dbc = tmp_path / "bad.dbc"

@@ -22,7 +22,7 @@ ALL_CASES = {name: list(group.cases(False)) for name, group in GROUPS.items()}
 
 
 def compare(*line):
-    """Exit code and output."""
+    """Returns exit code and output."""
     output = io.StringIO()
     code = command.run(make_parser().parse_args(["compare", *map(str, line)]), stream=output)
     return code, output.getvalue()
@@ -35,7 +35,7 @@ def run_metrics(controller="paper", sample="", failed="", condition="saturating"
 
 @pytest.fixture(scope="module")
 def start_folder(tmp_path_factory):
-    """Folder and output of the quick group start with two jobs."""
+    """Folder and output of the quick group `start` with two jobs."""
     folder = tmp_path_factory.mktemp("compare")
     code, output = compare("start", "--quick", "--jobs", 2, "--out", folder)
     assert code == 0
@@ -221,7 +221,7 @@ def test_maximum_speed_is_judged_by_its_excess_over_the_reference():
     assert change_of(150.01, 150.05, key=key) is None
 
 
-def test_printed_percentage_refers_to_the_same_metric_in_the_baseline():
+def test_reported_percentage_refers_to_the_same_metric_in_the_baseline():
     assert baseline.change_text(change_of(2.0, 2.5)).endswith(": median speed drop, r/min 2.00 -> 2.50 (+25.0 %)")
     key = ("dip", "saturating, 17 bits", "speed_after_rpm", "worst")
     change = change_of(150.1, 150.2, key=key)
@@ -265,18 +265,18 @@ def test_same_drive_has_no_change_and_a_modified_baseline_is_detected(start_fold
     assert code == 0
 
 
-@pytest.mark.parametrize(("content", "words"), [
+@pytest.mark.parametrize(("content", "expected_text"), [
     (None, "No such file"),
     ("{", "not JSON"),
     ("[]", "schema 1"),
     ('{"schema": 2, "rows": []}', "schema 1"),
     ('{"schema": 1, "quick": true, "rows": []}', "made with --quick"),
 ])  # fmt: skip
-def test_invalid_baseline_is_reported(tmp_path, content, words):
+def test_invalid_baseline_is_reported(tmp_path, content, expected_text):
     path = tmp_path / "earlier.json"
     if content is not None:
         path.write_text(content)
-    with pytest.raises(UsageError, match=f"--baseline .*earlier.json: .*{words}"):
+    with pytest.raises(UsageError, match=f"--baseline .*earlier.json: .*{expected_text}"):
         compare("start", "--out", tmp_path / "out", "--baseline", path)
     assert not (tmp_path / "out").exists()
 
@@ -343,14 +343,14 @@ def test_unknown_group_is_reported():
         compare("dips")
 
 
-@pytest.mark.parametrize(("line", "words"), [
+@pytest.mark.parametrize(("line", "expected_text"), [
     (("--jobs", "0"), "--jobs 0: must be a whole number from 1"),
     (("--worse-percent", "much"), "--worse-percent much: must be a number from 0"),
 ])  # fmt: skip
-def test_invalid_option_is_reported(line, words, capsys):
+def test_invalid_option_is_reported(line, expected_text, capsys):
     with pytest.raises(SystemExit, match="2"):
         compare(*line)
-    assert words in capsys.readouterr().err
+    assert expected_text in capsys.readouterr().err
 
 
 def test_unwritable_folder_is_reported_before_anything_runs(tmp_path):

@@ -1,4 +1,4 @@
-"""The figures that only the comparison takes, on made-up recordings whose answers are known."""
+"""Metrics of the comparison on synthetic recordings with known results."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ STROKE_DEG = 30.0
 
 
 def steady(lines=(), seconds=1.0, speed_rpm=150.0, mean_Nm=8.0, step_s=STEP_S):
-    """Torque with lines of (frequency in Hz, amplitude in N m) at a constant speed."""
+    """Torque with spectral lines (frequency in Hz, amplitude in N m) at constant speed."""
     rows = np.zeros(round(seconds / step_s) + 1,
                     dtype=[("time_s", "f8"), ("speed_rpm", "f4"), ("torque_Nm", "f4")])
     rows["time_s"] = 0.3 + np.arange(len(rows)) * step_s
@@ -26,20 +26,20 @@ def line_percent(recording):
 
 
 @pytest.mark.parametrize("frequency_Hz", [45.0, 317.0, 1033.0])
-def test_a_limit_cycle_is_found_with_its_amplitude(frequency_Hz):
+def test_limit_cycle_is_found_with_its_amplitude(frequency_Hz):
     assert line_percent(steady([(frequency_Hz, 0.4)])) == pytest.approx(5.0, rel=0.05)
 
 
-def test_the_strokes_and_their_harmonics_are_no_limit_cycle():
+def test_strokes_and_their_harmonics_are_not_a_limit_cycle():
     # 150 r/min are 30 strokes a second.
     assert line_percent(steady([(30.0, 2.0), (60.0, 1.0), (300.0, 1.0)])) < 0.02
 
 
-def test_the_switching_is_no_limit_cycle():
+def test_switching_is_not_a_limit_cycle():
     assert line_percent(steady([(20_000.0, 2.0), (40_000.0, 2.0)])) < 0.02
 
 
-def test_a_window_of_few_strokes_has_no_spectrum_between_them():
+def test_short_window_has_no_spectrum_between_the_strokes():
     with pytest.raises(metrics.MetricsError, match="needs 12 of them, the window has 6.0"):
         line_percent(steady(seconds=0.2))
 
@@ -49,12 +49,12 @@ def test_coarse_samples_have_no_spectrum():
         line_percent(steady(step_s=50e-6))
 
 
-def test_a_drive_that_brakes_has_no_spectrum_in_percent():
+def test_braking_drive_has_no_spectrum_in_percent():
     with pytest.raises(metrics.MetricsError, match="positive mean torque"):
         line_percent(steady(mean_Nm=-1.0))
 
 
-def test_the_speed_error_is_the_farther_of_both_sides_and_of_its_window_only():
+def test_speed_error_is_the_larger_of_both_signs_within_its_window():
     rows = steady(seconds=0.1)
     rows["speed_rpm"][0] = 0.0
     rows["speed_rpm"][1000] = 148.5
@@ -64,17 +64,17 @@ def test_the_speed_error_is_the_farther_of_both_sides_and_of_its_window_only():
     assert metrics.speed_error_percent(rows, 150.0, (0.303, end_s)) == pytest.approx(0.5)
 
 
-def test_what_came_before_the_load_step_does_not_count():
+def test_samples_before_the_load_step_do_not_count():
     rows = steady(seconds=0.1)
     rows["speed_rpm"][:1000] = 170.0
     rows["speed_rpm"][6000:7000] = 147.0
     rows["speed_rpm"][8000] = 150.5
-    figures = metrics.speed_after_step(rows, 150.0, 0.31)
-    assert figures["speed_dip_rpm"] == pytest.approx(3.0)
-    assert figures["recovery_time_s"] == pytest.approx(0.004, abs=1e-9)
-    assert figures["speed_after_rpm"] == pytest.approx(150.5)
+    result = metrics.speed_after_step(rows, 150.0, 0.31)
+    assert result["speed_dip_rpm"] == pytest.approx(3.0)
+    assert result["recovery_time_s"] == pytest.approx(0.004, abs=1e-9)
+    assert result["speed_after_rpm"] == pytest.approx(150.5)
 
 
 @pytest.mark.parametrize(("machine", "expected_deg"), [("saturating", 30.0), ("finite_element", 15.0)])
-def test_a_stroke_is_a_turn_shared_by_rotor_poles_and_phases(machine, expected_deg):
+def test_stroke_is_a_revolution_divided_by_rotor_poles_and_phases(machine, expected_deg):
     assert metrics.stroke_deg(load_machine(machine_path(machine))) == expected_deg

@@ -39,7 +39,7 @@ def test_read_telemetry_waits_for_the_drive_and_prints_decoded_frames(channel):
 
 def test_run_600_rpm_runs_the_drive_and_switches_it_off(channel):
     telemetry = SignalTable(drive_database(), "DRIVE")
-    # One tenth of real time: the time-out of commands stays far from what a loaded computer may miss.
+    # One tenth of real time: the time-out of commands leaves a wide margin for a loaded computer.
     with EmulatorProcess(BenchConfig(pace="x0.1"), channel):
         example = start("run_600_rpm.py", channel, "0.3")
         output, errors = example.communicate()
@@ -54,7 +54,7 @@ def test_run_600_rpm_runs_the_drive_and_switches_it_off(channel):
 
 
 @pytest.mark.parametrize("script", ["read_telemetry.py", "run_600_rpm.py"])
-def test_end_of_the_drive_is_one_line(channel, script):
+def test_end_of_the_drive_is_reported_in_one_line(channel, script):
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
         server.bind(channel.removeprefix("unix:"))
         server.listen()

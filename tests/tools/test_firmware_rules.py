@@ -26,12 +26,12 @@ def compiles_as_firmware(tmp_path: Path, source: str) -> bool:
     return result.returncode == 0
 
 
-def test_the_host_build_refuses_floating_point(tmp_path):
+def test_host_build_rejects_floating_point(tmp_path):
     assert compiles_as_firmware(tmp_path, INTEGERS)
     assert not compiles_as_firmware(tmp_path, FLOATING_POINT)
 
 
-def test_the_host_build_of_the_firmware_has_that_option():
+def test_host_build_of_the_firmware_has_that_option():
     assert "target_compile_options(salient_firmware PRIVATE -mgeneral-regs-only)" in (
         ROOT / "firmware/CMakeLists.txt"
     ).read_text()
@@ -67,14 +67,14 @@ def symbol_check(tmp_path: Path, compiler: str, source: str) -> subprocess.Compl
         ("riscv64-unknown-elf", PRINTS, "printf"),
     ],
 )
-def test_the_build_for_a_target_names_the_forbidden_symbol(tmp_path, compiler, source, symbol):
+def test_target_build_names_the_forbidden_symbol(tmp_path, compiler, source, symbol):
     result = symbol_check(tmp_path, compiler, source)
     assert result.returncode != 0
     assert symbol in result.stderr
 
 
 @pytest.mark.parametrize("compiler", TARGETS)
-def test_the_build_for_a_target_accepts_integers(tmp_path, compiler):
+def test_target_build_accepts_integers(tmp_path, compiler):
     assert symbol_check(tmp_path, compiler, INTEGERS).returncode == 0
 
 
@@ -93,7 +93,7 @@ def size_check(tmp_path: Path, bytes_of_table: int, initial: int) -> subprocess.
     )
 
 
-def test_the_cortex_m4_build_stops_at_one_byte_more_than_the_flash(tmp_path):
+def test_cortex_m4_build_fails_at_one_byte_above_the_flash_limit(tmp_path):
     fits = size_check(tmp_path, 900, 100)
     assert fits.returncode == 0
     assert "1000 of 1000 bytes" in fits.stdout

@@ -1,5 +1,5 @@
-"""The firmware's tables of a phase as the generator makes them, read back in double precision: machines whose flux
-linkage is no product of a curve over the angle and one over the current, and magnetics that the tables refuse."""
+"""The firmware's tables of a phase as generated, read back in double precision: machines whose flux linkage is not
+separable in angle and current, and magnetics that the tables cannot represent."""
 
 import math
 import shutil
@@ -19,8 +19,8 @@ HALF_RAD = math.pi / POLES
 
 
 class LocalSaturation:
-    """Poles that overlap over an arc, and saturate at a flux that goes with the overlap: at another current at every
-    angle. psi = Lu i + S o(x) (1 - e^(-b i)), b = (La - Lu) / S (1 + spread (1 - o)), of the overlap o."""
+    """Poles that overlap over an arc, and saturate at a flux proportional to the overlap, so at an angle-dependent
+    current. psi = Lu i + S o(x) (1 - e^(-b i)), b = (La - Lu) / S (1 + spread (1 - o)), of the overlap o."""
 
     pitch_rad = 2.0 * HALF_RAD
     current_max_A = math.inf
@@ -51,11 +51,11 @@ class LocalSaturation:
         return 0.4 * slope * (risen_A + overlap * rate_slope * by_rate)
 
 
-def read_back(tables, surface, place, current_A):
-    """What firmware/control/phase_map.c makes of the tables; place from 0, unaligned, to 1, aligned."""
+def read_back(tables, surface, position, current_A):
+    """Interpolation of firmware/control/phase_map.c in double precision; position from 0, unaligned, to 1, aligned."""
     start = tables.row_start / ROW_UNITS
-    row = np.clip(np.searchsorted(start, place, side="right") - 1, 0, ROWS - 2)
-    u = ((place - start[row]) / (start[row + 1] - start[row]))[:, None]
+    row = np.clip(np.searchsorted(start, position, side="right") - 1, 0, ROWS - 2)
+    u = ((position - start[row]) / (start[row + 1] - start[row]))[:, None]
     bends = surface.bend[row] * 2.0**surface.bend_shift
     rows = surface.node[row] + u * (surface.node[row + 1] - surface.node[row]) - u * (1.0 - u) * bends
     value = np.array([np.interp(current_A, CURRENT_A, at_angle) for at_angle in rows])
@@ -63,21 +63,21 @@ def read_back(tables, surface, place, current_A):
 
 
 def differences(magnetics, current_max_A):
-    """Greatest differences of torque in N m and flux linkage in Wb between tables and machine."""
+    """Maximum differences of torque in N m and flux linkage in Wb between tables and machine."""
     tables = phase_map(magnetics)
-    place = (np.arange(1999) + 0.37) / 2000.0
+    position = (np.arange(1999) + 0.37) / 2000.0
     current_A = np.arange(0.3, current_max_A, 0.4)
     half_rad = magnetics.pitch_rad / 2.0
-    angle_rad = half_rad + half_rad * place[:, None]
-    torque_Nm = read_back(tables, tables.torque_per_ampere, place, current_A)
-    flux_Wb = read_back(tables, tables.flux_per_ampere, place, current_A)
+    angle_rad = half_rad + half_rad * position[:, None]
+    torque_Nm = read_back(tables, tables.torque_per_ampere, position, current_A)
+    flux_Wb = read_back(tables, tables.flux_per_ampere, position, current_A)
     return (
         np.max(np.abs(torque_Nm - magnetics.torque_Nm(angle_rad, current_A))),
         np.max(np.abs(flux_Wb - magnetics.flux_linkage_Wb(angle_rad, current_A))),
     )
 
 
-def test_the_torque_of_the_test_s_machine_is_the_slope_of_its_coenergy():
+def test_torque_of_the_test_machine_is_the_slope_of_its_co_energy():
     magnetics = LocalSaturation()
     angle_rad, step_rad = HALF_RAD * np.linspace(1.05, 1.95, 50), 1e-5
     current_A = np.linspace(0.0, 40.0, 4001)
@@ -89,9 +89,9 @@ def test_the_torque_of_the_test_s_machine_is_the_slope_of_its_coenergy():
     assert np.max(np.abs(slope_Nm - magnetics.torque_Nm(angle_rad, 40.0))) < 1e-4 * np.max(slope_Nm)
 
 
-def test_a_machine_that_saturates_at_another_current_at_every_angle_is_held_within_21_millinewtonmetres():
+def test_angle_dependent_saturation_is_approximated_within_21_millinewton_metres():
     magnetics = LocalSaturation()
-    # No product: the saturation at half overlap is not that of the aligned position, scaled.
+    # Not separable: the saturation at half overlap is not a scaled copy of that at the aligned position.
     halved = magnetics.flux_linkage_Wb(np.array([[0.0], [math.radians(17.0)]]), np.array([5.0, 60.0]))
     assert halved[1, 0] / halved[0, 0] > 1.2 * halved[1, 1] / halved[0, 1]
     torque_Nm, flux_Wb = differences(magnetics, 30.0)
@@ -99,7 +99,7 @@ def test_a_machine_that_saturates_at_another_current_at_every_angle_is_held_with
     assert 110e-6 < flux_Wb < 140e-6
 
 
-def test_rows_stand_closest_where_the_torque_bends_most():
+def test_rows_are_densest_where_the_torque_curvature_is_largest():
     start_deg = 45.0 * phase_map(load_machine(MACHINES / "linear_trapezoid.toml").magnetics).row_start / ROW_UNITS
     for corner_deg in (1.0, 3.0, 42.0, 44.0):
         assert np.min(np.abs(start_deg - corner_deg)) < 0.003, corner_deg
@@ -120,7 +120,7 @@ class Scaled:
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 100.0])
-def test_the_format_follows_the_machine(factor):
+def test_format_depends_on_the_range_of_the_machine(factor):
     machine = load_machine(MACHINES / "saturating.toml").magnetics
     tables = phase_map(Scaled(machine, factor))
     for surface in (tables.torque_per_ampere, tables.flux_per_ampere):
@@ -131,7 +131,7 @@ def test_the_format_follows_the_machine(factor):
         assert 0 <= surface.result_shift <= 12
 
 
-def test_a_weak_machine_has_the_finest_format():
+def test_weak_machine_has_the_finest_format():
     machine = load_machine(MACHINES / "saturating.toml").magnetics
     tables = phase_map(Scaled(machine, 0.01))
     for surface in (tables.torque_per_ampere, tables.flux_per_ampere):
@@ -139,7 +139,7 @@ def test_a_weak_machine_has_the_finest_format():
         assert 500 < np.max(surface.node) < 5000
 
 
-def test_what_the_tables_cannot_hold_is_refused_in_one_line():
+def test_unrepresentable_machine_is_rejected_in_one_line():
     machine = load_machine(MACHINES / "saturating.toml").magnetics
     with pytest.raises(PhaseMapError, match=r"^[0-9.]+ N m/A of torque is more than the firmware's tables hold$"):
         phase_map(Scaled(machine, 2000.0))
@@ -149,7 +149,7 @@ def test_what_the_tables_cannot_hold_is_refused_in_one_line():
 
 @pytest.fixture
 def strong_machine(tmp_path):
-    """A file of allowed numbers whose torque is beyond the tables."""
+    """A file of valid numbers whose torque exceeds the range of the tables."""
     text = (MACHINES / "linear_cosine.toml").read_text(encoding="utf-8")
     text = text.replace("stator = 6", "stator = 12").replace("rotor = 4", "rotor = 8")
     path = tmp_path / "strong.toml"
@@ -157,19 +157,19 @@ def strong_machine(tmp_path):
     return path
 
 
-def test_the_build_step_names_the_file_that_it_refuses(strong_machine, tmp_path, capsys):
+def test_build_step_names_the_rejected_file(strong_machine, tmp_path, capsys):
     assert generate_machine.main([str(strong_machine), str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"salient: {strong_machine}: magnetics: ") and said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert output.startswith(f"salient: {strong_machine}: magnetics: ") and output.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
-def test_a_refused_machine_is_named_before_anything_is_built(strong_machine):
+def test_rejected_machine_is_named_before_anything_is_built(strong_machine):
     with pytest.raises(UsageError, match=r"strong\.toml: magnetics: [0-9]+ N m/A of torque is more than"):
         executable(str(strong_machine))
 
 
-def test_a_map_that_ends_early_is_levelled_where_its_straight_continuation_loses_torque(tmp_path):
+def test_map_that_ends_early_is_levelled_where_linear_extrapolation_loses_torque(tmp_path):
     lines = (MACHINES / "finite_element.csv").read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines if not line[0].isdigit() or float(line.split(",")[1]) <= 20.0]
     (tmp_path / "finite_element.csv").write_text("\n".join([*kept, ""]), encoding="utf-8")
@@ -178,7 +178,7 @@ def test_a_map_that_ends_early_is_levelled_where_its_straight_continuation_loses
     half_rad = magnetics.pitch_rad / 2.0
     angle_rad = half_rad + half_rad * np.linspace(0.0, 1.0, 100)[:, None]
     assert magnetics.current_max_A == 20.0
-    assert np.min(np.diff(magnetics.torque_Nm(angle_rad, CURRENT_A), axis=1)) < -1.0, "what is to be levelled"
-    torque = phase_map(magnetics).torque_per_ampere.node * CURRENT_A  # N m, in units of the last place
-    assert np.all(np.diff(torque, axis=1) >= -0.5 * (CURRENT_A[1:] + CURRENT_A[:-1])), "but for rounding of T / i"
+    assert np.min(np.diff(magnetics.torque_Nm(angle_rad, CURRENT_A), axis=1)) < -1.0, "no loss to level"
+    torque = phase_map(magnetics).torque_per_ampere.node * CURRENT_A  # N m, in LSB
+    assert np.all(np.diff(torque, axis=1) >= -0.5 * (CURRENT_A[1:] + CURRENT_A[:-1])), "beyond rounding of T / i"
     assert differences(magnetics, 18.0)[0] < 0.02

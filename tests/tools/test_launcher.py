@@ -1,4 +1,4 @@
-"""Mistakes of the caller: one line that names the mistake and the values allowed, and exit code 2."""
+"""Usage errors: one line that names the error and the valid values, and exit code 2."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ duration_s = 0.01
 """
 
 
-def assert_mistake(result, *words: str) -> None:
+def assert_usage_error(result, *expected_texts: str) -> None:
     assert result.returncode == 2, result
     assert result.stdout == ""
     assert re.fullmatch(r"salient: [^\n]+\n", result.stderr), result.stderr
-    for word in words:
-        assert word in result.stderr
+    for expected in expected_texts:
+        assert expected in result.stderr
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "expected_texts"),
     [
         ([], ["COMMAND"]),
         (["fly"], ["fly", "must be one of demo, test, sim, run, log, monitor, benchmark"]),
@@ -59,12 +59,12 @@ def assert_mistake(result, *words: str) -> None:
     ],
     ids=lambda value: "-".join(value) if isinstance(value, list) else None,
 )
-def test_wrong_command_line(salient, arguments, words):
-    assert_mistake(salient(*arguments), *words)
+def test_invalid_command_line_is_rejected(salient, arguments, expected_texts):
+    assert_usage_error(salient(*arguments), *expected_texts)
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "expected_texts"),
     [
         (SCENARIO + "duration = 1\n", ["duration", "unknown key", "duration_s"]),
         (SCENARIO.replace("0.01", "-1"), ["duration_s", "-1", "0.001 to 3600"]),
@@ -88,10 +88,10 @@ def test_wrong_command_line(salient, arguments, words):
         (SCENARIO + "seed = " + 20000 * "[", ["not TOML", "too deep"]),
     ],
 )
-def test_wrong_scenario(salient_without_build, tmp_path, text, words):
+def test_invalid_scenario_is_rejected(salient_without_build, tmp_path, text, expected_texts):
     path = tmp_path / "scenario.toml"
     path.write_text(text)
-    assert_mistake(salient_without_build("run", path, "--out", tmp_path / "out"), *words)
+    assert_usage_error(salient_without_build("run", path, "--out", tmp_path / "out"), *expected_texts)
 
 
 def machine_file(folder: Path, name: str, old: str, new: str) -> Path:
@@ -103,7 +103,7 @@ def machine_file(folder: Path, name: str, old: str, new: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "expected_texts"),
     [
         ("resistance_ohm", "resistence_ohm", ["winding.resistence_ohm", "unknown key", "resistance_ohm"]),
         ("inertia_kg_m2 = 0.02", "inertia_kg_m2 = -0.02", ["mechanics.inertia_kg_m2", "-0.02"]),
@@ -113,37 +113,37 @@ def machine_file(folder: Path, name: str, old: str, new: str) -> Path:
         ("[converter]", "[converter", ["not TOML"]),
     ],
 )
-def test_wrong_machine_file(salient_without_build, tmp_path, old, new, words):
+def test_invalid_machine_file_is_rejected(salient_without_build, tmp_path, old, new, expected_texts):
     path = machine_file(tmp_path, "mine", old, new)
-    assert_mistake(salient_without_build("sim", "--machine", path), str(path), *words)
+    assert_usage_error(salient_without_build("sim", "--machine", path), str(path), *expected_texts)
 
 
-def test_machine_file_with_the_name_of_a_bundled_machine(salient, tmp_path):
+def test_machine_file_with_the_name_of_a_bundled_machine_is_rejected(salient, tmp_path):
     path = machine_file(tmp_path, "saturating", "stator", "stator")
-    assert_mistake(salient("sim", "--machine", path), str(path), "rename the file")
+    assert_usage_error(salient("sim", "--machine", path), str(path), "rename the file")
 
 
-def test_bus_in_use(salient, make_bench):
+def test_bus_in_use_is_reported(salient, make_bench):
     bench = make_bench()
-    assert_mistake(salient("sim", "--can", bench.address), bench.address.removeprefix("unix:"))
+    assert_usage_error(salient("sim", "--can", bench.address), bench.address.removeprefix("unix:"))
 
 
-def test_missing_compiler(salient, tmp_path):
+def test_missing_compiler_is_reported(salient, tmp_path):
     tools = tmp_path / "bin"
     tools.mkdir()
     for tool in ("sh", "dirname", "readlink", "python3"):
         (tools / tool).symlink_to(shutil.which(tool, path="/usr/bin:/bin"))
-    assert_mistake(salient("sim", "--no-install", PATH=str(tools)), "missing", "gcc (compiler)", "--no-install")
+    assert_usage_error(salient("sim", "--no-install", PATH=str(tools)), "missing", "gcc (compiler)", "--no-install")
 
 
-def test_missing_python(salient, tmp_path):
+def test_missing_python_is_reported(salient, tmp_path):
     """Without a Python that is new enough the shell part of the launcher reports it."""
     text = (ROOT / "tools" / "salient").read_text()
     copy = tmp_path / "salient"
     copy.write_text(text.replace("/usr/bin/python3 python3", "/nonexistent/python3"))
     copy.chmod(0o755)
     result = subprocess.run([copy, "sim", "--no-install"], capture_output=True, text=True, env=os.environ)
-    assert_mistake(result, "python3", "python3-venv")
+    assert_usage_error(result, "python3", "python3-venv")
 
 
 @pytest.mark.xdist_group("machine_builds")
@@ -163,7 +163,7 @@ def test_two_processes_build_for_machine_files_of_the_user_simultaneously(tmp_pa
 
 
 @pytest.mark.xdist_group("machine_builds")
-def test_machine_file_of_the_user(make_bench, tmp_path):
+def test_machine_file_of_the_user_is_built_on_demand(make_bench, tmp_path):
     """A file with half the inertia is built on demand, and its motor accelerates about twice as fast."""
     path = machine_file(tmp_path, "half_inertia", "inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.01")
     speeds = []

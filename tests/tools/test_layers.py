@@ -1,7 +1,7 @@
-"""Includes of C and imports of Python lead from higher layers to lower ones, and never in a circle.
+"""Includes of C and imports of Python point from higher layers to lower ones, without cycles.
 
-Layers are listed from the lowest to the highest; a file belongs to the longest entry that its path or module name
-begins with. Lazy imports and those under TYPE_CHECKING count.
+Layers are listed from the lowest to the highest; a file belongs to the longest entry that is a prefix of its
+path or module name. Lazy imports and those under TYPE_CHECKING count.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PYTHON_LAYERS = (
 
 
 def includes(root: Path) -> Graph:
-    """Files of the C layers, each with those of the tree that it includes."""
+    """Files of the C layers, each with the files of the tree that it includes."""
     tops = (root / "hal", root / "firmware", root / "emulator")
     files = {str(path.relative_to(root)) for top in tops for path in top.rglob("*.[ch]")}
     graph = {}
@@ -49,7 +49,7 @@ def includes(root: Path) -> Graph:
 
 
 def imports(package: Path) -> Graph:
-    """Modules of a package, each with those of the package that it imports."""
+    """Modules of a package, each with the modules of the package that it imports."""
     paths = {".".join(path.relative_to(package.parent).with_suffix("").parts): path for path in package.rglob("*.py")}
     modules = {name.removesuffix(".__init__"): path for name, path in paths.items()}
     graph = {}
@@ -80,7 +80,7 @@ def upwards(graph: Graph, layers: Sequence[str], separator: str) -> Iterator[str
 
 
 def circle(graph: Graph) -> list[str]:
-    """A circle of the graph, or nothing."""
+    """A cycle of the graph, or an empty list."""
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -89,7 +89,7 @@ def circle(graph: Graph) -> list[str]:
 
 
 def crossings(graph: Graph) -> Iterator[str]:
-    """Includes that the order of layers allows and the design does not: firmware of a port, emulator of firmware."""
+    """Includes that the order of layers allows and the design forbids: firmware of a port, emulator of firmware."""
     for source, targets in sorted(graph.items()):
         for target in sorted(targets):
             if source.startswith("firmware/") and target.startswith("hal/qemu/"):
@@ -99,7 +99,7 @@ def crossings(graph: Graph) -> Iterator[str]:
                     yield f"{source} -> {target}"
 
 
-def test_includes() -> None:
+def test_includes_follow_the_layers() -> None:
     graph = includes(ROOT)
     assert "emulator/rig/rig.h" in graph["emulator/rig/rig.c"] and "hal/hal.h" in graph["hal/hal_adc.h"]
     assert list(upwards(graph, C_LAYERS, "/")) == []
@@ -107,7 +107,7 @@ def test_includes() -> None:
     assert circle(graph) == []
 
 
-def test_imports() -> None:
+def test_imports_follow_the_layers() -> None:
     graph = imports(ROOT / "tools" / "src" / "salient")
     assert "salient.bench.session" in graph["salient.bench.bench"]
     assert list(upwards(graph, PYTHON_LAYERS, ".")) == []
@@ -130,7 +130,7 @@ def test_forbidden_include_is_found(tmp_path: Path, file: str, line: str, found:
     assert [*upwards(graph, C_LAYERS, "/"), *crossings(graph)] == [found]
 
 
-def test_circle_of_includes_is_found(tmp_path: Path) -> None:
+def test_cyclic_include_is_found(tmp_path: Path) -> None:
     (tmp_path / "hal").mkdir()
     (tmp_path / "hal" / "a.h").write_text('#include "b.h"\n')
     (tmp_path / "hal" / "b.h").write_text('#include "a.h"\n')

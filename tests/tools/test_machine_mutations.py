@@ -130,7 +130,7 @@ def rejection(path: Path) -> str | None:
 
 
 def assert_is_a_machine(machine: Machine) -> None:
-    """Finite numbers of the right sign, and magnetics that are those of a reluctance machine."""
+    """Finite numbers of the right sign, and magnetics of a reluctance machine."""
     assert machine.name.isidentifier()
     assert (machine.stator_poles, machine.rotor_poles, machine.phases) in ((6, 4, 3), (8, 6, 4), (12, 8, 3))
     numbers = dataclasses.asdict(dataclasses.replace(machine, magnetics=None))
@@ -256,7 +256,7 @@ def other_cases() -> list[Case]:
 MACHINE_CASES = key_cases() + table_cases() + other_cases()
 
 
-def test_the_unmutated_files_are_machines(tmp_path: Path) -> None:
+def test_unmutated_files_are_valid_machines(tmp_path: Path) -> None:
     assert rejection(write(tmp_path, GOOD)) is None
     assert rejection(write(tmp_path, MAP_MACHINE, GOOD_MAP)) is None
 
@@ -268,7 +268,7 @@ def test_every_mutation_of_a_key_or_table_is_rejected_by_one_line_that_names_it(
     assert not wrong, wrong
 
 
-def test_a_machine_file_cut_anywhere_is_rejected_or_still_a_machine(tmp_path: Path) -> None:
+def test_truncated_machine_file_is_rejected_or_still_valid(tmp_path: Path) -> None:
     messages = [rejection(write(tmp_path, GOOD.encode()[:end])) for end in range(len(GOOD))]
     # After the last required key, [converter] supply_voltage_V, only a cut number can stay valid.
     needed = GOOD.index("switch_drop_V")
@@ -277,7 +277,7 @@ def test_a_machine_file_cut_anywhere_is_rejected_or_still_a_machine(tmp_path: Pa
 
 
 @pytest.mark.parametrize("good", [GOOD, MAP_MACHINE], ids=["formula", "map"])
-def test_flipped_bytes_of_a_machine_file_are_rejected_or_still_a_machine(tmp_path: Path, good: str) -> None:
+def test_machine_file_with_flipped_bytes_is_rejected_or_still_valid(tmp_path: Path, good: str) -> None:
     chance = random.Random(SEED)
     rejected = 0
     for _ in range(600):
@@ -287,7 +287,7 @@ def test_flipped_bytes_of_a_machine_file_are_rejected_or_still_a_machine(tmp_pat
     assert 300 < rejected < 600
 
 
-def test_an_unreadable_file_is_rejected(tmp_path: Path) -> None:
+def test_unreadable_file_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / f"{NAME}.toml"
     assert "no such file" in rejection(path)
     path.mkdir()
@@ -308,7 +308,7 @@ def test_an_unreadable_file_is_rejected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["", ".", "/", "x" * 5000, "a\nb", "a\0b", "pipe", "itself"])
-def test_an_unknown_machine_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_unknown_machine_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
     Path("itself").symlink_to("itself")
@@ -322,7 +322,7 @@ def test_an_unknown_machine_is_rejected(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def row(angle: int, current: int) -> int:
-    """Place of a row in ROWS."""
+    """Index of a row in ROWS."""
     return angle * len(CURRENTS_A) + current
 
 
@@ -338,7 +338,7 @@ def scaled(column: int, factor: float) -> list[str]:
 
 
 def row_cases(chance: random.Random) -> list[tuple[str, str, str]]:
-    """(what was done, map, what the rejection must name): the kinds of mistakes, each in some rows picked at random."""
+    """(what was done, map, what the rejection must name): kinds of errors, each in randomly selected rows."""
     cases = []
     for at in sorted(chance.sample(range(1, len(ROWS) - 1), 12)):
         angle, current, flux = ROWS[at].split(",")
@@ -351,7 +351,7 @@ def row_cases(chance: random.Random) -> list[tuple[str, str, str]]:
             "decimal comma": f"{angle},{current},{flux.replace('.', ',')}",
             "empty cell": f"{angle},,{flux}",
             "text": f"{angle},{current},much",
-            "unit behind the number": f"{angle},{current},{flux} Wb",
+            "unit after the number": f"{angle},{current},{flux} Wb",
             "nan": f"{angle},{current},nan",
             "infinite": f"{angle},inf,{flux}",
             "negative flux linkage": f"{angle},{current},-{flux}",
@@ -428,7 +428,7 @@ def test_every_mutation_of_a_map_is_rejected_by_one_line_that_names_its_row(tmp_
     assert not wrong, wrong
 
 
-def test_a_map_cut_anywhere_is_rejected_or_still_a_machine(tmp_path: Path) -> None:
+def test_truncated_map_is_rejected_or_still_valid(tmp_path: Path) -> None:
     data = GOOD_MAP.encode()
     last_angle = GOOD_MAP.rindex("\n45,8,")
     for end in range(0, last_angle, 13):
@@ -437,7 +437,7 @@ def test_a_map_cut_anywhere_is_rejected_or_still_a_machine(tmp_path: Path) -> No
     assert sum(text is not None for text in messages) > 0.5 * len(messages)
 
 
-def test_flipped_bytes_of_a_map_are_rejected_or_still_a_machine(tmp_path: Path) -> None:
+def test_map_with_flipped_bytes_is_rejected_or_still_valid(tmp_path: Path) -> None:
     chance = random.Random(SEED)
     rejected = 0
     for _ in range(300):
@@ -447,7 +447,7 @@ def test_flipped_bytes_of_a_map_are_rejected_or_still_a_machine(tmp_path: Path) 
     assert 150 < rejected < 300
 
 
-def test_rows_left_out_by_chance_are_rejected_or_still_a_machine(tmp_path: Path) -> None:
+def test_map_without_random_rows_is_rejected_or_still_valid(tmp_path: Path) -> None:
     chance = random.Random(SEED)
     messages = []
     for _ in range(60):
@@ -461,7 +461,7 @@ def test_rows_left_out_by_chance_are_rejected_or_still_a_machine(tmp_path: Path)
     ["nosuch.csv", "../nosuch.csv", "/nosuch/x.csv", "folder.csv", "pipe.csv", "zeros.csv", "itself.csv", "sparse.csv",
      "mutant.toml", "", "x.txt", "x" * 300 + ".csv", "a\\u0000b.csv", "a\\nb.csv", "3"],
 )  # fmt: skip
-def test_an_unreadable_map_is_rejected(tmp_path: Path, file: str) -> None:
+def test_unreadable_map_is_rejected(tmp_path: Path, file: str) -> None:
     (tmp_path / "folder.csv").mkdir()
     os.mkfifo(tmp_path / "pipe.csv")
     (tmp_path / "zeros.csv").symlink_to("/dev/zero")
@@ -496,7 +496,7 @@ def built() -> set[str]:
 
 
 def still_runs(words: str) -> bool:
-    """Another process than this one has words in its command line."""
+    """Another process has these texts in its command line."""
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
             if path.parent.name != str(os.getpid()) and words in path.read_bytes().decode(errors="replace"):
@@ -507,7 +507,7 @@ def still_runs(words: str) -> bool:
 
 
 @pytest.mark.parametrize("case", COMMAND_CASES)
-def test_commands_end_with_one_line_and_code_2_and_build_nothing(
+def test_commands_end_with_one_line_and_exit_code_2_and_build_nothing(
     salient: Callable, tmp_path: Path, case: str
 ) -> None:
     text, flux_map, named = COMMAND_CASES[case]

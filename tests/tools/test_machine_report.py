@@ -1,4 +1,4 @@
-"""salient machine, and the reference of the machine file that users read."""
+"""salient machine, and the documentation of the machine file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from salient.paths import MACHINES
 READ_ME = (MACHINES / "README.md").read_text(encoding="utf-8")
 
 
-def test_every_key_of_a_machine_file_is_in_the_reference_and_no_other():
+def test_reference_lists_exactly_the_keys_of_a_machine_file():
     tables = [machine.Poles, machine.Winding, machine.Mechanics, machine.Converter, machine.DcLink, machine.Sensors,
               machine.IronLoss, *machine.MAGNETICS.values()]
     keys = {key for table in tables for key in table.model_fields} | {"name"}
@@ -21,16 +21,16 @@ def test_every_key_of_a_machine_file_is_in_the_reference_and_no_other():
     assert set(re.findall(r"`(\w+)`", "".join(rows))) == keys
 
 
-def test_every_shipped_machine_is_in_the_reference_and_no_other():
-    table = READ_ME.partition("| shipped |")[2].partition("## Keys")[0]
+def test_reference_lists_exactly_the_bundled_machines():
+    table = READ_ME.partition("| bundled |")[2].partition("## Keys")[0]
     rows = [row.split("|")[1] for row in table.splitlines() if row.startswith("| `")]
     assert set(re.findall(r"`(\w+)`", "".join(rows))) == {path.stem for path in MACHINES.glob("*.toml")}
 
 
-def test_a_shipped_machine_is_described_and_drawn(salient, tmp_path):
+def test_bundled_machine_is_described_and_plotted(salient, tmp_path):
     result = salient("machine", "saturating", "--out", tmp_path / "view")
     assert result.returncode == 0, result.stderr
-    # Check values of the machine's source.
+    # Check values from the source of the machine.
     assert "6/4 poles, 3 phases" in result.stdout
     assert "23.60 mH aligned, 0.67 mH unaligned" in result.stdout
     assert "1.82 N m at 10 A, 6.17 N m at 20 A, 11.9 N m at 30 A, 25.3 N m at 50 A" in result.stdout
@@ -38,7 +38,7 @@ def test_a_shipped_machine_is_described_and_drawn(salient, tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 20_000
 
 
-def test_what_a_file_says_of_converter_and_sensors_is_described():
+def test_converter_and_sensors_of_a_file_are_described():
     for path in MACHINES.glob("*.toml"):
         data = tomllib.loads(path.read_text())
         text = "\n".join(describe(machine.load_machine(path)))
@@ -48,7 +48,7 @@ def test_what_a_file_says_of_converter_and_sensors_is_described():
         assert ("converter   ideal" in text) == (len(data["converter"]) == 1)
 
 
-def test_a_file_that_is_wrong_is_one_line_and_exit_code_2(salient, tmp_path):
+def test_invalid_file_is_one_line_and_exit_code_2(salient, tmp_path):
     wrong = tmp_path / "wrong.toml"
     wrong.write_text((MACHINES / "saturating.toml").read_text().replace("stator = 6", "stator = 5"))
     result = salient("machine", wrong, "--out", tmp_path / "view")

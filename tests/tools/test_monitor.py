@@ -1,4 +1,4 @@
-"""tools/salient log and monitor: what they record and print, and how they end."""
+"""tools/salient log and monitor: recordings, output and termination."""
 
 from __future__ import annotations
 

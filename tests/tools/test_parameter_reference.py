@@ -1,15 +1,15 @@
-"""The parameter table: the reference page follows from it, and every row has what a reader needs."""
+"""The parameter table: the reference page is generated from it, and every row is complete."""
 
 from __future__ import annotations
 
 from salient.generate.parameters import PAGE, page, read_table
 
 
-def test_the_reference_page_is_that_of_the_table():
+def test_reference_page_is_generated_from_the_table():
     assert PAGE.read_text(encoding="utf-8") == page(), "run python -m salient.generate.parameters"
 
 
-def test_every_parameter_is_explained():
+def test_every_parameter_has_a_description():
     rows = read_table()
     assert len({row.text for row in rows}) == len(rows) == 52
     for row in rows:

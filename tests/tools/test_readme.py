@@ -47,13 +47,13 @@ CASES = [pytest.param(blocks, id=f"{path.relative_to(ROOT)}: {title}")
          for path in DOCUMENTS if path.exists() for title, blocks in sections(path)]
 
 
-def test_the_main_readme_has_commands_and_a_drive_to_watch() -> None:
+def test_main_readme_has_commands_and_starts_a_drive() -> None:
     blocks = [block for _, blocks in sections(ROOT / "README.md") for block in blocks]
     assert any("tools/salient sim" in block and BUS in block for block in blocks)
 
 
 @pytest.mark.parametrize("blocks", CASES)
-def test_commands_of_a_section(tmp_path: Path, blocks: list[str]) -> None:
+def test_commands_of_a_section_succeed(tmp_path: Path, blocks: list[str]) -> None:
     simulators: list[subprocess.Popen[str]] = []
     try:
         for block in blocks:

@@ -186,7 +186,7 @@ def test_rounding_keeps_six_digits_and_all_other_types():
     assert results.rounded(given) == {"a": 1.23457e-7, "b": [150.0, 3], "c": None, "d": "x", "e": {"f": 0.3}}
 
 
-def test_not_a_number_is_not_written(tmp_path):
+def test_nan_is_not_written(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
         results.write_results(tmp_path / "results.json", {"a": float("nan")})
 

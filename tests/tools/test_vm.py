@@ -52,7 +52,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_command_has_vcan0_and_files_and_returns_output_and_exit_code(tmp_path: Path) -> None:
+def test_command_has_vcan0_and_files_and_returns_output_and_exit_code(tmp_path: Path) -> None:
     result_file = tmp_path / "result, of the VM"
     python = os.path.realpath(sys.executable)  # the virtual environment may be in a folder that the VM does not mount
     odd = "a  b'c\"$d"
@@ -63,7 +63,7 @@ def test_a_command_has_vcan0_and_files_and_returns_output_and_exit_code(tmp_path
     assert result_file.read_text() == "written in the VM"
 
 
-def test_the_time_limit_ends_the_vm_with_one_line() -> None:
+def test_time_limit_ends_the_vm_with_one_line() -> None:
     outcome = run("--timeout-s", "0.1", "--", "true")  # far less than the kernel needs
     assert outcome.returncode == 1
     assert outcome.stderr.splitlines()[-1] == (
@@ -71,7 +71,7 @@ def test_the_time_limit_ends_the_vm_with_one_line() -> None:
     )
 
 
-def test_a_missing_folder_is_named() -> None:
+def test_missing_folder_is_named() -> None:
     outcome = run("--write", "/no/such/folder", "--", "true")
     assert outcome.returncode == 2
     assert "--write /no/such/folder: not a folder" in outcome.stderr
