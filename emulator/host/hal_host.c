@@ -82,7 +82,7 @@ uint32_t hal_time_us(const hal_t *hal) {
     return (uint32_t)(hal->board->time_ns / 1000);
 }
 
-/* One thread: the interrupt cannot pre-empt the background. Only the pairing of the calls is checked. */
+/* One thread: the interrupt cannot interrupt the background. Only the pairing of the calls is checked. */
 void hal_critical_enter(hal_t *hal) {
     require(hal, false, __func__);
     if (hal->board->in_critical_section) {

@@ -128,5 +128,4 @@ void control_prepare(const control_parameters_t *parameters, control_state_t *st
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare);
 
-
 #endif
