@@ -24,8 +24,8 @@
 
 typedef struct {
     double current_max_A;
-    double least_inductance_H; /* of the incremental ones, > 0 */
-    double current_scale_A;    /* over which the inductance changes, at most four steps: limits an integrator's */
+    double inductance_min_H; /* of the incremental ones, > 0 */
+    double current_scale_A;  /* over which the inductance changes, at most four steps: limits an integrator's */
     /* Coefficients of W: entry [j][k] belongs to the product of the B-splines that start at current step j - 4 and at
      * angle step k - 3. */
     double coenergy_J[FLUX_MAP_CURRENT_INTERVALS + 4][FLUX_MAP_ANGLE_INTERVALS + 3];

@@ -46,7 +46,7 @@ typedef struct {
 typedef struct {
     magnetics_form_t form;
     double unaligned_inductance_H;
-    double least_inductance_H;              /* of the incremental ones, at any angle and current */
+    double inductance_min_H;                /* of the incremental ones, at any angle and current */
     double saturation_A;                    /* over which the incremental inductance changes; infinite: it does not */
     double linear_excess_H;                 /* (g(i) - Lu i) / i without the exponential part: La - Lu or Ls - Lu */
     double saturating_Wb;                   /* A; from here to the table only in the saturating form */

@@ -9,22 +9,17 @@
 #include <math.h>
 #include <stdint.h>
 
+#include "plant/exponential.h"
 #include "plant/flux_map_kernel.h"
 #include "plant/magnetics.h"
 
-/* Adding and subtracting it rounds to the nearest integer, for magnitudes below 2^51. */
-#define MAGNETICS_ROUNDING_SHIFT 0x1.8p52
-
-/* e^x for -700 <= x <= 700, relative error below 3e-16; 0 below that range. */
-double magnetics_exponential(double x);
-
 /* e^(-b i), relative error below 1e-15: the table's nearest entry times a series of what remains, abs <= 1/128. */
 MAGNETICS_INLINE double magnetics_kernel_decay(const magnetics_model_t *model, double current_A) {
-    const double shift_A = MAGNETICS_ROUNDING_SHIFT * model->decay_step_A;
+    const double shift_A = ROUNDING_SHIFT * model->decay_step_A;
     const double nearest_A = (current_A + shift_A) - shift_A;
     const int64_t step = (int64_t)(nearest_A * model->decay_steps_per_A);
     if (step < 0 || step >= MAGNETICS_DECAY_STEPS) {
-        return magnetics_exponential(-model->saturation_1_A * current_A);
+        return exponential(-model->saturation_1_A * current_A);
     }
     const double x = model->saturation_1_A * (nearest_A - current_A), x2 = x * x;
     return model->decay[step] * ((1.0 + x) + x2 * ((0.5 + x * (1.0 / 6.0)) + x2 * (1.0 / 24.0 + x * (1.0 / 120.0))));
@@ -77,8 +72,7 @@ MAGNETICS_INLINE void magnetics_kernel_trapezoid(const magnetics_model_t *model,
 
 /* The same phase angle within -half a pitch .. half a pitch. */
 MAGNETICS_INLINE double magnetics_kernel_wrap(const magnetics_model_t *model, double phase_angle_rad) {
-    const double pitches =
-        (phase_angle_rad * model->pitches_per_rad + MAGNETICS_ROUNDING_SHIFT) - MAGNETICS_ROUNDING_SHIFT;
+    const double pitches = (phase_angle_rad * model->pitches_per_rad + ROUNDING_SHIFT) - ROUNDING_SHIFT;
     return phase_angle_rad - pitches * model->pitch_rad;
 }
 

@@ -72,7 +72,7 @@ void plant_set_supply_voltage(plant_t *plant, double voltage_V) {
 
 void plant_set_step_factor(plant_t *plant, double factor) {
     double time_constant_s =
-        fmin(plant->magnetics.least_inductance_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
+        fmin(plant->magnetics.inductance_min_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
              plant->inertia_kg_m2 / plant->friction_Nm_s);
     if (has_link(plant)) {
         const dc_link_t *link = &plant->machine->dc_link;

@@ -38,8 +38,8 @@ void server_init(rig_t *rig) {
 static void send_clock(rig_t *rig, uint8_t sequence) {
     struct rig_clock_t clock = {.sequence = sequence};
     rig_clock_set_time_ns(&clock, (int64_t)rig->board.time_ns);
-    transport_frame_t frame = {
-        .size = CAN_MTU, .classic = {.can_id = RIG_CLOCK_FRAME_ID | CAN_EFF_FLAG, .len = RIG_CLOCK_LENGTH}};
+    transport_frame_t frame = {.size = CAN_MTU,
+                               .classic = {.can_id = RIG_CLOCK_FRAME_ID | CAN_EFF_FLAG, .len = RIG_CLOCK_LENGTH}};
     rig_clock_pack(frame.classic.data, &clock, RIG_CLOCK_LENGTH);
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_CLOCK, &frame);
 }
@@ -73,11 +73,9 @@ static void take_run_until(rig_t *rig, uint32_t client, const uint8_t *data) {
 
 static void take_set(rig_t *rig, const uint8_t *data) {
     const stimulus_reply_t result = stimulus_receive(rig, data);
-    const struct rig_set_reply_t reply = {
-        .quantity = result.variable, .status = result.status, .at_us = result.at_us};
+    const struct rig_set_reply_t reply = {.quantity = result.variable, .status = result.status, .at_us = result.at_us};
     transport_frame_t frame = {
-        .size = CAN_MTU,
-        .classic = {.can_id = RIG_SET_REPLY_FRAME_ID | CAN_EFF_FLAG, .len = RIG_SET_REPLY_LENGTH}};
+        .size = CAN_MTU, .classic = {.can_id = RIG_SET_REPLY_FRAME_ID | CAN_EFF_FLAG, .len = RIG_SET_REPLY_LENGTH}};
     rig_set_reply_pack(frame.classic.data, &reply, RIG_SET_REPLY_LENGTH);
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_EMULATOR, &frame);
 }

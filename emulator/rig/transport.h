@@ -5,25 +5,15 @@
 #ifndef RIG_TRANSPORT_H
 #define RIG_TRANSPORT_H
 
-#include <linux/can.h>
 #include <poll.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 
-#include "hal_can.h"
+#include "rig/transport_frame.h"
 
 #define TRANSPORT_DESCRIPTORS_MAX 72
 #define TRANSPORT_ERROR_SIZE 256
-
-/* One frame in Linux's layout; `size` selects the member. */
-typedef struct {
-    size_t size; /* CAN_MTU (classic) or CANFD_MTU (flexible data rate) */
-    union {
-        struct can_frame classic;
-        struct canfd_frame flexible;
-    };
-} transport_frame_t;
 
 /* Origin of a frame that is sent to the clients; it determines how the frame's time is conveyed. */
 typedef enum {
@@ -112,17 +102,5 @@ transport_t *transport_socketcan_open(const char *interface, char error[TRANSPOR
 /* SocketCAN over a descriptor that is open already and keeps record boundaries (for tests: one end of a socket pair
  * stands in for an interface). Takes the descriptor over. */
 transport_t *transport_socketcan_attach(int descriptor);
-
-/* True when `received` bytes are a frame. Fields without meaning are then zeroed, so that equal frames are equal bytes:
- * reserved fields and data beyond the length. A classic length of 9 to 15 becomes length 8 with len8_dlc. */
-bool transport_frame_accept(transport_frame_t *frame, size_t received);
-
-/* Never on the emulated bus: flexible data rate, error frames and the rig's identifiers (0x1F0000xx, 29 bits). */
-bool transport_frame_is_rig(const transport_frame_t *frame);
-bool transport_frame_is_off_bus(const transport_frame_t *frame);
-
-/* Between the wire's form and the controller's; classic data and remote frames only. */
-void transport_frame_to_hal(const transport_frame_t *frame, hal_can_frame_t *hal);
-void transport_frame_from_hal(const hal_can_frame_t *hal, transport_frame_t *frame);
 
 #endif

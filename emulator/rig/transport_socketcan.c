@@ -104,8 +104,8 @@ static void send_timestamp(socketcan_t *can, uint64_t time_ns, uint8_t subject) 
     struct rig_stamp_t timestamp;
     rig_stamp_set_time_ns(&timestamp, (int64_t)time_ns);
     timestamp.subject = subject;
-    transport_frame_t frame = {
-        .size = CAN_MTU, .classic = {.can_id = RIG_STAMP_FRAME_ID | CAN_EFF_FLAG, .len = RIG_STAMP_LENGTH}};
+    transport_frame_t frame = {.size = CAN_MTU,
+                               .classic = {.can_id = RIG_STAMP_FRAME_ID | CAN_EFF_FLAG, .len = RIG_STAMP_LENGTH}};
     rig_stamp_pack(frame.classic.data, &timestamp, RIG_STAMP_LENGTH);
     send_frame(can, &frame);
 }

@@ -3,7 +3,7 @@
 #define RIG_TRUTH_H
 
 #include "plant/plant.h"
-#include "rig/transport.h"
+#include "rig/transport_frame.h"
 
 #define TRUTH_FRAMES 3
 

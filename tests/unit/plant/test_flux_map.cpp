@@ -57,7 +57,7 @@ class FluxMap : public testing::Test {
   protected:
     FluxMap() : map(std::make_unique<flux_map_t>()) {
         map->current_max_A = CURRENT_MAX_A;
-        map->least_inductance_H = 1e-4;
+        map->inductance_min_H = 1e-4;
         map->current_scale_A = 25.0;
         for (int j = 0; j < FLUX_MAP_CURRENT_INTERVALS + 4; j++) {
             for (int k = 0; k < FLUX_MAP_ANGLE_INTERVALS + 3; k++) {
@@ -107,7 +107,7 @@ TEST_F(FluxMap, GivesEveryDerivativeOfThePotential) {
 TEST_F(FluxMap, IsScaledAtEveryPoint) {
     const magnetics_model_t once = model;
     magnetics_scale(&model, 1.25);
-    EXPECT_DOUBLE_EQ(model.least_inductance_H, 1.25 * once.least_inductance_H);
+    EXPECT_DOUBLE_EQ(model.inductance_min_H, 1.25 * once.inductance_min_H);
     for (const double angle_steps : ANGLES) {
         for (const double current_steps : CURRENTS) {
             const double x = angle_steps * STEP_RAD, i = current_steps * STEP_A;
@@ -166,7 +166,7 @@ TEST_F(FluxMap, IsContinuousAtTheGreatestCurrent) {
 }
 
 TEST_F(FluxMap, PreparesWhatTheIntegratorLimitsItsStepsBy) {
-    EXPECT_EQ(model.least_inductance_H, 1e-4);
+    EXPECT_EQ(model.inductance_min_H, 1e-4);
     EXPECT_EQ(model.saturation_A, 25.0);
     EXPECT_EQ(model.unaligned_inductance_H, 2.4e-3);
     EXPECT_TRUE(std::isinf(magnetics_smooth_distance_rad(&model, 0.1, 1.0)));
