@@ -63,7 +63,7 @@ void magnetics_evaluate(const magnetics_model_t *model, double phase_angle_rad, 
     magnetics_kernel(model, model->form, phase_angle_rad, current_A, 0.0, point);
 }
 
-/* W(i), the integral of g(i) - Lu i. */
+/* W(i), the integral of g(i) - Lu i from 0 to i. */
 static double excess_energy_J(const magnetics_model_t *model, double current_A) {
     double energy_J = 0.5 * model->linear_excess_H * current_A * current_A;
     if (model->form == MAGNETICS_SATURATING) {
@@ -92,26 +92,26 @@ double magnetics_field_energy_J(const magnetics_model_t *model, double phase_ang
 }
 
 double magnetics_smooth_distance_rad(const magnetics_model_t *model, double phase_angle_rad, double direction) {
-    /* Within half a pitch; the mirrored ones follow from the evenness of f. */
+    /* Points within half a pole pitch; the mirrored ones follow because f is even. */
     const double half_rad = 0.5 * model->pitch_rad;
     const double flat_end_rad = model->flat_rad, corner_end_rad = model->flat_rad + model->blend_rad;
-    double places_rad[4] = {0.0, half_rad, 0.0, 0.0};
-    unsigned places = 2;
+    double kinks_rad[4] = {0.0, half_rad, 0.0, 0.0};
+    unsigned kinks = 2;
     if (model->form == MAGNETICS_LINEAR_COSINE || model->form == MAGNETICS_MAP) {
         return INFINITY;
     }
     if (model->form == MAGNETICS_LINEAR_TRAPEZOID) {
-        places_rad[0] = flat_end_rad;
-        places_rad[1] = corner_end_rad;
-        places_rad[2] = half_rad - corner_end_rad;
-        places_rad[3] = half_rad - flat_end_rad;
-        places = 4;
+        kinks_rad[0] = flat_end_rad;
+        kinks_rad[1] = corner_end_rad;
+        kinks_rad[2] = half_rad - corner_end_rad;
+        kinks_rad[3] = half_rad - flat_end_rad;
+        kinks = 4;
     }
     const double position_rad = phase_angle_rad - floor(phase_angle_rad * model->pitches_per_rad) * model->pitch_rad;
     double nearest_rad = model->pitch_rad;
     for (unsigned mirrored = 0; mirrored < 2; mirrored++) {
-        for (unsigned place = 0; place < places; place++) {
-            const double at_rad = mirrored ? model->pitch_rad - places_rad[place] : places_rad[place];
+        for (unsigned kink = 0; kink < kinks; kink++) {
+            const double at_rad = mirrored ? model->pitch_rad - kinks_rad[kink] : kinks_rad[kink];
             double distance_rad = (at_rad - position_rad) * direction;
             distance_rad -= floor(distance_rad * model->pitches_per_rad) * model->pitch_rad;
             if (distance_rad > MAGNETICS_SMOOTH_TOLERANCE_RAD && distance_rad < nearest_rad) {
