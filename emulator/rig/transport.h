@@ -39,7 +39,7 @@ typedef struct {
 
 typedef struct transport transport_t;
 
-/* Each transport begins with this. The functions are called through transport_* below. */
+/* Base of all transports, their first member. The functions are called through transport_* below. */
 struct transport {
     size_t (*descriptors)(transport_t *transport, struct pollfd *list);
     size_t (*read)(transport_t *transport, const transport_receiver_t *receiver);
@@ -59,8 +59,8 @@ static inline size_t transport_descriptors(transport_t *transport, struct pollfd
     return transport->descriptors(transport, list);
 }
 
-/* Accepts new clients and hands over their frames, one frame of each client in turn, in the order of connection,
- * until a whole turn yields none. Never waits. Returns the number of frames handed over. */
+/* Accepts new clients and hands over their frames, one frame per client in turn, in the order of connection,
+ * until a round yields none. Never waits. Returns the number of frames handed over. */
 static inline size_t transport_read(transport_t *transport, const transport_receiver_t *receiver) {
     return transport->read(transport, receiver);
 }
@@ -82,7 +82,7 @@ static inline bool transport_connected(transport_t *transport, uint32_t client) 
     return transport->connected(transport, client);
 }
 
-/* True when a client is connected that has not left, or a new one waits to be accepted. */
+/* True when a client is connected, or a new one waits to be accepted. */
 static inline bool transport_in_use(transport_t *transport) {
     return transport->in_use(transport);
 }
@@ -95,12 +95,12 @@ static inline void transport_close(transport_t *transport) {
 /* Opens `address`, unix:PATH or socketcan:INTERFACE. NULL with a line in `error` on failure. */
 transport_t *transport_open(const char *address, char error[TRANSPORT_ERROR_SIZE]);
 
-/* The two kinds, by what follows the colon. */
+/* Open one kind of transport by its part of the address, without the prefix. */
 transport_t *transport_local_open(const char *path, char error[TRANSPORT_ERROR_SIZE]);
 transport_t *transport_socketcan_open(const char *interface, char error[TRANSPORT_ERROR_SIZE]);
 
 /* SocketCAN over a descriptor that is open already and keeps record boundaries (for tests: one end of a socket pair
- * stands in for an interface). Takes the descriptor over. */
+ * stands in for an interface). Takes ownership of the descriptor. */
 transport_t *transport_socketcan_attach(int descriptor);
 
 #endif

@@ -17,15 +17,16 @@ typedef struct {
     };
 } transport_frame_t;
 
-/* True when `received` bytes are a frame. Fields without meaning are then zeroed, so that equal frames are equal bytes:
- * reserved fields and data beyond the length. A classic length of 9 to 15 becomes length 8 with len8_dlc. */
+/* Validates a frame of `received` bytes; false when it is none. Zeroes reserved fields and data beyond the length, so
+ * that equal frames have equal bytes. A classic length of 9 to 15 becomes length 8 with len8_dlc. */
 bool transport_frame_accept(transport_frame_t *frame, size_t received);
 
-/* Never on the emulated bus: flexible data rate, error frames and the rig's identifiers (0x1F0000xx, 29 bits). */
+/* Frames that never appear on the emulated bus: flexible data rate, error frames and the identifiers of the rig
+ * (0x1F0000xx, 29 bits). */
 bool transport_frame_is_rig(const transport_frame_t *frame);
 bool transport_frame_is_off_bus(const transport_frame_t *frame);
 
-/* Between the wire's form and the controller's; classic data and remote frames only. */
+/* Convert between the formats of Linux and the HAL; classic data and remote frames only. */
 void transport_frame_to_hal(const transport_frame_t *frame, hal_can_frame_t *hal);
 void transport_frame_from_hal(const hal_can_frame_t *hal, transport_frame_t *frame);
 
