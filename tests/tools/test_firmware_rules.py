@@ -100,4 +100,4 @@ def test_the_cortex_m4_build_stops_at_one_byte_more_than_the_flash(tmp_path):
     assert size_check(tmp_path, 901, 100).returncode != 0
     too_much = size_check(tmp_path, 900, 101)
     assert too_much.returncode != 0
-    assert "1001 bytes of flash, 1000 are allowed" in too_much.stderr
+    assert "1001 bytes of flash, must be at most 1000" in too_much.stderr
