@@ -1,8 +1,8 @@
 /* FMI 3.0 co-simulation (Modelica Association, "Functional Mock-up Interface Specification" 3.0): life cycle,
- * variables, steps, states. What this unit does not have is in fmi3_unsupported.c.
+ * variables, steps, states. fmi3_unsupported.c has the functions that this unit does not support.
  *
- * Time: the plant counts whole nanoseconds from the start time; communication points are rounded to them, each for
- * itself, so the rounding does not add up. */
+ * Time: the plant counts whole nanoseconds from the start time; communication points are rounded
+ * individually, so that rounding errors do not accumulate. */
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
@@ -12,7 +12,7 @@
 #include "fmi/fmu_instance.h"
 
 #define NS_PER_S 1e9
-/* The plant's time beyond which a communication point would not be exact any more, 104 days. */
+/* Time of the plant, 104 days, beyond which communication points would not be exact. */
 #define TIME_MAX_NS 9007199254740992.0
 #define LOG_LENGTH 256
 
@@ -28,7 +28,7 @@ fmi3Status fmu_instance_error(const fmu_instance_t *instance, const char *format
     return fmi3Error;
 }
 
-/* Whether a function may be called in the instance's mode; logs when not. */
+/* True when a function may be called in the mode of the instance; logs an error otherwise. */
 static bool in_mode(const fmu_instance_t *instance, unsigned modes, const char *function) {
     if (instance == NULL) {
         return false;
@@ -52,7 +52,7 @@ const char *fmi3GetVersion(void) {
 
 fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, size_t nCategories,
                                const fmi3String categories[]) {
-    (void)loggingOn; /* there are no debug messages, and errors are always logged */
+    (void)loggingOn; /* no debug messages exist, and errors are always logged */
     if (instance == NULL) {
         return fmi3Error;
     }
@@ -126,7 +126,7 @@ static bool time_from_start(const fmu_state_t *state, double time_s, uint64_t *t
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean toleranceDefined, fmi3Float64 tolerance,
                                        fmi3Float64 startTime, fmi3Boolean stopTimeDefined, fmi3Float64 stopTime) {
-    (void)toleranceDefined, (void)tolerance; /* the plant's own limits of a step hold */
+    (void)toleranceDefined, (void)tolerance; /* the step limits of the plant apply */
     fmu_instance_t *self = instance;
     if (!in_mode(self, FMU_INSTANTIATED, "fmi3EnterInitializationMode")) {
         return fmi3Error;
@@ -164,7 +164,7 @@ fmi3Status fmi3Terminate(fmi3Instance instance) {
 
 /* --- Variables --- */
 
-/* The variable of a value reference, or NULL and a line in the log. */
+/* Variable of a value reference; NULL, after a line in the log, when there is none. */
 static const fmu_variable_t *find_variable(const fmu_instance_t *instance, fmi3ValueReference reference,
                                            fmu_type_t type, const char *function) {
     if (reference >= fmu_variable_count || fmu_variables[reference].type != type) {
@@ -174,7 +174,7 @@ static const fmu_variable_t *find_variable(const fmu_instance_t *instance, fmi3V
     return &fmu_variables[reference];
 }
 
-/* The variable of a value reference if it may be set now, or NULL and a line in the log. */
+/* Variable of a value reference that may be set in the present mode; NULL, after a line in the log, otherwise. */
 static const fmu_variable_t *find_settable(const fmu_instance_t *instance, fmi3ValueReference reference,
                                            fmu_type_t type, const char *function) {
     const fmu_variable_t *variable = find_variable(instance, reference, type, function);
@@ -188,7 +188,7 @@ static const fmu_variable_t *find_settable(const fmu_instance_t *instance, fmi3V
     return in_mode(instance, FMU_INSTANTIATED | FMU_INITIALIZATION, function) ? variable : NULL;
 }
 
-/* As many values as value references: no variable is an array. */
+/* True when there is one value per value reference: no variable is an array. */
 static bool counts_match(const fmu_instance_t *instance, size_t references, size_t values, const char *function) {
     if (references != values) {
         fmu_instance_error(instance, "%s: %zu values for %zu scalar variables", function, values, references);
@@ -206,7 +206,7 @@ static bool may_set(const fmu_instance_t *instance, size_t references, size_t va
            counts_match(instance, references, values, function);
 }
 
-/* Before the first step the outputs follow what is set. */
+/* Before the first step the outputs follow the variables that are set. */
 static fmi3Status after_set(fmu_instance_t *instance) {
     if (instance->state.mode != FMU_STEP) {
         fmu_model_restart(&instance->state.model);
@@ -300,7 +300,7 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
     *lastSuccessfulTime = state->model.values.time_s;
     const double to_s = currentCommunicationPoint + communicationStepSize;
     uint64_t from_ns, to_ns;
-    /* One nanosecond of grace: the importer may have added up its communication points in another way. */
+    /* Tolerance of one nanosecond: the importer may accumulate its communication points with other rounding. */
     if (!time_from_start(state, currentCommunicationPoint, &from_ns) || from_ns > state->model.plant.time_ns + 1 ||
         from_ns + 1 < state->model.plant.time_ns) {
         return fmu_instance_error(self, "fmi3DoStep: a step from %.12g s, but the last one ended at %.12g s",

@@ -1,13 +1,13 @@
-/* FMI functions that importers look for but this unit has no use for: each logs what there is not and gives back
+/* FMI functions that importers look up but this unit does not support: each logs the missing feature and returns
  * fmi3Error. */
 #include "fmi/fmu_instance.h"
 
-/* The standard gives the parameters; none of them matters here. */
+/* The standard defines the parameters; all of them are unused. */
 #pragma GCC diagnostic ignored "-Wunused-parameter"
 
 #define REFUSE(reason) return fmu_instance_error(instance, "%s: there " reason, __func__)
 
-/* --- Types that no variable has. An importer may ask for none of them. --- */
+/* --- Types that no variable has. Importers must not request them. --- */
 
 #define NO_VARIABLES(type)                                                                                             \
     fmi3Status fmi3Get##type(fmi3Instance instance, const fmi3ValueReference valueReferences[],                        \
@@ -182,7 +182,7 @@ fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte seriali
     REFUSE("are no serialized states");
 }
 
-/* --- Other interface types. Importers look their functions up too. --- */
+/* --- Other interface types. Importers look up their functions as well. --- */
 
 fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String instantiationToken,
                                           fmi3String resourcePath, fmi3Boolean visible, fmi3Boolean loggingOn,

@@ -1,4 +1,4 @@
-/* An instance of the functional mock-up unit as the FMI functions see it. */
+/* Instance of the functional mock-up unit. */
 #ifndef FMI_FMU_INSTANCE_H
 #define FMI_FMU_INSTANCE_H
 
@@ -8,12 +8,12 @@
 
 typedef enum { FMU_INSTANTIATED = 1, FMU_INITIALIZATION = 2, FMU_STEP = 4, FMU_TERMINATED = 8 } fmu_mode_t;
 
-/* Everything that fmi3GetFMUState keeps. */
+/* State that fmi3GetFMUState saves. */
 typedef struct {
     fmu_model_t model;
     fmu_mode_t mode;
-    double start_s;   /* of the importer's time; the plant's begins at 0 */
-    uint64_t stop_ns; /* of the plant's time; UINT64_MAX: none */
+    double start_s;   /* start time of the importer; that of the plant is 0 */
+    uint64_t stop_ns; /* stop time of the plant; UINT64_MAX: none */
 } fmu_state_t;
 
 typedef struct {
@@ -25,7 +25,7 @@ typedef struct {
 /* The only log category. */
 #define FMU_LOG_CATEGORY "logStatusError"
 
-/* Logs one formatted line and gives back fmi3Error. `instance` may be NULL: nothing is logged then. */
+/* Logs one formatted line, unless `instance` is NULL, and returns fmi3Error. */
 __attribute__((format(printf, 2, 3))) fmi3Status fmu_instance_error(const fmu_instance_t *instance, const char *format,
                                                                     ...);
 

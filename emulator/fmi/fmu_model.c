@@ -2,7 +2,7 @@
 
 #include <string.h>
 
-/* Held over a whole step, so the timer's period does not matter: fully on or fully off has no edges. */
+/* Any period would do: switches are fully on or off over a step, without edges. */
 #define PERIOD_TICKS 1
 
 static void set_switches(fmu_model_t *model) {
@@ -55,7 +55,7 @@ void fmu_model_restart(fmu_model_t *model) {
     model->machine.resistance_ohm = values->resistance_ohm;
     model->machine.inertia_kg_m2 = values->inertia_kg_m2;
     model->machine.friction_Nm_s = values->friction_Nm_s;
-    model->machine.supply_voltage_V = values->supply_voltage_V; /* the link is charged to it */
+    model->machine.supply_voltage_V = values->supply_voltage_V; /* initial voltage of the DC link */
     plant_init(&model->plant, &model->machine, values->initial_angle_rad);
     model->plant.speed_rad_s = values->initial_speed_rad_s;
     update_outputs(model);

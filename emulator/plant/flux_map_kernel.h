@@ -1,5 +1,5 @@
-/* The potential of flux_map.h and its derivatives, to be inlined into the integrator; part of magnetics_kernel.h. Same
- * bits everywhere: additions and multiplications only. */
+/* Co-energy of flux_map.h and its derivatives, inlined into the integrator as part of magnetics_kernel.h. Additions and
+ * multiplications only: equal bits on every computer. */
 #ifndef PLANT_FLUX_MAP_KERNEL_H
 #define PLANT_FLUX_MAP_KERNEL_H
 
@@ -10,12 +10,12 @@
 
 #define MAGNETICS_INLINE static inline __attribute__((always_inline))
 
-/* The uniform B-splines that are not zero at a place t, 0..1, of an interval, by degree. */
+/* Values of the uniform B-splines that are not zero at position t, 0..1, of an interval, by degree. */
 typedef struct {
     double linear[2], quadratic[3], cubic[4], quartic[5];
 } flux_map_weights_t;
 
-/* De Boor's recursion, what is symmetric in t and u written out. */
+/* De Boor's recursion, with the terms symmetric in t and u written out. */
 MAGNETICS_INLINE void flux_map_weights(double t, flux_map_weights_t *weights) {
     const double u = 1.0 - t, tu = t * u;
     double *w2 = weights->quadratic, *w3 = weights->cubic, *w4 = weights->quartic;
@@ -35,7 +35,7 @@ MAGNETICS_INLINE void flux_map_weights(double t, flux_map_weights_t *weights) {
     w4[4] = 0.25 * (t * w3[3]);
 }
 
-/* The interval of a position on the grid; outside, the first and the last go on. */
+/* Interval of a position on the grid; positions outside belong to the first or the last one. */
 MAGNETICS_INLINE int64_t flux_map_interval(double position, int64_t intervals) {
     const int64_t interval = (int64_t)position;
     return interval < 0 ? 0 : interval >= intervals ? intervals - 1 : interval;
@@ -56,9 +56,9 @@ MAGNETICS_INLINE double flux_map_curvature(const flux_map_weights_t *weights, co
     return w[0] * ((c[2] - c[1]) - (c[1] - c[0])) + w[1] * ((c[3] - c[2]) - (c[2] - c[1]));
 }
 
-/* The operating point at an angle within half a pitch of the aligned position, and its co-energy. First along the
- * current, for the four B-splines over the angle at once, then over the angle. Differences come before weights, for the
- * coefficients are large against what is left of them. */
+/* Operating point and co-energy at an angle within half a pole pitch of the aligned position. Evaluated first along the
+ * current, for all four B-splines over the angle, then along the angle. Coefficients are subtracted before they are
+ * weighted, because their differences are small compared with the coefficients. */
 MAGNETICS_INLINE void flux_map_kernel(const magnetics_model_t *model, double wrapped_rad, double current_A,
                                       magnetics_point_t *point, double *coenergy_J) {
     const double across = fabs(wrapped_rad) * model->map_steps_1_rad;
@@ -70,7 +70,7 @@ MAGNETICS_INLINE void flux_map_kernel(const magnetics_model_t *model, double wra
     flux_map_weights(along - (double)row, &by_current);
     flux_map_weights(across - (double)column, &by_angle);
 
-    /* Co-energy and its derivatives by the current, in steps of the grid. */
+    /* Co-energy and its derivatives with respect to the current, per step of the grid. */
     double energy[4], flux[4], inductance[4], slope[4];
     const double *w1 = by_current.linear, *w2 = by_current.quadratic, *w3 = by_current.cubic, *w4 = by_current.quartic;
     for (unsigned k = 0; k < 4; k++) {

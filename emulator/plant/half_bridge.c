@@ -1,7 +1,6 @@
 #include "plant/half_bridge.h"
 
-/* The instants, in ticks from the period's start and up to its middle, where the pattern changes; the second half
- * mirrors the first. */
+/* Edge in the first half of the period, in ticks from its start; the second half mirrors the first. */
 typedef struct {
     uint16_t tick;
     half_bridge_switches_t toggles;
@@ -33,7 +32,7 @@ static void append_edge(half_bridge_pattern_t *pattern, uint64_t time_ns, half_b
     pattern->edges[pattern->count++] = (half_bridge_edge_t){time_ns, switches};
 }
 
-/* A compare value whose pulse, or the gap beside it, is too short becomes none or all of the period. */
+/* Suppresses a pulse, or the gap between two pulses, that is too short: the compare value becomes 0 or the period. */
 static uint16_t without_short_pulses(uint16_t compare, uint16_t period_ticks, double minimum_pulse_ns) {
     if (compare >= period_ticks) {
         return period_ticks;

@@ -1,8 +1,8 @@
 #include "plant/integrator.h"
 #include "plant/magnetics_kernel.h"
 
-/* The functions ending in _of are inlined for each form of the magnetics and for one and two conducting phases: the
- * compiler then leaves out the other forms and unrolls. `form`, `link` and `count` are the setting's. */
+/* The functions ending in _of are inlined for each form of the magnetics and for one and two conducting phases, so that
+ * the compiler removes the other forms and unrolls the loops. `form`, `link` and `count` are those of the setting. */
 
 MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magnetics_form_t form, bool link,
                                        unsigned count, const integrator_state_t *state,
@@ -33,8 +33,8 @@ MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magn
         (torque_Nm - friction_Nm_s * speed_rad_s - setting->load_torque_Nm) * inverse_inertia;
     derivative->acceleration_rad_s2 = acceleration_rad_s2;
     derivative->jerk_rad_s3 = (torque_Nm_s - friction_Nm_s * acceleration_rad_s2) * inverse_inertia;
-    derivative->bus_V_s = 0.0;
-    derivative->bus_V_s2 = 0.0;
+    derivative->link_V_s = 0.0;
+    derivative->link_V_s2 = 0.0;
     if (link) {
         const dc_link_t *dc_link = &setting->machine->dc_link;
         double conductance_S = 0.0;
@@ -45,15 +45,15 @@ MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magn
         if (setting->chopper_on) {
             conductance_S += 1.0 / dc_link->chopper_resistance_ohm;
         }
-        derivative->bus_V_s = -(conductance_S * state->bus_voltage_V + link_A) / dc_link->capacitance_F;
-        derivative->bus_V_s2 = -(conductance_S * derivative->bus_V_s + link_A_s) / dc_link->capacitance_F;
+        derivative->link_V_s = -(conductance_S * state->bus_voltage_V + link_A) / dc_link->capacitance_F;
+        derivative->link_V_s2 = -(conductance_S * derivative->link_V_s + link_A_s) / dc_link->capacitance_F;
     }
     for (unsigned index = 0; index < count; index++) {
         const magnetics_point_t *point = &points[index];
         const double current_A_s = derivative->current_A_s[index];
         double voltage_V_s = -setting->resistance_ohm[index] * current_A_s;
         if (link) {
-            voltage_V_s += setting->link_sign[index] * derivative->bus_V_s;
+            voltage_V_s += setting->link_sign[index] * derivative->link_V_s;
         }
         const double motional_V_s = acceleration_rad_s2 * point->flux_gradient_Wb_rad +
                                     speed_rad_s * (speed_rad_s * point->flux_curvature_Wb_rad2);
@@ -74,7 +74,7 @@ MAGNETICS_INLINE void step_of(const integrator_setting_t *setting, magnetics_for
     middle.speed_rad_s = start->speed_rad_s + half_s * first->acceleration_rad_s2 + eighth_s2 * first->jerk_rad_s3;
     middle.bus_voltage_V = start->bus_voltage_V;
     if (link) {
-        middle.bus_voltage_V += half_s * first->bus_V_s + eighth_s2 * first->bus_V_s2;
+        middle.bus_voltage_V += half_s * first->link_V_s + eighth_s2 * first->link_V_s2;
     }
     for (unsigned index = 0; index < count; index++) {
         middle.current_A[index] =
@@ -93,10 +93,10 @@ MAGNETICS_INLINE void step_of(const integrator_setting_t *setting, magnetics_for
     end->bus_voltage_V = start->bus_voltage_V;
     if (link) {
         const double start_V = start->bus_voltage_V, middle_V = middle.bus_voltage_V;
-        end->bus_voltage_V += step_s * first->bus_V_s + sixth_s2 * (first->bus_V_s2 + 2.0 * second.bus_V_s2);
-        integrals->bus_Vs = step_s * start_V + sixth_s2 * (first->bus_V_s + 2.0 * second.bus_V_s);
-        integrals->bus2_V2s =
-            step_s * start_V * start_V + sixth_s2 * (2.0 * start_V * first->bus_V_s + 4.0 * middle_V * second.bus_V_s);
+        end->bus_voltage_V += step_s * first->link_V_s + sixth_s2 * (first->link_V_s2 + 2.0 * second.link_V_s2);
+        integrals->link_Vs = step_s * start_V + sixth_s2 * (first->link_V_s + 2.0 * second.link_V_s);
+        integrals->link2_V2s = step_s * start_V * start_V +
+                               sixth_s2 * (2.0 * start_V * first->link_V_s + 4.0 * middle_V * second.link_V_s);
     }
     for (unsigned index = 0; index < count; index++) {
         const double start_A = start->current_A[index], middle_A = middle.current_A[index];
@@ -109,8 +109,8 @@ MAGNETICS_INLINE void step_of(const integrator_setting_t *setting, magnetics_for
         if (link) {
             integrals->link_J[index] =
                 step_s * start->bus_voltage_V * start_A +
-                sixth_s2 * ((first->bus_V_s * start_A + start->bus_voltage_V * start_A_s) +
-                            2.0 * (second.bus_V_s * middle_A + middle.bus_voltage_V * middle_A_s));
+                sixth_s2 * ((first->link_V_s * start_A + start->bus_voltage_V * start_A_s) +
+                            2.0 * (second.link_V_s * middle_A + middle.bus_voltage_V * middle_A_s));
         }
     }
 }

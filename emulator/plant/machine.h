@@ -1,35 +1,35 @@
-/* A machine with its converter, link and sensors, as its machine file (tools/machines) says. */
+/* Machine with converter, DC link and sensors, as defined by a machine file (tools/machines). */
 #ifndef PLANT_MACHINE_H
 #define PLANT_MACHINE_H
 
 #include "plant/magnetics.h"
 
-/* The asymmetric half bridges' devices, all alike. All zero: ideal. */
+/* Devices of the asymmetric half bridges, all equal. All zero: ideal. */
 typedef struct {
-    double switch_drop_V; /* at any current, and its slope */
+    double switch_drop_V; /* threshold voltage; the resistance is the slope */
     double switch_resistance_ohm;
     double diode_drop_V;
     double diode_resistance_ohm;
-    double minimum_pulse_ns; /* a shorter pulse or gap of a switch does not happen */
+    double minimum_pulse_ns; /* shorter pulses and gaps of a switch are suppressed */
 } converter_t;
 
-/* The DC link: a capacitor behind a supply with inner resistance that takes nothing back, and a brake chopper that is
- * on from chopper_on_V until the voltage is down to chopper_off_V. */
+/* DC link: a unidirectional supply with internal resistance, a capacitor, and a brake chopper that switches on at
+ * chopper_on_V and off at chopper_off_V. */
 typedef struct {
-    double capacitance_F; /* 0: an ideal supply that takes energy back, and the rest is ignored */
+    double capacitance_F; /* 0: an ideal bidirectional supply; the other members are ignored */
     double source_resistance_ohm;
     double chopper_resistance_ohm; /* 0: no chopper */
     double chopper_on_V, chopper_off_V;
 } dc_link_t;
 
-/* What the sensors do wrong; sensors.h applies it, the rig can change it. */
+/* Sensor errors; sensors.h applies them, and the rig can change them. */
 typedef struct {
-    double current_gain; /* 1 is right */
+    double current_gain; /* 1 is exact */
     double current_offset_A;
     double current_noise_A; /* standard deviation */
-    double current_limit_A; /* the sensor shows no more than this */
+    double current_limit_A; /* magnitude at which the sensor saturates */
     double current_delay_ns;
-    double encoder_eccentricity_deg; /* amplitude of an error that goes once round with the rotor, mechanical */
+    double encoder_eccentricity_deg; /* amplitude of the angle error of one period per revolution, mechanical */
 } sensor_errors_t;
 
 typedef struct {
@@ -47,7 +47,7 @@ typedef struct {
     sensor_errors_t sensors;
 } machine_t;
 
-/* The machine this executable was built for; generated from the machine file. */
+/* Machine that this executable was built for; generated from the machine file. */
 extern const machine_t machine_plant;
 
 #endif

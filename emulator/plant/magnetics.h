@@ -9,17 +9,17 @@
  *                       f = 2 (Nr theta / pi)^3 - 3 (Nr theta / pi)^2 + 1 on [0, pi / Nr], even,
  *                       g = Ls i + A (1 - e^(-b i)), A = psi_m - Ls I_m, b = (La - Ls) / A
  *
- * The fourth form is a map of psi over angle and current: flux_map.h.
+ * The fourth form is a flux-linkage map over angle and current: flux_map.h.
  *
- * The phase angle theta is mechanical: 0 aligned, half a pitch (pi / Nr) unaligned; torque is positive from half a
- * pitch to a whole one. One phase does not see the others' currents.
+ * The phase angle theta is mechanical: 0 aligned, half a pole pitch (pi / Nr) unaligned; torque is positive from half a
+ * pitch to a whole one. There is no mutual coupling between phases.
  */
 #ifndef PLANT_MAGNETICS_H
 #define PLANT_MAGNETICS_H
 
 #include "plant/flux_map.h"
 
-/* Entries of the table of e^(-b i): up to 8 / b and more, slower but as exact beyond. */
+/* Size of the table of e^(-b i), which covers at least i <= 4 / b; larger currents are slower, with equal accuracy. */
 #define MAGNETICS_DECAY_STEPS 512
 
 typedef enum {
@@ -29,7 +29,7 @@ typedef enum {
     MAGNETICS_MAP
 } magnetics_form_t;
 
-/* What a machine file says. Fields that a form does not use are 0. */
+/* Magnetics as defined by the machine file. Fields that a form does not use are 0. */
 typedef struct {
     magnetics_form_t form;
     double unaligned_inductance_H;        /* Lu, > 0; map: at 0 A */
@@ -39,17 +39,17 @@ typedef struct {
     double saturated_inductance_H;        /* saturating: Ls, slope of the aligned curve at large currents */
     double flux_linkage_max_Wb;           /* saturating: psi_m, aligned at I_m */
     double current_at_flux_linkage_max_A; /* saturating: I_m */
-    const flux_map_t *map;                /* map; must outlive the models of it */
+    const flux_map_t *map;                /* map; must outlive its models */
 } magnetics_t;
 
-/* The same with everything computed beforehand that a form needs; made by magnetics_prepare. */
+/* Magnetics with precomputed constants; initialised by magnetics_prepare. */
 typedef struct {
     magnetics_form_t form;
     double unaligned_inductance_H;
-    double least_inductance_H;              /* of the incremental ones, at any angle and current */
-    double saturation_A;                    /* over which the incremental inductance changes; infinite: it does not */
+    double inductance_min_H;                /* smallest incremental inductance at any angle and current */
+    double saturation_A;                    /* scale on which the incremental inductance changes; infinite: constant */
     double linear_excess_H;                 /* (g(i) - Lu i) / i without the exponential part: La - Lu or Ls - Lu */
-    double saturating_Wb;                   /* A; from here to the table only in the saturating form */
+    double saturating_Wb;                   /* A; this and the members up to the table: saturating only */
     double saturation_1_A;                  /* b */
     double initial_slope_H;                 /* A b */
     double decay_step_A, decay_steps_per_A; /* a power of two, at most 1 / (64 b) */
@@ -65,24 +65,24 @@ typedef struct {
 typedef struct {
     double flux_linkage_Wb;          /* psi */
     double incremental_inductance_H; /* d psi / d i, > 0 */
-    double flux_gradient_Wb_rad;     /* d psi / d theta, per mechanical radian; times speed: motional voltage */
+    double flux_gradient_Wb_rad;     /* d psi / d theta, per mechanical radian; times speed: back-EMF */
     double torque_Nm;                /* d co-energy / d theta */
-    /* Second derivatives, for the integrator; d torque / d i is the flux gradient. */
+    /* Second derivatives, for the integrator; d torque / d i equals flux_gradient_Wb_rad. */
     double inductance_slope_H_A;      /* d2 psi / d i2 */
     double inductance_gradient_H_rad; /* d2 psi / d i d theta */
     double flux_curvature_Wb_rad2;    /* d2 psi / d theta2 */
     double torque_gradient_Nm_rad;    /* d torque / d theta */
 } magnetics_point_t;
 
-/* Prepares `model` for `magnetics` of a machine with `rotor_poles` poles. The values must be a checked machine file's;
- * they are not checked again. */
+/* Prepares `model` for `magnetics` of a machine with `rotor_poles` poles. The values must be those of a validated
+ * machine file; they are not checked. */
 void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, unsigned rotor_poles);
 
 /* Multiplies flux linkage, and with it torque and energies, by `gain` (> 0) at every angle and current. */
 void magnetics_scale(magnetics_model_t *model, double gain);
 
-/* The operating point at a phase angle (any mechanical angle, rad) and a current (A, >= 0; slightly negative values
- * continue the curves smoothly, for the search of a zero). */
+/* Computes the operating point at a phase angle (any mechanical angle, rad) and a current (A, >= 0; slightly negative
+ * values continue the curves smoothly, for root finding). */
 void magnetics_evaluate(const magnetics_model_t *model, double phase_angle_rad, double current_A,
                         magnetics_point_t *point);
 
@@ -92,12 +92,12 @@ double magnetics_coenergy_J(const magnetics_model_t *model, double phase_angle_r
 /* Energy stored in the field: psi i - co-energy, in J. */
 double magnetics_field_energy_J(const magnetics_model_t *model, double phase_angle_rad, double current_A);
 
-/* A place where f loses smoothness counts as passed when it is nearer than this. */
+/* A point where f is not smooth counts as passed when it is nearer than this. */
 #define MAGNETICS_SMOOTH_TOLERANCE_RAD 1e-8
 
-/* How far the angle may move from phase_angle_rad in a direction (+1 or -1) before f loses smoothness (a jump of its
- * second or third derivative), mechanical rad, > 0; infinite for the cosine, and for a map, whose jumps are many and
- * small. An integrator that ends a step there keeps its order. */
+/* Distance, mechanical rad, > 0, from phase_angle_rad in a direction (+1 or -1) to the next point where the second or
+ * third derivative of f jumps; infinite for the cosine, and for a map, whose jumps are many and small. An integrator
+ * that ends its steps at these points keeps its order. */
 double magnetics_smooth_distance_rad(const magnetics_model_t *model, double phase_angle_rad, double direction);
 
 #endif

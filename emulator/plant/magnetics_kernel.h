@@ -1,36 +1,31 @@
-/* The inner loop of the plant: magnetics_evaluate to be inlined into the integrator, where a call costs as much as the
- * arithmetic. Only magnetics.c and plant.c include it, and sensors.c for its sine; everybody else calls magnetics.h.
+/* Inner loop of the plant: magnetics_evaluate as inline functions for the integrator, where a call takes as long as the
+ * arithmetic. Included only by magnetics.c, integrator.c, and sensors.c for the sine; all others call magnetics.h.
  *
- * Exponential and cosine are computed here and not by libm, whose results differ in the last bit between processors
- * (it picks a variant with fused multiply-add where there is one): equal inputs must give equal bits anywhere. */
+ * Exponential and cosine do not use libm: see exponential.h. */
 #ifndef PLANT_MAGNETICS_KERNEL_H
 #define PLANT_MAGNETICS_KERNEL_H
 
 #include <math.h>
 #include <stdint.h>
 
+#include "plant/exponential.h"
 #include "plant/flux_map_kernel.h"
 #include "plant/magnetics.h"
 
-/* Adding and subtracting it rounds to the nearest integer, for magnitudes below 2^51. */
-#define MAGNETICS_ROUNDING_SHIFT 0x1.8p52
-
-/* e^x for -700 <= x <= 700, relative error below 3e-16; 0 below that range. */
-double magnetics_exponential(double x);
-
-/* e^(-b i), relative error below 1e-15: the table's nearest entry times a series of what remains, abs <= 1/128. */
+/* e^(-b i), relative error below 1e-15: the nearest entry of the table times a series of the remainder, abs <= 1/128.
+ */
 MAGNETICS_INLINE double magnetics_kernel_decay(const magnetics_model_t *model, double current_A) {
-    const double shift_A = MAGNETICS_ROUNDING_SHIFT * model->decay_step_A;
+    const double shift_A = ROUNDING_SHIFT * model->decay_step_A;
     const double nearest_A = (current_A + shift_A) - shift_A;
     const int64_t step = (int64_t)(nearest_A * model->decay_steps_per_A);
     if (step < 0 || step >= MAGNETICS_DECAY_STEPS) {
-        return magnetics_exponential(-model->saturation_1_A * current_A);
+        return exponential(-model->saturation_1_A * current_A);
     }
     const double x = model->saturation_1_A * (nearest_A - current_A), x2 = x * x;
     return model->decay[step] * ((1.0 + x) + x2 * ((0.5 + x * (1.0 / 6.0)) + x2 * (1.0 / 24.0 + x * (1.0 / 120.0))));
 }
 
-/* Sine and cosine for abs(x) <= pi, absolute error below 2e-15: series of x / 4, then the double angle twice. */
+/* Sine and cosine for abs(x) <= pi, absolute error below 2e-15: series of x / 4, then two double-angle steps. */
 MAGNETICS_INLINE void magnetics_kernel_sine_cosine(double x, double *sine, double *cosine) {
     const double q = 0.25 * x, z = q * q, z2 = z * z, z4 = z2 * z2;
     const double quarter_sine =
@@ -47,13 +42,13 @@ MAGNETICS_INLINE void magnetics_kernel_sine_cosine(double x, double *sine, doubl
     *cosine = 1.0 - 2.0 * half_sine * half_sine;
 }
 
-/* f and its derivatives at some angle, per mechanical radian. */
+/* f and its derivatives at an angle, per mechanical radian. */
 typedef struct {
     double f, gradient_1_rad, curvature_1_rad2;
 } magnetics_shape_t;
 
-/* f of half a pitch, from 1 at 0 to 0 at half a pitch. The curvature jumps at the corners; `ahead_rad` is the angle a
- * little further on in the direction of motion: it says which side of a corner is meant. */
+/* f over half a pole pitch, from 1 at 0 to 0 at half a pitch. The curvature jumps at the corners; `ahead_rad`, an angle
+ * slightly ahead in the direction of motion, selects the side of a corner. */
 MAGNETICS_INLINE void magnetics_kernel_trapezoid(const magnetics_model_t *model, double angle_rad, double ahead_rad,
                                                  magnetics_shape_t *shape) {
     const double unaligned_rad = 0.5 * model->pitch_rad - model->flat_rad;
@@ -75,14 +70,14 @@ MAGNETICS_INLINE void magnetics_kernel_trapezoid(const magnetics_model_t *model,
     }
 }
 
-/* The same phase angle within -half a pitch .. half a pitch. */
+/* Phase angle wrapped to +- half a pole pitch. */
 MAGNETICS_INLINE double magnetics_kernel_wrap(const magnetics_model_t *model, double phase_angle_rad) {
-    const double pitches =
-        (phase_angle_rad * model->pitches_per_rad + MAGNETICS_ROUNDING_SHIFT) - MAGNETICS_ROUNDING_SHIFT;
+    const double pitches = (phase_angle_rad * model->pitches_per_rad + ROUNDING_SHIFT) - ROUNDING_SHIFT;
     return phase_angle_rad - pitches * model->pitch_rad;
 }
 
-/* f at any phase angle. `form` is the model's, apart so that a caller that knows it gets nothing of the others. */
+/* f at any phase angle. `form` is that of the model, an argument of its own so that with a constant the compiler
+ * removes the other forms. */
 MAGNETICS_INLINE void magnetics_kernel_shape(const magnetics_model_t *model, magnetics_form_t form,
                                              double phase_angle_rad, double ahead_rad, magnetics_shape_t *shape) {
     const double wrapped_rad = magnetics_kernel_wrap(model, phase_angle_rad);
@@ -116,7 +111,7 @@ MAGNETICS_INLINE void magnetics_kernel(const magnetics_model_t *model, magnetics
     }
     magnetics_shape_t shape;
     magnetics_kernel_shape(model, form, phase_angle_rad, ahead_rad, &shape);
-    /* g(i) - Lu i, its slope and the slope of that, and its integral W(i) */
+    /* g(i) - Lu i, its first and second derivatives, and its integral W(i) */
     double excess_Wb = model->linear_excess_H * current_A;
     double excess_H = model->linear_excess_H;
     double excess_H_A = 0.0;

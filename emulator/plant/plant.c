@@ -5,24 +5,24 @@
 
 #include "plant/integrator.h"
 
-/* Limits of a step at factor 1, chosen so that currents, torque and speed stay within 1e-6 of their range (measured
- * against SciPy's DOP853 at a tolerance of 1e-12: 9e-7) at the speeds and currents of a drive. A whole control period
- * at 40 kHz is one step where nothing happens in it. */
+/* Limits of a step at factor 1, chosen for errors of currents, torque and speed below 1e-6 of their range (measured
+ * against SciPy's DOP853 at a tolerance of 1e-12: 9e-7) at the speeds and currents of a drive. A control period at
+ * 40 kHz without an event is one step. */
 #define STEP_MAX_S 25e-6
-/* Of the magnetics' saturation_A: limits the change of the incremental inductance. */
+/* Fraction of saturation_A of the magnetics: limits the change of the incremental inductance. */
 #define STEP_CURRENT_FRACTION 0.09
 #define STEP_ANGLE_PITCHES 0.0015
 
-/* Of the shortest time constants, those of a winding at its least inductance and of the free rotor: a Runge-Kutta step
- * loses its accuracy, and beyond 2.8 its stability, where the resistance or the friction is large. */
+/* Fraction of the shortest time constant, among them those of a winding at its smallest inductance and of the free
+ * rotor: where resistance or friction is large, longer Runge-Kutta steps lose accuracy, and beyond 2.8 stability. */
 #define STEP_TIME_CONSTANTS 0.05
 
-/* A diode's end of conduction, and the instants at which supply and chopper begin and end, are located to this. */
+/* Accuracy of event times: end of conduction of a diode, switching of supply and chopper. */
 #define EVENT_TOLERANCE_S 1e-13
 #define EVENT_ITERATIONS 60
-/* The bus voltage counts as at its threshold when an event has brought it this near. */
+/* After an event, a DC-link voltage within this tolerance of its threshold is set to it. */
 #define THRESHOLD_TOLERANCE_V 1e-6
-/* A freewheeling current decays without ever ending; below this it counts as ended. */
+/* A freewheeling current decays exponentially; below this it counts as zero. */
 #define CURRENT_NEGLIGIBLE_A 1e-9
 
 static const double NS_S = 1e-9;
@@ -41,7 +41,7 @@ void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_r
     plant->step_factor = 1.0;
     plant_set_gains(plant, &(plant_gains_t){1.0, 1.0, 1.0, 1.0});
     plant->phase_offset_rad = plant->magnetics.pitch_rad / machine->phases;
-    /* Empty: the first step computes it. */
+    /* Empty range: the first step computes it. */
     plant->smooth_from_rad = INFINITY;
     plant->smooth_to_rad = -INFINITY;
 }
@@ -72,7 +72,7 @@ void plant_set_supply_voltage(plant_t *plant, double voltage_V) {
 
 void plant_set_step_factor(plant_t *plant, double factor) {
     double time_constant_s =
-        fmin(plant->magnetics.least_inductance_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
+        fmin(plant->magnetics.inductance_min_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
              plant->inertia_kg_m2 / plant->friction_Nm_s);
     if (has_link(plant)) {
         const dc_link_t *link = &plant->machine->dc_link;
@@ -104,8 +104,8 @@ void plant_open_all(plant_t *plant) {
 
 /* --- One step --- */
 
-/* Which phases conduct, and through which devices. A phase whose current is zero and is not driven is left out, its
- * current is exactly zero. */
+/* Lists the conducting phases and their devices. A phase without current that is not driven is omitted; its current is
+ * set to exactly zero. */
 static void find_conducting(plant_t *plant, integrator_setting_t *setting) {
     static const double link_signs[3] = {-1.0, 0.0, 1.0};
     const unsigned upper = plant->switches.upper, lower = plant->switches.lower;
@@ -128,25 +128,25 @@ static void find_conducting(plant_t *plant, integrator_setting_t *setting) {
     setting->count = count;
 }
 
-/* What supply and chopper do from here. At the very voltage at which the supply's rectifier begins to conduct, it is
- * the current of the half bridges that decides. */
+/* Determines the conduction states of supply and chopper. At exactly the voltage at which the supply's rectifier begins
+ * to conduct, the current of half bridges and chopper decides. */
 static void find_link(plant_t *plant, integrator_setting_t *setting) {
     double drawn_A = 0.0;
     for (unsigned index = 0; index < setting->count; index++) {
         drawn_A += setting->link_sign[index] * plant->current_A[setting->phase[index]];
     }
     const dc_link_t *link = &plant->machine->dc_link;
-    const double bus_V = plant->bus_voltage_V, supply_V = plant->supply_voltage_V;
+    const double link_V = plant->bus_voltage_V, supply_V = plant->supply_voltage_V;
     if (link->chopper_resistance_ohm > 0.0) {
-        if (bus_V >= link->chopper_on_V) {
+        if (link_V >= link->chopper_on_V) {
             plant->chopper_on = true;
-        } else if (bus_V <= link->chopper_off_V) {
+        } else if (link_V <= link->chopper_off_V) {
             plant->chopper_on = false;
         }
-        drawn_A += plant->chopper_on ? bus_V / link->chopper_resistance_ohm : 0.0;
+        drawn_A += plant->chopper_on ? link_V / link->chopper_resistance_ohm : 0.0;
     }
     setting->chopper_on = plant->chopper_on;
-    setting->source_conducts = bus_V < supply_V || (bus_V == supply_V && drawn_A >= 0.0);
+    setting->source_conducts = link_V < supply_V || (link_V == supply_V && drawn_A >= 0.0);
 }
 
 static void find_setting(plant_t *plant, integrator_setting_t *setting) {
@@ -165,7 +165,7 @@ static void find_setting(plant_t *plant, integrator_setting_t *setting) {
     }
 }
 
-/* The next bus voltage at which supply or chopper change what they do, and whether it is met rising. */
+/* Nearest DC-link voltages at which supply or chopper switch: with rising and with falling voltage. */
 typedef struct {
     double rising_V, falling_V;
 } thresholds_t;
@@ -186,25 +186,26 @@ static thresholds_t thresholds_of(const integrator_setting_t *setting) {
     return thresholds;
 }
 
-/* How far a state is from the end of what the setting describes: the least of the currents that are not driven, and of
- * the bus voltage's distances (V counted as A) from its thresholds. Negative: beyond. */
+/* Distance of a state from the next event: minimum of the currents that are not driven and of the distances between
+ * DC-link voltage and thresholds (V and A with equal weight). Negative: past the event. */
 static double distance_to_event(const integrator_setting_t *setting, const integrator_state_t *state) {
-    double least = INFINITY;
+    double nearest = INFINITY;
     for (unsigned index = 0; index < setting->count; index++) {
-        if (!setting->driven[index] && state->current_A[index] < least) {
-            least = state->current_A[index];
+        if (!setting->driven[index] && state->current_A[index] < nearest) {
+            nearest = state->current_A[index];
         }
     }
     if (setting->link) {
         const thresholds_t thresholds = thresholds_of(setting);
-        least =
-            fmin(least, fmin(thresholds.rising_V - state->bus_voltage_V, state->bus_voltage_V - thresholds.falling_V));
+        nearest = fmin(nearest,
+                       fmin(thresholds.rising_V - state->bus_voltage_V, state->bus_voltage_V - thresholds.falling_V));
     }
-    return least;
+    return nearest;
 }
 
-/* An event lies within `step_s`: shortens the step to that instant. Illinois variant of false position on the step's
- * result; what falls is nearly linear in time, so a few steps do. Never a step of no length, so that time goes on. */
+/* Shortens a step that contains an event to the time of the event; returns the length. Illinois variant of the false
+ * position method on the result of the step: the distance is nearly linear in time, so few iterations suffice. The
+ * length is never zero, so that time advances. */
 static double step_to_event(const integrator_setting_t *setting, const integrator_state_t *start,
                             const integrator_derivative_t *first, double step_s, integrator_state_t *end,
                             integrator_integrals_t *integrals) {
@@ -214,7 +215,7 @@ static double step_to_event(const integrator_setting_t *setting, const integrato
     double at_s = step_s;
     for (unsigned iteration = 0; iteration < EVENT_ITERATIONS; iteration++) {
         const double previous_s = at_s;
-        /* From a threshold itself, as after the event before, false position would not move. */
+        /* False position makes no progress from a start exactly on a threshold, as after the previous event. */
         const double fraction = before > 0.0 ? before / (before - after) : 0.5;
         at_s = fmax(before_s + (after_s - before_s) * fraction, EVENT_TOLERANCE_S);
         integrator_step(setting, start, first, at_s, end, integrals);
@@ -237,9 +238,9 @@ static double step_to_event(const integrator_setting_t *setting, const integrato
     return at_s;
 }
 
-/* After a step that an event ended: a current that has met zero is exactly zero, a bus voltage that has met a threshold
- * exactly there. */
-static void settle(const integrator_setting_t *setting, integrator_state_t *end) {
+/* After a step that ended at an event: sets a current that reached zero, or a DC-link voltage that reached a threshold,
+ * exactly to that value. */
+static void snap_to_event(const integrator_setting_t *setting, integrator_state_t *end) {
     for (unsigned index = 0; index < setting->count; index++) {
         end->current_A[index] = fmax(end->current_A[index], 0.0);
     }
@@ -267,8 +268,8 @@ static void sample_now(plant_t *plant) {
     plant->sample_next_ns += plant->sample_step_ns;
 }
 
-/* Samples within a step that began `start_s` after plant->time_ns, at instants before `limit_ns` and not after the
- * step's end. */
+/* Takes the samples within a step that began `start_s` after plant->time_ns, before `limit_ns` and not after the end of
+ * the step. */
 static void sample_step(plant_t *plant, const integrator_setting_t *setting, const integrator_state_t *start,
                         const integrator_derivative_t *first, const integrator_state_t *end, double start_s,
                         double step_s, uint64_t limit_ns) {
@@ -279,7 +280,7 @@ static void sample_step(plant_t *plant, const integrator_setting_t *setting, con
     integrator_derivative_t last;
     integrator_differentiate(setting, end, &last);
     const uint64_t time_ns = plant->time_ns;
-    const double angle_rad = plant->rotor_angle_rad, speed_rad_s = plant->speed_rad_s, bus_V = plant->bus_voltage_V;
+    const double angle_rad = plant->rotor_angle_rad, speed_rad_s = plant->speed_rad_s, link_V = plant->bus_voltage_V;
     double current_A[HAL_PHASES_MAX];
     memcpy(current_A, plant->current_A, sizeof current_A);
     do {
@@ -291,7 +292,7 @@ static void sample_step(plant_t *plant, const integrator_setting_t *setting, con
                                          last.acceleration_rad_s2);
         if (setting->link) {
             plant->bus_voltage_V =
-                interpolate(x, step_s, start->bus_voltage_V, first->bus_V_s, end->bus_voltage_V, last.bus_V_s);
+                interpolate(x, step_s, start->bus_voltage_V, first->link_V_s, end->bus_voltage_V, last.link_V_s);
         }
         for (unsigned index = 0; index < setting->count; index++) {
             const double at_A = interpolate(x, step_s, start->current_A[index], first->current_A_s[index],
@@ -304,7 +305,7 @@ static void sample_step(plant_t *plant, const integrator_setting_t *setting, con
     plant->time_ns = time_ns;
     plant->rotor_angle_rad = angle_rad;
     plant->speed_rad_s = speed_rad_s;
-    plant->bus_voltage_V = bus_V;
+    plant->bus_voltage_V = link_V;
     memcpy(plant->current_A, current_A, sizeof current_A);
 }
 
@@ -320,7 +321,7 @@ void plant_observe(plant_t *plant, uint64_t first_ns, uint64_t step_ns, plant_sa
 
 /* --- Time --- */
 
-/* The range of rotor angles around the present one in which no phase's magnetics lose their smoothness. */
+/* Finds the range of rotor angles around the present one in which the magnetics of all phases are smooth. */
 static void find_smooth_range(plant_t *plant) {
     double forward_rad = INFINITY, backward_rad = INFINITY;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
@@ -332,7 +333,7 @@ static void find_smooth_range(plant_t *plant) {
     plant->smooth_to_rad = plant->rotor_angle_rad + forward_rad;
 }
 
-/* The longest step from here: within the limits, and not across a place where the magnetics are not smooth. */
+/* Longest step within the limits that does not cross a point where the magnetics are not smooth. */
 static double step_length_s(plant_t *plant, const integrator_setting_t *setting, const integrator_derivative_t *first,
                             double remaining_s) {
     const double speed_rad_s = fabs(plant->speed_rad_s);
@@ -359,7 +360,7 @@ static double step_length_s(plant_t *plant, const integrator_setting_t *setting,
         angle_rad > plant->smooth_to_rad - MAGNETICS_SMOOTH_TOLERANCE_RAD) {
         find_smooth_range(plant);
     }
-    /* The acceleration counts: from standstill it alone brings the rotor there. */
+    /* The acceleration matters: from standstill it alone moves the rotor to that point. */
     const double acceleration_rad_s2 = first->acceleration_rad_s2;
     const bool forward = plant->speed_rad_s > 0.0 || (plant->speed_rad_s == 0.0 && acceleration_rad_s2 > 0.0);
     const double distance_rad = forward ? plant->smooth_to_rad - angle_rad : angle_rad - plant->smooth_from_rad;
@@ -371,12 +372,12 @@ static double step_length_s(plant_t *plant, const integrator_setting_t *setting,
     return step_s;
 }
 
-static void book(plant_t *plant, const integrator_setting_t *setting, const integrator_integrals_t *integrals) {
+static void add_energies(plant_t *plant, const integrator_setting_t *setting, const integrator_integrals_t *integrals) {
     const double winding_ohm = plant->winding_ohm;
     for (unsigned index = 0; index < setting->count; index++) {
         const double charge_As = integrals->charge_As[index], current2_A2s = integrals->current2_A2s[index];
-        const double bus_J = setting->link ? integrals->link_J[index] : plant->bus_voltage_V * charge_As;
-        const double energy_J = setting->link_sign[index] * bus_J;
+        const double link_J = setting->link ? integrals->link_J[index] : plant->bus_voltage_V * charge_As;
+        const double energy_J = setting->link_sign[index] * link_J;
         if (energy_J > 0.0) {
             plant->energy_drawn_J += energy_J;
         } else {
@@ -390,22 +391,22 @@ static void book(plant_t *plant, const integrator_setting_t *setting, const inte
     plant->energy_friction_J += plant->friction_Nm_s * integrals->speed2_rad2_s;
 }
 
-/* Through source and chopper: integrals of (supply - bus) / Rs, its square, and bus^2 / Rc. */
-static void book_link(plant_t *plant, const integrator_setting_t *setting, const integrator_integrals_t *integrals,
-                      double step_s) {
+/* Adds the energies of source and chopper: Vs (Vs - Vdc) / Rs, (Vs - Vdc)^2 / Rs and Vdc^2 / Rc, integrated. */
+static void add_link_energies(plant_t *plant, const integrator_setting_t *setting,
+                              const integrator_integrals_t *integrals, double step_s) {
     const dc_link_t *link = &plant->machine->dc_link;
     if (setting->source_conducts) {
         const double supply_V = plant->supply_voltage_V;
-        plant->energy_supplied_J += supply_V * (supply_V * step_s - integrals->bus_Vs) / link->source_resistance_ohm;
-        plant->energy_source_J += (supply_V * (supply_V * step_s - 2.0 * integrals->bus_Vs) + integrals->bus2_V2s) /
+        plant->energy_supplied_J += supply_V * (supply_V * step_s - integrals->link_Vs) / link->source_resistance_ohm;
+        plant->energy_source_J += (supply_V * (supply_V * step_s - 2.0 * integrals->link_Vs) + integrals->link2_V2s) /
                                   link->source_resistance_ohm;
     }
     if (setting->chopper_on) {
-        plant->energy_chopper_J += integrals->bus2_V2s / link->chopper_resistance_ohm;
+        plant->energy_chopper_J += integrals->link2_V2s / link->chopper_resistance_ohm;
     }
 }
 
-/* From time_ns to `to_ns`, with the switches as they are. */
+/* Integrates from time_ns to `to_ns` with constant switch states. */
 static void integrate(plant_t *plant, uint64_t to_ns) {
     const double length_s = (double)(to_ns - plant->time_ns) * NS_S;
     integrator_setting_t setting;
@@ -429,14 +430,14 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
         event = distance_to_event(&setting, &end) < 0.0;
         if (event) {
             step_s = step_to_event(&setting, &start, &first, step_s, &end, &integrals);
-            settle(&setting, &end);
+            snap_to_event(&setting, &end);
         }
         if (plant->sample != NULL) {
             sample_step(plant, &setting, &start, &first, &end, at_s, step_s, to_ns);
         }
-        book(plant, &setting, &integrals);
+        add_energies(plant, &setting, &integrals);
         if (setting.link) {
-            book_link(plant, &setting, &integrals, step_s);
+            add_link_energies(plant, &setting, &integrals, step_s);
         }
         plant->rotor_angle_rad = end.angle_rad;
         plant->speed_rad_s = end.speed_rad_s;

@@ -11,10 +11,10 @@
 #define RPM_PER_RAD_S 9.549296585513721
 
 #if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
-#error "the rows are written as they lie in memory, which the header calls little endian"
+#error "rows are written in native byte order, which must be little endian as in the header"
 #endif
 
-/* A row as it lies in the file; the floats end with those of the machine's phases and the energies. */
+/* Row of the file; only the currents of existing phases are written, directly followed by the energies. */
 typedef struct {
     double time_s;
     float values[5 + HAL_PHASES_MAX + 6];
@@ -34,8 +34,8 @@ static void append(header_t *header, const char *format, ...) {
     header->length += (size_t)written;
 }
 
-/* Format: numpy.lib.format, version 1.0. The header is padded to RECORDER_HEADER_BYTES, so that it keeps its size
- * whatever the number of rows. */
+/* Format: numpy.lib.format, version 1.0. Padding to RECORDER_HEADER_BYTES makes the size of the header independent of
+ * the number of rows. */
 static bool write_header(const recorder_t *recorder) {
     header_t header = {.length = PREAMBLE_BYTES};
     append(&header, "{'descr': [('time_s', '<f8'), ('speed_rpm', '<f4'), ('torque_Nm', '<f4'), "
@@ -54,8 +54,8 @@ static bool write_header(const recorder_t *recorder) {
     return fwrite(header.text, sizeof header.text, 1, recorder->file) == 1;
 }
 
-static void say(const recorder_t *recorder, const char *what, int reason, char *error, size_t error_size) {
-    snprintf(error, error_size, "cannot %s recording '%s': %s", what, recorder->path, strerror(reason));
+static void format_error(const recorder_t *recorder, const char *action, int reason, char *error, size_t error_size) {
+    snprintf(error, error_size, "cannot %s recording '%s': %s", action, recorder->path, strerror(reason));
 }
 
 bool recorder_open(recorder_t *recorder, const char *path, unsigned phases, char *error, size_t error_size) {
@@ -64,12 +64,12 @@ bool recorder_open(recorder_t *recorder, const char *path, unsigned phases, char
     recorder->phases = phases;
     recorder->file = fopen(path, "wb");
     if (recorder->file == NULL) {
-        say(recorder, "create", errno, error, error_size);
+        format_error(recorder, "create", errno, error, error_size);
         return false;
     }
-    setvbuf(recorder->file, NULL, _IONBF, 0); /* rows are buffered here: stdio costs a third of a row */
+    setvbuf(recorder->file, NULL, _IONBF, 0); /* rows are buffered here: stdio takes a third of the time per row */
     if (!write_header(recorder)) {
-        say(recorder, "write", errno, error, error_size);
+        format_error(recorder, "write", errno, error, error_size);
         fclose(recorder->file);
         recorder->file = NULL;
         return false;
@@ -94,7 +94,7 @@ void recorder_sample(void *context, const plant_t *plant) {
     row.values[0] = (float)(plant->speed_rad_s * RPM_PER_RAD_S);
     row.values[1] = (float)plant_torque_Nm(plant);
     row.values[2] = (float)plant->load_torque_Nm;
-    row.values[3] = wrapped_deg < 360.0f ? wrapped_deg : 0.0f; /* just below a turn the float rounds up to it */
+    row.values[3] = wrapped_deg < 360.0f ? wrapped_deg : 0.0f; /* just below 360 deg the float is rounded up */
     row.values[4] = (float)plant->bus_voltage_V;
     float *value = row.values + 5;
     for (unsigned phase = 0; phase < recorder->phases; phase++) {
@@ -129,7 +129,7 @@ bool recorder_close(recorder_t *recorder, char *error, size_t error_size) {
     }
     recorder->file = NULL;
     if (reason != 0) {
-        say(recorder, "write", reason, error, error_size);
+        format_error(recorder, "write", reason, error, error_size);
     }
     return reason == 0;
 }

@@ -1,23 +1,22 @@
-/* Sensors between plant and firmware: converter counts of currents and bus voltage, encoder counts, their errors and
- * their faults.
+/* Sensors between plant and firmware: ADC counts of currents and DC-link voltage, encoder counts, errors and faults.
  *
- * Current, in the order of the chain: the phase current of `current_delay_ns` before the sampling instant (the plain
- * delay of an isolated amplifier or a filter well below its corner), times the gain, plus offset, plus Gaussian noise,
- * limited to +-`current_limit_A` (the sensor saturates), then the converter. Bus voltage and load torque have no
- * errors; the torque transducer between machine and load shows the load's torque.
+ * Current, in the order of the signal chain: the phase current `current_delay_ns` before the sampling instant (the pure
+ * delay of an isolated amplifier, or of a filter well below its corner frequency), times the gain, plus offset, plus
+ * Gaussian noise, saturated at +-`current_limit_A`, then the ADC. DC-link voltage and load torque have no errors; the
+ * torque transducer between machine and load measures the load torque.
  *
- * Encoder: the angle read is theta + e sin(theta), then its floor in counts. This is a code disc whose centre is off
- * the axis by e (in rad) times the radius at which it is read, and at theta = 0 off towards the reading head: seen from
- * the disc's centre the head lies at -theta - e sin(theta), to first order in e; the familiar angular error of
- * eccentricity / radius. `encoder_offset_deg` is added: an encoder, or a table of angles, that is aligned wrongly.
+ * Encoder: the angle reading is theta + e sin(theta), and its floor in counts. It models a code disc whose centre is
+ * off the axis by e (in rad) times the track radius, at theta = 0 towards the reading head: seen from the centre of the
+ * disc the head is at -theta - e sin(theta), to first order in e; the well-known angle error of eccentricity / radius.
+ * `encoder_offset_deg` is added: a misaligned encoder or angle table.
  *
- * Edges of the encoder are what the angle read does at the counts' boundaries between two latches, the rotor's motion
- * there being the cubic through angle and speed of both: within 0.001 urad of the plant's at 40 kHz. The rotor may turn
- * round once between two latches. A frozen encoder has no edges, and a jump or a change of offset or eccentricity is
- * none: when the reading is elsewhere without having moved there, the last edge is forgotten.
+ * Encoder edges are the times at which the angle reading crosses boundaries of counts between two latches, computed
+ * with the cubic through angle and speed at both latches, which differs from the plant's motion by at most 0.001 urad
+ * at 40 kHz. The rotor may reverse once between two latches. A frozen encoder has no edges. A jump and a change of
+ * offset or eccentricity are no edges: when the reading has changed without a motion, the last edge is discarded.
  *
- * Scales are hal_adc.h's. A code is the nearest one (half a code upwards), limited to 0..2^bits-1: the converter is
- * unipolar, below 0 A it shows 0. Encoder counts are modulo a turn, for negative angles too.
+ * Scales: hal_adc.h. Counts are rounded to nearest (halves upwards) and clamped to 0..2^bits-1: the ADC is unipolar and
+ * reads 0 below 0 A. Encoder counts are modulo one revolution, for negative angles too.
  */
 #ifndef PLANT_SENSORS_H
 #define PLANT_SENSORS_H
@@ -31,7 +30,7 @@
 #include "plant/machine.h"
 #include "plant/plant.h"
 
-/* Values are rig.dbc's. */
+/* Values of rig.dbc. */
 typedef enum {
     SENSORS_ENCODER_HEALTHY = 0,
     SENSORS_ENCODER_FROZEN = 1,
@@ -40,43 +39,43 @@ typedef enum {
 
 typedef struct {
     /* Settings; write at any time. */
-    sensor_errors_t errors; /* the delay is kept by whoever calls sensors_hold_currents */
+    sensor_errors_t errors; /* the caller of sensors_hold_currents implements the delay */
     sensors_encoder_fault_t encoder_fault;
     double encoder_offset_deg; /* mechanical */
     bool encoder_edges;        /* the board captures edges; false after sensors_init */
 
-    /* What is converted instead of the plant's present currents while `currents_held`; clear it to let go. */
+    /* Currents that are converted instead of the present ones while `currents_held`; clear it to return to those. */
     bool currents_held;
     double held_current_A[HAL_PHASES_MAX];
 
     unsigned adc_bits, encoder_bits; /* read only */
 
-    /* The rest is sensors.c's. */
+    /* Private to sensors.c. */
     uint32_t encoder_last_counts;
     struct {
         bool known, forward;
-        int64_t boundary; /* its number, counted on from turn to turn */
+        int64_t boundary; /* number of the count above it, continued over revolutions */
         double time_ns;
     } edge;
-    bool latched; /* the state of the latch before, from here: there was one */
+    bool latched; /* the members below are those of the previous latch */
     double latch_time_ns, latch_angle_rad, latch_speed_rad_s;
     uint64_t random_state;
 } sensors_t;
 
-/* Sensors with these errors and without faults. encoder_bits 8..32, 0 means ideal (32); adc_bits 12..16. Equal seeds
- * give equal noise. */
+/* Initialises sensors with these errors and without faults. encoder_bits 8..32, 0 means ideal (32); adc_bits 12..16.
+ * Equal seeds give equal noise. */
 void sensors_init(sensors_t *sensors, const sensor_errors_t *errors, unsigned encoder_bits, unsigned adc_bits,
                   uint64_t seed);
 
-/* Holds the plant's present currents for the next conversion: call it `errors.current_delay_ns` before that. */
+/* Holds the present currents for the next conversion: call it `errors.current_delay_ns` before that. */
 void sensors_hold_currents(sensors_t *sensors, const plant_t *plant);
 
-/* Converts the held currents, or else the plant's present ones, and its present bus voltage and load torque:
- * unused phases read 0. Noise moves on by one draw a phase when it is on. */
+/* Converts the held currents, or else the present ones, and the present DC-link voltage and load torque; unused phases
+ * read 0. With noise, draws one random number per phase. */
 void sensors_sample_adc(sensors_t *sensors, const plant_t *plant, hal_adc_sample_t *sample);
 
-/* Latches the encoder; each control period, for edges are looked for since the latch before. Frozen: the count latched
- * last; jump: half a turn off as long as it is set. */
+/* Latches the encoder. Call it in each control period: edges are found between two latches. Fault frozen: the count
+ * latched last; jump: offset by half a revolution while it is set. */
 void sensors_sample_encoder(sensors_t *sensors, const plant_t *plant, hal_encoder_sample_t *sample);
 
 #endif

@@ -1,12 +1,12 @@
-/* The plant for callers that cannot lay out a plant_t, such as Python's ctypes: only in libsalient_plant.so. Together
- * with plant_set_switches, plant_open_all, plant_advance, plant_observe and plant_set_step_factor, whose arguments are
- * plain, it is all of plant.h. */
+/* Plant for callers without the layout of plant_t, such as ctypes in Python: only in libsalient_plant.so. Complements
+ * plant_set_switches, plant_open_all, plant_advance, plant_observe and plant_set_step_factor, which have plain
+ * arguments, to the whole interface of plant.h. */
 #include <stdlib.h>
 #include <string.h>
 
 #include "plant/plant.h"
 
-/* What plant_library_read gives out. */
+/* Output of plant_library_read. */
 typedef struct {
     double time_s;
     double speed_rad_s;
@@ -30,8 +30,7 @@ void plant_library_read(const plant_t *plant, plant_library_state_t *state);
 void plant_library_evaluate(const machine_t *machine, double phase_angle_rad, double current_A,
                             magnetics_point_t *point);
 
-/* A plant as plant_init makes it, to be given to plant_library_destroy; `machine` must outlive it. NULL without
- * memory. */
+/* Creates a plant by plant_init; plant_library_destroy frees it. `machine` must outlive it. NULL when out of memory. */
 plant_t *plant_library_create(const machine_t *machine, double initial_angle_rad) {
     plant_t *plant = malloc(sizeof *plant);
     if (plant != NULL) {
@@ -49,14 +48,14 @@ void plant_library_set_inputs(plant_t *plant, double load_torque_Nm, double supp
     plant_set_supply_voltage(plant, supply_voltage_V);
 }
 
-/* Puts the rotor somewhere else at another speed, as if it had been so since plant_init: the energy ledger takes no
- * note, so use it before the first advance. */
+/* Sets angle and speed of the rotor as initial values: not part of the energy balance, so call it before the first
+ * advance. */
 void plant_library_set_motion(plant_t *plant, double speed_rad_s, double rotor_angle_rad) {
     plant->speed_rad_s = speed_rad_s;
     plant->rotor_angle_rad = rotor_angle_rad;
 }
 
-/* Puts a current (>= 0) into a phase of the machine; the ledger takes no note of it either. */
+/* Sets the current (>= 0) of a phase as an initial value; not part of the energy balance either. */
 void plant_library_set_current(plant_t *plant, unsigned phase, double current_A) {
     plant->current_A[phase] = current_A;
 }

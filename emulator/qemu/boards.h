@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later
  *
- * The boards that a drive runs on in QEMU: what an image for one looks like, how QEMU is started, where the memory is
- * that drive and world share.
+ * QEMU boards that a drive runs on: properties of their images, arguments of QEMU, address of the memory shared by
+ * drive and co-simulation host.
  */
 #ifndef BOARDS_H
 #define BOARDS_H
@@ -12,16 +12,16 @@
 
 typedef struct {
     uint16_t elf_machine; /* of the images */
-    const char *target;   /* QEMU's name of the processor, in a plugin */
+    const char *target;   /* name of the processor that QEMU passes to plugins */
     const char *program;  /* QEMU's executable */
-    const char *package;  /* that has it in Debian */
+    const char *package;  /* Debian package of the executable */
     const char *machine;  /* QEMU's name of the board */
-    /* Of the shared memory; the sizes are those that the board takes. The mailbox is in it at an offset. */
+    /* Shared memory, of a size that the board accepts; the mailbox is at an offset in it. */
     uint32_t memory_address;
     uint32_t memory_bytes;
     uint32_t mailbox_offset;
-    bool timer;               /* its port uses one: the processor may take time */
-    const char *network_card; /* one that the board always has, or NULL */
+    bool timer;               /* the port uses a timer: instruction timing is available */
+    const char *network_card; /* model that is always part of the board, or NULL */
 } board_description_t;
 
 static const board_description_t boards[] = {
@@ -43,7 +43,7 @@ static const board_description_t boards[] = {
         .program = "qemu-system-riscv32",
         .package = "qemu-system-misc",
         .machine = "virt",
-        .memory_address = 0x80000000, /* all of the board's RAM; the device tree that QEMU puts there is at 16 MiB */
+        .memory_address = 0x80000000, /* the whole RAM; QEMU places the device tree at 16 MiB */
         .memory_bytes = 32 * 1024 * 1024,
         .mailbox_offset = 8 * 1024 * 1024,
     },

@@ -12,7 +12,7 @@
 
 static const char *name;
 static FILE *file;
-static uint64_t count; /* since the handler's entry; blocks count when they begin */
+static uint64_t count; /* since entry of the handler; a block is counted when it begins */
 
 static void entered(unsigned vcpu, void *size) {
     (void)vcpu;
@@ -31,8 +31,8 @@ bool instructions_open(const char *path) {
     return file != NULL;
 }
 
-/* The handler's first and last instruction have names of their own. Exceptions are taken and returned from between
- * blocks only, so that these begin a block and end one. */
+/* The handler's ends are symbols: control_handler and control_handler_return. Exception entry and return occur between
+ * blocks only, so that the first instruction begins a block and the last one ends one. */
 void instructions_translate(struct qemu_plugin_tb *tb) {
     const size_t size = qemu_plugin_tb_n_insns(tb);
     const char *symbol = qemu_plugin_insn_symbol(qemu_plugin_tb_get_insn(tb, 0));

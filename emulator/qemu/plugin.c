@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later
  *
- * The QEMU plugin: opens the co-simulation when QEMU starts, and serves each store of the drive to the doorbell.
+ * QEMU plugin: opens the co-simulation when QEMU starts, and serves each store of the drive to the doorbell.
  *
  * Plugin arguments: mailbox=FILE, the board's shared memory; instructions=FILE, see instructions.h;
- * execution=FILE and stack=END-BEGIN, see trace.h; timed=1, instructions take time; argument=TEXT, a word of the
- * host executable's command line, repeated in order.
+ * execution=FILE and stack=END-BEGIN, see trace.h; timed=1, instructions take time; argument=TEXT, one
+ * argument of the command line of the host executable, repeated in order.
  */
 #define _DEFAULT_SOURCE /* on_exit */
 
@@ -33,7 +33,7 @@ static const board_description_t *board;
 static mailbox_t *mailbox;
 static bool counting, tracing;
 
-/* The function has further stores in images that are not optimised. */
+/* In images that are not optimised the function has further stores. */
 static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, void *context) {
     (void)vcpu;
     (void)info;

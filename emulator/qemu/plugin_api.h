@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later
  *
- * What the plugin uses of QEMU's plugin interface, version 1 (QEMU 4.2 to 8.1): Debian ships no header. Described in
+ * Part of QEMU's plugin interface, version 1 (QEMU 4.2 to 8.1), that the plugin uses: Debian has no header. Reference:
  * https://www.qemu.org/docs/master/devel/tcg-plugins.html
  */
 #ifndef PLUGIN_API_H
@@ -28,8 +28,8 @@ typedef struct {
     } system;
 } qemu_info_t;
 
-struct qemu_plugin_tb;   /* a translated block: runs from its first instruction to its last */
-struct qemu_plugin_insn; /* an instruction of it, while it is translated */
+struct qemu_plugin_tb;   /* translated block: executed from its first instruction to its last */
+struct qemu_plugin_insn; /* instruction of a block, valid while the block is translated */
 
 enum qemu_plugin_cb_flags { QEMU_PLUGIN_CB_NO_REGS };
 enum qemu_plugin_mem_rw { QEMU_PLUGIN_MEM_R = 1, QEMU_PLUGIN_MEM_W, QEMU_PLUGIN_MEM_RW };

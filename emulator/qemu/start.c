@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later
  *
- * Becomes QEMU with the image of one machine's drive, its world in the plugin: a program with the command line, the
- * ready line and the exit codes of the host executable.
+ * Starts QEMU with the image of the drive for one machine and the co-simulation host as plugin, in the same process:
+ * command line, ready line and exit codes are those of the host executable.
  */
 #define _GNU_SOURCE /* memfd_create */
 
@@ -16,12 +16,13 @@
 #include "host/simulation.h"
 #include "qemu/boards.h"
 
-static int mistake(const char *what) {
-    fprintf(stderr, "salient: %s: %s\n", what, strerror(errno));
+/* Reports errno of an operation on `subject`; returns the exit code. */
+static int system_error(const char *subject) {
+    fprintf(stderr, "salient: %s: %s\n", subject, strerror(errno));
     return EXIT_USAGE;
 }
 
-/* ,KEY=VALUE as QEMU reads it: a comma in the value is written twice. */
+/* Writes ,KEY=VALUE in the syntax of QEMU: commas in the value are doubled. */
 static void put_option(FILE *list, const char *key, const char *value) {
     fprintf(list, ",%s=", key);
     for (; *value; ++value) {
@@ -32,7 +33,7 @@ static void put_option(FILE *list, const char *key, const char *value) {
     }
 }
 
-/* 2^shift is the number; -1: it is none that is allowed. */
+/* Shift with 2^shift equal to the number; -1 when the number is invalid. */
 static int shift_of(const char *number) {
     static const char *const powers[] = {"1", "2", "4", "8", "16", "32", "64"};
     for (int shift = 0; shift < (int)(sizeof powers / sizeof powers[0]); ++shift) {
@@ -43,14 +44,14 @@ static int shift_of(const char *number) {
     return -1;
 }
 
-/* The board that an image is for; NULL: one line on stderr said why. */
+/* Board of an image; NULL, after one line on stderr, on failure. */
 static const board_description_t *board_of(const char *image) {
     FILE *file = fopen(image, "rb");
     if (!file) {
-        mistake(image);
+        system_error(image);
         return NULL;
     }
-    Elf32_Ehdr header = {0}; /* little endian, as this program's */
+    Elf32_Ehdr header = {0}; /* little endian, like this computer */
     const bool whole = fread(&header, sizeof header, 1, file) == 1;
     fclose(file);
     if (whole && memcmp(header.e_ident, ELFMAG, SELFMAG) == 0 && header.e_ident[EI_CLASS] == ELFCLASS32) {
@@ -68,11 +69,11 @@ int main(int argc, char *argv[]) {
     if (argc < 2 || strcmp(argv[1], "--help") == 0) {
         printf("usage: %s IMAGE.elf [--instructions FILE] [--execution FILE STACK] [--instruction-ns N] OPTION...\n"
                "  IMAGE.elf            the drive, as built for a board of QEMU\n"
-               "  --instructions FILE  writes the instructions of each control interrupt, a uint32_t each\n"
-               "  --execution FILE STACK  writes how often each block of instructions was executed and how far\n"
-               "                       down the stack was written to, whose end and beginning STACK are: END-BEGIN\n"
-               "  --instruction-ns N   an instruction takes so long, a power of two up to 64; without it the drive\n"
-               "                       takes no time\n"
+               "  --instructions FILE  writes the number of instructions of each control interrupt as uint32_t\n"
+               "  --execution FILE STACK  writes the execution count of each block of instructions and the lowest\n"
+               "                       address written on the stack, whose limits are STACK: END-BEGIN, hexadecimal\n"
+               "  --instruction-ns N   execution time per instruction: a power of two up to 64; without this option\n"
+               "                       instructions take no time\n"
                "  OPTION               as the host executable's; its --help lists them\n",
                argv[0]);
         return argc < 2 ? EXIT_USAGE : 0;
@@ -98,7 +99,7 @@ int main(int argc, char *argv[]) {
     }
     const int shift = instruction_ns ? shift_of(instruction_ns) : 0;
     if (shift < 0) {
-        fprintf(stderr, "salient: --instruction-ns %s: allowed are 1, 2, 4, 8, 16, 32 and 64\n", instruction_ns);
+        fprintf(stderr, "salient: --instruction-ns %s: must be 1, 2, 4, 8, 16, 32 or 64\n", instruction_ns);
         return EXIT_USAGE;
     }
     if (instruction_ns && !board->timer) {
@@ -106,9 +107,9 @@ int main(int argc, char *argv[]) {
                 board->machine);
         return EXIT_USAGE;
     }
-    const int memory = memfd_create("salient mailbox", 0); /* inherited by QEMU, gone with it */
+    const int memory = memfd_create("salient mailbox", 0); /* inherited by QEMU, freed when it ends */
     if (memory < 0 || ftruncate(memory, board->memory_bytes) != 0) {
-        return mistake("the board's memory");
+        return system_error("the board's memory");
     }
     char path[64], *machine = NULL, *object = NULL, *plugin = NULL;
     size_t size;
@@ -137,14 +138,14 @@ int main(int argc, char *argv[]) {
     }
     fclose(list);
     char card[64] = "none";
-    if (board->network_card) { /* it warns when nothing is at the other end */
+    if (board->network_card) { /* QEMU warns about an unconnected card */
         int network[2];
         if (socketpair(AF_UNIX, SOCK_DGRAM, 0, network) != 0) {
-            return mistake("a socket pair");
+            return system_error("a socket pair");
         }
         snprintf(card, sizeof card, "socket,model=%s,fd=%d", board->network_card, network[0]);
     }
-    /* The clock of the board's timers counts instructions, and nothing else. */
+    /* The clock of the timers counts instructions only. */
     char clock[64];
     snprintf(clock, sizeof clock, "shift=%d,align=off,sleep=off", shift);
     execlp(board->program, board->program, "-nodefaults", "-display", "none", "-nic", card, "-machine", machine,
@@ -152,5 +153,5 @@ int main(int argc, char *argv[]) {
            "-plugin", plugin, instruction_ns ? "-icount" : (char *)NULL, clock, (char *)NULL);
     char name[64];
     snprintf(name, sizeof name, "%s (Debian package %s)", board->program, board->package);
-    return mistake(name);
+    return system_error(name);
 }

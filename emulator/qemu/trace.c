@@ -14,21 +14,21 @@
 #define BLOCKS_MAX 65536
 #define WORD_BYTES 4
 
-/* An exact count of each instruction at the cost of one addition a block. */
+/* Executions are counted per block, exactly for each instruction and with one addition per block. */
 static struct {
     uint64_t address;
     size_t size; /* instructions */
 } blocks[BLOCKS_MAX];
 static unsigned block_count;
 
-/* `executed` goes on in the background, too; `before` is what it was when the interrupt began. Apart from the blocks,
- * because every interrupt goes through them. */
-static uint64_t executed[BLOCKS_MAX], before[BLOCKS_MAX], inside[BLOCKS_MAX], in_worst[BLOCKS_MAX];
-static uint64_t worst; /* instructions */
+/* `executed` counts interrupts and background; `before` is its value at the start of the interrupt. Separate arrays,
+ * because every interrupt iterates over them. */
+static uint64_t executed[BLOCKS_MAX], before[BLOCKS_MAX], inside[BLOCKS_MAX], in_longest[BLOCKS_MAX];
+static uint64_t longest; /* instructions */
 
-/* Of the stack, as far as written to; low > high: not at all. Of the interrupt: the present one. */
+/* Range of the stack that was written to; low > high: none. by_interrupt: by the present interrupt. */
 typedef struct {
-    uint64_t low, high; /* the lowest byte, the highest word */
+    uint64_t low, high; /* lowest byte, highest word */
 } written_t;
 
 static const written_t NOTHING_WRITTEN = {.low = UINT64_MAX, .high = 0};
@@ -41,7 +41,7 @@ static FILE *file;
 
 static void entered(unsigned vcpu, void *block) {
     (void)vcpu;
-    memcpy(before, executed, block_count * sizeof before[0]); /* of a block yet to be translated both are 0 */
+    memcpy(before, executed, block_count * sizeof before[0]); /* both are 0 for a block not yet translated */
     ++executed[(uintptr_t)block];
     in_interrupt = true;
     by_interrupt = NOTHING_WRITTEN;
@@ -54,10 +54,10 @@ static void leave(void) {
         inside[i] += times;
         instructions += times * blocks[i].size;
     }
-    if (instructions > worst) {
-        worst = instructions;
+    if (instructions > longest) {
+        longest = instructions;
         for (unsigned i = 0; i < block_count; ++i) {
-            in_worst[i] = executed[i] - before[i];
+            in_longest[i] = executed[i] - before[i];
         }
     }
     in_interrupt = false;
@@ -85,7 +85,7 @@ static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, 
     written->high = address > written->high ? address : written->high;
 }
 
-/* The block's number; one that QEMU translates again keeps it. */
+/* Number of a block; a block that QEMU translates again keeps its number. */
 static unsigned number_of(uint64_t address, size_t size) {
     unsigned i = 0;
     while (i < block_count && (blocks[i].address != address || blocks[i].size != size)) {
@@ -107,7 +107,7 @@ bool trace_open(const char *path, const char *stack) {
     name = path;
     char rest;
     if (sscanf(stack, "%" SCNx64 "-%" SCNx64 "%c", &stack_end, &stack_begin, &rest) != 2 || stack_end >= stack_begin) {
-        fprintf(stderr, "salient: %s %s: not a stack, END-BEGIN\n", OPTION, stack);
+        fprintf(stderr, "salient: %s %s: must be the limits of the stack, END-BEGIN\n", OPTION, stack);
         return false;
     }
     by_thread = NOTHING_WRITTEN;
@@ -115,8 +115,8 @@ bool trace_open(const char *path, const char *stack) {
     return file != NULL;
 }
 
-/* As in instructions.c, the handler's two ends are blocks that begin and end with them. They count themselves, so that
- * it does not matter which of a block's callbacks QEMU calls first. */
+/* The ends of the handler are recognised as in instructions.c. Their callbacks also count the block, so that the order
+ * in which QEMU calls the callbacks of a block does not matter. */
 void trace_translate(struct qemu_plugin_tb *tb) {
     const size_t size = qemu_plugin_tb_n_insns(tb);
     struct qemu_plugin_insn *first = qemu_plugin_tb_get_insn(tb, 0);
@@ -137,11 +137,11 @@ void trace_translate(struct qemu_plugin_tb *tb) {
 
 bool trace_close(void) {
     if (in_interrupt) {
-        leave(); /* the program ends in the middle of one */
+        leave(); /* the program ended during an interrupt */
     }
     for (unsigned i = 0; i < block_count; ++i) {
         fprintf(file, "block %" PRIx64 " %zu %" PRIu64 " %" PRIu64 " %" PRIu64 "\n", blocks[i].address, blocks[i].size,
-                executed[i], inside[i], in_worst[i]);
+                executed[i], inside[i], in_longest[i]);
     }
     fprintf(file, "stack thread %" PRIx64 "\n", by_thread.low);
     fprintf(file, "stack interrupt %" PRIu64 "\n", interrupt_bytes_max);

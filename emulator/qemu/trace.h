@@ -10,23 +10,22 @@
 
 struct qemu_plugin_tb;
 
-/* Begins a text file, which will have these lines, addresses in hexadecimal, all else in decimal:
- *   block ADDRESS INSTRUCTIONS EXECUTED IN_INTERRUPTS IN_WORST
- *       instructions that follow each other; how often they ran, in control interrupts, in the first of the longest
- *       interrupts; blocks may overlap
+/* Creates a text file with these lines, addresses in hexadecimal, all other numbers in decimal:
+ *   block ADDRESS INSTRUCTIONS EXECUTED IN_INTERRUPTS IN_LONGEST
+ *       block of consecutive instructions; executions in total, in control interrupts, in the longest interrupt (the
+ *       first of equally long ones); blocks may overlap
  *   stack thread ADDRESS
- *       the lowest byte that the background wrote to
+ *       lowest byte that the background wrote to
  *   stack interrupt BYTES
- *       from the highest to the lowest word that one interrupt wrote to, at most
- * The stack, a text: the address that it ends at and the one that it begins below, "0x20000b70-0x20008000". Without a
- * store there ADDRESS is ffffffffffffffff, that of no byte, and BYTES is 0. False, after one line on stderr, on
- * failure. */
+ *       maximum extent, from the highest to the lowest word, that one interrupt wrote to
+ * `stack` is a text: lowest address of the stack and the address above its highest, "0x20000b70-0x20008000". Without a
+ * store to the stack ADDRESS is ffffffffffffffff and BYTES is 0. False, after one line on stderr, on failure. */
 bool trace_open(const char *path, const char *stack);
 
-/* Counts in a block that is being translated. */
+/* Instruments a block that is being translated. */
 void trace_translate(struct qemu_plugin_tb *tb);
 
-/* Writes the file and ends it; false, after one line on stderr, when a write has failed. */
+/* Writes and closes the file; false, after one line on stderr, when a write has failed. */
 bool trace_close(void);
 
 #endif

@@ -1,6 +1,6 @@
-/* The emulated board: the registers that a port of the firmware reads and writes. The rig moves them in time.
+/* Emulated board: the registers that a port of the firmware reads and writes; the rig updates them over time.
  *
- * Nothing here knows the firmware; a port maps its hal_* functions to these, one to one.
+ * Independent of the firmware; a port maps its hal_* functions to these, one to one.
  */
 #ifndef RIG_BOARD_H
 #define RIG_BOARD_H
@@ -16,7 +16,7 @@
 #include "plant/sensors.h"
 #include "rig/can_bus.h"
 
-/* From where the firmware is being called. */
+/* Context in which the firmware is called. */
 typedef enum { BOARD_START, BOARD_INTERRUPT, BOARD_BACKGROUND } board_context_t;
 
 typedef struct {
@@ -24,17 +24,17 @@ typedef struct {
     board_context_t context;
     bool in_critical_section;
 
-    hal_adc_sample_t adc;         /* latched at the period's start */
+    hal_adc_sample_t adc;         /* latched at the start of the period */
     hal_encoder_sample_t encoder; /* likewise */
     unsigned adc_bits;            /* 12..16 */
     unsigned encoder_bits;        /* 8..32 */
 
     uint16_t period_ticks; /* 0 until the timer is started */
-    bool immediate_pwm;    /* a setting: see board_pwm_write; false after board_init */
+    bool immediate_pwm;    /* setting, see board_pwm_write; false after board_init */
     hal_pwm_compare_t active, buffered;
     uint32_t missed_triggers;   /* since last read */
-    uint64_t interrupt_took_ns; /* the present control interrupt, from its trigger on: as the rig says, unless the port,
-                                   whose processor takes time of its own, says otherwise before it is over */
+    uint64_t interrupt_took_ns; /* execution time of the present control interrupt, from its trigger on: set by the rig,
+                                   overwritten before its end by a port with instruction timing */
 
     hal_can_frame_t received[HAL_CAN_RECEIVE_QUEUE];
     uint32_t received_pushed, received_popped; /* counts, not indices */
@@ -45,21 +45,21 @@ typedef struct {
     can_bus_t *bus;
 } board_t;
 
-/* A board after reset at time 0: timer stopped, switches open, queues empty. It has the resolutions of `sensors`, and
- * uses plant, sensors and bus without owning them. */
+/* Initialises a board after reset at time 0: timer stopped, switches open, queues empty, resolutions of `sensors`.
+ * Plant, sensors and bus are used, not owned. */
 void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus);
 
-/* For the rig: a control period starts now, the plant is there. Latches the sensors; the buffered compare values
- * become active unless the interrupt is still running (`busy`), then the interrupt is lost and counted, and what the
- * interrupt reads stays. */
+/* For the rig: starts a control period at the time of the plant. Latches the sensors and activates the buffered compare
+ * values. While the interrupt is still running (`busy`), the trigger is missed and counted, and the values that the
+ * interrupt reads are unchanged. */
 void board_start_period(board_t *board, bool busy);
 
-/* For the rig: a frame of another node is complete. */
+/* For the rig: delivers a complete frame of another node. */
 void board_deliver(board_t *board, const hal_can_frame_t *frame);
 
-/* For the port; each is the hal_* function of the same name. With `immediate_pwm` the compare values act in the present
- * period, at whose very start the control interrupt runs, and in the next: a converter without the delay of a period,
- * which no timer is. */
+/* For the port; each is the hal_* function of the same name. With `immediate_pwm` the compare values act from the
+ * present period on, at whose start the control interrupt runs: modulation without the delay of one period that a real
+ * timer has. */
 void board_pwm_start(board_t *board, uint16_t period_ticks);
 void board_pwm_write(board_t *board, const hal_pwm_compare_t *compare);
 void board_pwm_open_all(board_t *board);

@@ -4,7 +4,7 @@
 
 #define NS_PER_S UINT64_C(1000000000)
 
-/* The arbitration field as the wire has it, first bit highest; the lowest wins. Standard: identifier, RTR, IDE 0;
+/* Arbitration field as transmitted, first bit highest; the lowest value wins. Standard: identifier, RTR, IDE 0;
  * extended: base identifier, SRR 1, IDE 1, extension, RTR. */
 static uint32_t arbitration_field(const hal_can_frame_t *frame) {
     uint32_t remote = frame->remote;
@@ -53,7 +53,7 @@ bool can_bus_push(can_bus_t *bus, const hal_can_frame_t *frame) {
     return true;
 }
 
-/* The mailbox that the drive's controller would send next, or HAL_CAN_MAILBOXES. */
+/* Mailbox that the CAN controller of the drive sends next, or HAL_CAN_MAILBOXES. */
 static unsigned best_mailbox(const can_bus_t *bus) {
     unsigned best = HAL_CAN_MAILBOXES;
     for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
@@ -64,9 +64,9 @@ static unsigned best_mailbox(const can_bus_t *bus) {
             best = i;
             continue;
         }
-        uint32_t mine = arbitration_field(&bus->mailbox[i].frame);
-        uint32_t others = arbitration_field(&bus->mailbox[best].frame);
-        if (mine < others || (mine == others && bus->mailbox[i].request < bus->mailbox[best].request)) {
+        uint32_t candidate = arbitration_field(&bus->mailbox[i].frame);
+        uint32_t present = arbitration_field(&bus->mailbox[best].frame);
+        if (candidate < present || (candidate == present && bus->mailbox[i].request < bus->mailbox[best].request)) {
             best = i;
         }
     }

@@ -1,9 +1,9 @@
-/* The emulated CAN bus: bit rate, exact frame lengths, arbitration by identifier.
+/* Emulated CAN bus: bit rate, exact frame lengths, arbitration by identifier.
  *
- * Two nodes send: the drive through three mailboxes (the lowest identifier leaves first, equal ones in the order of
- * their requests), and all clients together through one controller that sends in the order of arrival. The node whose
- * identifier wins arbitration sends; on equal identifiers the drive. There are no bit errors and every frame is
- * acknowledged. Pure: no time but what it is given.
+ * Two nodes send: the drive through three mailboxes (lowest identifier first, equal ones in the order of their
+ * requests), and all clients together through one controller that sends in the order of arrival. The node with the
+ * lower identifier wins arbitration; the drive on equal identifiers. There are no bit errors and every frame is
+ * acknowledged. All times are arguments; the module has no clock.
  *
  * A frame is complete, and delivered, at the last bit of its end of frame; the next one starts three bits later.
  */
@@ -28,12 +28,12 @@ typedef struct {
 } can_bus_delivery_t;
 
 typedef struct {
-    /* When can_bus_step is due, CAN_BUS_NEVER while nothing is to be sent. */
+    /* Time at which can_bus_step is due, CAN_BUS_NEVER while nothing is to be sent. */
     uint64_t next_event_ns;
     /* A frame was queued on an idle bus: can_bus_start is due. */
     bool start_requested;
 
-    /* The rest is can_bus.c's. */
+    /* Private to can_bus.c. */
     can_length_t lengths;
     uint32_t bit_rate;
     uint64_t frame_start_ns, idle_from_ns;
@@ -42,14 +42,14 @@ typedef struct {
     struct {
         hal_can_frame_t frame;
         bool taken;
-        uint64_t request; /* rises with each frame */
+        uint64_t request; /* sequence number of the request */
     } mailbox[HAL_CAN_MAILBOXES];
     uint64_t requests;
     hal_can_frame_t client_queue[CAN_BUS_CLIENT_QUEUE];
     uint64_t client_pushed, client_popped;
 } can_bus_t;
 
-/* An idle bus at time 0. bit_rate in bit/s, CAN_BUS_BIT_RATE_MIN..CAN_BUS_BIT_RATE_MAX. */
+/* Initialises an idle bus at time 0. bit_rate in bit/s, CAN_BUS_BIT_RATE_MIN..CAN_BUS_BIT_RATE_MAX. */
 void can_bus_init(can_bus_t *bus, uint32_t bit_rate);
 
 /* Drive: puts a frame into a free mailbox; false when all three are taken. A mailbox is free again when its frame is
@@ -59,13 +59,13 @@ bool can_bus_transmit(can_bus_t *bus, const hal_can_frame_t *frame);
 /* Clients: queues a frame; false when CAN_BUS_CLIENT_QUEUE frames wait. */
 bool can_bus_push(can_bus_t *bus, const hal_can_frame_t *frame);
 
-/* Frames of clients that are not complete yet. */
+/* Number of client frames that are not complete yet. */
 size_t can_bus_client_backlog(const can_bus_t *bus);
 
-/* To be called when everything that wants to send from `now_ns` on was queued: lets an idle bus begin. */
+/* Starts arbitration on an idle bus; call it when all frames that are ready to send at `now_ns` are queued. */
 void can_bus_start(can_bus_t *bus, uint64_t now_ns);
 
-/* The event due at next_event_ns. True when a frame is complete: `delivery` is it. */
+/* Processes the event due at next_event_ns. True when a frame is complete, in `delivery`. */
 bool can_bus_step(can_bus_t *bus, can_bus_delivery_t *delivery);
 
 #endif

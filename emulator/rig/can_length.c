@@ -10,7 +10,7 @@ static unsigned run_state(unsigned level, unsigned length) {
     return level * 5 + length - 1;
 }
 
-/* The state after one more bit; counts the stuff bit it causes. */
+/* State after one more bit; counts the stuff bit that it causes. */
 static unsigned stuff_step(unsigned state, unsigned bit, uint8_t *stuff_bits) {
     unsigned level = state / 5, length = state % 5 + 1;
     length = bit == level ? length + 1 : 1;
@@ -57,7 +57,7 @@ static uint64_t header(const hal_can_frame_t *frame, unsigned *bits) {
 }
 
 uint16_t can_length_crc(const can_length_t *tables, const hal_can_frame_t *frame) {
-    /* Leading zeros do not change a CRC that begins with zero, so the header may be cut into whole bytes. */
+    /* Leading zeros do not change a CRC that begins with zero, so the header may be processed in whole bytes. */
     unsigned bits;
     uint64_t head = header(frame, &bits);
     unsigned crc = 0;
@@ -75,8 +75,8 @@ unsigned can_length_bits(const can_length_t *tables, const hal_can_frame_t *fram
     uint64_t head = header(frame, &bits);
     unsigned crc = can_length_crc(tables, frame);
 
-    /* Padding to whole bytes by bits that cannot stuff: alternating ones that end recessive before start of frame
-     * (which is dominant), and behind the CRC the complement of its last bit. */
+    /* Padding to whole bytes with bits that cause no stuffing: alternating bits that end recessive before start of
+     * frame (which is dominant), and after the CRC the complement of its last bit. */
     uint64_t padded = bits == 19 ? head | UINT64_C(0x15) << 19 : head | UINT64_C(1) << 39;
     unsigned tail = crc << 1 | (~crc & 1u);
 

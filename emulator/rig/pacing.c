@@ -23,7 +23,7 @@ bool pacing_parse(pacing_t *pacing, const char *text) {
     if (strcmp(text, "realtime") == 0) {
         return true;
     }
-    /* Digits and a point only: strtod alone would also take signs, hexadecimal, infinity and not-a-number. */
+    /* Digits and a point only: strtod would also accept signs, hexadecimal, infinity and not-a-number. */
     if (text[0] != 'x' || text[1] == '\0' || strspn(text + 1, "0123456789.") != strlen(text + 1)) {
         return false;
     }

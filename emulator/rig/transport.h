@@ -5,25 +5,15 @@
 #ifndef RIG_TRANSPORT_H
 #define RIG_TRANSPORT_H
 
-#include <linux/can.h>
 #include <poll.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 
-#include "hal_can.h"
+#include "rig/transport_frame.h"
 
 #define TRANSPORT_DESCRIPTORS_MAX 72
 #define TRANSPORT_ERROR_SIZE 256
-
-/* One frame in Linux's layout; `size` selects the member. */
-typedef struct {
-    size_t size; /* CAN_MTU (classic) or CANFD_MTU (flexible data rate) */
-    union {
-        struct can_frame classic;
-        struct canfd_frame flexible;
-    };
-} transport_frame_t;
 
 /* Origin of a frame that is sent to the clients; it determines how the frame's time is conveyed. */
 typedef enum {
@@ -49,7 +39,7 @@ typedef struct {
 
 typedef struct transport transport_t;
 
-/* Each transport begins with this. The functions are called through transport_* below. */
+/* Base of all transports, their first member. The functions are called through transport_* below. */
 struct transport {
     size_t (*descriptors)(transport_t *transport, struct pollfd *list);
     size_t (*read)(transport_t *transport, const transport_receiver_t *receiver);
@@ -69,8 +59,8 @@ static inline size_t transport_descriptors(transport_t *transport, struct pollfd
     return transport->descriptors(transport, list);
 }
 
-/* Accepts new clients and hands over their frames, one frame of each client in turn, in the order of connection,
- * until a whole turn yields none. Never waits. Returns the number of frames handed over. */
+/* Accepts new clients and hands over their frames, one frame per client in turn, in the order of connection,
+ * until a round yields none. Never waits. Returns the number of frames handed over. */
 static inline size_t transport_read(transport_t *transport, const transport_receiver_t *receiver) {
     return transport->read(transport, receiver);
 }
@@ -92,7 +82,7 @@ static inline bool transport_connected(transport_t *transport, uint32_t client) 
     return transport->connected(transport, client);
 }
 
-/* True when a client is connected that has not left, or a new one waits to be accepted. */
+/* True when a client is connected, or a new one waits to be accepted. */
 static inline bool transport_in_use(transport_t *transport) {
     return transport->in_use(transport);
 }
@@ -105,24 +95,12 @@ static inline void transport_close(transport_t *transport) {
 /* Opens `address`, unix:PATH or socketcan:INTERFACE. NULL with a line in `error` on failure. */
 transport_t *transport_open(const char *address, char error[TRANSPORT_ERROR_SIZE]);
 
-/* The two kinds, by what follows the colon. */
+/* Open one kind of transport by its part of the address, without the prefix. */
 transport_t *transport_local_open(const char *path, char error[TRANSPORT_ERROR_SIZE]);
 transport_t *transport_socketcan_open(const char *interface, char error[TRANSPORT_ERROR_SIZE]);
 
 /* SocketCAN over a descriptor that is open already and keeps record boundaries (for tests: one end of a socket pair
- * stands in for an interface). Takes the descriptor over. */
+ * stands in for an interface). Takes ownership of the descriptor. */
 transport_t *transport_socketcan_attach(int descriptor);
-
-/* True when `received` bytes are a frame. Fields without meaning are then zeroed, so that equal frames are equal bytes:
- * reserved fields and data beyond the length. A classic length of 9 to 15 becomes length 8 with len8_dlc. */
-bool transport_frame_accept(transport_frame_t *frame, size_t received);
-
-/* Never on the emulated bus: flexible data rate, error frames and the rig's identifiers (0x1F0000xx, 29 bits). */
-bool transport_frame_is_rig(const transport_frame_t *frame);
-bool transport_frame_is_off_bus(const transport_frame_t *frame);
-
-/* Between the wire's form and the controller's; classic data and remote frames only. */
-void transport_frame_to_hal(const transport_frame_t *frame, hal_can_frame_t *hal);
-void transport_frame_from_hal(const hal_can_frame_t *hal, transport_frame_t *frame);
 
 #endif

@@ -1,4 +1,4 @@
-/* The local bus: an AF_UNIX SOCK_SEQPACKET socket, one record a frame: virtual time in ns (8 bytes, little endian; 0
+/* The local bus: an AF_UNIX SOCK_SEQPACKET socket, one record per frame: virtual time in ns (8 bytes, little endian; 0
  * from clients), then struct can_frame or struct canfd_frame. Records of any other size, or with an impossible length
  * or identifier, are ignored and counted. An empty record ends the connection, as closing it does.
  */
@@ -23,7 +23,7 @@
 #define CLIENTS_MAX 64
 #define BATCH 256
 #define SEND_BUFFER_BYTES (8 * 1024 * 1024) /* some 10,000 records; the default queue holds 278 */
-#define READ_TURNS_MAX 65536 /* a client that never stops sending cannot hold up the others indefinitely */
+#define READ_ROUNDS_MAX 65536 /* a client that never stops sending cannot hold up the others indefinitely */
 
 /* Waiting for a client whose queue is full: rounds of a sleep of WAIT_SLEEP_MS, which the client's first read of a
  * quarter of the queue may end early, and of WAIT_BUSY_NS of this process's own processor time. */
@@ -178,7 +178,7 @@ static void read_one(local_t *local, unsigned index, const transport_receiver_t 
 static size_t local_read(transport_t *transport, const transport_receiver_t *receiver) {
     local_t *local = (local_t *)transport;
     size_t taken = 0;
-    for (unsigned turn = 0; turn < READ_TURNS_MAX; ++turn) {
+    for (unsigned round = 0; round < READ_ROUNDS_MAX; ++round) {
         struct pollfd list[TRANSPORT_DESCRIPTORS_MAX];
         uint32_t numbers[TRANSPORT_DESCRIPTORS_MAX];
         size_t count = local_descriptors(transport, list);

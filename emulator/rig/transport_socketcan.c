@@ -2,7 +2,7 @@
  *
  * The interface carries no virtual time, so RIG_STAMP frames do (rig.dbc): before each frame of the emulator one with
  * subject "next", and one with "oldest_on_bus" or "oldest_at_once" when a frame of a client completes on the emulated
- * bus or was taken at once. Clients' frames are on the interface already and are not sent again.
+ * bus or was taken immediately. Clients' frames are on the interface already and are not sent again.
  */
 #define _GNU_SOURCE /* SO_SNDBUFFORCE */
 
@@ -37,7 +37,7 @@ static size_t socketcan_descriptors(transport_t *transport, struct pollfd *list)
     return 1;
 }
 
-/* The interface does not report which clients there are. */
+/* The interface does not report its clients. */
 static bool socketcan_connected(transport_t *transport, uint32_t client) {
     (void)transport;
     (void)client;
@@ -193,10 +193,10 @@ transport_t *transport_socketcan_open(const char *interface, char error[TRANSPOR
     can_err_mask_t errors = CAN_ERR_MASK;
     setsockopt(descriptor, SOL_CAN_RAW, CAN_RAW_FD_FRAMES, &on, sizeof on);
     setsockopt(descriptor, SOL_CAN_RAW, CAN_RAW_ERR_FILTER, &errors, sizeof errors);
-    const int force[] = {SO_SNDBUFFORCE, SO_RCVBUFFORCE}, ask[] = {SO_SNDBUF, SO_RCVBUF};
+    const int force[] = {SO_SNDBUFFORCE, SO_RCVBUFFORCE}, plain[] = {SO_SNDBUF, SO_RCVBUF};
     for (unsigned i = 0; i < 2; ++i) {
         if (setsockopt(descriptor, SOL_SOCKET, force[i], &bytes, sizeof bytes) != 0) {
-            setsockopt(descriptor, SOL_SOCKET, ask[i], &bytes, sizeof bytes);
+            setsockopt(descriptor, SOL_SOCKET, plain[i], &bytes, sizeof bytes);
         }
     }
     transport_t *transport = transport_socketcan_attach(descriptor);

@@ -1,9 +1,10 @@
-/* Functions of a QEMU board for the drive's program (emulator/qemu/image/main.c). A board has these, the critical
- * section of hal_time.h, hal_interrupt_elapsed_ticks, the processor's vectors or their like, and a linker script
+/* Functions of a QEMU board for the program of the drive (emulator/qemu/image/main.c). A board implements these, the
+ * critical section of hal_time.h, hal_interrupt_elapsed_ticks and the exception vectors, and has a linker script
  * memory.ld.
  *
- * Who counts instructions knows the control interrupt's ends by their names: control_handler is the handler's first
- * instruction; at control_handler_return it begins its end, which has no jump before the return and lies within a page.
+ * The instruction counter recognises the ends of the control interrupt by symbols: control_handler is the first
+ * instruction of the handler, control_handler_return the start of its epilogue, which has no jump before the return and
+ * lies within one page.
  */
 #ifndef BOARD_H
 #define BOARD_H
@@ -11,16 +12,16 @@
 #include <stdint.h>
 #include <stdnoreturn.h>
 
-/* The program: the processor's reset leads here, with a stack and without variables. */
+/* Entry point of the program after reset: the stack is set up, variables are not initialised. */
 noreturn void program_start(void);
 
-/* The control interrupt's work: the handler calls it, in the processor's interrupt context. */
+/* Body of the control interrupt; the handler calls it in interrupt context. */
 void program_interrupt(void);
 
-/* Lets board_interrupt_pend act, and starts the timer on a processor that takes time. The period is in the mailbox. */
+/* Enables the control interrupt and, with instruction timing, starts the timer; the period is in the mailbox. */
 void board_interrupt_enable(void);
 
-/* Asks for the control interrupt, as the timer would; not in a critical section. It is over when this returns. */
+/* Requests the control interrupt in place of the timer, and returns after it; not in a critical section. */
 void board_interrupt_pend(void);
 
 /* Ends QEMU with an exit code, 0..255. */

@@ -1,5 +1,4 @@
-/* The hal_* functions on the mailbox, for any board of QEMU; the critical section and the time on the
- * processor are the board's. */
+/* The hal_* functions on the mailbox, for any QEMU board; the board implements critical section and execution time. */
 #ifndef HAL_QEMU_H
 #define HAL_QEMU_H
 
@@ -10,10 +9,10 @@ struct hal {
     mailbox_t mailbox;
 };
 
-/* The one board there is; the linker places it in the memory shared with the co-simulation host. */
+/* The board; the linker places it in the memory shared with the co-simulation host. */
 extern hal_t board;
 
-/* Stores a command to the doorbell. Whatever of the mailbox the compiler held in registers is read again after it. */
+/* Stores a command to the doorbell. The compiler keeps no part of the mailbox in registers across the call. */
 void doorbell_ring(mailbox_command_t command);
 
 #endif

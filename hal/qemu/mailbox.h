@@ -2,8 +2,8 @@
  *
  * A structure in memory that the drive shares with the co-simulation host (emulator/qemu). The drive reads registers
  * and sends commands: it stores one to `doorbell`, and the host has executed it before the drive's next instruction. No
- * polling is needed, and time stands still while the drive computes, as in the host executable. The layout is the same
- * on both sides: little endian, natural alignment, no pointers.
+ * polling is needed, and virtual time does not advance while the drive computes, as in the host executable. The layout
+ * is the same on both sides: little endian, natural alignment, no pointers.
  *
  * When `timed` is set, instructions take time and a timer of the board defines the control period. The timer's handler
  * sends MAILBOX_TRIGGER before and MAILBOX_INTERRUPT_END after the control interrupt, and only these advance the
@@ -43,13 +43,13 @@ typedef enum {
 typedef enum {
     MAILBOX_INTERRUPT = 1, /* the timer requests the control interrupt */
     MAILBOX_BACKGROUND,    /* the processor has time for the background */
-    MAILBOX_EXIT,          /* over: end with exit_code */
+    MAILBOX_EXIT,          /* end of the run, with exit_code */
 } mailbox_event_t;
 
 typedef struct {
     uint32_t doorbell; /* mailbox_command_t */
 
-    /* Constant from the start on. */
+    /* Constant after start. */
     uint32_t layout; /* MAILBOX_LAYOUT */
     uint32_t control_rate_hz;
     uint32_t controller; /* drive_controller_t */

@@ -37,7 +37,7 @@ MAP = 3  # MAGNETICS_MAP, after the forms
 class FluxMap(ctypes.Structure):
     _fields_ = [
         ("current_max_A", ctypes.c_double),
-        ("least_inductance_H", ctypes.c_double),
+        ("inductance_min_H", ctypes.c_double),
         ("current_scale_A", ctypes.c_double),
         ("coenergy_J", (ctypes.c_double * (ANGLE_INTERVALS + 3)) * (CURRENT_INTERVALS + 4)),
     ]
@@ -162,8 +162,8 @@ def load_library() -> ctypes.CDLL:
 
 def flux_map_of(model: salient.machine.flux_map.FluxMap) -> FluxMap:
     """The map structure that the build generates from a machine file."""
-    least_inductance_H, _, _, current_scale_A = model.inductance_extremes()
-    flux_map = FluxMap(model.current_max_A, least_inductance_H, current_scale_A)
+    inductance_min_H, _, _, current_scale_A = model.inductance_extremes()
+    flux_map = FluxMap(model.current_max_A, inductance_min_H, current_scale_A)
     for row, coefficients_J in zip(flux_map.coenergy_J, model.coefficients_J.tolist(), strict=True):
         row[:] = coefficients_J
     return flux_map

@@ -1,12 +1,12 @@
-/* What background and control interrupt share, torn or whole.
+/* Detects torn data in the structures that background and control interrupt share.
  *
- * Stands in for the laws, the bus and the program around drive.c: the background configures, commands and takes a
- * snapshot in every round, with the same number in every member of what it writes; the interrupt writes the same number
- * into every member of what a snapshot reads. Members that differ were torn. drive.c, the critical section and the
- * timer are the drive's own.
+ * Replaces the control laws, the CAN interface and the program around drive.c: in every round the background
+ * configures, commands and takes a snapshot, with one number in all members that it writes; the interrupt writes one
+ * number into all members that a snapshot reads. Members that differ were torn. drive.c, the critical section and the
+ * timer are those of the drive.
  *
- * Each 400 interrupts a frame says how often since start: uint16 little endian, interrupts, torn parameters, torn
- * commands, torn snapshots. The processor must take time.
+ * Every 400 interrupts a frame reports the counts since start as uint16, little endian: interrupts, torn parameters,
+ * torn commands, torn snapshots. Requires instruction timing.
  */
 #include <assert.h>
 #include <stddef.h>
@@ -21,7 +21,7 @@
 #define FRAME_ID 0x7A0
 #define INTERRUPTS_PER_FRAME 400
 
-/* Of the linker script. */
+/* Symbols of the linker script. */
 extern uint32_t bss_start[], bss_end[];
 
 const machine_tables_t machine_tables = {.phases = 3, .rotor_poles = 4};
@@ -50,7 +50,7 @@ bool configure_rate_allowed(uint32_t control_rate_hz) {
     return control_rate_hz == 40000;
 }
 
-/* The first set has the timer's period in every half word; a later one is long enough as a timeout, too. */
+/* The first set has the period of the timer in every half word; later sets are also long enough as a timeout. */
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
                                        uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits) {
     (void)tables, (void)control_rate_hz, (void)encoder_bits, (void)adc_bits;
@@ -77,9 +77,9 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     return false;
 }
 
-static_assert(sizeof(drive_telemetry_t) <= sizeof(control_state_t), "what a snapshot reads");
+static_assert(sizeof(drive_telemetry_t) <= sizeof(control_state_t), "a snapshot reads only control_state_t");
 
-/* Word by word, as the interrupt wrote them. */
+/* Copies the words that the interrupt wrote. */
 void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t *telemetry) {
     (void)time_us;
     memcpy(telemetry, &from->control, sizeof *telemetry);
@@ -99,7 +99,7 @@ bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool
     (void)writable, (void)time_us;
     static uint32_t number;
     static uint16_t reported; /* interrupts */
-    number--;                 /* downwards: as a time it is past, and a command of it not stale */
+    number--;                 /* downwards: as a time it is past, and a command with it is not stale */
     fill(&comms->command, sizeof comms->command, number);
     parameters->revision++;
     hal_critical_enter(hal);
@@ -124,12 +124,12 @@ void hal_critical_leave(hal_t *hal) {
 }
 #endif
 
-__attribute__((used)) void program_interrupt(void) { /* by the handler, in assembly */
+__attribute__((used)) void program_interrupt(void) { /* called by the handler, in assembly */
     drive_control_interrupt(&drive);
 }
 
-/* Rounds of different lengths, so that the interrupt comes at every place of one. */
-static void dally(void) {
+/* Random delay, so that the interrupt occurs at all points of a round. */
+static void random_delay(void) {
     static uint32_t random;
     random = random * UINT32_C(1664525) + UINT32_C(1013904223);
     for (uint32_t i = random >> 23; i > 0; i--) {
@@ -145,7 +145,7 @@ noreturn void program_start(void) {
     doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REJECTED);
     while (board.mailbox.event != MAILBOX_EXIT) {
         drive_background(&drive);
-        dally();
+        random_delay();
         doorbell_ring(MAILBOX_NEXT);
     }
     board_exit(board.mailbox.exit_code);

@@ -30,7 +30,7 @@ def program() -> list[str]:
         (["--instructions", "/no/such/folder/x", "--can", "BUS"], ["--instructions /no/such/folder/x"]),
         (["--execution", "/no/such/folder/x", "0-1", "--can", "BUS"], ["--execution /no/such/folder/x"]),
         (["--execution", "x", "8-8", "--can", "BUS"], ["--execution 8-8", "END-BEGIN"]),
-        (["--instruction-ns", "9", "--can", "BUS"], ["--instruction-ns 9", "1, 2, 4, 8, 16, 32 and 64"]),
+        (["--instruction-ns", "9", "--can", "BUS"], ["--instruction-ns 9", "must be 1, 2, 4, 8, 16, 32 or 64"]),
         (["--can", "BUS", "--bogus"], ["--bogus"]),
     ],
 )

@@ -100,4 +100,4 @@ def test_cortex_m4_build_fails_at_one_byte_above_the_flash_limit(tmp_path):
     assert size_check(tmp_path, 901, 100).returncode != 0
     too_much = size_check(tmp_path, 900, 101)
     assert too_much.returncode != 0
-    assert "1001 bytes of flash, 1000 are allowed" in too_much.stderr
+    assert "1001 bytes of flash, must be at most 1000" in too_much.stderr

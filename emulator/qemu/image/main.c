@@ -1,4 +1,4 @@
-/* One drive on a board of QEMU: the same firmware as on the host, its interrupt a real exception. */
+/* One drive on a QEMU board: the firmware of the host executable, with the control interrupt as a real exception. */
 #include <string.h>
 
 #include "control/machine_tables.h"
@@ -6,12 +6,12 @@
 #include "qemu/board.h"
 #include "qemu/hal_qemu.h"
 
-/* Of the linker script. */
+/* Symbols of the linker script. */
 extern uint32_t data_start[], data_end[], data_load[], bss_start[], bss_end[];
 
 static drive_t drive;
 
-__attribute__((used)) void program_interrupt(void) { /* by the handler, in assembly */
+__attribute__((used)) void program_interrupt(void) { /* called by the handler, in assembly */
     drive_control_interrupt(&drive);
 }
 

@@ -1,4 +1,4 @@
-/* The board mps2-an386, a Cortex-M4: start, end, the control interrupt, the critical section. */
+/* Board mps2-an386, a Cortex-M4: start, end, the control interrupt, the critical section. */
 #include "qemu/board.h"
 
 #include "hal_interrupt.h"
@@ -6,7 +6,7 @@
 #include "qemu/hal_qemu.h"
 #include "qemu/mps2_an386/timer.h"
 
-/* A line that the board's own peripherals do not use. */
+/* Interrupt line that no peripheral of the board uses. */
 #define CONTROL_IRQ 31
 
 /* Armv7-M architecture reference manual, B3.4. */
@@ -17,7 +17,7 @@
 #define SYS_EXIT_EXTENDED 0x20
 #define ADP_STOPPED_APPLICATION_EXIT 0x20026
 
-extern uint32_t stack_top[]; /* of the linker script */
+extern uint32_t stack_top[]; /* symbol of the linker script */
 
 noreturn void board_exit(uint32_t code) {
     const uint32_t block[2] = {ADP_STOPPED_APPLICATION_EXIT, code};
@@ -28,7 +28,7 @@ noreturn void board_exit(uint32_t code) {
     }
 }
 
-/* Every exception but the control interrupt: none is expected. */
+/* Handler of all other exceptions: none is expected. */
 static void fault_handler(void) {
     board_exit(MAILBOX_EXIT_FAULT);
 }
@@ -41,7 +41,7 @@ __asm__(".text\n"
         ".global control_handler\n"
         ".type control_handler, %function\n"
         "control_handler:\n"
-        "    push {r4, lr}\n" /* r4 keeps the stack aligned to 8 bytes */
+        "    push {r4, lr}\n" /* r4: stack alignment to 8 bytes */
         ".size control_handler, . - control_handler\n"
         "    bl program_interrupt\n"
         ".type control_handler_return, %function\n"
@@ -50,10 +50,10 @@ __asm__(".text\n"
         ".size control_handler_return, . - control_handler_return\n");
 
 void board_interrupt_enable(void) {
-    NVIC_IPR(CONTROL_IRQ) = 0; /* the highest that can be set */
+    NVIC_IPR(CONTROL_IRQ) = 0; /* highest configurable priority */
     NVIC_ISER0 = UINT32_C(1) << CONTROL_IRQ;
     if (board.mailbox.timed && board.mailbox.period_ticks > 0) {
-        NVIC_IPR(TIMER_IRQ) = 0x80; /* lower: the control interrupt comes within the timer's */
+        NVIC_IPR(TIMER_IRQ) = 0x80; /* lower: the control interrupt pre-empts that of the timer */
         NVIC_ISER0 = UINT32_C(1) << TIMER_IRQ;
         timer_start(board.mailbox.period_ticks);
     }
@@ -68,7 +68,7 @@ uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
     return hal->mailbox.timed ? timer_elapsed_ticks() : hal->mailbox.elapsed_ticks;
 }
 
-/* There is no interrupt but the control interrupt and the timer's that asks for it, so all interrupts may be masked. */
+/* Masks all interrupts: there are only the control interrupt and that of the timer, which requests it. */
 void hal_critical_enter(hal_t *hal) {
     (void)hal;
     __asm__ volatile("cpsid i" ::: "memory");

@@ -4,7 +4,7 @@
 #include "qemu/board.h"
 #include "qemu/hal_qemu.h"
 
-/* Timers of the CMSDK, at 25 MHz; they count down. Arm DDI 0479, 4.3. */
+/* CMSDK timers, 25 MHz, counting down. Arm DDI 0479, 4.3. */
 typedef struct {
     uint32_t control;
     uint32_t value;
@@ -19,20 +19,20 @@ typedef struct {
 #define TICKS_PER_COUNT (40 / HAL_PWM_TICK_NS)
 
 static uint32_t period;       /* counts */
-static uint32_t trigger_time; /* of the trigger served last, counts */
+static uint32_t trigger_time; /* time of the trigger served last, counts */
 static uint32_t passed;       /* triggers after that one and before the control interrupt's end */
 
-/* Counts, upwards, modulo 2^32. */
+/* Present time in counts, modulo 2^32. */
 static uint32_t now(void) {
     return ~COUNTER->value;
 }
 
 void timer_start(uint32_t period_ticks) {
     period = 2u * period_ticks / TICKS_PER_COUNT;
-    TRIGGER->reload = TRIGGER->value = period - 1u; /* 0 is one of its counts */
+    TRIGGER->reload = TRIGGER->value = period - 1u; /* the timer also counts 0 */
     COUNTER->reload = COUNTER->value = UINT32_MAX;
     COUNTER->control = CONTROL_ENABLE;
-    /* Before the other starts, so that no trigger is later than its multiple of the period as counted by now(). */
+    /* Read before the other timer starts, so that no trigger is later than its multiple of the period on now(). */
     trigger_time = now();
     TRIGGER->control = CONTROL_ENABLE | CONTROL_INTERRUPT;
 }
@@ -41,7 +41,7 @@ uint32_t timer_elapsed_ticks(void) {
     return (now() - trigger_time) * TICKS_PER_COUNT;
 }
 
-/* The counter identifies the trigger: one that came while interrupts were masked hides those before it. */
+/* The counter identifies the trigger: one that occurs while interrupts are masked hides earlier pending ones. */
 void timer_handler(void) {
     TRIGGER->interrupt_clear = 1;
     const uint32_t periods = (now() - trigger_time) / period;
@@ -60,7 +60,7 @@ void timer_handler(void) {
         passed = board.mailbox.elapsed_ticks / TICKS_PER_COUNT / period;
         doorbell_ring(MAILBOX_INTERRUPT_END);
     }
-    if (board.mailbox.event == MAILBOX_EXIT) { /* here: the background may have no time left to see it */
+    if (board.mailbox.event == MAILBOX_EXIT) { /* here, because the background may have no time left to check it */
         board_exit(board.mailbox.exit_code);
     }
 }

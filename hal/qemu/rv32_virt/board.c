@@ -1,16 +1,16 @@
-/* The board virt with an RV32IMAC: start, end, the control interrupt, the critical section. */
+/* Board virt with an RV32IMAC: start, end, the control interrupt, the critical section. */
 #include "qemu/board.h"
 
 #include "hal_interrupt.h"
 #include "hal_time.h"
 #include "qemu/hal_qemu.h"
 
-/* SiFive's test finisher: its status ends QEMU with the exit code in the upper half. */
+/* SiFive test finisher: writing its status ends QEMU with the exit code in the upper half. */
 #define FINISHER (*(volatile uint32_t *)0x00100000)
 #define FINISHER_FAIL 0x3333
 
-/* RISC-V ACLINT specification: the first processor's software interrupt, the nearest to a timer's that may be asked
- * for. */
+/* RISC-V ACLINT specification: software interrupt of the first hart, which software can request, unlike that of the
+ * timer. */
 #define ACLINT_MSIP (*(volatile uint32_t *)0x02000000)
 
 /* RISC-V privileged architecture, 3.1.6 and 3.1.9. */
@@ -18,20 +18,20 @@
 #define MIE_MSIE "8"
 
 noreturn void board_exit(uint32_t code) {
-    FINISHER = code << 16 | FINISHER_FAIL; /* a pass has no code */
+    FINISHER = code << 16 | FINISHER_FAIL; /* status PASS has no exit code */
     for (;;) {
     }
 }
 
-/* Every exception: none is expected. */
+/* Handler of all exceptions: none is expected. */
 noreturn void fault_handler(void);
 noreturn void fault_handler(void) {
     board_exit(MAILBOX_EXIT_FAULT);
 }
 
-/* The first instruction, and what traps lead to: exceptions to the table's begin, software interrupts, number 3, to its
- * fourth word, where the handler begins. It keeps what a function may change and takes the request back. Aligned so
- * that it lies within a page: its end is one block of QEMU's. */
+/* Reset code and vector table: exceptions jump to the start of the table, software interrupts, number 3, to its fourth
+ * word, where the handler begins. The handler saves the caller-saved registers and clears the request. Its alignment
+ * keeps it within one page, so that its epilogue is one block of QEMU. */
 __asm__(".macro for_each_saved access\n"
         "    .set .Loffset, 4\n"
         "    .irp register, t0, t1, t2, t3, t4, t5, t6, a0, a1, a2, a3, a4, a5, a6, a7\n"
@@ -42,7 +42,7 @@ __asm__(".macro for_each_saved access\n"
 
         ".section .first, \"ax\"\n"
         "    la sp, stack_top\n"
-        "    la t0, traps + 1\n" /* 1: an interrupt has an entry of its own */
+        "    la t0, traps + 1\n" /* 1: vectored mode */
         "    csrw mtvec, t0\n"
         "    j program_start\n"
 
@@ -79,16 +79,16 @@ void board_interrupt_enable(void) {
 
 void board_interrupt_pend(void) {
     ACLINT_MSIP = 1;
-    while (ACLINT_MSIP) { /* the handler takes it back */
+    while (ACLINT_MSIP) { /* the handler clears it */
     }
 }
 
-/* No timer is used: instructions take no time, except as set by the bench. */
+/* No timer, so instructions take no time: the execution time is that set by the bench. */
 uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
     return hal->mailbox.elapsed_ticks;
 }
 
-/* The control interrupt is the only one there is, so all interrupts may be masked. */
+/* Masks all interrupts: there is only the control interrupt. */
 void hal_critical_enter(hal_t *hal) {
     (void)hal;
     __asm__ volatile("csrci mstatus, " MSTATUS_MIE ::: "memory");

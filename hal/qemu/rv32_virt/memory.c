@@ -1,4 +1,4 @@
-/* memcpy and memset, which the compiler calls by itself, too: Debian's for RISC-V comes without a C library. */
+/* memcpy and memset, which the compiler also calls implicitly: Debian's compiler for RISC-V has no C library. */
 #include <string.h>
 
 void *memcpy(void *restrict to, const void *restrict from, size_t size) {

@@ -1,4 +1,4 @@
-// The converter as it is: drops of its devices, pulses that do not happen, a link that regeneration pumps up.
+// Non-ideal converter: voltage drops of the devices, suppressed short pulses, a DC link charged by regeneration.
 
 #include <gtest/gtest.h>
 
@@ -23,7 +23,7 @@ void set_switches(plant_t &plant, uint16_t upper, uint16_t lower, unsigned phase
     plant_set_switches(&plant, &compare, TICKS);
 }
 
-// --- Devices. An aligned linear phase whose rotor cannot move is an inductance: its slope shows the voltage. ---
+// --- Devices. An aligned linear phase with a locked rotor is an inductance: its current slope gives the voltage. ---
 
 class Devices : public testing::Test {
   protected:
@@ -46,20 +46,20 @@ class Devices : public testing::Test {
     plant_t plant;
 };
 
-TEST_F(Devices, BothSwitchesDropTheirVoltageFromTheSupply) {
+TEST_F(Devices, BothSwitchesReduceTheSupplyVoltage) {
     EXPECT_NEAR(voltage_V(TICKS, TICKS), 240.0 - 2.0 * (1.5 + 0.02 * 50.0), 1e-2);
 }
 
-TEST_F(Devices, FreewheelingGoesThroughASwitchAndADiode) {
+TEST_F(Devices, FreewheelingCurrentFlowsThroughASwitchAndADiode) {
     EXPECT_NEAR(voltage_V(TICKS, 0), -(1.5 + 0.02 * 50.0) - (0.9 + 0.01 * 50.0), 1e-3);
     EXPECT_NEAR(voltage_V(0, TICKS), -(1.5 + 0.02 * 50.0) - (0.9 + 0.01 * 50.0), 1e-3);
 }
 
-TEST_F(Devices, BothDiodesDropTheirVoltageOnTopOfTheSupply) {
+TEST_F(Devices, BothDiodesAddToTheSupplyVoltage) {
     EXPECT_NEAR(voltage_V(0, 0), -240.0 - 2.0 * (0.9 + 0.01 * 50.0), 1e-2);
 }
 
-TEST_F(Devices, FreewheelingEndsAtZeroAndItsEnergyIsTheDevices) {
+TEST_F(Devices, FreewheelingEndsAtZeroAndItsEnergyIsDissipatedInTheDevices) {
     plant.current_A[0] = 2.0;
     const double field_J = plant_field_energy_J(&plant);
     set_switches(plant, TICKS, 0);
@@ -71,8 +71,8 @@ TEST_F(Devices, FreewheelingEndsAtZeroAndItsEnergyIsTheDevices) {
     EXPECT_EQ(plant.energy_copper_J, 0.0);
 }
 
-TEST_F(Devices, ADrivenCurrentIsTheTextbooksExponential) {
-    // i' = (V - 2 Vt - 2 r i) / L from zero: the textbook's exponential.
+TEST_F(Devices, DrivenCurrentFollowsTheRlStepResponse) {
+    // i' = (V - 2 Vt - 2 r i) / L from zero: exponential step response.
     plant.current_A[0] = 0.0;
     set_switches(plant, TICKS, TICKS);
     plant_advance(&plant, 5000000);
@@ -91,7 +91,7 @@ struct Pattern : half_bridge_pattern_t {
     }
 };
 
-TEST(MinimumPulse, AShorterPulseOfTheUpperSwitchDoesNotHappen) {
+TEST(MinimumPulse, ShorterPulseOfTheUpperSwitchIsSuppressed) {
     EXPECT_EQ(Pattern(19, 0, 200.0).count, 0u); // 190 ns
     EXPECT_EQ(Pattern(19, 0, 200.0).first.upper, 0);
     const Pattern shortest(20, 0, 200.0); // 200 ns
@@ -99,13 +99,13 @@ TEST(MinimumPulse, AShorterPulseOfTheUpperSwitchDoesNotHappen) {
     EXPECT_EQ(shortest.edges[1].time_ns - shortest.edges[0].time_ns, 200u);
 }
 
-TEST(MinimumPulse, AShorterGapOfTheUpperSwitchDoesNotHappen) {
+TEST(MinimumPulse, ShorterGapOfTheUpperSwitchIsSuppressed) {
     EXPECT_EQ(Pattern(TICKS - 19, 0, 200.0).count, 0u);
     EXPECT_EQ(Pattern(TICKS - 19, 0, 200.0).first.upper, 1);
     EXPECT_EQ(Pattern(TICKS - 20, 0, 200.0).count, 2u);
 }
 
-TEST(MinimumPulse, TheLowerSwitchFollowsTheSameRuleWithinThePeriod) {
+TEST(MinimumPulse, LowerSwitchFollowsTheSameRuleWithinThePeriod) {
     EXPECT_EQ(Pattern(0, 19, 200.0).count, 0u);
     EXPECT_EQ(Pattern(0, 19, 200.0).first.lower, 0);
     EXPECT_EQ(Pattern(0, 20, 200.0).count, 2u);
@@ -113,7 +113,7 @@ TEST(MinimumPulse, TheLowerSwitchFollowsTheSameRuleWithinThePeriod) {
     EXPECT_EQ(Pattern(0, TICKS - 19, 200.0).first.lower, 1);
 }
 
-TEST(MinimumPulse, NoneLeavesTheShortestPulseOfTheTimer) {
+TEST(MinimumPulse, ZeroKeepsTheShortestPulseOfTheTimer) {
     EXPECT_EQ(Pattern(1, 0, 0.0).count, 2u);
     EXPECT_EQ(Pattern(TICKS - 1, 0, 0.0).count, 2u);
     EXPECT_EQ(Pattern(0, 0, 0.0).count, 0u);
@@ -137,8 +137,8 @@ class Link : public testing::Test {
         link_J = plant_link_energy_J(&plant);
     }
 
-    // Of both ledgers, J.
-    double missing_J() const {
+    // Residuals of both energy balances, J.
+    double residual_J() const {
         const double net_J = plant.energy_drawn_J - plant.energy_returned_J;
         const double machine_J =
             net_J - plant.energy_copper_J - plant.energy_converter_J - (plant_field_energy_J(&plant) - field_J);
@@ -152,7 +152,7 @@ class Link : public testing::Test {
     double field_J, link_J;
 };
 
-TEST_F(Link, AReturnedCurrentPumpsItUpByItsFieldsEnergy) {
+TEST_F(Link, ReturnedCurrentChargesItWithTheFieldEnergy) {
     machine.resistance_ohm = 1e-9;
     start(20.0);
     set_switches(plant, 0, 0);
@@ -163,73 +163,74 @@ TEST_F(Link, AReturnedCurrentPumpsItUpByItsFieldsEnergy) {
     EXPECT_EQ(plant.energy_supplied_J, 0.0);
     const double pumped_V = plant.bus_voltage_V;
     plant_advance(&plant, 1000000000);
-    EXPECT_EQ(plant.bus_voltage_V, pumped_V) << "the supply takes nothing back";
+    EXPECT_EQ(plant.bus_voltage_V, pumped_V) << "the supply is unidirectional";
 }
 
-TEST_F(Link, ADrawnCurrentSagsItAndTheSupplyFollows) {
+TEST_F(Link, DrawnCurrentDischargesItAndTheSupplyRecharges) {
     start(0.0);
     set_switches(plant, TICKS, TICKS);
     plant_advance(&plant, 3000000);
     EXPECT_LT(plant.bus_voltage_V, 240.0 - 0.5 * 0.8 * plant.current_A[0]);
     EXPECT_GT(plant.bus_voltage_V, 240.0 - 0.5 * plant.current_A[0]);
-    EXPECT_LT(missing_J(), 1e-8 * plant.energy_drawn_J);
-    // Released to freewheel, it recovers to the supply's voltage by the source's resistance.
+    EXPECT_LT(residual_J(), 1e-8 * plant.energy_drawn_J);
+    // While the phase freewheels, the link recovers to the supply voltage through the source resistance.
     const double sag_V = 240.0 - plant.bus_voltage_V;
     set_switches(plant, TICKS, 0);
     plant_advance(&plant, 3000000 + 500000);
     EXPECT_NEAR(240.0 - plant.bus_voltage_V, sag_V * std::exp(-0.5e-3 / (0.5 * 1e-3)), 1e-6 * sag_V);
 }
 
-TEST_F(Link, TheChopperHoldsItBetweenItsThresholds) {
+TEST_F(Link, ChopperKeepsItBetweenItsThresholds) {
     machine.dc_link = {0.2e-3, 0.5, 20.0, 280.0, 270.0};
     start(60.0);
     set_switches(plant, 0, 0);
-    double most_V = 0.0;
+    double highest_V = 0.0;
     bool was_on = false;
     for (unsigned us = 1; us <= 20000; us++) {
         plant_advance(&plant, us * 1000u);
-        most_V = std::fmax(most_V, plant.bus_voltage_V);
+        highest_V = std::fmax(highest_V, plant.bus_voltage_V);
         was_on = was_on || plant.chopper_on;
     }
-    // 60 A into a chopper that takes 14 A at 280 V: it rises beyond, and when the current ends it comes down to 270 V.
+    // 60 A into a chopper that draws 14 A at 280 V: the voltage rises above, and falls to 270 V when the current has
+    // ended.
     EXPECT_TRUE(was_on);
     EXPECT_FALSE(plant.chopper_on);
-    EXPECT_GT(most_V, 281.0);
-    EXPECT_LT(most_V, 600.0);
+    EXPECT_GT(highest_V, 281.0);
+    EXPECT_LT(highest_V, 600.0);
     EXPECT_DOUBLE_EQ(plant.bus_voltage_V, 270.0);
     EXPECT_GT(plant.energy_chopper_J, 0.5 * field_J);
-    EXPECT_LT(missing_J(), 1e-8 * field_J);
+    EXPECT_LT(residual_J(), 1e-8 * field_J);
 }
 
-TEST_F(Link, AChopperThatTakesMoreThanComesBackSwitchesOnAndOff) {
+TEST_F(Link, ChopperThatDrawsMoreThanIsReturnedSwitchesOnAndOff) {
     machine.dc_link = {0.2e-3, 0.5, 5.0, 280.0, 270.0};
     start(40.0);
     set_switches(plant, 0, 0);
     unsigned changes = 0;
-    double most_V = 0.0;
+    double highest_V = 0.0;
     for (unsigned us = 1; us <= 3000; us++) {
         const bool before = plant.chopper_on;
         plant_advance(&plant, us * 1000u);
         changes += before != plant.chopper_on;
-        most_V = std::fmax(most_V, plant.bus_voltage_V);
+        highest_V = std::fmax(highest_V, plant.bus_voltage_V);
     }
     EXPECT_GE(changes, 6u);
-    EXPECT_LE(most_V, 280.0 + 1e-6) << "switched at its threshold, whatever the steps";
-    EXPECT_LT(missing_J(), 1e-8 * field_J);
+    EXPECT_LE(highest_V, 280.0 + 1e-6) << "switches at its threshold at any step length";
+    EXPECT_LT(residual_J(), 1e-8 * field_J);
 }
 
-TEST_F(Link, TheSupplysVoltageMayChangeUnderWay) {
+TEST_F(Link, SupplyVoltageMayChangeDuringOperation) {
     start(0.0);
     plant_set_supply_voltage(&plant, 200.0);
     plant_advance(&plant, 1000000);
-    EXPECT_EQ(plant.bus_voltage_V, 240.0) << "nothing drains the capacitor";
+    EXPECT_EQ(plant.bus_voltage_V, 240.0) << "nothing discharges the capacitor";
     plant_set_supply_voltage(&plant, 260.0);
     plant_advance(&plant, 11000000);
     EXPECT_NEAR(plant.bus_voltage_V, 260.0, 1e-6);
-    EXPECT_LT(missing_J(), 5e-8 * plant.energy_supplied_J);
+    EXPECT_LT(residual_J(), 5e-8 * plant.energy_supplied_J);
 }
 
-TEST_F(Link, WithoutACapacitorTheBusIsTheSupply) {
+TEST_F(Link, WithoutACapacitorItIsAtTheSupplyVoltage) {
     machine.dc_link = {};
     start(20.0);
     set_switches(plant, 0, 0);

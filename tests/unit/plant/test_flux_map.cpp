@@ -1,5 +1,5 @@
-// The map's kernel against a potential that its splines hold exactly: a polynomial, its coefficients by polar forms
-// (blossoms), written down without the kernel's recursions.
+// Kernel of the map compared with a co-energy that its splines represent exactly: a polynomial, with coefficients by
+// polar forms (blossoms), independent of the recursions of the kernel.
 #include <gtest/gtest.h>
 
 #include <cmath>
@@ -45,7 +45,7 @@ double shape_coefficient(int k) {
     return 1.0 - 0.9 * ((a * b + b * c + c * a) - 2.0 * a * b * c);
 }
 
-// The same of the quartic energy_J(): at j - 3, j - 2, j - 1, j.
+// Coefficient for the quartic energy_J(): its polar form at j - 3, j - 2, j - 1, j.
 double energy_coefficient(int j) {
     const double a = (j - 3) * STEP_A, b = (j - 2) * STEP_A, c = (j - 1) * STEP_A, d = j * STEP_A;
     const double pairs = (a * b + a * c + a * d + b * c + b * d + c * d) / 6.0;
@@ -57,7 +57,7 @@ class FluxMap : public testing::Test {
   protected:
     FluxMap() : map(std::make_unique<flux_map_t>()) {
         map->current_max_A = CURRENT_MAX_A;
-        map->least_inductance_H = 1e-4;
+        map->inductance_min_H = 1e-4;
         map->current_scale_A = 25.0;
         for (int j = 0; j < FLUX_MAP_CURRENT_INTERVALS + 4; j++) {
             for (int k = 0; k < FLUX_MAP_ANGLE_INTERVALS + 3; k++) {
@@ -81,11 +81,11 @@ class FluxMap : public testing::Test {
     magnetics_model_t model;
 };
 
-// On knots, between them and next to them; both ends.
+// Points on knots, between them and next to them, and at both ends.
 constexpr double ANGLES[] = {0.0, 0.001, 0.3, 1.0 - 1e-12, 1.0, 1.0 + 1e-12, 17.77, 48.0, 60.5, 95.0, 95.99, 96.0};
 constexpr double CURRENTS[] = {-1.5, -0.7, 0.0, 1e-6, 0.4, 1.0 - 1e-12, 1.0, 2.5, 31.0, 40.25, 63.0, 63.999, 64.0};
 
-TEST_F(FluxMap, GivesEveryDerivativeOfThePotential) {
+TEST_F(FluxMap, HasEveryDerivativeOfTheCoenergy) {
     for (const double angle_steps : ANGLES) {
         for (const double current_steps : CURRENTS) {
             SCOPED_TRACE(testing::Message() << angle_steps << " angle steps, " << current_steps << " current steps");
@@ -104,10 +104,10 @@ TEST_F(FluxMap, GivesEveryDerivativeOfThePotential) {
     }
 }
 
-TEST_F(FluxMap, IsScaledAtEveryPoint) {
+TEST_F(FluxMap, ScalesWithTheGainAtEveryPoint) {
     const magnetics_model_t once = model;
     magnetics_scale(&model, 1.25);
-    EXPECT_DOUBLE_EQ(model.least_inductance_H, 1.25 * once.least_inductance_H);
+    EXPECT_DOUBLE_EQ(model.inductance_min_H, 1.25 * once.inductance_min_H);
     for (const double angle_steps : ANGLES) {
         for (const double current_steps : CURRENTS) {
             const double x = angle_steps * STEP_RAD, i = current_steps * STEP_A;
@@ -140,13 +140,13 @@ TEST_F(FluxMap, IsEvenAboutTheAlignedPositionAndRepeatsEveryPitch) {
     }
 }
 
-TEST_F(FluxMap, GoesOnStraightBeyondTheGreatestCurrent) {
+TEST_F(FluxMap, ExtrapolatesLinearlyBeyondTheMaximumCurrent) {
     const double x = 40.3 * STEP_RAD, i = 1.6 * CURRENT_MAX_A, more_A = i - CURRENT_MAX_A;
     const magnetics_point_t point = at(x, i), end = at(x, CURRENT_MAX_A);
     EXPECT_NEAR(point.incremental_inductance_H, end.incremental_inductance_H, 1e-15);
     EXPECT_EQ(point.inductance_slope_H_A, 0.0);
     EXPECT_NEAR(point.flux_linkage_Wb, end.flux_linkage_Wb + end.incremental_inductance_H * more_A, 1e-13);
-    // The potential goes on with it: co-energy by integration, torque as its derivative, for each power of more_A.
+    // Extrapolated co-energy by integration, and torque as its derivative, for each power of more_A.
     const double energies[] = {energy_J(CURRENT_MAX_A, 0), energy_J(CURRENT_MAX_A, 1), energy_J(CURRENT_MAX_A, 2)};
     const double beyond_J = energies[0] + energies[1] * more_A + 0.5 * energies[2] * more_A * more_A;
     EXPECT_NEAR(magnetics_coenergy_J(&model, x, i), shape(x, 0) * beyond_J, 1e-11);
@@ -156,7 +156,7 @@ TEST_F(FluxMap, GoesOnStraightBeyondTheGreatestCurrent) {
     EXPECT_NEAR(point.inductance_gradient_H_rad, shape(x, 1) * energies[2], 1e-12);
 }
 
-TEST_F(FluxMap, IsContinuousAtTheGreatestCurrent) {
+TEST_F(FluxMap, IsContinuousAtTheMaximumCurrent) {
     const magnetics_point_t before = at(0.3, CURRENT_MAX_A * (1.0 - 1e-12)),
                             after = at(0.3, CURRENT_MAX_A * (1 + 1e-12));
     EXPECT_NEAR(before.flux_linkage_Wb, after.flux_linkage_Wb, 1e-11);
@@ -165,17 +165,17 @@ TEST_F(FluxMap, IsContinuousAtTheGreatestCurrent) {
     EXPECT_NEAR(before.torque_gradient_Nm_rad, after.torque_gradient_Nm_rad, 1e-8);
 }
 
-TEST_F(FluxMap, PreparesWhatTheIntegratorLimitsItsStepsBy) {
-    EXPECT_EQ(model.least_inductance_H, 1e-4);
+TEST_F(FluxMap, PreparesTheScalesOfTheStepLimits) {
+    EXPECT_EQ(model.inductance_min_H, 1e-4);
     EXPECT_EQ(model.saturation_A, 25.0);
     EXPECT_EQ(model.unaligned_inductance_H, 2.4e-3);
     EXPECT_TRUE(std::isinf(magnetics_smooth_distance_rad(&model, 0.1, 1.0)));
 }
 
-TEST_F(FluxMap, StaysWithinItsCoefficientsWhateverIsAsked) {
+TEST_F(FluxMap, IsFiniteAndReadsOnlyItsCoefficientsAtAnyPoint) {
     for (const double angle_rad : {0.0, 1e9, -1e9, HALF_RAD, -HALF_RAD}) {
         for (const double current_A : {-1e9, 1e9, -5.0, CURRENT_MAX_A}) {
-            EXPECT_TRUE(std::isfinite(at(angle_rad, current_A).torque_Nm)); // and the sanitizers watch
+            EXPECT_TRUE(std::isfinite(at(angle_rad, current_A).torque_Nm)); // sanitizers detect reads beyond the table
         }
     }
 }

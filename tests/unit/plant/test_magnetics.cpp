@@ -5,6 +5,7 @@
 #include "support/emulator_machines.h"
 
 extern "C" {
+#include "plant/exponential.h"
 #include "plant/magnetics_kernel.h"
 }
 
@@ -30,11 +31,11 @@ INSTANTIATE_TEST_SUITE_P(Forms, Magnetics,
                          testing::Values(MAGNETICS_LINEAR_COSINE, MAGNETICS_LINEAR_TRAPEZOID, MAGNETICS_SATURATING),
                          [](const auto &form) { return form_name(form.param); });
 
-// Angles that miss the corners of the trapezoid by more than the difference quotients reach.
+// Angles farther from the corners of the trapezoid than the step of the difference quotients.
 constexpr double ANGLES_DEG[] = {-200.3, -46.1, -20.0, -0.4, 0.6, 2.2, 10.0, 31.7, 42.9, 44.7, 45.3, 60.0, 88.5, 130.0};
 constexpr double CURRENTS_A[] = {0.01, 1.0, 7.3, 20.0, 50.0, 79.9, 127.0, 129.0, 300.0};
 
-TEST_P(Magnetics, DerivativesAreThoseOfFluxLinkageAndCoenergy) {
+TEST_P(Magnetics, DerivativesMatchDifferenceQuotients) {
     for (const double angle_deg : ANGLES_DEG) {
         for (const double current_A : CURRENTS_A) {
             SCOPED_TRACE(testing::Message() << angle_deg << " deg, " << current_A << " A");
@@ -61,7 +62,7 @@ TEST_P(Magnetics, DerivativesAreThoseOfFluxLinkageAndCoenergy) {
     }
 }
 
-TEST_P(Magnetics, FieldEnergyAndCoenergyShareFluxLinkageTimesCurrent) {
+TEST_P(Magnetics, FieldEnergyAndCoenergyAddUpToFluxLinkageTimesCurrent) {
     for (const double angle_deg : ANGLES_DEG) {
         for (const double current_A : CURRENTS_A) {
             const double angle_rad = angle_deg * RAD_PER_DEG;
@@ -75,7 +76,7 @@ TEST_P(Magnetics, FieldEnergyAndCoenergyShareFluxLinkageTimesCurrent) {
     }
 }
 
-TEST_P(Magnetics, RepeatsEveryPitchAndMirrorsAtTheAlignedPosition) {
+TEST_P(Magnetics, IsPeriodicInThePitchAndEvenAboutTheAlignedPosition) {
     for (const double angle_deg : ANGLES_DEG) {
         const magnetics_point_t here = at(angle_deg, 25.0), mirrored = at(-angle_deg, 25.0);
         const magnetics_point_t later = at(angle_deg + 90.0 * 1000.0, 25.0);
@@ -86,7 +87,7 @@ TEST_P(Magnetics, RepeatsEveryPitchAndMirrorsAtTheAlignedPosition) {
     }
 }
 
-TEST_P(Magnetics, TorqueIsPositiveFromUnalignedToAlignedForwards) {
+TEST_P(Magnetics, TorqueIsPositiveFromUnalignedToAlignedInForwardDirection) {
     for (double angle_deg = 46.5; angle_deg < 88.6; angle_deg += 0.5) {
         EXPECT_GT(at(angle_deg, 10.0).torque_Nm, 0.0) << angle_deg;
         EXPECT_LT(at(-angle_deg, 10.0).torque_Nm, 0.0) << angle_deg;
@@ -95,7 +96,7 @@ TEST_P(Magnetics, TorqueIsPositiveFromUnalignedToAlignedForwards) {
     EXPECT_NEAR(at(45.0, 10.0).torque_Nm, 0.0, 1e-12);
 }
 
-TEST_P(Magnetics, EndsAreTheInductancesOfTheMachineFile) {
+TEST_P(Magnetics, HasTheInductancesOfTheMachineFileAtBothEnds) {
     EXPECT_NEAR(at(45.0, 20.0).flux_linkage_Wb, machine.magnetics.unaligned_inductance_H * 20.0, 1e-15);
     EXPECT_NEAR(at(0.0, 1e-6).flux_linkage_Wb / 1e-6, 23.6e-3, 1e-9);
 }
@@ -107,7 +108,7 @@ TEST_P(Magnetics, ContinuesSmoothlyBelowZeroCurrent) {
     EXPECT_LT(far.flux_linkage_Wb, below.flux_linkage_Wb);
 }
 
-TEST_P(Magnetics, SmoothDistanceLeadsToTheNextPlaceThatIsNot) {
+TEST_P(Magnetics, SmoothDistanceReachesTheNextPointThatIsNotSmooth) {
     const auto distance_deg = [&](double angle_deg, double direction) {
         return magnetics_smooth_distance_rad(&model, angle_deg * RAD_PER_DEG, direction) / RAD_PER_DEG;
     };
@@ -132,7 +133,7 @@ TEST_P(Magnetics, SmoothDistanceLeadsToTheNextPlaceThatIsNot) {
     }
 }
 
-TEST(MagneticsTrapezoid, JoinsItsPiecesWithoutAJumpInSlope) {
+TEST(MagneticsTrapezoid, HasNoJumpInSlopeAtTheCorners) {
     const machine_t machine = machine_of(MAGNETICS_LINEAR_TRAPEZOID);
     magnetics_model_t model;
     magnetics_prepare(&model, &machine.magnetics, 4);
@@ -145,8 +146,8 @@ TEST(MagneticsTrapezoid, JoinsItsPiecesWithoutAJumpInSlope) {
     }
 }
 
-// Values found with another model of the same machine, to the digits they were given with.
-TEST(MagneticsSaturating, MeetsTheCheckValues) {
+// Values of an independent model of the same machine, to all digits given.
+TEST(MagneticsSaturating, MatchesAnIndependentModel) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     magnetics_model_t model;
     magnetics_prepare(&model, &machine.magnetics, 4);
@@ -163,16 +164,16 @@ TEST(MagneticsSaturating, MeetsTheCheckValues) {
     EXPECT_NEAR(at(67.5, 50.0).torque_Nm, 25.3, 0.05);
 }
 
-TEST(MagneticsKernel, ExponentialIsLibms) {
+TEST(MagneticsKernel, ExponentialMatchesLibm) {
     for (double x = -700.0; x <= 700.0; x += 0.0317) {
         const double expected = std::exp(x);
-        ASSERT_NEAR(magnetics_exponential(x), expected, 4e-16 * expected) << x;
+        ASSERT_NEAR(exponential(x), expected, 4e-16 * expected) << x;
     }
-    EXPECT_EQ(magnetics_exponential(0.0), 1.0);
-    EXPECT_EQ(magnetics_exponential(-701.0), 0.0);
+    EXPECT_EQ(exponential(0.0), 1.0);
+    EXPECT_EQ(exponential(-701.0), 0.0);
 }
 
-TEST(MagneticsKernel, DecayIsLibmsWithinTheTableAndBeyond) {
+TEST(MagneticsKernel, DecayMatchesLibmWithinAndBeyondTheTable) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     magnetics_model_t model;
     magnetics_prepare(&model, &machine.magnetics, 4);
@@ -182,7 +183,7 @@ TEST(MagneticsKernel, DecayIsLibmsWithinTheTableAndBeyond) {
     }
 }
 
-TEST(MagneticsKernel, SineAndCosineAreLibms) {
+TEST(MagneticsKernel, SineAndCosineMatchLibm) {
     for (double x = -M_PI; x <= M_PI; x += 0.00137) {
         double sine, cosine;
         magnetics_kernel_sine_cosine(x, &sine, &cosine);

@@ -23,7 +23,7 @@ hal_pwm_compare_t compare_of(std::vector<uint16_t> upper, std::vector<uint16_t> 
     return compare;
 }
 
-// --- Converter: an aligned, linear machine without resistance is an inductance; it turns voltage into slope ---
+// --- Converter: an aligned linear machine without resistance is an inductance; its current slope gives the voltage ---
 
 class Converter : public testing::Test {
   protected:
@@ -33,7 +33,7 @@ class Converter : public testing::Test {
         plant.current_A[0] = 50.0;
     }
 
-    // Volts at the phase in each nanosecond, where they change: (first ns, volts / supply voltage).
+    // Changes of the phase voltage, resolved to 1 ns: (first ns, voltage / supply voltage).
     std::vector<std::pair<uint64_t, int>> levels(uint16_t upper, uint16_t lower, uint64_t length_ns = PERIOD_NS) {
         std::vector<std::pair<uint64_t, int>> found;
         const hal_pwm_compare_t compare = compare_of({upper}, {lower});
@@ -44,7 +44,7 @@ class Converter : public testing::Test {
             plant_advance(&plant, start_ns + ns + 1);
             const double volts = (plant.current_A[0] - before_A) * 23.6e-3 / 1e-9;
             const int level = static_cast<int>(std::lround(volts / 240.0));
-            EXPECT_NEAR(volts, 240.0 * level, 1e-2 * 240.0); // a tick cut into two by an edge would show
+            EXPECT_NEAR(volts, 240.0 * level, 1e-2 * 240.0); // an edge within a tick would fail here
             if (found.empty() || found.back().second != level) {
                 found.emplace_back(ns, level);
             }
@@ -77,7 +77,7 @@ TEST_F(Converter, ZeroIsOffAndTicksOrMoreIsOnForTheWholePeriod) {
 TEST_F(Converter, TwoPartialDutiesInterleave) {
     // Upper on 7000..18000, lower on 0..8000 and 17000..25000: both on twice for 1000 ns.
     EXPECT_EQ(levels(1100, 1600), (Levels{{0, 0}, {7000, 1}, {8000, 0}, {17000, 1}, {18000, 0}}));
-    // Too small to overlap: both off in between.
+    // Without overlap: both off in between.
     EXPECT_EQ(levels(500, 1000), (Levels{{0, 0}, {5000, -1}, {10000, 0}, {15000, -1}, {20000, 0}}));
 }
 
@@ -92,12 +92,12 @@ TEST_F(Converter, SmallestAndLargestPulsesAreTwoTicksWide) {
     EXPECT_EQ(levels(TICKS - 1, TICKS), (Levels{{0, 0}, {5, 1}, {24995, 0}}));
 }
 
-TEST_F(Converter, HoldsTheStateOfThePeriodsEnd) {
+TEST_F(Converter, KeepsTheStateAtTheEndOfThePeriod) {
     EXPECT_EQ(levels(TICKS, 700, 2 * PERIOD_NS), (Levels{{0, 1}, {3500, 0}, {21500, 1}}));
     EXPECT_EQ(levels(700, TICKS, 2 * PERIOD_NS), (Levels{{0, 0}, {9000, 1}, {16000, 0}}));
 }
 
-TEST_F(Converter, OpenAllActsAtOnceAndForgetsTheRestOfThePeriod) {
+TEST_F(Converter, OpenAllActsImmediatelyAndDiscardsTheRestOfThePeriod) {
     const hal_pwm_compare_t compare = compare_of({TICKS}, {700});
     plant_set_switches(&plant, &compare, TICKS);
     plant_advance(&plant, 1001);
@@ -108,7 +108,7 @@ TEST_F(Converter, OpenAllActsAtOnceAndForgetsTheRestOfThePeriod) {
 }
 
 TEST_F(Converter, EveryPhaseHasItsOwnSwitches) {
-    machine.inertia_kg_m2 = 1e9; // torque is not to turn it
+    machine.inertia_kg_m2 = 1e9; // locked: torque must not turn it
     plant_init(&plant, &machine, 0.0);
     const hal_pwm_compare_t compare = compare_of({TICKS, 900, TICKS}, {300, TICKS, 2000});
     plant_set_switches(&plant, &compare, TICKS);
@@ -121,7 +121,7 @@ TEST_F(Converter, EveryPhaseHasItsOwnSwitches) {
 
 // --- Machine ---
 
-TEST(Plant, StartsAtRestWithItsSupply) {
+TEST(Plant, StartsAtRestAtTheSupplyVoltage) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     plant_t plant;
     plant_init(&plant, &machine, 0.5);
@@ -135,7 +135,7 @@ TEST(Plant, StartsAtRestWithItsSupply) {
     EXPECT_EQ(plant.time_ns, 1000000u);
 }
 
-TEST(Plant, AlignedLinearPhaseIsTheTextbooksResistanceAndInductance) {
+TEST(Plant, AlignedLinearPhaseHasTheRlStepResponse) {
     machine_t machine = machine_of(MAGNETICS_LINEAR_COSINE);
     machine.resistance_ohm = 2.0;
     plant_t plant;
@@ -149,7 +149,7 @@ TEST(Plant, AlignedLinearPhaseIsTheTextbooksResistanceAndInductance) {
     EXPECT_EQ(plant.speed_rad_s, 0.0);
 }
 
-TEST(Plant, CoastsDownByFrictionAndLoad) {
+TEST(Plant, CoastsUnderFrictionAndLoad) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     plant_t plant;
     plant_init(&plant, &machine, 0.0);
@@ -165,7 +165,7 @@ TEST(Plant, CoastsDownByFrictionAndLoad) {
 
 TEST(Plant, FastWindingAndFastRotorStayAccurate) {
     machine_t machine = machine_of(MAGNETICS_LINEAR_COSINE);
-    machine.resistance_ohm = 100.0; // 6.8 us unaligned: a period's step would not even be stable
+    machine.resistance_ohm = 100.0; // 6.8 us unaligned: a step of one period would be unstable
     machine.inertia_kg_m2 = 1e-4;
     machine.friction_Nm_s = 2.0; // 50 us
     plant_t plant;
@@ -206,7 +206,8 @@ TEST(Plant, CurrentEndsWhenTheVoltSecondsAreUsedUp) {
     for (const uint64_t driven_ns : {7u, 1000u, 123457u, 400001u}) {
         plant_t plant;
         plant_init(&plant, &machine, 70.0 * RAD_PER_DEG);
-        const hal_pwm_compare_t compare = compare_of({TICKS, TICKS}, {TICKS, TICKS}); // the second ends likewise
+        const hal_pwm_compare_t compare =
+            compare_of({TICKS, TICKS}, {TICKS, TICKS}); // the second current ends in the same way
         plant_set_switches(&plant, &compare, TICKS);
         plant_advance(&plant, driven_ns);
         EXPECT_NEAR(plant_flux_linkage_Wb(&plant, 0), 240e-9 * static_cast<double>(driven_ns), 1e-9);
@@ -223,8 +224,8 @@ TEST(Plant, CurrentEndsWhenTheVoltSecondsAreUsedUp) {
     }
 }
 
-// The link is at its supply's voltage, where the rectifier would begin, when the event is the end of the current: the
-// charge arrives, none of it is lost on the way.
+// At the end of the current the DC link is exactly at the voltage at which the rectifier starts to conduct: the whole
+// charge must reach the capacitor.
 TEST(Plant, CurrentThatEndsWithinAStepChargesALinkAtItsSupply) {
     machine_t machine = machine_of(MAGNETICS_SATURATING);
     machine.dc_link.capacitance_F = 2.2e-3;
@@ -238,7 +239,7 @@ TEST(Plant, CurrentThatEndsWithinAStepChargesALinkAtItsSupply) {
     EXPECT_NEAR(plant.bus_voltage_V - 240.0, charge_As / 2.2e-3, 1e-3 * charge_As / 2.2e-3);
 }
 
-TEST(Plant, WithoutBusVoltageCurrentsOnlyDecay) {
+TEST(Plant, CurrentsDecayWithoutDcLinkVoltage) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     plant_t plant;
     plant_init(&plant, &machine, 1.0);
@@ -255,7 +256,7 @@ TEST(Plant, WithoutBusVoltageCurrentsOnlyDecay) {
     }
 }
 
-TEST(Plant, TorqueAndFluxLinkageAreTheMagneticsAtTheRotorsAngle) {
+TEST(Plant, TorqueAndFluxLinkageAreThoseOfTheMagneticsAtTheRotorAngle) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     magnetics_model_t model;
     magnetics_prepare(&model, &machine.magnetics, machine.rotor_poles);
@@ -273,7 +274,7 @@ TEST(Plant, TorqueAndFluxLinkageAreTheMagneticsAtTheRotorsAngle) {
     EXPECT_NEAR(plant_torque_Nm(&plant), torque_Nm, 1e-13);
 }
 
-// --- A drive's life: start, chopping, braking, at speed ---
+// --- Operating cycle: start, chopping, braking, at speed ---
 
 struct Energies {
     double turnover_J, missing_J;
@@ -283,7 +284,8 @@ double stored_J(const plant_t &plant) {
     return plant_field_energy_J(&plant) + plant_kinetic_energy_J(&plant);
 }
 
-// A crude controller that visits everything: motoring with two pulses a period, braking, both at changing speed.
+// Simple controller that covers all operating modes: motoring with two pulses per period, and braking, both at varying
+// speed.
 Energies live(plant_t &plant, unsigned periods) {
     const plant_t before = plant;
     for (unsigned period = 0; period < periods; period++) {
@@ -309,18 +311,18 @@ Energies live(plant_t &plant, unsigned periods) {
     return {drawn_J + returned_J, drawn_J - returned_J - spent_J - (stored_J(plant) - stored_J(before))};
 }
 
-class Life : public testing::TestWithParam<magnetics_form_t> {
+class OperatingCycle : public testing::TestWithParam<magnetics_form_t> {
   protected:
-    Life() : machine(machine_of(GetParam())) { plant_init(&plant, &machine, 0.9); }
+    OperatingCycle() : machine(machine_of(GetParam())) { plant_init(&plant, &machine, 0.9); }
     const machine_t machine;
     plant_t plant;
 };
 
-INSTANTIATE_TEST_SUITE_P(Forms, Life,
+INSTANTIATE_TEST_SUITE_P(Forms, OperatingCycle,
                          testing::Values(MAGNETICS_LINEAR_COSINE, MAGNETICS_LINEAR_TRAPEZOID, MAGNETICS_SATURATING),
                          [](const auto &form) { return form_name(form.param); });
 
-TEST_P(Life, EnergyIsKept) {
+TEST_P(OperatingCycle, ConservesEnergy) {
     const Energies energies = live(plant, 12000);
     EXPECT_GT(energies.turnover_J, 100.0);
     EXPECT_GT(plant.energy_returned_J, 10.0);
@@ -329,7 +331,7 @@ TEST_P(Life, EnergyIsKept) {
         << energies.missing_J << " J of " << energies.turnover_J << " J";
 }
 
-TEST_P(Life, EqualInputsGiveEqualBits) {
+TEST_P(OperatingCycle, EqualInputsGiveEqualBits) {
     live(plant, 2000);
     plant_t again;
     plant_init(&again, &machine, 0.9);
@@ -340,9 +342,9 @@ TEST_P(Life, EqualInputsGiveEqualBits) {
     EXPECT_EQ(plant.energy_drawn_J, again.energy_drawn_J);
 }
 
-// --- Another machine than the file's ---
+// --- Gains on the values of the machine file ---
 
-TEST_P(Life, GainsMakeTheMachineOfSuchAFile) {
+TEST_P(OperatingCycle, GainsAreEquivalentToAScaledMachineFile) {
     machine_t other = machine;
     other.magnetics.unaligned_inductance_H *= 1.1;
     other.magnetics.aligned_inductance_H *= 1.1;
@@ -357,7 +359,7 @@ TEST_P(Life, GainsMakeTheMachineOfSuchAFile) {
     plant_set_gains(&plant, &gains);
     live(plant, 2000);
     live(of_file, 2000);
-    // Equal but for rounding, which two lives of this length enlarge.
+    // Equal except for rounding, whose effect grows over a cycle of this length.
     EXPECT_NEAR(plant.speed_rad_s, of_file.speed_rad_s, 1e-7);
     EXPECT_NEAR(plant.rotor_angle_rad, of_file.rotor_angle_rad, 1e-9);
     EXPECT_NEAR(plant.energy_copper_J, of_file.energy_copper_J, 1e-7);
@@ -366,7 +368,7 @@ TEST_P(Life, GainsMakeTheMachineOfSuchAFile) {
     EXPECT_GT(plant.energy_friction_J, 0.01);
 }
 
-TEST_P(Life, GainsOfOneLeaveEveryBit) {
+TEST_P(OperatingCycle, GainsOfOneChangeNoBit) {
     plant_t untouched = plant;
     const plant_gains_t other = {1.3, 0.7, 2.0, 0.0}, one = {1.0, 1.0, 1.0, 1.0};
     plant_set_gains(&plant, &other);
@@ -374,7 +376,7 @@ TEST_P(Life, GainsOfOneLeaveEveryBit) {
     EXPECT_EQ(std::memcmp(&plant, &untouched, sizeof plant), 0);
 }
 
-TEST_P(Life, EnergyIsKeptBetweenChangesOfTheMachineAndJumpsByThemAlone) {
+TEST_P(OperatingCycle, ConservesEnergyBetweenChangesOfTheMachine) {
     live(plant, 3000);
     for (const plant_gains_t gains : {plant_gains_t{1.1, 1.0, 1.0, 1.0}, plant_gains_t{1.1, 2.0, 0.3, 1.0},
                                       plant_gains_t{0.7, 0.5, 1.0, 5.0}, plant_gains_t{1.0, 1.0, 3.0, 0.0}}) {
@@ -406,7 +408,7 @@ void watch(void *context, const plant_t *plant) {
     seen->angles_rad.push_back(plant->rotor_angle_rad);
 }
 
-TEST_P(Life, WatchingChangesNothing) {
+TEST_P(OperatingCycle, ObservationChangesNoBit) {
     Watch seen;
     plant_observe(&plant, 0, 777, watch, &seen);
     live(plant, 2000);
@@ -440,7 +442,7 @@ TEST(PlantObserve, SamplesExactlyOnItsGrid) {
     }
 }
 
-TEST(PlantObserve, FirstInstantInThePastIsMovedAlongTheGridAndStepZeroEndsIt) {
+TEST(PlantObserve, StartInThePastContinuesOnTheGridAndStepZeroStops) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     plant_t plant;
     plant_init(&plant, &machine, 0.0);

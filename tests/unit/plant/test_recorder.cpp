@@ -53,7 +53,7 @@ TEST_F(Recorder, WritesAHeaderThatNumpyReads) {
     ASSERT_EQ(bytes.size(), RECORDER_HEADER_BYTES + 5 * ROW_BYTES);
     EXPECT_EQ(bytes.substr(0, 8), std::string("\x93NUMPY\x01\x00", 8));
     EXPECT_EQ(number_at<uint16_t>(bytes, 8), RECORDER_HEADER_BYTES - 10);
-    EXPECT_EQ(RECORDER_HEADER_BYTES % 64, 0); // the format asks for aligned data
+    EXPECT_EQ(RECORDER_HEADER_BYTES % 64, 0); // the format requires aligned data
     const std::string dictionary = bytes.substr(10, RECORDER_HEADER_BYTES - 10);
     EXPECT_EQ(dictionary.back(), '\n');
     EXPECT_EQ(dictionary.substr(0, dictionary.find_last_not_of(" \n") + 1),
@@ -65,7 +65,7 @@ TEST_F(Recorder, WritesAHeaderThatNumpyReads) {
               "'fortran_order': False, 'shape': (5,), }");
 }
 
-TEST_F(Recorder, RowsHoldTheStateInTheirUnits) {
+TEST_F(Recorder, RowsHaveTheStateInTheUnitsOfTheHeader) {
     ASSERT_TRUE(recorder_open(&recorder, path.c_str(), 3, error, sizeof error)) << error;
     plant.time_ns = 130000001;
     plant.speed_rad_s = 20.0 * M_PI;
@@ -81,7 +81,7 @@ TEST_F(Recorder, RowsHoldTheStateInTheirUnits) {
     plant.energy_load_J = -16.0;
     plant.energy_friction_J = 8.0;
     recorder_sample(&recorder, &plant);
-    plant.rotor_angle_rad = -1e-12; // as a float a whole turn
+    plant.rotor_angle_rad = -1e-12; // 360 deg as a float
     recorder_sample(&recorder, &plant);
     const double torque_Nm = plant_torque_Nm(&plant);
     ASSERT_TRUE(recorder_close(&recorder, error, sizeof error)) << error;
@@ -100,7 +100,7 @@ TEST_F(Recorder, RowsHoldTheStateInTheirUnits) {
     EXPECT_EQ(number_at<float>(bytes, row + ROW_BYTES + 20), 0.0f);
 }
 
-TEST_F(Recorder, IsThePlantsObserver) {
+TEST_F(Recorder, WorksAsAnObserverOfThePlant) {
     ASSERT_TRUE(recorder_open(&recorder, path.c_str(), 3, error, sizeof error)) << error;
     plant_observe(&plant, 0, 1000, recorder_sample, &recorder);
     plant_advance(&plant, 1000000);
@@ -110,8 +110,8 @@ TEST_F(Recorder, IsThePlantsObserver) {
     EXPECT_EQ(number_at<double>(bytes, RECORDER_HEADER_BYTES + 1000 * ROW_BYTES), 1e-3);
 }
 
-// More rows than the buffer holds, of a size that does not divide it: none lost, none twice.
-TEST_F(Recorder, EveryRowOfALongRunIsThereOnce) {
+// More rows than fit into the buffer, whose size is no multiple of theirs: none is lost or duplicated.
+TEST_F(Recorder, EveryRowOfALongRunIsWrittenOnce) {
     static_assert(RECORDER_BUFFER_BYTES % (8 + 5 * 4 + 4 * 4 + 6 * 4) != 0);
     ASSERT_TRUE(recorder_open(&recorder, path.c_str(), 4, error, sizeof error)) << error;
     const size_t rows = 3 * RECORDER_BUFFER_BYTES / (ROW_BYTES + 4);
@@ -143,7 +143,7 @@ TEST_F(Recorder, UnfinishedRunHasAHeaderWithoutRows) {
     recorder_sample(&recorder, &plant);
     EXPECT_NE(contents(path).find("'shape': (0,)"), std::string::npos);
     ASSERT_TRUE(recorder_close(&recorder, error, sizeof error));
-    EXPECT_TRUE(recorder_close(&recorder, error, sizeof error)); // twice does nothing
+    EXPECT_TRUE(recorder_close(&recorder, error, sizeof error)); // the second call does nothing
 }
 
 TEST_F(Recorder, FileThatCannotBeCreatedIsNamed) {
@@ -162,8 +162,8 @@ TEST_F(Recorder, FullDiskIsReportedAtTheEnd) {
     EXPECT_STREQ(error, "cannot write recording '/dev/full': No space left on device");
 }
 
-// A limit of the file's size stands for a disk that fills while the run lasts.
-TEST_F(Recorder, RowsThatCouldNotBeWrittenAreReportedAtTheEnd) {
+// A file size limit emulates a disk that fills up during the run.
+TEST_F(Recorder, WriteErrorDuringTheRunIsReportedAtTheEnd) {
     struct rlimit before = {}, low = {};
     ASSERT_EQ(getrlimit(RLIMIT_FSIZE, &before), 0);
     const auto signal_before = std::signal(SIGXFSZ, SIG_IGN);

@@ -51,7 +51,7 @@ class Sensors : public testing::Test {
     sensors_t sensors;
 };
 
-TEST_F(Sensors, CurrentIsTheNearestCode) {
+TEST_F(Sensors, CurrentIsRoundedToTheNearestCount) {
     EXPECT_EQ(current_counts(0.0), 0);
     EXPECT_EQ(current_counts(0.49 / 51.2), 0);
     EXPECT_EQ(current_counts(0.5 / 51.2), 1);
@@ -59,7 +59,7 @@ TEST_F(Sensors, CurrentIsTheNearestCode) {
     EXPECT_EQ(current_counts(40.0), 2048);
 }
 
-TEST_F(Sensors, CurrentSaturatesAtTheLargestCode) {
+TEST_F(Sensors, CurrentSaturatesAtTheLargestCount) {
     EXPECT_EQ(current_counts(4094.4 / 51.2), 4094);
     EXPECT_EQ(current_counts(4094.5 / 51.2), 4095);
     EXPECT_EQ(current_counts(80.0), 4095);
@@ -68,14 +68,14 @@ TEST_F(Sensors, CurrentSaturatesAtTheLargestCode) {
     EXPECT_EQ(current_counts(std::nan("")), 0);
 }
 
-TEST_F(Sensors, BusVoltageHasItsOwnScale) {
+TEST_F(Sensors, DcLinkVoltageHasItsOwnScale) {
     EXPECT_EQ(bus_counts(240.0), 1920);
     EXPECT_EQ(bus_counts(240.06), 1920);
     EXPECT_EQ(bus_counts(240.07), 1921);
     EXPECT_EQ(bus_counts(600.0), 4095);
 }
 
-TEST_F(Sensors, CodesHaveTheBitsTheyWereGivenOverTheSameFullScale) {
+TEST_F(Sensors, CountsHaveTheConfiguredResolutionOverTheSameFullScale) {
     for (unsigned bits = 12; bits <= 16; bits++) {
         sensors_init(&sensors, &machine.sensors, 17, bits, 1);
         const auto code = [bits](double fraction) {
@@ -88,7 +88,7 @@ TEST_F(Sensors, CodesHaveTheBitsTheyWereGivenOverTheSameFullScale) {
     }
 }
 
-TEST_F(Sensors, LoadTorqueIsOffsetBinaryAndLimited) {
+TEST_F(Sensors, LoadTorqueIsOffsetBinaryAndSaturates) {
     EXPECT_EQ(load_torque_counts(0.0), 2048);
     EXPECT_EQ(load_torque_counts(8.0), 2048 + 256);
     EXPECT_EQ(load_torque_counts(-8.0), 2048 - 256);
@@ -104,7 +104,7 @@ TEST_F(Sensors, EachPhaseIsConvertedAndUnusedOnesReadZero) {
     plant.current_A[0] = 10.0;
     plant.current_A[1] = 20.0;
     plant.current_A[2] = 30.0;
-    plant.current_A[3] = 30.0; // the machine has three
+    plant.current_A[3] = 30.0; // the machine has three phases
     sensors.errors.current_gain = 1.5;
     hal_adc_sample_t sample;
     std::memset(&sample, 0xFF, sizeof sample);
@@ -115,7 +115,7 @@ TEST_F(Sensors, EachPhaseIsConvertedAndUnusedOnesReadZero) {
     EXPECT_EQ(sample.phase_current_counts[3], 0);
 }
 
-TEST_F(Sensors, ErrorsAreTheMachinesUntilChanged) {
+TEST_F(Sensors, ErrorsAreThoseOfTheMachineUntilChanged) {
     machine_t other = machine;
     other.sensors = {1.25, -1.0, 0.5, 30.0, 3000.0, 0.5};
     sensors_init(&sensors, &other.sensors, 17, 12, 1);
@@ -127,7 +127,7 @@ TEST_F(Sensors, ErrorsAreTheMachinesUntilChanged) {
     EXPECT_EQ(encoder_counts(0.25), 32768u);
 }
 
-TEST_F(Sensors, OffsetComesBehindTheGainAndShowsNothingBelowZero) {
+TEST_F(Sensors, OffsetIsAddedAfterTheGainAndReadsZeroBelowZero) {
     sensors.errors.current_gain = 0.5;
     sensors.errors.current_offset_A = 10.0;
     EXPECT_EQ(current_counts(0.0), 512);
@@ -138,7 +138,7 @@ TEST_F(Sensors, OffsetComesBehindTheGainAndShowsNothingBelowZero) {
     EXPECT_EQ(current_counts(0.0), 0);
 }
 
-TEST_F(Sensors, LimitComesBehindGainOffsetAndNoise) {
+TEST_F(Sensors, LimitIsAppliedAfterGainOffsetAndNoise) {
     sensors.errors.current_limit_A = 30.0;
     EXPECT_EQ(current_counts(29.98), 1535);
     EXPECT_EQ(current_counts(30.0), 1536);
@@ -154,7 +154,7 @@ TEST_F(Sensors, LimitComesBehindGainOffsetAndNoise) {
     }
 }
 
-TEST_F(Sensors, HeldCurrentsAreConvertedUntilLetGoAndTheBusIsNotHeld) {
+TEST_F(Sensors, HeldCurrentsAreConvertedWhileHeldAndTheDcLinkVoltageIsNot) {
     plant.current_A[0] = 10.0;
     plant.current_A[1] = 20.0;
     plant.bus_voltage_V = 240.0;
@@ -173,7 +173,7 @@ TEST_F(Sensors, HeldCurrentsAreConvertedUntilLetGoAndTheBusIsNotHeld) {
     EXPECT_EQ(sample.phase_current_counts[1], 2048);
 }
 
-TEST_F(Sensors, NoiseHasItsDeviationAndItsSeed) {
+TEST_F(Sensors, NoiseHasTheDeviationAndTheSeedGiven) {
     sensors.errors.current_noise_A = 0.5;
     sensors_t same = sensors, other;
     sensors_init(&other, &machine.sensors, 17, 12, 2);
@@ -217,7 +217,7 @@ TEST_F(Sensors, EncoderCountsDownThroughZero) {
     EXPECT_EQ(encoder_counts(-1e-30), 0u);
 }
 
-TEST_F(Sensors, EncoderHasTheBitsItWasGiven) {
+TEST_F(Sensors, EncoderHasTheConfiguredResolution) {
     for (const unsigned bits : {8u, 24u, 32u}) {
         sensors_init(&sensors, &machine.sensors, bits, 12, 0);
         EXPECT_EQ(encoder_counts(0.5), UINT32_C(1) << (bits - 1));
@@ -227,7 +227,7 @@ TEST_F(Sensors, EncoderHasTheBitsItWasGiven) {
     EXPECT_EQ(encoder_counts(0.75), UINT32_C(0xC0000000));
 }
 
-TEST_F(Sensors, EccentricityGoesOnceRoundWithTheRotor) {
+TEST_F(Sensors, EccentricityErrorHasOnePeriodPerRevolution) {
     sensors_init(&sensors, &machine.sensors, 32, 12, 1);
     sensors.errors.encoder_eccentricity_deg = 0.5;
     const double counts_per_degree = std::exp2(32) / 360.0;
@@ -241,7 +241,7 @@ TEST_F(Sensors, EccentricityGoesOnceRoundWithTheRotor) {
     }
 }
 
-TEST_F(Sensors, OffsetIsAddedToTheAngleRead) {
+TEST_F(Sensors, OffsetIsAddedToTheReading) {
     sensors.encoder_offset_deg = 0.5;
     EXPECT_EQ(encoder_counts(0.25), 32768u + 182u) << "0.5 deg of 131072 counts a turn: 182.04";
     sensors.encoder_offset_deg = -0.5;
@@ -257,7 +257,7 @@ TEST_F(Sensors, FrozenEncoderKeepsItsCountUntilHealthy) {
     EXPECT_EQ(encoder_counts(0.5), 65536u);
 }
 
-TEST_F(Sensors, JumpedEncoderIsHalfATurnOff) {
+TEST_F(Sensors, JumpOffsetsTheEncoderByHalfARevolution) {
     sensors.encoder_fault = SENSORS_ENCODER_JUMP;
     EXPECT_EQ(encoder_counts(0.25), 98304u);
     EXPECT_EQ(encoder_counts(0.75), 32768u);
@@ -271,8 +271,8 @@ TEST_F(Sensors, JumpedEncoderIsHalfATurnOff) {
 constexpr uint64_t PERIOD_NS = 25000;
 constexpr uint16_t TICKS = 2500;
 
-// A machine that is latched each period, and what its encoder's edges should be: the same plant once more, advanced by
-// nanoseconds.
+// A machine whose encoder is latched in each period, and the reference for its edges: a copy of the plant, advanced in
+// steps of nanoseconds.
 class Edges : public testing::Test {
   protected:
     Edges() : machine(machine_of(MAGNETICS_SATURATING)) { start(17, 0.1, 0.0); }
@@ -296,7 +296,8 @@ class Edges : public testing::Test {
                sensors.encoder_offset_deg * M_PI / 180.0;
     }
 
-    // One period, with phases switched on for so many ticks. A new edge is compared with where the plant was then.
+    // One period with phases switched on for the given ticks. A new edge is compared with the position of the plant
+    // then.
     void period(std::vector<uint16_t> ticks = {}, uint64_t length_ns = PERIOD_NS) {
         hal_pwm_compare_t compare{};
         for (size_t phase = 0; phase < ticks.size(); phase++) {
@@ -330,7 +331,7 @@ class Edges : public testing::Test {
     unsigned edges = 0;
 };
 
-TEST_F(Edges, AreUnknownUntilTheFirstOneAndWithoutCapture) {
+TEST_F(Edges, AreUnknownBeforeTheFirstOneAndWithoutCapture) {
     for (unsigned k = 0; k < 10; k++) {
         period();
         EXPECT_FALSE(sample.edge_known);
@@ -347,18 +348,18 @@ TEST_F(Edges, AreUnknownUntilTheFirstOneAndWithoutCapture) {
     }
 }
 
-TEST_F(Edges, AreWithinAHundredthOfAMicroradianUnderSwitchingAndJumpsOfTheLoad) {
-    machine.inertia_kg_m2 = 0.01; // half of the motor's
-    for (double held_rad_s : {314.0, -314.0, 3.0, -3.0}) {
-        const double direction = std::copysign(1.0, held_rad_s);
-        start(17, 0.1, held_rad_s);
+TEST_F(Edges, AreWithinAHundredthOfAMicroradianUnderSwitchingAndLoadSteps) {
+    machine.inertia_kg_m2 = 0.01; // half of the machine file
+    for (double controlled_rad_s : {314.0, -314.0, 3.0, -3.0}) {
+        const double direction = std::copysign(1.0, controlled_rad_s);
+        start(17, 0.1, controlled_rad_s);
         for (unsigned k = 0; k < 4000; k++) {
-            // A load that jumps, on a dynamometer that holds the speed.
-            plant.load_torque_Nm = (k / 7 % 2 == 0 ? -8.0 : 8.0) + 10.0 * (plant.speed_rad_s - held_rad_s);
-            // Each phase for a part of its pitch, with what duty it may.
+            // Load steps on a dynamometer that controls the speed.
+            plant.load_torque_Nm = (k / 7 % 2 == 0 ? -8.0 : 8.0) + 10.0 * (plant.speed_rad_s - controlled_rad_s);
+            // Each phase is switched for a part of its pitch, with its permitted duty.
             std::vector<uint16_t> ticks;
             for (unsigned phase = 0; phase < 3; phase++) {
-                // Torque forwards is from half a pitch to a whole one.
+                // Torque is positive from half a pitch to a whole one.
                 const double pitches = direction * plant_phase_angle_rad(&plant, phase) / (M_PI / 2.0);
                 const double part = pitches - std::floor(pitches);
                 const bool on = part > 0.45 && part < 0.8;
@@ -366,14 +367,14 @@ TEST_F(Edges, AreWithinAHundredthOfAMicroradianUnderSwitchingAndJumpsOfTheLoad) 
             }
             period(ticks);
         }
-        EXPECT_NEAR(plant.speed_rad_s, held_rad_s, 10.0);
+        EXPECT_NEAR(plant.speed_rad_s, controlled_rad_s, 10.0);
         EXPECT_GT(edges, 3000u);
         EXPECT_LT(worst_rad, 0.01e-6);
-        EXPECT_GT(worst_rad, 1e-13) << "something was compared";
+        EXPECT_GT(worst_rad, 1e-13) << "at least one edge was compared";
     }
 }
 
-TEST_F(Edges, AreAsExactWhereOneComesInSeveralPeriods) {
+TEST_F(Edges, AreEquallyAccurateWithOneEdgeInSeveralPeriods) {
     machine.friction_Nm_s = 0.0;
     start(17, 0.1, 0.02); // 0.19 r/min: a count in 96 periods
     unsigned aged = 0;
@@ -392,7 +393,7 @@ TEST_F(Edges, AreAsExactWhereOneComesInSeveralPeriods) {
     EXPECT_LT(worst_rad, 0.1e-6);
 }
 
-TEST_F(Edges, AreOfTheReadingWithItsErrors) {
+TEST_F(Edges, AreThoseOfTheReadingWithItsErrors) {
     start(17, 0.1, 100.0);
     sensors.errors.encoder_eccentricity_deg = 2.0;
     sensors.encoder_offset_deg = -1.5;
@@ -403,18 +404,18 @@ TEST_F(Edges, AreOfTheReadingWithItsErrors) {
     EXPECT_LT(worst_rad, 0.1e-6);
 }
 
-TEST_F(Edges, TurnRoundWithTheRotor) {
-    // The load swings the shaft to and fro over a few counts, at last over none.
+TEST_F(Edges, FollowReversalsOfTheRotor) {
+    // The load makes the shaft oscillate over a few counts, finally over none.
     machine.friction_Nm_s = 0.0;
     const double count_rad = 2.0 * M_PI / 131072.0;
     unsigned forward = 0, backward = 0;
     for (double amplitude_counts : {3.2, 0.6, 0.05}) {
-        // Angle about a boundary, half a swing from there; a period of the swing is 160 control periods.
-        const double swing_rad_s = 2.0 * M_PI / (160 * 25e-6);
+        // Oscillation about a boundary, starting at a reversal; its period is 160 control periods.
+        const double oscillation_rad_s = 2.0 * M_PI / (160 * 25e-6);
         start(17, (1000.0 - amplitude_counts) * count_rad, 0.0);
         for (unsigned k = 0; k < 1600; k++) {
-            plant.load_torque_Nm =
-                machine.inertia_kg_m2 * swing_rad_s * swing_rad_s * (plant.rotor_angle_rad - 1000.0 * count_rad);
+            plant.load_torque_Nm = machine.inertia_kg_m2 * oscillation_rad_s * oscillation_rad_s *
+                                   (plant.rotor_angle_rad - 1000.0 * count_rad);
             const unsigned seen = edges;
             period();
             if (edges > seen) {
@@ -428,24 +429,24 @@ TEST_F(Edges, TurnRoundWithTheRotor) {
     EXPECT_GT(backward, 40u);
 }
 
-TEST_F(Edges, OfARotorThatTurnsBackWithinAPeriodAreSeen) {
+TEST_F(Edges, AreDetectedWhenTheRotorReversesWithinAPeriod) {
     // 0.3 counts before a boundary, over it and back within one long period.
     const double count_rad = 2.0 * M_PI / 131072.0;
     machine.friction_Nm_s = 0.0;
     start(17, 999.9 * count_rad, 0.0);
     plant.speed_rad_s = 1.0;
-    plant.load_torque_Nm = machine.inertia_kg_m2 * 2.0 / 50e-6; // back there after 50 us, 0.52 counts on at most
+    plant.load_torque_Nm = machine.inertia_kg_m2 * 2.0 / 50e-6; // returns after 50 us, at most 0.52 counts farther
     latch();
     EXPECT_EQ(sample.counts, 999u);
     period({}, 50000);
     EXPECT_EQ(sample.counts, 999u);
     EXPECT_TRUE(sample.edge_known);
-    EXPECT_FALSE(sample.edge_forward) << "the last one went backwards";
+    EXPECT_FALSE(sample.edge_forward) << "the last edge is in reverse direction";
     EXPECT_EQ(edges, 1u);
     EXPECT_LT(worst_rad, 0.1e-6);
 }
 
-TEST_F(Edges, AgeIsHeldAtItsLargestValue) {
+TEST_F(Edges, AgeSaturates) {
     start(17, 0.1, 10.0);
     period();
     ASSERT_TRUE(sample.edge_known);
@@ -459,7 +460,7 @@ TEST_F(Edges, AgeIsHeldAtItsLargestValue) {
     EXPECT_TRUE(sample.edge_known);
 }
 
-TEST_F(Edges, OfAFrozenEncoderDoNotComeAndWhatMovedMeanwhileIsForgotten) {
+TEST_F(Edges, AreAbsentWhileTheEncoderIsFrozenAndNotReportedLater) {
     start(17, 0.1, 100.0);
     period();
     const uint32_t counts = sample.counts, age_ticks = sample.edge_age_ticks;
@@ -479,7 +480,7 @@ TEST_F(Edges, OfAFrozenEncoderDoNotComeAndWhatMovedMeanwhileIsForgotten) {
     EXPECT_LT(worst_rad, 0.1e-6);
 }
 
-TEST_F(Edges, AreNotMadeByAChangeOfTheReading) {
+TEST_F(Edges, AreNotCausedByAChangeOfTheReading) {
     start(17, 0.1, 10.0);
     period();
     ASSERT_TRUE(sample.edge_known);
@@ -496,11 +497,11 @@ TEST_F(Edges, AreNotMadeByAChangeOfTheReading) {
     sensors.encoder_fault = SENSORS_ENCODER_JUMP;
     latch();
     EXPECT_EQ(sample.counts, counts + 65536u);
-    EXPECT_TRUE(sample.edge_known) << "the boundaries jump too";
+    EXPECT_TRUE(sample.edge_known) << "the boundaries jump as well";
     EXPECT_EQ(sample.edge_age_ticks, age_ticks);
 }
 
-TEST_F(Edges, OfAnIdealEncoderAreAtTheLatch) {
+TEST_F(Edges, AreAtTheLatchForAnIdealEncoder) {
     start(32, 0.1, 10.0);
     period();
     EXPECT_TRUE(sample.edge_known);

@@ -1,4 +1,4 @@
-// The three machines of tools/machines, for tests of the plant.
+// Machines of tools/machines with analytic magnetics, for tests of the plant.
 #ifndef EMULATOR_MACHINES_H
 #define EMULATOR_MACHINES_H
 

@@ -1,4 +1,4 @@
-/* Of C11's assert.h, what the firmware uses: Debian's compiler for RISC-V comes without a C library. */
+/* Part of C11's assert.h that the firmware uses: Debian's compiler for RISC-V has no C library. */
 #ifndef ASSERT_H
 #define ASSERT_H
 

@@ -1,4 +1,4 @@
-/* Of C's string.h, what the firmware uses: Debian's compiler for RISC-V comes without a C library. */
+/* Part of C's string.h that the firmware uses: Debian's compiler for RISC-V has no C library. */
 #ifndef STRING_H
 #define STRING_H
 

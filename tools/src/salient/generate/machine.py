@@ -125,11 +125,11 @@ def _members(values: dict[str, float]) -> list[str]:
 
 
 def _flux_map_lines(flux_map: FluxMap) -> list[str]:
-    least_inductance_H, _, _, current_scale_A = flux_map.inductance_extremes()
+    inductance_min_H, _, _, current_scale_A = flux_map.inductance_extremes()
     return [
         "static const flux_map_t flux_map = {",
         f"    .current_max_A = {flux_map.current_max_A!r},",
-        f"    .least_inductance_H = {least_inductance_H!r},",
+        f"    .inductance_min_H = {inductance_min_H!r},",
         f"    .current_scale_A = {current_scale_A!r},",
         "    .coenergy_J = {",
         *("        {" + ", ".join(map(repr, row)) + "}," for row in flux_map.coefficients_J.tolist()),

@@ -1,21 +1,9 @@
-#include "rig/transport.h"
+#include "rig/transport_frame.h"
 
-#include <stdio.h>
 #include <string.h>
 
 #define RIG_IDENTIFIER_MASK 0x1FFFFF00u
 #define RIG_IDENTIFIER_BASE 0x1F000000u
-
-transport_t *transport_open(const char *address, char error[TRANSPORT_ERROR_SIZE]) {
-    if (strncmp(address, "unix:", 5) == 0 && address[5] != '\0') {
-        return transport_local_open(address + 5, error);
-    }
-    if (strncmp(address, "socketcan:", 10) == 0 && address[10] != '\0') {
-        return transport_socketcan_open(address + 10, error);
-    }
-    snprintf(error, TRANSPORT_ERROR_SIZE, "--can %.120s: must be unix:PATH or socketcan:INTERFACE", address);
-    return NULL;
-}
 
 bool transport_frame_accept(transport_frame_t *frame, size_t received) {
     /* Both forms begin with the same fields: identifier with flags, length, flags or padding. */
