@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import Self
 
 import can
 
@@ -85,10 +86,10 @@ class Session(KnownAttributes):
         self._ask_to_run(self.time_ns + round(duration_s * 1e9))
         self.close()
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     @property
@@ -206,7 +207,7 @@ class Session(KnownAttributes):
         if message.is_remote_frame or message.is_error_frame or len(message.data) != _IDENTITY.length:
             return
         self._identity_checked = True
-        identity = _IDENTITY.decode(bytes(message.data))
+        identity = _IDENTITY.decode_simple(bytes(message.data))
         expected = database_hash(drive_database())
         if identity["dbc_hash"] != expected:
             version = ".".join(str(identity[f"firmware_{part}"]) for part in ("major", "minor", "patch"))

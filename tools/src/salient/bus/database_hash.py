@@ -1,4 +1,4 @@
-"""Hash of a CAN database: a drive sends the one of its own DBC, so that tools notice another."""
+"""Hash of a CAN database: a drive sends that of its DBC, so that tools notice a different one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def database_hash(database: Database) -> int:
     return zlib.crc32(json.dumps(messages, separators=(",", ":")).encode())
 
 
-def _normal(signal: Signal) -> list:
+def _normal(signal: Signal) -> list[object]:
     numbers = [None if x is None else float(x) for x in (signal.scale, signal.offset, signal.minimum, signal.maximum)]
     choices = sorted((int(number), str(text)) for number, text in (signal.choices or {}).items())
     return [

@@ -88,7 +88,8 @@ class Position:
             step = splu(jacobian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                         options={"SymmetricMode": True}).solve(-residual)  # fmt: skip
             if size < _RESIDUAL * first:
-                return potential + step
+                solution: np.ndarray = potential + step
+                return solution
             fraction = 1.0
             while True:
                 tried = potential + fraction * step
@@ -141,7 +142,8 @@ class Position:
 
     def _at_corners(self, potential: np.ndarray) -> np.ndarray:
         # The unknown -1 is the boundary's zero.
-        return np.append(potential, 0.0)[self._unknown] * self._sign
+        at_corners: np.ndarray = np.append(potential, 0.0)[self._unknown] * self._sign
+        return at_corners
 
     def _gather(self, at_corners: np.ndarray) -> np.ndarray:
         values = (at_corners * self._sign).ravel()

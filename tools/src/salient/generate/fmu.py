@@ -137,7 +137,8 @@ def description(machine: Machine, token: str) -> bytes:
     for reference in outputs:
         ElementTree.SubElement(structure, "InitialUnknown", valueReference=str(reference))
     ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
+    encoded: bytes = ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True)
+    return encoded + b"\n"
 
 
 def _describe(parent: ElementTree.Element, reference: int, variable: Variable) -> None:
@@ -212,7 +213,9 @@ def instantiation_token(machine: Machine, sources: list[Path]) -> str:
 def pack(unit: Path, description_file: Path, library: Path, platform: str, licence: Path) -> None:
     """Writes the unit: a ZIP archive without times or owners of the files. The library gets the name that the
     description gives it."""
-    identifier = ElementTree.parse(description_file).find("CoSimulation").get("modelIdentifier")
+    co_simulation = ElementTree.parse(description_file).find("CoSimulation")
+    assert co_simulation is not None  # as description() writes it
+    identifier = co_simulation.get("modelIdentifier")
     members = {
         "modelDescription.xml": description_file,
         f"binaries/{platform}/{identifier}{library.suffix}": library,

@@ -58,7 +58,7 @@ def _range(option: Option) -> tuple[Any, ...]:
 
 
 def _is_wide(option: Option) -> bool:
-    return max(_range(option)) >= 2**32
+    return bool(max(_range(option)) >= 2**32)
 
 
 def _members(name: str, option: Option) -> list[str]:

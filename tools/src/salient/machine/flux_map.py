@@ -144,7 +144,8 @@ class FluxMap:
             for along_weight, parts in zip(_weights(along, 4 - by_current), cell, strict=True)
         )
         scale = math.prod([steps_1_rad] * by_angle + [steps_1_A] * by_current)  # libm's powers differ in the last bit
-        return value * scale * np.where(wrapped_rad < 0.0, (-1.0) ** by_angle, 1.0)
+        result: np.ndarray = value * scale * np.where(wrapped_rad < 0.0, (-1.0) ** by_angle, 1.0)
+        return result
 
 
 def fit(curves: Sequence[Curve], rotor_poles: int) -> FluxMap:
@@ -304,7 +305,8 @@ def _limited(x: np.ndarray, y: np.ndarray, slopes: np.ndarray, limits: tuple[flo
     right = np.concatenate([chord, chord[-1:]])
     sign = np.where(left * right > 0.0, np.sign(left), 0.0)
     flatter = np.minimum(np.abs(left), np.abs(right))
-    return sign * np.clip(sign * slopes, limits[0] * flatter, limits[1] * flatter)
+    limited: np.ndarray = sign * np.clip(sign * slopes, limits[0] * flatter, limits[1] * flatter)
+    return limited
 
 
 def _hermite(x: np.ndarray, y: np.ndarray, slopes: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -313,9 +315,10 @@ def _hermite(x: np.ndarray, y: np.ndarray, slopes: np.ndarray, at: np.ndarray) -
     step = _column(x[k + 1] - x[k], y)
     t = _column((at - x[k]) / (x[k + 1] - x[k]), y)
     u = 1.0 - t
-    return u * u * (y[k] * (1.0 + 2.0 * t) + step * t * slopes[k]) + t * t * (
+    value: np.ndarray = u * u * (y[k] * (1.0 + 2.0 * t) + step * t * slopes[k]) + t * t * (
         y[k + 1] * (1.0 + 2.0 * u) - step * u * slopes[k + 1]
     )
+    return value
 
 
 def _coefficients(y: np.ndarray, step: float, *, flat_ends: bool) -> np.ndarray:
@@ -330,7 +333,8 @@ def _coefficients(y: np.ndarray, step: float, *, flat_ends: bool) -> np.ndarray:
 def _integral(coefficients: np.ndarray, step: float) -> np.ndarray:
     """Coefficients of degree four, one more, of the integral from the first knot of a cubic spline."""
     summed = np.concatenate([np.zeros_like(coefficients[:1]), np.cumsum(step * coefficients, axis=0)])
-    return summed - (summed[0] + 11.0 * summed[1] + 11.0 * summed[2] + summed[3]) / 24.0
+    integral: np.ndarray = summed - (summed[0] + 11.0 * summed[1] + 11.0 * summed[2] + summed[3]) / 24.0
+    return integral
 
 
 def _interval(position: np.ndarray, intervals: int) -> tuple[np.ndarray, np.ndarray]:
@@ -343,7 +347,7 @@ def _weights(t: np.ndarray, degree: int) -> list[Any]:
     """The degree + 1 uniform B-splines that are not zero at place t of an interval (de Boor's recursion)."""
     weights = [np.ones_like(t)]
     for d in range(1, degree + 1):
-        last = [0.0, *weights, 0.0]
+        last: list[Any] = [0.0, *weights, 0.0]
         weights = [((t + (d - j)) * last[j] + ((1.0 - t) + j) * last[j + 1]) / d for j in range(d + 1)]
     return weights
 

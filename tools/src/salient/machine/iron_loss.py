@@ -21,6 +21,7 @@ electrical side: it is not part of the emulator's energy balance.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
@@ -76,7 +77,8 @@ def specific_loss_W_kg(time_s: np.ndarray, flux_density_T: np.ndarray, k: float,
     cosine = 2.0 * math.sqrt(math.pi) * math.gamma((alpha + 1.0) / 2.0) / math.gamma(alpha / 2.0 + 1.0)
     k_i = k / ((2.0 * math.pi) ** (alpha - 1.0) * cosine * 2.0 ** (beta - alpha))
     energy = sum(swing_T ** (beta - alpha) * integral for swing_T, integral in split_loops(flux_density_T, steps))
-    return k_i * energy / (time_s[-1] - time_s[0])
+    loss_W_kg: float = k_i * energy / (time_s[-1] - time_s[0])
+    return loss_W_kg
 
 
 def split_loops(values: np.ndarray, step_integrals: np.ndarray) -> list[tuple[float, float]]:
@@ -100,7 +102,7 @@ def split_loops(values: np.ndarray, step_integrals: np.ndarray) -> list[tuple[fl
     # The turning points of the loops that are still open, each swing smaller than the one before, and the integral on
     # the way to each from the point before it.
     open_points: list[tuple[float, float]] = [(values[0], 0.0)]
-    for first, last in zip(ends[:-1], ends[1:], strict=True):
+    for first, last in pairwise(ends):
         sign = 1.0 if values[last] > values[first] else -1.0
         run, run_so_far = sign * values[first:last + 1], so_far[first:last + 1]
         position, carried = run_so_far[0], 0.0

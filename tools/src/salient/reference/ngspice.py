@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from salient.machine.file import Machine
+from salient.machine.magnetics import Formula
 
 _NETLISTS = Path(__file__).resolve().parent / "spice"
 
@@ -35,6 +36,7 @@ class Waveforms:
 def machine_lines(machine: Machine, bridge: str) -> list[str]:
     """The machine's numbers, its link `dc`, and its phase: the subcircuit that spice/winding.cir describes. bridge:
     half_bridge or series_diode. Machines by formula only."""
+    assert isinstance(machine.magnetics, Formula)
     numbers = {
         "resistance_ohm": machine.resistance_ohm,
         "rotor_poles": machine.rotor_poles,
