@@ -19,8 +19,8 @@ from salient.bench.client import KnownAttributes
 from salient.bench.drive import Drive, ParameterRow
 from salient.bench.rig import Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
-from salient.bus.database_hash import database_hash
 from salient.bus.signals import SignalTable, drive_database, rig_database
+from salient.dbc import database_hash
 
 _ALIVE_CHECK_S = 1.0
 """Wall time between two checks that the emulator is alive; a debugger may stop it for any time."""

@@ -10,7 +10,7 @@ import binascii
 
 from cantools.database.can.message import Message
 
-from salient.bus.attributes import attributes
+from salient.dbc import attributes
 
 HEADER_BYTES = 3
 

@@ -22,8 +22,7 @@ from cantools.database.can.database import Database
 from cantools.database.can.signal import Signal
 from cantools.database.errors import UnsupportedDatabaseFormatError
 
-from salient.bus.attributes import attributes
-from salient.bus.database_hash import database_hash
+from salient.dbc import attributes, database_hash
 from salient.generate.enumerations import enumerations_header
 from salient.generate.error import CodecError
 from salient.generate.telemetry import message_c_name, telemetry

@@ -10,7 +10,7 @@ import re
 
 from cantools.database.can.database import Database
 
-from salient.bus.attributes import attributes
+from salient.dbc import attributes
 from salient.generate.error import CodecError
 
 

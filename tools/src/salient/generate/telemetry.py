@@ -14,7 +14,7 @@ from cantools.database.can.database import Database
 from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
 
-from salient.bus.attributes import attributes
+from salient.dbc import attributes
 from salient.generate.error import CodecError
 
 

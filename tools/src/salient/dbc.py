@@ -1,12 +1,22 @@
-"""Hash of a CAN database: a drive sends that of its DBC, so that tools notice a different one."""
+"""CAN databases: the attributes (BA_) of their messages and signals, and a hash. The drive sends
+the hash of its database, so that tools notice a different one."""
 
 from __future__ import annotations
 
 import json
 import zlib
+from typing import Any
 
 from cantools.database.can.database import Database
+from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
+
+
+def attributes(owner: Message | Signal) -> dict[str, Any]:
+    """Values of the attributes that the database sets, by name."""
+    if owner.dbc is None:
+        return {}
+    return {name: attribute.value for name, attribute in owner.dbc.attributes.items()}
 
 
 def database_hash(database: Database) -> int:
