@@ -1,4 +1,4 @@
-"""The drive over CAN as its user sees it: commands, parameters, state."""
+"""The drive over CAN: commands, parameters, state."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Drive(KnownAttributes):
         self.ask("off")
 
     def clear_fault(self) -> None:
-        """Leave the fault state, if its cause has gone. The drive clears when the request changes: hence off first."""
+        """Leave the fault state, if its cause has ended. The drive clears when the request changes: hence off first."""
         self.ask("off")
         self.ask("clear_fault")
 

@@ -26,7 +26,7 @@ from salient.paths import BUILD, MACHINES, ROOT
 
 
 class EmulatorError(Exception):
-    """The executable failed; the text has its standard error."""
+    """The executable failed; the text includes its standard error."""
 
 
 _BUILDERS = {"host": "any tools/salient command",
@@ -123,7 +123,7 @@ def _build_custom(path: Path, names: dict[str, str]) -> list[Path]:
 
 
 def _remove_orphans() -> None:
-    """Removes the builds of machine files that are gone."""
+    """Removes the builds of machine files that no longer exist."""
     for note in BUILD.glob("machine-*/machine_file"):
         try:
             if not Path(note.read_text(encoding="utf-8")).exists():

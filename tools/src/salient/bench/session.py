@@ -203,7 +203,7 @@ class Session(KnownAttributes):
         return message
 
     def _check_identity(self, message: can.Message) -> None:
-        """One line on stderr, once, when the drive's frames are not those of our DBC."""
+        """One line on stderr, once, when the drive was built from another DBC than that of the tools."""
         if message.is_remote_frame or message.is_error_frame or len(message.data) != _IDENTITY.length:
             return
         self._identity_checked = True

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 from salient.finite_elements.mesh import COIL_MINUS, COIL_PLUS, FINE_DEG, IRON, Geometry, build_mesh
 from salient.finite_elements.steel import MU_0, Laminations
 
-# Of the Newton iteration, from its first residual; the flux linkage's error is of the order of its square.
+# Reduction of the Newton iteration's first residual; the flux linkage's error is of the order of its square.
 _RESIDUAL = 1e-7
 _ITERATIONS_MAX = 60
 
@@ -101,7 +101,7 @@ class Position:
         raise FieldError(f"no convergence at {current_A:g} A")
 
     def flux_linkage_Wb(self, potential: np.ndarray) -> float:
-        """Of the phase: both coils, by the same weights as the current's, so that its integral is the co-energy."""
+        """Flux linkage of the phase, both coils. Its weights are the current's: its integral is the co-energy."""
         return 2.0 * self._machine.length_m * float(self._source @ potential)
 
     def torque_Nm(self, potential: np.ndarray) -> float:

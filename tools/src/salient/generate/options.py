@@ -14,7 +14,7 @@ from salient.bench import config
 from salient.bench.config import DEFAULTS, OPTIONS, Option
 
 _HEAD = "/* Generated from tools/src/salient/bench/config.py. */"
-_INDENT = 26  # of the usage text's second column
+_INDENT = 26  # column of the usage text's second part
 
 
 def arguments() -> dict[str, Option]:

@@ -47,7 +47,7 @@ class ParameterDefinition:
     text: str
 
     def physical(self, raw: int) -> str:
-        """A raw value in the unit: the shortest decimal number that stands for it."""
+        """A raw value in the unit: the shortest decimal number that identifies it."""
         lsb = Fraction(1, 1 << self.fraction_bits)
         value = raw * lsb
         for digits in range(12):

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 INDUCTANCES = {"unaligned_inductance_H": (1e-5, 10.0), "aligned_inductance_H": (1e-5, 10.0)}
-"""(minimum, maximum) of every machine's, both allowed; of the unsaturated phase."""
+"""(minimum, maximum) for every machine, both included; of the unsaturated phase."""
 
-# Keys of each form in a machine file with (minimum, maximum), both allowed.
+# Keys of each form in a machine file with (minimum, maximum), both included.
 FORMULA_KEYS: dict[str, dict[str, tuple[float, float]]] = {
     "linear_cosine": INDUCTANCES,
     "linear_trapezoid": INDUCTANCES | {"flat_deg": (0.0, 20.0), "blend_deg": (0.01, 20.0)},
@@ -46,7 +46,7 @@ class Formula:
 
     @property
     def unaligned_inductance_H(self) -> float:
-        """Of the unsaturated phase, d psi / d i at 0 A."""
+        """Incremental inductance of the unsaturated phase, d psi / d i at 0 A."""
         return self.parameters["unaligned_inductance_H"]
 
     def mistake(self) -> tuple[str, str] | None:
