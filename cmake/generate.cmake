@@ -4,7 +4,7 @@ set(SALIENT_GENERATOR_SOURCES ${CMAKE_SOURCE_DIR}/tools/src/salient)
 set(SALIENT_GENERATOR ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m)
 
 set(SALIENT_CODEC_GENERATOR generate/codec.py generate/enumerations.py generate/telemetry.py generate/error.py
-    bus/database_hash.py)
+    dbc.py)
 
 # Machines that drives are built for: the bundled ones, and one more on request.
 if(SALIENT_MACHINE_FILE AND NOT EXISTS ${SALIENT_MACHINE_FILE})

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import salient.bench.session
 from salient.bench.session import Session
-from salient.bus.database_hash import database_hash
 from salient.bus.signals import drive_database
+from salient.dbc import database_hash
 from salient.version import VERSION
 
 

@@ -141,7 +141,7 @@ def test_reluctivity_matches_the_curve_and_its_slope_is_the_derivative():
     steel = steel_data.Laminations(1.0)
     assert steel.reluctivity(np.array([1.0, 2.25]))[0] == pytest.approx([106.201, 1108.33 / 1.5])
     square_T2 = np.linspace(0.01, 6.0, 200) + 1e-4
-    nu, slope = steel.reluctivity(square_T2)
+    _, slope = steel.reluctivity(square_T2)
     right, left = (steel.reluctivity(square_T2 + step)[0] for step in (1e-6, -1e-6))
     assert slope == pytest.approx((right - left) / 2e-6, rel=1e-3, abs=1e-3)
     # In the lamination stack the steel carries the flux until it saturates.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import math
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -172,7 +173,7 @@ def library() -> ctypes.CDLL:
 class Point(ctypes.Structure):
     """magnetics_point_t; orders of the derivative of the co-energy for each member: by angle, by current."""
 
-    ORDERS = {
+    ORDERS: ClassVar = {
         "flux_linkage_Wb": (0, 1),
         "incremental_inductance_H": (0, 2),
         "flux_gradient_Wb_rad": (1, 1),

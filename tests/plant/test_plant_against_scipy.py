@@ -179,7 +179,7 @@ def test_conduction_ends_at_the_same_nanosecond(library: ctypes.CDLL, form: str)
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("name", ("chopping", "single_pulse"))
+@pytest.mark.parametrize("name", ["chopping", "single_pulse"])
 def test_samples_within_steps_agree_and_leave_the_run_unchanged(library: ctypes.CDLL, name: str, form: str) -> None:
     machine, run = run_of(library, name, form)
     expected, _ = run_reference(machine, run, sample_ns=1000)

@@ -81,9 +81,9 @@ def test_every_solver_reports_its_accuracy_and_is_compared_with_a_plant_at_least
     rows = {row["solver"]: row for row in content["solvers"]}
     assert list(rows) == [*PLANT, *REFERENCE_SOLVERS] == list(ACCURACY)
     output = capsys.readouterr().out.splitlines()
-    for name in rows:
+    for name, row in rows.items():
         (line,) = [line for line in output if line.startswith(f"  {name} ")]
-        assert ("times faster" in line) == (rows[name].get("plant_times_faster") is not None)
+        assert ("times faster" in line) == (row.get("plant_times_faster") is not None)
     for name, (least, most) in ACCURACY.items():
         for quantity in ("current", "torque"):
             assert least < rows[name]["deviation"][quantity] < most, (name, rows[name])

@@ -13,7 +13,7 @@ from cantools.database.can.c_source import camel_to_snake_case
 from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
 
-from salient.bus.database_hash import database_hash
+from salient.dbc import database_hash
 from salient.generate.codec import generate_codec, main, raw_range
 from salient.generate.error import CodecError
 from salient.generate.telemetry import is_bit_field, message_c_name, short_name

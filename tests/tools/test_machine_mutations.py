@@ -203,12 +203,12 @@ def key_cases() -> list[Case]:
 
 def table_cases() -> list[Case]:
     cases: list[Case] = []
-    for table in GOOD_TABLES:
+    for table, content in GOOD_TABLES.items():
         without = {name: keys for name, keys in GOOD_TABLES.items() if name != table}
         if table not in ("dc_link", "sensors", "iron_loss"):
             cases.append((f"[{table}] removed", toml(without), table))
         cases += [
-            (f"[{table}] renamed", toml({**without, f"{table}s": GOOD_TABLES[table]}), f"{table}s"),
+            (f"[{table}] renamed", toml({**without, f"{table}s": content}), f"{table}s"),
             (f"[{table}] twice", GOOD + f"[{table}]\n", "line "),
             (f"[{table}] in brackets of an array", GOOD.replace(f"[{table}]", f"[[{table}]]"), table),
             (f"[{table}] a number", f"{table} = 1\n" + toml(without), table),

@@ -56,7 +56,7 @@ def _test(options: argparse.Namespace) -> int:
     return checks.run(options.only)
 
 
-def _sim(options: argparse.Namespace) -> int:
+def _sim(options: argparse.Namespace) -> int:  # noqa: RET503 - os.execv does not return
     from salient.bench.emulator import EmulatorError, command_line
 
     try:

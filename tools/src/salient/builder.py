@@ -21,7 +21,7 @@ def run_commands(commands: Sequence[Sequence[str]], folder: Path, log: Path, not
         for command in commands:
             with subprocess.Popen(command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                   stderr=subprocess.STDOUT) as process:
-                for line in process.stdout:
+                for line in process.stdout or ():
                     output.write(line)
                     if not noticed and _WORK.match(line):
                         notice()

@@ -1,4 +1,4 @@
-"""Says how far a command has come: in place on a terminal, a line a step elsewhere."""
+"""Shows the progress of a command: in place on a terminal, elsewhere one line per step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _ERASE_LINE = "\r\x1b[K"
 
 
 class Progress:
-    """Counts `total` steps on `stream`. Use as a context manager: leaving it clears what stands in place."""
+    """Counts `total` steps on `stream`. Use as a context manager: leaving it clears the line in place."""
 
     def __init__(self, total: int, stream: TextIO) -> None:
         self._total, self._done, self._stream = total, 0, stream
@@ -23,7 +23,7 @@ class Progress:
             self._write(_ERASE_LINE)
 
     def step(self, what: str) -> None:
-        """One step more is done; `what` says which, in a few words."""
+        """Counts a step; `what` names it in a few words."""
         self._done += 1
         if self._in_place:
             filled = _BAR_WIDTH * self._done // self._total

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from salient.bench.emulator import TARGET_BUILDS
+from salient.bench.config import TARGET_BUILDS
 from salient.paths import BUILD, ROOT, SCENARIOS
 
 RESULTS = BUILD / "results"
@@ -180,7 +180,7 @@ def _sources(*folders: str, suffixes: tuple[str, ...]) -> list[Path]:
 def _clang_tidy() -> bool:
     """The C sources that the host build compiles, with the compiler's own headers: the wheel brings none."""
     headers = subprocess.run(["gcc", "-print-file-name=include"], capture_output=True, text=True).stdout.strip()
-    command = [_tool("clang-tidy"), "-p", BUILD / "host", "--quiet", f"--extra-arg=-isystem{headers}",
+    command: list[str | Path] = [_tool("clang-tidy"), "-p", BUILD / "host", "--quiet", f"--extra-arg=-isystem{headers}",
                "--extra-arg=-Wno-ignored-optimization-argument"]
     compiled = (BUILD / "host" / "compile_commands.json").read_text(encoding="utf-8")
     sources = [path for path in _sources("firmware", "hal", "emulator", suffixes=(".c",))

@@ -1,18 +1,22 @@
 """Reads TOML files of users: bounded in size and time, checked by a model, every mistake one line.
 
-A model is a subclass of Table whose fields have the types made here: number, whole, one_of, SWITCH, or another Table.
+A model is a subclass of Table. Its fields are tables or annotated with a check made here:
+
+    speed_rpm: Annotated[float, number(0.0, 3000.0)]
 """
 
 from __future__ import annotations
 
+import math
 import re
 import stat
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+from typing import Any, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, WrapValidator
+from pydantic import BaseModel, ConfigDict, ValidationError, WrapValidator
 from pydantic_core import PydanticCustomError
 
 from salient.bench import config
@@ -44,7 +48,7 @@ def read_text(path: Path, bytes_max: int) -> str:
         raise TextFileError(f"not UTF-8 at byte {error.start + 1}") from None
 
 
-def read_toml(path: Path) -> dict:
+def read_toml(path: Path) -> dict[str, Any]:
     """The tables of a TOML file of at most TOML_BYTES_MAX."""
     try:
         return tomllib.loads(read_text(path, TOML_BYTES_MAX))
@@ -54,7 +58,7 @@ def read_toml(path: Path) -> dict:
         raise TextFileError("not TOML: a number too long or tables too deep") from None
 
 
-# --- types ----------------------------------------------------------------------------------------------------------
+# --- checks ---------------------------------------------------------------------------------------------------------
 
 class Table(BaseModel):
     """A table of a file: no other keys than its fields, no conversions."""
@@ -62,40 +66,40 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-def number(low: float, high: float) -> Any:
-    """A finite number from low to high, an integer or not."""
-    return checked(Annotated[float, Field(ge=low, le=high, allow_inf_nan=False)], f"a number from {low:g} to {high:g}")
+def number(low: float, high: float) -> WrapValidator:
+    """float: a number from low to high, an integer or not."""
+    return checked(f"a number from {low:g} to {high:g}", lambda value: low <= value <= high)
 
 
-def any_number() -> Any:
-    """A finite number."""
-    return checked(Annotated[float, Field(allow_inf_nan=False)], "a number")
+def any_number() -> WrapValidator:
+    """float: a finite number."""
+    return checked("a number", math.isfinite)
 
 
-def whole(low: int, high: int) -> Any:
-    """An integer from low to high."""
-    return checked(Annotated[int, Field(ge=low, le=high)], f"a whole number from {low} to {high}")
+def whole(low: int, high: int) -> WrapValidator:
+    """int: from low to high."""
+    return checked(f"a whole number from {low} to {high}", lambda value: low <= value <= high)
 
 
-def one_of(choices: tuple) -> Any:
-    """One of some words or integers; 17.0 and true are not integers."""
-    return checked(type(choices[0]), either(choices), lambda value: value in choices)
+def one_of(choices: tuple[str, ...]) -> WrapValidator:
+    """str: one of some words."""
+    return checked(either(choices), lambda value: value in choices)
 
 
-def option(name: str) -> Any:
-    """The type of an option of the test bench."""
+def option(name: str) -> WrapValidator:
+    """An option of the test bench, of the type of its field; 17.0 and true are not integers."""
     record = OPTIONS[name]
     if record.choices:
-        return checked(type(record.choices[0]), record.allowed, lambda value: value in record.choices)
+        return checked(record.allowed, lambda value: value in record.choices)
     if record.kind == config.INTEGER:
         return whole(int(record.minimum), int(record.maximum))
     if record.kind == config.NUMBER:
         return number(record.minimum, record.maximum)
-    return checked(bool if record.kind == config.FLAG else str, record.allowed)
+    return checked(record.allowed)
 
 
-def checked(kind: Any, allowed: str, accepts=lambda value: True) -> Any:
-    """A type whose mistakes all have the same text: "must be" and what is allowed."""
+def checked(allowed: str, accepts: Callable[[Any], bool] = lambda value: True) -> WrapValidator:
+    """A check of a field; its mistakes, a wrong type included, all have the text "must be" and the values allowed."""
 
     def check(value: Any, validate: Any) -> Any:
         try:
@@ -106,10 +110,10 @@ def checked(kind: Any, allowed: str, accepts=lambda value: True) -> Any:
             pass
         raise PydanticCustomError("must_be", "{text}", {"text": f"must be {allowed}"})
 
-    return Annotated[kind, WrapValidator(check)]
+    return WrapValidator(check)
 
 
-# --- checking -------------------------------------------------------------------------------------------------------
+# --- validation -----------------------------------------------------------------------------------------------------
 
 _Model = TypeVar("_Model", bound=Table)
 

@@ -5,4 +5,7 @@ import re
 from pathlib import Path
 
 _PROJECT = Path(__file__).resolve().parents[3] / "CMakeLists.txt"
-VERSION = re.search(r"^project\(salient VERSION ([0-9.]+)", _PROJECT.read_text(encoding="utf-8"), re.MULTILINE)[1]
+_found = re.search(r"^project\(salient VERSION ([0-9.]+)", _PROJECT.read_text(encoding="utf-8"), re.MULTILINE)
+if _found is None:
+    raise ValueError(f"{_PROJECT}: no line project(salient VERSION ...)")
+VERSION = _found[1]

@@ -7,19 +7,22 @@ from typing import Any, Protocol
 
 import can
 
+from salient.bus.signals import SignalTable
+
 
 class Client(Protocol):
     """Sends and receives frames in virtual time; Session is one."""
 
     time_ns: int
+    telemetry: SignalTable
 
     def send(self, message: can.Message) -> None:
         """Sends a frame."""
 
-    def receive_until(self, wanted: Callable[[can.Message], bool]) -> can.Message:
+    def receive_until(self, matches: Callable[[can.Message], bool]) -> can.Message:
         """Receives, without time passing in lock-step, until a frame meets the condition."""
 
-    def advance_until_frame(self, wanted: Callable[[can.Message], bool], timeout_s: float) -> can.Message:
+    def advance_until_frame(self, matches: Callable[[can.Message], bool], timeout_s: float) -> can.Message:
         """Lets virtual time pass until a frame meets the condition; TimeoutError after timeout_s."""
 
 

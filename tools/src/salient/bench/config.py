@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,7 @@ class Option:
     kind: str
     help: str
     metavar: str = ""
-    choices: tuple = ()
+    choices: tuple[Any, ...] = ()
     minimum: int | float = 0
     maximum: int | float = 0
     commands: tuple[str, ...] = ()
@@ -72,21 +73,30 @@ class Option:
     def parse(self, text: str) -> Any:
         """The value that a text on a command line means; ValueError: it is not allowed."""
         if self.kind == INTEGER and re.fullmatch("[0-9]{1,20}", text):
-            value = int(text)
-            if value in self.choices if self.choices else self.minimum <= value <= self.maximum:
-                return value
+            number = int(text)
+            if number in self.choices if self.choices else self.minimum <= number <= self.maximum:
+                return number
         elif self.kind == NUMBER and re.fullmatch(r"[-+0-9.eE]+", text):
             value = float(text)
             if self.minimum <= value <= self.maximum:
                 return value
-        elif (self.kind == WORD and text in self.choices) or (self.kind == BUS and re.fullmatch(r"(unix|socketcan):.+", text)) or (self.kind == PACE and (text in PACES or _is_pace_factor(text))):
+        elif self.kind == FILE and text:
+            return Path(text)
+        elif self._is_text(text):
             return text
-        elif self.kind in (FILE, MACHINE) and text:
-            return Path(text) if self.kind == FILE else text
         raise ValueError(f"must be {self.allowed}")
 
+    def _is_text(self, text: str) -> bool:
+        """True for an allowed value of an option that is a text."""
+        return {
+            WORD: text in self.choices,
+            BUS: re.fullmatch(r"(unix|socketcan):.+", text) is not None,
+            PACE: text in PACES or _is_pace_factor(text),
+            MACHINE: text != "",
+        }.get(self.kind, False)
 
-def either(values) -> str:
+
+def either(values: Iterable[object]) -> str:
     """A, B or C."""
     *first, last = map(str, values)
     return f"{', '.join(first)} or {last}" if first else last
@@ -97,9 +107,9 @@ def _plain(number: float) -> str:
     return f"{number:.9f}".rstrip("0").rstrip(".")
 
 
-def _runs(choices: tuple) -> list[str]:
+def _runs(choices: tuple[Any, ...]) -> list[str]:
     """The choices, three or more consecutive integers as a range."""
-    parts: list[list] = []
+    parts: list[list[Any]] = []
     for choice in choices:
         if parts and isinstance(choice, int) and choice == parts[-1][-1] + 1:
             parts[-1].append(choice)
@@ -122,7 +132,7 @@ _CONDITION = ("sim", "demo")
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """The drive and the conditions under which it runs: the options that a scenario has, too."""
+    """The drive and the conditions under which it runs: the options that a scenario has as well."""
 
     machine: str = _option("saturating", MACHINE, "machine", metavar="NAME|FILE", commands=_CONDITION, argument=False)
     controller: str = _option("salient", WORD, "controller at the start", metavar="NAME", choices=CONTROLLERS,
@@ -204,7 +214,7 @@ def flag_of(name: str) -> str:
 def description(name: str) -> str:
     """Meaning, values allowed and default, for a usage text."""
     option, default = OPTIONS[name], DEFAULTS[name]
-    if option.kind == FLAG or option.kind == FILE:
+    if option.kind in (FLAG, FILE):
         return option.help
     shown = _plain(default) if option.kind == NUMBER and default is not None else default
     return f"{option.help}: {option.allowed}" + ("" if default is None or option.kind == BUS else f" (default {shown})")

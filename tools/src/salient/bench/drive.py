@@ -1,18 +1,20 @@
-"""The drive over CAN as its user sees it: commands, parameters, state."""
+"""The drive over CAN: commands, parameters, state."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass
+from typing import Any
 
 import can
 
 from salient.bench.client import Client, KnownAttributes
 from salient.bus import e2e
-from salient.bus.signals import drive_database, value_numbers
+from salient.bus.signals import drive_database, signal_range, value_numbers
 
 _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
 REQUESTS = value_numbers(drive_database(), "DRIVE_COMMAND", "request")
+assert _COMMAND.cycle_time is not None  # GenMsgCycleTime in drive.dbc
 COMMAND_PERIOD_NS = _COMMAND.cycle_time * 1_000_000
 """Period of the commands in virtual time; the drive stops when they are no longer sent."""
 
@@ -62,8 +64,9 @@ class Drive(KnownAttributes):
     @speed_reference_rpm.setter
     def speed_reference_rpm(self, value: float) -> None:
         signal = _COMMAND.get_signal_by_name("speed_reference_rpm")
-        if not signal.minimum <= value <= signal.maximum:
-            limits = f"{signal.minimum:g} to {signal.maximum:g} {signal.unit}"
+        low, high = signal_range(signal)
+        if not low <= value <= high:
+            limits = f"{low:g} to {high:g} {signal.unit}"
             raise DriveError(f"speed_reference_rpm {value:g}: must be {limits}")
         self._speed_reference_rpm = float(value)
         self.ask("run")
@@ -77,7 +80,7 @@ class Drive(KnownAttributes):
         self.ask("off")
 
     def clear_fault(self) -> None:
-        """Leave the fault state, if its cause has gone. The drive clears when the request changes: hence off first."""
+        """Leave the fault state, if its cause has ended. The drive clears when the request changes: hence off first."""
         self.ask("off")
         self.ask("clear_fault")
 
@@ -153,7 +156,7 @@ class Parameters(MutableMapping[str, float]):
 
     def __getitem__(self, name: str) -> float:
         row = self.row(name)
-        return _access(self._session, "read", row.index)[1] / 2**row.fraction_bits
+        return _access(self._session, "read", row.index)[1] / (1 << row.fraction_bits)
 
     def __setitem__(self, name: str, value: float) -> None:
         row = self.row(name)
@@ -175,7 +178,7 @@ class Parameters(MutableMapping[str, float]):
 
 def raw_value(row: ParameterRow, value: float) -> int:
     """Raw integer of a physical value; DriveError when it exceeds 32 bits."""
-    raw = round(value * 2**row.fraction_bits)
+    raw = round(value * (1 << row.fraction_bits))
     if not -(2**31) <= raw < 2**31:
         raise DriveError(f"{row.name} {value:g}: must be {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
     return raw
@@ -189,7 +192,7 @@ def read_parameter_table(session: Client) -> list[ParameterRow]:
         status, fraction_bits = _access(session, "fraction_bits", index)
         if status != "done":
             return rows
-        limits = (_access(session, what, index)[1] / 2**fraction_bits for what in ("minimum", "maximum", "default"))
+        limits = (_access(session, what, index)[1] / (1 << fraction_bits) for what in ("minimum", "maximum", "default"))
         name, unit = (_read_text(session, what, index) for what in ("name", "unit"))
         rows.append(ParameterRow(index, name, unit, fraction_bits, *limits))
 
@@ -218,7 +221,7 @@ def _access(session: Client, operation: str, index: int, part: int = 0, value: i
     except TimeoutError:
         text = f"no response to PARAMETER_REQUEST {operation} {index} within {_RESPONSE_TIMEOUT_S} s"
         raise DriveError(text) from None
-    signals = message.decode(bytes(response.data))
+    signals: Mapping[str, Any] = message.decode_simple(bytes(response.data))
     return str(signals["status"]), int(signals["value"])
 
 

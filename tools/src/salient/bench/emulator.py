@@ -26,7 +26,7 @@ from salient.paths import BUILD, MACHINES, ROOT
 
 
 class EmulatorError(Exception):
-    """The executable failed; the text has its standard error."""
+    """The executable failed; the text includes its standard error."""
 
 
 _BUILDERS = {"host": "any tools/salient command",
@@ -123,7 +123,7 @@ def _build_custom(path: Path, names: dict[str, str]) -> list[Path]:
 
 
 def _remove_orphans() -> None:
-    """Removes the builds of machine files that are gone."""
+    """Removes the builds of machine files that no longer exist."""
     for note in BUILD.glob("machine-*/machine_file"):
         try:
             if not Path(note.read_text(encoding="utf-8")).exists():
@@ -145,14 +145,16 @@ class EmulatorProcess:
     def __init__(self, config: BenchConfig, can: str, prefix: Sequence[str] = ()) -> None:
         self.config = replace(config, can=can)
         self.command = [*prefix, *command_line(self.config)]
-        self._errors = tempfile.TemporaryFile()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - read as long as the object exists
         self._process = subprocess.Popen(
             [*self.command, "--follow-stdin"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
         )
-        line = self._process.stdout.readline()
+        assert self._process.stdin is not None and self._process.stdout is not None  # pipes
+        self._stdin, self._stdout = self._process.stdin, self._process.stdout
+        line = self._stdout.readline()
         if not line:
             self._raise_failure(self._process.wait())
         self.ready = json.loads(line)
@@ -176,16 +178,16 @@ class EmulatorProcess:
     def close(self) -> None:
         """Ends it and waits: recording finished, socket removed. EmulatorError when its exit code is not 0."""
         if self.is_alive:
-            self._process.stdin.close()
+            self._stdin.close()
             self._process.wait()
-        self._process.stdout.close()
+        self._stdout.close()
         if self._process.returncode != 0:
             self._raise_failure(self._process.returncode)
 
     def __enter__(self) -> EmulatorProcess:
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     def _raise_failure(self, code: int) -> None:

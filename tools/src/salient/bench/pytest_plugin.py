@@ -18,9 +18,11 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+from typing import Any
 
+import pluggy
 import pytest
 
 from salient.bench.bench import Bench
@@ -52,7 +54,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselects tests that are not for the transport of this run."""
     on_interface = config.getoption("--salient-can") != "local"
-    selected, deselected = [], []
+    selected: list[pytest.Item] = []
+    deselected: list[pytest.Item] = []
     for item in items:
         interface_only = item.get_closest_marker("socketcan") is not None
         both = item.get_closest_marker("both_transports") is not None
@@ -71,7 +74,7 @@ def make_bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Calla
     bus = request.config.getoption("--salient-can")
     build = request.config.getoption("--salient-build")
 
-    def make(can: str | None = None, **options) -> Bench:
+    def make(can: str | None = None, **options: Any) -> Bench:
         options.setdefault("build", build)
         if can is None and bus != "local":
             can = bus
@@ -98,7 +101,8 @@ def bench(request: pytest.FixtureRequest, make_bench: Callable[..., Bench]) -> B
 
 
 @pytest.hookimpl(hookwrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo):
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]
+                              ) -> Generator[None, pluggy.Result[pytest.TestReport], None]:
     outcome = yield
     report = outcome.get_result()
     if call.when != "call" or not report.failed:
@@ -108,7 +112,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo):
     test = "::".join([os.path.relpath(item.path, ROOT), *item.nodeid.split("::")[1:]])
     replay = shlex.join(["build/venv/bin/python", "-m", "pytest", test, *options])
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", item.nodeid).strip("_")
-    for number, bench in enumerate(item.stash.get(_benches_key, [])):
+    benches: list[Bench] = item.stash.get(_benches_key, [])
+    for number, bench in enumerate(benches):
         folder = Path(item.config.getoption("--salient-failures")) / name / str(number)
         try:
             bench.save(folder, replay)

@@ -13,7 +13,7 @@ from cantools.database.can import Signal
 from cantools.database.namedsignalvalue import NamedSignalValue
 
 from salient.bench.client import Client, unknown_attribute
-from salient.bus.signals import rig_database
+from salient.bus.signals import rig_database, signal_range
 
 _AT_US_MAX = 2**32 - 1
 
@@ -38,15 +38,20 @@ class Rig:
 
     __slots__ = ("_assigned", "_at_us", "_client")
 
+    _assigned: dict[str, float]
+    _at_us: int
+    _client: Client
+
     def __init__(self, client: Client, at_us: int = 0) -> None:
         for name, value in (("_client", client), ("_at_us", at_us), ("_assigned", {})):
             object.__setattr__(self, name, value)
 
     def __getattr__(self, name: str) -> float:
-        value = self._assigned.get(name, _variable(name).initial)
+        value: Any = self._assigned.get(name, _variable(name).initial)
         if value is None:
             raise AttributeError(f"{name} has the value of the machine file until it is set")
-        return value.value if isinstance(value, NamedSignalValue) else value
+        number: float = value.value if isinstance(value, NamedSignalValue) else value
+        return number
 
     def __setattr__(self, name: str, value: Any) -> None:
         self.set(name, value)
@@ -62,19 +67,20 @@ class Rig:
     def set(self, name: str, value: float) -> None:
         """Sets a bench variable by its name in rig.dbc."""
         signal = _variable(name)
-        if not signal.minimum <= value <= signal.maximum:
+        low, high = signal_range(signal)
+        if not low <= value <= high:
             raise RigError(f"{name} {value:g}: must be {_range(signal)}")
         if not 0 <= self._at_us <= _AT_US_MAX:
             raise RigError(f"{name} at {self._at_us} us: must be 0 to {_AT_US_MAX} us")
         message = rig_database().get_message_by_name("RIG_SET")
-        number = signal.multiplexer_ids[0]
+        number = _multiplex_number(signal)
         data = message.encode({"quantity": number, name: value, "at_us": self._at_us})
         self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
         reply = rig_database().get_message_by_name("RIG_SET_REPLY")
         answer = self._client.receive_until(
             lambda m: m.arbitration_id == reply.frame_id and m.is_extended_id and m.data[0] == number
         )
-        status = reply.decode(bytes(answer.data))["status"]
+        status = reply.decode_simple(bytes(answer.data))["status"]
         if status != "done":
             raise RigError(f"{name} {value:g} at {self._at_us} us: {status}")
 
@@ -90,5 +96,11 @@ def _variable(name: str) -> Signal:
     return bench_variables()[name]
 
 
+def _multiplex_number(signal: Signal) -> int:
+    assert signal.multiplexer_ids  # as bench_variables selects
+    return signal.multiplexer_ids[0]
+
+
 def _range(signal: Signal) -> str:
-    return f"{signal.minimum:g} to {signal.maximum:g} {signal.unit or ''}".rstrip()
+    low, high = signal_range(signal)
+    return f"{low:g} to {high:g} {signal.unit or ''}".rstrip()

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import Self
 
 import can
 
@@ -18,8 +19,8 @@ from salient.bench.client import KnownAttributes
 from salient.bench.drive import Drive, ParameterRow
 from salient.bench.rig import Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
-from salient.bus.database_hash import database_hash
 from salient.bus.signals import SignalTable, drive_database, rig_database
+from salient.dbc import database_hash
 
 _ALIVE_CHECK_S = 1.0
 """Wall time between two checks that the emulator is alive; a debugger may stop it for any time."""
@@ -85,10 +86,10 @@ class Session(KnownAttributes):
         self._ask_to_run(self.time_ns + round(duration_s * 1e9))
         self.close()
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     @property
@@ -202,11 +203,11 @@ class Session(KnownAttributes):
         return message
 
     def _check_identity(self, message: can.Message) -> None:
-        """One line on stderr, once, when the drive's frames are not those of our DBC."""
+        """One line on stderr, once, when the drive was built from another DBC than that of the tools."""
         if message.is_remote_frame or message.is_error_frame or len(message.data) != _IDENTITY.length:
             return
         self._identity_checked = True
-        identity = _IDENTITY.decode(bytes(message.data))
+        identity = _IDENTITY.decode_simple(bytes(message.data))
         expected = database_hash(drive_database())
         if identity["dbc_hash"] != expected:
             version = ".".join(str(identity[f"firmware_{part}"]) for part in ("major", "minor", "patch"))

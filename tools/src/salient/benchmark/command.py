@@ -57,8 +57,8 @@ def measure(controller: str, condition: str) -> float:
             build="cortex-m4" if condition == "cortex-m4" else "host",
         )
         can = f"unix:{folder}/can.sock"
-        with EmulatorProcess(options, can) as simulator:
-            with Session(can, parameter_table=lambda: parameter_table(options)) as session:
+        with EmulatorProcess(options, can) as simulator, \
+                Session(can, parameter_table=lambda: parameter_table(options)) as session:
                 session.drive.parameters["command_timeout_ms"] = _COMMAND_TIMEOUT_MS
                 session.rig.truth_period_us = 1000 if recording else 0
                 session.drive.speed_reference_rpm = 600.0

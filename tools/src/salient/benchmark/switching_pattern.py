@@ -47,7 +47,7 @@ class SwitchingPattern:
 
     @property
     def phases(self) -> int:
-        return self.upper.shape[1]
+        return int(self.upper.shape[1])
 
     @property
     def period_ns(self) -> int:
@@ -111,14 +111,15 @@ def record(folder: Path, duration_s: float = 0.1) -> SwitchingPattern:
     start. The recording of the true state, one row per control period, is written to `folder`."""
     machine, load_torque_Nm, control_rate_hz = "saturating", 8.0, 40_000
     period_ns = 1_000_000_000 // control_rate_hz
+    recording, switches = folder / "recording.npy", folder / "switches"
     options = BenchConfig(
         machine=machine,
         controller="paper",
         control_rate_hz=control_rate_hz,
-        record=folder / "recording.npy",
+        record=recording,
         record_from_us=round(2 * _SETTLE_S * 1e6),
         record_step_ns=period_ns,
-        record_switches=folder / "switches",
+        record_switches=switches,
     )
     with Bench(options, f"unix:{folder}/can.sock") as bench:
         bench.rig.truth_period_us = 0
@@ -126,8 +127,8 @@ def record(folder: Path, duration_s: float = 0.1) -> SwitchingPattern:
         bench.run_for(_SETTLE_S)
         bench.load_torque_Nm = load_torque_Nm
         bench.run_for(_SETTLE_S + duration_s)
-    start = np.load(options.record)[0]
-    compares = np.fromfile(options.record_switches, dtype="u2").reshape(-1, 2, _PHASES_MAX)
+    start = np.load(recording)[0]
+    compares = np.fromfile(switches, dtype="u2").reshape(-1, 2, _PHASES_MAX)
     phases = load_machine(machine_path(machine)).phases
     # The first row takes effect at the end of the first period.
     first = round(start["time_s"] * 1e9 / period_ns) - 1

@@ -10,11 +10,12 @@ same order.
 from __future__ import annotations
 
 from collections import deque
+from typing import cast
 
 import can
-import cantools
+from cantools.database.can import Database
 
-from salient.bus.interface import is_on_bus
+from salient.bus.interface import VirtualMessage, is_on_bus
 from salient.bus.signals import drive_database, rig_database, value_numbers
 from salient.errors import UsageError
 
@@ -23,7 +24,7 @@ RIG_STAMP_ID = rig_database().get_message_by_name("RIG_STAMP").frame_id
 _SUBJECTS = value_numbers(rig_database(), "RIG_STAMP", "subject")
 
 
-def _sent_by(database: cantools.database.Database, node: str) -> frozenset[int]:
+def _sent_by(database: Database, node: str) -> frozenset[int]:
     return frozenset(message.frame_id for message in database.messages if node in message.senders)
 
 
@@ -63,7 +64,7 @@ class VirtualTimeReader:
             if message is None:
                 return None
             if not self._stamped:
-                return message.time_ns, message
+                return cast(VirtualMessage, message).time_ns, message  # of the local bus
             timed = self._join(message)
             if timed is not None:
                 return timed

@@ -10,12 +10,14 @@ import binascii
 
 from cantools.database.can.message import Message
 
+from salient.dbc import attributes
+
 HEADER_BYTES = 3
 
 
 def data_id(message: Message) -> int:
     """Data ID of a protected message: its attribute E2EDataId in the DBC."""
-    return int(message.dbc.attributes["E2EDataId"].value)
+    return int(attributes(message)["E2EDataId"])
 
 
 def checksum(data_id: int, frame: bytes) -> int:

@@ -23,7 +23,7 @@ class BlfLog:
 
     def write(self, time_ns: int, message: can.Message) -> None:
         plain = can.Message(
-            # The writer cuts off to whole nanoseconds: half of one more, so that a float just below comes out right.
+            # The writer truncates to whole nanoseconds: half of one is added against the rounding of the float.
             timestamp=(time_ns + 0.5) * 1e-9,
             arbitration_id=message.arbitration_id,
             is_extended_id=message.is_extended_id,

@@ -11,30 +11,40 @@ from pathlib import Path
 import can
 import cantools
 import numpy as np
+from cantools.database.can import Database, Message
 
 from salient.paths import DRIVE_DBC, RIG_DBC
 
 
 @lru_cache
-def load_database(path: Path) -> cantools.database.Database:
+def load_database(path: Path) -> Database:
     """A DBC file, loaded once."""
-    return cantools.database.load_file(path, strict=True)
+    database = cantools.database.load_file(path, strict=True)
+    assert isinstance(database, Database)  # as every DBC gives
+    return database
 
 
-def drive_database() -> cantools.database.Database:
+def drive_database() -> Database:
     """The drive's DBC."""
     return load_database(DRIVE_DBC)
 
 
-def rig_database() -> cantools.database.Database:
+def rig_database() -> Database:
     """The test bench's DBC."""
     return load_database(RIG_DBC)
 
 
-def value_numbers(database: cantools.database.Database, message: str, signal: str) -> dict[str, int]:
+def value_numbers(database: Database, message: str, signal: str) -> dict[str, int]:
     """Raw value by name of a signal with a value table, in the order of the values."""
-    choices = database.get_message_by_name(message).get_signal_by_name(signal).choices or {}
+    choices: Mapping[int, object] = database.get_message_by_name(message).get_signal_by_name(signal).choices or {}
     return {str(text): int(number) for number, text in sorted(choices.items())}
+
+
+def signal_range(signal: cantools.database.can.Signal) -> tuple[float, float]:
+    """Minimum and maximum in the signal's unit; ValueError when the DBC has none."""
+    if signal.minimum is None or signal.maximum is None:
+        raise ValueError(f"{signal.name}: no range in the DBC")
+    return signal.minimum, signal.maximum
 
 
 @dataclass(frozen=True)
@@ -73,9 +83,9 @@ class SignalTable(Mapping[str, Signal]):
     table["DRIVE_FAULT_SNAPSHOT.speed_rpm"] names its message. KeyError lists the signals.
     """
 
-    def __init__(self, database: cantools.database.Database, sender: str) -> None:
-        self._messages = {}
-        self._names: dict[str, tuple[int, cantools.database.can.Signal]] = {}
+    def __init__(self, database: Database, sender: str) -> None:
+        self._messages: dict[tuple[int, bool], Message] = {}
+        self._names: dict[str, tuple[tuple[int, bool], cantools.database.can.Signal]] = {}
         self._times: dict[tuple[int, bool], list[int]] = {}
         self._data: dict[tuple[int, bool], bytearray] = {}
         for message in sorted(database.messages, key=lambda m: m.frame_id):
@@ -126,7 +136,7 @@ def _physical(raw: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarr
     """Physical values of a little-endian signal from frames as 64-bit words."""
     if signal.byte_order != "little_endian":
         raise ValueError(f"{signal.name}: only little-endian signals are decoded")
-    field = raw >> np.uint64(signal.start)
+    field: np.ndarray = raw >> np.uint64(signal.start)
     if signal.length < 64:
         field = field & np.uint64((1 << signal.length) - 1)
     if signal.is_float:

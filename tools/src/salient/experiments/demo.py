@@ -228,6 +228,7 @@ def _by_experiment(runs: Iterable[_Run], attribute: str) -> dict[str, dict[str, 
 def _conditions(scenarios: Mapping[str, Sequence[Scenario]]) -> dict[str, Any]:
     """Conditions of the metrics; equal for all runs except the step of the recording, which is that of the ripple."""
     scenario = scenarios["load_step_150"][0]
+    assert scenario.record is not None  # as in its file
     return {
         "control_rate_hz": scenario.control_rate_hz,
         "adc": {"bits": scenario.adc_bits, "current_range_A": ADC_CURRENT_RANGE_A},
@@ -292,6 +293,7 @@ def _files(runs: Iterable[_Run], recordings: Iterable[list[tuple[str, Path]]],
 def _thin(result: _Run) -> list[tuple[str, Path]]:
     """Keeps one row per KEPT_STEP_US of a run's recording and, where the recording is finer, all rows of the ripple's
     window in a separate file. Returns (description, path) of the files."""
+    assert result.scenario.record is not None  # both scenario files have the table
     step_us = result.scenario.record.step_us
     every = max(1, round(KEPT_STEP_US / step_us))
     kept = [(f"true state every {every * step_us:g} µs (numpy.load)", result.recording_path)]

@@ -12,8 +12,8 @@ SCHEMA = 1
 # Significant digits of floats: more than the precision of any metric, few enough to be readable.
 SIGNIFICANT_DIGITS = 6
 
-# The published values, section 3 with tables 1 and 2; None where the paper gives none.
-PAPER: dict[str, dict[str, dict[str, float | None]]] = {
+# The published values, section 3 with tables 1 and 2.
+PAPER: dict[str, dict[str, dict[str, float]]] = {
     "start_600": {
         "traditional": {"settling_time_s": 0.18, "overshoot_percent": 3.3, "max_speed_rpm": 620.0},
         "paper": {"settling_time_s": 0.07, "overshoot_percent": 0.5, "max_speed_rpm": 603.0},

@@ -36,7 +36,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_type_hints
 
 import can
 import numpy as np
@@ -48,7 +48,7 @@ from salient.bench.drive import DriveError, write_request
 from salient.bench.emulator import executable, parameter_table
 from salient.bench.rig import bench_variables
 from salient.bus.log import write_logs
-from salient.bus.signals import SignalTable, drive_database
+from salient.bus.signals import SignalTable, drive_database, signal_range
 from salient.errors import UsageError
 from salient.experiments.metrics import losses
 from salient.machine.file import load_machine, machine_path
@@ -138,11 +138,11 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
                 bench.rig.set(name, value)
             for write in writes:  # before the first command; the answers are checked at the end
                 bench.send(write)
-            for step in scenario.load:
-                bench.at(step.at_s).load_torque_Nm = step.torque_Nm
-            for step in sorted(scenario.speed, key=lambda step: step.at_s):
-                bench.advance_to(round(step.at_s * 1e9))
-                bench.drive.speed_reference_rpm = step.value_rpm
+            for load in scenario.load:
+                bench.at(load.at_s).load_torque_Nm = load.torque_Nm
+            for speed in sorted(scenario.speed, key=lambda speed: speed.at_s):
+                bench.advance_to(round(speed.at_s * 1e9))
+                bench.drive.speed_reference_rpm = speed.value_rpm
             bench.advance_to(round(scenario.duration_s * 1e9))
             _check_parameters_taken(bench, len(writes))
             fault = bench.drive.fault
@@ -191,7 +191,7 @@ def _parameter_writes(scenario: Scenario, config: BenchConfig) -> list[can.Messa
 def _check_parameters_taken(bench: Bench, count: int) -> None:
     message = drive_database().get_message_by_name("PARAMETER_RESPONSE")
     answers = [m for _, m in bench.log if m.arbitration_id == message.frame_id and not m.is_extended_id]
-    refused = [a for a in answers if message.decode(bytes(a.data))["status"] != "done"]
+    refused = [a for a in answers if message.decode_simple(bytes(a.data))["status"] != "done"]
     if refused or len(answers) != count:
         raise DriveError(f"{count} parameters written, {len(answers)} answers, {len(refused)} of them refusals")
 
@@ -262,42 +262,45 @@ def write_summaries(scenarios: list[Scenario], results: dict[str, RunResult], ou
 
 # --- reading --------------------------------------------------------------------------------------------------------
 
-_TIME_S = number(0.0, 3600.0)
+_Time = Annotated[float, number(0.0, 3600.0)]
 
 
 class _SpeedTable(Table):
-    at_s: _TIME_S
-    value_rpm: number(-3000.0, 3000.0)
+    at_s: _Time
+    value_rpm: Annotated[float, number(-3000.0, 3000.0)]
 
 
 class _LoadTable(Table):
-    at_s: _TIME_S
-    torque_Nm: number(-200.0, 200.0)
+    at_s: _Time
+    torque_Nm: Annotated[float, number(-200.0, 200.0)]
 
 
 class _RecordTable(Table):
-    step_us: number(0.1, 1e6) = Record.step_us
-    from_s: _TIME_S = Record.from_s
+    step_us: Annotated[float, number(0.1, 1e6)] = Record.step_us
+    from_s: _Time = Record.from_s
 
 
 @lru_cache
 def _scenario_file() -> type[Table]:
     """The model of a file; the ranges of [bench] are those of rig.dbc."""
-    bench = create_model("bench", __base__=Table, **{name: (number(signal.minimum, signal.maximum), None)
-                                                     for name, signal in bench_variables().items()})
-    options = {name: (option(name), DEFAULTS[name]) for name in CONDITIONS if name not in ("machine", "controller")}
-    return create_model(
-        "scenario", __base__=Table,
-        machine=(option("machine"), ...),
-        controllers=(list[one_of(CONTROLLERS)], ...),
-        duration_s=(number(1e-3, 3600.0), ...),
+    variables: dict[str, Any] = {name: (Annotated[float, number(*signal_range(signal))], None)
+                                 for name, signal in bench_variables().items()}
+    bench = create_model("bench", __base__=Table, **variables)
+    kinds = get_type_hints(Conditions)
+    options: dict[str, Any] = {name: (Annotated[kinds[name], option(name)], DEFAULTS[name])
+                               for name in CONDITIONS if name not in ("machine", "controller")}
+    fields: dict[str, Any] = {
+        "machine": (Annotated[str, option("machine")], ...),
+        "controllers": (list[Annotated[str, one_of(CONTROLLERS)]], ...),
+        "duration_s": (Annotated[float, number(1e-3, 3600.0)], ...),
         **options,
-        parameters=(dict[str, any_number()], {}),
-        bench=(bench, bench()),
-        speed=(list[_SpeedTable], []),
-        load=(list[_LoadTable], []),
-        record=(_RecordTable, None),
-    )  # fmt: skip
+        "parameters": (dict[str, Annotated[float, any_number()]], {}),
+        "bench": (bench, bench()),
+        "speed": (list[_SpeedTable], []),
+        "load": (list[_LoadTable], []),
+        "record": (_RecordTable, None),
+    }
+    return create_model("scenario", __base__=Table, **fields)
 
 
 def load_scenarios(path: Path) -> list[Scenario]:
@@ -308,7 +311,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
     """
     try:
         data = read_toml(path)
-        file = validate(_scenario_file(), data)
+        file: Any = validate(_scenario_file(), data)  # its fields follow from rig.dbc and Conditions
         _check_controllers(file.controllers)
     except TextFileError as error:
         raise UsageError(f"{path}: {error}") from None

@@ -3,8 +3,8 @@
     build/venv/bin/python -m salient.finite_elements OUT.csv
 
 The field at every position and current by solver.py, on the cross section of mesh.py (its Geometry), with
-the steel of steel.py. machine_data is what else that machine's file says of the motor. Takes about four
-minutes of one core, and uses all there are.
+the steel of steel.py. machine_data gives the motor's other keys in that machine's file. Takes about four
+minutes of processor time, on all cores.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class Geometry:
     stator_radius: float = 85.0
     stator_pole_arc: float = 20.0
     rotor_pole_arc: float = 22.0
-    coil_arc: float = 10.0  # nominal, of a coil side beside its pole: 0.4 of the slot
+    coil_arc: float = 10.0  # nominal, of a coil side next to its pole: 0.4 of the slot
     stack_length: float = 170.0
     stacking_factor: float = 0.96
     turns: int = 26  # of each of the two coils of a phase, in series
@@ -68,9 +68,9 @@ class Mesh:
     triangles: np.ndarray
     """(triangles, 3) nodes."""
     gradients: np.ndarray
-    """(triangles, 3, 2): of the three shape functions, 1/m, in the frame of the part."""
+    """(triangles, 3, 2): gradients of the three shape functions, 1/m, in the frame of the part."""
     area_m2: np.ndarray
-    """What a triangle counts for."""
+    """Weight of a triangle in integrals over the area."""
     centre_m: np.ndarray
     """(triangles, 2)."""
     region: np.ndarray
@@ -117,7 +117,7 @@ def build_mesh(g: Geometry, refinement: int = 1) -> Mesh:
     triangles, weights, region, in_rotor = (np.concatenate(column) for column in zip(*parts, strict=True))
 
     corners = np.concatenate(nodes)[triangles] * 1e-3
-    # Of the shape function of corner k: the side opposite to it, turned by a quarter.
+    # The gradient of the shape function of corner k is the opposite side, turned by 90 degrees.
     sides = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
     double_area = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
     turned = np.stack([-sides[:, :, 1], sides[:, :, 0]], axis=2)
@@ -140,7 +140,7 @@ class _RotorPart:
         self.side = g.rotor_pole_arc / 2.0
 
     def side_angle(self, radius: float) -> float:
-        """Of the pole's side from its axis, deg."""
+        """Angle of the pole's side from its axis, deg."""
         within = min(max(radius, self.g.rotor_root_radius), self.g.rotor_radius)
         return math.degrees(math.asin(self.g.rotor_pole_width / (2.0 * within)))
 
@@ -168,8 +168,8 @@ class _StatorPart:
         from_axis = np.abs(nominal - self.pitch * np.rint(nominal / self.pitch))
         region = np.where((radius > g.stator_root_radius) | (from_axis < self.side), IRON, AIR)
         if g.coil_inner_radius < radius < g.coil_outer_radius:
-            beside = (np.abs(nominal) > self.side) & (np.abs(nominal) < self.side + g.coil_arc)
-            region[beside] = np.where(nominal[beside] > 0.0, COIL_PLUS, COIL_MINUS)
+            in_coil = (np.abs(nominal) > self.side) & (np.abs(nominal) < self.side + g.coil_arc)
+            region[in_coil] = np.where(nominal[in_coil] > 0.0, COIL_PLUS, COIL_MINUS)
         return region
 
 

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 from salient.finite_elements.mesh import COIL_MINUS, COIL_PLUS, FINE_DEG, IRON, Geometry, build_mesh
 from salient.finite_elements.steel import MU_0, Laminations
 
-# Of the Newton iteration, from its first residual; the flux linkage's error is of the order of its square.
+# Reduction of the Newton iteration's first residual; the flux linkage's error is of the order of its square.
 _RESIDUAL = 1e-7
 _ITERATIONS_MAX = 60
 
@@ -88,7 +88,8 @@ class Position:
             step = splu(jacobian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                         options={"SymmetricMode": True}).solve(-residual)  # fmt: skip
             if size < _RESIDUAL * first:
-                return potential + step
+                solution: np.ndarray = potential + step
+                return solution
             fraction = 1.0
             while True:
                 tried = potential + fraction * step
@@ -100,7 +101,7 @@ class Position:
         raise FieldError(f"no convergence at {current_A:g} A")
 
     def flux_linkage_Wb(self, potential: np.ndarray) -> float:
-        """Of the phase: both coils, by the same weights as the current's, so that its integral is the co-energy."""
+        """Flux linkage of the phase, both coils. Its weights are the current's: its integral is the co-energy."""
         return 2.0 * self._machine.length_m * float(self._source @ potential)
 
     def torque_Nm(self, potential: np.ndarray) -> float:
@@ -141,7 +142,8 @@ class Position:
 
     def _at_corners(self, potential: np.ndarray) -> np.ndarray:
         # The unknown -1 is the boundary's zero.
-        return np.append(potential, 0.0)[self._unknown] * self._sign
+        at_corners: np.ndarray = np.append(potential, 0.0)[self._unknown] * self._sign
+        return at_corners
 
     def _gather(self, at_corners: np.ndarray) -> np.ndarray:
         values = (at_corners * self._sign).ravel()

@@ -12,9 +12,12 @@ from pathlib import Path
 
 import cantools
 from cantools.database.can.c_source import camel_to_snake_case
+from cantools.database.can.database import Database
 from cantools.database.can.signal import Signal
+from cantools.database.errors import UnsupportedDatabaseFormatError
 
-from salient.generate.codec import CodecError, raw_range
+from salient.generate.codec import raw_range
+from salient.generate.error import CodecError
 
 _MESSAGE = "RIG_SET"
 _HEADER = """\
@@ -60,20 +63,28 @@ def _check(signals: list[Signal]) -> None:
             raise CodecError(f"signal {signal.name}: a bench variable must be 1 to 4 whole bytes")
         if (signal.start, signal.length, signal.is_signed) != (first.start, first.length, first.is_signed):
             raise CodecError(f"signal {signal.name}: must have the bits and the sign of {first.name}")
-        if len(signal.multiplexer_ids) != 1:
-            raise CodecError(f"signal {signal.name}: must have one multiplex number")
+        _number(signal)
+
+
+def _number(signal: Signal) -> int:
+    """Multiplex number; CodecError unless there is exactly one."""
+    numbers = signal.multiplexer_ids or []
+    if len(numbers) != 1:
+        raise CodecError(f"signal {signal.name}: must have one multiplex number")
+    return numbers[0]
 
 
 def generate_table(dbc: Path) -> str:
     """C text of the table; CodecError, in one line."""
     try:
         database = cantools.database.load_file(dbc, encoding="cp1252")
+        assert isinstance(database, Database)  # as every DBC gives
         signals = [s for s in database.get_message_by_name(_MESSAGE).signals if s.multiplexer_ids]
     except OSError as error:
         raise CodecError(f"{dbc}: {error.strerror}") from error
     except KeyError as error:
         raise CodecError(f"{dbc}: has no message {_MESSAGE}") from error
-    except (cantools.database.UnsupportedDatabaseFormatError, cantools.Error, UnicodeDecodeError) as error:
+    except (UnsupportedDatabaseFormatError, cantools.Error, UnicodeDecodeError) as error:
         raise CodecError(f"{dbc}: {' '.join(str(error).split())}") from error
     if not signals:
         raise CodecError(f"{dbc}: {_MESSAGE} has no multiplexed signal")
@@ -82,8 +93,8 @@ def generate_table(dbc: Path) -> str:
         ranges = [raw_range(signal) for signal in signals]
     except CodecError as error:
         raise CodecError(f"{dbc}: {error}") from error
-    signals, ranges = zip(*sorted(zip(signals, ranges, strict=True), key=lambda p: p[0].multiplexer_ids), strict=True)
-    names = [f"BENCH_VARIABLE_{camel_to_snake_case(signal.name).upper()}" for signal in signals]
+    variables = sorted(zip(signals, ranges, strict=True), key=lambda variable: _number(variable[0]))
+    names = [f"BENCH_VARIABLE_{camel_to_snake_case(signal.name).upper()}" for signal, _ in variables]
     first = signals[0]
     octets = range(first.length // 8)
     bits = " | ".join(f"(uint32_t)data[{first.start // 8 + i}]" + (f" << {8 * i}" if i else "") for i in octets)
@@ -91,11 +102,11 @@ def generate_table(dbc: Path) -> str:
     # Flipping the sign bit and subtracting its weight extends the sign without relying on shifts of negative numbers.
     value = f"(int32_t)((int64_t)(bits ^ {sign}u) - {sign})" if first.is_signed else "(int32_t)bits"
     enumerators = "\n".join(
-        f"    {name} = {signal.multiplexer_ids[0]}," for name, signal in zip(names, signals, strict=True)
+        f"    {name} = {_number(signal)}," for name, (signal, _) in zip(names, variables, strict=True)
     )
     rows = "\n".join(
         f'    [{name}] = {{"{signal.name}", {float(signal.scale)!r}, {low}, {high}}},'
-        for name, signal, (low, high) in zip(names, signals, ranges, strict=True)
+        for name, (signal, (low, high)) in zip(names, variables, strict=True)
     )
     return _HEADER.format(
         message=_MESSAGE, source=dbc.name, enumerators=enumerators, rows=rows, bits=bits, value=value

@@ -20,8 +20,9 @@ import cantools
 from cantools.database.can.c_source import camel_to_snake_case, generate
 from cantools.database.can.database import Database
 from cantools.database.can.signal import Signal
+from cantools.database.errors import UnsupportedDatabaseFormatError
 
-from salient.bus.database_hash import database_hash
+from salient.dbc import attributes, database_hash
 from salient.generate.enumerations import enumerations_header
 from salient.generate.error import CodecError
 from salient.generate.telemetry import message_c_name, telemetry
@@ -43,7 +44,7 @@ def raw_range(signal: Signal) -> tuple[int, int]:
 
 
 def integer_literal(value: int) -> str:
-    """C literal of a 64-bit integer; the most negative one has no literal of its own."""
+    """C literal of a 64-bit integer; the most negative one has no literal."""
     return f"(-{-value - 1}ll - 1)" if value < 0 else f"{value}ll"
 
 
@@ -111,8 +112,9 @@ def generate_codec(dbc: Path, integer: bool, node: str | None = None) -> dict[st
         database = cantools.database.load_string(text, database_format="dbc")
     except OSError as error:
         raise CodecError(f"{dbc}: {error.strerror}") from error
-    except (cantools.database.UnsupportedDatabaseFormatError, cantools.Error, UnicodeDecodeError) as error:
+    except (UnsupportedDatabaseFormatError, cantools.Error, UnicodeDecodeError) as error:
         raise CodecError(f"{dbc}: {' '.join(str(error).split())}") from error
+    assert isinstance(database, Database)  # as every DBC gives
     if not database.messages:
         raise CodecError(f"{dbc}: describes no CAN messages")
     prefix = camel_to_snake_case(dbc.stem)
@@ -162,11 +164,11 @@ def _constants(database: Database, prefix: str) -> str:
         f"#define {prefix.upper()}_DBC_HASH {database_hash(database):#010x}u",
     ]
     for message in database.messages:
-        if "E2EDataId" in message.dbc.attributes:
+        if "E2EDataId" in attributes(message):
             lines += [
                 f"/* Data ID of {message.name}: part of its checksum, not transmitted. */",
                 f"#define {message_c_name(message, prefix).upper()}_E2E_DATA_ID "
-                f"{int(message.dbc.attributes['E2EDataId'].value):#06x}u",
+                f"{int(attributes(message)['E2EDataId']):#06x}u",
             ]
     return "\n".join(lines) + "\n"
 

@@ -10,6 +10,7 @@ import re
 
 from cantools.database.can.database import Database
 
+from salient.dbc import attributes
 from salient.generate.error import CodecError
 
 
@@ -18,7 +19,7 @@ def enumerations_header(database: Database, prefix: str, dbc_name: str) -> str:
     types: dict[str, tuple[str, dict[int, str], str]] = {}
     for message in database.messages:
         for signal in message.signals:
-            name = str(signal.dbc.attributes["CEnumeration"].value) if "CEnumeration" in signal.dbc.attributes else ""
+            name = str(attributes(signal).get("CEnumeration", ""))
             if not name:
                 continue
             if not re.fullmatch(r"[a-z_]\w* [A-Z]\w*", name):

@@ -3,9 +3,9 @@
     python -m salient.generate.fmu describe FILE.toml OUTDIR SOURCE...      modelDescription.xml and fmu_variables.c
     python -m salient.generate.fmu pack OUT.fmu modelDescription.xml LIBRARY PLATFORM LICENSE
 
-Both files of `describe` come from `variables()`, the one list of what the unit takes and gives. The instantiation token
-that they share is a hash of them, the machine and the C sources, so that a library and a description that do not belong
-together are told apart. Equal inputs give an equal unit to the last byte.
+Both files of `describe` come from `variables()`, the list of inputs, outputs and parameters of the unit. The
+instantiation token that they share is a hash of them, the machine and the C sources, so that a library and a
+description that do not belong together are recognised. The unit is a function of the inputs, to the last byte.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ DESCRIPTION = (
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of the unit; its value reference is its place in the list."""
+    """A variable of the unit; its value reference is its index in the list."""
 
     name: str
     member: str
-    """Of fmu_values_t in emulator/fmi/fmu_model.h."""
+    """Member of fmu_values_t in emulator/fmi/fmu_model.h."""
     causality: str
     description: str
     unit: str | None = None
@@ -66,8 +66,8 @@ class Variable:
 
 
 def variables(machine: Machine) -> list[Variable]:
-    """What a unit of this machine takes and gives. Limits are those of the plant, wider than a machine file's: the
-    firmware's number formats do not matter here."""
+    """Inputs, outputs and parameters of a unit of this machine. Limits are those of the plant, wider than a machine
+    file's: the firmware's number formats do not matter here."""
     phases = [(phase, "abcd"[phase]) for phase in range(machine.phases)]
     return [
         Variable("time", "time_s", "independent", "time", "s"),
@@ -137,7 +137,8 @@ def description(machine: Machine, token: str) -> bytes:
     for reference in outputs:
         ElementTree.SubElement(structure, "InitialUnknown", valueReference=str(reference))
     ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
+    encoded: bytes = ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True)
+    return encoded + b"\n"
 
 
 def _describe(parent: ElementTree.Element, reference: int, variable: Variable) -> None:
@@ -202,7 +203,7 @@ def _number(value: float) -> str:
 
 
 def instantiation_token(machine: Machine, sources: list[Path]) -> str:
-    """Hash of what the unit is made of; `sources` in any order, their folders do not matter."""
+    """Hash of the contents of the unit; `sources` in any order, their folders do not matter."""
     digest = hashlib.sha256(description(machine, "") + plant_source(machine).encode())
     for source in sorted(sources, key=lambda path: path.name):
         digest.update(source.name.encode() + b"\0" + source.read_bytes())
@@ -212,7 +213,9 @@ def instantiation_token(machine: Machine, sources: list[Path]) -> str:
 def pack(unit: Path, description_file: Path, library: Path, platform: str, licence: Path) -> None:
     """Writes the unit: a ZIP archive without times or owners of the files. The library gets the name that the
     description gives it."""
-    identifier = ElementTree.parse(description_file).find("CoSimulation").get("modelIdentifier")
+    co_simulation = ElementTree.parse(description_file).find("CoSimulation")
+    assert co_simulation is not None  # as description() writes it
+    identifier = co_simulation.get("modelIdentifier")
     members = {
         "modelDescription.xml": description_file,
         f"binaries/{platform}/{identifier}{library.suffix}": library,

@@ -155,7 +155,7 @@ def main(arguments: list[str]) -> int:
     outputs = " ".join(_escaped(out / name) for name in ("machine_tables.c", "machine_plant.c"))
     # Never empty: CMake drops a dependency file without inputs, and Ninja would regenerate on every build.
     inputs = [Path(arguments[0]).resolve()]
-    if isinstance(machine.magnetics, FluxMap):
+    if isinstance(machine.magnetics, FluxMap) and machine.magnetics.file is not None:
         inputs.append(machine.magnetics.file)
     dependencies = f"{outputs}: {' '.join(map(_escaped, inputs))}\n"
     (out / "machine.d").write_text(dependencies, encoding="utf-8")

@@ -14,7 +14,7 @@ from salient.bench import config
 from salient.bench.config import DEFAULTS, OPTIONS, Option
 
 _HEAD = "/* Generated from tools/src/salient/bench/config.py. */"
-_INDENT = 26  # of the usage text's second column
+_INDENT = 26  # column of the usage text's second part
 
 
 def arguments() -> dict[str, Option]:
@@ -58,7 +58,7 @@ def _range(option: Option) -> tuple[Any, ...]:
 
 
 def _is_wide(option: Option) -> bool:
-    return max(_range(option)) >= 2**32
+    return bool(max(_range(option)) >= 2**32)
 
 
 def _members(name: str, option: Option) -> list[str]:

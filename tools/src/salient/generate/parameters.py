@@ -47,7 +47,7 @@ class ParameterDefinition:
     text: str
 
     def physical(self, raw: int) -> str:
-        """A raw value in the unit: the shortest decimal number that stands for it."""
+        """A raw value in the unit: the shortest decimal number that identifies it."""
         lsb = Fraction(1, 1 << self.fraction_bits)
         value = raw * lsb
         for digits in range(12):
@@ -63,9 +63,15 @@ def read_table() -> list[ParameterDefinition]:
     calls = ast.parse(re.sub(r"\)\s*PARAMETER\(", ")\nPARAMETER(", source.strip())).body
     rows = []
     for index, statement in enumerate(calls):
-        constant, name, unit, bits, *limits, text = statement.value.args
-        rows.append(ParameterDefinition(index, constant.id, name.value, unit.value, bits.value,
-                                        *(_value(limit) for limit in limits), text.value))
+        match statement:
+            case ast.Expr(value=ast.Call(args=[
+                ast.Name(id=constant), ast.Constant(value=str(name)), ast.Constant(value=str(unit)),
+                ast.Constant(value=int(bits)), minimum, maximum, default, ast.Constant(value=str(text)),
+            ])):
+                rows.append(ParameterDefinition(index, constant, name, unit, bits, _value(minimum), _value(maximum),
+                                                _value(default), text))
+            case _:
+                raise ValueError(f"{TABLE}: {ast.unparse(statement)} is not a row of the table")
     return rows
 
 

@@ -14,6 +14,7 @@ from cantools.database.can.database import Database
 from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
 
+from salient.dbc import attributes
 from salient.generate.error import CodecError
 
 
@@ -22,9 +23,10 @@ def telemetry(database: Database, prefix: str, dbc_name: str, node: str) -> tupl
     messages = [m for m in database.messages if node in m.senders and m.cycle_time]
     if not messages:
         raise CodecError(f"node {node} sends no cyclic message: GenMsgCycleTime is required")
+    assert database.dbc is not None  # as every DBC has
     groups = list(database.dbc.attribute_definitions["TelemetryGroup"].choices)
     messages.sort(key=lambda m: (groups.index(_group(m, groups)), m.frame_id))
-    cycle_ms = math.gcd(*(m.cycle_time for m in messages), *map(_delay_ms, messages))
+    cycle_ms = math.gcd(*map(_period_ms, messages), *map(_delay_ms, messages))
     return _header(messages, groups, prefix, dbc_name, cycle_ms), _source(messages, prefix, dbc_name, cycle_ms)
 
 
@@ -34,13 +36,20 @@ def short_name(message: Message, prefix: str) -> str:
 
 
 def _group(message: Message, groups: list[str]) -> str:
-    attribute = message.dbc.attributes.get("TelemetryGroup")
-    return groups[0] if attribute is None else groups[int(attribute.value)]
+    return groups[_group_number(message)]
+
+
+def _group_number(message: Message) -> int:
+    return int(attributes(message).get("TelemetryGroup", 0))
+
+
+def _period_ms(message: Message) -> int:
+    assert message.cycle_time is not None  # cyclic
+    return message.cycle_time
 
 
 def _delay_ms(message: Message) -> int:
-    attribute = message.dbc.attributes.get("GenMsgStartDelayTime")
-    return 0 if attribute is None else int(attribute.value)
+    return int(attributes(message).get("GenMsgStartDelayTime", 0))
 
 
 def is_bit_field(message: Message) -> bool:
@@ -150,8 +159,8 @@ def _source(messages: list[Message], prefix: str, dbc_name: str, cycle_ms: int) 
                 f"{head}    struct {codec_name}_t message;\n{''.join(setters)}"
                 f"    (void){codec_name}_pack(data, &message, 8u);\n}}\n"
             )
-        delay, period = _delay_ms(message) // cycle_ms, message.cycle_time // cycle_ms
-        group = int(message.dbc.attributes["TelemetryGroup"].value) if "TelemetryGroup" in message.dbc.attributes else 0
+        delay, period = _delay_ms(message) // cycle_ms, _period_ms(message) // cycle_ms
+        group = _group_number(message)
         active = str(message.send_type == "cyclicIfActive").lower()
         rows.append(
             f"    {{{prefix}_telemetry_pack_{name}, {message.frame_id:#x}u, {message.length}u, {group}u, {active}, "

@@ -7,9 +7,10 @@ The meaning of the keys: emulator/plant/machine.h.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import create_model
 
@@ -36,75 +37,80 @@ class Poles(Table):
 
 
 class Winding(Table):
-    resistance_ohm: number(1e-4, 100.0)
+    resistance_ohm: Annotated[float, number(1e-4, 100.0)]
 
 
 class Mechanics(Table):
-    inertia_kg_m2: number(1e-4, 1.9)
-    friction_Nm_s: number(0.0, 1.9)
+    inertia_kg_m2: Annotated[float, number(1e-4, 1.9)]
+    friction_Nm_s: Annotated[float, number(0.0, 1.9)]
 
 
 class Converter(Table):
-    supply_voltage_V: number(10.0, 500.0)
-    switch_drop_V: number(0.0, 5.0) = 0.0
-    switch_resistance_ohm: number(0.0, 1.0) = 0.0
-    diode_drop_V: number(0.0, 5.0) = 0.0
-    diode_resistance_ohm: number(0.0, 1.0) = 0.0
-    minimum_pulse_ns: number(0.0, 2000.0) = 0.0
+    supply_voltage_V: Annotated[float, number(10.0, 500.0)]
+    switch_drop_V: Annotated[float, number(0.0, 5.0)] = 0.0
+    switch_resistance_ohm: Annotated[float, number(0.0, 1.0)] = 0.0
+    diode_drop_V: Annotated[float, number(0.0, 5.0)] = 0.0
+    diode_resistance_ohm: Annotated[float, number(0.0, 1.0)] = 0.0
+    minimum_pulse_ns: Annotated[float, number(0.0, 2000.0)] = 0.0
 
 
 class DcLink(Table):
     """Without the table: an ideal supply that absorbs energy."""
 
-    capacitance_F: number(1e-5, 1.0)
-    source_resistance_ohm: number(0.001, 10.0)
-    chopper_resistance_ohm: number(0.1, 1000.0) = None
-    chopper_on_V: number(10.0, 510.0) = None
-    chopper_off_V: number(10.0, 510.0) = None
+    capacitance_F: Annotated[float, number(1e-5, 1.0)]
+    source_resistance_ohm: Annotated[float, number(0.001, 10.0)]
+    chopper_resistance_ohm: Annotated[float, number(0.1, 1000.0)] | None = None
+    chopper_on_V: Annotated[float, number(10.0, 510.0)] | None = None
+    chopper_off_V: Annotated[float, number(10.0, 510.0)] | None = None
 
 
 class Sensors(Table):
-    current_gain: number(0.0, 10.0) = 1.0
-    current_offset_A: number(-10.0, 10.0) = 0.0
-    current_noise_A: number(0.0, 10.0) = 0.0
-    current_limit_A: number(0.1, 1000.0) = 1000.0
-    current_delay_ns: number(0.0, 8000.0) = 0.0
-    encoder_eccentricity_deg: number(0.0, 5.0) = 0.0
+    current_gain: Annotated[float, number(0.0, 10.0)] = 1.0
+    current_offset_A: Annotated[float, number(-10.0, 10.0)] = 0.0
+    current_noise_A: Annotated[float, number(0.0, 10.0)] = 0.0
+    current_limit_A: Annotated[float, number(0.1, 1000.0)] = 1000.0
+    current_delay_ns: Annotated[float, number(0.0, 8000.0)] = 0.0
+    encoder_eccentricity_deg: Annotated[float, number(0.0, 5.0)] = 0.0
 
 
 class IronLoss(Table):
     """Without the table: no estimate."""
 
-    turns_area_m2: number(1e-6, 10.0)
-    mass_kg: number(1e-3, 1000.0)
-    steinmetz_k: number(1e-6, 10.0)
-    steinmetz_alpha: number(1.0, 2.0)
-    steinmetz_beta: number(1.5, 3.0)
+    turns_area_m2: Annotated[float, number(1e-6, 10.0)]
+    mass_kg: Annotated[float, number(1e-3, 1000.0)]
+    steinmetz_k: Annotated[float, number(1e-6, 10.0)]
+    steinmetz_alpha: Annotated[float, number(1.0, 2.0)]
+    steinmetz_beta: Annotated[float, number(1.5, 3.0)]
 
 
 class MapMagnetics(Table):
-    form: one_of(("map",))
-    file: checked(str, "the name of a .csv file", lambda name: name.isprintable() and name.endswith(".csv"))
+    form: Annotated[str, one_of(("map",))]
+    file: Annotated[str, checked("the name of a .csv file", lambda name: name.isprintable() and name.endswith(".csv"))]
+
+
+
+def _formula_model(form: str, limits: Mapping[str, tuple[float, float]]) -> type[Table]:
+    fields: dict[str, Any] = {key: (Annotated[float, number(low, high)], ...) for key, (low, high) in limits.items()}
+    return create_model(form, __base__=Table, form=(Annotated[str, one_of((form,))], ...), **fields)
 
 
 MAGNETICS: dict[str, type[Table]] = {"map": MapMagnetics} | {
-    form: create_model(form, __base__=Table, form=(one_of((form,)), ...),
-                       **{key: (number(*limits), ...) for key, limits in keys.items()})
-    for form, keys in FORMULA_KEYS.items()
+    form: _formula_model(form, limits) for form, limits in FORMULA_KEYS.items()
 }
 """The table [magnetics] by its form."""
 
 
 class MachineFile(Table):
-    name: checked(str, "a word of letters, digits and underscores", lambda name: name.isidentifier() and name.isascii())
+    name: Annotated[str, checked("a word of letters, digits and underscores",
+                                 lambda name: name.isidentifier() and name.isascii())]
     poles: Poles
     winding: Winding
     mechanics: Mechanics
-    magnetics: dict
+    magnetics: dict[str, Any]
     converter: Converter
-    dc_link: DcLink = None
+    dc_link: DcLink | None = None
     sensors: Sensors = Sensors()
-    iron_loss: IronLoss = None
+    iron_loss: IronLoss | None = None
 
 
 # --- machine --------------------------------------------------------------------------------------------------------
@@ -203,11 +209,12 @@ def _check_chopper(link: DcLink, supply_voltage_V: float) -> None:
     missing = [key for key, value in chopper.items() if value is None]
     if missing and len(missing) < len(chopper):
         raise TextFileError(f"dc_link.{missing[0]}: missing")
-    if not missing and not supply_voltage_V < link.chopper_off_V < link.chopper_on_V:
+    on_V, off_V = link.chopper_on_V, link.chopper_off_V
+    if on_V is not None and off_V is not None and not supply_voltage_V < off_V < on_V:
         raise TextFileError("dc_link.chopper_off_V: must be above converter.supply_voltage_V and below chopper_on_V")
 
 
-def _magnetics(path: Path, table: dict, rotor_poles: int) -> Formula | FluxMap:
+def _magnetics(path: Path, table: dict[str, Any], rotor_poles: int) -> Formula | FluxMap:
     form = table.get("form")
     if not isinstance(form, str) or form not in MAGNETICS:
         raise TextFileError(f"magnetics.form: {shown(form)}: must be one of {', '.join(FORMS)}")

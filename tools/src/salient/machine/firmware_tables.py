@@ -1,9 +1,9 @@
 """The firmware's magnetics of a phase, sampled from a machine's: rows, cells and both surfaces of
 firmware/control/machine_tables.h.
 
-Torque over the angle has corners where poles begin to overlap, at angles of their own in every machine. So the rows are
-put where they are needed: as far apart as a parabola through three points of the torque, at both rows and half way, is
-within a tolerance everywhere between, and the tolerance is the least with which the rows suffice.
+Torque over the angle has corners where poles begin to overlap, at angles that differ between machines. Hence rows are
+as far apart as a tolerance permits: between two rows, the parabola through the torque at both and half way must be
+within it. The tolerance is the smallest with which the rows suffice.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ ROWS = 33
 CELLS = 64
 NODE_OFFSET = 32768
 CURRENT_A = np.arange(0.0, 81.0, 2.0)
-"""Of the columns."""
-ROW_UNITS = 1 << 14  # of row_start, in half a pitch
+"""Currents of the columns."""
+ROW_UNITS = 1 << 14  # units of row_start in half a pitch
 _HALF_PITCH = 1 << 31
 BEND_SHIFT_MAX = 8
-# The finest are 4 uN m and 0.12 uWb an ampere, beyond which no product is finer than its result.
+# The finest are 4 uN m and 0.12 uWb per ampere, beyond which no product is finer than its result.
 TORQUE_FRACTION_BITS = (6, 18)
 FLUX_FRACTION_BITS = (11, 23)
 
-# Tolerances of the rows, as a fraction of the greatest torque at each of these currents.
+# Tolerances of the rows, as a fraction of the largest torque at each of these currents.
 _LEAST_TOLERANCE, _GREATEST_TOLERANCE = 1e-6, 1.0
-_ROW_CURRENTS = np.array([1.0, 0.75, 0.5, 0.25, 0.125, 0.0625])  # of the greatest
+_ROW_CURRENTS = np.array([1.0, 0.75, 0.5, 0.25, 0.125, 0.0625])  # fractions of the largest
 
 # Torque that falls with the current, or is negative from the unaligned to the aligned position, has no inverse and is
-# levelled: as noise of a map up to this fraction of the greatest torque at the same current, and whatever it is beyond
-# the map's own greatest current, where its flux linkage only goes on straight.
+# levelled: as noise of a map, up to this fraction of the largest torque at the same current; beyond the map's largest
+# current, where its flux linkage is extrapolated linearly, by any amount.
 FALL_TOLERANCE = 0.01
 
-# Stands for no current where psi / i is asked there.
+# Current at which psi / i of zero current is evaluated.
 _SMALL_A = 1e-6
 
 
@@ -50,13 +50,13 @@ class PhaseMapError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What an ampere gives: integers with `fraction_bits` fraction bits."""
+    """Torque or flux linkage per ampere: integers with `fraction_bits` fraction bits."""
 
     fraction_bits: int
     result_bits: int
     """Fraction bits of the result in the firmware."""
     bend_shift: int
-    """0..BEND_SHIFT_MAX: the least with which the bends fit."""
+    """0..BEND_SHIFT_MAX: the smallest with which the bends fit."""
     node: np.ndarray
     """(ROWS, columns), 0..65535."""
     bend: np.ndarray
@@ -64,7 +64,7 @@ class Surface:
 
     @property
     def result_shift(self) -> int:
-        """Of the product of a value in Q14 and a current in Q9 times 2^15, less its low 32 bits."""
+        """Right shift of the product of a value in Q14 and a current in Q9 times 2^15, less its low 32 bits."""
         return self.result_bits + 32 - 15 - (self.fraction_bits + 14 + 9)
 
 
@@ -101,7 +101,7 @@ def phase_map(magnetics: Any) -> PhaseMap:
     """The tables of `magnetics`: a `Formula`, a `FluxMap` or another object with their methods. PhaseMapError."""
     half_rad = magnetics.pitch_rad / 2.0
     row_start = _row_starts(magnetics)
-    # The rows and, between them, the places half way.
+    # The rows and, between them, the positions half way.
     places = np.interp(np.arange(2 * ROWS - 1), np.arange(0, 2 * ROWS - 1, 2), row_start)
     angle_rad = half_rad + half_rad * places[:, None] / ROW_UNITS
 
@@ -129,8 +129,8 @@ def _rising_torque(magnetics: Any, angle_rad: np.ndarray) -> np.ndarray:
     if excess_Nm[row, column] > 0.0:
         raise PhaseMapError(
             f"at {math.degrees(angle_rad[row, 0]):.4g} deg, towards aligned, the torque falls to"
-            f" {torque_Nm[row, column]:.4g} N m at {CURRENT_A[column]:g} A; it must rise with the current, but for"
-            f" {FALL_TOLERANCE:.0%} of the greatest torque at that current"
+            f" {torque_Nm[row, column]:.4g} N m at {CURRENT_A[column]:g} A; it must rise with the current, except for"
+            f" {FALL_TOLERANCE:.0%} of the largest torque at that current"
         )
     return rising_Nm
 
@@ -194,7 +194,7 @@ def _rows_within(shape: np.ndarray, tolerance: float) -> list[int] | None:
 
 
 def _is_parabola(shape: np.ndarray, tolerance: float) -> bool:
-    """Whether the parabola through both ends and the middle is within the tolerance of all points."""
+    """True if the parabola through both ends and the middle is within the tolerance of all points."""
     last = len(shape) - 1
     u = (np.arange(last + 1) / last)[:, None]
     middle = 0.5 * (shape[last // 2] + shape[(last + 1) // 2])

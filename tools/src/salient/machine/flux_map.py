@@ -3,7 +3,7 @@
 The model is the co-energy W(theta, i), a tensor product of uniform B-splines, cubic in the angle and quartic in the
 current, on half a rotor pitch (mirrored at the aligned and at the unaligned position) times 0 .. the map's greatest
 current. Flux linkage dW/di, torque dW/dtheta, incremental inductance and every further derivative are those of this one
-function, so that an integration loses no energy in it. Beyond the greatest current the flux linkage goes on straight,
+function, so that an integration loses no energy in it. Beyond the greatest current the flux linkage continues linearly
 with its last slope. emulator/plant/flux_map.h evaluates the same coefficients.
 
 From the points to the potential, all in plain NumPy element by element (no BLAS, whose bits differ between processors):
@@ -33,12 +33,12 @@ from numpy.typing import ArrayLike
 ANGLE_INTERVALS = 96
 CURRENT_INTERVALS = 64
 
-# Of the slope at a knot, times the flatter chord beside it. Up to 3 the cubic between two knots has no turning point;
-# from a quarter to 2 its slope stays above a quarter of the flattest chord: the inductance is to be > 0.
+# Range of the slope at a knot, as a multiple of the flatter adjacent chord. Up to 3 the cubic between two knots has no
+# turning point; from a quarter to 2 its slope stays above a quarter of the flattest chord: the inductance must be > 0.
 ANGLE_LIMITS = (0.0, 3.0)
 CURRENT_LIMITS = (0.25, 2.0)
 
-# Allowed, as fractions. Measured maps repeat themselves within a percent or so; a mistake in the file is larger.
+# Tolerances, as fractions. Measured maps repeat within a percent or so; a mistake in the file is larger.
 MIRROR_TOLERANCE = 0.02  # between the halves of a whole pitch, of the map's greatest flux linkage
 FALL_TOLERANCE = 0.01  # rise away from the aligned position, of the aligned flux linkage at the same current
 MISS_TOLERANCE = 0.02  # between a point and the model, of the map's greatest flux linkage
@@ -54,7 +54,7 @@ class FluxMapError(ValueError):
 
 @dataclass(frozen=True)
 class Curve:
-    """Magnetisation at one angle: rising currents > 0 and flux linkages, with the lines of the file they stand in."""
+    """Magnetisation at one angle: rising currents > 0 and flux linkages, with their lines in the file."""
 
     angle_rad: float
     current_A: np.ndarray
@@ -68,11 +68,11 @@ class FluxMap:
 
     rotor_poles: int
     current_max_A: float
-    """Beyond it the flux linkage goes on straight."""
+    """Beyond it the flux linkage continues linearly."""
     coefficients_J: np.ndarray
-    """Of the co-energy's B-splines: (CURRENT_INTERVALS + 4, ANGLE_INTERVALS + 3)."""
+    """Coefficients of the co-energy's B-splines: (CURRENT_INTERVALS + 4, ANGLE_INTERVALS + 3)."""
     file: Path | None = None
-    """Where the points came from."""
+    """Source of the points."""
 
     form = "map"
 
@@ -82,7 +82,7 @@ class FluxMap:
 
     @property
     def unaligned_inductance_H(self) -> float:
-        """Of the unsaturated phase, d psi / d i at 0 A."""
+        """Incremental inductance of the unsaturated phase, d psi / d i at 0 A."""
         return float(self.derivative(self.pitch_rad / 2.0, 0.0, 0, 2))
 
     def flux_linkage_Wb(self, angle_rad: ArrayLike, current_A: ArrayLike) -> np.ndarray:
@@ -115,15 +115,15 @@ class FluxMap:
 
     def inductance_extremes(self) -> tuple[float, float, float, float]:
         """(least incremental inductance in H, its angle in rad, its current in A, the current in A over which
-        it changes: greatest inductance by greatest slope), looked for at four points an interval."""
+        it changes: largest inductance by largest slope), searched at four points per interval."""
         angle_rad = np.linspace(0.0, self.pitch_rad / 2.0, 4 * ANGLE_INTERVALS + 1)[:, None]
         current_A = np.linspace(0.0, self.current_max_A, 4 * CURRENT_INTERVALS + 1)
         inductance_H = self.derivative(angle_rad, current_A, 0, 2)
         slope_H_A = np.max(np.abs(self.derivative(angle_rad, current_A, 0, 3)))
         row, column = np.unravel_index(np.argmin(inductance_H), inductance_H.shape)
         scale_A = float(np.max(inductance_H) / max(slope_H_A, 1e-300))
-        # Not below a step of the grid, which says no more; not above four, for the slope bends at every step and an
-        # integrator that takes many of them at once loses its order.
+        # Not below a step of the grid, its resolution; not above four, because the third derivative of the co-energy
+        # jumps at every step and an integrator that crosses many of them in one step loses its order.
         step_A = self.current_max_A / CURRENT_INTERVALS
         scale_A = min(max(scale_A, step_A), 4.0 * step_A)
         return float(inductance_H[row, column]), float(angle_rad[row, 0]), float(current_A[column]), scale_A
@@ -144,7 +144,8 @@ class FluxMap:
             for along_weight, parts in zip(_weights(along, 4 - by_current), cell, strict=True)
         )
         scale = math.prod([steps_1_rad] * by_angle + [steps_1_A] * by_current)  # libm's powers differ in the last bit
-        return value * scale * np.where(wrapped_rad < 0.0, (-1.0) ** by_angle, 1.0)
+        result: np.ndarray = value * scale * np.where(wrapped_rad < 0.0, (-1.0) ** by_angle, 1.0)
+        return result
 
 
 def fit(curves: Sequence[Curve], rotor_poles: int) -> FluxMap:
@@ -232,8 +233,8 @@ def _check_mirror(grid_Wb: np.ndarray, angle_rad: np.ndarray, current_A: np.ndar
         raise FluxMapError(
             f"the halves of the pitch do not mirror each other: at {current_A[column]:.3g} A the flux linkage is"
             f" {grid_Wb[row, column]:.4g} Wb at {_degrees(angle_rad[row])} deg and"
-            f" {grid_Wb[-1 - row, column]:.4g} Wb at {_degrees(angle_rad[-1 - row])} deg; allowed is"
-            f" {MIRROR_TOLERANCE:.0%} of the greatest"
+            f" {grid_Wb[-1 - row, column]:.4g} Wb at {_degrees(angle_rad[-1 - row])} deg; they must"
+            f" agree within {MIRROR_TOLERANCE:.0%} of the largest"
         )
 
 
@@ -243,8 +244,8 @@ def _check_model(model: FluxMap, curves: Sequence[Curve]) -> None:
         nearest = min(curves, key=lambda curve: abs(curve.angle_rad - angle_rad))
         raise FluxMapError(
             f"line {_nearest_line(nearest, current_A)}: the curve through the points has an incremental inductance of"
-            f" {least_H:.3g} H near {_degrees(angle_rad)} deg and {current_A:.3g} A; {INDUCTANCE_MIN_H:g} H is the"
-            " least allowed: the points there are too uneven, or of another unit"
+            f" {least_H:.3g} H near {_degrees(angle_rad)} deg and {current_A:.3g} A; it must be at least"
+            f" {INDUCTANCE_MIN_H:g} H: the points there are too uneven, or in another unit"
         )
     allowed_Wb = MISS_TOLERANCE * max(curve.flux_linkage_Wb[-1] for curve in curves)
     for curve in curves:
@@ -254,8 +255,8 @@ def _check_model(model: FluxMap, curves: Sequence[Curve]) -> None:
         at = int(np.argmax(miss_Wb))
         if miss_Wb[at] > allowed_Wb:
             raise FluxMapError(
-                f"line {curve.lines[at]}: the smooth model misses this point by {miss_Wb[at]:.3g} Wb, allowed is"
-                f" {MISS_TOLERANCE:.0%} of the map's greatest flux linkage: the points there are too uneven"
+                f"line {curve.lines[at]}: the smooth model misses this point by {miss_Wb[at]:.3g} Wb; it must be"
+                f" within {MISS_TOLERANCE:.0%} of the map's largest flux linkage: the points there are too uneven"
             )
 
 
@@ -298,13 +299,14 @@ def _spline_slopes(x: np.ndarray, y: np.ndarray, *, flat_ends: bool) -> np.ndarr
 
 
 def _limited(x: np.ndarray, y: np.ndarray, slopes: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
-    """Slopes of the chords' sign and within `limits` times the flatter chord beside; none where the chords disagree."""
+    """Slopes of the chords' sign and within `limits` times the flatter adjacent chord; 0 where their signs differ."""
     chord = (y[1:] - y[:-1]) / _column(np.diff(x), y)
     left = np.concatenate([chord[:1], chord])
     right = np.concatenate([chord, chord[-1:]])
     sign = np.where(left * right > 0.0, np.sign(left), 0.0)
     flatter = np.minimum(np.abs(left), np.abs(right))
-    return sign * np.clip(sign * slopes, limits[0] * flatter, limits[1] * flatter)
+    limited: np.ndarray = sign * np.clip(sign * slopes, limits[0] * flatter, limits[1] * flatter)
+    return limited
 
 
 def _hermite(x: np.ndarray, y: np.ndarray, slopes: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -313,9 +315,10 @@ def _hermite(x: np.ndarray, y: np.ndarray, slopes: np.ndarray, at: np.ndarray) -
     step = _column(x[k + 1] - x[k], y)
     t = _column((at - x[k]) / (x[k + 1] - x[k]), y)
     u = 1.0 - t
-    return u * u * (y[k] * (1.0 + 2.0 * t) + step * t * slopes[k]) + t * t * (
+    value: np.ndarray = u * u * (y[k] * (1.0 + 2.0 * t) + step * t * slopes[k]) + t * t * (
         y[k + 1] * (1.0 + 2.0 * u) - step * u * slopes[k + 1]
     )
+    return value
 
 
 def _coefficients(y: np.ndarray, step: float, *, flat_ends: bool) -> np.ndarray:
@@ -330,20 +333,21 @@ def _coefficients(y: np.ndarray, step: float, *, flat_ends: bool) -> np.ndarray:
 def _integral(coefficients: np.ndarray, step: float) -> np.ndarray:
     """Coefficients of degree four, one more, of the integral from the first knot of a cubic spline."""
     summed = np.concatenate([np.zeros_like(coefficients[:1]), np.cumsum(step * coefficients, axis=0)])
-    return summed - (summed[0] + 11.0 * summed[1] + 11.0 * summed[2] + summed[3]) / 24.0
+    integral: np.ndarray = summed - (summed[0] + 11.0 * summed[1] + 11.0 * summed[2] + summed[3]) / 24.0
+    return integral
 
 
 def _interval(position: np.ndarray, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """Number of the interval and the place in it, 0 to 1; outside, the first and last intervals go on."""
+    """Number of the interval and the position in it, 0 to 1; outside, the first and last intervals continue."""
     number = np.clip(np.floor(position).astype(int), 0, intervals - 1)
     return number, position - number
 
 
 def _weights(t: np.ndarray, degree: int) -> list[Any]:
-    """The degree + 1 uniform B-splines that are not zero at place t of an interval (de Boor's recursion)."""
+    """The degree + 1 uniform B-splines that are not zero at position t of an interval (de Boor's recursion)."""
     weights = [np.ones_like(t)]
     for d in range(1, degree + 1):
-        last = [0.0, *weights, 0.0]
+        last: list[Any] = [0.0, *weights, 0.0]
         weights = [((t + (d - j)) * last[j] + ((1.0 - t) + j) * last[j + 1]) / d for j in range(d + 1)]
     return weights
 

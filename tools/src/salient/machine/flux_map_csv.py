@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +73,8 @@ def _header_names() -> str:
     return ",".join("|".join(allowed) for allowed in _COLUMNS)
 
 
-def _numbers(line: int, cells: list[str], header: list[str], factors: list[float]) -> list[float]:
+def _numbers(line: int, cells: list[str], header: list[str], factors: list[float]
+             ) -> tuple[float, float, float]:
     if len(cells) != len(header):
         raise FluxMapError(f"line {line}: {len(cells)} columns; must be {len(header)}: {','.join(header)}")
     values = []
@@ -87,12 +88,13 @@ def _numbers(line: int, cells: list[str], header: list[str], factors: list[float
         if value < 0.0:
             raise FluxMapError(f"line {line}: {name}: {cell:.40}: must not be negative")
         values.append(value * factor)
-    return values
+    angle_rad, current_A, flux_Wb = values
+    return angle_rad, current_A, flux_Wb
 
 
 def _curves(points: list[Point], half_rad: float) -> list[Curve]:
     """One curve per angle, after all checks of the file that require no model."""
-    for (_, before_rad, *_), (line, angle_rad, *_) in zip(points, points[1:], strict=False):
+    for (_, before_rad, *_), (line, angle_rad, *_) in pairwise(points):
         if angle_rad != before_rad and math.degrees(angle_rad - before_rad) < ANGLE_STEP_MIN_DEG:
             raise FluxMapError(
                 f"line {line}: the angle goes from {math.degrees(before_rad):.5g} to {math.degrees(angle_rad):.5g} deg;"
@@ -149,5 +151,5 @@ def _curve(points: list[Point], angle_rad: float) -> Curve:
         if flux_Wb > FLUX_LINKAGE_MAX_Wb:
             raise FluxMapError(f"line {line}: {flux_Wb:g} Wb: must be at most {FLUX_LINKAGE_MAX_Wb:g} Wb")
         last_A, last_Wb = current_A, flux_Wb
-    lines, _, current_A, flux_Wb = zip(*points, strict=True)
-    return Curve(angle_rad, np.array(current_A), np.array(flux_Wb), lines)
+    lines, _, currents_A, fluxes_Wb = zip(*points, strict=True)
+    return Curve(angle_rad, np.array(currents_A), np.array(fluxes_Wb), lines)

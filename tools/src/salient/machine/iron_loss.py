@@ -10,17 +10,18 @@ Steinmetz parameters", IEEE Workshop on Computers in Power Electronics, 2002):
 
 where swing is the peak-to-peak flux density of the loop that the waveform is in. As that paper does, the waveform is
 split into a major loop and minor loops, here those that chopping makes: a minor loop begins where the flux turns back
-and ends where it is at that level again; loops may hold loops.
+and ends where it is at that level again; loops may contain loops.
 
-What the estimate leaves out: the flux density is that of a stator pole, psi / turns_area_m2, and stands for all of the
-iron, though yoke and rotor see other waveforms; the bias of the loops (a pole's flux does not change its sign), which
-Steinmetz's numbers do not know; relaxation while the flux is constant; leakage. The iron does not act back on the
-electrical side: it is not part of the emulator's energy balance.
+Simplifications: the flux density of a stator pole, psi / turns_area_m2, is taken for all of the iron, though the
+waveforms in yoke and rotor differ. Neglected: the bias of the loops (a pole's flux does not change its sign), which
+Steinmetz's parameters do not describe; relaxation while the flux is constant; leakage. The iron does not act back on
+the electrical side: it is not part of the emulator's energy balance.
 """
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
@@ -76,14 +77,15 @@ def specific_loss_W_kg(time_s: np.ndarray, flux_density_T: np.ndarray, k: float,
     cosine = 2.0 * math.sqrt(math.pi) * math.gamma((alpha + 1.0) / 2.0) / math.gamma(alpha / 2.0 + 1.0)
     k_i = k / ((2.0 * math.pi) ** (alpha - 1.0) * cosine * 2.0 ** (beta - alpha))
     energy = sum(swing_T ** (beta - alpha) * integral for swing_T, integral in split_loops(flux_density_T, steps))
-    return k_i * energy / (time_s[-1] - time_s[0])
+    loss_W_kg: float = k_i * energy / (time_s[-1] - time_s[0])
+    return loss_W_kg
 
 
 def split_loops(values: np.ndarray, step_integrals: np.ndarray) -> list[tuple[float, float]]:
     """The loops of a periodic waveform through `values`, straight in between: (peak to peak, integral over the loop).
 
-    step_integrals[k] belongs to the step from value k to k + 1, in proportion to the way; the step from the last value
-    back to the first has none. Minor loops come before the loops that hold them. A constant has no loop.
+    step_integrals[k] belongs to the step from value k to k + 1, in proportion to the distance; the step from the last
+    value back to the first has none. Minor loops come before the loops that contain them. A constant has no loop.
     """
     # One turn from the lowest value to itself, without the steps that do not move.
     lowest = int(np.argmin(values))
@@ -100,11 +102,11 @@ def split_loops(values: np.ndarray, step_integrals: np.ndarray) -> list[tuple[fl
     # The turning points of the loops that are still open, each swing smaller than the one before, and the integral on
     # the way to each from the point before it.
     open_points: list[tuple[float, float]] = [(values[0], 0.0)]
-    for first, last in zip(ends[:-1], ends[1:], strict=True):
+    for first, last in pairwise(ends):
         sign = 1.0 if values[last] > values[first] else -1.0
         run, run_so_far = sign * values[first:last + 1], so_far[first:last + 1]
         position, carried = run_so_far[0], 0.0
-        # Each level that the run comes back to ends the loop which began there.
+        # Each level to which the run returns ends the loop that began there.
         while len(open_points) > 1 and sign * values[last] >= sign * open_points[-2][0]:
             (turn, way_to_turn), (back, way_back) = open_points[-2:]
             closed = float(np.interp(sign * turn, run, run_so_far))

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 INDUCTANCES = {"unaligned_inductance_H": (1e-5, 10.0), "aligned_inductance_H": (1e-5, 10.0)}
-"""(minimum, maximum) of every machine's, both allowed; of the unsaturated phase."""
+"""(minimum, maximum) for every machine, both included; of the unsaturated phase."""
 
-# Keys of each form in a machine file with (minimum, maximum), both allowed.
+# Keys of each form in a machine file with (minimum, maximum), both included.
 FORMULA_KEYS: dict[str, dict[str, tuple[float, float]]] = {
     "linear_cosine": INDUCTANCES,
     "linear_trapezoid": INDUCTANCES | {"flat_deg": (0.0, 20.0), "blend_deg": (0.01, 20.0)},
@@ -46,7 +46,7 @@ class Formula:
 
     @property
     def unaligned_inductance_H(self) -> float:
-        """Of the unsaturated phase, d psi / d i at 0 A."""
+        """Incremental inductance of the unsaturated phase, d psi / d i at 0 A."""
         return self.parameters["unaligned_inductance_H"]
 
     def mistake(self) -> tuple[str, str] | None:
@@ -67,16 +67,22 @@ class Formula:
         """psi."""
         i = np.asarray(current_A, dtype=float)
         unaligned_Wb = self.unaligned_inductance_H * i
-        return unaligned_Wb + self._position_factor(angle_rad)[0] * (self._aligned_Wb(i) - unaligned_Wb)
+        factor = self._position_factor(angle_rad)[0]
+        flux_Wb: np.ndarray = unaligned_Wb + factor * (self._aligned_Wb(i) - unaligned_Wb)
+        return flux_Wb
 
     def coenergy_J(self, angle_rad: ArrayLike, current_A: ArrayLike) -> np.ndarray:
         """Integral of psi over the current at a constant angle."""
         i = np.asarray(current_A, dtype=float)
-        return 0.5 * self.unaligned_inductance_H * i * i + self._position_factor(angle_rad)[0] * self._excess_J(i)
+        factor = self._position_factor(angle_rad)[0]
+        energy_J: np.ndarray = 0.5 * self.unaligned_inductance_H * i * i + factor * self._excess_J(i)
+        return energy_J
 
     def torque_Nm(self, angle_rad: ArrayLike, current_A: ArrayLike) -> np.ndarray:
         """Derivative of the co-energy by the angle."""
-        return self._position_factor(angle_rad)[1] * self._excess_J(np.asarray(current_A, dtype=float))
+        slope = self._position_factor(angle_rad)[1]
+        torque_Nm: np.ndarray = slope * self._excess_J(np.asarray(current_A, dtype=float))
+        return torque_Nm
 
     def _position_factor(self, angle_rad: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """f and df/dtheta (1/rad): f is 1 aligned, 0 unaligned."""
@@ -114,13 +120,16 @@ class Formula:
         if self.form != "saturating":
             return m["aligned_inductance_H"] * i
         amplitude, rate = self._saturation()
-        return m["saturated_inductance_H"] * i - amplitude * np.expm1(-rate * i)
+        flux_Wb: np.ndarray = m["saturated_inductance_H"] * i - amplitude * np.expm1(-rate * i)
+        return flux_Wb
 
     def _excess_J(self, i: np.ndarray) -> np.ndarray:
         """W(i)."""
         m = self.parameters
         if self.form != "saturating":
-            return 0.5 * (m["aligned_inductance_H"] - m["unaligned_inductance_H"]) * i * i
+            unsaturated_J: np.ndarray = 0.5 * (m["aligned_inductance_H"] - m["unaligned_inductance_H"]) * i * i
+            return unsaturated_J
         amplitude, rate = self._saturation()
         linear = 0.5 * (m["saturated_inductance_H"] - m["unaligned_inductance_H"]) * i * i
-        return linear + amplitude * (i + np.expm1(-rate * i) / rate)
+        energy_J: np.ndarray = linear + amplitude * (i + np.expm1(-rate * i) / rate)
+        return energy_J

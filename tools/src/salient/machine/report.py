@@ -84,8 +84,8 @@ def _plot_flux(axes: Axes, machine: Machine) -> None:
         angle_rad = pitches * machine.pitch_rad
         flux_Wb = machine.magnetics.flux_linkage_Wb(angle_rad, current_A)
         axes.plot(current_A, flux_Wb, color=colour)
-        place = {0.0: " aligned", 0.5: " unaligned"}.get(pitches, "")
-        axes.annotate(f"{math.degrees(angle_rad):.0f} deg{place}", (current_A[-1], flux_Wb[-1]), color=colour,
+        position = {0.0: " aligned", 0.5: " unaligned"}.get(pitches, "")
+        axes.annotate(f"{math.degrees(angle_rad):.0f} deg{position}", (current_A[-1], flux_Wb[-1]), color=colour,
                       xytext=(3, 0), textcoords="offset points", va="center", fontsize=8)
     axes.set(xlabel="current / A", ylabel="flux linkage / Wb", xlim=(0.0, 1.3 * CURRENT_MAX_A), ylim=(0.0, None))
     axes.set_title("flux linkage by angle", loc="left", fontsize=10)

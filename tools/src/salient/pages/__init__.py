@@ -48,12 +48,16 @@ def _symbols(text: str) -> Markup:
     return Markup(str(escape(text)).replace("K_t", "<i>K</i><sub>t</sub>"))
 
 
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
+
+
 @lru_cache
 def _environment() -> Environment:
     environment = Environment(loader=PackageLoader("salient", "pages"), autoescape=True, undefined=StrictUndefined,
                               trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     environment.filters |= {
-        "base64": lambda data: base64.b64encode(data).decode("ascii"),
+        "base64": _base64,
         "colour": controller_colour,
         "controller_name": controller_name,
         "symbols": _symbols,

@@ -1,4 +1,4 @@
-"""Machine and half bridges as circuits for ngspice, a solver that is not ours: spice/*.cir, and how to run a deck."""
+"""Machine and half bridges as circuits for ngspice, an independent solver: spice/*.cir, and how to run a deck."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from pathlib import Path
 import numpy as np
 
 from salient.machine.file import Machine
+from salient.machine.magnetics import Formula
 
 _NETLISTS = Path(__file__).resolve().parent / "spice"
 
 OPTIONS = ".options method=gear reltol=1e-3 abstol=1e-6 chgtol=1 itl4=100"
-"""Gear's method because the trapezoidal rule would let the phase voltage ring for ever after the current has ended.
+"""Gear's method because with the trapezoidal rule the phase voltage rings without end after the current has ended.
 chgtol is the smallest charge, here the smallest flux linkage, that relative errors are taken of: at its default of
 1e-14 the step would shrink to nothing in a phase without current. The length of the step is .tran's."""
 
 
 class NgspiceError(Exception):
-    """ngspice is missing or failed; the text has what it said."""
+    """ngspice is missing or failed; the text includes its output."""
 
 
 @dataclass(frozen=True)
 class Waveforms:
-    """What the deck saves, by name, at the time points that ngspice chose; and what it took."""
+    """The waveforms that the deck saves, by name, at ngspice's time points; and the processor time of the run."""
 
     time_s: np.ndarray
     values: dict[str, np.ndarray]
@@ -35,6 +36,7 @@ class Waveforms:
 def machine_lines(machine: Machine, bridge: str) -> list[str]:
     """The machine's numbers, its link `dc`, and its phase: the subcircuit that spice/winding.cir describes. bridge:
     half_bridge or series_diode. Machines by formula only."""
+    assert isinstance(machine.magnetics, Formula)
     numbers = {
         "resistance_ohm": machine.resistance_ohm,
         "rotor_poles": machine.rotor_poles,
@@ -50,7 +52,7 @@ def machine_lines(machine: Machine, bridge: str) -> list[str]:
 
 
 def run(folder: Path, lines: list[str], timeout_s: float) -> Waveforms:
-    """Runs a deck (its first line is a title) in a folder; NgspiceError with what ngspice said."""
+    """Runs a deck (its first line is a title) in a folder; NgspiceError with the output of ngspice."""
     (folder / "deck.cir").write_text("\n".join(lines) + "\n")
     raw = folder / "deck.raw"
     raw.unlink(missing_ok=True)
@@ -63,9 +65,9 @@ def run(folder: Path, lines: list[str], timeout_s: float) -> Waveforms:
     except subprocess.TimeoutExpired:
         raise NgspiceError(f"ngspice took longer than {timeout_s:g} s on {folder / 'deck.cir'}") from None
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    said = done.stdout + done.stderr
-    if done.returncode != 0 or not raw.exists() or "aborted" in said:
-        raise NgspiceError(f"ngspice failed on {folder / 'deck.cir'}:\n{said[-2000:]}")
+    output = done.stdout + done.stderr
+    if done.returncode != 0 or not raw.exists() or "aborted" in output:
+        raise NgspiceError(f"ngspice failed on {folder / 'deck.cir'}:\n{output[-2000:]}")
     header, _, values = raw.read_bytes().partition(b"Binary:\n")
     variables = header.decode().partition("Variables:\n")[2].split()[1::3]
     columns = dict(zip(variables, np.frombuffer(values).reshape(-1, len(variables)).T, strict=True))

@@ -3,7 +3,7 @@ with.
 
 A source and a diode are the half bridge of a phase (spice/series_diode.cir). Speed is the voltage of a capacitor of J
 farads that the torque charges, 1 A for 1 N m; angle that of one farad that the speed charges. The gate signals are
-XSPICE's digital source, whose file is read as time goes on: a PWL source searches all its points at every evaluation.
+XSPICE's digital source, whose file is read as time advances: a PWL source searches all its points at every evaluation.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from salient.benchmark.switching_pattern import TICK_NS, SwitchingPattern, Traje
 from salient.machine.file import load_machine, machine_path
 from salient.reference import ngspice
 
-_RAMP_NS = 0.1  # of a gate signal, begins at the edge
+_RAMP_NS = 0.1  # rise and fall of a gate signal, from the edge on
 
 
 def run_ngspice(pattern: SwitchingPattern, step_ns: int, timeout_s: float = 600.0) -> Trajectory:

@@ -22,6 +22,7 @@ from scipy.integrate import ode, odeint
 
 from salient.benchmark.switching_pattern import SwitchingPattern, Trajectory
 from salient.machine.file import Machine, load_machine, machine_path
+from salient.machine.magnetics import Formula
 
 _ZERO_TOLERANCE_A = 1e-10
 
@@ -36,7 +37,8 @@ def lsoda(tolerance: float) -> Solver:
     """SciPy's LSODA; tolerance: relative, and absolute in A, rad/s and rad."""
 
     def solve(right_side: RightSide, y: State, from_s: float, to_s: float) -> State:
-        return odeint(right_side, y, (from_s, to_s), tfirst=True, rtol=tolerance, atol=tolerance)[-1].tolist()
+        end: State = odeint(right_side, y, (from_s, to_s), tfirst=True, rtol=tolerance, atol=tolerance)[-1].tolist()
+        return end
 
     return solve
 
@@ -53,7 +55,7 @@ def dop853(tolerance: float) -> Solver:
 
 def _runge_kutta(method: str, tolerance: float, right_side: RightSide, y: State, from_s: float, to_s: float) -> State:
     solver = ode(right_side).set_integrator(method, rtol=tolerance, atol=tolerance, nsteps=10_000)
-    end = solver.set_initial_value(y, from_s).integrate(to_s).tolist()
+    end: State = solver.set_initial_value(y, from_s).integrate(to_s).tolist()
     if not solver.successful():
         raise ArithmeticError(f"{method} stopped at {solver.t:g} s")
     return end
@@ -62,6 +64,7 @@ def _runge_kutta(method: str, tolerance: float, right_side: RightSide, y: State,
 def _right_side(machine: Machine, load_torque_Nm: float, voltage_V: dict[int, float],
                 evaluations: Iterator[int]) -> RightSide:
     """voltage_V: of each phase that conducts; evaluations: stepped at each call."""
+    assert isinstance(machine.magnetics, Formula)
     m = machine.magnetics.parameters
     lu, ls = m["unaligned_inductance_H"], m["saturated_inductance_H"]
     a = m["flux_linkage_max_Wb"] - ls * m["current_at_flux_linkage_max_A"]

@@ -19,6 +19,7 @@ An input is a TOML file. An action is time in ms, name, and a value for actions 
 
 from __future__ import annotations
 
+import contextlib
 import random
 import signal
 import sys
@@ -29,7 +30,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -38,6 +39,7 @@ from salient.bench.config import CONTROLLERS, BenchConfig
 from salient.bench.drive import ParameterRow, write_request
 from salient.bench.emulator import parameter_table
 from salient.bench.rig import RigError, bench_variables
+from salient.bus.signals import signal_range
 from salient.errors import UsageError
 from salient.paths import ROOT
 from salient.target.isr_profile import IsrProfile, read_profile
@@ -101,19 +103,26 @@ class Input:
 
 # --- files ----------------------------------------------------------------------------------------------------------
 
+def _is_action(what: str) -> bool:
+    """The drive knows its parameters; they are checked when they are written."""
+    scope, _, name = what.partition(".")
+    return what in (*_WITH_VALUE, *_WITHOUT_VALUE) or scope == "parameter" or (
+        scope == "bench" and name in bench_variables())
+
+
 class _InputFile(Table):
-    machine: option("machine")
-    controller: option("controller")
-    seed: option("seed")
-    initial_angle_deg: option("initial_angle_deg")
-    duration_ms: number(0.0, 3.6e6)
-    actions: list[list]
+    machine: Annotated[str, option("machine")]
+    controller: Annotated[str, option("controller")]
+    seed: Annotated[int, option("seed")]
+    initial_angle_deg: Annotated[float, option("initial_angle_deg")]
+    duration_ms: Annotated[float, number(0.0, 3.6e6)]
+    actions: list[list[Any]]
 
 
 class _ActionRow(Table):
-    at_ms: number(0.0, 3.6e6)
-    what: checked(str, "the name of an action", lambda what: _is_action(what))
-    value: any_number() = None
+    at_ms: Annotated[float, number(0.0, 3.6e6)]
+    what: Annotated[str, checked("the name of an action", _is_action)]
+    value: Annotated[float, any_number()] | None = None
 
 
 def read_input(path: Path) -> Input:
@@ -126,7 +135,7 @@ def read_input(path: Path) -> Input:
     return Input(file.machine, file.controller, file.seed, file.initial_angle_deg, file.duration_ms, actions)
 
 
-def _read_action(row_number: int, row: list) -> Action:
+def _read_action(row_number: int, row: list[Any]) -> Action:
     section = f"actions row {row_number}"
     if len(row) > len(_ActionRow.model_fields):
         raise TextFileError(f"{section}: must be time in ms, action and value")
@@ -135,12 +144,6 @@ def _read_action(row_number: int, row: list) -> Action:
     if needs_value != (action.value is not None):
         raise TextFileError(f"{section}: {action.what}: {'requires a' if needs_value else 'has no'} value")
     return Action(action.at_ms, action.what, action.value)
-
-
-def _is_action(what: str) -> bool:
-    """The drive knows its parameters; they are checked when they are written."""
-    scope, _, name = what.partition(".")
-    return what in (*_WITH_VALUE, *_WITHOUT_VALUE) or scope == "parameter" or (scope == "bench" and name in bench_variables())
 
 
 def write_input(path: Path, found: Input) -> None:
@@ -195,10 +198,8 @@ def _do(bench: Bench, rows: dict[str, ParameterRow], action: Action) -> None:
     if what == "speed_rpm":
         bench.drive.speed_reference_rpm = value
     elif scope == "bench":
-        try:
+        with contextlib.suppress(RigError):  # a rejected value has no effect
             bench.rig.set(name, value)
-        except RigError:
-            pass  # a rejected value has no effect
     elif scope == "parameter":
         bench.send(write_request(rows[name], value))  # the drive may reject it, too
     elif what == "commands":
@@ -318,7 +319,7 @@ def mutated(given: Input, source: random.Random) -> Input:
 def _added(given: Input, source: random.Random) -> Input:
     if len(given.actions) >= _ACTIONS_MAX:
         return _removed(given, source)
-    names = [f"bench.{name}" for name in bench_variables() if name not in ("truth_period_us",)]
+    names = [f"bench.{name}" for name in bench_variables() if name != "truth_period_us"]
     names += [f"parameter.{name}" for name in _rows(given.controller) if name not in _FIXED_PARAMETERS]
     names += ["speed_rpm", "commands", "silence", *_REQUESTS] * 4
     action = Action(_time(given, source), source.choice(names))
@@ -379,7 +380,7 @@ def _with_value(given: Input, action: Action, source: random.Random) -> Action:
     elif action.what == "commands":
         low, high = 1.0, _COMMANDS_MAX
     elif scope == "bench":
-        low, high = float(bench_variables()[name].minimum), float(bench_variables()[name].maximum)
+        low, high = map(float, signal_range(bench_variables()[name]))
     elif scope == "parameter":
         row = _rows(given.controller)[name]
         low, high = row.minimum, row.maximum

@@ -18,8 +18,8 @@ from salient.experiments.compare.metrics import STEADY_S
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 
 # Parameters of the drive that conditions set, by meaning; the numbers are those of firmware/PARAMETERS.md.
-LOAD_KNOWN = {"load_source": 1}
-PULSES = {1: {"pulses_per_period": 1}, 2: {"pulses_per_period": 2}}
+LOAD_KNOWN: dict[str, float] = {"load_source": 1}
+PULSES: dict[int, dict[str, float]] = {1: {"pulses_per_period": 1}, 2: {"pulses_per_period": 2}}
 NETWORK = {"off": 0, "fixed": 1, "frozen": 2, "learning": 3}
 NETWORK_PARAMETER = {"paper": "bp_mode", "salient": "bp_trim_mode"}
 RESERVE = {"torque_reserve_Nm": 8.0}
@@ -56,7 +56,7 @@ SENSING: dict[str, dict[str, Any]] = {
     "ideal sensing": {"encoder_bits": 0, "adc_bits": 16},
 }
 PAPER_CONDITIONS = {"control_rate_hz": 1_000_000, "encoder_bits": 0, "adc_bits": 16, "immediate_pwm": True}
-PAPER_PARAMETERS = {**LOAD_KNOWN, "observer_bandwidth_rad_s": 8000, "torque_band_inner_Nm": 0.01,
+PAPER_PARAMETERS: dict[str, float] = {**LOAD_KNOWN, "observer_bandwidth_rad_s": 8000, "torque_band_inner_Nm": 0.01,
                     "torque_band_outer_Nm": 0.02, "outgoing_off_angle_deg": 356}
 """Parameters for the paper's conditions. The speed observer does not know the load torque and overestimates the speed
 until it has converged; exact sensing permits a high bandwidth. The default bands are for 40 kHz, where the torque
@@ -273,9 +273,8 @@ def _steady(group: str, condition: str, speed_rpm: float, from_s: float, quick: 
     scenario = _scenario(duration_s=from_s + (0.1 if quick else LONG_S), speed=(SpeedStep(0.0, speed_rpm),),
                          load=(LoadStep(loaded_s, load_Nm),), record=Record(1.0, from_s), **fields)
     for case in _by_controller(group, condition, "ripple", scenario):
-        if case.controller == "salient" and pulses:
-            case = replace(case, scenario=replace(case.scenario, parameters=PULSES[pulses]))
-        yield replace(case, traced=traced)
+        parameters = PULSES[pulses] if case.controller == "salient" and pulses else case.scenario.parameters
+        yield replace(case, scenario=replace(case.scenario, parameters=parameters), traced=traced)
 
 
 def _by_controller(group: str, condition: str, extractor: str, scenario: Scenario, sample: str = "") -> Iterator[Case]:

@@ -67,9 +67,14 @@ METRICS = {
 }
 
 
+def _recorded_from_s(scenario: Scenario) -> float:
+    assert scenario.record is not None  # every case is recorded
+    return scenario.record.from_s
+
+
 def ripple_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
     """Ripple from the first recorded sample, over SHORT_WINDOW_S and to the end of the run; speed error."""
-    first_s, last_s = scenario.record.from_s, scenario.duration_s
+    first_s, last_s = _recorded_from_s(scenario), scenario.duration_s
     values: Metrics = {"ripple": _ripple(recording, (first_s, first_s + SHORT_WINDOW_S))}
     if last_s > first_s + 1.5 * SHORT_WINDOW_S:
         values["ripple_long"] = _ripple(recording, (first_s, last_s))
@@ -80,7 +85,7 @@ def ripple_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
 
 def late_ripple_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
     """Ripple over the whole recording, which is the end of a long run."""
-    return {"ripple_late": _ripple(recording, (scenario.record.from_s, scenario.duration_s))}
+    return {"ripple_late": _ripple(recording, (_recorded_from_s(scenario), scenario.duration_s))}
 
 
 def start_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:

@@ -100,7 +100,7 @@ def _ripples(content: Content) -> Figure | None:
 
 def _tick(row: Mapping[str, Any], single: bool) -> str:
     parts = row["condition"].split(", ")
-    return parts[-1] if single else parts[0].replace("_", "\n")
+    return str(parts[-1] if single else parts[0].replace("_", "\n"))
 
 
 def _traces(content: Content) -> Figure | None:

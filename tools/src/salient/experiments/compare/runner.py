@@ -76,6 +76,7 @@ def _run(case: Case) -> tuple[Metrics, str, Any]:
             result = run_scenario(case.scenario, Path(folder))
             if result.fault != "none":
                 return {}, f"fault {result.fault}", None
+            assert result.recording is not None  # every case is recorded
             metrics: Metrics = rounded(EXTRACTORS[case.extractor](case.scenario, result.recording))
         except (EmulatorError, SessionError, DriveError, CanError, MetricsError) as error:
             return {}, str(error), None

@@ -1,12 +1,22 @@
-"""Hash of a CAN database: a drive sends the one of its own DBC, so that tools notice another."""
+"""CAN databases: the attributes (BA_) of their messages and signals, and a hash. The drive sends
+the hash of its database, so that tools notice a different one."""
 
 from __future__ import annotations
 
 import json
 import zlib
+from typing import Any
 
 from cantools.database.can.database import Database
+from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
+
+
+def attributes(owner: Message | Signal) -> dict[str, Any]:
+    """Values of the attributes that the database sets, by name."""
+    if owner.dbc is None:
+        return {}
+    return {name: attribute.value for name, attribute in owner.dbc.attributes.items()}
 
 
 def database_hash(database: Database) -> int:
@@ -21,7 +31,7 @@ def database_hash(database: Database) -> int:
     return zlib.crc32(json.dumps(messages, separators=(",", ":")).encode())
 
 
-def _normal(signal: Signal) -> list:
+def _normal(signal: Signal) -> list[object]:
     numbers = [None if x is None else float(x) for x in (signal.scale, signal.offset, signal.minimum, signal.maximum)]
     choices = sorted((int(number), str(text)) for number, text in (signal.choices or {}).items())
     return [
