@@ -1,5 +1,5 @@
 /* The command line of the host executable. Names, ranges, defaults and usage text of the options are a table generated
- * from tools/src/salient/bench/config.py. */
+ * from tools/src/salient/config.py. */
 #ifndef OPTIONS_H
 #define OPTIONS_H
 

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from salient.bench import session as session_module
-from salient.bench.config import BenchConfig
 from salient.bench.drive import DriveError
 from salient.bench.emulator import EmulatorError, EmulatorProcess
 from salient.bench.rig import RigError, bench_variables
 from salient.bench.session import Session, SessionError
 from salient.bus.signals import drive_database, rig_database
+from salient.config import BenchConfig
 
 FAILING_TEST = """
 import pytest

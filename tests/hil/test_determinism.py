@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from salient.bench.config import CONTROLLERS
+from salient.config import CONTROLLERS
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, run_all, run_scenario
 
 FILES = ("can.blf", "can.log", "recording.npy")

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from salient.bench.config import DEFAULTS, FLAG, OPTIONS, flag_of
 from salient.bench.emulator import executable
+from salient.config import DEFAULTS, FLAG, OPTIONS, flag_of
 
 TIMEOUT_S = 20
 RUN_UNTIL_ID = 0x9F000001  # includes the extended flag

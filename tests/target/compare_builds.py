@@ -29,7 +29,7 @@ def digest_of_run(name: str, build: str, machine: str, controller: str) -> dict[
     from test_same_bits import ROW_BYTES, RUNS
 
     from salient.bench.bench import Bench
-    from salient.bench.config import BenchConfig
+    from salient.config import BenchConfig
 
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         switches, recording = Path(folder) / "switches", Path(folder) / "recording.npy"
@@ -54,7 +54,7 @@ def run_all(options: argparse.Namespace) -> None:
     """Prints the digests of every run as JSON."""
     from test_same_bits import MACHINES, RUNS
 
-    from salient.bench.config import CONTROLLERS
+    from salient.config import CONTROLLERS
 
     runs = [(name, build, machine, controller) for name in options.runs or RUNS for build in options.builds
             for machine in MACHINES for controller in CONTROLLERS]

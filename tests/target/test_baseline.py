@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import pytest
 
-from salient.bench.config import CONTROLLERS, TARGET_BUILDS
+from salient.config import CONTROLLERS, TARGET_BUILDS
 from salient.errors import UsageError
 from salient.target import worst_case
 from salient.target.baseline import (

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from salient.bench.config import CONTROLLERS, BenchConfig
 from salient.bench.emulator import command_line
 from salient.benchmark import command as benchmark
+from salient.config import CONTROLLERS, BenchConfig
 from salient.elf import ElfImage
 from salient.target.isr_profile import IsrProfile, measure, read_profile
 

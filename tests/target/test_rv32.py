@@ -7,8 +7,8 @@ import re
 import subprocess
 from pathlib import Path
 
-from salient.bench.config import BenchConfig
 from salient.bench.emulator import command_line
+from salient.config import BenchConfig
 from salient.elf import ElfImage
 from salient.target.isr_profile import read_profile
 

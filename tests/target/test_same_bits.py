@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from salient.bench.bench import Bench
-from salient.bench.config import CONTROLLERS, TARGET_BUILDS, TARGETS
+from salient.config import CONTROLLERS, TARGET_BUILDS, TARGETS
 
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
 ROW_BYTES = 16

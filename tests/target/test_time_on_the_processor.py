@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from salient.bench.bench import Bench
-from salient.bench.config import CONTROLLERS, TARGET_BUILDS, BenchConfig
 from salient.bench.emulator import EmulatorProcess, command_line, executable
 from salient.bench.session import Session
+from salient.config import CONTROLLERS, TARGET_BUILDS, BenchConfig
 from salient.errors import UsageError
 from salient.experiments.metrics import load_step_metrics, start_metrics, torque_metrics
 from salient.paths import BUILD

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from salient.bench.config import CONTROLLERS
 from salient.cli import make_parser
+from salient.config import CONTROLLERS
 from salient.errors import UsageError
 from salient.experiments.compare import baseline, cases, command, results_file, table
 from salient.experiments.compare.cases import GROUPS, Case, random_drive, scenario_toml, start_scenario

@@ -8,8 +8,8 @@ import re
 import numpy as np
 import pytest
 
-from salient.bench.config import CONTROLLERS as ALL_CONTROLLERS
 from salient.cli import make_parser
+from salient.config import CONTROLLERS as ALL_CONTROLLERS
 from salient.errors import UsageError
 from salient.experiments import demo, metrics
 from salient.experiments.results import PAPER, rounded

@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from salient.bench.config import BenchConfig
 from salient.bench.emulator import EmulatorProcess
 from salient.bus.clock import open_bus
 from salient.bus.signals import SignalTable, drive_database
+from salient.config import BenchConfig
 from salient.paths import ROOT
 
 EXAMPLES = ROOT / "tools" / "examples"

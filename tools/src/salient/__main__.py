@@ -7,8 +7,8 @@ import os
 import sys
 from pathlib import Path
 
-from salient.bench.config import OPTIONS, BenchConfig
 from salient.cli import make_parser
+from salient.config import OPTIONS, BenchConfig
 from salient.errors import UsageError
 from salient.paths import BUILD
 

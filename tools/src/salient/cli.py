@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from salient.bench.config import BUSES, CONDITIONS, DEFAULTS, FLAG, OPTIONS, TARGETS, description, either, flag_of
+from salient.config import BUSES, CONDITIONS, DEFAULTS, FLAG, OPTIONS, TARGETS, description, either, flag_of
 from salient.version import VERSION
 
 LOG_SUFFIXES = (".blf", ".log")

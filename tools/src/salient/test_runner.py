@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from salient.bench.config import TARGET_BUILDS
+from salient.config import TARGET_BUILDS
 from salient.paths import BUILD, ROOT, SCENARIOS
 
 RESULTS = BUILD / "results"

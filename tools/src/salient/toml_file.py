@@ -19,8 +19,8 @@ from typing import Any, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, ValidationError, WrapValidator
 from pydantic_core import PydanticCustomError
 
-from salient.bench import config
-from salient.bench.config import OPTIONS, either
+from salient import config
+from salient.config import OPTIONS, either
 
 TOML_BYTES_MAX = 1_000_000
 

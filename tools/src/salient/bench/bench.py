@@ -13,10 +13,10 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
-from salient.bench.config import BenchConfig
 from salient.bench.emulator import EmulatorProcess, parameter_table
 from salient.bench.session import Session
 from salient.bus.log import write_logs
+from salient.config import BenchConfig
 
 LAST_MOMENTS_S = 0.05
 

@@ -14,10 +14,10 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from salient.bench.config import TARGET_BUILDS, BenchConfig
 from salient.bench.drive import ParameterRow, read_parameter_table
 from salient.bench.session import Session
 from salient.builder import run_commands
+from salient.config import TARGET_BUILDS, BenchConfig
 from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.machine.file import MachineError, load_machine, machine_path

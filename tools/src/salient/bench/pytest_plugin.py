@@ -26,7 +26,7 @@ import pluggy
 import pytest
 
 from salient.bench.bench import Bench
-from salient.bench.config import HOST_BUILDS, TARGET_BUILDS, BenchConfig
+from salient.config import HOST_BUILDS, TARGET_BUILDS, BenchConfig
 from salient.paths import BUILD, ROOT
 
 _benches_key = pytest.StashKey[list[Bench]]()

@@ -11,10 +11,10 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from salient.bench.config import BenchConfig
 from salient.bench.emulator import EmulatorProcess
 from salient.bench.session import Session
 from salient.benchmark.switching_pattern import SwitchingPattern, program, program_input
+from salient.config import BenchConfig
 from salient.errors import UsageError
 from salient.paths import ROOT
 

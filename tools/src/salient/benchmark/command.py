@@ -11,11 +11,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from salient.bench.config import CONTROLLERS, BenchConfig
 from salient.bench.emulator import EmulatorError, EmulatorProcess, parameter_table
 from salient.bench.session import Session
 from salient.benchmark import callgrind, solvers
 from salient.benchmark.switching_pattern import record
+from salient.config import CONTROLLERS, BenchConfig
 from salient.errors import UsageError
 from salient.experiments.network_ablation import run_ablation
 from salient.progress import Progress

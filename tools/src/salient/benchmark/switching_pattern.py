@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from salient.bench.bench import Bench
-from salient.bench.config import BenchConfig
+from salient.config import BenchConfig
 from salient.errors import UsageError
 from salient.machine.file import load_machine, machine_path
 from salient.paths import BUILD, ROOT

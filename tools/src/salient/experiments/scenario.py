@@ -4,7 +4,7 @@
     controllers = ["traditional", "paper"]  # one run each
     duration_s = 0.4
     seed = 1                                # optional, as everything below; other fields of
-    control_rate_hz = 40000                 # salient.bench.config.Conditions likewise
+    control_rate_hz = 40000                 # salient.config.Conditions likewise
 
     [parameters]                            # parameters of the drive by name, in their units
     torque_max_Nm = 19.1
@@ -43,12 +43,12 @@ import numpy as np
 from pydantic import create_model
 
 from salient.bench.bench import Bench
-from salient.bench.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
 from salient.bench.drive import DriveError, write_request
 from salient.bench.emulator import executable, parameter_table
 from salient.bench.rig import bench_variables
 from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database, signal_range
+from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
 from salient.errors import UsageError
 from salient.experiments.metrics import losses
 from salient.machine.file import load_machine, machine_path

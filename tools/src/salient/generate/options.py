@@ -1,4 +1,4 @@
-"""Build step: options_table.h and options_table.c, the host executable's options as salient.bench.config has them.
+"""Build step: options_table.h and options_table.c, the host executable's options as salient.config has them.
 
     python -m salient.generate.options OUTDIR
 """
@@ -10,10 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from salient.bench import config
-from salient.bench.config import DEFAULTS, OPTIONS, Option
+from salient import config
+from salient.config import DEFAULTS, OPTIONS, Option
 
-_HEAD = "/* Generated from tools/src/salient/bench/config.py. */"
+_HEAD = "/* Generated from tools/src/salient/config.py. */"
 _INDENT = 26  # column of the usage text's second part
 
 

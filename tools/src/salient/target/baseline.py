@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from salient.bench.config import CONTROLLERS, TARGET_BUILDS
 from salient.bench.emulator import image
+from salient.config import CONTROLLERS, TARGET_BUILDS
 from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.paths import BUILD, ROOT

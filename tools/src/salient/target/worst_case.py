@@ -35,11 +35,11 @@ from typing import Annotated, Any
 import numpy as np
 
 from salient.bench.bench import Bench
-from salient.bench.config import CONTROLLERS, BenchConfig
 from salient.bench.drive import ParameterRow, write_request
 from salient.bench.emulator import parameter_table
 from salient.bench.rig import RigError, bench_variables
 from salient.bus.signals import signal_range
+from salient.config import CONTROLLERS, BenchConfig
 from salient.errors import UsageError
 from salient.paths import ROOT
 from salient.target.isr_profile import IsrProfile, read_profile

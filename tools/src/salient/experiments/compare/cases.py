@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from salient.bench.config import CONTROLLERS
+from salient.config import CONTROLLERS
 from salient.experiments.compare.metrics import STEADY_S
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 

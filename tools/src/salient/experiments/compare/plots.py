@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from salient.bench.config import CONTROLLERS
+from salient.config import CONTROLLERS
 from salient.experiments.compare.baseline import Change
 from salient.experiments.compare.metrics import METRICS
 from salient.experiments.compare.table import in_order

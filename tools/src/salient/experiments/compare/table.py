@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 
-from salient.bench.config import CONTROLLERS
+from salient.config import CONTROLLERS
 from salient.experiments.compare.cases import GROUPS, STROKE_DEG
 from salient.experiments.compare.metrics import METRICS
 from salient.experiments.compare.runner import RunMetrics
