@@ -19,7 +19,7 @@ static bool count_down(uint16_t *cycles_left, uint16_t period) {
 
 static void enqueue(telemetry_t *telemetry, const drive_telemetry_message_t *message, const drive_telemetry_t *values) {
     hal_can_frame_t frame = {.identifier = message->identifier, .length = message->length};
-    message->pack(values, frame.data);
+    drive_telemetry_pack((unsigned)(message - drive_telemetry_messages), values, frame.data);
     frame_queue_push(&telemetry->queue, &frame);
 }
 

@@ -30,7 +30,7 @@ int32_t units_quarter_rpm(int32_t milli_rpm);
 /* 2^-16 turn from 2^-32 turn; the last half LSB of a turn rounds to 0. */
 uint16_t units_angle_u16(uint32_t angle);
 
-/* 2^-20 turn from a small angle in 2^-32 turn: +-2^19 (drive_telemetry_pack_trim saturates). */
+/* 2^-20 turn from a small angle in 2^-32 turn: +-2^19 (drive_telemetry_pack saturates). */
 int32_t units_deviation_q20(int32_t angle);
 
 /* N m in 2^-8 from Q7.24: -32768..32768; the upper end exceeds 16 bits by one (the drive_telemetry_pack functions

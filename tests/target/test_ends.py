@@ -61,8 +61,9 @@ def make_image(request, tmp_path: Path) -> Callable[[int], Path]:
         drive, image = tmp_path / "drive.c", tmp_path / "image.elf"
         drive.write_text(DRIVE)
         folders = [tmp_path, hal, ROOT / "firmware", BUILD / "cortex-m4" / "firmware" / "codec"]
-        sources = [*sorted((hal / "qemu").glob("*.c")), *sorted((hal / request.param).glob("*.c"))]
-        scripts = [hal / request.param / "memory.ld", hal / "qemu" / "sections.ld"]
+        sources = [ROOT / "emulator/qemu/image/main.c", *sorted((hal / "qemu").glob("*.c")),
+                   *sorted((hal / "qemu" / request.param).glob("*.c"))]
+        scripts = [hal / "qemu" / request.param / "memory.ld", hal / "qemu" / "sections.ld"]
         command = [*COMPILERS[request.param], "-std=c11", "-O1", "-ffreestanding", *(f"-I{one}" for one in folders),
                    *map(str, sources), str(drive), *(f"-Wl,-T,{one}" for one in scripts), "-o", str(image)]
         subprocess.run(command, check=True, timeout=TIMEOUT_S)

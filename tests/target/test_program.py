@@ -25,7 +25,7 @@ def program() -> list[str]:
     [
         ([], ["--can", "unix:PATH"]),
         (["--can", "unix:/no/such/folder/bus"], ["/no/such/folder/bus"]),
-        (["--can", "BUS", "--controller", "pid"], ["--controller pid", "traditional, paper and salient"]),
+        (["--can", "BUS", "--controller", "pid"], ["--controller pid", "traditional, paper or salient"]),
         (["--can", "BUS", "--record", "/no/such/folder/x.npy"], ["/no/such/folder/x.npy"]),
         (["--instructions", "/no/such/folder/x", "--can", "BUS"], ["--instructions /no/such/folder/x"]),
         (["--execution", "/no/such/folder/x", "0-1", "--can", "BUS"], ["--execution /no/such/folder/x"]),
@@ -79,7 +79,7 @@ def test_ready_line_then_a_clean_end_without_the_socket(program, tmp_path: Path,
     with process:
         ready = json.loads(process.stdout.readline())
         assert ready == {"ready": True, "can": f"unix:{bus}", "pid": process.pid, "machine": "saturating",
-                         "controller": "paper", "control_rate_hz": 40000, "pace": pace, "seed": 1}
+                         "controller": "salient", "control_rate_hz": 40000, "pace": pace, "seed": 1}
         if end == "stdin":
             process.stdin.close()
         else:

@@ -261,7 +261,8 @@ class Telemetry(Codec):
 
     def pack_telemetry(self, message: Message, telemetry: ctypes.Structure) -> bytes:
         data = ctypes.create_string_buffer(b"\xa5" * 8, 8)
-        getattr(self.library, f"drive_telemetry_pack_{short_name(message, 'drive')}")(ctypes.byref(telemetry), data)
+        index = [other.name for other in self.messages].index(message.name)
+        self.library.drive_telemetry_pack(ctypes.c_uint(index), ctypes.byref(telemetry), data)
         return data.raw[: message.length]
 
 
@@ -295,7 +296,7 @@ def test_telemetry_is_packed_with_saturation(telemetry: Telemetry) -> None:
 def test_schedule_is_that_of_the_dbc(telemetry: Telemetry) -> None:
     class Row(ctypes.Structure):
         _fields_ = [
-            ("pack", ctypes.c_void_p), ("identifier", ctypes.c_uint32), ("length", ctypes.c_uint8),
+            ("identifier", ctypes.c_uint32), ("length", ctypes.c_uint8),
             ("group", ctypes.c_uint8), ("if_active", ctypes.c_bool), ("period", ctypes.c_uint16),
             ("delay", ctypes.c_uint16),
         ]  # fmt: skip

@@ -28,8 +28,8 @@ FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive.h", "firmware/control/machine_table
 JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/main.c", "emulator/qemu/image/main.c"}
 
 PYTHON_LAYERS = (
-    "salient", "salient.errors", "salient.paths", "salient.progress", "salient.config", "salient.version", "salient.dbc",
-    "salient.toml_file",
+    "salient", "salient.errors", "salient.paths", "salient.progress", "salient.config", "salient.version",
+    "salient.dbc", "salient.toml_file",
     "salient.cli", "salient.elf", "salient.vm", "salient.machine", "salient.finite_elements", "salient.generate",
     "salient.bus", "salient.bench", "salient.experiments", "salient.test_runner",
     "salient.benchmark.switching_pattern", "salient.reference", "salient.target", "salient.benchmark",

@@ -76,10 +76,6 @@ def _header(messages: list[Message], groups: list[str], prefix: str, dbc_name: s
             lsb = f"LSB {signal.scale} {signal.unit or ''}".rstrip()
             members.append(f"        {_member_type(signal)} {camel_to_snake_case(signal.name)}; /* {lsb} */")
         members.append(f"    }} {name}; /* {message.name} */")
-    packers = [
-        f"void {prefix}_telemetry_pack_{short_name(m, prefix)}(const {prefix}_telemetry_t *telemetry, uint8_t data[8]);"
-        for m in messages
-    ]
     indices = [f"    {upper}_TELEMETRY_{short_name(m, prefix).upper()}," for m in messages]
     group_names = [f"    {upper}_TELEMETRY_GROUP_{group.upper()}," for group in groups]
     return f"""/* Cyclic messages of {dbc_name}; generated. */
@@ -102,9 +98,6 @@ typedef struct {{
 {chr(10).join(members)}
 }} {prefix}_telemetry_t;
 
-/* One function per message: packs its signals, saturated to their ranges, into the bytes of its frame. */
-{chr(10).join(packers)}
-
 /* Messages that are queued together. */
 typedef enum {{
 {chr(10).join(group_names)}
@@ -117,7 +110,6 @@ enum {{
 }};
 
 typedef struct {{
-    void (*pack)(const {prefix}_telemetry_t *telemetry, uint8_t data[8]);
     uint32_t identifier;
     uint8_t length;
     uint8_t group;   /* {prefix}_telemetry_group_t */
@@ -127,6 +119,10 @@ typedef struct {{
 }} {prefix}_telemetry_message_t;
 
 extern const {prefix}_telemetry_message_t {prefix}_telemetry_messages[{upper}_TELEMETRY_MESSAGES];
+
+/* Packs the signals of a message, an index of {prefix}_telemetry_messages, saturated to their ranges, into the bytes of
+ * its frame. No table of function pointers: the depth of the stack can be read from the machine code. */
+void {prefix}_telemetry_pack(unsigned message, const {prefix}_telemetry_t *telemetry, uint8_t data[8]);
 
 #ifdef __cplusplus
 }}
@@ -138,11 +134,13 @@ extern const {prefix}_telemetry_message_t {prefix}_telemetry_messages[{upper}_TE
 
 def _source(messages: list[Message], prefix: str, dbc_name: str, cycle_ms: int) -> str:
     upper = prefix.upper()
-    functions, rows = [], []
+    functions, rows, cases = [], [], []
     for message in messages:
         name = short_name(message, prefix)
         codec_name = message_c_name(message, prefix)
-        head = f"void {prefix}_telemetry_pack_{name}(const {prefix}_telemetry_t *telemetry, uint8_t data[8])\n{{\n"
+        cases.append(f"    case {upper}_TELEMETRY_{name.upper()}:\n        pack_{name}(telemetry, data);")
+        cases.append("        break;")
+        head = f"static void pack_{name}(const {prefix}_telemetry_t *telemetry, uint8_t data[8])\n{{\n"
         if is_bit_field(message):
             mask = sum(1 << s.start for s in message.signals)
             functions.append(
@@ -163,7 +161,7 @@ def _source(messages: list[Message], prefix: str, dbc_name: str, cycle_ms: int) 
         group = _group_number(message)
         active = str(message.send_type == "cyclicIfActive").lower()
         rows.append(
-            f"    {{{prefix}_telemetry_pack_{name}, {message.frame_id:#x}u, {message.length}u, {group}u, {active}, "
+            f"    {{{message.frame_id:#x}u, {message.length}u, {group}u, {active}, "
             f"{period}u, {delay}u}},"
         )
     return (
@@ -172,7 +170,10 @@ def _source(messages: list[Message], prefix: str, dbc_name: str, cycle_ms: int) 
         + "\n".join(functions)
         + f"\nconst {prefix}_telemetry_message_t {prefix}_telemetry_messages[{upper}_TELEMETRY_MESSAGES] = {{\n"
         + "\n".join(rows)
-        + "\n};\n"
+        + f"\n}};\n\nvoid {prefix}_telemetry_pack(unsigned message, const {prefix}_telemetry_t *telemetry, "
+        + "uint8_t data[8])\n{\n    switch (message) {\n"
+        + "\n".join(cases)
+        + "\n    default:\n        break;\n    }\n}\n"
     )
 
 
