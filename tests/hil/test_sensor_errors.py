@@ -143,7 +143,7 @@ def test_starts_and_holds_speed_under_load(make_bench, controller, name):
 ])  # fmt: skip
 def test_measured_currents_have_the_injected_error(bench, variable, value, wrong):
     start_loaded(bench)
-    with pytest.raises(AttributeError, match=f"{variable} is as the machine file has it"):
+    with pytest.raises(AttributeError, match=f"{variable} has the value of the machine file until it is set"):
         getattr(bench.rig, variable)
     before_s = watch_closely(bench, 0.03)
     measured_A, true_A = currents_A(bench, before_s)

@@ -406,7 +406,7 @@ def file_cases() -> list[tuple[str, str | bytes, str]]:
         ("milliwebers under webers", csv(scaled(2, 1e3)), "line "),
         ("kiloamperes under amperes", csv(scaled(1, 1e-3)), "aligned_inductance_H"),
         ("microwebers under milliwebers", csv(scaled(2, 1e6), HEADER.replace("Wb", "mWb")), "line "),
-        ("webers under milliwebers", csv(ROWS, HEADER.replace("Wb", "mWb")), "1e-06 H is the least"),
+        ("webers under milliwebers", csv(ROWS, HEADER.replace("Wb", "mWb")), "must be at least 1e-06 H"),
         ("degrees under radians", csv(ROWS, HEADER.replace("deg", "rad")), "line "),
         ("radians under degrees", csv(scaled(0, math.pi / 180)), "line "),
         ("electrical degrees", csv(scaled(0, 4.0)), "line "),
