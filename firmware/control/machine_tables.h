@@ -25,25 +25,24 @@
 #define MACHINE_ANGLE_BINS 64  /* equal parts of half an electrical revolution, 2^25 each */
 #define MACHINE_ANGLE_BIN_BITS 25
 
-/* Row. Starts ascend from 0, unaligned, to 2^31, aligned, by at least 2^17. */
+/* Row. Starts ascend from 0, unaligned, to 2^31, aligned, by at least 2^17; at most two lie within an angle bin, not
+ * counting one at its begin. */
 typedef struct {
-    uint32_t start;      /* 2^-32 electrical rev past the unaligned position */
-    uint32_t reciprocal; /* 2^47 / width up to the next row, rounded down; 0 in the last row */
+    uint32_t start;     /* 2^-32 electrical rev past the unaligned position */
+    int32_t reciprocal; /* 2^46 / width up to the next row, rounded down; 0 in the last row */
 } machine_row_t;
 
 /* Nodes, 0..65535, are stored less this offset, as factors of signed 16-bit products. */
 #define MACHINE_NODE_OFFSET 32768
 
-/* Column: the nodes of two adjacent rows are adjacent in memory, for a dual 16-bit product. */
-typedef struct {
-    int16_t torque_node[MACHINE_ROWS]; /* T / i */
-    int16_t flux_node[MACHINE_ROWS];   /* psi / i */
-    int8_t torque_curvature[MACHINE_ROWS - 1];
-    int8_t flux_curvature[MACHINE_ROWS - 1];
-} machine_column_t;
+/* Layout of nodes and curvatures: for each column the torque of all rows, then the flux linkage of all rows. The nodes
+ * of two adjacent rows are adjacent in memory, for a dual 16-bit product. Distances from the torque of a row and column
+ * to the flux linkage there, and to the torque of the next column: */
+#define MACHINE_TO_FLUX MACHINE_ROWS
+#define MACHINE_TO_NEXT_COLUMN (2 * MACHINE_ROWS)
 
 /* Weight of a node's LSB: result = (value_q14 * current_q9 * 2^15 / 2^32) * 2^result_shift, with value_q14 the value in
- * 2^-14 node LSBs; torque in N m, Q7.24, or flux linkage in Wb, Q2.29. */
+ * 2^-14 node LSBs; torque in N m, Q7.24, which may exceed its format, or flux linkage in Wb, Q2.29, which does not. */
 typedef struct {
     uint8_t curvature_shift; /* 0..8 */
     uint8_t result_shift;    /* 0..12 */
@@ -60,7 +59,8 @@ typedef struct {
     uint8_t angle_bin_row[MACHINE_ANGLE_BINS]; /* row in which each angle bin begins */
     machine_format_t torque_format;
     machine_format_t flux_format;
-    machine_column_t column[MACHINE_COLUMNS];
+    int8_t curvature[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN]; /* of the interval that begins at the row; last row: 0 */
+    int16_t node[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
 } machine_tables_t;
 
 /* The machine that this firmware is built for. */

@@ -1,10 +1,14 @@
-/* Phase map: torque and flux linkage of one phase from angle and current, and the inverse.
+/* Phase map: torque and flux linkage of one phase from angle and current.
  *
  *   T = i value_T(angle, i),   psi = i value_psi(angle, i)
  *
  * with the values interpolated in the tables of T / i and psi / i, quadratically over the angle and linearly over the
  * current; machine_tables.h has the formula. Derived here. The error of the interpolation is within three LSBs of a
- * table node; the error of the tables against the machine is stated by tests/unit/control/test_phase_map.cpp. */
+ * table node; the error of the tables against the machine is stated by tests/unit/control/test_phase_map.cpp. The
+ * inverse is phase_cell.h.
+ *
+ * Results are in units of the tables, 2^result_shift LSBs of Q7.24 (torque) or Q2.29 (flux linkage), machine_format_t:
+ * below 2^29 in magnitude, so that the sum of all phases fits; phase_map_scale() converts. No loop depends on data. */
 #ifndef CONTROL_PHASE_MAP_H
 #define CONTROL_PHASE_MAP_H
 
@@ -13,60 +17,100 @@
 
 #include "control/machine_tables.h"
 #include "fixed/compiler.h"
+#include "fixed/dual16.h"
+#include "fixed/fixed.h"
+#include "fixed/formats.h"
 
 /* Largest current of the map, A, Q7.9: 1 LSB below 80 A, so that there is always a column above. */
 #define PHASE_MAP_CURRENT_MAX_Q9 (((MACHINE_COLUMNS - 1) << MACHINE_COLUMN_BITS) - 1)
 
-/* Interpolation weights of an angle, for any number of evaluations at that angle. */
+/* Interpolation over the angle, for any number of columns at that angle. */
 typedef struct {
     const machine_tables_t *tables;
     uint32_t row;         /* row that begins at or before the angle */
     uint32_t weights_q14; /* of this row's nodes and the next row's, sum 2^14: a dual16_pack() */
     int32_t torque_curvature_q14, flux_curvature_q14; /* u (1 - u) 2^curvature_shift */
-    bool mirrored;                                    /* angle below 2^31, where the torque is negative */
 } phase_map_lookup_t;
 
-/* Looks up an angle of the phase: 2^-32 electrical rev, 0 aligned, 2^31 unaligned. `tables` must outlive the lookup. */
-phase_map_lookup_t phase_map_lookup(const machine_tables_t *tables, uint32_t phase_angle);
+/* Distance of an electrical angle (2^-32 rev, 0 aligned, 2^31 unaligned) from the unaligned position, 0..2^31 - 1. The
+ * aligned position counts as 1 LSB before it. */
+ALWAYS_INLINE uint32_t phase_map_distance(uint32_t phase_angle) {
+    return (uint32_t)fixed_abs((int32_t)(phase_angle - HALF_REV));
+}
 
-/* Torque in N m, Q7.24: positive from unaligned to aligned, negative in the other half by mirror symmetry. Current in
- * A, Q7.9, clamped to 0..PHASE_MAP_CURRENT_MAX_Q9. The product with the current is rounded to nearest at 28 bits; the
- * result saturates. */
-int32_t phase_map_torque_q24(const phase_map_lookup_t *lookup, int32_t current_q9);
+/* True in the half of an electrical revolution in which the torque is negative. */
+ALWAYS_INLINE bool phase_map_mirrored(uint32_t phase_angle) {
+    return phase_angle < HALF_REV;
+}
 
-/* Torque as above, in one call, for a current of 0..PHASE_MAP_CURRENT_MAX_Q9. Kept out of line: see fixed/compiler.h.
- */
-NOINLINE int32_t phase_map_torque_at_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9);
+/* 1 when the next row begins at or before the distance, else 0: both are below 2^31. */
+ALWAYS_INLINE int32_t phase_map_row_step(const machine_row_t *row, uint32_t distance) {
+    return 1 + ((int32_t)(distance - row[1].start) >> 31);
+}
 
-/* Flux linkage in Wb, Q2.29, equal in both halves. Current, rounding and saturation as for the torque. */
-int32_t phase_map_flux_q29(const phase_map_lookup_t *lookup, int32_t current_q9);
+/* Looks up a distance from the unaligned position, 0..2^31 - 1. `tables` must outlive the lookup. */
+ALWAYS_INLINE phase_map_lookup_t phase_map_lookup(const machine_tables_t *tables, uint32_t distance) {
+    /* At most two rows begin within an angle bin; the start of the last row is above every distance. */
+    const machine_row_t *row = &tables->row[tables->angle_bin_row[distance >> MACHINE_ANGLE_BIN_BITS]];
+    row += phase_map_row_step(row, distance);
+    row += phase_map_row_step(row, distance);
+    /* The reciprocal is rounded down and the distance within the row is below its width: at most one after rounding. */
+    const int32_t fraction_q14 = fixed_multiply_high((int32_t)(distance - row->start), row->reciprocal);
+    const int32_t curvature_q14 = (fraction_q14 * (ONE_Q14 - fraction_q14)) >> 14;
+    return (phase_map_lookup_t){
+        .tables = tables,
+        .row = (uint32_t)(row - tables->row),
+        .weights_q14 = (uint32_t)(ONE_Q14 - fraction_q14) | (uint32_t)fraction_q14 << 16,
+        .torque_curvature_q14 = curvature_q14 << tables->torque_format.curvature_shift,
+        .flux_curvature_q14 = curvature_q14 << tables->flux_format.curvature_shift,
+    };
+}
 
-/* Slope of the torque at an angle, as the change over `angle_step` (2^-32 electrical rev, below 2^27): N m, Q7.24.
- * Current and saturation as for the torque. */
+/* Index of a column, 0..MACHINE_COLUMNS - 1, at the row of the lookup. */
+ALWAYS_INLINE uint32_t phase_map_index(const phase_map_lookup_t *lookup, uint32_t column) {
+    return lookup->row + column * MACHINE_TO_NEXT_COLUMN;
+}
+
+/* T / i and psi / i at an index, in node LSBs, Q14: the nodes' part is below 2^30, the curvature's within 2^27. */
+ALWAYS_INLINE int32_t phase_map_torque_value_q14(const phase_map_lookup_t *lookup, uint32_t index) {
+    return dual16_multiply_add(&lookup->tables->node[index], lookup->weights_q14, MACHINE_NODE_OFFSET << 14) -
+           lookup->tables->curvature[index] * lookup->torque_curvature_q14;
+}
+
+ALWAYS_INLINE int32_t phase_map_flux_value_q14(const phase_map_lookup_t *lookup, uint32_t index) {
+    return dual16_multiply_add(&lookup->tables->node[index + MACHINE_TO_FLUX], lookup->weights_q14,
+                               MACHINE_NODE_OFFSET << 14) -
+           lookup->tables->curvature[index + MACHINE_TO_FLUX] * lookup->flux_curvature_q14;
+}
+
+/* Result in units of the tables: value in Q14 times current in Q9, over 2^17. */
+ALWAYS_INLINE int32_t phase_map_product(int32_t value_q14, int32_t current_q9) {
+    return fixed_multiply_high(value_q14, current_q9 << 15);
+}
+
+/* Result at a current between two columns, whose values are given. */
+ALWAYS_INLINE int32_t phase_map_between(int32_t low_q14, int32_t high_q14, int32_t current_q9) {
+    const int32_t fraction_q31 = (int32_t)((uint32_t)current_q9 << (32 - MACHINE_COLUMN_BITS) >> 1);
+    return phase_map_product(low_q14 + 2 * fixed_multiply_high(high_q14 - low_q14, fraction_q31), current_q9);
+}
+
+/* Result in its format from units of the tables, saturated. */
+ALWAYS_INLINE int32_t phase_map_scale(const machine_format_t *format, int32_t result) {
+    const int32_t shifted = (int32_t)((uint32_t)result << format->result_shift);
+    return shifted >> format->result_shift == result ? shifted : INT32_MAX ^ (result >> 31);
+}
+
+/* Torque in units of the tables, at an electrical angle: positive from unaligned to aligned, negative in the other half
+ * by mirror symmetry. Current in A, Q7.9, 0..PHASE_MAP_CURRENT_MAX_Q9. */
+NOINLINE int32_t phase_map_torque(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9);
+
+/* The same, and the flux linkage in units of the tables, equal in both halves. */
+NOINLINE int32_t phase_map_torque_and_flux(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,
+                                           int32_t *flux);
+
+/* Slope of the torque at an angle, as the change over `angle_step` (2^-32 electrical rev, below 2^27): N m, Q7.24,
+ * saturated. Current as above. */
 int32_t phase_map_torque_slope_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,
                                    uint32_t angle_step);
-
-/* Operating point of a phase. */
-typedef struct {
-    uint32_t column;    /* column at or below its current, 0..MACHINE_COLUMNS - 2 */
-    int32_t flux_q29;   /* Wb, Q2.29 */
-    int32_t torque_q24; /* N m, Q7.24 */
-} phase_map_operating_point_t;
-
-/* Constraints on an operating point, by descending priority: flux_min, flux_max, current limit. */
-typedef struct {
-    int32_t flux_min_q29;     /* Wb, Q2.29, >= 0 */
-    int32_t flux_max_q29;     /* Wb, Q2.29, >= flux_min */
-    int32_t current_limit_q9; /* A, Q7.9, 0..PHASE_MAP_CURRENT_MAX_Q9 */
-} phase_map_constraints_t;
-
-/* Operating point for a torque (N m, Q7.24; negative ones count as 0) at an angle from 2^31, unaligned, to 2^32, or the
- * nearest point within the constraints; true when the torque is reached. At a flux constraint the flux linkage is
- * exactly the constraint; a torque of 0 gives flux_min. Torque and flux linkage of a point agree within 2 mN m.
- *
- * The search starts at the column of *point. Where torque and flux linkage increase with the current the result does
- * not depend on it; the search is short when the current has changed little. */
-bool phase_map_solve(const machine_tables_t *tables, uint32_t phase_angle, int32_t torque_q24,
-                     const phase_map_constraints_t *constraints, phase_map_operating_point_t *point);
 
 #endif

@@ -1,80 +1,153 @@
 #include "control/predictive_torque.h"
 
+#include <stddef.h>
+
+#include "control/phase_cell.h"
+#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "fixed/formats.h"
 
 /* 0.25 Wb: 512 V for half a millisecond. */
 #define FLUX_STEP_LIMIT_Q29 (1 << 27)
 
+/* Twice the largest unit of the tables, so that the division in set_duties() is defined without a DC link: 0.6 V at 40
+ * kHz. */
+#define FLUX_STEP_MIN_Q29 (1 << 13)
+
 /* Torque shortfall that advances the windows: 0.05 N m and 1/64 of the reference. Less may be rounding. */
 #define SHORTFALL_MIN_Q24 ((1 << 24) / 20)
 
-/* Torque shortfall below which none is reported: 1/64 N m. Torque and flux linkage of an operating point agree within 2
- * mN m, and a period may need several points. */
+/* Torque shortfall below which none is reported: 1/64 N m. Torque and flux linkage of an operating point agree within a
+ * few mN m. */
 #define SHORTFALL_TOLERANCE_Q24 (1 << 18)
 
-/* Plan of a phase for the sample two periods ahead. */
+/* Duty in Q1.15, -1..1 - 2^-15, which the modulator rounds to 1. */
+#define DUTY_BITS 16
+
+/* A column in Q4. */
+#define COLUMN_Q4 16
+
+/* Plan of a phase for the sample two periods ahead. Torque, by magnitude, and flux linkages in units of the tables. */
 typedef struct {
-    uint32_t angle;                      /* 2^-32 electrical rev, mirrored into the half of positive torque */
-    bool positive;                       /* the phase itself is in that half */
-    uint32_t since_on;                   /* angle past turn-on, 2^-32 electrical rev; from 2^31: before turn-on */
-    int32_t freewheeling_q29;            /* flux linkage after a period without voltage, Wb */
-    phase_map_constraints_t constraints; /* flux linkages that a period of -Vdc and of +Vdc reach, or less */
-    phase_map_operating_point_t point;   /* target, torque by magnitude */
+    phase_cell_t cell;        /* once `located` */
+    int32_t column;           /* of the cell */
+    int32_t u_q13;            /* of the planned point in the cell */
+    int32_t flux;             /* planned */
+    int32_t torque;           /* planned */
+    int32_t flux_min;         /* flux linkage that a period of -Vdc leaves */
+    int32_t flux_max;         /* that a period of +Vdc reaches, or less */
+    int32_t freewheeling_q29; /* flux linkage after a period without voltage, Wb */
+    uint32_t angle;           /* 2^-32 electrical rev, mirrored into the half of positive torque */
+    uint32_t since_on;        /* angle past turn-on, 2^-32 electrical rev; from 2^31: before turn-on */
+    int8_t limit;             /* -1: at flux_min, 1: at flux_max or at the current limit, 0: torque reached */
+    bool positive;            /* the phase itself is in that half */
+    bool located;             /* the cell is known */
 } plan_t;
 
-/* Plans the operating point for a torque within the constraints; true when they limit the torque. */
-static bool plan_torque(const machine_tables_t *tables, plan_t *plan, int32_t torque_q24) {
-    phase_map_operating_point_t *point = &plan->point;
-    if (torque_q24 <= 0 && plan->constraints.flux_min_q29 == 0) {
-        point->flux_q29 = 0;
-        point->torque_q24 = 0;
-        return false;
+/* Operating point within the cell, or at its end, for a torque within flux_min, flux_max and the current limit, by
+ * descending priority. */
+static inline void solve_in_cell(plan_t *p, int32_t torque, int32_t current_limit_q9) {
+    const int32_t limit_q13 = fixed_saturate_bits(
+        (current_limit_q9 - (p->column << MACHINE_COLUMN_BITS)) * (1 << (13 - MACHINE_COLUMN_BITS)) -
+            PHASE_CELL_HALF_Q13,
+        PHASE_CELL_BITS);
+    const int32_t torque_q13 = phase_cell_solve_q13(&p->cell.torque, torque);
+    const bool current_limited = torque_q13 > limit_q13;
+    p->u_q13 = current_limited ? limit_q13 : torque_q13;
+    p->flux = phase_cell_evaluate(&p->cell.flux, p->u_q13);
+    p->torque = torque;
+    p->limit = current_limited;
+    /* A torque of 0 is flux_min also where no current makes torque. */
+    if (torque <= 0 || p->flux <= p->flux_min) {
+        p->flux = p->flux_min;
+        p->limit = -1;
+    } else if (p->flux >= p->flux_max) {
+        p->flux = p->flux_max;
+        p->limit = 1;
+    } else if (!current_limited) {
+        return;
+    } else {
+        p->torque = phase_cell_evaluate(&p->cell.torque, p->u_q13);
+        return;
     }
-    return !phase_map_solve(tables, plan->angle, torque_q24, &plan->constraints, point);
+    p->u_q13 = phase_cell_solve_q13(&p->cell.flux, p->flux);
+    p->torque = phase_cell_evaluate(&p->cell.torque, p->u_q13);
 }
 
-/* Sorts the phases of one half past turn-on, last to enter first. Returns their number. */
-static unsigned sort_by_entry(const plan_t *plan, unsigned phases, bool positive, bool reverse,
-                              unsigned order[HAL_PHASES_MAX]) {
-    unsigned count = 0;
-    for (unsigned phase = 0; phase < phases; phase++) {
-        if (plan[phase].positive != positive || plan[phase].since_on >= HALF_REV) {
-            continue;
-        }
-        /* In forward rotation a phase enters the positive half at turn-on, the other half at turn-off. */
-        unsigned index = count++;
-        while (index > 0 && (plan[phase].since_on < plan[order[index - 1]].since_on) == (positive != reverse)) {
-            order[index] = order[index - 1];
-            index--;
-        }
-        order[index] = phase;
-    }
-    return count;
+/* Column in which the operating point is expected, by straight lines. */
+static inline int32_t expected_column(const plan_t *p, int32_t torque, int32_t current_limit_q9) {
+    const int32_t min_q4 = phase_cell_distance_q4(&p->cell.flux, p->flux_min);
+    const int32_t max_q4 = phase_cell_distance_q4(&p->cell.flux, p->flux_max);
+    const int32_t torque_q4 = torque > 0 ? phase_cell_distance_q4(&p->cell.torque, torque) : min_q4;
+    const int32_t distance_q4 = fixed_clamp(torque_q4, min_q4, max_q4);
+    const int32_t limit_column = current_limit_q9 >> MACHINE_COLUMN_BITS;
+    const int32_t column = fixed_add(p->column, fixed_add(distance_q4, COLUMN_Q4 / 2) >> 4);
+    return fixed_clamp(column, 0, limit_column < PHASE_CELL_COLUMN_MAX ? limit_column : PHASE_CELL_COLUMN_MAX);
 }
 
-/* Distributes a torque shortfall (signed, N m, Q7.24) over the phases of one half; returns the rest. */
-static int32_t redistribute_torque(const machine_tables_t *tables, plan_t *plan,
-                                   const predictive_torque_sample_t *sample, bool positive, bool decrease_only,
-                                   int32_t shortfall_q24) {
-    const bool increase = (shortfall_q24 > 0) == positive;
-    if (shortfall_q24 == 0 || (increase && decrease_only)) {
-        return shortfall_q24;
-    }
-    unsigned order[HAL_PHASES_MAX];
-    const unsigned count = sort_by_entry(plan, tables->phases, positive, sample->reverse, order);
-    for (unsigned n = 0; n < count && shortfall_q24 != 0; n++) {
-        plan_t *p = &plan[order[increase ? n : count - 1 - n]];
-        if (p->point.flux_q29 == (increase ? p->constraints.flux_max_q29 : p->constraints.flux_min_q29)) {
-            continue;
+/* Plans the operating point for a torque in units of the tables; true when flux linkage or current limit it. The cell is
+ * that of the last plan, and while *second_cells lasts another one where the point lies outside of it; otherwise the
+ * phase moves to the end of the cell in this period and further in the next. */
+NOINLINE static bool plan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9,
+                                 unsigned *second_cells) {
+    if (!p->located) {
+        if (torque <= 0 && p->flux_min == 0) {
+            p->flux = 0;
+            p->torque = 0;
+            p->limit = -1;
+            return false;
         }
-        const int32_t before_q24 = p->point.torque_q24;
-        const int32_t change_q24 = positive ? shortfall_q24 : fixed_subtract(0, shortfall_q24);
-        (void)plan_torque(tables, p, fixed_add(before_q24, change_q24));
-        const int32_t gained_q24 = fixed_subtract(p->point.torque_q24, before_q24);
-        shortfall_q24 = positive ? fixed_subtract(shortfall_q24, gained_q24) : fixed_add(shortfall_q24, gained_q24);
+        const phase_map_lookup_t lookup = phase_map_lookup(tables, p->angle - HALF_REV);
+        p->located = true;
+        p->cell = phase_cell_at(&lookup, p->column);
     }
-    return shortfall_q24;
+    for (;;) {
+        solve_in_cell(p, torque, current_limit_q9);
+        const bool outside = p->u_q13 == PHASE_CELL_MAX_Q13 || p->u_q13 == -PHASE_CELL_MAX_Q13 - 1;
+        if (!outside || *second_cells == 0) {
+            return p->limit != 0;
+        }
+        --*second_cells;
+        p->column = expected_column(p, torque, current_limit_q9);
+        const phase_map_lookup_t lookup = phase_map_lookup(tables, p->angle - HALF_REV);
+        p->cell = phase_cell_at(&lookup, p->column);
+    }
+}
+
+/* Corrects one phase by the torque shortfall (signed) where it can change in that direction; returns the rest. Of the
+ * half that carries the reference: a shortfall goes to the phase that entered last, an excess is taken from the one
+ * that entered first. Without such a phase an opposed one may reduce its torque. */
+static inline int32_t redistribute_torque(const machine_tables_t *tables, plan_t *plan, bool positive, bool reverse,
+                                          int32_t current_limit_q9, int32_t shortfall, unsigned *second_cells) {
+    const bool increase = (shortfall > 0) == positive;
+    const int8_t limit = increase ? 1 : -1;
+    /* In forward rotation a phase enters the positive half at turn-on, the other half at turn-off. The order of entry
+     * is that of since_on or the reverse; phases before turn-on stay last. */
+    const uint32_t reversal = ((positive != reverse) == increase) ? 0 : HALF_REV - 1;
+    plan_t *corrected = NULL;
+    plan_t *opposed = NULL;
+    uint32_t first = HALF_REV;
+    for (plan_t *p = plan; p < plan + tables->phases; p++) {
+        const uint32_t order = p->since_on ^ reversal;
+        if (p->positive != positive) {
+            opposed = p->limit >= 0 && p->torque > 0 ? p : opposed;
+        } else if (order < first && p->limit != limit) {
+            first = order;
+            corrected = p;
+        }
+    }
+    if (corrected == NULL) {
+        if (opposed == NULL || !increase) {
+            return shortfall;
+        }
+        corrected = opposed;
+    }
+    const int32_t before = corrected->torque;
+    const bool adds = corrected->positive;
+    (void)plan_torque(tables, corrected, adds ? fixed_add(before, shortfall) : fixed_subtract(before, shortfall),
+                      current_limit_q9, second_cells);
+    const int32_t gained = corrected->torque - before;
+    return adds ? shortfall - gained : shortfall + gained;
 }
 
 static void move_windows(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
@@ -94,46 +167,72 @@ static int32_t share_of(int32_t torque_q24, int32_t share_q15) {
     return share_q15 == ONE_Q15 ? torque_q24 : 4 * fixed_multiply_high(torque_q24, share_q15 << 15);
 }
 
-/* Flux linkage that -Vdc removes until `travel` is covered at `angle_step` per period, 2^-32 electrical rev; Wb, Q2.29,
- * saturated. */
-static int32_t removable_flux_q29(int32_t flux_step_max_q29, uint32_t travel, uint32_t angle_step) {
+/* Flux linkage that -Vdc removes until `travel` is covered at `angle_step` per period, 2^-32 electrical rev; in the unit
+ * of flux_step_max, saturated. */
+static inline int32_t removable_flux(int32_t flux_step_max, uint32_t travel, uint32_t angle_step) {
     const uint32_t periods_q8 = travel / ((angle_step >> 8) + 1);
-    return fixed_saturate(fixed_shift((int64_t)flux_step_max_q29 * periods_q8, 8));
+    const uint64_t flux_q8 = (uint64_t)(uint32_t)flux_step_max * periods_q8;
+    return flux_q8 >> 39 != 0 ? INT32_MAX : (int32_t)(flux_q8 >> 8);
 }
 
 /* Predicts the flux linkage of a phase and which flux linkages the coming period can reach from there. */
 static inline void predict_flux(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
                                 const predictive_torque_sample_t *sample, unsigned phase, int32_t flux_step_max_q29,
-                                plan_t *p) {
+                                unsigned flux_shift, plan_t *p) {
     int32_t *flux_q29 = &control->flux_q29[phase];
     /* Q15 * Q29 to Q29. */
     const int32_t applied_q29 = fixed_multiply_high(control->duty_q15[phase] * (1 << 14), flux_step_max_q29 << 3);
-    const int32_t resistive_drop_q29 = flux_observer_step(&parameters->flux, flux_q29, sample->flux_q29[phase],
-                                                          applied_q29, sample->current_q9[phase]);
+    const int32_t resistive_drop_q29 = flux_observer_step(
+        &parameters->flux, flux_q29, (int32_t)((uint32_t)sample->flux[phase] << flux_shift), applied_q29,
+        sample->current_q9[phase]);
     p->freewheeling_q29 = fixed_subtract(*flux_q29, resistive_drop_q29);
-    p->constraints = (phase_map_constraints_t){
-        .flux_min_q29 = non_negative(fixed_subtract(p->freewheeling_q29, flux_step_max_q29)),
-        .flux_max_q29 = non_negative(fixed_add(p->freewheeling_q29, flux_step_max_q29)),
-        .current_limit_q9 = parameters->current_limit_q9,
-    };
+    p->flux_min = non_negative(fixed_subtract(p->freewheeling_q29, flux_step_max_q29)) >> flux_shift;
+    p->flux_max = non_negative(fixed_add(p->freewheeling_q29, flux_step_max_q29)) >> flux_shift;
+}
+
+/* What the phases of one half have in common. */
+typedef struct {
+    const torque_sharing_window_t *window;
+    int32_t torque; /* to share, by magnitude */
+    bool braking;   /* its phases move towards unaligned */
+} half_t;
+
+/* Operating point of a phase two periods ahead; true when voltage or current limit its torque. */
+static inline bool plan_phase(const predictive_torque_parameters_t *parameters, const machine_tables_t *tables,
+                              const half_t *half, plan_t *p, int32_t flux_step_max, uint32_t angle_step,
+                              unsigned *second_cells) {
+    p->since_on = p->angle - half->window->turn_on;
+    const int32_t torque = half->torque > 0 ? share_of(half->torque, torque_sharing_q15(half->window, p->angle)) : 0;
+    if (half->braking && p->flux_max > p->flux_min) {
+        p->flux_max = fixed_clamp(removable_flux(flux_step_max, p->angle - HALF_REV, angle_step), p->flux_min,
+                                  p->flux_max);
+    }
+    return plan_torque(tables, p, torque, parameters->current_limit_q9, second_cells);
 }
 
 /* Duty of each phase from its planned flux linkage. */
 static inline void set_duties(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
-                              const predictive_torque_sample_t *sample, unsigned phases, int32_t flux_step_max_q29,
-                              const plan_t *plan, int32_t duty_q15[HAL_PHASES_MAX]) {
+                              const predictive_torque_sample_t *sample, const machine_tables_t *tables,
+                              int32_t flux_step_max_q29, const plan_t *plan, int32_t duty_q15[HAL_PHASES_MAX]) {
     /* Q15 quotient of two 32-bit numbers, normalised: divisor 2^14..2^15, dividend with 15 fraction bits more. */
     const int shift = __builtin_clz((uint32_t)flux_step_max_q29) - 2;
     const int32_t divisor = (flux_step_max_q29 << shift) >> 15;
-    for (unsigned phase = 0; phase < phases; phase++) {
+    for (unsigned phase = 0; phase < tables->phases; phase++) {
         const plan_t *p = &plan[phase];
-        const int32_t flux_step_q29 = p->point.flux_q29 - p->freewheeling_q29; /* within +-flux_step_max */
-        const int32_t unclamped_q15 = flux_step_q29 * (1 << shift) / divisor;
-        /* Target 0: both switches off. Current above the limit: no positive voltage. */
-        const int32_t duty_max_q15 = sample->current_q9[phase] > parameters->current_limit_q9 ? 0 : ONE_Q15;
-        duty_q15[phase] = p->point.flux_q29 > 0 ? fixed_clamp(unclamped_q15, -ONE_Q15, duty_max_q15) : -ONE_Q15;
-        control->duty_q15[phase] = duty_q15[phase];
-        control->column[phase] = (uint8_t)p->point.column;
+        int32_t duty = -ONE_Q15; /* target 0: both switches off */
+        if (p->flux > 0) {
+            /* Within +-flux_step_max and the truncation to the unit of the tables. */
+            const int32_t flux_step_q29 = p->flux * (1 << tables->flux_format.result_shift) - p->freewheeling_q29;
+            duty = fixed_saturate_bits(flux_step_q29 * (1 << shift) / divisor, DUTY_BITS);
+            if (sample->current_q9[phase] > parameters->current_limit_q9 && duty > 0) {
+                duty = 0; /* no positive voltage */
+            }
+        }
+        duty_q15[phase] = duty;
+        control->duty_q15[phase] = duty;
+        /* The column in which the point lies. */
+        control->column[phase] =
+            (uint8_t)fixed_clamp(p->column + ((p->u_q13 + PHASE_CELL_HALF_Q13) >> 13), 0, PHASE_CELL_COLUMN_MAX);
     }
 }
 
@@ -145,10 +244,13 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
                             const machine_tables_t *tables, const predictive_torque_sample_t *sample,
                             int32_t duty_q15[HAL_PHASES_MAX]) {
     const unsigned phases = tables->phases;
-    /* Vdc Ts: Q6 * Q40 to Q29; at least 64, so that the division in set_duties() is defined without a DC link. */
+    /* Vdc Ts: Q6 * Q40 to Q29. */
     const int32_t flux_step_max_q29 =
-        fixed_clamp(fixed_multiply_high(sample->bus_voltage_q6 << 15, parameters->period_q40), 64, FLUX_STEP_LIMIT_Q29);
+        fixed_clamp(fixed_multiply_high(sample->bus_voltage_q6 << 15, parameters->period_q40), FLUX_STEP_MIN_Q29,
+                    FLUX_STEP_LIMIT_Q29);
 
+    const unsigned torque_shift = tables->torque_format.result_shift;
+    const unsigned flux_shift = tables->flux_format.result_shift;
     const int32_t torque_q24 = sample->torque_q24;
     const int32_t opposed_q24 = fixed_clamp(parameters->reserve_q24 - fixed_abs(torque_q24), 0, INT32_MAX);
     const int32_t positive_half_q24 = fixed_add(torque_q24 > 0 ? torque_q24 : 0, opposed_q24);
@@ -159,44 +261,36 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     const torque_sharing_window_t *base_window = &parameters->base_window;
     const torque_sharing_window_t advanced_window =
         advance_q15 > 0 ? torque_sharing_window(&parameters->sharing, advance_q15) : *base_window;
+    /* Windows advance against the rotation, which would be later for a braking phase. */
+    const half_t half[2] = {
+        {sample->reverse ? &advanced_window : base_window, negative_half_q24 >> torque_shift, !sample->reverse},
+        {sample->reverse ? base_window : &advanced_window, positive_half_q24 >> torque_shift, sample->reverse},
+    };
 
     plan_t plan[HAL_PHASES_MAX];
-    int32_t shortfall_q24 = torque_q24;
+    int32_t shortfall = torque_q24 >> torque_shift;
+    unsigned second_cells = parameters->second_cells;
     bool limited = false;
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
-        predict_flux(parameters, control, sample, phase, flux_step_max_q29, p);
+        predict_flux(parameters, control, sample, phase, flux_step_max_q29, flux_shift, p);
         const uint32_t angle = sample->angle[phase];
         p->positive = angle >= HALF_REV;
         p->angle = p->positive ? angle : ~angle; /* mirrored, to 1 LSB */
-        p->point.column = control->column[phase];
-        const bool braking = p->positive == sample->reverse; /* it moves towards unaligned */
-        /* Windows advance against the rotation, which would be later for a braking phase. */
-        const torque_sharing_window_t *window = braking ? base_window : &advanced_window;
-        p->since_on = p->angle - window->turn_on;
-        const int32_t half_q24 = p->positive ? positive_half_q24 : negative_half_q24;
-        int32_t target_q24 = 0;
-        if (half_q24 > 0) {
-            target_q24 = share_of(half_q24, torque_sharing_q15(window, p->angle));
-        }
-        if (braking && p->constraints.flux_max_q29 > p->constraints.flux_min_q29) {
-            const int32_t removable_q29 =
-                removable_flux_q29(flux_step_max_q29, p->angle - HALF_REV, sample->angle_step);
-            p->constraints.flux_max_q29 =
-                fixed_clamp(removable_q29, p->constraints.flux_min_q29, p->constraints.flux_max_q29);
-        }
-        limited |= plan_torque(tables, p, target_q24);
-        const int32_t planned_q24 = p->point.torque_q24;
-        shortfall_q24 =
-            p->positive ? fixed_subtract(shortfall_q24, planned_q24) : fixed_add(shortfall_q24, planned_q24);
+        p->column = control->column[phase];
+        p->u_q13 = 0;
+        p->located = false;
+        limited |= plan_phase(parameters, tables, &half[p->positive], p, flux_step_max_q29 >> flux_shift,
+                              sample->angle_step, &second_cells);
+        shortfall = p->positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
     }
 
     control->torque_shortfall_q24 = 0;
     if (limited) {
-        const bool positive = torque_q24 >= 0;
-        shortfall_q24 = redistribute_torque(tables, plan, sample, positive, false, shortfall_q24);
-        shortfall_q24 = redistribute_torque(tables, plan, sample, !positive, true, shortfall_q24);
+        shortfall = redistribute_torque(tables, plan, torque_q24 >= 0, sample->reverse, parameters->current_limit_q9,
+                                        shortfall, &second_cells);
+        const int32_t shortfall_q24 = phase_map_scale(&tables->torque_format, shortfall);
         control->torque_shortfall_q24 = fixed_abs(shortfall_q24) > SHORTFALL_TOLERANCE_Q24 ? shortfall_q24 : 0;
     }
-    set_duties(parameters, control, sample, phases, flux_step_max_q29, plan, duty_q15);
+    set_duties(parameters, control, sample, tables, flux_step_max_q29, plan, duty_q15);
 }

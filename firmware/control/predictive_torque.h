@@ -36,7 +36,6 @@
 
 #include "control/flux_observer.h"
 #include "control/machine_tables.h"
-#include "control/phase_map.h"
 #include "control/torque_sharing.h"
 #include "hal.h"
 
@@ -47,6 +46,7 @@ typedef struct {
     int32_t period_q40;                  /* Ts in s, Q-9.40 */
     int32_t current_limit_q9;            /* A, Q7.9 */
     int32_t reserve_q24;                 /* N m, Q7.24, >= 0 */
+    unsigned second_cells;               /* cells per period beyond one for each phase */
     int32_t advance_step_q30;            /* per period with torque shortfall, Q1.30 */
     int32_t retract_step_q30;            /* per period without, Q1.30 */
 } predictive_torque_parameters_t;
@@ -61,7 +61,7 @@ typedef struct {
 
 typedef struct {
     const int32_t *current_q9; /* A, Q7.9, by phase, at the sample */
-    const int32_t *flux_q29;   /* from the tables, Wb, Q2.29, by phase, at the sample */
+    const int32_t *flux;       /* from the tables, in their unit, by phase, at the sample */
     const uint32_t *angle;     /* two periods after the sample, 2^-32 electrical rev, by phase */
     int32_t bus_voltage_q6;    /* DC-link voltage, V, Q9.6 */
     int32_t torque_q24;        /* reference, N m, Q7.24 */

@@ -15,7 +15,6 @@ void pwm_ditc_reset(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc) {
 }
 
 pwm_ditc_setpoints_t pwm_ditc_setpoints(const machine_tables_t *tables, uint32_t crossover_angle) {
-    const phase_map_lookup_t crossover = phase_map_lookup(tables, crossover_angle);
     pwm_ditc_setpoints_t setpoints = {{0}};
     for (unsigned k = 1; k < PWM_DITC_SETPOINTS; k++) {
         const uint32_t entry_q24 = ((4u + k % 4u) << (k / 4u + SETPOINT_UNIT_BITS - 2u)) - (1u << SETPOINT_UNIT_BITS);
@@ -23,7 +22,9 @@ pwm_ditc_setpoints_t pwm_ditc_setpoints(const machine_tables_t *tables, uint32_t
         /* Largest current whose torque does not exceed it, by bisection. */
         uint32_t current_q9 = 0;
         for (uint32_t bit = 1u << 15; bit > 0; bit >>= 1) {
-            if (phase_map_torque_q24(&crossover, (int32_t)(current_q9 | bit)) <= torque_q24) {
+            const int32_t trial_q9 = fixed_clamp((int32_t)(current_q9 | bit), 0, PHASE_MAP_CURRENT_MAX_Q9);
+            const int32_t torque = phase_map_torque(tables, crossover_angle, trial_q9);
+            if (phase_map_scale(&tables->torque_format, torque) <= torque_q24) {
                 current_q9 |= bit;
             }
         }
@@ -75,7 +76,8 @@ void pwm_ditc_step(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc, co
         duty_q15[active] = incoming_duty_q15(parameters, sample, sample->current_q9[active]);
         const int32_t eighth_q24 = fixed_clamp(sample->reference_q24 / 8, 0, parameters->depleted_torque_q24);
         const int32_t threshold_q24 = eighth_q24 > DEPLETED_MIN_Q24 ? eighth_q24 : DEPLETED_MIN_Q24;
-        const bool depleted = sample->torque_q24[ditc->regulated] < threshold_q24 && sample->error_q24 <= 0;
+        const bool depleted =
+            sample->torque[ditc->regulated] < threshold_q24 >> parameters->torque_shift && sample->error_q24 <= 0;
         if (depleted || ditc->regulated != commutation->outgoing) {
             bp_pid_preset(&ditc->pid, duty_q15[active]);
             ditc->regulated = active;

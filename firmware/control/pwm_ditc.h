@@ -46,6 +46,7 @@ typedef struct {
     int32_t depleted_torque_q24;  /* upper limit of the depletion threshold, N m, Q7.24, >= 0 */
     int32_t band_outer_q24;       /* N m, Q7.24 */
     int32_t current_limit_q9;     /* A, Q7.9 */
+    uint8_t torque_shift;         /* unit of the tables, 2^torque_shift of Q7.24 */
 } pwm_ditc_parameters_t;
 
 typedef struct {
@@ -55,7 +56,7 @@ typedef struct {
 
 typedef struct {
     const int32_t *current_q9; /* A, Q7.9, by phase */
-    const int32_t *torque_q24; /* N m, Q7.24, by phase */
+    const int32_t *torque;     /* by phase, unit of the tables */
     int32_t reference_q24;     /* N m, Q7.24, >= 0 */
     int32_t error_q24;         /* reference - total torque, N m, Q7.24 */
 } pwm_ditc_sample_t;

@@ -188,6 +188,8 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
         .period_q40 = (int32_t)fixed_divide((int64_t)1 << 40, rate),
         .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
+        /* At 20 kHz a phase can move further in a period than a cell holds, and there is time. */
+        .second_cells = control_rate_hz <= 20000u ? phases : 1u,
         .advance_step_q30 = (int32_t)fixed_divide(10 * ((int64_t)1 << 30), rate),
         .retract_step_q30 = (int32_t)fixed_divide((int64_t)1 << 30, rate),
     };
@@ -263,6 +265,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                 .depleted_torque_q24 = (int32_t)fixed_divide((int64_t)control_rate_hz << 20, GAIN_RATE_HZ),
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
                 .current_limit_q9 = current_limit_q9,
+                .torque_shift = tables->torque_format.result_shift,
             },
         .trim = trim_from(values),
         .predictive = predictive_from(values, tables->phases, control_rate_hz),

@@ -93,8 +93,9 @@ typedef struct {
     int32_t current_max_q9;                   /* largest phase current, A, Q7.9 */
     int32_t torque_sum_q24;                   /* machine torque, N m, Q7.24, saturated */
     int32_t current_q9[HAL_PHASES_MAX];       /* A, Q7.9 */
-    int32_t torque_q24[HAL_PHASES_MAX];       /* N m, Q7.24 */
-    int32_t flux_linkage_q29[HAL_PHASES_MAX]; /* Wb, Q2.29, with predictive torque control only */
+    /* In units of the tables, machine_format_t: */
+    int32_t torque[HAL_PHASES_MAX];
+    int32_t flux_linkage[HAL_PHASES_MAX]; /* with predictive torque control only */
 } control_measurement_t;
 
 typedef struct {

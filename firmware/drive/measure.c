@@ -31,13 +31,6 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
     measured->angle = edge + (uint32_t)fixed_shift((int64_t)angle_per_tick_q19 * (int32_t)encoder->edge_age_ticks, 19);
 }
 
-NOINLINE static int32_t look_up_torque_and_flux(const machine_tables_t *tables, uint32_t angle, int32_t current_q9,
-                                                int32_t *flux_linkage_q29) {
-    const phase_map_lookup_t place = phase_map_lookup(tables, angle);
-    *flux_linkage_q29 = phase_map_flux_q29(&place, current_q9);
-    return phase_map_torque_q24(&place, current_q9);
-}
-
 void measure(const control_parameters_t *parameters, const load_observer_t *observer,
              const misalignment_t *misalignment, const control_sample_t *sample, control_measurement_t *measured) {
     measure_angle(parameters, observer, &sample->encoder, measured);
@@ -47,22 +40,22 @@ void measure(const control_parameters_t *parameters, const load_observer_t *obse
     const unsigned phases = tables->phases;
     const bool with_flux = parameters->torque_law == TORQUE_LAW_PREDICTIVE;
     int32_t current_max_q9 = 0;
-    int32_t torque_sum_q24 = 0;
+    int32_t torque_sum = 0;
     for (unsigned phase = 0; phase < phases; phase++) {
         const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], parameters->current_scale_q18);
-        measured->current_q9[phase] = current_q9;
-        measured->torque_q24[phase] = 0;
-        measured->flux_linkage_q29[phase] = 0;
+        int32_t torque = 0;
+        int32_t flux = 0;
         if (current_q9 > 0) { /* false for most phases at any time */
             const uint32_t angle = measured_phase_angle(parameters, misalignment, measured, phase);
-            const int32_t torque_q24 =
-                with_flux ? look_up_torque_and_flux(tables, angle, current_q9, &measured->flux_linkage_q29[phase])
-                          : phase_map_torque_at_q24(tables, angle, current_q9);
-            measured->torque_q24[phase] = torque_q24;
-            torque_sum_q24 = fixed_add(torque_sum_q24, torque_q24);
+            torque = with_flux ? phase_map_torque_and_flux(tables, angle, current_q9, &flux)
+                               : phase_map_torque(tables, angle, current_q9);
+            torque_sum = fixed_add(torque_sum, torque);
             current_max_q9 = current_q9 > current_max_q9 ? current_q9 : current_max_q9;
         }
+        measured->current_q9[phase] = current_q9;
+        measured->torque[phase] = torque;
+        measured->flux_linkage[phase] = flux;
     }
     measured->current_max_q9 = current_max_q9;
-    measured->torque_sum_q24 = torque_sum_q24;
+    measured->torque_sum_q24 = phase_map_scale(&tables->torque_format, torque_sum);
 }

@@ -36,7 +36,7 @@ static void duty_control(const control_parameters_t *parameters, control_state_t
                          const control_measurement_t *measured) {
     const pwm_ditc_sample_t sample = {
         .current_q9 = measured->current_q9,
-        .torque_q24 = measured->torque_q24,
+        .torque = measured->torque,
         .reference_q24 = state->torque_reference_q24,
         .error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24),
     };
@@ -79,7 +79,7 @@ static void predictive_control(const control_parameters_t *parameters, control_s
                                                  measured->torque_sum_q24, voltage_limited);
     const predictive_torque_sample_t sample = {
         .current_q9 = measured->current_q9,
-        .flux_q29 = measured->flux_linkage_q29,
+        .flux = measured->flux_linkage,
         .angle = phase_angle_ahead,
         .bus_voltage_q6 = measured->dc_link_voltage_q6,
         .torque_q24 = trimmed_q24,

@@ -42,8 +42,12 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
             f"    .angle_bin_row = {{{_listed(tables.cell_row())}}},",
             *_format_lines("torque_format", tables.torque_per_ampere),
             *_format_lines("flux_format", tables.flux_per_ampere),
-            "    .column = {",
-            *(line for column in range(len(CURRENT_A)) for line in _column_lines(tables, column)),
+            "    .node = {",
+            *_column_lines(tables.torque_per_ampere.node - NODE_OFFSET, tables.flux_per_ampere.node - NODE_OFFSET),
+            "    },",
+            "    .curvature = {",
+            *_column_lines(*(np.pad(surface.bend, ((0, 1), (0, 0)))
+                             for surface in (tables.torque_per_ampere, tables.flux_per_ampere))),
             "    },",
             "};",
             "",
@@ -60,16 +64,9 @@ def _format_lines(name: str, surface: Surface) -> list[str]:
     ]
 
 
-def _column_lines(tables: PhaseMap, column: int) -> list[str]:
-    torque, flux = tables.torque_per_ampere, tables.flux_per_ampere
-    return [
-        "        {",
-        f"            .torque_node = {{{_listed(torque.node[:, column] - NODE_OFFSET)}}},",
-        f"            .flux_node = {{{_listed(flux.node[:, column] - NODE_OFFSET)}}},",
-        f"            .torque_curvature = {{{_listed(torque.bend[:, column])}}},",
-        f"            .flux_curvature = {{{_listed(flux.bend[:, column])}}},",
-        "        },",
-    ]
+def _column_lines(torque: np.ndarray, flux: np.ndarray) -> list[str]:
+    """Arrays by row and column in the layout of firmware/control/machine_tables.h."""
+    return [f"        {_listed(of[:, column])}," for column in range(len(CURRENT_A)) for of in (torque, flux)]
 
 
 def _listed(values: np.ndarray) -> str:

@@ -81,7 +81,7 @@ class PhaseMap:
         """Start and reciprocal of each `machine_row_t`."""
         starts = [int(start) * (_HALF_PITCH // ROW_UNITS) for start in self.row_start]
         widths = [following - start for start, following in pairwise(starts)]
-        return list(zip(starts, [*((1 << 47) // width for width in widths), 0], strict=True))
+        return list(zip(starts, [*((1 << 46) // width for width in widths), 0], strict=True))
 
     def cell_row(self) -> np.ndarray:
         """(CELLS,): the row in which each of the equal parts of half a pitch begins."""
