@@ -9,6 +9,7 @@
 extern "C" {
 #include "comms/e2e.h"
 #include "drive.h"
+#include "drive_codec.h"
 #include "hal_adc.h"
 #include "hal_can.h"
 #include "hal_encoder.h"
@@ -16,7 +17,6 @@ extern "C" {
 #include "hal_pwm.h"
 #include "hal_time.h"
 }
-#include "drive_codec.h"
 #include "support/frames.h"
 
 struct hal {
