@@ -55,7 +55,7 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
 def _format_lines(name: str, surface: Surface) -> list[str]:
     return [
         f"    .{name} = {{",
-        f"        .curvature_shift = {surface.bend_shift},",
+        f"        .curvature_shift = {surface.curvature_shift},",
         f"        .result_shift = {surface.result_shift},",
         "    },",
     ]
@@ -67,8 +67,8 @@ def _column_lines(tables: PhaseMap, column: int) -> list[str]:
         "        {",
         f"            .torque_node = {{{_listed(torque.node[:, column] - NODE_OFFSET)}}},",
         f"            .flux_node = {{{_listed(flux.node[:, column] - NODE_OFFSET)}}},",
-        f"            .torque_curvature = {{{_listed(torque.bend[:, column])}}},",
-        f"            .flux_curvature = {{{_listed(flux.bend[:, column])}}},",
+        f"            .torque_curvature = {{{_listed(torque.curvature[:, column])}}},",
+        f"            .flux_curvature = {{{_listed(flux.curvature[:, column])}}},",
         "        },",
     ]
 
