@@ -4,7 +4,8 @@ set(SALIENT_GENERATOR_SOURCES ${CMAKE_SOURCE_DIR}/tools/src/salient)
 set(SALIENT_GENERATOR ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m)
 
 set(SALIENT_CODEC_GENERATOR generate/codec.py generate/enumerations.py generate/telemetry.py generate/error.py
-    dbc.py)
+    generate/files.py dbc.py)
+list(TRANSFORM SALIENT_CODEC_GENERATOR PREPEND ${SALIENT_GENERATOR_SOURCES}/)
 
 # Machines that drives are built for: the bundled ones, and one more on request.
 if(SALIENT_MACHINE_FILE AND NOT EXISTS ${SALIENT_MACHINE_FILE})
@@ -36,11 +37,10 @@ function(salient_generate_codec target dbc)
         list(APPEND outputs ${out}/${name}_enumerations.h ${out}/${name}_telemetry.c ${out}/${name}_telemetry.h)
         list(APPEND sources ${out}/${name}_telemetry.c)
     endif()
-    list(TRANSFORM SALIENT_CODEC_GENERATOR PREPEND ${SALIENT_GENERATOR_SOURCES}/ OUTPUT_VARIABLE generator)
     add_custom_command(
         OUTPUT ${outputs}
         COMMAND ${SALIENT_GENERATOR} salient.generate.codec ${flags} ${dbc} ${out}
-        DEPENDS ${dbc} ${generator}
+        DEPENDS ${dbc} ${SALIENT_CODEC_GENERATOR}
         COMMENT "CAN codec from ${name}.dbc"
         VERBATIM)
     add_library(${target} STATIC ${sources})
@@ -54,8 +54,7 @@ function(salient_generate_bench_variables target dbc)
     add_custom_command(
         OUTPUT ${out}/bench_variables.h
         COMMAND ${SALIENT_GENERATOR} salient.generate.bench_variables ${dbc} ${out}
-        DEPENDS ${dbc} ${SALIENT_GENERATOR_SOURCES}/generate/bench_variables.py
-                ${SALIENT_GENERATOR_SOURCES}/generate/codec.py
+        DEPENDS ${dbc} ${SALIENT_GENERATOR_SOURCES}/generate/bench_variables.py ${SALIENT_CODEC_GENERATOR}
         COMMENT "bench variables"
         VERBATIM)
     add_custom_target(${target}_header DEPENDS ${out}/bench_variables.h)
@@ -77,7 +76,8 @@ function(salient_add_machines)
         add_custom_command(
             OUTPUT ${out}/machine_tables.c ${out}/machine_plant.c
             COMMAND ${SALIENT_GENERATOR} salient.generate.machine ${file} ${out}
-            DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate/machine.py ${generator_sources}
+            DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate/machine.py
+                    ${SALIENT_GENERATOR_SOURCES}/generate/files.py ${generator_sources}
             DEPFILE ${out}/machine.d # of a map: its CSV file
             COMMENT "machine ${name}"
             VERBATIM)

@@ -182,8 +182,8 @@ def make_environment(install: bool) -> None:
 
 
 def _pip_failure(log: Path) -> str:
-    """The cause in pip's output. An index that cannot be reached shows as warnings about retries; the last line then
-    only says that no version was found."""
+    """The cause in pip's output. An index that cannot be reached shows as warnings about retries; the last line is
+    then only that no version was found."""
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
     for line in lines:
         retry = re.search(r"Retry\(total=0,.* after connection broken by '\w+\((.*)\)': /\S*$", line)

@@ -16,7 +16,7 @@ static_assert(OPTIONS_ADC_BITS_MIN == HAL_ADC_BITS_MIN && OPTIONS_ADC_BITS_MAX =
 static_assert(OPTIONS_BIT_RATE_MIN == CAN_BUS_BIT_RATE_MIN && OPTIONS_BIT_RATE_MAX == CAN_BUS_BIT_RATE_MAX,
               "the record and the emulated bus disagree on bit rates");
 
-/* Return values of getopt_long: numbers of options from 1, because 0 has a meaning of its own. */
+/* Return values of getopt_long: numbers of options from 1, because getopt_long returns 0 for another purpose. */
 enum { HELP = OPTION_COUNT + 1 };
 
 static options_result_t mistake(const char *format, ...) __attribute__((format(printf, 1, 2)));

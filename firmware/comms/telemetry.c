@@ -60,6 +60,7 @@ static void enqueue_background(telemetry_t *telemetry, drive_telemetry_group_t g
         } else {
             enqueue(telemetry, due[i], values);
             telemetry->background_queued = true;
+            telemetry->background_identifier = due[i]->identifier;
         }
     }
 }
@@ -99,22 +100,12 @@ void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
     telemetry->cycle = (uint8_t)(telemetry->cycle + cycles);
 }
 
-static bool is_background(const hal_can_frame_t *frame) {
-    for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
-        const drive_telemetry_message_t *message = &drive_telemetry_messages[i];
-        if (message->identifier == frame->identifier) {
-            return message->group == DRIVE_TELEMETRY_GROUP_BACKGROUND || message->group == DRIVE_TELEMETRY_GROUP_IDLE;
-        }
-    }
-    return false;
-}
-
 void telemetry_flush(telemetry_t *telemetry, hal_t *hal) {
     unsigned filled = 0; /* mailboxes filled in this call, since a background frame entered one */
     const hal_can_frame_t *frame;
     while ((frame = frame_queue_peek(&telemetry->queue)) != NULL && hal_can_transmit(hal, frame)) {
         filled++;
-        if (is_background(frame)) {
+        if (telemetry->background_queued && frame->identifier == telemetry->background_identifier) {
             telemetry->background_queued = false;
             telemetry->background_in_mailbox = true;
             filled = 0;

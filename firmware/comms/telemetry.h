@@ -30,10 +30,11 @@ typedef struct {
     uint8_t cycle;                                /* number of the next cycle */
     uint16_t countdown[DRIVE_TELEMETRY_MESSAGES]; /* cycles until each message is due */
     bool in_fault;
-    uint32_t fault_time_us;     /* of the fault reported last */
-    bool background_queued;     /* a frame of `background` or `idle` is in the queue */
-    bool background_in_mailbox; /* one may be in a mailbox */
-    uint16_t dropped;           /* frames, since start; saturates at 65535 */
+    uint32_t fault_time_us;         /* of the fault reported last */
+    uint32_t background_identifier; /* of the frame that background_queued is about */
+    bool background_queued;         /* a frame of `background` or `idle` is in the queue */
+    bool background_in_mailbox;     /* one may be in a mailbox */
+    uint16_t dropped;               /* frames, since start; saturates at 65535 */
     frame_queue_t queue;
 } telemetry_t;
 

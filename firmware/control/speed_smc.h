@@ -7,7 +7,7 @@
  * with the load torque T_L and the speed w from the load observer. Reaching law: (10) of the paper is misprinted and
  * never moves the motor (H stays below 0.23 rad/s^2). Its source is X. Zhang, L. Sun, K. Zhao, L. Sun, "Nonlinear speed
  * control for PMSM system using sliding-mode control and disturbance compensation techniques", IEEE Trans. Power
- * Electron. 28(3), 2013, used here with a gain k:
+ * Electron. 28(3), 2013, used here:
  *
  *   H = k / (eps + (1 - eps + 1/|x|) e^(-delta |s|)) = k |x| / (eps |x| + ((1 - eps) |x| + 1) e^(-delta |x|))
  *

@@ -48,7 +48,11 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     observe(parameters, state, measured);
     const uint64_t fault_mask = protect(parameters, state, sample, command, measured);
     *compare = (hal_pwm_compare_t){{0}, {0}};
+    const bool was_running = state->state_machine.state == DRIVE_STATE_RUN;
     if (!supervise(parameters, state, sample, command, measured, fault_mask)) {
+        if (was_running) {
+            control_prepare(parameters, state);
+        }
         return false;
     }
     speed_control(parameters, state, sample, command);

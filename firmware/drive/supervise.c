@@ -16,13 +16,11 @@ static void complete_record(fault_record_t *record, const control_state_t *state
     record->dc_link_voltage_q6 = (uint16_t)measured->dc_link_voltage_q6;
 }
 
-static void leave_state(const control_parameters_t *parameters, control_state_t *state,
-                        const control_measurement_t *measured, drive_state_t left) {
+static void leave_state(control_state_t *state, const control_measurement_t *measured, drive_state_t left) {
     if (left == DRIVE_STATE_FAULT) {
         observe_reset(state, measured); /* its estimate may stem from a faulty encoder */
     }
     if (left == DRIVE_STATE_RUN) {
-        control_prepare(parameters, state);
         state->speed_reference_q22 = 0;
         state->torque_reference_q24 = 0;
     }
@@ -48,7 +46,7 @@ bool supervise(const control_parameters_t *parameters, control_state_t *state, c
         complete_record(&state_machine->record, state, sample, measured);
     }
     if (state_machine->state != before) {
-        leave_state(parameters, state, measured, before);
+        leave_state(state, measured, before);
         enter_state(parameters, state, state_machine->state);
     }
     return state_machine->state == DRIVE_STATE_RUN;

@@ -27,8 +27,8 @@ GRIDS = {"map_regular": (REGULAR_DEG, REGULAR_A), "map_irregular": irregular()}
 
 
 @dataclass(frozen=True)
-class Figures:
-    """Recordings of one machine: a start, and a load step at each of ANGLES_DEG."""
+class Metrics:
+    """Metrics of one machine: a start, and a load step at each of ANGLES_DEG."""
 
     settling_time_s: float
     dips_rpm: np.ndarray
@@ -43,7 +43,7 @@ def paper_scenario(name: str) -> Scenario:
     return scenario
 
 
-def figures_of(machine: str, folder: Path) -> Figures:
+def metrics_of(machine: str, folder: Path) -> Metrics:
     start = run_scenario(replace(paper_scenario("start_600"), machine=machine, duration_s=0.15), folder / "start")
     step = replace(paper_scenario("load_step_150"), machine=machine)
     steps, squares = [], []
@@ -56,7 +56,7 @@ def figures_of(machine: str, folder: Path) -> Figures:
         window = recording[(time_s >= RIPPLE_WINDOW_S[0]) & (time_s <= RIPPLE_WINDOW_S[1])]
         squares.append([np.mean(window[f"current_{phase}_A"].astype(float) ** 2) for phase in "abc"])
         result.recording_path.unlink()
-    return Figures(
+    return Metrics(
         settling_time_s=start_metrics(start.recording, 600.0)["settling_time_s"],
         dips_rpm=np.array([one["speed_dip_rpm"] for one in steps]),
         torques_Nm=np.array([one["torque_mean_Nm"] for one in steps]),
@@ -66,14 +66,14 @@ def figures_of(machine: str, folder: Path) -> Figures:
 
 
 @pytest.fixture(scope="module")
-def of_formula(tmp_path_factory) -> Figures:
-    return figures_of("saturating", tmp_path_factory.mktemp("formula"))
+def of_formula(tmp_path_factory) -> Metrics:
+    return metrics_of("saturating", tmp_path_factory.mktemp("formula"))
 
 
 @pytest.mark.parametrize("grid", GRIDS)
 def test_drive_of_a_map_performs_as_the_drive_of_its_formula(grid, of_formula, tmp_path):
     points = rows(formula("saturating"), *GRIDS[grid])
-    of_map = figures_of(str(write_machine(tmp_path, grid, csv_text(points))), tmp_path)
+    of_map = metrics_of(str(write_machine(tmp_path, grid, csv_text(points))), tmp_path)
     for name in ("settling_time_s", "dips_rpm", "torques_Nm", "ripples", "currents_A"):
         expected, measured = getattr(of_formula, name), getattr(of_map, name)
         single = np.max(np.abs(measured / expected - 1.0))

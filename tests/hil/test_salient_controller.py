@@ -77,7 +77,7 @@ def mean_dip_rpm(run_recorded, parameters: dict[str, float] | None = None, **opt
 
 
 @dataclass(frozen=True)
-class Figures:
+class Metrics:
     settling_s: Range
     dip_rpm: Range
     recovery_s: Range
@@ -87,11 +87,11 @@ class Figures:
 
 
 MACHINES = {
-    "saturating": Figures((0.068, 0.0705), (1.8, 3.0), (0.0015, 0.003), (0.006, 0.0100), (0.004, 0.0065)),
-    "linear_cosine": Figures((0.068, 0.0705), (1.6, 2.8), (0.0013, 0.003), (0.005, 0.0100), (0.003, 0.0065)),
-    "linear_trapezoid": Figures((0.068, 0.0705), (1.9, 3.2), (0.0015, 0.003), (0.004, 0.0100), (0.0025, 0.0065)),
+    "saturating": Metrics((0.068, 0.0705), (1.8, 3.0), (0.0015, 0.003), (0.006, 0.0100), (0.004, 0.0065)),
+    "linear_cosine": Metrics((0.068, 0.0705), (1.6, 2.8), (0.0013, 0.003), (0.005, 0.0100), (0.003, 0.0065)),
+    "linear_trapezoid": Metrics((0.068, 0.0705), (1.9, 3.2), (0.0015, 0.003), (0.004, 0.0100), (0.0025, 0.0065)),
     # A fifth of the inertia, and a converter with minimum pulses and device drops that the drive does not model.
-    "finite_element": Figures((0.030, 0.033), (6.0, 11.0), (0.005, 0.011), (0.010, 0.022), (0.0045, 0.0095)),
+    "finite_element": Metrics((0.030, 0.033), (6.0, 11.0), (0.005, 0.011), (0.010, 0.022), (0.0045, 0.0095)),
 }
 
 

@@ -1,9 +1,9 @@
-"""Vectorised reference: the model of reference_plant.py for many machines and runs, one lane of NumPy arrays per run.
+"""Vectorised reference: the model of reference_plant.py for many machines and runs, one row of NumPy arrays per run.
 
 SciPy's DOP853 costs a Python call a stage; here its tableau and its error estimate (the attributes of the public class)
-step all lanes together, each at its own step length. As in reference_plant.py the state is flux linkages, speed
+step all runs together, each at its own step length. As in reference_plant.py the state is flux linkages, speed
 and angle, formulas follow their sources, and steps end at switch edges, where a flux linkage reaches zero and where the
-magnetics are not smooth. test_plant_properties.py compares some lanes with reference_plant.run_reference.
+magnetics are not smooth. test_plant_properties.py compares some runs with reference_plant.run_reference.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = np.ndarray
 
 
 class Machines:
-    """Machine data of all lanes, one row per lane. The lanes are in the order of FORMS, so each form is a slice."""
+    """Machine data of all runs, one row per run. The runs are in the order of FORMS, so each form is a slice."""
 
     def __init__(self, machines: Sequence[Machine]) -> None:
         forms = [machine.magnetics.form for machine in machines]
@@ -51,7 +51,7 @@ class Machines:
             row[: len(reference.corners)] = reference.corners
 
     def shape(self, angle: Array) -> tuple[Array, Array]:
-        """f and df/dtheta of all phases at rotor angles (lanes)."""
+        """f and df/dtheta of all phases at rotor angles (by row)."""
         wrapped = angle[:, None] - self.offset
         wrapped = wrapped - 2 * self.half_pitch * np.round(wrapped / (2 * self.half_pitch))
         x, sign = np.abs(wrapped), np.sign(wrapped)
@@ -117,10 +117,10 @@ class Machines:
 
 
 class Schedule:
-    """Converter voltages of each lane: pieces of constant voltage of whole nanoseconds."""
+    """Converter voltages of each run: pieces of constant voltage of whole nanoseconds."""
 
     def __init__(self, machines: Sequence[Machine], runs: Sequence[Run]) -> None:
-        lanes = []
+        rows = []
         for machine, run in zip(machines, runs, strict=True):
             pieces = []
             for period, (upper, lower) in enumerate(run.compares):
@@ -128,33 +128,33 @@ class Schedule:
                     volts = [(number - 1) * machine.supply_voltage_V for number in on]
                     ends = period + 1 if end_ns == run.period_ns else 0
                     pieces.append((end_ns - start_ns, ends, [*volts, *[0.0] * (PHASES_MAX - len(volts))]))
-            lanes.append(pieces)
-        longest = max(map(len, lanes))
-        self.count = np.array([len(pieces) for pieces in lanes])
-        self.length_s = np.zeros((len(lanes), longest))
-        self.period_end = np.zeros((len(lanes), longest), dtype=int)  # period that ends here; 0: none
-        self.volts = np.zeros((len(lanes), longest, PHASES_MAX))
-        for lane, pieces in enumerate(lanes):
+            rows.append(pieces)
+        longest = max(map(len, rows))
+        self.count = np.array([len(pieces) for pieces in rows])
+        self.length_s = np.zeros((len(rows), longest))
+        self.period_end = np.zeros((len(rows), longest), dtype=int)  # period that ends here; 0: none
+        self.volts = np.zeros((len(rows), longest, PHASES_MAX))
+        for row, pieces in enumerate(rows):
             for index, (length_ns, ends, volts) in enumerate(pieces):
-                self.length_s[lane, index] = length_ns * 1e-9
-                self.period_end[lane, index] = ends
-                self.volts[lane, index] = volts
+                self.length_s[row, index] = length_ns * 1e-9
+                self.period_end[row, index] = ends
+                self.volts[row, index] = volts
 
 
-def run_lanes(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
+def run_batch(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
     """States at the start of each period and at the end, for runs of equal length; machines sorted by form."""
-    lanes = len(runs)
-    everything = np.arange(lanes)
+    rows = len(runs)
+    all_rows = np.arange(rows)
     model, schedule = Machines(machines), Schedule(machines, runs)
     periods = len(runs[0].compares)
     load = np.array([run.load_torque_Nm for run in runs])
     supply = np.array([machine.supply_voltage_V for machine in machines])
 
-    y = np.zeros((lanes, PHASES_MAX + 2))
-    start = np.zeros((lanes, PHASES_MAX))
-    for lane, run in enumerate(runs):
-        start[lane, : len(run.currents_A)] = run.currents_A
-        y[lane, SPEED], y[lane, ANGLE] = run.speed_rad_s, np.radians(run.angle_deg)
+    y = np.zeros((rows, PHASES_MAX + 2))
+    start = np.zeros((rows, PHASES_MAX))
+    for row, run in enumerate(runs):
+        start[row, : len(run.currents_A)] = run.currents_A
+        y[row, SPEED], y[row, ANGLE] = run.speed_rad_s, np.radians(run.angle_deg)
     f, _ = model.shape(y[:, ANGLE])
     y[:, :PHASES_MAX] = model.flux(f, start)
     record = np.empty((periods + 1, *y.shape))
@@ -170,23 +170,23 @@ def run_lanes(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
         result[:, ANGLE] = y[:, SPEED]
         return result
 
-    at = np.zeros(lanes, dtype=int)  # index of the piece
-    passed_s = np.zeros(lanes)  # elapsed time of the piece
-    longest_s = np.full(lanes, 1e-6)  # step length that the error allows
+    at = np.zeros(rows, dtype=int)  # index of the piece
+    elapsed_s = np.zeros(rows)  # of the piece
+    longest_s = np.full(rows, 1e-6)  # step length that the error allows
     # Search for an event within a step: bracket, distances from the event at its ends, last trial.
-    searching = np.zeros(lanes, dtype=bool)
-    low_s, high_s, low, high, last_s = (np.zeros(lanes) for _ in range(5))
-    side = np.zeros(lanes, dtype=int)
+    searching = np.zeros(rows, dtype=bool)
+    low_s, high_s, low, high, last_s = (np.zeros(rows) for _ in range(5))
+    side = np.zeros(rows, dtype=int)
     while True:
         running = at < schedule.count
         if not running.any():
             break
         piece = np.minimum(at, schedule.count - 1)
-        volts = schedule.volts[everything, piece]
+        volts = schedule.volts[all_rows, piece]
         conducts = model.present & ((volts > 0) | (y[:, :PHASES_MAX] > 0))
         falls = conducts & (volts < 0)
         previous, following = model.smooth_range(y[:, ANGLE])
-        left_s = schedule.length_s[everything, piece] - passed_s
+        left_s = schedule.length_s[all_rows, piece] - elapsed_s
         with np.errstate(invalid="ignore", divide="ignore"):
             trial_s = low_s + (high_s - low_s) * low / (low - high)
         h = np.where(searching, trial_s, np.minimum(longest_s, left_s))
@@ -198,13 +198,13 @@ def run_lanes(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
             stages[stage] = derivative(y + h[:, None] * change, volts, conducts)
         end = y + h[:, None] * np.tensordot(DOP853.B, stages, 1)
 
-        reach = np.empty_like(y)
-        reach[:, :PHASES_MAX] = (np.abs(y[:, :PHASES_MAX]).max(axis=1) + 1e-6 * supply)[:, None]
-        reach[:, SPEED], reach[:, ANGLE] = 1.0 + np.abs(y[:, SPEED]), 0.1
-        fifth = np.sum((np.tensordot(DOP853.E5[:-1], stages, 1) / reach) ** 2, axis=1)
-        third = np.sum((np.tensordot(DOP853.E3[:-1], stages, 1) / reach) ** 2, axis=1)
+        magnitude = np.empty_like(y)
+        magnitude[:, :PHASES_MAX] = (np.abs(y[:, :PHASES_MAX]).max(axis=1) + 1e-6 * supply)[:, None]
+        magnitude[:, SPEED], magnitude[:, ANGLE] = 1.0 + np.abs(y[:, SPEED]), 0.1
+        fifth = np.sum((np.tensordot(DOP853.E5[:-1], stages, 1) / magnitude) ** 2, axis=1)
+        third = np.sum((np.tensordot(DOP853.E3[:-1], stages, 1) / magnitude) ** 2, axis=1)
         scale = np.sqrt((fifth + 0.01 * third) * y.shape[1])
-        error = np.divide(h * fifth, scale, out=np.zeros(lanes), where=scale > 0) / TOLERANCE
+        error = np.divide(h * fifth, scale, out=np.zeros(rows), where=scale > 0) / TOLERANCE
         advice_s = h * np.clip(0.9 * np.maximum(error, 1e-12) ** -0.125, 0.2, 5.0)
 
         # Distance from the nearest event, in rad and in 1e-6 V s per V: negative when a step goes past it.
@@ -236,27 +236,27 @@ def run_lanes(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
         y[good] = end[good]
         ended = good[:, None] & falls & (y[:, :PHASES_MAX] <= 1e-14 * supply[:, None])
         y[:, :PHASES_MAX][ended] = 0.0
-        passed_s[good] += h[good]
+        elapsed_s[good] += h[good]
         done = good & (left_s - h <= 1e-18)
-        for lane in np.flatnonzero(done & (schedule.period_end[everything, piece] > 0)):
-            record[schedule.period_end[lane, piece[lane]], lane] = y[lane]
+        for row in np.flatnonzero(done & (schedule.period_end[all_rows, piece] > 0)):
+            record[schedule.period_end[row, piece[row]], row] = y[row]
         at[done] += 1
-        passed_s[done] = 0.0
+        elapsed_s[done] = 0.0
 
     traces: list[Trace] = [{} for _ in runs]
     for number, state in enumerate(record):
         f, slope = model.shape(state[:, ANGLE])
         currents = model.current(f, state[:, :PHASES_MAX])
         torques = model.torque(slope, currents)
-        for lane, (machine, run) in enumerate(zip(machines, runs, strict=True)):
+        for row, (machine, run) in enumerate(zip(machines, runs, strict=True)):
             columns = {
                 "time_ns": number * run.period_ns,
-                "angle": state[lane, ANGLE],
-                "speed": state[lane, SPEED],
-                "torque": torques[lane],
-                "currents": currents[lane, : machine.phases],
-                "fluxes": state[lane, : machine.phases],
+                "angle": state[row, ANGLE],
+                "speed": state[row, SPEED],
+                "torque": torques[row],
+                "currents": currents[row, : machine.phases],
+                "fluxes": state[row, : machine.phases],
             }
             for name, value in columns.items():
-                traces[lane].setdefault(name, []).append(value)
+                traces[row].setdefault(name, []).append(value)
     return [{name: np.array(values).T for name, values in trace.items()} for trace in traces]

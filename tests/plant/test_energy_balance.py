@@ -1,7 +1,7 @@
 """Energy balances of the plant over a second of every bundled machine: every loss has a term.
 
 Chopping at 40 kHz, motoring and braking in turn, so that energy goes back to the link, and load steps against the rotor
-and with it; as the machine file says, on an ideal supply, and on a DC link that is charged and has a brake chopper.
+and with it; on the ideal supply of the machine file, and on a DC link that is charged and has a brake chopper.
 Measured on x86-64 with gcc 12: at most 4e-9 of the energy drawn for the linear machines, 5e-8 for the saturating one.
 """
 
@@ -29,12 +29,12 @@ def library() -> ctypes.CDLL:
     return load_library()
 
 
-class Books:
-    """Residuals of both energy balances from the state, J."""
+class BalanceTerms:
+    """Terms of both energy balances from the state, J."""
 
     def __init__(self, state: State) -> None:
         self.net = state.energy_drawn_J - state.energy_returned_J
-        self.spent = (
+        self.consumed = (
             state.energy_copper_J + state.energy_converter_J + state.energy_load_J + state.energy_friction_J
         )
         self.stored = state.field_energy_J + state.kinetic_energy_J
@@ -65,10 +65,10 @@ def test_energy_balance_closes_over_a_second(library: ctypes.CDLL, name: str, li
         machine.converter = Converter(1.2, 0.015, 0.8, 0.01, 0.0)
     run = Run(FULL, [], speed_rad_s=100.0, angle_deg=50.0, load_torque_Nm=0.0)
     state, rising = State(), [True] * machine.phases
-    braking_returned_J, bus_V, brakes = 0.0, [], False
+    braking_returned_J, link_V, brakes = 0.0, [], False
     with plant_of(library, machine, run) as plant:
         library.plant_library_read(plant, ctypes.byref(state))
-        first = Books(state)
+        first = BalanceTerms(state)
         for period in range(PERIODS):
             # Speeds stay within 300 and 1500 r/min.
             brakes = state.speed_rad_s > 155.0 or (brakes and state.speed_rad_s > 35.0)
@@ -79,10 +79,10 @@ def test_energy_balance_closes_over_a_second(library: ctypes.CDLL, name: str, li
             library.plant_advance(plant, (period + 1) * run.period_ns)
             library.plant_library_read(plant, ctypes.byref(state))
             braking_returned_J += (state.energy_returned_J - state.energy_drawn_J - before_J) if brakes else 0.0
-            bus_V.append(state.bus_voltage_V)
+            link_V.append(state.bus_voltage_V)
             if period % 1000 == 999:
-                now = Books(state)
-                machine_J = now.net - first.net - (now.spent - first.spent) - (now.stored - first.stored)
+                now = BalanceTerms(state)
+                machine_J = now.net - first.net - (now.consumed - first.consumed) - (now.stored - first.stored)
                 assert abs(machine_J) < BOUND * state.energy_drawn_J, f"{machine_J} J of {state.energy_drawn_J} J"
                 if link == "link":
                     link_J = now.supplied - now.net - (now.link - first.link)
@@ -92,6 +92,6 @@ def test_energy_balance_closes_over_a_second(library: ctypes.CDLL, name: str, li
     assert braking_returned_J > 10.0, "energy went back"
     assert state.energy_drawn_J > 100.0
     if link == "link":
-        assert min(bus_V) < 238.0 and max(bus_V) > 270.0
+        assert min(link_V) < 238.0 and max(link_V) > 270.0
         assert state.energy_chopper_J > 1.0
         assert state.energy_converter_J > 1.0

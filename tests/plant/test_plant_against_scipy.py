@@ -132,8 +132,8 @@ def deviation(measured: Trace, expected: Trace) -> dict[str, float]:
     assert np.array_equal(measured["time_ns"], expected["time_ns"])
     worst = {}
     for name in ("speed", "torque", "currents"):
-        reach = np.ptp(expected[name]) if name == "speed" else np.max(np.abs(expected[name]))
-        worst[name] = float(np.max(np.abs(measured[name] - expected[name])) / reach)
+        magnitude = np.ptp(expected[name]) if name == "speed" else np.max(np.abs(expected[name]))
+        worst[name] = float(np.max(np.abs(measured[name] - expected[name])) / magnitude)
     return worst
 
 

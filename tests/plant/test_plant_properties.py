@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from batch_plant import run_lanes
+from batch_plant import run_batch
 from reference_plant import (
     FORMS,
     TICK_NS,
@@ -139,11 +139,12 @@ def case_of(number: int, ticks: int = 0) -> Case:
 
 def deviation(measured: Trace, expected: Trace) -> dict[str, float]:
     assert np.array_equal(measured["time_ns"], expected["time_ns"])
-    reach = {name: float(np.max(np.abs(expected[name]))) for name in QUANTITIES}
-    reach["angle"] = reach["speed"] * 1e-9 * float(expected["time_ns"][-1])
-    reach["speed"] = float(np.ptp(expected["speed"]))
+    magnitude = {name: float(np.max(np.abs(expected[name]))) for name in QUANTITIES}
+    magnitude["angle"] = magnitude["speed"] * 1e-9 * float(expected["time_ns"][-1])
+    magnitude["speed"] = float(np.ptp(expected["speed"]))
     # Without any current there is no torque either.
-    return {name: float(np.max(np.abs(measured[name] - expected[name]))) / max(reach[name], 1e-12) for name in reach}
+    return {name: float(np.max(np.abs(measured[name] - expected[name]))) / max(largest, 1e-12)
+            for name, largest in magnitude.items()}
 
 
 @pytest.fixture(scope="module")
@@ -156,14 +157,14 @@ def cases() -> list[tuple[Case, Trace]]:
     """The cases with the results of the reference."""
     print(f"seed {SEED}")
     drawn = [case_of(number) for number in range(CASES)]
-    expected = run_lanes([case.machine for case in drawn], [case.run for case in drawn])
+    expected = run_batch([case.machine for case in drawn], [case.run for case in drawn])
     return list(zip(drawn, expected, strict=True))
 
 
 def test_batch_reference_agrees_with_scipy(cases: list[tuple[Case, Trace]]) -> None:
-    for case, lane in cases[:: CASES // 6]:
+    for case, trace in cases[:: CASES // 6]:
         expected, _ = run_reference(case.machine, case.run)
-        worst = deviation(lane, expected)
+        worst = deviation(trace, expected)
         assert max(worst.values()) < 1e-9, f"{worst}\n{case}"
 
 
@@ -180,7 +181,7 @@ def test_error_falls_with_the_fourth_power_of_the_step(library: ctypes.CDLL) -> 
     # Periods of 200 us with whole pulses, so that the step limits determine the step, not the switch edges.
     drawn = [case_of(number, ticks=20_000) for number in range(0, CASES, 6)]
     ratios = []
-    expected = run_lanes([case.machine for case in drawn], [case.run for case in drawn])
+    expected = run_batch([case.machine for case in drawn], [case.run for case in drawn])
     for case, trace in zip(drawn, expected, strict=True):
         coarse, fine = (
             max(deviation(run_plant(library, case.machine, case.run, factor)[0], trace).values()) for factor in (1, 0.5)

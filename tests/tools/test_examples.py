@@ -1,4 +1,4 @@
-"""tools/examples: each script waits for the drive, does what its docstring says, and ends without warnings."""
+"""tools/examples: each script waits for the drive, does what its docstring describes, and ends without warnings."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from salient.bench.emulator import executable
 from salient.errors import UsageError
 from salient.generate import machine as generate_machine
 from salient.machine.file import load_machine
-from salient.machine.firmware_tables import BEND_SHIFT_MAX, CURRENT_A, ROW_UNITS, ROWS, PhaseMapError, phase_map
+from salient.machine.firmware_tables import CURRENT_A, CURVATURE_SHIFT_MAX, ROW_UNITS, ROWS, PhaseMapError, phase_map
 from salient.paths import MACHINES
 
 POLES = 4
@@ -56,8 +56,8 @@ def read_back(tables, surface, position, current_A):
     start = tables.row_start / ROW_UNITS
     row = np.clip(np.searchsorted(start, position, side="right") - 1, 0, ROWS - 2)
     u = ((position - start[row]) / (start[row + 1] - start[row]))[:, None]
-    bends = surface.bend[row] * 2.0**surface.bend_shift
-    rows = surface.node[row] + u * (surface.node[row + 1] - surface.node[row]) - u * (1.0 - u) * bends
+    curvatures = surface.curvature[row] * 2.0**surface.curvature_shift
+    rows = surface.node[row] + u * (surface.node[row + 1] - surface.node[row]) - u * (1.0 - u) * curvatures
     value = np.array([np.interp(current_A, CURRENT_A, at_angle) for at_angle in rows])
     return value * current_A / 2.0**surface.fraction_bits
 
@@ -126,8 +126,8 @@ def test_format_depends_on_the_range_of_the_machine(factor):
     for surface in (tables.torque_per_ampere, tables.flux_per_ampere):
         assert 32768 <= np.max(surface.node) <= 65535, "all 16 bits in use"
         assert np.min(surface.node) >= 0
-        assert 64 <= np.max(np.abs(surface.bend)) <= 127, "and of the bends all 8"
-        assert 0 <= surface.bend_shift <= BEND_SHIFT_MAX
+        assert 64 <= np.max(np.abs(surface.curvature)) <= 127, "and of the curvatures all 8"
+        assert 0 <= surface.curvature_shift <= CURVATURE_SHIFT_MAX
         assert 0 <= surface.result_shift <= 12
 
 

@@ -9,6 +9,7 @@
 extern "C" {
 #include "comms/e2e.h"
 #include "drive.h"
+#include "drive_codec.h"
 #include "hal_adc.h"
 #include "hal_can.h"
 #include "hal_encoder.h"
@@ -16,7 +17,6 @@ extern "C" {
 #include "hal_pwm.h"
 #include "hal_time.h"
 }
-#include "drive_codec.h"
 #include "support/frames.h"
 
 struct hal {
@@ -233,7 +233,7 @@ TEST_F(Drive, an_interrupt_that_loses_three_triggers_is_one_late_interrupt_and_a
     EXPECT_EQ(drive.late_interrupts, 1u);
 }
 
-TEST_F(Drive, its_time_on_the_processor_is_kept_reported_and_acted_upon_by_nobody) {
+TEST_F(Drive, processor_time_is_recorded_and_reported_without_any_reaction) {
     periods(100);
     command(COMMAND_RUN);
     periods(3);
@@ -291,7 +291,7 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
             EXPECT_EQ(status.fault, FAULT_NONE);
             seen |= 1;
         } else if (frame.identifier == DRIVE_TORQUE_FRAME_ID) {
-            // The rotor stands and the currents are held, so every cycle says the same.
+            // Rotor at standstill, currents held: the frame is the same in every cycle.
             drive_torque_t torque{};
             drive_torque_unpack(&torque, frame.data, frame.length);
             EXPECT_EQ(torque.torque_reference_nm, (control.torque_reference_q24 + 32768) >> 16);

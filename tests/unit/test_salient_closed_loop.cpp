@@ -223,7 +223,7 @@ TEST(SalientClosedLoop, a_speed_beyond_the_voltage_limit_is_approached_and_left_
             highest = std::max(highest, bench.trace.speed_rad_s[i]);
             fall_rpm = std::max(fall_rpm, rpm(highest - bench.trace.speed_rad_s[i]));
         }
-        std::printf("%-20s 3000 r/min asked with %g N m: %.1f reached, %.1f..%.1f, falls by %.2f on the way\n",
+        std::printf("%-20s 3000 r/min commanded with %g N m: %.1f reached, %.1f..%.1f, falls by %.2f on the way\n",
                     machine_plant.name, load_Nm, reached_rpm, least_rpm, most_rpm, fall_rpm);
         EXPECT_LT(most_rpm, 3000.0 * 1.005);
         EXPECT_GT(least_rpm, 2000.0 * 0.99);
@@ -257,9 +257,10 @@ braking_t brake_from(double from_rpm, double load_Nm) {
     return braking;
 }
 
-// The machines without saturation are asked up to 1500 r/min only. At 3000 r/min flux linkage built up near the aligned
-// position is not let go before their inductance falls, and the current rises against the whole bus voltage: they trip,
-// the current then reaches 230 A and the torque -380 N m (trapezoid); the cosine's torque is -35 N m at 2000 r/min.
+// The machines without saturation brake from at most 1500 r/min. At 3000 r/min flux linkage built up near the aligned
+// position is not removed before their inductance falls, and the current rises against the whole DC-link voltage: they
+// trip, the current then reaches 230 A and the torque -380 N m (trapezoid); the cosine's torque is -35 N m at 2000
+// r/min.
 TEST(SalientClosedLoop, brakes_from_3000_rpm_within_its_limits) {
     for (const double from_rpm : {600.0, 1500.0, 2000.0, 3000.0}) {
         for (const double load_Nm : {0.0, 2.0, 8.0}) {

@@ -3,7 +3,9 @@
 
 #include <gtest/gtest.h>
 
+extern "C" {
 #include "drive_codec.h"
+}
 
 namespace {
 

@@ -8,8 +8,8 @@
 extern "C" {
 #include "comms/commands.h"
 #include "comms/counter.h"
-}
 #include "drive_codec.h"
+}
 #include "support/frames.h"
 
 namespace {

@@ -7,8 +7,8 @@
 
 extern "C" {
 #include "comms/parameter_protocol.h"
-}
 #include "drive_codec.h"
+}
 #include "support/frames.h"
 
 namespace {

@@ -9,11 +9,11 @@
 
 extern "C" {
 #include "comms/comms.h"
+#include "drive_codec.h"
 #include "telemetry_collect.h"
 
 extern const machine_tables_t machine_tables;
 }
-#include "drive_codec.h"
 #include "support/frames.h"
 
 // The CAN side of the HAL: frames to receive, three mailboxes, and what left them.

@@ -96,7 +96,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
          0.5 * rate_hz / machine_tables.current_slew_rate_A_s * fixed_point::Q24, 1.0);
 
     near("surplus", c.duty.overshoot_margin_q32, 40000.0 / 16.0 / rate_hz * fixed_point::Q32, 4096.0);
-    near("spent torque", c.duty.depleted_torque_q24, rate_hz / 40000.0 / 16.0 * fixed_point::Q24, 1.0);
+    near("depleted torque", c.duty.depleted_torque_q24, rate_hz / 40000.0 / 16.0 * fixed_point::Q24, 1.0);
     ASSERT_EQ(int(c.duty.pid.mode), p.values[PARAMETER_BP_MODE]);
     ASSERT_EQ(int32_t(c.duty.pid.seed), p.values[PARAMETER_BP_SEED]);
     near("scale", c.duty.pid.error_scale_inverse_q24, fixed_point::Q24 / scale_Nm, 1.0);

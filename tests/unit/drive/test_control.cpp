@@ -318,7 +318,7 @@ TEST_F(Control, the_reference_starts_at_the_present_speed_and_follows_the_ramp) 
         ASSERT_NEAR(diagnostics.speed_reference_q22 / fixed_point::Q22, expected, 1e-4);
     }
     EXPECT_NEAR(expected, 30.0, 0.1);
-    // A stop ramps down from there, whatever the command's reference says.
+    // A stop ramps down from there, independent of the reference in the command.
     for (int k = 0; k < 500; k++) {
         step(COMMAND_STOP, 600.0);
         expected -= 0.01;

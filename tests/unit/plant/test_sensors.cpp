@@ -305,7 +305,7 @@ class Edges : public testing::Test {
             compare.lower[phase] = TICKS;
         }
         plant_set_switches(&plant, &compare, TICKS);
-        plant_t twin = plant;
+        plant_t at_edge = plant;
         const uint64_t before_ns = plant.time_ns;
         plant_advance(&plant, before_ns + length_ns);
         latch();
@@ -314,13 +314,13 @@ class Edges : public testing::Test {
         }
         edges++;
         const double edge_ns = sensors.edge.time_ns, whole_ns = std::floor(edge_ns);
-        plant_advance(&twin, uint64_t(whole_ns));
-        const double angle_rad = read_rad(twin) + twin.speed_rad_s * (edge_ns - whole_ns) * 1e-9;
+        plant_advance(&at_edge, uint64_t(whole_ns));
+        const double angle_rad = read_rad(at_edge) + at_edge.speed_rad_s * (edge_ns - whole_ns) * 1e-9;
         const double boundary = sample.counts + (sample.edge_forward ? 0.0 : 1.0);
         const double away_rad = std::remainder(angle_rad - boundary / counts_per_turn * 2.0 * M_PI, 2.0 * M_PI);
         worst_rad = std::max(worst_rad, std::fabs(away_rad));
         ASSERT_NEAR(sample.edge_age_ticks, (double(plant.time_ns) - edge_ns) / HAL_PWM_TICK_NS, 0.5 + 1e-6);
-        ASSERT_EQ(sample.edge_forward, twin.speed_rad_s > 0.0);
+        ASSERT_EQ(sample.edge_forward, at_edge.speed_rad_s > 0.0);
     }
 
     machine_t machine;

@@ -191,7 +191,7 @@ TEST_F(CanBus, StartsAtTheEndOfTheInterframeSpaceWhenQueuedInIt) {
     ASSERT_EQ(deliveries.size(), 1u);
     EXPECT_EQ(deliveries[0].first, end_ns + 1000 * (3 + bits(f)));
     EXPECT_FALSE(deliveries[0].second.from_drive);
-    // Long after that, at once.
+    // Long after that, without delay.
     transmit(f);
     can_bus_start(&bus, 90000000);
     EXPECT_EQ(run().at(0).first, 90000000 + 1000 * bits(f));

@@ -6,9 +6,9 @@
 extern "C" {
 #include "comms/commands.h"
 #include "comms/e2e.h"
+#include "drive_codec.h"
 #include "hal_can.h"
 }
-#include "drive_codec.h"
 
 namespace frames {
 

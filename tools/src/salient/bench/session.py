@@ -83,7 +83,7 @@ class Session(KnownAttributes):
 
     def leave_running(self, duration_s: float) -> None:
         """Leaves the bus after a request to run on for duration_s of virtual time; lock-step only."""
-        self._ask_to_run(self.time_ns + round(duration_s * 1e9))
+        self._request_run(self.time_ns + round(duration_s * 1e9))
         self.close()
 
     def __enter__(self) -> Self:
@@ -177,13 +177,13 @@ class Session(KnownAttributes):
                 self._receive()
 
     def _run_until(self, time_ns: int) -> None:
-        self._ask_to_run(time_ns)
+        self._request_run(time_ns)
         clock = self.receive_until(
             lambda m: m.arbitration_id == RIG_CLOCK_ID and m.is_extended_id and m.data[6] == self._sequence
         )
         self.time_ns = clock_of(clock)[0]
 
-    def _ask_to_run(self, time_ns: int) -> None:
+    def _request_run(self, time_ns: int) -> None:
         self._sequence = (self._sequence + 1) % 256
         data = time_ns.to_bytes(6, "little") + bytes([self._sequence])
         identifier = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id

@@ -206,7 +206,7 @@ def summary(result: RunResult) -> dict[str, Any]:
     if source is None:
         source = {name: result.truth[name].value for name in ("speed_rpm", "torque_Nm")}
     speed_rpm, torque_Nm = np.asarray(source["speed_rpm"]), np.asarray(source["torque_Nm"])
-    figures = {
+    metrics = {
         "max_speed_rpm": float(speed_rpm.max()),
         "final_speed_rpm": float(speed_rpm[-1]),
         "torque_max_Nm": float(torque_Nm.max()),
@@ -217,15 +217,15 @@ def summary(result: RunResult) -> dict[str, Any]:
     }
     worst_us = result.telemetry["DRIVE_PROCESSOR.worst_us"].last
     if worst_us > 0:
-        figures["processor"] = {
+        metrics["processor"] = {
             "worst_us": worst_us,
             "available_us": result.telemetry["DRIVE_PROCESSOR.available_us"].last,
             "late_interrupts": int(result.telemetry["DRIVE_PROCESSOR.late_interrupts"].last),
         }
     if result.recording is not None and len(result.recording) > 1:
         window_s = (float(result.recording["time_s"][0]), float(result.recording["time_s"][-1]))
-        figures["losses"] = losses(result.recording, load_machine(machine_path(result.scenario.machine)), window_s)
-    return figures
+        metrics["losses"] = losses(result.recording, load_machine(machine_path(result.scenario.machine)), window_s)
+    return metrics
 
 
 def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build: str = "host",

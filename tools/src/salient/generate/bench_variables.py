@@ -18,6 +18,7 @@ from cantools.database.errors import UnsupportedDatabaseFormatError
 
 from salient.generate.codec import raw_range
 from salient.generate.error import CodecError
+from salient.generate.files import write_files
 
 _MESSAGE = "RIG_SET"
 _HEADER = """\
@@ -119,17 +120,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("dbc", type=Path, metavar="DBC")
     parser.add_argument("folder", type=Path, metavar="OUTDIR")
     options = parser.parse_args(arguments)
-    try:
-        text = generate_table(options.dbc)
-        options.folder.mkdir(parents=True, exist_ok=True)
-        (options.folder / "bench_variables.h").write_text(text, encoding="utf-8")
-    except CodecError as error:
-        print(f"salient.generate.bench_variables: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"salient.generate.bench_variables: {error.filename}: {error.strerror}", file=sys.stderr)
-        return 2
-    return 0
+    return write_files("salient.generate.bench_variables", options.folder,
+                       lambda: {"bench_variables.h": generate_table(options.dbc)}, CodecError)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from cantools.database.errors import UnsupportedDatabaseFormatError
 from salient.dbc import attributes, database_hash
 from salient.generate.enumerations import enumerations_header
 from salient.generate.error import CodecError
+from salient.generate.files import write_files
 from salient.generate.telemetry import message_c_name, telemetry
 
 INT64_MAX = 2**63 - 1
@@ -181,18 +182,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("dbc", type=Path, metavar="DBC")
     parser.add_argument("folder", type=Path, metavar="OUTDIR")
     options = parser.parse_args(arguments)
-    try:
-        files = generate_codec(options.dbc, options.integer, options.node)
-        options.folder.mkdir(parents=True, exist_ok=True)
-        for name, text in files.items():
-            (options.folder / name).write_text(text, encoding="utf-8")
-    except CodecError as error:
-        print(f"salient.generate.codec: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"salient.generate.codec: {error.filename}: {error.strerror}", file=sys.stderr)
-        return 2
-    return 0
+    return write_files("salient.generate.codec", options.folder,
+                       lambda: generate_codec(options.dbc, options.integer, options.node), CodecError)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
+from salient.generate.files import write_files
 from salient.generate.machine import plant_source
 from salient.machine.file import Machine, MachineError, load_machine
 
@@ -230,19 +231,20 @@ def pack(unit: Path, description_file: Path, library: Path, platform: str, licen
             archive.writestr(entry, file.read_bytes())
 
 
+def described(file: str, sources: list[Path]) -> dict[str, str]:
+    """Contents of modelDescription.xml and fmu_variables.c of a machine file; MachineError."""
+    machine = load_machine(file)
+    token = instantiation_token(machine, sources)
+    return {
+        "modelDescription.xml": description(machine, token).decode("utf-8"),
+        "fmu_variables.c": variables_source(machine, token),
+    }
+
+
 def main(arguments: list[str]) -> int:
     if len(arguments) >= 3 and arguments[0] == "describe":
-        try:
-            machine = load_machine(arguments[1])
-        except MachineError as error:
-            print(f"salient: {error}", file=sys.stderr)
-            return 2
-        out = Path(arguments[2])
-        token = instantiation_token(machine, [Path(source) for source in arguments[3:]])
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "modelDescription.xml").write_bytes(description(machine, token))
-        (out / "fmu_variables.c").write_text(variables_source(machine, token), encoding="utf-8")
-        return 0
+        sources = [Path(source) for source in arguments[3:]]
+        return write_files("salient", Path(arguments[2]), lambda: described(arguments[1], sources), MachineError)
     if len(arguments) == 6 and arguments[0] == "pack":
         unit, description_file, library, platform, licence = arguments[1:]
         pack(Path(unit), Path(description_file), Path(library), platform, Path(licence))

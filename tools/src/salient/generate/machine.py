@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from salient.generate.files import write_files
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.firmware_tables import CURRENT_A, NODE_OFFSET, PhaseMap, Surface, machine_phase_map
 from salient.machine.flux_map import FluxMap
@@ -46,7 +47,7 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
             *_column_lines(tables.torque_per_ampere.node - NODE_OFFSET, tables.flux_per_ampere.node - NODE_OFFSET),
             "    },",
             "    .curvature = {",
-            *_column_lines(*(np.pad(surface.bend, ((0, 1), (0, 0)))
+            *_column_lines(*(np.pad(surface.curvature, ((0, 1), (0, 0)))
                              for surface in (tables.torque_per_ampere, tables.flux_per_ampere))),
             "    },",
             "};",
@@ -58,7 +59,7 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
 def _format_lines(name: str, surface: Surface) -> list[str]:
     return [
         f"    .{name} = {{",
-        f"        .curvature_shift = {surface.bend_shift},",
+        f"        .curvature_shift = {surface.curvature_shift},",
         f"        .result_shift = {surface.result_shift},",
         "    },",
     ]
@@ -135,33 +136,33 @@ def _flux_map_lines(flux_map: FluxMap) -> list[str]:
     ]
 
 
-def main(arguments: list[str]) -> int:
-    if len(arguments) != 2:
-        print("usage: python -m salient.generate.machine FILE.toml OUTDIR", file=sys.stderr)
-        return 2
-    try:
-        machine = load_machine(arguments[0])
-        tables = machine_phase_map(arguments[0], machine)
-    except MachineError as error:
-        print(f"salient: {error}", file=sys.stderr)
-        return 2
-    out = Path(arguments[1])
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "machine_tables.c").write_text(tables_source(machine, tables), encoding="utf-8")
-    (out / "machine_plant.c").write_text(plant_source(machine), encoding="utf-8")
-    outputs = " ".join(_escaped(out / name) for name in ("machine_tables.c", "machine_plant.c"))
+def machine_files(file: str, folder: Path) -> dict[str, str]:
+    """Contents of machine_tables.c, machine_plant.c and their dependency file machine.d, to be written to `folder`;
+    MachineError."""
+    machine = load_machine(file)
+    sources = {
+        "machine_tables.c": tables_source(machine, machine_phase_map(file, machine)),
+        "machine_plant.c": plant_source(machine),
+    }
+    outputs = " ".join(_escaped(folder / name) for name in sources)
     # Never empty: CMake drops a dependency file without inputs, and Ninja would regenerate on every build.
-    inputs = [Path(arguments[0]).resolve()]
+    inputs = [Path(file).resolve()]
     if isinstance(machine.magnetics, FluxMap) and machine.magnetics.file is not None:
         inputs.append(machine.magnetics.file)
-    dependencies = f"{outputs}: {' '.join(map(_escaped, inputs))}\n"
-    (out / "machine.d").write_text(dependencies, encoding="utf-8")
-    return 0
+    return sources | {"machine.d": f"{outputs}: {' '.join(map(_escaped, inputs))}\n"}
 
 
 def _escaped(path: Path) -> str:
     """For a dependency file, as make reads it."""
     return str(path).replace(" ", "\\ ")
+
+
+def main(arguments: list[str]) -> int:
+    if len(arguments) != 2:
+        print("usage: python -m salient.generate.machine FILE.toml OUTDIR", file=sys.stderr)
+        return 2
+    folder = Path(arguments[1])
+    return write_files("salient", folder, lambda: machine_files(arguments[0], folder), MachineError)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from typing import Any
 
 from salient import config
 from salient.config import DEFAULTS, OPTIONS, Option
+from salient.generate.files import write_files
 
 _HEAD = "/* Generated from tools/src/salient/config.py. */"
 _INDENT = 26  # column of the usage text's second part
@@ -125,11 +126,8 @@ def main() -> int:
     if len(sys.argv) != 2:
         print("usage: python -m salient.generate.options OUTDIR", file=sys.stderr)
         return 2
-    out = Path(sys.argv[1])
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "options_table.h").write_text(header(), encoding="utf-8")
-    (out / "options_table.c").write_text(source(), encoding="utf-8")
-    return 0
+    return write_files("salient.generate.options", Path(sys.argv[1]),
+                       lambda: {"options_table.h": header(), "options_table.c": source()})
 
 
 if __name__ == "__main__":

@@ -85,10 +85,6 @@ def _header(messages: list[Message], groups: list[str], prefix: str, dbc_name: s
 #include <stdbool.h>
 #include <stdint.h>
 
-#ifdef __cplusplus
-extern "C" {{
-#endif
-
 /* Greatest common divisor of all cycle and delay times. */
 #define {upper}_TELEMETRY_CYCLE_MS {cycle_ms}
 
@@ -123,10 +119,6 @@ extern const {prefix}_telemetry_message_t {prefix}_telemetry_messages[{upper}_TE
 /* Packs the signals of a message, an index of {prefix}_telemetry_messages, saturated to their ranges, into the bytes of
  * its frame. No table of function pointers: the depth of the stack can be read from the machine code. */
 void {prefix}_telemetry_pack(unsigned message, const {prefix}_telemetry_t *telemetry, uint8_t data[8]);
-
-#ifdef __cplusplus
-}}
-#endif
 
 #endif
 """

@@ -26,7 +26,7 @@ CURRENT_A = np.arange(0.0, 81.0, 2.0)
 """Currents of the columns."""
 ROW_UNITS = 1 << 14  # units of row_start in half a pitch
 _HALF_PITCH = 1 << 31
-BEND_SHIFT_MAX = 8
+CURVATURE_SHIFT_MAX = 8
 # The finest are 4 uN m and 0.12 uWb per ampere, beyond which no product is finer than its result.
 TORQUE_FRACTION_BITS = (6, 18)
 FLUX_FRACTION_BITS = (11, 23)
@@ -55,12 +55,12 @@ class Surface:
     fraction_bits: int
     result_bits: int
     """Fraction bits of the result in the firmware."""
-    bend_shift: int
-    """0..BEND_SHIFT_MAX: the smallest with which the bends fit."""
+    curvature_shift: int
+    """0..CURVATURE_SHIFT_MAX: the smallest with which the curvatures fit."""
     node: np.ndarray
     """(ROWS, columns), 0..65535."""
-    bend: np.ndarray
-    """(ROWS - 1, columns), -128..127, in 2^bend_shift of a node's last place."""
+    curvature: np.ndarray
+    """(ROWS - 1, columns), -128..127, in 2^curvature_shift of a node's last place."""
 
     @property
     def result_shift(self) -> int:
@@ -138,16 +138,16 @@ def _rising_torque(magnetics: Any, angle_rad: np.ndarray) -> np.ndarray:
 def _surface(what: str, unit: str, values: np.ndarray, fraction_bits: tuple[int, int], result_bits: int) -> Surface:
     """Values at the rows (even) and half way (odd), in as fine a format as holds them."""
     rows, half_way = values[::2], values[1::2]
-    bends = 2.0 * (rows[:-1] + rows[1:]) - 4.0 * half_way
+    curvatures = 2.0 * (rows[:-1] + rows[1:]) - 4.0 * half_way
     least, greatest = fraction_bits
     for bits in range(greatest, least - 1, -1):
         node = np.floor(rows * 2.0**bits + 0.5)
         if np.max(node) > 65535:
             continue
-        for shift in range(BEND_SHIFT_MAX + 1):
-            bend = np.floor(bends * 2.0 ** (bits - shift) + 0.5)
-            if np.max(np.abs(bend)) <= 127:
-                return Surface(bits, result_bits, shift, node.astype(int), bend.astype(int))
+        for shift in range(CURVATURE_SHIFT_MAX + 1):
+            curvature = np.floor(curvatures * 2.0 ** (bits - shift) + 0.5)
+            if np.max(np.abs(curvature)) <= 127:
+                return Surface(bits, result_bits, shift, node.astype(int), curvature.astype(int))
     raise PhaseMapError(f"{np.max(values):.4g} {unit} of {what} is more than the firmware's tables hold")
 
 
@@ -198,6 +198,6 @@ def _is_parabola(shape: np.ndarray, tolerance: float) -> bool:
     last = len(shape) - 1
     u = (np.arange(last + 1) / last)[:, None]
     middle = 0.5 * (shape[last // 2] + shape[(last + 1) // 2])
-    bend = 2.0 * (shape[0] + shape[-1]) - 4.0 * middle
-    parabola = shape[0] + u * (shape[-1] - shape[0]) - u * (1.0 - u) * bend
+    curvature = 2.0 * (shape[0] + shape[-1]) - 4.0 * middle
+    parabola = shape[0] + u * (shape[-1] - shape[0]) - u * (1.0 - u) * curvature
     return bool(np.max(np.abs(parabola - shape)) <= tolerance)

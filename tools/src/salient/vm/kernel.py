@@ -68,7 +68,7 @@ def prepare(folder: Path) -> VmFiles:
 
 
 def _download(folder: Path) -> None:
-    """`apt-get download` into `folder`; with package lists of its own where the host's are missing or too old."""
+    """`apt-get download` into `folder`; with newly downloaded package lists where the host's are missing or too old."""
     try:
         _apt_get_download(folder, [])
     except VmError:

@@ -1,0 +1,24 @@
+"""Writes generated files: the part that the command lines of the generators share."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+
+def write_files(
+    program: str, folder: Path, generate: Callable[[], dict[str, str]], *invalid_input: type[Exception]
+) -> int:
+    """Writes what `generate` returns, file name -> text, into `folder`, which is made. Exit code 0, or 2 after one line
+    on stderr: an exception of `invalid_input`, or a file or folder that cannot be used."""
+    try:
+        files = generate()
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in files.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    except invalid_input as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"{program}: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
+    return 0
