@@ -29,9 +29,9 @@
 
 /* Plan of a phase for the sample two periods ahead. Torque, by magnitude, and flux linkages in units of the tables. */
 typedef struct {
-    phase_cell_t cell;        /* once `located` */
+    phase_cell_t *cell;       /* once `located` */
     int32_t column;           /* of the cell */
-    int32_t u_q13;            /* of the planned point in the cell */
+    int32_t v_q13;            /* of the planned point in the cell */
     int32_t flux;             /* planned */
     int32_t torque;           /* planned */
     int32_t flux_min;         /* flux linkage that a period of -Vdc leaves */
@@ -39,88 +39,94 @@ typedef struct {
     int32_t freewheeling_q29; /* flux linkage after a period without voltage, Wb */
     uint32_t angle;           /* 2^-32 electrical rev, mirrored into the half of positive torque */
     uint32_t since_on;        /* angle past turn-on, 2^-32 electrical rev; from 2^31: before turn-on */
-    int8_t limit;             /* -1: at flux_min, 1: at flux_max or at the current limit, 0: torque reached */
+    int32_t limit;            /* -1: at flux_min, 1: at flux_max or at the current limit, 0: torque reached */
     bool positive;            /* the phase itself is in that half */
     bool located;             /* the cell is known */
 } plan_t;
 
 /* Operating point within the cell, or at its end, for a torque within flux_min, flux_max and the current limit, by
- * descending priority. */
-static inline void solve_in_cell(plan_t *p, int32_t torque, int32_t current_limit_q9) {
-    const int32_t limit_q13 = fixed_saturate_bits(
-        (current_limit_q9 - (p->column << MACHINE_COLUMN_BITS)) * (1 << (13 - MACHINE_COLUMN_BITS)) -
-            PHASE_CELL_HALF_Q13,
-        PHASE_CELL_BITS);
-    const int32_t torque_q13 = phase_cell_solve_q13(&p->cell.torque, torque);
-    const bool current_limited = torque_q13 > limit_q13;
-    p->u_q13 = current_limited ? limit_q13 : torque_q13;
-    p->flux = phase_cell_evaluate(&p->cell.flux, p->u_q13);
-    p->torque = torque;
-    p->limit = current_limited;
-    /* A torque of 0 is flux_min also where no current makes torque. */
-    if (torque <= 0 || p->flux <= p->flux_min) {
-        p->flux = p->flux_min;
-        p->limit = -1;
-    } else if (p->flux >= p->flux_max) {
-        p->flux = p->flux_max;
-        p->limit = 1;
-    } else if (!current_limited) {
-        return;
-    } else {
-        p->torque = phase_cell_evaluate(&p->cell.torque, p->u_q13);
-        return;
+ * descending priority; true when it has the torque. */
+static inline bool solve_in_cell(plan_t *p, int32_t torque, int32_t current_limit_q9) {
+    const phase_cell_t *cell = p->cell;
+    const int32_t limit_q13 = phase_cell_u_q13(cell, current_limit_q9);
+    int32_t v_q13 = phase_cell_solve_q13(cell, torque);
+    bool reached = v_q13 != PHASE_CELL_V_MAX_Q13 && v_q13 != -PHASE_CELL_V_MAX_Q13 - 1;
+    int32_t limit = 0;
+    if (v_q13 > limit_q13) {
+        v_q13 = limit_q13;
+        limit = 1;
     }
-    p->u_q13 = phase_cell_solve_q13(&p->cell.flux, p->flux);
-    p->torque = phase_cell_evaluate(&p->cell.torque, p->u_q13);
+    int32_t flux = phase_cell_flux(cell, v_q13);
+    if (flux >= p->flux_max) {
+        flux = p->flux_max;
+        limit = 1;
+    }
+    /* A torque of 0 is flux_min also where no current makes torque. */
+    if (torque <= 0 || flux <= p->flux_min) {
+        flux = p->flux_min;
+        limit = -1;
+    }
+    if (limit != 0 || !reached) {
+        reached = false;
+        v_q13 = phase_cell_v_q13(cell, flux);
+        torque = phase_cell_torque(cell, v_q13);
+    }
+    p->v_q13 = v_q13;
+    p->flux = flux;
+    p->torque = torque;
+    p->limit = limit;
+    return reached;
 }
 
-/* Column in which the operating point is expected, by straight lines. */
+static inline void locate_cell(const machine_tables_t *tables, plan_t *p) {
+    p->located = true;
+    phase_cell_locate(tables, p->angle - HALF_REV, p->column, p->cell);
+}
+
+/* Plans the operating point of a phase for a torque in units of the tables, in the cell of its last plan; true when the
+ * point has the torque. */
+NOINLINE static bool plan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
+    if (torque <= 0 && p->flux_min == 0) {
+        p->flux = 0;
+        p->torque = 0;
+        p->limit = -1;
+        return true;
+    }
+    locate_cell(tables, p);
+    return solve_in_cell(p, torque, current_limit_q9);
+}
+
+/* Column in which the operating point for a torque > 0 is expected, by straight lines. */
 static inline int32_t expected_column(const plan_t *p, int32_t torque, int32_t current_limit_q9) {
-    const int32_t min_q4 = phase_cell_distance_q4(&p->cell.flux, p->flux_min);
-    const int32_t max_q4 = phase_cell_distance_q4(&p->cell.flux, p->flux_max);
-    const int32_t torque_q4 = torque > 0 ? phase_cell_distance_q4(&p->cell.torque, torque) : min_q4;
-    const int32_t distance_q4 = fixed_clamp(torque_q4, min_q4, max_q4);
+    const phase_cell_t *cell = p->cell;
+    const int32_t distance_q4 = fixed_clamp(phase_cell_distance_q4(&cell->torque, torque),
+                                            phase_cell_distance_q4(&cell->flux, p->flux_min),
+                                            phase_cell_distance_q4(&cell->flux, p->flux_max));
     const int32_t limit_column = current_limit_q9 >> MACHINE_COLUMN_BITS;
     const int32_t column = fixed_add(p->column, fixed_add(distance_q4, COLUMN_Q4 / 2) >> 4);
     return fixed_clamp(column, 0, limit_column < PHASE_CELL_COLUMN_MAX ? limit_column : PHASE_CELL_COLUMN_MAX);
 }
 
-/* Plans the operating point for a torque in units of the tables; true when flux linkage or current limit it. The cell is
- * that of the last plan, and while *second_cells lasts another one where the point lies outside of it; otherwise the
- * phase moves to the end of the cell in this period and further in the next. */
-NOINLINE static bool plan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9,
-                                 unsigned *second_cells) {
+/* Plans a phase again, in another cell if that is where the point is expected. */
+static inline void replan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
     if (!p->located) {
-        if (torque <= 0 && p->flux_min == 0) {
-            p->flux = 0;
-            p->torque = 0;
-            p->limit = -1;
-            return false;
-        }
-        const phase_map_lookup_t lookup = phase_map_lookup(tables, p->angle - HALF_REV);
-        p->located = true;
-        p->cell = phase_cell_at(&lookup, p->column);
+        locate_cell(tables, p);
     }
-    for (;;) {
-        solve_in_cell(p, torque, current_limit_q9);
-        const bool outside = p->u_q13 == PHASE_CELL_MAX_Q13 || p->u_q13 == -PHASE_CELL_MAX_Q13 - 1;
-        if (!outside || *second_cells == 0) {
-            return p->limit != 0;
-        }
-        --*second_cells;
-        p->column = expected_column(p, torque, current_limit_q9);
-        const phase_map_lookup_t lookup = phase_map_lookup(tables, p->angle - HALF_REV);
-        p->cell = phase_cell_at(&lookup, p->column);
+    const int32_t column = expected_column(p, torque, current_limit_q9);
+    if (column != p->column) {
+        p->column = column;
+        locate_cell(tables, p);
     }
+    (void)solve_in_cell(p, torque, current_limit_q9);
 }
 
 /* Corrects one phase by the torque shortfall (signed) where it can change in that direction; returns the rest. Of the
  * half that carries the reference: a shortfall goes to the phase that entered last, an excess is taken from the one
  * that entered first. Without such a phase an opposed one may reduce its torque. */
-static inline int32_t redistribute_torque(const machine_tables_t *tables, plan_t *plan, bool positive, bool reverse,
-                                          int32_t current_limit_q9, int32_t shortfall, unsigned *second_cells) {
+static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *plan, bool positive, bool reverse,
+                                     int32_t current_limit_q9, int32_t shortfall) {
     const bool increase = (shortfall > 0) == positive;
-    const int8_t limit = increase ? 1 : -1;
+    const int32_t limit = increase ? 1 : -1;
     /* In forward rotation a phase enters the positive half at turn-on, the other half at turn-off. The order of entry
      * is that of since_on or the reverse; phases before turn-on stay last. */
     const uint32_t reversal = ((positive != reverse) == increase) ? 0 : HALF_REV - 1;
@@ -144,8 +150,8 @@ static inline int32_t redistribute_torque(const machine_tables_t *tables, plan_t
     }
     const int32_t before = corrected->torque;
     const bool adds = corrected->positive;
-    (void)plan_torque(tables, corrected, adds ? fixed_add(before, shortfall) : fixed_subtract(before, shortfall),
-                      current_limit_q9, second_cells);
+    replan_torque(tables, corrected, adds ? fixed_add(before, shortfall) : fixed_subtract(before, shortfall),
+                  current_limit_q9);
     const int32_t gained = corrected->torque - before;
     return adds ? shortfall - gained : shortfall + gained;
 }
@@ -197,17 +203,16 @@ typedef struct {
     bool braking;   /* its phases move towards unaligned */
 } half_t;
 
-/* Operating point of a phase two periods ahead; true when voltage or current limit its torque. */
+/* Operating point of a phase two periods ahead; true when it has the torque of the phase. */
 static inline bool plan_phase(const predictive_torque_parameters_t *parameters, const machine_tables_t *tables,
-                              const half_t *half, plan_t *p, int32_t flux_step_max, uint32_t angle_step,
-                              unsigned *second_cells) {
+                              const half_t *half, plan_t *p, int32_t flux_step_max, uint32_t angle_step) {
     p->since_on = p->angle - half->window->turn_on;
     const int32_t torque = half->torque > 0 ? share_of(half->torque, torque_sharing_q15(half->window, p->angle)) : 0;
     if (half->braking && p->flux_max > p->flux_min) {
         p->flux_max = fixed_clamp(removable_flux(flux_step_max, p->angle - HALF_REV, angle_step), p->flux_min,
                                   p->flux_max);
     }
-    return plan_torque(tables, p, torque, parameters->current_limit_q9, second_cells);
+    return plan_torque(tables, p, torque, parameters->current_limit_q9);
 }
 
 /* Duty of each phase from its planned flux linkage. */
@@ -232,7 +237,7 @@ static inline void set_duties(const predictive_torque_parameters_t *parameters, 
         control->duty_q15[phase] = duty;
         /* The column in which the point lies. */
         control->column[phase] =
-            (uint8_t)fixed_clamp(p->column + ((p->u_q13 + PHASE_CELL_HALF_Q13) >> 13), 0, PHASE_CELL_COLUMN_MAX);
+            (uint8_t)fixed_clamp(p->column + ((p->v_q13 + PHASE_CELL_HALF_Q13) >> 13), 0, PHASE_CELL_COLUMN_MAX);
     }
 }
 
@@ -268,9 +273,9 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     };
 
     plan_t plan[HAL_PHASES_MAX];
+    phase_cell_t cells[HAL_PHASES_MAX];
     int32_t shortfall = torque_q24 >> torque_shift;
-    unsigned second_cells = parameters->second_cells;
-    bool limited = false;
+    bool reached = true;
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
         predict_flux(parameters, control, sample, phase, flux_step_max_q29, flux_shift, p);
@@ -278,17 +283,20 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         p->positive = angle >= HALF_REV;
         p->angle = p->positive ? angle : ~angle; /* mirrored, to 1 LSB */
         p->column = control->column[phase];
-        p->u_q13 = 0;
+        p->v_q13 = 0;
         p->located = false;
-        limited |= plan_phase(parameters, tables, &half[p->positive], p, flux_step_max_q29 >> flux_shift,
-                              sample->angle_step, &second_cells);
+        p->cell = &cells[phase];
+        reached &= plan_phase(parameters, tables, &half[p->positive], p, flux_step_max_q29 >> flux_shift,
+                              sample->angle_step);
         shortfall = p->positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
     }
 
     control->torque_shortfall_q24 = 0;
-    if (limited) {
-        shortfall = redistribute_torque(tables, plan, torque_q24 >= 0, sample->reverse, parameters->current_limit_q9,
-                                        shortfall, &second_cells);
+    if (!reached) {
+        for (unsigned n = 0; n < parameters->corrections && shortfall != 0; n++) {
+            shortfall = correct_torque(tables, plan, torque_q24 >= 0, sample->reverse, parameters->current_limit_q9,
+                                       shortfall);
+        }
         const int32_t shortfall_q24 = phase_map_scale(&tables->torque_format, shortfall);
         control->torque_shortfall_q24 = fixed_abs(shortfall_q24) > SHORTFALL_TOLERANCE_Q24 ? shortfall_q24 : 0;
     }
