@@ -293,10 +293,8 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
 
     control->torque_shortfall_q24 = 0;
     if (!reached) {
-        for (unsigned n = 0; n < parameters->corrections && shortfall != 0; n++) {
-            shortfall = correct_torque(tables, plan, torque_q24 >= 0, sample->reverse, parameters->current_limit_q9,
-                                       shortfall);
-        }
+        shortfall = correct_torque(tables, plan, torque_q24 >= 0, sample->reverse, parameters->current_limit_q9,
+                                   shortfall);
         const int32_t shortfall_q24 = phase_map_scale(&tables->torque_format, shortfall);
         control->torque_shortfall_q24 = fixed_abs(shortfall_q24) > SHORTFALL_TOLERANCE_Q24 ? shortfall_q24 : 0;
     }

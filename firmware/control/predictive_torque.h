@@ -46,7 +46,6 @@ typedef struct {
     int32_t period_q40;                  /* Ts in s, Q-9.40 */
     int32_t current_limit_q9;            /* A, Q7.9 */
     int32_t reserve_q24;                 /* N m, Q7.24, >= 0 */
-    unsigned corrections;                /* per period */
     int32_t advance_step_q30;            /* per period with torque shortfall, Q1.30 */
     int32_t retract_step_q30;            /* per period without, Q1.30 */
 } predictive_torque_parameters_t;

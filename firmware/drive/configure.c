@@ -188,7 +188,6 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
         .period_q40 = (int32_t)fixed_divide((int64_t)1 << 40, rate),
         .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
-        .corrections = control_rate_hz <= 20000u ? phases : 1u, /* at 20 kHz there is time */
         .advance_step_q30 = (int32_t)fixed_divide(10 * ((int64_t)1 << 30), rate),
         .retract_step_q30 = (int32_t)fixed_divide((int64_t)1 << 30, rate),
     };
