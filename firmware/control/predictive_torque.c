@@ -225,7 +225,9 @@ static inline void set_duties(const predictive_torque_parameters_t *parameters, 
     for (unsigned phase = 0; phase < tables->phases; phase++) {
         const plan_t *p = &plan[phase];
         int32_t duty = -ONE_Q15; /* target 0: both switches off */
+        int32_t position_q13 = 0;
         if (p->flux > 0) {
+            position_q13 = p->column * (1 << 13) + p->v_q13 + PHASE_CELL_HALF_Q13;
             /* Within +-flux_step_max and the truncation to the unit of the tables. */
             const int32_t flux_step_q29 = p->flux * (1 << tables->flux_format.result_shift) - p->freewheeling_q29;
             duty = fixed_saturate_bits(flux_step_q29 * (1 << shift) / divisor, DUTY_BITS);
@@ -235,9 +237,10 @@ static inline void set_duties(const predictive_torque_parameters_t *parameters, 
         }
         duty_q15[phase] = duty;
         control->duty_q15[phase] = duty;
-        /* The column in which the point lies. */
-        control->column[phase] =
-            (uint8_t)fixed_clamp(p->column + ((p->v_q13 + PHASE_CELL_HALF_Q13) >> 13), 0, PHASE_CELL_COLUMN_MAX);
+        /* The column of the next plan, where current rises or falls as from the last plan to this one. */
+        control->column[phase] = (uint8_t)fixed_clamp((2 * position_q13 - control->position_q13[phase]) >> 13, 0,
+                                                      PHASE_CELL_COLUMN_MAX);
+        control->position_q13[phase] = position_q13;
     }
 }
 

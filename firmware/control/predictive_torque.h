@@ -55,7 +55,8 @@ typedef struct {
     int32_t duty_q15[HAL_PHASES_MAX]; /* acts from the coming sample on, Q1.15 */
     int32_t advance_q30;              /* of the windows, Q1.30, 0..1 */
     int32_t torque_shortfall_q24;     /* reference less planned torque, N m, Q7.24; 0 within 1/64 N m */
-    uint8_t column[HAL_PHASES_MAX];   /* table column of the planned operating point */
+    int32_t position_q13[HAL_PHASES_MAX]; /* of the planned operating point, in table columns, Q13; about 0..40 */
+    uint8_t column[HAL_PHASES_MAX];       /* table column in which the next plan begins */
 } predictive_torque_t;
 
 typedef struct {
