@@ -24,8 +24,8 @@
 
 #define PHASE_CELL_COLUMN_MAX (MACHINE_COLUMNS - 2)
 
-/* u and v in Q2.13; v is saturated to -1..1 - 2^-13. */
-#define PHASE_CELL_V_BITS 14
+/* u and v in Q2.13; v is saturated to -2..2 - 2^-13. */
+#define PHASE_CELL_V_BITS 15
 #define PHASE_CELL_V_MAX_Q13 ((1 << (PHASE_CELL_V_BITS - 1)) - 1)
 #define PHASE_CELL_U_BITS 16
 #define PHASE_CELL_HALF_Q13 (1 << 12)
@@ -77,7 +77,7 @@ ALWAYS_INLINE void phase_cell_locate(const machine_tables_t *tables, uint32_t di
         phase_cell_curve(phase_map_flux_value_q14(&lookup, low), phase_map_flux_value_q14(&lookup, high), low_q9);
     const int32_t ratio_q13 = phase_cell_quotient_q13(cell->flux.curvature, cell->flux.rise, PHASE_CELL_V_BITS);
     const int32_t curvature = cell->torque.curvature - 2 * fixed_multiply_high(cell->torque.rise, ratio_q13 * (1 << 18));
-    cell->curvature = fixed_saturate_bits(curvature, PHASE_CELL_RISE_BITS - 1);
+    cell->curvature = fixed_saturate_bits(curvature, PHASE_CELL_RISE_BITS - 2);
 }
 
 /* u of a current in A, Q7.9, 0..2^18: Q2.13, saturated to -4..4. */
