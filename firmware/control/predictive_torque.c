@@ -77,12 +77,14 @@ static int32_t redistribute_torque(const machine_tables_t *tables, plan_t *plan,
     return shortfall_q24;
 }
 
-static void move_windows(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
-                         int32_t torque_q24) {
-    const bool voltage_limited =
-        fixed_abs(control->torque_shortfall_q24) > SHORTFALL_MIN_Q24 + fixed_abs(torque_q24) / 64;
+torque_sharing_window_t predictive_torque_move_windows(const predictive_torque_parameters_t *parameters,
+                                                       int32_t *advance_q30, int32_t torque_q24,
+                                                       int32_t torque_shortfall_q24) {
+    const bool voltage_limited = fixed_abs(torque_shortfall_q24) > SHORTFALL_MIN_Q24 + fixed_abs(torque_q24) / 64;
     const int32_t step_q30 = voltage_limited ? parameters->advance_step_q30 : -parameters->retract_step_q30;
-    control->advance_q30 = fixed_clamp(control->advance_q30 + step_q30, 0, ONE_Q30);
+    *advance_q30 = fixed_clamp(*advance_q30 + step_q30, 0, ONE_Q30);
+    const int32_t advance_q15 = *advance_q30 >> 15;
+    return advance_q15 > 0 ? torque_sharing_window(&parameters->sharing, advance_q15) : parameters->base_window;
 }
 
 static int32_t non_negative(int32_t flux_q29) {
@@ -138,7 +140,7 @@ static inline void set_duties(const predictive_torque_parameters_t *parameters, 
 }
 
 void predictive_torque_reset(predictive_torque_t *control) {
-    *control = (predictive_torque_t){.advance_q30 = 0};
+    *control = (predictive_torque_t){.torque_shortfall_q24 = 0};
 }
 
 void predictive_torque_step(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
@@ -154,12 +156,6 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     const int32_t positive_half_q24 = fixed_add(torque_q24 > 0 ? torque_q24 : 0, opposed_q24);
     const int32_t negative_half_q24 = fixed_add(torque_q24 < 0 ? fixed_abs(torque_q24) : 0, opposed_q24);
 
-    move_windows(parameters, control, torque_q24);
-    const int32_t advance_q15 = control->advance_q30 >> 15;
-    const torque_sharing_window_t *base_window = &parameters->base_window;
-    const torque_sharing_window_t advanced_window =
-        advance_q15 > 0 ? torque_sharing_window(&parameters->sharing, advance_q15) : *base_window;
-
     plan_t plan[HAL_PHASES_MAX];
     int32_t shortfall_q24 = torque_q24;
     bool limited = false;
@@ -172,7 +168,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         p->point.column = control->column[phase];
         const bool braking = p->positive == sample->reverse; /* it moves towards unaligned */
         /* Windows advance against the rotation, which would be later for a braking phase. */
-        const torque_sharing_window_t *window = braking ? base_window : &advanced_window;
+        const torque_sharing_window_t *window = braking ? &parameters->base_window : sample->window;
         p->since_on = p->angle - window->turn_on;
         const int32_t half_q24 = p->positive ? positive_half_q24 : negative_half_q24;
         int32_t target_q24 = 0;
