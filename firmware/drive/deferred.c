@@ -37,8 +37,7 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->encoder_angle = measured->encoder_angle;
     input->dc_link_voltage_q6 = measured->dc_link_voltage_q6;
     input->command_age_us = sample->time_us - command->time_us;
-    input->run = state->state_machine.state == DRIVE_STATE_RUN;
-    input->observer = state->observer;
+    input->speed_q22 = state->observer.speed_q22;
     if (parameters->bandwidth.adaptive) {
         input->bandwidth.innovation = state->innovation;
         input->bandwidth.from_edge = measured->angle_from_edge;
@@ -47,6 +46,8 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
         state->bandwidth.trigger = OBSERVER_TRIGGER_NONE;
     }
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
+        input->run = state->state_machine.state == DRIVE_STATE_RUN;
+        input->observer = state->observer;
         input->electrical = measured->commutation.electrical;
         for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
             input->current_q9[phase] = measured->current_q9[phase];
@@ -77,7 +78,7 @@ static void follow_resets(deferred_t *deferred, const deferred_input_t *input) {
 static uint64_t protect(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
     const protection_deferred_input_t checked = {
         .dc_link_voltage_q6 = input->dc_link_voltage_q6,
-        .speed_q22 = input->observer.speed_q22,
+        .speed_q22 = input->speed_q22,
         .encoder_angle = input->encoder_angle,
         .command_age_us = input->command_age_us,
         .periods = input->periods,
@@ -117,7 +118,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
         results->bandwidth = observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, &input->bandwidth);
     }
     results->window = parameters->predictive.base_window;
-    if (input->run && parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
+    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run) {
         results->window = predictive_torque_move_windows(&parameters->predictive, &deferred->advance_q30,
                                                          input->torque_reference_q24, input->torque_shortfall_q24);
         learn_misalignment(parameters, deferred, input);

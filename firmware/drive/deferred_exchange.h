@@ -26,15 +26,17 @@
 /* Values of one control period. */
 typedef struct {
     uint32_t generation;
-    uint32_t periods;                      /* since the input of the previous deferred step, from 1 */
-    uint32_t encoder_angle;                /* start of the encoder count, 2^-32 rev */
-    int32_t dc_link_voltage_q6;            /* V, Q9.6 */
-    uint32_t command_age_us;               /* time since the last accepted command */
-    bool run;                              /* state RUN */
-    load_observer_t observer;              /* estimate for the coming sample */
-    observer_bandwidth_sample_t bandwidth; /* with an adaptive bandwidth only */
-    /* In RUN with predictive torque control only. */
-    uint32_t electrical; /* angle of phase 0, 2^-32 electrical rev */
+    uint32_t periods;           /* since the input of the previous deferred step, from 1 */
+    uint32_t encoder_angle;     /* start of the encoder count, 2^-32 rev */
+    int32_t dc_link_voltage_q6; /* V, Q9.6 */
+    uint32_t command_age_us;    /* time since the last accepted command */
+    int32_t speed_q22;          /* observer, for the coming sample, rad/s, Q9.22 */
+    /* With an adaptive bandwidth only. */
+    observer_bandwidth_sample_t bandwidth;
+    /* With predictive torque control only. */
+    bool run;                 /* state RUN */
+    load_observer_t observer; /* estimate for the coming sample */
+    uint32_t electrical;      /* angle of phase 0, 2^-32 electrical rev */
     int32_t current_q9[HAL_PHASES_MAX];
     int32_t speed_reference_q22;
     int32_t torque_reference_q24;

@@ -28,16 +28,16 @@ static void fail_if(uint64_t *failed, bool condition, fault_t fault) {
 }
 
 /* Triggers lost in consecutive periods, including this one; saturates. */
-static int32_t count_overruns(protection_t *protection, uint32_t missed_interrupts) {
-    protection->overruns =
-        missed_interrupts == 0 ? 0 : fixed_saturate((int64_t)protection->overruns + missed_interrupts);
+static uint32_t count_overruns(protection_t *protection, uint32_t missed_interrupts) {
+    const uint32_t sum = protection->overruns + missed_interrupts;
+    protection->overruns = missed_interrupts == 0 ? 0 : sum >= missed_interrupts ? sum : UINT32_MAX;
     return protection->overruns;
 }
 
 /* True when the angle changed by more than the rotor can turn, over the lost periods as well. */
 static bool encoder_jumped(const protection_parameters_t *parameters, int32_t angle_step, uint32_t missed_interrupts) {
-    const int64_t periods = (int64_t)missed_interrupts + 1;
-    return fixed_abs(angle_step) > fixed_saturate(parameters->angle_step_max * periods);
+    const uint64_t step_max = (uint32_t)parameters->angle_step_max;
+    return (uint32_t)fixed_abs(angle_step) > step_max * missed_interrupts + step_max;
 }
 
 /* True when the encoder does not count although the rotor turns. The observer alone cannot detect that: with a high

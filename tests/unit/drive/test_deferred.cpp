@@ -218,7 +218,7 @@ TEST_F(Deferred, a_late_over_speed_check_of_the_time_before_a_reset_is_no_new_fa
     period(COMMAND_OFF);
     state.observer.speed_q22 = 400 << 22; // of a faulty encoder
     interrupt(COMMAND_OFF);               // this step will be late
-    ASSERT_GT(state.deferred_request.input.observer.speed_q22, 380 << 22);
+    ASSERT_GT(state.deferred_request.input.speed_q22, 380 << 22);
     interrupt(COMMAND_CLEAR_FAULT);
     ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
     deferred_step(&parameters, &state);
