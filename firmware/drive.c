@@ -1,5 +1,6 @@
 #include "drive.h"
 
+#include "drive/deferred.h"
 #include "hal_encoder.h"
 #include "hal_interrupt.h"
 #include "hal_time.h"
@@ -49,10 +50,39 @@ void drive_control_interrupt(drive_t *drive) {
     } else {
         hal_pwm_open_all(drive->hal);
     }
+    if (drive->control.deferred_request.skipped == 0) {
+        hal_interrupt_request_deferred(drive->hal);
+    }
     drive->used_ticks = hal_interrupt_elapsed_ticks(drive->hal);
     if (drive->used_ticks > drive->worst_ticks) {
         drive->worst_ticks = drive->used_ticks;
     }
+}
+
+/* Ticks from the trigger of the control interrupt that requested the pending deferred step. The control interrupt may
+ * pre-empt this function: then the next one is a whole period away from the second attempt. */
+static uint32_t deferred_elapsed_ticks(const drive_t *drive) {
+    const volatile uint32_t *skipped = &drive->control.deferred_request.skipped;
+    uint32_t periods = *skipped;
+    uint32_t elapsed = hal_interrupt_elapsed_ticks(drive->hal);
+    if (*skipped != periods) {
+        periods = *skipped;
+        elapsed = hal_interrupt_elapsed_ticks(drive->hal);
+    }
+    return elapsed + periods * 2u * drive->control_parameters.period_ticks;
+}
+
+void drive_deferred_interrupt(drive_t *drive) {
+    control_state_t *control = &drive->control;
+    if (!deferred_pending(&control->deferred_request, &control->deferred.response)) {
+        return;
+    }
+    deferred_compute(&drive->control_parameters, control);
+    drive->deferred_used_ticks = deferred_elapsed_ticks(drive);
+    if (drive->deferred_used_ticks > drive->deferred_worst_ticks) {
+        drive->deferred_worst_ticks = drive->deferred_used_ticks;
+    }
+    deferred_complete(&control->deferred_request, &control->deferred.response);
 }
 
 /* Drops a command older than twice the timeout: the clock wraps, and its age would then appear small again. By twice

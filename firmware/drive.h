@@ -1,4 +1,4 @@
-/* The drive: called by a board's main program, its interrupt and its loop. */
+/* The drive: called by a board's main program, its interrupts and its loop. */
 #ifndef DRIVE_H
 #define DRIVE_H
 
@@ -14,18 +14,21 @@
 /* One drive. The caller allocates it; only the functions below and telemetry_collect() access it. */
 typedef struct {
     hal_t *hal;
-    /* Written by the interrupt; read by the background with the interrupt masked. */
+    /* Written by the control interrupt; read by the background with the interrupts masked. */
     control_sample_t sample;
-    /* Last accepted command; this and the next are written by the background with the interrupt masked. */
+    /* Last accepted command; this and the next are written by the background with the interrupts masked. */
     command_t command;
     control_parameters_t control_parameters;
-    /* Written by the interrupt; the background prepares the control laws for new parameters with the interrupt masked.
-     */
+    /* Written by the control interrupt, its member `deferred` by the deferred interrupt; the background prepares the
+     * control laws for new parameters with the interrupts masked. */
     control_state_t control;
-    /* Execution time of the interrupt, for telemetry only; overruns are handled by drive/protection.h. */
-    uint32_t used_ticks;      /* last interrupt, from trigger to end, HAL_PWM_TICK_NS */
-    uint32_t worst_ticks;     /* maximum since start */
-    uint32_t late_interrupts; /* interrupts that ended after the next trigger, since start */
+    /* Execution time of the interrupts, for telemetry only; overruns are handled by drive/protection.h. */
+    uint32_t used_ticks;           /* last control interrupt, from trigger to end, HAL_PWM_TICK_NS */
+    uint32_t worst_ticks;          /* maximum since start */
+    uint32_t late_interrupts;      /* control interrupts that ended after the next trigger, since start */
+    uint32_t deferred_used_ticks;  /* last deferred interrupt, from the trigger of its period to its end; this and the
+                                      next  are written by the deferred interrupt */
+    uint32_t deferred_worst_ticks; /* maximum since start */
     /* Used by the background only. */
     const machine_tables_t *tables;
     uint32_t control_rate_hz;
@@ -40,6 +43,9 @@ bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, cons
 
 /* One control period. [interrupt] */
 void drive_control_interrupt(drive_t *drive);
+
+/* The deferred step that the control interrupt has requested (drive/deferred.h). [deferred] */
+void drive_deferred_interrupt(drive_t *drive);
 
 /* Commands, telemetry, parameters; returns immediately when nothing is due. [background] */
 void drive_background(drive_t *drive);

@@ -16,7 +16,7 @@ static int32_t misalignment(const drive_t *drive) {
     const int32_t phases = drive->tables->phases;
     int64_t sum = 0;
     for (int32_t phase = 0; phase < phases; phase++) {
-        sum += drive->control.misalignment.phase[phase].offset;
+        sum += drive->control.deferred.misalignment.phase[phase].offset;
     }
     return (int32_t)sum / (phases * drive->tables->rotor_poles);
 }
@@ -86,6 +86,10 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->processor.worst_us = drive->worst_ticks;
     telemetry->processor.available_us = 2u * parameters->period_ticks;
     telemetry->processor.late_interrupts = drive->late_interrupts;
+
+    telemetry->deferred.used_us = drive->deferred_used_ticks;
+    telemetry->deferred.worst_us = drive->deferred_worst_ticks;
+    telemetry->deferred.skipped_periods = control->deferred_request.skipped_total;
 
     telemetry->identity.firmware_major = SALIENT_VERSION_MAJOR;
     telemetry->identity.firmware_minor = SALIENT_VERSION_MINOR;

@@ -1,4 +1,5 @@
-/* Timing of the control interrupt, which the PWM timer triggers at the start of each control period. */
+/* The control interrupt, which the PWM timer triggers at the start of each control period, and the deferred interrupt,
+ * which the control interrupt requests. */
 #ifndef HAL_INTERRUPT_H
 #define HAL_INTERRUPT_H
 
@@ -12,7 +13,12 @@ uint32_t hal_interrupt_missed_triggers(hal_t *hal);
 
 /* Ticks of HAL_PWM_TICK_NS from the trigger of the present control interrupt, which took its sample, rounded down to
  * the resolution of the port's counter. Continues beyond the period, wraps after 21 s; 0 on a port whose instructions
- * take no time. [interrupt] */
+ * take no time. [interrupt, deferred] */
 uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal);
+
+/* Requests the deferred interrupt: the port calls drive_deferred_interrupt once after the present control interrupt, at
+ * a priority between that of the control interrupt, which pre-empts it, and the background. A request while one is
+ * waiting has no effect; the drive makes none before the last call has returned. [interrupt] */
+void hal_interrupt_request_deferred(hal_t *hal);
 
 #endif

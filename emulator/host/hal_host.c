@@ -10,13 +10,24 @@
 #include "hal_pwm.h"
 #include "hal_time.h"
 
+static const char *const context_names[] = {
+    [BOARD_START] = "the background",
+    [BOARD_INTERRUPT] = "the control interrupt",
+    [BOARD_DEFERRED] = "the deferred interrupt",
+    [BOARD_BACKGROUND] = "the background",
+};
+
+static void abort_call(const hal_t *hal, board_context_t required, const char *function) {
+    fprintf(stderr, "salient: firmware called %s from %s, must be from %s\n", function,
+            context_names[hal->board->context], context_names[required]);
+    abort();
+}
+
 /* Aborts when the firmware calls a function from a context that the HAL does not allow. */
 static void require(const hal_t *hal, bool interrupt, const char *function) {
-    if ((hal->board->context == BOARD_INTERRUPT) != interrupt) {
-        fprintf(stderr, "salient: firmware called %s from %s, must be from %s\n", function,
-                interrupt ? "the background" : "the control interrupt",
-                interrupt ? "the control interrupt" : "the background");
-        abort();
+    const board_context_t context = hal->board->context;
+    if ((context == BOARD_INTERRUPT) != interrupt || context == BOARD_DEFERRED) {
+        abort_call(hal, interrupt ? BOARD_INTERRUPT : BOARD_BACKGROUND, function);
     }
 }
 
@@ -59,8 +70,15 @@ uint32_t hal_interrupt_missed_triggers(hal_t *hal) {
 
 /* The firmware's code takes no virtual time; the execution time that the bench sets counts from the start. */
 uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
-    require(hal, true, __func__);
+    if (hal->board->context != BOARD_DEFERRED) {
+        require(hal, true, __func__);
+    }
     return (uint32_t)(hal->board->interrupt_took_ns / HAL_PWM_TICK_NS);
+}
+
+void hal_interrupt_request_deferred(hal_t *hal) {
+    require(hal, true, __func__);
+    hal->board->deferred_requested = true;
 }
 
 bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {

@@ -19,6 +19,10 @@ static void control_interrupt(void *context) {
     drive_control_interrupt(context);
 }
 
+static void deferred_interrupt(void *context) {
+    drive_deferred_interrupt(context);
+}
+
 static void background(void *context) {
     drive_background(context);
 }
@@ -38,9 +42,10 @@ int main(int argc, char *argv[]) {
         .controller = (drive_controller_t)options.controller_index,
     };
     if (drive_init(&drive, &hal, &machine_tables, &drive_config)) {
-        simulation_run(
-            &simulation,
-            &(rig_firmware_t){.control_interrupt = control_interrupt, .background = background, .context = &drive});
+        simulation_run(&simulation, &(rig_firmware_t){.control_interrupt = control_interrupt,
+                                                      .deferred_interrupt = deferred_interrupt,
+                                                      .background = background,
+                                                      .context = &drive});
     } else {
         simulation_rejected(&simulation);
     }

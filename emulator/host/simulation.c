@@ -142,6 +142,11 @@ static void control_interrupt(void *context) {
     }
 }
 
+static void deferred_interrupt(void *context) {
+    simulation_t *simulation = context;
+    simulation->firmware.deferred_interrupt(simulation->firmware.context);
+}
+
 static void background(void *context) {
     simulation_t *simulation = context;
     simulation->firmware.background(simulation->firmware.context);
@@ -149,9 +154,10 @@ static void background(void *context) {
 
 void simulation_run(simulation_t *simulation, const rig_firmware_t *firmware) {
     simulation->firmware = *firmware;
-    rig_join(
-        &simulation->rig,
-        &(rig_firmware_t){.control_interrupt = control_interrupt, .background = background, .context = simulation});
+    rig_join(&simulation->rig, &(rig_firmware_t){.control_interrupt = control_interrupt,
+                                                 .deferred_interrupt = deferred_interrupt,
+                                                 .background = background,
+                                                 .context = simulation});
     print_ready(simulation->options);
     while (rig_serve(&simulation->rig, -1)) {
     }

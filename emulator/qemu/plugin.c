@@ -2,7 +2,7 @@
  *
  * QEMU plugin: opens the co-simulation when QEMU starts, and serves each store of the drive to the doorbell.
  *
- * Plugin arguments: mailbox=FILE, the board's shared memory; instructions=FILE, see instructions.h;
+ * Plugin arguments: mailbox=FILE, the board's shared memory; instructions=FILE and deferred=FILE, see instructions.h;
  * execution=FILE and stack=END-BEGIN, see trace.h; timed=1, instructions take time; argument=TEXT, one
  * argument of the command line of the host executable, repeated in order.
  */
@@ -116,7 +116,7 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
     static options_t options; /* the co-simulation keeps it */
     char *words[ARGUMENTS_MAX + 1] = {"salient"};
     int count = 1;
-    const char *mailbox_path = NULL, *instructions_path = NULL, *trace_path = NULL, *stack = "";
+    const char *mailbox_path = NULL, *control_path = NULL, *deferred_path = NULL, *trace_path = NULL, *stack = "";
     bool timed = false;
     for (int i = 0; i < argc; ++i) {
         char *value;
@@ -129,7 +129,9 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
         } else if ((value = value_of(argv[i], "mailbox="))) {
             mailbox_path = value;
         } else if ((value = value_of(argv[i], "instructions="))) {
-            instructions_path = strdup(value);
+            control_path = strdup(value);
+        } else if ((value = value_of(argv[i], "deferred="))) {
+            deferred_path = strdup(value);
         } else if ((value = value_of(argv[i], "execution="))) {
             trace_path = strdup(value);
         } else if ((value = value_of(argv[i], "stack="))) {
@@ -152,9 +154,9 @@ int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, 
         exit(result == OPTIONS_HELP ? 0 : EXIT_USAGE);
     }
     on_exit(ended, NULL);
-    counting = instructions_path;
+    counting = control_path || deferred_path;
     tracing = trace_path;
-    if ((counting && !instructions_open(instructions_path)) || (tracing && !trace_open(trace_path, stack))) {
+    if ((counting && !instructions_open(control_path, deferred_path)) || (tracing && !trace_open(trace_path, stack))) {
         exit(EXIT_USAGE);
     }
     qemu_plugin_register_vcpu_tb_trans_cb(id, translate);

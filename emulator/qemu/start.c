@@ -67,9 +67,11 @@ static const board_description_t *board_of(const char *image) {
 
 int main(int argc, char *argv[]) {
     if (argc < 2 || strcmp(argv[1], "--help") == 0) {
-        printf("usage: %s IMAGE.elf [--instructions FILE] [--execution FILE STACK] [--instruction-ns N] OPTION...\n"
+        printf("usage: %s IMAGE.elf [--instructions FILE] [--deferred-instructions FILE] [--execution FILE STACK] "
+               "[--instruction-ns N] OPTION...\n"
                "  IMAGE.elf            the drive, as built for a board of QEMU\n"
                "  --instructions FILE  writes the number of instructions of each control interrupt as uint32_t\n"
+               "  --deferred-instructions FILE  the same of each deferred interrupt\n"
                "  --execution FILE STACK  writes the execution count of each block of instructions and the lowest\n"
                "                       address written on the stack, whose limits are STACK: END-BEGIN, hexadecimal\n"
                "  --instruction-ns N   execution time per instruction: a power of two up to 64; without this option\n"
@@ -78,10 +80,15 @@ int main(int argc, char *argv[]) {
                argv[0]);
         return argc < 2 ? EXIT_USAGE : 0;
     }
-    const char *image = argv[1], *instructions = NULL, *execution = NULL, *stack = NULL, *instruction_ns = NULL;
+    const char *image = argv[1], *instructions = NULL, *deferred = NULL, *execution = NULL, *stack = NULL,
+               *instruction_ns = NULL;
     int first = 2;
     if (argc > first + 1 && strcmp(argv[first], "--instructions") == 0) {
         instructions = argv[first + 1];
+        first += 2;
+    }
+    if (argc > first + 1 && strcmp(argv[first], "--deferred-instructions") == 0) {
+        deferred = argv[first + 1];
         first += 2;
     }
     if (argc > first + 2 && strcmp(argv[first], "--execution") == 0) {
@@ -125,6 +132,9 @@ int main(int argc, char *argv[]) {
     put_option(list, "mailbox", path);
     if (instructions) {
         put_option(list, "instructions", instructions);
+    }
+    if (deferred) {
+        put_option(list, "deferred", deferred);
     }
     if (execution) {
         put_option(list, "execution", execution);

@@ -17,12 +17,13 @@
 #include "rig/can_bus.h"
 
 /* Context in which the firmware is called. */
-typedef enum { BOARD_START, BOARD_INTERRUPT, BOARD_BACKGROUND } board_context_t;
+typedef enum { BOARD_START, BOARD_INTERRUPT, BOARD_DEFERRED, BOARD_BACKGROUND } board_context_t;
 
 typedef struct {
     uint64_t time_ns;
     board_context_t context;
     bool in_critical_section;
+    bool deferred_requested; /* by the control interrupt: the rig calls the deferred interrupt after it */
 
     hal_adc_sample_t adc;         /* latched at the start of the period */
     hal_encoder_sample_t encoder; /* likewise */

@@ -24,6 +24,15 @@ static void call(rig_t *rig, board_context_t context, void (*function)(void *)) 
     function(rig->firmware.context);
 }
 
+/* A deferred interrupt that waits for the end of the control interrupt precedes a control interrupt triggered at that
+ * instant. */
+static void call_deferred(rig_t *rig) {
+    if (rig->board.deferred_requested) {
+        rig->board.deferred_requested = false;
+        call(rig, BOARD_DEFERRED, rig->firmware.deferred_interrupt);
+    }
+}
+
 void control_period_hold_event(void *context, uint64_t now_ns) {
     rig_t *rig = context;
     rig->scheduler.due_ns[EVENT_CURRENT_HOLD] = SCHEDULER_NEVER;
@@ -41,9 +50,11 @@ void control_period_start_event(void *context, uint64_t now_ns) {
     if (busy) {
         return;
     }
+    call_deferred(rig);
     rig->board.interrupt_took_ns = rig->interrupt_time_ns;
     call(rig, BOARD_INTERRUPT, rig->firmware.control_interrupt);
     if (rig->board.interrupt_took_ns == 0) {
+        call_deferred(rig);
         call(rig, BOARD_BACKGROUND, rig->firmware.background);
     } else {
         /* When that is the start of the next period, the interrupt comes first and postpones the background again. */
@@ -56,6 +67,7 @@ void control_period_background_event(void *context, uint64_t now_ns) {
     rig_t *rig = context;
     rig->scheduler.due_ns[EVENT_BACKGROUND] = SCHEDULER_NEVER;
     plant_advance(&rig->plant, now_ns);
+    call_deferred(rig);
     call(rig, BOARD_BACKGROUND, rig->firmware.background);
     bus_start(rig);
 }

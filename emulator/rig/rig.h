@@ -33,10 +33,11 @@
 #define RIG_RUNS_MAX 64           /* RIG_RUN_UNTILs that wait for their time */
 #define RIG_MOVING_BACKLOG_MAX 64 /* all paces but lock-step: clients wait while this many frames are queued */
 
-/* The firmware, seen from the emulator. Both take no virtual time but that in board.interrupt_took_ns. */
+/* The firmware, seen from the emulator. All take no virtual time, except as board.interrupt_took_ns says. */
 typedef struct {
-    void (*control_interrupt)(void *context); /* at the start of each control period */
-    void (*background)(void *context);        /* after each interrupt */
+    void (*control_interrupt)(void *context);  /* at the start of each control period */
+    void (*deferred_interrupt)(void *context); /* after a control interrupt that has set board.deferred_requested */
+    void (*background)(void *context);         /* after each control interrupt and the deferred one */
     void *context;
 } rig_firmware_t;
 

@@ -60,8 +60,20 @@ void observer_bandwidth_reset(observer_bandwidth_t *bandwidth) {
     *bandwidth = (observer_bandwidth_t){.stage = 0};
 }
 
+static uint32_t threshold_of(const observer_bandwidth_parameters_t *parameters, uint32_t threshold_mean,
+                             bool from_edge) {
+    const uint32_t threshold_min = from_edge ? parameters->threshold_edge : parameters->threshold_count;
+    return threshold_mean > threshold_min ? threshold_mean : threshold_min;
+}
+
+static uint32_t threshold_of_mean(const observer_bandwidth_statistics_t *statistics) {
+    const uint32_t mean = (uint32_t)(statistics->mean_innovation_q32 >> 32); /* below 2^27, as any innovation */
+    return mean * MEAN_INNOVATION_FACTOR;
+}
+
 const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_parameters_t *parameters,
-                                                     observer_bandwidth_t *bandwidth, int32_t innovation,
+                                                     observer_bandwidth_t *bandwidth,
+                                                     const observer_bandwidth_limits_t *limits, int32_t innovation,
                                                      bool from_edge) {
     if (!parameters->adaptive) {
         return &parameters->gains[LAST_STAGE];
@@ -69,42 +81,51 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
     if (bandwidth->ticks < UINT32_MAX) {
         bandwidth->ticks++;
     }
-    while (bandwidth->stage < LAST_STAGE && bandwidth->ticks >= parameters->end_ticks[bandwidth->stage]) {
+    /* One stage a sample: the ends of stages are further apart, but for those that already have the steady bandwidth.
+     */
+    if (bandwidth->stage < LAST_STAGE && bandwidth->ticks >= parameters->end_ticks[bandwidth->stage]) {
         bandwidth->stage++;
     }
-    const bool steady = bandwidth->stage == LAST_STAGE;
-    const uint32_t threshold_min = from_edge ? parameters->threshold_edge : parameters->threshold_count;
-    const int32_t mean = (int32_t)(bandwidth->mean_innovation_q32 >> 32); /* below 2^27, as any innovation */
-    const uint32_t relative = (uint32_t)mean * MEAN_INNOVATION_FACTOR;
-    const uint32_t threshold = relative > threshold_min ? relative : threshold_min;
-    const uint32_t magnitude = (uint32_t)fixed_abs(innovation);
-    if (steady) {
-        /* Innovations are clipped at the threshold, so that a load step does not raise it. */
-        const int32_t clipped = (int32_t)(magnitude < threshold ? magnitude : threshold);
-        bandwidth->mean_innovation_q32 =
-            fixed_accumulate(bandwidth->mean_innovation_q32, clipped - mean, parameters->mean_innovation_gain_q32);
-    }
-    bandwidth->holdoff_extension_q16 =
-        (uint32_t)(((uint64_t)bandwidth->holdoff_extension_q16 * parameters->holdoff_decay_q32) >> 32);
-    if (magnitude > threshold) {
-        const uint32_t retrigger_holdoff_ticks =
-            parameters->retrigger_holdoff_ticks +
-            (uint32_t)(((uint64_t)parameters->retrigger_holdoff_ticks * bandwidth->holdoff_extension_q16) >> 16);
-        if (bandwidth->ticks >= retrigger_holdoff_ticks) {
-            /* In the steady state a trigger is a new event; during a decay it may belong to the last one. */
-            const uint32_t growth_q16 =
-                steady ? bandwidth->holdoff_extension_q16 : bandwidth->holdoff_extension_q16 / 4;
-            const uint32_t extension_q16 = bandwidth->holdoff_extension_q16 + growth_q16 + HOLDOFF_INCREMENT_Q16;
-            bandwidth->holdoff_extension_q16 =
-                extension_q16 < HOLDOFF_EXTENSION_MAX_Q16 ? extension_q16 : HOLDOFF_EXTENSION_MAX_Q16;
-            bandwidth->stage = from_edge ? 0 : parameters->trigger_stage_count;
-            bandwidth->ticks = 0;
-        }
+    if ((uint32_t)fixed_abs(innovation) > threshold_of(parameters, limits->threshold_mean, from_edge) &&
+        bandwidth->ticks >= parameters->retrigger_holdoff_ticks + limits->holdoff_extension_ticks) {
+        bandwidth->trigger =
+            bandwidth->stage == LAST_STAGE ? OBSERVER_TRIGGER_IN_STEADY_STATE : OBSERVER_TRIGGER_IN_DECAY;
+        bandwidth->stage = from_edge ? 0 : parameters->trigger_stage_count;
+        bandwidth->ticks = 0;
     }
     return &parameters->gains[bandwidth->stage];
 }
 
-bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters,
-                               const observer_bandwidth_t *bandwidth) {
-    return !parameters->adaptive || bandwidth->stage == LAST_STAGE;
+observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
+                                                      observer_bandwidth_statistics_t *statistics,
+                                                      const observer_bandwidth_sample_t *sample) {
+    const bool triggered_steady = sample->trigger == OBSERVER_TRIGGER_IN_STEADY_STATE;
+    const bool was_steady = sample->trigger == OBSERVER_TRIGGER_NONE ? sample->stage == LAST_STAGE : triggered_steady;
+    if (was_steady) {
+        /* Innovations are clipped at the threshold, so that a load step does not raise it. */
+        const uint32_t threshold = threshold_of(parameters, threshold_of_mean(statistics), sample->from_edge);
+        const uint32_t magnitude = (uint32_t)fixed_abs(sample->innovation);
+        const int32_t clipped = (int32_t)(magnitude < threshold ? magnitude : threshold);
+        const int32_t mean = (int32_t)(statistics->mean_innovation_q32 >> 32);
+        statistics->mean_innovation_q32 =
+            fixed_accumulate(statistics->mean_innovation_q32, clipped - mean, parameters->mean_innovation_gain_q32);
+    }
+    if (sample->trigger != OBSERVER_TRIGGER_NONE) {
+        const uint32_t growth_q16 =
+            triggered_steady ? statistics->holdoff_extension_q16 : statistics->holdoff_extension_q16 / 4;
+        const uint32_t extension_q16 = statistics->holdoff_extension_q16 + growth_q16 + HOLDOFF_INCREMENT_Q16;
+        statistics->holdoff_extension_q16 =
+            extension_q16 < HOLDOFF_EXTENSION_MAX_Q16 ? extension_q16 : HOLDOFF_EXTENSION_MAX_Q16;
+    }
+    statistics->holdoff_extension_q16 =
+        (uint32_t)(((uint64_t)statistics->holdoff_extension_q16 * parameters->holdoff_decay_q32) >> 32);
+    return (observer_bandwidth_limits_t){
+        .threshold_mean = threshold_of_mean(statistics),
+        .holdoff_extension_ticks =
+            (uint32_t)(((uint64_t)parameters->retrigger_holdoff_ticks * statistics->holdoff_extension_q16) >> 16),
+    };
+}
+
+bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters, unsigned stage) {
+    return !parameters->adaptive || stage == LAST_STAGE;
 }

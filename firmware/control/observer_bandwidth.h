@@ -43,12 +43,40 @@ typedef struct {
     uint8_t trigger_stage_count;      /* first stage after a trigger by a count; by an edge stage 0 */
 } observer_bandwidth_parameters_t;
 
+/* Trigger in the last sample or samples. In the steady state it is a new event; during a decay it may belong to the
+ * last one. */
+typedef enum {
+    OBSERVER_TRIGGER_NONE,
+    OBSERVER_TRIGGER_IN_DECAY,
+    OBSERVER_TRIGGER_IN_STEADY_STATE,
+} observer_trigger_t;
+
+/* Schedule, advanced by every sample. */
 typedef struct {
     unsigned stage;
-    uint32_t ticks;                 /* periods since the last trigger, saturates */
-    uint32_t holdoff_extension_q16; /* hold-off beyond the minimum, in minimum hold-offs, Q8.16 */
-    int64_t mean_innovation_q32;    /* mean magnitude of the innovation, 2^-32 rev, Q27.32 */
+    uint32_t ticks;             /* periods since the last trigger, saturates */
+    observer_trigger_t trigger; /* since the caller last set it to OBSERVER_TRIGGER_NONE */
 } observer_bandwidth_t;
+
+/* Limits of the coming sample's trigger, besides those of the parameters; all zero: only those of the parameters. */
+typedef struct {
+    uint32_t threshold_mean;          /* four times the mean innovation, 2^-32 rev */
+    uint32_t holdoff_extension_ticks; /* hold-off beyond the minimum, periods */
+} observer_bandwidth_limits_t;
+
+/* Statistics from which the limits follow. */
+typedef struct {
+    uint32_t holdoff_extension_q16; /* hold-off beyond the minimum in the coming sample, in minimum hold-offs, Q8.16 */
+    int64_t mean_innovation_q32;    /* mean magnitude of the innovation, 2^-32 rev, Q27.32 */
+} observer_bandwidth_statistics_t;
+
+/* Sample for the statistics. */
+typedef struct {
+    int32_t innovation; /* 2^-32 rev */
+    bool from_edge;
+    unsigned stage;             /* after the sample */
+    observer_trigger_t trigger; /* since the last update */
+} observer_bandwidth_sample_t;
 
 /* Schedule from transient to steady bandwidth in rad/s (100 <= steady <= transient <= 10000); equal ones switch the
  * scheduling off. encoder_bits 10..32, control rate in Hz, inertia in kg m^2, Q1.30. */
@@ -60,13 +88,20 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t transient_
 void observer_bandwidth_reset(observer_bandwidth_t *bandwidth);
 
 /* One sample: returns its gains. `innovation` in 2^-32 rev, -2^27..2^27 - 1; from_edge: the angle was measured from the
- * time of an edge. 64-bit products, rounded down. */
+ * time of an edge. */
 const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_parameters_t *parameters,
-                                                     observer_bandwidth_t *bandwidth, int32_t innovation,
+                                                     observer_bandwidth_t *bandwidth,
+                                                     const observer_bandwidth_limits_t *limits, int32_t innovation,
                                                      bool from_edge);
 
+/* Updates the statistics with a sample after its observer_bandwidth_step, and returns the limits of the next one.
+ * 64-bit products, rounded down. A sample that is left out does not change the statistics; its trigger counts in the
+ * next. */
+observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
+                                                      observer_bandwidth_statistics_t *statistics,
+                                                      const observer_bandwidth_sample_t *sample);
+
 /* True at the steady bandwidth, always without scheduling. */
-bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters,
-                               const observer_bandwidth_t *bandwidth);
+bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters, unsigned stage);
 
 #endif

@@ -156,12 +156,14 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     return adds ? shortfall - gained : shortfall + gained;
 }
 
-static void move_windows(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
-                         int32_t torque_q24) {
-    const bool voltage_limited =
-        fixed_abs(control->torque_shortfall_q24) > SHORTFALL_MIN_Q24 + fixed_abs(torque_q24) / 64;
+torque_sharing_window_t predictive_torque_move_windows(const predictive_torque_parameters_t *parameters,
+                                                       int32_t *advance_q30, int32_t torque_q24,
+                                                       int32_t torque_shortfall_q24) {
+    const bool voltage_limited = fixed_abs(torque_shortfall_q24) > SHORTFALL_MIN_Q24 + fixed_abs(torque_q24) / 64;
     const int32_t step_q30 = voltage_limited ? parameters->advance_step_q30 : -parameters->retract_step_q30;
-    control->advance_q30 = fixed_clamp(control->advance_q30 + step_q30, 0, ONE_Q30);
+    *advance_q30 = fixed_clamp(*advance_q30 + step_q30, 0, ONE_Q30);
+    const int32_t advance_q15 = *advance_q30 >> 15;
+    return advance_q15 > 0 ? torque_sharing_window(&parameters->sharing, advance_q15) : parameters->base_window;
 }
 
 static int32_t non_negative(int32_t flux_q29) {
@@ -245,7 +247,7 @@ static inline void set_duties(const predictive_torque_parameters_t *parameters, 
 }
 
 void predictive_torque_reset(predictive_torque_t *control) {
-    *control = (predictive_torque_t){.advance_q30 = 0};
+    *control = (predictive_torque_t){.torque_shortfall_q24 = 0};
 }
 
 void predictive_torque_step(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
@@ -264,15 +266,11 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     const int32_t positive_half_q24 = fixed_add(torque_q24 > 0 ? torque_q24 : 0, opposed_q24);
     const int32_t negative_half_q24 = fixed_add(torque_q24 < 0 ? fixed_abs(torque_q24) : 0, opposed_q24);
 
-    move_windows(parameters, control, torque_q24);
-    const int32_t advance_q15 = control->advance_q30 >> 15;
-    const torque_sharing_window_t *base_window = &parameters->base_window;
-    const torque_sharing_window_t advanced_window =
-        advance_q15 > 0 ? torque_sharing_window(&parameters->sharing, advance_q15) : *base_window;
     /* Windows advance against the rotation, which would be later for a braking phase. */
+    const torque_sharing_window_t *base_window = &parameters->base_window;
     const half_t half[2] = {
-        {sample->reverse ? &advanced_window : base_window, negative_half_q24 >> torque_shift, !sample->reverse},
-        {sample->reverse ? base_window : &advanced_window, positive_half_q24 >> torque_shift, sample->reverse},
+        {sample->reverse ? sample->window : base_window, negative_half_q24 >> torque_shift, !sample->reverse},
+        {sample->reverse ? base_window : sample->window, positive_half_q24 >> torque_shift, sample->reverse},
     };
 
     plan_t plan[HAL_PHASES_MAX];

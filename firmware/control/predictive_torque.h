@@ -53,24 +53,30 @@ typedef struct {
 typedef struct {
     int32_t flux_q29[HAL_PHASES_MAX]; /* predicted for the coming sample, Wb, Q2.29 */
     int32_t duty_q15[HAL_PHASES_MAX]; /* acts from the coming sample on, Q1.15 */
-    int32_t advance_q30;              /* of the windows, Q1.30, 0..1 */
     int32_t torque_shortfall_q24;     /* reference less planned torque, N m, Q7.24; 0 within 1/64 N m */
     int32_t position_q13[HAL_PHASES_MAX]; /* of the planned operating point, in table columns, Q13; about 0..40 */
     uint8_t column[HAL_PHASES_MAX];       /* table column in which the next plan begins */
 } predictive_torque_t;
 
 typedef struct {
-    const int32_t *current_q9; /* A, Q7.9, by phase, at the sample */
-    const int32_t *flux;       /* from the tables, in their unit, by phase, at the sample */
-    const uint32_t *angle;     /* two periods after the sample, 2^-32 electrical rev, by phase */
-    int32_t bus_voltage_q6;    /* DC-link voltage, V, Q9.6 */
-    int32_t torque_q24;        /* reference, N m, Q7.24 */
-    bool reverse;              /* negative direction of rotation */
-    uint32_t angle_step;       /* magnitude of the rotation per period, 2^-32 electrical rev */
+    const int32_t *current_q9;             /* A, Q7.9, by phase, at the sample */
+    const int32_t *flux;                   /* from the tables, in their unit, by phase, at the sample */
+    const torque_sharing_window_t *window; /* of the motoring phases, from predictive_torque_move_windows */
+    const uint32_t *angle;                 /* two periods after the sample, 2^-32 electrical rev, by phase */
+    int32_t bus_voltage_q6;                /* DC-link voltage, V, Q9.6 */
+    int32_t torque_q24;                    /* reference, N m, Q7.24 */
+    bool reverse;                          /* negative direction of rotation */
+    uint32_t angle_step;                   /* magnitude of the rotation per period, 2^-32 electrical rev */
 } predictive_torque_sample_t;
 
-/* Flux linkages, duties and advance 0. */
+/* Flux linkages and duties 0. */
 void predictive_torque_reset(predictive_torque_t *control);
+
+/* Moves the windows by one period, from the torque reference and shortfall of a sample, N m, Q7.24: the window of the
+ * motoring phases for the next sample. *advance_q30: position of the windows, Q1.30, 0..1, 0 at the start. */
+torque_sharing_window_t predictive_torque_move_windows(const predictive_torque_parameters_t *parameters,
+                                                       int32_t *advance_q30, int32_t torque_q24,
+                                                       int32_t torque_shortfall_q24);
 
 /* One sample: duty of each phase, Q1.15, -32768..32768. All sums saturate; 32-bit products are rounded to nearest, the
  * error of the quotient is below 2^-14 of full duty. */

@@ -8,6 +8,7 @@
  *   speed control   speed reference -> torque reference                                               speed_control.h
  *   torque control  torque reference -> duties                                                        torque_control.h
  *   modulate        duties -> compare values                                                          modulator.h
+ *   hand over       values of the period -> deferred step, whose results act in the next one          deferred.h
  */
 #ifndef DRIVE_CONTROL_H
 #define DRIVE_CONTROL_H
@@ -27,6 +28,7 @@
 #include "control/speed_smc.h"
 #include "control/torque_trim.h"
 #include "drive/command.h"
+#include "drive/deferred_exchange.h"
 #include "drive/protection.h"
 #include "drive/state_machine.h"
 #include "hal_adc.h"
@@ -98,8 +100,21 @@ typedef struct {
     int32_t flux_linkage[HAL_PHASES_MAX]; /* with predictive torque control only */
 } control_measurement_t;
 
+/* State of the deferred step, which alone writes it. */
 typedef struct {
-    bool started; /* the first sample has initialised observer and protection */
+    deferred_response_t response;
+    bool started;        /* the first input has initialised the protection */
+    uint32_t generation; /* of the last input */
+    protection_deferred_t protection;
+    observer_bandwidth_statistics_t bandwidth;
+    int32_t advance_q30;         /* of the conduction windows, Q1.30, 0..1 */
+    misalignment_t misalignment; /* a property of the machine: survives the end of a run */
+} deferred_t;
+
+/* State of the control; the control interrupt alone writes the members other than `deferred`. */
+typedef struct {
+    bool started;       /* the first sample has initialised observer and protection */
+    int32_t innovation; /* of the last sample, 2^-32 rev */
     load_observer_t observer;
     observer_bandwidth_t bandwidth;
     protection_t protection;
@@ -112,7 +127,8 @@ typedef struct {
     pwm_ditc_t duty;
     torque_trim_t trim;
     predictive_torque_t predictive;
-    misalignment_t misalignment; /* a property of the machine: survives the end of a run */
+    deferred_request_t deferred_request;
+    deferred_t deferred;
     /* Last measurement, for telemetry: no step reads it here, each one receives the measurement as an argument. */
     control_measurement_t measurement;
 } control_state_t;
@@ -125,7 +141,8 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
 void control_prepare(const control_parameters_t *parameters, control_state_t *state);
 
 /* One control period. command: the last accepted one, COMMAND_OFF before the first. Returns false when every switch
- * must be open; then *compare is all zero. [interrupt] */
+ * must be open; then *compare is all zero. A deferred step (deferred.h) is requested, unless
+ * state->deferred_request.skipped > 0. [interrupt] */
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare);
 

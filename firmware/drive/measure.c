@@ -32,7 +32,8 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
 }
 
 void measure(const control_parameters_t *parameters, const load_observer_t *observer,
-             const misalignment_t *misalignment, const control_sample_t *sample, control_measurement_t *measured) {
+             const int32_t misalignment[HAL_PHASES_MAX], const control_sample_t *sample,
+             control_measurement_t *measured) {
     measure_angle(parameters, observer, &sample->encoder, measured);
     measured->dc_link_voltage_q6 = scale_counts(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
     commutation_find(&parameters->commutation, measured->angle, &measured->commutation);

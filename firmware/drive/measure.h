@@ -3,20 +3,20 @@
 #define DRIVE_MEASURE_H
 
 #include "control/commutation.h"
-#include "control/misalignment.h"
 #include "drive/control.h"
 
 /* Converts a sample. The angle of an encoder edge is extrapolated at the observer's speed; torque and flux linkage are
- * looked up in the machine's tables at the angle of each phase, corrected by its misalignment. Currents and voltage are
- * rounded to nearest; a count of 0 is exactly 0 A. */
+ * looked up in the machine's tables at the angle of each phase, corrected by its misalignment (2^-32 electrical rev).
+ * Currents and voltage are rounded to nearest; a count of 0 is exactly 0 A. */
 void measure(const control_parameters_t *parameters, const load_observer_t *observer,
-             const misalignment_t *misalignment, const control_sample_t *sample, control_measurement_t *measured);
+             const int32_t misalignment[HAL_PHASES_MAX], const control_sample_t *sample,
+             control_measurement_t *measured);
 
 /* Angle of a phase, corrected by the misalignment of its pole, 2^-32 electrical revolution. */
-static inline uint32_t measured_phase_angle(const control_parameters_t *parameters, const misalignment_t *misalignment,
+static inline uint32_t measured_phase_angle(const control_parameters_t *parameters,
+                                            const int32_t misalignment[HAL_PHASES_MAX],
                                             const control_measurement_t *measured, unsigned phase) {
-    return commutation_angle(&parameters->commutation, &measured->commutation, phase) -
-           (uint32_t)misalignment->phase[phase].offset;
+    return commutation_angle(&parameters->commutation, &measured->commutation, phase) - (uint32_t)misalignment[phase];
 }
 
 #endif

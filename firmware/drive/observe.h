@@ -5,7 +5,8 @@
 #include "drive/control.h"
 
 /* Corrects the observer with a measurement and predicts the coming sample; the bandwidth follows the innovation. */
-void observe(const control_parameters_t *parameters, control_state_t *state, const control_measurement_t *measured);
+void observe(const control_parameters_t *parameters, control_state_t *state, const observer_bandwidth_limits_t *limits,
+             const control_measurement_t *measured);
 
 /* Restarts the observer at the measured angle, at standstill, with its maximum bandwidth. */
 void observe_reset(control_state_t *state, const control_measurement_t *measured);

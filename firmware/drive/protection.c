@@ -8,11 +8,17 @@
 /* An encoder that does not count is no evidence of a fault below this speed: 1 rad/s. */
 #define STANDSTILL_Q22 (1 << 22)
 
-/* Above every limit; the sum stops growing there and so cannot overflow. */
+/* Above every limit; the sum stops growing there and so cannot overflow: with the highest speed at 20 kHz a period adds
+ * less than 2^25. */
 #define UNDETECTED_TRAVEL_STOP (1 << 30)
+#define PERIODS_MAX 16
 
 void protection_reset(protection_t *protection, uint32_t encoder_angle) {
     *protection = (protection_t){.encoder_angle = encoder_angle};
+}
+
+void protection_deferred_reset(protection_deferred_t *protection, uint32_t encoder_angle) {
+    *protection = (protection_deferred_t){.encoder_angle = encoder_angle};
 }
 
 static void fail_if(uint64_t *failed, bool condition, fault_t fault) {
@@ -22,56 +28,68 @@ static void fail_if(uint64_t *failed, bool condition, fault_t fault) {
 }
 
 /* Triggers lost in consecutive periods, including this one; saturates. */
-static int32_t count_overruns(protection_t *protection, uint32_t missed_interrupts) {
-    protection->overruns =
-        missed_interrupts == 0 ? 0 : fixed_saturate((int64_t)protection->overruns + missed_interrupts);
+static uint32_t count_overruns(protection_t *protection, uint32_t missed_interrupts) {
+    const uint32_t sum = protection->overruns + missed_interrupts;
+    protection->overruns = missed_interrupts == 0 ? 0 : sum >= missed_interrupts ? sum : UINT32_MAX;
     return protection->overruns;
 }
 
 /* True when the angle changed by more than the rotor can turn, over the lost periods as well. */
 static bool encoder_jumped(const protection_parameters_t *parameters, int32_t angle_step, uint32_t missed_interrupts) {
-    const int64_t periods = (int64_t)missed_interrupts + 1;
-    return fixed_abs(angle_step) > fixed_saturate(parameters->angle_step_max * periods);
+    const uint64_t step_max = (uint32_t)parameters->angle_step_max;
+    return (uint32_t)fixed_abs(angle_step) > step_max * missed_interrupts + step_max;
 }
 
 /* True when the encoder does not count although the rotor turns. The observer alone cannot detect that: with a high
  * bandwidth it follows a frozen encoder to standstill before the rotor has turned far. No torque stops the rotor that
  * quickly, so the rotor is also assumed to be no slower than at the last count less the largest possible deceleration
  * since. */
-static bool encoder_frozen(const protection_parameters_t *parameters, protection_t *protection, int32_t angle_step,
-                           int32_t speed_q22) {
-    if (angle_step != 0) {
+static bool encoder_frozen(const protection_parameters_t *parameters, protection_deferred_t *protection,
+                           const protection_deferred_input_t *input, int32_t speed_q22) {
+    const bool counted = input->encoder_angle != protection->encoder_angle;
+    protection->encoder_angle = input->encoder_angle;
+    if (counted) {
         protection->speed_lower_bound_q22 = speed_q22;
         protection->undetected_travel = 0;
         return false;
     }
-    const int32_t bound_q22 = fixed_subtract(protection->speed_lower_bound_q22, parameters->deceleration_max_q22);
+    const int32_t periods = (int32_t)(input->periods < PERIODS_MAX ? input->periods : PERIODS_MAX);
+    const int32_t deceleration_q22 = fixed_saturate((int64_t)parameters->deceleration_max_q22 * periods);
+    const int32_t bound_q22 = fixed_subtract(protection->speed_lower_bound_q22, deceleration_q22);
     const int32_t assumed_q22 = speed_q22 > bound_q22 ? speed_q22 : bound_q22;
     protection->speed_lower_bound_q22 = assumed_q22;
     if (assumed_q22 < STANDSTILL_Q22) {
         protection->undetected_travel = 0;
     } else if (protection->undetected_travel < UNDETECTED_TRAVEL_STOP) {
-        /* Highest speed and 20 kHz: below 2^25 per period. */
-        protection->undetected_travel += fixed_multiply_high(assumed_q22, parameters->angle_step_q32);
+        protection->undetected_travel += periods * fixed_multiply_high(assumed_q22, parameters->angle_step_q32);
     }
     return protection->undetected_travel > parameters->undetected_travel_max;
 }
 
 uint64_t protection_check(const protection_parameters_t *parameters, protection_t *protection,
                           const protection_input_t *input) {
-    const int32_t speed_q22 = fixed_abs(input->speed_q22);
     const int32_t angle_step = (int32_t)(input->encoder_angle - protection->encoder_angle); /* modulo one revolution */
     protection->encoder_angle = input->encoder_angle;
     const uint32_t missed = input->missed_interrupts;
+    const bool overrun = count_overruns(protection, missed) >= PROTECTION_OVERRUNS_MAX ||
+                         input->skipped_deferred >= PROTECTION_SKIPPED_DEFERRED_MAX;
 
     uint64_t failed = 0;
     fail_if(&failed, input->current_max_q9 > parameters->current_trip_q9, FAULT_OVER_CURRENT);
     fail_if(&failed, input->dc_link_voltage_q6 > parameters->dc_link_over_voltage_q6, FAULT_OVER_VOLTAGE);
+    fail_if(&failed, encoder_jumped(parameters, angle_step, missed), FAULT_ENCODER);
+    fail_if(&failed, overrun, FAULT_INTERRUPT_OVERRUN);
+    return failed;
+}
+
+uint64_t protection_check_deferred(const protection_parameters_t *parameters, protection_deferred_t *protection,
+                                   const protection_deferred_input_t *input) {
+    const int32_t speed_q22 = fixed_abs(input->speed_q22);
+
+    uint64_t failed = 0;
     fail_if(&failed, input->dc_link_voltage_q6 < parameters->dc_link_under_voltage_q6, FAULT_UNDER_VOLTAGE);
     fail_if(&failed, speed_q22 > parameters->over_speed_q22, FAULT_OVER_SPEED);
-    fail_if(&failed, encoder_jumped(parameters, angle_step, missed), FAULT_ENCODER);
-    fail_if(&failed, encoder_frozen(parameters, protection, angle_step, speed_q22), FAULT_ENCODER);
+    fail_if(&failed, encoder_frozen(parameters, protection, input, speed_q22), FAULT_ENCODER);
     fail_if(&failed, input->command_age_us > parameters->command_timeout_us, FAULT_COMMAND_TIMEOUT);
-    fail_if(&failed, count_overruns(protection, missed) >= PROTECTION_OVERRUNS_MAX, FAULT_INTERRUPT_OVERRUN);
     return failed;
 }

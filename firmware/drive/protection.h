@@ -1,5 +1,10 @@
-/* Fault detection: checks of every control period. All of them are evaluated in every period; the state machine decides
- * which ones count and latches the first fault. Speed and encoder are checked alike in both directions. */
+/* Fault detection, in every control period and state; the state machine decides which failed checks count and latches
+ * the first fault. Speed and encoder are checked alike in both directions.
+ *
+ *   immediate checks    in the control interrupt: over-current, over-voltage, encoder jump, overruns
+ *   deferred checks     in the deferred interrupt: under-voltage, over-speed, frozen encoder, command timeout. They act
+ * one period later, or later still when the deferred interrupt is late; a condition that has gone by then is not seen.
+ */
 #ifndef DRIVE_PROTECTION_H
 #define DRIVE_PROTECTION_H
 
@@ -17,32 +22,57 @@ typedef struct {
     uint32_t command_timeout_us;
 } protection_parameters_t;
 
+/* State of the immediate checks. */
 typedef struct {
-    uint32_t encoder_angle;        /* of the previous period, 2^-32 rev */
+    uint32_t encoder_angle; /* of the previous period, 2^-32 rev */
+    uint32_t overruns;      /* triggers lost in consecutive control periods; saturates */
+} protection_t;
+
+/* State of the deferred checks. */
+typedef struct {
+    uint32_t encoder_angle;        /* of the previous check, 2^-32 rev */
     int32_t speed_lower_bound_q22; /* lowest speed that the rotor can have, rad/s, Q9.22 */
     int32_t undetected_travel;     /* expected rotation since the last encoder count, 2^-32 rev; stops above 2^30 */
-    int32_t overruns;              /* triggers lost in consecutive control periods; saturates */
-} protection_t;
+} protection_deferred_t;
 
 typedef struct {
     int32_t current_max_q9;     /* largest phase current, A, Q7.9 */
     int32_t dc_link_voltage_q6; /* V, Q9.6 */
-    int32_t speed_q22;          /* observer, rad/s, Q9.22 */
     uint32_t encoder_angle;     /* start of the encoder count, 2^-32 rev */
     uint32_t missed_interrupts; /* triggers lost since the previous period */
-    uint32_t command_age_us;    /* time since the last accepted command */
+    uint32_t skipped_deferred;  /* periods in succession without a deferred step, before this one */
 } protection_input_t;
+
+typedef struct {
+    int32_t dc_link_voltage_q6; /* V, Q9.6 */
+    int32_t speed_q22;          /* observer, rad/s, Q9.22 */
+    uint32_t encoder_angle;     /* start of the encoder count, 2^-32 rev */
+    uint32_t command_age_us;    /* time since the last accepted command */
+    uint32_t periods;           /* control periods since the previous check, from 1 */
+} protection_deferred_input_t;
 
 /* Lost triggers in consecutive periods that are a fault. A control interrupt that ends after the next trigger loses
  * that trigger and every further one before its end: three such interrupts in succession are a fault, or one that lasts
  * three periods too long; the interrupt after them detects it. An interrupt that ends in time resets the count. */
 #define PROTECTION_OVERRUNS_MAX 3
 
-/* Starts at a measured encoder angle. */
-void protection_reset(protection_t *protection, uint32_t encoder_angle);
+/* Successive periods without a deferred step that are the same fault, because the deferred checks then do not run: 0.4
+ * ms at 20 kHz, so that every deferred check acts within 1 ms or the drive is off. A few are no fault: the deferred
+ * interrupt may extend into the next periods when control interrupts of more than the usual length follow each other.
+ */
+#define PROTECTION_SKIPPED_DEFERRED_MAX 8
 
-/* One control period: fault mask of the failed checks. */
+/* Start at a measured encoder angle. */
+void protection_reset(protection_t *protection, uint32_t encoder_angle);
+void protection_deferred_reset(protection_deferred_t *protection, uint32_t encoder_angle);
+
+/* Immediate checks of one control period: fault mask of those that failed. */
 uint64_t protection_check(const protection_parameters_t *parameters, protection_t *protection,
                           const protection_input_t *input);
+
+/* Deferred checks: fault mask of those that failed. The frozen encoder is detected over every period since the previous
+ * check, but no more than 16 of them. */
+uint64_t protection_check_deferred(const protection_parameters_t *parameters, protection_deferred_t *protection,
+                                   const protection_deferred_input_t *input);
 
 #endif

@@ -26,11 +26,10 @@ static void leave_state(control_state_t *state, const control_measurement_t *mea
     }
 }
 
-static void enter_state(const control_parameters_t *parameters, control_state_t *state, drive_state_t entered) {
-    if (entered == DRIVE_STATE_RUN) { /* the ramp starts at the present speed */
-        state->speed_reference_q22 =
-            fixed_clamp(state->observer.speed_q22, parameters->speed_reference_min_q22, INT32_MAX);
-    }
+/* RUN is entered from READY only, which leaves nothing to reset: no period resets and controls. */
+static void enter_run(const control_parameters_t *parameters, control_state_t *state) {
+    /* The ramp starts at the present speed. */
+    state->speed_reference_q22 = fixed_clamp(state->observer.speed_q22, parameters->speed_reference_min_q22, INT32_MAX);
 }
 
 bool supervise(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
@@ -45,9 +44,13 @@ bool supervise(const control_parameters_t *parameters, control_state_t *state, c
     if (state_machine_step(state_machine, &input, parameters->initialise_ticks)) {
         complete_record(&state_machine->record, state, sample, measured);
     }
-    if (state_machine->state != before) {
-        leave_state(state, measured, before);
-        enter_state(parameters, state, state_machine->state);
+    if (state_machine->state == before) {
+        return before == DRIVE_STATE_RUN;
     }
-    return state_machine->state == DRIVE_STATE_RUN;
+    if (state_machine->state == DRIVE_STATE_RUN) {
+        enter_run(parameters, state);
+        return true;
+    }
+    leave_state(state, measured, before);
+    return false;
 }

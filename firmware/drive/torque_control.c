@@ -43,24 +43,8 @@ static void duty_control(const control_parameters_t *parameters, control_state_t
     pwm_ditc_step(&parameters->duty, &state->duty, &measured->commutation, &sample, state->duty_q15);
 }
 
-/* The misalignment is observable only while speed, load and voltage are steady. */
-static void adapt_misalignment(const control_parameters_t *parameters, control_state_t *state,
-                               const control_measurement_t *measured, const uint32_t *phase_angle,
-                               bool voltage_limited) {
-    const load_observer_t *observer = &state->observer;
-    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(state->speed_reference_q22, observer->speed_q22));
-    const misalignment_sample_t sample = {
-        .current_q9 = measured->current_q9,
-        .angle = phase_angle,
-        .torque_q24 = state->torque_reference_q24,
-        .steady = observer_bandwidth_steady(&parameters->bandwidth, &state->bandwidth) &&
-                  speed_error_q22 < fixed_abs(observer->speed_q22) / 64 && !voltage_limited,
-    };
-    misalignment_step(&parameters->misalignment, &state->misalignment, parameters->tables, observer, &sample);
-}
-
 static void predictive_control(const control_parameters_t *parameters, control_state_t *state,
-                               const control_measurement_t *measured) {
+                               const deferred_results_t *deferred, const control_measurement_t *measured) {
     const load_observer_t *observer = &state->observer;
     const uint32_t rotor_poles = parameters->commutation.rotor_poles;
     const bool voltage_limited = state->predictive.torque_shortfall_q24 != 0; /* in the previous period */
@@ -68,18 +52,16 @@ static void predictive_control(const control_parameters_t *parameters, control_s
     const int32_t step = fixed_multiply_high(observer->speed_q22, parameters->observer.angle_step_q32);
     const uint32_t angle_in_two_periods = (uint32_t)(observer->angle_q64 >> 32) + (uint32_t)step;
     const uint32_t advance = (angle_in_two_periods - measured->angle) * rotor_poles;
-    uint32_t phase_angle[HAL_PHASES_MAX];
     uint32_t phase_angle_ahead[HAL_PHASES_MAX];
     for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
-        phase_angle[phase] = measured_phase_angle(parameters, &state->misalignment, measured, phase);
-        phase_angle_ahead[phase] = phase_angle[phase] + advance;
+        phase_angle_ahead[phase] = measured_phase_angle(parameters, deferred->misalignment, measured, phase) + advance;
     }
-    adapt_misalignment(parameters, state, measured, phase_angle, voltage_limited);
     const int32_t trimmed_q24 = torque_trim_step(&parameters->trim, &state->trim, state->torque_reference_q24,
                                                  measured->torque_sum_q24, voltage_limited);
     const predictive_torque_sample_t sample = {
         .current_q9 = measured->current_q9,
         .flux = measured->flux_linkage,
+        .window = &deferred->window,
         .angle = phase_angle_ahead,
         .bus_voltage_q6 = measured->dc_link_voltage_q6,
         .torque_q24 = trimmed_q24,
@@ -89,7 +71,7 @@ static void predictive_control(const control_parameters_t *parameters, control_s
     predictive_torque_step(&parameters->predictive, &state->predictive, parameters->tables, &sample, state->duty_q15);
 }
 
-void torque_control(const control_parameters_t *parameters, control_state_t *state,
+void torque_control(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
                     const control_measurement_t *measured) {
     switch (parameters->torque_law) {
     case TORQUE_LAW_HYSTERESIS:
@@ -99,7 +81,7 @@ void torque_control(const control_parameters_t *parameters, control_state_t *sta
         duty_control(parameters, state, measured);
         break;
     case TORQUE_LAW_PREDICTIVE:
-        predictive_control(parameters, state, measured);
+        predictive_control(parameters, state, deferred, measured);
         break;
     }
 }

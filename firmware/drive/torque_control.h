@@ -10,7 +10,7 @@
 void torque_control_reset(const control_parameters_t *parameters, control_state_t *state);
 
 /* Sets the duties of all phases by the configured law. The observer has predicted the coming sample before. */
-void torque_control(const control_parameters_t *parameters, control_state_t *state,
+void torque_control(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
                     const control_measurement_t *measured);
 
 /* True when the last period in RUN was limited by the DC-link voltage. [both] */

@@ -62,7 +62,7 @@ def currents_A(bench: Bench) -> list[float]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_fault_opens_all_switches_and_is_recorded(bench, name):
+def test_fault_opens_all_switches_and_is_recorded_by_a_deferred_check_one_period_later(bench, name):
     case = CASES[name]
     running(bench)
     caused_us = bench.time_ns / 1000
@@ -77,7 +77,8 @@ def test_fault_opens_all_switches_and_is_recorded(bench, name):
     assert int(cause["checks"].last) >> int(cause["fault"].last) & 1
     # A frozen encoder lowers the observed speed until it is detected.
     assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(600, abs=10)
-    assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.torque_reference_Nm"].last == pytest.approx(13.3, abs=3)
+    torque_Nm = 18.3 if name == "encoder_freezes" else 13.3  # the observer follows it until the period of the fault
+    assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.torque_reference_Nm"].last == pytest.approx(torque_Nm, abs=3)
 
     # -Vdc drives every phase current to zero, where it stays.
     assert currents_A(bench) == [0, 0, 0]

@@ -1,12 +1,16 @@
-/* Detects torn data in the structures that background and control interrupt share.
+/* Detects torn data in the structures that background, control interrupt and deferred interrupt share.
  *
  * Replaces the control laws, the CAN interface and the program around drive.c: in every round the background
- * configures, commands and takes a snapshot, with one number in all members that it writes; the interrupt writes one
- * number into all members that a snapshot reads. Members that differ were torn. drive.c, the critical section and the
- * timer are those of the drive.
+ * configures, commands and takes a snapshot, with one number in all members that it writes; the control interrupt
+ * writes one number into all members that a snapshot reads, and another into the input of a deferred step, which writes
+ * one number into its results. Members that differ were torn, as was an input that changes while its step lasts.
+ * drive.c, the exchange with the deferred step, the critical section and the interrupts are those of the drive.
  *
- * Every 400 interrupts a frame reports the counts since start as uint16, little endian: interrupts, torn parameters,
- * torn commands, torn snapshots. Requires instruction timing.
+ * With instruction timing, the timer triggers the control interrupt at any instruction. Without, the deferred step
+ * requests it at random places.
+ *
+ * Every 400 interrupts two frames report counts since start as uint16, little endian: interrupts, torn parameters, torn
+ * commands, torn snapshots; control interrupts during a deferred step, torn inputs, torn results, periods skipped.
  */
 #include <assert.h>
 #include <stddef.h>
@@ -19,6 +23,7 @@
 #include "telemetry_collect.h"
 
 #define FRAME_ID 0x7A0
+#define DEFERRED_FRAME_ID 0x7A1
 #define INTERRUPTS_PER_FRAME 400
 
 /* Symbols of the linker script. */
@@ -28,6 +33,20 @@ const machine_tables_t machine_tables = {.phases = 3, .rotor_poles = 4};
 
 static drive_t drive;
 static uint16_t interrupts, torn_parameters, torn_commands, torn_snapshots;
+static uint16_t preemptions, torn_inputs, torn_results;
+static bool computing; /* a deferred step */
+
+/* Sequences of pseudorandom numbers of background and deferred step, 0..511. */
+static uint32_t random_of(uint32_t *sequence) {
+    *sequence = *sequence * UINT32_C(1664525) + UINT32_C(1013904223);
+    return *sequence >> 23;
+}
+
+static void delay(uint32_t rounds) {
+    for (uint32_t i = rounds; i > 0; i--) {
+        __asm__ volatile("");
+    }
+}
 
 static void fill(void *object, size_t bytes, uint32_t number) {
     uint32_t *word = object;
@@ -67,6 +86,25 @@ void control_prepare(const control_parameters_t *parameters, control_state_t *st
     (void)parameters, (void)state;
 }
 
+/* Results without their first member, the generation. */
+#define RESULT(results) (&(results)->fault_mask)
+#define RESULT_BYTES (sizeof(deferred_results_t) - offsetof(deferred_results_t, fault_mask))
+
+static void exchange(control_state_t *state) {
+    deferred_request_t *request = &state->deferred_request;
+    preemptions += computing;
+    torn_results += torn(RESULT(deferred_results(request, &state->deferred.response)), RESULT_BYTES);
+#ifdef NO_EXCHANGE
+    fill(&request->input, sizeof request->input, interrupts * 0x10001u);
+#endif
+    if (deferred_pending(request, &state->deferred.response)) {
+        deferred_skip(request);
+        return;
+    }
+    fill(&request->input, sizeof request->input, interrupts * 0x10001u);
+    deferred_request(request);
+}
+
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare) {
     (void)sample, (void)compare;
@@ -74,10 +112,41 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     torn_parameters += torn(parameters, sizeof *parameters);
     torn_commands += torn(command, sizeof *command);
     fill(state, sizeof(drive_telemetry_t), interrupts * 0x10001u);
+    exchange(state);
     return false;
 }
 
-static_assert(sizeof(drive_telemetry_t) <= sizeof(control_state_t), "a snapshot reads only control_state_t");
+static_assert(sizeof(drive_telemetry_t) <= offsetof(control_state_t, deferred_request),
+              "a snapshot reads only members of control_state_t that nothing else here uses");
+
+/* A step of up to several control periods. */
+void deferred_compute(const control_parameters_t *parameters, control_state_t *state) {
+    (void)parameters;
+    static uint32_t sequence;
+    const deferred_input_t *input = &state->deferred_request.input;
+#ifdef NO_EXCHANGE
+    deferred_response_t *response = &state->deferred.response;
+    deferred_results_t *results = &response->results[response->latest];
+#else
+    deferred_results_t *results = deferred_buffer(&state->deferred.response);
+#endif
+    computing = true;
+    const uint32_t number = input->generation;
+    const uint32_t longest = random_of(&sequence); /* most steps take less than a period */
+    uint32_t *word = (uint32_t *)RESULT(results);
+    for (size_t i = 0; i < RESULT_BYTES / sizeof *word; i++) {
+        word[i] = number;
+        const uint32_t random = random_of(&sequence);
+        if (board.mailbox.timed) {
+            delay(random < longest / 2 ? random : 0);
+        } else if (random < 16) {
+            board_interrupt_pend();
+        }
+    }
+    results->generation = 0;
+    torn_inputs = (uint16_t)(torn_inputs + (torn(input, sizeof *input) != 0 || input->generation != number));
+    computing = false;
+}
 
 /* Copies the words that the interrupt wrote. */
 void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t *telemetry) {
@@ -104,11 +173,16 @@ bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool
     parameters->revision++;
     hal_critical_enter(hal);
     const uint16_t counts[4] = {interrupts, torn_parameters, torn_commands, torn_snapshots};
+    const uint16_t deferred_counts[4] = {preemptions, torn_inputs, torn_results,
+                                         (uint16_t)drive.control.deferred_request.skipped_total};
     hal_critical_leave(hal);
-    if (counts[0] - reported >= INTERRUPTS_PER_FRAME) {
+    if ((uint16_t)(counts[0] - reported) >= INTERRUPTS_PER_FRAME) {
         reported = counts[0];
         hal_can_frame_t frame = {.identifier = FRAME_ID, .length = sizeof counts};
         memcpy(frame.data, counts, sizeof counts);
+        hal_can_transmit(hal, &frame);
+        frame.identifier = DEFERRED_FRAME_ID;
+        memcpy(frame.data, deferred_counts, sizeof deferred_counts);
         hal_can_transmit(hal, &frame);
     }
     return true;
@@ -128,13 +202,8 @@ __attribute__((used)) void program_interrupt(void) { /* called by the handler, i
     drive_control_interrupt(&drive);
 }
 
-/* Random delay, so that the interrupt occurs at all points of a round. */
-static void random_delay(void) {
-    static uint32_t random;
-    random = random * UINT32_C(1664525) + UINT32_C(1013904223);
-    for (uint32_t i = random >> 23; i > 0; i--) {
-        __asm__ volatile("");
-    }
+__attribute__((used)) void program_deferred(void) { /* likewise */
+    drive_deferred_interrupt(&drive);
 }
 
 noreturn void program_start(void) {
@@ -143,9 +212,14 @@ noreturn void program_start(void) {
     const bool started = drive_init(&drive, &board, &machine_tables, &config);
     board_interrupt_enable();
     doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REJECTED);
+    uint32_t sequence = 1;
     while (board.mailbox.event != MAILBOX_EXIT) {
-        drive_background(&drive);
-        random_delay();
+        if (board.mailbox.event == MAILBOX_INTERRUPT && !board.mailbox.timed) {
+            board_interrupt_pend();
+        } else {
+            drive_background(&drive);
+            delay(random_of(&sequence)); /* the interrupt occurs at all points of a round */
+        }
         doorbell_ring(MAILBOX_NEXT);
     }
     board_exit(board.mailbox.exit_code);

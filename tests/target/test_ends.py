@@ -41,6 +41,9 @@ void drive_control_interrupt(drive_t *drive) {
     }
 }
 
+void drive_deferred_interrupt(drive_t *drive) {
+}
+
 void drive_background(drive_t *drive) {
 }
 """

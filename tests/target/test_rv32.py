@@ -1,4 +1,4 @@
-"""On RV32 the control interrupt is a processor exception, and its instructions are counted."""
+"""On RV32 both interrupts are processor exceptions, and their instructions are counted."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from salient.target.isr_profile import read_profile
 
 TIMEOUT_S = 60
 MACHINE_SOFTWARE_INTERRUPT = 3
+MACHINE_TIMER_INTERRUPT = 7
 HANDLER_INSTRUCTIONS = 38
-"""Instructions of the handler: stack pointer, 16 registers saved and restored, request cleared, a call, the return."""
+"""Instructions of the control interrupt's handler: stack pointer, 16 registers saved and restored, request cleared, a
+call, the return."""
 
 
-def test_each_control_interrupt_is_a_processor_exception_and_counted(tmp_path: Path):
+def test_each_control_interrupt_and_its_deferred_one_are_processor_exceptions_and_counted(tmp_path: Path):
     log, instructions, executed = tmp_path / "log", tmp_path / "instructions", tmp_path / "executed"
     wrapper = tmp_path / "qemu-system-riscv32"
     wrapper.write_text(f'#!/bin/sh\nPATH={os.environ["PATH"]}\nexec qemu-system-riscv32 -d int -D {log} "$@"\n')
@@ -31,7 +33,9 @@ def test_each_control_interrupt_is_a_processor_exception_and_counted(tmp_path: P
     profile = read_profile(instructions, executed, options.machine, options.build)
     taken = re.findall(r"async:(\d), cause:([0-9a-f]+)", log.read_text(encoding="utf-8"))
     assert len(profile.interrupts) == 200
-    assert [(int(interrupt), int(cause, 16)) for interrupt, cause in taken] == [(1, MACHINE_SOFTWARE_INTERRUPT)] * 200
+    assert len(profile.deferred) == 200
+    assert ([(int(interrupt), int(cause, 16)) for interrupt, cause in taken]
+            == [(1, MACHINE_SOFTWARE_INTERRUPT), (1, MACHINE_TIMER_INTERRUPT)] * 200)
     assert profile.trace.inside.sum() == profile.interrupts.sum()
     instructions_of = zip(ElfImage(profile.trace.image).instructions(), profile.trace.inside, strict=True)
     handler = sum(count for one, count in instructions_of if one.function.startswith("control_handler"))

@@ -10,6 +10,7 @@ import json
 import struct
 import subprocess
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -224,33 +225,89 @@ def test_instruction_timing_is_available_on_the_cortex_m4_only():
 # --- pre-emption ----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def race(tmp_path: Path) -> Callable[[str, str], tuple[int, ...]]:
-    """Runs race.c for 0.4 s: interrupts, torn parameter sets, commands, snapshots."""
+@dataclass(frozen=True)
+class Race:
+    """Counts of race.c."""
 
-    def run(build: str, kind: str) -> tuple[int, ...]:
+    interrupts: int
+    torn_parameters: int
+    torn_commands: int
+    torn_snapshots: int
+    preemptions: int
+    torn_inputs: int
+    torn_results: int
+    skipped: int
+
+    @property
+    def torn(self) -> tuple[int, ...]:
+        """All counts of torn data."""
+        return (self.torn_parameters, self.torn_commands, self.torn_snapshots, self.torn_inputs, self.torn_results)
+
+
+@pytest.fixture
+def race(tmp_path: Path) -> Callable[..., Race]:
+    """Runs an image of race.c for 0.4 s, with instruction timing or, when timed is False, without."""
+
+    def run(build: str, kind: str, timed: bool) -> Race:
         can = f"unix:{tmp_path}/{build}_{kind}"
-        command = [str(executable("saturating", build)), str(BUILD / build / "bin" / f"race_{kind}.elf"),
-                   "--instruction-ns", "8", "--can", can, "--pace", "lockstep", "--follow-stdin"]
+        timing = ["--instruction-ns", "8"] if timed else []
+        command = [str(executable("saturating", build)), str(BUILD / build / "bin" / f"race_{kind}.elf"), *timing,
+                   "--can", can, "--pace", "lockstep", "--follow-stdin"]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
             assert json.loads(process.stdout.readline())["ready"]
             with Session(can) as session:
                 session.run_for(0.4)
-                counts = [bytes(message.data) for _, message in session.log if message.arbitration_id == 0x7A0]
+                counts = {message.arbitration_id: bytes(message.data) for _, message in session.log}
             process.stdin.close()
         assert process.returncode == 0
-        return struct.unpack("<4H", counts[-1])
+        result = Race(*struct.unpack("<4H", counts[0x7A0]), *struct.unpack("<4H", counts[0x7A1]))
+        print(f"{build} {kind}: {result}")
+        return result
 
     return run
 
 
-@pytest.mark.parametrize("build", [build for build in TARGET_BUILDS if build.startswith("cortex-m4")])
+TIMED_BUILDS = [build for build in TARGET_BUILDS if build.startswith("cortex-m4")]
+
+
+@pytest.mark.parametrize("build", TIMED_BUILDS)
 def test_shared_data_is_torn_without_the_critical_section_and_never_with_it(race, build):
     """A command is three words stored by one instruction, which QEMU does not interrupt: never torn in either build."""
-    interrupts, *torn = race(build, "no_critical_section")
-    print(f"{build}: {torn} torn in {interrupts} interrupts without")
-    assert interrupts > 5000
-    assert torn[0] > 100 and torn[1] == 0 and torn[2] > 10
-    interrupts, *torn = race(build, "critical_section")
-    assert interrupts > 5000
-    assert torn == [0, 0, 0]
+    found = race(build, "no_critical_section", timed=True)
+    assert found.interrupts > 5000
+    assert found.torn_parameters > 100 and found.torn_commands == 0 and found.torn_snapshots > 10
+    found = race(build, "protected", timed=True)
+    assert found.interrupts > 5000
+    assert found.torn == (0, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("timed", [True, False])
+@pytest.mark.parametrize("build", TARGET_BUILDS)
+def test_control_interrupt_preempts_the_deferred_one_and_their_data_is_torn_only_without_the_exchange(race, build,
+                                                                                                      timed):
+    if timed and build not in TIMED_BUILDS:
+        pytest.skip("the port of this board uses no timer")
+    found = race(build, "no_exchange", timed)
+    assert found.preemptions > 1000
+    assert found.torn_inputs > 500 and found.torn_results > 500
+    found = race(build, "protected", timed)
+    assert found.preemptions > 1000
+    assert 0.9 * found.preemptions < found.skipped < 1.5 * found.preemptions
+    assert found.torn == (0, 0, 0, 0, 0)
+
+
+# --- the deferred interrupt -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_deferred_interrupt_ends_within_the_period_and_its_time_is_reported(make_bench, controller):
+    bench = make_bench(build="cortex-m4", controller=controller, instruction_ns=8 if controller == "salient" else 4)
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.25)
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+    reported = {signal: bench.telemetry[f"DRIVE_DEFERRED.{signal}"].last
+                for signal in ("used_us", "worst_us", "skipped_periods")}
+    print(controller, reported, f"control interrupt: worst {processor(bench, 'worst_us'):g} us")
+    assert processor(bench, "used_us") < reported["used_us"] <= reported["worst_us"]
+    assert processor(bench, "worst_us") < reported["worst_us"] < 1.5 * PERIOD_US
+    assert reported["skipped_periods"] <= 50

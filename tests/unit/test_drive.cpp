@@ -31,6 +31,7 @@ struct hal {
     unsigned writes = 0, opens = 0;
     bool open = true;
     bool critical = false;
+    unsigned deferred_requests = 0;
     hal_pwm_compare_t written{};
 };
 
@@ -80,6 +81,9 @@ uint32_t hal_interrupt_missed_triggers(hal_t *hal) {
 uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
     return hal->elapsed_ticks;
 }
+void hal_interrupt_request_deferred(hal_t *hal) {
+    hal->deferred_requests++;
+}
 bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {
     if (hal->to_drive.empty()) {
         return false;
@@ -107,10 +111,20 @@ class Drive : public testing::Test {
         ASSERT_TRUE(drive_init(&drive, &hal, &machine_tables, &config));
     }
 
+    // The deferred interrupt, when it is requested.
+    static void deferred_interrupt(drive_t *drive, hal_t *hal) {
+        if (hal->deferred_requests > 0) {
+            EXPECT_EQ(hal->deferred_requests, 1u);
+            hal->deferred_requests = 0;
+            drive_deferred_interrupt(drive);
+        }
+    }
+
     void periods(int count) {
         for (int k = 0; k < count; k++) {
             hal.time_us += 25;
             drive_control_interrupt(&drive);
+            deferred_interrupt(&drive, &hal);
             drive_background(&drive);
         }
     }
@@ -260,6 +274,52 @@ TEST_F(Drive, processor_time_is_recorded_and_reported_without_any_reaction) {
     EXPECT_EQ(seen, 1u);
 }
 
+TEST_F(Drive, the_time_of_the_deferred_interrupt_counts_from_the_trigger_of_its_period) {
+    periods(100);
+    hal.elapsed_ticks = 1500;
+    drive_control_interrupt(&drive);
+    EXPECT_EQ(hal.deferred_requests, 1u);
+    drive_control_interrupt(&drive); // before the deferred interrupt
+    drive_control_interrupt(&drive);
+    EXPECT_EQ(hal.deferred_requests, 1u) << "none while one is pending";
+    hal.elapsed_ticks = 2000;
+    deferred_interrupt(&drive, &hal);
+    EXPECT_EQ(drive.deferred_used_ticks, 2 * 5000 + 2000u);
+    drive_deferred_interrupt(&drive); // not requested
+    EXPECT_EQ(drive.deferred_used_ticks, 2 * 5000 + 2000u);
+    hal.from_drive.clear();
+    periods(4000 + 40);
+    EXPECT_EQ(drive.deferred_used_ticks, 2000u);
+    EXPECT_EQ(drive.deferred_worst_ticks, 2 * 5000 + 2000u);
+    unsigned seen = 0;
+    for (const hal_can_frame_t &frame : hal.from_drive) {
+        if (frame.identifier == DRIVE_DEFERRED_FRAME_ID) {
+            drive_deferred_t deferred{};
+            drive_deferred_unpack(&deferred, frame.data, frame.length);
+            EXPECT_EQ(deferred.used_us, 2000);
+            EXPECT_EQ(deferred.worst_us, 12000);
+            EXPECT_EQ(deferred.skipped_periods, 2);
+            seen++;
+        }
+    }
+    EXPECT_EQ(seen, 1u);
+}
+
+TEST_F(Drive, a_deferred_interrupt_that_does_not_come_opens_the_switches) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    ASSERT_FALSE(hal.open);
+    for (int k = 0; k < 9; k++) {
+        EXPECT_FALSE(hal.open) << k;
+        hal.time_us += 25;
+        drive_control_interrupt(&drive);
+    }
+    drive_control_interrupt(&drive);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+}
+
 TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
     periods(100);
     EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 5 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_DONE_CHOICE);
@@ -334,6 +394,7 @@ TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
         periods(1);
         other_hal.time_us += 50;
         drive_control_interrupt(&other);
+        deferred_interrupt(&other, &other_hal);
         drive_background(&other);
     }
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);

@@ -9,6 +9,7 @@
 extern "C" {
 #include "drive/configure.h"
 #include "drive/control.h"
+#include "drive/deferred.h"
 }
 
 namespace {
@@ -107,6 +108,9 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
             const drive_state_t before = state.state_machine.state;
             hal_pwm_compare_t compare;
             const bool closed = control_step(&parameters, &state, &bench.sample, &bench.command, &compare);
+            if ((period / 4 + sequence) % 5 != 0) { // four periods are skipped in a row
+                deferred_step(&parameters, &state);
+            }
             ASSERT_EQ(closed, state.state_machine.state == DRIVE_STATE_RUN) << "sequence " << sequence;
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
                 const bool exists = phase < tables->phases;
@@ -153,6 +157,9 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
                                            .time_us = uint32_t(random())};
                 hal_pwm_compare_t compare;
                 const bool closed = control_step(&parameters, &state, &sample, &command, &compare);
+                if (random() % 4 != 0) {
+                    deferred_step(&parameters, &state);
+                }
                 ASSERT_EQ(closed, state.state_machine.state == DRIVE_STATE_RUN);
             }
         }

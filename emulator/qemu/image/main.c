@@ -1,4 +1,4 @@
-/* One drive on a QEMU board: the firmware of the host executable, with the control interrupt as a real exception. */
+/* One drive on a QEMU board: the firmware of the host executable, with its interrupts as real exceptions. */
 #include <string.h>
 
 #include "control/machine_tables.h"
@@ -13,6 +13,10 @@ static drive_t drive;
 
 __attribute__((used)) void program_interrupt(void) { /* called by the handler, in assembly */
     drive_control_interrupt(&drive);
+}
+
+__attribute__((used)) void program_deferred(void) { /* likewise */
+    drive_deferred_interrupt(&drive);
 }
 
 static noreturn void run(void) {

@@ -1,4 +1,4 @@
-/* Board mps2-an386, a Cortex-M4: start, end, the control interrupt, the critical section. */
+/* Board mps2-an386, a Cortex-M4: start, end, the two interrupts, the critical section. */
 #include "qemu/board.h"
 
 #include "hal_interrupt.h"
@@ -12,6 +12,9 @@
 /* Armv7-M architecture reference manual, B3.4. */
 #define NVIC_ISER0 (*(volatile uint32_t *)0xE000E100)
 #define NVIC_ISPR0 (*(volatile uint32_t *)0xE000E200)
+#define SCB_ICSR (*(volatile uint32_t *)0xE000ED04)
+#define SCB_ICSR_PENDSVSET (UINT32_C(1) << 28)
+#define SCB_SHPR3_PENDSV (*(volatile uint8_t *)0xE000ED22) /* priority of PendSV */
 #define NVIC_IPR(irq) (*(volatile uint8_t *)(0xE000E400 + (irq)))
 
 #define SYS_EXIT_EXTENDED 0x20
@@ -33,23 +36,26 @@ static void fault_handler(void) {
     board_exit(MAILBOX_EXIT_FAULT);
 }
 
-/* In assembly, so that its first and its last instruction have names: the instruction counter recognises both ends. */
+/* In assembly, so that their first and their last instructions have names: the instruction counter recognises both
+ * ends. */
+#define HANDLER(name, body)                                                                                            \
+    ".balign 4\n"                                                                                                      \
+    ".global " name "\n"                                                                                               \
+    ".type " name ", %function\n" name ":\n"                                                                           \
+    "    push {r4, lr}\n" /* r4: stack alignment to 8 bytes */                                                         \
+    ".size " name ", . - " name "\n"                                                                                   \
+    "    bl " body "\n"                                                                                                \
+    ".type " name "_return, %function\n" name "_return:\n"                                                             \
+    "    pop {r4, pc}\n"                                                                                               \
+    ".size " name "_return, . - " name "_return\n"
+
 void control_handler(void);
+void deferred_handler(void);
 __asm__(".text\n"
-        ".balign 4\n"
-        ".thumb\n"
-        ".global control_handler\n"
-        ".type control_handler, %function\n"
-        "control_handler:\n"
-        "    push {r4, lr}\n" /* r4: stack alignment to 8 bytes */
-        ".size control_handler, . - control_handler\n"
-        "    bl program_interrupt\n"
-        ".type control_handler_return, %function\n"
-        "control_handler_return:\n"
-        "    pop {r4, pc}\n"
-        ".size control_handler_return, . - control_handler_return\n");
+        ".thumb\n" HANDLER("control_handler", "program_interrupt") HANDLER("deferred_handler", "program_deferred"));
 
 void board_interrupt_enable(void) {
+    SCB_SHPR3_PENDSV = 0xFF;   /* lowest priority */
     NVIC_IPR(CONTROL_IRQ) = 0; /* highest configurable priority */
     NVIC_ISER0 = UINT32_C(1) << CONTROL_IRQ;
     if (board.mailbox.timed && board.mailbox.period_ticks > 0) {
@@ -64,11 +70,18 @@ void board_interrupt_pend(void) {
     __asm__ volatile("dsb\n\tisb" ::: "memory");
 }
 
+void hal_interrupt_request_deferred(hal_t *hal) {
+    (void)hal;
+    SCB_ICSR = SCB_ICSR_PENDSVSET;
+}
+
 uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
     return hal->mailbox.timed ? timer_elapsed_ticks() : hal->mailbox.elapsed_ticks;
 }
 
-/* Masks all interrupts: there are only the control interrupt and that of the timer, which requests it. */
+/* Masks all interrupts: there are only the two of the drive and that of the timer, which requests the control
+ * interrupt.
+ */
 void hal_critical_enter(hal_t *hal) {
     (void)hal;
     __asm__ volatile("cpsid i" ::: "memory");
@@ -89,6 +102,6 @@ __attribute__((section(".first"), used)) static const struct {
     .stack = stack_top,
     .exceptions = {program_start, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
                    fault_handler, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
-                   fault_handler, fault_handler, fault_handler},
+                   fault_handler, deferred_handler, fault_handler},
     .interrupts = {[TIMER_IRQ] = timer_handler, [CONTROL_IRQ] = control_handler},
 };

@@ -11,8 +11,8 @@
  * multiple of 40 ns. */
 void timer_start(uint32_t period_ticks);
 
-/* Handler of TIMER_IRQ. Requests the control interrupt, which must have a higher priority, unless the trigger
- * occurred while the previous interrupt was running: then it is missed. */
+/* Handler of TIMER_IRQ, above the deferred interrupt. Requests the control interrupt, which must have a higher
+ * priority, unless the trigger occurred while the previous interrupt was running: then it is missed. */
 void timer_handler(void);
 
 /* Ticks of HAL_PWM_TICK_NS since the trigger that is served, in steps of 40 ns, rounded down. */

@@ -142,6 +142,7 @@ TEST_F(Comms, frames_come_at_their_rates) {
     EXPECT_EQ(bus.count(DRIVE_COMMAND_COUNTERS_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_BUS_COUNTERS_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_PROCESSOR_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_DEFERRED_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_IDENTITY_FRAME_ID), 10u);
     EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 0u);
     EXPECT_EQ(bus.count(DRIVE_FAULT_MASK_FRAME_ID), 0u);
@@ -169,7 +170,7 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     control.duty.pid.duty_q23 = -32769 * 256;
     control.trim.trim_q24 = -3 * (1 << 24);
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
-        control.misalignment.phase[phase].offset = (1 << 20) * machine_tables.rotor_poles;
+        control.deferred.misalignment.phase[phase].offset = (1 << 20) * machine_tables.rotor_poles;
     }
     control.predictive.torque_shortfall_q24 = INT32_MAX;
     p.bandwidth.bandwidth_rad_s[control.bandwidth.stage] = 8000;
@@ -177,6 +178,9 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     drive.worst_ticks = 4999;
     p.period_ticks = 2500;
     drive.late_interrupts = 70000;
+    drive.deferred_used_ticks = 4000;
+    drive.deferred_worst_ticks = 9001;
+    control.deferred_request.skipped_total = 70001;
     run(3000);
 
     drive_status_t status;
@@ -218,6 +222,11 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     EXPECT_EQ(processor.worst_us, 4999);
     EXPECT_EQ(processor.available_us, 5000);
     EXPECT_EQ(processor.late_interrupts, 65535);
+    drive_deferred_t deferred;
+    drive_deferred_unpack(&deferred, first(DRIVE_DEFERRED_FRAME_ID).data, 6);
+    EXPECT_EQ(deferred.used_us, 4000);
+    EXPECT_EQ(deferred.worst_us, 9001);
+    EXPECT_EQ(deferred.skipped_periods, 65535);
     drive_heartbeat_t heartbeat;
     drive_heartbeat_unpack(&heartbeat, first(DRIVE_HEARTBEAT_FRAME_ID).data, 8);
     EXPECT_EQ(heartbeat.state, DRIVE_STATE_RUN);
@@ -302,9 +311,9 @@ TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
 }
 
 TEST_F(Comms, dropped_frames_are_counted_exactly) {
-    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 2 counters + 1 PROCESSOR + 1 identity + 1 heartbeat
+    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 2 counters + PROCESSOR + DEFERRED + identity + heartbeat
     const unsigned waiting = unsigned(bus.mailboxes.size()) + comms.telemetry.queue.count;
-    EXPECT_EQ(comms.telemetry.dropped + waiting, 425u);
+    EXPECT_EQ(comms.telemetry.dropped + waiting, 426u);
 }
 
 TEST_F(Comms, others_above_the_heartbeat_cannot_block_telemetry) {

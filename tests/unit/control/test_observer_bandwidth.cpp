@@ -35,16 +35,30 @@ class Bandwidth {
 
     // One sample of both; true when the firmware triggered.
     bool step(int32_t innovation, bool from_edge = false) {
-        const load_observer_gains_t *gains = observer_bandwidth_step(&parameters, &state, innovation, from_edge);
+        const load_observer_gains_t *gains =
+            observer_bandwidth_step(&parameters, &state, &limits, innovation, from_edge);
         EXPECT_EQ(gains, &parameters.gains[parameters.adaptive ? state.stage : LAST_STAGE]);
-        model.step(innovation / REV, from_edge);
         const bool triggered = parameters.adaptive && state.ticks == 0;
+        EXPECT_TRUE(!triggered || state.trigger != OBSERVER_TRIGGER_NONE);
+        if (updating) {
+            update(innovation, from_edge);
+        }
+        model.step(innovation / REV, from_edge);
         triggers += triggered;
         return triggered;
     }
 
+    void update(int32_t innovation, bool from_edge) {
+        const observer_bandwidth_sample_t sample = {
+            .innovation = innovation, .from_edge = from_edge, .stage = state.stage, .trigger = state.trigger};
+        limits = observer_bandwidth_update(&parameters, &statistics, &sample);
+        state.trigger = OBSERVER_TRIGGER_NONE;
+    }
+
+    bool steady() const { return observer_bandwidth_steady(&parameters, state.stage); }
+
     void settle() {
-        while (!observer_bandwidth_steady(&parameters, &state)) {
+        while (!steady()) {
             step(0);
         }
     }
@@ -53,6 +67,9 @@ class Bandwidth {
 
     observer_bandwidth_parameters_t parameters;
     observer_bandwidth_t state{};
+    observer_bandwidth_limits_t limits{};
+    observer_bandwidth_statistics_t statistics{};
+    bool updating = true; // the statistics, with every sample
     reference_model::bandwidth_t model;
     unsigned triggers = 0;
 };
@@ -74,7 +91,7 @@ TEST(ObserverBandwidth, decays_as_3_5_over_time_within_11_percent_from_the_trans
         }
         EXPECT_GT(most, 0.05);
         EXPECT_LT(least, -0.05);
-        EXPECT_TRUE(observer_bandwidth_steady(&bandwidth.parameters, &bandwidth.state));
+        EXPECT_TRUE(bandwidth.steady());
         EXPECT_EQ(bandwidth.rad_s(), STEADY_RAD_S);
     }
 }
@@ -141,7 +158,7 @@ TEST(ObserverBandwidth, the_largest_innovations_of_either_sign_trigger_and_overf
         EXPECT_TRUE(bandwidth.step(innovation));
         for (int k = 0; k < 400000; k++) {
             bandwidth.step(innovation);
-            ASSERT_GE(bandwidth.state.mean_innovation_q32, 0);
+            ASSERT_GE(bandwidth.statistics.mean_innovation_q32, 0);
         }
         EXPECT_GT(bandwidth.triggers, 2u);
     }
@@ -159,7 +176,7 @@ TEST(ObserverBandwidth, triggers_with_its_reference_model_and_has_the_same_mean_
         EXPECT_EQ(bandwidth.triggers, bandwidth.model.triggers) << rate_hz;
         EXPECT_GE(bandwidth.triggers, 14u) << "each load step";
         EXPECT_LE(bandwidth.triggers, 16u) << "and nothing else";
-        EXPECT_NEAR(bandwidth.state.mean_innovation_q32 / Q32, bandwidth.model.mean_innovation * REV,
+        EXPECT_NEAR(bandwidth.statistics.mean_innovation_q32 / Q32, bandwidth.model.mean_innovation * REV,
                     0.01 * bandwidth.model.mean_innovation * REV);
         EXPECT_NEAR(bandwidth.model.mean_innovation * REV, COUNT / 4.0, COUNT / 16.0);
     }
@@ -173,7 +190,7 @@ TEST(ObserverBandwidth,
     unsigned last_second = 0;
     int quiet = 0;
     for (int k = 0; k < 3 * int(RATE_HZ); k++) {
-        quiet = observer_bandwidth_steady(&bandwidth.parameters, &bandwidth.state) ? quiet + 1 : 0;
+        quiet = bandwidth.steady() ? quiet + 1 : 0;
         const bool triggered = bandwidth.step(k == 0 || quiet < 80 ? (k % 2 == 0 ? 2 : -2) * COUNT : 0);
         last_second += triggered && k >= 2 * int(RATE_HZ);
     }
@@ -183,6 +200,21 @@ TEST(ObserverBandwidth,
         bandwidth.step(0);
     }
     EXPECT_TRUE(bandwidth.step(2 * COUNT));
+}
+
+TEST(ObserverBandwidth, a_trigger_counts_when_its_sample_and_the_next_ones_are_left_out_of_the_statistics) {
+    Bandwidth bandwidth(configure());
+    bandwidth.settle();
+    bandwidth.updating = false;
+    for (int k = 0; k < 5; k++) {
+        bandwidth.step(k == 0 ? 2 * COUNT : 0);
+        EXPECT_EQ(bandwidth.state.trigger, OBSERVER_TRIGGER_IN_STEADY_STATE);
+        EXPECT_EQ(bandwidth.statistics.holdoff_extension_q16, 0u);
+    }
+    bandwidth.update(0, false);
+    EXPECT_NEAR(bandwidth.statistics.holdoff_extension_q16 / 65536.0, 0.25, 0.01);
+    EXPECT_EQ(bandwidth.limits.holdoff_extension_ticks, RATE_HZ / 1000 / 4 - 1);
+    EXPECT_EQ(bandwidth.state.trigger, OBSERVER_TRIGGER_NONE);
 }
 
 TEST(ObserverBandwidth, a_slowly_growing_innovation_raises_the_threshold_and_does_not_trigger) {
@@ -195,8 +227,8 @@ TEST(ObserverBandwidth, a_slowly_growing_innovation_raises_the_threshold_and_doe
         const double uniform = random() / REV * 2.0 - 1.0;
         ASSERT_FALSE(bandwidth.step(int32_t(uniform * half_counts * COUNT / 2.0))) << k;
     }
-    EXPECT_NEAR(bandwidth.state.mean_innovation_q32 / Q32, 2.0 * COUNT, 0.15 * COUNT) << "their mean magnitude";
-    EXPECT_NEAR(bandwidth.state.mean_innovation_q32 / Q32, bandwidth.model.mean_innovation * REV, 0.01 * COUNT);
+    EXPECT_NEAR(bandwidth.statistics.mean_innovation_q32 / Q32, 2.0 * COUNT, 0.15 * COUNT) << "their mean magnitude";
+    EXPECT_NEAR(bandwidth.statistics.mean_innovation_q32 / Q32, bandwidth.model.mean_innovation * REV, 0.01 * COUNT);
     // An innovation far above the mean still triggers.
     EXPECT_TRUE(bandwidth.step(12 * COUNT));
 }

@@ -101,8 +101,11 @@ class Machine {
         seen.torque_Nm = reference_q24 / Q24;
         seen.reverse = speed_rev < 0.0;
         seen.angle_step = std::fabs(speed_rev);
+        const torque_sharing_window_t window =
+            predictive_torque_move_windows(&parameters, &advance_q30, reference_q24, control.torque_shortfall_q24);
         const predictive_torque_sample_t sample = {.current_q9 = current_q9,
                                                    .flux_q29 = flux_q29,
+                                                   .window = &window,
                                                    .angle = angle,
                                                    .bus_voltage_q6 = int32_t(BUS_V * Q6),
                                                    .torque_q24 = reference_q24,
@@ -128,6 +131,7 @@ class Machine {
 
     predictive_torque_parameters_t parameters;
     predictive_torque_t control;
+    int32_t advance_q30 = 0;
     reference_model::predictive_t<tables_t> model;
     int32_t duty_q15[HAL_PHASES_MAX] = {};
     double flux[PHASES] = {}, acting[PHASES] = {};
@@ -166,7 +170,7 @@ TEST(PredictiveTorque, duties_equal_the_reference_model_in_four_quadrants_with_a
                             machine.model.flux[phase] = machine.control.flux_q29[phase] / Q29;
                             machine.model.duty[phase] = machine.control.duty_q15[phase] / Q15;
                         }
-                        machine.model.advance = machine.control.advance_q30 / Q30;
+                        machine.model.advance = machine.advance_q30 / Q30;
                         machine.model.torque_shortfall = machine.control.torque_shortfall_q24 / Q24;
                         machine.step(speed_of(rpm), torque_Nm * (1.0 + 0.2 * std::sin(k * 0.01)));
                         worst = std::max(worst, machine.difference_Nm());
@@ -222,7 +226,7 @@ TEST(PredictiveTorque, a_reserve_adds_opposed_torque_and_keeps_the_total) {
 TEST(PredictiveTorque, advances_within_100_ms_during_a_shortfall_and_returns_within_a_second) {
     Machine machine(parameters_of());
     int up = 0;
-    while (machine.control.advance_q30 < 1 << 30 && up < 2 * int(RATE_HZ)) {
+    while (machine.advance_q30 < 1 << 30 && up < 2 * int(RATE_HZ)) {
         machine.step(speed_of(4500.0), 19.0);
         up++;
     }
@@ -230,7 +234,7 @@ TEST(PredictiveTorque, advances_within_100_ms_during_a_shortfall_and_returns_wit
     EXPECT_LT(up, int(RATE_HZ) / 5) << "voltage does not suffice in most periods";
     EXPECT_GT(machine.control.torque_shortfall_q24, 0);
     int down = 0;
-    while (machine.control.advance_q30 > 0 && down < 2 * int(RATE_HZ)) {
+    while (machine.advance_q30 > 0 && down < 2 * int(RATE_HZ)) {
         machine.step(speed_of(150.0), 1.0);
         down++;
     }
@@ -266,6 +270,7 @@ TEST(PredictiveTorque, a_phase_above_the_current_limit_gets_no_positive_voltage_
     const uint32_t angle[HAL_PHASES_MAX] = {0xC0000000u, 0xC0000000u, 0x80000000u, 0};
     const predictive_torque_sample_t sample = {.current_q9 = current_q9,
                                                .flux_q29 = flux_q29,
+                                               .window = &p.base_window,
                                                .angle = angle,
                                                .bus_voltage_q6 = 240 * 64,
                                                .torque_q24 = 19 << 24,
@@ -294,6 +299,7 @@ TEST(PredictiveTorque, a_braking_phase_carries_only_the_flux_linkage_that_the_vo
                                                     0, 0};
             const predictive_torque_sample_t sample = {.current_q9 = current_q9,
                                                        .flux_q29 = flux_q29,
+                                                       .window = &p.base_window,
                                                        .angle = angle,
                                                        .bus_voltage_q6 = 240 * 64,
                                                        .torque_q24 = (reverse ? 40 : -40) * (1 << 24),
@@ -333,6 +339,7 @@ TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing)
         predictive_torque_parameters_t p = parameters_of(i % 3 == 0 ? 20.0 : 0.0);
         p.current_limit_q9 = int32_t(random() % (79 * 512)) + 512;
         predictive_torque_t control{};
+        int32_t advance_q30 = 0;
         int32_t current_q9[HAL_PHASES_MAX], flux_q29[HAL_PHASES_MAX], duty_q15[HAL_PHASES_MAX];
         uint32_t angle[HAL_PHASES_MAX];
         for (int k = 0; k < 4; k++) {
@@ -343,11 +350,15 @@ TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing)
             }
             const int32_t references[] = {INT32_MIN, INT32_MAX, 0, int32_t(random())};
             const int32_t voltages[] = {0, 1, 512 * 64 - 1, int32_t(random() % (512 * 64))};
+            const int32_t reference_q24 = references[k];
+            const torque_sharing_window_t window =
+                predictive_torque_move_windows(&p, &advance_q30, reference_q24, control.torque_shortfall_q24);
             const predictive_torque_sample_t sample = {.current_q9 = current_q9,
                                                        .flux_q29 = flux_q29,
+                                                       .window = &window,
                                                        .angle = angle,
                                                        .bus_voltage_q6 = voltages[random() % 4],
-                                                       .torque_q24 = references[k],
+                                                       .torque_q24 = reference_q24,
                                                        .reverse = i % 2 == 0,
                                                        .angle_step = random_angle_step(random)};
             predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
@@ -356,8 +367,8 @@ TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing)
                 ASSERT_LE(duty_q15[phase], 32768);
                 ASSERT_GE(control.flux_q29[phase], 0);
             }
-            ASSERT_GE(control.advance_q30, 0);
-            ASSERT_LE(control.advance_q30, 1 << 30);
+            ASSERT_GE(advance_q30, 0);
+            ASSERT_LE(advance_q30, 1 << 30);
         }
     }
 }

@@ -11,6 +11,7 @@
 extern "C" {
 #include "drive/configure.h"
 #include "drive/control.h"
+#include "drive/deferred.h"
 #include "drive/fault.h"
 #include "telemetry_collect.h"
 
@@ -88,6 +89,7 @@ class Control : public testing::Test {
         turns += speed_rad_s / (2.0 * fixed_point::PI * RATE_HZ);
         sample.encoder.counts = uint32_t(int64_t(std::floor((turns - std::floor(turns)) * (1 << ENCODER_BITS))));
         const bool closed = control_step(&parameters, &state, &sample, &command, &compare);
+        deferred_step(&parameters, &state);
         diagnostics = diagnose();
         // No switch is ever closed outside RUN.
         EXPECT_EQ(closed, state.state_machine.state == DRIVE_STATE_RUN);
@@ -193,6 +195,7 @@ TEST_F(Control, the_same_state_and_sample_give_the_same_bits) {
             step(COMMAND_RUN, 150.0);
             hal_pwm_compare_t replayed;
             control_step(&parameters, &before, &sample, &command, &replayed);
+            deferred_step(&parameters, &before);
             ASSERT_EQ(std::memcmp(&before, &state, sizeof state), 0) << k;
             ASSERT_EQ(std::memcmp(&replayed, &compare, sizeof compare), 0) << k;
         }
@@ -211,17 +214,18 @@ TEST_F(Control, counts_become_amperes_volts_and_angle_exactly) {
     EXPECT_EQ(diagnostics.angle, (sample.encoder.counts << 15) + (1u << 14));
 }
 
-TEST_F(Control, each_cause_opens_every_switch_in_the_tick_that_sees_it) {
+TEST_F(Control, each_cause_opens_every_switch_in_the_tick_that_sees_it_and_a_deferred_check_in_the_next) {
     const struct {
         fault_t fault;
+        bool deferred;
         std::function<void()> provoke;
     } causes[] = {
-        {FAULT_OVER_CURRENT, [this] { sample.adc.phase_current_counts[1] = 3841; }}, // 75.02 A
-        {FAULT_OVER_VOLTAGE, [this] { sample.adc.bus_voltage_counts = 301 * 8; }},
-        {FAULT_UNDER_VOLTAGE, [this] { sample.adc.bus_voltage_counts = 149 * 8; }},
-        {FAULT_ENCODER, [this] { turns += 0.01; }},
-        {FAULT_COMMAND_TIMEOUT, [this] { command.time_us -= 100001; }},
-        {FAULT_INTERRUPT_OVERRUN, [this] { sample.missed_interrupts = 3; }},
+        {FAULT_OVER_CURRENT, false, [this] { sample.adc.phase_current_counts[1] = 3841; }}, // 75.02 A
+        {FAULT_OVER_VOLTAGE, false, [this] { sample.adc.bus_voltage_counts = 301 * 8; }},
+        {FAULT_UNDER_VOLTAGE, true, [this] { sample.adc.bus_voltage_counts = 149 * 8; }},
+        {FAULT_ENCODER, false, [this] { turns += 0.01; }},
+        {FAULT_COMMAND_TIMEOUT, true, [this] { command.time_us -= 100001; }},
+        {FAULT_INTERRUPT_OVERRUN, false, [this] { sample.missed_interrupts = 3; }},
     };
     for (const auto &cause : causes) {
         configure(DRIVE_CONTROLLER_PAPER);
@@ -229,9 +233,12 @@ TEST_F(Control, each_cause_opens_every_switch_in_the_tick_that_sees_it) {
         for (int k = 0; k < 10; k++) {
             step(COMMAND_RUN);
         }
-        const int32_t torque_reference_q24 = diagnostics.torque_reference_q24;
-        EXPECT_GT(torque_reference_q24, 0);
+        EXPECT_GT(diagnostics.torque_reference_q24, 0);
         cause.provoke();
+        if (cause.deferred) {
+            EXPECT_TRUE(step_unchanged()) << cause.fault;
+        }
+        const int32_t torque_reference_q24 = diagnostics.torque_reference_q24;
         EXPECT_FALSE(step_unchanged()) << cause.fault;
         EXPECT_TRUE(all_open(compare));
         const fault_record_t &record = state.state_machine.record;

@@ -28,13 +28,55 @@ const protection_parameters_t PARAMETERS = {
     .command_timeout_us = 100000,
 };
 
+// Values of one period for all checks.
+struct input_t {
+    int32_t current_max_q9, dc_link_voltage_q6, speed_q22;
+    uint32_t encoder_angle, missed_interrupts, command_age_us;
+    uint32_t skipped_deferred = 0, periods = 1;
+};
+
+struct checks_t {
+    protection_t immediate;
+    protection_deferred_t deferred;
+
+    void reset(uint32_t encoder_angle) {
+        protection_reset(&immediate, encoder_angle);
+        protection_deferred_reset(&deferred, encoder_angle);
+    }
+
+    uint64_t check_immediate(const input_t &input) {
+        const protection_input_t values = {
+            .current_max_q9 = input.current_max_q9,
+            .dc_link_voltage_q6 = input.dc_link_voltage_q6,
+            .encoder_angle = input.encoder_angle,
+            .missed_interrupts = input.missed_interrupts,
+            .skipped_deferred = input.skipped_deferred,
+        };
+        return protection_check(&PARAMETERS, &immediate, &values);
+    }
+
+    uint64_t check_deferred(const input_t &input) {
+        const protection_deferred_input_t values = {
+            .dc_link_voltage_q6 = input.dc_link_voltage_q6,
+            .speed_q22 = input.speed_q22,
+            .encoder_angle = input.encoder_angle,
+            .command_age_us = input.command_age_us,
+            .periods = input.periods,
+        };
+        return protection_check_deferred(&PARAMETERS, &deferred, &values);
+    }
+
+    // Failed checks of both, one after the other.
+    uint64_t check(const input_t &input) { return check_immediate(input) | check_deferred(input); }
+};
+
 class Protection : public testing::Test {
   protected:
-    Protection() { protection_reset(&protection, healthy.encoder_angle); }
+    Protection() { checks.reset(healthy.encoder_angle); }
 
-    uint64_t check(const protection_input_t &input) { return protection_check(&PARAMETERS, &protection, &input); }
+    uint64_t check(const input_t &input) { return checks.check(input); }
 
-    const protection_input_t healthy = {
+    const input_t healthy = {
         .current_max_q9 = 0,
         .dc_link_voltage_q6 = 240 << 6,
         .speed_q22 = 0,
@@ -42,8 +84,75 @@ class Protection : public testing::Test {
         .missed_interrupts = 0,
         .command_age_us = 0,
     };
-    protection_t protection{};
+    checks_t checks{};
 };
+
+TEST_F(Protection, voltage_speed_and_command_are_checked_in_the_deferred_step_and_the_others_in_the_interrupt) {
+    input_t input = healthy;
+    input.current_max_q9 = 76 << 9;
+    input.dc_link_voltage_q6 = 310 << 6;
+    input.speed_q22 = 400 << 22;
+    input.encoder_angle += 1u << 30;
+    input.command_age_us = UINT32_MAX;
+    input.missed_interrupts = 3;
+    EXPECT_EQ(checks.check_immediate(input), FAULT_BIT(FAULT_OVER_CURRENT) | FAULT_BIT(FAULT_OVER_VOLTAGE) |
+                                                 FAULT_BIT(FAULT_ENCODER) | FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
+    EXPECT_EQ(checks.check_deferred(input), FAULT_BIT(FAULT_OVER_SPEED) | FAULT_BIT(FAULT_COMMAND_TIMEOUT));
+    input.dc_link_voltage_q6 = 140 << 6;
+    input.encoder_angle++; // not a frozen encoder
+    EXPECT_EQ(checks.check_deferred(input),
+              FAULT_BIT(FAULT_UNDER_VOLTAGE) | FAULT_BIT(FAULT_OVER_SPEED) | FAULT_BIT(FAULT_COMMAND_TIMEOUT));
+}
+
+TEST_F(Protection, eight_periods_without_a_deferred_step_are_an_overrun) {
+    input_t input = healthy;
+    input.skipped_deferred = PROTECTION_SKIPPED_DEFERRED_MAX - 1;
+    EXPECT_EQ(check(input), 0);
+    input.skipped_deferred++;
+    EXPECT_EQ(check(input), FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
+    input.skipped_deferred = UINT32_MAX;
+    EXPECT_EQ(check(input), FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
+    input.skipped_deferred = 0;
+    EXPECT_EQ(check(input), 0);
+}
+
+TEST_F(Protection, a_frozen_encoder_is_detected_after_the_same_travel_when_periods_are_skipped) {
+    for (const int32_t speed_rad_s : {10, 60, 300}) {
+        int detected[3] = {};
+        int n = 0;
+        for (const uint32_t periods : {1u, 2u, 5u}) {
+            checks.reset(healthy.encoder_angle);
+            input_t input = healthy;
+            input.encoder_angle++;
+            input.speed_q22 = speed_rad_s << 22;
+            ASSERT_EQ(check(input), 0);
+            input.speed_q22 = 0; // the observer follows the encoder
+            input.periods = periods;
+            while (detected[n] < 2000 && checks.check_deferred(input) == 0) {
+                detected[n] += int(periods);
+            }
+            n++;
+        }
+        EXPECT_LT(detected[0], 2000);
+        EXPECT_NEAR(detected[1], detected[0], 2 + detected[0] / 20) << speed_rad_s;
+        EXPECT_NEAR(detected[2], detected[0], 5 + detected[0] / 10) << speed_rad_s;
+    }
+}
+
+TEST_F(Protection, any_number_of_skipped_periods_overflows_nothing) {
+    input_t input = healthy;
+    input.encoder_angle++;
+    input.speed_q22 = INT32_MAX;
+    check(input);
+    for (const uint32_t periods : {16u, 17u, UINT32_MAX}) {
+        input.periods = periods;
+        for (int k = 0; k < 100; k++) {
+            check(input);
+            ASSERT_GE(checks.deferred.undetected_travel, 0);
+        }
+    }
+    EXPECT_EQ(check(input), FAULT_BIT(FAULT_ENCODER) | FAULT_BIT(FAULT_OVER_SPEED));
+}
 
 TEST_F(Protection, no_check_fails_in_a_healthy_drive) {
     for (int k = 0; k < 1000; k++) {
@@ -52,7 +161,7 @@ TEST_F(Protection, no_check_fails_in_a_healthy_drive) {
 }
 
 TEST_F(Protection, a_current_above_the_trip_is_an_over_current) {
-    protection_input_t input = healthy;
+    input_t input = healthy;
     input.current_max_q9 = 75 << 9;
     EXPECT_EQ(check(input), 0);
     input.current_max_q9++;
@@ -60,7 +169,7 @@ TEST_F(Protection, a_current_above_the_trip_is_an_over_current) {
 }
 
 TEST_F(Protection, a_voltage_beyond_its_limit_is_an_over_or_under_voltage) {
-    protection_input_t input = healthy;
+    input_t input = healthy;
     input.dc_link_voltage_q6 = 300 << 6;
     EXPECT_EQ(check(input), 0);
     input.dc_link_voltage_q6++;
@@ -72,7 +181,7 @@ TEST_F(Protection, a_voltage_beyond_its_limit_is_an_over_or_under_voltage) {
 }
 
 TEST_F(Protection, over_speed_is_detected_in_both_directions) {
-    protection_input_t input = healthy;
+    input_t input = healthy;
     for (const int32_t sign : {1, -1}) {
         input.encoder_angle += 10; // not a frozen encoder
         input.speed_q22 = sign * (377 << 22);
@@ -87,7 +196,7 @@ TEST_F(Protection, over_speed_is_detected_in_both_directions) {
 }
 
 TEST_F(Protection, an_encoder_step_above_the_limit_per_period_is_a_fault) {
-    protection_input_t input = healthy;
+    input_t input = healthy;
     for (const uint32_t step : {ANGLE_STEP_MAX, -ANGLE_STEP_MAX}) {
         input.encoder_angle += step;
         EXPECT_EQ(check(input), 0);
@@ -100,16 +209,16 @@ TEST_F(Protection, an_encoder_step_above_the_limit_per_period_is_a_fault) {
 }
 
 TEST_F(Protection, a_wrap_of_the_angle_is_no_jump) {
-    protection_input_t input = healthy;
+    input_t input = healthy;
     input.encoder_angle = 10;
-    protection_reset(&protection, 0xFFFFFFF0u);
+    checks.reset(0xFFFFFFF0u);
     EXPECT_EQ(check(input), 0);
     input.encoder_angle = 0xFFFFFFF0u;
     EXPECT_EQ(check(input), 0);
 }
 
 TEST_F(Protection, the_limit_of_an_encoder_step_scales_with_the_lost_periods) {
-    protection_input_t input = healthy;
+    input_t input = healthy;
     input.missed_interrupts = 2;
     input.encoder_angle += 3 * ANGLE_STEP_MAX;
     EXPECT_EQ(check(input), 0);
@@ -124,8 +233,8 @@ TEST_F(Protection, a_frozen_encoder_is_detected_although_the_observer_follows_it
     // At constant deceleration from v the rotor travels v^2 / 2a: 4.1 rad/s is within the limit, 4.5 rad/s beyond it.
     for (const int32_t sign : {1, -1}) {
         for (const auto &[speed_rad_s, fails] : {std::pair{4.1, false}, std::pair{4.5, true}, std::pair{60.0, true}}) {
-            protection_reset(&protection, healthy.encoder_angle);
-            protection_input_t input = healthy;
+            checks.reset(healthy.encoder_angle);
+            input_t input = healthy;
             input.encoder_angle++;
             input.speed_q22 = sign * int32_t(speed_rad_s * (1 << 22));
             ASSERT_EQ(check(input), 0);
@@ -142,8 +251,8 @@ TEST_F(Protection, a_frozen_encoder_is_detected_although_the_observer_follows_it
 
 TEST_F(Protection, an_encoder_is_frozen_when_the_expected_travel_exceeds_the_limit) {
     for (const int32_t sign : {1, -1}) {
-        protection_reset(&protection, healthy.encoder_angle);
-        protection_input_t input = healthy;
+        checks.reset(healthy.encoder_angle);
+        input_t input = healthy;
         input.speed_q22 = sign * (10 << 22);
         const double moved_a_period = std::ldexp(double(10 << 22) * PARAMETERS.angle_step_q32, -32);
         const int periods = int(std::floor((UNDETECTED_TRAVEL_MAX + 1) / moved_a_period));
@@ -159,19 +268,19 @@ TEST_F(Protection, an_encoder_is_frozen_when_the_expected_travel_exceeds_the_lim
 }
 
 TEST_F(Protection, a_constant_encoder_angle_is_no_fault_at_standstill) {
-    protection_input_t input = healthy;
+    input_t input = healthy;
     input.speed_q22 = (1 << 22) - 1;
     for (int k = 0; k < 200000; k++) {
         ASSERT_EQ(check(input), 0);
     }
-    EXPECT_EQ(protection.undetected_travel, 0);
+    EXPECT_EQ(checks.deferred.undetected_travel, 0);
 }
 
 TEST_F(Protection, mirrored_random_motion_gives_the_same_fault_masks) {
     std::mt19937 random(11);
-    protection_t mirrored{};
-    protection_input_t input = healthy, mirror = healthy;
-    protection_reset(&mirrored, healthy.encoder_angle);
+    checks_t mirrored{};
+    input_t input = healthy, mirror = healthy;
+    mirrored.reset(healthy.encoder_angle);
     unsigned over_speed = 0, encoder = 0;
     for (int k = 0; k < 200000; k++) {
         // Often at standstill, occasionally beyond a limit.
@@ -183,11 +292,11 @@ TEST_F(Protection, mirrored_random_motion_gives_the_same_fault_masks) {
             input.speed_q22 = int32_t(random() % (fastest_rad_s << 22));
             mirror.speed_q22 = -input.speed_q22;
         }
-        const uint64_t checks = check(input);
-        ASSERT_EQ(protection_check(&PARAMETERS, &mirrored, &mirror), checks) << k;
-        ASSERT_EQ(mirrored.undetected_travel, protection.undetected_travel) << k;
-        over_speed += (checks & FAULT_BIT(FAULT_OVER_SPEED)) != 0;
-        encoder += (checks & FAULT_BIT(FAULT_ENCODER)) != 0;
+        const uint64_t failed = check(input);
+        ASSERT_EQ(mirrored.check(mirror), failed) << k;
+        ASSERT_EQ(mirrored.deferred.undetected_travel, checks.deferred.undetected_travel) << k;
+        over_speed += (failed & FAULT_BIT(FAULT_OVER_SPEED)) != 0;
+        encoder += (failed & FAULT_BIT(FAULT_ENCODER)) != 0;
     }
     EXPECT_GT(over_speed, 10u);
     EXPECT_LT(over_speed, 1000u);
@@ -196,7 +305,7 @@ TEST_F(Protection, mirrored_random_motion_gives_the_same_fault_masks) {
 }
 
 TEST_F(Protection, a_reversal_within_one_count_is_no_frozen_encoder) {
-    protection_input_t input = healthy;
+    input_t input = healthy;
     // From 50 rad/s to -50 rad/s in 2000 periods, the count is constant while the speed is below 2 rad/s.
     for (int k = -1000; k <= 1000; k++) {
         input.speed_q22 = -k * ((50 << 22) / 1000);
@@ -208,17 +317,17 @@ TEST_F(Protection, a_reversal_within_one_count_is_no_frozen_encoder) {
 }
 
 TEST_F(Protection, the_undetected_travel_of_a_permanently_frozen_encoder_does_not_overflow) {
-    protection_input_t input = healthy;
+    input_t input = healthy;
     input.speed_q22 = INT32_MAX;
     for (int k = 0; k < 1000; k++) {
         check(input);
-        ASSERT_GE(protection.undetected_travel, 0);
+        ASSERT_GE(checks.deferred.undetected_travel, 0);
     }
     EXPECT_EQ(check(input), FAULT_BIT(FAULT_ENCODER) | FAULT_BIT(FAULT_OVER_SPEED));
 }
 
 TEST_F(Protection, a_command_older_than_the_timeout_is_a_fault) {
-    protection_input_t input = healthy;
+    input_t input = healthy;
     input.command_age_us = 100000;
     EXPECT_EQ(check(input), 0);
     input.command_age_us++;
@@ -226,7 +335,7 @@ TEST_F(Protection, a_command_older_than_the_timeout_is_a_fault) {
 }
 
 TEST_F(Protection, three_consecutive_lost_interrupts_are_an_overrun_and_a_period_in_time_resets_the_count) {
-    protection_input_t input = healthy, missed = healthy;
+    input_t input = healthy, missed = healthy;
     missed.missed_interrupts = 1;
     EXPECT_EQ(check(missed), 0);
     EXPECT_EQ(check(missed), 0);
@@ -242,8 +351,8 @@ TEST_F(Protection, three_consecutive_lost_interrupts_are_an_overrun_and_a_period
 
 TEST_F(Protection, every_combination_of_failed_checks_is_reported) {
     for (unsigned mask = 0; mask < 64; mask++) {
-        protection_reset(&protection, healthy.encoder_angle);
-        protection_input_t input = healthy;
+        checks.reset(healthy.encoder_angle);
+        input_t input = healthy;
         input.encoder_angle += 10;
         uint64_t expected = 0;
         const auto fails = [&](unsigned bit, fault_t fault) {

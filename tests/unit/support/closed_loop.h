@@ -13,6 +13,7 @@
 extern "C" {
 #include "drive/configure.h"
 #include "drive/control.h"
+#include "drive/deferred.h"
 #include "plant/machine.h"
 #include "plant/plant.h"
 #include "plant/sensors.h"
@@ -54,7 +55,9 @@ struct fixed_drive_t {
     }
 
     bool step(const control_sample_t &sample, const command_t &command, hal_pwm_compare_t *compare) {
-        return control_step(&parameters, &state, &sample, &command, compare);
+        const bool run = control_step(&parameters, &state, &sample, &command, compare);
+        deferred_step(&parameters, &state);
+        return run;
     }
 };
 

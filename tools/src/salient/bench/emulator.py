@@ -50,6 +50,11 @@ def image(machine: str, build: str) -> Path:
     return _programs(machine, build)[1]
 
 
+def deferred_instructions(instructions: Path) -> Path:
+    """The file with the instruction counts of the deferred interrupts, from that of the control interrupts."""
+    return instructions.with_name(f"{instructions.name}.deferred")
+
+
 def command_line(config: BenchConfig) -> list[str]:
     """The command line that starts a test bench. UsageError: as executable(), and options that exclude each other."""
     program = str(executable(config.machine, config.build))
@@ -60,7 +65,8 @@ def command_line(config: BenchConfig) -> list[str]:
     elf = image(config.machine, config.build)
     line = [program, str(elf)]
     if config.instructions is not None:
-        line += ["--instructions", str(config.instructions)]
+        line += ["--instructions", str(config.instructions),
+                 "--deferred-instructions", str(deferred_instructions(config.instructions))]
     if config.execution is not None:
         end, begin = ElfImage(elf).stack()
         line += ["--execution", str(config.execution), f"{end:#x}-{begin:#x}"]

@@ -35,14 +35,22 @@ Baseline = dict[str, dict[str, dict[str, int]]]
 
 def sizes(build: str) -> dict[str, int]:
     """Sizes in bytes of a build's ELF image and, where it exists, of the firmware alone (firmware.elf: linked like the
-    image, without port and C library). The stack sizes are upper bounds of background and interrupt."""
+    image, without port and C library). The stack sizes are upper bounds of the background and of each interrupt."""
     whole = ElfImage(image(MACHINE, build))
     image_size = size(whole)
     alone = firmware_alone(build)
-    background, interrupt = (deepest_stack(whole, function)[0] for function in ("program_start", "control_handler"))
+    background, interrupt, deferred = (deepest_stack(whole, function)[0]
+                                       for function in ("program_start", "control_handler", "deferred_handler"))
     result = {"flash": image_size.flash, "ram": image_size.ram, "stack_background": background,
+              "stack_deferred": deferred + whole.exception_frame_bytes,
               "stack_interrupt": interrupt + whole.exception_frame_bytes}
     return ({"firmware": size(ElfImage(alone)).flash} if alone.exists() else {}) | result
+
+
+def ram_needed(of: Mapping[str, int]) -> int:
+    """Variables, and the stack when the control interrupt pre-empts the deferred one at its deepest point, and that one
+    the background at its deepest."""
+    return of["ram"] + of["stack_background"] + of["stack_deferred"] + of["stack_interrupt"]
 
 
 def firmware_alone(build: str) -> Path:
@@ -112,10 +120,10 @@ def tables_of(baseline: Baseline) -> list[str]:
 def size_table(of: Mapping[str, Mapping[str, int]]) -> str:
     """Sizes in bytes by build."""
     rows = [(build, values.get("firmware", "–"), values["flash"], values["ram"], values["stack_background"],
-             values["stack_interrupt"], values["ram"] + values["stack_background"] + values["stack_interrupt"])
+             values["stack_deferred"], values["stack_interrupt"], ram_needed(values))
             for build, values in of.items()]
     return _table(("bytes", "firmware with a machine's tables", "image", "variables", "stack: background",
-                   "interrupt", "total RAM"), rows)
+                   "deferred interrupt", "control interrupt", "total RAM"), rows)
 
 
 def profile_table(of: Mapping[str, Mapping[str, int]]) -> str:

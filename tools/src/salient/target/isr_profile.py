@@ -1,4 +1,4 @@
-"""Profile of the control interrupt on a target: instructions counted by QEMU, the same on every computer."""
+"""Profile of the interrupts on a target: instructions counted by QEMU, the same on every computer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from salient.bench.emulator import image
+from salient.bench.emulator import deferred_instructions, image
 from salient.experiments.scenario import RunResult, Scenario, load_scenarios, run_scenario
 from salient.paths import SCENARIOS
 from salient.target.trace import Trace, read_trace
@@ -18,29 +18,47 @@ EXPERIMENTS = ("start_600", "load_step_150")
 
 @dataclass(frozen=True)
 class IsrProfile:
-    """interrupts: instructions of each interrupt, from the handler's first to its return. trace: of the same runs."""
+    """interrupts: instructions of each control interrupt, from the handler's first to its return; deferred: of each
+    deferred interrupt, without those of control interrupts that pre-empt it. trace: of the same runs."""
 
     interrupts: np.ndarray
+    deferred: np.ndarray
     trace: Trace
 
     def __add__(self, other: IsrProfile) -> IsrProfile:
         """Both runs of the same ELF image."""
-        return IsrProfile(np.concatenate((self.interrupts, other.interrupts)), self.trace + other.trace)
+        return IsrProfile(np.concatenate((self.interrupts, other.interrupts)),
+                          np.concatenate((self.deferred, other.deferred)), self.trace + other.trace)
 
     def metrics(self) -> dict[str, int]:
-        """Instructions: median, 99th percentile and maximum."""
-        return {"median": int(np.percentile(self.interrupts, 50, method="inverted_cdf")),
-                "p99": int(np.percentile(self.interrupts, 99, method="inverted_cdf")),
-                "max": int(self.interrupts.max())}
+        """Instructions of the control interrupt: median, 99th percentile and maximum."""
+        return _metrics(self.interrupts)
+
+    def deferred_metrics(self) -> dict[str, int]:
+        """The same of the deferred interrupt."""
+        return _metrics(self.deferred)
+
+    def sum_metrics(self) -> dict[str, int]:
+        """The same of both interrupts of a period together. ValueError when a period has no deferred interrupt."""
+        if len(self.interrupts) != len(self.deferred):
+            raise ValueError(f"{len(self.interrupts)} control and {len(self.deferred)} deferred interrupts")
+        return _metrics(self.interrupts + self.deferred)
 
     def mean_by_module(self) -> dict[str, float]:
         """Mean instructions per interrupt, the largest first (Trace.by_module)."""
         return {name: count / len(self.interrupts) for name, count in self.trace.by_module().most_common()}
 
 
+def _metrics(instructions: np.ndarray) -> dict[str, int]:
+    return {"median": int(np.percentile(instructions, 50, method="inverted_cdf")),
+            "p99": int(np.percentile(instructions, 99, method="inverted_cdf")),
+            "max": int(instructions.max())}
+
+
 def read_profile(interrupts: Path, trace: Path, machine: str, build: str) -> IsrProfile:
     """Reads the files that a run has written for BenchConfig.instructions and execution."""
-    return IsrProfile(np.fromfile(interrupts, "<u4"), read_trace(trace, image(machine, build)))
+    return IsrProfile(np.fromfile(interrupts, "<u4"), np.fromfile(deferred_instructions(interrupts), "<u4"),
+                      read_trace(trace, image(machine, build)))
 
 
 def measure_run(scenario: Scenario, out_dir: Path, build: str = "cortex-m4") -> tuple[RunResult, IsrProfile]:

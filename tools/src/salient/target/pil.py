@@ -43,6 +43,8 @@ def as_json(profile: IsrProfile, target: str) -> dict[str, Any]:
     return {
         "interrupts": len(profile.interrupts),
         "instructions": metrics,
+        "deferred_instructions": profile.deferred_metrics(),
+        "instructions_of_both": profile.sum_metrics(),
         "longest_interrupt": int(profile.interrupts.argmax()),
         "mean_by_module": {name: round(mean, 1) for name, mean in profile.mean_by_module().items()},
         "max_by_module": dict(profile.trace.longest_by_module().most_common()),
@@ -67,6 +69,9 @@ def summary(profiles: Mapping[str, IsrProfile], target: str) -> str:
         lines += [
             f"{controller}: instructions per control interrupt: median {metrics['median']}, p99 {metrics['p99']},"
             f" max {metrics['max']}",
+            *(f"  {what}: median {of['median']}, p99 {of['p99']}, max {of['max']}"
+              for what, of in (("deferred interrupt", profile.deferred_metrics()),
+                               ("both interrupts of a period", profile.sum_metrics()))),
             f"  mean by module: {means}",
             f"  longest by module: {longest}",
             *([f"  longest in cycles, estimate: {low * metrics['max']:.0f} to {high * metrics['max']:.0f}; fits at"

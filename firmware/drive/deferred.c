@@ -1,0 +1,139 @@
+#include "drive/deferred.h"
+
+#include "fixed/fixed.h"
+
+#define RUN_MASK UINT32_C(0x0000FFFF)
+#define OBSERVER_MASK UINT32_C(0xFFFF0000)
+#define OBSERVER_STEP UINT32_C(0x00010000)
+
+/* From here on the results of earlier inputs are without effect. */
+static void change_generation(control_state_t *state, uint32_t generation) {
+    deferred_request_t *request = &state->deferred_request;
+    request->initial = *deferred_results(request, &state->deferred.response);
+    request->generation = generation;
+}
+
+void deferred_reset_run(const control_parameters_t *parameters, control_state_t *state) {
+    const uint32_t generation = state->deferred_request.generation;
+    change_generation(state, (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK));
+    state->deferred_request.initial.window = parameters->predictive.base_window;
+}
+
+void deferred_reset_observer(control_state_t *state) {
+    change_generation(state, state->deferred_request.generation + OBSERVER_STEP);
+    state->deferred_request.initial.bandwidth = (observer_bandwidth_limits_t){0, 0};
+}
+
+void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
+                        const command_t *command, const control_measurement_t *measured) {
+    deferred_request_t *request = &state->deferred_request;
+    if (deferred_pending(request, &state->deferred.response)) {
+        deferred_skip(request);
+        return;
+    }
+    deferred_input_t *input = &request->input;
+    input->generation = request->generation;
+    input->periods = request->skipped + 1;
+    input->encoder_angle = measured->encoder_angle;
+    input->dc_link_voltage_q6 = measured->dc_link_voltage_q6;
+    input->command_age_us = sample->time_us - command->time_us;
+    input->speed_q22 = state->observer.speed_q22;
+    if (parameters->bandwidth.adaptive) {
+        input->bandwidth.innovation = state->innovation;
+        input->bandwidth.from_edge = measured->angle_from_edge;
+        input->bandwidth.stage = state->bandwidth.stage;
+        input->bandwidth.trigger = state->bandwidth.trigger;
+        state->bandwidth.trigger = OBSERVER_TRIGGER_NONE;
+    }
+    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
+        input->run = state->state_machine.state == DRIVE_STATE_RUN;
+        input->observer = state->observer;
+        input->electrical = measured->commutation.electrical;
+        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+            input->current_q9[phase] = measured->current_q9[phase];
+        }
+        input->speed_reference_q22 = state->speed_reference_q22;
+        input->torque_reference_q24 = state->torque_reference_q24;
+        input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
+    }
+    deferred_request(request);
+}
+
+/* Resets what the control interrupt has reset since the previous step. */
+static void follow_resets(deferred_t *deferred, const deferred_input_t *input) {
+    const uint32_t changed = deferred->generation ^ input->generation;
+    if ((changed & RUN_MASK) != 0) {
+        deferred->advance_q30 = 0;
+    }
+    if ((changed & OBSERVER_MASK) != 0) {
+        deferred->bandwidth = (observer_bandwidth_statistics_t){0, 0};
+    }
+    deferred->generation = input->generation;
+    if (!deferred->started) {
+        deferred->started = true;
+        protection_deferred_reset(&deferred->protection, input->encoder_angle);
+    }
+}
+
+static uint64_t protect(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
+    const protection_deferred_input_t checked = {
+        .dc_link_voltage_q6 = input->dc_link_voltage_q6,
+        .speed_q22 = input->speed_q22,
+        .encoder_angle = input->encoder_angle,
+        .command_age_us = input->command_age_us,
+        .periods = input->periods,
+    };
+    return protection_check_deferred(&parameters->protection, &deferred->protection, &checked);
+}
+
+/* The misalignment is observable only while speed, load and voltage are steady. */
+static void learn_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
+                               const deferred_input_t *input) {
+    const commutation_t commutation = {.electrical = input->electrical};
+    uint32_t angle[HAL_PHASES_MAX];
+    for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
+        angle[phase] = commutation_angle(&parameters->commutation, &commutation, phase) -
+                       (uint32_t)deferred->misalignment.phase[phase].offset;
+    }
+    const load_observer_t *observer = &input->observer;
+    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(input->speed_reference_q22, observer->speed_q22));
+    const misalignment_sample_t sample = {
+        .current_q9 = input->current_q9,
+        .angle = angle,
+        .torque_q24 = input->torque_reference_q24,
+        .steady = observer_bandwidth_steady(&parameters->bandwidth, input->bandwidth.stage) &&
+                  speed_error_q22 < fixed_abs(observer->speed_q22) / 64 && input->torque_shortfall_q24 == 0,
+    };
+    misalignment_step(&parameters->misalignment, &deferred->misalignment, parameters->tables, observer, &sample);
+}
+
+void deferred_compute(const control_parameters_t *parameters, control_state_t *state) {
+    const deferred_input_t *input = &state->deferred_request.input;
+    deferred_t *deferred = &state->deferred;
+    deferred_results_t *results = deferred_buffer(&deferred->response);
+    follow_resets(deferred, input);
+    results->generation = input->generation;
+    results->fault_mask = protect(parameters, deferred, input);
+    if (parameters->bandwidth.adaptive) {
+        results->bandwidth = observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, &input->bandwidth);
+    }
+    results->window = parameters->predictive.base_window;
+    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run) {
+        results->window = predictive_torque_move_windows(&parameters->predictive, &deferred->advance_q30,
+                                                         input->torque_reference_q24, input->torque_shortfall_q24);
+        learn_misalignment(parameters, deferred, input);
+    }
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        results->misalignment[phase] = deferred->misalignment.phase[phase].offset;
+    }
+}
+
+bool deferred_step(const control_parameters_t *parameters, control_state_t *state) {
+    const deferred_request_t *request = &state->deferred_request;
+    if (!deferred_pending(request, &state->deferred.response)) {
+        return false;
+    }
+    deferred_compute(parameters, state);
+    deferred_complete(request, &state->deferred.response);
+    return true;
+}

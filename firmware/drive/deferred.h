@@ -1,0 +1,38 @@
+/* Deferred step: the part of the control that need not be done within the period.
+ *
+ *   protect      deferred checks                                                           protection.h
+ *   bandwidth    statistics of the innovation -> limits of the observer's trigger           observer_bandwidth.h
+ *   windows      torque shortfall -> conduction windows, with their reciprocal              predictive_torque.h
+ *   learn        misalignment of each phase                                                misalignment.h
+ *
+ * The control interrupt ends with the hand-over of its values; the deferred interrupt makes the step, and its results
+ * act in the next control period. When the step is not complete by then, the results of the previous one remain in
+ * effect, and no input is handed over until it is: periods are skipped, which delays the results but does not change
+ * their meaning. Checks and triggers cover the skipped periods, statistics and learning leave them out.
+ */
+#ifndef DRIVE_DEFERRED_H
+#define DRIVE_DEFERRED_H
+
+#include <stdbool.h>
+
+#include "drive/control.h"
+
+/* Hands the values of this period over, or counts the period as skipped. The state machine has made its tick.
+ * [interrupt] */
+void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
+                        const command_t *command, const control_measurement_t *measured);
+
+/* Computes the results of the pending step; deferred_complete() then puts them into effect. The control interrupt may
+ * pre-empt both. [deferred] */
+void deferred_compute(const control_parameters_t *parameters, control_state_t *state);
+
+/* Both of them, when a step is pending; else returns false. [deferred] */
+bool deferred_step(const control_parameters_t *parameters, control_state_t *state);
+
+/* Resets for the next run: windows without advance. [both] */
+void deferred_reset_run(const control_parameters_t *parameters, control_state_t *state);
+
+/* Resets with the observer: statistics of the innovation. [interrupt] */
+void deferred_reset_observer(control_state_t *state);
+
+#endif

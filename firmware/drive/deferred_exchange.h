@@ -1,0 +1,106 @@
+/* Data between the control interrupt and the deferred interrupt, which the former pre-empts at any instruction.
+ *
+ *   control interrupt    deferred_request_t     input of a deferred step; not written while the step is pending
+ *   deferred interrupt   deferred_response_t    results in one of two buffers, selected by one store when they are
+ * whole
+ *
+ * Each structure is written by one of the two only, and read by the other. A deferred step is pending from its request
+ * until its end. The control interrupt requests none in a period in which one is pending, and counts that period as
+ * skipped.
+ *
+ * Resets: the control interrupt that resets something changes the generation, and uses its own initial results until
+ * those of a step with an input of the present generation arrive. So a late step cannot undo a reset. The deferred step
+ * resets its own state when it sees another generation.
+ */
+#ifndef DRIVE_DEFERRED_EXCHANGE_H
+#define DRIVE_DEFERRED_EXCHANGE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "control/load_observer.h"
+#include "control/observer_bandwidth.h"
+#include "control/torque_sharing.h"
+#include "hal.h"
+
+/* Values of one control period. */
+typedef struct {
+    uint32_t generation;
+    uint32_t periods;           /* since the input of the previous deferred step, from 1 */
+    uint32_t encoder_angle;     /* start of the encoder count, 2^-32 rev */
+    int32_t dc_link_voltage_q6; /* V, Q9.6 */
+    uint32_t command_age_us;    /* time since the last accepted command */
+    int32_t speed_q22;          /* observer, for the coming sample, rad/s, Q9.22 */
+    /* With an adaptive bandwidth only. */
+    observer_bandwidth_sample_t bandwidth;
+    /* With predictive torque control only. */
+    bool run;                 /* state RUN */
+    load_observer_t observer; /* estimate for the coming sample */
+    uint32_t electrical;      /* angle of phase 0, 2^-32 electrical rev */
+    int32_t current_q9[HAL_PHASES_MAX];
+    int32_t speed_reference_q22;
+    int32_t torque_reference_q24;
+    int32_t torque_shortfall_q24;
+} deferred_input_t;
+
+/* Results that act from the next control period on; all zero: none, but for the window. */
+typedef struct {
+    uint32_t generation;                   /* of the input */
+    uint64_t fault_mask;                   /* failed deferred checks, FAULT_BIT */
+    observer_bandwidth_limits_t bandwidth; /* of the trigger */
+    torque_sharing_window_t window;        /* of the motoring phases */
+    int32_t misalignment[HAL_PHASES_MAX];  /* to subtract from the angle of each phase, 2^-32 electrical rev */
+} deferred_results_t;
+
+typedef struct {
+    uint32_t requests;   /* deferred steps, modulo 2^32 */
+    uint32_t generation; /* lower half: run, upper half: observer */
+    uint32_t skipped;    /* periods since the last request */
+    uint32_t skipped_total;
+    deferred_input_t input;
+    deferred_results_t initial; /* in effect until a result of the present generation */
+} deferred_request_t;
+
+typedef struct {
+    uint32_t completed; /* deferred steps, modulo 2^32 */
+    uint32_t latest;    /* index of the results in effect */
+    deferred_results_t results[2];
+} deferred_response_t;
+
+static inline bool deferred_pending(const deferred_request_t *request, const deferred_response_t *response) {
+    return request->requests != response->completed;
+}
+
+/* Results in effect. [interrupt, or background in a critical section] */
+static inline const deferred_results_t *deferred_results(const deferred_request_t *request,
+                                                         const deferred_response_t *response) {
+    const deferred_results_t *results = &response->results[response->latest];
+    return results->generation == request->generation ? results : &request->initial;
+}
+
+/* Requests a step with the input, which has been written while none was pending. [interrupt] */
+static inline void deferred_request(deferred_request_t *request) {
+    request->requests++;
+    request->skipped = 0;
+}
+
+/* Counts a period in which a step is still pending. [interrupt] */
+static inline void deferred_skip(deferred_request_t *request) {
+    request->skipped++;
+    request->skipped_total++;
+}
+
+/* Buffer for the results of the pending step. [deferred] */
+static inline deferred_results_t *deferred_buffer(deferred_response_t *response) {
+    return &response->results[response->latest ^ 1u];
+}
+
+/* Puts the buffer into effect and ends the step. The order of the stores matters. [deferred] */
+static inline void deferred_complete(const deferred_request_t *request, deferred_response_t *response) {
+    __atomic_signal_fence(__ATOMIC_RELEASE);
+    *(volatile uint32_t *)&response->latest = response->latest ^ 1u;
+    __atomic_signal_fence(__ATOMIC_RELEASE);
+    *(volatile uint32_t *)&response->completed = request->requests;
+}
+
+#endif

@@ -1,0 +1,279 @@
+// The deferred step: hand-over of the input, late and skipped steps, resets while a step is pending, starvation.
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "drive/configure.h"
+#include "drive/deferred.h"
+#include "drive/fault.h"
+}
+
+#include "support/fixed_point.h"
+
+namespace {
+
+constexpr double RATE_HZ = 40000.0;
+constexpr unsigned ENCODER_BITS = 17;
+constexpr int32_t COUNT = 1 << (32 - ENCODER_BITS);
+
+// A drive on a rotor whose speed the test prescribes. The test decides when the deferred step is made.
+class Deferred : public testing::Test {
+  protected:
+    Deferred() {
+        parameters_t p;
+        parameters_init(&p);
+        p.values[PARAMETER_CONTROLLER] = DRIVE_CONTROLLER_SALIENT;
+        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, 12);
+        control_reset(&parameters, &state);
+        sample.adc.bus_voltage_counts = 240 * 8;
+    }
+
+    // The control interrupt of one period.
+    bool interrupt(command_request_t request, double reference_rpm = 600.0) {
+        sample.time_us += 25;
+        command.request = request;
+        command.speed_reference_q22 = fixed_point::to_fixed(fixed_point::rad_s(reference_rpm), fixed_point::Q22);
+        command.time_us = sample.time_us;
+        turns += speed_rad_s / (2.0 * fixed_point::PI * RATE_HZ);
+        sample.encoder.counts = uint32_t(int64_t(std::floor((turns - std::floor(turns)) * (1 << ENCODER_BITS))));
+        return control_step(&parameters, &state, &sample, &command, &compare);
+    }
+
+    // A period with a deferred step in time.
+    bool period(command_request_t request, double reference_rpm = 600.0) {
+        const bool run = interrupt(request, reference_rpm);
+        EXPECT_TRUE(deferred_step(&parameters, &state));
+        return run;
+    }
+
+    void start() {
+        for (int k = 0; k < 41; k++) {
+            period(COMMAND_OFF);
+        }
+        ASSERT_TRUE(period(COMMAND_RUN));
+    }
+
+    const deferred_results_t &results() const {
+        return *deferred_results(&state.deferred_request, &state.deferred.response);
+    }
+    bool pending() const { return deferred_pending(&state.deferred_request, &state.deferred.response); }
+    bool advanced() const { return results().window.turn_on != parameters.predictive.base_window.turn_on; }
+
+    control_parameters_t parameters;
+    control_state_t state;
+    control_sample_t sample{};
+    command_t command{};
+    hal_pwm_compare_t compare{};
+    double turns = 0.1, speed_rad_s = 0.0;
+};
+
+TEST_F(Deferred, every_control_interrupt_requests_one_step) {
+    for (int k = 0; k < 100; k++) {
+        interrupt(COMMAND_OFF);
+        ASSERT_TRUE(pending());
+        EXPECT_TRUE(deferred_step(&parameters, &state));
+        EXPECT_FALSE(pending());
+        EXPECT_FALSE(deferred_step(&parameters, &state)) << "nothing is pending";
+    }
+    EXPECT_EQ(state.deferred_request.requests, 100u);
+    EXPECT_EQ(state.deferred_request.skipped_total, 0u);
+}
+
+TEST_F(Deferred, a_pending_step_keeps_its_input_and_the_next_input_counts_the_skipped_periods) {
+    start();
+    interrupt(COMMAND_RUN);
+    deferred_input_t before;
+    std::memcpy(&before, &state.deferred_request.input, sizeof before);
+    for (uint32_t skipped = 1; skipped <= 5; skipped++) {
+        turns += 0.0001;
+        ASSERT_TRUE(interrupt(COMMAND_RUN));
+        EXPECT_EQ(std::memcmp(&before, &state.deferred_request.input, sizeof before), 0);
+        EXPECT_EQ(state.deferred_request.skipped, skipped);
+    }
+    EXPECT_TRUE(deferred_step(&parameters, &state));
+    interrupt(COMMAND_RUN);
+    EXPECT_EQ(state.deferred_request.input.periods, 6u);
+    EXPECT_EQ(state.deferred_request.input.encoder_angle, sample.encoder.counts << 15);
+    EXPECT_EQ(state.deferred_request.skipped, 0u);
+    EXPECT_EQ(state.deferred_request.skipped_total, 5u);
+    EXPECT_TRUE(deferred_step(&parameters, &state));
+    interrupt(COMMAND_RUN);
+    EXPECT_EQ(state.deferred_request.input.periods, 1u);
+}
+
+TEST_F(Deferred, results_take_effect_together_at_the_end_of_the_step) {
+    start();
+    for (int k = 0; k < 400; k++) {
+        period(COMMAND_RUN, 3000.0); // a torque shortfall: the windows move in every step
+    }
+    interrupt(COMMAND_RUN, 3000.0);
+    deferred_results_t before;
+    std::memcpy(&before, &results(), sizeof before);
+    deferred_compute(&parameters, &state);
+    EXPECT_EQ(std::memcmp(&before, &results(), sizeof before), 0) << "while the step computes";
+    ASSERT_TRUE(interrupt(COMMAND_RUN, 3000.0)) << "pre-empts it";
+    EXPECT_EQ(std::memcmp(&before, &results(), sizeof before), 0);
+    deferred_complete(&state.deferred_request, &state.deferred.response);
+    EXPECT_NE(before.window.turn_on, results().window.turn_on);
+    EXPECT_NE(before.window.reciprocal, results().window.reciprocal);
+}
+
+TEST_F(Deferred, checks_act_one_period_later_or_when_the_late_step_ends) {
+    for (const int late : {0, 1, 4}) {
+        control_reset(&parameters, &state);
+        sample.adc.bus_voltage_counts = 240 * 8;
+        start();
+        sample.adc.bus_voltage_counts = 149 * 8;
+        EXPECT_TRUE(interrupt(COMMAND_RUN));
+        for (int k = 0; k < late; k++) {
+            EXPECT_TRUE(interrupt(COMMAND_RUN));
+        }
+        EXPECT_TRUE(deferred_step(&parameters, &state));
+        EXPECT_FALSE(interrupt(COMMAND_RUN));
+        EXPECT_EQ(state.state_machine.record.fault, FAULT_UNDER_VOLTAGE);
+        deferred_step(&parameters, &state);
+    }
+}
+
+TEST_F(Deferred, a_step_that_is_late_for_eight_periods_is_an_overrun) {
+    start();
+    interrupt(COMMAND_RUN);
+    for (int k = 0; k < PROTECTION_SKIPPED_DEFERRED_MAX; k++) {
+        ASSERT_TRUE(interrupt(COMMAND_RUN)) << k;
+    }
+    EXPECT_FALSE(interrupt(COMMAND_RUN));
+    EXPECT_EQ(state.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+    EXPECT_EQ(state.state_machine.record.fault_mask, FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
+    for (int k = 0; k < 20; k++) {
+        interrupt(COMMAND_CLEAR_FAULT);
+        interrupt(COMMAND_OFF);
+        EXPECT_EQ(state.state_machine.state, DRIVE_STATE_FAULT) << "no clearing while its cause lasts";
+    }
+    deferred_step(&parameters, &state);
+    period(COMMAND_OFF);
+    period(COMMAND_CLEAR_FAULT);
+    EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+}
+
+TEST_F(Deferred, steps_that_are_late_by_up_to_seven_periods_are_no_fault) {
+    start();
+    for (int k = 0; k < 1000; k++) {
+        ASSERT_TRUE(interrupt(COMMAND_RUN)) << k;
+        if (k % 8 == 7) {
+            deferred_step(&parameters, &state);
+        }
+    }
+    EXPECT_GT(state.deferred_request.skipped_total, 800u);
+}
+
+TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_windows_at_the_end_of_a_run) {
+    start();
+    for (int k = 0; k < 400; k++) {
+        period(COMMAND_RUN, 3000.0);
+    }
+    ASSERT_TRUE(advanced());
+    interrupt(COMMAND_RUN, 3000.0); // this step will be late
+    EXPECT_FALSE(interrupt(COMMAND_OFF));
+    EXPECT_FALSE(advanced()) << "in effect without a step";
+    EXPECT_TRUE(deferred_step(&parameters, &state)) << "computed with the windows of the run";
+    EXPECT_FALSE(advanced());
+    EXPECT_GT(state.deferred.advance_q30, 0);
+    EXPECT_TRUE(interrupt(COMMAND_RUN, 0.0)) << "the next run, without a period between";
+    EXPECT_FALSE(advanced());
+    EXPECT_TRUE(deferred_step(&parameters, &state));
+    EXPECT_EQ(state.deferred.advance_q30, 0) << "the windows start again";
+    EXPECT_FALSE(advanced());
+}
+
+TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_observer) {
+    start();
+    state.deferred.bandwidth.mean_innovation_q32 = int64_t(3 * COUNT) << 32;
+    period(COMMAND_RUN);
+    ASSERT_GT(results().bandwidth.threshold_mean, 11u * COUNT);
+    sample.adc.phase_current_counts[0] = 4000;
+    EXPECT_FALSE(period(COMMAND_OFF));
+    sample.adc.phase_current_counts[0] = 0;
+    period(COMMAND_OFF);
+    ASSERT_GT(results().bandwidth.threshold_mean, 11u * COUNT) << "the end of a run does not reset it";
+    interrupt(COMMAND_OFF); // this step will be late
+    interrupt(COMMAND_CLEAR_FAULT);
+    ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(results().bandwidth.threshold_mean, 0u);
+    deferred_step(&parameters, &state);
+    EXPECT_EQ(results().bandwidth.threshold_mean, 0u) << "the late step is without effect";
+    period(COMMAND_OFF);
+    EXPECT_LT(results().bandwidth.threshold_mean, 4u * COUNT);
+    EXPECT_EQ(results().generation, state.deferred_request.generation);
+}
+
+TEST_F(Deferred, a_late_over_speed_check_of_the_time_before_a_reset_is_no_new_fault) {
+    start();
+    sample.adc.phase_current_counts[0] = 4000;
+    EXPECT_FALSE(period(COMMAND_OFF));
+    sample.adc.phase_current_counts[0] = 0;
+    speed_rad_s = 5.0; // a count or two a period: the encoder is not frozen
+    period(COMMAND_OFF);
+    state.observer.speed_q22 = 400 << 22; // of a faulty encoder
+    interrupt(COMMAND_OFF);               // this step will be late
+    ASSERT_GT(state.deferred_request.input.speed_q22, 380 << 22);
+    interrupt(COMMAND_CLEAR_FAULT);
+    ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+    deferred_step(&parameters, &state);
+    for (int k = 0; k < 10; k++) {
+        period(COMMAND_OFF);
+        EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY) << k;
+    }
+}
+
+TEST_F(Deferred, the_misalignment_survives_every_reset_and_a_late_step) {
+    start();
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        state.deferred.misalignment.phase[phase].offset = int32_t(1000 * (phase + 1));
+    }
+    const auto kept = [this] {
+        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+            EXPECT_EQ(results().misalignment[phase], int32_t(1000 * (phase + 1)));
+        }
+    };
+    period(COMMAND_RUN);
+    kept();
+    interrupt(COMMAND_RUN);
+    interrupt(COMMAND_OFF);
+    kept();
+    deferred_step(&parameters, &state);
+    kept();
+    period(COMMAND_OFF);
+    kept();
+    sample.adc.phase_current_counts[0] = 4000;
+    period(COMMAND_OFF);
+    sample.adc.phase_current_counts[0] = 0;
+    period(COMMAND_OFF);
+    interrupt(COMMAND_CLEAR_FAULT);
+    ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+    kept();
+    deferred_step(&parameters, &state);
+    kept();
+    control_prepare(&parameters, &state); // new parameters
+    kept();
+}
+
+TEST_F(Deferred, a_trigger_in_a_skipped_period_lengthens_the_holdoff) {
+    for (int k = 0; k < 4000; k++) {
+        period(COMMAND_OFF);
+    }
+    ASSERT_EQ(state.bandwidth.stage, OBSERVER_BANDWIDTH_STAGES - 1u);
+    interrupt(COMMAND_OFF);
+    turns += 4.0 / (1 << ENCODER_BITS);
+    interrupt(COMMAND_OFF); // skipped
+    ASSERT_LT(state.bandwidth.stage, OBSERVER_BANDWIDTH_STAGES - 1u);
+    EXPECT_EQ(results().bandwidth.holdoff_extension_ticks, 0u);
+    deferred_step(&parameters, &state);
+    EXPECT_EQ(results().bandwidth.holdoff_extension_ticks, 0u) << "the input is that of the period before";
+    period(COMMAND_OFF);
+    EXPECT_NEAR(results().bandwidth.holdoff_extension_ticks, RATE_HZ / 1000.0 / 4.0, 1.0);
+}
+
+} // namespace
