@@ -217,33 +217,34 @@ static inline bool plan_phase(const predictive_torque_parameters_t *parameters, 
     return plan_torque(tables, p, torque, parameters->current_limit_q9);
 }
 
-/* Duty of each phase from its planned flux linkage. */
-static inline void set_duties(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
-                              const predictive_torque_sample_t *sample, const machine_tables_t *tables,
-                              int32_t flux_step_max_q29, const plan_t *plan, int32_t duty_q15[HAL_PHASES_MAX]) {
-    /* Q15 quotient of two 32-bit numbers, normalised: divisor 2^14..2^15, dividend with 15 fraction bits more. */
+/* Voltage of a period as divisor of flux linkages in Wb, Q2.29: normalised for a quotient of 15 bits. */
+typedef struct {
+    int shift;       /* of the dividend, which has 15 fraction bits more then */
+    int32_t divisor; /* 2^14..2^15 */
+} duty_divisor_t;
+
+static inline duty_divisor_t duty_divisor(int32_t flux_step_max_q29) {
     const int shift = __builtin_clz((uint32_t)flux_step_max_q29) - 2;
-    const int32_t divisor = (flux_step_max_q29 << shift) >> 15;
-    for (unsigned phase = 0; phase < tables->phases; phase++) {
-        const plan_t *p = &plan[phase];
-        int32_t duty = -ONE_Q15; /* target 0: both switches off */
-        int32_t position_q13 = 0;
-        if (p->flux > 0) {
-            position_q13 = p->column * (1 << 13) + p->v_q13 + PHASE_CELL_HALF_Q13;
-            /* Within +-flux_step_max and the truncation to the unit of the tables. */
-            const int32_t flux_step_q29 = p->flux * (1 << tables->flux_format.result_shift) - p->freewheeling_q29;
-            duty = fixed_saturate_bits(flux_step_q29 * (1 << shift) / divisor, DUTY_BITS);
-            if (sample->current_q9[phase] > parameters->current_limit_q9 && duty > 0) {
-                duty = 0; /* no positive voltage */
-            }
-        }
-        duty_q15[phase] = duty;
-        control->duty_q15[phase] = duty;
-        /* The column of the next plan, where current rises or falls as from the last plan to this one. */
-        control->column[phase] = (uint8_t)fixed_clamp((2 * position_q13 - control->position_q13[phase]) >> 13, 0,
-                                                      PHASE_CELL_COLUMN_MAX);
-        control->position_q13[phase] = position_q13;
+    return (duty_divisor_t){shift, (flux_step_max_q29 << shift) >> 15};
+}
+
+/* Duty of a phase for its planned flux linkage, Q1.15. */
+static inline int32_t duty_of(const plan_t *p, duty_divisor_t by, unsigned flux_shift, bool above_current_limit) {
+    if (p->flux <= 0) {
+        return -ONE_Q15; /* both switches off */
     }
+    /* Within +-flux_step_max and the truncation to the unit of the tables. */
+    const int32_t flux_step_q29 = p->flux * (1 << flux_shift) - p->freewheeling_q29;
+    const int32_t duty = fixed_saturate_bits(flux_step_q29 * (1 << by.shift) / by.divisor, DUTY_BITS);
+    return above_current_limit && duty > 0 ? 0 : duty; /* no positive voltage */
+}
+
+/* Column in which the next plan begins: the current changes as from the last plan to this one. */
+static inline void extrapolate_column(predictive_torque_t *control, unsigned phase, const plan_t *p) {
+    const int32_t position_q13 = p->flux > 0 ? p->column * (1 << 13) + p->v_q13 + PHASE_CELL_HALF_Q13 : 0;
+    control->column[phase] =
+        (uint8_t)fixed_clamp((2 * position_q13 - control->position_q13[phase]) >> 13, 0, PHASE_CELL_COLUMN_MAX);
+    control->position_q13[phase] = position_q13;
 }
 
 void predictive_torque_reset(predictive_torque_t *control) {
@@ -299,5 +300,11 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         const int32_t shortfall_q24 = phase_map_scale(&tables->torque_format, shortfall);
         control->torque_shortfall_q24 = fixed_abs(shortfall_q24) > SHORTFALL_TOLERANCE_Q24 ? shortfall_q24 : 0;
     }
-    set_duties(parameters, control, sample, tables, flux_step_max_q29, plan, duty_q15);
+    const duty_divisor_t by = duty_divisor(flux_step_max_q29);
+    for (unsigned phase = 0; phase < phases; phase++) {
+        const bool above_current_limit = sample->current_q9[phase] > parameters->current_limit_q9;
+        duty_q15[phase] = duty_of(&plan[phase], by, flux_shift, above_current_limit);
+        control->duty_q15[phase] = duty_q15[phase];
+        extrapolate_column(control, phase, &plan[phase]);
+    }
 }
