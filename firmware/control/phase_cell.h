@@ -17,6 +17,7 @@
 #ifndef CONTROL_PHASE_CELL_H
 #define CONTROL_PHASE_CELL_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "control/machine_tables.h"
@@ -43,6 +44,8 @@ typedef struct {
     phase_cell_curve_t flux;   /* over u */
     int32_t curvature;         /* c of the torque over v */
     int32_t column;
+    bool located; /* the cell is known */
+    bool negative; /* the phase is in the half of negative torque */
 } phase_cell_t;
 
 /* Quotient by a rise, Q2.13, saturated: of y - middle, which is saturated to 2^25 units, or of a curvature. A rise is
@@ -70,6 +73,7 @@ ALWAYS_INLINE void phase_cell_locate(const machine_tables_t *tables, uint32_t di
     const uint32_t low = phase_map_index(&lookup, (uint32_t)column);
     const uint32_t high = low + MACHINE_TO_NEXT_COLUMN;
     const int32_t low_q9 = column * (1 << MACHINE_COLUMN_BITS);
+    cell->located = true;
     cell->column = column;
     cell->torque =
         phase_cell_curve(phase_map_torque_value_q14(&lookup, low), phase_map_torque_value_q14(&lookup, high), low_q9);

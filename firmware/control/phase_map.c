@@ -15,16 +15,6 @@ int32_t phase_map_torque(const machine_tables_t *tables, uint32_t phase_angle, i
     return phase_map_mirrored(phase_angle) ? -torque : torque;
 }
 
-int32_t phase_map_torque_and_flux(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,
-                                  int32_t *flux) {
-    const phase_map_lookup_t lookup = phase_map_lookup(tables, phase_map_distance(phase_angle));
-    const uint32_t index = index_of(&lookup, current_q9);
-    const int32_t torque = torque_by_magnitude(&lookup, index, current_q9);
-    *flux = phase_map_between(phase_map_flux_value_q14(&lookup, index),
-                              phase_map_flux_value_q14(&lookup, index + MACHINE_TO_NEXT_COLUMN), current_q9);
-    return phase_map_mirrored(phase_angle) ? -torque : torque;
-}
-
 int32_t phase_map_torque_slope_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,
                                    uint32_t angle_step) {
     const machine_format_t *format = &tables->torque_format;

@@ -104,10 +104,6 @@ ALWAYS_INLINE int32_t phase_map_scale(const machine_format_t *format, int32_t re
  * by mirror symmetry. Current in A, Q7.9, 0..PHASE_MAP_CURRENT_MAX_Q9. */
 NOINLINE int32_t phase_map_torque(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9);
 
-/* The same, and the flux linkage in units of the tables, equal in both halves. */
-NOINLINE int32_t phase_map_torque_and_flux(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,
-                                           int32_t *flux);
-
 /* Slope of the torque at an angle, as the change over `angle_step` (2^-32 electrical rev, below 2^27): N m, Q7.24,
  * saturated. Current as above. */
 int32_t phase_map_torque_slope_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,

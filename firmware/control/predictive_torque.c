@@ -29,7 +29,7 @@
 
 /* Plan of a phase for the sample two periods ahead. Torque, by magnitude, and flux linkages in units of the tables. */
 typedef struct {
-    phase_cell_t *cell;       /* once `located` */
+    phase_cell_t *cell;
     int32_t column;           /* of the cell */
     int32_t v_q13;            /* of the planned point in the cell */
     int32_t flux;             /* planned */
@@ -41,7 +41,6 @@ typedef struct {
     uint32_t since_on;        /* angle past turn-on, 2^-32 electrical rev; from 2^31: before turn-on */
     int32_t limit;            /* -1: at flux_min, 1: at flux_max or at the current limit, 0: torque reached */
     bool positive;            /* the phase itself is in that half */
-    bool located;             /* the cell is known */
 } plan_t;
 
 /* Operating point within the cell, or at its end, for a torque within flux_min, flux_max and the current limit, by
@@ -79,7 +78,6 @@ static inline bool solve_in_cell(plan_t *p, int32_t torque, int32_t current_limi
 }
 
 static inline void locate_cell(const machine_tables_t *tables, plan_t *p) {
-    p->located = true;
     phase_cell_locate(tables, p->angle - HALF_REV, p->column, p->cell);
 }
 
@@ -109,7 +107,7 @@ static inline int32_t expected_column(const plan_t *p, int32_t torque, int32_t c
 
 /* Plans a phase again, in another cell if that is where the point is expected. */
 static inline void replan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
-    if (!p->located) {
+    if (!p->cell->located) {
         locate_cell(tables, p);
     }
     const int32_t column = expected_column(p, torque, current_limit_q9);
@@ -275,7 +273,8 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     };
 
     plan_t plan[HAL_PHASES_MAX];
-    phase_cell_t cells[HAL_PHASES_MAX];
+    phase_cell_t *cells = control->cell[control->turn]; /* those of this sample have served */
+    control->turn ^= 1;
     int32_t shortfall = torque_q24 >> torque_shift;
     bool reached = true;
     for (unsigned phase = 0; phase < phases; phase++) {
@@ -286,8 +285,9 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         p->angle = p->positive ? angle : ~angle; /* mirrored, to 1 LSB */
         p->column = control->column[phase];
         p->v_q13 = 0;
-        p->located = false;
         p->cell = &cells[phase];
+        p->cell->located = false;
+        p->cell->negative = !p->positive;
         reached &= plan_phase(parameters, tables, &half[p->positive], p, flux_step_max_q29 >> flux_shift,
                               sample->angle_step);
         shortfall = p->positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);

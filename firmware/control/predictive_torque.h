@@ -36,6 +36,7 @@
 
 #include "control/flux_observer.h"
 #include "control/machine_tables.h"
+#include "control/phase_cell.h"
 #include "control/torque_sharing.h"
 #include "hal.h"
 
@@ -56,6 +57,8 @@ typedef struct {
     int32_t torque_shortfall_q24;     /* reference less planned torque, N m, Q7.24; 0 within 1/64 N m */
     int32_t position_q13[HAL_PHASES_MAX]; /* of the planned operating point, in table columns, Q13; about 0..40 */
     uint8_t column[HAL_PHASES_MAX];       /* table column in which the next plan begins */
+    phase_cell_t cell[2][HAL_PHASES_MAX]; /* of the plans for this sample and for the next one, in turn */
+    unsigned turn;                        /* index of those for this sample */
 } predictive_torque_t;
 
 typedef struct {
@@ -77,6 +80,22 @@ void predictive_torque_reset(predictive_torque_t *control);
 torque_sharing_window_t predictive_torque_move_windows(const predictive_torque_parameters_t *parameters,
                                                        int32_t *advance_q30, int32_t torque_q24,
                                                        int32_t torque_shortfall_q24);
+
+/* Torque and flux linkage of a phase at a sample, in units of the tables, from its current in A, Q7.9, in the cell that
+ * was planned for this sample; 0 where the plan was no flux linkage. The planned angle is that which the load observer
+ * predicted two periods ago. */
+ALWAYS_INLINE int32_t predictive_torque_estimate(const predictive_torque_t *control, unsigned phase, int32_t current_q9,
+                                                 int32_t *flux) {
+    const phase_cell_t *cell = &control->cell[control->turn][phase];
+    if (!cell->located) {
+        *flux = 0;
+        return 0;
+    }
+    const int32_t u_q13 = phase_cell_u_q13(cell, current_q9);
+    *flux = phase_cell_curve_at(&cell->flux, u_q13);
+    const int32_t torque = phase_cell_curve_at(&cell->torque, u_q13);
+    return cell->negative ? -torque : torque;
+}
 
 /* One sample: duty of each phase, Q1.15, -32768..32768. All sums saturate; 32-bit products are rounded to nearest, the
  * error of the quotient is below 2^-14 of full duty. */

@@ -43,7 +43,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
                   const command_t *command, hal_pwm_compare_t *compare) {
     control_measurement_t *measured = &state->measurement;
     const deferred_results_t *deferred = deferred_results(&state->deferred_request, &state->deferred.response);
-    measure(parameters, &state->observer, deferred->misalignment, sample, measured);
+    measure(parameters, &state->observer, deferred->misalignment, &state->predictive, sample, measured);
     if (!state->started) {
         start(state, measured);
     }

@@ -32,14 +32,14 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
 }
 
 void measure(const control_parameters_t *parameters, const load_observer_t *observer,
-             const int32_t misalignment[HAL_PHASES_MAX], const control_sample_t *sample,
-             control_measurement_t *measured) {
+             const int32_t misalignment[HAL_PHASES_MAX], const predictive_torque_t *predictive,
+             const control_sample_t *sample, control_measurement_t *measured) {
     measure_angle(parameters, observer, &sample->encoder, measured);
     measured->dc_link_voltage_q6 = scale_counts(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
     commutation_find(&parameters->commutation, measured->angle, &measured->commutation);
     const machine_tables_t *tables = parameters->tables;
     const unsigned phases = tables->phases;
-    const bool with_flux = parameters->torque_law == TORQUE_LAW_PREDICTIVE;
+    const bool planned = parameters->torque_law == TORQUE_LAW_PREDICTIVE;
     int32_t current_max_q9 = 0;
     int32_t torque_sum = 0;
     for (unsigned phase = 0; phase < phases; phase++) {
@@ -47,9 +47,9 @@ void measure(const control_parameters_t *parameters, const load_observer_t *obse
         int32_t torque = 0;
         int32_t flux = 0;
         if (current_q9 > 0) { /* false for most phases at any time */
-            const uint32_t angle = measured_phase_angle(parameters, misalignment, measured, phase);
-            torque = with_flux ? phase_map_torque_and_flux(tables, angle, current_q9, &flux)
-                               : phase_map_torque(tables, angle, current_q9);
+            torque = planned ? predictive_torque_estimate(predictive, phase, current_q9, &flux)
+                             : phase_map_torque(tables, measured_phase_angle(parameters, misalignment, measured, phase),
+                                                current_q9);
             torque_sum = fixed_add(torque_sum, torque);
             current_max_q9 = current_q9 > current_max_q9 ? current_q9 : current_max_q9;
         }
