@@ -4,12 +4,9 @@ void state_machine_reset(state_machine_t *state_machine) {
     *state_machine = (state_machine_t){.state = DRIVE_STATE_INITIALISE};
 }
 
+/* fault_mask != 0. */
 static fault_t lowest_fault(uint64_t fault_mask) {
-    fault_t fault = FAULT_NONE;
-    while (fault < FAULT_COUNT && (fault_mask & FAULT_BIT(fault)) == 0) {
-        fault++;
-    }
-    return fault;
+    return (fault_t)__builtin_ctzll(fault_mask);
 }
 
 static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {
