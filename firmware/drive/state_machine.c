@@ -6,7 +6,8 @@ void state_machine_reset(state_machine_t *state_machine) {
 
 /* fault_mask != 0. */
 static fault_t lowest_fault(uint64_t fault_mask) {
-    return (fault_t)__builtin_ctzll(fault_mask);
+    const uint32_t low = (uint32_t)fault_mask;
+    return (fault_t)(low != 0 ? __builtin_ctz(low) : 32 + __builtin_ctz((uint32_t)(fault_mask >> 32)));
 }
 
 static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {
