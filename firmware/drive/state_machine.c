@@ -4,12 +4,10 @@ void state_machine_reset(state_machine_t *state_machine) {
     *state_machine = (state_machine_t){.state = DRIVE_STATE_INITIALISE};
 }
 
+/* fault_mask != 0. */
 static fault_t lowest_fault(uint64_t fault_mask) {
-    fault_t fault = FAULT_NONE;
-    while (fault < FAULT_COUNT && (fault_mask & FAULT_BIT(fault)) == 0) {
-        fault++;
-    }
-    return fault;
+    const uint32_t low = (uint32_t)fault_mask;
+    return (fault_t)(low != 0 ? __builtin_ctz(low) : 32 + __builtin_ctz((uint32_t)(fault_mask >> 32)));
 }
 
 static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {

@@ -7,7 +7,6 @@
 
 void torque_control_reset(const control_parameters_t *parameters, control_state_t *state) {
     ditc_hysteresis_reset(&state->hysteresis);
-    predictive_torque_reset(&state->predictive);
     bp_pid_clear_telemetry(&state->duty.pid);
     switch (parameters->torque_law) {
     case TORQUE_LAW_HYSTERESIS:
@@ -16,6 +15,7 @@ void torque_control_reset(const control_parameters_t *parameters, control_state_
         pwm_ditc_reset(&parameters->duty, &state->duty);
         break;
     case TORQUE_LAW_PREDICTIVE:
+        predictive_torque_reset(&state->predictive);
         torque_trim_reset(&parameters->trim, &state->trim, 0);
         break;
     }

@@ -99,7 +99,7 @@ def interrupts_in(log: Path) -> tuple[dict[str, list[int]], Counter[int]]:
     addresses: Counter[int] = Counter()
     with log.open(encoding="utf-8", errors="replace") as lines:
         for line in lines:
-            if line.startswith("Stopped execution") and active:  # the last line's instruction is pre-empted, not executed
+            if line.startswith("Stopped execution") and active:  # the instruction was pre-empted
                 active[-1] = (active[-1][0], active[-1][1] - 1)
             trace = re.match(r"Trace .*\[[0-9a-f]+/([0-9a-f]+)/.*\] ?(.*)", line)
             if not trace:

@@ -311,3 +311,33 @@ def test_deferred_interrupt_ends_within_the_period_and_its_time_is_reported(make
     assert processor(bench, "used_us") < reported["used_us"] <= reported["worst_us"]
     assert processor(bench, "worst_us") < reported["worst_us"] < 1.5 * PERIOD_US
     assert reported["skipped_periods"] <= 50
+
+
+def held(make_bench, held_us: float) -> Bench:
+    """A drive at rest whose control interrupt begins held_us after its trigger for 0.25 s."""
+    bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8)
+    bench.run_for(0.01)
+    bench.rig.interrupt_time_us = held_us
+    bench.run_for(0.25)
+    bench.rig.interrupt_time_us = 0
+    bench.run_for(0.15)
+    return bench
+
+
+def test_late_deferred_interrupt_is_counted_and_one_that_does_not_end_is_a_fault(make_bench):
+    bench = held(make_bench, 10)
+    assert bench.telemetry["DRIVE_DEFERRED.skipped_periods"].last == 0
+    control_us = processor(bench, "worst_us") - 10
+    deferred_us = bench.telemetry["DRIVE_DEFERRED.worst_us"].last - processor(bench, "worst_us")
+    assert 0.5 < deferred_us < 3
+
+    # In each period it has two thirds of the time that it takes: two periods.
+    bench = held(make_bench, PERIOD_US - control_us - 0.67 * deferred_us)
+    assert (bench.drive.state, bench.drive.fault) == ("ready", "none")
+    assert bench.telemetry["DRIVE_DEFERRED.skipped_periods"].last == pytest.approx(5000, abs=20)
+    assert PERIOD_US < bench.telemetry["DRIVE_DEFERRED.worst_us"].last < 2 * PERIOD_US
+    assert processor(bench, "late_interrupts") == 0
+
+    bench = held(make_bench, PERIOD_US - control_us - 2 * COUNT_US)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "interrupt_overrun")
+    assert bench.telemetry["DRIVE_FAULT_CAUSE.state"].last_name == "ready"
