@@ -45,11 +45,10 @@ static int32_t product_q24(int32_t a_q24, int32_t b_q24) {
 }
 
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                       const machine_tables_t *tables, const load_observer_t *observer,
-                       const misalignment_sample_t *sample) {
+                       const machine_tables_t *tables, const misalignment_sample_t *sample) {
     const bool steady = sample->steady && fixed_abs(sample->torque_q24) > TORQUE_MIN_Q24;
     const int32_t disturbance_q24 = fixed_subtract(
-        observer->load_torque_q24, fixed_multiply(observer->speed_correction_q22, parameters->inertia_rate_q8, 6));
+        sample->load_torque_q24, fixed_multiply(sample->speed_correction_q22, parameters->inertia_rate_q8, 6));
     const bool settled = misalignment->steady_ticks >= parameters->settle_ticks;
     misalignment->steady_ticks = !steady ? 0 : settled ? misalignment->steady_ticks : misalignment->steady_ticks + 1;
     const bool learning = steady && settled;

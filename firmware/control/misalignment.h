@@ -25,7 +25,6 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "control/load_observer.h"
 #include "control/machine_tables.h"
 #include "hal.h"
 
@@ -58,6 +57,8 @@ typedef struct {
 typedef struct {
     const int32_t *current_q9; /* A, Q7.9, by phase */
     const uint32_t *angle;     /* corrected, 2^-32 electrical rev, by phase */
+    int32_t load_torque_q24;   /* load observer, N m, Q7.24 */
+    int32_t speed_correction_q22; /* load observer, rad/s, Q9.22 */
     int32_t torque_q24;        /* reference, N m, Q7.24 */
     bool steady;               /* speed and load are steady, the voltage is not limited */
 } misalignment_sample_t;
@@ -72,7 +73,6 @@ void misalignment_reset(misalignment_t *misalignment);
 /* One sample, after load_observer_step(); updates one phase. 64-bit products, rounded to nearest; sums saturate,
  * offsets are clamped to +-0.875 of 0.02 rad (1 degree). */
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                       const machine_tables_t *tables, const load_observer_t *observer,
-                       const misalignment_sample_t *sample);
+                       const machine_tables_t *tables, const misalignment_sample_t *sample);
 
 #endif

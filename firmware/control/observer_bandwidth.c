@@ -71,13 +71,8 @@ static uint32_t threshold_of_mean(const observer_bandwidth_statistics_t *statist
     return mean * MEAN_INNOVATION_FACTOR;
 }
 
-const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_parameters_t *parameters,
-                                                     observer_bandwidth_t *bandwidth,
-                                                     const observer_bandwidth_limits_t *limits, int32_t innovation,
-                                                     bool from_edge) {
-    if (!parameters->adaptive) {
-        return &parameters->gains[LAST_STAGE];
-    }
+static unsigned adaptive_stage(const observer_bandwidth_parameters_t *parameters, observer_bandwidth_t *bandwidth,
+                               const observer_bandwidth_limits_t *limits, int32_t innovation, bool from_edge) {
     if (bandwidth->ticks < UINT32_MAX) {
         bandwidth->ticks++;
     }
@@ -93,7 +88,17 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
         bandwidth->stage = from_edge ? 0 : parameters->trigger_stage_count;
         bandwidth->ticks = 0;
     }
-    return &parameters->gains[bandwidth->stage];
+    return bandwidth->stage;
+}
+
+const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_parameters_t *parameters,
+                                                     observer_bandwidth_t *bandwidth,
+                                                     const observer_bandwidth_limits_t *limits, int32_t innovation,
+                                                     bool from_edge) {
+    const unsigned stage = parameters->adaptive
+                               ? adaptive_stage(parameters, bandwidth, limits, innovation, from_edge)
+                               : LAST_STAGE;
+    return &parameters->gains[stage];
 }
 
 observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,

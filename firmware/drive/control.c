@@ -15,7 +15,6 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
 }
 
 void control_prepare(const control_parameters_t *parameters, control_state_t *state) {
-    speed_control_reset(state);
     torque_control_reset(parameters, state);
     deferred_reset_run(parameters, state);
 }
@@ -53,7 +52,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     const bool was_running = state->state_machine.state == DRIVE_STATE_RUN;
     const bool run = supervise(parameters, state, sample, command, measured, fault_mask);
     if (run) {
-        speed_control(parameters, state, sample, command);
+        speed_control(parameters, state, sample, command, deferred->speed_law_torque_q24);
         torque_control(parameters, state, deferred, measured);
         modulate(state->duty_q15, parameters->tables->phases, parameters->period_ticks, parameters->interleaved_pwm,
                  compare);

@@ -107,6 +107,7 @@ typedef struct {
     uint32_t generation; /* of the last input */
     protection_deferred_t protection;
     observer_bandwidth_statistics_t bandwidth;
+    speed_pi_t speed_pi;
     int32_t advance_q30;         /* of the conduction windows, Q1.30, 0..1 */
     misalignment_t misalignment; /* a property of the machine: survives the end of a run */
 } deferred_t;
@@ -121,7 +122,6 @@ typedef struct {
     state_machine_t state_machine;
     int32_t speed_reference_q22;  /* after the ramp; 0 outside RUN */
     int32_t torque_reference_q24; /* 0 outside RUN */
-    speed_pi_t speed_pi;
     int32_t duty_q15[HAL_PHASES_MAX]; /* of the last period in RUN, -32768..32768 */
     ditc_hysteresis_t hysteresis;
     pwm_ditc_t duty;

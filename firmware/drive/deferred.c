@@ -1,5 +1,7 @@
 #include "drive/deferred.h"
 
+#include <string.h>
+
 #include "fixed/fixed.h"
 
 #define RUN_MASK UINT32_C(0x0000FFFF)
@@ -17,11 +19,31 @@ void deferred_reset_run(const control_parameters_t *parameters, control_state_t 
     const uint32_t generation = state->deferred_request.generation;
     change_generation(state, (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK));
     state->deferred_request.initial.window = parameters->predictive.base_window;
+    state->deferred_request.initial.speed_law_torque_q24 = 0;
 }
 
 void deferred_reset_observer(control_state_t *state) {
     change_generation(state, state->deferred_request.generation + OBSERVER_STEP);
     state->deferred_request.initial.bandwidth = (observer_bandwidth_limits_t){0, 0};
+}
+
+static void hand_over_bandwidth(control_state_t *state, const control_measurement_t *measured,
+                                deferred_input_t *input) {
+    input->bandwidth.innovation = state->innovation;
+    input->bandwidth.from_edge = measured->angle_from_edge;
+    input->bandwidth.stage = state->bandwidth.stage;
+    input->bandwidth.trigger = state->bandwidth.trigger;
+    state->bandwidth.trigger = OBSERVER_TRIGGER_NONE;
+}
+
+static void hand_over_predictive(const control_state_t *state, const control_measurement_t *measured,
+                                 deferred_input_t *input) {
+    input->load_torque_q24 = state->observer.load_torque_q24;
+    input->speed_correction_q22 = state->observer.speed_correction_q22;
+    input->electrical = measured->commutation.electrical;
+    memcpy(input->current_q9, measured->current_q9, sizeof input->current_q9);
+    input->torque_reference_q24 = state->torque_reference_q24;
+    input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
 }
 
 void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
@@ -38,23 +60,13 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->dc_link_voltage_q6 = measured->dc_link_voltage_q6;
     input->command_age_us = sample->time_us - command->time_us;
     input->speed_q22 = state->observer.speed_q22;
+    input->run = state->state_machine.state == DRIVE_STATE_RUN;
+    input->speed_reference_q22 = state->speed_reference_q22;
     if (parameters->bandwidth.adaptive) {
-        input->bandwidth.innovation = state->innovation;
-        input->bandwidth.from_edge = measured->angle_from_edge;
-        input->bandwidth.stage = state->bandwidth.stage;
-        input->bandwidth.trigger = state->bandwidth.trigger;
-        state->bandwidth.trigger = OBSERVER_TRIGGER_NONE;
+        hand_over_bandwidth(state, measured, input);
     }
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
-        input->run = state->state_machine.state == DRIVE_STATE_RUN;
-        input->observer = state->observer;
-        input->electrical = measured->commutation.electrical;
-        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-            input->current_q9[phase] = measured->current_q9[phase];
-        }
-        input->speed_reference_q22 = state->speed_reference_q22;
-        input->torque_reference_q24 = state->torque_reference_q24;
-        input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
+        hand_over_predictive(state, measured, input);
     }
     deferred_request(request);
 }
@@ -64,6 +76,7 @@ static void follow_resets(deferred_t *deferred, const deferred_input_t *input) {
     const uint32_t changed = deferred->generation ^ input->generation;
     if ((changed & RUN_MASK) != 0) {
         deferred->advance_q30 = 0;
+        speed_pi_reset(&deferred->speed_pi);
     }
     if ((changed & OBSERVER_MASK) != 0) {
         deferred->bandwidth = (observer_bandwidth_statistics_t){0, 0};
@@ -95,16 +108,30 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
         angle[phase] = commutation_angle(&parameters->commutation, &commutation, phase) -
                        (uint32_t)deferred->misalignment.phase[phase].offset;
     }
-    const load_observer_t *observer = &input->observer;
-    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(input->speed_reference_q22, observer->speed_q22));
+    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(input->speed_reference_q22, input->speed_q22));
     const misalignment_sample_t sample = {
         .current_q9 = input->current_q9,
         .angle = angle,
+        .load_torque_q24 = input->load_torque_q24,
+        .speed_correction_q22 = input->speed_correction_q22,
         .torque_q24 = input->torque_reference_q24,
         .steady = observer_bandwidth_steady(&parameters->bandwidth, input->bandwidth.stage) &&
-                  speed_error_q22 < fixed_abs(observer->speed_q22) / 64 && input->torque_shortfall_q24 == 0,
+                  speed_error_q22 < fixed_abs(input->speed_q22) / 64 && input->torque_shortfall_q24 == 0,
     };
-    misalignment_step(&parameters->misalignment, &deferred->misalignment, parameters->tables, observer, &sample);
+    misalignment_step(&parameters->misalignment, &deferred->misalignment, parameters->tables, &sample);
+}
+
+/* Torque of the speed law; the feed-forward of load and friction is that of the control interrupt. */
+static int32_t speed_law_torque_q24(const control_parameters_t *parameters, deferred_t *deferred,
+                                    const deferred_input_t *input) {
+    const int32_t error_q22 = fixed_subtract(input->speed_reference_q22, input->speed_q22);
+    switch (parameters->speed_law) {
+    case SPEED_LAW_SMC:
+        return speed_smc_reaching_torque_q24(&parameters->speed_smc, error_q22);
+    case SPEED_LAW_PI:
+    default:
+        return speed_pi_step(&parameters->speed_pi, &deferred->speed_pi, error_q22);
+    }
 }
 
 void deferred_compute(const control_parameters_t *parameters, control_state_t *state) {
@@ -117,6 +144,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     if (parameters->bandwidth.adaptive) {
         results->bandwidth = observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, &input->bandwidth);
     }
+    results->speed_law_torque_q24 = input->run ? speed_law_torque_q24(parameters, deferred, input) : 0;
     results->window = parameters->predictive.base_window;
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run) {
         results->window = predictive_torque_move_windows(&parameters->predictive, &deferred->advance_q30,

@@ -33,12 +33,13 @@ typedef struct {
     int32_t speed_q22;          /* observer, for the coming sample, rad/s, Q9.22 */
     /* With an adaptive bandwidth only. */
     observer_bandwidth_sample_t bandwidth;
+    bool run;                    /* state RUN */
+    int32_t speed_reference_q22; /* rad/s, Q9.22 */
     /* With predictive torque control only. */
-    bool run;                 /* state RUN */
-    load_observer_t observer; /* estimate for the coming sample */
-    uint32_t electrical;      /* angle of phase 0, 2^-32 electrical rev */
+    int32_t load_torque_q24;      /* observer, N m, Q7.24 */
+    int32_t speed_correction_q22; /* observer, rad/s, Q9.22 */
+    uint32_t electrical;          /* angle of phase 0, 2^-32 electrical rev */
     int32_t current_q9[HAL_PHASES_MAX];
-    int32_t speed_reference_q22;
     int32_t torque_reference_q24;
     int32_t torque_shortfall_q24;
 } deferred_input_t;
@@ -47,6 +48,7 @@ typedef struct {
 typedef struct {
     uint32_t generation;                   /* of the input */
     uint64_t fault_mask;                   /* failed deferred checks, FAULT_BIT */
+    int32_t speed_law_torque_q24;          /* of the speed law, without feed-forward, N m, Q7.24 */
     observer_bandwidth_limits_t bandwidth; /* of the trigger */
     torque_sharing_window_t window;        /* of the motoring phases */
     int32_t misalignment[HAL_PHASES_MAX];  /* to subtract from the angle of each phase, 2^-32 electrical rev */

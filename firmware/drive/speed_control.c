@@ -2,10 +2,6 @@
 
 #include "fixed/fixed.h"
 
-void speed_control_reset(control_state_t *state) {
-    speed_pi_reset(&state->speed_pi);
-}
-
 static int32_t ramp_step(int32_t reference_q22, int32_t target_q22, int32_t step_max_q22) {
     const int32_t difference_q22 = fixed_subtract(target_q22, reference_q22);
     return fixed_add(reference_q22, fixed_clamp(difference_q22, -step_max_q22, step_max_q22));
@@ -24,20 +20,18 @@ static int32_t load_torque_q24(const control_parameters_t *parameters, const con
 }
 
 void speed_control(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
-                   const command_t *command) {
+                   const command_t *command, int32_t law_torque_q24) {
     const int32_t commanded_q22 = command->request == COMMAND_RUN ? command->speed_reference_q22 : 0;
     const int32_t target_q22 = fixed_clamp(commanded_q22, parameters->speed_reference_min_q22, INT32_MAX);
     const int32_t reference_q22 = ramp_step(state->speed_reference_q22, target_q22, parameters->speed_ramp_q22);
-    const int32_t speed_q22 = state->observer.speed_q22;
     state->speed_reference_q22 = reference_q22;
     switch (parameters->speed_law) {
     case SPEED_LAW_PI:
-        state->torque_reference_q24 =
-            speed_pi_step(&parameters->speed_pi, &state->speed_pi, fixed_subtract(reference_q22, speed_q22));
+        state->torque_reference_q24 = law_torque_q24;
         break;
     case SPEED_LAW_SMC:
-        state->torque_reference_q24 = speed_smc_step(&parameters->speed_smc, reference_q22, speed_q22,
-                                                     load_torque_q24(parameters, state, sample));
+        state->torque_reference_q24 = speed_smc_torque_q24(&parameters->speed_smc, law_torque_q24, state->observer.speed_q22,
+                                                           load_torque_q24(parameters, state, sample));
         break;
     }
 }
