@@ -55,12 +55,12 @@ typedef struct {
 } misalignment_t;
 
 typedef struct {
-    const int32_t *current_q9; /* A, Q7.9, by phase */
-    const uint32_t *angle;     /* corrected, 2^-32 electrical rev, by phase */
-    int32_t load_torque_q24;   /* load observer, N m, Q7.24 */
+    int32_t current_q9;           /* of the phase to update, A, Q7.9 */
+    uint32_t angle;               /* of that phase, corrected, 2^-32 electrical rev */
+    int32_t load_torque_q24;      /* load observer, N m, Q7.24 */
     int32_t speed_correction_q22; /* load observer, rad/s, Q9.22 */
-    int32_t torque_q24;        /* reference, N m, Q7.24 */
-    bool steady;               /* speed and load are steady, the voltage is not limited */
+    int32_t torque_q24;           /* reference, N m, Q7.24 */
+    bool steady;                  /* speed and load are steady, the voltage is not limited */
 } misalignment_sample_t;
 
 /* Learning rate in 1/s (0..100), steady bandwidth of the load observer in rad/s, inertia in kg m^2, Q1.30. */

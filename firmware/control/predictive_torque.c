@@ -280,7 +280,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
         predict_flux(parameters, control, sample, phase, flux_step_max_q29, flux_shift, p);
-        const uint32_t angle = sample->angle[phase];
+        const uint32_t angle = sample->angle - phase * parameters->sharing.stroke - (uint32_t)sample->misalignment[phase];
         p->positive = angle >= HALF_REV;
         p->angle = p->positive ? angle : ~angle; /* mirrored, to 1 LSB */
         p->column = control->column[phase];

@@ -65,7 +65,8 @@ typedef struct {
     const int32_t *current_q9;             /* A, Q7.9, by phase, at the sample */
     const int32_t *flux;                   /* from the tables, in their unit, by phase, at the sample */
     const torque_sharing_window_t *window; /* of the motoring phases, from predictive_torque_move_windows */
-    const uint32_t *angle;                 /* two periods after the sample, 2^-32 electrical rev, by phase */
+    uint32_t angle;                        /* of phase 0 two periods after the sample, 2^-32 electrical rev */
+    const int32_t *misalignment;           /* to subtract from the angle of each phase, 2^-32 electrical rev */
     int32_t bus_voltage_q6;                /* DC-link voltage, V, Q9.6 */
     int32_t torque_q24;                    /* reference, N m, Q7.24 */
     bool reverse;                          /* negative direction of rotation */

@@ -1,7 +1,5 @@
 #include "drive/deferred.h"
 
-#include <string.h>
-
 #include "fixed/fixed.h"
 
 #define RUN_MASK UINT32_C(0x0000FFFF)
@@ -41,7 +39,7 @@ static void hand_over_predictive(const control_state_t *state, const control_mea
     input->load_torque_q24 = state->observer.load_torque_q24;
     input->speed_correction_q22 = state->observer.speed_correction_q22;
     input->electrical = measured->commutation.electrical;
-    memcpy(input->current_q9, measured->current_q9, sizeof input->current_q9);
+    input->current_q9 = measured->current_q9[state->deferred.misalignment.phase_index]; /* no step is pending */
     input->torque_reference_q24 = state->torque_reference_q24;
     input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
 }
@@ -103,15 +101,12 @@ static uint64_t protect(const control_parameters_t *parameters, deferred_t *defe
 static void learn_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                const deferred_input_t *input) {
     const commutation_t commutation = {.electrical = input->electrical};
-    uint32_t angle[HAL_PHASES_MAX];
-    for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
-        angle[phase] = commutation_angle(&parameters->commutation, &commutation, phase) -
-                       (uint32_t)deferred->misalignment.phase[phase].offset;
-    }
+    const unsigned phase = deferred->misalignment.phase_index;
     const int32_t speed_error_q22 = fixed_abs(fixed_subtract(input->speed_reference_q22, input->speed_q22));
     const misalignment_sample_t sample = {
         .current_q9 = input->current_q9,
-        .angle = angle,
+        .angle = commutation_angle(&parameters->commutation, &commutation, phase) -
+                 (uint32_t)deferred->misalignment.phase[phase].offset,
         .load_torque_q24 = input->load_torque_q24,
         .speed_correction_q22 = input->speed_correction_q22,
         .torque_q24 = input->torque_reference_q24,

@@ -39,7 +39,7 @@ typedef struct {
     int32_t load_torque_q24;      /* observer, N m, Q7.24 */
     int32_t speed_correction_q22; /* observer, rad/s, Q9.22 */
     uint32_t electrical;          /* angle of phase 0, 2^-32 electrical rev */
-    int32_t current_q9[HAL_PHASES_MAX];
+    int32_t current_q9;           /* of the phase to learn, misalignment_t.phase_index, A, Q7.9 */
     int32_t torque_reference_q24;
     int32_t torque_shortfall_q24;
 } deferred_input_t;

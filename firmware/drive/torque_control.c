@@ -51,18 +51,14 @@ static void predictive_control(const control_parameters_t *parameters, control_s
     /* The duties act from one to two periods after the sample: the observer has predicted the first period. */
     const int32_t step = fixed_multiply_high(observer->speed_q22, parameters->observer.angle_step_q32);
     const uint32_t angle_in_two_periods = (uint32_t)(observer->angle_q64 >> 32) + (uint32_t)step;
-    const uint32_t advance = (angle_in_two_periods - measured->angle) * rotor_poles;
-    uint32_t phase_angle_ahead[HAL_PHASES_MAX];
-    for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
-        phase_angle_ahead[phase] = measured_phase_angle(parameters, deferred->misalignment, measured, phase) + advance;
-    }
     const int32_t trimmed_q24 = torque_trim_step(&parameters->trim, &state->trim, state->torque_reference_q24,
                                                  measured->torque_sum_q24, voltage_limited);
     const predictive_torque_sample_t sample = {
         .current_q9 = measured->current_q9,
         .flux = measured->flux_linkage,
         .window = &deferred->window,
-        .angle = phase_angle_ahead,
+        .angle = angle_in_two_periods * rotor_poles,
+        .misalignment = deferred->misalignment,
         .bus_voltage_q6 = measured->dc_link_voltage_q6,
         .torque_q24 = trimmed_q24,
         .reverse = observer->speed_q22 < 0,
