@@ -1,0 +1,470 @@
+"""Computed bound of an interrupt: the largest number of instructions on any path through its machine code.
+
+Implicit path enumeration (Y.-T. S. Li, S. Malik, "Performance analysis of embedded software using implicit path
+enumeration", DAC 1995): the executions of each edge of the control-flow graph are unknowns of an integer program, with
+the flow through each block, the bounds of loops and the facts of bound_facts.py as constraints and the number of
+instructions as the objective. Every call has its own copy of the callee's graph. Instructions are counted as by
+emulator/qemu/instructions.c, from the first one of the handler to its return; those that an IT block skips count.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import coo_array
+
+from salient.elf import ElfImage, Instruction, SourceLocation
+from salient.errors import UsageError
+from salient.paths import ROOT
+from salient.target.bound_facts import Facts, LoopFact, Names
+from salient.target.control_flow import Block, ControlFlow, Loop, loops, place
+
+CONTROL = "control_handler"
+"""Symbol of the control interrupt's handler; NAME_return is the label of the code after its call."""
+
+_Node = tuple[int, int]
+"""Number of a copy of a function, address of a block."""
+_Edge = tuple[_Node | None, _Node | None]
+"""None: the start or the end of the interrupt."""
+_Row = dict[int, float]
+"""Coefficients by column."""
+
+_COUNTED_FOR = re.compile(r"\bfor \(\w[\w ]* (\w+) = 0; \1 < (?:\w+(?:->|\.))*(\w+); (?:\1\+\+|\+\+\1)\)")
+
+
+@dataclass
+class _Copy:
+    """A function for one call. site: None for the handler."""
+
+    entry: int
+    site: _Node | None
+    blocks: dict[int, Block]
+    size: int | None = None
+
+
+@dataclass(frozen=True)
+class LoopBound:
+    """A loop of a copy of a function. times: maximum executions of its first block per entry."""
+
+    copy: int
+    loop: Loop
+    times: int
+    line: str
+
+
+@dataclass
+class _Constraint:
+    """low <= coefficients of the edges <= high, in one interrupt. name: for messages."""
+
+    name: str
+    row: _Row
+    high: float
+    low: float = -np.inf
+
+
+@dataclass(frozen=True)
+class Bound:
+    """instructions: of the longest path. executed: executions of each instruction on it, by address. entries: for each
+    loop with its source line, executions of its first block per entry on the path and at most."""
+
+    instructions: int
+    executed: Counter[int]
+    model: Model = field(repr=False)
+
+    def by_function(self) -> list[tuple[str, int, int]]:
+        """Function with inlined code attributed to the inlined function, instructions, executions of the most frequent
+        one; the largest first."""
+        counts: Counter[str] = Counter()
+        times: dict[str, int] = defaultdict(int)
+        for address, count in self.executed.items():
+            function = self.model.chain(address)[0].function
+            counts[function] += count
+            times[function] = max(times[function], count)
+        return [(function, count, times[function]) for function, count in counts.most_common() if count]
+
+    def by_line(self) -> list[tuple[str, int, int]]:
+        """As by_function, by source line."""
+        counts: Counter[str] = Counter()
+        times: dict[str, int] = defaultdict(int)
+        for address, count in self.executed.items():
+            here = self.model.chain(address)[0]
+            line = f"{here.file}:{here.line}"
+            counts[line] += count
+            times[line] = max(times[line], count)
+        return [(line, count, times[line]) for line, count in counts.most_common() if count]
+
+
+class Model:
+    """Integer program of an interrupt.
+
+    configuration: name for the facts that hold in some configurations only. UsageError for a loop without bound, and
+    for code of which the flow is unknown.
+    """
+
+    def __init__(self, image: ElfImage, facts: Facts, configuration: str, handler: str = CONTROL,
+                 root: Path = ROOT) -> None:
+        self.image = image
+        self._facts = facts
+        self._configuration = configuration
+        self._root = root
+        self._names = Names(image, root)
+        self._code = ControlFlow(image)
+        symbols = image.symbols()
+        for symbol in (handler, f"{handler}_return"):
+            if symbol not in symbols:
+                raise UsageError(f"{image.path.name}: no symbol {symbol}")
+        self._copies: list[_Copy] = []
+        self._expand(symbols[handler], None, ())
+        if symbols[f"{handler}_return"] & ~1 not in {
+                one.address for block in self._copies[0].blocks.values() for one in block.instructions}:
+            raise UsageError(f"{handler} does not reach {handler}_return")
+        self._edges: dict[_Edge, int] = {}
+        self._into: defaultdict[_Node, list[int]] = defaultdict(list)
+        self._out_of: defaultdict[_Node, list[int]] = defaultdict(list)
+        self._connect()
+        self.loop_bounds: list[LoopBound] = []
+        self._constraints = self._flow()
+        self._bound_loops()
+        self._columns = len(self._edges)
+        self._integral = [True] * self._columns
+        self._apply_facts()
+
+    # --- graph ------------------------------------------------------------------------------------------------------
+
+    def _expand(self, entry: int, site: _Node | None, above: tuple[int, ...]) -> None:
+        if entry in above:
+            raise UsageError(f"recursion: {self._code.instruction(entry).function}")
+        blocks = _returning(self._code.function(entry), root=not above)
+        number = len(self._copies)
+        size = self._constant_size(site) if site else None
+        self._copies.append(_Copy(entry, site, blocks, size))
+        for address, block in blocks.items():
+            if block.call is not None:
+                self._expand(block.call, (number, address), (*above, entry))
+
+    def _connect(self) -> None:
+        """Edges, with the calls: from the calling block to the callee, and from its returns to the next block."""
+        self._edge(None, (0, self._copies[0].entry))
+        for number, copy in enumerate(self._copies):
+            back = None
+            if copy.site:
+                caller, at = copy.site
+                self._edge(copy.site, (number, copy.entry))
+                back = (caller, self._copies[caller].blocks[at].successors[0])
+            for address, block in copy.blocks.items():
+                if block.returns:
+                    self._edge((number, address), back)
+                if block.call is None:
+                    for successor in block.successors:
+                        if successor in copy.blocks:
+                            self._edge((number, address), (number, successor))
+
+    def _edge(self, begin: _Node | None, end: _Node | None) -> None:
+        column = self._edges.setdefault((begin, end), len(self._edges))
+        if begin is not None:
+            self._out_of[begin].append(column)
+        if end is not None:
+            self._into[end].append(column)
+
+    def _flow(self) -> list[_Constraint]:
+        rows = [_Constraint("start", {0: 1.0}, 1.0, 1.0)]
+        for node in self._nodes():
+            row: defaultdict[int, float] = defaultdict(float)
+            for column in self._into[node]:
+                row[column] += 1.0
+            for column in self._out_of[node]:
+                row[column] -= 1.0
+            rows.append(_Constraint("flow", {column: value for column, value in row.items() if value}, 0.0, 0.0))
+        return rows
+
+    def _nodes(self) -> Iterable[_Node]:
+        for number, copy in enumerate(self._copies):
+            for address in copy.blocks:
+                yield number, address
+
+    def _block(self, node: _Node) -> Block:
+        return self._copies[node[0]].blocks[node[1]]
+
+    @cached_property
+    def _chains(self) -> dict[int, list[SourceLocation]]:
+        addresses = {one.address for node in self._nodes() for one in self._block(node).instructions}
+        return self.image.locations(sorted(addresses))
+
+    def chain(self, address: int) -> list[SourceLocation]:
+        """The location in which an instruction is written, then those into which it is inlined; the function of the
+        linker's symbol where the image has no locations."""
+        found = self._chains[address]
+        if found and found[0].function != "??":
+            return found
+        return [SourceLocation(self._code.instruction(address).function, "?", 0)]
+
+    # --- loops ------------------------------------------------------------------------------------------------------
+
+    def _bound_loops(self) -> None:
+        by_entry: dict[int, list[Loop]] = {}
+        for number, copy in enumerate(self._copies):
+            if copy.entry not in by_entry:
+                outer = loops(copy.entry, copy.blocks)
+                by_entry[copy.entry] = [loop for one in outer for loop in one.nest()]
+            for loop in by_entry[copy.entry]:
+                times, line = self._times(copy, loop, by_entry[copy.entry])
+                self.loop_bounds.append(LoopBound(number, loop, times, line))
+                row: defaultdict[int, float] = defaultdict(float)
+                for column in self._columns_of(number, loop.repeats):
+                    row[column] += 1.0
+                for column in self._columns_of(number, loop.entries):
+                    row[column] -= times - 1.0
+                self._constraints.append(_Constraint(f"loop at {line}", dict(row), 0.0))
+
+    def _columns_of(self, copy: int, edges: Iterable[tuple[int, int]]) -> list[int]:
+        """Columns of edges within a copy; an edge after a call is counted at the call."""
+        columns: list[int] = []
+        for begin, end in edges:
+            if self._copies[copy].blocks[begin].call is None:
+                columns.append(self._edges[(copy, begin), (copy, end)])
+            else:
+                columns += self._into[copy, begin]
+        return columns
+
+    def _times(self, copy: _Copy, loop: Loop, of_function: list[Loop]) -> tuple[int, str]:
+        """Executions of the loop's first block per entry, and its source line."""
+        function = self._code.instruction(copy.entry).function
+        for library in self._facts.library:
+            if library.function == function:
+                return self._library_times(copy, loop, of_function, library.tests, function)
+        closing, others = self._lines(copy, loop)
+        inner = {line for one in loop.inner for line in self._lines(copy, one)[0]}
+        found = [(times, line) for lines in (closing, [line for line in others if line not in inner]) for line in lines
+                 if (times := self._source_times(line, loop)) is not None]
+        for chosen in ([one for one in found if one[1] in closing], found):
+            if chosen:
+                times, line = max(chosen)
+                return times, f"{line[0]}:{line[1]}"
+        where = ", ".join(f"{file}:{number}" for file, number in (closing or others)[:3]) or f"{loop.header:#x}"
+        raise UsageError(f"{self.image.path.name}: {function}: the loop at {where} has no bound: state one in"
+                         " tests/target/bounds.toml")
+
+    def _lines(self, copy: _Copy, loop: Loop) -> tuple[list[tuple[str, int]], list[tuple[str, int]]]:
+        """Source lines of the closing branches of a loop, and of its other instructions outside of inner loops, in the
+        function in which the loop is written: the innermost one, inlined or not, that has all of them."""
+        closing = [copy.blocks[begin].instructions[-1] for begin, _ in loop.repeats]
+        others = [one for address in sorted(loop.own) for one in copy.blocks[address].instructions]
+        stacks = [list(reversed(self.chain(one.address))) for one in (*closing, *others)]
+        depth = 0
+        while all(len(stack) > depth + 1 and stack[depth] == stacks[0][depth]
+                  and stack[depth + 1].function == stacks[0][depth + 1].function for stack in stacks):
+            depth += 1
+        lines = [(stack[depth].file, stack[depth].line) for stack in stacks]
+        return _numbered(lines[:len(closing)]), _numbered(lines[len(closing):])
+
+    def _source_times(self, line: tuple[str, int], loop: Loop) -> int | None:
+        """Bound by a fact about the source line, or by the line itself if it is a counted `for`."""
+        text = self._source_line(*line)
+        fact = next((one for one in self._facts.loop if one.file == line[0] and one.statement in text), None)
+        if fact is not None and fact.tests is not None:
+            return self._names.value(fact.tests)
+        iterations = fact.iterations if fact is not None else None
+        counted = _COUNTED_FOR.search(text)
+        if iterations is None and counted and (counted[2].isdigit() or self._names.known(counted[2])):
+            iterations = counted[2]
+        if iterations is None:
+            return None
+        return self._names.value(iterations) + (0 if loop.bottom_tested else 1)
+
+    def _source_line(self, file: str, line: int) -> str:
+        path = self._root / file
+        if file not in _sources:
+            _sources[file] = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+        lines = _sources[file]
+        return lines[line - 1] if 0 < line <= len(lines) else ""
+
+    def _library_times(self, copy: _Copy, loop: Loop, of_function: list[Loop], tests: list[str],
+                       function: str) -> tuple[int, str]:
+        if len(tests) != len(of_function):
+            raise UsageError(f"tests/target/bounds.toml: {function} has {len(of_function)} loops, not {len(tests)}")
+        ordered = sorted(of_function, key=lambda one: one.header)
+        if copy.size is None:
+            raise UsageError(f"{function}: {self._describe_site(copy)}: its size is no constant")
+        return max(0, self._names.value(tests[ordered.index(loop)], size=copy.size)), function
+
+    def _describe_site(self, copy: _Copy) -> str:
+        return place(self._block(copy.site).instructions[-1]) if copy.site else ""
+
+    def _constant_size(self, site: _Node) -> int | None:
+        """Constant third argument of the call at the end of a block."""
+        register = "a2" if self.image.is_riscv else "r2"
+        for one in reversed(self._block(site).instructions[:-1]):
+            words = re.split(r"[,\s]+", one.operands.partition("@")[0].strip())
+            if words[0] == register:
+                constant = one.mnemonic.partition(".")[0] in ("mov", "movs", "movw", "li") and len(words) == 2
+                return int(words[1].removeprefix("#"), 0) if constant and not words[1][0].isalpha() else None
+        return None
+
+    # --- facts ------------------------------------------------------------------------------------------------------
+
+    def _apply_facts(self) -> None:
+        for never in self._facts.never:
+            if self._configuration in never.configurations:
+                for function in never.functions:
+                    for nodes in self._copies_of(function).values():
+                        for node in nodes:
+                            self._constraints.append(_Constraint(f"never {function}", self._count(node), 0.0))
+        for most in self._facts.at_most:
+            if most.configurations is None or self._configuration in most.configurations:
+                executions = self._executions(most.function)
+                if executions:
+                    self._constraints.append(_Constraint(f"at most {most.times} times {most.function}",
+                                                         dict.fromkeys(executions, 1.0), self._names.value(most.times)))
+        for exclusive in self._facts.exclusive:
+            if exclusive.configurations is None or self._configuration in exclusive.configurations:
+                name = f"exclusive {', '.join(exclusive.functions)}"
+                switches: _Row = {}
+                for function in exclusive.functions:
+                    switch = self._column(integral=True)
+                    switches[switch] = 1.0
+                    for nodes in self._copies_of(function).values():
+                        for node in nodes:
+                            self._constraints.append(
+                                _Constraint(name, {**self._count(node), switch: -self._most(node)}, 0.0))
+                self._constraints.append(_Constraint(name, switches, 1.0))
+
+    def _column(self, integral: bool) -> int:
+        self._integral.append(integral)
+        self._columns += 1
+        return self._columns - 1
+
+    def _count(self, node: _Node) -> _Row:
+        """Executions of a block."""
+        return dict.fromkeys(self._into[node], 1.0)
+
+    def _copies_of(self, function: str) -> dict[object, list[_Node]]:
+        """Blocks of which all instructions belong to a function or to what is inlined into it, by call of the
+        function. A block that the compiler has mixed with others may be executed without the function."""
+        found: defaultdict[object, list[_Node]] = defaultdict(list)
+        for node in self._nodes():
+            keys = set()
+            for one in self._block(node).instructions:
+                chain = self.chain(one.address)
+                level = next((i for i, here in enumerate(chain) if here.function == function), None)
+                keys.add(None if level is None else tuple((here.function, here.line) for here in chain[level + 1:]))
+            if None not in keys:
+                found[node[0], min(keys)].append(node)
+        return found
+
+    def _executions(self, function: str) -> list[int]:
+        """One column for each call of a function, not below its number of executions: a block in a loop of the function
+        is executed as often as the loop permits in each of them."""
+        columns = []
+        for nodes in self._copies_of(function).values():
+            column = self._column(integral=False)
+            columns.append(column)
+            inside = set(nodes)
+            for node in nodes:
+                times = 1
+                for bound in self._around(node):
+                    if (bound.copy, bound.loop.header) in inside:
+                        times *= bound.times
+                self._constraints.append(
+                    _Constraint(f"executions of {function}", {**self._count(node), column: -times}, 0.0))
+        return columns
+
+    def _around(self, node: _Node) -> list[LoopBound]:
+        return [bound for bound in self.loop_bounds if bound.copy == node[0] and node[1] in bound.loop.blocks]
+
+    def _most(self, node: _Node) -> int:
+        """Upper limit of the executions of a block by the loops around it and around its callers."""
+        site = self._copies[node[0]].site
+        times = self._most(site) if site else 1
+        for bound in self._around(node):
+            times *= bound.times
+        return times
+
+    # --- solution ---------------------------------------------------------------------------------------------------
+
+    def solve(self) -> Bound:
+        """The longest path. UsageError when no path satisfies the facts."""
+        weights = np.zeros(self._columns)
+        for node in self._nodes():
+            weights[self._into[node]] -= len(self._block(node).instructions)
+        result = self._optimise(weights, self._constraints, integral=True)
+        if result is None:
+            raise UsageError(f"{self.image.path.name}, {self._configuration}: no path satisfies the facts")
+        executed: Counter[int] = Counter()
+        for node in self._nodes():
+            times = round(float(result[self._into[node]].sum()))
+            for one in self._block(node).instructions:
+                executed[one.address] += times
+        return Bound(executed.total(), executed, self)
+
+    def contradiction(self, executed: Mapping[int, int], interrupts: int = 1) -> str | None:
+        """Compares the model with executions of each instruction, by address, in a number of interrupts together: None
+        when paths of the model add up to them, else the part of the model that they violate. With one interrupt the
+        comparison is exact, with several it is that of their mean."""
+        known = {one.address for node in self._nodes() for one in self._block(node).instructions}
+        for address, times in executed.items():
+            if times and address not in known:
+                return f"{place(self._code.instruction(address))} was executed and is not in the graph"
+        observed, rows = [], defaultdict(list)
+        for node in self._nodes():
+            rows[node[1], self._block(node).instructions].append(node)
+        for (_, instructions), nodes in rows.items():
+            times = {executed.get(one.address, 0) for one in instructions}
+            row: defaultdict[int, float] = defaultdict(float)
+            for node in nodes:
+                for column in self._into[node]:
+                    row[column] += 1.0
+            if len(times) == 1:
+                observed.append(_Constraint("observed", dict(row), float(*times), float(*times)))
+        every = [_Constraint(one.name, one.row, one.high * interrupts, one.low * interrupts)
+                 for one in self._constraints] + observed
+        nothing = np.zeros(self._columns)
+        if self._optimise(nothing, every, integral=interrupts == 1) is not None:
+            return None
+        for name in dict.fromkeys(one.name for one in every if one.name not in ("start", "flow", "observed")):
+            without = [one for one in every if one.name != name]
+            if self._optimise(nothing, without, integral=interrupts == 1) is not None:
+                return name
+        return "the control flow"
+
+    def _optimise(self, weights: np.ndarray, constraints: list[_Constraint], integral: bool) -> np.ndarray | None:
+        entries = [(i, column, value) for i, one in enumerate(constraints) for column, value in one.row.items()]
+        rows, columns, values = zip(*entries, strict=True)
+        matrix = coo_array((values, (rows, columns)), shape=(len(constraints), self._columns)).tocsr()
+        limits = LinearConstraint(matrix, [one.low for one in constraints], [one.high for one in constraints])
+        result = milp(weights, constraints=limits, bounds=Bounds(0, np.inf),
+                      integrality=np.array(self._integral, dtype=int) if integral else None)
+        if result.status == 3:
+            raise UsageError(f"{self.image.path.name}: the number of instructions has no bound")
+        return result.x if result.success else None
+
+
+def _numbered(lines: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:
+    return list(dict.fromkeys(line for line in lines if line[1]))
+
+
+_sources: dict[str, list[str]] = {}
+
+
+def _returning(blocks: Mapping[int, Block], root: bool) -> dict[int, Block]:
+    """The blocks from which the function can return: an interrupt that does not return has no duration."""
+    before: defaultdict[int, list[int]] = defaultdict(list)
+    for address, block in blocks.items():
+        for successor in block.successors:
+            before[successor].append(address)
+    waiting = [address for address, block in blocks.items() if block.returns]
+    if root and not waiting:
+        raise UsageError("the handler does not return")
+    found = set(waiting)
+    while waiting:
+        for address in before[waiting.pop()]:
+            if address not in found:
+                found.add(address)
+                waiting.append(address)
+    return {address: block for address, block in blocks.items() if address in found}
