@@ -24,7 +24,7 @@ from salient.elf import ElfImage, Instruction, SourceLocation
 from salient.errors import UsageError
 from salient.paths import ROOT
 from salient.target.bound_facts import Facts, LoopFact, Names
-from salient.target.control_flow import Block, ControlFlow, Loop, loops, place
+from salient.target.control_flow import Block, ControlFlow, Loop, dominators, loops, place
 
 CONTROL = "control_handler"
 """Symbol of the control interrupt's handler; NAME_return is the label of the code after its call."""
@@ -121,6 +121,7 @@ class Model:
             if symbol not in symbols:
                 raise UsageError(f"{image.path.name}: no symbol {symbol}")
         self._copies: list[_Copy] = []
+        self._dominators: dict[int, dict[int, frozenset[int]]] = {}
         self._expand(symbols[handler], None, ())
         if symbols[f"{handler}_return"] & ~1 not in {
                 one.address for block in self._copies[0].blocks.values() for one in block.instructions}:
@@ -267,7 +268,8 @@ class Model:
     def _source_times(self, line: tuple[str, int], loop: Loop) -> int | None:
         """Bound by a fact about the source line, or by the line itself if it is a counted `for`."""
         text = self._source_line(*line)
-        fact = next((one for one in self._facts.loop if one.file == line[0] and one.statement in text), None)
+        fact = next((one for one in self._facts.loop if one.file == line[0] and one.statement in text
+                     and self._holds(one.configurations)), None)
         if fact is not None and fact.tests is not None:
             return self._names.value(fact.tests)
         iterations = fact.iterations if fact is not None else None
@@ -311,29 +313,35 @@ class Model:
 
     def _apply_facts(self) -> None:
         for never in self._facts.never:
-            if self._configuration in never.configurations:
+            if self._holds(never.configurations):
                 for function in never.functions:
-                    for nodes in self._copies_of(function).values():
+                    for nodes in self._copies_of(function):
                         for node in nodes:
                             self._constraints.append(_Constraint(f"never {function}", self._count(node), 0.0))
         for most in self._facts.at_most:
-            if most.configurations is None or self._configuration in most.configurations:
+            if self._holds(most.configurations):
                 executions = self._executions(most.function)
                 if executions:
                     self._constraints.append(_Constraint(f"at most {most.times} times {most.function}",
                                                          dict.fromkeys(executions, 1.0), self._names.value(most.times)))
         for exclusive in self._facts.exclusive:
-            if exclusive.configurations is None or self._configuration in exclusive.configurations:
-                name = f"exclusive {', '.join(exclusive.functions)}"
-                switches: _Row = {}
+            if self._holds(exclusive.configurations):
+                name = f"{', '.join(exclusive.functions)} exclude {', '.join(exclusive.excludes)}"
+                others = [self._switch(other, name) for other in exclusive.excludes]
                 for function in exclusive.functions:
-                    switch = self._column(integral=True)
-                    switches[switch] = 1.0
-                    for nodes in self._copies_of(function).values():
-                        for node in nodes:
-                            self._constraints.append(
-                                _Constraint(name, {**self._count(node), switch: -self._most(node)}, 0.0))
-                self._constraints.append(_Constraint(name, switches, 1.0))
+                    runs = self._switch(function, name)
+                    self._constraints += [_Constraint(name, {runs: 1.0, other: 1.0}, 1.0) for other in others]
+
+    def _switch(self, function: str, name: str) -> int:
+        """Column that is 1 if a function runs, else 0 or 1."""
+        switch = self._column(integral=True)
+        for nodes in self._copies_of(function):
+            for node in nodes:
+                self._constraints.append(_Constraint(name, {**self._count(node), switch: -self._most(node)}, 0.0))
+        return switch
+
+    def _holds(self, configurations: list[str] | None) -> bool:
+        return configurations is None or self._configuration in configurations
 
     def _column(self, integral: bool) -> int:
         self._integral.append(integral)
@@ -344,25 +352,35 @@ class Model:
         """Executions of a block."""
         return dict.fromkeys(self._into[node], 1.0)
 
-    def _copies_of(self, function: str) -> dict[object, list[_Node]]:
-        """Blocks of which all instructions belong to a function or to what is inlined into it, by call of the
-        function. A block that the compiler has mixed with others may be executed without the function."""
-        found: defaultdict[object, list[_Node]] = defaultdict(list)
+    def _copies_of(self, function: str) -> list[list[_Node]]:
+        """Blocks that are executed only if a function is, by call of the function, inlined or not.
+
+        All instructions of such a block belong to the function or to what is inlined into it: one that the compiler has
+        mixed with others may be executed without it. And one block of the call, the entry, dominates it: the compiler
+        merges equal ends of functions, and attributes them to one of them.
+        """
+        found: defaultdict[tuple[int, tuple[tuple[str, int], ...]], list[_Node]] = defaultdict(list)
         for node in self._nodes():
-            keys = set()
-            for one in self._block(node).instructions:
-                chain = self.chain(one.address)
-                level = next((i for i, here in enumerate(chain) if here.function == function), None)
-                keys.add(None if level is None else tuple((here.function, here.line) for here in chain[level + 1:]))
-            if None not in keys:
-                found[node[0], min(keys)].append(node)
-        return found
+            calls = {_call_of(function, self.chain(one.address)) for one in self._block(node).instructions}
+            if None not in calls:
+                found[node[0], min(call for call in calls if call is not None)].append(node)
+        return [self._dominated(nodes) for nodes in found.values()]
+
+    def _dominated(self, nodes: list[_Node]) -> list[_Node]:
+        """The nodes, all of one copy, that the node dominates which dominates most of them."""
+        copy = self._copies[nodes[0][0]]
+        if copy.entry not in self._dominators:
+            self._dominators[copy.entry] = dominators(copy.entry, copy.blocks)
+        dominated_by = self._dominators[copy.entry]
+        most = Counter(above for _, address in nodes for above in dominated_by[address])
+        entry = max((address for _, address in nodes), key=lambda address: most[address])
+        return [node for node in nodes if entry in dominated_by[node[1]]]
 
     def _executions(self, function: str) -> list[int]:
         """One column for each call of a function, not below its number of executions: a block in a loop of the function
         is executed as often as the loop permits in each of them."""
         columns = []
-        for nodes in self._copies_of(function).values():
+        for nodes in self._copies_of(function):
             column = self._column(integral=False)
             columns.append(column)
             inside = set(nodes)
@@ -443,6 +461,14 @@ class Model:
         if result.status == 3:
             raise UsageError(f"{self.image.path.name}: the number of instructions has no bound")
         return result.x if result.success else None
+
+
+def _call_of(function: str, chain: list[SourceLocation]) -> tuple[tuple[str, int], ...] | None:
+    """The call of a function that an instruction belongs to: the places in which it is inlined; None if to none."""
+    for level, here in enumerate(chain):
+        if here.function == function:
+            return tuple((outer.function, outer.line) for outer in chain[level + 1:])
+    return None
 
 
 def _numbered(lines: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:

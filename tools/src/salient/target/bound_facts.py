@@ -24,13 +24,15 @@ _Text = Annotated[str, checked("a text", lambda value: bool(value.strip()))]
 
 class LoopFact(Table):
     """Bound of the loops of a source line of `file` that contains `statement`. iterations: of the body of a counted
-    loop; tests: evaluations of the condition of a search."""
+    loop; tests: evaluations of the condition of a search. Of several facts about a line the
+    first one that holds in the configuration applies."""
 
     file: _Text
     statement: _Text
     reason: _Text
     iterations: str | None = None
     tests: str | None = None
+    configurations: list[str] | None = None
 
 
 class LibraryFact(Table):
@@ -51,9 +53,10 @@ class NeverFact(Table):
 
 
 class ExclusiveFact(Table):
-    """Functions of which at most one runs in an interrupt."""
+    """Functions of which none runs in an interrupt in which one of `functions` runs."""
 
     functions: list[str]
+    excludes: list[str]
     reason: _Text
     configurations: list[str] | None = None
 
@@ -91,7 +94,8 @@ def read_facts(path: Path = FILE, root: Path = ROOT) -> Facts:
         if not source.is_file() or loop.statement not in source.read_text(encoding="utf-8"):
             raise UsageError(f"{path}: {loop.file} has no statement {loop.statement}")
     named = [name for one in facts.never for name in one.functions]
-    named += [name for one in facts.exclusive for name in one.functions] + [one.function for one in facts.at_most]
+    named += [name for one in facts.exclusive for name in (*one.functions, *one.excludes)]
+    named += [one.function for one in facts.at_most]
     text = "\n".join(source.read_text(encoding="utf-8") for folder in ("firmware", "hal", "tests/target")
                      for source in sorted((root / folder).rglob("*.[ch]")))
     for name in named:
@@ -103,7 +107,8 @@ def read_facts(path: Path = FILE, root: Path = ROOT) -> Facts:
 # --- expressions ----------------------------------------------------------------------------------------------------
 
 _OPERATIONS: dict[type, Callable[[int, int], int]] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.FloorDiv: operator.floordiv}
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.FloorDiv: operator.floordiv,
+    ast.Mod: operator.mod}
 
 
 class Names:
@@ -118,12 +123,12 @@ class Names:
         self._root = root
 
     def value(self, expression: str, **more: int) -> int:
-        """Value of an expression of names, whole numbers, +, -, *, //; UsageError for anything else."""
+        """Value of an expression of names, whole numbers, +, -, *, //, %; UsageError for anything else."""
         try:
             return self._evaluate(ast.parse(expression, mode="eval").body, more)
         except (SyntaxError, ValueError, KeyError):
             raise UsageError(f"{expression}: must consist of numbers, macros of the firmware, phases, row_steps and"
-                             " + - * //") from None
+                             " + - * // %") from None
 
     def known(self, name: str) -> bool:
         """True when the name has a value."""

@@ -285,6 +285,26 @@ def _loops(entry: int | None, nodes: set[int], edges: Mapping[int, set[int]]) ->
     return found
 
 
+def dominators(entry: int, blocks: Mapping[int, Block]) -> dict[int, frozenset[int]]:
+    """For each block the blocks that lie on every path to it from the entry, with itself."""
+    before: dict[int, list[int]] = {address: [] for address in blocks}
+    for address, block in blocks.items():
+        for successor in block.successors:
+            if successor in before:
+                before[successor].append(address)
+    every = frozenset(blocks)
+    found = {address: every for address in blocks} | {entry: frozenset((entry,))}
+    changed = True
+    while changed:
+        changed = False
+        for address in blocks:
+            if address != entry:
+                common = frozenset.intersection(every, *(found[one] for one in before[address])) | {address}
+                changed |= common != found[address]
+                found[address] = common
+    return found
+
+
 def _components(nodes: Iterable[int], edges: Mapping[int, set[int]]) -> list[set[int]]:
     """Strongly connected components, by Tarjan's algorithm without recursion."""
     allowed = set(nodes)
