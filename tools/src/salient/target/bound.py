@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -23,16 +23,18 @@ from scipy.sparse import coo_array
 from salient.elf import ElfImage, Instruction, SourceLocation
 from salient.errors import UsageError
 from salient.paths import ROOT
-from salient.target.bound_facts import Facts, LoopFact, Names
-from salient.target.control_flow import Block, ControlFlow, Loop, dominators, loops, place
+from salient.target.bound_facts import Facts, Names
+from salient.target.control_flow import Block, ControlFlow, Loop, dominators, loops, place, predecessors
 
 CONTROL = "control_handler"
-"""Symbol of the control interrupt's handler; NAME_return is the label of the code after its call."""
+"""Symbol of the control interrupt's handler; with the suffix _return that of the code after its call."""
 
 _Node = tuple[int, int]
 """Number of a copy of a function, address of a block."""
 _Edge = tuple[_Node | None, _Node | None]
 """None: the start or the end of the interrupt."""
+_Call = tuple[tuple[str, int], ...]
+"""Functions and lines into which a function is inlined."""
 _Row = dict[int, float]
 """Coefficients by column."""
 
@@ -71,34 +73,29 @@ class _Constraint:
 
 @dataclass(frozen=True)
 class Bound:
-    """instructions: of the longest path. executed: executions of each instruction on it, by address. entries: for each
-    loop with its source line, executions of its first block per entry on the path and at most."""
+    """instructions: of the longest path. executed: executions of each instruction on it, by address."""
 
     instructions: int
     executed: Counter[int]
     model: Model = field(repr=False)
 
     def by_function(self) -> list[tuple[str, int, int]]:
-        """Function with inlined code attributed to the inlined function, instructions, executions of the most frequent
-        one; the largest first."""
-        counts: Counter[str] = Counter()
-        times: dict[str, int] = defaultdict(int)
-        for address, count in self.executed.items():
-            function = self.model.chain(address)[0].function
-            counts[function] += count
-            times[function] = max(times[function], count)
-        return [(function, count, times[function]) for function, count in counts.most_common() if count]
+        """Function, instructions, and executions of the most frequent one; the largest first. Inlined code counts for
+        the inlined function."""
+        return self._by(lambda here: here.function)
 
     def by_line(self) -> list[tuple[str, int, int]]:
         """As by_function, by source line."""
-        counts: Counter[str] = Counter()
-        times: dict[str, int] = defaultdict(int)
+        return self._by(lambda here: f"{here.file}:{here.line}")
+
+    def _by(self, name: Callable[[SourceLocation], str]) -> list[tuple[str, int, int]]:
+        instructions: Counter[str] = Counter()
+        times: dict[str, int] = {}
         for address, count in self.executed.items():
-            here = self.model.chain(address)[0]
-            line = f"{here.file}:{here.line}"
-            counts[line] += count
-            times[line] = max(times[line], count)
-        return [(line, count, times[line]) for line, count in counts.most_common() if count]
+            key = name(self.model.chain(address)[0])
+            instructions[key] += count
+            times[key] = max(times.get(key, 0), count)
+        return [(key, count, times[key]) for key, count in instructions.most_common() if count]
 
 
 class Model:
@@ -220,7 +217,8 @@ class Model:
                 row: defaultdict[int, float] = defaultdict(float)
                 for column in self._columns_of(number, loop.repeats):
                     row[column] += 1.0
-                for column in self._columns_of(number, loop.entries):
+                begins = [self._edges[copy.site, (number, copy.entry)]] if loop.at_entry else []
+                for column in (*self._columns_of(number, loop.entries), *begins):
                     row[column] -= times - 1.0
                 self._constraints.append(_Constraint(f"loop at {line}", dict(row), 0.0))
 
@@ -356,25 +354,37 @@ class Model:
         """Blocks that are executed only if a function is, by call of the function, inlined or not.
 
         All instructions of such a block belong to the function or to what is inlined into it: one that the compiler has
-        mixed with others may be executed without it. And one block of the call, the entry, dominates it: the compiler
-        merges equal ends of functions, and attributes them to one of them.
+        mixed with others may be executed without it. Of these blocks some may be shared, because the compiler merges
+        equal ends of functions and attributes them to one of them (_certain).
         """
-        found: defaultdict[tuple[int, tuple[tuple[str, int], ...]], list[_Node]] = defaultdict(list)
+        found: defaultdict[tuple[int, _Call], list[_Node]] = defaultdict(list)
+        mixed: defaultdict[tuple[int, _Call], set[int]] = defaultdict(set)
         for node in self._nodes():
             calls = {_call_of(function, self.chain(one.address)) for one in self._block(node).instructions}
-            if None not in calls:
-                found[node[0], min(call for call in calls if call is not None)].append(node)
-        return [self._dominated(nodes) for nodes in found.values()]
+            for call in calls - {None}:
+                assert call is not None
+                if len(calls) == 1:
+                    found[node[0], call].append(node)
+                else:
+                    mixed[node[0], call].add(node[1])
+        return [self._certain(nodes, mixed[key]) for key, nodes in found.items()]
 
-    def _dominated(self, nodes: list[_Node]) -> list[_Node]:
-        """The nodes, all of one copy, that the node dominates which dominates most of them."""
-        copy = self._copies[nodes[0][0]]
+    def _certain(self, nodes: list[_Node], mixed: set[int]) -> list[_Node]:
+        """The blocks of a call that are not shared: those dominated by the one that dominates most of them, and those
+        that are reached only from such blocks or from blocks in which the call is mixed with others."""
+        number = nodes[0][0]
+        copy = self._copies[number]
         if copy.entry not in self._dominators:
             self._dominators[copy.entry] = dominators(copy.entry, copy.blocks)
         dominated_by = self._dominators[copy.entry]
         most = Counter(above for _, address in nodes for above in dominated_by[address])
         entry = max((address for _, address in nodes), key=lambda address: most[address])
-        return [node for node in nodes if entry in dominated_by[node[1]]]
+        certain = {address for _, address in nodes}
+        before = predecessors(copy.blocks)
+        while shared := {address for address in certain if entry not in dominated_by[address]
+                         and any(one not in certain and one not in mixed for one in before[address])}:
+            certain -= shared
+        return [(number, address) for address in sorted(certain)]
 
     def _executions(self, function: str) -> list[int]:
         """One column for each call of a function, not below its number of executions: a block in a loop of the function
@@ -425,23 +435,23 @@ class Model:
         """Compares the model with executions of each instruction, by address, in a number of interrupts together: None
         when paths of the model add up to them, else the part of the model that they violate. With one interrupt the
         comparison is exact, with several it is that of their mean."""
-        known = {one.address for node in self._nodes() for one in self._block(node).instructions}
+        blocks: defaultdict[tuple[Instruction, ...], list[_Node]] = defaultdict(list)
+        for node in self._nodes():
+            blocks[self._block(node).instructions].append(node)
+        known = {one.address for instructions in blocks for one in instructions}
         for address, times in executed.items():
             if times and address not in known:
-                return f"{place(self._code.instruction(address))} was executed and is not in the graph"
-        observed, rows = [], defaultdict(list)
-        for node in self._nodes():
-            rows[node[1], self._block(node).instructions].append(node)
-        for (_, instructions), nodes in rows.items():
-            times = {executed.get(one.address, 0) for one in instructions}
-            row: defaultdict[int, float] = defaultdict(float)
-            for node in nodes:
-                for column in self._into[node]:
-                    row[column] += 1.0
-            if len(times) == 1:
-                observed.append(_Constraint("observed", dict(row), float(*times), float(*times)))
+                return f"{place(self._code.instruction(address))}: executed, and on no path"
         every = [_Constraint(one.name, one.row, one.high * interrupts, one.low * interrupts)
-                 for one in self._constraints] + observed
+                 for one in self._constraints]
+        for instructions, nodes in blocks.items():
+            times = executed.get(instructions[0].address, 0)
+            if any(executed.get(one.address, 0) != times for one in instructions):
+                return f"{place(instructions[0])}: a block of which only a part was executed"
+            row: defaultdict[int, float] = defaultdict(float)
+            for column in (column for node in nodes for column in self._into[node]):
+                row[column] += 1.0
+            every.append(_Constraint("observed", dict(row), times, times))
         nothing = np.zeros(self._columns)
         if self._optimise(nothing, every, integral=interrupts == 1) is not None:
             return None
@@ -463,7 +473,7 @@ class Model:
         return result.x if result.success else None
 
 
-def _call_of(function: str, chain: list[SourceLocation]) -> tuple[tuple[str, int], ...] | None:
+def _call_of(function: str, chain: list[SourceLocation]) -> _Call | None:
     """The call of a function that an instruction belongs to: the places in which it is inlined; None if to none."""
     for level, here in enumerate(chain):
         if here.function == function:
@@ -480,10 +490,7 @@ _sources: dict[str, list[str]] = {}
 
 def _returning(blocks: Mapping[int, Block], root: bool) -> dict[int, Block]:
     """The blocks from which the function can return: an interrupt that does not return has no duration."""
-    before: defaultdict[int, list[int]] = defaultdict(list)
-    for address, block in blocks.items():
-        for successor in block.successors:
-            before[successor].append(address)
+    before = predecessors(blocks)
     waiting = [address for address, block in blocks.items() if block.returns]
     if root and not waiting:
         raise UsageError("the handler does not return")

@@ -12,6 +12,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
+from pydantic import Field
+
 from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.paths import ROOT
@@ -73,11 +75,11 @@ class AtMostFact(Table):
 class Facts(Table):
     """Content of the file."""
 
-    loop: list[LoopFact] = []
-    library: list[LibraryFact] = []
-    never: list[NeverFact] = []
-    exclusive: list[ExclusiveFact] = []
-    at_most: list[AtMostFact] = []
+    loop: list[LoopFact] = Field(default_factory=list)
+    library: list[LibraryFact] = Field(default_factory=list)
+    never: list[NeverFact] = Field(default_factory=list)
+    exclusive: list[ExclusiveFact] = Field(default_factory=list)
+    at_most: list[AtMostFact] = Field(default_factory=list)
 
 
 def read_facts(path: Path = FILE, root: Path = ROOT) -> Facts:
@@ -151,12 +153,12 @@ class Names:
     def _macros(self) -> dict[str, int]:
         headers = [*(self._root / "firmware").rglob("*.h"), *(self._root / "hal").rglob("*.h"),
                    *self._image.path.parents[1].glob("firmware/codec/*.h")]
-        found = {}
+        found: dict[str, set[int]] = {}
         for header in headers:
             for name, value in re.findall(r"^#define (\w+) \(?(\d+)u?\)?(?=\s|$)",
                                           header.read_text(encoding="utf-8"), re.MULTILINE):
-                found[name] = int(value)
-        return found
+                found.setdefault(name, set()).add(int(value))
+        return {name: values.pop() for name, values in found.items() if len(values) == 1}
 
     def _tables(self, offset: int, size: int) -> bytes:
         """Part of machine_tables, in the layout of firmware/control/machine_tables.h on a 32-bit processor."""

@@ -59,11 +59,8 @@ class ControlFlow:
 
     def before(self, address: int, count: int) -> list[Instruction]:
         """The instructions before an address in the image, nearest first."""
-        found = []
         index = self._order.index(address)
-        for previous in reversed(self._order[max(0, index - count): index]):
-            found.append(self._at[previous])
-        return found
+        return [self._at[previous] for previous in reversed(self._order[max(0, index - count): index])]
 
     def following(self, address: int) -> int:
         """Address of the next instruction in memory, data skipped."""
@@ -209,26 +206,44 @@ def _riscv_table(code: ControlFlow, one: Instruction) -> tuple[int, ...]:
     return _unique(*targets)
 
 
+_RISCV_OPERANDS = re.compile(r"[,()\s]+")
+_NUMBER = re.compile(r"-?(?:0x[0-9a-f]+|[0-9]+)")
+_RISCV_SEARCHED = 24
+"""Instructions before a jump in which its table's address is made."""
+
+
 def _riscv_table_address(code: ControlFlow, one: Instruction) -> int:
-    """lw REG, OFFSET(REG) before the jump has the sum of a scaled index and the table's address."""
-    wanted, offset = {one.operands.strip()}, 0
-    for earlier in code.before(one.address, 12):
-        words = re.split(r"[,()\s]+", earlier.operands.partition("#")[0].strip())
-        if not words or words[0] not in wanted:
-            continue
-        if earlier.mnemonic == "lw":
-            wanted, offset = {words[2]}, int(words[1], 0)
-        elif earlier.mnemonic == "add":
-            wanted |= set(words[1:])
-        elif annotated := _RISCV_ANNOTATED.search(earlier.operands):
-            return int(annotated[1], 16) + offset
-        elif earlier.mnemonic in ("slli", "sh2add"):
-            wanted.discard(words[0])
-        elif earlier.mnemonic == "addi":
-            wanted, offset = {words[1]}, offset + int(words[2], 0)
-        elif earlier.mnemonic == "lui":
-            return ((int(words[1], 0) << 12) + offset) & 0xFFFFFFFF
+    """lw before the jump reads from the sum of a scaled index and the table's address."""
+    earlier = code.before(one.address, _RISCV_SEARCHED)
+    for i, load in enumerate(earlier):
+        words = _RISCV_OPERANDS.split(load.operands)
+        if words[0] == one.operands.strip():
+            address = _riscv_constant(words[2], earlier[i + 1:]) if load.mnemonic == "lw" else None
+            if address is not None:
+                return (address + int(words[1], 0)) & 0xFFFFFFFF
+            break
     raise UsageError(f"{place(one)}: a jump through a pointer has no bound")
+
+
+def _riscv_constant(register: str, earlier: list[Instruction]) -> int | None:
+    """The constant in a register, or in a sum the constant summand; earlier: instructions before, nearest first."""
+    for i, one in enumerate(earlier):
+        text, _, _ = one.operands.partition("#")
+        words = _RISCV_OPERANDS.split(text.strip())
+        if words[0] != register:
+            continue
+        if annotated := _RISCV_ANNOTATED.search(one.operands):
+            return int(annotated[1], 16)
+        if one.mnemonic == "lui":
+            return int(words[1], 0) << 12
+        if one.mnemonic in ("addi", "add") and _NUMBER.fullmatch(words[2]):
+            value = _riscv_constant(words[1], earlier[i + 1:])
+            return None if value is None else value + int(words[2], 0)
+        if one.mnemonic == "add":
+            values = [_riscv_constant(word, earlier[i + 1:]) for word in words[1:]]
+            return next((value for value in values if value is not None), None)
+        return None
+    return None
 
 
 def _unique(*addresses: int) -> tuple[int, ...]:
@@ -240,17 +255,20 @@ def _unique(*addresses: int) -> tuple[int, ...]:
 @dataclass
 class Loop:
     """A strongly connected part of a function. Edges are pairs of block addresses. entries: from outside; repeats: from
-    inside to `header`; leaves: to outside. own: the blocks that belong to no inner loop."""
+    inside to `header`. at_entry: the function begins in the loop, which is one more entry for each call. bottom_tested:
+    it is left only from blocks that may also repeat it."""
 
     header: int
     blocks: frozenset[int]
     entries: list[tuple[int, int]]
     repeats: list[tuple[int, int]]
+    at_entry: bool
     bottom_tested: bool
     inner: list[Loop] = field(default_factory=list)
 
     @property
     def own(self) -> frozenset[int]:
+        """Blocks that belong to no inner loop."""
         return self.blocks.difference(*(inner.blocks for inner in self.inner))
 
     def nest(self) -> Iterator[Loop]:
@@ -266,34 +284,40 @@ def loops(entry: int, blocks: Mapping[int, Block]) -> list[Loop]:
     return _loops(entry, set(blocks), edges)
 
 
-def _loops(entry: int | None, nodes: set[int], edges: Mapping[int, set[int]]) -> list[Loop]:
+def _loops(entry: int, nodes: set[int], edges: Mapping[int, set[int]]) -> list[Loop]:
     found = []
     for part in _components(nodes, edges):
         inside = [(a, b) for a in part for b in edges[a] if b in part]
         if not inside:
             continue
         entries = [(a, b) for a in edges if a not in part for b in edges[a] if b in part]
-        heads = {b for _, b in entries} | ({entry} & part if entry is not None else set())
+        heads = {b for _, b in entries} | ({entry} & part)
         header = min(heads)
         repeats = [edge for edge in inside if edge[1] == header]
         latches = {a for a, _ in repeats}
-        loop = Loop(header, frozenset(part), entries, repeats,
+        loop = Loop(header, frozenset(part), entries, repeats, entry in part,
                     all(a in latches for a in part if edges[a] - part))
         reduced = {a: {b for b in edges[a] if (a, b) not in repeats} for a in edges}
-        loop.inner = _loops(None, part, reduced)
+        loop.inner = _loops(entry, part, reduced)
         found.append(loop)
     return found
 
 
-def dominators(entry: int, blocks: Mapping[int, Block]) -> dict[int, frozenset[int]]:
-    """For each block the blocks that lie on every path to it from the entry, with itself."""
+def predecessors(blocks: Mapping[int, Block]) -> dict[int, list[int]]:
+    """For each block those after which it may follow."""
     before: dict[int, list[int]] = {address: [] for address in blocks}
     for address, block in blocks.items():
         for successor in block.successors:
             if successor in before:
                 before[successor].append(address)
+    return before
+
+
+def dominators(entry: int, blocks: Mapping[int, Block]) -> dict[int, frozenset[int]]:
+    """For each block the blocks that lie on every path to it from the entry, with itself."""
+    before = predecessors(blocks)
     every = frozenset(blocks)
-    found = {address: every for address in blocks} | {entry: frozenset((entry,))}
+    found = dict.fromkeys(blocks, every) | {entry: frozenset((entry,))}
     changed = True
     while changed:
         changed = False
