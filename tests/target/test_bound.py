@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import subprocess
-from functools import lru_cache
 from pathlib import Path
 
 import pytest
 
 from salient.bench.emulator import image
+from salient.config import CONTROLLERS
 from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.target import worst_case
 from salient.target.bound import Model
 from salient.target.bound_facts import FILE, Facts, Names, read_facts
 from salient.target.bound_report import bound, by_module
-from salient.target.isr_profile import IsrProfile
 
 CORTEX_M4 = ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb"]
 RV32 = ["riscv64-unknown-elf-gcc", "-march=rv32imac", "-mabi=ilp32"]
@@ -280,7 +279,7 @@ def test_call_in_a_loop_counts_in_each_iteration(longest, tmp_path):
 
 
 @pytest.mark.parametrize(("size", "iterations"), [(16, 4), (40, 10)])
-def test_loops_of_a_library_function_follow_from_the_constant_size_of_each_call(longest, size, iterations):
+def test_loops_of_a_copying_function_follow_from_the_constant_size_of_each_call(longest, tmp_path, size, iterations):
     source = f"""
     function f
         push {{r4, lr}}
@@ -291,9 +290,11 @@ def test_loops_of_a_library_function_follow_from_the_constant_size_of_each_call(
         pop {{r4, pc}}
     function fill
     1:  subs r2, #4
-        bne 1b
+        bne 1b              @ fill
         bx lr
     """
+    facts = Facts.model_validate({"loop": [loop("@ fill", tmp_path / "x.s", iterations="size // 4")]})
+    assert longest(source, facts) == 6 + (2 * iterations + 1) + (2 + 1)
     facts = Facts.model_validate({"library": [{"function": "fill", "tests": ["size // 4"], "reason": "test"}]})
     assert longest(source, facts) == 6 + (2 * iterations + 1) + (2 + 1)
     with pytest.raises(UsageError, match="fill: .*: its size is no constant"):
@@ -424,18 +425,13 @@ def test_names_have_the_values_of_image_and_headers(machine, phases):
 
 # --- the firmware ---------------------------------------------------------------------------------------------------
 
-BUILDS = ("cortex-m4", "rv32")
+RUNS = [*(("cortex-m4", variant) for variant in worst_case.VARIANTS), *(("rv32", variant) for variant in CONTROLLERS)]
 
 
-@lru_cache
-def known_worst_case(variant: str, build: str) -> IsrProfile:
-    return worst_case.profile(worst_case.read_input(worst_case.committed(variant)), build=build)
-
-
-@pytest.mark.parametrize("build", BUILDS)
-@pytest.mark.parametrize("variant", worst_case.VARIANTS)
+@pytest.mark.parametrize(("build", "variant"), RUNS)
 def test_every_run_is_a_path_within_the_facts_and_the_bound(variant, build):
-    found, profile = bound(variant, build), known_worst_case(variant, build)
+    found = bound(variant, build)
+    profile = worst_case.profile(worst_case.read_input(worst_case.committed(variant)), build=build)
     addresses = [one.address for one in found.model.image.instructions()]
     longest = dict(zip(addresses, profile.trace.in_longest.tolist(), strict=True))
     assert sum(longest.values()) == profile.metrics()["max"] <= found.instructions

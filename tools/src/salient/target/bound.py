@@ -23,7 +23,7 @@ from scipy.sparse import coo_array
 from salient.elf import ElfImage, Instruction, SourceLocation
 from salient.errors import UsageError
 from salient.paths import ROOT
-from salient.target.bound_facts import Facts, Names
+from salient.target.bound_facts import Facts, LibraryFact, Names
 from salient.target.control_flow import Block, ControlFlow, Loop, dominators, loops, place, predecessors
 
 CONTROL = "control_handler"
@@ -234,18 +234,18 @@ class Model:
 
     def _times(self, copy: _Copy, loop: Loop, of_function: list[Loop]) -> tuple[int, str]:
         """Executions of the loop's first block per entry, and its source line."""
-        function = self._code.instruction(copy.entry).function
-        for library in self._facts.library:
-            if library.function == function:
-                return self._library_times(copy, loop, of_function, library.tests, function)
         closing, others = self._lines(copy, loop)
         inner = {line for one in loop.inner for line in self._lines(copy, one)[0]}
         found = [(times, line) for lines in (closing, [line for line in others if line not in inner]) for line in lines
-                 if (times := self._source_times(line, loop)) is not None]
+                 if (times := self._source_times(copy, line, loop)) is not None]
         for chosen in ([one for one in found if one[1] in closing], found):
             if chosen:
                 times, line = max(chosen)
                 return times, f"{line[0]}:{line[1]}"
+        function = self._code.instruction(copy.entry).function
+        for library in self._facts.library:
+            if library.function == function:
+                return self._library_times(copy, loop, of_function, library), function
         where = ", ".join(f"{file}:{number}" for file, number in (closing or others)[:3]) or f"{loop.header:#x}"
         raise UsageError(f"{self.image.path.name}: {function}: the loop at {where} has no bound: state one in"
                          " tests/target/bounds.toml")
@@ -263,20 +263,29 @@ class Model:
         lines = [(stack[depth].file, stack[depth].line) for stack in stacks]
         return _numbered(lines[:len(closing)]), _numbered(lines[len(closing):])
 
-    def _source_times(self, line: tuple[str, int], loop: Loop) -> int | None:
+    def _source_times(self, copy: _Copy, line: tuple[str, int], loop: Loop) -> int | None:
         """Bound by a fact about the source line, or by the line itself if it is a counted `for`."""
         text = self._source_line(*line)
         fact = next((one for one in self._facts.loop if one.file == line[0] and one.statement in text
                      and self._holds(one.configurations)), None)
         if fact is not None and fact.tests is not None:
-            return self._names.value(fact.tests)
+            return self._value(copy, fact.tests)
         iterations = fact.iterations if fact is not None else None
         counted = _COUNTED_FOR.search(text)
         if iterations is None and counted and (counted[2].isdigit() or self._names.known(counted[2])):
             iterations = counted[2]
         if iterations is None:
             return None
-        return self._names.value(iterations) + (0 if loop.bottom_tested else 1)
+        return self._value(copy, iterations) + (0 if loop.bottom_tested else 1)
+
+    def _value(self, copy: _Copy, expression: str) -> int:
+        """Value of a bound for a call."""
+        if not re.search(r"\bsize\b", expression):
+            return self._names.value(expression)
+        if copy.size is None:
+            site = place(self._block(copy.site).instructions[-1]) if copy.site else "the handler"
+            raise UsageError(f"{self._code.instruction(copy.entry).function}: {site}: its size is no constant")
+        return self._names.value(expression, size=copy.size)
 
     def _source_line(self, file: str, line: int) -> str:
         path = self._root / file
@@ -285,17 +294,11 @@ class Model:
         lines = _sources[file]
         return lines[line - 1] if 0 < line <= len(lines) else ""
 
-    def _library_times(self, copy: _Copy, loop: Loop, of_function: list[Loop], tests: list[str],
-                       function: str) -> tuple[int, str]:
-        if len(tests) != len(of_function):
-            raise UsageError(f"tests/target/bounds.toml: {function} has {len(of_function)} loops, not {len(tests)}")
-        ordered = sorted(of_function, key=lambda one: one.header)
-        if copy.size is None:
-            raise UsageError(f"{function}: {self._describe_site(copy)}: its size is no constant")
-        return max(0, self._names.value(tests[ordered.index(loop)], size=copy.size)), function
-
-    def _describe_site(self, copy: _Copy) -> str:
-        return place(self._block(copy.site).instructions[-1]) if copy.site else ""
+    def _library_times(self, copy: _Copy, loop: Loop, of_function: list[Loop], library: LibraryFact) -> int:
+        if len(library.tests) != len(of_function):
+            raise UsageError(f"tests/target/bounds.toml: {library.function} has {len(of_function)} loops, not"
+                             f" {len(library.tests)}")
+        return self._value(copy, library.tests[sorted(one.header for one in of_function).index(loop.header)])
 
     def _constant_size(self, site: _Node) -> int | None:
         """Constant third argument of the call at the end of a block."""

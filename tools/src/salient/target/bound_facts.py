@@ -39,7 +39,7 @@ class LoopFact(Table):
 
 class LibraryFact(Table):
     """Bounds of the loops of a function without source, in the order of their addresses: executions of the first
-    block. `size`: its constant third argument."""
+    block."""
 
     function: _Text
     tests: list[str]
