@@ -143,6 +143,20 @@ def test_path_that_never_returns_has_no_duration(longest):
     assert longest("function f\n cbz r0, 1f\n bx lr\n 1: nop\n 2: nop\n b 2b\n") == 2
 
 
+def test_call_that_never_returns_has_no_duration(longest):
+    source = "function f\n push {r4, lr}\n cbz r0, 1f\n pop {r4, pc}\n 1: nop\n bl g\n pop {r4, pc}\n"
+    assert longest(source + "function g\n b g\n") == 3
+    assert longest(source + "function g\n bx lr\n") == 6
+
+
+def test_handler_is_named_by_its_symbols(tmp_path):
+    source = "function f\n bx lr\n function deferred_handler\n bl f\n function deferred_handler_return\n bx lr\n"
+    assert model(tmp_path, source).solve().instructions == 4
+    assert Model(ElfImage(tmp_path / "x.elf"), Facts(), "only", "deferred_handler", tmp_path).solve().instructions == 3
+    with pytest.raises(UsageError, match="no symbol other"):
+        Model(ElfImage(tmp_path / "x.elf"), Facts(), "only", "other", tmp_path)
+
+
 @pytest.mark.parametrize(("source", "message"), [
     ("function f\n blx r3\n bx lr\n", "f: .*: blx r3: a call through a pointer has no bound"),
     ("function f\n bx r3\n", "f: .*: bx r3: a jump through a pointer has no bound"),
@@ -211,7 +225,26 @@ def test_loop_without_a_bound_is_an_error_that_names_its_line(longest, tmp_path)
         longest(BOTTOM_TESTED)
 
 
+LEFT_BY_RETURN = """
+    function f
+        movs r0, #5     @ 1
+    1:  cmp r0, #0      @ test
+        it eq
+        bxeq lr         @ last
+        subs r0, #1
+        b 1b            @ repeat
+"""
+AROUND_THE_ENTRY = """
+    function f
+        subs r0, #1
+        bne f           @ repeat
+        bx lr           @ last
+"""
+
+
 @pytest.mark.parametrize(("source", "bound", "instructions"), [
+    (LEFT_BY_RETURN, {"iterations": "5"}, 1 + 5 * 5 + 3),
+    (AROUND_THE_ENTRY, {"iterations": "5"}, 5 * 2 + 1),
     (BOTTOM_TESTED, {"iterations": "5"}, 1 + 5 * 3 + 1),
     (BOTTOM_TESTED, {"tests": "5"}, 1 + 5 * 3 + 1),
     (TOP_TESTED, {"iterations": "5"}, 1 + 5 * 3 + 1 + 1),

@@ -139,7 +139,9 @@ class Model:
     def _expand(self, entry: int, site: _Node | None, above: tuple[int, ...]) -> None:
         if entry in above:
             raise UsageError(f"recursion: {self._code.instruction(entry).function}")
-        blocks = _returning(self._code.function(entry), root=not above)
+        blocks = _returning(self._code.function(entry))
+        if not above and not blocks:
+            raise UsageError(f"{self._code.instruction(entry).function} does not return")
         number = len(self._copies)
         size = self._constant_size(site) if site else None
         self._copies.append(_Copy(entry, site, blocks, size))
@@ -173,6 +175,8 @@ class Model:
 
     def _flow(self) -> list[_Constraint]:
         rows = [_Constraint("start", {0: 1.0}, 1.0, 1.0)]
+        rows += [_Constraint("flow", {self._edges[copy.site, (number, copy.entry)]: 1.0}, 0.0)
+                 for number, copy in enumerate(self._copies) if not copy.blocks]
         for node in self._nodes():
             row: defaultdict[int, float] = defaultdict(float)
             for column in self._into[node]:
@@ -491,12 +495,10 @@ def _numbered(lines: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:
 _sources: dict[str, list[str]] = {}
 
 
-def _returning(blocks: Mapping[int, Block], root: bool) -> dict[int, Block]:
+def _returning(blocks: Mapping[int, Block]) -> dict[int, Block]:
     """The blocks from which the function can return: an interrupt that does not return has no duration."""
     before = predecessors(blocks)
     waiting = [address for address, block in blocks.items() if block.returns]
-    if root and not waiting:
-        raise UsageError("the handler does not return")
     found = set(waiting)
     while waiting:
         for address in before[waiting.pop()]:

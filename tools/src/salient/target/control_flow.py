@@ -57,6 +57,10 @@ class ControlFlow:
             raise UsageError(f"{self.image.path.name}: a jump to {address:#x}, which is not an instruction")
         return self._at[address]
 
+    def has(self, address: int) -> bool:
+        """True when an instruction begins at an address."""
+        return address in self._at
+
     def before(self, address: int, count: int) -> list[Instruction]:
         """The instructions before an address in the image, nearest first."""
         index = self._order.index(address)
@@ -149,7 +153,7 @@ def _thumb(code: ControlFlow, one: Instruction) -> Flow:
         if not pop or (mnemonic != "pop" + (pop[1] or "") and not re.search(r"\bsp!|\[sp\], #", one.operands)):
             raise UsageError(f"{place(one)}: a jump through a pointer has no bound")
         return Flow((code.falls_to(one),) if pop[1] else (), returns=True)
-    if mnemonic in ("udf", "bkpt") and one.address not in code._following:
+    if mnemonic == "udf":
         return Flow(())
     return Flow((code.falls_to(one),))
 
@@ -192,13 +196,14 @@ def _riscv(code: ControlFlow, one: Instruction) -> Flow:
 
 def _riscv_table(code: ControlFlow, one: Instruction) -> tuple[int, ...]:
     """Targets of the jump table of a switch: words at an address that the instructions before build from constants,
-    as many of them as are addresses of the same function. The next words of the image may be such addresses too, then
-    the bound only becomes larger."""
+    as many of them as are addresses of the same function or its cold part. The next words of the image may be such
+    addresses too, then the bound only becomes larger."""
     base = _riscv_table_address(code, one)
+    own = one.function.partition(".cold")[0]
     targets: list[int] = []
     while True:
         target = int.from_bytes(code.image.read(base + 4 * len(targets), 4), "little")
-        if target not in code._at or code._at[target].function != one.function:
+        if not code.has(target) or code.instruction(target).function.partition(".cold")[0] != own:
             break
         targets.append(target)
     if not targets:
@@ -280,11 +285,12 @@ class Loop:
 
 def loops(entry: int, blocks: Mapping[int, Block]) -> list[Loop]:
     """Outermost loops of a function, with their inner loops."""
-    edges = {address: set(block.successors) for address, block in blocks.items()}
-    return _loops(entry, set(blocks), edges)
+    edges = {address: {one for one in block.successors if one in blocks} for address, block in blocks.items()}
+    returning = {address for address, block in blocks.items() if block.returns}
+    return _loops(entry, set(blocks), edges, returning)
 
 
-def _loops(entry: int, nodes: set[int], edges: Mapping[int, set[int]]) -> list[Loop]:
+def _loops(entry: int, nodes: set[int], edges: Mapping[int, set[int]], returning: set[int]) -> list[Loop]:
     found = []
     for part in _components(nodes, edges):
         inside = [(a, b) for a in part for b in edges[a] if b in part]
@@ -296,9 +302,9 @@ def _loops(entry: int, nodes: set[int], edges: Mapping[int, set[int]]) -> list[L
         repeats = [edge for edge in inside if edge[1] == header]
         latches = {a for a, _ in repeats}
         loop = Loop(header, frozenset(part), entries, repeats, entry in part,
-                    all(a in latches for a in part if edges[a] - part))
+                    all(a in latches for a in part if edges[a] - part or a in returning))
         reduced = {a: {b for b in edges[a] if (a, b) not in repeats} for a in edges}
-        loop.inner = _loops(entry, part, reduced)
+        loop.inner = _loops(entry, part, reduced, returning)
         found.append(loop)
     return found
 
