@@ -15,6 +15,7 @@ from salient.target import worst_case
 from salient.target.bound import Model
 from salient.target.bound_facts import FILE, Facts, Names, read_facts
 from salient.target.bound_report import bound, by_module
+from salient.target.c_loops import loop_statements
 
 CORTEX_M4 = ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb"]
 RV32 = ["riscv64-unknown-elf-gcc", "-march=rv32imac", "-mabi=ilp32"]
@@ -337,26 +338,60 @@ def test_loops_of_a_copying_function_follow_from_the_constant_size_of_each_call(
         longest(source, facts)
 
 
+def compiled(folder: Path, body: str, compiler: list[str], optimisation: str) -> Model:
+    """Model of a function f in C with a body."""
+    (folder / "firmware").mkdir()
+    (folder / "firmware" / "limit.h").write_text("#define LIMIT 9\n")
+    (folder / "x.c").write_text("struct machine { unsigned LIMIT; };\n__attribute__((used)) void f(volatile int *to,"
+                                f" const struct machine *machine) {{\n{body}\n}}\n")
+    (folder / "x.s").write_text(HANDLER[compiler[0]])
+    subprocess.run([*compiler, optimisation, "-g1", "-nostdlib", "-Wl,-e,control_handler", str(folder / "x.s"),
+                    str(folder / "x.c"), "-o", str(folder / "x.elf")], check=True)
+    return Model(ElfImage(folder / "x.elf"), Facts(), "only", root=folder)
+
+
 @pytest.mark.parametrize("compiler", [CORTEX_M4, RV32], ids=["cortex-m4", "rv32"])
+@pytest.mark.parametrize("optimisation", ["-O1", "-O2", "-Os"])
 @pytest.mark.parametrize(("statement", "iterations"), [
     ("for (unsigned i = 0; i < 70; i++)", 70), ("for (unsigned i = 0; i < machine->LIMIT; i++)", 9)])
-def test_counted_for_needs_no_fact(tmp_path, compiler, statement, iterations):
-    (tmp_path / "firmware").mkdir()
-    (tmp_path / "firmware" / "limit.h").write_text("#define LIMIT 9\n")
-    source = """
-    struct machine { unsigned LIMIT; };
-    __attribute__((used)) void f(volatile int *to, const struct machine *machine) {
-        STATEMENT { *to = 1; }
-    }
-    """.replace("STATEMENT", statement)
-    (tmp_path / "x.c").write_text(source)
-    (tmp_path / "x.s").write_text(HANDLER[compiler[0]])
-    subprocess.run([*compiler, "-O1", "-g1", "-nostdlib", "-Wl,-e,control_handler", str(tmp_path / "x.s"),
-                    str(tmp_path / "x.c"), "-o", str(tmp_path / "x.elf")], check=True)
-    found = Model(ElfImage(tmp_path / "x.elf"), Facts(), "only", root=tmp_path).solve()
+def test_counted_for_needs_no_fact(tmp_path, compiler, optimisation, statement, iterations):
+    found = compiled(tmp_path, f"(void)machine; {statement} {{\n*to = 1;\n}}", compiler, optimisation).solve()
     stores = [one.address for one in found.model.image.instructions()
               if one.function == "f" and one.mnemonic in ("str", "sw")]
     assert [found.executed[address] for address in stores] == [iterations]
+
+
+@pytest.mark.parametrize("compiler", [CORTEX_M4, RV32], ids=["cortex-m4", "rv32"])
+@pytest.mark.parametrize("body", [
+    "while (*to) {\n*to = 1;\nfor (unsigned i = 0; i < 2; i++) {\n*to = 2;\n}\n}",
+    "do {\nfor (unsigned i = 0; i < 2; i++) {\n*to = 2;\n}\n} while (*to);",
+    "for (;;) {\nif (*to) {\nreturn;\n}\nfor (unsigned i = 0; i < 2; i++) {\n*to = 2;\n}\n}",
+])
+def test_unrolled_inner_loop_is_no_bound_of_the_outer_loop(tmp_path, compiler, body):
+    with pytest.raises(UsageError, match=r"x\.c:\d+ has no bound"):
+        compiled(tmp_path, body, compiler, "-O2")
+
+
+def test_statements_of_loops_in_c():
+    source = """
+    #define EACH(i) for (;;)
+    void f(int n) {
+        for (int i = 0;
+             i < n; i++) /* for (a;b;c) */ { // while (x)
+            while (n > 0)
+                if (n == '}') { n--; } else
+                    n = n - 2;
+            do {
+                n++;
+            } while (n < g("{"));
+        }
+        while (n) for (;;) { n--; }
+    }
+    """
+    assert [(one.first, one.last, one.head) for one in loop_statements(source)] == [
+        (4, 12, "for (int i = 0; i < n; i++)"), (6, 8, "while (n > 0)"), (9, 11, "while (n < g( ))"),
+        (13, 13, "while (n)"), (13, 13, "for (;;)")]
+    assert loop_statements("void f(void) { while (1) {") == []
 
 
 # --- paths ----------------------------------------------------------------------------------------------------------
@@ -434,9 +469,10 @@ def test_observed_executions_contradict_a_model_that_excludes_them(tmp_path):
     ('[[at_most]]\nfunction = "no_such"\ntimes = "1"\nreason = "r"', "no function no_such in the firmware"),
     ('[[never]]\nfunctions = ["no_such"]\nconfigurations = []\nreason = "r"', "no function no_such in the firmware"),
     ('[[loop]]\nfile = "firmware/drive.c"\nstatement = "while (tea)"\ntests = "1"\nreason = "r"',
-     r"firmware/drive.c has no statement while \(tea\)"),
+     r"firmware/drive.c has no loop while \(tea\)"),
     ('[[loop]]\nfile = "firmware/drive.c"\nstatement = "drive"\nreason = "r"', "must have either iterations or tests"),
     ('[[loop]]\nfile = "firmware/drive.c"\nstatement = "drive"\ntests = "1"', "reason"),
+    ('[[loop]]\nfile = "firmware/drive.c"\nstatement = "drive"\ntests = "1"\nreason = "r"', "has no loop drive"),
     ('[[loops]]\nfile = "firmware/drive.c"', "loops"),
 ])
 def test_mistake_in_the_file_of_facts_is_an_error(tmp_path, text, message):

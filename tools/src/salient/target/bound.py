@@ -24,6 +24,7 @@ from salient.elf import ElfImage, Instruction, SourceLocation
 from salient.errors import UsageError
 from salient.paths import ROOT
 from salient.target.bound_facts import Facts, LibraryFact, Names
+from salient.target.c_loops import LoopStatement, loop_statements
 from salient.target.control_flow import Block, ControlFlow, Loop, dominators, loops, place, predecessors
 
 CONTROL = "control_handler"
@@ -118,6 +119,7 @@ class Model:
             if symbol not in symbols:
                 raise UsageError(f"{image.path.name}: no symbol {symbol}")
         self._copies: list[_Copy] = []
+        self._sources: dict[str, tuple[list[str], list[LoopStatement]]] = {}
         self._dominators: dict[int, dict[int, frozenset[int]]] = {}
         self._expand(symbols[handler], None, ())
         if symbols[f"{handler}_return"] & ~1 not in {
@@ -238,24 +240,23 @@ class Model:
 
     def _times(self, copy: _Copy, loop: Loop, of_function: list[Loop]) -> tuple[int, str]:
         """Executions of the loop's first block per entry, and its source line."""
-        closing, others = self._lines(copy, loop)
-        inner = {line for one in loop.inner for line in self._lines(copy, one)[0]}
-        found = [(times, line) for lines in (closing, [line for line in others if line not in inner]) for line in lines
-                 if (times := self._source_times(copy, line, loop)) is not None]
-        for chosen in ([one for one in found if one[1] in closing], found):
-            if chosen:
-                times, line = max(chosen)
-                return times, f"{line[0]}:{line[1]}"
         function = self._code.instruction(copy.entry).function
+        lines = self._lines(copy, loop)
+        statements = [self._statement(*line, lines) for line in dict.fromkeys(lines[:len(loop.repeats)])]
+        found = [(times, statement) for file, statement in statements
+                 if (times := self._source_times(copy, file, statement, loop)) is not None]
+        if found and len(found) == len(statements):
+            times, statement = max(found, key=lambda one: one[0])
+            return times, f"{lines[0][0]}:{statement.first}"
         for library in self._facts.library:
             if library.function == function:
                 return self._library_times(copy, loop, of_function, library), function
-        where = ", ".join(f"{file}:{number}" for file, number in (closing or others)[:3]) or f"{loop.header:#x}"
+        where = ", ".join(dict.fromkeys(f"{file}:{statement.first}" for file, statement in statements))
         raise UsageError(f"{self.image.path.name}: {function}: the loop at {where} has no bound: state one in"
                          " tests/target/bounds.toml")
 
-    def _lines(self, copy: _Copy, loop: Loop) -> tuple[list[tuple[str, int]], list[tuple[str, int]]]:
-        """Source lines of the closing branches of a loop, and of its other instructions outside of inner loops, in the
+    def _lines(self, copy: _Copy, loop: Loop) -> list[tuple[str, int]]:
+        """Source lines of the instructions of a loop, those of its closing branches first, without inner loops, in the
         function in which the loop is written: the innermost one, inlined or not, that has all of them."""
         closing = [copy.blocks[begin].instructions[-1] for begin, _ in loop.repeats]
         others = [one for address in sorted(loop.own) for one in copy.blocks[address].instructions]
@@ -264,18 +265,30 @@ class Model:
         while all(len(stack) > depth + 1 and stack[depth] == stacks[0][depth]
                   and stack[depth + 1].function == stacks[0][depth + 1].function for stack in stacks):
             depth += 1
-        lines = [(stack[depth].file, stack[depth].line) for stack in stacks]
-        return _numbered(lines[:len(closing)]), _numbered(lines[len(closing):])
+        return [(stack[depth].file, stack[depth].line) for stack in stacks]
 
-    def _source_times(self, copy: _Copy, line: tuple[str, int], loop: Loop) -> int | None:
-        """Bound by a fact about the source line, or by the line itself if it is a counted `for`."""
-        text = self._source_line(*line)
-        fact = next((one for one in self._facts.loop if one.file == line[0] and one.statement in text
+    def _statement(self, file: str, line: int, lines: list[tuple[str, int]]) -> tuple[str, LoopStatement]:
+        """The loop statement to which a closing branch on a line belongs: the innermost one around it that has all
+        `lines` that are in the outermost one around it. A line that is in no loop statement stands for itself."""
+        if file not in self._sources:
+            path = self._root / file
+            text = path.read_text(encoding="utf-8") if path.is_file() else ""
+            self._sources[file] = text.splitlines(), loop_statements(text) if path.suffix in (".c", ".h") else []
+        text_lines, statements = self._sources[file]
+        around = [one for one in statements if one.first <= line <= one.last]
+        if not around:
+            return file, LoopStatement(line, line, text_lines[line - 1] if 0 < line <= len(text_lines) else "")
+        nest = {number for name, number in lines if name == file and around[0].first <= number <= around[0].last}
+        return file, next(one for one in reversed(around) if all(one.first <= number <= one.last for number in nest))
+
+    def _source_times(self, copy: _Copy, file: str, statement: LoopStatement, loop: Loop) -> int | None:
+        """Bound by a fact about a loop statement, or by the statement itself if it is a counted `for`."""
+        fact = next((one for one in self._facts.loop if one.file == file and one.statement in statement.head
                      and self._holds(one.configurations)), None)
         if fact is not None and fact.tests is not None:
             return self._value(copy, fact.tests)
         iterations = fact.iterations if fact is not None else None
-        counted = _COUNTED_FOR.search(text)
+        counted = _COUNTED_FOR.search(statement.head)
         if iterations is None and counted and (counted[2].isdigit() or self._names.known(counted[2])):
             iterations = counted[2]
         if iterations is None:
@@ -291,13 +304,6 @@ class Model:
             raise UsageError(f"{self._code.instruction(copy.entry).function}: {site}: its size is no constant")
         return self._names.value(expression, size=copy.size)
 
-    def _source_line(self, file: str, line: int) -> str:
-        path = self._root / file
-        if file not in _sources:
-            _sources[file] = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-        lines = _sources[file]
-        return lines[line - 1] if 0 < line <= len(lines) else ""
-
     def _library_times(self, copy: _Copy, loop: Loop, of_function: list[Loop], library: LibraryFact) -> int:
         if len(library.tests) != len(of_function):
             raise UsageError(f"tests/target/bounds.toml: {library.function} has {len(of_function)} loops, not"
@@ -308,10 +314,11 @@ class Model:
         """Constant third argument of the call at the end of a block."""
         register = "a2" if self.image.is_riscv else "r2"
         for one in reversed(self._block(site).instructions[:-1]):
-            words = re.split(r"[,\s]+", one.operands.partition("@")[0].strip())
-            if words[0] == register:
-                constant = one.mnemonic.partition(".")[0] in ("mov", "movs", "movw", "li") and len(words) == 2
-                return int(words[1].removeprefix("#"), 0) if constant and not words[1][0].isalpha() else None
+            constant = re.fullmatch(rf"{register},\s*#?(0x[0-9a-f]+|[0-9]+)", one.operands.partition("@")[0].strip())
+            if constant and one.mnemonic.partition(".")[0] in ("mov", "movs", "movw", "li"):
+                return int(constant[1], 0)
+            if re.search(rf"\b{register}\b", one.operands):
+                return None
         return None
 
     # --- facts ------------------------------------------------------------------------------------------------------
@@ -486,13 +493,6 @@ def _call_of(function: str, chain: list[SourceLocation]) -> _Call | None:
         if here.function == function:
             return tuple((outer.function, outer.line) for outer in chain[level + 1:])
     return None
-
-
-def _numbered(lines: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:
-    return list(dict.fromkeys(line for line in lines if line[1]))
-
-
-_sources: dict[str, list[str]] = {}
 
 
 def _returning(blocks: Mapping[int, Block]) -> dict[int, Block]:

@@ -17,6 +17,7 @@ from pydantic import Field
 from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.paths import ROOT
+from salient.target.c_loops import loop_statements
 from salient.toml_file import Table, TextFileError, checked, read_toml, validate
 
 FILE = ROOT / "tests" / "target" / "bounds.toml"
@@ -25,9 +26,9 @@ _Text = Annotated[str, checked("a text", lambda value: bool(value.strip()))]
 
 
 class LoopFact(Table):
-    """Bound of the loops of a source line of `file` that contains `statement`. iterations: of the body of a counted
-    loop; tests: evaluations of the condition of a search. Of several facts about a line the
-    first one that holds in the configuration applies."""
+    """Bound of a loop of `file`; `statement` is a part of its `for (...)` or `while (...)`. iterations: of the body of
+    a counted loop, which always ends by its count; tests: evaluations of the condition of a search. Of several facts
+    about a loop the first one that holds in the configuration applies."""
 
     file: _Text
     statement: _Text
@@ -93,8 +94,9 @@ def read_facts(path: Path = FILE, root: Path = ROOT) -> Facts:
         if (loop.iterations is None) == (loop.tests is None):
             raise UsageError(f"{path}: loop {loop.statement}: must have either iterations or tests")
         source = root / loop.file
-        if not source.is_file() or loop.statement not in source.read_text(encoding="utf-8"):
-            raise UsageError(f"{path}: {loop.file} has no statement {loop.statement}")
+        statements = loop_statements(source.read_text(encoding="utf-8")) if source.is_file() else []
+        if not any(loop.statement in one.head for one in statements):
+            raise UsageError(f"{path}: {loop.file} has no loop {loop.statement}")
     named = [name for one in facts.never for name in one.functions]
     named += [name for one in facts.exclusive for name in (*one.functions, *one.excludes)]
     named += [one.function for one in facts.at_most]
