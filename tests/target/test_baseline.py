@@ -13,9 +13,11 @@ from salient.config import CONTROLLERS, TARGET_BUILDS
 from salient.errors import UsageError
 from salient.target import worst_case
 from salient.target.baseline import (
+    BOUND_KEYS,
     FLASH_MAX_BYTES,
     RAM_MAX_BYTES,
     README,
+    profile_table,
     ram_needed,
     read,
     size_table,
@@ -23,6 +25,7 @@ from salient.target.baseline import (
     tables_of,
     with_table,
 )
+from salient.target.bound_report import bounds
 from salient.target.isr_profile import IsrProfile, measure
 from salient.target.trace import Trace
 
@@ -70,6 +73,25 @@ def test_isr_profile_of_the_experiments_matches_the_baseline(controller):
 def test_known_worst_case_matches_the_baseline(variant):
     measured = known_worst_case(variant).metrics()["max"]
     assert measured == pytest.approx(read()["interrupt"][variant]["worst_case"], rel=COUNT_TOLERANCE)
+
+
+@pytest.mark.parametrize("build", BOUND_KEYS)
+def test_computed_bounds_match_the_baseline_and_exceed_every_run(build):
+    for section, variants in bounds(build).items():
+        assert set(variants) == set(worst_case.VARIANTS)
+        for variant, instructions in variants.items():
+            committed = read()[section][variant]
+            assert instructions == pytest.approx(committed[BOUND_KEYS[build]], rel=COUNT_TOLERANCE), variant
+            if section == "interrupt" and build == "cortex-m4":
+                assert committed["worst_case"] <= instructions, variant
+
+
+def test_tables_show_a_deferred_interrupt_if_there_is_one():
+    without = read()
+    assert "deferred" not in profile_table(without["interrupt"], {})
+    table = profile_table(without["interrupt"], {"salient": {"computed_bound": 654}})
+    assert "| computed bound | deferred interrupt: computed bound |" in table
+    assert [line.split(" | ")[-1] for line in table.splitlines() if line.startswith("| salient |")] == ["654 |"]
 
 
 @pytest.mark.parametrize("variant", worst_case.VARIANTS)

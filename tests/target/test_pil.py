@@ -26,7 +26,7 @@ torque_Nm = 5.0
 
 def options(**given) -> argparse.Namespace:
     return argparse.Namespace(**{"scenario": None, "out": None, "target": "cortex-m4", "search": None, "seed": 1,
-                                 "figures": False, **given})
+                                 "bound": None, "figures": False, **given})
 
 
 @pytest.fixture
@@ -70,8 +70,9 @@ def test_fault_of_the_drive_is_exit_code_1(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("line", "message"), [
-    ([], "one of the arguments SCENARIO.toml --search --figures is required"),
+    ([], "one of the arguments SCENARIO.toml --search --bound --figures is required"),
     (["--search", "1", "--figures"], "--figures not allowed with argument --search"),
+    (["--bound", "salient", "--figures"], "--figures not allowed with argument --bound"),
     (["a.toml", "--figures"], "--figures not allowed with argument SCENARIO.toml"),
 ])
 def test_exactly_one_task_is_required_before_anything_is_installed(line, message, capsys):

@@ -101,6 +101,9 @@ def make_parser() -> argparse.ArgumentParser:
                      "time per controller")
     pil.add_argument("--seed", type=_option_type("seed"), default=DEFAULTS["seed"], metavar="N",
                      help=f"seed of the search (default {DEFAULTS['seed']})")
+    task.add_argument("--bound", nargs="?", const="all", metavar="VARIANT",
+                      help="instead: compute the bound of the interrupts of the target from its machine code; with the "
+                      "name of a variant its longest path by function")
     task.add_argument("--figures", action="store_true",
                      help="instead: repeat the measurements of the committed baseline and write it")
     return parser

@@ -4,6 +4,7 @@ binutils of its processor."""
 from __future__ import annotations
 
 import re
+import struct
 import subprocess
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,8 +13,10 @@ from pathlib import Path
 from salient.errors import UsageError
 from salient.paths import ROOT
 
+_RISCV = 243
+_LOADED = 1
 _PROCESSORS = {40: ("arm-none-eabi-", "binutils-arm-none-eabi", 36),
-               243: ("riscv64-unknown-elf-", "binutils-riscv64-unknown-elf", 0)}  # fmt: skip
+               _RISCV: ("riscv64-unknown-elf-", "binutils-riscv64-unknown-elf", 0)}  # fmt: skip
 """By the machine of the ELF header: prefix of the tools' names, their Debian package, size of the exception frame in
 bytes (Cortex-M4: eight words, and one for alignment)."""
 
@@ -53,6 +56,7 @@ class ElfImage:
         if machine not in _PROCESSORS:
             raise UsageError(f"{path}: ELF machine {machine}: must be one of {', '.join(map(str, _PROCESSORS))}")
         self._prefix, self._package, self.exception_frame_bytes = _PROCESSORS[machine]
+        self.is_riscv = machine == _RISCV
 
     def run(self, tool: str, *arguments: str, given: str | None = None) -> str:
         """Output of one of the binutils, called with the arguments followed by the image."""
@@ -71,6 +75,27 @@ class ElfImage:
         """Sizes of the sections in bytes by name."""
         rows = (line.split() for line in self.run("objdump", "-h").splitlines())
         return {row[1]: int(row[2], 16) for row in rows if len(row) == 7 and row[0].isdigit()}
+
+    def read(self, address: int, size: int) -> bytes:
+        """Bytes of a loaded section; UsageError outside of all sections."""
+        content = self._loaded()
+        for begin, loaded in content.items():
+            if begin <= address and address + size <= begin + len(loaded):
+                return loaded[address - begin: address - begin + size]
+        raise UsageError(f"{self.path}: no content at {address:#x}")
+
+    @lru_cache  # noqa: B019 an image is read a few times in a process
+    def _loaded(self) -> dict[int, bytes]:
+        """Content of the loaded segments by address: 32-bit little-endian ELF, System V ABI, program header."""
+        content = self.path.read_bytes()
+        offset, = struct.unpack_from("<I", content, 28)
+        size, count = struct.unpack_from("<HH", content, 42)
+        segments = {}
+        for at in range(offset, offset + size * count, size):
+            kind, begin, address, _, length = struct.unpack_from("<5I", content, at)
+            if kind == _LOADED:
+                segments[address] = content[begin: begin + length]
+        return segments
 
     def stack(self) -> tuple[int, int]:
         """Lowest address of the stack, after the variables, and the address below which it starts."""

@@ -71,6 +71,11 @@ class Variant:
     machine: str = "saturating"
     network: bool = False
 
+    @property
+    def configuration(self) -> str:
+        """Name in the facts of the computed bound (bound_facts.py)."""
+        return NETWORK if self.network else self.controller
+
 
 VARIANTS = {
     **{controller: Variant(controller, controller) for controller in CONTROLLERS},
