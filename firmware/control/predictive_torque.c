@@ -83,7 +83,7 @@ static inline void locate_cell(const machine_tables_t *tables, plan_t *p) {
 
 /* Plans the operating point of a phase for a torque in units of the tables, in the cell of its last plan; true when the
  * point has the torque. */
-NOINLINE static bool plan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
+static inline bool plan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
     if (torque <= 0 && p->flux_min == 0) {
         p->flux = 0;
         p->torque = 0;
@@ -106,7 +106,7 @@ static inline int32_t expected_column(const plan_t *p, int32_t torque, int32_t c
 }
 
 /* Plans a phase again, in another cell if that is where the point is expected. */
-static inline void replan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
+NOINLINE static void replan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
     if (!p->cell->located) {
         locate_cell(tables, p);
     }
