@@ -277,6 +277,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     control->turn ^= 1;
     int32_t shortfall = torque_q24 >> torque_shift;
     bool reached = true;
+    UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
         predict_flux(parameters, control, sample, phase, flux_step_max_q29, flux_shift, p);
@@ -301,6 +302,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         control->torque_shortfall_q24 = fixed_abs(shortfall_q24) > SHORTFALL_TOLERANCE_Q24 ? shortfall_q24 : 0;
     }
     const duty_divisor_t by = duty_divisor(flux_step_max_q29);
+    UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
         const bool above_current_limit = sample->current_q9[phase] > parameters->current_limit_q9;
         duty_q15[phase] = duty_of(&plan[phase], by, flux_shift, above_current_limit);

@@ -54,7 +54,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     if (run) {
         speed_control(parameters, state, sample, command, deferred->speed_law_torque_q24);
         torque_control(parameters, state, deferred, measured);
-        modulate(state->duty_q15, parameters->tables->phases, parameters->period_ticks, parameters->interleaved_pwm,
+        modulate(state->duty_q15, (&machine_tables)->phases, parameters->period_ticks, parameters->interleaved_pwm,
                  compare);
     } else if (was_running) {
         control_prepare(parameters, state);

@@ -37,11 +37,12 @@ void measure(const control_parameters_t *parameters, const load_observer_t *obse
     measure_angle(parameters, observer, &sample->encoder, measured);
     measured->dc_link_voltage_q6 = scale_counts(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
     commutation_find(&parameters->commutation, measured->angle, &measured->commutation);
-    const machine_tables_t *tables = parameters->tables;
+    const machine_tables_t *tables = (&machine_tables);
     const unsigned phases = tables->phases;
     const bool planned = parameters->torque_law == TORQUE_LAW_PREDICTIVE;
     int32_t current_max_q9 = 0;
     int32_t torque_sum = 0;
+    UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
         const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], parameters->current_scale_q18);
         int32_t torque = 0;
