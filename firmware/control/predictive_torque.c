@@ -131,7 +131,10 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     plan_t *corrected = NULL;
     plan_t *opposed = NULL;
     uint32_t first = HALF_REV;
-    for (plan_t *p = plan; p < plan + tables->phases; p++) {
+    const unsigned phases = tables->phases;
+    UNROLL(4)
+    for (unsigned phase = 0; phase < phases; phase++) {
+        plan_t *p = &plan[phase];
         const uint32_t order = p->since_on ^ reversal;
         if (p->positive != positive) {
             opposed = p->limit >= 0 && p->torque > 0 ? p : opposed;
