@@ -36,10 +36,14 @@ void measure(const control_parameters_t *parameters, const load_observer_t *obse
              const control_sample_t *sample, control_measurement_t *measured) {
     measure_angle(parameters, observer, &sample->encoder, measured);
     measured->dc_link_voltage_q6 = scale_counts(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
-    commutation_find(&parameters->commutation, measured->angle, &measured->commutation);
     const machine_tables_t *tables = (&machine_tables);
     const unsigned phases = tables->phases;
     const bool planned = parameters->torque_law == TORQUE_LAW_PREDICTIVE;
+    if (planned) {
+        measured->commutation.electrical = commutation_electrical(&parameters->commutation, measured->angle);
+    } else {
+        commutation_find(&parameters->commutation, measured->angle, &measured->commutation);
+    }
     int32_t current_max_q9 = 0;
     int32_t torque_sum = 0;
     UNROLL(4)
