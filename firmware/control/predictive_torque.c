@@ -49,7 +49,7 @@ static inline bool solve_in_cell(plan_t *p, int32_t torque, int32_t current_limi
     const phase_cell_t *cell = p->cell;
     const int32_t limit_q13 = phase_cell_u_q13(cell, current_limit_q9);
     int32_t v_q13 = phase_cell_solve_q13(cell, torque);
-    bool reached = v_q13 != PHASE_CELL_V_MAX_Q13 && v_q13 != -PHASE_CELL_V_MAX_Q13 - 1;
+    const bool outside = (v_q13 ^ v_q13 >> 31) == PHASE_CELL_V_MAX_Q13;
     int32_t limit = 0;
     if (v_q13 > limit_q13) {
         v_q13 = limit_q13;
@@ -65,8 +65,8 @@ static inline bool solve_in_cell(plan_t *p, int32_t torque, int32_t current_limi
         flux = p->flux_min;
         limit = -1;
     }
-    if (limit != 0 || !reached) {
-        reached = false;
+    const bool reached = limit == 0 && !outside;
+    if (!reached) {
         v_q13 = phase_cell_v_q13(cell, flux);
         torque = phase_cell_torque(cell, v_q13);
     }
@@ -85,6 +85,8 @@ static inline void locate_cell(const machine_tables_t *tables, plan_t *p) {
  * point has the torque. */
 static inline bool plan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
     if (torque <= 0 && p->flux_min == 0) {
+        p->cell->located = false;
+        p->v_q13 = 0;
         p->flux = 0;
         p->torque = 0;
         p->limit = -1;
@@ -288,9 +290,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         p->positive = angle >= HALF_REV;
         p->angle = p->positive ? angle : ~angle; /* mirrored, to 1 LSB */
         p->column = control->column[phase];
-        p->v_q13 = 0;
         p->cell = &cells[phase];
-        p->cell->located = false;
         p->cell->negative = !p->positive;
         reached &= plan_phase(parameters, tables, &half[p->positive], p, flux_step_max_q29 >> flux_shift,
                               sample->angle_step);
