@@ -40,7 +40,6 @@ typedef struct {
     uint32_t angle;           /* 2^-32 electrical rev, mirrored into the half of positive torque */
     uint32_t since_on;        /* angle past turn-on, 2^-32 electrical rev; from 2^31: before turn-on */
     int32_t limit;            /* -1: at flux_min, 1: at flux_max or at the current limit, 0: torque reached */
-    bool positive;            /* the phase itself is in that half */
 } plan_t;
 
 /* Operating point within the cell, or at its end, for a torque within flux_min, flux_max and the current limit, by
@@ -138,7 +137,7 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
         const uint32_t order = p->since_on ^ reversal;
-        if (p->positive != positive) {
+        if (p->cell->negative == positive) {
             opposed = p->limit >= 0 && p->torque > 0 ? p : opposed;
         } else if (order < first && p->limit != limit) {
             first = order;
@@ -152,7 +151,7 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
         corrected = opposed;
     }
     const int32_t before = corrected->torque;
-    const bool adds = corrected->positive;
+    const bool adds = !corrected->cell->negative;
     replan_torque(tables, corrected, adds ? fixed_add(before, shortfall) : fixed_subtract(before, shortfall),
                   current_limit_q9);
     const int32_t gained = corrected->torque - before;
@@ -287,14 +286,14 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         plan_t *p = &plan[phase];
         predict_flux(parameters, control, sample, phase, flux_step_max_q29, flux_shift, p);
         const uint32_t angle = sample->angle - phase * parameters->sharing.stroke - (uint32_t)sample->misalignment[phase];
-        p->positive = angle >= HALF_REV;
-        p->angle = p->positive ? angle : ~angle; /* mirrored, to 1 LSB */
+        const bool positive = angle >= HALF_REV;
+        p->angle = positive ? angle : ~angle; /* mirrored, to 1 LSB */
         p->column = control->column[phase];
         p->cell = &cells[phase];
-        p->cell->negative = !p->positive;
-        reached &= plan_phase(parameters, tables, &half[p->positive], p, flux_step_max_q29 >> flux_shift,
+        p->cell->negative = !positive;
+        reached &= plan_phase(parameters, tables, &half[positive], p, flux_step_max_q29 >> flux_shift,
                               sample->angle_step);
-        shortfall = p->positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
+        shortfall = positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
     }
 
     control->torque_shortfall_q24 = 0;
