@@ -96,7 +96,7 @@ typedef struct {
     int32_t torque_sum_q24;                   /* machine torque, N m, Q7.24, saturated */
     int32_t current_q9[HAL_PHASES_MAX];       /* A, Q7.9 */
     /* In units of the tables, machine_format_t: */
-    int32_t torque[HAL_PHASES_MAX];
+    int32_t torque[HAL_PHASES_MAX];       /* not with predictive torque control */
     int32_t flux_linkage[HAL_PHASES_MAX]; /* with predictive torque control only */
 } control_measurement_t;
 
