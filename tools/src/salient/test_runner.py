@@ -262,8 +262,9 @@ def _pytest(name: str, *files: Path, options: Sequence[str] = (), prefix: Sequen
     report.unlink(missing_ok=True)
     if processes:
         options = ["-n", str(processes), "--dist", "loadgroup", *options]
+    # The processes share the cores: threads of NumPy's linear algebra would only wait for one another.
     good = _succeeds(*prefix, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", ROOT,
-                     f"--junitxml={report}", *options, *files, quiet=quiet)
+                     f"--junitxml={report}", *options, *files, quiet=quiet, OPENBLAS_NUM_THREADS="1")
     count = _read_report(report)
     # Failures outside of the tests: a crash, an error at the end of the session.
     if not good and not count.failed:
