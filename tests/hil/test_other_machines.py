@@ -8,8 +8,6 @@ import pytest
 
 from salient.paths import MACHINES
 
-pytestmark = pytest.mark.xdist_group("machine_builds")
-
 
 @pytest.fixture(scope="module")
 def machine_file(tmp_path_factory):

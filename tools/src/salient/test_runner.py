@@ -166,7 +166,7 @@ PYTHON_TESTS = {
     "plant": "the emulated plant compared with reference solvers.",
     "target": "the firmware for Cortex-M4 (compiled in three ways) and RV32: symbols and size checked, run in QEMU.",
 }
-"""Folder of tests: its claim. The folder with the longest groups of one process is first."""
+"""Folder of tests: its claim. Last the folder with the longest file, whose tests use every core themselves."""
 
 
 # --- parts of steps -------------------------------------------------------------------------------------------------
@@ -257,11 +257,12 @@ def _experiments(build: str) -> Count:
 
 def _pytest(name: str, *files: Path, options: Sequence[str] = (), prefix: Sequence[str] = (),
             processes: int = CORES, quiet: bool = False) -> Count:
-    """Runs pytest in parallel processes; tests of one xdist_group (tests/conftest.py) share a process."""
+    """Runs pytest in parallel processes. The tests of a file share a process, which makes the file's fixtures once; the
+    files start in their order."""
     report = RESULTS / f"{name}.xml"
     report.unlink(missing_ok=True)
     if processes:
-        options = ["-n", str(processes), "--dist", "loadgroup", *options]
+        options = ["-n", str(processes), "--dist", "loadfile", "--no-loadscope-reorder", *options]
     # The processes share the cores: threads of NumPy's linear algebra would only wait for one another.
     good = _succeeds(*prefix, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", ROOT,
                      f"--junitxml={report}", *options, *files, quiet=quiet, OPENBLAS_NUM_THREADS="1")
