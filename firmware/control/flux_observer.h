@@ -19,8 +19,8 @@ typedef struct {
 
 /* One sample of one phase: corrects *flux_q29 (Wb, Q2.29) and advances it to the next sample. table_q29: flux linkage
  * from the tables at the measured current, Wb, Q2.29; 0 without current. applied_q29: volt-seconds of the duty that
- * acts in this period, Wb, Q2.29. current_q9: A, Q7.9, 0..2^18. Returns R i Ts in Wb, Q2.29. The correction is rounded to
- * 4 LSB, the drop to 1; sums saturate. */
+ * acts in this period, Wb, Q2.29. current_q9: A, Q7.9, 0..2^18. Returns R i Ts in Wb, Q2.29. The correction is rounded
+ * to 4 LSB, the drop to 1; sums saturate. */
 int32_t flux_observer_step(const flux_observer_parameters_t *parameters, int32_t *flux_q29, int32_t table_q29,
                            int32_t applied_q29, int32_t current_q9);
 

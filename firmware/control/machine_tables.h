@@ -59,7 +59,8 @@ typedef struct {
     uint8_t angle_bin_row[MACHINE_ANGLE_BINS]; /* row in which each angle bin begins */
     machine_format_t torque_format;
     machine_format_t flux_format;
-    int8_t curvature[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN]; /* of the interval that begins at the row; last row: 0 */
+    int8_t
+        curvature[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN]; /* of the interval that begins at the row; last row: 0 */
     int16_t node[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
 } machine_tables_t;
 

@@ -64,9 +64,8 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const int64_t sum_before_q24 = phase->last_sum_q24;
     phase->last_sum_q24 = misalignment->disturbance_sum_q24;
     const int32_t current_q9 = sample->current_q9;
-    const int32_t slope_q24 = current_q9 > 0 ? phase_map_torque_slope_q24(tables, sample->angle, current_q9,
-                                                                          2 * parameters->probe_angle)
-                                             : 0;
+    const int32_t slope_q24 =
+        current_q9 > 0 ? phase_map_torque_slope_q24(tables, sample->angle, current_q9, 2 * parameters->probe_angle) : 0;
     low_pass_step(&phase->slope_lag1_q24, slope_q24, parameters->filter_q16);
     low_pass_step(&phase->slope_lag2_q24, phase->slope_lag1_q24, parameters->filter_q16);
     low_pass_step(&phase->slope_mean_q24, phase->slope_lag2_q24, mean_gain_q16);

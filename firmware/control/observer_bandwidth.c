@@ -95,9 +95,8 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
                                                      observer_bandwidth_t *bandwidth,
                                                      const observer_bandwidth_limits_t *limits, int32_t innovation,
                                                      bool from_edge) {
-    const unsigned stage = parameters->adaptive
-                               ? adaptive_stage(parameters, bandwidth, limits, innovation, from_edge)
-                               : LAST_STAGE;
+    const unsigned stage =
+        parameters->adaptive ? adaptive_stage(parameters, bandwidth, limits, innovation, from_edge) : LAST_STAGE;
     return &parameters->gains[stage];
 }
 

@@ -4,8 +4,8 @@
  *   y(u) = middle + u (rise + u curvature),   u = (i - i_middle) / column width
  *
  * exactly what phase_map.h interpolates for u in -1/2..1/2, because value_T and value_psi are linear in the current
- * between columns and the result is their product with the current. Beyond, T / i and psi / i continue linearly: usable
- * to half a column further, u in -1..1.
+ * between columns and the result is their product with the current. Beyond, T / i and psi / i continue linearly; the
+ * error there is stated by tests/unit/control/test_phase_cell.cpp.
  *
  * Torque over flux linkage, to second order, with v = (psi - psi_middle) / rise_psi = u + u^2 c_psi / rise_psi:
  *
@@ -25,7 +25,7 @@
 
 #define PHASE_CELL_COLUMN_MAX (MACHINE_COLUMNS - 2)
 
-/* u and v in Q2.13; v is saturated to -2..2 - 2^-13. */
+/* u and v in Q2.13; v is saturated to -2..2 - 2^-13, a column and a half beyond the cell. */
 #define PHASE_CELL_V_BITS 15
 #define PHASE_CELL_V_MAX_Q13 ((1 << (PHASE_CELL_V_BITS - 1)) - 1)
 #define PHASE_CELL_U_BITS 16
@@ -44,7 +44,7 @@ typedef struct {
     phase_cell_curve_t flux;   /* over u */
     int32_t curvature;         /* c of the torque over v */
     int32_t column;
-    bool located; /* the cell is known */
+    bool located;  /* the cell is known */
     bool negative; /* the phase is in the half of negative torque */
 } phase_cell_t;
 
@@ -80,7 +80,8 @@ ALWAYS_INLINE void phase_cell_locate(const machine_tables_t *tables, uint32_t di
     cell->flux =
         phase_cell_curve(phase_map_flux_value_q14(&lookup, low), phase_map_flux_value_q14(&lookup, high), low_q9);
     const int32_t ratio_q13 = phase_cell_quotient_q13(cell->flux.curvature, cell->flux.rise, PHASE_CELL_V_BITS);
-    const int32_t curvature = cell->torque.curvature - 2 * fixed_multiply_high(cell->torque.rise, ratio_q13 * (1 << 18));
+    const int32_t curvature =
+        cell->torque.curvature - 2 * fixed_multiply_high(cell->torque.rise, ratio_q13 * (1 << 18));
     cell->curvature = fixed_saturate_bits(curvature, PHASE_CELL_RISE_BITS - 2);
 }
 
@@ -110,7 +111,8 @@ ALWAYS_INLINE int32_t phase_cell_torque(const phase_cell_t *cell, int32_t v_q13)
 }
 
 ALWAYS_INLINE int32_t phase_cell_solve_q13(const phase_cell_t *cell, int32_t torque) {
-    const int32_t rest_q5 = fixed_saturate_bits(fixed_subtract(torque, cell->torque.middle), PHASE_CELL_RISE_BITS) * (1 << 5);
+    const int32_t rest_q5 =
+        fixed_saturate_bits(fixed_subtract(torque, cell->torque.middle), PHASE_CELL_RISE_BITS) * (1 << 5);
     const int32_t rise = ((cell->torque.rise + (1 << 7)) >> 8) | 1; /* 2^8 units */
     const int32_t curvature = cell->curvature >> 8;
     const int32_t first_q13 = fixed_saturate_bits(rest_q5 / rise, PHASE_CELL_V_BITS);

@@ -10,7 +10,7 @@
 /* 0.25 Wb: 512 V for half a millisecond. */
 #define FLUX_STEP_LIMIT_Q29 (1 << 27)
 
-/* Twice the largest unit of the tables, so that the division in set_duties() is defined without a DC link: 0.6 V at 40
+/* Twice the largest unit of the tables, so that the division in duty_of() is defined without a DC link: 0.6 V at 40
  * kHz. */
 #define FLUX_STEP_MIN_Q29 (1 << 13)
 
@@ -98,16 +98,17 @@ static inline bool plan_torque(const machine_tables_t *tables, plan_t *p, int32_
 /* Column in which the operating point for a torque > 0 is expected, by straight lines. */
 static inline int32_t expected_column(const plan_t *p, int32_t torque, int32_t current_limit_q9) {
     const phase_cell_t *cell = p->cell;
-    const int32_t distance_q4 = fixed_clamp(phase_cell_distance_q4(&cell->torque, torque),
-                                            phase_cell_distance_q4(&cell->flux, p->flux_min),
-                                            phase_cell_distance_q4(&cell->flux, p->flux_max));
+    const int32_t distance_q4 =
+        fixed_clamp(phase_cell_distance_q4(&cell->torque, torque), phase_cell_distance_q4(&cell->flux, p->flux_min),
+                    phase_cell_distance_q4(&cell->flux, p->flux_max));
     const int32_t limit_column = current_limit_q9 >> MACHINE_COLUMN_BITS;
     const int32_t column = fixed_add(p->column, fixed_add(distance_q4, COLUMN_Q4 / 2) >> 4);
     return fixed_clamp(column, 0, limit_column < PHASE_CELL_COLUMN_MAX ? limit_column : PHASE_CELL_COLUMN_MAX);
 }
 
 /* Plans a phase again, in another cell if that is where the point is expected. */
-NOINLINE static void replan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
+NOINLINE static void replan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque,
+                                   int32_t current_limit_q9) {
     if (!p->cell->located) {
         locate_cell(tables, p);
     }
@@ -155,7 +156,7 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     replan_torque(tables, corrected, adds ? fixed_add(before, shortfall) : fixed_subtract(before, shortfall),
                   current_limit_q9);
     const int32_t gained = corrected->torque - before;
-    return adds ? shortfall - gained : shortfall + gained;
+    return adds ? fixed_subtract(shortfall, gained) : fixed_add(shortfall, gained);
 }
 
 torque_sharing_window_t predictive_torque_move_windows(const predictive_torque_parameters_t *parameters,
@@ -177,8 +178,8 @@ static int32_t share_of(int32_t torque_q24, int32_t share_q15) {
     return share_q15 == ONE_Q15 ? torque_q24 : 4 * fixed_multiply_high(torque_q24, share_q15 << 15);
 }
 
-/* Flux linkage that -Vdc removes until `travel` is covered at `angle_step` per period, 2^-32 electrical rev; in the unit
- * of flux_step_max, saturated. */
+/* Flux linkage that -Vdc removes until `travel` is covered at `angle_step` per period, 2^-32 electrical rev; in the
+ * unit of flux_step_max, saturated. */
 static inline int32_t removable_flux(int32_t flux_step_max, uint32_t travel, uint32_t angle_step) {
     const uint32_t periods_q8 = travel / ((angle_step >> 8) + 1);
     const uint64_t flux_q8 = (uint64_t)(uint32_t)flux_step_max * periods_q8;
@@ -192,9 +193,9 @@ static inline void predict_flux(const predictive_torque_parameters_t *parameters
     int32_t *flux_q29 = &control->flux_q29[phase];
     /* Q15 * Q29 to Q29. */
     const int32_t applied_q29 = fixed_multiply_high(control->duty_q15[phase] * (1 << 14), flux_step_max_q29 << 3);
-    const int32_t resistive_drop_q29 = flux_observer_step(
-        &parameters->flux, flux_q29, (int32_t)((uint32_t)sample->flux[phase] << flux_shift), applied_q29,
-        sample->current_q9[phase]);
+    const int32_t resistive_drop_q29 =
+        flux_observer_step(&parameters->flux, flux_q29, (int32_t)((uint32_t)sample->flux[phase] << flux_shift),
+                           applied_q29, sample->current_q9[phase]);
     p->freewheeling_q29 = fixed_subtract(*flux_q29, resistive_drop_q29);
     p->flux_min = non_negative(fixed_subtract(p->freewheeling_q29, flux_step_max_q29)) >> flux_shift;
     p->flux_max = non_negative(fixed_add(p->freewheeling_q29, flux_step_max_q29)) >> flux_shift;
@@ -213,8 +214,8 @@ static inline bool plan_phase(const predictive_torque_parameters_t *parameters, 
     p->since_on = p->angle - half->window->turn_on;
     const int32_t torque = half->torque > 0 ? share_of(half->torque, torque_sharing_q15(half->window, p->angle)) : 0;
     if (half->braking && p->flux_max > p->flux_min) {
-        p->flux_max = fixed_clamp(removable_flux(flux_step_max, p->angle - HALF_REV, angle_step), p->flux_min,
-                                  p->flux_max);
+        p->flux_max =
+            fixed_clamp(removable_flux(flux_step_max, p->angle - HALF_REV, angle_step), p->flux_min, p->flux_max);
     }
     return plan_torque(tables, p, torque, parameters->current_limit_q9);
 }
@@ -285,21 +286,22 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
         predict_flux(parameters, control, sample, phase, flux_step_max_q29, flux_shift, p);
-        const uint32_t angle = sample->angle - phase * parameters->sharing.stroke - (uint32_t)sample->misalignment[phase];
+        const uint32_t angle =
+            sample->angle - phase * parameters->sharing.stroke - (uint32_t)sample->misalignment[phase];
         const bool positive = angle >= HALF_REV;
         p->angle = positive ? angle : ~angle; /* mirrored, to 1 LSB */
         p->column = control->column[phase];
         p->cell = &cells[phase];
         p->cell->negative = !positive;
-        reached &= plan_phase(parameters, tables, &half[positive], p, flux_step_max_q29 >> flux_shift,
-                              sample->angle_step);
+        reached &=
+            plan_phase(parameters, tables, &half[positive], p, flux_step_max_q29 >> flux_shift, sample->angle_step);
         shortfall = positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
     }
 
     control->torque_shortfall_q24 = 0;
     if (!reached) {
-        shortfall = correct_torque(tables, plan, torque_q24 >= 0, sample->reverse, parameters->current_limit_q9,
-                                   shortfall);
+        shortfall =
+            correct_torque(tables, plan, torque_q24 >= 0, sample->reverse, parameters->current_limit_q9, shortfall);
         const int32_t shortfall_q24 = phase_map_scale(&tables->torque_format, shortfall);
         control->torque_shortfall_q24 = fixed_abs(shortfall_q24) > SHORTFALL_TOLERANCE_Q24 ? shortfall_q24 : 0;
     }

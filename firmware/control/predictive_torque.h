@@ -1,7 +1,7 @@
 /* Predictive torque control: deadbeat flux-linkage control of each phase, following a torque sharing function.
  *
  *   sample k          flux linkage now, and at k + 1 under the voltage that already acts (flux_observer.h)
- *   target            at the angle of k + 2: share of the torque -> current -> flux linkage (phase_map.h)
+ *   target            at the angle of k + 2: share of the torque -> flux linkage (phase_cell.h)
  *   voltage           duty = (psi*(k+2) - psi(k+1) + R i Ts) / (Vdc Ts), acts from k + 1 to k + 2
  *
  * Deadbeat flux control: B. H. Kenny, R. D. Lorenz, "Stator- and rotor-flux-based deadbeat direct torque control of
@@ -9,10 +9,17 @@
  * psi(k+2) = psi(k+1) + Ts (duty Vdc - R i), solved for the duty with psi(k+2) = psi*. Torque sharing:
  * torque_sharing.h.
  *
- * In one period a flux linkage changes by at most +-Vdc Ts. When that does not reach the target, the torque shortfall
- * (or excess) is redistributed to the other phases in the order of DITC (ditc_hysteresis.h): a shortfall to the
- * incoming phase first, then to the active, then to the outgoing one; an excess is taken from the outgoing phase first.
+ * Each phase is planned in one cell of the tables, a column wide and usable two columns beyond, at the current that is
+ * expected from its last two plans: no search, and the same number of instructions for any sample. In one period a flux
+ * linkage changes by at most +-Vdc Ts. When that, or the end of a cell, keeps phases from their torque, one phase is
+ * planned again with the sum of what is missing, in the order of DITC (ditc_hysteresis.h): a shortfall goes to the
+ * phase that entered last and can make more torque, an excess is taken from the one that entered first and can make
+ * less. This correction is free to change to another cell, so that a load step is answered within the period. Measured
+ * (tools/salient compare dip speeds): as many corrections and cells as phases give the same speed drop and ripple.
  * Switch states are those of DITC: every duty alternates between +1 and 0 or between -1 and 0.
+ *
+ * Two periods later the cell of the plan also gives torque and flux linkage from the measured current
+ * (predictive_torque_estimate), at the predicted angle.
  *
  * Four quadrants: a phase makes positive torque between unaligned and aligned position, negative torque in the other
  * half of the electrical revolution, where all quantities are evaluated at the mirrored angle.
@@ -52,9 +59,9 @@ typedef struct {
 } predictive_torque_parameters_t;
 
 typedef struct {
-    int32_t flux_q29[HAL_PHASES_MAX]; /* predicted for the coming sample, Wb, Q2.29 */
-    int32_t duty_q15[HAL_PHASES_MAX]; /* acts from the coming sample on, Q1.15 */
-    int32_t torque_shortfall_q24;     /* reference less planned torque, N m, Q7.24; 0 within 1/64 N m */
+    int32_t flux_q29[HAL_PHASES_MAX];     /* predicted for the coming sample, Wb, Q2.29 */
+    int32_t duty_q15[HAL_PHASES_MAX];     /* acts from the coming sample on, Q1.15 */
+    int32_t torque_shortfall_q24;         /* reference less planned torque, N m, Q7.24; 0 within 1/64 N m */
     int32_t position_q13[HAL_PHASES_MAX]; /* of the planned operating point, in table columns, Q13; about 0..40 */
     uint8_t column[HAL_PHASES_MAX];       /* table column in which the next plan begins */
     phase_cell_t cell[2][HAL_PHASES_MAX]; /* of the plans for this sample and for the next one, in turn */

@@ -35,7 +35,8 @@ typedef struct {
 int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, int32_t x_q22);
 
 /* Torque reference in N m, Q7.24, clamped to the limits: reaching torque, load torque (N m, Q7.24) and friction at a
- * speed in rad/s, Q9.22, any values. Sums saturate; the friction torque is rounded down, within 16 LSB of saturation when it saturates. */
+ * speed in rad/s, Q9.22, any values. Sums saturate; the friction torque is rounded down, within 16 LSB of saturation
+ * when it saturates. */
 int32_t speed_smc_torque_q24(const speed_smc_parameters_t *parameters, int32_t reaching_q24, int32_t speed_q22,
                              int32_t load_torque_q24);
 

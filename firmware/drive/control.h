@@ -92,9 +92,9 @@ typedef struct {
     int32_t predicted_speed_q22; /* observer's prediction for this sample, rad/s, Q9.22 */
     int32_t dc_link_voltage_q6;  /* V, Q9.6 */
     commutation_t commutation;
-    int32_t current_max_q9;                   /* largest phase current, A, Q7.9 */
-    int32_t torque_sum_q24;                   /* machine torque, N m, Q7.24, saturated */
-    int32_t current_q9[HAL_PHASES_MAX];       /* A, Q7.9 */
+    int32_t current_max_q9;             /* largest phase current, A, Q7.9 */
+    int32_t torque_sum_q24;             /* machine torque, N m, Q7.24, saturated */
+    int32_t current_q9[HAL_PHASES_MAX]; /* A, Q7.9 */
     /* In units of the tables, machine_format_t: */
     int32_t torque[HAL_PHASES_MAX];       /* not with predictive torque control */
     int32_t flux_linkage[HAL_PHASES_MAX]; /* with predictive torque control only */
@@ -122,7 +122,7 @@ typedef struct {
     observer_bandwidth_t bandwidth;
     protection_t protection;
     state_machine_t state_machine;
-    int32_t torque_reference_q24; /* 0 outside RUN */
+    int32_t torque_reference_q24;     /* 0 outside RUN */
     int32_t duty_q15[HAL_PHASES_MAX]; /* of the last period in RUN, -32768..32768 */
     ditc_hysteresis_t hysteresis;
     pwm_ditc_t duty;

@@ -1,5 +1,5 @@
-/* Speed control: torque reference from the commanded speed. The law is computed by the deferred step and acts one period
- * later; the feed-forward of the estimated load, which decides the speed drop after a load step, in the control
+/* Speed control: torque reference from the commanded speed. The law is computed by the deferred step and acts one
+ * period later; the feed-forward of the estimated load, which decides the speed drop after a load step, in the control
  * interrupt. */
 #ifndef DRIVE_SPEED_CONTROL_H
 #define DRIVE_SPEED_CONTROL_H
