@@ -8,7 +8,7 @@
 
 static void configure(drive_t *drive) {
     const control_parameters_t control_parameters =
-        configure_control(&drive->parameters, drive->tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
+        configure_control(&drive->parameters, &machine_tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
                           hal_adc_bits(drive->hal));
     hal_critical_enter(drive->hal);
     drive->control_parameters = control_parameters;
@@ -17,16 +17,16 @@ static void configure(drive_t *drive) {
     drive->applied_revision = drive->parameters.revision;
 }
 
-bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, const drive_config_t *config) {
+bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     if (!configure_rate_allowed(config->control_rate_hz)) {
         return false;
     }
-    *drive = (drive_t){.hal = hal, .tables = tables, .control_rate_hz = config->control_rate_hz};
+    *drive = (drive_t){.hal = hal, .control_rate_hz = config->control_rate_hz};
     parameters_init(&drive->parameters);
     parameters_set_default(&drive->parameters, PARAMETER_CONTROLLER, (int32_t)config->controller);
-    parameters_set_default(&drive->parameters, PARAMETER_INERTIA_KG_M2, tables->inertia_q30);
-    parameters_set_default(&drive->parameters, PARAMETER_FRICTION_NM_S, tables->friction_q30);
-    parameters_set_default(&drive->parameters, PARAMETER_RESISTANCE_OHM, tables->resistance_q24);
+    parameters_set_default(&drive->parameters, PARAMETER_INERTIA_KG_M2, machine_tables.inertia_q30);
+    parameters_set_default(&drive->parameters, PARAMETER_FRICTION_NM_S, machine_tables.friction_q30);
+    parameters_set_default(&drive->parameters, PARAMETER_RESISTANCE_OHM, machine_tables.resistance_q24);
     comms_init(&drive->comms, hal_time_us(hal));
     configure(drive);
     control_reset(&drive->control_parameters, &drive->control);

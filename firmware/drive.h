@@ -30,7 +30,6 @@ typedef struct {
                                       next  are written by the deferred interrupt */
     uint32_t deferred_worst_ticks; /* maximum since start */
     /* Used by the background only. */
-    const machine_tables_t *tables;
     uint32_t control_rate_hz;
     parameters_t parameters;
     uint32_t applied_revision; /* parameters.revision from which control_parameters are derived */
@@ -38,8 +37,8 @@ typedef struct {
 } drive_t;
 
 /* Prepares the drive and starts the timer. Returns false, and starts nothing, for a control rate that the timer cannot
- * make. hal and tables must outlive the drive. [background, before anything else] */
-bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, const drive_config_t *config);
+ * make. hal must outlive the drive. [background, before anything else] */
+bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config);
 
 /* One control period. [interrupt] */
 void drive_control_interrupt(drive_t *drive);

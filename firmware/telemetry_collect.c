@@ -13,12 +13,12 @@ static uint32_t gain_per_Nm_q15(const drive_t *drive, unsigned gain) {
 
 /* Mean of the phases, mechanical, 2^-32 turn. */
 static int32_t misalignment(const drive_t *drive) {
-    const int32_t phases = drive->tables->phases;
+    const int32_t phases = machine_tables.phases;
     int64_t sum = 0;
     for (int32_t phase = 0; phase < phases; phase++) {
         sum += drive->control.deferred.misalignment.phase[phase].offset;
     }
-    return (int32_t)sum / (phases * drive->tables->rotor_poles);
+    return (int32_t)sum / (phases * machine_tables.rotor_poles);
 }
 
 void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry) {
@@ -38,7 +38,8 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->status.cycle = drive->comms.telemetry.cycle;
 
     telemetry->motion.speed_rpm = units_milli_rpm(control->observer.speed_q22);
-    telemetry->motion.speed_reference_rpm = units_milli_rpm(deferred_results(&control->deferred_request, &control->deferred.response)->speed_reference_q22);
+    telemetry->motion.speed_reference_rpm =
+        units_milli_rpm(deferred_results(&control->deferred_request, &control->deferred.response)->speed_reference_q22);
     telemetry->motion.rotor_angle_deg = units_angle_u16(measured->angle);
 
     telemetry->torque.torque_reference_nm = units_torque_q8(control->torque_reference_q24);
@@ -99,6 +100,6 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->heartbeat.state = control->state_machine.state;
     telemetry->heartbeat.fault = record->fault;
     telemetry->heartbeat.controller = parameters->controller;
-    telemetry->heartbeat.phases = drive->tables->phases;
+    telemetry->heartbeat.phases = machine_tables.phases;
     telemetry->heartbeat.control_rate_hz = drive->control_rate_hz;
 }

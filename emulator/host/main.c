@@ -41,7 +41,7 @@ int main(int argc, char *argv[]) {
         .control_rate_hz = options.control_rate_hz,
         .controller = (drive_controller_t)options.controller_index,
     };
-    if (drive_init(&drive, &hal, &machine_tables, &drive_config)) {
+    if (drive_init(&drive, &hal, &drive_config)) {
         simulation_run(&simulation, &(rig_firmware_t){.control_interrupt = control_interrupt,
                                                       .deferred_interrupt = deferred_interrupt,
                                                       .background = background,

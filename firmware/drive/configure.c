@@ -204,7 +204,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     const controller_t controller = controller_from(values);
 
     control_parameters_t control = {
-        .tables = tables,
         .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
         .speed_law = controller.speed_law,
         .torque_law = controller.torque_law,

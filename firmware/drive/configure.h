@@ -16,8 +16,8 @@ typedef struct {
 /* True for the supported control rates; half a period is an integer number of timer ticks. */
 bool configure_rate_allowed(uint32_t control_rate_hz);
 
-/* Control parameters for a machine, a control rate and the board's resolutions (hal_encoder_bits, hal_adc_bits).
- * [background] */
+/* Control parameters for a machine (machine_tables, for which the control interrupt is linked), a control rate and the
+ * board's resolutions (hal_encoder_bits, hal_adc_bits). [background] */
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
                                        uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits);
 

@@ -55,7 +55,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
         state->torque_reference_q24 =
             speed_control_torque_q24(parameters, &state->observer, sample, deferred->speed_law_torque_q24);
         torque_control(parameters, state, deferred, measured);
-        modulate(state->duty_q15, (&machine_tables)->phases, parameters->period_ticks, parameters->interleaved_pwm,
+        modulate(state->duty_q15, machine_tables.phases, parameters->period_ticks, parameters->interleaved_pwm,
                  compare);
     } else if (was_running) {
         control_prepare(parameters, state);

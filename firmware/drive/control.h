@@ -48,7 +48,6 @@ typedef enum {
 
 /* Constant while the drive runs; derived from the user's parameters by configure_control. */
 typedef struct {
-    const machine_tables_t *tables;
     drive_controller_t controller; /* for telemetry; the laws below are its parts */
     speed_law_t speed_law;
     torque_law_t torque_law;

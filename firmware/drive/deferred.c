@@ -116,7 +116,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
         .steady = observer_bandwidth_steady(&parameters->bandwidth, input->bandwidth.stage) &&
                   speed_error_q22 < fixed_abs(input->speed_q22) / 64 && input->torque_shortfall_q24 == 0,
     };
-    misalignment_step(&parameters->misalignment, &deferred->misalignment, (&machine_tables), &sample);
+    misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);
 }
 
 void deferred_compute(const control_parameters_t *parameters, control_state_t *state) {

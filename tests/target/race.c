@@ -209,7 +209,7 @@ __attribute__((used)) void program_deferred(void) { /* likewise */
 noreturn void program_start(void) {
     memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start)); /* there are no other variables */
     const drive_config_t config = {.control_rate_hz = board.mailbox.control_rate_hz};
-    const bool started = drive_init(&drive, &board, &machine_tables, &config);
+    const bool started = drive_init(&drive, &board, &config);
     board_interrupt_enable();
     doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REJECTED);
     uint32_t sequence = 1;

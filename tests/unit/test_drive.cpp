@@ -108,7 +108,7 @@ class Drive : public testing::Test {
     void SetUp() override {
         hal.adc.bus_voltage_counts = 240 * 8;
         const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
-        ASSERT_TRUE(drive_init(&drive, &hal, &machine_tables, &config));
+        ASSERT_TRUE(drive_init(&drive, &hal, &config));
     }
 
     // The deferred interrupt, when it is requested.
@@ -166,7 +166,7 @@ TEST_F(Drive, refuses_a_rate_that_the_timer_cannot_make_and_starts_nothing) {
         hal_t other;
         drive_t refused;
         const drive_config_t config = {.control_rate_hz = rate_hz, .controller = DRIVE_CONTROLLER_TRADITIONAL};
-        EXPECT_FALSE(drive_init(&refused, &other, &machine_tables, &config));
+        EXPECT_FALSE(drive_init(&refused, &other, &config));
         EXPECT_TRUE(other.starts.empty());
         EXPECT_EQ(other.writes, 0u);
     }
@@ -387,7 +387,7 @@ TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
     other_hal.adc.bus_voltage_counts = 240 * 8;
     drive_t other;
     const drive_config_t config = {.control_rate_hz = 20000, .controller = DRIVE_CONTROLLER_TRADITIONAL};
-    ASSERT_TRUE(drive_init(&other, &other_hal, &machine_tables, &config));
+    ASSERT_TRUE(drive_init(&other, &other_hal, &config));
     periods(100);
     command(COMMAND_RUN);
     for (int k = 0; k < 50; k++) {

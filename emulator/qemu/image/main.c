@@ -28,7 +28,7 @@ static noreturn void run(void) {
         .control_rate_hz = mailbox->control_rate_hz,
         .controller = (drive_controller_t)mailbox->controller,
     };
-    const bool started = drive_init(&drive, &board, &machine_tables, &config);
+    const bool started = drive_init(&drive, &board, &config);
     board_interrupt_enable();
     doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REJECTED);
     for (;;) {
