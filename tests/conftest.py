@@ -1,4 +1,4 @@
-"""Shared fixtures and the distribution of tests over processes. `bench` and `make_bench` come from the package."""
+"""Shared fixtures. `bench` and `make_bench` come from the package."""
 
 from __future__ import annotations
 
@@ -14,17 +14,6 @@ from salient.paths import ROOT
 
 # Tests of the benchmark use the reference model of the plant, too.
 sys.path.append(str(ROOT / "tests" / "plant"))
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """With `pytest -n N --dist loadgroup`, tests that share a fixture of a module run in one process, which makes it
-    once. A test's explicit mark xdist_group has priority."""
-    for item in items:
-        definitions = item._fixtureinfo.name2fixturedefs.values()
-        shared = [definition for definition in (found[-1] for found in definitions if found)
-                  if definition.scope == "module" and definition.baseid]
-        if shared and item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
 
 
 @pytest.fixture

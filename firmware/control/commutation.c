@@ -23,7 +23,7 @@ commutation_parameters_t commutation_configure(const commutation_angles_t *angle
 }
 
 void commutation_find(const commutation_parameters_t *parameters, uint32_t rotor_angle, commutation_t *commutation) {
-    const uint32_t electrical = rotor_angle * parameters->rotor_poles; /* wraps modulo an electrical revolution */
+    const uint32_t electrical = commutation_electrical(parameters, rotor_angle);
     commutation->electrical = electrical;
     /* Complete strokes since turn-on of phase 0: the phase turned on last, and its angle past turn-on. */
     const uint32_t since_phase_0_on = electrical - parameters->turn_on;

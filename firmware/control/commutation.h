@@ -52,6 +52,11 @@ commutation_parameters_t commutation_configure(const commutation_angles_t *angle
 /* Roles of the phases for a rotor angle in 2^-32 mechanical rev. */
 void commutation_find(const commutation_parameters_t *parameters, uint32_t rotor_angle, commutation_t *commutation);
 
+/* Angle of phase 0, 2^-32 electrical rev, for a rotor angle in 2^-32 mechanical rev; wraps. */
+static inline uint32_t commutation_electrical(const commutation_parameters_t *parameters, uint32_t rotor_angle) {
+    return rotor_angle * parameters->rotor_poles;
+}
+
 /* Angle of a phase, 2^-32 electrical rev. */
 static inline uint32_t commutation_angle(const commutation_parameters_t *parameters, const commutation_t *commutation,
                                          unsigned phase) {

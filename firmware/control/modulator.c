@@ -1,5 +1,7 @@
 #include "control/modulator.h"
 
+#include "fixed/compiler.h"
+
 static void set_phase(hal_pwm_compare_t *compare, unsigned phase, int32_t duty_q15, int32_t period_ticks) {
     /* Magnitude at most the period: 2^15 * 2^15 before the shift. */
     const int32_t ticks = (duty_q15 * period_ticks + MODULATOR_DUTY_ONE_Q15 / 2) >> 15;
@@ -19,10 +21,12 @@ static void set_phase_interleaved(hal_pwm_compare_t *compare, unsigned phase, in
 void modulate(const int32_t duty_q15[], unsigned phases, uint16_t period_ticks, bool interleaved,
               hal_pwm_compare_t *compare) {
     if (interleaved) {
+        UNROLL(4)
         for (unsigned phase = 0; phase < phases; phase++) {
             set_phase_interleaved(compare, phase, duty_q15[phase], period_ticks);
         }
     } else {
+        UNROLL(4)
         for (unsigned phase = 0; phase < phases; phase++) {
             set_phase(compare, phase, duty_q15[phase], period_ticks);
         }

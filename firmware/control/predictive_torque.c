@@ -40,7 +40,6 @@ typedef struct {
     uint32_t angle;           /* 2^-32 electrical rev, mirrored into the half of positive torque */
     uint32_t since_on;        /* angle past turn-on, 2^-32 electrical rev; from 2^31: before turn-on */
     int32_t limit;            /* -1: at flux_min, 1: at flux_max or at the current limit, 0: torque reached */
-    bool positive;            /* the phase itself is in that half */
 } plan_t;
 
 /* Operating point within the cell, or at its end, for a torque within flux_min, flux_max and the current limit, by
@@ -49,7 +48,7 @@ static inline bool solve_in_cell(plan_t *p, int32_t torque, int32_t current_limi
     const phase_cell_t *cell = p->cell;
     const int32_t limit_q13 = phase_cell_u_q13(cell, current_limit_q9);
     int32_t v_q13 = phase_cell_solve_q13(cell, torque);
-    bool reached = v_q13 != PHASE_CELL_V_MAX_Q13 && v_q13 != -PHASE_CELL_V_MAX_Q13 - 1;
+    const bool outside = (v_q13 ^ v_q13 >> 31) == PHASE_CELL_V_MAX_Q13;
     int32_t limit = 0;
     if (v_q13 > limit_q13) {
         v_q13 = limit_q13;
@@ -65,8 +64,8 @@ static inline bool solve_in_cell(plan_t *p, int32_t torque, int32_t current_limi
         flux = p->flux_min;
         limit = -1;
     }
-    if (limit != 0 || !reached) {
-        reached = false;
+    const bool reached = limit == 0 && !outside;
+    if (!reached) {
         v_q13 = phase_cell_v_q13(cell, flux);
         torque = phase_cell_torque(cell, v_q13);
     }
@@ -83,8 +82,10 @@ static inline void locate_cell(const machine_tables_t *tables, plan_t *p) {
 
 /* Plans the operating point of a phase for a torque in units of the tables, in the cell of its last plan; true when the
  * point has the torque. */
-NOINLINE static bool plan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
+static inline bool plan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
     if (torque <= 0 && p->flux_min == 0) {
+        p->cell->located = false;
+        p->v_q13 = 0;
         p->flux = 0;
         p->torque = 0;
         p->limit = -1;
@@ -106,7 +107,7 @@ static inline int32_t expected_column(const plan_t *p, int32_t torque, int32_t c
 }
 
 /* Plans a phase again, in another cell if that is where the point is expected. */
-static inline void replan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
+NOINLINE static void replan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque, int32_t current_limit_q9) {
     if (!p->cell->located) {
         locate_cell(tables, p);
     }
@@ -131,9 +132,12 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     plan_t *corrected = NULL;
     plan_t *opposed = NULL;
     uint32_t first = HALF_REV;
-    for (plan_t *p = plan; p < plan + tables->phases; p++) {
+    const unsigned phases = tables->phases;
+    UNROLL(4)
+    for (unsigned phase = 0; phase < phases; phase++) {
+        plan_t *p = &plan[phase];
         const uint32_t order = p->since_on ^ reversal;
-        if (p->positive != positive) {
+        if (p->cell->negative == positive) {
             opposed = p->limit >= 0 && p->torque > 0 ? p : opposed;
         } else if (order < first && p->limit != limit) {
             first = order;
@@ -147,7 +151,7 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
         corrected = opposed;
     }
     const int32_t before = corrected->torque;
-    const bool adds = corrected->positive;
+    const bool adds = !corrected->cell->negative;
     replan_torque(tables, corrected, adds ? fixed_add(before, shortfall) : fixed_subtract(before, shortfall),
                   current_limit_q9);
     const int32_t gained = corrected->torque - before;
@@ -277,20 +281,19 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     control->turn ^= 1;
     int32_t shortfall = torque_q24 >> torque_shift;
     bool reached = true;
+    UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
         predict_flux(parameters, control, sample, phase, flux_step_max_q29, flux_shift, p);
         const uint32_t angle = sample->angle - phase * parameters->sharing.stroke - (uint32_t)sample->misalignment[phase];
-        p->positive = angle >= HALF_REV;
-        p->angle = p->positive ? angle : ~angle; /* mirrored, to 1 LSB */
+        const bool positive = angle >= HALF_REV;
+        p->angle = positive ? angle : ~angle; /* mirrored, to 1 LSB */
         p->column = control->column[phase];
-        p->v_q13 = 0;
         p->cell = &cells[phase];
-        p->cell->located = false;
-        p->cell->negative = !p->positive;
-        reached &= plan_phase(parameters, tables, &half[p->positive], p, flux_step_max_q29 >> flux_shift,
+        p->cell->negative = !positive;
+        reached &= plan_phase(parameters, tables, &half[positive], p, flux_step_max_q29 >> flux_shift,
                               sample->angle_step);
-        shortfall = p->positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
+        shortfall = positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
     }
 
     control->torque_shortfall_q24 = 0;
@@ -301,6 +304,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         control->torque_shortfall_q24 = fixed_abs(shortfall_q24) > SHORTFALL_TOLERANCE_Q24 ? shortfall_q24 : 0;
     }
     const duty_divisor_t by = duty_divisor(flux_step_max_q29);
+    UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
         const bool above_current_limit = sample->current_q9[phase] > parameters->current_limit_q9;
         duty_q15[phase] = duty_of(&plan[phase], by, flux_shift, above_current_limit);

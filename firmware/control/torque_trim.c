@@ -10,12 +10,12 @@ void torque_trim_reset(const torque_trim_parameters_t *parameters, torque_trim_t
 
 int32_t torque_trim_step(const torque_trim_parameters_t *parameters, torque_trim_t *trim, int32_t reference_q24,
                          int32_t torque_q24, bool voltage_limited) {
-    const int32_t due_q24 = trim->reference_q24[1];
-    trim->reference_q24[1] = trim->reference_q24[0];
-    trim->reference_q24[0] = reference_q24;
     if (parameters->pid.mode == BP_PID_OFF) {
         return reference_q24;
     }
+    const int32_t due_q24 = trim->reference_q24[1];
+    trim->reference_q24[1] = trim->reference_q24[0];
+    trim->reference_q24[0] = reference_q24;
     if (!voltage_limited) {
         const int32_t output_q15 = bp_pid_step(&parameters->pid, &trim->pid, fixed_subtract(due_q24, torque_q24));
         trim->trim_q24 = fixed_multiply(output_q15, parameters->limit_q24, 15);

@@ -96,7 +96,7 @@ typedef struct {
     int32_t torque_sum_q24;                   /* machine torque, N m, Q7.24, saturated */
     int32_t current_q9[HAL_PHASES_MAX];       /* A, Q7.9 */
     /* In units of the tables, machine_format_t: */
-    int32_t torque[HAL_PHASES_MAX];
+    int32_t torque[HAL_PHASES_MAX];       /* not with predictive torque control */
     int32_t flux_linkage[HAL_PHASES_MAX]; /* with predictive torque control only */
 } control_measurement_t;
 
@@ -107,6 +107,8 @@ typedef struct {
     uint32_t generation; /* of the last input */
     protection_deferred_t protection;
     observer_bandwidth_statistics_t bandwidth;
+    bool run;                    /* in the last input */
+    int32_t speed_reference_q22; /* after the ramp, rad/s, Q9.22 */
     speed_pi_t speed_pi;
     int32_t advance_q30;         /* of the conduction windows, Q1.30, 0..1 */
     misalignment_t misalignment; /* a property of the machine: survives the end of a run */
@@ -120,7 +122,6 @@ typedef struct {
     observer_bandwidth_t bandwidth;
     protection_t protection;
     state_machine_t state_machine;
-    int32_t speed_reference_q22;  /* after the ramp; 0 outside RUN */
     int32_t torque_reference_q24; /* 0 outside RUN */
     int32_t duty_q15[HAL_PHASES_MAX]; /* of the last period in RUN, -32768..32768 */
     ditc_hysteresis_t hysteresis;

@@ -1,5 +1,6 @@
 #include "drive/deferred.h"
 
+#include "drive/speed_control.h"
 #include "fixed/fixed.h"
 
 #define RUN_MASK UINT32_C(0x0000FFFF)
@@ -18,6 +19,7 @@ void deferred_reset_run(const control_parameters_t *parameters, control_state_t 
     change_generation(state, (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK));
     state->deferred_request.initial.window = parameters->predictive.base_window;
     state->deferred_request.initial.speed_law_torque_q24 = 0;
+    state->deferred_request.initial.speed_reference_q22 = 0;
 }
 
 void deferred_reset_observer(control_state_t *state) {
@@ -59,7 +61,7 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->command_age_us = sample->time_us - command->time_us;
     input->speed_q22 = state->observer.speed_q22;
     input->run = state->state_machine.state == DRIVE_STATE_RUN;
-    input->speed_reference_q22 = state->speed_reference_q22;
+    input->commanded_speed_q22 = command->request == COMMAND_RUN ? command->speed_reference_q22 : 0;
     if (parameters->bandwidth.adaptive) {
         hand_over_bandwidth(state, measured, input);
     }
@@ -74,6 +76,7 @@ static void follow_resets(deferred_t *deferred, const deferred_input_t *input) {
     const uint32_t changed = deferred->generation ^ input->generation;
     if ((changed & RUN_MASK) != 0) {
         deferred->advance_q30 = 0;
+        deferred->run = false;
         speed_pi_reset(&deferred->speed_pi);
     }
     if ((changed & OBSERVER_MASK) != 0) {
@@ -102,7 +105,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
                                const deferred_input_t *input) {
     const commutation_t commutation = {.electrical = input->electrical};
     const unsigned phase = deferred->misalignment.phase_index;
-    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(input->speed_reference_q22, input->speed_q22));
+    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
     const misalignment_sample_t sample = {
         .current_q9 = input->current_q9,
         .angle = commutation_angle(&parameters->commutation, &commutation, phase) -
@@ -113,20 +116,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
         .steady = observer_bandwidth_steady(&parameters->bandwidth, input->bandwidth.stage) &&
                   speed_error_q22 < fixed_abs(input->speed_q22) / 64 && input->torque_shortfall_q24 == 0,
     };
-    misalignment_step(&parameters->misalignment, &deferred->misalignment, parameters->tables, &sample);
-}
-
-/* Torque of the speed law; the feed-forward of load and friction is that of the control interrupt. */
-static int32_t speed_law_torque_q24(const control_parameters_t *parameters, deferred_t *deferred,
-                                    const deferred_input_t *input) {
-    const int32_t error_q22 = fixed_subtract(input->speed_reference_q22, input->speed_q22);
-    switch (parameters->speed_law) {
-    case SPEED_LAW_SMC:
-        return speed_smc_reaching_torque_q24(&parameters->speed_smc, error_q22);
-    case SPEED_LAW_PI:
-    default:
-        return speed_pi_step(&parameters->speed_pi, &deferred->speed_pi, error_q22);
-    }
+    misalignment_step(&parameters->misalignment, &deferred->misalignment, (&machine_tables), &sample);
 }
 
 void deferred_compute(const control_parameters_t *parameters, control_state_t *state) {
@@ -139,7 +129,13 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     if (parameters->bandwidth.adaptive) {
         results->bandwidth = observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, &input->bandwidth);
     }
-    results->speed_law_torque_q24 = input->run ? speed_law_torque_q24(parameters, deferred, input) : 0;
+    results->speed_law_torque_q24 = 0;
+    results->speed_reference_q22 = 0;
+    if (input->run) {
+        results->speed_law_torque_q24 = speed_control_law_q24(parameters, deferred, input);
+        results->speed_reference_q22 = deferred->speed_reference_q22;
+    }
+    deferred->run = input->run;
     results->window = parameters->predictive.base_window;
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run) {
         results->window = predictive_torque_move_windows(&parameters->predictive, &deferred->advance_q30,

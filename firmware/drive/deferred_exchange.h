@@ -34,7 +34,7 @@ typedef struct {
     /* With an adaptive bandwidth only. */
     observer_bandwidth_sample_t bandwidth;
     bool run;                    /* state RUN */
-    int32_t speed_reference_q22; /* rad/s, Q9.22 */
+    int32_t commanded_speed_q22; /* rad/s, Q9.22; 0 without a run request */
     /* With predictive torque control only. */
     int32_t load_torque_q24;      /* observer, N m, Q7.24 */
     int32_t speed_correction_q22; /* observer, rad/s, Q9.22 */
@@ -48,7 +48,8 @@ typedef struct {
 typedef struct {
     uint32_t generation;                   /* of the input */
     uint64_t fault_mask;                   /* failed deferred checks, FAULT_BIT */
-    int32_t speed_law_torque_q24;          /* of the speed law, without feed-forward, N m, Q7.24 */
+    int32_t speed_reference_q22;           /* after the ramp, rad/s, Q9.22; 0 outside RUN */
+    int32_t speed_law_torque_q24;          /* of the speed law, without feed-forward, N m, Q7.24; 0 outside RUN */
     observer_bandwidth_limits_t bandwidth; /* of the trigger */
     torque_sharing_window_t window;        /* of the motoring phases */
     int32_t misalignment[HAL_PHASES_MAX];  /* to subtract from the angle of each phase, 2^-32 electrical rev */

@@ -31,32 +31,68 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
     measured->angle = edge + (uint32_t)fixed_shift((int64_t)angle_per_tick_q19 * (int32_t)encoder->edge_age_ticks, 19);
 }
 
+/* Sums over the phases. */
+typedef struct {
+    int32_t current_max_q9;
+    int32_t torque; /* in units of the tables */
+} sums_t;
+
+static inline void add_phase(sums_t *sums, int32_t current_q9, int32_t torque) {
+    sums->torque = fixed_add(sums->torque, torque);
+    sums->current_max_q9 = current_q9 > sums->current_max_q9 ? current_q9 : sums->current_max_q9;
+}
+
+/* Torque of each phase by the machine's tables, at the measured angle. */
+static sums_t measure_by_map(const control_parameters_t *parameters, const int32_t misalignment[HAL_PHASES_MAX],
+                             const control_sample_t *sample, control_measurement_t *measured) {
+    sums_t sums = {0, 0};
+    const unsigned phases = machine_tables.phases;
+    UNROLL(4)
+    for (unsigned phase = 0; phase < phases; phase++) {
+        const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], parameters->current_scale_q18);
+        int32_t torque = 0;
+        if (current_q9 > 0) { /* false for most phases at any time */
+            const uint32_t angle = measured_phase_angle(parameters, misalignment, measured, phase);
+            torque = phase_map_torque(&machine_tables, angle, current_q9);
+            add_phase(&sums, current_q9, torque);
+        }
+        measured->current_q9[phase] = current_q9;
+        measured->torque[phase] = torque;
+    }
+    return sums;
+}
+
+/* Torque and flux linkage of each phase at the planned angle. */
+static sums_t measure_by_plan(const control_parameters_t *parameters, const predictive_torque_t *predictive,
+                              const control_sample_t *sample, control_measurement_t *measured) {
+    sums_t sums = {0, 0};
+    const unsigned phases = machine_tables.phases;
+    UNROLL(4)
+    for (unsigned phase = 0; phase < phases; phase++) {
+        const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], parameters->current_scale_q18);
+        int32_t flux = 0;
+        if (current_q9 > 0) { /* false for most phases at any time */
+            add_phase(&sums, current_q9, predictive_torque_estimate(predictive, phase, current_q9, &flux));
+        }
+        measured->current_q9[phase] = current_q9;
+        measured->flux_linkage[phase] = flux;
+    }
+    return sums;
+}
+
 void measure(const control_parameters_t *parameters, const load_observer_t *observer,
              const int32_t misalignment[HAL_PHASES_MAX], const predictive_torque_t *predictive,
              const control_sample_t *sample, control_measurement_t *measured) {
     measure_angle(parameters, observer, &sample->encoder, measured);
     measured->dc_link_voltage_q6 = scale_counts(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
-    commutation_find(&parameters->commutation, measured->angle, &measured->commutation);
-    const machine_tables_t *tables = parameters->tables;
-    const unsigned phases = tables->phases;
-    const bool planned = parameters->torque_law == TORQUE_LAW_PREDICTIVE;
-    int32_t current_max_q9 = 0;
-    int32_t torque_sum = 0;
-    for (unsigned phase = 0; phase < phases; phase++) {
-        const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], parameters->current_scale_q18);
-        int32_t torque = 0;
-        int32_t flux = 0;
-        if (current_q9 > 0) { /* false for most phases at any time */
-            torque = planned ? predictive_torque_estimate(predictive, phase, current_q9, &flux)
-                             : phase_map_torque(tables, measured_phase_angle(parameters, misalignment, measured, phase),
-                                                current_q9);
-            torque_sum = fixed_add(torque_sum, torque);
-            current_max_q9 = current_q9 > current_max_q9 ? current_q9 : current_max_q9;
-        }
-        measured->current_q9[phase] = current_q9;
-        measured->torque[phase] = torque;
-        measured->flux_linkage[phase] = flux;
+    sums_t sums;
+    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
+        measured->commutation.electrical = commutation_electrical(&parameters->commutation, measured->angle);
+        sums = measure_by_plan(parameters, predictive, sample, measured);
+    } else {
+        commutation_find(&parameters->commutation, measured->angle, &measured->commutation);
+        sums = measure_by_map(parameters, misalignment, sample, measured);
     }
-    measured->current_max_q9 = current_max_q9;
-    measured->torque_sum_q24 = phase_map_scale(&tables->torque_format, torque_sum);
+    measured->current_max_q9 = sums.current_max_q9;
+    measured->torque_sum_q24 = phase_map_scale(&machine_tables.torque_format, sums.torque);
 }

@@ -1,5 +1,6 @@
 #include "drive/protection.h"
 
+#include <assert.h>
 #include <stdbool.h>
 
 #include "drive/fault.h"
@@ -21,9 +22,11 @@ void protection_deferred_reset(protection_deferred_t *protection, uint32_t encod
     *protection = (protection_deferred_t){.encoder_angle = encoder_angle};
 }
 
-static void fail_if(uint64_t *failed, bool condition, fault_t fault) {
+static_assert(FAULT_COUNT <= 32, "checks are collected in 32 bits, which saves the interrupt eight instructions");
+
+static void fail_if(uint32_t *failed, bool condition, fault_t fault) {
     if (condition) {
-        *failed |= FAULT_BIT(fault);
+        *failed |= (uint32_t)FAULT_BIT(fault);
     }
 }
 
@@ -74,7 +77,7 @@ uint64_t protection_check(const protection_parameters_t *parameters, protection_
     const bool overrun = count_overruns(protection, missed) >= PROTECTION_OVERRUNS_MAX ||
                          input->skipped_deferred >= PROTECTION_SKIPPED_DEFERRED_MAX;
 
-    uint64_t failed = 0;
+    uint32_t failed = 0;
     fail_if(&failed, input->current_max_q9 > parameters->current_trip_q9, FAULT_OVER_CURRENT);
     fail_if(&failed, input->dc_link_voltage_q6 > parameters->dc_link_over_voltage_q6, FAULT_OVER_VOLTAGE);
     fail_if(&failed, encoder_jumped(parameters, angle_step, missed), FAULT_ENCODER);
@@ -86,7 +89,7 @@ uint64_t protection_check_deferred(const protection_parameters_t *parameters, pr
                                    const protection_deferred_input_t *input) {
     const int32_t speed_q22 = fixed_abs(input->speed_q22);
 
-    uint64_t failed = 0;
+    uint32_t failed = 0;
     fail_if(&failed, input->dc_link_voltage_q6 < parameters->dc_link_under_voltage_q6, FAULT_UNDER_VOLTAGE);
     fail_if(&failed, speed_q22 > parameters->over_speed_q22, FAULT_OVER_SPEED);
     fail_if(&failed, encoder_frozen(parameters, protection, input, speed_q22), FAULT_ENCODER);

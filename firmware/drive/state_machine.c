@@ -11,11 +11,10 @@ static fault_t lowest_fault(uint64_t fault_mask) {
 }
 
 static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {
-    state_machine->record = (fault_record_t){
-        .fault = lowest_fault(fault_mask),
-        .fault_mask = fault_mask,
-        .state = (uint8_t)state_machine->state,
-    };
+    fault_record_t *record = &state_machine->record; /* the caller sets its other members */
+    record->fault = lowest_fault(fault_mask);
+    record->fault_mask = fault_mask;
+    record->state = (uint8_t)state_machine->state;
     state_machine->state = DRIVE_STATE_FAULT;
     state_machine->rearmed = false;
     return true;

@@ -21,15 +21,8 @@ static void leave_state(control_state_t *state, const control_measurement_t *mea
         observe_reset(state, measured); /* its estimate may stem from a faulty encoder */
     }
     if (left == DRIVE_STATE_RUN) {
-        state->speed_reference_q22 = 0;
         state->torque_reference_q24 = 0;
     }
-}
-
-/* RUN is entered from READY only, which leaves nothing to reset: no period resets and controls. */
-static void enter_run(const control_parameters_t *parameters, control_state_t *state) {
-    /* The ramp starts at the present speed. */
-    state->speed_reference_q22 = fixed_clamp(state->observer.speed_q22, parameters->speed_reference_min_q22, INT32_MAX);
 }
 
 bool supervise(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
@@ -47,8 +40,7 @@ bool supervise(const control_parameters_t *parameters, control_state_t *state, c
     if (state_machine->state == before) {
         return before == DRIVE_STATE_RUN;
     }
-    if (state_machine->state == DRIVE_STATE_RUN) {
-        enter_run(parameters, state);
+    if (state_machine->state == DRIVE_STATE_RUN) { /* from READY, which leaves nothing to reset */
         return true;
     }
     leave_state(state, measured, before);

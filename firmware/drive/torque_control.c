@@ -64,7 +64,7 @@ static void predictive_control(const control_parameters_t *parameters, control_s
         .reverse = observer->speed_q22 < 0,
         .angle_step = (uint32_t)fixed_abs(step) * rotor_poles,
     };
-    predictive_torque_step(&parameters->predictive, &state->predictive, parameters->tables, &sample, state->duty_q15);
+    predictive_torque_step(&parameters->predictive, &state->predictive, (&machine_tables), &sample, state->duty_q15);
 }
 
 void torque_control(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
@@ -86,7 +86,7 @@ bool torque_control_voltage_saturated(const control_parameters_t *parameters, co
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
         return state->predictive.torque_shortfall_q24 != 0;
     }
-    for (unsigned phase = 0; phase < parameters->tables->phases; phase++) {
+    for (unsigned phase = 0; phase < (&machine_tables)->phases; phase++) {
         if (state->duty_q15[phase] == MODULATOR_DUTY_ONE_Q15) {
             return true;
         }

@@ -20,8 +20,6 @@ from salient.experiments.metrics import RIPPLE_WINDOW_S, load_step_metrics, star
 from salient.experiments.scenario import Scenario, load_scenarios, run_scenario
 from salient.paths import SCENARIOS
 
-pytestmark = pytest.mark.xdist_group("machine_builds")
-
 ANGLES_DEG = range(0, 90, 10)
 GRIDS = {"map_regular": (REGULAR_DEG, REGULAR_A), "map_irregular": irregular()}
 

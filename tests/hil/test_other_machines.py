@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from salient.paths import MACHINES
 
-pytestmark = pytest.mark.xdist_group("machine_builds")
+
+@pytest.fixture(scope="module")
+def machine_file(tmp_path_factory):
+    """Path of the file of a machine with these poles: one file, and so one build, for all controllers."""
+    folder = tmp_path_factory.mktemp("machines")
+
+    def write(stator: int, rotor: int) -> Path:
+        text = (MACHINES / "saturating.toml").read_text()
+        file = folder / f"poles_{stator}_{rotor}.toml"
+        file.write_text(
+            text.replace("stator = 6", f"stator = {stator}")
+            .replace("rotor = 4", f"rotor = {rotor}")
+            .replace('"saturating"\n\n[poles]', f'"poles_{stator}_{rotor}"\n\n[poles]')
+        )
+        return file
+
+    return {poles: write(*poles) for poles in ((8, 6), (12, 8))}
 
 
 @pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])
 @pytest.mark.parametrize(("stator", "rotor", "phases"), [(8, 6, 4), (12, 8, 3)])
-def test_starts_and_holds_speed_under_load(make_bench, tmp_path, controller, stator, rotor, phases):
-    text = (MACHINES / "saturating.toml").read_text()
-    file = tmp_path / f"poles_{stator}_{rotor}.toml"
-    file.write_text(
-        text.replace("stator = 6", f"stator = {stator}")
-        .replace("rotor = 4", f"rotor = {rotor}")
-        .replace('"saturating"\n\n[poles]', f'"poles_{stator}_{rotor}"\n\n[poles]')
-    )
+def test_starts_and_holds_speed_under_load(make_bench, machine_file, controller, stator, rotor, phases):
+    file = machine_file[stator, rotor]
     bench = make_bench(machine=str(file), controller=controller)
     bench.drive.speed_reference_rpm = 600
     bench.run_for(0.2)

@@ -230,7 +230,6 @@ def test_equal_runs_are_identical_with_every_error_on(make_bench):
     assert logs[0] != logs[2]
 
 
-@pytest.mark.xdist_group("machine_builds")
 def test_machine_file_sets_the_errors_and_the_rig_clears_them(make_bench, tmp_path):
     file = tmp_path / "poor_sensors.toml"
     text = (MACHINES / "saturating.toml").read_text().replace('name = "saturating"', 'name = "poor_sensors"')

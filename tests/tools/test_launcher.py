@@ -146,7 +146,6 @@ def test_missing_python_is_reported(salient, tmp_path):
     assert_usage_error(result, "python3", "python3-venv")
 
 
-@pytest.mark.xdist_group("machine_builds")
 def test_two_processes_build_for_machine_files_of_the_user_simultaneously(tmp_path):
     """Each of two files by two processes, one build per file."""
     files = [machine_file(tmp_path, name, "inertia_kg_m2 = 0.02", f"inertia_kg_m2 = {inertia}")
@@ -162,7 +161,6 @@ def test_two_processes_build_for_machine_files_of_the_user_simultaneously(tmp_pa
     assert [sum("building the drive for" in errors for _, errors in outputs[at::2]) for at in (0, 1)] == [1, 1]
 
 
-@pytest.mark.xdist_group("machine_builds")
 def test_machine_file_of_the_user_is_built_on_demand(make_bench, tmp_path):
     """A file with half the inertia is built on demand, and its motor accelerates about twice as fast."""
     path = machine_file(tmp_path, "half_inertia", "inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.01")

@@ -2,9 +2,7 @@
 #include <sys/stat.h>
 
 #include <atomic>
-#include <chrono>
 #include <fstream>
-#include <functional>
 #include <thread>
 
 #include "support/rig_bench.h"
@@ -206,56 +204,83 @@ TEST(LocalBus, StalledClientIsDisconnectedInTheFreePace) {
     EXPECT_TRUE(stalled->gone);
 }
 
-// In a thread: serves until `until_ns`, while the test's thread reads.
-void serve_in_thread(RigBench &bench, uint64_t until_ns, const std::function<void()> &meanwhile) {
-    std::atomic<bool> done = false;
-    std::thread server([&] {
-        while (bench.rig->board.time_ns < until_ns && rig_serve(bench.rig.get(), 0)) {
-        }
-        done = true;
-    });
-    while (!done) {
-        meanwhile();
+// Counts the calls of the rig's transport->give_up: one when a client's queue is found full, then one in each round of
+// the wait for room.
+class WaitCounter {
+  public:
+    explicit WaitCounter(RigBench &bench) : transport(*bench.rig->config.transport) {
+        give_up = transport.give_up;
+        context = transport.give_up_context;
+        transport.give_up_context = this;
+        transport.give_up = [](void *counter) { return static_cast<WaitCounter *>(counter)->count(); };
     }
-    server.join();
-}
+    ~WaitCounter() {
+        transport.give_up = give_up;
+        transport.give_up_context = context;
+    }
+    WaitCounter(const WaitCounter &) = delete;
+
+    std::atomic<unsigned> calls = 0;
+
+  private:
+    bool count() {
+        ++calls;
+        calls.notify_one();
+        return give_up(context);
+    }
+
+    transport_t &transport;
+    bool (*give_up)(void *context);
+    void *context;
+};
 
 TEST(LocalBus, TimeWaitsForAClientThatReads) {
-    // Each pause lasts until the queue is full and time waits; lock-step waits for any client, the free pace for one
-    // that reads.
+    // It reads only when its queue is full and time waits; lock-step waits for any client, the free pace for one that
+    // reads.
     for (const char *pace : {"lockstep", "free"}) {
         SCOPED_TRACE(pace);
         RigBench bench(pace);
+        WaitCounter waits(bench);
         auto client = bench.connect();
         client->set(6, 20);
         client->run_until(400 * MS);
         uint64_t frames = 0, last_ns = 0;
-        serve_in_thread(bench, 400 * MS, [&] {
-            std::this_thread::sleep_for(std::chrono::milliseconds(20));
+        std::atomic<bool> done = false;
+        std::thread server([&] {
+            while (bench.rig->board.time_ns < 400 * MS && rig_serve(bench.rig.get(), 0)) {
+            }
+            done = true;
+            ++waits.calls;
+            waits.calls.notify_one();
+        });
+        for (unsigned seen = 0; !done;) {
+            waits.calls.wait(seen);
+            seen = waits.calls;
             for (const auto &record : client->receive()) {
                 frames += 1;
                 EXPECT_GE(record.time_ns, last_ns);
                 last_ns = record.time_ns;
             }
-        });
+        }
+        server.join();
         frames += client->receive().size();
         EXPECT_GT(frames, 60000u) << "20,000 truths of three frames: none is lost";
+        EXPECT_GT(waits.calls, 1u) << "the queue was full";
         EXPECT_FALSE(client->gone);
     }
 }
 
 TEST(LocalBus, StopRequestEndsTheWaitForAStalledClient) {
     RigBench bench;
-    std::atomic<bool> stop = false;
-    bench.rig->config.stop.context = &stop;
-    bench.rig->config.stop.requested = [](void *context) { return static_cast<std::atomic<bool> *>(context)->load(); };
+    WaitCounter waits(bench);
+    bench.rig->config.stop.context = &waits;
+    // The second call comes from within the wait.
+    bench.rig->config.stop.requested = [](void *context) { return static_cast<WaitCounter *>(context)->calls >= 2; };
     auto client = bench.connect();
     client->set(6, 20);
     client->run_until(100'000 * MS);
-    serve_in_thread(bench, 100'000 * MS, [&] {
-        std::this_thread::sleep_for(std::chrono::milliseconds(100));
-        stop = true;
-    });
+    while (bench.rig->board.time_ns < 100'000 * MS && rig_serve(bench.rig.get(), 0)) {
+    }
     EXPECT_LT(bench.rig->board.time_ns, 100'000 * MS);
     EXPECT_FALSE(client->gone);
 }

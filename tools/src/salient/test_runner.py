@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,19 +44,35 @@ class Count:
 
 
 def run(only: list[str] | None) -> int:
-    """Runs all steps, or only the named ones; returns 0 when everything passed, else 1."""
+    """Runs all steps, or only the named ones; returns 0 when everything passed, else 1.
+
+    The VM of `socketcan` uses one core: it runs beside the first steps. The folders of Python tests are one run of
+    pytest, in which no process waits for the last test of a folder.
+    """
+    names = [name for name in (*STEPS, *PYTHON_TESTS, "socketcan") if not only or name in only]
+    RESULTS.mkdir(parents=True, exist_ok=True)
     total = Count()
-    for name, step in STEPS.items():
-        if only and name not in only:
-            continue
-        _print(f"--- {name}: {(step.__doc__ or '').splitlines()[0]}")
-        started_s = time.monotonic()
-        RESULTS.mkdir(parents=True, exist_ok=True)
-        count = step()
-        _print(f"--- {name}: {count} ({time.monotonic() - started_s:.0f} s)")
-        total += count
+    with ThreadPoolExecutor(1) as background:
+        socketcan = background.submit(_timed, _socketcan) if "socketcan" in names else None
+        for name in names:
+            if name in STEPS:
+                _print(f"--- {name}: {(STEPS[name].__doc__ or '').splitlines()[0]}")
+                count, duration_s = _timed(STEPS[name])
+                _print(f"--- {name}: {count} ({duration_s:.0f} s)")
+                total += count
+        if socketcan is not None:
+            _print(f"--- socketcan: {(_socketcan.__doc__ or '').splitlines()[0]}")
+            count, duration_s = socketcan.result()
+            _print(f"--- socketcan: {count} ({duration_s:.0f} s)")
+            total += count
+    total += _python_tests([name for name in names if name in PYTHON_TESTS])
     _print(str(total))
     return 1 if total.failed or not total.passed else 0
+
+
+def _timed(step: Callable[[], Count]) -> tuple[Count, float]:
+    started_s = time.monotonic()
+    return step(), time.monotonic() - started_s
 
 
 def _print(line: str) -> None:
@@ -113,29 +129,24 @@ def _sanitize() -> Count:
     return count
 
 
-def _target() -> Count:
-    """the firmware for Cortex-M4 (compiled in three ways) and RV32: symbols and size checked, run in QEMU."""
-    count = Count()
-    for preset in TARGET_BUILDS:
-        count += _one(build_preset(preset))
-    if not count.failed:
-        count += _pytest("target", TESTS / "target")
-    return count
-
-
-def _hil() -> Count:
-    """the drive through CAN on local buses."""
-    return _pytest("hil", TESTS / "hil")
-
-
-def _plant() -> Count:
-    """the emulated plant compared with reference solvers."""
-    return _pytest("plant", TESTS / "plant")
-
-
-def _tools() -> Count:
-    """launcher, commands, reports and the commands of the documentation."""
-    return _pytest("tools", TESTS / "tools")
+def _python_tests(names: list[str]) -> Count:
+    """One run of pytest for the folders of these names, with a line of each."""
+    total = Count()
+    folders = []
+    for name in names:
+        _print(f"--- {name}: {PYTHON_TESTS[name]}")
+        builds = [_one(build_preset(preset)) for preset in TARGET_BUILDS] if name == "target" else []
+        for build in builds:
+            total += build
+        if not any(build.failed for build in builds):
+            folders.append(TESTS / name)
+    if not folders:
+        return total
+    count = _pytest("python", *folders)
+    for folder in folders:
+        _print(f"--- {folder.name}: {_read_report(RESULTS / 'python.xml', f'tests.{folder.name}.')}")
+    total += count
+    return total
 
 
 def _socketcan() -> Count:
@@ -144,20 +155,18 @@ def _socketcan() -> Count:
     files = [path for path in sorted((TESTS / "hil").glob("test_*.py"))
              if mark.search(path.read_text(encoding="utf-8"))]
     vm = [sys.executable, "-m", "salient.vm.run", "--timeout-s", str(VM_TIMEOUT_S), "--"]
-    # One after the other: there is one interface.
-    return _pytest("socketcan", *files, options=["--salient-can=socketcan:vcan0"], prefix=vm, processes=0)
+    # One after the other: there is one interface. Quiet: it runs beside other steps.
+    return _pytest("socketcan", *files, options=["--salient-can=socketcan:vcan0"], prefix=vm, processes=0, quiet=True)
 
 
-STEPS = {
-    "style": _style,
-    "unit": _unit,
-    "sanitize": _sanitize,
-    "target": _target,
-    "hil": _hil,
-    "plant": _plant,
-    "tools": _tools,
-    "socketcan": _socketcan,
+STEPS = {"style": _style, "unit": _unit, "sanitize": _sanitize}
+PYTHON_TESTS = {
+    "hil": "the drive through CAN on local buses.",
+    "tools": "launcher, commands, reports and the commands of the documentation.",
+    "plant": "the emulated plant compared with reference solvers.",
+    "target": "the firmware for Cortex-M4 (compiled in three ways) and RV32: symbols and size checked, run in QEMU.",
 }
+"""Folder of tests: its claim. Last the folder with the longest file, whose tests use every core themselves."""
 
 
 # --- parts of steps -------------------------------------------------------------------------------------------------
@@ -213,14 +222,17 @@ def _ctest(preset: str) -> Count:
     return count if count.passed or count.failed else Count(failed=1)
 
 
-def _read_report(path: Path) -> Count:
-    """Reads a JUnit file of GoogleTest or pytest. A skipped test counts as failed: nothing is left out silently."""
+def _read_report(path: Path, prefix: str = "") -> Count:
+    """Reads the cases of a JUnit file of GoogleTest or pytest whose class name starts with a prefix. A skipped test
+    counts as failed: nothing is left out silently."""
     try:
         root = ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError):
         return Count(failed=1)
     count = Count()
     for case in root.iter("testcase"):
+        if not case.get("classname", "").startswith(prefix):
+            continue
         bad = any(case.find(tag) is not None for tag in ("failure", "error", "skipped"))
         count += _one(not bad and case.get("status", "run") == "run")
     return count
@@ -244,14 +256,16 @@ def _experiments(build: str) -> Count:
 
 
 def _pytest(name: str, *files: Path, options: Sequence[str] = (), prefix: Sequence[str] = (),
-            processes: int = CORES) -> Count:
-    """Runs pytest in parallel processes; tests of one xdist_group (tests/conftest.py) share a process."""
+            processes: int = CORES, quiet: bool = False) -> Count:
+    """Runs pytest in parallel processes. The tests of a file share a process, which makes the file's fixtures once; the
+    files start in their order."""
     report = RESULTS / f"{name}.xml"
     report.unlink(missing_ok=True)
     if processes:
-        options = ["-n", str(processes), "--dist", "loadgroup", *options]
+        options = ["-n", str(processes), "--dist", "loadfile", "--no-loadscope-reorder", *options]
+    # The processes share the cores: threads of NumPy's linear algebra would only wait for one another.
     good = _succeeds(*prefix, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", ROOT,
-                     f"--junitxml={report}", *options, *files, quiet=False)
+                     f"--junitxml={report}", *options, *files, quiet=quiet, OPENBLAS_NUM_THREADS="1")
     count = _read_report(report)
     # Failures outside of the tests: a crash, an error at the end of the session.
     if not good and not count.failed:
