@@ -507,6 +507,7 @@ def test_every_run_is_a_path_within_the_facts_and_the_bound(variant, build):
     assert found.model.contradiction(longest) is None
     every = dict(zip(addresses, profile.trace.inside.tolist(), strict=True))
     assert found.model.contradiction(every, len(profile.interrupts)) is None
+    assert profile.deferred_metrics()["max"] <= bound(variant, build, "deferred").instructions
 
 
 def test_longest_path_has_the_instructions_of_the_bound():

@@ -40,7 +40,7 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
             "    .row = {",
             *(f"        {{{start}u, {reciprocal}u}}," for start, reciprocal in tables.rows()),
             "    },",
-            f"    .angle_bin_row = {{{_listed(tables.cell_row())}}},",
+            f"    .angle_bin_row = {{{_listed(tables.angle_bin_row())}}},",
             *_format_lines("torque_format", tables.torque_per_ampere),
             *_format_lines("flux_format", tables.flux_per_ampere),
             "    .node = {",

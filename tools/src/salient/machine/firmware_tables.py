@@ -1,9 +1,10 @@
-"""The firmware's magnetics of a phase, sampled from a machine's: rows, cells and both surfaces of
+"""The firmware's magnetics of a phase, sampled from a machine's: rows, angle bins and both surfaces of
 firmware/control/machine_tables.h.
 
 Torque over the angle has corners where poles begin to overlap, at angles that differ between machines. Hence rows are
 as far apart as a tolerance permits: between two rows, the parabola through the torque at both and half way must be
-within it. The tolerance is the smallest with which the rows suffice.
+within it. The tolerance is the smallest with which the rows suffice. It is larger in an angle bin in which more rows
+would begin than the firmware's look-up of an angle steps over.
 """
 
 from __future__ import annotations
@@ -20,11 +21,14 @@ from salient.machine.file import Machine, MachineError
 
 # As in firmware/control/machine_tables.h.
 ROWS = 33
-CELLS = 64
+ANGLE_BINS = 64
+ROWS_INSIDE_BIN_MAX = 2
+"""Rows that begin within an angle bin, not counting one at its begin."""
 NODE_OFFSET = 32768
 CURRENT_A = np.arange(0.0, 81.0, 2.0)
 """Currents of the columns."""
 ROW_UNITS = 1 << 14  # units of row_start in half a pitch
+_BIN_UNITS = ROW_UNITS // ANGLE_BINS
 _HALF_PITCH = 1 << 31
 CURVATURE_SHIFT_MAX = 8
 # The finest are 4 uN m and 0.12 uWb per ampere, beyond which no product is finer than its result.
@@ -33,12 +37,18 @@ FLUX_FRACTION_BITS = (11, 23)
 
 # Tolerances of the rows, as a fraction of the largest torque at each of these currents.
 _LEAST_TOLERANCE, _GREATEST_TOLERANCE = 1e-6, 1.0
+_TOLERANCE_STEP = 2.0
+"""Factor by which the tolerance in a crowded angle bin grows until the rows fit."""
 _ROW_CURRENTS = np.array([1.0, 0.75, 0.5, 0.25, 0.125, 0.0625])  # fractions of the largest
 
 # Torque that falls with the current, or is negative from the unaligned to the aligned position, has no inverse and is
 # levelled: as noise of a map, up to this fraction of the largest torque at the same current; beyond the map's largest
 # current, where its flux linkage is extrapolated linearly, by any amount.
 FALL_TOLERANCE = 0.01
+
+# Columns from the middle of a cell to which the firmware extrapolates the flux linkage of a sample
+# (firmware/control/phase_cell.h), which it converts to its format without saturation.
+_EXTRAPOLATED_COLUMNS = 4.0
 
 # Current at which psi / i of zero current is evaluated.
 _SMALL_A = 1e-6
@@ -64,8 +74,17 @@ class Surface:
 
     @property
     def result_shift(self) -> int:
-        """Right shift of the product of a value in Q14 and a current in Q9 times 2^15, less its low 32 bits."""
+        """Left shift to the result's format, of the product of a value in Q14 and a current in Q9 times 2^15 without
+        its low 32 bits."""
         return self.result_bits + 32 - 15 - (self.fraction_bits + 14 + 9)
+
+    def over_angle(self, u: np.ndarray) -> np.ndarray:
+        """(ROWS - 1, len(u), columns), N m / A or Wb / A: the parabola from each row to the next at fractions u."""
+        u = u[:, None]
+        low, high, curvature = self.node[:-1, None], self.node[1:, None], self.curvature[:, None]
+        parabola = low + u * (high - low) - u * (1.0 - u) * curvature * 2.0**self.curvature_shift
+        result: np.ndarray = parabola / 2.0**self.fraction_bits
+        return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +102,9 @@ class PhaseMap:
         widths = [following - start for start, following in pairwise(starts)]
         return list(zip(starts, [*((1 << 46) // width for width in widths), 0], strict=True))
 
-    def cell_row(self) -> np.ndarray:
-        """(CELLS,): the row in which each of the equal parts of half a pitch begins."""
-        begins = np.arange(CELLS) * (ROW_UNITS // CELLS)
+    def angle_bin_row(self) -> np.ndarray:
+        """(ANGLE_BINS,): the row in which each angle bin begins."""
+        begins = np.arange(ANGLE_BINS) * _BIN_UNITS
         return np.searchsorted(self.row_start, begins, side="right") - 1
 
 
@@ -111,11 +130,36 @@ def phase_map(magnetics: Any) -> PhaseMap:
     torque_Nm = _rising_torque(magnetics, angle_rad)
     divisor_A = np.maximum(CURRENT_A, _SMALL_A)
     flux_per_ampere = magnetics.flux_linkage_Wb(angle_rad, divisor_A) / divisor_A
-    return PhaseMap(
+    tables = PhaseMap(
         row_start,
         _surface("torque", "N m/A", torque_Nm / divisor_A, TORQUE_FRACTION_BITS, 24),
         _surface("flux linkage", "Wb/A", flux_per_ampere, FLUX_FRACTION_BITS, 29),
     )
+    largest_Wb = _largest_flux_linkage_Wb(tables.flux_per_ampere)
+    limit_Wb = 2.0 ** (31 - tables.flux_per_ampere.result_bits)
+    if largest_Wb > 0.995 * limit_Wb:  # the angles of _largest_flux_linkage_Wb miss up to 0.1 %
+        raise PhaseMapError(
+            f"the flux linkage up to {CURRENT_A[-1]:g} A, extrapolated by up to {_EXTRAPOLATED_COLUMNS:g} columns of"
+            f" the tables, is up to {largest_Wb:.4g} Wb; it must be below {limit_Wb:g} Wb"
+        )
+    return tables
+
+
+def _largest_flux_linkage_Wb(surface: Surface) -> float:
+    """Largest magnitude up to the largest current, extrapolated from every cell as the firmware does, at every angle,
+    curvature included."""
+    values = surface.over_angle(np.linspace(0.0, 1.0, 33))
+    low, high = values[..., :-1], values[..., 1:]
+    width_A = CURRENT_A[1] - CURRENT_A[0]
+    middle_A = CURRENT_A[:-1] + 0.5 * width_A
+    slope = (high - low) / width_A
+    # psi = i (intercept + slope i) is extreme at the ends of its range of currents, or at its vertex.
+    intercept = low - slope * CURRENT_A[:-1]
+    ends_A = [np.clip(middle_A + columns * width_A, 0.0, CURRENT_A[-1])
+              for columns in (-_EXTRAPOLATED_COLUMNS, _EXTRAPOLATED_COLUMNS)]
+    vertex_A = -0.5 * intercept / np.where(slope == 0.0, 1.0, slope)
+    currents_A = [*ends_A, np.clip(vertex_A, *ends_A)]
+    return max(float(np.max(np.abs(current_A * (intercept + slope * current_A)))) for current_A in currents_A)
 
 
 def _rising_torque(magnetics: Any, angle_rad: np.ndarray) -> np.ndarray:
@@ -158,8 +202,7 @@ def _row_starts(magnetics: Any) -> np.ndarray:
     shape = torque_Nm / np.max(np.abs(torque_Nm), axis=0)
 
     least, greatest = _LEAST_TOLERANCE, _GREATEST_TOLERANCE
-    starts = _rows_within(shape, greatest)
-    assert starts is not None  # a single row satisfies the greatest tolerance
+    starts = _rows_within(shape, greatest) or [0, ROW_UNITS]
     while greatest > 1.1 * least:
         tolerance = math.sqrt(least * greatest)
         found = _rows_within(shape, tolerance)
@@ -167,7 +210,8 @@ def _row_starts(magnetics: Any) -> np.ndarray:
             least = tolerance
         else:
             starts, greatest = found, tolerance
-    # A machine that needs fewer rows gets the others where the rows are widest.
+    # A machine that needs fewer rows gets the others where the rows are widest: wider than two angle bins, so that no
+    # other row begins in the bin of its middle.
     while len(starts) < ROWS:
         widest = int(np.argmax(np.diff(starts)))
         starts.insert(widest + 1, (starts[widest] + starts[widest + 1]) // 2)
@@ -175,22 +219,38 @@ def _row_starts(magnetics: Any) -> np.ndarray:
 
 
 def _rows_within(shape: np.ndarray, tolerance: float) -> list[int] | None:
-    """Rows, each as wide as the tolerance allows; None when ROWS of them do not reach the aligned position."""
+    """Rows, each as wide as the tolerance permits; None when ROWS of them do not reach the aligned position. Where more
+    than ROWS_INSIDE_BIN_MAX would begin in an angle bin, the tolerance is larger for the rows after the first."""
     starts = [0]
+    end_of_bin, tolerance_in_bin = 0, tolerance
     while starts[-1] < ROW_UNITS:
         if len(starts) == ROWS:
             return None
-        start = starts[-1]
-        width, step = 1, 1
-        while start + width + step <= ROW_UNITS and _is_parabola(shape[start : start + width + step + 1], tolerance):
-            width += step
-            step *= 2
-        while step > 0:
-            if start + width + step <= ROW_UNITS and _is_parabola(shape[start : start + width + step + 1], tolerance):
-                width += step
-            step //= 2
-        starts.append(start + width)
+        start = starts[-1] + _row_width(shape, starts[-1], tolerance)
+        if end_of_bin - _BIN_UNITS <= starts[-1] < start < end_of_bin:
+            start = starts[-1] + _row_width(shape[: end_of_bin + 1], starts[-1], tolerance_in_bin)
+        starts.append(start)
+        begin = start - start % _BIN_UNITS
+        if sum(begin < other < begin + _BIN_UNITS for other in starts) > ROWS_INSIDE_BIN_MAX:
+            crowded_before = begin + _BIN_UNITS == end_of_bin
+            tolerance_in_bin = _TOLERANCE_STEP * (tolerance_in_bin if crowded_before else tolerance)
+            end_of_bin = begin + _BIN_UNITS
+            del starts[-ROWS_INSIDE_BIN_MAX:]
     return starts
+
+
+def _row_width(shape: np.ndarray, start: int, tolerance: float) -> int:
+    """Width of a row, as large as the tolerance permits, by doubled and then halved steps."""
+    width, step = 1, 1
+    last = len(shape) - 1
+    while start + width + step <= last and _is_parabola(shape[start : start + width + step + 1], tolerance):
+        width += step
+        step *= 2
+    while step > 0:
+        if start + width + step <= last and _is_parabola(shape[start : start + width + step + 1], tolerance):
+            width += step
+        step //= 2
+    return width
 
 
 def _is_parabola(shape: np.ndarray, tolerance: float) -> bool:

@@ -26,9 +26,10 @@ _Text = Annotated[str, checked("a text", lambda value: bool(value.strip()))]
 
 
 class LoopFact(Table):
-    """Bound of a loop of `file`; `statement` is a part of its `for (...)` or `while (...)`. iterations: of the body of
-    a counted loop, which always ends by its count; tests: evaluations of the condition of a search. Of several facts
-    about a loop the first one that holds in the configuration applies."""
+    """Bound of a loop of `file`; `statement` is a part of its `for (...)` or `while (...)`, or the assignment of a
+    structure, with its semicolon, that the compiler makes a loop. iterations: of the body of a counted loop, which
+    always ends by its count; tests: evaluations of the condition of a search. Of several facts about a loop the first
+    one that holds in the configuration applies."""
 
     file: _Text
     statement: _Text
@@ -94,8 +95,9 @@ def read_facts(path: Path = FILE, root: Path = ROOT) -> Facts:
         if (loop.iterations is None) == (loop.tests is None):
             raise UsageError(f"{path}: loop {loop.statement}: must have either iterations or tests")
         source = root / loop.file
-        statements = loop_statements(source.read_text(encoding="utf-8")) if source.is_file() else []
-        if not any(loop.statement in one.head for one in statements):
+        text = source.read_text(encoding="utf-8") if source.is_file() else ""
+        assignment = loop.statement.endswith(";") and loop.statement in text
+        if not assignment and not any(loop.statement in one.head for one in loop_statements(text)):
             raise UsageError(f"{path}: {loop.file} has no loop {loop.statement}")
     named = [name for one in facts.never for name in one.functions]
     named += [name for one in facts.exclusive for name in (*one.functions, *one.excludes)]

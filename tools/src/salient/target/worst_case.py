@@ -420,7 +420,9 @@ def search_and_write(seconds: float, seed: int) -> int:
                 print(f"\r{variant}: {tried} inputs tried, longest {longest}", end="", flush=True)
 
         longest, found = search(variant, [*known, *directed(variant)], seconds, seed, progress)
-        print(f"{chr(13) * sys.stdout.isatty()}{variant}: longest {longest}, before {before}", flush=True)
+        both = profile(found).sum_metrics()["max"]
+        print(f"{chr(13) * sys.stdout.isatty()}{variant}: longest {longest}, before {before};"
+              f" with the deferred interrupt of the same period up to {both}", flush=True)
         if longest > before or len(found.actions) < len(known[0].actions):
             FOLDER.mkdir(exist_ok=True)
             write_input(committed(variant), found)
