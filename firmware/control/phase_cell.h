@@ -29,6 +29,7 @@
 #define PHASE_CELL_V_BITS 15
 #define PHASE_CELL_V_MAX_Q13 ((1 << (PHASE_CELL_V_BITS - 1)) - 1)
 #define PHASE_CELL_U_BITS 16
+#define PHASE_CELL_RATIO_BITS 14 /* c_psi / rise_psi, Q2.13, saturated to -1..1: a fraction in any machine */
 #define PHASE_CELL_HALF_Q13 (1 << 12)
 
 #define PHASE_CELL_RISE_BITS 26
@@ -79,7 +80,7 @@ ALWAYS_INLINE void phase_cell_locate(const machine_tables_t *tables, uint32_t di
         phase_cell_curve(phase_map_torque_value_q14(&lookup, low), phase_map_torque_value_q14(&lookup, high), low_q9);
     cell->flux =
         phase_cell_curve(phase_map_flux_value_q14(&lookup, low), phase_map_flux_value_q14(&lookup, high), low_q9);
-    const int32_t ratio_q13 = phase_cell_quotient_q13(cell->flux.curvature, cell->flux.rise, PHASE_CELL_V_BITS);
+    const int32_t ratio_q13 = phase_cell_quotient_q13(cell->flux.curvature, cell->flux.rise, PHASE_CELL_RATIO_BITS);
     const int32_t curvature =
         cell->torque.curvature - 2 * fixed_multiply_high(cell->torque.rise, ratio_q13 * (1 << 18));
     cell->curvature = fixed_saturate_bits(curvature, PHASE_CELL_RISE_BITS - 2);

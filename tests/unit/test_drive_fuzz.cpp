@@ -38,9 +38,9 @@ machine_tables_t four_phases() {
     tables.phases = 4;
     tables.rotor_poles = 6;
     std::mt19937 random(1);
-    for (machine_column_t &column : tables.column) {
-        for (int16_t &torque : column.torque_node) {
-            torque = int16_t(random());
+    for (unsigned column = 0; column < MACHINE_COLUMNS; column++) {
+        for (unsigned row = 0; row < MACHINE_ROWS; row++) {
+            tables.node[column * MACHINE_TO_NEXT_COLUMN + row] = int16_t(random());
         }
     }
     return tables;

@@ -12,6 +12,7 @@ extern "C" {
 #include "drive/configure.h"
 }
 
+#include "support/phase_map_results.h"
 #include "support/reference_builders.h"
 
 namespace {
@@ -64,8 +65,7 @@ class Machine {
                 current_q9[phase] = 15 * 512;
             }
             const auto torque = [&](double rev) {
-                const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, angle_from_rev(rev));
-                return phase_map_torque_q24(&lookup, current_q9[phase]) / Q24;
+                return phase_map_results::torque_q24(machine_tables, angle_from_rev(rev), current_q9[phase]) / Q24;
             };
             if (current_q9[phase] > 0) {
                 slope[phase] = phase_map_torque_slope_q24(&machine_tables, angle[phase], current_q9[phase],
@@ -76,12 +76,15 @@ class Machine {
         }
         lag[0] += model.filter_1_s / RATE_HZ * (torque_error - lag[0]);
         lag[1] += model.filter_1_s / RATE_HZ * (lag[0] - lag[1]);
-        load_observer_t observer{};
-        observer.load_torque_q24 = to_fixed(load_Nm + lag[1], Q24);
-        const misalignment_sample_t sample = {
-            .current_q9 = current_q9, .angle = angle, .torque_q24 = to_fixed(torque_Nm, Q24), .steady = steady};
-        misalignment_step(&parameters, &state, &machine_tables, &observer, &sample);
-        model.step(observer.load_torque_q24 / Q24, steady, torque_Nm, [&](unsigned phase) { return slope[phase]; });
+        const unsigned learned = state.phase_index;
+        const misalignment_sample_t sample = {.current_q9 = current_q9[learned],
+                                              .angle = angle[learned],
+                                              .load_torque_q24 = to_fixed(load_Nm + lag[1], Q24),
+                                              .speed_correction_q22 = 0,
+                                              .torque_q24 = to_fixed(torque_Nm, Q24),
+                                              .steady = steady};
+        misalignment_step(&parameters, &state, &machine_tables, &sample);
+        model.step(sample.load_torque_q24 / Q24, steady, torque_Nm, [&](unsigned phase) { return slope[phase]; });
     }
 
     double offset_deg(unsigned phase) const {
@@ -169,19 +172,16 @@ TEST(Misalignment, is_limited_to_a_degree_and_overflows_nothing) {
         misalignment_t state;
         misalignment_reset(&state);
         for (uint32_t k = 0; k < 2 * RATE_HZ; k++) {
-            int32_t current_q9[HAL_PHASES_MAX] = {};
-            uint32_t angle[HAL_PHASES_MAX] = {};
-            load_observer_t observer{};
             const bool on = k / 400 % 2 == 0;
-            for (unsigned phase = 0; phase < PHASES; phase++) {
-                angle[phase] = on ? 0x90000000u : 0x81000000u;
-                current_q9[phase] = on ? 79 * 512 : 0;
-            }
-            observer.load_torque_q24 = sign * (on ? 60 << 24 : -(60 << 24));
-            observer.speed_correction_q22 = on == (sign > 0) ? INT32_MIN : INT32_MAX;
             const misalignment_sample_t sample = {
-                .current_q9 = current_q9, .angle = angle, .torque_q24 = 8 << 24, .steady = true};
-            misalignment_step(&p, &state, &machine_tables, &observer, &sample);
+                .current_q9 = on ? 79 * 512 : 0,
+                .angle = on ? 0x90000000u : 0x81000000u,
+                .load_torque_q24 = sign * (on ? 60 << 24 : -(60 << 24)),
+                .speed_correction_q22 = on == (sign > 0) ? INT32_MIN : INT32_MAX,
+                .torque_q24 = 8 << 24,
+                .steady = true,
+            };
+            misalignment_step(&p, &state, &machine_tables, &sample);
         }
         for (unsigned phase = 0; phase < PHASES; phase++) {
             const double deg = state.phase[phase].offset / REV / machine_tables.rotor_poles * 360.0;

@@ -1,5 +1,5 @@
-// Torque and flux linkage of a phase: interpolation against double precision, inverse, and the tables against the
-// magnetics of the machine that they were generated from. One program per bundled machine.
+// Torque and flux linkage of a phase: interpolation against double precision, and the tables against the magnetics of
+// the machine that they were generated from; the inverse is tested with the cell. One program per bundled machine.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -15,6 +15,7 @@ extern "C" {
 }
 
 #include "support/fixed_point.h"
+#include "support/phase_map_results.h"
 
 namespace {
 
@@ -23,13 +24,11 @@ constexpr int32_t CURRENT_END_Q9 = PHASE_MAP_CURRENT_MAX_Q9;
 constexpr uint32_t ROW_STEP = 1u << 17; // rows start at multiples of it
 
 int32_t torque_q24(uint32_t angle, int32_t current_q9) {
-    const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, angle);
-    return phase_map_torque_q24(&lookup, current_q9);
+    return phase_map_results::torque_q24(machine_tables, angle, current_q9);
 }
 
 int32_t flux_q29(uint32_t angle, int32_t current_q9) {
-    const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, angle);
-    return phase_map_flux_q29(&lookup, current_q9);
+    return phase_map_results::flux_q29(machine_tables, angle, current_q9);
 }
 
 // LSB of an unscaled result in N m and Wb.
@@ -42,23 +41,23 @@ constexpr int32_t column_q9(int32_t column) {
 
 // One of the two surfaces of the tables and the weight of a node's LSB in a result of `result_bits` fraction bits.
 struct surface_t {
-    int16_t (machine_column_t::*nodes)[MACHINE_ROWS];
-    int8_t (machine_column_t::*curvatures)[MACHINE_ROWS - 1];
+    unsigned first; // index of row 0, column 0
     machine_format_t machine_tables_t::*format;
     int result_bits;
 
-    int node(int row, int column) const { return (machine_tables.column[column].*nodes)[row] + MACHINE_NODE_OFFSET; }
+    unsigned index(int row, int column) const {
+        return first + unsigned(row) + unsigned(column) * MACHINE_TO_NEXT_COLUMN;
+    }
+    int node(int row, int column) const { return machine_tables.node[index(row, column)] + MACHINE_NODE_OFFSET; }
     double curvature(int row, int column) const {
-        return std::ldexp((machine_tables.column[column].*curvatures)[row], (machine_tables.*format).curvature_shift);
+        return std::ldexp(machine_tables.curvature[index(row, column)], (machine_tables.*format).curvature_shift);
     }
     // Q14 * Q9 * 2^15 / 2^32.
     int fraction_bits() const { return result_bits + 32 - 15 - 9 - 14 - (machine_tables.*format).result_shift; }
 };
 
-constexpr surface_t TORQUE = {&machine_column_t::torque_node, &machine_column_t::torque_curvature,
-                              &machine_tables_t::torque_format, 24};
-constexpr surface_t FLUX = {&machine_column_t::flux_node, &machine_column_t::flux_curvature,
-                            &machine_tables_t::flux_format, 29};
+constexpr surface_t TORQUE = {0, &machine_tables_t::torque_format, 24};
+constexpr surface_t FLUX = {MACHINE_TO_FLUX, &machine_tables_t::flux_format, 29};
 
 int row_of(uint32_t distance) {
     int row = 0;
@@ -106,16 +105,65 @@ TEST(PhaseMap, rows_ascend_from_the_unaligned_to_the_aligned_position) {
         const uint64_t width = machine_tables.row[row + 1].start - uint64_t(machine_tables.row[row].start);
         EXPECT_GE(width, ROW_STEP);
         EXPECT_LE(width, HALF_REV_Q32);
-        EXPECT_EQ(machine_tables.row[row].reciprocal, (uint64_t(1) << 47) / width);
+        EXPECT_EQ(machine_tables.row[row].reciprocal, (uint64_t(1) << 46) / width);
     }
 }
 
-TEST(PhaseMap, angle_bins_begin_in_their_row_and_the_search_takes_at_most_two_steps) {
-    for (uint32_t bin = 0; bin < MACHINE_ANGLE_BINS; bin++) {
-        EXPECT_EQ(machine_tables.angle_bin_row[bin], row_of(bin << MACHINE_ANGLE_BIN_BITS));
-        EXPECT_LE(row_of((bin << MACHINE_ANGLE_BIN_BITS) + ((1u << MACHINE_ANGLE_BIN_BITS) - 1)),
-                  machine_tables.angle_bin_row[bin] + 2);
+TEST(PhaseMap, the_last_row_has_neither_curvature_nor_reciprocal) {
+    const int last = MACHINE_ROWS - 1;
+    EXPECT_EQ(machine_tables.row[last].reciprocal, 0);
+    for (int column = 0; column < MACHINE_COLUMNS; column++) {
+        EXPECT_EQ(TORQUE.curvature(last, column), 0.0);
+        EXPECT_EQ(FLUX.curvature(last, column), 0.0);
     }
+}
+
+TEST(PhaseMap, angle_bins_begin_in_their_row_and_at_most_two_rows_begin_within) {
+    for (uint32_t bin = 0; bin < MACHINE_ANGLE_BINS; bin++) {
+        const uint32_t begin = bin << MACHINE_ANGLE_BIN_BITS, last = begin + ((1u << MACHINE_ANGLE_BIN_BITS) - 1);
+        EXPECT_EQ(machine_tables.angle_bin_row[bin], row_of(begin));
+        EXPECT_LE(row_of(last) - row_of(begin), 2) << "the steps of a lookup";
+    }
+}
+
+TEST(PhaseMap, a_lookup_finds_its_row_where_two_begin_within_an_angle_bin) {
+    static machine_tables_t dense = machine_tables;
+    constexpr uint32_t BIN = 1u << MACHINE_ANGLE_BIN_BITS;
+    for (uint32_t row = 1; row + 1 < MACHINE_ROWS; row++) { // 1 and 2 in bin 0, 3 and 4 in bin 1, ...
+        dense.row[row].start = (row - 1) / 2 * BIN + (row % 2 == 1 ? BIN / 3 : BIN - 1);
+    }
+    for (uint32_t bin = 0; bin < MACHINE_ANGLE_BINS; bin++) {
+        dense.angle_bin_row[bin] = uint8_t(std::min(2 * bin, MACHINE_ROWS - 2u));
+    }
+    const auto expected_row = [](uint32_t distance) {
+        uint32_t row = 0;
+        while (dense.row[row + 1].start <= distance) {
+            row++;
+        }
+        return row;
+    };
+    for (uint32_t bin = 0; bin < MACHINE_ANGLE_BINS; bin++) {
+        for (const uint32_t within : {0u, BIN / 3 - 1, BIN / 3, BIN - 2, BIN - 1}) {
+            const uint32_t distance = bin * BIN + within;
+            ASSERT_EQ(phase_map_lookup(&dense, distance).row, expected_row(distance)) << bin << ", " << within;
+        }
+    }
+}
+
+TEST(PhaseMap, the_distance_is_that_from_the_unaligned_position_and_below_half_a_revolution) {
+    std::mt19937 random(12);
+    for (int i = 0; i < 100000; i++) {
+        const auto angle = uint32_t(random());
+        const uint32_t expected = angle == 0             ? HALF_REV_Q32 - 1
+                                  : angle < HALF_REV_Q32 ? HALF_REV_Q32 - angle
+                                                         : angle - HALF_REV_Q32;
+        ASSERT_EQ(phase_map_distance(angle), expected) << angle;
+        ASSERT_EQ(phase_map_mirrored(angle), angle < HALF_REV_Q32);
+    }
+    EXPECT_EQ(phase_map_distance(HALF_REV_Q32), 0u);
+    EXPECT_EQ(phase_map_distance(0), HALF_REV_Q32 - 1) << "aligned, 1 LSB before it";
+    EXPECT_EQ(phase_map_distance(UINT32_MAX), HALF_REV_Q32 - 1);
+    EXPECT_EQ(phase_map_distance(1), HALF_REV_Q32 - 1);
 }
 
 TEST(PhaseMap, a_lookup_is_the_nearest_fraction_of_its_row_and_never_above_one) {
@@ -123,7 +171,7 @@ TEST(PhaseMap, a_lookup_is_the_nearest_fraction_of_its_row_and_never_above_one) 
     double worst = 0.0;
     int32_t maximum = 0;
     const auto look = [&](uint32_t distance) {
-        const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, HALF_REV_Q32 + distance);
+        const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, distance);
         const int row = row_of(distance);
         ASSERT_EQ(lookup.row, uint32_t(row));
         const auto fraction_q14 = int32_t(lookup.weights_q14 >> 16);
@@ -139,9 +187,9 @@ TEST(PhaseMap, a_lookup_is_the_nearest_fraction_of_its_row_and_never_above_one) 
     }
     for (int row = 0; row < MACHINE_ROWS; row++) {
         const uint32_t start = machine_tables.row[row].start;
-        look(start);
+        look(std::min(start, HALF_REV_Q32 - 1));
         look(start - (row > 0 ? 1 : 0));
-        look(std::min(start + 1, HALF_REV_Q32));
+        look(std::min(start + 1, HALF_REV_Q32 - 1));
     }
     EXPECT_EQ(maximum, 1 << 14);
     EXPECT_LT(worst, 0.6);
@@ -172,7 +220,8 @@ TEST(PhaseMap, torque_and_flux_equal_the_tables_within_three_lsb) {
 
 TEST(PhaseMap, torque_and_flux_are_exact_at_every_node_of_the_tables) {
     for (int row = 0; row < MACHINE_ROWS; row++) {
-        const uint32_t angle = HALF_REV_Q32 + machine_tables.row[row].start; // of the last row: 0, aligned
+        // Of the last row: 0, aligned, which counts as 1 LSB before.
+        const uint32_t angle = HALF_REV_Q32 + machine_tables.row[row].start;
         for (int32_t column = 0; column + 1 < MACHINE_COLUMNS; column++) {
             const int32_t current_q9 = column_q9(column);
             const double current_A = current_q9 / Q9;
@@ -206,11 +255,10 @@ TEST(PhaseMap, errors_against_the_formula_of_the_machine_are_those_stated_here) 
     for (uint32_t unit = 0; unit < HALF_REV_Q32 / ROW_STEP; unit++) {
         // Midway between adjacent angles at which a row can start.
         const uint32_t angle = HALF_REV_Q32 + unit * ROW_STEP + ROW_STEP / 2;
-        const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, angle);
         for (int32_t current_q9 = 256; current_q9 <= 60 * 512; current_q9 += 256) {
             const magnetics_point_t point = magnetics.at(angle, current_q9 / Q9);
-            const double torque_Nm = std::fabs(phase_map_torque_q24(&lookup, current_q9) / Q24 - point.torque_Nm);
-            const double flux_Wb = std::fabs(phase_map_flux_q29(&lookup, current_q9) / Q29 - point.flux_linkage_Wb);
+            const double torque_Nm = std::fabs(torque_q24(angle, current_q9) / Q24 - point.torque_Nm);
+            const double flux_Wb = std::fabs(flux_q29(angle, current_q9) / Q29 - point.flux_linkage_Wb);
             worst.torque_Nm = std::max(worst.torque_Nm, torque_Nm);
             worst.flux_Wb = std::max(worst.flux_Wb, flux_Wb);
             if (point.torque_Nm <= 10.0) {
@@ -239,8 +287,9 @@ TEST(PhaseMap, is_mirror_symmetric_about_the_unaligned_position) {
         const uint32_t distance = 1 + uint32_t(random()) % (HALF_REV_Q32 - 1);
         const uint32_t second_half = HALF_REV_Q32 + distance, first_half = HALF_REV_Q32 - distance;
         const auto current_q9 = int32_t(random() % uint32_t(CURRENT_END_Q9 + 1));
-        const int32_t torque = torque_q24(second_half, current_q9), flux = flux_q29(second_half, current_q9);
-        ASSERT_EQ(torque_q24(first_half, current_q9), -torque);
+        const int32_t torque = phase_map_torque(&machine_tables, second_half, current_q9);
+        const int32_t flux = flux_q29(second_half, current_q9);
+        ASSERT_EQ(phase_map_torque(&machine_tables, first_half, current_q9), -torque);
         ASSERT_EQ(flux_q29(first_half, current_q9), flux);
     }
 }
@@ -267,11 +316,11 @@ TEST(PhaseMap, torque_and_flux_increase_with_the_current) {
     constexpr double FALL_Nm = 1e-5;
     std::mt19937 random(5);
     for (int i = 0; i < 300; i++) {
-        const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, HALF_REV_Q32 | uint32_t(random()));
+        const uint32_t angle = HALF_REV_Q32 | uint32_t(random());
         int32_t torque = 0, flux = 0;
         for (int32_t current_q9 = 1; current_q9 <= CURRENT_END_Q9; current_q9++) {
-            const int32_t next_torque = phase_map_torque_q24(&lookup, current_q9);
-            const int32_t next_flux = phase_map_flux_q29(&lookup, current_q9);
+            const int32_t next_torque = torque_q24(angle, current_q9);
+            const int32_t next_flux = flux_q29(angle, current_q9);
             ASSERT_GE(next_torque / Q24, torque / Q24 - FALL_Nm) << current_q9;
             ASSERT_GT(next_flux, flux) << current_q9;
             torque = std::max(torque, next_torque);
@@ -280,116 +329,13 @@ TEST(PhaseMap, torque_and_flux_increase_with_the_current) {
     }
 }
 
-TEST(PhaseMap, current_is_clamped_to_the_tables) {
-    const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, HALF_REV_Q32 + HALF_REV_Q32 / 2);
-    for (const int32_t below : {0, -1, INT32_MIN}) {
-        EXPECT_EQ(phase_map_torque_q24(&lookup, below), 0);
-        EXPECT_EQ(phase_map_flux_q29(&lookup, below), 0);
-    }
-    for (const int32_t above : {CURRENT_END_Q9 + 1, INT32_MAX}) {
-        EXPECT_EQ(phase_map_torque_q24(&lookup, above), phase_map_torque_q24(&lookup, CURRENT_END_Q9));
-        EXPECT_EQ(phase_map_flux_q29(&lookup, above), phase_map_flux_q29(&lookup, CURRENT_END_Q9));
-    }
-    EXPECT_GT(phase_map_torque_q24(&lookup, CURRENT_END_Q9), 30 << 24);
-    EXPECT_GT(phase_map_flux_q29(&lookup, CURRENT_END_Q9), int32_t(0.15 * Q29));
-}
-
-// Torque at a flux linkage, interpolated between the two currents that enclose it.
-double torque_of_flux_Nm(const phase_map_lookup_t &lookup, int32_t flux) {
-    int32_t below = 0, above = CURRENT_END_Q9;
-    while (above - below > 1) {
-        const int32_t middle = (below + above) / 2;
-        (phase_map_flux_q29(&lookup, middle) <= flux ? below : above) = middle;
-    }
-    const double low = phase_map_flux_q29(&lookup, below), high = phase_map_flux_q29(&lookup, above);
-    const double low_q24 = phase_map_torque_q24(&lookup, below), high_q24 = phase_map_torque_q24(&lookup, above);
-    return (low_q24 + (flux - low) / (high - low) * (high_q24 - low_q24)) / Q24;
-}
-
-TEST(PhaseMap, torque_and_flux_linkage_of_an_operating_point_agree_within_2_millinewtonmetres) {
-    std::mt19937 random(4);
-    double worst = 0.0;
-    int reached_count = 0, flux_min_count = 0, flux_max_count = 0, limited_count = 0;
-    for (int i = 0; i < 300000; i++) {
-        const uint32_t angle = HALF_REV_Q32 | uint32_t(random());
-        const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, angle);
-        const int32_t centre = phase_map_flux_q29(&lookup, int32_t(random() % (60 * 512)));
-        const int32_t flux_step = int32_t(0.05 * Q29) >> (random() % 8);
-        const phase_map_constraints_t constraints = {std::max(centre - flux_step, 0), centre + flux_step, 52 * 512};
-        const int32_t target = int32_t(random() % (60u << 24)) >> (random() % 10);
-        phase_map_operating_point_t point = {uint32_t(random() % (MACHINE_COLUMNS - 1)), 0, 0};
-        const bool reached = phase_map_solve(&machine_tables, angle, target, &constraints, &point);
-        ASSERT_GE(point.flux_q29, constraints.flux_min_q29);
-        ASSERT_LE(point.flux_q29, constraints.flux_max_q29);
-        const int32_t limit_q29 = phase_map_flux_q29(&lookup, constraints.current_limit_q9);
-        const double slack = 1e-6 * Q29;
-        if (reached) {
-            ASSERT_EQ(point.torque_q24, target);
-            reached_count++;
-        } else if (point.flux_q29 == constraints.flux_min_q29) {
-            flux_min_count++;
-        } else if (point.flux_q29 == constraints.flux_max_q29) {
-            flux_max_count++;
-        } else {
-            ASSERT_NEAR(point.flux_q29, limit_q29, slack) << "neither reached nor at a constraint";
-            limited_count++;
-        }
-        ASSERT_LE(point.flux_q29, std::max<double>(constraints.flux_min_q29, limit_q29 + slack));
-        if (point.flux_q29 < phase_map_flux_q29(&lookup, CURRENT_END_Q9)) {
-            const double torque_Nm = point.torque_q24 / Q24;
-            worst = std::max(worst, std::fabs(torque_Nm - torque_of_flux_Nm(lookup, point.flux_q29)));
-            // A flux constraint is only active against the remaining torque error.
-            const double shortfall_Nm = target / Q24 - torque_Nm;
-            if (!reached) {
-                ASSERT_TRUE(point.flux_q29 == constraints.flux_min_q29 || shortfall_Nm > -2e-3);
-                ASSERT_TRUE(point.flux_q29 != constraints.flux_min_q29 || shortfall_Nm < 2e-3 ||
-                            point.flux_q29 >= limit_q29 - slack);
-            }
-        }
-    }
-    EXPECT_LT(worst, 2e-3);
-    EXPECT_GT(worst, 1e-5);
-    for (const int count : {reached_count, flux_min_count, flux_max_count, limited_count}) {
-        EXPECT_GT(count, 1000);
-    }
-}
-
-TEST(PhaseMap, zero_torque_gives_the_minimum_flux_linkage_also_where_no_current_makes_torque) {
-    std::mt19937 random(11);
-    for (int i = 0; i < 20000; i++) {
-        // Every other angle at or close to the aligned position.
-        const uint32_t angle = i % 2 == 0 ? ~(uint32_t(random()) >> (8 + i % 24)) : HALF_REV_Q32 | uint32_t(random());
-        const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, angle);
-        const int32_t flux_min = phase_map_flux_q29(&lookup, 512 + int32_t(random() % (40 * 512)));
-        const phase_map_constraints_t constraints = {flux_min, flux_min + int32_t(0.05 * Q29), 52 * 512};
-        for (const int32_t target : {0, -(1 << 24)}) {
-            phase_map_operating_point_t point = {uint32_t(random() % (MACHINE_COLUMNS - 1)), 0, 0};
-            phase_map_solve(&machine_tables, angle, target, &constraints, &point);
-            ASSERT_EQ(point.flux_q29, flux_min) << angle;
-        }
-    }
-}
-
-TEST(PhaseMap, a_point_is_the_same_wherever_its_search_begins) {
-    std::mt19937 random(9);
-    for (int i = 0; i < 2000; i++) {
-        // But near the ends, where the torque hardly rises.
-        const uint32_t angle = HALF_REV_Q32 + (1u << 26) + uint32_t(random()) % (HALF_REV_Q32 - (1u << 27));
-        const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, angle);
-        const int32_t centre = phase_map_flux_q29(&lookup, int32_t(random() % (60 * 512)));
-        const int32_t flux_step = int32_t(0.05 * Q29) >> (random() % 8);
-        const phase_map_constraints_t constraints = {std::max(centre - flux_step, 0), centre + flux_step, 52 * 512};
-        const int32_t target = int32_t(random() % (30u << 24));
-        phase_map_operating_point_t first = {0, 0, 0};
-        const bool reached = phase_map_solve(&machine_tables, angle, target, &constraints, &first);
-        for (uint32_t column = 1; column < MACHINE_COLUMNS - 1; column++) {
-            phase_map_operating_point_t point = {column, 0, 0};
-            ASSERT_EQ(phase_map_solve(&machine_tables, angle, target, &constraints, &point), reached);
-            ASSERT_EQ(point.column, first.column);
-            ASSERT_EQ(point.flux_q29, first.flux_q29);
-            ASSERT_EQ(point.torque_q24, first.torque_q24);
-        }
-    }
+TEST(PhaseMap, the_largest_current_is_just_below_the_last_column) {
+    EXPECT_EQ(CURRENT_END_Q9, 80 * 512 - 1);
+    const uint32_t angle = HALF_REV_Q32 + HALF_REV_Q32 / 2;
+    EXPECT_EQ(torque_q24(angle, 0), 0);
+    EXPECT_EQ(flux_q29(angle, 0), 0);
+    EXPECT_GT(torque_q24(angle, CURRENT_END_Q9), 30 << 24);
+    EXPECT_GT(flux_q29(angle, CURRENT_END_Q9), int32_t(0.15 * Q29));
 }
 
 TEST(PhaseMap, a_slope_equals_the_difference_quotient_of_the_torque) {
@@ -422,57 +368,54 @@ TEST(PhaseMap, results_beyond_their_format_saturate) {
     static machine_tables_t strong = machine_tables;
     strong.torque_format.result_shift = 12;
     strong.flux_format.result_shift = 12;
-    const phase_map_lookup_t second_half = phase_map_lookup(&strong, HALF_REV_Q32 + HALF_REV_Q32 / 2);
-    const phase_map_lookup_t first_half = phase_map_lookup(&strong, HALF_REV_Q32 / 2);
-    EXPECT_EQ(phase_map_torque_q24(&second_half, CURRENT_END_Q9), INT32_MAX);
-    EXPECT_EQ(phase_map_torque_q24(&first_half, CURRENT_END_Q9), -INT32_MAX);
-    EXPECT_EQ(phase_map_flux_q29(&second_half, CURRENT_END_Q9), INT32_MAX);
-    const phase_map_constraints_t unconstrained = {
-        .flux_min_q29 = 0, .flux_max_q29 = INT32_MAX, .current_limit_q9 = CURRENT_END_Q9};
-    phase_map_operating_point_t point = {0, 0, 0};
-    phase_map_solve(&strong, HALF_REV_Q32 + HALF_REV_Q32 / 2, INT32_MAX, &unconstrained, &point);
-    EXPECT_EQ(point.flux_q29, INT32_MAX);
+    EXPECT_EQ(phase_map_results::torque_q24(strong, HALF_REV_Q32 + HALF_REV_Q32 / 2, CURRENT_END_Q9), INT32_MAX);
+    EXPECT_EQ(phase_map_results::torque_q24(strong, HALF_REV_Q32 / 2, CURRENT_END_Q9), INT32_MIN);
+    EXPECT_EQ(phase_map_results::flux_q29(strong, HALF_REV_Q32 + HALF_REV_Q32 / 2, CURRENT_END_Q9), INT32_MAX);
+}
+
+TEST(PhaseMap, units_become_the_format_exactly_or_saturate) {
+    for (unsigned shift = 0; shift <= 12; shift++) {
+        const machine_format_t format = {.curvature_shift = 0, .result_shift = uint8_t(shift)};
+        const int64_t limit = int64_t(1) << (31 - shift);
+        for (const int64_t units : {int64_t(0), int64_t(1), int64_t(-1), int64_t(12345), limit - 1, -limit, limit,
+                                    -limit - 1, int64_t(INT32_MAX), int64_t(INT32_MIN)}) {
+            if (units > INT32_MAX || units < INT32_MIN) {
+                continue;
+            }
+            const int64_t expected = std::clamp<int64_t>(units * (int64_t(1) << shift), INT32_MIN, INT32_MAX);
+            ASSERT_EQ(phase_map_scale(&format, int32_t(units)), expected) << units << " << " << shift;
+        }
+    }
 }
 
 TEST(PhaseMap, tables_of_extreme_entries_do_not_overflow) {
     std::mt19937 random(7);
+    int32_t largest = 0;
     for (int tables = 0; tables < 20; tables++) {
         static machine_tables_t extreme = machine_tables;
         for (machine_format_t *format : {&extreme.torque_format, &extreme.flux_format}) {
             format->curvature_shift = uint8_t(tables % 3 * 4);
             format->result_shift = uint8_t(tables % 2 == 0 ? 12 : 0);
         }
-        for (machine_column_t &column : extreme.column) {
-            for (auto *nodes : {&column.torque_node, &column.flux_node}) {
-                for (int16_t &entry : *nodes) {
-                    entry = random() % 2 == 0 ? INT16_MIN : INT16_MAX;
-                }
-            }
-            for (auto *curvatures : {&column.torque_curvature, &column.flux_curvature}) {
-                for (int8_t &entry : *curvatures) {
-                    entry = random() % 2 == 0 ? INT8_MIN : INT8_MAX;
-                }
-            }
+        for (int16_t &entry : extreme.node) {
+            entry = random() % 2 == 0 ? INT16_MIN : INT16_MAX;
+        }
+        for (int8_t &entry : extreme.curvature) {
+            entry = random() % 2 == 0 ? INT8_MIN : INT8_MAX;
         }
         for (int i = 0; i < 20000; i++) {
-            const phase_map_lookup_t lookup = phase_map_lookup(&extreme, uint32_t(random()));
-            const auto any = int32_t(uint32_t(random())) >> (random() % 24);
-            phase_map_torque_q24(&lookup, any);
-            phase_map_flux_q29(&lookup, any);
-            const uint32_t angle = uint32_t(random()) | HALF_REV_Q32;
-            phase_map_torque_slope_q24(&extreme, angle, any, 1u << 26);
-            const int32_t flux_min = int32_t(uint32_t(random()) >> 1) >> (random() % 24);
-            const int32_t above = int32_t(uint32_t(random()) >> 1) >> (random() % 24);
-            const phase_map_constraints_t constraints = {flux_min,
-                                                         above < INT32_MAX - flux_min ? flux_min + above : INT32_MAX,
-                                                         int32_t(random() % uint32_t(CURRENT_END_Q9))};
-            phase_map_operating_point_t point = {uint32_t(random() % (MACHINE_COLUMNS - 1)), 0, 0};
-            phase_map_solve(&extreme, angle, any, &constraints, &point);
-            ASSERT_LE(point.column, uint32_t(MACHINE_COLUMNS - 2));
-            ASSERT_GE(point.flux_q29, constraints.flux_min_q29);
-            ASSERT_LE(point.flux_q29, constraints.flux_max_q29);
+            const auto angle = uint32_t(random());
+            const auto current_q9 = int32_t(random() % uint32_t(CURRENT_END_Q9 + 1)) >> (random() % 16);
+            const int32_t torque = phase_map_torque(&extreme, angle, current_q9);
+            const int32_t flux = phase_map_results::flux_units(extreme, angle, current_q9);
+            phase_map_torque_slope_q24(&extreme, angle, current_q9, 1u << 26);
+            phase_map_scale(&extreme.torque_format, torque);
+            largest = std::max({largest, std::abs(torque), std::abs(flux)});
         }
     }
+    // So that the sum of four phases fits.
+    EXPECT_LT(largest, 1 << 29);
+    EXPECT_GT(largest, 1 << 28);
 }
 
 } // namespace

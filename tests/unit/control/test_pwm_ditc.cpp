@@ -7,13 +7,13 @@
 #include <gtest/gtest.h>
 
 extern "C" {
-#include "control/phase_map.h"
 #include "control/pwm_ditc.h"
 #include "fixed/formats.h"
 }
 
 #include "support/commutation_roles.h"
 #include "support/fixed_point.h"
+#include "support/phase_map_results.h"
 
 namespace {
 
@@ -30,8 +30,7 @@ roles_t commutation_of(double phase_0_deg) {
 }
 
 int32_t map_torque_q24(uint32_t phase_angle, int32_t current_q9) {
-    const phase_map_lookup_t place = phase_map_lookup(&machine_tables, phase_angle);
-    return phase_map_torque_q24(&place, current_q9);
+    return phase_map_results::torque_q24(machine_tables, phase_angle, current_q9);
 }
 
 int32_t map_current_q9(uint32_t phase_angle, int32_t torque_q24) {
@@ -58,6 +57,7 @@ pwm_ditc_parameters_t parameters_of(bp_pid_mode_t mode) {
     parameters.depleted_torque_q24 = 1 << 20;
     parameters.band_outer_q24 = 2 << 24;
     parameters.current_limit_q9 = LIMIT_Q9;
+    parameters.torque_shift = machine_tables.torque_format.result_shift;
     return parameters;
 }
 
@@ -67,14 +67,12 @@ class PwmDitc : public testing::Test {
 
     // One sample with the torques of the phase map for the currents.
     void step(const roles_t &commutation, double reference_Nm) {
-        pwm_ditc_sample_t sample{.current_q9 = current_q9,
-                                 .torque_q24 = torque_q24,
-                                 .reference_q24 = to_fixed(reference_Nm, Q24),
-                                 .error_q24 = 0};
+        pwm_ditc_sample_t sample{
+            .current_q9 = current_q9, .torque = torque, .reference_q24 = to_fixed(reference_Nm, Q24), .error_q24 = 0};
         sample.error_q24 = sample.reference_q24;
         for (unsigned phase = 0; phase < 3; phase++) {
-            torque_q24[phase] = map_torque_q24(commutation.angle[phase], current_q9[phase]);
-            sample.error_q24 -= torque_q24[phase];
+            torque[phase] = phase_map_torque(&machine_tables, commutation.angle[phase], current_q9[phase]);
+            sample.error_q24 -= phase_map_scale(&machine_tables.torque_format, torque[phase]);
         }
         error_q24 = sample.error_q24;
         pwm_ditc_step(&parameters, &ditc, &commutation, &sample, duty_q15);
@@ -83,7 +81,11 @@ class PwmDitc : public testing::Test {
     pwm_ditc_parameters_t parameters = parameters_of(BP_PID_FIXED);
     pwm_ditc_t ditc{};
     int32_t current_q9[HAL_PHASES_MAX] = {0, 0, 0, 0};
-    int32_t torque_q24[HAL_PHASES_MAX] = {0, 0, 0, 0};
+    double torque_Nm(unsigned phase) const {
+        return std::ldexp(torque[phase], machine_tables.torque_format.result_shift) / Q24;
+    }
+
+    int32_t torque[HAL_PHASES_MAX] = {0, 0, 0, 0}; // unit of the tables
     int32_t error_q24 = 0;
     int32_t duty_q15[HAL_PHASES_MAX] = {0, 0, 0, 0};
 };
@@ -181,7 +183,7 @@ TEST_F(PwmDitc, the_pid_switches_over_when_the_outgoing_phase_is_depleted_and_st
     EXPECT_EQ(ditc.regulated, 0u);
     // No torque left and no shortfall.
     current_q9[1] = 12 << 9;
-    const double reference = torque_q24[1] / Q24;
+    const double reference = torque_Nm(1);
     step(commutation, 0.5 * reference);
     ASSERT_LE(error_q24, 0);
     EXPECT_EQ(ditc.regulated, 1u);
@@ -249,7 +251,7 @@ TEST_F(PwmDitc, an_outgoing_phase_is_depleted_below_the_depleted_torque_an_eight
                 current_q9[1] = 52 << 9;
                 step(commutation, reference);
                 const double limit = std::max(0.0625, std::min(reference / 8.0, depleted_Nm));
-                const bool depleted = torque_q24[0] < limit * Q24 && error_q24 <= 0;
+                const bool depleted = torque_Nm(0) < limit && error_q24 <= 0;
                 ASSERT_EQ(ditc.regulated, depleted ? 1u : 0u)
                     << depleted_Nm << " " << reference << " " << current_eighth_A;
                 switched += depleted;
@@ -313,10 +315,10 @@ TEST_F(PwmDitc, nothing_overflows_at_the_ends_of_all_ranges) {
                 const roles_t commutation = roles_at(ANGLES, 3, 4, uint32_t(random()));
                 for (unsigned phase = 0; phase < 3; phase++) {
                     current_q9[phase] = int32_t(random() % 40951);
-                    torque_q24[phase] = ends[random() % 5];
+                    torque[phase] = ends[random() % 5];
                 }
                 const pwm_ditc_sample_t sample = {.current_q9 = current_q9,
-                                                  .torque_q24 = torque_q24,
+                                                  .torque = torque,
                                                   .reference_q24 = int32_t(random() >> 1),
                                                   .error_q24 = ends[random() % 5]};
                 pwm_ditc_step(&parameters, &ditc, &commutation, &sample, duty_q15);

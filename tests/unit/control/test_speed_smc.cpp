@@ -8,6 +8,7 @@
 
 extern "C" {
 #include "control/speed_smc.h"
+#include "fixed/fixed.h"
 }
 
 #include "support/reference_models.h"
@@ -37,6 +38,14 @@ speed_smc_parameters_t parameters_of(double gain_1_s, double epsilon, double del
 double model_torque_Nm(const speed_smc_parameters_t &parameters, int32_t x_q22) {
     return reference_model::reaching_rad_s2(parameters.gain_q24 / Q24, parameters.epsilon_q31 / Q31,
                                             parameters.delta_q27 / Q27 * std::log(2.0), x_q22 / Q22);
+}
+
+// Torque reference without the period between reaching torque and feed-forward that the drive has (deferred.h).
+int32_t torque_q24_of(const speed_smc_parameters_t &parameters, int32_t reference_q22, int32_t speed_q22,
+                      int32_t load_q24) {
+    const int32_t error_q22 = fixed_subtract(reference_q22, speed_q22);
+    const int32_t reaching_q24 = speed_smc_reaching_torque_q24(&parameters, error_q22);
+    return speed_smc_torque_q24(&parameters, reaching_q24, speed_q22, load_q24);
 }
 
 // Ends of the range, zero, every magnitude with both signs, and random values.
@@ -105,7 +114,7 @@ TEST(SpeedSmc, torque_includes_load_and_friction_and_is_clamped_to_the_limits) {
         const double exact =
             model_torque_Nm(parameters, reference_q22 - speed_q22) + load_q24 / Q24 + FRICTION_NM_S * speed_q22 / Q22;
         const double clamped = std::clamp(exact, -TORQUE_MAX_NM, TORQUE_MAX_NM);
-        const double torque = speed_smc_step(&parameters, reference_q22, speed_q22, load_q24) / Q24;
+        const double torque = torque_q24_of(parameters, reference_q22, speed_q22, load_q24) / Q24;
         ASSERT_NEAR(torque, clamped, 1e-4 * 40.0 + 1.0 / Q20);
     }
 }
@@ -124,7 +133,7 @@ TEST(SpeedSmc, nothing_overflows_at_the_ends_of_all_ranges) {
                 for (const int32_t reference : ends) {
                     for (const int32_t speed : ends) {
                         for (const int32_t load : ends) {
-                            const int32_t torque_q24 = speed_smc_step(&parameters, reference, speed, load);
+                            const int32_t torque_q24 = torque_q24_of(parameters, reference, speed, load);
                             ASSERT_LE(std::abs(torque_q24), 40 << 24);
                         }
                     }
@@ -144,7 +153,7 @@ TEST(SpeedSmc, the_lyapunov_function_decreases_while_the_torque_is_not_limited) 
         const int32_t speed_q22 = to_fixed(speed(random), Q22);
         const int32_t reference_q22 = to_fixed(speed_q22 / Q22 + sign * std::pow(10.0, exponent(random)), Q22);
         const int32_t load_q24 = to_fixed(load(random), Q24);
-        const double torque = speed_smc_step(&parameters, reference_q22, speed_q22, load_q24) / Q24;
+        const double torque = torque_q24_of(parameters, reference_q22, speed_q22, load_q24) / Q24;
         const double s = (double(reference_q22) - speed_q22) / Q22;
         const double s_rate = -(torque - FRICTION_NM_S * speed_q22 / Q22 - load_q24 / Q24) / INERTIA_KG_M2;
         ASSERT_LT(s * s_rate, 0.0) << "s " << s;
@@ -162,7 +171,7 @@ TEST(SpeedSmc, the_speed_error_of_the_sampled_model_never_grows) {
             double last = std::fabs(reference - speed);
             for (int k = 0; k < 8000; k++) {
                 const int32_t torque_q24 =
-                    speed_smc_step(&parameters, to_fixed(reference, Q22), to_fixed(speed, Q22), to_fixed(load, Q24));
+                    torque_q24_of(parameters, to_fixed(reference, Q22), to_fixed(speed, Q22), to_fixed(load, Q24));
                 speed += (torque_q24 / Q24 - FRICTION_NM_S * speed - load) / INERTIA_KG_M2 / rate_hz;
                 const double error = std::fabs(reference - speed);
                 ASSERT_LE(error, last + 2.0 / Q22) << "run " << run << ", sample " << k;
@@ -199,7 +208,7 @@ TEST(SpeedSmc, the_corrected_reaching_law_starts_the_motor_within_72_ms) {
     const double rate_hz = 40000.0;
     double speed = 0.0, settled_s = 0.0, highest = 0.0;
     for (int k = 0; k < 8000; k++) {
-        const int32_t torque_q24 = speed_smc_step(&parameters, to_fixed(REFERENCE_RAD_S, Q22), to_fixed(speed, Q22), 0);
+        const int32_t torque_q24 = torque_q24_of(parameters, to_fixed(REFERENCE_RAD_S, Q22), to_fixed(speed, Q22), 0);
         speed += (torque_q24 / Q24 - FRICTION_NM_S * speed) / INERTIA_KG_M2 / rate_hz;
         highest = std::max(highest, speed);
         if (std::fabs(REFERENCE_RAD_S - speed) > 0.005 * REFERENCE_RAD_S) {
