@@ -76,7 +76,6 @@ class Comms : public testing::Test {
   protected:
     Comms() {
         drive.hal = &bus;
-        drive.tables = drive.control_parameters.tables = &machine_tables;
         drive.control_rate_hz = 40000;
         drive.control.state_machine.state = DRIVE_STATE_RUN;
         parameters_init(&parameters);
@@ -156,7 +155,7 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     p.torque_law = TORQUE_LAW_PREDICTIVE;
     control.state_machine.record.fault = FAULT_ENCODER;
     control.observer.speed_q22 = int32_t(std::lround(-600 * 2 * M_PI / 60 * 4194304));
-    control.speed_reference_q22 = int32_t(std::lround(150 * 2 * M_PI / 60 * 4194304));
+    control.deferred.response.results[0].speed_reference_q22 = int32_t(std::lround(150 * 2 * M_PI / 60 * 4194304));
     control.measurement.angle = 0x40000000;
     control.torque_reference_q24 = int32_t(19.1 * (1 << 24));
     control.measurement.torque_sum_q24 = INT32_MAX;
