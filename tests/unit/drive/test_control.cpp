@@ -479,6 +479,42 @@ TEST_F(SalientControl, brakes_and_reverses_a_turning_rotor_with_a_torque_referen
     }
 }
 
+TEST_F(SalientControl, the_torque_is_estimated_in_the_planned_cells_which_the_end_of_a_run_discards) {
+    const auto planned = [this] {
+        unsigned cells = 0;
+        for (unsigned phase = 0; phase < 3; phase++) {
+            cells += state.predictive.cell[0][phase].located + state.predictive.cell[1][phase].located;
+        }
+        return cells;
+    };
+    start();
+    for (int k = 0; k < 10; k++) {
+        sample.adc.phase_current_counts[2] = uint16_t(50 * k);
+        ASSERT_TRUE(step(COMMAND_RUN, 600.0));
+    }
+    EXPECT_GT(planned(), 0u);
+    int32_t estimate_q24 = 0;
+    predictive_torque_t before;
+    std::memcpy(&before, &state.predictive, sizeof before);
+    ASSERT_TRUE(step(COMMAND_RUN, 600.0));
+    for (unsigned phase = 0; phase < 3; phase++) {
+        int32_t flux;
+        const int32_t current_q9 = state.measurement.current_q9[phase];
+        const int32_t torque = current_q9 > 0 ? predictive_torque_estimate(&before, phase, current_q9, &flux) : 0;
+        EXPECT_EQ(state.measurement.torque[phase], torque) << phase;
+        estimate_q24 += phase_map_scale(&machine_tables.torque_format, torque);
+    }
+    EXPECT_GT(diagnostics.torque_q24, 1 << 24);
+    EXPECT_EQ(diagnostics.torque_q24, estimate_q24);
+
+    EXPECT_FALSE(step(COMMAND_OFF));
+    EXPECT_EQ(planned(), 0u);
+    EXPECT_FALSE(step(COMMAND_OFF));
+    EXPECT_EQ(diagnostics.torque_q24, 0) << "without a plan";
+    EXPECT_TRUE(step(COMMAND_RUN, 600.0));
+    EXPECT_EQ(diagnostics.torque_q24, 0) << "no cell of the previous run";
+}
+
 TEST_F(SalientControl, the_number_of_pulses_per_period_is_a_parameter) {
     for (const int32_t pulses : {1, 2}) {
         configure_with(DRIVE_CONTROLLER_SALIENT, PARAMETER_PULSES_PER_PERIOD, pulses);

@@ -22,10 +22,12 @@ constexpr int32_t COUNT = 1 << (32 - ENCODER_BITS);
 // A drive on a rotor whose speed the test prescribes. The test decides when the deferred step is made.
 class Deferred : public testing::Test {
   protected:
-    Deferred() {
+    Deferred() { configure(DRIVE_CONTROLLER_SALIENT); }
+
+    void configure(drive_controller_t controller) {
         parameters_t p;
         parameters_init(&p);
-        p.values[PARAMETER_CONTROLLER] = DRIVE_CONTROLLER_SALIENT;
+        p.values[PARAMETER_CONTROLLER] = controller;
         parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, 12);
         control_reset(&parameters, &state);
         sample.adc.bus_voltage_counts = 240 * 8;
@@ -186,6 +188,69 @@ TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_windows_at_the_end_o
     EXPECT_TRUE(deferred_step(&parameters, &state));
     EXPECT_EQ(state.deferred.advance_q30, 0) << "the windows start again";
     EXPECT_FALSE(advanced());
+}
+
+TEST_F(Deferred, the_torque_of_the_speed_law_acts_one_period_later_with_the_feed_forward_of_that_period) {
+    start();
+    for (int k = 0; k < 200; k++) {
+        speed_rad_s = 0.02 * k;
+        interrupt(COMMAND_RUN, 30.0);
+        const deferred_input_t &input = state.deferred_request.input;
+        const int32_t error_q22 = state.speed_reference_q22 - state.observer.speed_q22;
+        EXPECT_EQ(input.speed_reference_q22 - input.speed_q22, error_q22) << "the speed after this sample";
+        deferred_step(&parameters, &state);
+        const int32_t law_q24 = results().speed_law_torque_q24;
+        ASSERT_EQ(law_q24, speed_smc_reaching_torque_q24(&parameters.speed_smc, error_q22));
+        interrupt(COMMAND_RUN, 30.0);
+        ASSERT_EQ(state.torque_reference_q24,
+                  speed_smc_torque_q24(&parameters.speed_smc, law_q24, state.observer.speed_q22,
+                                       state.observer.load_torque_q24));
+        deferred_step(&parameters, &state);
+    }
+}
+
+TEST_F(Deferred, the_speed_law_keeps_its_torque_while_its_step_is_late) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_SALIENT}) {
+        configure(controller);
+        start();
+        period(COMMAND_RUN, 10.0);
+        const int32_t law_q24 = results().speed_law_torque_q24;
+        ASSERT_GT(law_q24, 0);
+        interrupt(COMMAND_RUN, 10.0);
+        for (int k = 0; k < 4; k++) {
+            interrupt(COMMAND_RUN, 20.0);
+            ASSERT_EQ(results().speed_law_torque_q24, law_q24);
+        }
+        deferred_step(&parameters, &state);
+        period(COMMAND_RUN, 20.0);
+        EXPECT_GT(results().speed_law_torque_q24, law_q24);
+    }
+}
+
+TEST_F(Deferred, a_run_begins_without_torque_and_integral_of_the_speed_law_also_after_a_late_step) {
+    configure(DRIVE_CONTROLLER_TRADITIONAL);
+    start();
+    EXPECT_EQ(state.torque_reference_q24, 0) << "first period of a run";
+    for (int k = 0; k < 400; k++) {
+        period(COMMAND_RUN, 2.0);
+    }
+    const int64_t integral_q54 = state.deferred.speed_pi.integral_q54;
+    ASSERT_GT(integral_q54, 0);
+    EXPECT_GT(state.torque_reference_q24, 0);
+    interrupt(COMMAND_RUN, 2.0); // this step will be late
+    EXPECT_FALSE(interrupt(COMMAND_OFF));
+    EXPECT_EQ(results().speed_law_torque_q24, 0) << "in effect without a step";
+    EXPECT_TRUE(deferred_step(&parameters, &state)) << "with the integral of the run";
+    EXPECT_EQ(results().speed_law_torque_q24, 0);
+    EXPECT_TRUE(interrupt(COMMAND_RUN, 2.0)) << "the next run, without a period between";
+    EXPECT_EQ(state.torque_reference_q24, 0);
+    EXPECT_TRUE(deferred_step(&parameters, &state));
+    EXPECT_GT(state.deferred.speed_pi.integral_q54, 0);
+    EXPECT_LT(state.deferred.speed_pi.integral_q54, integral_q54 / 100) << "of one step";
+    period(COMMAND_OFF);
+    period(COMMAND_OFF);
+    EXPECT_EQ(state.deferred.speed_pi.integral_q54, 0);
+    EXPECT_EQ(results().speed_law_torque_q24, 0);
 }
 
 TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_observer) {

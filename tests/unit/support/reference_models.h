@@ -154,7 +154,8 @@ inline double flux_step(double flux, double gain, double table, double applied, 
     return std::max(flux + gain * (table - flux) + applied - drop, 0.0);
 }
 
-// Predictive torque control. machine_t models a phase, angles in electrical revolutions from 0.5 (unaligned) to 1:
+// Predictive torque control with exact inverses: no cell limits how far an operating point moves. machine_t models a
+// phase, angles in electrical revolutions from 0.5 (unaligned) to 1:
 // torque(angle, A), flux(angle, A), current_of_torque(angle, N m) and current_of_flux(angle, Wb).
 template <typename machine_t> struct predictive_t {
     static constexpr unsigned PHASES_MAX = 4;
@@ -201,13 +202,12 @@ template <typename machine_t> struct predictive_t {
         }
         torque_shortfall = 0.0;
         if (limited) {
-            const bool positive = reference >= 0.0;
             torque_shortfall = reference;
             for (unsigned phase = 0; phase < phases; phase++) {
                 torque_shortfall -= plan[phase].positive ? plan[phase].torque : -plan[phase].torque;
             }
-            redistribute_torque(positive, sample.reverse, true);
-            redistribute_torque(!positive, sample.reverse, false);
+            correct_torque(reference >= 0.0, sample.reverse);
+            torque_shortfall = std::fabs(torque_shortfall) > 1.0 / 64.0 ? torque_shortfall : 0.0;
         }
         for (unsigned phase = 0; phase < phases; phase++) {
             const double duty_max = sample.current_A[phase] > current_limit_A ? 0.0 : 1.0;
@@ -219,6 +219,7 @@ template <typename machine_t> struct predictive_t {
   private:
     struct plan_t {
         double angle, since_on, torque, flux, flux_min, flux_max;
+        int limit; // -1: minimum of the flux linkage, 1: maximum or current limit, 0: none
         bool positive;
     };
     std::array<plan_t, PHASES_MAX> plan{};
@@ -239,41 +240,43 @@ template <typename machine_t> struct predictive_t {
         torque = std::max(torque, 0.0);
         double current = torque > 0.0 ? machine->current_of_torque(p.angle, torque) : 0.0;
         bool limited = current > current_limit_A;
+        p.limit = torque == 0.0 ? -1 : limited ? 1 : 0;
         current = std::min(current, current_limit_A);
         const double target = current > 0.0 ? machine->flux(p.angle, current) : 0.0;
         p.flux = std::clamp(target, p.flux_min, p.flux_max);
         if (p.flux != target) {
             limited = true;
+            p.limit = p.flux > target ? -1 : 1;
             current = machine->current_of_flux(p.angle, p.flux);
         }
         p.torque = limited ? machine->torque(p.angle, current) : torque;
         return limited;
     }
 
-    // The half of the reference takes shortfall and excess, the other one only excess.
-    void redistribute_torque(bool positive, bool reverse, bool may_increase) {
-        std::array<unsigned, PHASES_MAX> order{};
-        unsigned count = 0;
+    // One phase takes the shortfall or excess: of the half of the reference, the one that entered last or first and is
+    // not at its limit; when none is, an opposed one may reduce its torque.
+    void correct_torque(bool positive, bool reverse) {
+        const bool increase = (torque_shortfall > 0.0) == positive;
+        const bool latest_is_least = positive != reverse;
+        plan_t *corrected = nullptr, *opposed = nullptr;
         for (unsigned phase = 0; phase < phases; phase++) {
-            if (plan[phase].positive == positive && plan[phase].since_on >= 0.0) {
-                order[count++] = phase;
+            plan_t &p = plan[phase];
+            if (p.positive != positive) {
+                opposed = p.limit >= 0 && p.torque > 0.0 ? &p : opposed;
+            } else if (p.since_on >= 0.0 && p.limit != (increase ? 1 : -1) &&
+                       (corrected == nullptr || (p.since_on < corrected->since_on) == (latest_is_least == increase))) {
+                corrected = &p;
             }
         }
-        const bool increase = (torque_shortfall > 0.0) == positive;
-        if (increase && !may_increase) {
-            return;
+        if (corrected == nullptr) {
+            if (opposed == nullptr || !increase) {
+                return;
+            }
+            corrected = opposed;
         }
-        const bool incoming_is_least = positive != reverse;
-        std::sort(order.begin(), order.begin() + count, [&](unsigned a, unsigned b) {
-            const bool less = plan[a].since_on < plan[b].since_on;
-            return less == (incoming_is_least == increase);
-        });
-        for (unsigned n = 0; n < count && torque_shortfall != 0.0; n++) {
-            plan_t &p = plan[order[n]];
-            const double before = p.torque;
-            plan_torque(p, before + (positive ? torque_shortfall : -torque_shortfall));
-            torque_shortfall -= positive ? p.torque - before : before - p.torque;
-        }
+        const double before = corrected->torque, sign = corrected->positive ? 1.0 : -1.0;
+        plan_torque(*corrected, before + sign * torque_shortfall);
+        torque_shortfall -= sign * (corrected->torque - before);
     }
 };
 

@@ -125,14 +125,16 @@ class salient_t {
         observer.set_gains(observer_t::ideal(now_rad_s, rate_hz, inertia_kg_m2, friction_Nm_s));
         observer.step(measured, torque_Nm);
         if (!run) {
+            reaching_Nm = 0.0;
             return {-1.0, -1.0, -1.0, -1.0};
         }
 
         const double reference_rad_s = command.speed_reference_q22 / Q22;
         const double slip_rad_s = reference_rad_s - observer.speed;
-        const double reference_Nm = std::clamp(gain_Nm_s * reaching_rad_s2(1.0, epsilon, delta_s, slip_rad_s) +
-                                                   observer.load_torque + friction_Nm_s * observer.speed,
+        // The reaching torque of the previous period, of the deferred step; the feed-forward of this one.
+        const double reference_Nm = std::clamp(reaching_Nm + observer.load_torque + friction_Nm_s * observer.speed,
                                                -torque_max_Nm, torque_max_Nm);
+        reaching_Nm = gain_Nm_s * reaching_rad_s2(1.0, epsilon, delta_s, slip_rad_s);
 
         const bool steady = bandwidth.steady() && std::fabs(slip_rad_s) < std::fabs(observer.speed) / 64.0 &&
                             predictive.torque_shortfall == 0.0;
@@ -166,6 +168,7 @@ class salient_t {
     unsigned encoder_bits, adc_bits;
     double epsilon, delta_s, gain_Nm_s, torque_max_Nm;
     bool initialised = false;
+    double reaching_Nm = 0.0; // acts in the next period
     observer_t observer{};
     bandwidth_t bandwidth{};
     predict_t predictive{};
