@@ -196,9 +196,9 @@ TEST_F(Deferred, the_torque_of_the_speed_law_acts_one_period_later_with_the_feed
         speed_rad_s = 0.02 * k;
         interrupt(COMMAND_RUN, 30.0);
         const deferred_input_t &input = state.deferred_request.input;
-        const int32_t error_q22 = state.speed_reference_q22 - state.observer.speed_q22;
-        EXPECT_EQ(input.speed_reference_q22 - input.speed_q22, error_q22) << "the speed after this sample";
+        EXPECT_EQ(input.speed_q22, state.observer.speed_q22) << "the speed after this sample";
         deferred_step(&parameters, &state);
+        const int32_t error_q22 = results().speed_reference_q22 - input.speed_q22;
         const int32_t law_q24 = results().speed_law_torque_q24;
         ASSERT_EQ(law_q24, speed_smc_reaching_torque_q24(&parameters.speed_smc, error_q22));
         interrupt(COMMAND_RUN, 30.0);
