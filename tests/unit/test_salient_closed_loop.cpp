@@ -30,8 +30,8 @@ void compare(const std::string &metric, double fixed, double model, double relat
 }
 
 // 6 mN m of 8 N m and friction. The reference model has no tables; those of the firmware have errors of 4 to 9 mN m
-// (test_control_phase_map), more than a tenth of the small ripple with two pulses: measured up to 5 mN m, 11 %. With
-// the same tables in the model the ratios of the saturating machine are 1.01 instead of 1.07 and 1.11.
+// (test_control_phase_map), more than a tenth of the small ripple with two pulses: measured up to 4 mN m, 8 %, with the
+// tables of the finite-element machine; 2 % or less with two pulses and the tables of the others.
 constexpr double TABLES_RIPPLE = 6e-3 / 8.3;
 
 template <typename drive_t> Bench<drive_t> at_speed(const setup_t &setup, double reference_rpm, double load_Nm) {

@@ -132,6 +132,10 @@ TEST(PhaseMap, a_lookup_finds_its_row_where_two_begin_within_an_angle_bin) {
     for (uint32_t row = 1; row + 1 < MACHINE_ROWS; row++) { // 1 and 2 in bin 0, 3 and 4 in bin 1, ...
         dense.row[row].start = (row - 1) / 2 * BIN + (row % 2 == 1 ? BIN / 3 : BIN - 1);
     }
+    for (uint32_t row = 0; row + 1 < MACHINE_ROWS; row++) {
+        const uint32_t width = dense.row[row + 1].start - dense.row[row].start;
+        dense.row[row].reciprocal = int32_t((uint64_t(1) << 46) / width);
+    }
     for (uint32_t bin = 0; bin < MACHINE_ANGLE_BINS; bin++) {
         dense.angle_bin_row[bin] = uint8_t(std::min(2 * bin, MACHINE_ROWS - 2u));
     }
