@@ -24,6 +24,10 @@
 /* Duty in Q1.15, -1..1 - 2^-15, which the modulator rounds to 1. */
 #define DUTY_BITS 16
 
+/* Position from which a phase without flux linkage starts, in columns, Q13: its cell is then usable from 0.5 to 4.5
+ * columns. */
+#define START_Q13 (2 << 13)
+
 /* A column in Q4. */
 #define COLUMN_Q4 16
 
@@ -244,7 +248,7 @@ static inline int32_t duty_of(const plan_t *p, duty_divisor_t by, unsigned flux_
 
 /* Column in which the next plan begins: the current changes as from the last plan to this one. */
 static inline void extrapolate_column(predictive_torque_t *control, unsigned phase, const plan_t *p) {
-    const int32_t position_q13 = p->flux > 0 ? p->column * (1 << 13) + p->v_q13 + PHASE_CELL_HALF_Q13 : 0;
+    const int32_t position_q13 = p->flux > 0 ? p->column * (1 << 13) + p->v_q13 + PHASE_CELL_HALF_Q13 : START_Q13;
     control->column[phase] =
         (uint8_t)fixed_clamp((2 * position_q13 - control->position_q13[phase]) >> 13, 0, PHASE_CELL_COLUMN_MAX);
     control->position_q13[phase] = position_q13;

@@ -105,7 +105,7 @@ ALWAYS_INLINE int32_t predictive_torque_estimate(const predictive_torque_t *cont
     return cell->negative ? -torque : torque;
 }
 
-/* One sample: duty of each phase, Q1.15, -32768..32768. All sums saturate; 32-bit products are rounded to nearest, the
+/* One sample: duty of each phase, Q1.15, -32768..32767. All sums saturate; 32-bit products are rounded to nearest, the
  * error of the quotient is below 2^-14 of full duty. */
 void predictive_torque_step(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
                             const machine_tables_t *tables, const predictive_torque_sample_t *sample,
