@@ -2,6 +2,7 @@
  *
  *   protect      deferred checks                                                           protection.h
  *   bandwidth    statistics of the innovation -> limits of the observer's trigger           observer_bandwidth.h
+ *   speed law    speed error -> torque, without feed-forward                               speed_pi.h, speed_smc.h
  *   windows      torque shortfall -> conduction windows, with their reciprocal              predictive_torque.h
  *   learn        misalignment of each phase                                                misalignment.h
  *
