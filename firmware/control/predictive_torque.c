@@ -24,9 +24,9 @@
 /* Duty in Q1.15, -1..1 - 2^-15, which the modulator rounds to 1. */
 #define DUTY_BITS 16
 
-/* Position from which a phase without flux linkage starts, in columns, Q13: its cell is then usable from 0.5 to 4.5
+/* Position from which a phase without flux linkage starts, in columns, Q13: its cell is then usable from 0 to 3.5
  * columns. */
-#define START_Q13 (2 << 13)
+#define START_Q13 (1 << 13)
 
 /* A column in Q4. */
 #define COLUMN_Q4 16

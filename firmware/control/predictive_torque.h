@@ -15,7 +15,7 @@
  * planned again with the sum of what is missing, in the order of DITC (ditc_hysteresis.h): a shortfall goes to the
  * phase that entered last and can make more torque, an excess is taken from the one that entered first and can make
  * less. This correction is free to change to another cell, so that a load step is answered within the period. Measured
- * (tools/salient compare dip speeds): as many corrections and cells as phases give the same speed drop and ripple.
+ * (tools/salient compare dip --quick): three corrections, each in a cell of its own, give the same speed drop.
  * Switch states are those of DITC: every duty alternates between +1 and 0 or between -1 and 0.
  *
  * Two periods later the cell of the plan also gives torque and flux linkage from the measured current

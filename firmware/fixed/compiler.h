@@ -12,8 +12,8 @@
 #define ALWAYS_INLINE __attribute__((always_inline)) static inline
 
 /* Unrolls the loop that follows; iterations is a number. Sums of the BP network and its PID: 29 instructions forward,
- * 12 learning, 16 in the PID. Duties of hysteresis control: 11. Loops over the phases, whose number is known when a drive
- * is linked with the tables of its machine: 122 of the computed bound of salient, 40 of paper's. */
+ * 12 learning, 16 in the PID. Duties of hysteresis control: 11. Loops over the phases, whose number is known when a
+ * drive is linked with the tables of its machine: 122 of the computed bound of salient, 40 of paper's. */
 #define UNROLL(iterations) COMPILER_PRAGMA(GCC unroll iterations)
 #define COMPILER_PRAGMA(text) _Pragma(#text)
 

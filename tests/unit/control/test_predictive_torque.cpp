@@ -291,7 +291,7 @@ TEST(PredictiveTorque, duties_equal_the_reference_model_in_four_quadrants_with_a
     EXPECT_LT(extrapolated.worst_Nm, 0.5);
     EXPECT_GT(extrapolated.worst_Nm, 0.3);
     EXPECT_LT(extrapolated.shortfall_Nm, 0.35);
-    EXPECT_LT(limited.periods, 0.04 * periods);
+    EXPECT_LT(limited.periods, 0.045 * periods);
     EXPECT_LT(limited.mean_Nm(), 0.12);
     EXPECT_LT(limited.worst_Nm, 4.8);
     EXPECT_GT(limited.worst_Nm, 3.0);

@@ -43,7 +43,6 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
 
     const bool salient = p.values[PARAMETER_CONTROLLER] == DRIVE_CONTROLLER_SALIENT;
 
-
     ASSERT_EQ(int(c.controller), p.values[PARAMETER_CONTROLLER]);
     const bool traditional = p.values[PARAMETER_CONTROLLER] == DRIVE_CONTROLLER_TRADITIONAL;
     ASSERT_EQ(c.speed_law, traditional ? SPEED_LAW_PI : SPEED_LAW_SMC);
