@@ -34,6 +34,13 @@ static void hysteresis_control(const control_parameters_t *parameters, control_s
 
 static void duty_control(const control_parameters_t *parameters, control_state_t *state,
                          const control_measurement_t *measured) {
+    if (state->duty.regulated == COMMUTATION_NONE && state->torque_reference_q24 <= 0) {
+        /* The speed law's first torque acts in the second period: the outgoing phase would count as depleted before. */
+        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+            state->duty_q15[phase] = -MODULATOR_DUTY_ONE_Q15;
+        }
+        return;
+    }
     const pwm_ditc_sample_t sample = {
         .current_q9 = measured->current_q9,
         .torque = measured->torque,
