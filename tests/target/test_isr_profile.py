@@ -109,7 +109,7 @@ def interrupts_in(log: Path) -> tuple[dict[str, list[int]], Counter[int]]:
     addresses: Counter[int] = Counter()
     with log.open(encoding="utf-8", errors="replace") as lines:
         for line in lines:
-            if line.startswith("Stopped execution") and active:  # the instruction was pre-empted
+            if line.startswith("Stopped execution") and active:  # the instruction was interrupted
                 active[-1] = (active[-1][0], active[-1][1] - 1)
             trace = re.match(r"Trace .*\[[0-9a-f]+/([0-9a-f]+)/.*\] ?(.*)", line)
             if not trace:
@@ -152,7 +152,7 @@ def test_control_interrupt_that_preempts_the_deferred_one_is_not_part_of_its_cou
                    env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"})
     lengths, _ = interrupts_in(log)
     assert len(lengths["deferred"]) > 90
-    assert len(lengths["control"]) > 1.2 * len(lengths["deferred"])  # the others pre-empted one
+    assert len(lengths["control"]) > 1.2 * len(lengths["deferred"])  # the others interrupted one
     for name, path in counts.items():
         assert lengths[name] == list(np.fromfile(path, "<u4")), name
 
