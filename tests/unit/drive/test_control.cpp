@@ -173,6 +173,7 @@ TEST_F(Control, every_switch_is_open_until_run_is_commanded) {
         step(k % 2 == 0 ? COMMAND_STOP : COMMAND_CLEAR_FAULT);
         ASSERT_TRUE(all_open(compare));
     }
+    step(COMMAND_RUN); // the first torque of the speed law acts in the next period
     step(COMMAND_RUN);
     EXPECT_FALSE(all_open(compare));
 }
