@@ -25,8 +25,12 @@
 
 #define PHASE_CELL_COLUMN_MAX (MACHINE_COLUMNS - 2)
 
-/* u and v in Q2.13; v is saturated to -2..2 - 2^-13, a column and a half beyond the cell. */
-#define PHASE_CELL_V_BITS 15
+/* u and v in Q2.13, saturated to -4..4 - 2^-13, three columns and a half beyond the cell: with two columns a voltage
+ * limited machine overshot its torque limit by 8 % (tests/hil,
+ * test_enters_and_leaves_voltage_limited_operation_smoothly).
+ */
+#define PHASE_CELL_V_BITS 16
+#define PHASE_CELL_FIRST_BITS 15 /* of the first step of the inverse: -2..2 */
 #define PHASE_CELL_V_MAX_Q13 ((1 << (PHASE_CELL_V_BITS - 1)) - 1)
 #define PHASE_CELL_U_BITS 16
 #define PHASE_CELL_RATIO_BITS 14 /* c_psi / rise_psi, Q2.13, saturated to -1..1: a fraction in any machine */
@@ -116,7 +120,7 @@ ALWAYS_INLINE int32_t phase_cell_solve_q13(const phase_cell_t *cell, int32_t tor
         fixed_saturate_bits(fixed_subtract(torque, cell->torque.middle), PHASE_CELL_RISE_BITS) * (1 << 5);
     const int32_t rise = ((cell->torque.rise + (1 << 7)) >> 8) | 1; /* 2^8 units */
     const int32_t curvature = cell->curvature >> 8;
-    const int32_t first_q13 = fixed_saturate_bits(rest_q5 / rise, PHASE_CELL_V_BITS);
+    const int32_t first_q13 = fixed_saturate_bits(rest_q5 / rise, PHASE_CELL_FIRST_BITS);
     const int32_t slope = (rise + ((curvature * first_q13) >> 12)) | 1;
     const int32_t numerator_q5 = rest_q5 + curvature * ((first_q13 * first_q13) >> 13);
     return fixed_saturate_bits(numerator_q5 / slope, PHASE_CELL_V_BITS);

@@ -9,7 +9,7 @@
  * psi(k+2) = psi(k+1) + Ts (duty Vdc - R i), solved for the duty with psi(k+2) = psi*. Torque sharing:
  * torque_sharing.h.
  *
- * Each phase is planned in one cell of the tables, a column wide and usable two columns beyond, at the current that is
+ * Each phase is planned in one cell of the tables, a column wide and extrapolated where needed, at the current that is
  * expected from its last two plans: no search, and the same number of instructions for any sample. In one period a flux
  * linkage changes by at most +-Vdc Ts. When that, or the end of a cell, keeps phases from their torque, one phase is
  * planned again with the sum of what is missing, in the order of DITC (ditc_hysteresis.h): a shortfall goes to the

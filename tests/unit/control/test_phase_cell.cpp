@@ -99,16 +99,16 @@ TEST(PhaseCell, inside_the_cell_both_parabolas_are_the_interpolation_of_the_map_
 struct errors_t {
     double inside_Nm;                                 // torque at a flux linkage, within the cell
     double one_column_Nm;                             // for u within -1..1
-    double two_columns_Nm;                            // for v within -2..2
+    double two_columns_Nm;                            // for u within -2.5..2.5
     double inverse_inside_Nm, inverse_two_columns_Nm; // torque at the flux linkage that the inverse gives
     double solved_inside_Nm, solved_two_columns_Nm;   // torque(solve(T)) against T
 };
 
 const std::map<std::string, errors_t> ERRORS = {
-    {"saturating", {8.4e-3, 0.164, 0.598, 9.4e-3, 0.535, 4.6e-3, 67.8e-3}},
-    {"finite_element", {4.7e-3, 0.125, 0.472, 5.2e-3, 0.462, 2.4e-3, 36.5e-3}},
-    {"linear_cosine", {0.92e-3, 4.8e-3, 10.3e-3, 4.5e-3, 58.2e-3, 4.5e-3, 58.2e-3}},
-    {"linear_trapezoid", {1.68e-3, 3.6e-3, 6.8e-3, 3.2e-3, 40.9e-3, 3.2e-3, 40.9e-3}},
+    {"saturating", {8.4e-3, 0.164, 1.167, 9.4e-3, 1.633, 4.6e-3, 0.801}},
+    {"finite_element", {4.7e-3, 0.125, 0.815, 5.2e-3, 1.209, 2.4e-3, 0.564}},
+    {"linear_cosine", {0.92e-3, 4.8e-3, 12.8e-3, 4.5e-3, 58.2e-3, 4.5e-3, 58.2e-3}},
+    {"linear_trapezoid", {1.68e-3, 3.6e-3, 8.6e-3, 3.2e-3, 40.9e-3, 3.2e-3, 40.9e-3}},
 };
 
 void expect_stated(const char *what, double measured, double errors_t::*stated) {
@@ -165,7 +165,7 @@ TEST(PhaseCell, the_inverse_has_the_torque_within_the_errors_stated_here) {
     expect_stated("solved to two columns", two_columns.solved_Nm, &errors_t::solved_two_columns_Nm);
 }
 
-TEST(PhaseCell, a_torque_beyond_two_columns_saturates_the_inverse) {
+TEST(PhaseCell, the_inverse_of_a_torque_far_beyond_the_cell_is_on_its_side) {
     std::mt19937 random(3);
     int compared = 0;
     for (int i = 0; i < 100000; i++) {
@@ -176,14 +176,13 @@ TEST(PhaseCell, a_torque_beyond_two_columns_saturates_the_inverse) {
             continue; // hardly any torque at any current
         }
         const double highest_Nm = map_torque_Nm(distance, std::min((column + 4) * 1024, CURRENT_END_Q9));
-        ASSERT_EQ(phase_cell_solve_q13(&cell, int32_t(highest_Nm / TORQUE_UNIT)), PHASE_CELL_V_MAX_Q13)
-            << column << " " << distance;
+        ASSERT_GT(phase_cell_solve_q13(&cell, int32_t(highest_Nm / TORQUE_UNIT)), 3 << 12) << column << " " << distance;
         if (column >= 8) {
             const double lowest_Nm = map_torque_Nm(distance, (column - 3) * 1024);
-            ASSERT_EQ(phase_cell_solve_q13(&cell, int32_t(lowest_Nm / TORQUE_UNIT)), -PHASE_CELL_V_MAX_Q13 - 1)
+            ASSERT_LT(phase_cell_solve_q13(&cell, int32_t(lowest_Nm / TORQUE_UNIT)), -(3 << 12))
                 << column << " " << distance;
         }
-        ASSERT_EQ(phase_cell_solve_q13(&cell, INT32_MAX), PHASE_CELL_V_MAX_Q13);
+        ASSERT_GT(phase_cell_solve_q13(&cell, INT32_MAX), 3 << 12);
         compared++;
     }
     EXPECT_GT(compared, 50000);

@@ -236,12 +236,12 @@ struct differences_t {
 //
 // The model moves every phase to the exact operating point. The firmware plans in the cell where it expects the point,
 // and differs where the point is outside: torque over flux linkage is extrapolated there (test_control_phase_cell has
-// the errors), ends at two columns, and the one correction may be needed by the phase that ended there. Periods by what
-// the plans needed:
+// the errors), ends at four columns, and the one correction may be needed by the phase that ended there. Periods by
+// what the plans needed:
 //
 //   inside        every point within a tenth of a column of its cell, none in another cell than expected
 //   extrapolated  a point further away, to two columns
-//   limited       a point at two columns, or a correction in another cell
+//   limited       a point further than two columns, or a correction in another cell
 //
 // Inside, 63 periods of 240000 differ by more than 0.03 N m. Up to 0.046 N m: at the current limit, whose u the
 // firmware takes for v. Up to 0.135 N m: which of two opposed phases reduces depends on a torque that rounds to 0 in
@@ -293,13 +293,13 @@ TEST(PredictiveTorque, duties_equal_the_reference_model_in_four_quadrants_with_a
     EXPECT_LT(extrapolated.shortfall_Nm, 0.35);
     EXPECT_LT(limited.periods, 0.045 * periods);
     EXPECT_LT(limited.mean_Nm(), 0.12);
-    EXPECT_LT(limited.worst_Nm, 4.8);
-    EXPECT_GT(limited.worst_Nm, 3.0);
+    EXPECT_LT(limited.worst_Nm, 2.3);
+    EXPECT_GT(limited.worst_Nm, 1.5);
     EXPECT_LT(limited.shortfall_Nm, 4.0);
     // Without overlap each phase takes the whole torque from one period to the next.
-    EXPECT_LT(mean_with_sharing_Nm, 0.008);
-    EXPECT_LT(mean_without_Nm, 0.075);
-    EXPECT_GT(mean_without_Nm, 0.03);
+    EXPECT_LT(mean_with_sharing_Nm, 0.01);
+    EXPECT_LT(mean_without_Nm, 0.0125);
+    EXPECT_GT(mean_without_Nm, 0.008);
 }
 
 // A phase at an angle of its own, with a torque reference that it alone carries, and the flux linkage of the torque.
@@ -337,7 +337,7 @@ int repetitions_until_planned(uint32_t angle, double current_A, int column, int 
     return settled + 1;
 }
 
-TEST(PredictiveTorque, from_any_column_the_operating_point_is_planned_within_8_periods_and_mostly_within_3) {
+TEST(PredictiveTorque, from_any_column_the_operating_point_is_planned_within_10_periods_and_mostly_within_3) {
     std::mt19937 random(3);
     int within_3 = 0, longest = 0;
     for (int i = 0; i < 6000; i++) {
@@ -348,10 +348,10 @@ TEST(PredictiveTorque, from_any_column_the_operating_point_is_planned_within_8_p
         longest = std::max(longest, n);
         within_3 += n <= 3;
     }
-    EXPECT_LE(longest, 8);
+    EXPECT_LE(longest, 10);
     EXPECT_GE(longest, 5);
-    EXPECT_GT(within_3, 0.8 * 6000);
-    EXPECT_LT(within_3, 0.9 * 6000);
+    EXPECT_GT(within_3, 0.68 * 6000);
+    EXPECT_LT(within_3, 0.76 * 6000);
 }
 
 // Errors of estimates within some distance of the middle of the planned cell.
