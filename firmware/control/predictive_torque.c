@@ -261,7 +261,8 @@ void predictive_torque_reset(predictive_torque_t *control) {
 void predictive_torque_step(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
                             const machine_tables_t *tables, const predictive_torque_sample_t *sample,
                             int32_t duty_q15[HAL_PHASES_MAX]) {
-    const unsigned phases = tables->phases;
+    /* At most HAL_PHASES_MAX; the compiler needs to see it where it unrolls loops without knowing the tables. */
+    const unsigned phases = tables->phases < HAL_PHASES_MAX ? tables->phases : HAL_PHASES_MAX;
     /* Vdc Ts: Q6 * Q40 to Q29. */
     const int32_t flux_step_max_q29 =
         fixed_clamp(fixed_multiply_high(sample->bus_voltage_q6 << 15, parameters->period_q40), FLUX_STEP_MIN_Q29,
