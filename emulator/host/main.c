@@ -1,7 +1,6 @@
 /* One drive on its bench: the firmware, the host port and the emulator in one process and one thread. */
 #include <assert.h>
 
-#include "control/machine_tables.h"
 #include "drive.h"
 #include "host/hal_host.h"
 #include "host/simulation.h"

@@ -23,13 +23,10 @@ COMPILERS = {
 }
 
 DRIVE = """
-#include "control/machine_tables.h"
 #include "drive.h"
 #include "hal_pwm.h"
 
-const machine_tables_t machine_tables;
-
-bool drive_init(drive_t *drive, hal_t *hal, const machine_tables_t *tables, const drive_config_t *config) {
+bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     hal_pwm_start(hal, 2500);
     return true;
 }

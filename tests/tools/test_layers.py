@@ -24,7 +24,7 @@ C_LAYERS = (
     "emulator/host/", "emulator/qemu/", "emulator/qemu/image/",
 )  # fmt: skip
 INCLUDE_ROOTS = ("", "hal", "firmware", "emulator")
-FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive.h", "firmware/control/machine_tables.h"}
+FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive.h"}
 JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/main.c", "emulator/qemu/image/main.c"}
 
 PYTHON_LAYERS = (

@@ -1,7 +1,6 @@
 /* One drive on a QEMU board: the firmware of the host executable, with its interrupts as real exceptions. */
 #include <string.h>
 
-#include "control/machine_tables.h"
 #include "drive.h"
 #include "qemu/board.h"
 #include "qemu/hal_qemu.h"
