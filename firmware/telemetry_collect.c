@@ -1,6 +1,7 @@
 #include "telemetry_collect.h"
 
 #include "comms/units.h"
+#include "drive/deferred.h"
 #include "drive/torque_control.h"
 #include "drive_codec.h"
 #include "fixed/fixed.h"
@@ -38,8 +39,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->status.cycle = drive->comms.telemetry.cycle;
 
     telemetry->motion.speed_rpm = units_milli_rpm(control->observer.speed_q22);
-    telemetry->motion.speed_reference_rpm =
-        units_milli_rpm(deferred_results(&control->deferred_request, &control->deferred.response)->speed_reference_q22);
+    telemetry->motion.speed_reference_rpm = units_milli_rpm(deferred_in_effect(control)->speed_reference_q22);
     telemetry->motion.rotor_angle_deg = units_angle_u16(measured->angle);
 
     telemetry->torque.torque_reference_nm = units_torque_q8(control->torque_reference_q24);

@@ -29,10 +29,9 @@
  * limited machine overshot its torque limit by 8 % (tests/hil,
  * test_enters_and_leaves_voltage_limited_operation_smoothly).
  */
-#define PHASE_CELL_V_BITS 16
+#define PHASE_CELL_BITS 16
+#define PHASE_CELL_V_MAX_Q13 ((1 << (PHASE_CELL_BITS - 1)) - 1)
 #define PHASE_CELL_FIRST_BITS 15 /* of the first step of the inverse: -2..2 */
-#define PHASE_CELL_V_MAX_Q13 ((1 << (PHASE_CELL_V_BITS - 1)) - 1)
-#define PHASE_CELL_U_BITS 16
 #define PHASE_CELL_RATIO_BITS 14 /* c_psi / rise_psi, Q2.13, saturated to -1..1: a fraction in any machine */
 #define PHASE_CELL_HALF_Q13 (1 << 12)
 
@@ -53,12 +52,19 @@ typedef struct {
     bool negative; /* the phase is in the half of negative torque */
 } phase_cell_t;
 
-/* Quotient by a rise, Q2.13, saturated: of y - middle, which is saturated to 2^25 units, or of a curvature. A rise is
- * rounded to 2^8 units, 2 uWb or 0.1 mN m over a column; one of less than that, or negative by rounding, counts as
- * 2^8. */
-ALWAYS_INLINE int32_t phase_cell_quotient_q13(int32_t numerator, int32_t rise, unsigned bits) {
-    const int32_t divisor = ((rise + (1 << 7)) >> 8) | 1;
-    return fixed_saturate_bits(fixed_saturate_bits(numerator, PHASE_CELL_RISE_BITS) * (1 << 5) / divisor, bits);
+/* Dividend and divisor of quotients in Q2.13 by a rise. The dividend, y - middle or a curvature, is saturated to 2^25
+ * units. The rise is rounded to 2^8 units, 2 uWb or 0.1 mN m over a column; one of less than that, or negative by
+ * rounding, counts as 2^8. */
+ALWAYS_INLINE int32_t phase_cell_dividend(int32_t units) {
+    return fixed_saturate_bits(units, PHASE_CELL_RISE_BITS) * (1 << 5);
+}
+
+ALWAYS_INLINE int32_t phase_cell_divisor(int32_t rise) {
+    return ((rise + (1 << 7)) >> 8) | 1;
+}
+
+ALWAYS_INLINE int32_t phase_cell_quotient_q13(int32_t units, int32_t rise, unsigned bits) {
+    return fixed_saturate_bits(phase_cell_dividend(units) / phase_cell_divisor(rise), bits);
 }
 
 /* Curve from the values at both columns, Q14, and the current of the lower one, A, Q7.9. A value is below 2^31, the
@@ -95,7 +101,7 @@ ALWAYS_INLINE int32_t phase_cell_u_q13(const phase_cell_t *cell, int32_t current
     return fixed_saturate_bits((current_q9 - cell->column * (1 << MACHINE_COLUMN_BITS)) *
                                        (1 << (13 - MACHINE_COLUMN_BITS)) -
                                    PHASE_CELL_HALF_Q13,
-                               PHASE_CELL_U_BITS);
+                               PHASE_CELL_BITS);
 }
 
 /* middle + x (rise + x curvature), x in Q2.13, rounded to 8 units. */
@@ -116,14 +122,13 @@ ALWAYS_INLINE int32_t phase_cell_torque(const phase_cell_t *cell, int32_t v_q13)
 }
 
 ALWAYS_INLINE int32_t phase_cell_solve_q13(const phase_cell_t *cell, int32_t torque) {
-    const int32_t rest_q5 =
-        fixed_saturate_bits(fixed_subtract(torque, cell->torque.middle), PHASE_CELL_RISE_BITS) * (1 << 5);
-    const int32_t rise = ((cell->torque.rise + (1 << 7)) >> 8) | 1; /* 2^8 units */
-    const int32_t curvature = cell->curvature >> 8;
-    const int32_t first_q13 = fixed_saturate_bits(rest_q5 / rise, PHASE_CELL_FIRST_BITS);
+    const int32_t rest = phase_cell_dividend(fixed_subtract(torque, cell->torque.middle));
+    const int32_t rise = phase_cell_divisor(cell->torque.rise);
+    const int32_t curvature = cell->curvature >> 8; /* in the unit of the divisor */
+    const int32_t first_q13 = fixed_saturate_bits(rest / rise, PHASE_CELL_FIRST_BITS);
     const int32_t slope = (rise + ((curvature * first_q13) >> 12)) | 1;
-    const int32_t numerator_q5 = rest_q5 + curvature * ((first_q13 * first_q13) >> 13);
-    return fixed_saturate_bits(numerator_q5 / slope, PHASE_CELL_V_BITS);
+    const int32_t dividend = rest + curvature * ((first_q13 * first_q13) >> 13);
+    return fixed_saturate_bits(dividend / slope, PHASE_CELL_BITS);
 }
 
 /* Flux linkage at v, and the v of a flux linkage. */
@@ -132,7 +137,7 @@ ALWAYS_INLINE int32_t phase_cell_flux(const phase_cell_t *cell, int32_t v_q13) {
 }
 
 ALWAYS_INLINE int32_t phase_cell_v_q13(const phase_cell_t *cell, int32_t flux) {
-    return phase_cell_quotient_q13(fixed_subtract(flux, cell->flux.middle), cell->flux.rise, PHASE_CELL_V_BITS);
+    return phase_cell_quotient_q13(fixed_subtract(flux, cell->flux.middle), cell->flux.rise, PHASE_CELL_BITS);
 }
 
 /* Columns from the middle of the cell to y along the straight line through the middle, Q4, rounded towards zero. */

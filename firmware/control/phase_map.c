@@ -4,14 +4,12 @@ static inline uint32_t index_of(const phase_map_lookup_t *lookup, int32_t curren
     return phase_map_index(lookup, (uint32_t)current_q9 >> MACHINE_COLUMN_BITS);
 }
 
-static inline int32_t torque_by_magnitude(const phase_map_lookup_t *lookup, uint32_t index, int32_t current_q9) {
-    return phase_map_between(phase_map_torque_value_q14(lookup, index),
-                             phase_map_torque_value_q14(lookup, index + MACHINE_TO_NEXT_COLUMN), current_q9);
-}
-
 int32_t phase_map_torque(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9) {
     const phase_map_lookup_t lookup = phase_map_lookup(tables, phase_map_distance(phase_angle));
-    const int32_t torque = torque_by_magnitude(&lookup, index_of(&lookup, current_q9), current_q9);
+    const uint32_t index = index_of(&lookup, current_q9);
+    const int32_t torque =
+        phase_map_between(phase_map_torque_value_q14(&lookup, index),
+                          phase_map_torque_value_q14(&lookup, index + MACHINE_TO_NEXT_COLUMN), current_q9);
     return phase_map_mirrored(phase_angle) ? -torque : torque;
 }
 

@@ -41,7 +41,7 @@ static uint64_t protect(const control_parameters_t *parameters, control_state_t 
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare) {
     control_measurement_t *measured = &state->measurement;
-    const deferred_results_t *deferred = deferred_results(&state->deferred_request, &state->deferred.response);
+    const deferred_results_t *deferred = deferred_in_effect(state);
     measure(parameters, &state->observer, deferred->misalignment, &state->predictive, sample, measured);
     if (!state->started) {
         start(state, measured);

@@ -10,7 +10,7 @@
 /* From here on the results of earlier inputs are without effect. */
 static void change_generation(control_state_t *state, uint32_t generation) {
     deferred_request_t *request = &state->deferred_request;
-    request->initial = *deferred_results(request, &state->deferred.response);
+    request->initial = *deferred_in_effect(state);
     request->generation = generation;
 }
 

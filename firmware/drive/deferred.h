@@ -18,6 +18,11 @@
 
 #include "drive/control.h"
 
+/* Results in effect. [interrupt, or background in a critical section] */
+static inline const deferred_results_t *deferred_in_effect(const control_state_t *state) {
+    return deferred_results(&state->deferred_request, &state->deferred.response);
+}
+
 /* Hands the values of this period over, or counts the period as skipped. The state machine has made its tick.
  * [interrupt] */
 void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,

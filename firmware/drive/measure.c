@@ -31,6 +31,13 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
     measured->angle = edge + (uint32_t)fixed_shift((int64_t)angle_per_tick_q19 * (int32_t)encoder->edge_age_ticks, 19);
 }
 
+static inline int32_t measure_current_q9(const control_parameters_t *parameters, const control_sample_t *sample,
+                                         unsigned phase, control_measurement_t *measured) {
+    const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], parameters->current_scale_q18);
+    measured->current_q9[phase] = current_q9;
+    return current_q9;
+}
+
 /* Sums over the phases. */
 typedef struct {
     int32_t current_max_q9;
@@ -49,14 +56,13 @@ static sums_t measure_by_map(const control_parameters_t *parameters, const int32
     const unsigned phases = machine_tables.phases;
     UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
-        const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], parameters->current_scale_q18);
+        const int32_t current_q9 = measure_current_q9(parameters, sample, phase, measured);
         int32_t torque = 0;
         if (current_q9 > 0) { /* false for most phases at any time */
-            const uint32_t angle = measured_phase_angle(parameters, misalignment, measured, phase);
-            torque = phase_map_torque(&machine_tables, angle, current_q9);
+            const uint32_t angle = commutation_angle(&parameters->commutation, &measured->commutation, phase);
+            torque = phase_map_torque(&machine_tables, angle - (uint32_t)misalignment[phase], current_q9);
             add_phase(&sums, current_q9, torque);
         }
-        measured->current_q9[phase] = current_q9;
         measured->torque[phase] = torque;
     }
     return sums;
@@ -69,12 +75,11 @@ static sums_t measure_by_plan(const control_parameters_t *parameters, const pred
     const unsigned phases = machine_tables.phases;
     UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
-        const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], parameters->current_scale_q18);
+        const int32_t current_q9 = measure_current_q9(parameters, sample, phase, measured);
         int32_t flux = 0;
         if (current_q9 > 0) { /* false for most phases at any time */
             add_phase(&sums, current_q9, predictive_torque_estimate(predictive, phase, current_q9, &flux));
         }
-        measured->current_q9[phase] = current_q9;
         measured->flux_linkage[phase] = flux;
     }
     return sums;

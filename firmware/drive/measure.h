@@ -13,11 +13,4 @@ void measure(const control_parameters_t *parameters, const load_observer_t *obse
              const int32_t misalignment[HAL_PHASES_MAX], const predictive_torque_t *predictive,
              const control_sample_t *sample, control_measurement_t *measured);
 
-/* Angle of a phase, corrected by the misalignment of its pole, 2^-32 electrical revolution. */
-static inline uint32_t measured_phase_angle(const control_parameters_t *parameters,
-                                            const int32_t misalignment[HAL_PHASES_MAX],
-                                            const control_measurement_t *measured, unsigned phase) {
-    return commutation_angle(&parameters->commutation, &measured->commutation, phase) - (uint32_t)misalignment[phase];
-}
-
 #endif

@@ -1,7 +1,6 @@
 #include "drive/torque_control.h"
 
 #include "control/modulator.h"
-#include "drive/measure.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 

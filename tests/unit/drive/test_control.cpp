@@ -107,7 +107,7 @@ class Control : public testing::Test {
             .angle = state.measurement.angle,
             .speed_q22 = state.observer.speed_q22,
             .speed_reference_q22 =
-                deferred_results(&state.deferred_request, &state.deferred.response)->speed_reference_q22,
+                deferred_in_effect(&state)->speed_reference_q22,
             .torque_reference_q24 = state.torque_reference_q24,
             .torque_q24 = state.measurement.torque_sum_q24,
             .load_torque_q24 = state.observer.load_torque_q24,

@@ -59,7 +59,7 @@ class Deferred : public testing::Test {
     }
 
     const deferred_results_t &results() const {
-        return *deferred_results(&state.deferred_request, &state.deferred.response);
+        return *deferred_in_effect(&state);
     }
     bool pending() const { return deferred_pending(&state.deferred_request, &state.deferred.response); }
     bool advanced() const { return results().window.turn_on != parameters.predictive.base_window.turn_on; }

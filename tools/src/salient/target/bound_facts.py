@@ -6,7 +6,6 @@ from __future__ import annotations
 import ast
 import operator
 import re
-import struct
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -118,11 +117,8 @@ _OPERATIONS: dict[type, Callable[[int, int], int]] = {
 
 
 class Names:
-    """Values of the names in bounds: macros of the headers of firmware and HAL that are numbers, and the properties of
-    the machine whose tables are in the image:
-
-    phases: number of phases; row_steps: largest number of rows of the tables that begin in one angle bin.
-    """
+    """Values of the names in bounds: macros of the headers of firmware and HAL that are numbers, and `phases`, the
+    number of phases of the machine whose tables are in the image."""
 
     def __init__(self, image: ElfImage, root: Path = ROOT) -> None:
         self._image = image
@@ -133,12 +129,12 @@ class Names:
         try:
             return self._evaluate(ast.parse(expression, mode="eval").body, more)
         except (SyntaxError, ValueError, KeyError):
-            raise UsageError(f"{expression}: must consist of numbers, macros of the firmware, phases, row_steps and"
+            raise UsageError(f"{expression}: must consist of numbers, macros of the firmware, phases and"
                              " + - * // %") from None
 
     def known(self, name: str) -> bool:
         """True when the name has a value."""
-        return name in ("phases", "row_steps") or name in self._macros
+        return name == "phases" or name in self._macros
 
     def _evaluate(self, node: ast.expr, more: Mapping[str, int]) -> int:
         if isinstance(node, ast.Constant) and type(node.value) is int:
@@ -149,8 +145,8 @@ class Names:
             if node.id in more:
                 return more[node.id]
             if node.id == "phases":
-                return self._tables(0, 1)[0]
-            return self.row_steps if node.id == "row_steps" else self._macros[node.id]
+                return self._phases
+            return self._macros[node.id]
         raise ValueError
 
     @cached_property
@@ -164,21 +160,10 @@ class Names:
                 found.setdefault(name, set()).add(int(value))
         return {name: values.pop() for name, values in found.items() if len(values) == 1}
 
-    def _tables(self, offset: int, size: int) -> bytes:
-        """Part of machine_tables, in the layout of firmware/control/machine_tables.h on a 32-bit processor."""
+    @cached_property
+    def _phases(self) -> int:
+        """First member of machine_tables."""
         address = self._image.symbols().get("machine_tables")
         if address is None:
             raise UsageError(f"{self._image.path}: no machine_tables")
-        return self._image.read(address + offset, size)
-
-    @cached_property
-    def row_steps(self) -> int:
-        """Steps of the row search from the row in which an angle bin begins to the last row that begins in the bin."""
-        rows, bins = self._macros["MACHINE_ROWS"], self._macros["MACHINE_ANGLE_BINS"]
-        starts = struct.unpack(f"<{2 * rows}I", self._tables(20, 8 * rows))[::2]
-        first = self._tables(20 + 8 * rows, bins)
-        if starts[0] != 0 or starts[-1] != 1 << 31 or list(starts) != sorted(starts):
-            raise UsageError("machine_tables has another layout than salient.target.bound_facts")
-        width = (1 << 31) // bins
-        last = [max(row for row in range(rows - 1) if starts[row] < (index + 1) * width) for index in range(bins)]
-        return max(after - before for before, after in zip(first, last, strict=True))
+        return self._image.read(address, 1)[0]
