@@ -149,6 +149,21 @@ class Drive : public testing::Test {
         return -1;
     }
 
+    // The content of the only frame of an identifier since from_drive was cleared.
+    template <typename frame_t>
+    frame_t only_frame(uint32_t identifier, int (*unpack)(frame_t *, const uint8_t *, size_t)) {
+        frame_t content{};
+        unsigned seen = 0;
+        for (const hal_can_frame_t &sent : hal.from_drive) {
+            if (sent.identifier == identifier) {
+                unpack(&content, sent.data, sent.length);
+                seen++;
+            }
+        }
+        EXPECT_EQ(seen, 1u);
+        return content;
+    }
+
     hal_t hal;
     drive_t drive;
     uint8_t counter = 0;
@@ -259,19 +274,11 @@ TEST_F(Drive, processor_time_is_recorded_and_reported_without_any_reaction) {
     EXPECT_EQ(drive.used_ticks, 1234u);
     EXPECT_EQ(drive.worst_ticks, 70000u);
     EXPECT_EQ(drive.late_interrupts, 0u);
-    unsigned seen = 0;
-    for (const hal_can_frame_t &frame : hal.from_drive) {
-        if (frame.identifier == DRIVE_PROCESSOR_FRAME_ID) {
-            drive_processor_t processor{};
-            drive_processor_unpack(&processor, frame.data, frame.length);
-            EXPECT_EQ(processor.used_us, 1234);
-            EXPECT_EQ(processor.worst_us, 65535) << "held at its end";
-            EXPECT_EQ(processor.available_us, 5000);
-            EXPECT_EQ(processor.late_interrupts, 0);
-            seen++;
-        }
-    }
-    EXPECT_EQ(seen, 1u);
+    const auto processor = only_frame(DRIVE_PROCESSOR_FRAME_ID, drive_processor_unpack);
+    EXPECT_EQ(processor.used_us, 1234);
+    EXPECT_EQ(processor.worst_us, 65535) << "held at its end";
+    EXPECT_EQ(processor.available_us, 5000);
+    EXPECT_EQ(processor.late_interrupts, 0);
 }
 
 TEST_F(Drive, the_time_of_the_deferred_interrupt_counts_from_the_trigger_of_its_period) {
@@ -291,18 +298,10 @@ TEST_F(Drive, the_time_of_the_deferred_interrupt_counts_from_the_trigger_of_its_
     periods(4000 + 40);
     EXPECT_EQ(drive.deferred_used_ticks, 2000u);
     EXPECT_EQ(drive.deferred_worst_ticks, 2 * 5000 + 2000u);
-    unsigned seen = 0;
-    for (const hal_can_frame_t &frame : hal.from_drive) {
-        if (frame.identifier == DRIVE_DEFERRED_FRAME_ID) {
-            drive_deferred_t deferred{};
-            drive_deferred_unpack(&deferred, frame.data, frame.length);
-            EXPECT_EQ(deferred.used_us, 2000);
-            EXPECT_EQ(deferred.worst_us, 12000);
-            EXPECT_EQ(deferred.skipped_periods, 2);
-            seen++;
-        }
-    }
-    EXPECT_EQ(seen, 1u);
+    const auto deferred = only_frame(DRIVE_DEFERRED_FRAME_ID, drive_deferred_unpack);
+    EXPECT_EQ(deferred.used_us, 2000);
+    EXPECT_EQ(deferred.worst_us, 12000);
+    EXPECT_EQ(deferred.skipped_periods, 2);
 }
 
 TEST_F(Drive, a_deferred_interrupt_that_does_not_come_opens_the_switches) {

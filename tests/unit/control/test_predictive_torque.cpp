@@ -60,6 +60,20 @@ struct placed_t {
             misalignment[phase] = int32_t(angle - phase * p.sharing.stroke - angles[phase]);
         }
     }
+
+    // A sample at standstill with the windows of the parameters.
+    predictive_torque_sample_t sample(const predictive_torque_parameters_t &p, const int32_t *current_q9,
+                                      const int32_t *flux, int32_t torque_q24) const {
+        return {.current_q9 = current_q9,
+                .flux = flux,
+                .window = &p.base_window,
+                .angle = angle,
+                .misalignment = misalignment,
+                .bus_voltage_q6 = int32_t(BUS_V * Q6),
+                .torque_q24 = torque_q24,
+                .reverse = false,
+                .angle_step = 0};
+    }
 };
 
 const tables_t TABLES;
@@ -315,15 +329,7 @@ int repetitions_until_planned(uint32_t angle, double current_A, int column, int 
     control.position_q13[0] = last_column << 13;
     const int32_t current_q9[HAL_PHASES_MAX] = {};
     const int32_t flux[HAL_PHASES_MAX] = {to_fixed(flux_Wb, Q29) >> machine_tables.flux_format.result_shift};
-    const predictive_torque_sample_t sample = {.current_q9 = current_q9,
-                                               .flux = flux,
-                                               .window = &p.base_window,
-                                               .angle = placed.angle,
-                                               .misalignment = placed.misalignment,
-                                               .bus_voltage_q6 = int32_t(BUS_V * Q6),
-                                               .torque_q24 = to_fixed(torque_Nm, Q24),
-                                               .reverse = false,
-                                               .angle_step = 0};
+    const predictive_torque_sample_t sample = placed.sample(p, current_q9, flux, to_fixed(torque_Nm, Q24));
     int settled = 0;
     for (int k = 1; k <= 20; k++) {
         control.flux_q29[0] = to_fixed(flux_Wb, Q29);
@@ -413,15 +419,7 @@ TEST(PredictiveTorque, the_estimate_has_the_sign_of_its_half_and_is_0_after_a_re
     const int32_t current_q9[HAL_PHASES_MAX] = {}, flux[HAL_PHASES_MAX] = {};
     // Braking with phase 1, motoring with none.
     const placed_t placed(p, {0x10000000u, 0x50000000u, 0x20000000u});
-    const predictive_torque_sample_t sample = {.current_q9 = current_q9,
-                                               .flux = flux,
-                                               .window = &p.base_window,
-                                               .angle = placed.angle,
-                                               .misalignment = placed.misalignment,
-                                               .bus_voltage_q6 = 240 * 64,
-                                               .torque_q24 = -(8 << 24),
-                                               .reverse = false,
-                                               .angle_step = 0};
+    const predictive_torque_sample_t sample = placed.sample(p, current_q9, flux, -(8 << 24));
     const auto estimate = [&control](unsigned phase, int32_t *flux_units) {
         return predictive_torque_estimate(&control, phase, 5 * 512, flux_units);
     };
@@ -548,15 +546,7 @@ TEST(PredictiveTorque, a_phase_above_the_current_limit_gets_no_positive_voltage_
     const int32_t current_q9[HAL_PHASES_MAX] = {10 * 512 + 1, 0, 0, 0};
     const int32_t flux[HAL_PHASES_MAX] = {};
     const placed_t placed(p, {0xC0000000u, 0xC0000000u, 0x80000000u});
-    const predictive_torque_sample_t sample = {.current_q9 = current_q9,
-                                               .flux = flux,
-                                               .window = &p.base_window,
-                                               .angle = placed.angle,
-                                               .misalignment = placed.misalignment,
-                                               .bus_voltage_q6 = 240 * 64,
-                                               .torque_q24 = 19 << 24,
-                                               .reverse = false,
-                                               .angle_step = 0};
+    const predictive_torque_sample_t sample = placed.sample(p, current_q9, flux, 19 << 24);
     int32_t duty_q15[HAL_PHASES_MAX] = {};
     predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
     EXPECT_LE(duty_q15[0], 0);
@@ -577,15 +567,9 @@ TEST(PredictiveTorque, a_braking_phase_carries_only_the_flux_linkage_that_the_vo
             const int32_t current_q9[HAL_PHASES_MAX] = {};
             const int32_t flux[HAL_PHASES_MAX] = {carried_q29 >> machine_tables.flux_format.result_shift};
             const placed_t placed(p, {uint32_t((reverse ? 0.5 + travel_rev : 0.5 - travel_rev) * REV), 0, 0});
-            predictive_torque_sample_t sample = {.current_q9 = current_q9,
-                                                 .flux = flux,
-                                                 .window = &p.base_window,
-                                                 .angle = placed.angle,
-                                                 .misalignment = placed.misalignment,
-                                                 .bus_voltage_q6 = 240 * 64,
-                                                 .torque_q24 = (reverse ? 40 : -40) * (1 << 24),
-                                                 .reverse = reverse,
-                                                 .angle_step = uint32_t(step_rev * REV)};
+            predictive_torque_sample_t sample = placed.sample(p, current_q9, flux, (reverse ? 40 : -40) * (1 << 24));
+            sample.reverse = reverse;
+            sample.angle_step = uint32_t(step_rev * REV);
             int32_t duty_q15[HAL_PHASES_MAX] = {};
             // The same period again, until the plan is in the cell of its operating point.
             const auto settled_duty_q15 = [&] {

@@ -9,7 +9,6 @@
 #include <gtest/gtest.h>
 
 extern "C" {
-#include "drive/configure.h"
 #include "drive/control.h"
 #include "drive/deferred.h"
 #include "drive/fault.h"
@@ -20,6 +19,7 @@ uint32_t hal_can_receive_overflows(const hal_t *) {
 }
 }
 
+#include "support/configured.h"
 #include "support/reference_models.h"
 
 namespace {
@@ -55,10 +55,7 @@ class Control : public testing::Test {
     explicit Control(drive_controller_t controller = DRIVE_CONTROLLER_PAPER) { configure(controller); }
 
     void configure(drive_controller_t controller) {
-        parameters_t p;
-        parameters_init(&p);
-        p.values[PARAMETER_CONTROLLER] = controller;
-        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, 12);
+        parameters = configured(controller, uint32_t(RATE_HZ), ENCODER_BITS);
         control_reset(&parameters, &state);
         diagnostics = diagnostics_t{};
         sample = control_sample_t{};
@@ -70,11 +67,7 @@ class Control : public testing::Test {
     // Reset with one parameter changed.
     void configure_with(drive_controller_t controller, parameter_index_t index, int32_t value, unsigned adc_bits = 12) {
         configure(controller);
-        parameters_t p;
-        parameters_init(&p);
-        p.values[PARAMETER_CONTROLLER] = controller;
-        p.values[index] = value;
-        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, adc_bits);
+        parameters = configured(controller, uint32_t(RATE_HZ), ENCODER_BITS, adc_bits, {{index, value}});
     }
 
     bool step(command_request_t request, double reference_rpm = 600.0) {
@@ -106,8 +99,7 @@ class Control : public testing::Test {
         diagnostics_t values = {
             .angle = state.measurement.angle,
             .speed_q22 = state.observer.speed_q22,
-            .speed_reference_q22 =
-                deferred_in_effect(&state)->speed_reference_q22,
+            .speed_reference_q22 = deferred_in_effect(&state)->speed_reference_q22,
             .torque_reference_q24 = state.torque_reference_q24,
             .torque_q24 = state.measurement.torque_sum_q24,
             .load_torque_q24 = state.observer.load_torque_q24,

@@ -6,11 +6,11 @@
 #include <gtest/gtest.h>
 
 extern "C" {
-#include "drive/configure.h"
 #include "drive/deferred.h"
 #include "drive/fault.h"
 }
 
+#include "support/configured.h"
 #include "support/fixed_point.h"
 
 namespace {
@@ -25,10 +25,7 @@ class Deferred : public testing::Test {
     Deferred() { configure(DRIVE_CONTROLLER_SALIENT); }
 
     void configure(drive_controller_t controller) {
-        parameters_t p;
-        parameters_init(&p);
-        p.values[PARAMETER_CONTROLLER] = controller;
-        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, 12);
+        parameters = configured(controller, uint32_t(RATE_HZ), ENCODER_BITS);
         control_reset(&parameters, &state);
         sample.adc.bus_voltage_counts = 240 * 8;
     }
@@ -58,9 +55,7 @@ class Deferred : public testing::Test {
         ASSERT_TRUE(period(COMMAND_RUN));
     }
 
-    const deferred_results_t &results() const {
-        return *deferred_in_effect(&state);
-    }
+    const deferred_results_t &results() const { return *deferred_in_effect(&state); }
     bool pending() const { return deferred_pending(&state.deferred_request, &state.deferred.response); }
     bool advanced() const { return results().window.turn_on != parameters.predictive.base_window.turn_on; }
 
