@@ -26,7 +26,7 @@
 #define MACHINE_ANGLE_BIN_BITS 25
 
 /* Row. Starts ascend from 0, unaligned, to 2^31, aligned, by at least 2^17; at most two lie within an angle bin, not
- * counting one at its begin. */
+ * counting one at its start. */
 typedef struct {
     uint32_t start;     /* 2^-32 electrical rev past the unaligned position */
     int32_t reciprocal; /* 2^46 / width up to the next row, rounded down; 0 in the last row */
@@ -59,8 +59,8 @@ typedef struct {
     uint8_t angle_bin_row[MACHINE_ANGLE_BINS]; /* row in which each angle bin begins */
     machine_format_t torque_format;
     machine_format_t flux_format;
-    int8_t
-        curvature[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN]; /* of the interval that begins at the row; last row: 0 */
+    /* Of the interval that begins at the row; 0 in the last row. */
+    int8_t curvature[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
     int16_t node[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
 } machine_tables_t;
 

@@ -26,9 +26,7 @@
 #define PHASE_CELL_COLUMN_MAX (MACHINE_COLUMNS - 2)
 
 /* u and v in Q2.13, saturated to -4..4 - 2^-13, three columns and a half beyond the cell: with two columns a voltage
- * limited machine overshot its torque limit by 8 % (tests/hil,
- * test_enters_and_leaves_voltage_limited_operation_smoothly).
- */
+ * limited machine overshot its torque limit by 8 % (tests/hil/test_salient_controller.py). */
 #define PHASE_CELL_BITS 16
 #define PHASE_CELL_V_MAX_Q13 ((1 << (PHASE_CELL_BITS - 1)) - 1)
 #define PHASE_CELL_FIRST_BITS 15 /* of the first step of the inverse: -2..2 */
