@@ -6,6 +6,10 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
 from salient.elf import ElfImage, Instruction
 from salient.errors import UsageError
 
@@ -336,39 +340,17 @@ def dominators(entry: int, blocks: Mapping[int, Block]) -> dict[int, frozenset[i
 
 
 def _components(nodes: Iterable[int], edges: Mapping[int, set[int]]) -> list[set[int]]:
-    """Strongly connected components, by Tarjan's algorithm without recursion."""
-    allowed = set(nodes)
-    number: dict[int, int] = {}
-    low: dict[int, int] = {}
-    stack: list[int] = []
-    on_stack: set[int] = set()
-    found = []
-    for root in sorted(allowed):
-        if root in number:
-            continue
-        work = [(root, iter(sorted(edges[root] & allowed)))]
-        number[root] = low[root] = len(number)
-        stack.append(root)
-        on_stack.add(root)
-        while work:
-            node, following = work[-1]
-            for one in following:
-                if one not in number:
-                    number[one] = low[one] = len(number)
-                    stack.append(one)
-                    on_stack.add(one)
-                    work.append((one, iter(sorted(edges[one] & allowed))))
-                    break
-                if one in on_stack:
-                    low[node] = min(low[node], number[one])
-            else:
-                work.pop()
-                if work:
-                    low[work[-1][0]] = min(low[work[-1][0]], low[node])
-                if low[node] == number[node]:
-                    part = set()
-                    while node not in part:
-                        part.add(stack[-1])
-                        on_stack.discard(stack.pop())
-                    found.append(part)
+    """Strongly connected components."""
+    addresses = sorted(nodes)
+    index = {address: i for i, address in enumerate(addresses)}
+    rows, columns = [], []
+    for address in addresses:
+        for successor in edges[address] & index.keys():
+            rows.append(index[address])
+            columns.append(index[successor])
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(addresses), len(addresses)))
+    count, labels = connected_components(graph, connection="strong")
+    found: list[set[int]] = [set() for _ in range(count)]
+    for address, label in zip(addresses, labels, strict=True):
+        found[label].add(address)
     return found
