@@ -13,19 +13,24 @@
 #define TORQUE_MIN_Q24 (1 << 24)
 /* 0.05 * 0.02^2 of T^2, Q20: keeps the denominator above the noise of s_j. */
 #define POWER_FLOOR_Q20 21
-#define OFFSET_LIMIT_Q40 (((int64_t)7 << 40) / 8)
+#define OFFSET_LIMIT_Q40 (((int64_t)7 << 40) / 2)
+/* The mean of the square of the sum: 25 ms at 40 kHz. */
+#define COMMON_POWER_SHIFT 9
+/* Its rate is an eighth: the sum is smaller than its parts, and the noise is not. */
+#define COMMON_SLOWER 8
 
-misalignment_parameters_t misalignment_configure(int32_t rate_1_s, uint32_t bandwidth_rad_s, uint32_t control_rate_hz,
-                                                 int32_t inertia_q30, unsigned phases, unsigned rotor_poles) {
-    const int64_t update_rate_hz = control_rate_hz / phases;
+misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings) {
+    const int64_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
+    const int64_t phase_rate_hz = update_rate_hz / settings->phases;
+    const int64_t common_rate_hz = settings->control_rate_hz / settings->periods_per_common_update;
     return (misalignment_parameters_t){
-        .probe_angle = PROBE_ANGLE * rotor_poles,
-        .rate_q30 = (int32_t)fixed_divide((int64_t)rate_1_s << 30, update_rate_hz),
-        .filter_q16 = fixed_clamp((int32_t)fixed_divide((int64_t)(bandwidth_rad_s * 8u / 5u) << 16, update_rate_hz), 0,
-                                  FILTER_GAIN_MAX_Q16),
-        .mean_q16 = (int32_t)fixed_divide((int64_t)MEAN_1_S << 16, update_rate_hz) + 1,
-        .inertia_rate_q8 = fixed_saturate(((int64_t)inertia_q30 * control_rate_hz) >> 22),
-        .settle_ticks = control_rate_hz / 1000u * SETTLE_MS,
+        .probe_angle = PROBE_ANGLE * settings->rotor_poles,
+        .rate_q30 = (int32_t)fixed_divide((int64_t)settings->rate_1_s << 30, phase_rate_hz),
+        .common_rate_q30 = (int32_t)fixed_divide((int64_t)settings->rate_1_s << 30, COMMON_SLOWER * common_rate_hz),
+        .filter_q32 = (int32_t)fixed_divide(((int64_t)8 << 32) / 5, phase_rate_hz),
+        .mean_q16 = (int32_t)fixed_divide((int64_t)MEAN_1_S << 16, phase_rate_hz) + 1,
+        .inertia_rate_q8 = fixed_saturate(((int64_t)settings->inertia_q30 * settings->control_rate_hz) >> 22),
+        .settle_updates = (uint32_t)update_rate_hz * SETTLE_MS / 1000u,
     };
 }
 
@@ -44,17 +49,27 @@ static int32_t product_q24(int32_t a_q24, int32_t b_q24) {
     return fixed_multiply(a_q24, b_q24, 24);
 }
 
+int32_t misalignment_disturbance_q24(const misalignment_parameters_t *parameters, int32_t load_torque_q24,
+                                     int32_t speed_correction_q22) {
+    return fixed_subtract(load_torque_q24, fixed_multiply(speed_correction_q22, parameters->inertia_rate_q8, 6));
+}
+
+static int64_t clamped_offset_q40(int64_t offset_q40) {
+    return offset_q40 > OFFSET_LIMIT_Q40    ? OFFSET_LIMIT_Q40
+           : offset_q40 < -OFFSET_LIMIT_Q40 ? -OFFSET_LIMIT_Q40
+                                            : offset_q40;
+}
+
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                        const machine_tables_t *tables, const misalignment_sample_t *sample) {
     const bool steady = sample->steady && fixed_abs(sample->torque_q24) > TORQUE_MIN_Q24;
-    const int32_t disturbance_q24 = fixed_subtract(
-        sample->load_torque_q24, fixed_multiply(sample->speed_correction_q22, parameters->inertia_rate_q8, 6));
-    const bool settled = misalignment->steady_ticks >= parameters->settle_ticks;
-    misalignment->steady_ticks = !steady ? 0 : settled ? misalignment->steady_ticks : misalignment->steady_ticks + 1;
+    const int32_t disturbance_q24 = sample->disturbance_q24;
+    const bool settled = misalignment->steady_updates >= parameters->settle_updates;
+    misalignment->steady_updates = !steady ? 0 : settled ? misalignment->steady_updates : misalignment->steady_updates + 1;
     const bool learning = steady && settled;
     /* Means over the time since the state became steady, at most 100 ms: before, the load was another. */
     const int32_t phases = (int32_t)tables->phases;
-    const int32_t growing_memory_q16 = FILTER_GAIN_MAX_Q16 / ((int32_t)misalignment->steady_ticks / phases + 1);
+    const int32_t growing_memory_q16 = FILTER_GAIN_MAX_Q16 / ((int32_t)misalignment->steady_updates / phases + 1);
     const int32_t mean_gain_q16 = growing_memory_q16 > parameters->mean_q16 ? growing_memory_q16 : parameters->mean_q16;
 
     const unsigned index = misalignment->phase_index;
@@ -66,8 +81,10 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const int32_t current_q9 = sample->current_q9;
     const int32_t slope_q24 =
         current_q9 > 0 ? phase_map_torque_slope_q24(tables, sample->angle, current_q9, 2 * parameters->probe_angle) : 0;
-    low_pass_step(&phase->slope_lag1_q24, slope_q24, parameters->filter_q16);
-    low_pass_step(&phase->slope_lag2_q24, phase->slope_lag1_q24, parameters->filter_q16);
+    const int32_t filter_q16 = fixed_clamp(
+        fixed_multiply_high((int32_t)(sample->bandwidth_rad_s << 16), parameters->filter_q32), 0, FILTER_GAIN_MAX_Q16);
+    low_pass_step(&phase->slope_lag1_q24, slope_q24, filter_q16);
+    low_pass_step(&phase->slope_lag2_q24, phase->slope_lag1_q24, filter_q16);
     low_pass_step(&phase->slope_mean_q24, phase->slope_lag2_q24, mean_gain_q16);
     const int32_t alternating_q24 = fixed_subtract(phase->slope_lag2_q24, phase->slope_mean_q24);
     /* One phase per period stands for all: the sum over the phases. */
@@ -87,9 +104,34 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     /* Q24 * Q24 to Q30, divided by Q20: Q10. */
     const int32_t step_q10 = fixed_multiply(error_q24, alternating_q24, 18) / ((power_q24 >> 4) + 1);
     const int64_t offset_q40 = phase->offset_q40 + (int64_t)step_q10 * parameters->rate_q30;
-    phase->offset_q40 = offset_q40 > OFFSET_LIMIT_Q40    ? OFFSET_LIMIT_Q40
-                        : offset_q40 < -OFFSET_LIMIT_Q40 ? -OFFSET_LIMIT_Q40
-                                                         : offset_q40;
+    phase->offset_q40 = clamped_offset_q40(offset_q40);
     /* 0.02 rad is twice the probe angle. */
-    phase->offset = fixed_multiply((int32_t)fixed_shift(phase->offset_q40, 10), (int32_t)parameters->probe_angle, 29);
+    phase->offset = fixed_multiply((int32_t)fixed_shift(phase->offset_q40, 12), (int32_t)parameters->probe_angle, 27);
+}
+
+void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                              unsigned phases, int32_t disturbance_q24, int32_t torque_q24) {
+    /* A quarter of the sum over the phases, which fits. */
+    int32_t quarter_q24 = 0;
+    for (unsigned i = 0; i < phases; i++) {
+        const misalignment_phase_t *phase = &misalignment->phase[i];
+        quarter_q24 += fixed_subtract(phase->slope_lag2_q24, phase->slope_mean_q24) / 4;
+    }
+    const int64_t square_q40 = fixed_product(quarter_q24, quarter_q24) >> 8;
+    misalignment->common_power_q40 += (square_q40 - misalignment->common_power_q40) >> COMMON_POWER_SHIFT;
+    if (misalignment->steady_updates < parameters->settle_updates) {
+        return;
+    }
+    const int32_t power_q22 = fixed_saturate(misalignment->common_power_q40 >> 18);
+    /* T^2 2^-22 of the square of a quarter: 0.01 T^2 / rad^2. */
+    const int32_t torque_q10 = torque_q24 >> 14;
+    const int32_t floor_q22 = (torque_q10 * torque_q10 >> 20) + 1;
+    const int32_t error_q24 = fixed_subtract(disturbance_q24, misalignment->disturbance_mean_q24);
+    /* y 4 q / (16 q^2), q the quarter. */
+    const int32_t step_q10 = fixed_multiply(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22);
+    const int64_t step_q40 = (int64_t)step_q10 * parameters->common_rate_q30;
+    for (unsigned i = 0; i < phases; i++) {
+        misalignment_phase_t *phase = &misalignment->phase[i];
+        phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + step_q40);
+    }
 }

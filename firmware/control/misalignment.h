@@ -12,12 +12,21 @@
  *
  *   d delta_j / dt = rate y s_j / (mean of sum s_j^2 + 0.05 T^2 / rad^2)
  *
+ * A misaligned encoder displaces all phases by the same angle, and its y is delta sum s_j, which is small because the
+ * slopes of two overlapping phases nearly cancel, and at high speeds much smaller after the observer than those of the
+ * phases, which alternate more slowly. So the same law learns that angle once more, normalised by itself:
+ *
+ *   d delta / dt = rate / 8 y S / (mean of S^2 + 0.01 T^2 / rad^2),   S = sum s_j
+ *
+ * At 600 r/min it takes 2 s instead of 10.
+ *
  * y is the load estimate plus the torque that the speed correction stands for, -(J / Ts) l2 e, which responds within
  * 1 / w0; s_j passes through two first-order filters of 1 / (1.6 w0), about the same delay. A correction indexed by the
  * rotor angle in bins could cancel any error, not only a misalignment, but would have dozens of values to learn from
  * the same signal instead of one per phase.
  *
- * Learning is suspended unless speed and load are steady, the torque is above 1 N m and the voltage is not limited.
+ * s_j is filtered by the observer's present bandwidth. Learning is suspended unless speed and load are steady, the
+ * torque is above 1 N m and the voltage is not limited.
  */
 #ifndef CONTROL_MISALIGNMENT_H
 #define CONTROL_MISALIGNMENT_H
@@ -31,48 +40,66 @@
 typedef struct {
     uint32_t probe_angle;    /* 0.01 rad mechanical, 2^-32 electrical rev; s_j is the torque change over twice that */
     int32_t rate_q30;        /* rate times the update interval of a phase, Q1.30; 0: no learning */
-    int32_t filter_q16;      /* 1.6 w0 times the update interval, Q0.16 */
+    int32_t common_rate_q30; /* the same for the common angle, an eighth of that rate, Q1.30 */
+    int32_t filter_q32;      /* 1.6 times the update interval, s, Q0.32 */
     int32_t mean_q16;        /* 10 / s times the update interval, Q0.16 */
     int32_t inertia_rate_q8; /* J / Ts: N m per rad/s, Q23.8 */
-    uint32_t settle_ticks;   /* steady periods before learning */
+    uint32_t settle_updates; /* steady updates before learning */
 } misalignment_parameters_t;
 
 typedef struct {
     int32_t slope_lag1_q24, slope_lag2_q24,
         slope_mean_q24;   /* s_j after one filter, two, and mean: N m per 0.02 rad, Q7.24 */
     int64_t last_sum_q24; /* disturbance_sum_q24 at the last update of the phase */
-    int64_t offset_q40;   /* delta_j in 0.02 rad, within +-0.875 (1 degree) */
+    int64_t offset_q40;   /* delta_j in 0.02 rad, within +-3.5 (4 degrees) */
     int32_t offset;       /* delta_j, 2^-32 electrical rev, to subtract from the phase's angle */
 } misalignment_phase_t;
 
 typedef struct {
     misalignment_phase_t phase[HAL_PHASES_MAX];
-    int64_t disturbance_sum_q24;  /* sum of y over all periods, N m, Q24; 2^37 periods fit */
+    int64_t disturbance_sum_q24;  /* sum of y over all updates, N m, Q24; 2^37 updates fit */
     int32_t disturbance_mean_q24; /* mean of y, N m, Q7.24 */
     int32_t power_q24;            /* mean of sum s_j^2, Q7.24 */
-    uint32_t steady_ticks;
-    unsigned phase_index; /* phase to update: one per period, in turn */
+    uint32_t steady_updates;
+    int64_t common_power_q40; /* mean of (sum s_j / 4)^2, (N m per 0.02 rad)^2, Q40 */
+    unsigned phase_index; /* phase to update, in turn */
 } misalignment_t;
 
 typedef struct {
-    int32_t current_q9;           /* of the phase to update, A, Q7.9 */
-    uint32_t angle;               /* of that phase, corrected, 2^-32 electrical rev */
-    int32_t load_torque_q24;      /* load observer, N m, Q7.24 */
-    int32_t speed_correction_q22; /* load observer, rad/s, Q9.22 */
-    int32_t torque_q24;           /* reference, N m, Q7.24 */
-    bool steady;                  /* speed and load are steady, the voltage is not limited */
+    int32_t current_q9;       /* of the phase to update, A, Q7.9 */
+    uint32_t angle;           /* of that phase, corrected, 2^-32 electrical rev */
+    int32_t disturbance_q24;  /* y, N m, Q7.24 */
+    int32_t torque_q24;       /* reference, N m, Q7.24 */
+    uint32_t bandwidth_rad_s; /* of the load observer */
+    bool steady;              /* speed and load are steady, the voltage is not limited */
 } misalignment_sample_t;
 
-/* Learning rate in 1/s (0..100), steady bandwidth of the load observer in rad/s, inertia in kg m^2, Q1.30. */
-misalignment_parameters_t misalignment_configure(int32_t rate_1_s, uint32_t bandwidth_rad_s, uint32_t control_rate_hz,
-                                                 int32_t inertia_q30, unsigned phases, unsigned rotor_poles);
+typedef struct {
+    int32_t rate_1_s; /* 0..100 */
+    uint32_t control_rate_hz;
+    unsigned periods_per_update;        /* control periods, misalignment_step */
+    unsigned periods_per_common_update; /* misalignment_common_step */
+    int32_t inertia_q30;                /* kg m^2, Q1.30 */
+    unsigned phases, rotor_poles;
+} misalignment_settings_t;
+
+misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings);
+
+/* y in N m, Q7.24, from load torque (N m, Q7.24) and speed correction (rad/s, Q9.22) of the load observer. */
+int32_t misalignment_disturbance_q24(const misalignment_parameters_t *parameters, int32_t load_torque_q24,
+                                     int32_t speed_correction_q22);
 
 /* Offsets and filters 0. */
 void misalignment_reset(misalignment_t *misalignment);
 
 /* One sample, after load_observer_step(); updates one phase. 64-bit products, rounded to nearest; sums saturate,
- * offsets are clamped to +-0.875 of 0.02 rad (1 degree). */
+ * offsets are clamped to +-3.5 of 0.02 rad (4 degrees). */
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                        const machine_tables_t *tables, const misalignment_sample_t *sample);
+
+/* One sample: updates the offset that the phases have in common, from the slopes of the last misalignment_step of each,
+ * while those learn. Disturbance and torque reference in N m, Q7.24; rounding as there. */
+void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                              unsigned phases, int32_t disturbance_q24, int32_t torque_q24);
 
 #endif

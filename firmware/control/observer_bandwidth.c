@@ -27,32 +27,90 @@
 #define HOLDOFF_INCREMENT_Q16 (1u << 14)
 #define HOLDOFF_DECAY_1_S 5
 
-observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t transient_rad_s, uint32_t steady_rad_s,
-                                                             unsigned encoder_bits, uint32_t control_rate_hz,
-                                                             int32_t inertia_q30) {
-    const uint32_t count = 1u << (32u - encoder_bits);
-    const bool adaptive = transient_rad_s > steady_rad_s;
-    const uint32_t threshold_count = adaptive ? count + count / 8 + THRESHOLD_IDEAL : THRESHOLD_NEVER;
-    observer_bandwidth_parameters_t parameters = {
-        .retrigger_holdoff_ticks = control_rate_hz / 1000u,
-        .holdoff_decay_q32 = (65536u - (65536u * HOLDOFF_DECAY_1_S + control_rate_hz - 1) / control_rate_hz) << 16,
-        .threshold_count = threshold_count,
-        .threshold_edge = adaptive ? THRESHOLD_EDGE : THRESHOLD_NEVER,
-        .mean_innovation_gain_q32 = (int32_t)fixed_divide((int64_t)MEAN_INNOVATION_1_S << 32, control_rate_hz),
-        .adaptive = adaptive,
-        /* Counts finer than the resolution of an edge's time are as good as edges. */
-        .trigger_stage_count = threshold_count <= THRESHOLD_EDGE ? 0 : TRIGGER_STAGE_COARSE,
-    };
-    uint32_t bandwidth_q8 = transient_rad_s << 8;
+/* One count as torque, J w0^2 2 pi / 2^bits, at most 5/8, 1/6 and 1/20 of the drive's largest torque. */
+#define TRIGGER_SHARE 10
+#define MOVING_SHARE 40
+#define STEADY_SHARE 128
+#define STEADY_MIN_RAD_S 100u
+
+/* Edges are frequent from one each 100 us on. */
+#define EDGE_RATE_MIN_HZ 10000u
+
+/* T 2^bits / J in rad/s^2: 2 pi times the square of the bandwidth at which a count is worth the torque T. */
+static uint64_t square_of_count(const observer_bandwidth_settings_t *settings) {
+    return (uint64_t)fixed_divide((int64_t)settings->torque_max_q24 << 6, settings->inertia_q30)
+           << settings->encoder_bits; /* below 2^19 + 32 */
+}
+
+static bool within(uint32_t bandwidth_rad_s, uint64_t square, unsigned share) {
+    return (uint64_t)bandwidth_rad_s * bandwidth_rad_s * share <= square;
+}
+
+static uint32_t limited_steady_rad_s(uint32_t steady_rad_s, uint64_t square) {
+    uint32_t limited_rad_s = steady_rad_s;
+    while (limited_rad_s > STEADY_MIN_RAD_S && !within(limited_rad_s, square, STEADY_SHARE)) {
+        limited_rad_s--;
+    }
+    return limited_rad_s;
+}
+
+/* First stage from `first` on whose bandwidth is neither above a maximum nor worth more than a share of the torque. */
+static uint8_t first_stage(const observer_bandwidth_parameters_t *parameters, unsigned first, uint32_t max_rad_s,
+                           uint64_t square, unsigned share) {
+    unsigned stage = first;
+    while (stage < LAST_STAGE && (parameters->bandwidth_rad_s[stage] > max_rad_s ||
+                                  !within(parameters->bandwidth_rad_s[stage], square, share))) {
+        stage++;
+    }
+    return (uint8_t)stage;
+}
+
+static void configure_stages(const observer_bandwidth_settings_t *settings, observer_bandwidth_parameters_t *parameters,
+                             uint32_t steady_rad_s) {
+    uint32_t bandwidth_q8 = settings->transient_rad_s << 8;
     for (unsigned stage = 0; stage < OBSERVER_BANDWIDTH_STAGES; stage++) {
         const bool last = stage == LAST_STAGE || bandwidth_q8 >> 8 <= steady_rad_s;
         const uint32_t bandwidth_rad_s = last ? steady_rad_s : bandwidth_q8 >> 8;
-        parameters.bandwidth_rad_s[stage] = (uint16_t)bandwidth_rad_s;
-        parameters.gains[stage] = load_observer_gains(bandwidth_rad_s, control_rate_hz, inertia_q30);
+        parameters->bandwidth_rad_s[stage] = (uint16_t)bandwidth_rad_s;
+        parameters->gains[stage] =
+            load_observer_gains(bandwidth_rad_s, settings->control_rate_hz, settings->inertia_q30);
         /* 3.5 / t is then midway between the bandwidths of this stage and the next: t = 1.1 * 3.5 / w0. */
-        parameters.end_ticks[stage] = control_rate_hz * 385u / 100u / bandwidth_rad_s;
+        parameters->end_ticks[stage] = settings->control_rate_hz * 385u / 100u / bandwidth_rad_s;
         bandwidth_q8 = bandwidth_q8 / 16 * 13;
     }
+}
+
+observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_bandwidth_settings_t *settings) {
+    const uint32_t rate_hz = settings->control_rate_hz;
+    const uint32_t count = 1u << (32u - settings->encoder_bits);
+    const bool adaptive = settings->transient_rad_s > settings->steady_rad_s;
+    const uint32_t threshold_count = adaptive ? count + count / 8 + THRESHOLD_IDEAL : THRESHOLD_NEVER;
+    observer_bandwidth_parameters_t parameters = {
+        .retrigger_holdoff_ticks = rate_hz / 1000u,
+        .holdoff_decay_q32 = (65536u - (65536u * HOLDOFF_DECAY_1_S + rate_hz - 1) / rate_hz) << 16,
+        .threshold_count = threshold_count,
+        .threshold_edge = adaptive ? THRESHOLD_EDGE : THRESHOLD_NEVER,
+        .mean_innovation_gain_q32 = (int32_t)fixed_divide((int64_t)MEAN_INNOVATION_1_S << 32, rate_hz),
+        .edge_step_min = count / (rate_hz / EDGE_RATE_MIN_HZ),
+        .adaptive = adaptive,
+        .trigger_stage_count = LAST_STAGE,
+        .moving_stage = LAST_STAGE,
+        .steady_stage_edge = LAST_STAGE,
+    };
+    if (!adaptive) {
+        configure_stages(settings, &parameters, settings->steady_rad_s);
+        return parameters;
+    }
+    const uint64_t square = square_of_count(settings);
+    const uint32_t steady_rad_s = limited_steady_rad_s(settings->steady_rad_s, square);
+    configure_stages(settings, &parameters, steady_rad_s);
+    /* Counts finer than the resolution of an edge's time are as good as edges. */
+    const unsigned first = threshold_count <= THRESHOLD_EDGE ? 0 : TRIGGER_STAGE_COARSE;
+    parameters.trigger_stage_count =
+        first_stage(&parameters, first, settings->transient_rad_s, square, TRIGGER_SHARE);
+    parameters.moving_stage =
+        first_stage(&parameters, parameters.trigger_stage_count, settings->moving_rad_s, square, MOVING_SHARE);
+    parameters.steady_stage_edge = LAST_STAGE - (steady_rad_s < settings->steady_rad_s);
     return parameters;
 }
 
@@ -78,14 +136,14 @@ static unsigned adaptive_stage(const observer_bandwidth_parameters_t *parameters
     }
     /* One stage a sample: the ends of stages are further apart, but for those that already have the steady bandwidth.
      */
-    if (bandwidth->stage < LAST_STAGE && bandwidth->ticks >= parameters->end_ticks[bandwidth->stage]) {
-        bandwidth->stage++;
-    }
+    const unsigned next = bandwidth->stage + (bandwidth->ticks >= parameters->end_ticks[bandwidth->stage]);
+    const unsigned last = LAST_STAGE - limits->withheld_stages;
+    bandwidth->stage = next < last ? next : last;
     if ((uint32_t)fixed_abs(innovation) > threshold_of(parameters, limits->threshold_mean, from_edge) &&
-        bandwidth->ticks >= parameters->retrigger_holdoff_ticks + limits->holdoff_extension_ticks) {
-        bandwidth->trigger =
-            bandwidth->stage == LAST_STAGE ? OBSERVER_TRIGGER_IN_STEADY_STATE : OBSERVER_TRIGGER_IN_DECAY;
-        bandwidth->stage = from_edge ? 0 : parameters->trigger_stage_count;
+        bandwidth->ticks >= limits->holdoff_ticks) {
+        bandwidth->trigger = bandwidth->stage >= parameters->steady_stage_edge ? OBSERVER_TRIGGER_IN_STEADY_STATE
+                                                                               : OBSERVER_TRIGGER_IN_DECAY;
+        bandwidth->stage = from_edge ? limits->trigger_stage_edge : parameters->trigger_stage_count;
         bandwidth->ticks = 0;
     }
     return bandwidth->stage;
@@ -104,7 +162,9 @@ observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_p
                                                       observer_bandwidth_statistics_t *statistics,
                                                       const observer_bandwidth_sample_t *sample) {
     const bool triggered_steady = sample->trigger == OBSERVER_TRIGGER_IN_STEADY_STATE;
-    const bool was_steady = sample->trigger == OBSERVER_TRIGGER_NONE ? sample->stage == LAST_STAGE : triggered_steady;
+    const bool was_steady = sample->trigger == OBSERVER_TRIGGER_NONE
+                                ? observer_bandwidth_steady(parameters, sample->stage)
+                                : triggered_steady;
     if (was_steady) {
         /* Innovations are clipped at the threshold, so that a load step does not raise it. */
         const uint32_t threshold = threshold_of(parameters, threshold_of_mean(statistics), sample->from_edge);
@@ -123,13 +183,17 @@ observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_p
     }
     statistics->holdoff_extension_q16 =
         (uint32_t)(((uint64_t)statistics->holdoff_extension_q16 * parameters->holdoff_decay_q32) >> 32);
+    const bool frequent_edges = sample->from_edge && sample->angle_step >= parameters->edge_step_min;
     return (observer_bandwidth_limits_t){
-        .threshold_mean = threshold_of_mean(statistics),
-        .holdoff_extension_ticks =
+        .threshold_mean = threshold_of(parameters, threshold_of_mean(statistics), frequent_edges),
+        .withheld_stages = frequent_edges ? (uint8_t)(LAST_STAGE - parameters->steady_stage_edge) : 0,
+        .trigger_stage_edge = frequent_edges ? 0 : parameters->trigger_stage_count,
+        .holdoff_ticks =
+            parameters->retrigger_holdoff_ticks +
             (uint32_t)(((uint64_t)parameters->retrigger_holdoff_ticks * statistics->holdoff_extension_q16) >> 16),
     };
 }
 
 bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters, unsigned stage) {
-    return !parameters->adaptive || stage == LAST_STAGE;
+    return !parameters->adaptive || stage >= parameters->steady_stage_edge;
 }

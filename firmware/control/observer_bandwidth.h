@@ -11,7 +11,13 @@
  * mean.
  *
  * The threshold depends on the resolution of the angle: 1.125 counts for the middle of a count, 8 urad where the time
- * of the last edge is known. The latter has less noise, so its transient bandwidth is wider.
+ * of the last edge is known. The latter has less noise, so its transient bandwidth is wider. Edges count as such only
+ * while they are frequent, one each 100 us or more.
+ *
+ * No bandwidth is wider than the encoder allows. An innovation of one count 2 pi / 2^bits moves the load estimate within
+ * 1 / w0 by about J w0^2 2 pi / 2^bits, which is limited to 3/5 of the largest torque after a trigger, to 1/6 while the
+ * load moves (moving_load.h), and to 1/20 in the steady state. Values found by trial: with twice as much, a load step at
+ * 10 r/min is answered by a torque in the wrong direction.
  *
  * With a wrong model (three times the inertia, tables half a degree off) each transient would trigger the next: a limit
  * cycle. Two measures suppress it. Each trigger lengthens the retrigger hold-off, the minimum time to the next trigger,
@@ -39,8 +45,11 @@ typedef struct {
     uint32_t threshold_count;         /* 2^-32 rev, for the middle of a count */
     uint32_t threshold_edge;          /* 2^-32 rev, for an angle from the time of an edge */
     int32_t mean_innovation_gain_q32; /* low-pass gain of the mean innovation per period, Q0.32 */
+    uint32_t edge_step_min;           /* rotation per period from which edges are frequent, 2^-32 rev */
     bool adaptive;                    /* false: always the steady bandwidth */
-    uint8_t trigger_stage_count;      /* first stage after a trigger by a count; by an edge stage 0 */
+    uint8_t trigger_stage_count;      /* first stage after a trigger by a count; by frequent edges stage 0 */
+    uint8_t moving_stage;             /* while the load moves */
+    uint8_t steady_stage_edge;        /* in the steady state with frequent edges; from counts the last one */
 } observer_bandwidth_parameters_t;
 
 /* Trigger in the last sample or samples. In the steady state it is a new event; during a decay it may belong to the
@@ -61,7 +70,9 @@ typedef struct {
 /* Limits of the coming sample's trigger, besides those of the parameters; all zero: only those of the parameters. */
 typedef struct {
     uint32_t threshold_mean;          /* four times the mean innovation, 2^-32 rev */
-    uint32_t holdoff_extension_ticks; /* hold-off beyond the minimum, periods */
+    uint32_t holdoff_ticks;           /* minimum time to the next trigger, periods */
+    uint8_t withheld_stages;          /* last stages that the decay does not reach */
+    uint8_t trigger_stage_edge;       /* first stage after a trigger by an edge */
 } observer_bandwidth_limits_t;
 
 /* Statistics from which the limits follow. */
@@ -75,14 +86,22 @@ typedef struct {
     int32_t innovation; /* 2^-32 rev */
     bool from_edge;
     unsigned stage;             /* after the sample */
+    uint32_t angle_step;        /* rotation per period, magnitude, 2^-32 rev */
     observer_trigger_t trigger; /* since the last update */
 } observer_bandwidth_sample_t;
 
-/* Schedule from transient to steady bandwidth in rad/s (100 <= steady <= transient <= 10000); equal ones switch the
- * scheduling off. encoder_bits 10..32, control rate in Hz, inertia in kg m^2, Q1.30. */
-observer_bandwidth_parameters_t observer_bandwidth_configure(uint32_t transient_rad_s, uint32_t steady_rad_s,
-                                                             unsigned encoder_bits, uint32_t control_rate_hz,
-                                                             int32_t inertia_q30);
+typedef struct {
+    uint32_t transient_rad_s; /* 100..10000 */
+    uint32_t moving_rad_s;    /* while the load moves; not above the transient bandwidth, not below the steady one */
+    uint32_t steady_rad_s;    /* 100..transient_rad_s; equal: no scheduling */
+    unsigned encoder_bits;    /* 8..32 */
+    uint32_t control_rate_hz;
+    int32_t inertia_q30;    /* kg m^2, Q1.30 */
+    int32_t torque_max_q24; /* of the drive, N m, Q7.24 */
+} observer_bandwidth_settings_t;
+
+/* Schedule of the settings, limited to what the encoder allows. */
+observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_bandwidth_settings_t *settings);
 
 /* Starts at the transient bandwidth: the initial estimate is unknown. */
 void observer_bandwidth_reset(observer_bandwidth_t *bandwidth);
@@ -94,7 +113,8 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
                                                      const observer_bandwidth_limits_t *limits, int32_t innovation,
                                                      bool from_edge);
 
-/* Updates the statistics with a sample after its observer_bandwidth_step, and returns the limits of the next one.
+/* Updates the statistics with a sample after its observer_bandwidth_step, and returns the limits of the next one; the
+ * caller may withhold more stages.
  * 64-bit products, rounded down. A sample that is left out does not change the statistics; its trigger counts in the
  * next. */
 observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,

@@ -54,8 +54,8 @@ typedef struct {
     int32_t period_q40;                  /* Ts in s, Q-9.40 */
     int32_t current_limit_q9;            /* A, Q7.9 */
     int32_t reserve_q24;                 /* N m, Q7.24, >= 0 */
-    int32_t advance_step_q30;            /* per period with torque shortfall, Q1.30 */
-    int32_t retract_step_q30;            /* per period without, Q1.30 */
+    int32_t advance_step_q30;            /* per update with torque shortfall, Q1.30 */
+    int32_t retract_step_q30;            /* per update without, Q1.30 */
 } predictive_torque_parameters_t;
 
 typedef struct {
@@ -83,7 +83,7 @@ typedef struct {
 /* Flux linkages and duties 0. */
 void predictive_torque_reset(predictive_torque_t *control);
 
-/* Moves the windows by one period, from the torque reference and shortfall of a sample, N m, Q7.24: the window of the
+/* Moves the windows by one update, from the torque reference and shortfall of a sample, N m, Q7.24: the window of the
  * motoring phases for the next sample. *advance_q30: position of the windows, Q1.30, 0..1, 0 at the start. */
 torque_sharing_window_t predictive_torque_move_windows(const predictive_torque_parameters_t *parameters,
                                                        int32_t *advance_q30, int32_t torque_q24,

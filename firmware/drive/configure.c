@@ -1,5 +1,6 @@
 #include "drive/configure.h"
 
+#include "drive/deferred.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
@@ -92,8 +93,9 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
         .dc_link_under_voltage_q6 = values[PARAMETER_BUS_UNDER_VOLTAGE_V],
         .over_speed_q22 = over_speed_q22,
         .angle_step_max = fixed_saturate((int64_t)step + 2 * (int64_t)count),
-        /* A quarter of a degree, and four counts of a coarse encoder. */
-        .undetected_travel_max = (int32_t)(((uint64_t)1 << 32) / 1440u + 4u * count),
+        /* A quarter of a degree, and twelve counts of a coarse encoder: a load step may stop the rotor within a count,
+         * and the observer needs several to notice. */
+        .undetected_travel_max = (int32_t)(((uint64_t)1 << 32) / 1440u + 12u * count),
         .angle_step_q32 = angle_step_q32,
         .command_timeout_us = (uint32_t)values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u,
         .deceleration_max_q22 = fixed_saturate(fixed_divide(
@@ -115,9 +117,15 @@ static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, boo
     const uint32_t steady_rad_s =
         (uint32_t)values[schedules_bandwidth ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S];
     const bool adaptive = schedules_bandwidth && values[PARAMETER_OBSERVER_WAKING] != 0;
-    const uint32_t transient_rad_s = adaptive ? (uint32_t)values[PARAMETER_OBSERVER_WAKE_RAD_S] : steady_rad_s;
-    return observer_bandwidth_configure(transient_rad_s, steady_rad_s, encoder_bits, control_rate_hz,
-                                        values[PARAMETER_INERTIA_KG_M2]);
+    return observer_bandwidth_configure(&(observer_bandwidth_settings_t){
+        .transient_rad_s = adaptive ? (uint32_t)values[PARAMETER_OBSERVER_WAKE_RAD_S] : steady_rad_s,
+        .moving_rad_s = (uint32_t)values[PARAMETER_OBSERVER_MOVING_RAD_S],
+        .steady_rad_s = steady_rad_s,
+        .encoder_bits = encoder_bits,
+        .control_rate_hz = control_rate_hz,
+        .inertia_q30 = values[PARAMETER_INERTIA_KG_M2],
+        .torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM],
+    });
 }
 
 /* The gain of the torque trim is in N m per N m: the PID's output 1 is the limit, its error 1 the error scale. */
@@ -188,8 +196,8 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
         .period_q40 = (int32_t)fixed_divide((int64_t)1 << 40, rate),
         .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
-        .advance_step_q30 = (int32_t)fixed_divide(10 * ((int64_t)1 << 30), rate),
-        .retract_step_q30 = (int32_t)fixed_divide((int64_t)1 << 30, rate),
+        .advance_step_q30 = (int32_t)fixed_divide(10 * DEFERRED_SLOW_PERIODS * ((int64_t)1 << 30), rate),
+        .retract_step_q30 = (int32_t)fixed_divide(DEFERRED_SLOW_PERIODS * ((int64_t)1 << 30), rate),
     };
 }
 
@@ -267,10 +275,20 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .trim = trim_from(values),
         .predictive = predictive_from(values, tables->phases, control_rate_hz),
         .misalignment =
-            misalignment_configure(values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
-                                   (uint32_t)values[PARAMETER_OBSERVER_STEADY_RAD_S], control_rate_hz, inertia_q30,
-                                   tables->phases, tables->rotor_poles),
+            misalignment_configure(&(misalignment_settings_t){
+                .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
+                .control_rate_hz = control_rate_hz,
+                .periods_per_update = DEFERRED_LEARNING_PERIODS,
+                .periods_per_common_update = DEFERRED_SLOW_PERIODS,
+                .inertia_q30 = inertia_q30,
+                .phases = tables->phases,
+                .rotor_poles = tables->rotor_poles,
+            }),
+        .stroke_mean = stroke_mean_configure(tables->phases, control_rate_hz / DEFERRED_SLOW_PERIODS),
     };
+    control.moving_load = moving_load_configure(encoder_bits, control_rate_hz,
+                                                OBSERVER_BANDWIDTH_STAGES - 1u - control.bandwidth.moving_stage);
+    control.torque_offset = torque_offset_configure(control_rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
     return control;
 }

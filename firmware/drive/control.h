@@ -21,11 +21,14 @@
 #include "control/load_observer.h"
 #include "control/machine_tables.h"
 #include "control/misalignment.h"
+#include "control/moving_load.h"
 #include "control/observer_bandwidth.h"
 #include "control/predictive_torque.h"
 #include "control/pwm_ditc.h"
 #include "control/speed_pi.h"
 #include "control/speed_smc.h"
+#include "control/stroke_mean.h"
+#include "control/torque_offset.h"
 #include "control/torque_trim.h"
 #include "drive/command.h"
 #include "drive/deferred_exchange.h"
@@ -73,6 +76,9 @@ typedef struct {
     predictive_torque_parameters_t predictive;
     misalignment_parameters_t misalignment;
     observer_bandwidth_parameters_t bandwidth;
+    moving_load_parameters_t moving_load;
+    stroke_mean_parameters_t stroke_mean;
+    torque_offset_parameters_t torque_offset;
 } control_parameters_t;
 
 /* Inputs of one control period as the HAL delivers them. */
@@ -106,10 +112,17 @@ typedef struct {
     uint32_t generation; /* of the last input */
     protection_deferred_t protection;
     observer_bandwidth_statistics_t bandwidth;
+    moving_load_t moving_load;
+    torque_offset_t torque_offset;
+    int32_t torque_offset_q24; /* of the last torque_offset_step */
     bool run;                    /* in the last input */
     int32_t speed_reference_q22; /* after the ramp, rad/s, Q9.22 */
     speed_pi_t speed_pi;
+    unsigned turn;               /* of the last step, below DEFERRED_TURNS */
     int32_t advance_q30;         /* of the conduction windows, Q1.30, 0..1 */
+    torque_sharing_window_t window;
+    stroke_mean_t stroke_mean;
+    bool load_constant; /* in the last stroke_mean_step */
     misalignment_t misalignment; /* a property of the machine: survives the end of a run */
 } deferred_t;
 

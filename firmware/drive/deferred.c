@@ -24,15 +24,15 @@ void deferred_reset_run(const control_parameters_t *parameters, control_state_t 
 
 void deferred_reset_observer(control_state_t *state) {
     change_generation(state, state->deferred_request.generation + OBSERVER_STEP);
-    state->deferred_request.initial.bandwidth = (observer_bandwidth_limits_t){0, 0};
+    state->deferred_request.initial.bandwidth = (observer_bandwidth_limits_t){0, 0, 0, 0};
 }
 
 static void hand_over_bandwidth(control_state_t *state, const control_measurement_t *measured,
                                 deferred_input_t *input) {
-    input->bandwidth.innovation = state->innovation;
-    input->bandwidth.from_edge = measured->angle_from_edge;
-    input->bandwidth.stage = state->bandwidth.stage;
-    input->bandwidth.trigger = state->bandwidth.trigger;
+    input->innovation = state->innovation;
+    input->angle_from_edge = measured->angle_from_edge;
+    input->bandwidth_stage = state->bandwidth.stage;
+    input->bandwidth_trigger = state->bandwidth.trigger;
     state->bandwidth.trigger = OBSERVER_TRIGGER_NONE;
 }
 
@@ -43,6 +43,7 @@ static void hand_over_predictive(const control_state_t *state, const control_mea
     input->electrical = measured->commutation.electrical;
     input->current_q9 = measured->current_q9[state->deferred.misalignment.phase_index]; /* no step is pending */
     input->torque_reference_q24 = state->torque_reference_q24;
+    input->torque_sum_q24 = measured->torque_sum_q24;
     input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
 }
 
@@ -72,15 +73,19 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
 }
 
 /* Resets what the control interrupt has reset since the previous step. */
-static void follow_resets(deferred_t *deferred, const deferred_input_t *input) {
+static void follow_resets(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
     const uint32_t changed = deferred->generation ^ input->generation;
     if ((changed & RUN_MASK) != 0) {
         deferred->advance_q30 = 0;
+        deferred->window = parameters->predictive.base_window;
         deferred->run = false;
         speed_pi_reset(&deferred->speed_pi);
+        deferred->torque_offset = (torque_offset_t){0};
+        deferred->torque_offset_q24 = 0;
     }
     if ((changed & OBSERVER_MASK) != 0) {
         deferred->bandwidth = (observer_bandwidth_statistics_t){0, 0};
+        deferred->moving_load = (moving_load_t){0, 0, 0, 0};
     }
     deferred->generation = input->generation;
     if (!deferred->started) {
@@ -100,48 +105,102 @@ static uint64_t protect(const control_parameters_t *parameters, deferred_t *defe
     return protection_check_deferred(&parameters->protection, &deferred->protection, &checked);
 }
 
-/* The misalignment is observable only while speed, load and voltage are steady. */
+static observer_bandwidth_limits_t bandwidth_limits(const control_parameters_t *parameters, deferred_t *deferred,
+                                                    const deferred_input_t *input) {
+    const int32_t angle_step = fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32);
+    const observer_bandwidth_sample_t sample = {
+        .innovation = input->innovation,
+        .from_edge = input->angle_from_edge,
+        .stage = input->bandwidth_stage,
+        .trigger = input->bandwidth_trigger,
+        .angle_step = (uint32_t)fixed_abs(angle_step),
+    };
+    observer_bandwidth_limits_t limits =
+        observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, &sample);
+    const uint32_t withheld = moving_load_step(&parameters->moving_load, &deferred->moving_load, sample.innovation,
+                                               sample.angle_step, sample.from_edge);
+    limits.withheld_stages = (uint8_t)(withheld > limits.withheld_stages ? withheld : limits.withheld_stages);
+    return limits;
+}
+
+/* The misalignment is observable while speed, load and voltage are steady. */
+static bool steady(const control_parameters_t *parameters, const deferred_t *deferred, const deferred_input_t *input) {
+    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
+    return deferred->load_constant && input->bandwidth_stage >= parameters->bandwidth.moving_stage &&
+           speed_error_q22 < fixed_abs(input->speed_q22) / 8 && input->torque_shortfall_q24 == 0;
+}
+
+static int32_t disturbance_q24(const control_parameters_t *parameters, const deferred_input_t *input) {
+    return misalignment_disturbance_q24(&parameters->misalignment, input->load_torque_q24, input->speed_correction_q22);
+}
+
 static void learn_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                const deferred_input_t *input) {
     const commutation_t commutation = {.electrical = input->electrical};
     const unsigned phase = deferred->misalignment.phase_index;
-    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
     const misalignment_sample_t sample = {
         .current_q9 = input->current_q9,
         .angle = commutation_angle(&parameters->commutation, &commutation, phase) -
                  (uint32_t)deferred->misalignment.phase[phase].offset,
-        .load_torque_q24 = input->load_torque_q24,
-        .speed_correction_q22 = input->speed_correction_q22,
+        .disturbance_q24 = disturbance_q24(parameters, input),
         .torque_q24 = input->torque_reference_q24,
-        .steady = observer_bandwidth_steady(&parameters->bandwidth, input->bandwidth.stage) &&
-                  speed_error_q22 < fixed_abs(input->speed_q22) / 64 && input->torque_shortfall_q24 == 0,
+        .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth_stage],
+        .steady = steady(parameters, deferred, input),
     };
     misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);
+}
+
+static void learn_common_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
+                                      const deferred_input_t *input) {
+    misalignment_common_step(&parameters->misalignment, &deferred->misalignment, machine_tables.phases,
+                             disturbance_q24(parameters, input), input->torque_reference_q24);
+}
+
+/* What is not urgent, in four turns: no step takes the time of all. The learning of the phases has two of them, because
+ * at a high bandwidth of the observer it follows within a millisecond. */
+static void take_turns(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
+    deferred->turn = (deferred->turn + 1) % 4;
+    switch (deferred->turn) {
+    case 0:
+        deferred->load_constant = stroke_mean_step(&parameters->stroke_mean, &deferred->stroke_mean, input->electrical,
+                                                   input->load_torque_q24, input->torque_reference_q24);
+        deferred->window = predictive_torque_move_windows(&parameters->predictive, &deferred->advance_q30,
+                                                          input->torque_reference_q24, input->torque_shortfall_q24);
+        deferred->torque_offset_q24 =
+            torque_offset_step(&parameters->torque_offset, &deferred->torque_offset, input->torque_reference_q24,
+                               input->torque_sum_q24, input->torque_shortfall_q24 != 0);
+        break;
+    case 2:
+        learn_common_misalignment(parameters, deferred, input);
+        break;
+    default:
+        learn_misalignment(parameters, deferred, input);
+        break;
+    }
 }
 
 void deferred_compute(const control_parameters_t *parameters, control_state_t *state) {
     const deferred_input_t *input = &state->deferred_request.input;
     deferred_t *deferred = &state->deferred;
     deferred_results_t *results = deferred_buffer(&deferred->response);
-    follow_resets(deferred, input);
+    follow_resets(parameters, deferred, input);
     results->generation = input->generation;
-    results->fault_mask = protect(parameters, deferred, input);
+    results->fault_mask = (uint32_t)protect(parameters, deferred, input);
     if (parameters->bandwidth.adaptive) {
-        results->bandwidth = observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, &input->bandwidth);
+        results->bandwidth = bandwidth_limits(parameters, deferred, input);
     }
     results->speed_law_torque_q24 = 0;
     results->speed_reference_q22 = 0;
     if (input->run) {
-        results->speed_law_torque_q24 = speed_control_law_q24(parameters, deferred, input);
+        results->speed_law_torque_q24 =
+            fixed_add(speed_control_law_q24(parameters, deferred, input), deferred->torque_offset_q24);
         results->speed_reference_q22 = deferred->speed_reference_q22;
     }
     deferred->run = input->run;
-    results->window = parameters->predictive.base_window;
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run) {
-        results->window = predictive_torque_move_windows(&parameters->predictive, &deferred->advance_q30,
-                                                         input->torque_reference_q24, input->torque_shortfall_q24);
-        learn_misalignment(parameters, deferred, input);
+        take_turns(parameters, deferred, input);
     }
+    results->window = deferred->window;
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         results->misalignment[phase] = deferred->misalignment.phase[phase].offset;
     }

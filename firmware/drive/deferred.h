@@ -2,8 +2,10 @@
  *
  *   protect      deferred checks                                                           protection.h
  *   bandwidth    statistics of the innovation -> limits of the observer's trigger           observer_bandwidth.h
+ *   moving load  trend of the innovation -> least bandwidth                                 moving_load.h
  *   speed law    speed error -> torque, without feed-forward                               speed_pi.h, speed_smc.h
  *   windows      torque shortfall -> conduction windows, with their reciprocal              predictive_torque.h
+ *   offset       mean torque error -> torque reference                                     torque_offset.h
  *   learn        misalignment of each phase                                                misalignment.h
  *
  * The control interrupt ends with the hand-over of its values; the deferred interrupt makes the step, and its results
@@ -17,6 +19,11 @@
 #include <stdbool.h>
 
 #include "drive/control.h"
+
+/* Periods per update of what takes turns: learning of the phases; learning of their common angle, windows, torque offset
+ * and mean load. */
+#define DEFERRED_LEARNING_PERIODS 2
+#define DEFERRED_SLOW_PERIODS 4
 
 /* Results in effect. [interrupt, or background in a critical section] */
 static inline const deferred_results_t *deferred_in_effect(const control_state_t *state) {

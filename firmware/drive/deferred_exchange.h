@@ -32,7 +32,10 @@ typedef struct {
     uint32_t command_age_us;    /* time since the last accepted command */
     int32_t speed_q22;          /* observer, for the coming sample, rad/s, Q9.22 */
     /* With an adaptive bandwidth only. */
-    observer_bandwidth_sample_t bandwidth;
+    int32_t innovation; /* 2^-32 rev */
+    bool angle_from_edge;
+    unsigned bandwidth_stage;
+    observer_trigger_t bandwidth_trigger; /* since the input of the previous deferred step */
     bool run;                    /* state RUN */
     int32_t commanded_speed_q22; /* rad/s, Q9.22; 0 without a run request */
     /* With predictive torque control only. */
@@ -41,13 +44,14 @@ typedef struct {
     uint32_t electrical;          /* angle of phase 0, 2^-32 electrical rev */
     int32_t current_q9;           /* of the phase to learn, misalignment_t.phase_index, A, Q7.9 */
     int32_t torque_reference_q24;
+    int32_t torque_sum_q24; /* of the sample, N m, Q7.24 */
     int32_t torque_shortfall_q24;
 } deferred_input_t;
 
 /* Results that act from the next control period on; all zero: none, but for the window. */
 typedef struct {
     uint32_t generation;                   /* of the input */
-    uint64_t fault_mask;                   /* failed deferred checks, FAULT_BIT */
+    uint32_t fault_mask;                   /* failed deferred checks, lower half of their FAULT_BITs */
     int32_t speed_reference_q22;           /* after the ramp, rad/s, Q9.22; 0 outside RUN */
     int32_t speed_law_torque_q24;          /* of the speed law, without feed-forward, N m, Q7.24; 0 outside RUN */
     observer_bandwidth_limits_t bandwidth; /* of the trigger */

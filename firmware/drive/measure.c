@@ -15,17 +15,30 @@ static int32_t scale_counts(uint16_t counts, int32_t scale_q18) {
     return fixed_multiply_high(counts << 14, scale_q18);
 }
 
+/* The angle of the count that is nearest to the predicted one. The last edge was exact, since then the count is only a
+ * limit: its middle would pull a coarse encoder's estimate off what the edges have told. */
+static uint32_t nearest_in_count(const control_parameters_t *parameters, const load_observer_t *observer,
+                                 uint32_t count_start) {
+    const int32_t predicted = (int32_t)((uint32_t)(observer->angle_q64 >> 32) - count_start);
+    const int32_t last = (int32_t)((1u << parameters->encoder_shift) - 1);
+    return count_start + (uint32_t)fixed_clamp(predicted, 0, last);
+}
+
 static void measure_angle(const control_parameters_t *parameters, const load_observer_t *observer,
                           const hal_encoder_sample_t *encoder, control_measurement_t *measured) {
     const uint32_t count_start = encoder->counts << parameters->encoder_shift;
     measured->encoder_angle = count_start;
     measured->predicted_speed_q22 = observer->speed_q22;
-    measured->angle_from_edge = encoder->edge_known && encoder->edge_age_ticks <= EDGE_AGE_MAX_TICKS;
-    if (!measured->angle_from_edge) {
-        /* The middle of the count: its mean error is zero. */
-        measured->angle = count_start + parameters->encoder_middle;
+    measured->angle_from_edge = false;
+    if (!encoder->edge_known) {
+        measured->angle = count_start + parameters->encoder_middle; /* its mean error is zero */
         return;
     }
+    if (encoder->edge_age_ticks > EDGE_AGE_MAX_TICKS) {
+        measured->angle = nearest_in_count(parameters, observer, count_start);
+        return;
+    }
+    measured->angle_from_edge = true;
     const uint32_t edge = encoder->edge_forward ? count_start : count_start + (1u << parameters->encoder_shift);
     const int32_t angle_per_tick_q19 = fixed_multiply_high(observer->speed_q22, ANGLE_PER_TICK_Q51);
     measured->angle = edge + (uint32_t)fixed_shift((int64_t)angle_per_tick_q19 * (int32_t)encoder->edge_age_ticks, 19);

@@ -55,15 +55,15 @@ inline bandwidth_t model_of(const observer_bandwidth_parameters_t &p, double rat
     return bandwidth;
 }
 
-inline misalignment_t model_of(const misalignment_parameters_t &p, unsigned phases, double rate_hz) {
-    const double update_rate_hz = rate_hz / phases;
+inline misalignment_t model_of(const misalignment_parameters_t &p, unsigned phases, double update_rate_hz) {
+    const double phase_rate_hz = update_rate_hz / phases;
     misalignment_t misalignment{};
     misalignment.phases = phases;
-    misalignment.rate_hz = rate_hz;
-    misalignment.rate_1_s = p.rate_q30 / fixed_point::Q30 * update_rate_hz;
-    misalignment.filter_1_s = p.filter_q16 / fixed_point::Q16 * update_rate_hz;
-    misalignment.mean_1_s = p.mean_q16 / fixed_point::Q16 * update_rate_hz;
-    misalignment.settle_s = p.settle_ticks / rate_hz;
+    misalignment.rate_hz = update_rate_hz;
+    misalignment.rate_1_s = p.rate_q30 / fixed_point::Q30 * phase_rate_hz;
+    misalignment.filter_factor = p.filter_q32 / fixed_point::Q32 * phase_rate_hz;
+    misalignment.mean_1_s = p.mean_q16 / fixed_point::Q16 * phase_rate_hz;
+    misalignment.settle_s = p.settle_updates / update_rate_hz;
     return misalignment;
 }
 

@@ -285,12 +285,13 @@ template <typename machine_t> struct predictive_t {
 struct misalignment_t {
     static constexpr unsigned PHASES_MAX = 4;
     unsigned phases;
-    double rate_1_s, filter_1_s, rate_hz;
+    double rate_1_s, filter_factor, rate_hz; // filters of 1 / (factor w0); updates in 1 s
     double settle_s = 0.15, mean_1_s = 10.0;
     std::array<double, PHASES_MAX> offset_rad{};
 
     // disturbance: load torque less J / Ts times the speed correction, N m. slope(phase): dT / dtheta, N m / rad.
-    template <typename slope_t> void step(double disturbance, bool steady, double torque, const slope_t &slope) {
+    template <typename slope_t>
+    void step(double disturbance, double bandwidth_rad_s, bool steady, double torque, const slope_t &slope) {
         const double update_s = phases / rate_hz;
         const bool settled = steady_ticks >= std::floor(settle_s * rate_hz);
         steady_ticks = !steady || std::fabs(torque) <= 1.0 ? 0.0 : settled ? steady_ticks : steady_ticks + 1.0;
@@ -301,8 +302,9 @@ struct misalignment_t {
         sum += disturbance;
         const double mean = (sum - last_sum[phase]) / phases;
         last_sum[phase] = sum;
-        slope_lag1[phase] += filter_1_s * update_s * (slope(phase) - slope_lag1[phase]);
-        slope_lag2[phase] += filter_1_s * update_s * (slope_lag1[phase] - slope_lag2[phase]);
+        const double filter = std::min(filter_factor * bandwidth_rad_s * update_s, 1.0);
+        slope_lag1[phase] += filter * (slope(phase) - slope_lag1[phase]);
+        slope_lag2[phase] += filter * (slope_lag1[phase] - slope_lag2[phase]);
         slope_mean[phase] += mean_gain * (slope_lag2[phase] - slope_mean[phase]);
         const double alternating = slope_lag2[phase] - slope_mean[phase];
         power += mean_gain / phases * (alternating * alternating * phases - power);

@@ -10,6 +10,7 @@
 
 extern "C" {
 #include "drive/control.h"
+#include "drive/deferred.h"
 #include "plant/machine.h"
 }
 
@@ -98,7 +99,7 @@ class salient_t {
         predictive = model_of(p.predictive, &machine, phases);
         predictive.period_s = 1.0 / rate_hz;
         predictive.resistance_ohm = plant.resistance_ohm;
-        misalignment = model_of(p.misalignment, phases, rate_hz);
+        misalignment = model_of(p.misalignment, phases, rate_hz / DEFERRED_LEARNING_PERIODS);
     }
 
     // One period: duty of each phase.
@@ -139,12 +140,15 @@ class salient_t {
         const bool steady = bandwidth.steady() && std::fabs(slip_rad_s) < std::fabs(observer.speed) / 64.0 &&
                             predictive.torque_shortfall == 0.0;
         const double disturbance_Nm = observer.load_torque - observer.speed_correction * inertia_kg_m2 * rate_hz;
-        misalignment.step(disturbance_Nm, steady, reference_Nm, [&](unsigned phase) {
+        const auto torque_slope = [&](unsigned phase) {
             constexpr double PROBE_RAD = 0.01;
             const double probe = PROBE_RAD / (2.0 * PI) * poles, current_A = seen.current_A[phase];
             return (machine.torque(angle[phase] + probe, current_A) - machine.torque(angle[phase] - probe, current_A)) /
                    (2.0 * PROBE_RAD);
-        });
+        };
+        if (++turn % DEFERRED_LEARNING_PERIODS == 0) {
+            misalignment.step(disturbance_Nm, now_rad_s, steady, reference_Nm, torque_slope);
+        }
 
         seen.bus_V = sample.adc.bus_voltage_counts * std::ldexp(512.0, -int(adc_bits));
         seen.torque_Nm = reference_Nm;
@@ -168,6 +172,7 @@ class salient_t {
     unsigned encoder_bits, adc_bits;
     double epsilon, delta_s, gain_Nm_s, torque_max_Nm;
     bool initialised = false;
+    unsigned turn = 0;
     double reaching_Nm = 0.0; // acts in the next period
     observer_t observer{};
     bandwidth_t bandwidth{};

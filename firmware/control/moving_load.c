@@ -1,0 +1,65 @@
+#include "control/moving_load.h"
+
+#include "fixed/divide.h"
+#include "fixed/fixed.h"
+
+#define TIME_CONSTANT_US 1600
+#define HOLD_MS 50
+#define HOLDS_MAX 16
+#define RELEASE_MS 5
+
+/* 2^-32 rev, Q28.4: 0.3 urad, what an ideal encoder leaves (observer_bandwidth.c), and 0.7 urad. */
+#define THRESHOLD_IDEAL_Q4 3281
+#define THRESHOLD_EDGE_Q4 7656
+
+moving_load_parameters_t moving_load_configure(unsigned encoder_bits, uint32_t control_rate_hz, uint32_t stages) {
+    const unsigned encoder_shift = 32u - encoder_bits;
+    const uint32_t time_constant = (uint32_t)((uint64_t)control_rate_hz * TIME_CONSTANT_US / 1000000u);
+    const uint32_t hold_ticks = control_rate_hz / 1000u * HOLD_MS;
+    return (moving_load_parameters_t){
+        .gain_q32 = (int32_t)fixed_divide((int64_t)1 << 32, time_constant),
+        .time_constant = time_constant,
+        .encoder_shift = encoder_shift,
+        .threshold_count_q4 = (2u << encoder_shift) + THRESHOLD_IDEAL_Q4,
+        .hold_ticks_min = hold_ticks,
+        .hold_ticks_max = hold_ticks * HOLDS_MAX,
+        .release_ticks = control_rate_hz / 1000u * RELEASE_MS,
+        .stages = stages,
+    };
+}
+
+/* Largest trend that rounding to counts causes when only few of them pass within the time constant: half a count up to
+ * one, then less by their number. Q28.4. */
+static uint32_t rounding_q4(const moving_load_parameters_t *parameters, uint32_t angle_step) {
+    const uint32_t counts = (angle_step * parameters->time_constant) >> parameters->encoder_shift; /* below 1/7 rev */
+    return (8u << parameters->encoder_shift) / (counts / 2 + 1);
+}
+
+/* Hold after a trend; a trend that interrupts the release doubles it. */
+static uint32_t hold_ticks(const moving_load_parameters_t *parameters, const moving_load_t *moving) {
+    const uint32_t ticks = moving->withheld == parameters->stages ? moving->hold_ticks : 2 * moving->hold_ticks;
+    return (uint32_t)fixed_clamp((int32_t)ticks, (int32_t)parameters->hold_ticks_min, (int32_t)parameters->hold_ticks_max);
+}
+
+uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
+                          uint32_t angle_step, bool from_edge) {
+    const int32_t trend_q4 = (int32_t)(moving->trend_q32 >> 28);
+    const int32_t difference_q4 = fixed_subtract(innovation * 16, trend_q4);
+    moving->trend_q32 += fixed_product(difference_q4, parameters->gain_q32) >> 4;
+    const uint32_t threshold_q4 =
+        from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4(parameters, angle_step);
+    if ((uint32_t)fixed_abs(trend_q4) > threshold_q4) {
+        moving->hold_ticks = hold_ticks(parameters, moving);
+        moving->withheld = parameters->stages;
+        moving->ticks = moving->hold_ticks;
+    } else if (moving->ticks > 0) {
+        moving->ticks--;
+    } else if (moving->withheld > 0) {
+        moving->withheld--;
+        moving->ticks = moving->withheld > 0 ? parameters->release_ticks : moving->hold_ticks;
+    } else {
+        moving->hold_ticks /= 2;
+        moving->ticks = moving->hold_ticks;
+    }
+    return moving->withheld;
+}

@@ -1,0 +1,50 @@
+/* Moving load: a load that changes steadily, as that of a piston compressor, detected by the trend of the innovation.
+ *
+ * The load observer assumes a constant load. Under one that changes at a rate r its innovation has the mean
+ *
+ *   e = r / (J w0^3)
+ *
+ * (derived here: the triple pole of load_observer.h at z = 1), and the speed is wrong by 3 w0 e. That mean stays below the
+ * threshold of observer_bandwidth.h, which belongs to single samples, and that threshold follows it. So the mean is
+ * looked for by itself:
+ *
+ *   trend += (innovation - trend) Ts / 1.6 ms
+ *
+ * Rounding to counts leaves 1/40 of a count of it as noise. A trend of 1/8 count withholds the last stages of the
+ * bandwidth's decay, so that the observer follows the load. They are released 50 ms after the last such trend, one
+ * each 5 ms; when they had to be withheld again soon, after twice that time, up to 0.4 s. */
+#ifndef CONTROL_MOVING_LOAD_H
+#define CONTROL_MOVING_LOAD_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+typedef struct {
+    int32_t gain_q32;           /* of the low-pass per period, Q0.32 */
+    uint32_t time_constant;      /* of the low-pass, periods */
+    unsigned encoder_shift;      /* a count is 2^encoder_shift of 2^-32 rev */
+    uint32_t threshold_count_q4; /* of the trend, 2^-32 rev, Q28.4, for angles from counts */
+    uint32_t hold_ticks_min;    /* 50 ms, periods */
+    uint32_t hold_ticks_max;    /* 1.6 s */
+    uint32_t release_ticks;     /* 5 ms */
+    uint32_t stages;            /* to withhold; 0: no detection */
+} moving_load_parameters_t;
+
+/* All zero at the start. */
+typedef struct {
+    int64_t trend_q32;   /* low-pass of the innovation, 2^-32 rev, Q27.32 */
+    uint32_t hold_ticks; /* next hold, periods; 0: the shortest */
+    uint32_t ticks;      /* until the next release */
+    uint32_t withheld;   /* stages */
+} moving_load_t;
+
+/* Encoder bits 8..32; control rate in Hz; stages to withhold. */
+moving_load_parameters_t moving_load_configure(unsigned encoder_bits, uint32_t control_rate_hz, uint32_t stages);
+
+/* One sample: returns the number of stages to withhold. innovation: 2^-32 rev, -2^27..2^27 - 1; angle_step: rotation per
+ * period, magnitude, 2^-32 rev; from_edge: the angle was measured from the time of an edge. 64-bit product, rounded
+ * down. */
+uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
+                          uint32_t angle_step, bool from_edge);
+
+#endif

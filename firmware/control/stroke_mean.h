@@ -1,0 +1,34 @@
+/* Mean load over a stroke, and whether it is constant.
+ *
+ * What a wrong table adds to the load estimate repeats with every stroke and has the same mean in each; a load that
+ * changes has not. The mean of each stroke is compared with that of the stroke before. */
+#ifndef CONTROL_STROKE_MEAN_H
+#define CONTROL_STROKE_MEAN_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+typedef struct {
+    uint32_t phases;
+    uint32_t settle_updates; /* updates without a change before a load is constant: 150 ms */
+} stroke_mean_parameters_t;
+
+/* All zero at the start. */
+typedef struct {
+    int64_t sum_q24;    /* N m, Q24, since the stroke began */
+    uint32_t updates;   /* in the sum */
+    uint32_t stroke;    /* number of the stroke in the electrical revolution */
+    int32_t mean_q24;   /* of the last whole stroke, N m, Q7.24 */
+    uint32_t remaining; /* updates until the load is constant */
+} stroke_mean_t;
+
+/* Rate of the updates in Hz. */
+stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_rate_hz);
+
+/* One update; true if the load is constant: no two successive strokes within the last 150 ms and four strokes differed by
+ * more than 0.1 N m and 1/64 of the torque. electrical: angle of phase 0, 2^-32 electrical rev; load and torque in N m,
+ * Q7.24. Strokes of fewer than 8 updates are not separated. */
+bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t electrical,
+                      int32_t load_torque_q24, int32_t torque_q24);
+
+#endif
