@@ -7,24 +7,38 @@
 #define HOLD_MS 50
 #define HOLDS_MAX 16
 #define RELEASE_MS 5
+#define BLOCKED_MS 1000
 
 /* 2^-32 rev, Q28.4: 0.3 urad, what an ideal encoder leaves (observer_bandwidth.c), and 0.7 urad. */
 #define THRESHOLD_IDEAL_Q4 3281
 #define THRESHOLD_EDGE_Q4 7656
 
-moving_load_parameters_t moving_load_configure(unsigned encoder_bits, uint32_t control_rate_hz, uint32_t stages) {
-    const unsigned encoder_shift = 32u - encoder_bits;
-    const uint32_t time_constant = (uint32_t)((uint64_t)control_rate_hz * TIME_CONSTANT_US / 1000000u);
-    const uint32_t hold_ticks = control_rate_hz / 1000u * HOLD_MS;
+/* 2 pi 100 Hz times 2^32 / 2 pi, in Q4. */
+#define SLOPE_1_S_Q36 (INT64_C(100) << 36)
+
+/* T 2 pi 100 / (J w^3). */
+static uint32_t implausible_q4(const moving_load_settings_t *settings) {
+    const int64_t acceleration = fixed_divide((int64_t)settings->torque_max_q24 << 6, settings->inertia_q30); /* 19 bits */
+    const int64_t bandwidth = settings->bandwidth_rad_s;
+    const int64_t trend_q4 = fixed_divide(fixed_divide(acceleration * SLOPE_1_S_Q36, bandwidth * bandwidth), bandwidth);
+    return (uint32_t)fixed_saturate(trend_q4);
+}
+
+moving_load_parameters_t moving_load_configure(const moving_load_settings_t *settings) {
+    const unsigned encoder_shift = 32u - settings->encoder_bits;
+    const uint32_t ticks_per_ms = settings->control_rate_hz / 1000u;
+    const uint32_t time_constant = ticks_per_ms * TIME_CONSTANT_US / 1000u;
     return (moving_load_parameters_t){
         .gain_q32 = (int32_t)fixed_divide((int64_t)1 << 32, time_constant),
         .time_constant = time_constant,
         .encoder_shift = encoder_shift,
         .threshold_count_q4 = (2u << encoder_shift) + THRESHOLD_IDEAL_Q4,
-        .hold_ticks_min = hold_ticks,
-        .hold_ticks_max = hold_ticks * HOLDS_MAX,
-        .release_ticks = control_rate_hz / 1000u * RELEASE_MS,
-        .stages = stages,
+        .implausible_q4 = implausible_q4(settings),
+        .blocked_ticks = ticks_per_ms * BLOCKED_MS,
+        .hold_ticks_min = ticks_per_ms * HOLD_MS,
+        .hold_ticks_max = ticks_per_ms * HOLD_MS * HOLDS_MAX,
+        .release_ticks = ticks_per_ms * RELEASE_MS,
+        .stages = settings->stages,
     };
 }
 
@@ -46,9 +60,17 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
     const int32_t trend_q4 = (int32_t)(moving->trend_q32 >> 28);
     const int32_t difference_q4 = fixed_subtract(innovation * 16, trend_q4);
     moving->trend_q32 += fixed_product(difference_q4, parameters->gain_q32) >> 4;
+    if (moving->blocked > 0) {
+        moving->blocked--;
+        return 0;
+    }
     const uint32_t threshold_q4 =
         from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4(parameters, angle_step);
-    if ((uint32_t)fixed_abs(trend_q4) > threshold_q4) {
+    const uint32_t magnitude_q4 = (uint32_t)fixed_abs(trend_q4);
+    if (magnitude_q4 > parameters->implausible_q4 && moving->withheld > 0) {
+        moving->withheld = 0;
+        moving->blocked = parameters->blocked_ticks;
+    } else if (magnitude_q4 > threshold_q4) {
         moving->hold_ticks = hold_ticks(parameters, moving);
         moving->withheld = parameters->stages;
         moving->ticks = moving->hold_ticks;

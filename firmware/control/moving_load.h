@@ -10,6 +10,9 @@
  *
  *   trend += (innovation - trend) Ts / 1.6 ms
  *
+ * A trend beyond that of a load of the drive's largest torque at 100 Hz is none of a load: the observer's model is so wrong
+ * that the wide bandwidth itself makes the speed swing. Nothing is withheld then for a second.
+ *
  * Rounding to counts leaves 1/40 of a count of it as noise. A trend of 1/8 count withholds the last stages of the
  * bandwidth's decay, so that the observer follows the load. They are released 50 ms after the last such trend, one
  * each 5 ms; when they had to be withheld again soon, after twice that time, up to 0.4 s. */
@@ -24,6 +27,8 @@ typedef struct {
     uint32_t time_constant;      /* of the low-pass, periods */
     unsigned encoder_shift;      /* a count is 2^encoder_shift of 2^-32 rev */
     uint32_t threshold_count_q4; /* of the trend, 2^-32 rev, Q28.4, for angles from counts */
+    uint32_t implausible_q4;     /* trend that no load causes, 2^-32 rev, Q28.4 */
+    uint32_t blocked_ticks;      /* after that, 1 s */
     uint32_t hold_ticks_min;    /* 50 ms, periods */
     uint32_t hold_ticks_max;    /* 1.6 s */
     uint32_t release_ticks;     /* 5 ms */
@@ -35,11 +40,20 @@ typedef struct {
     int64_t trend_q32;   /* low-pass of the innovation, 2^-32 rev, Q27.32 */
     uint32_t hold_ticks; /* next hold, periods; 0: the shortest */
     uint32_t ticks;      /* until the next release */
+    uint32_t blocked;    /* periods in which nothing is withheld */
     uint32_t withheld;   /* stages */
 } moving_load_t;
 
-/* Encoder bits 8..32; control rate in Hz; stages to withhold. */
-moving_load_parameters_t moving_load_configure(unsigned encoder_bits, uint32_t control_rate_hz, uint32_t stages);
+typedef struct {
+    unsigned encoder_bits; /* 8..32 */
+    uint32_t control_rate_hz;
+    uint32_t stages;          /* to withhold */
+    uint32_t bandwidth_rad_s; /* of the observer then, from 100 */
+    int32_t inertia_q30;      /* kg m^2, Q1.30 */
+    int32_t torque_max_q24;   /* of the drive, N m, Q7.24 */
+} moving_load_settings_t;
+
+moving_load_parameters_t moving_load_configure(const moving_load_settings_t *settings);
 
 /* One sample: returns the number of stages to withhold. innovation: 2^-32 rev, -2^27..2^27 - 1; angle_step: rotation per
  * period, magnitude, 2^-32 rev; from_edge: the angle was measured from the time of an edge. 64-bit product, rounded

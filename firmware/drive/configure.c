@@ -60,6 +60,9 @@ static uint32_t angle_from_degrees(int32_t degrees_q7) {
 /* Value of one count in Q18 for a full scale below 2^16; exact. */
 #define COUNT_SCALE_Q18(full_scale, bits) ((int32_t)(((int64_t)(full_scale) << 18) >> (bits)))
 
+/* 2^-15, the smallest epsilon of speed_smc.h. */
+#define EPSILON_MIN_Q31 (1 << 16)
+
 /* log2(e). */
 #define LOG2_E_Q30 1549082005
 
@@ -201,6 +204,15 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
     };
 }
 
+/* Far from the sliding surface the reaching law asks for the torque J k / epsilon. On a light machine that would be less
+ * than the torque limit: epsilon is then reduced until it is 5/4 of it. Near the surface the law is that of k alone. */
+static int32_t epsilon_q31(const int32_t *values, int32_t gain_q24) {
+    const int64_t set_q31 = (int64_t)values[PARAMETER_SMC_EPSILON] << 15;
+    const int64_t limit_q24 = (int64_t)values[PARAMETER_TORQUE_MAX_NM] * 5 / 4 + 1;
+    const int64_t reduced_q31 = fixed_divide((int64_t)gain_q24 << 31, limit_q24);
+    return fixed_clamp(fixed_saturate(reduced_q31 < set_q31 ? reduced_q31 : set_q31), EPSILON_MIN_Q31, INT32_MAX);
+}
+
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
                                        uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits) {
     const int32_t *values = parameters->values;
@@ -238,7 +250,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .speed_smc =
             {
                 .gain_q24 = fixed_multiply(inertia_q30, values[PARAMETER_SMC_K], 22),
-                .epsilon_q31 = fixed_saturate((int64_t)values[PARAMETER_SMC_EPSILON] << 15),
+                .epsilon_q31 = epsilon_q31(values, fixed_multiply(inertia_q30, values[PARAMETER_SMC_K], 22)),
                 .delta_q27 = fixed_multiply(values[PARAMETER_SMC_DELTA], LOG2_E_Q30, 19),
                 .friction_q30 = friction_q30,
                 .torque_min_q24 = controller.four_quadrant ? -torque_max_q24 : 0,
@@ -286,8 +298,14 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             }),
         .stroke_mean = stroke_mean_configure(tables->phases, control_rate_hz / DEFERRED_SLOW_PERIODS),
     };
-    control.moving_load = moving_load_configure(encoder_bits, control_rate_hz,
-                                                OBSERVER_BANDWIDTH_STAGES - 1u - control.bandwidth.moving_stage);
+    control.moving_load = moving_load_configure(&(moving_load_settings_t){
+        .encoder_bits = encoder_bits,
+        .control_rate_hz = control_rate_hz,
+        .stages = OBSERVER_BANDWIDTH_STAGES - 1u - control.bandwidth.moving_stage,
+        .bandwidth_rad_s = control.bandwidth.bandwidth_rad_s[control.bandwidth.moving_stage],
+        .inertia_q30 = inertia_q30,
+        .torque_max_q24 = torque_max_q24,
+    });
     control.torque_offset = torque_offset_configure(control_rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
     return control;

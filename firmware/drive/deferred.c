@@ -85,7 +85,7 @@ static void follow_resets(const control_parameters_t *parameters, deferred_t *de
     }
     if ((changed & OBSERVER_MASK) != 0) {
         deferred->bandwidth = (observer_bandwidth_statistics_t){0, 0};
-        deferred->moving_load = (moving_load_t){0, 0, 0, 0};
+        deferred->moving_load = (moving_load_t){0, 0, 0, 0, 0};
     }
     deferred->generation = input->generation;
     if (!deferred->started) {
