@@ -22,6 +22,8 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "fixed/compiler.h"
+
 typedef struct {
     int32_t gain_q32;           /* of the low-pass per period, Q0.32 */
     uint32_t time_constant;      /* of the low-pass, periods */
@@ -58,7 +60,7 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
 /* One sample: returns the number of stages to withhold. innovation: 2^-32 rev, -2^27..2^27 - 1; angle_step: rotation per
  * period, magnitude, 2^-32 rev; from_edge: the angle was measured from the time of an edge. 64-bit product, rounded
  * down. */
-uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
+NOINLINE uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
                           uint32_t angle_step, bool from_edge);
 
 #endif

@@ -25,10 +25,14 @@ typedef struct {
 /* Rate of the updates in Hz, limit of the torque reference in N m, Q7.24: the offset is at most an eighth of it. */
 torque_offset_parameters_t torque_offset_configure(uint32_t update_rate_hz, int32_t torque_max_q24);
 
-/* One sample: offset in N m, Q7.24, for the next reference. Reference, with the present offset, and estimated torque in
- * N m, Q7.24, any value; voltage_limited keeps the offset. Differences saturate, the 64-bit integral is clamped, the
- * result rounded down. */
-int32_t torque_offset_step(const torque_offset_parameters_t *parameters, torque_offset_t *offset, int32_t reference_q24,
-                           int32_t torque_q24, bool voltage_limited);
+/* Offset for the next reference, N m, Q7.24, rounded down. */
+static inline int32_t torque_offset_q24(const torque_offset_t *offset) {
+    return (int32_t)(offset->offset_q56 >> 32);
+}
+
+/* One sample: reference, with the present offset, and estimated torque in N m, Q7.24, any value; voltage_limited keeps the
+ * offset. Differences saturate, the 64-bit integral is clamped. */
+void torque_offset_step(const torque_offset_parameters_t *parameters, torque_offset_t *offset, int32_t reference_q24,
+                        int32_t torque_q24, bool voltage_limited);
 
 #endif

@@ -114,7 +114,6 @@ typedef struct {
     observer_bandwidth_statistics_t bandwidth;
     moving_load_t moving_load;
     torque_offset_t torque_offset;
-    int32_t torque_offset_q24; /* of the last torque_offset_step */
     bool run;                    /* in the last input */
     int32_t speed_reference_q22; /* after the ramp, rad/s, Q9.22 */
     speed_pi_t speed_pi;

@@ -81,11 +81,9 @@ static void follow_resets(const control_parameters_t *parameters, deferred_t *de
         deferred->run = false;
         speed_pi_reset(&deferred->speed_pi);
         deferred->torque_offset = (torque_offset_t){0};
-        deferred->torque_offset_q24 = 0;
     }
     if ((changed & OBSERVER_MASK) != 0) {
         deferred->bandwidth = (observer_bandwidth_statistics_t){0, 0};
-        deferred->moving_load = (moving_load_t){0, 0, 0, 0, 0};
     }
     deferred->generation = input->generation;
     if (!deferred->started) {
@@ -166,9 +164,8 @@ static void take_turns(const control_parameters_t *parameters, deferred_t *defer
                                                    input->load_torque_q24, input->torque_reference_q24);
         deferred->window = predictive_torque_move_windows(&parameters->predictive, &deferred->advance_q30,
                                                           input->torque_reference_q24, input->torque_shortfall_q24);
-        deferred->torque_offset_q24 =
-            torque_offset_step(&parameters->torque_offset, &deferred->torque_offset, input->torque_reference_q24,
-                               input->torque_sum_q24, input->torque_shortfall_q24 != 0);
+        torque_offset_step(&parameters->torque_offset, &deferred->torque_offset, input->torque_reference_q24,
+                           input->torque_sum_q24, input->torque_shortfall_q24 != 0);
         break;
     case 2:
         learn_common_misalignment(parameters, deferred, input);
@@ -193,7 +190,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     results->speed_reference_q22 = 0;
     if (input->run) {
         results->speed_law_torque_q24 =
-            fixed_add(speed_control_law_q24(parameters, deferred, input), deferred->torque_offset_q24);
+            fixed_add(speed_control_law_q24(parameters, deferred, input), torque_offset_q24(&deferred->torque_offset));
         results->speed_reference_q22 = deferred->speed_reference_q22;
     }
     deferred->run = input->run;
