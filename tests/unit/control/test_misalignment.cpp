@@ -10,6 +10,7 @@ extern "C" {
 #include "control/misalignment.h"
 #include "control/phase_map.h"
 #include "drive/configure.h"
+#include "drive/deferred.h"
 }
 
 #include "support/phase_map_results.h"
@@ -18,7 +19,8 @@ extern "C" {
 namespace {
 
 using namespace fixed_point;
-constexpr uint32_t RATE_HZ = 40000;
+constexpr uint32_t RATE_HZ = 40000 / DEFERRED_LEARNING_PERIODS; // of the updates
+constexpr double BANDWIDTH_RAD_S = 250.0;
 constexpr unsigned PHASES = 3;
 constexpr double PROBE_RAD = 0.01;
 using offsets_t = std::array<double, PHASES>; // degrees
@@ -30,7 +32,7 @@ misalignment_parameters_t parameters_of(int32_t rate_1_s) {
     if (rate_1_s != 0) {
         p.values[PARAMETER_ANGLE_TRIM_RATE_1_S] = rate_1_s;
     }
-    return configure_control(&p, &machine_tables, RATE_HZ, 17, 12).misalignment;
+    return configure_control(&p, &machine_tables, 40000, 17, 12).misalignment;
 }
 
 double electrical_rev_of(double rad) {
@@ -51,7 +53,7 @@ class Machine {
     }
 
     void step(double torque_Nm, double load_Nm, bool steady) {
-        position += 150.0 / 60.0 * machine_tables.rotor_poles / RATE_HZ;
+        position += rpm / 60.0 * machine_tables.rotor_poles / RATE_HZ;
         int32_t current_q9[HAL_PHASES_MAX] = {};
         uint32_t angle[HAL_PHASES_MAX] = {};
         std::array<double, PHASES> slope{};
@@ -74,17 +76,22 @@ class Machine {
                 torque_error += torque(corrected) - torque(assumed - electrical_rev_of(off[phase] / 180.0 * PI));
             }
         }
-        lag[0] += model.filter_1_s / RATE_HZ * (torque_error - lag[0]);
-        lag[1] += model.filter_1_s / RATE_HZ * (lag[0] - lag[1]);
+        const double lag_gain = model.filter_factor * BANDWIDTH_RAD_S / RATE_HZ;
+        lag[0] += lag_gain * (torque_error - lag[0]);
+        lag[1] += lag_gain * (lag[0] - lag[1]);
         const unsigned learned = state.phase_index;
         const misalignment_sample_t sample = {.current_q9 = current_q9[learned],
                                               .angle = angle[learned],
-                                              .load_torque_q24 = to_fixed(load_Nm + lag[1], Q24),
-                                              .speed_correction_q22 = 0,
+                                              .disturbance_q24 = to_fixed(load_Nm + lag[1], Q24),
                                               .torque_q24 = to_fixed(torque_Nm, Q24),
+                                              .bandwidth_rad_s = uint32_t(BANDWIDTH_RAD_S),
                                               .steady = steady};
         misalignment_step(&parameters, &state, &machine_tables, &sample);
-        model.step(sample.load_torque_q24 / Q24, steady, torque_Nm, [&](unsigned phase) { return slope[phase]; });
+        model.step(sample.disturbance_q24 / Q24, BANDWIDTH_RAD_S, steady, torque_Nm,
+                   [&](unsigned phase) { return slope[phase]; });
+        if (common && ++updates % (DEFERRED_SLOW_PERIODS / DEFERRED_LEARNING_PERIODS) == 0) {
+            misalignment_common_step(&parameters, &state, PHASES, sample.disturbance_q24, sample.torque_q24);
+        }
     }
 
     double offset_deg(unsigned phase) const {
@@ -96,6 +103,9 @@ class Machine {
     misalignment_t state{};
     reference_model::misalignment_t model{};
     offsets_t off;
+    double rpm = 150.0;
+    bool common = false; // the common angle is learned, too
+    unsigned updates = 0;
     double position = 0.0;
     std::array<double, 2> lag{};
 };
@@ -124,7 +134,7 @@ TEST(Misalignment, is_not_learned_while_unsteady_below_1_Nm_or_before_settling) 
     for (int k = 0; k < int(RATE_HZ); k++) {
         unsteady.step(8.0, 8.0, false);
         idle.step(0.99, 0.99, true);
-        settling.step(8.0, 8.0, uint32_t(k) % (settling.parameters.settle_ticks + 1) != 0);
+        settling.step(8.0, 8.0, uint32_t(k) % (settling.parameters.settle_updates + 1) != 0);
     }
     for (unsigned phase = 0; phase < PHASES; phase++) {
         EXPECT_EQ(unsteady.offset_deg(phase), 0.0);
@@ -166,7 +176,32 @@ TEST(Misalignment, an_aligned_machine_learns_less_than_0_01_degrees_from_a_load_
     }
 }
 
-TEST(Misalignment, is_limited_to_a_degree_and_overflows_nothing) {
+TEST(Misalignment, at_600_rpm_the_common_angle_is_learned_in_3_s_and_the_phases_alone_take_longer) {
+    Machine with(8, {0.5, 0.5, 0.5}), without(8, {0.5, 0.5, 0.5});
+    with.common = true;
+    with.rpm = without.rpm = 600.0;
+    for (int k = 0; k < int(3 * RATE_HZ); k++) {
+        with.step(8.0, 8.0, true);
+        without.step(8.0, 8.0, true);
+    }
+    for (unsigned phase = 0; phase < PHASES; phase++) {
+        EXPECT_NEAR(with.offset_deg(phase), 0.5, 0.04) << phase;
+        EXPECT_LT(without.offset_deg(phase), 0.45) << phase;
+    }
+}
+
+TEST(Misalignment, the_common_angle_is_not_learned_while_unsteady) {
+    Machine machine(12, {0.3, 0.3, 0.3});
+    machine.common = true;
+    for (int k = 0; k < int(RATE_HZ); k++) {
+        machine.step(8.0, 8.0, false);
+    }
+    for (unsigned phase = 0; phase < PHASES; phase++) {
+        EXPECT_EQ(machine.offset_deg(phase), 0.0);
+    }
+}
+
+TEST(Misalignment, is_limited_to_four_degrees_and_overflows_nothing) {
     const misalignment_parameters_t p = parameters_of(100);
     for (const int32_t sign : {1, -1}) {
         misalignment_t state;
@@ -176,17 +211,19 @@ TEST(Misalignment, is_limited_to_a_degree_and_overflows_nothing) {
             const misalignment_sample_t sample = {
                 .current_q9 = on ? 79 * 512 : 0,
                 .angle = on ? 0x90000000u : 0x81000000u,
-                .load_torque_q24 = sign * (on ? 60 << 24 : -(60 << 24)),
-                .speed_correction_q22 = on == (sign > 0) ? INT32_MIN : INT32_MAX,
+                .disturbance_q24 = misalignment_disturbance_q24(&p, sign * (on ? 60 << 24 : -(60 << 24)),
+                                                                on == (sign > 0) ? INT32_MIN : INT32_MAX),
                 .torque_q24 = 8 << 24,
+                .bandwidth_rad_s = 250,
                 .steady = true,
             };
             misalignment_step(&p, &state, &machine_tables, &sample);
+            misalignment_common_step(&p, &state, PHASES, sample.disturbance_q24, sample.torque_q24);
         }
         for (unsigned phase = 0; phase < PHASES; phase++) {
             const double deg = state.phase[phase].offset / REV / machine_tables.rotor_poles * 360.0;
-            EXPECT_LE(std::fabs(deg), 1.003);
-            EXPECT_GT(std::fabs(deg), 0.5);
+            EXPECT_LE(std::fabs(deg), 4.02);
+            EXPECT_GT(std::fabs(deg), 1.0);
         }
     }
 }

@@ -14,16 +14,26 @@ extern "C" {
 namespace {
 
 using namespace fixed_point;
-constexpr uint32_t TRANSIENT_RAD_S = 9000, STEADY_RAD_S = 250;
+constexpr uint32_t TRANSIENT_RAD_S = 9000, MOVING_RAD_S = 1800, STEADY_RAD_S = 250;
+constexpr double TORQUE_MAX_NM = 19.1, INERTIA = 0.02;
 constexpr unsigned ENCODER_BITS = 17;
 constexpr int32_t COUNT = 1 << (32 - ENCODER_BITS);
 constexpr uint32_t RATE_HZ = 40000;
-const int32_t INERTIA_Q30 = to_fixed(0.02, Q30);
+const int32_t INERTIA_Q30 = to_fixed(INERTIA, Q30);
 constexpr unsigned LAST_STAGE = OBSERVER_BANDWIDTH_STAGES - 1;
 
 observer_bandwidth_parameters_t configure(uint32_t transient_rad_s = TRANSIENT_RAD_S, uint32_t rate_hz = RATE_HZ,
                                           unsigned encoder_bits = ENCODER_BITS) {
-    return observer_bandwidth_configure(transient_rad_s, STEADY_RAD_S, encoder_bits, rate_hz, INERTIA_Q30);
+    const observer_bandwidth_settings_t settings = {
+        .transient_rad_s = transient_rad_s,
+        .moving_rad_s = MOVING_RAD_S,
+        .steady_rad_s = STEADY_RAD_S,
+        .encoder_bits = encoder_bits,
+        .control_rate_hz = rate_hz,
+        .inertia_q30 = INERTIA_Q30,
+        .torque_max_q24 = to_fixed(TORQUE_MAX_NM, Q24),
+    };
+    return observer_bandwidth_configure(&settings);
 }
 
 class Bandwidth {
@@ -31,6 +41,7 @@ class Bandwidth {
     explicit Bandwidth(const observer_bandwidth_parameters_t &p, double rate_hz = RATE_HZ)
         : parameters(p), model(reference_model::model_of(p, rate_hz)) {
         observer_bandwidth_reset(&state);
+        limits.holdoff_ticks = p.retrigger_holdoff_ticks;
     }
 
     // One sample of both; true when the firmware triggered.
@@ -49,17 +60,20 @@ class Bandwidth {
     }
 
     void update(int32_t innovation, bool from_edge) {
-        const observer_bandwidth_sample_t sample = {
-            .innovation = innovation, .from_edge = from_edge, .stage = state.stage, .trigger = state.trigger};
+        const observer_bandwidth_sample_t sample = {.innovation = innovation,
+                                                    .from_edge = from_edge,
+                                                    .stage = state.stage,
+                                                    .angle_step = angle_step,
+                                                    .trigger = state.trigger};
         limits = observer_bandwidth_update(&parameters, &statistics, &sample);
         state.trigger = OBSERVER_TRIGGER_NONE;
     }
 
     bool steady() const { return observer_bandwidth_steady(&parameters, state.stage); }
 
-    void settle() {
+    void settle(bool from_edge = false) {
         while (!steady()) {
-            step(0);
+            step(0, from_edge);
         }
     }
 
@@ -70,6 +84,7 @@ class Bandwidth {
     observer_bandwidth_limits_t limits{};
     observer_bandwidth_statistics_t statistics{};
     bool updating = true; // the statistics, with every sample
+    uint32_t angle_step = COUNT;
     reference_model::bandwidth_t model;
     unsigned triggers = 0;
 };
@@ -128,12 +143,12 @@ TEST(ObserverBandwidth, an_innovation_above_1_25_counts_or_8_urad_of_an_edge_tri
         const double threshold = from_edge ? 8.0 * urad : 1.25 * COUNT;
         for (const double side : {1.0, -1.0}) {
             Bandwidth bandwidth(configure());
-            bandwidth.settle();
+            bandwidth.settle(from_edge);
             // A single sample, because many would raise the mean innovation.
             const int32_t below = int32_t(side * (from_edge ? threshold : 1.1 * COUNT)) - (from_edge ? int(side) : 0);
             EXPECT_FALSE(bandwidth.step(below, from_edge));
             EXPECT_TRUE(bandwidth.step(int32_t(side * (threshold + 0.5 * urad)), from_edge));
-            EXPECT_EQ(bandwidth.rad_s(), bandwidth.parameters.bandwidth_rad_s[from_edge ? 0 : 3]);
+            EXPECT_EQ(bandwidth.rad_s(), from_edge ? TRANSIENT_RAD_S : 3186);
         }
     }
     const observer_bandwidth_parameters_t ideal = configure(TRANSIENT_RAD_S, RATE_HZ, 32);
@@ -213,7 +228,7 @@ TEST(ObserverBandwidth, a_trigger_counts_when_its_sample_and_the_next_ones_are_l
     }
     bandwidth.update(0, false);
     EXPECT_NEAR(bandwidth.statistics.holdoff_extension_q16 / 65536.0, 0.25, 0.01);
-    EXPECT_EQ(bandwidth.limits.holdoff_extension_ticks, RATE_HZ / 1000 / 4 - 1);
+    EXPECT_EQ(bandwidth.limits.holdoff_ticks, RATE_HZ / 1000 + RATE_HZ / 1000 / 4 - 1);
     EXPECT_EQ(bandwidth.state.trigger, OBSERVER_TRIGGER_NONE);
 }
 
@@ -231,6 +246,70 @@ TEST(ObserverBandwidth, a_slowly_growing_innovation_raises_the_threshold_and_doe
     EXPECT_NEAR(bandwidth.statistics.mean_innovation_q32 / Q32, bandwidth.model.mean_innovation * REV, 0.01 * COUNT);
     // An innovation far above the mean still triggers.
     EXPECT_TRUE(bandwidth.step(12 * COUNT));
+}
+
+// J w0^2 2 pi / 2^bits: a count as torque.
+double count_Nm(double rad_s, unsigned bits) {
+    return INERTIA * rad_s * rad_s * 2.0 * PI / std::ldexp(1.0, int(bits));
+}
+
+TEST(ObserverBandwidth, no_stage_is_wider_than_the_encoder_allows_and_the_next_wider_one_would_be) {
+    for (unsigned bits = 8; bits <= 15; bits++) {
+        const observer_bandwidth_parameters_t p = configure(TRANSIENT_RAD_S, RATE_HZ, bits);
+        const auto largest_Nm = [&](unsigned stage) { return count_Nm(p.bandwidth_rad_s[stage], bits); };
+        const unsigned trigger = p.trigger_stage_count, moving = p.moving_stage;
+        const unsigned steady_rad_s = p.bandwidth_rad_s[LAST_STAGE];
+        EXPECT_LE(trigger, moving);
+        EXPECT_TRUE(trigger == LAST_STAGE || largest_Nm(trigger) <= TORQUE_MAX_NM * 0.63) << bits;
+        EXPECT_GT(largest_Nm(trigger - 1), TORQUE_MAX_NM * 0.62) << bits;
+        EXPECT_TRUE(moving == LAST_STAGE || largest_Nm(moving) <= TORQUE_MAX_NM * 0.16) << bits;
+        EXPECT_TRUE(steady_rad_s == 100 || count_Nm(steady_rad_s, bits) <= TORQUE_MAX_NM * 0.05) << bits;
+        EXPECT_TRUE(steady_rad_s == STEADY_RAD_S || count_Nm(steady_rad_s + 1, bits) > TORQUE_MAX_NM * 0.049) << bits;
+    }
+}
+
+TEST(ObserverBandwidth, a_fine_encoder_keeps_the_bandwidths_of_the_settings) {
+    const observer_bandwidth_parameters_t p = configure();
+    EXPECT_EQ(configure(TRANSIENT_RAD_S, RATE_HZ, 19).trigger_stage_count, 3) << "coarser than edges";
+    EXPECT_EQ(p.bandwidth_rad_s[LAST_STAGE], STEADY_RAD_S);
+    EXPECT_EQ(p.steady_stage_edge, LAST_STAGE);
+    EXPECT_LE(p.bandwidth_rad_s[p.moving_stage], MOVING_RAD_S);
+    EXPECT_GT(p.bandwidth_rad_s[p.moving_stage - 1], MOVING_RAD_S);
+}
+
+TEST(ObserverBandwidth, withheld_stages_are_left_at_once_and_not_entered) {
+    Bandwidth bandwidth(configure());
+    bandwidth.settle();
+    bandwidth.updating = false;
+    bandwidth.limits.withheld_stages = 9;
+    bandwidth.step(0);
+    EXPECT_EQ(bandwidth.state.stage, LAST_STAGE - 9);
+    for (uint32_t k = 0; k < RATE_HZ; k++) {
+        bandwidth.step(0);
+    }
+    EXPECT_EQ(bandwidth.state.stage, LAST_STAGE - 9);
+    EXPECT_FALSE(bandwidth.steady());
+    bandwidth.limits.withheld_stages = 0;
+    for (unsigned stage = LAST_STAGE - 8; stage <= LAST_STAGE; stage++) {
+        bandwidth.step(0);
+        EXPECT_EQ(bandwidth.state.stage, stage) << "one stage a sample";
+    }
+}
+
+TEST(ObserverBandwidth, rare_edges_of_a_coarse_encoder_count_as_counts_and_frequent_ones_do_not) {
+    constexpr unsigned COARSE_BITS = 10;
+    const observer_bandwidth_parameters_t p = configure(TRANSIENT_RAD_S, RATE_HZ, COARSE_BITS);
+    const uint32_t count = 1u << (32 - COARSE_BITS);
+    for (const bool frequent : {false, true}) {
+        Bandwidth bandwidth(p);
+        bandwidth.angle_step = frequent ? count / 4 : count / 4 - 1; // one each 100 us
+        for (uint32_t k = 0; k < RATE_HZ; k++) {
+            bandwidth.step(0, true);
+        }
+        EXPECT_EQ(bandwidth.state.stage, frequent ? p.steady_stage_edge : LAST_STAGE);
+        EXPECT_EQ(bandwidth.step(int32_t(count), true), frequent);
+        EXPECT_EQ(bandwidth.limits.trigger_stage_edge, frequent ? 0 : p.trigger_stage_count);
+    }
 }
 
 } // namespace

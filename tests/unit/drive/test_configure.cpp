@@ -9,6 +9,7 @@
 
 extern "C" {
 #include "drive/configure.h"
+#include "drive/deferred.h"
 }
 
 #include "support/reference_models.h"
@@ -64,7 +65,11 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("torque max", c.speed_pi.torque_max_q24, v(PARAMETER_TORQUE_MAX_NM) * fixed_point::Q24, 0.0);
 
     near("smc gain", c.speed_smc.gain_q24, v(PARAMETER_INERTIA_KG_M2) * v(PARAMETER_SMC_K) * fixed_point::Q24, 0.51);
-    near("epsilon", c.speed_smc.epsilon_q31, std::ldexp(v(PARAMETER_SMC_EPSILON), 31), 1.01);
+    // Reduced where J k / epsilon would be less than 5/4 of the torque limit.
+    const double limit_Nm = 1.25 * v(PARAMETER_TORQUE_MAX_NM) + 1e-9;
+    const double reaching_Nm = v(PARAMETER_INERTIA_KG_M2) * v(PARAMETER_SMC_K);
+    const double epsilon = std::max(std::min(v(PARAMETER_SMC_EPSILON), reaching_Nm / limit_Nm), std::ldexp(1.0, -15));
+    near("epsilon", c.speed_smc.epsilon_q31, std::ldexp(epsilon, 31), 2.0 + 128.0 / limit_Nm + 1e-6 * epsilon * 2e9);
     near("delta", c.speed_smc.delta_q27, std::ldexp(v(PARAMETER_SMC_DELTA) / std::log(2.0), 27), 1.01);
     near("friction", c.speed_smc.friction_q30, v(PARAMETER_FRICTION_NM_S) * fixed_point::Q30, 0.0);
     ASSERT_EQ(c.speed_smc.torque_min_q24, salient ? -c.speed_smc.torque_max_q24 : 0);
@@ -115,7 +120,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
          0.6);
     near("step", c.protection.angle_step_max, 0.0, fixed_point::REV);
     ASSERT_LE(std::fabs(c.protection.angle_step_max - (1.5 * fastest + 2.0 * count)), 3.0 + 1e-6 * fastest);
-    ASSERT_LE(std::fabs(c.protection.undetected_travel_max - (fixed_point::REV / 1440.0 + 4.0 * count)), 1.0);
+    ASSERT_LE(std::fabs(c.protection.undetected_travel_max - (fixed_point::REV / 1440.0 + 12.0 * count)), 1.0);
     ASSERT_EQ(c.protection.angle_step_q32, c.observer.angle_step_q32);
     near("slowing", c.protection.deceleration_max_q22, 40.0 / v(PARAMETER_INERTIA_KG_M2) / rate_hz * fixed_point::Q22,
          2.0);
@@ -144,8 +149,8 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const double q40 = std::ldexp(1.0, 40);
     near("resistance", c.predictive.flux.resistance_period_q40, v(PARAMETER_RESISTANCE_OHM) / rate_hz * q40, 1.0);
     near("period", c.predictive.period_q40, q40 / rate_hz, 1.0);
-    near("advance", c.predictive.advance_step_q30, 10.0 / rate_hz * fixed_point::Q30, 1.0);
-    near("return", c.predictive.retract_step_q30, 1.0 / rate_hz * fixed_point::Q30, 1.0);
+    near("advance", c.predictive.advance_step_q30, 10.0 * DEFERRED_SLOW_PERIODS / rate_hz * fixed_point::Q30, 1.0);
+    near("return", c.predictive.retract_step_q30, 1.0 * DEFERRED_SLOW_PERIODS / rate_hz * fixed_point::Q30, 1.0);
 
     const auto trim_scale = [&](unsigned index) {
         return std::min(v(index) * scale_Nm / v(PARAMETER_BP_TRIM_LIMIT_NM), 4.0) * fixed_point::Q15;
@@ -161,8 +166,10 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("trim alpha", c.trim.pid.network.momentum_q32, v(PARAMETER_BP_ALPHA) * fixed_point::Q32, 1.0);
 
     const double learn_1_s = p.values[PARAMETER_ANGLE_TRIM] == 1 ? v(PARAMETER_ANGLE_TRIM_RATE_1_S) : 0.0;
-    const double turn_rate_hz = std::floor(rate_hz / machine_tables.phases);
+    const double turn_rate_hz = std::floor(rate_hz / DEFERRED_LEARNING_PERIODS / machine_tables.phases);
     near("misalignment rate", c.misalignment.rate_q30, learn_1_s / turn_rate_hz * fixed_point::Q30, 1.0);
+    near("common misalignment rate", c.misalignment.common_rate_q30,
+         learn_1_s / 8.0 / (rate_hz / DEFERRED_SLOW_PERIODS) * fixed_point::Q30, 1.0);
     near("inertia rate", c.misalignment.inertia_rate_q8, v(PARAMETER_INERTIA_KG_M2) * rate_hz * 256.0, 1.0);
     ASSERT_LE(std::fabs(c.misalignment.probe_angle -
                         0.01 / (2.0 * fixed_point::PI) * fixed_point::REV * machine_tables.rotor_poles),
@@ -172,9 +179,12 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const uint32_t rate = uint32_t(rate_hz);
     const int32_t inertia_q30 = p.values[PARAMETER_INERTIA_KG_M2];
     const load_observer_model_t observer = load_observer_model(rate, inertia_q30, p.values[PARAMETER_FRICTION_NM_S]);
-    const load_observer_gains_t gains = load_observer_gains(
-        uint32_t(p.values[salient ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S]), rate,
-        inertia_q30);
+    const auto set_rad_s =
+        uint32_t(p.values[salient ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S]);
+    const uint32_t steady_rad_s = c.bandwidth.bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES - 1];
+    ASSERT_LE(steady_rad_s, set_rad_s);
+    ASSERT_TRUE(steady_rad_s == set_rad_s || c.bandwidth.adaptive) << "limited to what the encoder allows";
+    const load_observer_gains_t gains = load_observer_gains(steady_rad_s, rate, inertia_q30);
     const load_observer_gains_t &steady = c.bandwidth.gains[OBSERVER_BANDWIDTH_STAGES - 1];
     ASSERT_EQ(steady.angle_gain_q28, gains.angle_gain_q28);
     ASSERT_EQ(steady.speed_gain_q24, gains.speed_gain_q24);

@@ -81,6 +81,10 @@ class Control : public testing::Test {
     bool step_unchanged() {
         turns += speed_rad_s / (2.0 * fixed_point::PI * RATE_HZ);
         sample.encoder.counts = uint32_t(int64_t(std::floor((turns - std::floor(turns)) * (1 << ENCODER_BITS))));
+        return step_as_sampled();
+    }
+
+    bool step_as_sampled() {
         const bool closed = control_step(&parameters, &state, &sample, &command, &compare);
         deferred_step(&parameters, &state);
         diagnostics = diagnose();
@@ -589,7 +593,7 @@ TEST_F(SalientControl, the_angle_after_an_edge_is_extrapolated_at_the_observed_s
     }
 }
 
-TEST_F(SalientControl, without_a_recent_edge_the_angle_is_the_middle_of_the_count) {
+TEST_F(SalientControl, without_edges_the_angle_is_the_middle_of_the_count_and_long_after_one_the_prediction_within_it) {
     speed_rad_s = 15.0;
     for (int k = 0; k < 400; k++) {
         step(COMMAND_OFF);
@@ -598,9 +602,15 @@ TEST_F(SalientControl, without_a_recent_edge_the_angle_is_the_middle_of_the_coun
     sample.encoder.edge_known = true;
     sample.encoder.edge_forward = true;
     for (const uint32_t age_ticks : {20001u, HAL_ENCODER_AGE_MAX_TICKS}) {
-        sample.encoder.edge_age_ticks = age_ticks;
-        step(COMMAND_OFF);
-        EXPECT_EQ(diagnostics.angle, middle()) << age_ticks;
+        for (const int32_t counts : {-1, 0, 1}) { // the prediction is in the count after, in this one, in that before
+            sample.encoder.edge_age_ticks = age_ticks;
+            const auto predicted = uint32_t(state.observer.angle_q64 >> 32);
+            sample.encoder.counts = (predicted >> 15) + uint32_t(counts);
+            const uint32_t count_start = sample.encoder.counts << 15;
+            step_as_sampled();
+            EXPECT_EQ(diagnostics.angle,
+                      counts == 0 ? predicted : count_start + (counts < 0 ? (1u << 15) - 1 : 0)) << age_ticks;
+        }
     }
     sample.encoder.edge_age_ticks = 100;
     step(COMMAND_OFF);

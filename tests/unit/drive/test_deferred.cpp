@@ -104,7 +104,10 @@ TEST_F(Deferred, a_pending_step_keeps_its_input_and_the_next_input_counts_the_sk
 TEST_F(Deferred, results_take_effect_together_at_the_end_of_the_step) {
     start();
     for (int k = 0; k < 400; k++) {
-        period(COMMAND_RUN, 3000.0); // a torque shortfall: the windows move in every step
+        period(COMMAND_RUN, 3000.0); // a torque shortfall: the windows move in every fourth step
+    }
+    while (state.deferred.turn != 3) { // the next step moves them
+        period(COMMAND_RUN, 3000.0);
     }
     interrupt(COMMAND_RUN, 3000.0);
     deferred_results_t before;
@@ -192,10 +195,12 @@ TEST_F(Deferred, the_torque_of_the_speed_law_acts_one_period_later_with_the_feed
         interrupt(COMMAND_RUN, 30.0);
         const deferred_input_t &input = state.deferred_request.input;
         EXPECT_EQ(input.speed_q22, state.observer.speed_q22) << "the speed after this sample";
+        const int32_t torque_offset_before_q24 = torque_offset_q24(&state.deferred.torque_offset);
         deferred_step(&parameters, &state);
         const int32_t error_q22 = results().speed_reference_q22 - input.speed_q22;
         const int32_t law_q24 = results().speed_law_torque_q24;
-        ASSERT_EQ(law_q24, speed_smc_reaching_torque_q24(&parameters.speed_smc, error_q22));
+        ASSERT_EQ(law_q24, speed_smc_reaching_torque_q24(&parameters.speed_smc, error_q22) +
+                               torque_offset_before_q24);
         interrupt(COMMAND_RUN, 30.0);
         ASSERT_EQ(state.torque_reference_q24,
                   speed_smc_torque_q24(&parameters.speed_smc, law_q24, state.observer.speed_q22,
@@ -329,11 +334,11 @@ TEST_F(Deferred, a_trigger_in_a_skipped_period_lengthens_the_holdoff) {
     turns += 4.0 / (1 << ENCODER_BITS);
     interrupt(COMMAND_OFF); // skipped
     ASSERT_LT(state.bandwidth.stage, OBSERVER_BANDWIDTH_STAGES - 1u);
-    EXPECT_EQ(results().bandwidth.holdoff_extension_ticks, 0u);
+    EXPECT_EQ(results().bandwidth.holdoff_ticks, RATE_HZ / 1000);
     deferred_step(&parameters, &state);
-    EXPECT_EQ(results().bandwidth.holdoff_extension_ticks, 0u) << "the input is that of the period before";
+    EXPECT_EQ(results().bandwidth.holdoff_ticks, RATE_HZ / 1000) << "the input is that of the period before";
     period(COMMAND_OFF);
-    EXPECT_NEAR(results().bandwidth.holdoff_extension_ticks, RATE_HZ / 1000.0 / 4.0, 1.0);
+    EXPECT_NEAR(results().bandwidth.holdoff_ticks, RATE_HZ / 1000.0 * 1.25, 1.0);
 }
 
 } // namespace

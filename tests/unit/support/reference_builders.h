@@ -6,6 +6,7 @@ extern "C" {
 #include "control/bp_pid.h"
 #include "control/load_observer.h"
 #include "control/misalignment.h"
+#include "control/moving_load.h"
 #include "control/observer_bandwidth.h"
 #include "control/predictive_torque.h"
 #include "control/speed_pi.h"
@@ -53,6 +54,16 @@ inline bandwidth_t model_of(const observer_bandwidth_parameters_t &p, double rat
     bandwidth.holdoff_s = p.retrigger_holdoff_ticks / rate_hz;
     bandwidth.holdoff_decay = p.holdoff_decay_q32 / fixed_point::Q32;
     return bandwidth;
+}
+
+inline moving_load_t model_of(const moving_load_parameters_t &p, bool edges, double rate_hz) {
+    moving_load_t moving{};
+    moving.rate_hz = rate_hz;
+    // A count's rounding adds to the threshold only at low speeds.
+    moving.threshold = (edges ? 7656.0 : p.threshold_count_q4) / 16.0 / fixed_point::REV;
+    moving.implausible = p.implausible_q4 / 16.0 / fixed_point::REV;
+    moving.stages = p.stages;
+    return moving;
 }
 
 inline misalignment_t model_of(const misalignment_parameters_t &p, unsigned phases, double update_rate_hz) {

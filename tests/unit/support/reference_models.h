@@ -91,6 +91,40 @@ struct observer_t {
     }
 };
 
+// Trend of the innovation, in revolutions: stages of the bandwidth that are withheld while the load moves.
+struct moving_load_t {
+    double rate_hz, threshold, implausible;
+    unsigned stages;
+    double time_constant_s = 1.6e-3, hold_min_s = 0.05, hold_max_s = 0.8, release_s = 0.005, blocked_s = 1.0;
+    double trend = 0.0, hold_s = 0.0, remaining_s = 0.0, blocked_until_s = 0.0, time_s = 0.0;
+    unsigned withheld = 0;
+
+    unsigned step(double innovation) {
+        const double magnitude = std::fabs(trend);
+        time_s += 1.0 / rate_hz;
+        remaining_s -= 1.0 / rate_hz;
+        trend += (innovation - trend) / (time_constant_s * rate_hz);
+        if (time_s < blocked_until_s) {
+            return 0;
+        }
+        if (magnitude > implausible && withheld > 0) {
+            withheld = 0;
+            blocked_until_s = time_s + blocked_s;
+        } else if (magnitude > threshold) {
+            hold_s = std::clamp(withheld == stages ? hold_s : 2.0 * hold_s, hold_min_s, hold_max_s);
+            withheld = stages;
+            remaining_s = hold_s;
+        } else if (remaining_s <= 0.0 && withheld > 0) {
+            withheld--;
+            remaining_s = withheld > 0 ? release_s : hold_s;
+        } else if (remaining_s <= 0.0) {
+            hold_s /= 2.0;
+            remaining_s = hold_s;
+        }
+        return withheld;
+    }
+};
+
 // Bandwidth schedule of the load observer: 3.5 / t since the last trigger, between steady and transient bandwidth.
 // Angles in revolutions. The thresholds are those of the firmware.
 struct bandwidth_t {
@@ -103,13 +137,14 @@ struct bandwidth_t {
 
     bool steady() const { return bandwidth_rad_s <= steady_rad_s; }
 
-    double step(double innovation, bool from_edge) {
+    // least_rad_s: while the load moves.
+    double step(double innovation, bool from_edge, double least_rad_s = 0.0) {
         const double transient_rad_s = edge_trigger_rad_s;
         since_s += 1.0 / rate_hz;
         if (bandwidth_rad_s == 0.0) {
             start_rad_s = transient_rad_s;
         }
-        bandwidth_rad_s = std::max(std::min(start_rad_s, 3.5 / since_s), steady_rad_s);
+        bandwidth_rad_s = std::max(std::min(start_rad_s, 3.5 / since_s), std::max(steady_rad_s, least_rad_s));
         const double threshold = std::max(4.0 * mean_innovation, from_edge ? threshold_edge : threshold_count);
         const double magnitude = std::fabs(innovation);
         if (steady()) {

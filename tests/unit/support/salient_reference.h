@@ -96,6 +96,10 @@ class salient_t {
           delta_s(std::ldexp(p.speed_smc.delta_q27, -27) * std::log(2.0)), gain_Nm_s(p.speed_smc.gain_q24 / Q24),
           torque_max_Nm(p.speed_smc.torque_max_q24 / Q24) {
         bandwidth = model_of(p.bandwidth, rate_hz);
+        moving_load[0] = model_of(p.moving_load, false, rate_hz);
+        moving_load[1] = model_of(p.moving_load, true, rate_hz);
+        std::copy(std::begin(p.bandwidth.bandwidth_rad_s), std::end(p.bandwidth.bandwidth_rad_s), stage_rad_s.begin());
+        offset_limit_Nm = torque_max_Nm / 8.0;
         predictive = model_of(p.predictive, &machine, phases);
         predictive.period_s = 1.0 / rate_hz;
         predictive.resistance_ohm = plant.resistance_ohm;
@@ -122,7 +126,10 @@ class salient_t {
             seen.table_Wb[phase] = machine.flux(angle[phase], current_A);
             torque_Nm += machine.torque(angle[phase], current_A);
         }
-        const double now_rad_s = bandwidth.step(observer.innovation(measured), from_edge);
+        const double innovation = observer.innovation(measured);
+        const double now_rad_s = bandwidth.step(innovation, from_edge, least_rad_s);
+        const unsigned withheld = moving_load[from_edge].step(innovation); // acts in the next period
+        least_rad_s = withheld > 0 ? stage_rad_s[OBSERVER_BANDWIDTH_STAGES - 1 - withheld] : 0.0;
         observer.set_gains(observer_t::ideal(now_rad_s, rate_hz, inertia_kg_m2, friction_Nm_s));
         observer.step(measured, torque_Nm);
         if (!run) {
@@ -133,10 +140,15 @@ class salient_t {
         const double reference_rad_s = command.speed_reference_q22 / Q22;
         const double slip_rad_s = reference_rad_s - observer.speed;
         // The reaching torque of the previous period, of the deferred step; the feed-forward of this one.
-        const double reference_Nm = std::clamp(reaching_Nm + observer.load_torque + friction_Nm_s * observer.speed,
-                                               -torque_max_Nm, torque_max_Nm);
+        const double reference_Nm = std::clamp(reaching_Nm + offset_Nm + observer.load_torque +
+                                                   friction_Nm_s * observer.speed, -torque_max_Nm, torque_max_Nm);
         reaching_Nm = gain_Nm_s * reaching_rad_s2(1.0, epsilon, delta_s, slip_rad_s);
+        if (predictive.torque_shortfall == 0.0) {
+            offset_Nm += 20.0 / rate_hz * (reference_Nm - offset_Nm - torque_Nm);
+            offset_Nm = std::clamp(offset_Nm, -offset_limit_Nm, offset_limit_Nm);
+        }
 
+        // The common angle and the mean load of the strokes are left out: these runs are aligned, their load is constant.
         const bool steady = bandwidth.steady() && std::fabs(slip_rad_s) < std::fabs(observer.speed) / 64.0 &&
                             predictive.torque_shortfall == 0.0;
         const double disturbance_Nm = observer.load_torque - observer.speed_correction * inertia_kg_m2 * rate_hz;
@@ -176,6 +188,9 @@ class salient_t {
     double reaching_Nm = 0.0; // acts in the next period
     observer_t observer{};
     bandwidth_t bandwidth{};
+    std::array<moving_load_t, 2> moving_load{}; // of counts, of edges
+    std::array<double, OBSERVER_BANDWIDTH_STAGES> stage_rad_s{};
+    double least_rad_s = 0.0, offset_Nm = 0.0, offset_limit_Nm;
     predict_t predictive{};
     misalignment_t misalignment{};
 

@@ -1,0 +1,144 @@
+// Trend of the innovation: detection of a load that moves.
+#include <cmath>
+#include <cstdint>
+#include <random>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/moving_load.h"
+}
+
+#include "support/fixed_point.h"
+
+namespace {
+
+using namespace fixed_point;
+constexpr unsigned ENCODER_BITS = 17, STAGES = 9;
+constexpr int32_t COUNT = 1 << (32 - ENCODER_BITS);
+constexpr uint32_t RATE_HZ = 40000;
+constexpr uint32_t FAST = 8 * COUNT; // rotation per period
+
+moving_load_settings_t settings(unsigned encoder_bits = ENCODER_BITS, uint32_t rate_hz = RATE_HZ) {
+    return {.encoder_bits = encoder_bits,
+            .control_rate_hz = rate_hz,
+            .stages = STAGES,
+            .bandwidth_rad_s = 1700,
+            .inertia_q30 = to_fixed(0.02, Q30),
+            .torque_max_q24 = to_fixed(19.1, Q24)};
+}
+
+class Detector {
+  public:
+    explicit Detector(const moving_load_settings_t &of = settings()) : parameters(moving_load_configure(&of)) {}
+
+    uint32_t step(int32_t innovation, uint32_t angle_step = FAST, bool from_edge = false) {
+        return moving_load_step(&parameters, &state, innovation, angle_step, from_edge);
+    }
+    // Longest sequence of samples with withheld stages.
+    uint32_t run(uint32_t samples, int32_t innovation, uint32_t angle_step = FAST) {
+        uint32_t withheld = 0;
+        for (uint32_t k = 0; k < samples; k++) {
+            withheld += step(innovation, angle_step) > 0;
+        }
+        return withheld;
+    }
+
+    moving_load_parameters_t parameters;
+    moving_load_t state{};
+};
+
+TEST(MovingLoad, a_constant_innovation_of_a_seventh_of_a_count_withholds_and_of_a_ninth_does_not) {
+    for (const int32_t sign : {1, -1}) {
+        Detector moving, constant;
+        moving.run(RATE_HZ / 50, sign * COUNT / 7);
+        EXPECT_EQ(moving.step(sign * COUNT / 7), STAGES);
+        EXPECT_EQ(constant.run(RATE_HZ, sign * COUNT / 9), 0u);
+    }
+}
+
+TEST(MovingLoad, rounding_to_counts_withholds_nothing_at_any_speed) {
+    for (const unsigned bits : {8u, 12u, 17u, 20u}) {
+        Detector detector(settings(bits));
+        const uint32_t count = 1u << (32 - bits);
+        for (double counts = 1e-4; counts < 20.0; counts *= 1.7) {
+            uint32_t angle = 0;
+            const auto step = uint32_t(counts * count);
+            for (uint32_t k = 0; k < 2 * RATE_HZ; k++) {
+                angle += step;
+                const int32_t innovation = int32_t(angle / count * count + count / 2 - angle);
+                ASSERT_EQ(detector.step(innovation, step), 0u) << bits << " bits, " << counts << " counts a period";
+            }
+        }
+    }
+}
+
+TEST(MovingLoad, stages_are_released_after_50_ms_one_each_5_ms) {
+    for (const uint32_t rate_hz : {20000u, 40000u, 1000000u}) {
+        Detector detector(settings(ENCODER_BITS, rate_hz));
+        while (detector.step(COUNT) == 0) {
+        }
+        const uint32_t withheld = detector.run(rate_hz, 0);
+        // The trend itself decays within milliseconds.
+        EXPECT_NEAR(withheld * 1e3 / rate_hz, 50.0 + (STAGES - 1) * 5.0, 4.0) << rate_hz;
+    }
+}
+
+TEST(MovingLoad, a_trend_during_the_release_doubles_the_hold_up_to_0_4_or_0_8_s_and_a_quiet_time_ends_that) {
+    Detector detector;
+    double hold_ms = 0.0;
+    for (int repeat = 0; repeat < 8; repeat++) {
+        while (detector.step(COUNT) < STAGES) {
+        }
+        uint32_t periods = 0;
+        while (detector.step(0) == STAGES) {
+            periods++;
+        }
+        const double next_ms = periods * 1e3 / RATE_HZ;
+        if (repeat > 0) {
+            EXPECT_NEAR(next_ms, std::min(2.0 * hold_ms, 800.0), 10.0) << repeat;
+        }
+        hold_ms = next_ms;
+    }
+    EXPECT_NEAR(hold_ms, 800.0, 10.0);
+    detector.run(10 * RATE_HZ, 0);
+    while (detector.step(COUNT) < STAGES) {
+    }
+    EXPECT_NEAR(detector.run(RATE_HZ, 0) * 1e3 / RATE_HZ, 90.0, 6.0);
+}
+
+TEST(MovingLoad, a_trend_that_no_load_causes_blocks_for_a_second) {
+    // 2 pi 100 Hz * 19.1 N m / (J w^3) = 122 urad.
+    const double limit = 2.0 * PI * 100.0 * 19.1 / (0.02 * std::pow(1700.0, 3)) / (2.0 * PI) * REV;
+    Detector below, above;
+    EXPECT_GT(below.run(RATE_HZ, int32_t(0.98 * limit)), RATE_HZ * 9 / 10);
+    uint32_t blocked = 0;
+    for (uint32_t k = 0; k < 3 * RATE_HZ; k++) {
+        blocked += above.step(int32_t(1.02 * limit)) == 0;
+    }
+    EXPECT_GT(blocked, 29 * RATE_HZ / 10);
+    EXPECT_EQ(above.run(RATE_HZ, 0), 0u);
+    EXPECT_GT(above.run(RATE_HZ / 10, COUNT), 0u) << "again after the second";
+}
+
+TEST(MovingLoad, edges_have_a_threshold_of_0_7_urad) {
+    const double urad = REV / (2.0 * PI) * 1e-6;
+    for (const double trend_urad : {0.65, 0.75}) {
+        Detector detector;
+        uint32_t withheld = 0;
+        for (uint32_t k = 0; k < RATE_HZ / 10; k++) {
+            withheld += detector.step(int32_t(trend_urad * urad), FAST, true) > 0;
+        }
+        EXPECT_EQ(withheld > 0, trend_urad > 0.7);
+    }
+}
+
+TEST(MovingLoad, the_largest_innovations_overflow_nothing) {
+    Detector detector;
+    std::mt19937 random(1);
+    for (uint32_t k = 0; k < RATE_HZ; k++) {
+        EXPECT_LE(detector.step(random() % 2 ? (1 << 27) - 1 : -(1 << 27), uint32_t(random()) >> 10), STAGES);
+    }
+}
+
+} // namespace

@@ -1,0 +1,76 @@
+// Whether the mean load of the strokes is constant.
+#include <cmath>
+#include <cstdint>
+#include <functional>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/stroke_mean.h"
+}
+
+#include "support/fixed_point.h"
+
+namespace {
+
+using namespace fixed_point;
+constexpr uint32_t RATE_HZ = 10000;
+constexpr unsigned PHASES = 3, ROTOR_POLES = 4;
+
+// Share of the updates at which the load counted as constant, after the first `from_s`.
+double constant_share(double rpm, const std::function<double(double time_s, double stroke)> &load_Nm, double torque_Nm,
+                      double from_s = 1.0, double duration_s = 2.0) {
+    const stroke_mean_parameters_t parameters = stroke_mean_configure(PHASES, RATE_HZ);
+    stroke_mean_t mean{};
+    unsigned constant = 0, updates = 0;
+    for (uint32_t k = 0; k < uint32_t(duration_s * RATE_HZ); k++) {
+        const double time_s = double(k) / RATE_HZ, electrical_rev = rpm / 60.0 * ROTOR_POLES * time_s;
+        const double stroke = electrical_rev * PHASES;
+        const bool now = stroke_mean_step(&parameters, &mean, angle_from_rev(electrical_rev),
+                                          to_fixed(load_Nm(time_s, stroke), Q24), to_fixed(torque_Nm, Q24));
+        if (time_s >= from_s) {
+            constant += now;
+            updates++;
+        }
+    }
+    return double(constant) / updates;
+}
+
+TEST(StrokeMean, a_load_that_repeats_every_stroke_is_constant) {
+    for (const double rpm : {20.0, 150.0, 600.0}) {
+        const auto load = [](double, double stroke) { return 8.0 + 2.0 * std::sin(2.0 * PI * stroke); };
+        EXPECT_EQ(constant_share(rpm, load, 8.0, 2.0, 4.0), 1.0) << rpm;
+    }
+}
+
+TEST(StrokeMean, a_load_that_moves_more_slowly_than_the_strokes_is_not_constant) {
+    for (const double frequency_hz : {1.0, 7.0, 12.0}) {
+        EXPECT_LT(constant_share(
+                      150.0, [&](double t, double) { return 8.0 + 4.0 * std::sin(2.0 * PI * frequency_hz * t); }, 8.0),
+                  0.2)
+            << frequency_hz;
+    }
+}
+
+TEST(StrokeMean, a_load_step_counts_for_150_ms) {
+    const auto step = [](double t, double) { return t < 1.0 ? 0.0 : 8.0; };
+    // The step is seen at the end of its stroke, 33 ms long at 150 r/min, the next one has another mean once more.
+    const double not_constant_s = 1.0 - constant_share(150.0, step, 8.0, 1.0, 2.0);
+    EXPECT_GT(not_constant_s, 0.14);
+    EXPECT_LT(not_constant_s, 0.20);
+}
+
+TEST(StrokeMean, a_change_below_0_1_Nm_and_a_64th_of_the_torque_is_constant) {
+    const auto load = [](double change_Nm) {
+        return [=](double t, double) { return t < 1.2 ? 8.0 : 8.0 + change_Nm; };
+    };
+    EXPECT_EQ(constant_share(150.0, load(0.21), 8.0), 1.0);
+    EXPECT_LT(constant_share(150.0, load(0.24), 8.0), 1.0);
+}
+
+TEST(StrokeMean, the_largest_loads_and_a_shaft_at_rest_overflow_nothing) {
+    EXPECT_EQ(constant_share(0.0, [](double, double) { return -64.0; }, -64.0, 35.0, 40.0), 1.0);
+    EXPECT_LT(constant_share(3000.0, [](double t, double) { return std::fmod(t, 0.1) < 0.05 ? 64.0 : -64.0; }, 64.0), 1.0);
+}
+
+} // namespace
