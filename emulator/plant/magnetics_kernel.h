@@ -1,5 +1,6 @@
 /* Inner loop of the plant: magnetics_evaluate as inline functions for the integrator, where a call takes as long as the
- * arithmetic. Included only by magnetics.c, integrator.c, and sensors.c for the sine; all others call magnetics.h.
+ * arithmetic. Included only by magnetics.c and integrator.c, and for the sine by sensors.c and rig/load.c; all others
+ * call magnetics.h.
  *
  * Exponential and cosine do not use libm: see exponential.h. */
 #ifndef PLANT_MAGNETICS_KERNEL_H

@@ -2,6 +2,7 @@
 
 #include "rig/bus_events.h"
 #include "rig/control_period.h"
+#include "rig/load.h"
 #include "rig/server.h"
 #include "rig/stimulus.h"
 
@@ -9,6 +10,7 @@
 
 static const scheduler_handler_t handlers[EVENT_COUNT] = {
     [EVENT_BENCH_VARIABLE] = stimulus_event,
+    [EVENT_LOAD] = load_event,
     [EVENT_CAN] = bus_event,
     [EVENT_CURRENT_HOLD] = control_period_hold_event,
     [EVENT_CONTROL] = control_period_start_event,
@@ -30,6 +32,7 @@ void rig_init(rig_t *rig, const rig_config_t *config) {
     rig->truth_period_ns = rig->scheduler.due_ns[EVENT_TRUTH] = TRUTH_PERIOD_DEFAULT_NS;
     rig->interrupt_time_ns = rig->interrupt_end_ns = 0;
     rig->stimuli.count = 0;
+    load_init(rig);
     server_init(rig);
 }
 

@@ -75,6 +75,17 @@ typedef struct {
     uint32_t client;
 } rig_run_t;
 
+typedef struct {
+    double torque_Nm; /* load_torque_Nm as set: where a ramp ends */
+    double ramp_Nm_s; /* 0: steps */
+    double ramp_from_Nm;
+    uint64_t ramp_start_ns;
+    double sine_amplitude_Nm;
+    double sine_frequency_Hz;
+    double sine_start_periods; /* phase at sine_start_ns */
+    uint64_t sine_start_ns;
+} load_t;
+
 /* Large (several MB): static or on the heap. */
 typedef struct {
     plant_t plant;
@@ -90,6 +101,7 @@ typedef struct {
     uint64_t interrupt_time_ns, interrupt_end_ns; /* triggers before the end of the last interrupt are lost */
     uint64_t truth_period_ns;
     stimulus_queue_t stimuli;
+    load_t load;                  /* load.c */
     rig_run_t runs[RIG_RUNS_MAX]; /* server.c, by time, equal times in the order of arrival */
     unsigned run_count;
     uint64_t stop_checked_ns;

@@ -4,6 +4,7 @@
 
 #include "bench_variables.h"
 #include "rig/control_period.h"
+#include "rig/load.h"
 #include "rig_codec.h"
 
 #define NS_PER_US UINT64_C(1000)
@@ -20,11 +21,6 @@ typedef struct {
     { .gain = offsetof(plant_gains_t, field) + 1 }
 #define MEMBER(field)                                                                                                  \
     { .member = offsetof(rig_t, field) + 1 }
-
-static void set_load_torque(rig_t *rig, double torque_Nm) {
-    plant_advance(&rig->plant, rig->board.time_ns);
-    rig->plant.load_torque_Nm = torque_Nm;
-}
 
 static void set_supply_voltage(rig_t *rig, double voltage_V) {
     plant_advance(&rig->plant, rig->board.time_ns);
@@ -52,7 +48,7 @@ static void set_truth_period(rig_t *rig, double period_us) {
 }
 
 static const target_t targets[BENCH_VARIABLE_COUNT] = {
-    [BENCH_VARIABLE_LOAD_TORQUE_NM] = {.set = set_load_torque},
+    [BENCH_VARIABLE_LOAD_TORQUE_NM] = {.set = load_set_torque},
     [BENCH_VARIABLE_SUPPLY_VOLTAGE_V] = {.set = set_supply_voltage},
     [BENCH_VARIABLE_ENCODER_FAULT] = {.set = set_encoder_fault},
     [BENCH_VARIABLE_INTERRUPT_TIME_US] = {.set = set_interrupt_time},
@@ -69,6 +65,9 @@ static const target_t targets[BENCH_VARIABLE_COUNT] = {
     [BENCH_VARIABLE_FRICTION_GAIN] = GAIN(friction),
     [BENCH_VARIABLE_ENCODER_OFFSET_DEG] = MEMBER(sensors.encoder_offset_deg),
     [BENCH_VARIABLE_MINIMUM_PULSE_NS] = MEMBER(plant.minimum_pulse_ns),
+    [BENCH_VARIABLE_LOAD_RAMP_NM_S] = {.set = load_set_ramp},
+    [BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_NM] = {.set = load_set_sine_amplitude},
+    [BENCH_VARIABLE_LOAD_SINE_FREQUENCY_HZ] = {.set = load_set_sine_frequency},
 };
 
 static void apply(rig_t *rig, const stimulus_t *stimulus) {

@@ -1,0 +1,28 @@
+/* The load on the shaft: load_torque_Nm, which steps or ramps, plus a sine.
+ *
+ * A load that moves is a staircase: EVENT_LOAD sets the torque each LOAD_STEP_NS of virtual time to its exact value at
+ * that instant, where it stays until the next event. On average it is half a step late. Without a sine or a ramp there
+ * are no events, and the plant is advanced as if this file did not exist.
+ */
+#ifndef RIG_LOAD_H
+#define RIG_LOAD_H
+
+#include <stdint.h>
+
+#include "rig/rig.h"
+
+#define LOAD_STEP_NS UINT64_C(20000)
+
+/* No load; a change of load_torque_Nm steps; amplitude 0. */
+void load_init(rig_t *rig);
+
+/* The bench variables of these names (rig.dbc), from the present time on. */
+void load_set_torque(rig_t *rig, double torque_Nm);
+void load_set_ramp(rig_t *rig, double rate_Nm_s);
+void load_set_sine_amplitude(rig_t *rig, double amplitude_Nm);
+void load_set_sine_frequency(rig_t *rig, double frequency_Hz);
+
+/* Handler of EVENT_LOAD; context is the rig. */
+void load_event(void *context, uint64_t now_ns);
+
+#endif
