@@ -70,6 +70,23 @@ def test_load_steps_are_equally_spaced_over_one_stroke():
     assert np.diff(steps_s) * 6.0 * 150.0 == pytest.approx(30.0 / 24)
 
 
+def test_moving_loads_are_judged_over_two_periods_after_the_transient():
+    for case in ALL_CASES["moving"]:
+        scenario = case.scenario
+        period_s = 1.0 / scenario.bench["load_sine_frequency_Hz"]
+        window_s = scenario.duration_s - scenario.record.from_s
+        assert window_s == pytest.approx(max(0.15, 2.0 * period_s))
+        assert scenario.record.from_s - scenario.load[0].at_s >= max(0.3, period_s) - 1e-6
+        assert scenario.load[0].at_s >= 0.2 + scenario.speed[0].value_rpm / 5000.0 - 1e-9
+
+
+def test_ramps_have_their_lengths():
+    for case in ALL_CASES["ramps"]:
+        ramp_s = case.scenario.load[0].torque_Nm / case.scenario.bench["load_ramp_Nm_s"]
+        assert case.condition.endswith(f", {ramp_s * 1000:g} ms")
+        assert case.scenario.duration_s == pytest.approx(case.scenario.load[0].at_s + ramp_s + 0.3)
+
+
 def test_random_drives_cover_their_ranges_and_are_reproducible():
     drives = [random_drive(number) for number in range(cases.DRIVES)]
     assert drives[:5] == [random_drive(number) for number in range(5)]
@@ -329,6 +346,18 @@ def test_studies_have_plots_and_quick_targets_are_not_judged(tmp_path):
     assert 5.0 <= values["dip", "step_angle_deg", "gap"]["paper"] < 5.3
     assert 0.0 <= values["robustness", "failed", "count"]["paper"] <= 10.0
     assert 40.0 < values["robustness", "peak_current_A", "worst"]["paper"] < 90.0
+
+
+def test_drive_follows_moving_loads(tmp_path):
+    code, output = compare("moving", "ramps", "--quick", "--out", tmp_path)
+    assert code == 0 and "6 of 6 targets reached" in output
+    content = json.loads((tmp_path / "compare.json").read_text())
+    values = {row["condition"]: row["values"] for row in content["rows"]}
+    for condition, controller, low_rpm, high_rpm in (
+        ("saturating, 150 r/min, 5 Hz", "salient", 0.3, 0.7), ("saturating, 150 r/min, 5 Hz", "paper", 0.6, 0.9),
+        ("saturating, 150 r/min, 20 Hz", "traditional", 9.0, 13.0), ("saturating, 20 ms", "salient", 0.3, 0.8),
+        ("finite_element, 20 ms", "paper", 4.5, 6.5), ("finite_element, 200 ms", "salient", 0.3, 0.6)):
+        assert low_rpm < values[condition][controller] < high_rpm
 
 
 def test_groups_are_listed():

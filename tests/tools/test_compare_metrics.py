@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from salient.experiments import metrics
+from salient.experiments.compare.metrics import moving_metrics
+from salient.experiments.scenario import Scenario
 from salient.machine.file import load_machine, machine_path
 
 STEP_S = 2e-6
@@ -73,6 +75,12 @@ def test_samples_before_the_load_step_do_not_count():
     assert result["speed_dip_rpm"] == pytest.approx(3.0)
     assert result["recovery_time_s"] == pytest.approx(0.004, abs=1e-9)
     assert result["speed_after_rpm"] == pytest.approx(150.5)
+
+
+def test_speed_under_a_periodic_load_is_judged_by_its_range():
+    rows = steady(seconds=0.1)
+    rows["speed_rpm"][[1000, 2000]] = 149.0, 150.5
+    assert moving_metrics(Scenario(name="moving", duration_s=0.4), rows) == {"speed_swing_rpm": 1.5}
 
 
 @pytest.mark.parametrize(("machine", "expected_deg"), [("saturating", 30.0), ("finite_element", 15.0)])

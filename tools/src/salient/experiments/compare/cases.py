@@ -7,7 +7,7 @@ and, where a metric is a statistic, by sample. Identical runs are executed once 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,6 +40,13 @@ RIPPLE_FROM_S = 0.3
 LONG_S = 1.0
 LATE_S = 3.0
 """Adaptation has converged by then: 90 strokes at 150 r/min."""
+
+MOVING_MACHINES = ("saturating", "finite_element")
+SINE_NM = 4.0
+SINES_HZ = (1.0, 5.0, 20.0, 50.0, 100.0)
+SINE_WINDOW_S = 0.15
+"""Two periods of the load where they are longer."""
+RAMPS_MS = (1, 5, 20, 50, 100, 200, 500)
 
 IMPERFECTIONS: dict[str, dict[str, float]] = {
     "20 mA of noise": {"current_noise_A": 0.02},
@@ -160,6 +167,38 @@ def _dip(quick: bool) -> Iterator[Case]:
                            replace(scenario, controller="salient", parameters=RESERVE), sample)
 
 
+def _moving(quick: bool) -> Iterator[Case]:
+    conditions: list[tuple[float, float, Sequence[str]]] = [
+        (RIPPLE_RPM, frequency_Hz, CONTROLLERS) for frequency_Hz in ((5.0, 20.0) if quick else SINES_HZ)]
+    if not quick:
+        conditions += [(speed_rpm, frequency_Hz, ("salient",)) for speed_rpm in (30.0, 600.0, 1500.0)
+                       for frequency_Hz in (1.0, 20.0)]
+    for machine in MOVING_MACHINES[:1] if quick else MOVING_MACHINES:
+        for speed_rpm, frequency_Hz, controllers in conditions:
+            scenario = _sine_scenario(speed_rpm, frequency_Hz, machine=machine)
+            yield from _by_controller("moving", f"{machine}, {speed_rpm:g} r/min, {frequency_Hz:g} Hz", "moving",
+                                      scenario, controllers=controllers)
+
+
+def _sine_scenario(speed_rpm: float, frequency_Hz: float, **fields: Any) -> Scenario:
+    """A load of 8 N m after the acceleration, with a sine from time 0; recorded at the end, in the steady state."""
+    loaded_s = 0.2 + 0.6 * speed_rpm / 3000.0
+    from_s = round(loaded_s + max(0.3, 1.0 / frequency_Hz), 6)
+    return _scenario(duration_s=from_s + max(SINE_WINDOW_S, 2.0 / frequency_Hz), speed=(SpeedStep(0.0, speed_rpm),),
+                     load=(LoadStep(loaded_s, LOAD_NM),), record=Record(10.0, from_s),
+                     bench={"load_sine_amplitude_Nm": SINE_NM, "load_sine_frequency_Hz": frequency_Hz}, **fields)
+
+
+def _ramps(quick: bool) -> Iterator[Case]:
+    for machine in MOVING_MACHINES:
+        for ramp_ms in (20, 200) if quick else RAMPS_MS:
+            ramp_s = ramp_ms / 1000.0
+            scenario = _scenario(machine=machine, duration_s=STEP_AT_S + ramp_s + 0.3,
+                                 speed=(SpeedStep(0.0, RIPPLE_RPM),), load=(LoadStep(STEP_AT_S, LOAD_NM),),
+                                 record=Record(10.0, STEP_AT_S), bench={"load_ramp_Nm_s": LOAD_NM / ramp_s})
+            yield from _by_controller("ramps", f"{machine}, {ramp_ms} ms", "load_step", scenario)
+
+
 def _paper_conditions(quick: bool) -> Iterator[Case]:
     for machine in ("saturating",) if quick else MAGNETICS:
         step = replace(step_scenario(machine=machine, **PAPER_CONDITIONS), duration_s=0.5)
@@ -230,6 +269,8 @@ GROUPS: dict[str, Group] = {
     "dip": Group("load step of 8 N m at 150 r/min, over the rotor's angle, 40 kHz", _dip,
                  (("speed_dip_rpm", "median"), ("speed_dip_rpm", "worst"), ("recovery_time_s", "median"),
                   ("speed_after_rpm", "worst"), ("copper_W", "median"), ("step_angle_deg", "gap"))),
+    "moving": Group("load of 8 N m and a sine of 4 N m, 40 kHz", _moving, (("speed_swing_rpm", ""),)),
+    "ramps": Group("load ramp to 8 N m at 150 r/min, 40 kHz", _ramps, (("speed_dip_rpm", ""),)),
     "paper_conditions": Group("the paper's conditions: 1 MHz, no delay, exact sensing, load torque known",
                               _paper_conditions,
                               (("settling_time_s", ""), ("overshoot_percent", ""), ("speed_dip_rpm", ""),
@@ -277,8 +318,9 @@ def _steady(group: str, condition: str, speed_rpm: float, from_s: float, quick: 
         yield replace(case, scenario=replace(case.scenario, parameters=parameters), traced=traced)
 
 
-def _by_controller(group: str, condition: str, extractor: str, scenario: Scenario, sample: str = "") -> Iterator[Case]:
-    for controller in CONTROLLERS:
+def _by_controller(group: str, condition: str, extractor: str, scenario: Scenario, sample: str = "",
+                   controllers: Sequence[str] = CONTROLLERS) -> Iterator[Case]:
+    for controller in controllers:
         yield Case(group, condition, controller, extractor, replace(scenario, controller=controller), sample)
 
 

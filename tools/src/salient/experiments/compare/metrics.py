@@ -57,6 +57,7 @@ METRICS = {
     "speed_dip_rpm": Metric("speed drop", "r/min", 2, 0.02),
     "recovery_time_s": Metric("recovery time to 0.5 %", "ms", 2, 0.1, 1e3),
     "speed_after_rpm": Metric("maximum speed after the step", "r/min", 2, 0.05, reference=150.0),
+    "speed_swing_rpm": Metric("peak-to-peak speed", "r/min", 2, 0.02),
     "copper_W": Metric("copper loss before the step", "W", 2, 0.05),
     "torque_mean_Nm": Metric("mean torque", "N m", 3, 0.01),
     "peak_current_A": Metric("peak phase current", "A", 1, 0.5),
@@ -110,6 +111,11 @@ def load_step_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
     return {**values, "step_angle_deg": float(recording["rotor_angle_deg"][at_step]) % stroke_deg}
 
 
+def moving_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
+    """Peak-to-peak speed over the whole recording, which is the steady state under a periodic load."""
+    return {"speed_swing_rpm": float(np.ptp(recording["speed_rpm"]))}
+
+
 def step_and_ripple_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
     """A load step, and ripple and mean torque over the paper's window."""
     torque = metrics.torque_metrics(recording["time_s"], recording["torque_Nm"], metrics.RIPPLE_WINDOW_S)
@@ -139,6 +145,7 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray], Metrics]] = {
     "late_ripple": late_ripple_metrics,
     "start": start_metrics,
     "load_step": load_step_metrics,
+    "moving": moving_metrics,
     "step_and_ripple": step_and_ripple_metrics,
     "robustness": robustness_metrics,
 }
