@@ -15,9 +15,9 @@ static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t
     /* The sum is that of Q7.24 numbers: in units of 2^8 it fits in 32 bits for 2^8 updates, of 2^16 for 2^16. */
     const unsigned shift = mean->updates < 256 ? 8 : 16;
     const int32_t mean_q24 = (int32_t)(mean->sum_q24 >> shift) / (int32_t)mean->updates * (1 << shift);
-    const int32_t change_q24 = fixed_abs(fixed_subtract(mean_q24, mean->mean_q24));
-    mean->mean_q24 = mean_q24;
+    const int32_t change_q24 = fixed_abs(fixed_subtract(mean_q24, mean->constant_q24));
     if (change_q24 > TOLERANCE_Q24 + fixed_abs(torque_q24) / 64) {
+        mean->constant_q24 = mean_q24;
         const uint32_t strokes = SETTLE_STROKES * mean->updates;
         mean->remaining = strokes > parameters->settle_updates ? strokes : parameters->settle_updates;
     }

@@ -52,6 +52,11 @@ TEST(StrokeMean, a_load_that_moves_more_slowly_than_the_strokes_is_not_constant)
     }
 }
 
+TEST(StrokeMean, a_load_that_moves_by_little_from_stroke_to_stroke_is_not_constant) {
+    const auto sine = [](double t, double) { return 8.0 + 4.0 * std::sin(2.0 * PI * t); };
+    EXPECT_LT(constant_share(1500.0, sine, 8.0, 1.0, 3.0), 0.2);
+}
+
 TEST(StrokeMean, a_load_step_counts_for_150_ms) {
     const auto step = [](double t, double) { return t < 1.0 ? 0.0 : 8.0; };
     // The step is seen at the end of its stroke, 33 ms long at 150 r/min, the next one has another mean once more.
