@@ -65,7 +65,9 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const bool steady = sample->steady && fixed_abs(sample->torque_q24) > TORQUE_MIN_Q24;
     const int32_t disturbance_q24 = sample->disturbance_q24;
     const bool settled = misalignment->steady_updates >= parameters->settle_updates;
-    misalignment->steady_updates = !steady ? 0 : settled ? misalignment->steady_updates : misalignment->steady_updates + 1;
+    misalignment->steady_updates = !steady   ? 0
+                                   : settled ? misalignment->steady_updates
+                                             : misalignment->steady_updates + 1;
     const bool learning = steady && settled;
     /* Means over the time since the state became steady, at most 100 ms: before, the load was another. */
     const int32_t phases = (int32_t)tables->phases;
@@ -110,10 +112,10 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
 }
 
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                              unsigned phases, int32_t disturbance_q24, int32_t torque_q24) {
-    /* A quarter of the sum over the phases, which fits. */
+                              int32_t disturbance_q24, int32_t torque_q24) {
+    /* A quarter of the sum over the phases, which fits; those that the machine has not have slope 0. */
     int32_t quarter_q24 = 0;
-    for (unsigned i = 0; i < phases; i++) {
+    for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
         const misalignment_phase_t *phase = &misalignment->phase[i];
         quarter_q24 += fixed_subtract(phase->slope_lag2_q24, phase->slope_mean_q24) / 4;
     }
@@ -130,7 +132,7 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     /* y 4 q / (16 q^2), q the quarter. */
     const int32_t step_q10 = fixed_multiply(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22);
     const int64_t step_q40 = (int64_t)step_q10 * parameters->common_rate_q30;
-    for (unsigned i = 0; i < phases; i++) {
+    for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
         misalignment_phase_t *phase = &misalignment->phase[i];
         phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + step_q40);
     }

@@ -62,7 +62,7 @@ typedef struct {
     int32_t power_q24;            /* mean of sum s_j^2, Q7.24 */
     uint32_t steady_updates;
     int64_t common_power_q40; /* mean of (sum s_j / 4)^2, (N m per 0.02 rad)^2, Q40 */
-    unsigned phase_index; /* phase to update, in turn */
+    unsigned phase_index;     /* phase to update, in turn */
 } misalignment_t;
 
 typedef struct {
@@ -100,6 +100,6 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
 /* One sample: updates the offset that the phases have in common, from the slopes of the last misalignment_step of each,
  * while those learn. Disturbance and torque reference in N m, Q7.24; rounding as there. */
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                              unsigned phases, int32_t disturbance_q24, int32_t torque_q24);
+                              int32_t disturbance_q24, int32_t torque_q24);
 
 #endif

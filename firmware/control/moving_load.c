@@ -18,7 +18,8 @@
 
 /* T 2 pi 100 / (J w^3). */
 static uint32_t implausible_q4(const moving_load_settings_t *settings) {
-    const int64_t acceleration = fixed_divide((int64_t)settings->torque_max_q24 << 6, settings->inertia_q30); /* 19 bits */
+    const int64_t acceleration =
+        fixed_divide((int64_t)settings->torque_max_q24 << 6, settings->inertia_q30); /* 19 bits */
     const int64_t bandwidth = settings->bandwidth_rad_s;
     const int64_t trend_q4 = fixed_divide(fixed_divide(acceleration * SLOPE_1_S_Q36, bandwidth * bandwidth), bandwidth);
     return (uint32_t)fixed_saturate(trend_q4);
@@ -52,7 +53,8 @@ static uint32_t rounding_q4(const moving_load_parameters_t *parameters, uint32_t
 /* Hold after a trend; a trend that interrupts the release doubles it. */
 static uint32_t hold_ticks(const moving_load_parameters_t *parameters, const moving_load_t *moving) {
     const uint32_t ticks = moving->withheld == parameters->stages ? moving->hold_ticks : 2 * moving->hold_ticks;
-    return (uint32_t)fixed_clamp((int32_t)ticks, (int32_t)parameters->hold_ticks_min, (int32_t)parameters->hold_ticks_max);
+    return (uint32_t)fixed_clamp((int32_t)ticks, (int32_t)parameters->hold_ticks_min,
+                                 (int32_t)parameters->hold_ticks_max);
 }
 
 uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,

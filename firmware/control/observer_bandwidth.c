@@ -106,8 +106,7 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_band
     configure_stages(settings, &parameters, steady_rad_s);
     /* Counts finer than the resolution of an edge's time are as good as edges. */
     const unsigned first = threshold_count <= THRESHOLD_EDGE ? 0 : TRIGGER_STAGE_COARSE;
-    parameters.trigger_stage_count =
-        first_stage(&parameters, first, settings->transient_rad_s, square, TRIGGER_SHARE);
+    parameters.trigger_stage_count = first_stage(&parameters, first, settings->transient_rad_s, square, TRIGGER_SHARE);
     parameters.moving_stage =
         first_stage(&parameters, parameters.trigger_stage_count, settings->moving_rad_s, square, MOVING_SHARE);
     parameters.steady_stage_edge = LAST_STAGE - (steady_rad_s < settings->steady_rad_s);

@@ -14,10 +14,10 @@
  * of the last edge is known. The latter has less noise, so its transient bandwidth is wider. Edges count as such only
  * while they are frequent, one each 100 us or more.
  *
- * No bandwidth is wider than the encoder allows. An innovation of one count 2 pi / 2^bits moves the load estimate within
- * 1 / w0 by about J w0^2 2 pi / 2^bits, which is limited to 3/5 of the largest torque after a trigger, to 1/6 while the
- * load moves (moving_load.h), and to 1/20 in the steady state. Values found by trial: with twice as much, a load step at
- * 10 r/min is answered by a torque in the wrong direction.
+ * No bandwidth is wider than the encoder allows. An innovation of one count 2 pi / 2^bits moves the load estimate
+ * within 1 / w0 by about J w0^2 2 pi / 2^bits, which is limited to 3/5 of the largest torque after a trigger, to 1/6
+ * while the load moves (moving_load.h), and to 1/20 in the steady state. Values found by trial: with twice as much, a
+ * load step at 10 r/min is answered by a torque in the wrong direction.
  *
  * With a wrong model (three times the inertia, tables half a degree off) each transient would trigger the next: a limit
  * cycle. Two measures suppress it. Each trigger lengthens the retrigger hold-off, the minimum time to the next trigger,
@@ -67,12 +67,12 @@ typedef struct {
     observer_trigger_t trigger; /* since the caller last set it to OBSERVER_TRIGGER_NONE */
 } observer_bandwidth_t;
 
-/* Limits of the coming sample's trigger, besides those of the parameters; all zero: only those of the parameters. */
+/* Limits of the coming sample, besides those of the parameters. All zero at the start. */
 typedef struct {
-    uint32_t threshold_mean;          /* four times the mean innovation, 2^-32 rev */
-    uint32_t holdoff_ticks;           /* minimum time to the next trigger, periods */
-    uint8_t withheld_stages;          /* last stages that the decay does not reach */
-    uint8_t trigger_stage_edge;       /* first stage after a trigger by an edge */
+    uint32_t threshold_mean;    /* four times the mean innovation, 2^-32 rev */
+    uint32_t holdoff_ticks;     /* minimum time to the next trigger, periods */
+    uint8_t withheld_stages;    /* last stages that the decay does not reach */
+    uint8_t trigger_stage_edge; /* first stage after a trigger by an edge */
 } observer_bandwidth_limits_t;
 
 /* Statistics from which the limits follow. */

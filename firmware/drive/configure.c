@@ -204,8 +204,9 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
     };
 }
 
-/* Far from the sliding surface the reaching law asks for the torque J k / epsilon. On a light machine that would be less
- * than the torque limit: epsilon is then reduced until it is 5/4 of it. Near the surface the law is that of k alone. */
+/* Far from the sliding surface the reaching law asks for the torque J k / epsilon. On a light machine that would be
+ * less than the torque limit: epsilon is then reduced until it is 5/4 of it. Near the surface the law is that of k
+ * alone. */
 static int32_t epsilon_q31(const int32_t *values, int32_t gain_q24) {
     const int64_t set_q31 = (int64_t)values[PARAMETER_SMC_EPSILON] << 15;
     const int64_t limit_q24 = (int64_t)values[PARAMETER_TORQUE_MAX_NM] * 5 / 4 + 1;
@@ -286,16 +287,15 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             },
         .trim = trim_from(values),
         .predictive = predictive_from(values, tables->phases, control_rate_hz),
-        .misalignment =
-            misalignment_configure(&(misalignment_settings_t){
-                .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
-                .control_rate_hz = control_rate_hz,
-                .periods_per_update = DEFERRED_LEARNING_PERIODS,
-                .periods_per_common_update = DEFERRED_SLOW_PERIODS,
-                .inertia_q30 = inertia_q30,
-                .phases = tables->phases,
-                .rotor_poles = tables->rotor_poles,
-            }),
+        .misalignment = misalignment_configure(&(misalignment_settings_t){
+            .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
+            .control_rate_hz = control_rate_hz,
+            .periods_per_update = DEFERRED_LEARNING_PERIODS,
+            .periods_per_common_update = DEFERRED_SLOW_PERIODS,
+            .inertia_q30 = inertia_q30,
+            .phases = tables->phases,
+            .rotor_poles = tables->rotor_poles,
+        }),
         .stroke_mean = stroke_mean_configure(tables->phases, control_rate_hz / DEFERRED_SLOW_PERIODS),
     };
     control.moving_load = moving_load_configure(&(moving_load_settings_t){

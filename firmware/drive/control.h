@@ -117,11 +117,11 @@ typedef struct {
     bool run;                    /* in the last input */
     int32_t speed_reference_q22; /* after the ramp, rad/s, Q9.22 */
     speed_pi_t speed_pi;
-    unsigned turn;               /* of the last step, below DEFERRED_TURNS */
-    int32_t advance_q30;         /* of the conduction windows, Q1.30, 0..1 */
+    unsigned turn;       /* of the last step, below DEFERRED_TURNS */
+    int32_t advance_q30; /* of the conduction windows, Q1.30, 0..1 */
     torque_sharing_window_t window;
     stroke_mean_t stroke_mean;
-    bool load_constant; /* in the last stroke_mean_step */
+    bool load_constant;          /* in the last stroke_mean_step */
     misalignment_t misalignment; /* a property of the machine: survives the end of a run */
 } deferred_t;
 

@@ -150,8 +150,8 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
 
 static void learn_common_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                       const deferred_input_t *input) {
-    misalignment_common_step(&parameters->misalignment, &deferred->misalignment, machine_tables.phases,
-                             disturbance_q24(parameters, input), input->torque_reference_q24);
+    misalignment_common_step(&parameters->misalignment, &deferred->misalignment, disturbance_q24(parameters, input),
+                             input->torque_reference_q24);
 }
 
 /* What is not urgent, in four turns: no step takes the time of all. The learning of the phases has two of them, because

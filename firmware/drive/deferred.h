@@ -20,8 +20,8 @@
 
 #include "drive/control.h"
 
-/* Periods per update of what takes turns: learning of the phases; learning of their common angle, windows, torque offset
- * and mean load. */
+/* Periods per update of what takes turns: learning of the phases; learning of their common angle, windows, torque
+ * offset and mean load. */
 #define DEFERRED_LEARNING_PERIODS 2
 #define DEFERRED_SLOW_PERIODS 4
 

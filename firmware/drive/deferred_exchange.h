@@ -36,8 +36,8 @@ typedef struct {
     bool angle_from_edge;
     unsigned bandwidth_stage;
     observer_trigger_t bandwidth_trigger; /* since the input of the previous deferred step */
-    bool run;                    /* state RUN */
-    int32_t commanded_speed_q22; /* rad/s, Q9.22; 0 without a run request */
+    bool run;                             /* state RUN */
+    int32_t commanded_speed_q22;          /* rad/s, Q9.22; 0 without a run request */
     /* With predictive torque control only. */
     int32_t load_torque_q24;      /* observer, N m, Q7.24 */
     int32_t speed_correction_q22; /* observer, rad/s, Q9.22 */

@@ -7,7 +7,7 @@
 /* 5 ns / (2 pi): rotation per tick, 2^-32 rev per rad/s Q9.22, in Q51. */
 #define ANGLE_PER_TICK_Q51 1834931565
 
-/* The count is the better measurement once an edge is older than this: two periods at 20 kHz. */
+/* An older edge only limits the angle to its count: two periods at 20 kHz. */
 #define EDGE_AGE_MAX_TICKS 20000
 
 /* Product of counts and scale, rounded to nearest, halves upwards; below 2^16. */
@@ -15,8 +15,8 @@ static int32_t scale_counts(uint16_t counts, int32_t scale_q18) {
     return fixed_multiply_high(counts << 14, scale_q18);
 }
 
-/* The angle of the count that is nearest to the predicted one. The last edge was exact, since then the count is only a
- * limit: its middle would pull a coarse encoder's estimate off what the edges have told. */
+/* The angle of the count that is nearest to the predicted one. The last edge was exact, and since then the count is
+ * only a limit: its middle would draw the estimate away from what the edges have told. */
 static uint32_t nearest_in_count(const control_parameters_t *parameters, const load_observer_t *observer,
                                  uint32_t count_start) {
     const int32_t predicted = (int32_t)((uint32_t)(observer->angle_q64 >> 32) - count_start);

@@ -7,8 +7,8 @@
 /* A stop ends below this speed: 0.5 rad/s, 5 r/min. */
 #define STANDSTILL_Q22 (1 << 21)
 
-NOINLINE static void complete_record(fault_record_t *record, const control_state_t *state, const control_sample_t *sample,
-                                     const control_measurement_t *measured) {
+NOINLINE static void complete_record(fault_record_t *record, const control_state_t *state,
+                                     const control_sample_t *sample, const control_measurement_t *measured) {
     record->time_us = sample->time_us;
     /* The estimate without this sample: the encoder may be the cause of the fault. */
     record->speed_q22 = measured->predicted_speed_q22;

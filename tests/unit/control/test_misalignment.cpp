@@ -90,7 +90,7 @@ class Machine {
         model.step(sample.disturbance_q24 / Q24, BANDWIDTH_RAD_S, steady, torque_Nm,
                    [&](unsigned phase) { return slope[phase]; });
         if (common && ++updates % (DEFERRED_SLOW_PERIODS / DEFERRED_LEARNING_PERIODS) == 0) {
-            misalignment_common_step(&parameters, &state, PHASES, sample.disturbance_q24, sample.torque_q24);
+            misalignment_common_step(&parameters, &state, sample.disturbance_q24, sample.torque_q24);
         }
     }
 
@@ -218,7 +218,7 @@ TEST(Misalignment, is_limited_to_four_degrees_and_overflows_nothing) {
                 .steady = true,
             };
             misalignment_step(&p, &state, &machine_tables, &sample);
-            misalignment_common_step(&p, &state, PHASES, sample.disturbance_q24, sample.torque_q24);
+            misalignment_common_step(&p, &state, sample.disturbance_q24, sample.torque_q24);
         }
         for (unsigned phase = 0; phase < PHASES; phase++) {
             const double deg = state.phase[phase].offset / REV / machine_tables.rotor_poles * 360.0;

@@ -74,8 +74,12 @@ TEST(StrokeMean, a_change_below_0_1_Nm_and_a_64th_of_the_torque_is_constant) {
 }
 
 TEST(StrokeMean, the_largest_loads_and_a_shaft_at_rest_overflow_nothing) {
-    EXPECT_EQ(constant_share(0.0, [](double, double) { return -64.0; }, -64.0, 35.0, 40.0), 1.0);
-    EXPECT_LT(constant_share(3000.0, [](double t, double) { return std::fmod(t, 0.1) < 0.05 ? 64.0 : -64.0; }, 64.0), 1.0);
+    EXPECT_EQ(constant_share(
+                  0.0, [](double, double) { return -64.0; }, -64.0, 35.0, 40.0),
+              1.0);
+    EXPECT_LT(constant_share(
+                  3000.0, [](double t, double) { return std::fmod(t, 0.1) < 0.05 ? 64.0 : -64.0; }, 64.0),
+              1.0);
 }
 
 } // namespace

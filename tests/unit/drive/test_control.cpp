@@ -608,8 +608,8 @@ TEST_F(SalientControl, without_edges_the_angle_is_the_middle_of_the_count_and_lo
             sample.encoder.counts = (predicted >> 15) + uint32_t(counts);
             const uint32_t count_start = sample.encoder.counts << 15;
             step_as_sampled();
-            EXPECT_EQ(diagnostics.angle,
-                      counts == 0 ? predicted : count_start + (counts < 0 ? (1u << 15) - 1 : 0)) << age_ticks;
+            EXPECT_EQ(diagnostics.angle, counts == 0 ? predicted : count_start + (counts < 0 ? (1u << 15) - 1 : 0))
+                << age_ticks;
         }
     }
     sample.encoder.edge_age_ticks = 100;

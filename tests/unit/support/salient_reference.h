@@ -140,15 +140,17 @@ class salient_t {
         const double reference_rad_s = command.speed_reference_q22 / Q22;
         const double slip_rad_s = reference_rad_s - observer.speed;
         // The reaching torque of the previous period, of the deferred step; the feed-forward of this one.
-        const double reference_Nm = std::clamp(reaching_Nm + offset_Nm + observer.load_torque +
-                                                   friction_Nm_s * observer.speed, -torque_max_Nm, torque_max_Nm);
+        const double reference_Nm =
+            std::clamp(reaching_Nm + offset_Nm + observer.load_torque + friction_Nm_s * observer.speed, -torque_max_Nm,
+                       torque_max_Nm);
         reaching_Nm = gain_Nm_s * reaching_rad_s2(1.0, epsilon, delta_s, slip_rad_s);
         if (predictive.torque_shortfall == 0.0) {
             offset_Nm += 20.0 / rate_hz * (reference_Nm - offset_Nm - torque_Nm);
             offset_Nm = std::clamp(offset_Nm, -offset_limit_Nm, offset_limit_Nm);
         }
 
-        // The common angle and the mean load of the strokes are left out: these runs are aligned, their load is constant.
+        // The common angle and the mean load of the strokes are left out: these runs are aligned, their load is
+        // constant.
         const bool steady = bandwidth.steady() && std::fabs(slip_rad_s) < std::fabs(observer.speed) / 64.0 &&
                             predictive.torque_shortfall == 0.0;
         const double disturbance_Nm = observer.load_torque - observer.speed_correction * inertia_kg_m2 * rate_hz;
