@@ -4,8 +4,8 @@
 #include "fixed/fixed.h"
 
 #define TIME_CONSTANT_US 1600
-#define HOLD_MS 50
-#define HOLDS_MAX 16
+#define HOLD_MS 25
+#define HOLDS_MAX 32
 #define RELEASE_MS 5
 #define BLOCKED_MS 1000
 

@@ -15,7 +15,7 @@
  * wrong that the wide bandwidth itself makes the speed swing. Nothing is withheld then for a second.
  *
  * Rounding to counts leaves up to 1/40 of a count of it as noise. A trend of 1/8 count withholds the last stages of the
- * bandwidth's decay, so that the observer follows the load. They are released 50 ms after the last such trend, one each
+ * bandwidth's decay, so that the observer follows the load. They are released 25 ms after the last such trend, one each
  * 5 ms; when a trend interrupts the release, after twice the time before, up to 0.8 s. The values are found by trial: a
  * threshold of 1/11 count takes the ripple of an encoder that is 0.05 degrees off for a moving load, one of 1/5 makes
  * the speed drop of a load ramp of 200 ms that of the paper's controller twice over. */
@@ -34,7 +34,7 @@ typedef struct {
     uint32_t threshold_count_q4; /* of the trend, 2^-32 rev, Q28.4, for angles from counts */
     uint32_t implausible_q4;     /* trend that no load causes, 2^-32 rev, Q28.4 */
     uint32_t blocked_ticks;      /* after that, 1 s */
-    uint32_t hold_ticks_min;     /* 50 ms, periods */
+    uint32_t hold_ticks_min;     /* 25 ms, periods */
     uint32_t hold_ticks_max;     /* 0.8 s */
     uint32_t release_ticks;      /* 5 ms */
     uint32_t stages;             /* to withhold; 0: no detection */

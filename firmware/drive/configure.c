@@ -88,6 +88,7 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
                                                uint32_t control_rate_hz) {
     const int32_t over_speed_q22 = fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM]));
     const uint32_t count = 1u << encoder_shift;
+    const uint32_t quarter_deg = (uint32_t)(((uint64_t)1 << 32) / 1440u);
     /* One period at 1.5 times the speed limit, and the quantisation of two readings. */
     const uint64_t step = ((uint64_t)over_speed_q22 * (uint64_t)angle_step_q32 >> 32) * 3 / 2;
     return (protection_parameters_t){
@@ -96,9 +97,9 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
         .dc_link_under_voltage_q6 = values[PARAMETER_BUS_UNDER_VOLTAGE_V],
         .over_speed_q22 = over_speed_q22,
         .angle_step_max = fixed_saturate((int64_t)step + 2 * (int64_t)count),
-        /* A quarter of a degree, and twelve counts of a coarse encoder: a load step may stop the rotor within a count,
-         * and the observer needs several to notice. */
-        .undetected_travel_max = (int32_t)(((uint64_t)1 << 32) / 1440u + 12u * count),
+        /* A quarter of a degree and four counts. Of a coarse encoder twelve counts: a load step may stop the rotor
+         * within a count, and the observer needs several to notice. */
+        .undetected_travel_max = (int32_t)(quarter_deg > 8u * count ? quarter_deg + 4u * count : 12u * count),
         .angle_step_q32 = angle_step_q32,
         .command_timeout_us = (uint32_t)values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u,
         .deceleration_max_q22 = fixed_saturate(fixed_divide(
