@@ -18,6 +18,8 @@
 #define COMMON_POWER_SHIFT 9
 /* Its rate is an eighth: the sum is smaller than its parts, and the noise is not. */
 #define COMMON_SLOWER 8
+/* 0.04 rad: a load step teaches nothing noticeable before the end of its stroke, where learning stops. */
+#define COMMON_STEP_MAX_Q10 (2 << 10)
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings) {
     const int64_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
@@ -130,7 +132,8 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     const int32_t floor_q22 = (torque_q10 * torque_q10 >> 20) + 1;
     const int32_t error_q24 = fixed_subtract(disturbance_q24, misalignment->disturbance_mean_q24);
     /* y 4 q / (16 q^2), q the quarter. */
-    const int32_t step_q10 = fixed_multiply(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22);
+    const int32_t unlimited_q10 = fixed_multiply(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22);
+    const int32_t step_q10 = fixed_clamp(unlimited_q10, -COMMON_STEP_MAX_Q10, COMMON_STEP_MAX_Q10);
     const int64_t step_q40 = (int64_t)step_q10 * parameters->common_rate_q30;
     for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
         misalignment_phase_t *phase = &misalignment->phase[i];

@@ -190,6 +190,21 @@ TEST(Misalignment, at_600_rpm_the_common_angle_is_learned_in_3_s_and_the_phases_
     }
 }
 
+TEST(Misalignment, a_load_step_at_3000_rpm_teaches_less_than_0_02_degrees_within_a_stroke) {
+    Machine machine(8, {0.0, 0.0, 0.0});
+    machine.common = true;
+    machine.rpm = 3000.0;
+    for (int k = 0; k < int(RATE_HZ); k++) {
+        machine.step(8.0, 8.0, true);
+    }
+    for (int k = 0; k < int(0.0017 * RATE_HZ); k++) {
+        machine.step(8.0, 0.0, true);
+    }
+    for (unsigned phase = 0; phase < PHASES; phase++) {
+        EXPECT_NEAR(machine.offset_deg(phase), 0.0, 0.02);
+    }
+}
+
 TEST(Misalignment, the_common_angle_is_not_learned_while_unsteady) {
     Machine machine(12, {0.3, 0.3, 0.3});
     machine.common = true;
