@@ -14,12 +14,13 @@
 /* 0.05 * 0.02^2 of T^2, Q20: keeps the denominator above the noise of s_j. */
 #define POWER_FLOOR_Q20 21
 #define OFFSET_LIMIT_Q40 (((int64_t)7 << 40) / 2)
+/* Error that a step corrects, 0.02 rad: a load step teaches little before the end of its stroke, where learning stops.
+ */
+#define STEP_MAX_Q10 (1 << 10)
 /* The mean of the square of the sum: 25 ms at 40 kHz. */
 #define COMMON_POWER_SHIFT 9
 /* Its rate is an eighth: the sum is smaller than its parts, and the noise is not. */
 #define COMMON_SLOWER 8
-/* 0.04 rad: a load step teaches nothing noticeable before the end of its stroke, where learning stops. */
-#define COMMON_STEP_MAX_Q10 (2 << 10)
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings) {
     const int64_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
@@ -54,6 +55,10 @@ static int32_t product_q24(int32_t a_q24, int32_t b_q24) {
 int32_t misalignment_disturbance_q24(const misalignment_parameters_t *parameters, int32_t load_torque_q24,
                                      int32_t speed_correction_q22) {
     return fixed_subtract(load_torque_q24, fixed_multiply(speed_correction_q22, parameters->inertia_rate_q8, 6));
+}
+
+static int32_t limited_step_q10(int32_t step_q10) {
+    return fixed_clamp(step_q10, -STEP_MAX_Q10, STEP_MAX_Q10);
 }
 
 static int64_t clamped_offset_q40(int64_t offset_q40) {
@@ -106,7 +111,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const int32_t recent_mean_q24 = 4 * ((int32_t)((misalignment->disturbance_sum_q24 - sum_before_q24) >> 2) / phases);
     const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
     /* Q24 * Q24 to Q30, divided by Q20: Q10. */
-    const int32_t step_q10 = fixed_multiply(error_q24, alternating_q24, 18) / ((power_q24 >> 4) + 1);
+    const int32_t step_q10 = limited_step_q10(fixed_multiply(error_q24, alternating_q24, 18) / ((power_q24 >> 4) + 1));
     const int64_t offset_q40 = phase->offset_q40 + (int64_t)step_q10 * parameters->rate_q30;
     phase->offset_q40 = clamped_offset_q40(offset_q40);
     /* 0.02 rad is twice the probe angle. */
@@ -132,8 +137,8 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     const int32_t floor_q22 = (torque_q10 * torque_q10 >> 20) + 1;
     const int32_t error_q24 = fixed_subtract(disturbance_q24, misalignment->disturbance_mean_q24);
     /* y 4 q / (16 q^2), q the quarter. */
-    const int32_t unlimited_q10 = fixed_multiply(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22);
-    const int32_t step_q10 = fixed_clamp(unlimited_q10, -COMMON_STEP_MAX_Q10, COMMON_STEP_MAX_Q10);
+    const int32_t step_q10 =
+        limited_step_q10(fixed_multiply(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));
     const int64_t step_q40 = (int64_t)step_q10 * parameters->common_rate_q30;
     for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
         misalignment_phase_t *phase = &misalignment->phase[i];

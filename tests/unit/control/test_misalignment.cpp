@@ -190,8 +190,9 @@ TEST(Misalignment, at_600_rpm_the_common_angle_is_learned_in_3_s_and_the_phases_
     }
 }
 
-TEST(Misalignment, a_load_step_at_3000_rpm_teaches_less_than_0_02_degrees_within_a_stroke) {
+TEST(Misalignment, of_a_load_step_at_3000_rpm_the_common_angle_learns_less_than_0_02_degrees_within_a_stroke) {
     Machine machine(8, {0.0, 0.0, 0.0});
+    machine.parameters.rate_q30 = 0; // the phases learn nothing
     machine.common = true;
     machine.rpm = 3000.0;
     for (int k = 0; k < int(RATE_HZ); k++) {
