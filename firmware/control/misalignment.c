@@ -14,9 +14,9 @@
 /* 0.05 * 0.02^2 of T^2, Q20: keeps the denominator above the noise of s_j. */
 #define POWER_FLOOR_Q20 21
 #define OFFSET_LIMIT_Q40 (((int64_t)7 << 40) / 2)
-/* Error that a step corrects, 0.02 rad: a load step teaches little before the end of its stroke, where learning stops.
+/* Error that a step corrects, 0.08 rad: a load step teaches little before the end of its stroke, where learning stops.
  */
-#define STEP_MAX_Q10 (1 << 10)
+#define STEP_MAX_Q10 (4 << 10)
 /* The mean of the square of the sum: 25 ms at 40 kHz. */
 #define COMMON_POWER_SHIFT 9
 /* Its rate is an eighth: the sum is smaller than its parts, and the noise is not. */
