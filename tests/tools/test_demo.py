@@ -173,10 +173,11 @@ def test_readme_shows_the_metrics_of_the_demo(demo_metrics):
         assert_shown(table[row], values)
 
 
-# Settling times of the paper's controller follow from T_max over inertia, which is small in the finite-element machine.
+# Settling times of the paper's controller follow from T_max over inertia, which is small in the finite-element machine:
+# 62.8 rad/s * 0.00401 kg m^2 / 19.1 N m is 0.0132 s.
 @pytest.mark.parametrize(("machine", "settles_s"), [("linear_cosine", (0.0673, 0.072)),
                                                     ("linear_trapezoid", (0.0673, 0.072)),
-                                                    ("finite_element", (0.015, 0.04))])
+                                                    ("finite_element", (0.0132, 0.017))])
 def test_other_machines_are_within_the_same_bounds(machine, settles_s, tmp_path):
     demo.run(options("--out", tmp_path, "--machine", machine), stream=io.StringIO())
     results = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
