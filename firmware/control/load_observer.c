@@ -86,6 +86,10 @@ load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t iner
     };
 }
 
+int64_t load_observer_acceleration(int32_t torque_q24, int32_t inertia_q30) {
+    return fixed_divide((int64_t)torque_q24 << 6, inertia_q30);
+}
+
 void load_observer_reset(load_observer_t *observer, uint32_t angle) {
     *observer = (load_observer_t){.angle_q64 = (uint64_t)angle << 32};
 }

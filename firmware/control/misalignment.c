@@ -62,9 +62,7 @@ static int32_t limited_step_q10(int32_t step_q10) {
 }
 
 static int64_t clamped_offset_q40(int64_t offset_q40) {
-    return offset_q40 > OFFSET_LIMIT_Q40    ? OFFSET_LIMIT_Q40
-           : offset_q40 < -OFFSET_LIMIT_Q40 ? -OFFSET_LIMIT_Q40
-                                            : offset_q40;
+    return fixed_clamp_64(offset_q40, -OFFSET_LIMIT_Q40, OFFSET_LIMIT_Q40);
 }
 
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
@@ -96,7 +94,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     low_pass_step(&phase->slope_lag2_q24, phase->slope_lag1_q24, filter_q16);
     low_pass_step(&phase->slope_mean_q24, phase->slope_lag2_q24, mean_gain_q16);
     const int32_t alternating_q24 = fixed_subtract(phase->slope_lag2_q24, phase->slope_mean_q24);
-    /* One phase per period stands for all: the sum over the phases. */
+    /* One phase per update stands for all: the sum over the phases. */
     const int32_t square_q24 = product_q24(alternating_q24, alternating_q24);
     low_pass_step(&misalignment->power_q24, fixed_saturate((int64_t)square_q24 * phases), mean_gain_q16 / phases + 1);
     low_pass_step(&misalignment->disturbance_mean_q24, disturbance_q24, mean_gain_q16 / phases + 1);
@@ -107,7 +105,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const int32_t torque_square_q24 = product_q24(sample->torque_q24, sample->torque_q24);
     const int32_t power_q24 =
         fixed_add(misalignment->power_q24, fixed_multiply(torque_square_q24, POWER_FLOOR_Q20, 20));
-    /* Mean of y since the last update of the phase: at most four periods, 32 bits each. */
+    /* Mean of y since the last update of the phase: at most four updates, 32 bits each. */
     const int32_t recent_mean_q24 = 4 * ((int32_t)((misalignment->disturbance_sum_q24 - sum_before_q24) >> 2) / phases);
     const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
     /* Q24 * Q24 to Q30, divided by Q20: Q10. */

@@ -1,5 +1,6 @@
 #include "control/moving_load.h"
 
+#include "control/load_observer.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
@@ -18,8 +19,7 @@
 
 /* T 2 pi 100 / (J w^3). */
 static uint32_t implausible_q4(const moving_load_settings_t *settings) {
-    const int64_t acceleration =
-        fixed_divide((int64_t)settings->torque_max_q24 << 6, settings->inertia_q30); /* 19 bits */
+    const int64_t acceleration = load_observer_acceleration(settings->torque_max_q24, settings->inertia_q30);
     const int64_t bandwidth = settings->bandwidth_rad_s;
     const int64_t trend_q4 = fixed_divide(fixed_divide(acceleration * SLOPE_1_S_Q36, bandwidth * bandwidth), bandwidth);
     return (uint32_t)fixed_saturate(trend_q4);
@@ -59,9 +59,9 @@ static uint32_t hold_ticks(const moving_load_parameters_t *parameters, const mov
 
 uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
                           uint32_t angle_step, bool from_edge) {
-    const int32_t trend_q4 = (int32_t)(moving->trend_q32 >> 28);
-    const int32_t difference_q4 = fixed_subtract(innovation * 16, trend_q4);
-    moving->trend_q32 += fixed_product(difference_q4, parameters->gain_q32) >> 4;
+    const int32_t trend_q4 = (int32_t)(moving->trend_q36 >> 32);
+    moving->trend_q36 =
+        fixed_accumulate(moving->trend_q36, fixed_subtract(innovation * 16, trend_q4), parameters->gain_q32);
     if (moving->blocked > 0) {
         moving->blocked--;
         return 0;

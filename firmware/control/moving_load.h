@@ -25,8 +25,6 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "fixed/compiler.h"
-
 typedef struct {
     int32_t gain_q32;            /* of the low-pass per period, Q0.32 */
     uint32_t time_constant;      /* of the low-pass, periods */
@@ -42,7 +40,7 @@ typedef struct {
 
 /* All zero at the start. */
 typedef struct {
-    int64_t trend_q32;   /* low-pass of the innovation, 2^-32 rev, Q27.32 */
+    int64_t trend_q36;   /* low-pass of the innovation, 2^-32 rev, Q27.36 */
     uint32_t hold_ticks; /* next hold, periods; 0: the shortest */
     uint32_t ticks;      /* until the next release */
     uint32_t blocked;    /* periods in which nothing is withheld */
@@ -63,7 +61,7 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
 /* One sample: returns the number of stages to withhold. innovation: 2^-32 rev, -2^27..2^27 - 1; angle_step: rotation
  * per period, magnitude, 2^-32 rev; from_edge: the angle was measured from the time of an edge. 64-bit product, rounded
  * down. */
-NOINLINE uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving,
-                                   int32_t innovation, uint32_t angle_step, bool from_edge);
+uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
+                          uint32_t angle_step, bool from_edge);
 
 #endif

@@ -38,8 +38,8 @@
 
 /* T 2^bits / J in rad/s^2: 2 pi times the square of the bandwidth at which a count is worth the torque T. */
 static uint64_t square_of_count(const observer_bandwidth_settings_t *settings) {
-    return (uint64_t)fixed_divide((int64_t)settings->torque_max_q24 << 6, settings->inertia_q30)
-           << settings->encoder_bits; /* below 2^19 + 32 */
+    return (uint64_t)load_observer_acceleration(settings->torque_max_q24, settings->inertia_q30)
+           << settings->encoder_bits; /* below 2^(19 + 32) */
 }
 
 static bool within(uint32_t bandwidth_rad_s, uint64_t square, unsigned share) {
@@ -159,7 +159,8 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
 
 observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
                                                       observer_bandwidth_statistics_t *statistics,
-                                                      const observer_bandwidth_sample_t *sample) {
+                                                      const observer_bandwidth_sample_t *sample, uint32_t angle_step,
+                                                      uint32_t withheld_stages) {
     const bool triggered_steady = sample->trigger == OBSERVER_TRIGGER_IN_STEADY_STATE;
     const bool was_steady = sample->trigger == OBSERVER_TRIGGER_NONE
                                 ? observer_bandwidth_steady(parameters, sample->stage)
@@ -182,10 +183,11 @@ observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_p
     }
     statistics->holdoff_extension_q16 =
         (uint32_t)(((uint64_t)statistics->holdoff_extension_q16 * parameters->holdoff_decay_q32) >> 32);
-    const bool frequent_edges = sample->from_edge && sample->angle_step >= parameters->edge_step_min;
+    const bool frequent_edges = sample->from_edge && angle_step >= parameters->edge_step_min;
+    const uint32_t withheld_min = frequent_edges ? LAST_STAGE - parameters->steady_stage_edge : 0;
     return (observer_bandwidth_limits_t){
         .threshold_mean = threshold_of(parameters, threshold_of_mean(statistics), frequent_edges),
-        .withheld_stages = frequent_edges ? (uint8_t)(LAST_STAGE - parameters->steady_stage_edge) : 0,
+        .withheld_stages = (uint8_t)(withheld_stages > withheld_min ? withheld_stages : withheld_min),
         .trigger_stage_edge = frequent_edges ? 0 : parameters->trigger_stage_count,
         .holdoff_ticks =
             parameters->retrigger_holdoff_ticks +

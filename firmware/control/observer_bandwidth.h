@@ -86,7 +86,6 @@ typedef struct {
     int32_t innovation; /* 2^-32 rev */
     bool from_edge;
     unsigned stage;             /* after the sample */
-    uint32_t angle_step;        /* rotation per period, magnitude, 2^-32 rev */
     observer_trigger_t trigger; /* since the last update */
 } observer_bandwidth_sample_t;
 
@@ -113,13 +112,14 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
                                                      const observer_bandwidth_limits_t *limits, int32_t innovation,
                                                      bool from_edge);
 
-/* Updates the statistics with a sample after its observer_bandwidth_step, and returns the limits of the next one; the
- * caller may withhold more stages.
+/* Updates the statistics with a sample after its observer_bandwidth_step, and returns the limits of the next one.
+ * angle_step: rotation per period, magnitude, 2^-32 rev; withheld_stages: of moving_load_step.
  * 64-bit products, rounded down. A sample that is left out does not change the statistics; its trigger counts in the
  * next. */
 observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
                                                       observer_bandwidth_statistics_t *statistics,
-                                                      const observer_bandwidth_sample_t *sample);
+                                                      const observer_bandwidth_sample_t *sample, uint32_t angle_step,
+                                                      uint32_t withheld_stages);
 
 /* True at the steady bandwidth, always without scheduling. */
 bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters, unsigned stage);

@@ -21,5 +21,5 @@ void torque_offset_step(const torque_offset_parameters_t *parameters, torque_off
     const int32_t error_q24 = fixed_subtract(requested_q24, torque_q24);
     const int64_t sum_q56 = offset->offset_q56 + fixed_product(error_q24, parameters->gain_q32); /* below 2^60 */
     const int64_t limit_q56 = (int64_t)parameters->limit_q24 << 32;
-    offset->offset_q56 = sum_q56 > limit_q56 ? limit_q56 : sum_q56 < -limit_q56 ? -limit_q56 : sum_q56;
+    offset->offset_q56 = fixed_clamp_64(sum_q56, -limit_q56, limit_q56);
 }

@@ -29,10 +29,10 @@ void deferred_reset_observer(control_state_t *state) {
 
 static void hand_over_bandwidth(control_state_t *state, const control_measurement_t *measured,
                                 deferred_input_t *input) {
-    input->innovation = state->innovation;
-    input->angle_from_edge = measured->angle_from_edge;
-    input->bandwidth_stage = state->bandwidth.stage;
-    input->bandwidth_trigger = state->bandwidth.trigger;
+    input->bandwidth.innovation = state->innovation;
+    input->bandwidth.from_edge = measured->angle_from_edge;
+    input->bandwidth.stage = state->bandwidth.stage;
+    input->bandwidth.trigger = state->bandwidth.trigger;
     state->bandwidth.trigger = OBSERVER_TRIGGER_NONE;
 }
 
@@ -105,26 +105,18 @@ static uint64_t protect(const control_parameters_t *parameters, deferred_t *defe
 
 static observer_bandwidth_limits_t bandwidth_limits(const control_parameters_t *parameters, deferred_t *deferred,
                                                     const deferred_input_t *input) {
-    const int32_t angle_step = fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32);
-    const observer_bandwidth_sample_t sample = {
-        .innovation = input->innovation,
-        .from_edge = input->angle_from_edge,
-        .stage = input->bandwidth_stage,
-        .trigger = input->bandwidth_trigger,
-        .angle_step = (uint32_t)fixed_abs(angle_step),
-    };
-    observer_bandwidth_limits_t limits =
-        observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, &sample);
-    const uint32_t withheld = moving_load_step(&parameters->moving_load, &deferred->moving_load, sample.innovation,
-                                               sample.angle_step, sample.from_edge);
-    limits.withheld_stages = (uint8_t)(withheld > limits.withheld_stages ? withheld : limits.withheld_stages);
-    return limits;
+    const observer_bandwidth_sample_t *sample = &input->bandwidth;
+    const uint32_t angle_step =
+        (uint32_t)fixed_abs(fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32));
+    const uint32_t withheld = moving_load_step(&parameters->moving_load, &deferred->moving_load, sample->innovation,
+                                               angle_step, sample->from_edge);
+    return observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld);
 }
 
 /* The misalignment is observable while speed, load and voltage are steady. */
 static bool steady(const control_parameters_t *parameters, const deferred_t *deferred, const deferred_input_t *input) {
     const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
-    return deferred->load_constant && input->bandwidth_stage >= parameters->bandwidth.moving_stage &&
+    return deferred->load_constant && input->bandwidth.stage >= parameters->bandwidth.moving_stage &&
            speed_error_q22 < fixed_abs(input->speed_q22) / 8 && input->torque_shortfall_q24 == 0;
 }
 
@@ -142,7 +134,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
                  (uint32_t)deferred->misalignment.phase[phase].offset,
         .disturbance_q24 = disturbance_q24(parameters, input),
         .torque_q24 = input->torque_reference_q24,
-        .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth_stage],
+        .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth.stage],
         .steady = steady(parameters, deferred, input),
     };
     misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);
@@ -157,7 +149,7 @@ static void learn_common_misalignment(const control_parameters_t *parameters, de
 /* What is not urgent, in four turns: no step takes the time of all. The learning of the phases has two of them, because
  * at a high bandwidth of the observer it follows within a millisecond. */
 static void take_turns(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
-    deferred->turn = (deferred->turn + 1) % 4;
+    deferred->turn = (deferred->turn + 1) % DEFERRED_SLOW_PERIODS;
     switch (deferred->turn) {
     case 0:
         deferred->load_constant = stroke_mean_step(&parameters->stroke_mean, &deferred->stroke_mean, input->electrical,

@@ -32,10 +32,7 @@ typedef struct {
     uint32_t command_age_us;    /* time since the last accepted command */
     int32_t speed_q22;          /* observer, for the coming sample, rad/s, Q9.22 */
     /* With an adaptive bandwidth only. */
-    int32_t innovation; /* 2^-32 rev */
-    bool angle_from_edge;
-    unsigned bandwidth_stage;
-    observer_trigger_t bandwidth_trigger; /* since the input of the previous deferred step */
+    observer_bandwidth_sample_t bandwidth;
     bool run;                             /* state RUN */
     int32_t commanded_speed_q22;          /* rad/s, Q9.22; 0 without a run request */
     /* With predictive torque control only. */

@@ -39,6 +39,13 @@ static inline int32_t fixed_clamp(int32_t value, int32_t low, int32_t high) {
     return value < low ? low : value;
 }
 
+static inline int64_t fixed_clamp_64(int64_t value, int64_t low, int64_t high) {
+    if (value > high) {
+        return high;
+    }
+    return value < low ? low : value;
+}
+
 /* Saturating sum and difference: one instruction each on a processor with DSP extension, with identical results. */
 static inline int32_t fixed_add(int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP

@@ -60,12 +60,9 @@ class Bandwidth {
     }
 
     void update(int32_t innovation, bool from_edge) {
-        const observer_bandwidth_sample_t sample = {.innovation = innovation,
-                                                    .from_edge = from_edge,
-                                                    .stage = state.stage,
-                                                    .angle_step = angle_step,
-                                                    .trigger = state.trigger};
-        limits = observer_bandwidth_update(&parameters, &statistics, &sample);
+        const observer_bandwidth_sample_t sample = {
+            .innovation = innovation, .from_edge = from_edge, .stage = state.stage, .trigger = state.trigger};
+        limits = observer_bandwidth_update(&parameters, &statistics, &sample, angle_step, 0);
         state.trigger = OBSERVER_TRIGGER_NONE;
     }
 
