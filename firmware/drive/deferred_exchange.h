@@ -33,8 +33,8 @@ typedef struct {
     int32_t speed_q22;          /* observer, for the coming sample, rad/s, Q9.22 */
     /* With an adaptive bandwidth only. */
     observer_bandwidth_sample_t bandwidth;
-    bool run;                             /* state RUN */
-    int32_t commanded_speed_q22;          /* rad/s, Q9.22; 0 without a run request */
+    bool run;                    /* state RUN */
+    int32_t commanded_speed_q22; /* rad/s, Q9.22; 0 without a run request */
     /* With predictive torque control only. */
     int32_t load_torque_q24;      /* observer, N m, Q7.24 */
     int32_t speed_correction_q22; /* observer, rad/s, Q9.22 */
