@@ -97,9 +97,9 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
         .dc_link_under_voltage_q6 = values[PARAMETER_BUS_UNDER_VOLTAGE_V],
         .over_speed_q22 = over_speed_q22,
         .angle_step_max = fixed_saturate((int64_t)step + 2 * (int64_t)count),
-        /* A quarter of a degree and four counts. Of a coarse encoder twelve counts: a load step may stop the rotor
+        /* A quarter of a degree and four counts. Of a coarse encoder sixteen counts: a load step may stop the rotor
          * within a count, and the observer needs several to notice. */
-        .undetected_travel_max = (int32_t)(quarter_deg > 8u * count ? quarter_deg + 4u * count : 12u * count),
+        .undetected_travel_max = (int32_t)(quarter_deg > 12u * count ? quarter_deg + 4u * count : 16u * count),
         .angle_step_q32 = angle_step_q32,
         .command_timeout_us = (uint32_t)values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u,
         .deceleration_max_q22 = fixed_saturate(fixed_divide(
