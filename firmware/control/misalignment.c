@@ -67,12 +67,15 @@ static int64_t clamped_offset_q40(int64_t offset_q40) {
 
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                        const machine_tables_t *tables, const misalignment_sample_t *sample) {
-    const bool steady = sample->steady && fixed_abs(sample->torque_q24) > TORQUE_MIN_Q24;
+    const bool torque_suffices = fixed_abs(sample->torque_q24) > TORQUE_MIN_Q24;
+    const bool steady = sample->condition == MISALIGNMENT_STEADY && torque_suffices;
     const int32_t disturbance_q24 = sample->disturbance_q24;
     const bool settled = misalignment->steady_updates >= parameters->settle_updates;
-    misalignment->steady_updates = !steady   ? 0
-                                   : settled ? misalignment->steady_updates
-                                             : misalignment->steady_updates + 1;
+    if (steady) {
+        misalignment->steady_updates += !settled;
+    } else if (sample->condition == MISALIGNMENT_UNSTEADY || !torque_suffices) {
+        misalignment->steady_updates = 0;
+    }
     const bool learning = steady && settled;
     /* Means over the time since the state became steady, at most 100 ms: before, the load was another. */
     const int32_t phases = (int32_t)tables->phases;

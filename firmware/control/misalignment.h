@@ -65,13 +65,20 @@ typedef struct {
     unsigned phase_index;     /* phase to update, in turn */
 } misalignment_t;
 
+typedef enum {
+    MISALIGNMENT_UNSTEADY,    /* learning waits until the state has been steady for 150 ms */
+    MISALIGNMENT_INTERRUPTED, /* by what a large misalignment itself causes, with every stroke: learning goes on after
+                               */
+    MISALIGNMENT_STEADY,      /* speed and load are steady, the voltage is not limited */
+} misalignment_condition_t;
+
 typedef struct {
     int32_t current_q9;       /* of the phase to update, A, Q7.9 */
     uint32_t angle;           /* of that phase, corrected, 2^-32 electrical rev */
     int32_t disturbance_q24;  /* y, N m, Q7.24 */
     int32_t torque_q24;       /* reference, N m, Q7.24 */
     uint32_t bandwidth_rad_s; /* of the load observer */
-    bool steady;              /* speed and load are steady, the voltage is not limited */
+    misalignment_condition_t condition;
 } misalignment_sample_t;
 
 typedef struct {

@@ -6,6 +6,8 @@
 #define SETTLE_STROKES 4
 #define STROKE_UPDATES_MIN 8
 #define TOLERANCE_Q24 1677722 /* 0.1 N m */
+/* Disturbed strokes of equal mean from which on the machine disturbs itself. */
+#define REPEATED_STROKES 8u
 
 stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_rate_hz) {
     return (stroke_mean_parameters_t){.phases = phases, .settle_updates = update_rate_hz * SETTLE_MS / 1000u};
@@ -16,17 +18,23 @@ static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t
     const unsigned shift = mean->updates < 256 ? 8 : 16;
     const int32_t mean_q24 = (int32_t)(mean->sum_q24 >> shift) / (int32_t)mean->updates * (1 << shift);
     const int32_t change_q24 = fixed_abs(fixed_subtract(mean_q24, mean->constant_q24));
-    if (change_q24 > TOLERANCE_Q24 + fixed_abs(torque_q24) / 64) {
+    if (change_q24 > TOLERANCE_Q24 + fixed_abs(torque_q24) / 16) {
         mean->constant_q24 = mean_q24;
         const uint32_t strokes = SETTLE_STROKES * mean->updates;
         mean->remaining = strokes > parameters->settle_updates ? strokes : parameters->settle_updates;
+        mean->disturbed_strokes = 0;
+    } else if (mean->disturbed) {
+        mean->disturbed_strokes += mean->disturbed_strokes < 3 * REPEATED_STROKES ? 2 : 0;
+    } else {
+        mean->disturbed_strokes -= mean->disturbed_strokes > 0;
     }
+    mean->disturbed = false;
     mean->sum_q24 = 0;
     mean->updates = 0;
 }
 
 bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t electrical,
-                      int32_t load_torque_q24, int32_t torque_q24) {
+                      int32_t load_torque_q24, int32_t torque_q24, bool disturbed) {
     const uint32_t stroke = (uint32_t)(((uint64_t)electrical * parameters->phases) >> 32);
     mean->remaining -= mean->remaining > 0;
     if ((stroke != mean->stroke && mean->updates >= STROKE_UPDATES_MIN) || mean->updates == UINT16_MAX) {
@@ -35,5 +43,10 @@ bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t 
     mean->stroke = stroke;
     mean->sum_q24 += load_torque_q24;
     mean->updates++;
+    mean->disturbed |= disturbed;
     return mean->remaining == 0;
+}
+
+bool stroke_mean_repeats(const stroke_mean_t *mean) {
+    return mean->disturbed_strokes >= REPEATED_STROKES;
 }

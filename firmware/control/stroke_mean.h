@@ -16,20 +16,25 @@ typedef struct {
 
 /* All zero at the start. */
 typedef struct {
-    int64_t sum_q24;      /* N m, Q24, since the stroke began */
-    uint32_t updates;     /* in the sum */
-    uint32_t stroke;      /* number of the stroke in the electrical revolution */
-    int32_t constant_q24; /* mean of the stroke that is compared with, N m, Q7.24 */
-    uint32_t remaining;   /* updates until the load is constant */
+    int64_t sum_q24;            /* N m, Q24, since the stroke began */
+    uint32_t updates;           /* in the sum */
+    uint32_t stroke;            /* number of the stroke in the electrical revolution */
+    int32_t constant_q24;       /* mean of the stroke that is compared with, N m, Q7.24 */
+    uint32_t remaining;         /* updates until the load is constant */
+    uint32_t disturbed_strokes; /* of the present load, less the undisturbed ones since */
+    bool disturbed;             /* in this stroke */
 } stroke_mean_t;
 
 /* Rate of the updates in Hz. */
 stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_rate_hz);
 
 /* One update; true if the load is constant: within the last 150 ms, and the last four strokes, the mean changed by no
- * more than 0.1 N m and 1/64 of the torque. electrical: angle of phase 0, 2^-32 electrical rev; load and torque in N m,
+ * more than 0.1 N m and 1/16 of the torque. electrical: angle of phase 0, 2^-32 electrical rev; load and torque in N m,
  * Q7.24. Strokes of fewer than 8 updates are not separated. */
 bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t electrical,
-                      int32_t load_torque_q24, int32_t torque_q24);
+                      int32_t load_torque_q24, int32_t torque_q24, bool disturbed);
+
+/* True if strokes of equal mean load keep being disturbed: not by the load, but by the machine itself. */
+bool stroke_mean_repeats(const stroke_mean_t *mean);
 
 #endif

@@ -113,11 +113,21 @@ static observer_bandwidth_limits_t bandwidth_limits(const control_parameters_t *
     return observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld);
 }
 
+static bool disturbed(const control_parameters_t *parameters, const deferred_input_t *input) {
+    return input->bandwidth.stage < parameters->bandwidth.moving_stage;
+}
+
 /* The misalignment is observable while speed, load and voltage are steady. */
-static bool steady(const control_parameters_t *parameters, const deferred_t *deferred, const deferred_input_t *input) {
+static misalignment_condition_t condition(const control_parameters_t *parameters, const deferred_t *deferred,
+                                          const deferred_input_t *input) {
     const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
-    return deferred->load_constant && input->bandwidth.stage >= parameters->bandwidth.moving_stage &&
-           speed_error_q22 < fixed_abs(input->speed_q22) / 8 && input->torque_shortfall_q24 == 0;
+    if (!deferred->load_constant || speed_error_q22 >= fixed_abs(input->speed_q22) / 8) {
+        return MISALIGNMENT_UNSTEADY;
+    }
+    if (!disturbed(parameters, input) && input->torque_shortfall_q24 == 0) {
+        return MISALIGNMENT_STEADY;
+    }
+    return stroke_mean_repeats(&deferred->stroke_mean) ? MISALIGNMENT_INTERRUPTED : MISALIGNMENT_UNSTEADY;
 }
 
 static int32_t disturbance_q24(const control_parameters_t *parameters, const deferred_input_t *input) {
@@ -135,7 +145,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
         .disturbance_q24 = disturbance_q24(parameters, input),
         .torque_q24 = input->torque_reference_q24,
         .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth.stage],
-        .steady = steady(parameters, deferred, input),
+        .condition = condition(parameters, deferred, input),
     };
     misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);
 }
@@ -152,8 +162,9 @@ static void take_turns(const control_parameters_t *parameters, deferred_t *defer
     deferred->turn = (deferred->turn + 1) % DEFERRED_SLOW_PERIODS;
     switch (deferred->turn) {
     case 0:
-        deferred->load_constant = stroke_mean_step(&parameters->stroke_mean, &deferred->stroke_mean, input->electrical,
-                                                   input->load_torque_q24, input->torque_reference_q24);
+        deferred->load_constant =
+            stroke_mean_step(&parameters->stroke_mean, &deferred->stroke_mean, input->electrical,
+                             input->load_torque_q24, input->torque_reference_q24, disturbed(parameters, input));
         deferred->window = predictive_torque_move_windows(&parameters->predictive, &deferred->advance_q30,
                                                           input->torque_reference_q24, input->torque_shortfall_q24);
         torque_offset_step(&parameters->torque_offset, &deferred->torque_offset, input->torque_reference_q24,

@@ -53,6 +53,10 @@ class Machine {
     }
 
     void step(double torque_Nm, double load_Nm, bool steady) {
+        step(torque_Nm, load_Nm, steady ? MISALIGNMENT_STEADY : MISALIGNMENT_UNSTEADY);
+    }
+
+    void step(double torque_Nm, double load_Nm, misalignment_condition_t condition) {
         position += rpm / 60.0 * machine_tables.rotor_poles / RATE_HZ;
         int32_t current_q9[HAL_PHASES_MAX] = {};
         uint32_t angle[HAL_PHASES_MAX] = {};
@@ -85,9 +89,9 @@ class Machine {
                                               .disturbance_q24 = to_fixed(load_Nm + lag[1], Q24),
                                               .torque_q24 = to_fixed(torque_Nm, Q24),
                                               .bandwidth_rad_s = uint32_t(BANDWIDTH_RAD_S),
-                                              .steady = steady};
+                                              .condition = condition};
         misalignment_step(&parameters, &state, &machine_tables, &sample);
-        model.step(sample.disturbance_q24 / Q24, BANDWIDTH_RAD_S, steady, torque_Nm,
+        model.step(sample.disturbance_q24 / Q24, BANDWIDTH_RAD_S, condition == MISALIGNMENT_STEADY, torque_Nm,
                    [&](unsigned phase) { return slope[phase]; });
         if (common && ++updates % (DEFERRED_SLOW_PERIODS / DEFERRED_LEARNING_PERIODS) == 0) {
             misalignment_common_step(&parameters, &state, sample.disturbance_q24, sample.torque_q24);
@@ -140,6 +144,26 @@ TEST(Misalignment, is_not_learned_while_unsteady_below_1_Nm_or_before_settling) 
         EXPECT_EQ(unsteady.offset_deg(phase), 0.0);
         EXPECT_EQ(idle.offset_deg(phase), 0.0);
         EXPECT_EQ(settling.offset_deg(phase), 0.0);
+    }
+}
+
+TEST(Misalignment, is_learned_between_interruptions_once_150_ms_without_them_have_added_up) {
+    Machine machine(12, {1.0, 1.0, 1.0});
+    const auto interrupted = [](int k) { return k % 400 < 100 ? MISALIGNMENT_INTERRUPTED : MISALIGNMENT_STEADY; };
+    const int settling = int(machine.parameters.settle_updates) * 4 / 3;
+    for (int k = 0; k < settling; k++) {
+        machine.step(8.0, 8.0, interrupted(k));
+        EXPECT_EQ(machine.offset_deg(0), 0.0) << k;
+    }
+    for (int k = 0; k < 2 * int(RATE_HZ); k++) {
+        const double before = machine.offset_deg(0);
+        machine.step(8.0, 8.0, interrupted(k));
+        if (interrupted(k) == MISALIGNMENT_INTERRUPTED) {
+            EXPECT_EQ(machine.offset_deg(0), before) << k;
+        }
+    }
+    for (unsigned phase = 0; phase < PHASES; phase++) {
+        EXPECT_NEAR(machine.offset_deg(phase), 1.0, 0.1);
     }
 }
 
@@ -231,7 +255,7 @@ TEST(Misalignment, is_limited_to_four_degrees_and_overflows_nothing) {
                                                                 on == (sign > 0) ? INT32_MIN : INT32_MAX),
                 .torque_q24 = 8 << 24,
                 .bandwidth_rad_s = 250,
-                .steady = true,
+                .condition = MISALIGNMENT_STEADY,
             };
             misalignment_step(&p, &state, &machine_tables, &sample);
             misalignment_common_step(&p, &state, sample.disturbance_q24, sample.torque_q24);
