@@ -16,7 +16,7 @@
  * slopes of two overlapping phases nearly cancel, and at high speeds much smaller after the observer than those of the
  * phases, which alternate more slowly. So the same law learns that angle once more, normalised by itself:
  *
- *   d delta / dt = rate / 8 y S / (mean of S^2 + 0.01 T^2 / rad^2),   S = sum s_j
+ *   d delta / dt = rate / 8 y S / (mean of S^2 + 0.0012 T^2 / rad^2),   S = sum s_j
  *
  * At 600 r/min it takes 2 s instead of 10.
  *
@@ -25,8 +25,9 @@
  * rotor angle in bins could cancel any error, not only a misalignment, but would have dozens of values to learn from
  * the same signal instead of one per phase.
  *
- * s_j is filtered by the observer's present bandwidth. Learning is suspended unless speed and load are steady, the
- * torque is above 1 N m and the voltage is not limited.
+ * s_j is filtered by the observer's present bandwidth; where that is wider than in steady state, the phases learn four
+ * times as fast. Learning is suspended unless speed and load are steady, the torque is above 1 N m and the voltage is
+ * not limited; a large misalignment itself disturbs every stroke, and is learned between these disturbances.
  */
 #ifndef CONTROL_MISALIGNMENT_H
 #define CONTROL_MISALIGNMENT_H
@@ -78,6 +79,7 @@ typedef struct {
     int32_t disturbance_q24;  /* y, N m, Q7.24 */
     int32_t torque_q24;       /* reference, N m, Q7.24 */
     uint32_t bandwidth_rad_s; /* of the load observer */
+    bool wide;                /* wider than in steady state */
     misalignment_condition_t condition;
 } misalignment_sample_t;
 

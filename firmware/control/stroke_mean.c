@@ -18,7 +18,9 @@ static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t
     const unsigned shift = mean->updates < 256 ? 8 : 16;
     const int32_t mean_q24 = (int32_t)(mean->sum_q24 >> shift) / (int32_t)mean->updates * (1 << shift);
     const int32_t change_q24 = fixed_abs(fixed_subtract(mean_q24, mean->constant_q24));
-    if (change_q24 > TOLERANCE_Q24 + fixed_abs(torque_q24) / 16) {
+    const bool disturbed = mean->disturbed || mean->disturbed_strokes > 0;
+    const int32_t torque_share_q24 = fixed_abs(torque_q24) / (disturbed ? 8 : 64);
+    if (change_q24 > TOLERANCE_Q24 + torque_share_q24) {
         mean->constant_q24 = mean_q24;
         const uint32_t strokes = SETTLE_STROKES * mean->updates;
         mean->remaining = strokes > parameters->settle_updates ? strokes : parameters->settle_updates;

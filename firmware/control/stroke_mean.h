@@ -29,8 +29,8 @@ typedef struct {
 stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_rate_hz);
 
 /* One update; true if the load is constant: within the last 150 ms, and the last four strokes, the mean changed by no
- * more than 0.1 N m and 1/16 of the torque. electrical: angle of phase 0, 2^-32 electrical rev; load and torque in N m,
- * Q7.24. Strokes of fewer than 8 updates are not separated. */
+ * more than 0.1 N m and 1/64 of the torque, 1/8 while strokes are disturbed. electrical: angle of phase 0, 2^-32
+ * electrical rev; load and torque in N m, Q7.24. Strokes of fewer than 8 updates are not separated. */
 bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t electrical,
                       int32_t load_torque_q24, int32_t torque_q24, bool disturbed);
 

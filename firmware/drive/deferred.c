@@ -145,6 +145,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
         .disturbance_q24 = disturbance_q24(parameters, input),
         .torque_q24 = input->torque_reference_q24,
         .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth.stage],
+        .wide = input->bandwidth.stage < parameters->bandwidth.steady_stage_edge,
         .condition = condition(parameters, deferred, input),
     };
     misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);

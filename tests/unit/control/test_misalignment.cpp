@@ -89,6 +89,7 @@ class Machine {
                                               .disturbance_q24 = to_fixed(load_Nm + lag[1], Q24),
                                               .torque_q24 = to_fixed(torque_Nm, Q24),
                                               .bandwidth_rad_s = uint32_t(BANDWIDTH_RAD_S),
+                                              .wide = wide,
                                               .condition = condition};
         misalignment_step(&parameters, &state, &machine_tables, &sample);
         model.step(sample.disturbance_q24 / Q24, BANDWIDTH_RAD_S, condition == MISALIGNMENT_STEADY, torque_Nm,
@@ -108,6 +109,7 @@ class Machine {
     reference_model::misalignment_t model{};
     offsets_t off;
     double rpm = 150.0;
+    bool wide = false;   // bandwidth of the observer
     bool common = false; // the common angle is learned, too
     unsigned updates = 0;
     double position = 0.0;
@@ -165,6 +167,20 @@ TEST(Misalignment, is_learned_between_interruptions_once_150_ms_without_them_hav
     for (unsigned phase = 0; phase < PHASES; phase++) {
         EXPECT_NEAR(machine.offset_deg(phase), 1.0, 0.1);
     }
+}
+
+TEST(Misalignment, is_learned_four_times_as_fast_while_the_observer_is_wide) {
+    Machine steady(4, {0.3, 0.3, 0.3}), wide(4, {0.3, 0.3, 0.3});
+    wide.wide = true;
+    for (uint32_t k = 0; k < steady.parameters.settle_updates + RATE_HZ / 50; k++) {
+        steady.step(8.0, 8.0, true);
+        wide.step(8.0, 8.0, true);
+    }
+    const auto sum = [](const Machine &machine) {
+        return machine.offset_deg(0) + machine.offset_deg(1) + machine.offset_deg(2);
+    };
+    EXPECT_GT(sum(steady), 0.005);
+    EXPECT_NEAR(sum(wide) / sum(steady), 4.0, 0.3);
 }
 
 TEST(Misalignment, is_kept_while_unsteady_and_with_a_learning_rate_of_zero) {

@@ -65,12 +65,12 @@ TEST(StrokeMean, a_load_step_counts_for_150_ms) {
     EXPECT_LT(not_constant_s, 0.20);
 }
 
-TEST(StrokeMean, a_change_below_0_1_Nm_and_a_16th_of_the_torque_is_constant) {
+TEST(StrokeMean, a_change_below_0_1_Nm_and_a_64th_of_the_torque_is_constant) {
     const auto load = [](double change_Nm) {
         return [=](double t, double) { return t < 1.2 ? 8.0 : 8.0 + change_Nm; };
     };
-    EXPECT_EQ(constant_share(150.0, load(0.58), 8.0), 1.0);
-    EXPECT_LT(constant_share(150.0, load(0.62), 8.0), 1.0);
+    EXPECT_EQ(constant_share(150.0, load(0.21), 8.0), 1.0);
+    EXPECT_LT(constant_share(150.0, load(0.24), 8.0), 1.0);
 }
 
 // Strokes until a machine is found to disturb itself, at most 99; by the given disturbance and mean load of a stroke.
