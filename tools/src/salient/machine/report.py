@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from salient.errors import UsageError
+from salient.machine.drive_report import drive_json, drive_lines
 from salient.machine.file import Converter, Machine, MachineError, Sensors, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
 
@@ -23,15 +24,18 @@ SHOWN_A = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0)
 SHOWN_PITCHES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 
 
-def run(name_or_path: str, out: Path) -> int:
-    """Checks the file, prints its data sheet and plots its magnetics; returns 0. UsageError."""
+def run(name_or_path: str, out: Path, json_path: Path | None = None) -> int:
+    """Checks the file, prints its data sheet and the drive's data, plots its magnetics; returns 0. UsageError.
+
+    json_path: the drive's data are also written there.
+    """
     try:
         path = machine_path(name_or_path)
         machine = load_machine(path)
         machine_phase_map(path, machine)
     except MachineError as error:
         raise UsageError(str(error)) from None
-    print("\n".join(describe(machine)))
+    print("\n".join([*describe(machine), *drive_lines(machine)]))
     plot_path = out / f"{machine.name}.png"
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -39,6 +43,11 @@ def run(name_or_path: str, out: Path) -> int:
     except OSError as error:
         raise UsageError(f"--out {out}: {error.strerror}") from None
     print(f"plot: {plot_path}")
+    if json_path is not None:
+        try:
+            json_path.write_text(drive_json(machine), encoding="utf-8")
+        except OSError as error:
+            raise UsageError(f"--json {json_path}: {error.strerror}") from None
     return 0
 
 
