@@ -292,6 +292,7 @@ def check(machine: Machine) -> None:
     in_order("current_rated_A", "current_peak_A")
     in_order("torque_rated_Nm", "torque_peak_Nm")
     in_order("speed_base_rpm", "speed_max_rpm")
+    in_order("current_peak_A", "adc_current_A", 0.9)
     in_order("current_limit_A", "current_trip_A", 0.98)
     in_order("current_trip_A", "adc_current_A", 0.9875)
     in_order("bus_under_voltage_V", "supply_min_V", 0.98)
@@ -301,7 +302,7 @@ def check(machine: Machine) -> None:
     in_order("speed_max_rpm", "over_speed_rpm")
     in_order("torque_band_inner_Nm", "torque_band_outer_Nm")
     most_Nm = mean_torque_Nm(machine.magnetics, machine.phases, data.current_peak_A)
-    for name in ("torque_rated_Nm", "torque_peak_Nm"):
+    for name in ("torque_peak_Nm", "torque_rated_Nm"):
         if values[name] > most_Nm:
             raise TextFileError(f"{places[name]}: {values[name]:g}: must not be above {most_Nm:.3g}, the mean torque "
                                 f"at {places['current_peak_A']}, {data.current_peak_A:g}")

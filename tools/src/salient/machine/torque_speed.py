@@ -22,7 +22,7 @@ _END_DEG = 540
 _FLUX_POINTS = 128
 
 _STROKE_POINTS = 61
-_SEARCH_POINTS = 48
+_SEARCH_POINTS = 80
 _BISECTIONS = 24  # to 1e-7 of the range
 _CURRENT_OVER = 1.03
 """A current that rises above its limit against the full voltage, by which a pair of angles is refused."""
@@ -49,24 +49,27 @@ def mean_torque_Nm(magnetics: Any, phases: int, current_A: float) -> float:
 
 
 def _stroke_torque_Nm(magnetics: Any, phases: int, current_A: np.ndarray) -> np.ndarray:
-    """By current and angle."""
+    """By current and angle; of the phases on their way from the unaligned to the aligned position."""
     stroke_rad = magnetics.pitch_rad / phases
     angle_rad = np.linspace(0.0, stroke_rad, _STROKE_POINTS) + stroke_rad * np.arange(phases)[:, None]
-    total_Nm: np.ndarray = np.maximum(magnetics.torque_Nm(angle_rad, current_A[:, None, None]), 0.0).sum(axis=1)
+    motoring = angle_rad > 0.5 * magnetics.pitch_rad
+    torque_Nm = np.where(motoring, magnetics.torque_Nm(angle_rad, current_A[:, None, None]), 0.0)
+    total_Nm: np.ndarray = np.maximum(torque_Nm, 0.0).sum(axis=1)
     return total_Nm
 
 
 def current_of_torque_A(magnetics: Any, phases: int, torque_Nm: float, current_max_A: float) -> float:
-    """Current whose smooth torque is torque_Nm, at most current_max_A; to a hundred-thousandth of it."""
-    low_A, high_A = 0.0, current_max_A
+    """The smallest current whose smooth torque is torque_Nm, to a ten-thousandth; that of the largest torque up to
+    current_max_A when none is."""
+    grid_A = np.geomspace(1e-6 * current_max_A, current_max_A, _SEARCH_POINTS)
     for _ in range(3):
-        grid_A = np.linspace(low_A, high_A, _SEARCH_POINTS)
-        reached = np.flatnonzero(_stroke_torque_Nm(magnetics, phases, grid_A).min(axis=1) >= torque_Nm)
+        smooth_Nm = _stroke_torque_Nm(magnetics, phases, grid_A).min(axis=1)
+        reached = np.flatnonzero(smooth_Nm >= torque_Nm)
         if not reached.size:
-            return high_A
+            return float(grid_A[int(np.argmax(smooth_Nm))])
         first = max(int(reached[0]), 1)
-        low_A, high_A = float(grid_A[first - 1]), float(grid_A[first])
-    return high_A
+        grid_A = np.linspace(grid_A[first - 1], grid_A[first], _SEARCH_POINTS // 4)
+    return float(grid_A[-1])
 
 
 def knee_A(magnetics: Any, current_max_A: float) -> float:
