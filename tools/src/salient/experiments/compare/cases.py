@@ -15,6 +15,7 @@ import numpy as np
 
 from salient.config import CONTROLLERS
 from salient.experiments.compare.metrics import STEADY_S
+from salient.experiments.metrics import RIPPLE_WINDOW_S
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 
 # Parameters of the drive that conditions set, by meaning; the numbers are those of firmware/PARAMETERS.md.
@@ -82,7 +83,8 @@ class Case:
     """One run and its metrics.
 
     extractor: key of compare/metrics.EXTRACTORS. sample: distinguishes the runs of a condition, "" for a single run.
-    traced: keep the torque over the paper's window for a plot.
+    traced: keep the torque over the paper's window for a plot. window_s: of the ripple, for extractors whose
+    recordings are longer. strokes: by which the load step is later than STEP_AT_S.
     """
 
     group: str
@@ -92,6 +94,8 @@ class Case:
     scenario: Scenario
     sample: str = ""
     traced: bool = False
+    window_s: tuple[float, float] = RIPPLE_WINDOW_S
+    strokes: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -161,10 +165,11 @@ def _dip(quick: bool) -> Iterator[Case]:
             scenario = _scenario(machine=machine, duration_s=step_s + 0.3, speed=(SpeedStep(0.0, RIPPLE_RPM),),
                                  load=(LoadStep(step_s, LOAD_NM),), record=Record(10.0, 0.09), **SENSING[sensing])
             sample = f"angle {number:02}"
-            yield from _by_controller("dip", f"{machine}, {sensing}", "load_step", scenario, sample)
+            strokes = number / angles
+            yield from _by_controller("dip", f"{machine}, {sensing}", "load_step", scenario, sample, strokes=strokes)
             if machine == "saturating" and sensing != "17 bits" and not quick:
                 yield Case("dip", f"{machine}, {sensing}, reserve of 8 N m", "salient", "load_step",
-                           replace(scenario, controller="salient", parameters=RESERVE), sample)
+                           replace(scenario, controller="salient", parameters=RESERVE), sample, strokes=strokes)
 
 
 def _moving(quick: bool) -> Iterator[Case]:
@@ -229,7 +234,8 @@ def _ablation(quick: bool) -> Iterator[Case]:
                                  bench={"current_noise_A": 0.02, "encoder_offset_deg": offset_deg})
                 late = replace(step, duration_s=LATE_S, record=Record(1.0, LATE_S - 0.1))
                 for extractor, scenario in (("step_and_ripple", step), ("late_ripple", late)):
-                    yield Case("ablation", f"{change}, {table}", controller, extractor, scenario, f"seed {seed}")
+                    yield Case("ablation", f"{change}, {table}", controller, extractor, scenario, f"seed {seed}",
+                               strokes=(seed - 1) / len(SEEDS))
 
 
 def _robustness(quick: bool) -> Iterator[Case]:
@@ -319,9 +325,10 @@ def _steady(group: str, condition: str, speed_rpm: float, from_s: float, quick: 
 
 
 def _by_controller(group: str, condition: str, extractor: str, scenario: Scenario, sample: str = "",
-                   controllers: Sequence[str] = CONTROLLERS) -> Iterator[Case]:
+                   controllers: Sequence[str] = CONTROLLERS, strokes: float = 0.0) -> Iterator[Case]:
     for controller in controllers:
-        yield Case(group, condition, controller, extractor, replace(scenario, controller=controller), sample)
+        yield Case(group, condition, controller, extractor, replace(scenario, controller=controller), sample,
+                   strokes=strokes)
 
 
 def scenario_toml(case: Case) -> str:
