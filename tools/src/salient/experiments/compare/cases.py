@@ -295,6 +295,8 @@ GROUPS: dict[str, Group] = {
                          ("cycle_percent", "median"), ("cycle_percent", "worst")), long=True),
 }
 
+TITLES = {name: group.title for name, group in GROUPS.items()}
+
 
 # --- scenarios ------------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from typing import TextIO
 from salient.bench.emulator import executable
 from salient.errors import UsageError
 from salient.experiments.compare import baseline, results_file, table
-from salient.experiments.compare.cases import GROUPS, Case, scenario_toml
+from salient.experiments.compare.cases import GROUPS, TITLES, Case, scenario_toml
 from salient.experiments.compare.machine import Subject, cases_of, subject
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.machine.file import MachineError
@@ -29,7 +29,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
                           for name, group in GROUPS.items())
         return 0
     cases = _cases(options.groups, options.quick)
-    titles = {name: group.title for name, group in GROUPS.items()}
+    titles = TITLES
     if options.machine is not None:
         on = _subject(options.machine)
         cases, titles = cases_of(cases, on), {name: on.text(title) for name, title in titles.items()}

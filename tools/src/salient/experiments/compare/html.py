@@ -9,12 +9,13 @@ from typing import Any
 
 from salient.experiments.compare import plots, table
 from salient.experiments.compare.baseline import Change
+from salient.experiments.compare.cases import TITLES
 from salient.experiments.compare.table import Row
 from salient.pages import write_page as write_template
 
 
 def write_page(path: Path, rows: Sequence[Row], content: Mapping[str, Any], change_summary: str | None,
-               changes: Sequence[Change], command: str, titles: Mapping[str, str]) -> None:
+               changes: Sequence[Change], command: str, titles: Mapping[str, str] = TITLES) -> None:
     """Writes the page for `rows` and `content` (of compare.json), titles by group. change_summary: text of
     baseline.summary, None without a baseline. Equal input gives equal bytes."""
     write_template(path, "compare.html", {

@@ -1,7 +1,8 @@
 """Metrics of a run, and the label, unit and resolution of each.
 
 An extractor is a function of (scenario, recording, window of the ripple in s where the recording is longer) that
-returns metrics by name. A metric is None when its event does not occur within the run (a drive that never settles). MetricsError for a recording without the data of a metric.
+returns metrics by name. A metric is None when its event does not occur within the run (a drive that never settles).
+MetricsError for a recording without the data of a metric.
 """
 
 from __future__ import annotations
@@ -14,18 +15,19 @@ import numpy as np
 from salient.experiments import metrics
 from salient.experiments.scaled import scale_of_name
 from salient.experiments.scenario import Scenario
+from salient.machine.definition import Machine
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 
 Metrics = dict[str, float | None]
 Window = tuple[float, float]
+PAPER_WINDOW_S = metrics.RIPPLE_WINDOW_S
 
 STEADY_S = 0.5
 """Window at the end of a run of the robustness study, for the speed error and the spectrum."""
 
 SPEED_ERROR_MAX_PERCENT = 100.0 * metrics.BAND
 PEAK_CURRENT_MAX_A = 90.0
-PEAK_CURRENT_OF_LIMIT = PEAK_CURRENT_MAX_A / 52.0
 SPEED_MAX_PERCENT = 105.0
 LIMIT_CYCLE_MAX_PERCENT = 1.0
 """Limits of the robustness study. The last: strongest line of the torque's spectrum that is not a harmonic of the
@@ -74,7 +76,7 @@ def _recorded_from_s(scenario: Scenario) -> float:
     return scenario.record.from_s
 
 
-def ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window) -> Metrics:
+def ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """Ripple from the first recorded sample, over the paper's window and to the end of the run; speed error."""
     first_s, last_s = _recorded_from_s(scenario), scenario.duration_s
     short_s = scale_of_name(scenario.machine).window_s(scenario.speed[-1].value_rpm)
@@ -86,19 +88,19 @@ def ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window) 
     return values
 
 
-def late_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window) -> Metrics:
+def late_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """Ripple over the whole recording, which is the end of a long run."""
     return {"ripple_late": _ripple(recording, (_recorded_from_s(scenario), scenario.duration_s))}
 
 
-def start_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window) -> Metrics:
+def start_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """A start from standstill."""
     reference = scenario.speed[0]
     values = metrics.start_metrics(recording, reference.value_rpm, reference.at_s)
     return {name: values[name] for name in ("settling_time_s", "overshoot_percent")}
 
 
-def load_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window) -> Metrics:
+def load_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """A load step at steady speed: metrics after it, copper loss over the stroke before it where that was recorded, and
     the rotor angle at the step within a stroke, in degrees."""
     reference_rpm, step_s = scenario.speed[-1].value_rpm, scenario.load[0].at_s
@@ -113,19 +115,19 @@ def load_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Windo
     return {**values, "step_angle_deg": float(recording["rotor_angle_deg"][at_step]) % stroke_deg}
 
 
-def moving_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window) -> Metrics:
+def moving_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """Peak-to-peak speed over the whole recording, which is the steady state under a periodic load."""
     return {"speed_swing_rpm": float(np.ptp(recording["speed_rpm"]))}
 
 
-def step_and_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window) -> Metrics:
+def step_and_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """A load step, and ripple and mean torque over the window."""
     torque = metrics.torque_metrics(recording["time_s"], recording["torque_Nm"], window_s)
     step = load_step_metrics(scenario, recording, window_s)
     return {**step, "ripple": torque["torque_ripple"], "torque_mean_Nm": torque["torque_mean_Nm"]}
 
 
-def robustness_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window) -> Metrics:
+def robustness_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """A start and a load step; the last STEADY_S are steady. The whole run is recorded."""
     reference_rpm, last_s = scenario.speed[-1].value_rpm, scenario.duration_s
     steady_s = (last_s - STEADY_S, last_s)
@@ -153,10 +155,14 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
 }
 
 
-def failures(values: Metrics, scenario: Scenario) -> list[str]:
+def peak_current_max_A(machine: Machine) -> float:
+    """PEAK_CURRENT_MAX_A for a machine, in proportion to its peak current."""
+    return PEAK_CURRENT_MAX_A * derive(machine).current_peak_A / 52.0
+
+
+def failures(values: Metrics, peak_A: float = PEAK_CURRENT_MAX_A) -> list[str]:
     """Limits that a drive of the robustness study violated, as text; empty when it passes."""
     wrong = []
-    peak_A = PEAK_CURRENT_OF_LIMIT * derive(load_machine(machine_path(scenario.machine))).parameters["current_limit_A"]
     if values["settling_time_s"] is None:
         wrong.append("not at speed before the load step")
     for name, limit in (("speed_error_percent", SPEED_ERROR_MAX_PERCENT), ("peak_current_A", peak_A),

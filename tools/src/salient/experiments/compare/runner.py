@@ -16,10 +16,11 @@ from salient.bench.drive import DriveError
 from salient.bench.emulator import EmulatorError
 from salient.bench.session import SessionError
 from salient.experiments.compare.cases import Case
-from salient.experiments.compare.metrics import EXTRACTORS, Metrics, failures
+from salient.experiments.compare.metrics import EXTRACTORS, Metrics, failures, peak_current_max_A
 from salient.experiments.metrics import MetricsError
 from salient.experiments.results import rounded
 from salient.experiments.scenario import run_scenario
+from salient.machine.file import load_machine, machine_path
 from salient.progress import Progress
 
 _PROGRESS_LINES_MAX = 20
@@ -80,7 +81,10 @@ def _run(case: Case) -> tuple[Metrics, str, Any]:
             metrics: Metrics = rounded(EXTRACTORS[case.extractor](case.scenario, result.recording, case.window_s))
         except (EmulatorError, SessionError, DriveError, CanError, MetricsError) as error:
             return {}, str(error), None
-        failed = "; ".join(failures(metrics, case.scenario)) if case.extractor == "robustness" else ""
+        failed = ""
+        if case.extractor == "robustness":
+            machine = load_machine(machine_path(case.scenario.machine))
+            failed = "; ".join(failures(metrics, peak_current_max_A(machine)))
         return metrics, failed, _trace(case, result.recording) if case.traced else None
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import groupby, pairwise
 
 from salient.config import CONTROLLERS
-from salient.experiments.compare.cases import GROUPS, STROKE_DEG
+from salient.experiments.compare.cases import GROUPS, STROKE_DEG, TITLES
 from salient.experiments.compare.metrics import METRICS
 from salient.experiments.compare.runner import RunMetrics
 from salient.experiments.compare.targets import TARGETS, Key, Target
@@ -129,7 +129,7 @@ def status(row: Row) -> str:
     return {True: "reached", False: "NOT REACHED", None: ""}[row.reached]
 
 
-def table(rows: Sequence[Row], titles: Mapping[str, str]) -> str:
+def table(rows: Sequence[Row], titles: Mapping[str, str] = TITLES) -> str:
     """All rows as text, titles by group. Columns: the controllers, target, theoretical limit, published values,
     status."""
     columns = controllers_of(rows)
