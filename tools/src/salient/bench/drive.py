@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass
 from typing import Any
@@ -156,7 +157,7 @@ class Parameters(MutableMapping[str, float]):
 
     def __getitem__(self, name: str) -> float:
         row = self.row(name)
-        return _access(self._session, "read", row.index)[1] / (1 << row.fraction_bits)
+        return math.ldexp(_access(self._session, "read", row.index)[1], -row.fraction_bits)
 
     def __setitem__(self, name: str, value: float) -> None:
         row = self.row(name)
@@ -178,7 +179,7 @@ class Parameters(MutableMapping[str, float]):
 
 def raw_value(row: ParameterRow, value: float) -> int:
     """Raw integer of a physical value; DriveError when it exceeds 32 bits."""
-    raw = round(value * (1 << row.fraction_bits))
+    raw = round(math.ldexp(value, row.fraction_bits))
     if not -(2**31) <= raw < 2**31:
         raise DriveError(f"{row.name} {value:g}: must be {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
     return raw
@@ -192,7 +193,8 @@ def read_parameter_table(session: Client) -> list[ParameterRow]:
         status, fraction_bits = _access(session, "fraction_bits", index)
         if status != "done":
             return rows
-        limits = (_access(session, what, index)[1] / (1 << fraction_bits) for what in ("minimum", "maximum", "default"))
+        limits = (math.ldexp(_access(session, what, index)[1], -fraction_bits)
+                  for what in ("minimum", "maximum", "default"))
         name, unit = (_read_text(session, what, index) for what in ("name", "unit"))
         rows.append(ParameterRow(index, name, unit, fraction_bits, *limits))
 

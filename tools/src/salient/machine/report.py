@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from salient.errors import UsageError
 from salient.machine.file import Converter, Machine, MachineError, Sensors, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
+from salient.machine.scaling import scaling_of
 
 # Range of the current sensors and of the firmware's tables.
 CURRENT_MAX_A = 80.0
@@ -28,7 +29,7 @@ def run(name_or_path: str, out: Path) -> int:
     try:
         path = machine_path(name_or_path)
         machine = load_machine(path)
-        machine_phase_map(path, machine)
+        machine_phase_map(path, machine, scaling_of(path, machine).exponents)
     except MachineError as error:
         raise UsageError(str(error)) from None
     print("\n".join(describe(machine)))
