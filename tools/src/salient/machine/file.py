@@ -6,19 +6,23 @@ The meaning of the keys: emulator/plant/machine.h.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import create_model
+from pydantic import Field, create_model
 
+from salient.machine.definition import Machine, MachineError
+from salient.machine.drive_data import check
 from salient.machine.flux_map import FluxMap, FluxMapError
 from salient.machine.flux_map_csv import load_flux_map
 from salient.machine.magnetics import FORMULA_KEYS, INDUCTANCES, Formula
+from salient.machine.parameter_table import SAME_UNITS, read_table
 from salient.paths import MACHINES
-from salient.toml_file import Table, TextFileError, checked, number, one_of, read_toml, shown, validate
+from salient.toml_file import Table, TextFileError, checked, number, one_of, option, read_toml, shown, validate
+
+__all__ = ["FORMS", "MAGNETICS", "Converter", "Machine", "MachineError", "MachineFile", "Sensors", "load_machine",
+           "machine_path"]
 
 FORMS = (*FORMULA_KEYS, "map")
 
@@ -83,6 +87,27 @@ class IronLoss(Table):
     steinmetz_beta: Annotated[float, number(1.5, 3.0)]
 
 
+class Drive(Table):
+    """What is left out is derived (drive_data.py)."""
+
+    supply_min_V: Annotated[float, number(1.0, 2000.0)] | None = None
+    supply_max_V: Annotated[float, number(1.0, 2000.0)] | None = None
+    current_rated_A: Annotated[float, number(0.01, 5000.0)] | None = None
+    current_peak_A: Annotated[float, number(0.01, 5000.0)] | None = None
+    torque_rated_Nm: Annotated[float, number(1e-4, 20_000.0)] | None = None
+    torque_peak_Nm: Annotated[float, number(1e-4, 20_000.0)] | None = None
+    speed_base_rpm: Annotated[float, number(1.0, 100_000.0)] | None = None
+    speed_max_rpm: Annotated[float, number(1.0, 100_000.0)] | None = None
+    thermal_time_constant_s: Annotated[float, number(0.1, 100_000.0)] | None = None
+    control_rate_hz: Annotated[int, option("control_rate_hz")] | None = None
+    encoder_bits: Annotated[int, option("encoder_bits")] | None = None
+    encoder_edges: Annotated[bool, option("encoder_edges")] | None = None
+    adc_bits: Annotated[int, option("adc_bits")] | None = None
+    adc_current_A: Annotated[float, number(0.1, 10_000.0)] | None = None
+    adc_voltage_V: Annotated[float, number(1.0, 5000.0)] | None = None
+    parameters: dict[str, Any] = Field(default={})
+
+
 class MapMagnetics(Table):
     form: Annotated[str, one_of(("map",))]
     file: Annotated[str, checked("the name of a .csv file", lambda name: name.isprintable() and name.endswith(".csv"))]
@@ -111,46 +136,10 @@ class MachineFile(Table):
     dc_link: DcLink | None = None
     sensors: Sensors = Sensors()
     iron_loss: IronLoss | None = None
+    drive: Drive = Drive()
 
 
 # --- machine --------------------------------------------------------------------------------------------------------
-
-class MachineError(ValueError):
-    """A machine file that cannot be used; the text is one line that begins with the file."""
-
-
-@dataclass(frozen=True)
-class Machine:
-    """A motor with its converter and sensors, in SI units."""
-
-    name: str
-    stator_poles: int
-    rotor_poles: int
-    phases: int
-    resistance_ohm: float
-    inertia_kg_m2: float
-    friction_Nm_s: float
-    supply_voltage_V: float
-    magnetics: Formula | FluxMap
-    converter: dict[str, float]
-    """Every key of Converter but supply_voltage_V."""
-    dc_link: dict[str, float] | None
-    """Keys of DcLink, those of the chopper only when there is one; None: ideal."""
-    sensors: dict[str, float]
-    """Every key of Sensors."""
-    iron_loss: dict[str, float] | None
-    """Every key of IronLoss; None: no estimate."""
-
-    @property
-    def pitch_rad(self) -> float:
-        """Rotor pole pitch."""
-        return 2.0 * math.pi / self.rotor_poles
-
-    @property
-    def current_rise_A_s(self) -> float:
-        """Current slope at the supply voltage with the rotor unaligned and at rest, A/s."""
-        return self.supply_voltage_V / self.magnetics.unaligned_inductance_H
-
 
 def machine_path(name_or_path: str) -> Path:
     """The file meant by the name of a bundled machine or by a path; MachineError when there is none."""
@@ -176,8 +165,15 @@ def load_machine(path: Path | str) -> Machine:
         magnetics = _magnetics(path, file.magnetics, rotor)
         if file.dc_link is not None:
             _check_chopper(file.dc_link, file.converter.supply_voltage_V)
+        machine = _machine(file, (stator, rotor, phases), magnetics)
+        check(machine)
     except TextFileError as error:
         raise MachineError(f"{path}: {error}") from None
+    return machine
+
+
+def _machine(file: MachineFile, poles: tuple[int, int, int], magnetics: Formula | FluxMap) -> Machine:
+    stator, rotor, phases = poles
     return Machine(
         name=file.name,
         stator_poles=stator,
@@ -191,6 +187,8 @@ def load_machine(path: Path | str) -> Machine:
         dc_link=None if file.dc_link is None else file.dc_link.model_dump(exclude_none=True),
         sensors=file.sensors.model_dump(),
         iron_loss=None if file.iron_loss is None else file.iron_loss.model_dump(),
+        drive=file.drive.model_dump(exclude_none=True, exclude={"parameters"}),
+        drive_parameters=_parameters(file.drive.parameters),
     )
 
 
@@ -212,6 +210,21 @@ def _check_chopper(link: DcLink, supply_voltage_V: float) -> None:
     on_V, off_V = link.chopper_on_V, link.chopper_off_V
     if on_V is not None and off_V is not None and not supply_voltage_V < off_V < on_V:
         raise TextFileError("dc_link.chopper_off_V: must be above converter.supply_voltage_V and below chopper_on_V")
+
+
+def _parameters(table: dict[str, Any]) -> dict[str, float]:
+    """[drive.parameters]: names, and for values whose unit is the same for every machine the ranges of the drive."""
+    rows = {row.name: row for row in read_table()}
+    for name, value in table.items():
+        row = rows.get(name)
+        if row is None:
+            raise TextFileError(f"drive.parameters.{shown(name)}: unknown key; must be one of {', '.join(rows)}")
+        low, high = row.limits if row.unit in SAME_UNITS else (0.0, 1e6)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not low <= value <= high or (row.fraction_bits == 0 and value != int(value)):
+            kind = "a whole number" if row.fraction_bits == 0 else "a number"
+            raise TextFileError(f"drive.parameters.{name}: {shown(value)}: must be {kind} from {low:g} to {high:g}")
+    return {name: float(value) for name, value in table.items()}
 
 
 def _magnetics(path: Path, table: dict[str, Any], rotor_poles: int) -> Formula | FluxMap:
