@@ -216,6 +216,7 @@ def parameter_table(config: BenchConfig) -> list[ParameterRow]:
 def _parameter_table(config: BenchConfig) -> list[ParameterRow]:
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         can = f"unix:{folder}/can.sock"
-        with EmulatorProcess(config, can) as process, Session(can, is_alive=lambda: process.is_alive) as session:
+        with EmulatorProcess(config, can) as process, Session(
+                can, is_alive=lambda: process.is_alive, machine=config.machine) as session:
             session.rig.truth_period_us = 0
             return read_parameter_table(session)

@@ -13,6 +13,8 @@ import cantools
 import numpy as np
 from cantools.database.can import Database, Message
 
+from salient.machine.file import load_machine, machine_path
+from salient.machine.scaling import database_of, scaling_of
 from salient.paths import DRIVE_DBC, RIG_DBC
 
 
@@ -24,9 +26,14 @@ def load_database(path: Path) -> Database:
     return database
 
 
-def drive_database() -> Database:
-    """The drive's DBC."""
-    return load_database(DRIVE_DBC)
+@lru_cache
+def drive_database(machine: str | None = None) -> Database:
+    """The DBC of the drive of a machine, given by name or file, with its factors and ranges; without a machine that in
+    SI units. MachineError."""
+    if machine is None:
+        return load_database(DRIVE_DBC)
+    path = machine_path(machine)
+    return database_of(scaling_of(path, load_machine(path)).dbc())
 
 
 def rig_database() -> Database:

@@ -24,12 +24,14 @@ SHOWN_A = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0)
 SHOWN_PITCHES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 
 
-def run(name_or_path: str, out: Path) -> int:
-    """Checks the file, prints its data sheet and plots its magnetics; returns 0. UsageError."""
+def run(name_or_path: str, out: Path, dbc: Path | None = None) -> int:
+    """Checks the file, prints its data sheet and plots its magnetics; writes the CAN database of its drive to dbc.
+    Returns 0. UsageError."""
     try:
         path = machine_path(name_or_path)
         machine = load_machine(path)
-        machine_phase_map(path, machine, scaling_of(path, machine).exponents)
+        scaling = scaling_of(path, machine)
+        machine_phase_map(path, machine, scaling.exponents)
     except MachineError as error:
         raise UsageError(str(error)) from None
     print("\n".join(describe(machine)))
@@ -40,6 +42,12 @@ def run(name_or_path: str, out: Path) -> int:
     except OSError as error:
         raise UsageError(f"--out {out}: {error.strerror}") from None
     print(f"plot: {plot_path}")
+    if dbc is not None:
+        try:
+            dbc.write_text(scaling.dbc(), encoding="ascii")
+        except OSError as error:
+            raise UsageError(f"--dbc {dbc}: {error.strerror}") from None
+        print(f"CAN database: {dbc}")
     return 0
 
 

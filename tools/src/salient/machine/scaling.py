@@ -11,9 +11,9 @@ The rule, the same for every machine:
 
 - current and voltage: the sensors' full scale is within 80 units of current, 512 of voltage, and above half of it. The
   flux linkage up to the full scale of the current must be below 4 units: otherwise the voltage's unit is larger.
-- torque: torque_peak_Nm is within 40 units, the range of torque_max_Nm, and above 10. The format has 10^7 steps per N m:
-  a finer unit would have no use, and the firmware's thresholds, 1 N m for learning or 0.05 N m for a shortfall, have to
-  suit the machine to a factor of four only.
+- torque: torque_peak_Nm is within 40 units, the range of torque_max_Nm, and above 10. The format has 10^7
+  steps per N m, so that a finer unit would have no use; the firmware's thresholds, such as 1 N m for learning and
+  0.05 N m for a shortfall, suit machines of which the largest has four times the torque of the smallest.
 - speed: over_speed_rpm is within 4800 units of r/min; never below one rad/s, as 2.4e-7 rad/s are fine enough for any.
 """
 
@@ -147,13 +147,14 @@ def _check(data: DriveData, exponents: Exponents, machine: Machine) -> None:
         raise _OutOfRange(f"drive.speed_max_rpm: its limit over_speed_rpm is {data.over_speed_rpm:g} r/min; must be at"
                           f" most {limit:g}")
     rows = {row.name: row for row in read_table()}
-    for key, value in (("inertia_kg_m2", machine.inertia_kg_m2), ("friction_Nm_s", machine.friction_Nm_s)):
-        row = rows[key]
+    values = {f"drive.parameters.{name}": (rows[name], value) for name, value in machine.drive_parameters.items()}
+    values["mechanics.inertia_kg_m2"] = (rows["inertia_kg_m2"], machine.inertia_kg_m2)
+    values["mechanics.friction_Nm_s"] = (rows["friction_Nm_s"], machine.friction_Nm_s)
+    for key, (row, value) in values.items():
         low, high = (math.ldexp(raw, -exponents.fraction_bits(row)) for raw in (row.minimum, row.maximum))
-        if not low * (1.0 - 1e-6) <= value <= high * (1.0 + 1e-6):
-            raise _OutOfRange(
-                f"mechanics.{key}: {value:g}: must be a number from {low:.4g} to {high:.4g}, for a drive of"
-                f" {data.torque_peak_Nm:.3g} N m and {data.speed_max_rpm:.0f} r/min")
+        if not low - 1e-6 * abs(low) <= value <= high + 1e-6 * abs(high):
+            raise _OutOfRange(f"{key}: {value:g}: must be a number from {low:.4g} to {high:.4g}, the range for a machine"
+                              f" of {data.torque_peak_Nm:.3g} N m and {data.speed_max_rpm:.0f} r/min")
 
 
 # --- CAN database ---------------------------------------------------------------------------------------------------
@@ -169,21 +170,21 @@ def drive_dbc(exponents: Exponents, speed_reference_max_rpm: float) -> str:
     for line in DRIVE_DBC.read_text(encoding="ascii").splitlines(keepends=True):
         if found := _MESSAGE_LINE.match(line):
             message = found[1]
-        elif found := _SIGNAL_LINE.match(line):
-            head, name, factor, offset, low, high, tail, unit = found.groups()
-            line = _signal_line(head, exponents.of_unit(unit), (factor, offset, low, high), tail) + "\n"
-            if (message, name) == (_COMMAND, _COMMAND_SIGNAL):
-                scaled = Fraction(factor) * Fraction(2) ** exponents.speed
-                limit = _plain(scaled * math.floor(Fraction(speed_reference_max_rpm) / scaled))
-                line = re.sub(r"\[[^]]*\]", f"[-{limit}|{limit}]", line)
-        lines.append(line)
+        found = _SIGNAL_LINE.match(line)
+        lines.append(_signal_line(message, found, exponents, speed_reference_max_rpm) if found else line)
     return "".join(lines)
 
 
-def _signal_line(head: str, exponent: int, numbers: tuple[str, ...], tail: str) -> str:
+def _signal_line(message: str, line: re.Match[str], exponents: Exponents, speed_reference_max_rpm: float) -> str:
+    """The line of a signal of a message, with its factor, offset and range in the units."""
+    head, name, *numbers, tail, unit = line.groups()
+    exponent = exponents.of_unit(unit)
     factor, offset, low, high = (_plain(Fraction(number) * Fraction(2) ** exponent) if exponent else number
                                  for number in numbers)
-    return f"{head}({factor},{offset}) [{low}|{high}] {tail}"
+    if (message, name) == (_COMMAND, _COMMAND_SIGNAL):
+        high = _plain(Fraction(factor) * math.floor(Fraction(speed_reference_max_rpm) / Fraction(factor)))
+        low = f"-{high}"
+    return f"{head}({factor},{offset}) [{low}|{high}] {tail}\n"
 
 
 def _plain(number: Fraction) -> str:
