@@ -206,8 +206,8 @@ def _number(value: float) -> str:
 
 def instantiation_token(machine: Machine, sources: list[Path]) -> str:
     """Hash of the contents of the unit; `sources` in any order, their folders do not matter."""
-    source = plant_source(machine, scaling_of(machine.name, machine))
-    digest = hashlib.sha256(description(machine, "") + source.encode())
+    plant = plant_source(machine, scaling_of(machine.name, machine))
+    digest = hashlib.sha256(description(machine, "") + plant.encode())
     for source in sorted(sources, key=lambda path: path.name):
         digest.update(source.name.encode() + b"\0" + source.read_bytes())
     return digest.hexdigest()

@@ -71,8 +71,8 @@ class DcLink(Table):
 class Sensors(Table):
     current_gain: Annotated[float, number(0.0, 10.0)] = 1.0
     current_offset_A: Annotated[float, number(-100.0, 100.0)] = 0.0
-    current_noise_A: Annotated[float, number(0.0, 100.0)] = 0.0
-    current_limit_A: Annotated[float, number(0.1, 10_000.0)] = 10_000.0
+    current_noise_A: Annotated[float, number(0.0, 80.0)] = 0.0
+    current_limit_A: Annotated[float, number(0.1, 8000.0)] = 8000.0
     current_delay_ns: Annotated[float, number(0.0, 8000.0)] = 0.0
     encoder_eccentricity_deg: Annotated[float, number(0.0, 5.0)] = 0.0
 

@@ -153,7 +153,7 @@ def _check(data: DriveData, exponents: Exponents, machine: Machine) -> None:
     for key, (row, value) in values.items():
         low, high = (math.ldexp(raw, -exponents.fraction_bits(row)) for raw in (row.minimum, row.maximum))
         if not low - 1e-6 * abs(low) <= value <= high + 1e-6 * abs(high):
-            raise _OutOfRange(f"{key}: {value:g}: must be a number from {low:.4g} to {high:.4g}, the range for a machine"
+            raise _OutOfRange(f"{key}: {value:g}: must be a number from {low:.4g} to {high:.4g}, for a machine"
                               f" of {data.torque_peak_Nm:.3g} N m and {data.speed_max_rpm:.0f} r/min")
 
 
