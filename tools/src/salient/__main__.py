@@ -109,7 +109,7 @@ def _compare(options: argparse.Namespace) -> int:
 def _machine(options: argparse.Namespace) -> int:
     from salient.machine.report import run
 
-    return run(options.machine, options.out, options.dbc)
+    return run(options.machine, options.out, options.json, options.dbc)
 
 
 def _pil(options: argparse.Namespace) -> int:

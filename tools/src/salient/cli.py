@@ -87,10 +87,12 @@ def make_parser() -> argparse.ArgumentParser:
     _add_compare_options(command("compare", "the controllers compared with each other, their targets and an earlier "
                                  "run"))
 
-    machine = command("machine", "check a machine file, summarise it, draw its magnetics")
+    machine = command("machine", "check a machine file, summarise it, list what follows for its drive, draw its "
+                      "magnetics")
     machine.add_argument("machine", metavar="NAME|FILE")
     machine.add_argument("--out", type=Path, default=Path("out/machine"), metavar="DIR",
                          help="folder of the plot (default out/machine)")
+    machine.add_argument("--json", type=Path, metavar="FILE", help="also write the drive's data to a file")
     machine.add_argument("--dbc", type=Path, metavar="FILE.dbc",
                          help="also write the CAN database of its drive, with the factors and ranges of this machine")
 

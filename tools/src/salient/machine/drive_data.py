@@ -159,11 +159,10 @@ def _derive_ratings(machine: Machine, data: _Values) -> None:
 
     rise_A = maximum_V / magnetics.unaligned_inductance_H / rate_hz
     data.add("adc_current_A", "A",
-             _full_scale(80.0, max(1.25 * peak_A, 1.1 * peak_A + 1.5 * rise_A) / 0.9375),
-             "80 * 2^a A with 15/16 of it above 1.25 current_peak_A and 1.1 current_peak_A + 1.5 V Ts / Lu")
+             max(1.5 * peak_A, 1.1 * peak_A + 2.2 * rise_A) / 0.9375,
+             "16/15 max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu)")
     over_V, _ = _over_voltage(machine, maximum_V)
-    data.add("adc_voltage_V", "V", _full_scale(512.0, 1.02 * over_V),
-             "512 * 2^v V, at least 1.02 bus_over_voltage_V")
+    data.add("adc_voltage_V", "V", 1.25 * over_V, "1.25 bus_over_voltage_V")
     data.add("torque_step_Nm", "N m",
              maximum_V / rate_hz * torque_per_flux_Nm_Wb(magnetics, 0.5 * peak_A),
              "supply_max_V Ts dT/dpsi at half of current_peak_A")
@@ -197,11 +196,6 @@ def _base_speed_rpm(machine: Machine, voltage_V: float, current_A: float) -> flo
     left_V = max(voltage_V - machine.resistance_ohm * current_A, 0.1 * voltage_V)
     flux_Wb = float(machine.magnetics.flux_linkage_Wb(0.0, current_A))
     return left_V * overlap_rad / flux_Wb * _RPM
-
-
-def _full_scale(unit: float, least: float) -> float:
-    """The smallest unit * 2^n that is at least `least`."""
-    return unit * 2.0 ** math.ceil(math.log2(least / unit))
 
 
 def _over_voltage(machine: Machine, supply_max_V: float) -> tuple[float, str]:
@@ -245,8 +239,8 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
     return {
         "torque_max_Nm": (peak_Nm, "torque_peak_Nm"),
         "current_limit_A": (peak_A, "current_peak_A"),
-        "current_trip_A": (min(0.9375 * data["adc_current_A"], max(1.45 * peak_A, 1.1 * peak_A + 2.2 * rise_A)),
-                           "max(1.45 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), at most 15/16 of "
+        "current_trip_A": (min(0.9375 * data["adc_current_A"], max(1.5 * peak_A, 1.1 * peak_A + 2.2 * rise_A)),
+                           "max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), at most 15/16 of "
                            "adc_current_A"),
         "bus_over_voltage_V": (over_V, over_V_formula),
         "bus_under_voltage_V": (0.625 * data["supply_min_V"], "0.625 supply_min_V"),
@@ -257,7 +251,8 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
                                  "max(torque_rated_Nm / 16, torque_step_Nm / 4)"),
         "speed_kp": (kp, "min(400/s * inertia, torque_peak_Nm / 1.5 % of speed_base_rpm)"),
         "speed_ki": (50.0 * kp, "50/s * speed_kp"),
-        "smc_k": (min(0.0275 / period_s, 10_000.0), "0.0275 / Ts"),
+        "smc_k": (min(max(0.0275 / period_s, 36.0 * peak_Nm / (inertia * base_rad_s)), 0.1 / period_s),
+                  "max(0.0275 / Ts, 36 torque_peak_Nm / (inertia * speed_base_rpm)), at most 0.1 / Ts"),
         "observer_bandwidth_rad_s": (min(0.025 / period_s, 8000.0), "0.025 / Ts"),
         "observer_wake_rad_s": (min(0.225 / period_s, 10_000.0), "0.225 / Ts, at most 10000"),
         "observer_moving_rad_s": (min(0.045 / period_s, 10_000.0), "0.045 / Ts, at most 10000"),
