@@ -12,7 +12,7 @@ from salient.paths import MACHINES, ROOT
 
 OTHERS = ROOT / "tests" / "machines"
 
-# Exponents of a similar machine's units: current a, voltage and flux linkage v, torque a + v. Powers by the end of a key.
+# Powers of 2^a and 2^v of a key, by its end.
 UNITS = {"_ohm": (-1, 1), "_H": (-1, 1), "_V": (0, 1), "_Wb": (0, 1), "_A": (1, 0), "_Nm": (1, 1), "_kg_m2": (1, 1),
          "_Nm_s": (1, 1)}
 
@@ -29,9 +29,10 @@ def similar_file(name: str, a: int, v: int, folder: Path) -> Path:
         for key, value in content.items():
             powers = [power for end, power in UNITS.items() if key.endswith(end) and isinstance(value, float)]
             if powers:
-                ((of_a, of_v),) = powers if len(powers) == 1 else powers[-1:]
-                value = math.ldexp(value, a * of_a + v * of_v)
-            lines.append(f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}")
+                of_a, of_v = powers[-1]
+                lines.append(f"{key} = {math.ldexp(value, a * of_a + v * of_v)!r}")
+            else:
+                lines.append(f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}")
     file = folder / f"similar_{a + 8}_{v + 8}.toml"
     file.write_text("\n".join(lines) + "\n")
     return file

@@ -73,8 +73,8 @@ def test_no_derived_default_is_beyond_the_range_of_its_parameter(name):
 @pytest.mark.parametrize(("old", "new", "text"), [
     ("inertia_kg_m2 = 4.0", "inertia_kg_m2 = 200.0",
      r"mechanics\.inertia_kg_m2: 200: must be a number from 0\.0064 to 121\.6, for a machine of 2e\+03 N m and "),
-    ("inertia_kg_m2 = 4.0", "inertia_kg_m2 = 0.001", r"mechanics\.inertia_kg_m2: 0\.001: must be a number from 0\.0064"),
-    ("friction_Nm_s = 0.5", "friction_Nm_s = 200.0", r"mechanics\.friction_Nm_s: 200: must be a number from 0 to 121\.6"),
+    ("inertia_kg_m2 = 4.0", "inertia_kg_m2 = 0.001", r"mechanics\.inertia_kg_m2: 0\.001: must be a number from 0\.006"),
+    ("friction_Nm_s = 0.5", "friction_Nm_s = 200.0", r"mechanics\.friction_Nm_s: 200: must be a number from 0 to 121"),
     ("torque_peak_Nm = 2000.0", "torque_peak_Nm = 2000.0\n[drive.parameters]\ntorque_max_Nm = 3000.0",
      r"drive\.parameters\.torque_max_Nm: 3000: must be a number from 0 to 2560, "),
 ])
