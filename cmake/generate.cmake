@@ -76,9 +76,9 @@ function(salient_add_machines)
         add_custom_command(
             OUTPUT ${out}/machine_tables.c ${out}/machine_plant.c
             COMMAND ${SALIENT_GENERATOR} salient.generate.machine ${file} ${out}
-            DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate/machine.py
-                    ${SALIENT_GENERATOR_SOURCES}/generate/files.py ${generator_sources}
-            DEPFILE ${out}/machine.d # of a map: its CSV file
+            DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate/machine.py ${SALIENT_CODEC_GENERATOR}
+                    ${generator_sources}
+            DEPFILE ${out}/machine.d # parameters, DBC, of a map: its CSV file
             COMMENT "machine ${name}"
             VERBATIM)
         add_library(${name}_tables OBJECT ${out}/machine_tables.c)

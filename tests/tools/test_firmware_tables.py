@@ -22,6 +22,7 @@ from salient.machine.firmware_tables import (
     machine_phase_map,
     phase_map,
 )
+from salient.machine.scaling import Exponents
 from salient.paths import MACHINES
 
 POLES = 4
@@ -336,4 +337,4 @@ def test_flux_linkage_beyond_its_format_is_an_error_that_names_the_file(tmp_path
     path = tmp_path / "inductive.toml"
     path.write_text(text.replace("23.6e-3", "60e-3"), encoding="utf-8")
     with pytest.raises(MachineError, match=r"inductive\.toml: magnetics: the flux linkage .* it must be below 4 Wb$"):
-        machine_phase_map(path, load_machine(path))
+        machine_phase_map(path, load_machine(path), Exponents())

@@ -21,7 +21,8 @@ constexpr int SEQUENCES = 6000;
 constexpr int PERIODS = 400;
 
 // Any value of the row's range; its ends and its default more often.
-int32_t any_value(const parameter_row_t *row, std::mt19937_64 &random) {
+int32_t any_value(unsigned index, std::mt19937_64 &random) {
+    const parameter_row_t *row = parameters_row(index);
     switch (random() % 8) {
     case 0:
         return row->minimum;
@@ -29,7 +30,7 @@ int32_t any_value(const parameter_row_t *row, std::mt19937_64 &random) {
         return row->maximum;
     case 2:
     case 3:
-        return row->default_value;
+        return changeable_tables.parameter_default[index];
     default:
         return int32_t(row->minimum + int64_t(random() % (uint64_t(int64_t(row->maximum) - row->minimum) + 1)));
     }
@@ -98,7 +99,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
         parameters_t p;
         parameters_init(&p);
         for (unsigned index = 0; index < PARAMETER_COUNT; index++) {
-            ASSERT_EQ(parameters_set(&p, index, any_value(parameters_row(index), random)), PARAMETER_STATUS_DONE);
+            ASSERT_EQ(parameters_set(&p, index, any_value(index, random)), PARAMETER_STATUS_DONE);
         }
         const uint32_t rate_hz = rates_hz[random() % 4];
         const control_parameters_t parameters =

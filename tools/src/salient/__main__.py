@@ -91,7 +91,7 @@ def _log(options: argparse.Namespace) -> int:
 def _monitor(options: argparse.Namespace) -> int:
     from salient.bus.monitor import monitor
 
-    return monitor(options.can, options.every_s, options.duration_s)
+    return monitor(options.can, options.every_s, options.duration_s, options.machine)
 
 
 def _benchmark(options: argparse.Namespace) -> int:
@@ -109,7 +109,7 @@ def _compare(options: argparse.Namespace) -> int:
 def _machine(options: argparse.Namespace) -> int:
     from salient.machine.report import run
 
-    return run(options.machine, options.out, options.json)
+    return run(options.machine, options.out, options.json, options.dbc)
 
 
 def _pil(options: argparse.Namespace) -> int:

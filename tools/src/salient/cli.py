@@ -76,6 +76,8 @@ def make_parser() -> argparse.ArgumentParser:
     monitor.add_argument("--every-s", type=_positive, default=0.1, metavar="X",
                          help="period in virtual time (default 0.1)")
     monitor.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
+    monitor.add_argument("--machine", type=_option_type("machine"), default=DEFAULTS["machine"],
+                         metavar=OPTIONS["machine"].metavar, help=description("machine"))
 
     benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
                         "ngspice; effect of the network")
@@ -91,6 +93,8 @@ def make_parser() -> argparse.ArgumentParser:
     machine.add_argument("--out", type=Path, default=Path("out/machine"), metavar="DIR",
                          help="folder of the plot (default out/machine)")
     machine.add_argument("--json", type=Path, metavar="FILE", help="also write the drive's data to a file")
+    machine.add_argument("--dbc", type=Path, metavar="FILE.dbc",
+                         help="also write the CAN database of its drive, with the factors and ranges of this machine")
 
     pil = command("pil", "processor in the loop: a scenario on the target, and its load on the processor")
     task = pil.add_mutually_exclusive_group(required=True)

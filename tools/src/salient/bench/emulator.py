@@ -22,6 +22,7 @@ from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.machine.file import MachineError, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
+from salient.machine.scaling import scaling_of
 from salient.paths import BUILD, MACHINES, ROOT
 
 
@@ -83,7 +84,7 @@ def _programs(machine: str, build: str) -> list[Path]:
         checked = load_machine(path)
         is_bundled = path.parent == MACHINES
         if not is_bundled:
-            machine_phase_map(path, checked)  # or the build would fail
+            machine_phase_map(path, checked, scaling_of(path, checked).exponents)  # or the build would fail
     except MachineError as error:
         raise UsageError(str(error)) from None
     names = {build: f"salient_{path.stem}"}
@@ -215,6 +216,7 @@ def parameter_table(config: BenchConfig) -> list[ParameterRow]:
 def _parameter_table(config: BenchConfig) -> list[ParameterRow]:
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         can = f"unix:{folder}/can.sock"
-        with EmulatorProcess(config, can) as process, Session(can, is_alive=lambda: process.is_alive) as session:
+        with EmulatorProcess(config, can) as process, Session(
+                can, is_alive=lambda: process.is_alive, machine=config.machine) as session:
             session.rig.truth_period_us = 0
             return read_parameter_table(session)

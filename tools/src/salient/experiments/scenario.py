@@ -45,9 +45,9 @@ from pydantic import create_model
 from salient.bench.bench import Bench
 from salient.bench.drive import DriveError, write_request
 from salient.bench.emulator import executable, parameter_table
-from salient.bench.rig import bench_variables
+from salient.bench.rig import bench_variables, variable_range
 from salient.bus.log import write_logs
-from salient.bus.signals import SignalTable, drive_database, signal_range
+from salient.bus.signals import SignalTable, drive_database
 from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
 from salient.errors import UsageError
 from salient.experiments.metrics import losses
@@ -267,12 +267,12 @@ _Time = Annotated[float, number(0.0, 3600.0)]
 
 class _SpeedTable(Table):
     at_s: _Time
-    value_rpm: Annotated[float, number(-3000.0, 3000.0)]
+    value_rpm: Annotated[float, number(-38_400.0, 38_400.0)]
 
 
 class _LoadTable(Table):
     at_s: _Time
-    torque_Nm: Annotated[float, number(-200.0, 200.0)]
+    torque_Nm: Annotated[float, number(-10_000.0, 10_000.0)]
 
 
 class _RecordTable(Table):
@@ -283,8 +283,8 @@ class _RecordTable(Table):
 @lru_cache
 def _scenario_file() -> type[Table]:
     """The model of a file; the ranges of [bench] are those of rig.dbc."""
-    variables: dict[str, Any] = {name: (Annotated[float, number(*signal_range(signal))], None)
-                                 for name, signal in bench_variables().items()}
+    variables: dict[str, Any] = {name: (Annotated[float, number(*variable_range(name))], None)
+                                 for name in bench_variables()}
     bench = create_model("bench", __base__=Table, **variables)
     kinds = get_type_hints(Conditions)
     options: dict[str, Any] = {name: (Annotated[kinds[name], option(name)], DEFAULTS[name])

@@ -11,19 +11,24 @@ from pathlib import Path
 
 import numpy as np
 
+from salient.dbc import database_hash
+from salient.generate.codec import raw_range
 from salient.generate.files import write_files
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.firmware_tables import CURRENT_A, NODE_OFFSET, PhaseMap, Surface, machine_phase_map
 from salient.machine.flux_map import FluxMap
+from salient.machine.parameter_table import TABLE
+from salient.machine.scaling import LOAD_TORQUE_RANGE_NM, Scaling, database_of, scaling_of
+from salient.paths import DRIVE_DBC
 
 
 def quantise(value: float, fraction_bits: int, bits: int) -> int:
     """Nearest integer of `value` in a signed format, saturated to `bits`."""
     limit = 1 << (bits - 1)
-    return max(-limit, min(limit - 1, math.floor(value * (1 << fraction_bits) + 0.5)))
+    return max(-limit, min(limit - 1, math.floor(math.ldexp(value, fraction_bits) + 0.5)))
 
 
-def tables_source(machine: Machine, tables: PhaseMap) -> str:
+def tables_source(machine: Machine, scaling: Scaling, tables: PhaseMap) -> str:
     """C source of the firmware's tables."""
     return "\n".join(
         [
@@ -33,10 +38,7 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
             "const machine_tables_t machine_tables = {",
             f"    .phases = {machine.phases},",
             f"    .rotor_poles = {machine.rotor_poles},",
-            f"    .inertia_q30 = {quantise(machine.inertia_kg_m2, 30, 32)},",
-            f"    .friction_q30 = {quantise(machine.friction_Nm_s, 30, 32)},",
-            f"    .resistance_q24 = {quantise(machine.resistance_ohm, 24, 32)},",
-            f"    .current_slew_rate_A_s = {quantise(machine.current_rise_A_s, 0, 32)},",
+            *(f"    .{name} = {value}," for name, value in scalars(machine, scaling).items()),
             "    .row = {",
             *(f"        {{{start}u, {reciprocal}u}}," for start, reciprocal in tables.rows()),
             "    },",
@@ -50,10 +52,27 @@ def tables_source(machine: Machine, tables: PhaseMap) -> str:
             *_column_lines(*(np.pad(surface.curvature, ((0, 1), (0, 0)))
                              for surface in (tables.torque_per_ampere, tables.flux_per_ampere))),
             "    },",
+            f"    .parameter_default = {{{', '.join(map(str, scaling.raw_parameters()))}}},",
+            f"    .parameter_fraction_bits = {{{', '.join(map(str, scaling.fraction_bits()))}}},",
             "};",
             "",
         ]
     )
+
+
+def scalars(machine: Machine, scaling: Scaling) -> dict[str, int]:
+    """Members of machine_tables_t that are single numbers of the machine's units and its bus."""
+    exponents, data = scaling.exponents, scaling.data
+    database = database_of(scaling.dbc())
+    reference = database.get_message_by_name("DRIVE_COMMAND").get_signal_by_name("speed_reference_rpm")
+    return {
+        "speed_exponent": exponents.speed,
+        "current_range_q9": quantise(data.adc_current_A, 9 - exponents.current, 17),
+        "voltage_range_q6": quantise(data.adc_voltage_V, 6 - exponents.voltage, 17),
+        "current_slew_rate_A_s": quantise(machine.current_rise_A_s, -exponents.current, 32),
+        "speed_reference_max": raw_range(reference)[1],
+        "dbc_hash": database_hash(database),
+    }
 
 
 def _format_lines(name: str, surface: Surface) -> list[str]:
@@ -74,7 +93,16 @@ def _listed(values: np.ndarray) -> str:
     return ", ".join(map(str, values.tolist()))
 
 
-def plant_source(machine: Machine) -> str:
+def sensor_ranges(scaling: Scaling) -> dict[str, float]:
+    """Members of the emulator's sensor_ranges_t."""
+    return {
+        "current_A": scaling.data.adc_current_A,
+        "dc_link_V": scaling.data.adc_voltage_V,
+        "load_torque_Nm": math.ldexp(LOAD_TORQUE_RANGE_NM, scaling.exponents.torque),
+    }
+
+
+def plant_source(machine: Machine, scaling: Scaling) -> str:
     """C source of the emulator's machine, every number to the last bit."""
     magnetics = machine.magnetics
     if isinstance(magnetics, FluxMap):
@@ -112,6 +140,9 @@ def plant_source(machine: Machine) -> str:
             "    .sensors = {",
             *_members(machine.sensors),
             "    },",
+            "    .ranges = {",
+            *_members(sensor_ranges(scaling)),
+            "    },",
             "};",
             "",
         ]
@@ -140,13 +171,14 @@ def machine_files(file: str, folder: Path) -> dict[str, str]:
     """Contents of machine_tables.c, machine_plant.c and their dependency file machine.d, to be written to `folder`;
     MachineError."""
     machine = load_machine(file)
+    scaling = scaling_of(file, machine)
     sources = {
-        "machine_tables.c": tables_source(machine, machine_phase_map(file, machine)),
-        "machine_plant.c": plant_source(machine),
+        "machine_tables.c": tables_source(machine, scaling, machine_phase_map(file, machine, scaling.exponents)),
+        "machine_plant.c": plant_source(machine, scaling),
     }
     outputs = " ".join(_escaped(folder / name) for name in sources)
     # Never empty: CMake drops a dependency file without inputs, and Ninja would regenerate on every build.
-    inputs = [Path(file).resolve()]
+    inputs = [Path(file).resolve(), TABLE, DRIVE_DBC]
     if isinstance(machine.magnetics, FluxMap) and machine.magnetics.file is not None:
         inputs.append(machine.magnetics.file)
     return sources | {"machine.d": f"{outputs}: {' '.join(map(_escaped, inputs))}\n"}

@@ -33,8 +33,8 @@ _PHASES = {(6, 4): 3, (8, 6): 4, (12, 8): 3}
 
 # --- tables ---------------------------------------------------------------------------------------------------------
 
-# The ranges are wide enough for any machine that the number formats of the firmware can carry (inertia and friction are
-# Q1.30 there). Defaults are those of ideal devices and sensors.
+# The ranges are those of machines from 0.05 to 2000 N m and 12 to 1000 V, and more; whether inertia and friction suit a
+# machine's units in the firmware is checked with them (scaling.py). Defaults are those of ideal devices and sensors.
 
 class Poles(Table):
     stator: Any
@@ -42,16 +42,16 @@ class Poles(Table):
 
 
 class Winding(Table):
-    resistance_ohm: Annotated[float, number(1e-4, 100.0)]
+    resistance_ohm: Annotated[float, number(1e-5, 100.0)]
 
 
 class Mechanics(Table):
-    inertia_kg_m2: Annotated[float, number(1e-4, 1.9)]
-    friction_Nm_s: Annotated[float, number(0.0, 1.9)]
+    inertia_kg_m2: Annotated[float, number(1e-9, 1000.0)]
+    friction_Nm_s: Annotated[float, number(0.0, 1000.0)]
 
 
 class Converter(Table):
-    supply_voltage_V: Annotated[float, number(10.0, 500.0)]
+    supply_voltage_V: Annotated[float, number(5.0, 1500.0)]
     switch_drop_V: Annotated[float, number(0.0, 5.0)] = 0.0
     switch_resistance_ohm: Annotated[float, number(0.0, 1.0)] = 0.0
     diode_drop_V: Annotated[float, number(0.0, 5.0)] = 0.0
@@ -65,15 +65,15 @@ class DcLink(Table):
     capacitance_F: Annotated[float, number(1e-5, 1.0)]
     source_resistance_ohm: Annotated[float, number(0.001, 10.0)]
     chopper_resistance_ohm: Annotated[float, number(0.1, 1000.0)] | None = None
-    chopper_on_V: Annotated[float, number(10.0, 510.0)] | None = None
-    chopper_off_V: Annotated[float, number(10.0, 510.0)] | None = None
+    chopper_on_V: Annotated[float, number(5.0, 2000.0)] | None = None
+    chopper_off_V: Annotated[float, number(5.0, 2000.0)] | None = None
 
 
 class Sensors(Table):
     current_gain: Annotated[float, number(0.0, 10.0)] = 1.0
-    current_offset_A: Annotated[float, number(-10.0, 10.0)] = 0.0
-    current_noise_A: Annotated[float, number(0.0, 10.0)] = 0.0
-    current_limit_A: Annotated[float, number(0.1, 1000.0)] = 1000.0
+    current_offset_A: Annotated[float, number(-100.0, 100.0)] = 0.0
+    current_noise_A: Annotated[float, number(0.0, 80.0)] = 0.0
+    current_limit_A: Annotated[float, number(0.1, 8000.0)] = 8000.0
     current_delay_ns: Annotated[float, number(0.0, 8000.0)] = 0.0
     encoder_eccentricity_deg: Annotated[float, number(0.0, 5.0)] = 0.0
 
