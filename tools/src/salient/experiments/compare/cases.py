@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from salient.config import CONTROLLERS
+from salient.experiments.compare import every_machine
 from salient.experiments.compare.metrics import STEADY_S
 from salient.experiments.metrics import RIPPLE_WINDOW_S
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
@@ -244,6 +246,11 @@ def _robustness(quick: bool) -> Iterator[Case]:
                                   f"drive {number:03}")
 
 
+def _machines(quick: bool) -> Iterator[Case]:
+    for scenario in every_machine.scenarios(quick):
+        yield Case("machines", Path(scenario.machine).stem, scenario.controller, "every_machine", scenario)
+
+
 def random_drive(number: int) -> Scenario:
     """A drive and bench of the robustness study, reproducible by number: start to 150 r/min (even numbers) or
     600 r/min, then 8 N m."""
@@ -295,6 +302,10 @@ GROUPS: dict[str, Group] = {
                          ("cycle_percent", "median"), ("cycle_percent", "worst")), long=True),
 }
 
+GROUPS["machines"] = Group(
+    "machines of all sizes: start to 0.4 of the base speed, half of the rated torque at a quarter of it, reversal",
+    _machines, (("start_to_bound", ""), ("brake_to_bound", ""), ("reverse_to_bound", ""), ("late_s", ""),
+                ("dip_percent", ""), ("recovery_time_s", ""), ("hold_percent", ""), ("ripple", "")), long=True)
 TITLES = {name: group.title for name, group in GROUPS.items()}
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from salient.experiments import metrics
+from salient.experiments.compare import every_machine
 from salient.experiments.scaled import scale_of_name
 from salient.experiments.scenario import Scenario
 from salient.machine.definition import Machine
@@ -66,6 +67,12 @@ METRICS = {
     "peak_current_A": Metric("peak phase current", "A", 1, 0.5),
     "highest_speed_percent": Metric("maximum speed", "% of reference", 2, 0.05, reference=100.0),
     "cycle_percent": Metric("limit cycle", "% of torque", 3, 0.05),
+    "start_to_bound": Metric("time of the start", "of its bound", 3, 0.01),
+    "brake_to_bound": Metric("time of the braking", "of its bound", 3, 0.01),
+    "reverse_to_bound": Metric("time of the reversal", "of its bound", 3, 0.01),
+    "late_s": Metric("latest beyond 1.1 times the bound or 2 ms", "ms", 2, 0.1, 1e3),
+    "dip_percent": Metric("speed drop", "%", 2, 0.05),
+    "hold_percent": Metric("mean speed error", "%", 4, 0.002),
     "failed": Metric("failed drives", "", 0, 0.5),
     "step_angle_deg": Metric("rotor angle at the step", "deg", 2, 0.2),
 }
@@ -144,6 +151,11 @@ def robustness_metrics(scenario: Scenario, recording: np.ndarray, window_s: Wind
     }
 
 
+def every_machine_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """A run of every_machine.py."""
+    return every_machine.extract(scenario, recording)
+
+
 EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "ripple": ripple_metrics,
     "late_ripple": late_ripple_metrics,
@@ -152,6 +164,7 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "moving": moving_metrics,
     "step_and_ripple": step_and_ripple_metrics,
     "robustness": robustness_metrics,
+    "every_machine": every_machine_metrics,
 }
 
 

@@ -15,6 +15,7 @@ from can import CanError
 from salient.bench.drive import DriveError
 from salient.bench.emulator import EmulatorError
 from salient.bench.session import SessionError
+from salient.experiments.compare import every_machine
 from salient.experiments.compare.cases import Case
 from salient.experiments.compare.metrics import EXTRACTORS, Metrics, failures, peak_current_max_A
 from salient.experiments.metrics import MetricsError
@@ -85,6 +86,8 @@ def _run(case: Case) -> tuple[Metrics, str, Any]:
         if case.extractor == "robustness":
             machine = load_machine(machine_path(case.scenario.machine))
             failed = "; ".join(failures(metrics, peak_current_max_A(machine)))
+        if case.extractor == "every_machine":
+            failed = "; ".join(every_machine.failures(metrics, case.controller))
         return metrics, failed, _trace(case, result.recording) if case.traced else None
 
 
