@@ -339,7 +339,8 @@ CONTRADICTIONS: list[tuple[dict[str, str], str, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("keys", "first", "second"), CONTRADICTIONS, ids=[" ".join(keys) for keys, _, _ in CONTRADICTIONS])
+@pytest.mark.parametrize(("keys", "first", "second"), CONTRADICTIONS,
+                         ids=[" ".join(keys) for keys, _, _ in CONTRADICTIONS])
 def test_contradictory_data_of_the_drive_are_refused_by_a_line_that_names_both(
         tmp_path: Path, keys: dict[str, str], first: str, second: str) -> None:
     text = rejection(write(tmp_path, drive(**keys)))
