@@ -24,8 +24,9 @@ import numpy as np
 from can import CanError
 
 from salient.bench.drive import DriveError
-from salient.bench.emulator import EmulatorError, executable
+from salient.bench.programs import EmulatorError, command_line
 from salient.bench.session import SessionError
+from salient.config import BenchConfig
 from salient.errors import UsageError
 from salient.experiments import metrics, plots
 from salient.experiments.report import METRIC_ROWS, captions, format_metric, format_published, write_report
@@ -146,7 +147,7 @@ def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
     scenarios = {experiment: [replace(scenario, **changes)
                               for scenario in load_scenarios(SCENARIOS / f"{experiment}.toml")]
                  for experiment in EXPERIMENTS}
-    executable(scenarios["start_600"][0].machine, options.build)
+    command_line(BenchConfig(machine=scenarios["start_600"][0].machine, build=options.build))  # checks the machine
     return scenarios
 
 

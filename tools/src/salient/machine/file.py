@@ -17,7 +17,8 @@ from pydantic import create_model
 from salient.machine.flux_map import FluxMap, FluxMapError
 from salient.machine.flux_map_csv import load_flux_map
 from salient.machine.magnetics import FORMULA_KEYS, INDUCTANCES, Formula
-from salient.paths import MACHINES
+from salient.machine.path import MachineError as MachineError  # noqa: PLC0414 - for users of load_machine
+from salient.machine.path import machine_path as machine_path  # noqa: PLC0414
 from salient.toml_file import Table, TextFileError, checked, number, one_of, read_toml, shown, validate
 
 FORMS = (*FORMULA_KEYS, "map")
@@ -115,10 +116,6 @@ class MachineFile(Table):
 
 # --- machine --------------------------------------------------------------------------------------------------------
 
-class MachineError(ValueError):
-    """A machine file that cannot be used; the text is one line that begins with the file."""
-
-
 @dataclass(frozen=True)
 class Machine:
     """A motor with its converter and sensors, in SI units."""
@@ -150,20 +147,6 @@ class Machine:
     def current_rise_A_s(self) -> float:
         """Current slope at the supply voltage with the rotor unaligned and at rest, A/s."""
         return self.supply_voltage_V / self.magnetics.unaligned_inductance_H
-
-
-def machine_path(name_or_path: str) -> Path:
-    """The file meant by the name of a bundled machine or by a path; MachineError when there is none."""
-    bundled, path = MACHINES / f"{name_or_path}.toml", Path(name_or_path)
-    try:
-        if bundled.is_file():
-            return bundled
-        if path.is_file():
-            return path.resolve()
-    except OSError:
-        pass  # a name too long for a file: there is none
-    names = ", ".join(sorted(p.stem for p in MACHINES.glob("*.toml")))
-    raise MachineError(f"machine {shown(name_or_path)}: no such file, and no bundled machine of that name ({names})")
 
 
 def load_machine(path: Path | str) -> Machine:
