@@ -13,7 +13,7 @@ from typing import Any, TextIO
 from can import CanError
 
 from salient.bench.drive import DriveError
-from salient.bench.emulator import EmulatorError
+from salient.bench.programs import EmulatorError
 from salient.bench.session import SessionError
 from salient.experiments.compare.cases import RIPPLE_FROM_S, Case
 from salient.experiments.compare.metrics import EXTRACTORS, SHORT_WINDOW_S, Metrics, failures
