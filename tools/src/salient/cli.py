@@ -150,6 +150,8 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     """The groups are checked by salient.experiments.compare.command, which defines them."""
     parser.add_argument("groups", nargs="*", metavar="GROUP", help="measurements (default all but the long ones)")
     parser.add_argument("--list", action="store_true", help="list the groups")
+    parser.add_argument("--machine", metavar="NAME|FILE", help="of one machine only, its speeds fractions of its base "
+                        "speed and its loads of its rated torque, as those of the paper's machine")
     parser.add_argument("--quick", action="store_true", help="fewer machines, rates and angles: some 20 s")
     parser.add_argument("--out", type=Path, default=Path("out/compare"), metavar="DIR",
                         help="folder (default out/compare)")

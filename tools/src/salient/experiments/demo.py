@@ -33,6 +33,7 @@ from salient.experiments.report import METRIC_ROWS, captions, format_metric, for
 from salient.experiments.results import make_results, write_results
 from salient.experiments.scaled import scale_of, scale_of_name, scaled, steady_window_s
 from salient.experiments.scenario import Scenario, load_scenarios, run_scenario
+from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 from salient.pages import Plot
 from salient.paths import SCENARIOS
@@ -41,9 +42,6 @@ from salient.progress import Progress
 Metrics = dict[str, float | None]
 
 EXPERIMENTS = ("start_600", "load_step_150")
-
-# Range of HAL_ADC in hal/hal_adc.h.
-ADC_CURRENT_RANGE_A = [0.0, 80.0]
 
 # Name of the plot's file -> title, with keys of the operating point in the results' conditions, and experiment.
 PLOTS = {
@@ -241,12 +239,13 @@ def _conditions(scenarios: Mapping[str, Sequence[Scenario]]) -> dict[str, Any]:
     """Conditions of the metrics; equal for all runs except the step of the recording, which is that of the ripple."""
     scenario, start = scenarios["load_step_150"][0], scenarios["start_600"][0]
     assert scenario.record is not None  # as in its file
+    data = derive(load_machine(machine_path(scenario.machine)))
     return {
         "operating_point": {"start_rpm": start.speed[0].value_rpm, "step_rpm": scenario.speed[0].value_rpm,
                             "load_Nm": scenario.load[0].torque_Nm, "step_at_s": scenario.load[0].at_s,
                             "window_s": list(steady_window_s(scenario, scale_of_name(scenario.machine)))},
         "control_rate_hz": scenario.control_rate_hz,
-        "adc": {"bits": scenario.adc_bits, "current_range_A": ADC_CURRENT_RANGE_A},
+        "adc": {"bits": scenario.adc_bits, "current_range_A": [0.0, data.adc_current_A]},
         "encoder": {"bits": scenario.encoder_bits or "ideal", "edges": scenario.encoder_edges},
         "immediate_pwm": scenario.immediate_pwm,
         "machine": Path(scenario.machine).stem,

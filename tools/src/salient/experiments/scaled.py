@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from salient.bus.signals import drive_database, signal_range
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 from salient.machine.definition import Machine
 from salient.machine.drive_data import derive
@@ -60,12 +59,10 @@ class Scale:
 def scale_of(machine: Machine) -> Scale:
     """The scale of a machine's experiments."""
     data = derive(machine)
-    low_rpm, high_rpm = signal_range(drive_database().get_message_by_name("DRIVE_COMMAND")
-                                     .get_signal_by_name("speed_reference_rpm"))
     return Scale(
         speed=data.speed_base_rpm / PAPER_BASE_RPM,
         torque=data.torque_rated_Nm / PAPER_RATED_NM,
-        speed_max_rpm=min(data.speed_max_rpm, high_rpm, -low_rpm),
+        speed_max_rpm=data.speed_max_rpm,
         start_s_per_rpm=machine.inertia_kg_m2 * math.pi / 30.0 / data.parameters["torque_max_Nm"],
         electrical_Hz_per_rpm=machine.rotor_poles / 60.0,
     )

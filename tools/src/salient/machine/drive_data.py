@@ -233,7 +233,7 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
     step_40_kHz_Nm = step_Nm / period_s / 40_000.0
     base_rad_s = data["speed_base_rpm"] / _RPM
     over_V, over_V_formula = _over_voltage(machine, data["supply_max_V"])
-    kp = min(400.0 * inertia, peak_Nm / (0.015 * base_rad_s))
+    kp = min(1000.0 * inertia, peak_Nm / (0.015 * base_rad_s))
     gain = min(8.0 / rated_Nm, 0.6 / step_40_kHz_Nm)
     gain_text = "min(8 / torque_rated_Nm, 0.6 / torque_step_Nm at 40 kHz)"
     return {
@@ -249,7 +249,7 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
                                  "max(torque_rated_Nm / 160, torque_step_Nm / 40)"),
         "torque_band_outer_Nm": (max(rated_Nm / 16.0, step_Nm / 4.0),
                                  "max(torque_rated_Nm / 16, torque_step_Nm / 4)"),
-        "speed_kp": (kp, "min(400/s * inertia, torque_peak_Nm / 1.5 % of speed_base_rpm)"),
+        "speed_kp": (kp, "min(1000/s * inertia, torque_peak_Nm / 1.5 % of speed_base_rpm)"),
         "speed_ki": (50.0 * kp, "50/s * speed_kp"),
         "smc_k": (min(max(0.0275 / period_s, 36.0 * peak_Nm / (inertia * base_rad_s)), 0.1 / period_s),
                   "max(0.0275 / Ts, 36 torque_peak_Nm / (inertia * speed_base_rpm)), at most 0.1 / Ts"),
@@ -292,6 +292,7 @@ def check(machine: Machine) -> None:
     in_order("current_rated_A", "current_peak_A")
     in_order("torque_rated_Nm", "torque_peak_Nm")
     in_order("speed_base_rpm", "speed_max_rpm")
+    in_order("current_peak_A", "adc_current_A", 0.9)
     in_order("current_limit_A", "current_trip_A", 0.98)
     in_order("current_trip_A", "adc_current_A", 0.9875)
     in_order("bus_under_voltage_V", "supply_min_V", 0.98)
@@ -301,7 +302,7 @@ def check(machine: Machine) -> None:
     in_order("speed_max_rpm", "over_speed_rpm")
     in_order("torque_band_inner_Nm", "torque_band_outer_Nm")
     most_Nm = mean_torque_Nm(machine.magnetics, machine.phases, data.current_peak_A)
-    for name in ("torque_rated_Nm", "torque_peak_Nm"):
+    for name in ("torque_peak_Nm", "torque_rated_Nm"):
         if values[name] > most_Nm:
             raise TextFileError(f"{places[name]}: {values[name]:g}: must not be above {most_Nm:.3g}, the mean torque "
                                 f"at {places['current_peak_A']}, {data.current_peak_A:g}")

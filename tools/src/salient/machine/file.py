@@ -6,6 +6,7 @@ The meaning of the keys: emulator/plant/machine.h.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -206,7 +207,9 @@ def _parameters(table: dict[str, Any]) -> dict[str, float]:
     for name, value in table.items():
         row = rows.get(name)
         if row is None:
-            raise TextFileError(f"drive.parameters.{shown(name)}: unknown key; must be one of {', '.join(rows)}")
+            key = name if name.isidentifier() and name.isascii() and len(name) < 60 else shown(name)
+            near = "".join(f"; the nearest is {match}" for match in difflib.get_close_matches(name[:60], rows, 1))
+            raise TextFileError(f"drive.parameters.{key}: unknown key{near}; all are in firmware/PARAMETERS.md")
         low, high = row.limits if row.unit in SAME_UNITS else (0.0, 1e6)
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not is_number or not low <= value <= high or (row.fraction_bits == 0 and value != int(value)):

@@ -21,8 +21,9 @@ _END_DEG = 540
 """The flux linkage must have ended here, the next unaligned position."""
 _FLUX_POINTS = 128
 
+_CHANGE_STEPS = 3000
 _STROKE_POINTS = 61
-_SEARCH_POINTS = 48
+_SEARCH_POINTS = 80
 _BISECTIONS = 24  # to 1e-7 of the range
 _CURRENT_OVER = 1.03
 """A current that rises above its limit against the full voltage, by which a pair of angles is refused."""
@@ -49,24 +50,27 @@ def mean_torque_Nm(magnetics: Any, phases: int, current_A: float) -> float:
 
 
 def _stroke_torque_Nm(magnetics: Any, phases: int, current_A: np.ndarray) -> np.ndarray:
-    """By current and angle."""
+    """By current and angle; of the phases on their way from the unaligned to the aligned position."""
     stroke_rad = magnetics.pitch_rad / phases
     angle_rad = np.linspace(0.0, stroke_rad, _STROKE_POINTS) + stroke_rad * np.arange(phases)[:, None]
-    total_Nm: np.ndarray = np.maximum(magnetics.torque_Nm(angle_rad, current_A[:, None, None]), 0.0).sum(axis=1)
+    motoring = angle_rad > 0.5 * magnetics.pitch_rad
+    torque_Nm = np.where(motoring, magnetics.torque_Nm(angle_rad, current_A[:, None, None]), 0.0)
+    total_Nm: np.ndarray = np.maximum(torque_Nm, 0.0).sum(axis=1)
     return total_Nm
 
 
 def current_of_torque_A(magnetics: Any, phases: int, torque_Nm: float, current_max_A: float) -> float:
-    """Current whose smooth torque is torque_Nm, at most current_max_A; to a hundred-thousandth of it."""
-    low_A, high_A = 0.0, current_max_A
+    """The smallest current whose smooth torque is torque_Nm, to a ten-thousandth; that of the largest torque up to
+    current_max_A when none is."""
+    grid_A = np.geomspace(1e-6 * current_max_A, current_max_A, _SEARCH_POINTS)
     for _ in range(3):
-        grid_A = np.linspace(low_A, high_A, _SEARCH_POINTS)
-        reached = np.flatnonzero(_stroke_torque_Nm(magnetics, phases, grid_A).min(axis=1) >= torque_Nm)
+        smooth_Nm = _stroke_torque_Nm(magnetics, phases, grid_A).min(axis=1)
+        reached = np.flatnonzero(smooth_Nm >= torque_Nm)
         if not reached.size:
-            return high_A
+            return float(grid_A[int(np.argmax(smooth_Nm))])
         first = max(int(reached[0]), 1)
-        low_A, high_A = float(grid_A[first - 1]), float(grid_A[first])
-    return high_A
+        grid_A = np.linspace(grid_A[first - 1], grid_A[first], _SEARCH_POINTS // 4)
+    return float(grid_A[-1])
 
 
 def knee_A(magnetics: Any, current_max_A: float) -> float:
@@ -153,3 +157,37 @@ def _inverse_table(magnetics: Any, current_A: float) -> tuple[np.ndarray, np.nda
     fractions = np.linspace(0.0, 1.0, _FLUX_POINTS)
     table = np.array([np.interp(fractions * top, row, grid_A) for row, top in zip(flux_Wb, limit_Wb, strict=True)])
     return table, limit_Wb
+
+
+def speed_change_s(magnetics: Any, phases: int, source: Source, current_A: float, torque_max_Nm: float,
+                   inertia_kg_m2: float, friction_Nm_s: float, from_rad_s: float, to_rad_s: float) -> float:
+    """Time that a machine takes from one speed to another: full voltage on every phase whose torque helps and full
+    opposite voltage on the others, currents up to current_A, the sum of the torques up to torque_max_Nm; the phases
+    carry no current at first, and phase 0 is aligned. A drive that turns phases on earlier may need a little less."""
+    table, limit_Wb = _inverse_table(magnetics, current_A)
+    grid_A = np.linspace(0.0, current_A, _FLUX_POINTS)
+    angle_rad = np.arange(181) / 180.0 * magnetics.pitch_rad / 2.0
+    torque_Nm = np.abs(magnetics.torque_Nm(angle_rad[:, None], grid_A[None, :]))
+    direction = math.copysign(1.0, to_rad_s - from_rad_s)
+    least_s = abs(to_rad_s - from_rad_s) * inertia_kg_m2 / torque_max_Nm
+    step_s = max(2e-6, least_s / _CHANGE_STEPS)
+    turn_deg_per_rad = 360.0 / magnetics.pitch_rad
+    offsets_deg = 360.0 / phases * np.arange(phases)
+    speed_rad_s, angle_deg, flux_Wb, time_s = from_rad_s, 0.0, np.zeros(phases), 0.0
+    current = np.zeros(phases)
+    while direction * (to_rad_s - speed_rad_s) > 0.0 and time_s < 20.0 * least_s + 1.0:
+        electrical_deg = (angle_deg - offsets_deg) % 360.0
+        helps = (electrical_deg >= 180.0) == (direction > 0.0)
+        index = np.minimum(np.abs((electrical_deg + 180.0) % 360.0 - 180.0).round().astype(int), 180)
+        applied_V = np.where(helps, source.voltage_V, -source.voltage_V)
+        flux_Wb = flux_Wb + (applied_V - source.resistance_ohm * current) * step_s
+        flux_Wb = np.clip(flux_Wb, 0.0, limit_Wb[index])
+        place = flux_Wb / limit_Wb[index] * (_FLUX_POINTS - 1)
+        low = np.minimum(place.astype(int), _FLUX_POINTS - 2)
+        current = table[index, low] + (place - low) * (table[index, low + 1] - table[index, low])
+        column = np.minimum((current / current_A * (_FLUX_POINTS - 1)).round().astype(int), _FLUX_POINTS - 1)
+        total_Nm = min(float((np.where(helps, 1.0, -1.0) * torque_Nm[index, column]).sum()), torque_max_Nm)
+        speed_rad_s += (direction * total_Nm - friction_Nm_s * speed_rad_s) / inertia_kg_m2 * step_s
+        angle_deg += speed_rad_s * step_s * turn_deg_per_rad
+        time_s += step_s
+    return time_s
