@@ -55,7 +55,7 @@ typedef struct {
     sensor_ranges_t ranges;
 } machine_t;
 
-/* Machine that this executable was built for; generated from the machine file. */
+/* Machine of a program that is built for one; generated from the machine file. */
 extern const machine_t machine_plant;
 
 #endif

@@ -1,4 +1,4 @@
-/* Data of the machine, generated from the machine file at build time. */
+/* Data of the machine, generated from the machine file. */
 #ifndef CONTROL_MACHINE_TABLES_H
 #define CONTROL_MACHINE_TABLES_H
 
@@ -82,7 +82,13 @@ typedef struct {
     uint32_t dbc_hash;           /* of the machine's CAN database, comms/drive.dbc with its factors and ranges */
 } machine_tables_t;
 
-/* The machine that this firmware is built for. */
-extern const machine_tables_t machine_tables;
+/* The machine. On a target a constant, which the laws are compiled for when a drive is linked; on the host a variable,
+ * filled before drive_init: one program serves every machine. */
+#ifdef MACHINE_TABLES_VARIABLE
+#define MACHINE_TABLES_CONST
+#else
+#define MACHINE_TABLES_CONST const
+#endif
+extern MACHINE_TABLES_CONST machine_tables_t machine_tables;
 
 #endif

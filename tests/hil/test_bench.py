@@ -16,7 +16,8 @@ import pytest
 
 from salient.bench import session as session_module
 from salient.bench.drive import DriveError
-from salient.bench.emulator import EmulatorError, EmulatorProcess
+from salient.bench.emulator import EmulatorProcess
+from salient.bench.programs import EmulatorError
 from salient.bench.rig import RigError, bench_variables
 from salient.bench.session import Session, SessionError
 from salient.bus.signals import drive_database, rig_database

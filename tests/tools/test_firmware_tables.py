@@ -7,9 +7,9 @@ import shutil
 import numpy as np
 import pytest
 
-from salient.bench.emulator import executable
 from salient.errors import UsageError
 from salient.generate import machine as generate_machine
+from salient.machine.cache import machine_image
 from salient.machine.file import MachineError, load_machine
 from salient.machine.firmware_tables import (
     ANGLE_BINS,
@@ -314,7 +314,7 @@ def test_build_step_names_the_rejected_file(strong_machine, tmp_path, capsys):
 
 def test_rejected_machine_is_named_before_anything_is_built(strong_machine):
     with pytest.raises(UsageError, match=r"strong\.toml: magnetics: [0-9]+ N m/A of torque is more than"):
-        executable(str(strong_machine))
+        machine_image(str(strong_machine))
 
 
 def test_map_that_ends_early_is_levelled_where_linear_extrapolation_loses_torque(tmp_path):

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from salient.machine.cache import FOLDER, content_key
 from salient.machine.drive_data import derive
 from salient.machine.file import Machine, MachineError, load_machine, machine_path
 from salient.machine.magnetics import Formula
@@ -643,5 +644,6 @@ def test_commands_end_with_one_line_and_exit_code_2_and_build_nothing(
     assert not any(case in name for name in built())
     assert case not in (BUILD / "host" / "CMakeCache.txt").read_text()
     assert not any(case in note.read_text() for note in BUILD.glob("machine-*/machine_file"))
+    assert not (FOLDER / f"{content_key(path)}.machine").exists()
     assert not still_runs(str(tmp_path))
     assert {entry.name for entry in tmp_path.iterdir()} <= before | {"out"}

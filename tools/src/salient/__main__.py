@@ -57,7 +57,7 @@ def _test(options: argparse.Namespace) -> int:
 
 
 def _sim(options: argparse.Namespace) -> int:  # noqa: RET503 - os.execv does not return
-    from salient.bench.emulator import EmulatorError, command_line
+    from salient.bench.programs import EmulatorError, command_line
 
     try:
         command = command_line(BenchConfig(**{name: value for name, value in vars(options).items() if name in OPTIONS}))

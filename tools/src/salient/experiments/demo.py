@@ -24,9 +24,9 @@ import numpy as np
 from can import CanError
 
 from salient.bench.drive import DriveError
-from salient.bench.emulator import EmulatorError, executable
+from salient.bench.programs import EmulatorError, command_line
 from salient.bench.session import SessionError
-from salient.config import CONDITIONS
+from salient.config import CONDITIONS, BenchConfig
 from salient.errors import UsageError
 from salient.experiments import metrics, plots
 from salient.experiments.report import METRIC_ROWS, captions, format_metric, format_published, write_report
@@ -149,7 +149,7 @@ def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
                               for scenario in load_scenarios(SCENARIOS / f"{experiment}.toml")]
                  for experiment in EXPERIMENTS}
     machine = scenarios["start_600"][0].machine
-    executable(machine, options.build)
+    command_line(BenchConfig(machine=machine, build=options.build))  # checks the machine
     loaded = load_machine(machine_path(machine))
     scale, stated = scale_of(loaded), {name: value for name, value in loaded.drive.items()
                                        if name in CONDITIONS and name not in changes}

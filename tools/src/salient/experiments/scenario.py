@@ -44,13 +44,14 @@ from pydantic import create_model
 
 from salient.bench.bench import Bench
 from salient.bench.drive import DriveError, write_request
-from salient.bench.emulator import executable, parameter_table
+from salient.bench.emulator import parameter_table
 from salient.bench.rig import bench_variables, variable_range
 from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database
 from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
 from salient.errors import UsageError
 from salient.experiments.metrics import losses
+from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
 from salient.toml_file import Table, TextFileError, any_number, number, one_of, option, read_toml, validate
 
@@ -317,7 +318,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
         raise UsageError(f"{path}: {error}") from None
     relative = path.parent / file.machine
     machine = str(relative.resolve()) if relative.suffix == ".toml" else file.machine
-    executable(machine)
+    machine_image(machine)  # checks it
     common: dict[str, Any] = {name: getattr(file, name) for name in CONDITIONS if name in type(file).model_fields}
     common |= {
         "name": path.stem,

@@ -8,10 +8,9 @@ from typing import Any
 
 from salient.machine.flux_map import FluxMap
 from salient.machine.magnetics import Formula
+from salient.machine.path import MachineError
 
-
-class MachineError(ValueError):
-    """A machine file that cannot be used; the text is one line that begins with the file."""
+__all__ = ["Machine", "MachineError"]
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from salient.machine.flux_map import FluxMap, FluxMapError
 from salient.machine.flux_map_csv import load_flux_map
 from salient.machine.magnetics import FORMULA_KEYS, INDUCTANCES, Formula
 from salient.machine.parameter_table import SAME_UNITS, read_table
-from salient.paths import MACHINES
+from salient.machine.path import machine_path
 from salient.toml_file import Table, TextFileError, checked, number, one_of, option, read_toml, shown, validate
 
 __all__ = ["FORMS", "MAGNETICS", "Converter", "Machine", "MachineError", "MachineFile", "Sensors", "load_machine",
@@ -142,18 +142,6 @@ class MachineFile(Table):
 
 # --- machine --------------------------------------------------------------------------------------------------------
 
-def machine_path(name_or_path: str) -> Path:
-    """The file meant by the name of a bundled machine or by a path; MachineError when there is none."""
-    bundled, path = MACHINES / f"{name_or_path}.toml", Path(name_or_path)
-    try:
-        if bundled.is_file():
-            return bundled
-        if path.is_file():
-            return path.resolve()
-    except OSError:
-        pass  # a name too long for a file: there is none
-    names = ", ".join(sorted(p.stem for p in MACHINES.glob("*.toml")))
-    raise MachineError(f"machine {shown(name_or_path)}: no such file, and no bundled machine of that name ({names})")
 
 
 def load_machine(path: Path | str) -> Machine:

@@ -223,7 +223,7 @@ def _row_starts(magnetics: Any) -> np.ndarray:
     half_rad = magnetics.pitch_rad / 2.0
     angle_rad = half_rad + half_rad * np.arange(ROW_UNITS + 1)[:, None] / ROW_UNITS
     torque_Nm = magnetics.torque_Nm(angle_rad, min(CURRENT_A[-1], magnetics.current_max_A) * _ROW_CURRENTS)
-    shape = torque_Nm / np.max(np.abs(torque_Nm), axis=0)
+    shape = np.ascontiguousarray((torque_Nm / np.max(np.abs(torque_Nm), axis=0)).T)  # long rows: six times as fast
 
     least, greatest = _LEAST_TOLERANCE, _GREATEST_TOLERANCE
     starts = _rows_within(shape, greatest) or [0, ROW_UNITS]
@@ -252,7 +252,7 @@ def _rows_within(shape: np.ndarray, tolerance: float) -> list[int] | None:
             return None
         start = starts[-1] + _row_width(shape, starts[-1], tolerance)
         if end_of_bin - _BIN_UNITS <= starts[-1] < start < end_of_bin:
-            start = starts[-1] + _row_width(shape[: end_of_bin + 1], starts[-1], tolerance_in_bin)
+            start = starts[-1] + _row_width(shape[:, : end_of_bin + 1], starts[-1], tolerance_in_bin)
         starts.append(start)
         begin = start - start % _BIN_UNITS
         if sum(begin < other < begin + _BIN_UNITS for other in starts) > ROWS_INSIDE_BIN_MAX:
@@ -266,12 +266,12 @@ def _rows_within(shape: np.ndarray, tolerance: float) -> list[int] | None:
 def _row_width(shape: np.ndarray, start: int, tolerance: float) -> int:
     """Width of a row, as large as the tolerance permits, by doubled and then halved steps."""
     width, step = 1, 1
-    last = len(shape) - 1
-    while start + width + step <= last and _is_parabola(shape[start : start + width + step + 1], tolerance):
+    last = shape.shape[1] - 1
+    while start + width + step <= last and _is_parabola(shape[:, start : start + width + step + 1], tolerance):
         width += step
         step *= 2
     while step > 0:
-        if start + width + step <= last and _is_parabola(shape[start : start + width + step + 1], tolerance):
+        if start + width + step <= last and _is_parabola(shape[:, start : start + width + step + 1], tolerance):
             width += step
         step //= 2
     return width
@@ -279,9 +279,13 @@ def _row_width(shape: np.ndarray, start: int, tolerance: float) -> int:
 
 def _is_parabola(shape: np.ndarray, tolerance: float) -> bool:
     """True if the parabola through both ends and the middle is within the tolerance of all points."""
-    last = len(shape) - 1
-    u = (np.arange(last + 1) / last)[:, None]
-    middle = 0.5 * (shape[last // 2] + shape[(last + 1) // 2])
-    curvature = 2.0 * (shape[0] + shape[-1]) - 4.0 * middle
-    parabola = shape[0] + u * (shape[-1] - shape[0]) - u * (1.0 - u) * curvature
-    return bool(np.max(np.abs(parabola - shape)) <= tolerance)
+    last = shape.shape[1] - 1
+    u = np.arange(last + 1) / last
+    first, end = shape[:, :1], shape[:, -1:]
+    middle = 0.5 * (shape[:, last // 2, None] + shape[:, (last + 1) // 2, None])
+    curvature = 2.0 * (first + end) - 4.0 * middle
+    difference = u * (end - first)  # in place: memory is most of the time
+    difference += first
+    difference -= u * (1.0 - u) * curvature
+    difference -= shape
+    return bool(max(difference.max(), -difference.min()) <= tolerance)

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 
-from salient.paths import ROOT
-
-TABLE = ROOT / "firmware" / "drive" / "parameters.def"
+from salient.paths import PARAMETERS
 
 SAME_UNITS = ("", "1/s", "s", "ms", "deg", "rad/s")
 """Units of the parameters whose range and resolution are the same for every machine."""
@@ -51,7 +49,7 @@ class ParameterDefinition:
 @lru_cache
 def read_table() -> tuple[ParameterDefinition, ...]:
     """All rows of parameters.def, by index."""
-    source = re.sub(r"/\*.*?\*/", "", TABLE.read_text(encoding="ascii"), flags=re.DOTALL)
+    source = re.sub(r"/\*.*?\*/", "", PARAMETERS.read_text(encoding="ascii"), flags=re.DOTALL)
     calls = ast.parse(re.sub(r"\)\s*PARAMETER\(", ")\nPARAMETER(", source.strip())).body
     rows = []
     for index, statement in enumerate(calls):
@@ -63,7 +61,7 @@ def read_table() -> tuple[ParameterDefinition, ...]:
                 rows.append(ParameterDefinition(index, constant, name, unit, bits, _value(minimum), _value(maximum),
                                                 _value(default), text))
             case _:
-                raise ValueError(f"{TABLE}: {ast.unparse(statement)} is not a row of the table")
+                raise ValueError(f"{PARAMETERS}: {ast.unparse(statement)} is not a row of the table")
     return tuple(rows)
 
 
@@ -79,4 +77,4 @@ def _value(node: ast.expr) -> int:
         case ast.Call(func=ast.Name(id="Q"), args=[numerator, denominator, bits]):
             divisor = _value(denominator)
             return ((_value(numerator) << _value(bits)) + divisor // 2) // divisor
-    raise ValueError(f"{TABLE}: {ast.unparse(node)} is not a constant of the table")
+    raise ValueError(f"{PARAMETERS}: {ast.unparse(node)} is not a constant of the table")

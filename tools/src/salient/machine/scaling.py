@@ -40,6 +40,8 @@ FLUX_LINKAGE_RANGE_WB, TORQUE_RANGE_NM, SPEED_RANGE_RPM = 4.0, 40.0, 4800.0
 SPEED_EXPONENT_MAX = 3
 SPEED_COMMAND_RPM = 3000.0
 """Every drive takes commands up to this speed, a faster machine up to its own."""
+SPEED_LSB_RPM = Fraction(1, 1000)
+"""Factor of the speeds in the DBC with SI units."""
 _COMMAND, _COMMAND_SIGNAL = "DRIVE_COMMAND", "speed_reference_rpm"
 
 
@@ -98,14 +100,20 @@ class Scaling:
         """Of every parameter, by index."""
         return [self.exponents.fraction_bits(row) for row in read_table()]
 
+    def sensor_ranges(self) -> dict[str, float]:
+        """Full scales: the emulator's sensor_ranges_t."""
+        return {"current_A": self.data.adc_current_A, "dc_link_V": self.data.adc_voltage_V,
+                "load_torque_Nm": math.ldexp(LOAD_TORQUE_RANGE_NM, self.exponents.torque)}
+
     @property
-    def speed_reference_max_rpm(self) -> float:
-        """Magnitude of the largest command."""
-        return max(SPEED_COMMAND_RPM, self.data.speed_max_rpm)
+    def speed_reference_max(self) -> int:
+        """Magnitude of the largest command, in LSBs of the bus."""
+        limit_rpm = max(SPEED_COMMAND_RPM, self.data.speed_max_rpm)
+        return math.floor(Fraction(limit_rpm) / (SPEED_LSB_RPM * Fraction(2) ** self.exponents.speed))
 
     def dbc(self) -> str:
         """Text of the drive's CAN database: firmware/comms/drive.dbc with the factors and ranges of this machine."""
-        return drive_dbc(self.exponents, self.speed_reference_max_rpm)
+        return drive_dbc(self.exponents, self.speed_reference_max)
 
 
 def scaling_of(path: object, machine: Machine) -> Scaling:
@@ -163,26 +171,26 @@ _MESSAGE_LINE = re.compile(r"BO_ \d+ (\w+):")
 _SIGNAL_LINE = re.compile(r'( SG_ (\w+) [^(]*)\(([^,]+),([^)]+)\) \[([^|]+)\|([^]]+)\] ("([^"]*)".*)')
 
 
-def drive_dbc(exponents: Exponents, speed_reference_max_rpm: float) -> str:
+def drive_dbc(exponents: Exponents, speed_reference_max: int) -> str:
     """Text of firmware/comms/drive.dbc for these units: factors and ranges times powers of two, and the range of the
-    commands. With SI units and 3000 r/min it is that file."""
+    commands in LSBs. With SI units and 3000 r/min it is that file."""
     lines, message = [], ""
     for line in DRIVE_DBC.read_text(encoding="ascii").splitlines(keepends=True):
         if found := _MESSAGE_LINE.match(line):
             message = found[1]
         found = _SIGNAL_LINE.match(line)
-        lines.append(_signal_line(message, found, exponents, speed_reference_max_rpm) if found else line)
+        lines.append(_signal_line(message, found, exponents, speed_reference_max) if found else line)
     return "".join(lines)
 
 
-def _signal_line(message: str, line: re.Match[str], exponents: Exponents, speed_reference_max_rpm: float) -> str:
+def _signal_line(message: str, line: re.Match[str], exponents: Exponents, speed_reference_max: int) -> str:
     """The line of a signal of a message, with its factor, offset and range in the units."""
     head, name, *numbers, tail, unit = line.groups()
     exponent = exponents.of_unit(unit)
     factor, offset, low, high = (_plain(Fraction(number) * Fraction(2) ** exponent) if exponent else number
                                  for number in numbers)
     if (message, name) == (_COMMAND, _COMMAND_SIGNAL):
-        high = _plain(Fraction(factor) * math.floor(Fraction(speed_reference_max_rpm) / Fraction(factor)))
+        high = _plain(Fraction(factor) * speed_reference_max)
         low = f"-{high}"
     return f"{head}({factor},{offset}) [{low}|{high}] {tail}\n"
 

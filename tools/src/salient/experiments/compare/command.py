@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
 
-from salient.bench.emulator import executable
 from salient.errors import UsageError
 from salient.experiments.compare import baseline, results_file, table
 from salient.experiments.compare.cases import GROUPS, TITLES, Case, scenario_toml
 from salient.experiments.compare.machine import Subject, cases_of, subject
 from salient.experiments.compare.runner import RunMetrics, run_all
+from salient.machine.cache import machine_image
 from salient.machine.file import MachineError
 
 FAILED = "failed"
@@ -36,7 +36,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
     _prepare_folder(options.out)
     for machine in {case.scenario.machine for case in cases}:
-        executable(machine)
+        machine_image(machine)
     runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr)
     rows = table.make_rows(runs)
     changes: list[baseline.Change] = []

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 from can import CanError
 
 from salient.bench.drive import DriveError
-from salient.bench.emulator import EmulatorError
+from salient.bench.programs import EmulatorError
 from salient.bench.session import SessionError
 from salient.experiments.compare import every_machine
 from salient.experiments.compare.cases import Case
