@@ -7,7 +7,8 @@ set(SALIENT_CODEC_GENERATOR generate/codec.py generate/enumerations.py generate/
     generate/files.py dbc.py)
 list(TRANSFORM SALIENT_CODEC_GENERATOR PREPEND ${SALIENT_GENERATOR_SOURCES}/)
 
-# Machines that drives are built for: the bundled ones, and one more on request.
+# Machines that images for a board, functional mock-up units and tests are built for: the bundled ones, and one more,
+# "custom", on request.
 if(SALIENT_MACHINE_FILE AND NOT EXISTS ${SALIENT_MACHINE_FILE})
     message(FATAL_ERROR "SALIENT_MACHINE_FILE: ${SALIENT_MACHINE_FILE}: no such file")
 endif()
@@ -15,8 +16,7 @@ file(GLOB bundled CONFIGURE_DEPENDS ${CMAKE_SOURCE_DIR}/tools/machines/*.toml)
 list(TRANSFORM bundled REPLACE ".*/([^/]*)\\.toml$" "\\1" OUTPUT_VARIABLE SALIENT_BUNDLED_MACHINES)
 set(SALIENT_MACHINES ${SALIENT_BUNDLED_MACHINES})
 if(SALIENT_MACHINE_FILE)
-    get_filename_component(name ${SALIENT_MACHINE_FILE} NAME_WE)
-    list(APPEND SALIENT_MACHINES ${name})
+    list(APPEND SALIENT_MACHINES custom)
 endif()
 
 # salient_generate_codec(TARGET DBC [INTEGER] [NODE name]): a static library with <name>_codec.h/.c generated from DBC.
@@ -74,15 +74,16 @@ function(salient_add_machines)
         endif()
         set(out ${CMAKE_BINARY_DIR}/machine/${name})
         add_custom_command(
-            OUTPUT ${out}/machine_tables.c ${out}/machine_plant.c
+            OUTPUT ${out}/machine_tables.c ${out}/machine_plant.c ${out}/machine.image
             COMMAND ${SALIENT_GENERATOR} salient.generate.machine ${file} ${out}
-            DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate/machine.py
-                    ${SALIENT_GENERATOR_SOURCES}/generate/files.py ${generator_sources}
-            DEPFILE ${out}/machine.d # of a map: its CSV file
+            DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate/machine.py ${SALIENT_CODEC_GENERATOR}
+                    ${generator_sources}
+            DEPFILE ${out}/machine.d # parameters, DBC, of a map: its CSV file
             COMMENT "machine ${name}"
             VERBATIM)
         add_library(${name}_tables OBJECT ${out}/machine_tables.c)
         target_include_directories(${name}_tables PRIVATE ${CMAKE_SOURCE_DIR}/firmware)
+        target_compile_definitions(${name}_tables PRIVATE ${SALIENT_TABLES_DEFINITION})
         if(CMAKE_C_COMPILER_ID STREQUAL "GNU") # the laws are compiled for this machine's constants when a drive is linked
             target_compile_options(${name}_tables PRIVATE $<$<CONFIG:Release>:-flto=auto -ffat-lto-objects>)
         endif()

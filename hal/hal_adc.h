@@ -9,14 +9,10 @@
 #define HAL_ADC_BITS_MIN 12
 #define HAL_ADC_BITS_MAX 16
 
-/* Full scale is 2^bits counts, one above the largest. Current sensors are unipolar: 0 counts are 0 A, full scale 80 A.
- */
-#define HAL_ADC_CURRENT_FULL_SCALE_A 80
-/* DC-link voltage divider: 0 counts are 0 V, full scale 512 V. */
-#define HAL_ADC_BUS_FULL_SCALE_V 512
-/* Torque transducer between machine and load, offset binary: mid-scale, 2^(bits-1), is 0 N m, 0 counts are -64 N m. A
- * board without a transducer leaves the input floating: only use it where a parameter enables it. */
-#define HAL_ADC_LOAD_TORQUE_FULL_SCALE_NM 64
+/* Full scale is 2^bits counts, one above the largest. The full scales are data of the board, in the machine's tables
+ * and so in its machine file. Current sensors are unipolar: 0 counts are 0 A; the DC-link voltage divider likewise. The
+ * torque transducer between machine and load is offset binary: mid-scale, 2^(bits-1), is 0 N m. A board without a
+ * transducer leaves the input floating: only use it where a parameter enables it. */
 
 typedef struct {
     uint16_t phase_current_counts[HAL_PHASES_MAX]; /* 0..2^bits-1, as all counts */

@@ -274,10 +274,9 @@ def main() -> None:
         install_packages(dependencies(options, target), install)
         make_environment(install)
         if needs_build(options):
-            machines = sorted(path.stem for path in (TOOLS / "machines").glob("*.toml"))
-            targets = [f"salient_{name}" for name in machines]
+            targets = ["salient_host"]
             targets += ["plant_benchmark_saturating"] if options.command == "benchmark" else []
-            targets += [f"salient_target_{name}" for name in machines] if target != "host" else []
+            targets += ["salient_target"] if target != "host" else []
             was_built = build("host", [] if options.command == "test" else targets)
             if target != "host":
                 was_built |= build(target, [])

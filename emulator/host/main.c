@@ -13,6 +13,7 @@ static_assert((int)DRIVE_CONTROLLER_TRADITIONAL == OPTIONS_CONTROLLER_TRADITIONA
 /* Large: static. */
 static simulation_t simulation;
 static drive_t drive;
+machine_tables_t machine_tables;
 
 static void control_interrupt(void *context) {
     drive_control_interrupt(context);
@@ -33,6 +34,10 @@ int main(int argc, char *argv[]) {
         return result == OPTIONS_HELP ? 0 : EXIT_USAGE;
     }
     if (!simulation_open(&simulation, &options)) {
+        return EXIT_USAGE;
+    }
+    if (!machine_image_tables(&simulation.image, &machine_tables_structure, &machine_tables)) {
+        simulation_close(&simulation);
         return EXIT_USAGE;
     }
     hal_t hal = {.board = &simulation.rig.board};

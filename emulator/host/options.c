@@ -117,6 +117,9 @@ static options_result_t check_combination(const options_t *options, const bool g
     if (!given[OPTION_CAN]) {
         return mistake("--can: missing; must be %s", options_table[OPTION_CAN].allowed);
     }
+    if (!options->machine_image) {
+        return mistake("--machine-image: missing; must be %s", options_table[OPTION_MACHINE_IMAGE].allowed);
+    }
     if ((given[OPTION_RECORD_STEP_NS] || given[OPTION_RECORD_FROM_US]) && !options->record) {
         return mistake("--record-step-ns and --record-from-us require --record FILE.npy");
     }

@@ -11,7 +11,6 @@
 #include <unistd.h>
 
 #include "host/output.h"
-#include "plant/machine.h"
 
 #define SWITCHES_OPTION "--record-switches"
 #define RAD_PER_DEG (3.14159265358979323846 / 180.0)
@@ -69,11 +68,11 @@ static void print_json_string(const char *text) {
     putchar('"');
 }
 
-static void print_ready(const options_t *options) {
+static void print_ready(const options_t *options, const char *machine) {
     printf("{\"ready\": true, \"can\": ");
     print_json_string(options->can);
     printf(", \"pid\": %ld, \"machine\": ", (long)getpid());
-    print_json_string(machine_plant.name);
+    print_json_string(machine);
     printf(", \"controller\": ");
     print_json_string(options->controller);
     printf(", \"control_rate_hz\": %" PRIu32 ", \"pace\": ", options->control_rate_hz);
@@ -82,7 +81,8 @@ static void print_ready(const options_t *options) {
     fflush(stdout);
 }
 
-bool simulation_open(simulation_t *simulation, const options_t *options) {
+/* Opens everything but the image. */
+static bool open_bench(simulation_t *simulation, const options_t *options) {
     simulation->options = options;
     simulation->exit_code = 0;
     simulation->switches = NULL;
@@ -98,7 +98,7 @@ bool simulation_open(simulation_t *simulation, const options_t *options) {
         return false;
     }
     if (options->record &&
-        !recorder_open(&simulation->recorder, options->record, machine_plant.phases, error, sizeof error)) {
+        !recorder_open(&simulation->recorder, options->record, simulation->image.machine.phases, error, sizeof error)) {
         fprintf(stderr, "salient: %s\n", error);
         transport_close(transport);
         return false;
@@ -113,7 +113,7 @@ bool simulation_open(simulation_t *simulation, const options_t *options) {
     }
 
     const rig_config_t config = {
-        .machine = &machine_plant,
+        .machine = &simulation->image.machine,
         .initial_angle_rad = options->initial_angle_deg * RAD_PER_DEG,
         .encoder_bits = options->encoder_bits,
         .adc_bits = options->adc_bits,
@@ -130,6 +130,17 @@ bool simulation_open(simulation_t *simulation, const options_t *options) {
     if (options->record) {
         plant_observe(&simulation->rig.plant, options->record_from_us * 1000, options->record_step_ns, recorder_sample,
                       &simulation->recorder);
+    }
+    return true;
+}
+
+bool simulation_open(simulation_t *simulation, const options_t *options) {
+    if (!machine_image_open(&simulation->image, options->machine_image)) {
+        return false;
+    }
+    if (!open_bench(simulation, options)) {
+        machine_image_close(&simulation->image);
+        return false;
     }
     return true;
 }
@@ -158,7 +169,7 @@ void simulation_run(simulation_t *simulation, const rig_firmware_t *firmware) {
                                                  .deferred_interrupt = deferred_interrupt,
                                                  .background = background,
                                                  .context = simulation});
-    print_ready(simulation->options);
+    print_ready(simulation->options, simulation->image.machine.name);
     while (rig_serve(&simulation->rig, -1)) {
     }
     rig_finish(&simulation->rig);
@@ -170,7 +181,7 @@ void simulation_run(simulation_t *simulation, const rig_firmware_t *firmware) {
 }
 
 void simulation_rejected(simulation_t *simulation) {
-    fprintf(stderr, "salient: drive_init rejected machine %s at %" PRIu32 " Hz\n", machine_plant.name,
+    fprintf(stderr, "salient: drive_init rejected machine %s at %" PRIu32 " Hz\n", simulation->image.machine.name,
             simulation->options->control_rate_hz);
     simulation->exit_code = EXIT_USAGE;
 }
@@ -186,5 +197,6 @@ int simulation_close(simulation_t *simulation) {
         simulation->exit_code = EXIT_USAGE;
     }
     transport_close(simulation->rig.config.transport);
+    machine_image_close(&simulation->image);
     return simulation->exit_code;
 }

@@ -10,15 +10,17 @@
 #include <stdbool.h>
 #include <stdio.h>
 
+#include "host/machine_image.h"
 #include "host/options.h"
 #include "plant/recorder.h"
 #include "rig/rig.h"
 
 #define EXIT_USAGE 2 /* exit code after an invalid argument or a resource that cannot be opened */
 
-/* Large: static or on the heap. rig is for the port; the other members are private to simulation.c. */
+/* Large: static or on the heap. rig and image are for the port; the other members are private to simulation.c. */
 typedef struct {
     rig_t rig;
+    machine_image_t image;
     const options_t *options;
     recorder_t recorder;
     rig_stop_t stop;

@@ -32,6 +32,13 @@ typedef struct {
     double encoder_eccentricity_deg; /* amplitude of the angle error of one period per revolution, mechanical */
 } sensor_errors_t;
 
+/* Full scales of the board's analogue inputs, 2^bits counts (hal_adc.h). */
+typedef struct {
+    double current_A;      /* current sensors */
+    double dc_link_V;      /* divider of the DC-link voltage */
+    double load_torque_Nm; /* torque transducer, in either direction */
+} sensor_ranges_t;
+
 typedef struct {
     const char *name;
     unsigned stator_poles;
@@ -45,9 +52,10 @@ typedef struct {
     converter_t converter;
     dc_link_t dc_link;
     sensor_errors_t sensors;
+    sensor_ranges_t ranges;
 } machine_t;
 
-/* Machine that this executable was built for; generated from the machine file. */
+/* Machine of a program that is built for one; generated from the machine file. */
 extern const machine_t machine_plant;
 
 #endif

@@ -74,14 +74,14 @@ static double sensed_current_A(sensors_t *sensors, double true_A) {
 
 void sensors_sample_adc(sensors_t *sensors, const plant_t *plant, hal_adc_sample_t *sample) {
     memset(sample, 0, sizeof *sample);
+    const sensor_ranges_t *ranges = &plant->machine->ranges;
     const double *true_A = sensors->currents_held ? sensors->held_current_A : plant->current_A;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         sample->phase_current_counts[phase] =
-            to_counts(sensors, sensed_current_A(sensors, true_A[phase]) * (1.0 / HAL_ADC_CURRENT_FULL_SCALE_A));
+            to_counts(sensors, sensed_current_A(sensors, true_A[phase]) * (1.0 / ranges->current_A));
     }
-    sample->bus_voltage_counts = to_counts(sensors, plant->bus_voltage_V * (1.0 / HAL_ADC_BUS_FULL_SCALE_V));
-    sample->load_torque_counts =
-        to_counts(sensors, 0.5 + plant->load_torque_Nm * (0.5 / HAL_ADC_LOAD_TORQUE_FULL_SCALE_NM));
+    sample->bus_voltage_counts = to_counts(sensors, plant->bus_voltage_V * (1.0 / ranges->dc_link_V));
+    sample->load_torque_counts = to_counts(sensors, 0.5 + plant->load_torque_Nm * (0.5 / ranges->load_torque_Nm));
 }
 
 /* --- Encoder --- */

@@ -15,8 +15,8 @@
  * at 40 kHz. The rotor may reverse once between two latches. A frozen encoder has no edges. A jump and a change of
  * offset or eccentricity are no edges: when the reading has changed without a motion, the last edge is discarded.
  *
- * Scales: hal_adc.h. Counts are rounded to nearest (halves upwards) and clamped to 0..2^bits-1: the ADC is unipolar and
- * reads 0 below 0 A. Encoder counts are modulo one revolution, for negative angles too.
+ * Full scales: machine.h. Counts are rounded to nearest (halves upwards) and clamped to 0..2^bits-1: the ADC is
+ * unipolar and reads 0 below 0 A. Encoder counts are modulo one revolution, for negative angles too.
  */
 #ifndef PLANT_SENSORS_H
 #define PLANT_SENSORS_H

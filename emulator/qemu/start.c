@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later
  *
- * Starts QEMU with the image of the drive for one machine and the co-simulation host as plugin, in the same process:
+ * Starts QEMU with the image of a drive and the co-simulation host as plugin, in the same process:
  * command line, ready line and exit codes are those of the host executable.
  */
 #define _GNU_SOURCE /* memfd_create */

@@ -27,12 +27,18 @@ void truth_pack(const plant_t *plant, transport_frame_t frames[TRUTH_FRAMES]) {
     rig_truth_currents_set_physical_current_b_a(&currents, plant->current_A[1]);
     rig_truth_currents_set_physical_current_c_a(&currents, plant->current_A[2]);
     rig_truth_currents_set_physical_current_d_a(&currents, plant->current_A[3]);
-    rig_truth_currents_pack(begin(&frames[1], RIG_TRUTH_CURRENTS_FRAME_ID), &currents, 8);
+    for (uint8_t part = 0; part < 2; part++) {
+        currents.part = part;
+        rig_truth_currents_pack(begin(&frames[1 + part], RIG_TRUTH_CURRENTS_FRAME_ID), &currents, 8);
+    }
 
     double angle_deg = fmod(plant->rotor_angle_rad * DEG_PER_RAD, 360.0);
     struct rig_truth_bench_t bench;
-    bench.rotor_angle_deg = rig_truth_bench_rotor_angle_deg_encode(angle_deg < 0.0 ? angle_deg + 360.0 : angle_deg);
-    rig_truth_bench_set_physical_load_torque_nm(&bench, plant->load_torque_Nm);
-    rig_truth_bench_set_physical_bus_voltage_v(&bench, plant->bus_voltage_V);
-    rig_truth_bench_pack(begin(&frames[2], RIG_TRUTH_BENCH_FRAME_ID), &bench, 8);
+    rig_truth_bench_set_physical_rotor_angle_deg(&bench, angle_deg < 0.0 ? angle_deg + 360.0 : angle_deg);
+    bench.load_torque_nm = rig_truth_bench_load_torque_nm_encode(plant->load_torque_Nm);
+    bench.bus_voltage_v = rig_truth_bench_bus_voltage_v_encode(plant->bus_voltage_V);
+    for (uint8_t part = 0; part < 2; part++) {
+        bench.part = part;
+        rig_truth_bench_pack(begin(&frames[3 + part], RIG_TRUTH_BENCH_FRAME_ID), &bench, 8);
+    }
 }

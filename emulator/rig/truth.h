@@ -5,9 +5,9 @@
 #include "plant/plant.h"
 #include "rig/transport_frame.h"
 
-#define TRUTH_FRAMES 3
+#define TRUTH_FRAMES 5
 
-/* Packs the present state: motion, currents, bench. Values are clamped to the range of their signal; the rotor angle is
+/* Packs the present state: motion, currents and bench in two parts each. Values are clamped to the range of their signal; the rotor angle is
  * wrapped to 0..360 deg. */
 void truth_pack(const plant_t *plant, transport_frame_t frames[TRUTH_FRAMES]);
 

@@ -2,7 +2,9 @@
 
 #include "comms/counter.h"
 #include "comms/units.h"
+#include "control/machine_tables.h"
 #include "drive_codec.h"
+#include "fixed/fixed.h"
 
 /* The only bits of a frame to the drive that no signal covers: required to be zero, reserved for later use. */
 #define PARAMETER_REQUEST_RESERVED_BYTE 3
@@ -44,7 +46,7 @@ static commands_frame_t receive_command(commands_t *commands, const hal_can_fram
     struct drive_command_t message;
     drive_command_unpack(&message, frame->data, frame->length);
     if (!drive_command_request_is_in_range(message.request) ||
-        !drive_command_speed_reference_rpm_is_in_range(message.speed_reference_rpm)) {
+        fixed_abs(message.speed_reference_rpm) > machine_tables.speed_reference_max) {
         return reject(&counters->out_of_range);
     }
     counter_add(&counters->accepted, 1);

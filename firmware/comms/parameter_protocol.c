@@ -1,5 +1,6 @@
 #include "comms/parameter_protocol.h"
 
+#include "control/machine_tables.h"
 #include "drive_codec.h"
 
 #define CHARACTERS_PER_PART 4
@@ -47,7 +48,7 @@ void parameter_protocol_respond(parameters_t *parameters, bool writable, const h
             response.value = parameters->defaults[request.index];
             break;
         case PARAMETER_OPERATION_FRACTION_BITS:
-            response.value = row->fraction_bits;
+            response.value = machine_tables.parameter_fraction_bits[request.index];
             break;
         case PARAMETER_OPERATION_NAME:
             response.value = text_part(row->name, request.part);

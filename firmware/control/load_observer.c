@@ -1,5 +1,6 @@
 #include "control/load_observer.h"
 
+#include "control/machine_tables.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
@@ -11,7 +12,8 @@
  * indefinitely; a larger one lets a jump of the encoder move the speed estimate into overspeed. */
 #define INNOVATION_LIMIT (1 << 27)
 
-/* 2 pi in Q3.28. */
+/* 2 pi in Q3.28. It joins angle and speed: its products are divided by the unit of speed, 2^speed_exponent rad/s, or
+ * multiplied by it. */
 #define TWO_PI_Q28 1686629713
 #define TWO_PI_Q9 3217
 
@@ -62,12 +64,13 @@ load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t con
 
     /* l2 2 pi 2^14: from 2 pi 2^-32 rad to 2^-22 rad/s, in Q24. */
     const int64_t l2_q46 = ((p2_q46 * ((one_q31 + q_q31) >> 16)) >> 15) * 3 / 2 * rate; /* 46 + 16 bits */
-    gains.speed_gain_q24 = fixed_saturate(fixed_shift((l2_q46 >> 24) * (TWO_PI_Q28 >> 4), 32));
+    gains.speed_gain_q24 =
+        fixed_saturate(fixed_shift((l2_q46 >> 24) * (TWO_PI_Q28 >> 4), 32u + machine_tables.speed_exponent));
 
     /* J l3 2 pi 2^-8: from 2 pi 2^-32 rad to 2^-24 N m; J l3 = (J rate) (p^3 rate). Factors and products are normalised
      * to 31 bits. */
     normal_t load = normal_product(normal(inertia_q30 * rate, 30), normal(p3_q46 * rate, 46));
-    load = normal_product(load, normal(TWO_PI_Q28, 28 + 8));
+    load = normal_product(load, normal(TWO_PI_Q28, 28 + 8 + machine_tables.speed_exponent));
     /* More than 28 fraction bits are cut off, fewer become the factor: at most 2^20 per unit, for which it is 2^17. */
     const int exponent = 28 - load.fraction_bits;
     gains.load_gain_q28 = -(exponent >= 0 ? load.value : exponent > -31 ? load.value >> -exponent : 0);
@@ -82,7 +85,8 @@ load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t iner
         .acceleration_q32 = fixed_saturate(fixed_divide((int64_t)1 << 60, inertia_q30 * rate)),
         .friction_q30 = friction_q30,
         /* Ts / (2 pi) * 2^10 * 2^32 = 2^42 / (2 pi rate). */
-        .angle_step_q32 = (int32_t)fixed_divide(((int64_t)1 << 62) / TWO_PI_Q28 * 256, rate),
+        .angle_step_q32 =
+            (int32_t)fixed_divide(((int64_t)1 << 62) / TWO_PI_Q28 * (256 << machine_tables.speed_exponent), rate),
     };
 }
 

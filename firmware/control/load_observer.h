@@ -49,8 +49,8 @@ load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t con
 /* Model for a control rate in Hz, an inertia in kg m^2, Q1.30, and a viscous friction in N m s, Q1.30. */
 load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t inertia_q30, int32_t friction_q30);
 
-/* Acceleration in rad/s^2 by a torque (N m, Q7.24) on an inertia (kg m^2, Q1.30), rounded to nearest: 19 bits for 40 N
- * m. */
+/* Acceleration in rad/s^2 (2^speed_exponent of SI, as every speed) by a torque (N m, Q7.24) on an inertia (kg m^2,
+ * Q1.30), rounded to nearest: 19 bits for 40 N m. */
 int64_t load_observer_acceleration(int32_t torque_q24, int32_t inertia_q30);
 
 /* Estimate: given angle (2^-32 rev), speed 0, load torque 0. The estimate converges to a spinning rotor within 10 / w0

@@ -1,12 +1,23 @@
-/* Data of the machine, generated from the machine file at build time. */
+/* Data of the machine, generated from the machine file. */
 #ifndef CONTROL_MACHINE_TABLES_H
 #define CONTROL_MACHINE_TABLES_H
 
 #include <stdint.h>
 
+/* Units: the firmware's unit of a quantity is a power of two of the SI unit, chosen for the machine by the generator
+ * (tools/src/salient/machine/scaling.py), so that a format's range fits it:
+ *
+ *   current 2^a A, voltage and flux linkage 2^v V and Wb, torque 2^t N m, speed 2^w rad/s, time s, angle rev
+ *
+ * and what follows from them: resistance 2^(v-a) ohm, inertia 2^(t-w) kg m^2, friction 2^(t-w) N m s. Where a comment
+ * of the firmware says A, V, Wb, N m or rad/s it means these units; with all exponents 0, as for the bundled machines,
+ * they are the SI units. Sensor codes, compare values and encoder counts have no unit, so no law depends on a, v and t.
+ * Only what joins angle and speed depends on w; the bus has parameters' fraction bits and the DBC's factors of the
+ * machine. */
+
 /* Magnetics of a phase: torque and flux linkage per ampere, T / i and psi / i, over angle and current, from the
- * unaligned to the next aligned position and from 0 to 80 A. T / i is nearly linear in the current and psi / i of an
- * unsaturated machine constant, so that linear interpolation between columns suffices.
+ * unaligned to the next aligned position and from 0 to 80 A (in the unit of current). T / i is nearly linear in the
+ * current and psi / i of an unsaturated machine constant, so that linear interpolation between columns suffices.
  *
  * Rows: angles, chosen by the generator where the torque curve of the machine has the largest curvature: equidistant
  * rows would miss the corners where poles begin to overlap. Columns: currents in equal steps of 2 A, 2^10 in Q7.9.
@@ -48,12 +59,14 @@ typedef struct {
     uint8_t result_shift;    /* 0..12 */
 } machine_format_t;
 
+#define MACHINE_PARAMETERS_MAX 64
+
 typedef struct {
     uint8_t phases;                /* 3 or 4 */
     uint8_t rotor_poles;           /* electrical revolutions per mechanical revolution */
-    int32_t inertia_q30;           /* kg m^2, Q1.30 */
-    int32_t friction_q30;          /* N m s, Q1.30 */
-    int32_t resistance_q24;        /* ohm, Q7.24 */
+    uint8_t speed_exponent;        /* w, 0..3 */
+    uint16_t current_range_q9;     /* full scale of the current sensors, A, unsigned Q7.9 */
+    uint16_t voltage_range_q6;     /* full scale of the DC-link voltage divider, V, unsigned Q10.6 */
     int32_t current_slew_rate_A_s; /* di/dt at the unaligned position: supply voltage / inductance */
     machine_row_t row[MACHINE_ROWS];
     uint8_t angle_bin_row[MACHINE_ANGLE_BINS]; /* row in which each angle bin begins */
@@ -62,9 +75,20 @@ typedef struct {
     /* Of the interval that begins at the row; 0 in the last row. */
     int8_t curvature[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
     int16_t node[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
+    /* Of drive/parameters.def, by index: default, raw, and fraction bits of a raw value in the SI unit. */
+    int32_t parameter_default[MACHINE_PARAMETERS_MAX];
+    int8_t parameter_fraction_bits[MACHINE_PARAMETERS_MAX];
+    int32_t speed_reference_max; /* magnitude of a command, LSBs of DRIVE_COMMAND.speed_reference_rpm */
+    uint32_t dbc_hash;           /* of the machine's CAN database, comms/drive.dbc with its factors and ranges */
 } machine_tables_t;
 
-/* The machine that this firmware is built for. */
-extern const machine_tables_t machine_tables;
+/* The machine. On a target a constant, which the laws are compiled for when a drive is linked; on the host a variable,
+ * filled before drive_init: one program serves every machine. */
+#ifdef MACHINE_TABLES_VARIABLE
+#define MACHINE_TABLES_CONST
+#else
+#define MACHINE_TABLES_CONST const
+#endif
+extern MACHINE_TABLES_CONST machine_tables_t machine_tables;
 
 #endif

@@ -1,6 +1,7 @@
 #include "control/moving_load.h"
 
 #include "control/load_observer.h"
+#include "control/machine_tables.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
@@ -22,7 +23,7 @@ static uint32_t implausible_q4(const moving_load_settings_t *settings) {
     const int64_t acceleration = load_observer_acceleration(settings->torque_max_q24, settings->inertia_q30);
     const int64_t bandwidth = settings->bandwidth_rad_s;
     const int64_t trend_q4 = fixed_divide(fixed_divide(acceleration * SLOPE_1_S_Q36, bandwidth * bandwidth), bandwidth);
-    return (uint32_t)fixed_saturate(trend_q4);
+    return (uint32_t)fixed_saturate(trend_q4 << machine_tables.speed_exponent);
 }
 
 moving_load_parameters_t moving_load_configure(const moving_load_settings_t *settings) {
@@ -46,7 +47,9 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
 /* Largest trend that rounding to counts causes when only few of them pass within the time constant: half a count up to
  * one, then less by their number. Q28.4. */
 static uint32_t rounding_q4(const moving_load_parameters_t *parameters, uint32_t angle_step) {
-    const uint32_t counts = (angle_step * parameters->time_constant) >> parameters->encoder_shift; /* below 1/7 rev */
+    const uint32_t counts =
+        (angle_step * parameters->time_constant) >>
+        parameters->encoder_shift; /* at most 1.05 rev: a longer way wraps and the threshold rises */
     return (8u << parameters->encoder_shift) / (counts / 2 + 1);
 }
 

@@ -1,5 +1,6 @@
 #include "control/observer_bandwidth.h"
 
+#include "control/machine_tables.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
@@ -39,7 +40,7 @@
 /* T 2^bits / J in rad/s^2: 2 pi times the square of the bandwidth at which a count is worth the torque T. */
 static uint64_t square_of_count(const observer_bandwidth_settings_t *settings) {
     return (uint64_t)load_observer_acceleration(settings->torque_max_q24, settings->inertia_q30)
-           << settings->encoder_bits; /* below 2^(19 + 32) */
+           << (settings->encoder_bits + machine_tables.speed_exponent); /* below 2^(19 + 32 + 3) */
 }
 
 static bool within(uint32_t bandwidth_rad_s, uint64_t square, unsigned share) {

@@ -4,7 +4,7 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
-/* 5 ns / (2 pi): rotation per tick, 2^-32 rev per rad/s Q9.22, in Q51. */
+/* 5 ns / (2 pi): rotation per tick, 2^-32 rev per rad/s (SI) Q9.22, in Q51. */
 #define ANGLE_PER_TICK_Q51 1834931565
 
 /* An older edge only limits the angle to its count: two periods at 20 kHz. */
@@ -41,7 +41,8 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
     measured->angle_from_edge = true;
     const uint32_t edge = encoder->edge_forward ? count_start : count_start + (1u << parameters->encoder_shift);
     const int32_t angle_per_tick_q19 = fixed_multiply_high(observer->speed_q22, ANGLE_PER_TICK_Q51);
-    measured->angle = edge + (uint32_t)fixed_shift((int64_t)angle_per_tick_q19 * (int32_t)encoder->edge_age_ticks, 19);
+    measured->angle = edge + (uint32_t)fixed_shift((int64_t)angle_per_tick_q19 * (int32_t)encoder->edge_age_ticks,
+                                                   19u - machine_tables.speed_exponent);
 }
 
 static inline int32_t measure_current_q9(const control_parameters_t *parameters, const control_sample_t *sample,

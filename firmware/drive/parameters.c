@@ -1,20 +1,25 @@
 #include "drive/parameters.h"
 
+#include <assert.h>
+
+#include "control/machine_tables.h"
 #include "fixed/fixed.h"
 
 #define Q FIXED_CONSTANT
 
 static const parameter_row_t rows[PARAMETER_COUNT] = {
 #define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text)                             \
-    [PARAMETER_##index] = {name, unit, fraction_bits, minimum, maximum, default_value},
+    [PARAMETER_##index] = {name, unit, minimum, maximum},
 #include "drive/parameters.def"
 #undef PARAMETER
 };
 
+static_assert((int)PARAMETER_COUNT <= MACHINE_PARAMETERS_MAX, "the machine's tables have a default of each parameter");
+
 void parameters_init(parameters_t *parameters) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
-        parameters->values[i] = rows[i].default_value;
-        parameters->defaults[i] = rows[i].default_value;
+        parameters->values[i] = machine_tables.parameter_default[i];
+        parameters->defaults[i] = machine_tables.parameter_default[i];
     }
     parameters->revision = 0;
 }

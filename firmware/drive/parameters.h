@@ -1,6 +1,7 @@
 /* The drive's parameters, addressed by index over CAN; parameters.def is their table.
  *
- * A value is a raw 32-bit integer; its LSB is 2^-fraction_bits of its unit.
+ * A value is a raw 32-bit integer; its LSB is 2^-fraction_bits of its unit. Fraction bits and defaults are those of the
+ * machine (machine_tables): parameters.def has them for a machine whose units are the SI units.
  */
 #ifndef DRIVE_PARAMETERS_H
 #define DRIVE_PARAMETERS_H
@@ -21,10 +22,8 @@ typedef enum {
 typedef struct {
     const char *name; /* at most PARAMETER_NAME_MAX ASCII characters */
     const char *unit; /* ASCII, empty for a plain number */
-    uint8_t fraction_bits;
-    int32_t minimum; /* both limits are inclusive */
+    int32_t minimum;  /* both limits are inclusive */
     int32_t maximum;
-    int32_t default_value; /* unless the machine defines another (parameters_set_default) */
 } parameter_row_t;
 
 /* The values of one drive. Read `values` directly; write through the functions, so that the limits apply. */
@@ -34,14 +33,14 @@ typedef struct {
     uint32_t revision; /* incremented by every write, so that derived values can be recomputed */
 } parameters_t;
 
-/* Sets every value to the table's default. */
+/* Sets every value to the machine's default. */
 void parameters_init(parameters_t *parameters);
 
 /* The table's row; index 0..PARAMETER_COUNT-1. */
 const parameter_row_t *parameters_row(unsigned index);
 
-/* Sets the default of this drive and its present value, clamped to the row's limits: for what the machine or the
- * configuration defines. index 0..PARAMETER_COUNT-1. */
+/* Sets the default of this drive and its present value, clamped to the row's limits: for what the configuration
+ * defines. index 0..PARAMETER_COUNT-1. */
 void parameters_set_default(parameters_t *parameters, unsigned index, int32_t value);
 
 /* Writes a value: PARAMETER_STATUS_DONE, or, with nothing changed, PARAMETER_STATUS_NO_SUCH_PARAMETER or

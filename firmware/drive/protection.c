@@ -6,13 +6,14 @@
 #include "drive/fault.h"
 #include "fixed/fixed.h"
 
-/* An encoder that does not count is no evidence of a fault below this speed: 1 rad/s. */
+/* An encoder that does not count is no evidence of a fault below this speed: 1 rad/s, of a fast machine up to 8 rad/s
+ * (machine_tables.h), always less than 0.4 % of the range of speeds. */
 #define STANDSTILL_Q22 (1 << 22)
 
 /* Above every limit; the sum stops growing there and so cannot overflow: with the highest speed at 20 kHz a period adds
- * less than 2^25. */
-#define UNDETECTED_TRAVEL_STOP (1 << 30)
-#define PERIODS_MAX 16
+ * less than 2^28, and a step stands for PERIODS_MAX periods at most. */
+#define UNDETECTED_TRAVEL_STOP (1 << 29)
+#define PERIODS_MAX PROTECTION_SKIPPED_DEFERRED_MAX
 
 void protection_reset(protection_t *protection, uint32_t encoder_angle) {
     *protection = (protection_t){.encoder_angle = encoder_angle};

@@ -13,26 +13,27 @@ from pathlib import Path
 
 import pytest
 
-from salient.bench.emulator import executable
+from salient.bench.programs import executable
 from salient.config import DEFAULTS, FLAG, OPTIONS, flag_of
+from salient.machine.cache import machine_image
 
 TIMEOUT_S = 20
 RUN_UNTIL_ID = 0x9F000001  # includes the extended flag
 
 
 @pytest.fixture
-def program() -> str:
-    return str(executable("saturating"))
+def program() -> list[str]:
+    return [str(executable()), "--machine-image", str(machine_image("saturating"))]
 
 
 @pytest.fixture
-def start(program: str, tmp_path: Path) -> Iterator:
+def start(program: list[str], tmp_path: Path) -> Iterator:
     """Starts the executable on tmp_path/bus and waits for its ready line; ends remaining processes."""
     processes = []
 
     def run(*arguments: str) -> tuple[subprocess.Popen[str], dict]:
         process = subprocess.Popen(
-            [program, "--can", f"unix:{tmp_path}/bus", *arguments],
+            [*program, "--can", f"unix:{tmp_path}/bus", *arguments],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         processes.append(process)
@@ -78,11 +79,11 @@ def start(program: str, tmp_path: Path) -> Iterator:
     ],
 )
 def test_usage_error_is_one_line_and_exit_code_2(
-    program: str, tmp_path: Path, arguments: list[str], expected_texts: list[str]
+    program: list[str], tmp_path: Path, arguments: list[str], expected_texts: list[str]
 ) -> None:
     bus = tmp_path / "bus"
     line = [f"unix:{bus}" if argument == "BUS" else argument for argument in arguments]
-    command = [program, *line]
+    command = [*program, *line]
     result = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path, timeout=TIMEOUT_S)
     assert result.returncode == 2
     assert result.stdout == ""
@@ -92,8 +93,8 @@ def test_usage_error_is_one_line_and_exit_code_2(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_usage_text_has_every_option_and_controller(program: str) -> None:
-    result = subprocess.run([program, "--help"], check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
+def test_usage_text_has_every_option_and_controller(program: list[str]) -> None:
+    result = subprocess.run([*program, "--help"], check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert (result.returncode, result.stderr) == (0, "")
     described = re.findall(r"^  (--[a-z-]+)", result.stdout, re.MULTILINE)
     assert described == [flag_of(name) for name, option in OPTIONS.items() if option.argument]
@@ -120,8 +121,8 @@ def test_defaults_are_those_of_bench_config(start, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("pace", "is_valid"), [
     ("x0.01", True), ("x1000", True), ("x.5", True), ("x0.009", False), ("x1000.1", False), ("x", False), ("1", False),
 ])  # fmt: skip
-def test_paces_are_those_of_bench_config(program: str, tmp_path: Path, pace: str, is_valid: bool) -> None:
-    line = [program, "--can", f"unix:{tmp_path}/bus", "--pace", pace, "--stop-at-s", "0.000001"]
+def test_paces_are_those_of_bench_config(program: list[str], tmp_path: Path, pace: str, is_valid: bool) -> None:
+    line = [*program, "--can", f"unix:{tmp_path}/bus", "--pace", pace, "--stop-at-s", "0.000001"]
     result = subprocess.run(line, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert result.returncode == (0 if is_valid else 2), result.stderr
     if is_valid:
@@ -171,13 +172,13 @@ def test_distant_run_until_does_not_prevent_termination(start, tmp_path: Path) -
     assert process.wait(TIMEOUT_S) == 0
 
 
-def test_stale_socket_is_replaced_and_a_live_one_is_not(start, program: str, tmp_path: Path) -> None:
+def test_stale_socket_is_replaced_and_a_live_one_is_not(start, program: list[str], tmp_path: Path) -> None:
     process, _ = start("--pace", "lockstep")
     process.kill()
     process.wait()
     assert (tmp_path / "bus").exists()
     start("--pace", "lockstep")
-    line = [program, "--can", f"unix:{tmp_path}/bus"]
+    line = [*program, "--can", f"unix:{tmp_path}/bus"]
     second = subprocess.run(line, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert second.returncode == 2
     assert re.fullmatch(r"salient: [^\n]*in use[^\n]*\n", second.stderr)

@@ -88,6 +88,14 @@ class SensorErrors(ctypes.Structure):
     ]
 
 
+class SensorRanges(ctypes.Structure):
+    _fields_ = [
+        ("current_A", ctypes.c_double),
+        ("dc_link_V", ctypes.c_double),
+        ("load_torque_Nm", ctypes.c_double),
+    ]
+
+
 class Machine(ctypes.Structure):
     _fields_ = [
         ("name", ctypes.c_char_p),
@@ -102,6 +110,7 @@ class Machine(ctypes.Structure):
         ("converter", Converter),
         ("dc_link", DcLink),
         ("sensors", SensorErrors),
+        ("ranges", SensorRanges),
     ]
 
 

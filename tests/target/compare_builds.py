@@ -25,7 +25,7 @@ BUILDS = ("host", "cortex-m4", "rv32")
 
 
 def digest_of_run(name: str, build: str, machine: str, controller: str) -> dict[str, Any]:
-    """Hashes of a run by the build that the environment variable SALIENT_BUILD names."""
+    """Hashes of a run by the checkout that the package is imported from."""
     from test_same_bits import ROW_BYTES, RUNS
 
     from salient.bench.bench import Bench
@@ -63,10 +63,11 @@ def run_all(options: argparse.Namespace) -> None:
         json.dump({" ".join(run): digest for run, digest in zip(runs, digests, strict=True)}, sys.stdout)
 
 
-def digests_of(build: Path, arguments: list[str]) -> dict[str, Any]:
-    """Digests of the runs by the build folder of a checkout."""
+def digests_of(root: Path, arguments: list[str]) -> dict[str, Any]:
+    """Digests of the runs by a checkout: its programs, and its package, which makes the machine images that they
+    read."""
     done = subprocess.run([sys.executable, __file__, *arguments, "--print"], stdout=subprocess.PIPE, check=True,
-                          env={**os.environ, "SALIENT_BUILD": str(build)})
+                          env={**os.environ, "PYTHONPATH": str(root / "tools" / "src")})
     return json.loads(done.stdout)
 
 
@@ -83,7 +84,7 @@ def main() -> int:
         run_all(options)
         return 0
     root = Path(__file__).resolve().parents[2]
-    theirs, ours = (digests_of(folder / "build", sys.argv[1:]) for folder in (options.other.resolve(), root))
+    theirs, ours = (digests_of(folder, sys.argv[1:]) for folder in (options.other.resolve(), root))
     periods = frames = differences = 0
     for run, old in theirs.items():
         new = ours[run]

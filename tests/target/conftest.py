@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from salient.bench.emulator import TARGET_BUILDS
+from salient.config import TARGET_BUILDS
 from salient.target.baseline import size_table
 
 _PROPERTY = "control_periods"

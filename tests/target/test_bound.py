@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from salient.bench.emulator import image
+from salient.bench.programs import image
 from salient.config import CONTROLLERS
 from salient.elf import ElfImage
 from salient.errors import UsageError

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from salient.bench.emulator import executable
+from salient.bench.programs import executable
+from salient.machine.cache import machine_image
 from salient.paths import BUILD, ROOT
 
 TIMEOUT_S = 30
@@ -77,8 +78,8 @@ def layout_of_world() -> int:
 
 
 def run(image: Path, folder: Path) -> subprocess.CompletedProcess:
-    command = [executable("saturating", "cortex-m4"), image, "--can", f"unix:{folder}/bus", "--pace", "free",
-               "--stop-at-s", "1", "--record", folder / "state.npy"]
+    command = [executable("cortex-m4"), image, "--can", f"unix:{folder}/bus", "--pace", "free",
+               "--machine-image", machine_image("saturating"), "--stop-at-s", "1", "--record", folder / "state.npy"]
     return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL)
 
 

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from salient.bench.emulator import command_line, deferred_instructions, executable
+from salient.bench.programs import command_line, deferred_instructions, executable
 from salient.benchmark import command as benchmark
 from salient.config import CONTROLLERS, BenchConfig
 from salient.elf import ElfImage
+from salient.machine.cache import machine_image
 from salient.paths import BUILD
 from salient.target.isr_profile import IsrProfile, measure, read_profile
 
@@ -145,9 +146,10 @@ def test_control_interrupt_that_preempts_the_deferred_one_is_not_part_of_its_cou
                        f'exec qemu-system-arm -singlestep -d exec,nochain -D {log} "$@"\n')
     wrapper.chmod(0o755)
     counts = {"control": control, "deferred": deferred_instructions(control)}
-    command = [executable("saturating", "cortex-m4"), BUILD / "cortex-m4" / "bin" / "race_protected.elf",
+    command = [executable("cortex-m4"), BUILD / "cortex-m4" / "bin" / "race_protected.elf",
                "--instructions", counts["control"], "--deferred-instructions", counts["deferred"], "--pace", "free",
-               "--can", f"unix:{tmp_path}/bus", "--stop-at-s", "0.003"]
+               "--can", f"unix:{tmp_path}/bus", "--machine-image", machine_image("saturating"),
+               "--stop-at-s", "0.003"]
     subprocess.run(command, check=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                    env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"})
     lengths, _ = interrupts_in(log)

@@ -10,14 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from salient.bench.emulator import executable, image
+from salient.bench.programs import executable, image
+from salient.machine.cache import machine_image
 
 TIMEOUT_S = 20
 
 
 @pytest.fixture
 def program() -> list[str]:
-    return [str(executable("saturating", "cortex-m4")), str(image("saturating", "cortex-m4"))]
+    return [str(executable("cortex-m4")), str(image("saturating", "cortex-m4"))]
 
 
 @pytest.mark.parametrize(
@@ -38,7 +39,8 @@ def test_usage_error_is_one_line_and_exit_code_2(
     program, tmp_path: Path, arguments: list[str], expected_texts: list[str]
 ):
     line = [f"unix:{tmp_path}/bus" if argument == "BUS" else argument for argument in arguments]
-    result = subprocess.run([*program, *line], capture_output=True, text=True, cwd=tmp_path, timeout=TIMEOUT_S)
+    result = subprocess.run([*program, *line, "--machine-image", machine_image("saturating")], capture_output=True,
+                            text=True, cwd=tmp_path, timeout=TIMEOUT_S)
     assert result.returncode == 2
     assert result.stdout == ""
     assert re.fullmatch(r"salient: [^\n]+\n", result.stderr), result.stderr
@@ -63,7 +65,7 @@ def test_file_that_is_not_an_image_is_named(program, tmp_path: Path):
 @pytest.mark.parametrize(("build", "qemu", "package"), [("cortex-m4", "qemu-system-arm", "qemu-system-arm"),
                                                         ("rv32", "qemu-system-riscv32", "qemu-system-misc")])
 def test_missing_qemu_is_reported_with_its_package(tmp_path: Path, build: str, qemu: str, package: str):
-    program = [executable("saturating", build), image("saturating", build)]
+    program = [executable(build), image("saturating", build)]
     result = subprocess.run([*program, "--can", f"unix:{tmp_path}/bus"], capture_output=True, text=True,
                             env={"PATH": str(tmp_path)}, timeout=TIMEOUT_S)
     assert result.returncode == 2
@@ -74,7 +76,8 @@ def test_missing_qemu_is_reported_with_its_package(tmp_path: Path, build: str, q
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, "stdin"])
 def test_ready_line_then_a_clean_end_without_the_socket(program, tmp_path: Path, pace: str, end):
     bus = tmp_path / "with,comma"
-    process = subprocess.Popen([*program, "--can", f"unix:{bus}", "--pace", pace, "--follow-stdin"],
+    process = subprocess.Popen([*program, "--machine-image", machine_image("saturating"), "--can", f"unix:{bus}",
+                                "--pace", pace, "--follow-stdin"],
                                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     with process:
         ready = json.loads(process.stdout.readline())

@@ -7,7 +7,7 @@ import re
 import subprocess
 from pathlib import Path
 
-from salient.bench.emulator import command_line
+from salient.bench.programs import command_line
 from salient.config import BenchConfig
 from salient.elf import ElfImage
 from salient.target.isr_profile import read_profile

@@ -6,6 +6,8 @@ Compared are the compare values of every control period, every CAN frame with it
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +17,8 @@ import pytest
 
 from salient.bench.bench import Bench
 from salient.config import CONTROLLERS, TARGET_BUILDS, TARGETS
+from salient.paths import BUILD
+from salient.paths import MACHINES as MACHINE_FILES
 
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
 ROW_BYTES = 16
@@ -122,6 +126,37 @@ def test_other_board_options_agree_on_host_and_targets(traces, board):
     made = traces(TARGETS, "load_step_150", controller="salient", **board)
     for build in TARGETS:
         assert made[build] == made["host"], build
+
+
+def machine_file(folder: Path, stem: str, inertia: float) -> Path:
+    text = (MACHINE_FILES / "linear_cosine.toml").read_text(encoding="utf-8")
+    assert "inertia_kg_m2 = 0.02" in text
+    path = folder / f"{stem}.toml"
+    path.write_text(text.replace("inertia_kg_m2 = 0.02", f"inertia_kg_m2 = {inertia}"), encoding="utf-8")
+    return path
+
+
+def test_machine_file_of_the_user_agrees_on_host_and_targets(traces, tmp_path):
+    """The host reads the tables, in the targets they are compiled in; the file has the name of another machine."""
+    made = traces(TARGETS, "start_600", machine=str(machine_file(tmp_path, "saturating", 0.013)))
+    bundled = traces(["host"], "start_600", machine="linear_cosine")["host"]
+    for build in TARGETS:
+        assert made[build] == made["host"], build
+    assert made["host"].compare_values != bundled.compare_values
+
+
+def test_processes_that_build_firmware_for_machine_files_at_once_do_not_collide(tmp_path):
+    """Each of two files by two processes, one build per file."""
+    files = [machine_file(tmp_path, name, inertia) for name, inertia in (("my light", 0.01), ("my heavy", 0.03))]
+    code = "import sys; from salient.bench.programs import image; print(image(sys.argv[1], 'cortex-m4'))"
+    processes = [subprocess.Popen([sys.executable, "-c", code, file], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                                  text=True) for file in files * 2]
+    outputs = [process.communicate() for process in processes]
+    assert [process.returncode for process in processes] == [0] * 4, outputs
+    images = [Path(output.strip()) for output, _ in outputs]
+    assert images[:2] == images[2:] and images[0].parents[2] != images[1].parents[2]
+    assert all(made.is_file() and made.is_relative_to(BUILD) for made in images)
+    assert [sum("building the firmware for" in errors for _, errors in outputs[at::2]) for at in (0, 1)] == [1, 1]
 
 
 def test_different_seeds_give_different_runs(traces):

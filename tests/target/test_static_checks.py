@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from salient.bench.emulator import TARGET_BUILDS, image
+from salient.bench.programs import image
+from salient.config import TARGET_BUILDS
 from salient.elf import ElfImage
 from salient.target.baseline import firmware_alone
 from salient.target.static_checks import deepest_stack, forbidden, indirect_calls, size, undefined_symbols

@@ -17,11 +17,13 @@ import numpy as np
 import pytest
 
 from salient.bench.bench import Bench
-from salient.bench.emulator import EmulatorProcess, command_line, executable
+from salient.bench.emulator import EmulatorProcess
+from salient.bench.programs import command_line, executable
 from salient.bench.session import Session
 from salient.config import CONTROLLERS, TARGET_BUILDS, BenchConfig
 from salient.errors import UsageError
 from salient.experiments.metrics import load_step_metrics, start_metrics, torque_metrics
+from salient.machine.cache import machine_image
 from salient.paths import BUILD
 
 PERIOD_US = 25.0
@@ -251,8 +253,9 @@ def race(tmp_path: Path) -> Callable[..., Race]:
     def run(build: str, kind: str, timed: bool) -> Race:
         can = f"unix:{tmp_path}/{build}_{kind}"
         timing = ["--instruction-ns", "8"] if timed else []
-        command = [str(executable("saturating", build)), str(BUILD / build / "bin" / f"race_{kind}.elf"), *timing,
-                   "--can", can, "--pace", "lockstep", "--follow-stdin"]
+        command = [str(executable(build)), str(BUILD / build / "bin" / f"race_{kind}.elf"), *timing,
+                   "--can", can, "--machine-image", str(machine_image("saturating")), "--pace", "lockstep",
+                   "--follow-stdin"]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
             assert json.loads(process.stdout.readline())["ready"]
             with Session(can) as session:

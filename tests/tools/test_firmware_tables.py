@@ -7,9 +7,9 @@ import shutil
 import numpy as np
 import pytest
 
-from salient.bench.emulator import executable
 from salient.errors import UsageError
 from salient.generate import machine as generate_machine
+from salient.machine.cache import machine_image
 from salient.machine.file import MachineError, load_machine
 from salient.machine.firmware_tables import (
     ANGLE_BINS,
@@ -22,6 +22,7 @@ from salient.machine.firmware_tables import (
     machine_phase_map,
     phase_map,
 )
+from salient.machine.scaling import Exponents
 from salient.paths import MACHINES
 
 POLES = 4
@@ -313,7 +314,7 @@ def test_build_step_names_the_rejected_file(strong_machine, tmp_path, capsys):
 
 def test_rejected_machine_is_named_before_anything_is_built(strong_machine):
     with pytest.raises(UsageError, match=r"strong\.toml: magnetics: [0-9]+ N m/A of torque is more than"):
-        executable(str(strong_machine))
+        machine_image(str(strong_machine))
 
 
 def test_map_that_ends_early_is_levelled_where_linear_extrapolation_loses_torque(tmp_path):
@@ -336,4 +337,4 @@ def test_flux_linkage_beyond_its_format_is_an_error_that_names_the_file(tmp_path
     path = tmp_path / "inductive.toml"
     path.write_text(text.replace("23.6e-3", "60e-3"), encoding="utf-8")
     with pytest.raises(MachineError, match=r"inductive\.toml: magnetics: the flux linkage .* it must be below 4 Wb$"):
-        machine_phase_map(path, load_machine(path))
+        machine_phase_map(path, load_machine(path), Exponents())

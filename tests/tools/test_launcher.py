@@ -6,12 +6,11 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from salient.paths import BUILD, MACHINES, ROOT
+from salient.paths import MACHINES, ROOT
 
 SCENARIO = """
 machine = "saturating"
@@ -118,11 +117,6 @@ def test_invalid_machine_file_is_rejected(salient_without_build, tmp_path, old, 
     assert_usage_error(salient_without_build("sim", "--machine", path), str(path), *expected_texts)
 
 
-def test_machine_file_with_the_name_of_a_bundled_machine_is_rejected(salient, tmp_path):
-    path = machine_file(tmp_path, "saturating", "stator", "stator")
-    assert_usage_error(salient("sim", "--machine", path), str(path), "rename the file")
-
-
 def test_bus_in_use_is_reported(salient, make_bench):
     bench = make_bench()
     assert_usage_error(salient("sim", "--can", bench.address), bench.address.removeprefix("unix:"))
@@ -144,30 +138,3 @@ def test_missing_python_is_reported(salient, tmp_path):
     copy.chmod(0o755)
     result = subprocess.run([copy, "sim", "--no-install"], capture_output=True, text=True, env=os.environ)
     assert_usage_error(result, "python3", "python3-venv")
-
-
-def test_two_processes_build_for_machine_files_of_the_user_simultaneously(tmp_path):
-    """Each of two files by two processes, one build per file."""
-    files = [machine_file(tmp_path, name, "inertia_kg_m2 = 0.02", f"inertia_kg_m2 = {inertia}")
-             for name, inertia in (("light", 0.01), ("heavy", 0.03))]
-    code = "import sys; from salient.bench.emulator import executable; print(executable(sys.argv[1]))"
-    processes = [subprocess.Popen([sys.executable, "-c", code, file], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                                  text=True) for file in files * 2]
-    outputs = [process.communicate() for process in processes]
-    assert [process.returncode for process in processes] == [0] * 4, outputs
-    programs = [Path(output.strip()) for output, _ in outputs]
-    assert programs[:2] == programs[2:] and programs[0].parents[2] != programs[1].parents[2]
-    assert all(program.exists() and program.is_relative_to(BUILD) for program in programs)
-    assert [sum("building the drive for" in errors for _, errors in outputs[at::2]) for at in (0, 1)] == [1, 1]
-
-
-def test_machine_file_of_the_user_is_built_on_demand(make_bench, tmp_path):
-    """A file with half the inertia is built on demand, and its motor accelerates about twice as fast."""
-    path = machine_file(tmp_path, "half_inertia", "inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.01")
-    speeds = []
-    for machine in (str(path), "saturating"):
-        bench = make_bench(machine=machine, controller="paper")
-        bench.drive.speed_reference_rpm = 3000
-        bench.run_for(0.05)
-        speeds.append(bench.truth["speed_rpm"].last)
-    assert speeds[0] / speeds[1] == pytest.approx(2.0, abs=0.3)

@@ -15,8 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from salient.machine.cache import FOLDER, content_key
+from salient.machine.drive_data import derive
 from salient.machine.file import Machine, MachineError, load_machine, machine_path
 from salient.machine.magnetics import Formula
+from salient.machine.parameter_table import read_table
 from salient.paths import BUILD
 
 SEED = 20
@@ -67,8 +70,32 @@ GOOD_TABLES = {
         "steinmetz_alpha": "1.4",
         "steinmetz_beta": "1.8",
     },
+    "drive": {
+        "supply_min_V": "200.0",
+        "supply_max_V": "260.0",
+        "current_rated_A": "40.0",
+        "current_peak_A": "50.0",
+        "torque_rated_Nm": "14.0",
+        "torque_peak_Nm": "18.0",
+        "speed_base_rpm": "1400.0",
+        "speed_max_rpm": "3500.0",
+        "thermal_time_constant_s": "90.0",
+        "control_rate_hz": "50000",
+        "encoder_bits": "14",
+        "encoder_edges": "true",
+        "adc_bits": "13",
+        "adc_current_A": "80.0",
+        "adc_voltage_V": "512.0",
+    },
+    "drive.parameters": {
+        "speed_kp": "5.0",
+        "current_trip_A": "70.0",
+        "smc_k": "1200.0",
+        "pulses_per_period": "1",
+    },
 }
-MAY_BE_LEFT_OUT = {(table, key) for table in ("converter", "sensors") for key in GOOD_TABLES[table]}
+MAY_BE_LEFT_OUT = {(table, key) for table in ("converter", "sensors", "drive", "drive.parameters")
+                   for key in GOOD_TABLES[table]}
 MAY_BE_LEFT_OUT -= {("converter", "supply_voltage_V")}
 
 
@@ -174,6 +201,8 @@ WRONG_VALUES = {
 }
 ZERO_ALLOWED = {("mechanics", "friction_Nm_s"), ("sensors", "current_gain")} | MAY_BE_LEFT_OUT
 ZERO_ALLOWED -= {("sensors", "current_limit_A")}
+ZERO_ALLOWED -= {("drive", key) for key in GOOD_TABLES["drive"] if key != "encoder_bits"}
+ZERO_ALLOWED -= {("drive.parameters", "current_trip_A"), ("drive.parameters", "pulses_per_period")}
 
 Case = tuple[str, str, str]
 """(what was done, machine file, what the rejection must name)."""
@@ -195,7 +224,8 @@ def key_cases() -> list[Case]:
             cases.append((f"{name} renamed", renamed, f"{table}.{key}"))
             line = f"{key} = {keys[key]}\n"
             cases.append((f"{name} twice", GOOD.replace(line, line + line, 1), "line "))
-            wrong = WRONG_VALUES | ({} if (table, key) in ZERO_ALLOWED else {"zero": "0"})
+            wrong = {what: value for what, value in WRONG_VALUES.items() if value != keys[key]}
+            wrong |= ({} if (table, key) in ZERO_ALLOWED else {"zero": "0"})
             cases += [(f"{name} {what}", with_value(table, key, value), "not TOML" if what == TOO_LONG else name)
                       for what, value in wrong.items()]  # fmt: skip
     return cases
@@ -205,13 +235,13 @@ def table_cases() -> list[Case]:
     cases: list[Case] = []
     for table, content in GOOD_TABLES.items():
         without = {name: keys for name, keys in GOOD_TABLES.items() if name != table}
-        if table not in ("dc_link", "sensors", "iron_loss"):
+        if table not in ("dc_link", "sensors", "iron_loss", "drive", "drive.parameters"):
             cases.append((f"[{table}] removed", toml(without), table))
         cases += [
             (f"[{table}] renamed", toml({**without, f"{table}s": content}), f"{table}s"),
             (f"[{table}] twice", GOOD + f"[{table}]\n", "line "),
             (f"[{table}] in brackets of an array", GOOD.replace(f"[{table}]", f"[[{table}]]"), table),
-            (f"[{table}] a number", f"{table} = 1\n" + toml(without), table),
+            (f"[{table}] a number", f"{table} = 1\n" + toml(without), "line " if table.startswith("drive") else table),
             (f"[{table}] open", GOOD.replace(f"[{table}]", f"[{table}"), "line "),
         ]
     return cases
@@ -266,6 +296,87 @@ def test_every_mutation_of_a_key_or_table_is_rejected_by_one_line_that_names_it(
     messages = {what: (rejection(write(tmp_path, text)), named) for what, text, named in MACHINE_CASES}
     wrong = {what: text for what, (text, named) in messages.items() if text is None or named not in text}
     assert not wrong, wrong
+
+
+def drive(**keys: str) -> str:
+    """A machine file whose [drive] has nothing but these keys; one with a point in its name is of [drive.parameters]
+    ("parameters.smc_k")."""
+    tables: dict[str, dict[str, str]] = {"drive": {}, "drive.parameters": {}}
+    for key, value in keys.items():
+        *_, name = key.split(".")
+        tables["drive.parameters" if "." in key else "drive"][name] = value
+    return toml({**GOOD_TABLES, **tables})
+
+
+CONTRADICTIONS: list[tuple[dict[str, str], str, str]] = [
+    ({"parameters.current_limit_A": "60", "parameters.current_trip_A": "50"}, "drive.parameters.current_limit_A: 60",
+     "drive.parameters.current_trip_A, 50"),
+    ({"parameters.current_trip_A": "40"}, "current_limit_A (derived)", "drive.parameters.current_trip_A, 40"),
+    ({"current_peak_A": "90", "adc_current_A": "80"}, "drive.current_peak_A: 90", "drive.adc_current_A, 80"),
+    ({"adc_current_A": "70", "parameters.current_trip_A": "70"}, "drive.parameters.current_trip_A: 70",
+     "drive.adc_current_A, 70"),
+    ({"supply_min_V": "250"}, "drive.supply_min_V: 250", "converter.supply_voltage_V, 240"),
+    ({"supply_max_V": "230"}, "converter.supply_voltage_V: 240", "drive.supply_max_V, 230"),
+    ({"parameters.bus_over_voltage_V": "200"}, "supply_max_V (derived): 240", "drive.parameters.bus_over_voltage_V"),
+    ({"parameters.bus_over_voltage_V": "275"}, "dc_link.chopper_on_V: 280", "drive.parameters.bus_over_voltage_V, 275"),
+    ({"parameters.bus_under_voltage_V": "300"}, "drive.parameters.bus_under_voltage_V: 300", "supply_min_V (derived)"),
+    ({"adc_voltage_V": "256"}, "bus_over_voltage_V (derived): 300", "drive.adc_voltage_V, 256"),
+    ({"current_rated_A": "60", "current_peak_A": "50"}, "drive.current_rated_A: 60", "drive.current_peak_A, 50"),
+    ({"torque_rated_Nm": "20", "torque_peak_Nm": "19"}, "drive.torque_rated_Nm: 20", "drive.torque_peak_Nm, 19"),
+    ({"torque_peak_Nm": "40", "current_peak_A": "52"}, "drive.torque_peak_Nm: 40", "drive.current_peak_A, 52"),
+    ({"speed_base_rpm": "3000", "speed_max_rpm": "2000"}, "drive.speed_base_rpm: 3000", "drive.speed_max_rpm, 2000"),
+    ({"speed_max_rpm": "30000"}, "drive.speed_max_rpm: 30000: 20 control periods in an electrical revolution",
+     "control_rate_hz (default), 40000; must be at least 25"),
+    ({"speed_max_rpm": "20000", "control_rate_hz": "20000"}, "drive.speed_max_rpm: 20000",
+     "drive.control_rate_hz, 20000"),
+    ({"speed_max_rpm": "3000", "parameters.over_speed_rpm": "2900"}, "drive.speed_max_rpm: 3000",
+     "drive.parameters.over_speed_rpm, 2900"),
+    ({"parameters.torque_band_inner_Nm": "2", "parameters.torque_band_outer_Nm": "1"},
+     "drive.parameters.torque_band_inner_Nm: 2", "drive.parameters.torque_band_outer_Nm, 1"),
+    ({"control_rate_hz": "30000"}, "drive.control_rate_hz: 30000", "must be 20000, 40000"),
+    ({"encoder_bits": "7"}, "drive.encoder_bits: 7", "must be 0 or 8 to 24"),
+    ({"parameters.smc_K": "7"}, "drive.parameters.smc_K: unknown key", "the nearest is smc_k"),
+    ({"parameters.pulses_per_period": "1.5"}, "drive.parameters.pulses_per_period: 1.5", "a whole number from 1 to 2"),
+]
+
+
+@pytest.mark.parametrize(("keys", "first", "second"), CONTRADICTIONS,
+                         ids=[" ".join(keys) for keys, _, _ in CONTRADICTIONS])
+def test_contradictory_data_of_the_drive_are_refused_by_a_line_that_names_both(
+        tmp_path: Path, keys: dict[str, str], first: str, second: str) -> None:
+    text = rejection(write(tmp_path, drive(**keys)))
+    assert text is not None and text.startswith(first) and second in text, text
+
+
+@pytest.mark.parametrize("map_file", [False, True], ids=["formula", "map"])
+def test_random_data_of_the_drive_are_refused_by_a_line_that_names_one_or_give_finite_values(
+        tmp_path: Path, map_file: bool) -> None:
+    chance = random.Random(SEED)
+    names = [*GOOD_TABLES["drive"], *(f"parameters.{row.name}" for row in read_table())]
+    refused, accepted = 0, 0
+    for _ in range(60 if map_file else 400):
+        keys = {}
+        for name in chance.sample(names, chance.randrange(1, 5)):
+            good = GOOD_TABLES["drive"].get(name)
+            near = f"{float(good) * chance.uniform(0.5, 2.0):.6g}" if good and good != "true" else "1"
+            keys[name] = chance.choice([near, near, f"{10.0 ** chance.uniform(-4.0, 5.0):.6g}",
+                                        str(chance.randrange(-2, 20)), chance.choice(list(WRONG_VALUES.values()))])
+        text = drive(**keys)
+        if map_file:
+            text = text.replace(toml({"magnetics": GOOD_TABLES["magnetics"]}).split("\n", 2)[2],
+                                f'[magnetics]\nform = "map"\nfile = "{NAME}.csv"\n')
+        path = write(tmp_path, text, GOOD_MAP)
+        message = rejection(path)
+        if message is None:
+            accepted += 1
+            data = derive(load_machine(path))
+            assert all(math.isfinite(each.value) for each in data.derivations), keys
+            assert data.parameters["current_limit_A"] < data.current_trip_A < data.adc_current_A, keys
+        else:
+            refused += 1
+            stated = [f"drive.{name}" for name in keys]
+            assert any(name in message for name in stated) or "line " in message or "not TOML" in message, message
+    assert refused > 20 and accepted > 5
 
 
 def test_truncated_machine_file_is_rejected_or_still_valid(tmp_path: Path) -> None:
@@ -533,5 +644,6 @@ def test_commands_end_with_one_line_and_exit_code_2_and_build_nothing(
     assert not any(case in name for name in built())
     assert case not in (BUILD / "host" / "CMakeCache.txt").read_text()
     assert not any(case in note.read_text() for note in BUILD.glob("machine-*/machine_file"))
+    assert not (FOLDER / f"{content_key(path)}.machine").exists()
     assert not still_runs(str(tmp_path))
     assert {entry.name for entry in tmp_path.iterdir()} <= before | {"out"}

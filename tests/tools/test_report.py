@@ -14,6 +14,8 @@ from salient.pages import CONTROLLER_COLOUR, Plot
 CONTROLLERS = ("traditional", "paper", "salient")
 """Controllers of pages and plots; the paper has no values for the last."""
 CONDITIONS = {
+    "operating_point": {"start_rpm": 600.0, "step_rpm": 150.0, "load_Nm": 8.0, "step_at_s": 0.13,
+                        "window_s": [0.3, 0.4]},
     "control_rate_hz": 40_000,
     "adc": {"bits": 12, "range_A": [0.0, 80.0]},
     "encoder": {"bits": 17},

@@ -172,8 +172,10 @@ class Drive : public testing::Test {
 TEST_F(Drive, starts_the_timer_once_with_the_rate_s_period_and_the_machine_s_defaults) {
     EXPECT_EQ(hal.starts, std::vector<uint16_t>{2500});
     EXPECT_EQ(drive.parameters.values[PARAMETER_CONTROLLER], DRIVE_CONTROLLER_PAPER);
-    EXPECT_EQ(drive.parameters.values[PARAMETER_INERTIA_KG_M2], machine_tables.inertia_q30);
-    EXPECT_EQ(drive.parameters.values[PARAMETER_FRICTION_NM_S], machine_tables.friction_q30);
+    EXPECT_EQ(drive.parameters.values[PARAMETER_INERTIA_KG_M2],
+              machine_tables.parameter_default[PARAMETER_INERTIA_KG_M2]);
+    EXPECT_EQ(drive.parameters.values[PARAMETER_FRICTION_NM_S],
+              machine_tables.parameter_default[PARAMETER_FRICTION_NM_S]);
 }
 
 TEST_F(Drive, refuses_a_rate_that_the_timer_cannot_make_and_starts_nothing) {

@@ -12,16 +12,14 @@ extern "C" {
 #include "drive/deferred.h"
 }
 
-// support/changeable_tables.c
-extern "C" machine_tables_t changeable_tables asm("machine_tables");
-
 namespace {
 
 constexpr int SEQUENCES = 6000;
 constexpr int PERIODS = 400;
 
 // Any value of the row's range; its ends and its default more often.
-int32_t any_value(const parameter_row_t *row, std::mt19937_64 &random) {
+int32_t any_value(unsigned index, std::mt19937_64 &random) {
+    const parameter_row_t *row = parameters_row(index);
     switch (random() % 8) {
     case 0:
         return row->minimum;
@@ -29,7 +27,7 @@ int32_t any_value(const parameter_row_t *row, std::mt19937_64 &random) {
         return row->maximum;
     case 2:
     case 3:
-        return row->default_value;
+        return machine_tables.parameter_default[index];
     default:
         return int32_t(row->minimum + int64_t(random() % (uint64_t(int64_t(row->maximum) - row->minimum) + 1)));
     }
@@ -37,7 +35,7 @@ int32_t any_value(const parameter_row_t *row, std::mt19937_64 &random) {
 
 // The machine at hand, and one with four phases whose map is full of noise.
 machine_tables_t four_phases() {
-    machine_tables_t tables = changeable_tables;
+    machine_tables_t tables = machine_tables;
     tables.phases = 4;
     tables.rotor_poles = 6;
     std::mt19937 random(1);
@@ -88,17 +86,17 @@ struct bench_t {
 };
 
 TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
-    const machine_tables_t bundled = changeable_tables, other = four_phases();
+    const machine_tables_t bundled = machine_tables, other = four_phases();
     const uint32_t rates_hz[] = {20000, 40000, 50000, 100000};
     uint64_t running = 0, faults = 0, cleared = 0, driven = 0;
     for (int sequence = 0; sequence < SEQUENCES; sequence++) {
         std::mt19937_64 random{uint64_t(sequence)};
-        changeable_tables = sequence % 2 == 0 ? bundled : other;
-        const machine_tables_t *tables = &changeable_tables;
+        machine_tables = sequence % 2 == 0 ? bundled : other;
+        const machine_tables_t *tables = &machine_tables;
         parameters_t p;
         parameters_init(&p);
         for (unsigned index = 0; index < PARAMETER_COUNT; index++) {
-            ASSERT_EQ(parameters_set(&p, index, any_value(parameters_row(index), random)), PARAMETER_STATUS_DONE);
+            ASSERT_EQ(parameters_set(&p, index, any_value(index, random)), PARAMETER_STATUS_DONE);
         }
         const uint32_t rate_hz = rates_hz[random() % 4];
         const control_parameters_t parameters =
@@ -131,7 +129,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
             cleared += before == DRIVE_STATE_FAULT && state.state_machine.state == DRIVE_STATE_READY;
         }
     }
-    changeable_tables = bundled;
+    machine_tables = bundled;
     // The sequences are not so wild that they say nothing.
     EXPECT_GT(running, uint64_t(SEQUENCES) * PERIODS / 20);
     EXPECT_GT(driven, running / 20);
@@ -145,7 +143,7 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
     parameters_init(&p);
     for (const uint32_t rate_hz : {20000u, 100000u}) {
         for (const unsigned bits : {8u, 17u, 32u}) {
-            const control_parameters_t parameters = configure_control(&p, &changeable_tables, rate_hz, bits, 12);
+            const control_parameters_t parameters = configure_control(&p, &machine_tables, rate_hz, bits, 12);
             control_state_t state;
             control_reset(&parameters, &state);
             for (int period = 0; period < 20000; period++) {

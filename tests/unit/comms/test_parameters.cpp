@@ -7,6 +7,7 @@
 
 extern "C" {
 #include "comms/parameter_protocol.h"
+#include "control/machine_tables.h"
 #include "drive_codec.h"
 }
 #include "support/frames.h"
@@ -63,11 +64,12 @@ TEST_F(Parameters, every_row_is_sound) {
         EXPECT_GT(std::strlen(row->name), 0u);
         EXPECT_TRUE(names.insert(row->name).second) << "named twice";
         ASSERT_NE(row->unit, nullptr);
-        EXPECT_LE(row->fraction_bits, 30);
+        EXPECT_LE(machine_tables.parameter_fraction_bits[i], 30);
         EXPECT_LT(row->minimum, row->maximum);
-        EXPECT_LE(row->minimum, row->default_value);
-        EXPECT_LE(row->default_value, row->maximum);
-        EXPECT_EQ(parameters.values[i], row->default_value);
+        EXPECT_LE(row->minimum, parameters.defaults[i]);
+        EXPECT_LE(parameters.defaults[i], row->maximum);
+        EXPECT_EQ(parameters.values[i], parameters.defaults[i]);
+        EXPECT_EQ(parameters.defaults[i], machine_tables.parameter_default[i]);
     }
 }
 
@@ -125,11 +127,12 @@ TEST_F(Parameters, protocol_reads_everything_of_every_row) {
         const parameter_row_t *row = parameters_row(i);
         SCOPED_TRACE(row->name);
         parameters_set(&parameters, i, row->maximum);
-        for (const auto &[operation, expected] : {std::pair<unsigned, int32_t>{PARAMETER_OPERATION_READ, row->maximum},
-                                                  {PARAMETER_OPERATION_MINIMUM, row->minimum},
-                                                  {PARAMETER_OPERATION_MAXIMUM, row->maximum},
-                                                  {PARAMETER_OPERATION_DEFAULT, row->default_value},
-                                                  {PARAMETER_OPERATION_FRACTION_BITS, row->fraction_bits}}) {
+        for (const auto &[operation, expected] :
+             {std::pair<unsigned, int32_t>{PARAMETER_OPERATION_READ, row->maximum},
+              {PARAMETER_OPERATION_MINIMUM, row->minimum},
+              {PARAMETER_OPERATION_MAXIMUM, row->maximum},
+              {PARAMETER_OPERATION_DEFAULT, machine_tables.parameter_default[i]},
+              {PARAMETER_OPERATION_FRACTION_BITS, machine_tables.parameter_fraction_bits[i]}}) {
             const auto response = request(operation, i);
             EXPECT_EQ(response.status, PARAMETER_STATUS_DONE);
             EXPECT_EQ(response.value, expected) << "operation " << operation;

@@ -11,8 +11,6 @@ extern "C" {
 #include "comms/comms.h"
 #include "drive_codec.h"
 #include "telemetry_collect.h"
-
-extern const machine_tables_t machine_tables;
 }
 #include "support/frames.h"
 

@@ -19,7 +19,7 @@ namespace {
 const double RATES_HZ[] = {20000.0, 40000.0, 50000.0, 100000.0, 1000000.0};
 
 double value_of(const parameters_t &parameters, unsigned index) {
-    return std::ldexp(double(parameters.values[index]), -int(parameters_row(index)->fraction_bits));
+    return std::ldexp(double(parameters.values[index]), -machine_tables.parameter_fraction_bits[index]);
 }
 
 double held(double value) {
@@ -269,9 +269,9 @@ TEST(Configure, every_default_is_within_its_range_and_every_name_fits) {
         ASSERT_NE(row->name, nullptr) << index;
         EXPECT_LE(std::string(row->name).size(), size_t(PARAMETER_NAME_MAX));
         EXPECT_LT(row->minimum, row->maximum) << row->name;
-        EXPECT_GE(row->default_value, row->minimum) << row->name;
-        EXPECT_LE(row->default_value, row->maximum) << row->name;
-        EXPECT_LE(row->fraction_bits, 30) << row->name;
+        EXPECT_GE(machine_tables.parameter_default[index], row->minimum) << row->name;
+        EXPECT_LE(machine_tables.parameter_default[index], row->maximum) << row->name;
+        EXPECT_LE(machine_tables.parameter_fraction_bits[index], 30) << row->name;
     }
 }
 

@@ -37,11 +37,12 @@ TEST_F(BenchVariables, RangesAreThoseOfTheDatabase) {
     struct {
         uint8_t variable;
         int32_t low, high;
-    } ranges[] = {{1, -2000000, 2000000}, {2, 0, 500000},    {3, 0, 2},        {4, 0, 1000000},
-                  {5, 0, 100000},         {6, 0, 1000000},   {7, 0, 1000000},  {8, -100000, 100000},
-                  {9, 100, 1000000},      {10, 0, 800},      {11, 0, 50000},   {12, 2000, 50000},
-                  {13, 2000, 50000},      {14, 2000, 50000}, {15, 0, 50000},   {16, -50000, 50000},
-                  {17, 0, 2000},          {18, 0, 8000000},  {19, 0, 2000000}, {20, 10, 1000000}};
+    } ranges[] = {{1, -2000000, 2000000},  {2, 0, 2000000},   {3, 0, 2},        {4, 0, 1000000},
+                  {5, 0, 100000},          {6, 0, 1000000},   {7, 0, 8000000},  {8, -1000000, 1000000},
+                  {9, 100, 8000000},       {10, 0, 800},      {11, 0, 50000},   {12, 2000, 50000},
+                  {13, 2000, 50000},       {14, 2000, 50000}, {15, 0, 50000},   {16, -50000, 50000},
+                  {17, 0, 2000},           {18, 0, 8000000},  {19, 0, 2000000}, {20, 10, 1000000},
+                  {30, -1000000, 1000000}, {31, 0, 8000000},  {32, 0, 1000000}};
     for (const auto &range : ranges) {
         SCOPED_TRACE(int(range.variable));
         EXPECT_EQ(set(range.variable, range.low), DONE);
@@ -49,7 +50,7 @@ TEST_F(BenchVariables, RangesAreThoseOfTheDatabase) {
         EXPECT_EQ(set(range.variable, range.low - 1), OUT_OF_RANGE);
         EXPECT_EQ(set(range.variable, range.high + 1), OUT_OF_RANGE);
     }
-    for (unsigned variable : {0u, 21u, 128u, 255u}) {
+    for (unsigned variable : {0u, 29u, 33u, 128u, 255u}) {
         EXPECT_EQ(set(static_cast<uint8_t>(variable), 1), NO_SUCH_VARIABLE);
     }
 }
@@ -177,6 +178,7 @@ TEST_F(BenchVariables, TruthIsTheStateOfThePlant) {
     rig_truth_motion_t motion{};
     rig_truth_currents_t currents{};
     rig_truth_bench_t state{};
+    unsigned parts = 0;
     for (const auto &record : records) {
         if (record.time_ns != 4 * MS) {
             continue;
@@ -185,20 +187,24 @@ TEST_F(BenchVariables, TruthIsTheStateOfThePlant) {
             rig_truth_motion_unpack(&motion, record.frame.data, 8);
         } else if (record.identifier() == RIG_TRUTH_CURRENTS_FRAME_ID) {
             rig_truth_currents_unpack(&currents, record.frame.data, 8);
+            parts |= 1u << currents.part;
         } else if (record.identifier() == RIG_TRUTH_BENCH_FRAME_ID) {
             rig_truth_bench_unpack(&state, record.frame.data, 8);
+            parts |= 4u << state.part;
         }
     }
+    EXPECT_EQ(parts, 0xFu);
     const plant_t &plant = bench.rig->plant;
     ASSERT_EQ(plant.time_ns, 4 * MS);
     ASSERT_GT(plant.current_A[1], 1.0);
     EXPECT_FLOAT_EQ(motion.speed_rpm, static_cast<float>(plant.speed_rad_s * 30 / 3.14159265358979));
     EXPECT_FLOAT_EQ(motion.torque_nm, static_cast<float>(plant_torque_Nm(&plant)));
-    EXPECT_NEAR(currents.current_b_a / 512.0, plant.current_A[1], 0.5 / 512 + 1e-9);
+    EXPECT_NEAR(currents.current_b_a / 65536.0, plant.current_A[1], 0.5 / 65536 + 1e-9);
     EXPECT_EQ(currents.current_d_a, 0);
-    EXPECT_NEAR(state.rotor_angle_deg, plant.rotor_angle_rad * 180 / 3.14159265358979, 1e-4);
-    EXPECT_NEAR(state.load_torque_nm / 256.0, -50.0, 1e-9);
-    EXPECT_NEAR(state.bus_voltage_v / 64.0, 240.0, 1e-9);
+    EXPECT_NEAR(rig_truth_bench_rotor_angle_deg_decode(state.rotor_angle_deg),
+                plant.rotor_angle_rad * 180 / 3.14159265358979, 1.1e-5);
+    EXPECT_EQ(state.load_torque_nm, -50.0f);
+    EXPECT_EQ(state.bus_voltage_v, 240.0f);
 }
 
 // ADC counts of phase 1's current. The stand-in firmware's pulse is from 4 to 21 us of each period: a delay of more

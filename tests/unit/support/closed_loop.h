@@ -35,11 +35,9 @@ struct setup_t {
         parameters_t values;
         parameters_init(&values);
         parameters_set_default(&values, PARAMETER_CONTROLLER, DRIVE_CONTROLLER_SALIENT);
-        parameters_set_default(&values, PARAMETER_INERTIA_KG_M2, machine_tables.inertia_q30);
-        parameters_set_default(&values, PARAMETER_FRICTION_NM_S, machine_tables.friction_q30);
-        parameters_set_default(&values, PARAMETER_RESISTANCE_OHM, machine_tables.resistance_q24);
         for (const auto &[index, value] : parameters) {
-            values.values[index] = fixed_point::to_fixed(value, std::ldexp(1.0, parameters_row(index)->fraction_bits));
+            values.values[index] =
+                fixed_point::to_fixed(value, std::ldexp(1.0, machine_tables.parameter_fraction_bits[index]));
         }
         return configure_control(&values, &machine_tables, rate_hz, encoder_bits, adc_bits);
     }

@@ -18,6 +18,7 @@ inline machine_t machine_of(magnetics_form_t form) {
     machine.supply_voltage_V = 240.0;
     machine.sensors.current_gain = 1.0;
     machine.sensors.current_limit_A = 1000.0;
+    machine.ranges = {80.0, 512.0, 64.0};
     machine.magnetics.form = form;
     machine.magnetics.unaligned_inductance_H = 0.676e-3;
     machine.magnetics.aligned_inductance_H = 23.6e-3;

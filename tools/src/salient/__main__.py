@@ -57,7 +57,7 @@ def _test(options: argparse.Namespace) -> int:
 
 
 def _sim(options: argparse.Namespace) -> int:  # noqa: RET503 - os.execv does not return
-    from salient.bench.emulator import EmulatorError, command_line
+    from salient.bench.programs import EmulatorError, command_line
 
     try:
         command = command_line(BenchConfig(**{name: value for name, value in vars(options).items() if name in OPTIONS}))
@@ -91,7 +91,7 @@ def _log(options: argparse.Namespace) -> int:
 def _monitor(options: argparse.Namespace) -> int:
     from salient.bus.monitor import monitor
 
-    return monitor(options.can, options.every_s, options.duration_s)
+    return monitor(options.can, options.every_s, options.duration_s, options.machine)
 
 
 def _benchmark(options: argparse.Namespace) -> int:
@@ -109,7 +109,7 @@ def _compare(options: argparse.Namespace) -> int:
 def _machine(options: argparse.Namespace) -> int:
     from salient.machine.report import run
 
-    return run(options.machine, options.out)
+    return run(options.machine, options.out, options.json, options.dbc)
 
 
 def _pil(options: argparse.Namespace) -> int:

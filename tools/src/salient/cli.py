@@ -76,6 +76,8 @@ def make_parser() -> argparse.ArgumentParser:
     monitor.add_argument("--every-s", type=_positive, default=0.1, metavar="X",
                          help="period in virtual time (default 0.1)")
     monitor.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
+    monitor.add_argument("--machine", type=_option_type("machine"), default=DEFAULTS["machine"],
+                         metavar=OPTIONS["machine"].metavar, help=description("machine"))
 
     benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
                         "ngspice; effect of the network")
@@ -85,10 +87,14 @@ def make_parser() -> argparse.ArgumentParser:
     _add_compare_options(command("compare", "the controllers compared with each other, their targets and an earlier "
                                  "run"))
 
-    machine = command("machine", "check a machine file, summarise it, draw its magnetics")
+    machine = command("machine", "check a machine file, summarise it, list what follows for its drive, draw its "
+                      "magnetics")
     machine.add_argument("machine", metavar="NAME|FILE")
     machine.add_argument("--out", type=Path, default=Path("out/machine"), metavar="DIR",
                          help="folder of the plot (default out/machine)")
+    machine.add_argument("--json", type=Path, metavar="FILE", help="also write the drive's data to a file")
+    machine.add_argument("--dbc", type=Path, metavar="FILE.dbc",
+                         help="also write the CAN database of its drive, with the factors and ranges of this machine")
 
     pil = command("pil", "processor in the loop: a scenario on the target, and its load on the processor")
     task = pil.add_mutually_exclusive_group(required=True)
@@ -144,6 +150,8 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     """The groups are checked by salient.experiments.compare.command, which defines them."""
     parser.add_argument("groups", nargs="*", metavar="GROUP", help="measurements (default all but the long ones)")
     parser.add_argument("--list", action="store_true", help="list the groups")
+    parser.add_argument("--machine", metavar="NAME|FILE", help="of one machine only, its speeds fractions of its base "
+                        "speed and its loads of its rated torque, as those of the paper's machine")
     parser.add_argument("--quick", action="store_true", help="fewer machines, rates and angles: some 20 s")
     parser.add_argument("--out", type=Path, default=Path("out/compare"), metavar="DIR",
                         help="folder (default out/compare)")

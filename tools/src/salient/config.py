@@ -155,7 +155,8 @@ class Conditions:
 class BenchConfig(Conditions):
     """A drive and its test bench.
 
-    can: the bus, "auto" until a command or a fixture has chosen one. build: a CMake preset, of HOST_BUILDS or
+    can: the bus, "auto" until a command or a fixture has chosen one. machine_image: that of `machine`, from the cache
+    unless given. build: a CMake preset, of HOST_BUILDS or
     TARGET_BUILDS. instructions, execution, instruction_ns: in QEMU only, the last on the Cortex-M4 only; instructions
     gets the instruction count of each control interrupt (uint32, little endian) and a file beside it those of each
     deferred interrupt (deferred_instructions), execution what salient.target.trace reads. instruction_ns None: the
@@ -167,6 +168,8 @@ class BenchConfig(Conditions):
                         commands=("sim",))
     bit_rate: int = _option(1_000_000, INTEGER, "bit rate of the emulated bus", metavar="N", minimum=10_000,
                             maximum=1_000_000, commands=("sim",))
+    machine_image: Path | None = _option(None, FILE, "the machine, as salient.generate.machine writes it",
+                                         metavar="FILE")
     record: Path | None = _option(None, FILE, "records the true state", metavar="FILE.npy")
     record_step_ns: int = _option(1000, INTEGER, "step of the recording", metavar="N", minimum=100,
                                   maximum=1_000_000_000)

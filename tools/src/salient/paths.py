@@ -1,12 +1,12 @@
 """Where things are in the repository that this package is installed from."""
 
-import os
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[3]
-BUILD = Path(os.environ.get("SALIENT_BUILD", ROOT / "build"))
-"""Build folder; the environment variable SALIENT_BUILD names another one, as tests/target/compare_builds.py does."""
+BUILD = ROOT / "build"
+PYTHON_PACKAGES = ROOT / "tools" / "requirements.lock"
 MACHINES = ROOT / "tools" / "machines"
 SCENARIOS = ROOT / "tools" / "scenarios"
 DRIVE_DBC = ROOT / "firmware" / "comms" / "drive.dbc"
+PARAMETERS = ROOT / "firmware" / "drive" / "parameters.def"
 RIG_DBC = ROOT / "emulator" / "rig" / "rig.dbc"

@@ -36,7 +36,7 @@ class Bench(Session):
         self.simulator = EmulatorProcess(self.options, can)
         try:
             super().__init__(can, parameter_table=lambda: parameter_table(config),
-                             is_alive=lambda: self.simulator.is_alive)
+                             is_alive=lambda: self.simulator.is_alive, machine=config.machine)
         except BaseException:
             self.simulator.close()
             raise

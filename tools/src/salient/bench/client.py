@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
 import can
+from cantools.database.can import Database
 
 from salient.bus.signals import SignalTable
 
@@ -15,6 +16,8 @@ class Client(Protocol):
 
     time_ns: int
     telemetry: SignalTable
+    drive_database: Database
+    """The DBC of the drive."""
 
     def send(self, message: can.Message) -> None:
         """Sends a frame."""

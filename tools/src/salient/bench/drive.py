@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass
 from typing import Any
 
 import can
+from cantools.database.can import Message
 
 from salient.bench.client import Client, KnownAttributes
 from salient.bus import e2e
@@ -27,17 +29,18 @@ class DriveError(Exception):
     """The drive rejected a request or did not respond; the message has the reason."""
 
 
-def command_frame(counter: int, request: str, speed_reference_rpm: float) -> can.Message:
-    """A DRIVE_COMMAND with its checksum. counter 0..255; request one of REQUESTS; -3000..3000 r/min."""
+def command_frame(counter: int, request: str, speed_reference_rpm: float, message: Message = _COMMAND) -> can.Message:
+    """A DRIVE_COMMAND with its checksum. counter 0..255; request one of REQUESTS; the speed within the range of the
+    message, which is that of the drive's DBC."""
     signals = {
         "checksum": 0,
         "counter": counter,
         "request": REQUESTS[request],
         "speed_reference_rpm": speed_reference_rpm,
     }
-    payload = _COMMAND.encode(signals)[e2e.HEADER_BYTES :]
-    data = e2e.protect(e2e.data_id(_COMMAND), counter, payload)
-    return can.Message(arbitration_id=_COMMAND.frame_id, is_extended_id=False, data=data)
+    payload = message.encode(signals)[e2e.HEADER_BYTES :]
+    data = e2e.protect(e2e.data_id(message), counter, payload)
+    return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=data)
 
 
 class Drive(KnownAttributes):
@@ -50,6 +53,7 @@ class Drive(KnownAttributes):
 
     def __init__(self, session: Client, parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
         self._session = session
+        self._command = session.drive_database.get_message_by_name(_COMMAND.name)
         self._request: str | None = None
         self._speed_reference_rpm = 0.0
         self._counter = 0
@@ -58,12 +62,13 @@ class Drive(KnownAttributes):
 
     @property
     def speed_reference_rpm(self) -> float:
-        """Last requested value, -3000..3000; negative is reverse, and 0 to a controller that drives forward only."""
+        """Last requested value, in the range of the drive's DBC, at least -3000..3000; negative is reverse, and 0 to a
+        controller that drives forward only."""
         return self._speed_reference_rpm
 
     @speed_reference_rpm.setter
     def speed_reference_rpm(self, value: float) -> None:
-        signal = _COMMAND.get_signal_by_name("speed_reference_rpm")
+        signal = self._command.get_signal_by_name("speed_reference_rpm")
         low, high = signal_range(signal)
         if not low <= value <= high:
             limits = f"{low:g} to {high:g} {signal.unit}"
@@ -100,7 +105,8 @@ class Drive(KnownAttributes):
         """Repeats the present request now; the next is due a period later."""
         if self._request is None:
             raise DriveError("no request to repeat")
-        self._session.send(command_frame(self._counter, self._request, self._speed_reference_rpm))
+        self._session.send(command_frame(self._counter, self._request, self._speed_reference_rpm,
+                                         self._command))
         self._counter = (self._counter + 1) % 256
         self.command_due_ns = self._session.time_ns + COMMAND_PERIOD_NS
 
@@ -156,7 +162,7 @@ class Parameters(MutableMapping[str, float]):
 
     def __getitem__(self, name: str) -> float:
         row = self.row(name)
-        return _access(self._session, "read", row.index)[1] / (1 << row.fraction_bits)
+        return math.ldexp(_access(self._session, "read", row.index)[1], -row.fraction_bits)
 
     def __setitem__(self, name: str, value: float) -> None:
         row = self.row(name)
@@ -178,7 +184,7 @@ class Parameters(MutableMapping[str, float]):
 
 def raw_value(row: ParameterRow, value: float) -> int:
     """Raw integer of a physical value; DriveError when it exceeds 32 bits."""
-    raw = round(value * (1 << row.fraction_bits))
+    raw = round(math.ldexp(value, row.fraction_bits))
     if not -(2**31) <= raw < 2**31:
         raise DriveError(f"{row.name} {value:g}: must be {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
     return raw
@@ -192,7 +198,8 @@ def read_parameter_table(session: Client) -> list[ParameterRow]:
         status, fraction_bits = _access(session, "fraction_bits", index)
         if status != "done":
             return rows
-        limits = (_access(session, what, index)[1] / (1 << fraction_bits) for what in ("minimum", "maximum", "default"))
+        limits = (math.ldexp(_access(session, what, index)[1], -fraction_bits)
+                  for what in ("minimum", "maximum", "default"))
         name, unit = (_read_text(session, what, index) for what in ("name", "unit"))
         rows.append(ParameterRow(index, name, unit, fraction_bits, *limits))
 

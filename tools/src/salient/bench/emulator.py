@@ -2,143 +2,19 @@
 
 from __future__ import annotations
 
-import fcntl
-import hashlib
 import json
-import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 from salient.bench.drive import ParameterRow, read_parameter_table
+from salient.bench.programs import EmulatorError, command_line
 from salient.bench.session import Session
-from salient.builder import run_commands
-from salient.config import TARGET_BUILDS, BenchConfig
-from salient.elf import ElfImage
+from salient.config import BenchConfig
 from salient.errors import UsageError
-from salient.machine.file import MachineError, load_machine, machine_path
-from salient.machine.firmware_tables import machine_phase_map
-from salient.paths import BUILD, MACHINES, ROOT
 
-
-class EmulatorError(Exception):
-    """The executable failed; the text includes its standard error."""
-
-
-_BUILDERS = {"host": "any tools/salient command",
-             "debug": "cmake --preset debug && cmake --build --preset debug"}
-_TESTS = "tools/salient test"
-
-
-# --- programs -------------------------------------------------------------------------------------------------------
-
-def executable(machine: str, build: str = "host") -> Path:
-    """The executable for a machine and a build (BenchConfig.build); that for a user's machine file is built first.
-
-    For a target build it is the program that starts QEMU with image(). UsageError: no such machine, a mistake in its
-    file, or the executable of a bundled machine is not built.
-    """
-    return _programs(machine, build)[0]
-
-
-def image(machine: str, build: str) -> Path:
-    """The image that executable() runs for a target build. UsageError as executable()."""
-    return _programs(machine, build)[1]
-
-
-def deferred_instructions(instructions: Path) -> Path:
-    """The file with the instruction counts of the deferred interrupts, from that of the control interrupts."""
-    return instructions.with_name(f"{instructions.name}.deferred")
-
-
-def command_line(config: BenchConfig) -> list[str]:
-    """The command line that starts a test bench. UsageError: as executable(), and options that exclude each other."""
-    program = str(executable(config.machine, config.build))
-    if config.build not in TARGET_BUILDS:
-        if config.instruction_ns is not None:
-            raise UsageError(f"--instruction-ns {config.instruction_ns}: only with --target cortex-m4")
-        return [program, *config.arguments()]
-    elf = image(config.machine, config.build)
-    line = [program, str(elf)]
-    if config.instructions is not None:
-        line += ["--instructions", str(config.instructions),
-                 "--deferred-instructions", str(deferred_instructions(config.instructions))]
-    if config.execution is not None:
-        end, begin = ElfImage(elf).stack()
-        line += ["--execution", str(config.execution), f"{end:#x}-{begin:#x}"]
-    if config.instruction_ns is not None:
-        line += ["--instruction-ns", str(config.instruction_ns)]
-    return [*line, *config.arguments()]
-
-
-@lru_cache
-def _programs(machine: str, build: str) -> list[Path]:
-    """The program to start, and for a target build the image."""
-    try:
-        path = machine_path(machine)
-        checked = load_machine(path)
-        is_bundled = path.parent == MACHINES
-        if not is_bundled:
-            machine_phase_map(path, checked)  # or the build would fail
-    except MachineError as error:
-        raise UsageError(str(error)) from None
-    names = {build: f"salient_{path.stem}"}
-    if build in TARGET_BUILDS:
-        names = {"host": f"salient_target_{path.stem}", build: f"salient_{path.stem}.elf"}
-    if not is_bundled:
-        return _build_custom(path, names)
-    programs = [BUILD / preset / "bin" / name for preset, name in names.items()]
-    for program in programs:
-        if not program.exists():
-            raise UsageError(f"{program.relative_to(ROOT)} is not built; {_BUILDERS.get(build, _TESTS)} builds it")
-    return programs
-
-
-def _build_custom(path: Path, names: dict[str, str]) -> list[Path]:
-    """Builds the programs (preset: name) for a user's machine file in a folder of the file, one process at a time."""
-    if (MACHINES / path.name).exists():
-        raise UsageError(f"{path}: a bundled machine has the name {path.stem}; rename the file")
-    if not path.stem.isidentifier() or not path.stem.isascii():
-        raise UsageError(f"{path}: the name of the file must be letters, digits and underscores")
-    if shutil.which("cmake") is None:
-        raise UsageError("cmake is missing; a machine file of your own requires a build")
-    _remove_orphans()
-    folder = BUILD / f"machine-{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
-    folder.mkdir(exist_ok=True)
-    with (folder / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        (folder / "machine_file").write_text(str(path), encoding="utf-8")
-        commands = []
-        for preset, name in names.items():
-            if not (folder / preset / "build.ninja").exists():
-                commands.append(["cmake", "--preset", preset, "-B", str(folder / preset),
-                                 f"-DSALIENT_MACHINE_FILE={path}"])
-            commands.append(["cmake", "--build", str(folder / preset), "--target", name])
-        log = folder / "build.log"
-
-        def notice() -> None:
-            print(f"salient: building the drive for {path}", file=sys.stderr, flush=True)
-
-        if not run_commands(commands, ROOT, log, notice):
-            raise EmulatorError(f"building the drive for {path} failed: see {log.relative_to(ROOT)}")
-    return [folder / preset / "bin" / name for preset, name in names.items()]
-
-
-def _remove_orphans() -> None:
-    """Removes the builds of machine files that no longer exist."""
-    for note in BUILD.glob("machine-*/machine_file"):
-        try:
-            if not Path(note.read_text(encoding="utf-8")).exists():
-                shutil.rmtree(note.parent, ignore_errors=True)
-        except OSError:
-            continue  # another process removes it
-
-
-# --- process --------------------------------------------------------------------------------------------------------
 
 class EmulatorProcess:
     """A running executable, ended with this process or by close().
@@ -215,6 +91,7 @@ def parameter_table(config: BenchConfig) -> list[ParameterRow]:
 def _parameter_table(config: BenchConfig) -> list[ParameterRow]:
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         can = f"unix:{folder}/can.sock"
-        with EmulatorProcess(config, can) as process, Session(can, is_alive=lambda: process.is_alive) as session:
+        with EmulatorProcess(config, can) as process, Session(
+                can, is_alive=lambda: process.is_alive, machine=config.machine) as session:
             session.rig.truth_period_us = 0
             return read_parameter_table(session)

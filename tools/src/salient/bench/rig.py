@@ -23,9 +23,26 @@ class RigError(Exception):
 
 
 @lru_cache
-def bench_variables() -> dict[str, Signal]:
-    """The bench variables by name: the multiplexed signals of RIG_SET, with unit, range and comment."""
+def _signals() -> dict[str, Signal]:
+    """The multiplexed signals of RIG_SET."""
     return {s.name: s for s in rig_database().get_message_by_name("RIG_SET").signals if s.multiplexer_ids}
+
+
+@lru_cache
+def bench_variables() -> dict[str, Signal]:
+    """The bench variables by name, with unit and comment; the range is that of variable_range()."""
+    return {name: signal for name, signal in _signals().items() if "_coarse_" not in name}
+
+
+def _coarse(name: str) -> Signal | None:
+    """The signal that carries a variable beyond the range of that of its name."""
+    head, _, unit = name.partition("_Nm")
+    return _signals().get(f"{head}_coarse_Nm{unit}")
+
+
+def variable_range(name: str) -> tuple[float, float]:
+    """Minimum and maximum of a bench variable in its unit."""
+    return signal_range(_coarse(name) or _variable(name))
 
 
 class Rig:
@@ -67,14 +84,17 @@ class Rig:
     def set(self, name: str, value: float) -> None:
         """Sets a bench variable by its name in rig.dbc."""
         signal = _variable(name)
-        low, high = signal_range(signal)
+        low, high = variable_range(name)
         if not low <= value <= high:
-            raise RigError(f"{name} {value:g}: must be {_range(signal)}")
+            raise RigError(f"{name} {value:g}: must be {_range(name)}")
+        fine_low, fine_high = signal_range(signal)
+        if not fine_low <= value <= fine_high:
+            signal = _coarse(name) or signal
         if not 0 <= self._at_us <= _AT_US_MAX:
             raise RigError(f"{name} at {self._at_us} us: must be 0 to {_AT_US_MAX} us")
         message = rig_database().get_message_by_name("RIG_SET")
         number = _multiplex_number(signal)
-        data = message.encode({"quantity": number, name: value, "at_us": self._at_us})
+        data = message.encode({"quantity": number, signal.name: value, "at_us": self._at_us})
         self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
         reply = rig_database().get_message_by_name("RIG_SET_REPLY")
         answer = self._client.receive_until(
@@ -87,7 +107,7 @@ class Rig:
     @staticmethod
     def describe() -> str:
         """One line per bench variable: name, range with unit, meaning."""
-        return "\n".join(f"{s.name}: {_range(s)}. {s.comment}" for s in bench_variables().values())
+        return "\n".join(f"{s.name}: {_range(s.name)}. {s.comment}" for s in bench_variables().values())
 
 
 def _variable(name: str) -> Signal:
@@ -101,6 +121,6 @@ def _multiplex_number(signal: Signal) -> int:
     return signal.multiplexer_ids[0]
 
 
-def _range(signal: Signal) -> str:
-    low, high = signal_range(signal)
-    return f"{low:g} to {high:g} {signal.unit or ''}".rstrip()
+def _range(name: str) -> str:
+    low, high = variable_range(name)
+    return f"{low:g} to {high:g} {_variable(name).unit or ''}".rstrip()

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Self
 
 import can
+from cantools.database.can import Database
 
 from salient.bench.client import KnownAttributes
 from salient.bench.drive import Drive, ParameterRow
@@ -40,6 +41,8 @@ class Session(KnownAttributes):
     session follows it by the times of received frames. is_alive: the emulator has not ended; without it the end of the
     emulator is seen on a local bus only. A session waits for the emulator for any wall time, as at a breakpoint.
 
+    machine: name or file of the drive's machine, whose DBC the session then uses; without it that in SI units.
+
     time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. telemetry, truth:
     signals of the drive and of the test bench by name.
     """
@@ -49,16 +52,18 @@ class Session(KnownAttributes):
     log: list[tuple[int, can.Message]]
     telemetry: SignalTable
     truth: SignalTable
+    drive_database: Database
     drive: Drive
     rig: Rig
 
     def __init__(self, address: str, lockstep: bool = True,
                  parameter_table: Callable[[], list[ParameterRow]] | None = None,
-                 is_alive: Callable[[], bool] = lambda: True) -> None:
+                 is_alive: Callable[[], bool] = lambda: True, machine: str | None = None) -> None:
         self.address = address
         self.time_ns = 0
         self.log = []
-        self.telemetry = SignalTable(drive_database(), "DRIVE")
+        self.drive_database = drive_database(machine)
+        self.telemetry = SignalTable(self.drive_database, "DRIVE")
         self.truth = SignalTable(rig_database(), "RIG")
         self.drive = Drive(self, parameter_table)
         self.rig = Rig(self)
@@ -208,7 +213,7 @@ class Session(KnownAttributes):
             return
         self._identity_checked = True
         identity = _IDENTITY.decode_simple(bytes(message.data))
-        expected = database_hash(drive_database())
+        expected = database_hash(self.drive_database)
         if identity["dbc_hash"] != expected:
             version = ".".join(str(identity[f"firmware_{part}"]) for part in ("major", "minor", "patch"))
             print(

@@ -11,7 +11,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from salient.bench.emulator import EmulatorError, EmulatorProcess, parameter_table
+from salient.bench.emulator import EmulatorProcess, parameter_table
+from salient.bench.programs import EmulatorError
 from salient.bench.session import Session
 from salient.benchmark import callgrind, solvers
 from salient.benchmark.switching_pattern import record

@@ -14,6 +14,7 @@ from salient.bus.interface import closed_in_order
 from salient.bus.log import open_log
 from salient.bus.signals import SignalTable, drive_database
 from salient.errors import UsageError
+from salient.machine.file import MachineError
 
 _COLUMNS = (
     ("state", "DRIVE_STATUS.state", "{:>10}"),
@@ -59,10 +60,14 @@ def record(address: str, path: Path, duration_s: float | None) -> int:
     return _report_closed(address, duration_s) if closed else 0
 
 
-def monitor(address: str, every_s: float, duration_s: float | None) -> int:
-    """Prints the main signals of the drive every `every_s` of virtual time; ends as `record` does, with its exit
-    code."""
-    telemetry = SignalTable(drive_database(), "DRIVE")
+def monitor(address: str, every_s: float, duration_s: float | None, machine: str) -> int:
+    """Prints the main signals of the drive of a machine every `every_s` of virtual time; ends as `record` does, with
+    its exit code. UsageError: no such machine."""
+    try:
+        database = drive_database(machine)
+    except MachineError as error:
+        raise UsageError(str(error)) from None
+    telemetry = SignalTable(database, "DRIVE")
     due_ns = None
     try:
         for time_ns, message in _frames(address, duration_s, "monitoring"):
@@ -73,7 +78,7 @@ def monitor(address: str, every_s: float, duration_s: float | None) -> int:
             if telemetry.count("DRIVE_TORQUE"):
                 sys.stdout.write(_line(time_ns, telemetry) + "\n")
                 sys.stdout.flush()
-            telemetry = SignalTable(drive_database(), "DRIVE")
+            telemetry = SignalTable(database, "DRIVE")
             due_ns += round(every_s * 1e9)
     except _BusClosed:
         return _report_closed(address, duration_s)

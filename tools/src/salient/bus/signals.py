@@ -13,6 +13,8 @@ import cantools
 import numpy as np
 from cantools.database.can import Database, Message
 
+from salient.machine.file import load_machine, machine_path
+from salient.machine.scaling import database_of, scaling_of
 from salient.paths import DRIVE_DBC, RIG_DBC
 
 
@@ -24,9 +26,14 @@ def load_database(path: Path) -> Database:
     return database
 
 
-def drive_database() -> Database:
-    """The drive's DBC."""
-    return load_database(DRIVE_DBC)
+@lru_cache
+def drive_database(machine: str | None = None) -> Database:
+    """The DBC of the drive of a machine, given by name or file, with its factors and ranges; without a machine that in
+    SI units. MachineError."""
+    if machine is None:
+        return load_database(DRIVE_DBC)
+    path = machine_path(machine)
+    return database_of(scaling_of(path, load_machine(path)).dbc())
 
 
 def rig_database() -> Database:
@@ -77,7 +84,8 @@ class Signal:
 
 
 class SignalTable(Mapping[str, Signal]):
-    """The signals of the messages that one node sends, filled frame by frame.
+    """The signals of the messages that one node sends, filled frame by frame. A multiplexed signal has the frames that
+    carry it.
 
     table["speed_rpm"] is the signal of that name in the message with the lowest identifier that has one;
     table["DRIVE_FAULT_SNAPSHOT.speed_rpm"] names its message. KeyError lists the signals.
@@ -89,7 +97,7 @@ class SignalTable(Mapping[str, Signal]):
         self._times: dict[tuple[int, bool], list[int]] = {}
         self._data: dict[tuple[int, bool], bytearray] = {}
         for message in sorted(database.messages, key=lambda m: m.frame_id):
-            if sender not in message.senders or message.is_multiplexed():
+            if sender not in message.senders:
                 continue
             key = (message.frame_id, message.is_extended_frame)
             self._messages[key] = message
@@ -114,9 +122,12 @@ class SignalTable(Mapping[str, Signal]):
             raise KeyError(f"no signal '{name}'; the signals are {', '.join(n for n in self._names if '.' not in n)}")
         key, signal = self._names[name]
         raw = np.frombuffer(bytes(self._data[key]), dtype="<u8")
+        time_ns = np.array(self._times[key], dtype=np.int64)
+        if signal.multiplexer_ids:
+            carries = _raw(raw, _multiplexer(self._messages[key])) == signal.multiplexer_ids[0]
+            raw, time_ns = raw[carries], time_ns[carries]
         choices = {int(number): str(text) for number, text in (signal.choices or {}).items()}
-        time_s = np.array(self._times[key], dtype=np.int64) / 1e9
-        return Signal(signal.name, signal.unit or "", time_s, _physical(raw, signal), choices or None)
+        return Signal(signal.name, signal.unit or "", time_ns / 1e9, _physical(raw, signal), choices or None)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -134,14 +145,25 @@ class SignalTable(Mapping[str, Signal]):
 
 def _physical(raw: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
     """Physical values of a little-endian signal from frames as 64-bit words."""
-    if signal.byte_order != "little_endian":
-        raise ValueError(f"{signal.name}: only little-endian signals are decoded")
-    field: np.ndarray = raw >> np.uint64(signal.start)
-    if signal.length < 64:
-        field = field & np.uint64((1 << signal.length) - 1)
+    field = _raw(raw, signal)
     if signal.is_float:
         return field.astype("<u4").view("<f4").astype(float)
     if signal.is_signed:
         shift = np.int64(64 - signal.length)
         field = (field.astype(np.int64) << shift) >> shift
     return field * float(signal.scale) + float(signal.offset)
+
+
+def _multiplexer(message: Message) -> cantools.database.can.Signal:
+    """The signal that selects the others; a message has at most one."""
+    return next(signal for signal in message.signals if signal.is_multiplexer)
+
+
+def _raw(raw: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
+    """The bits of a little-endian signal."""
+    if signal.byte_order != "little_endian":
+        raise ValueError(f"{signal.name}: only little-endian signals are decoded")
+    field: np.ndarray = raw >> np.uint64(signal.start)
+    if signal.length < 64:
+        field = field & np.uint64((1 << signal.length) - 1)
+    return field

@@ -24,13 +24,16 @@ import numpy as np
 from can import CanError
 
 from salient.bench.drive import DriveError
-from salient.bench.emulator import EmulatorError, executable
+from salient.bench.programs import EmulatorError, command_line
 from salient.bench.session import SessionError
+from salient.config import CONDITIONS, BenchConfig
 from salient.errors import UsageError
 from salient.experiments import metrics, plots
 from salient.experiments.report import METRIC_ROWS, captions, format_metric, format_published, write_report
 from salient.experiments.results import make_results, write_results
+from salient.experiments.scaled import scale_of, scale_of_name, scaled, steady_window_s
 from salient.experiments.scenario import Scenario, load_scenarios, run_scenario
+from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 from salient.pages import Plot
 from salient.paths import SCENARIOS
@@ -40,14 +43,11 @@ Metrics = dict[str, float | None]
 
 EXPERIMENTS = ("start_600", "load_step_150")
 
-# Range of HAL_ADC in hal/hal_adc.h.
-ADC_CURRENT_RANGE_A = [0.0, 80.0]
-
-# Name of the plot's file -> title, experiment.
+# Name of the plot's file -> title, with keys of the operating point in the results' conditions, and experiment.
 PLOTS = {
-    "figure_5": ("Figure 5: start to 600 r/min without load", "start_600"),
-    "figure_6": ("Figure 6: speed at 150 r/min with a load step of 8 N m", "load_step_150"),
-    "figure_7": ("Figure 7: torque at 150 r/min with a load step of 8 N m", "load_step_150"),
+    "figure_5": ("Figure 5: start to {start_rpm:g} r/min without load", "start_600"),
+    "figure_6": ("Figure 6: speed at {step_rpm:g} r/min with a load step of {load_Nm:g} N m", "load_step_150"),
+    "figure_7": ("Figure 7: torque at {step_rpm:g} r/min with a load step of {load_Nm:g} N m", "load_step_150"),
     "phase_currents": ("Phase currents over two strokes", "load_step_150"),
 }
 
@@ -69,6 +69,8 @@ class _Run:
 
     experiment: str
     scenario: Scenario
+    window_s: tuple[float, float]
+    """Of the ripple and the losses."""
     metrics: Metrics
     losses: dict[str, Any]
     log_paths: tuple[Path, Path]
@@ -140,14 +142,19 @@ def summary(results: Mapping[str, Any]) -> str:
 # --- runs -----------------------------------------------------------------------------------------------------------
 
 def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
-    """Experiment -> one scenario per controller, with the options applied."""
+    """Experiment -> one scenario per controller, with the options applied, in terms of the machine."""
     changes = {name: value for name in ("machine", "control_rate_hz", "encoder_bits", "seed")
                if (value := getattr(options, name)) is not None}
     scenarios = {experiment: [replace(scenario, **changes)
                               for scenario in load_scenarios(SCENARIOS / f"{experiment}.toml")]
                  for experiment in EXPERIMENTS}
-    executable(scenarios["start_600"][0].machine, options.build)
-    return scenarios
+    machine = scenarios["start_600"][0].machine
+    command_line(BenchConfig(machine=machine, build=options.build))  # checks the machine
+    loaded = load_machine(machine_path(machine))
+    scale, stated = scale_of(loaded), {name: value for name, value in loaded.drive.items()
+                                       if name in CONDITIONS and name not in changes}
+    return {experiment: [scaled(replace(scenario, **stated), scale) for scenario in of]
+            for experiment, of in scenarios.items()}
 
 
 def _prepare_folder(out: Path) -> None:
@@ -186,19 +193,22 @@ def _run_one(experiment: str, scenario: Scenario, folder: Path, can: str, build:
     if result.fault != "none":
         raise DemoFailed(f"{name}: the drive ended in fault {result.fault}; see {result.text_log_path}")
     assert result.recording is not None and result.recording_path is not None  # the experiments record
+    machine = load_machine(machine_path(scenario.machine))
+    window_s = steady_window_s(scenario, scale_of(machine))
     try:
-        values = _metrics(experiment, scenario, result.recording)
-        losses = metrics.losses(result.recording, load_machine(machine_path(scenario.machine)), metrics.LOSS_WINDOW_S)
+        values = _metrics(experiment, scenario, result.recording, window_s)
+        losses = metrics.losses(result.recording, machine, window_s)
     except metrics.MetricsError as error:
         raise DemoFailed(f"{name}: {error}; see {result.text_log_path}") from error
-    return _Run(experiment, scenario, values, losses, (result.log_path, result.text_log_path), result.recording_path)
+    return _Run(experiment, scenario, window_s, values, losses,
+                (result.log_path, result.text_log_path), result.recording_path)
 
 
-def _metrics(experiment: str, scenario: Scenario, recording: np.ndarray) -> Metrics:
+def _metrics(experiment: str, scenario: Scenario, recording: np.ndarray, window_s: tuple[float, float]) -> Metrics:
     reference = scenario.speed[0]
     if experiment == "start_600":
         return metrics.start_metrics(recording, reference.value_rpm, reference.at_s)
-    return metrics.load_step_metrics(recording, reference.value_rpm, scenario.load[0].at_s)
+    return metrics.load_step_metrics(recording, reference.value_rpm, scenario.load[0].at_s, window_s)
 
 
 def _gather(futures: Mapping[str, Future[Any]], progress: Progress) -> list[Any]:
@@ -227,11 +237,15 @@ def _by_experiment(runs: Iterable[_Run], attribute: str) -> dict[str, dict[str, 
 
 def _conditions(scenarios: Mapping[str, Sequence[Scenario]]) -> dict[str, Any]:
     """Conditions of the metrics; equal for all runs except the step of the recording, which is that of the ripple."""
-    scenario = scenarios["load_step_150"][0]
+    scenario, start = scenarios["load_step_150"][0], scenarios["start_600"][0]
     assert scenario.record is not None  # as in its file
+    data = derive(load_machine(machine_path(scenario.machine)))
     return {
+        "operating_point": {"start_rpm": start.speed[0].value_rpm, "step_rpm": scenario.speed[0].value_rpm,
+                            "load_Nm": scenario.load[0].torque_Nm, "step_at_s": scenario.load[0].at_s,
+                            "window_s": list(steady_window_s(scenario, scale_of_name(scenario.machine)))},
         "control_rate_hz": scenario.control_rate_hz,
-        "adc": {"bits": scenario.adc_bits, "current_range_A": ADC_CURRENT_RANGE_A},
+        "adc": {"bits": scenario.adc_bits, "current_range_A": [0.0, data.adc_current_A]},
         "encoder": {"bits": scenario.encoder_bits or "ideal", "edges": scenario.encoder_edges},
         "immediate_pwm": scenario.immediate_pwm,
         "machine": Path(scenario.machine).stem,
@@ -249,7 +263,9 @@ def _plot_all(workers: Executor, runs: Sequence[_Run], results: Mapping[str, Any
                                        [run for run in runs if run.experiment == PLOTS[name][1]], results)
              for name, path in paths.items()}, progress)
     caption_of = captions(results)
-    return [Plot(PLOTS[name][0], caption_of[name], path.read_bytes()) for name, path in paths.items()]
+    point = results["conditions"]["operating_point"]
+    return [Plot(PLOTS[name][0].format_map(point), caption_of[name], path.read_bytes())
+            for name, path in paths.items()]
 
 
 def _plot(name: str, path: Path, runs: Sequence[_Run], results: Mapping[str, Any]) -> None:
@@ -260,11 +276,12 @@ def _plot(name: str, path: Path, runs: Sequence[_Run], results: Mapping[str, Any
     if name == "figure_5":
         plots.plot_start(path, recordings, ours, paper, reference.value_rpm, reference.at_s)
     elif name == "figure_6":
-        plots.plot_load_step_speed(path, recordings, ours, paper, scenario.load[0].at_s, reference.value_rpm)
+        plots.plot_load_step_speed(path, recordings, ours, paper, scenario.load[0], reference.value_rpm)
     elif name == "figure_7":
-        plots.plot_load_step_torque(path, recordings, ours, paper, scenario.load[0].at_s)
+        plots.plot_load_step_torque(path, recordings, ours, paper, scenario.load[0], runs[0].window_s)
     else:
-        plots.plot_phase_currents(path, recordings)
+        machine = load_machine(machine_path(scenario.machine))
+        plots.plot_phase_currents(path, recordings, runs[0].window_s[0], 2.0 * metrics.stroke_deg(machine))
 
 
 def _commands(scenarios: Mapping[str, Sequence[Scenario]], build: str) -> list[str]:
@@ -300,11 +317,11 @@ def _thin(result: _Run) -> list[tuple[str, Path]]:
     if every > 1:
         rows = np.load(result.recording_path)
         half_step_s = 0.5e-6 * step_us
-        first, end = np.searchsorted(rows["time_s"], (metrics.RIPPLE_WINDOW_S[0] - half_step_s,
-                                                      metrics.RIPPLE_WINDOW_S[1] + half_step_s))
+        first, end = np.searchsorted(rows["time_s"], (result.window_s[0] - half_step_s,
+                                                      result.window_s[1] + half_step_s))
         window_path = result.recording_path.with_name(RIPPLE_WINDOW_FILE)
         np.save(window_path, rows[first:end])
         np.save(result.recording_path, rows[::every])
-        kept.append((f"every {step_us:g} µs from {metrics.RIPPLE_WINDOW_S[0]:g} to {metrics.RIPPLE_WINDOW_S[1]:g} s",
+        kept.append((f"every {step_us:g} µs from {result.window_s[0]:g} to {result.window_s[1]:g} s",
                      window_path))
     return kept

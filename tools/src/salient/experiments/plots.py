@@ -22,6 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from salient.experiments.metrics import BAND, RIPPLE_WINDOW_S
+from salient.experiments.scenario import LoadStep
 from salient.pages import controller_colour
 
 Recordings = Mapping[str, np.ndarray]
@@ -32,6 +33,7 @@ CONTROLLER_TITLE = {
     "paper": "Paper: SMC, BP-PID in DITC",
     "salient": "Salient: observer, predictive flux PWM",
 }
+PAPER_LOAD = LoadStep(0.13, 8.0)
 PAPER_COLOUR = "#6f6f6f"
 LOAD_COLOUR = "#222222"
 BAND_COLOUR = "#dfe9d8"
@@ -127,13 +129,14 @@ def plot_start(path: Path, recordings: Recordings, ours: Metrics, paper: Metrics
     _save(path, draw, len(recordings), height_in=6.0, row_gap=0.24)
 
 
-def plot_load_step_speed(path: Path, recordings: Recordings, ours: Metrics, paper: Metrics, step_time_s: float = 0.13,
+def plot_load_step_speed(path: Path, recordings: Recordings, ours: Metrics, paper: Metrics, load: LoadStep = PAPER_LOAD,
                          reference_rpm: float = 150.0) -> None:
-    """Figure 6: 8 N m load step at 150 r/min; the whole run, the speed around the step, the first 10 ms after it."""
+    """Figure 6: load step, by the paper of 8 N m at 150 r/min; the whole run, the speed around the step, the
+    first 10 ms after it."""
 
     def draw(figure: Figure) -> None:
         axes = _grid(figure, recordings, rows=3, heights=(1.0, 1.15, 0.9))
-        after_ms = _zoom_after_ms(ours)
+        after_ms, step_time_s = _zoom_after_ms(ours), load.at_s
         for column, (controller, recording) in enumerate(recordings.items()):
             colour = controller_colour(controller)
             mine, published = ours[controller], paper.get(controller, {})
@@ -141,7 +144,8 @@ def plot_load_step_speed(path: Path, recordings: Recordings, ours: Metrics, pape
             _band(whole, reference_rpm)
             _trace(whole, recording["time_s"], recording["speed_rpm"], colour)
             _step_line(whole, step_time_s)
-            whole.annotate("8 N m", (step_time_s, 0.25 * reference_rpm), xytext=(5, 0), textcoords="offset points",
+            whole.annotate(f"{load.torque_Nm:g} N m", (step_time_s, 0.25 * reference_rpm),
+                           xytext=(5, 0), textcoords="offset points",
                            color=LOAD_COLOUR, fontsize=8.5, va="center")
             whole.set_xlim(0.0, float(recording["time_s"][-1]))
             whole.set_ylim(0.0, 1.16 * reference_rpm)
@@ -168,7 +172,8 @@ def plot_load_step_speed(path: Path, recordings: Recordings, ours: Metrics, pape
     _save(path, draw, len(recordings), height_in=8.8)
 
 
-def plot_load_step_torque(path: Path, recordings: Recordings, ours: Metrics, paper: Metrics, step_time_s: float = 0.13,
+def plot_load_step_torque(path: Path, recordings: Recordings, ours: Metrics, paper: Metrics,
+                          load: LoadStep = PAPER_LOAD,
                           window_s: tuple[float, float] = RIPPLE_WINDOW_S) -> None:
     """Figure 7: torque around the step, in the steady window with extremes and mean, and 1 ms around its maximum."""
 
@@ -182,10 +187,11 @@ def plot_load_step_torque(path: Path, recordings: Recordings, ours: Metrics, pap
             mine, published = ours[controller], paper.get(controller, {})
             around, steady, detail = axes[:, column]
 
-            part = _between(recording, step_time_s - 0.01, step_time_s + 0.05)
-            _trace(around, (part["time_s"] - step_time_s) * 1e3, part["torque_Nm"], colour, width=0.8)
-            _trace(around, (part["time_s"] - step_time_s) * 1e3, part["load_torque_Nm"], LOAD_COLOUR, width=1.0)
-            around.annotate("load", (0.0, 4.0), xytext=(-5, 0), textcoords="offset points", color=LOAD_COLOUR,
+            part = _between(recording, load.at_s - 0.01, load.at_s + 0.05)
+            _trace(around, (part["time_s"] - load.at_s) * 1e3, part["torque_Nm"], colour, width=0.8)
+            _trace(around, (part["time_s"] - load.at_s) * 1e3, part["load_torque_Nm"], LOAD_COLOUR, width=1.0)
+            around.annotate("load", (0.0, 0.5 * load.torque_Nm), xytext=(-5, 0), textcoords="offset points",
+                            color=LOAD_COLOUR,
                             fontsize=8.5, ha="right")
             around.set_xlim(-10.0, 50.0)
             around.set_xlabel("time after the load step / ms")
@@ -242,7 +248,7 @@ def plot_phase_currents(path: Path, recordings: Recordings, from_s: float = RIPP
             _trace(torque, travel_deg, part["torque_Nm"], controller_colour(controller), width=0.8)
             for axis in (currents, torque):
                 axis.set_xlim(0.0, rotor_span_deg)
-                axis.set_xticks(np.arange(0.0, rotor_span_deg + 1.0, 15.0))
+                axis.set_xticks(np.linspace(0.0, rotor_span_deg, 5))
             torque.set_xlabel(f"rotor angle from {from_s:g} s / deg")
         for row in axes:
             _same_limits(row, from_zero=True)

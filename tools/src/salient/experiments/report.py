@@ -17,10 +17,12 @@ CONTROLLER_DESCRIPTION = {
     "salient": "sliding mode, torque sharing, predictive flux PWM, BP-PID trim",
 }
 EXPERIMENT_TITLE = {
-    "start_600": "Start to 600 r/min, no load",
-    "load_step_150": "150 r/min, load step of 8 N m at 0.13 s",
+    "start_600": "Start to {start_rpm:g} r/min, no load",
+    "load_step_150": "{step_rpm:g} r/min, load step of {load_Nm:g} N m at {step_at_s:g} s",
 }
-STEADY_STATE_TITLE = {"start_600": "600 r/min, no load", "load_step_150": "150 r/min, 8 N m"}
+"""Titles, with keys of conditions.operating_point, as below."""
+STEADY_STATE_TITLE = {"start_600": "{start_rpm:g} r/min, no load",
+                      "load_step_150": "{step_rpm:g} r/min, {load_Nm:g} N m"}
 """Operating points of the power balance, by experiment."""
 METRIC_ROWS = {
     "settling_time_s": ("settling time to ±0.5 %", "s", 4, 1.0),
@@ -28,9 +30,9 @@ METRIC_ROWS = {
     "max_speed_rpm": ("maximum speed", "r/min", 1, 1.0),
     "speed_dip_rpm": ("speed drop after the step", "r/min", 2, 1.0),
     "recovery_time_s": ("recovery time to ±0.5 %", "ms", 2, 1e3),
-    "torque_max_Nm": ("max. torque, 0.3 to 0.4 s", "N m", 3, 1.0),
-    "torque_min_Nm": ("min. torque, 0.3 to 0.4 s", "N m", 3, 1.0),
-    "torque_mean_Nm": ("mean torque, 0.3 to 0.4 s", "N m", 3, 1.0),
+    "torque_max_Nm": ("max. torque, steady", "N m", 3, 1.0),
+    "torque_min_Nm": ("min. torque, steady", "N m", 3, 1.0),
+    "torque_mean_Nm": ("mean torque, steady", "N m", 3, 1.0),
     "torque_ripple": ("torque ripple K_t", "", 4, 1.0),
 }
 """Metric in results.json -> label, unit, decimals, factor into that unit."""
@@ -66,7 +68,7 @@ def write_report(path: Path, results: Mapping[str, Any], plots: Sequence[Plot], 
         "machine": conditions["machine"],
         "tiles": [_tile(results, *tile) for tile in _TILES],
         "tables": [_table(results, experiment) for experiment in results["experiments"]],
-        "losses": _losses(results["losses"]),
+        "losses": _losses(results["losses"], conditions["operating_point"]),
         "plots": plots,
         "ripple": {controller: f"{metrics['torque_ripple']:.3g}"
                    for controller, metrics in results["experiments"]["load_step_150"].items()},
@@ -99,22 +101,27 @@ def format_published(name: str, value: float | None) -> str:
 def captions(results: Mapping[str, Any]) -> dict[str, str]:
     """Captions of the plots with the metrics of this run, by name: figure_5, figure_6, figure_7, phase_currents."""
     start, step = results["experiments"]["start_600"], results["experiments"]["load_step_150"]
+    point = results["conditions"]["operating_point"]
+    start_rpm, step_rpm, window_s = point["start_rpm"], point["step_rpm"], point["window_s"]
     return {
         "figure_5":
-            "Speed from standstill to 600 r/min. The green band is ±0.5 %, the dot marks the settling time, the hollow"
-            " diamond the published one. " + _each(start, "settling_time_s")
-            + " Bottom: detail around 600 r/min with the maximum speed (coloured) and the published one (grey).",
+            f"Speed from standstill to {start_rpm:g} r/min. The green band is ±0.5 %, the dot marks the settling time,"
+            " the hollow diamond the published one. " + _each(start, "settling_time_s")
+            + f" Bottom: detail around {start_rpm:g} r/min with the maximum speed (coloured) and the published one"
+            " (grey).",
         "figure_6":
-            "Speed at 150 r/min with a load step of 8 N m at 0.13 s: the whole run, the time around the step, and the"
-            " first 10 ms after it; the scales are the same for all controllers. "
+            f"Speed at {step_rpm:g} r/min with a load step of {point['load_Nm']:g} N m at {point['step_at_s']:g} s: the"
+            " whole run, the time around the step, and the first 10 ms after it; the scales are the same for all"
+            " controllers. "
             + _each(step, "speed_dip_rpm") + " " + _each(step, "recovery_time_s"),
         "figure_7":
-            "True shaft torque around the load step (black: the load), in the steady window from 0.3 s to 0.4 s with"
-            " its extremes and its mean, and the millisecond around its maximum. Each column of pixels spans from the"
-            " minimum to the maximum of its samples, so no spike is lost. "
+            "True shaft torque around the load step (black: the load), in the steady window from"
+            f" {window_s[0]:g} s to {window_s[1]:g} s with its extremes and its mean, and the millisecond around its"
+            " maximum. Each column of pixels spans from the minimum to the maximum of its samples, so no spike is"
+            " lost. "
             + _each(step, "torque_ripple"),
         "phase_currents":
-            "Phase currents and torque over two strokes of the rotor (60 degrees) in the steady window. During"
+            "Phase currents and torque over two strokes of the rotor in the steady window. During"
             " commutation both phases carry current, and the torque is hardest to control.",
     }
 
@@ -125,8 +132,8 @@ def _each(metrics: Metrics, name: str) -> str:
         f"{controller} {format_metric(name, of[name])}" for controller, of in metrics.items()) + "."
 
 
-_TILES = (("start_600", "settling_time_s", "start to 600 r/min, settling time"),
-          ("load_step_150", "recovery_time_s", "8 N m load step, recovery time"),
+_TILES = (("start_600", "settling_time_s", "start to {start_rpm:g} r/min, settling time"),
+          ("load_step_150", "recovery_time_s", "{load_Nm:g} N m load step, recovery time"),
           ("load_step_150", "torque_ripple", "torque ripple"))
 
 
@@ -136,7 +143,7 @@ def _tile(results: Mapping[str, Any], experiment: str, name: str, title: str) ->
         published = results["paper"].get(experiment, {}).get(controller)
         lines.append({"controller": controller, "value": format_metric(name, metrics[name]),
                       "published": format_published(name, published[name]) if published else ""})
-    return {"title": title, "lines": lines}
+    return {"title": title.format_map(results["conditions"]["operating_point"]), "lines": lines}
 
 
 def _table(results: Mapping[str, Any], experiment: str) -> dict[str, Any]:
@@ -153,15 +160,17 @@ def _table(results: Mapping[str, Any], experiment: str) -> dict[str, Any]:
         rows.append({"label": f"{label}, {unit}" if unit else label, "cells": cells})
     heads = [{"controller": controller, "published": controller in published,
               "description": CONTROLLER_DESCRIPTION.get(controller, "")} for controller in metrics]
-    return {"title": EXPERIMENT_TITLE.get(experiment, experiment), "heads": heads, "rows": rows}
+    title = EXPERIMENT_TITLE.get(experiment, experiment).format_map(results["conditions"]["operating_point"])
+    return {"title": title, "heads": heads, "rows": rows}
 
 
-def _losses(losses: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Any]:
+def _losses(losses: Mapping[str, Mapping[str, Mapping[str, Any]]], point: Mapping[str, Any]) -> dict[str, Any]:
     """One table of all experiments."""
     columns = [(controller, of) for by_controller in losses.values() for controller, of in by_controller.items()]
     first = columns[0][1]
     return {
-        "experiments": [{"title": STEADY_STATE_TITLE.get(experiment, experiment), "columns": len(by_controller)}
+        "experiments": [{"title": STEADY_STATE_TITLE.get(experiment, experiment).format_map(point),
+                         "columns": len(by_controller)}
                         for experiment, by_controller in losses.items()],
         "controllers": [controller for controller, _ in columns],
         "rows": [{"label": f"{label}, {unit}",

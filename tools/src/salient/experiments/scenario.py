@@ -44,13 +44,14 @@ from pydantic import create_model
 
 from salient.bench.bench import Bench
 from salient.bench.drive import DriveError, write_request
-from salient.bench.emulator import executable, parameter_table
-from salient.bench.rig import bench_variables
+from salient.bench.emulator import parameter_table
+from salient.bench.rig import bench_variables, variable_range
 from salient.bus.log import write_logs
-from salient.bus.signals import SignalTable, drive_database, signal_range
+from salient.bus.signals import SignalTable, drive_database
 from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
 from salient.errors import UsageError
 from salient.experiments.metrics import losses
+from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
 from salient.toml_file import Table, TextFileError, any_number, number, one_of, option, read_toml, validate
 
@@ -267,12 +268,12 @@ _Time = Annotated[float, number(0.0, 3600.0)]
 
 class _SpeedTable(Table):
     at_s: _Time
-    value_rpm: Annotated[float, number(-3000.0, 3000.0)]
+    value_rpm: Annotated[float, number(-38_400.0, 38_400.0)]
 
 
 class _LoadTable(Table):
     at_s: _Time
-    torque_Nm: Annotated[float, number(-200.0, 200.0)]
+    torque_Nm: Annotated[float, number(-10_000.0, 10_000.0)]
 
 
 class _RecordTable(Table):
@@ -283,8 +284,8 @@ class _RecordTable(Table):
 @lru_cache
 def _scenario_file() -> type[Table]:
     """The model of a file; the ranges of [bench] are those of rig.dbc."""
-    variables: dict[str, Any] = {name: (Annotated[float, number(*signal_range(signal))], None)
-                                 for name, signal in bench_variables().items()}
+    variables: dict[str, Any] = {name: (Annotated[float, number(*variable_range(name))], None)
+                                 for name in bench_variables()}
     bench = create_model("bench", __base__=Table, **variables)
     kinds = get_type_hints(Conditions)
     options: dict[str, Any] = {name: (Annotated[kinds[name], option(name)], DEFAULTS[name])
@@ -317,7 +318,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
         raise UsageError(f"{path}: {error}") from None
     relative = path.parent / file.machine
     machine = str(relative.resolve()) if relative.suffix == ".toml" else file.machine
-    executable(machine)
+    machine_image(machine)  # checks it
     common: dict[str, Any] = {name: getattr(file, name) for name in CONDITIONS if name in type(file).model_fields}
     common |= {
         "name": path.stem,

@@ -1,20 +1,20 @@
 """Writes generated files: the part that the command lines of the generators share."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 
 def write_files(
-    program: str, folder: Path, generate: Callable[[], dict[str, str]], *invalid_input: type[Exception]
+    program: str, folder: Path, generate: Callable[[], Mapping[str, str | bytes]], *invalid_input: type[Exception]
 ) -> int:
-    """Writes what `generate` returns, file name -> text, into `folder`, which is made. Exit code 0, or 2 after one line
-    on stderr: an exception of `invalid_input`, or a file or folder that cannot be used."""
+    """Writes what `generate` returns, file name -> content, into `folder`, which is made. Exit code 0, or 2 after one
+    line on stderr: an exception of `invalid_input`, or a file or folder that cannot be used."""
     try:
         files = generate()
         folder.mkdir(parents=True, exist_ok=True)
-        for name, text in files.items():
-            (folder / name).write_text(text, encoding="utf-8")
+        for name, content in files.items():
+            (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
     except invalid_input as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2

@@ -21,6 +21,7 @@ from xml.etree import ElementTree
 from salient.generate.files import write_files
 from salient.generate.machine import plant_source
 from salient.machine.file import Machine, MachineError, load_machine
+from salient.machine.scaling import scaling_of
 
 # Base units and display units (name, factor: display value = factor * value) of each unit.
 UNITS: dict[str, tuple[dict[str, int], dict[str, float]]] = {
@@ -205,7 +206,8 @@ def _number(value: float) -> str:
 
 def instantiation_token(machine: Machine, sources: list[Path]) -> str:
     """Hash of the contents of the unit; `sources` in any order, their folders do not matter."""
-    digest = hashlib.sha256(description(machine, "") + plant_source(machine).encode())
+    plant = plant_source(machine, scaling_of(machine.name, machine))
+    digest = hashlib.sha256(description(machine, "") + plant.encode())
     for source in sorted(sources, key=lambda path: path.name):
         digest.update(source.name.encode() + b"\0" + source.read_bytes())
     return digest.hexdigest()

@@ -105,7 +105,7 @@ def _default(name: str, option: Option) -> str:
 
 
 def _usage() -> list[str]:
-    lines = ["usage: %s --can BUS [option...]\n"]
+    lines = ["usage: %s --can BUS --machine-image FILE [option...]\n"]
     for name, option in arguments().items():
         head = f"  {config.flag_of(name)} {option.metavar}".rstrip()
         gap = " " * max(2, _INDENT - len(head))

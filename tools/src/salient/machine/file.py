@@ -6,19 +6,24 @@ The meaning of the keys: emulator/plant/machine.h.
 
 from __future__ import annotations
 
-import math
+import difflib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import create_model
+from pydantic import Field, create_model
 
+from salient.machine.definition import Machine, MachineError
+from salient.machine.drive_data import check
 from salient.machine.flux_map import FluxMap, FluxMapError
 from salient.machine.flux_map_csv import load_flux_map
 from salient.machine.magnetics import FORMULA_KEYS, INDUCTANCES, Formula
-from salient.paths import MACHINES
-from salient.toml_file import Table, TextFileError, checked, number, one_of, read_toml, shown, validate
+from salient.machine.parameter_table import SAME_UNITS, read_table
+from salient.machine.path import machine_path
+from salient.toml_file import Table, TextFileError, checked, number, one_of, option, read_toml, shown, validate
+
+__all__ = ["FORMS", "MAGNETICS", "Converter", "Machine", "MachineError", "MachineFile", "Sensors", "load_machine",
+           "machine_path"]
 
 FORMS = (*FORMULA_KEYS, "map")
 
@@ -28,8 +33,8 @@ _PHASES = {(6, 4): 3, (8, 6): 4, (12, 8): 3}
 
 # --- tables ---------------------------------------------------------------------------------------------------------
 
-# The ranges are wide enough for any machine that the number formats of the firmware can carry (inertia and friction are
-# Q1.30 there). Defaults are those of ideal devices and sensors.
+# The ranges are those of machines from 0.05 to 2000 N m and 12 to 1000 V, and more; whether inertia and friction suit a
+# machine's units in the firmware is checked with them (scaling.py). Defaults are those of ideal devices and sensors.
 
 class Poles(Table):
     stator: Any
@@ -37,16 +42,16 @@ class Poles(Table):
 
 
 class Winding(Table):
-    resistance_ohm: Annotated[float, number(1e-4, 100.0)]
+    resistance_ohm: Annotated[float, number(1e-5, 100.0)]
 
 
 class Mechanics(Table):
-    inertia_kg_m2: Annotated[float, number(1e-4, 1.9)]
-    friction_Nm_s: Annotated[float, number(0.0, 1.9)]
+    inertia_kg_m2: Annotated[float, number(1e-9, 1000.0)]
+    friction_Nm_s: Annotated[float, number(0.0, 1000.0)]
 
 
 class Converter(Table):
-    supply_voltage_V: Annotated[float, number(10.0, 500.0)]
+    supply_voltage_V: Annotated[float, number(5.0, 1500.0)]
     switch_drop_V: Annotated[float, number(0.0, 5.0)] = 0.0
     switch_resistance_ohm: Annotated[float, number(0.0, 1.0)] = 0.0
     diode_drop_V: Annotated[float, number(0.0, 5.0)] = 0.0
@@ -60,15 +65,15 @@ class DcLink(Table):
     capacitance_F: Annotated[float, number(1e-5, 1.0)]
     source_resistance_ohm: Annotated[float, number(0.001, 10.0)]
     chopper_resistance_ohm: Annotated[float, number(0.1, 1000.0)] | None = None
-    chopper_on_V: Annotated[float, number(10.0, 510.0)] | None = None
-    chopper_off_V: Annotated[float, number(10.0, 510.0)] | None = None
+    chopper_on_V: Annotated[float, number(5.0, 2000.0)] | None = None
+    chopper_off_V: Annotated[float, number(5.0, 2000.0)] | None = None
 
 
 class Sensors(Table):
     current_gain: Annotated[float, number(0.0, 10.0)] = 1.0
-    current_offset_A: Annotated[float, number(-10.0, 10.0)] = 0.0
-    current_noise_A: Annotated[float, number(0.0, 10.0)] = 0.0
-    current_limit_A: Annotated[float, number(0.1, 1000.0)] = 1000.0
+    current_offset_A: Annotated[float, number(-100.0, 100.0)] = 0.0
+    current_noise_A: Annotated[float, number(0.0, 80.0)] = 0.0
+    current_limit_A: Annotated[float, number(0.1, 8000.0)] = 8000.0
     current_delay_ns: Annotated[float, number(0.0, 8000.0)] = 0.0
     encoder_eccentricity_deg: Annotated[float, number(0.0, 5.0)] = 0.0
 
@@ -81,6 +86,27 @@ class IronLoss(Table):
     steinmetz_k: Annotated[float, number(1e-6, 10.0)]
     steinmetz_alpha: Annotated[float, number(1.0, 2.0)]
     steinmetz_beta: Annotated[float, number(1.5, 3.0)]
+
+
+class Drive(Table):
+    """What is left out is derived (drive_data.py)."""
+
+    supply_min_V: Annotated[float, number(1.0, 2000.0)] | None = None
+    supply_max_V: Annotated[float, number(1.0, 2000.0)] | None = None
+    current_rated_A: Annotated[float, number(0.01, 5000.0)] | None = None
+    current_peak_A: Annotated[float, number(0.01, 5000.0)] | None = None
+    torque_rated_Nm: Annotated[float, number(1e-4, 20_000.0)] | None = None
+    torque_peak_Nm: Annotated[float, number(1e-4, 20_000.0)] | None = None
+    speed_base_rpm: Annotated[float, number(1.0, 100_000.0)] | None = None
+    speed_max_rpm: Annotated[float, number(1.0, 100_000.0)] | None = None
+    thermal_time_constant_s: Annotated[float, number(0.1, 100_000.0)] | None = None
+    control_rate_hz: Annotated[int, option("control_rate_hz")] | None = None
+    encoder_bits: Annotated[int, option("encoder_bits")] | None = None
+    encoder_edges: Annotated[bool, option("encoder_edges")] | None = None
+    adc_bits: Annotated[int, option("adc_bits")] | None = None
+    adc_current_A: Annotated[float, number(0.1, 10_000.0)] | None = None
+    adc_voltage_V: Annotated[float, number(1.0, 5000.0)] | None = None
+    parameters: dict[str, Any] = Field(default={})
 
 
 class MapMagnetics(Table):
@@ -111,59 +137,11 @@ class MachineFile(Table):
     dc_link: DcLink | None = None
     sensors: Sensors = Sensors()
     iron_loss: IronLoss | None = None
+    drive: Drive = Drive()
 
 
 # --- machine --------------------------------------------------------------------------------------------------------
 
-class MachineError(ValueError):
-    """A machine file that cannot be used; the text is one line that begins with the file."""
-
-
-@dataclass(frozen=True)
-class Machine:
-    """A motor with its converter and sensors, in SI units."""
-
-    name: str
-    stator_poles: int
-    rotor_poles: int
-    phases: int
-    resistance_ohm: float
-    inertia_kg_m2: float
-    friction_Nm_s: float
-    supply_voltage_V: float
-    magnetics: Formula | FluxMap
-    converter: dict[str, float]
-    """Every key of Converter but supply_voltage_V."""
-    dc_link: dict[str, float] | None
-    """Keys of DcLink, those of the chopper only when there is one; None: ideal."""
-    sensors: dict[str, float]
-    """Every key of Sensors."""
-    iron_loss: dict[str, float] | None
-    """Every key of IronLoss; None: no estimate."""
-
-    @property
-    def pitch_rad(self) -> float:
-        """Rotor pole pitch."""
-        return 2.0 * math.pi / self.rotor_poles
-
-    @property
-    def current_rise_A_s(self) -> float:
-        """Current slope at the supply voltage with the rotor unaligned and at rest, A/s."""
-        return self.supply_voltage_V / self.magnetics.unaligned_inductance_H
-
-
-def machine_path(name_or_path: str) -> Path:
-    """The file meant by the name of a bundled machine or by a path; MachineError when there is none."""
-    bundled, path = MACHINES / f"{name_or_path}.toml", Path(name_or_path)
-    try:
-        if bundled.is_file():
-            return bundled
-        if path.is_file():
-            return path.resolve()
-    except OSError:
-        pass  # a name too long for a file: there is none
-    names = ", ".join(sorted(p.stem for p in MACHINES.glob("*.toml")))
-    raise MachineError(f"machine {shown(name_or_path)}: no such file, and no bundled machine of that name ({names})")
 
 
 def load_machine(path: Path | str) -> Machine:
@@ -176,8 +154,15 @@ def load_machine(path: Path | str) -> Machine:
         magnetics = _magnetics(path, file.magnetics, rotor)
         if file.dc_link is not None:
             _check_chopper(file.dc_link, file.converter.supply_voltage_V)
+        machine = _machine(file, (stator, rotor, phases), magnetics)
+        check(machine)
     except TextFileError as error:
         raise MachineError(f"{path}: {error}") from None
+    return machine
+
+
+def _machine(file: MachineFile, poles: tuple[int, int, int], magnetics: Formula | FluxMap) -> Machine:
+    stator, rotor, phases = poles
     return Machine(
         name=file.name,
         stator_poles=stator,
@@ -191,6 +176,8 @@ def load_machine(path: Path | str) -> Machine:
         dc_link=None if file.dc_link is None else file.dc_link.model_dump(exclude_none=True),
         sensors=file.sensors.model_dump(),
         iron_loss=None if file.iron_loss is None else file.iron_loss.model_dump(),
+        drive=file.drive.model_dump(exclude_none=True, exclude={"parameters"}),
+        drive_parameters=_parameters(file.drive.parameters),
     )
 
 
@@ -212,6 +199,23 @@ def _check_chopper(link: DcLink, supply_voltage_V: float) -> None:
     on_V, off_V = link.chopper_on_V, link.chopper_off_V
     if on_V is not None and off_V is not None and not supply_voltage_V < off_V < on_V:
         raise TextFileError("dc_link.chopper_off_V: must be above converter.supply_voltage_V and below chopper_on_V")
+
+
+def _parameters(table: dict[str, Any]) -> dict[str, float]:
+    """[drive.parameters]: names, and for values whose unit is the same for every machine the ranges of the drive."""
+    rows = {row.name: row for row in read_table()}
+    for name, value in table.items():
+        row = rows.get(name)
+        if row is None:
+            key = name if name.isidentifier() and name.isascii() and len(name) < 60 else shown(name)
+            near = "".join(f"; the nearest is {match}" for match in difflib.get_close_matches(name[:60], rows, 1))
+            raise TextFileError(f"drive.parameters.{key}: unknown key{near}; all are in firmware/PARAMETERS.md")
+        low, high = row.limits if row.unit in SAME_UNITS else (0.0, 1e6)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not low <= value <= high or (row.fraction_bits == 0 and value != int(value)):
+            kind = "a whole number" if row.fraction_bits == 0 else "a number"
+            raise TextFileError(f"drive.parameters.{name}: {shown(value)}: must be {kind} from {low:g} to {high:g}")
+    return {name: float(value) for name, value in table.items()}
 
 
 def _magnetics(path: Path, table: dict[str, Any], rotor_poles: int) -> Formula | FluxMap:

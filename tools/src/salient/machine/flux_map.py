@@ -107,6 +107,8 @@ class FluxMap:
         value = self._spline(angle_rad, within_A, by_angle, by_current)
         if by_current == 3:
             return np.where(beyond_A > 0.0, 0.0, value)
+        if not np.any(beyond_A):
+            return value
         factor = np.ones_like(beyond_A)
         for order in range(1, 3 - by_current):
             factor = factor * beyond_A / order
@@ -136,12 +138,11 @@ class FluxMap:
         wrapped_rad = angle_rad - np.rint(angle_rad / self.pitch_rad) * self.pitch_rad
         column, across = _interval(np.abs(wrapped_rad) * steps_1_rad, ANGLE_INTERVALS)
         row, along = _interval(current_A * steps_1_A, CURRENT_INTERVALS)
-        cell = np.array([[self.coefficients_J[row + j, column + k] for k in range(4)] for j in range(5)])
-        cell = np.diff(np.diff(cell, by_current, axis=0), by_angle, axis=1)
+        differences = np.diff(np.diff(self.coefficients_J, by_current, axis=0), by_angle, axis=1)
+        across_weights = _weights(across, 3 - by_angle)
         value = sum(
-            along_weight * sum(across_weight * part for across_weight, part in zip(across_weights, parts, strict=True))
-            for across_weights in [_weights(across, 3 - by_angle)]
-            for along_weight, parts in zip(_weights(along, 4 - by_current), cell, strict=True)
+            along_weight * sum(weight * differences[row + j, column + k] for k, weight in enumerate(across_weights))
+            for j, along_weight in enumerate(_weights(along, 4 - by_current))
         )
         scale = math.prod([steps_1_rad] * by_angle + [steps_1_A] * by_current)  # libm's powers differ in the last bit
         result: np.ndarray = value * scale * np.where(wrapped_rad < 0.0, (-1.0) ** by_angle, 1.0)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-INDUCTANCES = {"unaligned_inductance_H": (1e-5, 10.0), "aligned_inductance_H": (1e-5, 10.0)}
+INDUCTANCES = {"unaligned_inductance_H": (1e-6, 10.0), "aligned_inductance_H": (1e-6, 10.0)}
 """(minimum, maximum) for every machine, both included; of the unsaturated phase."""
 
 # Keys of each form in a machine file with (minimum, maximum), both included.
@@ -22,9 +22,9 @@ FORMULA_KEYS: dict[str, dict[str, tuple[float, float]]] = {
     "linear_trapezoid": INDUCTANCES | {"flat_deg": (0.0, 20.0), "blend_deg": (0.01, 20.0)},
     "saturating": INDUCTANCES
     | {
-        "saturated_inductance_H": (1e-6, 10.0),
-        "flux_linkage_max_Wb": (1e-3, 100.0),
-        "current_at_flux_linkage_max_A": (1.0, 10000.0),
+        "saturated_inductance_H": (1e-7, 10.0),
+        "flux_linkage_max_Wb": (1e-4, 100.0),
+        "current_at_flux_linkage_max_A": (0.1, 100_000.0),
     },
 }
 

@@ -14,8 +14,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from salient.errors import UsageError
+from salient.machine.drive_report import drive_json, drive_lines
 from salient.machine.file import Converter, Machine, MachineError, Sensors, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
+from salient.machine.scaling import scaling_of
 
 # Range of the current sensors and of the firmware's tables.
 CURRENT_MAX_A = 80.0
@@ -23,15 +25,19 @@ SHOWN_A = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0)
 SHOWN_PITCHES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 
 
-def run(name_or_path: str, out: Path) -> int:
-    """Checks the file, prints its data sheet and plots its magnetics; returns 0. UsageError."""
+def run(name_or_path: str, out: Path, json_path: Path | None = None, dbc_path: Path | None = None) -> int:
+    """Checks the file, prints its data sheet and the drive's data, plots its magnetics; returns 0. UsageError.
+
+    json_path: the drive's data are also written there; dbc_path: the CAN database of its drive.
+    """
     try:
         path = machine_path(name_or_path)
         machine = load_machine(path)
-        machine_phase_map(path, machine)
+        scaling = scaling_of(path, machine)
+        machine_phase_map(path, machine, scaling.exponents)
     except MachineError as error:
         raise UsageError(str(error)) from None
-    print("\n".join(describe(machine)))
+    print("\n".join([*describe(machine), *drive_lines(machine)]))
     plot_path = out / f"{machine.name}.png"
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -39,7 +45,18 @@ def run(name_or_path: str, out: Path) -> int:
     except OSError as error:
         raise UsageError(f"--out {out}: {error.strerror}") from None
     print(f"plot: {plot_path}")
+    if json_path is not None:
+        _write("--json", json_path, drive_json(machine))
+    if dbc_path is not None:
+        _write("--dbc", dbc_path, scaling.dbc())
     return 0
+
+
+def _write(option: str, path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{option} {path}: {error.strerror}") from None
 
 
 def describe(machine: Machine) -> list[str]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from salient.bench.emulator import image
+from salient.bench.programs import image
 from salient.config import CONTROLLERS, TARGET_BUILDS
 from salient.elf import ElfImage
 from salient.errors import UsageError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from salient.bench.emulator import image
+from salient.bench.programs import image
 from salient.config import either
 from salient.elf import ElfImage
 from salient.errors import UsageError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from salient.bench.emulator import deferred_instructions, image
+from salient.bench.programs import deferred_instructions, image
 from salient.experiments.scenario import RunResult, Scenario, load_scenarios, run_scenario
 from salient.paths import SCENARIOS
 from salient.target.trace import Trace, read_trace

@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from salient.config import CONTROLLERS
+from salient.experiments.compare import every_machine
 from salient.experiments.compare.metrics import STEADY_S
+from salient.experiments.metrics import RIPPLE_WINDOW_S
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 
 # Parameters of the drive that conditions set, by meaning; the numbers are those of firmware/PARAMETERS.md.
@@ -82,7 +85,8 @@ class Case:
     """One run and its metrics.
 
     extractor: key of compare/metrics.EXTRACTORS. sample: distinguishes the runs of a condition, "" for a single run.
-    traced: keep the torque over the paper's window for a plot.
+    traced: keep the torque over the paper's window for a plot. window_s: of the ripple, for extractors whose
+    recordings are longer. strokes: by which the load step is later than STEP_AT_S.
     """
 
     group: str
@@ -92,6 +96,8 @@ class Case:
     scenario: Scenario
     sample: str = ""
     traced: bool = False
+    window_s: tuple[float, float] = RIPPLE_WINDOW_S
+    strokes: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -161,10 +167,11 @@ def _dip(quick: bool) -> Iterator[Case]:
             scenario = _scenario(machine=machine, duration_s=step_s + 0.3, speed=(SpeedStep(0.0, RIPPLE_RPM),),
                                  load=(LoadStep(step_s, LOAD_NM),), record=Record(10.0, 0.09), **SENSING[sensing])
             sample = f"angle {number:02}"
-            yield from _by_controller("dip", f"{machine}, {sensing}", "load_step", scenario, sample)
+            strokes = number / angles
+            yield from _by_controller("dip", f"{machine}, {sensing}", "load_step", scenario, sample, strokes=strokes)
             if machine == "saturating" and sensing != "17 bits" and not quick:
                 yield Case("dip", f"{machine}, {sensing}, reserve of 8 N m", "salient", "load_step",
-                           replace(scenario, controller="salient", parameters=RESERVE), sample)
+                           replace(scenario, controller="salient", parameters=RESERVE), sample, strokes=strokes)
 
 
 def _moving(quick: bool) -> Iterator[Case]:
@@ -229,13 +236,19 @@ def _ablation(quick: bool) -> Iterator[Case]:
                                  bench={"current_noise_A": 0.02, "encoder_offset_deg": offset_deg})
                 late = replace(step, duration_s=LATE_S, record=Record(1.0, LATE_S - 0.1))
                 for extractor, scenario in (("step_and_ripple", step), ("late_ripple", late)):
-                    yield Case("ablation", f"{change}, {table}", controller, extractor, scenario, f"seed {seed}")
+                    yield Case("ablation", f"{change}, {table}", controller, extractor, scenario, f"seed {seed}",
+                               strokes=(seed - 1) / len(SEEDS))
 
 
 def _robustness(quick: bool) -> Iterator[Case]:
     for number in range(10 if quick else DRIVES):
         yield from _by_controller("robustness", "random drives", "robustness", random_drive(number),
                                   f"drive {number:03}")
+
+
+def _machines(quick: bool) -> Iterator[Case]:
+    for scenario in every_machine.scenarios(quick):
+        yield Case("machines", Path(scenario.machine).stem, scenario.controller, "every_machine", scenario)
 
 
 def random_drive(number: int) -> Scenario:
@@ -289,6 +302,12 @@ GROUPS: dict[str, Group] = {
                          ("cycle_percent", "median"), ("cycle_percent", "worst")), long=True),
 }
 
+GROUPS["machines"] = Group(
+    "machines of all sizes: start to 0.4 of the base speed, half of the rated torque at a quarter of it, reversal",
+    _machines, (("start_to_bound", ""), ("brake_to_bound", ""), ("reverse_to_bound", ""), ("late_s", ""),
+                ("dip_percent", ""), ("recovery_time_s", ""), ("hold_percent", ""), ("ripple", "")), long=True)
+TITLES = {name: group.title for name, group in GROUPS.items()}
+
 
 # --- scenarios ------------------------------------------------------------------------------------------------------
 
@@ -319,9 +338,10 @@ def _steady(group: str, condition: str, speed_rpm: float, from_s: float, quick: 
 
 
 def _by_controller(group: str, condition: str, extractor: str, scenario: Scenario, sample: str = "",
-                   controllers: Sequence[str] = CONTROLLERS) -> Iterator[Case]:
+                   controllers: Sequence[str] = CONTROLLERS, strokes: float = 0.0) -> Iterator[Case]:
     for controller in controllers:
-        yield Case(group, condition, controller, extractor, replace(scenario, controller=controller), sample)
+        yield Case(group, condition, controller, extractor, replace(scenario, controller=controller), sample,
+                   strokes=strokes)
 
 
 def scenario_toml(case: Case) -> str:

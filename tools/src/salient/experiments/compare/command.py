@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
 
-from salient.bench.emulator import executable
 from salient.errors import UsageError
 from salient.experiments.compare import baseline, results_file, table
-from salient.experiments.compare.cases import GROUPS, Case, scenario_toml
+from salient.experiments.compare.cases import GROUPS, TITLES, Case, scenario_toml
+from salient.experiments.compare.machine import Subject, cases_of, subject
 from salient.experiments.compare.runner import RunMetrics, run_all
+from salient.machine.cache import machine_image
+from salient.machine.file import MachineError
 
 FAILED = "failed"
 _FAILED_LISTED_MAX = 10
@@ -26,10 +29,14 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
                           for name, group in GROUPS.items())
         return 0
     cases = _cases(options.groups, options.quick)
+    titles = TITLES
+    if options.machine is not None:
+        on = _subject(options.machine)
+        cases, titles = cases_of(cases, on), {name: on.text(title) for name, title in titles.items()}
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
     _prepare_folder(options.out)
     for machine in {case.scenario.machine for case in cases}:
-        executable(machine)
+        machine_image(machine)
     runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr)
     rows = table.make_rows(runs)
     changes: list[baseline.Change] = []
@@ -43,8 +50,8 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
 
     from salient.experiments.compare.html import write_page  # imports Matplotlib, which takes a second
 
-    write_page(options.out / "compare.html", rows, content, change_summary, changes, _command(options))
-    stream.write(f"{table.table(rows)}\n\n{table.summary(rows)}\n")
+    write_page(options.out / "compare.html", rows, content, change_summary, changes, _command(options), titles)
+    stream.write(f"{table.table(rows, titles)}\n\n{table.summary(rows)}\n")
     for run, path in failed[:_FAILED_LISTED_MAX]:
         stream.write(f"{_name(run.case)}: {run.failed}; reproduce with: tools/salient run {path}\n")
     if len(failed) > _FAILED_LISTED_MAX:
@@ -61,6 +68,13 @@ def _cases(groups: Sequence[str], quick: bool) -> list[Case]:
             raise UsageError(f"unknown group {name}: must be one of {', '.join(GROUPS)}")
     return [case for name, group in GROUPS.items() if name in groups or (not groups and not group.long)
             for case in group.cases(quick)]
+
+
+def _subject(name_or_path: str) -> Subject:
+    try:
+        return subject(name_or_path)
+    except MachineError as error:
+        raise UsageError(str(error)) from None
 
 
 def _prepare_folder(out: Path) -> None:
@@ -93,4 +107,5 @@ def _name(case: Case) -> str:
 
 
 def _command(options: argparse.Namespace) -> str:
-    return " ".join(["tools/salient compare", *options.groups, *(["--quick"] if options.quick else [])])
+    machine = [] if options.machine is None else ["--machine", shlex.quote(options.machine)]
+    return " ".join(["tools/salient compare", *options.groups, *machine, *(["--quick"] if options.quick else [])])

@@ -9,21 +9,22 @@ from typing import Any
 
 from salient.experiments.compare import plots, table
 from salient.experiments.compare.baseline import Change
-from salient.experiments.compare.cases import GROUPS
+from salient.experiments.compare.cases import TITLES
 from salient.experiments.compare.table import Row
 from salient.pages import write_page as write_template
 
 
 def write_page(path: Path, rows: Sequence[Row], content: Mapping[str, Any], change_summary: str | None,
-               changes: Sequence[Change], command: str) -> None:
-    """Writes the page for `rows` and `content` (of compare.json). change_summary: text of baseline.summary, None
-    without a baseline. Equal input gives equal bytes."""
+               changes: Sequence[Change], command: str, titles: Mapping[str, str] = TITLES) -> None:
+    """Writes the page for `rows` and `content` (of compare.json), titles by group. change_summary: text of
+    baseline.summary, None without a baseline. Equal input gives equal bytes."""
     write_template(path, "compare.html", {
         "summary": table.summary(rows),
         "missed": [_missed(row) for row in rows if row.reached is False],
         "changes": change_summary,
         "changes_plot": plots.changes_plot(changes),
-        "groups": [_group(name, list(of), content) for name, of in groupby(rows, key=lambda row: row.key[0])],
+        "groups": [_group(name, titles[name], list(of), content)
+                   for name, of in groupby(rows, key=lambda row: row.key[0])],
         "command": command,
     })
 
@@ -36,8 +37,7 @@ def _missed(row: Row) -> str:
     return f"{text} {row.target.reason}".rstrip()
 
 
-def _group(name: str, rows: Sequence[Row], content: Mapping[str, Any]) -> dict[str, Any]:
-    title = GROUPS[name].title
+def _group(name: str, title: str, rows: Sequence[Row], content: Mapping[str, Any]) -> dict[str, Any]:
     controllers = table.controllers_of(rows)
     conditions = []
     for condition, of_condition in groupby(rows, key=lambda row: row.key[1]):

@@ -1,7 +1,8 @@
 """Metrics of a run, and the label, unit and resolution of each.
 
-An extractor is a function of (scenario, recording) that returns metrics by name. A metric is None when its event does
-not occur within the run (a drive that never settles). MetricsError for a recording without the data of a metric.
+An extractor is a function of (scenario, recording, window of the ripple in s where the recording is longer) that
+returns metrics by name. A metric is None when its event does not occur within the run (a drive that never settles).
+MetricsError for a recording without the data of a metric.
 """
 
 from __future__ import annotations
@@ -12,13 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from salient.experiments import metrics
+from salient.experiments.compare import every_machine
+from salient.experiments.scaled import scale_of_name
 from salient.experiments.scenario import Scenario
+from salient.machine.definition import Machine
+from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 
 Metrics = dict[str, float | None]
-
-SHORT_WINDOW_S = 0.1
-"""Length of the paper's window; longer runs also have a metric over their whole length."""
+Window = tuple[float, float]
+PAPER_WINDOW_S = metrics.RIPPLE_WINDOW_S
 
 STEADY_S = 0.5
 """Window at the end of a run of the robustness study, for the speed error and the spectrum."""
@@ -63,6 +67,12 @@ METRICS = {
     "peak_current_A": Metric("peak phase current", "A", 1, 0.5),
     "highest_speed_percent": Metric("maximum speed", "% of reference", 2, 0.05, reference=100.0),
     "cycle_percent": Metric("limit cycle", "% of torque", 3, 0.05),
+    "start_to_bound": Metric("time of the start", "of its bound", 3, 0.01),
+    "brake_to_bound": Metric("time of the braking", "of its bound", 3, 0.01),
+    "reverse_to_bound": Metric("time of the reversal", "of its bound", 3, 0.01),
+    "late_s": Metric("latest beyond 1.1 times the bound or 2 ms", "ms", 2, 0.1, 1e3),
+    "dip_percent": Metric("speed drop", "%", 2, 0.05),
+    "hold_percent": Metric("mean speed error", "%", 4, 0.002),
     "failed": Metric("failed drives", "", 0, 0.5),
     "step_angle_deg": Metric("rotor angle at the step", "deg", 2, 0.2),
 }
@@ -73,30 +83,31 @@ def _recorded_from_s(scenario: Scenario) -> float:
     return scenario.record.from_s
 
 
-def ripple_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
-    """Ripple from the first recorded sample, over SHORT_WINDOW_S and to the end of the run; speed error."""
+def ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """Ripple from the first recorded sample, over the paper's window and to the end of the run; speed error."""
     first_s, last_s = _recorded_from_s(scenario), scenario.duration_s
-    values: Metrics = {"ripple": _ripple(recording, (first_s, first_s + SHORT_WINDOW_S))}
-    if last_s > first_s + 1.5 * SHORT_WINDOW_S:
+    short_s = scale_of_name(scenario.machine).window_s(scenario.speed[-1].value_rpm)
+    values: Metrics = {"ripple": _ripple(recording, (first_s, first_s + short_s))}
+    if last_s > first_s + 1.5 * short_s:
         values["ripple_long"] = _ripple(recording, (first_s, last_s))
     values["speed_error_percent"] = metrics.speed_error_percent(recording, scenario.speed[-1].value_rpm,
                                                                 (first_s, last_s))
     return values
 
 
-def late_ripple_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
+def late_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """Ripple over the whole recording, which is the end of a long run."""
     return {"ripple_late": _ripple(recording, (_recorded_from_s(scenario), scenario.duration_s))}
 
 
-def start_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
+def start_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """A start from standstill."""
     reference = scenario.speed[0]
     values = metrics.start_metrics(recording, reference.value_rpm, reference.at_s)
     return {name: values[name] for name in ("settling_time_s", "overshoot_percent")}
 
 
-def load_step_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
+def load_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """A load step at steady speed: metrics after it, copper loss over the stroke before it where that was recorded, and
     the rotor angle at the step within a stroke, in degrees."""
     reference_rpm, step_s = scenario.speed[-1].value_rpm, scenario.load[0].at_s
@@ -111,19 +122,19 @@ def load_step_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
     return {**values, "step_angle_deg": float(recording["rotor_angle_deg"][at_step]) % stroke_deg}
 
 
-def moving_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
+def moving_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """Peak-to-peak speed over the whole recording, which is the steady state under a periodic load."""
     return {"speed_swing_rpm": float(np.ptp(recording["speed_rpm"]))}
 
 
-def step_and_ripple_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
-    """A load step, and ripple and mean torque over the paper's window."""
-    torque = metrics.torque_metrics(recording["time_s"], recording["torque_Nm"], metrics.RIPPLE_WINDOW_S)
-    step = load_step_metrics(scenario, recording)
+def step_and_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """A load step, and ripple and mean torque over the window."""
+    torque = metrics.torque_metrics(recording["time_s"], recording["torque_Nm"], window_s)
+    step = load_step_metrics(scenario, recording, window_s)
     return {**step, "ripple": torque["torque_ripple"], "torque_mean_Nm": torque["torque_mean_Nm"]}
 
 
-def robustness_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
+def robustness_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """A start and a load step; the last STEADY_S are steady. The whole run is recorded."""
     reference_rpm, last_s = scenario.speed[-1].value_rpm, scenario.duration_s
     steady_s = (last_s - STEADY_S, last_s)
@@ -140,7 +151,12 @@ def robustness_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
     }
 
 
-EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray], Metrics]] = {
+def every_machine_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """A run of every_machine.py."""
+    return every_machine.extract(scenario, recording)
+
+
+EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "ripple": ripple_metrics,
     "late_ripple": late_ripple_metrics,
     "start": start_metrics,
@@ -148,15 +164,21 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray], Metrics]] = {
     "moving": moving_metrics,
     "step_and_ripple": step_and_ripple_metrics,
     "robustness": robustness_metrics,
+    "every_machine": every_machine_metrics,
 }
 
 
-def failures(values: Metrics) -> list[str]:
+def peak_current_max_A(machine: Machine) -> float:
+    """PEAK_CURRENT_MAX_A for a machine, in proportion to its peak current."""
+    return PEAK_CURRENT_MAX_A * derive(machine).current_peak_A / 52.0
+
+
+def failures(values: Metrics, peak_A: float = PEAK_CURRENT_MAX_A) -> list[str]:
     """Limits that a drive of the robustness study violated, as text; empty when it passes."""
     wrong = []
     if values["settling_time_s"] is None:
         wrong.append("not at speed before the load step")
-    for name, limit in (("speed_error_percent", SPEED_ERROR_MAX_PERCENT), ("peak_current_A", PEAK_CURRENT_MAX_A),
+    for name, limit in (("speed_error_percent", SPEED_ERROR_MAX_PERCENT), ("peak_current_A", peak_A),
                         ("highest_speed_percent", SPEED_MAX_PERCENT), ("cycle_percent", LIMIT_CYCLE_MAX_PERCENT)):
         value = values[name]
         if value is not None and value > limit:

@@ -13,13 +13,15 @@ from typing import Any, TextIO
 from can import CanError
 
 from salient.bench.drive import DriveError
-from salient.bench.emulator import EmulatorError
+from salient.bench.programs import EmulatorError
 from salient.bench.session import SessionError
-from salient.experiments.compare.cases import RIPPLE_FROM_S, Case
-from salient.experiments.compare.metrics import EXTRACTORS, SHORT_WINDOW_S, Metrics, failures
+from salient.experiments.compare import every_machine
+from salient.experiments.compare.cases import Case
+from salient.experiments.compare.metrics import EXTRACTORS, Metrics, failures, peak_current_max_A
 from salient.experiments.metrics import MetricsError
 from salient.experiments.results import rounded
 from salient.experiments.scenario import run_scenario
+from salient.machine.file import load_machine, machine_path
 from salient.progress import Progress
 
 _PROGRESS_LINES_MAX = 20
@@ -77,17 +79,22 @@ def _run(case: Case) -> tuple[Metrics, str, Any]:
             if result.fault != "none":
                 return {}, f"fault {result.fault}", None
             assert result.recording is not None  # every case is recorded
-            metrics: Metrics = rounded(EXTRACTORS[case.extractor](case.scenario, result.recording))
+            metrics: Metrics = rounded(EXTRACTORS[case.extractor](case.scenario, result.recording, case.window_s))
         except (EmulatorError, SessionError, DriveError, CanError, MetricsError) as error:
             return {}, str(error), None
-        failed = "; ".join(failures(metrics)) if case.extractor == "robustness" else ""
-        return metrics, failed, _trace(result.recording) if case.traced else None
+        failed = ""
+        if case.extractor == "robustness":
+            machine = load_machine(machine_path(case.scenario.machine))
+            failed = "; ".join(failures(metrics, peak_current_max_A(machine)))
+        if case.extractor == "every_machine":
+            failed = "; ".join(every_machine.failures(metrics, case.controller))
+        return metrics, failed, _trace(case, result.recording) if case.traced else None
 
 
-def _trace(recording: Any) -> tuple[list[float], list[float]]:
+def _trace(case: Case, recording: Any) -> tuple[list[float], list[float]]:
     from salient.experiments.plots import extremes
 
-    window = ((recording["time_s"] >= RIPPLE_FROM_S - 1e-9)
-              & (recording["time_s"] <= RIPPLE_FROM_S + SHORT_WINDOW_S + 1e-9))
+    first_s, last_s = case.window_s
+    window = (recording["time_s"] >= first_s - 1e-9) & (recording["time_s"] <= last_s + 1e-9)
     time_s, torque_Nm = extremes(recording["time_s"][window], recording["torque_Nm"][window], slices=800)
     return rounded(time_s.tolist()), rounded([float(value) for value in torque_Nm])

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import groupby, pairwise
 
 from salient.config import CONTROLLERS
-from salient.experiments.compare.cases import GROUPS, STROKE_DEG
+from salient.experiments.compare.cases import GROUPS, STROKE_DEG, TITLES
 from salient.experiments.compare.metrics import METRICS
 from salient.experiments.compare.runner import RunMetrics
 from salient.experiments.compare.targets import TARGETS, Key, Target
@@ -129,12 +129,13 @@ def status(row: Row) -> str:
     return {True: "reached", False: "NOT REACHED", None: ""}[row.reached]
 
 
-def table(rows: Sequence[Row]) -> str:
-    """All rows as text. Columns: the controllers, target, theoretical limit, published values, status."""
+def table(rows: Sequence[Row], titles: Mapping[str, str] = TITLES) -> str:
+    """All rows as text, titles by group. Columns: the controllers, target, theoretical limit, published values,
+    status."""
     columns = controllers_of(rows)
     lines: list[str] = []
     for group, of_group in groupby(rows, key=lambda row: row.key[0]):
-        lines += ["", f"{group}: {GROUPS[group].title}",
+        lines += ["", f"{group}: {titles[group]}",
                   f"{'':<40}" + "".join(f"{name:>12}" for name in (*columns, "target", "limit")) + "  published"]
         for condition, of_condition in groupby(of_group, key=lambda row: row.key[1]):
             condition_rows = list(of_condition)

@@ -1,0 +1,182 @@
+"""The units of the firmware's formats for a machine, and its CAN database in them."""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from salient.bus.signals import drive_database
+from salient.dbc import database_hash
+from salient.generate.machine import tables_source
+from salient.machine.file import Machine, MachineError, load_machine
+from salient.machine.firmware_tables import machine_phase_map
+from salient.machine.magnetics import Formula
+from salient.machine.parameter_table import read_table
+from salient.machine.scaling import Exponents, Scaling, database_of, drive_dbc, scaling_of
+from salient.paths import DRIVE_DBC, MACHINES, ROOT
+
+OTHERS = ROOT / "tests" / "machines"
+SEED = 14
+
+
+def scaling_of_file(path: Path) -> Scaling:
+    return scaling_of(path, load_machine(path))
+
+
+def random_exponents(count: int) -> list[Exponents]:
+    chance = random.Random(SEED)
+    return [Exponents(chance.randint(-5, 6), chance.randint(-5, 2), chance.randint(-10, 6), chance.randint(0, 3))
+            for _ in range(count)]
+
+
+# --- rule -----------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("path", sorted(MACHINES.glob("*.toml")), ids=lambda path: path.stem)
+def test_bundled_machines_are_in_si_units_with_the_database_and_defaults_of_the_firmware(path):
+    scaling = scaling_of_file(path)
+    assert scaling.exponents == Exponents()
+    assert scaling.dbc() == DRIVE_DBC.read_text()
+    of_machine = {"inertia_kg_m2", "friction_Nm_s", "resistance_ohm", "speed_kp", "speed_ki"}
+    for row, raw in zip(read_table(), scaling.raw_parameters(), strict=True):
+        assert raw == row.default or row.name in of_machine, row.name
+    assert scaling.fraction_bits() == [row.fraction_bits for row in read_table()]
+
+
+@pytest.mark.parametrize(("name", "exponents"), [
+    ("smallest", Exponents(-5, -4, -8, 0)), ("largest", Exponents(5, 2, 6, 0)), ("fastest", Exponents(1, 0, -4, 3)),
+])
+def test_units_follow_the_machine(name, exponents):
+    path = OTHERS / f"{name}.toml"
+    scaling = scaling_of_file(path)
+    assert scaling.exponents == exponents
+    data = scaling.data
+    for value, unit, full_scale, least in (
+        (data.adc_current_A, "A", 80.0, 0.5), (data.adc_voltage_V, "V", 512.0, 0.25),
+        (data.torque_peak_Nm, "N m", 40.0, 0.25), (data.over_speed_rpm, "r/min", 4800.0, 0.1),
+    ):
+        assert least < math.ldexp(value, -exponents.of_unit(unit)) / full_scale <= 1.0, unit
+
+
+@pytest.mark.parametrize("name", ["smallest", "largest", "fastest"])
+def test_no_derived_default_is_beyond_the_range_of_its_parameter(name):
+    scaling = scaling_of_file(OTHERS / f"{name}.toml")
+    for row, raw in zip(read_table(), scaling.raw_parameters(), strict=True):
+        lsb = math.ldexp(1.0, -scaling.exponents.fraction_bits(row))
+        assert raw * lsb == pytest.approx(scaling.data.parameters[row.name], rel=1e-6, abs=lsb / 2), row.name
+
+
+@pytest.mark.parametrize(("old", "new", "text"), [
+    ("inertia_kg_m2 = 4.0", "inertia_kg_m2 = 200.0",
+     r"mechanics\.inertia_kg_m2: 200: must be a number from 0\.0064 to 121\.6, for a machine of 2e\+03 N m and "),
+    ("inertia_kg_m2 = 4.0", "inertia_kg_m2 = 0.001", r"mechanics\.inertia_kg_m2: 0\.001: must be a number from 0\.006"),
+    ("friction_Nm_s = 0.5", "friction_Nm_s = 200.0", r"mechanics\.friction_Nm_s: 200: must be a number from 0 to 121"),
+    ("torque_peak_Nm = 2000.0", "torque_peak_Nm = 2000.0\n[drive.parameters]\ntorque_max_Nm = 3000.0",
+     r"drive\.parameters\.torque_max_Nm: 3000: must be a number from 0 to 2560, "),
+])
+def test_machine_that_its_units_do_not_fit_is_refused_in_one_line(tmp_path, old, new, text):
+    file = tmp_path / "refused.toml"
+    file.write_text((OTHERS / "largest.toml").read_text().replace(old, new))
+    with pytest.raises(MachineError, match=f"^{re.escape(str(file))}: {text}[^\n]*$"):
+        scaling_of_file(file)
+
+
+# --- similar machines -----------------------------------------------------------------------------------------------
+
+_POWERS_OF_DRIVE = {"supply_min_V": "V", "supply_max_V": "V", "current_rated_A": "A", "current_peak_A": "A",
+                    "torque_rated_Nm": "N m", "torque_peak_Nm": "N m", "adc_current_A": "A", "adc_voltage_V": "V"}
+
+
+def similar(machine: Machine, a: int, v: int) -> Machine:
+    """The machine with 2^a times the current and 2^v times the voltage and flux linkage, and so 2^(a + v) times the
+    torque, at the same speeds."""
+    exponents = Exponents(a, v, a + v, 0)
+
+    def times(value: float, unit: str) -> float:
+        return math.ldexp(value, exponents.of_unit(unit))
+
+    assert isinstance(machine.magnetics, Formula)
+    powers = {"H": v - a, "Wb": v, "A": a, "deg": 0}
+    magnetics = {key: math.ldexp(value, powers[key.rpartition("_")[2]])
+                 for key, value in machine.magnetics.parameters.items()}
+    return replace(
+        machine,
+        resistance_ohm=times(machine.resistance_ohm, "ohm"),
+        inertia_kg_m2=times(machine.inertia_kg_m2, "kg m^2"),
+        friction_Nm_s=times(machine.friction_Nm_s, "N m s"),
+        supply_voltage_V=times(machine.supply_voltage_V, "V"),
+        magnetics=replace(machine.magnetics, parameters=magnetics),
+        drive={key: times(value, _POWERS_OF_DRIVE.get(key, "")) if isinstance(value, float) else value
+               for key, value in machine.drive.items()},
+    )
+
+
+def in_no_unit(machine: Machine, scaling: Scaling) -> str:
+    """The source of the firmware's tables but for what states the units."""
+    source = tables_source(machine, scaling, machine_phase_map("", machine, scaling.exponents))
+    return re.sub(r"\.(parameter_fraction_bits|dbc_hash) = [^.]*", "", source)
+
+
+@pytest.mark.parametrize("name", ["saturating", "linear_cosine", "linear_trapezoid"])
+def test_similar_machines_have_the_same_firmware_to_the_bit(name):
+    path = MACHINES / f"{name}.toml"
+    machine = load_machine(path)
+    expected = in_no_unit(machine, scaling_of(path, machine))
+    chance = random.Random(SEED)
+    for _ in range(4):
+        a, v = chance.randint(-5, 5), chance.randint(-5, 2)
+        a += (a + v) % 2  # the torque's exponent is even
+        other = similar(machine, a, v)
+        scaling = scaling_of(path, other)
+        assert scaling.exponents == Exponents(a, v, a + v, 0)
+        assert in_no_unit(other, scaling) == expected
+
+
+# --- CAN database ---------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("exponents", random_exponents(12), ids=str)
+def test_database_in_other_units_has_the_same_frames_and_exact_factors(exponents):
+    scaled, si = database_of(drive_dbc(exponents, 3_000_000)), drive_database()
+    assert [m.frame_id for m in scaled.messages] == [m.frame_id for m in si.messages]
+    changed = 0
+    for message, original in zip(scaled.messages, si.messages, strict=True):
+        for signal, before in zip(message.signals, original.signals, strict=True):
+            assert (signal.name, signal.start, signal.length, signal.unit) == (
+                before.name, before.start, before.length, before.unit)
+            exponent = exponents.of_unit(before.unit or "")
+            assert signal.scale == math.ldexp(before.scale, exponent), signal.name
+            if (message.name, signal.name) != ("DRIVE_COMMAND", "speed_reference_rpm"):
+                assert signal.maximum == math.ldexp(before.maximum, exponent), signal.name
+                assert signal.minimum == math.ldexp(before.minimum, exponent), signal.name
+            changed += exponent != 0
+    assert (database_hash(scaled) != database_hash(si)) == (changed > 0)
+
+
+@pytest.mark.parametrize("exponents", random_exponents(12), ids=str)
+def test_values_survive_the_round_trip_within_half_an_lsb(exponents):
+    database = database_of(drive_dbc(exponents, 3_000_000))
+    chance = random.Random(SEED)
+    for message in database.messages:
+        for _ in range(20):
+            values = {s.name: chance.uniform(float(s.minimum), float(s.maximum)) for s in message.signals}
+            values |= {s.name: round(values[s.name]) for s in message.signals if s.scale == 1}
+            decoded = message.decode(message.encode(values), decode_choices=False)
+            for signal in message.signals:
+                assert abs(decoded[signal.name] - values[signal.name]) <= 0.500001 * signal.scale, signal.name
+
+
+@pytest.mark.parametrize(("speed_exponent", "speed_max_rpm", "limit_rpm", "raw"), [
+    (0, 1200.0, 3000, 3_000_000), (0, 4000.5, 4000.5, 4_000_500), (3, 20_000.003, 20_000, 2_500_000),
+])
+def test_commands_reach_the_largest_speed_of_the_machine_and_3000_rpm_at_least(speed_exponent, speed_max_rpm, limit_rpm,
+                                                                              raw):
+    path = MACHINES / "saturating.toml"
+    data = replace(scaling_of_file(path).data, speed_max_rpm=speed_max_rpm)
+    scaling = Scaling(data, Exponents(speed=speed_exponent))
+    signal = database_of(scaling.dbc()).get_message_by_name("DRIVE_COMMAND").get_signal_by_name("speed_reference_rpm")
+    assert (signal.minimum, signal.maximum) == (-limit_rpm, limit_rpm)
+    assert scaling.speed_reference_max == raw

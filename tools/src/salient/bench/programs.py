@@ -1,0 +1,118 @@
+"""The programs that a drive and its test bench are: the host executable, or one that starts QEMU with an image for a
+board; and their command line.
+
+Few imports: `salient sim` starts as fast as these.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import shutil
+import sys
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+from salient.builder import run_commands
+from salient.config import TARGET_BUILDS, BenchConfig
+from salient.elf import ElfImage
+from salient.errors import UsageError
+from salient.machine.cache import content_key, machine_image
+from salient.machine.path import machine_path
+from salient.paths import BUILD, MACHINES, ROOT
+
+_BUILDERS = {"host": "any tools/salient command",
+             "debug": "cmake --preset debug && cmake --build --preset debug"}
+_TESTS = "tools/salient test"
+
+
+class EmulatorError(Exception):
+    """A program failed; the text includes its standard error."""
+
+
+def executable(build: str = "host") -> Path:
+    """The executable of a build (BenchConfig.build), for a target build the program that starts QEMU. UsageError: it is
+    not built."""
+    if build in TARGET_BUILDS:
+        return _built("host", "salient_target")
+    return _built(build, "salient_host")
+
+
+def image(machine: str, build: str) -> Path:
+    """The firmware for a machine as an image for the board of a target build; that for a user's machine file is built
+    first. UsageError: no such machine, a mistake in its file, or the image of a bundled machine is not built."""
+    machine_image(machine)  # checks the file
+    path = machine_path(machine)
+    if path.parent == MACHINES:
+        return _built(build, f"salient_{path.stem}.elf")
+    return _build_custom(path, content_key(path), build)
+
+
+def deferred_instructions(instructions: Path) -> Path:
+    """The file with the instruction counts of the deferred interrupts, from that of the control interrupts."""
+    return instructions.with_name(f"{instructions.name}.deferred")
+
+
+def command_line(config: BenchConfig) -> list[str]:
+    """The command line that starts a test bench. UsageError: as executable() and image(), and options that exclude each
+    other."""
+    arguments = replace(config, machine_image=config.machine_image or machine_image(config.machine)).arguments()
+    program = str(executable(config.build))
+    if config.build not in TARGET_BUILDS:
+        if config.instruction_ns is not None:
+            raise UsageError(f"--instruction-ns {config.instruction_ns}: only with --target cortex-m4")
+        return [program, *arguments]
+    elf = image(config.machine, config.build)
+    line = [program, str(elf)]
+    if config.instructions is not None:
+        line += ["--instructions", str(config.instructions),
+                 "--deferred-instructions", str(deferred_instructions(config.instructions))]
+    if config.execution is not None:
+        end, begin = ElfImage(elf).stack()
+        line += ["--execution", str(config.execution), f"{end:#x}-{begin:#x}"]
+    if config.instruction_ns is not None:
+        line += ["--instruction-ns", str(config.instruction_ns)]
+    return [*line, *arguments]
+
+
+def _built(build: str, name: str) -> Path:
+    program = BUILD / build / "bin" / name
+    if not program.exists():
+        raise UsageError(f"{program.relative_to(ROOT)} is not built; {_BUILDERS.get(build, _TESTS)} builds it")
+    return program
+
+
+@lru_cache
+def _build_custom(path: Path, key: str, build: str) -> Path:
+    """Builds the image for a user's machine file in a folder for its path and content, one process at a time."""
+    if shutil.which("cmake") is None:
+        raise UsageError("cmake is missing; a machine file of your own on a target requires a build")
+    _remove_orphans()
+    folder = BUILD / f"machine-{hashlib.sha256(f'{path} {key}'.encode()).hexdigest()[:12]}"
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        (folder / "machine_file").write_text(str(path), encoding="utf-8")
+        commands = []
+        if not (folder / build / "build.ninja").exists():
+            commands.append(["cmake", "--preset", build, "-B", str(folder / build), f"-DSALIENT_MACHINE_FILE={path}"])
+        commands.append(["cmake", "--build", str(folder / build), "--target", "custom_image"])
+        log = folder / "build.log"
+
+        def notice() -> None:
+            print(f"salient: building the firmware for {path}", file=sys.stderr, flush=True)
+
+        if not run_commands(commands, ROOT, log, notice):
+            raise EmulatorError(f"building the firmware for {path} failed: see {log.relative_to(ROOT)}")
+    return folder / build / "bin" / "salient_custom.elf"
+
+
+def _remove_orphans() -> None:
+    """Removes the builds of machine files that no longer exist."""
+    for note in BUILD.glob("machine-*/machine_file"):
+        try:
+            if not Path(note.read_text(encoding="utf-8")).exists():
+                shutil.rmtree(note.parent, ignore_errors=True)
+        except OSError:
+            continue  # another process removes it

@@ -1,0 +1,97 @@
+"""The comparison for one machine: the cases of the paper's machine in terms of another (experiments/scaled.py)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+from salient.bench.rig import bench_variables
+from salient.experiments.compare.cases import RIPPLE_RPM, STROKE_DEG, Case
+from salient.experiments.metrics import stroke_deg
+from salient.experiments.scaled import PAPER_WINDOW_S, Scale, scale_of
+from salient.experiments.scenario import LoadStep, Record, SpeedStep
+from salient.machine.definition import Machine
+from salient.machine.drive_data import derive
+from salient.machine.file import load_machine, machine_path
+from salient.machine.parameter_table import read_table
+
+PAPER = "saturating"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A machine and its factors of the paper's machine's values, by unit."""
+
+    path: str
+    machine: Machine
+    scale: Scale
+    factors: Mapping[str, float]
+
+    def text(self, text: str) -> str:
+        """A title or condition with the machine's speeds and torques."""
+        text = re.sub(r"\b(\d[\d.]*)( or (\d[\d.]*))?(?= r/min)", self._speeds, text)
+        text = re.sub(r"\b(\d[\d.]*)(?= N m)", lambda match: f"{self.scale.Nm(float(match[1])):g}", text)
+        return re.sub(rf"\b{PAPER}\b", self.machine.name, text)
+
+    def _speeds(self, match: re.Match[str]) -> str:
+        return " or ".join(f"{self.scale.rpm(float(number)):g}" for number in (match[1], match[3]) if number)
+
+
+def subject(name_or_path: str) -> Subject:
+    """The subject of a machine file; MachineError."""
+    path = machine_path(name_or_path)
+    machine, of_paper = load_machine(path), load_machine(machine_path(PAPER))
+    data, paper = derive(machine), derive(of_paper)
+    scale = scale_of(machine)
+    torque = scale.torque
+    return Subject(name_or_path, machine, scale, {
+        "N m": torque, "N m/s": torque, "1/(N m)": 1.0 / torque, "r/min": scale.speed,
+        "A": data.current_peak_A / paper.current_peak_A, "V": data.supply_max_V / paper.supply_max_V,
+    })
+
+
+def cases_of(cases: Iterable[Case], on: Subject) -> list[Case]:
+    """The cases of the paper's machine among `cases`, for another machine."""
+    return [_case(case, on) for case in cases if case.scenario.machine == PAPER]
+
+
+def _case(case: Case, on: Subject) -> Case:
+    scenario, scale = case.scenario, on.scale
+    speeds = tuple(SpeedStep(step.at_s, scale.rpm(step.value_rpm)) for step in scenario.speed)
+    fastest_rpm = max(abs(step.value_rpm) for step in speeds)
+    step_s = min((load.at_s for load in scenario.load), default=None)
+    event_s = step_s if step_s is not None else scenario.duration_s - PAPER_WINDOW_S
+    delay_s = scale.delay_s(fastest_rpm, event_s - speeds[0].at_s)
+    if case.strokes:
+        # The load step is at this part of a stroke, of the machine's instead of the paper's machine's.
+        paper_s = STROKE_DEG / (6.0 * RIPPLE_RPM)
+        delay_s += case.strokes * (stroke_deg(on.machine) / (6.0 * fastest_rpm) - paper_s)
+    longer_s = scale.window_s(fastest_rpm) - PAPER_WINDOW_S if "ripple" in case.extractor else 0.0
+    record = scenario.record
+    if record is not None and record.from_s > 0.0:
+        record = Record(record.step_us, round(record.from_s + delay_s, 6))
+    return replace(
+        case, condition=on.text(case.condition),
+        window_s=(round(case.window_s[0] + delay_s, 6), round(case.window_s[1] + delay_s + longer_s, 6)),
+        scenario=replace(
+            scenario, machine=on.path, speed=speeds, record=record,
+            load=tuple(LoadStep(round(load.at_s + delay_s, 9), scale.Nm(load.torque_Nm)) for load in scenario.load),
+            duration_s=round(scenario.duration_s + delay_s + longer_s, 6),
+            parameters=_scaled(scenario.parameters, _parameter_units(), on.factors),
+            bench=_scaled(scenario.bench, _bench_units(), on.factors)))
+
+
+def _scaled(values: Mapping[str, float], units: Mapping[str, str], factors: Mapping[str, float]) -> dict[str, float]:
+    return {name: value * factors.get(units[name], 1.0) for name, value in values.items()}
+
+
+@lru_cache
+def _parameter_units() -> dict[str, str]:
+    return {row.name: row.unit for row in read_table()}
+
+
+@lru_cache
+def _bench_units() -> dict[str, str]:
+    return {name: signal.unit or "" for name, signal in bench_variables().items()}

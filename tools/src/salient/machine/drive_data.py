@@ -1,0 +1,322 @@
+"""The drive's data of a machine: from the table [drive] of its file, and derived by one rule for all machines.
+
+`derive` fills in what the file leaves out. Every formula is written once, here, and displayed by `salient machine`.
+The reasons and the meaning of the keys are in tools/machines/README.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from salient.config import DEFAULTS
+from salient.machine.definition import Machine
+from salient.machine.parameter_table import SAME_UNITS, ParameterDefinition, read_table
+from salient.machine.torque_speed import (
+    current_of_torque_A,
+    knee_A,
+    mean_torque_Nm,
+    smooth_torque_Nm,
+    torque_per_flux_Nm_Wb,
+)
+from salient.toml_file import TextFileError
+
+FILE, DERIVED, OVERRIDDEN, DEFAULT = "file", "derived", "overridden", "default"
+"""Sources of a value: the table [drive] or another table of the machine file, a formula, [drive.parameters], the row of
+firmware/drive/parameters.def."""
+
+SAMPLES_PER_TURN_MIN = 25
+"""Control periods of an electrical revolution at speed_max_rpm."""
+
+PEAK_OF_KNEE = 3.0
+PEAK_OF_MAP = 0.65
+"""Part of a flux-linkage map's largest current: search and over-current need the rest."""
+KNEELESS_SPEED_RPM = 1500.0
+SMOOTH_SHARE = 0.8
+"""Part of the torque of the tables that is left when currents rise and fall with finite voltage."""
+PEAK_OF_RATED = 1.2
+_CURRENT_SEARCHED_A = 10_000.0
+_RPM = 30.0 / math.pi
+
+
+@dataclass(frozen=True)
+class Derivation:
+    """One value, for display."""
+
+    name: str
+    value: float
+    unit: str
+    formula: str
+    source: str
+    """FILE, DERIVED, OVERRIDDEN or DEFAULT."""
+
+
+@dataclass(frozen=True)
+class DriveData:
+    """SI units, r/min where the name has it."""
+
+    supply_min_V: float
+    supply_max_V: float
+    current_rated_A: float
+    current_peak_A: float
+    torque_rated_Nm: float
+    torque_peak_Nm: float
+    speed_base_rpm: float
+    speed_max_rpm: float
+    thermal_time_constant_s: float
+    control_rate_hz: int
+    encoder_bits: int
+    encoder_edges: bool
+    adc_bits: int
+    adc_current_A: float
+    """Full scale of the current sensors."""
+    adc_voltage_V: float
+    """Full scale of the DC link's divider."""
+    torque_step_Nm: float
+    """Torque of a phase that the highest voltage changes within a control period."""
+    parameters: dict[str, float]
+    """Default of every parameter of firmware/drive/parameters.def by name."""
+    derivations: tuple[Derivation, ...] = field(repr=False)
+
+    @property
+    def current_trip_A(self) -> float:
+        return self.parameters["current_trip_A"]
+
+    @property
+    def over_speed_rpm(self) -> float:
+        return self.parameters["over_speed_rpm"]
+
+    @property
+    def bus_over_voltage_V(self) -> float:
+        return self.parameters["bus_over_voltage_V"]
+
+    @property
+    def bus_under_voltage_V(self) -> float:
+        return self.parameters["bus_under_voltage_V"]
+
+
+def derive(machine: Machine) -> DriveData:
+    """The data of a machine."""
+    derived = _Values(machine.drive)
+    _derive_ratings(machine, derived)
+    parameters = _Values(machine.drive_parameters, OVERRIDDEN)
+    _derive_parameters(machine, derived.values, parameters)
+    return DriveData(**derived.values, parameters={row.name: parameters.values[row.name] for row in read_table()},
+                     derivations=(*derived.derivations, *parameters.derivations))
+
+
+class _Values:
+    """Values in order: those given, and what `add` derives otherwise."""
+
+    def __init__(self, given: dict[str, Any], kind: str = FILE) -> None:
+        self.given, self.kind = given, kind
+        self.values: dict[str, Any] = {}
+        self.derivations: list[Derivation] = []
+
+    def add(self, name: str, unit: str, value: Any, formula: str, source: str = DERIVED) -> Any:
+        if name in self.given:
+            value, source = self.given[name], self.kind
+        self.values[name] = value
+        self.derivations.append(Derivation(name, value, unit, formula, source))
+        return value
+
+
+def _derive_ratings(machine: Machine, data: _Values) -> None:
+    magnetics, phases, supply_V = machine.magnetics, machine.phases, machine.supply_voltage_V
+    minimum_V = data.add("supply_min_V", "V", min(supply_V, data.given.get("supply_max_V", supply_V)),
+                         "converter.supply_voltage_V")
+    maximum_V = data.add("supply_max_V", "V", max(supply_V, minimum_V), "converter.supply_voltage_V")
+    rate_hz = data.add("control_rate_hz", "Hz", DEFAULTS["control_rate_hz"], "that of the board", DEFAULT)
+    data.add("encoder_bits", "", DEFAULTS["encoder_bits"], "that of the board; 0 ideal", DEFAULT)
+    data.add("encoder_edges", "", DEFAULTS["encoder_edges"], "that of the board", DEFAULT)
+    data.add("adc_bits", "", DEFAULTS["adc_bits"], "that of the board", DEFAULT)
+
+    peak_A = data.add("current_peak_A", "A", *_peak_current(machine, data.given))
+    peak_Nm = data.add("torque_peak_Nm", "N m",
+                       max(SMOOTH_SHARE * smooth_torque_Nm(magnetics, phases, peak_A),
+                           data.given.get("torque_rated_Nm", 0.0)),
+                       f"{SMOOTH_SHARE:g} * least torque over a stroke of all phases at current_peak_A")
+    if "current_rated_A" in data.given:
+        rated_Nm = SMOOTH_SHARE * smooth_torque_Nm(magnetics, phases, data.given["current_rated_A"])
+        formula = "as torque_peak_Nm, at current_rated_A"
+    else:
+        rated_Nm, formula = peak_Nm / PEAK_OF_RATED, f"torque_peak_Nm / {PEAK_OF_RATED:g}"
+    rated_Nm = data.add("torque_rated_Nm", "N m", min(rated_Nm, peak_Nm), formula)
+    rated_A = data.add("current_rated_A", "A",
+                       current_of_torque_A(magnetics, phases, rated_Nm / SMOOTH_SHARE, peak_A),
+                       "current whose smooth torque, as for torque_peak_Nm, is torque_rated_Nm")
+
+    sampled_rpm = 60.0 * rate_hz / (SAMPLES_PER_TURN_MIN * machine.rotor_poles)
+    data.add("speed_base_rpm", "r/min",
+             min(_base_speed_rpm(machine, minimum_V, rated_A), sampled_rpm,
+                 data.given.get("speed_max_rpm", math.inf)),
+             "full voltage builds up the aligned flux linkage of current_rated_A within the overlap of two phases, "
+             "half a pole pitch less a stroke: (supply_min_V - R I) * angle / psi; at most speed_max_rpm")
+    data.add("speed_max_rpm", "r/min", min(2.0 * data.values["speed_base_rpm"], sampled_rpm),
+             f"2 * speed_base_rpm, with at least {SAMPLES_PER_TURN_MIN} control periods in an electrical revolution")
+    data.add("thermal_time_constant_s", "s", 60.0, "that of a winding without forced cooling", DEFAULT)
+
+    rise_A = maximum_V / magnetics.unaligned_inductance_H / rate_hz
+    data.add("adc_current_A", "A",
+             max(1.5 * peak_A, 1.1 * peak_A + 2.2 * rise_A) / 0.9375,
+             "16/15 max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu)")
+    over_V, _ = _over_voltage(machine, maximum_V)
+    data.add("adc_voltage_V", "V", 1.25 * over_V, "1.25 bus_over_voltage_V")
+    data.add("torque_step_Nm", "N m",
+             maximum_V / rate_hz * torque_per_flux_Nm_Wb(magnetics, 0.5 * peak_A),
+             "supply_max_V Ts dT/dpsi at half of current_peak_A")
+
+
+def _peak_current(machine: Machine, given: dict[str, Any]) -> tuple[float, str]:
+    """current_peak_A and its formula."""
+    magnetics, phases = machine.magnetics, machine.phases
+    if "torque_peak_Nm" in given or "torque_rated_Nm" in given:
+        peak_Nm = given.get("torque_peak_Nm", PEAK_OF_RATED * given.get("torque_rated_Nm", 0.0))
+        current_A = current_of_torque_A(magnetics, phases, peak_Nm / SMOOTH_SHARE, _CURRENT_SEARCHED_A)
+        return current_A, "current whose smooth torque is torque_peak_Nm"
+    if "current_rated_A" in given:
+        return PEAK_OF_RATED * given["current_rated_A"], f"{PEAK_OF_RATED:g} current_rated_A"
+    if math.isfinite(magnetics.current_max_A):
+        knee = knee_A(magnetics, magnetics.current_max_A)
+        return (min(PEAK_OF_KNEE * knee, PEAK_OF_MAP * magnetics.current_max_A),
+                f"{PEAK_OF_KNEE:g} * knee of the aligned flux linkage, {PEAK_OF_MAP:g} * largest current of the map")
+    knee = knee_A(magnetics, _CURRENT_SEARCHED_A)
+    if knee < _CURRENT_SEARCHED_A:
+        return PEAK_OF_KNEE * knee, f"{PEAK_OF_KNEE:g} * knee of the aligned flux linkage"
+    aligned_H = float(magnetics.flux_linkage_Wb(0.0, 1.0))
+    flux_Wb = machine.supply_voltage_V * 60.0 / (2.0 * machine.rotor_poles * KNEELESS_SPEED_RPM)
+    return flux_Wb / aligned_H, ("without saturation: the supply builds up the aligned flux linkage in half an "
+                                 f"electrical revolution at {KNEELESS_SPEED_RPM:g} r/min")
+
+
+def _base_speed_rpm(machine: Machine, voltage_V: float, current_A: float) -> float:
+    overlap_rad = machine.pitch_rad * (0.5 - 1.0 / machine.phases)
+    # A winding that takes nearly the whole voltage leaves a tenth of it.
+    left_V = max(voltage_V - machine.resistance_ohm * current_A, 0.1 * voltage_V)
+    flux_Wb = float(machine.magnetics.flux_linkage_Wb(0.0, current_A))
+    return left_V * overlap_rad / flux_Wb * _RPM
+
+
+def _over_voltage(machine: Machine, supply_max_V: float) -> tuple[float, str]:
+    chopper_on_V = (machine.dc_link or {}).get("chopper_on_V", 0.0)
+    return max(1.25 * supply_max_V, 1.03 * chopper_on_V), "1.25 supply_max_V, at least 1.03 dc_link.chopper_on_V"
+
+
+# --- parameters -----------------------------------------------------------------------------------------------------
+
+def _derive_parameters(machine: Machine, data: dict[str, Any], parameters: _Values) -> None:
+    """Every parameter of the drive, those without a formula with the default of their row."""
+    formulae = _parameter_formulae(machine, data)
+    for row in read_table():
+        default = row.default / (1 << row.fraction_bits)
+        value, formula = formulae.get(row.name, (None, ""))
+        if value is None:
+            parameters.add(row.name, row.unit, default, "the same for every machine", DEFAULT)
+        else:
+            source = FILE if row.name in ("inertia_kg_m2", "friction_Nm_s", "resistance_ohm") else DERIVED
+            parameters.add(row.name, row.unit, _within(row, value), formula, source)
+
+
+def _within(row: ParameterDefinition, value: float) -> float:
+    """A derived value within the range of its parameter, if that is the same for every machine."""
+    low, high = row.limits
+    return min(max(value, low), high) if row.unit in SAME_UNITS else value
+
+
+def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tuple[float, str]]:
+    peak_A, peak_Nm, rated_Nm = data["current_peak_A"], data["torque_peak_Nm"], data["torque_rated_Nm"]
+    period_s, inertia = 1.0 / data["control_rate_hz"], machine.inertia_kg_m2
+    rise_A = data["supply_max_V"] / machine.magnetics.unaligned_inductance_H * period_s
+    step_Nm = data["torque_step_Nm"]
+    # The gains of the BP-PID are those at 40 kHz.
+    step_40_kHz_Nm = step_Nm / period_s / 40_000.0
+    base_rad_s = data["speed_base_rpm"] / _RPM
+    over_V, over_V_formula = _over_voltage(machine, data["supply_max_V"])
+    kp = min(1000.0 * inertia, peak_Nm / (0.015 * base_rad_s))
+    gain = min(8.0 / rated_Nm, 0.6 / step_40_kHz_Nm)
+    gain_text = "min(8 / torque_rated_Nm, 0.6 / torque_step_Nm at 40 kHz)"
+    return {
+        "torque_max_Nm": (peak_Nm, "torque_peak_Nm"),
+        "current_limit_A": (peak_A, "current_peak_A"),
+        "current_trip_A": (min(0.9375 * data["adc_current_A"], max(1.5 * peak_A, 1.1 * peak_A + 2.2 * rise_A)),
+                           "max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), at most 15/16 of "
+                           "adc_current_A"),
+        "bus_over_voltage_V": (over_V, over_V_formula),
+        "bus_under_voltage_V": (0.625 * data["supply_min_V"], "0.625 supply_min_V"),
+        "over_speed_rpm": (1.2 * data["speed_max_rpm"], "1.2 speed_max_rpm"),
+        "torque_band_inner_Nm": (max(rated_Nm / 160.0, step_Nm / 40.0),
+                                 "max(torque_rated_Nm / 160, torque_step_Nm / 40)"),
+        "torque_band_outer_Nm": (max(rated_Nm / 16.0, step_Nm / 4.0),
+                                 "max(torque_rated_Nm / 16, torque_step_Nm / 4)"),
+        "speed_kp": (kp, "min(1000/s * inertia, torque_peak_Nm / 1.5 % of speed_base_rpm)"),
+        "speed_ki": (50.0 * kp, "50/s * speed_kp"),
+        "smc_k": (min(max(0.0275 / period_s, 36.0 * peak_Nm / (inertia * base_rad_s)), 0.1 / period_s),
+                  "max(0.0275 / Ts, 36 torque_peak_Nm / (inertia * speed_base_rpm)), at most 0.1 / Ts"),
+        "observer_bandwidth_rad_s": (min(0.025 / period_s, 8000.0), "0.025 / Ts"),
+        "observer_wake_rad_s": (min(0.225 / period_s, 10_000.0), "0.225 / Ts, at most 10000"),
+        "observer_moving_rad_s": (min(0.045 / period_s, 10_000.0), "0.045 / Ts, at most 10000"),
+        "bp_error_scale_Nm": (rated_Nm / 8.0, "torque_rated_Nm / 8"),
+        "bp_assist_band_Nm": (rated_Nm / 8.0, "torque_rated_Nm / 8"),
+        "bp_kp_max": (gain, gain_text),
+        "bp_ki_max": (0.24 * gain, "0.24 bp_kp_max"),
+        "bp_kd_max": (0.4 * gain, "0.4 bp_kp_max"),
+        "bp_trim_limit_Nm": (3.0 / 16.0 * rated_Nm, "3/16 torque_rated_Nm"),
+        "inertia_kg_m2": (inertia, "mechanics.inertia_kg_m2"),
+        "friction_Nm_s": (machine.friction_Nm_s, "mechanics.friction_Nm_s"),
+        "resistance_ohm": (machine.resistance_ohm, "winding.resistance_ohm"),
+    }
+
+
+# --- contradictions -------------------------------------------------------------------------------------------------
+
+def check(machine: Machine) -> None:
+    """TextFileError: what the table [drive] states contradicts itself, another table or what follows from both; the
+    text names the two. A file without the table is never refused."""
+    if not machine.drive and not machine.drive_parameters:
+        return
+    data = derive(machine)
+    values = {each.name: each.value for each in data.derivations}
+    values["converter.supply_voltage_V"] = machine.supply_voltage_V
+    values["dc_link.chopper_on_V"] = (machine.dc_link or {}).get("chopper_on_V", 0.0)
+    places = {each.name: _place(each, machine) for each in data.derivations}
+
+    def in_order(low: str, high: str, factor: float = 1.0) -> None:
+        if values[low] > factor * values[high]:
+            most = "" if factor == 1.0 else f"{factor:g} of "
+            raise TextFileError(f"{places.get(low, low)}: {values[low]:g}: must not be above {most}"
+                                f"{places.get(high, high)}, {values[high]:g}")
+
+    in_order("supply_min_V", "converter.supply_voltage_V")
+    in_order("converter.supply_voltage_V", "supply_max_V")
+    in_order("current_rated_A", "current_peak_A")
+    in_order("torque_rated_Nm", "torque_peak_Nm")
+    in_order("speed_base_rpm", "speed_max_rpm")
+    in_order("current_peak_A", "adc_current_A", 0.9)
+    in_order("current_limit_A", "current_trip_A", 0.98)
+    in_order("current_trip_A", "adc_current_A", 0.9875)
+    in_order("bus_under_voltage_V", "supply_min_V", 0.98)
+    in_order("supply_max_V", "bus_over_voltage_V", 0.98)
+    in_order("dc_link.chopper_on_V", "bus_over_voltage_V")
+    in_order("bus_over_voltage_V", "adc_voltage_V", 0.995)
+    in_order("speed_max_rpm", "over_speed_rpm")
+    in_order("torque_band_inner_Nm", "torque_band_outer_Nm")
+    most_Nm = mean_torque_Nm(machine.magnetics, machine.phases, data.current_peak_A)
+    for name in ("torque_peak_Nm", "torque_rated_Nm"):
+        if values[name] > most_Nm:
+            raise TextFileError(f"{places[name]}: {values[name]:g}: must not be above {most_Nm:.3g}, the mean torque "
+                                f"at {places['current_peak_A']}, {data.current_peak_A:g}")
+    samples = 60.0 * data.control_rate_hz / (data.speed_max_rpm * machine.rotor_poles)
+    if samples < SAMPLES_PER_TURN_MIN * (1.0 - 1e-9):
+        raise TextFileError(f"{places['speed_max_rpm']}: {data.speed_max_rpm:g}: {samples:.3g} control periods in an "
+                            f"electrical revolution at {places['control_rate_hz']}, {data.control_rate_hz}; must be at "
+                            f"least {SAMPLES_PER_TURN_MIN}")
+
+
+def _place(derivation: Derivation, machine: Machine) -> str:
+    """Key of a value in a message."""
+    if derivation.name in machine.drive:
+        return f"drive.{derivation.name}"
+    if derivation.name in machine.drive_parameters:
+        return f"drive.parameters.{derivation.name}"
+    return f"{derivation.name} ({derivation.source})"

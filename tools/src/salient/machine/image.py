@@ -1,0 +1,235 @@
+"""What a drive is made of, member by member: the C structures that a machine file fills, and the machine image, the
+file from which the emulator reads them when it starts (emulator/host/machine_image.h has its layout).
+
+Each member is one line here. From it follow the C sources of programs that have a machine compiled in
+(salient.generate.machine), the image, and the table by which the emulator reads an image
+(salient.generate.machine_layout), which also checks name, type and size against the C structure.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from salient.dbc import database_hash
+from salient.machine.file import FORMS, Converter, DcLink, Machine, Sensors, load_machine
+from salient.machine.firmware_tables import (
+    ANGLE_BINS,
+    CURRENT_A,
+    NODE_OFFSET,
+    ROWS,
+    PhaseMap,
+    Surface,
+    machine_phase_map,
+)
+from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS, FluxMap
+from salient.machine.magnetics import FORMULA_KEYS
+from salient.machine.scaling import Scaling, database_of, scaling_of
+
+MAGIC = b"SALIENTM"
+HEADER = struct.Struct("<8sII4I")
+"""Magic, LAYOUT, CRC-32 of everything after it, bytes of each part."""
+_CHECKED_FROM = 16
+
+_TYPES: dict[str, Any] = {
+    "uint8_t": "<u1", "int8_t": "<i1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
+    "unsigned": "<u4", "double": "<f8", "magnetics_form_t": "<u4",
+    "machine_row_t": [("start", "<u4"), ("reciprocal", "<i4")],
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Member:
+    """A member of a C structure.
+
+    name: as in C, with the structure that it is nested in. type: of an element, a key of _TYPES. value: number or array
+    from what the structure is made of. shape: of an array.
+    """
+
+    name: str
+    type: str
+    value: Callable[..., Any]
+    shape: tuple[int, ...] = ()
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Layout of an element in the image."""
+        dtype: np.dtype[Any] = np.dtype(_TYPES[self.type])
+        return dtype
+
+    @property
+    def size(self) -> int:
+        """Bytes in the image."""
+        return self.dtype.itemsize * math.prod(self.shape)
+
+    def array(self, *source: Any) -> np.ndarray:
+        """The value as it is in the image; OverflowError when the type cannot hold it."""
+        value = self.value(*source)
+        array = np.array(value, dtype=self.dtype)
+        if array.shape != self.shape:
+            raise ValueError(f"{self.name}: shape {array.shape}, must be {self.shape}")
+        if array.dtype.kind in "iu" and not np.array_equal(array, value):
+            raise OverflowError(f"{self.name}: does not fit into {self.type}")
+        return array
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A C structure and its members, in the sequence of the image."""
+
+    type: str
+    members: tuple[Member, ...]
+
+    @property
+    def size(self) -> int:
+        """Bytes in the image."""
+        return sum(member.size for member in self.members)
+
+    def packed(self, *source: Any) -> bytes:
+        """The part of the image."""
+        return b"".join(member.array(*source).tobytes() for member in self.members)
+
+
+def quantise(value: float, fraction_bits: int, bits: int) -> int:
+    """Nearest integer of `value` in a signed format, saturated to `bits`."""
+    limit = 1 << (bits - 1)
+    return max(-limit, min(limit - 1, math.floor(math.ldexp(value, fraction_bits) + 0.5)))
+
+
+# --- the firmware's tables ------------------------------------------------------------------------------------------
+
+def _columns(torque: np.ndarray, flux: np.ndarray) -> np.ndarray:
+    """Arrays by row and column in the layout of firmware/control/machine_tables.h; without a last row: 0 there."""
+    columns = [np.pad(of, ((0, ROWS - len(of)), (0, 0))).T for of in (torque, flux)]
+    return np.stack(columns, axis=1).reshape(-1)
+
+
+def _format(name: str, surface: Callable[[PhaseMap], Surface]) -> tuple[Member, ...]:
+    return (
+        Member(f"{name}.curvature_shift", "uint8_t", lambda machine, scaling, tables: surface(tables).curvature_shift),
+        Member(f"{name}.result_shift", "uint8_t", lambda machine, scaling, tables: surface(tables).result_shift),
+    )
+
+
+def _padded(values: list[int]) -> list[int]:
+    """Of every parameter, with zeros up to the size of the array."""
+    return values + [0] * (_PARAMETERS_MAX - len(values))
+
+
+_PARAMETERS_MAX = 64
+_CELLS = (2 * ROWS * len(CURRENT_A),)
+
+TABLES = Structure("machine_tables_t", (
+    Member("phases", "uint8_t", lambda machine, scaling, tables: machine.phases),
+    Member("rotor_poles", "uint8_t", lambda machine, scaling, tables: machine.rotor_poles),
+    Member("speed_exponent", "uint8_t", lambda machine, scaling, tables: scaling.exponents.speed),
+    Member("current_range_q9", "uint16_t", lambda machine, scaling, tables: quantise(
+        scaling.data.adc_current_A, 9 - scaling.exponents.current, 17)),
+    Member("voltage_range_q6", "uint16_t", lambda machine, scaling, tables: quantise(
+        scaling.data.adc_voltage_V, 6 - scaling.exponents.voltage, 17)),
+    Member("current_slew_rate_A_s", "int32_t", lambda machine, scaling, tables: quantise(
+        machine.current_rise_A_s, -scaling.exponents.current, 32)),
+    Member("row", "machine_row_t", lambda machine, scaling, tables: tables.rows(), (ROWS,)),
+    Member("angle_bin_row", "uint8_t", lambda machine, scaling, tables: tables.angle_bin_row(), (ANGLE_BINS,)),
+    *_format("torque_format", lambda tables: tables.torque_per_ampere),
+    *_format("flux_format", lambda tables: tables.flux_per_ampere),
+    Member("curvature", "int8_t", lambda machine, scaling, tables: _columns(
+        tables.torque_per_ampere.curvature, tables.flux_per_ampere.curvature), _CELLS),
+    Member("node", "int16_t", lambda machine, scaling, tables: _columns(
+        tables.torque_per_ampere.node - NODE_OFFSET, tables.flux_per_ampere.node - NODE_OFFSET), _CELLS),
+    Member("parameter_default", "int32_t", lambda machine, scaling, tables: _padded(scaling.raw_parameters()),
+           (_PARAMETERS_MAX,)),
+    Member("parameter_fraction_bits", "int8_t", lambda machine, scaling, tables: _padded(scaling.fraction_bits()),
+           (_PARAMETERS_MAX,)),
+    Member("speed_reference_max", "int32_t", lambda machine, scaling, tables: scaling.speed_reference_max),
+    Member("dbc_hash", "uint32_t", lambda machine, scaling, tables: database_hash(database_of(scaling.dbc()))),
+))  # fmt: skip
+"""Of a Machine, its Scaling and its PhaseMap: firmware/control/machine_tables.h."""
+
+
+# --- the emulator's machine -----------------------------------------------------------------------------------------
+
+def _magnetics(machine: Machine, scaling: Scaling) -> Mapping[str, float]:
+    if isinstance(machine.magnetics, FluxMap):
+        return {"unaligned_inductance_H": machine.magnetics.unaligned_inductance_H}
+    return machine.magnetics.parameters
+
+
+def _doubles(part: str, keys: Any, values: Callable[[Machine, Scaling], Mapping[str, float] | None]
+             ) -> tuple[Member, ...]:
+    """The members of a nested structure; those that a machine does not have are 0."""
+    return tuple(Member(f"{part}.{key}", "double", lambda machine, scaling, key=key: (
+        values(machine, scaling) or {}).get(key, 0.0))
+                 for key in keys)
+
+
+_MAGNETICS_KEYS = dict.fromkeys(key for keys in FORMULA_KEYS.values() for key in keys)
+
+PLANT = Structure("machine_t", (
+    Member("stator_poles", "unsigned", lambda machine, scaling: machine.stator_poles),
+    Member("rotor_poles", "unsigned", lambda machine, scaling: machine.rotor_poles),
+    Member("phases", "unsigned", lambda machine, scaling: machine.phases),
+    Member("resistance_ohm", "double", lambda machine, scaling: machine.resistance_ohm),
+    Member("inertia_kg_m2", "double", lambda machine, scaling: machine.inertia_kg_m2),
+    Member("friction_Nm_s", "double", lambda machine, scaling: machine.friction_Nm_s),
+    Member("supply_voltage_V", "double", lambda machine, scaling: machine.supply_voltage_V),
+    Member("magnetics.form", "magnetics_form_t", lambda machine, scaling: FORMS.index(machine.magnetics.form)),
+    *_doubles("magnetics", _MAGNETICS_KEYS, _magnetics),
+    *_doubles("converter", [key for key in Converter.model_fields if key != "supply_voltage_V"],
+              lambda machine, scaling: machine.converter),
+    *_doubles("dc_link", DcLink.model_fields, lambda machine, scaling: machine.dc_link),
+    *_doubles("sensors", Sensors.model_fields, lambda machine, scaling: machine.sensors),
+    *_doubles("ranges", ("current_A", "dc_link_V", "load_torque_Nm"),
+              lambda machine, scaling: scaling.sensor_ranges()),
+))  # fmt: skip
+"""Of a Machine and its Scaling: emulator/plant/machine.h, without the name and the flux map, parts of their own."""
+
+@lru_cache(maxsize=1)
+def _extremes(flux_map: FluxMap) -> tuple[float, float, float, float]:
+    return flux_map.inductance_extremes()
+
+
+FLUX_MAP = Structure("flux_map_t", (
+    Member("current_max_A", "double", lambda flux_map: flux_map.current_max_A),
+    Member("inductance_min_H", "double", lambda flux_map: _extremes(flux_map)[0]),
+    Member("current_scale_A", "double", lambda flux_map: _extremes(flux_map)[3]),
+    Member("coenergy_J", "double", lambda flux_map: flux_map.coefficients_J,
+           (CURRENT_INTERVALS + 4, ANGLE_INTERVALS + 3)),
+))  # fmt: skip
+"""Of a FluxMap: emulator/plant/flux_map.h."""
+
+
+# --- the image ------------------------------------------------------------------------------------------------------
+
+STRUCTURES = (TABLES, PLANT, FLUX_MAP)
+
+LAYOUT = zlib.crc32("\n".join(f"{structure.type} {member.name} {member.type} {member.shape}"
+                              for structure in STRUCTURES for member in structure.members).encode())
+"""Version of the image: changes with every change of a structure."""
+
+
+def image(machine: Machine, scaling: Scaling, tables: PhaseMap) -> bytes:
+    """The machine image."""
+    parts = [
+        TABLES.packed(machine, scaling, tables),
+        PLANT.packed(machine, scaling),
+        FLUX_MAP.packed(machine.magnetics) if isinstance(machine.magnetics, FluxMap) else b"",
+        machine.name.encode("ascii") + b"\0",
+    ]
+    checked = HEADER.pack(b"", 0, 0, *map(len, parts))[_CHECKED_FROM:] + b"".join(parts)
+    return MAGIC + struct.pack("<II", LAYOUT, zlib.crc32(checked)) + checked
+
+
+def image_of(path: Path) -> bytes:
+    """The machine image of a machine file; MachineError."""
+    machine = load_machine(path)
+    scaling = scaling_of(path, machine)
+    return image(machine, scaling, machine_phase_map(path, machine, scaling.exponents))
