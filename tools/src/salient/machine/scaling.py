@@ -29,7 +29,7 @@ from functools import lru_cache
 import cantools
 from cantools.database.can import Database
 
-from salient.machine.drive_data import DriveData, derive
+from salient.machine.drive_data import SAMPLES_PER_TURN_MIN, DriveData, derive
 from salient.machine.file import Machine, MachineError
 from salient.machine.parameter_table import ParameterDefinition, read_table
 from salient.paths import DRIVE_DBC
@@ -104,6 +104,12 @@ class Scaling:
         """Full scales: the emulator's sensor_ranges_t."""
         return {"current_A": self.data.adc_current_A, "dc_link_V": self.data.adc_voltage_V,
                 "load_torque_Nm": math.ldexp(LOAD_TORQUE_RANGE_NM, self.exponents.torque)}
+
+    def control_rate_min_hz(self, machine: Machine) -> int:
+        """Control rate that the highest speed of the file requires; 0 when the file states none: it is then derived
+        from the control rate of the file, and lower at a lower one."""
+        turns_1_s = self.data.speed_max_rpm / 60.0 * machine.rotor_poles
+        return math.ceil(SAMPLES_PER_TURN_MIN * turns_1_s * (1.0 - 1e-9)) if "speed_max_rpm" in machine.drive else 0
 
     @property
     def speed_reference_max(self) -> int:
