@@ -93,6 +93,14 @@ def test_usage_error_is_one_line_and_exit_code_2(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_missing_machine_image_is_named(tmp_path: Path) -> None:
+    result = subprocess.run([executable(), "--can", f"unix:{tmp_path}/bus"], check=False, capture_output=True,
+                            text=True, timeout=TIMEOUT_S)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr == "salient: --machine-image: missing; must be the name of a file\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_usage_text_has_every_option_and_controller(program: list[str]) -> None:
     result = subprocess.run([*program, "--help"], check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert (result.returncode, result.stderr) == (0, "")
