@@ -40,13 +40,29 @@ static double sine_Nm(const rig_t *rig) {
     return rig->load.sine_amplitude_Nm * sine;
 }
 
+/* Of the middle of the coming step, so that the staircase is not late on average. */
+static double profile_Nm(const rig_t *rig) {
+    const load_t *load = &rig->load;
+    if (load->profile_Nm == 0.0 || load->profile_values == 0) {
+        return 0.0;
+    }
+    const double angle_rad =
+        rig->plant.rotor_angle_rad + rig->plant.speed_rad_s * (0.5 * (double)LOAD_STEP_NS * S_PER_NS);
+    const double turns = angle_rad / TWO_PI;
+    const double position = (turns - floor(turns)) * load->profile_values;
+    const double before = floor(position);
+    const unsigned index = (unsigned)before % load->profile_values; /* rounding may give a whole turn */
+    const double from = load->profile[index], to = load->profile[(index + 1) % load->profile_values];
+    return load->profile_Nm * (from + (position - before) * (to - from));
+}
+
 /* Applies the load of the present time and schedules the next step while it moves. */
 static void apply(rig_t *rig) {
     const uint64_t now_ns = rig->board.time_ns;
     const double base = base_Nm(rig);
     plant_advance(&rig->plant, now_ns);
-    rig->plant.load_torque_Nm = base + sine_Nm(rig);
-    const bool moves = base != rig->load.torque_Nm || rig->load.sine_amplitude_Nm != 0.0;
+    rig->plant.load_torque_Nm = base + sine_Nm(rig) + profile_Nm(rig);
+    const bool moves = base != rig->load.torque_Nm || rig->load.sine_amplitude_Nm != 0.0 || rig->load.profile_Nm != 0.0;
     rig->scheduler.due_ns[EVENT_LOAD] = moves ? now_ns + LOAD_STEP_NS : SCHEDULER_NEVER;
 }
 
@@ -86,6 +102,19 @@ void load_set_sine_frequency(rig_t *rig, double frequency_Hz) {
     rig->load.sine_start_ns = rig->board.time_ns;
     rig->load.sine_frequency_Hz = frequency_Hz;
     apply(rig);
+}
+
+void load_set_profile(rig_t *rig, double torque_Nm) {
+    rig->load.profile_Nm = torque_Nm;
+    apply(rig);
+}
+
+void load_set_profile_value(rig_t *rig, unsigned values, unsigned index, double value) {
+    if (values < 1 || values > RIG_LOAD_PROFILE_MAX || index >= values) {
+        return;
+    }
+    rig->load.profile_values = values;
+    rig->load.profile[index] = value;
 }
 
 void load_event(void *context, uint64_t now_ns) {

@@ -30,6 +30,7 @@
 #define RIG_READ_STEP_NS UINT64_C(1000000)
 #define RIG_STOP_STEP_NS UINT64_C(10000000) /* virtual time between two checks for a stop request */
 #define RIG_NEVER SCHEDULER_NEVER
+#define RIG_LOAD_PROFILE_MAX 256  /* values */
 #define RIG_RUNS_MAX 64           /* RIG_RUN_UNTILs that wait for their time */
 #define RIG_MOVING_BACKLOG_MAX 64 /* all paces but lock-step: clients wait while this many frames are queued */
 
@@ -84,6 +85,9 @@ typedef struct {
     double sine_frequency_Hz;
     double sine_start_periods; /* phase at sine_start_ns */
     uint64_t sine_start_ns;
+    double profile_Nm; /* of the value 1 */
+    unsigned profile_values;
+    double profile[RIG_LOAD_PROFILE_MAX]; /* over one turn */
 } load_t;
 
 /* Large (several MB): static or on the heap. */

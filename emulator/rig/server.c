@@ -4,8 +4,11 @@
 #include <string.h>
 
 #include "rig/bus_events.h"
+#include "rig/load.h"
 #include "rig/stimulus.h"
 #include "rig_codec.h"
+
+#define LOAD_PROFILE_LSB 1e-6 /* of value in RIG_LOAD_PROFILE */
 
 static uint64_t earlier(uint64_t a, uint64_t b) {
     return a < b ? a : b;
@@ -80,6 +83,12 @@ static void take_set(rig_t *rig, const uint8_t *data) {
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_EMULATOR, &frame);
 }
 
+static void take_load_profile(rig_t *rig, const uint8_t *data) {
+    struct rig_load_profile_t message;
+    rig_load_profile_unpack(&message, data, RIG_LOAD_PROFILE_LENGTH);
+    load_set_profile_value(rig, message.values, message.index, (double)message.value * LOAD_PROFILE_LSB);
+}
+
 static bool may_read(void *context, uint32_t client) {
     const rig_t *rig = context;
     if (rig->config.pacing.kind != PACING_LOCKSTEP) {
@@ -114,6 +123,8 @@ static bool take(void *context, uint32_t client, const transport_frame_t *frame)
             take_run_until(rig, client, frame->classic.data);
         } else if (identifier == RIG_SET_FRAME_ID && frame->classic.len == RIG_SET_LENGTH) {
             take_set(rig, frame->classic.data);
+        } else if (identifier == RIG_LOAD_PROFILE_FRAME_ID && frame->classic.len == RIG_LOAD_PROFILE_LENGTH) {
+            take_load_profile(rig, frame->classic.data);
         }
     }
     return true;

@@ -61,7 +61,7 @@ static uint32_t hold_ticks(const moving_load_parameters_t *parameters, const mov
 }
 
 uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
-                          uint32_t angle_step, bool from_edge) {
+                          uint32_t angle_step, bool from_edge, bool hold) {
     const int32_t trend_q4 = (int32_t)(moving->trend_q36 >> 32);
     moving->trend_q36 =
         fixed_accumulate(moving->trend_q36, fixed_subtract(innovation * 16, trend_q4), parameters->gain_q32);
@@ -80,7 +80,7 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
         moving->withheld = parameters->stages;
         moving->ticks = moving->hold_ticks;
     } else if (moving->ticks > 0) {
-        moving->ticks--;
+        moving->ticks -= !hold;
     } else if (moving->withheld > 0) {
         moving->withheld--;
         moving->ticks = moving->withheld > 0 ? parameters->release_ticks : moving->hold_ticks;

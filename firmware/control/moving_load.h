@@ -59,9 +59,9 @@ typedef struct {
 moving_load_parameters_t moving_load_configure(const moving_load_settings_t *settings);
 
 /* One sample: returns the number of stages to withhold. innovation: 2^-32 rev, -2^27..2^27 - 1; angle_step: rotation
- * per period, magnitude, 2^-32 rev; from_edge: the angle was measured from the time of an edge. 64-bit product, rounded
- * down. */
+ * per period, magnitude, 2^-32 rev; from_edge: the angle was measured from the time of an edge; hold: what is withheld
+ * stays withheld. 64-bit product, rounded down. */
 uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
-                          uint32_t angle_step, bool from_edge);
+                          uint32_t angle_step, bool from_edge, bool hold);
 
 #endif

@@ -307,6 +307,12 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .inertia_q30 = inertia_q30,
         .torque_max_q24 = torque_max_q24,
     });
+    /* With a transducer the whole load is fed forward already. */
+    const bool learns_load =
+        values[PARAMETER_PERIODIC_LOAD] != 0 && !control.load_from_transducer && control.moving_load.stages > 0;
+    control.periodic_load = periodic_load_configure(
+        control_rate_hz, learns_load ? control.bandwidth.bandwidth_rad_s[control.bandwidth.moving_stage] : 0,
+        torque_max_q24);
     control.torque_offset = torque_offset_configure(control_rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
     return control;

@@ -46,7 +46,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     if (!state->started) {
         start(state, measured);
     }
-    observe(parameters, state, &deferred->bandwidth, measured);
+    observe(parameters, state, deferred, measured);
     const uint64_t fault_mask = protect(parameters, state, sample, measured) | deferred->fault_mask;
     *compare = (hal_pwm_compare_t){{0}, {0}};
     const bool was_running = state->state_machine.state == DRIVE_STATE_RUN;

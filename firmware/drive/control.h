@@ -23,6 +23,7 @@
 #include "control/misalignment.h"
 #include "control/moving_load.h"
 #include "control/observer_bandwidth.h"
+#include "control/periodic_load.h"
 #include "control/predictive_torque.h"
 #include "control/pwm_ditc.h"
 #include "control/speed_pi.h"
@@ -79,6 +80,7 @@ typedef struct {
     moving_load_parameters_t moving_load;
     stroke_mean_parameters_t stroke_mean;
     torque_offset_parameters_t torque_offset;
+    periodic_load_parameters_t periodic_load;
 } control_parameters_t;
 
 /* Inputs of one control period as the HAL delivers them. */
@@ -114,6 +116,7 @@ typedef struct {
     observer_bandwidth_statistics_t bandwidth;
     moving_load_t moving_load;
     torque_offset_t torque_offset;
+    periodic_load_t periodic_load;
     bool run;                    /* in the last input */
     int32_t speed_reference_q22; /* after the ramp, rad/s, Q9.22 */
     speed_pi_t speed_pi;

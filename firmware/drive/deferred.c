@@ -19,6 +19,7 @@ void deferred_reset_run(const control_parameters_t *parameters, control_state_t 
     change_generation(state, (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK));
     state->deferred_request.initial.window = parameters->predictive.base_window;
     state->deferred_request.initial.speed_law_torque_q24 = 0;
+    state->deferred_request.initial.periodic_load_q24 = 0;
     state->deferred_request.initial.speed_reference_q22 = 0;
 }
 
@@ -81,6 +82,7 @@ static void follow_resets(const control_parameters_t *parameters, deferred_t *de
         deferred->run = false;
         speed_pi_reset(&deferred->speed_pi);
         deferred->torque_offset = (torque_offset_t){0};
+        periodic_load_reset(&deferred->periodic_load);
     }
     if ((changed & OBSERVER_MASK) != 0) {
         deferred->bandwidth = (observer_bandwidth_statistics_t){0, 0};
@@ -109,7 +111,7 @@ static observer_bandwidth_limits_t bandwidth_limits(const control_parameters_t *
     const uint32_t angle_step =
         (uint32_t)fixed_abs(fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32));
     const uint32_t withheld = moving_load_step(&parameters->moving_load, &deferred->moving_load, sample->innovation,
-                                               angle_step, sample->from_edge);
+                                               angle_step, sample->from_edge, deferred->periodic_load.engaged);
     return observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld);
 }
 
@@ -157,6 +159,17 @@ static void learn_common_misalignment(const control_parameters_t *parameters, de
                              input->torque_reference_q24);
 }
 
+static void learn_periodic_load(const control_parameters_t *parameters, deferred_t *deferred,
+                                const deferred_input_t *input) {
+    const periodic_load_sample_t sample = {
+        .angle = input->encoder_angle,
+        .angle_step = fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32),
+        .load_torque_q24 = input->load_torque_q24,
+        .moving = deferred->moving_load.withheld > 0 && !deferred->load_constant,
+    };
+    periodic_load_step(&parameters->periodic_load, &deferred->periodic_load, &sample);
+}
+
 /* What is not urgent, in four turns: no step takes the time of all. The learning of the phases has two of them, because
  * at a high bandwidth of the observer it follows within a millisecond. */
 static void take_turns(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
@@ -165,11 +178,13 @@ static void take_turns(const control_parameters_t *parameters, deferred_t *defer
     case 0:
         deferred->load_constant =
             stroke_mean_step(&parameters->stroke_mean, &deferred->stroke_mean, input->electrical,
-                             input->load_torque_q24, input->torque_reference_q24, disturbed(parameters, input));
+                             input->load_torque_q24, input->torque_reference_q24, disturbed(parameters, input)) &&
+            !deferred->periodic_load.engaged;
         deferred->window = predictive_torque_move_windows(&parameters->predictive, &deferred->advance_q30,
                                                           input->torque_reference_q24, input->torque_shortfall_q24);
         torque_offset_step(&parameters->torque_offset, &deferred->torque_offset, input->torque_reference_q24,
                            input->torque_sum_q24, input->torque_shortfall_q24 != 0);
+        learn_periodic_load(parameters, deferred, input);
         break;
     case 2:
         learn_common_misalignment(parameters, deferred, input);
@@ -192,9 +207,13 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     results->speed_law_torque_q24 = 0;
     results->speed_reference_q22 = 0;
+    results->periodic_load_q24 = 0;
     if (input->run) {
+        const int32_t law_q24 = speed_control_law_q24(parameters, deferred, input);
+        const int32_t periodic_load_q24 = deferred->periodic_load.torque_q24;
         results->speed_law_torque_q24 =
-            fixed_add(speed_control_law_q24(parameters, deferred, input), torque_offset_q24(&deferred->torque_offset));
+            fixed_add(fixed_add(law_q24, torque_offset_q24(&deferred->torque_offset)), periodic_load_q24);
+        results->periodic_load_q24 = periodic_load_q24;
         results->speed_reference_q22 = deferred->speed_reference_q22;
     }
     deferred->run = input->run;

@@ -6,6 +6,7 @@
  *   speed law    speed error -> torque, without feed-forward                               speed_pi.h, speed_smc.h
  *   windows      torque shortfall -> conduction windows, with their reciprocal              predictive_torque.h
  *   offset       mean torque error -> torque reference                                     torque_offset.h
+ *   periodic     load torque that repeats with every turn -> torque reference, observer    periodic_load.h
  *   learn        misalignment of each phase                                                misalignment.h
  *
  * The control interrupt ends with the hand-over of its values; the deferred interrupt makes the step, and its results
@@ -21,7 +22,7 @@
 #include "drive/control.h"
 
 /* Periods per update of what takes turns: learning of the phases; learning of their common angle, windows, torque
- * offset and mean load. */
+ * offset, mean load and periodic load. */
 #define DEFERRED_LEARNING_PERIODS 2
 #define DEFERRED_SLOW_PERIODS 4
 

@@ -50,7 +50,8 @@ typedef struct {
     uint32_t generation;                   /* of the input */
     uint32_t fault_mask;                   /* failed deferred checks, lower half of their FAULT_BITs */
     int32_t speed_reference_q22;           /* after the ramp, rad/s, Q9.22; 0 outside RUN */
-    int32_t speed_law_torque_q24;          /* of the speed law, without feed-forward, N m, Q7.24; 0 outside RUN */
+    int32_t speed_law_torque_q24;          /* speed law, torque offset, periodic load, N m, Q7.24; 0 outside RUN */
+    int32_t periodic_load_q24;             /* part that the observer is given as load, N m, Q7.24; 0 outside RUN */
     observer_bandwidth_limits_t bandwidth; /* of the trigger */
     torque_sharing_window_t window;        /* of the motoring phases */
     int32_t misalignment[HAL_PHASES_MAX];  /* to subtract from the angle of each phase, 2^-32 electrical rev */

@@ -1,6 +1,7 @@
 #include "drive/observe.h"
 
 #include "drive/deferred.h"
+#include "fixed/fixed.h"
 
 void observe_reset(control_state_t *state, const control_measurement_t *measured) {
     load_observer_reset(&state->observer, measured->angle);
@@ -8,11 +9,12 @@ void observe_reset(control_state_t *state, const control_measurement_t *measured
     deferred_reset_observer(state);
 }
 
-void observe(const control_parameters_t *parameters, control_state_t *state, const observer_bandwidth_limits_t *limits,
+void observe(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
              const control_measurement_t *measured) {
     const int32_t innovation = load_observer_innovation(&state->observer, measured->angle);
-    const load_observer_gains_t *gains = observer_bandwidth_step(&parameters->bandwidth, &state->bandwidth, limits,
-                                                                 innovation, measured->angle_from_edge);
+    const load_observer_gains_t *gains = observer_bandwidth_step(
+        &parameters->bandwidth, &state->bandwidth, &deferred->bandwidth, innovation, measured->angle_from_edge);
     state->innovation = innovation;
-    load_observer_step(&parameters->observer, gains, &state->observer, innovation, measured->torque_sum_q24);
+    const int32_t torque_q24 = fixed_subtract(measured->torque_sum_q24, deferred->periodic_load_q24);
+    load_observer_step(&parameters->observer, gains, &state->observer, innovation, torque_q24);
 }

@@ -4,8 +4,9 @@
 
 #include "drive/control.h"
 
-/* Corrects the observer with a measurement and predicts the coming sample; the bandwidth follows the innovation. */
-void observe(const control_parameters_t *parameters, control_state_t *state, const observer_bandwidth_limits_t *limits,
+/* Corrects the observer with a measurement and predicts the coming sample, with the periodic load of the deferred step;
+ * the bandwidth follows the innovation. */
+void observe(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
              const control_measurement_t *measured);
 
 /* Restarts the observer at the measured angle, at standstill, with its maximum bandwidth. */

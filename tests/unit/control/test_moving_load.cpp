@@ -32,8 +32,8 @@ class Detector {
   public:
     explicit Detector(const moving_load_settings_t &of = settings()) : parameters(moving_load_configure(&of)) {}
 
-    uint32_t step(int32_t innovation, uint32_t angle_step = FAST, bool from_edge = false) {
-        return moving_load_step(&parameters, &state, innovation, angle_step, from_edge);
+    uint32_t step(int32_t innovation, uint32_t angle_step = FAST, bool from_edge = false, bool hold = false) {
+        return moving_load_step(&parameters, &state, innovation, angle_step, from_edge, hold);
     }
     // Longest sequence of samples with withheld stages.
     uint32_t run(uint32_t samples, int32_t innovation, uint32_t angle_step = FAST) {
@@ -105,6 +105,18 @@ TEST(MovingLoad, a_trend_during_the_release_doubles_the_hold_up_to_0_8_s_and_a_q
     while (detector.step(COUNT) < STAGES) {
     }
     EXPECT_NEAR(detector.run(RATE_HZ, 0) * 1e3 / RATE_HZ, 65.0, 6.0);
+}
+
+TEST(MovingLoad, hold_keeps_what_is_withheld_and_withholds_nothing_itself) {
+    Detector moving;
+    for (uint32_t k = 0; k < RATE_HZ; k++) {
+        ASSERT_EQ(moving.step(0, FAST, false, true), 0u);
+    }
+    moving.run(RATE_HZ / 50, COUNT);
+    for (uint32_t k = 0; k < 2 * RATE_HZ; k++) {
+        ASSERT_EQ(moving.step(0, FAST, false, true), STAGES);
+    }
+    EXPECT_LT(moving.run(RATE_HZ, 0), RATE_HZ / 5) << "released without it";
 }
 
 TEST(MovingLoad, a_trend_that_no_load_causes_blocks_for_a_second) {

@@ -1,4 +1,4 @@
-// A load that moves: sine and ramp, instant by instant.
+// A load that moves: sine, ramp and profile over the angle, instant by instant.
 #include "support/rig_bench.h"
 
 extern "C" {
@@ -12,9 +12,9 @@ extern "C" {
 namespace {
 
 constexpr uint64_t US = 1000, MS = 1000 * US;
-enum : uint8_t { LOAD_TORQUE = 1, TRUTH_PERIOD = 6, RAMP = 18, AMPLITUDE = 19, FREQUENCY = 20 };
-const std::map<uint8_t, double> SCALES = {
-    {LOAD_TORQUE, 0.0001}, {TRUTH_PERIOD, 1.0}, {RAMP, 0.01}, {AMPLITUDE, 0.0001}, {FREQUENCY, 0.001}};
+enum : uint8_t { LOAD_TORQUE = 1, TRUTH_PERIOD = 6, RAMP = 18, AMPLITUDE = 19, FREQUENCY = 20, PROFILE = 21 };
+const std::map<uint8_t, double> SCALES = {{LOAD_TORQUE, 0.0001}, {TRUTH_PERIOD, 1.0}, {RAMP, 0.01},
+                                          {AMPLITUDE, 0.0001},   {FREQUENCY, 0.001},  {PROFILE, 0.0001}};
 
 class Load : public testing::Test {
   protected:
@@ -27,6 +27,32 @@ class Load : public testing::Test {
         const auto records = client->receive();
         ASSERT_EQ(records.back().identifier(), RIG_SET_REPLY_FRAME_ID);
         ASSERT_EQ(records.back().frame.data[1], 0) << "done";
+    }
+
+    void set_profile_value(unsigned values, unsigned index, double value) {
+        const auto raw = static_cast<uint32_t>(std::lround(value * 1e6));
+        std::vector<uint8_t> data = {static_cast<uint8_t>(values), static_cast<uint8_t>(values >> 8),
+                                     static_cast<uint8_t>(index), static_cast<uint8_t>(index >> 8)};
+        for (int i = 0; i < 4; ++i) {
+            data.push_back(static_cast<uint8_t>(raw >> (8 * i)));
+        }
+        ASSERT_TRUE(client->send(RIG_LOAD_PROFILE_FRAME_ID | CAN_EFF_FLAG, data));
+        bench.serve();
+    }
+    void set_profile(const std::vector<double> &values) {
+        for (unsigned index = 0; index < values.size(); ++index) {
+            set_profile_value(static_cast<unsigned>(values.size()), index, values[index]);
+        }
+    }
+
+    // Value of a profile half a step after the present angle.
+    double profile_ahead(const std::vector<double> &values) const {
+        const plant_t &plant = bench.rig->plant;
+        const double turns = (plant.rotor_angle_rad + plant.speed_rad_s * 10e-6) / (2.0 * std::numbers::pi);
+        const double position = (turns - std::floor(turns)) * static_cast<double>(values.size());
+        const auto index = static_cast<size_t>(position);
+        const double fraction = position - static_cast<double>(index);
+        return (1.0 - fraction) * values[index % values.size()] + fraction * values[(index + 1) % values.size()];
     }
 
     // The load at a time that is not in the past.
@@ -132,6 +158,42 @@ TEST_F(Load, SineAndRampAdd) {
     EXPECT_TRUE(event_is_due());
     set(AMPLITUDE, 0);
     EXPECT_FALSE(event_is_due());
+}
+
+TEST_F(Load, ProfileFollowsTheTrueAngleInBothDirectionsAndAddsToTheRest) {
+    const std::vector<double> values = {0.5, -1.0, 2.0, 0.0, 1.5, 1.0, 0.25};
+    set_profile(values);
+    for (const double sign : {-1.0, 1.0}) {
+        set(LOAD_TORQUE, sign * 60);
+        set(PROFILE, 3);
+        double before_rad = bench.rig->plant.rotor_angle_rad;
+        const uint64_t start_ns = bench.rig->board.time_ns;
+        double least = 1e9, most = -1e9;
+        for (uint64_t step = 1; step <= 10000; ++step) {
+            const double load_Nm = load_at(start_ns + step * LOAD_STEP_NS);
+            ASSERT_NEAR(load_Nm, sign * 60 + 3 * profile_ahead(values), 1e-9) << step;
+            least = std::min(least, load_Nm);
+            most = std::max(most, load_Nm);
+        }
+        EXPECT_GT(std::fabs(bench.rig->plant.rotor_angle_rad - before_rad), 4 * std::numbers::pi) << "turns";
+        EXPECT_LT(least, sign * 60 - 2.8);
+        EXPECT_GT(most, sign * 60 + 5.8);
+    }
+    set(PROFILE, 0);
+    EXPECT_EQ(load_at(bench.rig->board.time_ns + LOAD_STEP_NS), 60.0);
+    EXPECT_FALSE(event_is_due());
+}
+
+TEST_F(Load, ProfileValuesOutOfRangeAreIgnored) {
+    set_profile({2.0});
+    set(PROFILE, 1.5);
+    EXPECT_EQ(load_at(LOAD_STEP_NS), 3.0) << "a single value is constant";
+    set_profile_value(257, 0, 7.0);
+    set_profile_value(0, 0, 7.0);
+    set_profile_value(1, 1, 7.0);
+    EXPECT_EQ(load_at(2 * LOAD_STEP_NS), 3.0);
+    set_profile_value(1, 0, -4.0);
+    EXPECT_EQ(load_at(3 * LOAD_STEP_NS), -6.0);
 }
 
 TEST_F(Load, WithoutSineAndRampTheLoadStepsAndThePlantStopsForNothingElse) {

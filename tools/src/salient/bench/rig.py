@@ -5,6 +5,7 @@ The names, units, ranges and descriptions of the bench variables are those of th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -16,6 +17,8 @@ from salient.bench.client import Client, unknown_attribute
 from salient.bus.signals import rig_database, signal_range
 
 _AT_US_MAX = 2**32 - 1
+LOAD_PROFILE_VALUES_MAX = 256
+LOAD_PROFILE_VALUE_MAX = 1000.0
 
 
 class RigError(Exception):
@@ -103,6 +106,20 @@ class Rig:
         status = reply.decode_simple(bytes(answer.data))["status"]
         if status != "done":
             raise RigError(f"{name} {value:g} at {self._at_us} us: {status}")
+
+    def set_load_profile(self, values: Sequence[float]) -> None:
+        """Sets the load profile, now: torque over one turn of the rotor at equal steps of its angle from 0, times
+        load_profile_Nm. RigError: not 1 to 256 values of at most +-1000."""
+        if not 1 <= len(values) <= LOAD_PROFILE_VALUES_MAX:
+            raise RigError(f"load profile of {len(values)} values: must be 1 to {LOAD_PROFILE_VALUES_MAX}")
+        for value in values:
+            if not abs(value) <= LOAD_PROFILE_VALUE_MAX:
+                raise RigError(f"load profile value {value:g}: must be {-LOAD_PROFILE_VALUE_MAX:g} to "
+                               f"{LOAD_PROFILE_VALUE_MAX:g}")
+        message = rig_database().get_message_by_name("RIG_LOAD_PROFILE")
+        for index, value in enumerate(values):
+            data = message.encode({"values": len(values), "index": index, "value": value})
+            self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
 
     @staticmethod
     def describe() -> str:

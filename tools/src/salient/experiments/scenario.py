@@ -3,6 +3,7 @@
     machine = "saturating"                  # name of a bundled machine or path of a machine file
     controllers = ["traditional", "paper"]  # one run each
     duration_s = 0.4
+    load_profile = "compressor_one_cylinder"  # optional: torque over the rotor angle, tools/loads or path of a CSV file
     seed = 1                                # optional, as everything below; other fields of
     control_rate_hz = 40000                 # salient.config.Conditions likewise
 
@@ -20,6 +21,7 @@
     [[load]]
     at_s = 0.13
     torque_Nm = 8.0
+    profile_Nm = 2.0                        # optional: with a load_profile, the torque of its value 1
 
     [record]                                # the true state; without the table nothing is recorded
     step_us = 1.0
@@ -50,6 +52,7 @@ from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database
 from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
 from salient.errors import UsageError
+from salient.experiments.load_profile import load_profile_path, read_load_profile
 from salient.experiments.metrics import losses
 from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
@@ -66,10 +69,12 @@ class SpeedStep:
 
 @dataclass(frozen=True)
 class LoadStep:
-    """Load torque on the shaft from at_s on, positive against forward motion."""
+    """Load torque on the shaft from at_s on, positive against forward motion; profile_Nm: the rig's load_profile_Nm, None
+    leaves it."""
 
     at_s: float
     torque_Nm: float
+    profile_Nm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,8 @@ class Record:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario(Conditions):
-    """One run of one drive. Times in seconds of virtual time, not negative."""
+    """One run of one drive. Times in seconds of virtual time, not negative. load_profile: name of a bundled load profile
+    or path of a CSV file (salient.experiments.load_profile)."""
 
     name: str
     duration_s: float
@@ -90,6 +96,7 @@ class Scenario(Conditions):
     bench: dict[str, float] = field(default_factory=dict)
     speed: tuple[SpeedStep, ...] = ()
     load: tuple[LoadStep, ...] = ()
+    load_profile: str | None = None
     record: Record | None = None
 
 
@@ -132,15 +139,20 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
     config = replace(_bench_config(scenario, recording_path, build), instructions=instructions,
                      execution=execution, instruction_ns=instruction_ns)
     writes = _parameter_writes(scenario, config)
+    profile = read_load_profile(load_profile_path(scenario.load_profile)) if scenario.load_profile else ()
     out_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         with Bench(config, f"unix:{folder}/can.sock" if can == "local" else can) as bench:
+            if profile:
+                bench.rig.set_load_profile(profile)
             for name, value in scenario.bench.items():
                 bench.rig.set(name, value)
             for write in writes:  # before the first command; the answers are checked at the end
                 bench.send(write)
             for load in scenario.load:
                 bench.at(load.at_s).load_torque_Nm = load.torque_Nm
+                if load.profile_Nm is not None:
+                    bench.at(load.at_s).load_profile_Nm = load.profile_Nm
             for speed in sorted(scenario.speed, key=lambda speed: speed.at_s):
                 bench.advance_to(round(speed.at_s * 1e9))
                 bench.drive.speed_reference_rpm = speed.value_rpm
@@ -274,6 +286,7 @@ class _SpeedTable(Table):
 class _LoadTable(Table):
     at_s: _Time
     torque_Nm: Annotated[float, number(-10_000.0, 10_000.0)]
+    profile_Nm: Annotated[float, number(-200.0, 200.0)] = None
 
 
 class _RecordTable(Table):
@@ -299,6 +312,7 @@ def _scenario_file() -> type[Table]:
         "bench": (bench, bench()),
         "speed": (list[_SpeedTable], []),
         "load": (list[_LoadTable], []),
+        "load_profile": (str, None),
         "record": (_RecordTable, None),
     }
     return create_model("scenario", __base__=Table, **fields)
@@ -319,6 +333,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
     relative = path.parent / file.machine
     machine = str(relative.resolve()) if relative.suffix == ".toml" else file.machine
     machine_image(machine)  # checks it
+    profile = _load_profile_of(path, file.load_profile) if file.load_profile is not None else None
     common: dict[str, Any] = {name: getattr(file, name) for name in CONDITIONS if name in type(file).model_fields}
     common |= {
         "name": path.stem,
@@ -328,9 +343,21 @@ def load_scenarios(path: Path) -> list[Scenario]:
         "bench": {name: getattr(file.bench, name) for name in data.get("bench", {})},  # set in the order of the file
         "speed": tuple(SpeedStep(**step.model_dump()) for step in file.speed),
         "load": tuple(LoadStep(**step.model_dump()) for step in file.load),
+        "load_profile": profile,
         "record": None if file.record is None else Record(**file.record.model_dump()),
     }
     return [Scenario(controller=controller, **common) for controller in file.controllers]
+
+
+def _load_profile_of(path: Path, name: str) -> str:
+    """Name or path of the load profile of a scenario file; it is read to be checked."""
+    relative = path.parent / name
+    profile = str(relative.resolve()) if relative.suffix == ".csv" else name
+    try:
+        read_load_profile(load_profile_path(profile))
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+    return profile
 
 
 def _check_controllers(controllers: list[str]) -> None:

@@ -1,0 +1,271 @@
+// Learning of a load that repeats with every turn: the firmware against its equations in double precision, and what is
+// learned and what is not.
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <functional>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/periodic_load.h"
+}
+
+#include "support/fixed_point.h"
+
+namespace {
+
+using namespace fixed_point;
+constexpr uint32_t RATE_HZ = 40000, UPDATE_PERIODS = 4, BANDWIDTH_RAD_S = 1700;
+constexpr int VALUES = PERIODIC_LOAD_VALUES;
+constexpr double TORQUE_MAX_NM = 19.1, LEAD_PERIODS = 4.0;
+const double LAG_S = std::floor(2.2 / BANDWIDTH_RAD_S * RATE_HZ) / RATE_HZ;
+
+using load_t = std::function<double(double time_s, double turns)>;
+
+// The law in double precision, of periodic_load.h.
+class Reference {
+  public:
+    void step(double turns, double turns_per_s, double y, bool moving) {
+        const double lag = turns_per_s * LAG_S * VALUES;
+        const int now = wrapped(int(std::floor(turns * VALUES - lag)));
+        if (now != index) {
+            if (updates > 0 && now == wrapped(index + (turns_per_s < 0.0 ? -1 : 1))) {
+                end_value(lag);
+            } else {
+                mode = mode == CLEAR ? CLEAR : KEEP;
+                begin_turn();
+            }
+            index = now;
+            updates = 0;
+            sum = 0.0;
+        }
+        moved = moved || moving;
+        updates++;
+        sum += y;
+        const double position = turns * VALUES + turns_per_s * LEAD_PERIODS / RATE_HZ * VALUES - 0.5;
+        const double before = std::floor(position), fraction = position - before;
+        const double from = profile[wrapped(int(before))], to = profile[wrapped(int(before) + 1)];
+        torque = mode == CLEAR ? 0.0 : from + fraction * (to - from);
+    }
+
+    double torque = 0.0;
+
+  private:
+    enum mode_t { CLEAR, KEEP, LEARN, FORGET };
+    static int wrapped(int n) { return ((n % VALUES) + VALUES) % VALUES; }
+
+    void begin_turn() {
+        count = 0;
+        total = load = change = residual = 0.0;
+        moved = false;
+    }
+
+    void end_value(double lag) {
+        const double y = sum / updates, z = y + (mode == CLEAR ? 0.0 : profile[index]);
+        total += y;
+        residual += std::fabs(y - mean);
+        load += std::fabs(z - mean);
+        change += std::fabs(z - estimate[index]);
+        estimate[index] = z;
+        const int ahead = wrapped(index + (lag < 0.0 ? -VALUES / 4 : VALUES / 4));
+        const double smooth =
+            estimate[ahead] + std::fabs(lag) / 64.0 *
+                                  (estimate[wrapped(ahead - 1)] - 2.0 * estimate[ahead] + estimate[wrapped(ahead + 1)]);
+        const double learned = mode == CLEAR    ? 0.0
+                               : mode == LEARN  ? profile[ahead] + (smooth - mean - profile[ahead]) / 4.0
+                               : mode == FORGET ? profile[ahead] / 2.0
+                                                : profile[ahead];
+        profile[ahead] = std::clamp(learned, -TORQUE_MAX_NM, TORQUE_MAX_NM);
+        if (++count == VALUES) {
+            end_turn();
+        }
+    }
+
+    void end_turn() {
+        const double threshold = VALUES * TORQUE_MAX_NM / 256.0;
+        if (load < threshold || load < residual / 4.0) {
+            mode = CLEAR;
+        } else if (mode == CLEAR) {
+            mode = KEEP;
+        } else if (moved && residual >= threshold && change < residual / 2.0) {
+            mode = LEARN;
+        } else {
+            mode = load < residual ? FORGET : KEEP;
+        }
+        mean = total / VALUES;
+        begin_turn();
+    }
+
+    std::array<double, VALUES> profile{}, estimate{};
+    mode_t mode = CLEAR;
+    int index = 0, count = 0;
+    unsigned updates = 0;
+    double sum = 0.0, mean = 0.0, total = 0.0, load = 0.0, change = 0.0, residual = 0.0;
+    bool moved = false;
+};
+
+// Estimate of the load observer: three equal poles, of what the profile leaves.
+class Observer {
+  public:
+    double step(double torque_Nm) {
+        const double gain = 1.0 - std::exp(-double(BANDWIDTH_RAD_S) / RATE_HZ);
+        double input = torque_Nm;
+        for (double &stage : stages) {
+            input = stage += gain * (input - stage);
+        }
+        return stages[2];
+    }
+
+  private:
+    std::array<double, 3> stages{};
+};
+
+struct learned_t {
+    double rest_Nm;      // RMS of load less profile, about its mean, in the last turn
+    double load_Nm;      // RMS of the load there
+    double torque_Nm;    // largest magnitude of the profile's torque there
+    double error_Nm;     // largest difference from the reference in the whole run
+    int32_t largest_q24; // largest magnitude of the torque in the whole run
+    bool engaged;
+};
+
+learned_t learn(double rpm, const load_t &load_Nm, double run_s, bool moving = true) {
+    const periodic_load_parameters_t parameters =
+        periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24));
+    periodic_load_t state{};
+    Reference reference;
+    Observer observer;
+    learned_t result{};
+    double sum = 0.0, square = 0.0, load_sum = 0.0, load_square = 0.0, n = 0.0;
+    const double turns_per_s = rpm / 60.0, last_s = run_s - 1.0 / std::fabs(turns_per_s);
+    for (uint32_t k = 0; k < uint32_t(run_s * RATE_HZ); k++) {
+        const double time_s = double(k) / RATE_HZ, turns = 0.2 + turns_per_s * time_s;
+        const double load = load_Nm(time_s, turns), rest = load - (state.torque_q24 / Q24);
+        const double estimate = observer.step(rest);
+        if (k % UPDATE_PERIODS == 0) {
+            const periodic_load_sample_t sample = {.angle = angle_from_rev(turns),
+                                                   .angle_step = int32_t(std::lround(turns_per_s / RATE_HZ * 0x1p32)),
+                                                   .load_torque_q24 = to_fixed(estimate, Q24),
+                                                   .moving = moving};
+            periodic_load_step(&parameters, &state, &sample);
+            reference.step(turns, turns_per_s, estimate, moving);
+            result.error_Nm = std::max(result.error_Nm, std::fabs((state.torque_q24 / Q24) - reference.torque));
+            result.largest_q24 = std::max(result.largest_q24, std::abs(state.torque_q24));
+        }
+        if (time_s >= last_s) {
+            sum += rest;
+            square += rest * rest;
+            load_sum += load;
+            load_square += load * load;
+            n += 1.0;
+            result.torque_Nm = std::max(result.torque_Nm, std::fabs((state.torque_q24 / Q24)));
+        }
+    }
+    result.rest_Nm = std::sqrt(std::max(0.0, square / n - sum / n * sum / n));
+    result.load_Nm = std::sqrt(std::max(0.0, load_square / n - load_sum / n * load_sum / n));
+    result.engaged = state.engaged;
+    return result;
+}
+
+double harmonics(double, double turns) {
+    return 8.0 + 3.0 * std::sin(2.0 * PI * turns) + 2.0 * std::cos(4.0 * PI * turns) +
+           1.0 * std::sin(10.0 * PI * turns + 1.0);
+}
+
+TEST(PeriodicLoad, follows_its_equations_within_50_mNm_at_any_speed_and_in_both_directions) {
+    for (const double rpm : {10.0, 150.0, -150.0, 600.0, -1500.0, 3000.0}) {
+        const learned_t learned = learn(rpm, harmonics, 12.0 * 60.0 / std::fabs(rpm));
+        EXPECT_LT(learned.error_Nm, 0.05) << rpm;
+        EXPECT_TRUE(learned.engaged) << rpm;
+    }
+}
+
+TEST(PeriodicLoad, leaves_less_than_a_tenth_of_a_load_that_repeats_after_20_turns) {
+    for (const double rpm : {10.0, 150.0, -600.0, 1500.0}) {
+        const learned_t learned = learn(rpm, harmonics, 20.0 * 60.0 / std::fabs(rpm));
+        EXPECT_LT(learned.rest_Nm, 0.1 * learned.load_Nm) << rpm;
+        EXPECT_GT(learned.torque_Nm, 4.0) << rpm;
+    }
+    const learned_t fast = learn(3000.0, harmonics, 0.8);
+    EXPECT_LT(fast.rest_Nm, 0.1 * fast.load_Nm) << "40 turns, with the low-pass wider";
+}
+
+TEST(PeriodicLoad, does_not_grow_within_1000_turns_at_the_highest_speed) {
+    const auto corners = [](double, double turns) { return turns - std::floor(turns) < 0.3 ? 10.0 : 2.0; };
+    for (const double rpm : {1500.0, 4800.0}) {
+        const learned_t early = learn(rpm, corners, 60.0 * 60.0 / rpm), late = learn(rpm, corners, 1000.0 * 60.0 / rpm);
+        EXPECT_LT(late.rest_Nm, 1.05 * early.rest_Nm) << rpm;
+        EXPECT_LT(late.rest_Nm, 0.5 * late.load_Nm) << rpm;
+        EXPECT_LT((late.largest_q24 / Q24), 12.0) << rpm;
+    }
+}
+
+TEST(PeriodicLoad, learns_nothing_from_a_constant_load_a_step_or_a_ramp) {
+    const load_t loads[] = {[](double, double) { return 8.0; },
+                            [](double time_s, double) { return time_s < 1.03 ? 2.0 : 12.0; },
+                            [](double time_s, double) { return 5.0 * time_s; }};
+    for (const auto &load : loads) {
+        for (const double rpm : {150.0, 600.0, 3000.0}) {
+            const learned_t learned = learn(rpm, load, 3.0);
+            EXPECT_EQ(learned.largest_q24, 0) << rpm;
+            EXPECT_FALSE(learned.engaged) << rpm;
+        }
+    }
+}
+
+TEST(PeriodicLoad, learns_nothing_while_the_load_does_not_count_as_moving) {
+    EXPECT_EQ(learn(600.0, harmonics, 2.0, false).largest_q24, 0);
+}
+
+TEST(PeriodicLoad, sine_between_the_harmonics_is_not_amplified_by_more_than_a_tenth) {
+    for (double ratio = 0.25; ratio < 4.0; ratio += 0.07) {
+        const auto sine = [&](double time_s, double) { return 8.0 + 4.0 * std::sin(2.0 * PI * 10.0 * ratio * time_s); };
+        double worst = 0.0;
+        for (const double run_s : {2.03, 2.51}) {
+            const learned_t learned = learn(600.0, sine, run_s);
+            worst = std::max(worst, learned.rest_Nm / learned.load_Nm);
+        }
+        EXPECT_LT(worst, 1.1) << ratio;
+    }
+}
+
+TEST(PeriodicLoad, profile_is_gone_three_turns_after_the_load_stops_and_follows_half_of_it_within_10) {
+    constexpr double END_S = 2.037;
+    const auto stopping = [](double time_s, double turns) { return time_s < END_S ? harmonics(0.0, turns) : 6.0; };
+    const auto halving = [](double time_s, double turns) {
+        return time_s < END_S ? harmonics(0.0, turns) : 4.0 + 0.5 * harmonics(0.0, turns);
+    };
+    EXPECT_GT(learn(600.0, stopping, END_S).torque_Nm, 4.0);
+    const learned_t stopped = learn(600.0, stopping, END_S + 0.41);
+    EXPECT_EQ(stopped.torque_Nm, 0.0);
+    EXPECT_FALSE(stopped.engaged);
+    const learned_t halved = learn(600.0, halving, END_S + 1.0);
+    EXPECT_LT(halved.rest_Nm, 0.2 * halved.load_Nm);
+}
+
+TEST(PeriodicLoad, torque_is_bounded_by_the_largest_torque_of_the_drive) {
+    const auto large = [](double, double turns) { return 50.0 * std::sin(2.0 * PI * turns); };
+    const learned_t learned = learn(600.0, large, 4.0);
+    EXPECT_LE((learned.largest_q24 / Q24), TORQUE_MAX_NM);
+    EXPECT_GT((learned.largest_q24 / Q24), 0.99 * TORQUE_MAX_NM);
+}
+
+TEST(PeriodicLoad, without_a_bandwidth_or_beyond_a_delay_of_eight_values_nothing_is_learned) {
+    const int32_t torque_max_q24 = to_fixed(TORQUE_MAX_NM, Q24);
+    EXPECT_EQ(periodic_load_configure(RATE_HZ, 0, torque_max_q24).lag_periods, 0);
+    const periodic_load_parameters_t slow = periodic_load_configure(RATE_HZ, 250, torque_max_q24);
+    EXPECT_EQ(slow.lag_periods, 352);
+    EXPECT_NEAR(slow.angle_step_max * 352.0, 0x1p29, 0x1p21);
+    periodic_load_t state{};
+    state.engaged = true;
+    const periodic_load_sample_t sample = {
+        .angle = 0, .angle_step = -slow.angle_step_max - 1, .load_torque_q24 = torque_max_q24, .moving = true};
+    periodic_load_step(&slow, &state, &sample);
+    EXPECT_FALSE(state.engaged);
+    EXPECT_EQ(state.torque_q24, 0);
+}
+
+} // namespace
