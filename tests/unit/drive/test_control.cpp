@@ -498,7 +498,9 @@ TEST_F(SalientControl, the_torque_is_estimated_in_the_planned_cells_which_the_en
     for (unsigned phase = 0; phase < 3; phase++) {
         int32_t flux = 0;
         const int32_t current_q9 = state.measurement.current_q9[phase];
-        const int32_t torque = current_q9 > 0 ? predictive_torque_estimate(&before, phase, current_q9, &flux) : 0;
+        const int32_t torque =
+            current_q9 > 0 ? predictive_torque_estimate(&predictive_torque_cells(&before)[phase], current_q9, &flux)
+                           : 0;
         EXPECT_EQ(state.measurement.flux_linkage[phase], flux) << phase;
         estimate_q24 += phase_map_scale(&machine_tables.torque_format, torque);
     }
