@@ -137,7 +137,7 @@ class Control : public testing::Test {
     drive_t telemetry_drive{}; // as telemetry_collect reads it
     control_sample_t sample;
     command_t command;
-    hal_pwm_compare_t compare;
+    hal_pwm_compare_t compare{};
     double turns = 0.1, speed_rad_s = 0.0;
 };
 
@@ -190,7 +190,7 @@ TEST_F(Control, the_same_state_and_sample_give_the_same_bits) {
             control_state_t before;
             std::memcpy(&before, &state, sizeof state);
             step(COMMAND_RUN, 150.0);
-            hal_pwm_compare_t replayed;
+            hal_pwm_compare_t replayed{};
             control_step(&parameters, &before, &sample, &command, &replayed);
             deferred_step(&parameters, &before);
             ASSERT_EQ(std::memcmp(&before, &state, sizeof state), 0) << k;
