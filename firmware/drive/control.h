@@ -135,7 +135,6 @@ typedef struct {
     state_machine_t state_machine;
     int32_t torque_reference_q24;     /* 0 outside RUN */
     int32_t duty_q15[HAL_PHASES_MAX]; /* of the last period in RUN, -32768..32768 */
-    ditc_hysteresis_t hysteresis;
     pwm_ditc_t duty;
     torque_trim_t trim;
     predictive_torque_t predictive;

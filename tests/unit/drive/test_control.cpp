@@ -365,7 +365,7 @@ TEST_F(Control, hysteresis_control_switches_whole_periods_only) {
                 ASSERT_GE(compare.lower[phase], compare.upper[phase]);
                 // States of the hysteresis: +1 both on, 0 one on, -1 both off.
                 const int on = (compare.upper[phase] != 0) + (compare.lower[phase] != 0);
-                ASSERT_EQ(on - 1, state.hysteresis.state[phase]);
+                ASSERT_EQ((on - 1) * 32768, state.duty_q15[phase]);
             }
         }
     }
