@@ -62,6 +62,6 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
             control_prepare(parameters, state);
         }
     }
-    deferred_hand_over(parameters, state, sample, command, measured);
+    deferred_hand_over(parameters, state, sample, command, measured, run);
     return run;
 }
