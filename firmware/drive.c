@@ -42,9 +42,8 @@ void drive_control_interrupt(drive_t *drive) {
     }
     hal_encoder_read(drive->hal, &sample->encoder);
     hal_adc_read(drive->hal, &sample->adc);
-    hal_pwm_compare_t compare;
-    if (control_step(&drive->control_parameters, &drive->control, sample, &drive->command, &compare)) {
-        hal_pwm_write(drive->hal, &compare);
+    if (control_step(&drive->control_parameters, &drive->control, sample, &drive->command, &drive->compare)) {
+        hal_pwm_write(drive->hal, &drive->compare);
     } else {
         hal_pwm_open_all(drive->hal);
     }

@@ -22,6 +22,7 @@ typedef struct {
     /* Written by the control interrupt, its member `deferred` by the deferred interrupt; the background prepares the
      * control laws for new parameters with the interrupts masked. */
     control_state_t control;
+    hal_pwm_compare_t compare; /* of the last period in RUN; written by the control interrupt */
     /* Execution time of the interrupts, for telemetry only; overruns are handled by drive/protection.h. */
     uint32_t used_ticks;           /* last control interrupt, from trigger to end, HAL_PWM_TICK_NS */
     uint32_t worst_ticks;          /* maximum since start */

@@ -2,66 +2,74 @@
 
 #include <stdbool.h>
 
-void ditc_hysteresis_reset(ditc_hysteresis_t *ditc) {
+#include "fixed/compiler.h"
+#include "fixed/formats.h"
+
+#define ON ONE_Q15
+#define OFF (-ONE_Q15)
+
+void ditc_hysteresis_reset(int32_t duty_q15[HAL_PHASES_MAX]) {
+    UNROLL(4)
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        ditc->state[phase] = -1;
+        duty_q15[phase] = OFF;
     }
 }
 
-static int8_t single_state(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t error_q24) {
+static int32_t single_state(const ditc_hysteresis_parameters_t *parameters, int32_t state, int32_t error_q24) {
     if (error_q24 > parameters->band_inner_q24) {
-        return 1;
+        return ON;
     }
     if (error_q24 < -parameters->band_outer_q24) {
-        return -1;
+        return OFF;
     }
     return error_q24 < -parameters->band_inner_q24 || state < 0 ? 0 : state;
 }
 
-static int8_t incoming_state(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t error_q24) {
+static int32_t incoming_state(const ditc_hysteresis_parameters_t *parameters, int32_t state, int32_t error_q24) {
     if (error_q24 > parameters->band_outer_q24) {
-        return 1;
+        return ON;
     }
     return error_q24 < 0 || state < 0 ? 0 : state;
 }
 
-static int8_t outgoing_state(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t error_q24) {
+static int32_t outgoing_state(const ditc_hysteresis_parameters_t *parameters, int32_t state, int32_t error_q24) {
     if (error_q24 > parameters->band_inner_q24) {
-        return 1;
+        return ON;
     }
     if (error_q24 < -parameters->band_inner_q24) {
-        return -1;
+        return OFF;
     }
     const bool crossed_zero = (state > 0 && error_q24 <= 0) || (state < 0 && error_q24 >= 0);
     return crossed_zero ? 0 : state;
 }
 
-static int8_t limit_current(const ditc_hysteresis_parameters_t *parameters, int8_t state, int32_t current_q9) {
+static int32_t limit_current(const ditc_hysteresis_parameters_t *parameters, int32_t state, int32_t current_q9) {
     return state > 0 && current_q9 > parameters->current_limit_q9 ? 0 : state;
 }
 
-void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_hysteresis_t *ditc,
-                          const commutation_t *commutation, int32_t torque_error_q24, const int32_t *current_q9) {
+void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, const commutation_t *commutation,
+                          int32_t torque_error_q24, const int32_t *current_q9, int32_t duty_q15[HAL_PHASES_MAX]) {
     const unsigned active = commutation->active;
     const unsigned outgoing = commutation->outgoing;
-    int8_t outgoing_state_next = -1;
+    int32_t outgoing_next = OFF;
     bool outgoing_conducts = false;
     if (outgoing != COMMUTATION_NONE) {
-        outgoing_state_next = limit_current(
-            parameters, outgoing_state(parameters, ditc->state[outgoing], torque_error_q24), current_q9[outgoing]);
-        outgoing_conducts = current_q9[outgoing] > 0;
+        const int32_t outgoing_current_q9 = current_q9[outgoing];
+        outgoing_next = limit_current(parameters, outgoing_state(parameters, duty_q15[outgoing], torque_error_q24),
+                                      outgoing_current_q9);
+        outgoing_conducts = outgoing_current_q9 > 0;
     }
-    int8_t active_state_next = -1;
+    int32_t active_next = OFF;
     if (active != COMMUTATION_NONE) {
-        active_state_next = outgoing_conducts ? incoming_state(parameters, ditc->state[active], torque_error_q24)
-                                              : single_state(parameters, ditc->state[active], torque_error_q24);
-        active_state_next = limit_current(parameters, active_state_next, current_q9[active]);
+        active_next = outgoing_conducts ? incoming_state(parameters, duty_q15[active], torque_error_q24)
+                                        : single_state(parameters, duty_q15[active], torque_error_q24);
+        active_next = limit_current(parameters, active_next, current_q9[active]);
     }
-    ditc_hysteresis_reset(ditc);
+    ditc_hysteresis_reset(duty_q15);
     if (outgoing != COMMUTATION_NONE) {
-        ditc->state[outgoing] = outgoing_state_next;
+        duty_q15[outgoing] = outgoing_next;
     }
     if (active != COMMUTATION_NONE) {
-        ditc->state[active] = active_state_next;
+        duty_q15[active] = active_next;
     }
 }

@@ -30,15 +30,12 @@ typedef struct {
     int32_t current_limit_q9; /* A, Q7.9 */
 } ditc_hysteresis_parameters_t;
 
-typedef struct {
-    int8_t state[HAL_PHASES_MAX]; /* +1, 0, -1 */
-} ditc_hysteresis_t;
-
 /* All phases -1. */
-void ditc_hysteresis_reset(ditc_hysteresis_t *ditc);
+void ditc_hysteresis_reset(int32_t duty_q15[HAL_PHASES_MAX]);
 
-/* One sample: new states from the torque error (N m, Q7.24, any value) and the phase currents (A, Q7.9). */
-void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, ditc_hysteresis_t *ditc,
-                          const commutation_t *commutation, int32_t torque_error_q24, const int32_t *current_q9);
+/* One sample: new states from the last ones, the torque error (N m, Q7.24, any value) and the phase currents (A, Q7.9).
+ * States are duties in Q1.15: -32768, 0, 32768. */
+void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, const commutation_t *commutation,
+                          int32_t torque_error_q24, const int32_t *current_q9, int32_t duty_q15[HAL_PHASES_MAX]);
 
 #endif

@@ -47,7 +47,7 @@ typedef struct {
     int32_t curvature;         /* c of the torque over v */
     int32_t column;
     bool located;  /* the cell is known */
-    bool negative; /* the phase is in the half of negative torque */
+    bool positive; /* the phase is in the half of positive torque */
 } phase_cell_t;
 
 /* Dividend and divisor of quotients in Q2.13 by a rise. The dividend, y - middle or a curvature, is saturated to 2^25

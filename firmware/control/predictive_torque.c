@@ -80,8 +80,8 @@ static inline bool solve_in_cell(plan_t *p, int32_t torque, int32_t current_limi
     return reached;
 }
 
-static inline void locate_cell(const machine_tables_t *tables, plan_t *p) {
-    phase_cell_locate(tables, p->angle - HALF_REV, p->column, p->cell);
+NOINLINE static void locate_cell(const machine_tables_t *tables, uint32_t angle, int32_t column, phase_cell_t *cell) {
+    phase_cell_locate(tables, angle - HALF_REV, column, cell);
 }
 
 /* Plans the operating point of a phase for a torque in units of the tables, in the cell of its last plan; true when the
@@ -95,7 +95,7 @@ static inline bool plan_torque(const machine_tables_t *tables, plan_t *p, int32_
         p->limit = -1;
         return true;
     }
-    locate_cell(tables, p);
+    locate_cell(tables, p->angle, p->column, p->cell);
     return solve_in_cell(p, torque, current_limit_q9);
 }
 
@@ -114,12 +114,12 @@ static inline int32_t expected_column(const plan_t *p, int32_t torque, int32_t c
 NOINLINE static void replan_torque(const machine_tables_t *tables, plan_t *p, int32_t torque,
                                    int32_t current_limit_q9) {
     if (!p->cell->located) {
-        locate_cell(tables, p);
+        locate_cell(tables, p->angle, p->column, p->cell);
     }
     const int32_t column = expected_column(p, torque, current_limit_q9);
     if (column != p->column) {
         p->column = column;
-        locate_cell(tables, p);
+        locate_cell(tables, p->angle, column, p->cell);
     }
     (void)solve_in_cell(p, torque, current_limit_q9);
 }
@@ -142,7 +142,7 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
         const uint32_t order = p->since_on ^ reversal;
-        if (p->cell->negative == positive) {
+        if (p->cell->positive != positive) {
             opposed = p->limit >= 0 && p->torque > 0 ? p : opposed;
         } else if (order < first && p->limit != limit) {
             first = order;
@@ -156,7 +156,7 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
         corrected = opposed;
     }
     const int32_t before = corrected->torque;
-    const bool adds = !corrected->cell->negative;
+    const bool adds = corrected->cell->positive;
     replan_torque(tables, corrected, adds ? fixed_add(before, shortfall) : fixed_subtract(before, shortfall),
                   current_limit_q9);
     const int32_t gained = corrected->torque - before;
@@ -182,11 +182,16 @@ static int32_t share_of(int32_t torque_q24, int32_t share_q15) {
     return share_q15 == ONE_Q15 ? torque_q24 : 4 * fixed_multiply_high(torque_q24, share_q15 << 15);
 }
 
-/* Flux linkage that -Vdc removes until `travel` is covered at `angle_step` per period, 2^-32 electrical rev; in the
- * unit of flux_step_max, saturated. */
-static inline int32_t removable_flux(int32_t flux_step_max, uint32_t travel, uint32_t angle_step) {
-    const uint32_t periods_q8 = travel / ((angle_step >> 8) + 1);
-    const uint64_t flux_q8 = (uint64_t)(uint32_t)flux_step_max * periods_q8;
+/* What all phases have in common. */
+typedef struct {
+    uint32_t flux_step_max;  /* that a period of Vdc adds or removes, in units of the tables */
+    uint32_t angle_step_q24; /* rotation per period, 2^-24 electrical rev, rounded up */
+} period_t;
+
+/* Flux linkage that -Vdc removes until `travel` is covered, 2^-32 electrical rev; in units of the tables, saturated. */
+static inline int32_t removable_flux(const period_t *period, uint32_t travel) {
+    const uint32_t periods_q8 = travel / period->angle_step_q24;
+    const uint64_t flux_q8 = (uint64_t)period->flux_step_max * periods_q8;
     return flux_q8 >> 39 != 0 ? INT32_MAX : (int32_t)(flux_q8 >> 8);
 }
 
@@ -209,17 +214,16 @@ static inline void predict_flux(const predictive_torque_parameters_t *parameters
 typedef struct {
     const torque_sharing_window_t *window;
     int32_t torque; /* to share, by magnitude */
-    bool braking;   /* its phases move towards unaligned */
 } half_t;
 
-/* Operating point of a phase two periods ahead; true when it has the torque of the phase. */
+/* Operating point of a phase two periods ahead; true when it has the torque of the phase. braking: it moves towards the
+ * unaligned position. */
 static inline bool plan_phase(const predictive_torque_parameters_t *parameters, const machine_tables_t *tables,
-                              const half_t *half, plan_t *p, int32_t flux_step_max, uint32_t angle_step) {
+                              const period_t *period, const half_t *half, bool braking, plan_t *p) {
     p->since_on = p->angle - half->window->turn_on;
     const int32_t torque = half->torque > 0 ? share_of(half->torque, torque_sharing_q15(half->window, p->angle)) : 0;
-    if (half->braking && p->flux_max > p->flux_min) {
-        p->flux_max =
-            fixed_clamp(removable_flux(flux_step_max, p->angle - HALF_REV, angle_step), p->flux_min, p->flux_max);
+    if (braking && p->flux_max > p->flux_min) {
+        p->flux_max = fixed_clamp(removable_flux(period, p->angle - HALF_REV), p->flux_min, p->flux_max);
     }
     return plan_torque(tables, p, torque, parameters->current_limit_q9);
 }
@@ -278,9 +282,10 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     /* Windows advance against the rotation, which would be later for a braking phase. */
     const torque_sharing_window_t *base_window = &parameters->base_window;
     const half_t half[2] = {
-        {sample->reverse ? sample->window : base_window, negative_half_q24 >> torque_shift, !sample->reverse},
-        {sample->reverse ? base_window : sample->window, positive_half_q24 >> torque_shift, sample->reverse},
+        {sample->reverse ? sample->window : base_window, negative_half_q24 >> torque_shift},
+        {sample->reverse ? base_window : sample->window, positive_half_q24 >> torque_shift},
     };
+    const period_t period = {(uint32_t)flux_step_max_q29 >> flux_shift, (sample->angle_step >> 8) + 1};
 
     plan_t plan[HAL_PHASES_MAX];
     phase_cell_t *cells = control->cell[control->turn]; /* those of this sample have served */
@@ -297,9 +302,8 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         p->angle = positive ? angle : ~angle; /* mirrored, to 1 LSB */
         p->column = control->column[phase];
         p->cell = &cells[phase];
-        p->cell->negative = !positive;
-        reached &=
-            plan_phase(parameters, tables, &half[positive], p, flux_step_max_q29 >> flux_shift, sample->angle_step);
+        p->cell->positive = positive;
+        reached &= plan_phase(parameters, tables, &period, &half[positive], positive == sample->reverse, p);
         shortfall = positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
     }
 

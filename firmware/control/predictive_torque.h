@@ -89,12 +89,15 @@ torque_sharing_window_t predictive_torque_move_windows(const predictive_torque_p
                                                        int32_t *advance_q30, int32_t torque_q24,
                                                        int32_t torque_shortfall_q24);
 
+/* Cells by phase that were planned for the sample of predictive_torque_estimate. */
+ALWAYS_INLINE const phase_cell_t *predictive_torque_cells(const predictive_torque_t *control) {
+    return control->cell[control->turn];
+}
+
 /* Torque and flux linkage of a phase at a sample, in units of the tables, from its current in A, Q7.9, in the cell that
  * was planned for this sample; 0 where the plan was no flux linkage. The planned angle is that which the load observer
  * predicted two periods ago. */
-ALWAYS_INLINE int32_t predictive_torque_estimate(const predictive_torque_t *control, unsigned phase, int32_t current_q9,
-                                                 int32_t *flux) {
-    const phase_cell_t *cell = &control->cell[control->turn][phase];
+ALWAYS_INLINE int32_t predictive_torque_estimate(const phase_cell_t *cell, int32_t current_q9, int32_t *flux) {
     if (!cell->located) {
         *flux = 0;
         return 0;
@@ -102,7 +105,7 @@ ALWAYS_INLINE int32_t predictive_torque_estimate(const predictive_torque_t *cont
     const int32_t u_q13 = phase_cell_u_q13(cell, current_q9);
     *flux = phase_cell_curve_at(&cell->flux, u_q13);
     const int32_t torque = phase_cell_curve_at(&cell->torque, u_q13);
-    return cell->negative ? -torque : torque;
+    return cell->positive ? torque : -torque;
 }
 
 /* One sample: duty of each phase, Q1.15, -32768..32767. All sums saturate; 32-bit products are rounded to nearest, the

@@ -28,10 +28,7 @@ static int32_t rising_share_q15(const torque_sharing_window_t *window, uint32_t 
 }
 
 int32_t torque_sharing_q15(const torque_sharing_window_t *window, uint32_t angle) {
-    if (angle < window->turn_on) {
-        return 0;
-    }
-    const uint32_t since_on = angle - window->turn_on;
+    const uint32_t since_on = angle - window->turn_on; /* from 2^31 before turn-on: beyond the window */
     if (since_on < window->overlap) {
         return rising_share_q15(window, since_on);
     }

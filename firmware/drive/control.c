@@ -48,7 +48,6 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     }
     observe(parameters, state, deferred, measured);
     const uint64_t fault_mask = protect(parameters, state, sample, measured) | deferred->fault_mask;
-    *compare = (hal_pwm_compare_t){{0}, {0}};
     const bool was_running = state->state_machine.state == DRIVE_STATE_RUN;
     const bool run = supervise(parameters, state, sample, command, measured, fault_mask);
     if (run) {
@@ -57,9 +56,12 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
         torque_control(parameters, state, deferred, measured);
         modulate(state->duty_q15, machine_tables.phases, parameters->period_ticks, parameters->interleaved_pwm,
                  compare);
-    } else if (was_running) {
-        control_prepare(parameters, state);
+    } else {
+        *compare = (hal_pwm_compare_t){{0}, {0}};
+        if (was_running) {
+            control_prepare(parameters, state);
+        }
     }
-    deferred_hand_over(parameters, state, sample, command, measured);
+    deferred_hand_over(parameters, state, sample, command, measured, run);
     return run;
 }

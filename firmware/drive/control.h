@@ -138,7 +138,6 @@ typedef struct {
     state_machine_t state_machine;
     int32_t torque_reference_q24;     /* 0 outside RUN */
     int32_t duty_q15[HAL_PHASES_MAX]; /* of the last period in RUN, -32768..32768 */
-    ditc_hysteresis_t hysteresis;
     pwm_ditc_t duty;
     torque_trim_t trim;
     predictive_torque_t predictive;
@@ -156,8 +155,8 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
 void control_prepare(const control_parameters_t *parameters, control_state_t *state);
 
 /* One control period. command: the last accepted one, COMMAND_OFF before the first. Returns false when every switch
- * must be open; then *compare is all zero. A deferred step (deferred.h) is requested, unless
- * state->deferred_request.skipped > 0. [interrupt] */
+ * must be open; then *compare is all zero, else the values of the machine's phases are set. A deferred step
+ * (deferred.h) is requested, unless state->deferred_request.skipped > 0. [interrupt] */
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare);
 

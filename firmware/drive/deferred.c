@@ -49,7 +49,7 @@ static void hand_over_predictive(const control_state_t *state, const control_mea
 }
 
 void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
-                        const command_t *command, const control_measurement_t *measured) {
+                        const command_t *command, const control_measurement_t *measured, bool run) {
     deferred_request_t *request = &state->deferred_request;
     if (deferred_pending(request, &state->deferred.response)) {
         deferred_skip(request);
@@ -62,7 +62,7 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->dc_link_voltage_q6 = measured->dc_link_voltage_q6;
     input->command_age_us = sample->time_us - command->time_us;
     input->speed_q22 = state->observer.speed_q22;
-    input->run = state->state_machine.state == DRIVE_STATE_RUN;
+    input->run = run;
     input->commanded_speed_q22 = command->request == COMMAND_RUN ? command->speed_reference_q22 : 0;
     if (parameters->bandwidth.adaptive) {
         hand_over_bandwidth(state, measured, input);

@@ -31,10 +31,9 @@ static inline const deferred_results_t *deferred_in_effect(const control_state_t
     return deferred_results(&state->deferred_request, &state->deferred.response);
 }
 
-/* Hands the values of this period over, or counts the period as skipped. The state machine has made its tick.
- * [interrupt] */
+/* Hands the values of this period over, or counts the period as skipped. run: in state RUN. [interrupt] */
 void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
-                        const command_t *command, const control_measurement_t *measured);
+                        const command_t *command, const control_measurement_t *measured, bool run);
 
 /* Computes the results of the pending step; deferred_complete() then puts them into effect. The control interrupt may
  * pre-empt both. [deferred] */

@@ -41,13 +41,14 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
     measured->angle_from_edge = true;
     const uint32_t edge = encoder->edge_forward ? count_start : count_start + (1u << parameters->encoder_shift);
     const int32_t angle_per_tick_q19 = fixed_multiply_high(observer->speed_q22, ANGLE_PER_TICK_Q51);
-    measured->angle = edge + (uint32_t)fixed_shift((int64_t)angle_per_tick_q19 * (int32_t)encoder->edge_age_ticks,
-                                                   19u - machine_tables.speed_exponent);
+    measured->angle =
+        edge + (uint32_t)fixed_multiply_high(
+                   angle_per_tick_q19, (int32_t)(encoder->edge_age_ticks << (13 + machine_tables.speed_exponent)));
 }
 
-static inline int32_t measure_current_q9(const control_parameters_t *parameters, const control_sample_t *sample,
-                                         unsigned phase, control_measurement_t *measured) {
-    const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], parameters->current_scale_q18);
+static inline int32_t measure_current_q9(int32_t scale_q18, const control_sample_t *sample, unsigned phase,
+                                         control_measurement_t *measured) {
+    const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], scale_q18);
     measured->current_q9[phase] = current_q9;
     return current_q9;
 }
@@ -67,10 +68,11 @@ static inline void add_phase(sums_t *sums, int32_t current_q9, int32_t torque) {
 static sums_t measure_by_map(const control_parameters_t *parameters, const int32_t misalignment[HAL_PHASES_MAX],
                              const control_sample_t *sample, control_measurement_t *measured) {
     sums_t sums = {0, 0};
+    const int32_t scale_q18 = parameters->current_scale_q18;
     const unsigned phases = machine_tables.phases;
     UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
-        const int32_t current_q9 = measure_current_q9(parameters, sample, phase, measured);
+        const int32_t current_q9 = measure_current_q9(scale_q18, sample, phase, measured);
         int32_t torque = 0;
         if (current_q9 > 0) { /* false for most phases at any time */
             const uint32_t angle = commutation_angle(&parameters->commutation, &measured->commutation, phase);
@@ -86,13 +88,15 @@ static sums_t measure_by_map(const control_parameters_t *parameters, const int32
 static sums_t measure_by_plan(const control_parameters_t *parameters, const predictive_torque_t *predictive,
                               const control_sample_t *sample, control_measurement_t *measured) {
     sums_t sums = {0, 0};
+    const phase_cell_t *cells = predictive_torque_cells(predictive);
+    const int32_t scale_q18 = parameters->current_scale_q18;
     const unsigned phases = machine_tables.phases;
     UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
-        const int32_t current_q9 = measure_current_q9(parameters, sample, phase, measured);
+        const int32_t current_q9 = measure_current_q9(scale_q18, sample, phase, measured);
         int32_t flux = 0;
         if (current_q9 > 0) { /* false for most phases at any time */
-            add_phase(&sums, current_q9, predictive_torque_estimate(predictive, phase, current_q9, &flux));
+            add_phase(&sums, current_q9, predictive_torque_estimate(&cells[phase], current_q9, &flux));
         }
         measured->flux_linkage[phase] = flux;
     }

@@ -38,10 +38,12 @@ static uint32_t count_overruns(protection_t *protection, uint32_t missed_interru
     return protection->overruns;
 }
 
-/* True when the angle changed by more than the rotor can turn, over the lost periods as well. */
+/* True when the angle changed by more than the rotor can turn, over the lost periods as well: of those no more than 15
+ * count, which is beyond the overruns that are a fault. */
 static bool encoder_jumped(const protection_parameters_t *parameters, int32_t angle_step, uint32_t missed_interrupts) {
-    const uint64_t step_max = (uint32_t)parameters->angle_step_max;
-    return (uint32_t)fixed_abs(angle_step) > step_max * missed_interrupts + step_max;
+    const uint32_t step_max = (uint32_t)parameters->angle_step_max;
+    const uint32_t lost = (uint32_t)fixed_saturate_bits((int32_t)missed_interrupts, 5);
+    return (uint32_t)fixed_abs(angle_step) > step_max * lost + step_max;
 }
 
 /* True when the encoder does not count although the rotor turns. The observer alone cannot detect that: with a high
@@ -75,14 +77,13 @@ uint64_t protection_check(const protection_parameters_t *parameters, protection_
     const int32_t angle_step = (int32_t)(input->encoder_angle - protection->encoder_angle); /* modulo one revolution */
     protection->encoder_angle = input->encoder_angle;
     const uint32_t missed = input->missed_interrupts;
-    const bool overrun = count_overruns(protection, missed) >= PROTECTION_OVERRUNS_MAX ||
-                         input->skipped_deferred >= PROTECTION_SKIPPED_DEFERRED_MAX;
 
     uint32_t failed = 0;
     fail_if(&failed, input->current_max_q9 > parameters->current_trip_q9, FAULT_OVER_CURRENT);
     fail_if(&failed, input->dc_link_voltage_q6 > parameters->dc_link_over_voltage_q6, FAULT_OVER_VOLTAGE);
     fail_if(&failed, encoder_jumped(parameters, angle_step, missed), FAULT_ENCODER);
-    fail_if(&failed, overrun, FAULT_INTERRUPT_OVERRUN);
+    fail_if(&failed, count_overruns(protection, missed) >= PROTECTION_OVERRUNS_MAX, FAULT_INTERRUPT_OVERRUN);
+    fail_if(&failed, input->skipped_deferred >= PROTECTION_SKIPPED_DEFERRED_MAX, FAULT_INTERRUPT_OVERRUN);
     return failed;
 }
 

@@ -5,10 +5,10 @@
 #include "fixed/fixed.h"
 
 void torque_control_reset(const control_parameters_t *parameters, control_state_t *state) {
-    ditc_hysteresis_reset(&state->hysteresis);
     bp_pid_clear_telemetry(&state->duty.pid);
     switch (parameters->torque_law) {
     case TORQUE_LAW_HYSTERESIS:
+        ditc_hysteresis_reset(state->duty_q15);
         break;
     case TORQUE_LAW_DUTY:
         pwm_ditc_reset(&parameters->duty, &state->duty);
@@ -23,12 +23,8 @@ void torque_control_reset(const control_parameters_t *parameters, control_state_
 static void hysteresis_control(const control_parameters_t *parameters, control_state_t *state,
                                const control_measurement_t *measured) {
     const int32_t error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24);
-    ditc_hysteresis_step(&parameters->hysteresis, &state->hysteresis, &measured->commutation, error_q24,
-                         measured->current_q9);
-    UNROLL(4)
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        state->duty_q15[phase] = state->hysteresis.state[phase] * MODULATOR_DUTY_ONE_Q15;
-    }
+    ditc_hysteresis_step(&parameters->hysteresis, &measured->commutation, error_q24, measured->current_q9,
+                         state->duty_q15);
 }
 
 static void duty_control(const control_parameters_t *parameters, control_state_t *state,

@@ -54,11 +54,14 @@ scene_t scene(bool outgoing, int32_t outgoing_current_q9, int32_t active_current
     return s;
 }
 
-int8_t next_state(const scene_t &s, unsigned phase, int state, int32_t error) {
-    ditc_hysteresis_t ditc{};
-    ditc.state[phase] = int8_t(state);
-    ditc_hysteresis_step(&PARAMETERS, &ditc, &s.commutation, error, s.current_q9);
-    return ditc.state[phase];
+constexpr int32_t ONE_Q15 = 32768;
+
+int next_state(const scene_t &s, unsigned phase, int state, int32_t error) {
+    int32_t duty_q15[HAL_PHASES_MAX] = {};
+    duty_q15[phase] = state * ONE_Q15;
+    ditc_hysteresis_step(&PARAMETERS, &s.commutation, error, s.current_q9, duty_q15);
+    EXPECT_EQ(duty_q15[phase] % ONE_Q15, 0);
+    return duty_q15[phase] / ONE_Q15;
 }
 
 TEST(DitcHysteresis, follows_the_rule_table_for_every_state_error_and_role) {
@@ -106,11 +109,11 @@ TEST(DitcHysteresis, every_phase_can_have_every_role) {
             commutation.active = active;
             commutation.outgoing = outgoing;
             const int32_t current_q9[HAL_PHASES_MAX] = {100, 100, 100, 100};
-            ditc_hysteresis_t ditc;
-            ditc_hysteresis_reset(&ditc);
-            ditc_hysteresis_step(&PARAMETERS, &ditc, &commutation, INT32_MAX, current_q9);
+            int32_t duty_q15[HAL_PHASES_MAX];
+            ditc_hysteresis_reset(duty_q15);
+            ditc_hysteresis_step(&PARAMETERS, &commutation, INT32_MAX, current_q9, duty_q15);
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-                EXPECT_EQ(ditc.state[phase], phase == active || phase == outgoing ? 1 : -1);
+                EXPECT_EQ(duty_q15[phase], phase == active || phase == outgoing ? ONE_Q15 : -ONE_Q15);
             }
         }
     }
@@ -120,15 +123,15 @@ TEST(DitcHysteresis, in_a_commutation_gap_and_after_reset_all_phases_are_off) {
     commutation_t commutation{};
     commutation.active = commutation.outgoing = COMMUTATION_NONE;
     const int32_t current_q9[HAL_PHASES_MAX] = {100, 100, 100, 100};
-    ditc_hysteresis_t ditc;
-    ditc_hysteresis_reset(&ditc);
-    for (const int8_t state : ditc.state) {
-        EXPECT_EQ(state, -1);
+    int32_t duty_q15[HAL_PHASES_MAX];
+    ditc_hysteresis_reset(duty_q15);
+    for (const int32_t state : duty_q15) {
+        EXPECT_EQ(state, -ONE_Q15);
     }
     for (const int32_t error : ERRORS) {
-        ditc_hysteresis_step(&PARAMETERS, &ditc, &commutation, error, current_q9);
-        for (const int8_t state : ditc.state) {
-            EXPECT_EQ(state, -1);
+        ditc_hysteresis_step(&PARAMETERS, &commutation, error, current_q9, duty_q15);
+        for (const int32_t state : duty_q15) {
+            EXPECT_EQ(state, -ONE_Q15);
         }
     }
 }
@@ -140,11 +143,11 @@ TEST(DitcHysteresis, extreme_bands_do_not_overflow) {
             const ditc_hysteresis_parameters_t parameters = {
                 .band_inner_q24 = inner, .band_outer_q24 = outer, .current_limit_q9 = LIMIT};
             for (const int32_t error : ERRORS) {
-                ditc_hysteresis_t ditc;
-                ditc_hysteresis_reset(&ditc);
-                ditc_hysteresis_step(&parameters, &ditc, &both.commutation, error, both.current_q9);
+                int32_t duty_q15[HAL_PHASES_MAX];
+                ditc_hysteresis_reset(duty_q15);
+                ditc_hysteresis_step(&parameters, &both.commutation, error, both.current_q9, duty_q15);
                 for (unsigned phase = 0; phase < 3; phase++) {
-                    ASSERT_LE(std::abs(ditc.state[phase]), 1);
+                    ASSERT_LE(std::abs(duty_q15[phase]), ONE_Q15);
                 }
             }
         }

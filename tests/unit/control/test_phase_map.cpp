@@ -372,9 +372,10 @@ TEST(PhaseMap, results_beyond_their_format_saturate) {
     static machine_tables_t strong = machine_tables;
     strong.torque_format.result_shift = 12;
     strong.flux_format.result_shift = 12;
-    EXPECT_EQ(phase_map_results::torque_q24(strong, HALF_REV_Q32 + HALF_REV_Q32 / 2, CURRENT_END_Q9), INT32_MAX);
+    constexpr int32_t LAST_UNIT = INT32_MAX - 4095;
+    EXPECT_EQ(phase_map_results::torque_q24(strong, HALF_REV_Q32 + HALF_REV_Q32 / 2, CURRENT_END_Q9), LAST_UNIT);
     EXPECT_EQ(phase_map_results::torque_q24(strong, HALF_REV_Q32 / 2, CURRENT_END_Q9), INT32_MIN);
-    EXPECT_EQ(phase_map_results::flux_q29(strong, HALF_REV_Q32 + HALF_REV_Q32 / 2, CURRENT_END_Q9), INT32_MAX);
+    EXPECT_EQ(phase_map_results::flux_q29(strong, HALF_REV_Q32 + HALF_REV_Q32 / 2, CURRENT_END_Q9), LAST_UNIT);
 }
 
 TEST(PhaseMap, units_become_the_format_exactly_or_saturate) {
@@ -386,7 +387,7 @@ TEST(PhaseMap, units_become_the_format_exactly_or_saturate) {
             if (units > INT32_MAX || units < INT32_MIN) {
                 continue;
             }
-            const int64_t expected = std::clamp<int64_t>(units * (int64_t(1) << shift), INT32_MIN, INT32_MAX);
+            const int64_t expected = std::clamp(units, -limit, limit - 1) * (int64_t(1) << shift);
             ASSERT_EQ(phase_map_scale(&format, int32_t(units)), expected) << units << " << " << shift;
         }
     }

@@ -118,7 +118,8 @@ class Machine {
             current_q9[phase] = int32_t(std::floor(current_A * Q9 / 10.0 + 0.5)) * 10;
             if (current_q9[phase] > 0) {
                 const double estimate_Nm =
-                    std::ldexp(predictive_torque_estimate(&control, phase, current_q9[phase], &flux_units[phase]),
+                    std::ldexp(predictive_torque_estimate(&predictive_torque_cells(&control)[phase], current_q9[phase],
+                                                          &flux_units[phase]),
                                machine_tables.torque_format.result_shift) /
                     Q24;
                 const phase_cell_t &cell = control.cell[control.turn][phase];
@@ -422,7 +423,7 @@ TEST(PredictiveTorque, the_estimate_has_the_sign_of_its_half_and_is_0_after_a_re
     const placed_t placed(p, {0x10000000u, 0x50000000u, 0x20000000u});
     const predictive_torque_sample_t sample = placed.sample(p, current_q9, flux, -(8 << 24));
     const auto estimate = [&control](unsigned phase, int32_t *flux_units) {
-        return predictive_torque_estimate(&control, phase, 5 * 512, flux_units);
+        return predictive_torque_estimate(&predictive_torque_cells(&control)[phase], 5 * 512, flux_units);
     };
     int32_t duty_q15[HAL_PHASES_MAX], flux_units = 1;
     for (int k = 0; k < 2; k++) {
@@ -620,7 +621,7 @@ TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing)
                 flux[phase] = int32_t(random() >> 1);
                 misalignment[phase] = int32_t(uint32_t(random()));
                 int32_t estimate = 0;
-                predictive_torque_estimate(&control, phase, current_q9[phase], &estimate);
+                predictive_torque_estimate(&predictive_torque_cells(&control)[phase], current_q9[phase], &estimate);
             }
             const int32_t references[] = {INT32_MIN, INT32_MAX, 0, int32_t(random())};
             const int32_t voltages[] = {0, 1, 512 * 64 - 1, int32_t(random() % (512 * 64))};

@@ -137,7 +137,7 @@ class Control : public testing::Test {
     drive_t telemetry_drive{}; // as telemetry_collect reads it
     control_sample_t sample;
     command_t command;
-    hal_pwm_compare_t compare;
+    hal_pwm_compare_t compare{};
     double turns = 0.1, speed_rad_s = 0.0;
 };
 
@@ -190,7 +190,7 @@ TEST_F(Control, the_same_state_and_sample_give_the_same_bits) {
             control_state_t before;
             std::memcpy(&before, &state, sizeof state);
             step(COMMAND_RUN, 150.0);
-            hal_pwm_compare_t replayed;
+            hal_pwm_compare_t replayed{};
             control_step(&parameters, &before, &sample, &command, &replayed);
             deferred_step(&parameters, &before);
             ASSERT_EQ(std::memcmp(&before, &state, sizeof state), 0) << k;
@@ -365,7 +365,7 @@ TEST_F(Control, hysteresis_control_switches_whole_periods_only) {
                 ASSERT_GE(compare.lower[phase], compare.upper[phase]);
                 // States of the hysteresis: +1 both on, 0 one on, -1 both off.
                 const int on = (compare.upper[phase] != 0) + (compare.lower[phase] != 0);
-                ASSERT_EQ(on - 1, state.hysteresis.state[phase]);
+                ASSERT_EQ((on - 1) * 32768, state.duty_q15[phase]);
             }
         }
     }
@@ -498,7 +498,9 @@ TEST_F(SalientControl, the_torque_is_estimated_in_the_planned_cells_which_the_en
     for (unsigned phase = 0; phase < 3; phase++) {
         int32_t flux = 0;
         const int32_t current_q9 = state.measurement.current_q9[phase];
-        const int32_t torque = current_q9 > 0 ? predictive_torque_estimate(&before, phase, current_q9, &flux) : 0;
+        const int32_t torque =
+            current_q9 > 0 ? predictive_torque_estimate(&predictive_torque_cells(&before)[phase], current_q9, &flux)
+                           : 0;
         EXPECT_EQ(state.measurement.flux_linkage[phase], flux) << phase;
         estimate_q24 += phase_map_scale(&machine_tables.torque_format, torque);
     }
