@@ -171,7 +171,7 @@ def load_library() -> ctypes.CDLL:
 
 def flux_map_of(model: salient.machine.flux_map.FluxMap) -> FluxMap:
     """The map structure that the build generates from a machine file."""
-    inductance_min_H, _, _, current_scale_A = model.inductance_extremes()
+    inductance_min_H, _, _, current_scale_A = model.inductance_extremes
     flux_map = FluxMap(model.current_max_A, inductance_min_H, current_scale_A)
     for row, coefficients_J in zip(flux_map.coenergy_J, model.coefficients_J.tolist(), strict=True):
         row[:] = coefficients_J

@@ -119,7 +119,7 @@ def test_noise_on_the_map_is_not_amplified(tmp_path):
     torque_noise = np.abs(rough.torque_Nm(angle_rad, current_A) - torque_Nm) / np.max(np.abs(torque_Nm))
     assert 1e-3 < np.max(flux_noise) < 5e-3
     assert 3e-3 < np.max(torque_noise) < 2e-2
-    assert rough.inductance_extremes()[0] > 0.0
+    assert rough.inductance_extremes[0] > 0.0
 
 
 def test_all_derivatives_are_those_of_one_potential(sampled):

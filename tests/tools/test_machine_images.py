@@ -160,7 +160,7 @@ def started(folder: Path, machine: str | Path, **environment: str) -> subprocess
 
 
 def result_of(process: subprocess.Popen[str]) -> list:
-    output, errors = process.communicate(timeout=TIMEOUT_S)
+    output, errors = process.communicate()
     assert (process.returncode, errors) == (0, "")
     return json.loads(output)
 

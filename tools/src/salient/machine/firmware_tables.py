@@ -29,6 +29,7 @@ NODE_OFFSET = 32768
 CURRENT_A = np.arange(0.0, 81.0, 2.0)
 """Currents of the columns, in the machine's unit of current."""
 ROW_UNITS = 1 << 14  # units of row_start in half a pitch
+_COUNT = np.arange(ROW_UNITS + 1.0)
 _BIN_UNITS = ROW_UNITS // ANGLE_BINS
 _HALF_PITCH = 1 << 31
 CURVATURE_SHIFT_MAX = 8
@@ -280,7 +281,7 @@ def _row_width(shape: np.ndarray, start: int, tolerance: float) -> int:
 def _is_parabola(shape: np.ndarray, tolerance: float) -> bool:
     """True if the parabola through both ends and the middle is within the tolerance of all points."""
     last = shape.shape[1] - 1
-    u = np.arange(last + 1) / last
+    u = _COUNT[: last + 1] / last
     first, end = shape[:, :1], shape[:, -1:]
     middle = 0.5 * (shape[:, last // 2, None] + shape[:, (last + 1) // 2, None])
     curvature = 2.0 * (first + end) - 4.0 * middle

@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,7 @@ class FluxMap:
             value = value + factor * self._spline(angle_rad, within_A, by_angle, by_current + order)
         return value
 
+    @cached_property
     def inductance_extremes(self) -> tuple[float, float, float, float]:
         """(least incremental inductance in H, its angle in rad, its current in A, the current in A over which
         it changes: largest inductance by largest slope), searched at four points per interval."""
@@ -149,7 +151,7 @@ class FluxMap:
         return result
 
 
-def fit(curves: Sequence[Curve], rotor_poles: int) -> FluxMap:
+def fit(curves: Sequence[Curve], rotor_poles: int, file: Path | None = None) -> FluxMap:
     """The model of checked curves, their angles rising from 0 to half a pitch or to a whole one. FluxMapError when the
     curves contradict each other or the symmetry of the machine, or are too uneven for the model."""
     half_rad = math.pi / rotor_poles
@@ -170,7 +172,7 @@ def fit(curves: Sequence[Curve], rotor_poles: int) -> FluxMap:
     over_current = _coefficients(grid_Wb.T, current_A[1], flat_ends=False)
     step_rad = half_rad / ANGLE_INTERVALS
     flux_coefficients = _coefficients(over_current.T, step_rad, flat_ends=True).T
-    model = FluxMap(rotor_poles, current_max_A, _integral(flux_coefficients, current_A[1]))
+    model = FluxMap(rotor_poles, current_max_A, _integral(flux_coefficients, current_A[1]), file)
     _check_model(model, curves)
     return model
 
@@ -240,7 +242,7 @@ def _check_mirror(grid_Wb: np.ndarray, angle_rad: np.ndarray, current_A: np.ndar
 
 
 def _check_model(model: FluxMap, curves: Sequence[Curve]) -> None:
-    least_H, angle_rad, current_A, _ = model.inductance_extremes()
+    least_H, angle_rad, current_A, _ = model.inductance_extremes
     if least_H < INDUCTANCE_MIN_H:
         nearest = min(curves, key=lambda curve: abs(curve.angle_rad - angle_rad))
         raise FluxMapError(

@@ -10,7 +10,6 @@ may be irregular: angles at any distance, each with different currents. A row of
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from itertools import groupby, pairwise
 from pathlib import Path
 
@@ -44,10 +43,9 @@ def load_flux_map(path: Path, rotor_poles: int) -> FluxMap:
     """The model of a CSV file's map. FluxMapError: one line with the file and where possible its line."""
     try:
         text = read_text(path, FILE_BYTES_MAX)
-        model = fit(_curves(_points(text), math.pi / rotor_poles), rotor_poles)
+        return fit(_curves(_points(text), math.pi / rotor_poles), rotor_poles, path)
     except (FluxMapError, TextFileError) as error:
         raise FluxMapError(f"{path}: {error}") from None
-    return replace(model, file=path)
 
 
 Point = tuple[int, float, float, float]

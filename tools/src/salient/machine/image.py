@@ -13,7 +13,6 @@ import struct
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -193,15 +192,10 @@ PLANT = Structure("machine_t", (
 ))  # fmt: skip
 """Of a Machine and its Scaling: emulator/plant/machine.h, without the name and the flux map, parts of their own."""
 
-@lru_cache(maxsize=1)
-def _extremes(flux_map: FluxMap) -> tuple[float, float, float, float]:
-    return flux_map.inductance_extremes()
-
-
 FLUX_MAP = Structure("flux_map_t", (
     Member("current_max_A", "double", lambda flux_map: flux_map.current_max_A),
-    Member("inductance_min_H", "double", lambda flux_map: _extremes(flux_map)[0]),
-    Member("current_scale_A", "double", lambda flux_map: _extremes(flux_map)[3]),
+    Member("inductance_min_H", "double", lambda flux_map: flux_map.inductance_extremes[0]),
+    Member("current_scale_A", "double", lambda flux_map: flux_map.inductance_extremes[3]),
     Member("coenergy_J", "double", lambda flux_map: flux_map.coefficients_J,
            (CURRENT_INTERVALS + 4, ANGLE_INTERVALS + 3)),
 ))  # fmt: skip
