@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from salient.bench.drive import DriveError
+from salient.bench.session import Session
+from salient.bus.signals import load_database
+from salient.dbc import database_hash
 from salient.errors import UsageError
 from salient.machine.parameter_table import read_table
 from salient.machine.scaling import Exponents
@@ -110,3 +114,30 @@ def test_control_rate_too_low_for_the_highest_speed_of_the_file_is_refused_with_
     with pytest.raises(UsageError, match=f"^{reason}$"):
         make_bench(machine=str(OTHERS / "fastest.toml"), control_rate_hz=20_000)
     assert make_bench(machine=str(OTHERS / "fastest.toml"), control_rate_hz=50_000).drive.fault in ("none", "unknown")
+
+
+def test_parameters_are_written_and_read_in_si_units(make_bench):
+    bench = make_bench(machine=str(OTHERS / "fastest.toml"))
+    parameters = bench.drive.parameters
+    assert parameters.row("over_speed_rpm").fraction_bits == -3
+    for name, value in (("over_speed_rpm", 16_000.0), ("torque_max_Nm", 1.125), ("current_limit_A", 20.25),
+                        ("inertia_kg_m2", 1.25e-4), ("smc_delta", 0.5)):
+        row = parameters.row(name)
+        parameters[name] = value
+        assert parameters[name] == pytest.approx(value, abs=0.5 * 2.0**-row.fraction_bits), name
+    with pytest.raises(DriveError, match="torque_max_Nm 3: must be 0 to 2.5 N m"):
+        parameters["torque_max_Nm"] = 3.0
+
+
+def test_database_written_for_a_machine_is_that_of_its_drive_and_another_is_reported(make_bench, salient, tmp_path,
+                                                                                    capsys):
+    file, dbc = OTHERS / "smallest.toml", tmp_path / "smallest.dbc"
+    result = salient("machine", file, "--out", tmp_path, "--dbc", dbc)
+    assert result.returncode == 0, result.stderr
+    bench = make_bench(machine=str(file))
+    bench.run_for(0.02)
+    assert bench.telemetry["dbc_hash"].last == database_hash(load_database(dbc))
+    assert "another drive.dbc" not in capsys.readouterr().err
+    with Session(bench.address) as session:
+        session.run_for(0.15)
+    assert "was built from another drive.dbc" in capsys.readouterr().err
