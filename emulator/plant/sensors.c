@@ -81,7 +81,7 @@ void sensors_sample_adc(sensors_t *sensors, const plant_t *plant, hal_adc_sample
     }
     sample->bus_voltage_counts = to_counts(sensors, plant->bus_voltage_V * (1.0 / HAL_ADC_BUS_FULL_SCALE_V));
     sample->load_torque_counts =
-        to_counts(sensors, 0.5 + plant->load_torque_Nm * (0.5 / HAL_ADC_LOAD_TORQUE_FULL_SCALE_NM));
+        to_counts(sensors, 0.5 + plant_shaft_torque_Nm(plant) * (0.5 / HAL_ADC_LOAD_TORQUE_FULL_SCALE_NM));
 }
 
 /* --- Encoder --- */

@@ -32,7 +32,7 @@ void truth_pack(const plant_t *plant, transport_frame_t frames[TRUTH_FRAMES]) {
     double angle_deg = fmod(plant->rotor_angle_rad * DEG_PER_RAD, 360.0);
     struct rig_truth_bench_t bench;
     bench.rotor_angle_deg = rig_truth_bench_rotor_angle_deg_encode(angle_deg < 0.0 ? angle_deg + 360.0 : angle_deg);
-    rig_truth_bench_set_physical_load_torque_nm(&bench, plant->load_torque_Nm);
+    rig_truth_bench_set_physical_load_torque_nm(&bench, plant_shaft_torque_Nm(plant));
     rig_truth_bench_set_physical_bus_voltage_v(&bench, plant->bus_voltage_V);
     rig_truth_bench_pack(begin(&frames[2], RIG_TRUTH_BENCH_FRAME_ID), &bench, 8);
 }

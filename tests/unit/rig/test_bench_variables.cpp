@@ -41,7 +41,8 @@ TEST_F(BenchVariables, RangesAreThoseOfTheDatabase) {
                   {5, 0, 100000},         {6, 0, 1000000},   {7, 0, 1000000},  {8, -100000, 100000},
                   {9, 100, 1000000},      {10, 0, 800},      {11, 0, 50000},   {12, 2000, 50000},
                   {13, 2000, 50000},      {14, 2000, 50000}, {15, 0, 50000},   {16, -50000, 50000},
-                  {17, 0, 2000},          {18, 0, 8000000},  {19, 0, 2000000}, {20, 10, 1000000}};
+                  {17, 0, 2000},          {18, 0, 8000000},  {19, 0, 2000000}, {20, 10, 1000000},
+                  {21, -8388608, 8000000}};
     for (const auto &range : ranges) {
         SCOPED_TRACE(int(range.variable));
         EXPECT_EQ(set(range.variable, range.low), DONE);
@@ -49,7 +50,7 @@ TEST_F(BenchVariables, RangesAreThoseOfTheDatabase) {
         EXPECT_EQ(set(range.variable, range.low - 1), OUT_OF_RANGE);
         EXPECT_EQ(set(range.variable, range.high + 1), OUT_OF_RANGE);
     }
-    for (unsigned variable : {0u, 21u, 128u, 255u}) {
+    for (unsigned variable : {0u, 22u, 128u, 255u}) {
         EXPECT_EQ(set(static_cast<uint8_t>(variable), 1), NO_SUCH_VARIABLE);
     }
 }
