@@ -20,6 +20,8 @@ void deferred_reset_run(const control_parameters_t *parameters, control_state_t 
     state->deferred_request.initial.window = parameters->predictive.base_window;
     state->deferred_request.initial.speed_law_torque_q24 = 0;
     state->deferred_request.initial.speed_reference_q22 = 0;
+    state->deferred_request.initial.torque_min_q24 = 0;
+    state->deferred_request.initial.torque_max_q24 = 0;
 }
 
 void deferred_reset_observer(control_state_t *state) {
@@ -42,7 +44,6 @@ static void hand_over_predictive(const control_state_t *state, const control_mea
     input->speed_correction_q22 = state->observer.speed_correction_q22;
     input->electrical = measured->commutation.electrical;
     input->current_q9 = measured->current_q9[state->deferred.misalignment.phase_index]; /* no step is pending */
-    input->torque_reference_q24 = state->torque_reference_q24;
     input->torque_sum_q24 = measured->torque_sum_q24;
     input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
 }
@@ -62,7 +63,8 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->command_age_us = sample->time_us - command->time_us;
     input->speed_q22 = state->observer.speed_q22;
     input->run = state->state_machine.state == DRIVE_STATE_RUN;
-    input->commanded_speed_q22 = command->request == COMMAND_RUN ? command->speed_reference_q22 : 0;
+    input->command = *command;
+    input->torque_reference_q24 = state->torque_reference_q24;
     if (parameters->bandwidth.adaptive) {
         hand_over_bandwidth(state, measured, input);
     }
@@ -79,6 +81,7 @@ static void follow_resets(const control_parameters_t *parameters, deferred_t *de
         deferred->advance_q30 = 0;
         deferred->window = parameters->predictive.base_window;
         deferred->run = false;
+        deferred->mode = DRIVE_MODE_SPEED;
         speed_pi_reset(&deferred->speed_pi);
         deferred->torque_offset = (torque_offset_t){0};
     }
@@ -113,10 +116,13 @@ static observer_bandwidth_limits_t bandwidth_limits(const control_parameters_t *
     return observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld);
 }
 
-/* The misalignment is observable while speed, load and voltage are steady. */
+/* The misalignment is observable while speed, load and voltage are steady. In torque mode nothing keeps the speed
+ * steady; a dynamometer that does hides the ripple of the torque, and what the observer then takes for a load would be
+ * learned. */
 static bool steady(const control_parameters_t *parameters, const deferred_t *deferred, const deferred_input_t *input) {
     const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
-    return deferred->load_constant && input->bandwidth.stage >= parameters->bandwidth.moving_stage &&
+    return deferred->mode == DRIVE_MODE_SPEED && deferred->load_constant &&
+           input->bandwidth.stage >= parameters->bandwidth.moving_stage &&
            speed_error_q22 < fixed_abs(input->speed_q22) / 8 && input->torque_shortfall_q24 == 0;
 }
 
@@ -178,13 +184,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     if (parameters->bandwidth.adaptive) {
         results->bandwidth = bandwidth_limits(parameters, deferred, input);
     }
-    results->speed_law_torque_q24 = 0;
-    results->speed_reference_q22 = 0;
-    if (input->run) {
-        results->speed_law_torque_q24 =
-            fixed_add(speed_control_law_q24(parameters, deferred, input), torque_offset_q24(&deferred->torque_offset));
-        results->speed_reference_q22 = deferred->speed_reference_q22;
-    }
+    speed_control_deferred(parameters, deferred, input, results);
     deferred->run = input->run;
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run) {
         take_turns(parameters, deferred, input);
