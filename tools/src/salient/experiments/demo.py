@@ -30,7 +30,7 @@ from salient.errors import UsageError
 from salient.experiments import metrics, plots
 from salient.experiments.report import METRIC_ROWS, captions, format_metric, format_published, write_report
 from salient.experiments.results import make_results, write_results
-from salient.experiments.scenario import Scenario, load_scenarios, run_scenario
+from salient.experiments.scenario import Scenario, check_parameters, load_scenarios, run_scenario
 from salient.machine.file import load_machine, machine_path
 from salient.pages import Plot
 from salient.paths import SCENARIOS
@@ -147,6 +147,8 @@ def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
                               for scenario in load_scenarios(SCENARIOS / f"{experiment}.toml")]
                  for experiment in EXPERIMENTS}
     executable(scenarios["start_600"][0].machine, options.build)
+    for of in scenarios.values():
+        check_parameters(of, options.build)
     return scenarios
 
 
