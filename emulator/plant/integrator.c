@@ -30,9 +30,13 @@ MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magn
     }
     const double friction_Nm_s = setting->friction_Nm_s, inverse_inertia = 1.0 / setting->inertia_kg_m2;
     const double acceleration_rad_s2 =
-        (torque_Nm - friction_Nm_s * speed_rad_s - setting->load_torque_Nm) * inverse_inertia;
+        setting->held ? setting->held_acceleration_rad_s2
+                      : (torque_Nm - friction_Nm_s * speed_rad_s - setting->load_torque_Nm) * inverse_inertia;
     derivative->acceleration_rad_s2 = acceleration_rad_s2;
-    derivative->jerk_rad_s3 = (torque_Nm_s - friction_Nm_s * acceleration_rad_s2) * inverse_inertia;
+    derivative->jerk_rad_s3 =
+        setting->held ? 0.0 : (torque_Nm_s - friction_Nm_s * acceleration_rad_s2) * inverse_inertia;
+    derivative->torque_Nm = torque_Nm;
+    derivative->torque_Nm_s = torque_Nm_s;
     derivative->link_V_s = 0.0;
     derivative->link_V_s2 = 0.0;
     if (link) {
@@ -87,6 +91,14 @@ MAGNETICS_INLINE void step_of(const integrator_setting_t *setting, magnetics_for
     integrals->speed2_rad2_s = step_s * start->speed_rad_s * start->speed_rad_s +
                                sixth_s2 * (2.0 * start->speed_rad_s * first->acceleration_rad_s2 +
                                            4.0 * middle.speed_rad_s * second.acceleration_rad_s2);
+    if (setting->held) {
+        const double start_W_s =
+            first->torque_Nm_s * start->speed_rad_s + first->torque_Nm * first->acceleration_rad_s2;
+        const double middle_W_s =
+            second.torque_Nm_s * middle.speed_rad_s + second.torque_Nm * second.acceleration_rad_s2;
+        integrals->mechanical_J =
+            step_s * first->torque_Nm * start->speed_rad_s + sixth_s2 * (start_W_s + 2.0 * middle_W_s);
+    }
     end->angle_rad = start->angle_rad + integrals->angle_rad;
     end->speed_rad_s = start->speed_rad_s + step_s * first->acceleration_rad_s2 +
                        sixth_s2 * (first->jerk_rad_s3 + 2.0 * second.jerk_rad_s3);

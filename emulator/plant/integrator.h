@@ -23,6 +23,8 @@ typedef struct {
     const magnetics_model_t *magnetics;
     double inertia_kg_m2, friction_Nm_s;
     double load_torque_Nm, supply_voltage_V;
+    bool held; /* the acceleration is imposed */
+    double held_acceleration_rad_s2;
     double ahead_rad; /* small angle in the direction of motion, see magnetics_kernel_trapezoid */
     bool link;        /* the DC link has a capacitor: its voltage is a state */
     bool source_conducts, chopper_on;
@@ -43,6 +45,7 @@ typedef struct {
 /* First and second time derivatives; the first of the angle is the speed of the state. */
 typedef struct {
     double acceleration_rad_s2, jerk_rad_s3;
+    double torque_Nm, torque_Nm_s; /* of the machine: itself and its first derivative */
     double link_V_s, link_V_s2;
     double current_A_s[HAL_PHASES_MAX], current_A_s2[HAL_PHASES_MAX];
 } integrator_derivative_t;
@@ -51,6 +54,7 @@ typedef struct {
 typedef struct {
     double angle_rad;                    /* speed */
     double speed2_rad2_s;                /* speed^2 */
+    double mechanical_J;                 /* torque of the machine times speed; only of a held shaft */
     double charge_As[HAL_PHASES_MAX];    /* current */
     double current2_A2s[HAL_PHASES_MAX]; /* current^2 */
     /* Only with a capacitor: */

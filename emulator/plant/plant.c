@@ -70,6 +70,16 @@ void plant_set_supply_voltage(plant_t *plant, double voltage_V) {
     }
 }
 
+void plant_hold(plant_t *plant, double speed_rad_s, double acceleration_rad_s2) {
+    plant->held = true;
+    plant->speed_rad_s = speed_rad_s;
+    plant->held_acceleration_rad_s2 = acceleration_rad_s2;
+}
+
+void plant_release(plant_t *plant) {
+    plant->held = false;
+}
+
 void plant_set_step_factor(plant_t *plant, double factor) {
     double time_constant_s =
         fmin(plant->magnetics.inductance_min_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
@@ -155,6 +165,8 @@ static void find_setting(plant_t *plant, integrator_setting_t *setting) {
     setting->inertia_kg_m2 = plant->inertia_kg_m2;
     setting->friction_Nm_s = plant->friction_Nm_s;
     setting->load_torque_Nm = plant->load_torque_Nm;
+    setting->held = plant->held;
+    setting->held_acceleration_rad_s2 = plant->held_acceleration_rad_s2;
     setting->supply_voltage_V = plant->supply_voltage_V;
     setting->ahead_rad = copysign(2.0 * MAGNETICS_SMOOTH_TOLERANCE_RAD, plant->speed_rad_s);
     find_conducting(plant, setting);
@@ -372,7 +384,15 @@ static double step_length_s(plant_t *plant, const integrator_setting_t *setting,
     return step_s;
 }
 
-static void add_energies(plant_t *plant, const integrator_setting_t *setting, const integrator_integrals_t *integrals) {
+/* The dynamometer takes what the machine gives and neither load, friction nor the rotor's kinetic energy takes. */
+static double dynamometer_J(const plant_t *plant, const integrator_integrals_t *integrals, double speed_change_rad_s) {
+    const double mean_rad_s = plant->speed_rad_s + 0.5 * speed_change_rad_s;
+    return integrals->mechanical_J - plant->load_torque_Nm * integrals->angle_rad -
+           plant->friction_Nm_s * integrals->speed2_rad2_s - plant->inertia_kg_m2 * speed_change_rad_s * mean_rad_s;
+}
+
+static void add_energies(plant_t *plant, const integrator_setting_t *setting, const integrator_integrals_t *integrals,
+                         double speed_change_rad_s) {
     const double winding_ohm = plant->winding_ohm;
     for (unsigned index = 0; index < setting->count; index++) {
         const double charge_As = integrals->charge_As[index], current2_A2s = integrals->current2_A2s[index];
@@ -388,6 +408,9 @@ static void add_energies(plant_t *plant, const integrator_setting_t *setting, co
             setting->drop_V[index] * charge_As + (setting->resistance_ohm[index] - winding_ohm) * current2_A2s;
     }
     plant->energy_load_J += plant->load_torque_Nm * integrals->angle_rad;
+    if (setting->held) {
+        plant->energy_load_J += dynamometer_J(plant, integrals, speed_change_rad_s);
+    }
     plant->energy_friction_J += plant->friction_Nm_s * integrals->speed2_rad2_s;
 }
 
@@ -435,7 +458,7 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
         if (plant->sample != NULL) {
             sample_step(plant, &setting, &start, &first, &end, at_s, step_s, to_ns);
         }
-        add_energies(plant, &setting, &integrals);
+        add_energies(plant, &setting, &integrals, end.speed_rad_s - start.speed_rad_s);
         if (setting.link) {
             add_link_energies(plant, &setting, &integrals, step_s);
         }
@@ -485,6 +508,14 @@ double plant_torque_Nm(const plant_t *plant) {
         }
     }
     return torque_Nm;
+}
+
+double plant_shaft_torque_Nm(const plant_t *plant) {
+    if (!plant->held) {
+        return plant->load_torque_Nm;
+    }
+    return plant_torque_Nm(plant) - plant->friction_Nm_s * plant->speed_rad_s -
+           plant->inertia_kg_m2 * plant->held_acceleration_rad_s2;
 }
 
 double plant_flux_linkage_Wb(const plant_t *plant, unsigned phase) {

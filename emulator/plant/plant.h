@@ -5,6 +5,7 @@
  *
  *   d psi_j / dt = v_j - R i_j      with psi_j = psi(theta - j pitch / phases, i_j)
  *   J d omega / dt = sum T_j - B omega - T_load,   d theta / dt = omega
+ *     A dynamometer that holds the shaft imposes d omega / dt and takes what is missing in this equation.
  *   v_j = s_j Vdc - voltage drops of the two conducting devices; s_j = +1 with both switches on (two switches),
  *     0 with one (a switch and a diode), -1 with none (two diodes); a device drops V + r i (machine.h). A phase without
  *     current that is not driven by a positive v_j is open (its diodes block) and stays at exactly 0 A.
@@ -73,7 +74,7 @@ typedef struct plant {
     double energy_returned_J;  /* to the link, both switches off */
     double energy_copper_J;    /* in the windings */
     double energy_converter_J; /* in the half bridges' devices */
-    double energy_load_J;      /* work done on the load */
+    double energy_load_J;      /* work done on the load and the dynamometer */
     double energy_friction_J;
     double energy_supplied_J; /* by the source; this and the next two with a capacitor only */
     double energy_source_J;   /* in the source's resistance */
@@ -88,6 +89,8 @@ typedef struct plant {
     double step_factor, step_max_s, step_current_A, step_angle_rad;
     double smooth_from_rad, smooth_to_rad;
     double supply_voltage_V;
+    bool held; /* plant_hold */
+    double held_acceleration_rad_s2;
     half_bridge_switches_t switches;
     half_bridge_pattern_t pattern;
     unsigned edge_next;
@@ -102,6 +105,13 @@ void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_r
 
 /* Sets the supply voltage (>= 0) from time_ns on; without a capacitor it is the DC-link voltage. */
 void plant_set_supply_voltage(plant_t *plant, double voltage_V);
+
+/* Holds the shaft by a dynamometer from time_ns on, whatever the torques: at this speed and acceleration. A speed other
+ * than the present one is a jump, whose kinetic energy is not in the energy balance. */
+void plant_hold(plant_t *plant, double speed_rad_s, double acceleration_rad_s2);
+
+/* Frees a held shaft from time_ns on. */
+void plant_release(plant_t *plant);
 
 /* Changes the machine from time_ns on. Angle, speed and currents continue unchanged, so the energies of fields and
  * rotor jump, without a counterpart in the energy balance, which holds over intervals without such a change. */
@@ -130,6 +140,9 @@ void plant_set_step_factor(plant_t *plant, double factor);
 
 /* Electromagnetic torque, sum of all phases. */
 double plant_torque_Nm(const plant_t *plant);
+
+/* Torque that the shaft takes, as a torque transducer on it shows: that of the load and of a dynamometer. */
+double plant_shaft_torque_Nm(const plant_t *plant);
 
 /* Mechanical angle relative to the aligned position of a phase (0 and every pole pitch), not wrapped. */
 double plant_phase_angle_rad(const plant_t *plant, unsigned phase);

@@ -93,7 +93,7 @@ void recorder_sample(void *context, const plant_t *plant) {
     row.time_s = (double)plant->time_ns * 1e-9;
     row.values[0] = (float)(plant->speed_rad_s * RPM_PER_RAD_S);
     row.values[1] = (float)plant_torque_Nm(plant);
-    row.values[2] = (float)plant->load_torque_Nm;
+    row.values[2] = (float)plant_shaft_torque_Nm(plant);
     row.values[3] = wrapped_deg < 360.0f ? wrapped_deg : 0.0f; /* just below 360 deg the float is rounded up */
     row.values[4] = (float)plant->bus_voltage_V;
     float *value = row.values + 5;

@@ -81,7 +81,8 @@ void sensors_sample_adc(sensors_t *sensors, const plant_t *plant, hal_adc_sample
             to_counts(sensors, sensed_current_A(sensors, true_A[phase]) * (1.0 / ranges->current_A));
     }
     sample->bus_voltage_counts = to_counts(sensors, plant->bus_voltage_V * (1.0 / ranges->dc_link_V));
-    sample->load_torque_counts = to_counts(sensors, 0.5 + plant->load_torque_Nm * (0.5 / ranges->load_torque_Nm));
+    sample->load_torque_counts =
+        to_counts(sensors, 0.5 + plant_shaft_torque_Nm(plant) * (0.5 / ranges->load_torque_Nm));
 }
 
 /* --- Encoder --- */

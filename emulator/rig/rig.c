@@ -2,6 +2,7 @@
 
 #include "rig/bus_events.h"
 #include "rig/control_period.h"
+#include "rig/dynamometer.h"
 #include "rig/load.h"
 #include "rig/server.h"
 #include "rig/stimulus.h"
@@ -11,6 +12,7 @@
 static const scheduler_handler_t handlers[EVENT_COUNT] = {
     [EVENT_BENCH_VARIABLE] = stimulus_event,
     [EVENT_LOAD] = load_event,
+    [EVENT_DYNAMOMETER] = dynamometer_event,
     [EVENT_CAN] = bus_event,
     [EVENT_CURRENT_HOLD] = control_period_hold_event,
     [EVENT_CONTROL] = control_period_start_event,

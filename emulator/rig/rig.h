@@ -106,6 +106,7 @@ typedef struct {
     uint64_t truth_period_ns;
     stimulus_queue_t stimuli;
     load_t load;                  /* load.c */
+    double held_speed_rad_s;      /* dynamometer.c: where its acceleration ends */
     rig_run_t runs[RIG_RUNS_MAX]; /* server.c, by time, equal times in the order of arrival */
     unsigned run_count;
     uint64_t stop_checked_ns;

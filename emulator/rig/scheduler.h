@@ -13,6 +13,7 @@
 typedef enum {
     EVENT_BENCH_VARIABLE, /* a bench variable changes (RIG_SET) */
     EVENT_LOAD,           /* a load that moves takes its next step */
+    EVENT_DYNAMOMETER,    /* the shaft has the speed at which it is held */
     EVENT_CAN,            /* the CAN bus: a frame is complete, or the next one may start */
     EVENT_CURRENT_HOLD,   /* delayed current sensors hold the phase currents */
     EVENT_CONTROL,        /* a control period starts */

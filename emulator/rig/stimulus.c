@@ -4,6 +4,7 @@
 
 #include "bench_variables.h"
 #include "rig/control_period.h"
+#include "rig/dynamometer.h"
 #include "rig/load.h"
 #include "rig_codec.h"
 
@@ -69,6 +70,7 @@ static const target_t targets[BENCH_VARIABLE_COUNT] = {
     [BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_NM] = {.set = load_set_sine_amplitude},
     [BENCH_VARIABLE_LOAD_SINE_FREQUENCY_HZ] = {.set = load_set_sine_frequency},
     [BENCH_VARIABLE_LOAD_PROFILE_NM] = {.set = load_set_profile},
+    [BENCH_VARIABLE_HELD_SPEED_RPM] = {.set = dynamometer_set_speed},
     [BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM] = {.set = load_set_torque},
     [BENCH_VARIABLE_LOAD_RAMP_COARSE_NM_S] = {.set = load_set_ramp},
     [BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM] = {.set = load_set_sine_amplitude},

@@ -35,7 +35,7 @@ void truth_pack(const plant_t *plant, transport_frame_t frames[TRUTH_FRAMES]) {
     double angle_deg = fmod(plant->rotor_angle_rad * DEG_PER_RAD, 360.0);
     struct rig_truth_bench_t bench;
     rig_truth_bench_set_physical_rotor_angle_deg(&bench, angle_deg < 0.0 ? angle_deg + 360.0 : angle_deg);
-    bench.load_torque_nm = rig_truth_bench_load_torque_nm_encode(plant->load_torque_Nm);
+    bench.load_torque_nm = rig_truth_bench_load_torque_nm_encode(plant_shaft_torque_Nm(plant));
     bench.bus_voltage_v = rig_truth_bench_bus_voltage_v_encode(plant->bus_voltage_V);
     for (uint8_t part = 0; part < 2; part++) {
         bench.part = part;

@@ -20,8 +20,9 @@ typedef struct {
 } commands_counters_t;
 
 typedef struct {
-    e2e_receiver_t receiver;
-    uint32_t last_received_us; /* time of the last frame that the receiver accepted */
+    e2e_receiver_t receiver;        /* of DRIVE_COMMAND */
+    e2e_receiver_t torque_receiver; /* of DRIVE_TORQUE_COMMAND */
+    uint32_t last_received_us;      /* time of the last frame that one of them accepted */
     commands_counters_t counters;
 } commands_t;
 
@@ -30,7 +31,7 @@ typedef enum { COMMANDS_REJECTED, COMMANDS_COMMAND, COMMANDS_PARAMETER_REQUEST }
 /* Clears the counters; the first valid command is accepted with any sequence counter. */
 void commands_init(commands_t *commands);
 
-/* Restarts the receiver after more than timeout_us without a command, so that a sender may start again with any
+/* Restarts the receivers after more than timeout_us without a command, so that a sender may start again with any
  * counter. Call it at least once in 35 minutes, half the period of the clock. [background] */
 void commands_check_timeout(commands_t *commands, uint32_t time_us, uint32_t timeout_us);
 

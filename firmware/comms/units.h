@@ -5,6 +5,7 @@
  *   angle      2^-32 turn, unsigned           2^-16 turn (DBC: degrees)      units_angle_u16
  *   deviation  2^-32 turn, signed             2^-20 turn (DBC: degrees)      units_deviation_q20
  *   torque     Q7.24 N m                      2^-8 N m                       units_torque_q8
+ *   torque     Q7.24 N m                      2^-16 N m (command)            units_torque_q24
  *   current    unsigned Q7.9 A                2^-9 A                         none
  *   voltage    unsigned Q9.6 V                2^-6 V                         none
  *   gains      unsigned Q1.15 1/(N m)         2^-15 1/(N m)                  none
@@ -36,5 +37,10 @@ int32_t units_deviation_q20(int32_t angle);
 /* N m in 2^-8 from Q7.24: -32768..32768; the upper end exceeds 16 bits by one (the drive_telemetry_pack functions
  * saturate). */
 int32_t units_torque_q8(int32_t torque_q24);
+
+/* N m in Q7.24 from 2^-16, 24 bits: exact. */
+static inline int32_t units_torque_q24(int32_t torque_q16) {
+    return torque_q16 * (1 << 8);
+}
 
 #endif

@@ -11,6 +11,10 @@ void speed_pi_reset(speed_pi_t *pi) {
     pi->integral_q54 = 0;
 }
 
+void speed_pi_follow(speed_pi_t *pi, int32_t torque_q24) {
+    pi->integral_q54 = fixed_product(torque_q24, 1 << 30);
+}
+
 int32_t speed_pi_step(const speed_pi_parameters_t *parameters, speed_pi_t *pi, int32_t speed_error_q22) {
     const int32_t min_q24 = parameters->torque_min_q24;
     const int32_t max_q24 = parameters->torque_max_q24;

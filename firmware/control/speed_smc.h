@@ -25,7 +25,7 @@ typedef struct {
     int32_t epsilon_q31;    /* eps, Q0.31, 2^-15..1 - 2^-31; eps = 1 is stored as 1 - 2^-31 */
     int32_t delta_q27;      /* delta / ln 2, s/rad, Q4.27; delta 0..10 */
     int32_t friction_q30;   /* B, N m s, Q1.30, >= 0 */
-    int32_t torque_min_q24; /* N m, Q7.24 */
+    int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
     int32_t torque_max_q24; /* N m, Q7.24 */
 } speed_smc_parameters_t;
 
@@ -34,10 +34,10 @@ typedef struct {
  * the gain and 2^-20 N m. Accumulator: 64 bits, unsigned. Rounded towards zero. */
 int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, int32_t x_q22);
 
-/* Torque reference in N m, Q7.24, clamped to the limits: reaching torque, load torque (N m, Q7.24) and friction at a
+/* Torque reference in N m, Q7.24, within the limits: reaching torque, load torque (N m, Q7.24) and friction at a
  * speed in rad/s, Q9.22, any values. Sums saturate; the friction torque is rounded down, within 16 LSB of saturation
  * when it saturates. */
 int32_t speed_smc_torque_q24(const speed_smc_parameters_t *parameters, int32_t reaching_q24, int32_t speed_q22,
-                             int32_t load_torque_q24);
+                             int32_t load_torque_q24, int32_t torque_min_q24, int32_t torque_max_q24);
 
 #endif

@@ -4,6 +4,7 @@
  * positive throughout the drive. A negative speed reference requests reverse rotation. The quadrants depend on the
  * controller: salient motors and brakes in both directions and reverses through zero speed without leaving RUN;
  * traditional and paper only motor forwards, treat a negative reference as 0 and leave braking to friction and load.
+ * `stop` ramps the speed to zero in either mode.
  */
 #ifndef DRIVE_COMMAND_H
 #define DRIVE_COMMAND_H
@@ -14,8 +15,10 @@
 
 typedef struct {
     command_request_t request;
-    int32_t speed_reference_q22; /* for COMMAND_RUN: rad/s, Q9.22, -3000..3000 r/min, negative: reverse */
-    uint32_t time_us;            /* the drive's time at acceptance */
+    drive_mode_t mode;            /* of COMMAND_RUN: which of the references it follows */
+    int32_t speed_reference_q22;  /* rad/s, Q9.22, -3000..3000 r/min, negative: reverse */
+    int32_t torque_reference_q24; /* N m, Q7.24, any value, negative: reverse or braking */
+    uint32_t time_us;             /* the drive's time at acceptance */
 } command_t;
 
 #endif

@@ -51,8 +51,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     const bool was_running = state->state_machine.state == DRIVE_STATE_RUN;
     const bool run = supervise(parameters, state, sample, command, measured, fault_mask);
     if (run) {
-        state->torque_reference_q24 =
-            speed_control_torque_q24(parameters, &state->observer, sample, deferred->speed_law_torque_q24);
+        state->torque_reference_q24 = speed_control_torque_q24(parameters, &state->observer, sample, deferred);
         torque_control(parameters, state, deferred, measured);
         modulate(state->duty_q15, machine_tables.phases, parameters->period_ticks, parameters->interleaved_pwm,
                  compare);

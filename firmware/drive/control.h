@@ -29,6 +29,7 @@
 #include "control/speed_pi.h"
 #include "control/speed_smc.h"
 #include "control/stroke_mean.h"
+#include "control/torque_mode.h"
 #include "control/torque_offset.h"
 #include "control/torque_trim.h"
 #include "drive/command.h"
@@ -81,6 +82,7 @@ typedef struct {
     stroke_mean_parameters_t stroke_mean;
     torque_offset_parameters_t torque_offset;
     periodic_load_parameters_t periodic_load;
+    torque_mode_parameters_t torque_mode;
 } control_parameters_t;
 
 /* Inputs of one control period as the HAL delivers them. */
@@ -120,6 +122,8 @@ typedef struct {
     bool run;                    /* in the last input */
     int32_t speed_reference_q22; /* after the ramp, rad/s, Q9.22 */
     speed_pi_t speed_pi;
+    drive_mode_t mode; /* of the last input */
+    torque_mode_t torque_mode;
     unsigned turn;       /* of the last step, below DEFERRED_TURNS */
     int32_t advance_q30; /* of the conduction windows, Q1.30, 0..1 */
     torque_sharing_window_t window;

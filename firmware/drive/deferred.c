@@ -21,6 +21,8 @@ void deferred_reset_run(const control_parameters_t *parameters, control_state_t 
     state->deferred_request.initial.speed_law_torque_q24 = 0;
     state->deferred_request.initial.periodic_load_q24 = 0;
     state->deferred_request.initial.speed_reference_q22 = 0;
+    state->deferred_request.initial.torque_min_q24 = 0;
+    state->deferred_request.initial.torque_max_q24 = 0;
 }
 
 void deferred_reset_observer(control_state_t *state) {
@@ -43,7 +45,6 @@ static void hand_over_predictive(const control_state_t *state, const control_mea
     input->speed_correction_q22 = state->observer.speed_correction_q22;
     input->electrical = measured->commutation.electrical;
     input->current_q9 = measured->current_q9[state->deferred.misalignment.phase_index]; /* no step is pending */
-    input->torque_reference_q24 = state->torque_reference_q24;
     input->torque_sum_q24 = measured->torque_sum_q24;
     input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
 }
@@ -63,7 +64,8 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->command_age_us = sample->time_us - command->time_us;
     input->speed_q22 = state->observer.speed_q22;
     input->run = run;
-    input->commanded_speed_q22 = command->request == COMMAND_RUN ? command->speed_reference_q22 : 0;
+    input->command = *command;
+    input->torque_reference_q24 = state->torque_reference_q24;
     if (parameters->bandwidth.adaptive) {
         hand_over_bandwidth(state, measured, input);
     }
@@ -80,6 +82,7 @@ static void follow_resets(const control_parameters_t *parameters, deferred_t *de
         deferred->advance_q30 = 0;
         deferred->window = parameters->predictive.base_window;
         deferred->run = false;
+        deferred->mode = DRIVE_MODE_SPEED;
         speed_pi_reset(&deferred->speed_pi);
         deferred->torque_offset = (torque_offset_t){0};
         periodic_load_reset(&deferred->periodic_load);
@@ -119,11 +122,14 @@ static bool disturbed(const control_parameters_t *parameters, const deferred_inp
     return input->bandwidth.stage < parameters->bandwidth.moving_stage;
 }
 
-/* The misalignment is observable while speed, load and voltage are steady. */
+/* The misalignment is observable while speed, load and voltage are steady. In torque mode nothing keeps the speed
+ * steady; a dynamometer that does hides the ripple of the torque, and what the observer then takes for a load would be
+ * learned. */
 static misalignment_condition_t condition(const control_parameters_t *parameters, const deferred_t *deferred,
                                           const deferred_input_t *input) {
     const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
-    if (!deferred->load_constant || speed_error_q22 >= fixed_abs(input->speed_q22) / 8) {
+    if (deferred->mode != DRIVE_MODE_SPEED || !deferred->load_constant ||
+        speed_error_q22 >= fixed_abs(input->speed_q22) / 8) {
         return MISALIGNMENT_UNSTEADY;
     }
     if (!disturbed(parameters, input) && input->torque_shortfall_q24 == 0) {
@@ -161,6 +167,10 @@ static void learn_common_misalignment(const control_parameters_t *parameters, de
 
 static void learn_periodic_load(const control_parameters_t *parameters, deferred_t *deferred,
                                 const deferred_input_t *input) {
+    if (deferred->mode != DRIVE_MODE_SPEED) {
+        periodic_load_reset(&deferred->periodic_load);
+        return;
+    }
     const periodic_load_sample_t sample = {
         .angle = input->encoder_angle,
         .angle_step = fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32),
@@ -205,17 +215,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     if (parameters->bandwidth.adaptive) {
         results->bandwidth = bandwidth_limits(parameters, deferred, input);
     }
-    results->speed_law_torque_q24 = 0;
-    results->speed_reference_q22 = 0;
-    results->periodic_load_q24 = 0;
-    if (input->run) {
-        const int32_t law_q24 = speed_control_law_q24(parameters, deferred, input);
-        const int32_t periodic_load_q24 = deferred->periodic_load.torque_q24;
-        results->speed_law_torque_q24 =
-            fixed_add(fixed_add(law_q24, torque_offset_q24(&deferred->torque_offset)), periodic_load_q24);
-        results->periodic_load_q24 = periodic_load_q24;
-        results->speed_reference_q22 = deferred->speed_reference_q22;
-    }
+    speed_control_deferred(parameters, deferred, input, results);
     deferred->run = input->run;
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run) {
         take_turns(parameters, deferred, input);

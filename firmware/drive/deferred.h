@@ -4,6 +4,7 @@
  *   bandwidth    statistics of the innovation -> limits of the observer's trigger           observer_bandwidth.h
  *   moving load  trend of the innovation -> least bandwidth                                 moving_load.h
  *   speed law    speed error -> torque, without feed-forward                               speed_pi.h, speed_smc.h
+ *   torque mode  commanded torque -> torque                                                torque_mode.h
  *   windows      torque shortfall -> conduction windows, with their reciprocal              predictive_torque.h
  *   offset       mean torque error -> torque reference                                     torque_offset.h
  *   periodic     load torque that repeats with every turn -> torque reference, observer    periodic_load.h

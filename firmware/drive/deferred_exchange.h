@@ -21,6 +21,7 @@
 #include "control/load_observer.h"
 #include "control/observer_bandwidth.h"
 #include "control/torque_sharing.h"
+#include "drive/command.h"
 #include "hal.h"
 
 /* Values of one control period. */
@@ -33,15 +34,15 @@ typedef struct {
     int32_t speed_q22;          /* observer, for the coming sample, rad/s, Q9.22 */
     /* With an adaptive bandwidth only. */
     observer_bandwidth_sample_t bandwidth;
-    bool run;                    /* state RUN */
-    int32_t commanded_speed_q22; /* rad/s, Q9.22; 0 without a run request */
+    bool run; /* state RUN */
+    command_t command;
+    int32_t torque_reference_q24; /* of this period, N m, Q7.24; 0 outside RUN */
     /* With predictive torque control only. */
     int32_t load_torque_q24;      /* observer, N m, Q7.24 */
     int32_t speed_correction_q22; /* observer, rad/s, Q9.22 */
     uint32_t electrical;          /* angle of phase 0, 2^-32 electrical rev */
     int32_t current_q9;           /* of the phase to learn, misalignment_t.phase_index, A, Q7.9 */
-    int32_t torque_reference_q24;
-    int32_t torque_sum_q24; /* of the sample, N m, Q7.24 */
+    int32_t torque_sum_q24;       /* of the sample, N m, Q7.24 */
     int32_t torque_shortfall_q24;
 } deferred_input_t;
 
@@ -49,9 +50,11 @@ typedef struct {
 typedef struct {
     uint32_t generation;                   /* of the input */
     uint32_t fault_mask;                   /* failed deferred checks, lower half of their FAULT_BITs */
-    int32_t speed_reference_q22;           /* after the ramp, rad/s, Q9.22; 0 outside RUN */
+    int32_t speed_reference_q22;           /* after the ramp, rad/s, Q9.22; 0 outside RUN and in torque mode */
     int32_t speed_law_torque_q24;          /* speed law, torque offset, periodic load, N m, Q7.24; 0 outside RUN */
     int32_t periodic_load_q24;             /* part that the observer is given as load, N m, Q7.24; 0 outside RUN */
+    int32_t torque_min_q24;                /* limits of the torque reference, feed-forward included, N m, Q7.24; */
+    int32_t torque_max_q24;                /* both are the reference in torque mode, and 0 outside RUN */
     observer_bandwidth_limits_t bandwidth; /* of the trigger */
     torque_sharing_window_t window;        /* of the motoring phases */
     int32_t misalignment[HAL_PHASES_MAX];  /* to subtract from the angle of each phase, 2^-32 electrical rev */

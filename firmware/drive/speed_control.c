@@ -7,12 +7,14 @@ static int32_t ramp_step(int32_t reference_q22, int32_t target_q22, int32_t step
     return fixed_add(reference_q22, fixed_clamp(difference_q22, -step_max_q22, step_max_q22));
 }
 
-int32_t speed_control_law_q24(const control_parameters_t *parameters, deferred_t *deferred,
-                              const deferred_input_t *input) {
+static int32_t speed_law_q24(const control_parameters_t *parameters, deferred_t *deferred,
+                             const deferred_input_t *input) {
+    const command_t *command = &input->command;
+    const int32_t commanded_q22 = command->request == COMMAND_RUN ? command->speed_reference_q22 : 0;
     const int32_t min_q22 = parameters->speed_reference_min_q22;
     const int32_t before_q22 =
         deferred->run ? deferred->speed_reference_q22 : fixed_clamp(input->speed_q22, min_q22, INT32_MAX);
-    const int32_t target_q22 = fixed_clamp(input->commanded_speed_q22, min_q22, INT32_MAX);
+    const int32_t target_q22 = fixed_clamp(commanded_q22, min_q22, INT32_MAX);
     const int32_t reference_q22 = ramp_step(before_q22, target_q22, parameters->speed_ramp_q22);
     deferred->speed_reference_q22 = reference_q22;
     const int32_t error_q22 = fixed_subtract(reference_q22, input->speed_q22);
@@ -25,6 +27,45 @@ int32_t speed_control_law_q24(const control_parameters_t *parameters, deferred_t
     }
 }
 
+/* Torque mode begins with the present torque; the laws of the speed follow it. */
+static int32_t torque_law_q24(const control_parameters_t *parameters, deferred_t *deferred,
+                              const deferred_input_t *input, int32_t offset_q24) {
+    if (deferred->mode != DRIVE_MODE_TORQUE) {
+        deferred->torque_mode.torque_q24 = fixed_subtract(input->torque_reference_q24, offset_q24);
+    }
+    const int32_t torque_q24 = torque_mode_step(&parameters->torque_mode, &deferred->torque_mode,
+                                                input->command.torque_reference_q24, input->speed_q22);
+    deferred->speed_reference_q22 = fixed_clamp(input->speed_q22, parameters->speed_reference_min_q22, INT32_MAX);
+    speed_pi_follow(&deferred->speed_pi, torque_q24);
+    return fixed_add(torque_q24, offset_q24);
+}
+
+void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
+                            deferred_results_t *results) {
+    const int32_t offset_q24 = torque_offset_q24(&deferred->torque_offset);
+    int32_t min_q24 = parameters->torque_mode.torque_min_q24, max_q24 = parameters->torque_mode.torque_max_q24;
+    int32_t torque_q24 = 0;
+    drive_mode_t mode = DRIVE_MODE_SPEED;
+    results->speed_reference_q22 = 0;
+    results->periodic_load_q24 = 0;
+    if (!input->run) {
+        min_q24 = max_q24 = 0;
+    } else if (input->command.mode == DRIVE_MODE_TORQUE && input->command.request == COMMAND_RUN) {
+        mode = DRIVE_MODE_TORQUE;
+        torque_q24 = fixed_clamp(torque_law_q24(parameters, deferred, input, offset_q24), min_q24, max_q24);
+        min_q24 = max_q24 = torque_q24;
+    } else {
+        results->periodic_load_q24 = deferred->periodic_load.torque_q24;
+        torque_q24 =
+            fixed_add(fixed_add(speed_law_q24(parameters, deferred, input), offset_q24), results->periodic_load_q24);
+        results->speed_reference_q22 = deferred->speed_reference_q22;
+    }
+    deferred->mode = mode;
+    results->speed_law_torque_q24 = torque_q24;
+    results->torque_min_q24 = min_q24;
+    results->torque_max_q24 = max_q24;
+}
+
 /* The transducer is offset binary, +-64 N m full scale: 2^31 of Q7.24 over all counts. */
 static int32_t transducer_torque_q24(const control_parameters_t *parameters, uint16_t counts) {
     const unsigned bits = parameters->adc_bits;
@@ -32,16 +73,17 @@ static int32_t transducer_torque_q24(const control_parameters_t *parameters, uin
 }
 
 int32_t speed_control_torque_q24(const control_parameters_t *parameters, const load_observer_t *observer,
-                                 const control_sample_t *sample, int32_t law_torque_q24) {
+                                 const control_sample_t *sample, const deferred_results_t *deferred) {
     switch (parameters->speed_law) {
     case SPEED_LAW_SMC: {
         const int32_t load_q24 = parameters->load_from_transducer
                                      ? transducer_torque_q24(parameters, sample->adc.load_torque_counts)
                                      : observer->load_torque_q24;
-        return speed_smc_torque_q24(&parameters->speed_smc, law_torque_q24, observer->speed_q22, load_q24);
+        return speed_smc_torque_q24(&parameters->speed_smc, deferred->speed_law_torque_q24, observer->speed_q22,
+                                    load_q24, deferred->torque_min_q24, deferred->torque_max_q24);
     }
     case SPEED_LAW_PI:
     default:
-        return law_torque_q24;
+        return deferred->speed_law_torque_q24;
     }
 }

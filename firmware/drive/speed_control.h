@@ -1,19 +1,24 @@
-/* Speed control: torque reference from the commanded speed. The law is computed by the deferred step and acts one
- * period later; the feed-forward of the estimated load, which decides the speed drop after a load step, in the control
- * interrupt. */
+/* Torque reference from the commanded speed, or in torque mode from the commanded torque. The laws are computed by the
+ * deferred step and act one period later; the feed-forward of the estimated load, which decides the speed drop after a
+ * load step, in the control interrupt. The limits that the deferred step sets keep the feed-forward out of torque mode:
+ * both of them are the torque reference then. */
 #ifndef DRIVE_SPEED_CONTROL_H
 #define DRIVE_SPEED_CONTROL_H
 
 #include "drive/control.h"
 
-/* Moves the speed reference by at most the ramp towards the commanded speed, from the present speed at the start of a
- * run, and returns the torque of the configured law without feed-forward, N m, Q7.24. [deferred] */
-int32_t speed_control_law_q24(const control_parameters_t *parameters, deferred_t *deferred,
-                              const deferred_input_t *input);
+/* Computes law torque, limits of the torque reference and speed reference of the results, and the mode.
+ *
+ * Speed mode: moves the speed reference by at most the ramp towards the commanded speed, from the present speed at the
+ * start of a run, or 0 without a run request; the torque is that of the configured law without feed-forward. Torque
+ * mode: torque_mode.h. It begins with the present torque; after it the speed reference begins with the present speed,
+ * and the integral of the PI with the present torque. [deferred] */
+void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
+                            deferred_results_t *results);
 
 /* Torque reference: that of the law, and with sliding mode the feed-forward of load and friction, limited. [interrupt]
  */
 int32_t speed_control_torque_q24(const control_parameters_t *parameters, const load_observer_t *observer,
-                                 const control_sample_t *sample, int32_t law_torque_q24);
+                                 const control_sample_t *sample, const deferred_results_t *deferred);
 
 #endif

@@ -4,15 +4,17 @@ void state_machine_reset(state_machine_t *state_machine) {
     *state_machine = (state_machine_t){.state = DRIVE_STATE_INITIALISE};
 }
 
-/* fault_mask != 0. */
-static fault_t lowest_fault(uint64_t fault_mask) {
+fault_t state_machine_first_fault(uint64_t fault_mask) {
     const uint32_t low = (uint32_t)fault_mask;
+    if (fault_mask == 0) {
+        return FAULT_NONE;
+    }
     return (fault_t)(low != 0 ? __builtin_ctz(low) : 32 + __builtin_ctz((uint32_t)(fault_mask >> 32)));
 }
 
 static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {
     fault_record_t *record = &state_machine->record; /* the caller sets its other members */
-    record->fault = lowest_fault(fault_mask);
+    record->fault = state_machine_first_fault(fault_mask);
     record->fault_mask = fault_mask;
     record->state = (uint8_t)state_machine->state;
     state_machine->state = DRIVE_STATE_FAULT;
@@ -29,6 +31,7 @@ bool state_machine_step(state_machine_t *state_machine, const state_machine_inpu
     }
     switch (state_machine->state) {
     case DRIVE_STATE_INITIALISE:
+        state_machine->start_inhibit_mask = (uint32_t)all_but_timeout;
         state_machine->fault_free_ticks = all_but_timeout == 0 ? state_machine->fault_free_ticks + 1 : 0;
         if (state_machine->fault_free_ticks >= initialise_ticks) {
             state_machine->state = DRIVE_STATE_READY;

@@ -25,6 +25,7 @@
 typedef struct {
     drive_state_t state;
     uint32_t fault_free_ticks;      /* in INITIALISE, since the last failed check */
+    uint32_t start_inhibit_mask;    /* in INITIALISE: failed checks of this tick; 0 in every other state */
     bool rearmed;                   /* the run request has been withdrawn since the last fault */
     command_request_t last_request; /* of the previous tick */
     fault_record_t record;          /* in FAULT; fault FAULT_NONE in every other state */
@@ -35,6 +36,9 @@ typedef struct {
     command_request_t request;
     bool at_standstill; /* the speed, in either direction, allows a stop to end */
 } state_machine_input_t;
+
+/* Fault with the lowest number in a mask; FAULT_NONE of an empty one. */
+fault_t state_machine_first_fault(uint64_t fault_mask);
 
 /* State INITIALISE, no fault. */
 void state_machine_reset(state_machine_t *state_machine);

@@ -80,6 +80,18 @@ def test_moving_loads_are_judged_over_two_periods_after_the_transient():
         assert scenario.load[0].at_s >= 0.2 + scenario.speed[0].value_rpm / 5000.0 - 1e-9
 
 
+def test_torque_over_speed_is_recorded_over_whole_strokes_of_a_shaft_that_has_its_speed():
+    for case in ALL_CASES["torque_speed"]:
+        scenario = case.scenario
+        speed_rpm = scenario.bench["held_speed_rpm"]
+        (step,) = scenario.torque
+        assert step.at_s >= speed_rpm / 10_000 + 0.01
+        assert scenario.record.from_s >= step.at_s + 0.1 - 1e-9
+        strokes = (scenario.duration_s - scenario.record.from_s) * 6.0 * speed_rpm / 30.0
+        assert strokes == pytest.approx(round(strokes), abs=1e-3)
+        assert case.controller == "salient" or step.value_Nm > 0
+
+
 def test_ramps_have_their_lengths():
     for case in ALL_CASES["ramps"]:
         ramp_s = case.scenario.load[0].torque_Nm / case.scenario.bench["load_ramp_Nm_s"]

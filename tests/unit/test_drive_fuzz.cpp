@@ -81,6 +81,8 @@ struct bench_t {
             command.time_us = sample.time_us;
             command.request = rarely(3) ? command_request_t(random() % 4) : COMMAND_RUN;
             command.speed_reference_q22 = int32_t(uint32_t(random()));
+            command.mode = drive_mode_t(random() % 2);
+            command.torque_reference_q24 = int32_t(uint32_t(random()));
         }
     }
 };
@@ -156,7 +158,9 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
                 sample.missed_interrupts = uint32_t(random());
                 sample.time_us = uint32_t(random());
                 const command_t command = {.request = command_request_t(random() % 4),
+                                           .mode = drive_mode_t(random() % 2),
                                            .speed_reference_q22 = int32_t(uint32_t(random())),
+                                           .torque_reference_q24 = int32_t(uint32_t(random())),
                                            .time_us = uint32_t(random())};
                 hal_pwm_compare_t compare;
                 const bool closed = control_step(&parameters, &state, &sample, &command, &compare);

@@ -64,6 +64,50 @@ TEST_F(Commands, a_reference_has_a_sign_and_is_symmetric) {
     }
 }
 
+TEST_F(Commands, the_message_of_the_last_command_is_the_mode) {
+    ASSERT_EQ(receive(command_frame(7)), COMMANDS_COMMAND);
+    EXPECT_EQ(command.mode, DRIVE_MODE_SPEED);
+    ASSERT_EQ(receive(frames::torque_command(200, COMMAND_RUN, -(19 << 16) - 1), 12345), COMMANDS_COMMAND);
+    EXPECT_EQ(command.mode, DRIVE_MODE_TORQUE);
+    EXPECT_EQ(command.request, COMMAND_RUN);
+    EXPECT_EQ(command.torque_reference_q24, -(19 << 24) - 256);
+    EXPECT_EQ(command.time_us, 12345u);
+    ASSERT_EQ(receive(command_frame(8)), COMMANDS_COMMAND) << "each message has a counter of its own";
+    EXPECT_EQ(command.mode, DRIVE_MODE_SPEED);
+    EXPECT_EQ(commands.counters.accepted, 3);
+}
+
+TEST_F(Commands, a_torque_command_has_the_whole_range_of_its_bits) {
+    uint8_t counter = 0;
+    for (const int32_t torque_q16 : {0, 1, -1, 0x7FFFFF, -0x800000}) {
+        ASSERT_EQ(receive(frames::torque_command(++counter, COMMAND_RUN, torque_q16)), COMMANDS_COMMAND);
+        EXPECT_EQ(command.torque_reference_q24, torque_q16 * 256);
+    }
+}
+
+TEST_F(Commands, a_torque_command_is_protected_as_a_speed_command) {
+    receive(frames::torque_command(1, COMMAND_RUN, 0));
+    for (unsigned bit = 0; bit < 8 * DRIVE_TORQUE_COMMAND_LENGTH; bit++) {
+        hal_can_frame_t frame = frames::torque_command(2, COMMAND_RUN, 5 << 16);
+        frame.data[bit / 8] = uint8_t(frame.data[bit / 8] ^ (1u << bit % 8));
+        expect_rejected(frame, &commands.counters.wrong_checksum);
+    }
+    expect_rejected(frames::torque_command(1, COMMAND_RUN, 0), &commands.counters.wrong_counter);
+    expect_rejected(frames::torque_command(5, COMMAND_RUN, 0), &commands.counters.wrong_counter);
+    expect_rejected(frames::torque_command(2, COMMAND_CLEAR_FAULT + 1, 0), &commands.counters.out_of_range);
+    hal_can_frame_t other = command_frame(3);
+    other.identifier = DRIVE_TORQUE_COMMAND_FRAME_ID;
+    expect_rejected(other, &commands.counters.wrong_checksum); // a speed is no torque: another data ID
+    for (int length = 0; length < 16; length++) {
+        hal_can_frame_t frame = frames::torque_command(3, COMMAND_RUN, 0);
+        frame.length = uint8_t(length);
+        if (length != DRIVE_TORQUE_COMMAND_LENGTH) {
+            expect_rejected(frame, &commands.counters.wrong_length);
+        }
+    }
+    EXPECT_EQ(receive(frames::torque_command(3, COMMAND_RUN, 0)), COMMANDS_COMMAND);
+}
+
 TEST_F(Commands, every_wrong_length_is_rejected) {
     for (int length = 0; length < 16; length++) {
         hal_can_frame_t frame = command_frame(1);
@@ -84,7 +128,8 @@ TEST_F(Commands, every_unknown_standard_identifier_is_rejected) {
         hal_can_frame_t frame = command_frame(1);
         frame.identifier = identifier;
         frame.length = 8;
-        if (identifier != DRIVE_COMMAND_FRAME_ID && identifier != DRIVE_PARAMETER_REQUEST_FRAME_ID) {
+        if (identifier != DRIVE_COMMAND_FRAME_ID && identifier != DRIVE_TORQUE_COMMAND_FRAME_ID &&
+            identifier != DRIVE_PARAMETER_REQUEST_FRAME_ID) {
             expect_rejected(frame, &commands.counters.unknown_frame);
         }
     }
@@ -167,6 +212,16 @@ TEST_F(Commands, after_a_timeout_a_sender_may_start_with_any_counter) {
     expect_rejected(command_frame(100), &commands.counters.wrong_counter, 5000 + TIMEOUT_US);
     commands_check_timeout(&commands, 5000 + TIMEOUT_US + 1, TIMEOUT_US);
     EXPECT_EQ(receive(command_frame(100), 5000 + TIMEOUT_US + 1), COMMANDS_COMMAND);
+}
+
+TEST_F(Commands, a_command_of_either_message_restarts_the_timeout_of_both) {
+    receive(command_frame(1), 0);
+    receive(frames::torque_command(1, COMMAND_RUN, 0), TIMEOUT_US);
+    commands_check_timeout(&commands, 2 * TIMEOUT_US, TIMEOUT_US);
+    EXPECT_EQ(receive(command_frame(2), 2 * TIMEOUT_US), COMMANDS_COMMAND);
+    expect_rejected(frames::torque_command(77, COMMAND_RUN, 0), &commands.counters.wrong_counter, 2 * TIMEOUT_US);
+    commands_check_timeout(&commands, 3 * TIMEOUT_US + 1, TIMEOUT_US);
+    EXPECT_EQ(receive(frames::torque_command(77, COMMAND_RUN, 0), 3 * TIMEOUT_US + 1), COMMANDS_COMMAND);
 }
 
 TEST_F(Commands, the_timeout_is_measured_across_the_wrap_of_the_clock) {

@@ -152,6 +152,8 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     p.controller = DRIVE_CONTROLLER_SALIENT;
     p.torque_law = TORQUE_LAW_PREDICTIVE;
     control.state_machine.record.fault = FAULT_ENCODER;
+    control.deferred.mode = DRIVE_MODE_TORQUE;
+    control.state_machine.start_inhibit_mask = uint32_t(FAULT_BIT(FAULT_UNDER_VOLTAGE) | FAULT_BIT(FAULT_OVER_SPEED));
     control.observer.speed_q22 = int32_t(std::lround(-600 * 2 * M_PI / 60 * 4194304));
     control.deferred.response.results[0].speed_reference_q22 = int32_t(std::lround(150 * 2 * M_PI / 60 * 4194304));
     control.measurement.angle = 0x40000000;
@@ -187,6 +189,8 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     EXPECT_EQ(status.controller, 2);
     EXPECT_EQ(status.fault, 5);
     EXPECT_EQ(status.voltage_saturated, 1);
+    EXPECT_EQ(status.mode, DRIVE_MODE_TORQUE);
+    EXPECT_EQ(status.start_inhibited_by, FAULT_UNDER_VOLTAGE);
     drive_motion_t motion;
     drive_motion_unpack(&motion, first(DRIVE_MOTION_FRAME_ID).data, 8);
     EXPECT_EQ(motion.speed_rpm, -600000);

@@ -45,7 +45,8 @@ int32_t torque_q24_of(const speed_smc_parameters_t &parameters, int32_t referenc
                       int32_t load_q24) {
     const int32_t error_q22 = fixed_subtract(reference_q22, speed_q22);
     const int32_t reaching_q24 = speed_smc_reaching_torque_q24(&parameters, error_q22);
-    return speed_smc_torque_q24(&parameters, reaching_q24, speed_q22, load_q24);
+    return speed_smc_torque_q24(&parameters, reaching_q24, speed_q22, load_q24, parameters.torque_min_q24,
+                                parameters.torque_max_q24);
 }
 
 // Ends of the range, zero, every magnitude with both signs, and random values.

@@ -125,6 +125,11 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(c.protection.angle_step_q32, c.observer.angle_step_q32);
     near("slowing", c.protection.deceleration_max_q22, 40.0 / v(PARAMETER_INERTIA_KG_M2) / rate_hz * fixed_point::Q22,
          2.0);
+    const double slew = v(PARAMETER_TORQUE_SLEW_RATE_NM_S) / rate_hz * fixed_point::Q24;
+    near("torque slew", c.torque_mode.slew_q24, slew == 0.0 ? INT32_MAX : std::max(slew, 1.0), 1.0);
+    ASSERT_EQ(c.torque_mode.torque_min_q24, c.speed_smc.torque_min_q24);
+    ASSERT_EQ(c.torque_mode.torque_max_q24, c.speed_smc.torque_max_q24);
+    near("fold-back", c.torque_mode.speed_end_q22, c.protection.over_speed_q22 * 15.0 / 16.0, 1.0);
     near("timeout", c.protection.command_timeout_us, 1000.0 * v(PARAMETER_COMMAND_TIMEOUT_MS), 0.0);
 
     const auto &share = c.predictive.sharing;

@@ -41,6 +41,15 @@ class Deferred : public testing::Test {
         return control_step(&parameters, &state, &sample, &command, &compare);
     }
 
+    // A period in torque mode, with a deferred step in time.
+    bool torque_period(double torque_Nm, command_request_t request = COMMAND_RUN) {
+        command.mode = DRIVE_MODE_TORQUE;
+        command.torque_reference_q24 = fixed_point::to_fixed(torque_Nm, fixed_point::Q24);
+        const bool run = period(request);
+        command.mode = DRIVE_MODE_SPEED;
+        return run;
+    }
+
     // A period with a deferred step in time.
     bool period(command_request_t request, double reference_rpm = 600.0) {
         const bool run = interrupt(request, reference_rpm);
@@ -203,7 +212,8 @@ TEST_F(Deferred, the_torque_of_the_speed_law_acts_one_period_later_with_the_feed
         interrupt(COMMAND_RUN, 30.0);
         ASSERT_EQ(state.torque_reference_q24,
                   speed_smc_torque_q24(&parameters.speed_smc, law_q24, state.observer.speed_q22,
-                                       state.observer.load_torque_q24));
+                                       state.observer.load_torque_q24, parameters.speed_smc.torque_min_q24,
+                                       parameters.speed_smc.torque_max_q24));
         deferred_step(&parameters, &state);
     }
 }
@@ -250,6 +260,109 @@ TEST_F(Deferred, a_run_begins_without_torque_and_integral_of_the_speed_law_also_
     period(COMMAND_OFF);
     EXPECT_EQ(state.deferred.speed_pi.integral_q54, 0);
     EXPECT_EQ(results().speed_law_torque_q24, 0);
+}
+
+TEST_F(Deferred, in_torque_mode_the_reference_is_the_command_without_load_and_friction) {
+    for (const drive_controller_t controller :
+         {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        configure(controller);
+        speed_rad_s = 20.0;
+        start();
+        state.observer.load_torque_q24 = 5 << 24;
+        for (int k = 0; k < 10; k++) {
+            ASSERT_TRUE(torque_period(3.0));
+        }
+        ASSERT_NE(state.observer.load_torque_q24, 0);
+        EXPECT_EQ(state.torque_reference_q24, (3 << 24) + torque_offset_q24(&state.deferred.torque_offset))
+            << controller;
+        EXPECT_EQ(state.deferred.mode, DRIVE_MODE_TORQUE);
+        EXPECT_EQ(results().speed_reference_q22, 0);
+        for (int k = 0; k < 10; k++) {
+            ASSERT_TRUE(torque_period(-3.0));
+        }
+        if (controller == DRIVE_CONTROLLER_SALIENT) {
+            EXPECT_NEAR(state.torque_reference_q24 / fixed_point::Q24, -3.0, 0.01);
+        } else {
+            EXPECT_EQ(state.torque_reference_q24, 0) << "drives forwards only";
+        }
+        for (int k = 0; k < 10; k++) {
+            ASSERT_TRUE(torque_period(100.0));
+        }
+        EXPECT_NEAR(state.torque_reference_q24 / fixed_point::Q24, 19.1, 0.01);
+    }
+}
+
+TEST_F(Deferred, a_run_in_torque_mode_begins_without_torque_whatever_the_load) {
+    parameters.torque_mode.slew_q24 = 1 << 20;
+    for (int k = 0; k < 41; k++) {
+        period(COMMAND_OFF);
+    }
+    state.observer.load_torque_q24 = 8 << 24;
+    ASSERT_TRUE(torque_period(3.0));
+    EXPECT_EQ(state.torque_reference_q24, 0) << "the results in effect are those of the time before the run";
+    ASSERT_GT(state.observer.load_torque_q24, 7 << 24);
+    torque_period(3.0);
+    EXPECT_EQ(state.torque_reference_q24, 1 << 20) << "slew rate from zero";
+}
+
+TEST_F(Deferred, torque_mode_begins_with_the_present_torque) {
+    for (const drive_controller_t controller :
+         {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        configure(controller);
+        parameters.torque_mode.slew_q24 = 1 << 16;
+        speed_rad_s = 20.0;
+        start();
+        for (int k = 0; k < 300; k++) {
+            period(COMMAND_RUN, 200.0);
+        }
+        const int32_t before_q24 = state.torque_reference_q24;
+        ASSERT_GT(before_q24, 1 << 24);
+        torque_period(0.0); // the command is handed over: still the speed law's torque
+        int32_t last_q24 = state.torque_reference_q24;
+        for (int k = 0; k < 50; k++) {
+            torque_period(0.0);
+            const int32_t step_q24 = last_q24 - state.torque_reference_q24;
+            ASSERT_NEAR(step_q24, 1 << 16, 1 << 13) << controller << " " << k << ": but for the torque offset";
+            last_q24 = state.torque_reference_q24;
+        }
+    }
+}
+
+TEST_F(Deferred, speed_mode_begins_with_the_present_torque_and_speed) {
+    configure(DRIVE_CONTROLLER_TRADITIONAL);
+    speed_rad_s = 20.0;
+    start();
+    for (int k = 0; k < 100; k++) {
+        torque_period(6.0);
+    }
+    const double speed_rpm = state.observer.speed_q22 / fixed_point::Q22 * 30.0 / fixed_point::PI;
+    period(COMMAND_RUN, speed_rpm);
+    const int32_t error_q22 = results().speed_reference_q22 - state.deferred_request.input.speed_q22;
+    const double proportional_Nm = parameters.speed_pi.kp_q16 / fixed_point::Q16 * error_q22 / fixed_point::Q22;
+    EXPECT_LT(std::fabs(proportional_Nm), 0.5);
+    EXPECT_NEAR(results().speed_law_torque_q24 / fixed_point::Q24, 6.0 + proportional_Nm, 1e-3) << "integral of the PI";
+    configure(DRIVE_CONTROLLER_SALIENT);
+    parameters.speed_ramp_q22 = 1 << 10;
+    start();
+    for (int k = 0; k < 100; k++) {
+        torque_period(6.0);
+    }
+    const int32_t speed_q22 = state.deferred_request.input.speed_q22;
+    period(COMMAND_RUN, 1000.0);
+    EXPECT_EQ(results().speed_reference_q22, speed_q22 + (1 << 10)) << "ramp from the present speed";
+}
+
+TEST_F(Deferred, a_stop_in_torque_mode_ramps_the_speed_to_zero) {
+    speed_rad_s = 20.0;
+    start();
+    for (int k = 0; k < 100; k++) {
+        torque_period(3.0);
+    }
+    for (int k = 0; k < 3; k++) {
+        ASSERT_TRUE(torque_period(3.0, COMMAND_STOP));
+    }
+    EXPECT_EQ(state.deferred.mode, DRIVE_MODE_SPEED);
+    EXPECT_LT(state.torque_reference_q24, 0) << "salient brakes";
 }
 
 TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_observer) {

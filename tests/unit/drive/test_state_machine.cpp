@@ -141,6 +141,20 @@ TEST_F(StateMachine, initialise_lasts_until_all_checks_have_passed_for_its_time_
     EXPECT_EQ(step(COMMAND_OFF, TIMEOUT), DRIVE_STATE_READY);
 }
 
+TEST_F(StateMachine, the_check_that_holds_initialise_is_known_and_none_is_afterwards) {
+    const uint64_t failed = FAULT_BIT(FAULT_UNDER_VOLTAGE) | FAULT_BIT(FAULT_OVER_SPEED);
+    step(COMMAND_RUN, failed | TIMEOUT);
+    EXPECT_EQ(state_machine_first_fault(state_machine.start_inhibit_mask), FAULT_UNDER_VOLTAGE);
+    step(COMMAND_OFF, FAULT_BIT(FAULT_OVER_SPEED));
+    EXPECT_EQ(state_machine_first_fault(state_machine.start_inhibit_mask), FAULT_OVER_SPEED);
+    for (uint32_t k = 0; k < INITIALISE_TICKS; k++) {
+        step(COMMAND_OFF, TIMEOUT);
+        EXPECT_EQ(state_machine_first_fault(state_machine.start_inhibit_mask), FAULT_NONE) << "no command is no cause";
+    }
+    EXPECT_EQ(step(COMMAND_OFF, failed), DRIVE_STATE_FAULT);
+    EXPECT_EQ(state_machine.start_inhibit_mask, 0u) << "a fault is one by itself";
+}
+
 TEST_F(StateMachine, a_run_request_from_power_on_does_not_start_the_drive) {
     for (int k = 0; k < 100; k++) {
         ASSERT_NE(step(COMMAND_RUN), DRIVE_STATE_RUN);

@@ -331,6 +331,38 @@ TEST_P(OperatingCycle, ConservesEnergy) {
         << energies.missing_J << " J of " << energies.turnover_J << " J";
 }
 
+TEST_P(OperatingCycle, ConservesEnergyWhileADynamometerHoldsTheShaft) {
+    for (const double speed_rad_s : {-60.0, 15.0, 150.0}) {
+        for (const double acceleration_rad_s2 : {-400.0, 0.0, 400.0}) {
+            plant_init(&plant, &machine, 0.9);
+            plant_hold(&plant, speed_rad_s, acceleration_rad_s2);
+            const Energies energies = live(plant, 12000);
+            const double duration_s = static_cast<double>(plant.time_ns) * 1e-9;
+            EXPECT_NEAR(plant.speed_rad_s, speed_rad_s + acceleration_rad_s2 * duration_s, 1e-9);
+            EXPECT_GT(energies.turnover_J, 10.0);
+            EXPECT_GT(std::fabs(plant.energy_load_J), 1.0);
+            EXPECT_LT(std::fabs(energies.missing_J), 2e-7 * energies.turnover_J)
+                << energies.missing_J << " J of " << energies.turnover_J << " J";
+        }
+    }
+}
+
+TEST(Plant, ShaftTorqueIsWhatTheDynamometerTakes) {
+    machine_t machine = machine_of(MAGNETICS_SATURATING);
+    plant_t plant;
+    plant_init(&plant, &machine, -20.0 * RAD_PER_DEG);
+    plant.current_A[0] = 20.0;
+    plant.load_torque_Nm = 2.5;
+    EXPECT_EQ(plant_shaft_torque_Nm(&plant), 2.5) << "a free shaft";
+    plant_hold(&plant, 100.0, 50.0);
+    const double taken_Nm = plant_torque_Nm(&plant) - machine.friction_Nm_s * 100.0 - machine.inertia_kg_m2 * 50.0;
+    EXPECT_GT(plant_torque_Nm(&plant), 1.0);
+    EXPECT_NEAR(plant_shaft_torque_Nm(&plant), taken_Nm, 1e-12) << "the load is a part of it";
+    plant_release(&plant);
+    EXPECT_EQ(plant.speed_rad_s, 100.0);
+    EXPECT_EQ(plant_shaft_torque_Nm(&plant), 2.5);
+}
+
 TEST_P(OperatingCycle, EqualInputsGiveEqualBits) {
     live(plant, 2000);
     plant_t again;

@@ -25,6 +25,19 @@ inline hal_can_frame_t command(uint8_t counter, unsigned request, int32_t milli_
     return frame;
 }
 
+// DRIVE_TORQUE_COMMAND with its checksum; the values are not checked.
+inline hal_can_frame_t torque_command(uint8_t counter, unsigned request, int32_t torque_q16) {
+    drive_torque_command_t message{};
+    message.request = uint8_t(request);
+    message.torque_reference_nm = torque_q16;
+    hal_can_frame_t frame{};
+    frame.identifier = DRIVE_TORQUE_COMMAND_FRAME_ID;
+    frame.length = DRIVE_TORQUE_COMMAND_LENGTH;
+    drive_torque_command_pack(frame.data, &message, sizeof frame.data);
+    e2e_protect(DRIVE_TORQUE_COMMAND_E2E_DATA_ID, counter, frame.data, frame.length);
+    return frame;
+}
+
 // PARAMETER_REQUEST; the values are not checked.
 inline hal_can_frame_t parameter_request(unsigned operation, unsigned index, unsigned part, int32_t value) {
     drive_parameter_request_t message{};

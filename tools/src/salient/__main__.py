@@ -9,7 +9,7 @@ from pathlib import Path
 
 from salient.cli import make_parser
 from salient.config import OPTIONS, BenchConfig
-from salient.errors import UsageError
+from salient.errors import RunFailed, UsageError
 from salient.paths import BUILD
 
 
@@ -23,6 +23,9 @@ def main() -> int:
     except UsageError as error:
         print(f"salient: {error}", file=sys.stderr)
         return 2
+    except RunFailed as error:
+        print(f"salient: {error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:

@@ -25,6 +25,9 @@ class Client(Protocol):
     def receive_until(self, matches: Callable[[can.Message], bool]) -> can.Message:
         """Receives, without time passing in lock-step, until a frame meets the condition."""
 
+    def advance_to(self, time_ns: int) -> None:
+        """Lets virtual time pass until `time_ns`."""
+
     def advance_until_frame(self, matches: Callable[[can.Message], bool], timeout_s: float) -> can.Message:
         """Lets virtual time pass until a frame meets the condition; TimeoutError after timeout_s."""
 

@@ -13,12 +13,17 @@ from cantools.database.can import Message
 from salient.bench.client import Client, KnownAttributes
 from salient.bus import e2e
 from salient.bus.signals import drive_database, signal_range, value_numbers
+from salient.errors import RunFailed
 
 _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
+_TORQUE_COMMAND = drive_database().get_message_by_name("DRIVE_TORQUE_COMMAND")
 REQUESTS = value_numbers(drive_database(), "DRIVE_COMMAND", "request")
 assert _COMMAND.cycle_time is not None  # GenMsgCycleTime in drive.dbc
 COMMAND_PERIOD_NS = _COMMAND.cycle_time * 1_000_000
 """Period of the commands in virtual time; the drive stops when they are no longer sent."""
+
+READY_TIMEOUT_S = 0.02
+"""Time after its start in which a drive without a failing check is ready: 1 ms of passed checks, and its telemetry."""
 
 _RESPONSE_TIMEOUT_S = 0.1
 _TEXT_PARTS_MAX = 64
@@ -29,23 +34,33 @@ class DriveError(Exception):
     """The drive rejected a request or did not respond; the message has the reason."""
 
 
+class DriveNotReady(DriveError, RunFailed):
+    """A check keeps the drive in state initialise; the message names it."""
+
+
 def command_frame(counter: int, request: str, speed_reference_rpm: float, message: Message = _COMMAND) -> can.Message:
     """A DRIVE_COMMAND with its checksum. counter 0..255; request one of REQUESTS; the speed within the range of the
     message, which is that of the drive's DBC."""
-    signals = {
-        "checksum": 0,
-        "counter": counter,
-        "request": REQUESTS[request],
-        "speed_reference_rpm": speed_reference_rpm,
-    }
-    payload = message.encode(signals)[e2e.HEADER_BYTES :]
-    data = e2e.protect(e2e.data_id(message), counter, payload)
-    return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=data)
+    return _protected(message, counter, request, {"speed_reference_rpm": speed_reference_rpm})
+
+
+def torque_command_frame(counter: int, request: str, torque_reference_Nm: float,
+                         message: Message = _TORQUE_COMMAND) -> can.Message:
+    """A DRIVE_TORQUE_COMMAND with its checksum, as command_frame."""
+    return _protected(message, counter, request, {"torque_reference_Nm": torque_reference_Nm})
+
+
+def _protected(command: Message, counter: int, request: str, reference: Mapping[str, float]) -> can.Message:
+    signals = {"checksum": 0, "counter": counter, "request": REQUESTS[request], **reference}
+    payload = command.encode(signals)[e2e.HEADER_BYTES :]
+    data = e2e.protect(e2e.data_id(command), counter, payload)
+    return can.Message(arbitration_id=command.frame_id, is_extended_id=False, data=data)
 
 
 class Drive(KnownAttributes):
-    """Commands a drive. Assigning speed_reference_rpm requests run; the command is sent immediately and then every
-    COMMAND_PERIOD_NS as the session's time advances, until `silence`. Nothing is sent before the first request.
+    """Commands a drive. Assigning speed_reference_rpm or torque_reference_Nm requests run in speed or torque mode; the
+    command is sent immediately and then every COMMAND_PERIOD_NS as the session's time advances, until `silence`.
+    Nothing is sent before the first request.
     """
 
     command_due_ns: int | None
@@ -54,9 +69,12 @@ class Drive(KnownAttributes):
     def __init__(self, session: Client, parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
         self._session = session
         self._command = session.drive_database.get_message_by_name(_COMMAND.name)
+        self._torque_command = session.drive_database.get_message_by_name(_TORQUE_COMMAND.name)
         self._request: str | None = None
         self._speed_reference_rpm = 0.0
-        self._counter = 0
+        self._torque_reference_Nm = 0.0
+        self._torque_mode = False
+        self._counter = {False: 0, True: 0}
         self.command_due_ns = None
         self.parameters = Parameters(session, parameter_table)
 
@@ -68,12 +86,20 @@ class Drive(KnownAttributes):
 
     @speed_reference_rpm.setter
     def speed_reference_rpm(self, value: float) -> None:
-        signal = self._command.get_signal_by_name("speed_reference_rpm")
-        low, high = signal_range(signal)
-        if not low <= value <= high:
-            limits = f"{low:g} to {high:g} {signal.unit}"
-            raise DriveError(f"speed_reference_rpm {value:g}: must be {limits}")
-        self._speed_reference_rpm = float(value)
+        self._speed_reference_rpm = _checked(self._command, "speed_reference_rpm", value)
+        self._torque_mode = False
+        self.ask("run")
+
+    @property
+    def torque_reference_Nm(self) -> float:
+        """Last requested value, which the drive limits to +-torque_max_Nm; a negative one drives in reverse or brakes,
+        and is 0 to a controller that drives forward only. Requests from here on are in torque mode."""
+        return self._torque_reference_Nm
+
+    @torque_reference_Nm.setter
+    def torque_reference_Nm(self, value: float) -> None:
+        self._torque_reference_Nm = _checked(self._torque_command, "torque_reference_Nm", value)
+        self._torque_mode = True
         self.ask("run")
 
     def stop(self) -> None:
@@ -105,9 +131,13 @@ class Drive(KnownAttributes):
         """Repeats the present request now; the next is due a period later."""
         if self._request is None:
             raise DriveError("no request to repeat")
-        self._session.send(command_frame(self._counter, self._request, self._speed_reference_rpm,
-                                         self._command))
-        self._counter = (self._counter + 1) % 256
+        counter = self._counter[self._torque_mode]
+        if self._torque_mode:
+            self._session.send(torque_command_frame(counter, self._request, self._torque_reference_Nm,
+                                                    self._torque_command))
+        else:
+            self._session.send(command_frame(counter, self._request, self._speed_reference_rpm, self._command))
+        self._counter[self._torque_mode] = (counter + 1) % 256
         self.command_due_ns = self._session.time_ns + COMMAND_PERIOD_NS
 
     @property
@@ -119,6 +149,38 @@ class Drive(KnownAttributes):
     def fault(self) -> str:
         """Name of the latched fault, or none, by its latest telemetry."""
         return self._session.telemetry["DRIVE_STATUS.fault"].last_name
+
+    @property
+    def mode(self) -> str:
+        """speed or torque, by its latest telemetry."""
+        return self._session.telemetry["DRIVE_STATUS.mode"].last_name
+
+    @property
+    def start_inhibited_by(self) -> str:
+        """Name of the check that keeps the drive in state initialise, or none, by its latest telemetry."""
+        return self._session.telemetry["DRIVE_STATUS.start_inhibited_by"].last_name
+
+    def check_ready(self) -> None:
+        """DriveNotReady, with the check that fails, while the drive is in state initialise. Not a failure before
+        READY_TIMEOUT_S have passed since its start."""
+        if self.state == "initialise":
+            raise DriveNotReady(f"the drive is not ready: its check {self.start_inhibited_by} fails")
+
+    def wait_until_ready(self) -> None:
+        """Lets virtual time pass until the drive has left state initialise; DriveNotReady after READY_TIMEOUT_S."""
+        deadline_ns = self._session.time_ns + round(READY_TIMEOUT_S * 1e9)
+        while self.state in ("initialise", "unknown") and self._session.time_ns < deadline_ns:
+            self._session.advance_to(self._session.time_ns + 1_000_000)
+        self.check_ready()
+
+
+def _checked(command: Message, name: str, value: float) -> float:
+    """The value of a reference; DriveError when it is out of the range in the DBC."""
+    signal = command.get_signal_by_name(name)
+    low, high = signal_range(signal)
+    if not low <= value <= high:
+        raise DriveError(f"{name} {value:g}: must be {low:g} to {high:g} {signal.unit}")
+    return float(value)
 
 
 @dataclass(frozen=True)

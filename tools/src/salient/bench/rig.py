@@ -5,6 +5,7 @@ The names, units, ranges and descriptions of the bench variables are those of th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -19,6 +20,8 @@ from salient.bus.signals import rig_database, signal_range
 _AT_US_MAX = 2**32 - 1
 LOAD_PROFILE_VALUES_MAX = 256
 LOAD_PROFILE_VALUE_MAX = 1000.0
+_FREE = "free"
+"""Named value of a variable that imposes nothing; not-a-number in Python."""
 
 
 class RigError(Exception):
@@ -70,7 +73,9 @@ class Rig:
         value: Any = self._assigned.get(name, _variable(name).initial)
         if value is None:
             raise AttributeError(f"{name} has the value of the machine file until it is set")
-        number: float = value.value if isinstance(value, NamedSignalValue) else value
+        if isinstance(value, NamedSignalValue):
+            value = math.nan if str(value) == _FREE else value.value
+        number: float = value
         return number
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -87,17 +92,18 @@ class Rig:
     def set(self, name: str, value: float) -> None:
         """Sets a bench variable by its name in rig.dbc."""
         signal = _variable(name)
+        is_free = math.isnan(value) and _FREE in (signal.choices or {}).values()
         low, high = variable_range(name)
-        if not low <= value <= high:
+        if not (is_free or low <= value <= high):
             raise RigError(f"{name} {value:g}: must be {_range(name)}")
         fine_low, fine_high = signal_range(signal)
-        if not fine_low <= value <= fine_high:
+        if not (is_free or fine_low <= value <= fine_high):
             signal = _coarse(name) or signal
         if not 0 <= self._at_us <= _AT_US_MAX:
             raise RigError(f"{name} at {self._at_us} us: must be 0 to {_AT_US_MAX} us")
         message = rig_database().get_message_by_name("RIG_SET")
         number = _multiplex_number(signal)
-        data = message.encode({"quantity": number, signal.name: value, "at_us": self._at_us})
+        data = message.encode({"quantity": number, signal.name: _FREE if is_free else value, "at_us": self._at_us})
         self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
         reply = rig_database().get_message_by_name("RIG_SET_REPLY")
         answer = self._client.receive_until(

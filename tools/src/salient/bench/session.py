@@ -111,6 +111,15 @@ class Session(KnownAttributes):
     def load_torque_Nm(self, value: float) -> None:
         self.rig.load_torque_Nm = value
 
+    @property
+    def held_speed_rpm(self) -> float:
+        """Shorthand for rig.held_speed_rpm."""
+        return self.rig.held_speed_rpm
+
+    @held_speed_rpm.setter
+    def held_speed_rpm(self, value: float) -> None:
+        self.rig.held_speed_rpm = value
+
     def at(self, time_s: float) -> Rig:
         """The bench variables at a virtual time: session.at(0.13).load_torque_Nm = 8."""
         return self.rig.at(time_s)
@@ -127,7 +136,10 @@ class Session(KnownAttributes):
         deadline_ns = self.time_ns + round(timeout * 1e9)
         while not condition():
             if self.time_ns >= deadline_ns:
-                raise AssertionError(f"condition not met within {timeout:g} s, at {self.time_s:g} s of virtual time")
+                held = self.drive.start_inhibited_by
+                reason = "" if held in ("none", "unknown") else f"; the drive is not ready: its check {held} fails"
+                raise AssertionError(f"condition not met within {timeout:g} s, at {self.time_s:g} s of virtual time"
+                                     f"{reason}")
             self.advance_to(min(deadline_ns, self.time_ns + round(step_s * 1e9)))
         return self.time_s
 

@@ -125,4 +125,7 @@ def _line(time_ns: int, telemetry: SignalTable) -> str:
         value = telemetry[name]
         shown = number_format.format(value.last_name if value.choices else value.last)
         cells.append(f"{title} {shown} {value.unit}".rstrip())
+    held = telemetry["DRIVE_STATUS.start_inhibited_by"].last_name
+    if held not in ("none", "unknown"):
+        cells.append(f"start inhibited by {held}")
     return "  ".join(cells)

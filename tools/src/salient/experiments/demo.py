@@ -32,7 +32,7 @@ from salient.experiments import metrics, plots
 from salient.experiments.report import METRIC_ROWS, captions, format_metric, format_published, write_report
 from salient.experiments.results import make_results, write_results
 from salient.experiments.scaled import scale_of, scale_of_name, scaled, steady_window_s
-from salient.experiments.scenario import Scenario, load_scenarios, run_scenario
+from salient.experiments.scenario import Scenario, check_parameters, load_scenarios, run_scenario
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 from salient.pages import Plot
@@ -153,8 +153,11 @@ def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
     loaded = load_machine(machine_path(machine))
     scale, stated = scale_of(loaded), {name: value for name, value in loaded.drive.items()
                                        if name in CONDITIONS and name not in changes}
-    return {experiment: [scaled(replace(scenario, **stated), scale) for scenario in of]
-            for experiment, of in scenarios.items()}
+    scenarios = {experiment: [scaled(replace(scenario, **stated), scale) for scenario in of]
+                 for experiment, of in scenarios.items()}
+    for of in scenarios.values():
+        check_parameters(of, options.build)
+    return scenarios
 
 
 def _prepare_folder(out: Path) -> None:

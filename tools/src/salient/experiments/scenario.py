@@ -18,6 +18,10 @@
     at_s = 0.0
     value_rpm = 600.0
 
+    [[torque]]                              # from here on in torque mode, until the next [[speed]]
+    at_s = 0.2
+    value_Nm = 5.0
+
     [[load]]
     at_s = 0.13
     torque_Nm = 8.0
@@ -45,13 +49,14 @@ import numpy as np
 from pydantic import create_model
 
 from salient.bench.bench import Bench
-from salient.bench.drive import DriveError, write_request
+from salient.bench.drive import READY_TIMEOUT_S, DriveError, write_request
 from salient.bench.emulator import parameter_table
 from salient.bench.rig import bench_variables, variable_range
 from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database
 from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
 from salient.errors import UsageError
+from salient.experiments.consistency import check_consistency
 from salient.experiments.load_profile import load_profile_path, read_load_profile
 from salient.experiments.metrics import losses
 from salient.machine.cache import machine_image
@@ -65,6 +70,14 @@ class SpeedStep:
 
     at_s: float
     value_rpm: float
+
+
+@dataclass(frozen=True)
+class TorqueStep:
+    """Torque reference from at_s on, in torque mode."""
+
+    at_s: float
+    value_Nm: float
 
 
 @dataclass(frozen=True)
@@ -95,6 +108,7 @@ class Scenario(Conditions):
     parameters: dict[str, float] = field(default_factory=dict)
     bench: dict[str, float] = field(default_factory=dict)
     speed: tuple[SpeedStep, ...] = ()
+    torque: tuple[TorqueStep, ...] = ()
     load: tuple[LoadStep, ...] = ()
     load_profile: str | None = None
     record: Record | None = None
@@ -133,7 +147,8 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
 
     can: "local" for a new local bus, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; the variables
     of the rig are set first, then parameters are written, then commands follow. build, instructions, execution,
-    instruction_ns: see BenchConfig. UsageError: a parameter that the drive does not know or refuses.
+    instruction_ns: see BenchConfig. UsageError: a parameter that the drive does not know or refuses. DriveNotReady: a
+    check keeps it from starting.
     """
     recording_path = out_dir / _RECORDING if scenario.record else None
     config = replace(_bench_config(scenario, recording_path, build), instructions=instructions,
@@ -153,10 +168,14 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
                 bench.at(load.at_s).load_torque_Nm = load.torque_Nm
                 if load.profile_Nm is not None:
                     bench.at(load.at_s).load_profile_Nm = load.profile_Nm
-            for speed in sorted(scenario.speed, key=lambda speed: speed.at_s):
-                bench.advance_to(round(speed.at_s * 1e9))
-                bench.drive.speed_reference_rpm = speed.value_rpm
-            bench.advance_to(round(scenario.duration_s * 1e9))
+            steps: list[SpeedStep | TorqueStep] = [*scenario.speed, *scenario.torque]
+            for step in sorted(steps, key=lambda step: step.at_s):
+                _advance(bench, step.at_s)
+                if isinstance(step, SpeedStep):
+                    bench.drive.speed_reference_rpm = step.value_rpm
+                else:
+                    bench.drive.torque_reference_Nm = step.value_Nm
+            _advance(bench, scenario.duration_s)
             _check_parameters_taken(bench, len(writes))
             fault = bench.drive.fault
         write_logs(bench.log, out_dir / _LOG, out_dir / _TEXT_LOG)
@@ -171,6 +190,15 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
         truth=bench.truth,
         fault=fault,
     )
+
+
+def _advance(bench: Bench, to_s: float) -> None:
+    """Lets virtual time pass; a drive that is commanded and not ready in time has failed."""
+    if bench.time_s < READY_TIMEOUT_S <= to_s:
+        bench.advance_to(round(READY_TIMEOUT_S * 1e9))
+        if bench.drive.command_due_ns is not None:
+            bench.drive.check_ready()
+    bench.advance_to(round(to_s * 1e9))
 
 
 def _bench_config(scenario: Scenario, recording_path: Path | None, build: str) -> BenchConfig:
@@ -257,9 +285,14 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build:
 
 
 def check_parameters(scenarios: list[Scenario], build: str) -> None:
-    """UsageError before the first run: a parameter that the drive does not know or would refuse."""
+    """UsageError before the first run: a parameter that the drive does not know or would refuse, or parameters that
+    contradict each other or the supply."""
     for scenario in scenarios:
-        _parameter_writes(scenario, _bench_config(scenario, None, build))
+        config = _bench_config(scenario, None, build)
+        _parameter_writes(scenario, config)
+        values = {row.name: row.default for row in parameter_table(config)} | scenario.parameters
+        supply_V = load_machine(machine_path(scenario.machine)).supply_voltage_V
+        check_consistency(values, scenario.parameters, scenario.bench.get("supply_voltage_V", supply_V))
 
 
 def write_summaries(scenarios: list[Scenario], results: dict[str, RunResult], out_dir: Path) -> None:
@@ -281,6 +314,11 @@ _Time = Annotated[float, number(0.0, 3600.0)]
 class _SpeedTable(Table):
     at_s: _Time
     value_rpm: Annotated[float, number(-38_400.0, 38_400.0)]
+
+
+class _TorqueTable(Table):
+    at_s: _Time
+    value_Nm: Annotated[float, number(-10_000.0, 10_000.0)]
 
 
 class _LoadTable(Table):
@@ -311,6 +349,7 @@ def _scenario_file() -> type[Table]:
         "parameters": (dict[str, Annotated[float, any_number()]], {}),
         "bench": (bench, bench()),
         "speed": (list[_SpeedTable], []),
+        "torque": (list[_TorqueTable], []),
         "load": (list[_LoadTable], []),
         "load_profile": (str, None),
         "record": (_RecordTable, None),
@@ -342,6 +381,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
         "parameters": file.parameters,
         "bench": {name: getattr(file.bench, name) for name in data.get("bench", {})},  # set in the order of the file
         "speed": tuple(SpeedStep(**step.model_dump()) for step in file.speed),
+        "torque": tuple(TorqueStep(**step.model_dump()) for step in file.torque),
         "load": tuple(LoadStep(**step.model_dump()) for step in file.load),
         "load_profile": profile,
         "record": None if file.record is None else Record(**file.record.model_dump()),

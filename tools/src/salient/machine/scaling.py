@@ -62,6 +62,7 @@ class Exponents:
             "Wb": self.voltage,
             "ohm": self.voltage - self.current,
             "N m": self.torque,
+            "N m/s": self.torque,
             "1/(N m)": -self.torque,
             "N m s": self.torque - self.speed,
             "kg m^2": self.torque - self.speed,

@@ -9,7 +9,7 @@ An input is a TOML file. An action is time in ms, name, and a value for actions 
     initial_angle_deg = 0.0
     duration_ms = 60.0
     actions = [
-        [0.0, "speed_rpm", 600.0],             # run command
+        [0.0, "speed_rpm", 600.0],             # run command; torque_Nm: in torque mode
         [0.0, "parameter.smc_k", 2000.0],      # parameter of the drive, in its unit
         [20.5, "bench.load_torque_Nm", 8.0],   # rig variable of RIG_SET in rig.dbc
         [30.0, "commands", 20.0],              # burst of that many commands
@@ -50,7 +50,7 @@ NETWORK = "salient_network"
 
 _REQUESTS = ("stop", "off", "clear_fault")
 _WITHOUT_VALUE = ("silence", *_REQUESTS)
-_WITH_VALUE = ("speed_rpm", "commands")
+_WITH_VALUE = ("speed_rpm", "torque_Nm", "commands")
 _FIXED_PARAMETERS = ("controller", "bp_mode", "bp_trim_mode")
 """Parameters that select another controller; the variant determines them."""
 _DURATION_MS = (2.0, 120.0)
@@ -202,6 +202,8 @@ def _do(bench: Bench, rows: dict[str, ParameterRow], action: Action) -> None:
     scope, _, name = what.partition(".")
     if what == "speed_rpm":
         bench.drive.speed_reference_rpm = value
+    elif what == "torque_Nm":
+        bench.drive.torque_reference_Nm = value
     elif scope == "bench":
         with contextlib.suppress(RigError):  # a rejected value has no effect
             bench.rig.set(name, value)
@@ -326,7 +328,7 @@ def _added(given: Input, source: random.Random) -> Input:
         return _removed(given, source)
     names = [f"bench.{name}" for name in bench_variables() if name != "truth_period_us"]
     names += [f"parameter.{name}" for name in _rows(given.controller) if name not in _FIXED_PARAMETERS]
-    names += ["speed_rpm", "commands", "silence", *_REQUESTS] * 4
+    names += ["speed_rpm", "torque_Nm", "commands", "silence", *_REQUESTS] * 4
     action = Action(_time(given, source), source.choice(names))
     return replace(given, actions=(*given.actions, _with_value(given, action, source)))
 
@@ -382,6 +384,8 @@ def _with_value(given: Input, action: Action, source: random.Random) -> Action:
     scope, _, name = action.what.partition(".")
     if action.what == "speed_rpm":
         low, high = -3000.0, 3000.0
+    elif action.what == "torque_Nm":
+        low, high = -40.0, 40.0
     elif action.what == "commands":
         low, high = 1.0, _COMMANDS_MAX
     elif scope == "bench":

@@ -18,7 +18,7 @@ from salient.config import CONTROLLERS
 from salient.experiments.compare import every_machine
 from salient.experiments.compare.metrics import STEADY_S
 from salient.experiments.metrics import RIPPLE_WINDOW_S
-from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
+from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep
 
 # Parameters of the drive that conditions set, by meaning; the numbers are those of firmware/PARAMETERS.md.
 LOAD_KNOWN: dict[str, float] = {"load_source": 1}
@@ -50,6 +50,14 @@ SINES_HZ = (1.0, 5.0, 20.0, 50.0, 100.0)
 SINE_WINDOW_S = 0.15
 """Two periods of the load where they are longer."""
 RAMPS_MS = (1, 5, 20, 50, 100, 200, 500)
+
+HELD_SPEEDS_RPM = (100.0, 300.0, 600.0, 1000.0, 1500.0, 2000.0, 2500.0, 3000.0)
+HELD_SPEEDS_QUICK_RPM = (300.0, 3000.0)
+DYNAMOMETER_RPM_S = 10_000.0
+"""Acceleration by the dynamometer: held_speed_rpm in rig.dbc."""
+TORQUE_REQUESTED_NM = {"motoring": 100.0, "braking": -100.0}
+"""Beyond the torque limit of every drive, which then decides."""
+TORQUE_SETTLED_S = 0.1
 
 IMPERFECTIONS: dict[str, dict[str, float]] = {
     "20 mA of noise": {"current_noise_A": 0.02},
@@ -206,6 +214,25 @@ def _ramps(quick: bool) -> Iterator[Case]:
             yield from _by_controller("ramps", f"{machine}, {ramp_ms} ms", "load_step", scenario)
 
 
+def _torque_speed(quick: bool) -> Iterator[Case]:
+    for machine in ("saturating",) if quick else MACHINES:
+        for quadrant, torque_Nm in TORQUE_REQUESTED_NM.items():
+            for speed_rpm in HELD_SPEEDS_QUICK_RPM if quick else HELD_SPEEDS_RPM:
+                yield from _by_controller("torque_speed", f"{machine}, {speed_rpm:g} r/min, {quadrant}", "held",
+                                          _held_scenario(speed_rpm, torque_Nm, machine=machine),
+                                          controllers=CONTROLLERS if torque_Nm > 0.0 else ("salient",))
+
+
+def _held_scenario(speed_rpm: float, torque_Nm: float, **fields: Any) -> Scenario:
+    """A shaft that a dynamometer holds; recorded over whole strokes, at least 0.1 s."""
+    held_s = round(speed_rpm / DYNAMOMETER_RPM_S + 0.02, 6)
+    from_s = held_s + TORQUE_SETTLED_S
+    stroke_s = STROKE_DEG / (6.0 * speed_rpm)
+    return _scenario(duration_s=round(from_s + math.ceil(0.1 / stroke_s) * stroke_s, 6),
+                     torque=(TorqueStep(held_s, torque_Nm),), record=Record(10.0, from_s),
+                     bench={"held_speed_rpm": speed_rpm}, **fields)
+
+
 def _paper_conditions(quick: bool) -> Iterator[Case]:
     for machine in ("saturating",) if quick else MAGNETICS:
         step = replace(step_scenario(machine=machine, **PAPER_CONDITIONS), duration_s=0.5)
@@ -284,6 +311,8 @@ GROUPS: dict[str, Group] = {
                   ("speed_after_rpm", "worst"), ("copper_W", "median"), ("step_angle_deg", "gap"))),
     "moving": Group("load of 8 N m and a sine of 4 N m, 40 kHz", _moving, (("speed_swing_rpm", ""),)),
     "ramps": Group("load ramp to 8 N m at 150 r/min, 40 kHz", _ramps, (("speed_dip_rpm", ""),)),
+    "torque_speed": Group("torque at the torque limit over the speed of a held shaft, 40 kHz", _torque_speed,
+                          (("torque_mean_Nm", ""), ("peak_current_A", ""))),
     "paper_conditions": Group("the paper's conditions: 1 MHz, no delay, exact sensing, load torque known",
                               _paper_conditions,
                               (("settling_time_s", ""), ("overshoot_percent", ""), ("speed_dip_rpm", ""),

@@ -127,6 +127,12 @@ def moving_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window =
     return {"speed_swing_rpm": float(np.ptp(recording["speed_rpm"]))}
 
 
+def held_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """Mean torque and peak current over the whole recording, which is of whole strokes."""
+    return {"torque_mean_Nm": float(recording["torque_Nm"].mean(dtype=float)),
+            "peak_current_A": _peak_current_A(recording)}
+
+
 def step_and_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """A load step, and ripple and mean torque over the window."""
     torque = metrics.torque_metrics(recording["time_s"], recording["torque_Nm"], window_s)
@@ -139,11 +145,10 @@ def robustness_metrics(scenario: Scenario, recording: np.ndarray, window_s: Wind
     reference_rpm, last_s = scenario.speed[-1].value_rpm, scenario.duration_s
     steady_s = (last_s - STEADY_S, last_s)
     machine = load_machine(machine_path(scenario.machine))
-    currents = [recording[name] for name in recording.dtype.names or () if name.startswith("current_")]
     return {
         "settling_time_s": metrics.time_to_stay_in_band_s(
             *_until(recording, scenario.load[0].at_s), reference_rpm, scenario.speed[-1].at_s),
-        "peak_current_A": max(float(np.max(np.abs(current))) for current in currents),
+        "peak_current_A": _peak_current_A(recording),
         "highest_speed_percent": 100.0 * float(np.max(recording["speed_rpm"])) / reference_rpm,
         "speed_dip_rpm": metrics.speed_after_step(recording, reference_rpm, scenario.load[0].at_s)["speed_dip_rpm"],
         "speed_error_percent": metrics.speed_error_percent(recording, reference_rpm, steady_s),
@@ -162,6 +167,7 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "start": start_metrics,
     "load_step": load_step_metrics,
     "moving": moving_metrics,
+    "held": held_metrics,
     "step_and_ripple": step_and_ripple_metrics,
     "robustness": robustness_metrics,
     "every_machine": every_machine_metrics,
@@ -189,6 +195,11 @@ def failures(values: Metrics, peak_A: float = PEAK_CURRENT_MAX_A) -> list[str]:
 
 def _ripple(recording: np.ndarray, window_s: tuple[float, float]) -> float:
     return metrics.torque_metrics(recording["time_s"], recording["torque_Nm"], window_s)["torque_ripple"]
+
+
+def _peak_current_A(recording: np.ndarray) -> float:
+    currents = [recording[name] for name in recording.dtype.names or () if name.startswith("current_")]
+    return max(float(np.max(np.abs(current))) for current in currents)
 
 
 def _until(recording: np.ndarray, end_s: float) -> tuple[np.ndarray, np.ndarray]:

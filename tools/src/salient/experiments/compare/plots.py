@@ -129,6 +129,31 @@ def _over_load(content: Content) -> Figure | None:
     return _over(content, "loads", "load / (N m)")
 
 
+def _torque_over_speed(content: Content) -> Figure | None:
+    """Mean torque over speed, one panel per machine; braking below zero."""
+    rows = [row for row in _rows(content, "torque_speed") if row["figure"] == "torque_mean_Nm"]
+    machines = list(dict.fromkeys(row["condition"].split(", ")[0] for row in rows))
+    if not rows:
+        return None
+    figure, axes = _panels(len(machines), columns=4, height_in=3.4, sharey=True)
+    for axis, machine in zip(axes, machines, strict=True):
+        for controller in _controllers(rows):
+            for quadrant in ("motoring", "braking"):
+                points = [(float(speed.split()[0]), row["values"][controller]) for row in rows
+                          for of, speed, kind in [row["condition"].split(", ")]
+                          if (of, kind) == (machine, quadrant) and row["values"].get(controller) is not None]
+                if points:
+                    axis.plot(*zip(*points, strict=True), _MARKER.get(controller, "o") + "-",
+                              color=controller_colour(controller), markersize=4)
+        axis.axhline(0.0, color="#555555", linewidth=0.8)
+        axis.set_title(machine)
+        axis.set_xlabel("speed / (r/min)")
+        axis.set_xlim(0.0, None)
+    axes[0].set_ylabel("mean torque / (N m)")
+    _legend(figure, rows)
+    return figure
+
+
 def _over(content: Content, group: str, label: str) -> Figure | None:
     """Ripple over the number at the start of a condition's second part, one panel per machine."""
     rows = [row for row in _rows(content, group) if row["figure"] == "ripple"]
@@ -267,6 +292,8 @@ _PLOTS: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...
     "speeds": (("Torque ripple over speed", "Short lines: target.", _over_speed),),
     "loads": (("Torque ripple over load", "150 r/min; the mean torque is the load plus 0.31 N m of friction.",
                _over_load),),
+    "torque_speed": (("Torque over speed", "Mean of the true torque in torque mode at the torque limit of 19.1 N m,"
+                      " while a dynamometer holds the shaft; below zero: braking.", _torque_over_speed),),
     "dip": (("Speed drop over the rotor angle at the load step", "Dotted and dashed: theoretical limit of median and"
              " maximum (non-causal controller, voltage 0 µs (ideal sensing) or 100 µs after the step).", _over_angle),),
     "ablation": (("Parts switched off", "One dot per seed of weights, noise and time of the load step.", _ablations),),
