@@ -11,8 +11,10 @@ from typing import TextIO
 
 from salient.bench.emulator import executable
 from salient.errors import UsageError
-from salient.experiments.compare import baseline, results_file, table
-from salient.experiments.compare.cases import GROUPS, Case, scenario_toml
+from salient.experiments.compare import baseline, finished_runs, results_file, summary_file, table
+from salient.experiments.compare.case import Case
+from salient.experiments.compare.cases import GROUPS, scenario_toml
+from salient.experiments.compare.finished_runs import FinishedRuns
 from salient.experiments.compare.runner import RunMetrics, run_all
 
 FAILED = "failed"
@@ -25,12 +27,13 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
         stream.writelines(f"{name:<18}{group.title}{' (long: runs only when named)' if group.long else ''}\n"
                           for name, group in GROUPS.items())
         return 0
-    cases = _cases(options.groups, options.quick)
+    cases = _first_samples(_cases(options.groups, options.quick), options.samples)
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
-    _prepare_folder(options.out)
+    _prepare_folder(options.out, options.resume)
     for machine in {case.scenario.machine for case in cases}:
         executable(machine)
-    runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr)
+    finished = FinishedRuns(options.out / finished_runs.NAME)
+    runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr, finished)
     rows = table.make_rows(runs)
     changes: list[baseline.Change] = []
     change_summary = None
@@ -39,6 +42,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
         change_summary = baseline.summary(changes, both, str(options.baseline), options.worse_percent)
     content = results_file.content(rows, runs, options.quick)
     results_file.write(options.out / results_file.NAME, content)
+    summary_file.write(options.out / summary_file.NAME, runs, _command(options))
     failed = _write_failed(options.out / FAILED, runs)
 
     from salient.experiments.compare.html import write_page  # imports Matplotlib, which takes a second
@@ -63,11 +67,21 @@ def _cases(groups: Sequence[str], quick: bool) -> list[Case]:
             for case in group.cases(quick)]
 
 
-def _prepare_folder(out: Path) -> None:
-    """Creates the folder and removes the files of an earlier run."""
+def _first_samples(cases: Sequence[Case], count: int | None) -> list[Case]:
+    """The cases of the first `count` samples of each condition; None for all."""
+    samples: dict[tuple[str, str], dict[str, None]] = {}  # in order
+    for case in cases:
+        samples.setdefault((case.group, case.condition), {}).setdefault(case.sample)
+    kept = {condition: list(of)[:count] for condition, of in samples.items()}
+    return [case for case in cases if case.sample in kept[case.group, case.condition]]
+
+
+def _prepare_folder(out: Path, resume: bool) -> None:
+    """Creates the folder and removes the files of an earlier run, except for its finished runs when it is resumed."""
     try:
         (out / FAILED).mkdir(parents=True, exist_ok=True)
-        for path in (*(out / FAILED).glob("*.toml"), out / results_file.NAME, out / "compare.html"):
+        for path in (*(out / FAILED).glob("*.toml"), out / results_file.NAME, out / "compare.html",
+                     out / summary_file.NAME, *(() if resume else (out / finished_runs.NAME,))):
             path.unlink(missing_ok=True)
         (out / results_file.NAME).touch()
         (out / results_file.NAME).unlink()
@@ -93,4 +107,5 @@ def _name(case: Case) -> str:
 
 
 def _command(options: argparse.Namespace) -> str:
-    return " ".join(["tools/salient compare", *options.groups, *(["--quick"] if options.quick else [])])
+    return " ".join(["tools/salient compare", *options.groups, *(["--quick"] if options.quick else []),
+                     *([f"--samples {options.samples}"] if options.samples else [])])

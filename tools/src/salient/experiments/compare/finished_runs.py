@@ -1,0 +1,56 @@
+"""The finished runs of a comparison, in a file that an interrupted comparison continues from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from salient.bench.emulator import executable
+from salient.experiments import metrics as run_metrics
+from salient.experiments.compare import metrics as compare_metrics
+from salient.experiments.compare.case import Case
+from salient.experiments.compare.metrics import Metrics
+
+NAME = "runs.jsonl"
+METRICS_FILES = (Path(run_metrics.__file__), Path(compare_metrics.__file__))
+
+
+class FinishedRuns:
+    """Results by run, which its description, the executable of its machine and the code of the metrics identify.
+
+    The file has a line per run, [key, metrics, why it failed, trace], written as soon as the run has finished; a line
+    that is cut off at the end is ignored.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._results: dict[str, tuple[Metrics, str, Any]] = {}
+        self._path = path
+        if not path.exists():
+            return
+        complete = [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")]
+        path.write_text("".join(complete), encoding="utf-8")
+        for line in complete:
+            key, metrics, failed, trace = json.loads(line)
+            self._results[key] = (metrics, failed, trace)
+
+    def get(self, case: Case, description: str) -> tuple[Metrics, str, Any] | None:
+        """The results of a run, None when it has not finished."""
+        return self._results.get(_key(case, description))
+
+    def add(self, case: Case, description: str, metrics: Metrics, failed: str, trace: Any) -> None:
+        """Appends a run to the file."""
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps([_key(case, description), metrics, failed, trace], allow_nan=False) + "\n")
+
+
+def _key(case: Case, description: str) -> str:
+    files = (executable(case.scenario.machine), *METRICS_FILES)
+    return hashlib.sha256(" ".join([*map(_digest, files), description]).encode()).hexdigest()
+
+
+@lru_cache
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
