@@ -118,7 +118,7 @@ def test_random_loads_are_of_every_kind_and_within_what_the_drive_can_make():
         peak_Nm = load.load[0].torque_Nm + load.bench.get("load_sine_amplitude_Nm", 0.0)
         assert 0.9 < peak_Nm < max(1.2, 17.3 - friction_Nm * load.speed[0].value_rpm * np.pi / 30)
     for load in sines:
-        window_s = load.duration_s - load.load[0].at_s - 0.5
+        window_s = load.duration_s - load.load[0].at_s - 3.0
         periods = window_s * load.bench["load_sine_frequency_Hz"]
         assert window_s > 0.499 and periods == pytest.approx(max(2, round(periods)), abs=1e-3)
 
@@ -192,20 +192,20 @@ def test_swing_is_the_excess_after_the_drop_or_the_oscillation_that_remains():
 
 
 def random_load_metrics(speed_rpm, **bench):
-    """Metrics of 1 s at 60 r/min; the load of 8 N m is applied at 0.2 s."""
-    scenario = Scenario(name="", duration_s=1.0, speed=(SpeedStep(0.0, 60.0),), load=(LoadStep(0.2, 8.0),),
+    """Metrics of 4 s at 60 r/min; the load of 8 N m is applied at 0.2 s."""
+    scenario = Scenario(name="", duration_s=4.0, speed=(SpeedStep(0.0, 60.0),), load=(LoadStep(0.2, 8.0),),
                         bench={"inertia_gain": 2.0, **bench})
-    recording = recording_of(speed_rpm=speed_rpm, torque_Nm=speed_rpm, current_a_A=np.full(1000, 20.0))
+    recording = recording_of(speed_rpm=speed_rpm, torque_Nm=speed_rpm, current_a_A=np.full(4000, 20.0))
     return EXTRACTORS["random_load"](scenario, recording)
 
 
-def test_constant_load_is_judged_half_a_second_after_it():
-    speed_rpm = np.full(1000, 60.0)
-    speed_rpm[200:690] = 30.0
+def test_constant_load_is_judged_three_seconds_after_it():
+    speed_rpm = np.full(4000, 60.0)
+    speed_rpm[200:3190] = 30.0
     assert failures(random_load_metrics(speed_rpm)) == []
-    speed_rpm[710] = 60.3 + 0.09
+    speed_rpm[3210] = 60.3 + 0.09
     assert failures(random_load_metrics(speed_rpm)) == []
-    speed_rpm[710] = 60.3 + 0.11
+    speed_rpm[3210] = 60.3 + 0.11
     assert failures(random_load_metrics(speed_rpm)) == ["deviation under a constant load beyond 0.5 % 0.11 r/min"]
     speed_rpm[100:200] = 67.6
     assert "maximum speed 105.07 % of reference" in failures(random_load_metrics(speed_rpm))
@@ -215,7 +215,7 @@ def test_constant_load_is_judged_half_a_second_after_it():
 
 def test_sine_is_judged_by_the_swing_of_the_free_shaft():
     # 2 * 4 N m / (2 * 0.02 kg m^2 * 2 pi 10 Hz) is 3.183 rad/s, 30.4 r/min peak to peak.
-    wave_rpm = np.sin(2.0 * np.pi * 10.0 * np.arange(1000) * 1e-3)
+    wave_rpm = np.sin(2.0 * np.pi * 10.0 * np.arange(4000) * 1e-3)
     sine = {"load_sine_amplitude_Nm": 4.0, "load_sine_frequency_Hz": 10.0}
     values = random_load_metrics(60.0 + 15.2 * wave_rpm, **sine)
     assert values["swing_ratio"] == pytest.approx((30.4 - 0.1) / 30.4, rel=2e-3)

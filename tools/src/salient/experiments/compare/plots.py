@@ -19,7 +19,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from salient.config import CONTROLLERS
 from salient.experiments.compare.baseline import Change
-from salient.experiments.compare.metrics import METRICS
+from salient.experiments.compare.metrics import METRICS, Metric
 from salient.experiments.compare.table import in_order
 from salient.experiments.plots import STYLE
 from salient.experiments.results import PAPER
@@ -215,8 +215,7 @@ def _curves(group: str, metrics: Sequence[tuple[str, str]], where: Callable[[lis
                              and controller in row["values"]]
                     colour = controller_colour(controller) if len(lines) == 1 else _LINES(
                         lines.index(line) / max(1, len(lines) - 1))
-                    axis.plot([x for x, _ in shown], [_positive(row["values"][controller], of.factor)
-                                                      for _, row in shown],
+                    axis.plot([x for x, _ in shown], [_visible(row["values"][controller], of) for _, row in shown],
                               _MARKER.get(controller, "o") + "-", color=colour, markersize=4, linewidth=1.0)
                     missing = [x for x, row in shown if row["values"][controller] is None]
                     axis.plot(missing, [0.97] * len(missing), "x", color=colour, transform=axis.get_xaxis_transform())
@@ -224,6 +223,8 @@ def _curves(group: str, metrics: Sequence[tuple[str, str]], where: Callable[[lis
                     if targets:
                         axis.plot(*zip(*targets, strict=True), "_", color=_TARGET_COLOUR, markersize=14)
             _logarithmic(axis.xaxis)
+            axis.set_xticks(sorted({x for _, _, x in places}))
+            axis.minorticks_off()
             _logarithmic(axis.yaxis)
             axis.set_title(panel)
             axis.set_xlabel(x_label)
@@ -239,9 +240,9 @@ def _curves(group: str, metrics: Sequence[tuple[str, str]], where: Callable[[lis
     return draw
 
 
-def _positive(value: float | None, factor: float) -> float:
-    """For a logarithmic axis; nothing is drawn for an event that did not occur."""
-    return np.nan if value is None else max(value * factor, 1e-4)
+def _visible(value: float | None, of: Metric) -> float:
+    """For a logarithmic axis: at least the metric's resolution; nothing is drawn for an event that did not occur."""
+    return np.nan if value is None else max(value * of.factor, of.resolution)
 
 
 # --- studies --------------------------------------------------------------------------------------------------------
@@ -342,7 +343,7 @@ _PLOTS: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...
     "encoders": (("Encoders", "Longest time with a torque against the load of more than a tenth of it, the largest over"
                   " the rotor angles, by speed. Short lines: target.", _curves(
         "encoders", (("against_periods", "worst"),), lambda parts: (
-            f"{parts[0]}{parts[1].partition(' bits')[2]}", parts[2], _number(parts[1])), "bits")),),
+            ", ".join((parts[0], *parts[1].split(" and ")[1:])), parts[2], _number(parts[1])), "bits")),),
     "misalignment": (("Learning of a misalignment", "Torque ripple relative to that of the aligned drive, by speed."
                       " Short lines: target.", _curves(
         "misalignment", (("ripple_3s_ratio", ""), ("ripple_6s_ratio", "")),
