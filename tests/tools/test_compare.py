@@ -15,12 +15,16 @@ from salient.errors import UsageError
 from salient.experiments.compare import baseline, command, random_cases, results_file, summary_file, table
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS, scenario_toml, start_scenario
+from salient.experiments.compare.every_machine import EXAMPLES
 from salient.experiments.compare.finished_runs import FinishedRuns
-from salient.experiments.compare.metrics import EXTRACTORS, METRICS, failures
+from salient.experiments.compare.machine import cases_of, subject
+from salient.experiments.compare.metrics import EXTRACTORS, METRICS, failures, peak_current_max_A
 from salient.experiments.compare.random_cases import random_drive, random_load
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS, Target
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, load_scenarios
+from salient.machine.file import load_machine, machine_path
+from salient.paths import MACHINES
 
 ALL_CASES = {name: list(group.cases(False)) for name, group in GROUPS.items()}
 
@@ -282,6 +286,41 @@ def test_resumed_comparison_executes_nothing_again_and_a_new_one_everything(tmp_
         assert len(keys) == lines
         executed = (tmp_path / "runs.jsonl").stat().st_mtime_ns > modified_before
         assert executed or option == ("--resume",)
+
+
+def test_finished_run_counts_for_its_machine_file_only(tmp_path):
+    text, machine = (MACHINES / "saturating.toml").read_text(), tmp_path / "machine.toml"
+    case = Case("start", "machine", "paper", "start",
+                replace(start_scenario(controller="paper"), machine=str(machine), duration_s=0.01))
+    heavier = text.replace("inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.03")
+    for content, executed in ((text, True), (text, False), (heavier, True), (text, False)):
+        machine.write_text(content)
+        progress = io.StringIO()
+        run_all([case], 1, progress, FinishedRuns(tmp_path / "runs.jsonl"))
+        assert ("1/1 start" in progress.getvalue()) == executed
+
+
+def test_cases_of_another_machine_have_its_speeds_and_torques():
+    on = subject(str(EXAMPLES / "fan12.toml"))
+    scale = on.scale
+    for name, of in ALL_CASES.items():
+        own = [case for case in of if case.scenario.machine == "saturating"]
+        for case, scaled in zip(own, cases_of(of, on), strict=True):
+            assert scaled.scenario.machine == on.path and "saturating" not in scaled.condition
+            assert (scaled.group, scaled.sample, scaled.extractor) == (name, case.sample, case.extractor)
+            assert [step.value_rpm for step in scaled.scenario.speed] == [
+                scale.rpm(step.value_rpm) for step in case.scenario.speed]
+            assert [step.torque_Nm for step in scaled.scenario.load] == [
+                scale.Nm(step.torque_Nm) for step in case.scenario.load]
+            assert scaled.scenario.record.from_s <= scaled.scenario.duration_s
+
+
+def test_peak_current_is_judged_in_proportion_to_that_of_the_machine():
+    limit_A = peak_current_max_A(load_machine(EXAMPLES / "fan12.toml"))
+    assert limit_A == pytest.approx(12.6, rel=0.01)
+    assert peak_current_max_A(load_machine(machine_path("saturating"))) == pytest.approx(90.0)
+    assert failures({"peak_current_A": 0.99 * limit_A}, limit_A) == []
+    assert len(failures({"peak_current_A": 1.01 * limit_A}, limit_A)) == 1
 
 
 def test_summary_counts_runs_and_failures_of_a_commit(tmp_path):
