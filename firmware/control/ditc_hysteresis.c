@@ -43,27 +43,40 @@ static int32_t outgoing_state(const ditc_hysteresis_parameters_t *parameters, in
     return crossed_zero ? 0 : state;
 }
 
-static int32_t limit_current(const ditc_hysteresis_parameters_t *parameters, int32_t state, int32_t current_q9) {
-    return state > 0 && current_q9 > parameters->current_limit_q9 ? 0 : state;
+typedef struct {
+    int32_t current_q9; /* A, Q7.9 */
+    int32_t state;      /* highest one above it */
+} limit_t;
+
+/* While the rotor turns backwards, the back-EMF drives the current of a freewheeling phase further up. */
+static limit_t limit_of(const ditc_hysteresis_parameters_t *parameters, bool backwards) {
+    const int32_t limit_q9 = parameters->current_limit_q9;
+    return backwards ? (limit_t){limit_q9 - limit_q9 / 4, OFF} : (limit_t){limit_q9, 0};
+}
+
+static int32_t limit_current(limit_t limit, int32_t state, int32_t current_q9) {
+    return state > limit.state && current_q9 > limit.current_q9 ? limit.state : state;
 }
 
 void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, const commutation_t *commutation,
-                          int32_t torque_error_q24, const int32_t *current_q9, int32_t duty_q15[HAL_PHASES_MAX]) {
+                          int32_t torque_error_q24, const int32_t *current_q9, bool backwards,
+                          int32_t duty_q15[HAL_PHASES_MAX]) {
+    const limit_t limit = limit_of(parameters, backwards);
     const unsigned active = commutation->active;
     const unsigned outgoing = commutation->outgoing;
     int32_t outgoing_next = OFF;
     bool outgoing_conducts = false;
     if (outgoing != COMMUTATION_NONE) {
         const int32_t outgoing_current_q9 = current_q9[outgoing];
-        outgoing_next = limit_current(parameters, outgoing_state(parameters, duty_q15[outgoing], torque_error_q24),
-                                      outgoing_current_q9);
+        outgoing_next =
+            limit_current(limit, outgoing_state(parameters, duty_q15[outgoing], torque_error_q24), outgoing_current_q9);
         outgoing_conducts = outgoing_current_q9 > 0;
     }
     int32_t active_next = OFF;
     if (active != COMMUTATION_NONE) {
         active_next = outgoing_conducts ? incoming_state(parameters, duty_q15[active], torque_error_q24)
                                         : single_state(parameters, duty_q15[active], torque_error_q24);
-        active_next = limit_current(parameters, active_next, current_q9[active]);
+        active_next = limit_current(limit, active_next, current_q9[active]);
     }
     ditc_hysteresis_reset(duty_q15);
     if (outgoing != COMMUTATION_NONE) {

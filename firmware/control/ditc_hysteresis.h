@@ -15,11 +15,14 @@
  * driven to the current limit before it has torque, and the torque ripple is 1.0 to 1.6 instead of 0.3 to 0.8 at 40
  * kHz.
  *
- * A phase above the current limit is not switched on: 0 instead of +1. Comparisons only, nothing overflows.
+ * A phase above the current limit is not switched on: 0 instead of +1. While the rotor turns backwards, the phases
+ * generate: a freewheeling current rises further, and faster than the limit provides for. The limit is then 3/4, and a
+ * phase above it is switched off: -1. Comparisons only, nothing overflows.
  */
 #ifndef CONTROL_DITC_HYSTERESIS_H
 #define CONTROL_DITC_HYSTERESIS_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "control/commutation.h"
@@ -34,8 +37,9 @@ typedef struct {
 void ditc_hysteresis_reset(int32_t duty_q15[HAL_PHASES_MAX]);
 
 /* One sample: new states from the last ones, the torque error (N m, Q7.24, any value) and the phase currents (A, Q7.9).
- * States are duties in Q1.15: -32768, 0, 32768. */
+ * States are duties in Q1.15: -32768, 0, 32768. backwards: the rotor turns against the order of the phases. */
 void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, const commutation_t *commutation,
-                          int32_t torque_error_q24, const int32_t *current_q9, int32_t duty_q15[HAL_PHASES_MAX]);
+                          int32_t torque_error_q24, const int32_t *current_q9, bool backwards,
+                          int32_t duty_q15[HAL_PHASES_MAX]);
 
 #endif

@@ -74,7 +74,7 @@ void pwm_ditc_step(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc, co
     if (ditc->regulated != active) {
         /* The BP-PID regulates the outgoing phase until that phase is depleted. */
         duty_q15[active] = incoming_duty_q15(parameters, sample, sample->current_q9[active]);
-        const int32_t eighth_q24 = fixed_clamp(sample->reference_q24 / 8, 0, parameters->depleted_torque_q24);
+        const int32_t eighth_q24 = fixed_clamp(sample->reference_q24 >> 3, 0, parameters->depleted_torque_q24);
         const int32_t threshold_q24 = eighth_q24 > DEPLETED_MIN_Q24 ? eighth_q24 : DEPLETED_MIN_Q24;
         const bool depleted =
             sample->torque[ditc->regulated] < threshold_q24 >> parameters->torque_shift && sample->error_q24 <= 0;

@@ -20,11 +20,18 @@ void torque_control_reset(const control_parameters_t *parameters, control_state_
     }
 }
 
+/* Threshold of a rotor that turns backwards: 8 rad/s, above the noise of the speed estimate at standstill. */
+#define BACKWARDS_Q22 (1 << 25)
+
+static bool turns_backwards(const control_state_t *state) {
+    return state->observer.speed_q22 < -BACKWARDS_Q22;
+}
+
 static void hysteresis_control(const control_parameters_t *parameters, control_state_t *state,
                                const control_measurement_t *measured) {
     const int32_t error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24);
     ditc_hysteresis_step(&parameters->hysteresis, &measured->commutation, error_q24, measured->current_q9,
-                         state->duty_q15);
+                         turns_backwards(state), state->duty_q15);
 }
 
 static void duty_control(const control_parameters_t *parameters, control_state_t *state,
@@ -34,6 +41,12 @@ static void duty_control(const control_parameters_t *parameters, control_state_t
         for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
             state->duty_q15[phase] = -MODULATOR_DUTY_ONE_Q15;
         }
+        return;
+    }
+    if (turns_backwards(state)) {
+        /* The BP-PID assumes the order of the phases of forward motion. It begins again, as from standstill. */
+        state->duty.regulated = COMMUTATION_NONE;
+        hysteresis_control(parameters, state, measured);
         return;
     }
     const pwm_ditc_sample_t sample = {

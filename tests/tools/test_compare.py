@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,19 @@ import pytest
 from salient.cli import make_parser
 from salient.config import CONTROLLERS
 from salient.errors import UsageError
-from salient.experiments.compare import baseline, cases, command, results_file, table
-from salient.experiments.compare.cases import GROUPS, Case, random_drive, scenario_toml, start_scenario
-from salient.experiments.compare.metrics import METRICS, failures
+from salient.experiments.compare import baseline, command, random_cases, results_file, summary_file, table
+from salient.experiments.compare.case import Case
+from salient.experiments.compare.cases import GROUPS, scenario_toml, start_scenario
+from salient.experiments.compare.every_machine import EXAMPLES
+from salient.experiments.compare.finished_runs import FinishedRuns
+from salient.experiments.compare.machine import cases_of, subject
+from salient.experiments.compare.metrics import EXTRACTORS, METRICS, failures, peak_current_max_A
+from salient.experiments.compare.random_cases import random_drive, random_load
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS, Target
-from salient.experiments.scenario import load_scenarios
+from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, load_scenarios
+from salient.machine.file import load_machine, machine_path
+from salient.paths import MACHINES
 
 ALL_CASES = {name: list(group.cases(False)) for name, group in GROUPS.items()}
 
@@ -53,8 +61,9 @@ def test_every_target_belongs_to_a_row():
 
 def test_every_controller_runs_in_every_group_that_it_supports():
     for name, of in ALL_CASES.items():
+        salient = {key: {"salient"} for key in ("rates", "encoders", "misalignment", "standing_error", "hold")}
         expected = {"paper_conditions": {"traditional", "paper"}, "ablation": set(CONTROLLERS) - {"traditional"}}
-        assert {case.controller for case in of} == expected.get(name, set(CONTROLLERS))
+        assert {case.controller for case in of} == (expected | salient).get(name, set(CONTROLLERS))
 
 
 def test_quick_runs_are_a_subset_of_the_conditions():
@@ -100,7 +109,7 @@ def test_ramps_have_their_lengths():
 
 
 def test_random_drives_cover_their_ranges_and_are_reproducible():
-    drives = [random_drive(number) for number in range(cases.DRIVES)]
+    drives = [random_drive(number) for number in range(random_cases.DRIVES)]
     assert drives[:5] == [random_drive(number) for number in range(5)]
     assert {drive.encoder_bits for drive in drives} == set(range(14, 21))
     for name, low, high in (("flux_linkage_gain", 0.9, 1.1), ("resistance_gain", 0.8, 1.5), ("inertia_gain", 0.5, 3.0),
@@ -110,6 +119,128 @@ def test_random_drives_cover_their_ranges_and_are_reproducible():
         assert low - 1e-6 <= min(values) < low + 0.02 * (high - low)
         assert high - 0.02 * (high - low) < max(values) <= high + 1e-6
 
+
+def test_random_loads_are_of_every_kind_and_within_what_the_drive_can_make():
+    loads = [random_load(number) for number in range(200)]
+    assert loads[:5] == [random_load(number) for number in range(5)]
+    assert {load.machine for load in loads} == {"saturating", "linear_cosine", "linear_trapezoid", "finite_element"}
+    speeds_rpm = [load.speed[0].value_rpm for load in loads]
+    assert 10.0 <= min(speeds_rpm) < 12.0 and 1300.0 < max(speeds_rpm) <= 1500.0
+    sines = [load for load in loads if "load_sine_frequency_Hz" in load.bench]
+    ramps = [load for load in loads if "load_ramp_Nm_s" in load.bench]
+    assert min(len(sines), len(ramps), 200 - len(sines) - len(ramps)) > 50
+    for load in loads:
+        friction_Nm = (0.002 if load.machine == "finite_element" else 0.02) * load.bench["friction_gain"]
+        peak_Nm = load.load[0].torque_Nm + load.bench.get("load_sine_amplitude_Nm", 0.0)
+        assert 0.9 < peak_Nm < max(1.2, 17.3 - friction_Nm * load.speed[0].value_rpm * np.pi / 30)
+    for load in sines:
+        window_s = load.duration_s - load.load[0].at_s - 3.0
+        periods = window_s * load.bench["load_sine_frequency_Hz"]
+        assert window_s > 0.499 and periods == pytest.approx(max(2, round(periods)), abs=1e-3)
+
+
+def test_encoders_are_judged_over_angles_spread_over_a_stroke():
+    of = [case for case in ALL_CASES["encoders"] if case.condition == "saturating, 12 bits and edge stamps, 10 r/min"]
+    assert sorted(case.scenario.initial_angle_deg for case in of) == pytest.approx(np.arange(24) * 1.25)
+    assert all(case.scenario.encoder_edges and case.scenario.encoder_bits == 12 for case in of)
+
+
+def test_mean_speed_is_taken_over_whole_turns():
+    for case in ALL_CASES["standing_error"]:
+        scenario = case.scenario
+        turns = (scenario.duration_s - scenario.record.from_s) * scenario.speed[0].value_rpm / 60.0
+        assert turns == pytest.approx(max(1, round(turns)), abs=1e-4)
+
+
+def test_moving_load_of_the_misaligned_drive_is_constant_before_the_ripple_is_taken():
+    moving = [case for case in ALL_CASES["misalignment"] if case.condition.endswith("moving load")]
+    for case in moving:
+        scenario = case.scenario
+        steps = scenario.load
+        assert steps[-1].torque_Nm == 6.0 and steps[-1].at_s <= scenario.record.from_s - 0.29
+        if case.sample == "misaligned":
+            assert {step.torque_Nm for step in steps[:-1]} == {2.0, 10.0} and len(steps) > 20
+            # A ramp from 10 to 2 N m takes as long as a step lasts.
+            assert scenario.bench["load_ramp_Nm_s"] * (steps[1].at_s - steps[0].at_s) == pytest.approx(8.0)
+        else:
+            assert len(steps) == 1
+
+
+# --- metrics --------------------------------------------------------------------------------------------------------
+
+def recording_of(step_s=1e-3, **columns):
+    """A recording of equal steps from 0 s on."""
+    count = len(next(iter(columns.values())))
+    columns = {"time_s": np.arange(count) * step_s, **columns}
+    return np.rec.fromarrays([np.asarray(column, dtype=float) for column in columns.values()], names=list(columns))
+
+
+def test_torque_against_the_load_is_timed_in_control_periods():
+    torque_Nm = np.full(400, 8.0)
+    torque_Nm[20:25] = -0.79  # within a tenth of the load
+    torque_Nm[50:58] = -2.0
+    torque_Nm[100:105] = -19.0
+    recording = recording_of(5e-6, torque_Nm=torque_Nm, speed_rpm=np.full(400, 149.0))
+    scenario = Scenario(name="", duration_s=0.002, speed=(SpeedStep(0.0, 150.0),), load=(LoadStep(0.0, 8.0),))
+    values = EXTRACTORS["encoder"](scenario, recording)
+    assert values == pytest.approx({"against_periods": 8 * 5 / 25, "speed_dip_rpm": 1.0})
+
+
+def test_mean_speed_and_movement_count_turns_beyond_360_degrees():
+    # A turn a second, too fast by a thousandth.
+    angle_deg = (350.0 + 360.0 * 1.001 * np.arange(1001) * 1e-3) % 360.0
+    scenario = Scenario(name="", duration_s=1.0, speed=(SpeedStep(0.0, 60.0),), record=Record())
+    recording = recording_of(rotor_angle_deg=angle_deg)
+    assert EXTRACTORS["mean_error"](scenario, recording)["mean_error_rpm"] == pytest.approx(0.06)
+    assert EXTRACTORS["hold"](scenario, recording)["drift_deg"] == pytest.approx(360.36)
+
+
+def test_swing_is_the_excess_after_the_drop_or_the_oscillation_that_remains():
+    scenario = Scenario(name="", duration_s=0.4, speed=(SpeedStep(0.0, 150.0),), load=(LoadStep(0.0, 8.0),))
+    speed_rpm = np.full(400, 150.0)
+    speed_rpm[:50] = 100.0
+    speed_rpm[60:70] = 153.0
+    recording = recording_of(speed_rpm=speed_rpm, torque_Nm=speed_rpm)
+    assert EXTRACTORS["inertia_step"](scenario, recording)["swing_percent"] == pytest.approx(2.0)
+    speed_rpm[350:] = 144.0
+    recording = recording_of(speed_rpm=speed_rpm, torque_Nm=speed_rpm)
+    assert EXTRACTORS["inertia_step"](scenario, recording)["swing_percent"] == pytest.approx(4.0)
+
+
+def random_load_metrics(speed_rpm, **bench):
+    """Metrics of 4 s at 60 r/min; the load of 8 N m is applied at 0.2 s."""
+    scenario = Scenario(name="", duration_s=4.0, speed=(SpeedStep(0.0, 60.0),), load=(LoadStep(0.2, 8.0),),
+                        bench={"inertia_gain": 2.0, **bench})
+    recording = recording_of(speed_rpm=speed_rpm, torque_Nm=speed_rpm, current_a_A=np.full(4000, 20.0))
+    return EXTRACTORS["random_load"](scenario, recording)
+
+
+def test_constant_load_is_judged_three_seconds_after_it():
+    speed_rpm = np.full(4000, 60.0)
+    speed_rpm[200:3190] = 30.0
+    assert failures(random_load_metrics(speed_rpm)) == []
+    speed_rpm[3210] = 60.3 + 0.09
+    assert failures(random_load_metrics(speed_rpm)) == []
+    speed_rpm[3210] = 60.3 + 0.11
+    assert failures(random_load_metrics(speed_rpm)) == ["deviation under a constant load beyond 0.5 % 0.11 r/min"]
+    speed_rpm[100:200] = 67.6
+    assert "maximum speed 105.07 % of reference" in failures(random_load_metrics(speed_rpm))
+    speed_rpm[100:150] = 60.0
+    assert failures(random_load_metrics(speed_rpm))[0] == "not at speed before the load step"
+
+
+def test_sine_is_judged_by_the_swing_of_the_free_shaft():
+    # 2 * 4 N m / (2 * 0.02 kg m^2 * 2 pi 10 Hz) is 3.183 rad/s, 30.4 r/min peak to peak.
+    wave_rpm = np.sin(2.0 * np.pi * 10.0 * np.arange(4000) * 1e-3)
+    sine = {"load_sine_amplitude_Nm": 4.0, "load_sine_frequency_Hz": 10.0}
+    values = random_load_metrics(60.0 + 15.2 * wave_rpm, **sine)
+    assert values["swing_ratio"] == pytest.approx((30.4 - 0.1) / 30.4, rel=2e-3)
+    assert failures(values) == []
+    assert failures(random_load_metrics(60.0 + 16.1 * wave_rpm, **sine)) == [
+        "swing under a sine relative to the free shaft 1.056"]
+
+
+# --- scenarios ------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_written_scenario_equals_the_one_that_ran(group, tmp_path):
@@ -130,6 +261,97 @@ def test_run_that_ends_in_a_fault_is_reported_and_reproducible(tmp_path):
     ((_, path),) = command._write_failed(tmp_path, [run])
     assert path.name == "start_saturating_paper.toml"
     assert load_scenarios(path) == [replace(scenario, name=path.stem)]
+
+
+def test_ratios_are_relative_to_the_first_sample():
+    step = replace(start_scenario(controller="salient"), duration_s=0.2, speed=(SpeedStep(0.0, 150.0),),
+                   load=(LoadStep(0.1, 8.0),))
+    doubled = {"inertia_gain": 2.0}
+    samples = (("nominal", step), ("changed", replace(step, bench=doubled)))
+    runs = run_all([Case("inertia", "saturating, inertia x 2", "salient", "inertia_step", scenario, sample)
+                    for sample, scenario in samples], 1, io.StringIO())
+    nominal, changed = (run.metrics for run in runs)
+    assert "recovery_ratio" not in nominal
+    assert changed["recovery_ratio"] == pytest.approx(changed["recovery_time_s"] / nominal["recovery_time_s"])
+    assert 1.0 < changed["recovery_ratio"] < 3.0
+
+
+def test_interrupted_comparison_continues_with_the_runs_that_are_missing(tmp_path):
+    path = tmp_path / "runs.jsonl"
+    short = replace(start_scenario(controller="paper"), duration_s=0.01)
+    first, second = (Case("start", "saturating", "paper", "start", replace(short, seed=seed)) for seed in (1, 2))
+    (before,) = run_all([first], 1, io.StringIO(), FinishedRuns(path))
+    with path.open("a") as file:
+        file.write('["cut off')
+    progress = io.StringIO()
+    after, added = run_all([first, second], 1, progress, FinishedRuns(path))
+    assert progress.getvalue().startswith("1/1 start")
+    assert after == before and added.case == second
+    assert len(path.read_text().splitlines()) == 2
+
+
+def test_resumed_comparison_executes_nothing_again_and_a_new_one_everything(tmp_path):
+    for option, lines in (((), 3), (("--resume",), 3), ((), 3)):
+        modified_before = (tmp_path / "runs.jsonl").stat().st_mtime_ns if (tmp_path / "runs.jsonl").exists() else 0
+        assert compare("start", "--quick", "--out", tmp_path, *option)[0] == 0
+        keys = (tmp_path / "runs.jsonl").read_text().splitlines()
+        assert len(keys) == lines
+        executed = (tmp_path / "runs.jsonl").stat().st_mtime_ns > modified_before
+        assert executed or option == ("--resume",)
+
+
+def test_finished_run_counts_for_its_machine_file_only(tmp_path):
+    text, machine = (MACHINES / "saturating.toml").read_text(), tmp_path / "machine.toml"
+    case = Case("start", "machine", "paper", "start",
+                replace(start_scenario(controller="paper"), machine=str(machine), duration_s=0.01))
+    heavier = text.replace("inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.03")
+    for content, executed in ((text, True), (text, False), (heavier, True), (text, False)):
+        machine.write_text(content)
+        progress = io.StringIO()
+        run_all([case], 1, progress, FinishedRuns(tmp_path / "runs.jsonl"))
+        assert ("1/1 start" in progress.getvalue()) == executed
+
+
+def test_cases_of_another_machine_have_its_speeds_and_torques():
+    on = subject(str(EXAMPLES / "fan12.toml"))
+    scale = on.scale
+    for name, of in ALL_CASES.items():
+        own = [case for case in of if case.scenario.machine == "saturating"]
+        for case, scaled in zip(own, cases_of(of, on), strict=True):
+            assert scaled.scenario.machine == on.path and "saturating" not in scaled.condition
+            assert (scaled.group, scaled.sample, scaled.extractor) == (name, case.sample, case.extractor)
+            assert [step.value_rpm for step in scaled.scenario.speed] == [
+                scale.rpm(step.value_rpm) for step in case.scenario.speed]
+            assert [step.torque_Nm for step in scaled.scenario.load] == [
+                scale.Nm(step.torque_Nm) for step in case.scenario.load]
+            assert scaled.scenario.record.from_s <= scaled.scenario.duration_s
+
+
+def test_peak_current_is_judged_in_proportion_to_that_of_the_machine():
+    limit_A = peak_current_max_A(load_machine(EXAMPLES / "fan12.toml"))
+    assert limit_A == pytest.approx(12.6, rel=0.01)
+    assert peak_current_max_A(load_machine(machine_path("saturating"))) == pytest.approx(90.0)
+    assert failures({"peak_current_A": 0.99 * limit_A}, limit_A) == []
+    assert len(failures({"peak_current_A": 1.01 * limit_A}, limit_A)) == 1
+
+
+def test_summary_counts_runs_and_failures_of_a_commit(tmp_path):
+    runs = [run_metrics(group="robustness", condition="random drives", sample=f"drive {number:03}",
+                        failed="fault encoder" if number == 1 else "") for number in range(3)]
+    summary_file.write(tmp_path / "summary.toml", runs, "tools/salient compare robustness")
+    summary = tomllib.loads((tmp_path / "summary.toml").read_text())
+    assert summary["command"] == "tools/salient compare robustness"
+    assert re.fullmatch("[0-9a-f]{7,}(-dirty)?|unknown", summary["commit"])
+    assert summary["study"] == [{
+        "group": "robustness", "condition": "random drives", "controller": "paper", "first": "drive 000",
+        "last": "drive 002", "runs": 3, "failed": 1, "failures": ["drive 001: fault encoder"]}]
+
+
+def test_samples_are_the_first_ones_of_each_condition():
+    kept = command._first_samples(ALL_CASES["robustness"], 3)
+    assert {case.sample for case in kept} == {f"drive 00{n}" for n in range(3)} | {f"load 0{n}" for n in range(3)}
+    assert len(kept) == 3 * 6
+    assert command._first_samples(ALL_CASES["robustness"], None) == ALL_CASES["robustness"]
 
 
 def test_identical_runs_are_executed_once():
@@ -347,12 +569,13 @@ def test_studies_have_plots_and_quick_targets_are_not_judged(tmp_path):
     code, output = compare("dip", "ablation", "robustness", "--quick", "--out", tmp_path)
     assert code == 0
     assert "not judged (6 of 24 angles)" in output and "not judged (10 of 500 drives)" in output
+    assert "not judged (4 of 20 loads)" in output
     assert "REACHED" not in output and "0 of 0 targets reached, " in output
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
     assert page.count('src="data:image/png;base64,') == 3 and "not judged (6 of 24 angles)" in page
     content = json.loads((tmp_path / "compare.json").read_text())
     values = {(row["group"], row["figure"], row["statistic"]): row["values"] for row in content["rows"]
-              if row["group"] != "ablation"}
+              if row["group"] != "ablation" and row["condition"] != "random machines, speeds and loads"}
     assert all(row["reached"] is None for row in content["rows"])
     # Six load steps over a stroke of 30 degrees.
     assert 5.0 <= values["dip", "step_angle_deg", "gap"]["paper"] < 5.3
@@ -372,11 +595,32 @@ def test_drive_follows_moving_loads(tmp_path):
         assert low_rpm < values[condition][controller] < high_rpm
 
 
+def test_ranges_have_figures_and_plots(tmp_path):
+    code, output = compare("inertia", "rates", "encoders", "misalignment", "standing_error", "hold", "--quick",
+                           "--out", tmp_path)
+    assert code == 0 and "9 of 9 targets reached, 16 not judged" in output
+    page = (tmp_path / "compare.html").read_text(encoding="utf-8")
+    assert page.count('src="data:image/png;base64,') == 6
+    content = json.loads((tmp_path / "compare.json").read_text())
+    values = {(row["condition"], row["figure"]): row["values"].get("salient") for row in content["rows"]}
+    for row, low, high in (
+        (("saturating, inertia x 0.33", "recovery_ratio"), 1.5, 3.0),
+        (("saturating, inertia x 0.33", "swing_percent"), 0.3, 2.0),
+        (("saturating, 20 kHz", "ripple"), 0.006, 0.015), (("saturating, 100 kHz", "speed_dip_rpm"), 1.0, 3.0),
+        (("saturating, 17 bits, 10 r/min", "speed_dip_rpm"), 2.0, 4.5),
+        (("saturating, 17 bits, 600 r/min", "against_periods"), -0.1, 2.0),
+        (("saturating, 600 r/min, 0.5 deg", "ripple_6s_ratio"), 0.9, 1.3),
+        (("saturating, 600 r/min, 8 N m", "mean_error_rpm"), -0.1, 0.005),
+        (("saturating, 8 N m", "drift_deg"), 0.0, 0.02)):
+        assert low < values[row] < high, row
+
+
 def test_groups_are_listed():
     code, output = compare("--list")
     assert code == 0
     assert [line.split()[0] for line in output.splitlines()] == list(GROUPS)
-    assert [line.split()[0] for line in output.splitlines() if "only when named" in line] == ["ablation", "robustness"]
+    assert [line.split()[0] for line in output.splitlines() if "only when named" in line] == [
+        "encoders", "misalignment", "standing_error", "hold", "ablation", "robustness", "machines"]
 
 
 def test_unknown_group_is_reported():

@@ -56,10 +56,10 @@ scene_t scene(bool outgoing, int32_t outgoing_current_q9, int32_t active_current
 
 constexpr int32_t ONE_Q15 = 32768;
 
-int next_state(const scene_t &s, unsigned phase, int state, int32_t error) {
+int next_state(const scene_t &s, unsigned phase, int state, int32_t error, bool backwards = false) {
     int32_t duty_q15[HAL_PHASES_MAX] = {};
     duty_q15[phase] = state * ONE_Q15;
-    ditc_hysteresis_step(&PARAMETERS, &s.commutation, error, s.current_q9, duty_q15);
+    ditc_hysteresis_step(&PARAMETERS, &s.commutation, error, s.current_q9, backwards, duty_q15);
     EXPECT_EQ(duty_q15[phase] % ONE_Q15, 0);
     return duty_q15[phase] / ONE_Q15;
 }
@@ -99,6 +99,23 @@ TEST(DitcHysteresis, a_phase_above_the_current_limit_freewheels_instead_of_being
     }
 }
 
+TEST(DitcHysteresis, backwards_a_phase_above_three_quarters_of_the_limit_is_switched_off) {
+    for (const int state : {-1, 0, 1}) {
+        for (const int32_t error : ERRORS) {
+            for (const int32_t current : {512, LIMIT * 3 / 4, LIMIT * 3 / 4 + 1, 79 << 9}) {
+                for (const role_t role : {SINGLE, INCOMING, OUTGOING}) {
+                    const unsigned phase = role == OUTGOING ? 0 : 1;
+                    const scene_t s = role == SINGLE     ? scene(false, 0, current)
+                                      : role == INCOMING ? scene(true, 512, current)
+                                                         : scene(true, current, 512);
+                    const int expected = current > LIMIT * 3 / 4 ? -1 : rule(role, state, error);
+                    EXPECT_EQ(next_state(s, phase, state, error, true), expected);
+                }
+            }
+        }
+    }
+}
+
 TEST(DitcHysteresis, every_phase_can_have_every_role) {
     for (unsigned active = 0; active < HAL_PHASES_MAX; active++) {
         for (unsigned outgoing = 0; outgoing <= HAL_PHASES_MAX; outgoing++) {
@@ -111,7 +128,7 @@ TEST(DitcHysteresis, every_phase_can_have_every_role) {
             const int32_t current_q9[HAL_PHASES_MAX] = {100, 100, 100, 100};
             int32_t duty_q15[HAL_PHASES_MAX];
             ditc_hysteresis_reset(duty_q15);
-            ditc_hysteresis_step(&PARAMETERS, &commutation, INT32_MAX, current_q9, duty_q15);
+            ditc_hysteresis_step(&PARAMETERS, &commutation, INT32_MAX, current_q9, false, duty_q15);
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
                 EXPECT_EQ(duty_q15[phase], phase == active || phase == outgoing ? ONE_Q15 : -ONE_Q15);
             }
@@ -129,7 +146,7 @@ TEST(DitcHysteresis, in_a_commutation_gap_and_after_reset_all_phases_are_off) {
         EXPECT_EQ(state, -ONE_Q15);
     }
     for (const int32_t error : ERRORS) {
-        ditc_hysteresis_step(&PARAMETERS, &commutation, error, current_q9, duty_q15);
+        ditc_hysteresis_step(&PARAMETERS, &commutation, error, current_q9, false, duty_q15);
         for (const int32_t state : duty_q15) {
             EXPECT_EQ(state, -ONE_Q15);
         }
@@ -145,7 +162,7 @@ TEST(DitcHysteresis, extreme_bands_do_not_overflow) {
             for (const int32_t error : ERRORS) {
                 int32_t duty_q15[HAL_PHASES_MAX];
                 ditc_hysteresis_reset(duty_q15);
-                ditc_hysteresis_step(&parameters, &both.commutation, error, both.current_q9, duty_q15);
+                ditc_hysteresis_step(&parameters, &both.commutation, error, both.current_q9, false, duty_q15);
                 for (unsigned phase = 0; phase < 3; phase++) {
                     ASSERT_LE(std::abs(duty_q15[phase]), ONE_Q15);
                 }

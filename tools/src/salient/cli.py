@@ -156,6 +156,10 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/compare"), metavar="DIR",
                         help="folder (default out/compare)")
     parser.add_argument("--jobs", type=_count, metavar="N", help="simultaneous runs (default: number of cores)")
+    parser.add_argument("--samples", type=_count, metavar="N",
+                        help="only the first N samples (drives, angles, seeds) of each condition")
+    parser.add_argument("--resume", action="store_true",
+                        help="keep the finished runs in the folder, of the same scenario, machine and executable")
     parser.add_argument("--baseline", type=Path, metavar="DIR|FILE",
                         help="folder or compare.json of an earlier run: list the changes, exit code 1 when one is for "
                         "the worse")

@@ -82,8 +82,8 @@ class TorqueStep:
 
 @dataclass(frozen=True)
 class LoadStep:
-    """Load torque on the shaft from at_s on, positive against forward motion; profile_Nm: the rig's load_profile_Nm, None
-    leaves it."""
+    """Load torque on the shaft from at_s on, positive against forward motion; profile_Nm: the rig's load_profile_Nm,
+    None leaves it."""
 
     at_s: float
     torque_Nm: float
@@ -100,8 +100,8 @@ class Record:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario(Conditions):
-    """One run of one drive. Times in seconds of virtual time, not negative. load_profile: name of a bundled load profile
-    or path of a CSV file (salient.experiments.load_profile)."""
+    """One run of one drive. Times in seconds of virtual time, not negative. load_profile: name of a bundled load
+    profile or path of a CSV file (salient.experiments.load_profile)."""
 
     name: str
     duration_s: float

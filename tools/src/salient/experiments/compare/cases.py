@@ -6,18 +6,25 @@ and, where a metric is a statistic, by sample. Identical runs are executed once 
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from salient.config import CONTROLLERS
-from salient.experiments.compare import every_machine
-from salient.experiments.compare.metrics import STEADY_S
-from salient.experiments.metrics import RIPPLE_WINDOW_S
+from salient.experiments.compare import every_machine, random_cases, range_cases
+from salient.experiments.compare.case import (
+    LOAD_NM,
+    MACHINES,
+    MAGNETICS,
+    STEP_AT_S,
+    Case,
+    Group,
+    by_controller,
+    make_scenario,
+)
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep
 
 # Parameters of the drive that conditions set, by meaning; the numbers are those of firmware/PARAMETERS.md.
@@ -33,12 +40,7 @@ SWITCHES = {
 }  # fmt: skip
 """Optional parts of the controller salient, by condition."""
 
-MAGNETICS = ("saturating", "linear_cosine", "linear_trapezoid")
-MACHINES = (*MAGNETICS, "finite_element")
-
-LOAD_NM = 8.0
 RIPPLE_RPM = 150.0
-STEP_AT_S = 0.13
 RIPPLE_FROM_S = 0.3
 LONG_S = 1.0
 LATE_S = 3.0
@@ -85,42 +87,6 @@ ANGLES, ANGLES_QUICK = 24, 6
 STROKE_DEG = 30.0
 _STROKE_S = STROKE_DEG / (6.0 * RIPPLE_RPM)
 SEEDS = (1, 2, 3, 4, 5)
-DRIVES = 500
-
-
-@dataclass(frozen=True)
-class Case:
-    """One run and its metrics.
-
-    extractor: key of compare/metrics.EXTRACTORS. sample: distinguishes the runs of a condition, "" for a single run.
-    traced: keep the torque over the paper's window for a plot. window_s: of the ripple, for extractors whose
-    recordings are longer. strokes: by which the load step is later than STEP_AT_S.
-    """
-
-    group: str
-    condition: str
-    controller: str
-    extractor: str
-    scenario: Scenario
-    sample: str = ""
-    traced: bool = False
-    window_s: tuple[float, float] = RIPPLE_WINDOW_S
-    strokes: float = 0.0
-
-
-@dataclass(frozen=True)
-class Group:
-    """A part of the comparison.
-
-    columns: (metric, statistic) of its rows, as far as its runs have them. The statistic is "" for a single run, else
-    median, worst (maximum), gap (widest between angles, modulo STROKE_DEG) or count (of failed runs). long: runs only
-    when named.
-    """
-
-    title: str
-    cases: Callable[[bool], Iterator[Case]]
-    columns: tuple[tuple[str, str], ...]
-    long: bool = False
 
 
 def _ripple(quick: bool) -> Iterator[Case]:
@@ -161,7 +127,7 @@ def _loads(quick: bool) -> Iterator[Case]:
 
 def _start(quick: bool) -> Iterator[Case]:
     for machine in ("saturating",) if quick else MACHINES:
-        yield from _by_controller("start", machine, "start", start_scenario(machine=machine))
+        yield from by_controller("start", machine, "start", start_scenario(machine=machine))
 
 
 def _dip(quick: bool) -> Iterator[Case]:
@@ -172,11 +138,11 @@ def _dip(quick: bool) -> Iterator[Case]:
     for machine, sensing in conditions:
         for number in range(angles):
             step_s = STEP_AT_S + number * _STROKE_S / angles
-            scenario = _scenario(machine=machine, duration_s=step_s + 0.3, speed=(SpeedStep(0.0, RIPPLE_RPM),),
+            scenario = make_scenario(machine=machine, duration_s=step_s + 0.3, speed=(SpeedStep(0.0, RIPPLE_RPM),),
                                  load=(LoadStep(step_s, LOAD_NM),), record=Record(10.0, 0.09), **SENSING[sensing])
             sample = f"angle {number:02}"
             strokes = number / angles
-            yield from _by_controller("dip", f"{machine}, {sensing}", "load_step", scenario, sample, strokes=strokes)
+            yield from by_controller("dip", f"{machine}, {sensing}", "load_step", scenario, sample, strokes=strokes)
             if machine == "saturating" and sensing != "17 bits" and not quick:
                 yield Case("dip", f"{machine}, {sensing}, reserve of 8 N m", "salient", "load_step",
                            replace(scenario, controller="salient", parameters=RESERVE), sample, strokes=strokes)
@@ -191,7 +157,7 @@ def _moving(quick: bool) -> Iterator[Case]:
     for machine in MOVING_MACHINES[:1] if quick else MOVING_MACHINES:
         for speed_rpm, frequency_Hz, controllers in conditions:
             scenario = _sine_scenario(speed_rpm, frequency_Hz, machine=machine)
-            yield from _by_controller("moving", f"{machine}, {speed_rpm:g} r/min, {frequency_Hz:g} Hz", "moving",
+            yield from by_controller("moving", f"{machine}, {speed_rpm:g} r/min, {frequency_Hz:g} Hz", "moving",
                                       scenario, controllers=controllers)
 
 
@@ -199,7 +165,7 @@ def _sine_scenario(speed_rpm: float, frequency_Hz: float, **fields: Any) -> Scen
     """A load of 8 N m after the acceleration, with a sine from time 0; recorded at the end, in the steady state."""
     loaded_s = 0.2 + 0.6 * speed_rpm / 3000.0
     from_s = round(loaded_s + max(0.3, 1.0 / frequency_Hz), 6)
-    return _scenario(duration_s=from_s + max(SINE_WINDOW_S, 2.0 / frequency_Hz), speed=(SpeedStep(0.0, speed_rpm),),
+    return make_scenario(duration_s=from_s + max(SINE_WINDOW_S, 2.0 / frequency_Hz), speed=(SpeedStep(0.0, speed_rpm),),
                      load=(LoadStep(loaded_s, LOAD_NM),), record=Record(10.0, from_s),
                      bench={"load_sine_amplitude_Nm": SINE_NM, "load_sine_frequency_Hz": frequency_Hz}, **fields)
 
@@ -208,17 +174,17 @@ def _ramps(quick: bool) -> Iterator[Case]:
     for machine in MOVING_MACHINES:
         for ramp_ms in (20, 200) if quick else RAMPS_MS:
             ramp_s = ramp_ms / 1000.0
-            scenario = _scenario(machine=machine, duration_s=STEP_AT_S + ramp_s + 0.3,
+            scenario = make_scenario(machine=machine, duration_s=STEP_AT_S + ramp_s + 0.3,
                                  speed=(SpeedStep(0.0, RIPPLE_RPM),), load=(LoadStep(STEP_AT_S, LOAD_NM),),
                                  record=Record(10.0, STEP_AT_S), bench={"load_ramp_Nm_s": LOAD_NM / ramp_s})
-            yield from _by_controller("ramps", f"{machine}, {ramp_ms} ms", "load_step", scenario)
+            yield from by_controller("ramps", f"{machine}, {ramp_ms} ms", "load_step", scenario)
 
 
 def _torque_speed(quick: bool) -> Iterator[Case]:
     for machine in ("saturating",) if quick else MACHINES:
         for quadrant, torque_Nm in TORQUE_REQUESTED_NM.items():
             for speed_rpm in HELD_SPEEDS_QUICK_RPM if quick else HELD_SPEEDS_RPM:
-                yield from _by_controller("torque_speed", f"{machine}, {speed_rpm:g} r/min, {quadrant}", "held",
+                yield from by_controller("torque_speed", f"{machine}, {speed_rpm:g} r/min, {quadrant}", "held",
                                           _held_scenario(speed_rpm, torque_Nm, machine=machine),
                                           controllers=CONTROLLERS if torque_Nm > 0.0 else ("salient",))
 
@@ -228,7 +194,7 @@ def _held_scenario(speed_rpm: float, torque_Nm: float, **fields: Any) -> Scenari
     held_s = round(speed_rpm / DYNAMOMETER_RPM_S + 0.02, 6)
     from_s = held_s + TORQUE_SETTLED_S
     stroke_s = STROKE_DEG / (6.0 * speed_rpm)
-    return _scenario(duration_s=round(from_s + math.ceil(0.1 / stroke_s) * stroke_s, 6),
+    return make_scenario(duration_s=round(from_s + math.ceil(0.1 / stroke_s) * stroke_s, 6),
                      torque=(TorqueStep(held_s, torque_Nm),), record=Record(10.0, from_s),
                      bench={"held_speed_rpm": speed_rpm}, **fields)
 
@@ -256,7 +222,7 @@ def _ablation(quick: bool) -> Iterator[Case]:
         for controller, change, parameters in changes:
             for seed in SEEDS[:1] if quick else SEEDS:
                 # The seed also selects the angle of the load step within a stroke.
-                step = _scenario(controller=controller, seed=seed, duration_s=RIPPLE_FROM_S + 0.1,
+                step = make_scenario(controller=controller, seed=seed, duration_s=RIPPLE_FROM_S + 0.1,
                                  speed=(SpeedStep(0.0, RIPPLE_RPM),),
                                  load=(LoadStep(STEP_AT_S + (seed - 1) * _STROKE_S / len(SEEDS), LOAD_NM),),
                                  record=Record(1.0, STEP_AT_S), parameters={"bp_seed": seed, **parameters},
@@ -267,36 +233,9 @@ def _ablation(quick: bool) -> Iterator[Case]:
                                strokes=(seed - 1) / len(SEEDS))
 
 
-def _robustness(quick: bool) -> Iterator[Case]:
-    for number in range(10 if quick else DRIVES):
-        yield from _by_controller("robustness", "random drives", "robustness", random_drive(number),
-                                  f"drive {number:03}")
-
-
 def _machines(quick: bool) -> Iterator[Case]:
     for scenario in every_machine.scenarios(quick):
         yield Case("machines", Path(scenario.machine).stem, scenario.controller, "every_machine", scenario)
-
-
-def random_drive(number: int) -> Scenario:
-    """A drive and bench of the robustness study, reproducible by number: start to 150 r/min (even numbers) or
-    600 r/min, then 8 N m."""
-    draw = np.random.default_rng(number).uniform
-    bench = {
-        "flux_linkage_gain": draw(0.9, 1.1),
-        "resistance_gain": draw(0.8, 1.5),
-        "inertia_gain": math.exp(draw(math.log(0.5), math.log(3.0))),
-        "friction_gain": draw(0.0, 5.0),
-        "supply_voltage_V": draw(200.0, 280.0),
-        "encoder_offset_deg": draw(-0.1, 0.1),
-        "current_noise_A": draw(0.0, 0.04),
-    }
-    encoder_bits = int(draw(14.0, 21.0))
-    # CAN carries rig variables as single-precision floats; rounded here so that the scenario holds what is applied.
-    bench = {name: float(np.float32(value)) for name, value in bench.items()}
-    return _scenario(seed=number, duration_s=0.5 + 0.2 + STEADY_S, speed=(SpeedStep(0.0, (150.0, 600.0)[number % 2]),),
-                     load=(LoadStep(0.5, LOAD_NM),), record=Record(2.0, 0.0), encoder_bits=encoder_bits, bench=bench,
-                     initial_angle_deg=round(draw(0.0, 90.0), 3))
 
 
 GROUPS: dict[str, Group] = {
@@ -318,12 +257,29 @@ GROUPS: dict[str, Group] = {
                               (("settling_time_s", ""), ("overshoot_percent", ""), ("speed_dip_rpm", ""),
                                ("recovery_time_s", ""), ("speed_after_rpm", ""), ("torque_mean_Nm", ""),
                                ("ripple", ""))),
+    "inertia": Group("inertia other than assumed: load step of 8 N m at 150 r/min, start to 600 r/min, 40 kHz",
+                     range_cases.inertia,
+                     (("speed_dip_rpm", "worst"), ("recovery_ratio", ""), ("swing_percent", "worst"),
+                      ("settling_time_s", "worst"), ("overshoot_percent", "worst")),
+                     ratios={"recovery_time_s": "recovery_ratio"}),
+    "rates": Group("control rates: load step of 8 N m at 150 r/min, torque reserve of 8 N m, 20 mA of noise",
+                   range_cases.rates, (("ripple", ""), ("speed_dip_rpm", ""), ("recovery_time_s", ""))),
+    "encoders": Group("encoders: load step of 8 N m, 40 kHz", range_cases.encoders,
+                      (("failed", "count"), ("against_periods", "worst"), ("speed_dip_rpm", "worst")), long=True),
+    "misalignment": Group("misalignment of encoder and poles, 6 N m, 40 kHz", range_cases.misalignment,
+                          (("ripple_3s_ratio", ""), ("ripple_6s_ratio", ""), ("ripple_6s", "worst")), long=True,
+                          ratios={"ripple_3s": "ripple_3s_ratio", "ripple_6s": "ripple_6s_ratio"}),
+    "standing_error": Group("mean speed over whole turns, 40 kHz", range_cases.standing_error,
+                            (("mean_error_rpm", ""),), long=True),
+    "hold": Group("load at standstill, 40 kHz", range_cases.hold, (("drift_deg", ""),), long=True),
     "ablation": Group("parts switched off, 40 kHz, saturating, 20 mA of noise, five seeds", _ablation,
                       (("ripple", "median"), ("ripple", "worst"), ("ripple_late", "median"),
                        ("ripple_late", "worst"), ("speed_dip_rpm", "median"),
                        ("speed_dip_rpm", "worst")), long=True),
-    "robustness": Group("random drives: start to 150 or 600 r/min, then 8 N m, 40 kHz", _robustness,
-                        (("failed", "count"), ("settling_time_s", "median"), ("settling_time_s", "worst"),
+    "robustness": Group("random drives: start to 150 or 600 r/min, then 8 N m; random machines, speeds and loads; 40"
+                        " kHz", random_cases.robustness,
+                        (("failed", "count"), ("mean_error_percent", "worst"), ("deviation_rpm", "worst"),
+                         ("swing_ratio", "worst"), ("settling_time_s", "median"), ("settling_time_s", "worst"),
                          ("peak_current_A", "median"), ("peak_current_A", "worst"),
                          ("highest_speed_percent", "median"), ("highest_speed_percent", "worst"),
                          ("speed_dip_rpm", "median"), ("speed_dip_rpm", "worst"),
@@ -342,35 +298,24 @@ TITLES = {name: group.title for name, group in GROUPS.items()}
 
 def start_scenario(**fields: Any) -> Scenario:
     """From standstill to 600 r/min without load."""
-    return _scenario(duration_s=0.5, speed=(SpeedStep(0.0, 600.0),), record=Record(10.0, 0.0), **fields)
+    return make_scenario(duration_s=0.5, speed=(SpeedStep(0.0, 600.0),), record=Record(10.0, 0.0), **fields)
 
 
 def step_scenario(**fields: Any) -> Scenario:
     """The paper's load step, recorded from the step to the end of the ripple window."""
-    return _scenario(duration_s=RIPPLE_FROM_S + 0.1, speed=(SpeedStep(0.0, RIPPLE_RPM),),
+    return make_scenario(duration_s=RIPPLE_FROM_S + 0.1, speed=(SpeedStep(0.0, RIPPLE_RPM),),
                      load=(LoadStep(STEP_AT_S, LOAD_NM),), record=Record(1.0, STEP_AT_S), **fields)
-
-
-def _scenario(**fields: Any) -> Scenario:
-    return Scenario(name="compare", **fields)
 
 
 def _steady(group: str, condition: str, speed_rpm: float, from_s: float, quick: bool, traced: bool = False,
           loaded_s: float = STEP_AT_S, load_Nm: float = LOAD_NM, pulses: int | None = None,
           **fields: Any) -> Iterator[Case]:
     """Constant speed against a load, recorded from from_s. pulses: None for the default parameters."""
-    scenario = _scenario(duration_s=from_s + (0.1 if quick else LONG_S), speed=(SpeedStep(0.0, speed_rpm),),
+    scenario = make_scenario(duration_s=from_s + (0.1 if quick else LONG_S), speed=(SpeedStep(0.0, speed_rpm),),
                          load=(LoadStep(loaded_s, load_Nm),), record=Record(1.0, from_s), **fields)
-    for case in _by_controller(group, condition, "ripple", scenario):
+    for case in by_controller(group, condition, "ripple", scenario):
         parameters = PULSES[pulses] if case.controller == "salient" and pulses else case.scenario.parameters
         yield replace(case, scenario=replace(case.scenario, parameters=parameters), traced=traced)
-
-
-def _by_controller(group: str, condition: str, extractor: str, scenario: Scenario, sample: str = "",
-                   controllers: Sequence[str] = CONTROLLERS, strokes: float = 0.0) -> Iterator[Case]:
-    for controller in controllers:
-        yield Case(group, condition, controller, extractor, replace(scenario, controller=controller), sample,
-                   strokes=strokes)
 
 
 def scenario_toml(case: Case) -> str:
@@ -386,7 +331,8 @@ def scenario_toml(case: Case) -> str:
         if isinstance(value, Mapping):
             tables.append((f"[{key}]", value))
         elif isinstance(value, tuple):
-            tables += [(f"[[{key}]]", vars(step)) for step in value]
+            tables += [(f"[[{key}]]", {name: item for name, item in vars(step).items() if item is not None})
+                       for step in value]
         elif isinstance(value, Record):
             tables.append((f"[{key}]", vars(value)))
         else:
@@ -396,7 +342,9 @@ def scenario_toml(case: Case) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _toml(value: bool | int | float) -> str:
+def _toml(value: bool | int | float | str) -> str:
+    if isinstance(value, str):
+        return json.dumps(value)
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import TextIO
 
 from salient.errors import UsageError
-from salient.experiments.compare import baseline, results_file, table
-from salient.experiments.compare.cases import GROUPS, TITLES, Case, scenario_toml
+from salient.experiments.compare import baseline, finished_runs, results_file, summary_file, table
+from salient.experiments.compare.case import Case
+from salient.experiments.compare.cases import GROUPS, TITLES, scenario_toml
+from salient.experiments.compare.finished_runs import FinishedRuns
 from salient.experiments.compare.machine import Subject, cases_of, subject
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.machine.cache import machine_image
@@ -33,11 +35,13 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     if options.machine is not None:
         on = _subject(options.machine)
         cases, titles = cases_of(cases, on), {name: on.text(title) for name, title in titles.items()}
+    cases = _first_samples(cases, options.samples)
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
-    _prepare_folder(options.out)
+    _prepare_folder(options.out, options.resume)
     for machine in {case.scenario.machine for case in cases}:
         machine_image(machine)
-    runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr)
+    finished = FinishedRuns(options.out / finished_runs.NAME)
+    runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr, finished)
     rows = table.make_rows(runs)
     changes: list[baseline.Change] = []
     change_summary = None
@@ -46,6 +50,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
         change_summary = baseline.summary(changes, both, str(options.baseline), options.worse_percent)
     content = results_file.content(rows, runs, options.quick)
     results_file.write(options.out / results_file.NAME, content)
+    summary_file.write(options.out / summary_file.NAME, runs, _command(options))
     failed = _write_failed(options.out / FAILED, runs)
 
     from salient.experiments.compare.html import write_page  # imports Matplotlib, which takes a second
@@ -77,11 +82,21 @@ def _subject(name_or_path: str) -> Subject:
         raise UsageError(str(error)) from None
 
 
-def _prepare_folder(out: Path) -> None:
-    """Creates the folder and removes the files of an earlier run."""
+def _first_samples(cases: Sequence[Case], count: int | None) -> list[Case]:
+    """The cases of the first `count` samples of each condition; None for all."""
+    samples: dict[tuple[str, str], dict[str, None]] = {}  # in order
+    for case in cases:
+        samples.setdefault((case.group, case.condition), {}).setdefault(case.sample)
+    kept = {condition: list(of)[:count] for condition, of in samples.items()}
+    return [case for case in cases if case.sample in kept[case.group, case.condition]]
+
+
+def _prepare_folder(out: Path, resume: bool) -> None:
+    """Creates the folder and removes the files of an earlier run, except for its finished runs when it is resumed."""
     try:
         (out / FAILED).mkdir(parents=True, exist_ok=True)
-        for path in (*(out / FAILED).glob("*.toml"), out / results_file.NAME, out / "compare.html"):
+        for path in (*(out / FAILED).glob("*.toml"), out / results_file.NAME, out / "compare.html",
+                     out / summary_file.NAME, *(() if resume else (out / finished_runs.NAME,))):
             path.unlink(missing_ok=True)
         (out / results_file.NAME).touch()
         (out / results_file.NAME).unlink()
@@ -108,4 +123,5 @@ def _name(case: Case) -> str:
 
 def _command(options: argparse.Namespace) -> str:
     machine = [] if options.machine is None else ["--machine", shlex.quote(options.machine)]
-    return " ".join(["tools/salient compare", *options.groups, *machine, *(["--quick"] if options.quick else [])])
+    return " ".join(["tools/salient compare", *options.groups, *machine, *(["--quick"] if options.quick else []),
+                     *([f"--samples {options.samples}"] if options.samples else [])])

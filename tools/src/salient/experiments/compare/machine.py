@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from salient.bench.rig import bench_variables
-from salient.experiments.compare.cases import RIPPLE_RPM, STROKE_DEG, Case
+from salient.experiments.compare.case import Case
+from salient.experiments.compare.cases import RIPPLE_RPM, STROKE_DEG
 from salient.experiments.metrics import stroke_deg
 from salient.experiments.scaled import PAPER_WINDOW_S, Scale, scale_of
 from salient.experiments.scenario import LoadStep, Record, SpeedStep
@@ -77,10 +78,15 @@ def _case(case: Case, on: Subject) -> Case:
         window_s=(round(case.window_s[0] + delay_s, 6), round(case.window_s[1] + delay_s + longer_s, 6)),
         scenario=replace(
             scenario, machine=on.path, speed=speeds, record=record,
-            load=tuple(LoadStep(round(load.at_s + delay_s, 9), scale.Nm(load.torque_Nm)) for load in scenario.load),
+            load=tuple(_load(load, scale, delay_s) for load in scenario.load),
             duration_s=round(scenario.duration_s + delay_s + longer_s, 6),
             parameters=_scaled(scenario.parameters, _parameter_units(), on.factors),
             bench=_scaled(scenario.bench, _bench_units(), on.factors)))
+
+
+def _load(load: LoadStep, scale: Scale, delay_s: float) -> LoadStep:
+    return LoadStep(round(load.at_s + delay_s, 9), scale.Nm(load.torque_Nm),
+                    None if load.profile_Nm is None else scale.Nm(load.profile_Nm))
 
 
 def _scaled(values: Mapping[str, float], units: Mapping[str, str], factors: Mapping[str, float]) -> dict[str, float]:

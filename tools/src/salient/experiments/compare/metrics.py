@@ -7,6 +7,7 @@ MetricsError for a recording without the data of a metric.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -33,6 +34,28 @@ SPEED_MAX_PERCENT = 105.0
 LIMIT_CYCLE_MAX_PERCENT = 1.0
 """Limits of the robustness study. The last: strongest line of the torque's spectrum that is not a harmonic of the
 strokes, in percent of the mean torque (metrics.strongest_line_percent)."""
+
+
+ALLOWANCE_RPM = 0.1
+SETTLING_S = 3.0
+SWING_MAX_RATIO = 1.05
+OVERSHOOT_FROM_RPM = 150.0
+"""Limits of random machines, speeds and loads, judged SETTLING_S after the load has its value, which covers learning a
+misalignment. Before the load and under a constant one, the speed is within 0.5 % and ALLOWANCE_RPM of the reference; a
+sine moves it by at most SWING_MAX_RATIO times the swing of the free shaft and ALLOWANCE_RPM, and its mean is within
+0.5 % and ALLOWANCE_RPM of the reference. The overshoot of the start is relative to OVERSHOOT_FROM_RPM where the
+reference is lower: its 5 % are what the torque limit adds within 0.8 ms."""
+
+LIMITS = {
+    "speed_error_percent": SPEED_ERROR_MAX_PERCENT,
+    "mean_error_percent": SPEED_ERROR_MAX_PERCENT,
+    "deviation_rpm": ALLOWANCE_RPM,
+    "swing_ratio": SWING_MAX_RATIO,
+    "peak_current_A": PEAK_CURRENT_MAX_A,
+    "highest_speed_percent": SPEED_MAX_PERCENT,
+    "cycle_percent": LIMIT_CYCLE_MAX_PERCENT,
+}
+"""Limits of the robustness study; a run has those that apply to its load."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +97,18 @@ METRICS = {
     "dip_percent": Metric("speed drop", "%", 2, 0.05),
     "hold_percent": Metric("mean speed error", "%", 4, 0.002),
     "failed": Metric("failed drives", "", 0, 0.5),
+    "against_periods": Metric("longest torque against the load", "control periods", 1, 0.5),
+    "ripple_3s": Metric("K_t after 3 s", "", 5, 0.0002),
+    "ripple_6s": Metric("K_t after 6 s", "", 5, 0.0002),
+    "ripple_3s_ratio": Metric("K_t after 3 s relative to the aligned drive", "", 2, 0.05),
+    "ripple_6s_ratio": Metric("K_t after 6 s relative to the aligned drive", "", 2, 0.05),
+    "recovery_ratio": Metric("recovery time relative to the nominal inertia", "", 2, 0.05),
+    "swing_percent": Metric("swing after the drop", "% of reference", 2, 0.05),
+    "mean_error_rpm": Metric("error of the mean speed", "r/min", 4, 0.001),
+    "mean_error_percent": Metric("error of the mean speed", "%", 3, 0.01),
+    "deviation_rpm": Metric("deviation under a constant load beyond 0.5 %", "r/min", 2, 0.02),
+    "swing_ratio": Metric("swing under a sine relative to the free shaft", "", 3, 0.01),
+    "drift_deg": Metric("movement of the shaft", "deg", 4, 0.001),
     "step_angle_deg": Metric("rotor angle at the step", "deg", 2, 0.2),
 }
 
@@ -140,6 +175,84 @@ def step_and_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s:
     return {**step, "ripple": torque["torque_ripple"], "torque_mean_Nm": torque["torque_mean_Nm"]}
 
 
+def encoder_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """A load step: the speed drop, and the longest time with a torque against the load of more than a tenth of it, in
+    control periods."""
+    step = scenario.load[0]
+    drop = metrics.speed_after_step(recording, scenario.speed[-1].value_rpm, step.at_s)["speed_dip_rpm"]
+    against = np.asarray(recording["torque_Nm"]) < -0.1 * step.torque_Nm
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], against.astype(np.int8), [0]))))
+    longest = int(np.max(edges[1::2] - edges[::2], initial=0))
+    return {"against_periods": longest * metrics.sample_step_s(recording["time_s"]) * scenario.control_rate_hz,
+            "speed_dip_rpm": drop}
+
+
+def ripple_3s_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """Ripple over the whole recording."""
+    return {"ripple_3s": _ripple(recording, (_recorded_from_s(scenario), scenario.duration_s))}
+
+
+def ripple_6s_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """Ripple over the whole recording."""
+    return {"ripple_6s": _ripple(recording, (_recorded_from_s(scenario), scenario.duration_s))}
+
+
+def inertia_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """A load step: drop, recovery, and the highest speed above the reference after it or, where that is more, the
+    peak-to-peak speed over the last quarter of the recording."""
+    reference_rpm, step_s = scenario.speed[-1].value_rpm, scenario.load[0].at_s
+    after = metrics.speed_after_step(recording, reference_rpm, step_s)
+    speed_rpm = np.asarray(recording["speed_rpm"], dtype=float)
+    swing_rpm = max(float(np.max(speed_rpm)) - reference_rpm, float(np.ptp(speed_rpm[-(len(speed_rpm) // 4):])))
+    return {"speed_dip_rpm": after["speed_dip_rpm"], "recovery_time_s": after["recovery_time_s"],
+            "swing_percent": 100.0 * swing_rpm / reference_rpm}
+
+
+def mean_error_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """Absolute error of the mean speed over the whole recording."""
+    return {"mean_error_rpm": abs(_mean_speed_rpm(recording) - scenario.speed[-1].value_rpm)}
+
+
+def hold_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """Range of the rotor angle over the whole recording."""
+    return {"drift_deg": float(np.ptp(_travel_deg(recording)))}
+
+
+def random_load_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """A start and a load of any kind, judged SETTLING_S after the load has its value; a sine acts from the start on.
+
+    The whole run is recorded.
+    """
+    reference_rpm, load = scenario.speed[-1].value_rpm, scenario.load[0]
+    ramp_Nm_s = scenario.bench.get("load_ramp_Nm_s", 0.0)
+    from_s = load.at_s + (load.torque_Nm / ramp_Nm_s if ramp_Nm_s else 0.0) + SETTLING_S
+    steady = recording[int(np.searchsorted(recording["time_s"], from_s)):]
+    before = recording[:int(np.searchsorted(recording["time_s"], load.at_s))]
+    speed_rpm = np.asarray(steady["speed_rpm"], dtype=float)
+    swing_Nm = scenario.bench.get("load_sine_amplitude_Nm", 0.0)
+    currents = [recording[name] for name in recording.dtype.names or () if name.startswith("current_")]
+    values: Metrics = {
+        "peak_current_A": max(float(np.max(current)) for current in currents),
+    }
+    if swing_Nm:
+        inertia_kg_m2 = load_machine(machine_path(scenario.machine)).inertia_kg_m2 * scenario.bench["inertia_gain"]
+        angular_frequency = 2.0 * math.pi * scenario.bench["load_sine_frequency_Hz"]
+        free_rpm = 2.0 * swing_Nm / (inertia_kg_m2 * angular_frequency) * 30.0 / math.pi
+        values["swing_ratio"] = max(0.0, float(np.ptp(speed_rpm)) - ALLOWANCE_RPM) / free_rpm
+        values["mean_error_percent"] = 100.0 * max(
+            0.0, abs(float(np.mean(speed_rpm)) - reference_rpm) - ALLOWANCE_RPM) / reference_rpm
+    else:
+        values["settling_time_s"] = metrics.time_to_stay_in_band_s(
+            before["time_s"], before["speed_rpm"], reference_rpm, scenario.speed[-1].at_s,
+            metrics.BAND + ALLOWANCE_RPM / reference_rpm)
+        over_rpm = float(np.max(before["speed_rpm"])) - reference_rpm
+        values["highest_speed_percent"] = 100.0 * (1.0 + over_rpm / max(reference_rpm, OVERSHOOT_FROM_RPM))
+        deviation_rpm = float(np.max(np.abs(speed_rpm - reference_rpm)))
+        values["deviation_rpm"] = max(0.0, deviation_rpm - metrics.BAND * reference_rpm)
+        values["mean_error_percent"] = 100.0 * abs(float(np.mean(speed_rpm)) - reference_rpm) / reference_rpm
+    return values
+
+
 def robustness_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """A start and a load step; the last STEADY_S are steady. The whole run is recorded."""
     reference_rpm, last_s = scenario.speed[-1].value_rpm, scenario.duration_s
@@ -169,8 +282,15 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "moving": moving_metrics,
     "held": held_metrics,
     "step_and_ripple": step_and_ripple_metrics,
+    "encoder": encoder_metrics,
+    "ripple_3s": ripple_3s_metrics,
+    "ripple_6s": ripple_6s_metrics,
+    "inertia_step": inertia_step_metrics,
+    "mean_error": mean_error_metrics,
+    "hold": hold_metrics,
     "robustness": robustness_metrics,
     "every_machine": every_machine_metrics,
+    "random_load": random_load_metrics,
 }
 
 
@@ -182,14 +302,13 @@ def peak_current_max_A(machine: Machine) -> float:
 def failures(values: Metrics, peak_A: float = PEAK_CURRENT_MAX_A) -> list[str]:
     """Limits that a drive of the robustness study violated, as text; empty when it passes."""
     wrong = []
-    if values["settling_time_s"] is None:
+    if values.get("settling_time_s", 0.0) is None:
         wrong.append("not at speed before the load step")
-    for name, limit in (("speed_error_percent", SPEED_ERROR_MAX_PERCENT), ("peak_current_A", peak_A),
-                        ("highest_speed_percent", SPEED_MAX_PERCENT), ("cycle_percent", LIMIT_CYCLE_MAX_PERCENT)):
-        value = values[name]
+    for name, limit in {**LIMITS, "peak_current_A": peak_A}.items():
+        value = values.get(name)
         if value is not None and value > limit:
             metric = METRICS[name]
-            wrong.append(f"{metric.label} {value:.{metric.decimals}f} {metric.unit}")
+            wrong.append(f"{metric.label} {value:.{metric.decimals}f} {metric.unit}".rstrip())
     return wrong
 
 
@@ -200,6 +319,17 @@ def _ripple(recording: np.ndarray, window_s: tuple[float, float]) -> float:
 def _peak_current_A(recording: np.ndarray) -> float:
     currents = [recording[name] for name in recording.dtype.names or () if name.startswith("current_")]
     return max(float(np.max(np.abs(current))) for current in currents)
+
+
+def _travel_deg(recording: np.ndarray) -> np.ndarray:
+    """Rotor angle from the first sample on, without jumps at 360 degrees."""
+    travel_deg: np.ndarray = np.unwrap(np.asarray(recording["rotor_angle_deg"], dtype=float), period=360.0)
+    return travel_deg
+
+
+def _mean_speed_rpm(recording: np.ndarray) -> float:
+    travel_deg = _travel_deg(recording)
+    return float((travel_deg[-1] - travel_deg[0]) / (recording["time_s"][-1] - recording["time_s"][0]) / 6.0)
 
 
 def _until(recording: np.ndarray, end_s: float) -> tuple[np.ndarray, np.ndarray]:

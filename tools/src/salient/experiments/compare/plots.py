@@ -19,7 +19,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from salient.config import CONTROLLERS
 from salient.experiments.compare.baseline import Change
-from salient.experiments.compare.metrics import METRICS
+from salient.experiments.compare.metrics import METRICS, Metric
 from salient.experiments.compare.table import in_order
 from salient.experiments.plots import STYLE
 from salient.experiments.results import PAPER
@@ -30,6 +30,7 @@ Content = Mapping[str, Any]
 _TARGET_COLOUR = "#222222"
 _PUBLISHED_COLOUR = "#6f6f6f"
 _MARKER = {"traditional": "s", "paper": "D", "salient": "o"}
+_LINES = matplotlib.colormaps["viridis"]
 _CHANGES_MAX = 60
 
 _STYLE: Any = {**STYLE, "font.size": 9.0, "axes.titlesize": 9.5}
@@ -211,6 +212,64 @@ def _over_angle(content: Content) -> Figure | None:
     return figure
 
 
+# --- moving loads, ranges -------------------------------------------------------------------------------------------
+
+def _curves(group: str, metrics: Sequence[tuple[str, str]], where: Callable[[list[str]], tuple[str, str, float]],
+            x_label: str) -> Callable[[Content], Figure | None]:
+    """Metrics over a number in the conditions; panels by metric and machine.
+
+    metrics: (metric, statistic). where: the parts of a condition, without commas -> panel, line, number. A group with
+    several lines has one colour per line, and one of a single line one colour per controller.
+    """
+    def draw(content: Content) -> Figure | None:
+        rows = [row for row in _rows(content, group) if (row["figure"], row["statistic"]) in metrics]
+        if not rows:
+            return None
+        places = [where(row["condition"].split(", ")) for row in rows]
+        panels = list(dict.fromkeys((row["figure"], panel) for row, (panel, _, _) in zip(rows, places, strict=True)))
+        panels.sort(key=lambda panel: [metric for metric, _ in metrics].index(panel[0]))
+        lines = list(dict.fromkeys(line for _, line, _ in places))
+        controllers = _controllers(rows)
+        figure, axes = _panels(len(panels), columns=max(2, len(panels) // len(metrics)), height_in=2.8)
+        for axis, (name, panel) in zip(axes, panels, strict=True):
+            of = METRICS[name]
+            for line in lines:
+                for controller in controllers:
+                    shown = [(x, row) for row, (its_panel, its_line, x) in zip(rows, places, strict=True)
+                             if (row["figure"], its_panel, its_line) == (name, panel, line)
+                             and controller in row["values"]]
+                    colour = controller_colour(controller) if len(lines) == 1 else _LINES(
+                        lines.index(line) / max(1, len(lines) - 1))
+                    axis.plot([x for x, _ in shown], [_visible(row["values"][controller], of) for _, row in shown],
+                              _MARKER.get(controller, "o") + "-", color=colour, markersize=4, linewidth=1.0)
+                    missing = [x for x, row in shown if row["values"][controller] is None]
+                    axis.plot(missing, [0.97] * len(missing), "x", color=colour, transform=axis.get_xaxis_transform())
+                    targets = [(x, row["wanted"] * of.factor) for x, row in shown if row["wanted"]]
+                    if targets:
+                        axis.plot(*zip(*targets, strict=True), "_", color=_TARGET_COLOUR, markersize=14)
+            _logarithmic(axis.xaxis)
+            axis.set_xticks(sorted({x for _, _, x in places}))
+            axis.minorticks_off()
+            _logarithmic(axis.yaxis)
+            axis.set_title(panel)
+            axis.set_xlabel(x_label)
+            axis.set_ylabel(f"{of.label}, {of.unit}" if of.unit else of.label, fontsize=7.5)
+        if len(lines) == 1:
+            _legend(figure, rows)
+        else:
+            handles = [Line2D([], [], color=_LINES(number / (len(lines) - 1)), marker="o")
+                       for number in range(len(lines))]
+            figure.legend(handles, lines, loc="outside upper right", ncols=len(lines))
+        return figure
+
+    return draw
+
+
+def _visible(value: float | None, of: Metric) -> float:
+    """For a logarithmic axis: at least the metric's resolution; nothing is drawn for an event that did not occur."""
+    return np.nan if value is None else max(value * of.factor, of.resolution)
+
+
 # --- studies --------------------------------------------------------------------------------------------------------
 
 def _ablations(content: Content) -> Figure | None:
@@ -244,8 +303,9 @@ def _ablations(content: Content) -> Figure | None:
 
 def _distributions(content: Content) -> Figure | None:
     """Cumulative distribution over the drives, one panel per metric, with its limit."""
-    runs = [run for run in content["runs"] if run["group"] == "robustness" and run["figures"]]
-    rows = {row["figure"]: row for row in _rows(content, "robustness") if row["statistic"] == "worst"}
+    runs = [run for run in content["runs"] if run["condition"] == "random drives" and run["figures"]]
+    rows = {row["figure"]: row for row in _rows(content, "robustness")
+            if row["condition"] == "random drives" and row["statistic"] == "worst"}
     if not runs or not rows:
         return None
     figure, axes = _panels(len(rows), columns=3, height_in=2.5, sharey=True)
@@ -296,6 +356,30 @@ _PLOTS: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...
                       " while a dynamometer holds the shaft; below zero: braking.", _torque_over_speed),),
     "dip": (("Speed drop over the rotor angle at the load step", "Dotted and dashed: theoretical limit of median and"
              " maximum (non-causal controller, voltage 0 µs (ideal sensing) or 100 µs after the step).", _over_angle),),
+    "moving": (("Speed under a sine", "Peak-to-peak speed. Short lines: target.", _curves(
+        "moving", (("speed_swing_rpm", ""),), lambda parts: (f"{parts[0]}, {parts[1]}", "", _number(parts[2])),
+        "frequency / Hz")),),
+    "ramps": (("Speed drop under a load ramp", "Short lines: target.", _curves(
+        "ramps", (("speed_dip_rpm", ""),), lambda parts: (parts[0], "", _number(parts[1])), "ramp / ms")),),
+    "inertia": (("Inertia other than assumed", "Short lines: target. Crosses: not recovered.", _curves(
+        "inertia", (("recovery_ratio", ""), ("swing_percent", "worst")),
+        lambda parts: (parts[0], "", float(parts[1].split()[-1])), "inertia / assumed inertia")),),
+    "rates": (("Control rates", "One line per machine.", _curves(
+        "rates", (("ripple", ""), ("speed_dip_rpm", "")), lambda parts: ("", parts[0], _number(parts[1])),
+        "control rate / kHz")),),
+    "encoders": (("Encoders", "Longest time with a torque against the load of more than a tenth of it, the largest over"
+                  " the rotor angles, by speed. Short lines: target.", _curves(
+        "encoders", (("against_periods", "worst"),), lambda parts: (
+            ", ".join((parts[0], *parts[1].split(" and ")[1:])), parts[2], _number(parts[1])), "bits")),),
+    "misalignment": (("Learning of a misalignment", "Torque ripple relative to that of the aligned drive, by speed."
+                      " Short lines: target.", _curves(
+        "misalignment", (("ripple_3s_ratio", ""), ("ripple_6s_ratio", "")),
+        lambda parts: (", ".join((parts[0], *parts[3:])), parts[1], _number(parts[2])), "misalignment / deg")),),
+    "standing_error": (("Mean speed", "By load. Short lines: target.", _curves(
+        "standing_error", (("mean_error_rpm", ""),), lambda parts: (parts[0], parts[2], _number(parts[1])),
+        "speed / (r/min)")),),
+    "hold": (("Load at standstill", "One line per machine. Short lines: target.", _curves(
+        "hold", (("drift_deg", ""),), lambda parts: ("", parts[0], abs(_number(parts[1]))), "load / (N m)")),),
     "ablation": (("Parts switched off", "One dot per seed of weights, noise and time of the load step.", _ablations),),
     "robustness": (("Random drives", "Share of the drives below a value; dashed: the limit.", _distributions),),
 }  # fmt: skip
@@ -332,6 +416,11 @@ def _logarithmic(axis: Axis) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 300.0 * low else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def _number(text: str) -> float:
+    """The number at the start of a part of a condition."""
+    return float(text.split(maxsplit=1)[0])
 
 
 def _rows(content: Content, group: str) -> list[dict[str, Any]]:

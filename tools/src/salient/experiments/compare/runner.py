@@ -6,7 +6,7 @@ import signal
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -16,7 +16,9 @@ from salient.bench.drive import DriveError
 from salient.bench.programs import EmulatorError
 from salient.bench.session import SessionError
 from salient.experiments.compare import every_machine
-from salient.experiments.compare.cases import Case
+from salient.experiments.compare.case import Case
+from salient.experiments.compare.cases import GROUPS
+from salient.experiments.compare.finished_runs import FinishedRuns
 from salient.experiments.compare.metrics import EXTRACTORS, Metrics, failures, peak_current_max_A
 from salient.experiments.metrics import MetricsError
 from salient.experiments.results import rounded
@@ -39,18 +41,22 @@ class RunMetrics:
     trace: tuple[list[float], list[float]] | None = None
 
 
-def run_all(cases: Sequence[Case], jobs: int, stream: TextIO) -> list[RunMetrics]:
+def run_all(cases: Sequence[Case], jobs: int, stream: TextIO, finished: FinishedRuns | None = None) -> list[RunMetrics]:
     """Metrics in the order of `cases`, independent of the number of jobs; prints the progress on `stream`.
 
-    A run that ends in a fault, or whose metrics cannot be computed, is marked as failed. UsageError for parameters that
-    the drive does not have.
+    A run that ends in a fault, or whose metrics cannot be computed, is marked as failed. Runs in `finished` are not
+    executed, the others are added to it. UsageError for parameters that the drive does not have.
     """
+    descriptions = [repr((case.extractor, case.traced, case.window_s, case.scenario)) for case in cases]
     first_cases: dict[str, int] = {}  # description of the run -> number of its first case
-    first_of = [first_cases.setdefault(repr((case.extractor, case.traced, case.scenario)), number)
-                for number, case in enumerate(cases)]
-    numbers = sorted(first_cases.values())
-    lines = len(numbers) if stream.isatty() else min(len(numbers), _PROGRESS_LINES_MAX)
+    first_of = [first_cases.setdefault(description, number) for number, description in enumerate(descriptions)]
     results: dict[int, tuple[Metrics, str, Any]] = {}
+    for description, number in first_cases.items():
+        known = finished.get(cases[number], description) if finished else None
+        if known is not None:
+            results[number] = known
+    numbers = sorted(number for number in first_cases.values() if number not in results)
+    lines = len(numbers) if stream.isatty() else min(len(numbers), _PROGRESS_LINES_MAX)
     with (ProcessPoolExecutor(jobs, initializer=_leave_interrupts_to_parent) as workers,
           Progress(lines, stream) as progress):
         futures = {workers.submit(_run, cases[number]): number for number in numbers}
@@ -58,13 +64,36 @@ def run_all(cases: Sequence[Case], jobs: int, stream: TextIO) -> list[RunMetrics
             for done, future in enumerate(as_completed(futures), start=1):
                 case = cases[futures[future]]
                 results[futures[future]] = future.result()
+                if finished:
+                    finished.add(case, descriptions[futures[future]], *future.result())
                 if done * lines // len(numbers) > (done - 1) * lines // len(numbers):
                     progress.step(f"{case.group}: {case.condition} by {case.controller}")
         except BaseException:
             for future in futures:
                 future.cancel()
             raise
-    return [RunMetrics(case, *results[first]) for case, first in zip(cases, first_of, strict=True)]
+    return _with_ratios([RunMetrics(case, *results[first]) for case, first in zip(cases, first_of, strict=True)])
+
+
+def _with_ratios(runs: Sequence[RunMetrics]) -> list[RunMetrics]:
+    """Adds the ratios of the groups to the metrics of all samples but the first of each condition."""
+    first_of: dict[tuple[str, ...], Metrics] = {}
+    completed = []
+    for run in runs:
+        case, added = run.case, {}
+        first = first_of.setdefault((case.group, case.condition, case.controller, case.extractor), run.metrics)
+        for metric, ratio in GROUPS[case.group].ratios.items():
+            if first is not run.metrics and metric in run.metrics and metric in first:
+                added[ratio] = _ratio(run.metrics[metric], first[metric])
+        completed.append(replace(run, metrics={**run.metrics, **added}))
+    return completed
+
+
+def _ratio(value: float | None, of: float | None) -> float | None:
+    """None when the event did not occur in the run itself; 0 relative to 0 is 1."""
+    if value is None or of is None or (of == 0.0 and value > 0.0):
+        return None
+    return value / of if of > 0.0 else 1.0
 
 
 def _leave_interrupts_to_parent() -> None:
@@ -83,7 +112,7 @@ def _run(case: Case) -> tuple[Metrics, str, Any]:
         except (EmulatorError, SessionError, DriveError, CanError, MetricsError) as error:
             return {}, str(error), None
         failed = ""
-        if case.extractor == "robustness":
+        if case.extractor in ("robustness", "random_load"):
             machine = load_machine(machine_path(case.scenario.machine))
             failed = "; ".join(failures(metrics, peak_current_max_A(machine)))
         if case.extractor == "every_machine":

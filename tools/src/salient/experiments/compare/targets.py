@@ -12,12 +12,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from salient.experiments.compare.cases import ANGLES, DRIVES, MAGNETICS
+from salient.experiments.compare import random_cases, range_cases
+from salient.experiments.compare.case import MACHINES, MAGNETICS
+from salient.experiments.compare.cases import ANGLES
 from salient.experiments.compare.metrics import (
+    ALLOWANCE_RPM,
     LIMIT_CYCLE_MAX_PERCENT,
     PEAK_CURRENT_MAX_A,
     SPEED_ERROR_MAX_PERCENT,
     SPEED_MAX_PERCENT,
+    SWING_MAX_RATIO,
 )
 from salient.experiments.results import PAPER
 
@@ -67,6 +71,8 @@ def _starts() -> dict[Key, Target]:
             targets["start", machine, metric, ""] = Target(bound=bound, published=published)
         for machine in MAGNETICS:
             targets["paper_conditions", f"{machine}, start", metric, ""] = Target(bound=bound, published=published)
+    for metric, limit in (("settling_time_s", 0.0140), ("overshoot_percent", 1.0)):
+        targets["start", "finite_element", metric, ""] = Target(limit)
     return targets
 
 
@@ -139,14 +145,48 @@ def _paper_conditions() -> dict[Key, Target]:
     return targets
 
 
+def _ranges() -> dict[Key, Target]:
+    targets = {}
+    for machine in MACHINES:
+        for gain in range_cases.INERTIA_GAINS:
+            for metric, statistic, limit in (("recovery_ratio", "", 3.0), ("swing_percent", "worst", 5.0),
+                                             ("overshoot_percent", "worst", 5.0)):
+                targets["inertia", f"{machine}, inertia x {gain:g}", metric, statistic] = Target(limit)
+        for speed_rpm in range_cases.ERROR_SPEEDS_RPM:
+            for load_Nm in range_cases.ERROR_LOADS_NM:
+                targets["standing_error", f"{machine}, {speed_rpm:g} r/min, {load_Nm:g} N m", "mean_error_rpm", ""] = (
+                    Target(max(0.02, 0.0002 * speed_rpm)))
+        for load_Nm in range_cases.HOLD_LOADS_NM:
+            targets["hold", f"{machine}, {load_Nm:g} N m", "drift_deg", ""] = Target(0.1)
+    for machine, angles in range_cases.ENCODER_ANGLES.items():
+        for bits in range_cases.ENCODER_BITS:
+            for stamps in ("", " and edge stamps"):
+                for speed_rpm in range_cases.ENCODER_SPEEDS_RPM:
+                    condition = f"{machine}, {bits} bits{stamps}, {speed_rpm:g} r/min"
+                    for row, limit in ((("failed", "count"), 0.0), (("against_periods", "worst"), 2.0)):
+                        targets["encoders", condition, *row] = Target(limit, samples=angles, sample_unit="angles")
+        offsets = [f"{speed_rpm:g} r/min, {offset_deg:g} deg" for speed_rpm in range_cases.OFFSET_SPEEDS_RPM
+                   for offset_deg in range_cases.OFFSETS_DEG]
+        for offset in (*offsets, "150 r/min, 0 deg, moving load", "150 r/min, 0.5 deg, moving load"):
+            targets["misalignment", f"{machine}, {offset}", "ripple_6s_ratio", ""] = Target(1.5)
+    return targets
+
+
 def _robustness() -> dict[Key, Target]:
     limits = {("failed", "count"): 0.0, ("peak_current_A", "worst"): PEAK_CURRENT_MAX_A,
-              ("highest_speed_percent", "worst"): SPEED_MAX_PERCENT,
-              ("speed_error_percent", "worst"): SPEED_ERROR_MAX_PERCENT,
-              ("cycle_percent", "worst"): LIMIT_CYCLE_MAX_PERCENT}
-    return {("robustness", "random drives", *row): Target(limit, samples=DRIVES, sample_unit="drives")
-            for row, limit in limits.items()}
+              ("highest_speed_percent", "worst"): SPEED_MAX_PERCENT}
+    drive_limits = {**limits, ("speed_error_percent", "worst"): SPEED_ERROR_MAX_PERCENT,
+                    ("cycle_percent", "worst"): LIMIT_CYCLE_MAX_PERCENT}
+    load_limits = {**limits, ("mean_error_percent", "worst"): SPEED_ERROR_MAX_PERCENT,
+                   ("deviation_rpm", "worst"): ALLOWANCE_RPM, ("swing_ratio", "worst"): SWING_MAX_RATIO}
+    targets: dict[Key, Target] = {
+        ("robustness", "random drives", *row): Target(limit, samples=random_cases.DRIVES, sample_unit="drives")
+        for row, limit in drive_limits.items()}
+    return targets | {
+        ("robustness", "random machines, speeds and loads", *row): Target(limit, samples=random_cases.LOADS,
+                                                                          sample_unit="loads")
+        for row, limit in load_limits.items()}
 
 
 TARGETS: dict[Key, Target] = {**_ripples(), **_starts(), **_dips(), **_moving_loads(), **_paper_conditions(),
-                              **_robustness()}
+                              **_ranges(), **_robustness()}
