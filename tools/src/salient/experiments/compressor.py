@@ -2,8 +2,8 @@
 
     build/venv/bin/python -m salient.experiments.compressor tools/loads
 
-Slider-crank of radius r and rod length l = r / RATIO, angle a from top dead centre (J. E. Shigley, J. J. Uicker, "Theory of
-Machines and Mechanisms", McGraw-Hill, 1980):
+Slider-crank of radius r and rod length l = r / RATIO, angle a from top dead centre (J. E. Shigley, J. J. Uicker,
+"Theory of Machines and Mechanisms", McGraw-Hill, 1980):
 
     x / r = 1 - cos a + (1 - sqrt(1 - RATIO^2 sin^2 a)) / RATIO
     dx/da / r = sin a + RATIO sin a cos a / sqrt(1 - RATIO^2 sin^2 a)
