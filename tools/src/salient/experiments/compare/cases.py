@@ -6,6 +6,7 @@ and, where a metric is a statistic, by sample. Identical runs are executed once 
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -47,6 +48,12 @@ SINES_HZ = (1.0, 5.0, 20.0, 50.0, 100.0)
 SINE_WINDOW_S = 0.15
 """Two periods of the load where they are longer."""
 RAMPS_MS = (1, 5, 20, 50, 100, 200, 500)
+
+COMPRESSORS = {"one cylinder": ("compressor_one_cylinder", 1.5), "two cylinders": ("compressor_two_cylinders", 3.0)}
+"""Load profile and its mean torque in N m, which with 5 N m more is at most 14.6 N m."""
+COMPRESSOR_BASE_NM = 5.0
+COMPRESSOR_RPM = (150.0, 600.0, 1500.0)
+COMPRESSOR_TURNS = 20
 
 IMPERFECTIONS: dict[str, dict[str, float]] = {
     "20 mA of noise": {"current_noise_A": 0.02},
@@ -199,6 +206,23 @@ def _ramps(quick: bool) -> Iterator[Case]:
             yield from _by_controller("ramps", f"{machine}, {ramp_ms} ms", "load_step", scenario)
 
 
+def _compressor(quick: bool) -> Iterator[Case]:
+    for machine in MOVING_MACHINES[:1] if quick else MOVING_MACHINES:
+        for speed_rpm in (600.0,) if quick else COMPRESSOR_RPM:
+            for name, (profile, mean_Nm) in COMPRESSORS.items():
+                loaded_s = 0.2 + 0.6 * speed_rpm / 3000.0
+                turn_s = 60.0 / speed_rpm
+                scenario = _scenario(machine=machine, duration_s=round(loaded_s + (COMPRESSOR_TURNS + 3) * turn_s, 6),
+                                     speed=(SpeedStep(0.0, speed_rpm),), load_profile=profile,
+                                     load=(LoadStep(loaded_s, COMPRESSOR_BASE_NM, mean_Nm),),
+                                     record=Record(10.0, round(loaded_s + COMPRESSOR_TURNS * turn_s, 6)))
+                condition = f"{machine}, {name}, {speed_rpm:g} r/min"
+                yield from _by_controller("compressor", condition, "moving", scenario, controllers=("paper", "salient"))
+                if not quick:
+                    yield Case("compressor", f"{condition}, not learned", "salient", "moving",
+                               replace(scenario, controller="salient", parameters={"periodic_load": 0}))
+
+
 def _paper_conditions(quick: bool) -> Iterator[Case]:
     for machine in ("saturating",) if quick else MAGNETICS:
         step = replace(step_scenario(machine=machine, **PAPER_CONDITIONS), duration_s=0.5)
@@ -271,6 +295,8 @@ GROUPS: dict[str, Group] = {
                   ("speed_after_rpm", "worst"), ("copper_W", "median"), ("step_angle_deg", "gap"))),
     "moving": Group("load of 8 N m and a sine of 4 N m, 40 kHz", _moving, (("speed_swing_rpm", ""),)),
     "ramps": Group("load ramp to 8 N m at 150 r/min, 40 kHz", _ramps, (("speed_dip_rpm", ""),)),
+    "compressor": Group("reciprocating compressor, turns 21 to 23 under load, 40 kHz", _compressor,
+                        (("speed_swing_rpm", ""),)),
     "paper_conditions": Group("the paper's conditions: 1 MHz, no delay, exact sensing, load torque known",
                               _paper_conditions,
                               (("settling_time_s", ""), ("overshoot_percent", ""), ("speed_dip_rpm", ""),
@@ -337,7 +363,8 @@ def scenario_toml(case: Case) -> str:
         if isinstance(value, Mapping):
             tables.append((f"[{key}]", value))
         elif isinstance(value, tuple):
-            tables += [(f"[[{key}]]", vars(step)) for step in value]
+            tables += [(f"[[{key}]]", {name: item for name, item in vars(step).items() if item is not None})
+                       for step in value]
         elif isinstance(value, Record):
             tables.append((f"[{key}]", vars(value)))
         else:
@@ -347,8 +374,8 @@ def scenario_toml(case: Case) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _toml(value: bool | int | float) -> str:
-    return str(value).lower() if isinstance(value, bool) else repr(value)
+def _toml(value: bool | int | float | str) -> str:
+    return str(value).lower() if isinstance(value, bool) else json.dumps(value) if isinstance(value, str) else repr(value)
 
 
 def _khz(rate_hz: int) -> str:
