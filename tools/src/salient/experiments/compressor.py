@@ -2,8 +2,8 @@
 
     build/venv/bin/python -m salient.experiments.compressor tools/loads
 
-Slider-crank of radius r and rod length l = r / RATIO, angle a from top dead centre (J. E. Shigley, J. J. Uicker, "Theory
-of Machines and Mechanisms", McGraw-Hill, 1980):
+Slider-crank of radius r and rod length l = r / RATIO, angle a from top dead centre (J. E. Shigley, J. J. Uicker,
+"Theory of Machines and Mechanisms", McGraw-Hill, 1980):
 
     x / r = 1 - cos a + (1 - sqrt(1 - RATIO^2 sin^2 a)) / RATIO
     dx/da / r = sin a + RATIO sin a cos a / sqrt(1 - RATIO^2 sin^2 a)
@@ -60,12 +60,14 @@ def main(folder: Path) -> None:
         torque = compressor_torque(cylinders)
         rows = "\n".join(f"{360.0 * n / VALUES:.5f},{value:.6f}" for n, value in enumerate(torque))
         (folder / f"{name}.csv").write_text(
-            f"# Load torque of a reciprocating compressor, cylinders: {cylinders}, over the mechanical rotor angle from\n"
-            f"# top dead centre of the first; divided by its mean: load_profile_Nm (rig.dbc) is the mean torque. Model:\n"
+            f"# Load torque of a reciprocating compressor, cylinders: {cylinders}, over the mechanical rotor angle"
+            " from\n"
+            "# top dead centre of the first; divided by its mean: load_profile_Nm (rig.dbc) is the mean torque."
+            " Model:\n"
             f"# slider-crank, crank / rod {RATIO:g}, polytropic compression with exponent {EXPONENT:g} to"
             f" {PRESSURE_RATIO:g} times the suction\n"
             f"# pressure, clearance {100 * CLEARANCE:g} %; tools/src/salient/experiments/compressor.py. Made by\n"
-            f"#     build/venv/bin/python -m salient.experiments.compressor tools/loads\n"
+            "#     build/venv/bin/python -m salient.experiments.compressor tools/loads\n"
             f"angle_deg,torque\n{rows}\n", encoding="utf-8")
 
 

@@ -1,8 +1,8 @@
 """Load profiles: load torque over the rotor angle, from CSV files.
 
-Lines that start with # and blank lines are ignored. The first other line is the header `angle_deg,torque`; then follow 8
-to 256 rows at equal steps of the mechanical angle, which cover one turn from 0: the last is one step below 360. The torque
-is a factor of the rig variable load_profile_Nm, between the rows it is linear.
+Lines that start with # and blank lines are ignored. The first other line is the header `angle_deg,torque`; then follow
+8 to 256 rows at equal steps of the mechanical angle, which cover one turn from 0: the last is one step below 360. The
+torque is a factor of the rig variable load_profile_Nm, between the rows it is linear.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def _value(number: int, row: str, expected_deg: float) -> float:
     except ValueError:
         raise TextFileError(f"line {number}: {shown(row)}: must be two numbers, {_HEADER}") from None
     if not abs(angle_deg - expected_deg) <= _ANGLE_TOLERANCE_DEG:
-        raise TextFileError(f"line {number}: angle_deg {angle_deg:g}: must be {expected_deg:g}, for equal steps over one "
-                            "turn")
+        raise TextFileError(f"line {number}: angle_deg {angle_deg:g}: must be {expected_deg:g}, for equal steps over "
+                            "one turn")
     if not abs(torque) <= LOAD_PROFILE_VALUE_MAX:
         raise TextFileError(f"line {number}: torque {torque:g}: must be a number from {-LOAD_PROFILE_VALUE_MAX:g} to "
                             f"{LOAD_PROFILE_VALUE_MAX:g}")

@@ -68,8 +68,8 @@ class SpeedStep:
 
 @dataclass(frozen=True)
 class LoadStep:
-    """Load torque on the shaft from at_s on, positive against forward motion; profile_Nm: the rig's load_profile_Nm, None
-    leaves it."""
+    """Load torque on the shaft from at_s on, positive against forward motion; profile_Nm: the rig's load_profile_Nm,
+    None leaves it."""
 
     at_s: float
     torque_Nm: float
@@ -86,8 +86,8 @@ class Record:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario(Conditions):
-    """One run of one drive. Times in seconds of virtual time, not negative. load_profile: name of a bundled load profile
-    or path of a CSV file (salient.experiments.load_profile)."""
+    """One run of one drive. Times in seconds of virtual time, not negative. load_profile: name of a bundled load
+    profile or path of a CSV file (salient.experiments.load_profile)."""
 
     name: str
     duration_s: float
@@ -285,7 +285,7 @@ class _SpeedTable(Table):
 class _LoadTable(Table):
     at_s: _Time
     torque_Nm: Annotated[float, number(-200.0, 200.0)]
-    profile_Nm: Annotated[float, number(-200.0, 200.0)] = None
+    profile_Nm: Annotated[float | None, number(-200.0, 200.0)] = None
 
 
 class _RecordTable(Table):

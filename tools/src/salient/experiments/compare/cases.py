@@ -375,7 +375,9 @@ def scenario_toml(case: Case) -> str:
 
 
 def _toml(value: bool | int | float | str) -> str:
-    return str(value).lower() if isinstance(value, bool) else json.dumps(value) if isinstance(value, str) else repr(value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
 def _khz(rate_hz: int) -> str:
