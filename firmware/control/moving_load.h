@@ -12,7 +12,8 @@
  *   trend += (innovation - trend) Ts / 1.6 ms
  *
  * A trend beyond that of a load of the drive's largest torque at 100 Hz is none of a load: the observer's model is so
- * wrong that the wide bandwidth itself makes the speed swing. Nothing is withheld then for a second.
+ * wrong that the wide bandwidth itself makes the speed swing. Nothing is withheld then for a second. Within the 5 ms
+ * after the bandwidth has widened the trend may still be that of the narrow one, at which a load causes a larger trend.
  *
  * Rounding to counts leaves up to 1/40 of a count of it as noise. A trend of 1/8 count withholds the last stages of the
  * bandwidth's decay, so that the observer follows the load. They are released 25 ms after the last such trend, one each
@@ -44,6 +45,7 @@ typedef struct {
     uint32_t hold_ticks; /* next hold, periods; 0: the shortest */
     uint32_t ticks;      /* until the next release */
     uint32_t blocked;    /* periods in which nothing is withheld */
+    uint32_t settling;   /* periods in which the trend may be that of a narrower bandwidth */
     uint32_t withheld;   /* stages */
 } moving_load_t;
 

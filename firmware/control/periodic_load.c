@@ -3,7 +3,8 @@
 #include "fixed/fixed.h"
 
 #define VALUES PERIODIC_LOAD_VALUES
-#define VALUE_SHIFT 26 /* 2^32 / 64 */
+#define VALUES_LOG2 6
+#define VALUE_SHIFT (32 - VALUES_LOG2)
 
 /* Values between that which is learned and that which ends: more than lag and lead together. */
 #define AHEAD (VALUES / 4)
@@ -59,8 +60,7 @@ static periodic_load_mode_t next_mode(const periodic_load_parameters_t *paramete
 static void end_turn(const periodic_load_parameters_t *parameters, periodic_load_t *load) {
     load->mode = next_mode(parameters, load);
     load->engaged = load->mode == PERIODIC_LOAD_LEARN || (load->engaged && load->mode != PERIODIC_LOAD_CLEAR);
-    load->mean_q8 = load->total_q8 / VALUES;
-    begin_turn(load);
+    load->mean_q8 = load->total_q8 >> VALUES_LOG2;
 }
 
 static int32_t updated_q8(const periodic_load_t *load, uint32_t index, int32_t smoothing_q8) {
@@ -72,11 +72,11 @@ static int32_t updated_q8(const periodic_load_t *load, uint32_t index, int32_t s
         const int32_t estimate_q8 = load->estimate_q8[index];
         const int32_t curvature_q8 =
             load->estimate_q8[(index - 1) % VALUES] - 2 * estimate_q8 + load->estimate_q8[(index + 1) % VALUES];
-        const int32_t smooth_q8 = estimate_q8 + curvature_q8 * smoothing_q8 / 256;
-        return profile_q8 + (smooth_q8 - load->mean_q8 - profile_q8) / 4;
+        const int32_t smooth_q8 = estimate_q8 + (curvature_q8 * smoothing_q8 >> 8);
+        return profile_q8 + ((smooth_q8 - load->mean_q8 - profile_q8) >> 2);
     }
     case PERIODIC_LOAD_FORGET:
-        return profile_q8 / 2;
+        return profile_q8 >> 1;
     case PERIODIC_LOAD_KEEP:
     default:
         return profile_q8;
@@ -91,7 +91,7 @@ static void end_value(const periodic_load_parameters_t *parameters, periodic_loa
     load->residual_q8 += (uint32_t)fixed_abs(residual_q8 - load->mean_q8);
     load->load_q8 += (uint32_t)fixed_abs(estimate_q8 - load->mean_q8);
     load->change_q8 += (uint32_t)fixed_abs(estimate_q8 - load->estimate_q8[index]);
-    load->estimate_q8[index] = (int16_t)fixed_clamp(estimate_q8, INT16_MIN, INT16_MAX);
+    load->estimate_q8[index] = (int16_t)estimate_q8; /* the observer's at most 64 N m, the profile's at most 40 N m */
 
     const uint32_t ahead = (lag < 0 ? index - AHEAD : index + AHEAD) % VALUES;
     /* L / 64 in Q8. */
@@ -128,6 +128,9 @@ void periodic_load_step(const periodic_load_parameters_t *parameters, periodic_l
             end_value(parameters, load, lag);
         } else {
             load->mode = load->mode == PERIODIC_LOAD_CLEAR ? PERIODIC_LOAD_CLEAR : PERIODIC_LOAD_KEEP;
+            load->count = VALUES;
+        }
+        if (load->count == VALUES) {
             begin_turn(load);
         }
         load->index = index;

@@ -83,7 +83,8 @@ void periodic_load_reset(periodic_load_t *load);
 
 /* One sample; sets load->torque_q24, of the angle four control periods later. Steps of the angle by more than a value
  * of the profile, or against the direction of rotation, begin another turn. Values are means over their interval,
- * rounded towards zero, between which the torque is interpolated; the profile is clamped to the limit. */
+ * rounded towards zero, other terms down, between which the torque is interpolated; the profile is clamped to the
+ * limit. */
 void periodic_load_step(const periodic_load_parameters_t *parameters, periodic_load_t *load,
                         const periodic_load_sample_t *sample);
 

@@ -108,6 +108,15 @@ def test_ramps_have_their_lengths():
         assert case.scenario.duration_s == pytest.approx(case.scenario.load[0].at_s + ramp_s + 0.3)
 
 
+def test_compressors_are_judged_over_three_turns_after_20_turns_of_load():
+    for case in ALL_CASES["compressor"]:
+        turn_s = 60.0 / case.scenario.speed[0].value_rpm
+        (load,) = case.scenario.load
+        assert case.scenario.record.from_s - load.at_s == pytest.approx(20 * turn_s, abs=1e-5)
+        assert case.scenario.duration_s - case.scenario.record.from_s == pytest.approx(3 * turn_s, abs=1e-5)
+        assert load.profile_Nm > 0 and ("one cylinder" in case.condition) == ("one" in case.scenario.load_profile)
+
+
 def test_random_drives_cover_their_ranges_and_are_reproducible():
     drives = [random_drive(number) for number in range(random_cases.DRIVES)]
     assert drives[:5] == [random_drive(number) for number in range(5)]

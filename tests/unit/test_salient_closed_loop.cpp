@@ -294,4 +294,32 @@ TEST(SalientClosedLoop, with_three_times_the_inertia_the_observer_is_at_its_stea
     EXPECT_NEAR(rpm(bench.plant.speed_rad_s), 150.0, 0.75);
 }
 
+// Largest less smallest speed over two turns, after 14 turns under a load that follows the rotor angle.
+double swing_rpm(double reference_rpm, bool learns) {
+    setup_t setup;
+    setup.parameters[PARAMETER_PERIODIC_LOAD] = learns;
+    auto bench = at_speed<fixed_drive_t>(setup, reference_rpm, 5.0);
+    const double turn_s = 60.0 / std::fabs(reference_rpm), from_s = 0.1 + 14.0 * turn_s, to_s = from_s + 2.0 * turn_s;
+    for (double at_s = 25e-6; at_s < to_s; at_s += 25e-6) {
+        const double angle_rad = bench.plant.rotor_angle_rad;
+        if (at_s > 0.1) {
+            bench.plant.load_torque_Nm = 5.0 + 2.0 * std::sin(angle_rad) + 3.0 * std::cos(2.0 * angle_rad);
+        }
+        bench.run_until(at_s);
+    }
+    EXPECT_TRUE(bench.running);
+    const double swing = rpm(bench.trace.max_speed(from_s, to_s) - bench.trace.min_speed(from_s, to_s));
+    std::printf("%-20s load over the angle at %g r/min, %s: swing %.3f r/min\n", machine_plant.name, reference_rpm,
+                learns ? "learned" : "not learned", swing);
+    return swing;
+}
+
+TEST(SalientClosedLoop, a_load_that_repeats_with_every_turn_is_learned_in_both_directions) {
+    for (const double reference_rpm : {600.0, -600.0}) {
+        const double learned = swing_rpm(reference_rpm, true), not_learned = swing_rpm(reference_rpm, false);
+        EXPECT_LT(learned, 0.3 * not_learned) << reference_rpm;
+        EXPECT_GT(learned, 0.001) << reference_rpm;
+    }
+}
+
 } // namespace

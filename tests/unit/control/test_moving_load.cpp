@@ -133,6 +133,20 @@ TEST(MovingLoad, a_trend_that_no_load_causes_blocks_for_a_second) {
     EXPECT_GT(above.run(RATE_HZ / 10, COUNT), 0u) << "again after the second";
 }
 
+TEST(MovingLoad, a_trend_left_by_the_narrow_bandwidth_does_not_block) {
+    // Under a load that moves, a second at the narrow bandwidth leaves 25 counts, which the wide one removes.
+    Detector moving;
+    moving.run(RATE_HZ / 10, 25 * COUNT);
+    uint32_t narrow = 0;
+    while (moving.step(25 * COUNT) == 0) {
+        ASSERT_LT(++narrow, RATE_HZ);
+    }
+    EXPECT_GT(narrow, RATE_HZ / 2) << "blocked before";
+    for (uint32_t k = 0; k < RATE_HZ / 50; k++) {
+        ASSERT_EQ(moving.step(int32_t(25 * COUNT * std::exp(-1700.0 * k / RATE_HZ))), STAGES) << k;
+    }
+}
+
 TEST(MovingLoad, edges_have_a_threshold_of_0_7_urad) {
     const double urad = REV / (2.0 * PI) * 1e-6;
     for (const double trend_urad : {0.65, 0.75}) {

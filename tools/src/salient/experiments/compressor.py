@@ -60,12 +60,14 @@ def main(folder: Path) -> None:
         torque = compressor_torque(cylinders)
         rows = "\n".join(f"{360.0 * n / VALUES:.5f},{value:.6f}" for n, value in enumerate(torque))
         (folder / f"{name}.csv").write_text(
-            f"# Load torque of a reciprocating compressor, cylinders: {cylinders}, over the mechanical rotor angle\n"
-            f"# from top dead centre of the first; divided by its mean: load_profile_Nm (rig.dbc) is the mean torque.\n"
-            f"# Model: slider-crank, crank / rod {RATIO:g}, polytropic compression with exponent {EXPONENT:g} to"
+            f"# Load torque of a reciprocating compressor, cylinders: {cylinders}, over the mechanical rotor angle"
+            " from\n"
+            "# top dead centre of the first; divided by its mean: load_profile_Nm (rig.dbc) is the mean torque."
+            " Model:\n"
+            f"# slider-crank, crank / rod {RATIO:g}, polytropic compression with exponent {EXPONENT:g} to"
             f" {PRESSURE_RATIO:g} times the suction\n"
             f"# pressure, clearance {100 * CLEARANCE:g} %; tools/src/salient/experiments/compressor.py. Made by\n"
-            f"#     build/venv/bin/python -m salient.experiments.compressor tools/loads\n"
+            "#     build/venv/bin/python -m salient.experiments.compressor tools/loads\n"
             f"angle_deg,torque\n{rows}\n", encoding="utf-8")
 
 

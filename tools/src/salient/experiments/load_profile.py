@@ -62,8 +62,8 @@ def _value(number: int, row: str, expected_deg: float) -> float:
     except ValueError:
         raise TextFileError(f"line {number}: {shown(row)}: must be two numbers, {_HEADER}") from None
     if not abs(angle_deg - expected_deg) <= _ANGLE_TOLERANCE_DEG:
-        raise TextFileError(f"line {number}: angle_deg {angle_deg:g}: must be {expected_deg:g}, for equal steps over"
-                            " one turn")
+        raise TextFileError(f"line {number}: angle_deg {angle_deg:g}: must be {expected_deg:g}, for equal steps over "
+                            "one turn")
     if not abs(torque) <= LOAD_PROFILE_VALUE_MAX:
         raise TextFileError(f"line {number}: torque {torque:g}: must be a number from {-LOAD_PROFILE_VALUE_MAX:g} to "
                             f"{LOAD_PROFILE_VALUE_MAX:g}")

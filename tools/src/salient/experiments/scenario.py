@@ -324,7 +324,7 @@ class _TorqueTable(Table):
 class _LoadTable(Table):
     at_s: _Time
     torque_Nm: Annotated[float, number(-10_000.0, 10_000.0)]
-    profile_Nm: Annotated[float, number(-200.0, 200.0)] = None
+    profile_Nm: Annotated[float | None, number(-200.0, 200.0)] = None
 
 
 class _RecordTable(Table):

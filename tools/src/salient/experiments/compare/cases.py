@@ -61,6 +61,12 @@ TORQUE_REQUESTED_NM = {"motoring": 100.0, "braking": -100.0}
 """Beyond the torque limit of every drive, which then decides."""
 TORQUE_SETTLED_S = 0.1
 
+COMPRESSORS = {"one cylinder": ("compressor_one_cylinder", 1.5), "two cylinders": ("compressor_two_cylinders", 3.0)}
+"""Load profile and its mean torque in N m, which with 5 N m more is at most 14.6 N m."""
+COMPRESSOR_BASE_NM = 5.0
+COMPRESSOR_RPM = (150.0, 600.0, 1500.0)
+COMPRESSOR_TURNS = 20
+
 IMPERFECTIONS: dict[str, dict[str, float]] = {
     "20 mA of noise": {"current_noise_A": 0.02},
     "0.05 deg off": {"encoder_offset_deg": 0.05},
@@ -199,6 +205,23 @@ def _held_scenario(speed_rpm: float, torque_Nm: float, **fields: Any) -> Scenari
                      bench={"held_speed_rpm": speed_rpm}, **fields)
 
 
+def _compressor(quick: bool) -> Iterator[Case]:
+    for machine in MOVING_MACHINES[:1] if quick else MOVING_MACHINES:
+        for speed_rpm in (600.0,) if quick else COMPRESSOR_RPM:
+            for name, (profile, mean_Nm) in COMPRESSORS.items():
+                loaded_s = 0.2 + 0.6 * speed_rpm / 3000.0
+                turn_s = 60.0 / speed_rpm
+                scenario = make_scenario(machine=machine, duration_s=round(loaded_s + (COMPRESSOR_TURNS + 3) * turn_s, 6),
+                                     speed=(SpeedStep(0.0, speed_rpm),), load_profile=profile,
+                                     load=(LoadStep(loaded_s, COMPRESSOR_BASE_NM, mean_Nm),),
+                                     record=Record(10.0, round(loaded_s + COMPRESSOR_TURNS * turn_s, 6)))
+                condition = f"{machine}, {name}, {speed_rpm:g} r/min"
+                yield from by_controller("compressor", condition, "moving", scenario, controllers=("paper", "salient"))
+                if not quick:
+                    yield Case("compressor", f"{condition}, not learned", "salient", "moving",
+                               replace(scenario, controller="salient", parameters={"periodic_load": 0}))
+
+
 def _paper_conditions(quick: bool) -> Iterator[Case]:
     for machine in ("saturating",) if quick else MAGNETICS:
         step = replace(step_scenario(machine=machine, **PAPER_CONDITIONS), duration_s=0.5)
@@ -252,6 +275,8 @@ GROUPS: dict[str, Group] = {
     "ramps": Group("load ramp to 8 N m at 150 r/min, 40 kHz", _ramps, (("speed_dip_rpm", ""),)),
     "torque_speed": Group("torque at the torque limit over the speed of a held shaft, 40 kHz", _torque_speed,
                           (("torque_mean_Nm", ""), ("peak_current_A", ""))),
+    "compressor": Group("reciprocating compressor, turns 21 to 23 under load, 40 kHz", _compressor,
+                        (("speed_swing_rpm", ""),)),
     "paper_conditions": Group("the paper's conditions: 1 MHz, no delay, exact sensing, load torque known",
                               _paper_conditions,
                               (("settling_time_s", ""), ("overshoot_percent", ""), ("speed_dip_rpm", ""),
@@ -343,9 +368,9 @@ def scenario_toml(case: Case) -> str:
 
 
 def _toml(value: bool | int | float | str) -> str:
-    if isinstance(value, str):
-        return json.dumps(value)
-    return str(value).lower() if isinstance(value, bool) else repr(value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
 def _khz(rate_hz: int) -> str:
