@@ -211,10 +211,11 @@ def _compressor(quick: bool) -> Iterator[Case]:
             for name, (profile, mean_Nm) in COMPRESSORS.items():
                 loaded_s = 0.2 + 0.6 * speed_rpm / 3000.0
                 turn_s = 60.0 / speed_rpm
-                scenario = make_scenario(machine=machine, duration_s=round(loaded_s + (COMPRESSOR_TURNS + 3) * turn_s, 6),
-                                     speed=(SpeedStep(0.0, speed_rpm),), load_profile=profile,
-                                     load=(LoadStep(loaded_s, COMPRESSOR_BASE_NM, mean_Nm),),
-                                     record=Record(10.0, round(loaded_s + COMPRESSOR_TURNS * turn_s, 6)))
+                duration_s = round(loaded_s + (COMPRESSOR_TURNS + 3) * turn_s, 6)
+                scenario = make_scenario(machine=machine, duration_s=duration_s,
+                                         speed=(SpeedStep(0.0, speed_rpm),), load_profile=profile,
+                                         load=(LoadStep(loaded_s, COMPRESSOR_BASE_NM, mean_Nm),),
+                                         record=Record(10.0, round(loaded_s + COMPRESSOR_TURNS * turn_s, 6)))
                 condition = f"{machine}, {name}, {speed_rpm:g} r/min"
                 yield from by_controller("compressor", condition, "moving", scenario, controllers=("paper", "salient"))
                 if not quick:
