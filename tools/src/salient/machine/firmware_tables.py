@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from salient.machine.drive_data import derive
 from salient.machine.file import Machine, MachineError
 from salient.machine.scaling import Exponents
 
@@ -113,11 +114,11 @@ class PhaseMap:
 class _InUnits:
     """Magnetics in the units of a machine: multiplied by powers of two, exactly."""
 
-    def __init__(self, magnetics: Any, exponents: Exponents) -> None:
+    def __init__(self, magnetics: Any, exponents: Exponents, current_max_A: float) -> None:
         self.magnetics, self.pitch_rad = magnetics, magnetics.pitch_rad
         self.ampere, self.weber, self.newton_metre = (
             2.0**exponent for exponent in (exponents.current, exponents.voltage, exponents.torque))
-        self.current_max_A = magnetics.current_max_A / self.ampere
+        self.current_max_A = min(magnetics.current_max_A, current_max_A) / self.ampere
 
     def flux_linkage_Wb(self, angle_rad: Any, current_A: Any) -> np.ndarray:
         flux_Wb: np.ndarray = self.magnetics.flux_linkage_Wb(angle_rad, current_A * self.ampere) / self.weber
@@ -131,15 +132,17 @@ class _InUnits:
 def machine_phase_map(path: Path | str, machine: Machine, exponents: Exponents) -> PhaseMap:
     """The tables of a machine file's machine in its units; MachineError when they cannot hold it."""
     try:
-        return phase_map(machine.magnetics, exponents)
+        return phase_map(machine.magnetics, exponents, derive(machine).adc_current_A)
     except PhaseMapError as error:
         raise MachineError(f"{path}: magnetics: {error}") from None
 
 
-def phase_map(magnetics: Any, exponents: Exponents = Exponents()) -> PhaseMap:  # noqa: B008 - it cannot change
+def phase_map(magnetics: Any, exponents: Exponents = Exponents(),  # noqa: B008 - it cannot change
+              current_max_A: float = math.inf) -> PhaseMap:
     """The tables of `magnetics`: a `Formula`, a `FluxMap` or another object with their methods, in these units.
+    current_max_A: the largest current that is measured; torque may fall with the current beyond, where it is levelled.
     PhaseMapError, in SI units."""
-    magnetics = _InUnits(magnetics, exponents)
+    magnetics = _InUnits(magnetics, exponents, current_max_A)
     ampere, weber, newton_metre = magnetics.ampere, magnetics.weber, magnetics.newton_metre
     half_rad = magnetics.pitch_rad / 2.0
     row_start = _row_starts(magnetics)
