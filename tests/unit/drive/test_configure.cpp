@@ -120,7 +120,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
          0.6);
     near("step", c.protection.angle_step_max, 0.0, fixed_point::REV);
     ASSERT_LE(std::fabs(c.protection.angle_step_max - (1.5 * fastest + 2.0 * count)), 3.0 + 1e-6 * fastest);
-    const double travel_max = std::max(fixed_point::REV / 1440.0 + 4.0 * count, 12.0 * count);
+    const double travel_max = std::max(fixed_point::REV / 1440.0 + 4.0 * count, 16.0 * count);
     ASSERT_LE(std::fabs(c.protection.undetected_travel_max - travel_max), 1.0);
     ASSERT_EQ(c.protection.angle_step_q32, c.observer.angle_step_q32);
     near("slowing", c.protection.deceleration_max_q22, 40.0 / v(PARAMETER_INERTIA_KG_M2) / rate_hz * fixed_point::Q22,

@@ -11,7 +11,7 @@ extern "C" {
 namespace {
 
 constexpr uint64_t MS = 1000000;
-enum : uint8_t { LOAD_TORQUE = 1, HELD_SPEED = 21 };
+enum : uint8_t { LOAD_TORQUE = 1, HELD_SPEED = 22 };
 constexpr int32_t FREE = -8388608;
 constexpr double RAD_S_PER_RPM = std::numbers::pi / 30.0;
 
