@@ -364,7 +364,8 @@ def test_groups_are_listed():
     code, output = compare("--list")
     assert code == 0
     assert [line.split()[0] for line in output.splitlines()] == list(GROUPS)
-    assert [line.split()[0] for line in output.splitlines() if "only when named" in line] == ["ablation", "robustness"]
+    assert [line.split()[0] for line in output.splitlines() if "only when named" in line] == [
+        "ablation", "robustness", "machines"]
 
 
 def test_unknown_group_is_reported():
