@@ -18,7 +18,8 @@ static void configure(drive_t *drive) {
 }
 
 bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
-    if (!configure_rate_allowed(config->control_rate_hz)) {
+    if (!configure_rate_allowed(config->control_rate_hz) ||
+        config->control_rate_hz < machine_tables.control_rate_min_hz) {
         return false;
     }
     *drive = (drive_t){.hal = hal, .control_rate_hz = config->control_rate_hz};

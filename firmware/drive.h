@@ -37,7 +37,8 @@ typedef struct {
 } drive_t;
 
 /* Prepares the drive and starts the timer. Returns false, and starts nothing, for a control rate that the timer cannot
- * make. hal must outlive the drive. [background, before anything else] */
+ * make or that is too low for the machine (machine_tables.h). hal must outlive the drive. [background, before anything
+ * else] */
 bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config);
 
 /* One control period. [interrupt] */

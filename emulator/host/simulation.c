@@ -181,8 +181,10 @@ void simulation_run(simulation_t *simulation, const rig_firmware_t *firmware) {
 }
 
 void simulation_rejected(simulation_t *simulation) {
-    fprintf(stderr, "salient: drive_init rejected machine %s at %" PRIu32 " Hz\n", simulation->image.machine.name,
-            simulation->options->control_rate_hz);
+    fprintf(stderr,
+            "salient: machine %s at %" PRIu32 " Hz: fewer than 25 control periods in an electrical revolution at its"
+            " drive.speed_max_rpm\n",
+            simulation->image.machine.name, simulation->options->control_rate_hz);
     simulation->exit_code = EXIT_USAGE;
 }
 

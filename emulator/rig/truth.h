@@ -7,8 +7,8 @@
 
 #define TRUTH_FRAMES 5
 
-/* Packs the present state: motion, currents and bench in two parts each. Values are clamped to the range of their signal; the rotor angle is
- * wrapped to 0..360 deg. */
+/* Packs the present state: motion, currents and bench in two parts each. Values are clamped to the range of their
+ * signal; the rotor angle is wrapped to 0..360 deg. */
 void truth_pack(const plant_t *plant, transport_frame_t frames[TRUTH_FRAMES]);
 
 #endif

@@ -78,8 +78,9 @@ typedef struct {
     /* Of drive/parameters.def, by index: default, raw, and fraction bits of a raw value in the SI unit. */
     int32_t parameter_default[MACHINE_PARAMETERS_MAX];
     int8_t parameter_fraction_bits[MACHINE_PARAMETERS_MAX];
-    int32_t speed_reference_max; /* magnitude of a command, LSBs of DRIVE_COMMAND.speed_reference_rpm */
-    uint32_t dbc_hash;           /* of the machine's CAN database, comms/drive.dbc with its factors and ranges */
+    uint32_t control_rate_min_hz; /* 25 periods in an electrical revolution at a highest speed that the file states */
+    int32_t speed_reference_max;  /* magnitude of a command, LSBs of DRIVE_COMMAND.speed_reference_rpm */
+    uint32_t dbc_hash;            /* of the machine's CAN database, comms/drive.dbc with its factors and ranges */
 } machine_tables_t;
 
 /* The machine. On a target a constant, which the laws are compiled for when a drive is linked; on the host a variable,

@@ -8,6 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from salient.bench.drive import DriveError
+from salient.bench.session import Session
+from salient.bus.signals import load_database
+from salient.dbc import database_hash
+from salient.errors import UsageError
+from salient.machine.parameter_table import read_table
+from salient.machine.scaling import Exponents
 from salient.paths import MACHINES, ROOT
 
 OTHERS = ROOT / "tests" / "machines"
@@ -20,11 +27,12 @@ UNITS = {"_ohm": (-1, 1), "_H": (-1, 1), "_V": (0, 1), "_Wb": (0, 1), "_A": (1, 
 def similar_file(name: str, a: int, v: int, folder: Path) -> Path:
     """The file of a bundled machine with 2^a times the current and 2^v times the voltage, and so with 2^(a + v) times
     the torque and inertia."""
-    lines = []
-    for table, content in tomllib.loads((MACHINES / f"{name}.toml").read_text()).items():
-        if not isinstance(content, dict):
-            lines.append(f'{table} = "similar"')
-            continue
+    tables = tomllib.loads((MACHINES / f"{name}.toml").read_text())
+    assert tables.pop("name") == name
+    parameters = tables["drive"].pop("parameters", {})
+    exponents = Exponents(a, v, a + v)
+    lines = ['name = "similar"']
+    for table, content in tables.items():
         lines.append(f"[{table}]")
         for key, value in content.items():
             powers = [power for end, power in UNITS.items() if key.endswith(end) and isinstance(value, float)]
@@ -33,6 +41,9 @@ def similar_file(name: str, a: int, v: int, folder: Path) -> Path:
                 lines.append(f"{key} = {math.ldexp(value, a * of_a + v * of_v)!r}")
             else:
                 lines.append(f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}")
+    lines.append("[drive.parameters]")
+    lines += [f"{row.name} = {math.ldexp(parameters[row.name], exponents.of_parameter(row))!r}"
+              for row in read_table() if row.name in parameters]
     file = folder / f"similar_{a + 8}_{v + 8}.toml"
     file.write_text("\n".join(lines) + "\n")
     return file
@@ -95,3 +106,38 @@ def test_machine_at_the_end_of_the_range_starts_and_holds_speed_under_load(make_
     parameters = bench.drive.parameters
     parameters_read = {row.name: parameters[row.name] for row in parameters.rows.values()}
     assert parameters_read == {row.name: row.default for row in parameters.rows.values()}
+
+
+def test_control_rate_too_low_for_the_highest_speed_of_the_file_is_refused_with_that_reason(make_bench):
+    reason = ("machine fastest at 20000 Hz: fewer than 25 control periods in an electrical revolution at its "
+              "drive.speed_max_rpm")
+    with pytest.raises(UsageError, match=f"^{reason}$"):
+        make_bench(machine=str(OTHERS / "fastest.toml"), control_rate_hz=20_000)
+    assert make_bench(machine=str(OTHERS / "fastest.toml"), control_rate_hz=50_000).drive.fault in ("none", "unknown")
+
+
+def test_parameters_are_written_and_read_in_si_units(make_bench):
+    bench = make_bench(machine=str(OTHERS / "fastest.toml"))
+    parameters = bench.drive.parameters
+    assert parameters.row("over_speed_rpm").fraction_bits == -3
+    for name, value in (("over_speed_rpm", 16_000.0), ("torque_max_Nm", 1.125), ("current_limit_A", 20.25),
+                        ("inertia_kg_m2", 1.25e-4), ("smc_delta", 0.5)):
+        row = parameters.row(name)
+        parameters[name] = value
+        assert parameters[name] == pytest.approx(value, abs=0.5 * 2.0**-row.fraction_bits), name
+    with pytest.raises(DriveError, match="torque_max_Nm 3: must be 0 to 2.5 N m"):
+        parameters["torque_max_Nm"] = 3.0
+
+
+def test_database_written_for_a_machine_is_that_of_its_drive_and_another_is_reported(make_bench, salient, tmp_path,
+                                                                                    capsys):
+    file, dbc = OTHERS / "smallest.toml", tmp_path / "smallest.dbc"
+    result = salient("machine", file, "--out", tmp_path, "--dbc", dbc)
+    assert result.returncode == 0, result.stderr
+    bench = make_bench(machine=str(file))
+    bench.run_for(0.02)
+    assert bench.telemetry["dbc_hash"].last == database_hash(load_database(dbc))
+    assert "another drive.dbc" not in capsys.readouterr().err
+    with Session(bench.address) as session:
+        session.run_for(0.15)
+    assert "was built from another drive.dbc" in capsys.readouterr().err

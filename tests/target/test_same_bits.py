@@ -17,7 +17,7 @@ import pytest
 
 from salient.bench.bench import Bench
 from salient.config import CONTROLLERS, TARGET_BUILDS, TARGETS
-from salient.paths import BUILD
+from salient.paths import BUILD, ROOT
 from salient.paths import MACHINES as MACHINE_FILES
 
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
@@ -64,7 +64,18 @@ def tour(bench: Bench) -> None:
     bench.run_for(0.2)
 
 
-RUNS = {run.__name__: run for run in (start_600, load_step_150, tour)}
+def start_of_any_machine(bench: Bench) -> None:
+    """To a quarter of the speed limit, a load step of a third of the torque; then backwards, if the controller can."""
+    rows = bench.drive.parameters.rows
+    bench.at(0.3).load_torque_Nm = rows["torque_max_Nm"].default / 3.0
+    bench.drive.speed_reference_rpm = rows["over_speed_rpm"].default / 4.0
+    bench.run_for(0.4)
+    bench.drive.speed_reference_rpm = -rows["over_speed_rpm"].default / 8.0
+    bench.run_for(0.1)
+
+
+COMMON_RUNS = {run.__name__: run for run in (start_600, load_step_150, tour)}
+RUNS = COMMON_RUNS | {start_of_any_machine.__name__: start_of_any_machine}
 
 
 @dataclass(frozen=True)
@@ -106,7 +117,7 @@ def traces(make_bench, tmp_path: Path) -> Callable[..., dict[str, Trace]]:
 
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("controller", CONTROLLERS)
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", COMMON_RUNS)
 def test_host_and_targets_agree_in_every_control_period(traces, request, name, controller, machine):
     made = traces(("host", *TARGET_BUILDS), name, controller=controller, machine=machine, seed=3,
                   initial_angle_deg=12.0)
@@ -143,6 +154,17 @@ def test_machine_file_of_the_user_agrees_on_host_and_targets(traces, tmp_path):
     for build in TARGETS:
         assert made[build] == made["host"], build
     assert made["host"].compare_values != bundled.compare_values
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("name", ["smallest", "largest", "fastest"])
+def test_machine_at_the_end_of_the_range_agrees_on_host_and_targets(traces, name, controller):
+    """Machines whose formats have other units, compiled in."""
+    file = ROOT / "tests" / "machines" / f"{name}.toml"
+    made = traces(TARGETS, "start_of_any_machine", machine=str(file), controller=controller, seed=3)
+    assert any(made["host"].compare_values)
+    for build in TARGETS:
+        assert made[build] == made["host"], build
 
 
 def test_processes_that_build_firmware_for_machine_files_at_once_do_not_collide(tmp_path):

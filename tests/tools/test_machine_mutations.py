@@ -595,7 +595,7 @@ COMMAND_CASES: dict[str, tuple[str, str | None, str]] = {
     "nested": ("a = " + "[" * 20_000, None, "not TOML"),
     "flux_linkage_beyond_its_format": (
         toml({**GOOD_TABLES, "magnetics": {"form": '"linear_cosine"', "unaligned_inductance_H": "0.67e-3",
-                                           "aligned_inductance_H": "60e-3"}}), None, "must be below 4 Wb"),
+                                           "aligned_inductance_H": "0.6"}}), None, "must be below 16 Wb"),
     "file_cut": (GOOD[: GOOD.index("[converter]")], None, "converter: missing"),
     "file_binary": ("\0" * 100, None, "line 1"),
     "map_missing": (MAP_MACHINE, None, "no such file"),

@@ -12,6 +12,7 @@ import pytest
 
 from salient.bus.signals import drive_database
 from salient.dbc import database_hash
+from salient.generate import resolution
 from salient.generate.machine import tables_source
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.firmware_tables import machine_phase_map
@@ -112,6 +113,8 @@ def similar(machine: Machine, a: int, v: int) -> Machine:
         magnetics=replace(machine.magnetics, parameters=magnetics),
         drive={key: times(value, _POWERS_OF_DRIVE.get(key, "")) if isinstance(value, float) else value
                for key, value in machine.drive.items()},
+        drive_parameters={row.name: math.ldexp(machine.drive_parameters[row.name], exponents.of_parameter(row))
+                          for row in read_table() if row.name in machine.drive_parameters},
     )
 
 
@@ -180,3 +183,41 @@ def test_commands_reach_the_largest_speed_of_the_machine_and_3000_rpm_at_least(s
     signal = database_of(scaling.dbc()).get_message_by_name("DRIVE_COMMAND").get_signal_by_name("speed_reference_rpm")
     assert (signal.minimum, signal.maximum) == (-limit_rpm, limit_rpm)
     assert scaling.speed_reference_max == raw
+
+
+# --- resolutions ----------------------------------------------------------------------------------------------------
+
+def test_table_of_resolutions_in_the_readme_is_that_of_the_machines():
+    assert resolution.PAGE.read_text(encoding="utf-8") == resolution.page(), "run python -m salient.generate.resolution"
+
+
+@pytest.mark.parametrize("path", [*resolution.FILES, OTHERS / "fastest.toml"], ids=lambda path: path.stem)
+def test_every_quantity_has_the_range_and_the_resolution_that_the_machine_needs(path):
+    scaling = scaling_of_file(path)
+    machine, data = load_machine(path), scaling.data
+    of = {each.name: each for each in resolution.quantities(scaling)}
+    rpm = 30.0 / math.pi
+    flux_Wb = float(machine.magnetics.flux_linkage_Wb(0.0, data.adc_current_A))
+    for name, largest, rated, part in (
+        ("current", data.adc_current_A, data.current_rated_A, 1e-3),
+        ("voltage", data.adc_voltage_V, data.supply_max_V, 1e-3),
+        ("flux linkage", flux_Wb, flux_Wb, 1e-6),
+        ("torque", 2.5 * data.torque_peak_Nm, data.torque_rated_Nm, 1e-6),
+        ("speed", data.over_speed_rpm / rpm, data.speed_base_rpm / rpm, 1e-6),
+        ("inertia", machine.inertia_kg_m2, machine.inertia_kg_m2, 1e-4),
+        ("friction", machine.friction_Nm_s, machine.friction_Nm_s, 1e-4),
+        ("resistance", machine.resistance_ohm, machine.resistance_ohm, 1e-4),
+        ("current on the bus", data.adc_current_A, data.current_rated_A, 1e-3),
+        ("voltage on the bus", data.adc_voltage_V, data.supply_max_V, 1e-3),
+        ("torque on the bus", data.torque_peak_Nm, data.torque_rated_Nm, 1e-3),
+        ("speed on the bus", data.over_speed_rpm, data.speed_base_rpm, 1e-5),
+        ("current sensor", data.parameters["current_trip_A"], data.current_rated_A, 1e-3),
+        ("DC-link divider", data.parameters["bus_over_voltage_V"], data.supply_max_V, 1e-3),
+        ("torque transducer", data.torque_peak_Nm, data.torque_rated_Nm, 1e-2),
+    ):
+        quantity = of.pop(name)
+        assert quantity.maximum >= largest, name
+        assert quantity.lsb < part * rated, name
+        if quantity.unit in ("A", "V", "N m"):
+            assert quantity.maximum < 17.0 * largest, f"{name}: most of its range is idle"
+    assert not of

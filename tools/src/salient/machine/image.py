@@ -149,6 +149,7 @@ TABLES = Structure("machine_tables_t", (
            (_PARAMETERS_MAX,)),
     Member("parameter_fraction_bits", "int8_t", lambda machine, scaling, tables: _padded(scaling.fraction_bits()),
            (_PARAMETERS_MAX,)),
+    Member("control_rate_min_hz", "uint32_t", lambda machine, scaling, tables: scaling.control_rate_min_hz(machine)),
     Member("speed_reference_max", "int32_t", lambda machine, scaling, tables: scaling.speed_reference_max),
     Member("dbc_hash", "uint32_t", lambda machine, scaling, tables: database_hash(database_of(scaling.dbc()))),
 ))  # fmt: skip

@@ -19,9 +19,9 @@ from salient.machine.file import Converter, Machine, MachineError, Sensors, load
 from salient.machine.firmware_tables import machine_phase_map
 from salient.machine.scaling import scaling_of
 
-# Range of the current sensors and of the firmware's tables.
-CURRENT_MAX_A = 80.0
-SHOWN_A = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0)
+# Currents in the machine's unit (scaling.py): up to the end of the firmware's tables.
+CURRENT_MAX = 80.0
+SHOWN = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0)
 SHOWN_PITCHES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 
 
@@ -59,13 +59,19 @@ def _write(option: str, path: Path, text: str) -> None:
         raise UsageError(f"{option} {path}: {error.strerror}") from None
 
 
+def _ampere(machine: Machine) -> float:
+    """The machine's unit of current, A."""
+    return float(2.0**scaling_of(machine.name, machine).exponents.current)
+
+
 def describe(machine: Machine) -> list[str]:
     """The lines of a data sheet."""
     magnetics, half = machine.magnetics, machine.pitch_rad / 2.0
     small_A = 1e-3
     aligned_H = float(magnetics.flux_linkage_Wb(0.0, small_A)) / small_A
     angles = np.linspace(half, 2.0 * half, 361)[:, None]
-    torques_Nm = magnetics.torque_Nm(angles, np.array(SHOWN_A))
+    shown_A = np.array(SHOWN) * _ampere(machine)
+    torques_Nm = magnetics.torque_Nm(angles, shown_A)
     lines = [
         f"{machine.name}: {machine.stator_poles}/{machine.rotor_poles} poles, {machine.phases} phases,"
         f" magnetics {magnetics.form}",
@@ -76,7 +82,7 @@ def describe(machine: Machine) -> list[str]:
         + (f" through {machine.dc_link['source_resistance_ohm']:g} ohm, link {machine.dc_link['capacitance_F'] * 1e6:g}"
            " uF" if machine.dc_link else ", takes energy back"),
         "  torque      maximum of one phase: "
-        + ", ".join(f"{torque:.3g} N m at {i:g} A" for torque, i in zip(torques_Nm.max(axis=0), SHOWN_A, strict=True)),
+        + ", ".join(f"{torque:.3g} N m at {i:g} A" for torque, i in zip(torques_Nm.max(axis=0), shown_A, strict=True)),
     ]
     for title, values, table in (("converter", machine.converter, Converter), ("sensors", machine.sensors, Sensors)):
         stated = [f"{key} {value:g}" for key, value in values.items() if value != table.model_fields[key].default]
@@ -95,7 +101,7 @@ def plot(machine: Machine) -> Figure:
 
 
 def _plot_flux(axes: Axes, machine: Machine) -> None:
-    current_A = np.linspace(0.0, CURRENT_MAX_A, 321)
+    current_A = np.linspace(0.0, CURRENT_MAX * _ampere(machine), 321)
     colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(SHOWN_PITCHES)))
     for pitches, colour in zip(SHOWN_PITCHES, colours, strict=True):
         angle_rad = pitches * machine.pitch_rad
@@ -104,15 +110,15 @@ def _plot_flux(axes: Axes, machine: Machine) -> None:
         position = {0.0: " aligned", 0.5: " unaligned"}.get(pitches, "")
         axes.annotate(f"{math.degrees(angle_rad):.0f} deg{position}", (current_A[-1], flux_Wb[-1]), color=colour,
                       xytext=(3, 0), textcoords="offset points", va="center", fontsize=8)
-    axes.set(xlabel="current / A", ylabel="flux linkage / Wb", xlim=(0.0, 1.3 * CURRENT_MAX_A), ylim=(0.0, None))
+    axes.set(xlabel="current / A", ylabel="flux linkage / Wb", xlim=(0.0, 1.3 * current_A[-1]), ylim=(0.0, None))
     axes.set_title("flux linkage by angle", loc="left", fontsize=10)
     axes.grid(color="#e6e6e6")
 
 
 def _plot_torque(axes: Axes, machine: Machine) -> None:
     angle_rad = np.linspace(0.0, machine.pitch_rad, 721)
-    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(SHOWN_A)))
-    for current_A, colour in zip(SHOWN_A, colours, strict=True):
+    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(SHOWN)))
+    for current_A, colour in zip(np.array(SHOWN) * _ampere(machine), colours, strict=True):
         torque_Nm = machine.magnetics.torque_Nm(angle_rad, current_A)
         axes.plot(np.degrees(angle_rad), torque_Nm, color=colour, label=f"{current_A:g} A")
     axes.set(xlabel="angle of the phase / deg (0 aligned)", ylabel="torque / N m",

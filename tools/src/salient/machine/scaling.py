@@ -10,7 +10,8 @@ own.
 The rule, the same for every machine:
 
 - current and voltage: the sensors' full scale is within 80 units of current, 512 of voltage, and above half of it. The
-  flux linkage up to the full scale of the current must be below 4 units: otherwise the voltage's unit is larger.
+  flux linkage up to the full scale of the current must be below 4 units: otherwise the voltage's unit is larger, by a
+  factor of four at most.
 - torque: torque_peak_Nm is within 40 units, the range of torque_max_Nm, and above 10. The format has 10^7
   steps per N m, so that a finer unit would have no use; the firmware's thresholds, such as 1 N m for learning and
   0.05 N m for a shortfall, suit machines of which the largest has four times the torque of the smallest.
@@ -29,7 +30,7 @@ from functools import lru_cache
 import cantools
 from cantools.database.can import Database
 
-from salient.machine.drive_data import DriveData, derive
+from salient.machine.drive_data import SAMPLES_PER_TURN_MIN, DriveData, derive
 from salient.machine.file import Machine, MachineError
 from salient.machine.parameter_table import ParameterDefinition, read_table
 from salient.paths import DRIVE_DBC
@@ -37,6 +38,7 @@ from salient.paths import DRIVE_DBC
 CURRENT_RANGE_A, VOLTAGE_RANGE_V, LOAD_TORQUE_RANGE_NM = 80.0, 512.0, 64.0
 """Full scales of the sensors in units of the machine, at most; that of the torque transducer always."""
 FLUX_LINKAGE_RANGE_WB, TORQUE_RANGE_NM, SPEED_RANGE_RPM = 4.0, 40.0, 4800.0
+FLUX_LINKAGE_MORE = 2
 SPEED_EXPONENT_MAX = 3
 SPEED_COMMAND_RPM = 3000.0
 """Every drive takes commands up to this speed, a faster machine up to its own."""
@@ -105,6 +107,12 @@ class Scaling:
         return {"current_A": self.data.adc_current_A, "dc_link_V": self.data.adc_voltage_V,
                 "load_torque_Nm": math.ldexp(LOAD_TORQUE_RANGE_NM, self.exponents.torque)}
 
+    def control_rate_min_hz(self, machine: Machine) -> int:
+        """Control rate that the highest speed of the file requires; 0 when the file states none: it is then derived
+        from the control rate of the file, and lower at a lower one."""
+        turns_1_s = self.data.speed_max_rpm / 60.0 * machine.rotor_poles
+        return math.ceil(SAMPLES_PER_TURN_MIN * turns_1_s * (1.0 - 1e-9)) if "speed_max_rpm" in machine.drive else 0
+
     @property
     def speed_reference_max(self) -> int:
         """Magnitude of the largest command, in LSBs of the bus."""
@@ -138,7 +146,7 @@ def choose(data: DriveData, machine: Machine) -> Exponents:
     voltage = _exponent(data.adc_voltage_V, VOLTAGE_RANGE_V)
     return Exponents(
         current=current,
-        voltage=max(voltage, _exponent(flux_Wb, 0.98 * FLUX_LINKAGE_RANGE_WB)),
+        voltage=max(voltage, min(_exponent(flux_Wb, 0.98 * FLUX_LINKAGE_RANGE_WB), voltage + FLUX_LINKAGE_MORE)),
         torque=2 * math.ceil(_exponent(data.torque_peak_Nm, TORQUE_RANGE_NM) / 2),
         speed=max(0, _exponent(data.over_speed_rpm, SPEED_RANGE_RPM)),
     )
