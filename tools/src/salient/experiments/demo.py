@@ -29,7 +29,14 @@ from salient.bench.session import SessionError
 from salient.config import CONDITIONS, BenchConfig
 from salient.errors import UsageError
 from salient.experiments import metrics, plots
-from salient.experiments.report import METRIC_ROWS, captions, format_metric, format_published, write_report
+from salient.experiments.report import (
+    METRIC_ROWS,
+    captions,
+    format_metric,
+    format_published,
+    published_of,
+    write_report,
+)
 from salient.experiments.results import make_results, write_results
 from salient.experiments.scaled import scale_of, scale_of_name, scaled, steady_window_s
 from salient.experiments.scenario import Scenario, check_parameters, load_scenarios, run_scenario
@@ -128,7 +135,7 @@ def summary(results: Mapping[str, Any]) -> str:
     """The metrics of both experiments and the published values, as a table for a terminal."""
     lines = []
     for experiment, by_controller in results["experiments"].items():
-        published = results["paper"][experiment]
+        published = published_of(results, experiment)
         heads = (f"{controller:>16}" + f"{'published':>14}" * (controller in published) for controller in by_controller)
         lines += ["", f"{experiment:<30}" + "".join(heads)]
         for name in next(iter(by_controller.values())):
@@ -274,7 +281,7 @@ def _plot_all(workers: Executor, runs: Sequence[_Run], results: Mapping[str, Any
 def _plot(name: str, path: Path, runs: Sequence[_Run], results: Mapping[str, Any]) -> None:
     experiment, scenario = runs[0].experiment, runs[0].scenario
     recordings = {result.controller: np.load(result.recording_path, mmap_mode="r") for result in runs}
-    ours, paper = results["experiments"][experiment], results["paper"][experiment]
+    ours, paper = results["experiments"][experiment], published_of(results, experiment)
     reference = scenario.speed[0]
     if name == "figure_5":
         plots.plot_start(path, recordings, ours, paper, reference.value_rpm, reference.at_s)

@@ -72,21 +72,25 @@ def _case(case: Case, on: Subject) -> Case:
     longer_s = scale.window_s(fastest_rpm) - PAPER_WINDOW_S if "ripple" in case.extractor else 0.0
     record = scenario.record
     if record is not None and record.from_s > 0.0:
-        record = Record(record.step_us, round(record.from_s + delay_s, 6))
+        record = Record(record.step_us, _later(record.from_s, delay_s))
     return replace(
         case, condition=on.text(case.condition),
-        window_s=(round(case.window_s[0] + delay_s, 6), round(case.window_s[1] + delay_s + longer_s, 6)),
+        window_s=(_later(case.window_s[0], delay_s), _later(case.window_s[1], delay_s + longer_s)),
         scenario=replace(
             scenario, machine=on.path, speed=speeds, record=record,
             load=tuple(_load(load, scale, delay_s) for load in scenario.load),
-            duration_s=round(scenario.duration_s + delay_s + longer_s, 6),
+            duration_s=_later(scenario.duration_s, delay_s + longer_s),
             parameters=_scaled(scenario.parameters, _parameter_units(), on.factors),
             bench=_scaled(scenario.bench, _bench_units(), on.factors)))
 
 
 def _load(load: LoadStep, scale: Scale, delay_s: float) -> LoadStep:
-    return LoadStep(round(load.at_s + delay_s, 9), scale.Nm(load.torque_Nm),
+    return LoadStep(_later(load.at_s, delay_s), scale.Nm(load.torque_Nm),
                     None if load.profile_Nm is None else scale.Nm(load.profile_Nm))
+
+
+def _later(time_s: float, by_s: float) -> float:
+    return round(time_s + by_s, 6) if by_s else time_s
 
 
 def _scaled(values: Mapping[str, float], units: Mapping[str, str], factors: Mapping[str, float]) -> dict[str, float]:
