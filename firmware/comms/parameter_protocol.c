@@ -48,6 +48,7 @@ void parameter_protocol_respond(parameters_t *parameters, bool writable, const h
             response.value = parameters->defaults[request.index];
             break;
         case PARAMETER_OPERATION_FRACTION_BITS:
+            // NOLINTNEXTLINE(bugprone-signed-char-misuse): a number, no character
             response.value = machine_tables.parameter_fraction_bits[request.index];
             break;
         case PARAMETER_OPERATION_NAME:
