@@ -10,19 +10,19 @@
 /* From here on the results of earlier inputs are without effect. */
 static void change_generation(control_state_t *state, uint32_t generation) {
     deferred_request_t *request = &state->deferred_request;
-    request->initial = *deferred_in_effect(state);
+    const deferred_results_t *in_effect = deferred_in_effect(state);
+    request->initial.fault_mask = in_effect->fault_mask;
+    request->initial.speed = in_effect->speed;
+    request->initial.bandwidth = in_effect->bandwidth;
+    request->initial.predictive = in_effect->predictive;
     request->generation = generation;
 }
 
 void deferred_reset_run(const control_parameters_t *parameters, control_state_t *state) {
     const uint32_t generation = state->deferred_request.generation;
     change_generation(state, (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK));
-    state->deferred_request.initial.window = parameters->predictive.base_window;
-    state->deferred_request.initial.speed_law_torque_q24 = 0;
-    state->deferred_request.initial.periodic_load_q24 = 0;
-    state->deferred_request.initial.speed_reference_q22 = 0;
-    state->deferred_request.initial.torque_min_q24 = 0;
-    state->deferred_request.initial.torque_max_q24 = 0;
+    state->deferred_request.initial.predictive.window = parameters->predictive.base_window;
+    state->deferred_request.initial.speed = (deferred_speed_results_t){0, 0, 0, 0, 0};
 }
 
 void deferred_reset_observer(control_state_t *state) {
@@ -220,9 +220,9 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run) {
         take_turns(parameters, deferred, input);
     }
-    results->window = deferred->window;
+    results->predictive.window = deferred->window;
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        results->misalignment[phase] = deferred->misalignment.phase[phase].offset;
+        results->predictive.misalignment[phase] = deferred->misalignment.phase[phase].offset;
     }
 }
 

@@ -46,8 +46,8 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
     int32_t min_q24 = parameters->torque_mode.torque_min_q24, max_q24 = parameters->torque_mode.torque_max_q24;
     int32_t torque_q24 = 0;
     drive_mode_t mode = DRIVE_MODE_SPEED;
-    results->speed_reference_q22 = 0;
-    results->periodic_load_q24 = 0;
+    results->speed.speed_reference_q22 = 0;
+    results->speed.periodic_load_q24 = 0;
     if (!input->run) {
         min_q24 = max_q24 = 0;
     } else if (input->command.mode == DRIVE_MODE_TORQUE && input->command.request == COMMAND_RUN) {
@@ -55,15 +55,15 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
         torque_q24 = fixed_clamp(torque_law_q24(parameters, deferred, input, offset_q24), min_q24, max_q24);
         min_q24 = max_q24 = torque_q24;
     } else {
-        results->periodic_load_q24 = deferred->periodic_load.torque_q24;
-        torque_q24 =
-            fixed_add(fixed_add(speed_law_q24(parameters, deferred, input), offset_q24), results->periodic_load_q24);
-        results->speed_reference_q22 = deferred->speed_reference_q22;
+        results->speed.periodic_load_q24 = deferred->periodic_load.torque_q24;
+        torque_q24 = fixed_add(fixed_add(speed_law_q24(parameters, deferred, input), offset_q24),
+                               results->speed.periodic_load_q24);
+        results->speed.speed_reference_q22 = deferred->speed_reference_q22;
     }
     deferred->mode = mode;
-    results->speed_law_torque_q24 = torque_q24;
-    results->torque_min_q24 = min_q24;
-    results->torque_max_q24 = max_q24;
+    results->speed.speed_law_torque_q24 = torque_q24;
+    results->speed.torque_min_q24 = min_q24;
+    results->speed.torque_max_q24 = max_q24;
 }
 
 /* The transducer is offset binary, +-64 N m full scale: 2^31 of Q7.24 over all counts. */
@@ -79,11 +79,11 @@ int32_t speed_control_torque_q24(const control_parameters_t *parameters, const l
         const int32_t load_q24 = parameters->load_from_transducer
                                      ? transducer_torque_q24(parameters, sample->adc.load_torque_counts)
                                      : observer->load_torque_q24;
-        return speed_smc_torque_q24(&parameters->speed_smc, deferred->speed_law_torque_q24, observer->speed_q22,
-                                    load_q24, deferred->torque_min_q24, deferred->torque_max_q24);
+        return speed_smc_torque_q24(&parameters->speed_smc, deferred->speed.speed_law_torque_q24, observer->speed_q22,
+                                    load_q24, deferred->speed.torque_min_q24, deferred->speed.torque_max_q24);
     }
     case SPEED_LAW_PI:
     default:
-        return deferred->speed_law_torque_q24;
+        return deferred->speed.speed_law_torque_q24;
     }
 }

@@ -71,9 +71,9 @@ static void predictive_control(const control_parameters_t *parameters, control_s
     const predictive_torque_sample_t sample = {
         .current_q9 = measured->current_q9,
         .flux = measured->flux_linkage,
-        .window = &deferred->window,
+        .window = &deferred->predictive.window,
         .angle = angle_in_two_periods * rotor_poles,
-        .misalignment = deferred->misalignment,
+        .misalignment = deferred->predictive.misalignment,
         .bus_voltage_q6 = measured->dc_link_voltage_q6,
         .torque_q24 = trimmed_q24,
         .reverse = observer->speed_q22 < 0,

@@ -103,7 +103,7 @@ class Control : public testing::Test {
         diagnostics_t values = {
             .angle = state.measurement.angle,
             .speed_q22 = state.observer.speed_q22,
-            .speed_reference_q22 = deferred_in_effect(&state)->speed_reference_q22,
+            .speed_reference_q22 = deferred_in_effect(&state)->speed.speed_reference_q22,
             .torque_reference_q24 = state.torque_reference_q24,
             .torque_q24 = state.measurement.torque_sum_q24,
             .load_torque_q24 = state.observer.load_torque_q24,

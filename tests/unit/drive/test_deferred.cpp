@@ -66,7 +66,7 @@ class Deferred : public testing::Test {
 
     const deferred_results_t &results() const { return *deferred_in_effect(&state); }
     bool pending() const { return deferred_pending(&state.deferred_request, &state.deferred.response); }
-    bool advanced() const { return results().window.turn_on != parameters.predictive.base_window.turn_on; }
+    bool advanced() const { return results().predictive.window.turn_on != parameters.predictive.base_window.turn_on; }
 
     control_parameters_t parameters;
     control_state_t state;
@@ -126,8 +126,8 @@ TEST_F(Deferred, results_take_effect_together_at_the_end_of_the_step) {
     ASSERT_TRUE(interrupt(COMMAND_RUN, 3000.0)) << "pre-empts it";
     EXPECT_EQ(std::memcmp(&before, &results(), sizeof before), 0);
     deferred_complete(&state.deferred_request, &state.deferred.response);
-    EXPECT_NE(before.window.turn_on, results().window.turn_on);
-    EXPECT_NE(before.window.reciprocal, results().window.reciprocal);
+    EXPECT_NE(before.predictive.window.turn_on, results().predictive.window.turn_on);
+    EXPECT_NE(before.predictive.window.reciprocal, results().predictive.window.reciprocal);
 }
 
 TEST_F(Deferred, checks_act_one_period_later_or_when_the_late_step_ends) {
@@ -206,8 +206,8 @@ TEST_F(Deferred, the_torque_of_the_speed_law_acts_one_period_later_with_the_feed
         EXPECT_EQ(input.speed_q22, state.observer.speed_q22) << "the speed after this sample";
         const int32_t torque_offset_before_q24 = torque_offset_q24(&state.deferred.torque_offset);
         deferred_step(&parameters, &state);
-        const int32_t error_q22 = results().speed_reference_q22 - input.speed_q22;
-        const int32_t law_q24 = results().speed_law_torque_q24;
+        const int32_t error_q22 = results().speed.speed_reference_q22 - input.speed_q22;
+        const int32_t law_q24 = results().speed.speed_law_torque_q24;
         ASSERT_EQ(law_q24, speed_smc_reaching_torque_q24(&parameters.speed_smc, error_q22) + torque_offset_before_q24);
         interrupt(COMMAND_RUN, 30.0);
         ASSERT_EQ(state.torque_reference_q24,
@@ -223,16 +223,16 @@ TEST_F(Deferred, the_speed_law_keeps_its_torque_while_its_step_is_late) {
         configure(controller);
         start();
         period(COMMAND_RUN, 10.0);
-        const int32_t law_q24 = results().speed_law_torque_q24;
+        const int32_t law_q24 = results().speed.speed_law_torque_q24;
         ASSERT_GT(law_q24, 0);
         interrupt(COMMAND_RUN, 10.0);
         for (int k = 0; k < 4; k++) {
             interrupt(COMMAND_RUN, 20.0);
-            ASSERT_EQ(results().speed_law_torque_q24, law_q24);
+            ASSERT_EQ(results().speed.speed_law_torque_q24, law_q24);
         }
         deferred_step(&parameters, &state);
         period(COMMAND_RUN, 20.0);
-        EXPECT_GT(results().speed_law_torque_q24, law_q24);
+        EXPECT_GT(results().speed.speed_law_torque_q24, law_q24);
     }
 }
 
@@ -248,9 +248,9 @@ TEST_F(Deferred, a_run_begins_without_torque_and_integral_of_the_speed_law_also_
     EXPECT_GT(state.torque_reference_q24, 0);
     interrupt(COMMAND_RUN, 2.0); // this step will be late
     EXPECT_FALSE(interrupt(COMMAND_OFF));
-    EXPECT_EQ(results().speed_law_torque_q24, 0) << "in effect without a step";
+    EXPECT_EQ(results().speed.speed_law_torque_q24, 0) << "in effect without a step";
     EXPECT_TRUE(deferred_step(&parameters, &state)) << "with the integral of the run";
-    EXPECT_EQ(results().speed_law_torque_q24, 0);
+    EXPECT_EQ(results().speed.speed_law_torque_q24, 0);
     EXPECT_TRUE(interrupt(COMMAND_RUN, 2.0)) << "the next run, without a period between";
     EXPECT_EQ(state.torque_reference_q24, 0);
     EXPECT_TRUE(deferred_step(&parameters, &state));
@@ -259,7 +259,7 @@ TEST_F(Deferred, a_run_begins_without_torque_and_integral_of_the_speed_law_also_
     period(COMMAND_OFF);
     period(COMMAND_OFF);
     EXPECT_EQ(state.deferred.speed_pi.integral_q54, 0);
-    EXPECT_EQ(results().speed_law_torque_q24, 0);
+    EXPECT_EQ(results().speed.speed_law_torque_q24, 0);
 }
 
 TEST_F(Deferred, in_torque_mode_the_reference_is_the_command_without_load_and_friction) {
@@ -276,7 +276,7 @@ TEST_F(Deferred, in_torque_mode_the_reference_is_the_command_without_load_and_fr
         EXPECT_EQ(state.torque_reference_q24, (3 << 24) + torque_offset_q24(&state.deferred.torque_offset))
             << controller;
         EXPECT_EQ(state.deferred.mode, DRIVE_MODE_TORQUE);
-        EXPECT_EQ(results().speed_reference_q22, 0);
+        EXPECT_EQ(results().speed.speed_reference_q22, 0);
         for (int k = 0; k < 10; k++) {
             ASSERT_TRUE(torque_period(-3.0));
         }
@@ -337,10 +337,11 @@ TEST_F(Deferred, speed_mode_begins_with_the_present_torque_and_speed) {
     }
     const double speed_rpm = state.observer.speed_q22 / fixed_point::Q22 * 30.0 / fixed_point::PI;
     period(COMMAND_RUN, speed_rpm);
-    const int32_t error_q22 = results().speed_reference_q22 - state.deferred_request.input.speed_q22;
+    const int32_t error_q22 = results().speed.speed_reference_q22 - state.deferred_request.input.speed_q22;
     const double proportional_Nm = parameters.speed_pi.kp_q16 / fixed_point::Q16 * error_q22 / fixed_point::Q22;
     EXPECT_LT(std::fabs(proportional_Nm), 0.5);
-    EXPECT_NEAR(results().speed_law_torque_q24 / fixed_point::Q24, 6.0 + proportional_Nm, 1e-3) << "integral of the PI";
+    EXPECT_NEAR(results().speed.speed_law_torque_q24 / fixed_point::Q24, 6.0 + proportional_Nm, 1e-3)
+        << "integral of the PI";
     configure(DRIVE_CONTROLLER_SALIENT);
     parameters.speed_ramp_q22 = 1 << 10;
     start();
@@ -349,7 +350,7 @@ TEST_F(Deferred, speed_mode_begins_with_the_present_torque_and_speed) {
     }
     const int32_t speed_q22 = state.deferred_request.input.speed_q22;
     period(COMMAND_RUN, 1000.0);
-    EXPECT_EQ(results().speed_reference_q22, speed_q22 + (1 << 10)) << "ramp from the present speed";
+    EXPECT_EQ(results().speed.speed_reference_q22, speed_q22 + (1 << 10)) << "ramp from the present speed";
 }
 
 TEST_F(Deferred, a_stop_in_torque_mode_ramps_the_speed_to_zero) {
@@ -412,7 +413,7 @@ TEST_F(Deferred, the_misalignment_survives_every_reset_and_a_late_step) {
     }
     const auto kept = [this] {
         for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-            EXPECT_EQ(results().misalignment[phase], int32_t(1000 * (phase + 1)));
+            EXPECT_EQ(results().predictive.misalignment[phase], int32_t(1000 * (phase + 1)));
         }
     };
     period(COMMAND_RUN);
