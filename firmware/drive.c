@@ -24,7 +24,7 @@ bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     }
     *drive = (drive_t){.hal = hal, .control_rate_hz = config->control_rate_hz};
     parameters_init(&drive->parameters);
-    parameters_set_default(&drive->parameters, PARAMETER_CONTROLLER, (int32_t)config->controller);
+    parameters_set_controller(&drive->parameters, (int32_t)config->controller);
     comms_init(&drive->comms, hal_time_us(hal));
     configure(drive);
     control_reset(&drive->control_parameters, &drive->control);

@@ -45,7 +45,7 @@ void parameter_protocol_respond(parameters_t *parameters, bool writable, const h
             response.value = row->maximum;
             break;
         case PARAMETER_OPERATION_DEFAULT:
-            response.value = parameters->defaults[request.index];
+            response.value = parameters_default(parameters, request.index);
             break;
         case PARAMETER_OPERATION_FRACTION_BITS:
             // NOLINTNEXTLINE(bugprone-signed-char-misuse): a number, no character

@@ -19,8 +19,8 @@ static_assert((int)PARAMETER_COUNT <= MACHINE_PARAMETERS_MAX, "the machine's tab
 void parameters_init(parameters_t *parameters) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         parameters->values[i] = machine_tables.parameter_default[i];
-        parameters->defaults[i] = machine_tables.parameter_default[i];
     }
+    parameters->controller_default = machine_tables.parameter_default[PARAMETER_CONTROLLER];
     parameters->revision = 0;
 }
 
@@ -28,10 +28,15 @@ const parameter_row_t *parameters_row(unsigned index) {
     return &rows[index];
 }
 
-void parameters_set_default(parameters_t *parameters, unsigned index, int32_t value) {
-    parameters->defaults[index] = fixed_clamp(value, rows[index].minimum, rows[index].maximum);
-    parameters->values[index] = parameters->defaults[index];
+void parameters_set_controller(parameters_t *parameters, int32_t controller) {
+    const parameter_row_t *row = &rows[PARAMETER_CONTROLLER];
+    parameters->controller_default = fixed_clamp(controller, row->minimum, row->maximum);
+    parameters->values[PARAMETER_CONTROLLER] = parameters->controller_default;
     parameters->revision++;
+}
+
+int32_t parameters_default(const parameters_t *parameters, unsigned index) {
+    return index == PARAMETER_CONTROLLER ? parameters->controller_default : machine_tables.parameter_default[index];
 }
 
 parameter_status_t parameters_set(parameters_t *parameters, unsigned index, int32_t value) {

@@ -29,7 +29,7 @@ typedef struct {
 /* The values of one drive. Read `values` directly; write through the functions, so that the limits apply. */
 typedef struct {
     int32_t values[PARAMETER_COUNT];
-    int32_t defaults[PARAMETER_COUNT];
+    int32_t controller_default;
     uint32_t revision; /* incremented by every write, so that derived values can be recomputed */
 } parameters_t;
 
@@ -39,9 +39,11 @@ void parameters_init(parameters_t *parameters);
 /* The table's row; index 0..PARAMETER_COUNT-1. */
 const parameter_row_t *parameters_row(unsigned index);
 
-/* Sets the default of this drive and its present value, clamped to the row's limits: for what the configuration
- * defines. index 0..PARAMETER_COUNT-1. */
-void parameters_set_default(parameters_t *parameters, unsigned index, int32_t value);
+/* Sets the controller of this drive as default and present value, clamped to the row's limits. */
+void parameters_set_controller(parameters_t *parameters, int32_t controller);
+
+/* The default of this drive: that of the machine, but for the controller. index 0..PARAMETER_COUNT-1. */
+int32_t parameters_default(const parameters_t *parameters, unsigned index);
 
 /* Writes a value: PARAMETER_STATUS_DONE, or, with nothing changed, PARAMETER_STATUS_NO_SUCH_PARAMETER or
  * PARAMETER_STATUS_OUT_OF_RANGE. */

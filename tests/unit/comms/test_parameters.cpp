@@ -66,10 +66,10 @@ TEST_F(Parameters, every_row_is_sound) {
         ASSERT_NE(row->unit, nullptr);
         EXPECT_LE(machine_tables.parameter_fraction_bits[i], 30);
         EXPECT_LT(row->minimum, row->maximum);
-        EXPECT_LE(row->minimum, parameters.defaults[i]);
-        EXPECT_LE(parameters.defaults[i], row->maximum);
-        EXPECT_EQ(parameters.values[i], parameters.defaults[i]);
-        EXPECT_EQ(parameters.defaults[i], machine_tables.parameter_default[i]);
+        EXPECT_LE(row->minimum, parameters_default(&parameters, i));
+        EXPECT_LE(parameters_default(&parameters, i), row->maximum);
+        EXPECT_EQ(parameters.values[i], parameters_default(&parameters, i));
+        EXPECT_EQ(parameters_default(&parameters, i), machine_tables.parameter_default[i]);
     }
 }
 
@@ -114,12 +114,14 @@ TEST_F(Parameters, an_unknown_index_is_rejected) {
     EXPECT_EQ(std::memcmp(&before, &parameters, sizeof before), 0);
 }
 
-TEST_F(Parameters, a_default_of_the_machine_is_clamped_to_the_limits) {
-    parameters_set_default(&parameters, PARAMETER_INERTIA_KG_M2, 12345678);
-    EXPECT_EQ(parameters.values[PARAMETER_INERTIA_KG_M2], 12345678);
-    EXPECT_EQ(request(PARAMETER_OPERATION_DEFAULT, PARAMETER_INERTIA_KG_M2).value, 12345678);
-    parameters_set_default(&parameters, PARAMETER_INERTIA_KG_M2, INT32_MAX);
-    EXPECT_EQ(parameters.values[PARAMETER_INERTIA_KG_M2], parameters_row(PARAMETER_INERTIA_KG_M2)->maximum);
+TEST_F(Parameters, the_controller_of_the_drive_is_its_default_clamped_to_the_limits) {
+    parameters_set_controller(&parameters, 1);
+    EXPECT_EQ(parameters.values[PARAMETER_CONTROLLER], 1);
+    EXPECT_EQ(request(PARAMETER_OPERATION_DEFAULT, PARAMETER_CONTROLLER).value, 1);
+    parameters_set(&parameters, PARAMETER_CONTROLLER, 0);
+    EXPECT_EQ(request(PARAMETER_OPERATION_DEFAULT, PARAMETER_CONTROLLER).value, 1);
+    parameters_set_controller(&parameters, INT32_MAX);
+    EXPECT_EQ(parameters.values[PARAMETER_CONTROLLER], parameters_row(PARAMETER_CONTROLLER)->maximum);
 }
 
 TEST_F(Parameters, protocol_reads_everything_of_every_row) {

@@ -34,7 +34,7 @@ struct setup_t {
     control_parameters_t configured() const {
         parameters_t values;
         parameters_init(&values);
-        parameters_set_default(&values, PARAMETER_CONTROLLER, DRIVE_CONTROLLER_SALIENT);
+        parameters_set_controller(&values, DRIVE_CONTROLLER_SALIENT);
         for (const auto &[index, value] : parameters) {
             values.values[index] =
                 fixed_point::to_fixed(value, std::ldexp(1.0, machine_tables.parameter_fraction_bits[index]));
