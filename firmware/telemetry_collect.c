@@ -46,8 +46,8 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
 
     telemetry->torque.torque_reference_nm = units_torque_q8(control->torque_reference_q24);
     telemetry->torque.torque_estimate_nm = units_torque_q8(measured->torque_sum_q24);
-    telemetry->torque.load_torque_estimate_nm =
-        units_torque_q8(fixed_add(control->observer.load_torque_q24, deferred_in_effect(control)->speed.periodic_load_q24));
+    telemetry->torque.load_torque_estimate_nm = units_torque_q8(
+        fixed_add(control->observer.load_torque_q24, deferred_in_effect(control)->speed.periodic_load_q24));
     telemetry->torque.bus_voltage_v = (uint32_t)measured->dc_link_voltage_q6;
 
     telemetry->currents.current_a_a = (uint32_t)measured->current_q9[0];

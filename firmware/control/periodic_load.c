@@ -58,7 +58,7 @@ static periodic_load_mode_t next_mode(const periodic_load_parameters_t *paramete
 }
 
 static void end_turn(const periodic_load_parameters_t *parameters, periodic_load_t *load) {
-    load->mode = next_mode(parameters, load);
+    load->mode = (uint8_t)next_mode(parameters, load);
     load->engaged = load->mode == PERIODIC_LOAD_LEARN || (load->engaged && load->mode != PERIODIC_LOAD_CLEAR);
     load->mean_q8 = load->total_q8 >> VALUES_LOG2;
 }

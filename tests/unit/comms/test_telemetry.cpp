@@ -155,7 +155,8 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     control.deferred.mode = DRIVE_MODE_TORQUE;
     control.state_machine.start_inhibit_mask = uint32_t(FAULT_BIT(FAULT_UNDER_VOLTAGE) | FAULT_BIT(FAULT_OVER_SPEED));
     control.observer.speed_q22 = int32_t(std::lround(-600 * 2 * M_PI / 60 * 4194304));
-    control.deferred.response.results[0].speed.speed_reference_q22 = int32_t(std::lround(150 * 2 * M_PI / 60 * 4194304));
+    control.deferred.response.results[0].speed.speed_reference_q22 =
+        int32_t(std::lround(150 * 2 * M_PI / 60 * 4194304));
     control.measurement.angle = 0x40000000;
     control.torque_reference_q24 = int32_t(19.1 * (1 << 24));
     control.measurement.torque_sum_q24 = INT32_MAX;
