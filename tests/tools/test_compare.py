@@ -62,7 +62,8 @@ def test_every_target_belongs_to_a_row():
 def test_every_controller_runs_in_every_group_that_it_supports():
     for name, of in ALL_CASES.items():
         salient = {key: {"salient"} for key in ("rates", "encoders", "misalignment", "standing_error", "hold")}
-        expected = {"paper_conditions": {"traditional", "paper"}, "ablation": set(CONTROLLERS) - {"traditional"}}
+        expected = {"paper_conditions": {"traditional", "paper"}, "ablation": {"paper", "salient"},
+                    "compressor": {"paper", "salient"}}
         assert {case.controller for case in of} == (expected | salient).get(name, set(CONTROLLERS))
 
 

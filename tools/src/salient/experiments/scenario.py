@@ -53,7 +53,7 @@ from salient.bench.drive import READY_TIMEOUT_S, DriveError, write_request
 from salient.bench.emulator import parameter_table
 from salient.bench.rig import bench_variables, variable_range
 from salient.bus.log import write_logs
-from salient.bus.signals import SignalTable, drive_database
+from salient.bus.signals import SignalTable, drive_database, signal_range
 from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
 from salient.errors import UsageError
 from salient.experiments.consistency import check_consistency
@@ -357,6 +357,15 @@ def _scenario_file() -> type[Table]:
     return create_model("scenario", __base__=Table, **fields)
 
 
+def _check_reference(path: Path, machine: str, name: str, key: str, value: float) -> None:
+    """UsageError for a reference that the drive of the machine does not take."""
+    message, signal = name.split(".")
+    reference = drive_database(machine).get_message_by_name(message).get_signal_by_name(signal)
+    low, high = signal_range(reference)
+    if not low <= value <= high:
+        raise UsageError(f"{path}: {key}: {value:g}: must be a number from {low:g} to {high:g} {reference.unit}")
+
+
 def load_scenarios(path: Path) -> list[Scenario]:
     """Reads and checks a scenario file; returns one Scenario for each controller that it names.
 
@@ -372,6 +381,10 @@ def load_scenarios(path: Path) -> list[Scenario]:
     relative = path.parent / file.machine
     machine = str(relative.resolve()) if relative.suffix == ".toml" else file.machine
     machine_image(machine)  # checks it
+    for step in file.speed:
+        _check_reference(path, machine, "DRIVE_COMMAND.speed_reference_rpm", "speed.value_rpm", step.value_rpm)
+    for step in file.torque:
+        _check_reference(path, machine, "DRIVE_TORQUE_COMMAND.torque_reference_Nm", "torque.value_Nm", step.value_Nm)
     profile = _load_profile_of(path, file.load_profile) if file.load_profile is not None else None
     common: dict[str, Any] = {name: getattr(file, name) for name in CONDITIONS if name in type(file).model_fields}
     common |= {

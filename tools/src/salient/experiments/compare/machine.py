@@ -9,10 +9,10 @@ from functools import lru_cache
 
 from salient.bench.rig import bench_variables
 from salient.experiments.compare.case import Case
-from salient.experiments.compare.cases import RIPPLE_RPM, STROKE_DEG
+from salient.experiments.compare.cases import DYNAMOMETER_RPM_S, RIPPLE_RPM, STROKE_DEG
 from salient.experiments.metrics import stroke_deg
 from salient.experiments.scaled import PAPER_WINDOW_S, Scale, scale_of
-from salient.experiments.scenario import LoadStep, Record, SpeedStep
+from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep
 from salient.machine.definition import Machine
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
@@ -61,10 +61,8 @@ def cases_of(cases: Iterable[Case], on: Subject) -> list[Case]:
 def _case(case: Case, on: Subject) -> Case:
     scenario, scale = case.scenario, on.scale
     speeds = tuple(SpeedStep(step.at_s, scale.rpm(step.value_rpm)) for step in scenario.speed)
-    fastest_rpm = max(abs(step.value_rpm) for step in speeds)
-    step_s = min((load.at_s for load in scenario.load), default=None)
-    event_s = step_s if step_s is not None else scenario.duration_s - PAPER_WINDOW_S
-    delay_s = scale.delay_s(fastest_rpm, event_s - speeds[0].at_s)
+    fastest_rpm = max((abs(step.value_rpm) for step in speeds), default=0.0)
+    delay_s = _delay_s(scenario, scale, fastest_rpm)
     if case.strokes:
         # The load step is at this part of a stroke, of the machine's instead of the paper's machine's.
         paper_s = STROKE_DEG / (6.0 * RIPPLE_RPM)
@@ -79,9 +77,20 @@ def _case(case: Case, on: Subject) -> Case:
         scenario=replace(
             scenario, machine=on.path, speed=speeds, record=record,
             load=tuple(_load(load, scale, delay_s) for load in scenario.load),
+            torque=tuple(TorqueStep(_later(step.at_s, delay_s), scale.Nm(step.value_Nm)) for step in scenario.torque),
             duration_s=_later(scenario.duration_s, delay_s + longer_s),
             parameters=_scaled(scenario.parameters, _parameter_units(), on.factors),
             bench=_scaled(scenario.bench, _bench_units(), on.factors)))
+
+
+def _delay_s(scenario: Scenario, scale: Scale, fastest_rpm: float) -> float:
+    """Time by which the machine comes to its speed later than the paper's machine."""
+    if not scenario.speed:
+        held_rpm = scenario.bench["held_speed_rpm"]
+        return max(0.0, (scale.rpm(held_rpm) - held_rpm) / DYNAMOMETER_RPM_S)
+    step_s = min((load.at_s for load in scenario.load), default=None)
+    event_s = step_s if step_s is not None else scenario.duration_s - PAPER_WINDOW_S
+    return scale.delay_s(fastest_rpm, event_s - scenario.speed[0].at_s)
 
 
 def _load(load: LoadStep, scale: Scale, delay_s: float) -> LoadStep:
