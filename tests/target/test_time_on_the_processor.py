@@ -278,7 +278,7 @@ def test_shared_data_is_torn_without_the_critical_section_and_never_with_it(race
     """A command is three words stored by one instruction, which QEMU does not interrupt: never torn in either build."""
     found = race(build, "no_critical_section", timed=True)
     assert found.interrupts > 5000
-    assert found.torn_parameters > 20 and found.torn_commands == 0 and found.torn_snapshots > 10
+    assert found.torn_parameters > 20 and found.torn_commands == 0 and found.torn_snapshots > 0
     found = race(build, "protected", timed=True)
     assert found.interrupts > 5000
     assert found.torn == (0, 0, 0, 0, 0)
