@@ -68,8 +68,7 @@ typedef struct {
 
 typedef enum {
     MISALIGNMENT_UNSTEADY,    /* learning waits until the state has been steady for 150 ms */
-    MISALIGNMENT_INTERRUPTED, /* by what a large misalignment itself causes, with every stroke: learning goes on after
-                               */
+    MISALIGNMENT_INTERRUPTED, /* by the misalignment itself, with every stroke: learning continues afterwards */
     MISALIGNMENT_STEADY,      /* speed and load are steady, the voltage is not limited */
 } misalignment_condition_t;
 

@@ -21,12 +21,10 @@
 #include <stdint.h>
 
 typedef struct {
-    int32_t gain_q24;       /* J k, N m s/rad, Q7.24, > 0 */
-    int32_t epsilon_q31;    /* eps, Q0.31, 2^-15..1 - 2^-31; eps = 1 is stored as 1 - 2^-31 */
-    int32_t delta_q27;      /* delta / ln 2, s/rad, Q4.27; delta 0..10 */
-    int32_t friction_q30;   /* B, N m s, Q1.30, >= 0 */
-    int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
-    int32_t torque_max_q24; /* N m, Q7.24 */
+    int32_t gain_q24;     /* J k, N m s/rad, Q7.24, > 0 */
+    int32_t epsilon_q31;  /* eps, Q0.31, 2^-15..1 - 2^-31; eps = 1 is stored as 1 - 2^-31 */
+    int32_t delta_q27;    /* delta / ln 2, s/rad, Q4.27; delta 0..10 */
+    int32_t friction_q30; /* B, N m s, Q1.30, >= 0 */
 } speed_smc_parameters_t;
 
 /* J H(x) sgn(x) in N m, Q7.24, for x in rad/s, Q9.22, the whole range; saturates at +-INT32_MAX. Exactly odd in x.

@@ -16,7 +16,7 @@
 typedef struct {
     command_request_t request;
     drive_mode_t mode;            /* of COMMAND_RUN: which of the references it follows */
-    int32_t speed_reference_q22;  /* rad/s, Q9.22, -3000..3000 r/min, negative: reverse */
+    int32_t speed_reference_q22;  /* rad/s, Q9.22, within machine_tables.speed_reference_max, negative: reverse */
     int32_t torque_reference_q24; /* N m, Q7.24, any value, negative: reverse or braking */
     uint32_t time_us;             /* the drive's time at acceptance */
 } command_t;

@@ -255,8 +255,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                 .epsilon_q31 = epsilon_q31(values, fixed_multiply(inertia_q30, values[PARAMETER_SMC_K], 22)),
                 .delta_q27 = fixed_multiply(values[PARAMETER_SMC_DELTA], LOG2_E_Q30, 19),
                 .friction_q30 = friction_q30,
-                .torque_min_q24 = controller.four_quadrant ? -torque_max_q24 : 0,
-                .torque_max_q24 = torque_max_q24,
             },
         .commutation = commutation_configure(
             &(commutation_angles_t){
@@ -314,7 +312,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         control_rate_hz, learns_load ? control.bandwidth.bandwidth_rad_s[control.bandwidth.moving_stage] : 0,
         torque_max_q24);
     control.torque_mode = torque_mode_configure(values[PARAMETER_TORQUE_SLEW_RATE_NM_S], control_rate_hz,
-                                                control.speed_smc.torque_min_q24, torque_max_q24,
+                                                controller.four_quadrant ? -torque_max_q24 : 0, torque_max_q24,
                                                 fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
     control.torque_offset = torque_offset_configure(control_rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);

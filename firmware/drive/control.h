@@ -124,7 +124,7 @@ typedef struct {
     speed_pi_t speed_pi;
     drive_mode_t mode; /* of the last input */
     torque_mode_t torque_mode;
-    unsigned turn;       /* of the last step, below DEFERRED_TURNS */
+    unsigned turn;       /* of the last step, below DEFERRED_SLOW_PERIODS */
     int32_t advance_q30; /* of the conduction windows, Q1.30, 0..1 */
     torque_sharing_window_t window;
     stroke_mean_t stroke_mean;

@@ -108,11 +108,15 @@ static uint64_t protect(const control_parameters_t *parameters, deferred_t *defe
     return protection_check_deferred(&parameters->protection, &deferred->protection, &checked);
 }
 
+/* Rotation per control period, 2^-32 rev. */
+static int32_t rotation(const control_parameters_t *parameters, const deferred_input_t *input) {
+    return fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32);
+}
+
 static observer_bandwidth_limits_t bandwidth_limits(const control_parameters_t *parameters, deferred_t *deferred,
                                                     const deferred_input_t *input) {
     const observer_bandwidth_sample_t *sample = &input->bandwidth;
-    const uint32_t angle_step =
-        (uint32_t)fixed_abs(fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32));
+    const uint32_t angle_step = (uint32_t)fixed_abs(rotation(parameters, input));
     const uint32_t withheld = moving_load_step(&parameters->moving_load, &deferred->moving_load, sample->innovation,
                                                angle_step, sample->from_edge, deferred->periodic_load.engaged);
     return observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld);
@@ -173,7 +177,7 @@ static void learn_periodic_load(const control_parameters_t *parameters, deferred
     }
     const periodic_load_sample_t sample = {
         .angle = input->encoder_angle,
-        .angle_step = fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32),
+        .angle_step = rotation(parameters, input),
         .load_torque_q24 = input->load_torque_q24,
         .moving = deferred->moving_load.withheld > 0 && !deferred->load_constant,
     };

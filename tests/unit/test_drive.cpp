@@ -324,12 +324,12 @@ TEST_F(Drive, a_deferred_interrupt_that_does_not_come_opens_the_switches) {
 TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
     periods(100);
     EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 5 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_DONE_CHOICE);
-    EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
+    EXPECT_EQ(drive.control_parameters.torque_mode.torque_max_q24, 5 << 24);
     command(COMMAND_RUN);
     periods(3);
     EXPECT_EQ(drive.control.torque_reference_q24, 5 << 24);
     EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 6 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_NOT_WHILE_RUNNING_CHOICE);
-    EXPECT_EQ(drive.control_parameters.speed_smc.torque_max_q24, 5 << 24);
+    EXPECT_EQ(drive.control_parameters.torque_mode.torque_max_q24, 5 << 24);
 }
 
 TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {

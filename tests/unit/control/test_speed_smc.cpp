@@ -22,15 +22,12 @@ constexpr double FRICTION_NM_S = 0.02;
 constexpr double TORQUE_MAX_NM = 19.1;
 constexpr double REFERENCE_RAD_S = 20.0 * PI; // 600 r/min
 
-speed_smc_parameters_t parameters_of(double gain_1_s, double epsilon, double delta_s,
-                                     double torque_max_Nm = TORQUE_MAX_NM) {
+speed_smc_parameters_t parameters_of(double gain_1_s, double epsilon, double delta_s) {
     return {
         .gain_q24 = to_fixed(INERTIA_KG_M2 * gain_1_s, Q24),
         .epsilon_q31 = to_fixed(epsilon, Q31),
         .delta_q27 = to_fixed(delta_s / std::log(2.0), Q27),
         .friction_q30 = to_fixed(FRICTION_NM_S, Q30),
-        .torque_min_q24 = to_fixed(-torque_max_Nm, Q24),
-        .torque_max_q24 = to_fixed(torque_max_Nm, Q24),
     };
 }
 
@@ -42,11 +39,10 @@ double model_torque_Nm(const speed_smc_parameters_t &parameters, int32_t x_q22) 
 
 // Torque reference without the period between reaching torque and feed-forward that the drive has (deferred.h).
 int32_t torque_q24_of(const speed_smc_parameters_t &parameters, int32_t reference_q22, int32_t speed_q22,
-                      int32_t load_q24) {
+                      int32_t load_q24, int32_t torque_max_q24 = to_fixed(TORQUE_MAX_NM, Q24)) {
     const int32_t error_q22 = fixed_subtract(reference_q22, speed_q22);
     const int32_t reaching_q24 = speed_smc_reaching_torque_q24(&parameters, error_q22);
-    return speed_smc_torque_q24(&parameters, reaching_q24, speed_q22, load_q24, parameters.torque_min_q24,
-                                parameters.torque_max_q24);
+    return speed_smc_torque_q24(&parameters, reaching_q24, speed_q22, load_q24, -torque_max_q24, torque_max_q24);
 }
 
 // Ends of the range, zero, every magnitude with both signs, and random values.
@@ -128,13 +124,11 @@ TEST(SpeedSmc, nothing_overflows_at_the_ends_of_all_ranges) {
                 const speed_smc_parameters_t parameters = {.gain_q24 = gain_q24,
                                                            .epsilon_q31 = epsilon_q31,
                                                            .delta_q27 = delta_q27,
-                                                           .friction_q30 = INT32_MAX,
-                                                           .torque_min_q24 = -(40 << 24),
-                                                           .torque_max_q24 = 40 << 24};
+                                                           .friction_q30 = INT32_MAX};
                 for (const int32_t reference : ends) {
                     for (const int32_t speed : ends) {
                         for (const int32_t load : ends) {
-                            const int32_t torque_q24 = torque_q24_of(parameters, reference, speed, load);
+                            const int32_t torque_q24 = torque_q24_of(parameters, reference, speed, load, 40 << 24);
                             ASSERT_LE(std::abs(torque_q24), 40 << 24);
                         }
                     }

@@ -72,8 +72,8 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("epsilon", c.speed_smc.epsilon_q31, std::ldexp(epsilon, 31), 2.0 + 128.0 / limit_Nm + 1e-6 * epsilon * 2e9);
     near("delta", c.speed_smc.delta_q27, std::ldexp(v(PARAMETER_SMC_DELTA) / std::log(2.0), 27), 1.01);
     near("friction", c.speed_smc.friction_q30, v(PARAMETER_FRICTION_NM_S) * fixed_point::Q30, 0.0);
-    ASSERT_EQ(c.speed_smc.torque_min_q24, salient ? -c.speed_smc.torque_max_q24 : 0);
-    near("torque max", c.speed_smc.torque_max_q24, v(PARAMETER_TORQUE_MAX_NM) * fixed_point::Q24, 0.0);
+    ASSERT_EQ(c.torque_mode.torque_min_q24, salient ? -c.torque_mode.torque_max_q24 : 0);
+    near("torque max", c.torque_mode.torque_max_q24, v(PARAMETER_TORQUE_MAX_NM) * fixed_point::Q24, 0.0);
 
     near("turn on", c.commutation.turn_on, 0.0, fixed_point::REV);
     ASSERT_LE(std::fabs(c.commutation.turn_on - pitch(PARAMETER_TURN_ON_ANGLE_DEG)), 1.0);
@@ -127,8 +127,6 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
          2.0);
     const double slew = v(PARAMETER_TORQUE_SLEW_RATE_NM_S) / rate_hz * fixed_point::Q24;
     near("torque slew", c.torque_mode.slew_q24, slew == 0.0 ? INT32_MAX : std::max(slew, 1.0), 1.0);
-    ASSERT_EQ(c.torque_mode.torque_min_q24, c.speed_smc.torque_min_q24);
-    ASSERT_EQ(c.torque_mode.torque_max_q24, c.speed_smc.torque_max_q24);
     near("fold-back", c.torque_mode.speed_end_q22, c.protection.over_speed_q22 * 15.0 / 16.0, 1.0);
     near("timeout", c.protection.command_timeout_us, 1000.0 * v(PARAMETER_COMMAND_TIMEOUT_MS), 0.0);
 

@@ -212,8 +212,8 @@ TEST_F(Deferred, the_torque_of_the_speed_law_acts_one_period_later_with_the_feed
         interrupt(COMMAND_RUN, 30.0);
         ASSERT_EQ(state.torque_reference_q24,
                   speed_smc_torque_q24(&parameters.speed_smc, law_q24, state.observer.speed_q22,
-                                       state.observer.load_torque_q24, parameters.speed_smc.torque_min_q24,
-                                       parameters.speed_smc.torque_max_q24));
+                                       state.observer.load_torque_q24, parameters.torque_mode.torque_min_q24,
+                                       parameters.torque_mode.torque_max_q24));
         deferred_step(&parameters, &state);
     }
 }

@@ -94,7 +94,7 @@ class salient_t {
           inertia_kg_m2(plant.inertia_kg_m2), friction_Nm_s(plant.friction_Nm_s), encoder_bits(32 - p.encoder_shift),
           adc_bits(p.adc_bits), epsilon(std::ldexp(p.speed_smc.epsilon_q31, -31)),
           delta_s(std::ldexp(p.speed_smc.delta_q27, -27) * std::log(2.0)), gain_Nm_s(p.speed_smc.gain_q24 / Q24),
-          torque_max_Nm(p.speed_smc.torque_max_q24 / Q24) {
+          torque_max_Nm(p.torque_mode.torque_max_q24 / Q24) {
         bandwidth = model_of(p.bandwidth, rate_hz);
         moving_load[0] = model_of(p.moving_load, false, rate_hz);
         moving_load[1] = model_of(p.moving_load, true, rate_hz);
