@@ -12,17 +12,25 @@ extern "C" {
 
 namespace frames {
 
+// A command's frame with its checksum; pack: the packing of the message.
+template <typename message_t>
+hal_can_frame_t protected_frame(uint32_t identifier, uint8_t length, uint16_t data_id, uint8_t counter,
+                                const message_t &message, int (*pack)(uint8_t *, const message_t *, size_t)) {
+    hal_can_frame_t frame{};
+    frame.identifier = identifier;
+    frame.length = length;
+    pack(frame.data, &message, sizeof frame.data);
+    e2e_protect(data_id, counter, frame.data, frame.length);
+    return frame;
+}
+
 // DRIVE_COMMAND with its checksum; the values are not checked.
 inline hal_can_frame_t command(uint8_t counter, unsigned request, int32_t milli_rpm) {
     drive_command_t message{};
     message.request = uint8_t(request);
     message.speed_reference_rpm = milli_rpm;
-    hal_can_frame_t frame{};
-    frame.identifier = DRIVE_COMMAND_FRAME_ID;
-    frame.length = DRIVE_COMMAND_LENGTH;
-    drive_command_pack(frame.data, &message, sizeof frame.data);
-    e2e_protect(DRIVE_COMMAND_E2E_DATA_ID, counter, frame.data, frame.length);
-    return frame;
+    return protected_frame(DRIVE_COMMAND_FRAME_ID, DRIVE_COMMAND_LENGTH, DRIVE_COMMAND_E2E_DATA_ID, counter, message,
+                           drive_command_pack);
 }
 
 // DRIVE_TORQUE_COMMAND with its checksum; the values are not checked.
@@ -30,12 +38,8 @@ inline hal_can_frame_t torque_command(uint8_t counter, unsigned request, int32_t
     drive_torque_command_t message{};
     message.request = uint8_t(request);
     message.torque_reference_nm = torque_q16;
-    hal_can_frame_t frame{};
-    frame.identifier = DRIVE_TORQUE_COMMAND_FRAME_ID;
-    frame.length = DRIVE_TORQUE_COMMAND_LENGTH;
-    drive_torque_command_pack(frame.data, &message, sizeof frame.data);
-    e2e_protect(DRIVE_TORQUE_COMMAND_E2E_DATA_ID, counter, frame.data, frame.length);
-    return frame;
+    return protected_frame(DRIVE_TORQUE_COMMAND_FRAME_ID, DRIVE_TORQUE_COMMAND_LENGTH, DRIVE_TORQUE_COMMAND_E2E_DATA_ID,
+                           counter, message, drive_torque_command_pack);
 }
 
 // PARAMETER_REQUEST; the values are not checked.
