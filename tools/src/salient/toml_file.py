@@ -21,10 +21,9 @@ from pydantic_core import PydanticCustomError
 
 from salient import config
 from salient.config import OPTIONS, either
+from salient.errors import SHOWN_MAX, shown
 
 TOML_BYTES_MAX = 1_000_000
-
-_SHOWN_MAX = 60  # characters of a wrong value in a message
 
 
 class TextFileError(Exception):
@@ -126,21 +125,12 @@ def validate(model: type[_Model], data: object, section: str = "") -> _Model:
         raise TextFileError(_one_line(error, model, section)) from None
 
 
-def shown(value: object) -> str:
-    """A value or key of a file, short and on one line."""
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):
-        return "a value too long to show"
-    return text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
-
-
 def _one_line(error: ValidationError, model: type[Table], section: str) -> str:
     """The first mistake; an unknown key before others, because a misspelt key is missing as well."""
     found = min(error.errors(include_url=False), key=lambda each: each["type"] != "extra_forbidden")
     place = [part for part in found["loc"] if isinstance(part, str)]
     *parents, last = [*([section] if section else []), *place] or [""]
-    is_plain = re.fullmatch(r"\w+", last, re.ASCII) and len(last) <= _SHOWN_MAX
+    is_plain = re.fullmatch(r"\w+", last, re.ASCII) and len(last) <= SHOWN_MAX
     key = ".".join([*parents, last if is_plain else shown(last)])
     if found["type"] == "missing":
         return f"{key}: missing"

@@ -11,9 +11,9 @@ from functools import lru_cache
 from pathlib import Path
 
 from salient.bench.rig import LOAD_PROFILE_VALUE_MAX, LOAD_PROFILE_VALUES_MAX
-from salient.errors import UsageError
-from salient.paths import LOADS
-from salient.toml_file import TextFileError, read_text, shown
+from salient.errors import UsageError, shown
+from salient.paths import LOADS, bundled_or_path
+from salient.toml_file import TextFileError, read_text
 
 _HEADER = "angle_deg,torque"
 _VALUES_MIN = 8
@@ -23,17 +23,7 @@ _ANGLE_TOLERANCE_DEG = 0.01
 
 def load_profile_path(name_or_path: str) -> Path:
     """The file meant by the name of a bundled profile or by a path; UsageError when there is none."""
-    bundled, path = LOADS / f"{name_or_path}.csv", Path(name_or_path)
-    try:
-        if bundled.is_file():
-            return bundled
-        if path.is_file():
-            return path.resolve()
-    except OSError:
-        pass  # a name too long for a file: there is none
-    names = ", ".join(sorted(p.stem for p in LOADS.glob("*.csv")))
-    raise UsageError(
-        f"load_profile {shown(name_or_path)}: no such file, and no bundled load profile of that name ({names})")
+    return bundled_or_path(name_or_path, LOADS, ".csv", "load_profile")
 
 
 @lru_cache

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
+from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep
 from salient.machine.definition import Machine
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
@@ -28,8 +28,8 @@ _START_FACTOR, _START_EXTRA_S = 1.5, 0.05
 
 @dataclass(frozen=True)
 class Scale:
-    """speed, torque: factors of the paper's values. strokes_Hz_per_rpm: electrical revolutions in a second at 1 r/min.
-    """
+    """speed, torque: factors of the paper's values. electrical_Hz_per_rpm: electrical revolutions in a second at
+    1 r/min."""
 
     speed: float = 1.0
     torque: float = 1.0
@@ -75,17 +75,35 @@ def scale_of_name(name_or_path: str) -> Scale:
 
 def scaled(scenario: Scenario, scale: Scale) -> Scenario:
     """One of the demo's scenarios, written for the paper's machine, for another."""
-    speeds = tuple(SpeedStep(step.at_s, scale.rpm(step.value_rpm)) for step in scenario.speed)
-    speed_rpm = max(abs(step.value_rpm) for step in speeds)
+    speed_rpm = fastest_rpm(scenario, scale)
     first_s = min((load.at_s for load in scenario.load), default=scenario.duration_s - AFTER_WINDOW_S - PAPER_WINDOW_S)
-    delay_s = scale.delay_s(speed_rpm, first_s - speeds[0].at_s)
-    longer_s = scale.window_s(speed_rpm) - PAPER_WINDOW_S
+    delay_s = scale.delay_s(speed_rpm, first_s - scenario.speed[0].at_s)
+    return in_terms_of(scenario, scale, delay_s, scale.window_s(speed_rpm) - PAPER_WINDOW_S)
+
+
+def fastest_rpm(scenario: Scenario, scale: Scale) -> float:
+    """The highest speed that a scenario requests of the machine; 0 when it requests none."""
+    return max((abs(scale.rpm(step.value_rpm)) for step in scenario.speed), default=0.0)
+
+
+def in_terms_of(scenario: Scenario, scale: Scale, delay_s: float, longer_s: float) -> Scenario:
+    """Speeds, loads and torques of the machine; what follows the start comes delay_s later, and the end by longer_s
+    more."""
     record = scenario.record
     if record is not None and record.from_s > 0.0:
-        record = Record(record.step_us, record.from_s + delay_s)
-    return replace(scenario, speed=speeds, record=record,
-                   load=tuple(LoadStep(load.at_s + delay_s, scale.Nm(load.torque_Nm)) for load in scenario.load),
-                   duration_s=round(scenario.duration_s + delay_s + longer_s, 6))
+        record = Record(record.step_us, later_s(record.from_s, delay_s))
+    return replace(
+        scenario, record=record,
+        speed=tuple(SpeedStep(step.at_s, scale.rpm(step.value_rpm)) for step in scenario.speed),
+        torque=tuple(TorqueStep(later_s(step.at_s, delay_s), scale.Nm(step.value_Nm)) for step in scenario.torque),
+        load=tuple(LoadStep(later_s(load.at_s, delay_s), scale.Nm(load.torque_Nm),
+                            None if load.profile_Nm is None else scale.Nm(load.profile_Nm)) for load in scenario.load),
+        duration_s=later_s(scenario.duration_s, delay_s + longer_s))
+
+
+def later_s(time_s: float, by_s: float) -> float:
+    """A time of a scenario, whole microseconds when it changes."""
+    return round(time_s + by_s, 6) if by_s else time_s
 
 
 def steady_window_s(scenario: Scenario, scale: Scale) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, create_model
 
+from salient.errors import shown
 from salient.machine.definition import Machine, MachineError
 from salient.machine.drive_data import check
 from salient.machine.flux_map import FluxMap, FluxMapError
@@ -20,7 +21,7 @@ from salient.machine.flux_map_csv import load_flux_map
 from salient.machine.magnetics import FORMULA_KEYS, INDUCTANCES, Formula
 from salient.machine.parameter_table import SAME_UNITS, read_table
 from salient.machine.path import machine_path
-from salient.toml_file import Table, TextFileError, checked, number, one_of, option, read_toml, shown, validate
+from salient.toml_file import Table, TextFileError, checked, number, one_of, option, read_toml, validate
 
 __all__ = ["FORMS", "MAGNETICS", "Converter", "Machine", "MachineError", "MachineFile", "Sensors", "load_machine",
            "machine_path"]

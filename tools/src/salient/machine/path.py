@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from salient.paths import MACHINES
-
-_SHOWN_MAX = 60  # characters of a name in a message
+from salient.errors import UsageError
+from salient.paths import MACHINES, bundled_or_path
 
 
 class MachineError(ValueError):
@@ -19,15 +18,7 @@ class MachineError(ValueError):
 
 def machine_path(name_or_path: str) -> Path:
     """The file meant by the name of a bundled machine or by a path; MachineError when there is none."""
-    bundled, path = MACHINES / f"{name_or_path}.toml", Path(name_or_path)
     try:
-        if bundled.is_file():
-            return bundled
-        if path.is_file():
-            return path.resolve()
-    except OSError:
-        pass  # a name too long for a file: there is none
-    names = ", ".join(sorted(p.stem for p in MACHINES.glob("*.toml")))
-    text = repr(name_or_path)
-    shown = text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
-    raise MachineError(f"machine {shown}: no such file, and no bundled machine of that name ({names})")
+        return bundled_or_path(name_or_path, MACHINES, ".toml", "machine")
+    except UsageError as error:
+        raise MachineError(str(error)) from None

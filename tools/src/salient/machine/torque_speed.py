@@ -98,20 +98,6 @@ def torque_per_flux_Nm_Wb(magnetics: Any, current_A: float) -> float:
     return float(np.mean(slope[torque_Nm >= 0.5 * torque_Nm.max()]))
 
 
-def speed_of_torque_rad_s(magnetics: Any, phases: int, source: Source, current_A: float, torque_Nm: float) -> float:
-    """The highest speed at which the mean torque reaches torque_Nm; the lowest of the grid when none does."""
-    speed_rad_s, mean_Nm = torque_over_speed(magnetics, phases, source, current_A)
-    reached = np.flatnonzero(mean_Nm >= torque_Nm)
-    if not reached.size:
-        return float(speed_rad_s[0])
-    last = int(reached[-1])
-    if last == len(speed_rad_s) - 1:
-        return float(speed_rad_s[-1])
-    # Torque falls with the logarithm of the speed nearly linearly.
-    share = (mean_Nm[last] - torque_Nm) / (mean_Nm[last] - mean_Nm[last + 1])
-    return float(speed_rad_s[last] * (speed_rad_s[last + 1] / speed_rad_s[last]) ** share)
-
-
 def torque_over_speed(magnetics: Any, phases: int, source: Source, current_A: float) -> tuple[np.ndarray, np.ndarray]:
     """Speeds in rad/s and the largest mean torque at each: full voltage from a turn-on to a turn-off angle, then full
     opposite voltage, the current limited to current_A by chopping, the best pair of angles.

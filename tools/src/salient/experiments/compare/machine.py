@@ -11,8 +11,8 @@ from salient.bench.rig import bench_variables
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import DYNAMOMETER_RPM_S, RIPPLE_RPM, STROKE_DEG
 from salient.experiments.metrics import stroke_deg
-from salient.experiments.scaled import PAPER_WINDOW_S, Scale, scale_of
-from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep
+from salient.experiments.scaled import PAPER_WINDOW_S, Scale, fastest_rpm, in_terms_of, later_s, scale_of
+from salient.experiments.scenario import Scenario
 from salient.machine.definition import Machine
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
@@ -60,46 +60,30 @@ def cases_of(cases: Iterable[Case], on: Subject) -> list[Case]:
 
 def _case(case: Case, on: Subject) -> Case:
     scenario, scale = case.scenario, on.scale
-    speeds = tuple(SpeedStep(step.at_s, scale.rpm(step.value_rpm)) for step in scenario.speed)
-    fastest_rpm = max((abs(step.value_rpm) for step in speeds), default=0.0)
-    delay_s = _delay_s(scenario, scale, fastest_rpm)
+    speed_rpm = fastest_rpm(scenario, scale)
+    delay_s = _delay_s(scenario, scale, speed_rpm)
     if case.strokes:
         # The load step is at this part of a stroke, of the machine's instead of the paper's machine's.
         paper_s = STROKE_DEG / (6.0 * RIPPLE_RPM)
-        delay_s += case.strokes * (stroke_deg(on.machine) / (6.0 * fastest_rpm) - paper_s)
-    longer_s = scale.window_s(fastest_rpm) - PAPER_WINDOW_S if "ripple" in case.extractor else 0.0
-    record = scenario.record
-    if record is not None and record.from_s > 0.0:
-        record = Record(record.step_us, _later(record.from_s, delay_s))
+        delay_s += case.strokes * (stroke_deg(on.machine) / (6.0 * speed_rpm) - paper_s)
+    longer_s = scale.window_s(speed_rpm) - PAPER_WINDOW_S if "ripple" in case.extractor else 0.0
     return replace(
         case, condition=on.text(case.condition),
-        window_s=(_later(case.window_s[0], delay_s), _later(case.window_s[1], delay_s + longer_s)),
+        window_s=(later_s(case.window_s[0], delay_s), later_s(case.window_s[1], delay_s + longer_s)),
         scenario=replace(
-            scenario, machine=on.path, speed=speeds, record=record,
-            load=tuple(_load(load, scale, delay_s) for load in scenario.load),
-            torque=tuple(TorqueStep(_later(step.at_s, delay_s), scale.Nm(step.value_Nm)) for step in scenario.torque),
-            duration_s=_later(scenario.duration_s, delay_s + longer_s),
+            in_terms_of(scenario, scale, delay_s, longer_s), machine=on.path,
             parameters=_scaled(scenario.parameters, _parameter_units(), on.factors),
             bench=_scaled(scenario.bench, _bench_units(), on.factors)))
 
 
-def _delay_s(scenario: Scenario, scale: Scale, fastest_rpm: float) -> float:
+def _delay_s(scenario: Scenario, scale: Scale, speed_rpm: float) -> float:
     """Time by which the machine comes to its speed later than the paper's machine."""
     if not scenario.speed:
         held_rpm = scenario.bench["held_speed_rpm"]
         return max(0.0, (scale.rpm(held_rpm) - held_rpm) / DYNAMOMETER_RPM_S)
     step_s = min((load.at_s for load in scenario.load), default=None)
     event_s = step_s if step_s is not None else scenario.duration_s - PAPER_WINDOW_S
-    return scale.delay_s(fastest_rpm, event_s - scenario.speed[0].at_s)
-
-
-def _load(load: LoadStep, scale: Scale, delay_s: float) -> LoadStep:
-    return LoadStep(_later(load.at_s, delay_s), scale.Nm(load.torque_Nm),
-                    None if load.profile_Nm is None else scale.Nm(load.profile_Nm))
-
-
-def _later(time_s: float, by_s: float) -> float:
-    return round(time_s + by_s, 6) if by_s else time_s
+    return scale.delay_s(speed_rpm, event_s - scenario.speed[0].at_s)
 
 
 def _scaled(values: Mapping[str, float], units: Mapping[str, str], factors: Mapping[str, float]) -> dict[str, float]:
