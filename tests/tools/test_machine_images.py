@@ -178,7 +178,7 @@ def test_16_processes_start_8_machines_at_once_from_an_empty_cache(tmp_path: Pat
     folder = tmp_path / "cache"
     processes = [started(folder, file) for file in files * 2]
     results = [result_of(process) for process in processes]
-    assert results[:8] == results[8:]  # the same bits whoever made the image
+    assert results[:8] == results[8:]  # equal bits, from whichever process the image is
     assert all(fault == "none" and speed_rpm > 30.0 for _, speed_rpm, fault in results)
     assert [name for name, *_ in results[:4]] == BUNDLED
     images = [entry.name for entry in folder.iterdir()]
