@@ -10,6 +10,10 @@
 #define HOLDS_MAX 32
 #define RELEASE_MS 5
 #define BLOCKED_MS 1000
+#define STILL_MS 500
+#define RIPPLE_FACTOR 3
+
+#define HALF_PI_Q7 201
 
 /* 2^-32 rev, Q28.4: 0.3 urad, what an ideal encoder leaves (observer_bandwidth.c), and 0.7 urad. */
 #define THRESHOLD_IDEAL_Q4 3281
@@ -26,6 +30,16 @@ static uint32_t implausible_q4(const moving_load_settings_t *settings) {
     return (uint32_t)fixed_saturate(trend_q4 << machine_tables.speed_exponent);
 }
 
+/* J w^2 count / 4 + T / 64. */
+static int32_t movement_min_q24(const moving_load_settings_t *settings) {
+    const int64_t stiffness_q30 =
+        (int64_t)settings->bandwidth_rad_s * settings->bandwidth_rad_s * settings->inertia_q30;
+    /* A count is 2 pi 2^-encoder_bits; pi / 2 in Q1.7 of the inertia's Q1.30 cut to Q18. */
+    const int64_t noise_q24 =
+        (stiffness_q30 >> 12) * HALF_PI_Q7 >> (1u + settings->encoder_bits + machine_tables.speed_exponent);
+    return fixed_saturate(noise_q24 + settings->torque_max_q24 / 64);
+}
+
 moving_load_parameters_t moving_load_configure(const moving_load_settings_t *settings) {
     const unsigned encoder_shift = 32u - settings->encoder_bits;
     const uint32_t ticks_per_ms = settings->control_rate_hz / 1000u;
@@ -40,6 +54,8 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
         .hold_ticks_min = ticks_per_ms * HOLD_MS,
         .hold_ticks_max = ticks_per_ms * HOLD_MS * HOLDS_MAX,
         .release_ticks = ticks_per_ms * RELEASE_MS,
+        .still_reviews = ticks_per_ms * STILL_MS / settings->periods_per_review,
+        .movement_min_q24 = movement_min_q24(settings),
         .stages = settings->stages,
     };
 }
@@ -53,11 +69,18 @@ static uint32_t rounding_q4(const moving_load_parameters_t *parameters, uint32_t
     return (8u << parameters->encoder_shift) / (counts / 2 + 1);
 }
 
-/* Hold after a trend; a trend that interrupts the release doubles it. */
-static uint32_t hold_ticks(const moving_load_parameters_t *parameters, const moving_load_t *moving) {
-    const uint32_t ticks = moving->withheld == parameters->stages ? moving->hold_ticks : 2 * moving->hold_ticks;
-    return (uint32_t)fixed_clamp((int32_t)ticks, (int32_t)parameters->hold_ticks_min,
-                                 (int32_t)parameters->hold_ticks_max);
+/* A trend soon after the release of the first stage doubles the hold. */
+static void withhold(const moving_load_parameters_t *parameters, moving_load_t *moving) {
+    uint32_t hold_ticks = moving->hold_ticks;
+    if (moving->withheld < parameters->stages) {
+        hold_ticks *= 2;
+        moving->own_ripple |= hold_ticks > parameters->hold_ticks_min && moving->still == parameters->still_reviews;
+        moving->settling = parameters->release_ticks;
+    }
+    moving->hold_ticks = (uint32_t)fixed_clamp((int32_t)hold_ticks, (int32_t)parameters->hold_ticks_min,
+                                               (int32_t)parameters->hold_ticks_max);
+    moving->withheld = parameters->stages;
+    moving->ticks = moving->hold_ticks;
 }
 
 uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
@@ -69,20 +92,16 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
         moving->blocked--;
         return 0;
     }
-    const uint32_t threshold_q4 =
+    const uint32_t base_q4 =
         from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4(parameters, angle_step);
+    const uint32_t threshold_q4 = moving->own_ripple ? RIPPLE_FACTOR * base_q4 : base_q4;
     const uint32_t magnitude_q4 = (uint32_t)fixed_abs(trend_q4);
     moving->settling -= moving->settling > 0;
     if (magnitude_q4 > parameters->implausible_q4 && moving->withheld > 0 && moving->settling == 0) {
         moving->withheld = 0;
         moving->blocked = parameters->blocked_ticks;
     } else if (magnitude_q4 > threshold_q4) {
-        moving->hold_ticks = hold_ticks(parameters, moving);
-        if (moving->withheld < parameters->stages) {
-            moving->settling = parameters->release_ticks;
-        }
-        moving->withheld = parameters->stages;
-        moving->ticks = moving->hold_ticks;
+        withhold(parameters, moving);
     } else if (moving->ticks > 0) {
         moving->ticks -= !hold;
     } else if (moving->withheld > 0) {
@@ -93,4 +112,20 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
         moving->ticks = moving->hold_ticks;
     }
     return moving->withheld;
+}
+
+void moving_load_review(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t load_torque_q24,
+                        bool hold) {
+    moving->load_min_q24 = load_torque_q24 < moving->load_min_q24 ? load_torque_q24 : moving->load_min_q24;
+    moving->load_max_q24 = load_torque_q24 > moving->load_max_q24 ? load_torque_q24 : moving->load_max_q24;
+    if (fixed_subtract(moving->load_max_q24, moving->load_min_q24) >= parameters->movement_min_q24) {
+        moving->load_min_q24 = moving->load_max_q24 = load_torque_q24;
+        moving->still = 0;
+        moving->own_ripple = false;
+    } else if (moving->still < parameters->still_reviews) {
+        moving->still++;
+    } else if (moving->withheld == parameters->stages && !hold &&
+               moving->hold_ticks - moving->ticks >= parameters->hold_ticks_min) {
+        moving->ticks = 0;
+    }
 }

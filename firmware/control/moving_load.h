@@ -15,6 +15,13 @@
  * wrong that the wide bandwidth itself makes the speed swing. Nothing is withheld then for a second. Within the 5 ms
  * after the bandwidth has widened the trend may still be that of the narrow one, at which a load causes a larger trend.
  *
+ * The ripple of the drive itself has a trend as well, which a light rotor or a slow one shows. The wide bandwidth then
+ * only adds noise, of J w0^2 count / 4 to the estimate, and ripple. The load has moved when the range of the estimate
+ * since the last movement exceeds that noise and 1/64 of the largest torque together. While it has not for 0.5 s,
+ * a hold ends after 25 ms; a trend soon after a release then is ripple, and has three times the threshold until the
+ * load moves. More would let the innovation of that ripple reach the count at which observer_bandwidth.h takes it for a
+ * load step.
+ *
  * Rounding to counts leaves up to 1/40 of a count of it as noise. A trend of 1/8 count withholds the last stages of the
  * bandwidth's decay, so that the observer follows the load. They are released 25 ms after the last such trend, one each
  * 5 ms; when a trend interrupts the release, after twice the time before, up to 0.8 s. The values are found by trial: a
@@ -36,22 +43,28 @@ typedef struct {
     uint32_t hold_ticks_min;     /* 25 ms, periods */
     uint32_t hold_ticks_max;     /* 0.8 s */
     uint32_t release_ticks;      /* 5 ms */
+    uint32_t still_reviews;      /* 0.5 s */
+    int32_t movement_min_q24;    /* range of the load's estimate, N m, Q7.24 */
     uint32_t stages;             /* to withhold; 0: no detection */
 } moving_load_parameters_t;
 
 /* All zero at the start. */
 typedef struct {
-    int64_t trend_q36;   /* low-pass of the innovation, 2^-32 rev, Q27.36 */
-    uint32_t hold_ticks; /* next hold, periods; 0: the shortest */
-    uint32_t ticks;      /* until the next release */
-    uint32_t blocked;    /* periods in which nothing is withheld */
-    uint32_t settling;   /* periods in which the trend may be that of a narrower bandwidth */
-    uint32_t withheld;   /* stages */
+    int64_t trend_q36;                  /* low-pass of the innovation, 2^-32 rev, Q27.36 */
+    uint32_t hold_ticks;                /* next hold, periods; 0: the shortest */
+    uint32_t ticks;                     /* until the next release */
+    uint32_t blocked;                   /* periods in which nothing is withheld */
+    uint32_t settling;                  /* periods in which the trend may be that of a narrower bandwidth */
+    uint32_t withheld;                  /* stages */
+    bool own_ripple;                    /* the threshold is three times its base value */
+    uint32_t still;                     /* reviews since the last movement, up to still_reviews */
+    int32_t load_min_q24, load_max_q24; /* since the last movement, N m, Q7.24 */
 } moving_load_t;
 
 typedef struct {
     unsigned encoder_bits; /* 8..32 */
     uint32_t control_rate_hz;
+    uint32_t periods_per_review;
     uint32_t stages;          /* to withhold */
     uint32_t bandwidth_rad_s; /* of the observer then, from 100 */
     int32_t inertia_q30;      /* kg m^2, Q1.30 */
@@ -65,5 +78,10 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
  * stays withheld. 64-bit product, rounded down. */
 uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
                           uint32_t angle_step, bool from_edge, bool hold);
+
+/* Each periods_per_review: whether the load still moves, from the estimate of the observer in N m, Q7.24; hold: what is
+ * withheld stays withheld. */
+void moving_load_review(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t load_torque_q24,
+                        bool hold);
 
 #endif

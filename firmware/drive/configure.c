@@ -300,6 +300,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     control.moving_load = moving_load_configure(&(moving_load_settings_t){
         .encoder_bits = encoder_bits,
         .control_rate_hz = control_rate_hz,
+        .periods_per_review = DEFERRED_SLOW_PERIODS,
         .stages = OBSERVER_BANDWIDTH_STAGES - 1u - control.bandwidth.moving_stage,
         .bandwidth_rad_s = control.bandwidth.bandwidth_rad_s[control.bandwidth.moving_stage],
         .inertia_q30 = inertia_q30,

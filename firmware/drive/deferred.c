@@ -201,6 +201,8 @@ static void take_turns(const control_parameters_t *parameters, deferred_t *defer
         learn_periodic_load(parameters, deferred, input);
         break;
     case 2:
+        moving_load_review(&parameters->moving_load, &deferred->moving_load, input->load_torque_q24,
+                           deferred->periodic_load.engaged);
         learn_common_misalignment(parameters, deferred, input);
         break;
     default:

@@ -14,7 +14,7 @@ extern "C" {
 namespace {
 
 using namespace fixed_point;
-constexpr unsigned ENCODER_BITS = 17, STAGES = 9;
+constexpr unsigned ENCODER_BITS = 17, STAGES = 9, PERIODS_PER_REVIEW = 4;
 constexpr int32_t COUNT = 1 << (32 - ENCODER_BITS);
 constexpr uint32_t RATE_HZ = 40000;
 constexpr uint32_t FAST = 8 * COUNT; // rotation per period
@@ -22,6 +22,7 @@ constexpr uint32_t FAST = 8 * COUNT; // rotation per period
 moving_load_settings_t settings(unsigned encoder_bits = ENCODER_BITS, uint32_t rate_hz = RATE_HZ) {
     return {.encoder_bits = encoder_bits,
             .control_rate_hz = rate_hz,
+            .periods_per_review = PERIODS_PER_REVIEW,
             .stages = STAGES,
             .bandwidth_rad_s = 1700,
             .inertia_q30 = to_fixed(0.02, Q30),
@@ -33,6 +34,10 @@ class Detector {
     explicit Detector(const moving_load_settings_t &of = settings()) : parameters(moving_load_configure(&of)) {}
 
     uint32_t step(int32_t innovation, uint32_t angle_step = FAST, bool from_edge = false, bool hold = false) {
+        if (++periods % PERIODS_PER_REVIEW == 0) {
+            load_torque_q24 = range_q24 - load_torque_q24; // a movement
+            moving_load_review(&parameters, &state, load_torque_q24, hold);
+        }
         return moving_load_step(&parameters, &state, innovation, angle_step, from_edge, hold);
     }
     // Longest sequence of samples with withheld stages.
@@ -46,7 +51,22 @@ class Detector {
 
     moving_load_parameters_t parameters;
     moving_load_t state{};
+    int32_t range_q24 = to_fixed(10.0, Q24); // of the load's estimate
+
+  private:
+    uint32_t periods = 0;
+    int32_t load_torque_q24 = 0;
 };
+
+// A trend whenever stages are released: for that long something is withheld, as a part of the time.
+double withheld_part(Detector *detector, double time_s, int32_t innovation) {
+    const auto samples = uint32_t(time_s * RATE_HZ);
+    uint32_t withheld = 0;
+    for (uint32_t k = 0; k < samples; k++) {
+        withheld += detector->step(detector->state.withheld < STAGES ? innovation : 0) > 0;
+    }
+    return double(withheld) / samples;
+}
 
 TEST(MovingLoad, a_constant_innovation_of_a_seventh_of_a_count_withholds_and_of_a_ninth_does_not) {
     for (const int32_t sign : {1, -1}) {
@@ -117,6 +137,57 @@ TEST(MovingLoad, hold_keeps_what_is_withheld_and_withholds_nothing_itself) {
         ASSERT_EQ(moving.step(0, FAST, false, true), STAGES);
     }
     EXPECT_LT(moving.run(RATE_HZ, 0), RATE_HZ / 5) << "released without it";
+}
+
+// J w^2 count / 4 + 1/64 of the largest torque: 0.692 N m + 0.298 N m.
+const double RANGE_MIN_NM = 0.02 * 1700.0 * 1700.0 * 2.0 * PI / std::ldexp(4.0, ENCODER_BITS) + 19.1 / 64.0;
+
+TEST(MovingLoad, a_repeated_trend_of_a_load_that_does_not_move_is_not_followed_any_more) {
+    for (const double range : {0.0, 0.97, 1.03, 3.0}) {
+        Detector detector;
+        detector.range_q24 = to_fixed(range * RANGE_MIN_NM, Q24);
+        withheld_part(&detector, 2.0, COUNT / 7);
+        EXPECT_EQ(withheld_part(&detector, 10.0, COUNT / 7), range > 1.0 ? 1.0 : 0.0) << range;
+    }
+}
+
+TEST(MovingLoad, a_single_trend_leaves_the_threshold) {
+    Detector detector;
+    detector.range_q24 = 0;
+    for (int repeat = 0; repeat < 10; repeat++) {
+        EXPECT_GT(detector.run(RATE_HZ / 50, COUNT / 7), 0u) << repeat;
+        detector.run(RATE_HZ, 0);
+    }
+}
+
+TEST(MovingLoad, a_movement_restores_the_threshold) {
+    Detector detector;
+    detector.range_q24 = 0;
+    withheld_part(&detector, 2.0, COUNT / 4);
+    ASSERT_EQ(withheld_part(&detector, 1.0, COUNT / 4), 0.0);
+    detector.range_q24 = to_fixed(2.0, Q24);
+    detector.run(RATE_HZ / 2, 0);
+    EXPECT_GT(withheld_part(&detector, 1.0, COUNT / 7), 0.95);
+}
+
+TEST(MovingLoad, a_slow_movement_is_followed) {
+    // 4 N m/s: 0.4 of the range in 100 ms.
+    Detector detector;
+    double withheld = 0.0;
+    for (int k = 0; k < 100; k++) {
+        detector.range_q24 = to_fixed(0.4 * k, Q24);
+        withheld += withheld_part(&detector, 0.1, 2 * COUNT / 7) / 100.0;
+    }
+    EXPECT_GT(withheld, 0.95);
+}
+
+TEST(MovingLoad, the_threshold_of_ripple_is_three_eighths_of_a_count) {
+    for (const double counts : {0.37, 0.41}) {
+        Detector detector;
+        detector.range_q24 = 0;
+        withheld_part(&detector, 2.0, COUNT / 4);
+        EXPECT_EQ(withheld_part(&detector, 3.0, int32_t(counts * COUNT)) > 0.5, counts > 0.4) << counts;
+    }
 }
 
 TEST(MovingLoad, a_trend_that_no_load_causes_blocks_for_a_second) {
