@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from salient.experiments.compare import random_cases, range_cases
+from salient.experiments.compare import every_machine, random_cases, range_cases
 from salient.experiments.compare.case import MACHINES, MAGNETICS
 from salient.experiments.compare.cases import ANGLES, COMPRESSORS
 from salient.experiments.compare.metrics import (
@@ -201,5 +201,9 @@ def _robustness() -> dict[Key, Target]:
         for row, limit in load_limits.items()}
 
 
+def _machines() -> dict[Key, Target]:
+    return {("machines", name, "ripple_to_allowed", ""): Target(1.0) for name in every_machine.names()}
+
+
 TARGETS: dict[Key, Target] = {**_ripples(), **_starts(), **_dips(), **_moving_loads(), **_compressors(),
-                              **_paper_conditions(), **_ranges(), **_robustness()}
+                              **_paper_conditions(), **_ranges(), **_robustness(), **_machines()}
