@@ -49,20 +49,11 @@ def machine_files(quick: bool) -> list[Path]:
     RANDOM.mkdir(parents=True, exist_ok=True)
     files = sorted(EXAMPLES.glob("*.toml"))
     for number in range(COUNT):
-        path, text = RANDOM / f"{_random_name(number)}.toml", random_machine(number)
+        path, text = RANDOM / f"random_{number:02}.toml", random_machine(number)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
         files.append(path)
     return files
-
-
-def names() -> list[str]:
-    """Of all machines, those of the random ones without their files."""
-    return [*sorted(path.stem for path in EXAMPLES.glob("*.toml")), *map(_random_name, range(COUNT))]
-
-
-def _random_name(number: int) -> str:
-    return f"random_{number:02}"
 
 
 def scenarios(quick: bool) -> Iterator[Scenario]:

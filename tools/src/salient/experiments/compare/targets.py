@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from salient.experiments.compare import every_machine, random_cases, range_cases
+from salient.experiments.compare import random_cases, range_cases
 from salient.experiments.compare.case import MACHINES, MAGNETICS
 from salient.experiments.compare.cases import ANGLES, COMPRESSORS
 from salient.experiments.compare.metrics import (
@@ -201,9 +201,13 @@ def _robustness() -> dict[Key, Target]:
         for row, limit in load_limits.items()}
 
 
-def _machines() -> dict[Key, Target]:
-    return {("machines", name, "ripple_to_allowed", ""): Target(1.0) for name in every_machine.names()}
-
-
 TARGETS: dict[Key, Target] = {**_ripples(), **_starts(), **_dips(), **_moving_loads(), **_compressors(),
-                              **_paper_conditions(), **_ranges(), **_robustness(), **_machines()}
+                              **_paper_conditions(), **_ranges(), **_robustness()}
+_EVERY_CONDITION = {("machines", "ripple_to_allowed", ""): Target(1.0)}
+"""By group, metric and statistic: conditions are machines, also of the user."""
+
+
+def target_of(key: Key) -> Target:
+    """The reference values of a row, none for most."""
+    group, _, metric, statistic = key
+    return TARGETS.get(key) or _EVERY_CONDITION.get((group, metric, statistic), Target())
