@@ -96,7 +96,7 @@ def test_current_range_is_at_a_power_of_two_of_80_A_wherever_the_trip_has_room(t
         machine = load_machine(path)
         data = derive(machine)
         margin_A = 2.2 * rise_A(machine, data)
-        least_A = 1.06 * data.current_peak_A + margin_A
+        least_A = 1.04 * data.current_peak_A + margin_A
         most_A = max(1.5 * data.current_peak_A, 1.1 * data.current_peak_A + margin_A)
         assert least_A <= 1.0001 * data.current_trip_A <= 1.0002 * most_A
         assert data.current_trip_A <= 0.9876 * data.adc_current_A
