@@ -15,7 +15,8 @@ from salient.experiments.compare.machine import cases_of, subject
 from salient.experiments.compare.random_machines import COUNT, random_machine
 from salient.experiments.scaled import scale_of_name, scaled, steady_window_s
 from salient.experiments.scenario import load_scenarios
-from salient.machine.drive_data import DERIVED, derive
+from salient.machine.definition import Machine
+from salient.machine.drive_data import DERIVED, DriveData, derive
 from salient.machine.file import load_machine
 from salient.machine.parameter_table import read_table
 from salient.machine.torque_speed import Source, smooth_torque_Nm, speed_change_s, torque_over_speed
@@ -79,6 +80,43 @@ def test_every_value_is_finite_and_in_order(path):
                              machine.inertia_kg_m2, machine.friction_Nm_s, 0.0, 0.4 * base_rad_s)
     least_s = machine.inertia_kg_m2 * 0.4 * base_rad_s / data.torque_peak_Nm
     assert least_s <= bound_s < 1.5 * least_s + 2e-3
+
+
+def rise_A(machine: Machine, data: DriveData) -> float:
+    """Of the current in a control period by the largest voltage at the unaligned position."""
+    return data.supply_max_V / machine.magnetics.unaligned_inductance_H / data.control_rate_hz
+
+
+def test_current_range_is_at_a_power_of_two_of_80_A_wherever_the_trip_has_room(tmp_path):
+    files = [*OTHERS, *(tmp_path / f"random_{number:02}.toml" for number in range(COUNT))]
+    lowered = []
+    for number in range(COUNT):
+        files[len(OTHERS) + number].write_text(random_machine(number))
+    for path in files:
+        machine = load_machine(path)
+        data = derive(machine)
+        margin_A = 2.2 * rise_A(machine, data)
+        least_A = 1.04 * data.current_peak_A + margin_A
+        most_A = max(1.5 * data.current_peak_A, 1.1 * data.current_peak_A + margin_A)
+        assert least_A <= 1.0001 * data.current_trip_A <= 1.0002 * most_A
+        assert data.current_trip_A <= 0.9876 * data.adc_current_A
+        exponent = math.floor(math.log2(most_A / 0.9375 / 80.0))
+        if max(least_A / 0.9875, data.current_peak_A / 0.9) <= 80.0 * 2.0**exponent:
+            assert data.adc_current_A == 80.0 * 2.0**exponent
+            lowered.append(path.stem)
+        else:
+            assert data.adc_current_A == pytest.approx(most_A / 0.9375)
+            assert data.current_trip_A == pytest.approx(most_A)
+    assert {"fan12", "servo86", "random_19"} <= set(lowered) and len(lowered) < len(files) / 2
+
+
+@pytest.mark.parametrize("stated", ["current_trip_A = 93.0", "current_limit_A = 85.0"])
+def test_trip_or_limit_that_the_file_states_stays_within_the_current_range(tmp_path, stated):
+    path = tmp_path / "stated.toml"
+    path.write_text(f"{(every_machine.EXAMPLES / 'servo86.toml').read_text()}\n[drive.parameters]\n{stated}\n")
+    data = derive(load_machine(path))
+    assert data.parameters[stated.split()[0]] == float(stated.split()[2])
+    assert data.adc_current_A == pytest.approx(99.4, rel=0.01)
 
 
 def test_random_machines_are_valid_and_have_an_experiment(tmp_path):

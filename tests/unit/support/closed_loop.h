@@ -8,6 +8,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <map>
+#include <numeric>
 #include <vector>
 
 extern "C" {
@@ -30,6 +31,8 @@ struct setup_t {
     double rotor_deg = 0.0;
     std::map<parameter_index_t, double> parameters; // other than default, in their units
     plant_gains_t plant{1.0, 1.0, 1.0, 1.0};
+    const machine_t *machine = &machine_plant;
+    reference_model::units_t units = reference_model::units_of(machine_tables);
 
     control_parameters_t configured() const {
         parameters_t values;
@@ -88,8 +91,8 @@ struct reference_drive_t {
 
   private:
     reference_drive_t(const setup_t &setup, const control_parameters_t &p)
-        : model(p, machine_plant, setup.rate_hz), phases(machine_plant.phases), interleaved_pwm(p.interleaved_pwm),
-          period_ticks(p.period_ticks) {}
+        : model(p, *setup.machine, setup.units, setup.rate_hz), phases(setup.machine->phases),
+          interleaved_pwm(p.interleaved_pwm), period_ticks(p.period_ticks) {}
 };
 
 // Ground truth, one value per microsecond from first_us on.
@@ -102,13 +105,8 @@ struct trace_t {
         return std::min(size_t(us > first_us ? us - first_us : 0), torque_Nm.size());
     }
 
-    double mean_torque_Nm(double from_s, double to_s) const {
-        double sum = 0.0;
-        for (size_t i = index(from_s); i < index(to_s); i++) {
-            sum += torque_Nm[i];
-        }
-        return sum / double(index(to_s) - index(from_s));
-    }
+    double mean_torque_Nm(double from_s, double to_s) const { return mean(torque_Nm, from_s, to_s); }
+    double mean_speed_rad_s(double from_s, double to_s) const { return mean(speed_rad_s, from_s, to_s); }
 
     // (maximum - minimum) / mean.
     double ripple(double from_s, double to_s) const {
@@ -133,14 +131,21 @@ struct trace_t {
     double max_speed(double from_s, double to_s) const {
         return *std::max_element(speed_rad_s.begin() + long(index(from_s)), speed_rad_s.begin() + long(index(to_s)));
     }
+
+  private:
+    double mean(const std::vector<double> &values, double from_s, double to_s) const {
+        const auto first = values.begin() + long(index(from_s)), last = values.begin() + long(index(to_s));
+        return std::accumulate(first, last, 0.0) / double(last - first);
+    }
 };
 
 template <typename drive_t> class Bench {
   public:
-    explicit Bench(const setup_t &setup) : drive(setup), rate_hz(setup.rate_hz) {
-        plant_init(&plant, &machine_plant, setup.rotor_deg * fixed_point::PI / 180.0);
+    explicit Bench(const setup_t &setup)
+        : drive(setup), rate_hz(setup.rate_hz), speed_unit_rad_s(setup.units.speed_rad_s) {
+        plant_init(&plant, setup.machine, setup.rotor_deg * fixed_point::PI / 180.0);
         plant_set_gains(&plant, &setup.plant);
-        sensors_init(&sensors, &machine_plant.sensors, setup.encoder_bits, setup.adc_bits, 1);
+        sensors_init(&sensors, &setup.machine->sensors, setup.encoder_bits, setup.adc_bits, 1);
         sensors.encoder_edges = setup.edges;
         restart_trace();
     }
@@ -148,7 +153,8 @@ template <typename drive_t> class Bench {
     // Copies state and continues independently; the trace starts empty.
     Bench(const Bench &other)
         : plant(other.plant), sensors(other.sensors), drive(other.drive), reference_rpm(other.reference_rpm),
-          running(other.running), rate_hz(other.rate_hz), buffered(other.buffered) {
+          running(other.running), rate_hz(other.rate_hz), speed_unit_rad_s(other.speed_unit_rad_s),
+          buffered(other.buffered) {
         restart_trace();
     }
     Bench &operator=(const Bench &) = delete;
@@ -165,7 +171,8 @@ template <typename drive_t> class Bench {
             sample.time_us = uint32_t(plant.time_ns / 1000);
             const command_t command = {
                 .request = plant.time_ns > 1100000 ? COMMAND_RUN : COMMAND_OFF, // after the initialisation
-                .speed_reference_q22 = fixed_point::to_fixed(fixed_point::rad_s(reference_rpm), fixed_point::Q22),
+                .speed_reference_q22 =
+                    fixed_point::to_fixed(fixed_point::rad_s(reference_rpm) / speed_unit_rad_s, fixed_point::Q22),
                 .time_us = sample.time_us,
             };
             plant_set_switches(&plant, &buffered, ticks);
@@ -195,6 +202,7 @@ template <typename drive_t> class Bench {
 
   private:
     uint32_t rate_hz;
+    double speed_unit_rad_s;
     hal_pwm_compare_t buffered{};
 
     static void observe(void *context, const plant_t *plant) {

@@ -67,16 +67,19 @@ struct observer_t {
         return difference - std::round(difference);
     }
 
-    static observer_t ideal(double bandwidth_rad_s, double rate_hz, double inertia_kg_m2, double friction_Nm_s) {
+    // speed_unit_rad_s: unit of the speed, and with that of the torque of inertia and friction.
+    static observer_t ideal(double bandwidth_rad_s, double rate_hz, double inertia_kg_m2, double friction_Nm_s,
+                            double speed_unit_rad_s = 1.0) {
+        const double revolution = 2.0 * PI / speed_unit_rad_s; // speed times seconds
         const double q = std::exp(-bandwidth_rad_s / rate_hz);
         const double p = 1.0 - q;
         observer_t observer{};
         observer.angle_gain = 1.0 - q * q * q;
-        observer.speed_gain = 1.5 * p * p * (1.0 + q) * rate_hz * 2.0 * PI;
-        observer.torque_gain = inertia_kg_m2 * p * p * p * rate_hz * rate_hz * 2.0 * PI;
+        observer.speed_gain = 1.5 * p * p * (1.0 + q) * rate_hz * revolution;
+        observer.torque_gain = inertia_kg_m2 * p * p * p * rate_hz * rate_hz * revolution;
         observer.acceleration = 1.0 / (inertia_kg_m2 * rate_hz);
         observer.friction = friction_Nm_s;
-        observer.angle_step = 1.0 / (2.0 * PI * rate_hz);
+        observer.angle_step = 1.0 / (revolution * rate_hz);
         return observer;
     }
 

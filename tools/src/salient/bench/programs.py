@@ -25,6 +25,7 @@ from salient.paths import BUILD, MACHINES, ROOT
 _BUILDERS = {"host": "any tools/salient command",
              "debug": "cmake --preset debug && cmake --build --preset debug"}
 _TESTS = "tools/salient test"
+_REFERENCE = "salient_reference"
 
 
 class EmulatorError(Exception):
@@ -37,6 +38,11 @@ def executable(build: str = "host") -> Path:
     if build in TARGET_BUILDS:
         return _built("host", "salient_target")
     return _built(build, "salient_host")
+
+
+def reference_executable() -> Path:
+    """The program that runs a machine with the reference model of the controller. UsageError: it is not built."""
+    return _built("host", _REFERENCE)
 
 
 def image(machine: str, build: str) -> Path:
@@ -79,7 +85,8 @@ def command_line(config: BenchConfig) -> list[str]:
 def _built(build: str, name: str) -> Path:
     program = BUILD / build / "bin" / name
     if not program.exists():
-        raise UsageError(f"{program.relative_to(ROOT)} is not built; {_BUILDERS.get(build, _TESTS)} builds it")
+        builder = "tools/salient compare" if name == _REFERENCE else _BUILDERS.get(build, _TESTS)
+        raise UsageError(f"{program.relative_to(ROOT)} is not built; {builder} builds it")
     return program
 
 

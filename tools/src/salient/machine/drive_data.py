@@ -36,6 +36,8 @@ KNEELESS_SPEED_RPM = 1500.0
 SMOOTH_SHARE = 0.8
 """Part of the torque of the tables that is left when currents rise and fall with finite voltage."""
 PEAK_OF_RATED = 1.2
+CURRENT_RANGE_A = 80.0
+"""Largest current of the firmware's tables, in the machine's unit of current, a power of two."""
 _CURRENT_SEARCHED_A = 10_000.0
 _RPM = 30.0 / math.pi
 
@@ -158,9 +160,9 @@ def _derive_ratings(machine: Machine, data: _Values) -> None:
     data.add("thermal_time_constant_s", "s", 60.0, "that of a winding without forced cooling", DEFAULT)
 
     rise_A = maximum_V / magnetics.unaligned_inductance_H / rate_hz
-    data.add("adc_current_A", "A",
-             max(1.5 * peak_A, 1.1 * peak_A + 2.2 * rise_A) / 0.9375,
-             "16/15 max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu)")
+    data.add("adc_current_A", "A", _current_range_A(machine, peak_A, rise_A),
+             "16/15 max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), or 80 A times a power of two below it "
+             "that has room for 80/79 (1.04 current_peak_A + 2.2 V Ts / Lu) and 10/9 current_peak_A")
     over_V, _ = _over_voltage(machine, maximum_V)
     data.add("adc_voltage_V", "V", 1.25 * over_V, "1.25 bus_over_voltage_V")
     data.add("torque_step_Nm", "N m",
@@ -188,6 +190,21 @@ def _peak_current(machine: Machine, given: dict[str, Any]) -> tuple[float, str]:
     flux_Wb = machine.supply_voltage_V * 60.0 / (2.0 * machine.rotor_poles * KNEELESS_SPEED_RPM)
     return flux_Wb / aligned_H, ("without saturation: the supply builds up the aligned flux linkage in half an "
                                  f"electrical revolution at {KNEELESS_SPEED_RPM:g} r/min")
+
+
+def _current_range_A(machine: Machine, peak_A: float, rise_A: float) -> float:
+    """Full scale of the current sensors. The tables' columns are as far apart for one of 41 A as for one of 80 A: less
+    headroom halves their distance, and the errors of interpolation between them become a quarter."""
+    wanted_A = max(1.5 * peak_A, 1.1 * peak_A + 2.2 * rise_A) / 0.9375
+    below_A = math.ldexp(CURRENT_RANGE_A, math.floor(math.log2(wanted_A / CURRENT_RANGE_A)))
+    given = machine.drive_parameters
+    trip_A = given.get("current_trip_A", _least_trip_A(max(peak_A, given.get("current_limit_A", 0.0)), rise_A))
+    return below_A if max(trip_A / 0.9875, peak_A / 0.9) <= below_A else wanted_A
+
+
+def _least_trip_A(limit_A: float, rise_A: float) -> float:
+    """Hysteresis exceeds its limit by up to 2.4 periods of rise, measured on machines of all sizes."""
+    return 1.04 * limit_A + 2.2 * rise_A
 
 
 def _base_speed_rpm(machine: Machine, voltage_V: float, current_A: float) -> float:
@@ -228,7 +245,9 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
     peak_A, peak_Nm, rated_Nm = data["current_peak_A"], data["torque_peak_Nm"], data["torque_rated_Nm"]
     period_s, inertia = 1.0 / data["control_rate_hz"], machine.inertia_kg_m2
     rise_A = data["supply_max_V"] / machine.magnetics.unaligned_inductance_H * period_s
-    step_Nm = data["torque_step_Nm"]
+    adc_A, step_Nm = data["adc_current_A"], data["torque_step_Nm"]
+    trip_A = min(max(0.9375 * adc_A, min(_least_trip_A(peak_A, rise_A), 0.9875 * adc_A)),
+                 max(1.5 * peak_A, 1.1 * peak_A + 2.2 * rise_A))
     # The gains of the BP-PID are those at 40 kHz.
     step_40_kHz_Nm = step_Nm / period_s / 40_000.0
     base_rad_s = data["speed_base_rpm"] / _RPM
@@ -239,9 +258,9 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
     return {
         "torque_max_Nm": (peak_Nm, "torque_peak_Nm"),
         "current_limit_A": (peak_A, "current_peak_A"),
-        "current_trip_A": (min(0.9375 * data["adc_current_A"], max(1.5 * peak_A, 1.1 * peak_A + 2.2 * rise_A)),
+        "current_trip_A": (trip_A,
                            "max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), at most 15/16 of "
-                           "adc_current_A"),
+                           "adc_current_A, or up to 79/80 of it for at least 1.04 current_peak_A + 2.2 V Ts / Lu"),
         "bus_over_voltage_V": (over_V, over_V_formula),
         "bus_under_voltage_V": (0.625 * data["supply_min_V"], "0.625 supply_min_V"),
         "over_speed_rpm": (1.2 * data["speed_max_rpm"], "1.2 speed_max_rpm"),

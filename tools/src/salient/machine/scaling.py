@@ -30,13 +30,14 @@ from functools import lru_cache
 import cantools
 from cantools.database.can import Database
 
-from salient.machine.drive_data import SAMPLES_PER_TURN_MIN, DriveData, derive
+from salient.machine.drive_data import CURRENT_RANGE_A, SAMPLES_PER_TURN_MIN, DriveData, derive
 from salient.machine.file import Machine, MachineError
 from salient.machine.parameter_table import ParameterDefinition, read_table
 from salient.paths import DRIVE_DBC
 
-CURRENT_RANGE_A, VOLTAGE_RANGE_V, LOAD_TORQUE_RANGE_NM = 80.0, 512.0, 64.0
-"""Full scales of the sensors in units of the machine, at most; that of the torque transducer always."""
+VOLTAGE_RANGE_V, LOAD_TORQUE_RANGE_NM = 512.0, 64.0
+"""As CURRENT_RANGE_A, full scales of the sensors in units of the machine, at most; that of the torque transducer
+always."""
 FLUX_LINKAGE_RANGE_WB, TORQUE_RANGE_NM, SPEED_RANGE_RPM = 4.0, 40.0, 4800.0
 FLUX_LINKAGE_MORE = 2
 SPEED_EXPONENT_MAX = 3

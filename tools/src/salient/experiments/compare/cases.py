@@ -316,7 +316,8 @@ GROUPS: dict[str, Group] = {
 GROUPS["machines"] = Group(
     "machines of all sizes: start to 0.4 of the base speed, half of the rated torque at a quarter of it, reversal",
     _machines, (("start_to_bound", ""), ("brake_to_bound", ""), ("reverse_to_bound", ""), ("late_s", ""),
-                ("dip_percent", ""), ("recovery_time_s", ""), ("hold_percent", ""), ("ripple", "")), long=True)
+                ("dip_percent", ""), ("recovery_time_s", ""), ("hold_percent", ""), ("ripple", ""),
+                ("ripple_reference", ""), ("ripple_to_allowed", "")), long=True)
 TITLES = {name: group.title for name, group in GROUPS.items()}
 
 

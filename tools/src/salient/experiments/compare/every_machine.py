@@ -2,7 +2,8 @@
 
 A run starts to 0.4 of the base speed, takes half of the rated torque at a quarter of it, and with `salient` brakes to
 that speed before and reverses after. The start, the braking and the reversal are compared with what torque limit,
-inertia and voltage permit (machine/torque_speed.py).
+inertia and voltage permit (machine/torque_speed.py), the torque ripple of `salient` under the load with that of its
+reference model (compare/reference.py).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 from salient.config import CONDITIONS, CONTROLLERS
 from salient.experiments import metrics
+from salient.experiments.compare import reference
 from salient.experiments.compare.random_machines import COUNT, random_machine
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 from salient.machine.definition import Machine
@@ -32,6 +34,8 @@ START_PART, LOADED_PART, LOAD_PART = 0.4, 0.25, 0.5
 """Of base speed and rated torque."""
 BOUND_FACTOR, BOUND_EXTRA_S = 1.1, 0.002
 """A change of speed is in time within this factor of its bound, or the bound and this time."""
+RIPPLE_MAX, RIPPLE_OF_REFERENCE = 0.010, 1.2
+"""The torque ripple is at most the first, or this multiple of the reference model's."""
 _SETTLED_S, _LOADED_S, _UNLOADED_S = 0.06, 0.15, 0.05
 _RPM = 30.0 / math.pi
 
@@ -119,8 +123,27 @@ def extract(scenario: Scenario, recording: np.ndarray) -> Metrics:
     values["dip_percent"] = 100.0 * max(0.0, dip_rpm) / held_rpm
     values["recovery_time_s"] = metrics.time_to_stay_in_band_s(time_s[loaded], speed_rpm[loaded], held_rpm, load_s)
     values["hold_percent"] = 100.0 * abs(float(np.mean(speed_rpm[held], dtype=float)) / held_rpm - 1.0)
-    values["ripple"] = metrics.torque_metrics(time_s, recording["torque_Nm"], window_s)["torque_ripple"]
+    ripple = metrics.torque_metrics(time_s, recording["torque_Nm"], window_s)["torque_ripple"]
+    values["ripple"] = ripple
+    if scenario.controller == "salient":
+        of_reference = ripples(scenario)["reference"]
+        values["ripple_reference"] = of_reference
+        values["ripple_to_allowed"] = ripple / max(RIPPLE_MAX, RIPPLE_OF_REFERENCE * of_reference)
     return values
+
+
+def ripples(scenario: Scenario) -> dict[str, float]:
+    """Torque ripple of the firmware and of its reference model, by reference.DRIVES, under the load of a run of
+    `salient`, from a start to the speed under load on."""
+    machine = load_machine(machine_path(scenario.machine))
+    braking, load = scenario.speed[1], scenario.load[0]
+    load_s = load.at_s - braking.at_s
+    measured = reference.measure(
+        scenario.machine, control_rate_hz=scenario.control_rate_hz, encoder_bits=scenario.encoder_bits,
+        encoder_edges=scenario.encoder_edges, adc_bits=scenario.adc_bits, speed_rpm=braking.value_rpm,
+        load_Nm=load.torque_Nm, load_at_s=load_s, from_s=load_s + _LOADED_S,
+        window_s=_window_s(machine, braking.value_rpm))
+    return {drive: of["ripple"] for drive, of in measured.items()}
 
 
 @lru_cache(maxsize=256)
@@ -143,4 +166,6 @@ def failures(values: Metrics, controller: str) -> list[str]:
         wrong.append(f"{1e3 * late_s:.1f} ms late")
     if hold_percent is not None and hold_percent > 100.0 * metrics.BAND:
         wrong.append(f"speed under load {hold_percent:.2f} % off")
+    if (values.get("ripple_to_allowed") or 0.0) > 1.0:
+        wrong.append(f"K_t {values['ripple']:.4f}, of the reference model {values['ripple_reference']:.4f}")
     return wrong

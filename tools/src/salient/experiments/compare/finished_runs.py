@@ -8,9 +8,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from salient.bench.programs import executable
+from salient.bench.programs import executable, reference_executable
 from salient.experiments import metrics as run_metrics
-from salient.experiments.compare import every_machine
+from salient.experiments.compare import every_machine, reference
 from salient.experiments.compare import metrics as compare_metrics
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.metrics import Metrics
@@ -18,7 +18,7 @@ from salient.experiments.load_profile import load_profile_path
 from salient.machine.cache import machine_image
 
 NAME = "runs.jsonl"
-METRICS_FILES = tuple(Path(str(module.__file__)) for module in (run_metrics, compare_metrics, every_machine))
+METRICS_FILES = tuple(Path(str(module.__file__)) for module in (run_metrics, compare_metrics, every_machine, reference))
 
 
 class FinishedRuns:
@@ -55,6 +55,7 @@ class FinishedRuns:
         if machine not in self._images:
             self._images[machine] = machine_image(machine)
         files = (executable(), self._images[machine], *METRICS_FILES,
+                 *((reference_executable(),) if case.extractor == "every_machine" else ()),
                  *(() if profile is None else (load_profile_path(profile),)))
         return hashlib.sha256(" ".join([*map(_digest, files), description]).encode()).hexdigest()
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from salient.bench.rig import bench_variables
+from salient.experiments.compare import every_machine
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import DYNAMOMETER_RPM_S, RIPPLE_RPM, STROKE_DEG
 from salient.experiments.metrics import stroke_deg
@@ -54,8 +55,15 @@ def subject(name_or_path: str) -> Subject:
 
 
 def cases_of(cases: Iterable[Case], on: Subject) -> list[Case]:
-    """The cases of the paper's machine among `cases`, for another machine."""
-    return [_case(case, on) for case in cases if case.scenario.machine == PAPER]
+    """The cases of the paper's machine among `cases`, for another machine, and its own run of the group `machines`."""
+    of_paper, sized = [], {}
+    for case in cases:
+        if case.scenario.machine == PAPER:
+            of_paper.append(_case(case, on))
+        elif case.extractor == "every_machine":
+            sized[case.controller] = replace(case, condition=on.machine.name, scenario=every_machine.scenario(
+                machine_path(on.path), case.controller))
+    return [*of_paper, *sized.values()]
 
 
 def _case(case: Case, on: Subject) -> Case:

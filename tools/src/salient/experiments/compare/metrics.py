@@ -77,6 +77,8 @@ class Metric:
 METRICS = {
     "ripple": Metric("K_t over 0.1 s", "", 5, 0.0002),
     "ripple_long": Metric("K_t over 1 s", "", 5, 0.0002),
+    "ripple_reference": Metric("K_t of the reference model", "", 5, 0.0002),
+    "ripple_to_allowed": Metric("K_t", "of 0.010 or 1.2 times that", 3, 0.02),
     "ripple_late": Metric("K_t after 3 s", "", 5, 0.0002),
     "speed_error_percent": Metric("speed error", "%", 3, 0.01),
     "settling_time_s": Metric("settling time to 0.5 %", "s", 5, 0.0001),

@@ -12,7 +12,7 @@ from salient.config import CONTROLLERS
 from salient.experiments.compare.cases import GROUPS, STROKE_DEG, TITLES
 from salient.experiments.compare.metrics import METRICS
 from salient.experiments.compare.runner import RunMetrics
-from salient.experiments.compare.targets import TARGETS, Key, Target
+from salient.experiments.compare.targets import Key, Target, target_of
 
 NEVER = "never"
 
@@ -89,7 +89,7 @@ def _row(key: Key, by_controller: Mapping[str, Sequence[RunMetrics]]) -> Row | N
             values[controller] = _statistic(statistic, samples)
     if not values and len(failed) < len(by_controller):
         return None
-    target = TARGETS.get(key, Target())
+    target = target_of(key)
     return Row(key, values, failed, target, len(by_controller.get(target.controller, ())))
 
 

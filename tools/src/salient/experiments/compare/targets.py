@@ -203,3 +203,11 @@ def _robustness() -> dict[Key, Target]:
 
 TARGETS: dict[Key, Target] = {**_ripples(), **_starts(), **_dips(), **_moving_loads(), **_compressors(),
                               **_paper_conditions(), **_ranges(), **_robustness()}
+_EVERY_CONDITION = {("machines", "ripple_to_allowed", ""): Target(1.0)}
+"""By group, metric and statistic: conditions are machines, also of the user."""
+
+
+def target_of(key: Key) -> Target:
+    """The reference values of a row, none for most."""
+    group, _, metric, statistic = key
+    return TARGETS.get(key) or _EVERY_CONDITION.get((group, metric, statistic), Target())
