@@ -1,15 +1,19 @@
 #include "drive.h"
 
 #include "drive/deferred.h"
+#include "fixed/divide.h"
 #include "hal_encoder.h"
 #include "hal_interrupt.h"
 #include "hal_time.h"
 #include "telemetry_collect.h"
 
+/* Resolution of the processor times in telemetry: 5 ns. */
+#define PROCESSOR_TIME_HZ 200000000
+
 static void configure(drive_t *drive) {
     const control_parameters_t control_parameters =
         configure_control(&drive->parameters, &machine_tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
-                          hal_adc_bits(drive->hal));
+                          hal_adc_bits(drive->hal), hal_pwm_clock_hz(drive->hal));
     hal_critical_enter(drive->hal);
     drive->control_parameters = control_parameters;
     control_prepare(&drive->control_parameters, &drive->control); /* parameters change outside of RUN only */
@@ -18,11 +22,16 @@ static void configure(drive_t *drive) {
 }
 
 bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
-    if (!configure_rate_allowed(config->control_rate_hz) ||
+    const uint32_t clock_hz = hal_pwm_clock_hz(hal);
+    if (!configure_rate_allowed(config->control_rate_hz, clock_hz) ||
         config->control_rate_hz < machine_tables.control_rate_min_hz) {
         return false;
     }
-    *drive = (drive_t){.hal = hal, .control_rate_hz = config->control_rate_hz};
+    *drive = (drive_t){
+        .hal = hal,
+        .control_rate_hz = config->control_rate_hz,
+        .processor_time_q24 = (uint32_t)fixed_divide((int64_t)PROCESSOR_TIME_HZ << 24, clock_hz),
+    };
     parameters_init(&drive->parameters);
     parameters_set_controller(&drive->parameters, (int32_t)config->controller);
     comms_init(&drive->comms, hal_time_us(hal));

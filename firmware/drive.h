@@ -24,22 +24,23 @@ typedef struct {
     control_state_t control;
     hal_pwm_compare_t compare; /* of the last period in RUN; written by the control interrupt */
     /* Execution time of the interrupts, for telemetry only; overruns are handled by drive/protection.h. */
-    uint32_t used_ticks;           /* last control interrupt, from trigger to end, HAL_PWM_TICK_NS */
+    uint32_t used_ticks;           /* last control interrupt, from trigger to end, ticks of the timer */
     uint32_t worst_ticks;          /* maximum since start */
     uint32_t late_interrupts;      /* control interrupts that ended after the next trigger, since start */
     uint32_t deferred_used_ticks;  /* last deferred interrupt, from the trigger of its period to its end; this and the
                                       next  are written by the deferred interrupt */
     uint32_t deferred_worst_ticks; /* maximum since start */
     /* Used by the background only. */
+    uint32_t processor_time_q24; /* LSB of telemetry, 5 ns, per tick */
     uint32_t control_rate_hz;
     parameters_t parameters;
     uint32_t applied_revision; /* parameters.revision from which control_parameters are derived */
     comms_t comms;
 } drive_t;
 
-/* Prepares the drive and starts the timer. Returns false, and starts nothing, for a control rate that the timer cannot
- * make or that is too low for the machine (machine_tables.h). hal must outlive the drive. [background, before anything
- * else] */
+/* Prepares the drive and starts the timer. Returns false, and starts nothing, for a control rate that the timer's
+ * clock (hal_pwm.h) cannot make or that is too low for the machine (machine_tables.h). hal must outlive the drive.
+ * [background, before anything else] */
 bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config);
 
 /* One control period. [interrupt] */

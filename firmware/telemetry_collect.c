@@ -12,6 +12,11 @@ static uint32_t gain_per_Nm_q15(const drive_t *drive, unsigned gain) {
                                     drive->control_parameters.duty.pid.error_scale_inverse_q24, 33);
 }
 
+/* Ticks of the timer in 5 ns, the resolution of the DBC. */
+static uint32_t processor_time(const drive_t *drive, uint32_t ticks) {
+    return (uint32_t)((uint64_t)ticks * drive->processor_time_q24 >> 24);
+}
+
 /* Mean of the phases, mechanical, 2^-32 turn. */
 static int32_t misalignment(const drive_t *drive) {
     const int32_t phases = machine_tables.phases;
@@ -86,13 +91,13 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->bus_counters.receive_overflow = hal_can_receive_overflows(drive->hal);
     telemetry->bus_counters.command_accepted = counters->accepted;
 
-    telemetry->processor.used_us = drive->used_ticks;
-    telemetry->processor.worst_us = drive->worst_ticks;
-    telemetry->processor.available_us = 2u * parameters->period_ticks;
+    telemetry->processor.used_us = processor_time(drive, drive->used_ticks);
+    telemetry->processor.worst_us = processor_time(drive, drive->worst_ticks);
+    telemetry->processor.available_us = processor_time(drive, 2u * parameters->period_ticks);
     telemetry->processor.late_interrupts = drive->late_interrupts;
 
-    telemetry->deferred.used_us = drive->deferred_used_ticks;
-    telemetry->deferred.worst_us = drive->deferred_worst_ticks;
+    telemetry->deferred.used_us = processor_time(drive, drive->deferred_used_ticks);
+    telemetry->deferred.worst_us = processor_time(drive, drive->deferred_worst_ticks);
     telemetry->deferred.skipped_periods = control->deferred_request.skipped_total;
 
     telemetry->identity.firmware_major = SALIENT_VERSION_MAJOR;

@@ -13,11 +13,10 @@
 /* This period's latch. A board that captures the encoder's edges also reports the last one before the latch: at that
  * instant the angle was exactly on a boundary of the present count. */
 typedef struct {
-    uint32_t counts;   /* 0..2^bits-1, rising in the forward direction */
-    bool edge_known;   /* false: the board captures none, or none was seen since start */
-    bool edge_forward; /* true: passed forwards, at `counts`; false: backwards, at `counts` + 1 (modulo a turn) */
-    uint32_t
-        edge_age_ticks; /* from the edge to the latch, in ticks of HAL_PWM_TICK_NS, nearest; 0..2^31-1, saturated */
+    uint32_t counts;         /* 0..2^bits-1, rising in the forward direction */
+    bool edge_known;         /* false: the board captures none, or none was seen since start */
+    bool edge_forward;       /* true: passed forwards, at `counts`; false: backwards, at `counts` + 1 (modulo a turn) */
+    uint32_t edge_age_ticks; /* from the edge to the latch, in ticks of the PWM timer, nearest; 0..2^31-1, saturated */
 } hal_encoder_sample_t;
 
 /* Bits of one mechanical turn, 8..32; constant. [both] */

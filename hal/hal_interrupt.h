@@ -11,9 +11,9 @@
  * not made up for, and its period keeps the compare values of the period before. [interrupt] */
 uint32_t hal_interrupt_missed_triggers(hal_t *hal);
 
-/* Ticks of HAL_PWM_TICK_NS from the trigger of the present control interrupt, which took its sample, rounded down to
- * the resolution of the port's counter. Continues beyond the period, wraps after 21 s; 0 on a port whose instructions
- * take no time. [interrupt, deferred] */
+/* Ticks of the PWM timer from the trigger of the present control interrupt, which took its sample, rounded down to
+ * the resolution of the port's counter. Continues beyond the period, wraps after 2^32 ticks; 0 on a port whose
+ * instructions take no time. [interrupt, deferred] */
 uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal);
 
 /* Requests the deferred interrupt: the port calls drive_deferred_interrupt once after the present control interrupt, at

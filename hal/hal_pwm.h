@@ -1,6 +1,6 @@
 /* PWM timer of the asymmetric half bridges: two switches per phase, one compare value each.
  *
- * The timer counts up and down, `period_ticks` each way, so a control period is 2 * period_ticks * 5 ns.
+ * The timer counts up and down, `period_ticks` each way, so a control period is 2 * period_ticks ticks of its clock.
  * An upper switch is on while its carrier is below its compare value, with the carrier's valley in the middle of the
  * period: a pulse of 2 * compare ticks, centred. The lower switch's carrier has its valley at the ends of the period
  * (shifted by half a period), so a compare value gives a pulse split over both ends; two partial duties therefore
@@ -17,13 +17,19 @@
 
 #include "hal.h"
 
-#define HAL_PWM_TICK_NS 5
-#define HAL_PWM_CLOCK_HZ 200000000
+/* Range of the timer's clock. */
+#define HAL_PWM_CLOCK_HZ_MIN 25000000
+#define HAL_PWM_CLOCK_HZ_MAX 400000000
 
 typedef struct {
     uint16_t upper[HAL_PHASES_MAX]; /* compare value in ticks */
     uint16_t lower[HAL_PHASES_MAX];
 } hal_pwm_compare_t;
+
+/* Clock of the timer, whose ticks are the unit of compare values, edge ages and execution times; constant. The drive
+ * does not start unless it is in the range above and half a control period is an integer number of ticks. [background]
+ */
+uint32_t hal_pwm_clock_hz(const hal_t *hal);
 
 /* Sets the period and starts the timer; the first control interrupt comes one period later. Called once. [background]
  */

@@ -9,6 +9,7 @@
 #include "hal_interrupt.h"
 #include "hal_pwm.h"
 #include "hal_time.h"
+#include "plant/pwm_timer.h"
 
 static const char *const context_names[] = {
     [BOARD_START] = "the background",
@@ -49,6 +50,11 @@ void hal_encoder_read(const hal_t *hal, hal_encoder_sample_t *sample) {
     *sample = hal->board->encoder;
 }
 
+uint32_t hal_pwm_clock_hz(const hal_t *hal) {
+    (void)hal;
+    return PWM_TIMER_CLOCK_HZ;
+}
+
 void hal_pwm_start(hal_t *hal, uint16_t period_ticks) {
     require(hal, false, __func__);
     board_pwm_start(hal->board, period_ticks);
@@ -73,7 +79,7 @@ uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
     if (hal->board->context != BOARD_DEFERRED) {
         require(hal, true, __func__);
     }
-    return (uint32_t)(hal->board->interrupt_took_ns / HAL_PWM_TICK_NS);
+    return (uint32_t)(hal->board->interrupt_took_ns / PWM_TIMER_TICK_NS);
 }
 
 void hal_interrupt_request_deferred(hal_t *hal) {

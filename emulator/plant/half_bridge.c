@@ -1,5 +1,7 @@
 #include "plant/half_bridge.h"
 
+#include "plant/pwm_timer.h"
+
 /* Edge in the first half of the period, in ticks from its start; the second half mirrors the first. */
 typedef struct {
     uint16_t tick;
@@ -37,10 +39,10 @@ static uint16_t without_short_pulses(uint16_t compare, uint16_t period_ticks, do
     if (compare >= period_ticks) {
         return period_ticks;
     }
-    if (2.0 * compare * HAL_PWM_TICK_NS < minimum_pulse_ns) {
+    if (2.0 * compare * PWM_TIMER_TICK_NS < minimum_pulse_ns) {
         return 0;
     }
-    return 2.0 * (period_ticks - compare) * HAL_PWM_TICK_NS < minimum_pulse_ns ? period_ticks : compare;
+    return 2.0 * (period_ticks - compare) * PWM_TIMER_TICK_NS < minimum_pulse_ns ? period_ticks : compare;
 }
 
 void half_bridge_pattern(half_bridge_pattern_t *pattern, unsigned phases, const hal_pwm_compare_t *compare,
@@ -66,10 +68,10 @@ void half_bridge_pattern(half_bridge_pattern_t *pattern, unsigned phases, const 
         }
     }
     for (unsigned edge = 0; edge < count; edge++) {
-        append_edge(pattern, start_ns + (uint64_t)half_edges[edge].tick * HAL_PWM_TICK_NS, half_edges[edge].toggles);
+        append_edge(pattern, start_ns + (uint64_t)half_edges[edge].tick * PWM_TIMER_TICK_NS, half_edges[edge].toggles);
     }
     for (unsigned edge = count; edge-- > 0;) {
-        append_edge(pattern, start_ns + (2u * (uint64_t)period_ticks - half_edges[edge].tick) * HAL_PWM_TICK_NS,
+        append_edge(pattern, start_ns + (2u * (uint64_t)period_ticks - half_edges[edge].tick) * PWM_TIMER_TICK_NS,
                     half_edges[edge].toggles);
     }
 }

@@ -3,6 +3,7 @@
 
 #include "qemu/cosimulation.h"
 
+#include <assert.h>
 #include <inttypes.h>
 #include <setjmp.h>
 #include <stdio.h>
@@ -13,8 +14,11 @@
 #include "hal_time.h"
 #include "host/hal_host.h"
 #include "host/simulation.h"
+#include "plant/pwm_timer.h"
 
 #define RIG_STACK_BYTES (1024 * 1024)
+
+static_assert(MAILBOX_PWM_CLOCK_HZ == PWM_TIMER_CLOCK_HZ, "one clock on both sides of the mailbox");
 
 static mailbox_t *mailbox;
 static simulation_t simulation;
@@ -91,7 +95,7 @@ static void resume_rig(void) {
 /* Runs to the trigger that the drive serves; those before it are missed. */
 static void run_to_trigger(void) {
     rig_t *rig = &simulation.rig;
-    const uint64_t period_ns = UINT64_C(2) * HAL_PWM_TICK_NS * rig->board.period_ticks;
+    const uint64_t period_ns = UINT64_C(2) * PWM_TIMER_TICK_NS * rig->board.period_ticks;
     /* The trigger number wraps after 71 minutes at 1 MHz. */
     const uint32_t ahead = mailbox->trigger - (uint32_t)(rig->board.time_ns / period_ns);
     const uint64_t trigger_ns = (rig->board.time_ns / period_ns + ahead) * period_ns;
@@ -145,7 +149,7 @@ void cosimulation_serve(void) {
         break;
     case MAILBOX_INTERRUPT_END:
         /* The drive's counter rounds down: an interrupt that ends at a trigger has missed it. */
-        simulation.rig.board.interrupt_took_ns = (uint64_t)mailbox->elapsed_ticks * HAL_PWM_TICK_NS + 1;
+        simulation.rig.board.interrupt_took_ns = (uint64_t)mailbox->elapsed_ticks * PWM_TIMER_TICK_NS + 1;
         resume_rig();
         break;
     case MAILBOX_PWM_START:

@@ -1,5 +1,6 @@
 #include "rig/control_period.h"
 
+#include "plant/pwm_timer.h"
 #include "rig/bus_events.h"
 
 void control_period_schedule_hold(rig_t *rig) {
@@ -13,7 +14,7 @@ void control_period_schedule_hold(rig_t *rig) {
 
 void control_period_begin(rig_t *rig) {
     if (rig->board.period_ticks > 0) {
-        rig->period_ns = UINT64_C(2) * rig->board.period_ticks * HAL_PWM_TICK_NS;
+        rig->period_ns = UINT64_C(2) * rig->board.period_ticks * PWM_TIMER_TICK_NS;
         rig->scheduler.due_ns[EVENT_CONTROL] = rig->board.time_ns + rig->period_ns;
         control_period_schedule_hold(rig);
     }

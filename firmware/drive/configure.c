@@ -7,9 +7,11 @@
 /* Reference rate of the BP-PID gains: the torque change per period scales with the period. */
 #define GAIN_RATE_HZ 40000
 
-bool configure_rate_allowed(uint32_t control_rate_hz) {
-    return control_rate_hz == 20000 || control_rate_hz == 40000 || control_rate_hz == 50000 ||
-           control_rate_hz == 100000 || control_rate_hz == 1000000;
+bool configure_rate_allowed(uint32_t control_rate_hz, uint32_t timer_clock_hz) {
+    return (control_rate_hz == 20000 || control_rate_hz == 40000 || control_rate_hz == 50000 ||
+            control_rate_hz == 100000 || control_rate_hz == 1000000) &&
+           timer_clock_hz >= HAL_PWM_CLOCK_HZ_MIN && timer_clock_hz <= HAL_PWM_CLOCK_HZ_MAX &&
+           timer_clock_hz % (2u * control_rate_hz) == 0;
 }
 
 /* Laws and features of a controller. */
@@ -215,8 +217,30 @@ static int32_t epsilon_q31(const int32_t *values, int32_t gain_q24) {
     return fixed_clamp(fixed_saturate(reduced_q31 < set_q31 ? reduced_q31 : set_q31), EPSILON_MIN_Q31, INT32_MAX);
 }
 
+/* 2^32 / (2 pi): 2^-32 rev in a rad. */
+#define ANGLE_PER_RAD_Q29 INT64_C(366986312910250153)
+
+/* Slowest clock of whose ticks edge_angle_per_tick_q51 fits 32 bits; of a slower one, of a part of a tick. */
+#define EDGE_CLOCK_MIN_HZ 171000000u
+
+/* Of measure.c. At 200 MHz a tick is 5 ns. */
+static void set_edge_timing(control_parameters_t *control, unsigned speed_exponent, uint32_t timer_clock_hz) {
+    unsigned shift = 0;
+    while (timer_clock_hz << shift < EDGE_CLOCK_MIN_HZ) {
+        shift++;
+    }
+    const uint32_t shifted_hz = timer_clock_hz << shift;
+    const unsigned age_shift = 13u + speed_exponent + shift;
+    const uint32_t age_max = (uint32_t)INT32_MAX >> age_shift;
+    const uint32_t two_periods = timer_clock_hz / 10000u; /* at 20 kHz */
+    control->edge_angle_per_tick_q51 = (int32_t)fixed_divide(ANGLE_PER_RAD_Q29 + shifted_hz / 2u, shifted_hz);
+    control->edge_age_shift = (uint8_t)age_shift;
+    control->edge_age_max_ticks = (uint16_t)(two_periods < age_max ? two_periods : age_max);
+}
+
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
-                                       uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits) {
+                                       uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits,
+                                       uint32_t timer_clock_hz) {
     const int32_t *values = parameters->values;
     const int32_t inertia_q30 = values[PARAMETER_INERTIA_KG_M2];
     const int32_t friction_q30 = values[PARAMETER_FRICTION_NM_S];
@@ -232,7 +256,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .speed_reference_min_q22 = controller.four_quadrant ? INT32_MIN : 0,
         .interleaved_pwm = controller.may_interleave_pulses && values[PARAMETER_PULSES_PER_PERIOD] == 2,
         .load_from_transducer = values[PARAMETER_LOAD_SOURCE] != 0,
-        .period_ticks = (uint16_t)(HAL_PWM_CLOCK_HZ / (2u * control_rate_hz)),
+        .period_ticks = (uint16_t)(timer_clock_hz / (2u * control_rate_hz)),
         .encoder_shift = (uint8_t)encoder_shift,
         .encoder_middle = (1u << encoder_shift) >> 1,
         .adc_bits = (uint8_t)adc_bits,
@@ -297,6 +321,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         }),
         .stroke_mean = stroke_mean_configure(tables->phases, control_rate_hz / DEFERRED_SLOW_PERIODS),
     };
+    set_edge_timing(&control, tables->speed_exponent, timer_clock_hz);
     control.moving_load = moving_load_configure(&(moving_load_settings_t){
         .encoder_bits = encoder_bits,
         .control_rate_hz = control_rate_hz,

@@ -13,12 +13,14 @@ typedef struct {
     drive_controller_t controller; /* default of the parameter */
 } drive_config_t;
 
-/* True for the supported control rates; half a period is an integer number of timer ticks. */
-bool configure_rate_allowed(uint32_t control_rate_hz);
+/* True for the supported control rates of which a timer with this clock (hal_pwm_clock_hz, 25 to 400 MHz) makes half a
+ * period of an integer number of ticks. */
+bool configure_rate_allowed(uint32_t control_rate_hz, uint32_t timer_clock_hz);
 
 /* Control parameters for a machine (machine_tables, for which the control interrupt is linked), a control rate and the
- * board's resolutions (hal_encoder_bits, hal_adc_bits). [background] */
+ * board's resolutions and timer (hal_encoder_bits, hal_adc_bits, hal_pwm_clock_hz). [background] */
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
-                                       uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits);
+                                       uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits,
+                                       uint32_t timer_clock_hz);
 
 #endif

@@ -56,17 +56,20 @@ typedef struct {
     drive_controller_t controller; /* for telemetry; the laws below are its parts */
     speed_law_t speed_law;
     torque_law_t torque_law;
+    uint8_t edge_age_shift;          /* of an encoder edge's age: 13, on a fast machine or with a slow clock more */
     int32_t speed_reference_min_q22; /* rad/s, Q9.22: 0 for a single-quadrant controller, else INT32_MIN */
     bool interleaved_pwm;            /* two voltage pulses per period */
     bool load_from_transducer;       /* load torque of the sliding mode: measured; false: of the observer */
-    uint16_t period_ticks;
-    uint8_t encoder_shift;     /* counts to 2^-32 rev */
-    uint8_t adc_bits;          /* resolution, 12..16 */
-    uint32_t encoder_middle;   /* half a count, 2^-32 rev; 0 at 32 bits */
-    int32_t current_scale_q18; /* A Q7.9 per count, in Q18: 10 at 12 bits */
-    int32_t voltage_scale_q18; /* V Q9.6 per count, in Q18 */
-    uint32_t initialise_ticks; /* control periods in 1 ms */
-    int32_t speed_ramp_q22;    /* rad/s per period, Q9.22; INT32_MAX: no ramp */
+    uint16_t period_ticks;           /* half a control period */
+    uint8_t encoder_shift;           /* counts to 2^-32 rev */
+    uint8_t adc_bits;                /* resolution, 12..16 */
+    uint16_t edge_age_max_ticks;     /* two periods at 20 kHz; an older edge only limits the angle to its count */
+    int32_t edge_angle_per_tick_q51; /* rotation in a tick or, of a slow clock, a part, 2^-32 rev per rad/s */
+    uint32_t encoder_middle;         /* half a count, 2^-32 rev; 0 at 32 bits */
+    int32_t current_scale_q18;       /* A Q7.9 per count, in Q18: 10 at 12 bits */
+    int32_t voltage_scale_q18;       /* V Q9.6 per count, in Q18 */
+    uint32_t initialise_ticks;       /* control periods in 1 ms */
+    int32_t speed_ramp_q22;          /* rad/s per period, Q9.22; INT32_MAX: no ramp */
     load_observer_model_t observer;
     commutation_parameters_t commutation;
     protection_parameters_t protection;

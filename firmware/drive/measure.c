@@ -4,12 +4,6 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
-/* 5 ns / (2 pi): rotation per tick, 2^-32 rev per rad/s (SI) Q9.22, in Q51. */
-#define ANGLE_PER_TICK_Q51 1834931565
-
-/* An older edge only limits the angle to its count: two periods at 20 kHz. */
-#define EDGE_AGE_MAX_TICKS 20000
-
 /* Product of counts and scale, rounded to nearest, halves upwards; below 2^16. */
 static int32_t scale_counts(uint16_t counts, int32_t scale_q18) {
     return fixed_multiply_high(counts << 14, scale_q18);
@@ -29,21 +23,21 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
     const uint32_t count_start = encoder->counts << parameters->encoder_shift;
     measured->encoder_angle = count_start;
     measured->predicted_speed_q22 = observer->speed_q22;
-    measured->angle_from_edge = false;
     if (!encoder->edge_known) {
+        measured->angle_from_edge = false;
         measured->angle = count_start + parameters->encoder_middle; /* its mean error is zero */
         return;
     }
-    if (encoder->edge_age_ticks > EDGE_AGE_MAX_TICKS) {
+    if (encoder->edge_age_ticks > parameters->edge_age_max_ticks) {
+        measured->angle_from_edge = false;
         measured->angle = nearest_in_count(parameters, observer, count_start);
         return;
     }
     measured->angle_from_edge = true;
     const uint32_t edge = encoder->edge_forward ? count_start : count_start + (1u << parameters->encoder_shift);
-    const int32_t angle_per_tick_q19 = fixed_multiply_high(observer->speed_q22, ANGLE_PER_TICK_Q51);
-    measured->angle =
-        edge + (uint32_t)fixed_multiply_high(
-                   angle_per_tick_q19, (int32_t)(encoder->edge_age_ticks << (13 + machine_tables.speed_exponent)));
+    const int32_t angle_per_tick_q19 = fixed_multiply_high(observer->speed_q22, parameters->edge_angle_per_tick_q51);
+    measured->angle = edge + (uint32_t)fixed_multiply_high(
+                                 angle_per_tick_q19, (int32_t)(encoder->edge_age_ticks << parameters->edge_age_shift));
 }
 
 static inline int32_t measure_current_q9(int32_t scale_q18, const control_sample_t *sample, unsigned phase,

@@ -24,6 +24,11 @@ void hal_encoder_read(const hal_t *hal, hal_encoder_sample_t *sample) {
     *sample = hal->mailbox.encoder;
 }
 
+uint32_t hal_pwm_clock_hz(const hal_t *hal) {
+    (void)hal;
+    return MAILBOX_PWM_CLOCK_HZ;
+}
+
 void hal_pwm_start(hal_t *hal, uint16_t period_ticks) {
     hal->mailbox.period_ticks = period_ticks;
     doorbell_ring(MAILBOX_PWM_START);

@@ -23,6 +23,9 @@
 /* Changes with the structure, so that an image and a host with different layouts stop at the start. */
 #define MAILBOX_LAYOUT 3
 
+/* Clock of the emulated PWM timer. */
+#define MAILBOX_PWM_CLOCK_HZ 200000000
+
 /* Exit codes of a drive that ends QEMU itself (sysexits.h). */
 #define MAILBOX_EXIT_FAULT 70  /* an unexpected CPU exception */
 #define MAILBOX_EXIT_LAYOUT 78 /* the host has another layout */

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import pytest
+
 import salient.bench.session
+from salient.bench.drive import OtherDatabase
+from salient.bench.emulator import EmulatorProcess
 from salient.bench.session import Session
 from salient.bus.signals import drive_database
+from salient.config import BenchConfig
 from salient.dbc import database_hash
+from salient.errors import UsageError
+from salient.paths import ROOT
 from salient.version import VERSION
 
 
@@ -40,3 +47,40 @@ def test_session_reports_a_mismatched_dbc_once(bench, capsys, monkeypatch):
     assert len(lines) == 1
     assert f"firmware {VERSION} was built from another drive.dbc" in lines[0]
     assert "here 12345678" in lines[0]
+
+
+OTHER = str(ROOT / "tests" / "machines" / "largest.toml")
+
+
+@pytest.mark.parametrize("reference", ["speed_reference_rpm", "torque_reference_Nm"])
+def test_no_reference_goes_to_a_running_drive_of_another_database(tmp_path, reference):
+    can = f"unix:{tmp_path}/can.sock"
+    with EmulatorProcess(BenchConfig(pace="x2", machine=OTHER), can), Session(can, lockstep=False) as session:
+        with pytest.raises(OtherDatabase, match=r"^unix:\S+: firmware \S+ was built from another drive") as refused:
+            setattr(session.drive, reference, 10.0)
+        assert isinstance(refused.value, UsageError) and "\n" not in str(refused.value)
+        session.run_for(0.2)
+        assert session.drive.state == "ready"
+        assert session.telemetry["command_accepted"].last == 0
+        session.drive.off()  # has no scaling
+        session.run_until(lambda: session.telemetry["command_accepted"].last > 0, timeout=600.0)
+        assert session.drive.state == "ready"
+
+
+def test_references_go_to_a_running_drive_of_the_same_database(tmp_path):
+    can = f"unix:{tmp_path}/can.sock"
+    config = BenchConfig(pace="x2", machine=OTHER)
+    with EmulatorProcess(config, can), Session(can, lockstep=False, machine=OTHER) as session:
+        session.drive.speed_reference_rpm = 10.0
+        session.run_until(lambda: session.drive.state == "run", timeout=600.0)
+
+
+def test_in_lockstep_references_end_with_the_first_report_of_another_database(make_bench):
+    bench = make_bench(machine=OTHER)
+    with Session(bench.address) as session:
+        session.drive.speed_reference_rpm = 0.0
+        with pytest.raises(OtherDatabase):
+            session.run_for(0.2)
+        assert session.time_s <= 0.12
+        session.run_for(0.2)  # no further command is due
+        assert session.drive.state in ("ready", "fault")

@@ -65,14 +65,16 @@ static uint16_t torn(const void *object, size_t bytes) {
     return 0;
 }
 
-bool configure_rate_allowed(uint32_t control_rate_hz) {
+bool configure_rate_allowed(uint32_t control_rate_hz, uint32_t timer_clock_hz) {
+    (void)timer_clock_hz;
     return control_rate_hz == 40000;
 }
 
 /* The first set has the period of the timer in every half word; later sets are also long enough as a timeout. */
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
-                                       uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits) {
-    (void)tables, (void)control_rate_hz, (void)encoder_bits, (void)adc_bits;
+                                       uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits,
+                                       uint32_t timer_clock_hz) {
+    (void)timer_clock_hz, (void)tables, (void)control_rate_hz, (void)encoder_bits, (void)adc_bits;
     static control_parameters_t set;
     fill(&set, sizeof set, UINT32_C(2500) * 0x10001 + (parameters->revision & 0xFFF) * 0x10001);
     return set;

@@ -17,12 +17,13 @@ from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS, scenario_toml, start_scenario
 from salient.experiments.compare.every_machine import EXAMPLES
 from salient.experiments.compare.finished_runs import FinishedRuns
-from salient.experiments.compare.machine import cases_of, subject
+from salient.experiments.compare.machine import cases_of, subject, targets_of
 from salient.experiments.compare.metrics import EXTRACTORS, METRICS, failures, peak_current_max_A
 from salient.experiments.compare.random_cases import random_drive, random_load
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS, Target
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, load_scenarios
+from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 from salient.paths import MACHINES
 
@@ -344,6 +345,40 @@ def test_another_machine_has_its_own_run_among_machines_of_all_sizes():
     cases = cases_of(ALL_CASES["machines"], subject(str(path)))
     assert cases == [case for case in ALL_CASES["machines"] if case.condition == "mill"]
     assert [case.controller for case in cases] == ["traditional", "paper", "salient"]
+
+
+def test_torque_references_of_another_machine_are_within_its_torque_limit():
+    on = subject(str(EXAMPLES / "fan12.toml"))
+    limit_Nm = derive(on.machine).parameters["torque_max_Nm"]
+    references_Nm = [step.value_Nm for case in cases_of(ALL_CASES["torque_speed"], on) for step in case.scenario.torque]
+    assert {abs(reference_Nm) for reference_Nm in references_Nm} == {limit_Nm}
+    assert min(references_Nm) == -limit_Nm
+
+
+def test_another_machine_is_judged_by_relative_targets_only_and_a_bundled_one_by_its_own(tmp_path):
+    on = subject(str(EXAMPLES / "fan12.toml"))
+    targets = targets_of(on)
+    conditions = {(case.group, case.condition) for of in ALL_CASES.values() for case in cases_of(of, on)}
+    assert targets and {key[:2] for key in targets} <= conditions
+    assert {key[0] for key in targets} == {"inertia", "encoders", "misalignment", "standing_error"}
+    limits = {key[:1] + key[2:]: target.limit for key, target in TARGETS.items()}
+    for key, target in targets.items():
+        if key[0] != "standing_error":
+            assert target.limit == limits[key[:1] + key[2:]]
+    slowest = min(target.limit for key, target in targets.items() if key[0] == "standing_error")
+    assert slowest == pytest.approx(0.02 * on.scale.speed)
+    impostor = tmp_path / "saturating.toml"
+    impostor.write_text((EXAMPLES / "fan12.toml").read_text().replace('"fan12"', '"saturating"', 1))
+    assert not subject(str(impostor)).is_bundled
+    assert subject("finite_element").is_bundled
+
+
+def test_file_of_a_failed_run_has_no_slash_of_a_unit_in_its_name(tmp_path):
+    scenario = replace(start_scenario(controller="paper"), duration_s=0.01)
+    case = Case("speeds", "saturating, 600 r/min", "paper", "start", scenario)
+    ((_, path),) = command._write_failed(tmp_path, [RunMetrics(case, {}, "fault over_speed")])
+    assert path.parent == tmp_path and path.name == "speeds_saturating_600_r_min_paper.toml"
+    assert load_scenarios(path) == [replace(scenario, name=path.stem)]
 
 
 def test_peak_current_is_judged_in_proportion_to_that_of_the_machine():

@@ -10,7 +10,7 @@ import pytest
 from salient.bench.programs import reference_executable
 from salient.experiments.compare import every_machine, reference
 from salient.experiments.compare.every_machine import EXAMPLES
-from salient.experiments.compare.targets import target_of
+from salient.experiments.compare.targets import TARGETS, target_of
 from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
 from salient.machine.scaling import Exponents, scaling_of
@@ -81,5 +81,5 @@ def test_wrong_argument_is_reported_in_one_line(arguments, expected):
 
 def test_ripple_of_any_machine_is_judged():
     for machine in ("fan12", "one of a user"):
-        assert target_of(("machines", machine, "ripple_to_allowed", "")).limit == 1.0
-        assert target_of(("machines", machine, "ripple", "")).limit is None
+        assert target_of(TARGETS, ("machines", machine, "ripple_to_allowed", "")).limit == 1.0
+        assert target_of(TARGETS, ("machines", machine, "ripple", "")).limit is None

@@ -23,6 +23,7 @@ struct hal {
     hal_adc_sample_t adc{};
     uint32_t encoder_counts = 1000;
     uint32_t time_us = 0;
+    uint32_t clock_hz = 200000000;
     uint32_t missed = 0;
     uint32_t elapsed_ticks = 0;
     std::deque<hal_can_frame_t> to_drive;
@@ -59,6 +60,9 @@ void hal_critical_enter(hal_t *hal) {
 void hal_critical_leave(hal_t *hal) {
     EXPECT_TRUE(hal->critical);
     hal->critical = false;
+}
+uint32_t hal_pwm_clock_hz(const hal_t *hal) {
+    return hal->clock_hz;
 }
 void hal_pwm_start(hal_t *hal, uint16_t period_ticks) {
     EXPECT_TRUE(hal->open) << "the switches are opened before the timer starts";
@@ -281,6 +285,30 @@ TEST_F(Drive, processor_time_is_recorded_and_reported_without_any_reaction) {
     EXPECT_EQ(processor.worst_us, 65535) << "held at its end";
     EXPECT_EQ(processor.available_us, 5000);
     EXPECT_EQ(processor.late_interrupts, 0);
+}
+
+TEST_F(Drive, a_board_with_another_timer_clock_has_its_ticks_and_the_same_microseconds) {
+    hal.clock_hz = 170000000;
+    hal.open = true;
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    EXPECT_EQ(hal.starts.back(), 2125);
+    hal.elapsed_ticks = 1700; // 10 us
+    periods(100);
+    hal.from_drive.clear();
+    periods(4000 + 40);
+    const auto processor = only_frame(DRIVE_PROCESSOR_FRAME_ID, drive_processor_unpack);
+    EXPECT_NEAR(processor.used_us, 2000, 1);
+    EXPECT_NEAR(processor.available_us, 5000, 1);
+}
+
+TEST_F(Drive, does_not_start_on_a_timer_that_cannot_make_the_rate) {
+    for (const uint32_t clock_hz : {0u, 24960000u, 170000001u, 400080000u}) {
+        hal = {.clock_hz = clock_hz};
+        const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
+        EXPECT_FALSE(drive_init(&drive, &hal, &config)) << clock_hz;
+        EXPECT_TRUE(hal.starts.empty());
+    }
 }
 
 TEST_F(Drive, the_time_of_the_deferred_interrupt_counts_from_the_trigger_of_its_period) {

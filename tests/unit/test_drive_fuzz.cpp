@@ -14,6 +14,8 @@ extern "C" {
 
 namespace {
 
+constexpr uint32_t TIMER_CLOCKS_HZ[] = {25000000, 400000000}; // slowest and fastest
+
 constexpr int SEQUENCES = 6000;
 constexpr int PERIODS = 400;
 
@@ -102,7 +104,8 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
         }
         const uint32_t rate_hz = rates_hz[random() % 4];
         const control_parameters_t parameters =
-            configure_control(&p, tables, rate_hz, unsigned(8 + random() % 25), 12 + unsigned(sequence) % 5);
+            configure_control(&p, tables, rate_hz, unsigned(8 + random() % 25), 12 + unsigned(sequence) % 5,
+                              TIMER_CLOCKS_HZ[sequence % 2]);
         control_state_t state;
         control_reset(&parameters, &state);
         bench_t bench;
@@ -145,7 +148,8 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
     parameters_init(&p);
     for (const uint32_t rate_hz : {20000u, 100000u}) {
         for (const unsigned bits : {8u, 17u, 32u}) {
-            const control_parameters_t parameters = configure_control(&p, &machine_tables, rate_hz, bits, 12);
+            const control_parameters_t parameters =
+                configure_control(&p, &machine_tables, rate_hz, bits, 12, TIMER_CLOCKS_HZ[1]);
             control_state_t state;
             control_reset(&parameters, &state);
             for (int period = 0; period < 20000; period++) {

@@ -1,10 +1,9 @@
 #include "qemu/mps2_an386/timer.h"
 
-#include "hal_pwm.h"
 #include "qemu/board.h"
 #include "qemu/hal_qemu.h"
 
-/* CMSDK timers, 25 MHz, counting down. Arm DDI 0479, 4.3. */
+/* CMSDK timers, counting down. Arm DDI 0479, 4.3. */
 typedef struct {
     uint32_t control;
     uint32_t value;
@@ -14,9 +13,10 @@ typedef struct {
 
 #define TRIGGER ((volatile cmsdk_timer_t *)0x40000000)
 #define COUNTER ((volatile cmsdk_timer_t *)0x40001000)
+#define COUNTER_CLOCK_HZ 25000000
 #define CONTROL_ENABLE 1u
 #define CONTROL_INTERRUPT 8u
-#define TICKS_PER_COUNT (40 / HAL_PWM_TICK_NS)
+#define TICKS_PER_COUNT (MAILBOX_PWM_CLOCK_HZ / COUNTER_CLOCK_HZ)
 
 static uint32_t period;       /* counts */
 static uint32_t trigger_time; /* time of the trigger served last, counts */

@@ -7,7 +7,7 @@
 /* Interrupt of the timer that triggers; must be enabled. */
 #define TIMER_IRQ 8
 
-/* Starts both timers; the first trigger occurs after one control period of 2 * period_ticks * HAL_PWM_TICK_NS, a
+/* Starts both timers; the first trigger occurs after one control period of 2 * period_ticks PWM ticks, a
  * multiple of 40 ns. */
 void timer_start(uint32_t period_ticks);
 
@@ -15,7 +15,7 @@ void timer_start(uint32_t period_ticks);
  * priority, unless the trigger occurred while the previous interrupt was running: then it is missed. */
 void timer_handler(void);
 
-/* Ticks of HAL_PWM_TICK_NS since the trigger that is served, in steps of 40 ns, rounded down. */
+/* PWM ticks since the trigger that is served, in steps of 40 ns, rounded down. */
 uint32_t timer_elapsed_ticks(void);
 
 #endif

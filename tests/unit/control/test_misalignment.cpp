@@ -32,7 +32,7 @@ misalignment_parameters_t parameters_of(int32_t rate_1_s) {
     if (rate_1_s != 0) {
         p.values[PARAMETER_ANGLE_TRIM_RATE_1_S] = rate_1_s;
     }
-    return configure_control(&p, &machine_tables, 40000, 17, 12).misalignment;
+    return configure_control(&p, &machine_tables, 40000, 17, 12, fixed_point::TIMER_CLOCK_HZ).misalignment;
 }
 
 double electrical_rev_of(double rad) {

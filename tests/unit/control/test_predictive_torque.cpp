@@ -87,7 +87,7 @@ predictive_torque_parameters_t parameters_of(double reserve_Nm = 0.0, double cur
     p.values[PARAMETER_TORQUE_RESERVE_NM] = to_fixed(reserve_Nm, Q24);
     p.values[PARAMETER_CURRENT_LIMIT_A] = to_fixed(current_limit_A, Q9);
     p.values[PARAMETER_TORQUE_SHARING] = sharing;
-    return configure_control(&p, &machine_tables, RATE_HZ, 17, 12).predictive;
+    return configure_control(&p, &machine_tables, RATE_HZ, 17, 12, fixed_point::TIMER_CLOCK_HZ).predictive;
 }
 
 // A machine that equals its tables: exact flux linkages, currents from the tables, 12-bit ADC.

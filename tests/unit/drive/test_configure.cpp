@@ -16,6 +16,7 @@ extern "C" {
 
 namespace {
 
+const uint32_t TIMER_CLOCKS_HZ[] = {50000000, 100000000, 200000000, 400000000}; // of which every rate can be made
 const double RATES_HZ[] = {20000.0, 40000.0, 50000.0, 100000.0, 1000000.0};
 
 double value_of(const parameters_t &parameters, unsigned index) {
@@ -26,9 +27,20 @@ double held(double value) {
     return std::clamp(value, -2147483648.0, 2147483647.0);
 }
 
+// Rotation since an edge of the encoder, to 2^-29 of it, for every age that is not cut off.
+void expect_edge_timing(const control_parameters_t &c, uint32_t timer_clock_hz) {
+    const double exact = fixed_point::REV / (2.0 * fixed_point::PI) / timer_clock_hz; // 2^-32 rev per rad/s and tick
+    const double got = std::ldexp(c.edge_angle_per_tick_q51, 22 + int(c.edge_age_shift) - 64);
+    ASSERT_NEAR(got * std::ldexp(1.0, -int(machine_tables.speed_exponent)), exact, exact * std::ldexp(1.0, -29));
+    ASSERT_LT(std::ldexp(double(c.edge_age_max_ticks), c.edge_age_shift), 2147483648.0);
+    ASSERT_EQ(c.edge_age_max_ticks, timer_clock_hz / 10000) << "100 us";
+}
+
 // All the conversions, for one set of parameters.
-void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bits) {
-    const control_parameters_t c = configure_control(&p, &machine_tables, uint32_t(rate_hz), encoder_bits, 12);
+void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bits,
+                      uint32_t timer_clock_hz = fixed_point::TIMER_CLOCK_HZ) {
+    const control_parameters_t c =
+        configure_control(&p, &machine_tables, uint32_t(rate_hz), encoder_bits, 12, timer_clock_hz);
     const auto v = [&](unsigned index) { return value_of(p, index); };
     // Within lsb LSBs of the format, or of 1 in 10^9 for what has more than 30 bits.
     const auto near = [](const char *what, double got, double exact, double lsb) {
@@ -51,7 +63,8 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
                             : traditional || p.values[PARAMETER_BP_MODE] == BP_PID_OFF ? TORQUE_LAW_HYSTERESIS
                                                                                        : TORQUE_LAW_DUTY);
     ASSERT_EQ(c.speed_reference_min_q22, salient ? INT32_MIN : 0);
-    ASSERT_EQ(2.0 * c.period_ticks * rate_hz, double(HAL_PWM_CLOCK_HZ));
+    ASSERT_EQ(2.0 * c.period_ticks * rate_hz, double(timer_clock_hz));
+    expect_edge_timing(c, timer_clock_hz);
     ASSERT_EQ(c.encoder_shift, 32 - encoder_bits);
     ASSERT_EQ(c.encoder_middle, encoder_bits == 32 ? 0u : 1u << (31 - encoder_bits));
     ASSERT_EQ(c.initialise_ticks, uint32_t(rate_hz / 1000.0));
@@ -246,7 +259,8 @@ TEST(Configure, converts_random_sets_of_parameters_within_their_ranges) {
                       PARAMETER_STATUS_DONE);
         }
         SCOPED_TRACE(testing::Message() << "set " << i);
-        ASSERT_NO_FATAL_FAILURE(expect_converted(parameters, RATES_HZ[random() % 5], unsigned(8 + random() % 25)));
+        ASSERT_NO_FATAL_FAILURE(expect_converted(parameters, RATES_HZ[random() % 5], unsigned(8 + random() % 25),
+                                                 TIMER_CLOCKS_HZ[random() % 4]));
     }
 }
 
@@ -255,15 +269,46 @@ TEST(Configure, a_machine_whose_current_hardly_rises_gets_the_largest_gain_and_n
     slow.current_slew_rate_A_s = 1;
     parameters_t parameters;
     parameters_init(&parameters);
-    EXPECT_EQ(configure_control(&parameters, &slow, 100000, 17, 12).duty.incoming_gain_q24, INT32_MAX);
+    EXPECT_EQ(configure_control(&parameters, &slow, 100000, 17, 12, fixed_point::TIMER_CLOCK_HZ).duty.incoming_gain_q24,
+              INT32_MAX);
+}
+
+TEST(Configure, the_rotation_since_an_edge_is_right_for_every_clock_and_on_the_fastest_machine) {
+    const machine_tables_t bundled = machine_tables;
+    parameters_t parameters;
+    parameters_init(&parameters);
+    for (const uint8_t exponent : {0, 3}) {
+        machine_tables.speed_exponent = exponent;
+        for (uint32_t clock_hz = 25000000; clock_hz <= 400000000; clock_hz += 1000000) {
+            const control_parameters_t c = configure_control(&parameters, &machine_tables, 20000, 17, 12, clock_hz);
+            if (exponent == 3 && c.edge_age_max_ticks < clock_hz / 10000) {
+                // Only as old as the product allows, and that is at least 80 us.
+                EXPECT_EQ(c.edge_age_max_ticks, 32767u >> (c.edge_age_shift - 16)) << clock_hz;
+                EXPECT_GE(c.edge_age_max_ticks, clock_hz / 12500) << clock_hz;
+            } else {
+                ASSERT_NO_FATAL_FAILURE(expect_edge_timing(c, clock_hz)) << clock_hz;
+            }
+        }
+    }
+    machine_tables = bundled;
+    const control_parameters_t c = configure_control(&parameters, &machine_tables, 40000, 17, 12, 200000000);
+    EXPECT_EQ(c.edge_angle_per_tick_q51, 1834931565) << "5 ns / (2 pi)";
+    EXPECT_EQ(c.edge_age_shift, 13);
 }
 
 TEST(Configure, allows_the_rates_that_the_timer_makes_exactly) {
     for (uint32_t rate_hz = 0; rate_hz <= 2000000; rate_hz += 1000) {
         const bool listed = std::count(std::begin(RATES_HZ), std::end(RATES_HZ), double(rate_hz)) > 0;
-        EXPECT_EQ(configure_rate_allowed(rate_hz), listed) << rate_hz;
+        EXPECT_EQ(configure_rate_allowed(rate_hz, fixed_point::TIMER_CLOCK_HZ), listed) << rate_hz;
     }
-    EXPECT_FALSE(configure_rate_allowed(UINT32_MAX));
+    EXPECT_FALSE(configure_rate_allowed(UINT32_MAX, fixed_point::TIMER_CLOCK_HZ));
+    EXPECT_TRUE(configure_rate_allowed(40000, 170000000));
+    EXPECT_TRUE(configure_rate_allowed(50000, 25000000));
+    EXPECT_FALSE(configure_rate_allowed(1000000, 25000000)) << "12.5 ticks";
+    EXPECT_FALSE(configure_rate_allowed(40000, 170000001));
+    EXPECT_FALSE(configure_rate_allowed(20000, 24960000)) << "below 25 MHz";
+    EXPECT_TRUE(configure_rate_allowed(20000, 400000000));
+    EXPECT_FALSE(configure_rate_allowed(20000, 400040000)) << "above 400 MHz";
 }
 
 TEST(Configure, every_default_is_within_its_range_and_every_name_fits) {

@@ -145,7 +145,8 @@ TEST_F(Control, counts_of_every_resolution_become_the_nearest_current_and_voltag
     for (unsigned bits = 12; bits <= 16; bits++) {
         parameters_t p;
         parameters_init(&p);
-        parameters = configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, bits);
+        parameters =
+            configure_control(&p, &machine_tables, uint32_t(RATE_HZ), ENCODER_BITS, bits, fixed_point::TIMER_CLOCK_HZ);
         for (uint32_t code = 0; code < 1u << bits; code += 7) {
             sample.adc.phase_current_counts[1] = sample.adc.bus_voltage_counts = uint16_t(code);
             step(COMMAND_OFF);
@@ -573,8 +574,15 @@ TEST_F(SalientControl, the_sliding_mode_uses_the_load_torque_source_of_the_param
 
 TEST_F(SalientControl, the_angle_after_an_edge_is_extrapolated_at_the_observed_speed) {
     for (const double speed : {15.0, 100.0, -15.0, -100.0}) {
-        for (const uint32_t age_ticks : {0u, 1u, 3000u, 20000u}) {
+        for (const auto [age_ticks, clock_hz] : {std::pair{0u, 200000000u},
+                                                 {1u, 200000000u},
+                                                 {3000u, 200000000u},
+                                                 {20000u, 200000000u},
+                                                 {2500u, 25000000u},
+                                                 {8000u, 170000000u},
+                                                 {40000u, 400000000u}}) {
             configure(DRIVE_CONTROLLER_SALIENT);
+            parameters = configured(DRIVE_CONTROLLER_SALIENT, uint32_t(RATE_HZ), ENCODER_BITS, 12, {}, clock_hz);
             speed_rad_s = speed;
             for (int k = 0; k < 4000; k++) {
                 step(COMMAND_OFF);
@@ -587,7 +595,7 @@ TEST_F(SalientControl, the_angle_after_an_edge_is_extrapolated_at_the_observed_s
             step(COMMAND_OFF);
             const double boundary = sample.encoder.counts + (speed > 0.0 ? 0.0 : 1.0);
             const double turns_now =
-                std::ldexp(boundary, -int(ENCODER_BITS)) + known_rad_s * age_ticks * 5e-9 / (2.0 * fixed_point::PI);
+                std::ldexp(boundary, -int(ENCODER_BITS)) + known_rad_s * age_ticks / clock_hz / (2.0 * fixed_point::PI);
             double difference = diagnostics.angle - (turns_now - std::floor(turns_now)) * fixed_point::REV;
             difference -= std::round(difference / fixed_point::REV) * fixed_point::REV;
             EXPECT_NEAR(difference, 0.0, 2.0 + 1e-6 * std::fabs(speed) * age_ticks) << speed << ", " << age_ticks;

@@ -8,12 +8,13 @@
 
 extern "C" {
 #include "plant/plant.h"
+#include "plant/pwm_timer.h"
 }
 
 namespace {
 
 constexpr uint16_t TICKS = 2500; // 40 kHz
-constexpr uint64_t PERIOD_NS = 2 * TICKS * HAL_PWM_TICK_NS;
+constexpr uint64_t PERIOD_NS = 2 * TICKS * PWM_TIMER_TICK_NS;
 constexpr double ALIGNED_H = 23.6e-3;
 
 void set_switches(plant_t &plant, uint16_t upper, uint16_t lower, unsigned phase = 0) {

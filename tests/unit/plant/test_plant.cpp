@@ -8,13 +8,14 @@
 
 extern "C" {
 #include "plant/plant.h"
+#include "plant/pwm_timer.h"
 }
 
 namespace {
 
 constexpr double RAD_PER_DEG = M_PI / 180.0;
 constexpr uint16_t TICKS = 2500; // 40 kHz
-constexpr uint64_t PERIOD_NS = 2 * TICKS * HAL_PWM_TICK_NS;
+constexpr uint64_t PERIOD_NS = 2 * TICKS * PWM_TIMER_TICK_NS;
 
 hal_pwm_compare_t compare_of(std::vector<uint16_t> upper, std::vector<uint16_t> lower) {
     hal_pwm_compare_t compare = {};

@@ -6,6 +6,7 @@
 #include "support/emulator_machines.h"
 
 extern "C" {
+#include "plant/pwm_timer.h"
 #include "plant/sensors.h"
 }
 
@@ -319,7 +320,7 @@ class Edges : public testing::Test {
         const double boundary = sample.counts + (sample.edge_forward ? 0.0 : 1.0);
         const double away_rad = std::remainder(angle_rad - boundary / counts_per_turn * 2.0 * M_PI, 2.0 * M_PI);
         worst_rad = std::max(worst_rad, std::fabs(away_rad));
-        ASSERT_NEAR(sample.edge_age_ticks, (double(plant.time_ns) - edge_ns) / HAL_PWM_TICK_NS, 0.5 + 1e-6);
+        ASSERT_NEAR(sample.edge_age_ticks, (double(plant.time_ns) - edge_ns) / PWM_TIMER_TICK_NS, 0.5 + 1e-6);
         ASSERT_EQ(sample.edge_forward, at_edge.speed_rad_s > 0.0);
     }
 
@@ -385,7 +386,7 @@ TEST_F(Edges, AreEquallyAccurateWithOneEdgeInSeveralPeriods) {
         period();
         if (known && edges == seen) {
             aged++;
-            ASSERT_EQ(sample.edge_age_ticks, before_ticks + PERIOD_NS / HAL_PWM_TICK_NS);
+            ASSERT_EQ(sample.edge_age_ticks, before_ticks + PERIOD_NS / PWM_TIMER_TICK_NS);
         }
     }
     EXPECT_NEAR(edges, 8000 * 25e-6 * 0.02 / (2.0 * M_PI) * counts_per_turn, 1.0);
@@ -451,7 +452,7 @@ TEST_F(Edges, AgeSaturates) {
     period();
     ASSERT_TRUE(sample.edge_known);
     plant.speed_rad_s = 0.0;
-    plant.time_ns += UINT64_C(0x7FFFFFFE) * HAL_PWM_TICK_NS - sample.edge_age_ticks * HAL_PWM_TICK_NS;
+    plant.time_ns += UINT64_C(0x7FFFFFFE) * PWM_TIMER_TICK_NS - sample.edge_age_ticks * PWM_TIMER_TICK_NS;
     latch();
     EXPECT_NEAR(sample.edge_age_ticks, 0x7FFFFFFE, 1);
     plant.time_ns += UINT64_C(100000000000);
@@ -469,7 +470,7 @@ TEST_F(Edges, AreAbsentWhileTheEncoderIsFrozenAndNotReportedLater) {
         period();
         EXPECT_EQ(sample.counts, counts);
         EXPECT_TRUE(sample.edge_known);
-        EXPECT_EQ(sample.edge_age_ticks, age_ticks + k * PERIOD_NS / HAL_PWM_TICK_NS);
+        EXPECT_EQ(sample.edge_age_ticks, age_ticks + k * PERIOD_NS / PWM_TIMER_TICK_NS);
     }
     sensors.encoder_fault = SENSORS_ENCODER_HEALTHY;
     plant_advance(&plant, plant.time_ns + PERIOD_NS);

@@ -1,6 +1,10 @@
 // RIG_SET: its effect, its time and its reply; the truth frames; the interrupt that takes time.
 #include "support/rig_bench.h"
 
+extern "C" {
+#include "plant/pwm_timer.h"
+}
+
 namespace {
 
 constexpr uint64_t MS = 1000000;
@@ -358,7 +362,7 @@ TEST_F(BenchVariables, EdgesAreCapturedWhileTriggersAreMissed) {
     // 5 rad/s: a count of 48 urad each 10 us.
     EXPECT_GE(bench.rig->board.encoder.counts, read.counts + 5);
     EXPECT_TRUE(bench.rig->board.encoder.edge_known);
-    EXPECT_LT(bench.rig->board.encoder.edge_age_ticks * HAL_PWM_TICK_NS, 12000u);
+    EXPECT_LT(bench.rig->board.encoder.edge_age_ticks * PWM_TIMER_TICK_NS, 12000u);
 }
 
 TEST_F(BenchVariables, InterruptOfExactlyAPeriodStarvesTheBackground) {

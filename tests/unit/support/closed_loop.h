@@ -42,7 +42,8 @@ struct setup_t {
             values.values[index] =
                 fixed_point::to_fixed(value, std::ldexp(1.0, machine_tables.parameter_fraction_bits[index]));
         }
-        return configure_control(&values, &machine_tables, rate_hz, encoder_bits, adc_bits);
+        return configure_control(&values, &machine_tables, rate_hz, encoder_bits, adc_bits,
+                                 fixed_point::TIMER_CLOCK_HZ);
     }
 };
 
@@ -161,7 +162,7 @@ template <typename drive_t> class Bench {
 
     void run_until(double time_s) {
         const uint64_t period_ns = 1000000000u / rate_hz;
-        const auto ticks = uint16_t(HAL_PWM_CLOCK_HZ / (2u * rate_hz));
+        const auto ticks = uint16_t(fixed_point::TIMER_CLOCK_HZ / (2u * rate_hz));
         const auto to_ns = uint64_t(std::llround(time_s * 1e9));
         while (plant.time_ns + period_ns <= to_ns) {
             plant_advance(&plant, plant.time_ns + period_ns);

@@ -11,6 +11,7 @@ namespace fixed_point {
 constexpr double PI = 3.14159265358979323846;
 constexpr double REV = 4294967296.0; // 2^-32 rev, mechanical or electrical
 constexpr uint32_t HALF_REV_Q32 = 0x80000000u;
+constexpr uint32_t TIMER_CLOCK_HZ = 200000000; // of the board, as the emulator's
 
 constexpr double one(int fraction_bits) {
     return double(int64_t(1) << fraction_bits);

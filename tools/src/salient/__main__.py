@@ -61,9 +61,14 @@ def _test(options: argparse.Namespace) -> int:
 
 def _sim(options: argparse.Namespace) -> int:  # noqa: RET503 - os.execv does not return
     from salient.bench.programs import EmulatorError, command_line
+    from salient.machine.cache import machine_image
+    from salient.machine.path import machine_path, stated_conditions
 
+    image = machine_image(options.machine)  # checks the file
+    stated = stated_conditions(machine_path(options.machine))
+    given = {name: value for name, value in vars(options).items() if name in OPTIONS and value is not None}
     try:
-        command = command_line(BenchConfig(**{name: value for name, value in vars(options).items() if name in OPTIONS}))
+        command = command_line(BenchConfig(**{**stated, **given, "machine_image": image}))
     except EmulatorError as error:
         print(f"salient: {error}", file=sys.stderr)
         return 1

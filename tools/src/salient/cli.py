@@ -59,6 +59,7 @@ def make_parser() -> argparse.ArgumentParser:
 
     sim = command("sim", "the drive and its test bench until interrupted; prints one JSON line when ready")
     _add_bench_options(sim, "sim")
+    sim.set_defaults(**{name: None for name in CONDITIONS if name != "machine"})  # as the machine file states
 
     run = command("run", "one scenario, to a folder")
     run.add_argument("scenario", type=Path, metavar="SCENARIO.toml")

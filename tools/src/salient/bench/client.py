@@ -19,6 +19,9 @@ class Client(Protocol):
     drive_database: Database
     """The DBC of the drive."""
 
+    def require_drive_database(self) -> None:
+        """Raises an exception when the drive is known to have another DBC."""
+
     def send(self, message: can.Message) -> None:
         """Sends a frame."""
 

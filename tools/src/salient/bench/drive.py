@@ -13,7 +13,7 @@ from cantools.database.can import Message
 from salient.bench.client import Client, KnownAttributes
 from salient.bus import e2e
 from salient.bus.signals import drive_database, signal_range, value_numbers
-from salient.errors import RunFailed
+from salient.errors import RunFailed, UsageError
 
 _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
 _TORQUE_COMMAND = drive_database().get_message_by_name("DRIVE_TORQUE_COMMAND")
@@ -32,6 +32,10 @@ _OPERATIONS = value_numbers(drive_database(), "PARAMETER_REQUEST", "operation")
 
 class DriveError(Exception):
     """The drive rejected a request or did not respond; the message has the reason."""
+
+
+class OtherDatabase(DriveError, UsageError):
+    """A reference for a drive whose DBC is not that of the session: the drive would take it for another one."""
 
 
 class DriveNotReady(DriveError, RunFailed):
@@ -60,7 +64,8 @@ def _protected(command: Message, counter: int, request: str, reference: Mapping[
 class Drive(KnownAttributes):
     """Commands a drive. Assigning speed_reference_rpm or torque_reference_Nm requests run in speed or torque mode; the
     command is sent immediately and then every COMMAND_PERIOD_NS as the session's time advances, until `silence`.
-    Nothing is sent before the first request.
+    Nothing is sent before the first request. OtherDatabase instead of a request to run when the drive's DBC is another
+    than that of the session (Session.require_drive_database); off, stop and clear_fault have no scaling.
     """
 
     command_due_ns: int | None
@@ -131,6 +136,12 @@ class Drive(KnownAttributes):
         """Repeats the present request now; the next is due a period later."""
         if self._request is None:
             raise DriveError("no request to repeat")
+        if self._request == "run":
+            try:
+                self._session.require_drive_database()
+            except OtherDatabase:
+                self.silence()
+                raise
         counter = self._counter[self._torque_mode]
         if self._torque_mode:
             self._session.send(torque_command_frame(counter, self._request, self._torque_reference_Nm,

@@ -17,7 +17,7 @@ import can
 from cantools.database.can import Database
 
 from salient.bench.client import KnownAttributes
-from salient.bench.drive import Drive, ParameterRow
+from salient.bench.drive import Drive, OtherDatabase, ParameterRow
 from salient.bench.rig import Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
 from salient.bus.signals import SignalTable, drive_database, rig_database
@@ -27,6 +27,8 @@ _ALIVE_CHECK_S = 1.0
 """Wall time between two checks that the emulator is alive; a debugger may stop it for any time."""
 
 _POLL_STEP_NS = 500_000
+_IDENTITY_WAIT_NS = 250_000_000
+"""More than two periods of DRIVE_IDENTITY."""
 _IDENTITY = drive_database().get_message_by_name("DRIVE_IDENTITY")
 
 
@@ -41,7 +43,8 @@ class Session(KnownAttributes):
     session follows it by the times of received frames. is_alive: the emulator has not ended; without it the end of the
     emulator is seen on a local bus only. A session waits for the emulator for any wall time, as at a breakpoint.
 
-    machine: name or file of the drive's machine, whose DBC the session then uses; without it that in SI units.
+    machine: name or file of the drive's machine, whose DBC the session then uses; without it that in SI units. To a
+    drive that reports another DBC no reference is sent (OtherDatabase); its frames are decoded, after a warning.
 
     time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. telemetry, truth:
     signals of the drive and of the test bench by name.
@@ -71,6 +74,7 @@ class Session(KnownAttributes):
         self._is_alive = is_alive
         self._sequence = 0
         self._identity_checked = False
+        self._other_database = ""
         self._bus = open_bus(address)
         self._reader = VirtualTimeReader(self._bus)
         try:
@@ -167,6 +171,16 @@ class Session(KnownAttributes):
             seen = len(self.log)
         raise TimeoutError(f"no matching frame within {timeout_s:g} s")
 
+    def require_drive_database(self) -> None:
+        """OtherDatabase when the drive has reported another DBC than that of the session. Waits for its first report
+        where time moves by itself; in lock-step time belongs to the caller, and the report may come up to 100 ms later.
+        """
+        deadline_ns = self.time_ns + _IDENTITY_WAIT_NS
+        while not (self._lockstep or self._identity_checked) and self.time_ns < deadline_ns:
+            self._receive()
+        if self._other_database:
+            raise OtherDatabase(f"{self._other_database}: a reference would be another one; state the drive's machine")
+
     def receive_until(self, matches: Callable[[can.Message], bool]) -> can.Message:
         """Receives until a frame matches; in lock-step virtual time does not pass."""
         while True:
@@ -228,8 +242,6 @@ class Session(KnownAttributes):
         expected = database_hash(self.drive_database)
         if identity["dbc_hash"] != expected:
             version = ".".join(str(identity[f"firmware_{part}"]) for part in ("major", "minor", "patch"))
-            print(
-                f"salient: {self.address}: firmware {version} was built from another drive.dbc "
-                f"(hash {identity['dbc_hash']:08x}, here {expected:08x}): signals may be decoded wrongly",
-                file=sys.stderr,
-            )
+            self._other_database = (f"{self.address}: firmware {version} was built from another drive.dbc "
+                                    f"(hash {identity['dbc_hash']:08x}, here {expected:08x})")
+            print(f"salient: {self._other_database}: signals may be decoded wrongly", file=sys.stderr)

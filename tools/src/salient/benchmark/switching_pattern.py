@@ -20,7 +20,7 @@ from salient.machine.file import load_machine, machine_path
 from salient.paths import BUILD, ROOT
 
 TICK_NS = 5
-"""HAL_PWM_TICK_NS of hal/hal_pwm.h."""
+"""PWM_TIMER_TICK_NS of emulator/plant/pwm_timer.h."""
 
 _PHASES_MAX = 4
 _SETTLE_S = 0.2

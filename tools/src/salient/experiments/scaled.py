@@ -34,6 +34,7 @@ class Scale:
     speed: float = 1.0
     torque: float = 1.0
     speed_max_rpm: float = math.inf
+    torque_max_Nm: float = math.inf
     start_s_per_rpm: float = 0.0
     electrical_Hz_per_rpm: float = math.inf
 
@@ -45,6 +46,12 @@ class Scale:
     def Nm(self, paper_Nm: float) -> float:
         """The machine's torque for one of the paper's, two significant digits."""
         return _rounded(paper_Nm, self.torque)
+
+    def reference_Nm(self, paper_Nm: float) -> float:
+        """The machine's torque reference for one of the paper's, at most its torque limit: the range on CAN is the
+        machine's."""
+        torque_Nm = self.Nm(paper_Nm)
+        return math.copysign(min(abs(torque_Nm), self.torque_max_Nm), torque_Nm)
 
     def window_s(self, speed_rpm: float) -> float:
         """Length of a window of steady torque: the paper's, at least an electrical revolution."""
@@ -63,6 +70,7 @@ def scale_of(machine: Machine) -> Scale:
         speed=data.speed_base_rpm / PAPER_BASE_RPM,
         torque=data.torque_rated_Nm / PAPER_RATED_NM,
         speed_max_rpm=data.speed_max_rpm,
+        torque_max_Nm=data.parameters["torque_max_Nm"],
         start_s_per_rpm=machine.inertia_kg_m2 * math.pi / 30.0 / data.parameters["torque_max_Nm"],
         electrical_Hz_per_rpm=machine.rotor_poles / 60.0,
     )
@@ -95,7 +103,8 @@ def in_terms_of(scenario: Scenario, scale: Scale, delay_s: float, longer_s: floa
     return replace(
         scenario, record=record,
         speed=tuple(SpeedStep(step.at_s, scale.rpm(step.value_rpm)) for step in scenario.speed),
-        torque=tuple(TorqueStep(later_s(step.at_s, delay_s), scale.Nm(step.value_Nm)) for step in scenario.torque),
+        torque=tuple(TorqueStep(later_s(step.at_s, delay_s), scale.reference_Nm(step.value_Nm))
+                     for step in scenario.torque),
         load=tuple(LoadStep(later_s(load.at_s, delay_s), scale.Nm(load.torque_Nm),
                             None if load.profile_Nm is None else scale.Nm(load.profile_Nm)) for load in scenario.load),
         duration_s=later_s(scenario.duration_s, delay_s + longer_s))

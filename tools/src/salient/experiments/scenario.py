@@ -5,7 +5,7 @@
     duration_s = 0.4
     load_profile = "compressor_one_cylinder"  # optional: torque over the rotor angle, tools/loads or path of a CSV file
     seed = 1                                # optional, as everything below; other fields of
-    control_rate_hz = 40000                 # salient.config.Conditions likewise
+    control_rate_hz = 40000                 # salient.config.Conditions likewise, also in [drive] of the machine file
 
     [parameters]                            # parameters of the drive by name, in their units
     torque_max_Nm = 19.1
@@ -61,6 +61,7 @@ from salient.experiments.load_profile import load_profile_path, read_load_profil
 from salient.experiments.metrics import losses
 from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
+from salient.machine.path import stated_conditions
 from salient.toml_file import Table, TextFileError, any_number, number, one_of, option, read_toml, validate
 
 
@@ -387,6 +388,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
         _check_reference(path, machine, "DRIVE_TORQUE_COMMAND.torque_reference_Nm", "torque.value_Nm", step.value_Nm)
     profile = _load_profile_of(path, file.load_profile) if file.load_profile is not None else None
     common: dict[str, Any] = {name: getattr(file, name) for name in CONDITIONS if name in type(file).model_fields}
+    common |= {name: value for name, value in stated_conditions(machine_path(machine)).items() if name not in data}
     common |= {
         "name": path.stem,
         "machine": machine,

@@ -6,8 +6,11 @@ import than the drive to start.
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
+from typing import Any
 
+from salient.config import CONDITIONS
 from salient.errors import UsageError
 from salient.paths import MACHINES, bundled_or_path
 
@@ -22,3 +25,10 @@ def machine_path(name_or_path: str) -> Path:
         return bundled_or_path(name_or_path, MACHINES, ".toml", "machine")
     except UsageError as error:
         raise MachineError(str(error)) from None
+
+
+def stated_conditions(path: Path) -> dict[str, Any]:
+    """Control rate and sensors that the table [drive] of a machine file states, by the name of their option. The file
+    must be a checked one, as that of a machine_image."""
+    drive = tomllib.loads(path.read_text(encoding="utf-8-sig")).get("drive", {})
+    return {name: value for name, value in drive.items() if name in CONDITIONS}

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from salient.config import CONTROLLERS
+from salient.config import CONDITIONS, CONTROLLERS
 from salient.experiments.compare import every_machine, random_cases, range_cases
 from salient.experiments.compare.case import (
     LOAD_NM,
@@ -353,8 +353,8 @@ def scenario_toml(case: Case) -> str:
     plain = Scenario(name="", duration_s=0.0)
     tables: list[tuple[str, Mapping[str, float]]] = []
     for key, value in vars(scenario).items():
-        if key in ("name", "machine", "controller") or value == getattr(plain, key):
-            continue
+        if key in ("name", "machine", "controller") or (key not in CONDITIONS and value == getattr(plain, key)):
+            continue  # what is left out of the conditions would be that of the machine file
         if isinstance(value, Mapping):
             tables.append((f"[{key}]", value))
         elif isinstance(value, tuple):

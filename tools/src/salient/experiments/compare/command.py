@@ -15,8 +15,9 @@ from salient.experiments.compare import baseline, finished_runs, results_file, s
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS, TITLES, scenario_toml
 from salient.experiments.compare.finished_runs import FinishedRuns
-from salient.experiments.compare.machine import Subject, cases_of, subject
+from salient.experiments.compare.machine import Subject, cases_of, subject, targets_of
 from salient.experiments.compare.runner import RunMetrics, run_all
+from salient.experiments.compare.targets import TARGETS
 from salient.machine.cache import machine_image
 from salient.machine.file import MachineError
 
@@ -31,10 +32,11 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
                           for name, group in GROUPS.items())
         return 0
     cases = _cases(options.groups, options.quick)
-    titles = TITLES
+    titles, targets = TITLES, TARGETS
     if options.machine is not None:
         on = _subject(options.machine)
         cases, titles = cases_of(cases, on), {name: on.text(title) for name, title in titles.items()}
+        targets = TARGETS if on.is_bundled else targets_of(on)
     cases = _first_samples(cases, options.samples)
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
     _prepare_folder(options.out, options.resume)
@@ -42,7 +44,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
         machine_image(machine)
     finished = FinishedRuns(options.out / finished_runs.NAME)
     runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr, finished)
-    rows = table.make_rows(runs)
+    rows = table.make_rows(runs, targets)
     changes: list[baseline.Change] = []
     change_summary = None
     if earlier is not None:
@@ -111,7 +113,7 @@ def _write_failed(folder: Path, runs: Sequence[RunMetrics]) -> list[tuple[RunMet
     for run in runs:
         if not run.failed:
             continue
-        path = folder / f"{'_'.join(_name(run.case).replace(',', '').split())}.toml"
+        path = folder / f"{_file_name(run.case)}.toml"
         path.write_text(scenario_toml(run.case), encoding="utf-8")
         written.append((run, path))
     return written
@@ -119,6 +121,11 @@ def _write_failed(folder: Path, runs: Sequence[RunMetrics]) -> list[tuple[RunMet
 
 def _name(case: Case) -> str:
     return " ".join(f"{case.group} {case.condition} {case.sample} {case.controller}".split())
+
+
+def _file_name(case: Case) -> str:
+    """The name without spaces, commas and the slash of a unit."""
+    return "_".join(_name(case).replace(",", "").replace("/", "_").split())
 
 
 def _command(options: argparse.Namespace) -> str:

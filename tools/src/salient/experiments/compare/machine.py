@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -11,6 +11,7 @@ from salient.bench.rig import bench_variables
 from salient.experiments.compare import every_machine
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import DYNAMOMETER_RPM_S, RIPPLE_RPM, STROKE_DEG
+from salient.experiments.compare.targets import TARGETS, Key, Target
 from salient.experiments.metrics import stroke_deg
 from salient.experiments.scaled import PAPER_WINDOW_S, Scale, fastest_rpm, in_terms_of, later_s, scale_of
 from salient.experiments.scenario import Scenario
@@ -18,8 +19,17 @@ from salient.machine.definition import Machine
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 from salient.machine.parameter_table import read_table
+from salient.paths import MACHINES
 
 PAPER = "saturating"
+
+_RELATIVE: dict[tuple[str, str], Callable[[Scale], float]] = {
+    **dict.fromkeys((("inertia", "recovery_ratio"), ("inertia", "swing_percent"), ("inertia", "overshoot_percent"),
+                     ("encoders", "failed"), ("encoders", "against_periods"), ("misalignment", "ripple_6s_ratio")),
+                    lambda scale: 1.0),
+    ("standing_error", "mean_error_rpm"): lambda scale: scale.speed,
+}
+"""Group and metric of the targets that mean the same for every machine, and the factor of the limit."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +40,11 @@ class Subject:
     machine: Machine
     scale: Scale
     factors: Mapping[str, float]
+
+    @property
+    def is_bundled(self) -> bool:
+        """It is one of the machines that the targets are about, whatever a file of the same name contains."""
+        return machine_path(self.path).parent == MACHINES
 
     def text(self, text: str) -> str:
         """A title or condition with the machine's speeds and torques."""
@@ -64,6 +79,15 @@ def cases_of(cases: Iterable[Case], on: Subject) -> list[Case]:
             sized[case.controller] = replace(case, condition=on.machine.name, scenario=every_machine.scenario(
                 machine_path(on.path), case.controller))
     return [*of_paper, *sized.values()]
+
+
+def targets_of(on: Subject) -> dict[Key, Target]:
+    """The targets of the paper's machine that are relative, for another. The rest are values measured with the paper's
+    machine: no statement about another."""
+    return {(group, on.text(condition), metric, statistic): replace(
+                target, limit=None if target.limit is None else target.limit * _RELATIVE[group, metric](on.scale))
+            for (group, condition, metric, statistic), target in TARGETS.items()
+            if (group, metric) in _RELATIVE and condition.split(",")[0] == PAPER}
 
 
 def _case(case: Case, on: Subject) -> Case:

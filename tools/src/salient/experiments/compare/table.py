@@ -56,7 +56,7 @@ class Row:
         return f"{label}, {metric.unit}" if metric.unit else label
 
 
-def make_rows(runs: Iterable[RunMetrics]) -> list[Row]:
+def make_rows(runs: Iterable[RunMetrics], targets: Mapping[Key, Target] = TARGETS) -> list[Row]:
     """All rows, in the order of groups, conditions and metrics."""
     conditions: dict[tuple[str, str], dict[str, list[RunMetrics]]] = {}
     for run in runs:
@@ -65,13 +65,14 @@ def make_rows(runs: Iterable[RunMetrics]) -> list[Row]:
     rows = []
     for (group, condition), by_controller in conditions.items():
         for metric, statistic in GROUPS[group].columns:
-            row = _row((group, condition, metric, statistic), by_controller)
+            row = _row((group, condition, metric, statistic), by_controller, targets)
             if row is not None:
                 rows.append(row)
     return rows
 
 
-def _row(key: Key, by_controller: Mapping[str, Sequence[RunMetrics]]) -> Row | None:
+def _row(key: Key, by_controller: Mapping[str, Sequence[RunMetrics]],
+         targets: Mapping[Key, Target]) -> Row | None:
     """None when no run has the metric, though some have metrics."""
     _, _, metric, statistic = key
     values: dict[str, float | None] = {}
@@ -89,7 +90,7 @@ def _row(key: Key, by_controller: Mapping[str, Sequence[RunMetrics]]) -> Row | N
             values[controller] = _statistic(statistic, samples)
     if not values and len(failed) < len(by_controller):
         return None
-    target = target_of(key)
+    target = target_of(targets, key)
     return Row(key, values, failed, target, len(by_controller.get(target.controller, ())))
 
 

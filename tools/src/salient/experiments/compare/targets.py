@@ -207,7 +207,7 @@ _EVERY_CONDITION = {("machines", "ripple_to_allowed", ""): Target(1.0)}
 """By group, metric and statistic: conditions are machines, also of the user."""
 
 
-def target_of(key: Key) -> Target:
-    """The reference values of a row, none for most."""
+def target_of(targets: Mapping[Key, Target], key: Key) -> Target:
+    """The reference values of a row, none for most. targets: those that the conditions of a machine have."""
     group, _, metric, statistic = key
-    return TARGETS.get(key) or _EVERY_CONDITION.get((group, metric, statistic), Target())
+    return targets.get(key) or _EVERY_CONDITION.get((group, metric, statistic), Target())
