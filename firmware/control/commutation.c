@@ -1,5 +1,7 @@
 #include "control/commutation.h"
 
+#include "fixed/compiler.h"
+
 /* 2^32 / phases as (2^32 - phases) / phases + 1, for a 32-bit division. */
 uint32_t commutation_stroke(unsigned phases) {
     return (0u - phases) / phases + 1u;
@@ -29,14 +31,17 @@ void commutation_find(const commutation_parameters_t *parameters, uint32_t rotor
     const uint32_t since_phase_0_on = electrical - parameters->turn_on;
     const unsigned newest = (unsigned)(((uint64_t)since_phase_0_on * parameters->phases) >> 32);
     const uint32_t since_on = since_phase_0_on - newest * parameters->stroke;
+    unsigned active = COMMUTATION_NONE;
+    unsigned outgoing = COMMUTATION_NONE;
     if (since_on < parameters->active_width) {
-        commutation->active = newest;
-        commutation->outgoing = COMMUTATION_NONE;
+        active = newest;
+        const unsigned previous = LIKELY(newest > 0) ? newest - 1 : parameters->phases - 1;
         if (since_on + parameters->stroke < parameters->available_width) { /* at most two strokes: no overflow */
-            commutation->outgoing = (newest > 0 ? newest : parameters->phases) - 1;
+            outgoing = previous;
         }
-    } else {
-        commutation->active = COMMUTATION_NONE;
-        commutation->outgoing = since_on < parameters->available_width ? newest : COMMUTATION_NONE;
+    } else if (since_on < parameters->available_width) {
+        outgoing = newest;
     }
+    commutation->active = active;
+    commutation->outgoing = outgoing;
 }

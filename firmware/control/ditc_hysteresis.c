@@ -15,21 +15,16 @@ void ditc_hysteresis_reset(int32_t duty_q15[HAL_PHASES_MAX]) {
     }
 }
 
-static int32_t single_state(const ditc_hysteresis_parameters_t *parameters, int32_t state, int32_t error_q24) {
-    if (error_q24 > parameters->band_inner_q24) {
+/* The only phase, or with `supporting` the incoming one beside an outgoing one that conducts. */
+static int32_t active_state(const ditc_hysteresis_parameters_t *parameters, int32_t state, int32_t error_q24,
+                            bool supporting) {
+    if (error_q24 > (supporting ? parameters->band_outer_q24 : parameters->band_inner_q24)) {
         return ON;
     }
-    if (error_q24 < -parameters->band_outer_q24) {
+    if (!supporting && error_q24 < -parameters->band_outer_q24) {
         return OFF;
     }
-    return error_q24 < -parameters->band_inner_q24 || state < 0 ? 0 : state;
-}
-
-static int32_t incoming_state(const ditc_hysteresis_parameters_t *parameters, int32_t state, int32_t error_q24) {
-    if (error_q24 > parameters->band_outer_q24) {
-        return ON;
-    }
-    return error_q24 < 0 || state < 0 ? 0 : state;
+    return error_q24 < (supporting ? 0 : -parameters->band_inner_q24) || state < 0 ? 0 : state;
 }
 
 static int32_t outgoing_state(const ditc_hysteresis_parameters_t *parameters, int32_t state, int32_t error_q24) {
@@ -39,8 +34,7 @@ static int32_t outgoing_state(const ditc_hysteresis_parameters_t *parameters, in
     if (error_q24 < -parameters->band_inner_q24) {
         return OFF;
     }
-    const bool crossed_zero = (state > 0 && error_q24 <= 0) || (state < 0 && error_q24 >= 0);
-    return crossed_zero ? 0 : state;
+    return (state ^ error_q24) < 0 || error_q24 == 0 ? 0 : state; /* 0: the error has returned through zero */
 }
 
 typedef struct {
@@ -51,7 +45,7 @@ typedef struct {
 /* While the rotor turns backwards, the back-EMF drives the current of a freewheeling phase further up. */
 static limit_t limit_of(const ditc_hysteresis_parameters_t *parameters, bool backwards) {
     const int32_t limit_q9 = parameters->current_limit_q9;
-    return backwards ? (limit_t){limit_q9 - limit_q9 / 4, OFF} : (limit_t){limit_q9, 0};
+    return backwards ? (limit_t){limit_q9 - (limit_q9 >> 2), OFF} : (limit_t){limit_q9, 0};
 }
 
 static int32_t limit_current(limit_t limit, int32_t state, int32_t current_q9) {
@@ -72,17 +66,15 @@ void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, const 
             limit_current(limit, outgoing_state(parameters, duty_q15[outgoing], torque_error_q24), outgoing_current_q9);
         outgoing_conducts = outgoing_current_q9 > 0;
     }
-    int32_t active_next = OFF;
-    if (active != COMMUTATION_NONE) {
-        active_next = outgoing_conducts ? incoming_state(parameters, duty_q15[active], torque_error_q24)
-                                        : single_state(parameters, duty_q15[active], torque_error_q24);
-        active_next = limit_current(limit, active_next, current_q9[active]);
+    if (active == COMMUTATION_NONE) {
+        ditc_hysteresis_reset(duty_q15);
+    } else {
+        const int32_t state = active_state(parameters, duty_q15[active], torque_error_q24, outgoing_conducts);
+        const int32_t active_next = limit_current(limit, state, current_q9[active]);
+        ditc_hysteresis_reset(duty_q15);
+        duty_q15[active] = active_next;
     }
-    ditc_hysteresis_reset(duty_q15);
     if (outgoing != COMMUTATION_NONE) {
         duty_q15[outgoing] = outgoing_next;
-    }
-    if (active != COMMUTATION_NONE) {
-        duty_q15[active] = active_next;
     }
 }

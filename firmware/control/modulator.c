@@ -15,7 +15,9 @@ void modulate(const int32_t duty_q15[], unsigned phases, uint16_t period_ticks, 
             (duty_q15[phase] * period_ticks + (MODULATOR_DUTY_ONE_Q15 * period_ticks + rounding)) >> 15;
         const int32_t beyond = both - lower_alone;
         const int32_t upper = (beyond > 0 ? beyond : 0) >> halving;
+        int32_t lower = both - upper;
+        IN_REGISTER(lower); /* a difference of 32 bits, of which 16 are stored */
         compare->upper[phase] = (uint16_t)upper;
-        compare->lower[phase] = (uint16_t)(both - upper);
+        compare->lower[phase] = (uint16_t)lower;
     }
 }

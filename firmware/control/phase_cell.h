@@ -79,15 +79,14 @@ ALWAYS_INLINE phase_cell_curve_t phase_cell_curve(int32_t low_q14, int32_t high_
 ALWAYS_INLINE void phase_cell_locate(const machine_tables_t *tables, uint32_t distance, int32_t column,
                                      phase_cell_t *cell) {
     const phase_map_lookup_t lookup = phase_map_lookup(tables, distance);
-    const uint32_t low = phase_map_index(&lookup, (uint32_t)column);
-    const uint32_t high = low + MACHINE_TO_NEXT_COLUMN;
+    const phase_map_nodes_t low = phase_map_nodes(&lookup, (uint32_t)column);
     const int32_t low_q9 = column * (1 << MACHINE_COLUMN_BITS);
     cell->located = true;
     cell->column = column;
-    cell->torque =
-        phase_cell_curve(phase_map_torque_value_q14(&lookup, low), phase_map_torque_value_q14(&lookup, high), low_q9);
-    cell->flux =
-        phase_cell_curve(phase_map_flux_value_q14(&lookup, low), phase_map_flux_value_q14(&lookup, high), low_q9);
+    cell->torque = phase_cell_curve(phase_map_torque_value_q14(&lookup, &low, 0),
+                                    phase_map_torque_value_q14(&lookup, &low, MACHINE_TO_NEXT_COLUMN), low_q9);
+    cell->flux = phase_cell_curve(phase_map_flux_value_q14(&lookup, &low, 0),
+                                  phase_map_flux_value_q14(&lookup, &low, MACHINE_TO_NEXT_COLUMN), low_q9);
     const int32_t ratio_q13 = phase_cell_quotient_q13(cell->flux.curvature, cell->flux.rise, PHASE_CELL_RATIO_BITS);
     const int32_t curvature =
         cell->torque.curvature - 2 * fixed_multiply_high(cell->torque.rise, ratio_q13 * (1 << 18));

@@ -6,11 +6,12 @@ static inline uint32_t index_of(const phase_map_lookup_t *lookup, int32_t curren
 
 int32_t phase_map_torque(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9) {
     const phase_map_lookup_t lookup = phase_map_lookup(tables, phase_map_distance(phase_angle));
-    const uint32_t index = index_of(&lookup, current_q9);
+    const phase_map_nodes_t nodes = phase_map_nodes(&lookup, (uint32_t)current_q9 >> MACHINE_COLUMN_BITS);
     const int32_t torque =
-        phase_map_between(phase_map_torque_value_q14(&lookup, index),
-                          phase_map_torque_value_q14(&lookup, index + MACHINE_TO_NEXT_COLUMN), current_q9);
-    return phase_map_mirrored(phase_angle) ? -torque : torque;
+        phase_map_between(phase_map_torque_value_q14(&lookup, &nodes, 0),
+                          phase_map_torque_value_q14(&lookup, &nodes, MACHINE_TO_NEXT_COLUMN), current_q9);
+    const int32_t sign = (int32_t)(phase_angle - HALF_REV) >> 31; /* -1 in the mirrored half: -t is ~t + 1 */
+    return (torque ^ sign) - sign;
 }
 
 int32_t phase_map_torque_slope_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,

@@ -13,6 +13,7 @@
 #define CONTROL_PHASE_MAP_H
 
 #include <stdbool.h>
+#include <stddef.h>
 #include <stdint.h>
 
 #include "control/machine_tables.h"
@@ -38,6 +39,16 @@ ALWAYS_INLINE uint32_t phase_map_distance(uint32_t phase_angle) {
     return (uint32_t)fixed_abs((int32_t)(phase_angle - HALF_REV));
 }
 
+/* An array of the tables, of a type, moved by a number of bytes: entries at constant distances are one load each. */
+#define PHASE_MAP_MOVED(type, tables, array, bytes)                                                                    \
+    ((const type *)(const void *)(phase_map_moved(tables, bytes) + offsetof(machine_tables_t, array)))
+
+ALWAYS_INLINE const char *phase_map_moved(const machine_tables_t *tables, int32_t bytes) {
+    const char *moved = (const char *)tables + bytes;
+    IN_REGISTER(moved);
+    return moved;
+}
+
 /* True in the half of an electrical revolution in which the torque is negative. */
 ALWAYS_INLINE bool phase_map_mirrored(uint32_t phase_angle) {
     return phase_angle < HALF_REV;
@@ -55,14 +66,14 @@ ALWAYS_INLINE phase_map_lookup_t phase_map_lookup(const machine_tables_t *tables
     int32_t row = tables->angle_bin_row[distance >> MACHINE_ANGLE_BIN_BITS];
     row += phase_map_before_row(tables, row + 1, distance);
     row += phase_map_before_row(tables, row + 2, distance);
-    row += 2;
-    const machine_row_t *at = &tables->row[row];
+    const machine_row_t *before = PHASE_MAP_MOVED(machine_row_t, tables, row, row * (int32_t)sizeof(machine_row_t));
+    const machine_row_t *at = before + 2;
     /* The reciprocal is rounded down and the distance within the row is below its width: at most one after rounding. */
     const int32_t fraction_q14 = fixed_multiply_high((int32_t)(distance - at->start), at->reciprocal);
     const int32_t curvature_q14 = (fraction_q14 * (ONE_Q14 - fraction_q14)) >> 14;
     return (phase_map_lookup_t){
         .tables = tables,
-        .row = (uint32_t)row,
+        .row = (uint32_t)row + 2,
         .weights_q14 = (uint32_t)(ONE_Q14 - fraction_q14) | (uint32_t)fraction_q14 << 16,
         .torque_curvature_q14 = curvature_q14 << tables->torque_format.curvature_shift,
         .flux_curvature_q14 = curvature_q14 << tables->flux_format.curvature_shift,
@@ -74,16 +85,32 @@ ALWAYS_INLINE uint32_t phase_map_index(const phase_map_lookup_t *lookup, uint32_
     return lookup->row + column * MACHINE_TO_NEXT_COLUMN;
 }
 
-/* T / i and psi / i at an index, in node LSBs, Q14: the nodes' part is below 2^30, the curvature's within 2^27. */
-ALWAYS_INLINE int32_t phase_map_torque_value_q14(const phase_map_lookup_t *lookup, uint32_t index) {
-    return dual16_multiply_add(&lookup->tables->node[index], lookup->weights_q14, MACHINE_NODE_OFFSET << 14) -
-           lookup->tables->curvature[index] * lookup->torque_curvature_q14;
+/* Nodes and curvatures at a column and row, from the torque of that column on. */
+typedef struct {
+    const int16_t *node;
+    const int8_t *curvature;
+} phase_map_nodes_t;
+
+ALWAYS_INLINE phase_map_nodes_t phase_map_nodes(const phase_map_lookup_t *lookup, uint32_t column) {
+    /* Counted from two rows before, as in the lookup: the distances are then constants of the loads. */
+    const int32_t before = (int32_t)phase_map_index(lookup, column) - 2;
+    const int16_t *node = PHASE_MAP_MOVED(int16_t, lookup->tables, node, before * (int32_t)sizeof(int16_t));
+    const int8_t *curvature = PHASE_MAP_MOVED(int8_t, lookup->tables, curvature, before);
+    return (phase_map_nodes_t){node + 2, curvature + 2};
 }
 
-ALWAYS_INLINE int32_t phase_map_flux_value_q14(const phase_map_lookup_t *lookup, uint32_t index) {
-    return dual16_multiply_add(&lookup->tables->node[index + MACHINE_TO_FLUX], lookup->weights_q14,
-                               MACHINE_NODE_OFFSET << 14) -
-           lookup->tables->curvature[index + MACHINE_TO_FLUX] * lookup->flux_curvature_q14;
+/* T / i and psi / i at nodes, `offset` further on, in node LSBs, Q14: the nodes' part is below 2^30, the curvature's
+ * within 2^27. */
+ALWAYS_INLINE int32_t phase_map_torque_value_q14(const phase_map_lookup_t *lookup, const phase_map_nodes_t *nodes,
+                                                 unsigned offset) {
+    return dual16_multiply_add(&nodes->node[offset], lookup->weights_q14, MACHINE_NODE_OFFSET << 14) -
+           nodes->curvature[offset] * lookup->torque_curvature_q14;
+}
+
+ALWAYS_INLINE int32_t phase_map_flux_value_q14(const phase_map_lookup_t *lookup, const phase_map_nodes_t *nodes,
+                                               unsigned offset) {
+    return dual16_multiply_add(&nodes->node[offset + MACHINE_TO_FLUX], lookup->weights_q14, MACHINE_NODE_OFFSET << 14) -
+           nodes->curvature[offset + MACHINE_TO_FLUX] * lookup->flux_curvature_q14;
 }
 
 /* Result in units of the tables: value in Q14 times current in Q9, over 2^17. */

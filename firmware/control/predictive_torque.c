@@ -50,34 +50,39 @@ typedef struct {
  * descending priority; true when it has the torque. */
 static inline bool solve_in_cell(plan_t *p, int32_t torque, int32_t current_limit_q9) {
     const phase_cell_t *cell = p->cell;
-    const int32_t limit_q13 = phase_cell_u_q13(cell, current_limit_q9);
-    int32_t v_q13 = phase_cell_solve_q13(cell, torque);
-    const bool outside = (v_q13 ^ v_q13 >> 31) == PHASE_CELL_V_MAX_Q13;
-    int32_t limit = 0;
-    if (v_q13 > limit_q13) {
-        v_q13 = limit_q13;
-        limit = 1;
+    int32_t flux = p->flux_min; /* for a torque of 0, also where no current makes torque */
+    int32_t limit = -1;
+    if (torque > 0) {
+        const int32_t limit_q13 = phase_cell_u_q13(cell, current_limit_q9);
+        int32_t v_q13 = phase_cell_solve_q13(cell, torque);
+        const bool outside = (v_q13 ^ v_q13 >> 31) == PHASE_CELL_V_MAX_Q13;
+        limit = 0;
+        if (v_q13 > limit_q13) {
+            v_q13 = limit_q13;
+            limit = 1;
+        }
+        flux = phase_cell_flux(cell, v_q13);
+        if (flux >= p->flux_max) {
+            flux = p->flux_max;
+            limit = 1;
+        }
+        if (flux <= p->flux_min) {
+            flux = p->flux_min;
+            limit = -1;
+        }
+        if (limit == 0 && !outside) {
+            p->v_q13 = v_q13;
+            p->flux = flux;
+            p->torque = torque;
+            p->limit = 0;
+            return true;
+        }
     }
-    int32_t flux = phase_cell_flux(cell, v_q13);
-    if (flux >= p->flux_max) {
-        flux = p->flux_max;
-        limit = 1;
-    }
-    /* A torque of 0 is flux_min also where no current makes torque. */
-    if (torque <= 0 || flux <= p->flux_min) {
-        flux = p->flux_min;
-        limit = -1;
-    }
-    const bool reached = limit == 0 && !outside;
-    if (!reached) {
-        v_q13 = phase_cell_v_q13(cell, flux);
-        torque = phase_cell_torque(cell, v_q13);
-    }
-    p->v_q13 = v_q13;
+    p->v_q13 = phase_cell_v_q13(cell, flux);
     p->flux = flux;
-    p->torque = torque;
+    p->torque = phase_cell_torque(cell, p->v_q13);
     p->limit = limit;
-    return reached;
+    return false;
 }
 
 NOINLINE static void locate_cell(const machine_tables_t *tables, uint32_t angle, int32_t column, phase_cell_t *cell) {
@@ -303,7 +308,9 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         p->column = control->column[phase];
         p->cell = &cells[phase];
         p->cell->positive = positive;
-        reached &= plan_phase(parameters, tables, &period, &half[positive], positive == sample->reverse, p);
+        const half_t *half_of_phase = &half[positive];
+        IN_REGISTER(half_of_phase);
+        reached &= plan_phase(parameters, tables, &period, half_of_phase, positive == sample->reverse, p);
         shortfall = positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
     }
 

@@ -68,7 +68,7 @@ static sums_t measure_by_map(const control_parameters_t *parameters, const int32
     for (unsigned phase = 0; phase < phases; phase++) {
         const int32_t current_q9 = measure_current_q9(scale_q18, sample, phase, measured);
         int32_t torque = 0;
-        if (current_q9 > 0) { /* false for most phases at any time */
+        if (LIKELY(current_q9 > 0)) { /* though false for most phases at any time */
             const uint32_t angle = commutation_angle(&parameters->commutation, &measured->commutation, phase);
             torque = phase_map_torque(&machine_tables, angle - (uint32_t)misalignment[phase], current_q9);
             add_phase(&sums, current_q9, torque);

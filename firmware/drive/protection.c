@@ -31,10 +31,10 @@ static void fail_if(uint32_t *failed, bool condition, fault_t fault) {
     }
 }
 
-/* Triggers lost in consecutive periods, including this one; saturates. */
+/* Triggers lost in consecutive periods, including this one; saturates to 2^31 - 1. */
 static uint32_t count_overruns(protection_t *protection, uint32_t missed_interrupts) {
-    const uint32_t sum = protection->overruns + missed_interrupts;
-    protection->overruns = missed_interrupts == 0 ? 0 : sum >= missed_interrupts ? sum : UINT32_MAX;
+    const uint32_t sum = (uint32_t)fixed_add((int32_t)protection->overruns, (int32_t)missed_interrupts);
+    protection->overruns = missed_interrupts == 0 ? 0 : sum;
     return protection->overruns;
 }
 

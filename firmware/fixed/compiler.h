@@ -11,6 +11,15 @@
 /* For a function whose argument must be a constant, the operand of an instruction. */
 #define ALWAYS_INLINE __attribute__((always_inline)) static inline
 
+/* Computes a value here, in a register: the compiler otherwise moves a constant offset from the loads that follow into
+ * their index, an address for each of them, or narrows a difference before it is stored. 17 of the computed bound of
+ * salient. */
+#define IN_REGISTER(value) __asm__("" : "+r"(value))
+
+/* A condition that holds in the longest interrupt: its code follows it without a jump. 4 of the computed bound of
+ * traditional. */
+#define LIKELY(condition) __builtin_expect(!!(condition), 1)
+
 /* Unrolls the loop that follows; iterations is a number. Sums of the BP network and its PID: 29 instructions forward,
  * 12 learning, 16 in the PID. Duties of hysteresis control: 11. Loops over the phases, whose number is known when a
  * drive is linked with the tables of its machine: 122 of the computed bound of salient, 40 of paper's. */

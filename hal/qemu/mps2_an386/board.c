@@ -12,8 +12,6 @@
 /* Armv7-M architecture reference manual, B3.4. */
 #define NVIC_ISER0 (*(volatile uint32_t *)0xE000E100)
 #define NVIC_ISPR0 (*(volatile uint32_t *)0xE000E200)
-#define SCB_ICSR (*(volatile uint32_t *)0xE000ED04)
-#define SCB_ICSR_PENDSVSET (UINT32_C(1) << 28)
 #define SCB_SHPR3_PENDSV (*(volatile uint8_t *)0xE000ED22) /* priority of PendSV */
 #define NVIC_IPR(irq) (*(volatile uint8_t *)(0xE000E400 + (irq)))
 
@@ -68,15 +66,6 @@ void board_interrupt_enable(void) {
 void board_interrupt_pend(void) {
     NVIC_ISPR0 = UINT32_C(1) << CONTROL_IRQ;
     __asm__ volatile("dsb\n\tisb" ::: "memory");
-}
-
-void hal_interrupt_request_deferred(hal_t *hal) {
-    (void)hal;
-    SCB_ICSR = SCB_ICSR_PENDSVSET;
-}
-
-uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
-    return hal->mailbox.timed ? timer_elapsed_ticks() : hal->mailbox.elapsed_ticks;
 }
 
 /* Masks all interrupts: there are only the two of the drive and that of the timer, which requests the control

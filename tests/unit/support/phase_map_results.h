@@ -20,9 +20,9 @@ inline int32_t clamped_q9(int32_t current_q9) {
 inline int32_t flux_units(const machine_tables_t &tables, uint32_t angle, int32_t current_q9) {
     const int32_t clamped = clamped_q9(current_q9);
     const phase_map_lookup_t lookup = phase_map_lookup(&tables, phase_map_distance(angle));
-    const uint32_t index = phase_map_index(&lookup, uint32_t(clamped) >> MACHINE_COLUMN_BITS);
-    return phase_map_between(phase_map_flux_value_q14(&lookup, index),
-                             phase_map_flux_value_q14(&lookup, index + MACHINE_TO_NEXT_COLUMN), clamped);
+    const phase_map_nodes_t nodes = phase_map_nodes(&lookup, uint32_t(clamped) >> MACHINE_COLUMN_BITS);
+    return phase_map_between(phase_map_flux_value_q14(&lookup, &nodes, 0),
+                             phase_map_flux_value_q14(&lookup, &nodes, MACHINE_TO_NEXT_COLUMN), clamped);
 }
 
 inline int32_t torque_q24(const machine_tables_t &tables, uint32_t angle, int32_t current_q9) {
