@@ -110,7 +110,7 @@ int main(int argc, char *argv[]) {
         std::fprintf(stderr, "salient_reference: encoder_bits=%u: must be 0, an ideal one, or 8 to 24\n", encoder_bits);
         return EXIT_USAGE;
     }
-    if (!configure_rate_allowed(rate_hz)) {
+    if (!configure_rate_allowed(rate_hz, fixed_point::TIMER_CLOCK_HZ)) {
         std::fprintf(stderr, "salient_reference: control_rate_hz=%u: must be 20000, 40000, 50000, 100000 or 1000000\n",
                      unsigned(rate_hz));
         return EXIT_USAGE;

@@ -113,6 +113,23 @@ def test_switch_table(longest, width):
     """) == 5
 
 
+@pytest.mark.parametrize("width", ["tbb", "tbh"])
+def test_constants_behind_a_switch_table_are_not_part_of_it(longest, width):
+    index, unit = ("r0", ".byte") if width == "tbb" else ("r0, lsl #1", ".hword")
+    assert longest(f"""
+    function f
+        cmp r0, #1              @ 1
+        bhi 2f                  @ 2
+        {width} [pc, {index}]   @ 3
+    0:  {unit} (1f - 0b) / 2, (2f - 0b) / 2
+        .balign 4
+        .word 0x20000001, 0x00010003
+    1:  bx lr
+    2:  nop                     @ 4
+        bx lr                   @ 5
+    """) == 5
+
+
 def test_literals_are_not_code(longest):
     assert longest("function f\n ldr r0, =0x12345678\n b 1f\n .ltorg\n 1: bx lr\n") == 3
 

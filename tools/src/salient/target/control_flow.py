@@ -162,11 +162,27 @@ def _thumb(code: ControlFlow, one: Instruction) -> Flow:
     return Flow((code.falls_to(one),))
 
 
+_THUMB_INDEX = re.compile(r"\[pc, (r\d+)")
+
+
 def _thumb_table(code: ControlFlow, one: Instruction, width: int) -> tuple[int, ...]:
-    """Targets of tbb and tbh. The table is the data between the instruction and the next one, with padding of 0."""
+    """Targets of tbb and tbh. The table is the data between the instruction and the next one, with padding of 0, or as
+    much of it as the index, compared before, reaches: constants may follow in the same gap."""
     base, end = one.address + 4, code.following(one.address)
+    largest = _thumb_index_max(code, one)
+    if largest is not None:
+        end = min(end, base + width * (largest + 1))
     entries = (int.from_bytes(code.image.read(at, width), "little") for at in range(base, end - width + 1, width))
     return _unique(*(base + 2 * entry for entry in entries if entry))
+
+
+def _thumb_index_max(code: ControlFlow, one: Instruction) -> int | None:
+    """N of `cmp index, #N` and `bhi` immediately before a jump by table."""
+    index = _THUMB_INDEX.match(one.operands)
+    branch, compared = code.before(one.address, 2)
+    limit = re.fullmatch(rf"{index[1]}, #(\d+)(?:\s.*)?", compared.operands) if index else None
+    is_limit = limit and re.fullmatch(r"bhi(\.[nw])?", branch.mnemonic) and compared.mnemonic in ("cmp", "cmp.w")
+    return int(limit[1]) if limit and is_limit else None
 
 
 _RISCV_BRANCH = re.compile(r"b(eq|ne|lt|ge|gt|le)(u|z)?")

@@ -12,7 +12,7 @@ from salient.config import CONTROLLERS
 from salient.experiments.compare.cases import GROUPS, STROKE_DEG, TITLES
 from salient.experiments.compare.metrics import METRICS
 from salient.experiments.compare.runner import RunMetrics
-from salient.experiments.compare.targets import Key, Target, target_of
+from salient.experiments.compare.targets import TARGETS, Key, Target, target_of
 
 NEVER = "never"
 
