@@ -261,6 +261,7 @@ def main() -> None:
     options = make_parser().parse_args()
     install = not options.no_install
     os.environ["PYTHONPYCACHEPREFIX"] = str(BUILD / "pycache")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # compiling NumPy and pydantic at each start takes half a second
     try:
         BUILD.mkdir(exist_ok=True)
         lock = (BUILD / "launcher.lock").open("w")
