@@ -26,7 +26,7 @@ from can import CanError
 from salient.bench.drive import DriveError
 from salient.bench.programs import EmulatorError, command_line
 from salient.bench.session import SessionError
-from salient.config import CONDITIONS, BenchConfig
+from salient.config import BenchConfig
 from salient.errors import UsageError
 from salient.experiments import metrics, plots
 from salient.experiments.report import (
@@ -42,6 +42,7 @@ from salient.experiments.scaled import scale_of, scale_of_name, scaled, steady_w
 from salient.experiments.scenario import Scenario, check_parameters, load_scenarios, run_scenario
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
+from salient.machine.path import stated_conditions
 from salient.pages import Plot
 from salient.paths import SCENARIOS
 from salient.progress import Progress
@@ -157,10 +158,9 @@ def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
                  for experiment in EXPERIMENTS}
     machine = scenarios["start_600"][0].machine
     command_line(BenchConfig(machine=machine, build=options.build))  # checks the machine
-    loaded = load_machine(machine_path(machine))
-    scale, stated = scale_of(loaded), {name: value for name, value in loaded.drive.items()
-                                       if name in CONDITIONS and name not in changes}
-    scenarios = {experiment: [scaled(replace(scenario, **stated), scale) for scenario in of]
+    path = machine_path(machine)
+    scale, conditions = scale_of(load_machine(path)), stated_conditions(path) | changes
+    scenarios = {experiment: [scaled(replace(scenario, **conditions), scale) for scenario in of]
                  for experiment, of in scenarios.items()}
     for of in scenarios.values():
         check_parameters(of, options.build)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from salient.dbc import text_hash
+from salient.dbc import database_hash
 from salient.machine.file import FORMS, Converter, DcLink, Machine, Sensors, load_machine
 from salient.machine.firmware_tables import (
     ANGLE_BINS,
@@ -31,7 +31,7 @@ from salient.machine.firmware_tables import (
 )
 from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS, FluxMap
 from salient.machine.magnetics import FORMULA_KEYS
-from salient.machine.scaling import Scaling, scaling_of
+from salient.machine.scaling import Scaling, database_of, scaling_of
 
 MAGIC = b"SALIENTM"
 HEADER = struct.Struct("<8sII4I")
@@ -150,7 +150,7 @@ TABLES = Structure("machine_tables_t", (
            (_PARAMETERS_MAX,)),
     Member("control_rate_min_hz", "uint32_t", lambda machine, scaling, tables: scaling.control_rate_min_hz(machine)),
     Member("speed_reference_max", "int32_t", lambda machine, scaling, tables: scaling.speed_reference_max),
-    Member("dbc_hash", "uint32_t", lambda machine, scaling, tables: text_hash(scaling.dbc())),
+    Member("dbc_hash", "uint32_t", lambda machine, scaling, tables: database_hash(database_of(scaling.dbc()))),
 ))  # fmt: skip
 """Of a Machine, its Scaling and its PhaseMap: firmware/control/machine_tables.h."""
 

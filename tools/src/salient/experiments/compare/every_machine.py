@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from salient.config import CONDITIONS, CONTROLLERS
+from salient.config import CONTROLLERS
 from salient.experiments import metrics
 from salient.experiments.compare import reference
 from salient.experiments.compare.random_machines import COUNT, random_machine
@@ -23,6 +23,7 @@ from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 from salient.machine.definition import Machine
 from salient.machine.drive_data import DriveData, derive
 from salient.machine.file import load_machine, machine_path
+from salient.machine.path import stated_conditions
 from salient.machine.torque_speed import Source, speed_change_s
 from salient.paths import BUILD, ROOT
 
@@ -75,9 +76,9 @@ def scenario(path: Path, controller: str) -> Scenario:
     unload_s = _up(ripple_s + _window_s(machine, loaded_rpm))
     reversal_s = _up(unload_s + _UNLOADED_S)
     load = LoadStep(load_s, LOAD_PART * data.torque_rated_Nm)
-    stated = {name: value for name, value in machine.drive.items() if name in CONDITIONS}
     common = Scenario(name="compare", machine=str(path), controller=controller, duration_s=unload_s,
-                      speed=(SpeedStep(0.0, start_rpm),), load=(load,), record=Record(1.0, 0.0), **stated)
+                      speed=(SpeedStep(0.0, start_rpm),), load=(load,), record=Record(1.0, 0.0),
+                      **stated_conditions(path))
     if controller != "salient":  # single-quadrant: at the speed of the start
         return common
     return Scenario(**{**vars(common), "duration_s": _up(reversal_s + 3.0 * start_s + _SETTLED_S),
