@@ -26,15 +26,14 @@ from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from functools import lru_cache
-from typing import TYPE_CHECKING
+
+import cantools
+from cantools.database.can import Database
 
 from salient.machine.drive_data import CURRENT_RANGE_A, SAMPLES_PER_TURN_MIN, DriveData, derive
 from salient.machine.file import Machine, MachineError
 from salient.machine.parameter_table import ParameterDefinition, read_table
 from salient.paths import DRIVE_DBC
-
-if TYPE_CHECKING:
-    from cantools.database.can import Database
 
 VOLTAGE_RANGE_V, LOAD_TORQUE_RANGE_NM = 512.0, 64.0
 """As CURRENT_RANGE_A, full scales of the sensors in units of the machine, at most; that of the torque transducer
@@ -216,9 +215,6 @@ def _plain(number: Fraction) -> str:
 @lru_cache
 def database_of(text: str) -> Database:
     """A CAN database from the text of a DBC file."""
-    import cantools  # not needed for a machine image
-    from cantools.database.can import Database
-
     database = cantools.database.load_string(text, "dbc", strict=True)
     assert isinstance(database, Database)  # as every DBC gives
     return database
