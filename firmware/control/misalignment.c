@@ -25,9 +25,9 @@
 #define COMMON_SLOWER 8
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings) {
-    const int64_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
-    const int64_t phase_rate_hz = update_rate_hz / settings->phases;
-    const int64_t common_rate_hz = settings->control_rate_hz / settings->periods_per_common_update;
+    const uint32_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
+    const uint32_t phase_rate_hz = update_rate_hz / settings->phases;
+    const uint32_t common_rate_hz = settings->control_rate_hz / settings->periods_per_common_update;
     return (misalignment_parameters_t){
         .probe_angle = PROBE_ANGLE * settings->rotor_poles,
         .rate_q30 = (int32_t)fixed_divide((int64_t)settings->rate_1_s << 30, phase_rate_hz),
@@ -35,7 +35,7 @@ misalignment_parameters_t misalignment_configure(const misalignment_settings_t *
         .filter_q32 = (int32_t)fixed_divide(((int64_t)8 << 32) / 5, phase_rate_hz),
         .mean_q16 = (int32_t)fixed_divide((int64_t)MEAN_1_S << 16, phase_rate_hz) + 1,
         .inertia_rate_q8 = fixed_saturate(((int64_t)settings->inertia_q30 * settings->control_rate_hz) >> 22),
-        .settle_updates = (uint32_t)update_rate_hz * SETTLE_MS / 1000u,
+        .settle_updates = update_rate_hz * SETTLE_MS / 1000u,
     };
 }
 

@@ -1,4 +1,5 @@
-"""The checks of the build reject firmware that breaks a rule: no floating point, no C library, limited flash."""
+"""The checks of the build reject firmware that breaks a rule: no floating point, no C library, no 64-bit division of the
+compiler's library, limited flash."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 FLOATING_POINT = "int scaled(int x);\nint scaled(int x) { return (int)((float)x * 0.5f); }\n"
 PRINTS = 'int printf(const char *, ...);\nvoid report(int x);\nvoid report(int x) { printf("%d", x); }\n'
-INTEGERS = "int scaled(int x);\nint scaled(int x) { return (int)(((long long)x << 20) / (x + 3)); }\n"
+INTEGERS = "int scaled(int x);\nint scaled(int x) { return (int)((long long)x * x >> 20) / (x + 3); }\n"
+DIVIDES_64_BITS = "int scaled(int x);\nint scaled(int x) { return (int)(((long long)x << 20) / (x + 3)); }\n"
 
 
 def compiles_as_firmware(tmp_path: Path, source: str) -> bool:
@@ -63,8 +65,10 @@ def symbol_check(tmp_path: Path, compiler: str, source: str) -> subprocess.Compl
     [
         ("arm-none-eabi", FLOATING_POINT, "__aeabi_fmul"),
         ("arm-none-eabi", PRINTS, "printf"),
+        ("arm-none-eabi", DIVIDES_64_BITS, "__aeabi_ldivmod"),
         ("riscv64-unknown-elf", FLOATING_POINT, "__mulsf3"),
         ("riscv64-unknown-elf", PRINTS, "printf"),
+        ("riscv64-unknown-elf", DIVIDES_64_BITS, "__divdi3"),
     ],
 )
 def test_target_build_names_the_forbidden_symbol(tmp_path, compiler, source, symbol):
