@@ -4,7 +4,7 @@ set(SALIENT_GENERATOR_SOURCES ${CMAKE_SOURCE_DIR}/tools/src/salient)
 set(SALIENT_GENERATOR ${CMAKE_COMMAND} -E env PYTHONPATH=${CMAKE_SOURCE_DIR}/tools/src ${SALIENT_PYTHON} -m)
 
 set(SALIENT_CODEC_GENERATOR generate/codec.py generate/enumerations.py generate/telemetry.py generate/error.py
-    generate/files.py dbc.py)
+    generate/files.py generate/ranges.py dbc.py)
 list(TRANSFORM SALIENT_CODEC_GENERATOR PREPEND ${SALIENT_GENERATOR_SOURCES}/)
 
 # Machines that images for a board, functional mock-up units and tests are built for: the bundled ones, and one more,

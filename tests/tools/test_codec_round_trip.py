@@ -14,8 +14,9 @@ from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
 
 from salient.dbc import database_hash
-from salient.generate.codec import generate_codec, main, raw_range
+from salient.generate.codec import generate_codec, main
 from salient.generate.error import CodecError
+from salient.generate.ranges import raw_range
 from salient.generate.telemetry import is_bit_field, message_c_name, short_name
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -230,6 +231,16 @@ def test_value_tables_of_one_enumeration_must_be_equal(tmp_path: Path) -> None:
     dbc.write_text(text.replace('VAL_ 1793 state 0 "initialise"', 'VAL_ 1793 state 0 "start"'), encoding="cp1252")
     with pytest.raises(CodecError, match="drive.dbc: signal state: its value table differs"):
         generate_codec(dbc, True, "DRIVE")
+
+
+def test_cyclic_messages_have_little_endian_integers_of_at_most_32_bits(tmp_path: Path) -> None:
+    dbc = tmp_path / "drive.dbc"
+    text = DATABASES["drive"][0].read_text(encoding="cp1252")
+    for name, layout, changed in (("cycle", "56|8@1+", "63|8@0+"), ("dbc_hash", "32|32@1+", "24|33@1+")):
+        assert f" SG_ {name} : {layout}" in text
+        dbc.write_text(text.replace(f" SG_ {name} : {layout}", f" SG_ {name} : {changed}"), encoding="cp1252")
+        with pytest.raises(CodecError, match=f"drive.dbc: signal {name}: cyclic messages have little-endian integers"):
+            generate_codec(dbc, True, "DRIVE")
 
 
 # --- the cyclic messages of the drive ---------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
-"""The checks of the build reject firmware that breaks a rule: no floating point, no C library, no 64-bit division of the
-compiler's library, limited flash."""
+"""The checks of the build reject firmware that breaks a rule: no floating point, no C library, no 64-bit division by
+the compiler's library, limited flash."""
 
 from __future__ import annotations
 

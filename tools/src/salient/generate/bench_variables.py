@@ -16,9 +16,9 @@ from cantools.database.can.database import Database
 from cantools.database.can.signal import Signal
 from cantools.database.errors import UnsupportedDatabaseFormatError
 
-from salient.generate.codec import raw_range
 from salient.generate.error import CodecError
 from salient.generate.files import write_files
+from salient.generate.ranges import raw_range
 
 _MESSAGE = "RIG_SET"
 _HEADER = """\

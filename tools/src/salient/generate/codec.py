@@ -10,10 +10,8 @@ no date, version or path.
 """
 
 import argparse
-import math
 import re
 import sys
-from fractions import Fraction
 from pathlib import Path
 
 import cantools
@@ -26,22 +24,8 @@ from salient.dbc import attributes, database_hash
 from salient.generate.enumerations import enumerations_header
 from salient.generate.error import CodecError
 from salient.generate.files import write_files
+from salient.generate.ranges import raw_range
 from salient.generate.telemetry import message_c_name, telemetry
-
-INT64_MAX = 2**63 - 1
-
-
-def raw_range(signal: Signal) -> tuple[int, int]:
-    """Smallest and largest raw value of an integer signal: the range of its bits, narrowed to the range in the DBC."""
-    bits = signal.length
-    low, high = (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if signal.is_signed else (0, (1 << bits) - 1)
-    scale, offset = Fraction(str(signal.scale)), Fraction(str(signal.offset))
-    ends = [(Fraction(str(end)) - offset) / scale for end in (signal.minimum, signal.maximum) if end is not None]
-    if len(ends) == 2:
-        low, high = max(low, math.ceil(min(ends))), min(high, math.floor(max(ends)))
-    if low > high:
-        raise CodecError(f"signal {signal.name}: no value of its range fits {bits} bits")
-    return low, min(high, INT64_MAX)
 
 
 def integer_literal(value: int) -> str:
@@ -56,9 +40,8 @@ def c_type(signal: Signal) -> str:
 
 
 _SATURATE = {
-    f"saturate{bits}": "/* raw, limited to low..high. Kept out of line: inlined into each setter it takes 500 bytes\n"
-    " * more flash. */\n"
-    f"static __attribute__((noinline)) int{bits}_t saturate{bits}(int64_t raw, int{bits}_t low, int{bits}_t high)\n{{\n"
+    f"saturate{bits}": "/* raw, limited to low..high. */\n"
+    f"static int{bits}_t saturate{bits}(int64_t raw, int{bits}_t low, int{bits}_t high)\n{{\n"
     f"    return raw < low ? low : raw > high ? high : (int{bits}_t)raw;\n}}\n"
     for bits in (32, 64)
 }

@@ -1,4 +1,4 @@
-"""The cyclic messages of a node in C: a structure of all their signals, functions that pack it, and the schedule.
+"""The cyclic messages of a node in C: a structure of all their signals, a function that packs it, and the schedule.
 
 The schedule is that of the database: GenMsgCycleTime and GenMsgStartDelayTime in ms; GenMsgSendType cyclicIfActive
 marks messages that are sent only while their cause lasts; the enumeration TelemetryGroup names the messages that are
@@ -16,6 +16,7 @@ from cantools.database.can.signal import Signal
 
 from salient.dbc import attributes
 from salient.generate.error import CodecError
+from salient.generate.ranges import raw_range
 
 
 def telemetry(database: Database, prefix: str, dbc_name: str, node: str) -> tuple[str, str]:
@@ -23,6 +24,9 @@ def telemetry(database: Database, prefix: str, dbc_name: str, node: str) -> tupl
     messages = [m for m in database.messages if node in m.senders and m.cycle_time]
     if not messages:
         raise CodecError(f"node {node} sends no cyclic message: GenMsgCycleTime is required")
+    for signal in (signal for message in messages for signal in message.signals):
+        if signal.is_float or signal.length > 32 or signal.byte_order != "little_endian":
+            raise CodecError(f"signal {signal.name}: cyclic messages have little-endian integers of at most 32 bits")
     assert database.dbc is not None  # as every DBC has
     groups = list(database.dbc.attribute_definitions["TelemetryGroup"].choices)
     messages.sort(key=lambda m: (groups.index(_group(m, groups)), m.frame_id))
@@ -54,13 +58,11 @@ def _delay_ms(message: Message) -> int:
 
 def is_bit_field(message: Message) -> bool:
     """True for a message of one-bit signals only, which is one 64-bit member: bit n of it is bit n of the frame."""
-    return len(message.signals) > 1 and all(
-        s.length == 1 and s.byte_order == "little_endian" and not s.is_signed for s in message.signals
-    )
+    return len(message.signals) > 1 and all(s.length == 1 and not s.is_signed for s in message.signals)
 
 
 def _member_type(signal: Signal) -> str:
-    return f"{'' if signal.is_signed else 'u'}int{32 if signal.length <= 32 else 64}_t"
+    return f"{'' if signal.is_signed else 'u'}int32_t"
 
 
 def _header(messages: list[Message], groups: list[str], prefix: str, dbc_name: str, cycle_ms: int) -> str:
@@ -89,7 +91,7 @@ def _header(messages: list[Message], groups: list[str], prefix: str, dbc_name: s
 #define {upper}_TELEMETRY_CYCLE_MS {cycle_ms}
 
 /* All signals of the cyclic messages in the LSBs of the bus. A member is wider than its signal wherever a value can be
- * out of the signal's range: the pack functions saturate. */
+ * out of the signal's range: {prefix}_telemetry_pack() saturates. */
 typedef struct {{
 {chr(10).join(members)}
 }} {prefix}_telemetry_t;
@@ -117,7 +119,7 @@ typedef struct {{
 extern const {prefix}_telemetry_message_t {prefix}_telemetry_messages[{upper}_TELEMETRY_MESSAGES];
 
 /* Packs the signals of a message, an index of {prefix}_telemetry_messages, saturated to their ranges, into the bytes of
- * its frame. No table of function pointers: the depth of the stack can be read from the machine code. */
+ * its frame. */
 void {prefix}_telemetry_pack(unsigned message, const {prefix}_telemetry_t *telemetry, uint8_t data[8]);
 
 #endif
@@ -126,29 +128,26 @@ void {prefix}_telemetry_pack(unsigned message, const {prefix}_telemetry_t *telem
 
 def _source(messages: list[Message], prefix: str, dbc_name: str, cycle_ms: int) -> str:
     upper = prefix.upper()
-    functions, rows, cases = [], [], []
+    ranges: dict[str, int] = {}  # row of the table: its index
+    rows: list[str] = []
+    signals: list[str] = []
+    layouts: list[str] = []
+    bit_fields: list[str] = []
     for message in messages:
         name = short_name(message, prefix)
-        codec_name = message_c_name(message, prefix)
-        cases.append(f"    case {upper}_TELEMETRY_{name.upper()}:\n        pack_{name}(telemetry, data);")
-        cases.append("        break;")
-        head = f"static void pack_{name}(const {prefix}_telemetry_t *telemetry, uint8_t data[8])\n{{\n"
+        members = [] if is_bit_field(message) else message.signals
         if is_bit_field(message):
             mask = sum(1 << s.start for s in message.signals)
-            functions.append(
-                f"{head}    uint64_t bits = telemetry->{name} & {mask:#x}u;\n"
-                f"    for (unsigned i = 0; i < {message.length}u; i++) {{\n"
-                f"        data[i] = (uint8_t)bits;\n        bits >>= 8;\n    }}\n}}\n"
-            )
-        else:
-            setters = []
-            for signal in message.signals:
-                field = camel_to_snake_case(signal.name)
-                setters.append(f"    {codec_name}_set_{field}(&message, telemetry->{name}.{field});\n")
-            functions.append(
-                f"{head}    struct {codec_name}_t message;\n{''.join(setters)}"
-                f"    (void){codec_name}_pack(data, &message, 8u);\n}}\n"
-            )
+            bit_fields.append(f"    if (message == {upper}_TELEMETRY_{name.upper()}) {{")
+            bit_fields.append(f"        frame = telemetry->{name} & {mask:#x}u;\n    }}")
+        layouts.append(f"    {{offsetof({prefix}_telemetry_t, {name}), {len(signals)}u, {len(members)}u}},")
+        for signal in members:
+            low, high = raw_range(signal)
+            # Of an unsigned value no bits need to be cut off.
+            bits = signal.length if signal.is_signed else 32
+            row = f"    {{{low}, {high & 0xFFFFFFFF}u, {bits}u, {str(signal.is_signed).lower()}}},"
+            index = ranges.setdefault(row, len(ranges))
+            signals.append(f"    {{{signal.start}u, {index}u}}, /* {message.name}.{signal.name} */")
         delay, period = _delay_ms(message) // cycle_ms, _period_ms(message) // cycle_ms
         group = _group_number(message)
         active = str(message.send_type == "cyclicIfActive").lower()
@@ -156,17 +155,72 @@ def _source(messages: list[Message], prefix: str, dbc_name: str, cycle_ms: int) 
             f"    {{{message.frame_id:#x}u, {message.length}u, {group}u, {active}, "
             f"{period}u, {delay}u}},"
         )
-    return (
-        f'/* Cyclic messages of {dbc_name}; generated. */\n#include "{prefix}_telemetry.h"\n\n'
-        f'#include "{prefix}_codec.h"\n\n'
-        + "\n".join(functions)
-        + f"\nconst {prefix}_telemetry_message_t {prefix}_telemetry_messages[{upper}_TELEMETRY_MESSAGES] = {{\n"
-        + "\n".join(rows)
-        + f"\n}};\n\nvoid {prefix}_telemetry_pack(unsigned message, const {prefix}_telemetry_t *telemetry, "
-        + "uint8_t data[8])\n{\n    switch (message) {\n"
-        + "\n".join(cases)
-        + "\n    default:\n        break;\n    }\n}\n"
-    )
+    new_line = "\n"
+    return f"""/* Cyclic messages of {dbc_name}; generated. */
+#include "{prefix}_telemetry.h"
+
+#include <stddef.h>
+
+const {prefix}_telemetry_message_t {prefix}_telemetry_messages[{upper}_TELEMETRY_MESSAGES] = {{
+{new_line.join(rows)}
+}};
+
+/* Values that a signal can have. */
+typedef struct {{
+    int32_t low;
+    uint32_t high;
+    uint8_t bits; /* kept of a value within the range */
+    bool is_signed;
+}} range_t;
+
+static const range_t ranges[] = {{
+{new_line.join(ranges)}
+}};
+
+/* Signal in its frame, in the order of the members of {prefix}_telemetry_t. */
+typedef struct {{
+    uint8_t start; /* bit */
+    uint8_t range;
+}} signal_t;
+
+static const signal_t signals[] = {{
+{new_line.join(signals)}
+}};
+
+/* Members and signals of a message. A message of one-bit signals has none: its member is the frame. */
+typedef struct {{
+    uint16_t offset;
+    uint8_t first_signal;
+    uint8_t signals;
+}} layout_t;
+
+static const layout_t layouts[{upper}_TELEMETRY_MESSAGES] = {{
+{new_line.join(layouts)}
+}};
+
+static uint32_t saturate(uint32_t member, const range_t *range)
+{{
+    const int64_t value = range->is_signed ? (int64_t)(int32_t)member : (int64_t)member;
+    const int64_t high = range->is_signed ? (int64_t)(int32_t)range->high : (int64_t)range->high;
+    const int64_t saturated = value < range->low ? range->low : value > high ? high : value;
+    return (uint32_t)saturated << (32u - range->bits) >> (32u - range->bits);
+}}
+
+void {prefix}_telemetry_pack(unsigned message, const {prefix}_telemetry_t *telemetry, uint8_t data[8])
+{{
+    const layout_t *layout = &layouts[message];
+    const uint32_t *member = (const uint32_t *)((const char *)telemetry + layout->offset);
+    uint64_t frame = 0;
+{new_line.join(bit_fields)}
+    for (unsigned i = 0; i < layout->signals; i++) {{
+        const signal_t *signal = &signals[layout->first_signal + i];
+        frame |= (uint64_t)saturate(member[i], &ranges[signal->range]) << signal->start;
+    }}
+    for (unsigned i = 0; i < {prefix}_telemetry_messages[message].length; i++) {{
+        data[i] = (uint8_t)(frame >> 8 * i);
+    }}
+}}
+"""
 
 
 def message_c_name(message: Message, prefix: str) -> str:
