@@ -1,6 +1,7 @@
 #include "drive.h"
 
 #include "drive/deferred.h"
+#include "fixed/compiler.h"
 #include "fixed/divide.h"
 #include "hal_encoder.h"
 #include "hal_interrupt.h"
@@ -21,7 +22,7 @@ static void configure(drive_t *drive) {
     drive->applied_revision = drive->parameters.revision;
 }
 
-bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
+COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     const uint32_t clock_hz = hal_pwm_clock_hz(hal);
     if (!configure_rate_allowed(config->control_rate_hz, clock_hz) ||
         config->control_rate_hz < machine_tables.control_rate_min_hz) {
@@ -103,7 +104,7 @@ static void drop_stale_command(drive_t *drive, uint32_t time_us) {
     }
 }
 
-void drive_background(drive_t *drive) {
+COLD void drive_background(drive_t *drive) {
     const uint32_t time_us = hal_time_us(drive->hal);
     if (comms_telemetry_due(&drive->comms, time_us)) {
         drive_telemetry_t values;

@@ -8,6 +8,10 @@
  * look-ups: 11 instructions with traditional and paper, 20 with salient. */
 #define NOINLINE __attribute__((noinline))
 
+/* For the functions that a program calls outside the interrupts: they and what they alone call are optimised for size.
+ * 764 bytes of flash. */
+#define COLD __attribute__((cold))
+
 /* For a function whose argument must be a constant, the operand of an instruction. */
 #define ALWAYS_INLINE __attribute__((always_inline)) static inline
 
