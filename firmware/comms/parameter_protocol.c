@@ -52,10 +52,10 @@ void parameter_protocol_respond(parameters_t *parameters, bool writable, const h
             response.value = machine_tables.parameter_fraction_bits[request.index];
             break;
         case PARAMETER_OPERATION_NAME:
-            response.value = text_part(row->name, request.part);
+            response.value = text_part(parameters_name(request.index), request.part);
             break;
         case PARAMETER_OPERATION_UNIT:
-            response.value = text_part(row->unit, request.part);
+            response.value = text_part(parameters_unit(request.index), request.part);
             break;
         case PARAMETER_OPERATION_READ:
         default:

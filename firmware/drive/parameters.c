@@ -9,10 +9,17 @@
 
 static const parameter_row_t rows[PARAMETER_COUNT] = {
 #define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text)                             \
-    [PARAMETER_##index] = {name, unit, minimum, maximum},
+    [PARAMETER_##index] = {minimum, maximum},
 #include "drive/parameters.def"
 #undef PARAMETER
 };
+
+/* Name and unit of each parameter in turn; pointers to them would take half as much flash again. */
+static const char texts[] =
+#define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text) name "\0" unit "\0"
+#include "drive/parameters.def"
+#undef PARAMETER
+    ;
 
 static_assert((int)PARAMETER_COUNT <= MACHINE_PARAMETERS_MAX, "the machine's tables have a default of each parameter");
 
@@ -26,6 +33,22 @@ void parameters_init(parameters_t *parameters) {
 
 const parameter_row_t *parameters_row(unsigned index) {
     return &rows[index];
+}
+
+static const char *text_after(unsigned texts_before) {
+    const char *text = texts;
+    for (; texts_before > 0; text++) {
+        texts_before -= *text == '\0';
+    }
+    return text;
+}
+
+const char *parameters_name(unsigned index) {
+    return text_after(2 * index);
+}
+
+const char *parameters_unit(unsigned index) {
+    return text_after(2 * index + 1);
 }
 
 void parameters_set_controller(parameters_t *parameters, int32_t controller) {

@@ -20,9 +20,7 @@ typedef enum {
 } parameter_index_t;
 
 typedef struct {
-    const char *name; /* at most PARAMETER_NAME_MAX ASCII characters */
-    const char *unit; /* ASCII, empty for a plain number */
-    int32_t minimum;  /* both limits are inclusive */
+    int32_t minimum; /* both limits are inclusive */
     int32_t maximum;
 } parameter_row_t;
 
@@ -38,6 +36,12 @@ void parameters_init(parameters_t *parameters);
 
 /* The table's row; index 0..PARAMETER_COUNT-1. */
 const parameter_row_t *parameters_row(unsigned index);
+
+/* Name over CAN, at most PARAMETER_NAME_MAX ASCII characters; index 0..PARAMETER_COUNT-1. */
+const char *parameters_name(unsigned index);
+
+/* Unit, ASCII, empty for a plain number; index 0..PARAMETER_COUNT-1. */
+const char *parameters_unit(unsigned index);
 
 /* Sets the controller of this drive as default and present value, clamped to the row's limits. */
 void parameters_set_controller(parameters_t *parameters, int32_t controller);

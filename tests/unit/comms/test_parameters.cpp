@@ -14,6 +14,17 @@ extern "C" {
 
 namespace {
 
+struct Texts {
+    std::string name, unit;
+};
+
+// By index; those of the drive are one text.
+const Texts TEXTS[PARAMETER_COUNT] = {
+#define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text) {name, unit},
+#include "drive/parameters.def"
+#undef PARAMETER
+};
+
 class Parameters : public testing::Test {
   protected:
     Parameters() { parameters_init(&parameters); }
@@ -58,12 +69,13 @@ TEST_F(Parameters, every_row_is_sound) {
     std::set<std::string> names;
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         const parameter_row_t *row = parameters_row(i);
-        ASSERT_NE(row->name, nullptr) << "row " << i << " is missing";
-        SCOPED_TRACE(row->name);
-        EXPECT_LE(std::strlen(row->name), size_t(PARAMETER_NAME_MAX));
-        EXPECT_GT(std::strlen(row->name), 0u);
-        EXPECT_TRUE(names.insert(row->name).second) << "named twice";
-        ASSERT_NE(row->unit, nullptr);
+        const std::string name = parameters_name(i);
+        SCOPED_TRACE(name);
+        EXPECT_EQ(name, TEXTS[i].name);
+        EXPECT_EQ(parameters_unit(i), TEXTS[i].unit);
+        EXPECT_LE(name.size(), size_t(PARAMETER_NAME_MAX));
+        EXPECT_GT(name.size(), 0u);
+        EXPECT_TRUE(names.insert(name).second) << "named twice";
         EXPECT_LE(machine_tables.parameter_fraction_bits[i], 30);
         EXPECT_LT(row->minimum, row->maximum);
         EXPECT_LE(row->minimum, parameters_default(&parameters, i));
@@ -85,7 +97,7 @@ TEST_F(Parameters, defaults_are_a_consistent_set) {
 TEST_F(Parameters, limits_are_allowed_and_one_beyond_is_rejected) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         const parameter_row_t *row = parameters_row(i);
-        SCOPED_TRACE(row->name);
+        SCOPED_TRACE(TEXTS[i].name);
         for (const int32_t allowed : {row->minimum, row->maximum}) {
             const uint32_t revision = parameters.revision;
             EXPECT_EQ(parameters_set(&parameters, i, allowed), PARAMETER_STATUS_DONE);
@@ -127,7 +139,7 @@ TEST_F(Parameters, the_controller_of_the_drive_is_its_default_clamped_to_the_lim
 TEST_F(Parameters, protocol_reads_everything_of_every_row) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         const parameter_row_t *row = parameters_row(i);
-        SCOPED_TRACE(row->name);
+        SCOPED_TRACE(TEXTS[i].name);
         parameters_set(&parameters, i, row->maximum);
         for (const auto &[operation, expected] :
              {std::pair<unsigned, int32_t>{PARAMETER_OPERATION_READ, row->maximum},
@@ -139,15 +151,15 @@ TEST_F(Parameters, protocol_reads_everything_of_every_row) {
             EXPECT_EQ(response.status, PARAMETER_STATUS_DONE);
             EXPECT_EQ(response.value, expected) << "operation " << operation;
         }
-        EXPECT_EQ(text(PARAMETER_OPERATION_NAME, i), row->name);
-        EXPECT_EQ(text(PARAMETER_OPERATION_UNIT, i), row->unit);
+        EXPECT_EQ(text(PARAMETER_OPERATION_NAME, i), TEXTS[i].name);
+        EXPECT_EQ(text(PARAMETER_OPERATION_UNIT, i), TEXTS[i].unit);
     }
 }
 
 TEST_F(Parameters, protocol_never_reads_past_a_text) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         for (unsigned part = 0; part < 256; part++) {
-            const size_t length = std::strlen(parameters_row(i)->name);
+            const size_t length = TEXTS[i].name.size();
             EXPECT_EQ(request(PARAMETER_OPERATION_NAME, i, part).value != 0, part * 4 < length)
                 << i << " part " << part;
         }
