@@ -128,8 +128,10 @@ def _columns(torque: np.ndarray, flux: np.ndarray) -> np.ndarray:
 
 def _format(name: str, surface: Callable[[PhaseMap], Surface]) -> tuple[Member, ...]:
     return (
-        Member(f"{name}.curvature_shift", "uint8_t", lambda machine, scaling, tables: surface(tables.phase_map).curvature_shift),
-        Member(f"{name}.result_shift", "uint8_t", lambda machine, scaling, tables: surface(tables.phase_map).result_shift),
+        Member(f"{name}.curvature_shift", "uint8_t",
+               lambda machine, scaling, tables: surface(tables.phase_map).curvature_shift),
+        Member(f"{name}.result_shift", "uint8_t",
+               lambda machine, scaling, tables: surface(tables.phase_map).result_shift),
     )
 
 

@@ -1,5 +1,6 @@
-"""Single pulse operation: the turn-on and turn-off angles with which a machine makes its largest mean torque at a speed,
-those torques, and the flux linkage from which a braking current can still be ended, for firmware/control/single_pulse.h.
+"""Single pulse operation: the turn-on and turn-off angles with which a machine makes its largest mean torque at a
+speed, those torques, and the flux linkage from which a braking current can still be ended
+(firmware/control/single_pulse.h).
 
 Angles are electrical degrees of a phase: 180 is the unaligned, 360 the aligned position, from 360 to 540 the torque
 brakes. A pulse is the full DC-link voltage from a turn-on to a turn-off angle, the current limited by ideal chopping,
@@ -34,9 +35,10 @@ _INDEX_BITS = 12 + 32 - 22 + 6
 
 _STEP_DEG = 2
 _TURN = 360 // _STEP_DEG
-_FIRST_DEG = 60
 _LANE_DEG = 4  # of turn-on angles, turn-off angles and ends of the flux linkage in the search
-_MOTORING_ON_DEG, _MOTORING_OFF_DEG = (60, 180), (184, 352)
+_LANE_STEPS = _LANE_DEG // _STEP_DEG
+_FALL_LANES = 48
+_MOTORING_ON_DEG, _MOTORING_OFF_DEG = (60, 180), (184, 356)
 _BRAKING_ON_DEG, _BRAKING_OFF_DEG = (200, 360), (364, 540)
 _MOTORING_OFF_MAX_DEG = 353.0
 _SMOOTH_OFF_DEG = np.arange(240.0, 353.0, 8.0)
@@ -124,28 +126,26 @@ def single_pulse(machine: Machine, data: DriveData) -> SinglePulse:
     low, high = SPEED_PER_BASE
     last_rad_s = min(max(data.speed_max_rpm * math.pi / 30.0, low * base_rad_s), high * base_rad_s)
     speed_rad_s = np.arange(POINTS) * last_rad_s / (POINTS - 1)
-    moving_rad_s = speed_rad_s[1:]
-
-    rise = phase.run(moving_rad_s, np.arange(_MOTORING_ON_DEG[0], _BRAKING_ON_DEG[1] + 1.0, _LANE_DEG)[None, :],
-                     np.inf, _BRAKING_OFF_DEG[1])
-    fall = phase.falls(moving_rad_s)
-    pairs = [_best(rise, fall, 1.0, _MOTORING_ON_DEG, _MOTORING_OFF_DEG),
-             _best(rise, fall, -1.0, _BRAKING_ON_DEG, _BRAKING_OFF_DEG)]
-    on_deg = np.array([np.append(180.0, pairs[0][0]), np.append(360.0, pairs[1][0])])
-    off_deg = np.array([np.append(_MOTORING_OFF_MAX_DEG, np.minimum(pairs[0][1], _MOTORING_OFF_MAX_DEG)),
-                        np.append(540.0, pairs[1][1])])
+    on_deg, off_deg = phase.best_angles(speed_rad_s[1:])
+    on_deg = np.insert(on_deg, 0, [180.0, 360.0], axis=1)
+    off_deg = np.insert(off_deg, 0, [_MOTORING_OFF_MAX_DEG, 540.0], axis=1)
 
     # At standstill the current limit alone counts: any speed that is low enough.
-    seen_rad_s = np.append(1e-3 * speed_rad_s[1], moving_rad_s)
-    pulse_Nm = _stroke_torque(machine.phases, phase.run(seen_rad_s, on_deg.T, off_deg.T).torque_Nm)
-    smooth_Nm = [_stroke_torque(machine.phases, sign * phase.run(seen_rad_s, begin, off[None, :]).torque_Nm)
-                 .min(axis=0).max(axis=1)
-                 for sign, begin, off in ((1.0, 180.0, _SMOOTH_OFF_DEG), (-1.0, 360.0, 180.0 + _SMOOTH_OFF_DEG))]
+    seen_rad_s = np.append(1e-3 * speed_rad_s[1], speed_rad_s[1:])
+    begin_deg, ends = np.array([[180.0], [360.0]]), len(_SMOOTH_OFF_DEG)
+    smooth_on_deg = np.broadcast_to(np.repeat(begin_deg, ends)[:, None], (2 * ends, POINTS))
+    smooth_off_deg = np.broadcast_to((begin_deg - 180.0 + _SMOOTH_OFF_DEG).reshape(-1, 1), (2 * ends, POINTS))
+    torque_Nm = phase.torque_Nm(seen_rad_s, np.concatenate([on_deg, smooth_on_deg]).T,
+                                np.concatenate([off_deg, smooth_off_deg]).T)
+    total_Nm = torque_Nm.reshape(-1, _TURN // machine.phases, *torque_Nm.shape[1:]).sum(axis=0)
+    pulse_Nm = total_Nm[..., :2]
+    smooth_Nm = [(sign * total_Nm[..., lanes]).min(axis=0).max(axis=1)
+                 for sign, lanes in ((1.0, slice(2, 2 + ends)), (-1.0, slice(2 + ends, None)))]
     end_deg, flux_Wb = phase.envelope(seen_rad_s)
     return SinglePulse(
         speed_per_voltage=speed_rad_s / machine.supply_voltage_V,
-        lead_deg=np.array([[180.0], [360.0]]) - on_deg,
-        end_deg=off_deg - np.array([[180.0], [360.0]]),
+        lead_deg=begin_deg - on_deg,
+        end_deg=off_deg - begin_deg,
         smooth_Nm=np.maximum(smooth_Nm, 0.0),
         mean_Nm=np.abs(pulse_Nm.mean(axis=0)).T,
         peak_Nm=np.abs(pulse_Nm).max(axis=0).T,
@@ -154,26 +154,18 @@ def single_pulse(machine: Machine, data: DriveData) -> SinglePulse:
     )
 
 
-def _stroke_torque(phases: int, torque_Nm: np.ndarray) -> np.ndarray:
-    """Sum of all phases over a stroke, of the torque of one from its turn-on to its end, by angle."""
-    steps = _TURN // phases
-    padded = np.zeros((-len(torque_Nm) % steps + len(torque_Nm), *torque_Nm.shape[1:]))
-    padded[: len(torque_Nm)] = torque_Nm
-    total: np.ndarray = padded.reshape(-1, steps, *torque_Nm.shape[1:]).sum(axis=0)
-    return total
-
-
 @dataclass(frozen=True, eq=False)
-class _Runs:
-    """By angle from _FIRST_DEG in steps of _STEP_DEG, speed and lane."""
+class _Sweep:
+    """Rises from turn-on to turn-off, or falls from turn-off to zero; by turn-off angle, speed, and turn-on or end."""
 
-    lane_deg: np.ndarray
-    """Turn-on angles, or ends of the flux linkage."""
     flux_Wb: np.ndarray
-    torque_Nm: np.ndarray
-    current_A: np.ndarray
-    over_Wb: np.ndarray
-    """Flux linkage of the largest current, by angle."""
+    """At turn-off."""
+    torque: np.ndarray
+    """Integral over the angle, N m times steps."""
+    square: np.ndarray
+    """Of the square of the current, A^2 times steps."""
+    over: np.ndarray
+    """Largest flux linkage, as a fraction of that of _CURRENT_OVER times the current limit."""
 
 
 class _Phase:
@@ -200,75 +192,110 @@ class _Phase:
                   for flux_Wb, of in zip(grid_Wb, grid_Nm, strict=True)]
         half = np.array(curves).transpose(0, 2, 1)  # angle, flux linkage, current and torque
         braking = half[-2:0:-1] * np.array([1.0, -1.0])
-        self.table = np.concatenate([half, braking])  # from 180 degrees, a turn
-        self.table_rise = np.diff(self.table, axis=1, append=self.table[:, -1:])
-        top_Wb = np.concatenate([grid_Wb[:, -1], grid_Wb[-2:0:-1, -1]])
-        self.place_1_Wb = (_FLUX_POINTS - 1) / top_Wb
-        limit_Wb = magnetics.flux_linkage_Wb(angle_rad[:, 0], self.limit_A)
-        self.limit_Wb = np.concatenate([limit_Wb, limit_Wb[-2:0:-1]])
-        over_Wb = magnetics.flux_linkage_Wb(angle_rad[:, 0], _CURRENT_OVER * self.limit_A)
-        self.over_Wb = np.concatenate([over_Wb, over_Wb[-2:0:-1]])
+        table = np.concatenate([half, braking])  # from 180 degrees, a turn
+        self.slope = np.diff(table, axis=1, append=table[:, -1:])
+        self.begin = table - self.slope * np.arange(_FLUX_POINTS)[:, None]
+        self.place_1_Wb = (_FLUX_POINTS - 1) / _whole(grid_Wb[:, -1])
+        self.limit_Wb = _whole(magnetics.flux_linkage_Wb(angle_rad[:, 0], self.limit_A))
+        self.over_Wb = _whole(magnetics.flux_linkage_Wb(angle_rad[:, 0], _CURRENT_OVER * self.limit_A))
         fine_rad = np.arange(0.0, 180.0 + _FINE_DEG, _FINE_DEG) / 360.0 * self.pitch_rad
         self.fine_limit_Wb = magnetics.flux_linkage_Wb(fine_rad, self.limit_A)
 
     def state(self, index: int, flux_Wb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Current and torque at a multiple of _STEP_DEG."""
-        row = (index - 180 // _STEP_DEG) % _TURN
+        row = _row(index)
         place = np.minimum(flux_Wb * self.place_1_Wb[row], _FLUX_POINTS - 1.0)
         low = place.astype(np.intp)
-        value = self.table[row].take(low, axis=0) + self.table_rise[row].take(low, axis=0) * (place - low)[..., None]
+        value = self.begin[row].take(low, axis=0) + self.slope[row].take(low, axis=0) * place[..., None]
         return value[..., 0], value[..., 1]
 
-    def _step_s(self, speed_rad_s: np.ndarray) -> np.ndarray:
+    def step_s(self, speed_rad_s: np.ndarray) -> np.ndarray:
+        """By speed, as a column."""
         step_s: np.ndarray = _STEP_DEG / 360.0 * self.pitch_rad / speed_rad_s[:, None]
         return step_s
 
-    def run(self, speed_rad_s: np.ndarray, on_deg: Any, off_deg: Any, end_deg: int = 720 + _FIRST_DEG - _STEP_DEG
-            ) -> _Runs:
-        """Pulses of a turn-on and a turn-off angle."""
-        step_s = self._step_s(speed_rad_s)
-        on_deg, off_deg = (np.broadcast_arrays(angle, step_s, np.broadcast_arrays(on_deg, off_deg)[0])[0]
-                           for angle in (on_deg, off_deg))
-        first, last = _FIRST_DEG // _STEP_DEG, end_deg // _STEP_DEG
-        shape = (last - first + 1, *on_deg.shape)
-        flux_Wb, torque_Nm, current_A = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    def best_angles(self, speed_rad_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Turn-on and turn-off angles of the largest mean torque: motoring and braking, by speed."""
+        falls = self._falls(speed_rad_s, _MOTORING_OFF_DEG[0], _BRAKING_OFF_DEG[1])
+        found = []
+        for sign, on_range_deg, off_range_deg in (
+            (1.0, _MOTORING_ON_DEG, _MOTORING_OFF_DEG), (-1.0, _BRAKING_ON_DEG, _BRAKING_OFF_DEG),
+        ):
+            on_deg, off_deg = (np.arange(first, last + 1, _LANE_DEG) for first, last in (on_range_deg, off_range_deg))
+            row = (off_deg[0] - _MOTORING_OFF_DEG[0]) // _LANE_DEG
+            fall = _Sweep(*(of[row : row + len(off_deg)] for of in vars(falls).values()))
+            found.append(_best(self._rises(speed_rad_s, on_deg, off_deg), fall, sign, on_deg, off_deg))
+        on_deg, off_deg = (np.array(angle_deg) for angle_deg in zip(*found, strict=True))
+        off_deg[0] = np.minimum(off_deg[0], _MOTORING_OFF_MAX_DEG)
+        return on_deg, off_deg
+
+    def _rises(self, speed_rad_s: np.ndarray, on_deg: np.ndarray, off_deg: np.ndarray) -> _Sweep:
+        """Full voltage and ideal chopping from rising turn-on angles to every turn-off angle."""
+        step_s = self.step_s(speed_rad_s)
         rise_Wb, fall_Wb = self.rise_V * step_s, self.fall_V * step_s
         rise_ohm_s, fall_ohm_s = self.rise_ohm * step_s, self.fall_ohm * step_s
-        on_step, off_step = on_deg / _STEP_DEG, off_deg / _STEP_DEG
-        cap_Wb = self.cap_Wb(speed_rad_s, last)[..., None]
-        for at in range(last - first):
-            index = first + at + 1
-            off = np.clip(index - off_step, 0.0, 1.0)
-            on = np.clip(index - on_step, 0.0, 1.0) - off
-            falling_Wb = fall_Wb + fall_ohm_s * current_A[at]
-            free_Wb = flux_Wb[at] + on * (rise_Wb - rise_ohm_s * current_A[at]) - off * falling_Wb
+        cap_Wb = self.cap_Wb(speed_rad_s, int(off_deg[-1]) // _STEP_DEG)[..., None]
+        flux_Wb, current_A, torque_Nm, torque, square, over = np.zeros((6, len(speed_rad_s), len(on_deg)))
+        rows = []
+        for index in range(on_deg[0] // _STEP_DEG + 1, off_deg[-1] // _STEP_DEG + 1):
+            lanes = np.s_[:, : (index * _STEP_DEG - on_deg[0] - 1) // _LANE_DEG + 1]
+            before_Wb, before_A, before_Nm = flux_Wb[lanes], current_A[lanes], torque_Nm[lanes]
             # Chopping takes at most what the opposite voltage does.
-            held_Wb = np.minimum(free_Wb, np.maximum(cap_Wb[index], flux_Wb[at] - falling_Wb))
-            flux_Wb[at + 1] = np.maximum(np.where(on > 0.0, held_Wb, free_Wb), 0.0)
-            current_A[at + 1], torque_Nm[at + 1] = self.state(index, flux_Wb[at + 1])
-        return _Runs(on_deg, flux_Wb, torque_Nm, current_A, self._over(first, last))
+            least_Wb = np.maximum(before_Wb - (fall_Wb + fall_ohm_s * before_A), cap_Wb[index])
+            after_Wb = np.minimum(before_Wb + (rise_Wb - rise_ohm_s * before_A), least_Wb)
+            after_A, after_Nm = self.state(index, after_Wb)
+            torque[lanes] += 0.5 * (before_Nm + after_Nm)
+            square[lanes] += 0.5 * (before_A * before_A + after_A * after_A)
+            over[lanes] = np.maximum(over[lanes], after_Wb / self.over_Wb[_row(index)])
+            flux_Wb[lanes], current_A[lanes], torque_Nm[lanes] = after_Wb, after_A, after_Nm
+            if index * _STEP_DEG >= off_deg[0] and (index * _STEP_DEG - off_deg[0]) % _LANE_DEG == 0:
+                rows.append(np.stack([flux_Wb, torque, square, over]))
+        return _Sweep(*np.stack(rows, axis=1))
 
-    def falls(self, speed_rad_s: np.ndarray) -> _Runs:
-        """The flux linkage under the full opposite voltage on its way to zero at a lane's angle, backwards."""
-        step_s = self._step_s(speed_rad_s)
-        lane_deg = np.arange(_MOTORING_OFF_DEG[0], _BRAKING_ON_DEG[1] + 360.0 + _LANE_DEG, _LANE_DEG)
-        first, last = _FIRST_DEG // _STEP_DEG, int(lane_deg[-1]) // _STEP_DEG
-        shape = (last - first + 1, len(speed_rad_s), len(lane_deg))
-        flux_Wb, torque_Nm, current_A = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    def _falls(self, speed_rad_s: np.ndarray, first_deg: int, last_deg: int) -> _Sweep:
+        """Full opposite voltage from turn-off angles until the flux linkage is zero, backwards; the last axis is the
+        angle between both in multiples of _LANE_DEG."""
+        step_s = self.step_s(speed_rad_s)
         fall_Wb, fall_ohm_s = self.fall_V * step_s, self.fall_ohm * step_s
-        end_step = lane_deg / _STEP_DEG
-        for at in range(last - first - 1, -1, -1):
-            index = first + at
-            if index < _MOTORING_OFF_DEG[0] // _STEP_DEG:
-                break
-            falling_Wb = fall_Wb + fall_ohm_s * current_A[at + 1]
-            flux_Wb[at] = flux_Wb[at + 1] + np.clip(end_step - index, 0.0, 1.0) * falling_Wb
-            current_A[at], torque_Nm[at] = self.state(index, flux_Wb[at])
-        return _Runs(lane_deg, flux_Wb, torque_Nm, current_A, self._over(first, last))
+        # Ends beyond those that are searched: more than any flux linkage.
+        flux_Wb, current_A, torque_Nm, torque, square, over = np.zeros((6, len(speed_rad_s), _FALL_LANES))
+        flux_Wb[:, 1:] = 1e3 * self.limit_Wb.max()
+        rows = []
+        for index in range((_BRAKING_ON_DEG[1] + 360) // _STEP_DEG - 1, first_deg // _STEP_DEG - 1, -1):
+            flux_Wb = flux_Wb + (fall_Wb + fall_ohm_s * current_A)
+            after_A, after_Nm = self.state(index, flux_Wb)
+            torque = torque + 0.5 * (torque_Nm + after_Nm)
+            square = square + 0.5 * (current_A * current_A + after_A * after_A)
+            over = np.maximum(over, flux_Wb / self.over_Wb[_row(index)])
+            current_A, torque_Nm = after_A, after_Nm
+            if index % _LANE_STEPS == 0:  # the next end
+                moved = np.zeros((6, *flux_Wb.shape))
+                moved[..., 1:] = np.stack([flux_Wb, current_A, torque_Nm, torque, square, over])[..., :-1]
+                flux_Wb, current_A, torque_Nm, torque, square, over = moved
+                if index * _STEP_DEG <= last_deg:
+                    rows.append(moved[[0, 3, 4, 5]])
+        return _Sweep(*np.stack(rows[::-1], axis=1))
 
-    def _over(self, first: int, last: int) -> np.ndarray:
-        over_Wb: np.ndarray = self.over_Wb[(np.arange(first, last + 1) - 180 // _STEP_DEG) % _TURN]
-        return over_Wb
+    def torque_Nm(self, speed_rad_s: np.ndarray, on_deg: np.ndarray, off_deg: np.ndarray) -> np.ndarray:
+        """Torque of a phase in two turns, by angle, speed and pulse."""
+        step_s = self.step_s(speed_rad_s)
+        rise_Wb, fall_Wb = self.rise_V * step_s, self.fall_V * step_s
+        rise_ohm_s, fall_ohm_s = self.rise_ohm * step_s, self.fall_ohm * step_s
+        first = _MOTORING_ON_DEG[0] // _STEP_DEG
+        indices = np.arange(first, first + 2 * _TURN)
+        cap_Wb = self.cap_Wb(speed_rad_s, int(indices[-1]))[..., None]
+        # Parts of a step with the voltage and with the opposite one.
+        off = np.clip(indices[:, None, None] - off_deg / _STEP_DEG, 0.0, 1.0)
+        on = np.clip(indices[:, None, None] - on_deg / _STEP_DEG, 0.0, 1.0) - off
+        torque_Nm = np.zeros((len(indices), *on_deg.shape))
+        flux_Wb, current_A = np.zeros((2, *on_deg.shape))
+        for at in range(1, len(indices)):
+            falling_Wb = fall_Wb + fall_ohm_s * current_A
+            free_Wb = flux_Wb + on[at] * (rise_Wb - rise_ohm_s * current_A) - off[at] * falling_Wb
+            held_Wb = np.minimum(free_Wb, np.maximum(cap_Wb[indices[at]], flux_Wb - falling_Wb))
+            flux_Wb = np.maximum(np.where(on[at] > 0.0, held_Wb, free_Wb), 0.0)
+            current_A, torque_Nm[at] = self.state(int(indices[at]), flux_Wb)
+        return torque_Nm
 
     def envelope(self, speed_rad_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Angle past the aligned position and flux linkage at which that of the current limit, on its way to the
@@ -277,7 +304,7 @@ class _Phase:
         limit_Wb = self.fine_limit_Wb
         fall_Wb = -np.diff(limit_Wb)
         steepest = int(np.flatnonzero(fall_Wb >= 0.999 * fall_Wb.max())[-1])
-        taken_Wb = self.voltage_V * self._step_s(speed_rad_s)[:, 0] * (_FINE_DEG / _STEP_DEG)
+        taken_Wb = self.voltage_V * self.step_s(speed_rad_s)[:, 0] * (_FINE_DEG / _STEP_DEG)
         above_Wb = limit_Wb + taken_Wb[:, None] * np.arange(len(limit_Wb))
         at = steepest + above_Wb[:, steepest:].argmin(axis=1)
         return at * _FINE_DEG, limit_Wb[at]
@@ -286,89 +313,73 @@ class _Phase:
         """By angle from zero in steps and speed: the largest flux linkage from which full opposite voltage keeps the
         current within its limit."""
         index = np.arange(last + 1)
-        limit_Wb = self.limit_Wb[(index - 180 // _STEP_DEG) % _TURN][:, None]
+        limit_Wb = self.limit_Wb[_row(index)][:, None]
         end_deg, flux_Wb = self.envelope(speed_rad_s)
         left_deg = end_deg + 360.0 - _STEP_DEG * index[:, None]
-        line_Wb = flux_Wb + self.voltage_V * self._step_s(speed_rad_s)[:, 0] / _STEP_DEG * left_deg
+        line_Wb = flux_Wb + self.voltage_V * self.step_s(speed_rad_s)[:, 0] / _STEP_DEG * left_deg
         return np.where(left_deg > 0.0, np.minimum(limit_Wb, line_Wb), limit_Wb)
+
+
+def _row(index: Any) -> Any:
+    """Of the tables of a turn, by the angle in steps."""
+    return (index - 180 // _STEP_DEG) % _TURN
+
+
+def _whole(half: np.ndarray) -> np.ndarray:
+    """A turn from the half from 180 to 360 degrees."""
+    return np.concatenate([half, half[-2:0:-1]])
 
 
 # --- search ---------------------------------------------------------------------------------------------------------
 
-def _best(rise: _Runs, fall: _Runs, sign: float, on_range_deg: tuple[int, int], off_range_deg: tuple[int, int]
+def _best(rise: _Sweep, fall: _Sweep, sign: float, on_deg: np.ndarray, off_deg: np.ndarray
           ) -> tuple[np.ndarray, np.ndarray]:
     """Turn-on and turn-off angles of the largest mean torque of a sign, by speed."""
-    lanes = slice((on_range_deg[0] - _MOTORING_ON_DEG[0]) // _LANE_DEG,
-                  (on_range_deg[1] - _MOTORING_ON_DEG[0]) // _LANE_DEG + 1)
-    offs = slice((off_range_deg[0] - _FIRST_DEG) // _STEP_DEG, (off_range_deg[1] - _FIRST_DEG) // _STEP_DEG + 1,
-                 _LANE_DEG // _STEP_DEG)
-    on_deg = np.arange(on_range_deg[0], on_range_deg[1] + 1.0, _LANE_DEG)
-    off_deg = np.arange(off_range_deg[0], off_range_deg[1] + 1.0, _LANE_DEG)
-
-    # Turn-off angle, speed, turn-on angle.
-    flux_Wb = rise.flux_Wb[offs, :, lanes]
-    falling_Wb = fall.flux_Wb[offs]
-    below = np.maximum((falling_Wb[..., None, :] <= flux_Wb[..., None]).sum(axis=-1) - 1, 0)
-    below = np.minimum(below, len(fall.lane_deg) - 2)
+    below = (fall.flux_Wb[..., None, :] <= rise.flux_Wb[..., None]).sum(axis=-1) - 1
+    below = np.clip(below, 0, fall.flux_Wb.shape[-1] - 2)
 
     def both(of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.take_along_axis(of, below, axis=-1), np.take_along_axis(of, below + 1, axis=-1)
 
-    low_Wb, high_Wb = both(falling_Wb)
-    part = np.clip((flux_Wb - low_Wb) / np.maximum(high_Wb - low_Wb, 1e-9 * high_Wb.max()), 0.0, 1.0)
+    low_Wb, high_Wb = both(fall.flux_Wb)
+    part = np.minimum((rise.flux_Wb - low_Wb) / (high_Wb - low_Wb), 1.0)
 
     def in_fall(of: np.ndarray) -> np.ndarray:
         low, high = both(of)
         result: np.ndarray = low + part * (high - low)
         return result
 
-    def of_pulse(of_rise: np.ndarray, of_fall: np.ndarray) -> np.ndarray:
-        """Integral over the angle, in steps."""
-        rising = np.cumsum(of_rise, axis=0) - 0.5 * of_rise
-        falling = np.cumsum(of_fall[::-1], axis=0)[::-1] - 0.5 * of_fall
-        total: np.ndarray = rising[offs, :, lanes] + in_fall(falling[offs])
-        return total
-
-    work = sign * of_pulse(rise.torque_Nm, fall.torque_Nm)
-    square = of_pulse(rise.current_A**2, fall.current_A**2)
-    rising, falling = (runs.flux_Wb / runs.over_Wb[:, None, None] for runs in (rise, fall))
-    largest = np.maximum(np.maximum.accumulate(rising, axis=0)[offs, :, lanes],
-                         in_fall(np.maximum.accumulate(falling[::-1], axis=0)[::-1][offs]))
-    end_deg = fall.lane_deg[below] + part * _LANE_DEG
+    torque = sign * (rise.torque + in_fall(fall.torque))
+    square = rise.square + in_fall(fall.square)
+    end_deg = off_deg[:, None, None] + _LANE_DEG * (below + part)
     # Both limits are met by turning on later; positive: met.
     margin = np.minimum(on_deg + 360.0 - _REST_DEG - end_deg,
-                        100.0 * (1.0 - largest))
+                        100.0 * (1.0 - np.maximum(rise.over, in_fall(fall.over))))
     met = margin >= 0.0
 
-    largest = np.where(met, work, -np.inf).transpose(1, 0, 2).reshape(work.shape[1], -1)
-    of_largest = largest.argmax(axis=1)
-    reference = np.abs(largest.max(axis=1))[:, None]
-    reference_square = np.take_along_axis(square.transpose(1, 0, 2).reshape(largest.shape), of_largest[:, None], axis=1)
-    score = work / reference - _CURRENT_WEIGHT * square / reference_square
+    by_speed = np.where(met, torque, -np.inf).transpose(1, 0, 2).reshape(torque.shape[1], -1)
+    largest = by_speed.argmax(axis=1)[:, None]
+    of_largest = [np.take_along_axis(of.transpose(1, 0, 2).reshape(by_speed.shape), largest, axis=1)
+                  for of in (torque, square)]
+    score = torque / np.abs(of_largest[0]) - _CURRENT_WEIGHT * square / of_largest[1]
 
     # Turn-on by turn-off, continuous between the lanes and up to where the margin is used up.
-    score_met = np.where(met, score, -np.inf)
-    best = score_met.argmax(axis=-1)
-    shift = _vertex(score, best)
-    before = np.maximum(best - 1, 0)[..., None]
-    margins = [np.take_along_axis(margin, at, axis=-1)[..., 0] for at in (before, best[..., None])]
-    room = np.where(margins[0] < 0.0, margins[1] / np.maximum(margins[1] - margins[0], 1e-12), 1.0)
-    shift = np.clip(shift, -np.maximum(room, 0.0), 1.0)
-    on_by_off = on_deg[best] + shift * _LANE_DEG
+    best = np.where(met, score, -np.inf).argmax(axis=-1)
+    before, here, _ = _three(margin, best)
+    room = np.where(before < 0.0, np.maximum(here, 0.0) / np.maximum(here - before, 1e-12), 1.0)
+    shift = np.clip(_vertex(score, best), -room, 1.0)
     any_met = met.any(axis=-1)
-    on_by_off = np.where(any_met, on_by_off, np.nan)
-    score_by_off = np.where(any_met, _parabola(score, best, shift), -np.inf)
+    on_by_off = np.where(any_met, on_deg[best] + shift * _LANE_DEG, np.nan).T
+    score_by_off = np.where(any_met, _parabola(score, best, shift), -np.inf).T
 
-    # Turn-off.
-    best = score_by_off.argmax(axis=0)
-    shift = _vertex(score_by_off.T, best)
-    off = off_deg[best] + shift * _LANE_DEG
-    on = _parabola(on_by_off.T, best, shift)
-    return np.clip(on, on_deg[0], on_deg[-1]), off
+    best = score_by_off.argmax(axis=1)
+    shift = _vertex(score_by_off, best)
+    off = np.minimum(off_deg[best] + shift * _LANE_DEG, off_deg[-1])
+    return np.clip(_parabola(on_by_off, best, shift), on_deg[0], on_deg[-1]), off
 
 
 def _three(values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values at an index of the last axis and beside it; beyond the ends, and where there is none, that at the index."""
+    """Values at an index of the last axis and beside it; where there is none, that at the index."""
     last = values.shape[-1] - 1
     here = np.take_along_axis(values, at[..., None], axis=-1)[..., 0]
     sides = [np.take_along_axis(values, np.clip(at + step, 0, last)[..., None], axis=-1)[..., 0] for step in (-1, 1)]
