@@ -32,17 +32,24 @@ _UINT16_MAX, _HALF_TURN = (1 << 16) - 1, 1 << 15
 _INDEX_BITS = 12 + 32 - 22 + 6
 """Fraction bits of the index at the last speed, less those of a speed and a voltage: the index is
 ((speed_q22 * scale) >> 32) / voltage_q6, 2^12 at the last one."""
+_SCALE_BITS = 31
 
-_STEP_DEG = 2
+# Steps divide a stroke and a lane; between lanes the search interpolates. Its ranges are those of the angles and a lane
+# more where a maximum may be at their end.
+_STEP_DEG = 3
 _TURN = 360 // _STEP_DEG
-_LANE_DEG = 4  # of turn-on angles, turn-off angles and ends of the flux linkage in the search
+_LANE_DEG = 6
+"""Between turn-on angles, turn-off angles and ends of the flux linkage."""
 _LANE_STEPS = _LANE_DEG // _STEP_DEG
-_FALL_LANES = 48
-_MOTORING_ON_DEG, _MOTORING_OFF_DEG = (60, 180), (184, 356)
-_BRAKING_ON_DEG, _BRAKING_OFF_DEG = (200, 360), (364, 540)
+_FALL_LANES = 32
+_NEAR_LANES = 3
+"""Within which a maximum is followed from speed to speed."""
+_MOTORING_ON_DEG, _MOTORING_OFF_DEG = (60, 186), (192, 354)
+_BRAKING_ON_DEG, _BRAKING_OFF_DEG = (198, 366), (372, 546)
 _MOTORING_OFF_MAX_DEG = 353.0
 _SMOOTH_OFF_DEG = np.arange(240.0, 353.0, 8.0)
 _FINE_DEG = 0.25
+"""Of the braking envelope."""
 _FLUX_POINTS = 48
 _CURRENT_TOP = 1.2
 """Largest current of the tables, as a multiple of the limit."""
@@ -50,10 +57,11 @@ _CURRENT_OVER = 1.03
 """A current that rises above its limit against the full voltage, by which a pair of angles is refused."""
 _REST_DEG = 2.0
 """Between the end of the flux linkage and the next turn-on."""
-_CURRENT_WEIGHT = 0.02
+_CURRENT_WEIGHT = 0.05
 """Relative torque that a relative square of the RMS current is worth."""
 _VOLTAGE_SHARE_MAX = 0.95
-"""Of the voltage that the resistance may take: the current is not limited above it."""
+"""Of the voltage that the resistance may take, and of the supply that the switches may: a current that is not reached
+is no limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +104,9 @@ class PulseTables:
 
 def pulse_tables(machine: Machine, scaling: Scaling) -> PulseTables:
     """The tables of a machine."""
-    return in_units(single_pulse(machine, scaling.data), scaling.exponents)
+    exponents = scaling.exponents
+    least = math.ldexp(1.0, _INDEX_BITS - _SCALE_BITS + exponents.speed - exponents.voltage)
+    return in_units(single_pulse(machine, scaling.data, least), exponents)
 
 
 def in_units(pulse: SinglePulse, exponents: Exponents) -> PulseTables:
@@ -107,7 +117,7 @@ def in_units(pulse: SinglePulse, exponents: Exponents) -> PulseTables:
         pulse.smooth_Nm, pulse.mean_Nm, pulse.peak_Nm)]
     last = math.ldexp(float(pulse.speed_per_voltage[-1]), exponents.voltage - exponents.speed)
     return PulseTables(
-        index_scale=int(_rounded(1.0 / last, _INDEX_BITS, (1 << 31) - 1)),
+        index_scale=int(_rounded(1.0 / last, _INDEX_BITS, (1 << _SCALE_BITS) - 1)),
         pulse=np.stack([*angles, *torques], axis=-1),
         braking_end=_rounded(pulse.braking_end_deg / 360.0, 16, _HALF_TURN),
         braking_flux=_rounded(pulse.braking_flux_Wb, 13 - exponents.voltage),
@@ -119,16 +129,18 @@ def _rounded(value: Any, fraction_bits: int, limit: int = _UINT16_MAX) -> np.nda
     return result
 
 
-def single_pulse(machine: Machine, data: DriveData) -> SinglePulse:
-    """The pulses of a machine with the nominal voltage and the limit current_limit_A."""
+def single_pulse(machine: Machine, data: DriveData, speed_per_voltage_least: float = 0.0) -> SinglePulse:
+    """The pulses of a machine with the nominal voltage and the limit current_limit_A. speed_per_voltage_least: of the
+    last speed, rad/s/V."""
     phase = _Phase(machine, data.parameters["current_limit_A"])
     base_rad_s = data.speed_base_rpm * math.pi / 30.0
     low, high = SPEED_PER_BASE
     last_rad_s = min(max(data.speed_max_rpm * math.pi / 30.0, low * base_rad_s), high * base_rad_s)
+    last_rad_s = max(last_rad_s, speed_per_voltage_least * machine.supply_voltage_V)
     speed_rad_s = np.arange(POINTS) * last_rad_s / (POINTS - 1)
     on_deg, off_deg = phase.best_angles(speed_rad_s[1:])
-    on_deg = np.insert(on_deg, 0, [180.0, 360.0], axis=1)
-    off_deg = np.insert(off_deg, 0, [_MOTORING_OFF_MAX_DEG, 540.0], axis=1)
+    on_deg = _smoothed(np.insert(on_deg, 0, [180.0, 360.0], axis=1))
+    off_deg = _smoothed(np.insert(off_deg, 0, [_MOTORING_OFF_MAX_DEG, 540.0], axis=1))
 
     # At standstill the current limit alone counts: any speed that is low enough.
     seen_rad_s = np.append(1e-3 * speed_rad_s[1], speed_rad_s[1:])
@@ -175,7 +187,8 @@ class _Phase:
         magnetics, converter = machine.magnetics, machine.converter
         self.pitch_rad = magnetics.pitch_rad
         # Two devices conduct.
-        self.rise_V = machine.supply_voltage_V - 2.0 * converter["switch_drop_V"]
+        self.rise_V = max(machine.supply_voltage_V - 2.0 * converter["switch_drop_V"],
+                          (1.0 - _VOLTAGE_SHARE_MAX) * machine.supply_voltage_V)
         self.fall_V = machine.supply_voltage_V + 2.0 * converter["diode_drop_V"]
         self.rise_ohm = machine.resistance_ohm + 2.0 * converter["switch_resistance_ohm"]
         self.fall_ohm = machine.resistance_ohm + 2.0 * converter["diode_resistance_ohm"]
@@ -226,8 +239,7 @@ class _Phase:
             fall = _Sweep(*(of[row : row + len(off_deg)] for of in vars(falls).values()))
             found.append(_best(self._rises(speed_rad_s, on_deg, off_deg), fall, sign, on_deg, off_deg))
         on_deg, off_deg = (np.array(angle_deg) for angle_deg in zip(*found, strict=True))
-        off_deg[0] = np.minimum(off_deg[0], _MOTORING_OFF_MAX_DEG)
-        return on_deg, off_deg
+        return (np.minimum(on_deg, [[180.0], [360.0]]), np.minimum(off_deg, [[_MOTORING_OFF_MAX_DEG], [540.0]]))
 
     def _rises(self, speed_rad_s: np.ndarray, on_deg: np.ndarray, off_deg: np.ndarray) -> _Sweep:
         """Full voltage and ideal chopping from rising turn-on angles to every turn-off angle."""
@@ -317,7 +329,8 @@ class _Phase:
         end_deg, flux_Wb = self.envelope(speed_rad_s)
         left_deg = end_deg + 360.0 - _STEP_DEG * index[:, None]
         line_Wb = flux_Wb + self.voltage_V * self.step_s(speed_rad_s)[:, 0] / _STEP_DEG * left_deg
-        return np.where(left_deg > 0.0, np.minimum(limit_Wb, line_Wb), limit_Wb)
+        cap_Wb: np.ndarray = np.where(left_deg > 0.0, np.minimum(limit_Wb, line_Wb), limit_Wb)
+        return cap_Wb
 
 
 def _row(index: Any) -> Any:
@@ -372,10 +385,31 @@ def _best(rise: _Sweep, fall: _Sweep, sign: float, on_deg: np.ndarray, off_deg: 
     on_by_off = np.where(any_met, on_deg[best] + shift * _LANE_DEG, np.nan).T
     score_by_off = np.where(any_met, _parabola(score, best, shift), -np.inf).T
 
-    best = score_by_off.argmax(axis=1)
+    best = _followed(score_by_off)
     shift = _vertex(score_by_off, best)
     off = np.minimum(off_deg[best] + shift * _LANE_DEG, off_deg[-1])
     return np.clip(_parabola(on_by_off, best, shift), on_deg[0], on_deg[-1]), off
+
+
+def _followed(score: np.ndarray) -> np.ndarray:
+    """Index of the maximum of each row, and where there are two, of that which follows from the row before: angles
+    between two speeds are interpolated, and those between two maxima may be bad."""
+    found = np.zeros(len(score), dtype=np.intp)
+    at = int(score[0].argmax())
+    for row, values in enumerate(score):
+        before = -1
+        while at != before:
+            before, first = at, max(at - _NEAR_LANES, 0)
+            at = first + int(values[first : at + _NEAR_LANES + 1].argmax())
+        found[row] = at
+    return found
+
+
+def _smoothed(angle_deg: np.ndarray) -> np.ndarray:
+    """Over the speed: the maximum of a flat torque is found to some degrees only."""
+    smoothed_deg = angle_deg.copy()
+    smoothed_deg[:, 1:-1] += 0.25 * np.diff(angle_deg, 2)
+    return smoothed_deg
 
 
 def _three(values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
