@@ -59,6 +59,18 @@ typedef struct {
     uint8_t result_shift;    /* 0..12 */
 } machine_format_t;
 
+/* Single pulse operation (control/single_pulse.h): points equidistant in speed per DC-link voltage, the first at
+ * standstill. */
+#define MACHINE_PULSE_POINTS 17
+
+typedef struct {
+    uint16_t lead;          /* turn-on before the begin of the half of the wanted torque, 2^-16 electrical rev */
+    uint16_t end;           /* turn-off past the begin of that half, 2^-16 electrical rev, 0..2^15 */
+    uint16_t smooth_torque; /* largest torque without lead and without ripple, N m, Q7.8 */
+    uint16_t mean_torque;   /* largest mean torque, N m, Q7.8 */
+    uint16_t peak_torque;   /* largest instantaneous sum of all phases with that pulse, N m, Q7.8 */
+} machine_pulse_t;
+
 #define MACHINE_PARAMETERS_MAX 64
 
 typedef struct {
@@ -75,6 +87,13 @@ typedef struct {
     /* Of the interval that begins at the row; 0 in the last row. */
     int8_t curvature[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
     int16_t node[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
+    uint32_t pulse_index_scale;                     /* index in Q8 = ((|speed_q22| * scale) >> 32) / voltage_q6 */
+    machine_pulse_t pulse[2][MACHINE_PULSE_POINTS]; /* motoring, braking */
+    /* A braking current stays within its limit under full opposite voltage up to the angle theta_t at which it is
+     * psi_t, when psi <= psi_t + V / omega (theta_t - theta); past theta_t, when it is within its limit. Where no angle
+     * needs that, theta_t is where psi at the limit falls fastest. */
+    uint16_t braking_end[MACHINE_PULSE_POINTS];  /* theta_t past the aligned position, 2^-16 electrical rev */
+    uint16_t braking_flux[MACHINE_PULSE_POINTS]; /* psi_t, Wb, Q2.13 (Q2.29 >> 16) */
     /* Of drive/parameters.def, by index: default, raw, and fraction bits of a raw value in the SI unit. */
     int32_t parameter_default[MACHINE_PARAMETERS_MAX];
     int8_t parameter_fraction_bits[MACHINE_PARAMETERS_MAX];

@@ -19,7 +19,8 @@ from salient.machine.definition import Machine
 from salient.machine.drive_data import DERIVED, DriveData, derive
 from salient.machine.file import load_machine
 from salient.machine.parameter_table import read_table
-from salient.machine.torque_speed import Source, smooth_torque_Nm, speed_change_s, torque_over_speed
+from salient.machine.single_pulse import single_pulse
+from salient.machine.torque_speed import Source, smooth_torque_Nm, speed_change_s
 from salient.paths import MACHINES, ROOT, SCENARIOS
 
 BUNDLED = sorted(MACHINES.glob("*.toml"))
@@ -73,9 +74,10 @@ def test_every_value_is_finite_and_in_order(path):
     assert data.bus_under_voltage_V < data.supply_min_V <= data.supply_max_V < data.bus_over_voltage_V
     # The voltage makes the rated torque at the base speed, and the bound of a start is not below that of the torque.
     source = Source(data.supply_min_V, machine.resistance_ohm)
-    speed_rad_s, torque_Nm = torque_over_speed(machine.magnetics, machine.phases, source, data.current_peak_A)
+    pulses = single_pulse(replace(machine, supply_voltage_V=data.supply_min_V), data)
     base_rad_s = data.speed_base_rpm * math.pi / 30.0
-    assert torque_Nm[speed_rad_s <= base_rad_s].min() > data.torque_rated_Nm
+    assert data.parameters["current_limit_A"] == data.current_peak_A
+    assert pulses.mean_Nm[0][pulses.speed_per_voltage * data.supply_min_V <= base_rad_s].min() > data.torque_rated_Nm
     bound_s = speed_change_s(machine.magnetics, machine.phases, source, data.current_peak_A, data.torque_peak_Nm,
                              machine.inertia_kg_m2, machine.friction_Nm_s, 0.0, 0.4 * base_rad_s)
     least_s = machine.inertia_kg_m2 * 0.4 * base_rad_s / data.torque_peak_Nm

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import tomllib
 
+import pytest
+
 from salient.machine import file as machine
 from salient.machine.report import describe
 from salient.paths import MACHINES
@@ -34,6 +36,9 @@ def test_bundled_machine_is_described_and_plotted(salient, tmp_path):
     assert "6/4 poles, 3 phases" in result.stdout
     assert "23.60 mH aligned, 0.67 mH unaligned" in result.stdout
     assert "1.82 N m at 10 A, 6.17 N m at 20 A, 11.9 N m at 30 A, 25.3 N m at 50 A" in result.stdout
+    # A pulse of the largest torque, at half of the last speed.
+    found = re.search(r"2250 r/min +([\d.]+) N m +(\d+) to (\d+) deg +([\d.]+) N m +(\d+) to (\d+) deg", result.stdout)
+    assert [float(value) for value in found.groups()] == pytest.approx([26.1, 176, 342, 26.1, 290, 536], rel=0.02)
     picture = tmp_path / "view" / "saturating.png"
     assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 20_000
 

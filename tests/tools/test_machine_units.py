@@ -15,7 +15,7 @@ from salient.dbc import database_hash
 from salient.generate import resolution
 from salient.generate.machine import tables_source
 from salient.machine.file import Machine, MachineError, load_machine
-from salient.machine.firmware_tables import machine_phase_map
+from salient.machine.image import firmware_tables
 from salient.machine.magnetics import Formula
 from salient.machine.parameter_table import read_table
 from salient.machine.scaling import Exponents, Scaling, database_of, drive_dbc, scaling_of
@@ -120,7 +120,7 @@ def similar(machine: Machine, a: int, v: int) -> Machine:
 
 def in_no_unit(machine: Machine, scaling: Scaling) -> str:
     """The source of the firmware's tables but for what states the units."""
-    source = tables_source(machine, scaling, machine_phase_map("", machine, scaling.exponents))
+    source = tables_source(machine, scaling, firmware_tables("", machine, scaling))
     return re.sub(r"\.(parameter_fraction_bits|dbc_hash) = [^.]*", "", source)
 
 

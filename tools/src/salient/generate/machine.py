@@ -14,16 +14,15 @@ import numpy as np
 
 from salient.generate.files import write_files
 from salient.machine.file import FORMS, Machine, MachineError, load_machine
-from salient.machine.firmware_tables import PhaseMap, machine_phase_map
 from salient.machine.flux_map import FluxMap
-from salient.machine.image import FLUX_MAP, PLANT, TABLES, Member, Structure, image
+from salient.machine.image import FLUX_MAP, PLANT, TABLES, FirmwareTables, Member, Structure, firmware_tables, image
 from salient.machine.scaling import Scaling, scaling_of
 from salient.paths import DRIVE_DBC, PARAMETERS
 
 _VALUES_A_LINE = 16
 
 
-def tables_source(machine: Machine, scaling: Scaling, tables: PhaseMap) -> str:
+def tables_source(machine: Machine, scaling: Scaling, tables: FirmwareTables) -> str:
     """C source of the firmware's tables."""
     return _source(machine, "control/machine_tables.h", [
         "MACHINE_TABLES_CONST machine_tables_t machine_tables = {", *_initialisers(TABLES, machine, scaling, tables),
@@ -73,7 +72,7 @@ def machine_files(file: str, folder: Path) -> dict[str, str | bytes]:
     to `folder`; MachineError."""
     machine = load_machine(file)
     scaling = scaling_of(file, machine)
-    tables = machine_phase_map(file, machine, scaling.exponents)
+    tables = firmware_tables(file, machine, scaling)
     made: dict[str, str | bytes] = {
         "machine_tables.c": tables_source(machine, scaling, tables),
         "machine_plant.c": plant_source(machine, scaling),

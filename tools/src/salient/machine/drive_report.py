@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 
 from salient.machine.definition import Machine
-from salient.machine.drive_data import DEFAULT, Derivation, derive
+from salient.machine.drive_data import DEFAULT, Derivation, DriveData, derive
+from salient.machine.single_pulse import single_pulse
+
+_PULSES_SHOWN = slice(2, None, 2)
 
 
 def drive_lines(machine: Machine) -> list[str]:
@@ -18,6 +22,21 @@ def drive_lines(machine: Machine) -> list[str]:
     return [f"drive of {machine.name}, from its file or derived", *(line.rstrip() for line in lines),
             f"  {len(data.derivations) - len(shown)} more parameters have the same default for every machine"
             " (firmware/PARAMETERS.md)"]
+
+
+def pulse_lines(machine: Machine, data: DriveData) -> list[str]:
+    """Largest mean torque over the speed, and the angles that make it."""
+    of = single_pulse(machine, data)
+    rpm = of.speed_per_voltage * machine.supply_voltage_V * 30.0 / math.pi
+    begins_deg = (180.0, 360.0)
+    lines = []
+    for point in range(len(rpm))[_PULSES_SHOWN]:
+        halves = "   ".join(f"{of.mean_Nm[half, point]:9.4g} N m {begin_deg - of.lead_deg[half, point]:5.0f} to"
+                            f" {begin_deg + of.end_deg[half, point]:3.0f} deg" for half, begin_deg in
+                            enumerate(begins_deg))
+        lines.append(f"  {rpm[point]:7.0f} r/min{halves}")
+    return [f"largest mean torque of {machine.name} at {machine.supply_voltage_V:g} V, motoring and braking, and the"
+            " electrical angles between which a phase has full voltage (180 unaligned, 360 aligned)", *lines]
 
 
 def drive_json(machine: Machine) -> str:

@@ -32,6 +32,7 @@ from salient.machine.firmware_tables import (
 from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS, FluxMap
 from salient.machine.magnetics import FORMULA_KEYS
 from salient.machine.scaling import Scaling, database_of, scaling_of
+from salient.machine.single_pulse import POINTS, PulseTables, pulse_tables
 
 MAGIC = b"SALIENTM"
 HEADER = struct.Struct("<8sII4I")
@@ -42,6 +43,7 @@ _TYPES: dict[str, Any] = {
     "uint8_t": "<u1", "int8_t": "<i1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
     "unsigned": "<u4", "double": "<f8", "magnetics_form_t": "<u4",
     "machine_row_t": [("start", "<u4"), ("reciprocal", "<i4")],
+    "machine_pulse_t": [(name, "<u2") for name in ("lead", "end", "smooth_torque", "mean_torque", "peak_torque")],
 }  # fmt: skip
 
 
@@ -105,6 +107,19 @@ def quantise(value: float, fraction_bits: int, bits: int) -> int:
 
 # --- the firmware's tables ------------------------------------------------------------------------------------------
 
+@dataclass(frozen=True)
+class FirmwareTables:
+    """What is sampled or computed from a machine's magnetics."""
+
+    phase_map: PhaseMap
+    pulse: PulseTables
+
+
+def firmware_tables(path: Path | str, machine: Machine, scaling: Scaling) -> FirmwareTables:
+    """The tables of a machine file's machine; MachineError when the formats cannot hold them."""
+    return FirmwareTables(machine_phase_map(path, machine, scaling.exponents), pulse_tables(machine, scaling))
+
+
 def _columns(torque: np.ndarray, flux: np.ndarray) -> np.ndarray:
     """Arrays by row and column in the layout of firmware/control/machine_tables.h; without a last row: 0 there."""
     columns = [np.pad(of, ((0, ROWS - len(of)), (0, 0))).T for of in (torque, flux)]
@@ -113,8 +128,10 @@ def _columns(torque: np.ndarray, flux: np.ndarray) -> np.ndarray:
 
 def _format(name: str, surface: Callable[[PhaseMap], Surface]) -> tuple[Member, ...]:
     return (
-        Member(f"{name}.curvature_shift", "uint8_t", lambda machine, scaling, tables: surface(tables).curvature_shift),
-        Member(f"{name}.result_shift", "uint8_t", lambda machine, scaling, tables: surface(tables).result_shift),
+        Member(f"{name}.curvature_shift", "uint8_t",
+               lambda machine, scaling, tables: surface(tables.phase_map).curvature_shift),
+        Member(f"{name}.result_shift", "uint8_t",
+               lambda machine, scaling, tables: surface(tables.phase_map).result_shift),
     )
 
 
@@ -136,14 +153,20 @@ TABLES = Structure("machine_tables_t", (
         scaling.data.adc_voltage_V, 6 - scaling.exponents.voltage, 17)),
     Member("current_slew_rate_A_s", "int32_t", lambda machine, scaling, tables: quantise(
         machine.current_rise_A_s, -scaling.exponents.current, 32)),
-    Member("row", "machine_row_t", lambda machine, scaling, tables: tables.rows(), (ROWS,)),
-    Member("angle_bin_row", "uint8_t", lambda machine, scaling, tables: tables.angle_bin_row(), (ANGLE_BINS,)),
-    *_format("torque_format", lambda tables: tables.torque_per_ampere),
-    *_format("flux_format", lambda tables: tables.flux_per_ampere),
+    Member("row", "machine_row_t", lambda machine, scaling, tables: tables.phase_map.rows(), (ROWS,)),
+    Member("angle_bin_row", "uint8_t", lambda machine, scaling, tables: tables.phase_map.angle_bin_row(),
+           (ANGLE_BINS,)),
+    *_format("torque_format", lambda phase_map: phase_map.torque_per_ampere),
+    *_format("flux_format", lambda phase_map: phase_map.flux_per_ampere),
     Member("curvature", "int8_t", lambda machine, scaling, tables: _columns(
-        tables.torque_per_ampere.curvature, tables.flux_per_ampere.curvature), _CELLS),
+        tables.phase_map.torque_per_ampere.curvature, tables.phase_map.flux_per_ampere.curvature), _CELLS),
     Member("node", "int16_t", lambda machine, scaling, tables: _columns(
-        tables.torque_per_ampere.node - NODE_OFFSET, tables.flux_per_ampere.node - NODE_OFFSET), _CELLS),
+        tables.phase_map.torque_per_ampere.node - NODE_OFFSET,
+        tables.phase_map.flux_per_ampere.node - NODE_OFFSET), _CELLS),
+    Member("pulse_index_scale", "uint32_t", lambda machine, scaling, tables: tables.pulse.index_scale),
+    Member("pulse", "machine_pulse_t", lambda machine, scaling, tables: tables.pulse.pulses(), (2, POINTS)),
+    Member("braking_end", "uint16_t", lambda machine, scaling, tables: tables.pulse.braking_end, (POINTS,)),
+    Member("braking_flux", "uint16_t", lambda machine, scaling, tables: tables.pulse.braking_flux, (POINTS,)),
     Member("parameter_default", "int32_t", lambda machine, scaling, tables: _padded(scaling.raw_parameters()),
            (_PARAMETERS_MAX,)),
     Member("parameter_fraction_bits", "int8_t", lambda machine, scaling, tables: _padded(scaling.fraction_bits()),
@@ -152,7 +175,7 @@ TABLES = Structure("machine_tables_t", (
     Member("speed_reference_max", "int32_t", lambda machine, scaling, tables: scaling.speed_reference_max),
     Member("dbc_hash", "uint32_t", lambda machine, scaling, tables: database_hash(database_of(scaling.dbc()))),
 ))  # fmt: skip
-"""Of a Machine, its Scaling and its PhaseMap: firmware/control/machine_tables.h."""
+"""Of a Machine, its Scaling and its FirmwareTables: firmware/control/machine_tables.h."""
 
 
 # --- the emulator's machine -----------------------------------------------------------------------------------------
@@ -211,7 +234,7 @@ LAYOUT = zlib.crc32("\n".join(f"{structure.type} {member.name} {member.type} {me
 """Version of the image: changes with every change of a structure."""
 
 
-def image(machine: Machine, scaling: Scaling, tables: PhaseMap) -> bytes:
+def image(machine: Machine, scaling: Scaling, tables: FirmwareTables) -> bytes:
     """The machine image."""
     parts = [
         TABLES.packed(machine, scaling, tables),
@@ -227,4 +250,4 @@ def image_of(path: Path) -> bytes:
     """The machine image of a machine file; MachineError."""
     machine = load_machine(path)
     scaling = scaling_of(path, machine)
-    return image(machine, scaling, machine_phase_map(path, machine, scaling.exponents))
+    return image(machine, scaling, firmware_tables(path, machine, scaling))

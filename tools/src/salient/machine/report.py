@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from salient.errors import UsageError
-from salient.machine.drive_report import drive_json, drive_lines
+from salient.machine.drive_report import drive_json, drive_lines, pulse_lines
 from salient.machine.file import Converter, Machine, MachineError, Sensors, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
 from salient.machine.scaling import scaling_of
@@ -37,7 +37,7 @@ def run(name_or_path: str, out: Path, json_path: Path | None = None, dbc_path: P
         machine_phase_map(path, machine, scaling.exponents)
     except MachineError as error:
         raise UsageError(str(error)) from None
-    print("\n".join([*describe(machine), *drive_lines(machine)]))
+    print("\n".join([*describe(machine), *drive_lines(machine), *pulse_lines(machine, scaling.data)]))
     plot_path = out / f"{machine.name}.png"
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,5 @@
-"""What a machine's magnetics and a voltage can make: smooth torque of a current, mean torque over the speed.
-
-Angles of a phase are electrical degrees: 180 is the unaligned, 360 the aligned position.
-"""
+"""What a machine's magnetics and a voltage can make: smooth torque of a current, time of a change of speed. The mean
+torque over the speed: single_pulse.py."""
 
 from __future__ import annotations
 
@@ -11,22 +9,12 @@ from typing import Any
 
 import numpy as np
 
-# Grid of the mean torque: turn-on and turn-off angles among which the best is selected, and speeds as fractions of that
-# at which the voltage just builds up the aligned flux linkage within half a rotor pitch.
-_TURN_ON_DEG = np.arange(90.0, 201.0, 10.0)
-_TURN_OFF_DEG = np.arange(250.0, 351.0, 10.0)
-_SPEED_FRACTIONS = np.geomspace(0.05, 8.0, 24)
-_STEP_DEG = 1
-_END_DEG = 540
-"""The flux linkage must have ended here, the next unaligned position."""
 _FLUX_POINTS = 128
 
 _CHANGE_STEPS = 3000
 _STROKE_POINTS = 61
 _SEARCH_POINTS = 80
 _BISECTIONS = 24  # to 1e-7 of the range
-_CURRENT_OVER = 1.03
-"""A current that rises above its limit against the full voltage, by which a pair of angles is refused."""
 
 
 @dataclass(frozen=True)
@@ -96,41 +84,6 @@ def torque_per_flux_Nm_Wb(magnetics: Any, current_A: float) -> float:
     slope = ((magnetics.torque_Nm(angle_rad, high_A) - magnetics.torque_Nm(angle_rad, low_A))
              / (magnetics.flux_linkage_Wb(angle_rad, high_A) - magnetics.flux_linkage_Wb(angle_rad, low_A)))
     return float(np.mean(slope[torque_Nm >= 0.5 * torque_Nm.max()]))
-
-
-def torque_over_speed(magnetics: Any, phases: int, source: Source, current_A: float) -> tuple[np.ndarray, np.ndarray]:
-    """Speeds in rad/s and the largest mean torque at each: full voltage from a turn-on to a turn-off angle, then full
-    opposite voltage, the current limited to current_A by chopping, the best pair of angles.
-
-    A stroke's work is the area of its loop of flux linkage and current. Conduction ends before the next stroke.
-    """
-    voltage_V = max(source.voltage_V, 1e-6)
-    half_rad = magnetics.pitch_rad / 2.0
-    table, limit_Wb = _inverse_table(magnetics, current_A)
-    base_rad_s = voltage_V * half_rad / limit_Wb[0]
-    speed_rad_s, on_deg, off_deg = (grid.ravel() for grid in np.meshgrid(
-        base_rad_s * _SPEED_FRACTIONS, _TURN_ON_DEG, _TURN_OFF_DEG, indexing="ij"))
-    step_s = math.radians(_STEP_DEG) * half_rad / math.pi / speed_rad_s
-    flux_Wb, current, work_J = (np.zeros_like(speed_rad_s) for _ in range(3))
-    refused = np.zeros(speed_rad_s.shape, dtype=bool)
-    for angle_deg in range(int(_TURN_ON_DEG[0]), _END_DEG, _STEP_DEG):
-        index = abs((angle_deg + _STEP_DEG) % 360 - 360) if (angle_deg + _STEP_DEG) % 360 > 180 else (
-            angle_deg + _STEP_DEG) % 360
-        drives = (angle_deg >= on_deg) & (angle_deg < off_deg)
-        applied_V = np.where(drives, voltage_V, np.where(flux_Wb > 0.0, -voltage_V, 0.0))
-        next_Wb = np.maximum(flux_Wb + (applied_V - source.resistance_ohm * current) * step_s, 0.0)
-        over = next_Wb > limit_Wb[index]
-        refused |= over & ~drives & (next_Wb > _CURRENT_OVER * limit_Wb[index])
-        next_Wb = np.where(over, limit_Wb[index], next_Wb)
-        place = next_Wb / limit_Wb[index] * (_FLUX_POINTS - 1)
-        low = np.minimum(place.astype(int), _FLUX_POINTS - 2)
-        next_current = table[index, low] + (place - low) * (table[index, low + 1] - table[index, low])
-        work_J += 0.5 * (current + next_current) * (next_Wb - flux_Wb)
-        flux_Wb, current = next_Wb, next_current
-    work_J[refused | (flux_Wb > 0.01 * limit_Wb[0])] = 0.0
-    strokes_per_rad = phases / magnetics.pitch_rad
-    best_Nm = work_J.reshape(len(_SPEED_FRACTIONS), -1).max(axis=1) * strokes_per_rad
-    return base_rad_s * _SPEED_FRACTIONS, best_Nm
 
 
 def _inverse_table(magnetics: Any, current_A: float) -> tuple[np.ndarray, np.ndarray]:
