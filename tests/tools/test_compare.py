@@ -33,6 +33,7 @@ from salient.experiments.compare.targets import TARGETS, Target
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep, load_scenarios
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
+from salient.machine.parameter_table import read_table
 from salient.paths import MACHINES
 from salient.reference.torque_speed_bound import MOTORING, Limits, largest_torque
 
@@ -122,8 +123,9 @@ def test_largest_torque_is_requested_from_a_quarter_to_twice_the_base_speed_in_b
               if case.scenario.machine == machine and case.controller == "salient"]
         speeds_rpm = sorted({case.scenario.bench["held_speed_rpm"] for case in of})
         assert speeds_rpm == [375.0, 750.0, 1125.0, 1500.0, 1875.0, 2250.0, 3000.0]
-        assert {case.scenario.torque[0].value_Nm for case in of} == {40.0, -40.0}
-        assert all(case.scenario.parameters == {"torque_max_Nm": 40.0} for case in of)
+        (most_Nm,) = (row.limits[1] for row in read_table() if row.name == "torque_max_Nm")
+        assert {case.scenario.torque[0].value_Nm for case in of} == {most_Nm, -most_Nm}
+        assert all(case.scenario.parameters == {"torque_max_Nm": most_Nm} for case in of)
 
 
 def test_parts_of_the_torque_are_those_of_the_largest_one_above_base_speed():

@@ -153,7 +153,7 @@ def _torque_over_speed(content: Content) -> Figure | None:
             points = [(float(speed.split()[0]), bound_Nm) for condition, bound_Nm in bounds.items()
                       for of, speed, kind in [condition.split(", ")] if (of, kind) == (machine, quadrant)]
             if points:
-                axis.plot(*zip(*points, strict=True), color=_TARGET_COLOUR, linewidth=1.0, zorder=0)
+                axis.plot(*zip(*points, strict=True), color=_TARGET_COLOUR, linewidth=1.0)
         axis.axhline(0.0, color="#555555", linewidth=0.8)
         axis.set_title(machine)
         axis.set_xlabel("speed / (r/min)")
