@@ -12,7 +12,15 @@ import pytest
 from salient.cli import make_parser
 from salient.config import CONTROLLERS
 from salient.errors import UsageError
-from salient.experiments.compare import baseline, command, random_cases, results_file, summary_file, table
+from salient.experiments.compare import (
+    baseline,
+    command,
+    random_cases,
+    results_file,
+    speed_range,
+    summary_file,
+    table,
+)
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS, scenario_toml, start_scenario
 from salient.experiments.compare.every_machine import EXAMPLES
@@ -22,10 +30,12 @@ from salient.experiments.compare.metrics import EXTRACTORS, METRICS, failures, p
 from salient.experiments.compare.random_cases import random_drive, random_load
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS, Target
-from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, load_scenarios
+from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep, load_scenarios
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
+from salient.machine.parameter_table import read_table
 from salient.paths import MACHINES
+from salient.reference.torque_speed_bound import MOTORING, Limits, largest_torque
 
 ALL_CASES = {name: list(group.cases(False)) for name, group in GROUPS.items()}
 
@@ -62,7 +72,8 @@ def test_every_target_belongs_to_a_row():
 
 def test_every_controller_runs_in_every_group_that_it_supports():
     for name, of in ALL_CASES.items():
-        salient = {key: {"salient"} for key in ("rates", "encoders", "misalignment", "standing_error", "hold")}
+        salient = {key: {"salient"} for key in ("rates", "encoders", "misalignment", "standing_error", "hold",
+                                                "partial_torque", "transition", "torque_conditions")}
         expected = {"paper_conditions": {"traditional", "paper"}, "ablation": {"paper", "salient"},
                     "compressor": {"paper", "salient"}}
         assert {case.controller for case in of} == (expected | salient).get(name, set(CONTROLLERS))
@@ -91,16 +102,52 @@ def test_moving_loads_are_judged_over_two_periods_after_the_transient():
         assert scenario.load[0].at_s >= 0.2 + scenario.speed[0].value_rpm / 5000.0 - 1e-9
 
 
-def test_torque_over_speed_is_recorded_over_whole_strokes_of_a_shaft_that_has_its_speed():
-    for case in ALL_CASES["torque_speed"]:
+@pytest.mark.parametrize("group", ["torque_speed", "partial_torque", "torque_conditions"])
+def test_held_torque_is_recorded_over_whole_revolutions_of_a_shaft_that_has_its_speed(group):
+    rotor_poles = {"saturating": 4, "linear_cosine": 4, "linear_trapezoid": 4, "finite_element": 6}
+    for case in ALL_CASES[group]:
         scenario = case.scenario
         speed_rpm = scenario.bench["held_speed_rpm"]
         (step,) = scenario.torque
         assert step.at_s >= speed_rpm / 10_000 + 0.01
         assert scenario.record.from_s >= step.at_s + 0.1 - 1e-9
-        strokes = (scenario.duration_s - scenario.record.from_s) * 6.0 * speed_rpm / 30.0
-        assert strokes == pytest.approx(round(strokes), abs=1e-3)
+        recorded_s = scenario.duration_s - scenario.record.from_s
+        turns = recorded_s * speed_rpm / 60.0 * rotor_poles[scenario.machine]
+        assert turns == pytest.approx(max(1, round(turns)), abs=2e-3) and turns > 0.99
         assert case.controller == "salient" or step.value_Nm > 0
+
+
+def test_largest_torque_is_requested_from_a_quarter_to_twice_the_base_speed_in_both_quadrants():
+    for machine in ("saturating", "finite_element"):
+        of = [case for case in ALL_CASES["torque_speed"]
+              if case.scenario.machine == machine and case.controller == "salient"]
+        speeds_rpm = sorted({case.scenario.bench["held_speed_rpm"] for case in of})
+        assert speeds_rpm == [375.0, 750.0, 1125.0, 1500.0, 1875.0, 2250.0, 3000.0]
+        (most_Nm,) = (row.limits[1] for row in read_table() if row.name == "torque_max_Nm")
+        assert {case.scenario.torque[0].value_Nm for case in of} == {most_Nm, -most_Nm}
+        assert all(case.scenario.parameters == {"torque_max_Nm": most_Nm} for case in of)
+
+
+def test_parts_of_the_torque_are_those_of_the_largest_one_above_base_speed():
+    limits = Limits(52.0, 300.0, 240.0)
+    (largest,) = largest_torque(load_machine(machine_path("linear_cosine")), [2250.0], limits, MOTORING)
+    parts = {case.condition.split(", ")[3]: case.scenario.torque[0].value_Nm / largest.torque_Nm
+             for case in ALL_CASES["partial_torque"] if "linear_cosine, 2250 r/min, motoring" in case.condition}
+    assert parts == pytest.approx({"25 %": 0.25, "50 %": 0.5, "75 %": 0.75}, rel=0.03)
+    assert {case.scenario.bench["held_speed_rpm"] for case in ALL_CASES["partial_torque"]} == {1875.0, 2250.0, 3000.0}
+
+
+def test_load_steps_above_base_speed_are_preceded_by_those_below():
+    for case in ALL_CASES["transition"]:
+        scenario = case.scenario
+        if case.extractor != "fast_step":
+            continue
+        slow, fast = scenario.speed
+        assert fast.value_rpm == pytest.approx(3.0 * slow.value_rpm)
+        ends_s = [step.at_s for step in scenario.load]
+        assert ends_s == sorted(ends_s) and len(ends_s) == 16
+        assert ends_s[7] < fast.at_s < ends_s[8] and ends_s[0] > 0.1
+        assert [step.torque_Nm > 0.0 for step in scenario.load] == [True, False] * 8
 
 
 def test_ramps_have_their_lengths():
@@ -251,6 +298,67 @@ def test_sine_is_judged_by_the_swing_of_the_free_shaft():
         "swing under a sine relative to the free shaft 1.056"]
 
 
+def held(torque_Nm, current_A, request_Nm, speed_rpm=2250.0, **bench):
+    """Metrics of a held shaft of linear_cosine, and those of a part of the torque."""
+    scenario = Scenario(name="", machine="linear_cosine", duration_s=0.1, torque=(TorqueStep(0.0, request_Nm),),
+                        bench={"held_speed_rpm": speed_rpm, **bench})
+    recording = recording_of(torque_Nm=torque_Nm, current_a_A=current_A, current_b_A=current_A)
+    return EXTRACTORS["held"](scenario, recording), EXTRACTORS["held_part"](scenario, recording)
+
+
+def test_held_torque_is_judged_by_its_bound_and_the_current_by_its_limit():
+    motoring, part = held(np.linspace(20.0, 24.0, 101), np.linspace(0.0, 53.0, 101), 40.0)
+    assert motoring["torque_bound_Nm"] == pytest.approx(25.9, rel=0.01)
+    assert motoring["motoring_short_percent"] == pytest.approx(100.0 * (1.0 - 22.0 / motoring["torque_bound_Nm"]))
+    assert "braking_short_percent" not in motoring
+    assert (motoring["torque_mean_Nm"], motoring["ripple"]) == pytest.approx((22.0, 4.0 / 22.0))
+    assert motoring["peak_to_limit"] == pytest.approx(53.0 / 52.0)
+    assert part["torque_error_percent"] == pytest.approx(45.0)
+    braking, _ = held(np.full(101, -13.0), np.full(101, 20.0), -13.0)
+    assert braking["torque_bound_Nm"] == pytest.approx(-26.2, rel=0.01)
+    assert braking["braking_short_percent"] == pytest.approx(50.4, rel=0.02)
+    low, _ = held(np.full(101, 13.0), np.full(101, 20.0), 13.0, supply_voltage_V=168.0)
+    assert low["torque_bound_Nm"] == pytest.approx(17.1, rel=0.01)
+
+
+def test_partial_torque_is_judged_by_the_best_pulse_of_the_torque_that_was_made():
+    _, part = held(np.full(101, 13.0), np.full(101, 17.0), 13.0)
+    assert part["phase_rms_A"] == pytest.approx(17.0)
+    assert part["rms_to_best"] == pytest.approx(17.0 / 15.3, rel=0.01)
+    _, beyond = held(np.full(101, 30.0), np.full(101, 30.0), 30.0)
+    assert beyond["rms_to_best"] is None
+
+
+def test_torque_step_of_a_ramp_is_that_between_means_of_strokes():
+    # 10 r/min: a stroke of 30 degrees takes 0.5 s.
+    angle_deg = 60.0 * np.arange(20_000) * 1e-3
+    stroke = np.floor(angle_deg / 30.0)
+    torque_Nm = 8.0 + 2.0 * np.sin(2.0 * np.pi * angle_deg / 30.0) + np.where(stroke >= 12, 0.4, 0.0)
+    scenario = Scenario(name="", machine="saturating", duration_s=20.0, load=(LoadStep(0.0, 8.0),),
+                        speed=(SpeedStep(0.0, 5.0), SpeedStep(1.0, 10.0), SpeedStep(11.0, 5.0)),
+                        parameters={"speed_ramp_rpm_s": 0.5})
+    recording = recording_of(rotor_angle_deg=angle_deg % 360.0, torque_Nm=torque_Nm, speed_rpm=np.full(20_000, 10.1))
+    values = EXTRACTORS["speed_ramps"](scenario, recording)
+    assert values == pytest.approx({"torque_step_percent": 5.0, "highest_speed_percent": 101.0}, rel=1e-3)
+
+
+def test_drop_above_base_speed_is_relative_to_that_below():
+    speed_rpm = np.full(16_000, 500.0)
+    speed_rpm[8000:] = 1500.0
+    load = []
+    for number in range(8):
+        start = 2000 * number + 500
+        speed_rpm[start:start + 100] -= (4.0, 2.0)[number // 4] * (1.0 - 0.1 * (number % 4))
+        load += [LoadStep(start * 1e-3, (8.0, 2.0)[number // 4]), LoadStep(start * 1e-3 + 1.0, 0.0)]
+    scenario = Scenario(name="", duration_s=16.0, speed=(SpeedStep(0.0, 500.0), SpeedStep(8.0, 1500.0)),
+                        load=tuple(load))
+    values = EXTRACTORS["fast_step"](scenario, recording_of(speed_rpm=speed_rpm, torque_Nm=speed_rpm))
+    assert values == pytest.approx({"speed_dip_rpm": 2.0, "dip_ratio": 2.0, "recovery_time_s": 0.0})
+    speed_rpm[2000 * 7 + 500:2000 * 7 + 1500] = 1400.0
+    never = EXTRACTORS["fast_step"](scenario, recording_of(speed_rpm=speed_rpm, torque_Nm=speed_rpm))
+    assert never["recovery_time_s"] is None and never["dip_ratio"] == pytest.approx(100.0)
+
+
 # --- scenarios ------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("group", GROUPS)
@@ -327,7 +435,7 @@ def test_cases_of_another_machine_have_its_speeds_and_torques():
     on = subject(str(EXAMPLES / "fan12.toml"))
     scale = on.scale
     for name, of in ALL_CASES.items():
-        if name == "machines":  # of its own
+        if name == "machines" or name in speed_range.GROUPS:  # of its own
             continue
         own = [case for case in of if case.scenario.machine == "saturating"]
         for case, scaled in zip(own, cases_of(of, on), strict=True):
@@ -340,19 +448,28 @@ def test_cases_of_another_machine_have_its_speeds_and_torques():
             assert scaled.scenario.record.from_s <= scaled.scenario.duration_s
 
 
-def test_another_machine_has_its_own_run_among_machines_of_all_sizes():
+def test_another_machine_has_its_own_runs_among_machines_of_all_sizes():
     path = EXAMPLES / "mill.toml"
     cases = cases_of(ALL_CASES["machines"], subject(str(path)))
-    assert cases == [case for case in ALL_CASES["machines"] if case.condition == "mill"]
-    assert [case.controller for case in cases] == ["traditional", "paper", "salient"]
+    assert cases == [case for case in ALL_CASES["machines"] if case.condition.split(",")[0] == "mill"]
+    assert [case.controller for case in cases[:3]] == ["traditional", "paper", "salient"]
+    assert {case.extractor for case in cases[3:]} == {"held"} and len(cases) == 3 + 2 * 4
 
 
-def test_torque_references_of_another_machine_are_within_its_torque_limit():
+@pytest.mark.parametrize("group", speed_range.GROUPS)
+def test_another_machine_has_its_own_speeds_and_torques_over_the_range_of_speeds(group):
     on = subject(str(EXAMPLES / "fan12.toml"))
-    limit_Nm = derive(on.machine).parameters["torque_max_Nm"]
-    references_Nm = [step.value_Nm for case in cases_of(ALL_CASES["torque_speed"], on) for step in case.scenario.torque]
-    assert {abs(reference_Nm) for reference_Nm in references_Nm} == {limit_Nm}
-    assert min(references_Nm) == -limit_Nm
+    data = derive(on.machine)
+    cases = cases_of(ALL_CASES[group], on)
+    assert {case.condition.split(",")[0] for case in cases} == {"fan12"}
+    assert {case.scenario.machine for case in cases} == {on.path}
+    speeds_rpm = [case.scenario.bench.get("held_speed_rpm", 0.0) for case in cases]
+    speeds_rpm += [step.value_rpm for case in cases for step in case.scenario.speed]
+    assert 0.99 * 1.5 * data.speed_base_rpm < max(speeds_rpm) <= data.speed_max_rpm
+    torques_Nm = [step.value_Nm for case in cases for step in case.scenario.torque]
+    assert all(abs(torque_Nm) <= case.scenario.parameters["torque_max_Nm"]
+               for case, torque_Nm in zip(cases, torques_Nm, strict=False))
+    assert len(cases_of(GROUPS[group].cases(True), on, quick=True)) <= len(cases)
 
 
 def test_another_machine_is_judged_by_relative_targets_only_and_a_bundled_one_by_its_own(tmp_path):
@@ -674,7 +791,8 @@ def test_groups_are_listed():
     assert code == 0
     assert [line.split()[0] for line in output.splitlines()] == list(GROUPS)
     assert [line.split()[0] for line in output.splitlines() if "only when named" in line] == [
-        "encoders", "misalignment", "standing_error", "hold", "ablation", "robustness", "machines"]
+        "partial_torque", "transition", "torque_conditions", "encoders", "misalignment", "standing_error", "hold",
+        "ablation", "robustness", "machines"]
 
 
 def test_unknown_group_is_reported():

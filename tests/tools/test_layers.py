@@ -30,7 +30,8 @@ JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/main.c", "emulator/qemu/image/main
 PYTHON_LAYERS = (
     "salient", "salient.errors", "salient.paths", "salient.progress", "salient.config", "salient.version",
     "salient.dbc", "salient.toml_file",
-    "salient.cli", "salient.elf", "salient.vm", "salient.machine", "salient.finite_elements", "salient.generate",
+    "salient.cli", "salient.elf", "salient.vm", "salient.machine", "salient.finite_elements",
+    "salient.generate", "salient.reference.torque_speed_bound",
     "salient.bus", "salient.bench", "salient.experiments", "salient.test_runner",
     "salient.benchmark.switching_pattern", "salient.reference", "salient.target", "salient.benchmark",
     "salient.__main__",

@@ -1,1 +1,1 @@
-"""Reference models of the plant on other solvers: SciPy and ngspice."""
+"""Independent references: the plant on other solvers, SciPy and ngspice, and the bound of the torque over the speed."""

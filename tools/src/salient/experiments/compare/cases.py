@@ -7,14 +7,13 @@ and, where a metric is a statistic, by sample. Identical runs are executed once 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from salient.config import CONDITIONS, CONTROLLERS
-from salient.experiments.compare import every_machine, random_cases, range_cases
+from salient.experiments.compare import every_machine, random_cases, range_cases, speed_range
 from salient.experiments.compare.case import (
     LOAD_NM,
     MACHINES,
@@ -25,7 +24,7 @@ from salient.experiments.compare.case import (
     by_controller,
     make_scenario,
 )
-from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep
+from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 
 # Parameters of the drive that conditions set, by meaning; the numbers are those of firmware/PARAMETERS.md.
 LOAD_KNOWN: dict[str, float] = {"load_source": 1}
@@ -52,14 +51,6 @@ SINES_HZ = (1.0, 5.0, 20.0, 50.0, 100.0)
 SINE_WINDOW_S = 0.15
 """Two periods of the load where they are longer."""
 RAMPS_MS = (1, 5, 20, 50, 100, 200, 500)
-
-HELD_SPEEDS_RPM = (100.0, 300.0, 600.0, 1000.0, 1500.0, 2000.0, 2500.0, 3000.0)
-HELD_SPEEDS_QUICK_RPM = (300.0, 3000.0)
-DYNAMOMETER_RPM_S = 10_000.0
-"""Acceleration by the dynamometer: held_speed_rpm in rig.dbc."""
-TORQUE_REQUESTED_NM = {"motoring": 100.0, "braking": -100.0}
-"""Beyond the torque limit of every drive, which then decides."""
-TORQUE_SETTLED_S = 0.1
 
 COMPRESSORS = {"one cylinder": ("compressor_one_cylinder", 1.5), "two cylinders": ("compressor_two_cylinders", 3.0)}
 """Load profile and its mean torque in N m, which with 5 N m more is at most 14.6 N m."""
@@ -186,25 +177,6 @@ def _ramps(quick: bool) -> Iterator[Case]:
             yield from by_controller("ramps", f"{machine}, {ramp_ms} ms", "load_step", scenario)
 
 
-def _torque_speed(quick: bool) -> Iterator[Case]:
-    for machine in ("saturating",) if quick else MACHINES:
-        for quadrant, torque_Nm in TORQUE_REQUESTED_NM.items():
-            for speed_rpm in HELD_SPEEDS_QUICK_RPM if quick else HELD_SPEEDS_RPM:
-                yield from by_controller("torque_speed", f"{machine}, {speed_rpm:g} r/min, {quadrant}", "held",
-                                          _held_scenario(speed_rpm, torque_Nm, machine=machine),
-                                          controllers=CONTROLLERS if torque_Nm > 0.0 else ("salient",))
-
-
-def _held_scenario(speed_rpm: float, torque_Nm: float, **fields: Any) -> Scenario:
-    """A shaft that a dynamometer holds; recorded over whole strokes, at least 0.1 s."""
-    held_s = round(speed_rpm / DYNAMOMETER_RPM_S + 0.02, 6)
-    from_s = held_s + TORQUE_SETTLED_S
-    stroke_s = STROKE_DEG / (6.0 * speed_rpm)
-    return make_scenario(duration_s=round(from_s + math.ceil(0.1 / stroke_s) * stroke_s, 6),
-                     torque=(TorqueStep(held_s, torque_Nm),), record=Record(10.0, from_s),
-                     bench={"held_speed_rpm": speed_rpm}, **fields)
-
-
 def _compressor(quick: bool) -> Iterator[Case]:
     for machine in MOVING_MACHINES[:1] if quick else MOVING_MACHINES:
         for speed_rpm in (600.0,) if quick else COMPRESSOR_RPM:
@@ -260,6 +232,8 @@ def _ablation(quick: bool) -> Iterator[Case]:
 def _machines(quick: bool) -> Iterator[Case]:
     for scenario in every_machine.scenarios(quick):
         yield Case("machines", Path(scenario.machine).stem, scenario.controller, "every_machine", scenario)
+    for path in every_machine.machine_files(quick):
+        yield from speed_range.of_any_machine(quick, str(path))
 
 
 GROUPS: dict[str, Group] = {
@@ -274,8 +248,21 @@ GROUPS: dict[str, Group] = {
                   ("speed_after_rpm", "worst"), ("copper_W", "median"), ("step_angle_deg", "gap"))),
     "moving": Group("load of 8 N m and a sine of 4 N m, 40 kHz", _moving, (("speed_swing_rpm", ""),)),
     "ramps": Group("load ramp to 8 N m at 150 r/min, 40 kHz", _ramps, (("speed_dip_rpm", ""),)),
-    "torque_speed": Group("torque at the torque limit over the speed of a held shaft, 40 kHz", _torque_speed,
-                          (("torque_mean_Nm", ""), ("peak_current_A", ""))),
+    "torque_speed": Group("largest torque over the speed of a held shaft, 0.25 to 2 times the base speed, 40 kHz",
+                          speed_range.torque_speed,
+                          (("torque_mean_Nm", ""), ("torque_bound_Nm", ""), *speed_range.JUDGED, ("ripple", ""))),
+    "partial_torque": Group("parts of the largest torque on a held shaft above base speed, 40 kHz",
+                            speed_range.partial_torque,
+                            (("rms_to_best", ""), ("phase_rms_A", ""), ("torque_error_percent", ""), ("ripple", "")),
+                            long=True),
+    "transition": Group("load steps at 1.5 and 0.5 times the base speed, ramps between 0.5 and 2 times under load, 40"
+                        " kHz", speed_range.transition,
+                        (("dip_ratio", ""), ("speed_dip_rpm", ""), ("recovery_time_s", ""), ("torque_step_percent", ""),
+                         ("highest_speed_percent", "")), long=True),
+    "torque_conditions": Group("largest torque of a held shaft at 1.5 times the base speed, by control rate, encoder"
+                               " and supply", speed_range.torque_conditions,
+                               (("torque_mean_Nm", ""), ("torque_bound_Nm", ""), *speed_range.JUDGED, ("ripple", "")),
+                               long=True),
     "compressor": Group("reciprocating compressor, turns 21 to 23 under load, 40 kHz", _compressor,
                         (("speed_swing_rpm", ""),)),
     "paper_conditions": Group("the paper's conditions: 1 MHz, no delay, exact sensing, load torque known",
@@ -314,10 +301,12 @@ GROUPS: dict[str, Group] = {
 }
 
 GROUPS["machines"] = Group(
-    "machines of all sizes: start to 0.4 of the base speed, half of the rated torque at a quarter of it, reversal",
+    "machines of all sizes: start to 0.4 of the base speed, half of the rated torque at a quarter of it, reversal;"
+    " largest torque over the speed",
     _machines, (("start_to_bound", ""), ("brake_to_bound", ""), ("reverse_to_bound", ""), ("late_s", ""),
                 ("dip_percent", ""), ("recovery_time_s", ""), ("hold_percent", ""), ("ripple", ""),
-                ("ripple_reference", ""), ("ripple_to_allowed", "")), long=True)
+                ("ripple_reference", ""), ("ripple_to_allowed", ""), ("torque_mean_Nm", ""),
+                ("torque_bound_Nm", ""), *speed_range.JUDGED), long=True)
 TITLES = {name: group.title for name, group in GROUPS.items()}
 
 

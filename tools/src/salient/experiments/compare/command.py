@@ -35,7 +35,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     titles, targets = TITLES, TARGETS
     if options.machine is not None:
         on = _subject(options.machine)
-        cases, titles = cases_of(cases, on), {name: on.text(title) for name, title in titles.items()}
+        cases, titles = cases_of(cases, on, options.quick), {name: on.text(title) for name, title in titles.items()}
         targets = TARGETS if on.is_bundled else targets_of(on)
     cases = _first_samples(cases, options.samples)
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)

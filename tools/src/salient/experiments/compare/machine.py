@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from salient.bench.rig import bench_variables
-from salient.experiments.compare import every_machine
+from salient.experiments.compare import every_machine, speed_range
 from salient.experiments.compare.case import Case
-from salient.experiments.compare.cases import DYNAMOMETER_RPM_S, RIPPLE_RPM, STROKE_DEG
+from salient.experiments.compare.cases import RIPPLE_RPM, STROKE_DEG
 from salient.experiments.compare.targets import TARGETS, Key, Target
 from salient.experiments.metrics import stroke_deg
 from salient.experiments.scaled import PAPER_WINDOW_S, Scale, fastest_rpm, in_terms_of, later_s, scale_of
@@ -69,16 +69,25 @@ def subject(name_or_path: str) -> Subject:
     })
 
 
-def cases_of(cases: Iterable[Case], on: Subject) -> list[Case]:
-    """The cases of the paper's machine among `cases`, for another machine, and its own run of the group `machines`."""
+def cases_of(cases: Iterable[Case], on: Subject, quick: bool = False) -> list[Case]:
+    """The cases of the paper's machine among `cases`, for another machine, and its own runs of the groups `machines`
+    and those of speed_range.py."""
     of_paper, sized = [], {}
+    groups: dict[str, None] = {}
     for case in cases:
+        groups[case.group] = None  # in order
+        if case.group in speed_range.GROUPS:
+            continue
         if case.scenario.machine == PAPER:
             of_paper.append(_case(case, on))
         elif case.extractor == "every_machine":
             sized[case.controller] = replace(case, condition=on.machine.name, scenario=every_machine.scenario(
                 machine_path(on.path), case.controller))
-    return [*of_paper, *sized.values()]
+    own = [case for group in groups if group in speed_range.GROUPS
+           for case in speed_range.GROUPS[group](quick, (on.path,))]
+    if sized:
+        own += speed_range.of_any_machine(quick, on.path)
+    return [*of_paper, *sized.values(), *own]
 
 
 def targets_of(on: Subject) -> dict[Key, Target]:
@@ -110,9 +119,6 @@ def _case(case: Case, on: Subject) -> Case:
 
 def _delay_s(scenario: Scenario, scale: Scale, speed_rpm: float) -> float:
     """Time by which the machine comes to its speed later than the paper's machine."""
-    if not scenario.speed:
-        held_rpm = scenario.bench["held_speed_rpm"]
-        return max(0.0, (scale.rpm(held_rpm) - held_rpm) / DYNAMOMETER_RPM_S)
     step_s = min((load.at_s for load in scenario.load), default=None)
     event_s = step_s if step_s is not None else scenario.duration_s - PAPER_WINDOW_S
     return scale.delay_s(speed_rpm, event_s - scenario.speed[0].at_s)

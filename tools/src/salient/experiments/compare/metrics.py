@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from salient.experiments import metrics
-from salient.experiments.compare import every_machine
+from salient.experiments.compare import every_machine, speed_range
 from salient.experiments.scaled import scale_of_name
 from salient.experiments.scenario import Scenario
 from salient.machine.definition import Machine
@@ -89,6 +89,15 @@ METRICS = {
     "speed_swing_rpm": Metric("peak-to-peak speed", "r/min", 2, 0.02),
     "copper_W": Metric("copper loss before the step", "W", 2, 0.05),
     "torque_mean_Nm": Metric("mean torque", "N m", 3, 0.01),
+    "torque_bound_Nm": Metric("bound of the mean torque", "N m", 3, 0.01),
+    "motoring_short_percent": Metric("mean torque below its bound", "%", 2, 0.3),
+    "braking_short_percent": Metric("braking torque below its bound", "%", 2, 0.3),
+    "peak_to_limit": Metric("peak phase current", "of the limit", 3, 0.005),
+    "torque_error_percent": Metric("error of the mean torque", "%", 2, 0.1),
+    "phase_rms_A": Metric("RMS current of a phase", "A", 2, 0.1),
+    "rms_to_best": Metric("RMS current", "of the best pulse's", 3, 0.01),
+    "dip_ratio": Metric("speed drop by load", "of that at half base speed", 2, 0.05),
+    "torque_step_percent": Metric("largest torque step between strokes", "% of load", 2, 0.3),
     "peak_current_A": Metric("peak phase current", "A", 1, 0.5),
     "highest_speed_percent": Metric("maximum speed", "% of reference", 2, 0.05, reference=100.0),
     "cycle_percent": Metric("limit cycle", "% of torque", 3, 0.05),
@@ -165,9 +174,20 @@ def moving_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window =
 
 
 def held_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    """Mean torque and peak current over the whole recording, which is of whole strokes."""
-    return {"torque_mean_Nm": float(recording["torque_Nm"].mean(dtype=float)),
-            "peak_current_A": _peak_current_A(recording)}
+    """A run of speed_range.py; so are the next three."""
+    return speed_range.held_metrics(scenario, recording)
+
+
+def held_part_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    return speed_range.held_part_metrics(scenario, recording)
+
+
+def fast_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    return speed_range.fast_step_metrics(scenario, recording)
+
+
+def speed_ramps_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    return speed_range.speed_ramps_metrics(scenario, recording)
 
 
 def step_and_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
@@ -283,6 +303,9 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "load_step": load_step_metrics,
     "moving": moving_metrics,
     "held": held_metrics,
+    "held_part": held_part_metrics,
+    "fast_step": fast_step_metrics,
+    "speed_ramps": speed_ramps_metrics,
     "step_and_ripple": step_and_ripple_metrics,
     "encoder": encoder_metrics,
     "ripple_3s": ripple_3s_metrics,

@@ -131,8 +131,11 @@ def _over_load(content: Content) -> Figure | None:
 
 
 def _torque_over_speed(content: Content) -> Figure | None:
-    """Mean torque over speed, one panel per machine; braking below zero."""
-    rows = [row for row in _rows(content, "torque_speed") if row["figure"] == "torque_mean_Nm"]
+    """Mean torque over speed and its bound, one panel per machine; braking below zero."""
+    every = _rows(content, "torque_speed")
+    rows = [row for row in every if row["figure"] == "torque_mean_Nm"]
+    bounds = {row["condition"]: row["values"]["salient"] for row in every
+              if row["figure"] == "torque_bound_Nm" and row["values"].get("salient") is not None}
     machines = list(dict.fromkeys(row["condition"].split(", ")[0] for row in rows))
     if not rows:
         return None
@@ -146,6 +149,11 @@ def _torque_over_speed(content: Content) -> Figure | None:
                 if points:
                     axis.plot(*zip(*points, strict=True), _MARKER.get(controller, "o") + "-",
                               color=controller_colour(controller), markersize=4)
+        for quadrant in ("motoring", "braking"):
+            points = [(float(speed.split()[0]), bound_Nm) for condition, bound_Nm in bounds.items()
+                      for of, speed, kind in [condition.split(", ")] if (of, kind) == (machine, quadrant)]
+            if points:
+                axis.plot(*zip(*points, strict=True), color=_TARGET_COLOUR, linewidth=1.0)
         axis.axhline(0.0, color="#555555", linewidth=0.8)
         axis.set_title(machine)
         axis.set_xlabel("speed / (r/min)")
@@ -352,8 +360,9 @@ _PLOTS: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...
     "speeds": (("Torque ripple over speed", "Short lines: target.", _over_speed),),
     "loads": (("Torque ripple over load", "150 r/min; the mean torque is the load plus 0.31 N m of friction.",
                _over_load),),
-    "torque_speed": (("Torque over speed", "Mean of the true torque in torque mode at the torque limit of 19.1 N m,"
-                      " while a dynamometer holds the shaft; below zero: braking.", _torque_over_speed),),
+    "torque_speed": (("Torque over speed", "Mean of the true torque in torque mode at the current limit, while a"
+                      " dynamometer holds the shaft; below zero: braking. Black: the largest torque of a pulse of"
+                      " voltage in each electrical revolution.", _torque_over_speed),),
     "dip": (("Speed drop over the rotor angle at the load step", "Dotted and dashed: theoretical limit of median and"
              " maximum (non-causal controller, voltage 0 µs (ideal sensing) or 100 µs after the step).", _over_angle),),
     "moving": (("Speed under a sine", "Peak-to-peak speed. Short lines: target.", _curves(

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from salient.experiments.compare import random_cases, range_cases
+from salient.experiments.compare import random_cases, range_cases, speed_range
 from salient.experiments.compare.case import MACHINES, MAGNETICS
 from salient.experiments.compare.cases import ANGLES, COMPRESSORS
 from salient.experiments.compare.metrics import (
@@ -203,7 +203,17 @@ def _robustness() -> dict[Key, Target]:
 
 TARGETS: dict[Key, Target] = {**_ripples(), **_starts(), **_dips(), **_moving_loads(), **_compressors(),
                               **_paper_conditions(), **_ranges(), **_robustness()}
-_EVERY_CONDITION = {("machines", "ripple_to_allowed", ""): Target(1.0)}
+_EVERY_CONDITION = {
+    ("machines", "ripple_to_allowed", ""): Target(1.0),
+    **{(group, metric, ""): Target(limit) for group in ("torque_speed", "torque_conditions", "machines")
+       for metric, limit in (("motoring_short_percent", speed_range.MOTORING_SHORT_PERCENT),
+                             ("braking_short_percent", speed_range.BRAKING_SHORT_PERCENT),
+                             ("peak_to_limit", speed_range.PEAK_TO_LIMIT_MAX))},
+    ("partial_torque", "rms_to_best", ""): Target(speed_range.RMS_RATIO_MAX),
+    ("partial_torque", "torque_error_percent", ""): Target(speed_range.TORQUE_ERROR_MAX_PERCENT),
+    ("transition", "dip_ratio", ""): Target(speed_range.DIP_RATIO_MAX),
+    ("transition", "torque_step_percent", ""): Target(speed_range.TORQUE_STEP_MAX_PERCENT),
+}
 """By group, metric and statistic: conditions are machines, also of the user."""
 
 
