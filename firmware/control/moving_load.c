@@ -11,7 +11,6 @@
 #define RELEASE_MS 5
 #define BLOCKED_MS 1000
 #define STILL_MS 500
-#define RIPPLE_FACTOR 3
 
 #define HALF_PI_Q7 201
 
@@ -30,13 +29,16 @@ static uint32_t implausible_q4(const moving_load_settings_t *settings) {
     return (uint32_t)fixed_saturate(trend_q4 << machine_tables.speed_exponent);
 }
 
-/* J w^2 count / 4 + T / 64. */
+/* Low-pass of the estimate, 2^6 reviews: 6 ms at 40 kHz. */
+#define LOAD_SHIFT 6
+
+/* J w^2 count / 32 + T / 64. */
 static int32_t movement_min_q24(const moving_load_settings_t *settings) {
     const int64_t stiffness_q30 =
         (int64_t)settings->bandwidth_rad_s * settings->bandwidth_rad_s * settings->inertia_q30;
     /* A count is 2 pi 2^-encoder_bits; pi / 2 in Q1.7 of the inertia's Q1.30 cut to Q18. */
     const int64_t noise_q24 =
-        (stiffness_q30 >> 12) * HALF_PI_Q7 >> (1u + settings->encoder_bits + machine_tables.speed_exponent);
+        (stiffness_q30 >> 12) * HALF_PI_Q7 >> (4u + settings->encoder_bits + machine_tables.speed_exponent);
     return fixed_saturate(noise_q24 + settings->torque_max_q24 / 64);
 }
 
@@ -69,12 +71,21 @@ static uint32_t rounding_q4(const moving_load_parameters_t *parameters, uint32_t
     return (8u << parameters->encoder_shift) / (counts / 2 + 1);
 }
 
+/* A load that has been still long enough for a trend to be ripple: 156 ms or 0.5 s. */
+static bool still(const moving_load_parameters_t *parameters, const moving_load_t *moving) {
+    const uint32_t reviews = parameters->still_reviews;
+    return moving->still >= (moving->more_than_ripple ? reviews : reviews * 5 / 16);
+}
+
 /* A trend soon after the release of the first stage doubles the hold. */
 static void withhold(const moving_load_parameters_t *parameters, moving_load_t *moving) {
     uint32_t hold_ticks = moving->hold_ticks;
     if (moving->withheld < parameters->stages) {
         hold_ticks *= 2;
-        moving->own_ripple |= hold_ticks > parameters->hold_ticks_min && moving->still == parameters->still_reviews;
+        if (still(parameters, moving) && hold_ticks > parameters->hold_ticks_min) {
+            moving->more_than_ripple = moving->own_ripple;
+            moving->own_ripple = !moving->own_ripple || moving->still >= parameters->still_reviews;
+        }
         moving->settling = parameters->release_ticks;
     }
     moving->hold_ticks = (uint32_t)fixed_clamp((int32_t)hold_ticks, (int32_t)parameters->hold_ticks_min,
@@ -94,7 +105,7 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
     }
     const uint32_t base_q4 =
         from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4(parameters, angle_step);
-    const uint32_t threshold_q4 = moving->own_ripple ? RIPPLE_FACTOR * base_q4 : base_q4;
+    const uint32_t threshold_q4 = moving->own_ripple ? base_q4 * 5 / 2 : base_q4;
     const uint32_t magnitude_q4 = (uint32_t)fixed_abs(trend_q4);
     moving->settling -= moving->settling > 0;
     if (magnitude_q4 > parameters->implausible_q4 && moving->withheld > 0 && moving->settling == 0) {
@@ -116,16 +127,23 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
 
 void moving_load_review(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t load_torque_q24,
                         bool hold) {
-    moving->load_min_q24 = load_torque_q24 < moving->load_min_q24 ? load_torque_q24 : moving->load_min_q24;
-    moving->load_max_q24 = load_torque_q24 > moving->load_max_q24 ? load_torque_q24 : moving->load_max_q24;
+    const int32_t load_q24 = moving->load_q24 + (fixed_subtract(load_torque_q24, moving->load_q24) >> LOAD_SHIFT);
+    moving->load_q24 = load_q24;
+    moving->load_min_q24 = load_q24 < moving->load_min_q24 ? load_q24 : moving->load_min_q24;
+    moving->load_max_q24 = load_q24 > moving->load_max_q24 ? load_q24 : moving->load_max_q24;
     if (fixed_subtract(moving->load_max_q24, moving->load_min_q24) >= parameters->movement_min_q24) {
-        moving->load_min_q24 = moving->load_max_q24 = load_torque_q24;
+        moving->load_min_q24 = moving->load_max_q24 = load_q24;
         moving->still = 0;
-        moving->own_ripple = false;
-    } else if (moving->still < parameters->still_reviews) {
-        moving->still++;
-    } else if (moving->withheld == parameters->stages && !hold &&
-               moving->hold_ticks - moving->ticks >= parameters->hold_ticks_min) {
+        moving->own_ripple = moving->more_than_ripple = false;
+        return;
+    }
+    moving->still += moving->still < parameters->still_reviews;
+    if (!still(parameters, moving) || hold) {
+        return;
+    }
+    if (moving->withheld == parameters->stages && moving->hold_ticks - moving->ticks >= parameters->hold_ticks_min) {
         moving->ticks = 0;
+    } else if (moving->withheld == 0 && moving->hold_ticks > parameters->hold_ticks_min) {
+        moving->hold_ticks = moving->ticks = parameters->hold_ticks_min;
     }
 }

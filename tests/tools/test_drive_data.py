@@ -30,8 +30,13 @@ OTHERS = sorted((ROOT / "tools" / "examples" / "machines").glob("*.toml"))
 @pytest.mark.parametrize("path", BUNDLED, ids=lambda path: path.stem)
 def test_bundled_machines_keep_the_defaults_of_the_firmware(path):
     data = derive(load_machine(path))
+    own = {"inertia_kg_m2", "friction_Nm_s", "resistance_ohm"}
+    if path.stem == "finite_element":  # light: its reaching law is faster
+        own |= {"smc_k", "smc_delta"}
+        assert data.parameters["smc_k"] == pytest.approx(1213, rel=0.001)
+        assert data.parameters["smc_delta"] == pytest.approx(2.92, rel=0.01)
     for row in read_table():
-        if row.name not in ("inertia_kg_m2", "friction_Nm_s", "resistance_ohm"):
+        if row.name not in own:
             assert math.floor(math.ldexp(data.parameters[row.name], row.fraction_bits) + 0.5) == row.default, row.name
 
 
@@ -82,6 +87,27 @@ def test_every_value_is_finite_and_in_order(path):
                              machine.inertia_kg_m2, machine.friction_Nm_s, 0.0, 0.4 * base_rad_s)
     least_s = machine.inertia_kg_m2 * 0.4 * base_rad_s / data.torque_peak_Nm
     assert least_s <= bound_s < 1.5 * least_s + 2e-3
+
+
+def test_reaching_law_is_as_steep_as_a_short_start_needs_and_never_more_than_the_torque_can_follow(tmp_path):
+    files = [*BUNDLED, *OTHERS, *(tmp_path / f"random_{number:02}.toml" for number in range(COUNT))]
+    by_limit = set()
+    for path in files:
+        if path.parent == tmp_path:
+            path.write_text(random_machine(int(path.stem[-2:])))
+        machine = load_machine(path)
+        data = derive(machine)
+        acceleration = data.torque_peak_Nm / machine.inertia_kg_m2
+        start_s = data.speed_base_rpm * math.pi / 30.0 / acceleration
+        followed_s = (data.torque_peak_Nm / data.torque_step_Nm + 3.0) / data.control_rate_hz
+        delta_s = data.parameters["smc_delta"]
+        assert 0.3 < delta_s <= 1.0001 * max(1.0, 0.1 / start_s)
+        assert delta_s * acceleration * followed_s <= 8.001
+        if delta_s < 0.999 * max(1.0, 0.1 / start_s):
+            assert delta_s * acceleration * followed_s == pytest.approx(8.0)
+            by_limit.add(path.stem)
+    assert {"finite_element", "random_08", "random_13", "random_18"} <= by_limit
+    assert by_limit.isdisjoint({"saturating", "linear_cosine", "linear_trapezoid", "traction", "map86"})
 
 
 def rise_A(machine: Machine, data: DriveData) -> float:

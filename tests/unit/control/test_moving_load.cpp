@@ -35,8 +35,8 @@ class Detector {
 
     uint32_t step(int32_t innovation, uint32_t angle_step = FAST, bool from_edge = false, bool hold = false) {
         if (++periods % PERIODS_PER_REVIEW == 0) {
-            load_torque_q24 = range_q24 - load_torque_q24; // a movement
-            moving_load_review(&parameters, &state, load_torque_q24, hold);
+            const bool high = periods / (parameters.hold_ticks_min * 8 / 5) % 2 == 1; // for 40 ms
+            moving_load_review(&parameters, &state, load_q24 + (high ? range_q24 : 0), hold);
         }
         return moving_load_step(&parameters, &state, innovation, angle_step, from_edge, hold);
     }
@@ -51,11 +51,11 @@ class Detector {
 
     moving_load_parameters_t parameters;
     moving_load_t state{};
-    int32_t range_q24 = to_fixed(10.0, Q24); // of the load's estimate
+    int32_t load_q24 = 0;                    // estimate
+    int32_t range_q24 = to_fixed(10.0, Q24); // of its movements
 
   private:
     uint32_t periods = 0;
-    int32_t load_torque_q24 = 0;
 };
 
 // A trend whenever stages are released: for that long something is withheld, as a part of the time.
@@ -139,8 +139,8 @@ TEST(MovingLoad, hold_keeps_what_is_withheld_and_withholds_nothing_itself) {
     EXPECT_LT(moving.run(RATE_HZ, 0), RATE_HZ / 5) << "released without it";
 }
 
-// J w^2 count / 4 + 1/64 of the largest torque: 0.692 N m + 0.298 N m.
-const double RANGE_MIN_NM = 0.02 * 1700.0 * 1700.0 * 2.0 * PI / std::ldexp(4.0, ENCODER_BITS) + 19.1 / 64.0;
+// J w^2 count / 32 + 1/64 of the largest torque: 0.087 N m + 0.298 N m.
+const double RANGE_MIN_NM = 0.02 * 1700.0 * 1700.0 * 2.0 * PI / std::ldexp(32.0, ENCODER_BITS) + 19.1 / 64.0;
 
 TEST(MovingLoad, a_repeated_trend_of_a_load_that_does_not_move_is_not_followed_any_more) {
     for (const double range : {0.0, 0.97, 1.03, 3.0}) {
@@ -171,22 +171,53 @@ TEST(MovingLoad, a_movement_restores_the_threshold) {
 }
 
 TEST(MovingLoad, a_slow_movement_is_followed) {
-    // 4 N m/s: 0.4 of the range in 100 ms.
+    // 4 N m/s: 1.04 of the least range in 100 ms.
     Detector detector;
+    detector.range_q24 = 0;
     double withheld = 0.0;
     for (int k = 0; k < 100; k++) {
-        detector.range_q24 = to_fixed(0.4 * k, Q24);
+        detector.load_q24 = to_fixed(0.4 * k, Q24);
         withheld += withheld_part(&detector, 0.1, 2 * COUNT / 7) / 100.0;
     }
     EXPECT_GT(withheld, 0.95);
 }
 
-TEST(MovingLoad, the_threshold_of_ripple_is_three_eighths_of_a_count) {
-    for (const double counts : {0.37, 0.41}) {
+TEST(MovingLoad, ripple_after_a_load_step_is_not_followed_any_more_within_300_ms) {
+    Detector detector;
+    detector.run(RATE_HZ / 2, COUNT / 4); // the load moves
+    detector.load_q24 = to_fixed(8.0, Q24);
+    detector.range_q24 = 0;
+    EXPECT_GT(withheld_part(&detector, 0.15, COUNT / 4), 0.95);
+    withheld_part(&detector, 0.15, COUNT / 4);
+    EXPECT_EQ(withheld_part(&detector, 1.0, COUNT / 4), 0.0);
+}
+
+TEST(MovingLoad, more_than_ripple_of_a_constant_load_keeps_the_base_threshold_and_the_long_hold_for_half_a_second) {
+    Detector detector;
+    detector.range_q24 = 0;
+    while (!detector.state.own_ripple) {
+        detector.step(detector.state.withheld < STAGES ? COUNT / 4 : 0);
+        ASSERT_LT(detector.state.still, detector.parameters.still_reviews / 2);
+    }
+    while (detector.state.own_ripple) {
+        detector.step(detector.state.withheld < STAGES ? COUNT / 2 : 0);
+        ASSERT_LT(detector.state.still, detector.parameters.still_reviews * 3 / 4);
+    }
+    for (uint32_t k = 0; k < 3 * detector.parameters.hold_ticks_min; k++) {
+        ASSERT_EQ(detector.step(0), STAGES);
+    }
+    EXPECT_LT(detector.state.still, detector.parameters.still_reviews);
+    EXPECT_FALSE(detector.state.own_ripple);
+    withheld_part(&detector, 0.5, COUNT / 4);
+    EXPECT_TRUE(detector.state.own_ripple) << "after half a second";
+}
+
+TEST(MovingLoad, the_threshold_of_ripple_is_five_sixteenths_of_a_count) {
+    for (const double counts : {0.30, 0.34}) {
         Detector detector;
         detector.range_q24 = 0;
         withheld_part(&detector, 2.0, COUNT / 4);
-        EXPECT_EQ(withheld_part(&detector, 3.0, int32_t(counts * COUNT)) > 0.5, counts > 0.4) << counts;
+        EXPECT_EQ(withheld_part(&detector, 3.0, int32_t(counts * COUNT)) > 0.5, counts > 0.32) << counts;
     }
 }
 
