@@ -59,7 +59,7 @@ typedef struct {
     uint8_t result_shift;    /* 0..12 */
 } machine_format_t;
 
-/* Single pulse operation (control/single_pulse.h): points equidistant in speed per DC-link voltage, the first at
+/* Single pulse operation (control/conduction.h): points equidistant in speed per DC-link voltage, the first at
  * standstill. */
 #define MACHINE_PULSE_POINTS 17
 
@@ -89,6 +89,10 @@ typedef struct {
     int16_t node[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
     uint32_t pulse_index_scale;                     /* index in Q8 = ((|speed_q22| * scale) >> 32) / voltage_q6 */
     machine_pulse_t pulse[2][MACHINE_PULSE_POINTS]; /* motoring, braking */
+    uint16_t pulse_base_index;                      /* of the base speed at the nominal voltage, Q8 */
+    /* Window of torque sharing with the least RMS current, past the unaligned position, 2^-16 electrical rev. */
+    uint16_t sharing_on;
+    uint16_t sharing_off;
     /* A braking current stays within its limit under full opposite voltage up to the angle theta_t at which it is
      * psi_t, when psi <= psi_t + V / omega (theta_t - theta); past theta_t, when it is within its limit. Where no angle
      * needs that, theta_t is where psi at the limit falls fastest. */

@@ -14,9 +14,6 @@
  * kHz. */
 #define FLUX_STEP_MIN_Q29 (1 << 13)
 
-/* Torque shortfall that advances the windows: 0.05 N m and 1/64 of the reference. Less may be rounding. */
-#define SHORTFALL_MIN_Q24 ((1 << 24) / 20)
-
 /* Torque shortfall below which none is reported: 1/64 N m. Torque and flux linkage of an operating point agree within a
  * few mN m. */
 #define SHORTFALL_TOLERANCE_Q24 (1 << 18)
@@ -42,7 +39,7 @@ typedef struct {
     int32_t flux_max;         /* that a period of +Vdc reaches, or less */
     int32_t freewheeling_q29; /* flux linkage after a period without voltage, Wb */
     uint32_t angle;           /* 2^-32 electrical rev, mirrored into the half of positive torque */
-    uint32_t since_on;        /* angle past turn-on, 2^-32 electrical rev; from 2^31: before turn-on */
+    uint32_t since_on;        /* angle past turn-on, 2^-32 electrical rev; from 2^31: before turn-on, or ended */
     int32_t limit;            /* -1: at flux_min, 1: at flux_max or at the current limit, 0: torque reached */
 } plan_t;
 
@@ -168,16 +165,6 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     return adds ? fixed_subtract(shortfall, gained) : fixed_add(shortfall, gained);
 }
 
-torque_sharing_window_t predictive_torque_move_windows(const predictive_torque_parameters_t *parameters,
-                                                       int32_t *advance_q30, int32_t torque_q24,
-                                                       int32_t torque_shortfall_q24) {
-    const bool voltage_limited = fixed_abs(torque_shortfall_q24) > SHORTFALL_MIN_Q24 + fixed_abs(torque_q24) / 64;
-    const int32_t step_q30 = voltage_limited ? parameters->advance_step_q30 : -parameters->retract_step_q30;
-    *advance_q30 = fixed_clamp(*advance_q30 + step_q30, 0, ONE_Q30);
-    const int32_t advance_q15 = *advance_q30 >> 15;
-    return advance_q15 > 0 ? torque_sharing_window(&parameters->sharing, advance_q15) : parameters->base_window;
-}
-
 static int32_t non_negative(int32_t flux_q29) {
     return flux_q29 > 0 ? flux_q29 : 0;
 }
@@ -215,22 +202,35 @@ static inline void predict_flux(const predictive_torque_parameters_t *parameters
     p->flux_max = non_negative(fixed_add(p->freewheeling_q29, flux_step_max_q29)) >> flux_shift;
 }
 
-/* What the phases of one half have in common. */
-typedef struct {
-    const torque_sharing_window_t *window;
-    int32_t torque; /* to share, by magnitude */
-} half_t;
+/* Flux linkage that is built up at full voltage for the half that follows, up to the current limit. built: what Vdc has
+ * added since turn-on. */
+static inline void plan_lead(const machine_tables_t *tables, plan_t *p, int32_t built, int32_t current_limit_q9) {
+    locate_cell(tables, p->angle, p->column, p->cell);
+    const int32_t limit = phase_cell_flux(p->cell, phase_cell_u_q13(p->cell, current_limit_q9));
+    p->flux = fixed_clamp(built, p->flux_min, p->flux_max < limit ? p->flux_max : limit);
+    p->v_q13 = phase_cell_v_q13(p->cell, p->flux);
+    p->torque = phase_cell_torque(p->cell, p->v_q13);
+    p->limit = -1; /* none of it is to be taken away */
+}
 
-/* Operating point of a phase two periods ahead; true when it has the torque of the phase. braking: it moves towards the
- * unaligned position. */
+/* Operating point of a phase two periods ahead; true when it has the torque of the phase. torque: of its half, to
+ * share, by magnitude. outgoing: it moves towards the unaligned position. */
 static inline bool plan_phase(const predictive_torque_parameters_t *parameters, const machine_tables_t *tables,
-                              const period_t *period, const half_t *half, bool braking, plan_t *p) {
-    p->since_on = p->angle - half->window->turn_on;
-    const int32_t torque = half->torque > 0 ? share_of(half->torque, torque_sharing_q15(half->window, p->angle)) : 0;
-    if (braking && p->flux_max > p->flux_min) {
-        p->flux_max = fixed_clamp(removable_flux(period, p->angle - HALF_REV), p->flux_min, p->flux_max);
+                              const period_t *period, const conduction_half_t *half, int32_t torque, bool outgoing,
+                              plan_t *p) {
+    const uint32_t since_on = p->angle - half->window.turn_on;
+    p->since_on = since_on < half->width ? since_on : HALF_REV;
+    const uint32_t remaining = outgoing ? p->angle - HALF_REV : ~p->angle; /* until it leaves the half */
+    if (remaining < half->lead) {
+        plan_lead(tables, p, removable_flux(period, half->lead - remaining), parameters->current_limit_q9);
+        return false;
     }
-    return plan_torque(tables, p, torque, parameters->current_limit_q9);
+    if (p->angle > half->end && p->flux_max > p->flux_min) {
+        const int32_t flux = fixed_add(removable_flux(period, p->angle - half->end), half->flux);
+        p->flux_max = fixed_clamp(flux, p->flux_min, p->flux_max);
+    }
+    return plan_torque(tables, p, torque > 0 ? share_of(torque, torque_sharing_q15(&half->window, p->angle)) : 0,
+                       parameters->current_limit_q9);
 }
 
 /* Voltage of a period as divisor of flux linkages in Wb, Q2.29: normalised for a quotient of 15 bits. */
@@ -284,12 +284,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     const int32_t positive_half_q24 = fixed_add(torque_q24 > 0 ? torque_q24 : 0, opposed_q24);
     const int32_t negative_half_q24 = fixed_add(torque_q24 < 0 ? fixed_abs(torque_q24) : 0, opposed_q24);
 
-    /* Windows advance against the rotation, which would be later for a braking phase. */
-    const torque_sharing_window_t *base_window = &parameters->base_window;
-    const half_t half[2] = {
-        {sample->reverse ? sample->window : base_window, negative_half_q24 >> torque_shift},
-        {sample->reverse ? base_window : sample->window, positive_half_q24 >> torque_shift},
-    };
+    const int32_t torque[2] = {negative_half_q24 >> torque_shift, positive_half_q24 >> torque_shift};
     const period_t period = {(uint32_t)flux_step_max_q29 >> flux_shift, (sample->angle_step >> 8) + 1};
 
     plan_t plan[HAL_PHASES_MAX];
@@ -301,21 +296,23 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
         predict_flux(parameters, control, sample, phase, flux_step_max_q29, flux_shift, p);
-        const uint32_t angle =
-            sample->angle - phase * parameters->sharing.stroke - (uint32_t)sample->misalignment[phase];
+        const uint32_t angle = sample->angle - phase * parameters->stroke - (uint32_t)sample->misalignment[phase];
         const bool positive = angle >= HALF_REV;
         p->angle = positive ? angle : ~angle; /* mirrored, to 1 LSB */
         p->column = control->column[phase];
         p->cell = &cells[phase];
         p->cell->positive = positive;
-        const half_t *half_of_phase = &half[positive];
-        IN_REGISTER(half_of_phase);
-        reached &= plan_phase(parameters, tables, &period, half_of_phase, positive == sample->reverse, p);
+        const bool outgoing = positive == sample->reverse;
+        const conduction_half_t *half = &sample->conduction->half[outgoing];
+        IN_REGISTER(half);
+        reached &= plan_phase(parameters, tables, &period, half, torque[positive], outgoing, p);
         shortfall = positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
     }
 
     control->torque_shortfall_q24 = 0;
-    if (!reached) {
+    /* The share of a phase that is not yet in its half is missing. */
+    const int32_t tolerance = SHORTFALL_TOLERANCE_Q24 >> torque_shift;
+    if (!reached || shortfall > tolerance || shortfall < -tolerance) {
         shortfall =
             correct_torque(tables, plan, torque_q24 >= 0, sample->reverse, parameters->current_limit_q9, shortfall);
         const int32_t shortfall_q24 = phase_map_scale(&tables->torque_format, shortfall);
@@ -324,7 +321,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     const duty_divisor_t by = duty_divisor(flux_step_max_q29);
     UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
-        const bool above_current_limit = sample->current_q9[phase] > parameters->current_limit_q9;
+        const bool above_current_limit = sample->current_q9[phase] > parameters->current_max_q9;
         duty_q15[phase] = duty_of(&plan[phase], by, flux_shift, above_current_limit);
         control->duty_q15[phase] = duty_q15[phase];
         extrapolate_column(control, phase, &plan[phase]);

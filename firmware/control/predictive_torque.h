@@ -24,16 +24,18 @@
  * Four quadrants: a phase makes positive torque between unaligned and aligned position, negative torque in the other
  * half of the electrical revolution, where all quantities are evaluated at the mirrored angle.
  *
- * Braking: a phase that moves towards the unaligned position carries at most the flux linkage that -Vdc removes before
- * it is unaligned, Vdc Ts * (angle to unaligned) / (angle step per period). Otherwise, where the motional EMF exceeds
- * Vdc, its current would rise beyond any limit against full -Vdc, as the inductance falls.
+ * Braking: a phase that moves towards the unaligned position carries at most the flux linkage that leaves the braking
+ * flux linkage when -Vdc has acted up to the braking end, Vdc Ts * (angle to it) / (angle step per period): with torque
+ * sharing none at the unaligned position. Otherwise, where the motional EMF exceeds Vdc, its current would rise beyond
+ * any limit against full -Vdc, as the inductance falls.
  *
  * Torque reserve: the halves are loaded against each other so that positive and negative torque add up to at least the
  * reserve. A load step then only needs the removal of flux linkage, which -Vdc does immediately at any position. The
  * cost is continuous copper loss.
  *
- * Window advance: a torque shortfall moves the conduction windows to earlier angles (torque_sharing.h), fully within
- * 100 ms; without shortfall they return within 1 s.
+ * The conduction angles are those of torque sharing, or above base speed of single pulse operation (conduction.h):
+ * flux linkage is then built up before the phase enters the half of the wanted torque, at full voltage and up to the
+ * current limit. What a phase produces there counts as torque shortfall, and nothing of it is corrected there.
  */
 #ifndef CONTROL_PREDICTIVE_TORQUE_H
 #define CONTROL_PREDICTIVE_TORQUE_H
@@ -41,21 +43,19 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "control/conduction.h"
 #include "control/flux_observer.h"
 #include "control/machine_tables.h"
 #include "control/phase_cell.h"
-#include "control/torque_sharing.h"
 #include "hal.h"
 
 typedef struct {
     flux_observer_parameters_t flux;
-    torque_sharing_parameters_t sharing;
-    torque_sharing_window_t base_window; /* without advance */
-    int32_t period_q40;                  /* Ts in s, Q-9.40 */
-    int32_t current_limit_q9;            /* A, Q7.9 */
-    int32_t reserve_q24;                 /* N m, Q7.24, >= 0 */
-    int32_t advance_step_q30;            /* per update with torque shortfall, Q1.30 */
-    int32_t retract_step_q30;            /* per update without, Q1.30 */
+    uint32_t stroke;          /* 2^32 / phases */
+    int32_t period_q40;       /* Ts in s, Q-9.40 */
+    int32_t current_limit_q9; /* A, Q7.9 */
+    int32_t current_max_q9;   /* that gets no voltage: the limit, which the plans hold, and their error; A, Q7.9 */
+    int32_t reserve_q24;      /* N m, Q7.24, >= 0 */
 } predictive_torque_parameters_t;
 
 typedef struct {
@@ -69,25 +69,19 @@ typedef struct {
 } predictive_torque_t;
 
 typedef struct {
-    const int32_t *current_q9;             /* A, Q7.9, by phase, at the sample */
-    const int32_t *flux;                   /* from the tables, in their unit, by phase, at the sample */
-    const torque_sharing_window_t *window; /* of the motoring phases, from predictive_torque_move_windows */
-    uint32_t angle;                        /* of phase 0 two periods after the sample, 2^-32 electrical rev */
-    const int32_t *misalignment;           /* to subtract from the angle of each phase, 2^-32 electrical rev */
-    int32_t bus_voltage_q6;                /* DC-link voltage, V, Q9.6 */
-    int32_t torque_q24;                    /* reference, N m, Q7.24 */
-    bool reverse;                          /* negative direction of rotation */
-    uint32_t angle_step;                   /* magnitude of the rotation per period, 2^-32 electrical rev */
+    const int32_t *current_q9;      /* A, Q7.9, by phase, at the sample */
+    const int32_t *flux;            /* from the tables, in their unit, by phase, at the sample */
+    const conduction_t *conduction; /* conduction angles */
+    uint32_t angle;                 /* of phase 0 two periods after the sample, 2^-32 electrical rev */
+    const int32_t *misalignment;    /* to subtract from the angle of each phase, 2^-32 electrical rev */
+    int32_t bus_voltage_q6;         /* DC-link voltage, V, Q9.6 */
+    int32_t torque_q24;             /* reference, N m, Q7.24 */
+    bool reverse;                   /* negative direction of rotation */
+    uint32_t angle_step;            /* magnitude of the rotation per period, 2^-32 electrical rev */
 } predictive_torque_sample_t;
 
 /* Flux linkages and duties 0. */
 void predictive_torque_reset(predictive_torque_t *control);
-
-/* Moves the windows by one update, from the torque reference and shortfall of a sample, N m, Q7.24: the window of the
- * motoring phases for the next sample. *advance_q30: position of the windows, Q1.30, 0..1, 0 at the start. */
-torque_sharing_window_t predictive_torque_move_windows(const predictive_torque_parameters_t *parameters,
-                                                       int32_t *advance_q30, int32_t torque_q24,
-                                                       int32_t torque_shortfall_q24);
 
 /* Cells by phase that were planned for the sample of predictive_torque_estimate. */
 ALWAYS_INLINE const phase_cell_t *predictive_torque_cells(const predictive_torque_t *control) {

@@ -170,9 +170,7 @@ static torque_trim_parameters_t trim_from(const int32_t *values) {
     };
 }
 
-static predictive_torque_parameters_t predictive_from(const int32_t *values, unsigned phases,
-                                                      uint32_t control_rate_hz) {
-    const int64_t rate = control_rate_hz;
+static torque_sharing_parameters_t sharing_from(const int32_t *values, unsigned phases) {
     const uint32_t stroke = commutation_stroke(phases);
     const uint32_t turn_on = angle_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
     const uint32_t turn_off = angle_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
@@ -182,7 +180,7 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
     const uint32_t least = stroke + angle_from_degrees(2 << 7);
     const uint32_t width = turn_off - turn_on > least ? turn_off - turn_on : least;
     const uint32_t narrowing = off_early > on_early ? off_early - on_early : 0;
-    const torque_sharing_parameters_t share = {
+    return (torque_sharing_parameters_t){
         .overlapping = values[PARAMETER_TORQUE_SHARING] != 0,
         .stroke = stroke,
         .turn_on = turn_on,
@@ -190,6 +188,32 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
         .turn_on_advance = on_early,
         .turn_off_advance = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
     };
+}
+
+static conduction_parameters_t conduction_from(const int32_t *values, unsigned phases, uint32_t control_rate_hz,
+                                               int32_t torque_min_q24) {
+    const torque_sharing_parameters_t sharing = sharing_from(values, phases);
+    const torque_sharing_window_t base_window = torque_sharing_window(&sharing, 0);
+    const int32_t over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V];
+    return (conduction_parameters_t){
+        .sharing = sharing,
+        .initial = conduction_initial(&base_window),
+        /* A reserve loads both halves against each other: turn-on of one leads into the other. */
+        .single_pulse = sharing.overlapping && values[PARAMETER_TORQUE_RESERVE_NM] == 0,
+        .torque_min_q24 = torque_min_q24,
+        .torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM],
+        .advance_step_q30 =
+            (int32_t)fixed_divide(10 * DEFERRED_CONDUCTION_PERIODS * ((int64_t)1 << 30), (int64_t)control_rate_hz),
+        .retract_step_q30 =
+            (int32_t)fixed_divide(DEFERRED_CONDUCTION_PERIODS * ((int64_t)1 << 30), (int64_t)control_rate_hz),
+        .braking_end_q6 = over_voltage_q6 - over_voltage_q6 / 128,
+        .fold_back_range_q6 = over_voltage_q6 / 32 - over_voltage_q6 / 128 + 1,
+    };
+}
+
+static predictive_torque_parameters_t predictive_from(const int32_t *values, unsigned phases,
+                                                      uint32_t control_rate_hz) {
+    const int64_t rate = control_rate_hz;
     return (predictive_torque_parameters_t){
         .flux =
             {
@@ -197,13 +221,11 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
                 .resistance_period_q40 =
                     fixed_saturate(fixed_divide((int64_t)values[PARAMETER_RESISTANCE_OHM] << 16, rate)),
             },
-        .sharing = share,
-        .base_window = torque_sharing_window(&share, 0),
+        .stroke = commutation_stroke(phases),
         .period_q40 = (int32_t)fixed_divide((int64_t)1 << 40, rate),
         .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
+        .current_max_q9 = values[PARAMETER_CURRENT_LIMIT_A] + values[PARAMETER_CURRENT_LIMIT_A] / 64,
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
-        .advance_step_q30 = (int32_t)fixed_divide(10 * DEFERRED_SLOW_PERIODS * ((int64_t)1 << 30), rate),
-        .retract_step_q30 = (int32_t)fixed_divide(DEFERRED_SLOW_PERIODS * ((int64_t)1 << 30), rate),
     };
 }
 
@@ -310,6 +332,8 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             },
         .trim = trim_from(values),
         .predictive = predictive_from(values, tables->phases, control_rate_hz),
+        .conduction =
+            conduction_from(values, tables->phases, control_rate_hz, controller.four_quadrant ? -torque_max_q24 : 0),
         .misalignment = misalignment_configure(&(misalignment_settings_t){
             .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
             .control_rate_hz = control_rate_hz,

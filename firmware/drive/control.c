@@ -16,7 +16,7 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
 
 void control_prepare(const control_parameters_t *parameters, control_state_t *state) {
     torque_control_reset(parameters, state);
-    deferred_reset_run(parameters, state);
+    deferred_reset_run(state);
 }
 
 /* The first sample initialises what compares successive samples. */

@@ -17,6 +17,7 @@
 #include <stdint.h>
 
 #include "control/commutation.h"
+#include "control/conduction.h"
 #include "control/ditc_hysteresis.h"
 #include "control/load_observer.h"
 #include "control/machine_tables.h"
@@ -79,6 +80,7 @@ typedef struct {
     pwm_ditc_parameters_t duty;
     torque_trim_parameters_t trim;
     predictive_torque_parameters_t predictive;
+    conduction_parameters_t conduction;
     misalignment_parameters_t misalignment;
     observer_bandwidth_parameters_t bandwidth;
     moving_load_parameters_t moving_load;
@@ -127,9 +129,8 @@ typedef struct {
     speed_pi_t speed_pi;
     drive_mode_t mode; /* of the last input */
     torque_mode_t torque_mode;
-    unsigned turn;       /* of the last step, below DEFERRED_SLOW_PERIODS */
-    int32_t advance_q30; /* of the conduction windows, Q1.30, 0..1 */
-    torque_sharing_window_t window;
+    unsigned turn; /* of the last step, below DEFERRED_SLOW_PERIODS */
+    conduction_state_t conduction;
     stroke_mean_t stroke_mean;
     bool load_constant;          /* in the last stroke_mean_step */
     misalignment_t misalignment; /* a property of the machine: survives the end of a run */

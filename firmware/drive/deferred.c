@@ -18,10 +18,10 @@ static void change_generation(control_state_t *state, uint32_t generation) {
     request->generation = generation;
 }
 
-void deferred_reset_run(const control_parameters_t *parameters, control_state_t *state) {
+void deferred_reset_run(control_state_t *state) {
     const uint32_t generation = state->deferred_request.generation;
     change_generation(state, (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK));
-    state->deferred_request.initial.predictive.window = parameters->predictive.base_window;
+    state->deferred_request.initial.predictive.conduction = CONDUCTION_INITIAL;
     state->deferred_request.initial.speed = (deferred_speed_results_t){0, 0, 0, 0, 0};
 }
 
@@ -79,8 +79,7 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
 static void follow_resets(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
     const uint32_t changed = deferred->generation ^ input->generation;
     if ((changed & RUN_MASK) != 0) {
-        deferred->advance_q30 = 0;
-        deferred->window = parameters->predictive.base_window;
+        conduction_reset(&parameters->conduction, &deferred->conduction);
         deferred->run = false;
         deferred->mode = DRIVE_MODE_SPEED;
         speed_pi_reset(&deferred->speed_pi);
@@ -184,6 +183,27 @@ static void learn_periodic_load(const control_parameters_t *parameters, deferred
     periodic_load_step(&parameters->periodic_load, &deferred->periodic_load, &sample);
 }
 
+static void move_conduction(const control_parameters_t *parameters, deferred_t *deferred,
+                            const deferred_input_t *input) {
+    const conduction_sample_t sample = {
+        .torque_q24 = input->torque_reference_q24,
+        .torque_sum_q24 = input->torque_sum_q24,
+        .torque_shortfall_q24 = input->torque_shortfall_q24,
+        .speed_q22 = input->speed_q22,
+        .angle_step = (uint32_t)fixed_abs(rotation(parameters, input)) * parameters->commutation.rotor_poles *
+                      DEFERRED_CONDUCTION_PERIODS,
+        .dc_link_voltage_q6 = input->dc_link_voltage_q6,
+    };
+    conduction_step(&parameters->conduction, &deferred->conduction, &machine_tables, &sample);
+}
+
+/* In single pulse operation the level makes up for the missing torque; above base speed, where the windows stay where
+ * there is hardly any shortfall, the offset does. */
+static bool torque_limited(const deferred_t *deferred, const deferred_input_t *input) {
+    const conduction_state_t *conduction = &deferred->conduction;
+    return conduction->level_q15 > 0 || (input->torque_shortfall_q24 != 0 && conduction->sharing_q15 == 0);
+}
+
 /* What is not urgent, in four turns: no step takes the time of all. The learning of the phases has two of them, because
  * at a high bandwidth of the observer it follows within a millisecond. */
 static void take_turns(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
@@ -194,16 +214,15 @@ static void take_turns(const control_parameters_t *parameters, deferred_t *defer
             stroke_mean_step(&parameters->stroke_mean, &deferred->stroke_mean, input->electrical,
                              input->load_torque_q24, input->torque_reference_q24, disturbed(parameters, input)) &&
             !deferred->periodic_load.engaged;
-        deferred->window = predictive_torque_move_windows(&parameters->predictive, &deferred->advance_q30,
-                                                          input->torque_reference_q24, input->torque_shortfall_q24);
         torque_offset_step(&parameters->torque_offset, &deferred->torque_offset, input->torque_reference_q24,
-                           input->torque_sum_q24, input->torque_shortfall_q24 != 0);
+                           input->torque_sum_q24, torque_limited(deferred, input));
+        moving_load_review(&parameters->moving_load, &deferred->moving_load, input->load_torque_q24,
+                           deferred->periodic_load.engaged);
         learn_periodic_load(parameters, deferred, input);
         break;
     case 2:
-        moving_load_review(&parameters->moving_load, &deferred->moving_load, input->load_torque_q24,
-                           deferred->periodic_load.engaged);
         learn_common_misalignment(parameters, deferred, input);
+        move_conduction(parameters, deferred, input);
         break;
     default:
         learn_misalignment(parameters, deferred, input);
@@ -226,7 +245,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run) {
         take_turns(parameters, deferred, input);
     }
-    results->predictive.window = deferred->window;
+    results->predictive.conduction = deferred->conduction.latest;
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         results->predictive.misalignment[phase] = deferred->misalignment.phase[phase].offset;
     }

@@ -5,7 +5,7 @@
  *   moving load  trend of the innovation -> least bandwidth                                 moving_load.h
  *   speed law    speed error -> torque, without feed-forward                               speed_pi.h, speed_smc.h
  *   torque mode  commanded torque -> torque                                                torque_mode.h
- *   windows      torque shortfall -> conduction windows, with their reciprocal              predictive_torque.h
+ *   conduction   torque, its shortfall, speed, voltage -> angles, largest torque            conduction.h
  *   offset       mean torque error -> torque reference                                     torque_offset.h
  *   periodic     load torque that repeats with every turn -> torque reference, observer    periodic_load.h
  *   learn        misalignment of each phase                                                misalignment.h
@@ -22,10 +22,11 @@
 
 #include "drive/control.h"
 
-/* Periods per update of what takes turns: learning of the phases; learning of their common angle, windows, torque
- * offset, mean load and periodic load. */
+/* Periods per update of what takes turns: learning of the phases; learning of their common angle, torque offset, mean
+ * load and periodic load; conduction angles. */
 #define DEFERRED_LEARNING_PERIODS 2
 #define DEFERRED_SLOW_PERIODS 4
+#define DEFERRED_CONDUCTION_PERIODS (CONDUCTION_STEPS * DEFERRED_SLOW_PERIODS)
 
 /* Results in effect. [interrupt, or background in a critical section] */
 static inline const deferred_results_t *deferred_in_effect(const control_state_t *state) {
@@ -43,8 +44,8 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
 /* Both of them, when a step is pending; else returns false. [deferred] */
 bool deferred_step(const control_parameters_t *parameters, control_state_t *state);
 
-/* Resets for the next run: windows without advance. [both] */
-void deferred_reset_run(const control_parameters_t *parameters, control_state_t *state);
+/* Resets for the next run: conduction angles of torque sharing. [both] */
+void deferred_reset_run(control_state_t *state);
 
 /* Resets with the observer: statistics of the innovation. [interrupt] */
 void deferred_reset_observer(control_state_t *state);

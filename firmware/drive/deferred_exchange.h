@@ -18,9 +18,9 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "control/conduction.h"
 #include "control/load_observer.h"
 #include "control/observer_bandwidth.h"
-#include "control/torque_sharing.h"
 #include "drive/command.h"
 #include "hal.h"
 
@@ -48,7 +48,7 @@ typedef struct {
 
 /* Of torque control by flux linkage. */
 typedef struct {
-    torque_sharing_window_t window;       /* of the motoring phases */
+    unsigned conduction;                  /* index of the angles, conduction_angles() */
     int32_t misalignment[HAL_PHASES_MAX]; /* to subtract from the angle of each phase, 2^-32 electrical rev */
 } deferred_predictive_results_t;
 
@@ -61,7 +61,8 @@ typedef struct {
     int32_t torque_max_q24;       /* both are the reference in torque mode */
 } deferred_speed_results_t;
 
-/* Results that act from the next control period on; all zero: none, but for the window. In parts that are copied
+/* Results that act from the next control period on; all zero: none, but for the conduction angles. In
+ * parts that are copied
  * without a call of memcpy, which took 79 instructions of a reset. */
 typedef struct {
     uint32_t generation; /* of the input */

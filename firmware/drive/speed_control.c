@@ -43,7 +43,7 @@ static int32_t torque_law_q24(const control_parameters_t *parameters, deferred_t
 void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
                             deferred_results_t *results) {
     const int32_t offset_q24 = torque_offset_q24(&deferred->torque_offset);
-    int32_t min_q24 = parameters->torque_mode.torque_min_q24, max_q24 = parameters->torque_mode.torque_max_q24;
+    int32_t min_q24 = deferred->conduction.torque_min_q24, max_q24 = deferred->conduction.torque_max_q24;
     int32_t torque_q24 = 0;
     drive_mode_t mode = DRIVE_MODE_SPEED;
     results->speed.speed_reference_q22 = 0;

@@ -125,8 +125,8 @@ def test_parameters_are_written_and_read_in_si_units(make_bench):
         row = parameters.row(name)
         parameters[name] = value
         assert parameters[name] == pytest.approx(value, abs=0.5 * 2.0**-row.fraction_bits), name
-    with pytest.raises(DriveError, match="torque_max_Nm 3: must be 0 to 2.5 N m"):
-        parameters["torque_max_Nm"] = 3.0
+    with pytest.raises(DriveError, match="torque_max_Nm 7: must be 0 to 6.25 N m"):
+        parameters["torque_max_Nm"] = 7.0
 
 
 def test_database_written_for_a_machine_is_that_of_its_drive_and_another_is_reported(make_bench, salient, tmp_path,

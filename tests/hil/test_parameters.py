@@ -59,7 +59,7 @@ def test_value_out_of_range_is_rejected_and_changes_nothing(bench):
 
 
 def test_value_beyond_32_bits_is_rejected(bench):
-    with pytest.raises(DriveError, match="torque_max_Nm 1e.06: must be 0 to 40 N m"):
+    with pytest.raises(DriveError, match="torque_max_Nm 1e.06: must be 0 to 100 N m"):
         bench.drive.parameters["torque_max_Nm"] = 1e6
 
 

@@ -161,32 +161,33 @@ def test_3000_rpm_with_8_Nm_is_held_where_voltage_just_suffices(run_recorded):
         bench.run_for(1.2)
 
     recording, bench = run_recorded(steps, 0.9, 10.0, machine="linear_cosine")
-    assert 2997 < recording["speed_rpm"].min() < recording["speed_rpm"].max() < 3000.5
-    assert bench.telemetry["voltage_saturated"].last == 1
+    assert 2999 < recording["speed_rpm"].min() < recording["speed_rpm"].max() < 3002
+    assert within((0.2, 0.9), float(np.mean(bench.telemetry["voltage_saturated"].value)))
     assert highest_current_A(recording) < 52
 
 
 def test_enters_and_leaves_voltage_limited_operation_smoothly(run_recorded):
     def steps(bench: Bench) -> None:
         bench.drive.speed_reference_rpm = 3000
-        bench.at(0.6).load_torque_Nm = 14
+        bench.at(0.6).load_torque_Nm = 16
+        bench.at(0.6).supply_voltage_V = 200
         bench.at(1.2).load_torque_Nm = 0
         bench.run_for(1.7)
 
     recording, bench = run_recorded(steps, step_us=10.0, machine="linear_cosine")
     speed_rpm, torque_Nm, time_s = recording["speed_rpm"], recording["torque_Nm"], recording["time_s"]
-    assert 2990 < speed_rpm[time_s < 0.6][-1] < 3000.5
-    assert 2100 < speed_rpm[time_s < 1.2][-1] < 2330  # 14 N m is the maximum at this speed
+    assert 2990 < speed_rpm[time_s < 0.6][-1] < 3001
+    assert 2050 < speed_rpm[time_s < 1.2][-1] < 2330  # load and friction exceed the torque
     missing_Nm = bench.telemetry["torque_missing_Nm"].between(0.8, 1.2)
-    assert 3.0 < missing_Nm.value.max() < 12.0
+    assert 3.0 < missing_Nm.value.max() < 25.0  # between the pulses
     assert missing_Nm.value.min() >= 0.0
     # The windows return until the voltage just suffices: below 0.05 N m and 1/64 of the torque they stay.
     assert abs(bench.telemetry["torque_missing_Nm"].last) < 0.15
-    # Acceleration back is at the torque limit throughout, without overshoot.
+    # Acceleration back, without overshoot.
     back_rpm = speed_rpm[time_s >= 1.2]
     assert np.diff(back_rpm[:10_000:100]).min() > 0.0
-    assert 2999 < back_rpm[-1] <= back_rpm.max() < 3000.5
-    assert 18.0 < torque_Nm[time_s >= 0.1].max() < 19.6
+    assert 2999 < back_rpm[-1] <= back_rpm.max() < 3002
+    assert 25.0 < torque_Nm[time_s >= 0.1].max() < 33.0  # of a pulse
     assert 45.0 < highest_current_A(recording) < 53.0
 
 

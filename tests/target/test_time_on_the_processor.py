@@ -290,10 +290,10 @@ def test_shared_data_is_torn_without_the_critical_section_and_never_with_it(race
 def test_control_interrupt_preempts_the_deferred_one_and_their_data_is_torn_only_without_the_exchange(race, build,
                                                                                                       timed):
     found = race(build, "no_exchange", timed)
-    assert found.preemptions > 1000
+    assert found.preemptions > 700
     assert found.torn_inputs > 20 and found.torn_results > 500
     found = race(build, "protected", timed)
-    assert found.preemptions > 1000
+    assert found.preemptions > 700
     assert 0.9 * found.preemptions < found.skipped < 1.5 * found.preemptions
     assert found.torn == (0, 0, 0, 0, 0)
 

@@ -80,7 +80,7 @@ def test_invalid_command_line_is_rejected(salient, arguments, expected_texts):
         (SCENARIO + "[load]\nat_s = 0\n", ["load", "[[load]]"]),
         (SCENARIO + "[record]\nstep_us = 0\n", ["record.step_us", "0.1"]),
         (SCENARIO + "[parameters]\ntorque_max = 1\n", ["parameters.torque_max", "torque_max_Nm"]),
-        (SCENARIO + "[parameters]\ntorque_max_Nm = 1000\n", ["parameters.torque_max_Nm", "1000", "0 to 40 N m"]),
+        (SCENARIO + "[parameters]\ntorque_max_Nm = 1000\n", ["parameters.torque_max_Nm", "1000", "0 to 100 N m"]),
         (SCENARIO + "[parameters]\ntorque_max_Nm = true\n", ["parameters.torque_max_Nm", "must be a number"]),
         (SCENARIO + "seed = \n", ["not TOML"]),
         (SCENARIO + "seed = " + 5000 * "9", ["not TOML", "too long"]),

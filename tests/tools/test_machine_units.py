@@ -42,7 +42,7 @@ def test_bundled_machines_are_in_si_units_with_the_database_and_defaults_of_the_
     scaling = scaling_of_file(path)
     assert scaling.exponents == Exponents()
     assert scaling.dbc() == DRIVE_DBC.read_text()
-    of_machine = {"inertia_kg_m2", "friction_Nm_s", "resistance_ohm", "speed_kp", "speed_ki"}
+    of_machine = {"inertia_kg_m2", "friction_Nm_s", "resistance_ohm", "speed_kp", "speed_ki", "smc_k", "smc_delta"}
     for row, raw in zip(read_table(), scaling.raw_parameters(), strict=True):
         assert raw == row.default or row.name in of_machine, row.name
     assert scaling.fraction_bits() == [row.fraction_bits for row in read_table()]
@@ -76,8 +76,8 @@ def test_no_derived_default_is_beyond_the_range_of_its_parameter(name):
      r"mechanics\.inertia_kg_m2: 200: must be a number from 0\.0064 to 121\.6, for a machine of 2e\+03 N m and "),
     ("inertia_kg_m2 = 4.0", "inertia_kg_m2 = 0.001", r"mechanics\.inertia_kg_m2: 0\.001: must be a number from 0\.006"),
     ("friction_Nm_s = 0.5", "friction_Nm_s = 200.0", r"mechanics\.friction_Nm_s: 200: must be a number from 0 to 121"),
-    ("torque_peak_Nm = 2000.0", "torque_peak_Nm = 2000.0\n[drive.parameters]\ntorque_max_Nm = 3000.0",
-     r"drive\.parameters\.torque_max_Nm: 3000: must be a number from 0 to 2560, "),
+    ("torque_peak_Nm = 2000.0", "torque_peak_Nm = 2000.0\n[drive.parameters]\ntorque_max_Nm = 7000.0",
+     r"drive\.parameters\.torque_max_Nm: 7000: must be a number from 0 to 6400, "),
 ])
 def test_machine_that_its_units_do_not_fit_is_refused_in_one_line(tmp_path, old, new, text):
     file = tmp_path / "refused.toml"

@@ -260,7 +260,7 @@ def test_machine_of_odd_proportions_has_pulses_in_order(change: dict):
     machine = replace(machine, **change)
     of = single_pulse(machine, derive(machine))
     for values in vars(of).values():
-        assert np.all(np.isfinite(values)) and np.all(values >= 0.0)
+        assert np.all(np.isfinite(values)) and np.all(np.asarray(values) >= 0.0)
     assert np.all(of.lead_deg + of.end_deg < 360.0)
     assert np.all(of.mean_Nm[:, 0] >= 0.995 * of.mean_Nm.max(axis=1)) and np.all(of.mean_Nm <= of.peak_Nm)
     assert np.all(of.smooth_Nm <= 1.01 * of.mean_Nm)

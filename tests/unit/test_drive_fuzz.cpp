@@ -123,10 +123,12 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
                 const bool exists = phase < tables->phases;
                 ASSERT_LE(compare.upper[phase], closed && exists ? parameters.period_ticks : 0) << sequence;
                 ASSERT_LE(compare.lower[phase], closed && exists ? parameters.period_ticks : 0) << sequence;
-                // Both on at a time is the only way to put voltage on a phase: not above its limit.
+                // Both on at a time is the only way to put voltage on a phase: not above its limit and the error of the
+                // plans.
                 if (compare.upper[phase] + compare.lower[phase] > parameters.period_ticks) {
                     driven++;
-                    ASSERT_LE(state.measurement.current_q9[phase], p.values[PARAMETER_CURRENT_LIMIT_A]) << sequence;
+                    ASSERT_LE(state.measurement.current_q9[phase], p.values[PARAMETER_CURRENT_LIMIT_A] * 65 / 64)
+                        << sequence;
                 }
             }
             running += closed;

@@ -143,7 +143,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("fold-back", c.torque_mode.speed_end_q22, c.protection.over_speed_q22 * 15.0 / 16.0, 1.0);
     near("timeout", c.protection.command_timeout_us, 1000.0 * v(PARAMETER_COMMAND_TIMEOUT_MS), 0.0);
 
-    const auto &share = c.predictive.sharing;
+    const auto &share = c.conduction.sharing;
     const double stroke = fixed_point::REV / machine_tables.phases;
     const double least = 2.0 / 360.0 * fixed_point::REV;
     const double on_early = pitch(PARAMETER_SHARE_ON_EARLY_DEG);
@@ -166,8 +166,9 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const double q40 = std::ldexp(1.0, 40);
     near("resistance", c.predictive.flux.resistance_period_q40, v(PARAMETER_RESISTANCE_OHM) / rate_hz * q40, 1.0);
     near("period", c.predictive.period_q40, q40 / rate_hz, 1.0);
-    near("advance", c.predictive.advance_step_q30, 10.0 * DEFERRED_SLOW_PERIODS / rate_hz * fixed_point::Q30, 1.0);
-    near("return", c.predictive.retract_step_q30, 1.0 * DEFERRED_SLOW_PERIODS / rate_hz * fixed_point::Q30, 1.0);
+    near("advance", c.conduction.advance_step_q30, 10.0 * DEFERRED_CONDUCTION_PERIODS / rate_hz * fixed_point::Q30,
+         1.0);
+    near("return", c.conduction.retract_step_q30, 1.0 * DEFERRED_CONDUCTION_PERIODS / rate_hz * fixed_point::Q30, 1.0);
 
     const auto trim_scale = [&](unsigned index) {
         return std::min(v(index) * scale_Nm / v(PARAMETER_BP_TRIM_LIMIT_NM), 4.0) * fixed_point::Q15;

@@ -66,7 +66,15 @@ class Deferred : public testing::Test {
 
     const deferred_results_t &results() const { return *deferred_in_effect(&state); }
     bool pending() const { return deferred_pending(&state.deferred_request, &state.deferred.response); }
-    bool advanced() const { return results().predictive.window.turn_on != parameters.predictive.base_window.turn_on; }
+    const torque_sharing_window_t &window() const {
+        return conduction_angles(&parameters.conduction, &state.deferred.conduction, results().predictive.conduction)
+            ->half[CONDUCTION_MOTORING]
+            .window;
+    }
+    const torque_sharing_window_t &base_window() const {
+        return parameters.conduction.initial.half[CONDUCTION_MOTORING].window;
+    }
+    bool advanced() const { return window().turn_on != base_window().turn_on; }
 
     control_parameters_t parameters;
     control_state_t state;
@@ -113,21 +121,22 @@ TEST_F(Deferred, a_pending_step_keeps_its_input_and_the_next_input_counts_the_sk
 TEST_F(Deferred, results_take_effect_together_at_the_end_of_the_step) {
     start();
     for (int k = 0; k < 400; k++) {
-        period(COMMAND_RUN, 3000.0); // a torque shortfall: the windows move in every fourth step
+        period(COMMAND_RUN, 3000.0); // a torque shortfall: the windows move
     }
-    while (state.deferred.turn != 3) { // the next step moves them
+    while (state.deferred.turn != 1 || state.deferred.conduction.step != CONDUCTION_STEPS - 1) { // in the next step
         period(COMMAND_RUN, 3000.0);
     }
     interrupt(COMMAND_RUN, 3000.0);
     deferred_results_t before;
     std::memcpy(&before, &results(), sizeof before);
+    const torque_sharing_window_t window_before = window();
     deferred_compute(&parameters, &state);
     EXPECT_EQ(std::memcmp(&before, &results(), sizeof before), 0) << "while the step computes";
     ASSERT_TRUE(interrupt(COMMAND_RUN, 3000.0)) << "pre-empts it";
     EXPECT_EQ(std::memcmp(&before, &results(), sizeof before), 0);
+    EXPECT_EQ(std::memcmp(&window_before, &window(), sizeof window_before), 0);
     deferred_complete(&state.deferred_request, &state.deferred.response);
-    EXPECT_NE(before.predictive.window.turn_on, results().predictive.window.turn_on);
-    EXPECT_NE(before.predictive.window.reciprocal, results().predictive.window.reciprocal);
+    EXPECT_NE(window_before.turn_on, window().turn_on);
 }
 
 TEST_F(Deferred, checks_act_one_period_later_or_when_the_late_step_ends) {
@@ -189,11 +198,11 @@ TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_windows_at_the_end_o
     EXPECT_FALSE(advanced()) << "in effect without a step";
     EXPECT_TRUE(deferred_step(&parameters, &state)) << "computed with the windows of the run";
     EXPECT_FALSE(advanced());
-    EXPECT_GT(state.deferred.advance_q30, 0);
+    EXPECT_GT(state.deferred.conduction.advance_q30, 0);
     EXPECT_TRUE(interrupt(COMMAND_RUN, 0.0)) << "the next run, without a period between";
     EXPECT_FALSE(advanced());
     EXPECT_TRUE(deferred_step(&parameters, &state));
-    EXPECT_EQ(state.deferred.advance_q30, 0) << "the windows start again";
+    EXPECT_EQ(state.deferred.conduction.advance_q30, 0) << "the windows start again";
     EXPECT_FALSE(advanced());
 }
 

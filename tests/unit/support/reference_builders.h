@@ -87,7 +87,8 @@ inline torque_sharing_t model_of(const torque_sharing_parameters_t &p, double ad
 }
 
 template <typename machine_t>
-predictive_t<machine_t> model_of(const predictive_torque_parameters_t &p, const machine_t *machine, unsigned phases) {
+predictive_t<machine_t> model_of(const predictive_torque_parameters_t &p, const conduction_parameters_t &conduction,
+                                 const machine_t *machine, unsigned phases) {
     using namespace fixed_point;
     predictive_t<machine_t> model{};
     model.machine = machine;
@@ -97,9 +98,9 @@ predictive_t<machine_t> model_of(const predictive_torque_parameters_t &p, const 
     model.flux_gain = p.flux.gain_q15 / Q15;
     model.current_limit_A = p.current_limit_q9 / Q9;
     model.reserve_Nm = p.reserve_q24 / Q24;
-    model.sharing = p.sharing.overlapping;
-    model.base_window = model_of(p.sharing, 0.0);
-    model.advanced_window = model_of(p.sharing, 1.0);
+    model.sharing = conduction.sharing.overlapping;
+    model.base_window = model_of(conduction.sharing, 0.0);
+    model.advanced_window = model_of(conduction.sharing, 1.0);
     return model;
 }
 

@@ -233,22 +233,23 @@ template <typename machine_t> struct predictive_t {
                 p.flux_max =
                     std::max(std::min(p.flux_max, flux_step_max * (p.angle - 0.5) / sample.angle_step), p.flux_min);
             }
-            const torque_sharing_t share = p.positive != sample.reverse ? window() : base_window;
+            // Windows are advanced for motoring torque only.
+            const bool advanced = p.positive != sample.reverse && (reference < 0.0) == sample.reverse;
+            const torque_sharing_t share = advanced ? window() : base_window;
             p.since_on = p.angle - share.turn_on;
             const double side = p.positive ? reference : -reference;
             limited |= plan_torque(p, (std::max(side, 0.0) + opposed) * share.at(p.angle));
         }
-        torque_shortfall = 0.0;
-        if (limited) {
-            torque_shortfall = reference;
-            for (unsigned phase = 0; phase < phases; phase++) {
-                torque_shortfall -= plan[phase].positive ? plan[phase].torque : -plan[phase].torque;
-            }
-            correct_torque(reference >= 0.0, sample.reverse);
-            torque_shortfall = std::fabs(torque_shortfall) > 1.0 / 64.0 ? torque_shortfall : 0.0;
-        }
+        torque_shortfall = reference;
         for (unsigned phase = 0; phase < phases; phase++) {
-            const double duty_max = sample.current_A[phase] > current_limit_A ? 0.0 : 1.0;
+            torque_shortfall -= plan[phase].positive ? plan[phase].torque : -plan[phase].torque;
+        }
+        if (limited || std::fabs(torque_shortfall) > 1.0 / 64.0) {
+            correct_torque(reference >= 0.0, sample.reverse);
+        }
+        torque_shortfall = std::fabs(torque_shortfall) > 1.0 / 64.0 ? torque_shortfall : 0.0;
+        for (unsigned phase = 0; phase < phases; phase++) {
+            const double duty_max = sample.current_A[phase] > current_limit_A * 65.0 / 64.0 ? 0.0 : 1.0;
             const double unclamped = (plan[phase].flux - flux[phase] + drop[phase]) / flux_step_max;
             duty[phase] = plan[phase].flux > 0.0 ? std::clamp(unclamped, -1.0, duty_max) : -1.0;
         }

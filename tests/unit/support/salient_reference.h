@@ -123,7 +123,7 @@ class salient_t {
         moving_load[1] = model_of(p.moving_load, true, rate_hz);
         std::copy(std::begin(p.bandwidth.bandwidth_rad_s), std::end(p.bandwidth.bandwidth_rad_s), stage_rad_s.begin());
         offset_limit = torque_max / 8.0;
-        predictive = model_of(p.predictive, &machine, phases);
+        predictive = model_of(p.predictive, p.conduction, &machine, phases);
         predictive.period_s = 1.0 / rate_hz;
         predictive.resistance_ohm = plant.resistance_ohm * units.current_A / units.voltage_V;
         misalignment = model_of(p.misalignment, phases, rate_hz / DEFERRED_LEARNING_PERIODS);

@@ -1,6 +1,6 @@
 """Single pulse operation: the turn-on and turn-off angles with which a machine makes its largest mean torque at a
 speed, those torques, and the flux linkage from which a braking current can still be ended
-(firmware/control/single_pulse.h).
+(firmware/control/conduction.h).
 
 Angles are electrical degrees of a phase: 180 is the unaligned, 360 the aligned position, from 360 to 540 the torque
 brakes. A pulse is the full DC-link voltage from a turn-on to a turn-off angle, the current limited by ideal chopping,
@@ -22,6 +22,7 @@ import numpy as np
 from salient.machine.definition import Machine
 from salient.machine.drive_data import DriveData
 from salient.machine.scaling import Exponents, Scaling
+from salient.machine.sharing_window import least_current_window_deg
 
 POINTS = 17
 """As MACHINE_PULSE_POINTS: equidistant speeds per voltage, the first at standstill."""
@@ -59,6 +60,8 @@ _REST_DEG = 2.0
 """Between the end of the flux linkage and the next turn-on."""
 _CURRENT_WEIGHT = 0.05
 """Relative torque that a relative square of the RMS current is worth."""
+_SHARED_TORQUE = 0.6
+"""Of the peak torque, for which the window of torque sharing is the best one."""
 _VOLTAGE_SHARE_MAX = 0.95
 """Of the voltage that the resistance may take, and of the supply that the switches may: a current that is not reached
 is no limit."""
@@ -70,6 +73,9 @@ class SinglePulse:
 
     speed_per_voltage: np.ndarray
     """(POINTS,), rad/s of the rotor per volt."""
+    base_speed_per_voltage: float
+    sharing_deg: tuple[float, float]
+    """Turn-on and turn-off of the window of torque sharing with the least RMS current."""
     lead_deg: np.ndarray
     """(2, POINTS), turn-on before the half of the wanted torque."""
     end_deg: np.ndarray
@@ -96,6 +102,9 @@ class PulseTables:
     """(2, POINTS, 5): the members of machine_pulse_t."""
     braking_end: np.ndarray
     braking_flux: np.ndarray
+    base_index: int
+    sharing_on: int
+    sharing_off: int
 
     def pulses(self) -> list[list[tuple[int, ...]]]:
         """The values of machine_pulse_t."""
@@ -121,6 +130,9 @@ def in_units(pulse: SinglePulse, exponents: Exponents) -> PulseTables:
         pulse=np.stack([*angles, *torques], axis=-1),
         braking_end=_rounded(pulse.braking_end_deg / 360.0, 16, _HALF_TURN),
         braking_flux=_rounded(pulse.braking_flux_Wb, 13 - exponents.voltage),
+        base_index=int(_rounded(pulse.base_speed_per_voltage / float(pulse.speed_per_voltage[-1]), 12)),
+        sharing_on=int(_rounded((pulse.sharing_deg[0] - 180.0) / 360.0, 16)),
+        sharing_off=int(_rounded((pulse.sharing_deg[1] - 180.0) / 360.0, 16)),
     )
 
 
@@ -156,6 +168,9 @@ def single_pulse(machine: Machine, data: DriveData, speed_per_voltage_least: flo
     end_deg, flux_Wb = phase.envelope(seen_rad_s)
     return SinglePulse(
         speed_per_voltage=speed_rad_s / machine.supply_voltage_V,
+        base_speed_per_voltage=base_rad_s / machine.supply_voltage_V,
+        sharing_deg=least_current_window_deg(machine.magnetics, machine.phases, _SHARED_TORQUE * data.torque_peak_Nm,
+                                             data.parameters["current_limit_A"]),
         lead_deg=begin_deg - on_deg,
         end_deg=off_deg - begin_deg,
         smooth_Nm=np.maximum(smooth_Nm, 0.0),

@@ -1,0 +1,147 @@
+/* Conduction angles of the phases: torque sharing, its windows advanced at the voltage limit, and single pulse
+ * operation.
+ *
+ * Window advance: a torque shortfall moves the conduction windows to earlier angles (torque_sharing.h), fully within
+ * 100 ms; without shortfall they return within 1 s.
+ *
+ * Single pulse: above base speed the voltage has no time to build up the flux linkage of the torque after the unaligned
+ * position. Turn-on then leads the half in which the phase makes the wanted torque, and turn-off is early enough that
+ * the flux linkage ends with the half. The angles of the largest torque over speed / voltage come from the generator
+ * (tools/src/salient/machine/single_pulse.py). A level from 0, torque sharing, to 1 blends them in:
+ *
+ *   lead = level * lead_max,   end = end_sharing + level * (end_max - end_sharing)
+ *   level = (T - T_smooth) / (T_mean - T_smooth) + trim,   clamped to 0..1
+ *
+ * T_smooth is the largest torque without lead and without ripple, T_mean the largest mean torque. The trim is the
+ * integral of the sign of the voltage limitation. It makes up for what the tables do not know, a lower current limit or
+ * another load angle; the level ends where the voltage limits the torque during half of the time. Above T_smooth the
+ * torque of several phases pulsates; the reference of the instantaneous torque is raised by level * (T_peak - T_mean),
+ * so that the mean is that of the reference.
+ *
+ * Braking: with full -Vdc from an angle theta on, the current stays within its limit while the flux linkage is below
+ * psi_t + Vdc / omega (theta_t - theta), the tangent to the flux linkage of the current limit. With torque sharing the
+ * flux linkage ends at the unaligned position instead.
+ *
+ * The torque is limited to T_mean. Braking torque, whose energy goes into the DC link, is reduced linearly where the
+ * voltage approaches the over-voltage threshold: a chopper that cannot take more, or none, does not end in a fault.
+ *
+ * J. M. Stephenson, S. R. MacMinn, J. R. Hendershot, "Switched reluctance drives", tutorial, IEEE IAS 1990; the blend
+ * and the trim derived here.
+ */
+#ifndef CONTROL_CONDUCTION_H
+#define CONTROL_CONDUCTION_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "control/machine_tables.h"
+#include "control/torque_sharing.h"
+#include "fixed/formats.h"
+
+/* Of the phases in one half of the electrical revolution: those that move towards the aligned position, and those that
+ * move away from it. */
+enum { CONDUCTION_MOTORING, CONDUCTION_BRAKING, CONDUCTION_HALVES };
+
+/* Angles in 2^-32 electrical rev, of a phase mirrored into 2^31 unaligned .. 2^32 aligned. */
+typedef struct {
+    torque_sharing_window_t window;
+    uint32_t width; /* from turn-on to where a phase makes up for no shortfall any more; HALF_REV: it always does */
+    uint32_t lead;  /* before the end of the half, of the turn-on for the half that follows; 0: no pulse */
+    /* A phase past the angle `end` carries at most the flux linkage of which -Vdc leaves `flux` there, in units of the
+     * tables. */
+    uint32_t end;
+    int32_t flux;
+} conduction_half_t;
+
+typedef struct {
+    conduction_half_t half[CONDUCTION_HALVES];
+    int32_t ripple_q24; /* to add to the torque reference, N m, Q7.24, with its sign */
+} conduction_t;
+
+typedef struct {
+    torque_sharing_parameters_t sharing;
+    conduction_t initial;   /* torque sharing without advance */
+    bool single_pulse;      /* false: torque sharing only */
+    int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
+    int32_t torque_max_q24;
+    int32_t advance_step_q30;   /* per update with torque shortfall, Q1.30 */
+    int32_t retract_step_q30;   /* per update without, Q1.30 */
+    int32_t braking_end_q6;     /* DC-link voltage from which there is no braking torque, V, Q9.6 */
+    int32_t fold_back_range_q6; /* voltage range below, in which it decreases to 0, V, Q9.6, >= 1 */
+} conduction_parameters_t;
+
+/* Point of the tables: index of the lower one, and fraction of the way to the next. */
+typedef struct {
+    uint32_t k;
+    int32_t fraction_q8;
+} conduction_place_t;
+
+/* Between two points of the tables. */
+typedef struct {
+    uint32_t lead, end; /* of machine_pulse_t, 2^-32 electrical rev */
+    int32_t smooth_q24, mean_q24, peak_q24;
+} conduction_pulse_t;
+
+/* Positions of a phase past its entry into a half, against which it moves, 2^-32 electrical rev; before it: from 2^31.
+ */
+typedef struct {
+    uint32_t enter, leave; /* of the window */
+    uint32_t on;           /* turn-on */
+} conduction_interval_t;
+
+#define CONDUCTION_STEPS 4   /* of an update */
+#define CONDUCTION_INITIAL 2 /* index of no update yet */
+
+typedef struct {
+    unsigned step;
+    conduction_place_t place;
+    conduction_pulse_t pulse;
+    bool braking;             /* torque against the rotation */
+    int32_t motoring_max_q24; /* largest mean torque, by magnitude, N m, Q7.24 */
+    int32_t braking_max_q24;
+    int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
+    int32_t torque_max_q24;
+    int32_t sharing_q15;            /* part of the window with the least current, Q1.15, 0..1 */
+    int32_t advance_q30;            /* of the windows, Q1.30, 0..1 */
+    int32_t trim_q30;               /* of the level, Q1.30, -1..1 */
+    int32_t level_q15;              /* Q1.15, 0..1 */
+    conduction_interval_t interval; /* of the half with the torque */
+    conduction_t angles[2];         /* of the last two updates */
+    unsigned latest;                /* index of the last, or CONDUCTION_INITIAL */
+} conduction_state_t;
+
+typedef struct {
+    int32_t torque_q24;           /* reference, N m, Q7.24 */
+    int32_t torque_sum_q24;       /* estimated, N m, Q7.24 */
+    int32_t torque_shortfall_q24; /* of the reference with its ripple, N m, Q7.24 */
+    int32_t speed_q22;            /* rad/s, Q9.22 */
+    uint32_t angle_step;          /* magnitude of the rotation during an update, 2^-32 electrical rev */
+    int32_t dc_link_voltage_q6;   /* V, Q9.6 */
+} conduction_sample_t;
+
+/* Angles of torque sharing without advance. */
+conduction_t conduction_initial(const torque_sharing_window_t *window);
+
+/* State without an update; the angles of earlier ones are left as they are. */
+static inline void conduction_reset(const conduction_parameters_t *parameters, conduction_state_t *state) {
+    state->step = 0;
+    state->torque_min_q24 = parameters->torque_min_q24;
+    state->torque_max_q24 = parameters->torque_max_q24;
+    state->advance_q30 = 0;
+    state->trim_q30 = 0;
+    state->level_q15 = 0;
+    state->latest = CONDUCTION_INITIAL;
+}
+
+/* One of the steps of an update, in turn: tables, level, positions, angles. Products are rounded down; the level to
+ * 2^-15, angles of the tables to 2^-24. */
+void conduction_step(const conduction_parameters_t *parameters, conduction_state_t *state,
+                     const machine_tables_t *tables, const conduction_sample_t *sample);
+
+/* Angles of the update with an index. */
+static inline const conduction_t *conduction_angles(const conduction_parameters_t *parameters,
+                                                    const conduction_state_t *state, unsigned index) {
+    return index == CONDUCTION_INITIAL ? &parameters->initial : &state->angles[index];
+}
+
+#endif
