@@ -2,21 +2,21 @@
  * operation.
  *
  * Window advance: a torque shortfall moves the conduction windows to earlier angles (torque_sharing.h), fully within
- * 100 ms; without shortfall they return within 1 s.
+ * 100 ms; without shortfall they return within 1 s, above base speed within 8 s. From base speed on they begin at the
+ * window with the least RMS current, which is also in the tables; the advance of a motoring phase takes it back.
  *
  * Single pulse: above base speed the voltage has no time to build up the flux linkage of the torque after the unaligned
  * position. Turn-on then leads the half in which the phase makes the wanted torque, and turn-off is early enough that
  * the flux linkage ends with the half. The angles of the largest torque over speed / voltage come from the generator
  * (tools/src/salient/machine/single_pulse.py). A level from 0, torque sharing, to 1 blends them in:
  *
- *   lead = level * lead_max,   end = end_sharing + level * (end_max - end_sharing)
+ *   on = on_sharing + level * (-lead_max - on_sharing),   end = end_sharing + level * (end_max - end_sharing)
  *   level = (T - T_smooth) / (T_mean - T_smooth) + trim,   clamped to 0..1
  *
- * T_smooth is the largest torque without lead and without ripple, T_mean the largest mean torque. The trim is the
- * integral of the sign of the voltage limitation. It makes up for what the tables do not know, a lower current limit or
- * another load angle; the level ends where the voltage limits the torque during half of the time. Above T_smooth the
- * torque of several phases pulsates; the reference of the instantaneous torque is raised by level * (T_peak - T_mean),
- * so that the mean is that of the reference.
+ * with angles past the begin of that half. T_smooth is the largest torque without lead and without ripple, T_mean the
+ * largest mean torque. The trim is the integral over the angle of the missing torque, reference less estimate, half of
+ * it in an electrical revolution: it makes the mean torque that of the reference. With single pulses the torque
+ * pulsates, and the reference of the instantaneous torque is raised by level * (T_peak - T_mean).
  *
  * Braking: with full -Vdc from an angle theta on, the current stays within its limit while the flux linkage is below
  * psi_t + Vdc / omega (theta_t - theta), the tangent to the flux linkage of the current limit. With torque sharing the
@@ -36,7 +36,6 @@
 
 #include "control/machine_tables.h"
 #include "control/torque_sharing.h"
-#include "fixed/formats.h"
 
 /* Of the phases in one half of the electrical revolution: those that move towards the aligned position, and those that
  * move away from it. */

@@ -83,7 +83,7 @@ static int32_t pid_scale_q15(int32_t per_Nm_q15, int32_t error_scale_q24, uint32
     return fixed_clamp(fixed_saturate(fixed_divide(scaled_q15 * control_rate_hz, GAIN_RATE_HZ)), 0, 4 << 15);
 }
 
-/* Braking torque of drive and load together, N m: above the drive's largest torque limit. */
+/* Braking torque of drive and load together, N m, that the largest deceleration assumes. */
 #define BRAKING_TORQUE_MAX_NM 40
 
 static protection_parameters_t protection_from(const int32_t *values, int32_t angle_step_q32, unsigned encoder_shift,
@@ -270,6 +270,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     const int32_t current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A];
     const unsigned encoder_shift = 32u - encoder_bits;
     const controller_t controller = controller_from(values);
+    const int32_t torque_min_q24 = controller.four_quadrant ? -torque_max_q24 : 0;
 
     control_parameters_t control = {
         .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
@@ -332,8 +333,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             },
         .trim = trim_from(values),
         .predictive = predictive_from(values, tables->phases, control_rate_hz),
-        .conduction =
-            conduction_from(values, tables->phases, control_rate_hz, controller.four_quadrant ? -torque_max_q24 : 0),
+        .conduction = conduction_from(values, tables->phases, control_rate_hz, torque_min_q24),
         .misalignment = misalignment_configure(&(misalignment_settings_t){
             .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
             .control_rate_hz = control_rate_hz,
@@ -361,9 +361,9 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     control.periodic_load = periodic_load_configure(
         control_rate_hz, learns_load ? control.bandwidth.bandwidth_rad_s[control.bandwidth.moving_stage] : 0,
         torque_max_q24);
-    control.torque_mode = torque_mode_configure(values[PARAMETER_TORQUE_SLEW_RATE_NM_S], control_rate_hz,
-                                                controller.four_quadrant ? -torque_max_q24 : 0, torque_max_q24,
-                                                fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
+    control.torque_mode =
+        torque_mode_configure(values[PARAMETER_TORQUE_SLEW_RATE_NM_S], control_rate_hz, torque_min_q24, torque_max_q24,
+                              fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
     control.torque_offset = torque_offset_configure(control_rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
     return control;

@@ -61,9 +61,8 @@ typedef struct {
     int32_t torque_max_q24;       /* both are the reference in torque mode */
 } deferred_speed_results_t;
 
-/* Results that act from the next control period on; all zero: none, but for the conduction angles. In
- * parts that are copied
- * without a call of memcpy, which took 79 instructions of a reset. */
+/* Results that act from the next control period on; all zero: none, but for the conduction angles. In parts that
+ * are copied without a call of memcpy, which took 79 instructions of a reset. */
 typedef struct {
     uint32_t generation; /* of the input */
     uint32_t fault_mask; /* failed deferred checks, lower half of their FAULT_BITs */

@@ -28,6 +28,7 @@ def least_current_window_deg(magnetics: Any, phases: int, torque_Nm: float, curr
     stroke_deg = 360.0 / phases
     angle_deg = np.arange(180.0, 361.0, _STEP_DEG)
     share_A = _current_of_share_A(magnetics, angle_deg, torque_Nm, current_max_A)
+    row = np.arange(len(angle_deg))
     best_A2, best = np.inf, (float(_ON_DEG[0]), _OFF_MAX_DEG)
     for on_deg in _ON_DEG:
         for off_deg in np.arange(on_deg + stroke_deg + _OVERLAP_MIN_DEG, _OFF_MAX_DEG + 1.0, _WINDOW_STEP_DEG):
@@ -36,7 +37,6 @@ def least_current_window_deg(magnetics: Any, phases: int, torque_Nm: float, curr
             share = _share(angle_deg - on_deg, stroke_deg, off_deg - on_deg - stroke_deg)
             place = share * (_SHARES - 1)
             low = np.minimum(place.astype(int), _SHARES - 2)
-            row = np.arange(len(angle_deg))
             current_A = share_A[row, low] + (place - low) * (share_A[row, low + 1] - share_A[row, low])
             square_A2 = float((current_A**2).mean())
             if square_A2 < best_A2:
