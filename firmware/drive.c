@@ -50,12 +50,17 @@ void drive_control_interrupt(drive_t *drive) {
     if (sample->missed_interrupts != 0) {
         drive->late_interrupts++; /* the previous one */
     }
+    sample->break_causes = hal_pwm_break(drive->hal);
+    sample->background_fault_mask = drive->background_fault_mask;
     hal_encoder_read(drive->hal, &sample->encoder);
     hal_adc_read(drive->hal, &sample->adc);
     if (control_step(&drive->control_parameters, &drive->control, sample, &drive->command, &drive->compare)) {
         hal_pwm_write(drive->hal, &drive->compare);
     } else {
         hal_pwm_open_all(drive->hal);
+        if (sample->break_causes != 0) {
+            hal_pwm_clear_break(drive->hal);
+        }
     }
     if (drive->control.deferred_request.skipped == 0) {
         hal_interrupt_request_deferred(drive->hal);
@@ -104,8 +109,37 @@ static void drop_stale_command(drive_t *drive, uint32_t time_us) {
     }
 }
 
+static stall_input_t stall_input(const drive_t *drive) {
+    const control_state_t *control = &drive->control;
+    const deferred_speed_results_t *speed = &deferred_in_effect(control)->speed;
+    return (stall_input_t){
+        .speed_mode = control->state_machine.state == DRIVE_STATE_RUN && control->deferred.mode == DRIVE_MODE_SPEED,
+        .speed_reference_q22 = speed->speed_reference_q22,
+        .speed_q22 = control->observer.speed_q22,
+        .torque_reference_q24 = control->torque_reference_q24,
+        .torque_min_q24 = speed->torque_min_q24,
+        .torque_max_q24 = speed->torque_max_q24,
+    };
+}
+
+/* Checks whose reaction may take longer than a few periods. */
+COLD static void check_slowly(drive_t *drive, uint32_t time_us) {
+    hal_critical_enter(drive->hal);
+    const stall_input_t stall = stall_input(drive);
+    hal_critical_leave(drive->hal);
+    uint64_t failed = 0;
+    if (sto_monitor_failed(&drive->sto, drive->sample.break_causes, time_us)) {
+        failed |= FAULT_BIT(FAULT_STO_DISCREPANCY);
+    }
+    if (stall_monitor_failed(&drive->stall, &stall, time_us)) {
+        failed |= FAULT_BIT(FAULT_STALL);
+    }
+    drive->background_fault_mask = (uint32_t)failed;
+}
+
 COLD void drive_background(drive_t *drive) {
     const uint32_t time_us = hal_time_us(drive->hal);
+    check_slowly(drive, time_us);
     if (comms_telemetry_due(&drive->comms, time_us)) {
         drive_telemetry_t values;
         hal_critical_enter(drive->hal);

@@ -9,6 +9,8 @@
 #include "drive/configure.h"
 #include "drive/control.h"
 #include "drive/parameters.h"
+#include "drive/stall_monitor.h"
+#include "drive/sto_monitor.h"
 #include "hal.h"
 
 /* One drive. The caller allocates it; only the functions below and telemetry_collect() access it. */
@@ -16,6 +18,7 @@ typedef struct {
     hal_t *hal;
     /* Written by the control interrupt; read by the background with the interrupts masked. */
     control_sample_t sample;
+    uint32_t background_fault_mask; /* checks of the background that fail, FAULT_BIT; written by the background */
     /* Last accepted command; this and the next are written by the background with the interrupts masked. */
     command_t command;
     control_parameters_t control_parameters;
@@ -35,6 +38,8 @@ typedef struct {
     uint32_t control_rate_hz;
     parameters_t parameters;
     uint32_t applied_revision; /* parameters.revision from which control_parameters are derived */
+    sto_monitor_t sto;
+    stall_monitor_t stall;
     comms_t comms;
 } drive_t;
 

@@ -38,7 +38,29 @@ void hal_pwm_start(hal_t *hal, uint16_t period_ticks);
 /* Buffers the compare values of the next period. [interrupt] */
 void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare);
 
-/* Opens every switch now, not at the next period, and clears the buffer (the timer's break input). [both] */
+/* Opens every switch now, not at the next period, and clears the buffer. [both] */
 void hal_pwm_open_all(hal_t *hal);
+
+/* Causes of a break. A break opens every switch without the firmware, within the response of the hardware, and keeps
+ * them open whatever is written:
+ *
+ *   over-current   a comparator in a gate driver, from the current in the switch, independent of the ADC
+ *   not renewed    the compare values of two periods in succession were not written (nor cleared by hal_pwm_open_all):
+ *                  the control interrupt is late, hangs or is no longer triggered; the values act in the first of the
+ *                  two periods again and not in the second
+ *   STO            a line of safe torque off is not energised
+ *
+ * All are latched. */
+#define HAL_PWM_BREAK_OVER_CURRENT 1u
+#define HAL_PWM_BREAK_NOT_RENEWED 2u
+#define HAL_PWM_BREAK_STO_1 4u
+#define HAL_PWM_BREAK_STO_2 8u
+
+/* Latched causes, HAL_PWM_BREAK_*; 0: none. [interrupt] */
+uint32_t hal_pwm_break(const hal_t *hal);
+
+/* Clears the causes that have gone; without a cause left, compare values act again. The caller has called
+ * hal_pwm_open_all before. [interrupt] */
+void hal_pwm_clear_break(hal_t *hal);
 
 #endif

@@ -69,6 +69,16 @@ void hal_pwm_open_all(hal_t *hal) {
     board_pwm_open_all(hal->board);
 }
 
+uint32_t hal_pwm_break(const hal_t *hal) {
+    require(hal, true, __func__);
+    return board_pwm_break(hal->board);
+}
+
+void hal_pwm_clear_break(hal_t *hal) {
+    require(hal, true, __func__);
+    board_pwm_clear_break(hal->board);
+}
+
 uint32_t hal_interrupt_missed_triggers(hal_t *hal) {
     require(hal, true, __func__);
     return board_missed_triggers(hal->board);

@@ -23,7 +23,8 @@ typedef struct {
     const magnetics_model_t *magnetics;
     double inertia_kg_m2, friction_Nm_s;
     double load_torque_Nm, supply_voltage_V;
-    bool held; /* the acceleration is imposed */
+    double trip_current_A; /* of the comparators; INFINITY: none */
+    bool held;             /* the acceleration is imposed */
     double held_acceleration_rad_s2;
     double ahead_rad; /* small angle in the direction of motion, see magnetics_kernel_trapezoid */
     bool link;        /* the DC link has a capacitor: its voltage is a state */

@@ -53,6 +53,7 @@ typedef struct {
     dc_link_t dc_link;
     sensor_errors_t sensors;
     sensor_ranges_t ranges;
+    double trip_current_A; /* of the comparators in the gate drivers */
 } machine_t;
 
 /* Machine of a program that is built for one; generated from the machine file. */

@@ -39,6 +39,8 @@ void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_r
     plant->bus_voltage_V = machine->supply_voltage_V;
     plant->minimum_pulse_ns = machine->converter.minimum_pulse_ns;
     plant->step_factor = 1.0;
+    plant->trip_current_A = INFINITY;
+    plant->trip_ns = UINT64_MAX;
     plant_set_gains(plant, &(plant_gains_t){1.0, 1.0, 1.0, 1.0});
     plant->phase_offset_rad = plant->magnetics.pitch_rad / machine->phases;
     /* Empty range: the first step computes it. */
@@ -112,6 +114,14 @@ void plant_open_all(plant_t *plant) {
     plant->edge_next = 0;
 }
 
+void plant_set_trip(plant_t *plant, double trip_current_A) {
+    plant->trip_current_A = trip_current_A;
+}
+
+void plant_clear_trip(plant_t *plant) {
+    plant->tripped = false;
+}
+
 /* --- One step --- */
 
 /* Lists the conducting phases and their devices. A phase without current that is not driven is omitted; its current is
@@ -165,6 +175,7 @@ static void find_setting(plant_t *plant, integrator_setting_t *setting) {
     setting->inertia_kg_m2 = plant->inertia_kg_m2;
     setting->friction_Nm_s = plant->friction_Nm_s;
     setting->load_torque_Nm = plant->load_torque_Nm;
+    setting->trip_current_A = plant->trip_ns == UINT64_MAX && !plant->tripped ? plant->trip_current_A : INFINITY;
     setting->held = plant->held;
     setting->held_acceleration_rad_s2 = plant->held_acceleration_rad_s2;
     setting->supply_voltage_V = plant->supply_voltage_V;
@@ -198,10 +209,23 @@ static thresholds_t thresholds_of(const integrator_setting_t *setting) {
     return thresholds;
 }
 
+/* Distance of a state from a comparator's response; negative: past it. */
+static double distance_to_trip(const integrator_setting_t *setting, const integrator_state_t *state) {
+    double nearest_A = INFINITY;
+    for (unsigned index = 0; index < setting->count; index++) {
+        const double distance_A = setting->trip_current_A - state->current_A[index];
+        if (setting->link_sign[index] >= 0.0 && distance_A < nearest_A) { /* a switch conducts */
+            nearest_A = distance_A;
+        }
+    }
+    return nearest_A;
+}
+
 /* Distance of a state from the next event: minimum of the currents that are not driven and of the distances between
- * DC-link voltage and thresholds (V and A with equal weight). Negative: past the event. */
+ * DC-link voltage and thresholds, and between currents and comparators (V and A with equal weight). Negative: past the
+ * event. */
 static double distance_to_event(const integrator_setting_t *setting, const integrator_state_t *state) {
-    double nearest = INFINITY;
+    double nearest = distance_to_trip(setting, state);
     for (unsigned index = 0; index < setting->count; index++) {
         if (!setting->driven[index] && state->current_A[index] < nearest) {
             nearest = state->current_A[index];
@@ -429,9 +453,12 @@ static void add_link_energies(plant_t *plant, const integrator_setting_t *settin
     }
 }
 
-/* Integrates from time_ns to `to_ns` with constant switch states. */
+/* Within this distance of its threshold a comparator responds. */
+#define TRIP_TOLERANCE_A 1e-6
+
+/* Integrates from time_ns to `to_ns` with constant switch states, or to the time at which a comparator opens them. */
 static void integrate(plant_t *plant, uint64_t to_ns) {
-    const double length_s = (double)(to_ns - plant->time_ns) * NS_S;
+    double length_s = (double)(to_ns - plant->time_ns) * NS_S;
     integrator_setting_t setting;
     integrator_state_t start, end;
     bool event = true;
@@ -468,8 +495,15 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
         for (unsigned index = 0; index < setting.count; index++) {
             plant->current_A[setting.phase[index]] = end.current_A[index];
         }
-        start = end;
         at_s += step_s;
+        if (event && distance_to_trip(&setting, &end) < TRIP_TOLERANCE_A) {
+            plant->trip_ns = plant->time_ns + (uint64_t)ceil(at_s / NS_S) + PLANT_TRIP_RESPONSE_NS;
+            if (plant->trip_ns < to_ns) {
+                to_ns = plant->trip_ns;
+                length_s = (double)(to_ns - plant->time_ns) * NS_S;
+            }
+        }
+        start = end;
     }
     plant->time_ns = to_ns;
 }
@@ -477,6 +511,11 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
 void plant_advance(plant_t *plant, uint64_t to_ns) {
     while (plant->time_ns < to_ns) {
         const half_bridge_pattern_t *pattern = &plant->pattern;
+        if (plant->trip_ns <= plant->time_ns) {
+            plant->trip_ns = UINT64_MAX;
+            plant->tripped = true;
+            plant_open_all(plant);
+        }
         while (plant->edge_next < pattern->count && pattern->edges[plant->edge_next].time_ns <= plant->time_ns) {
             plant->switches = pattern->edges[plant->edge_next++].switches;
         }
@@ -486,6 +525,9 @@ void plant_advance(plant_t *plant, uint64_t to_ns) {
         uint64_t until_ns = to_ns;
         if (plant->edge_next < pattern->count && pattern->edges[plant->edge_next].time_ns < to_ns) {
             until_ns = pattern->edges[plant->edge_next].time_ns;
+        }
+        if (plant->trip_ns < until_ns) {
+            until_ns = plant->trip_ns;
         }
         integrate(plant, until_ns);
     }

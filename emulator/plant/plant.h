@@ -22,9 +22,9 @@
  * series resistance of the capacitor; elasticity and static friction of the shaft.
  *
  * Integration: integrator.h, for currents, speed, angle and DC-link voltage together. Steps end at every switching edge
- * (whole nanoseconds), at the times at which a diode, the supply or the chopper starts or stops conducting (located
- * within a picosecond) and where the magnetics are not smooth; plant_set_step_factor scales the other limits of their
- * length.
+ * (whole nanoseconds), at the times at which a diode, the supply or the chopper starts or stops conducting or a
+ * comparator responds (located within a picosecond) and where the magnetics are not smooth; plant_set_step_factor
+ * scales the other limits of their length.
  */
 #ifndef PLANT_PLANT_H
 #define PLANT_PLANT_H
@@ -37,6 +37,9 @@
 #include "plant/half_bridge.h"
 #include "plant/machine.h"
 #include "plant/magnetics.h"
+
+/* Response of comparator, filter and gate driver. */
+#define PLANT_TRIP_RESPONSE_NS 1000
 
 struct plant;
 typedef void (*plant_sample_t)(void *context, const struct plant *plant);
@@ -57,6 +60,7 @@ typedef struct plant {
     double current_A[HAL_PHASES_MAX];
     double bus_voltage_V;
     bool chopper_on;
+    bool tripped; /* the comparators have opened the switches since plant_clear_trip */
 
     /* Inputs; write at any time. The load torque acts from time_ns, the minimum pulse from the next plant_set_switches.
      */
@@ -94,6 +98,8 @@ typedef struct plant {
     half_bridge_switches_t switches;
     half_bridge_pattern_t pattern;
     unsigned edge_next;
+    double trip_current_A; /* plant_set_trip */
+    uint64_t trip_ns;      /* time at which the switches open, after a comparator's response; UINT64_MAX: none */
     plant_sample_t sample;
     void *sample_context;
     uint64_t sample_next_ns, sample_step_ns;
@@ -123,6 +129,14 @@ void plant_set_switches(plant_t *plant, const hal_pwm_compare_t *compare, uint16
 
 /* Opens all switches at time_ns and discards the pending edges. */
 void plant_open_all(plant_t *plant);
+
+/* Comparators of the gate drivers, from time_ns on: all switches open PLANT_TRIP_RESPONSE_NS after the current of a
+ * phase with a conducting switch exceeds trip_current_A, and `tripped` is set; plant_set_switches can close them again.
+ * INFINITY, after plant_init: none. */
+void plant_set_trip(plant_t *plant, double trip_current_A);
+
+/* Resets `tripped`; the comparators act again. */
+void plant_clear_trip(plant_t *plant);
 
 /* Advances to exactly to_ns; does nothing when that is not in the future. An advance that ends within a period splits a
  * step and thereby changes the last bits of all later results; plant_observe does not. */

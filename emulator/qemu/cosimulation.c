@@ -50,6 +50,7 @@ static void control_interrupt(void *context) {
     (void)context;
     hal_adc_read(&host, &mailbox->adc);
     hal_encoder_read(&host, &mailbox->encoder);
+    mailbox->break_causes = hal_pwm_break(&host);
     mailbox->missed_triggers += hal_interrupt_missed_triggers(&host);
     mailbox->elapsed_ticks = hal_interrupt_elapsed_ticks(&host);
     deliver_event(MAILBOX_INTERRUPT);
@@ -157,6 +158,9 @@ void cosimulation_serve(void) {
         break;
     case MAILBOX_PWM_OPEN_ALL:
         hal_pwm_open_all(&host);
+        break;
+    case MAILBOX_PWM_CLEAR_BREAK:
+        hal_pwm_clear_break(&host);
         break;
     case MAILBOX_CAN_RECEIVE:
         mailbox->accepted = hal_can_receive(&host, &mailbox->frame);

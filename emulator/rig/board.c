@@ -9,6 +9,54 @@ void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *b
     board->plant = plant;
     board->sensors = sensors;
     board->bus = bus;
+    board->sto_energised[0] = board->sto_energised[1] = true;
+    plant_set_trip(plant, plant->machine->trip_current_A);
+}
+
+/* --- Gate path: acts without the firmware --- */
+
+/* Periods in succession whose compare values are not renewed before the switches open. */
+#define PERIODS_UNRENEWED_MAX 2
+
+static void apply_break(board_t *board, uint32_t causes) {
+    board->break_causes |= causes;
+    plant_open_all(board->plant);
+}
+
+void board_set_sto(board_t *board, unsigned line, bool energised) {
+    board->sto_energised[line] = energised;
+    if (!energised) {
+        apply_break(board, line == 0 ? HAL_PWM_BREAK_STO_1 : HAL_PWM_BREAK_STO_2);
+    }
+}
+
+uint32_t board_pwm_break(const board_t *board) {
+    return board->break_causes | (board->plant->tripped ? HAL_PWM_BREAK_OVER_CURRENT : 0u);
+}
+
+void board_pwm_clear_break(board_t *board) {
+    plant_clear_trip(board->plant);
+    board->break_causes =
+        (board->sto_energised[0] ? 0u : HAL_PWM_BREAK_STO_1) | (board->sto_energised[1] ? 0u : HAL_PWM_BREAK_STO_2);
+}
+
+/* Start of a period: compare values that were not renewed twice in succession, or a break, open the switches. */
+static void drive_gates(board_t *board, bool busy) {
+    /* What an interrupt that still runs has written counts at its end. */
+    if (busy || !board->renewed) {
+        board->periods_unrenewed++;
+    } else {
+        board->periods_unrenewed = 0;
+        board->renewed = false;
+    }
+    if (board->periods_unrenewed == PERIODS_UNRENEWED_MAX) {
+        apply_break(board, HAL_PWM_BREAK_NOT_RENEWED);
+    }
+    if (board_pwm_break(board) == 0) {
+        plant_set_switches(board->plant, &board->active, board->period_ticks);
+    } else {
+        plant_open_all(board->plant);
+    }
 }
 
 void board_start_period(board_t *board, bool busy) {
@@ -21,7 +69,7 @@ void board_start_period(board_t *board, bool busy) {
         board->encoder = encoder;
         board->active = board->buffered;
     }
-    plant_set_switches(board->plant, &board->active, board->period_ticks);
+    drive_gates(board, busy);
 }
 
 void board_deliver(board_t *board, const hal_can_frame_t *frame) {
@@ -38,7 +86,8 @@ void board_pwm_start(board_t *board, uint16_t period_ticks) {
 
 void board_pwm_write(board_t *board, const hal_pwm_compare_t *compare) {
     board->buffered = *compare;
-    if (board->immediate_pwm) {
+    board->renewed = true;
+    if (board->immediate_pwm && board_pwm_break(board) == 0) {
         board->active = *compare;
         plant_set_switches(board->plant, compare, board->period_ticks);
     }
@@ -47,6 +96,7 @@ void board_pwm_write(board_t *board, const hal_pwm_compare_t *compare) {
 void board_pwm_open_all(board_t *board) {
     memset(&board->active, 0, sizeof board->active);
     memset(&board->buffered, 0, sizeof board->buffered);
+    board->renewed = true;
     plant_open_all(board->plant);
 }
 

@@ -16,6 +16,8 @@
 #include "plant/sensors.h"
 #include "rig/can_bus.h"
 
+#define BOARD_STO_LINES 2
+
 /* Context in which the firmware is called. */
 typedef enum { BOARD_START, BOARD_INTERRUPT, BOARD_DEFERRED, BOARD_BACKGROUND } board_context_t;
 
@@ -34,6 +36,10 @@ typedef struct {
     bool immediate_pwm;    /* setting, see board_pwm_write; false after board_init */
     hal_pwm_compare_t active, buffered;
     uint32_t missed_triggers;   /* since last read */
+    bool renewed;               /* compare values were written or cleared since the start of the period */
+    uint32_t periods_unrenewed; /* in succession, up to the start of the present one */
+    uint32_t break_causes;      /* latched, HAL_PWM_BREAK_*; that of the comparators is plant.tripped */
+    bool sto_energised[BOARD_STO_LINES];
     uint64_t interrupt_took_ns; /* execution time of the present control interrupt, from its trigger on: set by the rig,
                                    overwritten before its end by a port with instruction timing */
 
@@ -46,7 +52,8 @@ typedef struct {
     can_bus_t *bus;
 } board_t;
 
-/* Initialises a board after reset at time 0: timer stopped, switches open, queues empty, resolutions of `sensors`.
+/* Initialises a board after reset at time 0: timer stopped, switches open, safe torque off not requested, queues empty,
+ * resolutions of `sensors`, comparators of the machine.
  * Plant, sensors and bus are used, not owned. */
 void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus);
 
@@ -54,6 +61,10 @@ void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *b
  * values. While the interrupt is still running (`busy`), the trigger is missed and counted, and the values that the
  * interrupt reads are unchanged. */
 void board_start_period(board_t *board, bool busy);
+
+/* For the rig: energises a line of safe torque off, or not, at the time of the plant; without both every switch is
+ * open. line < BOARD_STO_LINES. */
+void board_set_sto(board_t *board, unsigned line, bool energised);
 
 /* For the rig: delivers a complete frame of another node. */
 void board_deliver(board_t *board, const hal_can_frame_t *frame);
@@ -64,6 +75,8 @@ void board_deliver(board_t *board, const hal_can_frame_t *frame);
 void board_pwm_start(board_t *board, uint16_t period_ticks);
 void board_pwm_write(board_t *board, const hal_pwm_compare_t *compare);
 void board_pwm_open_all(board_t *board);
+uint32_t board_pwm_break(const board_t *board);
+void board_pwm_clear_break(board_t *board);
 uint32_t board_missed_triggers(board_t *board);
 bool board_can_receive(board_t *board, hal_can_frame_t *frame);
 bool board_can_transmit(board_t *board, const hal_can_frame_t *frame);

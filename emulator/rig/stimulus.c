@@ -32,6 +32,16 @@ static void set_encoder_fault(rig_t *rig, double fault) {
     rig->sensors.encoder_fault = (sensors_encoder_fault_t)fault;
 }
 
+static void set_sto_1(rig_t *rig, double torque_off) {
+    plant_advance(&rig->plant, rig->board.time_ns);
+    board_set_sto(&rig->board, 0, torque_off == 0.0);
+}
+
+static void set_sto_2(rig_t *rig, double torque_off) {
+    plant_advance(&rig->plant, rig->board.time_ns);
+    board_set_sto(&rig->board, 1, torque_off == 0.0);
+}
+
 static void set_interrupt_time(rig_t *rig, double time_us) {
     rig->interrupt_time_ns = (uint64_t)(time_us * (double)NS_PER_US + 0.5);
 }
@@ -71,6 +81,8 @@ static const target_t targets[BENCH_VARIABLE_COUNT] = {
     [BENCH_VARIABLE_LOAD_SINE_FREQUENCY_HZ] = {.set = load_set_sine_frequency},
     [BENCH_VARIABLE_LOAD_PROFILE_NM] = {.set = load_set_profile},
     [BENCH_VARIABLE_HELD_SPEED_RPM] = {.set = dynamometer_set_speed},
+    [BENCH_VARIABLE_STO_1] = {.set = set_sto_1},
+    [BENCH_VARIABLE_STO_2] = {.set = set_sto_2},
     [BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM] = {.set = load_set_torque},
     [BENCH_VARIABLE_LOAD_RAMP_COARSE_NM_S] = {.set = load_set_ramp},
     [BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM] = {.set = load_set_sine_amplitude},

@@ -33,6 +33,7 @@ static uint64_t protect(const control_parameters_t *parameters, control_state_t 
         .dc_link_voltage_q6 = measured->dc_link_voltage_q6,
         .encoder_angle = measured->encoder_angle,
         .missed_interrupts = sample->missed_interrupts,
+        .break_causes = sample->break_causes,
         .skipped_deferred = state->deferred_request.skipped,
     };
     return protection_check(&parameters->protection, &state->protection, &input);
@@ -47,7 +48,8 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
         start(state, measured);
     }
     observe(parameters, state, deferred, measured);
-    const uint64_t fault_mask = protect(parameters, state, sample, measured) | deferred->fault_mask;
+    const uint64_t fault_mask =
+        protect(parameters, state, sample, measured) | deferred->fault_mask | sample->background_fault_mask;
     const bool was_running = state->state_machine.state == DRIVE_STATE_RUN;
     const bool run = supervise(parameters, state, sample, command, measured, fault_mask);
     if (run) {

@@ -94,7 +94,9 @@ typedef struct {
 typedef struct {
     hal_adc_sample_t adc;
     hal_encoder_sample_t encoder;
-    uint32_t missed_interrupts; /* since the previous period */
+    uint32_t missed_interrupts;     /* since the previous period */
+    uint32_t break_causes;          /* HAL_PWM_BREAK_* */
+    uint32_t background_fault_mask; /* checks of the background that fail, FAULT_BIT */
     uint32_t time_us;
 } control_sample_t;
 

@@ -5,6 +5,7 @@
 
 #include "drive/fault.h"
 #include "fixed/fixed.h"
+#include "hal_pwm.h"
 
 /* An encoder that does not count is no evidence of a fault below this speed: 1 rad/s, of a fast machine up to 8 rad/s
  * (machine_tables.h), always less than 0.4 % of the range of speeds. */
@@ -38,12 +39,12 @@ static uint32_t count_overruns(protection_t *protection, uint32_t missed_interru
     return protection->overruns;
 }
 
-/* True when the angle changed by more than the rotor can turn, over the lost periods as well: of those no more than 15
- * count, which is beyond the overruns that are a fault. */
+/* True when the angle changed by more than the rotor can turn, over the lost periods as well. More lost periods are the
+ * fault interrupt_overrun, and what the rotor did meanwhile is no other. */
 static bool encoder_jumped(const protection_parameters_t *parameters, int32_t angle_step, uint32_t missed_interrupts) {
     const uint32_t step_max = (uint32_t)parameters->angle_step_max;
-    const uint32_t lost = (uint32_t)fixed_saturate_bits((int32_t)missed_interrupts, 5);
-    return (uint32_t)fixed_abs(angle_step) > step_max * lost + step_max;
+    return missed_interrupts < PROTECTION_OVERRUNS_MAX &&
+           (uint32_t)fixed_abs(angle_step) > step_max * missed_interrupts + step_max;
 }
 
 /* True when the encoder does not count although the rotor turns. The observer alone cannot detect that: with a high
@@ -83,6 +84,9 @@ uint64_t protection_check(const protection_parameters_t *parameters, protection_
     fail_if(&failed, input->dc_link_voltage_q6 > parameters->dc_link_over_voltage_q6, FAULT_OVER_VOLTAGE);
     fail_if(&failed, encoder_jumped(parameters, angle_step, missed), FAULT_ENCODER);
     fail_if(&failed, count_overruns(protection, missed) >= PROTECTION_OVERRUNS_MAX, FAULT_INTERRUPT_OVERRUN);
+    fail_if(&failed, (input->break_causes & HAL_PWM_BREAK_NOT_RENEWED) != 0, FAULT_INTERRUPT_OVERRUN);
+    fail_if(&failed, (input->break_causes & HAL_PWM_BREAK_OVER_CURRENT) != 0, FAULT_HARDWARE_OVER_CURRENT);
+    fail_if(&failed, (input->break_causes & (HAL_PWM_BREAK_STO_1 | HAL_PWM_BREAK_STO_2)) != 0, FAULT_STO);
     fail_if(&failed, input->skipped_deferred >= PROTECTION_SKIPPED_DEFERRED_MAX, FAULT_INTERRUPT_OVERRUN);
     return failed;
 }

@@ -1,7 +1,7 @@
 /* Fault detection, in every control period and state; the state machine decides which failed checks count and latches
  * the first fault. Speed and encoder are checked alike in both directions.
  *
- *   immediate checks    in the control interrupt: over-current, over-voltage, encoder jump, overruns
+ *   immediate checks    in the control interrupt: over-current, over-voltage, encoder jump, overruns, break of the PWM
  *   deferred checks     in the deferred interrupt: under-voltage, over-speed, frozen encoder, command timeout. They act
  * one period later, or later still when the deferred interrupt is late; a condition that has gone by then is not seen.
  */
@@ -40,6 +40,7 @@ typedef struct {
     int32_t dc_link_voltage_q6; /* V, Q9.6 */
     uint32_t encoder_angle;     /* start of the encoder count, 2^-32 rev */
     uint32_t missed_interrupts; /* triggers lost since the previous period */
+    uint32_t break_causes;      /* of a break of the PWM, HAL_PWM_BREAK_* */
     uint32_t skipped_deferred;  /* periods in succession without a deferred step, before this one */
 } protection_input_t;
 
@@ -55,6 +56,9 @@ typedef struct {
  * that trigger and every further one before its end: three such interrupts in succession are a fault, or one that lasts
  * three periods too long; the interrupt after them detects it. An interrupt that ends in time resets the count. */
 #define PROTECTION_OVERRUNS_MAX 3
+
+/* Two lost triggers in succession have already opened the switches (HAL_PWM_BREAK_NOT_RENEWED), which is the same
+ * fault; the count detects interrupts that are each a little too long. */
 
 /* Successive periods without a deferred step that are the same fault, because the deferred checks then do not run: 0.4
  * ms at 20 kHz, so that every deferred check acts within 1 ms or the drive is off. A few are no fault: the deferred

@@ -44,6 +44,15 @@ void hal_pwm_open_all(hal_t *hal) {
     doorbell_ring(MAILBOX_PWM_OPEN_ALL);
 }
 
+uint32_t hal_pwm_break(const hal_t *hal) {
+    return hal->mailbox.break_causes;
+}
+
+void hal_pwm_clear_break(hal_t *hal) {
+    (void)hal;
+    doorbell_ring(MAILBOX_PWM_CLEAR_BREAK);
+}
+
 uint32_t hal_interrupt_missed_triggers(hal_t *hal) {
     const uint32_t missed = hal->mailbox.missed_triggers;
     hal->mailbox.missed_triggers = 0;

@@ -21,7 +21,7 @@
 #include "hal_pwm.h"
 
 /* Changes with the structure, so that an image and a host with different layouts stop at the start. */
-#define MAILBOX_LAYOUT 3
+#define MAILBOX_LAYOUT 4
 
 /* Clock of the emulated PWM timer. */
 #define MAILBOX_PWM_CLOCK_HZ 200000000
@@ -36,6 +36,7 @@ typedef enum {
     MAILBOX_NEXT,        /* the drive is idle: time may run to the next event */
     MAILBOX_PWM_START,   /* period_ticks */
     MAILBOX_PWM_OPEN_ALL,
+    MAILBOX_PWM_CLEAR_BREAK,
     MAILBOX_CAN_RECEIVE,   /* returns frame and accepted: there was one */
     MAILBOX_CAN_TRANSMIT,  /* takes frame, returns accepted: a mailbox was free */
     MAILBOX_TRIGGER,       /* takes trigger, returns an event: MAILBOX_INTERRUPT or MAILBOX_EXIT */
@@ -67,6 +68,7 @@ typedef struct {
     hal_adc_sample_t adc;
     hal_encoder_sample_t encoder;
     uint32_t missed_triggers; /* the drive sets it to 0 */
+    uint32_t break_causes;    /* HAL_PWM_BREAK_* */
     /* Execution time of the control interrupt, set by the bench. `timed`: delay that the bench inserts before the
      * interrupt; the drive stores the execution time at the end. */
     uint32_t elapsed_ticks;

@@ -25,6 +25,7 @@ struct hal {
     uint32_t time_us = 0;
     uint32_t clock_hz = 200000000;
     uint32_t missed = 0;
+    uint32_t break_causes = 0, break_lasts = 0;
     uint32_t elapsed_ticks = 0;
     std::deque<hal_can_frame_t> to_drive;
     std::vector<hal_can_frame_t> from_drive;
@@ -76,6 +77,13 @@ void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare) {
 void hal_pwm_open_all(hal_t *hal) {
     hal->open = true;
     hal->opens++;
+}
+uint32_t hal_pwm_break(const hal_t *hal) {
+    return hal->break_causes;
+}
+void hal_pwm_clear_break(hal_t *hal) {
+    EXPECT_TRUE(hal->open) << "the switches are opened before a break is cleared";
+    hal->break_causes &= hal->break_lasts;
 }
 uint32_t hal_interrupt_missed_triggers(hal_t *hal) {
     const uint32_t missed = hal->missed;
@@ -231,6 +239,38 @@ TEST_F(Drive, lost_interrupts_reach_the_protection) {
     periods(1);
     EXPECT_TRUE(hal.open);
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
+}
+
+TEST_F(Drive, break_of_the_pwm_is_a_fault_that_lasts_as_long_as_its_cause) {
+    const struct {
+        uint32_t cause;
+        fault_t fault;
+    } breaks[] = {{HAL_PWM_BREAK_OVER_CURRENT, FAULT_HARDWARE_OVER_CURRENT},
+                  {HAL_PWM_BREAK_NOT_RENEWED, FAULT_INTERRUPT_OVERRUN},
+                  {HAL_PWM_BREAK_STO_1, FAULT_STO},
+                  {HAL_PWM_BREAK_STO_2, FAULT_STO}};
+    periods(100);
+    for (const auto &expected : breaks) {
+        command(COMMAND_OFF);
+        periods(3);
+        command(COMMAND_RUN);
+        periods(3);
+        ASSERT_FALSE(hal.open);
+        hal.break_causes = hal.break_lasts = expected.cause;
+        periods(1);
+        EXPECT_TRUE(hal.open);
+        EXPECT_EQ(drive.control.state_machine.record.fault, expected.fault);
+        EXPECT_EQ(drive.control.state_machine.record.fault_mask, FAULT_BIT(expected.fault));
+        command(COMMAND_CLEAR_FAULT);
+        periods(3);
+        EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+        hal.break_lasts = 0;
+        command(COMMAND_OFF);
+        periods(3);
+        command(COMMAND_CLEAR_FAULT);
+        periods(3);
+        EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    }
 }
 
 TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {

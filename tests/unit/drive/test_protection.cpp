@@ -9,6 +9,7 @@
 extern "C" {
 #include "drive/fault.h"
 #include "drive/protection.h"
+#include "hal_pwm.h"
 }
 
 namespace {
@@ -32,7 +33,7 @@ const protection_parameters_t PARAMETERS = {
 struct input_t {
     int32_t current_max_q9, dc_link_voltage_q6, speed_q22;
     uint32_t encoder_angle, missed_interrupts, command_age_us;
-    uint32_t skipped_deferred = 0, periods = 1;
+    uint32_t skipped_deferred = 0, periods = 1, break_causes = 0;
 };
 
 struct checks_t {
@@ -50,6 +51,7 @@ struct checks_t {
             .dc_link_voltage_q6 = input.dc_link_voltage_q6,
             .encoder_angle = input.encoder_angle,
             .missed_interrupts = input.missed_interrupts,
+            .break_causes = input.break_causes,
             .skipped_deferred = input.skipped_deferred,
         };
         return protection_check(&PARAMETERS, &immediate, &values);
@@ -94,9 +96,10 @@ TEST_F(Protection, voltage_speed_and_command_are_checked_in_the_deferred_step_an
     input.speed_q22 = 400 << 22;
     input.encoder_angle += 1u << 30;
     input.command_age_us = UINT32_MAX;
-    input.missed_interrupts = 3;
+    input.break_causes = HAL_PWM_BREAK_NOT_RENEWED | HAL_PWM_BREAK_OVER_CURRENT | HAL_PWM_BREAK_STO_1;
     EXPECT_EQ(checks.check_immediate(input), FAULT_BIT(FAULT_OVER_CURRENT) | FAULT_BIT(FAULT_OVER_VOLTAGE) |
-                                                 FAULT_BIT(FAULT_ENCODER) | FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
+                                                 FAULT_BIT(FAULT_ENCODER) | FAULT_BIT(FAULT_INTERRUPT_OVERRUN) |
+                                                 FAULT_BIT(FAULT_HARDWARE_OVER_CURRENT) | FAULT_BIT(FAULT_STO));
     EXPECT_EQ(checks.check_deferred(input), FAULT_BIT(FAULT_OVER_SPEED) | FAULT_BIT(FAULT_COMMAND_TIMEOUT));
     input.dc_link_voltage_q6 = 140 << 6;
     input.encoder_angle++; // not a frozen encoder
@@ -349,6 +352,16 @@ TEST_F(Protection, three_consecutive_lost_interrupts_are_an_overrun_and_a_period
     EXPECT_EQ(check(missed), FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
 }
 
+TEST_F(Protection, a_jump_of_the_encoder_over_lost_interrupts_that_are_a_fault_is_no_fault_of_the_encoder) {
+    for (const uint32_t missed : {3u, 15u, 400u, UINT32_MAX}) {
+        checks.reset(healthy.encoder_angle);
+        input_t input = healthy;
+        input.missed_interrupts = missed;
+        input.encoder_angle += 1u << 30;
+        EXPECT_EQ(check(input), FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
+    }
+}
+
 TEST_F(Protection, every_combination_of_failed_checks_is_reported) {
     for (unsigned mask = 0; mask < 64; mask++) {
         checks.reset(healthy.encoder_angle);
@@ -378,7 +391,7 @@ TEST_F(Protection, every_combination_of_failed_checks_is_reported) {
             input.command_age_us = UINT32_MAX;
         }
         if (fails(5, FAULT_INTERRUPT_OVERRUN)) {
-            input.missed_interrupts = 5;
+            input.break_causes = HAL_PWM_BREAK_NOT_RENEWED;
         }
         EXPECT_EQ(check(input), expected) << mask;
     }

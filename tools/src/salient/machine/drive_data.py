@@ -86,6 +86,12 @@ class DriveData:
         return self.parameters["current_trip_A"]
 
     @property
+    def comparator_trip_A(self) -> float:
+        """Threshold of the comparators in the gate drivers: above every current that the sampled trip lets pass on a
+        healthy machine."""
+        return 1.1 * self.current_trip_A
+
+    @property
     def over_speed_rpm(self) -> float:
         return self.parameters["over_speed_rpm"]
 

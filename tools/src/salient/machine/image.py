@@ -215,6 +215,7 @@ PLANT = Structure("machine_t", (
     *_doubles("sensors", Sensors.model_fields, lambda machine, scaling: machine.sensors),
     *_doubles("ranges", ("current_A", "dc_link_V", "load_torque_Nm"),
               lambda machine, scaling: scaling.sensor_ranges()),
+    Member("trip_current_A", "double", lambda machine, scaling: scaling.data.comparator_trip_A),
 ))  # fmt: skip
 """Of a Machine and its Scaling: emulator/plant/machine.h, without the name and the flux map, parts of their own."""
 

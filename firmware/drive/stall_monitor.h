@@ -1,0 +1,35 @@
+/* Stalled rotor: in speed mode, no change of the speed with the torque at its limit.
+ *
+ * The rotor turns slower than at half of the reference, in either direction, the torque reference is within a sixteenth
+ * of its limit in the direction of the speed reference, and in STALL_TIME_US the speed error has become neither smaller
+ * nor larger than before by a 128th of the reference: a rotor that swings about a point is stalled, one that a larger
+ * load drives backwards faster and faster leads to over-speed instead. A start that takes up to 12 s from standstill to
+ * the reference is none. A reference of 0 is held as long as the currents can be.
+ */
+#ifndef DRIVE_STALL_MONITOR_H
+#define DRIVE_STALL_MONITOR_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#define STALL_TIME_US 100000u
+
+typedef struct {
+    bool speed_mode;              /* state RUN, speed mode */
+    int32_t speed_reference_q22;  /* after the ramp, rad/s, Q9.22 */
+    int32_t speed_q22;            /* rad/s, Q9.22 */
+    int32_t torque_reference_q24; /* N m, Q7.24 */
+    int32_t torque_min_q24;       /* limits of the torque reference, N m, Q7.24 */
+    int32_t torque_max_q24;
+} stall_input_t;
+
+typedef struct {
+    uint32_t changed_us;                     /* when the error last left its range, or there was none */
+    int32_t error_least_q22, error_most_q22; /* range of the speed error's magnitude, rad/s, Q9.22 */
+    bool vain;                               /* torque and speed of a stall at the last call */
+} stall_monitor_t;
+
+/* True when the rotor has been stalled for STALL_TIME_US at time_us. [background] */
+bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us);
+
+#endif

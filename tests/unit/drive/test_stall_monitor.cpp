@@ -1,0 +1,99 @@
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "drive/stall_monitor.h"
+}
+
+namespace {
+
+constexpr uint32_t START_US = UINT32_MAX - 50000; // the clock wraps during the tests
+constexpr int32_t RAD_S = 1 << 22, NM = 1 << 24;
+
+class Stall : public testing::Test {
+  protected:
+    // Time from the first input to the fault, or 0 when there is none in `length_us`; one input each millisecond.
+    template <typename Change> uint32_t time_to_fault_us(uint32_t length_us, Change change) {
+        stall_monitor_t monitor = {};
+        const stall_input_t off = {};
+        EXPECT_FALSE(stall_monitor_failed(&monitor, &off, START_US - 1000));
+        for (uint32_t us = 0; us <= length_us; us += 1000) {
+            change(us);
+            if (stall_monitor_failed(&monitor, &input, START_US + us)) {
+                return us;
+            }
+        }
+        return 0;
+    }
+    uint32_t time_to_fault_us() {
+        return time_to_fault_us(1000000, [](uint32_t) {});
+    }
+
+    stall_input_t input = {
+        .speed_mode = true,
+        .speed_reference_q22 = 60 * RAD_S,
+        .speed_q22 = 0,
+        .torque_reference_q24 = 19 * NM,
+        .torque_min_q24 = -19 * NM,
+        .torque_max_q24 = 19 * NM,
+    };
+};
+
+TEST_F(Stall, rotor_at_standstill_is_stalled_after_100_ms_in_both_directions) {
+    EXPECT_EQ(time_to_fault_us(), 101000u);
+    input.speed_reference_q22 = -60 * RAD_S;
+    input.torque_reference_q24 = -19 * NM;
+    EXPECT_EQ(time_to_fault_us(), 101000u);
+}
+
+TEST_F(Stall, rotor_that_the_load_turns_the_other_way_is_stalled) {
+    input.speed_q22 = -20 * RAD_S;
+    EXPECT_EQ(time_to_fault_us(), 101000u);
+}
+
+TEST_F(Stall, rotor_that_the_load_drives_backwards_faster_and_faster_is_not_stalled) {
+    EXPECT_EQ(time_to_fault_us(
+                  1000000,
+                  [this](uint32_t us) { input.speed_q22 = -static_cast<int32_t>(int64_t{20} * RAD_S * us / 1000000); }),
+              0u);
+}
+
+TEST_F(Stall, rotor_that_swings_without_progress_is_stalled) {
+    EXPECT_NEAR(time_to_fault_us(
+                    1000000, [this](uint32_t us) { input.speed_q22 = us / 1000 % 20 < 10 ? 3 * RAD_S : -3 * RAD_S; }),
+                101000, 20000);
+}
+
+TEST_F(Stall, start_of_12_s_is_none) {
+    EXPECT_EQ(time_to_fault_us(
+                  12000000,
+                  [this](uint32_t us) { input.speed_q22 = static_cast<int32_t>(int64_t{60} * RAD_S * us / 12000000); }),
+              0u);
+}
+
+TEST_F(Stall, without_the_torque_at_its_limit_or_a_large_error_or_a_reference_there_is_none) {
+    input.torque_reference_q24 = 17 * NM;
+    EXPECT_EQ(time_to_fault_us(), 0u);
+    input.torque_reference_q24 = -19 * NM; // against the error
+    EXPECT_EQ(time_to_fault_us(), 0u);
+    input.torque_reference_q24 = 19 * NM;
+    input.speed_q22 = 30 * RAD_S;
+    EXPECT_EQ(time_to_fault_us(), 0u);
+    input.speed_q22 = -30 * RAD_S;
+    input.speed_reference_q22 = 0;
+    EXPECT_EQ(time_to_fault_us(), 0u);
+}
+
+TEST_F(Stall, outside_speed_mode_there_is_none) {
+    input.speed_mode = false;
+    EXPECT_EQ(time_to_fault_us(), 0u);
+}
+
+TEST_F(Stall, extremes_saturate) {
+    input.speed_reference_q22 = INT32_MIN;
+    input.torque_reference_q24 = input.torque_min_q24 = INT32_MIN;
+    EXPECT_EQ(time_to_fault_us(), 101000u);
+    input.speed_q22 = INT32_MAX; // over-speed
+    EXPECT_EQ(time_to_fault_us(), 0u);
+}
+
+} // namespace
