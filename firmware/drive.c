@@ -51,7 +51,6 @@ void drive_control_interrupt(drive_t *drive) {
         drive->late_interrupts++; /* the previous one */
     }
     sample->break_causes = hal_pwm_break(drive->hal);
-    sample->background_fault_mask = drive->background_fault_mask;
     hal_encoder_read(drive->hal, &sample->encoder);
     hal_adc_read(drive->hal, &sample->adc);
     if (control_step(&drive->control_parameters, &drive->control, sample, &drive->command, &drive->compare)) {
@@ -134,13 +133,30 @@ COLD static void check_slowly(drive_t *drive, uint32_t time_us) {
     if (stall_monitor_failed(&drive->stall, &stall, time_us)) {
         failed |= FAULT_BIT(FAULT_STALL);
     }
-    drive->background_fault_mask = (uint32_t)failed;
+    if (drive->comms.bus.conflict) {
+        failed |= FAULT_BIT(FAULT_IDENTIFIER_CONFLICT);
+    }
+    drive->control.reported_fault_mask = (uint32_t)failed;
+}
+
+/* After bus-off a run request is without effect until the sender has withdrawn it: the present command ages until its
+ * timeout, and a sender that simply continues does not start the drive again. */
+COLD static void take_command(drive_t *drive) {
+    const command_t *command = &drive->comms.command;
+    bus_monitor_t *bus = &drive->comms.bus;
+    bus->run_inhibited = bus->run_inhibited && command->request == COMMAND_RUN;
+    if (!bus->run_inhibited) {
+        hal_critical_enter(drive->hal);
+        drive->command = *command;
+        hal_critical_leave(drive->hal);
+    }
 }
 
 COLD void drive_background(drive_t *drive) {
     const uint32_t time_us = hal_time_us(drive->hal);
     check_slowly(drive, time_us);
     if (comms_telemetry_due(&drive->comms, time_us)) {
+        bus_monitor_step(&drive->comms.bus, drive->hal, time_us);
         drive_telemetry_t values;
         hal_critical_enter(drive->hal);
         telemetry_collect(drive, time_us, &values);
@@ -150,9 +166,7 @@ COLD void drive_background(drive_t *drive) {
     /* Enumerations are read in one access: the interrupt may change the state, not tear it. */
     const bool writable = drive->control.state_machine.state != DRIVE_STATE_RUN;
     if (comms_background(&drive->comms, drive->hal, &drive->parameters, writable, time_us)) {
-        hal_critical_enter(drive->hal);
-        drive->command = drive->comms.command;
-        hal_critical_leave(drive->hal);
+        take_command(drive);
     }
     drop_stale_command(drive, time_us);
     if (drive->parameters.revision != drive->applied_revision) {

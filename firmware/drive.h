@@ -18,7 +18,6 @@ typedef struct {
     hal_t *hal;
     /* Written by the control interrupt; read by the background with the interrupts masked. */
     control_sample_t sample;
-    uint32_t background_fault_mask; /* checks of the background that fail, FAULT_BIT; written by the background */
     /* Last accepted command; this and the next are written by the background with the interrupts masked. */
     command_t command;
     control_parameters_t control_parameters;

@@ -33,6 +33,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     const control_measurement_t *measured = &control->measurement;
     const fault_record_t *record = &control->state_machine.record;
     const commands_counters_t *counters = &drive->comms.commands.counters;
+    const bus_monitor_t *bus = &drive->comms.bus;
     const bool run = control->state_machine.state == DRIVE_STATE_RUN;
     const bool salient = run && parameters->controller == DRIVE_CONTROLLER_SALIENT;
 
@@ -90,6 +91,12 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->bus_counters.unknown_frame = counters->unknown_frame;
     telemetry->bus_counters.receive_overflow = hal_can_receive_overflows(drive->hal);
     telemetry->bus_counters.command_accepted = counters->accepted;
+
+    telemetry->bus_state.bus_state = bus->status.state;
+    telemetry->bus_state.receive_error_counter = bus->status.receive_errors;
+    telemetry->bus_state.transmit_error_counter = bus->status.transmit_errors;
+    telemetry->bus_state.bus_off_count = bus->bus_off_count;
+    telemetry->bus_state.foreign_identifier_count = bus->foreign_count;
 
     telemetry->processor.used_us = processor_time(drive, drive->used_ticks);
     telemetry->processor.worst_us = processor_time(drive, drive->worst_ticks);

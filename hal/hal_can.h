@@ -24,7 +24,25 @@ bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame);
 /* Frames lost because the receive queue was full, since start. [background] */
 uint32_t hal_can_receive_overflows(const hal_t *hal);
 
-/* Puts a frame into a free mailbox; false when all are taken. The lowest identifier leaves first. [background] */
+/* Puts a frame into a free mailbox; false when all are taken, or in bus-off. The lowest identifier leaves first.
+ * [background] */
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame);
+
+/* Error state (ISO 11898-1): passive above 127 of either counter, bus-off above 255 transmit errors. In bus-off nothing
+ * is received or transmitted, and frames in the mailboxes are lost. */
+typedef enum { HAL_CAN_ERROR_ACTIVE, HAL_CAN_ERROR_PASSIVE, HAL_CAN_BUS_OFF } hal_can_error_state_t;
+
+typedef struct {
+    hal_can_error_state_t state;
+    uint16_t transmit_errors; /* transmit error counter */
+    uint16_t receive_errors;  /* receive error counter */
+} hal_can_status_t;
+
+/* Present error state and counters. [background] */
+void hal_can_status(const hal_t *hal, hal_can_status_t *status);
+
+/* Requests to leave bus-off, which the controller does after 128 times 11 recessive bits, with counters of 0; it must
+ * not leave it without request. No effect in the other states. [background] */
+void hal_can_rejoin(hal_t *hal);
 
 #endif

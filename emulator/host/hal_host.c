@@ -112,6 +112,16 @@ bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     return board_can_transmit(hal->board, frame);
 }
 
+void hal_can_status(const hal_t *hal, hal_can_status_t *status) {
+    require(hal, false, __func__);
+    board_can_status(hal->board, status);
+}
+
+void hal_can_rejoin(hal_t *hal) {
+    require(hal, false, __func__);
+    board_can_rejoin(hal->board);
+}
+
 uint32_t hal_time_us(const hal_t *hal) {
     return (uint32_t)(hal->board->time_ns / 1000);
 }

@@ -198,6 +198,7 @@ int simulation_close(simulation_t *simulation) {
         !output_close(simulation->switches, SWITCHES_OPTION, simulation->options->record_switches)) {
         simulation->exit_code = EXIT_USAGE;
     }
+    rig_close(&simulation->rig);
     transport_close(simulation->rig.config.transport);
     machine_image_close(&simulation->image);
     return simulation->exit_code;

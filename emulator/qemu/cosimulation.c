@@ -43,6 +43,11 @@ static void deliver_event(mailbox_event_t event) {
     mailbox->time_us = hal_time_us(&host);
     mailbox->receive_waiting = board->received_pushed - board->received_popped;
     mailbox->receive_overflows = board->receive_overflows;
+    hal_can_status_t status;
+    board_can_status(board, &status);
+    mailbox->can_error_state = status.state;
+    mailbox->transmit_errors = status.transmit_errors;
+    mailbox->receive_errors = status.receive_errors;
     resume_drive();
 }
 
@@ -165,6 +170,9 @@ void cosimulation_serve(void) {
     case MAILBOX_CAN_RECEIVE:
         mailbox->accepted = hal_can_receive(&host, &mailbox->frame);
         --mailbox->receive_waiting;
+        break;
+    case MAILBOX_CAN_REJOIN:
+        hal_can_rejoin(&host);
         break;
     case MAILBOX_CAN_TRANSMIT:
         mailbox->accepted = hal_can_transmit(&host, &mailbox->frame);

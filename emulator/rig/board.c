@@ -117,3 +117,18 @@ bool board_can_receive(board_t *board, hal_can_frame_t *frame) {
 bool board_can_transmit(board_t *board, const hal_can_frame_t *frame) {
     return can_bus_transmit(board->bus, frame);
 }
+
+void board_can_status(const board_t *board, hal_can_status_t *status) {
+    const can_node_t *node = &board->bus->drive;
+    *status = (hal_can_status_t){
+        .state = node->bus_off               ? HAL_CAN_BUS_OFF
+                 : can_node_is_passive(node) ? HAL_CAN_ERROR_PASSIVE
+                                             : HAL_CAN_ERROR_ACTIVE,
+        .transmit_errors = (uint16_t)node->transmit_errors,
+        .receive_errors = (uint16_t)node->receive_errors,
+    };
+}
+
+void board_can_rejoin(board_t *board) {
+    can_bus_rejoin(board->bus, board->time_ns);
+}

@@ -80,5 +80,7 @@ void board_pwm_clear_break(board_t *board);
 uint32_t board_missed_triggers(board_t *board);
 bool board_can_receive(board_t *board, hal_can_frame_t *frame);
 bool board_can_transmit(board_t *board, const hal_can_frame_t *frame);
+void board_can_status(const board_t *board, hal_can_status_t *status);
+void board_can_rejoin(board_t *board);
 
 #endif

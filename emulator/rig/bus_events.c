@@ -19,9 +19,13 @@ void bus_event(void *context, uint64_t now_ns) {
     }
     transport_frame_t frame;
     transport_frame_from_hal(&delivery.frame, &frame);
-    transport_send(rig->config.transport, now_ns,
-                   delivery.from_drive ? TRANSPORT_FROM_EMULATOR : TRANSPORT_FROM_CLIENT_ON_BUS, &frame);
-    if (!delivery.from_drive) {
+    if (delivery.to_clients) {
+        transport_send(rig->config.transport, now_ns,
+                       delivery.from_client ? TRANSPORT_FROM_CLIENT_ON_BUS
+                                            : (delivery.from_drive ? TRANSPORT_FROM_EMULATOR : TRANSPORT_FROM_OTHER),
+                       &frame);
+    }
+    if (delivery.to_drive) {
         board_deliver(&rig->board, &delivery.frame);
     }
 }

@@ -6,7 +6,8 @@
 
 #include "rig/rig.h"
 
-/* Starts the bus when a frame was queued while it was idle. Required after everything that may queue frames. */
+/* Starts the bus when a frame was queued while it was idle. Required, before time runs on, after
+ * everything that may queue frames. */
 void bus_start(rig_t *rig);
 
 /* Handlers of EVENT_CAN and EVENT_TRUTH; context is the rig. */

@@ -1,127 +1,551 @@
 #include "rig/can_bus.h"
 
+#include <stdlib.h>
 #include <string.h>
 
-#define NS_PER_S UINT64_C(1000000000)
+#include "rig/can_wire.h"
 
-/* Arbitration field as transmitted, first bit highest; the lowest value wins. Standard: identifier, RTR, IDE 0;
- * extended: base identifier, SRR 1, IDE 1, extension, RTR. */
-static uint32_t arbitration_field(const hal_can_frame_t *frame) {
-    uint32_t remote = frame->remote;
-    if (!frame->extended) {
-        return (frame->identifier & 0x7FFu) << 21 | remote << 20;
-    }
-    return (frame->identifier >> 18 & 0x7FFu) << 21 | UINT32_C(3) << 19 | (frame->identifier & 0x3FFFFu) << 1 | remote;
-}
+#define NS_PER_S UINT64_C(1000000000)
+#define SUSPEND_BITS 8 /* of an error-passive transmitter, after the interframe space */
+#define RECESSIVE_SEQUENCE_BITS 11
+#define CRC_MARGIN_BITS 6 /* a disturbed bit is not among the last of the CRC: its error flag ends in stuffed bits */
 
 /* End of the bit `bits` after `start_ns`. */
-static uint64_t bits_later(const can_bus_t *bus, uint64_t start_ns, unsigned bits) {
+static uint64_t bits_later(const can_bus_t *bus, uint64_t start_ns, uint64_t bits) {
     return start_ns + bits * NS_PER_S / bus->bit_rate;
 }
 
-void can_bus_init(can_bus_t *bus, uint32_t bit_rate) {
-    memset(bus, 0, offsetof(can_bus_t, client_queue));
-    bus->client_pushed = bus->client_popped = 0;
+static uint64_t bits_between(const can_bus_t *bus, uint64_t from_ns, uint64_t to_ns) {
+    return ((to_ns - from_ns) * bus->bit_rate + NS_PER_S / 2) / NS_PER_S;
+}
+
+static uint64_t earlier(uint64_t a, uint64_t b) {
+    return a < b ? a : b;
+}
+
+static uint64_t later(uint64_t a, uint64_t b) {
+    return a > b ? a : b;
+}
+
+void can_bus_init(can_bus_t *bus, uint32_t bit_rate, uint64_t seed) {
+    memset(bus, 0, sizeof *bus);
     can_length_init(&bus->lengths);
     bus->bit_rate = bit_rate;
-    bus->next_event_ns = CAN_BUS_NEVER;
+    bus->next_event_ns = bus->shared.next_event_ns = bus->alone.next_event_ns = CAN_BUS_NEVER;
+    can_faults_init(&bus->faults, seed);
+    can_node_init(&bus->drive);
+    can_node_init(&bus->babbler);
+    bus->babble.length = 8;
+}
+
+void can_bus_close(can_bus_t *bus) {
+    for (unsigned i = 0; i < bus->client_count; ++i) {
+        can_node_close(&bus->clients[i]->node);
+        free(bus->clients[i]);
+    }
+    free(bus->clients);
+    bus->clients = NULL;
+    bus->client_count = bus->client_capacity = 0;
+}
+
+static can_line_t *drive_line(can_bus_t *bus) {
+    return bus->disconnected ? &bus->alone : &bus->shared;
+}
+
+/* A change on an idle line: its next event is to be found anew. */
+static void request_start(can_bus_t *bus, const can_line_t *line) {
+    bus->start_requested = bus->start_requested || line->state == CAN_LINE_IDLE;
 }
 
 bool can_bus_transmit(can_bus_t *bus, const hal_can_frame_t *frame) {
+    if (bus->drive.bus_off || !can_node_transmit(&bus->drive, HAL_CAN_MAILBOXES, frame)) {
+        return false;
+    }
+    request_start(bus, drive_line(bus));
+    return true;
+}
+
+void can_bus_rejoin(can_bus_t *bus, uint64_t now_ns) {
+    can_node_rejoin(&bus->drive, now_ns);
+    request_start(bus, drive_line(bus));
+}
+
+static can_bus_client_t *find_client(const can_bus_t *bus, uint32_t number) {
+    for (unsigned i = 0; i < bus->client_count; ++i) {
+        if (bus->clients[i]->number == number) {
+            return bus->clients[i];
+        }
+    }
+    return NULL;
+}
+
+static can_bus_client_t *add_client(can_bus_t *bus, uint32_t number) {
+    if (bus->client_count == bus->client_capacity) {
+        const unsigned capacity = bus->client_capacity ? 2 * bus->client_capacity : 8;
+        can_bus_client_t **clients = realloc(bus->clients, capacity * sizeof(void *));
+        if (!clients) {
+            return NULL;
+        }
+        bus->clients = clients;
+        bus->client_capacity = capacity;
+    }
+    can_bus_client_t *client = malloc(sizeof *client);
+    if (client) {
+        can_node_init(&client->node);
+        client->number = number;
+        bus->clients[bus->client_count++] = client;
+    }
+    return client;
+}
+
+size_t can_bus_client_backlog(const can_bus_t *bus, uint32_t number) {
+    const can_bus_client_t *client = find_client(bus, number);
+    return client ? can_node_backlog(&client->node) : 0;
+}
+
+bool can_bus_push(can_bus_t *bus, uint32_t number, const hal_can_frame_t *frame) {
+    can_bus_client_t *client = find_client(bus, number);
+    if (!client) {
+        client = add_client(bus, number);
+    }
+    if (!client || !can_node_push(&client->node, frame)) {
+        return false;
+    }
+    request_start(bus, &bus->shared);
+    return true;
+}
+
+void can_bus_remove_clients(can_bus_t *bus, bool (*connected)(void *context, uint32_t client), void *context) {
+    unsigned kept = 0;
+    for (unsigned i = 0; i < bus->client_count; ++i) {
+        can_bus_client_t *client = bus->clients[i];
+        if (can_node_backlog(&client->node) > 0 || connected(context, client->number)) {
+            bus->clients[kept++] = client;
+        } else {
+            can_node_close(&client->node);
+            free(client);
+        }
+    }
+    bus->client_count = kept;
+}
+
+bool can_bus_has_client(const can_bus_t *bus, uint32_t number) {
+    return find_client(bus, number) != NULL;
+}
+
+/* Forced counters and connection of the drive, while no frame is under way on its line. True when it changes lines. */
+static bool apply_changes(can_bus_t *bus) {
+    if (drive_line(bus)->state != CAN_LINE_IDLE) {
+        return false;
+    }
+    if (bus->errors_set) {
+        can_node_set_transmit_errors(&bus->drive, bus->errors_to_set);
+        bus->errors_set = false;
+    }
+    const bool changes = bus->disconnected != bus->disconnect;
+    bus->disconnected = bus->disconnect;
+    return changes;
+}
+
+void can_bus_set_transmit_errors(can_bus_t *bus, unsigned errors) {
+    bus->errors_set = true;
+    bus->errors_to_set = errors;
+    apply_changes(bus);
+    bus->start_requested = true;
+}
+
+void can_bus_disconnect(can_bus_t *bus, bool disconnect) {
+    bus->disconnect = disconnect;
+    apply_changes(bus);
+    bus->start_requested = true;
+}
+
+static void fill_babbler(can_bus_t *bus, uint64_t not_before_ns) {
+    can_mailbox_t *mailbox = &bus->babbler.mailbox[0];
+    if (bus->babbler.bus_off || bus->babble.load <= 0 || mailbox->taken) {
+        return;
+    }
+    hal_can_frame_t frame = {.identifier = bus->babble.identifier, .length = bus->babble.length};
+    for (unsigned i = 0; i < frame.length && i < sizeof frame.data; ++i) {
+        frame.data[i] = (uint8_t)(bus->babbled >> (8 * i));
+    }
+    ++bus->babbled;
+    can_node_transmit(&bus->babbler, 1, &frame);
+    mailbox->not_before_ns = not_before_ns;
+}
+
+void can_bus_babble(can_bus_t *bus, uint64_t now_ns) {
+    const can_line_t *line = &bus->shared;
+    bool under_way = false;
+    for (unsigned i = 0; line->state != CAN_LINE_IDLE && i < line->transmitters; ++i) {
+        under_way = under_way || line->transmitter[i].node == &bus->babbler;
+    }
+    if (!under_way) {
+        bus->babbler.mailbox[0].taken = false;
+        fill_babbler(bus, now_ns);
+    }
+    request_start(bus, line);
+}
+
+/* Runs through the nodes of a line that may transmit. */
+#define FOR_EACH_NODE(bus, line, node)                                                                                 \
+    for (unsigned node##_index = 0; ((node) = node_of(bus, line, node##_index)) != NULL; ++node##_index)
+
+/* Nodes of a line by index: the drive, unless it is on the other line, then the others of the shared line; NULL after
+ * the last. */
+static can_node_t *node_of(can_bus_t *bus, const can_line_t *line, unsigned index) {
+    if (line == drive_line(bus)) {
+        if (index == 0) {
+            return &bus->drive;
+        }
+        --index;
+    }
+    if (line == &bus->alone) {
+        return NULL;
+    }
+    if (index == 0) {
+        return &bus->babbler;
+    }
+    return index - 1 < bus->client_count ? &bus->clients[index - 1]->node : NULL;
+}
+
+/* Draws the fault of a frame that is about to take part in arbitration for the first time. */
+static void draw_fault(can_bus_t *bus, const can_node_t *node, can_mailbox_t *mailbox, uint64_t now_ns) {
+    mailbox->drawn = true;
+    mailbox->fault = can_faults_draw(&bus->faults, node == &bus->drive);
+    if (mailbox->fault == CAN_FAULT_DELAYED) {
+        mailbox->not_before_ns = now_ns + bus->faults.delay_ns;
+    }
+}
+
+/* Mailbox that a node sends next, or NULL; *wake_ns becomes the time at which another one may, if that is earlier. */
+static can_mailbox_t *best_mailbox(can_bus_t *bus, can_node_t *node, uint64_t now_ns, uint64_t *wake_ns) {
+    can_mailbox_t *best = NULL;
     for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
-        if (!bus->mailbox[i].taken) {
-            bus->mailbox[i].frame = *frame;
-            bus->mailbox[i].taken = true;
-            bus->mailbox[i].request = bus->requests++;
-            bus->start_requested = bus->start_requested || bus->sender == CAN_BUS_IDLE;
+        can_mailbox_t *mailbox = &node->mailbox[i];
+        if (!mailbox->taken) {
+            continue;
+        }
+        if (!mailbox->drawn && mailbox->not_before_ns <= now_ns) {
+            draw_fault(bus, node, mailbox, now_ns);
+        }
+        const uint64_t not_before_ns = later(mailbox->not_before_ns, node->suspended_till_ns);
+        if (not_before_ns > now_ns) {
+            *wake_ns = earlier(*wake_ns, not_before_ns);
+        } else if (!best || mailbox->arbitration < best->arbitration ||
+                   (mailbox->arbitration == best->arbitration && mailbox->request < best->request)) {
+            best = mailbox;
+        }
+    }
+    return best;
+}
+
+/* Counts the recessive bits that have passed on an idle line, for nodes in bus-off; *wake_ns as in best_mailbox. */
+static void count_recessive(const can_bus_t *bus, const can_line_t *line, can_node_t *node, uint64_t now_ns,
+                            uint64_t *wake_ns) {
+    if (!node->rejoins) {
+        return;
+    }
+    const uint64_t from_ns = later(line->recessive_from_ns, node->rejoins_from_ns);
+    const uint64_t done_ns = bits_later(bus, from_ns, (uint64_t)node->sequences_left * RECESSIVE_SEQUENCE_BITS);
+    if (done_ns <= now_ns) {
+        can_node_count_recessive(node, node->sequences_left);
+    } else {
+        *wake_ns = earlier(*wake_ns, done_ns);
+    }
+}
+
+/* A frame starts: what has been counted of the recessive bits before it is kept. */
+static void keep_recessive(const can_bus_t *bus, const can_line_t *line, can_node_t *node, uint64_t now_ns) {
+    const uint64_t from_ns = later(line->recessive_from_ns, node->rejoins_from_ns);
+    if (node->rejoins && from_ns < now_ns) {
+        can_node_count_recessive(node, bits_between(bus, from_ns, now_ns) / RECESSIVE_SEQUENCE_BITS);
+    }
+}
+
+/* Nodes that transmit, all with the lowest arbitration field; none: *wake_ns is the time of the next attempt. */
+static void find_transmitters(can_bus_t *bus, can_line_t *line, uint64_t now_ns, uint64_t *wake_ns) {
+    can_node_t *node;
+    line->transmitters = 0;
+    FOR_EACH_NODE(bus, line, node) {
+        count_recessive(bus, line, node, now_ns, wake_ns);
+        if (node == &bus->babbler) {
+            fill_babbler(bus, now_ns);
+        }
+        can_mailbox_t *mailbox = node->bus_off ? NULL : best_mailbox(bus, node, now_ns, wake_ns);
+        if (!mailbox) {
+            continue;
+        }
+        const can_mailbox_t *leader = line->transmitters ? line->transmitter[0].mailbox : NULL;
+        if (leader && mailbox->arbitration < leader->arbitration) {
+            line->transmitters = 0;
+        }
+        if (line->transmitters == 0 ||
+            (mailbox->arbitration == leader->arbitration && line->transmitters < CAN_BUS_TRANSMITTERS_MAX)) {
+            line->transmitter[line->transmitters++] = (can_transmitter_t){node, mailbox};
+        }
+    }
+    line->remaining = line->transmitters;
+}
+
+/* The present frame ends with an error flag of `flag_bits` after `bits` bits. */
+static void plan_error(can_line_t *line, unsigned bits, unsigned flag_bits) {
+    line->state = CAN_LINE_ERROR_FRAME;
+    line->bits = bits + flag_bits + CAN_WIRE_ERROR_DELIMITER_BITS;
+    line->bits_to_idle = CAN_LENGTH_INTERFRAME_BITS;
+    line->recessive_bits = CAN_WIRE_ERROR_DELIMITER_BITS;
+}
+
+/* Several nodes transmit the same arbitration field. Those that send the first different bit recessive have a bit
+ * error. One that is error active destroys the frame by its flag; those that are error passive stop, and the others
+ * continue. */
+static void collide(can_bus_t *bus, can_line_t *line) {
+    static can_wire_t wires[CAN_BUS_TRANSMITTERS_MAX]; /* large; overwritten by each call */
+    can_wire_t *wire[CAN_BUS_TRANSMITTERS_MAX];
+    for (unsigned i = 0; i < line->transmitters; ++i) {
+        wire[i] = &wires[i];
+        can_wire_of(&bus->lengths, &line->transmitter[i].mailbox->frame, wire[i]);
+    }
+    for (;;) {
+        unsigned index = wire[0]->bits;
+        for (unsigned i = 1; i < line->remaining; ++i) {
+            const unsigned difference = can_wire_first_difference(wire[0], wire[i]);
+            index = difference < index ? difference : index;
+        }
+        if (index == wire[0]->bits) {
+            return;
+        }
+        bool active = false;
+        unsigned kept = 0;
+        for (unsigned i = 0; i < line->remaining; ++i) {
+            const bool recessive = wire[i]->bit[index];
+            active = active || (recessive && !can_node_is_passive(line->transmitter[i].node));
+        }
+        if (active) {
+            const can_wire_t *dominant = wire[0];
+            for (unsigned i = 0; i < line->remaining; ++i) {
+                dominant = wire[i]->bit[index] ? dominant : wire[i];
+            }
+            plan_error(line, index + 1, can_wire_error_flag_bits(dominant, index, 0, false));
+            return;
+        }
+        for (unsigned i = 0; i < line->remaining; ++i) {
+            if (!wire[i]->bit[index]) {
+                const can_transmitter_t transmitter = line->transmitter[kept];
+                can_wire_t *const other = wire[kept];
+                line->transmitter[kept] = line->transmitter[i];
+                wire[kept] = wire[i];
+                line->transmitter[i] = transmitter;
+                wire[i] = other;
+                ++kept;
+            }
+        }
+        line->remaining = kept;
+    }
+}
+
+/* One bit between arbitration field and end of the CRC is inverted for all nodes; the transmitters detect it first. */
+static void corrupt(can_bus_t *bus, can_line_t *line) {
+    can_wire_t wire;
+    can_wire_of(&bus->lengths, &line->transmitter[0].mailbox->frame, &wire);
+    const unsigned span = wire.bits - CRC_MARGIN_BITS - wire.arbitration_bits;
+    const unsigned index = wire.arbitration_bits + can_faults_random(&bus->faults, span);
+    const bool passive = can_node_is_passive(line->transmitter[0].node);
+    plan_error(line, index + 1, can_wire_error_flag_bits(&wire, index, !wire.bit[index], passive));
+}
+
+/* What becomes of the frame that begins, and when. */
+static void plan_frame(can_bus_t *bus, can_line_t *line) {
+    can_mailbox_t *mailbox = line->transmitter[0].mailbox;
+    line->state = CAN_LINE_FRAME;
+    line->acknowledge_error = false;
+    line->bits_to_idle = CAN_LENGTH_INTERFRAME_BITS;
+    line->recessive_bits = CAN_WIRE_AFTER_ACKNOWLEDGE_BITS;
+    if (line->transmitters > 1) {
+        collide(bus, line);
+        mailbox = line->transmitter[0].mailbox;
+    }
+    if (line->state == CAN_LINE_FRAME && mailbox->fault == CAN_FAULT_CORRUPTED) {
+        mailbox->fault = CAN_FAULT_NONE;
+        corrupt(bus, line);
+    }
+    if (line->state == CAN_LINE_ERROR_FRAME) {
+        return;
+    }
+    line->bits = can_length_bits(&bus->lengths, &mailbox->frame);
+    if (line == &bus->alone) {
+        plan_error(line, line->bits - CAN_WIRE_AFTER_ACKNOWLEDGE_BITS, CAN_WIRE_ACKNOWLEDGE_ERROR_FLAG_BITS);
+        line->acknowledge_error = true;
+    } else if (mailbox->fault == CAN_FAULT_DUPLICATED) {
+        line->bits_to_idle += CAN_WIRE_LAST_BIT_FLAG_BITS + CAN_WIRE_ERROR_DELIMITER_BITS;
+    }
+}
+
+static void arbitrate(can_bus_t *bus, can_line_t *line, uint64_t now_ns) {
+    uint64_t wake_ns = CAN_BUS_NEVER;
+    find_transmitters(bus, line, now_ns, &wake_ns);
+    if (line->transmitters == 0) {
+        line->next_event_ns = wake_ns;
+        return;
+    }
+    can_node_t *node;
+    FOR_EACH_NODE(bus, line, node) {
+        keep_recessive(bus, line, node, now_ns);
+    }
+    line->frame_start_ns = now_ns;
+    plan_frame(bus, line);
+    line->next_event_ns = bits_later(bus, now_ns, line->bits);
+}
+
+static void start_line(can_bus_t *bus, can_line_t *line, uint64_t now_ns) {
+    if (line->state != CAN_LINE_IDLE) {
+        return;
+    }
+    if (now_ns < line->idle_from_ns) {
+        line->next_event_ns = line->idle_from_ns;
+    } else {
+        arbitrate(bus, line, now_ns);
+    }
+}
+
+static void find_next_event(can_bus_t *bus) {
+    bus->next_event_ns = earlier(bus->shared.next_event_ns, bus->alone.next_event_ns);
+}
+
+void can_bus_start(can_bus_t *bus, uint64_t now_ns) {
+    bus->start_requested = false;
+    start_line(bus, &bus->shared, now_ns);
+    if (bus->disconnected || bus->alone.next_event_ns != CAN_BUS_NEVER) {
+        start_line(bus, &bus->alone, now_ns);
+    }
+    find_next_event(bus);
+}
+
+static bool transmits(const can_line_t *line, const can_node_t *node) {
+    for (unsigned i = 0; i < line->transmitters; ++i) {
+        if (line->transmitter[i].node == node) {
             return true;
         }
     }
     return false;
 }
 
-size_t can_bus_client_backlog(const can_bus_t *bus) {
-    return (size_t)(bus->client_pushed - bus->client_popped);
+static void suspend(const can_bus_t *bus, const can_line_t *line, can_node_t *node) {
+    if (can_node_is_passive(node)) {
+        node->suspended_till_ns = bits_later(bus, line->idle_from_ns, SUSPEND_BITS);
+    }
 }
 
-bool can_bus_push(can_bus_t *bus, const hal_can_frame_t *frame) {
-    if (can_bus_client_backlog(bus) == CAN_BUS_CLIENT_QUEUE) {
+static void transmission_failed(can_bus_t *bus, can_line_t *line, can_node_t *node, uint64_t now_ns) {
+    can_node_transmit_error(node);
+    suspend(bus, line, node);
+    if (node != &bus->drive) {
+        can_node_rejoin(node, now_ns);
+    }
+}
+
+/* Error confinement of the receivers. */
+static void count_reception(can_bus_t *bus, const can_line_t *line, bool disturbed) {
+    can_node_t *node;
+    FOR_EACH_NODE(bus, line, node) {
+        if (node->bus_off || (!disturbed && node->receive_errors == 0) || transmits(line, node)) {
+            continue;
+        }
+        if (disturbed) {
+            can_node_receive_error(node);
+        } else {
+            can_node_received(node);
+        }
+    }
+}
+
+static void end_error_frame(can_bus_t *bus, can_line_t *line, uint64_t now_ns) {
+    for (unsigned i = 0; i < line->transmitters; ++i) {
+        can_node_t *node = line->transmitter[i].node;
+        /* An error-passive node that nobody acknowledges does not count: it would else be bus-off when alone. */
+        if (line->acknowledge_error && can_node_is_passive(node)) {
+            suspend(bus, line, node);
+        } else {
+            transmission_failed(bus, line, node, now_ns);
+        }
+    }
+    count_reception(bus, line, true);
+}
+
+/* The babbling node's next frame, `load` per cent of the time from the start of this one to the start of the next. */
+static uint64_t next_babble_ns(const can_bus_t *bus, const can_line_t *line) {
+    const double bits = (line->bits + CAN_LENGTH_INTERFRAME_BITS) * 100.0 / bus->babble.load;
+    return bits_later(bus, line->frame_start_ns, (uint64_t)(bits + 0.5));
+}
+
+static void deliver(can_bus_t *bus, const can_line_t *line, can_bus_delivery_t *delivery) {
+    const can_mailbox_t *mailbox = line->transmitter[0].mailbox;
+    const bool drive_listens = !bus->disconnected && !bus->drive.bus_off;
+    *delivery = (can_bus_delivery_t){.frame = mailbox->frame, .to_drive = drive_listens, .to_clients = true};
+    for (unsigned i = 0; i < line->remaining; ++i) {
+        const can_node_t *node = line->transmitter[i].node;
+        delivery->from_drive = delivery->from_drive || node == &bus->drive;
+        delivery->from_client = delivery->from_client || (node != &bus->drive && node != &bus->babbler);
+    }
+    delivery->from_client = delivery->from_client && mailbox->fault != CAN_FAULT_DUPLICATED;
+    delivery->to_drive = delivery->to_drive && !delivery->from_drive;
+    if (mailbox->fault == CAN_FAULT_LOST) {
+        delivery->to_clients = !delivery->from_drive;
+        delivery->to_drive = false;
+    }
+}
+
+static void end_frame(can_bus_t *bus, can_line_t *line, can_bus_delivery_t *delivery, uint64_t now_ns) {
+    deliver(bus, line, delivery);
+    const bool again = line->transmitter[0].mailbox->fault == CAN_FAULT_DUPLICATED;
+    for (unsigned i = 0; i < line->transmitters; ++i) {
+        can_node_t *node = line->transmitter[i].node;
+        if (i >= line->remaining || again) {
+            line->transmitter[i].mailbox->fault = CAN_FAULT_NONE;
+            transmission_failed(bus, line, node, now_ns);
+            continue;
+        }
+        can_node_transmitted(node);
+        suspend(bus, line, node);
+        can_node_complete(node, line->transmitter[i].mailbox);
+        if (node == &bus->babbler && bus->babble.load > 0) {
+            fill_babbler(bus, next_babble_ns(bus, line));
+        }
+    }
+    count_reception(bus, line, false);
+}
+
+/* True when a frame is complete. */
+static bool step_line(can_bus_t *bus, can_line_t *line, can_bus_delivery_t *delivery) {
+    const uint64_t now_ns = line->next_event_ns;
+    if (line->state == CAN_LINE_IDLE) {
+        arbitrate(bus, line, now_ns);
         return false;
     }
-    bus->client_queue[bus->client_pushed++ % CAN_BUS_CLIENT_QUEUE] = *frame;
-    bus->start_requested = bus->start_requested || bus->sender == CAN_BUS_IDLE;
-    return true;
-}
-
-/* Mailbox that the CAN controller of the drive sends next, or HAL_CAN_MAILBOXES. */
-static unsigned best_mailbox(const can_bus_t *bus) {
-    unsigned best = HAL_CAN_MAILBOXES;
-    for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
-        if (!bus->mailbox[i].taken) {
-            continue;
+    const bool complete = line->state == CAN_LINE_FRAME;
+    line->recessive_from_ns = bits_later(bus, line->frame_start_ns, line->bits - line->recessive_bits);
+    line->idle_from_ns = bits_later(bus, line->frame_start_ns, line->bits + line->bits_to_idle);
+    if (complete) {
+        if (line->bits_to_idle != CAN_LENGTH_INTERFRAME_BITS) { /* error flag after the last bit */
+            line->recessive_from_ns = bits_later(bus, line->frame_start_ns, line->bits + CAN_WIRE_LAST_BIT_FLAG_BITS);
         }
-        if (best == HAL_CAN_MAILBOXES) {
-            best = i;
-            continue;
-        }
-        uint32_t candidate = arbitration_field(&bus->mailbox[i].frame);
-        uint32_t present = arbitration_field(&bus->mailbox[best].frame);
-        if (candidate < present || (candidate == present && bus->mailbox[i].request < bus->mailbox[best].request)) {
-            best = i;
-        }
-    }
-    return best;
-}
-
-static void arbitrate(can_bus_t *bus, uint64_t now_ns) {
-    unsigned mailbox = best_mailbox(bus);
-    bool drive = mailbox < HAL_CAN_MAILBOXES;
-    bool client = can_bus_client_backlog(bus) > 0;
-    if (!drive && !client) {
-        bus->next_event_ns = CAN_BUS_NEVER;
-        return;
-    }
-    const hal_can_frame_t *frame = drive ? &bus->mailbox[mailbox].frame : NULL;
-    const hal_can_frame_t *head = client ? &bus->client_queue[bus->client_popped % CAN_BUS_CLIENT_QUEUE] : NULL;
-    if (!drive || (client && arbitration_field(head) < arbitration_field(frame))) {
-        bus->sender = CAN_BUS_CLIENT_SENDS;
-        frame = head;
+        end_frame(bus, line, delivery, now_ns);
     } else {
-        bus->sender = CAN_BUS_DRIVE_SENDS;
-        bus->sending_mailbox = mailbox;
+        end_error_frame(bus, line, now_ns);
     }
-    bus->frame_start_ns = now_ns;
-    bus->sending_bits = can_length_bits(&bus->lengths, frame);
-    bus->next_event_ns = bits_later(bus, now_ns, bus->sending_bits);
-}
-
-void can_bus_start(can_bus_t *bus, uint64_t now_ns) {
-    bus->start_requested = false;
-    if (bus->sender != CAN_BUS_IDLE) {
-        return;
+    line->state = CAN_LINE_IDLE;
+    line->next_event_ns = line->idle_from_ns;
+    if (apply_changes(bus)) {
+        can_line_t *other = line == &bus->shared ? &bus->alone : &bus->shared;
+        other->next_event_ns =
+            other->state == CAN_LINE_IDLE ? later(now_ns, other->idle_from_ns) : other->next_event_ns;
     }
-    if (now_ns < bus->idle_from_ns) {
-        bus->next_event_ns = bus->idle_from_ns;
-    } else {
-        arbitrate(bus, now_ns);
-    }
+    return complete;
 }
 
 bool can_bus_step(can_bus_t *bus, can_bus_delivery_t *delivery) {
-    if (bus->sender == CAN_BUS_IDLE) {
-        arbitrate(bus, bus->next_event_ns);
-        return false;
-    }
-    delivery->from_drive = bus->sender == CAN_BUS_DRIVE_SENDS;
-    if (delivery->from_drive) {
-        delivery->frame = bus->mailbox[bus->sending_mailbox].frame;
-        bus->mailbox[bus->sending_mailbox].taken = false;
-    } else {
-        delivery->frame = bus->client_queue[bus->client_popped++ % CAN_BUS_CLIENT_QUEUE];
-    }
-    bus->sender = CAN_BUS_IDLE;
-    bus->start_requested = false;
-    bus->idle_from_ns = bits_later(bus, bus->frame_start_ns, bus->sending_bits + CAN_LENGTH_INTERFRAME_BITS);
-    bus->next_event_ns = bus->idle_from_ns;
-    return true;
+    can_line_t *line = bus->alone.next_event_ns < bus->shared.next_event_ns ? &bus->alone : &bus->shared;
+    const bool complete = step_line(bus, line, delivery);
+    find_next_event(bus);
+    return complete;
 }

@@ -1,9 +1,16 @@
-/* Emulated CAN bus: bit rate, exact frame lengths, arbitration by identifier.
+/* Emulated CAN bus: bit rate, exact frame lengths, arbitration by identifier, error frames, error confinement.
  *
- * Two nodes send: the drive through three mailboxes (lowest identifier first, equal ones in the order of their
- * requests), and all clients together through one controller that sends in the order of arrival. The node with the
- * lower identifier wins arbitration; the drive on equal identifiers. There are no bit errors and every frame is
- * acknowledged. All times are arguments; the module has no clock.
+ * Nodes: the drive with three mailboxes (lowest identifier first, equal ones in the order of their requests), each
+ * client with a queue in the order of arrival, a babbling node, and the bench's own interface, which only listens and
+ * therefore acknowledges every frame. The node with the lowest arbitration field transmits. When several transmit the
+ * same one, the first bit that differs is a bit error of those that sent it recessive; frames that are equal in every
+ * bit are one frame. The counters change at the end of a frame or of an error frame.
+ *
+ * The drive can be disconnected: it is then alone on a line of its own, and nobody acknowledges its frames.
+ *
+ * The drive leaves bus-off on request (can_bus_rejoin); clients and babbling node do so by themselves. An error flag is
+ * as long as with a receiver that is error active. Changes of the drive's counter and connection act when the frame
+ * that is under way has ended. All times are arguments; the module has no clock.
  *
  * A frame is complete, and delivered, at the last bit of its end of frame; the next one starts three bits later.
  */
@@ -15,17 +22,54 @@
 #include <stdint.h>
 
 #include "hal_can.h"
+#include "rig/can_faults.h"
 #include "rig/can_length.h"
+#include "rig/can_node.h"
 
-#define CAN_BUS_CLIENT_QUEUE 65536 /* a power of two */
+#define CAN_BUS_CLIENT_QUEUE CAN_NODE_QUEUE_MAX
 #define CAN_BUS_BIT_RATE_MIN 10000
 #define CAN_BUS_BIT_RATE_MAX 1000000
 #define CAN_BUS_NEVER UINT64_MAX
+#define CAN_BUS_TRANSMITTERS_MAX 64 /* nodes that transmit the same arbitration field at once; others wait */
 
 typedef struct {
     hal_can_frame_t frame;
     bool from_drive;
+    bool from_client; /* its first delivery: it completes a frame that a client sent */
+    bool to_drive;    /* the drive receives it */
+    bool to_clients;
 } can_bus_delivery_t;
+
+typedef struct {
+    can_node_t node;
+    uint32_t number; /* of the client */
+} can_bus_client_t;
+
+typedef struct {
+    double load;         /* per cent of the bus, 0: off */
+    uint32_t identifier; /* 11 bits */
+    uint8_t length;      /* 0..8 bytes of data, which number the frames */
+} can_babble_t;
+
+typedef struct {
+    can_node_t *node;
+    can_mailbox_t *mailbox;
+} can_transmitter_t;
+
+/* One pair of wires. */
+typedef struct {
+    enum { CAN_LINE_IDLE, CAN_LINE_FRAME, CAN_LINE_ERROR_FRAME } state;
+    uint64_t next_event_ns;
+    uint64_t frame_start_ns;
+    uint64_t idle_from_ns;      /* next start of frame */
+    uint64_t recessive_from_ns; /* while idle: since the last dominant bit */
+    unsigned bits;              /* until the event */
+    unsigned bits_to_idle;      /* after it */
+    unsigned recessive_bits;    /* before it, without a dominant one */
+    bool acknowledge_error;
+    unsigned transmitters, remaining; /* the first `remaining` send to the end; the others have lost a bit */
+    can_transmitter_t transmitter[CAN_BUS_TRANSMITTERS_MAX];
+} can_line_t;
 
 typedef struct {
     /* Time at which can_bus_step is due, CAN_BUS_NEVER while nothing is to be sent. */
@@ -33,34 +77,56 @@ typedef struct {
     /* A frame was queued on an idle bus: can_bus_start is due. */
     bool start_requested;
 
+    /* Settings. A change of `babble` requires can_bus_babble. */
+    can_faults_t faults;
+    can_babble_t babble;
+
     /* Private to can_bus.c. */
     can_length_t lengths;
     uint32_t bit_rate;
-    uint64_t frame_start_ns, idle_from_ns;
-    enum { CAN_BUS_IDLE, CAN_BUS_DRIVE_SENDS, CAN_BUS_CLIENT_SENDS } sender;
-    unsigned sending_mailbox, sending_bits;
-    struct {
-        hal_can_frame_t frame;
-        bool taken;
-        uint64_t request; /* sequence number of the request */
-    } mailbox[HAL_CAN_MAILBOXES];
-    uint64_t requests;
-    hal_can_frame_t client_queue[CAN_BUS_CLIENT_QUEUE];
-    uint64_t client_pushed, client_popped;
+    can_line_t shared, alone;      /* the drive's line while it is disconnected */
+    bool disconnected, disconnect; /* now, and from the end of the present frame on */
+    bool errors_set;
+    unsigned errors_to_set;
+    can_node_t drive, babbler;
+    uint64_t babbled;
+    can_bus_client_t **clients;
+    unsigned client_count, client_capacity;
 } can_bus_t;
 
-/* Initialises an idle bus at time 0. bit_rate in bit/s, CAN_BUS_BIT_RATE_MIN..CAN_BUS_BIT_RATE_MAX. */
-void can_bus_init(can_bus_t *bus, uint32_t bit_rate);
+/* Initialises an idle bus at time 0. bit_rate in bit/s, CAN_BUS_BIT_RATE_MIN..CAN_BUS_BIT_RATE_MAX. seed: of faults. */
+void can_bus_init(can_bus_t *bus, uint32_t bit_rate, uint64_t seed);
 
-/* Drive: puts a frame into a free mailbox; false when all three are taken. A mailbox is free again when its frame is
- * complete. */
+/* Frees the clients. */
+void can_bus_close(can_bus_t *bus);
+
+/* Drive: puts a frame into a free mailbox; false when all three are taken, or in bus-off. A mailbox is free again when
+ * its frame is complete. */
 bool can_bus_transmit(can_bus_t *bus, const hal_can_frame_t *frame);
 
-/* Clients: queues a frame; false when CAN_BUS_CLIENT_QUEUE frames wait. */
-bool can_bus_push(can_bus_t *bus, const hal_can_frame_t *frame);
+/* Drive: leaves bus-off once 128 times 11 recessive bits have passed from now_ns on. */
+void can_bus_rejoin(can_bus_t *bus, uint64_t now_ns);
 
-/* Number of client frames that are not complete yet. */
-size_t can_bus_client_backlog(const can_bus_t *bus);
+/* Queues a frame of a client, by its number; false when CAN_BUS_CLIENT_QUEUE of its frames wait. */
+bool can_bus_push(can_bus_t *bus, uint32_t number, const hal_can_frame_t *frame);
+
+/* Frames of a client that are not complete yet. */
+size_t can_bus_client_backlog(const can_bus_t *bus, uint32_t number);
+
+/* Removes the clients that have no frame left and are not connected. */
+void can_bus_remove_clients(can_bus_t *bus, bool (*connected)(void *context, uint32_t client), void *context);
+
+/* True when the client has a node on the bus: from its first frame on. */
+bool can_bus_has_client(const can_bus_t *bus, uint32_t number);
+
+/* Sets the drive's transmit error counter, 0..256; 256 is bus-off. */
+void can_bus_set_transmit_errors(can_bus_t *bus, unsigned errors);
+
+/* Disconnects or connects the drive. */
+void can_bus_disconnect(can_bus_t *bus, bool disconnect);
+
+/* Takes new settings of `babble` at now_ns. */
+void can_bus_babble(can_bus_t *bus, uint64_t now_ns);
 
 /* Starts arbitration on an idle bus; call it when all frames that are ready to send at `now_ns` are queued. */
 void can_bus_start(can_bus_t *bus, uint64_t now_ns);

@@ -24,7 +24,7 @@ void rig_init(rig_t *rig, const rig_config_t *config) {
     plant_init(&rig->plant, config->machine, config->initial_angle_rad);
     sensors_init(&rig->sensors, &config->machine->sensors, config->encoder_bits, config->adc_bits, config->seed);
     rig->sensors.encoder_edges = config->encoder_edges;
-    can_bus_init(&rig->bus, config->bit_rate);
+    can_bus_init(&rig->bus, config->bit_rate, config->seed);
     board_init(&rig->board, &rig->plant, &rig->sensors, &rig->bus);
     rig->board.immediate_pwm = config->immediate_pwm;
     rig->config = *config;
@@ -54,4 +54,8 @@ bool rig_serve(rig_t *rig, int timeout_ms) {
 void rig_finish(rig_t *rig) {
     plant_advance(&rig->plant, rig->board.time_ns);
     transport_flush(rig->config.transport);
+}
+
+void rig_close(rig_t *rig) {
+    can_bus_close(&rig->bus);
 }

@@ -5,9 +5,9 @@
  * divides time into RIG_RUN_UNTILs does not change a bit of the result.
  *
  * In lock-step, time stands still until a client sends RIG_RUN_UNTIL; clients are not read while time runs. Frames for
- * the bus that were sent while it stood still begin in the order in which their clients connected, then in the order
- * of each client, whatever the moment they arrived; a client's frames that were sent before another client's
- * RIG_RUN_UNTIL are taken before it. The RIG_RUN_UNTIL of a client that has disconnected is abandoned, within
+ * the bus that were sent while it stood still wait in the node of their client, in its order, and take part in
+ * arbitration when time runs, whatever the moment they arrived; a client's frames that were sent before another
+ * client's RIG_RUN_UNTIL are taken before it. The RIG_RUN_UNTIL of a client that has disconnected is abandoned, within
  * RIG_STOP_STEP_NS, when another client is connected; without one it runs to its end. In the other paces clients are
  * read each RIG_READ_STEP_NS of virtual time.
  */
@@ -32,7 +32,7 @@
 #define RIG_NEVER SCHEDULER_NEVER
 #define RIG_LOAD_PROFILE_MAX 256  /* values */
 #define RIG_RUNS_MAX 64           /* RIG_RUN_UNTILs that wait for their time */
-#define RIG_MOVING_BACKLOG_MAX 64 /* all paces but lock-step: clients wait while this many frames are queued */
+#define RIG_MOVING_BACKLOG_MAX 64 /* all paces but lock-step: a client waits while so many of its frames are queued */
 
 /* The firmware, seen from the emulator. All take no virtual time, except as board.interrupt_took_ns says. */
 typedef struct {
@@ -65,12 +65,6 @@ typedef struct {
 } rig_config_t;
 
 typedef struct {
-    uint32_t client;
-    uint32_t arrival;
-    hal_can_frame_t frame;
-} rig_staged_t;
-
-typedef struct {
     uint64_t time_ns;
     uint8_t sequence;
     uint32_t client;
@@ -90,7 +84,7 @@ typedef struct {
     double profile[RIG_LOAD_PROFILE_MAX]; /* over one turn */
 } load_t;
 
-/* Large (several MB): static or on the heap. */
+/* Large: static or on the heap. */
 typedef struct {
     plant_t plant;
     sensors_t sensors;
@@ -110,9 +104,6 @@ typedef struct {
     rig_run_t runs[RIG_RUNS_MAX]; /* server.c, by time, equal times in the order of arrival */
     unsigned run_count;
     uint64_t stop_checked_ns;
-    unsigned staged_count;
-    bool staged_mixed; /* not in the order of clients yet */
-    rig_staged_t staged[CAN_BUS_CLIENT_QUEUE];
 } rig_t;
 
 /* A bench at time 0: machine at rest, supply on, no load, no firmware. The rig must not be moved afterwards. */
@@ -132,5 +123,8 @@ bool rig_serve(rig_t *rig, int timeout_ms);
 
 /* Advances the plant, and its observer, to the present time and sends the frames that are still in batches. */
 void rig_finish(rig_t *rig);
+
+/* Frees what the rig allocated for its clients. */
+void rig_close(rig_t *rig);
 
 #endif

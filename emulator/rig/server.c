@@ -1,6 +1,5 @@
 #include "rig/server.h"
 
-#include <stdlib.h>
 #include <string.h>
 
 #include "rig/bus_events.h"
@@ -34,8 +33,6 @@ void server_init(rig_t *rig) {
     transport->give_up_context = rig;
     rig->run_count = 0;
     rig->stop_checked_ns = 0;
-    rig->staged_count = 0;
-    rig->staged_mixed = false;
 }
 
 static void send_clock(rig_t *rig, uint8_t sequence) {
@@ -92,7 +89,7 @@ static void take_load_profile(rig_t *rig, const uint8_t *data) {
 static bool may_read(void *context, uint32_t client) {
     const rig_t *rig = context;
     if (rig->config.pacing.kind != PACING_LOCKSTEP) {
-        return can_bus_client_backlog(&rig->bus) + rig->staged_count < RIG_MOVING_BACKLOG_MAX;
+        return can_bus_client_backlog(&rig->bus, client) < RIG_MOVING_BACKLOG_MAX;
     }
     for (unsigned i = 0; i < rig->run_count; ++i) {
         if (rig->runs[i].client == client) {
@@ -102,19 +99,19 @@ static bool may_read(void *context, uint32_t client) {
     return true;
 }
 
+static bool connected(void *context, uint32_t client) {
+    return transport_connected(context, client);
+}
+
 static bool take(void *context, uint32_t client, const transport_frame_t *frame) {
     rig_t *rig = context;
     if (!transport_frame_is_off_bus(frame)) {
-        if (can_bus_client_backlog(&rig->bus) + rig->staged_count == CAN_BUS_CLIENT_QUEUE) {
-            return false;
+        if (!can_bus_has_client(&rig->bus, client)) {
+            can_bus_remove_clients(&rig->bus, connected, rig->config.transport);
         }
-        rig_staged_t *staged = &rig->staged[rig->staged_count];
-        transport_frame_to_hal(frame, &staged->frame);
-        staged->client = client;
-        staged->arrival = rig->staged_count;
-        rig->staged_mixed = rig->staged_mixed || (rig->staged_count > 0 && staged[-1].client > client);
-        ++rig->staged_count;
-        return true;
+        hal_can_frame_t queued;
+        transport_frame_to_hal(frame, &queued);
+        return can_bus_push(&rig->bus, client, &queued);
     }
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_CLIENT_OFF_BUS, frame);
     if (frame->size == CAN_MTU && transport_frame_is_rig(frame) && !(frame->classic.can_id & CAN_RTR_FLAG)) {
@@ -128,27 +125,6 @@ static bool take(void *context, uint32_t client, const transport_frame_t *frame)
         }
     }
     return true;
-}
-
-static int compare_staged(const void *left, const void *right) {
-    const rig_staged_t *a = left, *b = right;
-    if (a->client != b->client) {
-        return a->client < b->client ? -1 : 1;
-    }
-    return a->arrival < b->arrival ? -1 : 1;
-}
-
-/* Queues the frames that arrived while time stood still on the bus. */
-static void submit_staged(rig_t *rig) {
-    if (rig->staged_mixed) {
-        qsort(rig->staged, rig->staged_count, sizeof rig->staged[0], compare_staged);
-    }
-    for (unsigned i = 0; i < rig->staged_count; ++i) {
-        can_bus_push(&rig->bus, &rig->staged[i].frame); /* take() left room for it */
-    }
-    rig->staged_count = 0;
-    rig->staged_mixed = false;
-    bus_start(rig);
 }
 
 static bool check_stop(rig_t *rig) {
@@ -191,7 +167,7 @@ static bool serve_lockstep(rig_t *rig, int timeout_ms) {
         transport_flush(rig->config.transport);
         return !(wait_for_clients(rig, timeout_ms) && check_stop(rig));
     }
-    submit_staged(rig);
+    bus_start(rig);
     uint64_t target_ns = rig->runs[0].time_ns;
     while (rig->board.time_ns < target_ns && !abandon_runs(rig)) {
         advance(rig, earlier(target_ns, rig->stop_checked_ns + RIG_STOP_STEP_NS));
@@ -204,7 +180,7 @@ static bool serve_lockstep(rig_t *rig, int timeout_ms) {
 }
 
 static bool serve_moving(rig_t *rig) {
-    submit_staged(rig);
+    bus_start(rig);
     uint64_t reading_ns = (rig->board.time_ns / RIG_READ_STEP_NS + 1) * RIG_READ_STEP_NS;
     advance(rig, earlier(reading_ns, rig->config.stop_at_ns));
     transport_flush(rig->config.transport);

@@ -3,6 +3,7 @@
 #include <stddef.h>
 
 #include "bench_variables.h"
+#include "rig/bus_events.h"
 #include "rig/control_period.h"
 #include "rig/dynamometer.h"
 #include "rig/load.h"
@@ -58,6 +59,41 @@ static void set_truth_period(rig_t *rig, double period_us) {
         period_ns > 0 ? (rig->board.time_ns / period_ns + 1) * period_ns : SCHEDULER_NEVER;
 }
 
+static void set_frame_fault(rig_t *rig, double fault) {
+    rig->bus.faults.fault = (can_fault_t)fault;
+}
+
+static void set_frame_fault_sender(rig_t *rig, double sender) {
+    rig->bus.faults.sender = (can_fault_sender_t)sender;
+}
+
+static void set_frame_delay(rig_t *rig, double delay_us) {
+    rig->bus.faults.delay_ns = (uint64_t)(delay_us * (double)NS_PER_US + 0.5);
+}
+
+static void set_bus_connection(rig_t *rig, double connected) {
+    can_bus_disconnect(&rig->bus, connected == 0);
+}
+
+static void set_transmit_error_counter(rig_t *rig, double errors) {
+    can_bus_set_transmit_errors(&rig->bus, (unsigned)errors);
+}
+
+static void set_babble_load(rig_t *rig, double load_percent) {
+    rig->bus.babble.load = load_percent;
+    can_bus_babble(&rig->bus, rig->board.time_ns);
+}
+
+static void set_babble_identifier(rig_t *rig, double identifier) {
+    rig->bus.babble.identifier = (uint32_t)identifier;
+    can_bus_babble(&rig->bus, rig->board.time_ns);
+}
+
+static void set_babble_length(rig_t *rig, double length) {
+    rig->bus.babble.length = (uint8_t)length;
+    can_bus_babble(&rig->bus, rig->board.time_ns);
+}
+
 static const target_t targets[BENCH_VARIABLE_COUNT] = {
     [BENCH_VARIABLE_LOAD_TORQUE_NM] = {.set = load_set_torque},
     [BENCH_VARIABLE_SUPPLY_VOLTAGE_V] = {.set = set_supply_voltage},
@@ -86,6 +122,15 @@ static const target_t targets[BENCH_VARIABLE_COUNT] = {
     [BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM] = {.set = load_set_torque},
     [BENCH_VARIABLE_LOAD_RAMP_COARSE_NM_S] = {.set = load_set_ramp},
     [BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM] = {.set = load_set_sine_amplitude},
+    [BENCH_VARIABLE_FRAME_FAULT] = {.set = set_frame_fault},
+    [BENCH_VARIABLE_FRAME_FAULT_PER_MILLE] = MEMBER(bus.faults.per_mille),
+    [BENCH_VARIABLE_FRAME_FAULT_SENDER] = {.set = set_frame_fault_sender},
+    [BENCH_VARIABLE_FRAME_DELAY_US] = {.set = set_frame_delay},
+    [BENCH_VARIABLE_BUS_CONNECTION] = {.set = set_bus_connection},
+    [BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER] = {.set = set_transmit_error_counter},
+    [BENCH_VARIABLE_BABBLE_LOAD_PERCENT] = {.set = set_babble_load},
+    [BENCH_VARIABLE_BABBLE_IDENTIFIER] = {.set = set_babble_identifier},
+    [BENCH_VARIABLE_BABBLE_LENGTH] = {.set = set_babble_length},
 };
 
 static void apply(rig_t *rig, const stimulus_t *stimulus) {
@@ -112,6 +157,7 @@ void stimulus_event(void *context, uint64_t now_ns) {
     const stimulus_t stimulus = stimulus_queue_pop(&rig->stimuli);
     schedule(rig);
     apply(rig, &stimulus);
+    bus_start(rig);
 }
 
 stimulus_reply_t stimulus_receive(rig_t *rig, const uint8_t *data) {

@@ -18,6 +18,7 @@
 /* Origin of a frame that is sent to the clients; it determines how the frame's time is conveyed. */
 typedef enum {
     TRANSPORT_FROM_EMULATOR,       /* the drive or the rig */
+    TRANSPORT_FROM_OTHER,          /* another node of the emulated bus, or a client's frame once more: any identifier */
     TRANSPORT_CLOCK,               /* RIG_CLOCK, carries its time itself */
     TRANSPORT_FROM_CLIENT_ON_BUS,  /* completed on the emulated bus */
     TRANSPORT_FROM_CLIENT_OFF_BUS, /* never on the emulated bus: rig, error, flexible data rate */

@@ -1,8 +1,9 @@
 /* SocketCAN: one raw socket on an interface, which all clients share.
  *
  * The interface carries no virtual time, so RIG_STAMP frames do (rig.dbc): before each frame of the emulator one with
- * subject "next", and one with "oldest_on_bus" or "oldest_at_once" when a frame of a client completes on the emulated
- * bus or was taken immediately. Clients' frames are on the interface already and are not sent again.
+ * subject "next" ("next_of_any_node" when it is not one of drive or rig), and one with "oldest_on_bus" or
+ * "oldest_at_once" when a frame of a client completes on the emulated bus or was taken immediately. Clients' frames are
+ * on the interface already and are not sent again.
  */
 #define _GNU_SOURCE /* SO_SNDBUFFORCE */
 
@@ -116,6 +117,10 @@ static void socketcan_send(transport_t *transport, uint64_t time_ns, transport_o
     switch (origin) {
     case TRANSPORT_FROM_EMULATOR:
         send_timestamp(can, time_ns, RIG_STAMP_SUBJECT_NEXT_CHOICE);
+        send_frame(can, frame);
+        break;
+    case TRANSPORT_FROM_OTHER:
+        send_timestamp(can, time_ns, RIG_STAMP_SUBJECT_NEXT_OF_ANY_NODE_CHOICE);
         send_frame(can, frame);
         break;
     case TRANSPORT_CLOCK:

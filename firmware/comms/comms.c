@@ -6,6 +6,7 @@
 
 void comms_init(comms_t *comms, uint32_t time_us) {
     *comms = (comms_t){0};
+    bus_monitor_init(&comms->bus, time_us);
     commands_init(&comms->commands);
     telemetry_init(&comms->telemetry, time_us);
 }
@@ -35,6 +36,8 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, bool w
             break;
         }
         case COMMANDS_REJECTED:
+            bus_monitor_check(&comms->bus, &frame, time_us);
+            break;
         default:
             break;
         }

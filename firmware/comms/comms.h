@@ -4,6 +4,7 @@
  *
  *     const uint32_t time_us = hal_time_us(hal);
  *     if (comms_telemetry_due(&comms, time_us)) {
+ *         bus_monitor_step(&comms.bus, hal, time_us);
  *         ... collect a drive_telemetry_t, with the control interrupt masked ...
  *         comms_telemetry(&comms, hal, &values);
  *     }
@@ -17,6 +18,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "comms/bus_monitor.h"
 #include "comms/commands.h"
 #include "comms/frame_queue.h"
 #include "comms/telemetry.h"
@@ -28,6 +30,7 @@
 #define COMMS_FRAMES_PER_CALL 4
 
 typedef struct {
+    bus_monitor_t bus;
     commands_t commands;
     telemetry_t telemetry;
     frame_queue_t responses; /* to parameter requests */
@@ -43,6 +46,8 @@ void comms_init(comms_t *comms, uint32_t time_us);
  * Telemetry is sent first, parameter responses when no telemetry waits. No response is ever dropped: while the queue of
  * responses is full nothing is received. That state cannot block commands, because PARAMETER_REQUEST loses arbitration
  * to all frames of the drive but those of the group `background`: responses leave before more requests arrive.
+ *
+ * Of a frame that is neither command nor request, the identifier may be one of the drive's own (comms->bus).
  *
  * `writable`: parameters may be written now. [background] */
 bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, uint32_t time_us);

@@ -48,8 +48,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
         start(state, measured);
     }
     observe(parameters, state, deferred, measured);
-    const uint64_t fault_mask =
-        protect(parameters, state, sample, measured) | deferred->fault_mask | sample->background_fault_mask;
+    const uint64_t fault_mask = protect(parameters, state, sample, measured) | deferred->fault_mask;
     const bool was_running = state->state_machine.state == DRIVE_STATE_RUN;
     const bool run = supervise(parameters, state, sample, command, measured, fault_mask);
     if (run) {

@@ -94,9 +94,8 @@ typedef struct {
 typedef struct {
     hal_adc_sample_t adc;
     hal_encoder_sample_t encoder;
-    uint32_t missed_interrupts;     /* since the previous period */
-    uint32_t break_causes;          /* HAL_PWM_BREAK_* */
-    uint32_t background_fault_mask; /* checks of the background that fail, FAULT_BIT */
+    uint32_t missed_interrupts; /* since the previous period */
+    uint32_t break_causes;      /* HAL_PWM_BREAK_* */
     uint32_t time_us;
 } control_sample_t;
 
@@ -138,10 +137,11 @@ typedef struct {
     misalignment_t misalignment; /* a property of the machine: survives the end of a run */
 } deferred_t;
 
-/* State of the control; the control interrupt alone writes the members other than `deferred`. */
+/* State of the control; the control interrupt alone writes the members other than `deferred` and the first. */
 typedef struct {
-    bool started;       /* the first sample has initialised observer and protection */
-    int32_t innovation; /* of the last sample, 2^-32 rev */
+    uint32_t reported_fault_mask; /* failed checks of the background, which writes it in one access; FAULT_BITs */
+    bool started;                 /* the first sample has initialised observer and protection */
+    int32_t innovation;           /* of the last sample, 2^-32 rev */
     load_observer_t observer;
     observer_bandwidth_t bandwidth;
     protection_t protection;

@@ -236,7 +236,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     deferred_results_t *results = deferred_buffer(&deferred->response);
     follow_resets(parameters, deferred, input);
     results->generation = input->generation;
-    results->fault_mask = (uint32_t)protect(parameters, deferred, input);
+    results->fault_mask = (uint32_t)protect(parameters, deferred, input) | state->reported_fault_mask;
     if (parameters->bandwidth.adaptive) {
         results->bandwidth = bandwidth_limits(parameters, deferred, input);
     }

@@ -78,6 +78,17 @@ bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     return hal->mailbox.accepted != 0;
 }
 
+void hal_can_status(const hal_t *hal, hal_can_status_t *status) {
+    status->state = (hal_can_error_state_t)hal->mailbox.can_error_state;
+    status->transmit_errors = (uint16_t)hal->mailbox.transmit_errors;
+    status->receive_errors = (uint16_t)hal->mailbox.receive_errors;
+}
+
+void hal_can_rejoin(hal_t *hal) {
+    (void)hal;
+    doorbell_ring(MAILBOX_CAN_REJOIN);
+}
+
 uint32_t hal_time_us(const hal_t *hal) {
     return hal->mailbox.time_us;
 }

@@ -41,6 +41,7 @@ typedef enum {
     MAILBOX_CAN_TRANSMIT,  /* takes frame, returns accepted: a mailbox was free */
     MAILBOX_TRIGGER,       /* takes trigger, returns an event: MAILBOX_INTERRUPT or MAILBOX_EXIT */
     MAILBOX_INTERRUPT_END, /* takes elapsed_ticks, returns an event: MAILBOX_BACKGROUND or MAILBOX_EXIT */
+    MAILBOX_CAN_REJOIN,    /* requests to leave bus-off */
 } mailbox_command_t;
 
 /* Result of MAILBOX_NEXT. */
@@ -80,6 +81,9 @@ typedef struct {
 
     uint32_t receive_waiting; /* frames */
     uint32_t receive_overflows;
+    uint32_t can_error_state; /* hal_can_error_state_t; this and the next as of the last event */
+    uint32_t transmit_errors;
+    uint32_t receive_errors;
     hal_can_frame_t frame;
     uint32_t accepted;
 } mailbox_t;

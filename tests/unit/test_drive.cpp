@@ -1,7 +1,9 @@
 // drive.c between a HAL that remembers and the laws: what it starts, writes, opens and passes on.
+#include <algorithm>
 #include <cstdint>
 #include <cstring>
 #include <deque>
+#include <random>
 #include <vector>
 
 #include <gtest/gtest.h>
@@ -33,6 +35,8 @@ struct hal {
     unsigned writes = 0, opens = 0;
     bool open = true;
     bool critical = false;
+    hal_can_status_t can_status{};
+    unsigned rejoins = 0;
     unsigned deferred_requests = 0;
     hal_pwm_compare_t written{};
 };
@@ -110,6 +114,12 @@ uint32_t hal_can_receive_overflows(const hal_t *) {
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     hal->from_drive.push_back(*frame);
     return true;
+}
+void hal_can_status(const hal_t *hal, hal_can_status_t *status) {
+    *status = hal->can_status;
+}
+void hal_can_rejoin(hal_t *hal) {
+    hal->rejoins++;
 }
 }
 
@@ -488,6 +498,163 @@ TEST_F(Drive, a_run_of_a_sender_long_silent_starts_nothing_when_the_clock_comes_
     periods(200);
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
     EXPECT_EQ(hal.writes, 0u);
+}
+
+// Bus-off: the error counter is above 255 until the controller has rejoined.
+TEST_F(Drive, rejoins_the_bus_with_a_back_off_that_doubles_up_to_320_ms_and_an_error_free_second_resets) {
+    const auto wait_us = [this] {
+        hal.can_status = {.state = HAL_CAN_BUS_OFF, .transmit_errors = 256, .receive_errors = 0};
+        const unsigned rejoins = hal.rejoins;
+        int waited = 0;
+        for (; hal.rejoins == rejoins && waited < 40000; waited++) {
+            periods(1);
+        }
+        periods(1000);
+        EXPECT_EQ(hal.rejoins, rejoins + 1) << "one request for each bus-off";
+        hal.can_status = {.state = HAL_CAN_ERROR_ACTIVE, .transmit_errors = 0, .receive_errors = 0};
+        periods(40);
+        return (waited - 1) * 25;
+    };
+    for (const int expected_us : {10000, 20000, 40000, 80000, 160000, 320000, 320000, 320000}) {
+        EXPECT_NEAR(wait_us(), expected_us, 1000) << "a step each millisecond";
+    }
+    EXPECT_EQ(drive.comms.bus.bus_off_count, 8u);
+    hal.can_status.state = HAL_CAN_ERROR_PASSIVE; // on the bus, but not free of errors
+    periods(80000);
+    EXPECT_NEAR(wait_us(), 320000, 1000);
+    periods(40100);
+    EXPECT_NEAR(wait_us(), 10000, 1000);
+    hal.from_drive.clear();
+    periods(4040);
+    const auto state = only_frame(DRIVE_BUS_STATE_FRAME_ID, drive_bus_state_unpack);
+    EXPECT_EQ(state.bus_off_count, 10);
+    EXPECT_EQ(state.bus_state, BUS_STATE_ERROR_ACTIVE);
+}
+
+TEST_F(Drive, after_bus_off_a_run_request_counts_only_once_it_has_been_withdrawn) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    ASSERT_FALSE(hal.open);
+    hal.can_status.state = HAL_CAN_BUS_OFF;
+    periods(500);
+    EXPECT_EQ(hal.rejoins, 1u);
+    hal.can_status.state = HAL_CAN_ERROR_ACTIVE;
+    for (int k = 0; k < 15; k++) { // a sender that simply continues
+        command(COMMAND_RUN);
+        periods(400);
+    }
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_COMMAND_TIMEOUT);
+    command(COMMAND_OFF);
+    command(COMMAND_CLEAR_FAULT);
+    periods(10);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    command(COMMAND_RUN);
+    periods(10);
+    EXPECT_FALSE(hal.open);
+}
+
+TEST_F(Drive, error_counters_are_reported) {
+    hal.can_status = {.state = HAL_CAN_ERROR_PASSIVE, .transmit_errors = 200, .receive_errors = 17};
+    periods(4040);
+    drive_bus_state_t state{};
+    for (const hal_can_frame_t &sent : hal.from_drive) {
+        if (sent.identifier == DRIVE_BUS_STATE_FRAME_ID) {
+            drive_bus_state_unpack(&state, sent.data, sent.length);
+        }
+    }
+    EXPECT_EQ(state.bus_state, BUS_STATE_ERROR_PASSIVE);
+    EXPECT_EQ(state.transmit_error_counter, 200);
+    EXPECT_EQ(state.receive_error_counter, 17);
+    EXPECT_EQ(state.bus_off_count, 0);
+    EXPECT_EQ(hal.rejoins, 0u);
+}
+
+TEST_F(Drive, a_frame_of_another_node_with_an_identifier_of_the_drive_is_a_fault_until_a_second_without) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    ASSERT_FALSE(hal.open);
+    hal_can_frame_t foreign{};
+    foreign.identifier = DRIVE_MOTION_FRAME_ID;
+    foreign.length = 8;
+    hal.to_drive.push_back(foreign);
+    periods(4); // background, deferred check, control interrupt
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_IDENTIFIER_CONFLICT);
+    EXPECT_EQ(drive.comms.bus.foreign_count, 1);
+    const auto clear = [this] {
+        command(COMMAND_OFF);
+        command(COMMAND_CLEAR_FAULT);
+        periods(10);
+        return drive.control.state_machine.state;
+    };
+    periods(1000000 / 25 - 100);
+    EXPECT_EQ(clear(), DRIVE_STATE_FAULT) << "its cause has not gone";
+    periods(200);
+    EXPECT_EQ(clear(), DRIVE_STATE_READY);
+}
+
+TEST_F(Drive, no_other_identifier_length_or_flag_is_an_identifier_conflict_or_changes_the_state) {
+    const std::vector<uint32_t> for_drive = {DRIVE_COMMAND_FRAME_ID, DRIVE_TORQUE_COMMAND_FRAME_ID,
+                                             DRIVE_PARAMETER_REQUEST_FRAME_ID};
+    std::vector<uint32_t> own = {DRIVE_PARAMETER_RESPONSE_FRAME_ID};
+    for (const auto &message : drive_telemetry_messages) {
+        own.push_back(message.identifier);
+    }
+    const auto contains = [](const std::vector<uint32_t> &list, uint32_t identifier) {
+        return std::find(list.begin(), list.end(), identifier) != list.end();
+    };
+    periods(100);
+    const control_parameters_t parameters = drive.control_parameters;
+    const parameters_t table = drive.parameters;
+    std::mt19937 random(20261122);
+    // All frames are received by the background of one period, which is all that sees them.
+    const auto receive = [&](hal_can_frame_t frame) {
+        for (uint8_t &byte : frame.data) {
+            byte = static_cast<uint8_t>(random());
+        }
+        hal.to_drive.push_back(frame);
+        if (hal.to_drive.size() == COMMS_FRAMES_PER_CALL) {
+            drive_background(&drive);
+            ASSERT_TRUE(hal.to_drive.empty());
+        }
+    };
+    unsigned foreign = 0;
+    for (const bool extended : {false, true}) {
+        for (const bool remote : {false, true}) {
+            for (uint32_t identifier = 0; identifier < 0x800; identifier++) {
+                for (uint8_t length = 0; length < 16; length++) {
+                    if (!extended && !remote && contains(own, identifier)) {
+                        continue; // they are a conflict: below
+                    }
+                    receive({identifier, extended, remote, length, {}});
+                }
+            }
+        }
+    }
+    for (int i = 0; i < 1000000; i++) {
+        receive({uint32_t(random()) & 0x1FFFFFFFu, true, random() % 8 == 0, uint8_t(random() % 16), {}});
+    }
+    EXPECT_EQ(drive.comms.bus.foreign_count, 0);
+    periods(10);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.command.request, COMMAND_OFF);
+    EXPECT_EQ(std::memcmp(&drive.control_parameters, &parameters, sizeof parameters), 0);
+    EXPECT_EQ(std::memcmp(drive.parameters.values, table.values, sizeof table.values), 0);
+    EXPECT_EQ(drive.comms.commands.counters.accepted, 0);
+    // Each identifier of the drive, whatever its length, and none of the remote or extended frames of it.
+    for (const uint32_t identifier : own) {
+        ASSERT_FALSE(contains(for_drive, identifier));
+        for (uint8_t length = 0; length < 16; length++) {
+            receive({identifier, false, false, length, {}});
+            foreign++;
+        }
+    }
+    periods(10);
+    EXPECT_EQ(drive.comms.bus.foreign_count, foreign);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_IDENTIFIER_CONFLICT);
 }
 
 } // namespace

@@ -63,6 +63,12 @@ bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     hal->mailboxes.push_back(*frame);
     return true;
 }
+
+void hal_can_status(const hal_t *, hal_can_status_t *status) {
+    *status = {};
+}
+
+void hal_can_rejoin(hal_t *) {}
 }
 
 namespace {
@@ -140,6 +146,7 @@ TEST_F(Comms, frames_come_at_their_rates) {
     EXPECT_EQ(bus.count(DRIVE_BUS_COUNTERS_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_PROCESSOR_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_DEFERRED_FRAME_ID), 11u);
+    EXPECT_EQ(bus.count(DRIVE_BUS_STATE_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_IDENTITY_FRAME_ID), 10u);
     EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 0u);
     EXPECT_EQ(bus.count(DRIVE_FAULT_MASK_FRAME_ID), 0u);
@@ -275,7 +282,7 @@ TEST_F(Comms, a_fault_is_reported_with_the_next_cycle_and_every_100_ms) {
             EXPECT_EQ(mask.over_current, 1);
             EXPECT_EQ(mask.encoder, 1);
             EXPECT_EQ(mask.over_voltage + mask.under_voltage + mask.over_speed + mask.command_timeout +
-                          mask.interrupt_overrun,
+                          mask.interrupt_overrun + mask.identifier_conflict,
                       0);
         }
     }
@@ -314,9 +321,9 @@ TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
 }
 
 TEST_F(Comms, dropped_frames_are_counted_exactly) {
-    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 2 counters + PROCESSOR + DEFERRED + identity + heartbeat
+    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 5 of group counters + identity + heartbeat
     const unsigned waiting = unsigned(bus.mailboxes.size()) + comms.telemetry.queue.count;
-    EXPECT_EQ(comms.telemetry.dropped + waiting, 426u);
+    EXPECT_EQ(comms.telemetry.dropped + waiting, 427u);
 }
 
 TEST_F(Comms, others_above_the_heartbeat_cannot_block_telemetry) {

@@ -45,7 +45,8 @@ class SocketCan : public testing::Test {
             uint64_t time_ns = 0;
             std::memcpy(&time_ns, frame.data, 6);
             if (identifier == RIG_STAMP_FRAME_ID) {
-                if (frame.data[6] == RIG_STAMP_SUBJECT_NEXT_CHOICE) {
+                if (frame.data[6] == RIG_STAMP_SUBJECT_NEXT_CHOICE ||
+                    frame.data[6] == RIG_STAMP_SUBJECT_NEXT_OF_ANY_NODE_CHOICE) {
                     next_ns = time_ns;
                 } else if (frame.data[6] == RIG_STAMP_SUBJECT_OLDEST_ON_BUS_CHOICE) {
                     result.emplace_back(time_ns, sent_on_bus.at(on_bus++));
@@ -81,6 +82,25 @@ TEST_F(SocketCan, TimestampsGiveTheSameListAsTheLocalBus) {
     }
     EXPECT_EQ(here, there);
     EXPECT_GT(here.size(), 30u);
+}
+
+TEST_F(SocketCan, FramesOfABabblingNodeAreSentWithTheirTime) {
+    const uint8_t babble_load_percent = 46;
+    send(RIG_SET_FRAME_ID | CAN_EFF_FLAG, {babble_load_percent, 0x10, 0x27, 0, 0, 0, 0, 0}); // 100 %
+    send(0x100, {1, 2});
+    run_until(10 * MS);
+    unsigned babbled = 0;
+    uint64_t last_ns = 0;
+    for (const auto &[time_ns, identifier] : timed({0x100}, {RIG_SET_FRAME_ID, RIG_RUN_UNTIL_FRAME_ID})) {
+        if (identifier == 0) {
+            EXPECT_GT(time_ns, last_ns);
+            last_ns = time_ns;
+            ++babbled;
+        } else {
+            EXPECT_NE(identifier, 0x100u) << "has no time: it does not win arbitration";
+        }
+    }
+    EXPECT_NEAR(babbled, 10000 / 140, 8); // with many stuff bits: zeros
 }
 
 TEST_F(SocketCan, InterfaceThatGoesAwayEndsTheRig) {

@@ -162,6 +162,7 @@ class RigBench {
     RigBench(transport_t *other, const char *pace) : transport(other) { init(pace, RIG_NEVER); }
 
     ~RigBench() {
+        rig_close(rig.get());
         transport_close(transport);
         if (!folder_.empty()) {
             std::filesystem::remove_all(folder_);

@@ -1,7 +1,8 @@
 """Frames with their exact virtual time, from either transport.
 
 The local bus carries the time in every record. SocketCAN carries none; there the emulator sends RIG_STAMP frames:
-before each of its frames one with the subject "next", and, when a client's frame (which is on the interface already)
+before each of its frames one with the subject "next", before a frame of another node of the
+emulated bus one with the subject "next_of_any_node", and, when a client's frame (which is on the interface already)
 completes on the emulated bus or is accepted without it, one with the subject "oldest_on_bus" or "oldest_at_once". The
 reader joins frame and stamp and removes the stamps, so both transports yield the same list of (time, frame), in the
 same order.
@@ -54,6 +55,7 @@ class VirtualTimeReader:
         self._rig_sends = _sent_by(rig_database(), "RIG")
         self._stamped = not hasattr(bus, "receive_own_messages")  # SocketCAN
         self._next_ns: int | None = None
+        self._next_of_any = False
         self._waiting_on_bus: deque[can.Message] = deque()
         self._waiting_at_once: deque[can.Message] = deque()
 
@@ -73,15 +75,15 @@ class VirtualTimeReader:
         identifier = message.arbitration_id
         if message.is_extended_id and identifier == RIG_STAMP_ID and len(message.data) == 7:
             time_ns, subject = clock_of(message)
-            if subject == _SUBJECTS["next"]:
-                self._next_ns = time_ns
+            if subject in (_SUBJECTS["next"], _SUBJECTS["next_of_any_node"]):
+                self._next_ns, self._next_of_any = time_ns, subject != _SUBJECTS["next"]
                 return None
             waiting = self._waiting_on_bus if subject == _SUBJECTS["oldest_on_bus"] else self._waiting_at_once
             # Nothing waits when the frame preceded this reader on the interface.
             return _timed(time_ns, waiting.popleft()) if waiting else None
         if message.is_extended_id and identifier == RIG_CLOCK_ID and len(message.data) == 7:
             return _timed(clock_of(message)[0], message)
-        if self._next_ns is not None and self._is_emulators(message):
+        if self._next_ns is not None and (self._next_of_any or self._is_emulators(message)):
             time_ns, self._next_ns = self._next_ns, None
             return _timed(time_ns, message)
         (self._waiting_on_bus if is_on_bus(message) else self._waiting_at_once).append(message)

@@ -1,0 +1,25 @@
+#include "rig/can_faults.h"
+
+#define STREAM UINT64_C(0x63616E5F66617565) /* distinguishes this stream from that of the sensors' noise */
+
+void can_faults_init(can_faults_t *faults, uint64_t seed) {
+    *faults = (can_faults_t){.fault = CAN_FAULT_NONE, .per_mille = 1000, .random_state = seed ^ STREAM};
+}
+
+uint32_t can_faults_random(can_faults_t *faults, uint32_t limit) {
+    /* splitmix64, as in plant/sensors.c */
+    uint64_t bits = faults->random_state += UINT64_C(0x9E3779B97F4A7C15);
+    bits = (bits ^ (bits >> 30)) * UINT64_C(0xBF58476D1CE4E5B9);
+    bits = (bits ^ (bits >> 27)) * UINT64_C(0x94D049BB133111EB);
+    bits ^= bits >> 31;
+    return (uint32_t)((bits >> 32) * limit >> 32);
+}
+
+can_fault_t can_faults_draw(can_faults_t *faults, bool from_drive) {
+    if (faults->fault == CAN_FAULT_NONE || (faults->sender == CAN_FAULT_OF_DRIVE && !from_drive) ||
+        (faults->sender == CAN_FAULT_OF_OTHERS && from_drive)) {
+        return CAN_FAULT_NONE;
+    }
+    const uint32_t number = can_faults_random(faults, 1000 * 1000);
+    return number < faults->per_mille * 1000 ? faults->fault : CAN_FAULT_NONE;
+}
