@@ -22,6 +22,10 @@ static void configure(drive_t *drive) {
     drive->applied_revision = drive->parameters.revision;
 }
 
+static uint32_t inhibit_mask(const drive_t *drive) {
+    return drive->store.inhibited ? (uint32_t)FAULT_BIT(FAULT_PARAMETER_MEMORY) : 0;
+}
+
 COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     const uint32_t clock_hz = hal_pwm_clock_hz(hal);
     if (!configure_rate_allowed(config->control_rate_hz, clock_hz) ||
@@ -35,9 +39,12 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     };
     parameters_init(&drive->parameters);
     parameters_set_controller(&drive->parameters, (int32_t)config->controller);
+    nvm_store_init(&drive->store, hal, &drive->parameters);
     comms_init(&drive->comms, hal_time_us(hal));
+    drive->comms.store = &drive->store;
     configure(drive);
     control_reset(&drive->control_parameters, &drive->control);
+    drive->control.state_machine.background_inhibit_mask = inhibit_mask(drive);
     hal_pwm_open_all(hal);
     hal_pwm_start(hal, drive->control_parameters.period_ticks);
     return true;
@@ -152,9 +159,28 @@ COLD static void take_command(drive_t *drive) {
     }
 }
 
+/* Log of faults and storing of parameters. No operation of the memory in RUN, nor when the next control interrupt may
+ * enter it: a command to run has been handed over. */
+static void keep_memory(drive_t *drive, uint32_t time_us) {
+    const drive_state_t state = drive->control.state_machine.state;
+    if (state == DRIVE_STATE_FAULT) {
+        hal_critical_enter(drive->hal);
+        const fault_record_t record = drive->control.state_machine.record;
+        hal_critical_leave(drive->hal);
+        nvm_store_follow_fault(&drive->store, record.fault == FAULT_NONE ? NULL : &record);
+    } else {
+        nvm_store_follow_fault(&drive->store, NULL);
+    }
+    const bool writable =
+        state == DRIVE_STATE_FAULT || (state != DRIVE_STATE_RUN && drive->command.request != COMMAND_RUN);
+    nvm_store_step(&drive->store, drive->hal, &drive->parameters, time_us, writable);
+    drive->control.state_machine.background_inhibit_mask = inhibit_mask(drive);
+}
+
 COLD void drive_background(drive_t *drive) {
     const uint32_t time_us = hal_time_us(drive->hal);
     check_slowly(drive, time_us);
+    keep_memory(drive, time_us);
     if (comms_telemetry_due(&drive->comms, time_us)) {
         bus_monitor_step(&drive->comms.bus, drive->hal, time_us);
         drive_telemetry_t values;

@@ -8,6 +8,7 @@
 #include "comms/comms.h"
 #include "drive/configure.h"
 #include "drive/control.h"
+#include "drive/nvm_store.h"
 #include "drive/parameters.h"
 #include "drive/stall_monitor.h"
 #include "drive/sto_monitor.h"
@@ -40,6 +41,7 @@ typedef struct {
     sto_monitor_t sto;
     stall_monitor_t stall;
     comms_t comms;
+    nvm_store_t store;
 } drive_t;
 
 /* Prepares the drive and starts the timer. Returns false, and starts nothing, for a control rate that the timer's

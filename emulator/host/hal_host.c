@@ -7,6 +7,7 @@
 #include "hal_can.h"
 #include "hal_encoder.h"
 #include "hal_interrupt.h"
+#include "hal_nvm.h"
 #include "hal_pwm.h"
 #include "hal_time.h"
 #include "plant/pwm_timer.h"
@@ -122,8 +123,32 @@ void hal_can_rejoin(hal_t *hal) {
     board_can_rejoin(hal->board);
 }
 
+/* Flash stalls the interrupts: the firmware must not operate it while they are masked. */
+static void require_unmasked(const hal_t *hal, const char *function) {
+    require(hal, false, function);
+    if (hal->board->in_critical_section) {
+        fprintf(stderr, "salient: firmware called %s in a critical section\n", function);
+        abort();
+    }
+}
+
+uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word) {
+    require(hal, false, __func__);
+    return nvm_read(&hal->board->nvm, page, word);
+}
+
+bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value) {
+    require_unmasked(hal, __func__);
+    return nvm_program(&hal->board->nvm, page, word, value);
+}
+
+bool hal_nvm_erase(hal_t *hal, unsigned page) {
+    require_unmasked(hal, __func__);
+    return nvm_erase(&hal->board->nvm, page);
+}
+
 uint32_t hal_time_us(const hal_t *hal) {
-    return (uint32_t)(hal->board->time_ns / 1000);
+    return (uint32_t)((hal->board->time_ns - hal->board->start_ns) / 1000);
 }
 
 /* One thread: the interrupt cannot interrupt the background. Only the pairing of the calls is checked. */

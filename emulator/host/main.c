@@ -13,6 +13,8 @@ static_assert((int)DRIVE_CONTROLLER_TRADITIONAL == OPTIONS_CONTROLLER_TRADITIONA
 /* Large: static. */
 static simulation_t simulation;
 static drive_t drive;
+static hal_t hal = {.board = &simulation.rig.board};
+static drive_config_t drive_config;
 machine_tables_t machine_tables;
 
 static void control_interrupt(void *context) {
@@ -25,6 +27,10 @@ static void deferred_interrupt(void *context) {
 
 static void background(void *context) {
     drive_background(context);
+}
+
+static void restart(void *context) {
+    drive_init(context, &hal, &drive_config); /* with the configuration of the start, which it accepted */
 }
 
 int main(int argc, char *argv[]) {
@@ -40,8 +46,7 @@ int main(int argc, char *argv[]) {
         simulation_close(&simulation);
         return EXIT_USAGE;
     }
-    hal_t hal = {.board = &simulation.rig.board};
-    const drive_config_t drive_config = {
+    drive_config = (drive_config_t){
         .control_rate_hz = options.control_rate_hz,
         .controller = (drive_controller_t)options.controller_index,
     };
@@ -49,6 +54,7 @@ int main(int argc, char *argv[]) {
         simulation_run(&simulation, &(rig_firmware_t){.control_interrupt = control_interrupt,
                                                       .deferred_interrupt = deferred_interrupt,
                                                       .background = background,
+                                                      .restart = restart,
                                                       .context = &drive});
     } else {
         simulation_rejected(&simulation);

@@ -12,6 +12,7 @@
 
 #include "host/output.h"
 
+#define MEMORY_OPTION "--memory"
 #define SWITCHES_OPTION "--record-switches"
 #define RAD_PER_DEG (3.14159265358979323846 / 180.0)
 
@@ -81,6 +82,31 @@ static void print_ready(const options_t *options, const char *machine) {
     fflush(stdout);
 }
 
+/* Content of the drive's memory; that of a file that does not exist yet is erased. */
+static bool read_memory(nvm_t *nvm, const char *path) {
+    FILE *file = fopen(path, "rb");
+    if (!file) {
+        if (errno == ENOENT) {
+            return true;
+        }
+        fprintf(stderr, "salient: %s %s: %s\n", MEMORY_OPTION, path, strerror(errno));
+        return false;
+    }
+    const size_t size = fread(nvm->word, 1, sizeof nvm->word, file);
+    const bool whole = size == sizeof nvm->word && fgetc(file) == EOF;
+    fclose(file);
+    if (!whole) {
+        fprintf(stderr, "salient: %s %s: not the memory of a drive, %zu bytes\n", MEMORY_OPTION, path,
+                sizeof nvm->word);
+    }
+    return whole;
+}
+
+static bool write_memory(const nvm_t *nvm, const char *path) {
+    FILE *file = output_open(MEMORY_OPTION, path);
+    return file && (fwrite(nvm->word, sizeof nvm->word, 1, file), output_close(file, MEMORY_OPTION, path));
+}
+
 /* Opens everything but the image. */
 static bool open_bench(simulation_t *simulation, const options_t *options) {
     simulation->options = options;
@@ -89,6 +115,10 @@ static bool open_bench(simulation_t *simulation, const options_t *options) {
     simulation->recorder = (recorder_t){0};
     if (!stop_init(&simulation->stop, options->follow_stdin)) {
         fprintf(stderr, "salient: signals: %s\n", strerror(errno));
+        return false;
+    }
+    nvm_init(&simulation->memory);
+    if (options->memory && !read_memory(&simulation->memory, options->memory)) {
         return false;
     }
     char error[TRANSPORT_ERROR_SIZE];
@@ -127,6 +157,7 @@ static bool open_bench(simulation_t *simulation, const options_t *options) {
         .transport = transport,
     };
     rig_init(&simulation->rig, &config);
+    memcpy(simulation->rig.board.nvm.word, simulation->memory.word, sizeof simulation->memory.word);
     if (options->record) {
         plant_observe(&simulation->rig.plant, options->record_from_us * 1000, options->record_step_ns, recorder_sample,
                       &simulation->recorder);
@@ -163,11 +194,17 @@ static void background(void *context) {
     simulation->firmware.background(simulation->firmware.context);
 }
 
+static void restart(void *context) {
+    simulation_t *simulation = context;
+    simulation->firmware.restart(simulation->firmware.context);
+}
+
 void simulation_run(simulation_t *simulation, const rig_firmware_t *firmware) {
     simulation->firmware = *firmware;
     rig_join(&simulation->rig, &(rig_firmware_t){.control_interrupt = control_interrupt,
                                                  .deferred_interrupt = deferred_interrupt,
                                                  .background = background,
+                                                 .restart = firmware->restart ? restart : NULL,
                                                  .context = simulation});
     print_ready(simulation->options, simulation->image.machine.name);
     while (rig_serve(&simulation->rig, -1)) {
@@ -199,6 +236,9 @@ int simulation_close(simulation_t *simulation) {
         simulation->exit_code = EXIT_USAGE;
     }
     rig_close(&simulation->rig);
+    if (simulation->options->memory && !write_memory(&simulation->rig.board.nvm, simulation->options->memory)) {
+        simulation->exit_code = EXIT_USAGE;
+    }
     transport_close(simulation->rig.config.transport);
     machine_image_close(&simulation->image);
     return simulation->exit_code;

@@ -23,6 +23,7 @@ typedef struct {
     machine_image_t image;
     const options_t *options;
     recorder_t recorder;
+    nvm_t memory; /* as read from the file of --memory */
     rig_stop_t stop;
     rig_firmware_t firmware;
     /* Rows of hal_pwm_compare_t: row n acts in the control period that starts at n + 1 periods, when no trigger was

@@ -11,6 +11,7 @@
 #include <ucontext.h>
 
 #include "hal_interrupt.h"
+#include "hal_nvm.h"
 #include "hal_time.h"
 #include "host/hal_host.h"
 #include "host/simulation.h"
@@ -66,12 +67,19 @@ static void background(void *context) {
     deliver_event(MAILBOX_BACKGROUND);
 }
 
+static void restart(void *context) {
+    (void)context;
+    mailbox->missed_triggers = 0;
+    deliver_event(MAILBOX_RESET); /* until MAILBOX_STARTED */
+}
+
 static void run_rig(void) {
     if (rejected) {
         simulation_rejected(&simulation);
     } else {
-        simulation_run(&simulation,
-                       &(rig_firmware_t){.control_interrupt = control_interrupt, .background = background});
+        simulation_run(&simulation, &(rig_firmware_t){.control_interrupt = control_interrupt,
+                                                      .background = background,
+                                                      .restart = mailbox->timed ? NULL : restart});
     }
     mailbox->exit_code = (uint32_t)simulation_close(&simulation);
     mailbox->event = MAILBOX_EXIT;
@@ -176,6 +184,19 @@ void cosimulation_serve(void) {
         break;
     case MAILBOX_CAN_TRANSMIT:
         mailbox->accepted = hal_can_transmit(&host, &mailbox->frame);
+        break;
+    case MAILBOX_NVM_READ: {
+        const uint64_t value = hal_nvm_read(&host, mailbox->nvm_page, mailbox->nvm_word);
+        mailbox->nvm_value[0] = (uint32_t)value;
+        mailbox->nvm_value[1] = (uint32_t)(value >> 32);
+        break;
+    }
+    case MAILBOX_NVM_PROGRAM:
+        mailbox->accepted = hal_nvm_program(&host, mailbox->nvm_page, mailbox->nvm_word,
+                                            (uint64_t)mailbox->nvm_value[1] << 32 | mailbox->nvm_value[0]);
+        break;
+    case MAILBOX_NVM_ERASE:
+        mailbox->accepted = hal_nvm_erase(&host, mailbox->nvm_page);
         break;
     default:
         fprintf(stderr, "salient: the drive sent the unknown command %u\n", (unsigned)mailbox->doorbell);

@@ -11,6 +11,7 @@ void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *b
     board->bus = bus;
     board->sto_energised[0] = board->sto_energised[1] = true;
     plant_set_trip(plant, plant->machine->trip_current_A);
+    nvm_init(&board->nvm);
 }
 
 /* --- Gate path: acts without the firmware --- */
@@ -57,6 +58,22 @@ static void drive_gates(board_t *board, bool busy) {
     } else {
         plant_open_all(board->plant);
     }
+}
+
+void board_reset(board_t *board) {
+    board_pwm_open_all(board);
+    board->start_ns = board->time_ns;
+    board->context = BOARD_START;
+    board->in_critical_section = false;
+    board->deferred_requested = false;
+    board->period_ticks = 0;
+    board->missed_triggers = 0;
+    board->periods_unrenewed = 0;
+    board_pwm_clear_break(board);
+    board->interrupt_took_ns = 0;
+    board->received_popped = board->received_pushed;
+    board->receive_overflows = 0;
+    nvm_power_on(&board->nvm);
 }
 
 void board_start_period(board_t *board, bool busy) {

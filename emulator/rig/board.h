@@ -15,6 +15,7 @@
 #include "plant/plant.h"
 #include "plant/sensors.h"
 #include "rig/can_bus.h"
+#include "rig/nvm.h"
 
 #define BOARD_STO_LINES 2
 
@@ -23,6 +24,7 @@ typedef enum { BOARD_START, BOARD_INTERRUPT, BOARD_DEFERRED, BOARD_BACKGROUND } 
 
 typedef struct {
     uint64_t time_ns;
+    uint64_t start_ns; /* of the drive, at its last reset */
     board_context_t context;
     bool in_critical_section;
     bool deferred_requested; /* by the control interrupt: the rig calls the deferred interrupt after it */
@@ -47,6 +49,8 @@ typedef struct {
     uint32_t received_pushed, received_popped; /* counts, not indices */
     uint32_t receive_overflows;
 
+    nvm_t nvm; /* keeps its content in a reset */
+
     plant_t *plant;
     sensors_t *sensors;
     can_bus_t *bus;
@@ -56,6 +60,10 @@ typedef struct {
  * resolutions of `sensors`, comparators of the machine.
  * Plant, sensors and bus are used, not owned. */
 void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus);
+
+/* For the rig: a reset of the drive, or power that returns. Timer stopped, switches open, what was received is lost;
+ * frames in the transmit mailboxes still leave. */
+void board_reset(board_t *board);
 
 /* For the rig: starts a control period at the time of the plant. Latches the sensors and activates the buffered compare
  * values. While the interrupt is still running (`busy`), the trigger is missed and counted, and the values that the

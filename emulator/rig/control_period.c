@@ -25,6 +25,14 @@ static void call(rig_t *rig, board_context_t context, void (*function)(void *)) 
     function(rig->firmware.context);
 }
 
+/* A drive that lost its power at an operation of its memory starts again. */
+static void call_background(rig_t *rig) {
+    call(rig, BOARD_BACKGROUND, rig->firmware.background);
+    if (rig->board.nvm.power_lost) {
+        rig_reset_drive(rig);
+    }
+}
+
 /* A deferred interrupt that waits for the end of the control interrupt precedes a control interrupt triggered at that
  * instant. */
 static void call_deferred(rig_t *rig) {
@@ -56,7 +64,7 @@ void control_period_start_event(void *context, uint64_t now_ns) {
     call(rig, BOARD_INTERRUPT, rig->firmware.control_interrupt);
     if (rig->board.interrupt_took_ns == 0) {
         call_deferred(rig);
-        call(rig, BOARD_BACKGROUND, rig->firmware.background);
+        call_background(rig);
     } else {
         /* When that is the start of the next period, the interrupt comes first and postpones the background again. */
         rig->interrupt_end_ns = rig->scheduler.due_ns[EVENT_BACKGROUND] = now_ns + rig->board.interrupt_took_ns;
@@ -69,6 +77,6 @@ void control_period_background_event(void *context, uint64_t now_ns) {
     rig->scheduler.due_ns[EVENT_BACKGROUND] = SCHEDULER_NEVER;
     plant_advance(&rig->plant, now_ns);
     call_deferred(rig);
-    call(rig, BOARD_BACKGROUND, rig->firmware.background);
+    call_background(rig);
     bus_start(rig);
 }

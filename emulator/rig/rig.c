@@ -27,6 +27,7 @@ void rig_init(rig_t *rig, const rig_config_t *config) {
     can_bus_init(&rig->bus, config->bit_rate, config->seed);
     board_init(&rig->board, &rig->plant, &rig->sensors, &rig->bus);
     rig->board.immediate_pwm = config->immediate_pwm;
+    rig->board.nvm.random = config->seed;
     rig->config = *config;
     rig->firmware = (rig_firmware_t){0};
     scheduler_init(&rig->scheduler, &rig->board.time_ns, handlers, rig);
@@ -41,6 +42,20 @@ void rig_init(rig_t *rig, const rig_config_t *config) {
 void rig_join(rig_t *rig, const rig_firmware_t *firmware) {
     rig->firmware = *firmware;
     control_period_begin(rig);
+}
+
+bool rig_reset_drive(rig_t *rig) {
+    if (!rig->firmware.restart) {
+        return false;
+    }
+    plant_advance(&rig->plant, rig->board.time_ns);
+    board_reset(&rig->board);
+    rig->interrupt_end_ns = 0;
+    rig->scheduler.due_ns[EVENT_CONTROL] = rig->scheduler.due_ns[EVENT_CURRENT_HOLD] =
+        rig->scheduler.due_ns[EVENT_BACKGROUND] = SCHEDULER_NEVER;
+    rig->firmware.restart(rig->firmware.context);
+    control_period_begin(rig);
+    return true;
 }
 
 void rig_busy_until(rig_t *rig, uint64_t time_ns) {

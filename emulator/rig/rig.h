@@ -39,6 +39,7 @@ typedef struct {
     void (*control_interrupt)(void *context);  /* at the start of each control period */
     void (*deferred_interrupt)(void *context); /* after a control interrupt that has set board.deferred_requested */
     void (*background)(void *context);         /* after each control interrupt and the deferred one */
+    void (*restart)(void *context);            /* from its start on, after board_reset; NULL: it cannot be reset */
     void *context;
 } rig_firmware_t;
 
@@ -111,6 +112,10 @@ void rig_init(rig_t *rig, const rig_config_t *config);
 
 /* Joins the firmware, which must have started the timer (hal_pwm_start); its first interrupt is one period away. */
 void rig_join(rig_t *rig, const rig_firmware_t *firmware);
+
+/* Resets the drive: the switches open, the firmware starts again, the memory and everything outside the drive continue.
+ * False when the firmware cannot be reset. */
+bool rig_reset_drive(rig_t *rig);
 
 /* The processor serves no trigger of a control interrupt before time_ns: they are lost, like those during an
  * interrupt. */

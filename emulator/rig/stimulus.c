@@ -52,6 +52,21 @@ static void set_current_sensor_delay(rig_t *rig, double delay_us) {
     control_period_schedule_hold(rig);
 }
 
+/* Without effect on a firmware that cannot be reset: stimulus_receive rejects it. */
+static void reset_drive(rig_t *rig, double reset) {
+    if (reset > 0.0) {
+        rig_reset_drive(rig);
+    }
+}
+
+static void set_memory_cut_operation(rig_t *rig, double operation) {
+    rig->board.nvm.cut_after = (uint32_t)operation;
+}
+
+static void set_memory_cut_kind(rig_t *rig, double kind) {
+    rig->board.nvm.cut_kind = (nvm_cut_t)kind;
+}
+
 /* On multiples of the period, so that two logs of one bench have the same instants. */
 static void set_truth_period(rig_t *rig, double period_us) {
     const uint64_t period_ns = rig->truth_period_ns = (uint64_t)period_us * NS_PER_US;
@@ -119,6 +134,9 @@ static const target_t targets[BENCH_VARIABLE_COUNT] = {
     [BENCH_VARIABLE_HELD_SPEED_RPM] = {.set = dynamometer_set_speed},
     [BENCH_VARIABLE_STO_1] = {.set = set_sto_1},
     [BENCH_VARIABLE_STO_2] = {.set = set_sto_2},
+    [BENCH_VARIABLE_DRIVE_RESET] = {.set = reset_drive},
+    [BENCH_VARIABLE_MEMORY_CUT_OPERATION] = {.set = set_memory_cut_operation},
+    [BENCH_VARIABLE_MEMORY_CUT_KIND] = {.set = set_memory_cut_kind},
     [BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM] = {.set = load_set_torque},
     [BENCH_VARIABLE_LOAD_RAMP_COARSE_NM_S] = {.set = load_set_ramp},
     [BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM] = {.set = load_set_sine_amplitude},
@@ -165,7 +183,9 @@ stimulus_reply_t stimulus_receive(rig_t *rig, const uint8_t *data) {
     rig_set_unpack(&message, data, RIG_SET_LENGTH);
     stimulus_reply_t reply = {
         .variable = message.quantity, .status = RIG_SET_REPLY_STATUS_DONE_CHOICE, .at_us = message.at_us};
-    if (message.quantity >= BENCH_VARIABLE_COUNT || !bench_variables[message.quantity].name) {
+    const bool resets = message.quantity == BENCH_VARIABLE_DRIVE_RESET;
+    if (message.quantity >= BENCH_VARIABLE_COUNT || !bench_variables[message.quantity].name ||
+        (resets && !rig->firmware.restart)) {
         reply.status = RIG_SET_REPLY_STATUS_NO_SUCH_QUANTITY_CHOICE;
         return reply;
     }

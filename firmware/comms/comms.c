@@ -1,5 +1,6 @@
 #include "comms/comms.h"
 
+#include "comms/memory_protocol.h"
 #include "comms/parameter_protocol.h"
 
 #define US_PER_MS 1000u
@@ -31,7 +32,9 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, bool w
             return true;
         case COMMANDS_PARAMETER_REQUEST: {
             hal_can_frame_t response;
-            parameter_protocol_respond(parameters, writable, &frame, &response);
+            if (!memory_protocol_respond(comms->store, hal, parameters, writable, &frame, &response)) {
+                parameter_protocol_respond(parameters, writable, &frame, &response);
+            }
             frame_queue_push(&comms->responses, &response);
             break;
         }

@@ -22,6 +22,7 @@
 #include "comms/commands.h"
 #include "comms/frame_queue.h"
 #include "comms/telemetry.h"
+#include "drive/nvm_store.h"
 #include "drive/parameters.h"
 #include "hal_can.h"
 
@@ -35,6 +36,7 @@ typedef struct {
     telemetry_t telemetry;
     frame_queue_t responses; /* to parameter requests */
     command_t command;       /* last accepted command */
+    nvm_store_t *store;      /* set by the caller after comms_init */
 } comms_t;
 
 /* The first telemetry cycle is due at time_us. */

@@ -26,7 +26,7 @@ void parameter_protocol_respond(parameters_t *parameters, bool writable, const h
     struct drive_parameter_response_t response = {
         .operation = request.operation, .index = request.index, .part = request.part, .status = PARAMETER_STATUS_DONE};
 
-    if (request.operation >= PARAMETER_OPERATION_COUNT) {
+    if (request.operation > PARAMETER_OPERATION_UNIT) {
         response.status = PARAMETER_STATUS_UNKNOWN_OPERATION;
     } else if (request.index >= PARAMETER_COUNT) {
         response.status = PARAMETER_STATUS_NO_SUCH_PARAMETER;

@@ -1,8 +1,11 @@
 #include "drive/parameters.h"
 
 #include <assert.h>
+#include <string.h>
 
 #include "control/machine_tables.h"
+#include "fixed/compiler.h"
+#include "fixed/crc32.h"
 #include "fixed/fixed.h"
 
 #define Q FIXED_CONSTANT
@@ -72,6 +75,28 @@ parameter_status_t parameters_set(parameters_t *parameters, unsigned index, int3
     parameters->values[index] = value;
     parameters->revision++;
     return PARAMETER_STATUS_DONE;
+}
+
+bool parameters_restore(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]) {
+    for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+        if (values[i] < rows[i].minimum || values[i] > rows[i].maximum) {
+            return false;
+        }
+    }
+    memcpy(parameters->values, values, sizeof parameters->values);
+    parameters->revision++;
+    return true;
+}
+
+void parameters_restore_defaults(parameters_t *parameters) {
+    for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+        parameters->values[i] = parameters_default(parameters, i);
+    }
+    parameters->revision++;
+}
+
+COLD uint32_t parameters_identity(void) {
+    return crc32_continue(crc32_continue(0, texts, sizeof texts), rows, sizeof rows);
 }
 
 parameter_status_t parameters_get(const parameters_t *parameters, unsigned index, int32_t *value) {

@@ -6,6 +6,7 @@
 #ifndef DRIVE_PARAMETERS_H
 #define DRIVE_PARAMETERS_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "drive_enumerations.h"
@@ -52,6 +53,15 @@ int32_t parameters_default(const parameters_t *parameters, unsigned index);
 /* Writes a value: PARAMETER_STATUS_DONE, or, with nothing changed, PARAMETER_STATUS_NO_SUCH_PARAMETER or
  * PARAMETER_STATUS_OUT_OF_RANGE. */
 parameter_status_t parameters_set(parameters_t *parameters, unsigned index, int32_t value);
+
+/* Sets every value at once. False, with nothing changed, when one of them is out of range. */
+bool parameters_restore(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]);
+
+/* Sets every value to the default of this drive. */
+void parameters_restore_defaults(parameters_t *parameters);
+
+/* CRC-32 of names, units and limits: differs from that of another list. */
+uint32_t parameters_identity(void);
 
 /* Reads a value: PARAMETER_STATUS_DONE, or, with *value unchanged, PARAMETER_STATUS_NO_SUCH_PARAMETER. */
 parameter_status_t parameters_get(const parameters_t *parameters, unsigned index, int32_t *value);

@@ -31,8 +31,9 @@ bool state_machine_step(state_machine_t *state_machine, const state_machine_inpu
     }
     switch (state_machine->state) {
     case DRIVE_STATE_INITIALISE:
-        state_machine->start_inhibit_mask = (uint32_t)all_but_timeout;
-        state_machine->fault_free_ticks = all_but_timeout == 0 ? state_machine->fault_free_ticks + 1 : 0;
+        state_machine->start_inhibit_mask = (uint32_t)all_but_timeout | state_machine->background_inhibit_mask;
+        state_machine->fault_free_ticks =
+            state_machine->start_inhibit_mask == 0 ? state_machine->fault_free_ticks + 1 : 0;
         if (state_machine->fault_free_ticks >= initialise_ticks) {
             state_machine->state = DRIVE_STATE_READY;
         }

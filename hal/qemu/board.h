@@ -26,6 +26,9 @@ void board_interrupt_enable(void);
  * background it returns after the deferred interrupt that the control interrupt has requested. */
 void board_interrupt_pend(void);
 
+/* Starts the program again, with an empty stack; in the background. */
+noreturn void board_restart(void);
+
 /* Ends QEMU with an exit code, 0..255. */
 noreturn void board_exit(uint32_t code);
 

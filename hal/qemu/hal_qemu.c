@@ -1,6 +1,7 @@
 #include "qemu/hal_qemu.h"
 
 #include "hal_interrupt.h"
+#include "hal_nvm.h"
 #include "hal_time.h"
 
 /* The plugin identifies this store by the function's name: the function must be neither inlined nor cloned. */
@@ -87,6 +88,31 @@ void hal_can_status(const hal_t *hal, hal_can_status_t *status) {
 void hal_can_rejoin(hal_t *hal) {
     (void)hal;
     doorbell_ring(MAILBOX_CAN_REJOIN);
+}
+
+/* The memory belongs to the host, which keeps it in a reset; hal is not written but through the mailbox. */
+uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word) {
+    (void)hal;
+    mailbox_t *mailbox = &board.mailbox;
+    mailbox->nvm_page = page;
+    mailbox->nvm_word = word;
+    doorbell_ring(MAILBOX_NVM_READ);
+    return (uint64_t)mailbox->nvm_value[1] << 32 | mailbox->nvm_value[0];
+}
+
+bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value) {
+    hal->mailbox.nvm_page = page;
+    hal->mailbox.nvm_word = word;
+    hal->mailbox.nvm_value[0] = (uint32_t)value;
+    hal->mailbox.nvm_value[1] = (uint32_t)(value >> 32);
+    doorbell_ring(MAILBOX_NVM_PROGRAM);
+    return hal->mailbox.accepted != 0;
+}
+
+bool hal_nvm_erase(hal_t *hal, unsigned page) {
+    hal->mailbox.nvm_page = page;
+    doorbell_ring(MAILBOX_NVM_ERASE);
+    return hal->mailbox.accepted != 0;
 }
 
 uint32_t hal_time_us(const hal_t *hal) {

@@ -18,6 +18,7 @@
 #include "hal_adc.h"
 #include "hal_can.h"
 #include "hal_encoder.h"
+#include "hal_nvm.h"
 #include "hal_pwm.h"
 
 /* Changes with the structure, so that an image and a host with different layouts stop at the start. */
@@ -42,6 +43,9 @@ typedef enum {
     MAILBOX_TRIGGER,       /* takes trigger, returns an event: MAILBOX_INTERRUPT or MAILBOX_EXIT */
     MAILBOX_INTERRUPT_END, /* takes elapsed_ticks, returns an event: MAILBOX_BACKGROUND or MAILBOX_EXIT */
     MAILBOX_CAN_REJOIN,    /* requests to leave bus-off */
+    MAILBOX_NVM_READ,      /* takes nvm_page and nvm_word, returns nvm_value */
+    MAILBOX_NVM_PROGRAM,   /* takes nvm_page, nvm_word and nvm_value, returns accepted */
+    MAILBOX_NVM_ERASE,     /* takes nvm_page, returns accepted */
 } mailbox_command_t;
 
 /* Result of MAILBOX_NEXT. */
@@ -49,6 +53,7 @@ typedef enum {
     MAILBOX_INTERRUPT = 1, /* the timer requests the control interrupt */
     MAILBOX_BACKGROUND,    /* the processor has time for the background */
     MAILBOX_EXIT,          /* end of the run, with exit_code */
+    MAILBOX_RESET,         /* the drive starts again; not when `timed` */
 } mailbox_event_t;
 
 typedef struct {
@@ -86,6 +91,10 @@ typedef struct {
     uint32_t receive_errors;
     hal_can_frame_t frame;
     uint32_t accepted;
+
+    uint32_t nvm_page;
+    uint32_t nvm_word;
+    uint32_t nvm_value[2]; /* lower half first */
 } mailbox_t;
 
 #endif

@@ -89,7 +89,7 @@ def test_parameter_takes_effect(make_bench):
 
 
 def test_unknown_operation_is_answered(bench):
-    request = can.Message(arbitration_id=0x600, is_extended_id=False, data=bytes([9, 0, 0, 0, 0, 0, 0, 0]))
+    request = can.Message(arbitration_id=0x600, is_extended_id=False, data=bytes([12, 0, 0, 0, 0, 0, 0, 0]))
     bench.send(request)
     answer = bench.advance_until_frame(lambda m: m.arbitration_id == 0x580, 0.01)
     status = drive_database().decode_message("PARAMETER_RESPONSE", bytes(answer.data))["status"]

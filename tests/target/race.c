@@ -156,6 +156,19 @@ void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t 
     memcpy(telemetry, &from->control, sizeof *telemetry);
 }
 
+/* No memory. */
+void nvm_store_init(nvm_store_t *store, const hal_t *hal, parameters_t *parameters) {
+    (void)store, (void)hal, (void)parameters;
+}
+
+void nvm_store_follow_fault(nvm_store_t *store, const fault_record_t *record) {
+    (void)store, (void)record;
+}
+
+void nvm_store_step(nvm_store_t *store, hal_t *hal, const parameters_t *parameters, uint32_t time_us, bool writable) {
+    (void)store, (void)hal, (void)parameters, (void)time_us, (void)writable;
+}
+
 void comms_init(comms_t *comms, uint32_t time_us) {
     (void)time_us;
     comms->telemetry.next_us = 0; /* always due */

@@ -16,8 +16,10 @@ extern "C" {
 #include "hal_can.h"
 #include "hal_encoder.h"
 #include "hal_interrupt.h"
+#include "hal_nvm.h"
 #include "hal_pwm.h"
 #include "hal_time.h"
+#include "rig/nvm.h"
 }
 #include "support/frames.h"
 
@@ -39,6 +41,14 @@ struct hal {
     unsigned rejoins = 0;
     unsigned deferred_requests = 0;
     hal_pwm_compare_t written{};
+    nvm_t nvm = erased();
+    unsigned nvm_operations = 0; // in the present background call
+
+    static nvm_t erased() {
+        nvm_t nvm;
+        nvm_init(&nvm);
+        return nvm;
+    }
 };
 
 extern "C" {
@@ -65,6 +75,19 @@ void hal_critical_enter(hal_t *hal) {
 void hal_critical_leave(hal_t *hal) {
     EXPECT_TRUE(hal->critical);
     hal->critical = false;
+}
+uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word) {
+    return nvm_read(&hal->nvm, page, word);
+}
+bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value) {
+    EXPECT_FALSE(hal->critical);
+    hal->nvm_operations++;
+    return nvm_program(&hal->nvm, page, word, value);
+}
+bool hal_nvm_erase(hal_t *hal, unsigned page) {
+    EXPECT_FALSE(hal->critical);
+    hal->nvm_operations++;
+    return nvm_erase(&hal->nvm, page);
 }
 uint32_t hal_pwm_clock_hz(const hal_t *hal) {
     return hal->clock_hz;

@@ -38,6 +38,8 @@ static noreturn void run(void) {
         case MAILBOX_BACKGROUND:
             drive_background(&drive);
             break;
+        case MAILBOX_RESET:
+            board_restart();
         case MAILBOX_EXIT:
             board_exit(mailbox->exit_code);
         }

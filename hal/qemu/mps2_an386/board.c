@@ -29,6 +29,11 @@ noreturn void board_exit(uint32_t code) {
     }
 }
 
+noreturn void board_restart(void) {
+    __asm__ volatile("msr msp, %0\n\tbx %1" ::"r"(stack_top), "r"(program_start));
+    __builtin_unreachable();
+}
+
 /* Handler of all other exceptions: none is expected. */
 static void fault_handler(void) {
     board_exit(MAILBOX_EXIT_FAULT);

@@ -30,6 +30,11 @@ noreturn void board_exit(uint32_t code) {
     }
 }
 
+noreturn void board_restart(void) {
+    __asm__ volatile("la sp, stack_top\n\tj program_start");
+    __builtin_unreachable();
+}
+
 /* Handler of all exceptions: none is expected. */
 noreturn void fault_handler(void);
 noreturn void fault_handler(void) {

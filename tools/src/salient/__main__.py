@@ -102,6 +102,12 @@ def _monitor(options: argparse.Namespace) -> int:
     return monitor(options.can, options.every_s, options.duration_s, options.machine)
 
 
+def _parameters(options: argparse.Namespace) -> int:
+    from salient.bench.parameter_file import run
+
+    return run(options)
+
+
 def _benchmark(options: argparse.Namespace) -> int:
     from salient.benchmark.command import run
 
@@ -133,6 +139,7 @@ _COMMANDS = {
     "run": _run,
     "log": _log,
     "monitor": _monitor,
+    "parameters": _parameters,
     "benchmark": _benchmark,
     "compare": _compare,
     "machine": _machine,

@@ -24,9 +24,9 @@ CHANGE_PERCENT = 10.0
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """One line and exit code 2."""
-        command = re.match(r"argument COMMAND: invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        command = re.match(r"argument (COMMAND|ACTION): invalid choice: '(.*?)' \(choose from (.*)\)", message)
         if command:
-            message = f"no command {command[1]}: must be one of {command[2]}".replace("'", "")
+            message = f"no {command[1].lower()} {command[2]}: must be one of {command[3]}".replace("'", "")
         message = re.sub(r"^argument ([^:]*): expected one argument$", r"\1: requires a value", message)
         message = re.sub(r"^argument ([^:]*): ", r"\1 ", message)
         message = message.replace("unrecognized arguments:", "unrecognised argument")
@@ -77,8 +77,22 @@ def make_parser() -> argparse.ArgumentParser:
     monitor.add_argument("--every-s", type=_positive, default=0.1, metavar="X",
                          help="period in virtual time (default 0.1)")
     monitor.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
-    monitor.add_argument("--machine", type=_option_type("machine"), default=DEFAULTS["machine"],
-                         metavar=OPTIONS["machine"].metavar, help=description("machine"))
+    _add_machine(monitor)
+
+    parameters = command("parameters", "parameters and fault log of a running drive")
+    actions = parameters.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
+    for name, text in (("save", "write the parameters to a file"),
+                       ("compare", "list the differences from a file, exit code 1 when there are any"),
+                       ("load", "set the parameters that a file has, all or none"),
+                       ("faults", "print the log of faults")):
+        action = actions.add_parser(name, help=text, description=text, prog=f"tools/salient parameters {name}")
+        if name != "faults":
+            action.add_argument("file", type=Path, metavar="FILE.toml")
+        if name == "load":
+            action.add_argument("--store", action="store_true", help="also store them in the memory of the drive, so "
+                                "that they survive a reset")
+        _add_can(action)
+        _add_machine(action)
 
     benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
                         "ngspice; effect of the network")
@@ -128,6 +142,11 @@ def _add_bench_options(parser: argparse.ArgumentParser, command: str) -> None:
         else:
             parser.add_argument(flag_of(name), dest=name, type=_option_type(name), default=DEFAULTS[name],
                                 metavar=option.metavar, help=description(name))
+
+
+def _add_machine(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--machine", type=_option_type("machine"), default=DEFAULTS["machine"],
+                        metavar=OPTIONS["machine"].metavar, help=description("machine"))
 
 
 def _add_can(parser: argparse.ArgumentParser) -> None:

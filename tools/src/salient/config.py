@@ -170,6 +170,9 @@ class BenchConfig(Conditions):
                             maximum=1_000_000, commands=("sim",))
     machine_image: Path | None = _option(None, FILE, "the machine, as salient.generate.machine writes it",
                                          metavar="FILE")
+    memory: Path | None = _option(None, FILE, "keeps the drive's non-volatile memory in a file, which is made when it "
+                                  "does not exist; without it the memory is erased at the start", metavar="FILE",
+                                  commands=("sim",))
     record: Path | None = _option(None, FILE, "records the true state", metavar="FILE.npy")
     record_step_ns: int = _option(1000, INTEGER, "step of the recording", metavar="N", minimum=100,
                                   maximum=1_000_000_000)

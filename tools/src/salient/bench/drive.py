@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,17 @@ READY_TIMEOUT_S = 0.02
 """Time after its start in which a drive without a failing check is ready: 1 ms of passed checks, and its telemetry."""
 
 _RESPONSE_TIMEOUT_S = 0.1
+_ATTEMPTS = 20
+"""Requests that are made for one response. Where time moves by itself, a client that does not keep up loses frames."""
 _TEXT_PARTS_MAX = 64
+_SAVE_TIMEOUT_S = 2.0
+_MEMORY_ITEMS = ("saving", "origin", "start", "newest_fault", "sets")
+_SAVING, _SAVED = 1, 2
+ORIGINS = ("defaults", "memory", "unusable")
+_FAULT_ITEMS = ("fault", "state", "checks", "start", "time_us", "time_wraps", "speed_rpm", "bus_voltage_V",
+                "current_max_A", "torque_reference_Nm")
+"""Parts of the operations memory and fault_log, as drive.dbc lists them."""
+LOGGED_FAULTS = 16
 _OPERATIONS = value_numbers(drive_database(), "PARAMETER_REQUEST", "operation")
 
 
@@ -70,6 +80,7 @@ class Drive(KnownAttributes):
 
     command_due_ns: int | None
     parameters: Parameters
+    fault_log: FaultLog
 
     def __init__(self, session: Client, parameter_table: Callable[[], list[ParameterRow]] | None = None) -> None:
         self._session = session
@@ -82,6 +93,7 @@ class Drive(KnownAttributes):
         self._counter = {False: 0, True: 0}
         self.command_due_ns = None
         self.parameters = Parameters(session, parameter_table)
+        self.fault_log = FaultLog(session)
 
     @property
     def speed_reference_rpm(self) -> float:
@@ -245,6 +257,27 @@ class Parameters(MutableMapping[str, float]):
         if status != "done":
             raise DriveError(f"{name} {value:g}: {status}")
 
+    def save(self) -> None:
+        """Stores the present values in the drive's memory; lets virtual time pass until that is done. DriveError while
+        the drive runs, and when the memory does not accept them."""
+        _require_done(self._session, "save")
+        deadline_ns = self._session.time_ns + round(_SAVE_TIMEOUT_S * 1e9)
+        while (saving := _memory_item(self._session, "saving")) == _SAVING and self._session.time_ns < deadline_ns:
+            pass  # each request takes time
+        if saving != _SAVED:
+            raise DriveError(f"save: not stored within {_SAVE_TIMEOUT_S:g} s" if saving == _SAVING
+                             else "save: the memory does not accept the parameters")
+
+    def restore_defaults(self) -> None:
+        """Sets all parameters to their defaults, without storing them. DriveError while the drive runs."""
+        _require_done(self._session, "restore_defaults")
+
+    @property
+    def origin(self) -> str:
+        """Parameters at the last start: defaults, memory, or unusable, which are the defaults because no set in the
+        memory could be used."""
+        return ORIGINS[_memory_item(self._session, "origin")]
+
     def __delitem__(self, name: str) -> None:
         raise TypeError("a drive's parameters cannot be deleted")
 
@@ -253,6 +286,61 @@ class Parameters(MutableMapping[str, float]):
 
     def __len__(self) -> int:
         return len(self.rows)
+
+
+@dataclass(frozen=True)
+class LoggedFault:
+    """A fault in the log of the drive. number counts from 1 and never begins again; start is the number of the start
+    of the drive, time_s the time since then; checks are the names of all checks that failed in that tick; the values
+    are those of that tick, torque and speed of the period before."""
+
+    number: int
+    start: int
+    time_s: float
+    fault: str
+    checks: tuple[str, ...]
+    state: str
+    speed_rpm: float
+    bus_voltage_V: float
+    current_max_A: float
+    torque_reference_Nm: float
+
+
+class FaultLog(Sequence[LoggedFault]):
+    """The last faults in the memory of the drive, 16 at most, the oldest first; read from the drive at each access.
+    They survive a reset."""
+
+    def __init__(self, session: Client) -> None:
+        self._session = session
+
+    def read(self) -> list[LoggedFault]:
+        """All of them. One that a fault pushes out meanwhile is left out."""
+        newest = _memory_item(self._session, "newest_fault")
+        found = (self._read(number) for number in range(max(1, newest - LOGGED_FAULTS + 1), newest + 1))
+        return [fault for fault in found if fault is not None]
+
+    def __len__(self) -> int:
+        return len(self.read())
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.read()[index]
+
+    def _read(self, number: int) -> LoggedFault | None:
+        items: dict[str, int] = {}
+        for part, name in enumerate(_FAULT_ITEMS):
+            status, items[name] = _access(self._session, "fault_log", 0, part, number)
+            if status != "done":
+                return None
+        snapshot = self._session.drive_database.get_message_by_name("DRIVE_FAULT_SNAPSHOT")
+        physical = {signal.name: items[signal.name] * float(signal.scale) for signal in snapshot.signals}
+        names = {value: name for name, value in value_numbers(drive_database(), "DRIVE_STATUS", "fault").items()}
+        states = {value: name for name, value in value_numbers(drive_database(), "DRIVE_STATUS", "state").items()}
+        time_us = (items["time_wraps"] << 32) + (items["time_us"] & 0xFFFFFFFF)
+        return LoggedFault(
+            number=number, start=items["start"], time_s=time_us / 1e6,
+            fault=names.get(items["fault"], str(items["fault"])),
+            checks=tuple(name for value, name in names.items() if value > 0 and items["checks"] >> value & 1),
+            state=states.get(items["state"], str(items["state"])), **physical)
 
 
 def raw_value(row: ParameterRow, value: float) -> int:
@@ -290,19 +378,32 @@ def _request(operation: str, index: int, part: int, value: int) -> can.Message:
 
 def _access(session: Client, operation: str, index: int, part: int = 0, value: int = 0) -> tuple[str, int]:
     """(status, value) of the drive's response; lets virtual time pass until it arrives."""
-    session.send(_request(operation, index, part, value))
     message = drive_database().get_message_by_name("PARAMETER_RESPONSE")
     head = bytes([_OPERATIONS[operation], index, part])
-    try:
-        response = session.advance_until_frame(
-            lambda m: m.arbitration_id == message.frame_id and not m.is_extended_id and bytes(m.data[:3]) == head,
-            _RESPONSE_TIMEOUT_S,
-        )
-    except TimeoutError:
-        text = f"no response to PARAMETER_REQUEST {operation} {index} within {_RESPONSE_TIMEOUT_S} s"
-        raise DriveError(text) from None
-    signals: Mapping[str, Any] = message.decode_simple(bytes(response.data))
-    return str(signals["status"]), int(signals["value"])
+    for _ in range(_ATTEMPTS):
+        session.send(_request(operation, index, part, value))
+        try:
+            response = session.advance_until_frame(
+                lambda m: m.arbitration_id == message.frame_id and not m.is_extended_id and bytes(m.data[:3]) == head,
+                _RESPONSE_TIMEOUT_S,
+            )
+        except TimeoutError:
+            continue
+        signals: Mapping[str, Any] = message.decode_simple(bytes(response.data))
+        return str(signals["status"]), int(signals["value"])
+    raise DriveError(f"no response to {_ATTEMPTS} PARAMETER_REQUEST {operation} {index} in "
+                     f"{_ATTEMPTS * _RESPONSE_TIMEOUT_S:g} s")
+
+
+def _require_done(session: Client, operation: str) -> None:
+    status, _ = _access(session, operation, 0)
+    if status != "done":
+        raise DriveError(f"{operation}: {status}")
+
+
+def _memory_item(session: Client, name: str) -> int:
+    """An item of the state of the memory."""
+    return _access(session, "memory", 0, _MEMORY_ITEMS.index(name))[1]
 
 
 def _read_text(session: Client, operation: str, index: int) -> str:

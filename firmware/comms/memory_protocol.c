@@ -1,0 +1,121 @@
+#include "comms/memory_protocol.h"
+
+#include "comms/units.h"
+#include "drive_codec.h"
+
+/* Parts of the responses, as drive.dbc lists them. */
+enum { MEMORY_SAVING, MEMORY_ORIGIN, MEMORY_START, MEMORY_NEWEST_FAULT, MEMORY_SETS };
+enum { ORIGIN_DEFAULTS, ORIGIN_MEMORY, ORIGIN_UNUSABLE };
+enum {
+    LOG_FAULT,
+    LOG_STATE,
+    LOG_CHECKS,
+    LOG_START,
+    LOG_TIME,
+    LOG_TIME_WRAPS,
+    LOG_SPEED,
+    LOG_VOLTAGE,
+    LOG_CURRENT,
+    LOG_TORQUE
+};
+
+static parameter_status_t memory_item(const nvm_store_t *store, unsigned part, int32_t *value) {
+    switch (part) {
+    case MEMORY_SAVING:
+        *value = (int32_t)store->saving;
+        break;
+    case MEMORY_ORIGIN:
+        *value = store->loaded ? ORIGIN_MEMORY : store->rejected ? ORIGIN_UNUSABLE : ORIGIN_DEFAULTS;
+        break;
+    case MEMORY_START:
+        *value = (int32_t)store->start;
+        break;
+    case MEMORY_NEWEST_FAULT:
+        *value = (int32_t)nvm_store_newest_fault(store);
+        break;
+    case MEMORY_SETS:
+        *value = (int32_t)store->parameters.sequence;
+        break;
+    default:
+        return PARAMETER_STATUS_NO_SUCH_ENTRY;
+    }
+    return PARAMETER_STATUS_DONE;
+}
+
+static parameter_status_t fault_item(const nvm_store_t *store, const hal_t *hal, uint32_t sequence, unsigned part,
+                                     int32_t *value) {
+    nvm_store_fault_t fault;
+    if (!nvm_store_read_fault(store, hal, sequence, &fault)) {
+        return PARAMETER_STATUS_NO_SUCH_ENTRY;
+    }
+    switch (part) {
+    case LOG_FAULT:
+        *value = fault.fault;
+        break;
+    case LOG_STATE:
+        *value = fault.state;
+        break;
+    case LOG_CHECKS:
+        *value = (int32_t)fault.checks;
+        break;
+    case LOG_START:
+        *value = (int32_t)fault.start;
+        break;
+    case LOG_TIME:
+        *value = (int32_t)fault.time_us;
+        break;
+    case LOG_TIME_WRAPS:
+        *value = fault.time_wraps;
+        break;
+    case LOG_SPEED:
+        *value = units_quarter_rpm(units_milli_rpm(fault.speed_q22));
+        break;
+    case LOG_VOLTAGE:
+        *value = fault.dc_link_voltage_q6;
+        break;
+    case LOG_CURRENT:
+        *value = fault.current_max_q9;
+        break;
+    case LOG_TORQUE:
+        *value = units_torque_q8(fault.torque_reference_q24);
+        break;
+    default:
+        return PARAMETER_STATUS_NO_SUCH_ENTRY;
+    }
+    return PARAMETER_STATUS_DONE;
+}
+
+bool memory_protocol_respond(nvm_store_t *store, const hal_t *hal, parameters_t *parameters, bool writable,
+                             const hal_can_frame_t *frame, hal_can_frame_t *response_frame) {
+    struct drive_parameter_request_t request;
+    drive_parameter_request_unpack(&request, frame->data, frame->length);
+    struct drive_parameter_response_t response = {
+        .operation = request.operation, .index = request.index, .part = request.part, .value = 0};
+    parameter_status_t status = writable ? PARAMETER_STATUS_DONE : PARAMETER_STATUS_NOT_WHILE_RUNNING;
+
+    switch (request.operation) {
+    case PARAMETER_OPERATION_SAVE:
+        if (writable) {
+            parameter_store_save(store);
+        }
+        break;
+    case PARAMETER_OPERATION_RESTORE_DEFAULTS:
+        if (writable) {
+            parameters_restore_defaults(parameters);
+        }
+        break;
+    case PARAMETER_OPERATION_MEMORY:
+        status = memory_item(store, request.part, &response.value);
+        break;
+    case PARAMETER_OPERATION_FAULT_LOG:
+        status = fault_item(store, hal, (uint32_t)request.value, request.part, &response.value);
+        break;
+    default:
+        return false;
+    }
+    response.status = (uint8_t)status;
+    *response_frame =
+        (hal_can_frame_t){.identifier = DRIVE_PARAMETER_RESPONSE_FRAME_ID, .length = DRIVE_PARAMETER_RESPONSE_LENGTH};
+    drive_parameter_response_pack(response_frame->data, &response, sizeof response_frame->data);
+    return true;
+}

@@ -1,0 +1,35 @@
+/* Non-volatile memory: pages of flash for data that survive a reset, apart from those of the program.
+ *
+ * A page is erased as a whole, which sets all its bits; a word is programmed once after that. Both block the caller. On
+ * a microcontroller whose program runs from the same flash they also stall the interrupts (STM32G431: 22 ms and 85 us),
+ * so that the drive has neither in RUN.
+ *
+ * Power may be lost during an operation. Of a word that was being programmed any of the bits to be cleared may be
+ * cleared; a page that was being erased may have any content, different in each word. Other words and pages are
+ * unchanged. A read of a torn word returns some value: a port whose memory has an error correction handles its errors.
+ */
+#ifndef HAL_NVM_H
+#define HAL_NVM_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "hal.h"
+
+#define HAL_NVM_PAGES 6
+#define HAL_NVM_PAGE_WORDS 256 /* of 64 bits; a port with larger pages offers the first words of each */
+
+/* Content of an erased word. */
+#define HAL_NVM_ERASED UINT64_MAX
+
+/* The word; page 0..HAL_NVM_PAGES-1, word 0..HAL_NVM_PAGE_WORDS-1, as below. [background] */
+uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word);
+
+/* Programs an erased word. False, with the word unchanged, when it is not erased; false also when the memory reports an
+ * error: then the content is undefined. [background] */
+bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value);
+
+/* Erases a page. False when the memory reports an error: then the content is undefined. [background] */
+bool hal_nvm_erase(hal_t *hal, unsigned page);
+
+#endif

@@ -1,0 +1,236 @@
+// The memory of the drive: what survives a reset, power cuts at every operation, sets that must not be loaded.
+#include <cstdio>
+#include <cstring>
+#include <vector>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/machine_tables.h"
+#include "support/power_cuts.h"
+}
+
+namespace {
+
+constexpr unsigned PARAMETER_PAGE = 0, FAULT_PAGE = 2;
+constexpr unsigned SET_WORDS = 1 + (PARAMETER_COUNT + 1) / 2 + NVM_RING_OVERHEAD;
+constexpr unsigned FAULT_WORDS = sizeof(nvm_store_fault_t) / 8 + NVM_RING_OVERHEAD;
+constexpr unsigned SETS_PER_PAGE = HAL_NVM_PAGE_WORDS / SET_WORDS;
+constexpr unsigned FAULTS_PER_PAGE = HAL_NVM_PAGE_WORDS / FAULT_WORDS;
+
+void expect_nothing_lost(const char *what, const power_cuts_t &result) {
+    std::printf("%s: %u single cuts, %u pairs of cuts, %u losses, %u mixed\n", what, result.cuts, result.pairs,
+                result.losses, result.mixed);
+    EXPECT_EQ(result.losses, 0u);
+    EXPECT_EQ(result.mixed, 0u);
+    EXPECT_EQ(result.failures, 0u);
+}
+
+power_cuts_work_t work;
+
+// The first one, one in the middle of a page, and those that erase: page 1 for the first time, page 0 with old records.
+bool paired_set(uint32_t number) {
+    return number == 1 || number == 3 || number == SETS_PER_PAGE + 1 || number == 2 * SETS_PER_PAGE + 1;
+}
+
+bool paired_fault(uint32_t number) {
+    return number == 1 || number == 3 || number == FAULTS_PER_PAGE + 1 || number == 2 * FAULTS_PER_PAGE + 1;
+}
+
+TEST(PowerCuts, at_every_operation_of_parameter_writes_lose_and_mix_nothing) {
+    power_cuts_t result{};
+    cut_writes(&result, &work, WRITE_SET, 2 * SETS_PER_PAGE + 2, paired_set);
+    expect_nothing_lost("sets of parameters", result);
+    EXPECT_GT(result.cuts, 3u * (2 * SETS_PER_PAGE + 2) * SET_WORDS);
+    EXPECT_GT(result.pairs, 4u * 9 * SET_WORDS * SET_WORDS);
+}
+
+TEST(PowerCuts, at_every_operation_of_log_entries_lose_and_mix_nothing) {
+    power_cuts_t result{};
+    cut_writes(&result, &work, WRITE_FAULT, 2 * FAULTS_PER_PAGE + 2, paired_fault);
+    expect_nothing_lost("faults in the log", result);
+    EXPECT_GT(result.cuts, 3u * (2 * FAULTS_PER_PAGE + 2) * FAULT_WORDS);
+    EXPECT_GT(result.pairs, 4u * 9 * FAULT_WORDS * FAULT_WORDS);
+}
+
+class NvmStore : public testing::Test {
+  protected:
+    void SetUp() override {
+        std::memset(&memory, 0, sizeof memory);
+        nvm_init(&memory.hal.nvm);
+        start_drive(&drive, &memory);
+    }
+
+    void write(write_t kind) {
+        write_next(&drive, &memory, kind, 0, NVM_CUT_OLD);
+        (kind == WRITE_SET ? memory.sets : memory.faults)++;
+        start_drive(&drive, &memory);
+    }
+
+    // Word of a stored set, by its place.
+    uint64_t *set_word(unsigned set, unsigned word) {
+        return &memory.hal.nvm.word[PARAMETER_PAGE][set * SET_WORDS + word];
+    }
+
+    memory_t memory;
+    started_t drive;
+};
+
+TEST_F(NvmStore, an_erased_memory_gives_the_defaults_without_inhibiting_the_start) {
+    EXPECT_TRUE(has_set(&drive, 0));
+    EXPECT_FALSE(drive.store.inhibited);
+    EXPECT_EQ(drive.store.start, 1u);
+    EXPECT_EQ(nvm_store_newest_fault(&drive.store), 0u);
+}
+
+TEST_F(NvmStore, every_bit_of_the_newest_set_that_flips_makes_the_drive_use_the_set_before) {
+    write(WRITE_SET);
+    write(WRITE_SET);
+    ASSERT_TRUE(has_set(&drive, 2));
+    // Of the commit word a flipped bit has no consequence: the checksum is that of a complete set.
+    for (unsigned word = 0; word + 1 < SET_WORDS; word++) {
+        for (unsigned bit = 0; bit < 64; bit++) {
+            *set_word(1, word) ^= UINT64_C(1) << bit;
+            start_drive(&drive, &memory);
+            EXPECT_TRUE(has_set(&drive, 1)) << word << ", " << bit;
+            EXPECT_FALSE(drive.store.inhibited);
+            *set_word(1, word) ^= UINT64_C(1) << bit;
+        }
+    }
+}
+
+TEST_F(NvmStore, sets_that_are_all_damaged_give_the_defaults_and_inhibit_the_start_until_one_is_stored) {
+    write(WRITE_SET);
+    write(WRITE_SET);
+    *set_word(0, 4) ^= 1;
+    *set_word(1, 5) ^= 1;
+    start_drive(&drive, &memory);
+    EXPECT_FALSE(drive.store.loaded);
+    EXPECT_TRUE(drive.store.inhibited);
+    for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+        EXPECT_EQ(drive.parameters.values[i], parameters_default(&drive.parameters, i));
+    }
+    parameter_store_save(&drive.store);
+    for (unsigned i = 0; i < SET_WORDS; i++) {
+        EXPECT_TRUE(drive.store.inhibited);
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 1, true);
+    }
+    EXPECT_FALSE(drive.store.inhibited);
+    EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED);
+    start_drive(&drive, &memory);
+    EXPECT_TRUE(drive.store.loaded);
+    EXPECT_FALSE(drive.store.inhibited);
+}
+
+TEST_F(NvmStore, a_set_of_another_machine_is_not_loaded_and_inhibits_the_start) {
+    write(WRITE_SET);
+    memory.sets = 1;
+    machine_tables.node[7] ^= 1;
+    start_drive(&drive, &memory);
+    EXPECT_FALSE(drive.store.loaded);
+    EXPECT_TRUE(drive.store.inhibited);
+    machine_tables.node[7] ^= 1;
+    start_drive(&drive, &memory);
+    EXPECT_TRUE(has_set(&drive, 1));
+    EXPECT_FALSE(drive.store.inhibited);
+}
+
+TEST_F(NvmStore, the_newest_of_a_thousand_sets_is_loaded_and_the_pages_wear_equally) {
+    for (unsigned i = 0; i < 1000; i++) {
+        write(WRITE_SET);
+        ASSERT_TRUE(has_set(&drive, memory.sets));
+    }
+    const uint32_t *erasures = memory.hal.nvm.erasures;
+    EXPECT_NEAR(erasures[PARAMETER_PAGE], 1000.0 / SETS_PER_PAGE / 2, 1.0);
+    EXPECT_NEAR(erasures[PARAMETER_PAGE + 1], 1000.0 / SETS_PER_PAGE / 2, 1.0);
+}
+
+TEST_F(NvmStore, the_last_16_faults_are_read_and_no_other) {
+    for (unsigned i = 0; i < 3 * FAULTS_PER_PAGE; i++) {
+        write(WRITE_FAULT);
+        const uint32_t newest = i + 1;
+        ASSERT_EQ(nvm_store_newest_fault(&drive.store), newest);
+        for (uint32_t number = 0; number <= newest + 1; number++) {
+            const bool readable = number > 0 && number <= newest && number + NVM_STORE_FAULTS > newest;
+            ASSERT_EQ(has_fault(&drive, &memory.hal, number), readable) << number << " of " << newest;
+        }
+    }
+    EXPECT_GE(memory.hal.nvm.erasures[FAULT_PAGE] + memory.hal.nvm.erasures[FAULT_PAGE + 1], 2u);
+}
+
+TEST_F(NvmStore, a_step_makes_one_operation_and_none_while_the_memory_must_not_be_written) {
+    const fault_record_t record = fault_of(1);
+    nvm_store_follow_fault(&drive.store, &record);
+    parameter_store_save(&drive.store);
+    const nvm_t before = memory.hal.nvm;
+    for (unsigned i = 0; i < 100; i++) {
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, i, false);
+    }
+    EXPECT_EQ(std::memcmp(&before, &memory.hal.nvm, sizeof before), 0);
+    const unsigned operations = FAULT_WORDS + SET_WORDS + NVM_RING_OVERHEAD; // and the number of the start
+    for (unsigned i = 1; i <= operations + 10; i++) {
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 100 + i, true);
+        EXPECT_EQ(memory.hal.nvm.operations, std::min(i, operations));
+    }
+}
+
+TEST_F(NvmStore, a_parameter_that_changes_while_the_set_is_written_gives_the_new_set_whole) {
+    write(WRITE_SET);
+    for (unsigned steps = 1; steps < SET_WORDS; steps++) {
+        memory_t copy = memory;
+        start_drive(&drive, &copy);
+        const int32_t before = drive.parameters.values[0];
+        parameter_store_save(&drive.store);
+        for (unsigned i = 0; i < steps; i++) {
+            nvm_store_step(&drive.store, &copy.hal, &drive.parameters, 1, true);
+        }
+        const int32_t changed = before == parameters_row(0)->minimum ? before + 1 : before - 1;
+        ASSERT_EQ(parameters_set(&drive.parameters, 0, changed), PARAMETER_STATUS_DONE);
+        for (unsigned i = 0; i < 2 * SET_WORDS && drive.store.saving == NVM_STORE_SAVING; i++) {
+            nvm_store_step(&drive.store, &copy.hal, &drive.parameters, 1, true);
+        }
+        ASSERT_EQ(drive.store.saving, NVM_STORE_SAVED);
+        start_drive(&drive, &copy);
+        EXPECT_TRUE(drive.store.loaded);
+        EXPECT_EQ(drive.parameters.values[0], changed) << steps;
+        for (unsigned i = 1; i < PARAMETER_COUNT; i++) {
+            EXPECT_EQ(drive.parameters.values[i], set_value(&drive.parameters, 1, i));
+        }
+    }
+}
+
+TEST_F(NvmStore, a_word_that_cannot_be_programmed_is_passed_over) {
+    memory.hal.nvm.word[PARAMETER_PAGE][5] = 0; // in the middle of the first place
+    memory.hal.nvm.word[PARAMETER_PAGE][SET_WORDS + 5] = 0;
+    write(WRITE_SET);
+    EXPECT_TRUE(has_set(&drive, 1));
+}
+
+TEST_F(NvmStore, a_fault_is_logged_once_and_the_same_fault_after_a_clearing_again) {
+    fault_record_t record = fault_of(1);
+    for (unsigned i = 0; i < 10; i++) {
+        nvm_store_follow_fault(&drive.store, &record);
+    }
+    EXPECT_EQ(drive.store.waiting_count, 1);
+    nvm_store_follow_fault(&drive.store, nullptr);
+    nvm_store_follow_fault(&drive.store, &record);
+    EXPECT_EQ(drive.store.waiting_count, 2);
+    nvm_store_follow_fault(&drive.store, nullptr);
+    nvm_store_follow_fault(&drive.store, &record); // a third one has no place
+    EXPECT_EQ(drive.store.waiting_count, 2);
+}
+
+TEST_F(NvmStore, the_time_of_a_fault_counts_the_wraps_of_the_clock) {
+    nvm_store_step(&drive.store, &memory.hal, &drive.parameters, UINT32_MAX - 100, false);
+    nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 10, false);
+    nvm_store_step(&drive.store, &memory.hal, &drive.parameters, UINT32_MAX - 10, false);
+    fault_record_t record = fault_of(1);
+    record.time_us = UINT32_MAX - 5;
+    nvm_store_follow_fault(&drive.store, &record);
+    record.time_us = 3; // after the last step the clock has wrapped
+    nvm_store_follow_fault(&drive.store, &record);
+    EXPECT_EQ(drive.store.waiting[0].time_wraps, 1);
+    EXPECT_EQ(drive.store.waiting[1].time_wraps, 2);
+}
+
+} // namespace
