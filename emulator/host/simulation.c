@@ -151,6 +151,7 @@ static bool open_bench(simulation_t *simulation, const options_t *options) {
         .immediate_pwm = options->immediate_pwm,
         .seed = options->seed,
         .bit_rate = options->bit_rate,
+        .drive_only = options->drive_only,
         .pacing = options->pacing,
         .stop_at_ns = options->stop_at_s > 0 ? (uint64_t)(options->stop_at_s * 1e9 + 0.5) : RIG_NEVER,
         .stop = simulation->stop,

@@ -32,7 +32,8 @@ void rig_init(rig_t *rig, const rig_config_t *config) {
     rig->firmware = (rig_firmware_t){0};
     scheduler_init(&rig->scheduler, &rig->board.time_ns, handlers, rig);
     rig->period_ns = 0;
-    rig->truth_period_ns = rig->scheduler.due_ns[EVENT_TRUTH] = TRUTH_PERIOD_DEFAULT_NS;
+    rig->truth_period_ns = config->drive_only ? 0 : TRUTH_PERIOD_DEFAULT_NS;
+    rig->scheduler.due_ns[EVENT_TRUTH] = config->drive_only ? SCHEDULER_NEVER : TRUTH_PERIOD_DEFAULT_NS;
     rig->interrupt_time_ns = rig->interrupt_end_ns = 0;
     rig->stimuli.count = 0;
     load_init(rig);

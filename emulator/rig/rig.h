@@ -59,6 +59,7 @@ typedef struct {
     bool immediate_pwm;    /* compare values act when they are written, not in the next period */
     uint64_t seed;
     uint32_t bit_rate;
+    bool drive_only; /* of the bench only replies are sent: no true state until its period is set, no time stamps */
     pacing_t pacing;
     uint64_t stop_at_ns;    /* RIG_NEVER: no end */
     rig_stop_t stop;        /* requested NULL: never */

@@ -29,6 +29,7 @@ void server_init(rig_t *rig) {
     };
     transport_t *transport = rig->config.transport;
     transport->full = full[rig->config.pacing.kind];
+    transport->unstamped = rig->config.drive_only;
     transport->give_up = give_up;
     transport->give_up_context = rig;
     rig->run_count = 0;

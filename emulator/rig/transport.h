@@ -50,6 +50,7 @@ struct transport {
     bool (*connected)(transport_t *transport, uint32_t client);
     bool (*in_use)(transport_t *transport);
     transport_full_t full;
+    bool unstamped;                 /* no frames that convey the time of others */
     bool (*give_up)(void *context); /* true: the program is to end, wait for no client; NULL: never */
     void *give_up_context;
     const char *failure; /* reason why the transport cannot continue, or NULL */

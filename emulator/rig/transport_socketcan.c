@@ -102,6 +102,9 @@ static void send_frame(socketcan_t *can, const transport_frame_t *frame) {
 }
 
 static void send_timestamp(socketcan_t *can, uint64_t time_ns, uint8_t subject) {
+    if (can->transport.unstamped) {
+        return;
+    }
     struct rig_stamp_t timestamp;
     rig_stamp_set_time_ns(&timestamp, (int64_t)time_ns);
     timestamp.subject = subject;

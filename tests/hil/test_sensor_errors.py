@@ -77,9 +77,10 @@ def start_loaded(bench: Bench) -> None:
     bench.run_for(0.2)
 
 
-def watch_closely(bench: Bench, duration_s: float) -> float:
-    """Runs with true-state frames every microsecond, to cover sampling instants less the delay; returns the start."""
-    bench.rig.truth_period_us = 1
+def watch_closely(bench: Bench, duration_s: float, period_us: int = 25) -> float:
+    """Runs with true-state frames every control period, at whose beginning the drive samples, or more often, for the
+    instants before; returns the start. Whether each instant is covered, at_samples checks."""
+    bench.rig.truth_period_us = period_us
     start_s = bench.time_s
     bench.run_for(duration_s)
     bench.rig.truth_period_us = 1000
@@ -161,7 +162,7 @@ def test_measured_currents_lag_by_the_sensor_delay(bench, delay_us):
     """With the traditional controller, which applies 240 V to a phase for whole periods."""
     start_loaded(bench)
     bench.rig.current_sensor_delay_us = delay_us
-    start_s = watch_closely(bench, 0.03)
+    start_s = watch_closely(bench, 0.03, period_us=1)
     measured_A, true_A = currents_A(bench, start_s, delay_us)
     assert np.abs(measured_A - true_A).max() <= RESOLUTION_A
     measured_A, present_A = currents_A(bench, start_s)
@@ -237,7 +238,7 @@ def test_machine_file_sets_the_errors_and_the_rig_clears_them(make_bench, tmp_pa
     file.write_text(text + SENSORS)
     bench = make_bench(machine=str(file), controller="paper")
     start_loaded(bench)
-    start_s = watch_closely(bench, 0.03)
+    start_s = watch_closely(bench, 0.03, period_us=1)
     assert (bench.drive.state, bench.drive.fault) == ("run", "none")
     measured_A, true_A = currents_A(bench, start_s, delay_us=3)
     noise_A = measured_A - (1.05 * true_A + 0.5)

@@ -32,7 +32,7 @@ ELECTRICAL_PERIODS = 2
 SAMPLE_NS = 1000
 SPICE_STEP_NS = 200
 RAMP_NS = 1  # transition of a gate signal, ends at the edge, where the switch acts
-NGSPICE_TIMEOUT_S = 60
+NGSPICE_PROCESSOR_S = 60
 CONSTANT_SPEED_INERTIA_KG_M2 = 1e9
 
 BOUND = 1e-3
@@ -154,7 +154,7 @@ def deck(machine: machine_file.Machine, run: Run) -> list[str]:
 def spice_waveforms(folder: Path, netlist: list[str]) -> Waveforms:
     """At the time points that ngspice chose."""
     try:
-        found = ngspice.run(folder, netlist, NGSPICE_TIMEOUT_S)
+        found = ngspice.run(folder, netlist, NGSPICE_PROCESSOR_S)
     except ngspice.NgspiceError as error:
         pytest.fail(str(error), pytrace=False)
     return Waveforms(found.time_s, found.values["i(v.xphase.vcurrent)"], found.values["v(xphase.flux_linkage)"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -115,3 +116,45 @@ def test_drive_stopped_before_the_requested_duration_is_reported(listen):
     listen.bench.simulator.close()
     assert finish(process)[1:] == (f"salient: {listen.bench.address}: the drive's bus closed before --duration-s 10 had"
                                    " passed: the drive was stopped\n", 1)
+
+
+def test_monitor_shows_chosen_signals_of_both_databases_with_units_and_names(listen):
+    bench = listen.bench
+    names = ["DRIVE_STATUS.state", "load_torque_estimate_Nm", "RIG_TRUTH_MOTION.speed_rpm", "DRIVE_HEARTBEAT.state",
+             "DRIVE_COMMAND.request", "RIG_SET.load_torque_Nm"]
+    monitor = listen("monitor", "--every-s", "0.02", "--signals", *names, activity="monitoring")
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.08)
+    bench.load_torque_Nm = 2.5
+    bench.run_for(0.12)
+    bench.simulator.close()
+    output, _, code = finish(monitor)
+    assert code == 0
+    lines = output.splitlines()
+    assert max(map(len, lines)) <= 120
+    assert all(line[12:].startswith("  ") for line in lines)
+    entries = re.split(r"\n(?= +[0-9.]+ s  )", output.strip())
+    assert 8 <= len(entries) <= 10
+    assert len({tuple(map(len, entry.split("\n"))) for entry in entries[1:]}) == 1  # columns do not move
+    first, last = " ".join(entries[0].split()), " ".join(entries[-1].split())
+    assert "DRIVE_STATUS.state run load_torque_estimate_Nm " in last
+    assert re.search(r"load_torque_estimate_Nm -?[0-9]+\.[0-9]+ N m RIG_TRUTH_MOTION.speed_rpm [0-9.]+ r/min ", last)
+    assert "DRIVE_HEARTBEAT.state run" in last  # sent every 100 ms, shown every 20 ms
+    assert "DRIVE_COMMAND.request run" in last
+    assert "RIG_SET.load_torque_Nm - N m" in first
+    assert last.endswith("RIG_SET.load_torque_Nm 2.5000 N m")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("nonsense", ["no such signal", "speed_rpm", "held_speed_rpm", "dbc_hash"]),
+        ("DRIVE_MOTION.nonsense", ["no such signal", "DRIVE_MOTION.speed_rpm", "DRIVE_MOTION.rotor_angle_deg"]),
+        ("speed_rpm", ["in several messages", "DRIVE_MOTION.speed_rpm", "RIG_TRUTH_MOTION.speed_rpm"]),
+    ],
+)
+def test_unknown_or_ambiguous_signal_is_one_line_with_those_there_are(salient_without_build, name, words):
+    result = salient_without_build("monitor", "--can", "unix:none", "--signals", "DRIVE_STATUS.state", name)
+    assert (result.stdout, result.returncode) == ("", 2)
+    assert result.stderr.count("\n") == 1
+    assert all(word in result.stderr for word in [f"--signals {name}: ", *words]), result.stderr

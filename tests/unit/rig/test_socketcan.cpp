@@ -103,6 +103,20 @@ TEST_F(SocketCan, FramesOfABabblingNodeAreSentWithTheirTime) {
     EXPECT_NEAR(babbled, 10000 / 140, 8); // with many stuff bits: zeros
 }
 
+TEST_F(SocketCan, UnstampedTransportSendsTheFramesOfTheEmulatorAndNoOthers) {
+    bench->transport->unstamped = true;
+    send(0x100, {1, 2});
+    run_until(10 * MS);
+    std::vector<uint32_t> identifiers;
+    can_frame frame;
+    while (recv(client, &frame, sizeof frame, MSG_DONTWAIT) == sizeof frame) {
+        identifiers.push_back(frame.can_id & CAN_EFF_MASK);
+    }
+    EXPECT_EQ(std::count(identifiers.begin(), identifiers.end(), RIG_STAMP_FRAME_ID), 0);
+    EXPECT_EQ(identifiers.back(), uint32_t{RIG_CLOCK_FRAME_ID});
+    EXPECT_GT(identifiers.size(), 30u);
+}
+
 TEST_F(SocketCan, InterfaceThatGoesAwayEndsTheRig) {
     close(client);
     client = -1;

@@ -91,15 +91,23 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _log(options: argparse.Namespace) -> int:
+    if options.convert:
+        from salient.bus.log_reader import convert
+
+        if options.duration_s is not None:
+            raise UsageError("--duration-s: not with --convert, which reads the whole file")
+        count = convert(options.convert, options.out, options.machine)
+        print(f"{count} frames: {options.out}")
+        return 0
     from salient.bus.monitor import record
 
-    return record(options.can, options.out, options.duration_s)
+    return record(options.can, options.out, options.duration_s, options.machine)
 
 
 def _monitor(options: argparse.Namespace) -> int:
     from salient.bus.monitor import monitor
 
-    return monitor(options.can, options.every_s, options.duration_s, options.machine)
+    return monitor(options.can, options.every_s, options.duration_s, options.machine, options.signals)
 
 
 def _parameters(options: argparse.Namespace) -> int:

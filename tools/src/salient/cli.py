@@ -11,10 +11,20 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from salient.config import BUSES, CONDITIONS, DEFAULTS, FLAG, OPTIONS, TARGETS, description, either, flag_of
+from salient.config import (
+    BUSES,
+    CONDITIONS,
+    DEFAULTS,
+    FLAG,
+    LOG_SUFFIXES,
+    OPTIONS,
+    TARGETS,
+    description,
+    either,
+    flag_of,
+)
 from salient.version import VERSION
 
-LOG_SUFFIXES = (".blf", ".log")
 TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "plant", "tools", "socketcan")
 """The steps of `test`, in order."""
 CHANGE_PERCENT = 10.0
@@ -66,17 +76,25 @@ def make_parser() -> argparse.ArgumentParser:
     run.add_argument("--out", type=Path, metavar="DIR", help="folder (default out/NAME)")
     _add_bench_options(run, "run")
 
-    log = command("log", "record a running bus until it ends, or is interrupted")
-    _add_can(log)
+    log = command("log", "record a running bus until it ends, or is interrupted; or convert a log")
+    source = log.add_mutually_exclusive_group()
+    _add_can(source)
+    source.add_argument("--convert", type=Path, metavar="FILE",
+                        help="instead: the frames of a log, FILE.blf, FILE.asc or FILE.log, into the format of --out")
     log.add_argument("--out", type=_log_path, default=Path("out/can.blf"), metavar="FILE",
-                     help="FILE.blf or FILE.log, candump text (default out/can.blf)")
+                     help="FILE.blf, FILE.asc, FILE.mf4 (decoded signals) or FILE.log, candump text (default "
+                     "out/can.blf)")
     log.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
+    _add_machine(log, "whose signals FILE.mf4 has: ")
 
     monitor = command("monitor", "watch a running drive, one line of values per period")
     _add_can(monitor)
     monitor.add_argument("--every-s", type=_positive, default=0.1, metavar="X",
                          help="period in virtual time (default 0.1)")
     monitor.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
+    monitor.add_argument("--signals", nargs="+", metavar="NAME",
+                         help="these signals of drive and test bench: MESSAGE.SIGNAL, or SIGNAL where only one message "
+                         "has it")
     _add_machine(monitor)
 
     parameters = command("parameters", "parameters and fault log of a running drive")
@@ -144,12 +162,12 @@ def _add_bench_options(parser: argparse.ArgumentParser, command: str) -> None:
                                 metavar=option.metavar, help=description(name))
 
 
-def _add_machine(parser: argparse.ArgumentParser) -> None:
+def _add_machine(parser: argparse.ArgumentParser, purpose: str = "") -> None:
     parser.add_argument("--machine", type=_option_type("machine"), default=DEFAULTS["machine"],
-                        metavar=OPTIONS["machine"].metavar, help=description("machine"))
+                        metavar=OPTIONS["machine"].metavar, help=purpose + description("machine"))
 
 
-def _add_can(parser: argparse.ArgumentParser) -> None:
+def _add_can(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--can", type=lambda text: text if text == "auto" else _convert("can", text), default="auto",
                         metavar="BUS", help=f"{BUSES}, or auto (default): vcan0 when it is up, else "
                         "unix:build/salient.sock")

@@ -29,6 +29,8 @@ PACES = ("lockstep", "realtime", "free")
 PACE_FACTOR_MIN, PACE_FACTOR_MAX = 0.01, 1000.0
 """PACING_FACTOR_MIN and PACING_FACTOR_MAX of emulator/rig/pacing.h."""
 BUSES = "unix:PATH or socketcan:INTERFACE"
+LOG_SUFFIXES = (".blf", ".asc", ".mf4", ".log")
+"""Formats of a log: BLF, ASC, MF4 and the text of candump -L."""
 
 FLAG, INTEGER, NUMBER, WORD, FILE, BUS, PACE = "flag", "integer", "number", "word", "file", "bus", "pace"
 MACHINE = "machine"
@@ -168,6 +170,8 @@ class BenchConfig(Conditions):
                         commands=("sim",))
     bit_rate: int = _option(1_000_000, INTEGER, "bit rate of the emulated bus", metavar="N", minimum=10_000,
                             maximum=1_000_000, commands=("sim",))
+    drive_only: bool = _option(False, FLAG, "the bus carries the drive alone; of the test bench only replies, no true "
+                               "state and on SocketCAN no virtual time", commands=("sim",))
     machine_image: Path | None = _option(None, FILE, "the machine, as salient.generate.machine writes it",
                                          metavar="FILE")
     memory: Path | None = _option(None, FILE, "keeps the drive's non-volatile memory in a file, which is made when it "

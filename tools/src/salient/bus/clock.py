@@ -5,7 +5,7 @@ before each of its frames one with the subject "next", before a frame of another
 emulated bus one with the subject "next_of_any_node", and, when a client's frame (which is on the interface already)
 completes on the emulated bus or is accepted without it, one with the subject "oldest_on_bus" or "oldest_at_once". The
 reader joins frame and stamp and removes the stamps, so both transports yield the same list of (time, frame), in the
-same order.
+same order. On an interface without stamps (`sim --drive-only`) the time is that at which the interface had the frame.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ class VirtualTimeReader:
         # with two senders of one identifier is broken anyway.
         self._drive_sends = _sent_by(drive_database(), "DRIVE")
         self._rig_sends = _sent_by(rig_database(), "RIG")
-        self._stamped = not hasattr(bus, "receive_own_messages")  # SocketCAN
+        self._on_interface = not hasattr(bus, "receive_own_messages")  # SocketCAN
+        self._unstamped = 0  # frames of the emulator before the first stamp
+        self._stamped = False
         self._next_ns: int | None = None
         self._next_of_any = False
         self._waiting_on_bus: deque[can.Message] = deque()
@@ -65,7 +67,7 @@ class VirtualTimeReader:
             message = self._bus.recv(timeout)
             if message is None:
                 return None
-            if not self._stamped:
+            if not self._on_interface:
                 return cast(VirtualMessage, message).time_ns, message  # of the local bus
             timed = self._join(message)
             if timed is not None:
@@ -75,6 +77,7 @@ class VirtualTimeReader:
         identifier = message.arbitration_id
         if message.is_extended_id and identifier == RIG_STAMP_ID and len(message.data) == 7:
             time_ns, subject = clock_of(message)
+            self._stamped = True
             if subject in (_SUBJECTS["next"], _SUBJECTS["next_of_any_node"]):
                 self._next_ns, self._next_of_any = time_ns, subject != _SUBJECTS["next"]
                 return None
@@ -83,9 +86,14 @@ class VirtualTimeReader:
             return _timed(time_ns, waiting.popleft()) if waiting else None
         if message.is_extended_id and identifier == RIG_CLOCK_ID and len(message.data) == 7:
             return _timed(clock_of(message)[0], message)
-        if self._next_ns is not None and (self._next_of_any or self._is_emulators(message)):
+        emulators = self._is_emulators(message)
+        if self._next_ns is not None and (self._next_of_any or emulators):
             time_ns, self._next_ns = self._next_ns, None
             return _timed(time_ns, message)
+        if emulators:
+            self._unstamped += 1
+        if not self._stamped and self._unstamped > 1:  # one is between its stamp and the first frame of this reader
+            return round(message.timestamp * 1e9), message
         (self._waiting_on_bus if is_on_bus(message) else self._waiting_at_once).append(message)
         return None
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import can
+from cantools.database.can import Database
 
 from salient.bus.clock import VirtualTimeReader, open_bus
 from salient.bus.interface import closed_in_order
 from salient.bus.log import open_log
-from salient.bus.signals import SignalTable, drive_database
+from salient.bus.selected_signals import SelectedSignals
+from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.errors import UsageError
 from salient.machine.file import MachineError
 
@@ -27,14 +30,16 @@ _COLUMNS = (
     ("DC link", "DRIVE_TORQUE.bus_voltage_V", "{:>8.1f}"),
 )
 """Title, signal and number format, in the order of a line."""
+_WIDTH = 120
+"""Characters of a line where the output is no terminal."""
 
 
 class _BusClosed(Exception):
     """The emulator closed the bus while this command was listening."""
 
 
-def record(address: str, path: Path, duration_s: float | None) -> int:
-    """Writes every frame on a bus to a log file, on virtual time.
+def record(address: str, path: Path, duration_s: float | None, machine: str) -> int:
+    """Writes every frame on a bus to a log file, on virtual time. machine: decodes the signals of an MF4 file.
 
     Ends when `duration_s` of virtual time have passed, on an interrupt, or when the bus closes; the file is complete in
     every case. Returns the exit code: 1 when the bus closed early (see _report_closed), else 0.
@@ -44,7 +49,7 @@ def record(address: str, path: Path, duration_s: float | None) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {path}: {error.strerror}") from None
-    log = open_log(path)
+    log = open_log(path, machine)
     count, closed = 0, False
     try:
         for timed in _frames(address, duration_s, "recording"):
@@ -60,25 +65,29 @@ def record(address: str, path: Path, duration_s: float | None) -> int:
     return _report_closed(address, duration_s) if closed else 0
 
 
-def monitor(address: str, every_s: float, duration_s: float | None, machine: str) -> int:
-    """Prints the main signals of the drive of a machine every `every_s` of virtual time; ends as `record` does, with
-    its exit code. UsageError: no such machine."""
+def monitor(address: str, every_s: float, duration_s: float | None, machine: str,
+            signals: Sequence[str] | None = None) -> int:
+    """Prints the named signals, else the main ones of the drive of a machine, every `every_s` of virtual time; ends as
+    `record` does, with its exit code. UsageError: no such machine, or no signal of a name."""
     try:
         database = drive_database(machine)
     except MachineError as error:
         raise UsageError(str(error)) from None
-    telemetry = SignalTable(database, "DRIVE")
+    shown: _MainSignals | SelectedSignals = _MainSignals(database)
+    if signals:
+        width = shutil.get_terminal_size((_WIDTH, 1)).columns
+        shown = SelectedSignals((database, rig_database()), signals, width)
     due_ns = None
     try:
         for time_ns, message in _frames(address, duration_s, "monitoring"):
-            telemetry.add(time_ns, message)
+            shown.add(time_ns, message)
             due_ns = time_ns + round(every_s * 1e9) if due_ns is None else due_ns
             if time_ns < due_ns:
                 continue
-            if telemetry.count("DRIVE_TORQUE"):
-                sys.stdout.write(_line(time_ns, telemetry) + "\n")
+            line = shown.line(time_ns)
+            if line:
+                sys.stdout.write(line + "\n")
                 sys.stdout.flush()
-            telemetry = SignalTable(database, "DRIVE")
             due_ns += round(every_s * 1e9)
     except _BusClosed:
         return _report_closed(address, duration_s)
@@ -119,13 +128,28 @@ def _report_closed(address: str, duration_s: float | None) -> int:
     return 0 if in_order and duration_s is None else 1
 
 
-def _line(time_ns: int, telemetry: SignalTable) -> str:
-    cells = [f"{time_ns * 1e-9:10.4f} s"]
-    for title, name, number_format in _COLUMNS:
-        value = telemetry[name]
-        shown = number_format.format(value.last_name if value.choices else value.last)
-        cells.append(f"{title} {shown} {value.unit}".rstrip())
-    held = telemetry["DRIVE_STATUS.start_inhibited_by"].last_name
-    if held not in ("none", "unknown"):
-        cells.append(f"start inhibited by {held}")
-    return "  ".join(cells)
+class _MainSignals:
+    """The signals of _COLUMNS, and the check that keeps the drive from starting."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._telemetry = SignalTable(database, "DRIVE")
+
+    def add(self, time_ns: int, message: can.Message) -> None:
+        """Takes a frame."""
+        self._telemetry.add(time_ns, message)
+
+    def line(self, time_ns: int) -> str:
+        """The values at a time; empty when the drive has sent none since the last line."""
+        telemetry, self._telemetry = self._telemetry, SignalTable(self._database, "DRIVE")
+        if not telemetry.count("DRIVE_TORQUE"):
+            return ""
+        cells = [f"{time_ns * 1e-9:10.4f} s"]
+        for title, name, number_format in _COLUMNS:
+            value = telemetry[name]
+            shown = number_format.format(value.last_name if value.choices else value.last)
+            cells.append(f"{title} {shown} {value.unit}".rstrip())
+        held = telemetry["DRIVE_STATUS.start_inhibited_by"].last_name
+        if held not in ("none", "unknown"):
+            cells.append(f"start inhibited by {held}")
+        return "  ".join(cells)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -84,24 +85,26 @@ class Signal:
 
 
 class SignalTable(Mapping[str, Signal]):
-    """The signals of the messages that one node sends, filled frame by frame. A multiplexed signal has the frames that
-    carry it.
+    """The signals of the messages that one node sends, or all without a sender, filled frame by frame. A multiplexed
+    signal has the frames that carry it.
 
     table["speed_rpm"] is the signal of that name in the message with the lowest identifier that has one;
     table["DRIVE_FAULT_SNAPSHOT.speed_rpm"] names its message. KeyError lists the signals.
     """
 
-    def __init__(self, database: Database, sender: str) -> None:
+    def __init__(self, database: Database, sender: str | None = None) -> None:
         self._messages: dict[tuple[int, bool], Message] = {}
         self._names: dict[str, tuple[tuple[int, bool], cantools.database.can.Signal]] = {}
-        self._times: dict[tuple[int, bool], list[int]] = {}
+        self._times: dict[tuple[int, bool], array[int]] = {}
         self._data: dict[tuple[int, bool], bytearray] = {}
+        self._length: dict[tuple[int, bool], int] = {}
         for message in sorted(database.messages, key=lambda m: m.frame_id):
-            if sender not in message.senders:
+            if sender is not None and sender not in message.senders:
                 continue
             key = (message.frame_id, message.is_extended_frame)
             self._messages[key] = message
-            self._times[key], self._data[key] = [], bytearray()
+            self._times[key], self._data[key] = array("q"), bytearray()
+            self._length[key] = message.length
             for signal in message.signals:
                 self._names.setdefault(signal.name, (key, signal))
                 self._names[f"{message.name}.{signal.name}"] = (key, signal)
@@ -109,13 +112,11 @@ class SignalTable(Mapping[str, Signal]):
     def add(self, time_ns: int, message: can.Message) -> None:
         """Adds a frame if the node sends it and its length is that of the DBC."""
         key = (message.arbitration_id, message.is_extended_id)
-        times = self._times.get(key)
-        if times is None or message.is_remote_frame or message.is_fd or message.is_error_frame:
+        data = message.data
+        if self._length.get(key) != len(data) or message.is_remote_frame or message.is_fd or message.is_error_frame:
             return
-        if len(message.data) != self._messages[key].length:
-            return
-        times.append(time_ns)
-        self._data[key] += bytes(message.data).ljust(8, b"\0")
+        self._times[key].append(time_ns)
+        self._data[key] += data if len(data) == 8 else data.ljust(8, b"\0")
 
     def __getitem__(self, name: str) -> Signal:
         if name not in self._names:

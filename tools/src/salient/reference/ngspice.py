@@ -51,22 +51,23 @@ def machine_lines(machine: Machine, bridge: str) -> list[str]:
     ]
 
 
-def run(folder: Path, lines: list[str], timeout_s: float) -> Waveforms:
-    """Runs a deck (its first line is a title) in a folder; NgspiceError with the output of ngspice."""
+def run(folder: Path, lines: list[str], processor_limit_s: int) -> Waveforms:
+    """Runs a deck (its first line is a title) in a folder; NgspiceError with the output of ngspice. The limit is one of
+    processor time, which does not depend on the load of the computer."""
     (folder / "deck.cir").write_text("\n".join(lines) + "\n")
     raw = folder / "deck.raw"
     raw.unlink(missing_ok=True)
     command = ["ngspice", "--batch", "--no-spiceinit", "--rawfile=deck.raw", "deck.cir"]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     try:
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=timeout_s)
+        process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     except FileNotFoundError:
         raise NgspiceError("ngspice is missing: install the Debian package ngspice") from None
-    except subprocess.TimeoutExpired:
-        raise NgspiceError(f"ngspice took longer than {timeout_s:g} s on {folder / 'deck.cir'}") from None
+    with process:
+        resource.prlimit(process.pid, resource.RLIMIT_CPU, (processor_limit_s, processor_limit_s))
+        output, _ = process.communicate()
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    output = done.stdout + done.stderr
-    if done.returncode != 0 or not raw.exists() or "aborted" in output:
+    if process.returncode != 0 or not raw.exists() or "aborted" in output:
         raise NgspiceError(f"ngspice failed on {folder / 'deck.cir'}:\n{output[-2000:]}")
     header, _, values = raw.read_bytes().partition(b"Binary:\n")
     variables = header.decode().partition("Variables:\n")[2].split()[1::3]

@@ -20,12 +20,12 @@ from salient.reference import ngspice
 _RAMP_NS = 0.1  # rise and fall of a gate signal, from the edge on
 
 
-def run_ngspice(pattern: SwitchingPattern, step_ns: int, timeout_s: float = 600.0) -> Trajectory:
+def run_ngspice(pattern: SwitchingPattern, step_ns: int, processor_limit_s: int = 600) -> Trajectory:
     """The saturating machine through a recorded pattern, in steps of step_ns at most. NgspiceError."""
     with tempfile.TemporaryDirectory(prefix="salient-") as name:
         folder = Path(name)
         (folder / "gates.txt").write_text("\n".join(_gate_lines(pattern)) + "\n")
-        waveforms = ngspice.run(folder, _deck(pattern, step_ns), timeout_s)
+        waveforms = ngspice.run(folder, _deck(pattern, step_ns), processor_limit_s)
     ends_s = (np.arange(pattern.periods) + 1) * pattern.period_ns * 1e-9
     values = {key: np.interp(ends_s, waveforms.time_s, column) for key, column in waveforms.values.items()}
     phases = range(pattern.phases)
