@@ -51,20 +51,21 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
 }
 
 void drive_control_interrupt(drive_t *drive) {
-    control_sample_t *sample = &drive->sample;
-    sample->missed_interrupts = hal_interrupt_missed_triggers(drive->hal);
-    sample->time_us = hal_time_us(drive->hal);
-    if (sample->missed_interrupts != 0) {
+    control_sample_t sample = {
+        .missed_interrupts = hal_interrupt_missed_triggers(drive->hal),
+        .time_us = hal_time_us(drive->hal),
+    };
+    if (sample.missed_interrupts != 0) {
         drive->late_interrupts++; /* the previous one */
     }
-    sample->break_causes = hal_pwm_break(drive->hal);
-    hal_encoder_read(drive->hal, &sample->encoder);
-    hal_adc_read(drive->hal, &sample->adc);
-    if (control_step(&drive->control_parameters, &drive->control, sample, &drive->command, &drive->compare)) {
+    drive->break_causes = sample.break_causes = hal_pwm_break(drive->hal);
+    hal_encoder_read(drive->hal, &sample.encoder);
+    hal_adc_read(drive->hal, &sample.adc);
+    if (control_step(&drive->control_parameters, &drive->control, &sample, &drive->command, &drive->compare)) {
         hal_pwm_write(drive->hal, &drive->compare);
     } else {
         hal_pwm_open_all(drive->hal);
-        if (sample->break_causes != 0) {
+        if (sample.break_causes != 0) {
             hal_pwm_clear_break(drive->hal);
         }
     }
@@ -134,7 +135,7 @@ COLD static void check_slowly(drive_t *drive, uint32_t time_us) {
     const stall_input_t stall = stall_input(drive);
     hal_critical_leave(drive->hal);
     uint64_t failed = 0;
-    if (sto_monitor_failed(&drive->sto, drive->sample.break_causes, time_us)) {
+    if (sto_monitor_failed(&drive->sto, drive->break_causes, time_us)) {
         failed |= FAULT_BIT(FAULT_STO_DISCREPANCY);
     }
     if (stall_monitor_failed(&drive->stall, &stall, time_us)) {

@@ -17,8 +17,6 @@
 /* One drive. The caller allocates it; only the functions below and telemetry_collect() access it. */
 typedef struct {
     hal_t *hal;
-    /* Written by the control interrupt; read by the background with the interrupts masked. */
-    control_sample_t sample;
     /* Last accepted command; this and the next are written by the background with the interrupts masked. */
     command_t command;
     control_parameters_t control_parameters;
@@ -26,6 +24,7 @@ typedef struct {
      * control laws for new parameters with the interrupts masked. */
     control_state_t control;
     hal_pwm_compare_t compare; /* of the last period in RUN; written by the control interrupt */
+    uint32_t break_causes;     /* of the last control interrupt, HAL_PWM_BREAK_*; written by it */
     /* Execution time of the interrupts, for telemetry only; overruns are handled by drive/protection.h. */
     uint32_t used_ticks;           /* last control interrupt, from trigger to end, ticks of the timer */
     uint32_t worst_ticks;          /* maximum since start */

@@ -107,7 +107,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->deferred.worst_us = processor_time(drive, drive->deferred_worst_ticks);
     telemetry->deferred.skipped_periods = control->deferred_request.skipped_total;
 
-    telemetry->gates = drive->sample.break_causes; /* the DBC has the bits of HAL_PWM_BREAK_* */
+    telemetry->gates = drive->break_causes; /* the DBC has the bits of HAL_PWM_BREAK_* */
 
     telemetry->identity.firmware_major = SALIENT_VERSION_MAJOR;
     telemetry->identity.firmware_minor = SALIENT_VERSION_MINOR;

@@ -109,15 +109,15 @@ void load_observer_step(const load_observer_model_t *model, const load_observer_
 
     /* Correct. */
     int64_t angle_q64 = fixed_accumulate((int64_t)observer->angle_q64, innovation_q4, gains->angle_gain_q28);
-    observer->speed_correction_q22 = fixed_shift_saturate(fixed_product(innovation_q4, gains->speed_gain_q24), 28);
+    observer->speed_correction_q22 = fixed_product_shift_saturate(innovation_q4, gains->speed_gain_q24, 28);
     const int32_t speed_q22 = fixed_add(observer->speed_q22, observer->speed_correction_q22);
     const int32_t unscaled_q24 = fixed_multiply_high(innovation_q4, gains->load_gain_q28);
-    const int32_t load_correction_q24 = fixed_shift_saturate(fixed_product(unscaled_q24, gains->load_factor_q4), 4);
+    const int32_t load_correction_q24 = fixed_product_shift_saturate(unscaled_q24, gains->load_factor_q4, 4);
     const int32_t load_q24 = fixed_add(observer->load_torque_q24, load_correction_q24);
     observer->load_torque_q24 = fixed_clamp(load_q24, -LOAD_TORQUE_LIMIT_Q24, LOAD_TORQUE_LIMIT_Q24 - 1);
 
     /* Predict: acceleration is constant over the period, so the angle advances at the mean of old and new speed. */
-    const int32_t friction_q24 = fixed_shift_saturate(fixed_product(speed_q22, model->friction_q30), 28);
+    const int32_t friction_q24 = fixed_product_shift_saturate(speed_q22, model->friction_q30, 28);
     const int32_t net_q24 = fixed_subtract(fixed_subtract(torque_q24, friction_q24), observer->load_torque_q24);
     const int32_t speed_change_q22 = fixed_multiply_high(net_q24, model->acceleration_q32);
     const int32_t mean_speed_q22 = fixed_add(speed_q22, speed_change_q22 >> 1);

@@ -18,7 +18,7 @@ void speed_pi_follow(speed_pi_t *pi, int32_t torque_q24) {
 int32_t speed_pi_step(const speed_pi_parameters_t *parameters, speed_pi_t *pi, int32_t speed_error_q22) {
     const int32_t min_q24 = parameters->torque_min_q24;
     const int32_t max_q24 = parameters->torque_max_q24;
-    const int32_t proportional_q24 = fixed_shift_saturate(fixed_product(speed_error_q22, parameters->kp_q16), 14);
+    const int32_t proportional_q24 = fixed_product_shift_saturate(speed_error_q22, parameters->kp_q16, 14);
     const int32_t sum_q24 = fixed_add(proportional_q24, integral_torque_q24(pi->integral_q54));
     int32_t torque_q24 = sum_q24;
     if (sum_q24 > max_q24) {

@@ -34,7 +34,7 @@ int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, 
 
 int32_t speed_smc_torque_q24(const speed_smc_parameters_t *parameters, int32_t reaching_q24, int32_t speed_q22,
                              int32_t load_torque_q24, int32_t torque_min_q24, int32_t torque_max_q24) {
-    const int32_t friction_q24 = fixed_shift_saturate(fixed_product(speed_q22, parameters->friction_q30), 28);
+    const int32_t friction_q24 = fixed_product_shift_saturate(speed_q22, parameters->friction_q30, 28);
     const int32_t torque_q24 = fixed_add(fixed_add(reaching_q24, load_torque_q24), friction_q24);
     return fixed_clamp(torque_q24, torque_min_q24, torque_max_q24);
 }

@@ -49,7 +49,6 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     }
     observe(parameters, state, deferred, measured);
     const uint64_t fault_mask = protect(parameters, state, sample, measured) | deferred->fault_mask;
-    const bool was_running = state->state_machine.state == DRIVE_STATE_RUN;
     const bool run = supervise(parameters, state, sample, command, measured, fault_mask);
     if (run) {
         state->torque_reference_q24 = speed_control_torque_q24(parameters, &state->observer, sample, deferred);
@@ -58,9 +57,6 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
                  compare);
     } else {
         *compare = (hal_pwm_compare_t){{0}, {0}};
-        if (was_running) {
-            control_prepare(parameters, state);
-        }
     }
     deferred_hand_over(parameters, state, sample, command, measured, run);
     return run;

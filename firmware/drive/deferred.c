@@ -1,33 +1,34 @@
 #include "drive/deferred.h"
 
 #include "drive/speed_control.h"
+#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
 #define RUN_MASK UINT32_C(0x0000FFFF)
 #define OBSERVER_MASK UINT32_C(0xFFFF0000)
 #define OBSERVER_STEP UINT32_C(0x00010000)
 
-/* From here on the results of earlier inputs are without effect. */
-static void change_generation(control_state_t *state, uint32_t generation) {
-    deferred_request_t *request = &state->deferred_request;
-    const deferred_results_t *in_effect = deferred_in_effect(state);
-    request->initial.fault_mask = in_effect->fault_mask;
-    request->initial.speed = in_effect->speed;
-    request->initial.bandwidth = in_effect->bandwidth;
-    request->initial.predictive = in_effect->predictive;
-    request->generation = generation;
-}
-
+/* From here on the results of earlier inputs are without effect, but for those that are kept. */
 void deferred_reset_run(control_state_t *state) {
-    const uint32_t generation = state->deferred_request.generation;
-    change_generation(state, (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK));
-    state->deferred_request.initial.predictive.conduction = CONDUCTION_INITIAL;
-    state->deferred_request.initial.speed = (deferred_speed_results_t){0, 0, 0, 0, 0};
+    deferred_request_t *request = &state->deferred_request;
+    const deferred_results_t *kept = deferred_in_effect(state);
+    const uint32_t generation = request->generation;
+    request->initial.fault_mask = kept->fault_mask;
+    request->initial.bandwidth = kept->bandwidth;
+    request->initial.predictive = kept->predictive;
+    request->initial.predictive.conduction = CONDUCTION_INITIAL;
+    request->initial.speed = (deferred_speed_results_t){0, 0, 0, 0, 0};
+    request->generation = (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK);
 }
 
 void deferred_reset_observer(control_state_t *state) {
-    change_generation(state, state->deferred_request.generation + OBSERVER_STEP);
-    state->deferred_request.initial.bandwidth = (observer_bandwidth_limits_t){0, 0, 0, 0};
+    deferred_request_t *request = &state->deferred_request;
+    const deferred_results_t *kept = deferred_in_effect(state);
+    request->initial.fault_mask = kept->fault_mask;
+    request->initial.speed = kept->speed;
+    request->initial.predictive = kept->predictive;
+    request->initial.bandwidth = (observer_bandwidth_limits_t){0, 0, 0, 0};
+    request->generation += OBSERVER_STEP;
 }
 
 static void hand_over_bandwidth(control_state_t *state, const control_measurement_t *measured,
@@ -64,7 +65,7 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->command_age_us = sample->time_us - command->time_us;
     input->speed_q22 = state->observer.speed_q22;
     input->run = run;
-    input->command = *command;
+    input->command = command;
     input->torque_reference_q24 = state->torque_reference_q24;
     if (parameters->bandwidth.adaptive) {
         hand_over_bandwidth(state, measured, input);
@@ -76,7 +77,8 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
 }
 
 /* Resets what the control interrupt has reset since the previous step. */
-static void follow_resets(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
+NOINLINE static void follow_resets(const control_parameters_t *parameters, deferred_t *deferred,
+                                   const deferred_input_t *input) {
     const uint32_t changed = deferred->generation ^ input->generation;
     if ((changed & RUN_MASK) != 0) {
         conduction_reset(&parameters->conduction, &deferred->conduction);
@@ -206,7 +208,8 @@ static bool torque_limited(const deferred_t *deferred, const deferred_input_t *i
 
 /* What is not urgent, in four turns: no step takes the time of all. The learning of the phases has two of them, because
  * at a high bandwidth of the observer it follows within a millisecond. */
-static void take_turns(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
+NOINLINE static void take_turns(const control_parameters_t *parameters, deferred_t *deferred,
+                                const deferred_input_t *input) {
     deferred->turn = (deferred->turn + 1) % DEFERRED_SLOW_PERIODS;
     switch (deferred->turn) {
     case 0:
@@ -234,7 +237,10 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     const deferred_input_t *input = &state->deferred_request.input;
     deferred_t *deferred = &state->deferred;
     deferred_results_t *results = deferred_buffer(&deferred->response);
-    follow_resets(parameters, deferred, input);
+    const bool reset = deferred->generation != input->generation || !deferred->started;
+    if (reset) {
+        follow_resets(parameters, deferred, input);
+    }
     results->generation = input->generation;
     results->fault_mask = (uint32_t)protect(parameters, deferred, input) | state->reported_fault_mask;
     if (parameters->bandwidth.adaptive) {
@@ -242,7 +248,8 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     speed_control_deferred(parameters, deferred, input, results);
     deferred->run = input->run;
-    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run) {
+    /* A step that resets has done enough. */
+    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run && !reset) {
         take_turns(parameters, deferred, input);
     }
     results->predictive.conduction = deferred->conduction.latest;

@@ -22,6 +22,7 @@
 #include "control/load_observer.h"
 #include "control/observer_bandwidth.h"
 #include "drive/command.h"
+#include "fixed/compiler.h"
 #include "hal.h"
 
 /* Values of one control period. */
@@ -34,8 +35,8 @@ typedef struct {
     int32_t speed_q22;          /* observer, for the coming sample, rad/s, Q9.22 */
     /* With an adaptive bandwidth only. */
     observer_bandwidth_sample_t bandwidth;
-    bool run; /* state RUN */
-    command_t command;
+    bool run;                 /* state RUN */
+    const command_t *command; /* the last accepted one; the background, which alone changes it, waits for the step */
     int32_t torque_reference_q24; /* of this period, N m, Q7.24; 0 outside RUN */
     /* With predictive torque control only. */
     int32_t load_torque_q24;      /* observer, N m, Q7.24 */
@@ -94,6 +95,7 @@ static inline bool deferred_pending(const deferred_request_t *request, const def
 static inline const deferred_results_t *deferred_results(const deferred_request_t *request,
                                                          const deferred_response_t *response) {
     const deferred_results_t *results = &response->results[response->latest];
+    IN_REGISTER(results);
     return results->generation == request->generation ? results : &request->initial;
 }
 

@@ -43,8 +43,8 @@ static uint32_t count_overruns(protection_t *protection, uint32_t missed_interru
  * fault interrupt_overrun, and what the rotor did meanwhile is no other. */
 static bool encoder_jumped(const protection_parameters_t *parameters, int32_t angle_step, uint32_t missed_interrupts) {
     const uint32_t step_max = (uint32_t)parameters->angle_step_max;
-    return missed_interrupts < PROTECTION_OVERRUNS_MAX &&
-           (uint32_t)fixed_abs(angle_step) > step_max * missed_interrupts + step_max;
+    const uint32_t limit = step_max * missed_interrupts + step_max;
+    return missed_interrupts < PROTECTION_OVERRUNS_MAX && (uint32_t)angle_step + limit > 2 * limit;
 }
 
 /* True when the encoder does not count although the rotor turns. The observer alone cannot detect that: with a high

@@ -9,7 +9,7 @@ static int32_t ramp_step(int32_t reference_q22, int32_t target_q22, int32_t step
 
 static int32_t speed_law_q24(const control_parameters_t *parameters, deferred_t *deferred,
                              const deferred_input_t *input) {
-    const command_t *command = &input->command;
+    const command_t *command = input->command;
     const int32_t commanded_q22 = command->request == COMMAND_RUN ? command->speed_reference_q22 : 0;
     const int32_t min_q22 = parameters->speed_reference_min_q22;
     const int32_t before_q22 =
@@ -34,7 +34,7 @@ static int32_t torque_law_q24(const control_parameters_t *parameters, deferred_t
         deferred->torque_mode.torque_q24 = fixed_subtract(input->torque_reference_q24, offset_q24);
     }
     const int32_t torque_q24 = torque_mode_step(&parameters->torque_mode, &deferred->torque_mode,
-                                                input->command.torque_reference_q24, input->speed_q22);
+                                                input->command->torque_reference_q24, input->speed_q22);
     deferred->speed_reference_q22 = fixed_clamp(input->speed_q22, parameters->speed_reference_min_q22, INT32_MAX);
     speed_pi_follow(&deferred->speed_pi, torque_q24);
     return fixed_add(torque_q24, offset_q24);
@@ -50,7 +50,7 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
     results->speed.periodic_load_q24 = 0;
     if (!input->run) {
         min_q24 = max_q24 = 0;
-    } else if (input->command.mode == DRIVE_MODE_TORQUE && input->command.request == COMMAND_RUN) {
+    } else if (input->command->mode == DRIVE_MODE_TORQUE && input->command->request == COMMAND_RUN) {
         mode = DRIVE_MODE_TORQUE;
         torque_q24 = fixed_clamp(torque_law_q24(parameters, deferred, input, offset_q24), min_q24, max_q24);
         min_q24 = max_q24 = torque_q24;

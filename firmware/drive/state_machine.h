@@ -45,8 +45,24 @@ fault_t state_machine_first_fault(uint64_t fault_mask);
 /* State INITIALISE, no fault. */
 void state_machine_reset(state_machine_t *state_machine);
 
-/* One tick. initialise_ticks: control periods in 1 ms. Returns true in the tick that latches a fault: fault, fault_mask
- * and state of the record are set, the caller completes the others. */
-bool state_machine_step(state_machine_t *state_machine, const state_machine_input_t *input, uint32_t initialise_ticks);
+/* First part of a tick: true when a run goes on, or begins, in which case nothing else is to be done. */
+static inline bool state_machine_runs(state_machine_t *state_machine, const state_machine_input_t *input) {
+    if (input->fault_mask != 0) {
+        return false;
+    }
+    if (state_machine->state == DRIVE_STATE_RUN) { /* rearmed; the last request matters in FAULT only */
+        return input->request != COMMAND_OFF && !(input->request == COMMAND_STOP && input->at_standstill);
+    }
+    if (state_machine->state == DRIVE_STATE_READY && input->request == COMMAND_RUN && state_machine->rearmed) {
+        state_machine->state = DRIVE_STATE_RUN;
+        return true;
+    }
+    return false;
+}
+
+/* The rest of a tick in which state_machine_runs() is false. initialise_ticks: control periods in 1 ms. Returns true in
+ * the tick that latches a fault: fault, fault_mask and state of the record are set, the caller completes the others. */
+bool state_machine_stands(state_machine_t *state_machine, uint64_t fault_mask, command_request_t request,
+                          uint32_t initialise_ticks);
 
 #endif

@@ -7,8 +7,8 @@
 /* A stop ends below this speed: 0.5 rad/s, 5 r/min. */
 #define STANDSTILL_Q22 (1 << 21)
 
-NOINLINE static void complete_record(fault_record_t *record, const control_state_t *state,
-                                     const control_sample_t *sample, const control_measurement_t *measured) {
+static void complete_record(fault_record_t *record, const control_state_t *state, const control_sample_t *sample,
+                            const control_measurement_t *measured) {
     record->time_us = sample->time_us;
     /* The estimate without this sample: the encoder may be the cause of the fault. */
     record->speed_q22 = measured->predicted_speed_q22;
@@ -17,12 +17,27 @@ NOINLINE static void complete_record(fault_record_t *record, const control_state
     record->dc_link_voltage_q6 = (uint16_t)measured->dc_link_voltage_q6;
 }
 
-static void leave_state(control_state_t *state, const control_measurement_t *measured, drive_state_t left) {
+NOINLINE static void leave_state(const control_parameters_t *parameters, control_state_t *state,
+                                 const control_measurement_t *measured, drive_state_t left) {
     if (left == DRIVE_STATE_FAULT) {
         observe_reset(state, measured); /* its estimate may stem from a faulty encoder */
-    }
-    if (left == DRIVE_STATE_RUN) {
+    } else if (left == DRIVE_STATE_RUN) {
         state->torque_reference_q24 = 0;
+        control_prepare(parameters, state);
+    }
+}
+
+/* Out of the way of a run, which is the longer path. */
+NOINLINE static void stand(const control_parameters_t *parameters, control_state_t *state,
+                           const control_sample_t *sample, const control_measurement_t *measured, uint64_t fault_mask,
+                           command_request_t request) {
+    state_machine_t *state_machine = &state->state_machine;
+    const drive_state_t before = state_machine->state;
+    if (state_machine_stands(state_machine, fault_mask, request, parameters->initialise_ticks)) {
+        complete_record(&state_machine->record, state, sample, measured);
+    }
+    if (state_machine->state != before) {
+        leave_state(parameters, state, measured, before);
     }
 }
 
@@ -34,16 +49,9 @@ bool supervise(const control_parameters_t *parameters, control_state_t *state, c
         .request = command->request,
         .at_standstill = fixed_abs(state->observer.speed_q22) < STANDSTILL_Q22,
     };
-    const drive_state_t before = state_machine->state;
-    if (state_machine_step(state_machine, &input, parameters->initialise_ticks)) {
-        complete_record(&state_machine->record, state, sample, measured);
-    }
-    if (state_machine->state == before) {
-        return before == DRIVE_STATE_RUN;
-    }
-    if (state_machine->state == DRIVE_STATE_RUN) { /* from READY, which leaves nothing to reset */
+    if (state_machine_runs(state_machine, &input)) { /* entered from READY, which leaves nothing to reset */
         return true;
     }
-    leave_state(state, measured, before);
+    stand(parameters, state, sample, measured, fault_mask, command->request);
     return false;
 }

@@ -34,20 +34,20 @@ static void hysteresis_control(const control_parameters_t *parameters, control_s
                          turns_backwards(state), state->duty_q15);
 }
 
-static void duty_control(const control_parameters_t *parameters, control_state_t *state,
+/* False when hysteresis control is to act instead. */
+static bool duty_control(const control_parameters_t *parameters, control_state_t *state,
                          const control_measurement_t *measured) {
     if (state->duty.regulated == COMMUTATION_NONE && state->torque_reference_q24 <= 0) {
         /* The speed law's first torque acts in the second period: the outgoing phase would count as depleted before. */
         for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
             state->duty_q15[phase] = -MODULATOR_DUTY_ONE_Q15;
         }
-        return;
+        return true;
     }
     if (turns_backwards(state)) {
         /* The BP-PID assumes the order of the phases of forward motion. It begins again, as from standstill. */
         state->duty.regulated = COMMUTATION_NONE;
-        hysteresis_control(parameters, state, measured);
-        return;
+        return false;
     }
     const pwm_ditc_sample_t sample = {
         .current_q9 = measured->current_q9,
@@ -56,6 +56,7 @@ static void duty_control(const control_parameters_t *parameters, control_state_t
         .error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24),
     };
     pwm_ditc_step(&parameters->duty, &state->duty, &measured->commutation, &sample, state->duty_q15);
+    return true;
 }
 
 static void predictive_control(const control_parameters_t *parameters, control_state_t *state,
@@ -86,16 +87,10 @@ static void predictive_control(const control_parameters_t *parameters, control_s
 
 void torque_control(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
                     const control_measurement_t *measured) {
-    switch (parameters->torque_law) {
-    case TORQUE_LAW_HYSTERESIS:
-        hysteresis_control(parameters, state, measured);
-        break;
-    case TORQUE_LAW_DUTY:
-        duty_control(parameters, state, measured);
-        break;
-    case TORQUE_LAW_PREDICTIVE:
+    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
         predictive_control(parameters, state, deferred, measured);
-        break;
+    } else if (parameters->torque_law == TORQUE_LAW_HYSTERESIS || !duty_control(parameters, state, measured)) {
+        hysteresis_control(parameters, state, measured); /* in one place, so that it is inlined */
     }
 }
 

@@ -15,6 +15,13 @@ static inline int64_t arm_smull(int32_t a, int32_t b) {
     return product;
 }
 
+/* a * b in words: the compiler would keep a product of which one word is altered in memory. */
+static inline int32_t arm_smull_words(int32_t a, int32_t b, uint32_t *low) {
+    int32_t high;
+    __asm__("smull %0, %1, %2, %3" : "=&r"(*low), "=&r"(high) : "r"(a), "r"(b));
+    return high;
+}
+
 /* sum + a * b; wraps. */
 static inline int64_t arm_smlal(int64_t sum, int32_t a, int32_t b) {
     __asm__("smlal %Q0, %R0, %1, %2" : "+r"(sum) : "r"(a), "r"(b));

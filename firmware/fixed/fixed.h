@@ -141,9 +141,23 @@ ALWAYS_INLINE int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
 
 /* value / 2^shift, rounded down; shift 1..31, a constant. Saturates to within 2^(32-shift) of INT32_MIN or INT32_MAX:
  * only the high word saturates, in one instruction, the low bits of the result pass unchanged. */
+ALWAYS_INLINE int32_t fixed_words_shift_saturate(int32_t high, uint32_t low, unsigned shift) {
+    return (int32_t)((uint32_t)fixed_saturate_bits(high, shift) << (32 - shift) | low >> shift);
+}
+
 ALWAYS_INLINE int32_t fixed_shift_saturate(int64_t value, unsigned shift) {
-    const int32_t high = fixed_saturate_bits((int32_t)(value >> 32), shift);
-    return (int32_t)((uint32_t)high << (32 - shift) | (uint32_t)value >> shift);
+    return fixed_words_shift_saturate((int32_t)(value >> 32), (uint32_t)value, shift);
+}
+
+/* a * b / 2^shift, as fixed_shift_saturate(). */
+ALWAYS_INLINE int32_t fixed_product_shift_saturate(int32_t a, int32_t b, unsigned shift) {
+#ifdef __ARM_FEATURE_DSP
+    uint32_t low;
+    const int32_t high = arm_smull_words(a, b, &low);
+    return fixed_words_shift_saturate(high, low, shift);
+#else
+    return fixed_shift_saturate(fixed_product(a, b), shift);
+#endif
 }
 
 #endif
