@@ -90,6 +90,15 @@ load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t iner
     };
 }
 
+load_observer_inertia_t load_observer_inertia(const load_observer_model_t *model, int32_t k) {
+    const int32_t nominal_q32 = model->acceleration_q32, max_q32 = INT32_MAX >> (k > 0 ? k : 0);
+    const int32_t limited_q32 = nominal_q32 < max_q32 ? nominal_q32 : max_q32;
+    return (load_observer_inertia_t){
+        .acceleration_q32 = k > 0 ? limited_q32 << k : limited_q32 >> -k,
+        .load_shift = k + 2,
+    };
+}
+
 int64_t load_observer_acceleration(int32_t torque_q24, int32_t inertia_q30) {
     return fixed_divide((int64_t)torque_q24 << 6, inertia_q30);
 }
@@ -104,7 +113,8 @@ int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle
 }
 
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
-                        load_observer_t *observer, int32_t innovation, int32_t torque_q24) {
+                        const load_observer_inertia_t *inertia, load_observer_t *observer, int32_t innovation,
+                        int32_t torque_q24) {
     const int32_t innovation_q4 = innovation * 16;
 
     /* Correct. */
@@ -112,14 +122,15 @@ void load_observer_step(const load_observer_model_t *model, const load_observer_
     observer->speed_correction_q22 = fixed_product_shift_saturate(innovation_q4, gains->speed_gain_q24, 28);
     const int32_t speed_q22 = fixed_add(observer->speed_q22, observer->speed_correction_q22);
     const int32_t unscaled_q24 = fixed_multiply_high(innovation_q4, gains->load_gain_q28);
-    const int32_t load_correction_q24 = fixed_product_shift_saturate(unscaled_q24, gains->load_factor_q4, 4);
+    const int32_t load_factor_q4 = (gains->load_factor_q4 << 2) >> inertia->load_shift; /* at most 2^23 */
+    const int32_t load_correction_q24 = fixed_product_shift_saturate(unscaled_q24, load_factor_q4, 4);
     const int32_t load_q24 = fixed_add(observer->load_torque_q24, load_correction_q24);
     observer->load_torque_q24 = fixed_clamp(load_q24, -LOAD_TORQUE_LIMIT_Q24, LOAD_TORQUE_LIMIT_Q24 - 1);
 
     /* Predict: acceleration is constant over the period, so the angle advances at the mean of old and new speed. */
     const int32_t friction_q24 = fixed_product_shift_saturate(speed_q22, model->friction_q30, 28);
     const int32_t net_q24 = fixed_subtract(fixed_subtract(torque_q24, friction_q24), observer->load_torque_q24);
-    const int32_t speed_change_q22 = fixed_multiply_high(net_q24, model->acceleration_q32);
+    const int32_t speed_change_q22 = fixed_multiply_high(net_q24, inertia->acceleration_q32);
     const int32_t mean_speed_q22 = fixed_add(speed_q22, speed_change_q22 >> 1);
     angle_q64 = fixed_accumulate(angle_q64, mean_speed_q22, model->angle_step_q32);
     observer->angle_q64 = (uint64_t)angle_q64;

@@ -34,6 +34,12 @@ typedef struct {
     int32_t angle_step_q32;   /* Ts: 2^-32 rev per rad/s Q9.22, in Q32 */
 } load_observer_model_t;
 
+/* Set by the identified inertia J 2^-k, k = -2..2. */
+typedef struct {
+    int32_t acceleration_q32; /* 2^k Ts / J */
+    int32_t load_shift;       /* 2 + k: the load gain is divided by 2^k */
+} load_observer_inertia_t;
+
 typedef struct {
     uint64_t angle_q64;           /* mechanical, 2^-64 rev, wraps */
     int32_t speed_q22;            /* rad/s, Q9.22, saturates */
@@ -48,6 +54,9 @@ load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t con
 
 /* Model for a control rate in Hz, an inertia in kg m^2, Q1.30, and a viscous friction in N m s, Q1.30. */
 load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t inertia_q30, int32_t friction_q30);
+
+/* For k = -2..2; the acceleration saturates. */
+load_observer_inertia_t load_observer_inertia(const load_observer_model_t *model, int32_t k);
 
 /* Acceleration in rad/s^2 (2^speed_exponent of SI, as every speed) by a torque (N m, Q7.24) on an inertia (kg m^2,
  * Q1.30), rounded to nearest: 19 bits for 40 N m. */
@@ -66,6 +75,7 @@ int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle
  * accumulator; speed correction and friction torque are rounded down, the other terms to nearest; speed and load torque
  * saturate. */
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
-                        load_observer_t *observer, int32_t innovation, int32_t torque_q24);
+                        const load_observer_inertia_t *inertia, load_observer_t *observer, int32_t innovation,
+                        int32_t torque_q24);
 
 #endif

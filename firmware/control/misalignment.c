@@ -1,6 +1,7 @@
 #include "control/misalignment.h"
 
 #include "control/phase_map.h"
+#include "fixed/compiler.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
@@ -19,8 +20,8 @@
 #define STEP_MAX_Q10 (4 << 10)
 /* At a wide bandwidth of the observer the signal is stronger against the noise, and the ripple is large meanwhile. */
 #define WIDE_FASTER 4
-/* The mean of the square of the sum: 25 ms at 40 kHz. */
-#define COMMON_POWER_SHIFT 9
+/* The mean of the square of the sum: 25 ms at 40 kHz, updates every 8 periods. */
+#define COMMON_POWER_SHIFT 8
 /* Its rate is an eighth: the sum is smaller than its parts, and the noise is not. */
 #define COMMON_SLOWER 8
 
@@ -54,9 +55,8 @@ static int32_t product_q24(int32_t a_q24, int32_t b_q24) {
     return fixed_multiply(a_q24, b_q24, 24);
 }
 
-int32_t misalignment_disturbance_q24(const misalignment_parameters_t *parameters, int32_t load_torque_q24,
-                                     int32_t speed_correction_q22) {
-    return fixed_subtract(load_torque_q24, fixed_multiply(speed_correction_q22, parameters->inertia_rate_q8, 6));
+int32_t misalignment_disturbance_q24(int32_t inertia_rate_q8, int32_t load_torque_q24, int32_t speed_correction_q22) {
+    return fixed_subtract(load_torque_q24, fixed_multiply(speed_correction_q22, inertia_rate_q8, 6));
 }
 
 static int32_t limited_step_q10(int32_t step_q10) {
@@ -67,8 +67,8 @@ static int64_t clamped_offset_q40(int64_t offset_q40) {
     return fixed_clamp_64(offset_q40, -OFFSET_LIMIT_Q40, OFFSET_LIMIT_Q40);
 }
 
-void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                       const machine_tables_t *tables, const misalignment_sample_t *sample) {
+NOINLINE void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                                const machine_tables_t *tables, const misalignment_sample_t *sample) {
     const bool torque_suffices = fixed_abs(sample->torque_q24) > TORQUE_MIN_Q24;
     const bool steady = sample->condition == MISALIGNMENT_STEADY && torque_suffices;
     const int32_t disturbance_q24 = sample->disturbance_q24;

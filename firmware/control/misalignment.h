@@ -93,9 +93,9 @@ typedef struct {
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings);
 
-/* y in N m, Q7.24, from load torque (N m, Q7.24) and speed correction (rad/s, Q9.22) of the load observer. */
-int32_t misalignment_disturbance_q24(const misalignment_parameters_t *parameters, int32_t load_torque_q24,
-                                     int32_t speed_correction_q22);
+/* y in N m, Q7.24, from J / Ts (misalignment_parameters_t), load torque (N m, Q7.24) and speed correction (rad/s,
+ * Q9.22) of the load observer. */
+int32_t misalignment_disturbance_q24(int32_t inertia_rate_q8, int32_t load_torque_q24, int32_t speed_correction_q22);
 
 /* Offsets and filters 0. */
 void misalignment_reset(misalignment_t *misalignment);

@@ -338,7 +338,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
             .control_rate_hz = control_rate_hz,
             .periods_per_update = DEFERRED_LEARNING_PERIODS,
-            .periods_per_common_update = DEFERRED_SLOW_PERIODS,
+            .periods_per_common_update = DEFERRED_COMMON_PERIODS,
             .inertia_q30 = inertia_q30,
             .phases = tables->phases,
             .rotor_poles = tables->rotor_poles,
@@ -361,6 +361,16 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     control.periodic_load = periodic_load_configure(
         control_rate_hz, learns_load ? control.bandwidth.bandwidth_rad_s[control.bandwidth.moving_stage] : 0,
         torque_max_q24);
+    control.inertia = inertia_configure(&(inertia_settings_t){
+        .control_rate_hz = control_rate_hz,
+        .periods_per_update = DEFERRED_COMMON_PERIODS,
+        .inertia_q30 = inertia_q30,
+        .torque_max_q24 = torque_max_q24,
+        .encoder_bits = encoder_bits,
+        .rotor_poles = tables->rotor_poles,
+        .reaching_gain_q24 = control.speed_smc.gain_q24,
+        .rate_q8 = control.misalignment.inertia_rate_q8,
+    });
     control.torque_mode =
         torque_mode_configure(values[PARAMETER_TORQUE_SLEW_RATE_NM_S], control_rate_hz, torque_min_q24, torque_max_q24,
                               fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));

@@ -12,6 +12,7 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
     *state = (control_state_t){0};
     state_machine_reset(&state->state_machine);
     control_prepare(parameters, state);
+    state->deferred_request.initial.observer = load_observer_inertia(&parameters->observer, 0);
 }
 
 void control_prepare(const control_parameters_t *parameters, control_state_t *state) {

@@ -19,6 +19,7 @@
 #include "control/commutation.h"
 #include "control/conduction.h"
 #include "control/ditc_hysteresis.h"
+#include "control/inertia.h"
 #include "control/load_observer.h"
 #include "control/machine_tables.h"
 #include "control/misalignment.h"
@@ -88,6 +89,7 @@ typedef struct {
     torque_offset_parameters_t torque_offset;
     periodic_load_parameters_t periodic_load;
     torque_mode_parameters_t torque_mode;
+    inertia_parameters_t inertia;
 } control_parameters_t;
 
 /* Inputs of one control period as the HAL delivers them. */
@@ -130,11 +132,12 @@ typedef struct {
     speed_pi_t speed_pi;
     drive_mode_t mode; /* of the last input */
     torque_mode_t torque_mode;
-    unsigned turn; /* of the last step, below DEFERRED_SLOW_PERIODS */
+    unsigned turn; /* of the last step, below DEFERRED_COMMON_PERIODS */
     conduction_state_t conduction;
     stroke_mean_t stroke_mean;
     bool load_constant;          /* in the last stroke_mean_step */
     misalignment_t misalignment; /* a property of the machine: survives the end of a run */
+    inertia_t inertia;           /* its shift likewise */
 } deferred_t;
 
 /* State of the control; the control interrupt alone writes the members other than `deferred` and the first. */

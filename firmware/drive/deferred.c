@@ -16,6 +16,7 @@ void deferred_reset_run(control_state_t *state) {
     request->initial.fault_mask = kept->fault_mask;
     request->initial.bandwidth = kept->bandwidth;
     request->initial.predictive = kept->predictive;
+    request->initial.observer = kept->observer;
     request->initial.predictive.conduction = CONDUCTION_INITIAL;
     request->initial.speed = (deferred_speed_results_t){0, 0, 0, 0, 0};
     request->generation = (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK);
@@ -27,6 +28,7 @@ void deferred_reset_observer(control_state_t *state) {
     request->initial.fault_mask = kept->fault_mask;
     request->initial.speed = kept->speed;
     request->initial.predictive = kept->predictive;
+    request->initial.observer = kept->observer;
     request->initial.bandwidth = (observer_bandwidth_limits_t){0, 0, 0, 0};
     request->generation += OBSERVER_STEP;
 }
@@ -143,8 +145,9 @@ static misalignment_condition_t condition(const control_parameters_t *parameters
     return stroke_mean_repeats(&deferred->stroke_mean) ? MISALIGNMENT_INTERRUPTED : MISALIGNMENT_UNSTEADY;
 }
 
-static int32_t disturbance_q24(const control_parameters_t *parameters, const deferred_input_t *input) {
-    return misalignment_disturbance_q24(&parameters->misalignment, input->load_torque_q24, input->speed_correction_q22);
+static int32_t disturbance_q24(const deferred_t *deferred, const deferred_input_t *input) {
+    return misalignment_disturbance_q24(deferred->inertia.laws.rate_q8, input->load_torque_q24,
+                                        input->speed_correction_q22);
 }
 
 static void learn_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
@@ -155,7 +158,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
         .current_q9 = input->current_q9,
         .angle = commutation_angle(&parameters->commutation, &commutation, phase) -
                  (uint32_t)deferred->misalignment.phase[phase].offset,
-        .disturbance_q24 = disturbance_q24(parameters, input),
+        .disturbance_q24 = disturbance_q24(deferred, input),
         .torque_q24 = input->torque_reference_q24,
         .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth.stage],
         .wide = input->bandwidth.stage < parameters->bandwidth.steady_stage_edge,
@@ -166,7 +169,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
 
 static void learn_common_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                       const deferred_input_t *input) {
-    misalignment_common_step(&parameters->misalignment, &deferred->misalignment, disturbance_q24(parameters, input),
+    misalignment_common_step(&parameters->misalignment, &deferred->misalignment, disturbance_q24(deferred, input),
                              input->torque_reference_q24);
 }
 
@@ -183,6 +186,15 @@ static void learn_periodic_load(const control_parameters_t *parameters, deferred
         .moving = deferred->moving_load.withheld > 0 && !deferred->load_constant,
     };
     periodic_load_step(&parameters->periodic_load, &deferred->periodic_load, &sample);
+}
+
+/* A torque at its limit follows no load. */
+static void identify_inertia(const control_parameters_t *parameters, deferred_t *deferred,
+                             const deferred_input_t *input) {
+    const int32_t torque_q24 = input->torque_reference_q24;
+    inertia_step(
+        &parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical, input->torque_sum_q24,
+        torque_q24 >= deferred->conduction.torque_max_q24 || torque_q24 <= deferred->conduction.torque_min_q24);
 }
 
 static void move_conduction(const control_parameters_t *parameters, deferred_t *deferred,
@@ -206,13 +218,14 @@ static bool torque_limited(const deferred_t *deferred, const deferred_input_t *i
     return conduction->level_q15 > 0 || (input->torque_shortfall_q24 != 0 && conduction->sharing_q15 == 0);
 }
 
-/* What is not urgent, in four turns: no step takes the time of all. The learning of the phases has two of them, because
- * at a high bandwidth of the observer it follows within a millisecond. */
+/* What is not urgent, in eight turns: no step takes the time of all. The learning of the phases has half of them,
+ * because at a high bandwidth of the observer it follows within a millisecond. */
 NOINLINE static void take_turns(const control_parameters_t *parameters, deferred_t *deferred,
                                 const deferred_input_t *input) {
-    deferred->turn = (deferred->turn + 1) % DEFERRED_SLOW_PERIODS;
+    deferred->turn = (deferred->turn + 1) % DEFERRED_COMMON_PERIODS;
     switch (deferred->turn) {
     case 0:
+    case DEFERRED_SLOW_PERIODS:
         deferred->load_constant =
             stroke_mean_step(&parameters->stroke_mean, &deferred->stroke_mean, input->electrical,
                              input->load_torque_q24, input->torque_reference_q24, disturbed(parameters, input)) &&
@@ -225,6 +238,10 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         break;
     case 2:
         learn_common_misalignment(parameters, deferred, input);
+        move_conduction(parameters, deferred, input);
+        break;
+    case 6:
+        identify_inertia(parameters, deferred, input);
         move_conduction(parameters, deferred, input);
         break;
     default:
@@ -248,10 +265,12 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     speed_control_deferred(parameters, deferred, input, results);
     deferred->run = input->run;
-    /* A step that resets has done enough. */
-    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && input->run && !reset) {
+    if (!input->run) {
+        inertia_restart(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical);
+    } else if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && !reset) { /* a step that resets has done enough */
         take_turns(parameters, deferred, input);
     }
+    results->observer = deferred->inertia.laws.observer;
     results->predictive.conduction = deferred->conduction.latest;
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         results->predictive.misalignment[phase] = deferred->misalignment.phase[phase].offset;

@@ -9,6 +9,7 @@
  *   offset       mean torque error -> torque reference                                     torque_offset.h
  *   periodic     load torque that repeats with every turn -> torque reference, observer    periodic_load.h
  *   learn        misalignment of each phase                                                misalignment.h
+ *   inertia      torque and acceleration in transients -> laws of the inertia              inertia.h
  *
  * The control interrupt ends with the hand-over of its values; the deferred interrupt makes the step, and its results
  * act in the next control period. When the step is not complete by then, the results of the previous one remain in
@@ -22,10 +23,11 @@
 
 #include "drive/control.h"
 
-/* Periods per update of what takes turns: learning of the phases; learning of their common angle, torque offset, mean
- * load and periodic load; conduction angles. */
+/* Periods per update of what takes turns: learning of the phases; torque offset, mean load and periodic load; learning
+ * of their common angle, inertia; conduction angles. */
 #define DEFERRED_LEARNING_PERIODS 2
 #define DEFERRED_SLOW_PERIODS 4
+#define DEFERRED_COMMON_PERIODS 8
 #define DEFERRED_CONDUCTION_PERIODS (CONDUCTION_STEPS * DEFERRED_SLOW_PERIODS)
 
 /* Results in effect. [interrupt, or background in a critical section] */

@@ -62,7 +62,8 @@ typedef struct {
     int32_t torque_max_q24;       /* both are the reference in torque mode */
 } deferred_speed_results_t;
 
-/* Results that act from the next control period on; all zero: none, but for the conduction angles. In parts that
+/* Results that act from the next control period on; all zero: none, but for the conduction angles and the
+ * inertia. In parts that
  * are copied without a call of memcpy, which took 79 instructions of a reset. */
 typedef struct {
     uint32_t generation; /* of the input */
@@ -70,6 +71,7 @@ typedef struct {
     deferred_speed_results_t speed;
     observer_bandwidth_limits_t bandwidth; /* of the trigger */
     deferred_predictive_results_t predictive;
+    load_observer_inertia_t observer; /* identified, inertia.h */
 } deferred_results_t;
 
 typedef struct {

@@ -263,6 +263,24 @@ def test_observer_bandwidth_stays_narrow_in_steady_state(make_bench, inertia_gai
     assert 149.9 < speed_rpm.min() < speed_rpm.max() < 150.1
 
 
+@pytest.mark.parametrize("inertia_gain", [0.2, 5.0])
+def test_estimate_of_the_load_holds_in_an_acceleration_of_an_identified_inertia(make_bench, inertia_gain):
+    bench = make_bench(controller="salient")
+    bench.rig.inertia_gain = inertia_gain
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.4)
+    bench.load_torque_Nm = 4
+    bench.run_for(0.2)
+    bench.drive.speed_reference_rpm = 600
+    before_s = bench.time_s
+    bench.run_for(0.2)
+    # 1/4 instead of 1/5, or 4 instead of 5, leaves up to a quarter of the 15 N m that accelerate.
+    estimate_Nm = bench.telemetry["load_torque_estimate_Nm"].between(before_s, before_s + 0.2).value
+    assert 4 - 5 < estimate_Nm.min() < estimate_Nm.max() < 4 + 5
+    speed_rpm = bench.truth["speed_rpm"].between(before_s, before_s + 0.2).value
+    assert speed_rpm.max() > 400, "accelerated"
+
+
 # --- controllers ------------------------------------------------------------------------------------------------------
 
 

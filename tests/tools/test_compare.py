@@ -392,7 +392,7 @@ def test_ratios_are_relative_to_the_first_sample():
     nominal, changed = (run.metrics for run in runs)
     assert "recovery_ratio" not in nominal
     assert changed["recovery_ratio"] == pytest.approx(changed["recovery_time_s"] / nominal["recovery_time_s"])
-    assert 1.0 < changed["recovery_ratio"] < 3.0
+    assert 0.5 < changed["recovery_ratio"] < 2.0
 
 
 def test_interrupted_comparison_continues_with_the_runs_that_are_missing(tmp_path):
@@ -775,8 +775,8 @@ def test_ranges_have_figures_and_plots(tmp_path):
     content = json.loads((tmp_path / "compare.json").read_text())
     values = {(row["condition"], row["figure"]): row["values"].get("salient") for row in content["rows"]}
     for row, low, high in (
-        (("saturating, inertia x 0.33", "recovery_ratio"), 1.5, 3.0),
-        (("saturating, inertia x 0.33", "swing_percent"), 0.3, 2.0),
+        (("saturating, inertia x 0.33", "recovery_ratio"), 1.0, 2.0),
+        (("saturating, inertia x 0.33", "swing_percent"), 0.005, 0.1),
         (("saturating, 20 kHz", "ripple"), 0.006, 0.015), (("saturating, 100 kHz", "speed_dip_rpm"), 1.0, 3.0),
         (("saturating, 17 bits, 10 r/min", "speed_dip_rpm"), 2.0, 4.5),
         (("saturating, 17 bits, 600 r/min", "against_periods"), -0.1, 2.0),

@@ -273,6 +273,33 @@ TEST(SalientClosedLoop, brakes_from_3000_rpm_within_its_limits) {
     }
 }
 
+struct load_step_t {
+    double recovery_s, swing_rpm; // time to +-0.5 %; highest speed above the reference
+};
+
+// A load step at 150 r/min after a start with another inertia than the parameter.
+load_step_t load_step(double inertia_gain) {
+    setup_t setup;
+    setup.plant.inertia = inertia_gain;
+    Bench<fixed_drive_t> bench(setup);
+    const double at_s = 0.3 * std::max(1.0, inertia_gain), end_s = at_s + 0.3, reference = fixed_point::rad_s(150.0);
+    bench.reference_rpm = 150.0;
+    bench.run_until(at_s);
+    bench.plant.load_torque_Nm = 8.0;
+    bench.run_until(end_s);
+    return {bench.trace.last_exit_s(reference, at_s, end_s), rpm(bench.trace.max_speed(at_s, end_s)) - 150.0};
+}
+
+TEST(SalientClosedLoop, recovers_within_three_times_the_nominal_time_at_a_fifth_to_five_times_the_inertia) {
+    const load_step_t nominal = load_step(1.0);
+    for (const double gain : {0.2, 0.33, 0.5, 2.0, 5.0}) {
+        const load_step_t other = load_step(gain);
+        EXPECT_LT(other.recovery_s, 3.0 * nominal.recovery_s) << machine_plant.name << ", inertia x " << gain;
+        EXPECT_GT(other.recovery_s, 0.2 * nominal.recovery_s) << machine_plant.name << ", inertia x " << gain;
+        EXPECT_LT(other.swing_rpm, 0.05 * 150.0) << machine_plant.name << ", inertia x " << gain;
+    }
+}
+
 TEST(SalientClosedLoop, with_three_times_the_inertia_the_observer_is_at_its_steady_bandwidth_in_the_steady_state) {
     setup_t setup;
     setup.plant.inertia = 3.0;

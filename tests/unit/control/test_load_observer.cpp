@@ -21,18 +21,20 @@ constexpr double RATE_HZ = 40000.0;
 struct observer_parameters_t {
     load_observer_gains_t gains;
     load_observer_model_t model;
+    load_observer_inertia_t inertia;
 };
 
 observer_parameters_t configure(double bandwidth_rad_s, double rate_hz = RATE_HZ, double inertia = INERTIA_KG_M2,
                                 double friction = FRICTION_NM_S) {
     const int32_t inertia_q30 = to_fixed(inertia, Q30);
-    return {load_observer_gains(uint32_t(bandwidth_rad_s), uint32_t(rate_hz), inertia_q30),
-            load_observer_model(uint32_t(rate_hz), inertia_q30, to_fixed(friction, Q30))};
+    const load_observer_model_t model = load_observer_model(uint32_t(rate_hz), inertia_q30, to_fixed(friction, Q30));
+    return {load_observer_gains(uint32_t(bandwidth_rad_s), uint32_t(rate_hz), inertia_q30), model,
+            load_observer_inertia(&model, 0)};
 }
 
 int32_t observe(const observer_parameters_t &p, load_observer_t *observer, uint32_t angle, int32_t torque_q24) {
     const int32_t innovation = load_observer_innovation(observer, angle);
-    load_observer_step(&p.model, &p.gains, observer, innovation, torque_q24);
+    load_observer_step(&p.model, &p.gains, &p.inertia, observer, innovation, torque_q24);
     return innovation;
 }
 
@@ -195,6 +197,30 @@ TEST(LoadObserver, follows_its_reference_model_through_half_a_second_with_a_load
                 EXPECT_GT(largest.speed_rad_s, 1.0 / Q22);
             }
         }
+    }
+}
+
+TEST(LoadObserver, with_an_identified_inertia_is_the_observer_configured_for_it) {
+    for (int32_t k = -2; k <= 2; k++) {
+        const double inertia = std::ldexp(INERTIA_KG_M2, -k);
+        const observer_parameters_t configured = configure(1000.0, RATE_HZ, inertia);
+        observer_parameters_t identified = configure(1000.0);
+        identified.inertia = load_observer_inertia(&identified.model, k);
+        rotor_t rotor{0.3, 15.7};
+        load_observer_t one, other;
+        load_observer_reset(&one, rotor.encoder(20));
+        load_observer_reset(&other, rotor.encoder(20));
+        double load_Nm = 0.0;
+        for (int n = 0; n < 2000; n++) {
+            const double torque = n < 1000 ? 8.0 : 12.0;
+            observe(configured, &one, rotor.encoder(20), to_fixed(torque, Q24));
+            observe(identified, &other, rotor.encoder(20), to_fixed(torque, Q24));
+            EXPECT_NEAR(one.load_torque_q24 / Q24, other.load_torque_q24 / Q24, 0.001) << k;
+            EXPECT_NEAR(one.speed_q22 / Q22, other.speed_q22 / Q22, 0.001) << k;
+            load_Nm = std::max(load_Nm, std::fabs(one.load_torque_q24 / Q24));
+            rotor.step(torque, 8.0);
+        }
+        EXPECT_GT(load_Nm, 1.0) << "the load moved";
     }
 }
 

@@ -94,7 +94,7 @@ class Machine {
         misalignment_step(&parameters, &state, &machine_tables, &sample);
         model.step(sample.disturbance_q24 / Q24, BANDWIDTH_RAD_S, condition == MISALIGNMENT_STEADY, torque_Nm,
                    [&](unsigned phase) { return slope[phase]; });
-        if (common && ++updates % (DEFERRED_SLOW_PERIODS / DEFERRED_LEARNING_PERIODS) == 0) {
+        if (common && ++updates % (DEFERRED_COMMON_PERIODS / DEFERRED_LEARNING_PERIODS) == 0) {
             misalignment_common_step(&parameters, &state, sample.disturbance_q24, sample.torque_q24);
         }
     }
@@ -267,7 +267,7 @@ TEST(Misalignment, is_limited_to_four_degrees_and_overflows_nothing) {
             const misalignment_sample_t sample = {
                 .current_q9 = on ? 79 * 512 : 0,
                 .angle = on ? 0x90000000u : 0x81000000u,
-                .disturbance_q24 = misalignment_disturbance_q24(&p, sign * (on ? 60 << 24 : -(60 << 24)),
+                .disturbance_q24 = misalignment_disturbance_q24(p.inertia_rate_q8, sign * (on ? 60 << 24 : -(60 << 24)),
                                                                 on == (sign > 0) ? INT32_MIN : INT32_MAX),
                 .torque_q24 = 8 << 24,
                 .bandwidth_rad_s = 250,

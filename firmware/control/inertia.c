@@ -1,0 +1,164 @@
+#include "control/inertia.h"
+
+#include "control/machine_tables.h"
+#include "fixed/divide.h"
+#include "fixed/fixed.h"
+
+#define SHIFT_MIN (-2)
+#define SHIFT_MAX 2
+
+/* A window is at least 0.8 ms, and not longer than needed for one count to be 1/24 of the largest torque. */
+#define WINDOW_RATE_MAX_HZ 1250u
+#define WINDOW_SHIFT_MAX 12
+#define COUNT_SHARE 24
+
+/* Means over 4 windows. */
+#define MEAN_SHIFT 2
+
+/* Windows from the start of a run until its torque acts on a turning rotor. */
+#define START_WINDOWS 4
+
+/* Windows after a torque at its limit that still belong to the transient. */
+#define TRANSIENT_WINDOWS 8
+
+/* Least standard deviation of the torque, as a part of the largest torque. */
+#define DEVIATION_SHARE 8
+
+/* 2 pi in Q3.28. */
+#define TWO_PI_Q28 1686629713
+
+/* 2 pi J0 rate^2 / (poles 2^speed_exponent), torque for an electrical revolution per window^2, is in N m, Q8.23, per
+ * 2^-32 revolution that divided by 2^9. */
+static int64_t gain_q8(const inertia_settings_t *settings, int64_t window_rate_hz) {
+    const int64_t inertia_q28 = fixed_shift((int64_t)settings->inertia_q30 * (TWO_PI_Q28 >> 8), 22);
+    const int64_t gain_q18 =
+        fixed_divide(((inertia_q28 * window_rate_hz) >> 10) * window_rate_hz, settings->rotor_poles);
+    return gain_q18 >> (19 + machine_tables.speed_exponent);
+}
+
+inertia_parameters_t inertia_configure(const inertia_settings_t *settings) {
+    const uint32_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
+    const int64_t count = (int64_t)settings->rotor_poles << (32 - settings->encoder_bits);
+    const int64_t gain_max_q8 = fixed_divide((int64_t)settings->torque_max_q24 << 7, COUNT_SHARE * count);
+    unsigned shift = 1;
+    while (update_rate_hz >> shift > WINDOW_RATE_MAX_HZ ||
+           (shift < WINDOW_SHIFT_MAX && gain_q8(settings, update_rate_hz >> shift) > gain_max_q8)) {
+        shift++;
+    }
+    const int32_t deviation_q23 = settings->torque_max_q24 / 2 / DEVIATION_SHARE;
+    return (inertia_parameters_t){
+        .gain_q8 = fixed_saturate(gain_q8(settings, update_rate_hz >> shift)),
+        .variance_min_q14 = fixed_multiply_high(deviation_q23, deviation_q23),
+        .window_shift = shift,
+        .reaching_gain_q24 = settings->reaching_gain_q24,
+        .rate_q8 = settings->rate_q8,
+    };
+}
+
+/* value 2^-k for value >= 0, saturates. */
+static int32_t scaled(int32_t value, int32_t k) {
+    if (k >= 0) {
+        return value >> k;
+    }
+    const int32_t max = INT32_MAX >> -k;
+    return (value < max ? value : max) << -k;
+}
+
+static void set_laws(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia) {
+    inertia->laws = (inertia_laws_t){
+        .observer = load_observer_inertia(model, inertia->shift),
+        .reaching_gain_q24 = scaled(parameters->reaching_gain_q24, inertia->shift),
+        .rate_q8 = scaled(parameters->rate_q8, inertia->shift),
+    };
+}
+
+void inertia_restart(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
+                     uint32_t angle) {
+    if (inertia->gain_q8 != parameters->gain_q8) {
+        inertia->gain_q8 = parameters->gain_q8;
+        inertia->shift = 0;
+    }
+    inertia->updates = 0;
+    inertia->sum_of_sums_q23 = 0;
+    inertia->angle = angle;
+    inertia->torque_mean_q23 = inertia->acceleration_mean_q23 = 0;
+    set_laws(parameters, model, inertia);
+}
+
+/* Ends a window. */
+static void measure(const inertia_parameters_t *parameters, inertia_t *inertia, uint32_t angle) {
+    const uint32_t rotation = angle - inertia->angle;
+    const int32_t change = (int32_t)(rotation - inertia->rotation);
+    inertia->torque_q23 = (int32_t)(inertia->sum_of_sums_q23 - inertia->last_sum_of_sums_q23);
+    inertia->acceleration_q23 = fixed_multiply(change, parameters->gain_q8, 8);
+    inertia->angle = angle;
+    inertia->rotation = rotation;
+    inertia->last_sum_of_sums_q23 = inertia->sum_of_sums_q23;
+    inertia->sum_of_sums_q23 = 0;
+}
+
+static int32_t mean_step(int32_t mean, int32_t value) {
+    return mean + (fixed_subtract(value, mean) >> MEAN_SHIFT);
+}
+
+static void correlate(inertia_t *inertia, uint32_t windows) {
+    if (windows < 2) {
+        return;
+    }
+    if (windows == START_WINDOWS) {
+        inertia->torque_mean_q23 = inertia->torque_q23;
+        inertia->acceleration_mean_q23 = inertia->acceleration_q23;
+        inertia->torque_variance_q14 = inertia->acceleration_variance_q14 = inertia->covariance_q14 = 0;
+        return;
+    }
+    const int32_t torque_q23 = fixed_subtract(inertia->torque_q23, inertia->torque_mean_q23);
+    const int32_t acceleration_q23 = fixed_subtract(inertia->acceleration_q23, inertia->acceleration_mean_q23);
+    inertia->torque_mean_q23 += torque_q23 >> MEAN_SHIFT;
+    inertia->acceleration_mean_q23 += acceleration_q23 >> MEAN_SHIFT;
+    inertia->torque_variance_q14 = mean_step(inertia->torque_variance_q14, fixed_multiply_high(torque_q23, torque_q23));
+    inertia->acceleration_variance_q14 =
+        mean_step(inertia->acceleration_variance_q14, fixed_multiply_high(acceleration_q23, acceleration_q23));
+    inertia->covariance_q14 = mean_step(inertia->covariance_q14, fixed_multiply_high(torque_q23, acceleration_q23));
+}
+
+/* Changes the shift by one when the regression is off by more than 1.75 or 1 / 1.6. An inertia of more than 8 J0 is
+ * none: T then follows a load that moves. */
+static void judge(const inertia_parameters_t *parameters, inertia_t *inertia, uint32_t windows) {
+    if (inertia->transient_windows == 0) {
+        return;
+    }
+    inertia->transient_windows--;
+    const int32_t variance = inertia->torque_variance_q14;
+    const int32_t covariance = inertia->covariance_q14;
+    const int64_t product = fixed_product(variance, inertia->acceleration_variance_q14);
+    if (variance < parameters->variance_min_q14 || covariance < variance / 8 ||
+        fixed_product(covariance, covariance) < product - (product >> 3)) {
+        return;
+    }
+    const int32_t present = scaled(variance, -inertia->shift) / 8;
+    if (covariance > present * 14 && inertia->shift < SHIFT_MAX) {
+        inertia->shift++;
+    } else if (covariance < present * 5 && inertia->shift > SHIFT_MIN && windows > START_WINDOWS) {
+        inertia->shift--;
+    }
+}
+
+void inertia_step(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
+                  uint32_t angle, int32_t torque_q24, bool limited) {
+    /* In this order the sums, weighted by the updates since, are those of the trapezoidal rule. */
+    inertia->sum_of_sums_q23 += inertia->sum_q23;
+    inertia->sum_q23 += (uint32_t)(torque_q24 >> (2 * parameters->window_shift + 1));
+    inertia->updates++;
+    if (limited) {
+        inertia->transient_windows = TRANSIENT_WINDOWS;
+    }
+    const uint32_t windows = inertia->updates >> parameters->window_shift;
+    const uint32_t update = inertia->updates & ((1u << parameters->window_shift) - 1);
+    if (update == 0) {
+        measure(parameters, inertia, angle);
+        correlate(inertia, windows);
+    } else if (update == 1 && windows > 1) { /* the rotation before the first window is unknown */
+        judge(parameters, inertia, windows);
+        set_laws(parameters, model, inertia);
+    }
+}

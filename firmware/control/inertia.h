@@ -1,0 +1,84 @@
+/* Inertia: power of two by which the machine's inertia differs from the parameter, identified from transients.
+ *
+ * With load TL the speed follows J dw/dt = T - TL. The second difference of the rotor angle over two windows is their
+ * acceleration in a triangular mean; times the inertia J0 of the parameters it is a torque A, and T the machine torque
+ * in the same mean. The regression of A on T, both less their means,
+ *
+ *   cov(T, A) / var(T) = J0 / J,
+ *
+ * is free of a load that stays the same, whatever it is. It counts when T varies enough and A follows it, cov(T, A)^2 >
+ * 7/8 var(T) var(A), while T is at its limit or has been within the last 8 windows: in a start, a braking or a
+ * reversal, and above all at their ends. A torque that follows a load is not in proportion to A, and seldom at its
+ * limit.
+ *
+ * Means are exponential, over 4 windows. A window is at least 0.8 ms, so that they last longer than the torque needs to
+ * fall from its limit, and as long as the encoder needs: an error of one count in the angle is 1/24 of the largest
+ * torque.
+ *
+ * At the start of a run T and A begin at 0. A load that begins with it, as friction, looks like a larger inertia then:
+ * for the first 4 windows only smaller ones are identified, after them the regression begins anew.
+ *
+ * The result is the shift k of J0 / J = 2^k, within -2..2: J = J0 / 5 and J = 5 J0 then differ from 2^-k J0 by a
+ * quarter. It changes by one at a time, when the regression is off by more than 1.75 or 1 / 1.6. A machine as its
+ * parameters state stays at k = 0, where the laws are those of the parameters.
+ */
+#ifndef CONTROL_INERTIA_H
+#define CONTROL_INERTIA_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "control/load_observer.h"
+
+/* What of the control laws is in proportion to the inertia or its reciprocal. */
+typedef struct {
+    load_observer_inertia_t observer;
+    int32_t reaching_gain_q24; /* J k of speed_smc.h, N m s/rad, Q7.24 */
+    int32_t rate_q8;           /* J / Ts of misalignment.h */
+} inertia_laws_t;
+
+typedef struct {
+    int32_t gain_q8;           /* J0 / window^2: N m, Q8.23, per 2^-32 electrical rev, in Q8 */
+    int32_t variance_min_q14;  /* of the torque, (N m)^2, Q17.14 */
+    unsigned window_shift;     /* a window is 2^window_shift updates, from 1 */
+    int32_t reaching_gain_q24; /* of J0 */
+    int32_t rate_q8;           /* of J0 */
+} inertia_parameters_t;
+
+typedef struct {
+    int32_t gain_q8; /* of the parameters with which the shift has been identified */
+    int32_t shift;   /* k */
+    inertia_laws_t laws;
+    uint32_t transient_windows;           /* left of the transient */
+    uint32_t updates;                     /* since the start of the run */
+    uint32_t sum_q23;                     /* of T / 4^window_shift, wraps */
+    uint32_t sum_of_sums_q23;             /* of that sum over the window, wraps */
+    uint32_t last_sum_of_sums_q23;        /* of the window before */
+    uint32_t angle;                       /* at its beginning, 2^-32 electrical rev */
+    uint32_t rotation;                    /* in the window before */
+    int32_t torque_q23, acceleration_q23; /* T and A of the last two windows */
+    int32_t torque_mean_q23, acceleration_mean_q23;
+    int32_t torque_variance_q14, acceleration_variance_q14, covariance_q14; /* (N m)^2 */
+} inertia_t;
+
+typedef struct {
+    uint32_t control_rate_hz;
+    unsigned periods_per_update;
+    unsigned encoder_bits, rotor_poles;
+    int32_t inertia_q30;    /* J0, kg m^2, Q1.30 */
+    int32_t torque_max_q24; /* of the drive, N m, Q7.24 */
+    int32_t reaching_gain_q24, rate_q8;
+} inertia_settings_t;
+
+inertia_parameters_t inertia_configure(const inertia_settings_t *settings);
+
+/* Outside a run, with the rotor angle in 2^-32 electrical rev. Parameters of another inertia reset the shift. */
+void inertia_restart(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
+                     uint32_t angle);
+
+/* One update of a run: rotor angle in 2^-32 electrical rev, machine torque in N m, Q7.24. limited: its reference is at
+ * a limit. */
+void inertia_step(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
+                  uint32_t angle, int32_t torque_q24, bool limited);
+
+#endif

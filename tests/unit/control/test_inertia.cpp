@@ -1,0 +1,186 @@
+// Inertia by powers of two, from the regression of the acceleration on the torque.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <functional>
+#include <map>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/inertia.h"
+#include "control/machine_tables.h"
+}
+
+#include "support/fixed_point.h"
+
+namespace {
+
+using namespace fixed_point;
+constexpr double J0 = 0.004, TORQUE_MAX = 19.0;
+constexpr double REACHING_GAIN = 0.5;
+constexpr int32_t RATE_Q8 = 40960;
+constexpr load_observer_model_t MODEL{.acceleration_q32 = 1 << 28, .friction_q30 = 0, .angle_step_q32 = 1};
+constexpr unsigned POLES = 4, PERIODS = 8;
+
+inertia_settings_t settings(unsigned encoder_bits = 17, uint32_t rate_hz = 40000) {
+    return {.control_rate_hz = rate_hz,
+            .periods_per_update = PERIODS,
+            .encoder_bits = encoder_bits,
+            .rotor_poles = POLES,
+            .inertia_q30 = to_fixed(J0 * std::ldexp(1.0, machine_tables.speed_exponent), Q30),
+            .torque_max_q24 = to_fixed(TORQUE_MAX, Q24),
+            .reaching_gain_q24 = to_fixed(REACHING_GAIN, Q24),
+            .rate_q8 = RATE_Q8};
+}
+
+// Torque and load in N m over time in s.
+using torque_t = std::function<double(double)>;
+
+// Shift after half a second of a shaft of `gain` times the inertia J0.
+int32_t shift_after(const inertia_settings_t &of, double gain, const torque_t &torque, const torque_t &load,
+                    inertia_t *last = nullptr) {
+    const inertia_parameters_t parameters = inertia_configure(&of);
+    inertia_t inertia{};
+    const double step_s = double(of.periods_per_update) / of.control_rate_hz;
+    const double counts = std::ldexp(1.0, int(of.encoder_bits));
+    double rev = 0.1, rev_s = 0.0;
+    inertia_restart(&parameters, &MODEL, &inertia, angle_from_rev(rev) * POLES);
+    for (double t = 0.0; t < 0.5; t += step_s) {
+        const uint32_t angle = angle_from_rev(std::floor(rev * counts) / counts) * POLES;
+        inertia_step(&parameters, &MODEL, &inertia, angle, to_fixed(torque(t), Q24), torque(t) >= TORQUE_MAX);
+        const double mean_Nm = 0.5 * (torque(t) - load(t) + torque(t + step_s) - load(t + step_s));
+        const double change = mean_Nm / (gain * J0 * 2.0 * PI) * step_s;
+        rev += (rev_s + 0.5 * change) * step_s;
+        rev_s += change;
+    }
+    if (last != nullptr) {
+        *last = inertia;
+    }
+    return inertia.shift;
+}
+
+double constant_8(double) {
+    return 8.0;
+}
+
+// A start at the largest torque for 20 ms, then the load alone.
+double start(double t) {
+    return t > 0.1 && t < 0.12 ? TORQUE_MAX : 8.0;
+}
+
+TEST(Inertia, a_start_under_load_identifies_a_fifth_to_five_times_to_the_nearest_powers_of_two) {
+    for (const auto &[gain, shift] :
+         {std::pair{0.2, 2}, {0.25, 2}, {0.5, 1}, {0.7, 0}, {1.0, 0}, {1.4, 0}, {2.0, -1}, {4.0, -2}, {5.0, -2}}) {
+        for (const uint32_t rate_hz : {20000u, 40000u, 100000u, 1000000u}) {
+            EXPECT_EQ(shift_after(settings(17, rate_hz), gain, start, constant_8), shift) << gain << ", " << rate_hz;
+        }
+        for (const unsigned bits : {14u, 20u, 32u}) {
+            EXPECT_EQ(shift_after(settings(bits), gain, start, constant_8), shift) << gain << ", " << bits << " bits";
+        }
+    }
+}
+
+TEST(Inertia, a_torque_that_follows_a_load_identifies_nothing) {
+    const auto limited = [](double torque_Nm) { return std::min(torque_Nm, TORQUE_MAX); };
+    const torque_t step = [](double t) { return t < 0.1 ? 0.0 : 15.0; };
+    for (const double delay_s : {0.0005, 0.002, 0.005}) {
+        // With an overshoot to the limit, as long as the delay.
+        const torque_t after = [=](double t) {
+            return step(t - delay_s) > 0.0 && t < 0.1 + 2.0 * delay_s ? TORQUE_MAX : step(t - delay_s);
+        };
+        EXPECT_EQ(shift_after(settings(), 1.0, after, step), 0) << delay_s;
+    }
+    for (const double frequency_hz : {1.0, 5.0, 20.0, 50.0, 100.0}) {
+        const torque_t sine = [=](double t) { return limited(11.0 + 9.0 * std::sin(2.0 * PI * frequency_hz * t)); };
+        const torque_t after = [=](double t) { return sine(t - 0.001); };
+        EXPECT_EQ(shift_after(settings(), 1.0, after, sine), 0) << frequency_hz << " Hz";
+    }
+}
+
+TEST(Inertia, a_short_torque_identifies_nothing) {
+    const torque_t none = [](double) { return 0.0; };
+    for (const auto &[duration_s, shift] : std::map<double, int32_t>{{0.00015, 0}, {0.006, 2}}) {
+        const torque_t pulse = [=](double t) { return t > 0.1 && t < 0.1 + duration_s ? TORQUE_MAX : 0.0; };
+        EXPECT_EQ(shift_after(settings(), 0.2, pulse, none), shift) << duration_s;
+    }
+}
+
+TEST(Inertia, torques_below_the_limit_identify_nothing) {
+    for (const double gain : {0.2, 5.0}) {
+        for (const double ratio : {0.99, 1.0}) {
+            const torque_t scaled = [=](double t) { return ratio * start(t); };
+            EXPECT_EQ(shift_after(settings(), gain, scaled, constant_8) != 0, ratio == 1.0) << gain << ", " << ratio;
+        }
+    }
+}
+
+TEST(Inertia, a_load_that_begins_with_the_rotation_is_no_other_inertia) {
+    const torque_t run = [](double t) { return t > 0.001 ? TORQUE_MAX : 0.0; };
+    for (const double length_s : {0.02, 0.1, 1.0}) {
+        for (const double friction_Nm : {2.0, 8.0, 15.0}) {
+            const torque_t friction = [=](double t) { return t > 0.001 ? friction_Nm : 0.0; };
+            const torque_t ended = [=](double t) { return t < length_s ? run(t) : friction_Nm; };
+            EXPECT_EQ(shift_after(settings(), 1.0, ended, friction), 0) << friction_Nm << ", " << length_s;
+        }
+    }
+}
+
+TEST(Inertia, the_end_of_a_start_identifies_an_inertia_under_a_load_that_began_with_the_rotation) {
+    const torque_t friction = [](double t) { return t > 0.001 ? 8.0 : 0.0; };
+    const torque_t run = [=](double t) { return t > 0.001 && t < 0.05 ? TORQUE_MAX : friction(t); };
+    for (const auto &[gain, shift] :
+         std::map<double, int32_t>{{0.2, 2}, {0.5, 1}, {0.7, 0}, {1.4, 0}, {2.0, -1}, {5.0, -2}}) {
+        EXPECT_EQ(shift_after(settings(), gain, run, friction), shift) << gain;
+    }
+}
+
+TEST(Inertia, a_restart_keeps_the_shift_unless_the_parameters_have_another_inertia) {
+    const inertia_settings_t of = settings();
+    inertia_settings_t doubled = settings();
+    doubled.inertia_q30 *= 2;
+    const inertia_parameters_t parameters = inertia_configure(&of), others = inertia_configure(&doubled);
+    inertia_t inertia{};
+    inertia_restart(&parameters, &MODEL, &inertia, 0);
+    inertia.shift = -2;
+    inertia_restart(&parameters, &MODEL, &inertia, 5);
+    EXPECT_EQ(inertia.shift, -2);
+    inertia_restart(&others, &MODEL, &inertia, 5);
+    EXPECT_EQ(inertia.shift, 0);
+}
+
+TEST(Inertia, the_laws_follow_the_shift_and_saturate) {
+    const inertia_settings_t of = settings();
+    const inertia_parameters_t parameters = inertia_configure(&of);
+    inertia_t inertia{};
+    inertia_restart(&parameters, &MODEL, &inertia, 0);
+    for (int32_t shift = -2; shift <= 2; shift++) {
+        inertia.shift = shift;
+        inertia_restart(&parameters, &MODEL, &inertia, 0);
+        const double ratio = std::ldexp(1.0, shift); // J0 / J
+        EXPECT_EQ(inertia.laws.observer.acceleration_q32, std::min(MODEL.acceleration_q32 * ratio, double(INT32_MAX)));
+        EXPECT_EQ(inertia.laws.observer.load_shift, 2 + shift);
+        EXPECT_EQ(inertia.laws.reaching_gain_q24, of.reaching_gain_q24 / ratio);
+        EXPECT_EQ(inertia.laws.rate_q8, of.rate_q8 / ratio);
+    }
+    load_observer_model_t light = MODEL;
+    light.acceleration_q32 = INT32_MAX / 3;
+    inertia_parameters_t heavy = parameters;
+    heavy.reaching_gain_q24 = heavy.rate_q8 = INT32_MAX / 3;
+    inertia.shift = 2;
+    inertia_restart(&heavy, &light, &inertia, 0);
+    EXPECT_GT(inertia.laws.observer.acceleration_q32, INT32_MAX - 4);
+    inertia.shift = -2;
+    inertia_restart(&heavy, &light, &inertia, 0);
+    EXPECT_GT(inertia.laws.reaching_gain_q24, INT32_MAX - 4);
+    EXPECT_GT(inertia.laws.rate_q8, INT32_MAX - 4);
+}
+
+TEST(Inertia, an_identified_shift_changes_the_laws_within_the_run) {
+    // shift_after() restarts before the run only.
+    inertia_t inertia{};
+    EXPECT_EQ(shift_after(settings(), 0.2, start, constant_8, &inertia), 2);
+    EXPECT_EQ(inertia.laws.observer.load_shift, 4);
+}
+
+} // namespace
