@@ -14,6 +14,11 @@
 /* Above base speed windows return within 8 s: each trial of a smaller advance is a torque shortfall. */
 #define ABOVE_BASE_SHIFT 3
 
+/* Base speed over the range of speeds above it in which the window with the least current takes effect, and the reduced
+ * gain of the speed law: the speed error that belongs to an acceleration changes with it. */
+#define LEAST_CURRENT_RANGE 8
+#define SLOWER_RANGE 2
+
 /* Least overlap of windows, 2^-32 electrical rev: 2 degrees. */
 #define OVERLAP_MIN 0x016C16C1u
 
@@ -87,11 +92,30 @@ static int32_t feed_forward_q15(const conduction_pulse_t *pulse, int32_t torque)
     return excess_q8 >= range_q8 ? ONE_Q15 : (excess_q8 << 15) / range_q8;
 }
 
-/* Part of the window with the least current, Q1.15: from base speed to an eighth above. */
-static int32_t above_base_q15(const machine_tables_t *tables, conduction_place_t place) {
+/* From 0 at the base speed to 1, Q1.15, at 1 / range of it above. */
+static int32_t above_base_q15(const machine_tables_t *tables, conduction_place_t place, int32_t range) {
     const int32_t base_q8 = tables->pulse_base_index;
-    const int32_t excess_q8 = 8 * ((int32_t)(place.k << 8) + place.fraction_q8 - base_q8);
+    const int32_t excess_q8 = range * ((int32_t)(place.k << 8) + place.fraction_q8 - base_q8);
     return excess_q8 >= base_q8 ? ONE_Q15 : (fixed_clamp(excess_q8, 0, base_q8) << 15) / base_q8;
+}
+
+/* By which the gain of the speed law exceeds a quarter of the stroke rate, as part of it, Q0.31. */
+static int32_t gain_excess_q31(const conduction_parameters_t *parameters, const conduction_sample_t *sample,
+                               int32_t above_base_q15) {
+    const uint64_t kept_q16 = ((uint64_t)sample->angle_step * parameters->gain_per_step_q16) >> 32;
+    return above_base_q15 * (UINT16_MAX - (int32_t)(kept_q16 < UINT16_MAX ? kept_q16 : UINT16_MAX));
+}
+
+/* Torque for the feed-forward: above base speed its mean over about a stroke, without the ripple that the pulses cause
+ * in the speed. */
+static int32_t smoothed_q24(const conduction_state_t *state, uint32_t phases, const conduction_sample_t *sample) {
+    const int32_t torque = fixed_abs(sample->torque_q24);
+    const uint64_t strokes_q31 = (uint64_t)sample->angle_step * phases >> 1;
+    const int32_t part_q31 = strokes_q31 > INT32_MAX ? INT32_MAX : (int32_t)strokes_q31;
+    if (state->sharing_q15 == 0 || state->latest == CONDUCTION_INITIAL) {
+        return torque;
+    }
+    return state->torque_q24 + 2 * fixed_multiply_high(torque - state->torque_q24, part_q31);
 }
 
 /* Half of the missing torque, as part of the largest, in an electrical revolution. */
@@ -108,9 +132,10 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
     const int32_t torque = fixed_abs(sample->torque_q24);
     const bool voltage_limited = fixed_abs(sample->torque_shortfall_q24) > SHORTFALL_MIN_Q24 + torque / 64;
     if (parameters->single_pulse) {
-        const int32_t forward_q15 = feed_forward_q15(&state->pulse, torque);
+        state->sharing_q15 = above_base_q15(tables, state->place, LEAST_CURRENT_RANGE);
+        state->torque_q24 = smoothed_q24(state, tables->phases, sample);
+        const int32_t forward_q15 = feed_forward_q15(&state->pulse, state->torque_q24);
         const int32_t forward_q30 = forward_q15 * (1 << 15);
-        state->sharing_q15 = above_base_q15(tables, state->place);
         if (forward_q15 > 0) {
             state->advance_q30 = ONE_Q30;
         }
@@ -247,6 +272,8 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
         break;
     case 2:
         limit_torque(parameters, state, sample);
+        state->gain_excess_q31 =
+            gain_excess_q31(parameters, sample, above_base_q15(tables, state->place, SLOWER_RANGE));
         set_interval(parameters, state, tables);
         break;
     default:

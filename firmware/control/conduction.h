@@ -13,10 +13,11 @@
  *   on = on_sharing + level * (-lead_max - on_sharing),   end = end_sharing + level * (end_max - end_sharing)
  *   level = (T - T_smooth) / (T_mean - T_smooth) + trim,   clamped to 0..1
  *
- * with angles past the begin of that half. T_smooth is the largest torque without lead and without ripple, T_mean the
- * largest mean torque. The trim is the integral over the angle of the missing torque, reference less estimate, half of
- * it in an electrical revolution: it makes the mean torque that of the reference. With single pulses the torque
- * pulsates, and the reference of the instantaneous torque is raised by level * (T_peak - T_mean).
+ * with angles past the begin of that half, and T the mean of the reference over about a stroke. T_smooth is the largest
+ * torque without lead and without ripple, T_mean the largest mean torque. The trim is the integral over the angle of
+ * the missing torque, reference less estimate, half of it in an electrical revolution: it makes the mean torque that of
+ * the reference. With single pulses the torque pulsates, and the reference of the instantaneous torque is raised by
+ * level * (T_peak - T_mean).
  *
  * Braking: with full -Vdc from an angle theta on, the current stays within its limit while the flux linkage is below
  * psi_t + Vdc / omega (theta_t - theta), the tangent to the flux linkage of the current limit. With torque sharing the
@@ -24,6 +25,10 @@
  *
  * The torque is limited to T_mean. Braking torque, whose energy goes into the DC link, is reduced linearly where the
  * voltage approaches the over-voltage threshold: a chopper that cannot take more, or none, does not end in a fault.
+ *
+ * The torque follows the reference once in a stroke. A speed law with a gain k of the order of the stroke rate f makes
+ * every second pulse larger: the error is multiplied by 1 - k / f from stroke to stroke. From base speed on its gain is
+ * reduced, at half above it to f / 4.
  *
  * J. M. Stephenson, S. R. MacMinn, J. R. Hendershot, "Switched reluctance drives", tutorial, IEEE IAS 1990; the blend
  * and the trim derived here.
@@ -63,9 +68,11 @@ typedef struct {
     bool single_pulse;      /* false: torque sharing only */
     int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
     int32_t torque_max_q24;
-    int32_t advance_step_q30;   /* per update with torque shortfall, Q1.30 */
-    int32_t retract_step_q30;   /* per update without, Q1.30 */
-    int32_t braking_end_q6;     /* DC-link voltage from which there is no braking torque, V, Q9.6 */
+    int32_t advance_step_q30; /* per update with torque shortfall, Q1.30 */
+    int32_t retract_step_q30; /* per update without, Q1.30 */
+    int32_t braking_end_q6;   /* DC-link voltage from which there is no braking torque, V, Q9.6 */
+    uint32_t
+        gain_per_step_q16; /* a quarter of the strokes per update over the gain of the speed law in an update, Q16.16 */
     int32_t fold_back_range_q6; /* voltage range below, in which it decreases to 0, V, Q9.6, >= 1 */
 } conduction_parameters_t;
 
@@ -100,6 +107,8 @@ typedef struct {
     int32_t braking_max_q24;
     int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
     int32_t torque_max_q24;
+    int32_t gain_excess_q31;        /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
+    int32_t torque_q24;             /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
     int32_t sharing_q15;            /* part of the window with the least current, Q1.15, 0..1 */
     int32_t advance_q30;            /* of the windows, Q1.30, 0..1 */
     int32_t trim_q30;               /* of the level, Q1.30, -1..1 */
@@ -129,6 +138,7 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->advance_q30 = 0;
     state->trim_q30 = 0;
     state->level_q15 = 0;
+    state->gain_excess_q31 = 0;
     state->latest = CONDUCTION_INITIAL;
 }
 

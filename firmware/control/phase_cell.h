@@ -28,6 +28,7 @@
 /* u and v in Q2.13, saturated to -4..4 - 2^-13, three columns and a half beyond the cell: with two columns a voltage
  * limited machine overshot its torque limit by 8 % (tests/hil/test_salient_controller.py). */
 #define PHASE_CELL_BITS 16
+#define PHASE_CELL_REACH 3 /* whole columns beyond the cell */
 #define PHASE_CELL_V_MAX_Q13 ((1 << (PHASE_CELL_BITS - 1)) - 1)
 #define PHASE_CELL_FIRST_BITS 15 /* of the first step of the inverse: -2..2 */
 #define PHASE_CELL_RATIO_BITS 14 /* c_psi / rise_psi, Q2.13, saturated to -1..1: a fraction in any machine */

@@ -256,10 +256,11 @@ static inline int32_t duty_of(const plan_t *p, duty_divisor_t by, unsigned flux_
 }
 
 /* Column in which the next plan begins: the current changes as from the last plan to this one. */
-static inline void extrapolate_column(predictive_torque_t *control, unsigned phase, const plan_t *p) {
+static inline void extrapolate_column(predictive_torque_t *control, unsigned phase, const plan_t *p,
+                                      int32_t column_max) {
     const int32_t position_q13 = p->flux > 0 ? p->column * (1 << 13) + p->v_q13 + PHASE_CELL_HALF_Q13 : START_Q13;
     control->column[phase] =
-        (uint8_t)fixed_clamp((2 * position_q13 - control->position_q13[phase]) >> 13, 0, PHASE_CELL_COLUMN_MAX);
+        (uint8_t)fixed_clamp((2 * position_q13 - control->position_q13[phase]) >> 13, 0, column_max);
     control->position_q13[phase] = position_q13;
 }
 
@@ -324,6 +325,6 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         const bool above_current_limit = sample->current_q9[phase] > parameters->current_max_q9;
         duty_q15[phase] = duty_of(&plan[phase], by, flux_shift, above_current_limit);
         control->duty_q15[phase] = duty_q15[phase];
-        extrapolate_column(control, phase, &plan[phase]);
+        extrapolate_column(control, phase, &plan[phase], parameters->column_max);
     }
 }

@@ -55,6 +55,7 @@ typedef struct {
     int32_t period_q40;       /* Ts in s, Q-9.40 */
     int32_t current_limit_q9; /* A, Q7.9 */
     int32_t current_max_q9;   /* that gets no voltage: the limit, which the plans hold, and their error; A, Q7.9 */
+    int32_t column_max;       /* last table column whose cell reaches down to the limit */
     int32_t reserve_q24;      /* N m, Q7.24, >= 0 */
 } predictive_torque_parameters_t;
 

@@ -6,7 +6,7 @@
 
 /*   J H(x) sgn(x) = J k x / D,   D = eps |x| + ((1 - eps) |x| + 1) 2^-y,   y = delta |x| / ln 2
  *   1 / D by a 16-bit mantissa of D and the reciprocal of the mantissa, a 32-bit division */
-int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, int32_t gain_q24, int32_t x_q22) {
+int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, int32_t x_q22) {
     const uint32_t magnitude_q22 = (uint32_t)fixed_abs(x_q22);
     /* y: Q22 * Q27 to Q17. */
     const uint32_t exponent_q17 = (uint32_t)(((uint64_t)magnitude_q22 * (uint32_t)parameters->delta_q27) >> 32);
@@ -24,7 +24,7 @@ int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, 
     const uint32_t normalised = (uint32_t)(denominator_q53 >> (32 - shift));
     const uint32_t mantissa16 = ((normalised >> 15) + 1) >> 1; /* rounded, 2^15..2^16 */
     const uint32_t reciprocal = UINT32_MAX / mantissa16;       /* at most 2^17 */
-    const uint32_t scaled_gain = (uint32_t)(((uint64_t)(uint32_t)gain_q24 * reciprocal) >> 17);
+    const uint32_t scaled_gain = (uint32_t)(((uint64_t)(uint32_t)parameters->gain_q24 * reciprocal) >> 17);
 
     const uint64_t product = (uint64_t)scaled_gain * magnitude_q22; /* below 2^62 */
     const uint64_t torque_q24 = product >> (32 - shift);

@@ -20,6 +20,8 @@
 
 #include <stdint.h>
 
+#define SPEED_SMC_EPSILON_MIN_Q31 (1 << 16) /* 2^-15 */
+
 typedef struct {
     int32_t gain_q24;     /* J k, N m s/rad, Q7.24, > 0 */
     int32_t epsilon_q31;  /* eps, Q0.31, 2^-15..1 - 2^-31; eps = 1 is stored as 1 - 2^-31 */
@@ -27,10 +29,10 @@ typedef struct {
     int32_t friction_q30; /* B, N m s, Q1.30, >= 0 */
 } speed_smc_parameters_t;
 
-/* J H(x) sgn(x) in N m, Q7.24, for J k in N m s/rad, Q7.24, > 0, and x in rad/s, Q9.22, the whole range; saturates at
- * +-INT32_MAX. Exactly odd in x. Error: 1e-4 of the value (table of the exponential, 16-bit mantissa and reciprocal of
- * the denominator), two LSBs of the gain and 2^-20 N m. Accumulator: 64 bits, unsigned. Rounded towards zero. */
-int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, int32_t gain_q24, int32_t x_q22);
+/* J H(x) sgn(x) in N m, Q7.24, for x in rad/s, Q9.22, the whole range; saturates at +-INT32_MAX. Exactly odd in x.
+ * Error: 1e-4 of the value (table of the exponential, 16-bit mantissa and reciprocal of the denominator), two LSBs of
+ * the gain and 2^-20 N m. Accumulator: 64 bits, unsigned. Rounded towards zero. */
+int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, int32_t x_q22);
 
 /* Torque reference in N m, Q7.24, within the limits: reaching torque, load torque (N m, Q7.24) and friction at a
  * speed in rad/s, Q9.22, any values. Sums saturate; the friction torque is rounded down, within 16 LSB of saturation

@@ -62,9 +62,6 @@ static uint32_t angle_from_degrees(int32_t degrees_q7) {
 /* Value of one count in Q18 for a full scale below 2^16; exact. */
 #define COUNT_SCALE_Q18(full_scale, bits) ((int32_t)(((int64_t)(full_scale) << 18) >> (bits)))
 
-/* 2^-15, the smallest epsilon of speed_smc.h. */
-#define EPSILON_MIN_Q31 (1 << 16)
-
 /* log2(e). */
 #define LOG2_E_Q30 1549082005
 
@@ -206,6 +203,9 @@ static conduction_parameters_t conduction_from(const int32_t *values, unsigned p
             (int32_t)fixed_divide(10 * DEFERRED_CONDUCTION_PERIODS * ((int64_t)1 << 30), (int64_t)control_rate_hz),
         .retract_step_q30 =
             (int32_t)fixed_divide(DEFERRED_CONDUCTION_PERIODS * ((int64_t)1 << 30), (int64_t)control_rate_hz),
+        .gain_per_step_q16 = (uint32_t)fixed_saturate(
+            fixed_divide((int64_t)phases * control_rate_hz << 30,
+                         (int64_t)DEFERRED_CONDUCTION_PERIODS * (values[PARAMETER_SMC_K] + 1))),
         .braking_end_q6 = over_voltage_q6 - over_voltage_q6 / 128,
         .fold_back_range_q6 = over_voltage_q6 / 32 - over_voltage_q6 / 128 + 1,
     };
@@ -214,6 +214,7 @@ static conduction_parameters_t conduction_from(const int32_t *values, unsigned p
 static predictive_torque_parameters_t predictive_from(const int32_t *values, unsigned phases,
                                                       uint32_t control_rate_hz) {
     const int64_t rate = control_rate_hz;
+    const int32_t limit_column = values[PARAMETER_CURRENT_LIMIT_A] >> MACHINE_COLUMN_BITS;
     return (predictive_torque_parameters_t){
         .flux =
             {
@@ -225,6 +226,7 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
         .period_q40 = (int32_t)fixed_divide((int64_t)1 << 40, rate),
         .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
         .current_max_q9 = values[PARAMETER_CURRENT_LIMIT_A] + values[PARAMETER_CURRENT_LIMIT_A] / 64,
+        .column_max = fixed_clamp(limit_column + PHASE_CELL_REACH, 0, PHASE_CELL_COLUMN_MAX),
         .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
     };
 }
@@ -236,7 +238,8 @@ static int32_t epsilon_q31(const int32_t *values, int32_t gain_q24) {
     const int64_t set_q31 = (int64_t)values[PARAMETER_SMC_EPSILON] << 15;
     const int64_t limit_q24 = (int64_t)values[PARAMETER_TORQUE_MAX_NM] * 5 / 4 + 1;
     const int64_t reduced_q31 = fixed_divide((int64_t)gain_q24 << 31, limit_q24);
-    return fixed_clamp(fixed_saturate(reduced_q31 < set_q31 ? reduced_q31 : set_q31), EPSILON_MIN_Q31, INT32_MAX);
+    return fixed_clamp(fixed_saturate(reduced_q31 < set_q31 ? reduced_q31 : set_q31), SPEED_SMC_EPSILON_MIN_Q31,
+                       INT32_MAX);
 }
 
 /* 2^32 / (2 pi): 2^-32 rev in a rad. */

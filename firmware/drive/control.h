@@ -135,9 +135,10 @@ typedef struct {
     unsigned turn; /* of the last step, below DEFERRED_COMMON_PERIODS */
     conduction_state_t conduction;
     stroke_mean_t stroke_mean;
-    bool load_constant;          /* in the last stroke_mean_step */
-    misalignment_t misalignment; /* a property of the machine: survives the end of a run */
-    inertia_t inertia;           /* its shift likewise */
+    bool load_constant;               /* in the last stroke_mean_step */
+    speed_smc_parameters_t speed_smc; /* in effect: gain by the identified inertia, above base speed smaller */
+    misalignment_t misalignment;      /* a property of the machine: survives the end of a run */
+    inertia_t inertia;                /* its shift likewise */
 } deferred_t;
 
 /* State of the control; the control interrupt alone writes the members other than `deferred` and the first. */

@@ -84,6 +84,7 @@ NOINLINE static void follow_resets(const control_parameters_t *parameters, defer
     const uint32_t changed = deferred->generation ^ input->generation;
     if ((changed & RUN_MASK) != 0) {
         conduction_reset(&parameters->conduction, &deferred->conduction);
+        deferred->speed_smc = parameters->speed_smc;
         deferred->run = false;
         deferred->mode = DRIVE_MODE_SPEED;
         speed_pi_reset(&deferred->speed_pi);
@@ -211,6 +212,17 @@ static void move_conduction(const control_parameters_t *parameters, deferred_t *
     conduction_step(&parameters->conduction, &deferred->conduction, &machine_tables, &sample);
 }
 
+/* Gain by the identified inertia; above base speed gain and epsilon by the same factor smaller: far from the reference
+ * the law stays the same. */
+static void set_speed_law(const control_parameters_t *parameters, deferred_t *deferred) {
+    const int32_t gain_q24 = deferred->inertia.laws.reaching_gain_q24;
+    const int32_t full_q31 = parameters->speed_smc.epsilon_q31;
+    const int32_t excess_q31 = deferred->conduction.gain_excess_q31;
+    deferred->speed_smc.gain_q24 = gain_q24 - 2 * fixed_multiply_high(gain_q24, excess_q31);
+    const int32_t epsilon_q31 = full_q31 - 2 * fixed_multiply_high(full_q31, excess_q31);
+    deferred->speed_smc.epsilon_q31 = epsilon_q31 > SPEED_SMC_EPSILON_MIN_Q31 ? epsilon_q31 : SPEED_SMC_EPSILON_MIN_Q31;
+}
+
 /* In single pulse operation the level makes up for the missing torque; above base speed, where the windows stay where
  * there is hardly any shortfall, the offset does. */
 static bool torque_limited(const deferred_t *deferred, const deferred_input_t *input) {
@@ -239,6 +251,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
     case 2:
         learn_common_misalignment(parameters, deferred, input);
         move_conduction(parameters, deferred, input);
+        set_speed_law(parameters, deferred);
         break;
     case 6:
         identify_inertia(parameters, deferred, input);

@@ -20,8 +20,7 @@ static int32_t speed_law_q24(const control_parameters_t *parameters, deferred_t 
     const int32_t error_q22 = fixed_subtract(reference_q22, input->speed_q22);
     switch (parameters->speed_law) {
     case SPEED_LAW_SMC:
-        return speed_smc_reaching_torque_q24(&parameters->speed_smc, deferred->inertia.laws.reaching_gain_q24,
-                                             error_q22);
+        return speed_smc_reaching_torque_q24(&deferred->speed_smc, error_q22);
     case SPEED_LAW_PI:
     default:
         return speed_pi_step(&parameters->speed_pi, &deferred->speed_pi, error_q22);

@@ -180,6 +180,7 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
         control.deferred.misalignment.phase[phase].offset = (1 << 20) * machine_tables.rotor_poles;
     }
     control.predictive.torque_shortfall_q24 = INT32_MAX;
+    control.deferred.conduction.level_q15 = 1;
     p.bandwidth.bandwidth_rad_s[control.bandwidth.stage] = 8000;
     drive.used_ticks = 3000;
     drive.worst_ticks = 4999;
@@ -200,6 +201,7 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     EXPECT_EQ(status.voltage_saturated, 1);
     EXPECT_EQ(status.mode, DRIVE_MODE_TORQUE);
     EXPECT_EQ(status.start_inhibited_by, FAULT_UNDER_VOLTAGE);
+    EXPECT_EQ(status.single_pulse, 1);
     drive_motion_t motion;
     drive_motion_unpack(&motion, first(DRIVE_MOTION_FRAME_ID).data, 8);
     EXPECT_EQ(motion.speed_rpm, -600000);

@@ -41,7 +41,7 @@ double model_torque_Nm(const speed_smc_parameters_t &parameters, int32_t x_q22) 
 int32_t torque_q24_of(const speed_smc_parameters_t &parameters, int32_t reference_q22, int32_t speed_q22,
                       int32_t load_q24, int32_t torque_max_q24 = to_fixed(TORQUE_MAX_NM, Q24)) {
     const int32_t error_q22 = fixed_subtract(reference_q22, speed_q22);
-    const int32_t reaching_q24 = speed_smc_reaching_torque_q24(&parameters, parameters.gain_q24, error_q22);
+    const int32_t reaching_q24 = speed_smc_reaching_torque_q24(&parameters, error_q22);
     return speed_smc_torque_q24(&parameters, reaching_q24, speed_q22, load_q24, -torque_max_q24, torque_max_q24);
 }
 
@@ -68,7 +68,7 @@ TEST(SpeedSmc, reaching_torque_error_is_within_its_bound_over_the_whole_range) {
                 const speed_smc_parameters_t parameters = parameters_of(gain, epsilon, delta_s);
                 for (const int32_t x_q22 : values) {
                     const double exact = model_torque_Nm(parameters, x_q22);
-                    const int32_t torque_q24 = speed_smc_reaching_torque_q24(&parameters, parameters.gain_q24, x_q22);
+                    const int32_t torque_q24 = speed_smc_reaching_torque_q24(&parameters, x_q22);
                     if (std::fabs(exact) > 127.98) {
                         ASSERT_GE(std::abs(torque_q24), int32_t(127.96 * Q24));
                         continue;
@@ -91,13 +91,13 @@ TEST(SpeedSmc, reaching_torque_is_exactly_odd_and_saturates) {
     const speed_smc_parameters_t parameters = parameters_of(6000.0, 0.01, 10.0);
     for (const int32_t x_q22 : speeds()) {
         if (x_q22 != INT32_MIN) {
-            ASSERT_EQ(speed_smc_reaching_torque_q24(&parameters, parameters.gain_q24, -x_q22),
-                      -speed_smc_reaching_torque_q24(&parameters, parameters.gain_q24, x_q22));
+            ASSERT_EQ(speed_smc_reaching_torque_q24(&parameters, -x_q22),
+                      -speed_smc_reaching_torque_q24(&parameters, x_q22));
         }
     }
-    EXPECT_EQ(speed_smc_reaching_torque_q24(&parameters, parameters.gain_q24, INT32_MAX), INT32_MAX);
-    EXPECT_EQ(speed_smc_reaching_torque_q24(&parameters, parameters.gain_q24, INT32_MIN), -INT32_MAX);
-    EXPECT_EQ(speed_smc_reaching_torque_q24(&parameters, parameters.gain_q24, 0), 0);
+    EXPECT_EQ(speed_smc_reaching_torque_q24(&parameters, INT32_MAX), INT32_MAX);
+    EXPECT_EQ(speed_smc_reaching_torque_q24(&parameters, INT32_MIN), -INT32_MAX);
+    EXPECT_EQ(speed_smc_reaching_torque_q24(&parameters, 0), 0);
 }
 
 TEST(SpeedSmc, torque_includes_load_and_friction_and_is_clamped_to_the_limits) {

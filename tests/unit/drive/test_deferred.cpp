@@ -218,9 +218,7 @@ TEST_F(Deferred, the_torque_of_the_speed_law_acts_one_period_later_with_the_feed
         deferred_step(&parameters, &state);
         const int32_t error_q22 = results().speed.speed_reference_q22 - input.speed_q22;
         const int32_t law_q24 = results().speed.speed_law_torque_q24;
-        ASSERT_EQ(law_q24,
-                  speed_smc_reaching_torque_q24(&parameters.speed_smc, parameters.speed_smc.gain_q24, error_q22) +
-                      torque_offset_before_q24);
+        ASSERT_EQ(law_q24, speed_smc_reaching_torque_q24(&parameters.speed_smc, error_q22) + torque_offset_before_q24);
         interrupt(COMMAND_RUN, 30.0);
         ASSERT_EQ(state.torque_reference_q24,
                   speed_smc_torque_q24(&parameters.speed_smc, law_q24, state.observer.speed_q22,

@@ -44,12 +44,17 @@ Metrics = dict[str, float | None]
 
 
 def machine_files(quick: bool) -> list[Path]:
-    """The examples, and the random machines, whose files are written when they are missing."""
+    """The examples and the random machines."""
     if quick:
         return [EXAMPLES / f"{name}.toml" for name in QUICK]
+    return [*sorted(EXAMPLES.glob("*.toml")), *random_files(range(COUNT))]
+
+
+def random_files(numbers: range) -> list[Path]:
+    """Files of random machines, written when they are missing."""
     RANDOM.mkdir(parents=True, exist_ok=True)
-    files = sorted(EXAMPLES.glob("*.toml"))
-    for number in range(COUNT):
+    files = []
+    for number in numbers:
         path, text = RANDOM / f"random_{number:02}.toml", random_machine(number)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")

@@ -21,7 +21,7 @@ _PEAK_POWER_PER_VOLT_A = 120.0
 
 
 def random_machine(number: int) -> str:
-    """The text of a machine file, number 0..COUNT - 1."""
+    """The text of a machine file, number 0 or more; those of `compare machines` are below COUNT."""
     draw = np.random.default_rng((SEED, number))
 
     def between(low: float, high: float) -> float:

@@ -2,6 +2,7 @@
 the firmware or its tables (reference/torque_speed_bound.py).
 
 - torque_speed: the largest torque in torque mode, motoring and braking, on a shaft that a dynamometer holds.
+- torque_speed_random: the same with ten random machines, which no other group has.
 - partial_torque: parts of it above base speed; the RMS current is compared with that of the best pulse.
 - transition: load steps at 1.5 times and half of the base speed in one run; speed ramps under load between half and
   twice the base speed.
@@ -21,6 +22,7 @@ import numpy as np
 
 from salient.config import CONTROLLERS
 from salient.experiments import metrics
+from salient.experiments.compare import every_machine
 from salient.experiments.compare.case import MACHINES, Case, make_scenario
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep
 from salient.machine.definition import Machine
@@ -43,6 +45,7 @@ QUADRANTS = {"motoring": MOTORING, "braking": BRAKING}
 OF_BASE = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
 OF_BASE_ANY = (0.5, 1.0, 1.5, 2.0)
 OF_BASE_QUICK = (0.5, 2.0)
+RANDOM_NUMBERS = range(20, 30)
 ABOVE_BASE = (1.25, 1.5, 2.0)
 PARTS = (0.25, 0.5, 0.75)
 MOTORING_SHORT_PERCENT, BRAKING_SHORT_PERCENT = 3.0, 8.0
@@ -89,6 +92,12 @@ def torque_speed(quick: bool, machines: Sequence[str] = MACHINES, group: str = "
                 for controller in controllers if sign == MOTORING else ("salient",):
                     yield Case(group, f"{subject.label}, {speed_rpm:g} r/min, {quadrant}", controller, "held",
                                subject.held(speed_rpm, sign * subject.torque_max_Nm, controller=controller))
+
+
+def torque_speed_random(quick: bool) -> Iterator[Case]:
+    """The largest torque of random machines."""
+    machines = [str(path) for path in every_machine.random_files(RANDOM_NUMBERS)]
+    return torque_speed(quick, machines, "torque_speed_random", ("salient",))
 
 
 def partial_torque(quick: bool, machines: Sequence[str] = MACHINES) -> Iterator[Case]:

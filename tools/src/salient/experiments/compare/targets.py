@@ -205,7 +205,8 @@ TARGETS: dict[Key, Target] = {**_ripples(), **_starts(), **_dips(), **_moving_lo
                               **_paper_conditions(), **_ranges(), **_robustness()}
 _EVERY_CONDITION = {
     ("machines", "ripple_to_allowed", ""): Target(1.0),
-    **{(group, metric, ""): Target(limit) for group in ("torque_speed", "torque_conditions", "machines")
+    **{(group, metric, ""): Target(limit)
+       for group in ("torque_speed", "torque_speed_random", "torque_conditions", "machines")
        for metric, limit in (("motoring_short_percent", speed_range.MOTORING_SHORT_PERCENT),
                              ("braking_short_percent", speed_range.BRAKING_SHORT_PERCENT),
                              ("peak_to_limit", speed_range.PEAK_TO_LIMIT_MAX))},

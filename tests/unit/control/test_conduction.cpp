@@ -1,0 +1,332 @@
+// Conduction angles against a model in double precision, written from the equations of conduction.h in electrical
+// revolutions, N m and volts; over both directions, both signs of the torque, sagging and high DC-link voltages.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <random>
+#include <string>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/conduction.h"
+}
+
+#include "support/fixed_point.h"
+
+namespace {
+
+using namespace fixed_point;
+
+constexpr unsigned PHASES = 3;
+constexpr double SPEED_MAX_RAD_S = 320.0, SUPPLY_V = 240.0; // of the last point
+constexpr double OVER_VOLTAGE_V = 300.0, FOLD_BACK_V = 7.0, TORQUE_MAX_NM = 40.0;
+constexpr double BASE_INDEX = 6.0;
+constexpr double GAIN_PER_STEP = 2.5;
+
+double signed_rev(uint32_t angle) {
+    return int32_t(angle) / REV;
+}
+
+uint32_t angle_of(double rev) {
+    return angle_from_rev(rev);
+}
+
+// Tables that fall or rise gently, of no machine.
+machine_tables_t tables_of() {
+    machine_tables_t tables{};
+    tables.phases = PHASES;
+    tables.flux_format.result_shift = 3;
+    tables.pulse_base_index = uint16_t(BASE_INDEX * Q8);
+    tables.sharing_on = uint16_t(0.06 * 65536);
+    tables.sharing_off = uint16_t(0.47 * 65536);
+    // index = |w| / w_max * 16 * V_supply / V, in Q8.
+    tables.pulse_index_scale = uint32_t(16 * Q8 / (SPEED_MAX_RAD_S * Q22) * (SUPPLY_V * Q6) * Q32);
+    for (unsigned k = 0; k < MACHINE_PULSE_POINTS; k++) {
+        for (unsigned braking = 0; braking < 2; braking++) {
+            tables.pulse[braking][k] = {.lead = uint16_t(400 * k + 500 * braking),
+                                        .end = uint16_t(30000 - 300 * k - 200 * braking),
+                                        .smooth_torque = uint16_t((30 - 1.4 * k + braking) * Q8),
+                                        .mean_torque = uint16_t((36 - 1.2 * k + braking) * Q8),
+                                        .peak_torque = uint16_t((50 - 1.5 * k) * Q8)};
+        }
+        tables.braking_end[k] = uint16_t(3000 + 500 * k);
+        tables.braking_flux[k] = uint16_t(2000 - 50 * k);
+    }
+    return tables;
+}
+
+conduction_parameters_t parameters_of() {
+    const torque_sharing_parameters_t sharing{.overlapping = true,
+                                              .stroke = uint32_t(REV / PHASES),
+                                              .turn_on = angle_of(184.0 / 360.0),
+                                              .turn_off = angle_of(356.0 / 360.0),
+                                              .turn_on_advance = angle_of(24.0 / 360.0),
+                                              .turn_off_advance = angle_of(16.0 / 360.0)};
+    const torque_sharing_window_t window = torque_sharing_window(&sharing, 0);
+    return {.sharing = sharing,
+            .initial = conduction_initial(&window),
+            .single_pulse = true,
+            .torque_min_q24 = to_fixed(-TORQUE_MAX_NM, Q24),
+            .torque_max_q24 = to_fixed(TORQUE_MAX_NM, Q24),
+            .advance_step_q30 = to_fixed(1.0 / 50.0, Q30),
+            .retract_step_q30 = to_fixed(1.0 / 400.0, Q30),
+            .braking_end_q6 = to_fixed(OVER_VOLTAGE_V, Q6),
+            .gain_per_step_q16 = uint32_t(GAIN_PER_STEP * Q16),
+            .fold_back_range_q6 = to_fixed(FOLD_BACK_V, Q6)};
+}
+
+struct sample_t {
+    double torque, estimate, shortfall, speed, voltage, step;
+};
+
+conduction_sample_t fixed(const sample_t &s) {
+    return {.torque_q24 = to_fixed(s.torque, Q24),
+            .torque_sum_q24 = to_fixed(s.estimate, Q24),
+            .torque_shortfall_q24 = to_fixed(s.shortfall, Q24),
+            .speed_q22 = to_fixed(s.speed, Q22),
+            .angle_step = uint32_t(s.step * REV),
+            .dc_link_voltage_q6 = to_fixed(s.voltage, Q6)};
+}
+
+struct model_t {
+    const machine_tables_t &tables;
+    double sharing_on = 4.0 / 360.0, sharing_off = 176.0 / 360.0; // past the unaligned position
+    double advance = 0.0, trim = 0.0, level = 0.0, torque = 0.0;
+    bool braking = false, first = true;
+    double lead = 0.0, end = 0.0, smooth = 0.0, mean = 0.0, peak = 0.0;
+    double torque_min = 0.0, torque_max = 0.0, gain_excess = 0.0, ripple = 0.0;
+    double turn_on_lead = 0.0, enter = 0.0, leave = 0.0, envelope_end = 0.0, envelope_flux_Wb = 0.0;
+
+    template <typename value_of_t> double at(double index, value_of_t value_of) const {
+        const double place = std::min(index, 16.0);
+        const unsigned low = std::min(unsigned(place), 15u);
+        return value_of(low) + (place - low) * (value_of(low + 1) - value_of(low));
+    }
+
+    double largest(bool of_braking, double index) const {
+        return at(index, [&](unsigned k) { return tables.pulse[of_braking][k].mean_torque / 256.0; });
+    }
+
+    void update(const sample_t &s) {
+        const double index = 16.0 * std::fabs(s.speed) / SPEED_MAX_RAD_S * SUPPLY_V / std::max(s.voltage, 1.0 / 64.0);
+        const bool now = (s.torque < 0.0) != (s.speed < 0.0);
+        trim = now == braking ? trim : 0.0;
+        braking = now;
+        const machine_pulse_t *pulse = tables.pulse[braking];
+        lead = at(index, [&](unsigned k) { return pulse[k].lead / 65536.0; });
+        end = at(index, [&](unsigned k) { return pulse[k].end / 65536.0; });
+        smooth = at(index, [&](unsigned k) { return pulse[k].smooth_torque / 256.0; });
+        mean = largest(braking, index);
+        peak = at(index, [&](unsigned k) { return pulse[k].peak_torque / 256.0; });
+
+        const auto above = [&](double range) {
+            return std::clamp(range * (std::min(index, 16.0) / BASE_INDEX - 1.0), 0.0, 1.0);
+        };
+        const double magnitude = std::fabs(s.torque), least_current = above(8.0);
+        const bool limited = std::fabs(s.shortfall) > 0.05 + magnitude / 64.0;
+        torque =
+            least_current > 0.0 && !first ? torque + (magnitude - torque) * std::min(1.0, s.step * PHASES) : magnitude;
+        first = false;
+        const double forward = std::clamp((torque - smooth) / (mean - smooth), 0.0, 1.0);
+        advance = forward > 0.0 ? 1.0 : advance;
+        if (forward == 1.0) {
+            trim = 0.0;
+        } else if ((advance == 1.0 || (braking && least_current > 0.0)) && (limited || level > 0.0)) {
+            const double missing = (s.torque < 0.0 ? -1.0 : 1.0) * (s.torque - s.estimate);
+            trim += 0.5 * s.step * std::clamp(missing / mean, -1.0, 1.0);
+        }
+        trim = std::clamp(trim, -forward, 1.0 - forward);
+        level = std::floor((forward + trim) * 32768.0) / 32768.0;
+        if (level == 0.0) {
+            const double retract = 1.0 / 400.0 / (least_current > 0.0 ? 8.0 : 1.0);
+            advance = std::clamp(advance + (limited ? 1.0 / 50.0 : -retract), 0.0, 1.0);
+        }
+        gain_excess = above(2.0) * (1.0 - std::min(1.0, s.step * GAIN_PER_STEP));
+
+        const double room = std::clamp((OVER_VOLTAGE_V - s.voltage) / FOLD_BACK_V, 0.0, 1.0);
+        const double motoring_max = std::min(largest(false, index), TORQUE_MAX_NM);
+        const double braking_max = std::min(largest(true, index) * room, TORQUE_MAX_NM);
+        torque_max = s.speed < 0.0 ? braking_max : motoring_max;
+        torque_min = -(s.speed < 0.0 ? motoring_max : braking_max);
+
+        const auto blend = [](double from, double to, double part) { return from + part * (to - from); };
+        const double share_on = tables.sharing_on / 65536.0, share_off = tables.sharing_off / 65536.0;
+        if (braking) {
+            enter = blend(0.5 - sharing_off, 0.5 - share_off, least_current);
+            leave = blend(0.5 - sharing_on, 0.5 - share_on, least_current);
+        } else {
+            enter = blend(sharing_on - advance * 24.0 / 360.0, share_on, least_current * (1.0 - advance));
+            leave = blend(sharing_off - advance * 16.0 / 360.0, share_off, least_current * (1.0 - advance));
+        }
+        double on = 0.0;
+        if (level > 0.0) {
+            on = blend(std::max(enter, 0.0), -lead, level);
+            leave = blend(leave, end, level);
+            enter = std::clamp(on, -20.0 / 360.0, enter);
+        }
+        turn_on_lead = std::max(-on, 0.0);
+        ripple = (s.torque < 0.0 ? -1.0 : 1.0) * level * (peak - mean);
+        envelope_end = at(index, [&](unsigned k) { return tables.braking_end[k] / 65536.0; });
+        envelope_flux_Wb = at(index, [&](unsigned k) { return tables.braking_flux[k] / 8192.0; });
+    }
+
+    double overlap() const { return std::max(leave - enter - 1.0 / PHASES, 2.0 / 360.0); }
+};
+
+class Conduction : public testing::Test {
+  protected:
+    Conduction() : tables(tables_of()), parameters(parameters_of()) { conduction_reset(&parameters, &state); }
+
+    void update(const sample_t &s) {
+        const conduction_sample_t sample = fixed(s);
+        for (unsigned step = 0; step < CONDUCTION_STEPS; step++) {
+            conduction_step(&parameters, &state, &tables, &sample);
+        }
+    }
+
+    const conduction_t &angles() const { return *conduction_angles(&parameters, &state, state.latest); }
+
+    void compare(const model_t &model, const std::string &of) const {
+        // The place in the tables is rounded to 2^-8: 0.006 N m, of smooth and mean torque that are 6 N m or more from
+        // each other. The trim loses up to 2^-8 of its step in every update.
+        constexpr double LEVEL = 0.012, ANGLE = LEVEL * 0.6;
+        EXPECT_NEAR(state.level_q15 / Q15, model.level, LEVEL) << of;
+        EXPECT_NEAR(state.advance_q30 / Q30, model.advance, 1e-6) << of;
+        EXPECT_NEAR(state.torque_max_q24 / Q24, model.torque_max, 0.02) << of;
+        EXPECT_NEAR(state.torque_min_q24 / Q24, model.torque_min, 0.02) << of;
+        EXPECT_NEAR(state.gain_excess_q31 / Q31, model.gain_excess, 0.01) << of;
+        const conduction_half_t &half = angles().half[model.braking], &other = angles().half[!model.braking];
+        EXPECT_NEAR(angles().ripple_q24 / Q24, model.ripple, LEVEL * 30.0) << of;
+        EXPECT_NEAR(signed_rev(other.lead), model.turn_on_lead, ANGLE) << of;
+        EXPECT_EQ(half.lead, 0u) << of;
+        EXPECT_NEAR(signed_rev(half.window.overlap), model.overlap(), 2.0 * ANGLE) << of;
+        const double turn_on = model.braking ? 1.0 - model.leave : 0.5 + model.leave - 1.0 / PHASES - model.overlap();
+        EXPECT_NEAR(half.window.turn_on / REV, turn_on, 2.0 * ANGLE) << of;
+        EXPECT_EQ(angles().half[CONDUCTION_MOTORING].end, UINT32_MAX) << of;
+        const bool envelope = state.level_q15 > 0 && model.braking;
+        EXPECT_NEAR(1.0 - angles().half[CONDUCTION_BRAKING].end / REV, envelope ? model.envelope_end : 0.5, 1e-4) << of;
+        EXPECT_NEAR(half.flux * 8 / Q29, envelope ? model.envelope_flux_Wb : 0.0, 1e-4) << of;
+    }
+
+    machine_tables_t tables;
+    conduction_parameters_t parameters;
+    conduction_state_t state{};
+};
+
+TEST_F(Conduction, equals_its_model_in_every_quadrant_at_all_speeds_and_voltages) {
+    unsigned sharing = 0, blended = 0, full = 0;
+    for (const double direction : {1.0, -1.0}) {
+        for (const double sign : {1.0, -1.0}) {
+            for (const double of_last : {0.0, 0.2, 0.41, 0.5, 0.75, 1.0, 1.4}) {
+                for (const double voltage : {160.0, 240.0, 288.0, 296.0, 310.0}) {
+                    for (const double torque : {0.0, 5.0, 14.0, 18.0, 22.0, 38.0}) {
+                        conduction_reset(&parameters, &state);
+                        model_t model{tables};
+                        const double speed = direction * of_last * SPEED_MAX_RAD_S;
+                        const sample_t s{sign * torque, sign * 0.9 * torque, sign * 0.1 * torque, speed,
+                                         voltage,       of_last * 0.1};
+                        for (unsigned k = 0; k < 60; k++) {
+                            update(s);
+                            model.update(s);
+                        }
+                        compare(model, std::to_string(sign * torque) + " N m, " + std::to_string(speed) + " rad/s, " +
+                                           std::to_string(voltage) + " V");
+                        ++(state.level_q15 == 0 ? sharing : state.level_q15 < 32768 ? blended : full);
+                    }
+                }
+            }
+        }
+    }
+    EXPECT_GT(sharing, 100u);
+    EXPECT_GT(blended, 50u);
+    EXPECT_GT(full, 50u);
+}
+
+TEST_F(Conduction, follows_its_model_through_the_transition_on_a_sagging_dc_link) {
+    model_t model{tables};
+    int32_t before_q15 = 0, largest_step_q15 = 0;
+    for (unsigned k = 0; k < 400; k++) {
+        const double up = k < 200 ? k / 200.0 : (400 - k) / 200.0;
+        const sample_t s{18.0, k < 200 ? 17.5 : 18.5, k < 200 ? 0.6 : 0.0, 300.0 * up, 240.0 - 50.0 * up, 0.1 * up};
+        update(s);
+        model.update(s);
+        compare(model, "update " + std::to_string(k));
+        largest_step_q15 = std::max(largest_step_q15, std::abs(state.level_q15 - before_q15));
+        before_q15 = state.level_q15;
+    }
+    EXPECT_LT(largest_step_q15, 32768 / 16) << "without a switch";
+    EXPECT_EQ(state.level_q15, 0);
+}
+
+TEST_F(Conduction, is_the_same_in_both_directions_but_for_signs) {
+    conduction_state_t forward{};
+    const sample_t ahead{20.0, 19.0, 0.5, 250.0, 230.0, 0.08};
+    const sample_t back{-20.0, -19.0, -0.5, -250.0, 230.0, 0.08};
+    for (unsigned k = 0; k < 30; k++) {
+        update(ahead);
+    }
+    forward = state;
+    conduction_reset(&parameters, &state);
+    for (unsigned k = 0; k < 30; k++) {
+        update(back);
+    }
+    EXPECT_NEAR(state.level_q15, forward.level_q15, 300); // roundings towards minus infinity
+    EXPECT_GT(state.level_q15, 16384);
+    EXPECT_EQ(state.torque_min_q24, -forward.torque_max_q24);
+    EXPECT_EQ(state.torque_max_q24, -forward.torque_min_q24);
+    EXPECT_LT(angles().ripple_q24, 0);
+}
+
+TEST_F(Conduction, without_single_pulses_windows_advance_and_no_phase_leads) {
+    parameters.single_pulse = false;
+    for (unsigned k = 0; k < 100; k++) {
+        update({30.0, 20.0, 8.0, 300.0, 200.0, 0.1});
+        ASSERT_EQ(state.level_q15, 0);
+        ASSERT_EQ(angles().half[CONDUCTION_BRAKING].lead, 0u);
+    }
+    EXPECT_EQ(state.advance_q30, 1 << 30);
+    EXPECT_NEAR(angles().half[CONDUCTION_MOTORING].window.turn_on / REV, 160.0 / 360.0, 1e-3);
+}
+
+TEST_F(Conduction, no_braking_torque_is_permitted_from_the_over_voltage_on) {
+    for (const double direction : {1.0, -1.0}) {
+        update({0.0, 0.0, 0.0, direction * 200.0, 300.0, 0.06});
+        EXPECT_EQ(direction > 0.0 ? state.torque_min_q24 : state.torque_max_q24, 0);
+        EXPECT_GT(direction > 0.0 ? state.torque_max_q24 : -state.torque_min_q24, 10 << 24);
+    }
+}
+
+TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
+    std::mt19937 random(15);
+    const auto any = [&] { return int32_t(random()) >> (random() % 32); };
+    for (unsigned k = 0; k < 20000; k++) {
+        if (k % 100 == 0) {
+            for (auto &half : tables.pulse) {
+                for (machine_pulse_t &pulse : half) {
+                    pulse = {uint16_t(random()), uint16_t(random() % 32769), uint16_t(random()), uint16_t(random()),
+                             uint16_t(random())};
+                }
+            }
+            tables.pulse_base_index = uint16_t(1 + random() % 4096);
+            tables.pulse_index_scale = random() >> 1;
+            conduction_reset(&parameters, &state);
+        }
+        const conduction_sample_t sample{any(), any(), any(), any(), uint32_t(random()), any() >> 15};
+        for (unsigned step = 0; step < CONDUCTION_STEPS; step++) {
+            conduction_step(&parameters, &state, &tables, &sample);
+        }
+        ASSERT_GE(state.level_q15, 0);
+        ASSERT_LE(state.level_q15, 32768);
+        ASSERT_GE(state.advance_q30, 0);
+        ASSERT_LE(state.advance_q30, 1 << 30);
+        ASSERT_GE(state.gain_excess_q31, 0);
+        ASSERT_LE(state.torque_min_q24, 0);
+        ASSERT_GE(state.torque_min_q24, parameters.torque_min_q24);
+        ASSERT_GE(state.torque_max_q24, 0);
+        ASSERT_LE(state.torque_max_q24, parameters.torque_max_q24);
+        ASSERT_GE(angles().half[state.braking].window.overlap, 0x016C16C1u);
+    }
+}
+
+} // namespace
