@@ -22,8 +22,8 @@ static void configure(drive_t *drive) {
     drive->applied_revision = drive->parameters.revision;
 }
 
-static uint32_t inhibit_mask(const drive_t *drive) {
-    return drive->store.inhibited ? (uint32_t)FAULT_BIT(FAULT_PARAMETER_MEMORY) : 0;
+static void inhibit_start(drive_t *drive) {
+    drive->control.state_machine.background_inhibit = drive->store.inhibited ? FAULT_PARAMETER_MEMORY : FAULT_NONE;
 }
 
 COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
@@ -44,7 +44,7 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     drive->comms.store = &drive->store;
     configure(drive);
     control_reset(&drive->control_parameters, &drive->control);
-    drive->control.state_machine.background_inhibit_mask = inhibit_mask(drive);
+    inhibit_start(drive);
     hal_pwm_open_all(hal);
     hal_pwm_start(hal, drive->control_parameters.period_ticks);
     return true;
@@ -174,8 +174,11 @@ static void keep_memory(drive_t *drive, uint32_t time_us) {
     }
     const bool writable =
         state == DRIVE_STATE_FAULT || (state != DRIVE_STATE_RUN && drive->command.request != COMMAND_RUN);
+    const bool inhibited = drive->store.inhibited;
     nvm_store_step(&drive->store, drive->hal, &drive->parameters, time_us, writable);
-    drive->control.state_machine.background_inhibit_mask = inhibit_mask(drive);
+    if (inhibited && !drive->store.inhibited) {
+        inhibit_start(drive);
+    }
 }
 
 COLD void drive_background(drive_t *drive) {

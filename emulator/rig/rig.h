@@ -39,8 +39,8 @@ typedef struct {
     void (*control_interrupt)(void *context);  /* at the start of each control period */
     void (*deferred_interrupt)(void *context); /* after a control interrupt that has set board.deferred_requested */
     void (*background)(void *context);         /* after each control interrupt and the deferred one */
-    void (*restart)(void *context);            /* from its start on, after board_reset; NULL: it cannot be reset */
     void *context;
+    void (*restart)(void *context); /* from its start on, after board_reset; NULL: it cannot be reset */
 } rig_firmware_t;
 
 /* When to end: `requested` is called at least every RIG_STOP_STEP_NS, and when a descriptor becomes readable. */

@@ -10,6 +10,7 @@
 extern "C" {
 #include "comms/comms.h"
 #include "drive_codec.h"
+#include "hal_nvm.h"
 #include "telemetry_collect.h"
 }
 #include "support/frames.h"
@@ -56,6 +57,15 @@ uint32_t hal_can_receive_overflows(const hal_t *hal) {
     return hal->overflows;
 }
 
+uint64_t hal_nvm_read(const hal_t *, unsigned, unsigned) {
+    return HAL_NVM_ERASED;
+}
+bool hal_nvm_program(hal_t *, unsigned, unsigned, uint64_t) {
+    return false;
+}
+bool hal_nvm_erase(hal_t *, unsigned) {
+    return false;
+}
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     if (hal->mailboxes.size() == 3) {
         return false;

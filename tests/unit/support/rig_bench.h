@@ -207,7 +207,7 @@ class RigBench {
         rig_init(rig.get(), &config);
         firmware.board = &rig->board;
         board_pwm_start(&rig->board, 2500);
-        rig_firmware_t callbacks{StandInFirmware::interrupt, nullptr, StandInFirmware::background, &firmware};
+        rig_firmware_t callbacks{StandInFirmware::interrupt, nullptr, StandInFirmware::background, &firmware, nullptr};
         rig_join(rig.get(), &callbacks);
     }
 

@@ -49,6 +49,7 @@ def save(session: Session, path: Path) -> int:
         comment = f"{row.unit + ', ' if row.unit else ''}{_range(row)}"
         lines.append(f"{name} = {decimal(row, parameters[name])}  # {comment}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
