@@ -2,7 +2,7 @@
 # Fails when the firmware references a symbol other than the HAL, memcpy and memset, the machine's tables and the
 # compiler's integer helpers, for example a floating-point helper (__aeabi_fadd, __aeabi_d2iz, ...), malloc or printf, or
 # a 64-bit division (firmware/fixed/divide.h has one).
-set(allowed "^(hal_[a-z_]+|machine_tables|memcpy|memset|__aeabi_(uidiv|idiv|uidivmod|idivmod|lmul|llsl|llsr|lasr|memcpy[48]?|memset[48]?|memclr[48]?)|__(ashl|ashr|lshr)di3|__clz[sd]i2)$")
+set(allowed "^(hal_[a-z0-9_]+|machine_tables|memcpy|memset|__aeabi_(uidiv|idiv|uidivmod|idivmod|lmul|llsl|llsr|lasr|memcpy[48]?|memset[48]?|memclr[48]?)|__(ashl|ashr|lshr)di3|__clz[sd]i2)$")
 
 set(defined)
 set(needed)

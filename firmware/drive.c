@@ -3,6 +3,7 @@
 #include "drive/deferred.h"
 #include "fixed/compiler.h"
 #include "fixed/divide.h"
+#include "fixed/fixed.h"
 #include "hal_encoder.h"
 #include "hal_interrupt.h"
 #include "hal_time.h"
@@ -11,15 +12,25 @@
 /* Resolution of the processor times in telemetry: 5 ns. */
 #define PROCESSOR_TIME_HZ 200000000
 
-static void configure(drive_t *drive) {
+/* True while the drive does not run and cannot begin to: a run starts with a command that only the background
+ * publishes. */
+static bool may_configure(const drive_t *drive) {
+    return drive->control.state_machine.state != DRIVE_STATE_RUN && drive->command.request != COMMAND_RUN;
+}
+
+/* Applies the parameters in one piece between two control periods, never in a run or beside the command that starts
+ * one. */
+COLD static void configure(drive_t *drive) {
     const control_parameters_t control_parameters =
         configure_control(&drive->parameters, &machine_tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
                           hal_adc_bits(drive->hal), hal_pwm_clock_hz(drive->hal));
     hal_critical_enter(drive->hal);
-    drive->control_parameters = control_parameters;
-    control_prepare(&drive->control_parameters, &drive->control); /* parameters change outside of RUN only */
+    if (may_configure(drive)) {
+        drive->control_parameters = control_parameters;
+        control_prepare(&drive->control_parameters, &drive->control);
+        drive->applied_revision = drive->parameters.revision;
+    }
     hal_critical_leave(drive->hal);
-    drive->applied_revision = drive->parameters.revision;
 }
 
 static void inhibit_start(drive_t *drive) {
@@ -104,12 +115,13 @@ void drive_deferred_interrupt(drive_t *drive) {
     deferred_complete(&control->deferred_request, &control->deferred.response);
 }
 
-/* Drops a command older than twice the timeout: the clock wraps, and its age would then appear small again. By twice
- * the timeout the interrupt has detected the timeout. */
+/* Withdraws a command that must not start a run later: to run without being armed, or one older than twice the time
+ * after which a run ends (the clock wraps, and its age would then appear small again). */
 static void drop_stale_command(drive_t *drive, uint32_t time_us) {
-    const uint32_t age_us = time_us - drive->command.time_us;
-    if (drive->command.request != COMMAND_OFF &&
-        age_us > 2u * drive->control_parameters.protection.command_timeout_us) {
+    const bool stale = time_us - drive->command.time_us > 2u * COMMAND_LOST_US;
+    const bool unarmed = drive->command.request == COMMAND_RUN && !drive->comms.commands.arming.armed &&
+                         drive->control.state_machine.state != DRIVE_STATE_RUN;
+    if (drive->command.request != COMMAND_OFF && (stale || unarmed)) {
         hal_critical_enter(drive->hal);
         drive->command.request = COMMAND_OFF;
         hal_critical_leave(drive->hal);
@@ -144,6 +156,11 @@ COLD static void check_slowly(drive_t *drive, uint32_t time_us) {
     if (drive->comms.bus.conflict) {
         failed |= FAULT_BIT(FAULT_IDENTIFIER_CONFLICT);
     }
+    if (drive->control.state_machine.state != DRIVE_STATE_RUN) {
+        drive->comms.commands.failed = false;
+    } else if (drive->comms.commands.failed) {
+        failed |= FAULT_BIT(FAULT_COMMAND_ERROR);
+    }
     drive->control.reported_fault_mask = (uint32_t)failed;
 }
 
@@ -157,6 +174,7 @@ COLD static void take_command(drive_t *drive) {
         hal_critical_enter(drive->hal);
         drive->command = *command;
         hal_critical_leave(drive->hal);
+        drive->ramping = false;
     }
 }
 
@@ -172,13 +190,38 @@ static void keep_memory(drive_t *drive, uint32_t time_us) {
     } else {
         nvm_store_follow_fault(&drive->store, NULL);
     }
-    const bool writable =
-        state == DRIVE_STATE_FAULT || (state != DRIVE_STATE_RUN && drive->command.request != COMMAND_RUN);
+    const bool writable = state == DRIVE_STATE_FAULT || may_configure(drive);
     const bool inhibited = drive->store.inhibited;
     nvm_store_step(&drive->store, drive->hal, &drive->parameters, time_us, writable);
     if (inhibited && !drive->store.inhibited) {
         inhibit_start(drive);
     }
+}
+
+/* In a run whose commands are overdue: ramps the torque from its present value to zero, by commands of the torque mode
+ * with the time of the last valid command, so that the interrupts need nothing for it. */
+static void ramp_down(drive_t *drive, uint32_t time_us) {
+    const uint32_t timeout_us = (uint32_t)drive->parameters.values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u;
+    const uint32_t age_us = time_us - drive->command.time_us;
+    if (drive->control.state_machine.state != DRIVE_STATE_RUN || age_us <= timeout_us ||
+        (drive->ramping && time_us - drive->ramp_us < DRIVE_RAMP_STEP_US)) {
+        return;
+    }
+    if (!drive->ramping) {
+        drive->ramping = true;
+        drive->ramp_from_q24 = drive->control.torque_reference_q24;
+    }
+    drive->ramp_us = time_us;
+    const uint32_t elapsed_us = age_us - timeout_us;
+    const uint32_t rest_us = elapsed_us < DRIVE_RAMP_US ? DRIVE_RAMP_US - elapsed_us : 0;
+    const int64_t torque_q39 = (int64_t)drive->ramp_from_q24 * (int32_t)((rest_us << 15) / DRIVE_RAMP_US);
+    hal_critical_enter(drive->hal);
+    if (drive->control.state_machine.state == DRIVE_STATE_RUN) { /* it leaves RUN in an interrupt, never enters it */
+        drive->command.request = COMMAND_RUN;
+        drive->command.mode = DRIVE_MODE_TORQUE;
+        drive->command.torque_reference_q24 = (int32_t)fixed_shift(torque_q39, 15);
+    }
+    hal_critical_leave(drive->hal);
 }
 
 COLD void drive_background(drive_t *drive) {
@@ -187,19 +230,24 @@ COLD void drive_background(drive_t *drive) {
     keep_memory(drive, time_us);
     if (comms_telemetry_due(&drive->comms, time_us)) {
         bus_monitor_step(&drive->comms.bus, drive->hal, time_us);
+        if (drive->comms.bus.run_inhibited) {
+            commands_disarm(&drive->comms.commands);
+        }
         drive_telemetry_t values;
         hal_critical_enter(drive->hal);
         telemetry_collect(drive, time_us, &values);
         hal_critical_leave(drive->hal);
         comms_telemetry(&drive->comms, drive->hal, &values);
     }
-    /* Enumerations are read in one access: the interrupt may change the state, not tear it. */
-    const bool writable = drive->control.state_machine.state != DRIVE_STATE_RUN;
-    if (comms_background(&drive->comms, drive->hal, &drive->parameters, writable, time_us)) {
+    const bool writable = may_configure(drive);
+    const bool commanded = comms_background(&drive->comms, drive->hal, &drive->parameters, writable,
+                                            drive->control.state_machine.state, time_us);
+    if (drive->parameters.revision != drive->applied_revision) {
+        configure(drive); /* before a command that was received after the parameters */
+    }
+    if (commanded) {
         take_command(drive);
     }
+    ramp_down(drive, time_us);
     drop_stale_command(drive, time_us);
-    if (drive->parameters.revision != drive->applied_revision) {
-        configure(drive);
-    }
 }

@@ -14,6 +14,13 @@
 #include "drive/sto_monitor.h"
 #include "hal.h"
 
+/* Without commands a run's torque ramps to zero in this time after the parameter command_timeout_ms, in steps of a
+ * hundredth; after COMMAND_LOST_US it ends in the fault command_timeout, in the control interrupt, whatever the
+ * background does. Commands of the same sender, in sequence, that come back before then continue the run without
+ * arming: the torque rises again from where it is, by the slew rates of the parameters. */
+#define DRIVE_RAMP_US 100000u
+#define DRIVE_RAMP_STEP_US 1000u
+
 /* One drive. The caller allocates it; only the functions below and telemetry_collect() access it. */
 typedef struct {
     hal_t *hal;
@@ -39,6 +46,9 @@ typedef struct {
     uint32_t applied_revision; /* parameters.revision from which control_parameters are derived */
     sto_monitor_t sto;
     stall_monitor_t stall;
+    bool ramping;          /* the torque ramps to zero, without commands; the next two are for this */
+    int32_t ramp_from_q24; /* torque reference at its begin, N m, Q7.24 */
+    uint32_t ramp_us;      /* time of the last step */
     comms_t comms;
     nvm_store_t store;
 } drive_t;

@@ -89,6 +89,13 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->command_counters.wrong_counter = counters->wrong_counter;
     telemetry->command_counters.out_of_range = counters->out_of_range;
 
+    const arming_t *arming = &drive->comms.commands.arming;
+    telemetry->arming.challenge = arming->challenge;
+    telemetry->arming.attempt = arming->attempt;
+    telemetry->arming.armed = arming->armed;
+    telemetry->arming.refused = arming->refused;
+    telemetry->arming.run_unarmed = counters->run_unarmed;
+
     telemetry->bus_counters.unknown_frame = counters->unknown_frame;
     telemetry->bus_counters.receive_overflow = hal_can_receive_overflows(drive->hal);
     telemetry->bus_counters.command_accepted = counters->accepted;

@@ -9,6 +9,7 @@
 #include "hal_interrupt.h"
 #include "hal_nvm.h"
 #include "hal_pwm.h"
+#include "hal_random.h"
 #include "hal_time.h"
 #include "plant/pwm_timer.h"
 
@@ -145,6 +146,11 @@ bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value) {
 bool hal_nvm_erase(hal_t *hal, unsigned page) {
     require_unmasked(hal, __func__);
     return nvm_erase(&hal->board->nvm, page);
+}
+
+uint32_t hal_random_u32(hal_t *hal) {
+    require(hal, false, __func__);
+    return board_random(hal->board);
 }
 
 uint32_t hal_time_us(const hal_t *hal) {

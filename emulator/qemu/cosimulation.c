@@ -12,6 +12,7 @@
 
 #include "hal_interrupt.h"
 #include "hal_nvm.h"
+#include "hal_random.h"
 #include "hal_time.h"
 #include "host/hal_host.h"
 #include "host/simulation.h"
@@ -197,6 +198,9 @@ void cosimulation_serve(void) {
         break;
     case MAILBOX_NVM_ERASE:
         mailbox->accepted = hal_nvm_erase(&host, mailbox->nvm_page);
+        break;
+    case MAILBOX_RANDOM:
+        mailbox->random = hal_random_u32(&host);
         break;
     default:
         fprintf(stderr, "salient: the drive sent the unknown command %u\n", (unsigned)mailbox->doorbell);

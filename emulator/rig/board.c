@@ -2,13 +2,14 @@
 
 #include <string.h>
 
-void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus) {
+void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, uint64_t seed) {
     memset(board, 0, sizeof *board);
     board->adc_bits = sensors->adc_bits;
     board->encoder_bits = sensors->encoder_bits;
     board->plant = plant;
     board->sensors = sensors;
     board->bus = bus;
+    board->random_state = seed;
     board->sto_energised[0] = board->sto_energised[1] = true;
     plant_set_trip(plant, plant->machine->trip_current_A);
     nvm_init(&board->nvm);
@@ -148,4 +149,13 @@ void board_can_status(const board_t *board, hal_can_status_t *status) {
 
 void board_can_rejoin(board_t *board) {
     can_bus_rejoin(board->bus, board->time_ns);
+}
+
+/* splitmix64, as the noise of the sensors, with the time in its state. */
+uint32_t board_random(board_t *board) {
+    board->random_state += UINT64_C(0x9E3779B97F4A7C15) + board->time_ns;
+    uint64_t z = board->random_state;
+    z = (z ^ z >> 30) * UINT64_C(0xBF58476D1CE4E5B9);
+    z = (z ^ z >> 27) * UINT64_C(0x94D049BB133111EB);
+    return (uint32_t)((z ^ z >> 31) >> 32);
 }

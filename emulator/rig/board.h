@@ -50,6 +50,8 @@ typedef struct {
     uint32_t receive_overflows;
 
     nvm_t nvm; /* keeps its content in a reset */
+    /* Of the true random number generator, from the seed of the bench: a reset of the board does not restart it. */
+    uint64_t random_state;
 
     plant_t *plant;
     sensors_t *sensors;
@@ -57,9 +59,9 @@ typedef struct {
 } board_t;
 
 /* Initialises a board after reset at time 0: timer stopped, switches open, safe torque off not requested, queues empty,
- * resolutions of `sensors`, comparators of the machine.
- * Plant, sensors and bus are used, not owned. */
-void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus);
+ * resolutions of `sensors`, comparators of the machine. Plant, sensors and bus are used, not owned. The random stream
+ * begins with `seed`. */
+void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, uint64_t seed);
 
 /* For the rig: a reset of the drive, or power that returns. Timer stopped, switches open, what was received is lost;
  * frames in the transmit mailboxes still leave. */
@@ -90,5 +92,9 @@ bool board_can_receive(board_t *board, hal_can_frame_t *frame);
 bool board_can_transmit(board_t *board, const hal_can_frame_t *frame);
 void board_can_status(const board_t *board, hal_can_status_t *status);
 void board_can_rejoin(board_t *board);
+
+/* The next number of a stream that depends on the seed and on the instants of the calls: a bench with the same seed and
+ * the same course repeats it, as everything else. */
+uint32_t board_random(board_t *board);
 
 #endif

@@ -25,7 +25,7 @@ void rig_init(rig_t *rig, const rig_config_t *config) {
     sensors_init(&rig->sensors, &config->machine->sensors, config->encoder_bits, config->adc_bits, config->seed);
     rig->sensors.encoder_edges = config->encoder_edges;
     can_bus_init(&rig->bus, config->bit_rate, config->seed);
-    board_init(&rig->board, &rig->plant, &rig->sensors, &rig->bus);
+    board_init(&rig->board, &rig->plant, &rig->sensors, &rig->bus, config->seed);
     rig->board.immediate_pwm = config->immediate_pwm;
     rig->board.nvm.random = config->seed;
     rig->config = *config;

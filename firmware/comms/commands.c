@@ -6,6 +6,7 @@
 #include "comms/units.h"
 #include "control/machine_tables.h"
 #include "drive_codec.h"
+#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
 /* The only bits of a frame to the drive that no signal covers: required to be zero, reserved for later use. */
@@ -13,20 +14,55 @@
 
 void commands_init(commands_t *commands) {
     *commands = (commands_t){0};
-    e2e_receiver_init(&commands->receiver, DRIVE_COMMAND_E2E_DATA_ID);
-    e2e_receiver_init(&commands->torque_receiver, DRIVE_TORQUE_COMMAND_E2E_DATA_ID);
+    e2e_receiver_init(&commands->receiver);
+    arming_init(&commands->arming);
 }
 
-void commands_check_timeout(commands_t *commands, uint32_t time_us, uint32_t timeout_us) {
-    if (time_us - commands->last_received_us > timeout_us) {
+COLD void commands_disarm(commands_t *commands) {
+    arming_disarm(&commands->arming);
+    commands->receiver.locked = false;
+    commands->used = commands->ran = false;
+    commands->errors = 0;
+}
+
+/* True when a drive that is armed must not remain so. */
+static bool must_disarm(const commands_t *commands, uint32_t time_us, uint32_t timeout_us) {
+    const uint32_t silent_us = time_us - commands->last_received_us;
+    const bool running = commands->state == DRIVE_STATE_RUN;
+    return commands->state == DRIVE_STATE_FAULT || (commands->ran && !running) ||
+           silent_us > (running ? COMMAND_LOST_US : timeout_us) ||
+           (!commands->used && time_us - commands->armed_us > COMMANDS_ARMED_UNUSED_US);
+}
+
+COLD void commands_supervise(commands_t *commands, drive_state_t state, uint32_t time_us, uint32_t timeout_us) {
+    commands->state = state;
+    arming_check_timeout(&commands->arming, time_us);
+    if (commands->arming.armed) {
+        commands->ran |= state == DRIVE_STATE_RUN;
+        if (must_disarm(commands, time_us, timeout_us)) {
+            commands_disarm(commands);
+        }
+    }
+    if (!commands->arming.armed && time_us - commands->last_received_us > timeout_us) {
         e2e_receiver_restart(&commands->receiver);
-        e2e_receiver_restart(&commands->torque_receiver);
     }
 }
 
 static commands_frame_t reject(uint16_t *counter) {
     counter_add(counter, 1);
     return COMMANDS_REJECTED;
+}
+
+/* As reject, of a command frame. */
+static commands_frame_t reject_command(commands_t *commands, uint16_t *counter) {
+    if (commands->arming.armed) {
+        commands->errors = (uint16_t)(commands->errors + COMMANDS_ERROR_STEP);
+        if (commands->errors > (COMMANDS_ERRORS_MAX - 1u) * COMMANDS_ERROR_STEP) {
+            commands->failed = true;
+            commands_disarm(commands);
+        }
+    }
+    return reject(counter);
 }
 
 static_assert(DRIVE_COMMAND_LENGTH == DRIVE_TORQUE_COMMAND_LENGTH, "both commands have one check of their length");
@@ -56,42 +92,91 @@ static bool unpack(const hal_can_frame_t *frame, command_t *command) {
     return true;
 }
 
-static commands_frame_t receive_command(commands_t *commands, e2e_receiver_t *receiver, const hal_can_frame_t *frame,
+/* Writes the command in effect: the last valid one, and off instead of run while not armed. */
+static void publish(commands_t *commands, command_t *command) {
+    *command = commands->requested;
+    if (command->request != COMMAND_RUN) {
+        return;
+    }
+    if (commands->arming.armed) {
+        commands->used = true;
+    } else {
+        command->request = COMMAND_OFF;
+        counter_add(&commands->counters.run_unarmed, 1);
+    }
+}
+
+static commands_frame_t receive_command(commands_t *commands, uint16_t data_id, const hal_can_frame_t *frame,
                                         uint32_t time_us, command_t *command) {
     commands_counters_t *counters = &commands->counters;
     if (frame->length != DRIVE_COMMAND_LENGTH) {
-        return reject(&counters->wrong_length);
+        return reject_command(commands, &counters->wrong_length);
     }
-    switch (e2e_check(receiver, frame->data, frame->length)) {
+    switch (e2e_check(&commands->receiver, data_id, frame->data, frame->length)) {
     case E2E_ACCEPTED:
         break;
     case E2E_WRONG_CHECKSUM:
-        return reject(&counters->wrong_checksum);
+        return reject_command(commands, &counters->wrong_checksum);
     case E2E_REPEATED:
     case E2E_WRONG_SEQUENCE:
     default:
-        return reject(&counters->wrong_counter);
+        return reject_command(commands, &counters->wrong_counter);
     }
     commands->last_received_us = time_us;
-    if (!unpack(frame, command)) {
-        return reject(&counters->out_of_range);
+    if (!unpack(frame, &commands->requested)) {
+        return reject_command(commands, &counters->out_of_range);
     }
     counter_add(&counters->accepted, 1);
-    command->time_us = time_us;
+    commands->errors = (uint16_t)(commands->errors - (commands->errors > 0));
+    commands->requested.time_us = time_us;
+    const bool stopping = commands->requested.request == COMMAND_STOP && commands->state == DRIVE_STATE_RUN;
+    if (commands->used && commands->requested.request != COMMAND_RUN && !stopping) {
+        commands_disarm(commands);
+    }
+    publish(commands, command);
     return COMMANDS_COMMAND;
 }
 
-commands_frame_t commands_receive(commands_t *commands, const hal_can_frame_t *frame, uint32_t time_us,
-                                  command_t *command) {
+/* The drive is armed for the sender of the last command, which must not be older than the command timeout. */
+static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const hal_can_frame_t *frame, uint32_t time_us,
+                                       uint32_t timeout_us, command_t *command) {
+    if (frame->length != DRIVE_ARM_LENGTH) {
+        return reject(&commands->counters.wrong_length);
+    }
+    if (!e2e_checksum_matches(DRIVE_ARM_E2E_DATA_ID, frame->data, frame->length)) {
+        return reject(&commands->counters.wrong_checksum);
+    }
+    const bool stopped = commands->state == DRIVE_STATE_INITIALISE || commands->state == DRIVE_STATE_READY;
+    const bool commanded = commands->receiver.synchronised && time_us - commands->last_received_us <= timeout_us;
+    const bool request = frame->data[E2E_HEADER_BYTES] == ARMING_STEP_REQUEST_RUN;
+    switch (arming_receive(&commands->arming, hal, frame, stopped && (commanded || request), time_us)) {
+    case ARMING_ARMED:
+        commands->receiver.locked = true;
+        commands->armed_us = time_us;
+        publish(commands, command);
+        return COMMANDS_COMMAND;
+    case ARMING_CHALLENGED:
+        return COMMANDS_ACCEPTED;
+    case ARMING_REFUSED:
+    default:
+        return COMMANDS_REJECTED;
+    }
+}
+
+commands_frame_t commands_receive(commands_t *commands, hal_t *hal, const hal_can_frame_t *frame, uint32_t time_us,
+                                  uint32_t timeout_us, command_t *command) {
     commands_counters_t *counters = &commands->counters;
     if (frame->extended || frame->remote) {
         return reject(&counters->unknown_frame);
     }
     if (frame->identifier == DRIVE_COMMAND_FRAME_ID) {
-        return receive_command(commands, &commands->receiver, frame, time_us, command);
+        return receive_command(commands, DRIVE_COMMAND_E2E_DATA_ID, frame, time_us, command);
     }
     if (frame->identifier == DRIVE_TORQUE_COMMAND_FRAME_ID) {
-        return receive_command(commands, &commands->torque_receiver, frame, time_us, command);
+        return receive_command(commands, DRIVE_TORQUE_COMMAND_E2E_DATA_ID, frame, time_us, command);
+    }
+    if (frame->identifier == DRIVE_ARM_FRAME_ID) {
+        return receive_arming(commands, hal, frame, time_us, timeout_us, command);
     }
     if (frame->identifier == DRIVE_PARAMETER_REQUEST_FRAME_ID) {
         if (frame->length != DRIVE_PARAMETER_REQUEST_LENGTH) {

@@ -12,22 +12,43 @@ void comms_init(comms_t *comms, uint32_t time_us) {
     telemetry_init(&comms->telemetry, time_us);
 }
 
-static void flush(comms_t *comms, hal_t *hal) {
+static void report_arming(comms_t *comms, hal_t *hal, uint32_t time_us) {
+    arming_t *arming = &comms->commands.arming;
+    hal_can_frame_t frame;
+    arming_report(arming, comms->commands.counters.run_unarmed, &frame);
+    arming->changed = !hal_can_transmit(hal, &frame);
+    comms->arming_sent_us = time_us;
+}
+
+static void flush(comms_t *comms, hal_t *hal, uint32_t time_us) {
+    const arming_t *arming = &comms->commands.arming;
+    if (arming->attempt != ARMING_ATTEMPT_NONE) {
+        if (arming->changed) {
+            report_arming(comms, hal, time_us);
+        }
+        if (arming->changed || time_us - comms->arming_sent_us < COMMS_CHALLENGE_FIRST_US) {
+            return;
+        }
+    }
     telemetry_flush(&comms->telemetry, hal);
     const hal_can_frame_t *frame;
+    if (frame_queue_peek(&comms->telemetry.queue) == NULL && arming->changed) {
+        report_arming(comms, hal, time_us);
+    }
     while (frame_queue_peek(&comms->telemetry.queue) == NULL && (frame = frame_queue_peek(&comms->responses)) != NULL &&
            hal_can_transmit(hal, frame)) {
         frame_queue_pop(&comms->responses);
     }
 }
 
-static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, uint32_t time_us) {
+static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, uint32_t timeout_us,
+                    uint32_t time_us) {
     hal_can_frame_t frame;
     for (int i = 0; i < COMMS_FRAMES_PER_CALL; i++) {
         if (frame_queue_free(&comms->responses) == 0 || !hal_can_receive(hal, &frame)) {
             return false;
         }
-        switch (commands_receive(&comms->commands, &frame, time_us, &comms->command)) {
+        switch (commands_receive(&comms->commands, hal, &frame, time_us, timeout_us, &comms->command)) {
         case COMMANDS_COMMAND:
             return true;
         case COMMANDS_PARAMETER_REQUEST: {
@@ -38,6 +59,7 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, bool w
             frame_queue_push(&comms->responses, &response);
             break;
         }
+        case COMMANDS_ACCEPTED:
         case COMMANDS_REJECTED:
             bus_monitor_check(&comms->bus, &frame, time_us);
             break;
@@ -48,15 +70,16 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, bool w
     return false;
 }
 
-bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, uint32_t time_us) {
-    commands_check_timeout(&comms->commands, time_us,
-                           (uint32_t)parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] * US_PER_MS);
-    const bool commanded = receive(comms, hal, parameters, writable, time_us);
-    flush(comms, hal);
+bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, drive_state_t state,
+                      uint32_t time_us) {
+    const uint32_t timeout_us = (uint32_t)parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] * US_PER_MS;
+    commands_supervise(&comms->commands, state, time_us, timeout_us);
+    const bool commanded = receive(comms, hal, parameters, writable, timeout_us, time_us);
+    flush(comms, hal, time_us);
     return commanded;
 }
 
 void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values) {
     telemetry_cycle(&comms->telemetry, values);
-    flush(comms, hal);
+    flush(comms, hal, values->status.time_us);
 }

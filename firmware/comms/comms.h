@@ -8,7 +8,7 @@
  *         ... collect a drive_telemetry_t, with the control interrupt masked ...
  *         comms_telemetry(&comms, hal, &values);
  *     }
- *     if (comms_background(&comms, hal, &parameters, writable, time_us)) {
+ *     if (comms_background(&comms, hal, &parameters, writable, state, time_us)) {
  *         ... execute comms.command ...
  *     }
  */
@@ -30,6 +30,10 @@
  * fully loaded bus delivers fewer than this between two calls at the lowest control rate. */
 #define COMMS_FRAMES_PER_CALL 4
 
+/* Telemetry fills no mailbox in this time after a challenge, unless the attempt to arm ends: most of its identifiers
+ * are lower than that of DRIVE_ARMING, and the host waits for the challenge. The frames wait in their queue. */
+#define COMMS_CHALLENGE_FIRST_US 500u
+
 typedef struct {
     bus_monitor_t bus;
     commands_t commands;
@@ -37,22 +41,26 @@ typedef struct {
     frame_queue_t responses; /* to parameter requests */
     command_t command;       /* last accepted command */
     nvm_store_t *store;      /* set by the caller after comms_init */
+    uint32_t arming_sent_us; /* when DRIVE_ARMING last entered a mailbox because of a change */
 } comms_t;
 
 /* The first telemetry cycle is due at time_us. */
 void comms_init(comms_t *comms, uint32_t time_us);
 
 /* Sends waiting frames and processes at most COMMS_FRAMES_PER_CALL received frames. Returns true when a command was
- * accepted, in comms->command; reception stops there, so that the caller sees every command, in order.
+ * accepted, in comms->command; reception stops there, so that the caller sees every command, in order. state: of the
+ * drive.
  *
- * Telemetry is sent first, parameter responses when no telemetry waits. No response is ever dropped: while the queue of
- * responses is full nothing is received. That state cannot block commands, because PARAMETER_REQUEST loses arbitration
- * to all frames of the drive but those of the group `background`: responses leave before more requests arrive.
+ * A challenge is sent first, then telemetry; when none waits, other changes of DRIVE_ARMING, then parameter responses.
+ * No response is ever dropped: while the queue of responses is full nothing is received. That state cannot block
+ * commands, because PARAMETER_REQUEST loses arbitration to all frames of the drive but those of the group `background`:
+ * responses leave before more requests arrive.
  *
  * Of a frame that is neither command nor request, the identifier may be one of the drive's own (comms->bus).
  *
  * `writable`: parameters may be written now. [background] */
-bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, uint32_t time_us);
+bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, drive_state_t state,
+                      uint32_t time_us);
 
 /* True when comms_telemetry is due. [background] */
 static inline bool comms_telemetry_due(const comms_t *comms, uint32_t time_us) {

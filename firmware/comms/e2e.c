@@ -26,12 +26,13 @@ void e2e_protect(uint16_t data_id, uint8_t counter, uint8_t *bytes, size_t lengt
     bytes[1] = (uint8_t)(crc >> 8);
 }
 
-void e2e_receiver_init(e2e_receiver_t *receiver, uint16_t data_id) {
-    *receiver = (e2e_receiver_t){.data_id = data_id};
+void e2e_receiver_init(e2e_receiver_t *receiver) {
+    *receiver = (e2e_receiver_t){0};
 }
 
 void e2e_receiver_restart(e2e_receiver_t *receiver) {
     receiver->synchronised = false;
+    receiver->locked = false;
     receiver->candidate_frames = 0;
 }
 
@@ -46,12 +47,12 @@ static void accept(e2e_receiver_t *receiver, uint8_t counter) {
     receiver->candidate_frames = 0;
 }
 
-e2e_result_t e2e_check(e2e_receiver_t *receiver, const uint8_t *bytes, size_t length) {
-    if (length < E2E_HEADER_BYTES) {
-        return E2E_WRONG_CHECKSUM;
-    }
-    const uint16_t received = (uint16_t)(bytes[0] | bytes[1] << 8);
-    if (received != checksum(receiver->data_id, bytes, length)) {
+bool e2e_checksum_matches(uint16_t data_id, const uint8_t *bytes, size_t length) {
+    return length >= E2E_HEADER_BYTES && (bytes[0] | bytes[1] << 8) == checksum(data_id, bytes, length);
+}
+
+e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t *bytes, size_t length) {
+    if (!e2e_checksum_matches(data_id, bytes, length)) {
         return E2E_WRONG_CHECKSUM;
     }
     const uint8_t counter = bytes[2];
@@ -61,6 +62,9 @@ e2e_result_t e2e_check(e2e_receiver_t *receiver, const uint8_t *bytes, size_t le
     }
     if (counter == receiver->counter) {
         return E2E_REPEATED;
+    }
+    if (receiver->locked) {
+        return E2E_WRONG_SEQUENCE;
     }
     const bool continues = receiver->candidate_frames > 0 && in_sequence(receiver->candidate_counter, counter);
     receiver->candidate_frames = continues ? (uint8_t)(receiver->candidate_frames + 1) : 1;

@@ -16,7 +16,8 @@
 /* Largest accepted increment of the counter: up to two consecutive frames may be lost. */
 #define E2E_COUNTER_STEP_MAX 3
 
-/* Consecutive valid frames after which a sender whose counter jumped is accepted, with the last of them. */
+/* Consecutive valid frames after which a sender whose counter jumped is accepted, with the last of them; never by a
+ * locked receiver, which thereby stays with one sender. */
 #define E2E_RESYNCHRONISE_FRAMES 3
 
 typedef enum {
@@ -27,7 +28,7 @@ typedef enum {
 } e2e_result_t;
 
 typedef struct {
-    uint16_t data_id;
+    bool locked;               /* set by the caller: no resynchronisation */
     bool synchronised;         /* false: the next frame with a valid checksum is accepted with any counter */
     uint8_t counter;           /* of the last accepted frame */
     uint8_t candidate_frames;  /* consecutive frames of another sequence, none of the accepted sequence between */
@@ -42,14 +43,18 @@ uint16_t e2e_crc16(uint16_t crc, const uint8_t *bytes, size_t length);
 void e2e_protect(uint16_t data_id, uint8_t counter, uint8_t *bytes, size_t length);
 
 /* Initialises a receiver that accepts the next valid frame with any counter. */
-void e2e_receiver_init(e2e_receiver_t *receiver, uint16_t data_id);
+void e2e_receiver_init(e2e_receiver_t *receiver);
 
 /* Forgets the sequence: call it after a timeout, so that a sender that starts again is accepted. */
 void e2e_receiver_restart(e2e_receiver_t *receiver);
 
-/* Checks a received frame. Its data may be used only after E2E_ACCEPTED. A frame with a wrong checksum changes nothing;
- * one out of sequence can only count towards a resynchronisation, which an accepted frame of the present sender resets.
+/* True when a frame's checksum is that of its data and data ID; false for one shorter than the header. */
+bool e2e_checksum_matches(uint16_t data_id, const uint8_t *bytes, size_t length);
+
+/* Checks a received frame of a message; messages with one sequence counter share a receiver. Its data may be used only
+ * after E2E_ACCEPTED. A frame with a wrong checksum changes nothing; one out of sequence can only count towards a
+ * resynchronisation, which an accepted frame of the present sender resets.
  */
-e2e_result_t e2e_check(e2e_receiver_t *receiver, const uint8_t *bytes, size_t length);
+e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t *bytes, size_t length);
 
 #endif

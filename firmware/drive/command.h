@@ -13,6 +13,9 @@
 
 #include "drive_enumerations.h"
 
+/* Time without a valid command after which a run ends in the fault command_timeout. */
+#define COMMAND_LOST_US 500000u
+
 typedef struct {
     command_request_t request;
     drive_mode_t mode;            /* of COMMAND_RUN: which of the references it follows */

@@ -100,7 +100,7 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
          * within a count, and the observer needs several to notice. */
         .undetected_travel_max = (int32_t)(quarter_deg > 12u * count ? quarter_deg + 4u * count : 16u * count),
         .angle_step_q32 = angle_step_q32,
-        .command_timeout_us = (uint32_t)values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u,
+        .command_timeout_us = COMMAND_LOST_US,
         .deceleration_max_q22 = fixed_saturate(fixed_divide(
             fixed_divide((int64_t)BRAKING_TORQUE_MAX_NM << 52, values[PARAMETER_INERTIA_KG_M2]), control_rate_hz)),
     };

@@ -19,7 +19,7 @@ typedef struct {
     int32_t undetected_travel_max;    /* expected rotation without an encoder count, 2^-32 rev, < 2^30 */
     int32_t angle_step_q32;           /* control period: 2^-32 rev per rad/s Q9.22, in Q32 */
     int32_t deceleration_max_q22;     /* largest speed drop per period, rad/s, Q9.22 */
-    uint32_t command_timeout_us;
+    uint32_t command_timeout_us;      /* age of the last valid command that ends a run */
 } protection_parameters_t;
 
 /* State of the immediate checks. */

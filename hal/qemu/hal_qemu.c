@@ -2,6 +2,7 @@
 
 #include "hal_interrupt.h"
 #include "hal_nvm.h"
+#include "hal_random.h"
 #include "hal_time.h"
 
 /* The plugin identifies this store by the function's name: the function must be neither inlined nor cloned. */
@@ -117,4 +118,9 @@ bool hal_nvm_erase(hal_t *hal, unsigned page) {
 
 uint32_t hal_time_us(const hal_t *hal) {
     return hal->mailbox.time_us;
+}
+
+uint32_t hal_random_u32(hal_t *hal) {
+    doorbell_ring(MAILBOX_RANDOM);
+    return hal->mailbox.random;
 }

@@ -46,6 +46,7 @@ typedef enum {
     MAILBOX_NVM_READ,      /* takes nvm_page and nvm_word, returns nvm_value */
     MAILBOX_NVM_PROGRAM,   /* takes nvm_page, nvm_word and nvm_value, returns accepted */
     MAILBOX_NVM_ERASE,     /* takes nvm_page, returns accepted */
+    MAILBOX_RANDOM,        /* returns random */
 } mailbox_command_t;
 
 /* Result of MAILBOX_NEXT. */
@@ -95,6 +96,7 @@ typedef struct {
     uint32_t nvm_page;
     uint32_t nvm_word;
     uint32_t nvm_value[2]; /* lower half first */
+    uint32_t random;
 } mailbox_t;
 
 #endif

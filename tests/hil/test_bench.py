@@ -89,7 +89,7 @@ def test_commands_are_sent_cyclically_until_silence(bench):
     # A frame waits for the one on the bus and then takes its transmission time: at most 135 bits each.
     assert all(0 < t - 10_000_000 * i < 270_000 for i, t in enumerate(times_ns))
     bench.drive.silence()
-    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.2)
+    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.6)
     assert bench.drive.fault == "command_timeout"
 
 
@@ -154,9 +154,10 @@ def test_two_benches_run_independently(make_bench):
 
 
 def test_session_follows_a_free_running_drive(tmp_path):
-    """A session follows the time of a free-running drive and commands it."""
+    """A session follows the time of a free-running drive and commands it. Its commands must follow each other within 50
+    ms of virtual time."""
     can_bus = f"unix:{tmp_path}/can.sock"
-    with EmulatorProcess(BenchConfig(pace="x20"), can_bus), Session(can_bus, lockstep=False) as session:
+    with EmulatorProcess(BenchConfig(pace="x2"), can_bus), Session(can_bus, lockstep=False) as session:
         session.drive.speed_reference_rpm = 150
         session.run_until(lambda: abs(session.telemetry["speed_rpm"].last - 150) < 5, timeout=5)
         assert session.drive.state == "run"

@@ -36,11 +36,17 @@ def changed(message: can.Message, **changes) -> can.Message:
 
 
 GOOD = command()
+BITS_CHANGED = [changed(GOOD, data=bytes(b ^ (1 << i % 8) if i == j else b for i, b in enumerate(GOOD.data)))
+                for j in range(7)]
+"""One bit in each byte."""
+
+# At most three invalid commands: a fourth one is a fault.
 ATTACKS = {
-    "wrong_length": [changed(GOOD, data=bytes(GOOD.data[:n])) for n in (0, 3, 6)]
-    + [changed(GOOD, data=bytes(GOOD.data) + b"\0")],
-    "wrong_checksum": [changed(GOOD, data=bytes(b ^ (1 << i % 8) if i == j else b for i, b in enumerate(GOOD.data)))
-                       for j in range(7)],
+    "wrong_length too short": [changed(GOOD, data=bytes(GOOD.data[:n])) for n in (0, 3, 6)],
+    "wrong_length too long": [changed(GOOD, data=bytes(GOOD.data) + b"\0")],
+    "wrong_checksum in the header": BITS_CHANGED[:3],
+    "wrong_checksum in the request": BITS_CHANGED[3:5],
+    "wrong_checksum in the reference": BITS_CHANGED[5:],
     "wrong_counter": [command(3000.0), command(-3000.0, counter=100)],
     "unknown_frame": [
         can.Message(arbitration_id=0x001, is_extended_id=False, data=bytes(8)),
@@ -76,15 +82,33 @@ def undisturbed(make_bench, tmp_path):
     return recording
 
 
-@pytest.mark.parametrize("counter", ATTACKS)
-def test_invalid_frames_are_counted_and_change_nothing(make_bench, tmp_path, undisturbed, counter):
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_invalid_frames_are_counted_and_change_nothing(make_bench, tmp_path, undisturbed, attack):
     bench = steady(make_bench, tmp_path, "disturbed")
     with open_bus(bench.address) as attacker:
-        for frame in ATTACKS[counter]:
+        for frame in ATTACKS[attack]:
             attacker.send(frame)
     recording, counters = finish(bench)
     assert np.array_equal(recording, undisturbed)
-    assert counters == dict.fromkeys(COUNTERS, 0.0) | {counter: len(ATTACKS[counter])}
+    assert counters == dict.fromkeys(COUNTERS, 0.0) | {attack.split()[0]: len(ATTACKS[attack])}
+
+
+@pytest.mark.parametrize("frames", [BITS_CHANGED[:4], [changed(GOOD, data=b"")] * 4,
+                                    [command(3000.0), command(3000.0), command(-3000.0, 9), command(100.0, 120)]],
+                         ids=["wrong_checksum", "wrong_length", "wrong_counter"])
+def test_four_invalid_commands_in_succession_are_a_fault(bench, frames):
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.1001)
+    bench.drive.silence()  # none of its commands between them
+    for number, frame in enumerate(frames):
+        assert bench.drive.state == "run", number
+        bench.send(frame)
+        bench.run_for(0.002)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "command_error")
+    bench.run_for(0.101)
+    assert bench.telemetry["DRIVE_FAULT_MASK.command_error"].last == 1
+    assert bench.telemetry["DRIVE_FAULT_CAUSE.state"].last_name == "run"
+    assert bench.truth["current_a_A"].last == bench.truth["current_b_A"].last == 0
 
 
 @pytest.mark.parametrize("raw_speed", [3_000_001, -3_000_001, 2**23 - 1, -(2**23)])

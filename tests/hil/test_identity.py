@@ -82,5 +82,5 @@ def test_in_lockstep_references_end_with_the_first_report_of_another_database(ma
         with pytest.raises(OtherDatabase):
             session.run_for(0.2)
         assert session.time_s <= 0.12
-        session.run_for(0.2)  # no further command is due
+        session.run_for(0.6)  # no further command is due
         assert session.drive.state in ("ready", "fault")

@@ -232,7 +232,7 @@ def test_commands_that_stop_coming_end_torque_mode(make_bench):
     bench.drive.torque_reference_Nm = 5
     bench.run_for(0.05)
     bench.drive.silence()
-    bench.run_for(0.09)
+    bench.run_for(0.49)
     assert bench.drive.state == "run"
     bench.run_for(0.02)
     assert (bench.drive.state, bench.drive.fault) == ("fault", "command_timeout")

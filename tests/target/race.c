@@ -179,13 +179,15 @@ void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values) {
     torn_snapshots += torn(values, sizeof *values);
 }
 
-bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, uint32_t time_us) {
-    (void)writable, (void)time_us;
-    static uint32_t number;
+bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, drive_state_t state,
+                      uint32_t time_us) {
+    (void)writable, (void)state;
     static uint16_t reported; /* interrupts */
-    number--;                 /* downwards: as a time it is past, and a command with it is not stale */
+    /* As a time just past: a command with it is neither stale nor overdue; as a request none to run. */
+    const uint32_t number = (time_us - 0x100u) | 0x80u;
     fill(&comms->command, sizeof comms->command, number);
     parameters->revision++;
+    parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] = 50;
     hal_critical_enter(hal);
     const uint16_t counts[4] = {interrupts, torn_parameters, torn_commands, torn_snapshots};
     const uint16_t deferred_counts[4] = {preemptions, torn_inputs, torn_results,

@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <cstring>
 #include <deque>
+#include <functional>
 #include <random>
 #include <vector>
 
@@ -18,6 +19,7 @@ extern "C" {
 #include "hal_interrupt.h"
 #include "hal_nvm.h"
 #include "hal_pwm.h"
+#include "hal_random.h"
 #include "hal_time.h"
 #include "rig/nvm.h"
 }
@@ -31,6 +33,7 @@ struct hal {
     uint32_t missed = 0;
     uint32_t break_causes = 0, break_lasts = 0;
     uint32_t elapsed_ticks = 0;
+    uint32_t random = 1;
     std::deque<hal_can_frame_t> to_drive;
     std::vector<hal_can_frame_t> from_drive;
     std::vector<uint16_t> starts;
@@ -39,6 +42,7 @@ struct hal {
     bool critical = false;
     hal_can_status_t can_status{};
     unsigned rejoins = 0;
+    std::function<void()> after_critical_section; // interrupts that were masked
     unsigned deferred_requests = 0;
     hal_pwm_compare_t written{};
     nvm_t nvm = erased();
@@ -65,6 +69,9 @@ void hal_encoder_read(const hal_t *hal, hal_encoder_sample_t *sample) {
     *sample = {};
     sample->counts = hal->encoder_counts;
 }
+uint32_t hal_random_u32(hal_t *hal) {
+    return hal->random = 1664525 * hal->random + 1013904223;
+}
 uint32_t hal_time_us(const hal_t *hal) {
     return hal->time_us;
 }
@@ -75,6 +82,9 @@ void hal_critical_enter(hal_t *hal) {
 void hal_critical_leave(hal_t *hal) {
     EXPECT_TRUE(hal->critical);
     hal->critical = false;
+    if (hal->after_critical_section) {
+        hal->after_critical_section();
+    }
 }
 uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word) {
     return nvm_read(&hal->nvm, page, word);
@@ -174,8 +184,26 @@ class Drive : public testing::Test {
         }
     }
 
+    // A command; to run one that is not armed, with the arming but its last frame's effect.
     void command(command_request_t request, double reference_rpm = 600.0) {
+        send(request, reference_rpm);
+        if (request == COMMAND_RUN && !drive.comms.commands.arming.armed) {
+            hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_RUN));
+            periods(10);
+            hal.to_drive.push_back(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
+        }
+    }
+
+    void send(command_request_t request, double reference_rpm = 600.0) {
         hal.to_drive.push_back(frames::command(++counter, request, int32_t(reference_rpm * 1000.0)));
+    }
+
+    // Periods with a command of the running drive every 10 ms.
+    void run(double seconds, double reference_rpm = 600.0) {
+        for (int k = 0; k < int(seconds * 100.0 + 0.5); k++) {
+            send(COMMAND_RUN, reference_rpm);
+            periods(400);
+        }
     }
 
     // Parameter write over the bus; the response's status.
@@ -259,9 +287,150 @@ TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
     command(COMMAND_RUN);
     periods(3);
     ASSERT_FALSE(hal.open);
-    periods(100000 / 25 + 2);
+    const uint32_t last_us = drive.command.time_us;
+    periods(int(500000 - (hal.time_us - last_us)) / 25);
+    EXPECT_FALSE(hal.open);
+    periods(2);
     EXPECT_TRUE(hal.open);
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_COMMAND_TIMEOUT);
+    EXPECT_FALSE(drive.comms.commands.arming.armed);
+    EXPECT_EQ(drive.command.request, COMMAND_OFF);
+}
+
+TEST_F(Drive, without_commands_the_torque_ramps_to_zero_in_a_tenth_of_a_second_and_comes_back_with_them) {
+    for (const drive_mode_t mode : {DRIVE_MODE_SPEED, DRIVE_MODE_TORQUE}) {
+        SetUp();
+        counter = 0;
+        periods(100);
+        command(COMMAND_RUN, 1000.0);
+        periods(3);
+        if (mode == DRIVE_MODE_TORQUE) {
+            hal.to_drive.push_back(frames::torque_command(++counter, COMMAND_RUN, 5 << 16));
+            periods(3);
+        }
+        const auto torque = [&](uint32_t age_us) {
+            periods(int(age_us - (hal.time_us - drive.command.time_us)) / 25);
+            EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+            return drive.control.torque_reference_q24;
+        };
+        const int32_t full_q24 = torque(50000);
+        ASSERT_GT(full_q24, 4 << 24);
+        int32_t before_q24 = full_q24;
+        for (uint32_t age_us = 51000; age_us < 150000; age_us += 1000) {
+            const int32_t torque_q24 = torque(age_us);
+            EXPECT_LE(torque_q24, before_q24) << age_us;
+            EXPECT_NEAR(torque_q24, full_q24 * (1.0 - (age_us - 50000.0) / 100000.0), full_q24 * 0.02) << age_us;
+            before_q24 = torque_q24;
+        }
+        EXPECT_EQ(torque(151100), 0);
+        EXPECT_EQ(torque(499000), 0);
+        // The same sender goes on, in sequence: no arming, no fault.
+        if (mode == DRIVE_MODE_TORQUE) {
+            hal.to_drive.push_back(frames::torque_command(++counter, COMMAND_RUN, 5 << 16));
+        } else {
+            send(COMMAND_RUN, 1000.0);
+        }
+        periods(10);
+        EXPECT_EQ(drive.control.torque_reference_q24, full_q24);
+        EXPECT_TRUE(drive.comms.commands.arming.armed);
+    }
+}
+
+TEST_F(Drive, a_background_that_hangs_ends_the_run_after_half_a_second) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    const uint32_t last_us = drive.command.time_us;
+    while (hal.time_us - last_us <= 500000) {
+        EXPECT_FALSE(hal.open);
+        hal.time_us += 25;
+        drive_control_interrupt(&drive);
+        deferred_interrupt(&drive, &hal);
+    }
+    hal.time_us += 25;
+    drive_control_interrupt(&drive);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_COMMAND_TIMEOUT);
+}
+
+TEST_F(Drive, one_frame_after_a_silence_does_not_start_it) {
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.05);
+    periods(600000 / 25);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+    send(COMMAND_OFF);
+    periods(10);
+    send(COMMAND_CLEAR_FAULT);
+    periods(10);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    periods(40000);
+    const unsigned writes = hal.writes;
+    run(0.1);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(hal.writes, writes);
+    command(COMMAND_RUN);
+    periods(3);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+}
+
+TEST_F(Drive, four_bad_commands_end_the_run_with_the_record_of_the_moment) {
+    hal.adc.phase_current_counts[1] = 200;
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.05);
+    const int32_t torque_q24 = drive.control.torque_reference_q24;
+    for (int i = 0; i < 4; i++) {
+        EXPECT_FALSE(hal.open);
+        hal.to_drive.push_back(frames::command(uint8_t(counter + 100), COMMAND_RUN, -600000));
+        periods(1);
+    }
+    EXPECT_TRUE(hal.open);
+    const fault_record_t &record = drive.control.state_machine.record;
+    EXPECT_EQ(record.fault, FAULT_COMMAND_ERROR);
+    EXPECT_EQ(record.fault_mask, FAULT_BIT(FAULT_COMMAND_ERROR));
+    EXPECT_EQ(record.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(record.time_us, hal.time_us);
+    EXPECT_EQ(record.current_max_q9, 2000);
+    EXPECT_EQ(record.torque_reference_q24, torque_q24);
+    EXPECT_EQ(drive.control.torque_reference_q24, 0);
+    const unsigned writes = hal.writes;
+    periods(100);
+    EXPECT_EQ(hal.writes, writes);
+    EXPECT_EQ(drive.command.request, COMMAND_OFF);
+    send(COMMAND_CLEAR_FAULT);
+    periods(3);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+}
+
+TEST_F(Drive, reports_its_arming_at_once_and_then_cyclically) {
+    periods(100);
+    hal.from_drive.clear();
+    hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_RUN));
+    periods(1);
+    ASSERT_EQ(hal.from_drive.size(), 1u) << "the challenge, and telemetry gives way to it";
+    const auto challenged = only_frame(DRIVE_ARMING_FRAME_ID, drive_arming_unpack);
+    EXPECT_EQ(challenged.challenge, hal.random);
+    EXPECT_EQ(challenged.attempt, ARMING_ATTEMPT_RUN);
+    EXPECT_EQ(challenged.armed, 0);
+    send(COMMAND_OFF);
+    periods(19);
+    EXPECT_EQ(hal.from_drive.size(), 1u) << "0.5 ms";
+    hal.from_drive.clear();
+    hal.to_drive.push_back(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~challenged.challenge));
+    periods(1);
+    const auto armed = only_frame(DRIVE_ARMING_FRAME_ID, drive_arming_unpack);
+    EXPECT_EQ(armed.armed, 1);
+    EXPECT_EQ(armed.challenge, 0u);
+    hal.from_drive.clear();
+    periods(40);
+    EXPECT_GE(hal.from_drive.size(), 4u) << "telemetry goes on";
+    hal.from_drive.clear();
+    for (int k = 0; k < 10; k++) {
+        send(COMMAND_OFF);
+        periods(400);
+    }
+    EXPECT_EQ(only_frame(DRIVE_ARMING_FRAME_ID, drive_arming_unpack).armed, 1);
 }
 
 TEST_F(Drive, lost_interrupts_reach_the_protection) {
@@ -431,6 +600,37 @@ TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
     EXPECT_EQ(drive.control.torque_reference_q24, 5 << 24);
     EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 6 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_NOT_WHILE_RUNNING_CHOICE);
     EXPECT_EQ(drive.control_parameters.torque_mode.torque_max_q24, 5 << 24);
+}
+
+TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_changed_in_run) {
+    periods(100);
+    // A write and the command to run wait together: one call of the background takes both.
+    hal.to_drive.push_back(frames::parameter_request(DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE,
+                                                     PARAMETER_CURRENT_TRIP_A, 0, 60 << 9));
+    hal.to_drive.push_back(frames::parameter_request(DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE,
+                                                     PARAMETER_CONTROLLER, 0, DRIVE_CONTROLLER_TRADITIONAL));
+    command(COMMAND_RUN);
+    bool ran = false;
+    control_parameters_t in_run{};
+    hal.after_critical_section = [&] {
+        hal.time_us += 25;
+        drive_control_interrupt(&drive);
+        deferred_interrupt(&drive, &hal);
+        if (!ran && drive.control.state_machine.state == DRIVE_STATE_RUN) {
+            ran = true;
+            in_run = drive.control_parameters;
+        }
+    };
+    for (int call = 0; call < 10; call++) {
+        drive_background(&drive);
+    }
+    hal.after_critical_section = nullptr;
+    periods(3);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    ASSERT_TRUE(ran);
+    EXPECT_EQ(in_run.protection.current_trip_q9, 60 << 9);
+    EXPECT_EQ(in_run.controller, DRIVE_CONTROLLER_TRADITIONAL);
+    EXPECT_EQ(std::memcmp(&in_run, &drive.control_parameters, sizeof in_run), 0);
 }
 
 TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {

@@ -9,8 +9,18 @@ extern "C" {
 #include "comms/commands.h"
 #include "comms/counter.h"
 #include "drive_codec.h"
+#include "hal_random.h"
 }
 #include "support/frames.h"
+
+// Its random numbers count up.
+struct hal {
+    uint32_t random = 0x12345678;
+};
+
+extern "C" uint32_t hal_random_u32(hal_t *hal) {
+    return hal->random++;
+}
 
 namespace {
 
@@ -25,7 +35,24 @@ class Commands : public testing::Test {
     Commands() { commands_init(&commands); }
 
     commands_frame_t receive(const hal_can_frame_t &frame, uint32_t time_us = 1000) {
-        return commands_receive(&commands, &frame, time_us, &command);
+        return commands_receive(&commands, &hal, &frame, time_us, TIMEOUT_US, &command);
+    }
+
+    void supervise(drive_state_t state, uint32_t time_us) { commands_supervise(&commands, state, time_us, TIMEOUT_US); }
+
+    // Time of the background's last round is that of the frame.
+    commands_frame_t take(const hal_can_frame_t &frame, drive_state_t state, uint32_t time_us) {
+        supervise(state, time_us);
+        return receive(frame, time_us);
+    }
+
+    // Arms in READY for a sender whose last command has this counter, a run; the last frame at time_us.
+    void arm(uint8_t counter, uint32_t time_us) {
+        take(command_frame(counter), DRIVE_STATE_READY, time_us - 1000);
+        ASSERT_EQ(take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, time_us - 1000), COMMANDS_ACCEPTED);
+        ASSERT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY, time_us),
+                  COMMANDS_COMMAND);
+        ASSERT_TRUE(commands.arming.armed);
     }
 
     // The frame is rejected, *counter rises by one, and nothing else that matters changes.
@@ -41,13 +68,14 @@ class Commands : public testing::Test {
         ASSERT_EQ(std::memcmp(&command_before, &command, sizeof command), 0);
     }
 
+    hal_t hal;
     commands_t commands;
     command_t command{};
 };
 
 TEST_F(Commands, a_valid_command_is_accepted) {
-    EXPECT_EQ(receive(command_frame(7, COMMAND_RUN, 600000), 12345), COMMANDS_COMMAND);
-    EXPECT_EQ(command.request, COMMAND_RUN);
+    EXPECT_EQ(receive(command_frame(7, COMMAND_STOP, 600000), 12345), COMMANDS_COMMAND);
+    EXPECT_EQ(command.request, COMMAND_STOP);
     EXPECT_NEAR(command.speed_reference_q22 / 4194304.0, 600 * 2 * M_PI / 60, 1e-6);
     EXPECT_EQ(command.time_us, 12345u);
     EXPECT_EQ(commands.counters.accepted, 1);
@@ -67,12 +95,12 @@ TEST_F(Commands, a_reference_has_a_sign_and_is_symmetric) {
 TEST_F(Commands, the_message_of_the_last_command_is_the_mode) {
     ASSERT_EQ(receive(command_frame(7)), COMMANDS_COMMAND);
     EXPECT_EQ(command.mode, DRIVE_MODE_SPEED);
-    ASSERT_EQ(receive(frames::torque_command(200, COMMAND_RUN, -(19 << 16) - 1), 12345), COMMANDS_COMMAND);
+    ASSERT_EQ(receive(frames::torque_command(8, COMMAND_STOP, -(19 << 16) - 1), 12345), COMMANDS_COMMAND);
     EXPECT_EQ(command.mode, DRIVE_MODE_TORQUE);
-    EXPECT_EQ(command.request, COMMAND_RUN);
+    EXPECT_EQ(command.request, COMMAND_STOP);
     EXPECT_EQ(command.torque_reference_q24, -(19 << 24) - 256);
     EXPECT_EQ(command.time_us, 12345u);
-    ASSERT_EQ(receive(command_frame(8)), COMMANDS_COMMAND) << "each message has a counter of its own";
+    ASSERT_EQ(receive(command_frame(9)), COMMANDS_COMMAND) << "both messages have one counter";
     EXPECT_EQ(command.mode, DRIVE_MODE_SPEED);
     EXPECT_EQ(commands.counters.accepted, 3);
 }
@@ -129,7 +157,7 @@ TEST_F(Commands, every_unknown_standard_identifier_is_rejected) {
         frame.identifier = identifier;
         frame.length = 8;
         if (identifier != DRIVE_COMMAND_FRAME_ID && identifier != DRIVE_TORQUE_COMMAND_FRAME_ID &&
-            identifier != DRIVE_PARAMETER_REQUEST_FRAME_ID) {
+            identifier != DRIVE_ARM_FRAME_ID && identifier != DRIVE_PARAMETER_REQUEST_FRAME_ID) {
             expect_rejected(frame, &commands.counters.unknown_frame);
         }
     }
@@ -178,7 +206,7 @@ TEST_F(Commands, every_request_beyond_the_last_is_rejected) {
         const hal_can_frame_t frame = command_frame(++counter, request);
         if (request <= COMMAND_CLEAR_FAULT) {
             EXPECT_EQ(receive(frame), COMMANDS_COMMAND);
-            EXPECT_EQ(command.request, request);
+            EXPECT_EQ(command.request, request == COMMAND_RUN ? COMMAND_OFF : request) << "not armed";
         } else {
             expect_rejected(frame, &commands.counters.out_of_range);
         }
@@ -208,28 +236,28 @@ TEST_F(Commands, a_parameter_request_with_a_reserved_bit_is_rejected) {
 
 TEST_F(Commands, after_a_timeout_a_sender_may_start_with_any_counter) {
     receive(command_frame(1), 5000);
-    commands_check_timeout(&commands, 5000 + TIMEOUT_US, TIMEOUT_US);
+    supervise(DRIVE_STATE_READY, 5000 + TIMEOUT_US);
     expect_rejected(command_frame(100), &commands.counters.wrong_counter, 5000 + TIMEOUT_US);
-    commands_check_timeout(&commands, 5000 + TIMEOUT_US + 1, TIMEOUT_US);
+    supervise(DRIVE_STATE_READY, 5000 + TIMEOUT_US + 1);
     EXPECT_EQ(receive(command_frame(100), 5000 + TIMEOUT_US + 1), COMMANDS_COMMAND);
 }
 
 TEST_F(Commands, a_command_of_either_message_restarts_the_timeout_of_both) {
     receive(command_frame(1), 0);
-    receive(frames::torque_command(1, COMMAND_RUN, 0), TIMEOUT_US);
-    commands_check_timeout(&commands, 2 * TIMEOUT_US, TIMEOUT_US);
-    EXPECT_EQ(receive(command_frame(2), 2 * TIMEOUT_US), COMMANDS_COMMAND);
+    receive(frames::torque_command(2, COMMAND_RUN, 0), TIMEOUT_US);
+    supervise(DRIVE_STATE_READY, 2 * TIMEOUT_US);
+    EXPECT_EQ(receive(command_frame(3), 2 * TIMEOUT_US), COMMANDS_COMMAND);
     expect_rejected(frames::torque_command(77, COMMAND_RUN, 0), &commands.counters.wrong_counter, 2 * TIMEOUT_US);
-    commands_check_timeout(&commands, 3 * TIMEOUT_US + 1, TIMEOUT_US);
+    supervise(DRIVE_STATE_READY, 3 * TIMEOUT_US + 1);
     EXPECT_EQ(receive(frames::torque_command(77, COMMAND_RUN, 0), 3 * TIMEOUT_US + 1), COMMANDS_COMMAND);
 }
 
 TEST_F(Commands, the_timeout_is_measured_across_the_wrap_of_the_clock) {
     const uint32_t before_wrap = UINT32_MAX - 500;
     receive(command_frame(1), before_wrap);
-    commands_check_timeout(&commands, before_wrap + 1000, TIMEOUT_US);
+    supervise(DRIVE_STATE_READY, before_wrap + 1000);
     EXPECT_TRUE(commands.receiver.synchronised);
-    commands_check_timeout(&commands, before_wrap + TIMEOUT_US + 1, TIMEOUT_US);
+    supervise(DRIVE_STATE_READY, before_wrap + TIMEOUT_US + 1);
     EXPECT_FALSE(commands.receiver.synchronised);
 }
 
@@ -239,7 +267,7 @@ TEST_F(Commands, rejected_frames_do_not_restart_the_timeout) {
     damaged.data[4] ^= 1;
     receive(damaged, TIMEOUT_US - 1);
     receive(command_frame(50), TIMEOUT_US);
-    commands_check_timeout(&commands, TIMEOUT_US + 1, TIMEOUT_US);
+    supervise(DRIVE_STATE_READY, TIMEOUT_US + 1);
     EXPECT_FALSE(commands.receiver.synchronised);
 }
 
@@ -258,6 +286,261 @@ TEST_F(Commands, random_frames_are_rejected) {
     // One in 65536 has the right checksum; most of those are out of sequence or out of range.
     EXPECT_LE(accepted, 1u);
     EXPECT_GE(commands.counters.wrong_checksum, 65535);
+}
+
+TEST_F(Commands, a_run_is_off_until_the_drive_is_armed_and_then_takes_effect_at_once) {
+    supervise(DRIVE_STATE_READY, 900);
+    EXPECT_EQ(receive(command_frame(1), 1000), COMMANDS_COMMAND);
+    EXPECT_EQ(command.request, COMMAND_OFF);
+    EXPECT_EQ(commands.counters.run_unarmed, 1);
+    EXPECT_EQ(receive(frames::arm(7, ARMING_STEP_REQUEST_RUN), 2000), COMMANDS_ACCEPTED);
+    EXPECT_EQ(commands.arming.challenge, 0x12345678u);
+    EXPECT_EQ(commands.arming.attempt, ARMING_ATTEMPT_RUN);
+    EXPECT_EQ(receive(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~0x12345678u), 3000), COMMANDS_COMMAND);
+    EXPECT_EQ(command.request, COMMAND_RUN);
+    EXPECT_EQ(command.time_us, 1000u) << "the age is that of the command";
+    EXPECT_EQ(commands.arming.attempt, ARMING_ATTEMPT_NONE);
+    EXPECT_EQ(commands.arming.challenge, 0u);
+    EXPECT_EQ(receive(command_frame(2), 4000), COMMANDS_COMMAND);
+    EXPECT_EQ(command.request, COMMAND_RUN);
+    EXPECT_EQ(commands.counters.run_unarmed, 1);
+    EXPECT_EQ(commands.arming.refused, 0);
+}
+
+TEST_F(Commands, every_other_sequence_of_arming_is_refused) {
+    const uint32_t challenge = 0x12345678;
+    const auto refused = [&](uint8_t counter, unsigned step, uint32_t response, uint32_t after_us,
+                             drive_state_t state = DRIVE_STATE_READY) {
+        commands_init(&commands);
+        hal.random = challenge;
+        take(command_frame(1), DRIVE_STATE_READY, 1000);
+        take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
+        EXPECT_EQ(commands.arming.challenge, challenge);
+        EXPECT_EQ(take(frames::arm(counter, step, response), state, 2000 + after_us), COMMANDS_REJECTED);
+        EXPECT_EQ(commands.arming.refused, 1);
+        EXPECT_FALSE(commands.arming.armed);
+        // The challenge has been used: the right response comes too late.
+        EXPECT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~challenge), DRIVE_STATE_READY, 2000 + after_us + 1),
+                  COMMANDS_REJECTED);
+        EXPECT_FALSE(commands.arming.armed);
+    };
+    refused(8, ARMING_STEP_CONFIRM_RUN, challenge, 1000);                        // the challenge itself
+    refused(8, ARMING_STEP_CONFIRM_RUN, ~challenge ^ 1, 1000);                   // wrong response
+    refused(8, ARMING_STEP_CONFIRM_RUN, 0, 1000);                                // none
+    refused(7, ARMING_STEP_CONFIRM_RUN, ~challenge, 1000);                       // counter of the request
+    refused(9, ARMING_STEP_CONFIRM_RUN, ~challenge, 1000);                       // a frame is missing
+    refused(8, ARMING_STEP_CONFIRM_RUN, ~challenge, ARMING_RESPONSE_MIN_US - 1); // cannot have read it
+    refused(8, ARMING_STEP_CONFIRM_RUN, ~challenge, ARMING_RESPONSE_MAX_US + 1);
+    refused(8, ARMING_STEP_CONFIRM_RUN, ~challenge, 1000, DRIVE_STATE_FAULT);
+    refused(8, ARMING_STEP_CONFIRM_RUN, ~challenge, 1000, DRIVE_STATE_RUN);
+}
+
+TEST_F(Commands, arming_without_a_living_sender_of_commands_is_refused) {
+    take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
+    EXPECT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY, 3000),
+              COMMANDS_REJECTED);
+    take(command_frame(1), DRIVE_STATE_READY, 20000);
+    take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 20000 + TIMEOUT_US - 1000);
+    EXPECT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY,
+                   20000 + TIMEOUT_US + 1),
+              COMMANDS_REJECTED);
+    EXPECT_FALSE(commands.arming.armed);
+}
+
+TEST_F(Commands, a_recording_of_a_whole_sequence_arms_nothing) {
+    hal.random = 99;
+    const hal_can_frame_t recorded[] = {command_frame(1), frames::arm(7, ARMING_STEP_REQUEST_RUN),
+                                        frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~99u), command_frame(2),
+                                        command_frame(3)};
+    uint32_t time_us = 1000;
+    for (int replay = 0; replay < 200; replay++) {
+        for (const hal_can_frame_t &frame : recorded) {
+            take(frame, DRIVE_STATE_READY, time_us += 1000);
+            EXPECT_EQ(command.request == COMMAND_RUN, replay == 0 && commands.arming.armed);
+        }
+        EXPECT_EQ(commands.arming.armed, replay == 0);
+        if (replay == 50) {
+            commands_init(&commands); // a reset: the random numbers go on
+        }
+        time_us += 600000;
+    }
+    EXPECT_GE(commands.arming.refused, 149);
+}
+
+TEST_F(Commands, challenges_are_drawn_ten_milliseconds_apart_at_most) {
+    const uint32_t first = hal.random;
+    for (uint32_t time_us = 100000; time_us < 200000; time_us += 100) {
+        take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, time_us);
+    }
+    EXPECT_EQ(hal.random - first, 10u);
+}
+
+TEST_F(Commands, a_damaged_arming_frame_is_counted_and_changes_nothing) {
+    for (unsigned bit = 0; bit < 8 * DRIVE_ARM_LENGTH; bit++) {
+        hal_can_frame_t frame = frames::arm(7, ARMING_STEP_REQUEST_RUN);
+        frame.data[bit / 8] = uint8_t(frame.data[bit / 8] ^ (1u << bit % 8));
+        expect_rejected(frame, &commands.counters.wrong_checksum);
+    }
+    for (int length = 0; length < 16; length++) {
+        hal_can_frame_t frame = frames::arm(7, ARMING_STEP_REQUEST_RUN);
+        frame.length = uint8_t(length);
+        if (length != DRIVE_ARM_LENGTH) {
+            expect_rejected(frame, &commands.counters.wrong_length);
+        }
+    }
+    EXPECT_EQ(commands.arming.attempt, ARMING_ATTEMPT_NONE);
+    for (unsigned step = ARMING_STEP_COUNT; step < 256; step++) {
+        EXPECT_EQ(receive(frames::arm(7, step)), COMMANDS_REJECTED);
+    }
+    EXPECT_EQ(commands.arming.refused, 256 - ARMING_STEP_COUNT);
+}
+
+TEST_F(Commands, what_disarms) {
+    const auto disarms = [&](const auto &event) {
+        commands_init(&commands);
+        arm(1, 10000);
+        take(command_frame(2), DRIVE_STATE_READY, 11000);
+        EXPECT_EQ(command.request, COMMAND_RUN);
+        event();
+        supervise(commands.state, 12000);
+        return !commands.arming.armed;
+    };
+    const auto in_run = [&](const auto &event) {
+        return disarms([&] {
+            supervise(DRIVE_STATE_RUN, 11500);
+            event();
+        });
+    };
+    EXPECT_FALSE(disarms([] {}));
+    EXPECT_FALSE(in_run([] {}));
+    EXPECT_FALSE(in_run([&] { receive(command_frame(3, COMMAND_STOP), 12000); })) << "a stop is part of the run";
+    EXPECT_TRUE(in_run([&] { receive(command_frame(3, COMMAND_OFF), 12000); }));
+    EXPECT_TRUE(in_run([&] { receive(command_frame(3, COMMAND_CLEAR_FAULT), 12000); }));
+    EXPECT_TRUE(in_run([&] { supervise(DRIVE_STATE_FAULT, 12000); }));
+    EXPECT_TRUE(in_run([&] { supervise(DRIVE_STATE_READY, 12000); })) << "the end of a stop";
+    EXPECT_TRUE(disarms([&] { receive(command_frame(3, COMMAND_OFF), 12000); }));
+    EXPECT_TRUE(disarms([&] { receive(command_frame(3, COMMAND_STOP), 12000); }));
+    EXPECT_TRUE(disarms([&] { commands_disarm(&commands); }));
+    EXPECT_FALSE(disarms([&] { supervise(DRIVE_STATE_READY, 11000 + TIMEOUT_US); }));
+    EXPECT_TRUE(disarms([&] { supervise(DRIVE_STATE_READY, 11000 + TIMEOUT_US + 1); }));
+    EXPECT_FALSE(in_run([&] { supervise(DRIVE_STATE_RUN, 11000 + COMMAND_LOST_US); }));
+    EXPECT_TRUE(in_run([&] { supervise(DRIVE_STATE_RUN, 11000 + COMMAND_LOST_US + 1); }));
+    EXPECT_TRUE(in_run([&] { commands_init(&commands); })) << "reset";
+    // Each of them takes a new sequence: one command does not run.
+    receive(command_frame(4), 13000);
+    EXPECT_EQ(command.request, COMMAND_OFF);
+}
+
+TEST_F(Commands, armed_without_a_request_to_run_lasts_half_a_second) {
+    take(command_frame(0, COMMAND_OFF), DRIVE_STATE_READY, 1000);
+    take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
+    take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY, 3000);
+    uint8_t counter = 0;
+    for (uint32_t time_us = 10000; time_us <= 3000 + COMMANDS_ARMED_UNUSED_US; time_us += 10000) {
+        take(command_frame(++counter, COMMAND_OFF), DRIVE_STATE_READY, time_us);
+        ASSERT_TRUE(commands.arming.armed) << time_us;
+    }
+    take(command_frame(++counter), DRIVE_STATE_READY, 3001 + COMMANDS_ARMED_UNUSED_US);
+    EXPECT_FALSE(commands.arming.armed);
+    EXPECT_EQ(command.request, COMMAND_OFF);
+}
+
+TEST_F(Commands, four_bad_frames_in_succession_are_a_fault_and_three_are_none) {
+    hal_can_frame_t damaged = command_frame(50), too_short = command_frame(50);
+    damaged.data[5] ^= 1;
+    too_short.length = 6;
+    for (const hal_can_frame_t &bad : {damaged, too_short, command_frame(1), command_frame(99)}) {
+        commands_init(&commands);
+        arm(1, 10000);
+        for (int i = 0; i < 3; i++) {
+            EXPECT_EQ(take(bad, DRIVE_STATE_RUN, 11000), COMMANDS_REJECTED);
+            EXPECT_FALSE(commands.failed);
+        }
+        EXPECT_TRUE(commands.arming.armed);
+        take(bad, DRIVE_STATE_RUN, 11000);
+        EXPECT_TRUE(commands.failed);
+        EXPECT_FALSE(commands.arming.armed);
+    }
+    commands_init(&commands);
+    arm(1, 10000);
+    for (uint8_t i = 0; i < 4; i++) {
+        take(command_frame(uint8_t(2 + i), 9), DRIVE_STATE_RUN, 11000); // out of range
+    }
+    EXPECT_TRUE(commands.failed);
+}
+
+TEST_F(Commands, bad_frames_are_no_fault_while_not_armed) {
+    for (int i = 0; i < 100; i++) {
+        hal_can_frame_t damaged = command_frame(1);
+        damaged.data[5] ^= 1;
+        take(damaged, DRIVE_STATE_READY, 1000);
+    }
+    EXPECT_FALSE(commands.failed);
+    arm(1, 10000);
+    EXPECT_EQ(commands.errors, 0) << "those before the arming do not count";
+}
+
+TEST_F(Commands, a_second_sender_neither_takes_over_nor_goes_unnoticed) {
+    // 100 frames per second of the first, with lost ones; frames of the second per frame of the first.
+    for (const double ratio : {10.0, 4.0, 1.0, 0.3, 0.1, 0.02}) {
+        for (int offset = 0; offset < 256; offset += 5) {
+            commands_init(&commands);
+            arm(0, 10000);
+            uint32_t time_us = 10000;
+            uint8_t counter = 0, foreign = uint8_t(offset);
+            int taken_over = 0, foreign_frames = 0;
+            double due = 0.0;
+            for (int frame = 1; frame < 3000 && !commands.failed; frame++) {
+                time_us += 10000;
+                counter = uint8_t(counter + (frame % 50 == 0 ? 3 : 1)); // two in 50 are lost
+                take(command_frame(counter, COMMAND_RUN, 600000), DRIVE_STATE_RUN, time_us);
+                for (due += ratio; due >= 1.0 && !commands.failed; due -= 1.0) {
+                    foreign_frames++;
+                    const bool accepted = take(command_frame(++foreign, COMMAND_RUN, -3000000), DRIVE_STATE_RUN,
+                                               time_us) == COMMANDS_COMMAND;
+                    taken_over += accepted && command.speed_reference_q22 < 0;
+                }
+            }
+            ASSERT_TRUE(commands.failed) << ratio << ", " << offset;
+            ASSERT_FALSE(commands.arming.armed);
+            const bool near = offset < 4 || offset > 256 - 12;
+            // A second sender that by chance continues the sequence of the first makes the first one's frames invalid:
+            // four of them end the run. Any other has a frame in sequence now and then.
+            ASSERT_LE(taken_over, near ? 4 * ratio + 2 : 6) << ratio << ", " << offset;
+            ASSERT_LE(foreign_frames, near ? 5 * ratio + 4 : ratio > 0.05 ? 12 : 30) << ratio << ", " << offset;
+        }
+    }
+}
+
+TEST_F(Commands, three_recorded_frames_beside_the_living_sender_end_the_run) {
+    arm(100, 10000);
+    uint8_t counter = 100;
+    int taken_over = 0;
+    for (uint32_t time_us = 20000; time_us < 1000000 && !commands.failed; time_us += 10000) {
+        take(command_frame(++counter, COMMAND_RUN, 600000), DRIVE_STATE_RUN, time_us);
+        for (uint8_t recorded = 20; recorded < 23 && !commands.failed; recorded++) {
+            taken_over +=
+                take(command_frame(recorded, COMMAND_RUN, -3000000), DRIVE_STATE_RUN, time_us) == COMMANDS_COMMAND;
+        }
+    }
+    EXPECT_TRUE(commands.failed);
+    EXPECT_EQ(taken_over, 0);
+}
+
+TEST_F(Commands, ordinary_loss_is_no_error) {
+    std::mt19937 random(3);
+    arm(0, 10000);
+    uint8_t counter = 0;
+    uint32_t time_us = 10000;
+    for (int frame = 0; frame < 100000; frame++) {
+        const unsigned lost = random() % 3; // up to two in succession
+        time_us += 10000 * (1 + lost);
+        counter = uint8_t(counter + 1 + lost);
+        ASSERT_EQ(take(command_frame(counter), DRIVE_STATE_RUN, time_us), COMMANDS_COMMAND);
+        ASSERT_EQ(command.request, COMMAND_RUN);
+    }
+    EXPECT_FALSE(commands.failed);
+    EXPECT_EQ(commands.counters.wrong_counter, 0);
 }
 
 TEST(Counter, saturates) {

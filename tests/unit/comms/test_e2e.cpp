@@ -23,10 +23,10 @@ frame_t protected_frame(uint8_t counter, uint32_t data = 0x01020304) {
 }
 
 struct receiver_t : e2e_receiver_t {
-    receiver_t() { e2e_receiver_init(this, DATA_ID); }
+    receiver_t() { e2e_receiver_init(this); }
     e2e_result_t take(uint8_t counter) {
         const frame_t frame = protected_frame(counter);
-        return e2e_check(this, frame.data(), frame.size());
+        return e2e_check(this, DATA_ID, frame.data(), frame.size());
     }
 };
 
@@ -96,6 +96,30 @@ TEST(E2e, a_replayed_sequence_is_refused_while_the_true_sender_lives) {
     }
 }
 
+TEST(E2e, a_locked_receiver_stays_with_its_sender) {
+    receiver_t receiver;
+    receiver.take(10);
+    receiver.locked = true;
+    for (int i = 0; i < 1000; i++) {
+        ASSERT_NE(receiver.take(uint8_t(100 + i % 100)), E2E_ACCEPTED) << i;
+    }
+    EXPECT_EQ(receiver.take(13), E2E_ACCEPTED) << "two frames lost";
+    EXPECT_EQ(receiver.take(17), E2E_WRONG_SEQUENCE) << "three";
+    e2e_receiver_restart(&receiver);
+    EXPECT_EQ(receiver.take(200), E2E_ACCEPTED);
+}
+
+TEST(E2e, messages_with_one_receiver_have_one_sequence) {
+    receiver_t receiver;
+    receiver.take(10);
+    frame_t other{};
+    e2e_protect(DATA_ID + 1, 11, other.data(), other.size());
+    EXPECT_EQ(e2e_check(&receiver, DATA_ID, other.data(), other.size()), E2E_WRONG_CHECKSUM);
+    EXPECT_EQ(e2e_check(&receiver, DATA_ID + 1, other.data(), other.size()), E2E_ACCEPTED);
+    EXPECT_EQ(receiver.take(11), E2E_REPEATED);
+    EXPECT_EQ(receiver.take(12), E2E_ACCEPTED);
+}
+
 TEST(E2e, a_wrong_checksum_leaves_the_receiver_alone) {
     receiver_t receiver;
     receiver.take(10);
@@ -103,7 +127,7 @@ TEST(E2e, a_wrong_checksum_leaves_the_receiver_alone) {
     const e2e_receiver_t before = receiver;
     frame_t frame = protected_frame(11);
     frame[5] ^= 0x10;
-    EXPECT_EQ(e2e_check(&receiver, frame.data(), frame.size()), E2E_WRONG_CHECKSUM);
+    EXPECT_EQ(e2e_check(&receiver, DATA_ID, frame.data(), frame.size()), E2E_WRONG_CHECKSUM);
     EXPECT_EQ(receiver.synchronised, before.synchronised);
     EXPECT_EQ(receiver.counter, before.counter);
     EXPECT_EQ(receiver.candidate_frames, before.candidate_frames);
@@ -114,14 +138,14 @@ TEST(E2e, another_data_id_fails) {
     frame_t frame{};
     e2e_protect(DATA_ID ^ 0x0100, 1, frame.data(), frame.size());
     receiver_t receiver;
-    EXPECT_EQ(e2e_check(&receiver, frame.data(), frame.size()), E2E_WRONG_CHECKSUM);
+    EXPECT_EQ(e2e_check(&receiver, DATA_ID, frame.data(), frame.size()), E2E_WRONG_CHECKSUM);
 }
 
 TEST(E2e, a_frame_shorter_than_the_header_fails) {
     const frame_t frame = protected_frame(1);
     receiver_t receiver;
     for (size_t length = 0; length < E2E_HEADER_BYTES; length++) {
-        EXPECT_EQ(e2e_check(&receiver, frame.data(), length), E2E_WRONG_CHECKSUM);
+        EXPECT_EQ(e2e_check(&receiver, DATA_ID, frame.data(), length), E2E_WRONG_CHECKSUM);
     }
 }
 
@@ -133,7 +157,7 @@ TEST(E2e, every_one_and_two_bit_error_is_found) {
             frame[bit / 8] = uint8_t(frame[bit / 8] ^ ((error >> bit & 1) << bit % 8));
         }
         receiver_t receiver;
-        return e2e_check(&receiver, frame.data(), frame.size()) == E2E_WRONG_CHECKSUM;
+        return e2e_check(&receiver, DATA_ID, frame.data(), frame.size()) == E2E_WRONG_CHECKSUM;
     };
     for (int sample = 0; sample < 50; sample++) {
         const frame_t frame = protected_frame(uint8_t(random()), uint32_t(random()));

@@ -66,6 +66,10 @@ bool hal_nvm_program(hal_t *, unsigned, unsigned, uint64_t) {
 bool hal_nvm_erase(hal_t *, unsigned) {
     return false;
 }
+uint32_t hal_random_u32(hal_t *) {
+    return 4711;
+}
+
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     if (hal->mailboxes.size() == 3) {
         return false;
@@ -112,7 +116,7 @@ class Comms : public testing::Test {
             if (comms_telemetry_due(&comms, time_us)) {
                 report(time_us);
             }
-            if (comms_background(&comms, &bus, &parameters, true, time_us)) {
+            if (comms_background(&comms, &bus, &parameters, true, DRIVE_STATE_READY, time_us)) {
                 accepted.push_back(comms.command);
             }
         }
@@ -334,6 +338,8 @@ TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
 
 TEST_F(Comms, dropped_frames_are_counted_exactly) {
     run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 5 of group counters + identity + heartbeat
+    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 2 counters + PROCESSOR + DEFERRED + ARMING + identity +
+                    // heartbeat
     const unsigned waiting = unsigned(bus.mailboxes.size()) + comms.telemetry.queue.count;
     EXPECT_EQ(comms.telemetry.dropped + waiting, 427u);
 }
@@ -410,7 +416,7 @@ TEST_F(Comms, cycles_go_on_across_the_wrap_of_the_clock) {
         if (comms_telemetry_due(&comms, start + elapsed)) {
             report(start + elapsed);
         }
-        comms_background(&comms, &bus, &parameters, true, start + elapsed);
+        comms_background(&comms, &bus, &parameters, true, DRIVE_STATE_READY, start + elapsed);
     }
     EXPECT_EQ(bus.count(DRIVE_STATUS_FRAME_ID), 10u);
 }
@@ -422,14 +428,14 @@ TEST_F(Comms, every_command_is_seen_in_order) {
     run(1000);
     ASSERT_EQ(accepted.size(), 4u);
     for (unsigned i = 0; i < 4; i++) {
-        EXPECT_EQ(accepted[i].request, i);
+        EXPECT_EQ(accepted[i].request, i == COMMAND_RUN ? COMMAND_OFF : i) << "not armed";
     }
     EXPECT_LT(accepted[0].time_us, accepted[1].time_us);
 }
 
 TEST_F(Comms, one_call_processes_a_bounded_number_of_frames) {
     bus.received.assign(HAL_CAN_RECEIVE_QUEUE, hal_can_frame_t{0x123, false, false, 8, {}});
-    comms_background(&comms, &bus, &parameters, true, 0);
+    comms_background(&comms, &bus, &parameters, true, DRIVE_STATE_READY, 0);
     EXPECT_EQ(bus.received.size(), size_t(HAL_CAN_RECEIVE_QUEUE - COMMS_FRAMES_PER_CALL));
     EXPECT_EQ(comms.commands.counters.unknown_frame, COMMS_FRAMES_PER_CALL);
 }

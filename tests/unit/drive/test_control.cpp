@@ -222,7 +222,7 @@ TEST_F(Control, each_cause_opens_every_switch_in_the_tick_that_sees_it_and_a_def
         {FAULT_OVER_VOLTAGE, false, [this] { sample.adc.bus_voltage_counts = 301 * 8; }},
         {FAULT_UNDER_VOLTAGE, true, [this] { sample.adc.bus_voltage_counts = 149 * 8; }},
         {FAULT_ENCODER, false, [this] { turns += 0.01; }},
-        {FAULT_COMMAND_TIMEOUT, true, [this] { command.time_us -= 100001; }},
+        {FAULT_COMMAND_TIMEOUT, true, [this] { command.time_us -= COMMAND_LOST_US + 1; }},
         {FAULT_INTERRUPT_OVERRUN, false, [this] { sample.missed_interrupts = 3; }},
     };
     for (const auto &cause : causes) {

@@ -42,6 +42,15 @@ inline hal_can_frame_t torque_command(uint8_t counter, unsigned request, int32_t
                            counter, message, drive_torque_command_pack);
 }
 
+// DRIVE_ARM with its checksum; the values are not checked.
+inline hal_can_frame_t arm(uint8_t counter, unsigned step, uint32_t response = 0) {
+    drive_arm_t message{};
+    message.step = uint8_t(step);
+    message.response = response;
+    return protected_frame(DRIVE_ARM_FRAME_ID, DRIVE_ARM_LENGTH, DRIVE_ARM_E2E_DATA_ID, counter, message,
+                           drive_arm_pack);
+}
+
 // PARAMETER_REQUEST; the values are not checked.
 inline hal_can_frame_t parameter_request(unsigned operation, unsigned index, unsigned part, int32_t value) {
     drive_parameter_request_t message{};

@@ -10,6 +10,7 @@ from typing import Any
 import can
 from cantools.database.can import Message
 
+from salient.bench.arming import ArmingSequence
 from salient.bench.client import Client, KnownAttributes
 from salient.bus import e2e
 from salient.bus.signals import drive_database, signal_range, value_numbers
@@ -21,6 +22,9 @@ REQUESTS = value_numbers(drive_database(), "DRIVE_COMMAND", "request")
 assert _COMMAND.cycle_time is not None  # GenMsgCycleTime in drive.dbc
 COMMAND_PERIOD_NS = _COMMAND.cycle_time * 1_000_000
 """Period of the commands in virtual time; the drive stops when they are no longer sent."""
+
+_DISARMED_NS = 2_000_000
+"""Time in which a report that the drive is armed may be older than the command that has disarmed it."""
 
 READY_TIMEOUT_S = 0.02
 """Time after its start in which a drive without a failing check is ready: 1 ms of passed checks, and its telemetry."""
@@ -74,7 +78,9 @@ def _protected(command: Message, counter: int, request: str, reference: Mapping[
 class Drive(KnownAttributes):
     """Commands a drive. Assigning speed_reference_rpm or torque_reference_Nm requests run in speed or torque mode; the
     command is sent immediately and then every COMMAND_PERIOD_NS as the session's time advances, until `silence`.
-    Nothing is sent before the first request. OtherDatabase instead of a request to run when the drive's DBC is another
+    Nothing is sent before the first request. A request to run arms a drive that is not armed, while time advances: the
+    drive runs about a millisecond later. One that was disarmed by a fault stays so until the next request.
+    OtherDatabase instead of a request to run when the drive's DBC is another
     than that of the session (Session.require_drive_database); off, stop and clear_fault have no scaling.
     """
 
@@ -90,7 +96,10 @@ class Drive(KnownAttributes):
         self._speed_reference_rpm = 0.0
         self._torque_reference_Nm = 0.0
         self._torque_mode = False
-        self._counter = {False: 0, True: 0}
+        self._counter = 0
+        self._arming: ArmingSequence | None = None
+        self._arming_counter = 0
+        self._disarmed_ns: int | None = None
         self.command_due_ns = None
         self.parameters = Parameters(session, parameter_table)
         self.fault_log = FaultLog(session)
@@ -135,6 +144,7 @@ class Drive(KnownAttributes):
     def silence(self) -> None:
         """Send no more commands until the next request."""
         self.command_due_ns = None
+        self._end_arming()
 
     def ask(self, request: str) -> None:
         """Request off, run, stop or clear_fault; sends it immediately."""
@@ -142,25 +152,65 @@ class Drive(KnownAttributes):
             *most, last = REQUESTS
             raise DriveError(f"request '{request}': must be {', '.join(most)} or {last}")
         self._request = request
+        if request == "run":
+            self._require_drive_database()
+            if self._arming is None and not self.armed:
+                self._arming = ArmingSequence(self._session, self._arming_counter)
+        else:
+            self._end_arming()
+            if request != "stop":
+                self._disarmed_ns = self._session.time_ns
         self.send_command()
+
+    @property
+    def armed(self) -> bool:
+        """The drive accepts requests to run, by its latest telemetry and what was requested since."""
+        report = self._session.telemetry["DRIVE_ARMING.armed"]
+        known = self._disarmed_ns is None or report.last_time_s * 1e9 > self._disarmed_ns + _DISARMED_NS
+        return known and report.last == 1
+
+    @property
+    def due_ns(self) -> int | None:
+        """When `send_due` has something to send next; None: never."""
+        due = [self.command_due_ns, None if self._arming is None else self._arming.due_ns]
+        return min((time_ns for time_ns in due if time_ns is not None), default=None)
+
+    def send_due(self) -> None:
+        """Sends what is due: a command, a step of the arming."""
+        if self.command_due_ns is not None and self.command_due_ns <= self._session.time_ns:
+            self.send_command()
+        if self._arming is not None and self._arming.due_ns <= self._session.time_ns:
+            self._arming.step()
+            if self._arming.armed:
+                self._disarmed_ns = None
+            if self._arming.armed or self._arming.given_up:
+                self._end_arming()
+
+    def _end_arming(self) -> None:
+        if self._arming is not None:
+            self._arming_counter = self._arming.counter
+            self._arming = None
+
+    def _require_drive_database(self) -> None:
+        try:
+            self._session.require_drive_database()
+        except OtherDatabase:
+            self.silence()
+            raise
 
     def send_command(self) -> None:
         """Repeats the present request now; the next is due a period later."""
         if self._request is None:
             raise DriveError("no request to repeat")
         if self._request == "run":
-            try:
-                self._session.require_drive_database()
-            except OtherDatabase:
-                self.silence()
-                raise
-        counter = self._counter[self._torque_mode]
+            self._require_drive_database()
+        counter = self._counter
         if self._torque_mode:
             self._session.send(torque_command_frame(counter, self._request, self._torque_reference_Nm,
                                                     self._torque_command))
         else:
             self._session.send(command_frame(counter, self._request, self._speed_reference_rpm, self._command))
-        self._counter[self._torque_mode] = (counter + 1) % 256
+        self._counter = (counter + 1) % 256
         self.command_due_ns = self._session.time_ns + COMMAND_PERIOD_NS
 
     @property

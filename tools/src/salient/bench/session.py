@@ -150,12 +150,12 @@ class Session(KnownAttributes):
     def advance_to(self, time_ns: int) -> None:
         """Lets virtual time pass until `time_ns`; commands go out as they fall due, one due just then included."""
         while True:
-            due_ns = self.drive.command_due_ns
+            due_ns = self.drive.due_ns
             stop_ns = time_ns if due_ns is None else min(time_ns, due_ns)
             if stop_ns > self.time_ns:
                 self._advance(stop_ns)
             if due_ns is not None and due_ns <= self.time_ns:
-                self.drive.send_command()
+                self.drive.send_due()
             if self.time_ns >= time_ns:
                 return
 

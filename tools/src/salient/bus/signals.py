@@ -74,6 +74,11 @@ class Signal:
         return self.value[-1].item() if len(self.value) else math.nan
 
     @property
+    def last_time_s(self) -> float:
+        """Time of the latest value; minus infinity before the first."""
+        return self.time_s[-1].item() if len(self.time_s) else -math.inf
+
+    @property
     def last_name(self) -> str:
         """The latest value by its name in the DBC, for signals with named values; "unknown" before the first."""
         return (self.choices or {}).get(int(self.last), str(self.last)) if len(self.value) else "unknown"

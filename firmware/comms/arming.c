@@ -1,0 +1,93 @@
+#include "comms/arming.h"
+
+#include "comms/counter.h"
+#include "comms/e2e.h"
+#include "drive_codec.h"
+#include "fixed/compiler.h"
+#include "hal_random.h"
+
+void arming_init(arming_t *arming) {
+    *arming = (arming_t){0};
+}
+
+static void end_attempt(arming_t *arming) {
+    arming->changed |= arming->attempt != ARMING_ATTEMPT_NONE;
+    arming->attempt = ARMING_ATTEMPT_NONE;
+    arming->challenge = 0;
+}
+
+COLD void arming_check_timeout(arming_t *arming, uint32_t time_us) {
+    const uint32_t age_us = time_us - arming->challenge_us;
+    if (age_us > ARMING_RESPONSE_MAX_US) {
+        end_attempt(arming);
+    }
+    if (age_us > ARMING_INTERVAL_US) {
+        arming->drawn = false; /* long ago: the clock may come round */
+    }
+}
+
+COLD void arming_disarm(arming_t *arming) {
+    end_attempt(arming);
+    arming->changed |= arming->armed;
+    arming->armed = false;
+}
+
+static arming_result_t refuse(arming_t *arming) {
+    counter_add(&arming->refused, 1);
+    return ARMING_REFUSED;
+}
+
+static arming_result_t request(arming_t *arming, hal_t *hal, bool permitted, const hal_can_frame_t *frame,
+                               uint32_t time_us) {
+    if (!permitted || arming->armed || arming->drawn) {
+        return refuse(arming);
+    }
+    arming->counter = frame->data[E2E_HEADER_BYTES - 1];
+    arming->attempt = ARMING_ATTEMPT_RUN;
+    arming->challenge = hal_random_u32(hal);
+    arming->challenge_us = time_us;
+    arming->drawn = true;
+    arming->changed = true;
+    return ARMING_CHALLENGED;
+}
+
+static arming_result_t confirm(arming_t *arming, bool permitted, const hal_can_frame_t *frame, uint32_t response,
+                               uint32_t time_us) {
+    const uint32_t age_us = time_us - arming->challenge_us;
+    const bool correct = permitted && arming->attempt == ARMING_ATTEMPT_RUN && response == ~arming->challenge &&
+                         age_us >= ARMING_RESPONSE_MIN_US && age_us <= ARMING_RESPONSE_MAX_US &&
+                         frame->data[E2E_HEADER_BYTES - 1] == (uint8_t)(arming->counter + 1u);
+    end_attempt(arming);
+    if (!correct) {
+        return refuse(arming);
+    }
+    arming->changed = true;
+    arming->armed = true;
+    return ARMING_ARMED;
+}
+
+COLD arming_result_t arming_receive(arming_t *arming, hal_t *hal, const hal_can_frame_t *frame, bool permitted,
+                                    uint32_t time_us) {
+    struct drive_arm_t message;
+    drive_arm_unpack(&message, frame->data, frame->length);
+    switch ((arming_step_t)message.step) {
+    case ARMING_STEP_REQUEST_RUN:
+        return request(arming, hal, permitted, frame, time_us);
+    case ARMING_STEP_CONFIRM_RUN:
+        return confirm(arming, permitted, frame, message.response, time_us);
+    default:
+        return refuse(arming);
+    }
+}
+
+COLD void arming_report(const arming_t *arming, uint16_t run_unarmed, hal_can_frame_t *frame) {
+    const struct drive_arming_t message = {
+        .challenge = arming->challenge,
+        .attempt = (uint8_t)arming->attempt,
+        .armed = arming->armed,
+        .refused = (uint8_t)(arming->refused < UINT8_MAX ? arming->refused : UINT8_MAX),
+        .run_unarmed = run_unarmed,
+    };
+    *frame = (hal_can_frame_t){.identifier = DRIVE_ARMING_FRAME_ID, .length = DRIVE_ARMING_LENGTH};
+    drive_arming_pack(frame->data, &message, sizeof frame->data);
+}

@@ -1,0 +1,92 @@
+"""Arming a drive in two steps (firmware/comms/arming.h): request, challenge, response."""
+
+from __future__ import annotations
+
+import can
+
+from salient.bench.client import Client
+from salient.bus import e2e
+from salient.bus.signals import drive_database, value_numbers
+
+_ARM = drive_database().get_message_by_name("DRIVE_ARM")
+_REPORT = "DRIVE_ARMING"
+STEPS = value_numbers(drive_database(), "DRIVE_ARM", "step")
+
+RETRY_NS = 500_000_000
+"""Time without a challenge or its result after which the request is repeated: that in which a challenge is valid."""
+ATTEMPTS_MAX = 4
+_FAST_POLL_NS = 50_000
+_FAST_POLL_FOR_NS = 2_000_000
+_SLOW_POLL_NS = 1_000_000
+
+
+def arm_frame(counter: int, step: str, response: int = 0) -> can.Message:
+    """A DRIVE_ARM with its checksum. counter 0..255; step one of STEPS; response 0..2^32-1."""
+    signals = {"checksum": 0, "counter": counter % 256, "step": STEPS[step], "response": response}
+    payload = _ARM.encode(signals)[e2e.HEADER_BYTES :]
+    data = e2e.protect(e2e.data_id(_ARM), counter % 256, payload)
+    return can.Message(arbitration_id=_ARM.frame_id, is_extended_id=False, data=data)
+
+
+def response_to(challenge: int) -> int:
+    """The response that confirms a challenge: every bit inverted."""
+    return ~challenge & 0xFFFFFFFF
+
+
+class ArmingSequence:
+    """Arms a drive as virtual time advances: call `step` at `due_ns`."""
+
+    due_ns: int
+    armed: bool
+    given_up: bool
+
+    def __init__(self, session: Client, counter: int) -> None:
+        self._session = session
+        self._counter = counter
+        self._attempts = 0
+        self._answered: int | None = None
+        self.armed = self.given_up = False
+        self._seen = session.telemetry.count(_REPORT)
+        self._request()
+
+    @property
+    def counter(self) -> int:
+        """Sequence counter of the next DRIVE_ARM."""
+        return self._counter
+
+    def step(self) -> None:
+        """Answers a challenge that has come, repeats a request that has had no result, sets due_ns."""
+        count = self._session.telemetry.count(_REPORT)
+        if count > self._seen:
+            self._seen = count
+            self._take_report()
+        elapsed_ns = self._session.time_ns - self._sent_ns
+        if elapsed_ns >= RETRY_NS and not self.armed:
+            if self._attempts == ATTEMPTS_MAX:
+                self.given_up = True
+                return
+            self._request()
+            elapsed_ns = 0
+        self.due_ns = self._session.time_ns + (_FAST_POLL_NS if elapsed_ns < _FAST_POLL_FOR_NS else _SLOW_POLL_NS)
+
+    def _take_report(self) -> None:
+        attempt, armed, challenge = (int(self._session.telemetry[f"{_REPORT}.{name}"].last)
+                                     for name in ("attempt", "armed", "challenge"))
+        if armed and self._answered is not None:
+            self.armed = True
+        elif attempt and challenge != self._answered:
+            self._answered = challenge
+            self._send("confirm_run", response_to(challenge))
+        elif not attempt and self._answered is not None:
+            self._sent_ns -= RETRY_NS  # the response was refused
+
+    def _request(self) -> None:
+        self._attempts += 1
+        self._answered = None
+        self._sent_ns = self._session.time_ns
+        self._send("request_run")
+        self.due_ns = self._sent_ns + _FAST_POLL_NS
+
+    def _send(self, step: str, response: int = 0) -> None:
+        self._session.send(arm_frame(self._counter, step, response))
+        self._counter = (self._counter + 1) % 256
