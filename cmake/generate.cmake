@@ -47,17 +47,17 @@ function(salient_generate_codec target dbc)
     target_include_directories(${target} PUBLIC ${out})
 endfunction()
 
-# salient_generate_bench_variables(TARGET DBC): an interface library with bench_variables.h, the table of the bench
-# variables in DBC.
-function(salient_generate_bench_variables target dbc)
+# salient_generate_rig_table(TARGET NAME DBC): an interface library with NAME.h, the table that salient.generate.NAME
+# makes of DBC: bench_variables or fault_kinds.
+function(salient_generate_rig_table target name dbc)
     set(out ${CMAKE_CURRENT_BINARY_DIR}/${target})
     add_custom_command(
-        OUTPUT ${out}/bench_variables.h
-        COMMAND ${SALIENT_GENERATOR} salient.generate.bench_variables ${dbc} ${out}
-        DEPENDS ${dbc} ${SALIENT_GENERATOR_SOURCES}/generate/bench_variables.py ${SALIENT_CODEC_GENERATOR}
-        COMMENT "bench variables"
+        OUTPUT ${out}/${name}.h
+        COMMAND ${SALIENT_GENERATOR} salient.generate.${name} ${dbc} ${out}
+        DEPENDS ${dbc} ${SALIENT_GENERATOR_SOURCES}/generate/${name}.py ${SALIENT_CODEC_GENERATOR}
+        COMMENT "${name}"
         VERBATIM)
-    add_custom_target(${target}_header DEPENDS ${out}/bench_variables.h)
+    add_custom_target(${target}_header DEPENDS ${out}/${name}.h)
     add_library(${target} INTERFACE)
     add_dependencies(${target} ${target}_header)
     target_include_directories(${target} INTERFACE ${out})

@@ -4,6 +4,23 @@
 /* The functions ending in _of are inlined for each form of the magnetics and for one and two conducting phases, so that
  * the compiler removes the other forms and unrolls the loops. `form`, `link` and `count` are those of the setting. */
 
+/* Current that phases draw from the DC link, its first derivative at a constant voltage of the link, and its derivative
+ * by that voltage, where some have shorted turns; link_A stays the current at the present voltage less the conductance
+ * times that voltage. */
+static void terminal_currents(const integrator_setting_t *setting, const integrator_state_t *state,
+                              const integrator_derivative_t *derivative, double *link_A, double *link_A_s,
+                              double *conductance_S) {
+    *link_A = *link_A_s = *conductance_S = 0.0;
+    for (unsigned index = 0; index < setting->count; index++) {
+        const double by_current =
+            setting->terminal_gain[index] - setting->terminal_S[index] * setting->resistance_ohm[index];
+        const double sign = setting->terminal_sign[index];
+        *link_A += sign * (by_current * state->current_A[index] - setting->terminal_S[index] * setting->drop_V[index]);
+        *link_A_s += sign * by_current * derivative->current_A_s[index];
+        *conductance_S += sign * setting->terminal_S[index] * setting->link_sign[index];
+    }
+}
+
 MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magnetics_form_t form, bool link,
                                        unsigned count, const integrator_state_t *state,
                                        integrator_derivative_t *derivative) {
@@ -42,9 +59,13 @@ MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magn
     if (link) {
         const dc_link_t *dc_link = &setting->machine->dc_link;
         double conductance_S = 0.0;
+        if (setting->shorted) {
+            terminal_currents(setting, state, derivative, &link_A, &link_A_s, &conductance_S);
+        }
         if (setting->source_conducts) {
-            conductance_S = 1.0 / dc_link->source_resistance_ohm;
-            link_A -= setting->supply_voltage_V * conductance_S;
+            const double source_S = 1.0 / dc_link->source_resistance_ohm;
+            conductance_S += source_S;
+            link_A -= setting->supply_voltage_V * source_S;
         }
         if (setting->chopper_on) {
             conductance_S += 1.0 / dc_link->chopper_resistance_ohm;

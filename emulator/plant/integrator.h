@@ -16,6 +16,7 @@
 #include "hal.h"
 #include "plant/machine.h"
 #include "plant/magnetics.h"
+#include "plant/plant.h"
 
 /* Constants of a step. Arrays are indexed by conducting phase, 0..count - 1. */
 typedef struct {
@@ -29,6 +30,7 @@ typedef struct {
     double ahead_rad; /* small angle in the direction of motion, see magnetics_kernel_trapezoid */
     bool link;        /* the DC link has a capacitor: its voltage is a state */
     bool source_conducts, chopper_on;
+    bool chopper; /* there is one that works */
     unsigned count;
     unsigned phase[HAL_PHASES_MAX];
     bool driven[HAL_PHASES_MAX]; /* by a positive voltage: the current cannot reach zero */
@@ -36,6 +38,14 @@ typedef struct {
     double link_sign[HAL_PHASES_MAX];      /* +1 both switches on, 0 one, -1 none */
     double drop_V[HAL_PHASES_MAX];         /* of the two devices that carry the current */
     double resistance_ohm[HAL_PHASES_MAX]; /* of winding and devices */
+    bool faulted;                          /* the members below are set, see faulted.h */
+    bool shorted;                          /* a phase has shorted turns: currents of the link by terminal_* */
+    bool stuck;                            /* friction holds the shaft; the next step may be another setting */
+    double friction_sign;                  /* of the motion that Coulomb or static friction will stop; 0: none */
+    double terminal_sign[HAL_PHASES_MAX], terminal_gain[HAL_PHASES_MAX], terminal_S[HAL_PHASES_MAX];
+    double turns[HAL_PHASES_MAX]; /* shorted fraction */
+    bool isolated[HAL_PHASES_MAX];
+    plant_path_t path[HAL_PHASES_MAX]; /* while current flows at the terminals */
 } integrator_setting_t;
 
 typedef struct {

@@ -3,7 +3,9 @@
 #include <math.h>
 #include <string.h>
 
+#include "plant/faulted.h"
 #include "plant/integrator.h"
+#include "plant/magnetics_kernel.h"
 
 /* Limits of a step at factor 1, chosen for errors of currents, torque and speed below 1e-6 of their range (measured
  * against SciPy's DOP853 at a tolerance of 1e-12: 9e-7) at the speeds and currents of a drive. A control period at
@@ -22,6 +24,8 @@
 #define EVENT_ITERATIONS 60
 /* After an event, a DC-link voltage within this tolerance of its threshold is set to it. */
 #define THRESHOLD_TOLERANCE_V 1e-6
+/* After an event, a slower shaft with friction stands still. */
+#define SPEED_TOLERANCE_RAD_S 1e-6
 /* A freewheeling current decays exponentially; below this it counts as zero. */
 #define CURRENT_NEGLIGIBLE_A 1e-9
 
@@ -78,6 +82,11 @@ void plant_hold(plant_t *plant, double speed_rad_s, double acceleration_rad_s2) 
     plant->held_acceleration_rad_s2 = acceleration_rad_s2;
 }
 
+void plant_lock(plant_t *plant) {
+    plant->energy_fault_J += plant_kinetic_energy_J(plant);
+    plant_hold(plant, 0.0, 0.0);
+}
+
 void plant_release(plant_t *plant) {
     plant->held = false;
 }
@@ -93,10 +102,25 @@ void plant_set_step_factor(plant_t *plant, double factor) {
             time_constant_s = fmin(time_constant_s, link->chopper_resistance_ohm * link->capacitance_F);
         }
     }
+    if (plant->faulted) {
+        time_constant_s = fmin(time_constant_s, faulted_time_constant_s(plant));
+    }
     plant->step_factor = factor;
     plant->step_max_s = factor * fmin(STEP_MAX_S, STEP_TIME_CONSTANTS * time_constant_s);
     plant->step_angle_rad = factor * STEP_ANGLE_PITCHES * plant->magnetics.pitch_rad;
     plant->step_current_A = factor * STEP_CURRENT_FRACTION * plant->magnetics.saturation_A;
+}
+
+void plant_set_faults(plant_t *plant, const plant_faults_t *faults) {
+    double sum = faults->winding_open + faults->switch_open.upper + faults->switch_open.lower +
+                 faults->switch_shorted.upper + faults->switch_shorted.lower + faults->diode_open.upper +
+                 faults->diode_open.lower + faults->chopper_open + faults->coulomb_Nm + faults->static_Nm;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        sum += faults->shorted_turns[phase];
+    }
+    plant->faults = *faults;
+    plant->faulted = sum > 0.0;
+    plant_set_step_factor(plant, plant->step_factor);
 }
 
 /* --- Switches --- */
@@ -126,7 +150,7 @@ void plant_clear_trip(plant_t *plant) {
 
 /* Lists the conducting phases and their devices. A phase without current that is not driven is omitted; its current is
  * set to exactly zero. */
-static void find_conducting(plant_t *plant, integrator_setting_t *setting) {
+MAGNETICS_INLINE void find_conducting(plant_t *plant, integrator_setting_t *setting) {
     static const double link_signs[3] = {-1.0, 0.0, 1.0};
     const unsigned upper = plant->switches.upper, lower = plant->switches.lower;
     unsigned count = 0;
@@ -150,14 +174,17 @@ static void find_conducting(plant_t *plant, integrator_setting_t *setting) {
 
 /* Determines the conduction states of supply and chopper. At exactly the voltage at which the supply's rectifier begins
  * to conduct, the current of half bridges and chopper decides. */
-static void find_link(plant_t *plant, integrator_setting_t *setting) {
+MAGNETICS_INLINE void find_link(plant_t *plant, integrator_setting_t *setting, bool faulted) {
     double drawn_A = 0.0;
     for (unsigned index = 0; index < setting->count; index++) {
-        drawn_A += setting->link_sign[index] * plant->current_A[setting->phase[index]];
+        const unsigned phase = setting->phase[index];
+        drawn_A += faulted ? setting->terminal_sign[index] * plant_current_A(plant, phase)
+                           : setting->link_sign[index] * plant->current_A[phase];
     }
     const dc_link_t *link = &plant->machine->dc_link;
     const double link_V = plant->bus_voltage_V, supply_V = plant->supply_voltage_V;
-    if (link->chopper_resistance_ohm > 0.0) {
+    setting->chopper = link->chopper_resistance_ohm > 0.0 && !plant->faults.chopper_open;
+    if (setting->chopper) {
         if (link_V >= link->chopper_on_V) {
             plant->chopper_on = true;
         } else if (link_V <= link->chopper_off_V) {
@@ -169,7 +196,7 @@ static void find_link(plant_t *plant, integrator_setting_t *setting) {
     setting->source_conducts = link_V < supply_V || (link_V == supply_V && drawn_A >= 0.0);
 }
 
-static void find_setting(plant_t *plant, integrator_setting_t *setting) {
+MAGNETICS_INLINE void find_setting(plant_t *plant, integrator_setting_t *setting, bool faulted) {
     setting->machine = plant->machine;
     setting->magnetics = &plant->magnetics;
     setting->inertia_kg_m2 = plant->inertia_kg_m2;
@@ -180,11 +207,18 @@ static void find_setting(plant_t *plant, integrator_setting_t *setting) {
     setting->held_acceleration_rad_s2 = plant->held_acceleration_rad_s2;
     setting->supply_voltage_V = plant->supply_voltage_V;
     setting->ahead_rad = copysign(2.0 * MAGNETICS_SMOOTH_TOLERANCE_RAD, plant->speed_rad_s);
-    find_conducting(plant, setting);
+    setting->faulted = faulted;
+    setting->shorted = false;
+    if (faulted) {
+        faulted_find_conducting(plant, setting);
+        faulted_find_friction(plant, setting);
+    } else {
+        find_conducting(plant, setting);
+    }
     setting->link = has_link(plant);
-    setting->source_conducts = setting->chopper_on = false;
+    setting->source_conducts = setting->chopper_on = setting->chopper = false;
     if (setting->link) {
-        find_link(plant, setting);
+        find_link(plant, setting, faulted);
     }
 }
 
@@ -203,7 +237,7 @@ static thresholds_t thresholds_of(const integrator_setting_t *setting) {
     }
     if (setting->chopper_on) {
         thresholds.falling_V = fmax(thresholds.falling_V, link->chopper_off_V);
-    } else if (link->chopper_resistance_ohm > 0.0) {
+    } else if (setting->chopper) {
         thresholds.rising_V = fmin(thresholds.rising_V, link->chopper_on_V);
     }
     return thresholds;
@@ -211,6 +245,9 @@ static thresholds_t thresholds_of(const integrator_setting_t *setting) {
 
 /* Distance of a state from a comparator's response; negative: past it. */
 static double distance_to_trip(const integrator_setting_t *setting, const integrator_state_t *state) {
+    if (setting->faulted && setting->shorted) {
+        return faulted_distance_to_trip(setting, state);
+    }
     double nearest_A = INFINITY;
     for (unsigned index = 0; index < setting->count; index++) {
         const double distance_A = setting->trip_current_A - state->current_A[index];
@@ -224,7 +261,7 @@ static double distance_to_trip(const integrator_setting_t *setting, const integr
 /* Distance of a state from the next event: minimum of the currents that are not driven and of the distances between
  * DC-link voltage and thresholds, and between currents and comparators (V and A with equal weight). Negative: past the
  * event. */
-static double distance_to_event(const integrator_setting_t *setting, const integrator_state_t *state) {
+MAGNETICS_INLINE double distance_to_event(const integrator_setting_t *setting, const integrator_state_t *state) {
     double nearest = distance_to_trip(setting, state);
     for (unsigned index = 0; index < setting->count; index++) {
         if (!setting->driven[index] && state->current_A[index] < nearest) {
@@ -239,14 +276,20 @@ static double distance_to_event(const integrator_setting_t *setting, const integ
     return nearest;
 }
 
+/* The same with the events that only faults have. */
+static double distance_to_any_event(const integrator_setting_t *setting, const integrator_state_t *state) {
+    const double distance = distance_to_event(setting, state);
+    return setting->faulted ? fmin(distance, faulted_distance_to_event(setting, state)) : distance;
+}
+
 /* Shortens a step that contains an event to the time of the event; returns the length. Illinois variant of the false
  * position method on the result of the step: the distance is nearly linear in time, so few iterations suffice. The
  * length is never zero, so that time advances. */
 static double step_to_event(const integrator_setting_t *setting, const integrator_state_t *start,
                             const integrator_derivative_t *first, double step_s, integrator_state_t *end,
                             integrator_integrals_t *integrals) {
-    double before_s = 0.0, before = fmax(distance_to_event(setting, start), 0.0);
-    double after_s = step_s, after = distance_to_event(setting, end);
+    double before_s = 0.0, before = fmax(distance_to_any_event(setting, start), 0.0);
+    double after_s = step_s, after = distance_to_any_event(setting, end);
     int last_side = 0;
     double at_s = step_s;
     for (unsigned iteration = 0; iteration < EVENT_ITERATIONS; iteration++) {
@@ -255,7 +298,7 @@ static double step_to_event(const integrator_setting_t *setting, const integrato
         const double fraction = before > 0.0 ? before / (before - after) : 0.5;
         at_s = fmax(before_s + (after_s - before_s) * fraction, EVENT_TOLERANCE_S);
         integrator_step(setting, start, first, at_s, end, integrals);
-        const double at = distance_to_event(setting, end);
+        const double at = distance_to_any_event(setting, end);
         if (at == 0.0 || fabs(at_s - previous_s) < EVENT_TOLERANCE_S) {
             break;
         }
@@ -279,6 +322,9 @@ static double step_to_event(const integrator_setting_t *setting, const integrato
 static void snap_to_event(const integrator_setting_t *setting, integrator_state_t *end) {
     for (unsigned index = 0; index < setting->count; index++) {
         end->current_A[index] = fmax(end->current_A[index], 0.0);
+    }
+    if (setting->faulted && setting->friction_sign != 0.0 && fabs(end->speed_rad_s) < SPEED_TOLERANCE_RAD_S) {
+        end->speed_rad_s = 0.0;
     }
     if (setting->link) {
         const thresholds_t thresholds = thresholds_of(setting);
@@ -370,8 +416,8 @@ static void find_smooth_range(plant_t *plant) {
 }
 
 /* Longest step within the limits that does not cross a point where the magnetics are not smooth. */
-static double step_length_s(plant_t *plant, const integrator_setting_t *setting, const integrator_derivative_t *first,
-                            double remaining_s) {
+MAGNETICS_INLINE double step_length_s(plant_t *plant, const integrator_setting_t *setting,
+                                      const integrator_derivative_t *first, double remaining_s) {
     const double speed_rad_s = fabs(plant->speed_rad_s);
     double limit_s = plant->step_max_s;
     if (speed_rad_s * limit_s > plant->step_angle_rad) {
@@ -415,8 +461,8 @@ static double dynamometer_J(const plant_t *plant, const integrator_integrals_t *
            plant->friction_Nm_s * integrals->speed2_rad2_s - plant->inertia_kg_m2 * speed_change_rad_s * mean_rad_s;
 }
 
-static void add_energies(plant_t *plant, const integrator_setting_t *setting, const integrator_integrals_t *integrals,
-                         double speed_change_rad_s) {
+MAGNETICS_INLINE void add_bridge_energies(plant_t *plant, const integrator_setting_t *setting,
+                                          const integrator_integrals_t *integrals) {
     const double winding_ohm = plant->winding_ohm;
     for (unsigned index = 0; index < setting->count; index++) {
         const double charge_As = integrals->charge_As[index], current2_A2s = integrals->current2_A2s[index];
@@ -431,16 +477,20 @@ static void add_energies(plant_t *plant, const integrator_setting_t *setting, co
         plant->energy_converter_J +=
             setting->drop_V[index] * charge_As + (setting->resistance_ohm[index] - winding_ohm) * current2_A2s;
     }
+}
+
+MAGNETICS_INLINE void add_shaft_energies(plant_t *plant, const integrator_integrals_t *integrals,
+                                         double speed_change_rad_s) {
     plant->energy_load_J += plant->load_torque_Nm * integrals->angle_rad;
-    if (setting->held) {
+    if (plant->held) {
         plant->energy_load_J += dynamometer_J(plant, integrals, speed_change_rad_s);
     }
     plant->energy_friction_J += plant->friction_Nm_s * integrals->speed2_rad2_s;
 }
 
 /* Adds the energies of source and chopper: Vs (Vs - Vdc) / Rs, (Vs - Vdc)^2 / Rs and Vdc^2 / Rc, integrated. */
-static void add_link_energies(plant_t *plant, const integrator_setting_t *setting,
-                              const integrator_integrals_t *integrals, double step_s) {
+MAGNETICS_INLINE void add_link_energies(plant_t *plant, const integrator_setting_t *setting,
+                                        const integrator_integrals_t *integrals, double step_s) {
     const dc_link_t *link = &plant->machine->dc_link;
     if (setting->source_conducts) {
         const double supply_V = plant->supply_voltage_V;
@@ -456,17 +506,18 @@ static void add_link_energies(plant_t *plant, const integrator_setting_t *settin
 /* Within this distance of its threshold a comparator responds. */
 #define TRIP_TOLERANCE_A 1e-6
 
-/* Integrates from time_ns to `to_ns` with constant switch states, or to the time at which a comparator opens them. */
-static void integrate(plant_t *plant, uint64_t to_ns) {
+/* Integrates from time_ns to `to_ns` with constant switch states, or to the time at which a comparator opens them;
+ * inlined for a plant with and without faults, so that the latter has no instruction of the former. */
+MAGNETICS_INLINE void integrate_of(plant_t *plant, uint64_t to_ns, bool faulted) {
     double length_s = (double)(to_ns - plant->time_ns) * NS_S;
     integrator_setting_t setting;
     integrator_state_t start, end;
-    bool event = true;
+    bool find = true;
     for (double at_s = 0.0; at_s < length_s;) {
         integrator_derivative_t first;
         integrator_integrals_t integrals;
-        if (event) {
-            find_setting(plant, &setting);
+        if (find) {
+            find_setting(plant, &setting, faulted);
             start.angle_rad = plant->rotor_angle_rad;
             start.speed_rad_s = plant->speed_rad_s;
             start.bus_voltage_V = plant->bus_voltage_V;
@@ -477,7 +528,7 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
         integrator_differentiate(&setting, &start, &first);
         double step_s = step_length_s(plant, &setting, &first, length_s - at_s);
         integrator_step(&setting, &start, &first, step_s, &end, &integrals);
-        event = distance_to_event(&setting, &end) < 0.0;
+        const bool event = (faulted ? distance_to_any_event(&setting, &end) : distance_to_event(&setting, &end)) < 0.0;
         if (event) {
             step_s = step_to_event(&setting, &start, &first, step_s, &end, &integrals);
             snap_to_event(&setting, &end);
@@ -485,7 +536,12 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
         if (plant->sample != NULL) {
             sample_step(plant, &setting, &start, &first, &end, at_s, step_s, to_ns);
         }
-        add_energies(plant, &setting, &integrals, end.speed_rad_s - start.speed_rad_s);
+        if (faulted) {
+            faulted_add_energies(plant, &setting, &integrals, step_s);
+        } else {
+            add_bridge_energies(plant, &setting, &integrals);
+        }
+        add_shaft_energies(plant, &integrals, end.speed_rad_s - start.speed_rad_s);
         if (setting.link) {
             add_link_energies(plant, &setting, &integrals, step_s);
         }
@@ -504,8 +560,17 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
             }
         }
         start = end;
+        find = event || (faulted && setting.stuck);
     }
     plant->time_ns = to_ns;
+}
+
+static void integrate(plant_t *plant, uint64_t to_ns) {
+    if (plant->faulted) {
+        integrate_of(plant, to_ns, true);
+    } else {
+        integrate_of(plant, to_ns, false);
+    }
 }
 
 void plant_advance(plant_t *plant, uint64_t to_ns) {

@@ -19,7 +19,8 @@
  * Deliberately not modelled: mutual coupling of the phases and end effects; iron loss, hysteresis and eddy currents in
  * the machine, skin effect, temperature; switching times and losses of the devices (these bridges need no dead time:
  * their two switches are in series with the winding), inductance of the DC link, ripple of the supply's rectifier,
- * series resistance of the capacitor; elasticity and static friction of the shaft.
+ * series resistance of the capacitor; elasticity of the shaft. Faults, friction at rest among them, change these
+ * equations as faulted.h states.
  *
  * Integration: integrator.h, for currents, speed, angle and DC-link voltage together. Steps end at every switching edge
  * (whole nanoseconds), at the times at which a diode, the supply or the chopper starts or stops conducting or a
@@ -52,12 +53,30 @@ typedef struct {
     double friction;     /* >= 0 */
 } plant_gains_t;
 
+/* Faults of converter, machine and shaft; all zero: none. The equations are in faulted.h. Bit j is phase j. */
+typedef struct {
+    uint8_t winding_open;
+    half_bridge_switches_t switch_open, switch_shorted; /* a shorted switch conducts even when it is open as well */
+    half_bridge_switches_t diode_open; /* upper: to the positive rail, from the winding's lower end; lower: from the
+                                          negative rail to its upper end */
+    bool chopper_open;
+    double shorted_turns[HAL_PHASES_MAX]; /* fraction of the turns of a phase, 0..0.5 */
+    double coulomb_Nm, static_Nm;         /* friction torques, >= 0 */
+} plant_faults_t;
+
+/* How a phase of a plant with faults carries its current: a row of the equations in faulted.h. */
+typedef struct {
+    double link_gain, drop_V, resistance_ohm;       /* of the flux rate: q s, q V, q (R + r / (1 - k)) */
+    double terminal_gain, terminal_S;               /* of the terminals' current: by i_m, by the flux rate */
+    double sign, device_V, device_ohm, breakdown_V; /* s; V and r without the breakdown, that of arc and avalanche */
+} plant_path_t;
+
 typedef struct plant {
     /* State at time_ns; read only. */
     uint64_t time_ns;
     double speed_rad_s;
-    double rotor_angle_rad; /* unwrapped */
-    double current_A[HAL_PHASES_MAX];
+    double rotor_angle_rad;           /* unwrapped */
+    double current_A[HAL_PHASES_MAX]; /* with shorted turns: plant_current_A */
     double bus_voltage_V;
     bool chopper_on;
     bool tripped; /* the comparators have opened the switches since plant_clear_trip */
@@ -67,10 +86,11 @@ typedef struct plant {
     double load_torque_Nm;
     double minimum_pulse_ns;
 
-    plant_gains_t gains; /* read only; plant_set_gains changes them */
+    plant_gains_t gains;   /* read only; plant_set_gains changes them */
+    plant_faults_t faults; /* read only; plant_set_faults changes them */
 
     /* Energies since plant_init. Energy balance at every instant:
-     * drawn - returned = copper + converter + load + friction
+     * drawn - returned = copper + converter + load + friction + fault
      *                    + change of plant_field_energy_J + change of plant_kinetic_energy_J
      * supplied = source + chopper + drawn - returned + change of plant_link_energy_J (with a capacitor)
      */
@@ -80,6 +100,7 @@ typedef struct plant {
     double energy_converter_J; /* in the half bridges' devices */
     double energy_load_J;      /* work done on the load and the dynamometer */
     double energy_friction_J;
+    double energy_fault_J;    /* in arcs and avalanches, and in a shaft that is locked */
     double energy_supplied_J; /* by the source; this and the next two with a capacitor only */
     double energy_source_J;   /* in the source's resistance */
     double energy_chopper_J;
@@ -95,6 +116,8 @@ typedef struct plant {
     double supply_voltage_V;
     bool held; /* plant_hold */
     double held_acceleration_rad_s2;
+    bool faulted; /* any of `faults` */
+    plant_path_t path[HAL_PHASES_MAX];
     half_bridge_switches_t switches;
     half_bridge_pattern_t pattern;
     unsigned edge_next;
@@ -116,12 +139,18 @@ void plant_set_supply_voltage(plant_t *plant, double voltage_V);
  * than the present one is a jump, whose kinetic energy is not in the energy balance. */
 void plant_hold(plant_t *plant, double speed_rad_s, double acceleration_rad_s2);
 
-/* Frees a held shaft from time_ns on. */
+/* Locks the shaft at time_ns until plant_release or plant_hold: it stops, and its kinetic energy goes into the lock. */
+void plant_lock(plant_t *plant);
+
+/* Frees a held or locked shaft from time_ns on. */
 void plant_release(plant_t *plant);
 
 /* Changes the machine from time_ns on. Angle, speed and currents continue unchanged, so the energies of fields and
  * rotor jump, without a counterpart in the energy balance, which holds over intervals without such a change. */
 void plant_set_gains(plant_t *plant, const plant_gains_t *gains);
+
+/* Changes the faults from time_ns on. Currents (with shorted turns: magnetomotive forces) continue unchanged. */
+void plant_set_faults(plant_t *plant, const plant_faults_t *faults);
 
 /* Starts a control period at time_ns: the switches follow `compare` (half_bridge.h) for 2 * period_ticks timer ticks
  * and then keep their states until the next call. period_ticks > 0. */
@@ -151,6 +180,9 @@ void plant_observe(plant_t *plant, uint64_t first_ns, uint64_t step_ns, plant_sa
 
 /* Scales all limits of the step length. factor > 0: 1 (default) gives the accuracy stated in plant.c, less is finer. */
 void plant_set_step_factor(plant_t *plant, double factor);
+
+/* Current at the terminals of a phase. */
+double plant_current_A(const plant_t *plant, unsigned phase);
 
 /* Electromagnetic torque, sum of all phases. */
 double plant_torque_Nm(const plant_t *plant);

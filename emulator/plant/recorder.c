@@ -98,7 +98,7 @@ void recorder_sample(void *context, const plant_t *plant) {
     row.values[4] = (float)plant->bus_voltage_V;
     float *value = row.values + 5;
     for (unsigned phase = 0; phase < recorder->phases; phase++) {
-        *value++ = (float)plant->current_A[phase];
+        *value++ = (float)plant_current_A(plant, phase);
     }
     *value++ = (float)plant->energy_drawn_J;
     *value++ = (float)plant->energy_returned_J;

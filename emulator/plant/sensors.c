@@ -20,10 +20,16 @@ void sensors_init(sensors_t *sensors, const sensor_errors_t *errors, unsigned en
     sensors->encoder_bits = encoder_bits == 0 ? ENCODER_BITS_IDEAL : encoder_bits;
     sensors->adc_bits = adc_bits;
     sensors->random_state = seed;
+    sensors->encoder.random_state = ~seed;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        sensors->current_line[phase] = phase;
+    }
 }
 
 void sensors_hold_currents(sensors_t *sensors, const plant_t *plant) {
-    memcpy(sensors->held_current_A, plant->current_A, sizeof sensors->held_current_A);
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        sensors->held_current_A[phase] = plant_current_A(plant, phase);
+    }
     sensors->currents_held = true;
 }
 
@@ -59,10 +65,13 @@ static uint16_t to_counts(const sensors_t *sensors, double fraction) {
     return counts >= largest ? (uint16_t)largest : (uint16_t)(counts + 0.5);
 }
 
-/* Output of a current sensor; NaN for a NaN. */
-static double sensed_current_A(sensors_t *sensors, double true_A) {
+/* Output of the current sensor of a phase; NaN for a NaN. */
+static double sensed_current_A(sensors_t *sensors, double true_A, const sensors_input_fault_t *fault) {
     const sensor_errors_t *errors = &sensors->errors;
     double current_A = true_A * errors->current_gain + errors->current_offset_A;
+    if (fault->scaled) {
+        current_A = current_A * fault->gain + fault->offset;
+    }
     if (errors->current_noise_A > 0.0) {
         current_A += errors->current_noise_A * next_gaussian(&sensors->random_state);
     }
@@ -72,15 +81,31 @@ static double sensed_current_A(sensors_t *sensors, double true_A) {
     return current_A < -errors->current_limit_A ? -errors->current_limit_A : current_A;
 }
 
+/* Count of an input, or the one at which a fault holds it. */
+static uint16_t held_counts(const sensors_t *sensors, const sensors_input_fault_t *fault, uint16_t counts) {
+    const uint32_t largest = (UINT32_C(1) << sensors->adc_bits) - 1;
+    return !fault->held ? counts : (uint16_t)(fault->code < largest ? fault->code : largest);
+}
+
 void sensors_sample_adc(sensors_t *sensors, const plant_t *plant, hal_adc_sample_t *sample) {
     memset(sample, 0, sizeof *sample);
     const sensor_ranges_t *ranges = &plant->machine->ranges;
-    const double *true_A = sensors->currents_held ? sensors->held_current_A : plant->current_A;
+    uint16_t counts[HAL_PHASES_MAX];
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-        sample->phase_current_counts[phase] =
-            to_counts(sensors, sensed_current_A(sensors, true_A[phase]) * (1.0 / ranges->current_A));
+        const sensors_input_fault_t *fault = &sensors->current_fault[phase];
+        const double true_A = sensors->currents_held ? sensors->held_current_A[phase] : plant_current_A(plant, phase);
+        counts[phase] = held_counts(
+            sensors, fault, to_counts(sensors, sensed_current_A(sensors, true_A, fault) * (1.0 / ranges->current_A)));
     }
-    sample->bus_voltage_counts = to_counts(sensors, plant->bus_voltage_V * (1.0 / ranges->dc_link_V));
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        sample->phase_current_counts[phase] = counts[sensors->current_line[phase]];
+    }
+    double link_V = plant->bus_voltage_V;
+    if (sensors->dc_link_fault.scaled) {
+        link_V = link_V * sensors->dc_link_fault.gain + sensors->dc_link_fault.offset;
+    }
+    sample->bus_voltage_counts =
+        held_counts(sensors, &sensors->dc_link_fault, to_counts(sensors, link_V * (1.0 / ranges->dc_link_V)));
     sample->load_torque_counts =
         to_counts(sensors, 0.5 + plant_shaft_torque_Nm(plant) * (0.5 / ranges->load_torque_Nm));
 }
@@ -95,7 +120,15 @@ static double reading_rev(const sensors_t *sensors, double rotor_angle_rad) {
         magnetics_kernel_sine_cosine((angle_rev - floor(angle_rev + 0.5)) * REVOLUTION_RAD, &sine, &cosine);
         angle_rev += sensors->errors.encoder_eccentricity_deg / 360.0 * sine;
     }
-    return angle_rev + sensors->encoder_offset_deg / 360.0;
+    angle_rev += sensors->encoder_offset_deg / 360.0;
+    const sensors_encoder_faults_t *faults = &sensors->encoder.faults;
+    if (faults->reversed) {
+        angle_rev = 2.0 * sensors->encoder.reversed_at_rev - angle_rev;
+    }
+    if (faults->shifted) {
+        angle_rev += sensors->encoder.shift_rev;
+    }
+    return angle_rev;
 }
 
 static double counts_per_rev(const sensors_t *sensors) {
@@ -210,14 +243,59 @@ static uint32_t edge_age_ticks(const sensors_t *sensors, const plant_t *plant) {
     return ticks >= (double)HAL_ENCODER_AGE_MAX_TICKS ? HAL_ENCODER_AGE_MAX_TICKS : (uint32_t)(fmax(ticks, 0.0) + 0.5);
 }
 
+/* Shift of the reading at a latch, from the faults that move it. */
+static double shift_rev(sensors_t *sensors, const plant_t *plant) {
+    const sensors_encoder_faults_t *faults = &sensors->encoder.faults;
+    const double slipped_s = (double)(plant->time_ns - sensors->encoder.slip_from_ns) * 1e-9;
+    const double turns = fabs(plant->rotor_angle_rad - sensors->encoder.losing_from_rad) / REVOLUTION_RAD;
+    double shift_deg = faults->jump_deg + faults->slip_deg_s * slipped_s;
+    if (faults->noise_deg > 0.0) {
+        shift_deg += faults->noise_deg * next_gaussian(&sensors->encoder.random_state);
+    }
+    return shift_deg / 360.0 - floor(turns * faults->lost_counts_per_turn) / counts_per_rev(sensors);
+}
+
+static uint32_t counts_of(const sensors_t *sensors, int64_t position) {
+    const uint64_t revolution = UINT64_C(1) << sensors->encoder_bits;
+    const uint64_t jump = sensors->encoder_fault == SENSORS_ENCODER_JUMP ? revolution / 2 : 0;
+    return (uint32_t)(((uint64_t)position + jump) & (revolution - 1));
+}
+
+void sensors_set_encoder_faults(sensors_t *sensors, const plant_t *plant, const sensors_encoder_faults_t *faults) {
+    const sensors_encoder_faults_t before = sensors->encoder.faults;
+    const double reading = reading_rev(sensors, plant->rotor_angle_rad);
+    if (faults->stuck && !before.stuck) {
+        sensors->encoder_last_counts = counts_of(sensors, position_of(sensors, reading));
+    }
+    sensors->encoder.faults = *faults;
+    sensors->encoder.faults.shifted = faults->jump_deg != 0.0 || faults->slip_deg_s != 0.0 || faults->noise_deg > 0.0 ||
+                                      faults->lost_counts_per_turn > 0.0;
+    if (faults->reversed && !before.reversed) {
+        sensors->encoder.reversed_at_rev = reading - (before.shifted ? sensors->encoder.shift_rev : 0.0);
+    }
+    if (before.slip_deg_s == 0.0) {
+        sensors->encoder.slip_from_ns = plant->time_ns;
+    }
+    if (before.lost_counts_per_turn == 0.0) {
+        sensors->encoder.losing_from_rad = plant->rotor_angle_rad;
+    }
+    sensors->encoder.shift_rev = shift_rev(sensors, plant);
+}
+
 void sensors_sample_encoder(sensors_t *sensors, const plant_t *plant, hal_encoder_sample_t *sample) {
-    if (sensors->encoder_fault == SENSORS_ENCODER_FROZEN) {
+    if (sensors->encoder.faults.no_answer) {
+        sensors->latched = false;
+        *sample = (hal_encoder_sample_t){.counts = (uint32_t)((UINT64_C(1) << sensors->encoder_bits) - 1)};
+        return;
+    }
+    if (sensors->encoder.faults.shifted) {
+        sensors->encoder.shift_rev = shift_rev(sensors, plant);
+    }
+    if (sensors->encoder_fault == SENSORS_ENCODER_FROZEN || sensors->encoder.faults.stuck) {
         sensors->latched = false; /* motion in the meantime has no edges */
     } else {
-        const uint64_t revolution = UINT64_C(1) << sensors->encoder_bits;
         const int64_t position = position_of(sensors, reading_rev(sensors, plant->rotor_angle_rad));
-        const uint64_t jump = sensors->encoder_fault == SENSORS_ENCODER_JUMP ? revolution / 2 : 0;
-        sensors->encoder_last_counts = (uint32_t)(((uint64_t)position + jump) & (revolution - 1));
+        sensors->encoder_last_counts = counts_of(sensors, position);
         if (sensors->encoder_edges) {
             capture_edges(sensors, plant, position);
         }

@@ -37,12 +37,33 @@ typedef enum {
     SENSORS_ENCODER_JUMP = 2
 } sensors_encoder_fault_t;
 
+/* Fault of one analogue input; all zero: none. */
+typedef struct {
+    bool held; /* the converter reads `code`, at most its largest count */
+    uint16_t code;
+    bool scaled; /* gain and offset (in the sensor's unit) after those of all sensors, before noise */
+    double gain, offset;
+} sensors_input_fault_t;
+
+/* Faults of the encoder, several at once; all zero: none. `stuck`: the count of the instant at which it was set;
+ * `no_answer`: all bits are 1. Neither has edges. The others change the angle reading, and with it the edges. */
+typedef struct {
+    bool stuck, no_answer;
+    bool reversed;               /* from the reading at which it was set */
+    double jump_deg, noise_deg;  /* noise: standard deviation, anew at each latch */
+    double slip_deg_s;           /* from the time at which it was set */
+    double lost_counts_per_turn; /* from the angle at which it was set, in either direction */
+    bool shifted;                /* set by sensors_set_encoder_faults */
+} sensors_encoder_faults_t;
+
 typedef struct {
     /* Settings; write at any time. */
     sensor_errors_t errors; /* the caller of sensors_hold_currents implements the delay */
     sensors_encoder_fault_t encoder_fault;
     double encoder_offset_deg; /* mechanical */
     bool encoder_edges;        /* the board captures edges; false after sensors_init */
+    sensors_input_fault_t current_fault[HAL_PHASES_MAX], dc_link_fault;
+    unsigned current_line[HAL_PHASES_MAX]; /* phase whose sensor the input of a phase is connected to */
 
     /* Currents that are converted instead of the present ones while `currents_held`; clear it to return to those. */
     bool currents_held;
@@ -60,6 +81,11 @@ typedef struct {
     bool latched; /* the members below are those of the previous latch */
     double latch_time_ns, latch_angle_rad, latch_speed_rad_s;
     uint64_t random_state;
+    struct {
+        sensors_encoder_faults_t faults;
+        uint64_t random_state, slip_from_ns;
+        double reversed_at_rev, losing_from_rad, shift_rev;
+    } encoder;
 } sensors_t;
 
 /* Initialises sensors with these errors and without faults. encoder_bits 8..32, 0 means ideal (32); adc_bits 12..16.
@@ -73,6 +99,9 @@ void sensors_hold_currents(sensors_t *sensors, const plant_t *plant);
 /* Converts the held currents, or else the present ones, and the present DC-link voltage and load torque; unused phases
  * read 0. With noise, draws one random number per phase. */
 void sensors_sample_adc(sensors_t *sensors, const plant_t *plant, hal_adc_sample_t *sample);
+
+/* Changes the faults of the encoder at the time of the plant. */
+void sensors_set_encoder_faults(sensors_t *sensors, const plant_t *plant, const sensors_encoder_faults_t *faults);
 
 /* Latches the encoder. Call it in each control period: edges are found between two latches. Fault frozen: the count
  * latched last; jump: offset by half a revolution while it is set. */

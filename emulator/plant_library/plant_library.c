@@ -1,6 +1,6 @@
 /* Plant for callers without the layout of plant_t, such as ctypes in Python: only in libsalient_plant.so. Complements
- * plant_set_switches, plant_open_all, plant_advance, plant_observe and plant_set_step_factor, which have plain
- * arguments, to the whole interface of plant.h. */
+ * plant_set_switches, plant_open_all, plant_advance, plant_observe, plant_set_step_factor, plant_set_faults and
+ * plant_lock, which have plain arguments, to the whole interface of plant.h. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -19,6 +19,7 @@ typedef struct {
     double bus_voltage_V;
     double energy_converter_J, energy_supplied_J, energy_source_J, energy_chopper_J;
     double link_energy_J;
+    double energy_fault_J;
 } plant_library_state_t;
 
 plant_t *plant_library_create(const machine_t *machine, double initial_angle_rad);
@@ -67,7 +68,7 @@ void plant_library_read(const plant_t *plant, plant_library_state_t *state) {
     state->rotor_angle_rad = plant->rotor_angle_rad;
     state->torque_Nm = plant_torque_Nm(plant);
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-        state->current_A[phase] = plant->current_A[phase];
+        state->current_A[phase] = plant_current_A(plant, phase);
         state->flux_linkage_Wb[phase] = plant_flux_linkage_Wb(plant, phase);
     }
     state->energy_drawn_J = plant->energy_drawn_J;
@@ -83,6 +84,7 @@ void plant_library_read(const plant_t *plant, plant_library_state_t *state) {
     state->energy_source_J = plant->energy_source_J;
     state->energy_chopper_J = plant->energy_chopper_J;
     state->link_energy_J = plant_link_energy_J(plant);
+    state->energy_fault_J = plant->energy_fault_J;
 }
 
 /* magnetics_evaluate for a machine. */

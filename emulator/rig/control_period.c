@@ -27,6 +27,9 @@ static void call(rig_t *rig, board_context_t context, void (*function)(void *)) 
 
 /* A drive that lost its power at an operation of its memory starts again. */
 static void call_background(rig_t *rig) {
+    if (rig->background_hung) {
+        return;
+    }
     call(rig, BOARD_BACKGROUND, rig->firmware.background);
     if (rig->board.nvm.power_lost) {
         rig_reset_drive(rig);
@@ -51,11 +54,16 @@ void control_period_hold_event(void *context, uint64_t now_ns) {
 
 void control_period_start_event(void *context, uint64_t now_ns) {
     rig_t *rig = context;
-    const bool busy = now_ns < rig->interrupt_end_ns;
+    const bool lost = rig->interrupts_lost && now_ns >= rig->interrupt_end_ns;
+    const bool busy = lost || now_ns < rig->interrupt_end_ns;
     plant_advance(&rig->plant, now_ns);
     board_start_period(&rig->board, busy);
     rig->scheduler.due_ns[EVENT_CONTROL] = now_ns + rig->period_ns;
     control_period_schedule_hold(rig);
+    if (lost) {
+        call_background(rig);
+        bus_start(rig);
+    }
     if (busy) {
         return;
     }

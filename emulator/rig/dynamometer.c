@@ -11,7 +11,29 @@ static bool is_free(double speed_rpm) {
     return speed_rpm == rig_set_held_speed_rpm_decode(RIG_SET_HELD_SPEED_RPM_FREE_CHOICE);
 }
 
+void dynamometer_init(rig_t *rig) {
+    rig->held_speed_rpm = rig_set_held_speed_rpm_decode(RIG_SET_HELD_SPEED_RPM_FREE_CHOICE);
+    rig->shaft_locked = false;
+}
+
+void dynamometer_lock(rig_t *rig, bool locked) {
+    plant_advance(&rig->plant, rig->board.time_ns);
+    if (locked && !rig->shaft_locked) {
+        plant_lock(&rig->plant);
+        rig->scheduler.due_ns[EVENT_DYNAMOMETER] = SCHEDULER_NEVER;
+    }
+    const bool unlocks = rig->shaft_locked && !locked;
+    rig->shaft_locked = locked;
+    if (unlocks) {
+        dynamometer_set_speed(rig, rig->held_speed_rpm);
+    }
+}
+
 void dynamometer_set_speed(rig_t *rig, double speed_rpm) {
+    rig->held_speed_rpm = speed_rpm;
+    if (rig->shaft_locked) {
+        return;
+    }
     plant_t *plant = &rig->plant;
     uint64_t *due_ns = &rig->scheduler.due_ns[EVENT_DYNAMOMETER];
     plant_advance(plant, rig->board.time_ns);

@@ -15,6 +15,12 @@
 /* The bench variable of this name, from the present time on. */
 void dynamometer_set_speed(rig_t *rig, double speed_rpm);
 
+/* A free shaft that is not locked. */
+void dynamometer_init(rig_t *rig);
+
+/* Locks the shaft at once, or unlocks it: then held_speed_rpm is as it was last set. */
+void dynamometer_lock(rig_t *rig, bool locked);
+
 /* Handler of EVENT_DYNAMOMETER; context is the rig. */
 void dynamometer_event(void *context, uint64_t now_ns);
 

@@ -61,7 +61,7 @@ static void apply(rig_t *rig) {
     const uint64_t now_ns = rig->board.time_ns;
     const double base = base_Nm(rig);
     plant_advance(&rig->plant, now_ns);
-    rig->plant.load_torque_Nm = base + sine_Nm(rig) + profile_Nm(rig);
+    rig->plant.load_torque_Nm = rig->load.dropped ? 0.0 : base + sine_Nm(rig) + profile_Nm(rig);
     const bool moves = base != rig->load.torque_Nm || rig->load.sine_amplitude_Nm != 0.0 || rig->load.profile_Nm != 0.0;
     rig->scheduler.due_ns[EVENT_LOAD] = moves ? now_ns + LOAD_STEP_NS : SCHEDULER_NEVER;
 }
@@ -106,6 +106,11 @@ void load_set_sine_frequency(rig_t *rig, double frequency_Hz) {
 
 void load_set_profile(rig_t *rig, double torque_Nm) {
     rig->load.profile_Nm = torque_Nm;
+    apply(rig);
+}
+
+void load_drop(rig_t *rig, bool dropped) {
+    rig->load.dropped = dropped;
     apply(rig);
 }
 

@@ -24,6 +24,9 @@ void load_set_sine_amplitude(rig_t *rig, double amplitude_Nm);
 void load_set_sine_frequency(rig_t *rig, double frequency_Hz);
 void load_set_profile(rig_t *rig, double torque_Nm);
 
+/* Takes the load off the shaft from the present time on, or puts it on again; its ramp, sine and profile go on. */
+void load_drop(rig_t *rig, bool dropped);
+
 /* RIG_LOAD_PROFILE: one value of the profile, from the next step on; ignored unless index < values <= 256. */
 void load_set_profile_value(rig_t *rig, unsigned values, unsigned index, double value);
 

@@ -3,14 +3,18 @@
 #include "rig/bus_events.h"
 #include "rig/control_period.h"
 #include "rig/dynamometer.h"
+#include "rig/faults.h"
 #include "rig/load.h"
 #include "rig/server.h"
 #include "rig/stimulus.h"
+#include "rig/supply.h"
 
 #define TRUTH_PERIOD_DEFAULT_NS UINT64_C(1000000)
 
 static const scheduler_handler_t handlers[EVENT_COUNT] = {
     [EVENT_BENCH_VARIABLE] = stimulus_event,
+    [EVENT_FAULT] = faults_event,
+    [EVENT_SUPPLY] = supply_event,
     [EVENT_LOAD] = load_event,
     [EVENT_DYNAMOMETER] = dynamometer_event,
     [EVENT_CAN] = bus_event,
@@ -36,7 +40,11 @@ void rig_init(rig_t *rig, const rig_config_t *config) {
     rig->scheduler.due_ns[EVENT_TRUTH] = config->drive_only ? SCHEDULER_NEVER : TRUTH_PERIOD_DEFAULT_NS;
     rig->interrupt_time_ns = rig->interrupt_end_ns = 0;
     rig->stimuli.count = 0;
+    rig->interrupts_lost = rig->background_hung = false;
     load_init(rig);
+    supply_init(rig);
+    dynamometer_init(rig);
+    faults_init(rig);
     server_init(rig);
 }
 

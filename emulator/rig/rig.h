@@ -84,7 +84,23 @@ typedef struct {
     double profile_Nm; /* of the value 1 */
     unsigned profile_values;
     double profile[RIG_LOAD_PROFILE_MAX]; /* over one turn */
+    bool dropped;                         /* no load, whatever the members above */
 } load_t;
+
+typedef struct {
+    double voltage_V; /* supply_voltage_V */
+    double factor;    /* of a fault */
+    double ripple_V;
+    uint64_t ripple_start_ns;
+} supply_t;
+
+#define RIG_FAULT_KINDS_MAX 64
+
+/* A fault of one kind at one place. */
+typedef struct {
+    bool present;
+    double value; /* of its attribute, in the DBC's unit */
+} fault_presence_t;
 
 /* Large: static or on the heap. */
 typedef struct {
@@ -101,8 +117,14 @@ typedef struct {
     uint64_t interrupt_time_ns, interrupt_end_ns; /* triggers before the end of the last interrupt are lost */
     uint64_t truth_period_ns;
     stimulus_queue_t stimuli;
-    load_t load;                  /* load.c */
-    double held_speed_rad_s;      /* dynamometer.c: where its acceleration ends */
+    load_t load;             /* load.c */
+    supply_t supply;         /* supply.c */
+    double held_speed_rpm;   /* dynamometer.c: as set */
+    double held_speed_rad_s; /* where its acceleration ends */
+    bool shaft_locked;
+    stimulus_queue_t fault_changes;                                  /* faults.c */
+    fault_presence_t faults[RIG_FAULT_KINDS_MAX][HAL_PHASES_MAX][2]; /* by kind, phase and leg */
+    bool interrupts_lost, background_hung;                           /* control_period.c */
     rig_run_t runs[RIG_RUNS_MAX]; /* server.c, by time, equal times in the order of arrival */
     unsigned run_count;
     uint64_t stop_checked_ns;

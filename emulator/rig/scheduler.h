@@ -12,6 +12,8 @@
 /* In the order of handling at equal times. */
 typedef enum {
     EVENT_BENCH_VARIABLE, /* a bench variable changes (RIG_SET) */
+    EVENT_FAULT,          /* a fault begins or ends (RIG_FAULT) */
+    EVENT_SUPPLY,         /* a supply with ripple takes its next step */
     EVENT_LOAD,           /* a load that moves takes its next step */
     EVENT_DYNAMOMETER,    /* the shaft has the speed at which it is held */
     EVENT_CAN,            /* the CAN bus: a frame is complete, or the next one may start */

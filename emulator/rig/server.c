@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "rig/bus_events.h"
+#include "rig/faults.h"
 #include "rig/load.h"
 #include "rig/stimulus.h"
 #include "rig_codec.h"
@@ -81,6 +82,16 @@ static void take_set(rig_t *rig, const uint8_t *data) {
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_EMULATOR, &frame);
 }
 
+static void take_fault(rig_t *rig, const uint8_t *data) {
+    transport_frame_t frame = {
+        .size = CAN_MTU, .classic = {.can_id = RIG_FAULT_REPLY_FRAME_ID | CAN_EFF_FLAG, .len = RIG_FAULT_REPLY_LENGTH}};
+    memcpy(frame.classic.data, data, RIG_FAULT_REPLY_LENGTH); /* kind, place and time of the request */
+    frame.classic.data[1] &= 0x0F;
+    frame.classic.data[2] = faults_receive(rig, data);
+    frame.classic.data[3] = 0;
+    transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_EMULATOR, &frame);
+}
+
 static void take_load_profile(rig_t *rig, const uint8_t *data) {
     struct rig_load_profile_t message;
     rig_load_profile_unpack(&message, data, RIG_LOAD_PROFILE_LENGTH);
@@ -121,6 +132,8 @@ static bool take(void *context, uint32_t client, const transport_frame_t *frame)
             take_run_until(rig, client, frame->classic.data);
         } else if (identifier == RIG_SET_FRAME_ID && frame->classic.len == RIG_SET_LENGTH) {
             take_set(rig, frame->classic.data);
+        } else if (identifier == RIG_FAULT_FRAME_ID && frame->classic.len == RIG_FAULT_LENGTH) {
+            take_fault(rig, frame->classic.data);
         } else if (identifier == RIG_LOAD_PROFILE_FRAME_ID && frame->classic.len == RIG_LOAD_PROFILE_LENGTH) {
             take_load_profile(rig, frame->classic.data);
         }

@@ -7,6 +7,7 @@
 #include "rig/control_period.h"
 #include "rig/dynamometer.h"
 #include "rig/load.h"
+#include "rig/supply.h"
 #include "rig_codec.h"
 
 #define NS_PER_US UINT64_C(1000)
@@ -23,11 +24,6 @@ typedef struct {
     { .gain = offsetof(plant_gains_t, field) + 1 }
 #define MEMBER(field)                                                                                                  \
     { .member = offsetof(rig_t, field) + 1 }
-
-static void set_supply_voltage(rig_t *rig, double voltage_V) {
-    plant_advance(&rig->plant, rig->board.time_ns);
-    plant_set_supply_voltage(&rig->plant, voltage_V);
-}
 
 static void set_encoder_fault(rig_t *rig, double fault) {
     rig->sensors.encoder_fault = (sensors_encoder_fault_t)fault;
@@ -111,7 +107,7 @@ static void set_babble_length(rig_t *rig, double length) {
 
 static const target_t targets[BENCH_VARIABLE_COUNT] = {
     [BENCH_VARIABLE_LOAD_TORQUE_NM] = {.set = load_set_torque},
-    [BENCH_VARIABLE_SUPPLY_VOLTAGE_V] = {.set = set_supply_voltage},
+    [BENCH_VARIABLE_SUPPLY_VOLTAGE_V] = {.set = supply_set_voltage},
     [BENCH_VARIABLE_ENCODER_FAULT] = {.set = set_encoder_fault},
     [BENCH_VARIABLE_INTERRUPT_TIME_US] = {.set = set_interrupt_time},
     [BENCH_VARIABLE_CURRENT_SENSOR_GAIN] = MEMBER(sensors.errors.current_gain),

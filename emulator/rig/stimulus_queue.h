@@ -1,4 +1,4 @@
-/* Changes of bench variables that wait for their time. */
+/* Changes of bench variables, or of faults, that wait for their time. */
 #ifndef RIG_STIMULUS_QUEUE_H
 #define RIG_STIMULUS_QUEUE_H
 
@@ -10,7 +10,7 @@
 
 typedef struct {
     uint64_t at_ns;
-    unsigned variable; /* BENCH_VARIABLE_* */
+    unsigned variable; /* BENCH_VARIABLE_*, or kind and place of a fault */
     double value;      /* in the DBC's unit */
 } stimulus_t;
 

@@ -16,6 +16,13 @@ static uint8_t *begin(transport_frame_t *frame, canid_t identifier) {
     return frame->classic.data;
 }
 
+void truth_pack_fault(unsigned kind, unsigned phase, unsigned leg, bool present, transport_frame_t *frame) {
+    const struct rig_truth_fault_t fault = {
+        .kind = (uint8_t)kind, .phase = (uint8_t)phase, .leg = (uint8_t)leg, .present = present};
+    rig_truth_fault_pack(begin(frame, RIG_TRUTH_FAULT_FRAME_ID), &fault, RIG_TRUTH_FAULT_LENGTH);
+    frame->classic.len = RIG_TRUTH_FAULT_LENGTH;
+}
+
 void truth_pack(const plant_t *plant, transport_frame_t frames[TRUTH_FRAMES]) {
     struct rig_truth_motion_t motion;
     motion.speed_rpm = rig_truth_motion_speed_rpm_encode(plant->speed_rad_s * RPM_PER_RAD_S);
@@ -23,10 +30,10 @@ void truth_pack(const plant_t *plant, transport_frame_t frames[TRUTH_FRAMES]) {
     rig_truth_motion_pack(begin(&frames[0], RIG_TRUTH_MOTION_FRAME_ID), &motion, 8);
 
     struct rig_truth_currents_t currents;
-    rig_truth_currents_set_physical_current_a_a(&currents, plant->current_A[0]);
-    rig_truth_currents_set_physical_current_b_a(&currents, plant->current_A[1]);
-    rig_truth_currents_set_physical_current_c_a(&currents, plant->current_A[2]);
-    rig_truth_currents_set_physical_current_d_a(&currents, plant->current_A[3]);
+    rig_truth_currents_set_physical_current_a_a(&currents, plant_current_A(plant, 0));
+    rig_truth_currents_set_physical_current_b_a(&currents, plant_current_A(plant, 1));
+    rig_truth_currents_set_physical_current_c_a(&currents, plant_current_A(plant, 2));
+    rig_truth_currents_set_physical_current_d_a(&currents, plant_current_A(plant, 3));
     for (uint8_t part = 0; part < 2; part++) {
         currents.part = part;
         rig_truth_currents_pack(begin(&frames[1 + part], RIG_TRUTH_CURRENTS_FRAME_ID), &currents, 8);

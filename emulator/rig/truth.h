@@ -11,4 +11,7 @@
  * signal; the rotor angle is wrapped to 0..360 deg. */
 void truth_pack(const plant_t *plant, transport_frame_t frames[TRUTH_FRAMES]);
 
+/* Packs RIG_TRUTH_FAULT: a fault of this kind (rig.dbc) begins or ends. */
+void truth_pack_fault(unsigned kind, unsigned phase, unsigned leg, bool present, transport_frame_t *frame);
+
 #endif

@@ -135,6 +135,7 @@ class State(ctypes.Structure):
         ("energy_source_J", ctypes.c_double),
         ("energy_chopper_J", ctypes.c_double),
         ("link_energy_J", ctypes.c_double),
+        ("energy_fault_J", ctypes.c_double),
     ]
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -15,6 +16,7 @@ from cantools.database.can import Signal
 from cantools.database.namedsignalvalue import NamedSignalValue
 
 from salient.bench.client import Client, unknown_attribute
+from salient.bench.faults import FaultError, fault_kind, fault_signals
 from salient.bus.signals import rig_database, signal_range
 
 _AT_US_MAX = 2**32 - 1
@@ -127,10 +129,63 @@ class Rig:
             data = message.encode({"values": len(values), "index": index, "value": value})
             self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
 
+    def fault(self, kind: str, *, duration_s: float | None = None, **arguments: Any) -> Fault:
+        """Begins a fault: its places (phase, leg) and its attribute by name, emulator/FAULTS.md. With duration_s it
+        ends by itself. FaultError."""
+        signals = fault_signals(kind, arguments, True, self._at_us)
+        start_us = self._at_us or -(-self._client.time_ns // 1000)
+        if duration_s is not None and not 1e-6 <= duration_s <= (_AT_US_MAX - start_us) / 1e6:
+            raise FaultError(f"{kind}: duration_s {duration_s:g}: must be at least 1e-06 and end before "
+                             f"{_AT_US_MAX / 1e6:g} s")
+        self._change_fault(signals)
+        fault = Fault(self, kind, {name: arguments[name] for name in ("phase", "leg") if name in arguments})
+        if duration_s is not None:
+            fault.clear(at_s=start_us / 1e6 + duration_s)
+        return fault
+
+    def clear_fault(self, kind: str, **places: str) -> None:
+        """Ends a fault at its places; one that is not present stays absent. FaultError."""
+        arguments = fault_kind(kind).arguments
+        for name in places:
+            if name not in ("phase", "leg") or name not in arguments:
+                raise FaultError(f"{kind} has no place {name}")
+        self._change_fault(fault_signals(kind, places, False, self._at_us))
+
+    def _change_fault(self, signals: dict[str, Any]) -> None:
+        kind, at_us = signals["kind"], signals["at_us"]
+        if not 0 <= at_us <= _AT_US_MAX:
+            raise FaultError(f"{kind} at {at_us} us: must be 0 to {_AT_US_MAX} us")
+        message = rig_database().get_message_by_name("RIG_FAULT")
+        data = message.encode(signals)
+        self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
+        reply = rig_database().get_message_by_name("RIG_FAULT_REPLY")
+        answer = self._client.receive_until(
+            lambda m: m.arbitration_id == reply.frame_id and m.is_extended_id and m.data[0] == data[0]
+        )
+        status = reply.decode_simple(bytes(answer.data))["status"]
+        if status != "done":
+            places = "".join(f" {value}" for name, value in signals.items()
+                             if name in (f"{kind}_phase", f"{kind}_leg"))
+            raise FaultError(f"{kind}{places} at {at_us} us: {status}")
+
     @staticmethod
     def describe() -> str:
         """One line per bench variable: name, range with unit, meaning."""
         return "\n".join(f"{s.name}: {_range(s.name)}. {s.comment}" for s in bench_variables().values())
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault that has been asked for; places: phase and leg."""
+
+    rig: Rig
+    kind: str
+    places: dict[str, str]
+
+    def clear(self, at_s: float | None = None) -> None:
+        """Ends it, now or at a virtual time (rounded to microseconds)."""
+        rig = Rig(self.rig._client) if at_s is None else self.rig.at(at_s)
+        rig.clear_fault(self.kind, **self.places)
 
 
 def _variable(name: str) -> Signal:

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Self
+from typing import Any, Self
 
 import can
 from cantools.database.can import Database
 
 from salient.bench.client import KnownAttributes
 from salient.bench.drive import Drive, OtherDatabase, ParameterRow
-from salient.bench.rig import Rig
+from salient.bench.rig import Fault, Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
 from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.dbc import database_hash
@@ -127,6 +127,14 @@ class Session(KnownAttributes):
     def at(self, time_s: float) -> Rig:
         """The bench variables at a virtual time: session.at(0.13).load_torque_Nm = 8."""
         return self.rig.at(time_s)
+
+    def fault(self, kind: str, *, duration_s: float | None = None, **arguments: Any) -> Fault:
+        """Begins a fault now: session.fault("winding_open", phase="b"). See Rig.fault."""
+        return self.rig.fault(kind, duration_s=duration_s, **arguments)
+
+    def clear_fault(self, kind: str, **places: str) -> None:
+        """Ends a fault now. See Rig.clear_fault."""
+        self.rig.clear_fault(kind, **places)
 
     def run_for(self, duration_s: float) -> None:
         """Lets virtual time pass; commands go out as they fall due."""

@@ -27,6 +27,13 @@
     torque_Nm = 8.0
     profile_Nm = 2.0                        # optional: with a load_profile, the torque of its value 1
 
+    [[fault]]                               # of the test bench, with its places and attribute: emulator/FAULTS.md
+    kind = "switch_open"
+    phase = "b"
+    leg = "low"
+    at_s = 0.2
+    duration_s = 0.01                       # optional: without it to the end
+
     [record]                                # the true state; without the table nothing is recorded
     step_us = 1.0
     from_s = 0.0
@@ -51,6 +58,7 @@ from pydantic import create_model
 from salient.bench.bench import Bench
 from salient.bench.drive import READY_TIMEOUT_S, DriveError, write_request
 from salient.bench.emulator import parameter_table
+from salient.bench.faults import FaultError, attribute_names, fault_signals
 from salient.bench.rig import bench_variables, variable_range
 from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database, signal_range
@@ -92,6 +100,16 @@ class LoadStep:
 
 
 @dataclass(frozen=True)
+class FaultStep:
+    """A fault of the test bench from at_s on, for duration_s, None: to the end. arguments: places and attribute."""
+
+    kind: str
+    at_s: float
+    duration_s: float | None = None
+    arguments: dict[str, float | str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Record:
     """Recording of the true state every step_us microseconds from from_s on."""
 
@@ -112,6 +130,7 @@ class Scenario(Conditions):
     torque: tuple[TorqueStep, ...] = ()
     load: tuple[LoadStep, ...] = ()
     load_profile: str | None = None
+    fault: tuple[FaultStep, ...] = ()
     record: Record | None = None
 
 
@@ -169,6 +188,9 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
                 bench.at(load.at_s).load_torque_Nm = load.torque_Nm
                 if load.profile_Nm is not None:
                     bench.at(load.at_s).load_profile_Nm = load.profile_Nm
+            for fault_step in scenario.fault:
+                bench.at(fault_step.at_s).fault(fault_step.kind, duration_s=fault_step.duration_s,
+                                                **fault_step.arguments)
             steps: list[SpeedStep | TorqueStep] = [*scenario.speed, *scenario.torque]
             for step in sorted(steps, key=lambda step: step.at_s):
                 _advance(bench, step.at_s)
@@ -328,6 +350,35 @@ class _LoadTable(Table):
     profile_Nm: Annotated[float | None, number(-200.0, 200.0)] = None
 
 
+_FAULT_STEP = ("kind", "at_s", "duration_s")
+
+
+@lru_cache
+def _fault_table() -> type[Table]:
+    """The model of a [[fault]]: any place and any attribute; which of them a kind has is checked afterwards."""
+    fields: dict[str, Any] = {
+        "kind": (str, ...),
+        "at_s": (_Time, ...),
+        "duration_s": (Annotated[float | None, number(1e-6, 3600.0)], None),
+        **dict.fromkeys(("phase", "leg", *attribute_names()), (str | float | None, None)),
+    }
+    return create_model("fault", __base__=Table, **fields)
+
+
+def _fault_steps(path: Path, tables: list[Any]) -> tuple[FaultStep, ...]:
+    """UsageError for a fault, a place or an attribute that the test bench does not know."""
+    steps = []
+    for table in tables:
+        values = table.model_dump(exclude_none=True)
+        arguments = {name: value for name, value in values.items() if name not in _FAULT_STEP}
+        try:
+            fault_signals(table.kind, arguments, True, 0)
+        except FaultError as error:
+            raise UsageError(f"{path}: fault: {error}") from None
+        steps.append(FaultStep(table.kind, table.at_s, table.duration_s, arguments))
+    return tuple(steps)
+
+
 class _RecordTable(Table):
     step_us: Annotated[float, number(0.1, 1e6)] = Record.step_us
     from_s: _Time = Record.from_s
@@ -353,6 +404,7 @@ def _scenario_file() -> type[Table]:
         "torque": (list[_TorqueTable], []),
         "load": (list[_LoadTable], []),
         "load_profile": (str, None),
+        "fault": (list[_fault_table()], []),  # type: ignore[misc]
         "record": (_RecordTable, None),
     }
     return create_model("scenario", __base__=Table, **fields)
@@ -399,6 +451,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
         "torque": tuple(TorqueStep(**step.model_dump()) for step in file.torque),
         "load": tuple(LoadStep(**step.model_dump()) for step in file.load),
         "load_profile": profile,
+        "fault": _fault_steps(path, file.fault),
         "record": None if file.record is None else Record(**file.record.model_dump()),
     }
     return [Scenario(controller=controller, **common) for controller in file.controllers]

@@ -1,0 +1,214 @@
+#include "plant/faulted.h"
+
+#include <math.h>
+
+/* As in plant.c: below this a current that decays exponentially counts as zero. */
+#define CURRENT_NEGLIGIBLE_A 1e-9
+
+/* Devices that carry the current of one end of a winding. */
+typedef struct {
+    bool rail; /* the end is where a switch that is on would put it */
+    double drop_V, resistance_ohm, breakdown_V;
+} end_t;
+
+static double breakdown_V(const plant_t *plant) {
+    return FAULTED_BREAKDOWN * plant->machine->supply_voltage_V;
+}
+
+static end_t end_of(const plant_t *plant, bool on, bool diode_open) {
+    const converter_t *converter = &plant->machine->converter;
+    if (on) {
+        return (end_t){true, converter->switch_drop_V, converter->switch_resistance_ohm, 0.0};
+    }
+    if (!diode_open) {
+        return (end_t){false, converter->diode_drop_V, converter->diode_resistance_ohm, 0.0};
+    }
+    return (end_t){true, 0.0, converter->switch_resistance_ohm, breakdown_V(plant)};
+}
+
+static bool bit(unsigned mask, unsigned phase) {
+    return (mask >> phase) & 1u;
+}
+
+/* Flux rate of a phase, at which a current of its turns and of its terminals follow. */
+static double flux_rate_V(const plant_path_t *path, double bus_voltage_V, double current_A) {
+    return path->link_gain * bus_voltage_V - path->drop_V - path->resistance_ohm * current_A;
+}
+
+static double terminal_A(const plant_path_t *path, double bus_voltage_V, double current_A) {
+    return path->terminal_gain * current_A + path->terminal_S * flux_rate_V(path, bus_voltage_V, current_A);
+}
+
+/* Path of a phase while current flows at its terminals. */
+static plant_path_t conducting_path(const plant_t *plant, unsigned phase) {
+    const plant_faults_t *faults = &plant->faults;
+    const unsigned upper = (plant->switches.upper & ~faults->switch_open.upper) | faults->switch_shorted.upper;
+    const unsigned lower = (plant->switches.lower & ~faults->switch_open.lower) | faults->switch_shorted.lower;
+    const end_t ends[2] = {
+        end_of(plant, bit(upper, phase), bit(faults->diode_open.lower, phase)),
+        end_of(plant, bit(lower, phase), bit(faults->diode_open.upper, phase)),
+    };
+    const double shorted = faults->shorted_turns[phase], winding_ohm = plant->winding_ohm;
+    plant_path_t path = {
+        .sign = (double)ends[0].rail + (double)ends[1].rail - 1.0,
+        .device_V = ends[0].drop_V + ends[1].drop_V,
+        .device_ohm = ends[0].resistance_ohm + ends[1].resistance_ohm,
+        .breakdown_V = ends[0].breakdown_V + ends[1].breakdown_V,
+    };
+    if (bit(faults->winding_open, phase)) {
+        path.breakdown_V += breakdown_V(plant);
+    }
+    path.terminal_gain = 1.0 / (1.0 - shorted);
+    path.terminal_S = shorted / (winding_ohm * (1.0 - shorted));
+    const double divider = 1.0 / (1.0 + path.device_ohm * path.terminal_S);
+    path.link_gain = divider * path.sign;
+    path.drop_V = divider * (path.device_V + path.breakdown_V);
+    path.resistance_ohm = divider * (winding_ohm + path.device_ohm * path.terminal_gain);
+    return path;
+}
+
+/* The loop of shorted turns alone. */
+static plant_path_t isolated_path(const plant_t *plant, unsigned phase) {
+    return (plant_path_t){.resistance_ohm = plant->winding_ohm / plant->faults.shorted_turns[phase]};
+}
+
+void faulted_find_conducting(plant_t *plant, integrator_setting_t *setting) {
+    unsigned count = 0;
+    setting->shorted = false;
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        const bool shorted = plant->faults.shorted_turns[phase] > 0.0;
+        const double current_A = plant->current_A[phase];
+        plant_path_t path = conducting_path(plant, phase);
+        const bool driven =
+            path.link_gain * plant->bus_voltage_V > path.drop_V && !bit(plant->faults.winding_open, phase);
+        plant->path[phase] = (plant_path_t){0};
+        if (!driven && current_A < CURRENT_NEGLIGIBLE_A) {
+            plant->current_A[phase] = 0.0;
+            continue;
+        }
+        setting->path[count] = path;
+        setting->isolated[count] = shorted && !driven && terminal_A(&path, plant->bus_voltage_V, current_A) <= 0.0;
+        if (setting->isolated[count]) {
+            path = isolated_path(plant, phase);
+        }
+        plant->path[phase] = path;
+        setting->shorted |= shorted;
+        setting->turns[count] = plant->faults.shorted_turns[phase];
+        setting->phase[count] = phase;
+        setting->driven[count] = driven || shorted; /* the end of its conduction: faulted_distance_to_event */
+        setting->angle_offset_rad[count] = phase * plant->phase_offset_rad;
+        setting->link_sign[count] = path.link_gain;
+        setting->drop_V[count] = path.drop_V;
+        setting->resistance_ohm[count] = path.resistance_ohm;
+        setting->terminal_sign[count] = path.sign;
+        setting->terminal_gain[count] = path.terminal_gain;
+        setting->terminal_S[count] = path.terminal_S;
+        count++;
+    }
+    setting->count = count;
+}
+
+void faulted_find_friction(plant_t *plant, integrator_setting_t *setting) {
+    const double coulomb_Nm = plant->faults.coulomb_Nm, static_Nm = plant->faults.static_Nm;
+    setting->friction_sign = 0.0;
+    setting->stuck = false;
+    if (plant->held || (coulomb_Nm == 0.0 && static_Nm == 0.0)) {
+        return;
+    }
+    double drive = plant->speed_rad_s;
+    if (drive == 0.0) {
+        drive = plant_torque_Nm(plant) - plant->load_torque_Nm;
+        setting->stuck = fabs(drive) <= fmax(coulomb_Nm, static_Nm);
+    }
+    if (setting->stuck) {
+        setting->held = true;
+        setting->held_acceleration_rad_s2 = 0.0;
+    } else {
+        setting->friction_sign = copysign(1.0, drive);
+        setting->load_torque_Nm += setting->friction_sign * coulomb_Nm;
+        setting->ahead_rad = copysign(setting->ahead_rad, drive);
+    }
+}
+
+double faulted_distance_to_event(const integrator_setting_t *setting, const integrator_state_t *state) {
+    double nearest = INFINITY;
+    if (setting->friction_sign != 0.0) {
+        nearest = setting->friction_sign * state->speed_rad_s;
+    }
+    for (unsigned index = 0; index < setting->count; index++) {
+        if (setting->turns[index] > 0.0) {
+            const double at_A = terminal_A(&setting->path[index], state->bus_voltage_V, state->current_A[index]);
+            nearest = fmin(nearest, setting->isolated[index] ? -at_A : at_A);
+        }
+    }
+    return nearest;
+}
+
+double faulted_distance_to_trip(const integrator_setting_t *setting, const integrator_state_t *state) {
+    double nearest_A = INFINITY;
+    for (unsigned index = 0; index < setting->count; index++) {
+        if (setting->terminal_sign[index] >= 0.0 && !setting->isolated[index]) {
+            const double at_A = terminal_A(&setting->path[index], state->bus_voltage_V, state->current_A[index]);
+            nearest_A = fmin(nearest_A, setting->trip_current_A - at_A);
+        }
+    }
+    return nearest_A;
+}
+
+void faulted_add_energies(plant_t *plant, const integrator_setting_t *setting, const integrator_integrals_t *integrals,
+                          double step_s) {
+    const double link_V = plant->bus_voltage_V;
+    const double link_Vs = setting->link ? integrals->link_Vs : link_V * step_s;
+    const double link2_V2s = setting->link ? integrals->link2_V2s : link_V * link_V * step_s;
+    for (unsigned index = 0; index < setting->count; index++) {
+        /* Integrals of current i_m, flux rate e and DC-link voltage Vdc, and of their products. */
+        const double a = setting->link_sign[index], b = setting->drop_V[index], r = setting->resistance_ohm[index];
+        const double i = integrals->charge_As[index], i2 = integrals->current2_A2s[index];
+        const double v_i = setting->link ? integrals->link_J[index] : link_V * i;
+        const double e = a * link_Vs - b * step_s - r * i;
+        const double i_e = a * v_i - b * i - r * i2;
+        const double v_e = a * link2_V2s - b * link_Vs - r * v_i;
+        const double e2 = a * v_e - b * e - r * i_e;
+        /* The same of the current at the terminals. */
+        const double gain = setting->terminal_gain[index], S = setting->terminal_S[index];
+        const double charge_As = gain * i + S * e;
+        const double current2_A2s = gain * gain * i2 + 2.0 * gain * S * i_e + S * S * e2;
+        const double energy_J = setting->terminal_sign[index] * (gain * v_i + S * v_e);
+        if (energy_J > 0.0) {
+            plant->energy_drawn_J += energy_J;
+        } else {
+            plant->energy_returned_J -= energy_J;
+        }
+        const plant_path_t *path = &setting->path[index];
+        const double k = setting->turns[index], winding_ohm = plant->winding_ohm;
+        plant->energy_copper_J += (1.0 - k) * winding_ohm * current2_A2s + k / winding_ohm * e2;
+        plant->energy_converter_J += path->device_V * charge_As + path->device_ohm * current2_A2s;
+        plant->energy_fault_J += path->breakdown_V * charge_As;
+    }
+    if (setting->friction_sign != 0.0) {
+        plant->energy_friction_J += plant->faults.coulomb_Nm * fabs(integrals->angle_rad);
+    }
+}
+
+double faulted_time_constant_s(const plant_t *plant) {
+    const double capacitance_F = plant->machine->dc_link.capacitance_F;
+    double time_constant_s = INFINITY;
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        const double k = plant->faults.shorted_turns[phase];
+        if (k > 0.0) {
+            time_constant_s = fmin(time_constant_s, plant->magnetics.inductance_min_H * k / plant->winding_ohm);
+            if (capacitance_F > 0.0) {
+                time_constant_s = fmin(time_constant_s, capacitance_F * plant->winding_ohm * (1.0 - k) / k);
+            }
+        }
+    }
+    return time_constant_s;
+}
+
+double plant_current_A(const plant_t *plant, unsigned phase) {
+    const double current_A = plant->current_A[phase];
+    if (!plant->faulted || plant->faults.shorted_turns[phase] == 0.0) {
+        return current_A;
+    }
+    return fmax(terminal_A(&plant->path[phase], plant->bus_voltage_V, current_A), 0.0);
+}
