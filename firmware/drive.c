@@ -161,7 +161,9 @@ COLD static void check_slowly(drive_t *drive, uint32_t time_us) {
     } else if (drive->comms.commands.failed) {
         failed |= FAULT_BIT(FAULT_COMMAND_ERROR);
     }
-    drive->control.reported_fault_mask = (uint32_t)failed;
+    if (failed != drive->failed_checks) {
+        drive->failed_checks = drive->control.reported_fault_mask = (uint32_t)failed;
+    }
 }
 
 /* After bus-off a run request is without effect until the sender has withdrawn it: the present command ages until its
@@ -169,7 +171,8 @@ COLD static void check_slowly(drive_t *drive, uint32_t time_us) {
 COLD static void take_command(drive_t *drive) {
     const command_t *command = &drive->comms.command;
     bus_monitor_t *bus = &drive->comms.bus;
-    bus->run_inhibited = bus->run_inhibited && command->request == COMMAND_RUN;
+    /* The request as it was sent: bus-off disarms, and a request to run is published as off. */
+    bus->run_inhibited = bus->run_inhibited && drive->comms.commands.requested.request == COMMAND_RUN;
     if (!bus->run_inhibited) {
         hal_critical_enter(drive->hal);
         drive->command = *command;

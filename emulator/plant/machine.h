@@ -53,7 +53,7 @@ typedef struct {
     dc_link_t dc_link;
     sensor_errors_t sensors;
     sensor_ranges_t ranges;
-    double trip_current_A; /* of the comparators in the gate drivers */
+    double trip_current_A; /* of the comparators in the gate drivers; 0: none */
 } machine_t;
 
 /* Machine of a program that is built for one; generated from the machine file. */

@@ -11,7 +11,9 @@ void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *b
     board->bus = bus;
     board->random_state = seed;
     board->sto_energised[0] = board->sto_energised[1] = true;
-    plant_set_trip(plant, plant->machine->trip_current_A);
+    if (plant->machine->trip_current_A > 0.0) {
+        plant_set_trip(plant, plant->machine->trip_current_A);
+    }
     nvm_init(&board->nvm);
 }
 

@@ -7,7 +7,7 @@
 #include "hal_random.h"
 
 void arming_init(arming_t *arming) {
-    *arming = (arming_t){0};
+    *arming = (arming_t){.changed = true}; /* a sender may take the drive for armed still */
 }
 
 static void end_attempt(arming_t *arming) {

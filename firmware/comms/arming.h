@@ -38,6 +38,7 @@ typedef struct {
 
 typedef enum { ARMING_REFUSED, ARMING_CHALLENGED, ARMING_ARMED } arming_result_t;
 
+/* Not armed, which is to be reported. */
 void arming_init(arming_t *arming);
 
 /* Ends an attempt whose response is overdue. Call it at least once in 35 minutes. [background] */

@@ -117,7 +117,8 @@ static commands_frame_t receive_command(commands_t *commands, uint16_t data_id, 
         break;
     case E2E_WRONG_CHECKSUM:
         return reject_command(commands, &counters->wrong_checksum);
-    case E2E_REPEATED:
+    case E2E_REPEATED: /* duplicated on the way, no evidence of a second sender */
+        return reject(&counters->wrong_counter);
     case E2E_WRONG_SEQUENCE:
     default:
         return reject_command(commands, &counters->wrong_counter);

@@ -9,11 +9,12 @@
  * Second sender: both command messages have one sequence counter, and while the drive is armed the receiver stays with
  * the sender that it followed when it was armed. A frame of another one is invalid, but for the few whose counter is by
  * chance the next; then those of the first are. Every invalid command frame (length, checksum, counter, range) adds
- * COMMANDS_ERROR_STEP to a count, every valid one takes 1 from it; COMMANDS_ERRORS_MAX invalid ones in succession, or
- * among fewer than COMMANDS_ERROR_STEP valid ones, are the fault command_error. Up to two frames lost in succession are
- * no error. After more the sender is out of sequence: the drive ends in a fault, and has to be armed again. A second
- * sender slower than one frame in COMMANDS_ERROR_STEP of the first (2.56 s at 100 frames per second) has no effect but
- * to be counted. */
+ * COMMANDS_ERROR_STEP to a count, every valid one takes 1 from it; COMMANDS_ERRORS_MAX invalid ones in succession,
+ * or among fewer than COMMANDS_ERROR_STEP valid ones, are the fault command_error. Up to two frames lost in
+ * succession are no error; nor is the last accepted frame once more, same counter and same checksum, as a gateway or
+ * a disturbed acknowledgement duplicates it: it is dropped and counted. After more lost ones the sender is out of
+ * sequence: the drive ends in a fault, and has to be armed again. A second sender slower than one frame in
+ * COMMANDS_ERROR_STEP of the first (2.56 s at 100 frames per second) has no effect but to be counted. */
 #ifndef COMMS_COMMANDS_H
 #define COMMS_COMMANDS_H
 

@@ -41,14 +41,20 @@ static bool in_sequence(uint8_t before, uint8_t counter) {
     return step >= 1 && step <= E2E_COUNTER_STEP_MAX;
 }
 
-static void accept(e2e_receiver_t *receiver, uint8_t counter) {
+static uint16_t checksum_of(const uint8_t *bytes) {
+    return (uint16_t)(bytes[0] | bytes[1] << 8);
+}
+
+static e2e_result_t accept(e2e_receiver_t *receiver, const uint8_t *bytes) {
     receiver->synchronised = true;
-    receiver->counter = counter;
+    receiver->counter = bytes[2];
+    receiver->checksum = checksum_of(bytes);
     receiver->candidate_frames = 0;
+    return E2E_ACCEPTED;
 }
 
 bool e2e_checksum_matches(uint16_t data_id, const uint8_t *bytes, size_t length) {
-    return length >= E2E_HEADER_BYTES && (bytes[0] | bytes[1] << 8) == checksum(data_id, bytes, length);
+    return length >= E2E_HEADER_BYTES && checksum_of(bytes) == checksum(data_id, bytes, length);
 }
 
 e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t *bytes, size_t length) {
@@ -57,11 +63,10 @@ e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t
     }
     const uint8_t counter = bytes[2];
     if (!receiver->synchronised || in_sequence(receiver->counter, counter)) {
-        accept(receiver, counter);
-        return E2E_ACCEPTED;
+        return accept(receiver, bytes);
     }
     if (counter == receiver->counter) {
-        return E2E_REPEATED;
+        return checksum_of(bytes) == receiver->checksum ? E2E_REPEATED : E2E_WRONG_SEQUENCE;
     }
     if (receiver->locked) {
         return E2E_WRONG_SEQUENCE;
@@ -72,6 +77,5 @@ e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t
     if (receiver->candidate_frames < E2E_RESYNCHRONISE_FRAMES) {
         return E2E_WRONG_SEQUENCE;
     }
-    accept(receiver, counter);
-    return E2E_ACCEPTED;
+    return accept(receiver, bytes);
 }

@@ -23,14 +23,15 @@
 typedef enum {
     E2E_ACCEPTED,
     E2E_WRONG_CHECKSUM, /* or shorter than the header */
-    E2E_REPEATED,       /* counter of the last accepted frame */
-    E2E_WRONG_SEQUENCE, /* any other increment than 1 to E2E_COUNTER_STEP_MAX */
+    E2E_REPEATED,       /* counter and checksum of the last accepted frame: the same frame once more */
+    E2E_WRONG_SEQUENCE, /* any other increment than 1 to E2E_COUNTER_STEP_MAX, 0 with another checksum included */
 } e2e_result_t;
 
 typedef struct {
     bool locked;               /* set by the caller: no resynchronisation */
     bool synchronised;         /* false: the next frame with a valid checksum is accepted with any counter */
     uint8_t counter;           /* of the last accepted frame */
+    uint16_t checksum;         /* likewise */
     uint8_t candidate_frames;  /* consecutive frames of another sequence, none of the accepted sequence between */
     uint8_t candidate_counter; /* counter of the last of these frames */
 } e2e_receiver_t;

@@ -131,8 +131,10 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
                  const conduction_sample_t *sample) {
     const int32_t torque = fixed_abs(sample->torque_q24);
     const bool voltage_limited = fixed_abs(sample->torque_shortfall_q24) > SHORTFALL_MIN_Q24 + torque / 64;
+    int32_t retract_q30 = voltage_limited ? 0 : parameters->retract_step_q30;
     if (parameters->single_pulse) {
         state->sharing_q15 = above_base_q15(tables, state->place, LEAST_CURRENT_RANGE);
+        retract_q30 >>= state->sharing_q15 > 0 ? ABOVE_BASE_SHIFT : 0;
         state->torque_q24 = smoothed_q24(state, tables->phases, sample);
         const int32_t forward_q15 = feed_forward_q15(&state->pulse, state->torque_q24);
         const int32_t forward_q30 = forward_q15 * (1 << 15);
@@ -143,13 +145,13 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
             state->trim_q30 = 0; /* the largest torque is that of the tables */
         } else if ((state->advance_q30 == ONE_Q30 || (state->braking && state->sharing_q15 > 0)) &&
                    (voltage_limited || state->level_q15 > 0)) {
-            state->trim_q30 += trim_step_q30(&state->pulse, sample);
+            /* Sharing follows the reference at any level that is too high: without a shortfall it returns. */
+            state->trim_q30 += trim_step_q30(&state->pulse, sample) - (forward_q15 == 0 ? retract_q30 : 0);
         }
         state->trim_q30 = fixed_clamp(state->trim_q30, -forward_q30, ONE_Q30 - forward_q30);
         state->level_q15 = forward_q15 + (state->trim_q30 >> 15);
     }
     if (state->level_q15 == 0) {
-        const int32_t retract_q30 = parameters->retract_step_q30 >> (state->sharing_q15 > 0 ? ABOVE_BASE_SHIFT : 0);
         const int32_t step_q30 = voltage_limited ? parameters->advance_step_q30 : -retract_q30;
         state->advance_q30 = fixed_clamp(state->advance_q30 + step_q30, 0, ONE_Q30);
     }

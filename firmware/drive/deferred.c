@@ -223,11 +223,16 @@ static void set_speed_law(const control_parameters_t *parameters, deferred_t *de
     deferred->speed_smc.epsilon_q31 = epsilon_q31 > SPEED_SMC_EPSILON_MIN_Q31 ? epsilon_q31 : SPEED_SMC_EPSILON_MIN_Q31;
 }
 
-/* In single pulse operation the level makes up for the missing torque; above base speed, where the windows stay where
- * there is hardly any shortfall, the offset does. */
-static bool torque_limited(const deferred_t *deferred, const deferred_input_t *input) {
+/* In single pulse operation the level makes the torque that of the reference, and the offset returns to 0: one that
+ * came from the shortfall before would remain. Above base speed, where the windows stay where there is hardly any
+ * shortfall, the offset makes up for it. */
+static void step_torque_offset(const control_parameters_t *parameters, deferred_t *deferred,
+                               const deferred_input_t *input) {
     const conduction_state_t *conduction = &deferred->conduction;
-    return conduction->level_q15 > 0 || (input->torque_shortfall_q24 != 0 && conduction->sharing_q15 == 0);
+    const bool single_pulse = conduction->level_q15 > 0;
+    const bool limited = !single_pulse && input->torque_shortfall_q24 != 0 && conduction->sharing_q15 == 0;
+    torque_offset_step(&parameters->torque_offset, &deferred->torque_offset, input->torque_reference_q24,
+                       single_pulse ? input->torque_reference_q24 : input->torque_sum_q24, limited);
 }
 
 /* What is not urgent, in eight turns: no step takes the time of all. The learning of the phases has half of them,
@@ -242,8 +247,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
             stroke_mean_step(&parameters->stroke_mean, &deferred->stroke_mean, input->electrical,
                              input->load_torque_q24, input->torque_reference_q24, disturbed(parameters, input)) &&
             !deferred->periodic_load.engaged;
-        torque_offset_step(&parameters->torque_offset, &deferred->torque_offset, input->torque_reference_q24,
-                           input->torque_sum_q24, torque_limited(deferred, input));
+        step_torque_offset(parameters, deferred, input);
         moving_load_review(&parameters->moving_load, &deferred->moving_load, input->load_torque_q24,
                            deferred->periodic_load.engaged);
         learn_periodic_load(parameters, deferred, input);

@@ -14,7 +14,7 @@ from salient.bus.signals import drive_database
 pytestmark = pytest.mark.bench_options(controller="traditional")
 
 DRIVE_IDS = frozenset(m.frame_id for m in drive_database().messages if "DRIVE" in m.senders)
-RUN_ENDS_S = 0.1
+RUN_ENDS_S = 0.5
 """Time without a command after which a run ends in the fault command_timeout."""
 MOTION_ID = drive_database().get_message_by_name("DRIVE_MOTION").frame_id
 
@@ -44,6 +44,7 @@ def test_control_is_bit_identical_under_a_babbling_node_of_identifier_0_until_th
     def recorded(name, attack):
         bench = make_bench(controller="salient", record=tmp_path / f"{name}.npy", record_step_ns=5_000,
                            record_from_us=150_000)
+        bench.drive.parameters["command_timeout_ms"] = 100  # the ramp of the torque begins after the record
         running(bench)
         attack(bench)
         bench.advance_to(280_000_000)  # 100 ms after the last command at 0.19 s or a little later: still in run
@@ -87,7 +88,8 @@ def test_frames_of_a_babbling_node_are_in_the_log_at_their_times(bench):
     bench.run_for(0.01)
     bench.rig.babble_load_percent = 100
     bench.rig.babble_length = 0
-    bench.run_for(0.02)
+    for _ in range(20):
+        bench.run_for(0.001)  # what an interface keeps for a receiver is limited
     times = [time_ns for time_ns, m in bench.log if m.arbitration_id == 0 and not m.is_extended_id]
     assert len(times) == pytest.approx(20_000 / 53, abs=4)
     assert {after - before for before, after in itertools.pairwise(times)} == {53_000}

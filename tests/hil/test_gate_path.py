@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from salient.bench.bench import Bench
@@ -23,12 +25,13 @@ def running(bench: Bench, speed_rpm: float = 600, load_Nm: float = 12) -> None:
 def currents_A(bench: Bench, from_s: float = 0.0) -> list[float]:
     """Largest true current at each time since from_s."""
     signals = [bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"] for phase in "abc"]
-    return [max(at) for time_s, *at in zip(signals[0].time_s, *(each.value for each in signals)) if time_s >= from_s]
+    return [max(at) for time_s, *at in zip(
+        signals[0].time_s, *(each.value for each in signals), strict=True) if time_s >= from_s]
 
 
 def fall_together(currents: list[float]) -> bool:
     """No switch conducts: the largest current falls from each instant to the next."""
-    return all(later < earlier or later == 0 for earlier, later in zip(currents, currents[1:]))
+    return all(later < earlier or later == 0 for earlier, later in pairwise(currents))
 
 
 @pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])

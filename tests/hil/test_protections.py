@@ -272,6 +272,7 @@ def test_load_beyond_the_torque_limit_trips_over_speed_in_run(make_bench, motion
     bench.run_for(0.1)
     bench.load_torque_Nm = 2.5 * moves.load_Nm
     bench.run_until(lambda: bench.drive.state == "fault", timeout=0.4)
+    bench.run_for(0.001)  # the snapshot follows the state in the same telemetry cycle
     assert bench.drive.fault == "over_speed"
     direction = -1 if moves.load_Nm > 0 else 1
     assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(700 * direction, abs=2)
@@ -291,6 +292,7 @@ def test_trip_current_parameter_acts_in_any_quadrant(make_bench, motion):
     assert bench.drive.state == "run"
     bench.load_torque_Nm = MOTIONS[motion].load_Nm
     bench.run_until(lambda: bench.drive.state == "fault", timeout=0.05)
+    bench.run_for(0.001)  # the snapshot follows the state in the same telemetry cycle
     assert bench.drive.fault == "over_current"
     # A period at 240 V over the unaligned inductance is 9 A.
     assert 25 < bench.telemetry["DRIVE_FAULT_SNAPSHOT.current_max_A"].last < 34

@@ -63,14 +63,18 @@ def within(bounds: Range, value: float) -> bool:
     return bounds[0] <= value <= bounds[1]
 
 
-def mean_dip_rpm(run_recorded, parameters: dict[str, float] | None = None, **options) -> float:
-    """Speed drops of load steps at six angles of a stroke."""
-    dips = []
+def mean_after_step(run_recorded, parameters: dict[str, float] | None = None, **options) -> dict[str, float]:
+    """Means over load steps at six angles of a stroke: of speed drop and recovery, which depend on the angle."""
+    results = []
     for number in range(6):
         step_s = STEP_S + number * STROKE_S / 6
         recording, _ = run_recorded(loaded_150(step_s + 0.03, parameters, step_s), step_s - 0.01, 10.0, **options)
-        dips.append(speed_after_step(recording, 150, step_s)["speed_dip_rpm"])
-    return float(np.mean(dips))
+        results.append(speed_after_step(recording, 150, step_s))
+    return {name: float(np.mean([result[name] for result in results])) for name in results[0]}
+
+
+def mean_dip_rpm(run_recorded, parameters: dict[str, float] | None = None, **options) -> float:
+    return mean_after_step(run_recorded, parameters, **options)["speed_dip_rpm"]
 
 
 # --- start, load step, ripple -----------------------------------------------------------------------------------------
@@ -81,17 +85,20 @@ class Metrics:
     settling_s: Range
     dip_rpm: Range
     recovery_s: Range
+    """Means over the angle of the step."""
     one_pulse: Range
     two_pulses: Range
     """Ripple K_t."""
 
 
+# The dip of a single step is 2.4 to 4.2 r/min with saturating, 2.4 to 5.0 with the linear ones and 7.5 to 11.5 with
+# finite_element, over 24 angles of a stroke; their mean is within 0.2 r/min of that over six.
 MACHINES = {
-    "saturating": Metrics((0.068, 0.0705), (1.8, 3.0), (0.0015, 0.003), (0.006, 0.0100), (0.004, 0.0065)),
-    "linear_cosine": Metrics((0.068, 0.0705), (1.6, 2.8), (0.0013, 0.003), (0.005, 0.0100), (0.003, 0.0065)),
-    "linear_trapezoid": Metrics((0.068, 0.0705), (1.9, 3.2), (0.0015, 0.003), (0.004, 0.0100), (0.0025, 0.0065)),
+    "saturating": Metrics((0.068, 0.0705), (2.8, 3.2), (0.0026, 0.0032), (0.006, 0.0100), (0.004, 0.0065)),
+    "linear_cosine": Metrics((0.068, 0.0705), (2.9, 3.6), (0.0026, 0.0033), (0.005, 0.0100), (0.003, 0.0065)),
+    "linear_trapezoid": Metrics((0.068, 0.0705), (3.2, 3.8), (0.0028, 0.0036), (0.004, 0.0100), (0.0025, 0.0065)),
     # A fifth of the inertia, and a converter with minimum pulses and device drops that the drive does not model.
-    "finite_element": Metrics((0.0142, 0.0152), (6.0, 11.0), (0.003, 0.006), (0.010, 0.022), (0.0045, 0.0095)),
+    "finite_element": Metrics((0.0142, 0.0152), (8.8, 10.0), (0.0033, 0.0043), (0.010, 0.022), (0.0045, 0.0095)),
 }
 
 
@@ -111,12 +118,16 @@ def test_starts_to_600_rpm_at_the_torque_limit_without_overshoot(run_recorded, m
 @pytest.mark.parametrize("machine", MACHINES)
 def test_8_Nm_load_step_at_150_rpm_is_compensated_with_low_ripple(run_recorded, machine, pulses):
     expected = MACHINES[machine]
-    recording, _ = run_recorded(loaded_150(0.4, {"pulses_per_period": pulses}), 0.1, machine=machine)
+    parameters = {"pulses_per_period": pulses}
+    mean = mean_after_step(run_recorded, parameters, machine=machine)
+    assert within(expected.dip_rpm, mean["speed_dip_rpm"])
+    assert within(expected.recovery_s, mean["recovery_time_s"])
+    recording, _ = run_recorded(loaded_150(0.4, parameters), 0.1, machine=machine)
     after = speed_after_step(recording, 150, STEP_S)
     torque = torque_metrics(recording["time_s"], recording["torque_Nm"], (0.3, 0.4))
-    assert within(expected.dip_rpm, after["speed_dip_rpm"])
-    assert within(expected.recovery_s, after["recovery_time_s"])
-    assert 150.0 < after["speed_after_rpm"] < (150.5 if machine == "finite_element" else 150.02)
+    # Like the dip it depends on the angle: 0.011 to 0.028 r/min with saturating.
+    assert mean["speed_after_rpm"] < 150.02
+    assert 150.0 < after["speed_after_rpm"] < (150.5 if machine == "finite_element" else 150.05)
     assert within(expected.one_pulse if pulses == 1 else expected.two_pulses, torque["torque_ripple"])
     friction_Nm = 0.002 if machine == "finite_element" else 0.02
     assert torque["torque_mean_Nm"] == pytest.approx(8 + friction_Nm * 150 * np.pi / 30, abs=0.02)
@@ -181,8 +192,12 @@ def test_enters_and_leaves_voltage_limited_operation_smoothly(run_recorded):
     missing_Nm = bench.telemetry["torque_missing_Nm"].between(0.8, 1.2)
     assert 3.0 < missing_Nm.value.max() < 25.0  # between the pulses
     assert missing_Nm.value.min() >= 0.0
-    # The windows return until the voltage just suffices: below 0.05 N m and 1/64 of the torque they stay.
-    assert abs(bench.telemetry["torque_missing_Nm"].last) < 0.15
+    # With a part of a single pulse the voltage need not suffice at each angle, but the torque has the mean of the
+    # reference. At 3000 r/min the shortfall is sampled at one angle.
+    assert 0.0 <= bench.telemetry["torque_missing_Nm"].last < 2.5
+    reference_Nm, estimate_Nm = (bench.telemetry[name].between(1.5, 1.7).value.mean()
+                                 for name in ("torque_reference_Nm", "torque_estimate_Nm"))
+    assert estimate_Nm == pytest.approx(reference_Nm, abs=0.1)
     # Acceleration back, without overshoot.
     back_rpm = speed_rpm[time_s >= 1.2]
     assert np.diff(back_rpm[:10_000:100]).min() > 0.0

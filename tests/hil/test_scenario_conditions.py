@@ -88,7 +88,8 @@ def test_every_bench_variable_may_be_set_from_the_start(tmp_path):
     values = {"supply_voltage_V": 230.0, "current_sensor_gain": 1.01, "truth_period_us": 500, "current_noise_A": 0.02,
               "current_sensor_limit_A": 90.0, "flux_linkage_gain": 1.05, "resistance_gain": 1.2, "inertia_gain": 1.1,
               "friction_gain": 0.9, "minimum_pulse_ns": 200.0, "load_ramp_Nm_s": 4000.0, "load_sine_amplitude_Nm": 0.1,
-              "load_sine_frequency_Hz": 50.0, "held_speed_rpm": math.nan}
+              "load_sine_frequency_Hz": 50.0, "held_speed_rpm": math.nan, "bus_connection": 1,
+              "frame_fault_per_mille": 1.0, "frame_delay_us": 100, "babble_identifier": 0x700, "babble_length": 1}
     bench = {name: values.get(name, 0.0) for name in bench_variables()}
     assert values.keys() <= bench.keys()
     result = loaded(tmp_path, bench=bench)

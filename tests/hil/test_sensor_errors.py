@@ -194,7 +194,7 @@ def test_eccentric_encoder_errs_once_per_revolution_and_the_speed_follows(make_b
 
 
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
-def test_sensor_that_saturates_below_the_current_limit_hides_the_overcurrent_from_the_drive_only(make_bench, controller):
+def test_sensor_that_saturates_below_the_limit_hides_an_overcurrent_from_the_drive_only(make_bench, controller):
     """Limit and trip are parameters of the drive (52 A, 75 A): a sensor that saturates at 40 A reaches neither; the
     comparators of the gate drivers see the current itself."""
     bench = make_bench(controller=controller)

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from plant_faults import Faults, Switches, read, set_faults, turns
 from reference_plant import Run, load_library, plant_of, set_switches
-from test_plant_against_ngspice import BOUND, NGSPICE_TIMEOUT_S, SPICE_STEP_NS, deck, machine_of, run_of
+from test_plant_against_ngspice import BOUND, NGSPICE_PROCESSOR_S, SPICE_STEP_NS, deck, machine_of, run_of
 
 from salient.machine.file import load_machine
 from salient.paths import MACHINES
@@ -140,7 +140,7 @@ def test_current_under_a_fault_agrees(library: ctypes.CDLL, tmp_path: Path, name
     netlist = case.change(healthy, fault_ns)
     assert netlist != healthy
     try:
-        found = ngspice.run(tmp_path, netlist.split("\n"), NGSPICE_TIMEOUT_S)
+        found = ngspice.run(tmp_path, netlist.split("\n"), NGSPICE_PROCESSOR_S)
     except ngspice.NgspiceError as error:
         pytest.fail(str(error), pytrace=False)
     time_s, current_A = plant_currents(library, form, run, case.faults, fault_ns)

@@ -156,6 +156,17 @@ void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t 
     memcpy(telemetry, &from->control, sizeof *telemetry);
 }
 
+/* No checks of the background: they would read the pattern. */
+bool sto_monitor_failed(sto_monitor_t *monitor, uint32_t break_causes, uint32_t time_us) {
+    (void)monitor, (void)break_causes, (void)time_us;
+    return false;
+}
+
+bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us) {
+    (void)monitor, (void)input, (void)time_us;
+    return false;
+}
+
 /* No memory. */
 void nvm_store_init(nvm_store_t *store, const hal_t *hal, parameters_t *parameters) {
     (void)store, (void)hal, (void)parameters;

@@ -127,7 +127,7 @@ def test_asyncio_notifier_receives_frames(connect):
     async def first_heartbeat() -> can.Message:
         reader = can.AsyncBufferedReader()
         with can.Notifier(bus, [reader], loop=asyncio.get_running_loop()):
-            connect.bench.run_for(0.002)
+            connect.bench.run_for(0.01)
             while (message := await asyncio.wait_for(reader.get_message(), TIMEOUT_S)).arbitration_id != 0x701:
                 pass
             return message

@@ -135,7 +135,7 @@ def test_mf4_has_names_units_states_and_times_of_both_databases(salient_without_
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("can.csv", b"", ["can.csv", ".blf, .asc or .log"]),
+        ("can.csv", b"", ["can.csv", ".asc, .blf or .log"]),
         ("can.mf4", b"", ["can.mf4", "MF4 has signals, no frames"]),
         ("missing.blf", None, ["missing.blf", "No such file"]),
         ("can.blf", b"", ["can.blf", "not readable as .blf"]),
@@ -190,7 +190,7 @@ def test_contradictory_options_are_one_line(salient_without_build, tmp_path, opt
 
 
 def test_suffix_of_no_format_and_two_sources_are_refused(capsys):
-    for options, words in ((["--out", "b.txt"], ["b.txt", ".blf, .asc, .mf4 or .log"]),
+    for options, words in ((["--out", "b.txt"], ["b.txt", ".asc, .mf4, .blf or .log"]),
                            (["--convert", "a.log", "--can", "unix:x"], ["--can", "not allowed with", "--convert"])):
         with pytest.raises(SystemExit) as ended:
             make_parser().parse_args(["log", *options])

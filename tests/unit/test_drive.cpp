@@ -385,6 +385,7 @@ TEST_F(Drive, four_bad_commands_end_the_run_with_the_record_of_the_moment) {
         hal.to_drive.push_back(frames::command(uint8_t(counter + 100), COMMAND_RUN, -600000));
         periods(1);
     }
+    periods(3); // background, deferred interrupt, control interrupt
     EXPECT_TRUE(hal.open);
     const fault_record_t &record = drive.control.state_machine.record;
     EXPECT_EQ(record.fault, FAULT_COMMAND_ERROR);
@@ -401,6 +402,13 @@ TEST_F(Drive, four_bad_commands_end_the_run_with_the_record_of_the_moment) {
     send(COMMAND_CLEAR_FAULT);
     periods(3);
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+}
+
+TEST_F(Drive, reports_that_it_is_not_armed_with_its_first_telemetry) {
+    periods(100);
+    const auto report = only_frame(DRIVE_ARMING_FRAME_ID, drive_arming_unpack);
+    EXPECT_EQ(report.armed, 0);
+    EXPECT_EQ(report.attempt, ARMING_ATTEMPT_NONE);
 }
 
 TEST_F(Drive, reports_its_arming_at_once_and_then_cyclically) {
@@ -454,7 +462,7 @@ TEST_F(Drive, break_of_the_pwm_is_a_fault_that_lasts_as_long_as_its_cause) {
     periods(100);
     for (const auto &expected : breaks) {
         command(COMMAND_OFF);
-        periods(3);
+        periods(500); // two challenges are 10 ms apart
         command(COMMAND_RUN);
         periods(3);
         ASSERT_FALSE(hal.open);
@@ -756,15 +764,15 @@ TEST_F(Drive, rejoins_the_bus_with_a_back_off_that_doubles_up_to_320_ms_and_an_e
 
 TEST_F(Drive, after_bus_off_a_run_request_counts_only_once_it_has_been_withdrawn) {
     periods(100);
-    command(COMMAND_RUN);
+    command(COMMAND_RUN, 0);
     periods(3);
     ASSERT_FALSE(hal.open);
     hal.can_status.state = HAL_CAN_BUS_OFF;
     periods(500);
     EXPECT_EQ(hal.rejoins, 1u);
     hal.can_status.state = HAL_CAN_ERROR_ACTIVE;
-    for (int k = 0; k < 15; k++) { // a sender that simply continues
-        command(COMMAND_RUN);
+    for (int k = 0; k < 60; k++) { // a sender that simply continues
+        command(COMMAND_RUN, 0);
         periods(400);
     }
     EXPECT_TRUE(hal.open);
@@ -773,7 +781,7 @@ TEST_F(Drive, after_bus_off_a_run_request_counts_only_once_it_has_been_withdrawn
     command(COMMAND_CLEAR_FAULT);
     periods(10);
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
-    command(COMMAND_RUN);
+    command(COMMAND_RUN, 0);
     periods(10);
     EXPECT_FALSE(hal.open);
 }

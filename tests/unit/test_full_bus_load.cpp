@@ -9,6 +9,7 @@
 
 extern "C" {
 #include "drive.h"
+#include "drive_codec.h"
 #include "host/hal_host.h"
 #include "rig/rig.h"
 #include "rig/transport.h"
@@ -21,12 +22,14 @@ namespace {
 constexpr uint64_t MS = 1000000;
 constexpr double S_DEFAULT = 3;
 
-// A transport whose only client sends a command every ten rounds of 1 ms.
+// A transport whose only client arms the drive and sends a command every ten rounds of 1 ms.
 struct Sender {
     transport_t transport{}; // first
     uint64_t rounds = 0;
     uint64_t frames[3] = {0, 0, 0}; // drive, babbling node, commands
     uint32_t worst_wait_us = 0;
+    uint32_t challenge = 0;
+    bool requested = false, confirmed = false;
 
     Sender() {
         transport.descriptors = [](transport_t *, struct pollfd *) { return size_t{0}; };
@@ -36,16 +39,31 @@ struct Sender {
         transport.in_use = [](transport_t *) { return true; };
         transport.read = [](transport_t *base, const transport_receiver_t *receiver) {
             auto *self = reinterpret_cast<Sender *>(base);
-            if (self->rounds++ % 10 == 0 && self->rounds > 2) {
-                const hal_can_frame_t command =
-                    frames::command(static_cast<uint8_t>(self->rounds / 10), COMMAND_RUN, 600000);
+            const auto take = [receiver](const hal_can_frame_t &sent) {
                 transport_frame_t frame;
-                transport_frame_from_hal(&command, &frame);
+                transport_frame_from_hal(&sent, &frame);
                 EXPECT_TRUE(receiver->take(receiver->context, 1, &frame));
+            };
+            if (self->rounds++ % 10 == 0 && self->rounds > 2) {
+                take(frames::command(static_cast<uint8_t>(self->rounds / 10), COMMAND_RUN, 600000));
+            }
+            if (self->rounds > 12 && !self->requested) {
+                take(frames::arm(7, ARMING_STEP_REQUEST_RUN));
+                self->requested = true;
+            } else if (self->challenge != 0 && !self->confirmed) {
+                take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~self->challenge));
+                self->confirmed = true;
             }
             return size_t{0};
         };
         transport.send = [](transport_t *base, uint64_t, transport_origin_t origin, const transport_frame_t *frame) {
+            hal_can_frame_t sent;
+            transport_frame_to_hal(frame, &sent);
+            if (origin == TRANSPORT_FROM_EMULATOR && sent.identifier == DRIVE_ARMING_FRAME_ID && !sent.extended) {
+                drive_arming_t arming;
+                drive_arming_unpack(&arming, sent.data, sent.length);
+                reinterpret_cast<Sender *>(base)->challenge = arming.challenge;
+            }
             if (!transport_frame_is_rig(frame)) {
                 ++reinterpret_cast<Sender *>(base)->frames[origin == TRANSPORT_FROM_EMULATOR ? 0
                                                            : origin == TRANSPORT_FROM_OTHER  ? 1

@@ -30,7 +30,7 @@ noreturn void board_exit(uint32_t code) {
 }
 
 noreturn void board_restart(void) {
-    __asm__ volatile("msr msp, %0\n\tbx %1" ::"r"(stack_top), "r"(program_start));
+    __asm__ volatile("msr msp, %0\n\tb program_start" ::"r"(stack_top));
     __builtin_unreachable();
 }
 

@@ -449,7 +449,7 @@ TEST_F(Commands, four_bad_frames_in_succession_are_a_fault_and_three_are_none) {
     hal_can_frame_t damaged = command_frame(50), too_short = command_frame(50);
     damaged.data[5] ^= 1;
     too_short.length = 6;
-    for (const hal_can_frame_t &bad : {damaged, too_short, command_frame(1), command_frame(99)}) {
+    for (const hal_can_frame_t &bad : {damaged, too_short, command_frame(1, COMMAND_RUN, -600000), command_frame(99)}) {
         commands_init(&commands);
         arm(1, 10000);
         for (int i = 0; i < 3; i++) {
@@ -465,6 +465,28 @@ TEST_F(Commands, four_bad_frames_in_succession_are_a_fault_and_three_are_none) {
     arm(1, 10000);
     for (uint8_t i = 0; i < 4; i++) {
         take(command_frame(uint8_t(2 + i), 9), DRIVE_STATE_RUN, 11000); // out of range
+    }
+    EXPECT_TRUE(commands.failed);
+}
+
+TEST_F(Commands, duplicated_frames_are_dropped_and_counted_but_are_no_second_sender) {
+    arm(0, 10000);
+    uint32_t time_us = 10000;
+    uint8_t counter = 0;
+    for (int frame = 1; frame <= 300; frame++) {
+        time_us += 10000;
+        ASSERT_EQ(take(command_frame(++counter), DRIVE_STATE_RUN, time_us), COMMANDS_COMMAND);
+        for (int copy = 0; copy < 10; copy++) {
+            ASSERT_EQ(take(command_frame(counter), DRIVE_STATE_RUN, time_us + 5000), COMMANDS_REJECTED);
+        }
+        ASSERT_EQ(commands.errors, 0);
+    }
+    EXPECT_EQ(commands.counters.wrong_counter, 3000);
+    EXPECT_EQ(commands.last_received_us, time_us) << "a copy does not prolong a run";
+    EXPECT_TRUE(commands.arming.armed);
+    // A copy of the last but one is no duplicate of a frame on the bus.
+    for (int i = 0; i < 4; i++) {
+        take(command_frame(uint8_t(counter - 1)), DRIVE_STATE_RUN, time_us);
     }
     EXPECT_TRUE(commands.failed);
 }

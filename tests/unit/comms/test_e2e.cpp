@@ -116,8 +116,27 @@ TEST(E2e, messages_with_one_receiver_have_one_sequence) {
     e2e_protect(DATA_ID + 1, 11, other.data(), other.size());
     EXPECT_EQ(e2e_check(&receiver, DATA_ID, other.data(), other.size()), E2E_WRONG_CHECKSUM);
     EXPECT_EQ(e2e_check(&receiver, DATA_ID + 1, other.data(), other.size()), E2E_ACCEPTED);
-    EXPECT_EQ(receiver.take(11), E2E_REPEATED);
+    EXPECT_EQ(e2e_check(&receiver, DATA_ID + 1, other.data(), other.size()), E2E_REPEATED);
+    EXPECT_EQ(receiver.take(11), E2E_WRONG_SEQUENCE) << "another message with the same counter";
     EXPECT_EQ(receiver.take(12), E2E_ACCEPTED);
+}
+
+TEST(E2e, only_an_exact_repetition_of_the_last_accepted_frame_is_a_repeated_one) {
+    for (const bool locked : {false, true}) {
+        for (unsigned bit = 0; bit < 8; bit++) {
+            receiver_t receiver;
+            receiver.take(10);
+            receiver.locked = locked;
+            EXPECT_EQ(receiver.take(10), E2E_REPEATED);
+            frame_t other = protected_frame(10);
+            other[E2E_HEADER_BYTES] = uint8_t(other[E2E_HEADER_BYTES] ^ (1u << bit));
+            e2e_protect(DATA_ID, 10, other.data(), other.size());
+            EXPECT_EQ(e2e_check(&receiver, DATA_ID, other.data(), other.size()), E2E_WRONG_SEQUENCE);
+            EXPECT_EQ(receiver.take(10), E2E_REPEATED) << "the other one has not become the last";
+            receiver.take(11);
+            EXPECT_EQ(receiver.take(10), E2E_WRONG_SEQUENCE) << "no longer the last";
+        }
+    }
 }
 
 TEST(E2e, a_wrong_checksum_leaves_the_receiver_alone) {

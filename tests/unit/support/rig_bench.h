@@ -12,6 +12,7 @@
 #include <cstdlib>
 #include <cstring>
 #include <filesystem>
+#include <limits>
 #include <memory>
 #include <string>
 #include <vector>
@@ -205,6 +206,7 @@ class RigBench {
         config.stop.descriptors[0] = config.stop.descriptors[1] = -1;
         config.transport = transport;
         rig_init(rig.get(), &config);
+        plant_set_trip(&rig->plant, std::numeric_limits<double>::infinity()); // the stand-in freewheels as a generator
         firmware.board = &rig->board;
         board_pwm_start(&rig->board, 2500);
         rig_firmware_t callbacks{StandInFirmware::interrupt, nullptr, StandInFirmware::background, &firmware, nullptr};

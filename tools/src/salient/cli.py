@@ -97,21 +97,6 @@ def make_parser() -> argparse.ArgumentParser:
                          "has it")
     _add_machine(monitor)
 
-    parameters = command("parameters", "parameters and fault log of a running drive")
-    actions = parameters.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
-    for name, text in (("save", "write the parameters to a file"),
-                       ("compare", "list the differences from a file, exit code 1 when there are any"),
-                       ("load", "set the parameters that a file has, all or none"),
-                       ("faults", "print the log of faults")):
-        action = actions.add_parser(name, help=text, description=text, prog=f"tools/salient parameters {name}")
-        if name != "faults":
-            action.add_argument("file", type=Path, metavar="FILE.toml")
-        if name == "load":
-            action.add_argument("--store", action="store_true", help="also store them in the memory of the drive, so "
-                                "that they survive a reset")
-        _add_can(action)
-        _add_machine(action)
-
     benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
                         "ngspice; effect of the network")
     benchmark.add_argument("--json", type=Path, metavar="FILE", help="also write the results to a file")
@@ -145,6 +130,22 @@ def make_parser() -> argparse.ArgumentParser:
                       "name of a variant its longest path by function")
     task.add_argument("--figures", action="store_true",
                      help="instead: repeat the measurements of the committed baseline and write it")
+
+    parameters = command("parameters", "parameters and fault log of a running drive")
+    actions = parameters.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
+    for name, text in (("save", "write the parameters to a file"),
+                       ("compare", "list the differences from a file, exit code 1 when there are any"),
+                       ("load", "set the parameters that a file has, all or none"),
+                       ("faults", "print the log of faults")):
+        action = actions.add_parser(name, help=text, description=text, prog=f"tools/salient parameters {name}")
+        if name != "faults":
+            action.add_argument("file", type=Path, metavar="FILE.toml")
+        if name == "load":
+            action.add_argument("--store", action="store_true", help="also store them in the memory of the drive, so "
+                                "that they survive a reset")
+        _add_can(action)
+        _add_machine(action)
+
     return parser
 
 

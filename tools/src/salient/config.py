@@ -29,8 +29,8 @@ PACES = ("lockstep", "realtime", "free")
 PACE_FACTOR_MIN, PACE_FACTOR_MAX = 0.01, 1000.0
 """PACING_FACTOR_MIN and PACING_FACTOR_MAX of emulator/rig/pacing.h."""
 BUSES = "unix:PATH or socketcan:INTERFACE"
-LOG_SUFFIXES = (".blf", ".asc", ".mf4", ".log")
-"""Formats of a log: BLF, ASC, MF4 and the text of candump -L."""
+LOG_SUFFIXES = (".asc", ".mf4", ".blf", ".log")
+"""Formats of a log: ASC, MF4, BLF and the text of candump -L."""
 
 FLAG, INTEGER, NUMBER, WORD, FILE, BUS, PACE = "flag", "integer", "number", "word", "file", "bus", "pace"
 MACHINE = "machine"

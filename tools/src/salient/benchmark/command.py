@@ -28,7 +28,9 @@ _SETTLE_S = 0.2
 _CONTROL_RATE_HZ = 40_000
 _COUNTED_S = 0.1
 _MODULES_SHOWN = 6
-_COMMAND_TIMEOUT_MS = 1000.0
+_COMMAND_TIMEOUT_MS = 400.0
+_ALONE_S = 0.35
+"""Virtual time without a client, less than the command timeout; scaled to SIMULATED_S."""
 _STARTED_S = 1e-3
 """Processor time: more than receiving a request takes, less than executing it."""
 _POLL_S = 1e-4
@@ -68,8 +70,9 @@ def measure(controller: str, condition: str) -> float:
                 session.run_for(_SETTLE_S)
                 before_s = _processor_s(simulator.pid)
                 if condition == "no client":
-                    session.leave_running(SIMULATED_S)
-                    return _until_reached(simulator.pid, can, session.time_s + SIMULATED_S, before_s) - before_s
+                    session.leave_running(_ALONE_S)
+                    after_s = _until_reached(simulator.pid, can, session.time_s + _ALONE_S, before_s)
+                    return (after_s - before_s) * SIMULATED_S / _ALONE_S
                 session.run_for(SIMULATED_S)
                 return _processor_s(simulator.pid) - before_s
 

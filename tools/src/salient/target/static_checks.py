@@ -63,6 +63,10 @@ def indirect_calls(image: ElfImage) -> list[str]:
             if _INDIRECT.match(f"{one.mnemonic} {one.operands}")]
 
 
+_RESTARTS = {("board_restart", "program_start")}
+"""Jumps with the stack pointer at its initial value: the stack begins anew."""
+
+
 def deepest_stack(image: ElfImage, function: str) -> tuple[int, list[str]]:
     """Upper bound of the stack of a function and its callees, in bytes, and the call path that reaches it. Each
     function counts with everything that it pushes on any path.
@@ -73,7 +77,7 @@ def deepest_stack(image: ElfImage, function: str) -> tuple[int, list[str]]:
     calls: dict[str, set[str]] = defaultdict(set)
     for one in image.instructions():
         frames[one.function] += _lowers_by(one)
-        if one.goes_to and one.goes_to != one.function:
+        if one.goes_to and one.goes_to != one.function and (one.function, one.goes_to) not in _RESTARTS:
             calls[one.function].add(one.goes_to)
         elif one.goes_to and one.mnemonic in ("bl", "jal"):
             raise ValueError(f"{one.function} calls itself")

@@ -28,7 +28,7 @@ _FAILED_LISTED_MAX = 10
 def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     """Runs the cases, prints the table, writes the files. Returns 0, or 1 when a metric is worse than in --baseline."""
     if options.list:
-        stream.writelines(f"{name:<18}{group.title}{' (long: runs only when named)' if group.long else ''}\n"
+        stream.writelines(f"{name:<20}{group.title}{' (long: runs only when named)' if group.long else ''}\n"
                           for name, group in GROUPS.items())
         return 0
     cases = _cases(options.groups, options.quick)

@@ -29,16 +29,16 @@ def mean_torque_Nm(bench, duration_s=0.15):
     return bench.truth["torque_Nm"].between(bench.time_s - duration_s, bench.time_s).value.mean()
 
 
-@pytest.mark.parametrize("direction", [1])
+@pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_torque_that_sharing_cannot_make_is_made_with_single_pulses_and_back(make_bench, direction, sign):
     bench = held(make_bench, direction * 900)
     for speed_rpm, torque_Nm, mode in ((900, 10, 0), (2250, 22, 1), (900, 10, 0)):
         bench.held_speed_rpm = direction * speed_rpm
         bench.drive.torque_reference_Nm = direction * sign * torque_Nm
-        bench.run_for(1.0)
+        bench.run_for(0.6)
         assert modes(bench) == {mode}
-        assert mean_torque_Nm(bench) == pytest.approx(direction * sign * torque_Nm, rel=0.12 if mode else 0.02)
+        assert mean_torque_Nm(bench) == pytest.approx(direction * sign * torque_Nm, rel=0.01)
     assert bench.drive.fault == "none"
 
 
@@ -53,7 +53,7 @@ def test_a_loaded_drive_passes_into_single_pulses_with_the_speed_and_back(make_b
         bench.drive.speed_reference_rpm = direction * speed_rpm
         bench.run_for(1.5)
         assert modes(bench) == {mode}
-        assert bench.truth["speed_rpm"].last == pytest.approx(direction * speed_rpm, rel=0.005)
+        assert bench.truth["speed_rpm"].last == pytest.approx(direction * speed_rpm, abs=1.0 if mode else 0.1)
     assert bench.drive.fault == "none"
 
 
