@@ -33,10 +33,6 @@ COLD static void configure(drive_t *drive) {
     hal_critical_leave(drive->hal);
 }
 
-static void inhibit_start(drive_t *drive) {
-    drive->control.state_machine.background_inhibit = drive->store.inhibited ? FAULT_PARAMETER_MEMORY : FAULT_NONE;
-}
-
 COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     const uint32_t clock_hz = hal_pwm_clock_hz(hal);
     if (!configure_rate_allowed(config->control_rate_hz, clock_hz) ||
@@ -55,7 +51,9 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     drive->comms.store = &drive->store;
     configure(drive);
     control_reset(&drive->control_parameters, &drive->control);
-    inhibit_start(drive);
+    if (drive->store.inhibited) {
+        drive->control.reported_fault_mask = (uint32_t)FAULT_BIT(FAULT_PARAMETER_MEMORY);
+    }
     hal_pwm_open_all(hal);
     hal_pwm_start(hal, drive->control_parameters.period_ticks);
     return true;
@@ -156,14 +154,15 @@ COLD static void check_slowly(drive_t *drive, uint32_t time_us) {
     if (drive->comms.bus.conflict) {
         failed |= FAULT_BIT(FAULT_IDENTIFIER_CONFLICT);
     }
+    if (drive->store.inhibited) { /* since the start; inhibits the first one only */
+        failed |= FAULT_BIT(FAULT_PARAMETER_MEMORY);
+    }
     if (drive->control.state_machine.state != DRIVE_STATE_RUN) {
         drive->comms.commands.failed = false;
     } else if (drive->comms.commands.failed) {
         failed |= FAULT_BIT(FAULT_COMMAND_ERROR);
     }
-    if (failed != drive->failed_checks) {
-        drive->failed_checks = drive->control.reported_fault_mask = (uint32_t)failed;
-    }
+    drive->control.reported_fault_mask = (uint32_t)failed;
 }
 
 /* After bus-off a run request is without effect until the sender has withdrawn it: the present command ages until its
@@ -194,11 +193,7 @@ static void keep_memory(drive_t *drive, uint32_t time_us) {
         nvm_store_follow_fault(&drive->store, NULL);
     }
     const bool writable = state == DRIVE_STATE_FAULT || may_configure(drive);
-    const bool inhibited = drive->store.inhibited;
     nvm_store_step(&drive->store, drive->hal, &drive->parameters, time_us, writable);
-    if (inhibited && !drive->store.inhibited) {
-        inhibit_start(drive);
-    }
 }
 
 /* In a run whose commands are overdue: ramps the torque from its present value to zero, by commands of the torque mode

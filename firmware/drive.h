@@ -44,7 +44,6 @@ typedef struct {
     uint32_t control_rate_hz;
     parameters_t parameters;
     uint32_t applied_revision; /* parameters.revision from which control_parameters are derived */
-    uint32_t failed_checks;    /* of the background, FAULT_BIT */
     sto_monitor_t sto;
     stall_monitor_t stall;
     bool ramping;          /* the torque ramps to zero, without commands; the next two are for this */

@@ -44,10 +44,7 @@ bool state_machine_stands(state_machine_t *state_machine, uint64_t fault_mask, c
     }
     switch (state_machine->state) {
     case DRIVE_STATE_INITIALISE:
-        /* A comparison and a constant shift: any other form makes the step in RUN longer. */
-        state_machine->start_inhibit_mask =
-            (uint32_t)all_but_timeout | (uint32_t)(state_machine->background_inhibit != FAULT_NONE)
-                                            << FAULT_PARAMETER_MEMORY;
+        state_machine->start_inhibit_mask = (uint32_t)all_but_timeout;
         state_machine->fault_free_ticks =
             state_machine->start_inhibit_mask == 0 ? state_machine->fault_free_ticks + 1 : 0;
         if (state_machine->fault_free_ticks >= initialise_ticks) {

@@ -28,7 +28,6 @@ typedef struct {
     uint32_t start_inhibit_mask;    /* in INITIALISE: failed checks of this tick; 0 in every other state */
     bool rearmed;                   /* the run request has been withdrawn since the last fault */
     command_request_t last_request; /* of the previous tick */
-    fault_t background_inhibit;     /* FAULT_PARAMETER_MEMORY keeps the drive in INITIALISE; by the background */
     fault_record_t record;          /* in FAULT; fault FAULT_NONE in every other state */
 } state_machine_t;
 
