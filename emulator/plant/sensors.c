@@ -5,6 +5,7 @@
 
 #include "plant/magnetics_kernel.h"
 #include "plant/pwm_timer.h"
+#include "plant/random.h"
 
 #define ENCODER_BITS_IDEAL 32
 #define REVOLUTION_RAD 6.28318530717958647692
@@ -33,21 +34,12 @@ void sensors_hold_currents(sensors_t *sensors, const plant_t *plant) {
     sensors->currents_held = true;
 }
 
-/* splitmix64 (G. L. Steele, D. Lea, C. H. Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014). */
-static uint64_t next_random(uint64_t *state) {
-    *state += UINT64_C(0x9E3779B97F4A7C15);
-    uint64_t z = *state;
-    z = (z ^ (z >> 30)) * UINT64_C(0xBF58476D1CE4E5B9);
-    z = (z ^ (z >> 27)) * UINT64_C(0x94D049BB133111EB);
-    return z ^ (z >> 31);
-}
-
 /* Mean 0, standard deviation 1, as the sum of twelve uniform 16-bit numbers: Gaussian up to four deviations, limited to
  * six. Without libm, so that the bits are equal on every computer. */
 static double next_gaussian(uint64_t *state) {
     int64_t sum = 0;
     for (unsigned draw = 0; draw < 3; draw++) {
-        const uint64_t bits = next_random(state);
+        const uint64_t bits = random_next(state);
         for (unsigned part = 0; part < 4; part++) {
             sum += (int64_t)((bits >> (16 * part)) & 0xFFFF);
         }

@@ -2,6 +2,8 @@
 
 #include <string.h>
 
+#include "plant/random.h"
+
 void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, uint64_t seed) {
     memset(board, 0, sizeof *board);
     board->adc_bits = sensors->adc_bits;
@@ -153,11 +155,8 @@ void board_can_rejoin(board_t *board) {
     can_bus_rejoin(board->bus, board->time_ns);
 }
 
-/* splitmix64, as the noise of the sensors, with the time in its state. */
+/* With the time in the state, so that the numbers of two runs with one seed differ once their calls do. */
 uint32_t board_random(board_t *board) {
-    board->random_state += UINT64_C(0x9E3779B97F4A7C15) + board->time_ns;
-    uint64_t z = board->random_state;
-    z = (z ^ z >> 30) * UINT64_C(0xBF58476D1CE4E5B9);
-    z = (z ^ z >> 27) * UINT64_C(0x94D049BB133111EB);
-    return (uint32_t)((z ^ z >> 31) >> 32);
+    board->random_state += board->time_ns;
+    return (uint32_t)(random_next(&board->random_state) >> 32);
 }

@@ -1,5 +1,7 @@
 #include "rig/can_faults.h"
 
+#include "plant/random.h"
+
 #define STREAM UINT64_C(0x63616E5F66617565) /* distinguishes this stream from that of the sensors' noise */
 
 void can_faults_init(can_faults_t *faults, uint64_t seed) {
@@ -7,12 +9,7 @@ void can_faults_init(can_faults_t *faults, uint64_t seed) {
 }
 
 uint32_t can_faults_random(can_faults_t *faults, uint32_t limit) {
-    /* splitmix64, as in plant/sensors.c */
-    uint64_t bits = faults->random_state += UINT64_C(0x9E3779B97F4A7C15);
-    bits = (bits ^ (bits >> 30)) * UINT64_C(0xBF58476D1CE4E5B9);
-    bits = (bits ^ (bits >> 27)) * UINT64_C(0x94D049BB133111EB);
-    bits ^= bits >> 31;
-    return (uint32_t)((bits >> 32) * limit >> 32);
+    return (uint32_t)((random_next(&faults->random_state) >> 32) * limit >> 32);
 }
 
 can_fault_t can_faults_draw(can_faults_t *faults, bool from_drive) {

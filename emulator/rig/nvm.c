@@ -2,6 +2,8 @@
 
 #include <string.h>
 
+#include "plant/random.h"
+
 void nvm_init(nvm_t *nvm) {
     memset(nvm, 0, sizeof *nvm);
     memset(nvm->word, 0xFF, sizeof nvm->word);
@@ -10,14 +12,6 @@ void nvm_init(nvm_t *nvm) {
 void nvm_power_on(nvm_t *nvm) {
     nvm->power_lost = false;
     nvm->cut_after = 0;
-}
-
-/* SplitMix64. */
-static uint64_t random_of(nvm_t *nvm) {
-    uint64_t z = nvm->random += UINT64_C(0x9E3779B97F4A7C15);
-    z = (z ^ (z >> 30)) * UINT64_C(0xBF58476D1CE4E5B9);
-    z = (z ^ (z >> 27)) * UINT64_C(0x94D049BB133111EB);
-    return z ^ (z >> 31);
 }
 
 /* Counts an operation; true when power is lost at it. */
@@ -45,7 +39,7 @@ bool nvm_program(nvm_t *nvm, unsigned page, unsigned word, uint64_t value) {
     }
     switch (nvm->cut_kind) {
     case NVM_CUT_TORN:
-        *target = value | random_of(nvm);
+        *target = value | random_next(&nvm->random);
         break;
     case NVM_CUT_HALF:
         *target = value | UINT64_C(0xFFFFFFFF00000000);
@@ -68,13 +62,13 @@ bool nvm_erase(nvm_t *nvm, unsigned page) {
     }
     for (unsigned i = 0; i < HAL_NVM_PAGE_WORDS; i++) {
         uint64_t *word = &nvm->word[page][i];
-        const uint64_t random = random_of(nvm);
+        const uint64_t random = random_next(&nvm->random);
         if (nvm->cut_kind == NVM_CUT_TORN) {
             *word = random;
         } else if (nvm->cut_kind == NVM_CUT_HALF && random % 3 == 0) {
             *word = HAL_NVM_ERASED;
         } else if (nvm->cut_kind == NVM_CUT_HALF && random % 3 == 1) {
-            *word |= random_of(nvm);
+            *word |= random_next(&nvm->random);
         }
     }
     return false;
