@@ -18,8 +18,8 @@ static bool may_configure(const drive_t *drive) {
     return drive->control.state_machine.state != DRIVE_STATE_RUN && drive->command.request != COMMAND_RUN;
 }
 
-/* Applies the parameters in one piece between two control periods, never in a run or beside the command that starts
- * one. */
+/* Applies the parameters in one piece between two control periods; in a run or beside the command that starts one,
+ * those that may then be changed, which are all that differ. */
 COLD static void configure(drive_t *drive) {
     const control_parameters_t control_parameters =
         configure_control(&drive->parameters, &machine_tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
@@ -28,8 +28,11 @@ COLD static void configure(drive_t *drive) {
     if (may_configure(drive)) {
         drive->control_parameters = control_parameters;
         control_prepare(&drive->control_parameters, &drive->control);
-        drive->applied_revision = drive->parameters.revision;
+    } else {
+        configure_tune(&drive->control_parameters, &control_parameters);
+        deferred_tune(&drive->control_parameters, &drive->control);
     }
+    drive->applied_revision = drive->parameters.revision;
     hal_critical_leave(drive->hal);
 }
 
@@ -231,14 +234,20 @@ COLD void drive_background(drive_t *drive) {
         if (drive->comms.bus.run_inhibited) {
             commands_disarm(&drive->comms.commands);
         }
+        if (drive->comms.bus.status.state == HAL_CAN_BUS_OFF) {
+            arming_end_configuration(&drive->comms.commands.arming);
+        }
         drive_telemetry_t values;
         hal_critical_enter(drive->hal);
         telemetry_collect(drive, time_us, &values);
         hal_critical_leave(drive->hal);
         comms_telemetry(&drive->comms, drive->hal, &values);
     }
-    const bool writable = may_configure(drive);
-    const bool commanded = comms_background(&drive->comms, drive->hal, &drive->parameters, writable,
+    const parameters_conditions_t conditions = {
+        .running = !may_configure(drive),
+        .dc_link_voltage_q6 = drive->control.measurement.dc_link_voltage_q6,
+    };
+    const bool commanded = comms_background(&drive->comms, drive->hal, &drive->parameters, &conditions,
                                             drive->control.state_machine.state, time_us);
     if (drive->parameters.revision != drive->applied_revision) {
         configure(drive); /* before a command that was received after the parameters */

@@ -93,6 +93,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->arming.challenge = arming->challenge;
     telemetry->arming.attempt = arming->attempt;
     telemetry->arming.armed = arming->armed;
+    telemetry->arming.configuring = arming->configuring;
     telemetry->arming.refused = arming->refused;
     telemetry->arming.run_unarmed = counters->run_unarmed;
 

@@ -24,26 +24,37 @@ COLD void arming_check_timeout(arming_t *arming, uint32_t time_us) {
     if (age_us > ARMING_INTERVAL_US) {
         arming->drawn = false; /* long ago: the clock may come round */
     }
+    if (time_us - arming->configuring_us > ARMING_CONFIGURATION_US) {
+        arming_end_configuration(arming);
+    }
 }
 
 COLD void arming_disarm(arming_t *arming) {
-    end_attempt(arming);
+    if (arming->attempt == ARMING_ATTEMPT_RUN) {
+        end_attempt(arming);
+    }
     arming->changed |= arming->armed;
     arming->armed = false;
 }
 
-static arming_result_t refuse(arming_t *arming) {
+COLD void arming_end_configuration(arming_t *arming) {
+    arming->changed |= arming->configuring;
+    arming->configuring = false;
+}
+
+COLD arming_result_t arming_refuse(arming_t *arming) {
     counter_add(&arming->refused, 1);
     return ARMING_REFUSED;
 }
 
-static arming_result_t request(arming_t *arming, hal_t *hal, bool permitted, const hal_can_frame_t *frame,
+static arming_result_t request(arming_t *arming, hal_t *hal, arming_attempt_t attempt, const hal_can_frame_t *frame,
                                uint32_t time_us) {
-    if (!permitted || arming->armed || arming->drawn) {
-        return refuse(arming);
+    if (arming->drawn) {
+        return arming_refuse(arming);
     }
+    arming_end_configuration(arming);
     arming->counter = frame->data[E2E_HEADER_BYTES - 1];
-    arming->attempt = ARMING_ATTEMPT_RUN;
+    arming->attempt = attempt;
     arming->challenge = hal_random_u32(hal);
     arming->challenge_us = time_us;
     arming->drawn = true;
@@ -51,19 +62,25 @@ static arming_result_t request(arming_t *arming, hal_t *hal, bool permitted, con
     return ARMING_CHALLENGED;
 }
 
-static arming_result_t confirm(arming_t *arming, bool permitted, const hal_can_frame_t *frame, uint32_t response,
-                               uint32_t time_us) {
+static arming_result_t confirm(arming_t *arming, arming_attempt_t attempt, bool permitted, const hal_can_frame_t *frame,
+                               uint32_t response, uint32_t time_us) {
     const uint32_t age_us = time_us - arming->challenge_us;
-    const bool correct = permitted && arming->attempt == ARMING_ATTEMPT_RUN && response == ~arming->challenge &&
+    const bool correct = permitted && arming->attempt == attempt && response == ~arming->challenge &&
                          age_us >= ARMING_RESPONSE_MIN_US && age_us <= ARMING_RESPONSE_MAX_US &&
                          frame->data[E2E_HEADER_BYTES - 1] == (uint8_t)(arming->counter + 1u);
     end_attempt(arming);
     if (!correct) {
-        return refuse(arming);
+        return arming_refuse(arming);
     }
     arming->changed = true;
-    arming->armed = true;
-    return ARMING_ARMED;
+    arming->drawn = false;
+    if (attempt == ARMING_ATTEMPT_RUN) {
+        arming->armed = true;
+        return ARMING_ARMED;
+    }
+    arming->configuring = true;
+    arming->configuring_us = time_us;
+    return ARMING_CONFIGURING;
 }
 
 COLD arming_result_t arming_receive(arming_t *arming, hal_t *hal, const hal_can_frame_t *frame, bool permitted,
@@ -72,11 +89,16 @@ COLD arming_result_t arming_receive(arming_t *arming, hal_t *hal, const hal_can_
     drive_arm_unpack(&message, frame->data, frame->length);
     switch ((arming_step_t)message.step) {
     case ARMING_STEP_REQUEST_RUN:
-        return request(arming, hal, permitted, frame, time_us);
+        return permitted && !arming->armed ? request(arming, hal, ARMING_ATTEMPT_RUN, frame, time_us)
+                                           : arming_refuse(arming);
     case ARMING_STEP_CONFIRM_RUN:
-        return confirm(arming, permitted, frame, message.response, time_us);
+        return confirm(arming, ARMING_ATTEMPT_RUN, permitted, frame, message.response, time_us);
+    case ARMING_STEP_REQUEST_CONFIGURATION:
+        return request(arming, hal, ARMING_ATTEMPT_CONFIGURATION, frame, time_us);
+    case ARMING_STEP_CONFIRM_CONFIGURATION:
+        return confirm(arming, ARMING_ATTEMPT_CONFIGURATION, true, frame, message.response, time_us);
     default:
-        return refuse(arming);
+        return arming_refuse(arming);
     }
 }
 
@@ -85,6 +107,7 @@ COLD void arming_report(const arming_t *arming, uint16_t run_unarmed, hal_can_fr
         .challenge = arming->challenge,
         .attempt = (uint8_t)arming->attempt,
         .armed = arming->armed,
+        .configuring = arming->configuring,
         .refused = (uint8_t)(arming->refused < UINT8_MAX ? arming->refused : UINT8_MAX),
         .run_unarmed = run_unarmed,
     };

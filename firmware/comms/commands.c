@@ -5,6 +5,7 @@
 #include "comms/counter.h"
 #include "comms/units.h"
 #include "control/machine_tables.h"
+#include "drive/parameters.h"
 #include "drive_codec.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
@@ -35,6 +36,9 @@ static bool must_disarm(const commands_t *commands, uint32_t time_us, uint32_t t
 }
 
 COLD void commands_supervise(commands_t *commands, drive_state_t state, uint32_t time_us, uint32_t timeout_us) {
+    if (state == DRIVE_STATE_RUN && commands->state != DRIVE_STATE_RUN) {
+        arming_end_configuration(&commands->arming);
+    }
     commands->state = state;
     arming_check_timeout(&commands->arming, time_us);
     if (commands->arming.armed) {
@@ -156,12 +160,42 @@ static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const h
         commands->armed_us = time_us;
         publish(commands, command);
         return COMMANDS_COMMAND;
+    case ARMING_CONFIGURING:
+        commands->set_receiver =
+            (e2e_receiver_t){.locked = true, .synchronised = true, .counter = frame->data[E2E_HEADER_BYTES - 1]};
+        return COMMANDS_ACCEPTED;
     case ARMING_CHALLENGED:
         return COMMANDS_ACCEPTED;
     case ARMING_REFUSED:
     default:
         return COMMANDS_REJECTED;
     }
+}
+
+static_assert(DRIVE_PARAMETER_WRITE_LENGTH == DRIVE_PARAMETER_SET_CONTROL_LENGTH, "one check of their length");
+
+/* The byte after the header is an index or a step. */
+static commands_frame_t receive_set(commands_t *commands, uint16_t data_id, unsigned end, const hal_can_frame_t *frame,
+                                    uint32_t time_us) {
+    commands_counters_t *counters = &commands->counters;
+    const bool control = frame->identifier == DRIVE_PARAMETER_SET_CONTROL_FRAME_ID;
+    if (frame->length != DRIVE_PARAMETER_WRITE_LENGTH) {
+        return reject(&counters->wrong_length);
+    }
+    if (!e2e_checksum_matches(data_id, frame->data, frame->length)) {
+        return reject(&counters->wrong_checksum);
+    }
+    if (!commands->arming.configuring) {
+        arming_refuse(&commands->arming);
+    } else if (e2e_check(&commands->set_receiver, data_id, frame->data, frame->length) != E2E_ACCEPTED) {
+        return reject(&counters->wrong_counter);
+    } else {
+        commands->arming.configuring_us = time_us;
+    }
+    if (frame->data[E2E_HEADER_BYTES] >= end) {
+        return reject(&counters->out_of_range);
+    }
+    return control || commands->arming.configuring ? COMMANDS_PARAMETER_SET : COMMANDS_REJECTED;
 }
 
 commands_frame_t commands_receive(commands_t *commands, hal_t *hal, const hal_can_frame_t *frame, uint32_t time_us,
@@ -178,6 +212,13 @@ commands_frame_t commands_receive(commands_t *commands, hal_t *hal, const hal_ca
     }
     if (frame->identifier == DRIVE_ARM_FRAME_ID) {
         return receive_arming(commands, hal, frame, time_us, timeout_us, command);
+    }
+    if (frame->identifier == DRIVE_PARAMETER_WRITE_FRAME_ID) {
+        return receive_set(commands, DRIVE_PARAMETER_WRITE_E2E_DATA_ID, PARAMETER_COUNT, frame, time_us);
+    }
+    if (frame->identifier == DRIVE_PARAMETER_SET_CONTROL_FRAME_ID) {
+        return receive_set(commands, DRIVE_PARAMETER_SET_CONTROL_E2E_DATA_ID, PARAMETER_SET_STEP_SAVE + 1u, frame,
+                           time_us);
     }
     if (frame->identifier == DRIVE_PARAMETER_REQUEST_FRAME_ID) {
         if (frame->length != DRIVE_PARAMETER_REQUEST_LENGTH) {

@@ -14,7 +14,11 @@
  * succession are no error; nor is the last accepted frame once more, same counter and same checksum, as a gateway or
  * a disturbed acknowledgement duplicates it: it is dropped and counted. After more lost ones the sender is out of
  * sequence: the drive ends in a fault, and has to be armed again. A second sender slower than one frame in
- * COMMANDS_ERROR_STEP of the first (2.56 s at 100 frames per second) has no effect but to be counted. */
+ * COMMANDS_ERROR_STEP of the first (2.56 s at 100 frames per second) has no effect but to be counted.
+ *
+ * PARAMETER_WRITE and PARAMETER_SET_CONTROL pass while the drive is armed for configuration. Their sequence counter
+ * continues that of confirm_configuration, whose sender the receiver stays with. They are no commands: invalid ones are
+ * counted, but no fault. */
 #ifndef COMMS_COMMANDS_H
 #define COMMS_COMMANDS_H
 
@@ -37,15 +41,17 @@ typedef struct {
     uint16_t accepted;
     uint16_t unknown_frame;  /* unknown or 29-bit identifier, or remote frame */
     uint16_t wrong_length;   /* known identifier with another length than the DBC's */
-    uint16_t wrong_checksum; /* command or DRIVE_ARM with a wrong checksum */
-    uint16_t wrong_counter;  /* command repeated or out of sequence */
-    uint16_t out_of_range;   /* value beyond the DBC's range, or a reserved byte that is not zero */
-    uint16_t run_unarmed;    /* request to run while not armed; counted as accepted, too */
+    uint16_t wrong_checksum; /* protected frame with a wrong checksum */
+    uint16_t wrong_counter;  /* command or frame of a set of parameters repeated or out of sequence */
+    uint16_t out_of_range; /* value beyond the DBC's range, index beyond the parameters, or a reserved byte that is not
+                              zero */
+    uint16_t run_unarmed;  /* request to run while not armed; counted as accepted, too */
 } commands_counters_t;
 
 typedef struct {
-    e2e_receiver_t receiver;   /* of DRIVE_COMMAND and DRIVE_TORQUE_COMMAND */
-    uint32_t last_received_us; /* time of the last frame that it accepted */
+    e2e_receiver_t receiver;     /* of DRIVE_COMMAND and DRIVE_TORQUE_COMMAND */
+    uint32_t last_received_us;   /* time of the last frame that it accepted */
+    e2e_receiver_t set_receiver; /* of PARAMETER_WRITE and PARAMETER_SET_CONTROL, while armed for configuration */
     arming_t arming;
     uint32_t armed_us;   /* when it was armed */
     bool used;           /* a request to run has taken effect since */
@@ -57,7 +63,13 @@ typedef struct {
     commands_counters_t counters;
 } commands_t;
 
-typedef enum { COMMANDS_REJECTED, COMMANDS_ACCEPTED, COMMANDS_COMMAND, COMMANDS_PARAMETER_REQUEST } commands_frame_t;
+typedef enum {
+    COMMANDS_REJECTED,
+    COMMANDS_ACCEPTED,
+    COMMANDS_COMMAND,
+    COMMANDS_PARAMETER_REQUEST,
+    COMMANDS_PARAMETER_SET
+} commands_frame_t;
 
 /* Clears the counters; not armed; the first valid command is accepted with any sequence counter. */
 void commands_init(commands_t *commands);
@@ -70,7 +82,9 @@ void commands_supervise(commands_t *commands, drive_state_t state, uint32_t time
 void commands_disarm(commands_t *commands);
 
 /* Checks a received frame. COMMANDS_COMMAND: *command is written. COMMANDS_PARAMETER_REQUEST: a request of the right
- * length, its contents not checked. COMMANDS_ACCEPTED: a frame that is no command and needs no response.
+ * length, its contents not checked. COMMANDS_PARAMETER_SET: a PARAMETER_WRITE within the DBC's range, or a
+ * PARAMETER_SET_CONTROL likewise, which comes while the drive is not armed for configuration, too, for the response.
+ * COMMANDS_ACCEPTED: a frame that is no command and needs no response.
  * COMMANDS_REJECTED: counted, *command unchanged. hal: its random number generator. [background] */
 commands_frame_t commands_receive(commands_t *commands, hal_t *hal, const hal_can_frame_t *frame, uint32_t time_us,
                                   uint32_t timeout_us, command_t *command);

@@ -2,6 +2,7 @@
 
 #include "comms/memory_protocol.h"
 #include "comms/parameter_protocol.h"
+#include "drive_codec.h"
 
 #define US_PER_MS 1000u
 
@@ -41,8 +42,23 @@ static void flush(comms_t *comms, hal_t *hal, uint32_t time_us) {
     }
 }
 
-static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, uint32_t timeout_us,
-                    uint32_t time_us) {
+static void receive_set(comms_t *comms, parameters_t *parameters, const parameters_conditions_t *conditions,
+                        const hal_can_frame_t *frame) {
+    arming_t *arming = &comms->commands.arming;
+    if (frame->identifier == DRIVE_PARAMETER_WRITE_FRAME_ID) {
+        parameter_set_write(&comms->set, frame);
+        return;
+    }
+    hal_can_frame_t response;
+    if (parameter_set_control(&comms->set, arming->configuring, parameters, comms->store, conditions, frame,
+                              &response)) {
+        arming_end_configuration(arming);
+    }
+    frame_queue_push(&comms->responses, &response);
+}
+
+static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,
+                    uint32_t timeout_us, uint32_t time_us) {
     hal_can_frame_t frame;
     for (int i = 0; i < COMMS_FRAMES_PER_CALL; i++) {
         if (frame_queue_free(&comms->responses) == 0 || !hal_can_receive(hal, &frame)) {
@@ -53,12 +69,15 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, bool w
             return true;
         case COMMANDS_PARAMETER_REQUEST: {
             hal_can_frame_t response;
-            if (!memory_protocol_respond(comms->store, hal, parameters, writable, &frame, &response)) {
-                parameter_protocol_respond(parameters, writable, &frame, &response);
+            if (!memory_protocol_respond(comms->store, hal, &frame, &response)) {
+                parameter_protocol_respond(parameters, &frame, &response);
             }
             frame_queue_push(&comms->responses, &response);
             break;
         }
+        case COMMANDS_PARAMETER_SET:
+            receive_set(comms, parameters, conditions, &frame);
+            break;
         case COMMANDS_ACCEPTED:
         case COMMANDS_REJECTED:
             bus_monitor_check(&comms->bus, &frame, time_us);
@@ -70,11 +89,12 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, bool w
     return false;
 }
 
-bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, drive_state_t state,
-                      uint32_t time_us) {
+bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,
+                      drive_state_t state, uint32_t time_us) {
     const uint32_t timeout_us = (uint32_t)parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] * US_PER_MS;
     commands_supervise(&comms->commands, state, time_us, timeout_us);
-    const bool commanded = receive(comms, hal, parameters, writable, timeout_us, time_us);
+    comms->set.begun = comms->set.begun && comms->commands.arming.configuring;
+    const bool commanded = receive(comms, hal, parameters, conditions, timeout_us, time_us);
     flush(comms, hal, time_us);
     return commanded;
 }

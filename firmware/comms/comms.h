@@ -1,4 +1,5 @@
-/* CAN interface of the drive: receives commands and parameter requests, sends telemetry and parameter responses.
+/* CAN interface of the drive: receives commands, parameter requests and sets of parameters, sends telemetry and
+ * responses.
  *
  * All functions run in the background. The caller's loop:
  *
@@ -8,7 +9,7 @@
  *         ... collect a drive_telemetry_t, with the control interrupt masked ...
  *         comms_telemetry(&comms, hal, &values);
  *     }
- *     if (comms_background(&comms, hal, &parameters, writable, state, time_us)) {
+ *     if (comms_background(&comms, hal, &parameters, &conditions, state, time_us)) {
  *         ... execute comms.command ...
  *     }
  */
@@ -21,6 +22,7 @@
 #include "comms/bus_monitor.h"
 #include "comms/commands.h"
 #include "comms/frame_queue.h"
+#include "comms/parameter_set.h"
 #include "comms/telemetry.h"
 #include "drive/nvm_store.h"
 #include "drive/parameters.h"
@@ -38,7 +40,8 @@ typedef struct {
     bus_monitor_t bus;
     commands_t commands;
     telemetry_t telemetry;
-    frame_queue_t responses; /* to parameter requests */
+    frame_queue_t responses; /* to parameter requests and steps of a set */
+    parameter_set_t set;     /* staged */
     command_t command;       /* last accepted command */
     nvm_store_t *store;      /* set by the caller after comms_init */
     uint32_t arming_sent_us; /* when DRIVE_ARMING last entered a mailbox because of a change */
@@ -58,9 +61,9 @@ void comms_init(comms_t *comms, uint32_t time_us);
  *
  * Of a frame that is neither command nor request, the identifier may be one of the drive's own (comms->bus).
  *
- * `writable`: parameters may be written now. [background] */
-bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, drive_state_t state,
-                      uint32_t time_us);
+ * conditions: for a set of parameters to be applied now. [background] */
+bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,
+                      drive_state_t state, uint32_t time_us);
 
 /* True when comms_telemetry is due. [background] */
 static inline bool comms_telemetry_due(const comms_t *comms, uint32_t time_us) {

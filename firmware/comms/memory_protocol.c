@@ -85,24 +85,17 @@ static parameter_status_t fault_item(const nvm_store_t *store, const hal_t *hal,
     return PARAMETER_STATUS_DONE;
 }
 
-bool memory_protocol_respond(nvm_store_t *store, const hal_t *hal, parameters_t *parameters, bool writable,
-                             const hal_can_frame_t *frame, hal_can_frame_t *response_frame) {
+bool memory_protocol_respond(const nvm_store_t *store, const hal_t *hal, const hal_can_frame_t *frame,
+                             hal_can_frame_t *response_frame) {
     struct drive_parameter_request_t request;
     drive_parameter_request_unpack(&request, frame->data, frame->length);
     struct drive_parameter_response_t response = {
         .operation = request.operation, .index = request.index, .part = request.part, .value = 0};
-    parameter_status_t status = writable ? PARAMETER_STATUS_DONE : PARAMETER_STATUS_NOT_WHILE_RUNNING;
+    parameter_status_t status = PARAMETER_STATUS_UNPROTECTED;
 
     switch (request.operation) {
     case PARAMETER_OPERATION_SAVE:
-        if (writable) {
-            parameter_store_save(store);
-        }
-        break;
     case PARAMETER_OPERATION_RESTORE_DEFAULTS:
-        if (writable) {
-            parameters_restore_defaults(parameters);
-        }
         break;
     case PARAMETER_OPERATION_MEMORY:
         status = memory_item(store, request.part, &response.value);

@@ -19,7 +19,7 @@ static int32_t text_part(const char *text, unsigned part) {
     return (int32_t)value;
 }
 
-void parameter_protocol_respond(parameters_t *parameters, bool writable, const hal_can_frame_t *frame,
+void parameter_protocol_respond(const parameters_t *parameters, const hal_can_frame_t *frame,
                                 hal_can_frame_t *response_frame) {
     struct drive_parameter_request_t request;
     drive_parameter_request_unpack(&request, frame->data, frame->length);
@@ -34,8 +34,7 @@ void parameter_protocol_respond(parameters_t *parameters, bool writable, const h
         const parameter_row_t *row = parameters_row(request.index);
         switch ((parameter_operation_t)request.operation) {
         case PARAMETER_OPERATION_WRITE:
-            response.status = (uint8_t)(writable ? parameters_set(parameters, request.index, request.value)
-                                                 : PARAMETER_STATUS_NOT_WHILE_RUNNING);
+            response.status = PARAMETER_STATUS_UNPROTECTED;
             response.value = parameters->values[request.index];
             break;
         case PARAMETER_OPERATION_MINIMUM:

@@ -1,6 +1,7 @@
 #include "control/inertia.h"
 
 #include "control/machine_tables.h"
+#include "fixed/compiler.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
@@ -82,6 +83,10 @@ void inertia_restart(const inertia_parameters_t *parameters, const load_observer
     inertia->sum_of_sums_q23 = 0;
     inertia->angle = angle;
     inertia->torque_mean_q23 = inertia->acceleration_mean_q23 = 0;
+    set_laws(parameters, model, inertia);
+}
+
+COLD void inertia_tune(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia) {
     set_laws(parameters, model, inertia);
 }
 

@@ -76,6 +76,9 @@ inertia_parameters_t inertia_configure(const inertia_settings_t *settings);
 void inertia_restart(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
                      uint32_t angle);
 
+/* The laws of changed parameters, which are not those of another inertia. */
+void inertia_tune(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia);
+
 /* One update of a run: rotor angle in 2^-32 electrical rev, machine torque in N m, Q7.24. limited: its reference is at
  * a limit. */
 void inertia_step(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,

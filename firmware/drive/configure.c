@@ -381,3 +381,16 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
     return control;
 }
+
+void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned) {
+    parameters->speed_pi = tuned->speed_pi;
+    parameters->speed_smc = tuned->speed_smc;
+    parameters->duty.pid = tuned->duty.pid;
+    parameters->trim.pid = tuned->trim.pid;
+    parameters->predictive.flux = tuned->predictive.flux;
+    parameters->conduction.gain_per_step_q16 = tuned->conduction.gain_per_step_q16;
+    parameters->bandwidth = tuned->bandwidth;
+    parameters->moving_load = tuned->moving_load;
+    parameters->periodic_load = tuned->periodic_load;
+    parameters->inertia = tuned->inertia;
+}

@@ -223,6 +223,15 @@ static void set_speed_law(const control_parameters_t *parameters, deferred_t *de
     deferred->speed_smc.epsilon_q31 = epsilon_q31 > SPEED_SMC_EPSILON_MIN_Q31 ? epsilon_q31 : SPEED_SMC_EPSILON_MIN_Q31;
 }
 
+COLD void deferred_tune(const control_parameters_t *parameters, control_state_t *state) {
+    deferred_t *deferred = &state->deferred;
+    inertia_tune(&parameters->inertia, &parameters->observer, &deferred->inertia);
+    deferred->speed_smc = parameters->speed_smc;
+    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
+        set_speed_law(parameters, deferred);
+    }
+}
+
 /* In single pulse operation the level makes the torque that of the reference, and the offset returns to 0: one that
  * came from the shortfall before would remain. Above base speed, where the windows stay where there is hardly any
  * shortfall, the offset makes up for it. */

@@ -49,6 +49,10 @@ bool deferred_step(const control_parameters_t *parameters, control_state_t *stat
 /* Resets for the next run: conduction angles of torque sharing. [both] */
 void deferred_reset_run(control_state_t *state);
 
+/* Makes the speed law that of changed parameters; no other state follows from tunable ones (parameters.h). [background,
+ * in a critical section] */
+void deferred_tune(const control_parameters_t *parameters, control_state_t *state);
+
 /* Resets with the observer: statistics of the innovation. [interrupt] */
 void deferred_reset_observer(control_state_t *state);
 

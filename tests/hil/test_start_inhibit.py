@@ -38,12 +38,12 @@ def test_drive_that_becomes_ready_is_inhibited_by_nothing(bench):
 
 
 def test_run_ends_with_the_check_that_fails_instead_of_waiting(tmp_path):
-    path = tmp_path / "offset.toml"
-    path.write_text(f"{HEAD}{SPEED}[parameters]\ncurrent_trip_A = 2\n[bench]\ncurrent_sensor_offset_A = 5\n")
+    path = tmp_path / "off.toml"
+    path.write_text(f"{HEAD}{SPEED}[bench]\nsto_1 = 1\n")
     done = subprocess.run([sys.executable, "-m", "salient", "run", path, "--out", tmp_path / "out"],
                           capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr == "salient: the drive is not ready: its check over_current fails\n"
+    assert done.stderr == "salient: the drive is not ready: its check sto fails\n"
 
 
 def test_scenario_without_a_command_may_leave_the_drive_as_it_is(tmp_path):

@@ -80,6 +80,14 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     return set;
 }
 
+void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned) {
+    (void)parameters, (void)tuned;
+}
+
+void deferred_tune(const control_parameters_t *parameters, control_state_t *state) {
+    (void)parameters, (void)state;
+}
+
 void control_reset(const control_parameters_t *parameters, control_state_t *state) {
     (void)parameters, (void)state;
 }
@@ -87,6 +95,9 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
 void control_prepare(const control_parameters_t *parameters, control_state_t *state) {
     (void)parameters, (void)state;
 }
+
+/* The state without its first member, which the background writes. */
+#define SNAPSHOT(state) ((uint32_t *)(state) + 1)
 
 /* Results without their first member, the generation. */
 #define RESULT(results) (&(results)->fault_mask)
@@ -113,12 +124,12 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     interrupts++;
     torn_parameters += torn(parameters, sizeof *parameters);
     torn_commands += torn(command, sizeof *command);
-    fill(state, sizeof(drive_telemetry_t), interrupts * 0x10001u);
+    fill(SNAPSHOT(state), sizeof(drive_telemetry_t), interrupts * 0x10001u);
     exchange(state);
     return false;
 }
 
-static_assert(sizeof(drive_telemetry_t) <= offsetof(control_state_t, deferred_request),
+static_assert(sizeof(uint32_t) + sizeof(drive_telemetry_t) <= offsetof(control_state_t, deferred_request),
               "a snapshot reads only members of control_state_t that nothing else here uses");
 
 /* A step of up to several control periods. */
@@ -153,7 +164,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
 /* Copies the words that the interrupt wrote. */
 void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t *telemetry) {
     (void)time_us;
-    memcpy(telemetry, &from->control, sizeof *telemetry);
+    memcpy(telemetry, SNAPSHOT(&from->control), sizeof *telemetry);
 }
 
 /* No checks of the background: they would read the pattern. */
@@ -190,9 +201,9 @@ void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values) {
     torn_snapshots += torn(values, sizeof *values);
 }
 
-bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, bool writable, drive_state_t state,
-                      uint32_t time_us) {
-    (void)writable, (void)state;
+bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,
+                      drive_state_t state, uint32_t time_us) {
+    (void)conditions, (void)state;
     static uint16_t reported; /* interrupts */
     /* As a time just past: a command with it is neither stale nor overdue; as a request none to run. */
     const uint32_t number = (time_us - 0x100u) | 0x80u;

@@ -298,6 +298,28 @@ def test_control_interrupt_preempts_the_deferred_one_and_their_data_is_torn_only
     assert found.torn == (0, 0, 0, 0, 0)
 
 
+# --- tuning ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("controller", "tuned"), [
+    ("traditional", {"speed_kp": 4.0, "observer_bandwidth_rad_s": 600.0}),
+    ("salient", {"smc_k": 500.0, "observer_steady_rad_s": 400.0, "bp_trim_kp_max": 0.2}),
+])
+def test_tuning_in_a_run_delays_the_control_interrupt_by_less_than_a_tenth_of_the_period(make_bench, controller, tuned):
+    bench = make_bench(build="cortex-m4", controller=controller, instruction_ns=8)
+    bench.load_torque_Nm = 6
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.35)
+    before_us = processor(bench, "worst_us")
+    for step in range(40):
+        bench.drive.parameters.update({name: value * (1 + step / 100) for name, value in tuned.items()})
+    bench.run_for(0.11)
+    print(controller, f"longest control interrupt: {before_us:.2f} us before, {processor(bench, 'worst_us'):.2f} us")
+    assert bench.drive.state == "run"
+    assert before_us <= processor(bench, "worst_us") < before_us + PERIOD_US / 10
+    assert processor(bench, "late_interrupts") == 0
+
+
 # --- the deferred interrupt -----------------------------------------------------------------------------------------
 
 

@@ -1,6 +1,7 @@
 // drive.c between a HAL that remembers and the laws: what it starts, writes, opens and passes on.
 #include <algorithm>
 #include <cstdint>
+#include <cstdio>
 #include <cstring>
 #include <deque>
 #include <functional>
@@ -23,6 +24,7 @@ extern "C" {
 #include "hal_time.h"
 #include "rig/nvm.h"
 }
+#include "support/equal_parameters.h"
 #include "support/frames.h"
 
 struct hal {
@@ -206,21 +208,40 @@ class Drive : public testing::Test {
         }
     }
 
-    // Parameter write over the bus; the response's status.
-    int write(unsigned index, int32_t value) {
+    // Arms for configuration; the counter of the first frame of the set.
+    uint8_t arm_for_configuration() {
+        hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_CONFIGURATION));
+        periods(10);
         hal.to_drive.push_back(
-            frames::parameter_request(DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE, index, 0, value));
-        hal.from_drive.clear();
-        periods(2);
+            frames::arm(8, ARMING_STEP_CONFIRM_CONFIGURATION, ~drive.comms.commands.arming.challenge));
+        return 9;
+    }
+
+    // The last response to a step of a set; status 255: none.
+    drive_parameter_response_t set_response() {
+        drive_parameter_response_t response{};
+        response.status = 255;
         for (const hal_can_frame_t &sent : hal.from_drive) {
-            if (sent.identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID) {
-                drive_parameter_response_t response{};
+            if (sent.identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID &&
+                sent.data[0] == PARAMETER_OPERATION_SET_CONTROL) {
                 drive_parameter_response_unpack(&response, sent.data, sent.length);
-                return response.status;
             }
         }
-        return -1;
+        return response;
     }
+
+    // A set over the bus; the response to its last frame.
+    drive_parameter_response_t set(const frames::parameter_writes_t &writes) {
+        for (const hal_can_frame_t &frame : frames::parameter_set(arm_for_configuration(), writes)) {
+            hal.to_drive.push_back(frame);
+        }
+        hal.from_drive.clear();
+        periods(int(writes.size()) + 4);
+        return set_response();
+    }
+
+    // A set of one parameter; its status.
+    int write(unsigned index, int32_t value) { return set({{index, value}}).status; }
 
     // The content of the only frame of an identifier since from_drive was cleared.
     template <typename frame_t>
@@ -610,14 +631,299 @@ TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
     EXPECT_EQ(drive.control_parameters.torque_mode.torque_max_q24, 5 << 24);
 }
 
+TEST_F(Drive, five_unprotected_frames_change_nothing) {
+    periods(100);
+    const parameters_t before = drive.parameters;
+    const control_parameters_t control_before = drive.control_parameters;
+    for (const auto &[index, value] : frames::parameter_writes_t{{PARAMETER_CURRENT_TRIP_A, 79 << 9},
+                                                                 {PARAMETER_BUS_OVER_VOLTAGE_V, 510 << 6},
+                                                                 {PARAMETER_BUS_UNDER_VOLTAGE_V, 0},
+                                                                 {PARAMETER_COMMAND_TIMEOUT_MS, 400},
+                                                                 {PARAMETER_CONTROLLER, DRIVE_CONTROLLER_SALIENT}}) {
+        hal.from_drive.clear();
+        hal.to_drive.push_back(frames::parameter_request(PARAMETER_OPERATION_WRITE, index, 0, value));
+        periods(2);
+        const auto response = only_frame(DRIVE_PARAMETER_RESPONSE_FRAME_ID, drive_parameter_response_unpack);
+        EXPECT_EQ(response.status, PARAMETER_STATUS_UNPROTECTED);
+        EXPECT_EQ(response.value, before.values[index]);
+    }
+    for (const unsigned operation : {PARAMETER_OPERATION_SAVE, PARAMETER_OPERATION_RESTORE_DEFAULTS}) {
+        hal.from_drive.clear();
+        hal.to_drive.push_back(frames::parameter_request(operation, 0, 0, 0));
+        periods(2);
+        const auto response = only_frame(DRIVE_PARAMETER_RESPONSE_FRAME_ID, drive_parameter_response_unpack);
+        EXPECT_EQ(response.status, PARAMETER_STATUS_UNPROTECTED);
+    }
+    EXPECT_EQ(std::memcmp(&before, &drive.parameters, sizeof before), 0);
+    EXPECT_EQ(std::memcmp(&control_before, &drive.control_parameters, sizeof control_before), 0);
+    EXPECT_EQ(drive.store.saving, NVM_STORE_IDLE);
+}
+
+TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {
+    periods(100);
+    const parameters_t before = drive.parameters;
+    const auto frames = frames::parameter_set(arm_for_configuration(), {{PARAMETER_TORQUE_MAX_NM, 5 << 24},
+                                                                        {PARAMETER_CURRENT_LIMIT_A, 40 << 9},
+                                                                        {PARAMETER_CURRENT_TRIP_A, 41 << 9}});
+    for (const hal_can_frame_t &frame : frames) {
+        EXPECT_EQ(std::memcmp(before.values, drive.parameters.values, sizeof before.values), 0);
+        hal.to_drive.push_back(frame);
+        periods(3);
+    }
+    EXPECT_EQ(drive.control_parameters.torque_mode.torque_max_q24, 5 << 24);
+    EXPECT_EQ(drive.control_parameters.predictive.current_limit_q9, 40 << 9);
+    EXPECT_EQ(drive.control_parameters.protection.current_trip_q9, 41 << 9);
+    EXPECT_FALSE(drive.comms.commands.arming.configuring);
+}
+
+TEST_F(Drive, a_recording_of_a_set_changes_nothing) {
+    periods(100);
+    std::vector<hal_can_frame_t> recording{frames::arm(7, ARMING_STEP_REQUEST_CONFIGURATION)};
+    arm_for_configuration();
+    recording.push_back(hal.to_drive.back());
+    const auto set = frames::parameter_set(9, {{PARAMETER_CURRENT_TRIP_A, 79 << 9}});
+    recording.insert(recording.end(), set.begin(), set.end());
+    hal.to_drive.insert(hal.to_drive.end(), set.begin(), set.end());
+    periods(10);
+    ASSERT_EQ(drive.parameters.values[PARAMETER_CURRENT_TRIP_A], 79 << 9);
+    ASSERT_EQ(write(PARAMETER_CURRENT_TRIP_A, 75 << 9), PARAMETER_STATUS_DONE);
+    for (const int distance : {1, 10, 1000, 100000}) { // periods between the frames
+        hal.from_drive.clear();
+        for (const hal_can_frame_t &frame : recording) {
+            hal.to_drive.push_back(frame);
+            periods(distance);
+        }
+        EXPECT_EQ(set_response().status, PARAMETER_STATUS_NOT_ARMED);
+        EXPECT_EQ(drive.parameters.values[PARAMETER_CURRENT_TRIP_A], 75 << 9);
+    }
+    EXPECT_GE(drive.comms.commands.arming.refused, 4 * 4);
+}
+
+TEST_F(Drive, a_set_with_a_missing_a_changed_or_an_additional_frame_is_refused) {
+    periods(100);
+    const parameters_t before = drive.parameters;
+    const frames::parameter_writes_t writes = {
+        {PARAMETER_TORQUE_MAX_NM, 5 << 24}, {PARAMETER_CURRENT_LIMIT_A, 40 << 9}, {PARAMETER_OVER_SPEED_RPM, 1000}};
+    for (int kind = 0; kind < 8; kind++) {
+        auto set = frames::parameter_set(arm_for_configuration(), writes);
+        commands_counters_t counted = drive.comms.commands.counters;
+        int status = PARAMETER_STATUS_INCOMPLETE;
+        switch (kind) {
+        case 0: // no begin
+        case 1: // no first write
+        case 2:
+        case 3:
+            set.erase(set.begin() + kind);
+            break;
+        case 4: // a bit of a value
+            set[2].data[5] ^= 1;
+            counted.wrong_checksum++;
+            break;
+        case 5: // twice: as the acknowledgement's disturbance does; the copy is dropped
+            set.insert(set.begin() + 2, set[1]);
+            counted.wrong_counter++;
+            status = PARAMETER_STATUS_DONE;
+            break;
+        case 6: // other order
+            std::swap(set[1], set[2]);
+            counted.wrong_counter++;
+            break;
+        default: // another write in the place of one
+            set[2] = frames::parameter_write(set[2].data[2], PARAMETER_CURRENT_LIMIT_A, 41 << 9);
+            break;
+        }
+        hal.from_drive.clear();
+        hal.to_drive.insert(hal.to_drive.end(), set.begin(), set.end());
+        periods(10);
+        EXPECT_EQ(set_response().status, status) << kind;
+        EXPECT_EQ(drive.comms.commands.counters.wrong_checksum, counted.wrong_checksum) << kind;
+        EXPECT_EQ(drive.comms.commands.counters.wrong_counter, counted.wrong_counter) << kind;
+        if (status == PARAMETER_STATUS_DONE) {
+            EXPECT_EQ(drive.parameters.values[PARAMETER_OVER_SPEED_RPM], 1000);
+            const auto restored = frames::parameter_set(arm_for_configuration(), {}, PARAMETER_SET_STEP_BEGIN_DEFAULTS);
+            hal.to_drive.insert(hal.to_drive.end(), restored.begin(), restored.end());
+            periods(10);
+        }
+        EXPECT_EQ(std::memcmp(before.values, drive.parameters.values, sizeof before.values), 0) << kind;
+    }
+    // More than two in succession are missing: the sequence counter.
+    auto set = frames::parameter_set(arm_for_configuration(), writes);
+    set.erase(set.begin() + 1, set.begin() + 4);
+    hal.from_drive.clear();
+    hal.to_drive.insert(hal.to_drive.end(), set.begin(), set.end());
+    const uint16_t counted = drive.comms.commands.counters.wrong_counter;
+    periods(10);
+    EXPECT_EQ(set_response().value & 0xFF, PARAMETER_SET_STEP_BEGIN) << "apply has no response";
+    EXPECT_EQ(drive.comms.commands.counters.wrong_counter, counted + 1);
+    EXPECT_EQ(std::memcmp(before.values, drive.parameters.values, sizeof before.values), 0);
+}
+
+TEST_F(Drive, a_refused_set_names_its_parameters_and_changes_nothing) {
+    periods(100);
+    const parameters_t before = drive.parameters;
+    const struct {
+        frames::parameter_writes_t writes;
+        parameter_status_t status;
+        unsigned index, other;
+    } cases[] = {
+        {{{PARAMETER_OVER_SPEED_RPM, 1000}, {PARAMETER_CURRENT_TRIP_A, 80 << 9}},
+         PARAMETER_STATUS_OUT_OF_RANGE,
+         PARAMETER_CURRENT_TRIP_A,
+         0},
+        {{{PARAMETER_OVER_SPEED_RPM, 9}}, PARAMETER_STATUS_OUT_OF_RANGE, PARAMETER_OVER_SPEED_RPM, 0},
+        {{{PARAMETER_OVER_SPEED_RPM, 1000}, {PARAMETER_CURRENT_LIMIT_A, 60 << 9}, {PARAMETER_CURRENT_TRIP_A, 50 << 9}},
+         PARAMETER_STATUS_CONTRADICTION,
+         PARAMETER_CURRENT_LIMIT_A,
+         PARAMETER_CURRENT_TRIP_A},
+        {{{PARAMETER_CURRENT_LIMIT_A, (75 << 9) + 1}},
+         PARAMETER_STATUS_CONTRADICTION,
+         PARAMETER_CURRENT_LIMIT_A,
+         PARAMETER_CURRENT_TRIP_A},
+        {{{PARAMETER_BUS_UNDER_VOLTAGE_V, 300 << 6}},
+         PARAMETER_STATUS_CONTRADICTION,
+         PARAMETER_BUS_UNDER_VOLTAGE_V,
+         PARAMETER_BUS_OVER_VOLTAGE_V},
+        {{{PARAMETER_TURN_ON_ANGLE_DEG, 300 << 7}},
+         PARAMETER_STATUS_CONTRADICTION,
+         PARAMETER_TURN_ON_ANGLE_DEG,
+         PARAMETER_TURN_OFF_ANGLE_DEG},
+        {{{PARAMETER_TURN_OFF_ANGLE_DEG, (348 << 7) + 1}},
+         PARAMETER_STATUS_CONTRADICTION,
+         PARAMETER_TURN_OFF_ANGLE_DEG,
+         PARAMETER_OUTGOING_OFF_ANGLE_DEG},
+        {{{PARAMETER_TORQUE_BAND_INNER_NM, (1 << 24) + 1}},
+         PARAMETER_STATUS_CONTRADICTION,
+         PARAMETER_TORQUE_BAND_INNER_NM,
+         PARAMETER_TORQUE_BAND_OUTER_NM},
+        {{{PARAMETER_BUS_OVER_VOLTAGE_V, (240 << 6) - 1}},
+         PARAMETER_STATUS_EXCLUDES_SUPPLY,
+         PARAMETER_BUS_OVER_VOLTAGE_V,
+         0},
+        {{{PARAMETER_BUS_UNDER_VOLTAGE_V, (240 << 6) + 1}},
+         PARAMETER_STATUS_EXCLUDES_SUPPLY,
+         PARAMETER_BUS_UNDER_VOLTAGE_V,
+         0},
+    };
+    for (const auto &refused : cases) {
+        const auto response = set(refused.writes);
+        EXPECT_EQ(response.status, refused.status);
+        EXPECT_EQ(response.index, refused.index);
+        EXPECT_EQ(response.part, refused.other);
+        EXPECT_EQ(std::memcmp(&before, &drive.parameters, sizeof before), 0);
+    }
+    // One LSB less of each is accepted.
+    for (const frames::parameter_writes_t &accepted :
+         {frames::parameter_writes_t{{PARAMETER_CURRENT_LIMIT_A, 75 << 9}},
+          {{PARAMETER_BUS_UNDER_VOLTAGE_V, 240 << 6}, {PARAMETER_BUS_OVER_VOLTAGE_V, (240 << 6) + 1}},
+          {{PARAMETER_TURN_ON_ANGLE_DEG, (300 << 7) - 1}},
+          {{PARAMETER_TURN_OFF_ANGLE_DEG, 348 << 7}},
+          {{PARAMETER_TORQUE_BAND_INNER_NM, 1 << 24}},
+          {{PARAMETER_CURRENT_TRIP_A, 20 << 9}}}) {
+        EXPECT_EQ(set(accepted).status, PARAMETER_STATUS_DONE) << accepted.front().first;
+    }
+    // Without its supply nothing is said about the thresholds.
+    hal.adc.bus_voltage_counts = 0;
+    periods(10);
+    EXPECT_EQ(set({{PARAMETER_BUS_OVER_VOLTAGE_V, 300 << 6}}).status, PARAMETER_STATUS_DONE);
+}
+
+TEST_F(Drive, armed_for_configuration_ends_with_the_set_a_run_bus_off_and_two_seconds) {
+    periods(100);
+    const auto armed = [this] { return drive.comms.commands.arming.configuring; };
+    const auto arm = [&] {
+        const uint8_t next = arm_for_configuration();
+        periods(2);
+        EXPECT_TRUE(armed());
+        return next;
+    };
+    for (const unsigned step : {PARAMETER_SET_STEP_APPLY, PARAMETER_SET_STEP_ABANDON, PARAMETER_SET_STEP_SAVE}) {
+        hal.to_drive.push_back(frames::parameter_set_control(arm(), step));
+        periods(2);
+        EXPECT_FALSE(armed()) << step;
+    }
+    uint8_t next = arm();
+    hal.to_drive.push_back(frames::parameter_set_control(next, PARAMETER_SET_STEP_BEGIN));
+    periods(70000); // 1.75 s
+    hal.to_drive.push_back(frames::parameter_write(++next, PARAMETER_OVER_SPEED_RPM, 1000));
+    periods(70000);
+    EXPECT_TRUE(armed());
+    periods(10100);
+    EXPECT_FALSE(armed());
+    arm();
+    hal.can_status.state = HAL_CAN_BUS_OFF;
+    periods(100);
+    EXPECT_FALSE(armed());
+    hal.can_status.state = HAL_CAN_ERROR_ACTIVE;
+    periods(2000);
+    // Another challenge, of which the response is missing.
+    arm();
+    hal.to_drive.push_back(frames::arm(50, ARMING_STEP_REQUEST_CONFIGURATION));
+    periods(2);
+    EXPECT_FALSE(armed());
+    periods(20000);
+    // A run.
+    send(COMMAND_OFF);
+    hal.to_drive.push_back(frames::arm(1, ARMING_STEP_REQUEST_RUN));
+    periods(10);
+    hal.to_drive.push_back(frames::arm(2, ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
+    periods(10);
+    arm();
+    send(COMMAND_RUN);
+    periods(4);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_FALSE(armed());
+    arm(); // for tunable parameters
+}
+
+// The control parameters are always those of the whole set, though a run takes over parts of them only.
+TEST_F(Drive, tunable_parameters_change_in_a_run_and_others_do_not) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(100);
+    unsigned tuned = 0;
+    for (unsigned index = 0; index < PARAMETER_COUNT; index++) {
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+        const parameter_row_t *row = parameters_row(index);
+        const parameters_t before = drive.parameters;
+        const int32_t middle = int32_t((int64_t(row->minimum) + row->maximum) / 2);
+        const int32_t value = before.values[index] == middle ? row->maximum : middle;
+        send(COMMAND_RUN);
+        const auto response = set({{index, value}});
+        if (parameters_tunable(index)) {
+            EXPECT_EQ(response.status, PARAMETER_STATUS_DONE) << parameters_name(index);
+            EXPECT_EQ(drive.parameters.values[index], value);
+            tuned++;
+        } else {
+            EXPECT_EQ(response.status, PARAMETER_STATUS_NOT_WHILE_RUNNING) << parameters_name(index);
+            EXPECT_EQ(response.index, index);
+            EXPECT_EQ(std::memcmp(&before, &drive.parameters, sizeof before), 0);
+        }
+        const control_parameters_t expected =
+            configure_control(&drive.parameters, &machine_tables, 40000, 17, 12, 200000000);
+        EXPECT_STREQ(difference(expected, drive.control_parameters), "") << parameters_name(index);
+    }
+    EXPECT_EQ(tuned, 15u);
+    EXPECT_EQ(drive.control.deferred.speed_smc.gain_q24, drive.control_parameters.speed_smc.gain_q24);
+    EXPECT_EQ(drive.control.deferred.speed_smc.delta_q27, drive.control_parameters.speed_smc.delta_q27);
+}
+
 TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_changed_in_run) {
     periods(100);
-    // A write and the command to run wait together: one call of the background takes both.
-    hal.to_drive.push_back(frames::parameter_request(DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE,
-                                                     PARAMETER_CURRENT_TRIP_A, 0, 60 << 9));
-    hal.to_drive.push_back(frames::parameter_request(DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE,
-                                                     PARAMETER_CONTROLLER, 0, DRIVE_CONTROLLER_TRADITIONAL));
-    command(COMMAND_RUN);
+    // Armed for a run by commands that are none to run.
+    send(COMMAND_OFF);
+    hal.to_drive.push_back(frames::arm(1, ARMING_STEP_REQUEST_RUN));
+    periods(10);
+    hal.to_drive.push_back(frames::arm(2, ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
+    periods(10);
+    ASSERT_TRUE(drive.comms.commands.arming.armed);
+    // The set and the command to run wait together: one call of the background takes apply and command.
+    const auto set =
+        frames::parameter_set(arm_for_configuration(), {{PARAMETER_CURRENT_TRIP_A, 60 << 9},
+                                                        {PARAMETER_CONTROLLER, DRIVE_CONTROLLER_TRADITIONAL}});
+    hal.to_drive.insert(hal.to_drive.end(), set.begin(), set.end());
+    send(COMMAND_RUN);
+    ASSERT_EQ(hal.to_drive.size(), 6u);
+    static_assert(COMMS_FRAMES_PER_CALL == 4, "confirm, begin and the writes in one call, apply and run in the next");
     bool ran = false;
     control_parameters_t in_run{};
     hal.after_critical_section = [&] {
@@ -639,6 +945,104 @@ TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_c
     EXPECT_EQ(in_run.protection.current_trip_q9, 60 << 9);
     EXPECT_EQ(in_run.controller, DRIVE_CONTROLLER_TRADITIONAL);
     EXPECT_EQ(std::memcmp(&in_run, &drive.control_parameters, sizeof in_run), 0);
+}
+
+// Frames of sets in any order, lost, damaged, recorded, with runs between: a model of the host says what may change.
+TEST_F(Drive, random_frames_change_parameters_only_as_a_whole_checked_set_of_an_armed_host) {
+    periods(100);
+    std::mt19937 random(16);
+    std::vector<hal_can_frame_t> recorded;
+    uint8_t next = 0; // sequence counter of the set
+    std::vector<int32_t> staged(drive.parameters.values, drive.parameters.values + PARAMETER_COUNT);
+    uint32_t check = 0;
+    unsigned applied = 0, refused = 0, tuned = 0;
+    const auto send_frame = [&](const hal_can_frame_t &frame) {
+        recorded.push_back(frame);
+        hal.to_drive.push_back(frame);
+    };
+    for (int step = 0; step < 40000; step++) {
+        const parameters_t before = drive.parameters;
+        const bool armed = drive.comms.commands.arming.configuring;
+        bool may_apply = false;
+        switch (random() % 16) {
+        case 0: // arms, mostly
+            if (random() % 4 != 0 && !armed) {
+                send_frame(frames::arm(50, ARMING_STEP_REQUEST_CONFIGURATION));
+                periods(10);
+                send_frame(frames::arm(51, ARMING_STEP_CONFIRM_CONFIGURATION, ~drive.comms.commands.arming.challenge));
+                next = 52;
+            }
+            break;
+        case 1:
+        case 2:
+        case 3: { // begins
+            const bool defaults = random() % 3 == 0;
+            send_frame(frames::parameter_set_control(next++, defaults ? PARAMETER_SET_STEP_BEGIN_DEFAULTS
+                                                                      : PARAMETER_SET_STEP_BEGIN));
+            for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+                staged[i] = defaults ? parameters_default(&before, i) : before.values[i];
+            }
+            check = 0;
+            break;
+        }
+        case 4: // any frame of before
+            if (!recorded.empty()) {
+                hal.to_drive.push_back(recorded[random() % recorded.size()]);
+                may_apply = armed; // it may be the very one that follows
+            }
+            break;
+        case 5: // commands, a run now and then
+            command(random() % 4 != 0 ? COMMAND_RUN : COMMAND_OFF);
+            break;
+        case 6:
+            periods(random() % 8 == 0 ? 4000 : 40);
+            break;
+        case 7:
+        case 8:
+        case 9: // applies, with the right check or not
+            may_apply = armed;
+            send_frame(frames::parameter_set_control(next++, PARAMETER_SET_STEP_APPLY, check + (random() % 4 == 0)));
+            break;
+        default: { // writes; one of 16 is lost
+            unsigned index = random() % PARAMETER_COUNT;
+            while (drive.control.state_machine.state == DRIVE_STATE_RUN && random() % 8 != 0 &&
+                   !parameters_tunable(index)) {
+                index = random() % PARAMETER_COUNT;
+            }
+            const parameter_row_t *row = parameters_row(index);
+            const int64_t width = int64_t(row->maximum) - row->minimum;
+            const int32_t value =
+                random() % 64 == 0 ? int32_t(random()) : int32_t(row->minimum + int64_t(random()) % (width + 1));
+            const hal_can_frame_t frame = frames::parameter_write(next++, index, value);
+            check = crc32_continue(check, frame.data + E2E_HEADER_BYTES, 5);
+            staged[index] = value;
+            if (random() % 16 != 0) {
+                send_frame(frame);
+            }
+        }
+        }
+        const bool running = drive.control.state_machine.state == DRIVE_STATE_RUN;
+        periods(3);
+        const int32_t *values = drive.parameters.values;
+        if (std::memcmp(before.values, values, sizeof before.values) != 0) {
+            ASSERT_TRUE(may_apply) << step;
+            ASSERT_TRUE(std::equal(staged.begin(), staged.end(), values)) << step;
+            applied++;
+            for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+                ASSERT_GE(values[i], parameters_row(i)->minimum) << step;
+                ASSERT_LE(values[i], parameters_row(i)->maximum) << step;
+                ASSERT_TRUE(!running || parameters_tunable(i) || values[i] == before.values[i]) << step;
+            }
+            ASSERT_LT(values[PARAMETER_BUS_UNDER_VOLTAGE_V], values[PARAMETER_BUS_OVER_VOLTAGE_V]) << step;
+            tuned += running;
+        } else {
+            refused += may_apply;
+        }
+    }
+    EXPECT_GT(applied, 100u);
+    EXPECT_GT(refused, 100u);
+    EXPECT_GT(tuned, 5u);
+    std::printf("%u sets applied, %u of them in a run, %u refused\n", applied, tuned, refused);
 }
 
 TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {

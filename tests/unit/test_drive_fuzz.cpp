@@ -11,6 +11,7 @@ extern "C" {
 #include "drive/control.h"
 #include "drive/deferred.h"
 }
+#include "support/equal_parameters.h"
 
 namespace {
 
@@ -33,6 +34,24 @@ int32_t any_value(unsigned index, std::mt19937_64 &random) {
     default:
         return int32_t(row->minimum + int64_t(random() % (uint64_t(int64_t(row->maximum) - row->minimum) + 1)));
     }
+}
+
+// Changes some of the tunable parameters as a drive that runs does; 1 when it runs and the set is accepted.
+unsigned tune(parameters_t &p, std::mt19937_64 &random, bool runs) {
+    parameters_t set = p;
+    uint64_t written = 0;
+    for (unsigned index = 0; index < PARAMETER_COUNT; index++) {
+        if (parameters_tunable(index) && random() % 3 == 0) {
+            set.values[index] = any_value(index, random);
+            written |= uint64_t(1) << index;
+        }
+    }
+    // The set itself may have contradictions, which remain; no tunable parameter is part of one.
+    const parameters_conditions_t conditions = {true, INT32_MAX};
+    const parameter_status_t status = parameters_check(&p, set.values, written, &conditions).status;
+    EXPECT_TRUE(status == PARAMETER_STATUS_DONE || status == PARAMETER_STATUS_CONTRADICTION);
+    parameters_apply(&p, set.values);
+    return runs;
 }
 
 // The machine at hand, and one with four phases whose map is full of noise.
@@ -92,7 +111,7 @@ struct bench_t {
 TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
     const machine_tables_t bundled = machine_tables, other = four_phases();
     const uint32_t rates_hz[] = {20000, 40000, 50000, 100000};
-    uint64_t running = 0, faults = 0, cleared = 0, driven = 0;
+    uint64_t running = 0, faults = 0, cleared = 0, driven = 0, tuned = 0;
     for (int sequence = 0; sequence < SEQUENCES; sequence++) {
         std::mt19937_64 random{uint64_t(sequence)};
         machine_tables = sequence % 2 == 0 ? bundled : other;
@@ -100,18 +119,27 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
         parameters_t p;
         parameters_init(&p);
         for (unsigned index = 0; index < PARAMETER_COUNT; index++) {
-            ASSERT_EQ(parameters_set(&p, index, any_value(index, random)), PARAMETER_STATUS_DONE);
+            p.values[index] = any_value(index, random);
         }
         const uint32_t rate_hz = rates_hz[random() % 4];
-        const control_parameters_t parameters =
-            configure_control(&p, tables, rate_hz, unsigned(8 + random() % 25), 12 + unsigned(sequence) % 5,
-                              TIMER_CLOCKS_HZ[sequence % 2]);
+        const unsigned encoder_bits = unsigned(8 + random() % 25), adc_bits = 12 + unsigned(sequence) % 5;
+        const auto configured = [&] {
+            return configure_control(&p, tables, rate_hz, encoder_bits, adc_bits, TIMER_CLOCKS_HZ[sequence % 2]);
+        };
+        control_parameters_t parameters = configured();
         control_state_t state;
         control_reset(&parameters, &state);
         bench_t bench;
         bench.angle = uint32_t(random());
         for (int period = 0; period < PERIODS; period++) {
             bench.advance(random, parameters, 1000000 / rate_hz);
+            if (random() % 50 == 0) { // between two periods, in any state
+                tuned += tune(p, random, state.state_machine.state == DRIVE_STATE_RUN);
+                const control_parameters_t of_the_set = configured();
+                configure_tune(&parameters, &of_the_set);
+                deferred_tune(&parameters, &state);
+                ASSERT_STREQ(difference(parameters, of_the_set), "") << "sequence " << sequence;
+            }
             const drive_state_t before = state.state_machine.state;
             hal_pwm_compare_t compare;
             const bool closed = control_step(&parameters, &state, &bench.sample, &bench.command, &compare);
@@ -142,6 +170,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
     EXPECT_GT(driven, running / 20);
     EXPECT_GT(faults, uint64_t(SEQUENCES) / 4);
     EXPECT_GT(cleared, uint64_t(SEQUENCES) / 20);
+    EXPECT_GT(tuned, uint64_t(SEQUENCES) / 2);
 }
 
 TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {

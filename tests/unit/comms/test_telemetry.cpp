@@ -116,7 +116,7 @@ class Comms : public testing::Test {
             if (comms_telemetry_due(&comms, time_us)) {
                 report(time_us);
             }
-            if (comms_background(&comms, &bus, &parameters, true, DRIVE_STATE_READY, time_us)) {
+            if (comms_background(&comms, &bus, &parameters, &conditions, DRIVE_STATE_READY, time_us)) {
                 accepted.push_back(comms.command);
             }
         }
@@ -142,6 +142,7 @@ class Comms : public testing::Test {
     drive_t drive{};
     comms_t &comms = drive.comms;
     parameters_t &parameters = drive.parameters;
+    parameters_conditions_t conditions{};
     uint32_t time_us = 0;
     std::vector<command_t> accepted;
 };
@@ -414,7 +415,7 @@ TEST_F(Comms, cycles_go_on_across_the_wrap_of_the_clock) {
         if (comms_telemetry_due(&comms, start + elapsed)) {
             report(start + elapsed);
         }
-        comms_background(&comms, &bus, &parameters, true, DRIVE_STATE_READY, start + elapsed);
+        comms_background(&comms, &bus, &parameters, &conditions, DRIVE_STATE_READY, start + elapsed);
     }
     EXPECT_EQ(bus.count(DRIVE_STATUS_FRAME_ID), 10u);
 }
@@ -433,7 +434,7 @@ TEST_F(Comms, every_command_is_seen_in_order) {
 
 TEST_F(Comms, one_call_processes_a_bounded_number_of_frames) {
     bus.received.assign(HAL_CAN_RECEIVE_QUEUE, hal_can_frame_t{0x123, false, false, 8, {}});
-    comms_background(&comms, &bus, &parameters, true, DRIVE_STATE_READY, 0);
+    comms_background(&comms, &bus, &parameters, &conditions, DRIVE_STATE_READY, 0);
     EXPECT_EQ(bus.received.size(), size_t(HAL_CAN_RECEIVE_QUEUE - COMMS_FRAMES_PER_CALL));
     EXPECT_EQ(comms.commands.counters.unknown_frame, COMMS_FRAMES_PER_CALL);
 }
@@ -457,11 +458,17 @@ TEST_F(Comms, no_parameter_response_is_lost_when_the_bus_is_blocked) {
 }
 
 TEST_F(Comms, parameters_can_be_written_over_the_bus) {
-    bus.received.push_back(request(DRIVE_PARAMETER_REQUEST_OPERATION_WRITE_CHOICE, PARAMETER_COMMAND_TIMEOUT_MS, 20));
-    run(3000);
+    bus.received.push_back(frames::arm(1, ARMING_STEP_REQUEST_CONFIGURATION));
+    run(1000);
+    bus.received.push_back(frames::arm(2, ARMING_STEP_CONFIRM_CONFIGURATION, ~comms.commands.arming.challenge));
+    for (const auto &frame : frames::parameter_set(3, {{PARAMETER_COMMAND_TIMEOUT_MS, 20}})) {
+        bus.received.push_back(frame);
+    }
+    run(4000);
     EXPECT_EQ(parameters.values[PARAMETER_COMMAND_TIMEOUT_MS], 20);
     bus.received.push_back(command(10, COMMAND_RUN));
     run(10000);
+    EXPECT_EQ(bus.count(DRIVE_PARAMETER_RESPONSE_FRAME_ID), 2u) << "begin, apply";
     ASSERT_EQ(accepted.size(), 1u);
     run(40000);
     bus.received.push_back(command(200, COMMAND_RUN)); // the sender was silent for longer than 20 ms

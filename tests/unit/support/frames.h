@@ -2,11 +2,14 @@
 #pragma once
 
 #include <cstdint>
+#include <utility>
+#include <vector>
 
 extern "C" {
 #include "comms/commands.h"
 #include "comms/e2e.h"
 #include "drive_codec.h"
+#include "fixed/crc32.h"
 #include "hal_can.h"
 }
 
@@ -49,6 +52,39 @@ inline hal_can_frame_t arm(uint8_t counter, unsigned step, uint32_t response = 0
     message.response = response;
     return protected_frame(DRIVE_ARM_FRAME_ID, DRIVE_ARM_LENGTH, DRIVE_ARM_E2E_DATA_ID, counter, message,
                            drive_arm_pack);
+}
+
+// PARAMETER_WRITE with its checksum; the values are not checked.
+inline hal_can_frame_t parameter_write(uint8_t counter, unsigned index, int32_t value) {
+    drive_parameter_write_t message{};
+    message.index = uint8_t(index);
+    message.value = value;
+    return protected_frame(DRIVE_PARAMETER_WRITE_FRAME_ID, DRIVE_PARAMETER_WRITE_LENGTH,
+                           DRIVE_PARAMETER_WRITE_E2E_DATA_ID, counter, message, drive_parameter_write_pack);
+}
+
+// PARAMETER_SET_CONTROL with its checksum; the values are not checked.
+inline hal_can_frame_t parameter_set_control(uint8_t counter, unsigned step, uint32_t check = 0) {
+    drive_parameter_set_control_t message{};
+    message.step = uint8_t(step);
+    message.check = check;
+    return protected_frame(DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DRIVE_PARAMETER_SET_CONTROL_LENGTH,
+                           DRIVE_PARAMETER_SET_CONTROL_E2E_DATA_ID, counter, message, drive_parameter_set_control_pack);
+}
+
+using parameter_writes_t = std::vector<std::pair<unsigned, int32_t>>;
+
+// The frames of a set from begin to apply, the first with this counter.
+inline std::vector<hal_can_frame_t> parameter_set(uint8_t counter, const parameter_writes_t &writes,
+                                                  unsigned begin = PARAMETER_SET_STEP_BEGIN) {
+    std::vector<hal_can_frame_t> set{parameter_set_control(counter, begin)};
+    uint32_t check = 0;
+    for (const auto &[index, value] : writes) {
+        set.push_back(parameter_write(++counter, index, value));
+        check = crc32_continue(check, set.back().data + E2E_HEADER_BYTES, 8 - E2E_HEADER_BYTES);
+    }
+    set.push_back(parameter_set_control(++counter, PARAMETER_SET_STEP_APPLY, check));
+    return set;
 }
 
 // PARAMETER_REQUEST; the values are not checked.

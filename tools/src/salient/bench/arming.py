@@ -11,6 +11,7 @@ from salient.bus.signals import drive_database, value_numbers
 _ARM = drive_database().get_message_by_name("DRIVE_ARM")
 _REPORT = "DRIVE_ARMING"
 STEPS = value_numbers(drive_database(), "DRIVE_ARM", "step")
+ATTEMPTS = value_numbers(drive_database(), "DRIVE_ARMING", "attempt")
 
 RETRY_NS = 500_000_000
 """Time without a challenge or its result after which the request is repeated: that in which a challenge is valid."""
@@ -22,10 +23,7 @@ _SLOW_POLL_NS = 1_000_000
 
 def arm_frame(counter: int, step: str, response: int = 0) -> can.Message:
     """A DRIVE_ARM with its checksum. counter 0..255; step one of STEPS; response 0..2^32-1."""
-    signals = {"checksum": 0, "counter": counter % 256, "step": STEPS[step], "response": response}
-    payload = _ARM.encode(signals)[e2e.HEADER_BYTES :]
-    data = e2e.protect(e2e.data_id(_ARM), counter % 256, payload)
-    return can.Message(arbitration_id=_ARM.frame_id, is_extended_id=False, data=data)
+    return e2e.protected_frame(_ARM, counter % 256, {"step": STEPS[step], "response": response})
 
 
 def response_to(challenge: int) -> int:
@@ -70,8 +68,9 @@ class ArmingSequence:
         self.due_ns = self._session.time_ns + (_FAST_POLL_NS if elapsed_ns < _FAST_POLL_FOR_NS else _SLOW_POLL_NS)
 
     def _take_report(self) -> None:
-        attempt, armed, challenge = (int(self._session.telemetry[f"{_REPORT}.{name}"].last)
+        present, armed, challenge = (int(self._session.telemetry[f"{_REPORT}.{name}"].last)
                                      for name in ("attempt", "armed", "challenge"))
+        attempt = present == ATTEMPTS["run"]
         if armed and self._answered is not None:
             self.armed = True
         elif attempt and challenge != self._answered:

@@ -12,6 +12,7 @@ from cantools.database.can import Message
 
 from salient.bench.arming import ArmingSequence
 from salient.bench.client import Client, KnownAttributes
+from salient.bench.parameter_set import ParameterSetWriter, SetResult
 from salient.bus import e2e
 from salient.bus.signals import drive_database, signal_range, value_numbers
 from salient.errors import RunFailed, UsageError
@@ -69,10 +70,7 @@ def torque_command_frame(counter: int, request: str, torque_reference_Nm: float,
 
 
 def _protected(command: Message, counter: int, request: str, reference: Mapping[str, float]) -> can.Message:
-    signals = {"checksum": 0, "counter": counter, "request": REQUESTS[request], **reference}
-    payload = command.encode(signals)[e2e.HEADER_BYTES :]
-    data = e2e.protect(e2e.data_id(command), counter, payload)
-    return can.Message(arbitration_id=command.frame_id, is_extended_id=False, data=data)
+    return e2e.protected_frame(command, counter, {"request": REQUESTS[request], **reference})
 
 
 class Drive(KnownAttributes):
@@ -272,12 +270,15 @@ class ParameterRow:
 class Parameters(MutableMapping[str, float]):
     """The drive's parameters by name, read and written in their units.
 
-    The table is read from the drive at the first use, unless `table` returns it. KeyError: unknown name. DriveError:
-    value rejected by the drive.
+    The table is read from the drive at the first use, unless `table` returns it. Writing arms the drive for
+    configuration and applies a set, of one parameter or, with `update`, of several: all of them or none. In a run the
+    drive takes tunable parameters only. KeyError: unknown name. DriveError: set refused by the drive; the message names
+    the parameters.
     """
 
     def __init__(self, session: Client, table: Callable[[], list[ParameterRow]] | None = None) -> None:
         self._session = session
+        self._writer = ParameterSetWriter(session)
         self._table = table
         self._loaded: dict[str, ParameterRow] | None = None
 
@@ -300,17 +301,44 @@ class Parameters(MutableMapping[str, float]):
         return math.ldexp(_access(self._session, "read", row.index)[1], -row.fraction_bits)
 
     def __setitem__(self, name: str, value: float) -> None:
-        row = self.row(name)
-        status, _ = _access(self._session, "write", row.index, value=raw_value(row, value))
-        if status == "out_of_range":
-            raise DriveError(f"{name} {value:g}: must be {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
-        if status != "done":
-            raise DriveError(f"{name} {value:g}: {status}")
+        self.update({name: value})
+
+    def update(self, *values: Any, **named: float) -> None:
+        """Sets several parameters in one piece; arguments as those of dict.update."""
+        wanted: dict[str, float] = dict(*values, **named)
+        writes = {self.row(name).index: raw_value(self.row(name), value) for name, value in wanted.items()}
+        if writes:
+            self._require_done(self._writer.apply(writes), wanted)
+
+    def _require_done(self, result: SetResult, wanted: Mapping[str, float], what: str = "") -> None:
+        """DriveError with names and values of the parameters for which a set is refused."""
+        if result.status == "done":
+            return
+        rows = list(self.rows.values())
+        row, other = rows[result.index], rows[result.other]
+        prefix = f"{what}: " if what else ""
+
+        def value(of: ParameterRow) -> float:
+            return wanted[of.name] if of.name in wanted else of.default if what else self[of.name]
+
+        match result.status:
+            case "out_of_range":
+                text = f"{row.name} {value(row):g}: must be {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip()
+            case "contradiction":
+                text = f"{row.name} {value(row):g}: contradicts {other.name}, {value(other):g} {row.unit}".rstrip()
+            case "excludes_supply":
+                present_V = self._session.telemetry["DRIVE_TORQUE.bus_voltage_V"].last
+                text = f"{row.name} {value(row):g}: excludes the present DC-link voltage, {present_V:.4g} V"
+            case "not_while_running":
+                text = "not_while_running" if what else f"{row.name} {value(row):g}: not_while_running"
+            case status:
+                text = status if what else f"{', '.join(wanted)}: {status}"
+        raise DriveError(prefix + text)
 
     def save(self) -> None:
         """Stores the present values in the drive's memory; lets virtual time pass until that is done. DriveError while
         the drive runs, and when the memory does not accept them."""
-        _require_done(self._session, "save")
+        self._require_done(self._writer.save(), {}, "save")
         deadline_ns = self._session.time_ns + round(_SAVE_TIMEOUT_S * 1e9)
         while (saving := _memory_item(self._session, "saving")) == _SAVING and self._session.time_ns < deadline_ns:
             pass  # each request takes time
@@ -320,7 +348,7 @@ class Parameters(MutableMapping[str, float]):
 
     def restore_defaults(self) -> None:
         """Sets all parameters to their defaults, without storing them. DriveError while the drive runs."""
-        _require_done(self._session, "restore_defaults")
+        self._require_done(self._writer.apply({}, defaults=True), {}, "restore_defaults")
 
     @property
     def origin(self) -> str:
@@ -415,11 +443,6 @@ def read_parameter_table(session: Client) -> list[ParameterRow]:
         rows.append(ParameterRow(index, name, unit, fraction_bits, *limits))
 
 
-def write_request(row: ParameterRow, value: float) -> can.Message:
-    """The PARAMETER_REQUEST that writes a value."""
-    return _request("write", row.index, 0, raw_value(row, value))
-
-
 def _request(operation: str, index: int, part: int, value: int) -> can.Message:
     message = drive_database().get_message_by_name("PARAMETER_REQUEST")
     signals = {"operation": _OPERATIONS[operation], "index": index, "part": part, "value": value}
@@ -443,12 +466,6 @@ def _access(session: Client, operation: str, index: int, part: int = 0, value: i
         return str(signals["status"]), int(signals["value"])
     raise DriveError(f"no response to {_ATTEMPTS} PARAMETER_REQUEST {operation} {index} in "
                      f"{_ATTEMPTS * _RESPONSE_TIMEOUT_S:g} s")
-
-
-def _require_done(session: Client, operation: str) -> None:
-    status, _ = _access(session, operation, 0)
-    if status != "done":
-        raise DriveError(f"{operation}: {status}")
 
 
 def _memory_item(session: Client, name: str) -> int:

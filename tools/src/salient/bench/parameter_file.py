@@ -73,9 +73,11 @@ def compare(session: Session, path: Path) -> int:
 
 
 def load(session: Session, path: Path, store: bool) -> int:
-    """Sets the parameters that the file has; nothing when one of them cannot be set. store: in the memory as well."""
-    for name, value in read(path, session.drive.parameters.rows).items():
-        session.drive.parameters[name] = value
+    """Sets the parameters that the file has, in one piece; nothing when the drive refuses them. store: in the memory as
+    well."""
+    values = read(path, session.drive.parameters.rows)
+    session.drive.parameters.update(values)
+    for name, value in values.items():
         print(f"{name} = {decimal(session.drive.parameters.row(name), value)}")
     if store:
         session.drive.parameters.save()

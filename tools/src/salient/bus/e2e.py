@@ -7,7 +7,9 @@ CRC-16/CCITT-FALSE over bytes 2 to the end and then the data ID, low byte first,
 from __future__ import annotations
 
 import binascii
+from collections.abc import Mapping
 
+import can
 from cantools.database.can.message import Message
 
 from salient.dbc import attributes
@@ -29,6 +31,13 @@ def protect(data_id: int, counter: int, payload: bytes) -> bytes:
     """The frame that carries `payload` (the data without header); counter 0..255."""
     body = bytes([counter]) + payload
     return checksum(data_id, b"\0\0" + body).to_bytes(2, "little") + body
+
+
+def protected_frame(message: Message, counter: int, signals: Mapping[str, float]) -> can.Message:
+    """A frame of a protected message with its checksum; signals are those after the header, counter 0..255."""
+    payload = message.encode({"checksum": 0, "counter": counter, **signals})[HEADER_BYTES:]
+    data = protect(data_id(message), counter, payload)
+    return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=data)
 
 
 def check(data_id: int, frame: bytes) -> bool:

@@ -51,12 +51,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
-import can
 import numpy as np
 from pydantic import create_model
 
 from salient.bench.bench import Bench
-from salient.bench.drive import READY_TIMEOUT_S, DriveError, write_request
+from salient.bench.drive import READY_TIMEOUT_S
 from salient.bench.emulator import parameter_table
 from salient.bench.faults import FaultError, attribute_names, fault_signals
 from salient.bench.rig import bench_variables, variable_range
@@ -157,6 +156,8 @@ class RunResult:
 
 # --- running --------------------------------------------------------------------------------------------------------
 
+_SETTING_NS = 1_000_000
+"""The first command after the parameters is sent at a multiple of this, a cycle of telemetry; a set takes 5 ms."""
 _RECORDING, _LOG, _TEXT_LOG = "recording.npy", "can.blf", "can.log"
 
 
@@ -173,7 +174,7 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
     recording_path = out_dir / _RECORDING if scenario.record else None
     config = replace(_bench_config(scenario, recording_path, build), instructions=instructions,
                      execution=execution, instruction_ns=instruction_ns)
-    writes = _parameter_writes(scenario, config)
+    _check_parameter_names(scenario, config)
     profile = read_load_profile(load_profile_path(scenario.load_profile)) if scenario.load_profile else ()
     out_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
@@ -182,8 +183,6 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
                 bench.rig.set_load_profile(profile)
             for name, value in scenario.bench.items():
                 bench.rig.set(name, value)
-            for write in writes:  # before the first command; the answers are checked at the end
-                bench.send(write)
             for load in scenario.load:
                 bench.at(load.at_s).load_torque_Nm = load.torque_Nm
                 if load.profile_Nm is not None:
@@ -191,6 +190,9 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
             for fault_step in scenario.fault:
                 bench.at(fault_step.at_s).fault(fault_step.kind, duration_s=fault_step.duration_s,
                                                 **fault_step.arguments)
+            if scenario.parameters:  # one set; the run begins at the same time whatever the lengths of its frames
+                bench.drive.parameters.update(scenario.parameters)
+                bench.advance_to(-(-bench.time_ns // _SETTING_NS) * _SETTING_NS)
             steps: list[SpeedStep | TorqueStep] = [*scenario.speed, *scenario.torque]
             for step in sorted(steps, key=lambda step: step.at_s):
                 _advance(bench, step.at_s)
@@ -199,7 +201,6 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
                 else:
                     bench.drive.torque_reference_Nm = step.value_Nm
             _advance(bench, scenario.duration_s)
-            _check_parameters_taken(bench, len(writes))
             fault = bench.drive.fault
         write_logs(bench.log, out_dir / _LOG, out_dir / _TEXT_LOG)
     return RunResult(
@@ -235,12 +236,11 @@ def _bench_config(scenario: Scenario, recording_path: Path | None, build: str) -
     )
 
 
-def _parameter_writes(scenario: Scenario, config: BenchConfig) -> list[can.Message]:
-    """The frames that write the parameters of a scenario; UsageError: the drive does not know or would refuse one."""
+def _check_parameter_names(scenario: Scenario, config: BenchConfig) -> None:
+    """UsageError: the drive does not know a parameter of a scenario or would refuse its value."""
     if not scenario.parameters:
-        return []
+        return
     rows = {row.name: row for row in parameter_table(config)}
-    writes = []
     for name, value in scenario.parameters.items():
         row = rows.get(name)
         if row is None:
@@ -248,16 +248,6 @@ def _parameter_writes(scenario: Scenario, config: BenchConfig) -> list[can.Messa
         if not row.minimum <= value <= row.maximum:
             allowed = f"{row.minimum:g} to {row.maximum:g} {row.unit}".rstrip()
             raise UsageError(f"parameters.{name}: {value:g}: must be a number from {allowed}")
-        writes.append(write_request(row, value))
-    return writes
-
-
-def _check_parameters_taken(bench: Bench, count: int) -> None:
-    message = drive_database().get_message_by_name("PARAMETER_RESPONSE")
-    answers = [m for _, m in bench.log if m.arbitration_id == message.frame_id and not m.is_extended_id]
-    refused = [a for a in answers if message.decode_simple(bytes(a.data))["status"] != "done"]
-    if refused or len(answers) != count:
-        raise DriveError(f"{count} parameters written, {len(answers)} answers, {len(refused)} of them refusals")
 
 
 def summary(result: RunResult) -> dict[str, Any]:
@@ -312,7 +302,7 @@ def check_parameters(scenarios: list[Scenario], build: str) -> None:
     contradict each other or the supply."""
     for scenario in scenarios:
         config = _bench_config(scenario, None, build)
-        _parameter_writes(scenario, config)
+        _check_parameter_names(scenario, config)
         values = {row.name: row.default for row in parameter_table(config)} | scenario.parameters
         supply_V = load_machine(machine_path(scenario.machine)).supply_voltage_V
         check_consistency(values, scenario.parameters, scenario.bench.get("supply_voltage_V", supply_V))

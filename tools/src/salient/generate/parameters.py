@@ -18,12 +18,14 @@ _HEAD = """# Parameters of the drive
 
 Generated from `drive/parameters.def` by `python -m salient.generate.parameters`; do not edit.
 
-The index addresses a parameter over CAN (PARAMETER_REQUEST in `comms/drive.dbc`); the raw value has an LSB of
-2^-(fraction bits) of the unit. Writes are accepted outside state run. Angles are electrical degrees of the phase: 180
-is the unaligned, 360 the aligned position. (traditional, paper, salient): used by these controllers only.
+The index addresses a parameter over CAN (`comms/drive.dbc`); the raw value has an LSB of 2^-(fraction bits) of the
+unit. Parameters are read with PARAMETER_REQUEST, and changed as a set that is applied as a whole
+([README.md](README.md#a-set-of-parameters-in-raw-frames)). *In run*: may be changed in state run, without a step of the
+law's state; the others outside of it only. Angles are electrical degrees of the phase: 180 is the unaligned, 360 the
+aligned position. (traditional, paper, salient): used by these controllers only.
 
-| index | name | unit | minimum | maximum | default | fraction bits | meaning |
-| ---: | --- | --- | ---: | ---: | ---: | ---: | --- |
+| index | name | unit | minimum | maximum | default | fraction bits | in run | meaning |
+| ---: | --- | --- | ---: | ---: | ---: | ---: | --- | --- |
 """
 
 
@@ -33,7 +35,8 @@ def page() -> str:
     for row in read_table():
         limits = " | ".join(row.physical(raw) for raw in (row.minimum, row.maximum, row.default))
         lines.append(
-            f"| {row.index} | `{row.name}` | {row.unit} | {limits} | {row.fraction_bits} | {row.text} |"
+            f"| {row.index} | `{row.name}` | {row.unit} | {limits} | {row.fraction_bits} | "
+            f"{'yes' if row.tunable else ''} | {row.text} |"
         )
     return _HEAD + "\n".join(lines) + "\n"
 

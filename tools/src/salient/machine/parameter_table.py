@@ -29,6 +29,8 @@ class ParameterDefinition:
     maximum: int
     default: int
     text: str
+    tunable: bool
+    """It may be changed in a run."""
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -50,16 +52,17 @@ class ParameterDefinition:
 def read_table() -> tuple[ParameterDefinition, ...]:
     """All rows of parameters.def, by index."""
     source = re.sub(r"/\*.*?\*/", "", PARAMETERS.read_text(encoding="ascii"), flags=re.DOTALL)
-    calls = ast.parse(re.sub(r"\)\s*PARAMETER\(", ")\nPARAMETER(", source.strip())).body
+    source = re.sub(r"^#.*$", "", source, flags=re.MULTILINE)  # directives
+    calls = ast.parse(re.sub(r"\)\s*(TUNABLE_)?PARAMETER\(", r")\n\1PARAMETER(", source.strip())).body
     rows = []
     for index, statement in enumerate(calls):
         match statement:
-            case ast.Expr(value=ast.Call(args=[
+            case ast.Expr(value=ast.Call(func=ast.Name(id=kind), args=[
                 ast.Name(id=constant), ast.Constant(value=str(name)), ast.Constant(value=str(unit)),
                 ast.Constant(value=int(bits)), minimum, maximum, default, ast.Constant(value=str(text)),
             ])):
                 rows.append(ParameterDefinition(index, constant, name, unit, bits, _value(minimum), _value(maximum),
-                                                _value(default), text))
+                                                _value(default), text, kind == "TUNABLE_PARAMETER"))
             case _:
                 raise ValueError(f"{PARAMETERS}: {ast.unparse(statement)} is not a row of the table")
     return tuple(rows)

@@ -35,7 +35,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from salient.bench.bench import Bench
-from salient.bench.drive import ParameterRow, write_request
+from salient.bench.drive import DriveError, ParameterRow
 from salient.bench.emulator import parameter_table
 from salient.bench.rig import RigError, bench_variables
 from salient.bus.signals import signal_range
@@ -188,16 +188,15 @@ def _board(given: Input, **options: Any) -> BenchConfig:
 
 
 def _run(given: Input, board: BenchConfig) -> None:
-    rows = _rows(given.controller)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder, Bench(board, f"unix:{folder}/can.sock") as bench:
         bench.rig.truth_period_us = 0
         for action in given.actions:
             bench.advance_to(round(action.at_ms * 1e6))
-            _do(bench, rows, action)
+            _do(bench, action)
         bench.advance_to(round(given.duration_ms * 1e6))
 
 
-def _do(bench: Bench, rows: dict[str, ParameterRow], action: Action) -> None:
+def _do(bench: Bench, action: Action) -> None:
     what, value = action.what, 0.0 if action.value is None else action.value
     scope, _, name = what.partition(".")
     if what == "speed_rpm":
@@ -208,7 +207,8 @@ def _do(bench: Bench, rows: dict[str, ParameterRow], action: Action) -> None:
         with contextlib.suppress(RigError):  # a rejected value has no effect
             bench.rig.set(name, value)
     elif scope == "parameter":
-        bench.send(write_request(rows[name], value))  # the drive may reject it, too
+        with contextlib.suppress(DriveError):  # likewise
+            bench.drive.parameters[name] = value
     elif what == "commands":
         for _ in range(int(value) if bench.drive.command_due_ns is not None else 0):
             bench.drive.send_command()

@@ -1,0 +1,39 @@
+/* A set of parameters over CAN: written to a copy, checked as a whole, and applied in one piece or not at all.
+ *
+ *   host    DRIVE_ARM request_configuration, DRIVE_ARM confirm_configuration: arming.h
+ *   host    PARAMETER_SET_CONTROL begin      the staged set is that in effect; begin_defaults: the defaults
+ *   host    PARAMETER_WRITE index, value     any number of them: into the staged set
+ *   host    PARAMETER_SET_CONTROL apply      with the CRC-32 of all writes, which is wrong when one is missing
+ *   drive   PARAMETER_RESPONSE set_control   done, or why not, with the parameters for which the set is refused
+ *
+ * apply ends the state armed for configuration, whatever its result; so do abandon, and save, which stores the
+ * parameters in effect. In a run a set may change tunable parameters only (parameters.h).
+ */
+#ifndef COMMS_PARAMETER_SET_H
+#define COMMS_PARAMETER_SET_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "drive/nvm_store.h"
+#include "drive/parameters.h"
+#include "hal_can.h"
+
+/* All zero: nothing is staged. */
+typedef struct {
+    bool begun;
+    uint32_t crc;     /* of the writes since begin */
+    uint64_t written; /* bit i: parameter i */
+    int32_t values[PARAMETER_COUNT];
+} parameter_set_t;
+
+/* Takes a PARAMETER_WRITE that has passed commands_receive. [background] */
+void parameter_set_write(parameter_set_t *set, const hal_can_frame_t *frame);
+
+/* Executes a PARAMETER_SET_CONTROL that has passed commands_receive and writes its response. armed: for configuration.
+ * True when that state ends. [background] */
+bool parameter_set_control(parameter_set_t *set, bool armed, parameters_t *parameters, nvm_store_t *store,
+                           const parameters_conditions_t *conditions, const hal_can_frame_t *frame,
+                           hal_can_frame_t *response_frame);
+
+#endif
