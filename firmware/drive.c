@@ -1,5 +1,6 @@
 #include "drive.h"
 
+#include "comms/node.h"
 #include "drive/deferred.h"
 #include "fixed/compiler.h"
 #include "fixed/divide.h"
@@ -39,7 +40,7 @@ COLD static void configure(drive_t *drive) {
 COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     const uint32_t clock_hz = hal_pwm_clock_hz(hal);
     if (!configure_rate_allowed(config->control_rate_hz, clock_hz) ||
-        config->control_rate_hz < machine_tables.control_rate_min_hz) {
+        config->control_rate_hz < machine_tables.control_rate_min_hz || config->node > NODE_MAX) {
         return false;
     }
     *drive = (drive_t){
@@ -49,8 +50,11 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     };
     parameters_init(&drive->parameters);
     parameters_set_controller(&drive->parameters, (int32_t)config->controller);
+    if (config->telemetry_period_ms != 0) {
+        parameters_set(&drive->parameters, PARAMETER_TELEMETRY_PERIOD_MS, (int32_t)config->telemetry_period_ms);
+    }
     nvm_store_init(&drive->store, hal, &drive->parameters);
-    comms_init(&drive->comms, hal_time_us(hal));
+    comms_init(&drive->comms, config->node, hal_time_us(hal));
     drive->comms.store = &drive->store;
     configure(drive);
     control_reset(&drive->control_parameters, &drive->control);

@@ -53,8 +53,9 @@ typedef struct {
     nvm_store_t store;
 } drive_t;
 
-/* Prepares the drive and starts the timer. Returns false, and starts nothing, for a control rate that the timer's
- * clock (hal_pwm.h) cannot make or that is too low for the machine (machine_tables.h). hal must outlive the drive.
+/* Prepares the drive and starts the timer. Returns false, and starts nothing, for a node number above NODE_MAX and
+ * for a control rate that the timer's clock (hal_pwm.h) cannot make or that is too low for the machine
+ * (machine_tables.h). hal must outlive the drive.
  * [background, before anything else] */
 bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config);
 

@@ -36,9 +36,10 @@ typedef struct {
     hal_can_error_state_t state;
     uint16_t transmit_errors; /* transmit error counter */
     uint16_t receive_errors;  /* receive error counter */
+    bool transmitting;        /* a frame is in a mailbox */
 } hal_can_status_t;
 
-/* Present error state and counters. [background] */
+/* Present error state, counters and mailboxes. [background] */
 void hal_can_status(const hal_t *hal, hal_can_status_t *status);
 
 /* Requests to leave bus-off, which the controller does after 128 times 11 recessive bits, with counters of 0; it must

@@ -1,4 +1,4 @@
-/* One drive on its bench: the firmware, the host port and the emulator in one process and one thread. */
+/* Drives on their benches: the firmware, the host port and the emulator in one process and one thread. */
 #include <assert.h>
 
 #include "drive.h"
@@ -12,25 +12,51 @@ static_assert((int)DRIVE_CONTROLLER_TRADITIONAL == OPTIONS_CONTROLLER_TRADITIONA
 
 /* Large: static. */
 static simulation_t simulation;
-static drive_t drive;
-static hal_t hal = {.board = &simulation.rig.board};
-static drive_config_t drive_config;
+static struct host_drive {
+    drive_t drive;
+    hal_t hal;
+    drive_config_t config;
+} drives[SIMULATION_DRIVES_MAX];
 machine_tables_t machine_tables;
 
 static void control_interrupt(void *context) {
-    drive_control_interrupt(context);
+    drive_control_interrupt(&((struct host_drive *)context)->drive);
 }
 
 static void deferred_interrupt(void *context) {
-    drive_deferred_interrupt(context);
+    drive_deferred_interrupt(&((struct host_drive *)context)->drive);
 }
 
 static void background(void *context) {
-    drive_background(context);
+    drive_background(&((struct host_drive *)context)->drive);
 }
 
 static void restart(void *context) {
-    drive_init(context, &hal, &drive_config); /* with the configuration of the start, which it accepted */
+    struct host_drive *host = context;
+    drive_init(&host->drive, &host->hal, &host->config); /* with the configuration of the start, which it accepted */
+}
+
+/* Starts every drive; false when one rejects its configuration. */
+static bool start(const options_t *options, rig_firmware_t firmware[]) {
+    for (unsigned i = 0; i < options->drives; ++i) {
+        struct host_drive *host = &drives[i];
+        host->hal.board = &simulation.rigs[i].board;
+        host->config = (drive_config_t){
+            .control_rate_hz = options->control_rate_hz,
+            .controller = (drive_controller_t)options->controller_index,
+            .node = options->node + i,
+            .telemetry_period_ms = options->telemetry_period_ms,
+        };
+        if (!drive_init(&host->drive, &host->hal, &host->config)) {
+            return false;
+        }
+        firmware[i] = (rig_firmware_t){.control_interrupt = control_interrupt,
+                                       .deferred_interrupt = deferred_interrupt,
+                                       .background = background,
+                                       .restart = restart,
+                                       .context = host};
+    }
+    return true;
 }
 
 int main(int argc, char *argv[]) {
@@ -46,16 +72,9 @@ int main(int argc, char *argv[]) {
         simulation_close(&simulation);
         return EXIT_USAGE;
     }
-    drive_config = (drive_config_t){
-        .control_rate_hz = options.control_rate_hz,
-        .controller = (drive_controller_t)options.controller_index,
-    };
-    if (drive_init(&drive, &hal, &drive_config)) {
-        simulation_run(&simulation, &(rig_firmware_t){.control_interrupt = control_interrupt,
-                                                      .deferred_interrupt = deferred_interrupt,
-                                                      .background = background,
-                                                      .restart = restart,
-                                                      .context = &drive});
+    rig_firmware_t firmware[SIMULATION_DRIVES_MAX];
+    if (start(&options, firmware)) {
+        simulation_run(&simulation, firmware);
     } else {
         simulation_rejected(&simulation);
     }

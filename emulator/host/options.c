@@ -15,6 +15,8 @@ static_assert(OPTIONS_ADC_BITS_MIN == HAL_ADC_BITS_MIN && OPTIONS_ADC_BITS_MAX =
               "the record and the HAL disagree on the resolution of converters");
 static_assert(OPTIONS_BIT_RATE_MIN == CAN_BUS_BIT_RATE_MIN && OPTIONS_BIT_RATE_MAX == CAN_BUS_BIT_RATE_MAX,
               "the record and the emulated bus disagree on bit rates");
+static_assert(OPTIONS_DRIVES_MAX == CAN_BUS_DRIVES_MAX && OPTIONS_NODE_MAX == CAN_BUS_DRIVES_MAX - 1,
+              "the record and the emulated bus disagree on the number of drives");
 
 /* Return values of getopt_long: numbers of options from 1, because getopt_long returns 0 for another purpose. */
 enum { HELP = OPTION_COUNT + 1 };
@@ -122,6 +124,10 @@ static options_result_t check_combination(const options_t *options, const bool g
     }
     if ((given[OPTION_RECORD_STEP_NS] || given[OPTION_RECORD_FROM_US]) && !options->record) {
         return mistake("--record-step-ns and --record-from-us require --record FILE.npy");
+    }
+    if (options->node + options->drives > CAN_BUS_DRIVES_MAX) {
+        return mistake("--drives %u: with --node %u at most %u", options->drives, options->node,
+                       CAN_BUS_DRIVES_MAX - options->node);
     }
     if (given[OPTION_STOP_AT_S] && options->pacing.kind == PACING_LOCKSTEP) {
         return mistake("--stop-at-s: not with --pace lockstep, where RIG_RUN_UNTIL moves time");

@@ -78,7 +78,8 @@ static void print_ready(const options_t *options, const char *machine) {
     print_json_string(options->controller);
     printf(", \"control_rate_hz\": %" PRIu32 ", \"pace\": ", options->control_rate_hz);
     print_json_string(options->pace);
-    printf(", \"seed\": %" PRIu64 "}\n", options->seed);
+    printf(", \"seed\": %" PRIu64 ", \"node\": %" PRIu32 ", \"drives\": %" PRIu32 "}\n", options->seed, options->node,
+           options->drives);
     fflush(stdout);
 }
 
@@ -142,7 +143,7 @@ static bool open_bench(simulation_t *simulation, const options_t *options) {
         }
     }
 
-    const rig_config_t config = {
+    rig_config_t config = {
         .machine = &simulation->image.machine,
         .initial_angle_rad = options->initial_angle_deg * RAD_PER_DEG,
         .encoder_bits = options->encoder_bits,
@@ -150,6 +151,7 @@ static bool open_bench(simulation_t *simulation, const options_t *options) {
         .encoder_edges = options->encoder_edges,
         .immediate_pwm = options->immediate_pwm,
         .seed = options->seed,
+        .node = options->node,
         .bit_rate = options->bit_rate,
         .drive_only = options->drive_only,
         .pacing = options->pacing,
@@ -157,11 +159,16 @@ static bool open_bench(simulation_t *simulation, const options_t *options) {
         .stop = simulation->stop,
         .transport = transport,
     };
-    rig_init(&simulation->rig, &config);
-    memcpy(simulation->rig.board.nvm.word, simulation->memory.word, sizeof simulation->memory.word);
+    rig_init(&simulation->rigs[0], &config);
+    for (unsigned i = 1; i < options->drives; ++i) {
+        ++config.node;
+        ++config.seed;
+        rig_add(&simulation->rigs[0], &simulation->rigs[i], &config);
+    }
+    memcpy(simulation->rigs[0].board.nvm.word, simulation->memory.word, sizeof simulation->memory.word);
     if (options->record) {
-        plant_observe(&simulation->rig.plant, options->record_from_us * 1000, options->record_step_ns, recorder_sample,
-                      &simulation->recorder);
+        plant_observe(&simulation->rigs[0].plant, options->record_from_us * 1000, options->record_step_ns,
+                      recorder_sample, &simulation->recorder);
     }
     return true;
 }
@@ -180,9 +187,8 @@ bool simulation_open(simulation_t *simulation, const options_t *options) {
 static void control_interrupt(void *context) {
     simulation_t *simulation = context;
     simulation->firmware.control_interrupt(simulation->firmware.context);
-    if (simulation->switches) {
-        fwrite(&simulation->rig.board.active, sizeof simulation->rig.board.active, 1, simulation->switches);
-    }
+    const hal_pwm_compare_t *active = &simulation->rigs[0].board.active;
+    fwrite(active, sizeof *active, 1, simulation->switches);
 }
 
 static void deferred_interrupt(void *context) {
@@ -200,18 +206,21 @@ static void restart(void *context) {
     simulation->firmware.restart(simulation->firmware.context);
 }
 
-void simulation_run(simulation_t *simulation, const rig_firmware_t *firmware) {
-    simulation->firmware = *firmware;
-    rig_join(&simulation->rig, &(rig_firmware_t){.control_interrupt = control_interrupt,
-                                                 .deferred_interrupt = deferred_interrupt,
-                                                 .background = background,
-                                                 .restart = firmware->restart ? restart : NULL,
-                                                 .context = simulation});
-    print_ready(simulation->options, simulation->image.machine.name);
-    while (rig_serve(&simulation->rig, -1)) {
+void simulation_run(simulation_t *simulation, const rig_firmware_t firmware[]) {
+    simulation->firmware = firmware[0];
+    const rig_firmware_t recorded = {.control_interrupt = control_interrupt,
+                                     .deferred_interrupt = deferred_interrupt,
+                                     .background = background,
+                                     .restart = firmware[0].restart ? restart : NULL,
+                                     .context = simulation};
+    for (unsigned i = 0; i < simulation->options->drives; ++i) {
+        rig_join(&simulation->rigs[i], i == 0 && simulation->switches ? &recorded : &firmware[i]);
     }
-    rig_finish(&simulation->rig);
-    const transport_t *transport = simulation->rig.config.transport;
+    print_ready(simulation->options, simulation->image.machine.name);
+    while (rig_serve(&simulation->rigs[0], -1)) {
+    }
+    rig_finish(&simulation->rigs[0]);
+    const transport_t *transport = simulation->rigs[0].config.transport;
     if (transport->failure) {
         fprintf(stderr, "salient: %s\n", transport->failure);
         simulation->exit_code = EXIT_USAGE;
@@ -236,11 +245,11 @@ int simulation_close(simulation_t *simulation) {
         !output_close(simulation->switches, SWITCHES_OPTION, simulation->options->record_switches)) {
         simulation->exit_code = EXIT_USAGE;
     }
-    rig_close(&simulation->rig);
-    if (simulation->options->memory && !write_memory(&simulation->rig.board.nvm, simulation->options->memory)) {
+    rig_close(&simulation->rigs[0]);
+    if (simulation->options->memory && !write_memory(&simulation->rigs[0].board.nvm, simulation->options->memory)) {
         simulation->exit_code = EXIT_USAGE;
     }
-    transport_close(simulation->rig.config.transport);
+    transport_close(simulation->rigs[0].config.transport);
     machine_image_close(&simulation->image);
     return simulation->exit_code;
 }

@@ -1,4 +1,4 @@
-/* Simulation of a drive on its bench: opens bus, recordings and rig from the options, prints the ready line, serves,
+/* Simulation of drives on their benches: opens bus, recordings and rig from the options, prints the ready line, serves,
  * closes.
  *
  * Shared by the programs that join a firmware with the rig: the host executable in one process, a target inside QEMU.
@@ -17,15 +17,18 @@
 
 #define EXIT_USAGE 2 /* exit code after an invalid argument or a resource that cannot be opened */
 
-/* Large: static or on the heap. rig and image are for the port; the other members are private to simulation.c. */
+#define SIMULATION_DRIVES_MAX CAN_BUS_DRIVES_MAX
+
+/* Large: static or on the heap. rigs, of options->drives drives, and image are for the port; the other members are
+ * private to simulation.c. */
 typedef struct {
-    rig_t rig;
+    rig_t rigs[SIMULATION_DRIVES_MAX];
     machine_image_t image;
     const options_t *options;
     recorder_t recorder;
-    nvm_t memory; /* as read from the file of --memory */
+    nvm_t memory; /* as read from the file of --memory; this and what is recorded is of the first drive */
     rig_stop_t stop;
-    rig_firmware_t firmware;
+    rig_firmware_t firmware; /* of the first drive */
     /* Rows of hal_pwm_compare_t: row n acts in the control period that starts at n + 1 periods, when no trigger was
      * missed. NULL: not recorded. */
     FILE *switches;
@@ -36,8 +39,8 @@ typedef struct {
  * the rig ends at them. Keeps options. False, with nothing left open, when something cannot be opened. */
 bool simulation_open(simulation_t *simulation, const options_t *options);
 
-/* Joins the firmware, which has started the timer, prints the ready line, and serves until the end. */
-void simulation_run(simulation_t *simulation, const rig_firmware_t *firmware);
+/* Joins the firmware of each drive, which has started its timer, prints the ready line, and serves until the end. */
+void simulation_run(simulation_t *simulation, const rig_firmware_t firmware[]);
 
 /* Reports that drive_init has rejected the configuration: instead of simulation_run. */
 void simulation_rejected(simulation_t *simulation);

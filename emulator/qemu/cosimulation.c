@@ -24,7 +24,7 @@ static_assert(MAILBOX_PWM_CLOCK_HZ == PWM_TIMER_CLOCK_HZ, "one clock on both sid
 
 static mailbox_t *mailbox;
 static simulation_t simulation;
-static hal_t host = {.board = &simulation.rig.board}; /* the host port checks the calling context */
+static hal_t host = {.board = &simulation.rigs[0].board}; /* the host port checks the calling context */
 static bool rejected, started;
 
 /* Contexts in which drive and rig wait for each other. setcontext starts the rig on a separate stack; later switches
@@ -40,7 +40,7 @@ static void resume_drive(void) {
 
 /* Back to the drive, until its next MAILBOX_NEXT. */
 static void deliver_event(mailbox_event_t event) {
-    const board_t *board = &simulation.rig.board;
+    const board_t *board = &simulation.rigs[0].board;
     mailbox->event = event;
     mailbox->time_us = hal_time_us(&host);
     mailbox->receive_waiting = board->received_pushed - board->received_popped;
@@ -50,6 +50,7 @@ static void deliver_event(mailbox_event_t event) {
     mailbox->can_error_state = status.state;
     mailbox->transmit_errors = status.transmit_errors;
     mailbox->receive_errors = status.receive_errors;
+    mailbox->transmitting = status.transmitting;
     resume_drive();
 }
 
@@ -109,7 +110,7 @@ static void resume_rig(void) {
 
 /* Runs to the trigger that the drive serves; those before it are missed. */
 static void run_to_trigger(void) {
-    rig_t *rig = &simulation.rig;
+    rig_t *rig = &simulation.rigs[0];
     const uint64_t period_ns = UINT64_C(2) * PWM_TIMER_TICK_NS * rig->board.period_ticks;
     /* The trigger number wraps after 71 minutes at 1 MHz. */
     const uint32_t ahead = mailbox->trigger - (uint32_t)(rig->board.time_ns / period_ns);
@@ -131,6 +132,8 @@ bool cosimulation_open(mailbox_t *shared, const options_t *options, bool timed) 
     mailbox->layout = MAILBOX_LAYOUT;
     mailbox->control_rate_hz = options->control_rate_hz;
     mailbox->controller = options->controller_index;
+    mailbox->node = options->node;
+    mailbox->telemetry_period_ms = options->telemetry_period_ms;
     mailbox->adc_bits = hal_adc_bits(&host);
     mailbox->encoder_bits = hal_encoder_bits(&host);
     mailbox->timed = timed;
@@ -164,7 +167,7 @@ void cosimulation_serve(void) {
         break;
     case MAILBOX_INTERRUPT_END:
         /* The drive's counter rounds down: an interrupt that ends at a trigger has missed it. */
-        simulation.rig.board.interrupt_took_ns = (uint64_t)mailbox->elapsed_ticks * PWM_TIMER_TICK_NS + 1;
+        simulation.rigs[0].board.interrupt_took_ns = (uint64_t)mailbox->elapsed_ticks * PWM_TIMER_TICK_NS + 1;
         resume_rig();
         break;
     case MAILBOX_PWM_START:

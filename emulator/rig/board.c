@@ -4,13 +4,14 @@
 
 #include "plant/random.h"
 
-void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, uint64_t seed) {
+void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, unsigned bus_drive, uint64_t seed) {
     memset(board, 0, sizeof *board);
     board->adc_bits = sensors->adc_bits;
     board->encoder_bits = sensors->encoder_bits;
     board->plant = plant;
     board->sensors = sensors;
     board->bus = bus;
+    board->bus_drive = bus_drive;
     board->random_state = seed;
     board->sto_energised[0] = board->sto_energised[1] = true;
     if (plant->machine->trip_current_A > 0.0) {
@@ -137,22 +138,23 @@ bool board_can_receive(board_t *board, hal_can_frame_t *frame) {
 }
 
 bool board_can_transmit(board_t *board, const hal_can_frame_t *frame) {
-    return can_bus_transmit(board->bus, frame);
+    return can_bus_transmit(board->bus, board->bus_drive, frame);
 }
 
 void board_can_status(const board_t *board, hal_can_status_t *status) {
-    const can_node_t *node = &board->bus->drive;
+    const can_node_t *node = &board->bus->drives[board->bus_drive].node;
     *status = (hal_can_status_t){
         .state = node->bus_off               ? HAL_CAN_BUS_OFF
                  : can_node_is_passive(node) ? HAL_CAN_ERROR_PASSIVE
                                              : HAL_CAN_ERROR_ACTIVE,
         .transmit_errors = (uint16_t)node->transmit_errors,
         .receive_errors = (uint16_t)node->receive_errors,
+        .transmitting = can_node_backlog(node) > 0,
     };
 }
 
 void board_can_rejoin(board_t *board) {
-    can_bus_rejoin(board->bus, board->time_ns);
+    can_bus_rejoin(board->bus, board->bus_drive, board->time_ns);
 }
 
 /* With the time in the state, so that the numbers of two runs with one seed differ once their calls do. */

@@ -56,12 +56,13 @@ typedef struct {
     plant_t *plant;
     sensors_t *sensors;
     can_bus_t *bus;
+    unsigned bus_drive; /* its number on the bus */
 } board_t;
 
 /* Initialises a board after reset at time 0: timer stopped, switches open, safe torque off not requested, queues empty,
- * resolutions of `sensors`, comparators of the machine. Plant, sensors and bus are used, not owned. The random stream
- * begins with `seed`. */
-void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, uint64_t seed);
+ * resolutions of `sensors`, comparators of the machine. Plant, sensors and bus, on which it is drive `bus_drive`, are
+ * used, not owned. The random stream begins with `seed`. */
+void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, unsigned bus_drive, uint64_t seed);
 
 /* For the rig: a reset of the drive, or power that returns. Timer stopped, switches open, what was received is lost;
  * frames in the transmit mailboxes still leave. */

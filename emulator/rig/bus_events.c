@@ -3,9 +3,10 @@
 #include "rig/truth.h"
 
 void bus_start(rig_t *rig) {
-    if (rig->bus.start_requested) {
-        can_bus_start(&rig->bus, rig->board.time_ns);
-        rig->scheduler.due_ns[EVENT_CAN] = rig->bus.next_event_ns;
+    rig_t *first = rig->first;
+    if (first->bus.start_requested) {
+        can_bus_start(&first->bus, rig->board.time_ns);
+        first->scheduler.due_ns[EVENT_CAN] = first->bus.next_event_ns;
     }
 }
 
@@ -25,8 +26,10 @@ void bus_event(void *context, uint64_t now_ns) {
                                             : (delivery.from_drive ? TRANSPORT_FROM_EMULATOR : TRANSPORT_FROM_OTHER),
                        &frame);
     }
-    if (delivery.to_drive) {
-        board_deliver(&rig->board, &delivery.frame);
+    for (; rig; rig = rig->next) {
+        if (delivery.to_drives >> rig->board.bus_drive & 1u) {
+            board_deliver(&rig->board, &delivery.frame);
+        }
     }
 }
 
@@ -37,6 +40,7 @@ void truth_event(void *context, uint64_t now_ns) {
     plant_advance(&rig->plant, now_ns);
     truth_pack(&rig->plant, frames);
     for (unsigned i = 0; i < TRUTH_FRAMES; ++i) {
+        transport_frame_set_node(&frames[i], rig->config.node);
         transport_send(rig->config.transport, now_ns, TRANSPORT_FROM_EMULATOR, &frames[i]);
     }
 }

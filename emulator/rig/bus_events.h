@@ -10,7 +10,7 @@
  * everything that may queue frames. */
 void bus_start(rig_t *rig);
 
-/* Handlers of EVENT_CAN and EVENT_TRUTH; context is the rig. */
+/* Handlers of EVENT_CAN, of the first rig, and EVENT_TRUTH; context is the rig. */
 void bus_event(void *context, uint64_t now_ns);
 void truth_event(void *context, uint64_t now_ns);
 

@@ -31,11 +31,18 @@ void can_bus_init(can_bus_t *bus, uint32_t bit_rate, uint64_t seed) {
     memset(bus, 0, sizeof *bus);
     can_length_init(&bus->lengths);
     bus->bit_rate = bit_rate;
-    bus->next_event_ns = bus->shared.next_event_ns = bus->alone.next_event_ns = CAN_BUS_NEVER;
+    bus->next_event_ns = bus->shared.next_event_ns = CAN_BUS_NEVER;
     can_faults_init(&bus->faults, seed);
-    can_node_init(&bus->drive);
+    can_bus_add_drive(bus);
     can_node_init(&bus->babbler);
     bus->babble.length = 8;
+}
+
+unsigned can_bus_add_drive(can_bus_t *bus) {
+    can_bus_drive_t *drive = &bus->drives[bus->drive_count];
+    can_node_init(&drive->node);
+    drive->alone.next_event_ns = CAN_BUS_NEVER;
+    return bus->drive_count++;
 }
 
 void can_bus_close(can_bus_t *bus) {
@@ -48,8 +55,18 @@ void can_bus_close(can_bus_t *bus) {
     bus->client_count = bus->client_capacity = 0;
 }
 
-static can_line_t *drive_line(can_bus_t *bus) {
-    return bus->disconnected ? &bus->alone : &bus->shared;
+static can_line_t *drive_line(can_bus_t *bus, can_bus_drive_t *drive) {
+    return drive->disconnected ? &drive->alone : &bus->shared;
+}
+
+/* The drive whose controller a node is, or NULL. */
+static const can_bus_drive_t *drive_of(const can_bus_t *bus, const can_node_t *node) {
+    for (unsigned i = 0; i < bus->drive_count; ++i) {
+        if (node == &bus->drives[i].node) {
+            return &bus->drives[i];
+        }
+    }
+    return NULL;
 }
 
 /* A change on an idle line: its next event is to be found anew. */
@@ -57,17 +74,18 @@ static void request_start(can_bus_t *bus, const can_line_t *line) {
     bus->start_requested = bus->start_requested || line->state == CAN_LINE_IDLE;
 }
 
-bool can_bus_transmit(can_bus_t *bus, const hal_can_frame_t *frame) {
-    if (bus->drive.bus_off || !can_node_transmit(&bus->drive, HAL_CAN_MAILBOXES, frame)) {
+bool can_bus_transmit(can_bus_t *bus, unsigned drive, const hal_can_frame_t *frame) {
+    can_node_t *node = &bus->drives[drive].node;
+    if (node->bus_off || !can_node_transmit(node, HAL_CAN_MAILBOXES, frame)) {
         return false;
     }
-    request_start(bus, drive_line(bus));
+    request_start(bus, drive_line(bus, &bus->drives[drive]));
     return true;
 }
 
-void can_bus_rejoin(can_bus_t *bus, uint64_t now_ns) {
-    can_node_rejoin(&bus->drive, now_ns);
-    request_start(bus, drive_line(bus));
+void can_bus_rejoin(can_bus_t *bus, unsigned drive, uint64_t now_ns) {
+    can_node_rejoin(&bus->drives[drive].node, now_ns);
+    request_start(bus, drive_line(bus, &bus->drives[drive]));
 }
 
 static can_bus_client_t *find_client(const can_bus_t *bus, uint32_t number) {
@@ -133,30 +151,30 @@ bool can_bus_has_client(const can_bus_t *bus, uint32_t number) {
     return find_client(bus, number) != NULL;
 }
 
-/* Forced counters and connection of the drive, while no frame is under way on its line. True when it changes lines. */
-static bool apply_changes(can_bus_t *bus) {
-    if (drive_line(bus)->state != CAN_LINE_IDLE) {
+/* Forced counters and connection of a drive, while no frame is under way on its line. True when it changes lines. */
+static bool apply_changes(can_bus_t *bus, can_bus_drive_t *drive) {
+    if (drive_line(bus, drive)->state != CAN_LINE_IDLE) {
         return false;
     }
-    if (bus->errors_set) {
-        can_node_set_transmit_errors(&bus->drive, bus->errors_to_set);
-        bus->errors_set = false;
+    if (drive->errors_set) {
+        can_node_set_transmit_errors(&drive->node, drive->errors_to_set);
+        drive->errors_set = false;
     }
-    const bool changes = bus->disconnected != bus->disconnect;
-    bus->disconnected = bus->disconnect;
+    const bool changes = drive->disconnected != drive->disconnect;
+    drive->disconnected = drive->disconnect;
     return changes;
 }
 
-void can_bus_set_transmit_errors(can_bus_t *bus, unsigned errors) {
-    bus->errors_set = true;
-    bus->errors_to_set = errors;
-    apply_changes(bus);
+void can_bus_set_transmit_errors(can_bus_t *bus, unsigned drive, unsigned errors) {
+    bus->drives[drive].errors_set = true;
+    bus->drives[drive].errors_to_set = errors;
+    apply_changes(bus, &bus->drives[drive]);
     bus->start_requested = true;
 }
 
-void can_bus_disconnect(can_bus_t *bus, bool disconnect) {
-    bus->disconnect = disconnect;
-    apply_changes(bus);
+void can_bus_disconnect(can_bus_t *bus, unsigned drive, bool disconnect) {
+    bus->drives[drive].disconnect = disconnect;
+    apply_changes(bus, &bus->drives[drive]);
     bus->start_requested = true;
 }
 
@@ -191,16 +209,14 @@ void can_bus_babble(can_bus_t *bus, uint64_t now_ns) {
 #define FOR_EACH_NODE(bus, line, node)                                                                                 \
     for (unsigned node##_index = 0; ((node) = node_of(bus, line, node##_index)) != NULL; ++node##_index)
 
-/* Nodes of a line by index: the drive, unless it is on the other line, then the others of the shared line; NULL after
- * the last. */
+/* Nodes of a line by index: the drives on it, then the others of the shared line; NULL after the last. */
 static can_node_t *node_of(can_bus_t *bus, const can_line_t *line, unsigned index) {
-    if (line == drive_line(bus)) {
-        if (index == 0) {
-            return &bus->drive;
+    for (unsigned i = 0; i < bus->drive_count; ++i) {
+        if (line == drive_line(bus, &bus->drives[i]) && index-- == 0) {
+            return &bus->drives[i].node;
         }
-        --index;
     }
-    if (line == &bus->alone) {
+    if (line != &bus->shared) {
         return NULL;
     }
     if (index == 0) {
@@ -212,7 +228,7 @@ static can_node_t *node_of(can_bus_t *bus, const can_line_t *line, unsigned inde
 /* Draws the fault of a frame that is about to take part in arbitration for the first time. */
 static void draw_fault(can_bus_t *bus, const can_node_t *node, can_mailbox_t *mailbox, uint64_t now_ns) {
     mailbox->drawn = true;
-    mailbox->fault = can_faults_draw(&bus->faults, node == &bus->drive);
+    mailbox->fault = can_faults_draw(&bus->faults, drive_of(bus, node) != NULL);
     if (mailbox->fault == CAN_FAULT_DELAYED) {
         mailbox->not_before_ns = now_ns + bus->faults.delay_ns;
     }
@@ -373,7 +389,7 @@ static void plan_frame(can_bus_t *bus, can_line_t *line) {
         return;
     }
     line->bits = can_length_bits(&bus->lengths, &mailbox->frame);
-    if (line == &bus->alone) {
+    if (line != &bus->shared) {
         plan_error(line, line->bits - CAN_WIRE_AFTER_ACKNOWLEDGE_BITS, CAN_WIRE_ACKNOWLEDGE_ERROR_FLAG_BITS);
         line->acknowledge_error = true;
     } else if (mailbox->fault == CAN_FAULT_DUPLICATED) {
@@ -408,17 +424,26 @@ static void start_line(can_bus_t *bus, can_line_t *line, uint64_t now_ns) {
     }
 }
 
-static void find_next_event(can_bus_t *bus) {
-    bus->next_event_ns = earlier(bus->shared.next_event_ns, bus->alone.next_event_ns);
+/* The line whose event is next. */
+static can_line_t *next_line(can_bus_t *bus) {
+    can_line_t *next = &bus->shared;
+    for (unsigned i = 0; i < bus->drive_count; ++i) {
+        can_line_t *alone = &bus->drives[i].alone;
+        next = alone->next_event_ns < next->next_event_ns ? alone : next;
+    }
+    return next;
 }
 
 void can_bus_start(can_bus_t *bus, uint64_t now_ns) {
     bus->start_requested = false;
     start_line(bus, &bus->shared, now_ns);
-    if (bus->disconnected || bus->alone.next_event_ns != CAN_BUS_NEVER) {
-        start_line(bus, &bus->alone, now_ns);
+    for (unsigned i = 0; i < bus->drive_count; ++i) {
+        can_bus_drive_t *drive = &bus->drives[i];
+        if (drive->disconnected || drive->alone.next_event_ns != CAN_BUS_NEVER) {
+            start_line(bus, &drive->alone, now_ns);
+        }
     }
-    find_next_event(bus);
+    bus->next_event_ns = next_line(bus)->next_event_ns;
 }
 
 static bool transmits(const can_line_t *line, const can_node_t *node) {
@@ -439,7 +464,7 @@ static void suspend(const can_bus_t *bus, const can_line_t *line, can_node_t *no
 static void transmission_failed(can_bus_t *bus, can_line_t *line, can_node_t *node, uint64_t now_ns) {
     can_node_transmit_error(node);
     suspend(bus, line, node);
-    if (node != &bus->drive) {
+    if (!drive_of(bus, node)) {
         can_node_rejoin(node, now_ns);
     }
 }
@@ -480,18 +505,23 @@ static uint64_t next_babble_ns(const can_bus_t *bus, const can_line_t *line) {
 
 static void deliver(can_bus_t *bus, const can_line_t *line, can_bus_delivery_t *delivery) {
     const can_mailbox_t *mailbox = line->transmitter[0].mailbox;
-    const bool drive_listens = !bus->disconnected && !bus->drive.bus_off;
-    *delivery = (can_bus_delivery_t){.frame = mailbox->frame, .to_drive = drive_listens, .to_clients = true};
+    *delivery = (can_bus_delivery_t){.frame = mailbox->frame, .to_clients = true};
+    unsigned senders = 0;
     for (unsigned i = 0; i < line->remaining; ++i) {
         const can_node_t *node = line->transmitter[i].node;
-        delivery->from_drive = delivery->from_drive || node == &bus->drive;
-        delivery->from_client = delivery->from_client || (node != &bus->drive && node != &bus->babbler);
+        const can_bus_drive_t *drive = drive_of(bus, node);
+        senders |= drive ? 1u << (drive - bus->drives) : 0;
+        delivery->from_client = delivery->from_client || (!drive && node != &bus->babbler);
     }
+    delivery->from_drive = senders != 0;
     delivery->from_client = delivery->from_client && mailbox->fault != CAN_FAULT_DUPLICATED;
-    delivery->to_drive = delivery->to_drive && !delivery->from_drive;
     if (mailbox->fault == CAN_FAULT_LOST) {
         delivery->to_clients = !delivery->from_drive;
-        delivery->to_drive = false;
+        return;
+    }
+    for (unsigned i = 0; i < bus->drive_count; ++i) {
+        const bool listens = !bus->drives[i].disconnected && !bus->drives[i].node.bus_off;
+        delivery->to_drives |= (uint8_t)((listens && !(senders >> i & 1u)) << i);
     }
 }
 
@@ -535,17 +565,18 @@ static bool step_line(can_bus_t *bus, can_line_t *line, can_bus_delivery_t *deli
     }
     line->state = CAN_LINE_IDLE;
     line->next_event_ns = line->idle_from_ns;
-    if (apply_changes(bus)) {
-        can_line_t *other = line == &bus->shared ? &bus->alone : &bus->shared;
-        other->next_event_ns =
-            other->state == CAN_LINE_IDLE ? later(now_ns, other->idle_from_ns) : other->next_event_ns;
+    for (unsigned i = 0; i < bus->drive_count; ++i) {
+        if (apply_changes(bus, &bus->drives[i])) {
+            can_line_t *other = drive_line(bus, &bus->drives[i]);
+            other->next_event_ns =
+                other->state == CAN_LINE_IDLE ? later(now_ns, other->idle_from_ns) : other->next_event_ns;
+        }
     }
     return complete;
 }
 
 bool can_bus_step(can_bus_t *bus, can_bus_delivery_t *delivery) {
-    can_line_t *line = bus->alone.next_event_ns < bus->shared.next_event_ns ? &bus->alone : &bus->shared;
-    const bool complete = step_line(bus, line, delivery);
-    find_next_event(bus);
+    const bool complete = step_line(bus, next_line(bus), delivery);
+    bus->next_event_ns = next_line(bus)->next_event_ns;
     return complete;
 }

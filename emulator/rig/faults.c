@@ -204,6 +204,7 @@ static void change(rig_t *rig, unsigned packed, double attribute) {
     effects[kind](rig);
     transport_frame_t frame;
     truth_pack_fault(kind, phase, leg, begins, &frame);
+    transport_frame_set_node(&frame, rig->config.node);
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_EMULATOR, &frame);
 }
 

@@ -24,14 +24,16 @@ static const scheduler_handler_t handlers[EVENT_COUNT] = {
     [EVENT_TRUTH] = truth_event,
 };
 
-void rig_init(rig_t *rig, const rig_config_t *config) {
+/* Everything but what the rigs of a list share. */
+static void init(rig_t *rig, rig_t *first, unsigned bus_drive, const rig_config_t *config) {
     plant_init(&rig->plant, config->machine, config->initial_angle_rad);
     sensors_init(&rig->sensors, &config->machine->sensors, config->encoder_bits, config->adc_bits, config->seed);
     rig->sensors.encoder_edges = config->encoder_edges;
-    can_bus_init(&rig->bus, config->bit_rate, config->seed);
-    board_init(&rig->board, &rig->plant, &rig->sensors, &rig->bus, config->seed);
+    board_init(&rig->board, &rig->plant, &rig->sensors, &first->bus, bus_drive, config->seed);
     rig->board.immediate_pwm = config->immediate_pwm;
     rig->board.nvm.random = config->seed;
+    rig->first = first;
+    rig->next = NULL;
     rig->config = *config;
     rig->firmware = (rig_firmware_t){0};
     scheduler_init(&rig->scheduler, &rig->board.time_ns, handlers, rig);
@@ -45,7 +47,22 @@ void rig_init(rig_t *rig, const rig_config_t *config) {
     supply_init(rig);
     dynamometer_init(rig);
     faults_init(rig);
+}
+
+void rig_init(rig_t *rig, const rig_config_t *config) {
+    can_bus_init(&rig->bus, config->bit_rate, config->seed);
+    init(rig, rig, 0, config);
     server_init(rig);
+}
+
+void rig_add(rig_t *first, rig_t *rig, const rig_config_t *config) {
+    init(rig, first, can_bus_add_drive(&first->bus), config);
+    rig_t *last = first;
+    while (last->next) {
+        last = last->next;
+    }
+    last->next = rig;
+    last->scheduler.next = &rig->scheduler;
 }
 
 void rig_join(rig_t *rig, const rig_firmware_t *firmware) {
@@ -76,7 +93,9 @@ bool rig_serve(rig_t *rig, int timeout_ms) {
 }
 
 void rig_finish(rig_t *rig) {
-    plant_advance(&rig->plant, rig->board.time_ns);
+    for (rig_t *each = rig; each; each = each->next) {
+        plant_advance(&each->plant, each->board.time_ns);
+    }
     transport_flush(rig->config.transport);
 }
 

@@ -1,5 +1,8 @@
 /* The test bench: joins plant, board, CAN bus and clients on one virtual clock.
  *
+ * Several drives on one bus are a list of rigs. The first one has the bus, the clients and the pacing; each has a
+ * plant, a board, variables and faults of its own.
+ *
  * One thread, next event first (scheduler.h). Events of the same instant come in the order of scheduler_event_t, then
  * the clients. The plant is advanced exactly to the events that touch it, and to no others, so that the way a client
  * divides time into RIG_RUN_UNTILs does not change a bit of the result.
@@ -58,6 +61,7 @@ typedef struct {
     bool encoder_edges;    /* the board captures the encoder's edges */
     bool immediate_pwm;    /* compare values act when they are written, not in the next period */
     uint64_t seed;
+    unsigned node; /* of the drive: in the identifiers of its rig */
     uint32_t bit_rate;
     bool drive_only; /* of the bench only replies are sent: no true state until its period is set, no time stamps */
     pacing_t pacing;
@@ -103,13 +107,14 @@ typedef struct {
 } fault_presence_t;
 
 /* Large: static or on the heap. */
-typedef struct {
+typedef struct rig {
     plant_t plant;
     sensors_t sensors;
-    can_bus_t bus;
+    can_bus_t bus; /* of the first rig of a list */
     board_t board; /* board.time_ns is the time */
 
     /* Private to the rig's files. */
+    struct rig *first, *next; /* of the list of the drives on one bus */
     rig_config_t config;
     rig_firmware_t firmware;
     scheduler_t scheduler;
@@ -133,6 +138,10 @@ typedef struct {
 /* A bench at time 0: machine at rest, supply on, no load, no firmware. The rig must not be moved afterwards. */
 void rig_init(rig_t *rig, const rig_config_t *config);
 
+/* A bench for another drive on the bus of `first`, which is at time 0: of the configuration, what concerns bus, clients
+ * and pacing is not used. There are at most CAN_BUS_DRIVES_MAX drives, with different nodes. */
+void rig_add(rig_t *first, rig_t *rig, const rig_config_t *config);
+
 /* Joins the firmware, which must have started the timer (hal_pwm_start); its first interrupt is one period away. */
 void rig_join(rig_t *rig, const rig_firmware_t *firmware);
 
@@ -144,9 +153,9 @@ bool rig_reset_drive(rig_t *rig);
  * interrupt. */
 void rig_busy_until(rig_t *rig, uint64_t time_ns);
 
-/* One round. Lock-step: takes the clients' frames; runs to the earliest requested time, or waits up to timeout_ms
- * (negative: indefinitely) when none is requested. Other paces: runs to the next reading point. False at the end: stop
- * requested, stop_at_ns reached, or config.transport->failure. */
+/* One round, of the first rig as the next two. Lock-step: takes the clients' frames; runs to the earliest requested
+ * time, or waits up to timeout_ms (negative: indefinitely) when none is requested. Other paces: runs to the next
+ * reading point. False at the end: stop requested, stop_at_ns reached, or config.transport->failure. */
 bool rig_serve(rig_t *rig, int timeout_ms);
 
 /* Advances the plant, and its observer, to the present time and sends the frames that are still in batches. */

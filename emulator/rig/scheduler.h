@@ -1,6 +1,7 @@
 /* Discrete-event scheduler: a due time and a handler for each event. Next event first, one thread.
  *
- * Events that are due at the same instant are handled in the order of scheduler_event_t.
+ * Events that are due at the same instant are handled in the order of scheduler_event_t, those of one kind in the order
+ * of the list of schedulers.
  */
 #ifndef RIG_SCHEDULER_H
 #define RIG_SCHEDULER_H
@@ -27,7 +28,8 @@ typedef enum {
 /* Handles the event that is due at now_ns; the handler sets the event's next due time. */
 typedef void (*scheduler_handler_t)(void *context, uint64_t now_ns);
 
-typedef struct {
+typedef struct scheduler {
+    struct scheduler *next;       /* of another drive on the same clock, or NULL */
     uint64_t *clock_ns;           /* virtual time, advanced by scheduler_run alone */
     uint64_t due_ns[EVENT_COUNT]; /* SCHEDULER_NEVER: not scheduled; never before the clock */
     const scheduler_handler_t *handlers;
@@ -37,7 +39,7 @@ typedef struct {
 /* Nothing scheduled. handlers has EVENT_COUNT entries; clock and handlers are kept. */
 void scheduler_init(scheduler_t *scheduler, uint64_t *clock_ns, const scheduler_handler_t *handlers, void *context);
 
-/* Handles every event up to and including until_ns, which the clock shows afterwards. */
-void scheduler_run(scheduler_t *scheduler, uint64_t until_ns);
+/* Handles every event of a list of schedulers up to and including until_ns, which all clocks show afterwards. */
+void scheduler_run(scheduler_t *first, uint64_t until_ns);
 
 #endif

@@ -79,6 +79,7 @@ static void take_set(rig_t *rig, const uint8_t *data) {
     transport_frame_t frame = {
         .size = CAN_MTU, .classic = {.can_id = RIG_SET_REPLY_FRAME_ID | CAN_EFF_FLAG, .len = RIG_SET_REPLY_LENGTH}};
     rig_set_reply_pack(frame.classic.data, &reply, RIG_SET_REPLY_LENGTH);
+    transport_frame_set_node(&frame, rig->config.node);
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_EMULATOR, &frame);
 }
 
@@ -89,6 +90,7 @@ static void take_fault(rig_t *rig, const uint8_t *data) {
     frame.classic.data[1] &= 0x0F;
     frame.classic.data[2] = faults_receive(rig, data);
     frame.classic.data[3] = 0;
+    transport_frame_set_node(&frame, rig->config.node);
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_EMULATOR, &frame);
 }
 
@@ -115,6 +117,17 @@ static bool connected(void *context, uint32_t client) {
     return transport_connected(context, client);
 }
 
+/* A frame to the rig of one drive, its identifier as of node 0. */
+static void take_for_drive(rig_t *rig, canid_t identifier, const transport_frame_t *frame) {
+    if (identifier == RIG_SET_FRAME_ID && frame->classic.len == RIG_SET_LENGTH) {
+        take_set(rig, frame->classic.data);
+    } else if (identifier == RIG_FAULT_FRAME_ID && frame->classic.len == RIG_FAULT_LENGTH) {
+        take_fault(rig, frame->classic.data);
+    } else if (identifier == RIG_LOAD_PROFILE_FRAME_ID && frame->classic.len == RIG_LOAD_PROFILE_LENGTH) {
+        take_load_profile(rig, frame->classic.data);
+    }
+}
+
 static bool take(void *context, uint32_t client, const transport_frame_t *frame) {
     rig_t *rig = context;
     if (!transport_frame_is_off_bus(frame)) {
@@ -127,15 +140,14 @@ static bool take(void *context, uint32_t client, const transport_frame_t *frame)
     }
     transport_send(rig->config.transport, rig->board.time_ns, TRANSPORT_FROM_CLIENT_OFF_BUS, frame);
     if (frame->size == CAN_MTU && transport_frame_is_rig(frame) && !(frame->classic.can_id & CAN_RTR_FLAG)) {
-        canid_t identifier = frame->classic.can_id & CAN_EFF_MASK;
+        const canid_t identifier = frame->classic.can_id & CAN_EFF_MASK;
         if (identifier == RIG_RUN_UNTIL_FRAME_ID && frame->classic.len == RIG_RUN_UNTIL_LENGTH) {
             take_run_until(rig, client, frame->classic.data);
-        } else if (identifier == RIG_SET_FRAME_ID && frame->classic.len == RIG_SET_LENGTH) {
-            take_set(rig, frame->classic.data);
-        } else if (identifier == RIG_FAULT_FRAME_ID && frame->classic.len == RIG_FAULT_LENGTH) {
-            take_fault(rig, frame->classic.data);
-        } else if (identifier == RIG_LOAD_PROFILE_FRAME_ID && frame->classic.len == RIG_LOAD_PROFILE_LENGTH) {
-            take_load_profile(rig, frame->classic.data);
+        }
+        for (rig_t *each = rig; each; each = each->next) {
+            if (transport_frame_node(frame) == each->config.node) {
+                take_for_drive(each, identifier & ~TRANSPORT_NODE_MASK, frame);
+            }
         }
     }
     return true;

@@ -71,38 +71,42 @@ static void set_truth_period(rig_t *rig, double period_us) {
 }
 
 static void set_frame_fault(rig_t *rig, double fault) {
-    rig->bus.faults.fault = (can_fault_t)fault;
+    rig->first->bus.faults.fault = (can_fault_t)fault;
+}
+
+static void set_frame_fault_per_mille(rig_t *rig, double per_mille) {
+    rig->first->bus.faults.per_mille = per_mille;
 }
 
 static void set_frame_fault_sender(rig_t *rig, double sender) {
-    rig->bus.faults.sender = (can_fault_sender_t)sender;
+    rig->first->bus.faults.sender = (can_fault_sender_t)sender;
 }
 
 static void set_frame_delay(rig_t *rig, double delay_us) {
-    rig->bus.faults.delay_ns = (uint64_t)(delay_us * (double)NS_PER_US + 0.5);
+    rig->first->bus.faults.delay_ns = (uint64_t)(delay_us * (double)NS_PER_US + 0.5);
 }
 
 static void set_bus_connection(rig_t *rig, double connected) {
-    can_bus_disconnect(&rig->bus, connected == 0);
+    can_bus_disconnect(&rig->first->bus, rig->board.bus_drive, connected == 0);
 }
 
 static void set_transmit_error_counter(rig_t *rig, double errors) {
-    can_bus_set_transmit_errors(&rig->bus, (unsigned)errors);
+    can_bus_set_transmit_errors(&rig->first->bus, rig->board.bus_drive, (unsigned)errors);
 }
 
 static void set_babble_load(rig_t *rig, double load_percent) {
-    rig->bus.babble.load = load_percent;
-    can_bus_babble(&rig->bus, rig->board.time_ns);
+    rig->first->bus.babble.load = load_percent;
+    can_bus_babble(&rig->first->bus, rig->board.time_ns);
 }
 
 static void set_babble_identifier(rig_t *rig, double identifier) {
-    rig->bus.babble.identifier = (uint32_t)identifier;
-    can_bus_babble(&rig->bus, rig->board.time_ns);
+    rig->first->bus.babble.identifier = (uint32_t)identifier;
+    can_bus_babble(&rig->first->bus, rig->board.time_ns);
 }
 
 static void set_babble_length(rig_t *rig, double length) {
-    rig->bus.babble.length = (uint8_t)length;
-    can_bus_babble(&rig->bus, rig->board.time_ns);
+    rig->first->bus.babble.length = (uint8_t)length;
+    can_bus_babble(&rig->first->bus, rig->board.time_ns);
 }
 
 static const target_t targets[BENCH_VARIABLE_COUNT] = {
@@ -137,7 +141,7 @@ static const target_t targets[BENCH_VARIABLE_COUNT] = {
     [BENCH_VARIABLE_LOAD_RAMP_COARSE_NM_S] = {.set = load_set_ramp},
     [BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM] = {.set = load_set_sine_amplitude},
     [BENCH_VARIABLE_FRAME_FAULT] = {.set = set_frame_fault},
-    [BENCH_VARIABLE_FRAME_FAULT_PER_MILLE] = MEMBER(bus.faults.per_mille),
+    [BENCH_VARIABLE_FRAME_FAULT_PER_MILLE] = {.set = set_frame_fault_per_mille},
     [BENCH_VARIABLE_FRAME_FAULT_SENDER] = {.set = set_frame_fault_sender},
     [BENCH_VARIABLE_FRAME_DELAY_US] = {.set = set_frame_delay},
     [BENCH_VARIABLE_BUS_CONNECTION] = {.set = set_bus_connection},

@@ -2,7 +2,7 @@
 
 #include <string.h>
 
-#define RIG_IDENTIFIER_MASK 0x1FFFFF00u
+#define RIG_IDENTIFIER_MASK (0x1FFFFF00u & ~TRANSPORT_NODE_MASK)
 #define RIG_IDENTIFIER_BASE 0x1F000000u
 
 bool transport_frame_accept(transport_frame_t *frame, size_t received) {

@@ -110,13 +110,14 @@ static void publish(commands_t *commands, command_t *command) {
     }
 }
 
-static commands_frame_t receive_command(commands_t *commands, uint16_t data_id, const hal_can_frame_t *frame,
+static commands_frame_t receive_command(commands_t *commands, unsigned data_id, const hal_can_frame_t *frame,
                                         uint32_t time_us, command_t *command) {
     commands_counters_t *counters = &commands->counters;
     if (frame->length != DRIVE_COMMAND_LENGTH) {
         return reject_command(commands, &counters->wrong_length);
     }
-    switch (e2e_check(&commands->receiver, data_id, frame->data, frame->length)) {
+    const uint16_t data_id_of_node = (uint16_t)(data_id + commands->data_id_offset);
+    switch (e2e_check(&commands->receiver, data_id_of_node, frame->data, frame->length)) {
     case E2E_ACCEPTED:
         break;
     case E2E_WRONG_CHECKSUM:
@@ -148,7 +149,8 @@ static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const h
     if (frame->length != DRIVE_ARM_LENGTH) {
         return reject(&commands->counters.wrong_length);
     }
-    if (!e2e_checksum_matches(DRIVE_ARM_E2E_DATA_ID, frame->data, frame->length)) {
+    if (!e2e_checksum_matches((uint16_t)(DRIVE_ARM_E2E_DATA_ID + commands->data_id_offset), frame->data,
+                              frame->length)) {
         return reject(&commands->counters.wrong_checksum);
     }
     const bool stopped = commands->state == DRIVE_STATE_INITIALISE || commands->state == DRIVE_STATE_READY;
@@ -175,19 +177,20 @@ static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const h
 static_assert(DRIVE_PARAMETER_WRITE_LENGTH == DRIVE_PARAMETER_SET_CONTROL_LENGTH, "one check of their length");
 
 /* The byte after the header is an index or a step. */
-static commands_frame_t receive_set(commands_t *commands, uint16_t data_id, unsigned end, const hal_can_frame_t *frame,
+static commands_frame_t receive_set(commands_t *commands, unsigned data_id, unsigned end, const hal_can_frame_t *frame,
                                     uint32_t time_us) {
     commands_counters_t *counters = &commands->counters;
+    const uint16_t data_id_of_node = (uint16_t)(data_id + commands->data_id_offset);
     const bool control = frame->identifier == DRIVE_PARAMETER_SET_CONTROL_FRAME_ID;
     if (frame->length != DRIVE_PARAMETER_WRITE_LENGTH) {
         return reject(&counters->wrong_length);
     }
-    if (!e2e_checksum_matches(data_id, frame->data, frame->length)) {
+    if (!e2e_checksum_matches(data_id_of_node, frame->data, frame->length)) {
         return reject(&counters->wrong_checksum);
     }
     if (!commands->arming.configuring) {
         arming_refuse(&commands->arming);
-    } else if (e2e_check(&commands->set_receiver, data_id, frame->data, frame->length) != E2E_ACCEPTED) {
+    } else if (e2e_check(&commands->set_receiver, data_id_of_node, frame->data, frame->length) != E2E_ACCEPTED) {
         return reject(&counters->wrong_counter);
     } else {
         commands->arming.configuring_us = time_us;

@@ -50,6 +50,8 @@ typedef struct {
 
 typedef struct {
     e2e_receiver_t receiver;     /* of DRIVE_COMMAND and DRIVE_TORQUE_COMMAND */
+    uint16_t data_id_offset;     /* of the node, added to the data IDs of drive.dbc; set by the caller after
+                                    commands_init */
     uint32_t last_received_us;   /* time of the last frame that it accepted */
     e2e_receiver_t set_receiver; /* of PARAMETER_WRITE and PARAMETER_SET_CONTROL, while armed for configuration */
     arming_t arming;

@@ -1,22 +1,26 @@
 #include "comms/comms.h"
 
 #include "comms/memory_protocol.h"
+#include "comms/node.h"
 #include "comms/parameter_protocol.h"
 #include "drive_codec.h"
 
 #define US_PER_MS 1000u
 
-void comms_init(comms_t *comms, uint32_t time_us) {
+void comms_init(comms_t *comms, unsigned node, uint32_t time_us) {
+    const uint32_t offset = node * NODE_STEP;
     *comms = (comms_t){0};
     bus_monitor_init(&comms->bus, time_us);
     commands_init(&comms->commands);
-    telemetry_init(&comms->telemetry, time_us);
+    comms->commands.data_id_offset = (uint16_t)offset;
+    telemetry_init(&comms->telemetry, offset, time_us);
 }
 
 static void report_arming(comms_t *comms, hal_t *hal, uint32_t time_us) {
     arming_t *arming = &comms->commands.arming;
     hal_can_frame_t frame;
     arming_report(arming, comms->commands.counters.run_unarmed, &frame);
+    frame.identifier += comms->telemetry.identifier_offset;
     arming->changed = !hal_can_transmit(hal, &frame);
     comms->arming_sent_us = time_us;
 }
@@ -31,7 +35,7 @@ static void flush(comms_t *comms, hal_t *hal, uint32_t time_us) {
             return;
         }
     }
-    telemetry_flush(&comms->telemetry, hal);
+    telemetry_flush(&comms->telemetry, hal, time_us);
     const hal_can_frame_t *frame;
     if (frame_queue_peek(&comms->telemetry.queue) == NULL && arming->changed) {
         report_arming(comms, hal, time_us);
@@ -54,6 +58,7 @@ static void receive_set(comms_t *comms, parameters_t *parameters, const paramete
                               &response)) {
         arming_end_configuration(arming);
     }
+    response.identifier += comms->telemetry.identifier_offset;
     frame_queue_push(&comms->responses, &response);
 }
 
@@ -64,6 +69,13 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const 
         if (frame_queue_free(&comms->responses) == 0 || !hal_can_receive(hal, &frame)) {
             return false;
         }
+        if (node_is_other(&frame, comms->telemetry.identifier_offset)) {
+            continue;
+        }
+        if (!frame.extended) {
+            frame.identifier ^=
+                comms->telemetry.identifier_offset; /* as of node 0, whose identifiers do not have these bits */
+        }
         switch (commands_receive(&comms->commands, hal, &frame, time_us, timeout_us, &comms->command)) {
         case COMMANDS_COMMAND:
             return true;
@@ -72,6 +84,7 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const 
             if (!memory_protocol_respond(comms->store, hal, &frame, &response)) {
                 parameter_protocol_respond(parameters, &frame, &response);
             }
+            response.identifier += comms->telemetry.identifier_offset;
             frame_queue_push(&comms->responses, &response);
             break;
         }
@@ -94,12 +107,17 @@ bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, cons
     const uint32_t timeout_us = (uint32_t)parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] * US_PER_MS;
     commands_supervise(&comms->commands, state, time_us, timeout_us);
     comms->set.begun = comms->set.begun && comms->commands.arming.configuring;
+    telemetry_set_period(&comms->telemetry, DRIVE_TELEMETRY_RATE_FAST,
+                         (unsigned)parameters->values[PARAMETER_TELEMETRY_PERIOD_MS]);
+    telemetry_set_period(&comms->telemetry, DRIVE_TELEMETRY_RATE_SLOW,
+                         (unsigned)parameters->values[PARAMETER_TELEMETRY_SLOW_PERIOD_MS]);
     const bool commanded = receive(comms, hal, parameters, conditions, timeout_us, time_us);
     flush(comms, hal, time_us);
     return commanded;
 }
 
 void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values) {
+    comms->telemetry.background_in_mailbox &= comms->bus.status.transmitting;
     telemetry_cycle(&comms->telemetry, values);
     flush(comms, hal, values->status.time_us);
 }

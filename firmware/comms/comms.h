@@ -47,8 +47,8 @@ typedef struct {
     uint32_t arming_sent_us; /* when DRIVE_ARMING last entered a mailbox because of a change */
 } comms_t;
 
-/* The first telemetry cycle is due at time_us. */
-void comms_init(comms_t *comms, uint32_t time_us);
+/* The first telemetry cycle is due at time_us. node: 0..NODE_MAX. */
+void comms_init(comms_t *comms, unsigned node, uint32_t time_us);
 
 /* Sends waiting frames and processes at most COMMS_FRAMES_PER_CALL received frames. Returns true when a command was
  * accepted, in comms->command; reception stops there, so that the caller sees every command, in order. state: of the
@@ -59,7 +59,8 @@ void comms_init(comms_t *comms, uint32_t time_us);
  * commands, because PARAMETER_REQUEST loses arbitration to all frames of the drive but those of the group `background`:
  * responses leave before more requests arrive.
  *
- * Of a frame that is neither command nor request, the identifier may be one of the drive's own (comms->bus).
+ * Of a frame that is neither command nor request, the identifier may be one of the drive's own (comms->bus). Frames of
+ * the traffic of other nodes are ignored (comms/node.h).
  *
  * conditions: for a set of parameters to be applied now. [background] */
 bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,

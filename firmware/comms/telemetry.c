@@ -1,13 +1,37 @@
 #include "comms/telemetry.h"
 
-#include "comms/counter.h"
-#include "drive_enumerations.h"
+#include <assert.h>
 
-void telemetry_init(telemetry_t *telemetry, uint32_t time_us) {
-    *telemetry = (telemetry_t){.next_us = time_us};
+#include "comms/counter.h"
+#include "drive_codec.h"
+#include "drive_enumerations.h"
+#include "fixed/compiler.h"
+
+/* The groups `background` and `idle` of any node have these, and no other frame of the drive. */
+#define BACKGROUND_IDENTIFIERS DRIVE_IDENTITY_FRAME_ID
+
+static_assert(DRIVE_TELEMETRY_CYCLE_MS == 1, "parameters have periods in ms");
+
+void telemetry_init(telemetry_t *telemetry, uint32_t identifier_offset, uint32_t time_us) {
+    *telemetry = (telemetry_t){.next_us = time_us, .identifier_offset = identifier_offset};
     for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
         telemetry->countdown[i] = drive_telemetry_messages[i].delay;
+        telemetry->period[drive_telemetry_messages[i].rate] = drive_telemetry_messages[i].period;
     }
+}
+
+COLD void telemetry_set_period(telemetry_t *telemetry, drive_telemetry_rate_t rate, unsigned period) {
+    const int longer = (int)period - telemetry->period[rate];
+    if (longer == 0) {
+        return;
+    }
+    for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
+        if (drive_telemetry_messages[i].rate == rate) {
+            const int left = telemetry->countdown[i] + longer;
+            telemetry->countdown[i] = (uint16_t)(left > 0 ? left : 0);
+        }
+    }
+    telemetry->period[rate] = (uint16_t)period;
 }
 
 /* Counts down the cycles to a message; true when it is due now. */
@@ -18,7 +42,8 @@ static bool count_down(uint16_t *cycles_left, uint16_t period) {
 }
 
 static void enqueue(telemetry_t *telemetry, const drive_telemetry_message_t *message, const drive_telemetry_t *values) {
-    hal_can_frame_t frame = {.identifier = message->identifier, .length = message->length};
+    hal_can_frame_t frame = {.identifier = message->identifier + telemetry->identifier_offset,
+                             .length = message->length};
     drive_telemetry_pack((unsigned)(message - drive_telemetry_messages), values, frame.data);
     frame_queue_push(&telemetry->queue, &frame);
 }
@@ -29,8 +54,9 @@ static unsigned due_messages(telemetry_t *telemetry, drive_telemetry_group_t gro
     unsigned count = 0;
     for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
         const drive_telemetry_message_t *message = &drive_telemetry_messages[i];
+        const bool settable = message->rate != DRIVE_TELEMETRY_RATE_FIXED;
         if (message->group == group && (telemetry->in_fault || !message->if_active) &&
-            count_down(&telemetry->countdown[i], message->period)) {
+            count_down(&telemetry->countdown[i], settable ? telemetry->period[message->rate] : message->period)) {
             due[count++] = message;
         }
     }
@@ -40,7 +66,7 @@ static unsigned due_messages(telemetry_t *telemetry, drive_telemetry_group_t gro
 static void enqueue_group(telemetry_t *telemetry, drive_telemetry_group_t group, const drive_telemetry_t *values) {
     const drive_telemetry_message_t *due[DRIVE_TELEMETRY_MESSAGES];
     const unsigned count = due_messages(telemetry, group, due);
-    if (frame_queue_free(&telemetry->queue) < count) {
+    if (frame_queue_free(&telemetry->queue) <= count) {
         counter_add(&telemetry->dropped, count);
         return;
     }
@@ -60,7 +86,6 @@ static void enqueue_background(telemetry_t *telemetry, drive_telemetry_group_t g
         } else {
             enqueue(telemetry, due[i], values);
             telemetry->background_queued = true;
-            telemetry->background_identifier = due[i]->identifier;
         }
     }
 }
@@ -81,14 +106,14 @@ static void follow_fault(telemetry_t *telemetry, const drive_telemetry_t *values
 }
 
 void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
-    const bool backlog = frame_queue_peek(&telemetry->queue) != NULL;
+    telemetry->backlog = frame_queue_peek(&telemetry->queue) != NULL;
     follow_fault(telemetry, values);
     enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_MEASUREMENTS, values);
     enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_FAULT, values);
     values->bus_counters.telemetry_dropped = telemetry->dropped;
     enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_COUNTERS, values);
     enqueue_background(telemetry, DRIVE_TELEMETRY_GROUP_BACKGROUND, true, values);
-    enqueue_background(telemetry, DRIVE_TELEMETRY_GROUP_IDLE, !backlog, values);
+    enqueue_background(telemetry, DRIVE_TELEMETRY_GROUP_IDLE, !telemetry->backlog, values);
 
     uint32_t cycles = 1;
     /* Negative when the values were collected a little before the cycle was due. */
@@ -100,18 +125,17 @@ void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
     telemetry->cycle = (uint8_t)(telemetry->cycle + cycles);
 }
 
-void telemetry_flush(telemetry_t *telemetry, hal_t *hal) {
-    unsigned filled = 0; /* mailboxes filled in this call, since a background frame entered one */
+void telemetry_flush(telemetry_t *telemetry, hal_t *hal, uint32_t time_us) {
+    if (telemetry->backlog && telemetry->background_in_mailbox &&
+        time_us - telemetry->background_us - TELEMETRY_PATIENCE_US < TELEMETRY_PAUSE_US) {
+        return;
+    }
     const hal_can_frame_t *frame;
     while ((frame = frame_queue_peek(&telemetry->queue)) != NULL && hal_can_transmit(hal, frame)) {
-        filled++;
-        if (telemetry->background_queued && frame->identifier == telemetry->background_identifier) {
+        if (frame->identifier >= BACKGROUND_IDENTIFIERS) {
             telemetry->background_queued = false;
             telemetry->background_in_mailbox = true;
-            filled = 0;
-        }
-        if (filled == HAL_CAN_MAILBOXES) {
-            telemetry->background_in_mailbox = false;
+            telemetry->background_us = time_us;
         }
         frame_queue_pop(&telemetry->queue);
     }

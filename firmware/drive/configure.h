@@ -11,6 +11,8 @@
 typedef struct {
     uint32_t control_rate_hz;      /* 20000, 40000, 50000, 100000 or 1000000 */
     drive_controller_t controller; /* default of the parameter */
+    uint32_t node;                 /* number on the bus, 0..NODE_MAX: the board's address switches */
+    uint32_t telemetry_period_ms;  /* parameter of that name at the start, unless one is stored; 0: its default */
 } drive_config_t;
 
 /* True for the supported control rates of which a timer with this clock (hal_pwm_clock_hz, 25 to 400 MHz) makes half a

@@ -64,11 +64,14 @@ const char *parameters_unit(unsigned index) {
     return text_after(2 * index + 1);
 }
 
-void parameters_set_controller(parameters_t *parameters, int32_t controller) {
-    const parameter_row_t *row = &rows[PARAMETER_CONTROLLER];
-    parameters->controller_default = fixed_clamp(controller, row->minimum, row->maximum);
-    parameters->values[PARAMETER_CONTROLLER] = parameters->controller_default;
+void parameters_set(parameters_t *parameters, unsigned index, int32_t value) {
+    parameters->values[index] = fixed_clamp(value, rows[index].minimum, rows[index].maximum);
     parameters->revision++;
+}
+
+void parameters_set_controller(parameters_t *parameters, int32_t controller) {
+    parameters_set(parameters, PARAMETER_CONTROLLER, controller);
+    parameters->controller_default = parameters->values[PARAMETER_CONTROLLER];
 }
 
 int32_t parameters_default(const parameters_t *parameters, unsigned index) {

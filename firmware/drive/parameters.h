@@ -44,6 +44,10 @@ const char *parameters_name(unsigned index);
 /* Unit, ASCII, empty for a plain number; index 0..PARAMETER_COUNT-1. */
 const char *parameters_unit(unsigned index);
 
+/* Sets one value before the drive starts, clamped to the row's limits; afterwards a whole set is applied. index
+ * 0..PARAMETER_COUNT-1. */
+void parameters_set(parameters_t *parameters, unsigned index, int32_t value);
+
 /* Sets the controller of this drive as default and present value, clamped to the row's limits. */
 void parameters_set_controller(parameters_t *parameters, int32_t controller);
 

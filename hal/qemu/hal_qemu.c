@@ -84,6 +84,7 @@ void hal_can_status(const hal_t *hal, hal_can_status_t *status) {
     status->state = (hal_can_error_state_t)hal->mailbox.can_error_state;
     status->transmit_errors = (uint16_t)hal->mailbox.transmit_errors;
     status->receive_errors = (uint16_t)hal->mailbox.receive_errors;
+    status->transmitting = hal->mailbox.transmitting != 0;
 }
 
 void hal_can_rejoin(hal_t *hal) {

@@ -22,7 +22,7 @@
 #include "hal_pwm.h"
 
 /* Changes with the structure, so that an image and a host with different layouts stop at the start. */
-#define MAILBOX_LAYOUT 4
+#define MAILBOX_LAYOUT 5
 
 /* Clock of the emulated PWM timer. */
 #define MAILBOX_PWM_CLOCK_HZ 200000000
@@ -64,6 +64,8 @@ typedef struct {
     uint32_t layout; /* MAILBOX_LAYOUT */
     uint32_t control_rate_hz;
     uint32_t controller; /* drive_controller_t */
+    uint32_t node;
+    uint32_t telemetry_period_ms; /* 0: as the parameter's default */
     uint32_t adc_bits;
     uint32_t encoder_bits;
     uint32_t timed; /* 1: instructions take time, 0: they take none */
@@ -87,9 +89,10 @@ typedef struct {
 
     uint32_t receive_waiting; /* frames */
     uint32_t receive_overflows;
-    uint32_t can_error_state; /* hal_can_error_state_t; this and the next as of the last event */
+    uint32_t can_error_state; /* hal_can_error_state_t; this and the next three as of the last event */
     uint32_t transmit_errors;
     uint32_t receive_errors;
+    uint32_t transmitting; /* 1: a frame is in a mailbox */
     hal_can_frame_t frame;
     uint32_t accepted;
 

@@ -125,12 +125,18 @@ def test_commands_out_of_range_are_counted_and_change_nothing(make_bench, tmp_pa
     assert counters["out_of_range"] == 1
 
 
+def of_another_node(identifier: int) -> bool:
+    """Traffic of a drive with another node number, of which this one takes no notice."""
+    return identifier >> 7 in (1, 3, 5, 11, 12, 14) and identifier & 0x70 != 0
+
+
 def test_flood_delays_telemetry_but_not_the_drive(make_bench, tmp_path, undisturbed):
     """Ten clients that send 40 frames each and leave. Not with identifiers of the drive's own, which are a fault
     (test_bus_faults.py), nor twice the same at once, which would be bit errors."""
     bench = steady(make_bench, tmp_path, "disturbed")
     generator = random.Random(1)
-    identifiers = generator.sample([i for i in range(0x800) if i not in KNOWN_IDS], 400)
+    sent = generator.sample([i for i in range(0x800) if i not in KNOWN_IDS], 400)
+    identifiers = sent.copy()
     for _ in range(10):
         with open_bus(bench.address) as attacker:
             for _ in range(40):
@@ -140,7 +146,7 @@ def test_flood_delays_telemetry_but_not_the_drive(make_bench, tmp_path, undistur
     recording, counters = finish(bench)
     assert np.array_equal(recording, undisturbed)
     # Low identifiers delay the telemetry, which is dropped by rule and counted.
-    assert counters["unknown_frame"] == 400
+    assert counters["unknown_frame"] == len([i for i in sent if not of_another_node(i)]) < 400
     assert {name for name, count in counters.items() if count} <= {"unknown_frame", "telemetry_dropped"}
 
 

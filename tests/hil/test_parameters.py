@@ -13,7 +13,7 @@ from salient.generate.parameters import read_table
 
 
 def test_table_is_complete_and_drive_has_its_defaults(make_bench):
-    bench = make_bench()
+    bench = make_bench(telemetry_period_ms=4)
     rows = read_parameter_table(bench)
     assert [row.index for row in rows] == list(range(len(rows)))
     assert len({row.name for row in rows}) == len(rows) > 20
@@ -50,6 +50,7 @@ def test_drive_has_the_table_of_the_reference_page(bench):
         assert row.default == definition.default * lsb or row.name in machine_defined, row.name
 
 
+@pytest.mark.bench_options(telemetry_period_ms=4)
 def test_value_out_of_range_is_rejected_and_changes_nothing(bench):
     parameters = bench.drive.parameters
     for name, row in parameters.rows.items():
@@ -180,6 +181,7 @@ def test_protected_frames_without_being_armed_change_nothing(bench):
     assert bench.telemetry["DRIVE_ARMING.refused"].last == refused + len(TRIPS) + 2
 
 
+@pytest.mark.bench_options(telemetry_period_ms=4)
 def test_recording_of_a_set_does_not_apply_again(bench, make_bench):
     bench.drive.parameters.update(TRIPS)
     bench.run_for(0.01)
@@ -187,7 +189,7 @@ def test_recording_of_a_set_does_not_apply_again(bench, make_bench):
     assert len(recording) == 2 + len(TRIPS) + 2
     bench.drive.parameters.restore_defaults()
     before = values(bench)
-    other = make_bench(seed=2)
+    other = make_bench(seed=2, telemetry_period_ms=4)
     other.run_for(0.0112)
     for at, distance_s in ((bench, 0.0), (bench, 0.001), (bench, 0.02), (other, 0.0), (other, 0.001)):
         begin_s = at.time_s

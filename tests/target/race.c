@@ -191,8 +191,8 @@ void nvm_store_step(nvm_store_t *store, hal_t *hal, const parameters_t *paramete
     (void)store, (void)hal, (void)parameters, (void)time_us, (void)writable;
 }
 
-void comms_init(comms_t *comms, uint32_t time_us) {
-    (void)time_us;
+void comms_init(comms_t *comms, unsigned node, uint32_t time_us) {
+    (void)node, (void)time_us;
     comms->telemetry.next_us = 0; /* always due */
 }
 

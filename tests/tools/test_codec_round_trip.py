@@ -18,6 +18,7 @@ from salient.generate.codec import generate_codec, main
 from salient.generate.error import CodecError
 from salient.generate.ranges import raw_range
 from salient.generate.telemetry import is_bit_field, message_c_name, short_name
+from salient.machine.parameter_table import read_table
 
 ROOT = Path(__file__).resolve().parents[2]
 DATABASES = {
@@ -308,21 +309,25 @@ def test_schedule_is_that_of_the_dbc(telemetry: Telemetry) -> None:
     class Row(ctypes.Structure):
         _fields_ = [
             ("identifier", ctypes.c_uint32), ("length", ctypes.c_uint8),
-            ("group", ctypes.c_uint8), ("if_active", ctypes.c_bool), ("period", ctypes.c_uint16),
-            ("delay", ctypes.c_uint16),
+            ("group", ctypes.c_uint8), ("rate", ctypes.c_uint8), ("if_active", ctypes.c_bool),
+            ("period", ctypes.c_uint16), ("delay", ctypes.c_uint16),
         ]  # fmt: skip
 
     table = (Row * len(telemetry.messages)).in_dll(telemetry.library, "drive_telemetry_messages")
     for row, message in zip(table, telemetry.messages, strict=True):
         assert (row.identifier, row.length) == (message.frame_id, message.length)
         assert row.group == telemetry.attribute(message, "TelemetryGroup")
+        assert row.rate == telemetry.attribute(message, "TelemetryRate")
         assert row.if_active == (message.send_type == "cyclicIfActive")
         assert (row.period, row.delay) == (message.cycle_time, telemetry.attribute(message, "GenMsgStartDelayTime"))
-    periods = {m.name: m.cycle_time for m in telemetry.messages}
-    assert [name for name, period in periods.items() if period == 1] == [
+    periods = {m.name: (telemetry.attribute(m, "TelemetryRate"), m.cycle_time) for m in telemetry.messages}
+    parameters = {row.name: row.default for row in read_table()}
+    fast, slow = (1, parameters["telemetry_period_ms"]), (2, parameters["telemetry_slow_period_ms"])
+    assert [name for name, period in periods.items() if period == fast] == [
         "DRIVE_STATUS", "DRIVE_MOTION", "DRIVE_TORQUE", "DRIVE_CURRENTS",
     ]  # fmt: skip
-    assert {name for name, period in periods.items() if period == 10} == {"DRIVE_BP_PID", "DRIVE_TRIM"}
+    assert {name for name, period in periods.items() if period == slow} == {"DRIVE_BP_PID", "DRIVE_TRIM"}
+    assert {rate for rate, _ in periods.values()} == {0, 1, 2}
 
 
 def test_every_fault_has_its_bit_in_the_fault_mask(telemetry: Telemetry) -> None:

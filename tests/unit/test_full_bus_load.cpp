@@ -131,7 +131,7 @@ TEST(FullBusLoad, commands_pass_a_full_bus_of_a_higher_identifier_and_control_is
     EXPECT_EQ(rig->board.receive_overflows, 0u);
     EXPECT_EQ(drive->late_interrupts, 0u);
     EXPECT_EQ(drive->control.deferred_request.skipped_total, 0u);
-    EXPECT_EQ(rig->bus.drive.transmit_errors + rig->bus.drive.receive_errors, 0u);
+    EXPECT_EQ(rig->bus.drives[0].node.transmit_errors + rig->bus.drives[0].node.receive_errors, 0u);
     EXPECT_EQ(can_bus_client_backlog(&rig->bus, 1), 0u);
     EXPECT_EQ(drive->comms.bus.foreign_count, 0u);
     rig_close(rig.get());

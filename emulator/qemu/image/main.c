@@ -26,6 +26,8 @@ static noreturn void run(void) {
     const drive_config_t config = {
         .control_rate_hz = mailbox->control_rate_hz,
         .controller = (drive_controller_t)mailbox->controller,
+        .node = mailbox->node,
+        .telemetry_period_ms = mailbox->telemetry_period_ms,
     };
     const bool started = drive_init(&drive, &board, &config);
     board_interrupt_enable();

@@ -78,8 +78,9 @@ bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     return true;
 }
 
-void hal_can_status(const hal_t *, hal_can_status_t *status) {
+void hal_can_status(const hal_t *hal, hal_can_status_t *status) {
     *status = {};
+    status->transmitting = !hal->mailboxes.empty();
 }
 
 void hal_can_rejoin(hal_t *) {}
@@ -88,7 +89,6 @@ void hal_can_rejoin(hal_t *) {}
 namespace {
 
 constexpr uint32_t STEP_US = 25;
-constexpr uint32_t FRAME_US = 125; // a frame on the bus, rounded to steps
 
 class Comms : public testing::Test {
   protected:
@@ -97,12 +97,14 @@ class Comms : public testing::Test {
         drive.control_rate_hz = 40000;
         drive.control.state_machine.state = DRIVE_STATE_RUN;
         parameters_init(&parameters);
-        comms_init(&comms, 0);
+        parameters.values[PARAMETER_TELEMETRY_PERIOD_MS] = 1;
+        comms_init(&comms, 0, 0);
     }
 
     // One cycle of telemetry from the drive's state.
     void report(uint32_t at_us) {
         drive_telemetry_t values;
+        bus_monitor_step(&comms.bus, &bus, at_us);
         telemetry_collect(&drive, at_us, &values);
         comms_telemetry(&comms, &bus, &values);
     }
@@ -110,7 +112,7 @@ class Comms : public testing::Test {
     // The drive's background and the bus, until `until_us`; other nodes hold the bus for identifiers from `limit` on.
     void run(uint32_t until_us, uint32_t limit = 0x800) {
         for (; time_us < until_us; time_us += STEP_US) {
-            if (time_us % FRAME_US == 0) {
+            if (time_us % frame_us == 0) {
                 bus.carry(limit);
             }
             if (comms_telemetry_due(&comms, time_us)) {
@@ -144,6 +146,7 @@ class Comms : public testing::Test {
     parameters_t &parameters = drive.parameters;
     parameters_conditions_t conditions{};
     uint32_t time_us = 0;
+    uint32_t frame_us = 125; // a frame on the bus, rounded to steps
     std::vector<command_t> accepted;
 };
 
@@ -354,6 +357,82 @@ TEST_F(Comms, others_above_the_heartbeat_cannot_block_telemetry) {
     EXPECT_GE(bus.count(DRIVE_IDENTITY_FRAME_ID), 1u);
 }
 
+TEST_F(Comms, own_telemetry_that_the_bus_does_not_take_lets_the_heartbeat_pass) {
+    frame_us = 500; // the fast telemetry alone is twice what the bus takes
+    run(2000500);
+    EXPECT_NEAR(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 20, 1);
+    EXPECT_GT(comms.telemetry.dropped, 4000);
+    EXPECT_LT(comms.telemetry.dropped, 5000);
+    EXPECT_GT(bus.count(DRIVE_STATUS_FRAME_ID), 800u);
+}
+
+TEST_F(Comms, periods_follow_the_parameters_from_the_last_frame_on) {
+    parameters.values[PARAMETER_TELEMETRY_PERIOD_MS] = 4;
+    run(20500);
+    parameters.values[PARAMETER_TELEMETRY_PERIOD_MS] = 7;
+    parameters.values[PARAMETER_TELEMETRY_SLOW_PERIOD_MS] = 3;
+    run(60500);
+    parameters.values[PARAMETER_TELEMETRY_PERIOD_MS] = 1;
+    run(64900);
+    std::vector<int> fast;
+    for (const auto &frame : bus.sent) {
+        if (frame.identifier == DRIVE_STATUS_FRAME_ID) {
+            fast.push_back(frame.data[7]);
+        }
+    }
+    EXPECT_EQ(fast, (std::vector<int>{0, 4, 8, 12, 16, 20, 27, 34, 41, 48, 55, 61, 62, 63, 64}));
+    EXPECT_EQ(bus.count(DRIVE_CURRENTS_FRAME_ID), fast.size());
+    EXPECT_EQ(bus.count(DRIVE_TRIM_FRAME_ID), 3u + 14u); // cycles 0, 10, 20; 23, 26 to 62
+    EXPECT_EQ(comms.telemetry.dropped, 0);
+}
+
+TEST_F(Comms, a_node_has_identifiers_of_its_own_and_ignores_those_of_others) {
+    comms_init(&comms, 5, 0);
+    for (const uint32_t other : {0x080u, 0x0E0u, 0x181u, 0x590u, 0x640u, 0x770u}) {
+        bus.received.push_back(hal_can_frame_t{other, false, false, 7, {}});
+    }
+    bus.received.push_back(hal_can_frame_t{0x0D0, false, false, 6, {}});
+    bus.received.push_back(hal_can_frame_t{0x100, false, false, 6, {}});
+    hal_can_frame_t read = request(DRIVE_PARAMETER_REQUEST_OPERATION_READ_CHOICE, PARAMETER_COMMAND_TIMEOUT_MS);
+    read.identifier += 0x50;
+    bus.received.push_back(read);
+    run(106000);
+    EXPECT_EQ(comms.commands.counters.wrong_length, 1);
+    EXPECT_EQ(comms.commands.counters.unknown_frame, 1);
+    EXPECT_EQ(comms.bus.foreign_count, 0);
+    for (const auto &frame : bus.sent) {
+        EXPECT_EQ(frame.identifier & 0x70, 0x50u);
+    }
+    EXPECT_EQ(bus.count(DRIVE_STATUS_FRAME_ID + 0x50), 106u);
+    EXPECT_EQ(bus.count(DRIVE_HEARTBEAT_FRAME_ID + 0x50), 2u);
+    EXPECT_GE(bus.count(DRIVE_ARMING_FRAME_ID + 0x50), 1u);
+    EXPECT_EQ(bus.count(DRIVE_PARAMETER_RESPONSE_FRAME_ID + 0x50), 1u);
+    bus.received.push_back(hal_can_frame_t{0x1D3, false, false, 8, {}});
+    run(107000);
+    EXPECT_EQ(comms.bus.foreign_count, 1) << "its own";
+}
+
+TEST_F(Comms, a_command_of_one_node_is_valid_for_no_other) {
+    for (unsigned node = 0; node < 8; node++) {
+        comms_init(&comms, node, 0);
+        for (unsigned sender = 0; sender < 8; sender++) {
+            accepted.clear();
+            for (const uint32_t base : {DRIVE_COMMAND_FRAME_ID, DRIVE_TORQUE_COMMAND_FRAME_ID}) {
+                const uint16_t data_id =
+                    base == DRIVE_COMMAND_FRAME_ID ? DRIVE_COMMAND_E2E_DATA_ID : DRIVE_TORQUE_COMMAND_E2E_DATA_ID;
+                for (const uint32_t identifier : {DRIVE_COMMAND_FRAME_ID, DRIVE_TORQUE_COMMAND_FRAME_ID}) {
+                    hal_can_frame_t frame{identifier + 16 * node, false, false, 7, {}};
+                    e2e_protect(uint16_t(data_id + 16 * sender), uint8_t(accepted.size()), frame.data, 7);
+                    bus.received.push_back(frame);
+                    run(time_us + 1000);
+                }
+            }
+            EXPECT_EQ(accepted.size(), sender == node ? 2u : 0u) << sender << " to " << node;
+        }
+        time_us = 0;
+    }
+}
+
 TEST_F(Comms, the_identity_is_sent_in_the_middle_of_a_slow_cycle) {
     run(106000);
     std::vector<int> cycles;
@@ -409,7 +488,7 @@ TEST_F(Comms, values_collected_just_before_the_cycle_is_due_keep_the_grid) {
 
 TEST_F(Comms, cycles_go_on_across_the_wrap_of_the_clock) {
     const uint32_t start = UINT32_MAX - 2499;
-    comms_init(&comms, start);
+    comms_init(&comms, 0, start);
     for (uint32_t elapsed = 0; elapsed < 10000; elapsed += STEP_US) {
         bus.carry();
         if (comms_telemetry_due(&comms, start + elapsed)) {

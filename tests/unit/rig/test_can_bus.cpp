@@ -162,7 +162,7 @@ class CanBus : public testing::Test {
         return result;
     }
 
-    bool transmit(const hal_can_frame_t &f) { return can_bus_transmit(&bus, &f); }
+    bool transmit(const hal_can_frame_t &f) { return can_bus_transmit(&bus, 0, &f); }
     bool push(const hal_can_frame_t &f, uint32_t client = 1) { return can_bus_push(&bus, client, &f); }
 
     // Delivery at the next event, or nothing; the event's time.
@@ -334,8 +334,8 @@ TEST_F(CanBus, FramesThatAreEqualInEveryBitAreOneFrame) {
     auto deliveries = run();
     ASSERT_EQ(deliveries.size(), 1u);
     EXPECT_TRUE(deliveries[0].second.from_drive);
-    EXPECT_FALSE(deliveries[0].second.to_drive);
-    EXPECT_EQ(bus.drive.transmit_errors + client(0).transmit_errors + client(1).transmit_errors, 0u);
+    EXPECT_FALSE(deliveries[0].second.to_drives);
+    EXPECT_EQ(bus.drives[0].node.transmit_errors + client(0).transmit_errors + client(1).transmit_errors, 0u);
 }
 
 // Start of frame and identifier 0x555 alternate; RTR, IDE, r0 and two bits of the length are five zeros, so a stuff bit
@@ -349,7 +349,7 @@ TEST_F(CanBus, SameIdentifierWithOtherDataIsABitErrorAndBothCountersClimb) {
     can_bus_start(&bus, 0);
     for (unsigned i = 0; i < 16; ++i) {
         EXPECT_EQ(step(), std::make_pair((43 * i + 40) * US, false));
-        EXPECT_EQ(bus.drive.transmit_errors, 8 * (i + 1));
+        EXPECT_EQ(bus.drives[0].node.transmit_errors, 8 * (i + 1));
         EXPECT_EQ(client(0).transmit_errors, 8 * (i + 1));
         EXPECT_EQ(step().first, 43 * (i + 1) * US);
     }
@@ -359,13 +359,13 @@ TEST_F(CanBus, SameIdentifierWithOtherDataIsABitErrorAndBothCountersClimb) {
     EXPECT_EQ(step().first, start_ns);
     EXPECT_EQ(step(), std::make_pair(start_ns + length * US, true));
     EXPECT_EQ(delivered.frame.data[0], 0x55);
-    EXPECT_TRUE(delivered.to_drive) << "the drive sees its own identifier";
-    EXPECT_EQ(bus.drive.transmit_errors, 136u);
+    EXPECT_TRUE(delivered.to_drives) << "the drive sees its own identifier";
+    EXPECT_EQ(bus.drives[0].node.transmit_errors, 136u);
     EXPECT_EQ(client(0).transmit_errors, 127u);
     auto rest = run();
     ASSERT_EQ(rest.size(), 1u);
     EXPECT_EQ(rest[0].first, start_ns + (length + 3 + 8 + bits(recessive)) * US);
-    EXPECT_EQ(bus.drive.transmit_errors, 135u);
+    EXPECT_EQ(bus.drives[0].node.transmit_errors, 135u);
 }
 
 TEST_F(CanBus, ThreeNodesWithOneIdentifierAllDeliverInTheEnd) {
@@ -384,7 +384,7 @@ TEST_F(CanBus, SecondSenderOfItsIdentifierDrivesANodeToBusOff) {
         push(frame(0x180, {0x00}));
         can_bus_start(&bus, bus.shared.idle_from_ns + 100 * US);
         run_to(bus.shared.idle_from_ns + 5000 * US);
-        off = bus.drive.bus_off;
+        off = bus.drives[0].node.bus_off;
     }
     EXPECT_TRUE(off);
     EXPECT_FALSE(client(0).bus_off);
@@ -393,64 +393,64 @@ TEST_F(CanBus, SecondSenderOfItsIdentifierDrivesANodeToBusOff) {
 // Alone on the bus: error in the acknowledge slot, eight bits before the end of frame; flag 6, delimiter 8, interframe
 // space 3: the next frame starts 9 bits after the end of the complete frame; eight more once error passive.
 TEST_F(CanBus, AloneIsErrorPassiveAndNeverBusOff) {
-    can_bus_disconnect(&bus, true);
+    can_bus_disconnect(&bus, 0, true);
     const auto f = frame(0x155, {1, 2, 3});
     transmit(f);
     can_bus_start(&bus, 0);
     uint64_t start_ns = 0;
     for (unsigned i = 1; i <= 1000; ++i) {
         EXPECT_EQ(step(), std::make_pair(start_ns + (bits(f) + 6) * US, false));
-        ASSERT_EQ(bus.drive.transmit_errors, i < 16 ? 8 * i : 128u);
+        ASSERT_EQ(bus.drives[0].node.transmit_errors, i < 16 ? 8 * i : 128u);
         start_ns += (bits(f) + 9 + (i < 16 ? 0 : 8)) * US;
-        while (bus.alone.state == can_line_t::CAN_LINE_IDLE) {
+        while (bus.drives[0].alone.state == can_line_t::CAN_LINE_IDLE) {
             step();
         }
-        ASSERT_EQ(bus.alone.frame_start_ns, start_ns);
+        ASSERT_EQ(bus.drives[0].alone.frame_start_ns, start_ns);
     }
-    EXPECT_TRUE(can_node_is_passive(&bus.drive));
+    EXPECT_TRUE(can_node_is_passive(&bus.drives[0].node));
     push(frame(0x100)); // the rest of the bus works
     can_bus_start(&bus, start_ns);
     auto deliveries = run_to(start_ns + 1000 * US);
     ASSERT_EQ(deliveries.size(), 1u);
-    EXPECT_FALSE(deliveries[0].second.to_drive);
-    can_bus_disconnect(&bus, false);
+    EXPECT_FALSE(deliveries[0].second.to_drives);
+    can_bus_disconnect(&bus, 0, false);
     deliveries = run_to(start_ns + 2000 * US);
     ASSERT_EQ(deliveries.size(), 1u) << "its frame is acknowledged at last";
     EXPECT_TRUE(deliveries[0].second.from_drive);
-    EXPECT_EQ(bus.drive.transmit_errors, 127u);
+    EXPECT_EQ(bus.drives[0].node.transmit_errors, 127u);
 }
 
 TEST_F(CanBus, BusOffEndsOnRequestAfter128Times11RecessiveBits) {
     transmit(frame(0x100));
     transmit(frame(0x101));
-    can_bus_set_transmit_errors(&bus, 256);
-    EXPECT_TRUE(bus.drive.bus_off);
+    can_bus_set_transmit_errors(&bus, 0, 256);
+    EXPECT_TRUE(bus.drives[0].node.bus_off);
     EXPECT_FALSE(transmit(frame(0x102)));
     can_bus_start(&bus, 0);
     push(frame(0x200)); // works without the drive, which does not see it
     can_bus_start(&bus, 1000 * US);
     auto deliveries = run_to(5000 * US);
     ASSERT_EQ(deliveries.size(), 1u);
-    EXPECT_FALSE(deliveries[0].second.to_drive);
-    EXPECT_TRUE(bus.drive.bus_off) << "not by itself";
-    can_bus_rejoin(&bus, 10000 * US);
+    EXPECT_FALSE(deliveries[0].second.to_drives);
+    EXPECT_TRUE(bus.drives[0].node.bus_off) << "not by itself";
+    can_bus_rejoin(&bus, 0, 10000 * US);
     can_bus_start(&bus, 10000 * US);
     EXPECT_EQ(bus.next_event_ns, (10000 + 128 * 11) * US);
     EXPECT_TRUE(run().empty()) << "its mailboxes were emptied";
-    EXPECT_FALSE(bus.drive.bus_off);
-    EXPECT_EQ(bus.drive.transmit_errors, 0u);
+    EXPECT_FALSE(bus.drives[0].node.bus_off);
+    EXPECT_EQ(bus.drives[0].node.transmit_errors, 0u);
     EXPECT_TRUE(transmit(frame(0x102)));
 }
 
 TEST_F(CanBus, OnAFullBusEachFrameEndsWithElevenRecessiveBits) {
-    can_bus_set_transmit_errors(&bus, 256);
+    can_bus_set_transmit_errors(&bus, 0, 256);
     for (unsigned i = 0; i < 300; ++i) {
         push(frame(0x200, {static_cast<uint8_t>(i)}));
     }
-    can_bus_rejoin(&bus, 10 * US);
+    can_bus_rejoin(&bus, 0, 10 * US);
     can_bus_start(&bus, 10 * US);
     unsigned frames = 0;
-    while (bus.drive.bus_off) {
+    while (bus.drives[0].node.bus_off) {
         frames += step().second;
         ASSERT_LE(frames, 128u);
     }
@@ -485,7 +485,7 @@ TEST_F(CanBus, CorruptedFrameIsRepeatedAfterAnErrorFrame) {
         auto [end_ns, complete] = step();
         ASSERT_FALSE(complete);
         ASSERT_EQ(client(0).transmit_errors, 8u);
-        ASSERT_EQ(bus.drive.receive_errors, 1u);
+        ASSERT_EQ(bus.drives[0].node.receive_errors, 1u);
         // Control field to the sixth last bit of the CRC, flag 6 to 12, delimiter 8.
         ASSERT_GE(end_ns, (13 + 1 + 6 + 8) * US);
         ASSERT_LE(end_ns, (bits(f) - 10 - 6 + 12 + 8) * US);
@@ -494,7 +494,7 @@ TEST_F(CanBus, CorruptedFrameIsRepeatedAfterAnErrorFrame) {
         ASSERT_EQ(deliveries.size(), 1u) << "repeated once";
         ASSERT_EQ(deliveries[0].first, end_ns + (3 + bits(f)) * US);
         ASSERT_EQ(client(0).transmit_errors, 7u);
-        ASSERT_EQ(bus.drive.receive_errors, 0u);
+        ASSERT_EQ(bus.drives[0].node.receive_errors, 0u);
     }
     std::sort(lengths.begin(), lengths.end());
     EXPECT_LT(lengths.front() + 40 * US, lengths.back()) << "any bit";
@@ -509,7 +509,7 @@ TEST_F(CanBus, DuplicatedFrameIsReceivedTwice) {
     ASSERT_EQ(deliveries.size(), 2u);
     // Flag of the transmitter and, a bit later, of the receivers: 7 bits; delimiter 8; interframe space 3.
     EXPECT_EQ(deliveries[1].first, (2 * bits(f) + 7 + 8 + 3) * US);
-    EXPECT_TRUE(deliveries[1].second.to_drive && deliveries[0].second.to_drive);
+    EXPECT_TRUE(deliveries[1].second.to_drives && deliveries[0].second.to_drives);
     EXPECT_FALSE(deliveries[0].second.from_client);
     EXPECT_TRUE(deliveries[1].second.from_client);
     EXPECT_EQ(client(0).transmit_errors, 7u);
@@ -523,9 +523,9 @@ TEST_F(CanBus, LostFrameIsOnTheBusButNotReceived) {
     can_bus_start(&bus, 0);
     auto deliveries = run();
     ASSERT_EQ(deliveries.size(), 2u);
-    EXPECT_TRUE(deliveries[0].second.to_drive && deliveries[0].second.to_clients);
+    EXPECT_TRUE(deliveries[0].second.to_drives && deliveries[0].second.to_clients);
     EXPECT_FALSE(deliveries[1].second.to_clients);
-    EXPECT_EQ(bus.drive.transmit_errors, 0u) << "acknowledged";
+    EXPECT_EQ(bus.drives[0].node.transmit_errors, 0u) << "acknowledged";
 }
 
 TEST_F(CanBus, DelayedFrameStaysInItsSender) {
@@ -550,7 +550,7 @@ TEST_F(CanBus, FaultsChooseTheirShareOfTheFrames) {
     can_bus_start(&bus, 0);
     unsigned lost = 0;
     for (const auto &[time_ns, delivery] : run()) {
-        lost += !delivery.to_drive;
+        lost += !delivery.to_drives;
     }
     EXPECT_NEAR(lost, 1000, 150);
 }

@@ -19,7 +19,7 @@ class GatePath : public testing::Test {
         machine.trip_current_A = 1000.0;
         plant_init(&plant, &machine, 0.3);
         sensors_init(&sensors, &machine.sensors, 17, 12, 1);
-        board_init(&board, &plant, &sensors, &bus, 1);
+        board_init(&board, &plant, &sensors, &bus, 0, 1);
         board_pwm_start(&board, TICKS);
         full.upper[0] = full.lower[0] = TICKS;
     }

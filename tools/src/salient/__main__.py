@@ -96,18 +96,18 @@ def _log(options: argparse.Namespace) -> int:
 
         if options.duration_s is not None:
             raise UsageError("--duration-s: not with --convert, which reads the whole file")
-        count = convert(options.convert, options.out, options.machine)
+        count = convert(options.convert, options.out, options.machine, options.node)
         print(f"{count} frames: {options.out}")
         return 0
     from salient.bus.monitor import record
 
-    return record(options.can, options.out, options.duration_s, options.machine)
+    return record(options.can, options.out, options.duration_s, options.machine, options.node)
 
 
 def _monitor(options: argparse.Namespace) -> int:
     from salient.bus.monitor import monitor
 
-    return monitor(options.can, options.every_s, options.duration_s, options.machine, options.signals)
+    return monitor(options.can, options.every_s, options.duration_s, options.machine, options.signals, options.node)
 
 
 def _parameters(options: argparse.Namespace) -> int:
@@ -131,7 +131,7 @@ def _compare(options: argparse.Namespace) -> int:
 def _machine(options: argparse.Namespace) -> int:
     from salient.machine.report import run
 
-    return run(options.machine, options.out, options.json, options.dbc)
+    return run(options.machine, options.out, options.json, options.dbc, options.node)
 
 
 def _pil(options: argparse.Namespace) -> int:

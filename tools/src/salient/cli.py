@@ -86,6 +86,7 @@ def make_parser() -> argparse.ArgumentParser:
                      "out/can.blf)")
     log.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
     _add_machine(log, "whose signals FILE.mf4 has: ")
+    _add_node(log)
 
     monitor = command("monitor", "watch a running drive, one line of values per period")
     _add_can(monitor)
@@ -96,6 +97,7 @@ def make_parser() -> argparse.ArgumentParser:
                          help="these signals of drive and test bench: MESSAGE.SIGNAL, or SIGNAL where only one message "
                          "has it")
     _add_machine(monitor)
+    _add_node(monitor)
 
     benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
                         "ngspice; effect of the network")
@@ -113,6 +115,7 @@ def make_parser() -> argparse.ArgumentParser:
     machine.add_argument("--json", type=Path, metavar="FILE", help="also write the drive's data to a file")
     machine.add_argument("--dbc", type=Path, metavar="FILE.dbc",
                          help="also write the CAN database of its drive, with the factors and ranges of this machine")
+    _add_node(machine)
 
     pil = command("pil", "processor in the loop: a scenario on the target, and its load on the processor")
     task = pil.add_mutually_exclusive_group(required=True)
@@ -145,6 +148,7 @@ def make_parser() -> argparse.ArgumentParser:
                                 "that they survive a reset")
         _add_can(action)
         _add_machine(action)
+        _add_node(action)
 
     return parser
 
@@ -166,6 +170,12 @@ def _add_bench_options(parser: argparse.ArgumentParser, command: str) -> None:
 def _add_machine(parser: argparse.ArgumentParser, purpose: str = "") -> None:
     parser.add_argument("--machine", type=_option_type("machine"), default=DEFAULTS["machine"],
                         metavar=OPTIONS["machine"].metavar, help=purpose + description("machine"))
+
+
+def _add_node(parser: argparse.ArgumentParser) -> None:
+    low, high = OPTIONS["node"].minimum, OPTIONS["node"].maximum
+    parser.add_argument("--node", type=_option_type("node"), default=DEFAULTS["node"], metavar="N",
+                        help=f"node number of the drive: {low} to {high} (default {DEFAULTS['node']})")
 
 
 def _add_can(parser: argparse._ActionsContainer) -> None:

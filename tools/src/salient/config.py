@@ -28,6 +28,7 @@ TARGETS = ("host", "cortex-m4", "rv32")
 PACES = ("lockstep", "realtime", "free")
 PACE_FACTOR_MIN, PACE_FACTOR_MAX = 0.01, 1000.0
 """PACING_FACTOR_MIN and PACING_FACTOR_MAX of emulator/rig/pacing.h."""
+NODE_MAX = 7
 BUSES = "unix:PATH or socketcan:INTERFACE"
 LOG_SUFFIXES = (".asc", ".mf4", ".blf", ".log")
 """Formats of a log: ASC, MF4, BLF and the text of candump -L."""
@@ -174,6 +175,13 @@ class BenchConfig(Conditions):
                                "state and on SocketCAN no virtual time", commands=("sim",))
     machine_image: Path | None = _option(None, FILE, "the machine, as salient.generate.machine writes it",
                                          metavar="FILE")
+    node: int = _option(0, INTEGER, "node number of the drive on the bus, of the first one of several", metavar="N",
+                        maximum=NODE_MAX, commands=("sim",))
+    drives: int = _option(1, INTEGER, "drives on the bus, each on a bench of its own, with ascending node numbers",
+                          metavar="N", minimum=1, maximum=NODE_MAX + 1, commands=("sim",))
+    telemetry_period_ms: int | None = _option(None, INTEGER, "period of the drive's fast telemetry at the start in ms; "
+                                              "without it the default of the parameter", metavar="N", minimum=1,
+                                              maximum=100, commands=("sim",))
     memory: Path | None = _option(None, FILE, "keeps the drive's non-volatile memory in a file, which is made when it "
                                   "does not exist; without it the memory is erased at the start", metavar="FILE",
                                   commands=("sim",))

@@ -1,10 +1,12 @@
-"""CAN databases: the attributes (BA_) of their messages and signals, and a hash. The drive sends
-the hash of its database, so that tools notice a different one."""
+"""CAN databases: the attributes (BA_) of their messages and signals, the databases of other node numbers, and a hash.
+The drive sends the hash of the database of node 0, so that tools notice a different one."""
 
 from __future__ import annotations
 
 import json
+import re
 import zlib
+from collections.abc import Callable
 from typing import Any
 
 from cantools.database.can.database import Database
@@ -17,6 +19,37 @@ def attributes(owner: Message | Signal) -> dict[str, Any]:
     if owner.dbc is None:
         return {}
     return {name: attribute.value for name, attribute in owner.dbc.attributes.items()}
+
+
+NODE_STEP = 16
+"""From the identifiers and data IDs of a drive to those of the next node number (firmware/comms/node.h)."""
+_RIG_NODE_STEP = 0x100
+"""Likewise of the test bench (TRANSPORT_NODE_SHIFT of emulator/rig/transport_frame.h)."""
+_RIG_OF_ALL = ("RIG_RUN_UNTIL", "RIG_CLOCK", "RIG_STAMP")
+"""Messages of the test bench that all drives of a bus share: time."""
+_STATEMENT = re.compile(r'^(BO_|(?:CM_|BA_ "\w+") (?:BO_|SG_)|VAL_|SIG_VALTYPE_|SG_MUL_VAL_) (\d+) ', re.MULTILINE)
+_DATA_ID = re.compile(r'^(BA_ "E2EDataId" BO_ \d+) (\d+);', re.MULTILINE)
+_NODE = re.compile(r'^(CM_ BU_ DRIVE "The drive with node number) 0\b[^"]*', re.MULTILINE)
+
+
+def drive_dbc_of_node(text: str, node: int) -> str:
+    """The DBC of a drive with another node number, from that of node 0."""
+    if node == 0:
+        return text
+    text = _NODE.sub(rf"\g<1> {node}.", text)
+    text = _DATA_ID.sub(lambda m: f"{m[1]} {int(m[2]) + NODE_STEP * node};", text)
+    return _with_identifiers(text, lambda identifier: identifier + NODE_STEP * node)
+
+
+def rig_dbc_of_node(text: str, node: int) -> str:
+    """The DBC of the test bench of a drive with another node number, from that of node 0."""
+    shared = {int(number) for number, name in re.findall(r"^BO_ (\d+) (\w+):", text, re.MULTILINE)
+              if name in _RIG_OF_ALL}
+    return _with_identifiers(text, lambda number: number + (0 if number in shared else _RIG_NODE_STEP * node))
+
+
+def _with_identifiers(text: str, change: Callable[[int], int]) -> str:
+    return _STATEMENT.sub(lambda m: f"{m[1]} {change(int(m[2]))} ", text)
 
 
 def database_hash(database: Database) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import can
+from cantools.database.can import Message
 
 from salient.bench.client import Client
 from salient.bus import e2e
@@ -21,9 +22,10 @@ _FAST_POLL_FOR_NS = 2_000_000
 _SLOW_POLL_NS = 1_000_000
 
 
-def arm_frame(counter: int, step: str, response: int = 0) -> can.Message:
-    """A DRIVE_ARM with its checksum. counter 0..255; step one of STEPS; response 0..2^32-1."""
-    return e2e.protected_frame(_ARM, counter % 256, {"step": STEPS[step], "response": response})
+def arm_frame(counter: int, step: str, response: int = 0, message: Message = _ARM) -> can.Message:
+    """A DRIVE_ARM with its checksum. counter 0..255; step one of STEPS; response 0..2^32-1; message: of the
+    node."""
+    return e2e.protected_frame(message, counter % 256, {"step": STEPS[step], "response": response})
 
 
 def response_to(challenge: int) -> int:
@@ -87,5 +89,6 @@ class ArmingSequence:
         self.due_ns = self._sent_ns + _FAST_POLL_NS
 
     def _send(self, step: str, response: int = 0) -> None:
-        self._session.send(arm_frame(self._counter, step, response))
+        message = self._session.drive_database.get_message_by_name(_ARM.name)
+        self._session.send(arm_frame(self._counter, step, response, message))
         self._counter = (self._counter + 1) % 256

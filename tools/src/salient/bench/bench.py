@@ -19,12 +19,15 @@ from salient.bus.log import write_logs
 from salient.config import BenchConfig
 
 LAST_MOMENTS_S = 0.05
+TELEMETRY_PERIOD_MS = 1
+"""Of a bench, unless its configuration states one; a bus with one drive alone has room for it."""
 
 
 class Bench(Session):
     """A session with an emulator that it starts and ends.
 
-    config: its pace is not used, a bench is in lock-step. can: "unix:PATH" or "socketcan:INTERFACE", one bench at
+    config: its pace is not used, a bench is in lock-step; its telemetry_period_ms is 1 unless stated,
+    with several drives that of the parameter. can: "unix:PATH" or "socketcan:INTERFACE", one bench at
     a time on an interface. options: the configuration. simulator: the process.
     """
 
@@ -32,11 +35,13 @@ class Bench(Session):
     simulator: EmulatorProcess
 
     def __init__(self, config: BenchConfig, can: str) -> None:
-        self.options = replace(config, pace="lockstep")
+        period_ms = config.telemetry_period_ms or (TELEMETRY_PERIOD_MS if config.drives == 1 else None)
+        self.options = replace(config, pace="lockstep", telemetry_period_ms=period_ms)
         self.simulator = EmulatorProcess(self.options, can)
         try:
             super().__init__(can, parameter_table=lambda: parameter_table(config),
-                             is_alive=lambda: self.simulator.is_alive, machine=config.machine)
+                             is_alive=lambda: self.simulator.is_alive, machine=config.machine, node=config.node,
+                             drives=config.drives)
         except BaseException:
             self.simulator.close()
             raise

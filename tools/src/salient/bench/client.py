@@ -16,8 +16,11 @@ class Client(Protocol):
 
     time_ns: int
     telemetry: SignalTable
+    truth: SignalTable
     drive_database: Database
-    """The DBC of the drive."""
+    """The DBC of the drive, with the identifiers of its node number."""
+    rig_database: Database
+    """That of its test bench."""
 
     def require_drive_database(self) -> None:
         """Raises an exception when the drive is known to have another DBC."""

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import can
-from cantools.database.can import Message
+from cantools.database.can import Database, Message
 
 from salient.bench.arming import ArmingSequence
 from salient.bench.client import Client, KnownAttributes
 from salient.bench.parameter_set import ParameterSetWriter, SetResult
 from salient.bus import e2e
-from salient.bus.signals import drive_database, signal_range, value_numbers
+from salient.bus.signals import SignalTable, drive_database, signal_range, value_numbers
 from salient.errors import RunFailed, UsageError
 
 _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
@@ -101,6 +101,11 @@ class Drive(KnownAttributes):
         self.command_due_ns = None
         self.parameters = Parameters(session, parameter_table)
         self.fault_log = FaultLog(session)
+
+    @property
+    def telemetry(self) -> SignalTable:
+        """The signals of this drive."""
+        return self._session.telemetry
 
     @property
     def speed_reference_rpm(self) -> float:
@@ -443,18 +448,18 @@ def read_parameter_table(session: Client) -> list[ParameterRow]:
         rows.append(ParameterRow(index, name, unit, fraction_bits, *limits))
 
 
-def _request(operation: str, index: int, part: int, value: int) -> can.Message:
-    message = drive_database().get_message_by_name("PARAMETER_REQUEST")
+def _request(database: Database, operation: str, index: int, part: int, value: int) -> can.Message:
+    message = database.get_message_by_name("PARAMETER_REQUEST")
     signals = {"operation": _OPERATIONS[operation], "index": index, "part": part, "value": value}
     return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=message.encode(signals))
 
 
 def _access(session: Client, operation: str, index: int, part: int = 0, value: int = 0) -> tuple[str, int]:
     """(status, value) of the drive's response; lets virtual time pass until it arrives."""
-    message = drive_database().get_message_by_name("PARAMETER_RESPONSE")
+    message = session.drive_database.get_message_by_name("PARAMETER_RESPONSE")
     head = bytes([_OPERATIONS[operation], index, part])
     for _ in range(_ATTEMPTS):
-        session.send(_request(operation, index, part, value))
+        session.send(_request(session.drive_database, operation, index, part, value))
         try:
             response = session.advance_until_frame(
                 lambda m: m.arbitration_id == message.frame_id and not m.is_extended_id and bytes(m.data[:3]) == head,

@@ -25,7 +25,7 @@ from salient.toml_file import TextFileError, read_toml
 def run(options: argparse.Namespace) -> int:
     """The action of a command line; its exit code."""
     try:
-        with Session(options.can, lockstep=False, machine=options.machine) as session:
+        with Session(options.can, lockstep=False, machine=options.machine, node=options.node) as session:
             match options.action:
                 case "save":
                     return save(session, options.file)

@@ -69,6 +69,8 @@ def command_line(config: BenchConfig) -> list[str]:
         if config.instruction_ns is not None:
             raise UsageError(f"--instruction-ns {config.instruction_ns}: only with --target cortex-m4")
         return [program, *arguments]
+    if config.drives > 1:
+        raise UsageError(f"--drives {config.drives}: only with --target host")
     elf = image(config.machine, config.build)
     line = [program, str(elf)]
     if config.instructions is not None:

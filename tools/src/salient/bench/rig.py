@@ -17,7 +17,7 @@ from cantools.database.namedsignalvalue import NamedSignalValue
 
 from salient.bench.client import Client, unknown_attribute
 from salient.bench.faults import FaultError, fault_kind, fault_signals
-from salient.bus.signals import rig_database, signal_range
+from salient.bus.signals import SignalTable, rig_database, signal_range
 
 _AT_US_MAX = 2**32 - 1
 LOAD_PROFILE_VALUES_MAX = 256
@@ -87,6 +87,11 @@ class Rig:
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *bench_variables()]
 
+    @property
+    def truth(self) -> SignalTable:
+        """The true signals of this bench."""
+        return self._client.truth
+
     def at(self, time_s: float) -> Rig:
         """The same bench, whose variables change at a virtual time (rounded to microseconds)."""
         return Rig(self._client, round(time_s * 1e6))
@@ -103,11 +108,11 @@ class Rig:
             signal = _coarse(name) or signal
         if not 0 <= self._at_us <= _AT_US_MAX:
             raise RigError(f"{name} at {self._at_us} us: must be 0 to {_AT_US_MAX} us")
-        message = rig_database().get_message_by_name("RIG_SET")
+        message = self._client.rig_database.get_message_by_name("RIG_SET")
         number = _multiplex_number(signal)
         data = message.encode({"quantity": number, signal.name: _FREE if is_free else value, "at_us": self._at_us})
         self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
-        reply = rig_database().get_message_by_name("RIG_SET_REPLY")
+        reply = self._client.rig_database.get_message_by_name("RIG_SET_REPLY")
         answer = self._client.receive_until(
             lambda m: m.arbitration_id == reply.frame_id and m.is_extended_id and m.data[0] == number
         )
@@ -124,7 +129,7 @@ class Rig:
             if not abs(value) <= LOAD_PROFILE_VALUE_MAX:
                 raise RigError(f"load profile value {value:g}: must be {-LOAD_PROFILE_VALUE_MAX:g} to "
                                f"{LOAD_PROFILE_VALUE_MAX:g}")
-        message = rig_database().get_message_by_name("RIG_LOAD_PROFILE")
+        message = self._client.rig_database.get_message_by_name("RIG_LOAD_PROFILE")
         for index, value in enumerate(values):
             data = message.encode({"values": len(values), "index": index, "value": value})
             self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
@@ -155,10 +160,10 @@ class Rig:
         kind, at_us = signals["kind"], signals["at_us"]
         if not 0 <= at_us <= _AT_US_MAX:
             raise FaultError(f"{kind} at {at_us} us: must be 0 to {_AT_US_MAX} us")
-        message = rig_database().get_message_by_name("RIG_FAULT")
+        message = self._client.rig_database.get_message_by_name("RIG_FAULT")
         data = message.encode(signals)
         self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
-        reply = rig_database().get_message_by_name("RIG_FAULT_REPLY")
+        reply = self._client.rig_database.get_message_by_name("RIG_FAULT_REPLY")
         answer = self._client.receive_until(
             lambda m: m.arbitration_id == reply.frame_id and m.is_extended_id and m.data[0] == data[0]
         )

@@ -16,7 +16,7 @@ from typing import Any, Self
 import can
 from cantools.database.can import Database
 
-from salient.bench.client import KnownAttributes
+from salient.bench.client import Client, KnownAttributes
 from salient.bench.drive import Drive, OtherDatabase, ParameterRow
 from salient.bench.rig import Fault, Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
@@ -29,11 +29,28 @@ _ALIVE_CHECK_S = 1.0
 _POLL_STEP_NS = 500_000
 _IDENTITY_WAIT_NS = 250_000_000
 """More than two periods of DRIVE_IDENTITY."""
-_IDENTITY = drive_database().get_message_by_name("DRIVE_IDENTITY")
 
 
 class SessionError(Exception):
     """The emulator has ended."""
+
+
+class _DriveOfSeveral:
+    """A session as the client of another drive than its first one."""
+
+    def __init__(self, session: Session, machine: str | None, node: int) -> None:
+        self._session = session
+        self.drive_database, self.rig_database = drive_database(machine, node), rig_database(node)
+        self.telemetry = SignalTable(self.drive_database, "DRIVE")
+        self.truth = SignalTable(self.rig_database, "RIG")
+        self.require_drive_database = session.require_drive_database  # all have the same machine
+        self.send, self.receive_until = session.send, session.receive_until
+        self.advance_to, self.advance_until_frame = session.advance_to, session.advance_until_frame
+
+    @property
+    def time_ns(self) -> int:
+        """Virtual time."""
+        return self._session.time_ns
 
 
 class Session(KnownAttributes):
@@ -46,6 +63,9 @@ class Session(KnownAttributes):
     machine: name or file of the drive's machine, whose DBC the session then uses; without it that in SI units. To a
     drive that reports another DBC no reference is sent (OtherDatabase); its frames are decoded, after a warning.
 
+    node: the node number of the drive; drives: their number, with ascending node numbers from there. drive, rig,
+    telemetry and truth are those of the first; drives[1] and rigs[1] have their own telemetry and truth.
+
     time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. telemetry, truth:
     signals of the drive and of the test bench by name.
     """
@@ -56,20 +76,30 @@ class Session(KnownAttributes):
     telemetry: SignalTable
     truth: SignalTable
     drive_database: Database
+    rig_database: Database
+    drives: list[Drive]
+    rigs: list[Rig]
     drive: Drive
     rig: Rig
 
     def __init__(self, address: str, lockstep: bool = True,
                  parameter_table: Callable[[], list[ParameterRow]] | None = None,
-                 is_alive: Callable[[], bool] = lambda: True, machine: str | None = None) -> None:
+                 is_alive: Callable[[], bool] = lambda: True, machine: str | None = None,
+                 node: int = 0, drives: int = 1) -> None:
         self.address = address
         self.time_ns = 0
         self.log = []
-        self.drive_database = drive_database(machine)
+        self.drive_database, self.rig_database = drive_database(machine, node), rig_database(node)
         self.telemetry = SignalTable(self.drive_database, "DRIVE")
-        self.truth = SignalTable(rig_database(), "RIG")
-        self.drive = Drive(self, parameter_table)
-        self.rig = Rig(self)
+        self.truth = SignalTable(self.rig_database, "RIG")
+        clients: list[Client] = [self]
+        clients += [_DriveOfSeveral(self, machine, node + number) for number in range(1, drives)]
+        self.drives = [Drive(client, parameter_table) for client in clients]
+        self.rigs = [Rig(client) for client in clients]
+        self.drive, self.rig = self.drives[0], self.rigs[0]
+        self._tables = [table for client in clients for table in (client.telemetry, client.truth)]
+        self._identity = self.drive_database.get_message_by_name("DRIVE_IDENTITY")
+        self._database_hash = database_hash(drive_database(machine))
         self._lockstep = lockstep
         self._is_alive = is_alive
         self._sequence = 0
@@ -158,12 +188,13 @@ class Session(KnownAttributes):
     def advance_to(self, time_ns: int) -> None:
         """Lets virtual time pass until `time_ns`; commands go out as they fall due, one due just then included."""
         while True:
-            due_ns = self.drive.due_ns
+            due_ns = min((drive.due_ns for drive in self.drives if drive.due_ns is not None), default=None)
             stop_ns = time_ns if due_ns is None else min(time_ns, due_ns)
             if stop_ns > self.time_ns:
                 self._advance(stop_ns)
             if due_ns is not None and due_ns <= self.time_ns:
-                self.drive.send_due()
+                for drive in self.drives:
+                    drive.send_due()
             if self.time_ns >= time_ns:
                 return
 
@@ -235,19 +266,20 @@ class Session(KnownAttributes):
         if not self._lockstep:
             self.time_ns = max(self.time_ns, time_ns)
         self.log.append(timed)
-        self.telemetry.add(time_ns, message)
-        if not self._identity_checked and message.arbitration_id == _IDENTITY.frame_id and not message.is_extended_id:
+        for table in self._tables:
+            table.add(time_ns, message)
+        if not self._identity_checked and message.arbitration_id == self._identity.frame_id:
             self._check_identity(message)
-        self.truth.add(time_ns, message)
         return message
 
     def _check_identity(self, message: can.Message) -> None:
         """One line on stderr, once, when the drive was built from another DBC than that of the tools."""
-        if message.is_remote_frame or message.is_error_frame or len(message.data) != _IDENTITY.length:
+        if (message.is_extended_id or message.is_remote_frame or message.is_error_frame
+                or len(message.data) != self._identity.length):
             return
         self._identity_checked = True
-        identity = _IDENTITY.decode_simple(bytes(message.data))
-        expected = database_hash(self.drive_database)
+        identity = self._identity.decode_simple(bytes(message.data))
+        expected = self._database_hash
         if identity["dbc_hash"] != expected:
             version = ".".join(str(identity[f"firmware_{part}"]) for part in ("major", "minor", "patch"))
             self._other_database = (f"{self.address}: firmware {version} was built from another drive.dbc "

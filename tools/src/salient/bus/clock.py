@@ -11,13 +11,15 @@ same order. On an interface without stamps (`sim --drive-only`) the time is that
 from __future__ import annotations
 
 from collections import deque
+from functools import lru_cache
 from typing import cast
 
 import can
-from cantools.database.can import Database
 
 from salient.bus.interface import VirtualMessage, is_on_bus
 from salient.bus.signals import drive_database, rig_database, value_numbers
+from salient.config import NODE_MAX
+from salient.dbc import NODE_STEP
 from salient.errors import UsageError
 
 RIG_CLOCK_ID = rig_database().get_message_by_name("RIG_CLOCK").frame_id
@@ -25,8 +27,17 @@ RIG_STAMP_ID = rig_database().get_message_by_name("RIG_STAMP").frame_id
 _SUBJECTS = value_numbers(rig_database(), "RIG_STAMP", "subject")
 
 
-def _sent_by(database: Database, node: str) -> frozenset[int]:
-    return frozenset(message.frame_id for message in database.messages if node in message.senders)
+@lru_cache
+def _sent_by_drives() -> frozenset[int]:
+    """The identifiers that drives of any node number transmit."""
+    return frozenset(message.frame_id + NODE_STEP * node for message in drive_database().messages
+                     if "DRIVE" in message.senders for node in range(NODE_MAX + 1))
+
+
+@lru_cache
+def _sent_by_rigs() -> frozenset[int]:
+    return frozenset(message.frame_id for node in range(NODE_MAX + 1) for message in rig_database(node).messages
+                     if "RIG" in message.senders)
 
 
 def open_bus(address: str, receive_own_messages: bool = True) -> can.BusABC:
@@ -51,8 +62,7 @@ class VirtualTimeReader:
         self._bus = bus
         # On SocketCAN a client that sends one of these between a stamp and its frame would take the frame's time; a bus
         # with two senders of one identifier is broken anyway.
-        self._drive_sends = _sent_by(drive_database(), "DRIVE")
-        self._rig_sends = _sent_by(rig_database(), "RIG")
+        self._drive_sends, self._rig_sends = _sent_by_drives(), _sent_by_rigs()
         self._on_interface = not hasattr(bus, "receive_own_messages")  # SocketCAN
         self._unstamped = 0  # frames of the emulator before the first stamp
         self._stamped = False

@@ -27,8 +27,8 @@ CANFD_BRS = 0x01
 CANFD_ESI = 0x02
 CANFD_FDF = 0x04
 
-RIG_IDENTIFIERS = range(0x1F000000, 0x1F000100)
-"""29-bit identifiers of the test bench (rig.dbc); these frames bypass the emulated bus."""
+RIG_IDENTIFIERS = range(0x1F000000, 0x1F000800)
+"""29-bit identifiers of the test benches (rig.dbc) of eight nodes; these frames bypass the emulated bus."""
 
 _TIME = struct.Struct("<Q")
 # can_frame: identifier, length, 2 bytes unused, raw length code 9..15 of an 8-byte frame, data

@@ -27,7 +27,7 @@ _ERROR_FLAG = 0x20000000
 _ASC_END = b"end triggerblock"
 
 
-def convert(source: Path, target: Path, machine: str) -> int:
+def convert(source: Path, target: Path, machine: str, node: int = 0) -> int:
     """Writes the frames of a log to another, whose suffix is the format; returns their number. UsageError: a file
     cannot be read or written, or is truncated; then there is no target."""
     if source.resolve() == target.resolve():
@@ -38,7 +38,7 @@ def convert(source: Path, target: Path, machine: str) -> int:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {target}: {error.strerror}") from None
-    log = open_log(target, machine)
+    log = open_log(target, machine, node)
     count = 0
     try:
         while first is not None:

@@ -29,7 +29,7 @@ class Mf4Log:
     frames.
     """
 
-    def __init__(self, path: Path, machine: str | None) -> None:
+    def __init__(self, path: Path, machine: str | None, node: int) -> None:
         try:
             import asammdf
         except ImportError:
@@ -38,7 +38,7 @@ class Mf4Log:
         self._mdf.start_time = datetime.fromtimestamp(0, UTC)  # virtual time has no date
         self._signal = asammdf.Signal
         try:
-            self._databases = (drive_database(machine), rig_database())
+            self._databases = (drive_database(machine, node), rig_database(node))
         except MachineError as error:
             raise UsageError(str(error)) from None
         self._tables = tuple(SignalTable(database) for database in self._databases)

@@ -38,8 +38,9 @@ class _BusClosed(Exception):
     """The emulator closed the bus while this command was listening."""
 
 
-def record(address: str, path: Path, duration_s: float | None, machine: str) -> int:
-    """Writes every frame on a bus to a log file, on virtual time. machine: decodes the signals of an MF4 file.
+def record(address: str, path: Path, duration_s: float | None, machine: str, node: int = 0) -> int:
+    """Writes every frame on a bus to a log file, on virtual time. machine, node: of the drive whose signals an MF4 file
+    has.
 
     Ends when `duration_s` of virtual time have passed, on an interrupt, or when the bus closes; the file is complete in
     every case. Returns the exit code: 1 when the bus closed early (see _report_closed), else 0.
@@ -49,7 +50,7 @@ def record(address: str, path: Path, duration_s: float | None, machine: str) -> 
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {path}: {error.strerror}") from None
-    log = open_log(path, machine)
+    log = open_log(path, machine, node)
     count, closed = 0, False
     try:
         for timed in _frames(address, duration_s, "recording"):
@@ -66,17 +67,17 @@ def record(address: str, path: Path, duration_s: float | None, machine: str) -> 
 
 
 def monitor(address: str, every_s: float, duration_s: float | None, machine: str,
-            signals: Sequence[str] | None = None) -> int:
-    """Prints the named signals, else the main ones of the drive of a machine, every `every_s` of virtual time; ends as
-    `record` does, with its exit code. UsageError: no such machine, or no signal of a name."""
+            signals: Sequence[str] | None = None, node: int = 0) -> int:
+    """Prints the named signals, else the main ones of the drive of a machine and node number, every `every_s` of
+    virtual time; ends as `record` does, with its exit code. UsageError: no such machine, or no signal of a name."""
     try:
-        database = drive_database(machine)
+        database = drive_database(machine, node)
     except MachineError as error:
         raise UsageError(str(error)) from None
     shown: _MainSignals | SelectedSignals = _MainSignals(database)
     if signals:
         width = shutil.get_terminal_size((_WIDTH, 1)).columns
-        shown = SelectedSignals((database, rig_database()), signals, width)
+        shown = SelectedSignals((database, rig_database(node)), signals, width)
     due_ns = None
     try:
         for time_ns, message in _frames(address, duration_s, "monitoring"):

@@ -14,6 +14,7 @@ import cantools
 import numpy as np
 from cantools.database.can import Database, Message
 
+from salient.dbc import drive_dbc_of_node, rig_dbc_of_node
 from salient.machine.file import load_machine, machine_path
 from salient.machine.scaling import database_of, scaling_of
 from salient.paths import DRIVE_DBC, RIG_DBC
@@ -28,18 +29,21 @@ def load_database(path: Path) -> Database:
 
 
 @lru_cache
-def drive_database(machine: str | None = None) -> Database:
-    """The DBC of the drive of a machine, given by name or file, with its factors and ranges; without a machine that in
-    SI units. MachineError."""
+def drive_database(machine: str | None = None, node: int = 0) -> Database:
+    """The DBC of the drive of a machine, given by name or file, with its factors and ranges, without a machine that in
+    SI units; and with the identifiers of a node number. MachineError."""
     if machine is None:
-        return load_database(DRIVE_DBC)
-    path = machine_path(machine)
-    return database_of(scaling_of(path, load_machine(path)).dbc())
+        text = DRIVE_DBC.read_text(encoding="ascii")
+    else:
+        path = machine_path(machine)
+        text = scaling_of(path, load_machine(path)).dbc()
+    return database_of(drive_dbc_of_node(text, node))
 
 
-def rig_database() -> Database:
-    """The test bench's DBC."""
-    return load_database(RIG_DBC)
+@lru_cache
+def rig_database(node: int = 0) -> Database:
+    """The DBC of the test bench of a drive with a node number."""
+    return database_of(rig_dbc_of_node(RIG_DBC.read_text(encoding="ascii"), node))
 
 
 def value_numbers(database: Database, message: str, signal: str) -> dict[str, int]:

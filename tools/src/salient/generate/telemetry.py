@@ -2,7 +2,7 @@
 
 The schedule is that of the database: GenMsgCycleTime and GenMsgStartDelayTime in ms; GenMsgSendType cyclicIfActive
 marks messages that are sent only while their cause lasts; the enumeration TelemetryGroup names the messages that are
-queued together.
+queued together; TelemetryRate those whose period can be set, GenMsgCycleTime being its default.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ def telemetry(database: Database, prefix: str, dbc_name: str, node: str) -> tupl
         if signal.is_float or signal.length > 32 or signal.byte_order != "little_endian":
             raise CodecError(f"signal {signal.name}: cyclic messages have little-endian integers of at most 32 bits")
     assert database.dbc is not None  # as every DBC has
-    groups = list(database.dbc.attribute_definitions["TelemetryGroup"].choices)
+    groups, rates = (list(database.dbc.attribute_definitions[name].choices)
+                     for name in ("TelemetryGroup", "TelemetryRate"))
     messages.sort(key=lambda m: (groups.index(_group(m, groups)), m.frame_id))
     cycle_ms = math.gcd(*map(_period_ms, messages), *map(_delay_ms, messages))
-    return _header(messages, groups, prefix, dbc_name, cycle_ms), _source(messages, prefix, dbc_name, cycle_ms)
+    return _header(messages, groups, rates, prefix, dbc_name, cycle_ms), _source(messages, prefix, dbc_name, cycle_ms)
 
 
 def short_name(message: Message, prefix: str) -> str:
@@ -45,6 +46,10 @@ def _group(message: Message, groups: list[str]) -> str:
 
 def _group_number(message: Message) -> int:
     return int(attributes(message).get("TelemetryGroup", 0))
+
+
+def _rate_number(message: Message) -> int:
+    return int(attributes(message).get("TelemetryRate", 0))
 
 
 def _period_ms(message: Message) -> int:
@@ -65,7 +70,8 @@ def _member_type(signal: Signal) -> str:
     return f"{'' if signal.is_signed else 'u'}int32_t"
 
 
-def _header(messages: list[Message], groups: list[str], prefix: str, dbc_name: str, cycle_ms: int) -> str:
+def _header(messages: list[Message], groups: list[str], rates: list[str], prefix: str, dbc_name: str,
+            cycle_ms: int) -> str:
     guard, upper = f"{prefix.upper()}_TELEMETRY_H", prefix.upper()
     members = []
     for message in messages:
@@ -80,6 +86,7 @@ def _header(messages: list[Message], groups: list[str], prefix: str, dbc_name: s
         members.append(f"    }} {name}; /* {message.name} */")
     indices = [f"    {upper}_TELEMETRY_{short_name(m, prefix).upper()}," for m in messages]
     group_names = [f"    {upper}_TELEMETRY_GROUP_{group.upper()}," for group in groups]
+    rate_names = [f"    {upper}_TELEMETRY_RATE_{rate.upper()}," for rate in rates]
     return f"""/* Cyclic messages of {dbc_name}; generated. */
 #ifndef {guard}
 #define {guard}
@@ -101,6 +108,12 @@ typedef enum {{
 {chr(10).join(group_names)}
 }} {prefix}_telemetry_group_t;
 
+/* Messages whose common period can be set, all but the first. */
+typedef enum {{
+{chr(10).join(rate_names)}
+    {upper}_TELEMETRY_RATES
+}} {prefix}_telemetry_rate_t;
+
 /* Messages in the order of transmission: by group, within a group by identifier. */
 enum {{
 {chr(10).join(indices)}
@@ -111,8 +124,9 @@ typedef struct {{
     uint32_t identifier;
     uint8_t length;
     uint8_t group;   /* {prefix}_telemetry_group_t */
+    uint8_t rate;    /* {prefix}_telemetry_rate_t */
     bool if_active;  /* sent only while its cause lasts (cyclicIfActive) */
-    uint16_t period; /* {upper}_TELEMETRY_CYCLE_MS */
+    uint16_t period; /* {upper}_TELEMETRY_CYCLE_MS; of a rate that can be set the default */
     uint16_t delay;  /* of the first frame after start, {upper}_TELEMETRY_CYCLE_MS */
 }} {prefix}_telemetry_message_t;
 
@@ -152,7 +166,7 @@ def _source(messages: list[Message], prefix: str, dbc_name: str, cycle_ms: int) 
         group = _group_number(message)
         active = str(message.send_type == "cyclicIfActive").lower()
         rows.append(
-            f"    {{{message.frame_id:#x}u, {message.length}u, {group}u, {active}, "
+            f"    {{{message.frame_id:#x}u, {message.length}u, {group}u, {_rate_number(message)}u, {active}, "
             f"{period}u, {delay}u}},"
         )
     new_line = "\n"

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from salient.dbc import drive_dbc_of_node
 from salient.errors import UsageError
 from salient.machine.drive_report import drive_json, drive_lines, pulse_lines
 from salient.machine.file import Converter, Machine, MachineError, Sensors, load_machine, machine_path
@@ -25,10 +26,12 @@ SHOWN = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0)
 SHOWN_PITCHES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 
 
-def run(name_or_path: str, out: Path, json_path: Path | None = None, dbc_path: Path | None = None) -> int:
+def run(name_or_path: str, out: Path, json_path: Path | None = None, dbc_path: Path | None = None,
+        node: int = 0) -> int:
     """Checks the file, prints its data sheet and the drive's data, plots its magnetics; returns 0. UsageError.
 
-    json_path: the drive's data are also written there; dbc_path: the CAN database of its drive.
+    json_path: the drive's data are also written there; dbc_path: the CAN database of its drive
+    with a node number.
     """
     try:
         path = machine_path(name_or_path)
@@ -48,7 +51,7 @@ def run(name_or_path: str, out: Path, json_path: Path | None = None, dbc_path: P
     if json_path is not None:
         _write("--json", json_path, drive_json(machine))
     if dbc_path is not None:
-        _write("--dbc", dbc_path, scaling.dbc())
+        _write("--dbc", dbc_path, drive_dbc_of_node(scaling.dbc(), node))
     return 0
 
 
