@@ -71,9 +71,6 @@ void drive_control_interrupt(drive_t *drive) {
         .missed_interrupts = hal_interrupt_missed_triggers(drive->hal),
         .time_us = hal_time_us(drive->hal),
     };
-    if (sample.missed_interrupts != 0) {
-        drive->late_interrupts++; /* the previous one */
-    }
     drive->break_causes = sample.break_causes = hal_pwm_break(drive->hal);
     hal_encoder_read(drive->hal, &sample.encoder);
     hal_adc_read(drive->hal, &sample.adc);

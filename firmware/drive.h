@@ -35,7 +35,6 @@ typedef struct {
     /* Execution time of the interrupts, for telemetry only; overruns are handled by drive/protection.h. */
     uint32_t used_ticks;           /* last control interrupt, from trigger to end, ticks of the timer */
     uint32_t worst_ticks;          /* maximum since start */
-    uint32_t late_interrupts;      /* control interrupts that ended after the next trigger, since start */
     uint32_t deferred_used_ticks;  /* last deferred interrupt, from the trigger of its period to its end; this and the
                                       next  are written by the deferred interrupt */
     uint32_t deferred_worst_ticks; /* maximum since start */

@@ -110,7 +110,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->processor.used_us = processor_time(drive, drive->used_ticks);
     telemetry->processor.worst_us = processor_time(drive, drive->worst_ticks);
     telemetry->processor.available_us = processor_time(drive, 2u * parameters->period_ticks);
-    telemetry->processor.late_interrupts = drive->late_interrupts;
+    telemetry->processor.late_interrupts = drive->control.protection.late_interrupts;
 
     telemetry->deferred.used_us = processor_time(drive, drive->deferred_used_ticks);
     telemetry->deferred.worst_us = processor_time(drive, drive->deferred_worst_ticks);

@@ -131,9 +131,7 @@ static uint32_t threshold_of_mean(const observer_bandwidth_statistics_t *statist
 
 static unsigned adaptive_stage(const observer_bandwidth_parameters_t *parameters, observer_bandwidth_t *bandwidth,
                                const observer_bandwidth_limits_t *limits, int32_t innovation, bool from_edge) {
-    if (bandwidth->ticks < UINT32_MAX) {
-        bandwidth->ticks++;
-    }
+    bandwidth->ticks = (uint32_t)fixed_add((int32_t)bandwidth->ticks, 1);
     /* One stage a sample: the ends of stages are further apart, but for those that already have the steady bandwidth.
      */
     const unsigned next = bandwidth->stage + (bandwidth->ticks >= parameters->end_ticks[bandwidth->stage]);

@@ -63,7 +63,7 @@ typedef enum {
 /* Schedule, advanced by every sample. */
 typedef struct {
     unsigned stage;
-    uint32_t ticks;             /* periods since the last trigger, saturates */
+    uint32_t ticks;             /* periods since the last trigger, saturates to 2^31 - 1 */
     observer_trigger_t trigger; /* since the caller last set it to OBSERVER_TRIGGER_NONE */
 } observer_bandwidth_t;
 

@@ -96,10 +96,10 @@ ALWAYS_INLINE void phase_cell_locate(const machine_tables_t *tables, uint32_t di
 
 /* u of a current in A, Q7.9, 0..2^18: Q2.13, saturated to -4..4. */
 ALWAYS_INLINE int32_t phase_cell_u_q13(const phase_cell_t *cell, int32_t current_q9) {
-    return fixed_saturate_bits((current_q9 - cell->column * (1 << MACHINE_COLUMN_BITS)) *
-                                       (1 << (13 - MACHINE_COLUMN_BITS)) -
-                                   PHASE_CELL_HALF_Q13,
-                               PHASE_CELL_BITS);
+    const unsigned shift = 13 - MACHINE_COLUMN_BITS;
+    const int32_t middle_q9 = PHASE_CELL_HALF_Q13 >> shift;
+    return fixed_shift_up_saturate_bits(current_q9 - cell->column * (1 << MACHINE_COLUMN_BITS) - middle_q9, shift,
+                                        PHASE_CELL_BITS);
 }
 
 /* middle + x (rise + x curvature), x in Q2.13, rounded to 8 units. */

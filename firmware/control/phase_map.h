@@ -55,17 +55,17 @@ ALWAYS_INLINE bool phase_map_mirrored(uint32_t phase_angle) {
 }
 
 /* -1 when a row begins after the distance, else 0: both are below 2^31. */
-ALWAYS_INLINE int32_t phase_map_before_row(const machine_tables_t *tables, int32_t row, uint32_t distance) {
-    return (int32_t)(distance - tables->row[row].start) >> 31;
+ALWAYS_INLINE int32_t phase_map_before(const machine_row_t *row, uint32_t distance) {
+    return (int32_t)(distance - row->start) >> 31;
 }
 
 /* Looks up a distance from the unaligned position, 0..2^31 - 1. `tables` must outlive the lookup. */
 ALWAYS_INLINE phase_map_lookup_t phase_map_lookup(const machine_tables_t *tables, uint32_t distance) {
-    /* At most two rows begin within an angle bin; the start of the last row is above every distance. Counted from two
-     * rows further on, which takes fewer instructions. */
-    int32_t row = tables->angle_bin_row[distance >> MACHINE_ANGLE_BIN_BITS];
-    row += phase_map_before_row(tables, row + 1, distance);
-    row += phase_map_before_row(tables, row + 2, distance);
+    /* At most two rows begin within an angle bin, those after its first; the start of the last row is above every
+     * distance. Counted from two rows further on, which takes fewer instructions. */
+    const int32_t first = tables->angle_bin_row[distance >> MACHINE_ANGLE_BIN_BITS];
+    const machine_row_t *in_bin = PHASE_MAP_MOVED(machine_row_t, tables, row, first * (int32_t)sizeof(machine_row_t));
+    const int32_t row = first + phase_map_before(&in_bin[1], distance) + phase_map_before(&in_bin[2], distance);
     const machine_row_t *before = PHASE_MAP_MOVED(machine_row_t, tables, row, row * (int32_t)sizeof(machine_row_t));
     const machine_row_t *at = before + 2;
     /* The reciprocal is rounded down and the distance within the row is below its width: at most one after rounding. */

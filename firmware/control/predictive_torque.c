@@ -165,6 +165,11 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     return adds ? fixed_subtract(shortfall, gained) : fixed_add(shortfall, gained);
 }
 
+/* True if the magnitude of a value exceeds a tolerance: in one comparison. */
+static bool beyond(int32_t value, int32_t tolerance) {
+    return (uint32_t)value + (uint32_t)tolerance > 2 * (uint32_t)tolerance;
+}
+
 static int32_t non_negative(int32_t flux_q29) {
     return flux_q29 > 0 ? flux_q29 : 0;
 }
@@ -313,11 +318,11 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     control->torque_shortfall_q24 = 0;
     /* The share of a phase that is not yet in its half is missing. */
     const int32_t tolerance = SHORTFALL_TOLERANCE_Q24 >> torque_shift;
-    if (!reached || shortfall > tolerance || shortfall < -tolerance) {
+    if (!reached || beyond(shortfall, tolerance)) {
         shortfall =
             correct_torque(tables, plan, torque_q24 >= 0, sample->reverse, parameters->current_limit_q9, shortfall);
         const int32_t shortfall_q24 = phase_map_scale(&tables->torque_format, shortfall);
-        control->torque_shortfall_q24 = fixed_abs(shortfall_q24) > SHORTFALL_TOLERANCE_Q24 ? shortfall_q24 : 0;
+        control->torque_shortfall_q24 = beyond(shortfall_q24, SHORTFALL_TOLERANCE_Q24) ? shortfall_q24 : 0;
     }
     const duty_divisor_t by = duty_divisor(flux_step_max_q29);
     UNROLL(4)

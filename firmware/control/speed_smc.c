@@ -1,5 +1,7 @@
 #include "control/speed_smc.h"
 
+#include <stdbool.h>
+
 #include "fixed/exp2.h"
 #include "fixed/fixed.h"
 #include "fixed/formats.h"
@@ -19,17 +21,21 @@ int32_t speed_smc_reaching_torque_q24(const speed_smc_parameters_t *parameters, 
         (uint64_t)magnitude_q22 * (uint32_t)parameters->epsilon_q31 + (uint64_t)bracket_q22 * decay_q31;
 
     /* The leading one of D is in the high word: the minimum of D, for eps = 2^-15 and delta = 10, is 2^-15.5. It is not
-     * bit 63, so the shift is at least 1. */
-    const int shift = __builtin_clz((uint32_t)(denominator_q53 >> 32));
-    const uint32_t normalised = (uint32_t)(denominator_q53 >> (32 - shift));
+     * bit 63, so the shift is at least 1. Shifted by words, which takes half the instructions. */
+    const uint32_t denominator_high = (uint32_t)(denominator_q53 >> 32);
+    const int shift = __builtin_clz(denominator_high);
+    const uint32_t normalised = denominator_high << shift | (uint32_t)denominator_q53 >> (32 - shift);
     const uint32_t mantissa16 = ((normalised >> 15) + 1) >> 1; /* rounded, 2^15..2^16 */
     const uint32_t reciprocal = UINT32_MAX / mantissa16;       /* at most 2^17 */
     const uint32_t scaled_gain = (uint32_t)(((uint64_t)(uint32_t)parameters->gain_q24 * reciprocal) >> 17);
 
     const uint64_t product = (uint64_t)scaled_gain * magnitude_q22; /* below 2^62 */
-    const uint64_t torque_q24 = product >> (32 - shift);
-    const int32_t saturated_q24 = torque_q24 > INT32_MAX ? INT32_MAX : (int32_t)torque_q24;
-    return x_q22 < 0 ? -saturated_q24 : saturated_q24;
+    const uint32_t product_high = (uint32_t)(product >> 32);
+    const uint32_t torque_q24 = product_high << shift | (uint32_t)product >> (32 - shift);
+    const bool fits = product_high >> (31 - shift) == 0; /* the bits above, and the sign bit */
+    const int32_t saturated_q24 = fits ? (int32_t)torque_q24 : INT32_MAX;
+    const int32_t sign = x_q22 >> 31; /* -1 or 0: -t is ~t + 1 */
+    return (saturated_q24 ^ sign) - sign;
 }
 
 int32_t speed_smc_torque_q24(const speed_smc_parameters_t *parameters, int32_t reaching_q24, int32_t speed_q22,

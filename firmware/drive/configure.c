@@ -218,7 +218,7 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
     return (predictive_torque_parameters_t){
         .flux =
             {
-                .gain_q15 = values[PARAMETER_FLUX_OBSERVER_GAIN],
+                .gain_q30 = values[PARAMETER_FLUX_OBSERVER_GAIN] << 15,
                 .resistance_period_q40 =
                     fixed_saturate(fixed_divide((int64_t)values[PARAMETER_RESISTANCE_OHM] << 16, rate)),
             },

@@ -48,8 +48,8 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     if (!state->started) {
         start(state, measured);
     }
-    observe(parameters, state, deferred, measured);
     const uint64_t fault_mask = protect(parameters, state, sample, measured) | deferred->fault_mask;
+    observe(parameters, state, deferred, measured);
     const bool run = supervise(parameters, state, sample, command, measured, fault_mask);
     if (run) {
         state->torque_reference_q24 = speed_control_torque_q24(parameters, &state->observer, sample, deferred);

@@ -2,8 +2,8 @@
  * interrupt handler of a target call the same function. control_step in control.c lists its steps:
  *
  *   measure         counts -> currents, DC-link voltage, rotor angle, phase torques, flux linkages    measure.h
- *   observe         rotor angle, speed and load torque                                                observe.h
  *   protect         fault mask of the failed checks                                                   protection.h
+ *   observe         rotor angle, speed and load torque                                                observe.h
  *   supervise       drive state, fault record; every switch is open outside RUN                       supervise.h
  *   speed control   speed reference -> torque reference                                               speed_control.h
  *   torque control  torque reference -> duties                                                        torque_control.h

@@ -280,7 +280,8 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     const deferred_input_t *input = &state->deferred_request.input;
     deferred_t *deferred = &state->deferred;
     deferred_results_t *results = deferred_buffer(&deferred->response);
-    const bool reset = deferred->generation != input->generation || !deferred->started;
+    IN_REGISTER(results);
+    const bool reset = deferred->generation != input->generation; /* as in the first step: control_prepare */
     if (reset) {
         follow_resets(parameters, deferred, input);
     }
@@ -298,7 +299,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     results->observer = deferred->inertia.laws.observer;
     results->predictive.conduction = deferred->conduction.latest;
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         results->predictive.misalignment[phase] = deferred->misalignment.phase[phase].offset;
     }
 }

@@ -24,8 +24,9 @@ typedef struct {
 
 /* State of the immediate checks. */
 typedef struct {
-    uint32_t encoder_angle; /* of the previous period, 2^-32 rev */
-    uint32_t overruns;      /* triggers lost in consecutive control periods; saturates to 2^31 - 1 */
+    uint32_t encoder_angle;   /* of the previous period, 2^-32 rev */
+    uint32_t overruns;        /* triggers lost in consecutive control periods; saturates to 2^31 - 1 */
+    uint32_t late_interrupts; /* control interrupts that ended after the next trigger, since start */
 } protection_t;
 
 /* State of the deferred checks. */

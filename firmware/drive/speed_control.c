@@ -68,8 +68,7 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
 
 /* The transducer is offset binary, +-64 N m full scale: 2^31 of Q7.24 over all counts. */
 static int32_t transducer_torque_q24(const control_parameters_t *parameters, uint16_t counts) {
-    const unsigned bits = parameters->adc_bits;
-    return (counts - (1 << (bits - 1))) * (1 << (31 - bits));
+    return (counts << (31 - parameters->adc_bits)) - (1 << 30);
 }
 
 static int32_t sliding_mode_torque_q24(const control_parameters_t *parameters, const load_observer_t *observer,

@@ -34,7 +34,7 @@ typedef struct {
 typedef struct {
     uint64_t fault_mask; /* failed checks of this tick, FAULT_BIT */
     command_request_t request;
-    bool at_standstill; /* the speed, in either direction, allows a stop to end */
+    bool at_standstill; /* the speed, in either direction, allows a stop to end; matters in a stop only */
 } state_machine_input_t;
 
 /* Fault with the lowest number in a mask; FAULT_NONE of an empty one. */

@@ -7,9 +7,9 @@
 /* A stop ends below this speed: 0.5 rad/s, 5 r/min. */
 #define STANDSTILL_Q22 (1 << 21)
 
-static void complete_record(fault_record_t *record, const control_state_t *state, const control_sample_t *sample,
+static void complete_record(fault_record_t *record, const control_state_t *state, uint32_t time_us,
                             const control_measurement_t *measured) {
-    record->time_us = sample->time_us;
+    record->time_us = time_us;
     /* The estimate without this sample: the encoder may be the cause of the fault. */
     record->speed_q22 = measured->predicted_speed_q22;
     record->torque_reference_q24 = state->torque_reference_q24; /* of the previous period */
@@ -27,14 +27,14 @@ NOINLINE static void leave_state(const control_parameters_t *parameters, control
     }
 }
 
-/* Out of the way of a run, which is the longer path. */
-NOINLINE static void stand(const control_parameters_t *parameters, control_state_t *state,
-                           const control_sample_t *sample, const control_measurement_t *measured, uint64_t fault_mask,
-                           command_request_t request) {
+/* Out of the way of a run, which is the longer path. The time by value: a sample whose address is passed on would have
+ * to be in memory as a whole. */
+NOINLINE static void stand(const control_parameters_t *parameters, control_state_t *state, uint32_t time_us,
+                           const control_measurement_t *measured, uint64_t fault_mask, command_request_t request) {
     state_machine_t *state_machine = &state->state_machine;
     const drive_state_t before = state_machine->state;
     if (state_machine_stands(state_machine, fault_mask, request, parameters->initialise_ticks)) {
-        complete_record(&state_machine->record, state, sample, measured);
+        complete_record(&state_machine->record, state, time_us, measured);
     }
     if (state_machine->state != before) {
         leave_state(parameters, state, measured, before);
@@ -47,11 +47,11 @@ bool supervise(const control_parameters_t *parameters, control_state_t *state, c
     const state_machine_input_t input = {
         .fault_mask = fault_mask,
         .request = command->request,
-        .at_standstill = fixed_abs(state->observer.speed_q22) < STANDSTILL_Q22,
+        .at_standstill = command->request == COMMAND_STOP && fixed_abs(state->observer.speed_q22) < STANDSTILL_Q22,
     };
     if (state_machine_runs(state_machine, &input)) { /* entered from READY, which leaves nothing to reset */
         return true;
     }
-    stand(parameters, state, sample, measured, fault_mask, command->request);
+    stand(parameters, state, sample->time_us, measured, fault_mask, command->request);
     return false;
 }

@@ -50,6 +50,14 @@ static inline int32_t arm_smmlar(int32_t sum, int32_t a, int32_t b) {
         saturated;                                                                                                     \
     })
 
+/* value * 2^shift saturated to `bits` bits with sign; both are constants. */
+#define ARM_SSAT_SHIFTED(value, shift, bits)                                                                           \
+    __extension__({                                                                                                    \
+        int32_t saturated;                                                                                             \
+        __asm__("ssat %0, %1, %2, lsl %3" : "=r"(saturated) : "I"(bits), "r"(value), "I"(shift));                      \
+        saturated;                                                                                                     \
+    })
+
 #endif
 
 /* The functions for three numbers name up to nine registers, which the compiler can spare only when it optimises. */

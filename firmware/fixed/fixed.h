@@ -139,6 +139,15 @@ ALWAYS_INLINE int32_t fixed_saturate_bits(int32_t value, unsigned bits) {
 #endif
 }
 
+/* value * 2^shift, which fits in 32 bits, saturated as fixed_saturate_bits(); shift 1..31, a constant. */
+ALWAYS_INLINE int32_t fixed_shift_up_saturate_bits(int32_t value, unsigned shift, unsigned bits) {
+#if defined __ARM_FEATURE_SAT && defined __OPTIMIZE__
+    return ARM_SSAT_SHIFTED(value, shift, bits);
+#else
+    return fixed_saturate_bits(value * (1 << shift), bits);
+#endif
+}
+
 /* value / 2^shift, rounded down; shift 1..31, a constant. Saturates to within 2^(32-shift) of INT32_MIN or INT32_MAX:
  * only the high word saturates, in one instruction, the low bits of the result pass unchanged. */
 ALWAYS_INLINE int32_t fixed_words_shift_saturate(int32_t high, uint32_t low, unsigned shift) {

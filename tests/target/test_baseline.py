@@ -35,6 +35,10 @@ LIMITED_BUILDS = ("cortex-m4", "cortex-m4-Os")
 FLASH_TOLERANCE_BYTES = 64
 RAM_TOLERANCE_BYTES = 32
 COUNT_TOLERANCE = 0.01
+BOUND_LIMITS = {"paper": 1200, "salient": 2000, "salient_network": 2600, "salient_four_phases": 2600}
+"""Of the control interrupt on the Cortex-M4."""
+BOTH_BOUND_LIMITS = {"salient": 2800, "salient_four_phases": 3200}
+"""Of both interrupts together."""
 
 measure_once = lru_cache(measure)
 
@@ -85,6 +89,14 @@ def test_computed_bounds_match_the_baseline_and_exceed_every_run(build):
             assert instructions == pytest.approx(committed[BOUND_KEYS[build]], rel=COUNT_TOLERANCE), variant
             if section == "interrupt" and build == "cortex-m4":
                 assert committed["worst_case"] <= instructions, variant
+
+
+def test_computed_bounds_on_the_cortex_m4_are_within_their_limits():
+    found = bounds("cortex-m4")
+    for variant, limit in BOUND_LIMITS.items():
+        assert 0.5 * limit < found["interrupt"][variant] <= limit, variant
+    for variant, limit in BOTH_BOUND_LIMITS.items():
+        assert 0.5 * limit < found["interrupt"][variant] + found["deferred"][variant] <= limit, variant
 
 
 @pytest.mark.parametrize("variant", worst_case.VARIANTS)

@@ -519,12 +519,12 @@ TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {
     periods(1);
     late(2);
     EXPECT_FALSE(hal.open);
-    EXPECT_EQ(drive.late_interrupts, 4u);
+    EXPECT_EQ(drive.control.protection.late_interrupts, 4u);
     late(1);
     EXPECT_TRUE(hal.open);
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
     EXPECT_EQ(drive.control.state_machine.record.fault_mask, FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
-    EXPECT_EQ(drive.late_interrupts, 5u);
+    EXPECT_EQ(drive.control.protection.late_interrupts, 5u);
 }
 
 TEST_F(Drive, an_interrupt_that_loses_three_triggers_is_one_late_interrupt_and_a_fault) {
@@ -536,7 +536,7 @@ TEST_F(Drive, an_interrupt_that_loses_three_triggers_is_one_late_interrupt_and_a
     periods(1);
     EXPECT_TRUE(hal.open);
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
-    EXPECT_EQ(drive.late_interrupts, 1u);
+    EXPECT_EQ(drive.control.protection.late_interrupts, 1u);
 }
 
 TEST_F(Drive, processor_time_is_recorded_and_reported_without_any_reaction) {
@@ -550,7 +550,7 @@ TEST_F(Drive, processor_time_is_recorded_and_reported_without_any_reaction) {
     periods(4000 + 40);
     EXPECT_EQ(drive.used_ticks, 1234u);
     EXPECT_EQ(drive.worst_ticks, 70000u);
-    EXPECT_EQ(drive.late_interrupts, 0u);
+    EXPECT_EQ(drive.control.protection.late_interrupts, 0u);
     const auto processor = only_frame(DRIVE_PROCESSOR_FRAME_ID, drive_processor_unpack);
     EXPECT_EQ(processor.used_us, 1234);
     EXPECT_EQ(processor.worst_us, 65535) << "held at its end";

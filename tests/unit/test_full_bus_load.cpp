@@ -129,7 +129,7 @@ TEST(FullBusLoad, commands_pass_a_full_bus_of_a_higher_identifier_and_control_is
     EXPECT_NEAR(static_cast<double>(babbled), static_cast<double>(seen), 2) << "counted by both sides";
     EXPECT_NEAR(static_cast<double>(sender.frames[2]), static_cast<double>(end_ns / (10 * MS)), 2);
     EXPECT_EQ(rig->board.receive_overflows, 0u);
-    EXPECT_EQ(drive->late_interrupts, 0u);
+    EXPECT_EQ(drive->control.protection.late_interrupts, 0u);
     EXPECT_EQ(drive->control.deferred_request.skipped_total, 0u);
     EXPECT_EQ(rig->bus.drives[0].node.transmit_errors + rig->bus.drives[0].node.receive_errors, 0u);
     EXPECT_EQ(can_bus_client_backlog(&rig->bus, 1), 0u);

@@ -204,7 +204,7 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     drive.worst_ticks = 4999;
     p.period_ticks = 2500;
     drive.processor_time_q24 = 1 << 24; // 200 MHz
-    drive.late_interrupts = 70000;
+    drive.control.protection.late_interrupts = 70000;
     drive.deferred_used_ticks = 4000;
     drive.deferred_worst_ticks = 9001;
     control.deferred_request.skipped_total = 70001;

@@ -18,7 +18,7 @@ using namespace fixed_point;
 constexpr double PERIOD_S = 25e-6, RESISTANCE_OHM = 0.05;
 
 flux_observer_parameters_t parameters_of(double gain, double resistance_ohm = RESISTANCE_OHM) {
-    return {to_fixed(gain, Q15), to_fixed(resistance_ohm * PERIOD_S, Q40)};
+    return {to_fixed(gain, Q15) << 15, to_fixed(resistance_ohm * PERIOD_S, Q40)};
 }
 
 // The correction is rounded to 4 LSB, 7.5 nWb, once a period: as a random walk with a gain that decays as slowly as
@@ -37,7 +37,7 @@ TEST(FluxObserver, follows_its_reference_model_within_40_nWb_and_within_20_at_a_
             const int32_t current_q9 = int32_t(random() % (60 * 512));
             const double drop = current_q9 / Q9 * p.resistance_period_q40 / Q40;
             const int32_t drop_q29 = flux_observer_step(&p, &flux_q29, table_q29, applied_q29, current_q9);
-            model = reference_model::flux_step(model, p.gain_q15 / Q15, table_q29 / Q29, applied_q29 / Q29, drop);
+            model = reference_model::flux_step(model, p.gain_q30 / Q30, table_q29 / Q29, applied_q29 / Q29, drop);
             ASSERT_NEAR(drop_q29 / Q29, drop, 0.51 / Q29);
             worst = std::max(worst, std::fabs(flux_q29 / Q29 - model));
         }

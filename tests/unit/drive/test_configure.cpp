@@ -162,7 +162,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_LE(std::fabs(share.turn_off_advance - on_early - narrowing), 4.0) << "at full advance, too";
     near("current limit", c.predictive.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * fixed_point::Q9, 0.0);
     near("reserve", c.predictive.reserve_q24, v(PARAMETER_TORQUE_RESERVE_NM) * fixed_point::Q24, 0.0);
-    near("flux gain", c.predictive.flux.gain_q15, v(PARAMETER_FLUX_OBSERVER_GAIN) * fixed_point::Q15, 0.0);
+    near("flux gain", c.predictive.flux.gain_q30, v(PARAMETER_FLUX_OBSERVER_GAIN) * fixed_point::Q30, 0.0);
     const double q40 = std::ldexp(1.0, 40);
     near("resistance", c.predictive.flux.resistance_period_q40, v(PARAMETER_RESISTANCE_OHM) / rate_hz * q40, 1.0);
     near("period", c.predictive.period_q40, q40 / rate_hz, 1.0);

@@ -422,7 +422,7 @@ TEST_F(Deferred, the_misalignment_survives_every_reset_and_a_late_step) {
         state.deferred.misalignment.phase[phase].offset = int32_t(1000 * (phase + 1));
     }
     const auto kept = [this] {
-        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
             EXPECT_EQ(results().predictive.misalignment[phase], int32_t(1000 * (phase + 1)));
         }
     };

@@ -95,7 +95,7 @@ predictive_t<machine_t> model_of(const predictive_torque_parameters_t &p, const 
     model.phases = phases;
     model.period_s = p.period_q40 / Q40;
     model.resistance_ohm = p.flux.resistance_period_q40 / Q40 / model.period_s;
-    model.flux_gain = p.flux.gain_q15 / Q15;
+    model.flux_gain = p.flux.gain_q30 / Q30;
     model.current_limit_A = p.current_limit_q9 / Q9;
     model.reserve_Nm = p.reserve_q24 / Q24;
     model.sharing = conduction.sharing.overlapping;

@@ -23,9 +23,9 @@ def attributes(owner: Message | Signal) -> dict[str, Any]:
 
 NODE_STEP = 16
 """From the identifiers and data IDs of a drive to those of the next node number (firmware/comms/node.h)."""
-_RIG_NODE_STEP = 0x100
+RIG_NODE_STEP = 0x100
 """Likewise of the test bench (TRANSPORT_NODE_SHIFT of emulator/rig/transport_frame.h)."""
-_RIG_OF_ALL = ("RIG_RUN_UNTIL", "RIG_CLOCK", "RIG_STAMP")
+RIG_OF_ALL = ("RIG_RUN_UNTIL", "RIG_CLOCK", "RIG_STAMP")
 """Messages of the test bench that all drives of a bus share: time."""
 _STATEMENT = re.compile(r'^(BO_|(?:CM_|BA_ "\w+") (?:BO_|SG_)|VAL_|SIG_VALTYPE_|SG_MUL_VAL_) (\d+) ', re.MULTILINE)
 _DATA_ID = re.compile(r'^(BA_ "E2EDataId" BO_ \d+) (\d+);', re.MULTILINE)
@@ -44,8 +44,8 @@ def drive_dbc_of_node(text: str, node: int) -> str:
 def rig_dbc_of_node(text: str, node: int) -> str:
     """The DBC of the test bench of a drive with another node number, from that of node 0."""
     shared = {int(number) for number, name in re.findall(r"^BO_ (\d+) (\w+):", text, re.MULTILINE)
-              if name in _RIG_OF_ALL}
-    return _with_identifiers(text, lambda number: number + (0 if number in shared else _RIG_NODE_STEP * node))
+              if name in RIG_OF_ALL}
+    return _with_identifiers(text, lambda number: number + (0 if number in shared else RIG_NODE_STEP * node))
 
 
 def _with_identifiers(text: str, change: Callable[[int], int]) -> str:

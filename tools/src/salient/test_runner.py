@@ -239,16 +239,20 @@ def _read_report(path: Path, prefix: str = "") -> Count:
 
 
 def _experiments(build: str) -> Count:
-    from salient.experiments.scenario import load_scenarios, run_scenario
+    from salient.experiments.scenario import Scenario, load_scenarios, run_scenario
 
+    def fault_of(scenario: Scenario) -> str:
+        with tempfile.TemporaryDirectory(prefix="salient-") as folder:
+            try:
+                return run_scenario(scenario, Path(folder), build=build).fault
+            except Exception as error:
+                return str(error)
+
+    scenarios = [(path, scenario) for path in sorted(SCENARIOS.glob("*.toml")) for scenario in load_scenarios(path)]
     count = Count()
-    for path in sorted(SCENARIOS.glob("*.toml")):
-        for scenario in load_scenarios(path):
-            with tempfile.TemporaryDirectory(prefix="salient-") as folder:
-                try:
-                    fault = run_scenario(scenario, Path(folder), build=build).fault
-                except Exception as error:
-                    fault = str(error)
+    with ThreadPoolExecutor(CORES) as pool:
+        faults = pool.map(lambda each: fault_of(each[1]), scenarios)
+        for (path, scenario), fault in zip(scenarios, faults, strict=True):
             if fault != "none":
                 _print(f"{path.stem} by {scenario.controller}: {fault}")
             count += _one(fault == "none")

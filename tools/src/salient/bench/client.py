@@ -14,13 +14,16 @@ from salient.bus.signals import SignalTable
 class Client(Protocol):
     """Sends and receives frames in virtual time; Session is one."""
 
-    time_ns: int
     telemetry: SignalTable
     truth: SignalTable
     drive_database: Database
     """The DBC of the drive, with the identifiers of its node number."""
     rig_database: Database
     """That of its test bench."""
+
+    @property
+    def time_ns(self) -> int:
+        """Virtual time."""
 
     def require_drive_database(self) -> None:
         """Raises an exception when the drive is known to have another DBC."""

@@ -83,8 +83,8 @@ def parameter_table(config: BenchConfig) -> list[ParameterRow]:
     """The parameters of the drive of a test bench, read from a second drive, so that reading takes no time on the bus
     of an experiment."""
     return _parameter_table(replace(config, can="auto", pace="lockstep", node=0, drives=1, memory=None, record=None,
-                                    record_step_ns=1000, record_from_us=0, record_switches=None, instructions=None, execution=None,
-                                    instruction_ns=None))
+                                    record_step_ns=1000, record_from_us=0, record_switches=None, instructions=None,
+                                    execution=None, instruction_ns=None))
 
 
 @lru_cache

@@ -19,7 +19,7 @@ import can
 from salient.bus.interface import VirtualMessage, is_on_bus
 from salient.bus.signals import drive_database, rig_database, value_numbers
 from salient.config import NODE_MAX
-from salient.dbc import NODE_STEP
+from salient.dbc import NODE_STEP, RIG_NODE_STEP, RIG_OF_ALL
 from salient.errors import UsageError
 
 RIG_CLOCK_ID = rig_database().get_message_by_name("RIG_CLOCK").frame_id
@@ -36,8 +36,8 @@ def _sent_by_drives() -> frozenset[int]:
 
 @lru_cache
 def _sent_by_rigs() -> frozenset[int]:
-    return frozenset(message.frame_id for node in range(NODE_MAX + 1) for message in rig_database(node).messages
-                     if "RIG" in message.senders)
+    return frozenset(message.frame_id + RIG_NODE_STEP * node for message in rig_database().messages
+                     if "RIG" in message.senders for node in range(1 if message.name in RIG_OF_ALL else NODE_MAX + 1))
 
 
 def open_bus(address: str, receive_own_messages: bool = True) -> can.BusABC:

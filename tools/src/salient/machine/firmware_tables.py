@@ -100,10 +100,11 @@ class PhaseMap:
     """Wb / A."""
 
     def rows(self) -> list[tuple[int, int]]:
-        """Start and reciprocal of each `machine_row_t`."""
+        """Start and reciprocal of each `machine_row_t`; the last twice, because the look-up compares two rows."""
         starts = [int(start) * (_HALF_PITCH // ROW_UNITS) for start in self.row_start]
         widths = [following - start for start, following in pairwise(starts)]
-        return list(zip(starts, [*((1 << 46) // width for width in widths), 0], strict=True))
+        last = (starts[-1], 0)
+        return [*zip(starts, ((1 << 46) // width for width in widths)), last, last]
 
     def angle_bin_row(self) -> np.ndarray:
         """(ANGLE_BINS,): the row in which each angle bin begins."""

@@ -153,7 +153,7 @@ TABLES = Structure("machine_tables_t", (
         scaling.data.adc_voltage_V, 6 - scaling.exponents.voltage, 17)),
     Member("current_slew_rate_A_s", "int32_t", lambda machine, scaling, tables: quantise(
         machine.current_rise_A_s, -scaling.exponents.current, 32)),
-    Member("row", "machine_row_t", lambda machine, scaling, tables: tables.phase_map.rows(), (ROWS,)),
+    Member("row", "machine_row_t", lambda machine, scaling, tables: tables.phase_map.rows(), (ROWS + 1,)),
     Member("angle_bin_row", "uint8_t", lambda machine, scaling, tables: tables.phase_map.angle_bin_row(),
            (ANGLE_BINS,)),
     *_format("torque_format", lambda phase_map: phase_map.torque_per_ampere),
