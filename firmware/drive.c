@@ -1,5 +1,6 @@
 #include "drive.h"
 
+#include "background_checks.h"
 #include "comms/node.h"
 #include "drive/deferred.h"
 #include "fixed/compiler.h"
@@ -8,6 +9,7 @@
 #include "hal_encoder.h"
 #include "hal_interrupt.h"
 #include "hal_time.h"
+#include "hal_watchdog.h"
 #include "telemetry_collect.h"
 
 /* Resolution of the processor times in telemetry: 5 ns. */
@@ -25,6 +27,7 @@ COLD static void configure(drive_t *drive) {
     const control_parameters_t control_parameters =
         configure_control(&drive->parameters, &machine_tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
                           hal_adc_bits(drive->hal), hal_pwm_clock_hz(drive->hal));
+    drive->thermal_parameters = thermal_configure(drive->parameters.values);
     hal_critical_enter(drive->hal);
     if (may_configure(drive)) {
         drive->control_parameters = control_parameters;
@@ -55,14 +58,21 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     }
     nvm_store_init(&drive->store, hal, &drive->parameters);
     comms_init(&drive->comms, config->node, hal_time_us(hal));
+    drive->thermal.step_us = hal_time_us(hal) - THERMAL_STEP_US / 2u; /* halfway between two telemetry cycles */
     drive->comms.store = &drive->store;
+    drive->comms.trace = &drive->trace;
+    drive->comms.control_parameters = &drive->control_parameters;
     configure(drive);
     control_reset(&drive->control_parameters, &drive->control);
     if (drive->store.inhibited) {
         drive->control.reported_fault_mask = (uint32_t)FAULT_BIT(FAULT_PARAMETER_MEMORY);
     }
+    if (hal_reset_cause(hal) == HAL_RESET_WATCHDOG) {
+        state_machine_start_in_fault(&drive->control.state_machine, FAULT_BIT(FAULT_WATCHDOG));
+    }
     hal_pwm_open_all(hal);
     hal_pwm_start(hal, drive->control_parameters.period_ticks);
+    hal_watchdog_start(hal);
     return true;
 }
 
@@ -74,13 +84,24 @@ void drive_control_interrupt(drive_t *drive) {
     drive->break_causes = sample.break_causes = hal_pwm_break(drive->hal);
     hal_encoder_read(drive->hal, &sample.encoder);
     hal_adc_read(drive->hal, &sample.adc);
-    if (control_step(&drive->control_parameters, &drive->control, &sample, &drive->command, &drive->compare)) {
+    const bool run =
+        control_step(&drive->control_parameters, &drive->control, &sample, &drive->command, &drive->compare);
+    const fault_trace_values_t values = {
+        .adc = &sample.adc,
+        .compare = &drive->compare,
+        .angle = drive->control.measurement.angle,
+        .speed_q22 = drive->control.observer.speed_q22,
+        .torque_reference_q24 = drive->control.torque_reference_q24,
+    };
+    if (run) {
         hal_pwm_write(drive->hal, &drive->compare);
+        fault_trace_run(&drive->trace, &values);
     } else {
         hal_pwm_open_all(drive->hal);
         if (sample.break_causes != 0) {
             hal_pwm_clear_break(drive->hal);
         }
+        fault_trace_stand(&drive->trace, &values, drive->control.state_machine.state);
     }
     if (drive->control.deferred_request.skipped == 0) {
         hal_interrupt_request_deferred(drive->hal);
@@ -128,45 +149,6 @@ static void drop_stale_command(drive_t *drive, uint32_t time_us) {
         drive->command.request = COMMAND_OFF;
         hal_critical_leave(drive->hal);
     }
-}
-
-static stall_input_t stall_input(const drive_t *drive) {
-    const control_state_t *control = &drive->control;
-    const deferred_speed_results_t *speed = &deferred_in_effect(control)->speed;
-    return (stall_input_t){
-        .speed_mode = control->state_machine.state == DRIVE_STATE_RUN && control->deferred.mode == DRIVE_MODE_SPEED,
-        .speed_reference_q22 = speed->speed_reference_q22,
-        .speed_q22 = control->observer.speed_q22,
-        .torque_reference_q24 = control->torque_reference_q24,
-        .torque_min_q24 = speed->torque_min_q24,
-        .torque_max_q24 = speed->torque_max_q24,
-    };
-}
-
-/* Checks whose reaction may take longer than a few periods. */
-COLD static void check_slowly(drive_t *drive, uint32_t time_us) {
-    hal_critical_enter(drive->hal);
-    const stall_input_t stall = stall_input(drive);
-    hal_critical_leave(drive->hal);
-    uint64_t failed = 0;
-    if (sto_monitor_failed(&drive->sto, drive->break_causes, time_us)) {
-        failed |= FAULT_BIT(FAULT_STO_DISCREPANCY);
-    }
-    if (stall_monitor_failed(&drive->stall, &stall, time_us)) {
-        failed |= FAULT_BIT(FAULT_STALL);
-    }
-    if (drive->comms.bus.conflict) {
-        failed |= FAULT_BIT(FAULT_IDENTIFIER_CONFLICT);
-    }
-    if (drive->store.inhibited) { /* since the start; inhibits the first one only */
-        failed |= FAULT_BIT(FAULT_PARAMETER_MEMORY);
-    }
-    if (drive->control.state_machine.state != DRIVE_STATE_RUN) {
-        drive->comms.commands.failed = false;
-    } else if (drive->comms.commands.failed) {
-        failed |= FAULT_BIT(FAULT_COMMAND_ERROR);
-    }
-    drive->control.reported_fault_mask = (uint32_t)failed;
 }
 
 /* After bus-off a run request is without effect until the sender has withdrawn it: the present command ages until its
@@ -226,10 +208,23 @@ static void ramp_down(drive_t *drive, uint32_t time_us) {
     hal_critical_leave(drive->hal);
 }
 
+/* Two words of each interrupt: one that comes in between advances what is read after it, by one step. */
+COLD static void kick_watchdog(drive_t *drive, uint32_t time_us) {
+    const deferred_request_t *request = &drive->control.deferred_request;
+    const volatile uint32_t *completed = &drive->control.deferred.response.completed;
+    const uint32_t completed_before = *completed;
+    if (watchdog_monitor_kick(&drive->watchdog, request->requests + request->skipped_total, request->requests,
+                              completed_before, time_us)) {
+        hal_watchdog_kick(drive->hal);
+    }
+}
+
 COLD void drive_background(drive_t *drive) {
     const uint32_t time_us = hal_time_us(drive->hal);
-    check_slowly(drive, time_us);
+    background_checks(drive, time_us);
+    watchdog_monitor_pass(&drive->watchdog, WATCHDOG_CHECKED);
     keep_memory(drive, time_us);
+    watchdog_monitor_pass(&drive->watchdog, WATCHDOG_STORED);
     if (comms_telemetry_due(&drive->comms, time_us)) {
         bus_monitor_step(&drive->comms.bus, drive->hal, time_us);
         if (drive->comms.bus.run_inhibited) {
@@ -256,6 +251,8 @@ COLD void drive_background(drive_t *drive) {
     if (commanded) {
         take_command(drive);
     }
+    watchdog_monitor_pass(&drive->watchdog, WATCHDOG_SERVED);
     ramp_down(drive, time_us);
     drop_stale_command(drive, time_us);
+    kick_watchdog(drive, time_us);
 }

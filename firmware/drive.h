@@ -8,10 +8,15 @@
 #include "comms/comms.h"
 #include "drive/configure.h"
 #include "drive/control.h"
+#include "drive/encoder_monitor.h"
+#include "drive/fault_trace.h"
 #include "drive/nvm_store.h"
 #include "drive/parameters.h"
+#include "drive/phase_monitor.h"
 #include "drive/stall_monitor.h"
 #include "drive/sto_monitor.h"
+#include "drive/thermal.h"
+#include "drive/watchdog_monitor.h"
 #include "hal.h"
 
 /* Without commands a run's torque ramps to zero in this time after the parameter command_timeout_ms, in steps of a
@@ -45,11 +50,18 @@ typedef struct {
     uint32_t applied_revision; /* parameters.revision from which control_parameters are derived */
     sto_monitor_t sto;
     stall_monitor_t stall;
+    phase_monitor_t phases;
+    encoder_monitor_t encoder;
+    thermal_parameters_t thermal_parameters;
+    thermal_t thermal;
+    watchdog_monitor_t watchdog;
     bool ramping;          /* the torque ramps to zero, without commands; the next two are for this */
     int32_t ramp_from_q24; /* torque reference at its begin, N m, Q7.24 */
     uint32_t ramp_us;      /* time of the last step */
     comms_t comms;
     nvm_store_t store;
+    /* Written by the control interrupt. Last: members behind it would be out of the reach of short instructions. */
+    fault_trace_t trace;
 } drive_t;
 
 /* Prepares the drive and starts the timer. Returns false, and starts nothing, for a node number above NODE_MAX and

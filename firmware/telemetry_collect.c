@@ -17,6 +17,11 @@ static uint32_t processor_time(const drive_t *drive, uint32_t ticks) {
     return (uint32_t)((uint64_t)ticks * drive->processor_time_q24 >> 24);
 }
 
+/* 0.01 % from Q16, below 2^22. */
+static uint32_t percent(uint32_t load_q16) {
+    return (uint32_t)(((uint64_t)load_q16 * 10000u + (1u << 15)) >> 16);
+}
+
 /* Mean of the phases, mechanical, 2^-32 turn. */
 static int32_t misalignment(const drive_t *drive) {
     const int32_t phases = machine_tables.phases;
@@ -115,6 +120,12 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->deferred.used_us = processor_time(drive, drive->deferred_used_ticks);
     telemetry->deferred.worst_us = processor_time(drive, drive->deferred_worst_ticks);
     telemetry->deferred.skipped_periods = control->deferred_request.skipped_total;
+
+    telemetry->gates = drive->break_causes;        /* the DBC has the bits of HAL_PWM_BREAK_* */
+    telemetry->phase_fault = drive->phases.phases; /* the DBC has a bit for each phase */
+    telemetry->thermal.winding_load = percent(thermal_winding_load_q16(&drive->thermal));
+    telemetry->thermal.switch_load = percent(thermal_switch_load_q16(&drive->thermal));
+    telemetry->thermal.torque_limit_nm = units_torque_q8(control->torque_limit_q24);
 
     telemetry->gates = drive->break_causes; /* the DBC has the bits of HAL_PWM_BREAK_* */
 

@@ -11,6 +11,7 @@
 #include "hal_pwm.h"
 #include "hal_random.h"
 #include "hal_time.h"
+#include "hal_watchdog.h"
 #include "plant/pwm_timer.h"
 
 static const char *const context_names[] = {
@@ -151,6 +152,21 @@ bool hal_nvm_erase(hal_t *hal, unsigned page) {
 uint32_t hal_random_u32(hal_t *hal) {
     require(hal, false, __func__);
     return board_random(hal->board);
+}
+
+hal_reset_cause_t hal_reset_cause(const hal_t *hal) {
+    require(hal, false, __func__);
+    return hal->board->reset_cause;
+}
+
+void hal_watchdog_start(hal_t *hal) {
+    require(hal, false, __func__);
+    board_watchdog_kick(hal->board);
+}
+
+void hal_watchdog_kick(hal_t *hal) {
+    require(hal, false, __func__);
+    board_watchdog_kick(hal->board);
 }
 
 uint32_t hal_time_us(const hal_t *hal) {

@@ -14,6 +14,7 @@
 #include "hal_nvm.h"
 #include "hal_random.h"
 #include "hal_time.h"
+#include "hal_watchdog.h"
 #include "host/hal_host.h"
 #include "host/simulation.h"
 #include "plant/pwm_timer.h"
@@ -72,6 +73,7 @@ static void background(void *context) {
 static void restart(void *context) {
     (void)context;
     mailbox->missed_triggers = 0;
+    mailbox->reset_cause = hal_reset_cause(&host);
     deliver_event(MAILBOX_RESET); /* until MAILBOX_STARTED */
 }
 
@@ -126,6 +128,10 @@ static void run_to_trigger(void) {
 
 bool cosimulation_open(mailbox_t *shared, const options_t *options, bool timed) {
     mailbox = shared;
+    if (options->drives > 1) {
+        fprintf(stderr, "salient: --drives %" PRIu32 ": only one with an image\n", options->drives);
+        return false;
+    }
     if (!simulation_open(&simulation, options)) {
         return false;
     }
@@ -204,6 +210,12 @@ void cosimulation_serve(void) {
         break;
     case MAILBOX_RANDOM:
         mailbox->random = hal_random_u32(&host);
+        break;
+    case MAILBOX_WATCHDOG_START:
+        hal_watchdog_start(&host);
+        break;
+    case MAILBOX_WATCHDOG_KICK:
+        hal_watchdog_kick(&host);
         break;
     default:
         fprintf(stderr, "salient: the drive sent the unknown command %u\n", (unsigned)mailbox->doorbell);

@@ -17,6 +17,7 @@ void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *b
     if (plant->machine->trip_current_A > 0.0) {
         plant_set_trip(plant, plant->machine->trip_current_A);
     }
+    board->watchdog_ns = UINT64_MAX;
     nvm_init(&board->nvm);
 }
 
@@ -66,7 +67,11 @@ static void drive_gates(board_t *board, bool busy) {
     }
 }
 
-void board_reset(board_t *board) {
+void board_stop_gates(board_t *board) {
+    apply_break(board, HAL_PWM_BREAK_NOT_RENEWED);
+}
+
+void board_reset(board_t *board, hal_reset_cause_t cause) {
     board_pwm_open_all(board);
     board->start_ns = board->time_ns;
     board->context = BOARD_START;
@@ -77,6 +82,8 @@ void board_reset(board_t *board) {
     board->periods_unrenewed = 0;
     board_pwm_clear_break(board);
     board->interrupt_took_ns = 0;
+    board->watchdog_ns = UINT64_MAX;
+    board->reset_cause = cause;
     board->received_popped = board->received_pushed;
     board->receive_overflows = 0;
     nvm_power_on(&board->nvm);
@@ -158,6 +165,10 @@ void board_can_rejoin(board_t *board) {
 }
 
 /* With the time in the state, so that the numbers of two runs with one seed differ once their calls do. */
+void board_watchdog_kick(board_t *board) {
+    board->watchdog_ns = board->time_ns + HAL_WATCHDOG_TIMEOUT_US * UINT64_C(1000);
+}
+
 uint32_t board_random(board_t *board) {
     board->random_state += board->time_ns;
     return (uint32_t)(random_next(&board->random_state) >> 32);

@@ -12,6 +12,7 @@
 #include "hal_can.h"
 #include "hal_encoder.h"
 #include "hal_pwm.h"
+#include "hal_watchdog.h"
 #include "plant/plant.h"
 #include "plant/sensors.h"
 #include "rig/can_bus.h"
@@ -49,6 +50,9 @@ typedef struct {
     uint32_t received_pushed, received_popped; /* counts, not indices */
     uint32_t receive_overflows;
 
+    uint64_t watchdog_ns; /* time at which the watchdog acts; UINT64_MAX: not started */
+    hal_reset_cause_t reset_cause;
+
     nvm_t nvm; /* keeps its content in a reset */
     /* Of the true random number generator, from the seed of the bench: a reset of the board does not restart it. */
     uint64_t random_state;
@@ -64,9 +68,12 @@ typedef struct {
  * used, not owned. The random stream begins with `seed`. */
 void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, unsigned bus_drive, uint64_t seed);
 
-/* For the rig: a reset of the drive, or power that returns. Timer stopped, switches open, what was received is lost;
- * frames in the transmit mailboxes still leave. */
-void board_reset(board_t *board);
+/* For the rig: a reset of the drive, or power that returns. Timer and watchdog stopped, switches open, what was
+ * received is lost; frames in the transmit mailboxes still leave. */
+void board_reset(board_t *board, hal_reset_cause_t cause);
+
+/* For the rig: the watchdog of a firmware that cannot be reset opens the switches, as a break does. */
+void board_stop_gates(board_t *board);
 
 /* For the rig: starts a control period at the time of the plant. Latches the sensors and activates the buffered compare
  * values. While the interrupt is still running (`busy`), the trigger is missed and counted, and the values that the
@@ -93,6 +100,7 @@ bool board_can_receive(board_t *board, hal_can_frame_t *frame);
 bool board_can_transmit(board_t *board, const hal_can_frame_t *frame);
 void board_can_status(const board_t *board, hal_can_status_t *status);
 void board_can_rejoin(board_t *board);
+void board_watchdog_kick(board_t *board);
 
 /* The next number of a stream that depends on the seed and on the instants of the calls: a bench with the same seed and
  * the same course repeats it, as everything else. */

@@ -13,6 +13,7 @@ void control_period_schedule_hold(rig_t *rig) {
 }
 
 void control_period_begin(rig_t *rig) {
+    rig->scheduler.due_ns[EVENT_WATCHDOG] = rig->board.watchdog_ns;
     if (rig->board.period_ticks > 0) {
         rig->period_ns = UINT64_C(2) * rig->board.period_ticks * PWM_TIMER_TICK_NS;
         rig->scheduler.due_ns[EVENT_CONTROL] = rig->board.time_ns + rig->period_ns;
@@ -32,7 +33,7 @@ static void call_background(rig_t *rig) {
     }
     call(rig, BOARD_BACKGROUND, rig->firmware.background);
     if (rig->board.nvm.power_lost) {
-        rig_reset_drive(rig);
+        rig_reset_drive(rig, HAL_RESET_POWER);
     }
 }
 
@@ -87,4 +88,18 @@ void control_period_background_event(void *context, uint64_t now_ns) {
     call_deferred(rig);
     call_background(rig);
     bus_start(rig);
+}
+
+/* A kick moves the time of the watchdog, and the event follows it when it is due. */
+void control_period_watchdog_event(void *context, uint64_t now_ns) {
+    rig_t *rig = context;
+    rig->scheduler.due_ns[EVENT_WATCHDOG] = rig->board.watchdog_ns;
+    if (rig->board.watchdog_ns > now_ns) {
+        return;
+    }
+    rig->scheduler.due_ns[EVENT_WATCHDOG] = SCHEDULER_NEVER;
+    plant_advance(&rig->plant, now_ns);
+    if (!rig_reset_drive(rig, HAL_RESET_WATCHDOG)) {
+        board_stop_gates(&rig->board);
+    }
 }

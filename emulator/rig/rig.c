@@ -21,6 +21,7 @@ static const scheduler_handler_t handlers[EVENT_COUNT] = {
     [EVENT_CURRENT_HOLD] = control_period_hold_event,
     [EVENT_CONTROL] = control_period_start_event,
     [EVENT_BACKGROUND] = control_period_background_event,
+    [EVENT_WATCHDOG] = control_period_watchdog_event,
     [EVENT_TRUTH] = truth_event,
 };
 
@@ -70,12 +71,12 @@ void rig_join(rig_t *rig, const rig_firmware_t *firmware) {
     control_period_begin(rig);
 }
 
-bool rig_reset_drive(rig_t *rig) {
+bool rig_reset_drive(rig_t *rig, hal_reset_cause_t cause) {
     if (!rig->firmware.restart) {
         return false;
     }
     plant_advance(&rig->plant, rig->board.time_ns);
-    board_reset(&rig->board);
+    board_reset(&rig->board, cause);
     rig->interrupt_end_ns = 0;
     rig->scheduler.due_ns[EVENT_CONTROL] = rig->scheduler.due_ns[EVENT_CURRENT_HOLD] =
         rig->scheduler.due_ns[EVENT_BACKGROUND] = SCHEDULER_NEVER;

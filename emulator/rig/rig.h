@@ -147,7 +147,7 @@ void rig_join(rig_t *rig, const rig_firmware_t *firmware);
 
 /* Resets the drive: the switches open, the firmware starts again, the memory and everything outside the drive continue.
  * False when the firmware cannot be reset. */
-bool rig_reset_drive(rig_t *rig);
+bool rig_reset_drive(rig_t *rig, hal_reset_cause_t cause);
 
 /* The processor serves no trigger of a control interrupt before time_ns: they are lost, like those during an
  * interrupt. */

@@ -21,6 +21,7 @@ typedef enum {
     EVENT_CURRENT_HOLD,   /* delayed current sensors hold the phase currents */
     EVENT_CONTROL,        /* a control period starts */
     EVENT_BACKGROUND,     /* the background resumes after an interrupt that takes time */
+    EVENT_WATCHDOG,       /* the watchdog's time may be over */
     EVENT_TRUTH,          /* the RIG_TRUTH frames are due */
     EVENT_COUNT
 } scheduler_event_t;

@@ -51,7 +51,7 @@ static void set_current_sensor_delay(rig_t *rig, double delay_us) {
 /* Without effect on a firmware that cannot be reset: stimulus_receive rejects it. */
 static void reset_drive(rig_t *rig, double reset) {
     if (reset > 0.0) {
-        rig_reset_drive(rig);
+        rig_reset_drive(rig, HAL_RESET_POWER);
     }
 }
 

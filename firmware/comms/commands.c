@@ -129,9 +129,12 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
         return reject_command(commands, &counters->wrong_counter);
     }
     commands->last_received_us = time_us;
-    if (!unpack(frame, &commands->requested)) {
+    command_t requested = commands->requested;
+    if (!unpack(frame, &requested) ||
+        (requested.request == COMMAND_CLEAR_FAULT && commands->state == DRIVE_STATE_RUN)) { /* nothing to clear */
         return reject_command(commands, &counters->out_of_range);
     }
+    commands->requested = requested;
     counter_add(&counters->accepted, 1);
     commands->errors = (uint16_t)(commands->errors - (commands->errors > 0));
     commands->requested.time_us = time_us;

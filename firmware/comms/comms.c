@@ -4,6 +4,7 @@
 #include "comms/node.h"
 #include "comms/parameter_protocol.h"
 #include "drive_codec.h"
+#include "comms/trace_protocol.h"
 
 #define US_PER_MS 1000u
 
@@ -81,7 +82,8 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const 
             return true;
         case COMMANDS_PARAMETER_REQUEST: {
             hal_can_frame_t response;
-            if (!memory_protocol_respond(comms->store, hal, &frame, &response)) {
+            if (!memory_protocol_respond(comms->store, hal, &frame, &response) &&
+                !trace_protocol_respond(comms->trace, comms->control_parameters, &frame, &response)) {
                 parameter_protocol_respond(parameters, &frame, &response);
             }
             response.identifier += comms->telemetry.identifier_offset;

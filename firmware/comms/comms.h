@@ -24,6 +24,8 @@
 #include "comms/frame_queue.h"
 #include "comms/parameter_set.h"
 #include "comms/telemetry.h"
+#include "drive/control.h"
+#include "drive/fault_trace.h"
 #include "drive/nvm_store.h"
 #include "drive/parameters.h"
 #include "hal_can.h"
@@ -43,7 +45,9 @@ typedef struct {
     frame_queue_t responses; /* to parameter requests and steps of a set */
     parameter_set_t set;     /* staged */
     command_t command;       /* last accepted command */
-    nvm_store_t *store;      /* set by the caller after comms_init */
+    nvm_store_t *store;      /* this and the next two are set by the caller after comms_init */
+    const fault_trace_t *trace;
+    const control_parameters_t *control_parameters;
     uint32_t arming_sent_us; /* when DRIVE_ARMING last entered a mailbox because of a change */
 } comms_t;
 

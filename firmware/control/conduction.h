@@ -73,7 +73,10 @@ typedef struct {
     int32_t braking_end_q6;   /* DC-link voltage from which there is no braking torque, V, Q9.6 */
     uint32_t
         gain_per_step_q16; /* a quarter of the strokes per update over the gain of the speed law in an update, Q16.16 */
-    int32_t fold_back_range_q6; /* voltage range below, in which it decreases to 0, V, Q9.6, >= 1 */
+    int32_t fold_back_range_q6;  /* voltage range below, in which it decreases to 0, V, Q9.6, >= 1 */
+    int32_t full_link_q6;        /* voltage of conduction_braking_q24 without braking torque, V, Q9.6 */
+    int32_t full_link_range_q6;  /* below it, V, Q9.6 */
+    int32_t full_link_slope_q18; /* N m per V up to there, Q7.18 */
 } conduction_parameters_t;
 
 /* Point of the tables: index of the lower one, and fraction of the way to the next. */
@@ -126,6 +129,16 @@ typedef struct {
     uint32_t angle_step;          /* magnitude of the rotation during an update, 2^-32 electrical rev */
     int32_t dc_link_voltage_q6;   /* V, Q9.6 */
 } conduction_sample_t;
+
+/* Limit of the braking torque's magnitude by what the DC link can take, from the voltage of the present period: N m,
+ * Q7.24, INT32_MAX where it is none. Faster than the limits of an update, in which the fields of the phases alone could
+ * fill the link. */
+static inline int32_t conduction_braking_q24(const conduction_parameters_t *parameters, int32_t dc_link_voltage_q6) {
+    const int32_t room_q6 = parameters->full_link_q6 - dc_link_voltage_q6;
+    return room_q6 > parameters->full_link_range_q6 ? INT32_MAX
+           : room_q6 <= 0                           ? 0
+                                                    : room_q6 * parameters->full_link_slope_q18;
+}
 
 /* Angles of torque sharing without advance. */
 conduction_t conduction_initial(const torque_sharing_window_t *window);

@@ -80,7 +80,8 @@ typedef struct {
     uint16_t current_range_q9;     /* full scale of the current sensors, A, unsigned Q7.9 */
     uint16_t voltage_range_q6;     /* full scale of the DC-link voltage divider, V, unsigned Q10.6 */
     int32_t current_slew_rate_A_s; /* di/dt at the unaligned position: supply voltage / inductance */
-    machine_row_t row[MACHINE_ROWS + 1]; /* one after the last, beyond every angle, for the look-up */
+    /* The last row twice: the look-up compares two. */
+    machine_row_t row[MACHINE_ROWS + 1];
     uint8_t angle_bin_row[MACHINE_ANGLE_BINS]; /* row in which each angle bin begins */
     machine_format_t torque_format;
     machine_format_t flux_format;

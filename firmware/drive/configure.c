@@ -106,6 +106,29 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
     };
 }
 
+/* 2^-32 rev. */
+#define DEGREE UINT32_C(11930465)
+
+static encoder_monitor_parameters_t encoder_monitor_from(const control_parameters_t *control, const int32_t *values,
+                                                         uint32_t control_rate_hz) {
+    const uint32_t rotor_poles = control->commutation.rotor_poles;
+    const uint32_t angle_deg =
+        control->torque_law == TORQUE_LAW_PREDICTIVE ? ENCODER_MONITOR_LEARNED_DEG : ENCODER_MONITOR_ANGLE_DEG;
+    const int32_t travel = fixed_multiply_high(control->protection.over_speed_q22, control->observer.angle_step_q32);
+    return (encoder_monitor_parameters_t){
+        .commutation = control->commutation,
+        .half_count = control->encoder_middle * rotor_poles,
+        .middle = control->encoder_middle,
+        .angle_max = DEGREE * angle_deg * rotor_poles,
+        .flux_error_q29 = encoder_monitor_flux_error_q29(
+            load_observer_acceleration(values[PARAMETER_TORQUE_MAX_NM], values[PARAMETER_INERTIA_KG_M2]),
+            values[PARAMETER_CURRENT_LIMIT_A] / 2, control->observer.angle_step_q32, rotor_poles),
+        .rate_hz = control_rate_hz,
+        .current_min_q9 = values[PARAMETER_CURRENT_LIMIT_A] / 8,
+        .travel_max = travel + travel / 16,
+    };
+}
+
 /* Hysteresis switches a phase on for whole periods, and off only two periods after its current exceeds the limit (one
  * until the sample, one until the new state acts): the limit stays 2.2 periods of current rise below the trip. The rise
  * is that of the unaligned position; a saturated phase comes close to it at any angle. */
@@ -208,6 +231,9 @@ static conduction_parameters_t conduction_from(const int32_t *values, unsigned p
                          (int64_t)DEFERRED_CONDUCTION_PERIODS * (values[PARAMETER_SMC_K] + 1))),
         .braking_end_q6 = over_voltage_q6 - over_voltage_q6 / 128,
         .fold_back_range_q6 = over_voltage_q6 / 32 - over_voltage_q6 / 128 + 1,
+        .full_link_q6 = over_voltage_q6 - over_voltage_q6 / 64,
+        .full_link_range_q6 = over_voltage_q6 / 64 + 1,
+        .full_link_slope_q18 = values[PARAMETER_TORQUE_MAX_NM] / (over_voltage_q6 / 64 + 1),
     };
 }
 
@@ -379,6 +405,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                               fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
     control.torque_offset = torque_offset_configure(control_rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
+    control.encoder_monitor = encoder_monitor_from(&control, values, control_rate_hz);
     return control;
 }
 

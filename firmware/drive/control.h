@@ -16,6 +16,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "control/applied_flux.h"
 #include "control/commutation.h"
 #include "control/conduction.h"
 #include "control/ditc_hysteresis.h"
@@ -36,6 +37,7 @@
 #include "control/torque_trim.h"
 #include "drive/command.h"
 #include "drive/deferred_exchange.h"
+#include "drive/encoder_monitor.h"
 #include "drive/protection.h"
 #include "drive/state_machine.h"
 #include "hal_adc.h"
@@ -90,6 +92,7 @@ typedef struct {
     periodic_load_parameters_t periodic_load;
     torque_mode_parameters_t torque_mode;
     inertia_parameters_t inertia;
+    encoder_monitor_parameters_t encoder_monitor; /* background */
 } control_parameters_t;
 
 /* Inputs of one control period as the HAL delivers them. */
@@ -141,7 +144,8 @@ typedef struct {
     inertia_t inertia;                /* its shift likewise */
 } deferred_t;
 
-/* State of the control; the control interrupt alone writes the members other than `deferred` and the first. */
+/* State of the control; the control interrupt alone writes the members other than `deferred`, the first and the last.
+ */
 typedef struct {
     uint32_t reported_fault_mask; /* failed checks of the background, which writes it in one access; FAULT_BITs */
     bool started;                 /* the first sample has initialised observer and protection */
@@ -151,14 +155,17 @@ typedef struct {
     protection_t protection;
     state_machine_t state_machine;
     int32_t torque_reference_q24;     /* 0 outside RUN */
-    int32_t duty_q15[HAL_PHASES_MAX]; /* of the last period in RUN, -32768..32768 */
+    int32_t duty_q15[HAL_PHASES_MAX]; /* acts from the coming sample on, -32768..32768; outside RUN -32768: off */
     pwm_ditc_t duty;
     torque_trim_t trim;
     predictive_torque_t predictive;
     deferred_request_t deferred_request;
+    applied_flux_t applied_flux; /* corrected by the background with the interrupts masked */
     deferred_t deferred;
-    /* Last measurement, for telemetry: no step reads it here, each one receives the measurement as an argument. */
+    /* Last measurement, for telemetry and background: the steps of the control interrupt receive the measurement as an
+     * argument. */
     control_measurement_t measurement;
+    int32_t torque_limit_q24; /* of the torque reference's magnitude, as reported_fault_mask, N m, Q7.24 */
 } control_state_t;
 
 /* State INITIALISE, rotor at standstill, controllers reset. */

@@ -290,7 +290,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     if (parameters->bandwidth.adaptive) {
         results->bandwidth = bandwidth_limits(parameters, deferred, input);
     }
-    speed_control_deferred(parameters, deferred, input, results);
+    speed_control_deferred(parameters, deferred, input, state->torque_limit_q24, results);
     deferred->run = input->run;
     if (!input->run) {
         inertia_restart(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical);

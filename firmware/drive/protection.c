@@ -51,15 +51,17 @@ static bool encoder_jumped(const protection_parameters_t *parameters, int32_t an
     return (uint32_t)angle_step + limit > 2 * limit;
 }
 
-/* True when the encoder does not count although the rotor turns. The observer alone cannot detect that: with a high
- * bandwidth it follows a frozen encoder to standstill before the rotor has turned far. No torque stops the rotor that
- * quickly, so the rotor is also assumed to be no slower than at the last count less the largest possible deceleration
- * since. */
+/* True when the encoder does not count although the rotor turns: it is no slower than at the last count less the
+ * largest possible deceleration since. The observer cannot tell: with a high bandwidth it follows a frozen encoder to
+ * standstill before the rotor has turned far, and of a locked rotor it predicts motion. A rotor that leaves standstill
+ * meanwhile is found by its flux linkage (encoder_monitor.h). Frozen until the encoder counts: at standstill nothing
+ * else shows whether it could. */
 static bool encoder_frozen(const protection_parameters_t *parameters, protection_deferred_t *protection,
                            const protection_deferred_input_t *input, int32_t speed_q22) {
     const bool counted = input->encoder_angle != protection->encoder_angle;
     protection->encoder_angle = input->encoder_angle;
     if (counted) {
+        protection->frozen = false;
         protection->speed_lower_bound_q22 = speed_q22;
         protection->undetected_travel = 0;
         return false;
@@ -67,14 +69,14 @@ static bool encoder_frozen(const protection_parameters_t *parameters, protection
     const int32_t periods = (int32_t)(input->periods < PERIODS_MAX ? input->periods : PERIODS_MAX);
     const int32_t deceleration_q22 = fixed_saturate((int64_t)parameters->deceleration_max_q22 * periods);
     const int32_t bound_q22 = fixed_subtract(protection->speed_lower_bound_q22, deceleration_q22);
-    const int32_t assumed_q22 = speed_q22 > bound_q22 ? speed_q22 : bound_q22;
-    protection->speed_lower_bound_q22 = assumed_q22;
-    if (assumed_q22 < STANDSTILL_Q22) {
+    protection->speed_lower_bound_q22 = bound_q22;
+    if (bound_q22 < STANDSTILL_Q22) {
         protection->undetected_travel = 0;
     } else if (protection->undetected_travel < UNDETECTED_TRAVEL_STOP) {
-        protection->undetected_travel += periods * fixed_multiply_high(assumed_q22, parameters->angle_step_q32);
+        protection->undetected_travel += periods * fixed_multiply_high(bound_q22, parameters->angle_step_q32);
     }
-    return protection->undetected_travel > parameters->undetected_travel_max;
+    protection->frozen |= protection->undetected_travel > parameters->undetected_travel_max;
+    return protection->frozen;
 }
 
 /* Which checks failed; by value, because what is passed by its address would have to be in memory in every period. */

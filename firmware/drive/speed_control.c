@@ -7,8 +7,19 @@ static int32_t ramp_step(int32_t reference_q22, int32_t target_q22, int32_t step
     return fixed_add(reference_q22, fixed_clamp(difference_q22, -step_max_q22, step_max_q22));
 }
 
+/* The PI within a limit below its own. */
+static int32_t limited_pi_q24(const control_parameters_t *parameters, deferred_t *deferred, int32_t error_q22,
+                              int32_t limit_q24) {
+    const int32_t torque_q24 = speed_pi_step(&parameters->speed_pi, &deferred->speed_pi, error_q22);
+    const int32_t limited_q24 = fixed_clamp(torque_q24, -limit_q24, limit_q24);
+    if (limited_q24 != torque_q24) {
+        speed_pi_follow(&deferred->speed_pi, limited_q24);
+    }
+    return limited_q24;
+}
+
 static int32_t speed_law_q24(const control_parameters_t *parameters, deferred_t *deferred,
-                             const deferred_input_t *input) {
+                             const deferred_input_t *input, int32_t limit_q24) {
     const command_t *command = input->command;
     const int32_t commanded_q22 = command->request == COMMAND_RUN ? command->speed_reference_q22 : 0;
     const int32_t min_q22 = parameters->speed_reference_min_q22;
@@ -23,7 +34,7 @@ static int32_t speed_law_q24(const control_parameters_t *parameters, deferred_t 
         return speed_smc_reaching_torque_q24(&deferred->speed_smc, error_q22);
     case SPEED_LAW_PI:
     default:
-        return speed_pi_step(&parameters->speed_pi, &deferred->speed_pi, error_q22);
+        return limited_pi_q24(parameters, deferred, error_q22, limit_q24);
     }
 }
 
@@ -41,9 +52,19 @@ static int32_t torque_law_q24(const control_parameters_t *parameters, deferred_t
 }
 
 void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
-                            deferred_results_t *results) {
+                            int32_t limit_q24, deferred_results_t *results) {
     const int32_t offset_q24 = torque_offset_q24(&deferred->torque_offset);
     int32_t min_q24 = deferred->conduction.torque_min_q24, max_q24 = deferred->conduction.torque_max_q24;
+    min_q24 = min_q24 > -limit_q24 ? min_q24 : -limit_q24;
+    max_q24 = max_q24 < limit_q24 ? max_q24 : limit_q24;
+    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
+        const int32_t braking_q24 = conduction_braking_q24(&parameters->conduction, input->dc_link_voltage_q6);
+        if (input->speed_q22 < 0) {
+            max_q24 = max_q24 < braking_q24 ? max_q24 : braking_q24;
+        } else {
+            min_q24 = min_q24 > -braking_q24 ? min_q24 : -braking_q24;
+        }
+    }
     int32_t torque_q24 = 0;
     drive_mode_t mode = DRIVE_MODE_SPEED;
     results->speed.speed_reference_q22 = 0;
@@ -56,7 +77,7 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
         min_q24 = max_q24 = torque_q24;
     } else {
         results->speed.periodic_load_q24 = deferred->periodic_load.torque_q24;
-        torque_q24 = fixed_add(fixed_add(speed_law_q24(parameters, deferred, input), offset_q24),
+        torque_q24 = fixed_add(fixed_add(speed_law_q24(parameters, deferred, input, limit_q24), offset_q24),
                                results->speed.periodic_load_q24);
         results->speed.speed_reference_q22 = deferred->speed_reference_q22;
     }

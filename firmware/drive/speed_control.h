@@ -12,9 +12,10 @@
  * Speed mode: moves the speed reference by at most the ramp towards the commanded speed, from the present speed at the
  * start of a run, or 0 without a run request; the torque is that of the configured law without feed-forward. Torque
  * mode: torque_mode.h. It begins with the present torque; after it the speed reference begins with the present speed,
- * and the integral of the PI with the present torque. [deferred] */
+ * and the integral of the PI with the present torque. limit_q24: of the torque's magnitude, N m, Q7.24, >= 0; what the
+ * interrupt adds is within it too. [deferred] */
 void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
-                            deferred_results_t *results);
+                            int32_t limit_q24, deferred_results_t *results);
 
 /* Torque reference: that of the law, and with sliding mode the feed-forward of load and friction, limited. [interrupt]
  */

@@ -1,5 +1,7 @@
 #include "drive/state_machine.h"
 
+#include "fixed/compiler.h"
+
 void state_machine_reset(state_machine_t *state_machine) {
     *state_machine = (state_machine_t){.state = DRIVE_STATE_INITIALISE};
 }
@@ -19,7 +21,13 @@ static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {
     record->state = (uint8_t)state_machine->state;
     state_machine->state = DRIVE_STATE_FAULT;
     state_machine->rearmed = false;
+    state_machine->clearing = false;
+    state_machine->fault_free_ticks = 0;
     return true;
+}
+
+COLD void state_machine_start_in_fault(state_machine_t *state_machine, uint64_t fault_mask) {
+    latch_fault(state_machine, fault_mask);
 }
 
 /* By members, because a call of memset takes 44 instructions. */
@@ -63,7 +71,11 @@ bool state_machine_stands(state_machine_t *state_machine, uint64_t fault_mask, c
         state_machine->state = DRIVE_STATE_READY;
         break;
     case DRIVE_STATE_FAULT:
-        if (request == COMMAND_CLEAR_FAULT && request_changed && all_but_timeout == 0) {
+        state_machine->fault_free_ticks = all_but_timeout == 0 ? state_machine->fault_free_ticks + 1 : 0;
+        state_machine->clearing =
+            all_but_timeout == 0 && request == COMMAND_CLEAR_FAULT && (request_changed || state_machine->clearing);
+        if (state_machine->clearing &&
+            state_machine->fault_free_ticks > STATE_MACHINE_CAUSE_GONE_MS * initialise_ticks) {
             state_machine->state = DRIVE_STATE_READY;
             clear(&state_machine->record);
         }

@@ -1,12 +1,13 @@
 /* States of the drive. The switches are closed only in RUN.
  *
  *   INITIALISE --all checks passed for 1 ms--> READY <--run / off, stopped--> RUN
- *   READY, RUN --a check fails--> FAULT --clear_fault, cause gone--> READY
+ *   READY, RUN --a check fails--> FAULT --clear_fault, all checks passed for 10 ms--> READY
  *
  * A command timeout is a fault only in RUN. After a fault the drive runs again only once the run request has been
- * withdrawn: a run request that persists through the fault does not restart it. Likewise `clear_fault` acts only in the
- * tick in which the request changes to it: a request that persists clears neither a later fault nor one whose cause
- * disappears later.
+ * withdrawn: a run request that persists through the fault does not restart it. Likewise `clear_fault` counts
+ * from the tick in which the request changes to it, and only if every check passes in that tick and until the 10 ms are
+ * over: a request that persists clears neither a later fault nor one whose cause disappears later. It has no reference:
+ * the demand is zero.
  *
  * The states are independent of the direction of rotation. RUN passes through zero speed when the reference changes its
  * sign. A stop remains in RUN with a reference that ramps to zero, from either side, until the rotor is at standstill:
@@ -22,10 +23,14 @@
 #include "drive/command.h"
 #include "drive/fault.h"
 
+/* Time for which every check must have passed before a fault can be cleared. */
+#define STATE_MACHINE_CAUSE_GONE_MS 10u
+
 typedef struct {
     drive_state_t state;
-    uint32_t fault_free_ticks;      /* in INITIALISE, since the last failed check */
+    uint32_t fault_free_ticks;      /* in INITIALISE and FAULT, since the last failed check */
     uint32_t start_inhibit_mask;    /* in INITIALISE: failed checks of this tick; 0 in every other state */
+    bool clearing;                  /* in FAULT: requested, waits for the rest of the time */
     bool rearmed;                   /* the run request has been withdrawn since the last fault */
     command_request_t last_request; /* of the previous tick */
     fault_record_t record;          /* in FAULT; fault FAULT_NONE in every other state */
@@ -42,6 +47,9 @@ fault_t state_machine_first_fault(uint64_t fault_mask);
 
 /* State INITIALISE, no fault. */
 void state_machine_reset(state_machine_t *state_machine);
+
+/* State FAULT, with these faults found at the start, after state_machine_reset. */
+void state_machine_start_in_fault(state_machine_t *state_machine, uint64_t fault_mask);
 
 /* First part of a tick: true when a run goes on, or begins, in which case nothing else is to be done. */
 static inline bool state_machine_runs(state_machine_t *state_machine, const state_machine_input_t *input) {

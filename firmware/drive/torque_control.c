@@ -6,9 +6,9 @@
 
 void torque_control_reset(const control_parameters_t *parameters, control_state_t *state) {
     bp_pid_clear_telemetry(&state->duty.pid);
+    ditc_hysteresis_reset(state->duty_q15);
     switch (parameters->torque_law) {
     case TORQUE_LAW_HYSTERESIS:
-        ditc_hysteresis_reset(state->duty_q15);
         break;
     case TORQUE_LAW_DUTY:
         pwm_ditc_reset(&parameters->duty, &state->duty);

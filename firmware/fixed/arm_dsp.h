@@ -42,6 +42,13 @@ static inline int32_t arm_smmlar(int32_t sum, int32_t a, int32_t b) {
     return result;
 }
 
+/* value, or 0 when it is negative. */
+static inline int32_t arm_usat31(int32_t value) {
+    int32_t saturated;
+    __asm__("usat %0, #31, %1" : "=r"(saturated) : "r"(value));
+    return saturated;
+}
+
 /* value saturated to `bits` bits with sign; bits is a constant. */
 #define ARM_SSAT(value, bits)                                                                                          \
     __extension__({                                                                                                    \

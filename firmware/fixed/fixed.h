@@ -77,6 +77,15 @@ static inline int32_t fixed_abs(int32_t value) {
     return fixed_subtract(value ^ sign, sign);
 }
 
+/* Value, or 0 when it is negative. */
+static inline int32_t fixed_non_negative(int32_t value) {
+#ifdef __ARM_FEATURE_DSP
+    return arm_usat31(value);
+#else
+    return value & ~(value >> 31);
+#endif
+}
+
 /* a * b, exact. Written as an instruction because the compiler otherwise sign-extends a factor of several products once
  * and multiplies 64-bit words. */
 static inline int64_t fixed_product(int32_t a, int32_t b) {

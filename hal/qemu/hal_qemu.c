@@ -4,6 +4,7 @@
 #include "hal_nvm.h"
 #include "hal_random.h"
 #include "hal_time.h"
+#include "hal_watchdog.h"
 
 /* The plugin identifies this store by the function's name: the function must be neither inlined nor cloned. */
 __attribute__((noipa)) void doorbell_ring(mailbox_command_t command) {
@@ -124,4 +125,18 @@ uint32_t hal_time_us(const hal_t *hal) {
 uint32_t hal_random_u32(hal_t *hal) {
     doorbell_ring(MAILBOX_RANDOM);
     return hal->mailbox.random;
+}
+
+hal_reset_cause_t hal_reset_cause(const hal_t *hal) {
+    return (hal_reset_cause_t)hal->mailbox.reset_cause;
+}
+
+void hal_watchdog_start(hal_t *hal) {
+    (void)hal;
+    doorbell_ring(MAILBOX_WATCHDOG_START);
+}
+
+void hal_watchdog_kick(hal_t *hal) {
+    (void)hal;
+    doorbell_ring(MAILBOX_WATCHDOG_KICK);
 }

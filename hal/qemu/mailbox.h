@@ -47,6 +47,8 @@ typedef enum {
     MAILBOX_NVM_PROGRAM,   /* takes nvm_page, nvm_word and nvm_value, returns accepted */
     MAILBOX_NVM_ERASE,     /* takes nvm_page, returns accepted */
     MAILBOX_RANDOM,        /* returns random */
+    MAILBOX_WATCHDOG_START,
+    MAILBOX_WATCHDOG_KICK,
 } mailbox_command_t;
 
 /* Result of MAILBOX_NEXT. */
@@ -100,6 +102,7 @@ typedef struct {
     uint32_t nvm_word;
     uint32_t nvm_value[2]; /* lower half first */
     uint32_t random;
+    uint32_t reset_cause; /* hal_reset_cause_t, of the last MAILBOX_RESET */
 } mailbox_t;
 
 #endif

@@ -43,7 +43,7 @@ def test_true_current_stays_below_1_2_times_the_trip_with_dead_or_weak_sensors(m
     bench.rig.current_sensor_gain = gain
     bench.run_for(0.05)
     assert bench.drive.state == "fault"
-    assert bench.drive.fault in ("hardware_over_current", "over_speed", "encoder")
+    assert bench.drive.fault in ("hardware_over_current", "over_speed", "encoder", "phase_open")
     peak_A = max(currents_A(bench, from_s))
     assert peak_A < 1.2 * TRIP_A
     if bench.drive.fault == "hardware_over_current":
@@ -52,7 +52,7 @@ def test_true_current_stays_below_1_2_times_the_trip_with_dead_or_weak_sensors(m
 
 
 @pytest.mark.parametrize("line", ["sto_1", "sto_2"])
-@pytest.mark.parametrize("interrupt_us", [0, 10000], ids=["healthy", "interrupt_hangs"])
+@pytest.mark.parametrize("interrupt_us", [0, 8000], ids=["healthy", "interrupt_hangs"])
 def test_either_line_of_safe_torque_off_opens_the_switches_at_once(bench, line, interrupt_us):
     running(bench)
     bench.rig.interrupt_time_us = interrupt_us

@@ -145,7 +145,19 @@ def test_ready_line_contains_the_conditions(start, tmp_path: Path) -> None:
     assert ready == {
         "ready": True, "can": f"unix:{tmp_path}/bus", "pid": process.pid, "machine": "saturating",
         "controller": "traditional", "control_rate_hz": 40000, "pace": "lockstep", "seed": 18446744073709551615,
+        "node": 0, "drives": 1,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    (["--node", "8"], "--node 8: must be a whole number from 0 to 7"),
+    (["--drives", "0"], "--drives 0: must be a whole number from 1 to 8"),
+    (["--node", "6", "--drives", "3"], "--drives 3: with --node 6 at most 2"),
+])  # fmt: skip
+def test_node_numbers_end_at_7(program: list[str], tmp_path: Path, options: list[str], message: str) -> None:
+    line = [*program, "--can", f"unix:{tmp_path}/bus", *options]
+    result = subprocess.run(line, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert (result.returncode, result.stderr) == (2, f"salient: {message}\n")
 
 
 def test_accepts_the_conditions_of_a_simulation(start) -> None:

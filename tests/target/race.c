@@ -168,6 +168,27 @@ void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t 
 }
 
 /* No checks of the background: they would read the pattern. */
+thermal_parameters_t thermal_configure(const int32_t *values) {
+    (void)values;
+    return (thermal_parameters_t){0};
+}
+
+bool thermal_sample(const thermal_parameters_t *parameters, thermal_t *thermal, const int32_t *current_q9,
+                    uint32_t time_us) {
+    (void)parameters, (void)thermal, (void)current_q9, (void)time_us;
+    return false;
+}
+
+int32_t thermal_torque_limit_q24(const thermal_parameters_t *parameters, const thermal_t *thermal) {
+    (void)parameters, (void)thermal;
+    return 0;
+}
+
+uint32_t thermal_faults(const thermal_t *thermal) {
+    (void)thermal;
+    return 0;
+}
+
 bool sto_monitor_failed(sto_monitor_t *monitor, uint32_t break_causes, uint32_t time_us) {
     (void)monitor, (void)break_causes, (void)time_us;
     return false;
@@ -176,6 +197,13 @@ bool sto_monitor_failed(sto_monitor_t *monitor, uint32_t break_causes, uint32_t 
 bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us) {
     (void)monitor, (void)input, (void)time_us;
     return false;
+}
+
+uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_t *tables,
+                            const phase_monitor_input_t *input, int32_t correction_q29[HAL_PHASES_MAX]) {
+    (void)monitor, (void)tables, (void)input;
+    memset(correction_q29, 0, HAL_PHASES_MAX * sizeof *correction_q29);
+    return 0;
 }
 
 /* No memory. */

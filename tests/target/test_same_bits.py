@@ -21,7 +21,8 @@ from salient.paths import BUILD, ROOT
 from salient.paths import MACHINES as MACHINE_FILES
 
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
-BUILDS = {machine: TARGET_BUILDS if machine in ("saturating", "finite_element") else TARGETS[1:] for machine in MACHINES}
+BUILDS = {"saturating": TARGET_BUILDS, "linear_cosine": TARGETS[1:], "linear_trapezoid": TARGETS[1:],
+          "finite_element": TARGET_BUILDS}
 """Builds of a machine: every optimisation level with three and with four phases; a table changes no code but constants,
 which the linked -O2 builds fold."""
 ROW_BYTES = 16

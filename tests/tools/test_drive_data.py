@@ -30,7 +30,7 @@ OTHERS = sorted((ROOT / "tools" / "examples" / "machines").glob("*.toml"))
 @pytest.mark.parametrize("path", BUNDLED, ids=lambda path: path.stem)
 def test_bundled_machines_keep_the_defaults_of_the_firmware(path):
     data = derive(load_machine(path))
-    own = {"inertia_kg_m2", "friction_Nm_s", "resistance_ohm"}
+    own = {"inertia_kg_m2", "friction_Nm_s", "resistance_ohm", "winding_current_A"}
     if path.stem == "finite_element":  # light: its reaching law is faster
         own |= {"smc_k", "smc_delta"}
         assert data.parameters["smc_k"] == pytest.approx(1213, rel=0.001)

@@ -22,10 +22,12 @@ extern "C" {
 #include "hal_pwm.h"
 #include "hal_random.h"
 #include "hal_time.h"
+#include "hal_watchdog.h"
 #include "rig/nvm.h"
 }
 #include "support/equal_parameters.h"
 #include "support/frames.h"
+#include "support/phase_map_results.h"
 
 struct hal {
     hal_adc_sample_t adc{};
@@ -47,6 +49,9 @@ struct hal {
     std::function<void()> after_critical_section; // interrupts that were masked
     unsigned deferred_requests = 0;
     hal_pwm_compare_t written{};
+    hal_reset_cause_t reset_cause = HAL_RESET_POWER;
+    unsigned watchdog_starts = 0, kicks = 0;
+    uint32_t kicked_us = 0;
     nvm_t nvm = erased();
     unsigned nvm_operations = 0; // in the present background call
 
@@ -76,6 +81,16 @@ uint32_t hal_random_u32(hal_t *hal) {
 }
 uint32_t hal_time_us(const hal_t *hal) {
     return hal->time_us;
+}
+hal_reset_cause_t hal_reset_cause(const hal_t *hal) {
+    return hal->reset_cause;
+}
+void hal_watchdog_start(hal_t *hal) {
+    hal->watchdog_starts++;
+}
+void hal_watchdog_kick(hal_t *hal) {
+    hal->kicks++;
+    hal->kicked_us = hal->time_us;
 }
 void hal_critical_enter(hal_t *hal) {
     EXPECT_FALSE(hal->critical) << "it does not nest";
@@ -181,8 +196,29 @@ class Drive : public testing::Test {
         for (int k = 0; k < count; k++) {
             hal.time_us += 25;
             drive_control_interrupt(&drive);
+            conduct();
             deferred_interrupt(&drive, &hal);
             drive_background(&drive);
+        }
+    }
+
+    // Currents of a rotor at standstill at the end of the period: what was written acts one period later.
+    void conduct() {
+        const double both_ticks = 2500.0;
+        for (unsigned phase = 0; phase < 3; phase++) {
+            const double duty = hal.open ? -1.0 : acting_ticks[phase] / both_ticks - 1.0;
+            acting_ticks[phase] = hal.open ? 0u : unsigned(hal.written.upper[phase] + hal.written.lower[phase]);
+            const double drop_V = drive.parameters.values[PARAMETER_RESISTANCE_OHM] / 16777216.0 *
+                                  hal.adc.phase_current_counts[phase] * 10.0 / 512.0;
+            flux_Wb[phase] = std::max(0.0, flux_Wb[phase] + (duty * 240.0 - drop_V) * 25e-6);
+            const uint32_t angle = (hal.encoder_counts << 15) * 4u - phase * 0x55555555u;
+            unsigned counts = 0;
+            for (unsigned bit = flux_Wb[phase] > 0.0 ? 2048 : 0; bit > 0; bit /= 2) {
+                const int32_t trial_q29 =
+                    phase_map_results::flux_q29(machine_tables, angle, int32_t(counts + bit) * 10);
+                counts += trial_q29 <= flux_Wb[phase] * 536870912.0 ? bit : 0;
+            }
+            hal.adc.phase_current_counts[phase] = uint16_t(counts);
         }
     }
 
@@ -261,6 +297,8 @@ class Drive : public testing::Test {
     hal_t hal;
     drive_t drive;
     uint8_t counter = 0;
+    double flux_Wb[3] = {};
+    unsigned acting_ticks[3] = {};
 };
 
 TEST_F(Drive, starts_the_timer_once_with_the_rate_s_period_and_the_machine_s_defaults) {
@@ -281,6 +319,58 @@ TEST_F(Drive, refuses_a_rate_that_the_timer_cannot_make_and_starts_nothing) {
         EXPECT_TRUE(other.starts.empty());
         EXPECT_EQ(other.writes, 0u);
     }
+}
+
+TEST_F(Drive, starts_the_watchdog_and_kicks_it_every_millisecond_while_everything_advances) {
+    EXPECT_EQ(hal.watchdog_starts, 1u);
+    periods(4000); // 100 ms
+    EXPECT_GE(hal.kicks, 98u);
+    EXPECT_LE(hal.kicks, 100u);
+}
+
+TEST_F(Drive, kicks_the_watchdog_no_more_when_one_of_the_three_stands_still) {
+    const std::vector<std::function<void()>> without = {
+        // Background, deferred interrupt, control interrupt.
+        [&] { drive_control_interrupt(&drive), deferred_interrupt(&drive, &hal); },
+        [&] { drive_control_interrupt(&drive), drive_background(&drive); },
+        [&] { drive_background(&drive); },
+    };
+    for (const std::function<void()> &step : without) {
+        hal = hal_t{};
+        SetUp();
+        periods(400);
+        const uint32_t stopped_us = hal.time_us;
+        for (int k = 0; k < 800; k++) {
+            hal.time_us += 25;
+            step();
+        }
+        EXPECT_LE(hal.kicked_us, stopped_us + WATCHDOG_KICK_US);
+        EXPECT_GE(hal.kicked_us, stopped_us - WATCHDOG_KICK_US);
+    }
+}
+
+TEST_F(Drive, after_a_reset_by_the_watchdog_is_in_fault_and_runs_only_when_cleared_and_armed) {
+    hal.reset_cause = HAL_RESET_WATCHDOG;
+    SetUp();
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_WATCHDOG);
+    hal.writes = 0;
+    for (int k = 0; k < 50; k++) { // a sender that simply continues
+        send(COMMAND_RUN);
+        periods(400);
+    }
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+    EXPECT_FALSE(drive.comms.commands.arming.armed);
+    EXPECT_EQ(hal.writes, 0u);
+    nvm_store_fault_t logged{};
+    ASSERT_TRUE(nvm_store_read_fault(&drive.store, &hal, 1, &logged));
+    EXPECT_EQ(logged.fault, FAULT_WATCHDOG);
+    send(COMMAND_CLEAR_FAULT);
+    periods(100);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    command(COMMAND_RUN);
+    periods(3);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
 }
 
 TEST_F(Drive, opens_the_switches_every_period_until_it_runs) {
@@ -396,7 +486,6 @@ TEST_F(Drive, one_frame_after_a_silence_does_not_start_it) {
 }
 
 TEST_F(Drive, four_bad_commands_end_the_run_with_the_record_of_the_moment) {
-    hal.adc.phase_current_counts[1] = 200;
     periods(100);
     command(COMMAND_RUN);
     run(0.05);
@@ -413,7 +502,8 @@ TEST_F(Drive, four_bad_commands_end_the_run_with_the_record_of_the_moment) {
     EXPECT_EQ(record.fault_mask, FAULT_BIT(FAULT_COMMAND_ERROR));
     EXPECT_EQ(record.state, DRIVE_STATE_RUN);
     EXPECT_EQ(record.time_us, hal.time_us);
-    EXPECT_EQ(record.current_max_q9, 2000);
+    EXPECT_EQ(record.current_max_q9, drive.control.measurement.current_max_q9);
+    EXPECT_GT(record.current_max_q9, 2000);
     EXPECT_EQ(record.torque_reference_q24, torque_q24);
     EXPECT_EQ(drive.control.torque_reference_q24, 0);
     const unsigned writes = hal.writes;
@@ -421,7 +511,7 @@ TEST_F(Drive, four_bad_commands_end_the_run_with_the_record_of_the_moment) {
     EXPECT_EQ(hal.writes, writes);
     EXPECT_EQ(drive.command.request, COMMAND_OFF);
     send(COMMAND_CLEAR_FAULT);
-    periods(3);
+    periods(305); // since the fault 10 ms
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
 }
 
@@ -499,7 +589,7 @@ TEST_F(Drive, break_of_the_pwm_is_a_fault_that_lasts_as_long_as_its_cause) {
         command(COMMAND_OFF);
         periods(3);
         command(COMMAND_CLEAR_FAULT);
-        periods(3);
+        periods(405);
         EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
     }
 }
@@ -929,6 +1019,7 @@ TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_c
     hal.after_critical_section = [&] {
         hal.time_us += 25;
         drive_control_interrupt(&drive);
+        conduct();
         deferred_interrupt(&drive, &hal);
         if (!ran && drive.control.state_machine.state == DRIVE_STATE_RUN) {
             ran = true;
@@ -1048,54 +1139,60 @@ TEST_F(Drive, random_frames_change_parameters_only_as_a_whole_checked_set_of_an_
 }
 
 TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
-    hal.adc.phase_current_counts[0] = 100;
-    hal.adc.phase_current_counts[1] = 200;
-    hal.adc.phase_current_counts[2] = 300;
     periods(100);
     command(COMMAND_RUN);
     periods(1000);
     hal.from_drive.clear();
-    periods(400); // a whole slow cycle
     const control_state_t &control = drive.control;
     unsigned seen = 0;
-    for (const hal_can_frame_t &frame : hal.from_drive) {
-        if (frame.identifier == DRIVE_STATUS_FRAME_ID) {
-            drive_status_t status{};
-            drive_status_unpack(&status, frame.data, frame.length);
-            EXPECT_EQ(status.state, DRIVE_STATE_RUN);
-            EXPECT_EQ(status.controller, DRIVE_CONTROLLER_PAPER);
-            EXPECT_EQ(status.fault, FAULT_NONE);
-            seen |= 1;
-        } else if (frame.identifier == DRIVE_TORQUE_FRAME_ID) {
-            // Rotor at standstill, currents held: the frame is the same in every cycle.
-            drive_torque_t torque{};
-            drive_torque_unpack(&torque, frame.data, frame.length);
-            EXPECT_EQ(torque.torque_reference_nm, (control.torque_reference_q24 + 32768) >> 16);
-            EXPECT_EQ(torque.torque_estimate_nm, (control.measurement.torque_sum_q24 + 32768) >> 16);
-            EXPECT_EQ(torque.bus_voltage_v, 240 << 6);
-            seen |= 2;
-        } else if (frame.identifier == DRIVE_CURRENTS_FRAME_ID) {
-            drive_currents_t currents{};
-            drive_currents_unpack(&currents, frame.data, frame.length);
-            EXPECT_EQ(currents.current_a_a, 1000);
-            EXPECT_EQ(currents.current_b_a, 2000);
-            EXPECT_EQ(currents.current_c_a, 3000);
-            EXPECT_EQ(currents.current_d_a, 0);
-            seen |= 4;
-        } else if (frame.identifier == DRIVE_BP_PID_FRAME_ID) {
-            // Gains per N m: those per scaled error over the scale.
-            drive_bp_pid_t pid{};
-            drive_bp_pid_unpack(&pid, frame.data, frame.length);
-            const double inverse = drive.control_parameters.duty.pid.error_scale_inverse_q24 / 16777216.0;
-            EXPECT_NEAR(pid.kp_per_nm, drive.control.duty.pid.gain_q24[0] / 512.0 * inverse, 0.51);
-            EXPECT_NEAR(pid.ki_per_nm, drive.control.duty.pid.gain_q24[1] / 512.0 * inverse, 0.51);
-            EXPECT_NEAR(pid.kd_per_nm, drive.control.duty.pid.gain_q24[2] / 512.0 * inverse, 0.51);
-            EXPECT_NE(pid.kp_per_nm, pid.ki_per_nm);
-            EXPECT_NE(pid.ki_per_nm, pid.kd_per_nm);
-            seen |= 8;
+    unsigned most_counts[3] = {};
+    for (int k = 0; k < 400; k++) { // a whole slow cycle
+        const hal_adc_sample_t sampled = hal.adc;
+        periods(1);
+        std::vector<hal_can_frame_t> sent;
+        std::swap(sent, hal.from_drive);
+        for (const hal_can_frame_t &frame : sent) {
+            if (frame.identifier == DRIVE_STATUS_FRAME_ID) {
+                drive_status_t status{};
+                drive_status_unpack(&status, frame.data, frame.length);
+                EXPECT_EQ(status.state, DRIVE_STATE_RUN);
+                EXPECT_EQ(status.controller, DRIVE_CONTROLLER_PAPER);
+                EXPECT_EQ(status.fault, FAULT_NONE);
+                seen |= 1;
+            } else if (frame.identifier == DRIVE_TORQUE_FRAME_ID) {
+                drive_torque_t torque{};
+                drive_torque_unpack(&torque, frame.data, frame.length);
+                EXPECT_EQ(torque.torque_reference_nm, (control.torque_reference_q24 + 32768) >> 16);
+                EXPECT_EQ(torque.torque_estimate_nm, (control.measurement.torque_sum_q24 + 32768) >> 16);
+                EXPECT_EQ(torque.bus_voltage_v, 240 << 6);
+                seen |= 2;
+            } else if (frame.identifier == DRIVE_CURRENTS_FRAME_ID) {
+                drive_currents_t currents{};
+                drive_currents_unpack(&currents, frame.data, frame.length);
+                EXPECT_EQ(currents.current_a_a, sampled.phase_current_counts[0] * 10);
+                most_counts[0] = std::max(most_counts[0], unsigned(sampled.phase_current_counts[0]));
+                EXPECT_EQ(currents.current_b_a, sampled.phase_current_counts[1] * 10);
+                most_counts[1] = std::max(most_counts[1], unsigned(sampled.phase_current_counts[1]));
+                EXPECT_EQ(currents.current_c_a, sampled.phase_current_counts[2] * 10);
+                most_counts[2] = std::max(most_counts[2], unsigned(sampled.phase_current_counts[2]));
+                EXPECT_EQ(currents.current_d_a, 0);
+                seen |= 4;
+            } else if (frame.identifier == DRIVE_BP_PID_FRAME_ID) {
+                // Gains per N m: those per scaled error over the scale.
+                drive_bp_pid_t pid{};
+                drive_bp_pid_unpack(&pid, frame.data, frame.length);
+                const double inverse = drive.control_parameters.duty.pid.error_scale_inverse_q24 / 16777216.0;
+                EXPECT_NEAR(pid.kp_per_nm, drive.control.duty.pid.gain_q24[0] / 512.0 * inverse, 0.51);
+                EXPECT_NEAR(pid.ki_per_nm, drive.control.duty.pid.gain_q24[1] / 512.0 * inverse, 0.51);
+                EXPECT_NEAR(pid.kd_per_nm, drive.control.duty.pid.gain_q24[2] / 512.0 * inverse, 0.51);
+                EXPECT_NE(pid.kp_per_nm, pid.ki_per_nm);
+                EXPECT_NE(pid.ki_per_nm, pid.kd_per_nm);
+                seen |= 8;
+            }
         }
     }
     EXPECT_EQ(seen, 15u);
+    EXPECT_GT(*std::max_element(most_counts, most_counts + 3), 200u);
 }
 
 TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
@@ -1224,10 +1321,10 @@ TEST_F(Drive, a_frame_of_another_node_with_an_identifier_of_the_drive_is_a_fault
     const auto clear = [this] {
         command(COMMAND_OFF);
         command(COMMAND_CLEAR_FAULT);
-        periods(10);
+        periods(405);
         return drive.control.state_machine.state;
     };
-    periods(1000000 / 25 - 100);
+    periods(1000000 / 25 - 500);
     EXPECT_EQ(clear(), DRIVE_STATE_FAULT) << "its cause has not gone";
     periods(200);
     EXPECT_EQ(clear(), DRIVE_STATE_READY);

@@ -169,7 +169,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
     EXPECT_GT(running, uint64_t(SEQUENCES) * PERIODS / 20);
     EXPECT_GT(driven, running / 20);
     EXPECT_GT(faults, uint64_t(SEQUENCES) / 4);
-    EXPECT_GT(cleared, uint64_t(SEQUENCES) / 20);
+    EXPECT_GT(cleared, uint64_t(SEQUENCES) / 200); // few have 10 ms without a cause
     EXPECT_GT(tuned, uint64_t(SEQUENCES) / 2);
 }
 

@@ -329,4 +329,19 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
     }
 }
 
+TEST(FullLink, limits_the_braking_torque_linearly_over_the_last_volts_and_to_zero_above) {
+    conduction_parameters_t parameters{};
+    parameters.full_link_q6 = to_fixed(295.0, Q6);
+    parameters.full_link_range_q6 = to_fixed(5.0, Q6);
+    parameters.full_link_slope_q18 = (20 << 24) / parameters.full_link_range_q6;
+    EXPECT_EQ(conduction_braking_q24(&parameters, 0), INT32_MAX);
+    EXPECT_EQ(conduction_braking_q24(&parameters, to_fixed(289.9, Q6)), INT32_MAX);
+    for (const double room_V : {5.0, 4.0, 2.5, 1.0, 0.25}) {
+        EXPECT_NEAR(conduction_braking_q24(&parameters, to_fixed(295.0 - room_V, Q6)) / 16777216.0, 4.0 * room_V,
+                    0.001);
+    }
+    EXPECT_EQ(conduction_braking_q24(&parameters, to_fixed(295.0, Q6)), 0);
+    EXPECT_EQ(conduction_braking_q24(&parameters, to_fixed(511.9, Q6)), 0);
+}
+
 } // namespace

@@ -278,7 +278,7 @@ TEST_F(Control, a_restart_after_a_fault_requires_clearing_and_a_withdrawn_run_re
     sample.adc.phase_current_counts[0] = 4000;
     EXPECT_FALSE(step(COMMAND_RUN));
     sample.adc.phase_current_counts[0] = 0;
-    for (int k = 0; k < 100; k++) {
+    for (int k = 0; k < 400; k++) {
         EXPECT_FALSE(step(COMMAND_RUN));
     }
     EXPECT_FALSE(step(COMMAND_CLEAR_FAULT));
@@ -298,6 +298,9 @@ TEST_F(Control, clearing_a_fault_on_a_turning_rotor_causes_no_over_speed_fault) 
         sample.adc.phase_current_counts[0] = 4000;
         step(COMMAND_OFF);
         sample.adc.phase_current_counts[0] = 0;
+        for (int k = 0; k < 400; k++) {
+            step(COMMAND_OFF);
+        }
         ASSERT_EQ(state.state_machine.state, DRIVE_STATE_FAULT);
         step(COMMAND_CLEAR_FAULT);
         for (int k = 0; k < 4000; k++) {

@@ -1,5 +1,6 @@
 // Every state with every input, and the conditions for a restart after a fault.
 #include <cstdint>
+#include <vector>
 
 #include <gtest/gtest.h>
 
@@ -12,6 +13,7 @@ namespace {
 constexpr uint32_t INITIALISE_TICKS = 5;
 constexpr uint64_t TIMEOUT = FAULT_BIT(FAULT_COMMAND_TIMEOUT);
 constexpr uint64_t EVERY_CHECK = FAULT_BIT(FAULT_COUNT) - FAULT_BIT(FAULT_OVER_CURRENT);
+constexpr uint32_t CAUSE_GONE_TICKS = STATE_MACHINE_CAUSE_GONE_MS * INITIALISE_TICKS;
 const command_request_t REQUESTS[] = {COMMAND_OFF, COMMAND_RUN, COMMAND_STOP, COMMAND_CLEAR_FAULT};
 
 // True in the tick that latches a fault.
@@ -25,7 +27,7 @@ struct expected_t {
     bool latched;
 };
 
-// The diagram of state_machine.h. INITIALISE is in its last tick.
+// The diagram of state_machine.h. INITIALISE is in its last tick, and a cause has been gone for long enough.
 expected_t expected(drive_state_t state, uint64_t fault_mask, command_request_t request, bool at_standstill,
                     bool rearmed) {
     const uint64_t all_but_timeout = fault_mask & ~TIMEOUT;
@@ -61,15 +63,27 @@ fault_t lowest(uint64_t fault_mask) {
     return FAULT_NONE;
 }
 
+// No check, each one, every two of them, all: the transitions distinguish the command timeout alone.
+std::vector<uint64_t> fault_masks() {
+    std::vector<uint64_t> masks = {0, EVERY_CHECK, EVERY_CHECK & ~TIMEOUT};
+    for (int one = FAULT_NONE + 1; one < FAULT_COUNT; one++) {
+        for (int other = one; other < FAULT_COUNT; other++) {
+            masks.push_back(FAULT_BIT(one) | FAULT_BIT(other));
+        }
+    }
+    return masks;
+}
+
 TEST(StateMachineTable, every_state_fault_mask_request_and_flag_has_the_documented_transition) {
     for (int state = DRIVE_STATE_INITIALISE; state <= DRIVE_STATE_FAULT; state++) {
-        for (uint64_t fault_mask = 0; fault_mask <= EVERY_CHECK; fault_mask += 2) { // bit 0 is FAULT_NONE
+        for (const uint64_t fault_mask : fault_masks()) {
             for (const command_request_t request : REQUESTS) {
                 for (const bool at_standstill : {false, true}) {
                     for (const bool rearmed : {false, true}) {
                         state_machine_t state_machine{};
                         state_machine.state = drive_state_t(state);
-                        state_machine.fault_free_ticks = INITIALISE_TICKS - 1;
+                        state_machine.fault_free_ticks =
+                            state == DRIVE_STATE_FAULT ? CAUSE_GONE_TICKS : INITIALISE_TICKS - 1;
                         state_machine.rearmed = rearmed;
                         const fault_record_t old = {
                             .fault = FAULT_ENCODER,
@@ -123,6 +137,12 @@ class StateMachine : public testing::Test {
             .fault_mask = fault_mask, .request = request, .at_standstill = at_standstill};
         tick(state_machine, input);
         return state_machine.state;
+    }
+
+    void wait_until_the_cause_is_gone(command_request_t request = COMMAND_OFF) {
+        for (uint32_t k = 0; k < CAUSE_GONE_TICKS; k++) {
+            step(request);
+        }
     }
 
     void run() {
@@ -189,7 +209,7 @@ TEST_F(StateMachine, the_record_keeps_the_first_fault) {
     EXPECT_EQ(state_machine.record.fault, FAULT_OVER_SPEED);
     EXPECT_EQ(state_machine.record.fault_mask, FAULT_BIT(FAULT_OVER_SPEED) | FAULT_BIT(FAULT_ENCODER));
     EXPECT_EQ(state_machine.record.state, DRIVE_STATE_RUN);
-    step(COMMAND_OFF);
+    wait_until_the_cause_is_gone();
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
     EXPECT_EQ(state_machine.record.fault, FAULT_NONE);
 }
@@ -202,6 +222,7 @@ TEST_F(StateMachine, after_a_fault_the_run_request_must_be_withdrawn_before_a_re
     }
     EXPECT_EQ(step(COMMAND_OFF), DRIVE_STATE_FAULT);
     EXPECT_EQ(step(COMMAND_RUN), DRIVE_STATE_FAULT);
+    wait_until_the_cause_is_gone();
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
     EXPECT_EQ(step(COMMAND_RUN), DRIVE_STATE_RUN);
 }
@@ -211,15 +232,43 @@ TEST_F(StateMachine, a_persistent_clear_fault_clears_only_once) {
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT, FAULT_BIT(FAULT_OVER_VOLTAGE)), DRIVE_STATE_FAULT);
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << "the cause disappeared after the request";
+    wait_until_the_cause_is_gone(COMMAND_CLEAR_FAULT);
+    EXPECT_EQ(state_machine.state, DRIVE_STATE_FAULT);
     step(COMMAND_OFF);
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT, FAULT_BIT(FAULT_ENCODER)), DRIVE_STATE_FAULT);
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << "a later fault is not cleared";
 }
 
+TEST_F(StateMachine, a_fault_is_cleared_when_its_cause_has_been_gone_for_ten_milliseconds) {
+    run();
+    step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
+    step(COMMAND_OFF, FAULT_BIT(FAULT_OVER_VOLTAGE));
+    for (uint32_t k = 0; k < CAUSE_GONE_TICKS; k++) {
+        ASSERT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << k;
+    }
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY) << "the request waits";
+}
+
+TEST_F(StateMachine, a_cause_that_returns_within_ten_milliseconds_cancels_the_request_to_clear) {
+    run();
+    step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
+    step(COMMAND_CLEAR_FAULT);
+    for (uint32_t k = 2; k < CAUSE_GONE_TICKS; k++) {
+        ASSERT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << k;
+    }
+    step(COMMAND_CLEAR_FAULT, FAULT_BIT(FAULT_UNDER_VOLTAGE));
+    for (uint32_t k = 0; k < 3 * CAUSE_GONE_TICKS; k++) {
+        ASSERT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << k;
+    }
+    step(COMMAND_OFF);
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
+}
+
 TEST_F(StateMachine, a_recurring_fault_requires_the_run_request_to_be_withdrawn_again) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
+    wait_until_the_cause_is_gone();
     step(COMMAND_CLEAR_FAULT);
     step(COMMAND_RUN);
     ASSERT_EQ(state_machine.state, DRIVE_STATE_RUN);

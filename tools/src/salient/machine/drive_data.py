@@ -294,6 +294,10 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
         "inertia_kg_m2": (inertia, "mechanics.inertia_kg_m2"),
         "friction_Nm_s": (machine.friction_Nm_s, "mechanics.friction_Nm_s"),
         "resistance_ohm": (machine.resistance_ohm, "winding.resistance_ohm"),
+        "winding_current_A": (0.8 * data["current_rated_A"],
+                              "0.8 current_rated_A: a turning machine has each phase on for about half of the time"),
+        "winding_time_constant_s": (round(data["thermal_time_constant_s"]), "thermal_time_constant_s"),
+        "switch_current_A": (peak_A / math.sqrt(1.5), "current_peak_A / sqrt(1.5)"),
     }
 
 

@@ -104,7 +104,7 @@ class PhaseMap:
         starts = [int(start) * (_HALF_PITCH // ROW_UNITS) for start in self.row_start]
         widths = [following - start for start, following in pairwise(starts)]
         last = (starts[-1], 0)
-        return [*zip(starts, ((1 << 46) // width for width in widths)), last, last]
+        return [*((start, (1 << 46) // width) for start, width in zip(starts[:-1], widths, strict=True)), last, last]
 
     def angle_bin_row(self) -> np.ndarray:
         """(ANGLE_BINS,): the row in which each angle bin begins."""

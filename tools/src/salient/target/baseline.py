@@ -23,10 +23,10 @@ from salient.target.static_checks import deepest_stack, size
 FILE = ROOT / "tests" / "target" / "baseline.toml"
 MACHINE = "saturating"
 README = ROOT / "firmware" / "README.md"
-FLASH_MAX_BYTES = 44 * 1024
+FLASH_MAX_BYTES = 52 * 1024
 """Limit of the firmware with the tables of one machine; cmake/check_size.cmake enforces it."""
-RAM_MAX_BYTES = 9 * 1024
-"""Limit of variables and stack."""
+RAM_MAX_BYTES = 11 * 1024
+"""Limit of variables and stack, with the 2 KiB of the fault trace."""
 
 BOUND_KEYS = {"cortex-m4": "computed_bound", "rv32": "computed_bound_rv32"}
 """Keys of the computed bounds in the tables of the interrupts, by build."""

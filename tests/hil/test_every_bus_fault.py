@@ -1,7 +1,4 @@
-"""The faults of the emulated bus on either transport.
-
-On SocketCAN the bus is emulated between drive and interface: what clients send is on the interface at once, and reaches
-the drive as the emulated bus delivers it. So every fault acts on the drive there, too; none is without an effect."""
+"""Every fault of the emulated bus is answered with done and acts, or is refused; none is without an effect."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import pytest
 
 from salient.bench.rig import RigError, bench_variables
 
-pytestmark = [pytest.mark.both_transports, pytest.mark.bench_options(telemetry_period_ms=4)]
+pytestmark = pytest.mark.bench_options(telemetry_period_ms=4)
 BUS_FAULTS = {"frame_fault", "frame_fault_per_mille", "frame_fault_sender", "frame_delay_us", "bus_connection",
               "transmit_error_counter", "babble_load_percent", "babble_identifier", "babble_length"}
 OF_ALL, OF_DRIVE, OF_OTHERS = 0, 1, 2

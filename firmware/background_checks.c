@@ -1,0 +1,128 @@
+#include "background_checks.h"
+
+#include "control/modulator.h"
+#include "drive/deferred.h"
+#include "fixed/compiler.h"
+#include "fixed/fixed.h"
+#include "hal_time.h"
+
+static stall_input_t stall_input(const drive_t *drive) {
+    const control_state_t *control = &drive->control;
+    const deferred_speed_results_t *speed = &deferred_in_effect(control)->speed;
+    return (stall_input_t){
+        .speed_mode = control->state_machine.state == DRIVE_STATE_RUN && control->deferred.mode == DRIVE_MODE_SPEED,
+        .speed_reference_q22 = speed->speed_reference_q22,
+        .speed_q22 = control->observer.speed_q22,
+        .torque_reference_q24 = control->torque_reference_q24,
+        .torque_min_q24 = speed->torque_min_q24,
+        .torque_max_q24 = speed->torque_max_q24,
+    };
+}
+
+/* The last sample, and what the integrals of the voltage were at it. */
+static phase_monitor_input_t phase_monitor_input(const drive_t *drive) {
+    const control_state_t *control = &drive->control;
+    const control_parameters_t *parameters = &drive->control_parameters;
+    const control_measurement_t *measured = &control->measurement;
+    const predictive_torque_parameters_t *constants = &parameters->predictive;
+    phase_monitor_input_t input = {
+        .run = control->state_machine.state == DRIVE_STATE_RUN,
+        .late_interrupts = control->protection.late_interrupts,
+        .periods = control->deferred_request.requests + control->deferred_request.skipped_total,
+        .periods_per_ms = parameters->initialise_ticks,
+        .electrical = measured->commutation.electrical,
+        .stroke = parameters->commutation.stroke,
+        .period_flux_q29 = applied_flux_period_q29(measured->dc_link_voltage_q6, constants->period_q40),
+        .resistance_period_q40 = constants->flux.resistance_period_q40,
+    };
+    const int32_t *misalignment = deferred_in_effect(control)->predictive.misalignment;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        input.misalignment[phase] = misalignment[phase];
+        input.current_q9[phase] = measured->current_q9[phase];
+        input.flux_q29[phase] = control->applied_flux.at_sample_q29[phase];
+        input.off[phase] = control->duty_q15[phase] == -MODULATOR_DUTY_ONE_Q15;
+    }
+    return input;
+}
+
+/* Of the sample of `input`; the integrals without the corrections that the other monitor has made. */
+static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input, const phase_monitor_t *phases,
+                                             uint32_t encoder_angle) {
+    encoder_monitor_input_t encoder = {
+        .run = input->run,
+        .encoder_angle = encoder_angle,
+        .flux_step_max_q29 = input->period_flux_q29,
+        .period = input->periods,
+    };
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        const phase_monitor_phase_t *state = &phases->phase[phase];
+        encoder.current_q9[phase] = input->current_q9[phase];
+        encoder.flux_q29[phase] = fixed_subtract(input->flux_q29[phase], state->followed_q29);
+        encoder.zero_at[phase] = state->zero_at;
+        encoder.known[phase] = input->periods - state->zero_at < input->periods - phases->lost_at;
+    }
+    return encoder;
+}
+
+/* Checks phases and encoder, and corrects the integrals. */
+COLD static uint32_t check_flux(drive_t *drive) {
+    control_state_t *control = &drive->control;
+    hal_critical_enter(drive->hal);
+    const phase_monitor_input_t input = phase_monitor_input(drive);
+    const uint32_t encoder_angle = control->measurement.encoder_angle;
+    hal_critical_leave(drive->hal);
+    const encoder_monitor_input_t encoder = encoder_input(&input, &drive->phases, encoder_angle);
+    encoder_monitor_step(&drive->control_parameters.encoder_monitor, &drive->encoder, &encoder);
+    int32_t correction_q29[HAL_PHASES_MAX];
+    const uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, &input, correction_q29);
+    hal_critical_enter(drive->hal);
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        int32_t *next_q29 = &control->applied_flux.next_q29[phase];
+        *next_q29 = fixed_clamp(fixed_add(*next_q29, correction_q29[phase]), 0, INT32_MAX);
+    }
+    hal_critical_leave(drive->hal);
+    return failed;
+}
+
+/* Each current is one word: a control interrupt in between changes none while it is read. */
+COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
+    if (thermal_sample(&drive->thermal_parameters, &drive->thermal, drive->control.measurement.current_q9, time_us)) {
+        drive->control.torque_limit_q24 = thermal_torque_limit_q24(&drive->thermal_parameters, &drive->thermal);
+    }
+}
+
+COLD void background_checks(drive_t *drive, uint32_t time_us) {
+    follow_heat(drive, time_us);
+    hal_critical_enter(drive->hal);
+    const stall_input_t stall = stall_input(drive);
+    hal_critical_leave(drive->hal);
+    uint64_t failed = check_flux(drive);
+    if (sto_monitor_failed(&drive->sto, drive->break_causes, time_us)) {
+        failed |= FAULT_BIT(FAULT_STO_DISCREPANCY);
+    }
+    if (stall_monitor_failed(&drive->stall, &stall, time_us)) {
+        failed |= FAULT_BIT(FAULT_STALL);
+    }
+    if (drive->encoder.frozen) {
+        failed |= FAULT_BIT(FAULT_ENCODER);
+    }
+    if (drive->encoder.angle) {
+        failed |= FAULT_BIT(FAULT_ENCODER_ANGLE);
+    }
+    if (drive->encoder.over_speed) {
+        failed |= FAULT_BIT(FAULT_OVER_SPEED);
+    }
+    failed |= thermal_faults(&drive->thermal);
+    if (drive->comms.bus.conflict) {
+        failed |= FAULT_BIT(FAULT_IDENTIFIER_CONFLICT);
+    }
+    if (drive->store.inhibited) { /* since the start; inhibits the first one only */
+        failed |= FAULT_BIT(FAULT_PARAMETER_MEMORY);
+    }
+    if (drive->control.state_machine.state != DRIVE_STATE_RUN) {
+        drive->comms.commands.failed = false;
+    } else if (drive->comms.commands.failed) {
+        failed |= FAULT_BIT(FAULT_COMMAND_ERROR);
+    }
+    drive->control.reported_fault_mask = (uint32_t)failed;
+}

@@ -1,0 +1,16 @@
+/* The operation fault_trace of PARAMETER_REQUEST: reads the control periods before a fault (drive/fault_trace.h). */
+#ifndef COMMS_TRACE_PROTOCOL_H
+#define COMMS_TRACE_PROTOCOL_H
+
+#include <stdbool.h>
+
+#include "drive/control.h"
+#include "drive/fault_trace.h"
+#include "hal_can.h"
+
+/* Executes a request and writes its response; false, with nothing done, when it is one of another operation. The
+ * response repeats operation, index and part. frame must have passed commands_receive. [background] */
+bool trace_protocol_respond(const fault_trace_t *trace, const control_parameters_t *parameters,
+                            const hal_can_frame_t *frame, hal_can_frame_t *response_frame);
+
+#endif

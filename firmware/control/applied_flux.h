@@ -1,0 +1,49 @@
+/* Flux linkage that the applied voltage has built up in each phase: the integral of Faraday's law alone, from the
+ * duties, whatever the current sensors say but for the resistive drop.
+ *
+ *   psi(k+1) = max(0, psi(k) + Ts (duty Vdc - R i))       forward Euler; the diodes block reverse current
+ *
+ * Both switches off are the duty -1: full opposite voltage until the flux linkage has gone. A phase that is off once in
+ * an electrical revolution begins at 0 each time. Drops of the devices and errors of R and Vdc accumulate; the caller
+ * corrects the integral by what it knows of the flux linkage (drive/phase_monitor.h). */
+#ifndef CONTROL_APPLIED_FLUX_H
+#define CONTROL_APPLIED_FLUX_H
+
+#include <stdint.h>
+
+#include "fixed/compiler.h"
+#include "fixed/fixed.h"
+#include "hal.h"
+
+typedef struct {
+    int32_t at_sample_q29[HAL_PHASES_MAX]; /* at the last sample, Wb, Q2.29, >= 0 */
+    int32_t next_q29[HAL_PHASES_MAX];      /* at the coming sample, Wb, Q2.29, >= 0 */
+} applied_flux_t;
+
+/* Vdc Ts, Wb, Q2.29. dc_link_voltage_q6: V, Q9.6, below 2^16; period_q40: Ts, s, Q-9.40. */
+ALWAYS_INLINE int32_t applied_flux_period_q29(int32_t dc_link_voltage_q6, int32_t period_q40) {
+    return fixed_multiply_high(dc_link_voltage_q6 << 15, period_q40);
+}
+
+/* One period, which begins with the sample. duty_q15: acts in this period, -32768..32768; current_q9: A, Q7.9, below
+ * 2^16; period_flux_q29: Vdc Ts, below 2^27; resistance_period_q40: R Ts, ohm s, Q-9.40. Both products are rounded to 1
+ * LSB, the sum saturates. */
+ALWAYS_INLINE void applied_flux_step(applied_flux_t *flux, unsigned phases, const int32_t *duty_q15,
+                                     const int32_t *current_q9, int32_t period_flux_q29,
+                                     int32_t resistance_period_q40) {
+    const int32_t full_q32 = period_flux_q29 * 8;
+    const int32_t against_q40 = -resistance_period_q40;
+    /* The compiler needs to see the bound where it unrolls the loop without knowing the tables. */
+    const unsigned count = phases < HAL_PHASES_MAX ? phases : HAL_PHASES_MAX;
+    UNROLL(4)
+    for (unsigned phase = 0; phase < count; phase++) {
+        const int32_t now_q29 = flux->next_q29[phase];
+        const int32_t gained_q29 = fixed_multiply_high(duty_q15[phase] * (1 << 14), full_q32); /* Q15 Q29 to Q29 */
+        const int32_t change_q29 = fixed_multiply_high_add(gained_q29, current_q9[phase] << 12, against_q40);
+        const int32_t then_q29 = fixed_add(now_q29, change_q29);
+        flux->at_sample_q29[phase] = now_q29;
+        flux->next_q29[phase] = fixed_non_negative(then_q29);
+    }
+}
+
+#endif

@@ -1,0 +1,239 @@
+#include "drive/encoder_monitor.h"
+
+#include "control/machine_tables.h"
+#include "control/phase_map.h"
+#include "fixed/compiler.h"
+#include "fixed/fixed.h"
+#include "fixed/formats.h"
+
+/* Time constant of the leak of the reference, and time over which the error of the voltage adds up in it: 1/256 s. */
+#define LEAK_SHIFT 8
+
+/* Error of the flux linkage by the shape of the tables: 1/64. */
+#define SHAPE_SHIFT 6
+
+/* Once the rotor has been seen to move in a run, a larger error of the voltage is none: the currents follow the torque,
+ * and pulses that are too short for the devices act in some periods and not in others. */
+#define MOVING_FACTOR 2u
+
+/* Error of the flux linkage by gains of sensors and machine: 1/8. */
+#define GAIN_SHIFT 3
+
+/* Error of a current, A, Q7.9: 0.75 A. */
+#define CURRENT_ERROR_Q9 384
+
+/* Time for which they have parted that shows a frozen encoder: 1/2048 s, in which a current that a sensor does not show
+ * trips the comparators first. */
+#define FROZEN_SHIFT 11
+
+/* Periods of a contradiction in succession that are one. */
+#define PERSISTENT_PERIODS 4
+
+/* Phases that contradict the angle within 1/4 s; or one for as long as 1/256 s, when no other conducts. */
+#define CONTRADICTING_PHASES 2
+#define SHOWN_SHIFT 2
+#define ALONE_SHIFT 8
+
+/* Time without a zero of the current after which an integral is too old to contradict the angle: 1/128 s. */
+#define AGE_SHIFT 7
+
+/* Window for the speed: 1/2048 s. */
+#define WINDOW_SHIFT 11
+
+/* Mechanical angle in which a free rotor at the torque limit reaches the speed whose back-EMF is the error of the
+ * voltage that is none, twice, in rad: 4 degrees, Q20. */
+#define TWICE_ANGLE_Q20 73204
+
+/* 2^20 rad/s^2: 52 N m on 5e-5 kg m^2. */
+#define ACCELERATION_MAX (INT64_C(1) << 20)
+
+/* Flux linkage by the tables, Wb, Q2.29, at a distance from the unaligned position. */
+static int32_t table_flux_q29(uint32_t distance, int32_t current_q9) {
+    const int32_t limited_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
+    const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, distance);
+    const phase_map_nodes_t nodes = phase_map_nodes(&lookup, (uint32_t)limited_q9 >> MACHINE_COLUMN_BITS);
+    const int32_t flux =
+        phase_map_between(phase_map_flux_value_q14(&lookup, &nodes, 0),
+                          phase_map_flux_value_q14(&lookup, &nodes, MACHINE_TO_NEXT_COLUMN), limited_q9);
+    return phase_map_scale(&machine_tables.flux_format, flux);
+}
+
+/* Least and largest flux linkage within `width` of an angle, at a current less or more its error. */
+typedef struct {
+    int32_t least_q29, most_q29;
+} flux_range_t;
+
+static flux_range_t flux_range(uint32_t angle, uint32_t width, int32_t current_q9, int32_t current_error_q9) {
+    const uint32_t distance = phase_map_distance(angle);
+    const uint32_t near = distance > width ? distance - width : 0;
+    const uint32_t far = distance + width < HALF_REV ? distance + width : HALF_REV - 1u;
+    return (flux_range_t){
+        .least_q29 = table_flux_q29(near, current_q9 - current_error_q9),
+        .most_q29 = table_flux_q29(far, current_q9 + current_error_q9),
+    };
+}
+
+/* Square root, rounded down. */
+static uint32_t square_root(uint64_t square) {
+    uint32_t root = 0;
+    for (uint32_t bit = UINT32_C(1) << 31; bit != 0; bit >>= 1) {
+        const uint64_t larger = root | bit;
+        root = larger * larger <= square ? (uint32_t)larger : root;
+    }
+    return root;
+}
+
+int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9, int32_t angle_step_q32,
+                                       uint32_t rotor_poles) {
+    const int64_t clamped = acceleration < ACCELERATION_MAX ? acceleration : ACCELERATION_MAX;
+    const uint64_t square_q22 = (uint64_t)clamped * TWICE_ANGLE_Q20 * 4u >> machine_tables.speed_exponent;
+    const int32_t speed_q22 = fixed_saturate((int64_t)square_root(square_q22) << 11);
+    const uint32_t step = (uint32_t)fixed_multiply_high(speed_q22, angle_step_q32) * rotor_poles;
+    const int32_t rise_q29 =
+        fixed_subtract(table_flux_q29(HALF_REV - 1u, current_q9), table_flux_q29(0, current_q9)) / 2;
+    return 2 * fixed_multiply_high(rise_q29, (int32_t)step);
+}
+
+/* First-order step of a value towards another, by a part in Q15. */
+static int32_t leak(int32_t value, int32_t towards, int32_t part_q15) {
+    return fixed_add(value, fixed_multiply(fixed_subtract(towards, value), part_q15, 15));
+}
+
+/* True when integral and tables have parted since the encoder has been at its present count. */
+static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_monitor_phase_t *phase,
+                      const encoder_monitor_input_t *input, uint32_t angle, unsigned index, uint32_t periods,
+                      uint32_t factor) {
+    const int32_t current_q9 = input->current_q9[index];
+    const flux_range_t range = flux_range(angle, parameters->half_count, current_q9, 0);
+    const int32_t table_q29 = range.least_q29 / 2 + range.most_q29 / 2;
+    const int32_t excess_q29 = fixed_subtract(input->flux_q29[index], table_q29);
+    const bool renewed = !phase->referred || phase->zero_at != input->zero_at[index];
+    if (renewed || current_q9 > phase->current_q9 + phase->current_q9 / 8) {
+        phase->referred = true;
+        phase->current_q9 = current_q9;
+        phase->excess_q29 = excess_q29;
+        phase->table_q29 = table_q29;
+        phase->referred_at = input->period;
+        phase->zero_at = input->zero_at[index];
+        phase->moved = 0;
+        return false;
+    }
+    const uint32_t leak_periods = parameters->rate_hz >> LEAK_SHIFT;
+    const uint32_t age = input->period - phase->referred_at;
+    const uint32_t summed = age < leak_periods ? age : leak_periods;
+    const int32_t drift_q29 = fixed_saturate((int64_t)parameters->flux_error_q29 * (int32_t)(factor * summed));
+    const int32_t change_q29 = fixed_abs(fixed_subtract(excess_q29, phase->excess_q29));
+    const int32_t tolerance_q29 = drift_q29 + (range.most_q29 - range.least_q29) + (table_q29 >> SHAPE_SHIFT) +
+                                  (fixed_abs(table_q29 - phase->table_q29) >> GAIN_SHIFT);
+    phase->moved = change_q29 > tolerance_q29 ? phase->moved + periods : 0;
+    const int32_t part_q15 = (int32_t)(((periods < leak_periods ? periods : leak_periods) << 15) / leak_periods);
+    phase->excess_q29 = leak(phase->excess_q29, excess_q29, part_q15);
+    phase->table_q29 = leak(phase->table_q29, table_q29, part_q15);
+    return phase->moved > parameters->rate_hz >> FROZEN_SHIFT;
+}
+
+/* Periods for which the flux linkage has contradicted the angle. */
+static uint32_t contradicted(const encoder_monitor_parameters_t *parameters, const encoder_monitor_phase_t *phase,
+                             const encoder_monitor_input_t *input, uint32_t angle, unsigned index, uint32_t periods) {
+    const uint32_t age = input->period - input->zero_at[index];
+    if (age > parameters->rate_hz >> AGE_SHIFT) {
+        return phase->contradicted;
+    }
+    const int32_t flux_q29 = input->flux_q29[index];
+    const flux_range_t range =
+        flux_range(angle, parameters->angle_max + parameters->half_count, input->current_q9[index], CURRENT_ERROR_Q9);
+    const int64_t drift_q29 =
+        input->flux_step_max_q29 / 4 + (int64_t)parameters->flux_error_q29 * (int32_t)(MOVING_FACTOR * age);
+    const bool below = flux_q29 < range.least_q29 - (range.least_q29 >> GAIN_SHIFT) - drift_q29;
+    const bool above = flux_q29 > range.most_q29 + (range.most_q29 >> GAIN_SHIFT) + drift_q29;
+    return below || above ? phase->contradicted + periods : 0;
+}
+
+static void forget_references(encoder_monitor_t *monitor) {
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        monitor->phase[phase].referred = false;
+    }
+}
+
+/* True while a phase has shown a contradiction in the last quarter of a second. */
+static bool shows(const encoder_monitor_parameters_t *parameters, encoder_monitor_phase_t *phase, uint32_t period) {
+    if (phase->contradicted >= PERSISTENT_PERIODS) {
+        phase->shown = true;
+        phase->shown_at = period;
+    } else if (period - phase->shown_at > parameters->rate_hz >> SHOWN_SHIFT) {
+        phase->shown = false;
+    }
+    return phase->shown;
+}
+
+static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
+                       const encoder_monitor_input_t *input, uint32_t periods) {
+    const uint32_t electrical =
+        commutation_electrical(&parameters->commutation, input->encoder_angle + parameters->middle);
+    const uint32_t factor = monitor->counted ? MOVING_FACTOR : 1;
+    unsigned contradicting = 0;
+    bool alone = false;
+    for (unsigned index = 0; index < machine_tables.phases; index++) {
+        encoder_monitor_phase_t *phase = &monitor->phase[index];
+        if (input->known[index] && input->current_q9[index] >= parameters->current_min_q9) {
+            const uint32_t angle = electrical - index * parameters->commutation.stroke;
+            monitor->frozen |= has_moved(parameters, phase, input, angle, index, periods, factor);
+            phase->contradicted = contradicted(parameters, phase, input, angle, index, periods);
+        } else {
+            phase->referred = false;
+            phase->contradicted = 0;
+        }
+        contradicting += shows(parameters, phase, input->period);
+        alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT;
+    }
+    monitor->angle |= contradicting >= CONTRADICTING_PHASES || alone;
+}
+
+static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
+                        const encoder_monitor_input_t *input) {
+    const uint32_t periods = input->period - monitor->window_period;
+    if (periods < parameters->rate_hz >> WINDOW_SHIFT) {
+        return;
+    }
+    const uint32_t travel = (uint32_t)fixed_abs((int32_t)(input->encoder_angle - monitor->window_angle));
+    const uint64_t limit = (uint64_t)parameters->travel_max * periods + 2 * (uint64_t)parameters->middle;
+    monitor->over_speed = limit < HALF_REV / 2 && travel > limit; /* over a longer time the travel is ambiguous */
+    monitor->window_period = input->period;
+    monitor->window_angle = input->encoder_angle;
+}
+
+static void start(encoder_monitor_t *monitor, const encoder_monitor_input_t *input) {
+    monitor->started = true;
+    monitor->window_period = input->period;
+    monitor->encoder_angle = monitor->window_angle = input->encoder_angle;
+}
+
+COLD void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
+                               const encoder_monitor_input_t *input) {
+    if (!monitor->started) {
+        start(monitor, input);
+    }
+    const uint32_t periods = input->period - monitor->period;
+    if (periods == 0) {
+        return;
+    }
+    monitor->period = input->period;
+    if (input->encoder_angle != monitor->encoder_angle) {
+        monitor->encoder_angle = input->encoder_angle;
+        monitor->frozen = false;
+        monitor->counted = true;
+        forget_references(monitor);
+    }
+    check_speed(parameters, monitor, input);
+    if (input->run) {
+        check_flux(parameters, monitor, input, periods);
+        return;
+    }
+    monitor->angle = false;
+    monitor->counted = false;
+    forget_references(monitor);
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        monitor->phase[phase].contradicted = 0;
+        monitor->phase[phase].shown = false;
+    }
+}

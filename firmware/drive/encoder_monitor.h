@@ -1,0 +1,86 @@
+/* Encoder against the machine: the flux linkage of a phase that conducts shows where the rotor is.
+ *
+ *   frozen     while the encoder stays at one count, the ratio of the flux linkage integrated from the voltage
+ *              (control/applied_flux.h) to that of the tables at that count and the measured current is constant, whatever the
+ *              gains of sensors and machine are. A rotor that turns changes it.
+ *   angle      the integrated flux linkage of two phases is outside what the tables allow within
+ * ENCODER_MONITOR_ANGLE_DEG of the encoder's angle: offset, slip, wrong direction, a constant reading of another angle.
+ *   over-speed by the encoder's counts over half a millisecond, without the observer.
+ *
+ * Both compare two ways to the flux linkage, voltage and time on the one side, current and angle on the other. A rotor
+ * that does not move, stalled or held by friction, contradicts nothing. Derived here.
+ */
+#ifndef DRIVE_ENCODER_MONITOR_H
+#define DRIVE_ENCODER_MONITOR_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "control/commutation.h"
+#include "hal.h"
+
+/* Error of the encoder's angle that is none, mechanical degrees: eccentricity and alignment; where the misalignment is
+ * learned, what the learning takes. */
+#define ENCODER_MONITOR_ANGLE_DEG 2u
+#define ENCODER_MONITOR_LEARNED_DEG 4u
+
+typedef struct {
+    commutation_parameters_t commutation;
+    uint32_t half_count;    /* of the encoder, 2^-32 electrical rev */
+    uint32_t middle;        /* of a count, 2^-32 rev */
+    uint32_t angle_max;     /* error of the angle that is none, 2^-32 electrical rev */
+    int32_t flux_error_q29; /* of the integral in a period, encoder_monitor_flux_error_q29() */
+    uint32_t rate_hz;       /* of the control periods */
+    int32_t current_min_q9; /* of a phase that is checked, A, Q7.9 */
+    int32_t travel_max;     /* of a period at the limit of the speed, 2^-32 rev */
+} encoder_monitor_parameters_t;
+
+typedef struct {
+    bool run;
+    uint32_t encoder_angle;    /* start of the encoder count, 2^-32 rev */
+    int32_t flux_step_max_q29; /* DC-link voltage times the control period, Wb, Q2.29 */
+    int32_t current_q9[HAL_PHASES_MAX];
+    uint32_t period;                  /* of the sample, modulo 2^32 */
+    int32_t flux_q29[HAL_PHASES_MAX]; /* by the applied voltage since the phase was last without current, Wb, Q2.29 */
+    uint32_t zero_at[HAL_PHASES_MAX]; /* period in which it was */
+    bool known[HAL_PHASES_MAX];       /* no trigger was lost since */
+} encoder_monitor_input_t;
+
+/* Of a phase. */
+typedef struct {
+    bool referred;         /* the next five are set */
+    int32_t current_q9;    /* at the reference, the largest since the count, A, Q7.9 */
+    int32_t excess_q29;    /* of the integral over the tables at the reference, with a leak, Wb, Q2.29 */
+    int32_t table_q29;     /* flux linkage by the tables, likewise */
+    uint32_t referred_at;  /* period of the reference */
+    uint32_t zero_at;      /* of the integral then */
+    uint32_t moved;        /* periods for which they have parted */
+    uint32_t contradicted; /* periods for which the angle has been contradicted */
+    bool shown;            /* the angle was contradicted for long enough, last in the period */
+    uint32_t shown_at;
+} encoder_monitor_phase_t;
+
+typedef struct {
+    bool started;
+    bool counted;           /* in this run */
+    uint32_t period;        /* of the last call */
+    uint32_t encoder_angle; /* then */
+    uint32_t window_period; /* of the start of the window for the speed */
+    uint32_t window_angle;
+    encoder_monitor_phase_t phase[HAL_PHASES_MAX];
+    bool frozen, angle, over_speed; /* failed checks */
+} encoder_monitor_t;
+
+/* Error of the integral that is none, per control period, Wb, Q2.29: half of the mean back-EMF of a phase, at a current
+ * in A, Q7.9, when a free rotor has turned by 2 degrees at an acceleration, in the unit of speed per s. A rotor that
+ * accelerates more slowly is found later, but after the same angle. angle_step_q32: as in load_observer_model_t.
+ * [background] */
+int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9, int32_t angle_step_q32,
+                                       uint32_t rotor_poles);
+
+/* Checks the sample. `frozen` remains until the encoder counts, `angle` until the state RUN ends: it needs current.
+ * [background] */
+void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
+                          const encoder_monitor_input_t *input);
+
+#endif

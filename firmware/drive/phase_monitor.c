@@ -1,0 +1,288 @@
+#include "drive/phase_monitor.h"
+
+#include "control/phase_map.h"
+#include "drive/fault.h"
+#include "fixed/compiler.h"
+#include "fixed/fixed.h"
+#include "fixed/formats.h"
+
+/* 10 degrees electrical: 2.5 degrees of a rotor with four poles. */
+#define ANGLE_TOLERANCE (UINT32_MAX / 36u)
+
+/* Rotation after which a difference that an angle may explain is a fault: 1/32 electrical rev. */
+#define TURN_MIN (1 << 27)
+
+/* Time constant with which the integral follows the tables, ms. */
+#define FOLLOW_MS 10u
+
+/* Currents up to this multiple of the offset, and the part of the DC-link voltage that drives no more of them, because
+ * of the drops of the devices and pulses that are too short. */
+#define SMALL_CURRENT 4
+#define SMALL_VOLTAGE 32
+
+#define OPEN_SAMPLES 2u
+
+/* A current that should not be is judged after 1/4 ms. One that does not move is its sensor's error after this time; at
+ * once when not even the last bit changes, and when it ends after 1/2 ms. */
+#define STILL_MS 8u
+
+/* What all phases have in common. */
+typedef struct {
+    const machine_tables_t *tables;
+    const phase_monitor_input_t *input;
+    bool lost;         /* triggers were lost since the previous input: the integral is wrong */
+    uint32_t elapsed;  /* control periods since the previous input */
+    uint32_t step;     /* rotation since then, 2^-32 electrical rev */
+    int32_t offset_q9; /* tolerance of a current, A, Q7.9 */
+    int32_t delay_q29; /* tolerance of a flux linkage, Wb, Q2.29 */
+} common_t;
+
+/* Flux linkage of the tables, Wb, Q2.29. distance: from the unaligned position, 0..2^31 - 1. */
+NOINLINE static int32_t table_flux_q29(const machine_tables_t *tables, uint32_t distance, int32_t current_q9) {
+    const int32_t clamped_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
+    const phase_map_lookup_t lookup = phase_map_lookup(tables, distance);
+    const phase_map_nodes_t nodes = phase_map_nodes(&lookup, (uint32_t)clamped_q9 >> MACHINE_COLUMN_BITS);
+    return phase_map_scale(&tables->flux_format,
+                           phase_map_between(phase_map_flux_value_q14(&lookup, &nodes, 0),
+                                             phase_map_flux_value_q14(&lookup, &nodes, MACHINE_TO_NEXT_COLUMN),
+                                             clamped_q9));
+}
+
+/* Largest and smallest flux linkage at a measured current, at a distance. */
+NOINLINE static int32_t most_q29(const common_t *common, uint32_t distance, int32_t current_q9, int32_t offset_q9) {
+    const int32_t table_q29 = table_flux_q29(common->tables, distance, current_q9 + current_q9 / 10 + offset_q9);
+    return fixed_add(table_q29, table_q29 / 20 * 3);
+}
+
+NOINLINE static int32_t least_q29(const common_t *common, uint32_t distance, int32_t current_q9) {
+    const int32_t table_q29 = table_flux_q29(common->tables, distance, (current_q9 - common->offset_q9) * 10 / 11);
+    return table_q29 - table_q29 / 20 * 3;
+}
+
+NOINLINE static uint32_t distance_of(const phase_monitor_input_t *input, unsigned phase) {
+    return phase_map_distance(input->electrical - phase * input->stroke - (uint32_t)input->misalignment[phase]);
+}
+
+/* Tolerance of the integral, Wb, Q2.29: what has accumulated since the phase was at rest, or in FOLLOW_MS. */
+static int32_t slack_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase) {
+    const phase_monitor_input_t *input = common->input;
+    const int32_t resistive_q29 = fixed_multiply_high(input->current_q9[phase] << 12, input->resistance_period_q40);
+    const int32_t error_q29 = resistive_q29 / 2 + input->period_flux_q29 / 64;
+    /* An error at the largest flux linkage remains while it falls. */
+    const int32_t fallen_q29 = state->peak_q29 - input->flux_q29[phase];
+    return fixed_saturate((int64_t)error_q29 * (int32_t)state->conducting + common->delay_q29 + fallen_q29 / 4);
+}
+
+/* Side and extent of a difference between voltage and current. */
+typedef enum {
+    AGREES,
+    WITHIN_ANGLES, /* differs at the measured angle */
+    BEYOND_ANGLES  /* differs at any */
+} difference_t;
+
+static difference_t compare(const common_t *common, phase_monitor_phase_t *state, unsigned phase, int *side) {
+    const int32_t current_q9 = common->input->current_q9[phase];
+    const int32_t flux_q29 = common->input->flux_q29[phase];
+    const int32_t slack = slack_q29(common, state, phase);
+    int32_t high_q29 = fixed_subtract(flux_q29, slack);
+    const int32_t low_q29 = fixed_add(flux_q29, slack);
+    const bool small = current_q9 <= SMALL_CURRENT * common->offset_q9;
+    if (!small || flux_q29 < state->base_q29 || common->elapsed > common->input->periods_per_ms / 2u) {
+        state->base_q29 = flux_q29;
+    }
+    if (small) { /* errors of the past do not count: only what has been built up since */
+        high_q29 = fixed_subtract(flux_q29, fixed_add(state->base_q29, common->delay_q29));
+        state->base_q29 = fixed_saturate(state->base_q29 + (int64_t)common->input->period_flux_q29 / SMALL_VOLTAGE *
+                                                               (int32_t)(common->elapsed & 0xffffu));
+    }
+    *side = 0;
+    if (current_q9 <= common->offset_q9 && high_q29 <= 0) {
+        return AGREES; /* as below */
+    }
+    const uint32_t distance = distance_of(common->input, phase);
+    const uint32_t far = distance + ANGLE_TOLERANCE;
+    if (high_q29 > most_q29(common, far < HALF_REV ? far : HALF_REV - 1, current_q9, common->offset_q9)) {
+        *side = 1;
+        return high_q29 > most_q29(common, HALF_REV - 1, current_q9, 0) ? BEYOND_ANGLES : WITHIN_ANGLES;
+    }
+    if (low_q29 < least_q29(common, distance > ANGLE_TOLERANCE ? distance - ANGLE_TOLERANCE : 0, current_q9)) {
+        *side = -1;
+        return low_q29 < least_q29(common, 0, current_q9) ? BEYOND_ANGLES : WITHIN_ANGLES;
+    }
+    return AGREES;
+}
+
+/* Flux linkage that the opposite voltage removes within a period. */
+static bool gone(const phase_monitor_input_t *input, unsigned phase) {
+    return input->flux_q29[phase] < input->period_flux_q29;
+}
+
+/* True when the voltage has left the phase without flux linkage, errors of the integral included. */
+static bool at_rest(const common_t *common, phase_monitor_phase_t *state, unsigned phase) {
+    const phase_monitor_input_t *input = common->input;
+    const int32_t flux_q29 = input->flux_q29[phase];
+    const uint32_t conducting = state->conducting + common->elapsed;
+    const uint32_t follow = FOLLOW_MS * input->periods_per_ms;
+    state->conducting = conducting < follow ? conducting : follow;
+    state->peak_q29 = flux_q29 > state->peak_q29 ? flux_q29 : state->peak_q29;
+    if (!input->off[phase] || flux_q29 > 0) {
+        state->rest_q29 = 0;
+        return false;
+    }
+    state->rest_q29 = fixed_add(state->rest_q29, input->period_flux_q29); /* at least */
+    if (state->rest_q29 < fixed_add(state->peak_q29 / 4, common->delay_q29)) {
+        return false;
+    }
+    if (input->current_q9[phase] <= 2 * common->offset_q9) {
+        state->peak_q29 = 0;
+        state->conducting = 0;
+        return false;
+    }
+    return true;
+}
+
+/* A current that should not be: does it move? */
+static uint32_t check_excess(const common_t *common, phase_monitor_phase_t *state, unsigned phase, bool excess) {
+    const int32_t current_q9 = common->input->current_q9[phase];
+    if (!excess) {
+        const bool lasted = state->excess_periods >= common->input->periods_per_ms / 2u;
+        state->excess_periods = 0;
+        return lasted ? (uint32_t)FAULT_BIT(FAULT_CURRENT_SENSOR) : 0;
+    }
+    if (state->excess_periods == 0) {
+        state->least_q9 = state->most_q9 = current_q9;
+    }
+    state->least_q9 = current_q9 < state->least_q9 ? current_q9 : state->least_q9;
+    state->most_q9 = current_q9 > state->most_q9 ? current_q9 : state->most_q9;
+    state->excess_periods += common->elapsed;
+    const int32_t moved_q9 = state->most_q9 - state->least_q9;
+    if (state->excess_periods <= common->input->periods_per_ms / 4u) {
+        return 0;
+    }
+    if (moved_q9 > common->offset_q9) {
+        return (uint32_t)FAULT_BIT(FAULT_PHASE_SHORTED);
+    }
+    const bool still = moved_q9 == 0 || state->excess_periods > STILL_MS * common->input->periods_per_ms;
+    return still ? (uint32_t)FAULT_BIT(FAULT_CURRENT_SENSOR) : 0;
+}
+
+static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, unsigned phase) {
+    phase_monitor_phase_t *state = &monitor->phase[phase];
+    const bool rest = at_rest(common, state, phase);
+    int side = 0;
+    difference_t difference = AGREES;
+    if (common->input->run && !common->lost) {
+        difference = compare(common, state, phase, &side);
+    }
+    const bool beyond = difference == BEYOND_ANGLES;
+    state->turned = side == 0 || side != state->side ? 0 : fixed_saturate((int64_t)state->turned + common->step);
+    state->side = (int8_t)side;
+    if (state->turned >= TURN_MIN) {
+        monitor->doubted |= 1u << phase;
+        monitor->doubted_side = side;
+    }
+    state->open_samples =
+        beyond && side > 0 ? (uint8_t)(state->open_samples + (state->open_samples < OPEN_SAMPLES)) : 0;
+    uint32_t failed = check_excess(common, state, phase, rest || (beyond && side < 0));
+    if (state->open_samples >= OPEN_SAMPLES) {
+        failed |= (uint32_t)FAULT_BIT(FAULT_PHASE_OPEN);
+    }
+    return failed;
+}
+
+/* Differences that an angle may explain: the encoder's, when more than one phase has them within an electrical
+ * revolution. */
+static uint32_t judge_doubts(phase_monitor_t *monitor, uint32_t step) {
+    if (monitor->doubted == 0) {
+        monitor->doubt_turned = 0;
+        return 0;
+    }
+    const uint32_t before = monitor->doubt_turned;
+    monitor->doubt_turned += step;
+    if (monitor->doubt_turned >= before) {
+        return 0;
+    }
+    const uint32_t doubted = monitor->doubted;
+    monitor->doubted = 0;
+    if ((doubted & (doubted - 1u)) != 0) {
+        return 0;
+    }
+    monitor->phases |= doubted;
+    return (uint32_t)(monitor->doubted_side > 0 ? FAULT_BIT(FAULT_PHASE_OPEN) : FAULT_BIT(FAULT_PHASE_SHORTED));
+}
+
+/* What brings the integral nearer to the tables. */
+static int32_t correction_of(const common_t *common, phase_monitor_phase_t *state, unsigned phase) {
+    const phase_monitor_input_t *input = common->input;
+    const int32_t current_q9 = input->current_q9[phase];
+    const int32_t flux_q29 = input->flux_q29[phase];
+    if (input->off[phase] && current_q9 <= common->offset_q9) {
+        state->zero_at = input->periods;
+        state->followed_q29 = 0;
+        return -flux_q29;
+    }
+    if (input->off[phase] && gone(input, phase)) {
+        state->followed_q29 = fixed_subtract(state->followed_q29, flux_q29);
+        return -flux_q29;
+    }
+    const int32_t error_q29 = table_flux_q29(common->tables, distance_of(input, phase), current_q9) - flux_q29;
+    const uint32_t follow = FOLLOW_MS * input->periods_per_ms;
+    const bool set = common->lost || common->elapsed >= follow;
+    const int32_t correction_q29 = set ? error_q29 : error_q29 / (int32_t)follow * (int32_t)common->elapsed;
+    state->followed_q29 = fixed_add(state->followed_q29, correction_q29);
+    return correction_q29;
+}
+
+static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t *tables,
+                          const phase_monitor_input_t *input) {
+    const int32_t period_q29 = input->period_flux_q29;
+    const uint32_t elapsed = input->periods - monitor->periods;
+    return (common_t){
+        .tables = tables,
+        .input = input,
+        .lost = input->late_interrupts != monitor->late_interrupts,
+        .elapsed = elapsed,
+        .step = (uint32_t)fixed_abs((int32_t)(input->electrical - monitor->electrical)),
+        .offset_q9 = tables->current_range_q9 / 128,
+        .delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)input->periods_per_ms),
+    };
+}
+
+COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_t *tables,
+                                 const phase_monitor_input_t *input, int32_t correction_q29[HAL_PHASES_MAX]) {
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        correction_q29[phase] = 0;
+    }
+    const common_t common = common_of(monitor, tables, input);
+    if (common.elapsed == 0) {
+        return monitor->failed;
+    }
+    monitor->late_interrupts = input->late_interrupts;
+    monitor->lost_at = common.lost ? input->periods : monitor->lost_at;
+    monitor->periods = input->periods;
+    monitor->electrical = input->electrical;
+    if (input->run && !monitor->run) {
+        monitor->phases = 0;
+        monitor->doubted = 0;
+    }
+    monitor->run = input->run;
+    uint32_t failed = 0;
+    uint32_t in_excess = 0;
+    for (unsigned phase = 0; phase < tables->phases; phase++) {
+        const uint32_t failed_of_phase = check_phase(&common, monitor, phase);
+        in_excess |= (uint32_t)(monitor->phase[phase].excess_periods > 0) << phase;
+        monitor->phases |= (uint32_t)(failed_of_phase != 0) << phase;
+        failed |= failed_of_phase;
+        correction_q29[phase] = correction_of(&common, &monitor->phase[phase], phase);
+    }
+    if (input->run) {
+        failed |= judge_doubts(monitor, common.step);
+    }
+    /* The current that one phase lacks is read in another. */
+    if ((failed & (uint32_t)FAULT_BIT(FAULT_PHASE_OPEN)) != 0 && in_excess != 0) {
+        failed = (uint32_t)FAULT_BIT(FAULT_CURRENT_SENSOR);
+        monitor->phases |= in_excess;
+    }
+    monitor->failed = input->run ? monitor->failed | failed : failed;
+    return monitor->failed;
+}

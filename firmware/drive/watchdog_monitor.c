@@ -1,0 +1,23 @@
+#include "drive/watchdog_monitor.h"
+
+#include "fixed/compiler.h"
+
+COLD void watchdog_monitor_pass(watchdog_monitor_t *monitor, watchdog_part_t part) {
+    monitor->disordered = monitor->disordered || monitor->passed != (uint32_t)part;
+    monitor->passed++;
+}
+
+COLD bool watchdog_monitor_kick(watchdog_monitor_t *monitor, uint32_t periods, uint32_t requests, uint32_t completed,
+                                uint32_t time_us) {
+    const uint32_t passed = monitor->passed;
+    monitor->passed = 0;
+    monitor->disordered = monitor->disordered || passed != WATCHDOG_PARTS;
+    if (monitor->disordered || time_us - monitor->kicked_us < WATCHDOG_KICK_US || periods == monitor->periods ||
+        completed == monitor->completed || requests - completed > 1u) {
+        return false;
+    }
+    monitor->periods = periods;
+    monitor->completed = completed;
+    monitor->kicked_us = time_us;
+    return true;
+}

@@ -1,0 +1,101 @@
+"""The last control periods before a fault, as the drive keeps them, against the true state at the same instants."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from salient.bench.bench import Bench
+from salient.bench.drive import DriveError
+
+
+def fault_at(bench: Bench, after_s: float = 0.1) -> float:
+    """Runs at 600 r/min into a jump of the encoder; the time of the fault, on the clock of the drive."""
+    bench.drive.speed_reference_rpm = 600
+    bench.load_torque_Nm = 4
+    bench.run_for(after_s)
+    bench.fault("encoder_jump", angle_deg=3)
+    bench.run_for(0.02)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "encoder")
+    return float(bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last) * 1e-6
+
+
+def at(bench: Bench, name: str, times_s: np.ndarray) -> np.ndarray:
+    """True values at these times."""
+    signal = bench.truth[name]
+    rows = np.searchsorted(np.asarray(signal.time_s), times_s - 1e-7)
+    assert np.allclose(np.asarray(signal.time_s)[rows], times_s, atol=1e-6)
+    return np.asarray(signal.value)[rows]
+
+
+@pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])
+@pytest.mark.parametrize("control_rate_hz", [20000, 40000])
+def test_every_row_is_the_true_state_at_the_start_of_its_period(make_bench, controller, control_rate_hz):
+    bench = make_bench(controller=controller, control_rate_hz=control_rate_hz)
+    bench.rig.truth_period_us = 25
+    fault_s = fault_at(bench)
+    trace = bench.drive.fault_trace()
+    times_s = fault_s + trace.time_s
+    assert len(times_s) == 64
+    assert np.diff(trace.time_s) == pytest.approx(1 / control_rate_hz)
+    assert trace.time_s[-1] == 0
+    for phase, name in enumerate("abc"):
+        true_A = at(bench, f"RIG_TRUTH_CURRENTS.current_{name}_A", times_s)
+        assert np.abs(trace.current_A[:, phase] - true_A).max() <= 0.012  # half a count, and the LSB of the frame
+    assert trace.current_A.shape == (64, 3)
+    assert trace.current_A.max() > 3
+    assert np.abs(trace.bus_voltage_V - 240).max() < 0.2
+    assert np.abs(trace.speed_rpm[:-2] - 600).max() < 30
+    true_deg = at(bench, "rotor_angle_deg", times_s)
+    wrapped = (trace.rotor_angle_deg - true_deg + 180) % 360 - 180
+    assert np.abs(wrapped[:-1]).max() < 0.02
+    assert wrapped[-1] == pytest.approx(3, abs=0.02), "the jump is the cause"
+
+
+@pytest.mark.parametrize("controller", ["traditional", "salient"])
+def test_the_duties_are_those_that_the_switches_follow_until_the_fault_opens_them(make_bench, controller):
+    bench = make_bench(controller=controller)
+    fault_at(bench)
+    trace = bench.drive.fault_trace()
+    assert trace.upper_duty.min() == 0
+    assert 0.1 < trace.upper_duty.max() <= 1.0001
+    assert 0.1 < trace.lower_duty.max() <= 1.0001
+    assert trace.upper_duty[-2].max() + trace.lower_duty[-2].max() > 0
+    assert not trace.upper_duty[-1].any()
+    assert not trace.lower_duty[-1].any()
+    assert trace.torque_reference_Nm[-2] > 1
+    rising = np.diff(trace.current_A, axis=0)[1:] > 0.1
+    both_on = (trace.upper_duty[:-2] > 0) & (trace.lower_duty[:-2] > 0)
+    assert rising.sum() > 5
+    assert both_on[rising].mean() > 0.95, "a current rises in the period after both duties were written"
+
+
+def test_the_trace_is_kept_until_the_drive_runs_again(bench):
+    with pytest.raises(DriveError, match="no_such_entry"):
+        bench.drive.fault_trace()
+    fault_at(bench)
+    first = bench.drive.fault_trace()
+    bench.clear_fault("encoder_jump")
+    bench.run_for(0.05)
+    bench.drive.clear_fault()
+    bench.run_for(0.05)
+    assert bench.drive.state == "ready"
+    again = bench.drive.fault_trace()
+    assert np.array_equal(first.current_A, again.current_A)
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.05)
+    assert bench.drive.state == "run"
+    with pytest.raises(DriveError, match="no_such_entry"):
+        bench.drive.fault_trace()
+
+
+def test_a_fault_right_after_the_start_has_rows_of_zeros_before_the_start(bench):
+    bench.rig.drive_reset = 1
+    bench.rig.at(bench.time_s + 0.001_3).sto_1 = 1
+    bench.run_for(0.02)
+    assert bench.drive.fault == "sto"
+    trace = bench.drive.fault_trace()
+    known = trace.bus_voltage_V > 0
+    assert known.sum() == pytest.approx(52, abs=1), "1.3 ms"
+    assert known[12:].sum() == known.sum()
+    assert not trace.upper_duty.any()

@@ -1,0 +1,73 @@
+"""Braking into a DC link that cannot take the energy: the torque falls before the over-voltage trip."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from salient.bench.bench import Bench
+
+OVER_VOLTAGE_V = 300.0
+CAPACITANCE_F = 2.2e-3
+
+
+def running(bench: Bench, speed_rpm: float) -> None:
+    """Without a chopper from here on: what is left is the capacitor, 35.6 J from 240 to 300 V, and the losses."""
+    bench.drive.speed_reference_rpm = speed_rpm
+    bench.run_until(lambda: abs(bench.truth["speed_rpm"].last - speed_rpm) < 5, timeout=3)
+    bench.run_for(0.05)
+    bench.fault("chopper_open")
+    bench.rig.truth_period_us = 250
+
+
+@pytest.mark.parametrize("inertia", [0.3, 1.0, 4.0])
+@pytest.mark.parametrize("speed_rpm", [600, 1500, 2500])
+@pytest.mark.parametrize("target", ["standstill", "reverse"])
+def test_braking_without_a_chopper_stays_below_the_trip(make_bench, inertia, speed_rpm, target):
+    bench = make_bench(machine="finite_element", controller="salient")
+    bench.rig.inertia_gain = inertia
+    running(bench, speed_rpm)
+    before_s = bench.time_s
+    bench.drive.speed_reference_rpm = 0 if target == "standstill" else -speed_rpm
+    bench.run_for(0.6)
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+    voltage = bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].between(before_s, bench.time_s + 1e-9).value
+    assert np.max(voltage) < 0.998 * OVER_VOLTAGE_V
+    assert np.max(voltage) > 241
+    assert bench.truth["speed_rpm"].last < 0.995 * speed_rpm, "friction and losses brake"
+
+
+@pytest.mark.parametrize("torque_Nm", [-4, -16])
+def test_a_commanded_braking_torque_falls_as_the_link_fills(make_bench, torque_Nm):
+    """The dynamometer holds the speed, so that the energy does not end."""
+    bench = make_bench(machine="finite_element", controller="salient")
+    bench.rig.held_speed_rpm = 1500
+    bench.run_for(0.25)
+    bench.fault("chopper_open")
+    bench.drive.torque_reference_Nm = torque_Nm
+    bench.run_for(0.6)
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+    voltage = bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"]
+    assert 0.97 * OVER_VOLTAGE_V < max(voltage.value) < 0.998 * OVER_VOLTAGE_V
+    assert bench.telemetry["torque_reference_Nm"].last > 0.75 * torque_Nm
+
+
+@pytest.mark.parametrize("supply_V", [265, 290])
+def test_a_supply_that_rises_while_the_drive_brakes_is_no_trip(make_bench, supply_V):
+    bench = make_bench(machine="finite_element", controller="salient")
+    running(bench, 1500)
+    bench.rig.supply_voltage_V = supply_V
+    bench.drive.speed_reference_rpm = -1500
+    bench.run_for(0.4)
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+    assert supply_V - 1 < max(bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].value) < 0.998 * OVER_VOLTAGE_V
+
+
+@pytest.mark.parametrize("controller", ["traditional", "paper"])
+def test_single_quadrant_controllers_regenerate_only_what_their_fields_hold(make_bench, controller):
+    bench = make_bench(machine="finite_element", controller=controller)
+    running(bench, 1500)
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.4)
+    assert bench.drive.fault == "none"
+    assert 239 < max(bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].value) < 250

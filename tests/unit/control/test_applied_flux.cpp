@@ -1,0 +1,63 @@
+// Flux linkage by the applied voltage, against its sum in double precision.
+#include <algorithm>
+#include <cstdint>
+#include <random>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/applied_flux.h"
+}
+
+#include "support/fixed_point.h"
+
+namespace {
+
+using namespace fixed_point;
+constexpr double PERIOD_S = 25e-6, RESISTANCE_OHM = 0.05;
+
+TEST(AppliedFlux, follows_the_sum_of_voltage_less_resistive_drop_within_2_LSB_a_period) {
+    const int32_t resistance_q40 = to_fixed(RESISTANCE_OHM * PERIOD_S, Q40);
+    std::mt19937 random(3);
+    applied_flux_t flux{};
+    double model[3] = {}, worst = 0.0, most = 0.0;
+    constexpr int PERIODS = 4000;
+    for (int k = 0; k < PERIODS; k++) {
+        const double voltage = 200.0 + double(random() % 80);
+        const int32_t period_q29 = applied_flux_period_q29(to_fixed(voltage, 64.0), to_fixed(PERIOD_S, Q40));
+        EXPECT_NEAR(period_q29 / Q29, voltage * PERIOD_S, 1e-8);
+        int32_t duty_q15[4] = {}, current_q9[4] = {};
+        for (int phase = 0; phase < 3; phase++) {
+            duty_q15[phase] = int32_t(random() % 65537) - 32768;
+            current_q9[phase] = int32_t(random() % (60 * 512));
+        }
+        applied_flux_step(&flux, 3, duty_q15, current_q9, period_q29, resistance_q40);
+        for (int phase = 0; phase < 3; phase++) {
+            EXPECT_NEAR(flux.at_sample_q29[phase] / Q29, model[phase], 1e-5);
+            const double drop = current_q9[phase] / 512.0 * resistance_q40 / Q40;
+            model[phase] = std::max(0.0, model[phase] + duty_q15[phase] / 32768.0 * period_q29 / Q29 - drop);
+            worst = std::max(worst, std::abs(flux.next_q29[phase] / Q29 - model[phase]));
+            most = std::max(most, model[phase]);
+        }
+        EXPECT_EQ(flux.next_q29[3], 0);
+    }
+    EXPECT_LT(worst, 2.0 * PERIODS / Q29);
+    EXPECT_GT(most, 0.05);
+}
+
+TEST(AppliedFlux, saturates_and_ends_at_0) {
+    applied_flux_t flux{};
+    const int32_t on[4] = {32768, 32768, 32768, 32768}, off[4] = {-32768, -32768, -32768, -32768}, none[4] = {};
+    for (int k = 0; k < 40; k++) {
+        applied_flux_step(&flux, 4, on, none, (1 << 27) - 1, 0);
+    }
+    EXPECT_EQ(flux.next_q29[3], INT32_MAX);
+    for (int k = 0; k < 16; k++) {
+        EXPECT_GT(flux.next_q29[0], 0);
+        applied_flux_step(&flux, 4, off, none, (1 << 27) - 1, 0);
+    }
+    applied_flux_step(&flux, 4, off, none, (1 << 27) - 1, 0);
+    EXPECT_EQ(flux.next_q29[0], 0);
+}
+
+} // namespace

@@ -1,0 +1,151 @@
+// Encoder against flux linkage and against its own counts, on a phase whose state is known exactly.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/load_observer.h"
+#include "control/machine_tables.h"
+#include "drive/encoder_monitor.h"
+}
+
+#include "support/fixed_point.h"
+#include "support/phase_map_results.h"
+
+namespace {
+
+using namespace fixed_point;
+constexpr uint32_t RATE_HZ = 40000;
+constexpr double PERIOD_S = 1.0 / RATE_HZ, DEGREE = 0x1p32 / 360.0;
+constexpr uint32_t PHASES = 3, POLES = 4;
+
+class EncoderMonitor : public testing::Test {
+  protected:
+    EncoderMonitor() {
+        const load_observer_model_t model = load_observer_model(RATE_HZ, to_fixed(0.02, Q30), 0);
+        const commutation_angles_t angles = {.turn_on = 1u << 31, .turn_off = 0xD5555555u, .outgoing_off = 0xF7000000u};
+        parameters.commutation = commutation_configure(&angles, PHASES, POLES);
+        parameters.half_count = (1u << 14) * POLES;
+        parameters.middle = 1u << 14;
+        parameters.angle_max = uint32_t(2 * DEGREE) * POLES;
+        parameters.flux_error_q29 = encoder_monitor_flux_error_q29(
+            load_observer_acceleration(to_fixed(19.1, Q24), to_fixed(0.02, Q30)), 26 << 9, model.angle_step_q32, POLES);
+        parameters.rate_hz = RATE_HZ;
+        parameters.current_min_q9 = 6 << 9;
+        parameters.travel_max = int32_t(3600.0 * 17.0 / 16.0 / 60.0 * PERIOD_S * 0x1p32);
+        input.run = true;
+        std::fill_n(input.known, PHASES, true);
+        input.flux_step_max_q29 = to_fixed(240.0 * PERIOD_S, Q29);
+        input.period = 100;
+        monitor_step();
+    }
+
+    void monitor_step() { encoder_monitor_step(&parameters, &monitor, &input); }
+
+    // One period: the phase carries a current at a true rotor angle, the encoder shows another; in degrees, A.
+    void step(double encoder_deg, double true_deg, double current_A, unsigned phase = 0) {
+        input.period++;
+        input.encoder_angle = uint32_t(int64_t(encoder_deg * DEGREE)) & ~((1u << 15) - 1u);
+        for (unsigned k = 0; k < PHASES; k++) {
+            input.current_q9[k] = 0;
+            input.flux_q29[k] = 0;
+            input.zero_at[k] = k == phase ? input.zero_at[k] : input.period;
+        }
+        const uint32_t angle = uint32_t(int64_t(true_deg * DEGREE)) * POLES - phase * parameters.commutation.stroke;
+        input.current_q9[phase] = to_fixed(current_A, Q9);
+        input.flux_q29[phase] = phase_map_results::flux_q29(machine_tables, angle, input.current_q9[phase]);
+        monitor_step();
+    }
+
+    encoder_monitor_parameters_t parameters{};
+    encoder_monitor_t monitor{};
+    encoder_monitor_input_t input{};
+};
+
+TEST_F(EncoderMonitor, the_tolerated_error_of_the_voltage_is_half_of_the_back_emf_after_2_degrees) {
+    // Saturating: 0.34 Wb aligned less 0.017 unaligned at 26 A over pi / 4; 8.2 rad/s after 2 degrees at 955 rad/s^2.
+    const double volts = parameters.flux_error_q29 / Q29 / PERIOD_S;
+    EXPECT_GT(volts, 1.4);
+    EXPECT_LT(volts, 1.9);
+}
+
+TEST_F(EncoderMonitor, a_rotor_that_accelerates_while_the_encoder_does_not_count_is_found_after_1_to_4_degrees) {
+    for (const double start_deg : {55.0, 65.0, 75.0}) {
+        monitor = {};
+        double moved_deg = 0.0;
+        for (int k = 0; !monitor.frozen; k++) {
+            ASSERT_LT(k, 1000) << start_deg;
+            moved_deg = 0.5 * 955.0 * (k * PERIOD_S) * (k * PERIOD_S) * 57.3;
+            step(start_deg, start_deg + moved_deg, 25.0);
+        }
+        EXPECT_GT(moved_deg, 0.5) << start_deg;
+        EXPECT_LT(moved_deg, 4.0) << start_deg;
+        for (int k = 0; k < 1000; k++) {
+            step(start_deg, start_deg, 0.0);
+        }
+        EXPECT_TRUE(monitor.frozen) << "until it counts";
+        step(start_deg + 0.1, start_deg, 0.0);
+        EXPECT_FALSE(monitor.frozen);
+    }
+}
+
+TEST_F(EncoderMonitor, a_rotor_at_rest_is_no_evidence_whatever_the_current_and_a_gain_of_the_sensor) {
+    for (const double gain : {0.95, 1.0, 1.05}) {
+        monitor = {};
+        for (int k = 0; k < 8000; k++) {
+            const double current_A = std::min(25.0, 0.5 * k) + 5.0 * std::sin(k * 0.3);
+            step(65.0, 65.0, std::max(0.0, current_A));
+            input.current_q9[0] = int32_t(input.current_q9[0] * gain);
+            input.period++;
+            monitor_step();
+            ASSERT_FALSE(monitor.frozen || monitor.angle) << gain << " " << k;
+        }
+    }
+}
+
+TEST_F(EncoderMonitor, an_angle_that_two_phases_contradict_is_a_fault_and_one_within_the_tolerance_is_none) {
+    for (const double error_deg : {-10.0, -6.0, -2.0, 0.0, 2.0, 6.0, 10.0}) {
+        monitor = {};
+        for (int k = 0; k < 2000; k++) {
+            const double true_deg = k * PERIOD_S * 3600.0;
+            const unsigned phase = unsigned(true_deg / 30.0) % PHASES;
+            const double since_deg = std::fmod(true_deg, 30.0);
+            if (since_deg < 0.05) {
+                input.zero_at[phase] = input.period;
+            }
+            // Phase j is unaligned at 45 + 30 j degrees.
+            const double rotor_deg = 48.0 + true_deg;
+            step(rotor_deg + error_deg, rotor_deg, 20.0, phase);
+        }
+        EXPECT_EQ(monitor.angle, std::fabs(error_deg) > 5.0) << error_deg;
+        input.run = false;
+        input.period++;
+        monitor_step();
+        EXPECT_FALSE(monitor.angle);
+        input.run = true;
+    }
+}
+
+TEST_F(EncoderMonitor, counts_faster_than_the_limit_are_over_speed_within_a_millisecond_in_either_direction) {
+    for (const double sign : {1.0, -1.0}) {
+        for (const auto &[rpm, fails] : {std::pair{3600.0, false}, std::pair{3800.0, false}, std::pair{3950.0, true}}) {
+            monitor = {};
+            int periods = 0;
+            for (double deg = 0.0; periods < 400 && !monitor.over_speed; periods++) {
+                deg += sign * rpm * 6.0 * PERIOD_S;
+                step(deg, deg, 0.0);
+            }
+            EXPECT_EQ(monitor.over_speed, fails) << sign * rpm;
+            EXPECT_LT(fails ? periods : 0, RATE_HZ / 1000) << sign * rpm;
+            EXPECT_GT(periods, 10);
+            for (int k = 0; k < 100; k++) {
+                step(0.0, 0.0, 0.0);
+            }
+            EXPECT_FALSE(monitor.over_speed) << "at rest again";
+        }
+    }
+}
+
+} // namespace
