@@ -37,6 +37,9 @@
 /* Time without a zero of the current after which an integral is too old to contradict the angle: 1/128 s. */
 #define AGE_SHIFT 7
 
+/* Part of the DC-link voltage that pulses too short for the devices do not make: 1/64. */
+#define PULSE_SHIFT 6
+
 /* Window for the speed: 1/2048 s. */
 #define WINDOW_SHIFT 11
 
@@ -143,7 +146,9 @@ static uint32_t contradicted(const encoder_monitor_parameters_t *parameters, con
     const flux_range_t range =
         flux_range(angle, parameters->angle_max + parameters->half_count, input->current_q9[index], CURRENT_ERROR_Q9);
     const int64_t drift_q29 =
-        input->flux_step_max_q29 / 4 + (int64_t)parameters->flux_error_q29 * (int32_t)(MOVING_FACTOR * age);
+        input->flux_step_max_q29 / 4 +
+        ((int64_t)parameters->flux_error_q29 * (int32_t)MOVING_FACTOR + (input->flux_step_max_q29 >> PULSE_SHIFT)) *
+            (int32_t)age;
     const bool below = flux_q29 < range.least_q29 - (range.least_q29 >> GAIN_SHIFT) - drift_q29;
     const bool above = flux_q29 > range.most_q29 + (range.most_q29 >> GAIN_SHIFT) + drift_q29;
     return below || above ? phase->contradicted + periods : 0;

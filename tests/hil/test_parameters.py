@@ -38,7 +38,8 @@ def test_written_value_is_read_back(bench):
 
 
 def test_drive_has_the_table_of_the_reference_page(bench):
-    machine_defined = {"controller", "inertia_kg_m2", "friction_Nm_s", "resistance_ohm"}
+    machine_defined = {"controller", "inertia_kg_m2", "friction_Nm_s", "resistance_ohm", "winding_current_A",
+                       "winding_time_constant_s", "switch_current_A"}
     table = read_table()
     rows = list(bench.drive.parameters.rows.values())
     assert [(r.index, r.name, r.unit, r.fraction_bits) for r in rows] == [
@@ -92,7 +93,7 @@ def test_parameter_takes_effect(make_bench):
 
 
 def test_unknown_operation_is_answered(bench):
-    request = can.Message(arbitration_id=0x600, is_extended_id=False, data=bytes([13, 0, 0, 0, 0, 0, 0, 0]))
+    request = can.Message(arbitration_id=0x600, is_extended_id=False, data=bytes([14, 0, 0, 0, 0, 0, 0, 0]))
     bench.send(request)
     answer = bench.advance_until_frame(lambda m: m.arbitration_id == 0x580, 0.01)
     assert response(answer)["status"] == "unknown_operation"
