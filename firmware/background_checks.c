@@ -65,7 +65,7 @@ static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input,
 }
 
 /* Checks phases and encoder, and corrects the integrals. */
-COLD static uint32_t check_flux(drive_t *drive) {
+COLD static uint32_t check_phases_and_encoder(drive_t *drive) {
     control_state_t *control = &drive->control;
     hal_critical_enter(drive->hal);
     const phase_monitor_input_t input = phase_monitor_input(drive);
@@ -96,7 +96,7 @@ COLD void background_checks(drive_t *drive, uint32_t time_us) {
     hal_critical_enter(drive->hal);
     const stall_input_t stall = stall_input(drive);
     hal_critical_leave(drive->hal);
-    uint64_t failed = check_flux(drive);
+    uint64_t failed = check_phases_and_encoder(drive);
     if (sto_monitor_failed(&drive->sto, drive->break_causes, time_us)) {
         failed |= FAULT_BIT(FAULT_STO_DISCREPANCY);
     }

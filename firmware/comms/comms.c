@@ -3,8 +3,8 @@
 #include "comms/memory_protocol.h"
 #include "comms/node.h"
 #include "comms/parameter_protocol.h"
-#include "drive_codec.h"
 #include "comms/trace_protocol.h"
+#include "drive_codec.h"
 
 #define US_PER_MS 1000u
 

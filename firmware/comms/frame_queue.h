@@ -7,7 +7,7 @@
 
 #include "hal_can.h"
 
-#define FRAME_QUEUE_CAPACITY 16 /* a power of two */
+#define FRAME_QUEUE_CAPACITY 32 /* a power of two */
 
 /* All zero is an empty queue. */
 typedef struct {

@@ -12,6 +12,11 @@
 
 static_assert(DRIVE_TELEMETRY_CYCLE_MS == 1, "parameters have periods in ms");
 
+/* Places of the queue: for the heartbeat, and with it for the frames of a fault and the counters, to which the
+ * measurements of a bus or a background that does not keep up give way. */
+#define KEPT_FOR_HEARTBEAT 1u
+#define KEPT_FOR_OTHERS 14u
+
 void telemetry_init(telemetry_t *telemetry, uint32_t identifier_offset, uint32_t time_us) {
     *telemetry = (telemetry_t){.next_us = time_us, .identifier_offset = identifier_offset};
     for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
@@ -63,10 +68,12 @@ static unsigned due_messages(telemetry_t *telemetry, drive_telemetry_group_t gro
     return count;
 }
 
-static void enqueue_group(telemetry_t *telemetry, drive_telemetry_group_t group, const drive_telemetry_t *values) {
+/* All of a group or none; `kept`: places that it leaves free. */
+static void enqueue_group(telemetry_t *telemetry, drive_telemetry_group_t group, unsigned kept,
+                          const drive_telemetry_t *values) {
     const drive_telemetry_message_t *due[DRIVE_TELEMETRY_MESSAGES];
     const unsigned count = due_messages(telemetry, group, due);
-    if (frame_queue_free(&telemetry->queue) <= count) {
+    if (frame_queue_free(&telemetry->queue) < count + kept) {
         counter_add(&telemetry->dropped, count);
         return;
     }
@@ -108,10 +115,10 @@ static void follow_fault(telemetry_t *telemetry, const drive_telemetry_t *values
 void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
     telemetry->backlog = frame_queue_peek(&telemetry->queue) != NULL;
     follow_fault(telemetry, values);
-    enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_MEASUREMENTS, values);
-    enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_FAULT, values);
+    enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_MEASUREMENTS, KEPT_FOR_OTHERS, values);
+    enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_FAULT, KEPT_FOR_HEARTBEAT, values);
     values->bus_counters.telemetry_dropped = telemetry->dropped;
-    enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_COUNTERS, values);
+    enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_COUNTERS, KEPT_FOR_HEARTBEAT, values);
     enqueue_background(telemetry, DRIVE_TELEMETRY_GROUP_BACKGROUND, true, values);
     enqueue_background(telemetry, DRIVE_TELEMETRY_GROUP_IDLE, !telemetry->backlog, values);
 

@@ -1,14 +1,14 @@
 /* Encoder against the machine: the flux linkage of a phase that conducts shows where the rotor is.
  *
- *   frozen     while the encoder stays at one count, the ratio of the flux linkage integrated from the voltage
- *              (control/applied_flux.h) to that of the tables at that count and the measured current is constant, whatever the
- *              gains of sensors and machine are. A rotor that turns changes it.
- *   angle      the integrated flux linkage of two phases is outside what the tables allow within
- * ENCODER_MONITOR_ANGLE_DEG of the encoder's angle: offset, slip, wrong direction, a constant reading of another angle.
- *   over-speed by the encoder's counts over half a millisecond, without the observer.
+ *   frozen      while the encoder stays at one count, the ratio of the flux linkage integrated from the voltage
+ *               (control/applied_flux.h) to that of the tables at that count and the measured current is constant,
+ *               whatever the gains of sensors and machine are. A rotor that turns changes it.
+ *   angle       the integrated flux linkage of two phases is outside what the tables allow around the encoder's angle:
+ *               offset, slip, wrong direction, a constant reading of another angle.
+ *   over-speed  by the encoder's counts over half a millisecond, without the observer.
  *
- * Both compare two ways to the flux linkage, voltage and time on the one side, current and angle on the other. A rotor
- * that does not move, stalled or held by friction, contradicts nothing. Derived here.
+ * Frozen and angle compare two ways to the flux linkage, voltage and time on the one side, current and angle on the
+ * other. A rotor that does not move, stalled or held by friction, contradicts nothing. Derived here.
  */
 #ifndef DRIVE_ENCODER_MONITOR_H
 #define DRIVE_ENCODER_MONITOR_H

@@ -82,7 +82,8 @@ def test_ready_line_then_a_clean_end_without_the_socket(program, tmp_path: Path,
     with process:
         ready = json.loads(process.stdout.readline())
         assert ready == {"ready": True, "can": f"unix:{bus}", "pid": process.pid, "machine": "saturating",
-                         "controller": "salient", "control_rate_hz": 40000, "pace": pace, "seed": 1}
+                         "controller": "salient", "control_rate_hz": 40000, "pace": pace, "seed": 1, "node": 0,
+                         "drives": 1}
         if end == "stdin":
             process.stdin.close()
         else:

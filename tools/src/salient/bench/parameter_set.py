@@ -37,7 +37,8 @@ class SetResult:
 
 def write_frame(counter: int, index: int, raw: int, database: Database = _DATABASE) -> can.Message:
     """A PARAMETER_WRITE with its checksum; database: of the node."""
-    return e2e.protected_frame(database.get_message_by_name("PARAMETER_WRITE"), counter % 256, {"index": index, "value": raw})
+    message = database.get_message_by_name("PARAMETER_WRITE")
+    return e2e.protected_frame(message, counter % 256, {"index": index, "value": raw})
 
 
 def control_frame(counter: int, step: str, check: int = 0, database: Database = _DATABASE) -> can.Message:
@@ -104,8 +105,8 @@ class ParameterSetWriter:
         value = (last[2] << 8 | last[3]).to_bytes(4, "little")
         try:
             response = self._session.advance_until_frame(
-                lambda m: m.arbitration_id == self._response.frame_id and not m.is_extended_id and m.data[0] == _OPERATION
-                and bytes(m.data[4:]) == value, _RESPONSE_TIMEOUT_S)
+                lambda m: m.arbitration_id == self._response.frame_id and not m.is_extended_id
+                and m.data[0] == _OPERATION and bytes(m.data[4:]) == value, _RESPONSE_TIMEOUT_S)
         except TimeoutError:
             return SetResult("no_response")
         status = str(self._response.decode_simple(bytes(response.data))["status"])

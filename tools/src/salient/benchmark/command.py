@@ -92,7 +92,7 @@ def _until_reached(pid: int, can: str, end_s: float, before_s: float) -> float:
         time.sleep(_POLL_S)
     with Session(can) as session:
         reached_s = session.time_s
-        session.run_for(2e-3)
+        session.run_for(5e-3)  # a period of the telemetry and more
         speed_rpm = session.telemetry["speed_rpm"].last
         if reached_s < end_s - 1e-9 or not 590.0 < speed_rpm < 610.0:
             raise EmulatorError(f"the drive stopped without a client: {speed_rpm:g} r/min at {reached_s:g} s")
