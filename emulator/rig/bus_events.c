@@ -27,7 +27,7 @@ void bus_event(void *context, uint64_t now_ns) {
                        &frame);
     }
     for (; rig; rig = rig->next) {
-        if (delivery.to_drives >> rig->board.bus_drive & 1u) {
+        if (((unsigned)delivery.to_drives >> rig->board.bus_drive & 1u) != 0) {
             board_deliver(&rig->board, &delivery.frame);
         }
     }

@@ -127,7 +127,7 @@ def test_instructions_of_the_drive_are_grouped(controller: str, least: float, mo
     assert least < total < most, counts
     assert 0.3 < counts["plant"] / total < 0.8, counts
     assert 0.05 < counts["control laws"] / total < 0.5, counts
-    assert 0.02 < counts["drive"] / total < 0.3, counts
+    assert 0.02 < counts["drive"] / total < 0.4, counts
     assert 0.002 < counts["CAN"] / total < 0.15, counts
     assert 0.002 < counts["rig"] / total < 0.15, counts
     assert 0.0 <= counts["other"] / total < 0.03, counts

@@ -27,6 +27,11 @@ _ALIVE_CHECK_S = 1.0
 """Wall time between two checks that the emulator is alive; a debugger may stop it for any time."""
 
 _POLL_STEP_NS = 500_000
+_SOCKETCAN_STEP_NS = 10_000_000
+"""Longest step on a SocketCAN interface: its socket loses frames that do not fit, and the end of the step with them."""
+
+_NO_STEP_NS = 1 << 62
+
 _IDENTITY_WAIT_NS = 250_000_000
 """More than two periods of DRIVE_IDENTITY."""
 
@@ -101,6 +106,7 @@ class Session(KnownAttributes):
         self._identity = self.drive_database.get_message_by_name("DRIVE_IDENTITY")
         self._database_hash = database_hash(drive_database(machine))
         self._lockstep = lockstep
+        self._step_max_ns = _SOCKETCAN_STEP_NS // drives if address.startswith("socketcan:") else _NO_STEP_NS
         self._is_alive = is_alive
         self._sequence = 0
         self._identity_checked = False
@@ -241,7 +247,8 @@ class Session(KnownAttributes):
 
     def _advance(self, time_ns: int) -> None:
         if self._lockstep:
-            self._run_until(time_ns)
+            while self.time_ns < time_ns:
+                self._run_until(min(time_ns, self.time_ns + self._step_max_ns))
         else:
             while self.time_ns < time_ns:
                 self._receive()
