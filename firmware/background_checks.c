@@ -78,7 +78,7 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive) {
     hal_critical_enter(drive->hal);
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         int32_t *next_q29 = &control->applied_flux.next_q29[phase];
-        *next_q29 = fixed_clamp(fixed_add(*next_q29, correction_q29[phase]), 0, INT32_MAX);
+        *next_q29 = fixed_non_negative(fixed_add(*next_q29, correction_q29[phase]));
     }
     hal_critical_leave(drive->hal);
     return failed;

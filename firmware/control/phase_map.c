@@ -31,3 +31,13 @@ int32_t phase_map_torque_slope_q24(const machine_tables_t *tables, uint32_t phas
     const int32_t product = phase_map_between(slope_q14[0] / 2, slope_q14[1] / 2, current_q9);
     return fixed_saturate(((int64_t)product * ratio_q14) >> (13 - format->result_shift));
 }
+
+int32_t phase_map_flux_q29(const machine_tables_t *tables, uint32_t distance, int32_t current_q9) {
+    const int32_t clamped_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
+    const phase_map_lookup_t lookup = phase_map_lookup(tables, distance);
+    const phase_map_nodes_t nodes = phase_map_nodes(&lookup, (uint32_t)clamped_q9 >> MACHINE_COLUMN_BITS);
+    return phase_map_scale(&tables->flux_format,
+                           phase_map_between(phase_map_flux_value_q14(&lookup, &nodes, 0),
+                                             phase_map_flux_value_q14(&lookup, &nodes, MACHINE_TO_NEXT_COLUMN),
+                                             clamped_q9));
+}

@@ -139,4 +139,8 @@ NOINLINE int32_t phase_map_torque(const machine_tables_t *tables, uint32_t phase
 int32_t phase_map_torque_slope_q24(const machine_tables_t *tables, uint32_t phase_angle, int32_t current_q9,
                                    uint32_t angle_step);
 
+/* Flux linkage, Wb, Q2.29, saturated, at a distance from the unaligned position, 0..2^31 - 1. Any current; it is
+ * limited to the range above. */
+NOINLINE int32_t phase_map_flux_q29(const machine_tables_t *tables, uint32_t distance, int32_t current_q9);
+
 #endif

@@ -50,17 +50,6 @@
 /* 2^20 rad/s^2: 52 N m on 5e-5 kg m^2. */
 #define ACCELERATION_MAX (INT64_C(1) << 20)
 
-/* Flux linkage by the tables, Wb, Q2.29, at a distance from the unaligned position. */
-static int32_t table_flux_q29(uint32_t distance, int32_t current_q9) {
-    const int32_t limited_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
-    const phase_map_lookup_t lookup = phase_map_lookup(&machine_tables, distance);
-    const phase_map_nodes_t nodes = phase_map_nodes(&lookup, (uint32_t)limited_q9 >> MACHINE_COLUMN_BITS);
-    const int32_t flux =
-        phase_map_between(phase_map_flux_value_q14(&lookup, &nodes, 0),
-                          phase_map_flux_value_q14(&lookup, &nodes, MACHINE_TO_NEXT_COLUMN), limited_q9);
-    return phase_map_scale(&machine_tables.flux_format, flux);
-}
-
 /* Least and largest flux linkage within `width` of an angle, at a current less or more its error. */
 typedef struct {
     int32_t least_q29, most_q29;
@@ -71,8 +60,8 @@ static flux_range_t flux_range(uint32_t angle, uint32_t width, int32_t current_q
     const uint32_t near = distance > width ? distance - width : 0;
     const uint32_t far = distance + width < HALF_REV ? distance + width : HALF_REV - 1u;
     return (flux_range_t){
-        .least_q29 = table_flux_q29(near, current_q9 - current_error_q9),
-        .most_q29 = table_flux_q29(far, current_q9 + current_error_q9),
+        .least_q29 = phase_map_flux_q29(&machine_tables, near, current_q9 - current_error_q9),
+        .most_q29 = phase_map_flux_q29(&machine_tables, far, current_q9 + current_error_q9),
     };
 }
 
@@ -92,8 +81,9 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
     const uint64_t square_q22 = (uint64_t)clamped * TWICE_ANGLE_Q20 * 4u >> machine_tables.speed_exponent;
     const int32_t speed_q22 = fixed_saturate((int64_t)square_root(square_q22) << 11);
     const uint32_t step = (uint32_t)fixed_multiply_high(speed_q22, angle_step_q32) * rotor_poles;
-    const int32_t rise_q29 =
-        fixed_subtract(table_flux_q29(HALF_REV - 1u, current_q9), table_flux_q29(0, current_q9)) / 2;
+    const int32_t rise_q29 = fixed_subtract(phase_map_flux_q29(&machine_tables, HALF_REV - 1u, current_q9),
+                                            phase_map_flux_q29(&machine_tables, 0, current_q9)) /
+                             2;
     return 2 * fixed_multiply_high(rise_q29, (int32_t)step);
 }
 

@@ -37,25 +37,14 @@ typedef struct {
     int32_t delay_q29; /* tolerance of a flux linkage, Wb, Q2.29 */
 } common_t;
 
-/* Flux linkage of the tables, Wb, Q2.29. distance: from the unaligned position, 0..2^31 - 1. */
-NOINLINE static int32_t table_flux_q29(const machine_tables_t *tables, uint32_t distance, int32_t current_q9) {
-    const int32_t clamped_q9 = fixed_clamp(current_q9, 0, PHASE_MAP_CURRENT_MAX_Q9);
-    const phase_map_lookup_t lookup = phase_map_lookup(tables, distance);
-    const phase_map_nodes_t nodes = phase_map_nodes(&lookup, (uint32_t)clamped_q9 >> MACHINE_COLUMN_BITS);
-    return phase_map_scale(&tables->flux_format,
-                           phase_map_between(phase_map_flux_value_q14(&lookup, &nodes, 0),
-                                             phase_map_flux_value_q14(&lookup, &nodes, MACHINE_TO_NEXT_COLUMN),
-                                             clamped_q9));
-}
-
 /* Largest and smallest flux linkage at a measured current, at a distance. */
 NOINLINE static int32_t most_q29(const common_t *common, uint32_t distance, int32_t current_q9, int32_t offset_q9) {
-    const int32_t table_q29 = table_flux_q29(common->tables, distance, current_q9 + current_q9 / 10 + offset_q9);
+    const int32_t table_q29 = phase_map_flux_q29(common->tables, distance, current_q9 + current_q9 / 10 + offset_q9);
     return fixed_add(table_q29, table_q29 / 20 * 3);
 }
 
 NOINLINE static int32_t least_q29(const common_t *common, uint32_t distance, int32_t current_q9) {
-    const int32_t table_q29 = table_flux_q29(common->tables, distance, (current_q9 - common->offset_q9) * 10 / 11);
+    const int32_t table_q29 = phase_map_flux_q29(common->tables, distance, (current_q9 - common->offset_q9) * 10 / 11);
     return table_q29 - table_q29 / 20 * 3;
 }
 
@@ -225,7 +214,7 @@ static int32_t correction_of(const common_t *common, phase_monitor_phase_t *stat
         state->followed_q29 = fixed_subtract(state->followed_q29, flux_q29);
         return -flux_q29;
     }
-    const int32_t error_q29 = table_flux_q29(common->tables, distance_of(input, phase), current_q9) - flux_q29;
+    const int32_t error_q29 = phase_map_flux_q29(common->tables, distance_of(input, phase), current_q9) - flux_q29;
     const uint32_t follow = FOLLOW_MS * input->periods_per_ms;
     const bool set = common->lost || common->elapsed >= follow;
     const int32_t correction_q29 = set ? error_q29 : error_q29 / (int32_t)follow * (int32_t)common->elapsed;
