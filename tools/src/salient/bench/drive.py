@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ _RESPONSE_TIMEOUT_S = 0.1
 _ATTEMPTS = 20
 """Requests that are made for one response. Where time moves by itself, a client that does not keep up loses frames."""
 _TEXT_PARTS_MAX = 64
+_REQUESTS_AT_ONCE = 16  # fewer than the frames that the drive's receive and transmit queues hold
 _SAVE_TIMEOUT_S = 2.0
 _MEMORY_ITEMS = ("saving", "origin", "start", "newest_fault", "sets")
 _SAVING, _SAVED = 1, 2
@@ -486,16 +488,20 @@ def raw_value(row: ParameterRow, value: float) -> int:
 
 def read_parameter_table(session: Client) -> list[ParameterRow]:
     """Reads the descriptions of all parameters from the drive; takes some 0.1 s of virtual time."""
-    rows: list[ParameterRow] = []
+    fraction_bits: list[int] = []
     while True:
-        index = len(rows)
-        status, fraction_bits = _access(session, "fraction_bits", index)
-        if status != "done":
-            return rows
-        limits = (math.ldexp(_access(session, what, index)[1], -fraction_bits)
-                  for what in ("minimum", "maximum", "default"))
-        name, unit = (_read_text(session, what, index) for what in ("name", "unit"))
-        rows.append(ParameterRow(index, name, unit, fraction_bits, *limits))
+        block = range(len(fraction_bits), len(fraction_bits) + _REQUESTS_AT_ONCE)
+        answers = _access_all(session, [("fraction_bits", index, 0) for index in block])
+        known = [value for status, value in answers if status == "done"]
+        fraction_bits += known
+        if len(known) < len(block):
+            break
+    indices = range(len(fraction_bits))
+    limits = [[value for _, value in _access_all(session, [(what, index, 0) for index in indices])]
+              for what in ("minimum", "maximum", "default")]
+    names, units = (_read_texts(session, what, len(indices)) for what in ("name", "unit"))
+    return [ParameterRow(index, names[index], units[index], fraction_bits[index],
+                         *(math.ldexp(limit[index], -fraction_bits[index]) for limit in limits)) for index in indices]
 
 
 def _request(database: Database, operation: str, index: int, part: int, value: int) -> can.Message:
@@ -528,11 +534,45 @@ def _memory_item(session: Client, name: str) -> int:
     return _access(session, "memory", 0, _MEMORY_ITEMS.index(name))[1]
 
 
-def _read_text(session: Client, operation: str, index: int) -> str:
-    text = b""
+def _read_texts(session: Client, operation: str, count: int) -> list[str]:
+    """Texts of parameters 0 to count - 1, four characters a part; a text ends with a part that ends in a zero."""
+    texts = [b""] * count
+    open_texts = list(range(count))
     for part in range(_TEXT_PARTS_MAX):
-        four = _access(session, operation, index, part)[1].to_bytes(4, "little", signed=True)
-        text += four.rstrip(b"\0")
-        if four.endswith(b"\0"):
+        answers = _access_all(session, [(operation, index, part) for index in open_texts])
+        fours = [value.to_bytes(4, "little", signed=True) for _, value in answers]
+        for index, four in zip(open_texts, fours, strict=True):
+            texts[index] += four.rstrip(b"\0")
+        open_texts = [index for index, four in zip(open_texts, fours, strict=True) if not four.endswith(b"\0")]
+        if not open_texts:
             break
-    return text.decode("ascii")
+    return [text.decode("ascii") for text in texts]
+
+
+def _access_all(session: Client, requests: Sequence[tuple[str, int, int]]) -> list[tuple[str, int]]:
+    """(status, value) of each request (operation, index, part), several under way at once; a lost one is repeated."""
+    message = session.drive_database.get_message_by_name("PARAMETER_RESPONSE")
+    answers: list[tuple[str, int]] = []
+    for start in range(0, len(requests), _REQUESTS_AT_ONCE):
+        block = requests[start:start + _REQUESTS_AT_ONCE]
+        waiting = {bytes([_OPERATIONS[operation], index, part]): number
+                   for number, (operation, index, part) in enumerate(block)}
+        found: dict[int, tuple[str, int]] = {}
+
+        def take(frame: can.Message, waiting: dict[bytes, int] = waiting,
+                 found: dict[int, tuple[str, int]] = found) -> bool:
+            if frame.arbitration_id == message.frame_id and not frame.is_extended_id:
+                number = waiting.pop(bytes(frame.data[:3]), None)
+                if number is not None:
+                    signals: Mapping[str, Any] = message.decode_simple(bytes(frame.data))
+                    found[number] = str(signals["status"]), int(signals["value"])
+            return not waiting
+
+        for operation, index, part in block:
+            session.send(_request(session.drive_database, operation, index, part, 0))
+        with contextlib.suppress(TimeoutError):
+            session.advance_until_frame(take, _RESPONSE_TIMEOUT_S)
+        answers += [found[number] if number in found else _access(session, *request)
+                    for number, request in enumerate(block)]
+    return answers
+
