@@ -3,6 +3,7 @@
 #include "background_checks.h"
 #include "comms/node.h"
 #include "drive/deferred.h"
+#include "drive/unmasked_read.h"
 #include "fixed/compiler.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
@@ -213,10 +214,25 @@ COLD static void kick_watchdog(drive_t *drive, uint32_t time_us) {
     const deferred_request_t *request = &drive->control.deferred_request;
     const volatile uint32_t *completed = &drive->control.deferred.response.completed;
     const uint32_t completed_before = *completed;
-    if (watchdog_monitor_kick(&drive->watchdog, request->requests + request->skipped_total, request->requests,
-                              completed_before, time_us)) {
+    if (watchdog_monitor_kick(&drive->watchdog, unmasked_read_periods(request), request->requests, completed_before,
+                              time_us)) {
         hal_watchdog_kick(drive->hal);
     }
+}
+
+/* Values of one control period. Interrupts are masked only when they leave the background less time than this takes. */
+COLD static void collect_telemetry(drive_t *drive, uint32_t time_us, drive_telemetry_t *values) {
+    const deferred_request_t *request = &drive->control.deferred_request;
+    for (unsigned attempt = 0; attempt < UNMASKED_READ_ATTEMPTS; attempt++) {
+        const uint32_t periods = unmasked_read_begin(request);
+        telemetry_collect(drive, time_us, values);
+        if (unmasked_read_ended(request, periods)) {
+            return;
+        }
+    }
+    hal_critical_enter(drive->hal);
+    telemetry_collect(drive, time_us, values);
+    hal_critical_leave(drive->hal);
 }
 
 COLD void drive_background(drive_t *drive) {
@@ -234,9 +250,7 @@ COLD void drive_background(drive_t *drive) {
             arming_end_configuration(&drive->comms.commands.arming);
         }
         drive_telemetry_t values;
-        hal_critical_enter(drive->hal);
-        telemetry_collect(drive, time_us, &values);
-        hal_critical_leave(drive->hal);
+        collect_telemetry(drive, time_us, &values);
         comms_telemetry(&drive->comms, drive->hal, &values);
     }
     const parameters_conditions_t conditions = {
