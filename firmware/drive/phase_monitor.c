@@ -65,6 +65,7 @@ static int32_t slack_q29(const common_t *common, const phase_monitor_phase_t *st
 /* Side and extent of a difference between voltage and current. */
 typedef enum {
     AGREES,
+    DOUBTFUL,      /* agrees within the tolerances, with hardly a current */
     WITHIN_ANGLES, /* differs at the measured angle */
     BEYOND_ANGLES  /* differs at any */
 } difference_t;
@@ -101,7 +102,7 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
         *side = -1;
         return low_q29 < least_q29(common, 0, current_q9) ? BEYOND_ANGLES : WITHIN_ANGLES;
     }
-    return AGREES;
+    return small && high_q29 > table_q29 ? DOUBTFUL : AGREES;
 }
 
 /* Flux linkage that the opposite voltage removes within a period. */
@@ -168,6 +169,7 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     if (common->input->run && !common->lost) {
         difference = compare(common, state, phase, table_q29, &side);
     }
+    monitor->suspicious |= difference != AGREES;
     const bool beyond = difference == BEYOND_ANGLES;
     state->turned = side == 0 || side != state->side ? 0 : fixed_saturate((int64_t)state->turned + common->step);
     state->side = (int8_t)side;
@@ -262,19 +264,18 @@ COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_
     monitor->run = input->run;
     uint32_t failed = 0;
     uint32_t in_excess = 0;
-    bool differs = false;
+    monitor->suspicious = false;
     for (unsigned phase = 0; phase < tables->phases; phase++) {
         const int32_t current_q9 = input->current_q9[phase];
         const bool zero = input->off[phase] && current_q9 <= common.offset_q9;
         const int32_t table_q29 = zero ? 0 : phase_map_flux_q29(tables, distance_of(input, phase), current_q9);
         const uint32_t failed_of_phase = check_phase(&common, monitor, phase, table_q29);
         in_excess |= (uint32_t)(monitor->phase[phase].excess_periods > 0) << phase;
-        differs = differs || monitor->phase[phase].side != 0;
         monitor->phases |= (uint32_t)(failed_of_phase != 0) << phase;
         failed |= failed_of_phase;
         correction_q29[phase] = correction_of(&common, &monitor->phase[phase], phase, table_q29, zero);
     }
-    monitor->suspicious = differs || in_excess != 0;
+    monitor->suspicious |= in_excess != 0;
     if (input->run) {
         failed |= judge_doubts(monitor, common.step);
     }
