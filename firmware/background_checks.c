@@ -7,12 +7,12 @@
 #include "fixed/fixed.h"
 #include "hal_time.h"
 
-/* Of phases, encoder, stall and STO lines: in each 5 control periods at 40 kHz; in each one while a phase or the encoder
- * is in doubt, so that it is found hardly later than with a check in each period. Heat is sampled at every call, because
- * currents may repeat after a few periods. */
+/* Of phases, encoder, stall and STO lines: in each 5 control periods at 40 kHz; in each one while a phase or the
+ * encoder is in doubt, so that it is found hardly later than with a check in each period. Heat is sampled at every
+ * call, because currents may repeat after a few periods. */
 #define CHECKS_PER_MS 8u
 
-static void read_stall_input(const control_state_t *control, stall_input_t *input) {
+COLD static void read_stall_input(const control_state_t *control, stall_input_t *input) {
     const deferred_speed_results_t *speed = &deferred_in_effect(control)->speed;
     *input = (stall_input_t){
         .speed_mode = control->state_machine.state == DRIVE_STATE_RUN && control->deferred.mode == DRIVE_MODE_SPEED,
@@ -31,7 +31,7 @@ typedef struct {
     uint32_t encoder_angle;
 } sample_t;
 
-static bool read_sample(const control_state_t *control, const control_parameters_t *parameters, sample_t *sample) {
+COLD static bool read_sample(const control_state_t *control, const control_parameters_t *parameters, sample_t *sample) {
     const deferred_request_t *request = &control->deferred_request;
     const control_measurement_t *measured = &control->measurement;
     phase_monitor_input_t *input = &sample->phases;
@@ -59,8 +59,8 @@ static bool read_sample(const control_state_t *control, const control_parameters
 }
 
 /* Of the sample of `input`; the integrals without the corrections that the other monitor has made. */
-static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input, const phase_monitor_t *phases,
-                                             uint32_t encoder_angle) {
+COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input, const phase_monitor_t *phases,
+                                                  uint32_t encoder_angle) {
     encoder_monitor_input_t encoder = {
         .run = input->run,
         .encoder_angle = encoder_angle,

@@ -22,8 +22,8 @@ static bool may_configure(const drive_t *drive) {
     return drive->control.state_machine.state != DRIVE_STATE_RUN && drive->command.request != COMMAND_RUN;
 }
 
-/* Applies the parameters in one piece between two control periods; in a run or beside the command that starts one,
- * those that may then be changed, which are all that differ. */
+/* Applies the parameters in one piece between two control periods; in a run or beside the command that starts one, in
+ * parts, those that may then be changed, which are all that differ. */
 COLD static void configure(drive_t *drive) {
     const control_parameters_t control_parameters =
         configure_control(&drive->parameters, &machine_tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
@@ -34,8 +34,13 @@ COLD static void configure(drive_t *drive) {
         drive->control_parameters = control_parameters;
         control_prepare(&drive->control_parameters, &drive->control);
     } else {
-        configure_tune(&drive->control_parameters, &control_parameters);
+        configure_tune(&drive->control_parameters, &control_parameters, 0);
         deferred_tune(&drive->control_parameters, &drive->control);
+        for (unsigned part = 1; part < CONFIGURE_TUNE_PARTS; part++) {
+            hal_critical_leave(drive->hal);
+            hal_critical_enter(drive->hal);
+            configure_tune(&drive->control_parameters, &control_parameters, part);
+        }
     }
     drive->applied_revision = drive->parameters.revision;
     hal_critical_leave(drive->hal);

@@ -80,8 +80,8 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     return set;
 }
 
-void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned) {
-    (void)parameters, (void)tuned;
+void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned, unsigned part) {
+    (void)parameters, (void)tuned, (void)part;
 }
 
 void deferred_tune(const control_parameters_t *parameters, control_state_t *state) {
