@@ -7,10 +7,10 @@
 #include "fixed/fixed.h"
 #include "hal_time.h"
 
-/* Of phases, encoder, stall and STO lines: in each 5 control periods at 40 kHz; in each one while a phase or the
+/* Of phases, encoder, stall and STO lines: in each 4 control periods at 40 kHz; in each one while a phase or the
  * encoder is in doubt, so that it is found hardly later than with a check in each period. Heat is sampled at every
  * call, because currents may repeat after a few periods. */
-#define CHECKS_PER_MS 8u
+#define CHECKS_PER_MS 10u
 
 COLD static void read_stall_input(const control_state_t *control, stall_input_t *input) {
     const deferred_speed_results_t *speed = &deferred_in_effect(control)->speed;

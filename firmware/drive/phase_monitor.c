@@ -111,7 +111,8 @@ static bool gone(const phase_monitor_input_t *input, unsigned phase) {
 }
 
 /* True when the voltage has left the phase without flux linkage, errors of the integral included. */
-static bool at_rest(const common_t *common, phase_monitor_phase_t *state, unsigned phase) {
+static bool at_rest(const common_t *common, phase_monitor_t *monitor, unsigned phase) {
+    phase_monitor_phase_t *state = &monitor->phase[phase];
     const phase_monitor_input_t *input = common->input;
     const int32_t flux_q29 = input->flux_q29[phase];
     const uint32_t conducting = state->conducting + common->elapsed;
@@ -124,6 +125,7 @@ static bool at_rest(const common_t *common, phase_monitor_phase_t *state, unsign
     }
     /* Since the previous input, if the phase was at 0 then already. */
     const uint32_t periods = state->rest_q29 == 0 ? 1 : common->elapsed & 0xffffu;
+    monitor->suspicious |= input->current_q9[phase] > 2 * common->offset_q9;
     state->rest_q29 = fixed_saturate(state->rest_q29 + (int64_t)input->period_flux_q29 * (int32_t)periods);
     if (state->rest_q29 < fixed_add(state->peak_q29 / 4, common->delay_q29)) {
         return false;
@@ -163,7 +165,7 @@ static uint32_t check_excess(const common_t *common, phase_monitor_phase_t *stat
 
 static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, unsigned phase, int32_t table_q29) {
     phase_monitor_phase_t *state = &monitor->phase[phase];
-    const bool rest = at_rest(common, state, phase);
+    const bool rest = at_rest(common, monitor, phase);
     int side = 0;
     difference_t difference = AGREES;
     if (common->input->run && !common->lost) {
