@@ -80,8 +80,8 @@ def mutated(mutant: Mutant, root: Path = ROOT) -> str:
     text = path.read_text(encoding="utf-8")
     count = text.count(mutant.old)
     if count != 1 or mutant.old == mutant.new:
-        raise UsageError(f"{TABLE.name}: {mutant.name}: {mutant.file} has the old text {count} times: must be once, and "
-                         "the new text another one")
+        raise UsageError(f"{TABLE.name}: {mutant.name}: {mutant.file} has the old text {count} times: must be once, "
+                         "and the new text another one")
     return text.replace(mutant.old, mutant.new)
 
 
@@ -132,7 +132,7 @@ def _copy_sources() -> str:
         content = (ROOT / name).read_bytes()
         _write(COPY / name, content)
         (COPY / name).chmod((ROOT / name).stat().st_mode)
-        if not name.endswith((".md", TABLE.name)):
+        if not name.endswith((".md", TABLE.name, Path(__file__).name)) and not name.startswith("tests/tools/"):
             digest.update(name.encode() + b"\0" + content)
     (COPY / "build").mkdir(exist_ok=True)
     venv = COPY / "build" / "venv"
@@ -215,8 +215,8 @@ def page(mutants: list[Mutant], killer_of: dict[str, str], commit: str) -> str:
     lines = [
         "# Protections removed or weakened, and the tests that notice it", "",
         "<!-- Written by python -m salient.experiments.protection_mutants. -->", "",
-        f"Each row is one build of the sources of `{commit}` with one change (`tests/protection_mutants.toml`), and the",
-        f"first test that failed: {killed} of {len(mutants)}. The others have their reason.", "",
+        f"Each row is one build of the sources of `{commit}` with one change (`tests/protection_mutants.toml`), and",
+        f"the first test that failed: {killed} of {len(mutants)}. The others have their reason.", "",
         "| protection | mutation | in | noticed by |", "| --- | --- | --- | --- |",
     ]
     for mutant in mutants:
@@ -230,7 +230,7 @@ def run(mutants: list[Mutant], *, of_all: bool) -> int:
     for mutant in mutants:
         mutated(mutant)
         check_tests(mutant)
-    sources = _copy_sources()
+    commit, sources = _commit(), _copy_sources()
     kept: dict[str, str] = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
     waiting = [mutant for mutant in mutants if _key(mutant, sources) not in kept]
     if waiting:
@@ -244,7 +244,7 @@ def run(mutants: list[Mutant], *, of_all: bool) -> int:
         print(f"{number}/{len(waiting)} {mutant.name}: {killer or 'survives'}", flush=True)
     killer_of = {mutant.name: kept[_key(mutant, sources)] for mutant in mutants}
     if of_all:
-        PAGE.write_text(page(mutants, killer_of, _commit()), encoding="utf-8")
+        PAGE.write_text(page(mutants, killer_of, commit), encoding="utf-8")
     survivors = [mutant for mutant in mutants if not killer_of[mutant.name] and not mutant.equivalent]
     for mutant in survivors:
         print(f"survives: {mutant.name}")
