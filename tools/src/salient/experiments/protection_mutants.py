@@ -145,9 +145,14 @@ def _run(command: list[str], **environment: str) -> subprocess.CompletedProcess[
     return subprocess.run(command, cwd=COPY, env={**os.environ, **environment}, capture_output=True, text=True)
 
 
-def _build(programs: list[str]) -> str:
-    """Builds; returns the last line of the error, "" without one."""
-    built = _run(["cmake", "--build", "build/host", "--target", "salient_host", *programs])
+def _programs(mutants: list[Mutant]) -> list[str]:
+    """Of unit tests, and the drive that the tests of pytest start."""
+    return sorted({"salient_host" if "::" in test else test for mutant in mutants for test in mutant.tests})
+
+
+def _build(mutants: list[Mutant]) -> str:
+    """Builds what the tests need; returns the last line of the error, "" without one."""
+    built = _run(["cmake", "--build", "build/host", "--target", *_programs(mutants)])
     return "" if built.returncode == 0 else (built.stdout.strip() or "build failed").splitlines()[-1]
 
 
@@ -167,13 +172,9 @@ def _first_failure(test: str) -> str:
     return f"`{failed[1]}`" if failed else f"`{test}` ends with code {result.returncode}"
 
 
-def _programs(mutants: list[Mutant]) -> list[str]:
-    return sorted({test for mutant in mutants for test in mutant.tests if "::" not in test})
-
-
 def check_unchanged(mutants: list[Mutant]) -> None:
     """UsageError when a test fails without a mutation: it would prove nothing."""
-    error = _build(_programs(mutants))
+    error = _build(mutants)
     if error:
         raise UsageError(f"the unchanged sources do not build: {error}")
     for test in sorted({test for mutant in mutants for test in mutant.tests}):
@@ -188,7 +189,7 @@ def judge(mutant: Mutant) -> str:
     unchanged = path.read_bytes()
     try:
         path.write_text(mutated(mutant, COPY), encoding="utf-8")
-        error = _build(_programs([mutant]))
+        error = _build([mutant])
         if error:
             raise UsageError(f"{TABLE.name}: {mutant.name}: does not build: {error}")
         return next((failure for failure in map(_first_failure, mutant.tests) if failure), "")
