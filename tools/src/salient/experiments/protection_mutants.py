@@ -35,8 +35,8 @@ KEYS = {"protection", "change", "file", "old", "new", "tests", "equivalent"}
 
 @dataclass(frozen=True)
 class Mutant:
-    """tests: programs of unit tests, or node ids of pytest; the first that fails ends the run. equivalent: why no test
-    can notice it, "" when one has to."""
+    """tests: programs of unit tests, with :SUITE.TEST for one of theirs, or node ids of pytest; the first that fails ends
+    the run. equivalent: why no test can notice it, "" when one has to."""
 
     protection: str
     change: str
@@ -101,7 +101,9 @@ def check_tests(mutant: Mutant, root: Path = ROOT) -> None:
             path = root / file
             found = path.is_file() and f"def {function.partition('[')[0]}(" in path.read_text(encoding="utf-8")
         else:
-            found = unit_test_source(test, root) is not None
+            program, _, name = test.partition(":")
+            source = unit_test_source(program, root)
+            found = source is not None and name.replace(".", ", ") in source.read_text(encoding="utf-8")
         if not found:
             raise UsageError(f"{TABLE.name}: {mutant.name}: no test {test}")
     if not mutant.tests and not mutant.equivalent:
@@ -147,7 +149,7 @@ def _run(command: list[str], **environment: str) -> subprocess.CompletedProcess[
 
 def _programs(mutants: list[Mutant]) -> list[str]:
     """Of unit tests, and the drive that the tests of pytest start."""
-    return sorted({"salient_host" if "::" in test else test for mutant in mutants for test in mutant.tests})
+    return sorted({"salient_host" if "::" in test else test.partition(":")[0] for mutant in mutants for test in mutant.tests})
 
 
 def _build(mutants: list[Mutant]) -> str:
@@ -163,7 +165,8 @@ def _first_failure(test: str) -> str:
                       PYTHONPATH=str(COPY / "tools" / "src"))
         failed = re.search(r"^(?:FAILED|ERROR) (?:.*/)?(\S+::\S+)", result.stdout, re.MULTILINE)
     else:
-        result = _run([str(COPY / "build/host/bin" / test), "--gtest_brief=1"])
+        program, _, name = test.partition(":")
+        result = _run([str(COPY / "build/host/bin" / program), "--gtest_brief=1", f"--gtest_filter={name or '*'}"])
         failed = re.search(r"^\[  FAILED  \] (\S+?)[,.]?(?: .*)?$", result.stdout, re.MULTILINE)
     if result.returncode == 0:
         return ""
