@@ -35,8 +35,8 @@ KEYS = {"protection", "change", "file", "old", "new", "tests", "equivalent"}
 
 @dataclass(frozen=True)
 class Mutant:
-    """tests: programs of unit tests, with :SUITE.TEST for one of theirs, or node ids of pytest; the first that fails ends
-    the run. equivalent: why no test can notice it, "" when one has to."""
+    """tests: programs of unit tests, with :SUITE.TEST for one of theirs, or node ids of pytest; the first that fails
+    ends the run. equivalent: why no test can notice it, "" when one has to."""
 
     protection: str
     change: str
@@ -149,7 +149,8 @@ def _run(command: list[str], **environment: str) -> subprocess.CompletedProcess[
 
 def _programs(mutants: list[Mutant]) -> list[str]:
     """Of unit tests, and the drive that the tests of pytest start."""
-    return sorted({"salient_host" if "::" in test else test.partition(":")[0] for mutant in mutants for test in mutant.tests})
+    tests = {test for mutant in mutants for test in mutant.tests}
+    return sorted({"salient_host" if "::" in test else test.partition(":")[0] for test in tests})
 
 
 def _build(mutants: list[Mutant]) -> str:
