@@ -70,7 +70,7 @@ def test_a_survivor_without_a_reason_fails_the_run(monkeypatch, capsys, tmp_path
     monkeypatch.setattr(protection_mutants, "_copy_sources", lambda: "")
     monkeypatch.setattr(protection_mutants, "_key", lambda mutant, sources: mutant.change)
     monkeypatch.setattr(protection_mutants, "_run", lambda command: type("Done", (), {"returncode": 0}))
-    monkeypatch.setattr(protection_mutants, "check_unchanged", lambda mutants: None)
+    monkeypatch.setattr(protection_mutants, "check_unchanged", lambda mutants, passed: None)
     monkeypatch.setattr(protection_mutants, "judge", lambda mutant: judged[mutant.change])
     assert protection_mutants.run(mutants, of_all=True) == 1
     assert "survives: over_current: alive" in capsys.readouterr().out

@@ -176,15 +176,17 @@ def _first_failure(test: str) -> str:
     return f"`{failed[1]}`" if failed else f"`{test}` ends with code {result.returncode}"
 
 
-def check_unchanged(mutants: list[Mutant]) -> None:
-    """UsageError when a test fails without a mutation: it would prove nothing."""
-    error = _build(mutants)
+def check_unchanged(mutants: list[Mutant], passed: set[str]) -> None:
+    """UsageError when a test fails without a mutation: it would prove nothing. passed: tests that have passed."""
+    tests = {test for mutant in mutants for test in mutant.tests} - passed
+    error = _build(mutants) if tests else ""
     if error:
         raise UsageError(f"the unchanged sources do not build: {error}")
-    for test in sorted({test for mutant in mutants for test in mutant.tests}):
+    for test in sorted(tests):
         failure = _first_failure(test)
         if failure:
             raise UsageError(f"without a mutation fails {failure}")
+        passed.add(test)
 
 
 def judge(mutant: Mutant) -> str:
@@ -242,8 +244,9 @@ def run(mutants: list[Mutant], *, of_all: bool) -> int:
         configured = _run(["cmake", "--preset", "host"])
         if configured.returncode != 0:
             raise UsageError(f"{COPY}: cmake --preset host fails")
-        check_unchanged(waiting)
+    passed: set[str] = set()
     for number, mutant in enumerate(waiting, 1):
+        check_unchanged([mutant], passed)
         kept[_key(mutant, sources)] = killer = judge(mutant)
         RESULTS.write_text(json.dumps(kept))
         print(f"{number}/{len(waiting)} {mutant.name}: {killer or 'survives'}", flush=True)
