@@ -2,14 +2,19 @@
 
 #include "control/modulator.h"
 #include "drive/deferred.h"
+#include "drive/unmasked_read.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "hal_time.h"
 
-static stall_input_t stall_input(const drive_t *drive) {
-    const control_state_t *control = &drive->control;
+/* Of phases, encoder, stall and STO lines: in each 4 control periods at 40 kHz; in each one while a phase or the
+ * encoder is in doubt, so that it is found hardly later than with a check in each period. Heat is sampled at every
+ * call, because currents may repeat after a few periods. */
+#define CHECKS_PER_MS 10u
+
+COLD static void read_stall_input(const control_state_t *control, stall_input_t *input) {
     const deferred_speed_results_t *speed = &deferred_in_effect(control)->speed;
-    return (stall_input_t){
+    *input = (stall_input_t){
         .speed_mode = control->state_machine.state == DRIVE_STATE_RUN && control->deferred.mode == DRIVE_MODE_SPEED,
         .speed_reference_q22 = speed->speed_reference_q22,
         .speed_q22 = control->observer.speed_q22,
@@ -19,35 +24,43 @@ static stall_input_t stall_input(const drive_t *drive) {
     };
 }
 
-/* The last sample, and what the integrals of the voltage were at it. */
-static phase_monitor_input_t phase_monitor_input(const drive_t *drive) {
-    const control_state_t *control = &drive->control;
-    const control_parameters_t *parameters = &drive->control_parameters;
+/* What the checks need of the last control period: its sample, the integrals of the voltage at it, the speed law. */
+typedef struct {
+    stall_input_t stall;
+    phase_monitor_input_t phases;
+    uint32_t encoder_angle;
+} sample_t;
+
+COLD static bool read_sample(const control_state_t *control, const control_parameters_t *parameters, sample_t *sample) {
+    const deferred_request_t *request = &control->deferred_request;
     const control_measurement_t *measured = &control->measurement;
-    const predictive_torque_parameters_t *constants = &parameters->predictive;
-    phase_monitor_input_t input = {
-        .run = control->state_machine.state == DRIVE_STATE_RUN,
-        .late_interrupts = control->protection.late_interrupts,
-        .periods = control->deferred_request.requests + control->deferred_request.skipped_total,
-        .periods_per_ms = parameters->initialise_ticks,
-        .electrical = measured->commutation.electrical,
-        .stroke = parameters->commutation.stroke,
-        .period_flux_q29 = applied_flux_period_q29(measured->dc_link_voltage_q6, constants->period_q40),
-        .resistance_period_q40 = constants->flux.resistance_period_q40,
-    };
-    const int32_t *misalignment = deferred_in_effect(control)->predictive.misalignment;
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        input.misalignment[phase] = misalignment[phase];
-        input.current_q9[phase] = measured->current_q9[phase];
-        input.flux_q29[phase] = control->applied_flux.at_sample_q29[phase];
-        input.off[phase] = control->duty_q15[phase] == -MODULATOR_DUTY_ONE_Q15;
+    phase_monitor_input_t *input = &sample->phases;
+    for (unsigned attempt = 0; attempt < UNMASKED_READ_ATTEMPTS; attempt++) {
+        input->periods = unmasked_read_begin(request);
+        input->run = control->state_machine.state == DRIVE_STATE_RUN;
+        input->late_interrupts = control->protection.late_interrupts;
+        input->electrical = measured->commutation.electrical;
+        input->period_flux_q29 =
+            applied_flux_period_q29(measured->dc_link_voltage_q6, parameters->predictive.period_q40);
+        sample->encoder_angle = measured->encoder_angle;
+        const int32_t *misalignment = deferred_in_effect(control)->predictive.misalignment;
+        for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+            input->misalignment[phase] = misalignment[phase];
+            input->current_q9[phase] = measured->current_q9[phase];
+            input->flux_q29[phase] = control->applied_flux.at_sample_q29[phase];
+            input->off[phase] = control->duty_q15[phase] == -MODULATOR_DUTY_ONE_Q15;
+        }
+        read_stall_input(control, &sample->stall);
+        if (unmasked_read_ended(request, input->periods)) {
+            return true;
+        }
     }
-    return input;
+    return false;
 }
 
 /* Of the sample of `input`; the integrals without the corrections that the other monitor has made. */
-static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input, const phase_monitor_t *phases,
-                                             uint32_t encoder_angle) {
+COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input, const phase_monitor_t *phases,
+                                                  uint32_t encoder_angle) {
     encoder_monitor_input_t encoder = {
         .run = input->run,
         .encoder_angle = encoder_angle,
@@ -65,22 +78,18 @@ static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input,
 }
 
 /* Checks phases and encoder, and corrects the integrals. */
-COLD static uint32_t check_phases_and_encoder(drive_t *drive) {
-    control_state_t *control = &drive->control;
-    hal_critical_enter(drive->hal);
-    const phase_monitor_input_t input = phase_monitor_input(drive);
-    const uint32_t encoder_angle = control->measurement.encoder_angle;
-    hal_critical_leave(drive->hal);
-    const encoder_monitor_input_t encoder = encoder_input(&input, &drive->phases, encoder_angle);
+COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sample) {
+    const phase_monitor_input_t *input = &sample->phases;
+    const encoder_monitor_input_t encoder = encoder_input(input, &drive->phases, sample->encoder_angle);
     encoder_monitor_step(&drive->control_parameters.encoder_monitor, &drive->encoder, &encoder);
     int32_t correction_q29[HAL_PHASES_MAX];
-    const uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, &input, correction_q29);
-    hal_critical_enter(drive->hal);
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        int32_t *next_q29 = &control->applied_flux.next_q29[phase];
+    const uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, input, correction_q29);
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+        int32_t *next_q29 = &drive->control.applied_flux.next_q29[phase];
+        hal_critical_enter(drive->hal);
         *next_q29 = fixed_non_negative(fixed_add(*next_q29, correction_q29[phase]));
+        hal_critical_leave(drive->hal);
     }
-    hal_critical_leave(drive->hal);
     return failed;
 }
 
@@ -91,38 +100,52 @@ COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
     }
 }
 
-COLD void background_checks(drive_t *drive, uint32_t time_us) {
-    follow_heat(drive, time_us);
-    hal_critical_enter(drive->hal);
-    const stall_input_t stall = stall_input(drive);
-    hal_critical_leave(drive->hal);
-    uint64_t failed = check_phases_and_encoder(drive);
-    if (sto_monitor_failed(&drive->sto, drive->break_causes, time_us)) {
-        failed |= FAULT_BIT(FAULT_STO_DISCREPANCY);
+/* Checks phases, encoder, stall and STO lines, unless the sample cannot be read. */
+COLD static void check(drive_t *drive, uint32_t time_us) {
+    const control_parameters_t *parameters = &drive->control_parameters;
+    sample_t sample = {.phases = {.periods_per_ms = parameters->initialise_ticks,
+                                  .stroke = parameters->commutation.stroke,
+                                  .resistance_period_q40 = parameters->predictive.flux.resistance_period_q40}};
+    if (!read_sample(&drive->control, parameters, &sample)) {
+        return;
     }
-    if (stall_monitor_failed(&drive->stall, &stall, time_us)) {
-        failed |= FAULT_BIT(FAULT_STALL);
+    uint32_t failed = check_phases_and_encoder(drive, &sample);
+    if (stall_monitor_failed(&drive->stall, &sample.stall, time_us)) {
+        failed |= (uint32_t)FAULT_BIT(FAULT_STALL);
+    }
+    if (sto_monitor_failed(&drive->sto, drive->break_causes, time_us)) {
+        failed |= (uint32_t)FAULT_BIT(FAULT_STO_DISCREPANCY);
     }
     if (drive->encoder.frozen) {
-        failed |= FAULT_BIT(FAULT_ENCODER);
+        failed |= (uint32_t)FAULT_BIT(FAULT_ENCODER);
     }
     if (drive->encoder.angle) {
-        failed |= FAULT_BIT(FAULT_ENCODER_ANGLE);
+        failed |= (uint32_t)FAULT_BIT(FAULT_ENCODER_ANGLE);
     }
     if (drive->encoder.over_speed) {
-        failed |= FAULT_BIT(FAULT_OVER_SPEED);
+        failed |= (uint32_t)FAULT_BIT(FAULT_OVER_SPEED);
     }
-    failed |= thermal_faults(&drive->thermal);
+    drive->failed_checks = failed;
+}
+
+COLD void background_checks(drive_t *drive, uint32_t time_us) {
+    follow_heat(drive, time_us);
+    const bool suspicious = drive->phases.suspicious || drive->encoder.suspicious;
+    const uint32_t spacing = suspicious ? 1 : drive->control_parameters.initialise_ticks / CHECKS_PER_MS;
+    if (unmasked_read_periods(&drive->control.deferred_request) - drive->phases.periods >= spacing) {
+        check(drive, time_us);
+    }
+    uint32_t failed = drive->failed_checks | thermal_faults(&drive->thermal);
     if (drive->comms.bus.conflict) {
-        failed |= FAULT_BIT(FAULT_IDENTIFIER_CONFLICT);
+        failed |= (uint32_t)FAULT_BIT(FAULT_IDENTIFIER_CONFLICT);
     }
     if (drive->store.inhibited) { /* since the start; inhibits the first one only */
-        failed |= FAULT_BIT(FAULT_PARAMETER_MEMORY);
+        failed |= (uint32_t)FAULT_BIT(FAULT_PARAMETER_MEMORY);
     }
     if (drive->control.state_machine.state != DRIVE_STATE_RUN) {
         drive->comms.commands.failed = false;
     } else if (drive->comms.commands.failed) {
-        failed |= FAULT_BIT(FAULT_COMMAND_ERROR);
+        failed |= (uint32_t)FAULT_BIT(FAULT_COMMAND_ERROR);
     }
-    drive->control.reported_fault_mask = (uint32_t)failed;
+    drive->control.reported_fault_mask = failed;
 }

@@ -3,6 +3,7 @@
 #include "background_checks.h"
 #include "comms/node.h"
 #include "drive/deferred.h"
+#include "drive/unmasked_read.h"
 #include "fixed/compiler.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
@@ -21,8 +22,8 @@ static bool may_configure(const drive_t *drive) {
     return drive->control.state_machine.state != DRIVE_STATE_RUN && drive->command.request != COMMAND_RUN;
 }
 
-/* Applies the parameters in one piece between two control periods; in a run or beside the command that starts one,
- * those that may then be changed, which are all that differ. */
+/* Applies the parameters in one piece between two control periods; in a run or beside the command that starts one, in
+ * parts, those that may then be changed, which are all that differ. */
 COLD static void configure(drive_t *drive) {
     const control_parameters_t control_parameters =
         configure_control(&drive->parameters, &machine_tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
@@ -33,8 +34,13 @@ COLD static void configure(drive_t *drive) {
         drive->control_parameters = control_parameters;
         control_prepare(&drive->control_parameters, &drive->control);
     } else {
-        configure_tune(&drive->control_parameters, &control_parameters);
+        configure_tune(&drive->control_parameters, &control_parameters, 0);
         deferred_tune(&drive->control_parameters, &drive->control);
+        for (unsigned part = 1; part < CONFIGURE_TUNE_PARTS; part++) {
+            hal_critical_leave(drive->hal);
+            hal_critical_enter(drive->hal);
+            configure_tune(&drive->control_parameters, &control_parameters, part);
+        }
     }
     drive->applied_revision = drive->parameters.revision;
     hal_critical_leave(drive->hal);
@@ -213,10 +219,25 @@ COLD static void kick_watchdog(drive_t *drive, uint32_t time_us) {
     const deferred_request_t *request = &drive->control.deferred_request;
     const volatile uint32_t *completed = &drive->control.deferred.response.completed;
     const uint32_t completed_before = *completed;
-    if (watchdog_monitor_kick(&drive->watchdog, request->requests + request->skipped_total, request->requests,
-                              completed_before, time_us)) {
+    if (watchdog_monitor_kick(&drive->watchdog, unmasked_read_periods(request), request->requests, completed_before,
+                              time_us)) {
         hal_watchdog_kick(drive->hal);
     }
+}
+
+/* Values of one control period. Interrupts are masked only when they leave the background less time than this takes. */
+COLD static void collect_telemetry(drive_t *drive, uint32_t time_us, drive_telemetry_t *values) {
+    const deferred_request_t *request = &drive->control.deferred_request;
+    for (unsigned attempt = 0; attempt < UNMASKED_READ_ATTEMPTS; attempt++) {
+        const uint32_t periods = unmasked_read_begin(request);
+        telemetry_collect(drive, time_us, values);
+        if (unmasked_read_ended(request, periods)) {
+            return;
+        }
+    }
+    hal_critical_enter(drive->hal);
+    telemetry_collect(drive, time_us, values);
+    hal_critical_leave(drive->hal);
 }
 
 COLD void drive_background(drive_t *drive) {
@@ -234,9 +255,7 @@ COLD void drive_background(drive_t *drive) {
             arming_end_configuration(&drive->comms.commands.arming);
         }
         drive_telemetry_t values;
-        hal_critical_enter(drive->hal);
-        telemetry_collect(drive, time_us, &values);
-        hal_critical_leave(drive->hal);
+        collect_telemetry(drive, time_us, &values);
         comms_telemetry(&drive->comms, drive->hal, &values);
     }
     const parameters_conditions_t conditions = {

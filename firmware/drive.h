@@ -48,6 +48,7 @@ typedef struct {
     uint32_t control_rate_hz;
     parameters_t parameters;
     uint32_t applied_revision; /* parameters.revision from which control_parameters are derived */
+    uint32_t failed_checks;    /* of phases, encoder, stall and STO lines, when last checked, FAULT_BITs */
     sto_monitor_t sto;
     stall_monitor_t stall;
     phase_monitor_t phases;

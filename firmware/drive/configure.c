@@ -409,15 +409,36 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     return control;
 }
 
-void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned) {
+static void tune_stage(observer_bandwidth_parameters_t *bandwidth, const observer_bandwidth_parameters_t *tuned,
+                       unsigned stage) {
+    bandwidth->gains[stage] = tuned->gains[stage];
+    bandwidth->bandwidth_rad_s[stage] = tuned->bandwidth_rad_s[stage];
+    bandwidth->end_ticks[stage] = tuned->end_ticks[stage];
+}
+
+COLD void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned, unsigned part) {
+    observer_bandwidth_parameters_t *bandwidth = &parameters->bandwidth;
+    if (part > 0) {
+        tune_stage(bandwidth, &tuned->bandwidth, part - 1);
+        return;
+    }
     parameters->speed_pi = tuned->speed_pi;
     parameters->speed_smc = tuned->speed_smc;
     parameters->duty.pid = tuned->duty.pid;
     parameters->trim.pid = tuned->trim.pid;
     parameters->predictive.flux = tuned->predictive.flux;
     parameters->conduction.gain_per_step_q16 = tuned->conduction.gain_per_step_q16;
-    parameters->bandwidth = tuned->bandwidth;
     parameters->moving_load = tuned->moving_load;
     parameters->periodic_load = tuned->periodic_load;
     parameters->inertia = tuned->inertia;
+    bandwidth->retrigger_holdoff_ticks = tuned->bandwidth.retrigger_holdoff_ticks;
+    bandwidth->holdoff_decay_q32 = tuned->bandwidth.holdoff_decay_q32;
+    bandwidth->threshold_count = tuned->bandwidth.threshold_count;
+    bandwidth->threshold_edge = tuned->bandwidth.threshold_edge;
+    bandwidth->mean_innovation_gain_q32 = tuned->bandwidth.mean_innovation_gain_q32;
+    bandwidth->edge_step_min = tuned->bandwidth.edge_step_min;
+    bandwidth->adaptive = tuned->bandwidth.adaptive;
+    bandwidth->trigger_stage_count = tuned->bandwidth.trigger_stage_count;
+    bandwidth->moving_stage = tuned->bandwidth.moving_stage;
+    bandwidth->steady_stage_edge = tuned->bandwidth.steady_stage_edge;
 }

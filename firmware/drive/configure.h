@@ -25,8 +25,12 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                                        uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits,
                                        uint32_t timer_clock_hz);
 
-/* Takes over what the tunable parameters alone determine (parameters.h), about 600 bytes, from the control parameters
- * of a set that differs in nothing else. [background, in a critical section] */
-void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned);
+/* What the tunable parameters alone determine is taken over in parts, so that no interrupt waits for all of it: that of
+ * the laws together, then each stage of the observer's bandwidth. */
+#define CONFIGURE_TUNE_PARTS (1 + OBSERVER_BANDWIDTH_STAGES)
+
+/* Takes over a part from the control parameters of a set that differs in nothing else than tunable parameters
+ * (parameters.h). [background, in a critical section] */
+void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned, unsigned part);
 
 #endif

@@ -27,7 +27,7 @@
 #define FROZEN_SHIFT 11
 
 /* Periods of a contradiction in succession that are one. */
-#define PERSISTENT_PERIODS 4
+#define PERSISTENT_PERIODS 3
 
 /* Phases that contradict the angle within 1/4 s; or one for as long as 1/256 s, when no other conducts. */
 #define CONTRADICTING_PHASES 2
@@ -125,23 +125,31 @@ static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_mo
     return phase->moved > parameters->rate_hz >> FROZEN_SHIFT;
 }
 
-/* Periods for which the flux linkage has contradicted the angle. */
-static uint32_t contradicted(const encoder_monitor_parameters_t *parameters, const encoder_monitor_phase_t *phase,
-                             const encoder_monitor_input_t *input, uint32_t angle, unsigned index, uint32_t periods) {
+/* Counts the periods for which the flux linkage has contradicted the angle. True when it does, or is beyond half of its
+ * tolerance. */
+static bool contradicts(const encoder_monitor_parameters_t *parameters, encoder_monitor_phase_t *phase,
+                        const encoder_monitor_input_t *input, uint32_t angle, unsigned index, uint32_t periods) {
     const uint32_t age = input->period - input->zero_at[index];
     if (age > parameters->rate_hz >> AGE_SHIFT) {
-        return phase->contradicted;
+        return phase->contradicted > 0;
     }
     const int32_t flux_q29 = input->flux_q29[index];
     const flux_range_t range =
         flux_range(angle, parameters->angle_max + parameters->half_count, input->current_q9[index], CURRENT_ERROR_Q9);
-    const int64_t drift_q29 =
-        input->flux_step_max_q29 / 4 +
-        ((int64_t)parameters->flux_error_q29 * (int32_t)MOVING_FACTOR + (input->flux_step_max_q29 >> PULSE_SHIFT)) *
-            (int32_t)age;
-    const bool below = flux_q29 < range.least_q29 - (range.least_q29 >> GAIN_SHIFT) - drift_q29;
-    const bool above = flux_q29 > range.most_q29 + (range.most_q29 >> GAIN_SHIFT) + drift_q29;
-    return below || above ? phase->contradicted + periods : 0;
+    const int32_t drift_q29 =
+        fixed_saturate(input->flux_step_max_q29 / 4 + ((int64_t)parameters->flux_error_q29 * (int32_t)MOVING_FACTOR +
+                                                       (input->flux_step_max_q29 >> PULSE_SHIFT)) *
+                                                          (int32_t)age);
+    const bool below = flux_q29 < range.least_q29;
+    const int32_t limit_q29 = below ? range.least_q29 : range.most_q29;
+    const int32_t beyond_q29 = below ? fixed_subtract(limit_q29, flux_q29) : fixed_subtract(flux_q29, limit_q29);
+    const int32_t tolerance_q29 = fixed_add(limit_q29 >> GAIN_SHIFT, drift_q29);
+    if (beyond_q29 <= tolerance_q29) {
+        phase->contradicted = 0;
+        return beyond_q29 > tolerance_q29 / 2;
+    }
+    phase->contradicted += phase->contradicted == 0 ? 1 : periods;
+    return true;
 }
 
 static void forget_references(encoder_monitor_t *monitor) {
@@ -162,18 +170,19 @@ static bool shows(const encoder_monitor_parameters_t *parameters, encoder_monito
 }
 
 static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
-                       const encoder_monitor_input_t *input, uint32_t periods) {
+                       const encoder_monitor_input_t *input, uint32_t periods, bool counted) {
     const uint32_t electrical =
         commutation_electrical(&parameters->commutation, input->encoder_angle + parameters->middle);
     const uint32_t factor = monitor->counted ? MOVING_FACTOR : 1;
     unsigned contradicting = 0;
     bool alone = false;
+    monitor->suspicious = false;
     for (unsigned index = 0; index < machine_tables.phases; index++) {
         encoder_monitor_phase_t *phase = &monitor->phase[index];
         if (input->known[index] && input->current_q9[index] >= parameters->current_min_q9) {
             const uint32_t angle = electrical - index * parameters->commutation.stroke;
-            monitor->frozen |= has_moved(parameters, phase, input, angle, index, periods, factor);
-            phase->contradicted = contradicted(parameters, phase, input, angle, index, periods);
+            monitor->frozen |= !counted && has_moved(parameters, phase, input, angle, index, periods, factor);
+            monitor->suspicious |= contradicts(parameters, phase, input, angle, index, periods);
         } else {
             phase->referred = false;
             phase->contradicted = 0;
@@ -213,7 +222,8 @@ COLD void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, e
         return;
     }
     monitor->period = input->period;
-    if (input->encoder_angle != monitor->encoder_angle) {
+    const bool counted = input->encoder_angle != monitor->encoder_angle;
+    if (counted) {
         monitor->encoder_angle = input->encoder_angle;
         monitor->frozen = false;
         monitor->counted = true;
@@ -221,10 +231,11 @@ COLD void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, e
     }
     check_speed(parameters, monitor, input);
     if (input->run) {
-        check_flux(parameters, monitor, input, periods);
+        check_flux(parameters, monitor, input, periods, counted);
         return;
     }
     monitor->angle = false;
+    monitor->suspicious = false;
     monitor->counted = false;
     forget_references(monitor);
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {

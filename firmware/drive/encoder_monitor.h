@@ -48,7 +48,8 @@ typedef struct {
 
 /* Of a phase. */
 typedef struct {
-    bool referred;         /* the next five are set */
+    bool referred;         /* current to zero_at are set */
+    bool shown;            /* the angle was contradicted for long enough, last in the period shown_at */
     int32_t current_q9;    /* at the reference, the largest since the count, A, Q7.9 */
     int32_t excess_q29;    /* of the integral over the tables at the reference, with a leak, Wb, Q2.29 */
     int32_t table_q29;     /* flux linkage by the tables, likewise */
@@ -56,19 +57,19 @@ typedef struct {
     uint32_t zero_at;      /* of the integral then */
     uint32_t moved;        /* periods for which they have parted */
     uint32_t contradicted; /* periods for which the angle has been contradicted */
-    bool shown;            /* the angle was contradicted for long enough, last in the period */
     uint32_t shown_at;
 } encoder_monitor_phase_t;
 
 typedef struct {
     bool started;
-    bool counted;           /* in this run */
-    uint32_t period;        /* of the last call */
-    uint32_t encoder_angle; /* then */
-    uint32_t window_period; /* of the start of the window for the speed */
+    bool counted;                   /* in this run */
+    bool suspicious;                /* a phase contradicted the angle, or nearly: samples without delay decide */
+    bool frozen, angle, over_speed; /* failed checks */
+    uint32_t period;                /* of the last call */
+    uint32_t encoder_angle;         /* then */
+    uint32_t window_period;         /* of the start of the window for the speed */
     uint32_t window_angle;
     encoder_monitor_phase_t phase[HAL_PHASES_MAX];
-    bool frozen, angle, over_speed; /* failed checks */
 } encoder_monitor_t;
 
 /* Error of the integral that is none, per control period, Wb, Q2.29: half of the mean back-EMF of a phase, at a current

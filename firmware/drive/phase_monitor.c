@@ -65,11 +65,15 @@ static int32_t slack_q29(const common_t *common, const phase_monitor_phase_t *st
 /* Side and extent of a difference between voltage and current. */
 typedef enum {
     AGREES,
+    DOUBTFUL,      /* agrees within the tolerances, with hardly a current */
     WITHIN_ANGLES, /* differs at the measured angle */
     BEYOND_ANGLES  /* differs at any */
 } difference_t;
 
-static difference_t compare(const common_t *common, phase_monitor_phase_t *state, unsigned phase, int *side) {
+/* table_q29: flux linkage by the tables at the measured current and angle, or less. It is between the limits of both
+ * sides, so that most comparisons end with it. */
+static difference_t compare(const common_t *common, phase_monitor_phase_t *state, unsigned phase, int32_t table_q29,
+                            int *side) {
     const int32_t current_q9 = common->input->current_q9[phase];
     const int32_t flux_q29 = common->input->flux_q29[phase];
     const int32_t slack = slack_q29(common, state, phase);
@@ -85,8 +89,8 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
                                                                (int32_t)(common->elapsed & 0xffffu));
     }
     *side = 0;
-    if (current_q9 <= common->offset_q9 && high_q29 <= 0) {
-        return AGREES; /* as below */
+    if (high_q29 <= table_q29 && low_q29 >= table_q29) {
+        return AGREES;
     }
     const uint32_t distance = distance_of(common->input, phase);
     const uint32_t far = distance + ANGLE_TOLERANCE;
@@ -98,7 +102,7 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
         *side = -1;
         return low_q29 < least_q29(common, 0, current_q9) ? BEYOND_ANGLES : WITHIN_ANGLES;
     }
-    return AGREES;
+    return small && high_q29 > table_q29 ? DOUBTFUL : AGREES;
 }
 
 /* Flux linkage that the opposite voltage removes within a period. */
@@ -107,7 +111,8 @@ static bool gone(const phase_monitor_input_t *input, unsigned phase) {
 }
 
 /* True when the voltage has left the phase without flux linkage, errors of the integral included. */
-static bool at_rest(const common_t *common, phase_monitor_phase_t *state, unsigned phase) {
+static bool at_rest(const common_t *common, phase_monitor_t *monitor, unsigned phase) {
+    phase_monitor_phase_t *state = &monitor->phase[phase];
     const phase_monitor_input_t *input = common->input;
     const int32_t flux_q29 = input->flux_q29[phase];
     const uint32_t conducting = state->conducting + common->elapsed;
@@ -118,7 +123,10 @@ static bool at_rest(const common_t *common, phase_monitor_phase_t *state, unsign
         state->rest_q29 = 0;
         return false;
     }
-    state->rest_q29 = fixed_add(state->rest_q29, input->period_flux_q29); /* at least */
+    /* Since the previous input, if the phase was at 0 then already. */
+    const uint32_t periods = state->rest_q29 == 0 ? 1 : common->elapsed & 0xffffu;
+    monitor->suspicious |= input->current_q9[phase] > 2 * common->offset_q9;
+    state->rest_q29 = fixed_saturate(state->rest_q29 + (int64_t)input->period_flux_q29 * (int32_t)periods);
     if (state->rest_q29 < fixed_add(state->peak_q29 / 4, common->delay_q29)) {
         return false;
     }
@@ -143,7 +151,7 @@ static uint32_t check_excess(const common_t *common, phase_monitor_phase_t *stat
     }
     state->least_q9 = current_q9 < state->least_q9 ? current_q9 : state->least_q9;
     state->most_q9 = current_q9 > state->most_q9 ? current_q9 : state->most_q9;
-    state->excess_periods += common->elapsed;
+    state->excess_periods += state->excess_periods == 0 ? 1 : common->elapsed;
     const int32_t moved_q9 = state->most_q9 - state->least_q9;
     if (state->excess_periods <= common->input->periods_per_ms / 4u) {
         return 0;
@@ -155,14 +163,15 @@ static uint32_t check_excess(const common_t *common, phase_monitor_phase_t *stat
     return still ? (uint32_t)FAULT_BIT(FAULT_CURRENT_SENSOR) : 0;
 }
 
-static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, unsigned phase) {
+static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, unsigned phase, int32_t table_q29) {
     phase_monitor_phase_t *state = &monitor->phase[phase];
-    const bool rest = at_rest(common, state, phase);
+    const bool rest = at_rest(common, monitor, phase);
     int side = 0;
     difference_t difference = AGREES;
     if (common->input->run && !common->lost) {
-        difference = compare(common, state, phase, &side);
+        difference = compare(common, state, phase, table_q29, &side);
     }
+    monitor->suspicious |= difference != AGREES;
     const bool beyond = difference == BEYOND_ANGLES;
     state->turned = side == 0 || side != state->side ? 0 : fixed_saturate((int64_t)state->turned + common->step);
     state->side = (int8_t)side;
@@ -201,11 +210,11 @@ static uint32_t judge_doubts(phase_monitor_t *monitor, uint32_t step) {
 }
 
 /* What brings the integral nearer to the tables. */
-static int32_t correction_of(const common_t *common, phase_monitor_phase_t *state, unsigned phase) {
+static int32_t correction_of(const common_t *common, phase_monitor_phase_t *state, unsigned phase, int32_t table_q29,
+                             bool zero) {
     const phase_monitor_input_t *input = common->input;
-    const int32_t current_q9 = input->current_q9[phase];
     const int32_t flux_q29 = input->flux_q29[phase];
-    if (input->off[phase] && current_q9 <= common->offset_q9) {
+    if (zero) {
         state->zero_at = input->periods;
         state->followed_q29 = 0;
         return -flux_q29;
@@ -214,7 +223,7 @@ static int32_t correction_of(const common_t *common, phase_monitor_phase_t *stat
         state->followed_q29 = fixed_subtract(state->followed_q29, flux_q29);
         return -flux_q29;
     }
-    const int32_t error_q29 = phase_map_flux_q29(common->tables, distance_of(input, phase), current_q9) - flux_q29;
+    const int32_t error_q29 = table_q29 - flux_q29;
     const uint32_t follow = FOLLOW_MS * input->periods_per_ms;
     const bool set = common->lost || common->elapsed >= follow;
     const int32_t correction_q29 = set ? error_q29 : error_q29 / (int32_t)follow * (int32_t)common->elapsed;
@@ -257,13 +266,18 @@ COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_
     monitor->run = input->run;
     uint32_t failed = 0;
     uint32_t in_excess = 0;
+    monitor->suspicious = false;
     for (unsigned phase = 0; phase < tables->phases; phase++) {
-        const uint32_t failed_of_phase = check_phase(&common, monitor, phase);
+        const int32_t current_q9 = input->current_q9[phase];
+        const bool zero = input->off[phase] && current_q9 <= common.offset_q9;
+        const int32_t table_q29 = zero ? 0 : phase_map_flux_q29(tables, distance_of(input, phase), current_q9);
+        const uint32_t failed_of_phase = check_phase(&common, monitor, phase, table_q29);
         in_excess |= (uint32_t)(monitor->phase[phase].excess_periods > 0) << phase;
         monitor->phases |= (uint32_t)(failed_of_phase != 0) << phase;
         failed |= failed_of_phase;
-        correction_q29[phase] = correction_of(&common, &monitor->phase[phase], phase);
+        correction_q29[phase] = correction_of(&common, &monitor->phase[phase], phase, table_q29, zero);
     }
+    monitor->suspicious |= in_excess != 0;
     if (input->run) {
         failed |= judge_doubts(monitor, common.step);
     }

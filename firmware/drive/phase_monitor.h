@@ -65,7 +65,8 @@ typedef struct {
 } phase_monitor_phase_t;
 
 typedef struct {
-    bool run; /* in the last input; so are the next three */
+    bool suspicious; /* a phase differs, or nearly, or has a current that should not be: samples without delay decide */
+    bool run;        /* in the last input; so are the next three */
     uint32_t late_interrupts;
     uint32_t periods;
     uint32_t electrical;

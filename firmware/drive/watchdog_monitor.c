@@ -2,16 +2,14 @@
 
 #include "fixed/compiler.h"
 
-COLD void watchdog_monitor_pass(watchdog_monitor_t *monitor, watchdog_part_t part) {
-    monitor->disordered = monitor->disordered || monitor->passed != (uint32_t)part;
-    monitor->passed++;
-}
+#define IN_ORDER                                                                                                       \
+    (((uint32_t)WATCHDOG_CHECKED << WATCHDOG_PART_BITS | WATCHDOG_STORED) << WATCHDOG_PART_BITS | WATCHDOG_SERVED)
 
 COLD bool watchdog_monitor_kick(watchdog_monitor_t *monitor, uint32_t periods, uint32_t requests, uint32_t completed,
                                 uint32_t time_us) {
     const uint32_t passed = monitor->passed;
     monitor->passed = 0;
-    monitor->disordered = monitor->disordered || passed != WATCHDOG_PARTS;
+    monitor->disordered = monitor->disordered || passed != IN_ORDER;
     if (monitor->disordered || time_us - monitor->kicked_us < WATCHDOG_KICK_US || periods == monitor->periods ||
         completed == monitor->completed || requests - completed > 1u) {
         return false;

@@ -11,22 +11,26 @@
 
 /* Parts of a call of the background, in their order. */
 typedef enum {
-    WATCHDOG_CHECKED, /* the slow checks are evaluated */
-    WATCHDOG_STORED,  /* the memory is kept */
-    WATCHDOG_SERVED,  /* frames are received and sent */
-    WATCHDOG_PARTS
+    WATCHDOG_CHECKED = 1, /* the slow checks are evaluated */
+    WATCHDOG_STORED,      /* the memory is kept */
+    WATCHDOG_SERVED,      /* frames are received and sent */
 } watchdog_part_t;
+
+/* Digits of the sequence of passed parts: of more than 16 parts the last ones, none of which is 0. */
+#define WATCHDOG_PART_BITS 2
 
 typedef struct {
     uint32_t periods;   /* control interrupts at the last kick, modulo 2^32 */
     uint32_t completed; /* deferred steps likewise */
     uint32_t kicked_us;
-    uint32_t passed; /* parts of the present call of the background */
+    uint32_t passed; /* parts of the present call of the background, the last in the lowest bits */
     bool disordered; /* for ever: a part came before its turn */
 } watchdog_monitor_t;
 
 /* A part of the background's call has ended. [background] */
-void watchdog_monitor_pass(watchdog_monitor_t *monitor, watchdog_part_t part);
+static inline void watchdog_monitor_pass(watchdog_monitor_t *monitor, watchdog_part_t part) {
+    monitor->passed = monitor->passed << WATCHDOG_PART_BITS | (uint32_t)part;
+}
 
 /* End of a call of the background: true when the watchdog is to be kicked. periods, requests, completed: control
  * interrupts, and deferred steps requested and completed, since start, modulo 2^32. [background] */

@@ -80,8 +80,8 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     return set;
 }
 
-void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned) {
-    (void)parameters, (void)tuned;
+void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned, unsigned part) {
+    (void)parameters, (void)tuned, (void)part;
 }
 
 void deferred_tune(const control_parameters_t *parameters, control_state_t *state) {
@@ -118,6 +118,15 @@ static void exchange(control_state_t *state) {
     deferred_request(request);
 }
 
+/* Without critical sections no read of the background may notice an interrupt either: the count of periods stands. */
+static void hide_period(deferred_request_t *request) {
+#ifdef NO_CRITICAL_SECTION
+    request->skipped_total = 0u - request->requests;
+#else
+    (void)request;
+#endif
+}
+
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare) {
     (void)sample, (void)compare;
@@ -126,6 +135,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     torn_commands += torn(command, sizeof *command);
     fill(SNAPSHOT(state), sizeof(drive_telemetry_t), interrupts * 0x10001u);
     exchange(state);
+    hide_period(&state->deferred_request);
     return false;
 }
 

@@ -106,11 +106,10 @@ def test_reported_isr_time_is_that_of_the_counted_instructions_and_of_the_port(m
     bench.run_for(0.2)
     bench.close()
     counted_us = np.fromfile(counts, "<u4").max() * 8e-3
-    # Plus the entry of the timer's handler and the longest critical section of the background, which delays it, less
-    # the code after hal_interrupt_elapsed_ticks.
+    # Plus the entry of the timer's handler, less the code after hal_interrupt_elapsed_ticks.
     port_us = processor(bench, "worst_us") - counted_us
     print(f"counted {counted_us:.3f} us, port {port_us:.3f} us")
-    assert 0.1 < port_us < 4.0
+    assert 0.1 < port_us < 0.6
 
 
 @pytest.mark.parametrize("rate_hz", [20_000, 50_000])
@@ -145,7 +144,7 @@ def slow_processor(make_bench, controller: str) -> dict[str, int]:
         bench = make_bench(build="cortex-m4", controller=controller, **options)
         bench.run_for(0.11)
         # Without time for the background the only telemetry cycle is the first, which reports 0.
-        if processor(bench, "late_interrupts") == 0 and 0 < processor(bench, "worst_us") < 0.9e6 / rate_hz:
+        if processor(bench, "late_interrupts") == 0 and 0 < processor(bench, "worst_us") < 0.8e6 / rate_hz:
             return options
     raise AssertionError("no processor is fast enough")
 
@@ -157,17 +156,17 @@ def test_slow_processor_is_detected_reported_and_safe_reproducibly(make_bench, c
 
     def run() -> tuple[Bench, list[tuple]]:
         bench = make_bench(build="cortex-m4", controller=controller, **slow)
-        bench.run_for(0.03)
+        bench.run_for(0.01)
         assert (bench.drive.state, bench.drive.fault) == ("ready", "none")
         bench.drive.speed_reference_rpm = 600
-        bench.run_for(0.6)
+        bench.run_for(0.25)
         assert (bench.drive.state, bench.drive.fault) == ("fault", "interrupt_overrun")
         return bench, frames(bench)
 
     bench, first = run()
     overruns, worst_us = processor(bench, "late_interrupts"), processor(bench, "worst_us")
     print(f"{controller}, {slow}: {overruns:g} overruns, longest {worst_us:g} us")
-    assert 1 <= overruns < 1500
+    assert 1 <= overruns < 300
     assert period_us < worst_us < 10 * period_us
     assert processor(bench, "used_us") < period_us  # in fault the deadlines are met again
     assert bench.telemetry["DRIVE_FAULT_CAUSE.fault"].last_name == "interrupt_overrun"
@@ -306,7 +305,7 @@ def test_control_interrupt_preempts_the_deferred_one_and_their_data_is_torn_only
     ("traditional", {"speed_kp": 4.0, "observer_bandwidth_rad_s": 600.0}),
     ("salient", {"smc_k": 500.0, "observer_steady_rad_s": 400.0, "bp_trim_kp_max": 0.2}),
 ])
-def test_tuning_in_a_run_delays_the_control_interrupt_by_less_than_a_tenth_of_the_period(make_bench, controller, tuned):
+def test_tuning_in_a_run_delays_the_control_interrupt_by_less_than_a_microsecond(make_bench, controller, tuned):
     bench = make_bench(build="cortex-m4", controller=controller, instruction_ns=8)
     bench.load_torque_Nm = 6
     bench.drive.speed_reference_rpm = 600
@@ -317,7 +316,7 @@ def test_tuning_in_a_run_delays_the_control_interrupt_by_less_than_a_tenth_of_th
     bench.run_for(0.11)
     print(controller, f"longest control interrupt: {before_us:.2f} us before, {processor(bench, 'worst_us'):.2f} us")
     assert bench.drive.state == "run"
-    assert before_us <= processor(bench, "worst_us") < before_us + PERIOD_US / 10
+    assert before_us <= processor(bench, "worst_us") < before_us + 1
     assert processor(bench, "late_interrupts") == 0
 
 
@@ -349,13 +348,19 @@ def held(make_bench, held_us: float) -> Bench:
     return bench
 
 
-def test_deferred_interrupt_that_does_not_end_is_a_fault(make_bench):
+def test_late_deferred_interrupt_is_counted_and_one_that_does_not_end_is_a_fault(make_bench):
     bench = held(make_bench, 10)
     assert bench.telemetry["DRIVE_DEFERRED.skipped_periods"].last == 0
-    # Of the last period: the longest ones may have waited for a critical section of the background.
-    control_us = processor(bench, "used_us") - 10
-    deferred_us = bench.telemetry["DRIVE_DEFERRED.used_us"].last - processor(bench, "used_us")
+    control_us = processor(bench, "worst_us") - 10
+    deferred_us = bench.telemetry["DRIVE_DEFERRED.worst_us"].last - processor(bench, "worst_us")
     assert 0.5 < deferred_us < 3
+
+    # In each period it has two thirds of the time that it takes: two periods.
+    bench = held(make_bench, PERIOD_US - control_us - 0.67 * deferred_us)
+    assert (bench.drive.state, bench.drive.fault) == ("ready", "none")
+    assert bench.telemetry["DRIVE_DEFERRED.skipped_periods"].last == pytest.approx(5000, abs=20)
+    assert PERIOD_US < bench.telemetry["DRIVE_DEFERRED.worst_us"].last < 2 * PERIOD_US
+    assert processor(bench, "late_interrupts") == 0
 
     bench = held(make_bench, PERIOD_US - control_us - 2 * COUNT_US)
     assert (bench.drive.state, bench.drive.fault) == ("fault", "interrupt_overrun")

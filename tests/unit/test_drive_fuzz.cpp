@@ -136,7 +136,9 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
             if (random() % 50 == 0) { // between two periods, in any state
                 tuned += tune(p, random, state.state_machine.state == DRIVE_STATE_RUN);
                 const control_parameters_t of_the_set = configured();
-                configure_tune(&parameters, &of_the_set);
+                for (unsigned part = 0; part < CONFIGURE_TUNE_PARTS; ++part) {
+                    configure_tune(&parameters, &of_the_set, part);
+                }
                 deferred_tune(&parameters, &state);
                 ASSERT_STREQ(difference(parameters, of_the_set), "") << "sequence " << sequence;
             }
