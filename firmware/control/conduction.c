@@ -139,7 +139,9 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
         const int32_t forward_q15 = feed_forward_q15(&state->pulse, state->torque_q24);
         const int32_t forward_q30 = forward_q15 * (1 << 15);
         if (forward_q15 > 0) {
-            state->advance_q30 = ONE_Q30;
+            /* With the level that is still the one before: from the trim alone, windows do not jump. */
+            const int32_t advanced_q30 = state->advance_q30 + parameters->advance_step_q30;
+            state->advance_q30 = state->level_q15 == 0 || advanced_q30 > ONE_Q30 ? ONE_Q30 : advanced_q30;
         }
         if (forward_q15 == ONE_Q15) {
             state->trim_q30 = 0; /* the largest torque is that of the tables */

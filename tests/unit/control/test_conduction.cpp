@@ -129,7 +129,7 @@ struct model_t {
             least_current > 0.0 && !first ? torque + (magnitude - torque) * std::min(1.0, s.step * PHASES) : magnitude;
         first = false;
         const double forward = std::clamp((torque - smooth) / (mean - smooth), 0.0, 1.0);
-        advance = forward > 0.0 ? 1.0 : advance;
+        advance = forward == 0.0 ? advance : level == 0.0 ? 1.0 : std::min(1.0, advance + 1.0 / 50.0);
         if (forward == 1.0) {
             trim = 0.0;
         } else if ((advance == 1.0 || least_current > 0.0) && (limited || level > 0.0)) {
