@@ -139,11 +139,13 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
         const int32_t forward_q15 = feed_forward_q15(&state->pulse, state->torque_q24);
         const int32_t forward_q30 = forward_q15 * (1 << 15);
         if (forward_q15 > 0) {
-            state->advance_q30 = ONE_Q30;
+            /* With the level that is still the one before: from the trim alone, windows do not jump. */
+            const int32_t advanced_q30 = state->advance_q30 + parameters->advance_step_q30;
+            state->advance_q30 = state->level_q15 == 0 || advanced_q30 > ONE_Q30 ? ONE_Q30 : advanced_q30;
         }
         if (forward_q15 == ONE_Q15) {
             state->trim_q30 = 0; /* the largest torque is that of the tables */
-        } else if ((state->advance_q30 == ONE_Q30 || (state->braking && state->sharing_q15 > 0)) &&
+        } else if ((state->advance_q30 == ONE_Q30 || state->sharing_q15 > 0) &&
                    (voltage_limited || state->level_q15 > 0)) {
             /* Sharing follows the reference at any level that is too high: without a shortfall it returns. */
             state->trim_q30 += trim_step_q30(&state->pulse, sample) - (forward_q15 == 0 ? retract_q30 : 0);
@@ -230,7 +232,10 @@ static void set_interval(const conduction_parameters_t *parameters, conduction_s
     if (level_q15 > 0) {
         interval.on = blend(interval.enter < HALF_REV ? interval.enter : 0, -state->pulse.lead, level_q15);
         interval.leave = blend(interval.leave, state->pulse.end, level_q15);
-        interval.enter = (uint32_t)fixed_clamp((int32_t)interval.on, -SHARE_LEAD_MAX, (int32_t)interval.enter);
+        /* Less than half a revolution before the end: beyond, a phase would make up for no shortfall. */
+        const int32_t earliest = (int32_t)(interval.leave - HALF_REV + 1);
+        const int32_t enter = fixed_clamp((int32_t)interval.on, -SHARE_LEAD_MAX, (int32_t)interval.enter);
+        interval.enter = (uint32_t)(enter > earliest ? enter : earliest);
     }
     state->interval = interval;
 }

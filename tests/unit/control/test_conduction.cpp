@@ -129,10 +129,10 @@ struct model_t {
             least_current > 0.0 && !first ? torque + (magnitude - torque) * std::min(1.0, s.step * PHASES) : magnitude;
         first = false;
         const double forward = std::clamp((torque - smooth) / (mean - smooth), 0.0, 1.0);
-        advance = forward > 0.0 ? 1.0 : advance;
+        advance = forward == 0.0 ? advance : level == 0.0 ? 1.0 : std::min(1.0, advance + 1.0 / 50.0);
         if (forward == 1.0) {
             trim = 0.0;
-        } else if ((advance == 1.0 || (braking && least_current > 0.0)) && (limited || level > 0.0)) {
+        } else if ((advance == 1.0 || least_current > 0.0) && (limited || level > 0.0)) {
             const double missing = (s.torque < 0.0 ? -1.0 : 1.0) * (s.torque - s.estimate);
             trim += 0.5 * s.step * std::clamp(missing / mean, -1.0, 1.0);
         }
@@ -163,7 +163,7 @@ struct model_t {
         if (level > 0.0) {
             on = blend(std::max(enter, 0.0), -lead, level);
             leave = blend(leave, end, level);
-            enter = std::clamp(on, -20.0 / 360.0, enter);
+            enter = std::max(std::clamp(on, -20.0 / 360.0, enter), leave - 0.5);
         }
         turn_on_lead = std::max(-on, 0.0);
         ripple = (s.torque < 0.0 ? -1.0 : 1.0) * level * (peak - mean);

@@ -168,7 +168,7 @@ def _derive_ratings(machine: Machine, data: _Values) -> None:
     rise_A = maximum_V / magnetics.unaligned_inductance_H / rate_hz
     data.add("adc_current_A", "A", _current_range_A(machine, peak_A, rise_A),
              "16/15 max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), or 80 A times a power of two below it "
-             "that has room for 80/79 (1.04 current_peak_A + 2.2 V Ts / Lu) and 10/9 current_peak_A")
+             "that has room for 80/79 (1.01 current_peak_A + 2.4 V Ts / Lu) and 10/9 current_peak_A")
     over_V, _ = _over_voltage(machine, maximum_V)
     data.add("adc_voltage_V", "V", 1.25 * over_V, "1.25 bus_over_voltage_V")
     data.add("torque_step_Nm", "N m",
@@ -209,8 +209,10 @@ def _current_range_A(machine: Machine, peak_A: float, rise_A: float) -> float:
 
 
 def _least_trip_A(limit_A: float, rise_A: float) -> float:
-    """Hysteresis exceeds its limit by up to 2.4 periods of rise, measured on machines of all sizes."""
-    return 1.04 * limit_A + 2.2 * rise_A
+    """What no current of a healthy machine reaches: hysteresis, which sees a current a period late and acts a period
+    later, exceeds its limit by up to 2.4 periods of rise, measured on machines of all sizes; the hundredth is the
+    sensors' error."""
+    return 1.01 * limit_A + 2.4 * rise_A
 
 
 def _base_speed_rpm(machine: Machine, voltage_V: float, current_A: float) -> float:
@@ -268,7 +270,7 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
         "current_limit_A": (peak_A, "current_peak_A"),
         "current_trip_A": (trip_A,
                            "max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), at most 15/16 of "
-                           "adc_current_A, or up to 79/80 of it for at least 1.04 current_peak_A + 2.2 V Ts / Lu"),
+                           "adc_current_A, or up to 79/80 of it for at least 1.01 current_peak_A + 2.4 V Ts / Lu"),
         "bus_over_voltage_V": (over_V, over_V_formula),
         "bus_under_voltage_V": (0.625 * data["supply_min_V"], "0.625 supply_min_V"),
         "over_speed_rpm": (1.2 * data["speed_max_rpm"], "1.2 speed_max_rpm"),
@@ -278,8 +280,8 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
                                  "max(torque_rated_Nm / 16, torque_step_Nm / 4)"),
         "speed_kp": (kp, "min(1000/s * inertia, torque_peak_Nm / 1.5 % of speed_base_rpm)"),
         "speed_ki": (50.0 * kp, "50/s * speed_kp"),
-        "smc_k": (min(max(0.0275 / period_s, 40.0 * acceleration / base_rad_s), 0.1 / period_s),
-                  "max(0.0275 / Ts, 40 torque_peak_Nm / (inertia * speed_base_rpm)), at most 0.1 / Ts"),
+        "smc_k": (min(max(0.0275 / period_s, 40.0 * acceleration / base_rad_s), 0.12 / period_s),
+                  "max(0.0275 / Ts, 40 torque_peak_Nm / (inertia * speed_base_rpm)), at most 0.12 / Ts"),
         "smc_delta": (min(max(1.0, 0.1 * acceleration / base_rad_s), 8.0 / (acceleration * torque_removed_s)),
                       "max(1, 0.1 s a / speed_base_rpm), at most 8 / (a (torque_peak_Nm / torque_step_Nm + 3) Ts)"),
         "observer_bandwidth_rad_s": (min(0.025 / period_s, 8000.0), "0.025 / Ts"),
