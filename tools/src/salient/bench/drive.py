@@ -36,11 +36,12 @@ _ATTEMPTS = 20
 """Requests that are made for one response. Where time moves by itself, a client that does not keep up loses frames."""
 _TEXT_PARTS_MAX = 64
 _SAVE_TIMEOUT_S = 2.0
-_MEMORY_ITEMS = ("saving", "origin", "start", "newest_fault", "sets")
+_MEMORY_ITEMS = ("saving", "origin", "start", "newest_fault", "sets", "stack_unused", "code_passes")
 _SAVING, _SAVED = 1, 2
 ORIGINS = ("defaults", "memory", "unusable")
 _FAULT_ITEMS = ("fault", "state", "checks", "start", "time_us", "time_wraps", "speed_rpm", "bus_voltage_V",
-                "current_max_A", "torque_reference_Nm")
+                "current_max_A", "torque_reference_Nm", "current_a", "current_b", "current_c", "current_d", "angle",
+                "self_test", "phases")
 """Parts of the operations memory and fault_log, as drive.dbc lists them."""
 LOGGED_FAULTS = 16
 TRACE_PERIODS = 64
@@ -394,6 +395,13 @@ class LoggedFault:
     bus_voltage_V: float
     current_max_A: float
     torque_reference_Nm: float
+    currents_A: tuple[float, ...]
+    """Of phases a to d; 0 of one that the machine does not have."""
+    rotor_angle_deg: float
+    self_test: tuple[str, ...]
+    """Checks of DRIVE_SELF_TEST that had failed."""
+    phases: str
+    """Letters of the phases of DRIVE_PHASE_FAULT."""
 
 
 class FaultLog(Sequence[LoggedFault]):
@@ -430,7 +438,13 @@ class FaultLog(Sequence[LoggedFault]):
             number=number, start=items["start"], time_s=time_us / 1e6,
             fault=names.get(items["fault"], str(items["fault"])),
             checks=tuple(name for value, name in names.items() if value > 0 and items["checks"] >> value & 1),
-            state=states.get(items["state"], str(items["state"])), **physical)
+            state=states.get(items["state"], str(items["state"])),
+            currents_A=tuple(items[f"current_{phase}"] * float(snapshot.get_signal_by_name("current_max_A").scale)
+                             for phase in "abcd"),
+            rotor_angle_deg=items["angle"] * 360.0 / 65536.0,
+            self_test=tuple(signal.name for signal in drive_database().get_message_by_name("DRIVE_SELF_TEST").signals
+                            if items["self_test"] >> signal.start & 1),
+            phases="".join(phase for bit, phase in enumerate("abcd") if items["phases"] >> bit & 1), **physical)
 
 
 @dataclass(frozen=True)
