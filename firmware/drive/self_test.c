@@ -11,7 +11,7 @@
 
 #define CONSTANTS_WORDS (sizeof(control_parameters_t) / sizeof(uint32_t))
 #define CONSTANTS_SLICE 16u
-#define CODE_SLICE 2u
+#define CODE_SLICE 4u
 #define STACK_SLICE 8u
 #define CLOCK_TOLERANCE 20u /* a part of the interval: 5 % */
 

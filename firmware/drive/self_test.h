@@ -5,7 +5,7 @@
  *   fault latch  number, mask and state of the latched fault, which contradict each other when one has changed, in
  * every call stack        the guard word at its end, in every call; how much of it has never been used, in a second
  *   registers    those of the port, each SELF_TEST_STEP_US
- *   code         the CRC of the program, as a whole at the start and then two words each SELF_TEST_STEP_US
+ *   code         the CRC of the program, as a whole at the start and then four words each SELF_TEST_STEP_US
  *   clock        time against the second clock over SELF_TEST_CLOCK_US, within 5 %
  *
  * What has failed stays so until a reset, but for the clock. What a port does not have (hal_memory.h) is not checked.

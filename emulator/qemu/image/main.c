@@ -25,7 +25,7 @@ static void flip(memory_object_t object, uint32_t bit) {
     hal_memory(&board, &memory);
     switch (object) {
     case MEMORY_CODE:
-        ((volatile uint8_t *)(uintptr_t)memory.code)[bit / 8u] ^= (uint8_t)(1u << bit % 8u);
+        ((volatile uint8_t *)(uintptr_t)memory.code)[bit % (4u * memory.code_words)] ^= 1u;
         break;
     case MEMORY_STACK_GUARD:
         *(volatile uint32_t *)(uintptr_t)memory.stack ^= UINT32_C(1) << bit;

@@ -353,7 +353,7 @@ class Parameters(MutableMapping[str, float]):
         the drive runs, and when the memory does not accept them."""
         self._require_done(self._writer.save(), {}, "save")
         deadline_ns = self._session.time_ns + round(_SAVE_TIMEOUT_S * 1e9)
-        while (saving := _memory_item(self._session, "saving")) == _SAVING and self._session.time_ns < deadline_ns:
+        while (saving := memory_item(self._session, "saving")) == _SAVING and self._session.time_ns < deadline_ns:
             pass  # each request takes time
         if saving != _SAVED:
             raise DriveError(f"save: not stored within {_SAVE_TIMEOUT_S:g} s" if saving == _SAVING
@@ -367,7 +367,7 @@ class Parameters(MutableMapping[str, float]):
     def origin(self) -> str:
         """Parameters at the last start: defaults, memory, or unusable, which are the defaults because no set in the
         memory could be used."""
-        return ORIGINS[_memory_item(self._session, "origin")]
+        return ORIGINS[memory_item(self._session, "origin")]
 
     def __delitem__(self, name: str) -> None:
         raise TypeError("a drive's parameters cannot be deleted")
@@ -413,7 +413,7 @@ class FaultLog(Sequence[LoggedFault]):
 
     def read(self) -> list[LoggedFault]:
         """All of them. One that a fault pushes out meanwhile is left out."""
-        newest = _memory_item(self._session, "newest_fault")
+        newest = memory_item(self._session, "newest_fault")
         found = (self._read(number) for number in range(max(1, newest - LOGGED_FAULTS + 1), newest + 1))
         return [fault for fault in found if fault is not None]
 
@@ -537,7 +537,7 @@ def _access(session: Client, operation: str, index: int, part: int = 0, value: i
                      f"{_ATTEMPTS * _RESPONSE_TIMEOUT_S:g} s")
 
 
-def _memory_item(session: Client, name: str) -> int:
+def memory_item(session: Client, name: str) -> int:
     """An item of the state of the memory."""
     return _access(session, "memory", 0, _MEMORY_ITEMS.index(name))[1]
 
