@@ -99,8 +99,8 @@ class ElfImage:
 
     @staticmethod
     def _segments(content: bytes) -> list[tuple[int, int, int]]:
-        """Address, offset in the file and length of each loaded segment: 32-bit little-endian ELF, System V ABI, program
-        header."""
+        """Address, offset in the file and length of each loaded segment: 32-bit little-endian ELF, System V ABI,
+        program header."""
         offset, = struct.unpack_from("<I", content, 28)
         size, count = struct.unpack_from("<HH", content, 42)
         rows = (struct.unpack_from("<5I", content, at) for at in range(offset, offset + size * count, size))

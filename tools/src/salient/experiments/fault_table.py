@@ -119,8 +119,8 @@ CASES = (
     FaultCase("bit of a constant flipped", "constant_flipped", {"bit": 3000}),
     FaultCase("bit of the state flipped", "state_flipped", {"bit": 0}),
     FaultCase("bit of the program flipped", "code_flipped", {"byte": 0},
-              unsupported="the program of the host is not that of the drive alone; tests/hil/test_self_test.py flips it "
-                          "on the Cortex-M4 and RV32"),
+              unsupported="the program of the host is not that of the drive alone; tests/hil/test_self_test.py flips "
+                          "it on the Cortex-M4 and RV32"),
     FaultCase("guard word of the stack changed", "stack_guard_flipped", {"bit": 0},
               unsupported="the stack of the host is that of its operating system; as the program"),
     FaultCase("bit of the timer's period flipped", "period_register_flipped", {"bit": 3}),
