@@ -95,9 +95,27 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
 
 /* Each current is one word: a control interrupt in between changes none while it is read. */
 COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
+    const temperature_t *temperature = &drive->temperature;
+    temperature_step(&drive->temperature_parameters, &drive->temperature, drive->hal, machine_tables.phases, time_us);
     if (thermal_sample(&drive->thermal_parameters, &drive->thermal, drive->control.measurement.current_q9, time_us)) {
-        drive->control.torque_limit_q24 = thermal_torque_limit_q24(&drive->thermal_parameters, &drive->thermal);
+        const int32_t limit_q24 = thermal_torque_limit_q24(&drive->thermal_parameters, &drive->thermal);
+        drive->control.torque_limit_q24 =
+            limit_q24 < temperature->torque_limit_q24 ? limit_q24 : temperature->torque_limit_q24;
     }
+}
+
+/* A latch that has changed is not to be trusted: the drive is in fault from here on. */
+COLD static void test_itself(drive_t *drive, uint32_t time_us) {
+    self_test_t *test = &drive->self_test;
+    state_machine_t *state_machine = &drive->control.state_machine;
+    self_test_step(test, drive->hal, &drive->control_parameters, time_us);
+    hal_critical_enter(drive->hal);
+    if (!self_test_latch_intact(state_machine)) {
+        test->failed |= SELF_TEST_FAULT_LATCH;
+        state_machine_start_in_fault(state_machine, FAULT_BIT(FAULT_MEMORY));
+        state_machine->record.time_us = time_us;
+    }
+    hal_critical_leave(drive->hal);
 }
 
 /* Checks phases, encoder, stall and STO lines, unless the sample cannot be read. */
@@ -130,12 +148,14 @@ COLD static void check(drive_t *drive, uint32_t time_us) {
 
 COLD void background_checks(drive_t *drive, uint32_t time_us) {
     follow_heat(drive, time_us);
+    test_itself(drive, time_us);
     const bool suspicious = drive->phases.suspicious || drive->encoder.suspicious;
     const uint32_t spacing = suspicious ? 1 : drive->control_parameters.initialise_ticks / CHECKS_PER_MS;
     if (unmasked_read_periods(&drive->control.deferred_request) - drive->phases.periods >= spacing) {
         check(drive, time_us);
     }
-    uint32_t failed = drive->failed_checks | thermal_faults(&drive->thermal);
+    uint32_t failed = drive->failed_checks | thermal_faults(&drive->thermal) | temperature_faults(&drive->temperature) |
+                      self_test_faults(&drive->self_test);
     if (drive->comms.bus.conflict) {
         failed |= (uint32_t)FAULT_BIT(FAULT_IDENTIFIER_CONFLICT);
     }

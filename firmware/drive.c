@@ -29,6 +29,7 @@ COLD static void configure(drive_t *drive) {
         configure_control(&drive->parameters, &machine_tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
                           hal_adc_bits(drive->hal), hal_pwm_clock_hz(drive->hal));
     drive->thermal_parameters = thermal_configure(drive->parameters.values);
+    drive->temperature_parameters = temperature_configure(drive->parameters.values);
     hal_critical_enter(drive->hal);
     if (may_configure(drive)) {
         drive->control_parameters = control_parameters;
@@ -44,6 +45,7 @@ COLD static void configure(drive_t *drive) {
     }
     drive->applied_revision = drive->parameters.revision;
     hal_critical_leave(drive->hal);
+    self_test_configured(&drive->self_test, &drive->control_parameters);
 }
 
 COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
@@ -57,6 +59,8 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
         .control_rate_hz = config->control_rate_hz,
         .processor_time_q24 = (uint32_t)fixed_divide((int64_t)PROCESSOR_TIME_HZ << 24, clock_hz),
     };
+    self_test_init(&drive->self_test, hal, hal_time_us(hal));
+    temperature_init(&drive->temperature, hal_time_us(hal));
     parameters_init(&drive->parameters);
     parameters_set_controller(&drive->parameters, (int32_t)config->controller);
     if (config->telemetry_period_ms != 0) {
@@ -67,14 +71,18 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     drive->thermal.step_us = hal_time_us(hal) - THERMAL_STEP_US / 2u; /* halfway between two telemetry cycles */
     drive->comms.store = &drive->store;
     drive->comms.trace = &drive->trace;
+    drive->comms.self_test = &drive->self_test;
     drive->comms.control_parameters = &drive->control_parameters;
     configure(drive);
     control_reset(&drive->control_parameters, &drive->control);
+    drive->control.reported_fault_mask = self_test_faults(&drive->self_test);
     if (drive->store.inhibited) {
-        drive->control.reported_fault_mask = (uint32_t)FAULT_BIT(FAULT_PARAMETER_MEMORY);
+        drive->control.reported_fault_mask |= (uint32_t)FAULT_BIT(FAULT_PARAMETER_MEMORY);
     }
-    if (hal_reset_cause(hal) == HAL_RESET_WATCHDOG) {
-        state_machine_start_in_fault(&drive->control.state_machine, FAULT_BIT(FAULT_WATCHDOG));
+    const uint64_t at_start = (hal_reset_cause(hal) == HAL_RESET_WATCHDOG ? FAULT_BIT(FAULT_WATCHDOG) : 0) |
+                              self_test_faults(&drive->self_test);
+    if (at_start != 0) {
+        state_machine_start_in_fault(&drive->control.state_machine, at_start);
     }
     hal_pwm_open_all(hal);
     hal_pwm_start(hal, drive->control_parameters.period_ticks);
@@ -178,8 +186,10 @@ static void keep_memory(drive_t *drive, uint32_t time_us) {
     const drive_state_t state = drive->control.state_machine.state;
     if (state == DRIVE_STATE_FAULT) {
         hal_critical_enter(drive->hal);
-        const fault_record_t record = drive->control.state_machine.record;
+        fault_record_t record = drive->control.state_machine.record;
         hal_critical_leave(drive->hal);
+        record.self_test = telemetry_self_test(drive);
+        record.phases = (uint8_t)drive->phases.phases;
         nvm_store_follow_fault(&drive->store, record.fault == FAULT_NONE ? NULL : &record);
     } else {
         nvm_store_follow_fault(&drive->store, NULL);

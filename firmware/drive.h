@@ -13,8 +13,10 @@
 #include "drive/nvm_store.h"
 #include "drive/parameters.h"
 #include "drive/phase_monitor.h"
+#include "drive/self_test.h"
 #include "drive/stall_monitor.h"
 #include "drive/sto_monitor.h"
+#include "drive/temperature.h"
 #include "drive/thermal.h"
 #include "drive/watchdog_monitor.h"
 #include "hal.h"
@@ -55,6 +57,9 @@ typedef struct {
     encoder_monitor_t encoder;
     thermal_parameters_t thermal_parameters;
     thermal_t thermal;
+    temperature_parameters_t temperature_parameters;
+    temperature_t temperature;
+    self_test_t self_test;
     watchdog_monitor_t watchdog;
     bool ramping;          /* the torque ramps to zero, without commands; the next two are for this */
     int32_t ramp_from_q24; /* torque reference at its begin, N m, Q7.24 */

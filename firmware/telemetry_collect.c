@@ -32,6 +32,10 @@ static int32_t misalignment(const drive_t *drive) {
     return (int32_t)sum / (phases * machine_tables.rotor_poles);
 }
 
+uint16_t telemetry_self_test(const drive_t *drive) {
+    return (uint16_t)(drive->temperature.failed_sensors | drive->self_test.failed << SELF_TEST_TELEMETRY_BIT);
+}
+
 void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const control_state_t *control = &drive->control;
@@ -126,6 +130,11 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->thermal.winding_load = percent(thermal_winding_load_q16(&drive->thermal));
     telemetry->thermal.switch_load = percent(thermal_switch_load_q16(&drive->thermal));
     telemetry->thermal.torque_limit_nm = units_torque_q8(control->torque_limit_q24);
+    telemetry->thermal.winding_temperature_c =
+        (uint32_t)fixed_non_negative(temperature_C(&drive->temperature, TEMPERATURE_WINDING));
+    telemetry->thermal.inverter_temperature_c =
+        (uint32_t)fixed_non_negative(temperature_C(&drive->temperature, TEMPERATURE_INVERTER));
+    telemetry->self_test = telemetry_self_test(drive);
 
     telemetry->gates = drive->break_causes; /* the DBC has the bits of HAL_PWM_BREAK_* */
 

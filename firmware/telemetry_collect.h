@@ -11,4 +11,7 @@
  * telemetry_dropped, which telemetry_cycle() writes. The control interrupt must not run meanwhile. [background] */
 void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry);
 
+/* Bits of DRIVE_SELF_TEST: failed temperature sensors, and above them SELF_TEST_*. */
+uint16_t telemetry_self_test(const drive_t *drive);
+
 #endif

@@ -26,4 +26,22 @@ unsigned hal_adc_bits(const hal_t *hal);
 /* The conversion results of this period's sample. [interrupt] */
 void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample);
 
+/* Temperature sensors, one in each winding and one in the switches of each phase, converted in the background. A code
+ * has 16 bits, whatever the resolution, and is linear: 0 is HAL_ADC_TEMPERATURE_ZERO_C, full scale
+ * HAL_ADC_TEMPERATURE_SPAN_K more; a port linearises what its sensors are. Outside of the limits below a sensor is
+ * shorted (0) or open (its largest code, by a pull-up resistor), and the divider of a port has to see to that. */
+#define HAL_ADC_TEMPERATURE_ZERO_C (-100)
+#define HAL_ADC_TEMPERATURE_SPAN_K 400
+#define HAL_ADC_TEMPERATURE_CODE_MIN 4096u  /* -75 C */
+#define HAL_ADC_TEMPERATURE_CODE_MAX 61440u /* 275 C */
+
+/* Sensor of a winding, of the switches of a phase: plus the number of the phase. */
+#define HAL_ADC_WINDING 0u
+#define HAL_ADC_INVERTER HAL_PHASES_MAX
+#define HAL_ADC_TEMPERATURES (2 * HAL_PHASES_MAX)
+
+/* Code of the last conversion, at most 2 ms old; those of phases that the machine does not have mean nothing.
+ * [background] */
+uint16_t hal_adc_temperature(const hal_t *hal, unsigned sensor);
+
 #endif

@@ -9,6 +9,10 @@
 /* Microseconds since start; wraps after 71 minutes. [both] */
 uint32_t hal_time_us(const hal_t *hal);
 
+/* The same by a second clock, that of the watchdog, with an oscillator of its own and from any beginning. [background]
+ */
+uint32_t hal_time_reference_us(const hal_t *hal);
+
 /* Masks the control interrupt and the deferred interrupt between the two calls; does not nest. [background] */
 void hal_critical_enter(hal_t *hal);
 void hal_critical_leave(hal_t *hal);

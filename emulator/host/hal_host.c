@@ -7,6 +7,7 @@
 #include "hal_can.h"
 #include "hal_encoder.h"
 #include "hal_interrupt.h"
+#include "hal_memory.h"
 #include "hal_nvm.h"
 #include "hal_pwm.h"
 #include "hal_random.h"
@@ -42,6 +43,11 @@ unsigned hal_adc_bits(const hal_t *hal) {
 void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample) {
     require(hal, true, __func__);
     *sample = hal->board->adc;
+}
+
+uint16_t hal_adc_temperature(const hal_t *hal, unsigned sensor) {
+    require(hal, false, __func__);
+    return hal->board->temperature_code[sensor];
 }
 
 unsigned hal_encoder_bits(const hal_t *hal) {
@@ -167,6 +173,22 @@ void hal_watchdog_start(hal_t *hal) {
 void hal_watchdog_kick(hal_t *hal) {
     require(hal, false, __func__);
     board_watchdog_kick(hal->board);
+}
+
+/* Code and stack are those of a process of the host. */
+void hal_memory(const hal_t *hal, hal_memory_t *memory) {
+    require(hal, false, __func__);
+    *memory = (hal_memory_t){0};
+}
+
+bool hal_registers_intact(const hal_t *hal) {
+    require(hal, false, __func__);
+    return board_registers_intact(hal->board);
+}
+
+uint32_t hal_time_reference_us(const hal_t *hal) {
+    require(hal, false, __func__);
+    return board_reference_us(hal->board);
 }
 
 uint32_t hal_time_us(const hal_t *hal) {

@@ -3,6 +3,7 @@
 
 #include "drive.h"
 #include "host/hal_host.h"
+#include "host/memory_flip.h"
 #include "host/simulation.h"
 
 static_assert((int)DRIVE_CONTROLLER_TRADITIONAL == OPTIONS_CONTROLLER_TRADITIONAL &&
@@ -36,6 +37,10 @@ static void restart(void *context) {
     drive_init(&host->drive, &host->hal, &host->config); /* with the configuration of the start, which it accepted */
 }
 
+static void flip(void *context, memory_object_t object, uint32_t bit) {
+    memory_flip(&((struct host_drive *)context)->drive, object, bit);
+}
+
 /* Starts every drive; false when one rejects its configuration. */
 static bool start(const options_t *options, rig_firmware_t firmware[]) {
     for (unsigned i = 0; i < options->drives; ++i) {
@@ -54,6 +59,8 @@ static bool start(const options_t *options, rig_firmware_t firmware[]) {
                                        .deferred_interrupt = deferred_interrupt,
                                        .background = background,
                                        .restart = restart,
+                                       .flip = flip,
+                                       .flip_objects = MEMORY_FLIP_OBJECTS,
                                        .context = host};
     }
     return true;

@@ -206,12 +206,19 @@ static void restart(void *context) {
     simulation->firmware.restart(simulation->firmware.context);
 }
 
+static void flip(void *context, memory_object_t object, uint32_t bit) {
+    simulation_t *simulation = context;
+    simulation->firmware.flip(simulation->firmware.context, object, bit);
+}
+
 void simulation_run(simulation_t *simulation, const rig_firmware_t firmware[]) {
     simulation->firmware = firmware[0];
     const rig_firmware_t recorded = {.control_interrupt = control_interrupt,
                                      .deferred_interrupt = deferred_interrupt,
                                      .background = background,
                                      .restart = firmware[0].restart ? restart : NULL,
+                                     .flip = flip,
+                                     .flip_objects = firmware[0].flip_objects,
                                      .context = simulation};
     for (unsigned i = 0; i < simulation->options->drives; ++i) {
         rig_join(&simulation->rigs[i], i == 0 && simulation->switches ? &recorded : &firmware[i]);

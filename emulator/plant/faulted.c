@@ -181,8 +181,12 @@ void faulted_add_energies(plant_t *plant, const integrator_setting_t *setting, c
         }
         const plant_path_t *path = &setting->path[index];
         const double k = setting->turns[index], winding_ohm = plant->winding_ohm;
-        plant->energy_copper_J += (1.0 - k) * winding_ohm * current2_A2s + k / winding_ohm * e2;
-        plant->energy_converter_J += path->device_V * charge_As + path->device_ohm * current2_A2s;
+        const double copper_J = (1.0 - k) * winding_ohm * current2_A2s + k / winding_ohm * e2;
+        const double converter_J = path->device_V * charge_As + path->device_ohm * current2_A2s;
+        plant->energy_copper_J += copper_J;
+        plant->energy_converter_J += converter_J;
+        plant->phase_copper_J[setting->phase[index]] += copper_J;
+        plant->phase_converter_J[setting->phase[index]] += converter_J;
         plant->energy_fault_J += path->breakdown_V * charge_As;
     }
     if (setting->friction_sign != 0.0) {

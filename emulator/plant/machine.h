@@ -39,6 +39,12 @@ typedef struct {
     double load_torque_Nm; /* torque transducer, in either direction */
 } sensor_ranges_t;
 
+/* Heat path to the surroundings of one winding, and of the switches of one phase (rig/heat.h). */
+typedef struct {
+    double winding_capacity_J_K, winding_resistance_K_W;
+    double inverter_capacity_J_K, inverter_resistance_K_W;
+} thermal_data_t;
+
 typedef struct {
     const char *name;
     unsigned stator_poles;
@@ -53,6 +59,7 @@ typedef struct {
     dc_link_t dc_link;
     sensor_errors_t sensors;
     sensor_ranges_t ranges;
+    thermal_data_t thermal;
     double trip_current_A; /* of the comparators in the gate drivers; 0: none */
 } machine_t;
 

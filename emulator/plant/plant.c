@@ -473,9 +473,13 @@ MAGNETICS_INLINE void add_bridge_energies(plant_t *plant, const integrator_setti
         } else {
             plant->energy_returned_J -= energy_J;
         }
-        plant->energy_copper_J += winding_ohm * current2_A2s;
-        plant->energy_converter_J +=
+        const double copper_J = winding_ohm * current2_A2s;
+        const double converter_J =
             setting->drop_V[index] * charge_As + (setting->resistance_ohm[index] - winding_ohm) * current2_A2s;
+        plant->energy_copper_J += copper_J;
+        plant->energy_converter_J += converter_J;
+        plant->phase_copper_J[setting->phase[index]] += copper_J;
+        plant->phase_converter_J[setting->phase[index]] += converter_J;
     }
 }
 

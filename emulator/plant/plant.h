@@ -104,6 +104,8 @@ typedef struct plant {
     double energy_supplied_J; /* by the source; this and the next two with a capacitor only */
     double energy_source_J;   /* in the source's resistance */
     double energy_chopper_J;
+    double phase_copper_J[HAL_PHASES_MAX], phase_converter_J[HAL_PHASES_MAX]; /* parts of energy_copper_J and
+                                                                                 energy_converter_J */
 
     /* Private to plant.c. */
     const machine_t *machine;

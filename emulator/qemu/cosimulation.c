@@ -8,6 +8,7 @@
 #include <setjmp.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <ucontext.h>
 
 #include "hal_interrupt.h"
@@ -19,6 +20,8 @@
 #include "host/simulation.h"
 #include "plant/pwm_timer.h"
 
+/* An image has them all. */
+#define FLIP_OBJECTS ((1u << MEMORY_OBJECTS) - 1u)
 #define RIG_STACK_BYTES (1024 * 1024)
 
 static_assert(MAILBOX_PWM_CLOCK_HZ == PWM_TIMER_CLOCK_HZ, "one clock on both sides of the mailbox");
@@ -52,6 +55,9 @@ static void deliver_event(mailbox_event_t event) {
     mailbox->transmit_errors = status.transmit_errors;
     mailbox->receive_errors = status.receive_errors;
     mailbox->transmitting = status.transmitting;
+    mailbox->reference_us = board_reference_us(board);
+    mailbox->registers_intact = board_registers_intact(board);
+    memcpy(mailbox->temperature_code, board->temperature_code, sizeof mailbox->temperature_code);
     resume_drive();
 }
 
@@ -77,13 +83,22 @@ static void restart(void *context) {
     deliver_event(MAILBOX_RESET); /* until MAILBOX_STARTED */
 }
 
+static void flip(void *context, memory_object_t object, uint32_t bit) {
+    (void)context;
+    mailbox->flip_object = object;
+    mailbox->flip_bit = bit;
+    deliver_event(MAILBOX_FLIP);
+}
+
 static void run_rig(void) {
     if (rejected) {
         simulation_rejected(&simulation);
     } else {
         simulation_run(&simulation, &(rig_firmware_t){.control_interrupt = control_interrupt,
                                                       .background = background,
-                                                      .restart = mailbox->timed ? NULL : restart});
+                                                      .restart = mailbox->timed ? NULL : restart,
+                                                      .flip = flip,
+                                                      .flip_objects = mailbox->timed ? 0 : FLIP_OBJECTS});
     }
     mailbox->exit_code = (uint32_t)simulation_close(&simulation);
     mailbox->event = MAILBOX_EXIT;

@@ -129,7 +129,8 @@ void trace_translate(struct qemu_plugin_tb *tb) {
     } else {
         qemu_plugin_register_vcpu_tb_exec_inline(tb, QEMU_PLUGIN_INLINE_ADD_U64, &executed[number], 1);
     }
-    for (size_t i = 0; i < size; ++i) {
+    const bool paints = symbol && strcmp(symbol, "stack_paint") == 0; /* not a use of the stack */
+    for (size_t i = 0; i < size && !paints; ++i) {
         qemu_plugin_register_vcpu_mem_cb(qemu_plugin_tb_get_insn(tb, i), stored, QEMU_PLUGIN_CB_NO_REGS,
                                          QEMU_PLUGIN_MEM_W, NULL);
     }

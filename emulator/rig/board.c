@@ -18,6 +18,7 @@ void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *b
         plant_set_trip(plant, plant->machine->trip_current_A);
     }
     board->watchdog_ns = UINT64_MAX;
+    board->reference_rate = 1.0;
     nvm_init(&board->nvm);
 }
 
@@ -111,7 +112,25 @@ void board_deliver(board_t *board, const hal_can_frame_t *frame) {
 }
 
 void board_pwm_start(board_t *board, uint16_t period_ticks) {
-    board->period_ticks = period_ticks;
+    board->period_ticks = board->period_written = period_ticks;
+}
+
+bool board_registers_intact(const board_t *board) {
+    return board->period_ticks == board->period_written;
+}
+
+static double reference_us(const board_t *board) {
+    return board->reference_at_us + (double)(board->time_ns - board->reference_from_ns) * board->reference_rate * 1e-3;
+}
+
+uint32_t board_reference_us(const board_t *board) {
+    return (uint32_t)(uint64_t)reference_us(board);
+}
+
+void board_set_reference_rate(board_t *board, double rate) {
+    board->reference_at_us = reference_us(board);
+    board->reference_from_ns = board->time_ns;
+    board->reference_rate = rate;
 }
 
 void board_pwm_write(board_t *board, const hal_pwm_compare_t *compare) {

@@ -34,9 +34,11 @@ typedef struct {
     hal_encoder_sample_t encoder; /* likewise */
     unsigned adc_bits;            /* 12..16 */
     unsigned encoder_bits;        /* 8..32 */
+    uint16_t temperature_code[HAL_ADC_TEMPERATURES];
 
-    uint16_t period_ticks; /* 0 until the timer is started */
-    bool immediate_pwm;    /* setting, see board_pwm_write; false after board_init */
+    uint16_t period_ticks;   /* register of the timer; 0 until it is started */
+    uint16_t period_written; /* to it */
+    bool immediate_pwm;      /* setting, see board_pwm_write; false after board_init */
     hal_pwm_compare_t active, buffered;
     uint32_t missed_triggers;   /* since last read */
     bool renewed;               /* compare values were written or cleared since the start of the period */
@@ -49,6 +51,10 @@ typedef struct {
     hal_can_frame_t received[HAL_CAN_RECEIVE_QUEUE];
     uint32_t received_pushed, received_popped; /* counts, not indices */
     uint32_t receive_overflows;
+
+    /* The second clock: its time at an instant and its rate from there on. */
+    uint64_t reference_from_ns;
+    double reference_at_us, reference_rate;
 
     uint64_t watchdog_ns; /* time at which the watchdog acts; UINT64_MAX: not started */
     hal_reset_cause_t reset_cause;
@@ -101,6 +107,11 @@ bool board_can_transmit(board_t *board, const hal_can_frame_t *frame);
 void board_can_status(const board_t *board, hal_can_status_t *status);
 void board_can_rejoin(board_t *board);
 void board_watchdog_kick(board_t *board);
+bool board_registers_intact(const board_t *board);
+uint32_t board_reference_us(const board_t *board);
+
+/* For the rig: rate of the second clock from now on, >= 0; 1 is right. */
+void board_set_reference_rate(board_t *board, double rate);
 
 /* The next number of a stream that depends on the seed and on the instants of the calls: a bench with the same seed and
  * the same course repeats it, as everything else. */

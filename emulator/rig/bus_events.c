@@ -38,7 +38,7 @@ void truth_event(void *context, uint64_t now_ns) {
     transport_frame_t frames[TRUTH_FRAMES];
     rig->scheduler.due_ns[EVENT_TRUTH] += rig->truth_period_ns;
     plant_advance(&rig->plant, now_ns);
-    truth_pack(&rig->plant, frames);
+    truth_pack(rig, frames);
     for (unsigned i = 0; i < TRUTH_FRAMES; ++i) {
         transport_frame_set_node(&frames[i], rig->config.node);
         transport_send(rig->config.transport, now_ns, TRANSPORT_FROM_EMULATOR, &frames[i]);

@@ -2,6 +2,7 @@
 
 #include "plant/pwm_timer.h"
 #include "rig/bus_events.h"
+#include "rig/heat.h"
 
 void control_period_schedule_hold(rig_t *rig) {
     const uint64_t control_ns = rig->scheduler.due_ns[EVENT_CONTROL];
@@ -12,10 +13,14 @@ void control_period_schedule_hold(rig_t *rig) {
     rig->sensors.currents_held = false;
 }
 
+void control_period_set_length(rig_t *rig) {
+    rig->period_ns = UINT64_C(2) * rig->board.period_ticks * PWM_TIMER_TICK_NS;
+}
+
 void control_period_begin(rig_t *rig) {
     rig->scheduler.due_ns[EVENT_WATCHDOG] = rig->board.watchdog_ns;
     if (rig->board.period_ticks > 0) {
-        rig->period_ns = UINT64_C(2) * rig->board.period_ticks * PWM_TIMER_TICK_NS;
+        control_period_set_length(rig);
         rig->scheduler.due_ns[EVENT_CONTROL] = rig->board.time_ns + rig->period_ns;
         control_period_schedule_hold(rig);
     }
@@ -58,6 +63,7 @@ void control_period_start_event(void *context, uint64_t now_ns) {
     const bool lost = rig->interrupts_lost && now_ns >= rig->interrupt_end_ns;
     const bool busy = lost || now_ns < rig->interrupt_end_ns;
     plant_advance(&rig->plant, now_ns);
+    heat_step(rig);
     board_start_period(&rig->board, busy);
     rig->scheduler.due_ns[EVENT_CONTROL] = now_ns + rig->period_ns;
     control_period_schedule_hold(rig);

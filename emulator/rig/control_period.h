@@ -9,6 +9,9 @@
 /* Schedules the first period, one period from now, when the firmware has started the timer, and the watchdog. */
 void control_period_begin(rig_t *rig);
 
+/* Takes the length of the periods after the present one from the timer's register. */
+void control_period_set_length(rig_t *rig);
+
 /* Schedules EVENT_CURRENT_HOLD for the next period's sample, ahead of it by the current sensors' delay, limited to one
  * period. Without a delay, or when that instant has passed, the currents at the sample itself will be converted. */
 void control_period_schedule_hold(rig_t *rig);

@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "fault_kinds.h"
+#include "rig/control_period.h"
 #include "rig/dynamometer.h"
 #include "rig/load.h"
 #include "rig/supply.h"
@@ -22,6 +23,7 @@ static unsigned pack(const fault_request_t *request) {
 
 void faults_init(rig_t *rig) {
     rig->fault_changes.count = 0;
+    memset(rig->flipped, 0, sizeof rig->flipped);
     memset(&rig->faults, 0, sizeof rig->faults);
 }
 
@@ -152,6 +154,67 @@ static void apply_processor(rig_t *rig) {
     rig->background_hung = present(rig, FAULT_BACKGROUND_HUNG);
 }
 
+static void apply_temperature_sensors(rig_t *rig) {
+    static const input_kinds_t kinds[] = {
+        {.high = FAULT_WINDING_TEMPERATURE_SENSOR_OPEN,
+         .low = FAULT_WINDING_TEMPERATURE_SENSOR_SHORTED,
+         .stuck = FAULT_WINDING_TEMPERATURE_SENSOR_STUCK,
+         .offset = FAULT_WINDING_TEMPERATURE_SENSOR_OFFSET},
+        {.high = FAULT_INVERTER_TEMPERATURE_SENSOR_OPEN,
+         .low = FAULT_INVERTER_TEMPERATURE_SENSOR_SHORTED,
+         .stuck = FAULT_INVERTER_TEMPERATURE_SENSOR_STUCK,
+         .offset = FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET},
+    };
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) { /* kind 0 is no fault: neither open nor gain */
+        rig->heat.winding.sensor_fault[phase] = input_fault(rig, &kinds[0], phase);
+        rig->heat.inverter.sensor_fault[phase] = input_fault(rig, &kinds[1], phase);
+    }
+}
+
+/* Kinds of flipped bits by object. */
+static const unsigned flip_kinds[MEMORY_OBJECTS] = {
+    [MEMORY_LIMITS] = FAULT_LIMIT_FLIPPED, [MEMORY_CONSTANTS] = FAULT_CONSTANT_FLIPPED,
+    [MEMORY_STATE] = FAULT_STATE_FLIPPED,  [MEMORY_FAULT_LATCH] = FAULT_FAULT_LATCH_FLIPPED,
+    [MEMORY_CODE] = FAULT_CODE_FLIPPED,    [MEMORY_STACK_GUARD] = FAULT_STACK_GUARD_FLIPPED,
+};
+
+static void apply_flips(rig_t *rig) {
+    for (unsigned object = 0; object < MEMORY_OBJECTS; object++) {
+        const bool flips = present(rig, flip_kinds[object]);
+        const uint32_t bit = (uint32_t)value(rig, flip_kinds[object]);
+        if (rig->flipped[object] && !(flips && rig->flipped_bit[object] == bit)) {
+            rig->flipped[object] = false;
+            rig->firmware.flip(rig->firmware.context, (memory_object_t)object, rig->flipped_bit[object]);
+        }
+        if (flips && !rig->flipped[object]) {
+            rig->flipped[object] = true;
+            rig->flipped_bit[object] = bit;
+            rig->firmware.flip(rig->firmware.context, (memory_object_t)object, bit);
+        }
+    }
+}
+
+void faults_drive_reset(rig_t *rig) {
+    for (unsigned object = 0; object < MEMORY_OBJECTS; object++) {
+        rig->flipped[object] = rig->flipped[object] && object == MEMORY_CODE;
+    }
+}
+
+static uint16_t flipped_period_ticks(const rig_t *rig, double bit) {
+    return (uint16_t)(rig->board.period_written ^ 1u << (unsigned)bit);
+}
+
+static void apply_period_register(rig_t *rig) {
+    rig->board.period_ticks = present(rig, FAULT_PERIOD_REGISTER_FLIPPED)
+                                  ? flipped_period_ticks(rig, value(rig, FAULT_PERIOD_REGISTER_FLIPPED))
+                                  : rig->board.period_written;
+    control_period_set_length(rig);
+}
+
+static void apply_clock(rig_t *rig) {
+    board_set_reference_rate(&rig->board, 1.0 + PERCENT * value(rig, FAULT_CLOCK_DRIFT));
+}
+
 typedef void (*effect_t)(rig_t *rig);
 
 static const effect_t effects[FAULT_COUNT] = {
@@ -192,6 +255,22 @@ static const effect_t effects[FAULT_COUNT] = {
     [FAULT_CHOPPER_OPEN] = apply_plant,
     [FAULT_INTERRUPT_LOST] = apply_processor,
     [FAULT_BACKGROUND_HUNG] = apply_processor,
+    [FAULT_WINDING_TEMPERATURE_SENSOR_OPEN] = apply_temperature_sensors,
+    [FAULT_WINDING_TEMPERATURE_SENSOR_SHORTED] = apply_temperature_sensors,
+    [FAULT_WINDING_TEMPERATURE_SENSOR_STUCK] = apply_temperature_sensors,
+    [FAULT_WINDING_TEMPERATURE_SENSOR_OFFSET] = apply_temperature_sensors,
+    [FAULT_INVERTER_TEMPERATURE_SENSOR_OPEN] = apply_temperature_sensors,
+    [FAULT_INVERTER_TEMPERATURE_SENSOR_SHORTED] = apply_temperature_sensors,
+    [FAULT_INVERTER_TEMPERATURE_SENSOR_STUCK] = apply_temperature_sensors,
+    [FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET] = apply_temperature_sensors,
+    [FAULT_LIMIT_FLIPPED] = apply_flips,
+    [FAULT_CONSTANT_FLIPPED] = apply_flips,
+    [FAULT_STATE_FLIPPED] = apply_flips,
+    [FAULT_FAULT_LATCH_FLIPPED] = apply_flips,
+    [FAULT_CODE_FLIPPED] = apply_flips,
+    [FAULT_STACK_GUARD_FLIPPED] = apply_flips,
+    [FAULT_PERIOD_REGISTER_FLIPPED] = apply_period_register,
+    [FAULT_CLOCK_DRIFT] = apply_clock,
 };
 
 /* --- Requests --- */
@@ -220,9 +299,25 @@ void faults_event(void *context, uint64_t now_ns) {
     change(rig, next.variable, next.value);
 }
 
-static bool unsupported(const rig_t *rig, unsigned kind) {
-    return kind == FAULT_CHOPPER_OPEN && (rig->plant.machine->dc_link.capacitance_F == 0.0 ||
-                                          rig->plant.machine->dc_link.chopper_resistance_ohm == 0.0);
+/* Shortest half period of the timer that a drive is asked to live with: 1 us. */
+#define PERIOD_TICKS_MIN 200
+
+static bool unsupported(const rig_t *rig, const fault_request_t *request) {
+    const unsigned kind = request->kind;
+    if (kind == FAULT_CHOPPER_OPEN) {
+        return rig->plant.machine->dc_link.capacitance_F == 0.0 ||
+               rig->plant.machine->dc_link.chopper_resistance_ohm == 0.0;
+    }
+    if (kind == FAULT_PERIOD_REGISTER_FLIPPED) { /* the timer of a target whose instructions take time is its own */
+        return !rig->firmware.restart ||
+               (request->begins && flipped_period_ticks(rig, (double)request->raw) < PERIOD_TICKS_MIN);
+    }
+    for (unsigned object = 0; object < MEMORY_OBJECTS; object++) {
+        if (kind == flip_kinds[object]) {
+            return (rig->firmware.flip_objects >> object & 1u) == 0;
+        }
+    }
+    return false;
 }
 
 static bool has_place(const rig_t *rig, const fault_request_t *request) {
@@ -254,7 +349,7 @@ uint8_t faults_receive(rig_t *rig, const uint8_t *data) {
     if (!in_range(&request)) {
         return RIG_FAULT_REPLY_STATUS_OUT_OF_RANGE_CHOICE;
     }
-    if (unsupported(rig, request.kind)) {
+    if (unsupported(rig, &request)) {
         return RIG_FAULT_REPLY_STATUS_UNSUPPORTED_CHOICE;
     }
     if (request.at_us == 0 || entry.at_ns == rig->board.time_ns) {

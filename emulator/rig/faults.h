@@ -17,6 +17,9 @@ void faults_init(rig_t *rig);
  * answer is RIG_FAULT_REPLY_STATUS_*_CHOICE. */
 uint8_t faults_receive(rig_t *rig, const uint8_t *data);
 
+/* The drive starts again: of its memory only the program keeps a flipped bit. */
+void faults_drive_reset(rig_t *rig);
+
 /* Handler of EVENT_FAULT; context is the rig. */
 void faults_event(void *context, uint64_t now_ns);
 

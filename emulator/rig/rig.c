@@ -4,6 +4,7 @@
 #include "rig/control_period.h"
 #include "rig/dynamometer.h"
 #include "rig/faults.h"
+#include "rig/heat.h"
 #include "rig/load.h"
 #include "rig/server.h"
 #include "rig/stimulus.h"
@@ -47,6 +48,7 @@ static void init(rig_t *rig, rig_t *first, unsigned bus_drive, const rig_config_
     load_init(rig);
     supply_init(rig);
     dynamometer_init(rig);
+    heat_init(rig);
     faults_init(rig);
 }
 
@@ -78,6 +80,7 @@ bool rig_reset_drive(rig_t *rig, hal_reset_cause_t cause) {
     plant_advance(&rig->plant, rig->board.time_ns);
     board_reset(&rig->board, cause);
     rig->interrupt_end_ns = 0;
+    faults_drive_reset(rig);
     rig->scheduler.due_ns[EVENT_CONTROL] = rig->scheduler.due_ns[EVENT_CURRENT_HOLD] =
         rig->scheduler.due_ns[EVENT_BACKGROUND] = SCHEDULER_NEVER;
     rig->firmware.restart(rig->firmware.context);

@@ -25,6 +25,7 @@
 #include "plant/sensors.h"
 #include "rig/board.h"
 #include "rig/can_bus.h"
+#include "rig/memory_object.h"
 #include "rig/pacing.h"
 #include "rig/scheduler.h"
 #include "rig/stimulus_queue.h"
@@ -44,6 +45,9 @@ typedef struct {
     void (*background)(void *context);         /* after each control interrupt and the deferred one */
     void *context;
     void (*restart)(void *context); /* from its start on, after board_reset; NULL: it cannot be reset */
+    /* Flips a bit of an object of memory_object.h; bit n of flip_objects: it has object n. */
+    void (*flip)(void *context, memory_object_t object, uint32_t bit);
+    uint32_t flip_objects;
 } rig_firmware_t;
 
 /* When to end: `requested` is called at least every RIG_STOP_STEP_NS, and when a descriptor becomes readable. */
@@ -98,7 +102,21 @@ typedef struct {
     uint64_t ripple_start_ns;
 } supply_t;
 
-#define RIG_FAULT_KINDS_MAX 64
+/* Bodies of one kind, one in each phase, and their temperature sensors (heat.h). */
+typedef struct {
+    double temperature_C[HAL_PHASES_MAX];
+    double loss_J[HAL_PHASES_MAX];                      /* of the plant, at the last step */
+    double held_C;                                      /* a variable of the bench */
+    sensors_input_fault_t sensor_fault[HAL_PHASES_MAX]; /* code: of 16 bits; offset in K */
+} heat_bodies_t;
+
+typedef struct {
+    uint64_t time_ns; /* of the last step */
+    double ambient_C;
+    heat_bodies_t winding, inverter;
+} heat_t;
+
+#define RIG_FAULT_KINDS_MAX 128
 
 /* A fault of one kind at one place. */
 typedef struct {
@@ -129,8 +147,11 @@ typedef struct rig {
     bool shaft_locked;
     stimulus_queue_t fault_changes;                                  /* faults.c */
     fault_presence_t faults[RIG_FAULT_KINDS_MAX][HAL_PHASES_MAX][2]; /* by kind, phase and leg */
-    bool interrupts_lost, background_hung;                           /* control_period.c */
-    rig_run_t runs[RIG_RUNS_MAX]; /* server.c, by time, equal times in the order of arrival */
+    bool flipped[MEMORY_OBJECTS];                                    /* and which bit: */
+    uint32_t flipped_bit[MEMORY_OBJECTS];
+    bool interrupts_lost, background_hung; /* control_period.c */
+    heat_t heat;                           /* heat.c */
+    rig_run_t runs[RIG_RUNS_MAX];          /* server.c, by time, equal times in the order of arrival */
     unsigned run_count;
     uint64_t stop_checked_ns;
 } rig_t;

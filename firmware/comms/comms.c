@@ -82,7 +82,7 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const 
             return true;
         case COMMANDS_PARAMETER_REQUEST: {
             hal_can_frame_t response;
-            if (!memory_protocol_respond(comms->store, hal, &frame, &response) &&
+            if (!memory_protocol_respond(comms->store, comms->self_test, hal, &frame, &response) &&
                 !trace_protocol_respond(comms->trace, comms->control_parameters, &frame, &response)) {
                 parameter_protocol_respond(parameters, &frame, &response);
             }

@@ -28,6 +28,7 @@
 #include "drive/fault_trace.h"
 #include "drive/nvm_store.h"
 #include "drive/parameters.h"
+#include "drive/self_test.h"
 #include "hal_can.h"
 
 /* Maximum number of received frames that one call processes. The shortest frame takes 47 us at 1 Mbit/s, so even a
@@ -45,8 +46,9 @@ typedef struct {
     frame_queue_t responses; /* to parameter requests and steps of a set */
     parameter_set_t set;     /* staged */
     command_t command;       /* last accepted command */
-    nvm_store_t *store;      /* this and the next two are set by the caller after comms_init */
+    nvm_store_t *store;      /* this and the next three are set by the caller after comms_init */
     const fault_trace_t *trace;
+    const self_test_t *self_test;
     const control_parameters_t *control_parameters;
     uint32_t arming_sent_us; /* when DRIVE_ARMING last entered a mailbox because of a change */
 } comms_t;

@@ -4,7 +4,15 @@
 #include "drive_codec.h"
 
 /* Parts of the responses, as drive.dbc lists them. */
-enum { MEMORY_SAVING, MEMORY_ORIGIN, MEMORY_START, MEMORY_NEWEST_FAULT, MEMORY_SETS };
+enum {
+    MEMORY_SAVING,
+    MEMORY_ORIGIN,
+    MEMORY_START,
+    MEMORY_NEWEST_FAULT,
+    MEMORY_SETS,
+    MEMORY_STACK_UNUSED,
+    MEMORY_CODE_PASSES
+};
 enum { ORIGIN_DEFAULTS, ORIGIN_MEMORY, ORIGIN_UNUSABLE };
 enum {
     LOG_FAULT,
@@ -16,10 +24,23 @@ enum {
     LOG_SPEED,
     LOG_VOLTAGE,
     LOG_CURRENT,
-    LOG_TORQUE
+    LOG_TORQUE,
+    LOG_CURRENT_A,
+    LOG_ANGLE = LOG_CURRENT_A + HAL_PHASES_MAX,
+    LOG_SELF_TEST,
+    LOG_PHASES
 };
 
-static parameter_status_t memory_item(const nvm_store_t *store, unsigned part, int32_t *value) {
+static uint16_t largest(const uint16_t *current_q9) {
+    uint16_t largest_q9 = 0;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        largest_q9 = current_q9[phase] > largest_q9 ? current_q9[phase] : largest_q9;
+    }
+    return largest_q9;
+}
+
+static parameter_status_t memory_item(const nvm_store_t *store, const self_test_t *test, unsigned part,
+                                      int32_t *value) {
     switch (part) {
     case MEMORY_SAVING:
         *value = (int32_t)store->saving;
@@ -35,6 +56,12 @@ static parameter_status_t memory_item(const nvm_store_t *store, unsigned part, i
         break;
     case MEMORY_SETS:
         *value = (int32_t)store->parameters.sequence;
+        break;
+    case MEMORY_STACK_UNUSED:
+        *value = (int32_t)(test->stack_unused * sizeof(uint32_t));
+        break;
+    case MEMORY_CODE_PASSES:
+        *value = (int32_t)test->code_passes;
         break;
     default:
         return PARAMETER_STATUS_NO_SUCH_ENTRY;
@@ -74,19 +101,32 @@ static parameter_status_t fault_item(const nvm_store_t *store, const hal_t *hal,
         *value = fault.dc_link_voltage_q6;
         break;
     case LOG_CURRENT:
-        *value = fault.current_max_q9;
+        *value = largest(fault.current_q9);
         break;
     case LOG_TORQUE:
         *value = units_torque_q8(fault.torque_reference_q24);
         break;
+    case LOG_ANGLE:
+        *value = fault.angle;
+        break;
+    case LOG_SELF_TEST:
+        *value = fault.self_test;
+        break;
+    case LOG_PHASES:
+        *value = fault.phases;
+        break;
     default:
+        if (part < LOG_ANGLE) {
+            *value = fault.current_q9[part - LOG_CURRENT_A];
+            break;
+        }
         return PARAMETER_STATUS_NO_SUCH_ENTRY;
     }
     return PARAMETER_STATUS_DONE;
 }
 
-bool memory_protocol_respond(const nvm_store_t *store, const hal_t *hal, const hal_can_frame_t *frame,
-                             hal_can_frame_t *response_frame) {
+bool memory_protocol_respond(const nvm_store_t *store, const self_test_t *test, const hal_t *hal,
+                             const hal_can_frame_t *frame, hal_can_frame_t *response_frame) {
     struct drive_parameter_request_t request;
     drive_parameter_request_unpack(&request, frame->data, frame->length);
     struct drive_parameter_response_t response = {
@@ -98,7 +138,7 @@ bool memory_protocol_respond(const nvm_store_t *store, const hal_t *hal, const h
     case PARAMETER_OPERATION_RESTORE_DEFAULTS:
         break;
     case PARAMETER_OPERATION_MEMORY:
-        status = memory_item(store, request.part, &response.value);
+        status = memory_item(store, test, request.part, &response.value);
         break;
     case PARAMETER_OPERATION_FAULT_LOG:
         status = fault_item(store, hal, (uint32_t)request.value, request.part, &response.value);

@@ -82,7 +82,8 @@ COLD void nvm_store_follow_fault(nvm_store_t *store, const fault_record_t *recor
     }
     /* The clock may have wrapped since the last step. */
     const bool wrapped = record->time_us < store->time_us && store->time_us - record->time_us > UINT32_MAX / 2;
-    store->waiting[store->waiting_count++] = (nvm_store_fault_t){
+    nvm_store_fault_t *entry = &store->waiting[store->waiting_count++];
+    *entry = (nvm_store_fault_t){
         .start = store->start,
         .time_us = record->time_us,
         .checks = (uint32_t)record->fault_mask,
@@ -91,9 +92,12 @@ COLD void nvm_store_follow_fault(nvm_store_t *store, const fault_record_t *recor
         .state = record->state,
         .speed_q22 = record->speed_q22,
         .torque_reference_q24 = record->torque_reference_q24,
-        .current_max_q9 = record->current_max_q9,
         .dc_link_voltage_q6 = record->dc_link_voltage_q6,
+        .angle = record->angle,
+        .self_test = record->self_test,
+        .phases = record->phases,
     };
+    memcpy(entry->current_q9, record->current_q9, sizeof entry->current_q9);
 }
 
 static void write_fault(nvm_store_t *store, hal_t *hal) {

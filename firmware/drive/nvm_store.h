@@ -27,19 +27,22 @@
 /* Faults that wait for being written: none is written in RUN. A further one is lost. */
 #define NVM_STORE_WAITING_MAX 2
 
-/* A fault in the log. 32 bytes, a multiple of a word of the memory. */
+/* A fault in the log. 40 bytes, a multiple of a word of the memory. */
 typedef struct {
-    uint32_t start;               /* number of the start, from 1 */
-    uint32_t time_us;             /* since that start, modulo 2^32 */
-    uint32_t checks;              /* failed in the tick that latched the fault, FAULT_BIT */
-    uint16_t time_wraps;          /* times 2^32 us; saturates */
-    uint8_t fault;                /* fault_t */
-    uint8_t state;                /* drive_state_t in that tick */
-    int32_t speed_q22;            /* rad/s, Q9.22 */
-    int32_t torque_reference_q24; /* N m, Q7.24 */
-    uint16_t current_max_q9;      /* A, Q7.9 */
-    uint16_t dc_link_voltage_q6;  /* V, Q9.6 */
-    uint32_t reserved;            /* 0 */
+    uint32_t start;                      /* number of the start, from 1 */
+    uint32_t time_us;                    /* since that start, modulo 2^32 */
+    uint32_t checks;                     /* failed in the tick that latched the fault, FAULT_BIT */
+    uint16_t time_wraps;                 /* times 2^32 us; saturates */
+    uint8_t fault;                       /* fault_t */
+    uint8_t state;                       /* drive_state_t in that tick */
+    int32_t speed_q22;                   /* rad/s, Q9.22 */
+    int32_t torque_reference_q24;        /* N m, Q7.24 */
+    uint16_t current_q9[HAL_PHASES_MAX]; /* A, Q7.9 */
+    uint16_t dc_link_voltage_q6;         /* V, Q9.6 */
+    uint16_t angle;                      /* rotor, 2^-16 rev */
+    uint16_t self_test; /* failed checks, bits of DRIVE_SELF_TEST; this and the next soon after that tick */
+    uint8_t phases;     /* of a fault of phases, bits */
+    uint8_t reserved;   /* 0 */
 } nvm_store_fault_t;
 
 typedef enum {

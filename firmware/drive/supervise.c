@@ -14,6 +14,10 @@ static void complete_record(fault_record_t *record, const control_state_t *state
     record->speed_q22 = measured->predicted_speed_q22;
     record->torque_reference_q24 = state->torque_reference_q24; /* of the previous period */
     record->current_max_q9 = (uint16_t)measured->current_max_q9;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        record->current_q9[phase] = (uint16_t)measured->current_q9[phase];
+    }
+    record->angle = (uint16_t)(measured->angle >> 16);
     record->dc_link_voltage_q6 = (uint16_t)measured->dc_link_voltage_q6;
 }
 

@@ -1,6 +1,7 @@
 #include "qemu/hal_qemu.h"
 
 #include "hal_interrupt.h"
+#include "hal_memory.h"
 #include "hal_nvm.h"
 #include "hal_random.h"
 #include "hal_time.h"
@@ -17,6 +18,10 @@ unsigned hal_adc_bits(const hal_t *hal) {
 
 void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample) {
     *sample = hal->mailbox.adc;
+}
+
+uint16_t hal_adc_temperature(const hal_t *hal, unsigned sensor) {
+    return hal->mailbox.temperature_code[sensor];
 }
 
 unsigned hal_encoder_bits(const hal_t *hal) {
@@ -116,6 +121,32 @@ bool hal_nvm_erase(hal_t *hal, unsigned page) {
     hal->mailbox.nvm_page = page;
     doorbell_ring(MAILBOX_NVM_ERASE);
     return hal->mailbox.accepted != 0;
+}
+
+/* Symbols of the linker script. */
+extern const uint32_t code_start[];
+extern uint32_t stack_end[], stack_top[];
+
+/* After the code; salient.generate.code_check fills in both. */
+__attribute__((section(".code_check"), used)) const volatile uint32_t code_check[2] = {0, 0};
+
+void hal_memory(const hal_t *hal, hal_memory_t *memory) {
+    (void)hal;
+    *memory = (hal_memory_t){
+        .code = code_start,
+        .code_words = code_check[0],
+        .code_crc = code_check[1],
+        .stack = stack_end,
+        .stack_words = (uint32_t)(stack_top - stack_end),
+    };
+}
+
+bool hal_registers_intact(const hal_t *hal) {
+    return hal->mailbox.registers_intact != 0;
+}
+
+uint32_t hal_time_reference_us(const hal_t *hal) {
+    return hal->mailbox.reference_us;
 }
 
 uint32_t hal_time_us(const hal_t *hal) {

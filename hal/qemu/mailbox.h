@@ -22,7 +22,7 @@
 #include "hal_pwm.h"
 
 /* Changes with the structure, so that an image and a host with different layouts stop at the start. */
-#define MAILBOX_LAYOUT 5
+#define MAILBOX_LAYOUT 6
 
 /* Clock of the emulated PWM timer. */
 #define MAILBOX_PWM_CLOCK_HZ 200000000
@@ -57,6 +57,7 @@ typedef enum {
     MAILBOX_BACKGROUND,    /* the processor has time for the background */
     MAILBOX_EXIT,          /* end of the run, with exit_code */
     MAILBOX_RESET,         /* the drive starts again; not when `timed` */
+    MAILBOX_FLIP,          /* the drive flips a bit of its memory; not when `timed` */
 } mailbox_event_t;
 
 typedef struct {
@@ -103,6 +104,13 @@ typedef struct {
     uint32_t nvm_value[2]; /* lower half first */
     uint32_t random;
     uint32_t reset_cause; /* hal_reset_cause_t, of the last MAILBOX_RESET */
+
+    uint32_t reference_us; /* of the second clock; this and the next two as of the last event */
+    uint32_t registers_intact;
+    uint16_t temperature_code[HAL_ADC_TEMPERATURES];
+
+    uint32_t flip_object; /* of MAILBOX_FLIP: memory_object_t, and its bit */
+    uint32_t flip_bit;
 } mailbox_t;
 
 #endif

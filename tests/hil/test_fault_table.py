@@ -7,7 +7,7 @@ import re
 import pytest
 
 from salient.config import CONTROLLERS
-from salient.experiments.fault_table import CASES, MACHINES, PAGE, measure, text
+from salient.experiments.fault_table import CASES, MACHINES, PAGE, measured_text
 
 CELL = re.compile(r"`(?P<fault>\w+)`, (?P<time>[\d.]+) (?P<unit>µs|ms)(, (?P<travel_deg>[\d.]+)°)?, (?P<peak>[\d.]+)")
 TRAVEL_MAX_DEG, FROZEN_MAX_S = 5.0, 0.3
@@ -37,13 +37,19 @@ def test_the_drive_reacts_as_the_page_says(number: int):
     """One cell of each fault; machine and controller change from one to the next."""
     case = CASES[number]
     machine, controller = MACHINES[number % len(MACHINES)], CONTROLLERS[number % len(CONTROLLERS)]
-    assert text(case, measure(case, machine, controller)) == table()[case.name, machine, controller]
+    assert measured_text(case, machine, controller) == table()[case.name, machine, controller]
 
 
 def test_a_drive_that_runs_on_has_a_reason():
     reasons = {case.name: case.unseen for case in CASES}
     runs_on = {case for (case, _, _), cell in table().items() if cell.startswith("runs on")}
     assert runs_on == {name for name, reason in reasons.items() if reason}
+
+
+def test_a_fault_that_the_host_cannot_have_has_a_reason():
+    reasons = {case.name: case.unsupported for case in CASES}
+    unsupported = {case for (case, _, _), cell in table().items() if cell == "unsupported"}
+    assert unsupported == {name for name, reason in reasons.items() if reason}
 
 
 def test_dead_sensors_and_encoders_are_found_within_their_limits():

@@ -177,6 +177,11 @@ void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t 
     memcpy(telemetry, SNAPSHOT(&from->control), sizeof *telemetry);
 }
 
+uint16_t telemetry_self_test(const drive_t *from) {
+    (void)from;
+    return 0;
+}
+
 /* No checks of the background: they would read the pattern. */
 thermal_parameters_t thermal_configure(const int32_t *values) {
     (void)values;
@@ -196,6 +201,47 @@ int32_t thermal_torque_limit_q24(const thermal_parameters_t *parameters, const t
 
 uint32_t thermal_faults(const thermal_t *thermal) {
     (void)thermal;
+    return 0;
+}
+
+temperature_parameters_t temperature_configure(const int32_t *values) {
+    (void)values;
+    return (temperature_parameters_t){0};
+}
+
+void temperature_init(temperature_t *temperature, uint32_t time_us) {
+    (void)temperature, (void)time_us;
+}
+
+void temperature_step(const temperature_parameters_t *parameters, temperature_t *temperature, const hal_t *hal,
+                      unsigned phases, uint32_t time_us) {
+    (void)parameters, (void)temperature, (void)hal, (void)phases, (void)time_us;
+}
+
+uint32_t temperature_faults(const temperature_t *temperature) {
+    (void)temperature;
+    return 0;
+}
+
+void self_test_init(self_test_t *test, const hal_t *hal, uint32_t time_us) {
+    (void)test, (void)hal, (void)time_us;
+}
+
+void self_test_configured(self_test_t *test, const control_parameters_t *parameters) {
+    (void)test, (void)parameters;
+}
+
+bool self_test_latch_intact(const state_machine_t *state_machine) {
+    (void)state_machine;
+    return true;
+}
+
+void self_test_step(self_test_t *test, const hal_t *hal, const control_parameters_t *parameters, uint32_t time_us) {
+    (void)test, (void)hal, (void)parameters, (void)time_us;
+}
+
+uint32_t self_test_faults(const self_test_t *test) {
+    (void)test;
     return 0;
 }
 

@@ -1,5 +1,6 @@
 // drive.c between a HAL that remembers and the laws: what it starts, writes, opens and passes on.
 #include <algorithm>
+#include <array>
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
@@ -18,6 +19,7 @@ extern "C" {
 #include "hal_can.h"
 #include "hal_encoder.h"
 #include "hal_interrupt.h"
+#include "hal_memory.h"
 #include "hal_nvm.h"
 #include "hal_pwm.h"
 #include "hal_random.h"
@@ -31,6 +33,9 @@ extern "C" {
 
 struct hal {
     hal_adc_sample_t adc{};
+    std::array<uint16_t, HAL_ADC_TEMPERATURES> temperature_code = warm();
+    hal_memory_t memory{};
+    bool registers_intact = true;
     uint32_t encoder_counts = 1000;
     uint32_t time_us = 0;
     uint32_t clock_hz = 200000000;
@@ -55,6 +60,11 @@ struct hal {
     nvm_t nvm = erased();
     unsigned nvm_operations = 0; // in the present background call
 
+    static std::array<uint16_t, HAL_ADC_TEMPERATURES> warm() {
+        std::array<uint16_t, HAL_ADC_TEMPERATURES> codes{};
+        codes.fill(20480); // 25 C
+        return codes;
+    }
     static nvm_t erased() {
         nvm_t nvm;
         nvm_init(&nvm);
@@ -68,6 +78,18 @@ void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample) {
 }
 unsigned hal_adc_bits(const hal_t *) {
     return 12;
+}
+uint16_t hal_adc_temperature(const hal_t *hal, unsigned sensor) {
+    return hal->temperature_code[sensor];
+}
+void hal_memory(const hal_t *hal, hal_memory_t *memory) {
+    *memory = hal->memory;
+}
+bool hal_registers_intact(const hal_t *hal) {
+    return hal->registers_intact;
+}
+uint32_t hal_time_reference_us(const hal_t *hal) {
+    return hal->time_us;
 }
 unsigned hal_encoder_bits(const hal_t *) {
     return 17;
@@ -371,6 +393,57 @@ TEST_F(Drive, after_a_reset_by_the_watchdog_is_in_fault_and_runs_only_when_clear
     command(COMMAND_RUN);
     periods(3);
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+}
+
+TEST_F(Drive, with_a_changed_program_starts_in_a_fault_that_is_not_cleared) {
+    const std::array<uint32_t, 3> program{1, 2, 3};
+    hal_t changed;
+    changed.memory = {.code = program.data(), .code_words = 3, .code_crc = 12345, .stack = nullptr, .stack_words = 0};
+    changed.adc.bus_voltage_counts = hal.adc.bus_voltage_counts;
+    drive_t other{};
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
+    ASSERT_TRUE(drive_init(&other, &changed, &config));
+    EXPECT_EQ(other.control.state_machine.state, DRIVE_STATE_FAULT);
+    EXPECT_EQ(other.control.state_machine.record.fault, FAULT_CODE);
+    EXPECT_EQ(other.control.reported_fault_mask, FAULT_BIT(FAULT_CODE));
+    other.command.request = COMMAND_CLEAR_FAULT;
+    for (int i = 0; i < 2000; i++) {
+        changed.time_us += 25;
+        drive_control_interrupt(&other);
+        drive_deferred_interrupt(&other);
+        drive_background(&other);
+    }
+    EXPECT_EQ(other.control.state_machine.state, DRIVE_STATE_FAULT);
+    EXPECT_TRUE(changed.open);
+}
+
+TEST_F(Drive, with_an_open_temperature_sensor_is_kept_from_starting_by_that) {
+    hal.temperature_code[HAL_ADC_INVERTER + 1] = 65520;
+    periods(100);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_INITIALISE);
+    EXPECT_EQ(drive.control.state_machine.start_inhibit_mask, FAULT_BIT(FAULT_TEMPERATURE_SENSOR));
+    hal.temperature_code[HAL_ADC_INVERTER + 1] = 20480;
+    periods(500);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+}
+
+TEST_F(Drive, a_changed_latch_is_the_fault_memory_from_the_next_background_on) {
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.05);
+    for (int i = 0; i < 4; i++) {
+        hal.to_drive.push_back(frames::command(uint8_t(counter + 100), COMMAND_RUN, -600000));
+        periods(1);
+    }
+    periods(3);
+    ASSERT_EQ(drive.control.state_machine.record.fault, FAULT_COMMAND_ERROR);
+    drive.control.state_machine.state = DRIVE_STATE_READY; // as by a flipped bit
+    drive_background(&drive);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_MEMORY);
+    periods(100);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.self_test.failed, SELF_TEST_FAULT_LATCH);
 }
 
 TEST_F(Drive, opens_the_switches_every_period_until_it_runs) {

@@ -79,7 +79,11 @@ static fault_record_t fault_of(uint32_t number) {
     record.fault_mask = FAULT_BIT(FAULT_ENCODER) | number % 2;
     record.speed_q22 = (int32_t)(number * 77777u);
     record.torque_reference_q24 = -(int32_t)number;
-    record.current_max_q9 = (uint16_t)number;
+    record.current_q9[0] = (uint16_t)number;
+    record.current_q9[HAL_PHASES_MAX - 1] = (uint16_t)(number + 2);
+    record.angle = (uint16_t)(number * 3);
+    record.self_test = (uint16_t)(number * 5);
+    record.phases = (uint8_t)(number & 15);
     record.dc_link_voltage_q6 = (uint16_t)(number + 1);
     record.state = DRIVE_STATE_RUN;
     return record;
@@ -130,7 +134,9 @@ static bool has_fault(const started_t *drive, const hal_t *hal, uint32_t number)
     return nvm_store_read_fault(&drive->store, hal, number, &fault) && fault.time_us == record.time_us &&
            fault.checks == record.fault_mask && fault.speed_q22 == record.speed_q22 && fault.state == record.state &&
            fault.torque_reference_q24 == record.torque_reference_q24 && fault.fault == record.fault &&
-           fault.current_max_q9 == record.current_max_q9 && fault.dc_link_voltage_q6 == record.dc_link_voltage_q6;
+           memcmp(fault.current_q9, record.current_q9, sizeof fault.current_q9) == 0 && fault.angle == record.angle &&
+           fault.self_test == record.self_test && fault.phases == record.phases &&
+           fault.dc_link_voltage_q6 == record.dc_link_voltage_q6;
 }
 
 /* Starts the drive after a cut and compares it with what was known; then that is known what it has. */

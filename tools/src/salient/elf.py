@@ -84,18 +84,27 @@ class ElfImage:
                 return loaded[address - begin: address - begin + size]
         raise UsageError(f"{self.path}: no content at {address:#x}")
 
+    def file_offset(self, address: int) -> int:
+        """Offset in the file of the content at an address; UsageError outside of all segments."""
+        for begin, start, length in self._segments(self.path.read_bytes()):
+            if begin <= address < begin + length:
+                return start + address - begin
+        raise UsageError(f"{self.path}: no content at {address:#x}")
+
     @lru_cache  # noqa: B019 an image is read a few times in a process
     def _loaded(self) -> dict[int, bytes]:
-        """Content of the loaded segments by address: 32-bit little-endian ELF, System V ABI, program header."""
+        """Content of the loaded segments by address."""
         content = self.path.read_bytes()
+        return {begin: content[start: start + length] for begin, start, length in self._segments(content)}
+
+    @staticmethod
+    def _segments(content: bytes) -> list[tuple[int, int, int]]:
+        """Address, offset in the file and length of each loaded segment: 32-bit little-endian ELF, System V ABI,
+        program header."""
         offset, = struct.unpack_from("<I", content, 28)
         size, count = struct.unpack_from("<HH", content, 42)
-        segments = {}
-        for at in range(offset, offset + size * count, size):
-            kind, begin, address, _, length = struct.unpack_from("<5I", content, at)
-            if kind == _LOADED:
-                segments[address] = content[begin: begin + length]
-        return segments
+        rows = (struct.unpack_from("<5I", content, at) for at in range(offset, offset + size * count, size))
+        return [(address, start, length) for kind, start, address, _, length in rows if kind == _LOADED]
 
     def stack(self) -> tuple[int, int]:
         """Lowest address of the stack, after the variables, and the address below which it starts."""

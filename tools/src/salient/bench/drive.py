@@ -38,11 +38,12 @@ _ATTEMPTS = 20
 _TEXT_PARTS_MAX = 64
 _REQUESTS_AT_ONCE = 16  # fewer than the frames that the drive's receive and transmit queues hold
 _SAVE_TIMEOUT_S = 2.0
-_MEMORY_ITEMS = ("saving", "origin", "start", "newest_fault", "sets")
+_MEMORY_ITEMS = ("saving", "origin", "start", "newest_fault", "sets", "stack_unused", "code_passes")
 _SAVING, _SAVED = 1, 2
 ORIGINS = ("defaults", "memory", "unusable")
 _FAULT_ITEMS = ("fault", "state", "checks", "start", "time_us", "time_wraps", "speed_rpm", "bus_voltage_V",
-                "current_max_A", "torque_reference_Nm")
+                "current_max_A", "torque_reference_Nm", "current_a", "current_b", "current_c", "current_d", "angle",
+                "self_test", "phases")
 """Parts of the operations memory and fault_log, as drive.dbc lists them."""
 LOGGED_FAULTS = 16
 TRACE_PERIODS = 64
@@ -354,7 +355,7 @@ class Parameters(MutableMapping[str, float]):
         the drive runs, and when the memory does not accept them."""
         self._require_done(self._writer.save(), {}, "save")
         deadline_ns = self._session.time_ns + round(_SAVE_TIMEOUT_S * 1e9)
-        while (saving := _memory_item(self._session, "saving")) == _SAVING and self._session.time_ns < deadline_ns:
+        while (saving := memory_item(self._session, "saving")) == _SAVING and self._session.time_ns < deadline_ns:
             pass  # each request takes time
         if saving != _SAVED:
             raise DriveError(f"save: not stored within {_SAVE_TIMEOUT_S:g} s" if saving == _SAVING
@@ -368,7 +369,7 @@ class Parameters(MutableMapping[str, float]):
     def origin(self) -> str:
         """Parameters at the last start: defaults, memory, or unusable, which are the defaults because no set in the
         memory could be used."""
-        return ORIGINS[_memory_item(self._session, "origin")]
+        return ORIGINS[memory_item(self._session, "origin")]
 
     def __delitem__(self, name: str) -> None:
         raise TypeError("a drive's parameters cannot be deleted")
@@ -396,6 +397,13 @@ class LoggedFault:
     bus_voltage_V: float
     current_max_A: float
     torque_reference_Nm: float
+    currents_A: tuple[float, ...]
+    """Of phases a to d; 0 of one that the machine does not have."""
+    rotor_angle_deg: float
+    self_test: tuple[str, ...]
+    """Checks of DRIVE_SELF_TEST that had failed."""
+    phases: str
+    """Letters of the phases of DRIVE_PHASE_FAULT."""
 
 
 class FaultLog(Sequence[LoggedFault]):
@@ -407,7 +415,7 @@ class FaultLog(Sequence[LoggedFault]):
 
     def read(self) -> list[LoggedFault]:
         """All of them. One that a fault pushes out meanwhile is left out."""
-        newest = _memory_item(self._session, "newest_fault")
+        newest = memory_item(self._session, "newest_fault")
         found = (self._read(number) for number in range(max(1, newest - LOGGED_FAULTS + 1), newest + 1))
         return [fault for fault in found if fault is not None]
 
@@ -432,7 +440,13 @@ class FaultLog(Sequence[LoggedFault]):
             number=number, start=items["start"], time_s=time_us / 1e6,
             fault=names.get(items["fault"], str(items["fault"])),
             checks=tuple(name for value, name in names.items() if value > 0 and items["checks"] >> value & 1),
-            state=states.get(items["state"], str(items["state"])), **physical)
+            state=states.get(items["state"], str(items["state"])),
+            currents_A=tuple(items[f"current_{phase}"] * float(snapshot.get_signal_by_name("current_max_A").scale)
+                             for phase in "abcd"),
+            rotor_angle_deg=items["angle"] * 360.0 / 65536.0,
+            self_test=tuple(signal.name for signal in drive_database().get_message_by_name("DRIVE_SELF_TEST").signals
+                            if items["self_test"] >> signal.start & 1),
+            phases="".join(phase for bit, phase in enumerate("abcd") if items["phases"] >> bit & 1), **physical)
 
 
 @dataclass(frozen=True)
@@ -529,7 +543,7 @@ def _access(session: Client, operation: str, index: int, part: int = 0, value: i
                      f"{_ATTEMPTS * _RESPONSE_TIMEOUT_S:g} s")
 
 
-def _memory_item(session: Client, name: str) -> int:
+def memory_item(session: Client, name: str) -> int:
     """An item of the state of the memory."""
     return _access(session, "memory", 0, _MEMORY_ITEMS.index(name))[1]
 

@@ -36,7 +36,7 @@ _START_S, _SETTLED_S, _BEFORE_S, _RECORD_US = 0.02, 0.12, 0.001, 5.0
 @dataclass(frozen=True)
 class FaultCase:
     """A fault as it is asked for. at_standstill: it begins before the start. rated_torque: attribute torque_Nm in
-    units of the machine's. unseen: why a drive may run on."""
+    units of the machine's. unseen: why a drive may run on. unsupported: why the host cannot have the fault."""
 
     name: str
     kind: str
@@ -45,6 +45,7 @@ class FaultCase:
     duration_s: float | None = None
     rated_torque: float | None = None
     unseen: str = ""
+    unsupported: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ class Reaction:
     peak: float
     travel_deg: float
 
+
+_PLAUSIBLE = "a reading in the range of the sensor is a temperature; the models of the currents remain"
 
 CASES = (
     FaultCase("open winding", "winding_open", {"phase": "b"}),
@@ -104,6 +107,24 @@ CASES = (
     FaultCase("supply surges by 50 %", "supply_surged", {"height_percent": 50.0}),
     FaultCase("triggers lost for 30 ms", "interrupt_lost", duration_s=0.03),
     FaultCase("background hung for 30 ms", "background_hung", duration_s=0.03),
+    FaultCase("temperature sensor of a winding open", "winding_temperature_sensor_open", {"phase": "b"}),
+    FaultCase("temperature sensor of a winding shorted", "winding_temperature_sensor_shorted", {"phase": "b"}),
+    FaultCase("temperature sensor of a winding stuck", "winding_temperature_sensor_stuck",
+              {"phase": "b", "code": 20480}, unseen=_PLAUSIBLE),
+    FaultCase("temperature sensor of a winding, -50 K", "winding_temperature_sensor_offset",
+              {"phase": "b", "offset_K": -50.0}, unseen=_PLAUSIBLE),
+    FaultCase("temperature sensor of switches open", "inverter_temperature_sensor_open", {"phase": "b"}),
+    FaultCase("temperature sensor of switches shorted", "inverter_temperature_sensor_shorted", {"phase": "b"}),
+    FaultCase("bit of the current trip flipped", "limit_flipped", {"bit": 12}),
+    FaultCase("bit of a constant flipped", "constant_flipped", {"bit": 3000}),
+    FaultCase("bit of the state flipped", "state_flipped", {"bit": 0}),
+    FaultCase("bit of the program flipped", "code_flipped", {"byte": 0},
+              unsupported="the program of the host is not that of the drive alone; tests/hil/test_self_test.py flips "
+                          "it on the Cortex-M4 and RV32"),
+    FaultCase("guard word of the stack changed", "stack_guard_flipped", {"bit": 0},
+              unsupported="the stack of the host is that of its operating system; as the program"),
+    FaultCase("bit of the timer's period flipped", "period_register_flipped", {"bit": 3}),
+    FaultCase("clock 6 % off", "clock_drift", {"drift_percent": 6.0}),
 )
 
 
@@ -154,9 +175,13 @@ def _time(time_s: float) -> str:
     return f"{time_s * 1e6:.0f} µs" if time_s < 9.995e-4 else f"{time_s * 1e3:.3g} ms"
 
 
+def measured_text(case: FaultCase, machine: str, controller: str) -> str:
+    """Runs one cell, if the host can have its fault."""
+    return "unsupported" if case.unsupported else text(case, measure(case, machine, controller))
+
+
 def _measure(cell: tuple[FaultCase, str, str]) -> str:
-    case, machine, controller = cell
-    return text(case, measure(case, machine, controller))
+    return measured_text(*cell)
 
 
 # --- The page ---
@@ -189,6 +214,8 @@ def page(cells_of: dict[tuple[str, str, str], str]) -> str:
                   for case in CASES]
     parts.append("\n## Why a drive may run on\n\n| fault | reason |\n| --- | --- |\n")
     parts += [f"| {case.name} | {case.unseen} |\n" for case in CASES if case.unseen]
+    parts.append("\n## What the host cannot have\n\n| fault | reason |\n| --- | --- |\n")
+    parts += [f"| {case.name} | {case.unsupported} |\n" for case in CASES if case.unsupported]
     return "".join(parts)
 
 

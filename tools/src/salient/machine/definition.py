@@ -34,6 +34,8 @@ class Machine:
     """Every key of Sensors."""
     iron_loss: dict[str, float] | None
     """Every key of IronLoss; None: no estimate."""
+    thermal: dict[str, float]
+    """The keys of the table [thermal] that the file has."""
     drive: dict[str, Any]
     """The keys of the table [drive] that the file has."""
     drive_parameters: dict[str, float]

@@ -89,6 +89,15 @@ class IronLoss(Table):
     steinmetz_beta: Annotated[float, number(1.5, 3.0)]
 
 
+class Thermal(Table):
+    """Heat path of one winding, and of the switches of one phase; what is left out is derived (heat.py)."""
+
+    winding_capacity_J_K: Annotated[float, number(1e-3, 1e7)] | None = None
+    winding_resistance_K_W: Annotated[float, number(1e-5, 1e5)] | None = None
+    inverter_capacity_J_K: Annotated[float, number(1e-3, 1e7)] | None = None
+    inverter_resistance_K_W: Annotated[float, number(1e-5, 1e5)] | None = None
+
+
 class Drive(Table):
     """What is left out is derived (drive_data.py)."""
 
@@ -138,6 +147,7 @@ class MachineFile(Table):
     dc_link: DcLink | None = None
     sensors: Sensors = Sensors()
     iron_loss: IronLoss | None = None
+    thermal: Thermal = Thermal()
     drive: Drive = Drive()
 
 
@@ -177,6 +187,7 @@ def _machine(file: MachineFile, poles: tuple[int, int, int], magnetics: Formula 
         dc_link=None if file.dc_link is None else file.dc_link.model_dump(exclude_none=True),
         sensors=file.sensors.model_dump(),
         iron_loss=None if file.iron_loss is None else file.iron_loss.model_dump(),
+        thermal=file.thermal.model_dump(exclude_none=True),
         drive=file.drive.model_dump(exclude_none=True, exclude={"parameters"}),
         drive_parameters=_parameters(file.drive.parameters),
     )

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from salient.dbc import database_hash
-from salient.machine.file import FORMS, Converter, DcLink, Machine, Sensors, load_machine
+from salient.machine.file import FORMS, Converter, DcLink, Machine, Sensors, Thermal, load_machine
 from salient.machine.firmware_tables import (
     ANGLE_BINS,
     CURRENT_A,
@@ -30,6 +30,7 @@ from salient.machine.firmware_tables import (
     machine_phase_map,
 )
 from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS, FluxMap
+from salient.machine.heat import thermal_constants
 from salient.machine.magnetics import FORMULA_KEYS
 from salient.machine.scaling import Scaling, database_of, scaling_of
 from salient.machine.single_pulse import POINTS, PulseTables, pulse_tables
@@ -215,6 +216,8 @@ PLANT = Structure("machine_t", (
     *_doubles("sensors", Sensors.model_fields, lambda machine, scaling: machine.sensors),
     *_doubles("ranges", ("current_A", "dc_link_V", "load_torque_Nm"),
               lambda machine, scaling: scaling.sensor_ranges()),
+    *_doubles("thermal", Thermal.model_fields, lambda machine, scaling: thermal_constants(
+        machine, scaling.data.parameters, scaling.data.supply_max_V)),
     Member("trip_current_A", "double", lambda machine, scaling: scaling.data.comparator_trip_A),
 ))  # fmt: skip
 """Of a Machine and its Scaling: emulator/plant/machine.h, without the name and the flux map, parts of their own."""

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 from salient.paths import PARAMETERS
 
-SAME_UNITS = ("", "1/s", "s", "ms", "deg", "rad/s")
+SAME_UNITS = ("", "1/s", "s", "ms", "deg", "rad/s", "C")
 """Units of the parameters whose range and resolution are the same for every machine."""
 
 _CONSTANTS = {"INT32_MAX": 2**31 - 1}

@@ -1,0 +1,88 @@
+#include "rig/heat.h"
+
+#include <math.h>
+#include <string.h>
+
+#include "rig_codec.h"
+
+#define AMBIENT_C 25.0
+#define STEP_NS UINT64_C(1000000)
+#define S_PER_NS 1e-9
+#define CODES 65536.0
+#define CODE_12_BITS 0xFFF0u
+
+static double free_C(void) {
+    return rig_set_held_winding_c_decode(RIG_SET_HELD_WINDING_C_FREE_CHOICE);
+}
+
+static uint16_t code_of(const sensors_input_fault_t *fault, double temperature_C) {
+    const double read_C = temperature_C + (fault->scaled ? fault->offset : 0.0);
+    const double code = (read_C - HAL_ADC_TEMPERATURE_ZERO_C) / HAL_ADC_TEMPERATURE_SPAN_K * CODES;
+    const double converted = fault->held ? (double)fault->code : code;
+    return (uint16_t)fmin(fmax(converted, 0.0), CODES - 1.0) & CODE_12_BITS;
+}
+
+static void convert(rig_t *rig) {
+    const heat_t *heat = &rig->heat;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        rig->board.temperature_code[HAL_ADC_WINDING + phase] =
+            code_of(&heat->winding.sensor_fault[phase], heat->winding.temperature_C[phase]);
+        rig->board.temperature_code[HAL_ADC_INVERTER + phase] =
+            code_of(&heat->inverter.sensor_fault[phase], heat->inverter.temperature_C[phase]);
+    }
+}
+
+void heat_init(rig_t *rig) {
+    memset(&rig->heat, 0, sizeof rig->heat);
+    rig->heat.ambient_C = AMBIENT_C;
+    rig->heat.winding.held_C = rig->heat.inverter.held_C = free_C();
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        rig->heat.winding.temperature_C[phase] = rig->heat.inverter.temperature_C[phase] = AMBIENT_C;
+    }
+    convert(rig);
+}
+
+/* loss_J: since the plant's begin, per phase. */
+static void step(heat_bodies_t *bodies, const double *loss_J, double capacity_J_K, double resistance_K_W,
+                 double ambient_C, double step_s) {
+    const bool held = bodies->held_C != free_C();
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        double *temperature_C = &bodies->temperature_C[phase];
+        const double gained_J = loss_J[phase] - bodies->loss_J[phase];
+        const double lost_J = (*temperature_C - ambient_C) * fmin(step_s / resistance_K_W, capacity_J_K);
+        *temperature_C = held ? bodies->held_C : *temperature_C + (gained_J - lost_J) / capacity_J_K;
+        bodies->loss_J[phase] = loss_J[phase];
+    }
+}
+
+void heat_step(rig_t *rig) {
+    heat_t *heat = &rig->heat;
+    const plant_t *plant = &rig->plant;
+    if (plant->time_ns - heat->time_ns < STEP_NS) {
+        return;
+    }
+    const double step_s = (double)(plant->time_ns - heat->time_ns) * S_PER_NS;
+    const thermal_data_t *data = &plant->machine->thermal;
+    step(&heat->winding, plant->phase_copper_J, data->winding_capacity_J_K, data->winding_resistance_K_W,
+         heat->ambient_C, step_s);
+    step(&heat->inverter, plant->phase_converter_J, data->inverter_capacity_J_K, data->inverter_resistance_K_W,
+         heat->ambient_C, step_s);
+    heat->time_ns = plant->time_ns;
+    convert(rig);
+}
+
+static double hottest_C(const rig_t *rig, const heat_bodies_t *bodies) {
+    double hottest_C = bodies->temperature_C[0];
+    for (unsigned phase = 1; phase < rig->plant.machine->phases; phase++) {
+        hottest_C = fmax(hottest_C, bodies->temperature_C[phase]);
+    }
+    return hottest_C;
+}
+
+double heat_winding_C(const rig_t *rig) {
+    return hottest_C(rig, &rig->heat.winding);
+}
+
+double heat_inverter_C(const rig_t *rig) {
+    return hottest_C(rig, &rig->heat.inverter);
+}
