@@ -64,6 +64,28 @@ static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input,
     return encoder;
 }
 
+/* Of the same sample: phases that conduct above the currents whose errors are those of the converter. */
+static phase_balance_sample_t balance_sample(const drive_t *drive, const encoder_monitor_input_t *encoder,
+                                             uint32_t elapsed, uint32_t step) {
+    const uint32_t recent = 10u * drive->control_parameters.initialise_ticks;
+    const bool learned = drive->control_parameters.torque_law == TORQUE_LAW_PREDICTIVE;
+    phase_balance_sample_t sample = {
+        .run = encoder->run,
+        .phases = machine_tables.phases,
+        .least_q8 = learned ? PHASE_BALANCE_LEAST_LEARNED_Q8 : PHASE_BALANCE_LEAST_Q8,
+        .elapsed = elapsed,
+        .periods_per_ms = drive->control_parameters.initialise_ticks,
+        .step = step,
+    };
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+        sample.flux_q29[phase] = encoder->flux_q29[phase];
+        sample.table_q29[phase] = drive->phases.phase[phase].table_q29;
+        sample.known[phase] = encoder->known[phase] && encoder->period - encoder->zero_at[phase] < recent &&
+                              encoder->current_q9[phase] > machine_tables.current_range_q9 / 32;
+    }
+    return sample;
+}
+
 /* Checks phases and encoder, and corrects the integrals. */
 COLD static uint32_t check_phases_and_encoder(drive_t *drive) {
     control_state_t *control = &drive->control;
@@ -74,7 +96,12 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive) {
     const encoder_monitor_input_t encoder = encoder_input(&input, &drive->phases, encoder_angle);
     encoder_monitor_step(&drive->control_parameters.encoder_monitor, &drive->encoder, &encoder);
     int32_t correction_q29[HAL_PHASES_MAX];
-    const uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, &input, correction_q29);
+    const uint32_t elapsed = input.periods - drive->phases.periods;
+    const uint32_t step = (uint32_t)fixed_abs((int32_t)(input.electrical - drive->phases.electrical));
+    uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, &input, correction_q29);
+    const phase_balance_sample_t sample = balance_sample(drive, &encoder, elapsed, step);
+    failed |= phase_balance_step(&drive->balance, &sample);
+    drive->phases.phases |= drive->balance.phases;
     hal_critical_enter(drive->hal);
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         int32_t *next_q29 = &control->applied_flux.next_q29[phase];

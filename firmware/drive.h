@@ -12,6 +12,7 @@
 #include "drive/fault_trace.h"
 #include "drive/nvm_store.h"
 #include "drive/parameters.h"
+#include "drive/phase_balance.h"
 #include "drive/phase_monitor.h"
 #include "drive/stall_monitor.h"
 #include "drive/sto_monitor.h"
@@ -51,6 +52,7 @@ typedef struct {
     sto_monitor_t sto;
     stall_monitor_t stall;
     phase_monitor_t phases;
+    phase_balance_t balance;
     encoder_monitor_t encoder;
     thermal_parameters_t thermal_parameters;
     thermal_t thermal;

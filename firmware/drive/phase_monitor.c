@@ -26,6 +26,11 @@
  * once when not even the last bit changes, and when it ends after 1/2 ms. */
 #define STILL_MS 8u
 
+#define TAKEN_MS 50u
+
+/* Time for which a current that has ended too soon may explain one that is read in another phase. */
+#define VANISHED_MS 2u
+
 /* What all phases have in common. */
 typedef struct {
     const machine_tables_t *tables;
@@ -130,6 +135,32 @@ static bool at_rest(const common_t *common, phase_monitor_phase_t *state, unsign
     return true;
 }
 
+/* True when the opposite voltage has removed a quarter of the flux linkage since the switches opened, and the tables
+ * saw less than a quarter of that part disappear. Parts, because at a wrong angle the tables err by a factor; of a flux
+ * linkage from which that may have taken away something. */
+static bool does_not_fall(const common_t *common, phase_monitor_phase_t *state, unsigned phase) {
+    const int32_t flux_q29 = common->input->flux_q29[phase];
+    if (!common->input->off[phase] || !state->was_off || common->lost) {
+        state->off_flux_q29 = flux_q29;
+        state->off_all_q29 = fixed_add(flux_q29, fixed_clamp(-state->followed_q29, 0, INT32_MAX));
+        state->off_table_q29 = state->table_q29;
+    }
+    state->was_off = common->input->off[phase];
+    const int32_t removed_q29 = fixed_subtract(fixed_subtract(state->off_flux_q29, flux_q29), 2 * common->delay_q29);
+    const int32_t fallen_q29 = fixed_subtract(state->off_table_q29, state->table_q29);
+    return common->input->current_q9[phase] > SMALL_CURRENT * common->offset_q9 &&
+           removed_q29 > state->off_all_q29 / 4 &&
+           fixed_product(fallen_q29, state->off_all_q29) < fixed_product(removed_q29, state->off_table_q29) / 4;
+}
+
+/* True when the integral has gone only because the tables have taken most of it away: by voltage and time alone the
+ * current may flow, and it is the angle of the tables that is wrong. Over a longer time drops of the devices and the
+ * resistance add up to as much. */
+static bool taken_away(const common_t *common, const phase_monitor_phase_t *state) {
+    return state->followed_q29 < -(state->peak_q29 / 2) &&
+           common->input->periods - state->zero_at < TAKEN_MS * common->input->periods_per_ms;
+}
+
 /* A current that should not be: does it move? */
 static uint32_t check_excess(const common_t *common, phase_monitor_phase_t *state, unsigned phase, bool excess) {
     const int32_t current_q9 = common->input->current_q9[phase];
@@ -149,7 +180,7 @@ static uint32_t check_excess(const common_t *common, phase_monitor_phase_t *stat
         return 0;
     }
     if (moved_q9 > common->offset_q9) {
-        return (uint32_t)FAULT_BIT(FAULT_PHASE_SHORTED);
+        return (uint32_t)(taken_away(common, state) ? FAULT_BIT(FAULT_ENCODER_ANGLE) : FAULT_BIT(FAULT_PHASE_SHORTED));
     }
     const bool still = moved_q9 == 0 || state->excess_periods > STILL_MS * common->input->periods_per_ms;
     return still ? (uint32_t)FAULT_BIT(FAULT_CURRENT_SENSOR) : 0;
@@ -158,6 +189,10 @@ static uint32_t check_excess(const common_t *common, phase_monitor_phase_t *stat
 static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, unsigned phase) {
     phase_monitor_phase_t *state = &monitor->phase[phase];
     const bool rest = at_rest(common, state, phase);
+    const int32_t current_q9 = common->input->current_q9[phase];
+    state->table_q29 =
+        current_q9 > 0 ? phase_map_flux_q29(common->tables, distance_of(common->input, phase), current_q9) : 0;
+    const bool remains = does_not_fall(common, state, phase);
     int side = 0;
     difference_t difference = AGREES;
     if (common->input->run && !common->lost) {
@@ -172,7 +207,7 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     }
     state->open_samples =
         beyond && side > 0 ? (uint8_t)(state->open_samples + (state->open_samples < OPEN_SAMPLES)) : 0;
-    uint32_t failed = check_excess(common, state, phase, rest || (beyond && side < 0));
+    uint32_t failed = check_excess(common, state, phase, rest || remains || (beyond && side < 0));
     if (state->open_samples >= OPEN_SAMPLES) {
         failed |= (uint32_t)FAULT_BIT(FAULT_PHASE_OPEN);
     }
@@ -200,12 +235,35 @@ static uint32_t judge_doubts(phase_monitor_t *monitor, uint32_t step) {
     return (uint32_t)(monitor->doubted_side > 0 ? FAULT_BIT(FAULT_PHASE_OPEN) : FAULT_BIT(FAULT_PHASE_SHORTED));
 }
 
+/* Bit of each phase whose current is missing, judged less strictly than a fault, of which it only decides the name: it
+ * is less than at the measured angle, or none while there is voltage, or ended within the last milliseconds before the
+ * voltage had removed it. */
+static uint32_t phases_that_lack(const common_t *common, const phase_monitor_t *monitor) {
+    const phase_monitor_input_t *input = common->input;
+    uint32_t lacking = 0;
+    for (unsigned phase = 0; phase < common->tables->phases; phase++) {
+        const phase_monitor_phase_t *state = &monitor->phase[phase];
+        const bool vanished =
+            state->vanished && input->periods - state->vanished_at < VANISHED_MS * input->periods_per_ms;
+        const int32_t table_q29 = fixed_add(state->table_q29, state->table_q29 / 4);
+        const bool less = fixed_subtract(input->flux_q29[phase], slack_q29(common, state, phase)) > table_q29;
+        const bool none = !input->off[phase] && input->current_q9[phase] <= common->offset_q9 &&
+                          input->flux_q29[phase] > common->delay_q29 / 2;
+        lacking |= (uint32_t)(vanished || less || none) << phase;
+    }
+    return lacking;
+}
+
 /* What brings the integral nearer to the tables. */
 static int32_t correction_of(const common_t *common, phase_monitor_phase_t *state, unsigned phase) {
     const phase_monitor_input_t *input = common->input;
     const int32_t current_q9 = input->current_q9[phase];
     const int32_t flux_q29 = input->flux_q29[phase];
     if (input->off[phase] && current_q9 <= common->offset_q9) {
+        if (flux_q29 > fixed_add(state->peak_q29 / 8, 2 * common->delay_q29)) {
+            state->vanished = true;
+            state->vanished_at = input->periods;
+        }
         state->zero_at = input->periods;
         state->followed_q29 = 0;
         return -flux_q29;
@@ -214,7 +272,7 @@ static int32_t correction_of(const common_t *common, phase_monitor_phase_t *stat
         state->followed_q29 = fixed_subtract(state->followed_q29, flux_q29);
         return -flux_q29;
     }
-    const int32_t error_q29 = phase_map_flux_q29(common->tables, distance_of(input, phase), current_q9) - flux_q29;
+    const int32_t error_q29 = state->table_q29 - flux_q29;
     const uint32_t follow = FOLLOW_MS * input->periods_per_ms;
     const bool set = common->lost || common->elapsed >= follow;
     const int32_t correction_q29 = set ? error_q29 : error_q29 / (int32_t)follow * (int32_t)common->elapsed;
@@ -268,9 +326,11 @@ COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_
         failed |= judge_doubts(monitor, common.step);
     }
     /* The current that one phase lacks is read in another. */
-    if ((failed & (uint32_t)FAULT_BIT(FAULT_PHASE_OPEN)) != 0 && in_excess != 0) {
+    const uint32_t lacking = failed != 0 && input->run ? phases_that_lack(&common, monitor) : 0;
+    if (((failed & (uint32_t)FAULT_BIT(FAULT_PHASE_OPEN)) != 0 && in_excess != 0) ||
+        ((failed & (uint32_t)FAULT_BIT(FAULT_PHASE_SHORTED)) != 0 && (lacking & ~in_excess) != 0)) {
         failed = (uint32_t)FAULT_BIT(FAULT_CURRENT_SENSOR);
-        monitor->phases |= in_excess;
+        monitor->phases |= in_excess | ((lacking & (lacking - 1u)) == 0 ? lacking : 0);
     }
     monitor->failed = input->run ? monitor->failed | failed : failed;
     return monitor->failed;

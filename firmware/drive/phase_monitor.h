@@ -62,6 +62,13 @@ typedef struct {
     uint8_t open_samples;      /* in succession with less current than at any angle */
     uint32_t zero_at;          /* period in which the phase was last without current */
     int32_t followed_q29;      /* sum of the corrections since, Wb, Q2.29 */
+    int32_t table_q29;         /* flux linkage by the tables at the last input, Wb, Q2.29; 0 without current */
+    int32_t off_flux_q29;      /* flux linkage by the voltage when the switches opened, Wb, Q2.29 */
+    int32_t off_all_q29;       /* the same with what the tables had taken away from it */
+    int32_t off_table_q29;     /* by the tables */
+    bool was_off;              /* in the last input */
+    bool vanished;             /* a current ended before the voltage had removed it, last in the period */
+    uint32_t vanished_at;
 } phase_monitor_phase_t;
 
 typedef struct {
