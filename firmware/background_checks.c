@@ -114,8 +114,29 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive) {
 /* Each current is one word: a control interrupt in between changes none while it is read. */
 COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
     if (thermal_sample(&drive->thermal_parameters, &drive->thermal, drive->control.measurement.current_q9, time_us)) {
-        drive->control.torque_limit_q24 = thermal_torque_limit_q24(&drive->thermal_parameters, &drive->thermal);
+        const int32_t thermal_q24 = thermal_torque_limit_q24(&drive->thermal_parameters, &drive->thermal);
+        const int32_t degraded_q24 = degraded_torque_limit_q24(&drive->degraded);
+        drive->control.torque_limit_q24 = thermal_q24 < degraded_q24 ? thermal_q24 : degraded_q24;
     }
+}
+
+/* With one phase lost the drive may go on: then what has failed is no fault any more. Until the fault is cleared
+ * outside a run. */
+COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
+    const degraded_parameters_t *parameters = &drive->control_parameters.degraded;
+    const bool run = drive->control.state_machine.state == DRIVE_STATE_RUN;
+    if (degraded_accepts(parameters, &drive->degraded, run, failed, drive->phases.phases)) {
+        drive->control.lost_phases = drive->degraded.lost;
+        phase_monitor_lose(&drive->phases, drive->degraded.lost);
+        drive->balance = (phase_balance_t){0};
+        failed = 0;
+    } else if (!run && drive->degraded.lost != 0 && drive->command.request == COMMAND_CLEAR_FAULT) {
+        drive->degraded.lost = 0;
+        drive->control.lost_phases = 0;
+        phase_monitor_lose(&drive->phases, 0);
+    }
+    degraded_step(parameters, &drive->degraded, &machine_tables);
+    return failed;
 }
 
 COLD void background_checks(drive_t *drive, uint32_t time_us) {
@@ -123,7 +144,7 @@ COLD void background_checks(drive_t *drive, uint32_t time_us) {
     hal_critical_enter(drive->hal);
     const stall_input_t stall = stall_input(drive);
     hal_critical_leave(drive->hal);
-    uint64_t failed = check_phases_and_encoder(drive);
+    uint64_t failed = follow_lost_phase(drive, check_phases_and_encoder(drive));
     if (sto_monitor_failed(&drive->sto, drive->break_causes, time_us)) {
         failed |= FAULT_BIT(FAULT_STO_DISCREPANCY);
     }

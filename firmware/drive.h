@@ -53,6 +53,7 @@ typedef struct {
     stall_monitor_t stall;
     phase_monitor_t phases;
     phase_balance_t balance;
+    degraded_t degraded;
     encoder_monitor_t encoder;
     thermal_parameters_t thermal_parameters;
     thermal_t thermal;

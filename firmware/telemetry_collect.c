@@ -32,6 +32,22 @@ static int32_t misalignment(const drive_t *drive) {
     return (int32_t)sum / (phases * machine_tables.rotor_poles);
 }
 
+/* The torque at the present angle only while it is of interest: it takes a look at the tables for each phase. */
+static void collect_degraded(const drive_t *drive, drive_telemetry_t *telemetry) {
+    const degraded_t *state = &drive->degraded;
+    const bool lost = state->lost != 0;
+    const uint32_t electrical = drive->control.measurement.commutation.electrical;
+    telemetry->degraded.degraded = lost;
+    telemetry->degraded.lost_phase_a = state->lost & 1u;
+    telemetry->degraded.lost_phase_b = state->lost >> 1 & 1u;
+    telemetry->degraded.lost_phase_c = state->lost >> 2 & 1u;
+    telemetry->degraded.lost_phase_d = state->lost >> 3 & 1u;
+    telemetry->degraded.torque_mean_nm = units_torque_q8(lost ? state->mean_q24 : 0);
+    telemetry->degraded.torque_least_nm = units_torque_q8(lost && state->mean_q24 != 0 ? state->least_q24 : 0);
+    telemetry->degraded.torque_here_nm = units_torque_q8(
+        lost ? degraded_torque_q24(&drive->control_parameters.degraded, state, &machine_tables, electrical) : 0);
+}
+
 void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const control_state_t *control = &drive->control;
@@ -126,6 +142,8 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->thermal.winding_load = percent(thermal_winding_load_q16(&drive->thermal));
     telemetry->thermal.switch_load = percent(thermal_switch_load_q16(&drive->thermal));
     telemetry->thermal.torque_limit_nm = units_torque_q8(control->torque_limit_q24);
+
+    collect_degraded(drive, telemetry);
 
     telemetry->gates = drive->break_causes; /* the DBC has the bits of HAL_PWM_BREAK_* */
 

@@ -195,7 +195,8 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     const bool remains = does_not_fall(common, state, phase);
     int side = 0;
     difference_t difference = AGREES;
-    if (common->input->run && !common->lost) {
+    const bool off = (monitor->lost >> phase & 1u) != 0;
+    if (common->input->run && !common->lost && !off) {
         difference = compare(common, state, phase, &side);
     }
     const bool beyond = difference == BEYOND_ANGLES;
@@ -293,6 +294,17 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
         .offset_q9 = tables->current_range_q9 / 128,
         .delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)input->periods_per_ms),
     };
+}
+
+void phase_monitor_lose(phase_monitor_t *monitor, uint32_t phases) {
+    monitor->lost = phases;
+    monitor->failed = 0;
+    monitor->doubted = 0;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        monitor->phase[phase].excess_periods = 0;
+        monitor->phase[phase].open_samples = 0;
+        monitor->phase[phase].turned = 0;
+    }
 }
 
 COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_t *tables,

@@ -82,6 +82,7 @@ typedef struct {
     uint32_t doubted;      /* bit of each phase with a difference that an angle may explain */
     int doubted_side;      /* of the last one */
     uint32_t doubt_turned; /* rotation since the first one, 2^-32 electrical rev */
+    uint32_t lost;         /* bit of each phase that stays off, phase_monitor_lose() */
     phase_monitor_phase_t phase[HAL_PHASES_MAX];
 } phase_monitor_t;
 
@@ -89,5 +90,10 @@ typedef struct {
  * each phase's integral. [background] */
 uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_t *tables,
                             const phase_monitor_input_t *input, int32_t correction_q29[HAL_PHASES_MAX]);
+
+/* Forgets the failed checks of a run that goes on without these phases, a bit each: their switches stay open, and only
+ * a current in them fails from now on, sooner or later than by the voltage of a quarter of their flux linkage. 0: none
+ * are lost. [background] */
+void phase_monitor_lose(phase_monitor_t *monitor, uint32_t phases);
 
 #endif
