@@ -94,11 +94,11 @@ typedef struct {
 typedef struct {
     double voltage_V; /* supply_voltage_V */
     double factor;    /* of a fault */
-    double ripple_V;
+    double ripple_V, ripple_Hz;
     uint64_t ripple_start_ns;
 } supply_t;
 
-#define RIG_FAULT_KINDS_MAX 64
+#define RIG_FAULT_KINDS_MAX 65
 
 /* A fault of one kind at one place. */
 typedef struct {
@@ -129,7 +129,8 @@ typedef struct rig {
     bool shaft_locked;
     stimulus_queue_t fault_changes;                                  /* faults.c */
     fault_presence_t faults[RIG_FAULT_KINDS_MAX][HAL_PHASES_MAX][2]; /* by kind, phase and leg */
-    bool interrupts_lost, background_hung;                           /* control_period.c */
+    bool interrupts_lost, background_hung;                           /* control_period.c; so is the next */
+    uint64_t interrupt_late_ns;                                      /* least time of the control interrupt */
     rig_run_t runs[RIG_RUNS_MAX]; /* server.c, by time, equal times in the order of arrival */
     unsigned run_count;
     uint64_t stop_checked_ns;
