@@ -6,12 +6,16 @@
  *                   (i - offset) / 1.1, or a current in a phase which the voltage has left without flux linkage
  *   current_sensor  such a current that does not move, offset included; or one that is read in another phase than in
  *                   the one that lacks it
+ *   encoder_angle   a current that is only too large because the tables, at a wrong angle, have emptied the integral
  *
  * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical; resistance 50 % and
  * voltage 1/64 since the phase was at rest, at most over 10 ms; a quarter of psi that has been removed since; and psi
  * of a period and 20 us at the DC-link voltage, for the delays of sensor and switches. At a current of up to 4/128 of
  * its range, phase_open counts only what more than 1/32 of the DC-link voltage has built up since the current was
  * larger.
+ *
+ * A current also is one that should not be when both switches are open and the voltage has removed a quarter of psi of
+ * which the tables saw less than a quarter disappear: freewheeling by a shorted switch.
  *
  * An error of the angle explains any psi between those of the unaligned and of the aligned position. Beyond these a
  * difference is phase_open in its second sample, or an excess of current. Between them it counts once the rotor has
@@ -91,9 +95,9 @@ typedef struct {
 uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_t *tables,
                             const phase_monitor_input_t *input, int32_t correction_q29[HAL_PHASES_MAX]);
 
-/* Forgets the failed checks of a run that goes on without these phases, a bit each: their switches stay open, and only
- * a current in them fails from now on, sooner or later than by the voltage of a quarter of their flux linkage. 0: none
- * are lost. [background] */
+/* Forgets the failed checks of a run that goes on without these phases, a bit each: their switches stay open, and from
+ * now on only a current in them fails, once the voltage has removed their flux linkage. 0: none are lost.
+ * [background] */
 void phase_monitor_lose(phase_monitor_t *monitor, uint32_t phases);
 
 #endif
