@@ -77,13 +77,40 @@ COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *i
     return encoder;
 }
 
+/* Of the same sample: phases that conduct above the currents whose errors are those of the converter. */
+static phase_balance_sample_t balance_sample(const drive_t *drive, const encoder_monitor_input_t *encoder,
+                                             uint32_t elapsed, uint32_t step) {
+    const uint32_t recent = 10u * drive->control_parameters.initialise_ticks;
+    const bool learned = drive->control_parameters.torque_law == TORQUE_LAW_PREDICTIVE;
+    phase_balance_sample_t sample = {
+        .run = encoder->run,
+        .phases = machine_tables.phases,
+        .least_q8 = learned ? PHASE_BALANCE_LEAST_LEARNED_Q8 : PHASE_BALANCE_LEAST_Q8,
+        .elapsed = elapsed,
+        .periods_per_ms = drive->control_parameters.initialise_ticks,
+        .step = step,
+    };
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+        sample.flux_q29[phase] = encoder->flux_q29[phase];
+        sample.table_q29[phase] = drive->phases.phase[phase].table_q29;
+        sample.known[phase] = encoder->known[phase] && encoder->period - encoder->zero_at[phase] < recent &&
+                              encoder->current_q9[phase] > machine_tables.current_range_q9 / 32;
+    }
+    return sample;
+}
+
 /* Checks phases and encoder, and corrects the integrals. */
 COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sample) {
     const phase_monitor_input_t *input = &sample->phases;
     const encoder_monitor_input_t encoder = encoder_input(input, &drive->phases, sample->encoder_angle);
     encoder_monitor_step(&drive->control_parameters.encoder_monitor, &drive->encoder, &encoder);
     int32_t correction_q29[HAL_PHASES_MAX];
-    const uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, input, correction_q29);
+    const uint32_t elapsed = input->periods - drive->phases.periods;
+    const uint32_t step = (uint32_t)fixed_abs((int32_t)(input->electrical - drive->phases.electrical));
+    uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, input, correction_q29);
+    const phase_balance_sample_t balance = balance_sample(drive, &encoder, elapsed, step);
+    failed |= phase_balance_step(&drive->balance, &balance);
+    drive->phases.phases |= drive->balance.phases;
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         int32_t *next_q29 = &drive->control.applied_flux.next_q29[phase];
         hal_critical_enter(drive->hal);
@@ -98,7 +125,9 @@ COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
     const temperature_t *temperature = &drive->temperature;
     temperature_step(&drive->temperature_parameters, &drive->temperature, drive->hal, machine_tables.phases, time_us);
     if (thermal_sample(&drive->thermal_parameters, &drive->thermal, drive->control.measurement.current_q9, time_us)) {
-        const int32_t limit_q24 = thermal_torque_limit_q24(&drive->thermal_parameters, &drive->thermal);
+        const int32_t thermal_q24 = thermal_torque_limit_q24(&drive->thermal_parameters, &drive->thermal);
+        const int32_t degraded_q24 = degraded_torque_limit_q24(&drive->degraded);
+        const int32_t limit_q24 = thermal_q24 < degraded_q24 ? thermal_q24 : degraded_q24;
         drive->control.torque_limit_q24 =
             limit_q24 < temperature->torque_limit_q24 ? limit_q24 : temperature->torque_limit_q24;
     }
@@ -118,6 +147,25 @@ COLD static void test_itself(drive_t *drive, uint32_t time_us) {
     hal_critical_leave(drive->hal);
 }
 
+/* With one phase lost the drive may go on: then what has failed is no fault any more. Until the fault is cleared
+ * outside a run. */
+COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
+    const degraded_parameters_t *parameters = &drive->control_parameters.degraded;
+    const bool run = drive->control.state_machine.state == DRIVE_STATE_RUN;
+    if (degraded_accepts(parameters, &drive->degraded, run, failed, drive->phases.phases)) {
+        drive->control.lost_phases = drive->degraded.lost;
+        phase_monitor_lose(&drive->phases, drive->degraded.lost);
+        drive->balance = (phase_balance_t){0};
+        failed = 0;
+    } else if (!run && drive->degraded.lost != 0 && drive->command.request == COMMAND_CLEAR_FAULT) {
+        drive->degraded.lost = 0;
+        drive->control.lost_phases = 0;
+        phase_monitor_lose(&drive->phases, 0);
+    }
+    degraded_step(parameters, &drive->degraded, &machine_tables);
+    return failed;
+}
+
 /* Checks phases, encoder, stall and STO lines, unless the sample cannot be read. */
 COLD static void check(drive_t *drive, uint32_t time_us) {
     const control_parameters_t *parameters = &drive->control_parameters;
@@ -127,7 +175,7 @@ COLD static void check(drive_t *drive, uint32_t time_us) {
     if (!read_sample(&drive->control, parameters, &sample)) {
         return;
     }
-    uint32_t failed = check_phases_and_encoder(drive, &sample);
+    uint32_t failed = follow_lost_phase(drive, check_phases_and_encoder(drive, &sample));
     if (stall_monitor_failed(&drive->stall, &sample.stall, time_us)) {
         failed |= (uint32_t)FAULT_BIT(FAULT_STALL);
     }

@@ -12,6 +12,7 @@
 #include "drive/fault_trace.h"
 #include "drive/nvm_store.h"
 #include "drive/parameters.h"
+#include "drive/phase_balance.h"
 #include "drive/phase_monitor.h"
 #include "drive/self_test.h"
 #include "drive/stall_monitor.h"
@@ -54,6 +55,8 @@ typedef struct {
     sto_monitor_t sto;
     stall_monitor_t stall;
     phase_monitor_t phases;
+    phase_balance_t balance;
+    degraded_t degraded;
     encoder_monitor_t encoder;
     thermal_parameters_t thermal_parameters;
     thermal_t thermal;

@@ -36,6 +36,22 @@ uint16_t telemetry_self_test(const drive_t *drive) {
     return (uint16_t)(drive->temperature.failed_sensors | drive->self_test.failed << SELF_TEST_TELEMETRY_BIT);
 }
 
+/* The torque at the present angle only while it is of interest: it takes a look at the tables for each phase. */
+static void collect_degraded(const drive_t *drive, drive_telemetry_t *telemetry) {
+    const degraded_t *state = &drive->degraded;
+    const bool lost = state->lost != 0;
+    const uint32_t electrical = drive->control.measurement.commutation.electrical;
+    telemetry->degraded.degraded = lost;
+    telemetry->degraded.lost_phase_a = state->lost & 1u;
+    telemetry->degraded.lost_phase_b = state->lost >> 1 & 1u;
+    telemetry->degraded.lost_phase_c = state->lost >> 2 & 1u;
+    telemetry->degraded.lost_phase_d = state->lost >> 3 & 1u;
+    telemetry->degraded.torque_mean_nm = units_torque_q8(lost ? state->mean_q24 : 0);
+    telemetry->degraded.torque_least_nm = units_torque_q8(lost && state->mean_q24 != 0 ? state->least_q24 : 0);
+    telemetry->degraded.torque_here_nm = units_torque_q8(
+        lost ? degraded_torque_q24(&drive->control_parameters.degraded, state, &machine_tables, electrical) : 0);
+}
+
 void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const control_state_t *control = &drive->control;
@@ -135,6 +151,8 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->thermal.inverter_temperature_c =
         (uint32_t)fixed_non_negative(temperature_C(&drive->temperature, TEMPERATURE_INVERTER));
     telemetry->self_test = telemetry_self_test(drive);
+
+    collect_degraded(drive, telemetry);
 
     telemetry->gates = drive->break_causes; /* the DBC has the bits of HAL_PWM_BREAK_* */
 

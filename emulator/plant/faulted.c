@@ -44,10 +44,14 @@ static plant_path_t conducting_path(const plant_t *plant, unsigned phase) {
     const plant_faults_t *faults = &plant->faults;
     const unsigned upper = (plant->switches.upper & ~faults->switch_open.upper) | faults->switch_shorted.upper;
     const unsigned lower = (plant->switches.lower & ~faults->switch_open.lower) | faults->switch_shorted.lower;
-    const end_t ends[2] = {
+    end_t ends[2] = {
         end_of(plant, bit(upper, phase), bit(faults->diode_open.lower, phase)),
         end_of(plant, bit(lower, phase), bit(faults->diode_open.upper, phase)),
     };
+    const double earth_ohm = faults->earth_ohm[phase];
+    if (earth_ohm > 0.0 && !bit(lower, phase)) {
+        ends[1] = (end_t){true, 0.0, earth_ohm, 0.0};
+    }
     const double shorted = faults->shorted_turns[phase], winding_ohm = plant->winding_ohm;
     plant_path_t path = {
         .sign = (double)ends[0].rail + (double)ends[1].rail - 1.0,

@@ -4,6 +4,9 @@
  * an end of the winding. Where neither switch nor diode can, the opening switch does in avalanche, with a drop of
  * FAULTED_BREAKDOWN supply voltages.
  *
+ * Winding to earth: the negative rail is earthed, too, so that a current of the lower end flows there while the lower
+ * switch is off; a switch that is on carries all of it.
+ *
  * Open winding: the break is an arc of constant voltage, FAULTED_BREAKDOWN supply voltages, until the current has
  * ended.
  *

@@ -116,7 +116,7 @@ void plant_set_faults(plant_t *plant, const plant_faults_t *faults) {
                  faults->switch_shorted.upper + faults->switch_shorted.lower + faults->diode_open.upper +
                  faults->diode_open.lower + faults->chopper_open + faults->coulomb_Nm + faults->static_Nm;
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        sum += faults->shorted_turns[phase];
+        sum += faults->shorted_turns[phase] + faults->earth_ohm[phase];
     }
     plant->faults = *faults;
     plant->faulted = sum > 0.0;

@@ -62,6 +62,7 @@ typedef struct {
     bool chopper_open;
     double shorted_turns[HAL_PHASES_MAX]; /* fraction of the turns of a phase, 0..0.5 */
     double coulomb_Nm, static_Nm;         /* friction torques, >= 0 */
+    double earth_ohm[HAL_PHASES_MAX];     /* of the lower end of a winding to the negative rail; 0: none */
 } plant_faults_t;
 
 /* How a phase of a plant with faults carries its current: a row of the equations in faulted.h. */

@@ -58,6 +58,10 @@ void control_period_hold_event(void *context, uint64_t now_ns) {
     sensors_hold_currents(&rig->sensors, &rig->plant);
 }
 
+static uint64_t at_least(uint64_t time_ns, uint64_t least_ns) {
+    return time_ns > least_ns ? time_ns : least_ns;
+}
+
 void control_period_start_event(void *context, uint64_t now_ns) {
     rig_t *rig = context;
     const bool lost = rig->interrupts_lost && now_ns >= rig->interrupt_end_ns;
@@ -75,8 +79,10 @@ void control_period_start_event(void *context, uint64_t now_ns) {
         return;
     }
     call_deferred(rig);
-    rig->board.interrupt_took_ns = rig->interrupt_time_ns;
+    rig->board.interrupt_took_ns = at_least(rig->interrupt_time_ns, rig->interrupt_late_ns);
     call(rig, BOARD_INTERRUPT, rig->firmware.control_interrupt);
+    /* A target has set the time that it took. */
+    rig->board.interrupt_took_ns = at_least(rig->board.interrupt_took_ns, rig->interrupt_late_ns);
     if (rig->board.interrupt_took_ns == 0) {
         call_deferred(rig);
         call_background(rig);

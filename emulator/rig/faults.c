@@ -71,6 +71,8 @@ static void apply_plant(rig_t *rig) {
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         const fault_presence_t *shorted = at(rig, FAULT_WINDING_SHORTED, phase, 0);
         faults.shorted_turns[phase] = shorted->present ? PERCENT * shorted->value : 0.0;
+        const fault_presence_t *earth = at(rig, FAULT_WINDING_TO_EARTH, phase, 0);
+        faults.earth_ohm[phase] = earth->present ? earth->value : 0.0;
     }
     plant_set_faults(&rig->plant, &faults);
 }
@@ -150,8 +152,10 @@ static void apply_load(rig_t *rig) {
 }
 
 static void apply_processor(rig_t *rig) {
-    rig->interrupts_lost = present(rig, FAULT_INTERRUPT_LOST);
-    rig->background_hung = present(rig, FAULT_BACKGROUND_HUNG);
+    const bool storm = present(rig, FAULT_INTERRUPT_STORM);
+    rig->interrupts_lost = present(rig, FAULT_INTERRUPT_LOST) || storm;
+    rig->background_hung = present(rig, FAULT_BACKGROUND_HUNG) || storm;
+    rig->interrupt_late_ns = (uint64_t)value(rig, FAULT_INTERRUPT_LATE) * NS_PER_US;
 }
 
 static void apply_temperature_sensors(rig_t *rig) {
@@ -224,6 +228,7 @@ static const effect_t effects[FAULT_COUNT] = {
     [FAULT_DIODE_OPEN] = apply_plant,
     [FAULT_GATE_SUPPLY_LOST] = apply_plant,
     [FAULT_WINDING_SHORTED] = apply_plant,
+    [FAULT_WINDING_TO_EARTH] = apply_plant,
     [FAULT_CURRENT_SENSOR_OPEN] = apply_current_sensors,
     [FAULT_CURRENT_SENSOR_STUCK] = apply_current_sensors,
     [FAULT_CURRENT_SENSOR_LOW_RAIL] = apply_current_sensors,
@@ -271,6 +276,8 @@ static const effect_t effects[FAULT_COUNT] = {
     [FAULT_STACK_GUARD_FLIPPED] = apply_flips,
     [FAULT_PERIOD_REGISTER_FLIPPED] = apply_period_register,
     [FAULT_CLOCK_DRIFT] = apply_clock,
+    [FAULT_INTERRUPT_LATE] = apply_processor,
+    [FAULT_INTERRUPT_STORM] = apply_processor,
 };
 
 /* --- Requests --- */

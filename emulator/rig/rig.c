@@ -45,6 +45,7 @@ static void init(rig_t *rig, rig_t *first, unsigned bus_drive, const rig_config_
     rig->interrupt_time_ns = rig->interrupt_end_ns = 0;
     rig->stimuli.count = 0;
     rig->interrupts_lost = rig->background_hung = false;
+    rig->interrupt_late_ns = 0;
     load_init(rig);
     supply_init(rig);
     dynamometer_init(rig);

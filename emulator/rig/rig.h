@@ -98,7 +98,7 @@ typedef struct {
 typedef struct {
     double voltage_V; /* supply_voltage_V */
     double factor;    /* of a fault */
-    double ripple_V;
+    double ripple_V, ripple_Hz;
     uint64_t ripple_start_ns;
 } supply_t;
 
@@ -150,6 +150,7 @@ typedef struct rig {
     bool flipped[MEMORY_OBJECTS];                                    /* and which bit: */
     uint32_t flipped_bit[MEMORY_OBJECTS];
     bool interrupts_lost, background_hung; /* control_period.c */
+    uint64_t interrupt_late_ns;            /* least time of the control interrupt, control_period.c */
     heat_t heat;                           /* heat.c */
     rig_run_t runs[RIG_RUNS_MAX];          /* server.c, by time, equal times in the order of arrival */
     unsigned run_count;

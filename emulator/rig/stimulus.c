@@ -132,6 +132,7 @@ static const target_t targets[BENCH_VARIABLE_COUNT] = {
     [BENCH_VARIABLE_LOAD_SINE_FREQUENCY_HZ] = {.set = load_set_sine_frequency},
     [BENCH_VARIABLE_LOAD_PROFILE_NM] = {.set = load_set_profile},
     [BENCH_VARIABLE_HELD_SPEED_RPM] = {.set = dynamometer_set_speed},
+    [BENCH_VARIABLE_SUPPLY_RIPPLE_FREQUENCY_HZ] = {.set = supply_set_ripple_frequency},
     [BENCH_VARIABLE_STO_1] = {.set = set_sto_1},
     [BENCH_VARIABLE_STO_2] = {.set = set_sto_2},
     [BENCH_VARIABLE_DRIVE_RESET] = {.set = reset_drive},

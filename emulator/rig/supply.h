@@ -15,7 +15,10 @@ void supply_init(rig_t *rig);
 /* supply_voltage_V, from the present time on. */
 void supply_set_voltage(rig_t *rig, double voltage_V);
 
-/* A factor of that voltage, and the amplitude of a sine of 300 Hz that is added, its phase 0 when it begins. */
+/* Of the ripple, 300 Hz at the start; its phase is 0 from now on. */
+void supply_set_ripple_frequency(rig_t *rig, double frequency_Hz);
+
+/* A factor of that voltage, and the amplitude of a sine that is added, its phase 0 when it begins. */
 void supply_set_fault(rig_t *rig, double factor, double ripple_V);
 
 /* Handler of EVENT_SUPPLY; context is the rig. */

@@ -289,6 +289,22 @@ static void set_edge_timing(control_parameters_t *control, unsigned speed_expone
     control->edge_age_max_ticks = (uint16_t)(two_periods < age_max ? two_periods : age_max);
 }
 
+/* The window in which each law uses a phase. */
+static degraded_parameters_t degraded_from(const control_parameters_t *control, const int32_t *values) {
+    const torque_sharing_parameters_t *sharing = &control->conduction.sharing;
+    const bool shares = control->torque_law == TORQUE_LAW_PREDICTIVE;
+    const commutation_parameters_t *commutation = &control->commutation;
+    return (degraded_parameters_t){
+        .allowed = values[PARAMETER_DEGRADED_RUNNING] != 0,
+        .stroke = commutation->stroke,
+        .window = {.turn_on = shares ? sharing->turn_on : commutation->turn_on,
+                   .width = shares ? sharing->turn_off - sharing->turn_on : commutation->available_width},
+        .current_limit_q9 = control->torque_law == TORQUE_LAW_HYSTERESIS ? control->hysteresis.current_limit_q9
+                                                                         : values[PARAMETER_CURRENT_LIMIT_A],
+        .torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM],
+    };
+}
+
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
                                        uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits,
                                        uint32_t timer_clock_hz) {
@@ -374,6 +390,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         }),
         .stroke_mean = stroke_mean_configure(tables->phases, control_rate_hz / DEFERRED_SLOW_PERIODS),
     };
+    control.degraded = degraded_from(&control, values);
     set_edge_timing(&control, tables->speed_exponent, timer_clock_hz);
     control.moving_load = moving_load_configure(&(moving_load_settings_t){
         .encoder_bits = encoder_bits,

@@ -37,6 +37,7 @@
 #include "control/torque_trim.h"
 #include "drive/command.h"
 #include "drive/deferred_exchange.h"
+#include "drive/degraded.h"
 #include "drive/encoder_monitor.h"
 #include "drive/protection.h"
 #include "drive/state_machine.h"
@@ -92,7 +93,8 @@ typedef struct {
     periodic_load_parameters_t periodic_load;
     torque_mode_parameters_t torque_mode;
     inertia_parameters_t inertia;
-    encoder_monitor_parameters_t encoder_monitor; /* background */
+    encoder_monitor_parameters_t encoder_monitor; /* this and the next: background */
+    degraded_parameters_t degraded;
 } control_parameters_t;
 
 /* Inputs of one control period as the HAL delivers them. */
@@ -165,6 +167,7 @@ typedef struct {
     /* Last measurement, for telemetry and background: the steps of the control interrupt receive the measurement as an
      * argument. */
     control_measurement_t measurement;
+    uint32_t lost_phases;     /* bit of each phase whose switches stay open, as reported_fault_mask */
     int32_t torque_limit_q24; /* of the torque reference's magnitude, as reported_fault_mask, N m, Q7.24 */
 } control_state_t;
 

@@ -34,6 +34,10 @@
 #define SHOWN_SHIFT 2
 #define ALONE_SHIFT 8
 
+/* Time for which a phase has to be consistent with the angle to speak for the encoder: 1/1024 s. When all others
+ * have within a quarter of a second (SHOWN_SHIFT), the contradiction of one alone is not the encoder's. */
+#define AGREES_SHIFT 10
+
 /* Time without a zero of the current after which an integral is too old to contradict the angle: 1/128 s. */
 #define AGE_SHIFT 7
 
@@ -169,6 +173,28 @@ static bool shows(const encoder_monitor_parameters_t *parameters, encoder_monito
     return phase->shown;
 }
 
+/* Notes how long a phase that is checked has been consistent with the angle. */
+static void note_agreement(const encoder_monitor_parameters_t *parameters, encoder_monitor_phase_t *phase,
+                           uint32_t period, uint32_t periods) {
+    phase->agrees = phase->contradicted == 0 ? phase->agrees + periods : 0;
+    if (phase->agrees > parameters->rate_hz >> AGREES_SHIFT) {
+        phase->agreed = true;
+        phase->agreed_at = period;
+    }
+}
+
+/* True when all other phases have been consistent with the angle in the last quarter of a second. */
+static bool others_agree(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor, unsigned index,
+                         uint32_t period) {
+    bool all = true;
+    for (unsigned other = 0; other < machine_tables.phases; other++) {
+        encoder_monitor_phase_t *phase = &monitor->phase[other];
+        phase->agreed = phase->agreed && period - phase->agreed_at <= parameters->rate_hz >> SHOWN_SHIFT;
+        all &= other == index || phase->agreed;
+    }
+    return all;
+}
+
 static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                        const encoder_monitor_input_t *input, uint32_t periods, bool counted) {
     const uint32_t electrical =
@@ -183,12 +209,15 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
             const uint32_t angle = electrical - index * parameters->commutation.stroke;
             monitor->frozen |= !counted && has_moved(parameters, phase, input, angle, index, periods, factor);
             monitor->suspicious |= contradicts(parameters, phase, input, angle, index, periods);
+            note_agreement(parameters, phase, input->period, periods);
         } else {
             phase->referred = false;
             phase->contradicted = 0;
+            phase->agrees = 0;
         }
         contradicting += shows(parameters, phase, input->period);
-        alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT;
+        alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT &&
+                 !others_agree(parameters, monitor, index, input->period);
     }
     monitor->angle |= contradicting >= CONTRADICTING_PHASES || alone;
 }
@@ -241,5 +270,7 @@ COLD void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, e
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         monitor->phase[phase].contradicted = 0;
         monitor->phase[phase].shown = false;
+        monitor->phase[phase].agreed = false;
+        monitor->phase[phase].agrees = 0;
     }
 }

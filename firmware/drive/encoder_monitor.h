@@ -4,7 +4,8 @@
  *               (control/applied_flux.h) to that of the tables at that count and the measured current is constant,
  *               whatever the gains of sensors and machine are. A rotor that turns changes it.
  *   angle       the integrated flux linkage of two phases is outside what the tables allow around the encoder's angle:
- *               offset, slip, wrong direction, a constant reading of another angle.
+ *               offset, slip, wrong direction, a constant reading of another angle. Of one alone unless all
+ *               others have agreed a short time ago: then the phase has a fault of its own (drive/phase_monitor.h).
  *   over-speed  by the encoder's counts over half a millisecond, without the observer.
  *
  * Frozen and angle compare two ways to the flux linkage, voltage and time on the one side, current and angle on the
@@ -58,6 +59,9 @@ typedef struct {
     uint32_t moved;        /* periods for which they have parted */
     uint32_t contradicted; /* periods for which the angle has been contradicted */
     uint32_t shown_at;
+    uint32_t agrees; /* periods in succession in which the angle was not contradicted */
+    bool agreed;     /* for long enough, last in the period */
+    uint32_t agreed_at;
 } encoder_monitor_phase_t;
 
 typedef struct {

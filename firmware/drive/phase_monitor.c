@@ -26,6 +26,11 @@
  * once when not even the last bit changes, and when it ends after 1/2 ms. */
 #define STILL_MS 8u
 
+#define TAKEN_MS 50u
+
+/* Time for which a current that has ended too soon may explain one that is read in another phase. */
+#define VANISHED_MS 2u
+
 /* What all phases have in common. */
 typedef struct {
     const machine_tables_t *tables;
@@ -70,10 +75,9 @@ typedef enum {
     BEYOND_ANGLES  /* differs at any */
 } difference_t;
 
-/* table_q29: flux linkage by the tables at the measured current and angle, or less. It is between the limits of both
- * sides, so that most comparisons end with it. */
-static difference_t compare(const common_t *common, phase_monitor_phase_t *state, unsigned phase, int32_t table_q29,
-                            int *side) {
+/* The flux linkage by the tables is between the limits of both sides, so that most comparisons end with it. */
+static difference_t compare(const common_t *common, phase_monitor_phase_t *state, unsigned phase, int *side) {
+    const int32_t table_q29 = state->table_q29;
     const int32_t current_q9 = common->input->current_q9[phase];
     const int32_t flux_q29 = common->input->flux_q29[phase];
     const int32_t slack = slack_q29(common, state, phase);
@@ -138,6 +142,32 @@ static bool at_rest(const common_t *common, phase_monitor_t *monitor, unsigned p
     return true;
 }
 
+/* True when the opposite voltage has removed a quarter of the flux linkage since the switches opened, and the tables
+ * saw less than a quarter of that part disappear. Parts, because at a wrong angle the tables err by a factor; of a flux
+ * linkage from which that may have taken away something. */
+static bool does_not_fall(const common_t *common, phase_monitor_phase_t *state, unsigned phase) {
+    const int32_t flux_q29 = common->input->flux_q29[phase];
+    if (!common->input->off[phase] || !state->was_off || common->lost) {
+        state->off_flux_q29 = flux_q29;
+        state->off_all_q29 = fixed_add(flux_q29, fixed_clamp(-state->followed_q29, 0, INT32_MAX));
+        state->off_table_q29 = state->table_q29;
+    }
+    state->was_off = common->input->off[phase];
+    const int32_t removed_q29 = fixed_subtract(fixed_subtract(state->off_flux_q29, flux_q29), 2 * common->delay_q29);
+    const int32_t fallen_q29 = fixed_subtract(state->off_table_q29, state->table_q29);
+    return common->input->current_q9[phase] > SMALL_CURRENT * common->offset_q9 &&
+           removed_q29 > state->off_all_q29 / 4 &&
+           fixed_product(fallen_q29, state->off_all_q29) < fixed_product(removed_q29, state->off_table_q29) / 4;
+}
+
+/* True when the integral has gone only because the tables have taken most of it away: by voltage and time alone the
+ * current may flow, and it is the angle of the tables that is wrong. Over a longer time drops of the devices and the
+ * resistance add up to as much. */
+static bool taken_away(const common_t *common, const phase_monitor_phase_t *state) {
+    return state->followed_q29 < -(state->peak_q29 / 2) &&
+           common->input->periods - state->zero_at < TAKEN_MS * common->input->periods_per_ms;
+}
+
 /* A current that should not be: does it move? */
 static uint32_t check_excess(const common_t *common, phase_monitor_phase_t *state, unsigned phase, bool excess) {
     const int32_t current_q9 = common->input->current_q9[phase];
@@ -157,19 +187,21 @@ static uint32_t check_excess(const common_t *common, phase_monitor_phase_t *stat
         return 0;
     }
     if (moved_q9 > common->offset_q9) {
-        return (uint32_t)FAULT_BIT(FAULT_PHASE_SHORTED);
+        return (uint32_t)(taken_away(common, state) ? FAULT_BIT(FAULT_ENCODER_ANGLE) : FAULT_BIT(FAULT_PHASE_SHORTED));
     }
     const bool still = moved_q9 == 0 || state->excess_periods > STILL_MS * common->input->periods_per_ms;
     return still ? (uint32_t)FAULT_BIT(FAULT_CURRENT_SENSOR) : 0;
 }
 
-static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, unsigned phase, int32_t table_q29) {
+static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, unsigned phase) {
     phase_monitor_phase_t *state = &monitor->phase[phase];
     const bool rest = at_rest(common, monitor, phase);
+    const bool remains = does_not_fall(common, state, phase);
     int side = 0;
     difference_t difference = AGREES;
-    if (common->input->run && !common->lost) {
-        difference = compare(common, state, phase, table_q29, &side);
+    const bool off = (monitor->lost >> phase & 1u) != 0;
+    if (common->input->run && !common->lost && !off) {
+        difference = compare(common, state, phase, &side);
     }
     monitor->suspicious |= difference != AGREES;
     const bool beyond = difference == BEYOND_ANGLES;
@@ -181,7 +213,7 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     }
     state->open_samples =
         beyond && side > 0 ? (uint8_t)(state->open_samples + (state->open_samples < OPEN_SAMPLES)) : 0;
-    uint32_t failed = check_excess(common, state, phase, rest || (beyond && side < 0));
+    uint32_t failed = check_excess(common, state, phase, rest || remains || (beyond && side < 0));
     if (state->open_samples >= OPEN_SAMPLES) {
         failed |= (uint32_t)FAULT_BIT(FAULT_PHASE_OPEN);
     }
@@ -209,12 +241,34 @@ static uint32_t judge_doubts(phase_monitor_t *monitor, uint32_t step) {
     return (uint32_t)(monitor->doubted_side > 0 ? FAULT_BIT(FAULT_PHASE_OPEN) : FAULT_BIT(FAULT_PHASE_SHORTED));
 }
 
+/* Bit of each phase whose current is missing, judged less strictly than a fault, of which it only decides the name: it
+ * is less than at the measured angle, or none while there is voltage, or ended within the last milliseconds before the
+ * voltage had removed it. */
+static uint32_t phases_that_lack(const common_t *common, const phase_monitor_t *monitor) {
+    const phase_monitor_input_t *input = common->input;
+    uint32_t lacking = 0;
+    for (unsigned phase = 0; phase < common->tables->phases; phase++) {
+        const phase_monitor_phase_t *state = &monitor->phase[phase];
+        const bool vanished =
+            state->vanished && input->periods - state->vanished_at < VANISHED_MS * input->periods_per_ms;
+        const int32_t table_q29 = fixed_add(state->table_q29, state->table_q29 / 4);
+        const bool less = fixed_subtract(input->flux_q29[phase], slack_q29(common, state, phase)) > table_q29;
+        const bool none = !input->off[phase] && input->current_q9[phase] <= common->offset_q9 &&
+                          input->flux_q29[phase] > common->delay_q29 / 2;
+        lacking |= (uint32_t)(vanished || less || none) << phase;
+    }
+    return lacking;
+}
+
 /* What brings the integral nearer to the tables. */
-static int32_t correction_of(const common_t *common, phase_monitor_phase_t *state, unsigned phase, int32_t table_q29,
-                             bool zero) {
+static int32_t correction_of(const common_t *common, phase_monitor_phase_t *state, unsigned phase, bool zero) {
     const phase_monitor_input_t *input = common->input;
     const int32_t flux_q29 = input->flux_q29[phase];
     if (zero) {
+        if (flux_q29 > fixed_add(state->peak_q29 / 8, 2 * common->delay_q29)) {
+            state->vanished = true;
+            state->vanished_at = input->periods;
+        }
         state->zero_at = input->periods;
         state->followed_q29 = 0;
         return -flux_q29;
@@ -223,7 +277,7 @@ static int32_t correction_of(const common_t *common, phase_monitor_phase_t *stat
         state->followed_q29 = fixed_subtract(state->followed_q29, flux_q29);
         return -flux_q29;
     }
-    const int32_t error_q29 = table_q29 - flux_q29;
+    const int32_t error_q29 = state->table_q29 - flux_q29;
     const uint32_t follow = FOLLOW_MS * input->periods_per_ms;
     const bool set = common->lost || common->elapsed >= follow;
     const int32_t correction_q29 = set ? error_q29 : error_q29 / (int32_t)follow * (int32_t)common->elapsed;
@@ -244,6 +298,17 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
         .offset_q9 = tables->current_range_q9 / 128,
         .delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)input->periods_per_ms),
     };
+}
+
+void phase_monitor_lose(phase_monitor_t *monitor, uint32_t phases) {
+    monitor->lost = phases;
+    monitor->failed = 0;
+    monitor->doubted = 0;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        monitor->phase[phase].excess_periods = 0;
+        monitor->phase[phase].open_samples = 0;
+        monitor->phase[phase].turned = 0;
+    }
 }
 
 COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_t *tables,
@@ -270,21 +335,23 @@ COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_
     for (unsigned phase = 0; phase < tables->phases; phase++) {
         const int32_t current_q9 = input->current_q9[phase];
         const bool zero = input->off[phase] && current_q9 <= common.offset_q9;
-        const int32_t table_q29 = zero ? 0 : phase_map_flux_q29(tables, distance_of(input, phase), current_q9);
-        const uint32_t failed_of_phase = check_phase(&common, monitor, phase, table_q29);
+        monitor->phase[phase].table_q29 = zero ? 0 : phase_map_flux_q29(tables, distance_of(input, phase), current_q9);
+        const uint32_t failed_of_phase = check_phase(&common, monitor, phase);
         in_excess |= (uint32_t)(monitor->phase[phase].excess_periods > 0) << phase;
         monitor->phases |= (uint32_t)(failed_of_phase != 0) << phase;
         failed |= failed_of_phase;
-        correction_q29[phase] = correction_of(&common, &monitor->phase[phase], phase, table_q29, zero);
+        correction_q29[phase] = correction_of(&common, &monitor->phase[phase], phase, zero);
     }
     monitor->suspicious |= in_excess != 0;
     if (input->run) {
         failed |= judge_doubts(monitor, common.step);
     }
     /* The current that one phase lacks is read in another. */
-    if ((failed & (uint32_t)FAULT_BIT(FAULT_PHASE_OPEN)) != 0 && in_excess != 0) {
+    const uint32_t lacking = failed != 0 && input->run ? phases_that_lack(&common, monitor) : 0;
+    if (((failed & (uint32_t)FAULT_BIT(FAULT_PHASE_OPEN)) != 0 && in_excess != 0) ||
+        ((failed & (uint32_t)FAULT_BIT(FAULT_PHASE_SHORTED)) != 0 && (lacking & ~in_excess) != 0)) {
         failed = (uint32_t)FAULT_BIT(FAULT_CURRENT_SENSOR);
-        monitor->phases |= in_excess;
+        monitor->phases |= in_excess | ((lacking & (lacking - 1u)) == 0 ? lacking : 0);
     }
     monitor->failed = input->run ? monitor->failed | failed : failed;
     return monitor->failed;

@@ -6,12 +6,16 @@
  *                   (i - offset) / 1.1, or a current in a phase which the voltage has left without flux linkage
  *   current_sensor  such a current that does not move, offset included; or one that is read in another phase than in
  *                   the one that lacks it
+ *   encoder_angle   a current that is only too large because the tables, at a wrong angle, have emptied the integral
  *
  * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical; resistance 50 % and
  * voltage 1/64 since the phase was at rest, at most over 10 ms; a quarter of psi that has been removed since; and psi
  * of a period and 20 us at the DC-link voltage, for the delays of sensor and switches. At a current of up to 4/128 of
  * its range, phase_open counts only what more than 1/32 of the DC-link voltage has built up since the current was
  * larger.
+ *
+ * A current also is one that should not be when both switches are open and the voltage has removed a quarter of psi of
+ * which the tables saw less than a quarter disappear: freewheeling by a shorted switch.
  *
  * An error of the angle explains any psi between those of the unaligned and of the aligned position. Beyond these a
  * difference is phase_open in its second sample, or an excess of current. Between them it counts once the rotor has
@@ -62,6 +66,13 @@ typedef struct {
     uint8_t open_samples;      /* in succession with less current than at any angle */
     uint32_t zero_at;          /* period in which the phase was last without current */
     int32_t followed_q29;      /* sum of the corrections since, Wb, Q2.29 */
+    int32_t table_q29;         /* flux linkage by the tables at the last input, Wb, Q2.29; 0 without current */
+    int32_t off_flux_q29;      /* flux linkage by the voltage when the switches opened, Wb, Q2.29 */
+    int32_t off_all_q29;       /* the same with what the tables had taken away from it */
+    int32_t off_table_q29;     /* by the tables */
+    bool was_off;              /* in the last input */
+    bool vanished;             /* a current ended before the voltage had removed it, last in the period */
+    uint32_t vanished_at;
 } phase_monitor_phase_t;
 
 typedef struct {
@@ -76,6 +87,7 @@ typedef struct {
     uint32_t doubted;      /* bit of each phase with a difference that an angle may explain */
     int doubted_side;      /* of the last one */
     uint32_t doubt_turned; /* rotation since the first one, 2^-32 electrical rev */
+    uint32_t lost;         /* bit of each phase that stays off, phase_monitor_lose() */
     phase_monitor_phase_t phase[HAL_PHASES_MAX];
 } phase_monitor_t;
 
@@ -83,5 +95,10 @@ typedef struct {
  * each phase's integral. [background] */
 uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_t *tables,
                             const phase_monitor_input_t *input, int32_t correction_q29[HAL_PHASES_MAX]);
+
+/* Forgets the failed checks of a run that goes on without these phases, a bit each: their switches stay open, and from
+ * now on only a current in them fails, once the voltage has removed their flux linkage. 0: none are lost.
+ * [background] */
+void phase_monitor_lose(phase_monitor_t *monitor, uint32_t phases);
 
 #endif

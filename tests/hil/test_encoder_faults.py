@@ -147,6 +147,20 @@ def test_encoder_displaced_by_5_degrees_under_load_is_a_fault_within_100_ms(make
     assert 0.003 < fault_s(bench) < 0.1
 
 
+@pytest.mark.parametrize(("machine", "controller"), [("saturating", "traditional"), ("finite_element", "traditional"),
+                                                      ("saturating", "salient"), ("linear_cosine", "salient")])
+def test_encoder_ahead_by_5_degrees_is_a_fault_after_two_windows_of_the_balance(make_bench, machine, controller):
+    """Sixteen electrical revolutions at least, of which four or six make a turn of 600 r/min."""
+    bench = make_bench(machine=machine, controller=controller, initial_angle_deg=10.0)
+    bench.rig.encoder_offset_deg = 5.0
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.12)
+    bench.load_torque_Nm = 8
+    run_until_fault(bench, 0.9)
+    assert bench.drive.fault == "encoder_angle"
+    assert 0.25 < fault_s(bench) < 0.75
+
+
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_encoder_reversed_before_the_start_is_a_fault_within_half_a_pole_pitch(make_bench, controller):
     bench = make_bench(controller=controller, initial_angle_deg=10.0)

@@ -21,6 +21,7 @@ class Faults(ctypes.Structure):
         ("shorted_turns", ctypes.c_double * PHASES_MAX),
         ("coulomb_Nm", ctypes.c_double),
         ("static_Nm", ctypes.c_double),
+        ("earth_ohm", ctypes.c_double * PHASES_MAX),
     ]
 
 
@@ -28,6 +29,14 @@ def set_faults(library: ctypes.CDLL, plant: int, faults: Faults) -> None:
     library.plant_set_faults.argtypes = [ctypes.c_void_p, ctypes.POINTER(Faults)]
     library.plant_set_faults.restype = None
     library.plant_set_faults(plant, ctypes.byref(faults))
+
+
+def earth(**phases: float) -> Faults:
+    """Resistances to earth, by phase letter."""
+    faults = Faults()
+    for phase, resistance_ohm in phases.items():
+        faults.earth_ohm["abcd".index(phase)] = resistance_ohm
+    return faults
 
 
 def lock(library: ctypes.CDLL, plant: int) -> None:

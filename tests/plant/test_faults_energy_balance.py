@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Iterator
 
 import pytest
-from plant_faults import Faults, Switches, lock, read, set_faults, turns
+from plant_faults import Faults, Switches, earth, lock, read, set_faults, turns
 from reference_plant import Converter, DcLink, Machine, Run, State, load_library, machine_from, plant_of, set_switches
 from test_energy_balance import FULL, BalanceTerms, switches
 
@@ -28,6 +28,7 @@ FAULTS = {
     "chopper_open": Faults(chopper_open=True),
     "winding_shorted": turns(b=0.1),
     "winding_shorted_half": turns(b=0.5, c=0.02),
+    "winding_to_earth": earth(b=0.2),
     "friction": Faults(coulomb_Nm=3.0, static_Nm=5.0),
     "several": Faults(winding_open=1, diode_open=Switches(BIT_B, 0), coulomb_Nm=1.0),
 }
