@@ -196,6 +196,8 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
         violate(oracle, "no_command", now_ns, 1, 0.0);
     }
     const bool bus_fault = variable_begun(oracle, BENCH_VARIABLE_FRAME_FAULT, now_ns / 1000) ||
+                           variable_begun(oracle, BENCH_VARIABLE_BUS_CONNECTION, now_ns / 1000) ||
+                           variable_begun(oracle, BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER, now_ns / 1000) ||
                            other_sender(oracle, now_ns / 1000) || (oracle->injected >> FAULT_BACKGROUND_HUNG & 1u) ||
                            variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, now_ns / 1000);
     if (oracle->off_seen && now_ns > oracle->off_ns + 5 * MS_NS && !bus_fault) {
@@ -256,7 +258,7 @@ static void look_at_recovery(oracle_t *oracle, const plant_t *plant) {
     }
     const double part = plant->speed_rad_s * RPM_PER_RAD_S / oracle->recovery_rpm;
     /* A drive of one quadrant waits for the friction to take an overshoot. */
-    const double most = oracle->world->controller == 2 ? 1.005 : 1.1;
+    const double most = oracle->world->controller == 2 ? 1.005 : 1.2;
     since(&oracle->in_band_ns, part >= 0.995 && part <= most, plant->time_ns);
     oracle->settled = oracle->settled || (oracle->in_band_ns && plant->time_ns >= oracle->in_band_ns + 2 * MS_NS);
 }
@@ -345,7 +347,7 @@ static bool true_of_plant(const oracle_t *oracle, unsigned cause, const plant_t 
         return fmin(oracle->voltage_recent_low_V, plant->bus_voltage_V) < 1.02 * machine->under_voltage_V;
     case CAUSE_OVER_SPEED:
         return fmax(oracle->speed_recent_rad_s, fabs(plant->speed_rad_s)) * RPM_PER_RAD_S >
-               0.98 * machine->over_speed_rpm;
+               0.95 * machine->over_speed_rpm;
     default:
         return false;
     }

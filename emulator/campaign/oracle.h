@@ -14,7 +14,7 @@
  *               wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
  *               false_alarm     a fault without any fault
  *   eventually  not_recovered   faults over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of
- *                               the speed (one quadrant: at most 10 % above) 100 ms after the time that half of the
+ *                               the speed (one quadrant: at most 20 % above) 100 ms after the time that half of the
  *                               torque limit needs, or again in a fault
  *   sometimes   cells           (fault, state of the drive, sector of phase a) in which a fault began */
 #ifndef CAMPAIGN_ORACLE_H
