@@ -52,11 +52,11 @@ static const struct {
 };
 
 static bool is_slow(unsigned kind) {
-    static const unsigned slow[] = {FAULT_ENCODER_LOST_COUNTS, FAULT_ENCODER_SLIP,        FAULT_ENCODER_REVERSED,
-                                    FAULT_COULOMB_FRICTION,    FAULT_STATIC_FRICTION,     FAULT_LOAD_DROPPED,
-                                    FAULT_DIODE_OPEN,          FAULT_CURRENT_SENSOR_GAIN, FAULT_SHAFT_LOCKED,
-                                    FAULT_SUPPLY_RIPPLE,       FAULT_BACKGROUND_HUNG,     FAULT_CURRENT_SENSOR_OFFSET,
-                                    FAULT_CURRENT_SENSOR_SWAPPED};
+    static const unsigned slow[] = {
+        FAULT_ENCODER_LOST_COUNTS,   FAULT_ENCODER_SLIP,  FAULT_ENCODER_REVERSED, FAULT_COULOMB_FRICTION,
+        FAULT_STATIC_FRICTION,       FAULT_LOAD_DROPPED,  FAULT_DIODE_OPEN,       FAULT_CURRENT_SENSOR_GAIN,
+        FAULT_SHAFT_LOCKED,          FAULT_SUPPLY_RIPPLE, FAULT_BACKGROUND_HUNG,  FAULT_CURRENT_SENSOR_OFFSET,
+        FAULT_CURRENT_SENSOR_SWAPPED};
     for (unsigned i = 0; i < sizeof slow / sizeof *slow; i++) {
         if (slow[i] == kind) {
             return true;
@@ -97,9 +97,12 @@ static void begin_fault(run_t *run, const variant_t *variant) {
 }
 
 bool branch_parse(branch_setting_t *setting, char *const words[]) {
-    *setting = (branch_setting_t){.controller = (unsigned)atoi(words[0]), .speed_rpm = atof(words[1]),
-                                  .load_Nm = atof(words[2]), .first = (unsigned)atoi(words[3]),
-                                  .ticks = (unsigned)atoi(words[4]), .every = (unsigned)atoi(words[5])};
+    *setting = (branch_setting_t){.controller = (unsigned)atoi(words[0]),
+                                  .speed_rpm = atof(words[1]),
+                                  .load_Nm = atof(words[2]),
+                                  .first = (unsigned)atoi(words[3]),
+                                  .ticks = (unsigned)atoi(words[4]),
+                                  .every = (unsigned)atoi(words[5])};
     return setting->controller <= 2 && setting->speed_rpm >= 0.0 && setting->every > 0;
 }
 
@@ -216,12 +219,11 @@ static void draw_world(world_t *world, const world_machine_t *machine, const bra
     world->duration_us = branching.settled_ns / 1000 + 10000000;
     world->event[world->events++] =
         (world_event_t){.kind = WORLD_SPEED, .value = setting->speed_rpm > 0.0 ? setting->speed_rpm : 150.0};
-    world->event[world->events++] = (world_event_t){.kind = WORLD_SET,
-                                                    .what = 1, /* load_torque_Nm */
-                                                    .raw = (int32_t)floor(setting->load_Nm * 1e4 + 0.5),
-                                                    .begin_us = setting->speed_rpm > 0.0
-                                                                    ? branching.settled_ns / 1000 - 200000
-                                                                    : 0};
+    world->event[world->events++] =
+        (world_event_t){.kind = WORLD_SET,
+                        .what = 1, /* load_torque_Nm */
+                        .raw = (int32_t)floor(setting->load_Nm * 1e4 + 0.5),
+                        .begin_us = setting->speed_rpm > 0.0 ? branching.settled_ns / 1000 - 200000 : 0};
 }
 
 static void run_base(run_t *run, world_t *world, const run_drive_t *drive) {
@@ -238,7 +240,8 @@ static void print_tallies(const branch_setting_t *setting) {
     static const char *const controllers[] = {"traditional", "paper", "salient"};
     for (unsigned i = 0; i < branching.count; i++) {
         const tally_t *tally = &branching.tallies[i];
-        printf("{\"controller\": \"%s\", \"speed_rpm\": %g, \"load_Nm\": %g, \"fault\": \"%s\", \"leg\": %u, \"value\": %g, "
+        printf("{\"controller\": \"%s\", \"speed_rpm\": %g, \"load_Nm\": %g, \"fault\": \"%s\", \"leg\": %u, "
+               "\"value\": %g, "
                "\"branches\": %" PRIu64 ", \"detected\": %" PRIu64 ", \"longest_us\": %" PRIu64 ", \"longest_tick\": "
                "%" PRIu64 ", \"causes\": [",
                controllers[setting->controller], setting->speed_rpm, setting->load_Nm,
@@ -251,8 +254,8 @@ static void print_tallies(const branch_setting_t *setting) {
                 separator = ", ";
             }
         }
-        printf("], \"virtual_ms\": %" PRIu64 ", \"violations\": %" PRIu64 ", \"rule\": \"%s\", \"violation_tick\": %" PRIu64
-               "}\n",
+        printf("], \"virtual_ms\": %" PRIu64 ", \"violations\": %" PRIu64
+               ", \"rule\": \"%s\", \"violation_tick\": %" PRIu64 "}\n",
                tally->virtual_ns / 1000000, tally->violations, tally->rule, tally->violation_tick);
     }
 }
@@ -261,7 +264,8 @@ int branch_all(const branch_setting_t *setting, run_t *run, world_t *world, cons
                const run_drive_t *drive) {
     branching.setting = setting;
     branching.count = list_variants(branching.variants, &machines[0].image.machine);
-    branching.tallies = mmap(NULL, sizeof(tally_t) * VARIANTS_MAX, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+    branching.tallies =
+        mmap(NULL, sizeof(tally_t) * VARIANTS_MAX, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
     if (branching.tallies == MAP_FAILED) {
         perror("salient: mmap");
         return 1;
@@ -270,7 +274,8 @@ int branch_all(const branch_setting_t *setting, run_t *run, world_t *world, cons
     if (setting->speed_rpm > 0.0) {
         run_base(run, world, drive);
     } else {
-        for (unsigned position = setting->first; position < setting->first + setting->ticks; position += setting->every) {
+        for (unsigned position = setting->first; position < setting->first + setting->ticks;
+             position += setting->every) {
             world->initial_angle_deg = position * 360.0 / 360.0;
             branching.tick = position;
             run_base(run, world, drive);

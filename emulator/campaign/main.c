@@ -169,7 +169,8 @@ static int run_apart(const arguments_t *arguments, uint64_t seed) {
         return 1;
     }
     if (WIFSIGNALED(status)) {
-        printf("{\"seed\": %" PRIu64 ", \"violations\": [{\"rule\": \"crash\", \"number\": %d, \"at_us\": 0, \"value\": "
+        printf("{\"seed\": %" PRIu64
+               ", \"violations\": [{\"rule\": \"crash\", \"number\": %d, \"at_us\": 0, \"value\": "
                "0}]}\n",
                seed, WTERMSIG(status));
         return 0;
@@ -222,7 +223,8 @@ static bool parse(arguments_t *arguments, int argc, char *argv[]) {
             i += BRANCH_ARGUMENTS;
         }
         if (!known) {
-            fprintf(stderr, "salient: %s %s: not an option of salient_campaign, or not a whole number\n", option, value);
+            fprintf(stderr, "salient: %s %s: not an option of salient_campaign, or not a whole number\n", option,
+                    value);
             return false;
         }
     }

@@ -1,22 +1,21 @@
-/* Judges a run in terms of the plant: true currents, speed, voltage and gate signals, the frames that its senders meant,
- * and of the drive its state and first fault only. Shares no code with the firmware or with the emulator's own checks.
+/* Judges a run in terms of the plant: true currents, speed, voltage and gate signals, the frames that its senders
+ * meant, and of the drive its state and first fault only. Shares no code with the firmware or with the emulator's own
+ * checks.
  *
  *   never       over_current    a phase's true current, with a gate of it on, above the comparators' threshold by more
  *                               than a period's rise, in two looks in succession; without a gate no drive can end a
  *                               current, which the rotor or a shorted switch then drives
  *               gate_on         a gate on while the drive is not in state run, or a line of safe torque off is not
  *                               energised, or 2.5 periods after the last control interrupt
- *               no_command      a gate on without a confirmed arming since the last fault, 502 ms after the last genuine
- *                               request to run, or 5 ms after a genuine off; torque 170 ms after the last request
- *               over_speed      a gate on for 2 ms at a speed above the limit by 2 %
- *               over_voltage    a gate on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply
- *                               takes no energy back, unless a fault of the only sensor hides it
- *               wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
- *               false_alarm     a fault without any fault
- *   eventually  not_recovered   faults over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of
- *                               the speed (one quadrant: at most 20 % above) 100 ms after the time that half of the
- *                               torque limit needs, or again in a fault
- *   sometimes   cells           (fault, state of the drive, sector of phase a) in which a fault began */
+ *               no_command      a gate on without a confirmed arming since the last fault, 502 ms after the last
+ * genuine request to run, or 5 ms after a genuine off; torque 170 ms after the last request over_speed      a gate on
+ * for 2 ms at a speed above the limit by 2 % over_voltage    a gate on for 200 us at a link voltage above the limit by
+ * 2 %, on a machine whose supply takes no energy back, unless a fault of the only sensor hides it wrong_cause     a
+ * first cause that neither is true of the plant nor belongs to a fault that was there false_alarm     a fault of the
+ * drive without any other, which is not true of the plant, or the drive's own work eventually  not_recovered   faults
+ * over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of the speed (one quadrant: at most
+ * 20 % above) 100 ms after the time that half of the torque limit needs, or again in a fault sometimes   cells (fault,
+ * state of the drive, sector of phase a) in which a fault began */
 #ifndef CAMPAIGN_ORACLE_H
 #define CAMPAIGN_ORACLE_H
 
@@ -36,8 +35,8 @@
 
 /* What is read of the drive. */
 typedef struct {
-    uint8_t state; /* initialise, ready, run, fault */
-    uint8_t fault; /* first cause, number of drive.dbc */
+    uint8_t state;   /* initialise, ready, run, fault */
+    uint8_t fault;   /* first cause, number of drive.dbc */
     uint32_t checks; /* failed ones of the tick that latched it */
 } oracle_drive_t;
 
@@ -62,7 +61,7 @@ typedef struct {
     /* Private. */
     oracle_drive_t drive;
     uint64_t interrupt_ns;
-    bool confirmed, commanded, off_seen;
+    bool confirmed, commanded, off_seen, clear_seen;
     uint64_t run_ns, off_ns, speed_ns, voltage_ns;
     unsigned over_current_looks;
     double peak_A[HAL_PHASES_MAX]; /* of the last looks, decaying not: of the last millisecond */

@@ -22,7 +22,7 @@ typedef struct run {
     oracle_t oracle;
     const world_t *world;
     const run_drive_t *drive;
-    uint64_t end_ns; /* may be moved while it runs */
+    uint64_t end_ns;                           /* may be moved while it runs */
     void (*before_interrupt)(struct run *run); /* NULL: none */
 } run_t;
 

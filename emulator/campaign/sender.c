@@ -190,7 +190,8 @@ static void step_honest(sender_t *sender, const transport_receiver_t *receiver) 
     if (request != sender->request || sender->time_us >= sender->due_us) {
         sender->request = request;
         sender->due_us = sender->time_us + COMMAND_PERIOD_US;
-        put_command(sender, receiver, HONEST, sender->counter++, request, request == SENDER_RUN ? sender->reference : 0);
+        put_command(sender, receiver, HONEST, sender->counter++, request,
+                    request == SENDER_RUN ? sender->reference : 0);
     }
     if (request != SENDER_RUN || sender->armed || sender->state == STATE_FAULT || sender->state == STATE_INITIALISE) {
         return;

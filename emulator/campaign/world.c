@@ -128,8 +128,7 @@ static void draw_load(world_t *world, double rpm, uint64_t begin_us) {
     const bool coarse = world->machine->torque_max_Nm > 150.0;
     const unsigned step = coarse ? BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM : BENCH_VARIABLE_LOAD_TORQUE_NM;
     const unsigned ramp = coarse ? BENCH_VARIABLE_LOAD_RAMP_COARSE_NM_S : BENCH_VARIABLE_LOAD_RAMP_NM_S;
-    const unsigned sine =
-        coarse ? BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM : BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_NM;
+    const unsigned sine = coarse ? BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM : BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_NM;
     switch (seeded_below(seed, STREAM_LOAD, 0, 4)) {
     case 0:
         break;
@@ -162,31 +161,47 @@ static double attribute_of(const world_t *world, unsigned kind, double unit) {
     const machine_t *machine = &world->machine->image.machine;
     const double range_A = machine->ranges.current_A, range_V = machine->ranges.dc_link_V;
     switch (kind) {
-    case FAULT_WINDING_SHORTED: return 2.0 + 48.0 * unit;
+    case FAULT_WINDING_SHORTED:
+        return 2.0 + 48.0 * unit;
     case FAULT_CURRENT_SENSOR_STUCK:
-    case FAULT_DC_LINK_SENSOR_STUCK: return floor(unit * (double)(1u << world->adc_bits));
-    case FAULT_CURRENT_SENSOR_GAIN: return unit < 0.5 ? unit : 2.0 + 4.0 * (unit - 0.5);
-    case FAULT_CURRENT_SENSOR_OFFSET: return (unit - 0.5) * 0.8 * range_A;
-    case FAULT_CURRENT_SENSOR_SWAPPED: return floor(unit * machine->phases);
-    case FAULT_DC_LINK_SENSOR_GAIN: return unit < 0.5 ? unit : 1.3 + 2.0 * (unit - 0.5);
-    case FAULT_DC_LINK_SENSOR_OFFSET: return (unit - 0.5) * range_V;
-    case FAULT_ENCODER_JUMP: return (unit < 0.5 ? -1.0 : 1.0) * exp(log(0.2) + (log(180.0) - log(0.2)) * fabs(2.0 * unit - 1.0));
-    case FAULT_ENCODER_LOST_COUNTS: return floor(exp(log(0.005) * unit) * (double)(1u << world->encoder_bits) * 0.2) + 1.0;
-    case FAULT_ENCODER_NOISE: return 0.3 + 9.0 * unit;
-    case FAULT_ENCODER_SLIP: return (unit - 0.5) * 700.0;
+    case FAULT_DC_LINK_SENSOR_STUCK:
+        return floor(unit * (double)(1u << world->adc_bits));
+    case FAULT_CURRENT_SENSOR_GAIN:
+        return unit < 0.5 ? unit : 2.0 + 4.0 * (unit - 0.5);
+    case FAULT_CURRENT_SENSOR_OFFSET:
+        return (unit - 0.5) * 0.8 * range_A;
+    case FAULT_CURRENT_SENSOR_SWAPPED:
+        return floor(unit * machine->phases);
+    case FAULT_DC_LINK_SENSOR_GAIN:
+        return unit < 0.5 ? unit : 1.3 + 2.0 * (unit - 0.5);
+    case FAULT_DC_LINK_SENSOR_OFFSET:
+        return (unit - 0.5) * range_V;
+    case FAULT_ENCODER_JUMP:
+        return (unit < 0.5 ? -1.0 : 1.0) * exp(log(0.2) + (log(180.0) - log(0.2)) * fabs(2.0 * unit - 1.0));
+    case FAULT_ENCODER_LOST_COUNTS:
+        return floor(exp(log(0.005) * unit) * (double)(1u << world->encoder_bits) * 0.2) + 1.0;
+    case FAULT_ENCODER_NOISE:
+        return 0.3 + 9.0 * unit;
+    case FAULT_ENCODER_SLIP:
+        return (unit - 0.5) * 700.0;
     case FAULT_COULOMB_FRICTION:
-    case FAULT_STATIC_FRICTION: return fmin(500.0, world->machine->torque_max_Nm * (0.3 + unit));
-    case FAULT_SUPPLY_SAGGED: return 100.0 * unit;
-    case FAULT_SUPPLY_SURGED: return 10.0 + 90.0 * unit;
-    case FAULT_SUPPLY_RIPPLE: return fmin(500.0, machine->supply_voltage_V * 0.6 * unit);
-    default: return 0.0;
+    case FAULT_STATIC_FRICTION:
+        return fmin(500.0, world->machine->torque_max_Nm * (0.3 + unit));
+    case FAULT_SUPPLY_SAGGED:
+        return 100.0 * unit;
+    case FAULT_SUPPLY_SURGED:
+        return 10.0 + 90.0 * unit;
+    case FAULT_SUPPLY_RIPPLE:
+        return fmin(500.0, machine->supply_voltage_V * 0.6 * unit);
+    default:
+        return 0.0;
     }
 }
 
 static bool possible(const world_t *world, unsigned kind) {
     const machine_t *machine = &world->machine->image.machine;
     return fault_kinds[kind].name && !(kind == FAULT_CHOPPER_OPEN && (machine->dc_link.capacitance_F == 0.0 ||
-                                                                       machine->dc_link.chopper_resistance_ohm == 0.0));
+                                                                      machine->dc_link.chopper_resistance_ohm == 0.0));
 }
 
 static void draw_fault(world_t *world, unsigned kind, uint64_t last_us) {
@@ -237,12 +252,13 @@ static void draw_other_faults(world_t *world, uint64_t last_us) {
         uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_GATES, 40 + i, 100.0, 3e5);
         end_us = end_us < last_us ? end_us : last_us;
         if (all[i].variable == BENCH_VARIABLE_FRAME_FAULT) {
-            add_set(world, BENCH_VARIABLE_FRAME_FAULT_PER_MILLE, seeded_between(seed, STREAM_BUS, 92, 10.0, 1000.0), 0.0,
-                    begin_us, end_us);
-            add_set(world, BENCH_VARIABLE_FRAME_DELAY_US, seeded_between(seed, STREAM_BUS, 93, 0.0, 1e5), 0.0, begin_us, 0);
+            add_set(world, BENCH_VARIABLE_FRAME_FAULT_PER_MILLE, seeded_between(seed, STREAM_BUS, 92, 10.0, 1000.0),
+                    0.0, begin_us, end_us);
+            add_set(world, BENCH_VARIABLE_FRAME_DELAY_US, seeded_between(seed, STREAM_BUS, 93, 0.0, 1e5), 0.0, begin_us,
+                    0);
         }
-        const bool once = all[i].variable == BENCH_VARIABLE_DRIVE_RESET ||
-                          all[i].variable == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER;
+        const bool once =
+            all[i].variable == BENCH_VARIABLE_DRIVE_RESET || all[i].variable == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER;
         add_set(world, all[i].variable, all[i].value, all[i].after, begin_us, once ? 0 : end_us);
     }
 }
@@ -250,7 +266,7 @@ static void draw_other_faults(world_t *world, uint64_t last_us) {
 static void draw_script(world_t *world, uint64_t last_us) {
     const uint64_t seed = world->seed;
     const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_SCRIPT, 1, 2e4, (double)last_us);
-    const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_SCRIPT, 2, 5e3, 8e5);
+    const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_SCRIPT, 2, 5e3, 1.5e6);
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
     if (sort < 0.12) {
         add(world, WORLD_SILENT, begin_us, end_us < last_us ? end_us : last_us);
@@ -269,12 +285,15 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     draw_board(world, machines, count, seed);
     draw_imperfections(world);
     const double first_rpm = draw_speed_rpm(world, 0);
-    const uint64_t last_us =
-        (uint64_t)(1e6 * fmin(0.1 + 1.5 * start_s(world, 0.0, first_rpm), seeded_between(seed, STREAM_SCRIPT, 9, 0.1, 0.4)));
+    uint64_t last_us = (uint64_t)(1e6 * fmin(0.1 + 1.5 * start_s(world, 0.0, first_rpm),
+                                             seeded_between(seed, STREAM_SCRIPT, 9, 0.1, 0.4)));
+    const bool long_silence = seeded_unit(seed, STREAM_SCRIPT, 0) < 0.04;
+    last_us = long_silence ? 900000 : last_us;
     world->recovery_us = last_us + 25000;
     add_speed(world, first_rpm, 0);
     if (seeded_unit(seed, STREAM_SPEED, 90) < 0.4) {
-        add_speed(world, draw_speed_rpm(world, 1), (uint64_t)seeded_between(seed, STREAM_SPEED, 91, 0.3, 1.0) * last_us);
+        add_speed(world, draw_speed_rpm(world, 1),
+                  (uint64_t)seeded_between(seed, STREAM_SPEED, 91, 0.3, 1.0) * last_us);
     }
     draw_load(world, first_rpm, (uint64_t)seeded_between(seed, STREAM_LOAD, 9, 1e4, (double)last_us));
     draw_script(world, last_us);

@@ -34,11 +34,11 @@ typedef enum {
 } world_kind_t;
 
 typedef enum {
-    WORLD_HOSTILE_NOISE,     /* random data with identifiers of commands */
-    WORLD_HOSTILE_REPLAY,    /* genuine frames once more, 50 to 500 ms old */
-    WORLD_HOSTILE_LENGTH,    /* commands of a wrong length */
-    WORLD_HOSTILE_FLOOD,     /* any identifier, five frames per millisecond */
-    WORLD_HOSTILE_IDENTITY,  /* identifiers of the drive's telemetry */
+    WORLD_HOSTILE_NOISE,    /* random data with identifiers of commands */
+    WORLD_HOSTILE_REPLAY,   /* genuine frames once more, 50 to 500 ms old */
+    WORLD_HOSTILE_LENGTH,   /* commands of a wrong length */
+    WORLD_HOSTILE_FLOOD,    /* any identifier, five frames per millisecond */
+    WORLD_HOSTILE_IDENTITY, /* identifiers of the drive's telemetry */
     WORLD_HOSTILE_SORTS
 } world_hostile_t;
 

@@ -12,7 +12,8 @@ STATES = ("initialise", "ready", "run", "fault")
 SECTORS = 6
 _REASONS = {
     "gate_on": {1: "outside of run", 2: "without safe torque off lines", 3: "without a control interrupt"},
-    "no_command": {1: "not armed", 2: "after off", 3: "without a command", 4: "torque without a command"},
+    "no_command": {1: "not armed", 2: "after off", 3: "without a command", 4: "torque without a command",
+                   5: "fault cleared"},
     "not_recovered": {1: "not in run", 2: "not at the speed", 3: "fault again"},
 }
 
