@@ -51,6 +51,7 @@ static const struct {
     {FAULT_SUPPLY_SURGED, 50.0},         {FAULT_SUPPLY_RIPPLE, 100.0},
 };
 
+/* Found within a few electrical periods, or by what adds up. */
 static bool is_slow(unsigned kind) {
     static const unsigned slow[] = {
         FAULT_ENCODER_LOST_COUNTS,   FAULT_ENCODER_SLIP,  FAULT_ENCODER_REVERSED, FAULT_COULOMB_FRICTION,
@@ -120,11 +121,15 @@ static struct {
 static void finish_child(run_t *run) {
     tally_t *tally = branching.tally;
     tally->branches++;
+    if (!branching.reaction_ns && run->oracle.dark_ns && run->drive->view().state != STATE_RUN) {
+        branching.reaction_ns = run->oracle.dark_ns; /* reset by the watchdog, long after the gates were off */
+    }
     tally->virtual_ns += run->rig.board.time_ns - branching.begin_ns;
     if (branching.reaction_ns) {
-        const uint64_t took_ns = branching.reaction_ns - branching.begin_ns;
+        const uint64_t took_ns =
+            branching.reaction_ns > branching.begin_ns ? branching.reaction_ns - branching.begin_ns : 0;
         tally->detected++;
-        tally->causes |= UINT64_C(1) << run->oracle.cause[0];
+        tally->causes |= UINT64_C(1) << (run->oracle.causes ? run->oracle.cause[0] : run->drive->view().fault);
         if (took_ns >= tally->longest_ns) {
             tally->longest_ns = took_ns;
             tally->longest_tick = branching.tick;
@@ -276,7 +281,7 @@ int branch_all(const branch_setting_t *setting, run_t *run, world_t *world, cons
     } else {
         for (unsigned position = setting->first; position < setting->first + setting->ticks;
              position += setting->every) {
-            world->initial_angle_deg = position * 360.0 / 360.0;
+            world->initial_angle_deg = position;
             branching.tick = position;
             run_base(run, world, drive);
         }

@@ -9,7 +9,8 @@
 
 typedef struct {
     unsigned controller; /* 0..2 */
-    double speed_rpm;    /* 0: starts from `ticks` positions of the rotor, the fault begins with the state run */
+    double
+        speed_rpm; /* 0: starts to 150 r/min from `ticks` positions a degree apart; the fault begins with state run */
     double load_Nm;
     unsigned first, ticks, every; /* every `every`-th tick of `ticks`, from the first on; slow faults a 50th of them */
 } branch_setting_t;

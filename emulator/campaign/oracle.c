@@ -323,6 +323,7 @@ static void remember(oracle_t *oracle, const plant_t *plant) {
 void oracle_look(oracle_t *oracle, const plant_t *plant) {
     remember(oracle, plant);
     const unsigned gates = plant->switches.upper | plant->switches.lower;
+    since(&oracle->dark_ns, gates == 0, plant->time_ns);
     look_at_currents(oracle, plant, gates);
     look_at_limits(oracle, plant, gates);
     look_at_recovery(oracle, plant);

@@ -56,6 +56,7 @@ typedef struct {
     unsigned causes;
     uint8_t cause[ORACLE_CAUSES_MAX]; /* first causes in their order */
     uint64_t cause_us;                /* of the first one; 0: none */
+    uint64_t dark_ns;                 /* since then no gate has been on; 0: one is */
     uint64_t injected;                /* bit: kind of fault that has begun */
     uint8_t cell[ORACLE_CELLS / 8];
     /* Private. */
