@@ -189,10 +189,9 @@ static void before_interrupt(run_t *run) {
         return;
     }
     if (setting->speed_rpm == 0.0) {
+        run->before_interrupt = NULL; /* once; a child has another one */
+        run->end_ns = run->rig.board.time_ns;
         branch_here(run);
-        if (!branching.child) {
-            run->end_ns = run->rig.board.time_ns;
-        }
         return;
     }
     if (run->rig.board.time_ns < branching.settled_ns) {
