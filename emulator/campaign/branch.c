@@ -18,7 +18,7 @@
 enum { STATE_RUN = 2 };
 
 #define SLOW_EVERY 50
-#define FAST_NS UINT64_C(80000000)
+#define FAST_NS UINT64_C(150000000)
 #define SLOW_NS UINT64_C(400000000)
 #define AFTER_NS UINT64_C(1000000) /* watched after the reaction */
 #define VARIANTS_MAX 80

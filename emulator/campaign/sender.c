@@ -226,6 +226,14 @@ static void put_replay(sender_t *sender, const transport_receiver_t *receiver) {
     }
 }
 
+/* A command of any kind with the next counter, its checksum off by a bit. */
+static void put_forged(sender_t *sender, const transport_receiver_t *receiver) {
+    uint8_t data[7] = {[3] = (uint8_t)(draw(sender) % 4)};
+    protect(data, sizeof data, DATA_ID_COMMAND, sender->counter);
+    data[0] ^= (uint8_t)(1u << draw(sender) % 8);
+    put(sender, receiver, OTHER, DRIVE_COMMAND_FRAME_ID, data, sizeof data);
+}
+
 static void step_hostile(sender_t *sender, const transport_receiver_t *receiver, world_hostile_t sort) {
     static const unsigned commands[] = {DRIVE_COMMAND_FRAME_ID, DRIVE_TORQUE_COMMAND_FRAME_ID, DRIVE_ARM_FRAME_ID,
                                         DRIVE_PARAMETER_WRITE_FRAME_ID, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID};
@@ -239,6 +247,9 @@ static void step_hostile(sender_t *sender, const transport_receiver_t *receiver,
         break;
     case WORLD_HOSTILE_LENGTH:
         put_random(sender, receiver, identifier, (unsigned)(draw(sender) % 9));
+        break;
+    case WORLD_HOSTILE_FORGED:
+        put_forged(sender, receiver);
         break;
     case WORLD_HOSTILE_FLOOD:
         for (unsigned i = 0; i < 5; i++) {

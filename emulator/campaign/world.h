@@ -39,6 +39,7 @@ typedef enum {
     WORLD_HOSTILE_LENGTH,   /* commands of a wrong length */
     WORLD_HOSTILE_FLOOD,    /* any identifier, five frames per millisecond */
     WORLD_HOSTILE_IDENTITY, /* identifiers of the drive's telemetry */
+    WORLD_HOSTILE_FORGED,   /* commands in sequence, with a wrong checksum */
     WORLD_HOSTILE_SORTS
 } world_hostile_t;
 
