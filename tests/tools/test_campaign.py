@@ -1,4 +1,4 @@
-"""Worlds by seed: the same bits everywhere, results that merge, failures that shrink and replay, bugs that are found."""
+"""Worlds by seed: equal bits everywhere, results that merge, failures that shrink and replay, bugs that are found."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_seeds_differ_in_machine_controller_and_events() -> None:
     assert len(files()) == 20
     assert 12 <= len({drawn["machine"] for drawn in worlds}) <= 20
     assert {drawn["controller"] for drawn in worlds} == {"traditional", "paper", "salient"}
-    of_kinds = {name for name in names.kinds().values()}
+    of_kinds = set(names.kinds().values())
     numbers = [sum(event["event"] in of_kinds for event in drawn["events"]) for drawn in worlds]
     assert min(numbers) <= 1 and 4 <= max(numbers) <= 6 and 2.0 < sum(numbers) / len(numbers) < 5.0
 

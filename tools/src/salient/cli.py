@@ -134,8 +134,8 @@ def make_parser() -> argparse.ArgumentParser:
     task.add_argument("--figures", action="store_true",
                      help="instead: repeat the measurements of the committed baseline and write it")
 
-    campaign = command("campaign", "random worlds by seed, judged by the plant: faults, hostile clients, machines; exit "
-                       "code 1 when a property is violated")
+    campaign = command("campaign", "random worlds by seed, judged by the plant: faults, hostile clients, machines; "
+                       "exit code 1 when a property is violated")
     campaign.add_argument("--seeds", type=_seeds, default=1000, metavar="N", help="number of seeds (default 1000)")
     campaign.add_argument("--first", type=_seed, default=1, metavar="SEED", help="the first one (default 1)")
     campaign.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N",
@@ -147,10 +147,10 @@ def make_parser() -> argparse.ArgumentParser:
     campaign.add_argument("--jobs", type=_count, metavar="N", help="simultaneous runs (default: number of cores)")
     campaign.add_argument("--healthy", action="store_true",
                           help="worlds without faults instead, in which a fault of the drive is a false alarm")
-    campaign.add_argument("--no-shrink", action="store_true", help="leave failures as they are, write no folders of them")
+    campaign.add_argument("--no-shrink", action="store_true", help="write no folders of failures")
 
-    replay = command("replay", "a seed of a campaign, or a failure that it left, once more on the usual bench, with log "
-                     "and plot")
+    replay = command("replay", "a seed of a campaign, or a failure that it left, once more on the usual bench, with "
+                     "log and plot")
     replay.add_argument("what", metavar="SEED|FOLDER")
     replay.add_argument("--healthy", action="store_true", help="the seed is one of campaign --healthy")
     replay.add_argument("--out", type=Path, default=Path("out/replay"), metavar="DIR",

@@ -2,9 +2,9 @@
 
     python -m salient.experiments.campaign.branching DIR [EVERY]
 
-forks the campaign's program before each control interrupt (each EVERY-th, default 1) of an electrical period at 150 r/min
-with load and at 1500 r/min, and at the begin of a start from 360 positions of the rotor, and lets each fault begin there.
-Slow faults have a 50th of the ticks. Writes DIR/branches.json and DIR/branches.png and prints a table. An operating
+forks the campaign's program before each control interrupt (each EVERY-th, default 1) of an electrical period at
+150 r/min with load and at 1500 r/min, and at the begin of a start from 360 positions of the rotor, and lets each fault
+begin there. Slow faults have a 50th of the ticks. Writes DIR/branches-POINT.jsonl and DIR/branches.png and prints a table. An operating
 point whose results DIR has is not run again. Exit code 1 when a property is violated.
 """
 

@@ -23,8 +23,8 @@ from typing import Any
 
 from salient.errors import RunFailed
 from salient.experiments.campaign import names
-from salient.experiments.campaign.runner import program
 from salient.experiments.campaign.machines import pool_file
+from salient.experiments.campaign.runner import program
 from salient.paths import BUILD, ROOT
 
 FILE = ROOT / "tests" / "campaign" / "canaries.toml"
@@ -68,7 +68,7 @@ def build(canary: Canary, number: int) -> Path:
     lines = subprocess.run(["ninja", "-t", "commands", _TARGET], cwd=host, capture_output=True, text=True,
                            check=True).stdout.splitlines()
     compiling = shlex.split(next(line for line in lines if line.endswith(f"-c {canary.file}")))
-    compiling = compiling[:compiling.index("-MD")] + ["-o", str(made), "-c", str(source)]
+    compiling = [*compiling[:compiling.index("-MD")], "-o", str(made), "-c", str(source)]
     linking = shlex.split(re.sub(r"^: && | && :$", "", lines[-1]))
     out = linking.index("-o") + 1
     linking[out] = str(folder / _TARGET)
@@ -153,8 +153,8 @@ def main(arguments: list[str]) -> int:
             print(f"{number}. {canary.name}: SURVIVES {SEEDS_MAX} seeds", flush=True)
         else:
             events = ", ".join(found.events) or "none"
-            print(f"{number}. {canary.name}: seed {found.seed}, {found.violation}, {found.processor_s:.2f} processor s, "
-                  f"{len(found.events)} events: {events}", flush=True)
+            print(f"{number}. {canary.name}: seed {found.seed}, {found.violation}, {found.processor_s:.2f} "
+                  f"processor s, {len(found.events)} events: {events}", flush=True)
     print(f"{len(chosen) - survived} of {len(chosen)} found")
     return 1 if survived else 0
 

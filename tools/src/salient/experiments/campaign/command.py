@@ -116,11 +116,12 @@ def run_replay(options: argparse.Namespace) -> int:
         except ValueError:
             seed = -1
         if not 0 <= seed < 2**63:
-            raise UsageError(f"replay {options.what}: must be a seed, a whole number from 0, or the folder of a failure")
+            raise UsageError(f"replay {options.what}: must be a seed, a whole number from 0, or the folder of a "
+                             "failure")
         folder = options.out / str(seed)
     described = world(seed, kept, healthy)
-    print(f"seed {seed}: {described['machine']}, {described['controller']}, {described['control_rate_hz']} Hz, encoder of "
-          f"{described['encoder_bits']} bits{' with edges' if described['encoder_edges'] else ''}")
+    print(f"seed {seed}: {described['machine']}, {described['controller']}, {described['control_rate_hz']} Hz, encoder "
+          f"of {described['encoder_bits']} bits{' with edges' if described['encoder_edges'] else ''}")
     for event in described["events"]:
         until = f" to {event['end_us']}" if event["end_us"] else ""
         print(f"  {event['begin_us']}{until} us: {event['event']} {event['value']:g}"
