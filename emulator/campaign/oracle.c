@@ -205,10 +205,10 @@ static bool may_be_deaf(const oracle_t *oracle, uint64_t time_us) {
 
 static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     const uint64_t now_ns = plant->time_ns;
-    if (!oracle->confirmed) {
+    const bool deaf = may_be_deaf(oracle, now_ns / 1000);
+    if (!oracle->confirmed && !deaf) {
         violate(oracle, "no_command", now_ns, 1, 0.0);
     }
-    const bool deaf = may_be_deaf(oracle, now_ns / 1000);
     if (oracle->off_seen && now_ns > oracle->off_ns + 5 * MS_NS && !deaf) {
         violate(oracle, "no_command", now_ns, 2, 0.0);
     }

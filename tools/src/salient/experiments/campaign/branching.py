@@ -4,8 +4,8 @@
 
 forks the campaign's program before each control interrupt (each EVERY-th, default 1) of an electrical period at
 150 r/min with load and at 1500 r/min, and at the begin of a start from 360 positions of the rotor, and lets each fault
-begin there. Slow faults have a 50th of the ticks. Writes DIR/branches-POINT.jsonl and DIR/branches.png and prints a table. An operating
-point whose results DIR has is not run again. Exit code 1 when a property is violated.
+begin there. Slow faults have a 50th of the ticks. Writes DIR/branches-POINT.jsonl and DIR/branches.png and prints a
+table. An operating point whose results DIR has is not run again. Exit code 1 when a property is violated.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from salient.experiments.campaign import names
 from salient.experiments.campaign.runner import branches
 
 SALIENT = 2
-POINTS = {"150": (SALIENT, 150, 8, 0, 2000), "1500": (SALIENT, 1500, 6, 0, 200), "start": (SALIENT, 0, 8, 0, 360)}
+POINTS = {"150": (SALIENT, 150, 8, 0, 2000), "1500": (SALIENT, 1500, 6, 0, 200), "start": (SALIENT, 0, 0, 0, 360)}
 """Controller, speed in r/min (0: starts), load in N m, first tick, ticks: an electrical period at 40 kHz."""
-TITLES = {"150": "150 r/min, 8 N m", "1500": "1500 r/min, 6 N m", "start": "start from 360 positions, 8 N m"}
+TITLES = {"150": "150 r/min, 8 N m", "1500": "1500 r/min, 6 N m", "start": "start to 150 r/min from 360 positions"}
 
 Rows = dict[str, list[dict[str, Any]]]
 
@@ -85,11 +85,11 @@ def plot(rows: Rows, path: Path) -> None:
     axes.set_xscale("log")
     axes.set_xlabel("longest time from the begin of the fault until the drive has reacted, ms")
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.4, 1.07), ncols=3, fontsize="small", frameon=False)
+    figure.legend(loc="outside lower center", ncols=3, fontsize="small", frameon=False)
     total = sum(row["branches"] for lines in rows.values() for row in lines)
     violations = sum(row["violations"] for lines in rows.values() for row in lines)
     axes.set_title(f"Emulated drive, salient, 40 kHz, machine saturating, ideal sensors of 12 and 17 bits, phase a\n"
-                   f"{total} branches, {violations} of them with a violation", fontsize="medium", pad=30)
+                   f"{total} branches, {violations} of them with a violation", fontsize="medium")
     figure.savefig(path, dpi=90)
 
 
