@@ -277,6 +277,7 @@ def main() -> None:
         if needs_build(options):
             targets = ["salient_host"]
             targets += ["plant_benchmark_saturating"] if options.command == "benchmark" else []
+            targets += ["salient_campaign"] if options.command in ("campaign", "replay") else []
             targets += ["salient_reference"] if options.command == "compare" else []
             targets += ["salient_target"] if target != "host" else []
             was_built = build("host", [] if options.command == "test" else targets)

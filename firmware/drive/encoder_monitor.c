@@ -91,6 +91,12 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
     return 2 * fixed_multiply_high(rise_q29, (int32_t)step);
 }
 
+/* Error of the integral in a period that is none: of the voltage, and of the resistance at a current, Wb, Q2.29. */
+static int64_t drift_of(const encoder_monitor_parameters_t *parameters, int32_t current_q9, uint32_t factor) {
+    return (int64_t)parameters->flux_error_q29 * (int32_t)factor +
+           fixed_multiply_high(current_q9 << 12, parameters->resistance_error_q40);
+}
+
 /* First-order step of a value towards another, by a part in Q15. */
 static int32_t leak(int32_t value, int32_t towards, int32_t part_q15) {
     return fixed_add(value, fixed_multiply(fixed_subtract(towards, value), part_q15, 15));
@@ -118,7 +124,7 @@ static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_mo
     const uint32_t leak_periods = parameters->rate_hz >> LEAK_SHIFT;
     const uint32_t age = input->period - phase->referred_at;
     const uint32_t summed = age < leak_periods ? age : leak_periods;
-    const int32_t drift_q29 = fixed_saturate((int64_t)parameters->flux_error_q29 * (int32_t)(factor * summed));
+    const int32_t drift_q29 = fixed_saturate(drift_of(parameters, current_q9, factor) * (int32_t)summed);
     const int32_t change_q29 = fixed_abs(fixed_subtract(excess_q29, phase->excess_q29));
     const int32_t tolerance_q29 = drift_q29 + (range.most_q29 - range.least_q29) + (table_q29 >> SHAPE_SHIFT) +
                                   (fixed_abs(table_q29 - phase->table_q29) >> GAIN_SHIFT);
@@ -141,7 +147,7 @@ static bool contradicts(const encoder_monitor_parameters_t *parameters, encoder_
     const flux_range_t range =
         flux_range(angle, parameters->angle_max + parameters->half_count, input->current_q9[index], CURRENT_ERROR_Q9);
     const int32_t drift_q29 =
-        fixed_saturate(input->flux_step_max_q29 / 4 + ((int64_t)parameters->flux_error_q29 * (int32_t)MOVING_FACTOR +
+        fixed_saturate(input->flux_step_max_q29 / 4 + (drift_of(parameters, input->current_q9[index], MOVING_FACTOR) +
                                                        (input->flux_step_max_q29 >> PULSE_SHIFT)) *
                                                           (int32_t)age);
     const bool below = flux_q29 < range.least_q29;

@@ -21,11 +21,12 @@ Graph = Mapping[str, set[str]]
 C_LAYERS = (
     "hal/", "hal/qemu/", "firmware/fixed/", "firmware/control/", "firmware/drive/", "firmware/comms/", "firmware/",
     "emulator/plant/", "emulator/plant_library/", "emulator/plant_benchmark/", "emulator/fmi/", "emulator/rig/",
-    "emulator/host/", "emulator/qemu/", "emulator/qemu/image/",
+    "emulator/host/", "emulator/campaign/", "emulator/qemu/", "emulator/qemu/image/",
 )  # fmt: skip
 INCLUDE_ROOTS = ("", "hal", "firmware", "emulator")
 FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive.h"}
-JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/main.c", "emulator/host/memory_flip.h", "emulator/qemu/image/main.c"}
+JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/main.c", "emulator/host/memory_flip.h", "emulator/campaign/main.c",
+                               "emulator/qemu/image/main.c"}
 
 PYTHON_LAYERS = (
     "salient", "salient.errors", "salient.paths", "salient.progress", "salient.config", "salient.version",

@@ -140,6 +140,18 @@ def _pil(options: argparse.Namespace) -> int:
     return run(options)
 
 
+def _campaign(options: argparse.Namespace) -> int:
+    from salient.experiments.campaign.command import run_campaign
+
+    return run_campaign(options)
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from salient.experiments.campaign.command import run_replay
+
+    return run_replay(options)
+
+
 _COMMANDS = {
     "demo": _demo,
     "test": _test,
@@ -147,6 +159,8 @@ _COMMANDS = {
     "run": _run,
     "log": _log,
     "monitor": _monitor,
+    "campaign": _campaign,
+    "replay": _replay,
     "parameters": _parameters,
     "benchmark": _benchmark,
     "compare": _compare,

@@ -134,6 +134,30 @@ def make_parser() -> argparse.ArgumentParser:
     task.add_argument("--figures", action="store_true",
                      help="instead: repeat the measurements of the committed baseline and write it")
 
+    campaign = command("campaign", "random worlds by seed, judged by the plant: faults, hostile clients, machines; "
+                       "exit code 1 when a property is violated")
+    campaign.add_argument("--seeds", type=_seeds, default=1000, metavar="N", help="number of seeds (default 1000)")
+    campaign.add_argument("--first", type=_seed, default=1, metavar="SEED", help="the first one (default 1)")
+    campaign.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N",
+                          help="every N-th seed only, beginning with the I-th; shards may share a folder")
+    campaign.add_argument("--scheduler", metavar="ADDRESS",
+                          help="Dask scheduler, tcp://HOST:PORT, whose workers have this installation")
+    campaign.add_argument("--out", type=Path, default=Path("out/campaign"), metavar="DIR",
+                          help="folder (default out/campaign); what it has of these seeds is not run again")
+    campaign.add_argument("--jobs", type=_count, metavar="N", help="simultaneous runs (default: number of cores)")
+    campaign.add_argument("--healthy", action="store_true",
+                          help="worlds without faults instead, in which a fault of the drive is a false alarm")
+    campaign.add_argument("--no-shrink", action="store_true", help="write no folders of failures")
+
+    replay = command("replay", "a seed of a campaign, or a failure that it left, once more on the usual bench, with "
+                     "log and plot")
+    replay.add_argument("what", metavar="SEED|FOLDER")
+    replay.add_argument("--healthy", action="store_true", help="the seed is one of campaign --healthy")
+    replay.add_argument("--out", type=Path, default=Path("out/replay"), metavar="DIR",
+                        help="parent of the folder for a seed (default out/replay)")
+    replay.add_argument("--target", dest="build", type=_one_of(TARGETS), default=TARGETS[0], metavar="NAME",
+                        help=f"{either(TARGETS)} (default {TARGETS[0]})")
+
     parameters = command("parameters", "parameters and fault log of a running drive")
     actions = parameters.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
     for name, text in (("save", "write the parameters to a file"),
@@ -229,6 +253,25 @@ def _count(text: str) -> int:
     if not re.fullmatch("[0-9]{1,4}", text) or not 1 <= int(text) <= 1024:
         raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 1 to 1024")
     return int(text)
+
+
+def _seed(text: str) -> int:
+    if not re.fullmatch("[0-9]{1,18}", text):
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 0 to 10^18 - 1")
+    return int(text)
+
+
+def _seeds(text: str) -> int:
+    if not re.fullmatch("[0-9]{1,8}", text) or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 1 to 99999999")
+    return int(text)
+
+
+def _shard(text: str) -> tuple[int, int]:
+    found = re.fullmatch("([0-9]{1,6})/([0-9]{1,6})", text)
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise argparse.ArgumentTypeError(f"{text}: must be I/N, whole numbers with I from 1 to N")
+    return int(found[1]), int(found[2])
 
 
 def _percent(text: str) -> float:

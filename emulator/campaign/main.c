@@ -1,0 +1,255 @@
+/* Worlds by seed: runs a range of seeds, each in a process of its own, and prints a JSON line for each.
+ *
+ *   salient_campaign --machines FILE [--first SEED] [--seeds N] [--step N] [--healthy] [--keep MASK]
+ *                    [--frames FILE] [--describe] [--serve] [--branch CONTROLLER SPEED_RPM LOAD_NM FIRST TICKS EVERY]
+ *
+ * --serve reads the seeds from standard input, a line each.
+ *
+ * FILE has a line for each machine: image, speed_base_rpm, torque_rated_Nm, torque_max_Nm, over_speed_rpm,
+ * over_voltage_V, under_voltage_V, trip_current_A, command_lsb_rpm, speed_command_max_rpm, rate_min_hz, name. */
+#define _POSIX_C_SOURCE 200809L
+
+#include <errno.h>
+#include <inttypes.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "campaign/branch.h"
+#include "campaign/run.h"
+#include "drive.h"
+#include "host/hal_host.h"
+
+#define EXIT_USAGE 2
+
+static world_machine_t machines[WORLD_MACHINES_MAX];
+static unsigned machine_count;
+static drive_t drive;
+static hal_t hal;
+static run_t run;
+static world_t world;
+machine_tables_t machine_tables;
+
+/* --- The drive --- */
+
+static bool start(const world_t *of, board_t *board) {
+    hal.board = board;
+    const drive_config_t config = {.control_rate_hz = of->control_rate_hz,
+                                   .controller = (drive_controller_t)of->controller,
+                                   .telemetry_period_ms = 4};
+    return machine_image_tables(&of->machine->image, &machine_tables_structure, &machine_tables) &&
+           drive_init(&drive, &hal, &config);
+}
+
+static void control_interrupt(void) {
+    drive_control_interrupt(&drive);
+}
+
+static void deferred_interrupt(void) {
+    drive_deferred_interrupt(&drive);
+}
+
+static void background(void) {
+    drive_background(&drive);
+}
+
+static oracle_drive_t view(void) {
+    const state_machine_t *state_machine = &drive.control.state_machine;
+    return (oracle_drive_t){.state = (uint8_t)state_machine->state,
+                            .fault = (uint8_t)state_machine->record.fault,
+                            .checks = (uint32_t)state_machine->record.fault_mask};
+}
+
+static const run_drive_t firmware = {start, control_interrupt, deferred_interrupt, background, view};
+
+/* --- Machines --- */
+
+static bool read_machines(const char *path) {
+    FILE *file = fopen(path, "r");
+    if (!file) {
+        fprintf(stderr, "salient: %s: %s\n", path, strerror(errno));
+        return false;
+    }
+    char image[1024];
+    world_machine_t *each = machines;
+    while (machine_count < WORLD_MACHINES_MAX &&
+           fscanf(file, "%1023s %lf %lf %lf %lf %lf %lf %lf %lf %lf %u %63s", image, &each->speed_base_rpm,
+                  &each->torque_rated_Nm, &each->torque_max_Nm, &each->over_speed_rpm, &each->over_voltage_V,
+                  &each->under_voltage_V, &each->trip_current_A, &each->command_lsb_rpm, &each->speed_command_max_rpm,
+                  &each->rate_min_hz, each->name) == 12) {
+        if (!machine_image_open(&each->image, image)) {
+            fclose(file);
+            return false;
+        }
+        each++;
+        machine_count++;
+    }
+    fclose(file);
+    if (machine_count == 0) {
+        fprintf(stderr, "salient: %s: no machine\n", path);
+    }
+    return machine_count > 0;
+}
+
+/* --- One seed --- */
+
+static void print_result(void) {
+    const oracle_t *oracle = &run.oracle;
+    printf("{\"seed\": %" PRIu64 ", \"hash\": \"%016" PRIx64 "\", \"machine\": %u, \"controller\": %u, \"virtual_us\": "
+           "%" PRIu64 ", \"causes\": [",
+           world.seed, run.sender.hash, (unsigned)(world.machine - machines), world.controller,
+           run.rig.board.time_ns / 1000);
+    for (unsigned i = 0; i < oracle->causes; i++) {
+        printf("%s%u", i ? ", " : "", oracle->cause[i]);
+    }
+    printf("], \"recovered\": %s, \"held\": %s, \"violations\": [", oracle->settled ? "true" : "false",
+           oracle->held ? "true" : "false");
+    for (unsigned i = 0; i < oracle->violations; i++) {
+        const oracle_violation_t *violation = &oracle->violation[i];
+        printf("%s{\"rule\": \"%s\", \"number\": %u, \"at_us\": %" PRIu64 ", \"value\": %.6g}", i ? ", " : "",
+               violation->rule, violation->number, violation->time_us, violation->value);
+    }
+    printf("], \"cells\": [");
+    const char *separator = "";
+    for (unsigned cell = 0; cell < ORACLE_CELLS; cell++) {
+        if (oracle->cell[cell / 8] >> cell % 8 & 1u) {
+            printf("%s%u", separator, cell);
+            separator = ", ";
+        }
+    }
+    printf("]}\n");
+}
+
+typedef struct {
+    const char *machines_file, *frames_file;
+    uint64_t first, seeds, step, keep;
+    bool healthy, describe, serve;
+    branch_setting_t branch;
+    bool branches;
+} arguments_t;
+
+static int run_seed(const arguments_t *arguments, uint64_t seed) {
+    (arguments->healthy ? world_draw_healthy : world_draw)(&world, machines, machine_count, seed);
+    world.kept = arguments->keep;
+    if (arguments->describe) {
+        world_print(&world);
+        return 0;
+    }
+    FILE *record = NULL;
+    if (arguments->frames_file && !(record = fopen(arguments->frames_file, "w"))) {
+        fprintf(stderr, "salient: %s: %s\n", arguments->frames_file, strerror(errno));
+        return EXIT_USAGE;
+    }
+    if (run_begin(&run, &world, &firmware, record)) {
+        run_to_end(&run);
+        print_result();
+    } else {
+        printf("{\"seed\": %" PRIu64 ", \"rejected\": true}\n", seed);
+    }
+    if (record) {
+        fclose(record);
+    }
+    return 0;
+}
+
+/* In a process of its own: a seed starts from the same memory, and one that crashes ends no other. */
+static int run_apart(const arguments_t *arguments, uint64_t seed) {
+    fflush(stdout);
+    const pid_t child = fork();
+    if (child == 0) {
+        const int code = run_seed(arguments, seed);
+        fflush(stdout);
+        _exit(code);
+    }
+    int status = 0;
+    if (child < 0 || waitpid(child, &status, 0) != child) {
+        fprintf(stderr, "salient: %s\n", strerror(errno));
+        return 1;
+    }
+    if (WIFSIGNALED(status)) {
+        printf("{\"seed\": %" PRIu64
+               ", \"violations\": [{\"rule\": \"crash\", \"number\": %d, \"at_us\": 0, \"value\": "
+               "0}]}\n",
+               seed, WTERMSIG(status));
+        return 0;
+    }
+    return WEXITSTATUS(status);
+}
+
+/* --- Command line --- */
+
+static bool number(const char *text, uint64_t *value) {
+    char *end;
+    errno = 0;
+    *value = strtoull(text, &end, 0);
+    return errno == 0 && end != text && *end == '\0' && text[0] != '-';
+}
+
+static bool parse(arguments_t *arguments, int argc, char *argv[]) {
+    *arguments = (arguments_t){.seeds = 1, .step = 1, .keep = UINT64_MAX};
+    for (int i = 1; i < argc; i++) {
+        const char *option = argv[i];
+        const char *value = i + 1 < argc ? argv[i + 1] : "";
+        const struct {
+            const char *name;
+            uint64_t *to;
+        } numbers[] = {{"--first", &arguments->first},
+                       {"--seeds", &arguments->seeds},
+                       {"--step", &arguments->step},
+                       {"--keep", &arguments->keep}};
+        bool known = false;
+        for (unsigned n = 0; n < sizeof numbers / sizeof *numbers && !known; n++) {
+            if (strcmp(option, numbers[n].name) == 0) {
+                known = number(value, numbers[n].to);
+                i++;
+            }
+        }
+        if (!known && strcmp(option, "--machines") == 0) {
+            arguments->machines_file = argv[++i < argc ? i : 0];
+            known = true;
+        } else if (!known && strcmp(option, "--frames") == 0) {
+            arguments->frames_file = argv[++i < argc ? i : 0];
+            known = true;
+        } else if (!known && strcmp(option, "--healthy") == 0) {
+            arguments->healthy = known = true;
+        } else if (!known && strcmp(option, "--describe") == 0) {
+            arguments->describe = known = true;
+        } else if (!known && strcmp(option, "--serve") == 0) {
+            arguments->serve = known = true;
+        } else if (!known && strcmp(option, "--branch") == 0 && i + BRANCH_ARGUMENTS < argc) {
+            known = arguments->branches = branch_parse(&arguments->branch, &argv[i + 1]);
+            i += BRANCH_ARGUMENTS;
+        }
+        if (!known) {
+            fprintf(stderr, "salient: %s %s: not an option of salient_campaign, or not a whole number\n", option,
+                    value);
+            return false;
+        }
+    }
+    if (!arguments->machines_file) {
+        fprintf(stderr, "salient: --machines: missing\n");
+    }
+    return arguments->machines_file;
+}
+
+int main(int argc, char *argv[]) {
+    arguments_t arguments;
+    if (!parse(&arguments, argc, argv) || !read_machines(arguments.machines_file)) {
+        return EXIT_USAGE;
+    }
+    if (arguments.branches) {
+        return branch_all(&arguments.branch, &run, &world, machines, &firmware);
+    }
+    int code = 0;
+    char line[64];
+    while (arguments.serve && code == 0 && fgets(line, sizeof line, stdin)) {
+        code = run_apart(&arguments, strtoull(line, NULL, 10));
+        fflush(stdout);
+    }
+    for (uint64_t i = 0; i < arguments.seeds && code == 0 && !arguments.serve; i++) {
+        code = run_apart(&arguments, arguments.first + i * arguments.step);
+    }
+    return code;
+}

@@ -1,0 +1,99 @@
+/* Judges a run in terms of the plant: true currents, speed, voltage and gate signals, the frames that its senders
+ * meant, and of the drive its state and first fault only. Shares no code with the firmware or with the emulator's own
+ * checks.
+ *
+ *   never       over_current    a phase's true current, with a gate of it on, above the comparators' threshold by more
+ *                               than a period's rise, in two looks in succession; without a gate no drive can end a
+ *                               current, which the rotor or a shorted switch then drives
+ *               gate_on         a gate on while the drive is not in state run, or a line of safe torque off is not
+ *                               energised, or 2.5 periods after the last control interrupt
+ *               no_command      a gate on without a confirmed arming since the last fault, 502 ms after the last
+ * genuine request to run, or 5 ms after a genuine off; torque 170 ms after the last request over_speed      a gate on
+ * for 2 ms at a speed above the limit by 2 % over_voltage    a gate on for 200 us at a link voltage above the limit by
+ * 2 %, on a machine whose supply takes no energy back, unless a fault of the only sensor hides it wrong_cause     a
+ * first cause that neither is true of the plant nor belongs to a fault that was there false_alarm     a fault of the
+ * drive without any other, which is not true of the plant, or the drive's own work eventually  not_recovered   faults
+ * over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of the speed (one quadrant: at most
+ * 20 % above) 100 ms after the time that half of the torque limit needs, or again in a fault sometimes   cells (fault,
+ * state of the drive, sector of phase a) in which a fault began */
+#ifndef CAMPAIGN_ORACLE_H
+#define CAMPAIGN_ORACLE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "campaign/sender.h"
+#include "campaign/world.h"
+#include "plant/plant.h"
+
+#define ORACLE_LOOK_NS UINT64_C(20000)
+#define ORACLE_SECTORS 6
+#define ORACLE_STATES 4
+#define ORACLE_CELLS (64 * ORACLE_STATES * ORACLE_SECTORS)
+#define ORACLE_VIOLATIONS_MAX 4
+#define ORACLE_CAUSES_MAX 8
+
+/* What is read of the drive. */
+typedef struct {
+    uint8_t state;   /* initialise, ready, run, fault */
+    uint8_t fault;   /* first cause, number of drive.dbc */
+    uint32_t checks; /* failed ones of the tick that latched it */
+} oracle_drive_t;
+
+typedef struct {
+    const char *rule;
+    uint64_t time_us;
+    unsigned number; /* cause or phase */
+    double value;
+} oracle_violation_t;
+
+typedef struct {
+    const world_t *world;
+    const sender_t *sender;
+    uint64_t period_ns;
+    unsigned violations;
+    oracle_violation_t violation[ORACLE_VIOLATIONS_MAX];
+    unsigned causes;
+    uint8_t cause[ORACLE_CAUSES_MAX]; /* first causes in their order */
+    uint64_t cause_us;                /* of the first one; 0: none */
+    uint64_t dark_ns;                 /* since then no gate has been on; 0: one is */
+    uint64_t injected;                /* bit: kind of fault that has begun */
+    uint8_t cell[ORACLE_CELLS / 8];
+    /* Private. */
+    oracle_drive_t drive;
+    uint64_t interrupt_ns;
+    bool confirmed, commanded, off_seen, clear_seen;
+    uint64_t run_ns, off_ns, speed_ns, voltage_ns;
+    unsigned over_current_looks;
+    double peak_A[HAL_PHASES_MAX]; /* of the last looks, decaying not: of the last millisecond */
+    double speed_recent_rad_s, voltage_recent_high_V, voltage_recent_low_V, current_recent_A;
+    uint64_t recent_ns;
+    /* Recovery. */
+    double recovery_rpm;
+    uint64_t recovered_run_ns, settle_by_ns, in_band_ns;
+    bool recovery_judged, recovered, settled;
+    bool held; /* at rest by an encoder that does not count: not judged, but counted */
+} oracle_t;
+
+void oracle_init(oracle_t *oracle, const world_t *world, const sender_t *sender, uint64_t period_ns);
+
+/* At each ORACLE_LOOK_NS of virtual time, from plant_observe. */
+void oracle_look(oracle_t *oracle, const plant_t *plant);
+
+/* After each control interrupt. */
+void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive_t drive);
+
+/* The drive was reset. */
+void oracle_reset(oracle_t *oracle, oracle_drive_t drive);
+
+/* Events of the sender. */
+void oracle_on_bus(oracle_t *oracle, uint64_t time_ns, const sender_meaning_t *meaning);
+void oracle_on_fault(oracle_t *oracle, const plant_t *plant, unsigned kind, bool begins);
+
+/* At the begin of the recovery: the speed to be commanded, r/min. */
+double oracle_recovery_speed_rpm(oracle_t *oracle, const plant_t *plant);
+
+/* At the end. */
+void oracle_finish(oracle_t *oracle, const plant_t *plant);
+
+#endif

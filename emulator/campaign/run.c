@@ -1,0 +1,96 @@
+#include "campaign/run.h"
+
+static void look(void *context, const plant_t *plant) {
+    oracle_look(&((run_t *)context)->oracle, plant);
+}
+
+static void control_interrupt(void *context) {
+    run_t *run = context;
+    if (run->before_interrupt) {
+        run->before_interrupt(run);
+    }
+    run->drive->control_interrupt();
+    oracle_after_interrupt(&run->oracle, &run->rig.plant, run->drive->view());
+}
+
+static void deferred_interrupt(void *context) {
+    ((run_t *)context)->drive->deferred_interrupt();
+}
+
+static void background(void *context) {
+    ((run_t *)context)->drive->background();
+}
+
+static void restart(void *context) {
+    run_t *run = context;
+    run->drive->start(run->world, &run->rig.board); /* which has accepted this configuration */
+    oracle_reset(&run->oracle, run->drive->view());
+}
+
+static void on_bus(void *context, uint64_t time_ns, const sender_meaning_t *meaning) {
+    oracle_on_bus(&((run_t *)context)->oracle, time_ns, meaning);
+}
+
+static void on_fault(void *context, uint64_t time_ns, unsigned kind, bool begins) {
+    run_t *run = context;
+    (void)time_ns;
+    oracle_on_fault(&run->oracle, &run->rig.plant, kind, begins);
+}
+
+bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE *record) {
+    run->world = world;
+    run->drive = drive;
+    run->before_interrupt = NULL;
+    run->end_ns = world->duration_us * 1000;
+    sender_init(&run->sender, world);
+    run->sender.record = record;
+    run->sender.on_bus = on_bus;
+    run->sender.on_fault = on_fault;
+    run->sender.context = run;
+    rig_config_t config = {
+        .machine = &world->machine->image.machine,
+        .initial_angle_rad = world->initial_angle_deg * (3.14159265358979323846 / 180.0),
+        .encoder_bits = world->encoder_bits,
+        .adc_bits = world->adc_bits,
+        .encoder_edges = world->encoder_edges,
+        .seed = world->seed,
+        .bit_rate = 1000000,
+        .stop_at_ns = RIG_NEVER,
+        .stop = {.descriptors = {-1, -1}},
+        .transport = &run->sender.transport,
+    };
+    pacing_parse(&config.pacing, "lockstep");
+    rig_init(&run->rig, &config);
+    if (!drive->start(world, &run->rig.board)) {
+        return false;
+    }
+    const rig_firmware_t firmware = {.control_interrupt = control_interrupt,
+                                     .deferred_interrupt = deferred_interrupt,
+                                     .background = background,
+                                     .restart = restart,
+                                     .context = run};
+    oracle_init(&run->oracle, world, &run->sender, 1000000000u / world->control_rate_hz);
+    rig_join(&run->rig, &firmware);
+    plant_observe(&run->rig.plant, ORACLE_LOOK_NS / 2, ORACLE_LOOK_NS, look, run);
+    return true;
+}
+
+void run_to_end(run_t *run) {
+    const uint64_t recovery_ns = run->world->recovery_us * 1000;
+    bool recovers = recovery_ns > 0;
+    while (run->rig.board.time_ns < run->end_ns) {
+        if (recovers && run->rig.board.time_ns >= recovery_ns) {
+            recovers = false;
+            sender_set_recovery_speed(&run->sender, oracle_recovery_speed_rpm(&run->oracle, &run->rig.plant));
+        }
+        if (!rig_serve(&run->rig, 0)) {
+            break;
+        }
+        if (run->oracle.settled) { /* nothing left to be judged */
+            run->end_ns = run->rig.board.time_ns;
+        }
+    }
+    rig_finish(&run->rig);
+    oracle_finish(&run->oracle, &run->rig.plant);
+    rig_close(&run->rig);
+}

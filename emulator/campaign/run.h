@@ -1,0 +1,36 @@
+/* A world in one process: rig, clients, oracle, and the drive by the functions of run_drive_t. One at a time. */
+#ifndef CAMPAIGN_RUN_H
+#define CAMPAIGN_RUN_H
+
+#include "campaign/oracle.h"
+#include "campaign/sender.h"
+#include "campaign/world.h"
+#include "rig/rig.h"
+
+/* The firmware. start: from reset, with the machine of the world; false when it rejects the configuration. */
+typedef struct {
+    bool (*start)(const world_t *world, board_t *board);
+    void (*control_interrupt)(void);
+    void (*deferred_interrupt)(void);
+    void (*background)(void);
+    oracle_drive_t (*view)(void);
+} run_drive_t;
+
+typedef struct run {
+    rig_t rig;
+    sender_t sender;
+    oracle_t oracle;
+    const world_t *world;
+    const run_drive_t *drive;
+    uint64_t end_ns;                           /* may be moved while it runs */
+    void (*before_interrupt)(struct run *run); /* NULL: none */
+} run_t;
+
+/* Begins a run at time 0. False when the drive rejects the configuration. record: of the frames that are sent, or NULL;
+ * frames: the clients' true state and hash are wanted. */
+bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE *record);
+
+/* Runs to end_ns, and judges what is judged at the end. */
+void run_to_end(run_t *run);
+
+#endif

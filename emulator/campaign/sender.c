@@ -1,0 +1,399 @@
+#include "campaign/sender.h"
+
+#include <inttypes.h>
+#include <math.h>
+#include <string.h>
+
+#include "bench_variables.h"
+#include "campaign/seeded.h"
+#include "drive_codec.h"
+#include "rig_codec.h"
+
+#define HASH_START UINT64_C(14695981039346656037)
+#define HASH_PRIME UINT64_C(1099511628211)
+#define COMMAND_PERIOD_US 10000
+#define ARM_RETRY_US 20000
+#define STREAM_HOSTILE 200
+
+/* E2EDataId of drive.dbc. */
+enum { DATA_ID_COMMAND = 23070, DATA_ID_ARM = 23072 };
+enum { STATE_INITIALISE, STATE_READY, STATE_RUN, STATE_FAULT };
+enum { HONEST = 1, OTHER = 2 };
+
+static void mix(sender_t *sender, const void *bytes, size_t count) {
+    const uint8_t *each = bytes;
+    for (size_t i = 0; i < count; i++) {
+        sender->hash = (sender->hash ^ each[i]) * HASH_PRIME;
+    }
+}
+
+/* --- Frames --- */
+
+/* AUTOSAR E2E profile 5; not the firmware's. */
+static uint16_t checksum(uint16_t crc, uint8_t byte) {
+    crc = (uint16_t)(crc ^ byte << 8);
+    for (unsigned bit = 0; bit < 8; bit++) {
+        crc = (uint16_t)(crc & 0x8000u ? (unsigned)crc << 1 ^ 0x1021u : (unsigned)crc << 1);
+    }
+    return crc;
+}
+
+static void protect(uint8_t *data, unsigned length, uint16_t data_id, uint8_t counter) {
+    data[2] = counter;
+    uint16_t crc = 0xFFFF;
+    for (unsigned i = 2; i < length; i++) {
+        crc = checksum(crc, data[i]);
+    }
+    crc = checksum(checksum(crc, (uint8_t)data_id), (uint8_t)(data_id >> 8));
+    data[0] = (uint8_t)crc;
+    data[1] = (uint8_t)(crc >> 8);
+}
+
+static void put(sender_t *sender, const transport_receiver_t *receiver, unsigned client, canid_t identifier,
+                const uint8_t *data, unsigned length) {
+    transport_frame_t frame;
+    memset(&frame, 0, sizeof frame);
+    frame.size = CAN_MTU;
+    frame.classic.can_id = identifier;
+    frame.classic.len = (uint8_t)length;
+    memcpy(frame.classic.data, data, length);
+    if (sender->record) {
+        fprintf(sender->record, "%" PRIu64 " %u %x ", sender->time_us * 1000, client, (unsigned)identifier);
+        for (unsigned i = 0; i < length; i++) {
+            fprintf(sender->record, "%02x", data[i]);
+        }
+        fputc('\n', sender->record);
+    }
+    receiver->take(receiver->context, client, &frame);
+}
+
+static void put_genuine(sender_t *sender, const transport_receiver_t *receiver, unsigned client, unsigned identifier,
+                        const uint8_t *data, unsigned length) {
+    sender_frame_t *kept = &sender->history[sender->sent++ % SENDER_HISTORY];
+    *kept = (sender_frame_t){.length = (uint8_t)length, .identifier = (uint16_t)identifier, .sent_us = sender->time_us};
+    memcpy(kept->data, data, length);
+    put(sender, receiver, client, identifier, data, length);
+}
+
+static void put_command(sender_t *sender, const transport_receiver_t *receiver, unsigned client, uint8_t counter,
+                        sender_request_t request, int32_t reference) {
+    uint8_t data[7] = {[3] = (uint8_t)request};
+    for (unsigned i = 0; i < 3; i++) {
+        data[4 + i] = (uint8_t)((uint32_t)reference >> 8 * i);
+    }
+    protect(data, sizeof data, DATA_ID_COMMAND, counter);
+    put_genuine(sender, receiver, client, DRIVE_COMMAND_FRAME_ID, data, sizeof data);
+}
+
+static void put_arm(sender_t *sender, const transport_receiver_t *receiver, unsigned step, uint32_t response) {
+    uint8_t data[8] = {[3] = (uint8_t)step};
+    for (unsigned i = 0; i < 4; i++) {
+        data[4 + i] = (uint8_t)(response >> 8 * i);
+    }
+    protect(data, sizeof data, DATA_ID_ARM, sender->arm_counter++);
+    put_genuine(sender, receiver, HONEST, DRIVE_ARM_FRAME_ID, data, sizeof data);
+}
+
+/* --- The bench --- */
+
+static void put_bench(sender_t *sender, const transport_receiver_t *receiver, canid_t identifier, uint8_t head,
+                      uint32_t bits, uint64_t at_us) {
+    uint8_t data[8] = {head, (uint8_t)bits, (uint8_t)(bits >> 8), (uint8_t)(bits >> 16)};
+    for (unsigned i = 0; i < 4; i++) {
+        data[4 + i] = (uint8_t)((at_us == sender->time_us ? 0 : at_us) >> 8 * i);
+    }
+    put(sender, receiver, HONEST, identifier | CAN_EFF_FLAG, data, sizeof data);
+}
+
+static bool in_step(const sender_t *sender, uint64_t at_us) {
+    return at_us >= sender->time_us && at_us < sender->time_us + SENDER_STEP_US;
+}
+
+static void put_events(sender_t *sender, const transport_receiver_t *receiver) {
+    const world_t *world = sender->world;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = &world->event[i];
+        if (!(world->kept >> i & 1u) || event->kind > WORLD_FAULT) {
+            continue;
+        }
+        for (unsigned end = 0; end < 2; end++) {
+            const uint64_t at_us = end ? event->end_us : event->begin_us;
+            if (!in_step(sender, at_us) || (end && event->end_us == 0)) {
+                continue;
+            }
+            if (event->kind == WORLD_SET) {
+                put_bench(sender, receiver, RIG_SET_FRAME_ID, (uint8_t)event->what,
+                          (uint32_t)(end ? event->raw_end : event->raw), at_us);
+            } else {
+                const uint32_t place = event->phase | event->leg << 2 | (end ? 0u : 8u);
+                put_bench(sender, receiver, RIG_FAULT_FRAME_ID, (uint8_t)event->what,
+                          place | ((uint32_t)event->raw & 0xFFFFFu) << 4, at_us);
+            }
+        }
+    }
+}
+
+/* --- The honest client --- */
+
+static bool has(const sender_t *sender, world_kind_t kind) {
+    for (unsigned i = 0; i < sender->world->events; i++) {
+        if (sender->world->event[i].kind == kind && world_active(sender->world, i, sender->time_us)) {
+            return true;
+        }
+    }
+    return false;
+}
+
+static int32_t reference_of(const world_t *world, double rpm) {
+    return (int32_t)floor(rpm / world->machine->command_lsb_rpm + 0.5);
+}
+
+/* off for 20 ms, clear_fault for 20 ms, until the drive has left the state fault. */
+static sender_request_t clearing(const sender_t *sender) {
+    const uint64_t since_us = sender->time_us - sender->phase_us;
+    return since_us % 40000 < 20000 ? SENDER_OFF : SENDER_CLEAR;
+}
+
+static sender_request_t wanted(sender_t *sender) {
+    const world_t *world = sender->world;
+    const bool recovers = world->recovery_us && sender->time_us >= world->recovery_us;
+    const bool clears = recovers || has(sender, WORLD_EAGER);
+    if (sender->state == STATE_FAULT && sender->last_state != STATE_FAULT) {
+        sender->phase_us = sender->time_us;
+    }
+    if (recovers && sender->time_us < world->recovery_us + 2 * SENDER_STEP_US) {
+        sender->phase_us = sender->time_us;
+    }
+    sender->last_state = sender->state;
+    if (recovers && sender->time_us < world->recovery_us + 25000) {
+        return SENDER_OFF;
+    }
+    return clears && sender->state == STATE_FAULT ? clearing(sender) : SENDER_RUN;
+}
+
+static void step_honest(sender_t *sender, const transport_receiver_t *receiver) {
+    const world_t *world = sender->world;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = &world->event[i];
+        if (event->kind == WORLD_SPEED && (world->kept >> i & 1u) && in_step(sender, event->begin_us)) {
+            sender->reference = reference_of(world, event->value);
+            sender->due_us = sender->time_us;
+        }
+    }
+    const sender_request_t request = wanted(sender);
+    if (world->recovery_us && sender->time_us >= world->recovery_us) {
+        sender->reference = sender->recovery_reference;
+    }
+    if (has(sender, WORLD_SILENT) || sender->time_us < 2000) {
+        return;
+    }
+    if (request != sender->request || sender->time_us >= sender->due_us) {
+        sender->request = request;
+        sender->due_us = sender->time_us + COMMAND_PERIOD_US;
+        put_command(sender, receiver, HONEST, sender->counter++, request,
+                    request == SENDER_RUN ? sender->reference : 0);
+    }
+    if (request != SENDER_RUN || sender->armed || sender->state == STATE_FAULT || sender->state == STATE_INITIALISE) {
+        return;
+    }
+    if (sender->challenge) {
+        put_arm(sender, receiver, 1, ~sender->challenge);
+        sender->challenge = 0;
+    } else if (sender->time_us >= sender->requested_us + ARM_RETRY_US) {
+        sender->requested_us = sender->time_us;
+        put_arm(sender, receiver, 0, 0);
+    }
+}
+
+/* --- The second client --- */
+
+static uint64_t draw(sender_t *sender) {
+    return seeded_bits(sender->world->seed, STREAM_HOSTILE, sender->drawn++);
+}
+
+static void put_random(sender_t *sender, const transport_receiver_t *receiver, unsigned identifier, unsigned length) {
+    uint8_t data[8];
+    const uint64_t bits = draw(sender);
+    memcpy(data, &bits, sizeof data);
+    put(sender, receiver, OTHER, identifier, data, length);
+}
+
+static void put_replay(sender_t *sender, const transport_receiver_t *receiver) {
+    const uint64_t back = 5 + draw(sender) % (SENDER_HISTORY - 6);
+    if (sender->sent > back) {
+        const sender_frame_t *old = &sender->history[(sender->sent - back) % SENDER_HISTORY];
+        put(sender, receiver, OTHER, old->identifier, old->data, old->length);
+    }
+}
+
+/* A command of any kind with the next counter, its checksum off by a bit. */
+static void put_forged(sender_t *sender, const transport_receiver_t *receiver) {
+    uint8_t data[7] = {[3] = (uint8_t)(draw(sender) % 4)};
+    protect(data, sizeof data, DATA_ID_COMMAND, sender->counter);
+    data[0] ^= (uint8_t)(1u << draw(sender) % 8);
+    put(sender, receiver, OTHER, DRIVE_COMMAND_FRAME_ID, data, sizeof data);
+}
+
+static void step_hostile(sender_t *sender, const transport_receiver_t *receiver, world_hostile_t sort) {
+    static const unsigned commands[] = {DRIVE_COMMAND_FRAME_ID, DRIVE_TORQUE_COMMAND_FRAME_ID, DRIVE_ARM_FRAME_ID,
+                                        DRIVE_PARAMETER_WRITE_FRAME_ID, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID};
+    const unsigned identifier = commands[draw(sender) % 5];
+    switch (sort) {
+    case WORLD_HOSTILE_NOISE:
+        put_random(sender, receiver, identifier, identifier == DRIVE_COMMAND_FRAME_ID ? 7 : 8);
+        break;
+    case WORLD_HOSTILE_REPLAY:
+        put_replay(sender, receiver);
+        break;
+    case WORLD_HOSTILE_LENGTH:
+        put_random(sender, receiver, identifier, (unsigned)(draw(sender) % 9));
+        break;
+    case WORLD_HOSTILE_FORGED:
+        put_forged(sender, receiver);
+        break;
+    case WORLD_HOSTILE_FLOOD:
+        for (unsigned i = 0; i < 5; i++) {
+            put_random(sender, receiver, (unsigned)(draw(sender) % 0x600), (unsigned)(draw(sender) % 9));
+        }
+        break;
+    default:
+        put_random(sender, receiver, DRIVE_STATUS_FRAME_ID + (unsigned)(draw(sender) % 16), 8);
+        break;
+    }
+}
+
+static void step_other(sender_t *sender, const transport_receiver_t *receiver) {
+    const world_t *world = sender->world;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = &world->event[i];
+        if (event->kind == WORLD_HOSTILE && world_active(world, i, sender->time_us)) {
+            step_hostile(sender, receiver, (world_hostile_t)event->what);
+        }
+        if (event->kind == WORLD_SECOND && world_active(world, i, sender->time_us) &&
+            sender->time_us >= sender->second_due_us) {
+            sender->second_due_us = sender->time_us + COMMAND_PERIOD_US;
+            put_command(sender, receiver, OTHER, sender->second_counter++, SENDER_RUN, -sender->reference / 2);
+        }
+    }
+}
+
+/* --- Transport --- */
+
+static size_t descriptors(transport_t *transport, struct pollfd *list) {
+    (void)transport;
+    (void)list;
+    return 0;
+}
+
+static size_t read_clients(transport_t *transport, const transport_receiver_t *receiver) {
+    sender_t *sender = (sender_t *)transport;
+    put_events(sender, receiver);
+    step_honest(sender, receiver);
+    step_other(sender, receiver);
+    uint8_t run[7];
+    const uint64_t until_ns = (sender->time_us + SENDER_STEP_US) * 1000;
+    memcpy(run, &until_ns, 6);
+    run[6] = (uint8_t)(sender->time_us / SENDER_STEP_US);
+    put(sender, receiver, HONEST, RIG_RUN_UNTIL_FRAME_ID | CAN_EFF_FLAG, run, sizeof run);
+    sender->time_us += SENDER_STEP_US;
+    return 0;
+}
+
+static bool is_latest(const sender_frame_t *frame, const struct can_frame *on_bus) {
+    return frame->identifier == on_bus->can_id && frame->length == on_bus->len &&
+           memcmp(frame->data, on_bus->data, frame->length) == 0;
+}
+
+/* A replay is at least five frames old, and a genuine frame waits for at most some milliseconds. */
+static sender_meaning_t meaning_of(const sender_t *sender, const struct can_frame *on_bus) {
+    for (uint64_t back = 1; back <= 4 && back <= sender->sent; back++) {
+        const sender_frame_t *frame = &sender->history[(sender->sent - back) % SENDER_HISTORY];
+        if (is_latest(frame, on_bus)) {
+            return (sender_meaning_t){.genuine = true,
+                                      .command = frame->identifier == DRIVE_COMMAND_FRAME_ID,
+                                      .confirms = frame->identifier == DRIVE_ARM_FRAME_ID && frame->data[3] == 1,
+                                      .request = (sender_request_t)frame->data[3]};
+        }
+    }
+    return (sender_meaning_t){.genuine = false};
+}
+
+static void listen(sender_t *sender, const struct can_frame *frame) {
+    if (frame->can_id == DRIVE_STATUS_FRAME_ID && frame->len == 8) {
+        sender->state = frame->data[4] & 0x0F;
+    } else if (frame->can_id == DRIVE_ARMING_FRAME_ID && frame->len == 8) {
+        uint32_t challenge;
+        memcpy(&challenge, frame->data, sizeof challenge);
+        sender->armed = frame->data[4] >> 2 & 1u;
+        sender->challenge = (frame->data[4] & 3u) == 1u ? challenge : 0;
+    }
+}
+
+/* What is on the bus, and the true state: not the answers of the bench, which depend on how a client divides time. */
+static bool counts(const transport_frame_t *frame) {
+    if (frame->size != CAN_MTU) {
+        return false;
+    }
+    const canid_t identifier = frame->classic.can_id & CAN_EFF_MASK;
+    return !transport_frame_is_rig(frame) ||
+           (identifier >= RIG_TRUTH_MOTION_FRAME_ID && identifier <= RIG_TRUTH_FAULT_FRAME_ID);
+}
+
+static void send_clients(transport_t *transport, uint64_t time_ns, transport_origin_t origin,
+                         const transport_frame_t *frame) {
+    sender_t *sender = (sender_t *)transport;
+    if (!counts(frame)) {
+        return;
+    }
+    sender->frames++;
+    mix(sender, &time_ns, sizeof time_ns);
+    mix(sender, &frame->classic.can_id, sizeof frame->classic.can_id);
+    mix(sender, &frame->classic.len, 1);
+    mix(sender, frame->classic.data, frame->classic.len);
+    if (origin == TRANSPORT_FROM_CLIENT_ON_BUS) {
+        const sender_meaning_t meaning = meaning_of(sender, &frame->classic);
+        sender->on_bus(sender->context, time_ns, &meaning);
+    } else if (origin == TRANSPORT_FROM_EMULATOR) {
+        if (frame->classic.can_id == (RIG_TRUTH_FAULT_FRAME_ID | CAN_EFF_FLAG)) {
+            sender->on_fault(sender->context, time_ns, frame->classic.data[0], frame->classic.data[2] & 1u);
+        } else {
+            listen(sender, &frame->classic);
+        }
+    }
+}
+
+static void nothing(transport_t *transport) {
+    (void)transport;
+}
+
+static bool connected(transport_t *transport, uint32_t client) {
+    (void)transport;
+    (void)client;
+    return true;
+}
+
+static bool in_use(transport_t *transport) {
+    (void)transport;
+    return true;
+}
+
+void sender_init(sender_t *sender, const world_t *world) {
+    *sender = (sender_t){
+        .transport = {.descriptors = descriptors,
+                      .read = read_clients,
+                      .send = send_clients,
+                      .flush = nothing,
+                      .close = nothing,
+                      .connected = connected,
+                      .in_use = in_use},
+        .world = world,
+        .counter = (uint8_t)seeded_bits(world->seed, STREAM_HOSTILE, UINT64_MAX),
+        .second_counter = (uint8_t)seeded_bits(world->seed, STREAM_HOSTILE, UINT64_MAX - 1),
+        .arm_counter = (uint8_t)seeded_bits(world->seed, STREAM_HOSTILE, UINT64_MAX - 2),
+        .hash = HASH_START,
+    };
+}
+
+void sender_set_recovery_speed(sender_t *sender, double rpm) {
+    sender->recovery_reference = reference_of(sender->world, rpm);
+}

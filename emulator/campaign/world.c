@@ -1,0 +1,371 @@
+#include "campaign/world.h"
+
+#include <inttypes.h>
+#include <math.h>
+#include <stdio.h>
+
+#include "bench_variables.h"
+#include "campaign/seeded.h"
+#include "fault_kinds.h"
+
+/* Streams of random numbers; the index within one is that of the draw. */
+enum {
+    STREAM_BOARD = 1,
+    STREAM_IMPERFECTION,
+    STREAM_SPEED,
+    STREAM_LOAD,
+    STREAM_SCRIPT,
+    STREAM_FAULT_ON,
+    STREAM_FAULT,
+    STREAM_BUS,
+    STREAM_GATES,
+};
+
+#define FAULT_DRAWS 8   /* random numbers of a kind of fault */
+#define FAULT_SHARE 0.1 /* of the kinds, on average, that a seed has */
+#define FAULTS_MAX 6
+
+static int32_t raw_of(unsigned variable, double value) {
+    const double raw = value / bench_variables[variable].scale;
+    return (int32_t)fmin(fmax(floor(raw + 0.5), bench_variables[variable].raw_minimum),
+                         bench_variables[variable].raw_maximum);
+}
+
+static world_event_t *add(world_t *world, world_kind_t kind, uint64_t begin_us, uint64_t end_us) {
+    if (world->events == WORLD_EVENTS_MAX) {
+        return NULL;
+    }
+    world_event_t *event = &world->event[world->events++];
+    *event = (world_event_t){.kind = kind, .begin_us = begin_us, .end_us = end_us};
+    return event;
+}
+
+static void add_set(world_t *world, unsigned variable, double value, double after, uint64_t begin_us, uint64_t end_us) {
+    world_event_t *event = add(world, WORLD_SET, begin_us, end_us);
+    if (event) {
+        event->what = variable;
+        event->raw = raw_of(variable, value);
+        event->raw_end = raw_of(variable, after);
+    }
+}
+
+static void add_speed(world_t *world, double rpm, uint64_t begin_us) {
+    world_event_t *event = add(world, WORLD_SPEED, begin_us, 0);
+    if (event) {
+        const double limit = world->machine->speed_command_max_rpm;
+        event->value = fmax(fmin(rpm, limit), -limit);
+    }
+}
+
+static double logarithmic(uint64_t seed, uint64_t stream, uint64_t index, double low, double high) {
+    return exp(seeded_between(seed, stream, index, log(low), log(high)));
+}
+
+/* Machine, board, sensors: what both kinds of worlds have. */
+static void draw_board(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
+    static const unsigned rates_hz[] = {20000, 40000, 40000, 50000};
+    *world = (world_t){.seed = seed, .kept = UINT64_MAX};
+    world->machine = &machines[seeded_below(seed, STREAM_BOARD, 0, count)];
+    const machine_t *machine = &world->machine->image.machine;
+    world->control_rate_hz = rates_hz[seeded_below(seed, STREAM_BOARD, 1, 4)];
+    if (world->control_rate_hz < world->machine->rate_min_hz) {
+        world->control_rate_hz = world->machine->rate_min_hz > 50000 ? 100000 : 50000;
+    }
+    world->controller = seeded_below(seed, STREAM_BOARD, 2, 3);
+    world->encoder_bits = 10 + seeded_below(seed, STREAM_BOARD, 3, 11);
+    world->adc_bits = 12 + seeded_below(seed, STREAM_BOARD, 4, 3);
+    world->encoder_edges = seeded_below(seed, STREAM_BOARD, 5, 2);
+    world->initial_angle_deg = seeded_between(seed, STREAM_BOARD, 6, 0.0, 360.0);
+    world->supply_V = machine->supply_voltage_V;
+    world->inertia_gain = 1.0;
+}
+
+/* As built machines and boards scatter; the ranges of the robustness study, the encoder apart. */
+static void draw_imperfections(world_t *world) {
+    const uint64_t seed = world->seed;
+    const machine_t *machine = &world->machine->image.machine;
+    const double range_A = machine->ranges.current_A;
+    world->inertia_gain = logarithmic(seed, STREAM_IMPERFECTION, 2, 0.7, 2.0);
+    const struct {
+        unsigned variable;
+        double value;
+    } all[] = {
+        {BENCH_VARIABLE_FLUX_LINKAGE_GAIN, seeded_between(seed, STREAM_IMPERFECTION, 0, 0.95, 1.05)},
+        {BENCH_VARIABLE_RESISTANCE_GAIN, seeded_between(seed, STREAM_IMPERFECTION, 1, 0.8, 1.4)},
+        {BENCH_VARIABLE_INERTIA_GAIN, world->inertia_gain},
+        {BENCH_VARIABLE_FRICTION_GAIN, seeded_between(seed, STREAM_IMPERFECTION, 3, 0.0, 3.0)},
+        {BENCH_VARIABLE_ENCODER_OFFSET_DEG, seeded_between(seed, STREAM_IMPERFECTION, 4, -0.1, 0.1)},
+        {BENCH_VARIABLE_CURRENT_NOISE_A, seeded_between(seed, STREAM_IMPERFECTION, 5, 0.0, 0.0005 * range_A)},
+    };
+    for (unsigned i = 0; i < sizeof all / sizeof *all; i++) {
+        if (seeded_unit(seed, STREAM_IMPERFECTION, 100 + i) < 0.5) {
+            add_set(world, all[i].variable, all[i].value, all[i].value, 0, 0);
+        } else if (all[i].variable == BENCH_VARIABLE_INERTIA_GAIN) {
+            world->inertia_gain = 1.0;
+        }
+    }
+}
+
+/* Largest load at a speed that leaves the drive a reserve. */
+static double load_max_Nm(const world_t *world, double rpm) {
+    const world_machine_t *machine = world->machine;
+    const double part = fabs(rpm) / machine->speed_base_rpm;
+    const double friction = machine->image.machine.friction_Nm_s * 3.0 * fabs(rpm) * 0.10472;
+    return fmax(0.0, 0.6 * machine->torque_rated_Nm * (part < 0.8 ? 1.0 : 0.8 / part) - friction);
+}
+
+static double draw_speed_rpm(const world_t *world, unsigned index) {
+    const double rpm = world->machine->speed_base_rpm * logarithmic(world->seed, STREAM_SPEED, index, 0.02, 1.0);
+    const bool reverse = world->controller == 2 && seeded_unit(world->seed, STREAM_SPEED, 50 + index) < 0.3;
+    return reverse ? -rpm : rpm;
+}
+
+/* Load of one of five sorts from begin_us on. */
+static void draw_load(world_t *world, double rpm, uint64_t begin_us) {
+    const uint64_t seed = world->seed;
+    const double sign = rpm < 0.0 ? -1.0 : 1.0;
+    const double torque_Nm = load_max_Nm(world, rpm) * seeded_unit(seed, STREAM_LOAD, 1);
+    const bool coarse = world->machine->torque_max_Nm > 150.0;
+    const unsigned step = coarse ? BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM : BENCH_VARIABLE_LOAD_TORQUE_NM;
+    const unsigned ramp = coarse ? BENCH_VARIABLE_LOAD_RAMP_COARSE_NM_S : BENCH_VARIABLE_LOAD_RAMP_NM_S;
+    const unsigned sine = coarse ? BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM : BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_NM;
+    switch (seeded_below(seed, STREAM_LOAD, 0, 4)) {
+    case 0:
+        break;
+    case 1:
+        add_set(world, step, sign * torque_Nm, 0.0, begin_us, world->recovery_us);
+        break;
+    case 2:
+        add_set(world, ramp, torque_Nm / logarithmic(seed, STREAM_LOAD, 2, 0.002, 0.2), 0.0, begin_us - 1000,
+                world->recovery_us);
+        add_set(world, step, sign * torque_Nm, 0.0, begin_us, world->recovery_us ? world->recovery_us + 1000 : 0);
+        break;
+    default:
+        add_set(world, BENCH_VARIABLE_LOAD_SINE_FREQUENCY_HZ, logarithmic(seed, STREAM_LOAD, 3, 1.0, 100.0), 1.0,
+                begin_us - 1000, 0);
+        add_set(world, sine, 0.3 * torque_Nm, 0.0, begin_us, world->recovery_us);
+        add_set(world, step, sign * 0.7 * torque_Nm, 0.0, begin_us, world->recovery_us);
+        break;
+    }
+}
+
+static double start_s(const world_t *world, double from_rpm, double to_rpm) {
+    const machine_t *machine = &world->machine->image.machine;
+    return machine->inertia_kg_m2 * world->inertia_gain * fabs(to_rpm - from_rpm) * 0.10472 /
+           world->machine->torque_max_Nm;
+}
+
+/* --- Faults --- */
+
+static double attribute_of(const world_t *world, unsigned kind, double unit) {
+    const machine_t *machine = &world->machine->image.machine;
+    const double range_A = machine->ranges.current_A, range_V = machine->ranges.dc_link_V;
+    switch (kind) {
+    case FAULT_WINDING_SHORTED:
+        return 2.0 + 48.0 * unit;
+    case FAULT_CURRENT_SENSOR_STUCK:
+    case FAULT_DC_LINK_SENSOR_STUCK:
+        return floor(unit * (double)(1u << world->adc_bits));
+    case FAULT_CURRENT_SENSOR_GAIN:
+        return unit < 0.5 ? unit : 2.0 + 4.0 * (unit - 0.5);
+    case FAULT_CURRENT_SENSOR_OFFSET:
+        return (unit - 0.5) * 0.8 * range_A;
+    case FAULT_CURRENT_SENSOR_SWAPPED:
+        return floor(unit * machine->phases);
+    case FAULT_DC_LINK_SENSOR_GAIN:
+        return unit < 0.5 ? unit : 1.3 + 2.0 * (unit - 0.5);
+    case FAULT_DC_LINK_SENSOR_OFFSET:
+        return (unit - 0.5) * range_V;
+    case FAULT_ENCODER_JUMP:
+        return (unit < 0.5 ? -1.0 : 1.0) * exp(log(0.2) + (log(180.0) - log(0.2)) * fabs(2.0 * unit - 1.0));
+    case FAULT_ENCODER_LOST_COUNTS:
+        return floor(exp(log(0.005) * unit) * (double)(1u << world->encoder_bits) * 0.2) + 1.0;
+    case FAULT_ENCODER_NOISE:
+        return 0.3 + 9.0 * unit;
+    case FAULT_ENCODER_SLIP:
+        return (unit - 0.5) * 700.0;
+    case FAULT_COULOMB_FRICTION:
+    case FAULT_STATIC_FRICTION:
+        return fmin(500.0, world->machine->torque_max_Nm * (0.3 + unit));
+    case FAULT_SUPPLY_SAGGED:
+        return 100.0 * unit;
+    case FAULT_SUPPLY_SURGED:
+        return 10.0 + 90.0 * unit;
+    case FAULT_SUPPLY_RIPPLE:
+        return fmin(500.0, machine->supply_voltage_V * 0.6 * unit);
+    default:
+        return 0.0;
+    }
+}
+
+static bool possible(const world_t *world, unsigned kind) {
+    const machine_t *machine = &world->machine->image.machine;
+    return fault_kinds[kind].name && !(kind == FAULT_CHOPPER_OPEN && (machine->dc_link.capacitance_F == 0.0 ||
+                                                                      machine->dc_link.chopper_resistance_ohm == 0.0));
+}
+
+static void draw_fault(world_t *world, unsigned kind, uint64_t last_us) {
+    const uint64_t seed = world->seed, base = (uint64_t)kind * FAULT_DRAWS;
+    /* A fifth is there before the start. */
+    const bool early = seeded_unit(seed, STREAM_FAULT, base) < 0.2;
+    const uint64_t begin_us = early ? 0 : (uint64_t)seeded_between(seed, STREAM_FAULT, base + 1, 5e3, (double)last_us);
+    uint64_t end_us = begin_us + 20 + (uint64_t)logarithmic(seed, STREAM_FAULT, base + 2, 30.0, 2e5);
+    end_us = end_us < last_us ? end_us : last_us;
+    world_event_t *event = end_us > begin_us ? add(world, WORLD_FAULT, begin_us, end_us) : NULL;
+    if (!event) {
+        return;
+    }
+    event->what = kind;
+    event->phase = fault_kinds[kind].has_phase
+                       ? seeded_below(seed, STREAM_FAULT, base + 3, world->machine->image.machine.phases)
+                       : 0;
+    event->leg = fault_kinds[kind].has_leg ? seeded_below(seed, STREAM_FAULT, base + 4, 2) : 0;
+    const double value = attribute_of(world, kind, seeded_unit(seed, STREAM_FAULT, base + 5));
+    if (fault_kinds[kind].has_attribute) {
+        event->raw = (int32_t)fmin(fmax(floor(value / fault_kinds[kind].scale + 0.5), fault_kinds[kind].raw_minimum),
+                                   fault_kinds[kind].raw_maximum);
+    }
+    event->value = value;
+}
+
+/* Faults of the bus, both lines of safe torque off, late interrupts and resets: bench variables. */
+static void draw_other_faults(world_t *world, uint64_t last_us) {
+    const uint64_t seed = world->seed;
+    const struct {
+        unsigned variable;
+        double value, after;
+    } all[] = {
+        {BENCH_VARIABLE_STO_1, 1, 0},
+        {BENCH_VARIABLE_STO_2, 1, 0},
+        {BENCH_VARIABLE_INTERRUPT_TIME_US, logarithmic(seed, STREAM_GATES, 90, 5.0, 5000.0), 0},
+        {BENCH_VARIABLE_BABBLE_LOAD_PERCENT, seeded_between(seed, STREAM_BUS, 90, 20.0, 100.0), 0},
+        {BENCH_VARIABLE_BUS_CONNECTION, 0, 1},
+        {BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER, 256, 0},
+        {BENCH_VARIABLE_FRAME_FAULT, 1 + seeded_below(seed, STREAM_BUS, 91, 4), 0},
+        {BENCH_VARIABLE_DRIVE_RESET, 1, 0},
+    };
+    for (unsigned i = 0; i < sizeof all / sizeof *all; i++) {
+        if (seeded_unit(seed, STREAM_GATES, i) >= 0.05) {
+            continue;
+        }
+        const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_GATES, 20 + i, 2e3, (double)last_us);
+        uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_GATES, 40 + i, 100.0, 3e5);
+        end_us = end_us < last_us ? end_us : last_us;
+        if (all[i].variable == BENCH_VARIABLE_FRAME_FAULT) {
+            add_set(world, BENCH_VARIABLE_FRAME_FAULT_PER_MILLE, seeded_between(seed, STREAM_BUS, 92, 10.0, 1000.0),
+                    0.0, begin_us, end_us);
+            add_set(world, BENCH_VARIABLE_FRAME_DELAY_US, seeded_between(seed, STREAM_BUS, 93, 0.0, 1e5), 0.0, begin_us,
+                    0);
+        }
+        const bool once =
+            all[i].variable == BENCH_VARIABLE_DRIVE_RESET || all[i].variable == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER;
+        add_set(world, all[i].variable, all[i].value, all[i].after, begin_us, once ? 0 : end_us);
+    }
+}
+
+static void draw_script(world_t *world, uint64_t last_us) {
+    const uint64_t seed = world->seed;
+    const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_SCRIPT, 1, 2e4, (double)last_us);
+    const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_SCRIPT, 2, 5e3, 1.5e6);
+    const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
+    if (sort < 0.12) {
+        add(world, WORLD_SILENT, begin_us, end_us < last_us ? end_us : last_us);
+    } else if (sort < 0.24) {
+        world_event_t *event = add(world, WORLD_HOSTILE, begin_us, end_us < last_us ? end_us : last_us);
+        event->what = seeded_below(seed, STREAM_SCRIPT, 3, WORLD_HOSTILE_SORTS);
+    } else if (sort < 0.32) {
+        add(world, WORLD_SECOND, begin_us, end_us < last_us ? end_us : last_us);
+    }
+    if (seeded_unit(seed, STREAM_SCRIPT, 4) < 0.3) {
+        add(world, WORLD_EAGER, 0, 0);
+    }
+}
+
+void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
+    draw_board(world, machines, count, seed);
+    draw_imperfections(world);
+    const double first_rpm = draw_speed_rpm(world, 0);
+    uint64_t last_us = (uint64_t)(1e6 * fmin(0.1 + 1.5 * start_s(world, 0.0, first_rpm),
+                                             seeded_between(seed, STREAM_SCRIPT, 9, 0.1, 0.4)));
+    const bool long_silence = seeded_unit(seed, STREAM_SCRIPT, 0) < 0.04;
+    last_us = long_silence ? 900000 : last_us;
+    world->recovery_us = last_us + 25000;
+    add_speed(world, first_rpm, 0);
+    if (seeded_unit(seed, STREAM_SPEED, 90) < 0.4) {
+        add_speed(world, draw_speed_rpm(world, 1),
+                  (uint64_t)seeded_between(seed, STREAM_SPEED, 91, 0.3, 1.0) * last_us);
+    }
+    draw_load(world, first_rpm, (uint64_t)seeded_between(seed, STREAM_LOAD, 9, 1e4, (double)last_us));
+    draw_script(world, last_us);
+    unsigned faults = 0;
+    for (unsigned i = 1; i < FAULT_COUNT && faults < FAULTS_MAX; i++) {
+        const unsigned kind = 1 + (i + (unsigned)(seed % (FAULT_COUNT - 1))) % (FAULT_COUNT - 1);
+        if (possible(world, kind) && seeded_unit(seed, STREAM_FAULT_ON, kind) < FAULT_SHARE) {
+            draw_fault(world, kind, last_us);
+            faults++;
+        }
+    }
+    draw_other_faults(world, last_us);
+    world->duration_us = world->recovery_us + 320000;
+}
+
+void world_draw_healthy(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
+    draw_board(world, machines, count, seed);
+    world->healthy = true;
+    draw_imperfections(world);
+    double rpm = 0.0, at_s = 0.0;
+    const unsigned changes = 1 + seeded_below(seed, STREAM_SPEED, 80, 3);
+    for (unsigned i = 0; i < changes; i++) {
+        const double next_rpm = draw_speed_rpm(world, i);
+        add_speed(world, next_rpm, (uint64_t)(at_s * 1e6));
+        at_s += fmin(2.0 * start_s(world, rpm, next_rpm) + 0.1, 3.0);
+        rpm = next_rpm;
+    }
+    draw_load(world, rpm, (uint64_t)(at_s * 1e6));
+    world->duration_us = (uint64_t)((at_s + seeded_between(seed, STREAM_LOAD, 8, 0.3, 1.0)) * 1e6);
+}
+
+bool world_active(const world_t *world, unsigned event, uint64_t time_us) {
+    const world_event_t *each = &world->event[event];
+    return (world->kept >> event & 1u) && each->begin_us <= time_us && (each->end_us == 0 || time_us < each->end_us);
+}
+
+const char *world_event_name(const world_event_t *event) {
+    static const char *const names[] = {
+        [WORLD_SPEED] = "speed_reference", [WORLD_SILENT] = "silent", [WORLD_HOSTILE] = "hostile",
+        [WORLD_SECOND] = "second_sender",  [WORLD_EAGER] = "eager",
+    };
+    return event->kind == WORLD_SET     ? bench_variables[event->what].name
+           : event->kind == WORLD_FAULT ? fault_kinds[event->what].name
+                                        : names[event->kind];
+}
+
+void world_print(const world_t *world) {
+    static const char *const controllers[] = {"traditional", "paper", "salient"};
+    printf("{\"seed\": %" PRIu64 ", \"machine\": \"%s\", \"controller\": \"%s\", \"control_rate_hz\": %u, "
+           "\"encoder_bits\": %u, \"adc_bits\": %u, \"encoder_edges\": %s, \"initial_angle_deg\": %.17g, "
+           "\"duration_us\": %" PRIu64 ", \"recovery_us\": %" PRIu64 ", \"events\": [",
+           world->seed, world->machine->name, controllers[world->controller], world->control_rate_hz,
+           world->encoder_bits, world->adc_bits, world->encoder_edges ? "true" : "false", world->initial_angle_deg,
+           world->duration_us, world->recovery_us);
+    const char *separator = "";
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = &world->event[i];
+        if (!(world->kept >> i & 1u)) {
+            continue;
+        }
+        double value = event->value;
+        if (event->kind == WORLD_SET) {
+            value = event->raw * bench_variables[event->what].scale;
+        } else if (event->kind == WORLD_FAULT) {
+            value = event->raw * fault_kinds[event->what].scale;
+        } else if (event->kind == WORLD_HOSTILE) {
+            value = event->what;
+        }
+        printf("%s{\"index\": %u, \"event\": \"%s\", \"begin_us\": %" PRIu64 ", \"end_us\": %" PRIu64
+               ", \"phase\": %u, \"leg\": %u, \"value\": %.9g}",
+               separator, i, world_event_name(event), event->begin_us, event->end_us, event->phase, event->leg, value);
+        separator = ", ";
+    }
+    printf("]}\n");
+}

@@ -1,0 +1,82 @@
+/* A world from a seed: machine, board, client's script and events.
+ *
+ * Swarm testing: each seed switches most kinds of events off (A. Groce et al., "Swarm testing", ISSTA 2012). */
+#ifndef CAMPAIGN_WORLD_H
+#define CAMPAIGN_WORLD_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "host/machine_image.h"
+
+#define WORLD_MACHINES_MAX 64
+#define WORLD_EVENTS_MAX 48
+
+/* A machine of the campaign: its image, and what the tools derive from its file for drawing and judging. */
+typedef struct {
+    machine_image_t image;
+    double speed_base_rpm, torque_rated_Nm, torque_max_Nm;
+    double over_speed_rpm, over_voltage_V, under_voltage_V, trip_current_A;
+    double command_lsb_rpm; /* of DRIVE_COMMAND.speed_reference_rpm */
+    double speed_command_max_rpm;
+    unsigned rate_min_hz;
+    char name[64];
+} world_machine_t;
+
+typedef enum {
+    WORLD_SET,     /* bench variable `what` has `raw` from begin to end, then `raw_end` */
+    WORLD_FAULT,   /* fault of kind `what` from begin to end */
+    WORLD_SPEED,   /* the client's speed reference is `value` r/min from begin on */
+    WORLD_SILENT,  /* the client sends nothing from begin to end */
+    WORLD_HOSTILE, /* a second client sends frames of sort `what` from begin to end */
+    WORLD_SECOND,  /* a second client sends protected commands of its own from begin to end */
+    WORLD_EAGER,   /* the client clears, arms and runs again after each fault, whatever its cause does */
+} world_kind_t;
+
+typedef enum {
+    WORLD_HOSTILE_NOISE,    /* random data with identifiers of commands */
+    WORLD_HOSTILE_REPLAY,   /* genuine frames once more, 50 to 500 ms old */
+    WORLD_HOSTILE_LENGTH,   /* commands of a wrong length */
+    WORLD_HOSTILE_FLOOD,    /* any identifier, five frames per millisecond */
+    WORLD_HOSTILE_IDENTITY, /* identifiers of the drive's telemetry */
+    WORLD_HOSTILE_FORGED,   /* commands in sequence, with a wrong checksum */
+    WORLD_HOSTILE_SORTS
+} world_hostile_t;
+
+typedef struct {
+    world_kind_t kind;
+    unsigned what, phase, leg;
+    int32_t raw, raw_end;
+    double value;
+    uint64_t begin_us, end_us; /* end_us 0: it lasts */
+} world_event_t;
+
+typedef struct {
+    uint64_t seed;
+    bool healthy;
+    const world_machine_t *machine;
+    double initial_angle_deg;
+    unsigned control_rate_hz, controller, encoder_bits, adc_bits;
+    bool encoder_edges;
+    uint64_t duration_us;
+    uint64_t recovery_us; /* all faults are over: the client clears, arms and commands a speed; 0: never */
+    double supply_V, inertia_gain;
+    unsigned events;
+    world_event_t event[WORLD_EVENTS_MAX];
+    uint64_t kept; /* bit n: event n happens */
+} world_t;
+
+/* Draws the world of a seed: with faults, or a healthy one of healthy_s seconds. */
+void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
+void world_draw_healthy(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
+
+/* True when the event is kept and active at a time. */
+bool world_active(const world_t *world, unsigned event, uint64_t time_us);
+
+/* Name of what an event is, for the description. */
+const char *world_event_name(const world_event_t *event);
+
+/* One line of JSON. */
+void world_print(const world_t *world);
+
+#endif

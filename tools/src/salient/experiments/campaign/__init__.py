@@ -1,0 +1,1 @@
+"""Random faults by seed: worlds, their judgement, and what is done with failures."""

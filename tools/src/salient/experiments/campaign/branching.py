@@ -1,0 +1,112 @@
+"""Every fault at every control tick of an electrical period, at three operating points, by branching.
+
+    python -m salient.experiments.campaign.branching DIR [EVERY]
+
+forks the campaign's program before each control interrupt (each EVERY-th, default 1) of an electrical period at
+150 r/min with load and at 1500 r/min, and at the begin of a start from 360 positions of the rotor, and lets each fault
+begin there. Slow faults have a 50th of the ticks. Writes DIR/branches-POINT.jsonl and DIR/branches.png and prints a
+table. An operating point whose results DIR has is not run again. Exit code 1 when a property is violated.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from salient.experiments.campaign import names
+from salient.experiments.campaign.runner import branches
+
+SALIENT = 2
+POINTS = {"150": (SALIENT, 150, 8, 0, 2000), "1500": (SALIENT, 1500, 6, 0, 200), "start": (SALIENT, 0, 0, 0, 360)}
+"""Controller, speed in r/min (0: starts), load in N m, first tick, ticks: an electrical period at 40 kHz."""
+TITLES = {"150": "150 r/min, 8 N m", "1500": "1500 r/min, 6 N m", "start": "start to 150 r/min from 360 positions"}
+
+Rows = dict[str, list[dict[str, Any]]]
+
+
+def run(out: Path, every: int) -> Rows:
+    """Results of each operating point."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows: Rows = {}
+    for point, setting in POINTS.items():
+        file = out / f"branches-{point}.jsonl"
+        if not file.exists():
+            lines = branches(*setting, every)
+            file.write_text("".join(f"{json.dumps(line)}\n" for line in lines), encoding="utf-8")
+        rows[point] = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    return rows
+
+
+def label(row: dict[str, Any]) -> str:
+    """Fault, its leg where it has one, and the value of its attribute."""
+    leg = f" {('low', 'high')[row['leg']]}" if row["fault"] in ("switch_open", "switch_shorted", "diode_open") else ""
+    return f"{row['fault']}{leg}" + (f", {row['value']:g}" if row["value"] else "")
+
+
+def cell(row: dict[str, Any]) -> str:
+    """Longest time, detected of branches when not all are."""
+    if row["detected"] == 0:
+        return f"runs on ({row['branches']})"
+    text = f"{row['longest_us'] / 1000:.3g} ms"
+    return text if row["detected"] == row["branches"] else f"{text}, {row['detected']} of {row['branches']}"
+
+
+def table(rows: Rows) -> list[str]:
+    """Markdown: a line for each fault."""
+    head = ["fault", "branches", *TITLES.values(), "first causes", "violations"]
+    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+    for of_fault in zip(*rows.values(), strict=True):
+        causes = sorted({cause for row in of_fault for cause in row["causes"]})
+        violations = sum(row["violations"] for row in of_fault)
+        fields = [f"`{label(of_fault[0])}`", str(sum(row["branches"] for row in of_fault)), *map(cell, of_fault),
+                  ", ".join(f"`{names.causes()[cause]}`" for cause in causes),
+                  "" if violations == 0 else f"{violations}: {next(row['rule'] for row in of_fault if row['rule'])}"]
+        lines.append(f"| {' | '.join(fields)} |")
+    return lines
+
+
+def plot(rows: Rows, path: Path) -> None:
+    """Longest time to the reaction of each fault, on a logarithmic axis."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    labels = [label(row) for row in next(iter(rows.values()))]
+    figure = Figure(figsize=(9, 9.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for (point, lines), marker, colour in zip(rows.items(), "os^", ("#1f77b4", "#d62728", "#2ca02c"), strict=True):
+        shown = [(index, max(row["longest_us"], 25) / 1000) for index, row in enumerate(lines) if row["detected"]]
+        axes.plot([time for _, time in shown], [index for index, _ in shown], marker, color=colour, label=TITLES[point],
+                  linestyle="none", markersize=5)
+    axes.set_yticks(range(len(labels)), labels, fontsize="small")
+    axes.invert_yaxis()
+    axes.set_xscale("log")
+    axes.set_xlabel("longest time from the begin of the fault until the drive has reacted, ms")
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside lower center", ncols=3, fontsize="small", frameon=False)
+    total = sum(row["branches"] for lines in rows.values() for row in lines)
+    violations = sum(row["violations"] for lines in rows.values() for row in lines)
+    axes.set_title(f"Emulated drive, salient, 40 kHz, machine saturating, ideal sensors of 12 and 17 bits, phase a\n"
+                   f"{total} branches, {violations} of them with a violation", fontsize="medium")
+    figure.savefig(path, dpi=90)
+
+
+def main(arguments: list[str]) -> int:
+    if len(arguments) not in (1, 2) or not (arguments[1:] or ["1"])[0].isdigit():
+        print("usage: python -m salient.experiments.campaign.branching DIR [EVERY]", file=sys.stderr)
+        return 2
+    out = Path(arguments[0])
+    rows = run(out, int((arguments[1:] or ["1"])[0]))
+    print("\n".join(table(rows)))
+    plot(rows, out / "branches.png")
+    every_row = [row for lines in rows.values() for row in lines]
+    total, violations = (sum(row[name] for row in every_row) for name in ("branches", "violations"))
+    print(f"{total} branches, {sum(row['virtual_ms'] for row in every_row) / 1000:.0f} s of virtual time, "
+          f"{violations} with a violation")
+    return 1 if violations else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

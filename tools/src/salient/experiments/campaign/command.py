@@ -1,0 +1,137 @@
+"""The commands `campaign` and `replay`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from salient.errors import UsageError
+from salient.experiments.campaign import names
+from salient.experiments.campaign.failure import load, replay, save
+from salient.experiments.campaign.runner import ALL_EVENTS, Result, digest, serve, world
+from salient.experiments.tasks import Task, run
+from salient.paths import ROOT
+from salient.progress import Progress
+
+_SHOWN_MAX = 8
+"""Failures that are shrunk, one of each class, and seeds that a summary lists of a class."""
+_LINES = 20
+
+
+def run_campaign(options: argparse.Namespace) -> int:
+    """`campaign`; returns the exit code."""
+    seeds = range(options.first, options.first + options.seeds)
+    kind = "healthy" if options.healthy else "faults"
+    tasks = [Task(f"{kind} {seed} {digest()}", (seed, options.healthy)) for seed in seeds]
+    mine = tasks[options.shard[0] - 1::options.shard[1]]
+    results = []
+    with Progress(_LINES, sys.stderr) as progress:
+        done = run(tasks, serve, options.out, options.shard, options.scheduler, options.jobs)
+        for number, (_, result) in enumerate(done, start=1):
+            results.append(result)
+            if number * _LINES // len(mine) > (number - 1) * _LINES // len(mine):
+                progress.step(f"{number} of {len(mine)} seeds")
+    note = summary(results, options.first, options.seeds, kind)
+    part = "" if options.shard == (1, 1) else "-{}-of-{}".format(*options.shard)
+    (options.out / f"summary{part}.json").write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
+    for line in report(note):
+        print(line)
+    for violation, entry in list(note["violations"].items())[:0 if options.no_shrink else _SHOWN_MAX]:
+        seed = entry["seeds"][0]
+        folder = options.out / "failures" / f"{seed}"
+        saved = save(seed, violation, folder, options.healthy)
+        events = ", ".join(f"{event['event']} at {event['begin_us']} us" for event in saved["world"]["events"])
+        print(f"{violation}: seed {seed} needs {len(saved['world']['events'])} events ({events or 'none'}); "
+              f"{saved['replay']}")
+    return 1 if note["violations"] else 0
+
+
+def summary(results: Iterable[Result], first: int, seeds: int, kind: str) -> dict[str, Any]:
+    """Totals of the results of a range of seeds."""
+    found: dict[str, list[int]] = defaultdict(list)
+    cells: set[int] = set()
+    virtual_us = finished = recovered = held = rejected = 0
+    for result in sorted(results, key=lambda result: int(result["seed"])):
+        finished += 1
+        virtual_us += result.get("virtual_us", 0)
+        recovered += result.get("recovered", False)
+        held += result.get("held", False)
+        rejected += result.get("rejected", False)
+        cells.update(result.get("cells", ()))
+        for violation in {names.violation(violation) for violation in result.get("violations", ())}:
+            found[violation].append(result["seed"])
+    missing = [] if kind == "healthy" else [cell for cell in names.cells() if cell not in cells]
+    by_number = sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))
+    return {
+        "kind": kind, "first": first, "seeds": seeds, "finished": finished, "commit": commit(),
+        "program_and_machines": digest(), "virtual_hours": round(virtual_us / 3.6e9, 4), "rejected": rejected,
+        "recovered": recovered, "held_by_the_encoder": held,
+        "violations": {name: {"count": len(seeds_of), "seeds": seeds_of[:_SHOWN_MAX]} for name, seeds_of in by_number},
+        "cells_reached": len(cells), "cells": 0 if kind == "healthy" else len(names.cells()),
+        "cells_not_reached": [names.cell(cell) for cell in missing],
+    }
+
+
+def report(note: dict[str, Any]) -> list[str]:
+    """A summary to be read."""
+    number = sum(entry["count"] for entry in note["violations"].values())
+    lines = [f"{note['finished']} {'healthy worlds' if note['kind'] == 'healthy' else 'worlds with faults'} "
+             f"from seed {note['first']}, {note['virtual_hours']:g} h of virtual time, commit {note['commit']}: "
+             f"{number} violations"]
+    lines += [f"  {name}: {entry['count']}, first seeds {', '.join(map(str, entry['seeds']))}"
+              for name, entry in note["violations"].items()]
+    if note["cells"]:
+        lines.append(f"cells of fault, state and sector: {note['cells_reached']} of {note['cells']} reached")
+        left = note["cells_not_reached"]
+        lines += [f"  not reached: {cell}" for cell in left[:_SHOWN_MAX]]
+        if len(left) > _SHOWN_MAX:
+            lines.append(f"  and {len(left) - _SHOWN_MAX} more, in summary.json")
+    return lines
+
+
+def commit() -> str:
+    """That of the sources, with a plus when they differ from it."""
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    known = git("rev-parse", "--short=10", "HEAD")
+    return f"{known}{'+' if git('status', '--porcelain', '--untracked-files=no') else ''}" if known else "unknown"
+
+
+def run_replay(options: argparse.Namespace) -> int:
+    """`replay`; returns the exit code."""
+    folder = Path(options.what)
+    if folder.is_dir():
+        seed, kept, healthy = load(folder)
+    else:
+        try:
+            seed, kept, healthy = int(options.what), ALL_EVENTS, options.healthy
+        except ValueError:
+            seed = -1
+        if not 0 <= seed < 2**63:
+            raise UsageError(f"replay {options.what}: must be a seed, a whole number from 0, or the folder of a "
+                             "failure")
+        folder = options.out / str(seed)
+    described = world(seed, kept, healthy)
+    print(f"seed {seed}: {described['machine']}, {described['controller']}, {described['control_rate_hz']} Hz, encoder "
+          f"of {described['encoder_bits']} bits{' with edges' if described['encoder_edges'] else ''}")
+    for event in described["events"]:
+        until = f" to {event['end_us']}" if event["end_us"] else ""
+        print(f"  {event['begin_us']}{until} us: {event['event']} {event['value']:g}"
+              + (f", phase {'abcd'[event['phase']]}, leg {('low', 'high')[event['leg']]}"
+                 if event["phase"] or event["leg"] else ""))
+    again = replay(seed, kept, healthy, folder, options.build)
+    for violation in again.campaign["violations"]:
+        print(f"violation: {names.violation(violation)} at {violation['at_us']} us")
+    causes = ", ".join(names.causes().get(cause, str(cause)) for cause in again.campaign["causes"])
+    print(f"first causes: {causes or 'none'}")
+    print(f"hash {again.hash}, {'equal to' if again.equal else 'NOT that of'} the campaign's; log and plot: {folder}")
+    return 0 if again.equal and not again.campaign["violations"] else 1
+

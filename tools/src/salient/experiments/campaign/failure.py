@@ -1,0 +1,145 @@
+"""A failing seed: its shortest list of events, and the replay on the usual test bench, to the bit."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+
+from salient.bench.bench import Bench
+from salient.bus.clock import open_bus
+from salient.config import BenchConfig
+from salient.errors import UsageError
+from salient.experiments.campaign import names
+from salient.experiments.campaign.machines import files
+from salient.experiments.campaign.runner import ALL_EVENTS, Result, run_world, world
+
+_STEP_NS = 1_000_000
+_HASH_START, _HASH_PRIME, _HASH_MASK = 14695981039346656037, 1099511628211, 2**64 - 1
+_TRUTH = range(0x1F000010, 0x1F000014)
+TELEMETRY_PERIOD_MS = 4
+
+
+def classes(result: Result) -> list[str]:
+    """Classes of the violations of a run."""
+    return [names.violation(violation) for violation in result["violations"]]
+
+
+def shrink(seed: int, violation: str, healthy: bool = False) -> int:
+    """The events, as bits, of the shortest list that still has a violation of this class: no event of it can be left
+    out. Leaves out halves, quarters, ... first (A. Zeller, R. Hildebrandt, "Simplifying and isolating failure-inducing
+    input", 2002)."""
+    events = [event["index"] for event in world(seed, healthy=healthy)["events"]]
+
+    def fails(kept: list[int]) -> bool:
+        return violation in classes(run_world(seed, sum(1 << index for index in kept), healthy))
+
+    part = len(events)
+    while part >= 1:
+        at = 0
+        while at < len(events):
+            fewer = events[:at] + events[at + part:]
+            if fails(fewer):
+                events = fewer
+            else:
+                at += part
+        part //= 2
+    return sum(1 << index for index in events)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """hash: of the frames on the bus and of the true state. campaign: the result of the campaign's own program."""
+
+    hash: str
+    campaign: Result
+
+    @property
+    def equal(self) -> bool:
+        """Both programs had the same bits."""
+        return self.hash == str(self.campaign["hash"])
+
+
+def replay(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, folder: Path | None = None,
+           build: str = "host") -> Replay:
+    """Runs a world again, and its frames once more on a test bench of salient_host, or of a target's build. folder: for
+    log and plot of the bench."""
+    described = world(seed, kept, healthy)
+    with tempfile.TemporaryDirectory(prefix="salient-") as temporary:
+        frames = Path(temporary) / "frames"
+        result = run_world(seed, kept, healthy, frames)
+        path = next(path for path in files() if path.stem == described["machine"])
+        config = BenchConfig(machine=str(path), controller=described["controller"], seed=seed, build=build,
+                             control_rate_hz=described["control_rate_hz"], encoder_bits=described["encoder_bits"],
+                             adc_bits=described["adc_bits"], encoder_edges=described["encoder_edges"],
+                             initial_angle_deg=described["initial_angle_deg"],
+                             telemetry_period_ms=TELEMETRY_PERIOD_MS)
+        with Bench(config, f"unix:{temporary}/can.sock") as bench:
+            _send(bench, frames.read_text(encoding="ascii").splitlines())
+            if folder is not None:
+                bench.save(folder, f"tools/salient replay {folder}")
+            return Replay(f"{_hash(bench.log):016x}", result)
+
+
+def _send(bench: Bench, lines: list[str]) -> None:
+    """Sends the frames of both clients, each at its time."""
+    other = open_bus(bench.address)
+    try:
+        for line in lines:
+            time, client, identifier, *data = line.split()
+            number = int(identifier, 16)
+            extended = bool(number & 0x80000000)
+            message = can.Message(arbitration_id=number & 0x1FFFFFFF, is_extended_id=extended,
+                                  data=bytes.fromhex(data[0] if data else ""))
+            if extended and message.arbitration_id == 0x1F000001:  # RIG_RUN_UNTIL
+                bench.advance_to(int(time) + _STEP_NS)
+                while other.recv(0) is not None:
+                    pass
+            elif client == "1":
+                bench.send(message)
+            else:
+                other.send(message)
+    finally:
+        other.shutdown()
+
+
+def _hash(log: list[tuple[int, can.Message]]) -> int:
+    """As the campaign's program computes it (emulator/campaign/sender.c)."""
+    value = _HASH_START
+    for time_ns, message in log:
+        identifier = message.arbitration_id
+        if message.is_extended_id:
+            if 0x1F000000 <= identifier <= 0x1F0007FF and identifier not in _TRUTH:
+                continue
+            identifier |= 0x80000000
+        data = bytes(message.data)
+        for byte in time_ns.to_bytes(8, "little") + identifier.to_bytes(4, "little") + bytes([len(data)]) + data:
+            value = (value ^ byte) * _HASH_PRIME & _HASH_MASK
+    return value
+
+
+def save(seed: int, violation: str, folder: Path, healthy: bool = False) -> dict[str, Any]:
+    """Shrinks a failing seed and writes its folder: failure.json with the events that are left, log and plot."""
+    folder.mkdir(parents=True, exist_ok=True)
+    kept = shrink(seed, violation, healthy)
+    again = replay(seed, kept, healthy, folder)
+    note = {"seed": seed, "healthy": healthy, "kept": f"{kept:#x}", "violation": violation, "hash": again.hash,
+            "equal": again.equal, "world": world(seed, kept, healthy), "result": again.campaign,
+            "replay": f"tools/salient replay {folder}"}
+    (folder / "failure.json").write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
+    return note
+
+
+def load(folder: Path) -> tuple[int, int, bool]:
+    """Seed, events and kind of world of a failure's folder; UsageError."""
+    path = folder / "failure.json"
+    try:
+        note = json.loads(path.read_text(encoding="utf-8"))
+        return int(note["seed"]), int(note["kept"], 16), bool(note["healthy"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{path}: not the note of a failure ({error}); give a seed or the folder of a failure that a "
+                         "campaign has left") from None

@@ -1,0 +1,50 @@
+"""The machines of a campaign: those of the repository and random ones, drawn beforehand."""
+
+from __future__ import annotations
+
+import os
+from functools import lru_cache
+from pathlib import Path
+
+from salient.experiments.compare.every_machine import EXAMPLES, random_files
+from salient.machine.cache import machine_image
+from salient.machine.file import load_machine
+from salient.machine.scaling import SPEED_LSB_RPM, scaling_of
+from salient.paths import BUILD, MACHINES
+
+RANDOM = range(10)
+"""Numbers of the random machines: 0.1 to 500 N m."""
+
+
+@lru_cache
+def files() -> tuple[Path, ...]:
+    """Machine files by number; the first is that of the paper."""
+    first = MACHINES / "saturating.toml"
+    bundled = [path for path in sorted(MACHINES.glob("*.toml")) if path != first]
+    return (first, *bundled, *sorted(EXAMPLES.glob("*.toml")), *random_files(RANDOM))
+
+
+def pool_file() -> Path:
+    """The machines as salient_campaign reads them (emulator/campaign/main.c)."""
+    lines = [_line(path) for path in files()]
+    path = BUILD / "campaign" / "machines.txt"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = "".join(f"{line}\n" for line in lines)
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        temporary = path.with_name(f"{path.name}.{os.getpid()}")
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    return path
+
+
+def _line(path: Path) -> str:
+    machine = load_machine(path)
+    scaling = scaling_of(path, machine)
+    data = scaling.data
+    lsb_rpm = float(SPEED_LSB_RPM) * 2.0**scaling.exponents.speed
+    values = (data.speed_base_rpm, data.torque_rated_Nm, data.parameters["torque_max_Nm"], data.over_speed_rpm,
+              data.bus_over_voltage_V, data.bus_under_voltage_V, data.current_trip_A, lsb_rpm,
+              scaling.speed_reference_max * lsb_rpm)
+    rate_min_hz = max(scaling.control_rate_min_hz(machine), data.control_rate_hz if data.control_rate_hz > 50000 else 0)
+    return " ".join([str(machine_image(str(path))), *(f"{value:.17g}" for value in values), str(rate_min_hz),
+                     machine.name])

@@ -1,0 +1,59 @@
+"""Names of the numbers in results."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+from salient.bus.signals import drive_database, rig_database, value_numbers
+from salient.experiments.campaign.machines import files
+
+STATES = ("initialise", "ready", "run", "fault")
+SECTORS = 6
+_REASONS = {
+    "gate_on": {1: "outside of run", 2: "without safe torque off lines", 3: "without a control interrupt"},
+    "no_command": {1: "not armed", 2: "after off", 3: "without a command", 4: "torque without a command",
+                   5: "fault cleared"},
+    "not_recovered": {1: "not in run", 2: "not at the speed", 3: "fault again"},
+}
+
+
+@lru_cache
+def causes() -> dict[int, str]:
+    """Names of the drive's faults by number."""
+    return {number: name for name, number in value_numbers(drive_database(), "DRIVE_STATUS", "fault").items()}
+
+
+@lru_cache
+def kinds() -> dict[int, str]:
+    """Names of the bench's faults by number."""
+    numbers = value_numbers(rig_database(), "RIG_FAULT", "kind")
+    return {number: name for name, number in numbers.items()}
+
+
+def violation(of: dict[str, Any]) -> str:
+    """The class of a violation: its rule, and what distinguishes it."""
+    rule, number = of["rule"], of["number"]
+    if rule in ("wrong_cause", "false_alarm"):
+        return f"{rule}: {causes().get(number, number)}"
+    return f"{rule}: {_REASONS[rule][number]}" if number in _REASONS.get(rule, {}) else str(rule)
+
+
+def cell(number: int) -> str:
+    """Fault, state and sector of a cell."""
+    rest, sector = divmod(number, SECTORS)
+    kind, state = divmod(rest, len(STATES))
+    return f"{kinds()[kind]} in {STATES[state]}, sector {sector}"
+
+
+def cells() -> list[int]:
+    """All cells that there are."""
+    part = len(STATES) * SECTORS
+    return [kind * part + index for kind in sorted(kinds()) for index in range(part)]
+
+
+def machine(number: int) -> str:
+    """Name of a machine of the campaign."""
+    return files()[number].stem
+
+

@@ -1,0 +1,88 @@
+"""Runs worlds with salient_campaign (emulator/campaign): by seed, in whole or with some of their events."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from salient.bench.programs import EmulatorError
+from salient.errors import UsageError
+from salient.experiments.campaign.machines import pool_file
+from salient.paths import BUILD, ROOT
+
+Result = dict[str, Any]
+"""seed, hash, machine, controller, virtual_us, causes, recovered, held, violations, cells."""
+ALL_EVENTS = 2**64 - 1
+
+
+def program() -> Path:
+    """UsageError: it is not built."""
+    path = BUILD / "host" / "bin" / "salient_campaign"
+    if not path.exists():
+        raise UsageError(f"{path.relative_to(ROOT)} is not built; tools/salient campaign builds it")
+    return path
+
+
+@lru_cache
+def digest() -> str:
+    """Of all that a result depends on but the seed: the program and the machines."""
+    images = [line.split()[0] for line in pool_file().read_text(encoding="utf-8").splitlines()]
+    parts = [program().read_bytes(), *(Path(image).read_bytes() for image in images)]
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()[:16]
+
+
+def command(*options: object) -> list[str]:
+    """A command line of the program."""
+    return [str(program()), "--machines", str(pool_file()), *map(str, options)]
+
+
+def _lines(options: Sequence[object]) -> list[Result]:
+    done = subprocess.run(command(*options), capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise EmulatorError(f"salient_campaign ended with {done.returncode}: {done.stderr.strip()}")
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def world(seed: int, kept: int = ALL_EVENTS, healthy: bool = False) -> Result:
+    """What a seed stands for: machine, board, events."""
+    return _lines(["--first", seed, "--keep", kept, "--describe", *_mode(healthy)])[0]
+
+
+def run_world(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, frames: Path | None = None) -> Result:
+    """Runs a world, with those of its events whose bits are set. frames: a file for the frames that its clients sent, a
+    line each: time in ns, number of the client, identifier with flags and data in hexadecimal."""
+    return _lines(["--first", seed, "--keep", kept, *_mode(healthy), *(["--frames", frames] if frames else [])])[0]
+
+
+def branches(*setting: object) -> list[Result]:
+    """Every fault at every control tick, a result for each fault and place (emulator/campaign/branch.h)."""
+    return _lines(["--branch", *setting])
+
+
+def _mode(healthy: bool) -> list[str]:
+    return ["--healthy"] if healthy else []
+
+
+_served: dict[bool, subprocess.Popen[str]] = {}
+
+
+def serve(task: tuple[int, bool]) -> Result:
+    """Runs a seed in a program of this process that stays; task: seed, healthy. For workers."""
+    seed, healthy = task
+    process = _served.get(healthy)
+    if process is None or process.poll() is not None:
+        process = _served[healthy] = subprocess.Popen(command("--serve", *_mode(healthy)), stdin=subprocess.PIPE,
+                                                      stdout=subprocess.PIPE, text=True)
+    assert process.stdin is not None and process.stdout is not None  # pipes
+    process.stdin.write(f"{seed}\n")
+    process.stdin.flush()
+    line = process.stdout.readline()
+    if not line:
+        raise EmulatorError(f"salient_campaign ended with {process.wait()} at seed {seed}")
+    result: Result = json.loads(line)
+    return result
