@@ -1,0 +1,188 @@
+"""Execution of many independent runs: on the cores of this computer or on a Dask scheduler, in shards, resumable.
+
+    for task, result in run([Task("seed 1", 1), Task("seed 2", 2)], function, Path("out")):
+        ...
+
+function(task.arguments) is called once for each key; it is a function of a module, its arguments can be pickled, and
+its result is a JSON value. Each result is appended to a file of JSON lines in the folder as soon as it is there, so
+that a run that is interrupted, whatever by, continues where it was. A result is the same wherever it was computed. The
+module needs nothing of a drive.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import json
+import os
+import re
+import signal
+import socket
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+from urllib.parse import urlsplit
+
+from salient.errors import RunFailed, UsageError
+
+RESULTS = "runs.jsonl"
+_WAITING_PER_WORKER = 4
+"""Tasks handed out in advance; all of them would be kept in the memory of a scheduler."""
+_BREAKS_MAX = 3
+"""Deaths of local workers one after the other, with no task finished in between, after which the tasks are to blame."""
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True)
+class Task:
+    """A run. key: identifies everything that its result depends on."""
+
+    key: str
+    arguments: Any
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """I/N; ValueError when it is not one of the parts 1/N to N/N."""
+    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise ValueError("must be I/N, whole numbers with I from 1 to N")
+    return int(match[1]), int(match[2])
+
+
+def run(tasks: Sequence[Task], function: Callable[[Any], Any], out: Path, shard: tuple[int, int] = (1, 1),
+        scheduler: str | None = None, jobs: int | None = None) -> Generator[tuple[Task, Any], None, None]:
+    """Yields each task of the shard with its result: first those that the folder has already, then the others as they
+    finish.
+
+    shard: (i, n), every n-th task beginning with the i-th, with a file of its own; several may share a folder.
+    scheduler: address of a Dask scheduler, whose workers need this package; without it `jobs` processes of this
+    computer, by default as many as it has cores. A worker that dies loses nothing: what it did not finish is done again. UsageError:
+    the folder is in use or cannot be written, no scheduler answers.
+    """
+    number, count = shard
+    mine = list({task.key: task for task in tasks[number - 1::count]}.values())
+    with _open_results(out, shard) as file:
+        finished = read_results(out)
+        todo = [task for task in mine if task.key not in finished]
+        for task in mine:
+            if task.key in finished:
+                yield task, finished[task.key]
+        execute = _on_this_computer if scheduler is None else _on_a_cluster
+        where: Any = (jobs or len(os.sched_getaffinity(0))) if scheduler is None else scheduler
+        for task, result in execute(todo, function, where) if todo else ():
+            line = json.dumps({"key": task.key, "result": result}, allow_nan=False)
+            file.write(line + "\n")
+            file.flush()
+            yield task, json.loads(line)["result"]  # as a later run reads it
+
+
+def read_results(out: Path) -> dict[str, Any]:
+    """The results in a folder, of all shards, by key. The end of a line that was being written is left out."""
+    results = {}
+    for path in sorted(out.glob("runs*.jsonl")):
+        for line in path.read_text(encoding="utf-8").splitlines(keepends=True):
+            if line.endswith("\n"):
+                entry = json.loads(line)
+                results[entry["key"]] = entry["result"]
+    return results
+
+
+def remove_results(out: Path) -> None:
+    """Forgets what the folder has, of all shards."""
+    for path in out.glob("runs*.jsonl"):
+        path.unlink(missing_ok=True)
+
+
+def _open_results(out: Path, shard: tuple[int, int]) -> TextIO:
+    """The file of a shard, for this process alone until it is closed."""
+    path = out / (RESULTS if shard == (1, 1) else f"runs-{shard[0]}-of-{shard[1]}.jsonl")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        file = path.open("a", encoding="utf-8")
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _remove_cut_line(path)
+    except BlockingIOError:
+        raise UsageError(f"{path}: another process writes it; choose another folder or shard") from None
+    except OSError as error:
+        raise UsageError(f"{path}: cannot write there ({error.strerror}); choose a writable folder") from None
+    return file
+
+
+def _remove_cut_line(path: Path) -> None:
+    content = path.read_bytes()
+    if not content.endswith(b"\n"):
+        os.truncate(path, content.rfind(b"\n") + 1)
+
+
+# --- execution ------------------------------------------------------------------------------------------------------
+
+def _on_this_computer(tasks: Sequence[Task], function: Callable[[Any], Any], jobs: int
+                      ) -> Generator[tuple[Task, Any], None, None]:
+    left = {task.key: task for task in tasks}
+    breaks = 0
+    while left:
+        workers = ProcessPoolExecutor(jobs, initializer=_begin_worker, initargs=(os.getpid(),))
+        try:
+            for task, result in _executed(workers, left.values(), function, jobs):
+                del left[task.key]
+                breaks = 0
+                yield task, result
+        except BrokenProcessPool:
+            breaks += 1
+            if breaks == _BREAKS_MAX:
+                raise RunFailed(f"worker processes were killed {breaks} times in succession; the next task was "
+                                f"{next(iter(left))}") from None
+        finally:
+            workers.shutdown(wait=True, cancel_futures=True)
+
+
+def _begin_worker(parent: int) -> None:
+    """Ctrl-C reaches the whole process group, and only the parent handles it; a worker ends with its parent, even when
+    that is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it has died before
+        os._exit(1)
+
+
+def _on_a_cluster(tasks: Sequence[Task], function: Callable[[Any], Any], address: str
+                  ) -> Generator[tuple[Task, Any], None, None]:
+    try:
+        import distributed
+    except ImportError:
+        raise UsageError(f"--scheduler {address}: the package distributed is missing; "
+                         "pip install 'salient-drive[cluster]'") from None
+    try:
+        place = urlsplit(address)
+        if place.scheme == "tcp":  # a refusal is known at once; the client would try again for half a minute
+            socket.create_connection((place.hostname or "", place.port or 0)).close()
+        client: Any = distributed.Client(address, set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--scheduler {address}: no Dask scheduler answers ({error})") from None
+    with client:
+        cores = sum(client.ncores().values())
+        with client.get_executor(pure=False) as workers:
+            yield from _executed(workers, tasks, function, max(1, cores))
+
+
+def _executed(workers: Executor, tasks: Iterable[Task], function: Callable[[Any], Any], count: int
+              ) -> Generator[tuple[Task, Any], None, None]:
+    """Results as they finish. The first exception of the function ends the others."""
+    waiting = iter(list(tasks))
+    futures: dict[Future[Any], Task] = {}
+    try:
+        while True:
+            while len(futures) < _WAITING_PER_WORKER * count and (task := next(waiting, None)) is not None:
+                futures[workers.submit(function, task.arguments)] = task
+            if not futures:
+                return
+            done, _ = wait(futures, return_when=FIRST_COMPLETED)
+            for future in done:
+                result = future.result()
+                yield futures.pop(future), result
+    finally:
+        for future in futures:
+            future.cancel()
