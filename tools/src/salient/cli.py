@@ -23,10 +23,13 @@ from salient.config import (
     either,
     flag_of,
 )
+from salient.paths import BUILD, COMMAND, IS_WHEEL
 from salient.version import VERSION
 
 TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "plant", "tools", "socketcan")
 """The steps of `test`, in order."""
+CLONE_ONLY = ("test", "benchmark", "pil", "wheel")
+"""Commands that need the sources."""
 CHANGE_PERCENT = 10.0
 """Smaller changes of a ripple, which is an extreme of one run, are within its scatter."""
 
@@ -46,13 +49,15 @@ class _Parser(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     """All commands and their options."""
-    parser = _Parser(prog="tools/salient", description="Salient: a switched-reluctance drive and its test bench.")
+    parser = _Parser(prog=COMMAND, description="Salient: a switched-reluctance drive and its test bench.")
     parser.add_argument("--version", action="version", version=f"salient {VERSION}")
     parser.add_argument("--no-install", action="store_true", help="name what is missing instead of installing it")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
 
     def command(name: str, text: str) -> argparse.ArgumentParser:
-        made = commands.add_parser(name, help=text, description=text, prog=f"tools/salient {name}")
+        if IS_WHEEL and name in CLONE_ONLY:
+            return _Parser()
+        made = commands.add_parser(name, help=text, description=text, prog=f"{COMMAND} {name}")
         made.add_argument("--no-install", action="store_true", default=argparse.SUPPRESS,
                           help="name what is missing instead of installing it")
         return made
@@ -134,13 +139,17 @@ def make_parser() -> argparse.ArgumentParser:
     task.add_argument("--figures", action="store_true",
                      help="instead: repeat the measurements of the committed baseline and write it")
 
+    wheel = command("wheel", "the Python package with its programs, for suites in other repositories")
+    wheel.add_argument("--out", type=Path, default=Path("out/wheel"), metavar="DIR",
+                       help="folder (default out/wheel)")
+
     parameters = command("parameters", "parameters and fault log of a running drive")
     actions = parameters.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
     for name, text in (("save", "write the parameters to a file"),
                        ("compare", "list the differences from a file, exit code 1 when there are any"),
                        ("load", "set the parameters that a file has, all or none"),
                        ("faults", "print the log of faults")):
-        action = actions.add_parser(name, help=text, description=text, prog=f"tools/salient parameters {name}")
+        action = actions.add_parser(name, help=text, description=text, prog=f"{COMMAND} parameters {name}")
         if name != "faults":
             action.add_argument("file", type=Path, metavar="FILE.toml")
         if name == "load":
@@ -181,7 +190,7 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
 def _add_can(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--can", type=lambda text: text if text == "auto" else _convert("can", text), default="auto",
                         metavar="BUS", help=f"{BUSES}, or auto (default): vcan0 when it is up, else "
-                        "unix:build/salient.sock")
+                        f"unix:{'' if IS_WHEEL else 'build/'}salient.sock" + (f" in {BUILD}" if IS_WHEEL else ""))
 
 
 def _option_type(name: str) -> Callable[[str], Any]:

@@ -20,6 +20,7 @@ from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS
 from salient.machine.cache import machine_image
 from salient.machine.file import MachineError
+from salient.paths import COMMAND
 
 FAILED = "failed"
 _FAILED_LISTED_MAX = 10
@@ -60,7 +61,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     write_page(options.out / "compare.html", rows, content, change_summary, changes, _command(options), titles)
     stream.write(f"{table.table(rows, titles)}\n\n{table.summary(rows)}\n")
     for run, path in failed[:_FAILED_LISTED_MAX]:
-        stream.write(f"{_name(run.case)}: {run.failed}; reproduce with: tools/salient run {path}\n")
+        stream.write(f"{_name(run.case)}: {run.failed}; reproduce with: {COMMAND} run {path}\n")
     if len(failed) > _FAILED_LISTED_MAX:
         stream.write(f"and {len(failed) - _FAILED_LISTED_MAX} more in {options.out / FAILED}\n")
     if change_summary:
@@ -130,5 +131,5 @@ def _file_name(case: Case) -> str:
 
 def _command(options: argparse.Namespace) -> str:
     machine = [] if options.machine is None else ["--machine", shlex.quote(options.machine)]
-    return " ".join(["tools/salient compare", *options.groups, *machine, *(["--quick"] if options.quick else []),
+    return " ".join([f"{COMMAND} compare", *options.groups, *machine, *(["--quick"] if options.quick else []),
                      *([f"--samples {options.samples}"] if options.samples else [])])
