@@ -17,7 +17,7 @@ set(SALIENT_MAIN ${CMAKE_CURRENT_LIST_DIR}/main.c)
 function(salient_add_drive target)
     add_executable(${target} ${SALIENT_MAIN} ${ARGN})
     target_compile_features(${target} PRIVATE c_std_11)
-    target_link_libraries(${target} PRIVATE salient::port salient::machine_tables salient::firmware)
+    target_link_libraries(${target} PRIVATE salient::machine_tables salient::firmware salient::port)
     target_link_options(${target} PRIVATE -fno-lto) # the libraries may be of another version of the compiler
     if(CMAKE_SYSTEM_PROCESSOR MATCHES "x86_64|AMD64")
         set_source_files_properties(${ARGN} PROPERTIES COMPILE_OPTIONS -mgeneral-regs-only)

@@ -2,7 +2,7 @@
 
 A wheel has, in salient/data, the files of the repository that its commands need, in their places there, and in
 salient/data/bin the programs of the host build, linked statically: they run on any Linux of their processor, and have
-the same C library, so the same bits, everywhere. An editable installation uses the repository.
+the same C library, so the same bits, everywhere. salient/data/install is the CMake package (cmake/install.cmake). An editable installation uses the repository.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from salient.version import VERSION  # noqa: E402  (needs the path above)
 
 
 def build_programs() -> Path:
-    """Builds the programs, in the host build where there is one; returns their folder."""
+    """Builds the programs, in the host build where there is one; returns its folder."""
     folder = ROOT / "build" / "host"
     if not (folder / "CMakeCache.txt").exists():
         folder = ROOT / "build" / "wheel"
         subprocess.run(["cmake", "-S", ROOT, "-B", folder, "-G", "Ninja", "-DCMAKE_BUILD_TYPE=Release",
                         f"-DSALIENT_PYTHON={sys.executable}"], check=True)
     subprocess.run(["cmake", "--build", folder, "--target", *(f"{name}_static" for name in PROGRAMS)], check=True)
-    return folder / "bin"
+    return folder
 
 
 class BuildPackage(build_py):
@@ -55,7 +55,12 @@ class BuildPackage(build_py):
         (data / "bin").mkdir()
         built = build_programs()
         for name in PROGRAMS:
-            subprocess.run(["strip", "-o", data / "bin" / name, built / f"{name}_static"], check=True)
+            subprocess.run(["strip", "-o", data / "bin" / name, built / "bin" / f"{name}_static"], check=True)
+        subprocess.run(["cmake", "--install", built, "--prefix", data / "install"], check=True)
+        for library in (data / "install" / "lib" / "salient").glob("*.a"):
+            # Without its intermediate code, which only the same version of the compiler reads.
+            subprocess.run(["objcopy", "--strip-debug", "--wildcard", "--remove-section=.gnu.lto_*",
+                            "--remove-section=.gnu.debuglto_*", library], check=True)
 
 
 class Wheel(bdist_wheel):

@@ -130,6 +130,12 @@ def _compare(options: argparse.Namespace) -> int:
     return run(options)
 
 
+def _sweep(options: argparse.Namespace) -> int:
+    from salient.experiments.sweep import run
+
+    return run(options)
+
+
 def _machine(options: argparse.Namespace) -> int:
     from salient.machine.report import run
 
@@ -158,6 +164,7 @@ _COMMANDS = {
     "parameters": _parameters,
     "benchmark": _benchmark,
     "compare": _compare,
+    "sweep": _sweep,
     "machine": _machine,
     "pil": _pil,
     "wheel": _wheel,

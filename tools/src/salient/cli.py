@@ -112,6 +112,9 @@ def make_parser() -> argparse.ArgumentParser:
     _add_compare_options(command("compare", "the controllers compared with each other, their targets and an earlier "
                                  "run"))
 
+    _add_sweep_options(command("sweep", "a scenario over parameters, machines, controllers, loads and "
+                               "seeds: one table"))
+
     machine = command("machine", "check a machine file, summarise it, list what follows for its drive, draw its "
                       "magnetics")
     machine.add_argument("machine", metavar="NAME|FILE")
@@ -213,7 +216,9 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="fewer machines, rates and angles: some 20 s")
     parser.add_argument("--out", type=Path, default=Path("out/compare"), metavar="DIR",
                         help="folder (default out/compare)")
-    parser.add_argument("--jobs", type=_count, metavar="N", help="simultaneous runs (default: number of cores)")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
+                        help="parameter of the drive or variable of the test bench, in every run; may be repeated")
+    _add_execution_options(parser)
     parser.add_argument("--samples", type=_count, metavar="N",
                         help="only the first N samples (drives, angles, seeds) of each condition")
     parser.add_argument("--resume", action="store_true",
@@ -223,6 +228,50 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
                         "the worse")
     parser.add_argument("--worse-percent", type=_percent, default=CHANGE_PERCENT, metavar="X",
                         help=f"a larger change is reported (default {CHANGE_PERCENT:g})")
+
+
+def _add_sweep_options(parser: argparse.ArgumentParser) -> None:
+    """What --set and --machine name is checked by salient.experiments.sweep."""
+    parser.add_argument("scenario", type=Path, metavar="NAME|SCENARIO.toml",
+                        help="bundled scenario or scenario file, for one machine of the sweep; on other machines its "
+                        "speeds and loads are in terms of their base speed and rated torque")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUES",
+                        help="parameter of the drive or variable of the test bench: VALUE,VALUE,... or "
+                        "FIRST:LAST:COUNT; may be repeated")
+    for name, metavar in (("machine", "NAME|FILE"), ("controller", "NAME")):
+        parser.add_argument(f"--{name}", action="append", default=[], type=_option_type(name), metavar=metavar,
+                            help=f"{name}; may be repeated (default as the scenario)")
+    parser.add_argument("--load-Nm", dest="load_Nm", type=_numbers, default=[], metavar="X,X,...",
+                        help="torques of the scenario's loads")
+    parser.add_argument("--load-profile", action="append", default=[], metavar="NAME|FILE",
+                        help="load profile; may be repeated")
+    parser.add_argument("--seeds", type=_count, default=1, metavar="N", help="number of seeds (default 1)")
+    parser.add_argument("--seed", type=_option_type("seed"), metavar="N", help="the first (default as the scenario)")
+    parser.add_argument("--out", type=Path, default=Path("out/sweep"), metavar="DIR", help="folder (default out/sweep)")
+    parser.add_argument("--resume", action="store_true", help="keep the finished runs in the folder")
+    _add_execution_options(parser)
+    parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N",
+                        help="only the I-th of N parts; keeps the finished runs in the folder")
+
+
+def _add_execution_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--jobs", type=_count, metavar="N", help="simultaneous runs (default: number of cores)")
+    parser.add_argument("--scheduler", metavar="ADDRESS",
+                        help="Dask scheduler whose workers run them instead: tcp://HOST:PORT")
+
+
+def _shard(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise argparse.ArgumentTypeError(f"{text}: must be I/N, whole numbers with I from 1 to N")
+    return int(match[1]), int(match[2])
+
+
+def _numbers(text: str) -> list[float]:
+    values = [_number(part) for part in text.split(",")]
+    if not all(map(math.isfinite, values)):
+        raise argparse.ArgumentTypeError(f"{text}: must be numbers with commas between them")
+    return values
 
 
 def _one_of(allowed: Iterable[str]) -> Callable[[str], str]:

@@ -47,7 +47,7 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
 
 
 def save_truth(recording: Path, folder: Path) -> None:
-    """Copies the last TRUTH_S of a recording, which may be of an emulator that was killed; numpy.load reads the copy."""
+    """Copies the last TRUTH_S of a recording, which may be of an emulator that was killed, for numpy.load."""
     with recording.open("rb") as file:
         np.lib.format.read_magic(file)
         _, _, dtype = np.lib.format.read_array_header_1_0(file)
