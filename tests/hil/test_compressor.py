@@ -14,7 +14,7 @@ import pytest
 
 from salient.bench.rig import RigError
 from salient.experiments.compare.cases import GROUPS
-from salient.experiments.load_profile import load_profile_path, read_load_profile
+from salient.bench.load_profile import load_profile_path, read_load_profile
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, run_scenario
 
 CASES = {(case.condition, case.controller): case.scenario for case in GROUPS["compressor"].cases(False)}

@@ -39,7 +39,7 @@ def test_drive_stops_when_commands_stop(bench):
     bench.drive.speed_reference_rpm = 300
     bench.run_for(0.1)
     bench.drive.silence()
-    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.5)
+    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.6)
     assert bench.drive.fault == "command_timeout"
 
 

@@ -22,12 +22,12 @@ from typing import Any, TextIO
 from can import CanError
 
 from salient.bench.drive import DriveError
+from salient.bench.load_profile import load_profile_path, read_load_profile
 from salient.bench.programs import EmulatorError, executable
 from salient.bench.session import SessionError
 from salient.errors import RunFailed, UsageError
 from salient.experiments import metrics as run_metrics
 from salient.experiments import tasks
-from salient.experiments.load_profile import load_profile_path, read_load_profile
 from salient.experiments.metrics import MetricsError, load_step_metrics, losses, start_metrics
 from salient.experiments.results import rounded
 from salient.experiments.scaled import scale_of_name, scaled
