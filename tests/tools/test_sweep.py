@@ -12,21 +12,23 @@ from pathlib import Path
 
 import pytest
 
+from salient.bench.rig import bench_variables
 from salient.cli import make_parser
 from salient.errors import UsageError
 from salient.experiments import sweep
 from salient.experiments.compare.command import run as compare
 from salient.experiments.tasks import read_results
+from salient.machine.parameter_table import read_table
 
 SCENARIO = """
 machine = "saturating"
 controllers = ["salient"]
-duration_s = 0.06
+duration_s = 0.1
 [[speed]]
 at_s = 0.0
 value_rpm = 300.0
 [[load]]
-at_s = 0.05
+at_s = 0.09
 torque_Nm = 2.0
 [record]
 step_us = 10.0
@@ -60,7 +62,7 @@ def test_sweep_gives_the_same_table_on_processes_shards_and_a_scheduler_whose_wo
     assert {row["machine"] for row in found} == {"saturating", "linear_cosine"}
     settling_s = [float(row["settling_time_s"]) for row in found[:10]]
     assert settling_s == sorted(settling_s, reverse=True)  # more torque, earlier
-    assert 0.02 < settling_s[-1] < settling_s[0] < 0.06
+    assert 0.02 < settling_s[-1] < settling_s[0] < 0.09
     assert (tmp_path / "a" / "sweep.png").read_bytes().startswith(b"\x89PNG")
 
     for shard in ("2/2", "1/2"):
@@ -95,7 +97,7 @@ def test_finished_runs_are_kept_for_the_same_scenario_only(scenario, tmp_path, m
     assert len(read_results(out)) == 2
     sweep.run(options(*arguments), io.StringIO())
     assert (len(read_results(out)), (out / "sweep.csv").read_bytes()) == (2, before)
-    scenario.write_text(SCENARIO.replace("0.06", "0.061"))
+    scenario.write_text(SCENARIO.replace("= 0.1", "= 0.101"))
     sweep.run(options(*arguments), io.StringIO())
     assert len(read_results(out)) == 4
 
@@ -106,15 +108,19 @@ def test_loads_profiles_and_seeds_are_columns(scenario, tmp_path):
     found = rows(tmp_path)
     assert [(row["load_Nm"], row["seed"]) for row in found] == [("1.0", "1"), ("1.0", "2"), ("3.0", "1"), ("3.0", "2")]
     assert {row["controller"] for row in found} == {"paper"}
-    assert len({row["torque_max_Nm"] for row in found}) == 4  # noise by seed, torque by load
+    assert len({row["final_speed_rpm"] for row in found}) == 4  # noise by seed, torque by load
 
 
 def test_failed_run_is_a_row_and_the_exit_code(scenario, tmp_path, capsys):
     code = sweep.run(options(scenario, tmp_path, "--set", "encoder_fault=0,1"), io.StringIO())
     assert code == 1
-    assert [row["error"] for row in rows(tmp_path)][0] == ""
-    assert "encoder" in rows(tmp_path)[1]["error"]
+    good, bad = rows(tmp_path)
+    assert good["error"] == "" and "encoder" in bad["error"]
     assert "1 of 2 runs failed, the first with" in capsys.readouterr().err
+
+
+def test_no_column_of_metrics_is_the_name_of_a_setting():
+    assert not set(sweep.METRICS) & ({row.name for row in read_table()} | set(bench_variables()))
 
 
 @pytest.mark.parametrize(("arguments", "error"), [
@@ -135,8 +141,8 @@ def test_invalid_sweep_is_refused_before_the_first_run(scenario, tmp_path, argum
 
 def compared(out: Path, *arguments: str) -> dict[str, object]:
     stream = io.StringIO()
-    compare(make_parser().parse_args(["compare", "inertia", "--quick", "--samples", "1", "--out", str(out), *arguments]),
-            stream)
+    compare(make_parser().parse_args(["compare", "inertia", "--quick", "--samples", "1", "--out", str(out),
+                                      *arguments]), stream)
     return json.loads((out / "compare.json").read_text())
 
 

@@ -43,7 +43,7 @@ from salient.errors import UsageError
 _AXES = {"machine": "machine", "controller": "controller", "target": "build"}
 """What tests are parametrised by: keyword of bench_each -> option of a bench."""
 _OF_THE_BENCH = frozenset(("rig", "rigs", "truth", "at", "fault", "clear_fault", "load_torque_Nm", "held_speed_rpm",
-                           "simulator"))
+                           "simulator", "options"))
 """Attributes of `bench` that a drive without its test bench has not."""
 _OF_ANY_DRIVE = frozenset(("machine", "node"))
 """Options that only describe a drive."""
@@ -145,9 +145,8 @@ def _needs_bench(item: pytest.Item) -> str:
     """What a test uses that only a test bench has, as far as its code shows; "" for nothing."""
     if not isinstance(item, pytest.Function) or "make_bench" not in item.fixturenames:
         return ""
-    options = {name for mark in item.iter_markers("bench_options") for name in mark.kwargs}
-    used = sorted((options | set(_AXES) & {n for m in item.iter_markers("bench_each") for n in m.kwargs})
-                  - _OF_ANY_DRIVE)
+    options = {name for mark in item.iter_markers("bench_options") for name in mark.kwargs} - _OF_ANY_DRIVE
+    used = sorted(options.union(*(mark.kwargs for mark in item.iter_markers("bench_each"))))
     if used:
         return f"option {used[0]}"
     used = sorted(_names(item.function.__code__) & _OF_THE_BENCH - {"fault"})  # a drive has one, too
@@ -169,9 +168,14 @@ class DriveOnBus(Session):
             raise UsageError(f"--salient-can {can}: no frame for a second; is there a drive?")
 
         super().__init__(can, lockstep=False, is_alive=is_alive, machine=machine, node=node)
+        self._refuses_bench = True
+
+    def release(self) -> None:
+        """From here on the signals of a test bench, of which there are none, can be read, to save them."""
+        self._refuses_bench = False
 
     def __getattribute__(self, name: str) -> Any:
-        if name in _OF_THE_BENCH and "_reader" in object.__getattribute__(self, "__dict__"):
+        if name in _OF_THE_BENCH and object.__getattribute__(self, "__dict__").get("_refuses_bench"):
             pytest.skip(f"needs the test bench (bench.{name}), and on {self.address} there is a drive alone")
         return super().__getattribute__(name)
 
@@ -268,6 +272,8 @@ def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
     seeds = []
     for number, bench in enumerate(state.benches):
         of_bench = state.saved[number] = folder / str(number)
+        if isinstance(bench, DriveOnBus):
+            bench.release()
         changed = failure.save(bench, of_bench, notes, getattr(bench, "options", None))
         if report.when == "teardown" and number in state.recordings:  # complete since the fixture has ended
             failure.save_truth(state.recordings[number], of_bench)

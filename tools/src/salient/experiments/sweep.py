@@ -41,9 +41,9 @@ from salient.progress import Progress
 
 TABLE, PLOT = "sweep.csv", "sweep.png"
 METRICS = ("settling_time_s", "overshoot_percent", "max_speed_rpm", "final_speed_rpm", "speed_dip_rpm",
-           "recovery_time_s", "torque_max_Nm", "torque_min_Nm", "torque_mean_Nm", "torque_ripple",
+           "recovery_time_s", "highest_torque_Nm", "lowest_torque_Nm", "mean_torque_Nm", "torque_ripple",
            "phase_current_rms_A", "efficiency_percent")
-"""Columns of every table; empty where a run has no such metric."""
+"""Columns of every table, none of which is the name of a setting; empty where a run has no such metric."""
 _STEADY_S = 0.1
 """At the end of a run: window of the mean torque, its ripple and the losses."""
 _PROGRESS_LINES_MAX = 20
@@ -178,14 +178,14 @@ def _metrics(result: RunResult) -> dict[str, Any]:
     if recording is None:
         speed_rpm, torque_Nm = result.truth["speed_rpm"].value, result.truth["torque_Nm"].value
         return {"max_speed_rpm": float(speed_rpm.max()), "final_speed_rpm": float(speed_rpm[-1]),
-                "torque_max_Nm": float(torque_Nm.max()), "torque_min_Nm": float(torque_Nm.min())}
+                "highest_torque_Nm": float(torque_Nm.max()), "lowest_torque_Nm": float(torque_Nm.min())}
     last_s = float(recording["time_s"][-1])
     window = recording[recording["time_s"] >= last_s - _STEADY_S]
     torque_Nm = window["torque_Nm"]
     low_Nm, high_Nm, mean_Nm = float(torque_Nm.min()), float(torque_Nm.max()), float(torque_Nm.mean(dtype=float))
     row: dict[str, Any] = {"max_speed_rpm": float(recording["speed_rpm"].max()),
-                           "final_speed_rpm": float(recording["speed_rpm"][-1]), "torque_max_Nm": high_Nm,
-                           "torque_min_Nm": low_Nm, "torque_mean_Nm": mean_Nm}
+                           "final_speed_rpm": float(recording["speed_rpm"][-1]), "highest_torque_Nm": high_Nm,
+                           "lowest_torque_Nm": low_Nm, "mean_torque_Nm": mean_Nm}
     if mean_Nm > 0.0 and scenario.record is not None and scenario.record.step_us <= 1.0:  # else it would be hidden
         row["torque_ripple"] = (high_Nm - low_Nm) / mean_Nm
     energy = losses(recording, load_machine(machine_path(scenario.machine)), (float(window["time_s"][0]), last_s))
