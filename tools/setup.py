@@ -2,7 +2,8 @@
 
 A wheel has, in salient/data, the files of the repository that its commands need, in their places there, and in
 salient/data/bin the programs of the host build, linked statically: they run on any Linux of their processor, and have
-the same C library, so the same bits, everywhere. salient/data/install is the CMake package (cmake/install.cmake). An editable installation uses the repository.
+the same C library, so the same bits, everywhere. salient/data/install is the CMake package (cmake/install.cmake).
+An editable installation uses the repository.
 """
 
 from __future__ import annotations

@@ -240,6 +240,6 @@ def plot(path: Path, combinations: Sequence[Run], rows: Sequence[Mapping[str, An
         axes.set_xlabel(x, fontsize="small")
         axes.grid(alpha=0.3)
     if len(lines) > 1:
-        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4,
+        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=4,
                       fontsize="small")
     figure.savefig(path, dpi=90)
