@@ -82,7 +82,7 @@ def test_first_test_passes(tmp_path):
 
 
 def test_torque_loop_holds_the_speed(tmp_path):
-    done = run(tmp_path, sys.executable, "-W", "error", EXAMPLES / "torque_loop.py")
+    done = run(tmp_path, sys.executable, EXAMPLES / "torque_loop.py")
     assert (done.returncode, done.stderr) == (0, "")
     found = re.fullmatch(r"return (-[0-9.]+), speed ([0-9]+) r/min\n", done.stdout)
     assert found is not None and -60 < float(found[1]) < -5 and 297 <= int(found[2]) <= 303
