@@ -44,7 +44,7 @@ function(salient_generate_codec target dbc)
         COMMENT "CAN codec from ${name}.dbc"
         VERBATIM)
     add_library(${target} STATIC ${sources})
-    target_include_directories(${target} PUBLIC ${out})
+    salient_public_headers(${target} ${out})
 endfunction()
 
 # salient_generate_rig_table(TARGET NAME DBC): an interface library with NAME.h, the table that salient.generate.NAME

@@ -155,7 +155,7 @@ def _as_root(command: list[str], output: BinaryIO) -> bool:
 def make_environment(install: bool) -> None:
     """Makes build/venv from the lock file, again when the lock file has changed."""
     packages = hashlib.sha256(LOCK.read_bytes() + str(ROOT).encode()).hexdigest()
-    ours = hashlib.sha256((TOOLS / "pyproject.toml").read_bytes()).hexdigest()
+    ours = hashlib.sha256(b"".join((TOOLS / name).read_bytes() for name in ("pyproject.toml", "setup.py"))).hexdigest()
     found = STAMP.read_text().split() if STAMP.exists() and (VENV / "bin/python").exists() else []
     if found == [packages, ours]:
         return

@@ -218,7 +218,7 @@ def test_failure_leaves_log_plot_seed_and_replay_command(tmp_path):
     assert "--seed 77" in notes["simulator"]
     assert notes["virtual_time_s"] == pytest.approx(0.06)
     assert "-m pytest" in notes["replay"]
-    assert (folder / "last_moments.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "failure.png").read_bytes().startswith(b"\x89PNG")
     with can.LogReader(folder / "can.blf") as log:
         assert len(list(log)) == len((folder / "can.log").read_text().splitlines()) > 300
 
@@ -230,7 +230,8 @@ def test_markers_select_by_transport(tmp_path):
         "@pytest.mark.socketcan\ndef test_interface(): pass\n"
         "def test_local(): pass\n"
     )
-    for can_bus, names in (("local", {"test_both", "test_local"}), ("socketcan:x", {"test_both", "test_interface"})):
+    everywhere = {"test_both", "test_local"}
+    for can_bus, names in (("local", everywhere), ("socketcan:x", everywhere | {"test_interface"})):
         result = subprocess.run(
             [sys.executable, "-m", "pytest", "-v", "-p", "no:cacheprovider", f"--salient-can={can_bus}", tmp_path],
             capture_output=True, text=True, cwd=tmp_path,
@@ -242,7 +243,7 @@ def test_invalid_transport_is_rejected(tmp_path):
     result = subprocess.run([sys.executable, "-m", "pytest", "--salient-can=vcan0", tmp_path], capture_output=True,
                             text=True, cwd=Path(tmp_path))
     assert result.returncode == 4
-    assert "--salient-can vcan0: must be local or socketcan:INTERFACE" in result.stderr
+    assert "--salient-can vcan0: must be local, unix:PATH or socketcan:INTERFACE" in result.stderr
 
 
 @pytest.mark.parametrize("name", ["phase_a_open", "load_torque", "Load_torque_Nm", "_load_torque_Nm"])

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from salient.bench.load_profile import load_profile_path, read_load_profile
 from salient.bench.rig import RigError
 from salient.experiments.compare.cases import GROUPS
-from salient.experiments.load_profile import load_profile_path, read_load_profile
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, run_scenario
 
 CASES = {(case.condition, case.controller): case.scenario for case in GROUPS["compressor"].cases(False)}

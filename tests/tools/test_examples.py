@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import re
+import shutil
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
@@ -12,7 +16,8 @@ from salient.bench.emulator import EmulatorProcess
 from salient.bus.clock import open_bus
 from salient.bus.signals import SignalTable, drive_database
 from salient.config import BenchConfig
-from salient.paths import ROOT
+from salient.experiments.scenario import load_scenarios, run_scenario
+from salient.paths import DRIVE_DBC, ROOT, SCENARIOS
 
 EXAMPLES = ROOT / "tools" / "examples"
 
@@ -63,3 +68,38 @@ def test_end_of_the_drive_is_reported_in_one_line(channel, script):
             server.accept()[0].close()
     output, errors = example.communicate()
     assert (output, errors, example.returncode) == ("", f"{channel}: the drive has ended\n", 1)
+
+
+def run(folder, *command, **environment):
+    return subprocess.run([str(part) for part in command], cwd=folder, env={**os.environ, **environment}, text=True,
+                          capture_output=True)
+
+
+def test_first_test_passes(tmp_path):
+    shutil.copy(EXAMPLES / "test_first.py", tmp_path)
+    done = run(tmp_path, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", ".")
+    assert (done.returncode, "1 passed" in done.stdout) == (0, True), done.stdout
+
+
+def test_torque_loop_holds_the_speed(tmp_path):
+    done = run(tmp_path, sys.executable, EXAMPLES / "torque_loop.py")
+    assert (done.returncode, done.stderr) == (0, "")
+    found = re.fullmatch(r"return (-[0-9.]+), speed ([0-9]+) r/min\n", done.stdout)
+    assert found is not None and -60 < float(found[1]) < -5 and 297 <= int(found[2]) <= 303
+
+
+def test_log_is_analysed_with_pandas(tmp_path):
+    scenario = replace(load_scenarios(SCENARIOS / "start_600.toml")[2], duration_s=0.3, record=None)
+    log = run_scenario(scenario, tmp_path).log_path
+    done = run(tmp_path, sys.executable, "-W", "error", EXAMPLES / "analyse_log.py", log, DRIVE_DBC)
+    assert (done.returncode, done.stderr) == (0, "")
+    last = done.stdout.splitlines()[-1].split()
+    assert last[0] == "0.2" and abs(float(last[2])) < 0.5 and int(last[1]) > 50
+
+
+def test_sweep_writes_its_table(tmp_path):
+    done = run(tmp_path, EXAMPLES / "sweep.sh", "--shard", "1/15", SALIENT=f"{sys.executable} -m salient")
+    assert done.returncode == 0, done.stderr
+    lines = (tmp_path / "out" / "sweep" / "sweep.csv").read_text().splitlines()
+    assert lines[0].startswith("machine,controller,observer_bandwidth_rad_s,current_noise_A,seed,settling_time_s")
+    assert len(lines) == 3  # of 30 runs

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from salient.bench.load_profile import load_profile_path, read_load_profile
 from salient.errors import UsageError
 from salient.experiments import compressor
-from salient.experiments.load_profile import load_profile_path, read_load_profile
 from salient.experiments.scenario import LoadStep, load_scenarios
 
 ROWS = "".join(f"{45 * n},{n}\n" for n in range(8))

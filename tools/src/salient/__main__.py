@@ -10,7 +10,7 @@ from pathlib import Path
 from salient.cli import make_parser
 from salient.config import OPTIONS, BenchConfig
 from salient.errors import RunFailed, UsageError
-from salient.paths import BUILD
+from salient.paths import BUILD, SCENARIOS
 
 
 def main() -> int:
@@ -78,6 +78,8 @@ def _sim(options: argparse.Namespace) -> int:  # noqa: RET503 - os.execv does no
 def _run(options: argparse.Namespace) -> int:
     from salient.experiments.scenario import load_scenarios, run_all
 
+    if (bundled := SCENARIOS / f"{options.scenario}.toml").is_file():
+        options.scenario = bundled
     scenarios = load_scenarios(options.scenario)
     out = options.out or Path("out") / options.scenario.stem
     results = run_all(scenarios, out, build=options.build, instruction_ns=options.instruction_ns,
@@ -128,10 +130,22 @@ def _compare(options: argparse.Namespace) -> int:
     return run(options)
 
 
+def _sweep(options: argparse.Namespace) -> int:
+    from salient.experiments.sweep import run
+
+    return run(options)
+
+
 def _machine(options: argparse.Namespace) -> int:
     from salient.machine.report import run
 
     return run(options.machine, options.out, options.json, options.dbc, options.node)
+
+
+def _wheel(options: argparse.Namespace) -> int:
+    from salient.wheel import build
+
+    return build(options.out)
 
 
 def _pil(options: argparse.Namespace) -> int:
@@ -164,8 +178,10 @@ _COMMANDS = {
     "parameters": _parameters,
     "benchmark": _benchmark,
     "compare": _compare,
+    "sweep": _sweep,
     "machine": _machine,
     "pil": _pil,
+    "wheel": _wheel,
 }
 
 if __name__ == "__main__":

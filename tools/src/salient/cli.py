@@ -23,10 +23,13 @@ from salient.config import (
     either,
     flag_of,
 )
+from salient.paths import BUILD, COMMAND, IS_WHEEL
 from salient.version import VERSION
 
 TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "plant", "tools", "socketcan")
 """The steps of `test`, in order."""
+CLONE_ONLY = ("test", "benchmark", "pil", "wheel")
+"""Commands that need the sources."""
 CHANGE_PERCENT = 10.0
 """Smaller changes of a ripple, which is an extreme of one run, are within its scatter."""
 
@@ -46,13 +49,15 @@ class _Parser(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     """All commands and their options."""
-    parser = _Parser(prog="tools/salient", description="Salient: a switched-reluctance drive and its test bench.")
+    parser = _Parser(prog=COMMAND, description="Salient: a switched-reluctance drive and its test bench.")
     parser.add_argument("--version", action="version", version=f"salient {VERSION}")
     parser.add_argument("--no-install", action="store_true", help="name what is missing instead of installing it")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
 
     def command(name: str, text: str) -> argparse.ArgumentParser:
-        made = commands.add_parser(name, help=text, description=text, prog=f"tools/salient {name}")
+        if IS_WHEEL and name in CLONE_ONLY:
+            return _Parser()
+        made = commands.add_parser(name, help=text, description=text, prog=f"{COMMAND} {name}")
         made.add_argument("--no-install", action="store_true", default=argparse.SUPPRESS,
                           help="name what is missing instead of installing it")
         return made
@@ -107,6 +112,9 @@ def make_parser() -> argparse.ArgumentParser:
     _add_compare_options(command("compare", "the controllers compared with each other, their targets and an earlier "
                                  "run"))
 
+    _add_sweep_options(command("sweep", "a scenario over parameters, machines, controllers, loads and "
+                               "seeds: one table"))
+
     machine = command("machine", "check a machine file, summarise it, list what follows for its drive, draw its "
                       "magnetics")
     machine.add_argument("machine", metavar="NAME|FILE")
@@ -157,6 +165,9 @@ def make_parser() -> argparse.ArgumentParser:
                         help="parent of the folder for a seed (default out/replay)")
     replay.add_argument("--target", dest="build", type=_one_of(TARGETS), default=TARGETS[0], metavar="NAME",
                         help=f"{either(TARGETS)} (default {TARGETS[0]})")
+    wheel = command("wheel", "the Python package with its programs, for suites in other repositories")
+    wheel.add_argument("--out", type=Path, default=Path("out/wheel"), metavar="DIR",
+                       help="folder (default out/wheel)")
 
     parameters = command("parameters", "parameters and fault log of a running drive")
     actions = parameters.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
@@ -164,7 +175,7 @@ def make_parser() -> argparse.ArgumentParser:
                        ("compare", "list the differences from a file, exit code 1 when there are any"),
                        ("load", "set the parameters that a file has, all or none"),
                        ("faults", "print the log of faults")):
-        action = actions.add_parser(name, help=text, description=text, prog=f"tools/salient parameters {name}")
+        action = actions.add_parser(name, help=text, description=text, prog=f"{COMMAND} parameters {name}")
         if name != "faults":
             action.add_argument("file", type=Path, metavar="FILE.toml")
         if name == "load":
@@ -205,7 +216,7 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
 def _add_can(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--can", type=lambda text: text if text == "auto" else _convert("can", text), default="auto",
                         metavar="BUS", help=f"{BUSES}, or auto (default): vcan0 when it is up, else "
-                        "unix:build/salient.sock")
+                        f"unix:{'' if IS_WHEEL else 'build/'}salient.sock" + (f" in {BUILD}" if IS_WHEEL else ""))
 
 
 def _option_type(name: str) -> Callable[[str], Any]:
@@ -228,7 +239,9 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="fewer machines, rates and angles: some 20 s")
     parser.add_argument("--out", type=Path, default=Path("out/compare"), metavar="DIR",
                         help="folder (default out/compare)")
-    parser.add_argument("--jobs", type=_count, metavar="N", help="simultaneous runs (default: number of cores)")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
+                        help="parameter of the drive or variable of the test bench, in every run; may be repeated")
+    _add_execution_options(parser)
     parser.add_argument("--samples", type=_count, metavar="N",
                         help="only the first N samples (drives, angles, seeds) of each condition")
     parser.add_argument("--resume", action="store_true",
@@ -238,6 +251,50 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
                         "the worse")
     parser.add_argument("--worse-percent", type=_percent, default=CHANGE_PERCENT, metavar="X",
                         help=f"a larger change is reported (default {CHANGE_PERCENT:g})")
+
+
+def _add_sweep_options(parser: argparse.ArgumentParser) -> None:
+    """What --set and --machine name is checked by salient.experiments.sweep."""
+    parser.add_argument("scenario", type=Path, metavar="NAME|SCENARIO.toml",
+                        help="bundled scenario or scenario file, for one machine of the sweep; on other machines its "
+                        "speeds and loads are in terms of their base speed and rated torque")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUES",
+                        help="parameter of the drive or variable of the test bench: VALUE,VALUE,... or "
+                        "FIRST:LAST:COUNT; may be repeated")
+    for name, metavar in (("machine", "NAME|FILE"), ("controller", "NAME")):
+        parser.add_argument(f"--{name}", action="append", default=[], type=_option_type(name), metavar=metavar,
+                            help=f"{name}; may be repeated (default as the scenario)")
+    parser.add_argument("--load-Nm", dest="load_Nm", type=_numbers, default=[], metavar="X,X,...",
+                        help="torques of the scenario's loads")
+    parser.add_argument("--load-profile", action="append", default=[], metavar="NAME|FILE",
+                        help="load profile; may be repeated")
+    parser.add_argument("--seeds", type=_count, default=1, metavar="N", help="number of seeds (default 1)")
+    parser.add_argument("--seed", type=_option_type("seed"), metavar="N", help="the first (default as the scenario)")
+    parser.add_argument("--out", type=Path, default=Path("out/sweep"), metavar="DIR", help="folder (default out/sweep)")
+    parser.add_argument("--resume", action="store_true", help="keep the finished runs in the folder")
+    _add_execution_options(parser)
+    parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N",
+                        help="only the I-th of N parts; keeps the finished runs in the folder")
+
+
+def _add_execution_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--jobs", type=_count, metavar="N", help="simultaneous runs (default: number of cores)")
+    parser.add_argument("--scheduler", metavar="ADDRESS",
+                        help="Dask scheduler whose workers run them instead: tcp://HOST:PORT")
+
+
+def _shard(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise argparse.ArgumentTypeError(f"{text}: must be I/N, whole numbers with I from 1 to N")
+    return int(match[1]), int(match[2])
+
+
+def _numbers(text: str) -> list[float]:
+    values = [_number(part) for part in text.split(",")]
+    if not all(map(math.isfinite, values)):
+        raise argparse.ArgumentTypeError(f"{text}: must be numbers with commas between them")
+    return values
 
 
 def _one_of(allowed: Iterable[str]) -> Callable[[str], str]:
@@ -265,13 +322,6 @@ def _seeds(text: str) -> int:
     if not re.fullmatch("[0-9]{1,8}", text) or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 1 to 99999999")
     return int(text)
-
-
-def _shard(text: str) -> tuple[int, int]:
-    found = re.fullmatch("([0-9]{1,6})/([0-9]{1,6})", text)
-    if found is None or not 1 <= int(found[1]) <= int(found[2]):
-        raise argparse.ArgumentTypeError(f"{text}: must be I/N, whole numbers with I from 1 to N")
-    return int(found[1]), int(found[2])
 
 
 def _percent(text: str) -> float:

@@ -198,6 +198,8 @@ class BenchConfig(Conditions):
     build: str = _option("host", WORD, "processor that runs the firmware: the host, or one that QEMU emulates",
                          metavar="NAME", choices=TARGETS, commands=("sim", "demo", "run"), flag="target",
                          argument=False)
+    program: Path | None = _option(None, FILE, "executable of another project instead of that of the build",
+                                   argument=False)
     instructions: Path | None = _option(None, FILE, "instruction counts", argument=False)
     execution: Path | None = _option(None, FILE, "execution trace", argument=False)
     instruction_ns: int | None = _option(None, INTEGER, "time of an instruction on the cortex-m4; without it the "

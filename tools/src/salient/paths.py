@@ -1,11 +1,18 @@
-"""Where things are in the repository that this package is installed from."""
+"""Where things are: in the repository that this package is installed from, or in the package itself, a wheel, whose
+folder data/ has the files that are needed in the places that they have in the repository (tools/setup.py)."""
 
+import os
 from pathlib import Path
 
 from salient.errors import UsageError, shown
 
-ROOT = Path(__file__).resolve().parents[3]
-BUILD = ROOT / "build"
+_DATA = Path(__file__).resolve().parent / "data"
+IS_WHEEL = _DATA.is_dir()
+ROOT = _DATA if IS_WHEEL else _DATA.parents[3]
+BUILD = (Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "salient" if IS_WHEEL
+         else ROOT / "build")
+"""What is made while the tools are used, and in a repository the programs."""
+COMMAND = "salient" if IS_WHEEL else "tools/salient"
 PYTHON_PACKAGES = ROOT / "tools" / "requirements.lock"
 MACHINES = ROOT / "tools" / "machines"
 LOADS = ROOT / "tools" / "loads"
@@ -13,6 +20,11 @@ SCENARIOS = ROOT / "tools" / "scenarios"
 DRIVE_DBC = ROOT / "firmware" / "comms" / "drive.dbc"
 PARAMETERS = ROOT / "firmware" / "drive" / "parameters.def"
 RIG_DBC = ROOT / "emulator" / "rig" / "rig.dbc"
+
+
+def program(build: str, name: str) -> Path:
+    """A program of a build, which may not exist; in a wheel all are for the host."""
+    return ROOT / "bin" / name if IS_WHEEL else BUILD / build / "bin" / name
 
 
 def bundled_or_path(name_or_path: str, folder: Path, suffix: str, key: str) -> Path:

@@ -156,7 +156,8 @@ def _socketcan() -> Count:
              if mark.search(path.read_text(encoding="utf-8"))]
     vm = [sys.executable, "-m", "salient.vm.run", "--timeout-s", str(VM_TIMEOUT_S), "--"]
     # One after the other: there is one interface. Quiet: it runs beside other steps.
-    return _pytest("socketcan", *files, options=["--salient-can=socketcan:vcan0"], prefix=vm, processes=0, quiet=True)
+    return _pytest("socketcan", *files, options=["--salient-can=socketcan:vcan0", "-m", "both_transports or socketcan"],
+                   prefix=vm, processes=0, quiet=True)
 
 
 STEPS = {"style": _style, "unit": _unit, "sanitize": _sanitize}

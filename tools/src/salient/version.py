@@ -1,10 +1,10 @@
-"""Version of firmware and tools: that of the CMake project. Standard library only, and imported by itself when the
-package is built."""
+"""Version of firmware and tools: that of the CMake project. Standard library only."""
 
 import re
-from pathlib import Path
 
-_PROJECT = Path(__file__).resolve().parents[3] / "CMakeLists.txt"
+from salient.paths import ROOT
+
+_PROJECT = ROOT / "CMakeLists.txt"
 _found = re.search(r"^project\(salient VERSION ([0-9.]+)", _PROJECT.read_text(encoding="utf-8"), re.MULTILINE)
 if _found is None:
     raise ValueError(f"{_PROJECT}: no line project(salient VERSION ...)")

@@ -8,17 +8,12 @@
 
 from __future__ import annotations
 
-import json
-import shlex
 from dataclasses import replace
-from pathlib import Path
 
 from salient.bench.emulator import EmulatorProcess, parameter_table
 from salient.bench.session import Session
-from salient.bus.log import write_logs
 from salient.config import BenchConfig
 
-LAST_MOMENTS_S = 0.05
 TELEMETRY_PERIOD_MS = 1
 """Of a bench, unless its configuration states one; a bus with one drive alone has room for it."""
 
@@ -52,42 +47,3 @@ class Bench(Session):
             super().close()
         finally:
             self.simulator.close()
-
-    def save(self, folder: Path, replay: str) -> None:
-        """Writes the evidence of a failure: log (BLF and candump text), plot of the last moments, seed and command
-        line, and the command that replays it."""
-        folder.mkdir(parents=True, exist_ok=True)
-        write_logs(self.log, folder / "can.blf", folder / "can.log")
-        notes = {
-            "virtual_time_s": self.time_s,
-            "seed": self.options.seed,
-            "simulator": shlex.join(self.simulator.command),
-            "replay": replay,
-            "stderr": self.simulator.errors,
-        }
-        (folder / "bench.json").write_text(json.dumps(notes, indent=2) + "\n", encoding="utf-8")
-        plot_last_moments(self, folder / "last_moments.png")
-
-
-def plot_last_moments(session: Session, path: Path) -> None:
-    """Speed, torque and phase currents, true and in the telemetry, over the last LAST_MOMENTS_S."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    panels = (
-        [("telemetry", "DRIVE_MOTION.speed_reference_rpm"), ("telemetry", "speed_rpm"), ("truth", "speed_rpm")],
-        [("telemetry", "torque_reference_Nm"), ("telemetry", "torque_estimate_Nm"), ("truth", "torque_Nm"),
-         ("truth", "load_torque_Nm")],
-        [("truth", f"current_{phase}_A") for phase in "abcd"],
-    )  # fmt: skip
-    figure = Figure(figsize=(10, 9), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, panel in zip(figure.subplots(len(panels), 1, sharex=True), panels, strict=True):
-        for source, name in panel:
-            signal = getattr(session, source)[name].between(session.time_s - LAST_MOMENTS_S, session.time_s + 1e-9)
-            axes.plot(signal.time_s, signal.value, label=f"{source} {signal.name}", marker=".", markersize=3)
-            axes.set_ylabel(signal.unit)
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
-        axes.grid(alpha=0.3)
-    axes.set_xlabel("virtual time, s")
-    figure.savefig(path, dpi=90)

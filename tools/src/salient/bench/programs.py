@@ -20,7 +20,7 @@ from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.machine.cache import content_key, machine_image
 from salient.machine.path import machine_path
-from salient.paths import BUILD, MACHINES, ROOT
+from salient.paths import BUILD, IS_WHEEL, MACHINES, ROOT, program
 
 _BUILDERS = {"host": "any tools/salient command",
              "debug": "cmake --preset debug && cmake --build --preset debug"}
@@ -35,6 +35,8 @@ class EmulatorError(Exception):
 def executable(build: str = "host") -> Path:
     """The executable of a build (BenchConfig.build), for a target build the program that starts QEMU. UsageError: it is
     not built."""
+    if IS_WHEEL and build != "host":
+        raise UsageError(f"--target {build}: only in a clone of the repository, where it is built; must be host")
     if build in TARGET_BUILDS:
         return _built("host", "salient_target")
     return _built(build, "salient_host")
@@ -64,15 +66,15 @@ def command_line(config: BenchConfig) -> list[str]:
     """The command line that starts a test bench. UsageError: as executable() and image(), and options that exclude each
     other."""
     arguments = replace(config, machine_image=config.machine_image or machine_image(config.machine)).arguments()
-    program = str(executable(config.build))
+    start = str(config.program or executable(config.build))
     if config.build not in TARGET_BUILDS:
         if config.instruction_ns is not None:
             raise UsageError(f"--instruction-ns {config.instruction_ns}: only with --target cortex-m4")
-        return [program, *arguments]
+        return [start, *arguments]
     if config.drives > 1:
         raise UsageError(f"--drives {config.drives}: only with --target host")
     elf = image(config.machine, config.build)
-    line = [program, str(elf)]
+    line = [start, str(elf)]
     if config.instructions is not None:
         line += ["--instructions", str(config.instructions),
                  "--deferred-instructions", str(deferred_instructions(config.instructions))]
@@ -85,11 +87,11 @@ def command_line(config: BenchConfig) -> list[str]:
 
 
 def _built(build: str, name: str) -> Path:
-    program = BUILD / build / "bin" / name
-    if not program.exists():
+    path = program(build, name)
+    if not path.exists():
         builder = "tools/salient compare" if name == _REFERENCE else _BUILDERS.get(build, _TESTS)
-        raise UsageError(f"{program.relative_to(ROOT)} is not built; {builder} builds it")
-    return program
+        raise UsageError(f"{path.relative_to(ROOT)} is not built; {builder} builds it")
+    return path
 
 
 @lru_cache

@@ -17,11 +17,15 @@ from cantools.database.namedsignalvalue import NamedSignalValue
 
 from salient.bench.client import Client, unknown_attribute
 from salient.bench.faults import FaultError, fault_kind, fault_signals
+from salient.bench.load_profile import (
+    LOAD_PROFILE_VALUE_MAX,
+    LOAD_PROFILE_VALUES_MAX,
+    load_profile_path,
+    read_load_profile,
+)
 from salient.bus.signals import SignalTable, rig_database, signal_range
 
 _AT_US_MAX = 2**32 - 1
-LOAD_PROFILE_VALUES_MAX = 256
-LOAD_PROFILE_VALUE_MAX = 1000.0
 _FREE = "free"
 """Named value of a variable that imposes nothing; not-a-number in Python."""
 
@@ -120,9 +124,12 @@ class Rig:
         if status != "done":
             raise RigError(f"{name} {value:g} at {self._at_us} us: {status}")
 
-    def set_load_profile(self, values: Sequence[float]) -> None:
+    def set_load_profile(self, values: str | Sequence[float]) -> None:
         """Sets the load profile, now: torque over one turn of the rotor at equal steps of its angle from 0, times
-        load_profile_Nm. RigError: not 1 to 256 values of at most +-1000."""
+        load_profile_Nm; or a bundled load profile or CSV file by its name. RigError: not 1 to 256 values of at most
+        +-1000. UsageError: no such load profile, or a mistake in its file."""
+        if isinstance(values, str):
+            values = read_load_profile(load_profile_path(values))
         if not 1 <= len(values) <= LOAD_PROFILE_VALUES_MAX:
             raise RigError(f"load profile of {len(values)} values: must be 1 to {LOAD_PROFILE_VALUES_MAX}")
         for value in values:

@@ -44,8 +44,9 @@ from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 from salient.machine.path import stated_conditions
 from salient.pages import Plot
-from salient.paths import SCENARIOS
+from salient.paths import COMMAND, SCENARIOS
 from salient.progress import Progress
+from salient.version import VERSION
 
 Metrics = dict[str, float | None]
 
@@ -262,7 +263,7 @@ def _conditions(scenarios: Mapping[str, Sequence[Scenario]]) -> dict[str, Any]:
         "torque_sample_step_s": scenario.record.step_us * 1e-6,
         "initial_angle_deg": scenario.initial_angle_deg,
         "seed": scenario.seed,
-        "versions": {name: version(name) for name in ("salient", "python-can", "cantools", "numpy")},
+        "versions": {"salient": VERSION} | {name: version(name) for name in ("python-can", "cantools", "numpy")},
     }
 
 
@@ -299,10 +300,10 @@ def _commands(scenarios: Mapping[str, Sequence[Scenario]], build: str) -> list[s
     one = scenarios["start_600"][0]
     return [
         "# everything on this page",
-        f"tools/salient demo --machine {shlex.quote(one.machine)} --control-rate-hz {one.control_rate_hz}"
+        f"{COMMAND} demo --machine {shlex.quote(one.machine)} --control-rate-hz {one.control_rate_hz}"
         f" --encoder-bits {one.encoder_bits} --seed {one.seed}{target}",
         "# one experiment, with every row of its recordings",
-        *(f"tools/salient run tools/scenarios/{experiment}.toml{target}" for experiment in scenarios),
+        *(f"{COMMAND} run {experiment}{target}" for experiment in scenarios),
     ]
 
 

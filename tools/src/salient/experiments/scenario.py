@@ -58,13 +58,13 @@ from salient.bench.bench import Bench
 from salient.bench.drive import READY_TIMEOUT_S
 from salient.bench.emulator import parameter_table
 from salient.bench.faults import FaultError, attribute_names, fault_signals
+from salient.bench.load_profile import load_profile_path, read_load_profile
 from salient.bench.rig import bench_variables, variable_range
 from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database, signal_range
 from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
 from salient.errors import UsageError
 from salient.experiments.consistency import check_consistency
-from salient.experiments.load_profile import load_profile_path, read_load_profile
 from salient.experiments.metrics import losses
 from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
@@ -119,7 +119,7 @@ class Record:
 @dataclass(frozen=True, kw_only=True)
 class Scenario(Conditions):
     """One run of one drive. Times in seconds of virtual time, not negative. load_profile: name of a bundled load
-    profile or path of a CSV file (salient.experiments.load_profile)."""
+    profile or path of a CSV file (salient.bench.load_profile)."""
 
     name: str
     duration_s: float

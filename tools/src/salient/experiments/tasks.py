@@ -15,7 +15,6 @@ import ctypes
 import fcntl
 import json
 import os
-import re
 import signal
 import socket
 from collections.abc import Callable, Generator, Iterable, Sequence
@@ -44,14 +43,6 @@ class Task:
     arguments: Any
 
 
-def parse_shard(text: str) -> tuple[int, int]:
-    """I/N; ValueError when it is not one of the parts 1/N to N/N."""
-    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
-    if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise ValueError("must be I/N, whole numbers with I from 1 to N")
-    return int(match[1]), int(match[2])
-
-
 def run(tasks: Sequence[Task], function: Callable[[Any], Any], out: Path, shard: tuple[int, int] = (1, 1),
         scheduler: str | None = None, jobs: int | None = None) -> Generator[tuple[Task, Any], None, None]:
     """Yields each task of the shard with its result: first those that the folder has already, then the others as they
@@ -70,13 +61,22 @@ def run(tasks: Sequence[Task], function: Callable[[Any], Any], out: Path, shard:
         for task in mine:
             if task.key in finished:
                 yield task, finished[task.key]
-        execute = _on_this_computer if scheduler is None else _on_a_cluster
-        where: Any = (jobs or len(os.sched_getaffinity(0))) if scheduler is None else scheduler
-        for task, result in execute(todo, function, where) if todo else ():
+        for task, result in execute(todo, function, scheduler, jobs):
             line = json.dumps({"key": task.key, "result": result}, allow_nan=False)
             file.write(line + "\n")
             file.flush()
             yield task, json.loads(line)["result"]  # as a later run reads it
+
+
+def execute(tasks: Sequence[Task], function: Callable[[Any], Any], scheduler: str | None = None,
+            jobs: int | None = None) -> Generator[tuple[Task, Any], None, None]:
+    """Yields tasks with their results as they finish, without a folder. See run()."""
+    if not tasks:
+        return
+    if scheduler is None:
+        yield from _on_this_computer(tasks, function, jobs or len(os.sched_getaffinity(0)))
+    else:
+        yield from _on_a_cluster(tasks, function, scheduler)
 
 
 def read_results(out: Path) -> dict[str, Any]:

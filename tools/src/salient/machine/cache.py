@@ -14,7 +14,7 @@ from pathlib import Path
 
 from salient.errors import UsageError
 from salient.machine.path import MachineError, machine_path
-from salient.paths import BUILD, DRIVE_DBC, PARAMETERS, PYTHON_PACKAGES
+from salient.paths import BUILD, DRIVE_DBC, IS_WHEEL, PARAMETERS, PYTHON_PACKAGES
 
 FOLDER = BUILD / "machines"
 _BYTES_MAX = 30_000_000
@@ -71,7 +71,13 @@ def _generator() -> bytes:
     """Hash of everything that the image of a given file depends on."""
     folder = Path(__file__).parent
     digest = hashlib.sha256()
-    others = [*map(folder.with_name, ("toml_file.py", "config.py", "dbc.py")), PYTHON_PACKAGES, DRIVE_DBC, PARAMETERS]
+    others = [*map(folder.with_name, ("toml_file.py", "config.py", "dbc.py")), DRIVE_DBC, PARAMETERS]
+    if IS_WHEEL:
+        from importlib.metadata import version  # takes as long as the rest of a start
+
+        digest.update(" ".join(map(version, ("numpy", "scipy"))).encode())
+    else:
+        others.append(PYTHON_PACKAGES)
     for source in [*sorted(folder.glob("*.py")), *others]:
         digest.update(source.name.encode() + b"\0" + source.read_bytes())
     return digest.digest()

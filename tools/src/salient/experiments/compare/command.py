@@ -7,9 +7,11 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TextIO
 
+from salient.config import DEFAULTS
 from salient.errors import UsageError
 from salient.experiments.compare import baseline, finished_runs, results_file, summary_file, table
 from salient.experiments.compare.case import Case
@@ -18,8 +20,11 @@ from salient.experiments.compare.finished_runs import FinishedRuns
 from salient.experiments.compare.machine import Subject, cases_of, subject, targets_of
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS
+from salient.experiments.scenario import check_parameters
+from salient.experiments.settings import parse_values, with_setting
 from salient.machine.cache import machine_image
 from salient.machine.file import MachineError
+from salient.paths import COMMAND
 
 FAILED = "failed"
 _FAILED_LISTED_MAX = 10
@@ -37,13 +42,13 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
         on = _subject(options.machine)
         cases, titles = cases_of(cases, on, options.quick), {name: on.text(title) for name, title in titles.items()}
         targets = TARGETS if on.is_bundled else targets_of(on)
-    cases = _first_samples(cases, options.samples)
+    cases = _with_settings(_first_samples(cases, options.samples), options.set)
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
     _prepare_folder(options.out, options.resume)
     for machine in {case.scenario.machine for case in cases}:
         machine_image(machine)
     finished = FinishedRuns(options.out / finished_runs.NAME)
-    runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr, finished)
+    runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr, finished, options.scheduler)
     rows = table.make_rows(runs, targets)
     changes: list[baseline.Change] = []
     change_summary = None
@@ -60,7 +65,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     write_page(options.out / "compare.html", rows, content, change_summary, changes, _command(options), titles)
     stream.write(f"{table.table(rows, titles)}\n\n{table.summary(rows)}\n")
     for run, path in failed[:_FAILED_LISTED_MAX]:
-        stream.write(f"{_name(run.case)}: {run.failed}; reproduce with: tools/salient run {path}\n")
+        stream.write(f"{_name(run.case)}: {run.failed}; reproduce with: {COMMAND} run {path}\n")
     if len(failed) > _FAILED_LISTED_MAX:
         stream.write(f"and {len(failed) - _FAILED_LISTED_MAX} more in {options.out / FAILED}\n")
     if change_summary:
@@ -91,6 +96,21 @@ def _first_samples(cases: Sequence[Case], count: int | None) -> list[Case]:
         samples.setdefault((case.group, case.condition), {}).setdefault(case.sample)
     kept = {condition: list(of)[:count] for condition, of in samples.items()}
     return [case for case in cases if case.sample in kept[case.group, case.condition]]
+
+
+def _with_settings(cases: Sequence[Case], settings: Sequence[str]) -> list[Case]:
+    """The cases with a parameter of the drive or a variable of the bench set in all of them."""
+    changed = list(cases)
+    for text in settings:
+        name, values = parse_values(text)
+        if len(values) != 1:
+            raise UsageError(f"--set {text}: must be one value; salient sweep takes several")
+        changed = [replace(case, scenario=with_setting(case.scenario, name, values[0])) for case in changed]
+    if settings:
+        checked = {repr(scenario): scenario for case in changed
+                   for scenario in [replace(case.scenario, seed=DEFAULTS["seed"], initial_angle_deg=0.0)]}
+        check_parameters(list(checked.values()), "host")
+    return changed
 
 
 def _prepare_folder(out: Path, resume: bool) -> None:
@@ -130,5 +150,6 @@ def _file_name(case: Case) -> str:
 
 def _command(options: argparse.Namespace) -> str:
     machine = [] if options.machine is None else ["--machine", shlex.quote(options.machine)]
-    return " ".join(["tools/salient compare", *options.groups, *machine, *(["--quick"] if options.quick else []),
+    return " ".join([f"{COMMAND} compare", *options.groups, *machine, *(["--quick"] if options.quick else []),
+                     *(["--set " + shlex.quote(text) for text in options.set]),
                      *([f"--samples {options.samples}"] if options.samples else [])])

@@ -8,13 +8,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from salient.bench.load_profile import load_profile_path
 from salient.bench.programs import executable, reference_executable
 from salient.experiments import metrics as run_metrics
 from salient.experiments.compare import every_machine, reference
 from salient.experiments.compare import metrics as compare_metrics
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.metrics import Metrics
-from salient.experiments.load_profile import load_profile_path
 from salient.machine.cache import machine_image
 
 NAME = "runs.jsonl"

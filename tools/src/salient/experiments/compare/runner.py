@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import signal
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
@@ -23,6 +21,7 @@ from salient.experiments.compare.metrics import EXTRACTORS, Metrics, failures, p
 from salient.experiments.metrics import MetricsError
 from salient.experiments.results import rounded
 from salient.experiments.scenario import run_scenario
+from salient.experiments.tasks import Task, execute
 from salient.machine.file import load_machine, machine_path
 from salient.progress import Progress
 
@@ -41,11 +40,13 @@ class RunMetrics:
     trace: tuple[list[float], list[float]] | None = None
 
 
-def run_all(cases: Sequence[Case], jobs: int, stream: TextIO, finished: FinishedRuns | None = None) -> list[RunMetrics]:
+def run_all(cases: Sequence[Case], jobs: int, stream: TextIO, finished: FinishedRuns | None = None,
+            scheduler: str | None = None) -> list[RunMetrics]:
     """Metrics in the order of `cases`, independent of the number of jobs; prints the progress on `stream`.
 
     A run that ends in a fault, or whose metrics cannot be computed, is marked as failed. Runs in `finished` are not
-    executed, the others are added to it. UsageError for parameters that the drive does not have.
+    executed, the others are added to it. scheduler: see tasks.run. UsageError for parameters that the drive does not
+    have.
     """
     descriptions = [repr((case.extractor, case.traced, case.window_s, case.scenario)) for case in cases]
     first_cases: dict[str, int] = {}  # description of the run -> number of its first case
@@ -57,21 +58,15 @@ def run_all(cases: Sequence[Case], jobs: int, stream: TextIO, finished: Finished
             results[number] = known
     numbers = sorted(number for number in first_cases.values() if number not in results)
     lines = len(numbers) if stream.isatty() else min(len(numbers), _PROGRESS_LINES_MAX)
-    with (ProcessPoolExecutor(jobs, initializer=_leave_interrupts_to_parent) as workers,
-          Progress(lines, stream) as progress):
-        futures = {workers.submit(_run, cases[number]): number for number in numbers}
-        try:
-            for done, future in enumerate(as_completed(futures), start=1):
-                case = cases[futures[future]]
-                results[futures[future]] = future.result()
-                if finished:
-                    finished.add(case, descriptions[futures[future]], *future.result())
-                if done * lines // len(numbers) > (done - 1) * lines // len(numbers):
-                    progress.step(f"{case.group}: {case.condition} by {case.controller}")
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            raise
+    listed = [Task(str(number), cases[number]) for number in numbers]
+    with Progress(lines, stream) as progress:
+        for done, (task, result) in enumerate(execute(listed, _run, scheduler, jobs), start=1):
+            case, number = cases[int(task.key)], int(task.key)
+            results[number] = result
+            if finished:
+                finished.add(case, descriptions[number], *result)
+            if done * lines // len(numbers) > (done - 1) * lines // len(numbers):
+                progress.step(f"{case.group}: {case.condition} by {case.controller}")
     return _with_ratios([RunMetrics(case, *results[first]) for case, first in zip(cases, first_of, strict=True)])
 
 
@@ -94,11 +89,6 @@ def _ratio(value: float | None, of: float | None) -> float | None:
     if value is None or of is None or (of == 0.0 and value > 0.0):
         return None
     return value / of if of > 0.0 else 1.0
-
-
-def _leave_interrupts_to_parent() -> None:
-    """Initialiser of workers: Ctrl-C reaches the whole process group; only the parent handles it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _run(case: Case) -> tuple[Metrics, str, Any]:

@@ -22,7 +22,8 @@ from itertools import groupby
 from pathlib import Path
 
 from salient.experiments.compare.runner import RunMetrics
-from salient.paths import ROOT
+from salient.paths import IS_WHEEL, ROOT
+from salient.version import VERSION
 
 NAME = "summary.toml"
 
@@ -47,6 +48,8 @@ def _study(run: RunMetrics) -> tuple[str, str, str]:
 
 
 def _commit() -> str:
+    if IS_WHEEL:
+        return f"version {VERSION}"
     described = subprocess.run(["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude", "*"],
                                capture_output=True, text=True, check=False)
     return described.stdout.strip() or "unknown"

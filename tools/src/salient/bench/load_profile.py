@@ -10,12 +10,13 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from salient.bench.rig import LOAD_PROFILE_VALUE_MAX, LOAD_PROFILE_VALUES_MAX
 from salient.errors import UsageError, shown
 from salient.paths import LOADS, bundled_or_path
 from salient.toml_file import TextFileError, read_text
 
 _HEADER = "angle_deg,torque"
+LOAD_PROFILE_VALUES_MAX = 256
+LOAD_PROFILE_VALUE_MAX = 1000.0
 _VALUES_MIN = 8
 _FILE_BYTES_MAX = 1_000_000
 _ANGLE_TOLERANCE_DEG = 0.01
