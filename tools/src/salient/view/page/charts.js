@@ -4,6 +4,8 @@ import { decimalsOf, textOf } from "./decoder.js";
 import { lineStyle } from "./palette.js";
 
 const HEIGHT_MIN = 110;
+const HEIGHT_STACKED = 160; // where the page is one column
+const ONE_COLUMN = matchMedia("(max-width: 900px)"); // as in style.css
 const AXIS_WIDTH = 58;
 
 /** Minimum and maximum of each column of the plot, in two points a column; the same times for all signals. */
@@ -165,7 +167,8 @@ export class Charts {
         const width = this.root.clientWidth;
         const legends = this.plots.reduce((sum, plot) => sum + plot.legend.offsetHeight, 0);
         const free = this.root.clientHeight - legends - 4 * this.plots.length;
-        const height = Math.max(HEIGHT_MIN, Math.floor(free / Math.max(1, this.plots.length)));
+        const height = ONE_COLUMN.matches ? HEIGHT_STACKED
+            : Math.max(HEIGHT_MIN, Math.floor(free / Math.max(1, this.plots.length)));
         if (width > 0) {
             this.plots.forEach((plot) => plot.plot.setSize({ width, height }));
         }
