@@ -13,7 +13,6 @@ from typing import Any
 import can
 from cantools.database.can import Database
 
-from salient.bench.client import Client
 from salient.bench.drive import Drive, DriveError, OtherDatabase
 from salient.bench.rig import Rig, RigError
 from salient.bus.clock import VirtualTimeReader, open_bus
@@ -80,7 +79,7 @@ class DriveTime:
         return interface_ns if self._offset_ns is None else interface_ns + self._offset_ns
 
 
-class Link(Client):
+class Link:
     """One drive on a bus. `call` runs a function in the thread of the bus, where drive and rig may be used."""
 
     def __init__(self, address: str, machine: str, node: int, store: FrameStore) -> None:

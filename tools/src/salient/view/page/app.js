@@ -287,9 +287,9 @@ class Page {
         }
     }
 
-    showWork(work) {
+    showWork({ work, samples }) {
         const total = work.reduce((sum, each) => sum + each, 0);
-        const key = work.map((each) => each.toFixed(2)).join();
+        const key = [samples, ...work.map((each) => each.toFixed(2))].join();
         if (key === this.workKey) {
             return;
         }
@@ -302,7 +302,7 @@ class Page {
         });
         const torque = total * this.info.machine.rotor_poles / (2 * Math.PI);
         element("work").replaceChildren("Work of a stroke, J: ", ...parts,
-                                        Number.isFinite(torque) ? ` mean torque ${torque.toFixed(2)} N m` : "");
+                                        Number.isFinite(torque) ? ` mean torque ${torque.toFixed(2)} N m (${samples} samples)` : "");
     }
 
     showState() {
