@@ -24,7 +24,7 @@ _TICK_S = 0.004
 """Between two looks at the bus: less than half the period of the commands."""
 _REPLY_TIMEOUT_S = 5.0
 """Wall time in which a test bench answers; a bus without one would be waited for until the end of time."""
-SHOWN_WITHIN_NS = 500_000_000
+SHOWN_WITHIN_NS = 1_000_000_000
 """A page commands only while what it has shown is not older than this, in time of the drive."""
 
 
