@@ -74,8 +74,10 @@ TARGET_DEPENDENCIES = {
         Dependency("qemu-system-misc", "emulated RV32", _tool("qemu-system-riscv32")),
     ),
 }
+BROWSER = Dependency("chromium", "browser in which the live page is tested and measured", _tool("chromium"))
 TEST_DEPENDENCIES = (
     *(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group),
+    BROWSER,
     Dependency("qemu-system-x86", "VM with a kernel that has CAN", lambda: not _vm_packages()),
 )
 MEASUREMENT_DEPENDENCIES = (
@@ -83,7 +85,7 @@ MEASUREMENT_DEPENDENCIES = (
     Dependency("valgrind", "instruction counts", _tool("valgrind")),
 )
 
-WITHOUT_BUILD = ("log", "monitor", "machine")
+WITHOUT_BUILD = ("log", "monitor", "view", "machine")
 """Commands that need no drive."""
 
 
@@ -251,6 +253,8 @@ def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, 
         found += TEST_DEPENDENCIES
     if getattr(options, "figures", False):  # measured on every target
         found += tuple(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group)
+    if getattr(options, "page", None) is not None:
+        found += (BROWSER,)
     if options.command in ("test", "benchmark"):
         found += MEASUREMENT_DEPENDENCIES
     return found

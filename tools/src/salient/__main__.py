@@ -112,6 +112,12 @@ def _monitor(options: argparse.Namespace) -> int:
     return monitor(options.can, options.every_s, options.duration_s, options.machine, options.signals, options.node)
 
 
+def _view(options: argparse.Namespace) -> int:
+    from salient.view.command import run
+
+    return run(options)
+
+
 def _parameters(options: argparse.Namespace) -> int:
     from salient.bench.parameter_file import run
 
@@ -121,7 +127,7 @@ def _parameters(options: argparse.Namespace) -> int:
 def _benchmark(options: argparse.Namespace) -> int:
     from salient.benchmark.command import run
 
-    return run(options.runs, options.json)
+    return run(options.runs, options.json, options.page)
 
 
 def _compare(options: argparse.Namespace) -> int:
@@ -175,6 +181,7 @@ _COMMANDS = {
     "monitor": _monitor,
     "campaign": _campaign,
     "replay": _replay,
+    "view": _view,
     "parameters": _parameters,
     "benchmark": _benchmark,
     "compare": _compare,

@@ -25,8 +25,8 @@ _RECORDING_HEADER_BYTES = 1024
 
 
 def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchConfig | None) -> list[str]:
-    """Writes log (BLF and candump text), plots around the failure and around the first fault, and bench.json with the
-    notes. config: of an emulator that the session has started. Returns what changed just before the failure."""
+    """Writes log (BLF and candump text), plots around the failure and around the first fault, bench.json with the
+    notes, and a page of all that. config: of an emulator that the session has started. Returns what changed just before the failure."""
     folder.mkdir(parents=True, exist_ok=True)
     write_logs(session.log, folder / "can.blf", folder / "can.log")
     plot_moment(session, session.time_s, "failure", folder / "failure.png")
@@ -39,11 +39,23 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
         about["first_fault"] = {"fault": name, "time_s": time_s, "changes": changes(session, time_s)}
     simulator = getattr(session, "simulator", None)
     if config is not None:
-        about["seed"] = config.seed
+        about |= {"seed": config.seed, "machine": config.machine, "node": config.node}
     if simulator is not None:
         about |= {"simulator": shlex.join(simulator.command), "stderr": simulator.errors}
-    (folder / "bench.json").write_text(json.dumps(about | notes, indent=2) + "\n", encoding="utf-8")
+    about |= {"view": f"tools/salient view --replay {shlex.quote(str(folder))}"} | notes
+    (folder / "bench.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    _write_page(folder, about)
     return changed
+
+
+def _write_page(folder: Path, about: dict[str, Any]) -> None:
+    from salient.pages import Plot, write_page
+
+    plots = [Plot("", title, (folder / name).read_bytes())
+             for name, title in (("failure.png", "The end"), ("first_fault.png", "The first fault"))
+             if (folder / name).exists()]
+    unknown = {"simulator": "", "stderr": "", "machine": "", "seed": ""}  # of a drive that is on the bus already
+    write_page(folder / "failure.html", "failure.html", unknown | about | {"plots": plots})
 
 
 def save_truth(recording: Path, folder: Path) -> None:
