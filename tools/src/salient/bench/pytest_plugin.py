@@ -26,7 +26,7 @@ import pluggy
 import pytest
 
 from salient.bench.bench import Bench
-from salient.config import HOST_BUILDS, TARGET_BUILDS, BenchConfig
+from salient.config import HOST_BUILDS, TARGET_BUILDS, WASM_BUILD, BenchConfig
 from salient.paths import BUILD, ROOT
 
 _benches_key = pytest.StashKey[list[Bench]]()
@@ -36,7 +36,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("salient")
     group.addoption("--salient-can", default="local", metavar="BUS",
                     help="local (default): a local bus for each bench; or socketcan:INTERFACE")
-    group.addoption("--salient-build", default="host", choices=(*HOST_BUILDS, *TARGET_BUILDS),
+    group.addoption("--salient-build", default="host", choices=(*HOST_BUILDS, *TARGET_BUILDS, WASM_BUILD),
                     help="build under test (default host)")
     group.addoption("--salient-failures", default=str(BUILD / "failures"), metavar="DIR",
                     help="parent of the folders that failed tests leave")
