@@ -76,6 +76,7 @@ TARGET_DEPENDENCIES = {
 }
 TEST_DEPENDENCIES = (
     *(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group),
+    Dependency("chromium", "browser for the tests of the live page", _tool("chromium")),
     Dependency("qemu-system-x86", "VM with a kernel that has CAN", lambda: not _vm_packages()),
 )
 MEASUREMENT_DEPENDENCIES = (
@@ -83,7 +84,7 @@ MEASUREMENT_DEPENDENCIES = (
     Dependency("valgrind", "instruction counts", _tool("valgrind")),
 )
 
-WITHOUT_BUILD = ("log", "monitor", "machine")
+WITHOUT_BUILD = ("log", "monitor", "view", "machine")
 """Commands that need no drive."""
 
 

@@ -110,6 +110,12 @@ def _monitor(options: argparse.Namespace) -> int:
     return monitor(options.can, options.every_s, options.duration_s, options.machine, options.signals, options.node)
 
 
+def _view(options: argparse.Namespace) -> int:
+    from salient.view.command import run
+
+    return run(options)
+
+
 def _parameters(options: argparse.Namespace) -> int:
     from salient.bench.parameter_file import run
 
@@ -147,6 +153,7 @@ _COMMANDS = {
     "run": _run,
     "log": _log,
     "monitor": _monitor,
+    "view": _view,
     "parameters": _parameters,
     "benchmark": _benchmark,
     "compare": _compare,

@@ -99,6 +99,15 @@ def make_parser() -> argparse.ArgumentParser:
     _add_machine(monitor)
     _add_node(monitor)
 
+    view = command("view", "the live page of a running drive, or of a log, in a browser; prints its link")
+    shown = view.add_mutually_exclusive_group()
+    _add_can(shown)
+    shown.add_argument("--replay", type=Path, metavar="FILE",
+                       help="instead: a log, FILE.blf, FILE.asc or FILE.log, or the folder of a failed test")
+    _add_machine(view, "whose poles and signals are shown: ")
+    _add_node(view)
+    view.set_defaults(machine=None, node=None)  # a failed test has noted them
+
     benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
                         "ngspice; effect of the network")
     benchmark.add_argument("--json", type=Path, metavar="FILE", help="also write the results to a file")

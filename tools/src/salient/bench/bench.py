@@ -61,8 +61,11 @@ class Bench(Session):
         notes = {
             "virtual_time_s": self.time_s,
             "seed": self.options.seed,
+            "machine": self.options.machine,
+            "node": self.options.node,
             "simulator": shlex.join(self.simulator.command),
             "replay": replay,
+            "view": f"tools/salient view --replay {shlex.quote(str(folder))}",
             "stderr": self.simulator.errors,
         }
         (folder / "bench.json").write_text(json.dumps(notes, indent=2) + "\n", encoding="utf-8")

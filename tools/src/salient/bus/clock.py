@@ -71,6 +71,11 @@ class VirtualTimeReader:
         self._waiting_on_bus: deque[can.Message] = deque()
         self._waiting_at_once: deque[can.Message] = deque()
 
+    @property
+    def has_virtual_time(self) -> bool:
+        """False while the times are those of the interface."""
+        return self._stamped or not self._on_interface
+
     def receive(self, timeout: float | None) -> tuple[int, can.Message] | None:
         """The next (virtual time in ns, message), or None after `timeout` seconds without one."""
         while True:

@@ -27,6 +27,10 @@ _ERROR_FLAG = 0x20000000
 _ASC_END = b"end triggerblock"
 
 
+class _Truncated(Exception):
+    """The end of a log is missing."""
+
+
 def convert(source: Path, target: Path, machine: str, node: int = 0) -> int:
     """Writes the frames of a log to another, whose suffix is the format; returns their number. UsageError: a file
     cannot be read or written, or is truncated; then there is no target."""
@@ -55,31 +59,29 @@ def convert(source: Path, target: Path, machine: str, node: int = 0) -> int:
     return count
 
 
-def read_log(path: Path) -> Iterator[tuple[int, can.Message]]:
+def read_log(path: Path, option: str = "--convert") -> Iterator[tuple[int, can.Message]]:
     """Time in ns and frame, in the order of the file. UsageError: the suffix, the file or its content is none that can
-    be read, or the end is missing."""
+    be read, or the end is missing; it begins with the option."""
     if path.suffix not in _READABLE:
         reason = " (MF4 has signals, no frames)" if path.suffix == ".mf4" else ""
-        raise UsageError(f"--convert {path}: the suffix must be {either(_READABLE)}{reason}")
+        raise UsageError(f"{option} {path}: the suffix must be {either(_READABLE)}{reason}")
     read: Callable[[Path], Iterator[tuple[int, can.Message]]]
     read = {".blf": _read_blf, ".asc": _read_asc, ".log": _read_candump}[path.suffix]
     try:
         yield from read(path)
+    except _Truncated as error:
+        raise UsageError(f"{option} {path}: truncated: {error}") from None
     except OSError as error:
-        raise UsageError(f"--convert {path}: {error.strerror}") from None
+        raise UsageError(f"{option} {path}: {error.strerror}") from None
     except (BLFParseError, struct.error, zlib.error, ValueError, IndexError) as error:
-        raise UsageError(f"--convert {path}: not readable as {path.suffix}: {error or 'unknown content'}") from None
-
-
-def _truncated(path: Path, reason: str) -> UsageError:
-    return UsageError(f"--convert {path}: truncated: {reason}")
+        raise UsageError(f"{option} {path}: not readable as {path.suffix}: {error or 'unknown content'}") from None
 
 
 def _read_blf(path: Path) -> Iterator[tuple[int, can.Message]]:
     size = path.stat().st_size
     with BLFReader(path) as reader:
         if reader.file_size != size:
-            raise _truncated(path, f"its header states {reader.file_size} bytes, the file has {size}")
+            raise _Truncated(f"its header states {reader.file_size} bytes, the file has {size}")
         for message in reader:
             yield round(message.timestamp * 1e9), message
 
@@ -91,7 +93,7 @@ def _read_asc(path: Path) -> Iterator[tuple[int, can.Message]]:
         size = path.stat().st_size
         file.seek(max(0, size - 200))
         if _ASC_END not in file.read().lower():
-            raise _truncated(path, "'End TriggerBlock' is missing")
+            raise _Truncated("'End TriggerBlock' is missing")
     with ASCReader(path) as reader:
         for message in reader:
             if reader.timestamps_format == "relative":
@@ -107,7 +109,7 @@ def _read_candump(path: Path) -> Iterator[tuple[int, can.Message]]:
     with path.open(encoding="ascii", newline="\n") as file:
         for number, line in enumerate(file, 1):
             if not line.endswith("\n"):
-                raise _truncated(path, f"line {number} has no end")
+                raise _Truncated(f"line {number} has no end")
             match = _CANDUMP.fullmatch(line)
             if match is None:
                 raise ValueError(f"line {number}: {line.strip()[:60]!r} is no frame as candump -L writes it")

@@ -1,0 +1,102 @@
+"""tools/salient view: the live page of a drive on a bus, or of a log."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+from salient.bus.log_reader import read_log
+from salient.config import DEFAULTS
+from salient.errors import UsageError
+from salient.version import VERSION
+from salient.view.commands import COMMANDS
+from salient.view.description import description
+from salient.view.frames import Chunk, FrameStore
+from salient.view.link import Link
+from salient.view.server import Feed, Server
+
+_CHUNK_FRAMES = 100_000
+_FAILURE_NOTES = "bench.json"
+
+
+class BusFeed:
+    """The frames of a bus, for each page from the moment at which it was opened."""
+
+    def __init__(self, address: str, machine: str, node: int) -> None:
+        self.info = {**description(machine, node), "kind": "live", "title": address, "commands": ["take", "release",
+                     *COMMANDS], "build": f"salient {VERSION}", "period_ms": 0}
+        self.store = FrameStore()
+        self.link = Link(address, machine, node, self.store)
+        self.link.start()
+
+    @property
+    def ended(self) -> str:
+        return f"{self.link.address}: the drive has ended" if self.link.ended else ""
+
+    def first_number(self) -> int:
+        return self.store.next_number
+
+
+class LogFeed:
+    """The frames of a log, all of them for each page."""
+
+    link = None
+
+    def __init__(self, path: Path, machine: str, node: int) -> None:
+        self.store = FrameStore(kept=1 << 62)
+        chunk = Chunk()
+        first_ns, last_ns = None, 0
+        for time_ns, message in read_log(path, "--replay"):
+            if chunk.add(time_ns, message):
+                first_ns, last_ns = time_ns if first_ns is None else first_ns, time_ns
+            if len(chunk) == _CHUNK_FRAMES:
+                self.store.put(chunk)
+                chunk = Chunk()
+        if len(chunk):
+            self.store.put(chunk)
+        if first_ns is None:
+            raise UsageError(f"--replay {path}: the log has no data frame")
+        self.ended = f"{path.name}: {self.store.next_number} frames"
+        self.info = {**description(machine, node), "kind": "replay", "title": str(path), "commands": [],
+                     "build": f"salient {VERSION}", "period_ms": 0, "start_ns": first_ns, "end_ns": last_ns}
+
+    def first_number(self) -> int:
+        return 0
+
+
+def run(options: argparse.Namespace) -> int:
+    """Serves the page until an interrupt; prints its link."""
+    feed: Feed
+    if options.replay is None:
+        feed = BusFeed(options.can, options.machine or DEFAULTS["machine"], options.node or 0)
+    else:
+        path, notes = _log_of(options.replay)
+        feed = LogFeed(path, options.machine or notes.get("machine", DEFAULTS["machine"]),
+                       notes.get("node", 0) if options.node is None else options.node)
+    server = Server(feed)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    print(f"live page: {server.link}", flush=True)
+    try:
+        server.run()
+    finally:
+        if feed.link is not None:
+            feed.link.close()
+    return 0
+
+
+def _log_of(path: Path) -> tuple[Path, dict[str, Any]]:
+    """The log, and the notes beside it in the folder of a failed test; a folder of benches is that of its first."""
+    if not path.is_dir():
+        return path, {}
+    folder = path if (path / _FAILURE_NOTES).is_file() else path / "0"
+    log = folder / "can.blf"
+    if not log.is_file():
+        raise UsageError(f"--replay {path}: a folder must have can.blf, as that of a failed test has")
+    try:
+        notes = json.loads((folder / _FAILURE_NOTES).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        notes = {}
+    return log, notes if isinstance(notes, dict) else {}

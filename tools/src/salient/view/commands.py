@@ -1,0 +1,128 @@
+"""The commands of a page: which there are, what they take, and what they do with drive and test bench."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from salient.bench.drive import DriveError
+from salient.bench.faults import FaultError, fault_kind
+from salient.bench.rig import Fault, RigError
+from salient.view.link import Link
+
+COMMANDS: dict[str, dict[str, type]] = {
+    "speed_reference": {"rpm": float},
+    "torque_reference": {"Nm": float},
+    "stop": {},
+    "off": {},
+    "clear_fault": {},
+    "load_torque": {"Nm": float},
+    "truth_period": {"us": float},
+    "fault": {"kind": str},
+    "end_faults": {},
+    "parameters": {},
+    "set_parameters": {"values": dict},
+    "save_parameters": {},
+    "fault_trace": {},
+    "fault_log": {},
+}
+"""Those of page/source.js that a drive on a bus carries out, with the arguments that each must have."""
+_OPTIONAL = {"fault": {"phase": str, "leg": str, "value": object, "duration_s": float}}
+
+
+class Malformed(Exception):
+    """No message that the page sends."""
+
+
+def check_command(name: Any, arguments: Any) -> None:
+    """Malformed when the name or the arguments are none of a command."""
+    if not isinstance(name, str) or name not in COMMANDS or not isinstance(arguments, dict):
+        raise Malformed
+    required, optional = COMMANDS[name], _OPTIONAL.get(name, {})
+    if not required.keys() <= arguments.keys() <= required.keys() | optional.keys():
+        raise Malformed
+    for key, value in arguments.items():
+        if not _is(value, {**optional, **required}[key]):
+            raise Malformed
+    if name == "set_parameters" and not all(_is(value, float) for value in arguments["values"].values()):
+        raise Malformed
+
+
+def _is(value: Any, kind: type) -> bool:
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, kind)
+
+
+class Commander:
+    """Carries out commands, in the thread of the link."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._faults: list[Fault] = []
+
+    def execute(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """The answer to a checked command: ok, message, and the value where there is one."""
+        action: Callable[..., Any] = getattr(self, f"_{name}")
+        try:
+            value = action(**arguments)
+        except (DriveError, RigError, FaultError) as error:
+            return {"ok": False, "message": str(error)}
+        except KeyError as error:
+            return {"ok": False, "message": str(error.args[0])}
+        return {"ok": True, "message": "", **({} if value is None else {"value": value})}
+
+    def _speed_reference(self, rpm: float) -> None:
+        self._link.drive.speed_reference_rpm = rpm
+
+    def _torque_reference(self, Nm: float) -> None:
+        self._link.drive.torque_reference_Nm = Nm
+
+    def _stop(self) -> None:
+        self._link.drive.stop()
+
+    def _off(self) -> None:
+        self._link.drive.off()
+
+    def _clear_fault(self) -> None:
+        self._link.drive.clear_fault()
+
+    def _load_torque(self, Nm: float) -> None:
+        self._link.rig.load_torque_Nm = Nm
+
+    def _truth_period(self, us: float) -> None:
+        self._link.rig.truth_period_us = us
+
+    def _fault(self, kind: str, value: Any = None, duration_s: float | None = None, **places: str) -> None:
+        definition = fault_kind(kind)
+        arguments: dict[str, Any] = dict(places)
+        if value is not None and definition.attribute is not None:
+            arguments[definition.attribute[0]] = value
+        fault = self._link.rig.fault(kind, duration_s=duration_s, **arguments)
+        if duration_s is None:
+            self._faults.append(fault)
+
+    def _end_faults(self) -> None:
+        while self._faults:
+            self._faults.pop().clear()
+
+    def _parameters(self) -> list[dict[str, Any]]:
+        parameters = self._link.drive.parameters
+        return [{**asdict(row), "value": parameters[name]} for name, row in parameters.rows.items()]
+
+    def _set_parameters(self, values: dict[str, float]) -> None:
+        self._link.drive.parameters.update(values)
+
+    def _save_parameters(self) -> None:
+        self._link.drive.parameters.save()
+
+    def _fault_trace(self) -> dict[str, Any]:
+        trace = self._link.drive.fault_trace()
+        return {name: np.asarray(column).tolist() for name, column in vars(trace).items()}
+
+    def _fault_log(self) -> list[dict[str, Any]]:
+        return [asdict(fault) for fault in self._link.drive.fault_log.read()]
