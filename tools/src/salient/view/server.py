@@ -23,6 +23,7 @@ from salient.view.frames import FrameStore
 from salient.view.link import SHOWN_WITHIN_NS, Link
 
 PAGE = Path(__file__).parent / "page"
+LOOK = Path(__file__).parents[1] / "pages" / "look.css"
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
@@ -102,10 +103,11 @@ class Server:
         return FileResponse(PAGE / "index.html", headers=_HEADERS)
 
     async def _file(self, request: Request) -> Response:
-        path = (PAGE / request.path_params["path"]).resolve()
+        name = request.path_params["path"]
+        path = LOOK if name == LOOK.name else (PAGE / name).resolve()
         if request.headers.get("host") not in self._hosts():
             return PlainTextResponse("", 403, headers=_HEADERS)
-        if not path.is_relative_to(PAGE) or not path.is_file() or path.suffix not in _TYPES:
+        if not (path == LOOK or path.is_relative_to(PAGE)) or not path.is_file() or path.suffix not in _TYPES:
             return PlainTextResponse("no such file", 404, headers=_HEADERS)
         return FileResponse(path, media_type=_TYPES[path.suffix], headers=_HEADERS)
 

@@ -1,6 +1,7 @@
 // The source of a page that a server serves: frames of a bus or a log over a WebSocket.
 
 const EXPECTED_HEADER_BYTES = 16;
+const LATENCIES_MAX = 100_000; // half an hour
 
 export class LiveSource {
     constructor(address) {
@@ -75,6 +76,9 @@ export class LiveSource {
         if (this.received_ms) {
             this.latencies_ms.push(performance.timeOrigin + performance.now() - this.received_ms);
             this.received_ms = 0;
+            if (this.latencies_ms.length > LATENCIES_MAX) {
+                this.latencies_ms.shift();
+            }
         }
         this.send({ shown: time_ns });
     }

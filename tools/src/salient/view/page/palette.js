@@ -1,0 +1,18 @@
+// Colours of Okabe and Ito, which the colour-blind can tell apart; the yellow is left out, too light on white.
+
+export const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000"];
+export const PHASE_COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7"];
+export const PHASE_NAMES = ["A", "B", "C", "D"];
+
+/** Colour and dash of the n-th signal of a plot: the dash tells those of the same colour apart. */
+export function lineStyle(index) {
+    const dashes = [[], [7, 4], [2, 3]];
+    return { stroke: COLOURS[index % COLOURS.length],
+             dash: dashes[Math.floor(index / COLOURS.length) % dashes.length] };
+}
+
+/** "#rrggbb" with an opacity. */
+export function withOpacity(colour, opacity) {
+    const part = (from) => parseInt(colour.slice(from, from + 2), 16);
+    return `rgba(${part(1)}, ${part(3)}, ${part(5)}, ${opacity})`;
+}
