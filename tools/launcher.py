@@ -74,7 +74,17 @@ TARGET_DEPENDENCIES = {
         Dependency("qemu-system-misc", "emulated RV32", _tool("qemu-system-riscv32")),
     ),
 }
+WASM_DEPENDENCIES = (
+    Dependency("clang-19", "compiler for WebAssembly", _tool("clang-19")),
+    Dependency("lld-19", "its linker", _tool("wasm-ld-19")),
+    Dependency("llvm-19", "its archiver", _tool("llvm-ar-19")),
+    Dependency("wasi-libc", "its C library", _file("/usr/lib/wasm32-wasi/libc.a")),
+    Dependency("libclang-rt-19-dev-wasm32", "its helpers",
+               _file("/usr/lib/llvm-19/lib/clang/19/lib/wasi/libclang_rt.builtins-wasm32.a")),
+)
 TEST_DEPENDENCIES = (
+    *WASM_DEPENDENCIES,
+    Dependency("nodejs", "runs the drive in WebAssembly", _tool("node")),
     *(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group),
     Dependency("chromium", "browser for the tests of the live page", _tool("chromium")),
     Dependency("qemu-system-x86", "VM with a kernel that has CAN", lambda: not _vm_packages()),
@@ -252,6 +262,8 @@ def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, 
         found += TEST_DEPENDENCIES
     if getattr(options, "figures", False):  # measured on every target
         found += tuple(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group)
+    if options.command == "tab":
+        found += WASM_DEPENDENCIES
     if options.command in ("test", "benchmark"):
         found += MEASUREMENT_DEPENDENCIES
     return found
@@ -283,6 +295,8 @@ def main() -> None:
             was_built = build("host", [] if options.command == "test" else targets)
             if target != "host":
                 was_built |= build(target, [])
+            if options.command == "tab":
+                build("wasm", [])
             # For a reader; a script waits for the JSON line.
             if options.command == "sim" and (was_built or sys.stderr.isatty()):
                 print_status("starting the drive")

@@ -116,6 +116,12 @@ def _view(options: argparse.Namespace) -> int:
     return run(options)
 
 
+def _tab(options: argparse.Namespace) -> int:
+    from salient.tab.file import run
+
+    return run(options.out, options.machine)
+
+
 def _parameters(options: argparse.Namespace) -> int:
     from salient.bench.parameter_file import run
 
@@ -154,6 +160,7 @@ _COMMANDS = {
     "log": _log,
     "monitor": _monitor,
     "view": _view,
+    "tab": _tab,
     "parameters": _parameters,
     "benchmark": _benchmark,
     "compare": _compare,

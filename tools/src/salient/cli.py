@@ -108,6 +108,11 @@ def make_parser() -> argparse.ArgumentParser:
     _add_node(view)
     view.set_defaults(machine=None, node=None)  # a failed test has noted them
 
+    tab = command("tab", "the live page with a drive inside, as one file for a browser: no installation, no server")
+    tab.add_argument("--out", type=Path, default=Path("out/tab.html"), metavar="FILE",
+                     help="the file (default out/tab.html)")
+    tab.add_argument("--machine", metavar="NAME|FILE", help="one more machine than the bundled ones: a machine file")
+
     benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
                         "ngspice; effect of the network")
     benchmark.add_argument("--json", type=Path, metavar="FILE", help="also write the results to a file")
