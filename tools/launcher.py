@@ -82,11 +82,12 @@ WASM_DEPENDENCIES = (
     Dependency("libclang-rt-19-dev-wasm32", "its helpers",
                _file("/usr/lib/llvm-19/lib/clang/19/lib/wasi/libclang_rt.builtins-wasm32.a")),
 )
+BROWSER = Dependency("chromium", "browser in which the live page is tested and measured", _tool("chromium"))
 TEST_DEPENDENCIES = (
     *WASM_DEPENDENCIES,
     Dependency("nodejs", "runs the drive in WebAssembly", _tool("node")),
     *(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group),
-    Dependency("chromium", "browser for the tests of the live page", _tool("chromium")),
+    BROWSER,
     Dependency("qemu-system-x86", "VM with a kernel that has CAN", lambda: not _vm_packages()),
 )
 MEASUREMENT_DEPENDENCIES = (
@@ -264,6 +265,8 @@ def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, 
         found += tuple(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group)
     if options.command == "tab":
         found += WASM_DEPENDENCIES
+    if getattr(options, "page", None) is not None:
+        found += (BROWSER,)
     if options.command in ("test", "benchmark"):
         found += MEASUREMENT_DEPENDENCIES
     return found

@@ -117,6 +117,8 @@ def make_parser() -> argparse.ArgumentParser:
                         "ngspice; effect of the network")
     benchmark.add_argument("--json", type=Path, metavar="FILE", help="also write the results to a file")
     benchmark.add_argument("--runs", type=_count, default=5, metavar="N", help="runs of each kind (default 5)")
+    benchmark.add_argument("--page", type=_positive, nargs="?", const=20.0, metavar="SECONDS",
+                           help="instead: the live page in Chromium for this wall time (default 20)")
 
     _add_compare_options(command("compare", "the controllers compared with each other, their targets and an earlier "
                                  "run"))

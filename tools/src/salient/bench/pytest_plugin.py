@@ -28,6 +28,7 @@ import pytest
 from salient.bench.bench import Bench
 from salient.config import HOST_BUILDS, TARGET_BUILDS, WASM_BUILD, BenchConfig
 from salient.paths import BUILD, ROOT
+from salient.tab.link import link_of
 
 _benches_key = pytest.StashKey[list[Bench]]()
 
@@ -120,6 +121,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]
         except Exception as error:  # must not hide the failure of the test
             report.sections.append(("salient bench", f"nothing saved in {folder}: {error!r}"))
             continue
-        report.sections.append(
-            ("salient bench", f"log, plot, seed {bench.options.seed}: {folder}\nreplay: {replay}")
-        )
+        lines = [f"log, plot, seed {bench.options.seed}: {folder}", f"replay: {replay}"]
+        link = link_of(bench)
+        if link is not None:
+            lines.append(f"in a browser (tools/salient tab): {link}")
+        report.sections.append(("salient bench", "\n".join(lines)))

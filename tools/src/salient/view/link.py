@@ -13,7 +13,6 @@ from typing import Any
 import can
 from cantools.database.can import Database
 
-from salient.bench.client import Client
 from salient.bench.drive import Drive, DriveError, OtherDatabase
 from salient.bench.rig import Rig, RigError
 from salient.bus.clock import VirtualTimeReader, open_bus
@@ -25,7 +24,7 @@ _TICK_S = 0.004
 """Between two looks at the bus: less than half the period of the commands."""
 _REPLY_TIMEOUT_S = 5.0
 """Wall time in which a test bench answers; a bus without one would be waited for until the end of time."""
-SHOWN_WITHIN_NS = 500_000_000
+SHOWN_WITHIN_NS = 1_000_000_000
 """A page commands only while what it has shown is not older than this, in time of the drive."""
 
 
@@ -80,7 +79,7 @@ class DriveTime:
         return interface_ns if self._offset_ns is None else interface_ns + self._offset_ns
 
 
-class Link(Client):
+class Link:
     """One drive on a bus. `call` runs a function in the thread of the bus, where drive and rig may be used."""
 
     def __init__(self, address: str, machine: str, node: int, store: FrameStore) -> None:

@@ -76,6 +76,7 @@ class Server:
         self._tasks: set[asyncio.Task[None]] = set()
         self._socket = socket.socket()
         self._socket.bind(("127.0.0.1", 0))
+        self._socket.listen()  # whoever is told the link may use it at once
         self._port = self._socket.getsockname()[1]
         routes = [Route("/", self._index), Route("/{path:path}", self._file), WebSocketRoute("/frames", self._serve)]
         self.application = Starlette(routes=[routes[2], routes[0], routes[1]])

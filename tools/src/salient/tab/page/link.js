@@ -3,11 +3,11 @@
 //     #build=0123456789ab&machine=saturating&seed=1&events=0.05:speed_reference:rpm=600;0.2:load_torque:Nm=8
 //
 // events: time in seconds, command of COMMANDS, its arguments; a set of parameters has their names as arguments.
-// frames: instead or before them, all frames of another client, packed (salient.tab.link). until, hash: when the link was
-// made, and the bits that there were.
+// frames: instead or before them, all frames of another client, packed (salient.tab.link). until, hash: time at which the
+// link was made, where time stops, and the bits that there were.
 
 const OPTIONS = ["controller", "control_rate_hz", "encoder_bits", "encoder_edges", "adc_bits", "immediate_pwm", "seed",
-                 "initial_angle_deg", "bit_rate", "node", "telemetry_period_ms"];
+                 "initial_angle_deg", "bit_rate", "telemetry_period_ms"];
 const DEFAULT_MACHINE = "saturating";
 
 const seconds = (timeNs) => (timeNs / 1e9).toFixed(9).replace(/\.?0+$/, "");

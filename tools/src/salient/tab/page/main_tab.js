@@ -90,6 +90,9 @@ async function main() {
     }
     const other = new OtherBranch(page);
     source.onRewound = (fromNs) => other.keep(fromNs);
+    source.onEnd = () => page.stopped || page.stopTime();
+    document.querySelector("#run-panel > .hint:last-child").textContent = "The drive is in this page: its time stands still "
+        + "while the page is not seen. To go back and change something takes another branch; the one that was left is dotted.";
     makeBar(page, source);
     if (setting.build !== undefined && setting.build !== data.build) {
         tell(`The link is of build ${setting.build}, this page is of build ${data.build}: its bits may be others.`, true);

@@ -46,9 +46,11 @@ export class TabSource {
         this.pace = 1; // of virtual time to that of the wall
         this.takeFrames = () => {};
         this.takeNotice = () => {};
-        /** Called when a run begins again at an earlier time, and when a compared hash is known. */
+        /** Called when a run begins again at an earlier time, when a compared hash is known, and at the end of a link. */
         this.onRewound = () => {};
         this.onSame = () => {};
+        this.onEnd = () => {};
+        this.endNs = setting.untilNs ?? Infinity;
     }
 
     onFrames(callback) {
@@ -98,9 +100,13 @@ export class TabSource {
 
     /** Lets time pass by some nanoseconds, or until the wall time is over. */
     advance(durationNs, endMs = Infinity) {
-        const untilNs = this.run.timeNs + durationNs;
+        const untilNs = Math.min(this.run.timeNs + durationNs, this.endNs);
         while (this.run.timeNs < untilNs && performance.now() < endMs && !this.stopped) {
             this.run.advanceTo(Math.min(untilNs, this.run.timeNs + SLICE_NS));
+        }
+        if (this.run.timeNs >= this.endNs) {
+            this.endNs = Infinity;
+            this.onEnd();
         }
     }
 

@@ -48,7 +48,8 @@ class Page {
     start() {
         const { info } = this;
         element("machine-name").textContent = info.machine.name;
-        element("title").textContent = info.title;
+        element("title").textContent = info.title.split("/").pop();
+        element("title").title = info.title;
         document.title = `Salient: ${info.title}`;
         makeTabs(info.commands);
         const act = (name, args) => this.act(name, args);
@@ -287,9 +288,9 @@ class Page {
         }
     }
 
-    showWork(work) {
+    showWork({ work, samples }) {
         const total = work.reduce((sum, each) => sum + each, 0);
-        const key = work.map((each) => each.toFixed(2)).join();
+        const key = [samples, ...work.map((each) => each.toFixed(2))].join();
         if (key === this.workKey) {
             return;
         }
@@ -302,7 +303,7 @@ class Page {
         });
         const torque = total * this.info.machine.rotor_poles / (2 * Math.PI);
         element("work").replaceChildren("Work of a stroke, J: ", ...parts,
-                                        Number.isFinite(torque) ? ` mean torque ${torque.toFixed(2)} N m` : "");
+                                        Number.isFinite(torque) ? ` mean torque ${torque.toFixed(2)} N m, ${samples} samples` : "");
     }
 
     showState() {

@@ -46,6 +46,12 @@ export function gridOf(from_ns, to_ns, columns) {
     return { from_ns: start_ns, column_ns, columns: columns + 2, time_s };
 }
 
+/** A number that fits beside an axis. */
+function shortNumber(value) {
+    const plain = +value.toPrecision(7);
+    return (Math.abs(plain) >= 1e5 ? `${+(plain / 1e6).toPrecision(5)}M` : String(plain)).replace("-", "−");
+}
+
 /** Scale of an axis: never of no height, and whole least significant bits do not fill it. */
 function rangeOf(list) {
     const resolution = Math.max(...list.map((series) => (series.signal.float ? 1e-3 : series.signal.factor)));
@@ -80,10 +86,11 @@ class Plot {
                 { size: 26, values: (plot, ticks) => ticks.map((tick) => `${+tick.toFixed(6)} s`), space: 90,
                   font: "12px system-ui, sans-serif", stroke: "#333", grid: { stroke: "#e8e8e8", width: 1 },
                   ticks: { size: 4 } },
-                { size: AXIS_WIDTH, label: unit, labelSize: unit ? 18 : 0, labelGap: 0,
+                { size: AXIS_WIDTH, label: unit, labelSize: 18, labelGap: 0,
                   font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif", stroke: "#333",
                   grid: { stroke: "#e8e8e8", width: 1 }, ticks: { size: 4 }, space: 26,
-                  ...(states ? { values: (plot, ticks) => ticks.map((tick) => this.stateName(tick)) } : {}) },
+                  values: (plot, ticks) => ticks.map((tick) => (states ? this.stateName(tick) : shortNumber(tick))),
+                  ...(states ? { incrs: [1, 2, 5, 10] } : {}) },
             ],
             cursor: { sync: { key: "time" }, points: { show: false }, drag: { x: true, y: false, setScale: false } },
             series: [{}, ...list.map((series) => ({

@@ -123,7 +123,7 @@ export function makeParameters(act) {
     const plain = (value) => String(+value.toPrecision(7));
     const filter = () => {
         const wanted = element("parameter-filter").value.toLowerCase();
-        rows.forEach((row) => { row.line.hidden = !row.name.includes(wanted); });
+        rows.forEach((row) => { row.line.hidden = !row.name.toLowerCase().includes(wanted); });
     };
     const mark = () => {
         rows.forEach((row) => row.line.classList.toggle("changed", row.input.value !== row.text));

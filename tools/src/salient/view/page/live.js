@@ -49,8 +49,9 @@ export class LiveSource {
         } else if (message.notice) {
             this.takeNotice(message.notice);
         } else if (this.answers.has(message.n)) {
-            this.answers.get(message.n)(message);
-            this.answers.delete(message.n);
+            const { n, ...answer } = message;
+            this.answers.get(n)(answer);
+            this.answers.delete(n);
         }
     }
 

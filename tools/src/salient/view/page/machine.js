@@ -232,7 +232,8 @@ export function drawMachine(canvas, state, time_ns) {
     context.fill();
 }
 
-/** Draws the last stroke of each phase over the magnetisation curves; returns the work of each, in J. */
+/** Draws the last stroke of each phase over the magnetisation curves; returns the work of each in J, and the samples
+ *  of the first. */
 export function drawLoops(canvas, state, time_ns) {
     const { context, width, height } = prepared(canvas);
     const { machine } = state;
@@ -268,9 +269,11 @@ export function drawLoops(canvas, state, time_ns) {
         line(context, "#9aa0a6", map.map((row, index) => [x(currents[index]), y(row[column])]));
     }
     const work = [];
+    let samples = 0;
     for (let phase = 0; phase < machine.phases; phase++) {
         const stroke = state.stroke(phase, time_ns);
         work.push(stroke ? stroke.work_J : NaN);
+        samples = samples || (stroke ? stroke.points.length : 0);
         const colour = PHASE_COLOURS[phase];
         if (stroke) {
             context.lineWidth = 1.75;
@@ -286,7 +289,7 @@ export function drawLoops(canvas, state, time_ns) {
             context.fill();
         }
     }
-    return work;
+    return { work, samples };
 }
 
 function line(context, colour, points) {

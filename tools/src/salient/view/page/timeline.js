@@ -8,7 +8,7 @@ export class Timeline {
     constructor(store, isReplay) {
         this.store = store;
         this.isReplay = isReplay;
-        this.window_ns = 2e9;
+        this.window_ns = 1e9;
         this.end_ns = 0;
         this.held = isReplay;
         this.speed = 1;
@@ -37,6 +37,9 @@ export class Timeline {
             this.end_ns = Math.min(this.end_ns + elapsed_ms * 1e6 * this.speed, this.store.last_ns);
             this.playing = this.end_ns < this.store.last_ns;
         } else if (!this.held && Number.isFinite(this.store.last_ns)) {
+            this.end_ns = this.store.last_ns;
+        }
+        if (this.isReplay && this.end_ns > this.store.last_ns) {
             this.end_ns = this.store.last_ns;
         }
     }

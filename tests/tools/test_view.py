@@ -1,0 +1,585 @@
+"""The live page in a real browser: a drive in lock-step, a server on its bus, and pages in Chromium.
+
+Time is virtual: the drive waits until the page has shown what has come so far.
+"""
+
+from __future__ import annotations
+
+import http.server
+import json
+import math
+import random
+import shutil
+import subprocess
+import sys
+import threading
+from collections import Counter
+from itertools import pairwise
+
+import can
+import numpy as np
+import pytest
+from playwright.sync_api import sync_playwright
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from salient.bus.signals import drive_database, rig_database
+from salient.paths import BUILD, ROOT
+from salient.view.commands import COMMANDS
+from salient.view.description import EXTENDED, description
+
+STEP_S = 0.04
+"""Less than the time after which the drive misses the commands that the server repeats."""
+PICTURES = BUILD / "view"
+PATIENCE = 2000
+"""Display frames in which a page does what it is asked."""
+
+TWENTY = [
+    *(f"DRIVE_STATUS.{name}" for name in ("time_us", "state", "fault", "voltage_saturated", "single_pulse", "cycle")),
+    *(f"DRIVE_MOTION.{name}" for name in ("speed_rpm", "speed_reference_rpm", "rotor_angle_deg")),
+    *(f"DRIVE_TORQUE.{name}" for name in ("torque_reference_Nm", "torque_estimate_Nm", "load_torque_estimate_Nm",
+                                          "bus_voltage_V")),
+    *(f"DRIVE_CURRENTS.current_{phase}_A" for phase in "abc"),
+    "RIG_TRUTH_MOTION.speed_rpm", "RIG_TRUTH_MOTION.torque_Nm", "RIG_TRUTH_CURRENTS.current_a_A",
+    "RIG_TRUTH_BENCH.load_torque_Nm",
+]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    executable = shutil.which("chromium")
+    assert executable, "chromium is missing: tools/salient test installs it"
+    with sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])  # tests run as root
+        yield launched
+        launched.close()
+
+
+@pytest.fixture
+def serve():
+    """Starts `view` with options and returns its link; ends it by an interrupt."""
+    processes = []
+
+    def start(*options):
+        line = [sys.executable, "-m", "salient", "view", *map(str, options)]
+        process = subprocess.Popen(line, stdout=subprocess.PIPE, text=True)
+        processes.append(process)
+        return process.stdout.readline().removeprefix("live page: ").strip()
+
+    yield start
+    for process in processes:
+        process.terminate()
+        process.communicate()
+
+
+class Visitor:
+    """A person with a page, and the bench whose drive the page shows."""
+
+    def __init__(self, browser, link, bench=None, width=1280, height=800):
+        # Playwright's own functions are evaluated from text, which the page's policy forbids.
+        self.page = browser.new_page(bypass_csp=True, viewport={"width": width, "height": height},
+                                     accept_downloads=True)
+        self.bench = bench
+        self.errors = []
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.goto(link)
+        self.wait("globalThis.salient !== undefined")
+
+    def ask(self, expression):
+        return self.page.evaluate(f"() => {expression}")
+
+    def wait(self, condition):
+        for _ in range(PATIENCE):
+            if self.page.evaluate(f"() => new Promise((done) => requestAnimationFrame(() => done({condition})))"):
+                return
+        raise AssertionError(f"not within {PATIENCE} display frames: {condition}")
+
+    def catch_up(self):
+        self.wait(f"salient.shown_ns >= {self.bench.log[-1][0]}")
+
+    def run(self, duration_s, step_s=STEP_S):
+        """Lets time pass in steps that the page sees one by one."""
+        steps = math.ceil(duration_s / step_s - 1e-9)
+        for _ in range(steps):
+            self.bench.run_for(duration_s / steps)
+            self.catch_up()
+
+    def finish(self):
+        """Lets time pass until the page has the answers to what it has sent."""
+        for count in range(PATIENCE * 10):
+            if not self.ask("salient.pending"):
+                return
+            self.bench.run_for(0.001)
+            if count % 100 == 99:
+                self.catch_up()
+        raise AssertionError("no answer to a command")
+
+    def press(self, selector):
+        self.page.click(selector)
+        self.finish()
+
+    def take_command(self):
+        self.press("#take")
+        self.wait("salient.lease === 'yours'")
+
+    def tab(self, name):
+        self.page.click(f"[role=tab]:text-is('{name}')")
+
+    def notice(self):
+        return self.page.inner_text("#notice")
+
+    def count(self, message):
+        return self.ask(f"salient.store.count('{message}')")
+
+
+@pytest.fixture
+def live(browser, make_bench, serve):
+    """A drive with 1 kHz telemetry, and a function that opens a page on it."""
+    bench = make_bench()
+    bench.run_for(0.02)
+    link = serve("--can", bench.address)
+    visitors = []
+
+    def visit(**size):
+        visitor = Visitor(browser, link, bench, **size)
+        visitors.append(visitor)
+        bench.run_for(0.01)
+        visitor.catch_up()
+        return visitor
+
+    visit.bench, visit.link = bench, link
+    yield visit
+    for visitor in visitors:
+        visitor.page.close()
+        assert visitor.errors == []
+
+
+def nothing_is_cut_off(page):
+    """Names of visible elements that are beyond the width of the page, or whose text is beyond themselves."""
+    return page.evaluate("""() => [...document.querySelectorAll("body *")].filter((each) => {
+        if (each.closest(".uplot, option, .list, canvas, datalist") || !each.checkVisibility()) { return false; }
+        const box = each.getBoundingClientRect();
+        const beyond = box.right > innerWidth + 0.5 || box.left < -0.5;
+        const cut = each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0
+            && getComputedStyle(each).display !== "inline" && !["SELECT", "INPUT"].includes(each.tagName);
+        return beyond || cut;
+    }).map((each) => `${each.tagName} ${each.id} ${each.className}`)""")
+
+
+def frames_by_message(bench):
+    names = {message.frame_id | (EXTENDED if message.is_extended_frame else 0): message.name
+             for database in (drive_database(), rig_database()) for message in database.messages}
+    return Counter(names[m.arbitration_id | (EXTENDED if m.is_extended_id else 0)] for _, m in bench.log
+                   if not (m.is_remote_frame or m.is_error_frame or m.is_fd))
+
+
+def test_twenty_signals_at_1_kHz_for_ten_seconds_without_a_lost_frame(live):
+    visitor, bench = live(), live.bench
+    visitor.tab("Signals")
+    for box in visitor.page.query_selector_all("#signals input:checked"):
+        box.uncheck()
+    for name in TWENTY:
+        visitor.page.check(f"#signals input[value='{name}']")
+    assert visitor.ask("salient.names.length") == 20
+    before = {name: visitor.count(name) for name in frames_by_message(bench)}
+    already = frames_by_message(bench)
+    visitor.run(10.0, step_s=0.25)
+    sent = frames_by_message(bench) - already
+    assert {name: visitor.count(name) - before.get(name, 0) for name in sent} == dict(sent)
+    assert 9990 <= sent["DRIVE_STATUS"] <= 10010 and 9990 <= sent["RIG_TRUTH_MOTION"] <= 10010
+    assert visitor.ask("salient.store.lost") == 0 and visitor.ask("salient.store.unknown") == 0
+    for name in TWENTY:
+        table = bench.telemetry if name.startswith("DRIVE") else bench.truth
+        shown = visitor.ask(f"(() => {{ const s = salient.store.watch('{name}'); "
+                            "return Array.from(s.value.slice(s.size - 9000, s.size)); })()")
+        assert np.array_equal(shown, table[name].value[-9000:]), name
+    visitor.page.screenshot(path=_picture("signals"))
+
+
+def _picture(name):
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    return PICTURES / f"{name}.png"
+
+
+def test_a_person_starts_loads_breaks_clears_tunes_and_exports(live):
+    visitor, bench, page = live(), live.bench, None
+    page = visitor.page
+    page.keyboard.press("Tab")
+    assert visitor.ask("document.activeElement.id") == "take"
+    page.keyboard.press("Enter")
+    visitor.wait("salient.lease === 'yours'")
+
+    visitor.tab("Parameters")
+    visitor.press("#read-parameters")
+    page.fill("#parameter-filter", "speed_ramp")
+    shown = page.locator("#parameters tbody tr:visible th").all_inner_texts()
+    assert shown and all("speed_ramp" in name for name in shown)
+
+    visitor.tab("Run")
+    page.fill("#speed-reference", "600")
+    visitor.press("#speed-form button")
+    visitor.run(0.4)
+    assert bench.drive.state == "run" and page.inner_text("#state") == "run"
+    assert 597 < bench.truth["speed_rpm"].last < 603
+
+    page.fill("#load-torque", "8")
+    visitor.press("#load-form button")
+    visitor.run(0.3)
+    assert bench.truth["load_torque_Nm"].last == pytest.approx(8, abs=0.05)
+    assert 598 < bench.truth["speed_rpm"].last < 602
+    page.select_option("#truth-period", "100")
+    visitor.finish()
+    page.select_option("#rotor", "step")
+    visitor.run(0.3)
+    # The area of the loops is the work of the strokes, and that the torque.
+    work = visitor.ask("salient.workKey").split(",")
+    mean_torque_Nm = sum(map(float, work[1:])) * 4 / (2 * math.pi)
+    torque_Nm = bench.truth["torque_Nm"].between(bench.time_s - 0.1, bench.time_s).value.mean()
+    assert 0.98 < mean_torque_Nm / torque_Nm < 1.02
+    assert nothing_is_cut_off(page) == []
+    page.select_option("#rotor", "slow")
+    page.select_option("#window", "0.1")
+    visitor.run(0.08)
+    page.screenshot(path=_picture("live"))
+    page.select_option("#window", "1")
+
+    visitor.tab("Parameters")
+    page.fill("#parameter-filter", "smc_k")
+    page.fill("#parameters tbody tr:not([hidden]) input", "900")
+    visitor.press("#apply-parameters")
+    assert visitor.notice() == ""
+    visitor.run(0.1)
+    assert bench.drive.state == "run"  # a tunable one
+    page.fill("#parameters tbody tr:not([hidden]) input", "1e6")
+    visitor.press("#apply-parameters")
+    assert "smc_k 1e+06: must be 0 to 10000 1/s" in visitor.notice()
+
+    visitor.tab("Faults")
+    page.select_option("#fault-kind", "current_sensor_high_rail")
+    page.select_option("#fault-phase", "b")
+    visitor.press("#fault-form button:text-is('Begin')")
+    visitor.run(0.1)
+    assert bench.drive.state == "fault" and page.inner_text("#state") == "fault"
+    assert page.inner_text("#fault") == bench.drive.fault.replace("_", " ") != "none"
+    visitor.press("#end-faults")
+    visitor.tab("Record")
+    visitor.press("#read-record")
+    assert visitor.ask("document.querySelectorAll('#record .uplot').length") == 4
+    assert len(page.query_selector_all("#fault-log tbody tr")) == 1
+    assert nothing_is_cut_off(page) == []
+    page.screenshot(path=_picture("record"))
+    page.click("#record button")
+    visitor.tab("Run")
+    visitor.press("#clear-fault")
+    visitor.run(0.1)
+    assert bench.drive.state == "ready" and page.inner_text("#state") == "ready"
+    assert bench.drive.parameters["smc_k"] == 900
+
+    page.fill("#load-torque", "0")
+    visitor.press("#load-form button")
+    page.fill("#torque-reference", "3")
+    visitor.press("#torque-form button")
+    visitor.run(0.1)
+    assert bench.drive.state == "run" and bench.drive.mode == "torque"
+    page.keyboard.press("Escape")
+    visitor.finish()
+    visitor.run(0.6)
+    assert bench.drive.state == "ready"
+
+    page.keyboard.press("p")
+    assert visitor.ask("salient.timeline.held")
+    with page.expect_download() as download:
+        page.click("#export")
+    lines = download.value.path().read_text().splitlines()
+    head = lines[0].split(",")
+    assert head[:2] == ["time_s", "DRIVE_MOTION.speed_rpm (r/min)"]
+    exported = {float(line.split(",")[0]): line.split(",")[1] for line in lines[1:]}
+    times = sorted(time for time, value in exported.items() if value)
+    assert 990 <= len(times) <= 1001 and {round((b - a) * 1e3) for a, b in pairwise(times)} == {1}
+    assert float(exported[times[-1]]) == pytest.approx(bench.telemetry["speed_rpm"].last, abs=1e-6)
+
+
+def test_cursors_trigger_and_the_part_that_is_dragged(live):
+    visitor = live()
+    visitor.take_command()
+    visitor.page.click("#trigger summary")
+    visitor.page.select_option("#trigger-signal", "DRIVE_MOTION.speed_rpm")
+    visitor.page.fill("#trigger-level", "100")
+    visitor.page.select_option("#trigger-mode", "single")
+    visitor.page.click("#trigger summary")
+    visitor.page.select_option("#window", "0.1")
+    visitor.press("#speed-form button")
+    visitor.run(0.4)
+    crossing = visitor.ask("salient.trigger.shown_ns")
+    speed = live.bench.telemetry["speed_rpm"]
+    expected_s = speed.time_s[np.argmax(speed.value >= 100)]
+    assert 0 <= expected_s - crossing / 1e9 < 0.002  # the telemetry is sent after its values were read
+    assert visitor.ask("salient.timeline.start_ns") == pytest.approx(crossing - 0.02e9, abs=10)
+    visitor.tab("Cursors")
+    box = visitor.page.locator("#charts .u-over").first.bounding_box()
+    middle = box["y"] + box["height"] / 2
+    visitor.page.mouse.click(box["x"] + box["width"] * 0.25, middle)
+    visitor.page.keyboard.down("Shift")
+    visitor.page.mouse.click(box["x"] + box["width"] * 0.75, middle)
+    visitor.page.keyboard.up("Shift")
+    difference = visitor.page.inner_text("#cursors tbody tr:first-child td:last-child")
+    assert float(difference.removesuffix(" ms")) == pytest.approx(50, abs=0.5)
+    visitor.page.mouse.move(box["x"] + box["width"] * 0.4, middle)
+    visitor.page.mouse.down()
+    visitor.page.mouse.move(box["x"] + box["width"] * 0.6, middle)
+    visitor.page.mouse.up()
+    assert visitor.ask("salient.timeline.window_ns") == pytest.approx(0.02e9, rel=0.03)
+
+
+def test_a_second_commanding_page_is_refused_with_a_message(live):
+    first, second = live(), live()
+    first.take_command()
+    second.press("#take")
+    assert "another page commands this drive" in second.notice()
+    assert second.ask("salient.act('speed_reference', {rpm: 600})") == {
+        "ok": False, "message": "this page does not command: take command first"}
+    first.run(0.1)
+    assert live.bench.drive.state == "ready"
+    first.press("#take")  # releases
+    second.take_command()
+
+
+def test_a_page_that_falls_asleep_lets_the_command_time_out_and_the_drive_stops(live):
+    sleeper, watcher, bench = live(), live(), live.bench
+    sleeper.take_command()
+    sleeper.press("#speed-form button")
+    for _ in range(20):
+        bench.run_for(STEP_S)
+        sleeper.catch_up()
+        watcher.catch_up()
+    assert bench.drive.state == "run" and bench.truth["speed_rpm"].last > 500
+    sleeper.page.evaluate("() => { globalThis.requestAnimationFrame = () => 0; }")  # as a hidden page
+    watcher.run(1.7)  # the server follows
+    assert bench.drive.state == "fault" and bench.drive.fault == "command_timeout"
+    assert watcher.ask("salient.lease") == "free"
+    assert "this page slept" in sleeper.notice()
+
+
+def test_a_page_that_is_closed_lets_the_command_time_out(live):
+    closed, watcher, bench = live(), live(), live.bench
+    closed.take_command()
+    closed.press("#speed-form button")
+    closed.run(0.4)
+    assert bench.drive.state == "run"
+    closed.page.close()
+    watcher.wait("salient.lease === 'free'")
+    watcher.run(0.7)
+    assert bench.drive.fault == "command_timeout"
+
+
+def _address(link):
+    return link.replace("http:", "ws:").replace("/?", "/frames?")
+
+
+def _origin(link):
+    return link.split("/?")[0]
+
+
+@pytest.mark.parametrize("wrong", ["origin", "no origin", "token", "no token"])
+def test_neither_a_foreign_origin_nor_a_page_without_the_token_is_served(live, wrong):
+    address, origin = _address(live.link), _origin(live.link)
+    if wrong == "token":
+        address += "x"
+    elif wrong == "no token":
+        address = address.split("?")[0]
+    foreign = {"origin": "http://127.0.0.1:1", "no origin": None}.get(wrong, origin)
+    with pytest.raises(InvalidStatus) as refused:
+        connect(address, origin=foreign, proxy=None)
+    assert refused.value.response.status_code == 403
+    with connect(_address(live.link), origin=origin, proxy=None) as accepted:
+        assert "info" in json.loads(accepted.recv())
+
+
+def test_a_page_of_another_origin_can_neither_command_nor_read_even_with_the_token(browser, live):
+    class Foreign(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Foreign) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        page = browser.new_page()
+        page.goto(f"http://127.0.0.1:{server.server_address[1]}/")
+        result = page.evaluate("""async ([link, address]) => {
+            const socket = await new Promise((done) => {
+                const tried = new WebSocket(address);
+                tried.onopen = () => done("open");
+                tried.onmessage = () => done("read");
+                tried.onerror = () => done("refused");
+            });
+            const read = await fetch(link).then(() => "read", () => "refused");
+            return [socket, read];
+        }""", [live.link, _address(live.link)])
+        page.close()
+        server.shutdown()
+    assert result == ["refused", "refused"]
+
+
+MALFORMED = [
+    "", "{", "[]", "null", "7", "[" * 100_000 + "]", '{"shown": "x"}', '{"shown": NaN}', '{"shown": -1}',
+    '{"shown": 1, "more": 2}', '{"n": 1, "name": "speed_reference", "args": {}}',
+    '{"n": 1, "name": "speed_reference", "args": {"rpm": "600"}}',
+    '{"n": 1, "name": "speed_reference", "args": {"rpm": 1e999}}',
+    '{"n": 1, "name": "speed_reference", "args": {"rpm": true}}',
+    '{"n": 1, "name": "speed_reference", "args": {"rpm": 600, "more": 1}}',
+    '{"n": 1, "name": "__init__", "args": {}}', '{"n": "1", "name": "stop", "args": {}}',
+    '{"n": 1, "name": ["stop"], "args": {}}', '{"n": 1, "name": "stop", "args": []}',
+    '{"n": 1, "name": "set_parameters", "args": {"values": {"torque_max_Nm": "9"}}}', b"\0\1\2",
+]
+
+
+def test_malformed_messages_are_counted_and_dropped(live):
+    visitor = live()
+    visitor.take_command()
+    messages = [message for message in MALFORMED if len(message) < 60_000]
+    with connect(_address(live.link), origin=_origin(live.link), proxy=None) as rude:
+        for message in messages:
+            rude.send(message)
+        visitor.wait(f"salient.malformed === {len(messages)}")
+    visitor.press("#speed-form button")
+    visitor.run(0.2)
+    assert live.bench.drive.state == "run"
+
+
+def test_a_failure_folder_is_replayed_with_its_machine_and_its_values(browser, make_bench, serve, tmp_path):
+    bench = make_bench(machine="linear_trapezoid")
+    bench.drive.speed_reference_rpm = 600
+    bench.at(0.3).load_torque_Nm = 6
+    bench.run_for(0.5)
+    bench.save(tmp_path / "0", "pytest")
+    visitor = Visitor(browser, serve("--replay", tmp_path))
+    visitor.wait(f"salient.store.frames >= {len(bench.log)}")
+    page = visitor.page
+    assert page.inner_text("#machine-name") == "linear_trapezoid"
+    assert page.locator("#take").is_hidden() and page.locator("[role=tab]").all_inner_texts() == ["Signals", "Cursors"]
+    page.focus("#scrub")
+    page.keyboard.press("Home")
+    visitor.wait("salient.timeline.end_ns === salient.first_ns()")
+    page.keyboard.press("End")
+    visitor.wait("salient.timeline.end_ns === salient.store.last_ns")
+    speed = page.inner_text(".legend li:first-child output")
+    assert float(speed.split()[0]) == pytest.approx(bench.telemetry["speed_rpm"].last, abs=1e-9)
+    page.click("#pause")  # plays it from its beginning
+    visitor.wait("salient.timeline.end_ns < salient.store.last_ns")
+    visitor.wait("!salient.timeline.playing")  # at its end
+    assert visitor.ask("salient.store.watch('DRIVE_TORQUE.torque_estimate_Nm').size") == (
+        bench.telemetry.count("DRIVE_TORQUE"))
+    assert nothing_is_cut_off(page) == []
+    page.screenshot(path=_picture("replay"))
+    page.close()
+    assert visitor.errors == []
+
+
+def test_every_tab_is_readable_on_a_phone(live):
+    visitor = live(width=390, height=844)
+    visitor.take_command()
+    visitor.press("#speed-form button")
+    visitor.run(0.4)
+    assert nothing_is_cut_off(visitor.page) == []
+    visitor.page.screenshot(path=_picture("phone"), full_page=True)
+    for name in visitor.page.locator("[role=tab]").all_inner_texts():
+        visitor.tab(name)
+        assert nothing_is_cut_off(visitor.page) == [], name
+
+
+def test_another_dbc_than_that_of_the_drive_is_said_and_no_reference_sent(browser, live, serve):
+    visitor = Visitor(browser, serve("--can", live.bench.address, "--machine",
+                                     ROOT / "tools/examples/machines/fan12.toml"), live.bench)
+    live.bench.run_for(0.2)
+    visitor.catch_up()
+    visitor.wait("document.getElementById('notice').textContent.includes('another drive.dbc')")
+    visitor.take_command()
+    visitor.press("#speed-form button")
+    assert "a reference would be another one" in visitor.notice()
+    visitor.run(0.1)
+    assert live.bench.drive.state == "ready"
+    visitor.page.close()
+
+
+def test_the_page_decodes_every_signal_as_cantools_does(live):
+    visitor = live()
+    random_ = random.Random(5)
+    frames, expected = [], []
+    for database in (drive_database(), rig_database()):
+        for message in database.messages:
+            for _ in range(20):
+                data = random_.randbytes(message.length)
+                try:
+                    decoded = message.decode(data, decode_choices=False, scaling=True)
+                except Exception:  # the multiplexer has a value that selects nothing
+                    continue
+                identifier = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
+                frames.append([identifier, list(data.ljust(8, b"\0"))])
+                expected.append({name: float(value) for name, value in decoded.items()})
+    decoded = visitor.page.evaluate("""async (frames) => {
+        const { decoderOf, presenceOf } = await import("/decoder.js");
+        const messages = new Map(salient.info.databases.map((message) => [message.id, message]));
+        return frames.map(([id, data]) => {
+            const [low, high] = new Uint32Array(new Uint8Array(data).buffer);
+            const message = messages.get(id);
+            return Object.fromEntries(message.signals.filter((signal) => presenceOf(message, signal)(low, high))
+                .map((signal) => [signal.name, decoderOf(signal)(low, high)]));
+        });
+    }""", frames)
+    assert len(frames) > 500
+    for found, wanted in zip(decoded, expected, strict=True):
+        assert found.keys() == wanted.keys()
+        for name, value in wanted.items():
+            assert found[name] == pytest.approx(value, rel=1e-12, nan_ok=True), name
+
+
+def test_the_commands_of_the_server_are_those_of_the_interface(live):
+    visitor = live()
+    names = visitor.page.evaluate("async () => Object.keys((await import('/source.js')).COMMANDS)")
+    assert {"take", "release", *COMMANDS} <= set(names)
+    assert visitor.ask("salient.info.commands") == ["take", "release", *COMMANDS]
+
+
+def test_flux_linkage_of_the_page_is_that_of_the_machine():
+    machine = description("saturating", 0)["machine"]
+    rows = np.array(machine["flux_map"]["flux_linkage_Wb"])
+    assert rows.shape == (len(machine["flux_map"]["current_A"]), len(machine["flux_map"]["angle_deg"]))
+    assert rows[0] == pytest.approx(0, abs=1e-12) and rows[:, 0] == pytest.approx(rows[:, -1])
+    aligned, unaligned = rows[1, 0], rows[1, len(rows[0]) // 2]
+    current_A = machine["flux_map"]["current_A"][1]
+    assert unaligned / current_A == pytest.approx(0.67e-3, rel=1e-4)
+    assert 0.9 < aligned / current_A / 23.6e-3 < 1.0
+
+
+@pytest.mark.parametrize(("options", "text"), [
+    (["--replay", "nothing.blf"], "--replay nothing.blf: No such file or directory"),
+    (["--replay", "."], "--replay .: a folder must have can.blf, as that of a failed test has"),
+    (["--replay", "x.mf4"], "--replay x.mf4: the suffix must be .asc, .blf or .log (MF4 has signals, no frames)"),
+    (["--can", "unix:nowhere"], "unix:nowhere: no drive answers there (No such file or directory)"),
+    (["--can", "unix:nowhere", "--machine", "nothing"], "machine 'nothing': no such file"),
+])
+def test_a_wrong_option_is_one_line_and_exit_code_2(salient_without_build, options, text):
+    done = salient_without_build("view", *options)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"salient: {text}")
+
+
+def test_frames_of_a_bus_without_virtual_time_get_that_of_the_drive():
+    from salient.view.link import DriveTime
+
+    clock = DriveTime(drive_database())
+    other = can.Message(arbitration_id=0x181, is_extended_id=False, data=bytes(8))
+
+    def status(time_us):
+        return can.Message(arbitration_id=0x180, is_extended_id=False,
+                           data=(time_us % 2**32).to_bytes(4, "little") + bytes(4))
+
+    assert clock.time_ns(7_000, other) == 7_000  # nothing is known yet
+    before_us = 2**32 - 1_000
+    assert clock.time_ns(10**18, status(before_us)) == before_us * 1000
+    assert clock.time_ns(10**18 + 40_000, other) == before_us * 1000 + 40_000
+    assert clock.time_ns(10**18 + 2 * 10**6, status(2**32 + 1_000)) == (2**32 + 1_000) * 1000  # a wrap
+    assert clock.time_ns(10**18 + 10**9, status(500)) == (2**32 + 500) * 1000  # another start of the drive
