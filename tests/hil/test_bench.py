@@ -219,6 +219,8 @@ def test_failure_leaves_log_plot_seed_and_replay_command(tmp_path):
     assert notes["virtual_time_s"] == pytest.approx(0.06)
     assert "-m pytest" in notes["replay"]
     assert (folder / "last_moments.png").read_bytes().startswith(b"\x89PNG")
+    page = (folder / "failure.html").read_text()
+    assert f"tools/salient view --replay {folder}" in page and "test_failing.py::test_that_fails" in page
     with can.LogReader(folder / "can.blf") as log:
         assert len(list(log)) == len((folder / "can.log").read_text().splitlines()) > 300
 

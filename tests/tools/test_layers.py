@@ -32,7 +32,7 @@ PYTHON_LAYERS = (
     "salient.dbc", "salient.toml_file",
     "salient.cli", "salient.elf", "salient.vm", "salient.machine", "salient.finite_elements",
     "salient.generate", "salient.reference.torque_speed_bound",
-    "salient.bus", "salient.bench", "salient.experiments", "salient.test_runner",
+    "salient.bus", "salient.bench", "salient.view", "salient.experiments", "salient.test_runner",
     "salient.benchmark.switching_pattern", "salient.reference", "salient.target", "salient.benchmark",
     "salient.__main__",
 )  # fmt: skip

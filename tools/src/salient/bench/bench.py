@@ -55,7 +55,9 @@ class Bench(Session):
 
     def save(self, folder: Path, replay: str) -> None:
         """Writes the evidence of a failure: log (BLF and candump text), plot of the last moments, seed and command
-        line, and the command that replays it."""
+        line, the commands that show and replay it, and a page of all that."""
+        from salient.pages import Plot, write_page
+
         folder.mkdir(parents=True, exist_ok=True)
         write_logs(self.log, folder / "can.blf", folder / "can.log")
         notes = {
@@ -70,6 +72,8 @@ class Bench(Session):
         }
         (folder / "bench.json").write_text(json.dumps(notes, indent=2) + "\n", encoding="utf-8")
         plot_last_moments(self, folder / "last_moments.png")
+        plot = Plot("", f"The last {LAST_MOMENTS_S * 1e3:g} ms", (folder / "last_moments.png").read_bytes())
+        write_page(folder / "failure.html", "failure.html", {**notes, "plot": plot})
 
 
 def plot_last_moments(session: Session, path: Path) -> None:

@@ -90,8 +90,8 @@ class Link:
         self.shown_ns: int | None = None
         """What the commanding page has shown; None without one."""
         self.drive_database, self.rig_database = drive_database(machine, node), rig_database(node)
-        self.telemetry = LatestSignals(self.drive_database, "DRIVE")
-        self.truth = LatestSignals(self.rig_database, "RIG")
+        self.telemetry: SignalTable = LatestSignals(self.drive_database, "DRIVE")
+        self.truth: SignalTable = LatestSignals(self.rig_database, "RIG")
         self._database_hash = database_hash(drive_database(machine))
         self._store, self._chunk = store, Chunk()
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()

@@ -6,8 +6,9 @@ import asyncio
 import json
 import secrets
 import socket
-from collections.abc import Awaitable, Callable
+from collections.abc import Coroutine
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,6 +34,7 @@ _HEADERS = {
 }
 _TEXT_BYTES_MAX = 65_536
 _POLL_S = 0.004
+_LOG_REFUSES = "a log takes no commands"
 
 
 class Feed(Protocol):
@@ -60,7 +62,7 @@ class _Page:
         self.websocket, self.number = websocket, number
         self.wants_frames = asyncio.Event()
         self.shown_ns = 0.0
-        self.told: dict[str, Any] = {}
+        self.has_slept = False
 
 
 class Server:
@@ -78,8 +80,8 @@ class Server:
         self._socket.bind(("127.0.0.1", 0))
         self._socket.listen()  # whoever is told the link may use it at once
         self._port = self._socket.getsockname()[1]
-        routes = [Route("/", self._index), Route("/{path:path}", self._file), WebSocketRoute("/frames", self._serve)]
-        self.application = Starlette(routes=[routes[2], routes[0], routes[1]])
+        self.application = Starlette(routes=[WebSocketRoute("/frames", self._serve), Route("/", self._index),
+                                             Route("/{path:path}", self._file)])
 
     @property
     def link(self) -> str:
@@ -175,21 +177,21 @@ class Server:
         if page is self._leaseholder and self.feed.link is not None:
             self.feed.link.shown_ns = round(page.shown_ns)
 
-    def _begin(self, task: Awaitable[None]) -> None:
-        running = asyncio.ensure_future(task)
+    def _begin(self, task: Coroutine[Any, Any, None]) -> None:
+        running = asyncio.create_task(task)
         self._tasks.add(running)
         running.add_done_callback(self._tasks.discard)
 
     async def _command(self, page: _Page, number: int, name: str, arguments: dict[str, Any]) -> None:
-        if self._commander is None or self.feed.link is None:
-            answer = {"ok": False, "message": "a log takes no commands"}
+        commander, link = self._commander, self.feed.link
+        if commander is None or link is None:
+            answer = {"ok": False, "message": _LOG_REFUSES}
         elif page is not self._leaseholder:
             answer = {"ok": False, "message": "this page does not command: take command first"}
         else:
-            job: Callable[[], dict[str, Any]] = lambda: self._commander.execute(name, arguments)  # type: ignore[union-attr]
             try:
-                answer = await asyncio.wrap_future(self.feed.link.call(job))
-            except Exception as error:
+                answer = await asyncio.wrap_future(link.call(partial(commander.execute, name, arguments)))
+            except Exception as error:  # whatever it is, the page is told
                 answer = {"ok": False, "message": str(error)}
         await self._answer(page, number, answer)
 
@@ -202,12 +204,12 @@ class Server:
     def _take(self, page: _Page) -> dict[str, Any]:
         link = self.feed.link
         if link is None:
-            return {"ok": False, "message": "a log takes no commands"}
+            return {"ok": False, "message": _LOG_REFUSES}
         if self._leaseholder is page:
             return {"ok": True, "message": ""}
         if self._leaseholder is not None:
             return {"ok": False, "message": "another page commands this drive: release or close it there first"}
-        self._leaseholder = page
+        self._leaseholder, page.has_slept = page, False
         link.shown_ns = round(page.shown_ns)
         return {"ok": True, "message": ""}
 
@@ -222,8 +224,7 @@ class Server:
         page, link = self._leaseholder, self.feed.link
         if page is not None and link is not None and link.time_ns - page.shown_ns > SHOWN_WITHIN_NS:
             self._release(page)
-            page.told.pop("text", None)
-            page.told["asleep"] = True
+            page.has_slept = True
 
     # --- what a page is told ---------------------------------------------------------------------------------------
 
@@ -257,9 +258,7 @@ class Server:
             "malformed": self.malformed,
             "text": "",
         }
-        if holder is page:
-            page.told.pop("asleep", None)
-        if page.told.get("asleep"):
+        if page.has_slept:
             notice["text"] = "command was released: this page slept, and the drive stops by its command timeout"
         if self.feed.ended and page.number >= self.feed.store.next_number:
             notice |= {"ended": True, "text": self.feed.ended}

@@ -89,7 +89,7 @@ class Page {
             this.lease = notice.lease;
             this.showLease();
         }
-        if (notice.text) {
+        if (notice.text && !this.isReplay) {
             this.tell(notice.text);
         }
         this.malformed = notice.malformed ?? this.malformed;

@@ -229,6 +229,12 @@ export function makeRecord(act) {
     });
 }
 
+/** A scale in which also a constant can be read. */
+function withMargin(low, high) {
+    const margin = Math.max(0.08 * (high - low), 0.01 * Math.abs(high), 0.05);
+    return [low - margin, high + margin];
+}
+
 function showRecord(trace) {
     const dialog = element("record");
     const root = element("record-plots");
@@ -253,9 +259,11 @@ function showRecord(trace) {
     for (const [title, lines] of plots) {
         root.append(make("p", { className: "hint", textContent: title }));
         new uPlot({
-            width, height: Math.max(110, Math.min(150, (innerHeight - 260) / plots.length)), legend: { show: false },
-            padding: [4, 12, 0, 0], scales: { x: { time: false } },
-            axes: [{ size: 26, values: (plot, ticks) => ticks.map((tick) => `${tick} µs`), space: 80 }, { size: 52 }],
+            width, height: Math.max(100, Math.min(150, (0.94 * innerHeight - 300) / plots.length)), legend: { show: false },
+            padding: [4, 12, 0, 0],
+            scales: { x: { time: false }, y: { range: (plot, low, high) => withMargin(low, high) } },
+            axes: [{ size: 26, values: (plot, ticks) => ticks.map((tick) => `${tick} µs`.replace("-", "−")),
+                     space: 80 }, { size: 52, space: 22 }],
             series: [{}, ...lines.map((each_) => ({ stroke: each_.stroke, dash: each_.dash, width: 1.5,
                                                      points: { show: false },
                                                      paths: uPlot.paths.stepped({ align: 1 }) }))],
