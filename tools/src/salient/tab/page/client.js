@@ -2,6 +2,7 @@
 // is done; what needs an answer lets virtual time pass.
 
 import { HEADER_BYTES, crc32 } from "./e2e.js";
+import { rounded } from "./messages.js";
 import { eachFrame, movesTime } from "./world.js";
 
 const COMMAND_PERIOD_NS = 10e6;
@@ -123,7 +124,7 @@ export class Client {
         const report = this.latest("DRIVE_ARMING");
         const { disarmedNs } = this.state;
         return report !== undefined && (disarmedNs === null || report.timeNs > disarmedNs + DISARMED_NS)
-            && this.messages.decode("DRIVE_ARMING", report.data).armed === 1;
+            && this.messages.decode("DRIVE_ARMING", report.data).armed === "yes";
     }
 
     speedReference(rpm) {
@@ -200,7 +201,7 @@ export class Client {
         if (report !== undefined && report.count > arming.seen) {
             arming.seen = report.count;
             const { attempt, armed, challenge } = this.messages.decode("DRIVE_ARMING", report.data);
-            if (armed === 1 && arming.answered !== null) {
+            if (armed === "yes" && arming.answered !== null) {
                 Object.assign(state, { arming: null, disarmedNs: null });
                 return;
             }
@@ -262,7 +263,7 @@ export class Client {
             if (row === undefined) {
                 throw new Rejected(`no parameter '${name}'`);
             }
-            const raw = Math.round(value * 2 ** row.fraction_bits);
+            const raw = rounded(value * 2 ** row.fraction_bits);
             if (!(raw >= -(2 ** 31) && raw < 2 ** 31)) {
                 throw new Rejected(this.#mustBe(row, value));
             }

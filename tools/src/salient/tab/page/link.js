@@ -6,6 +6,8 @@
 // frames: instead or before them, all frames of another client, packed (salient.tab.link). until, hash: time at which the
 // link was made, where time stops, and the bits that there were.
 
+import { EVENTS } from "./run.js";
+
 const OPTIONS = ["controller", "control_rate_hz", "encoder_bits", "encoder_edges", "adc_bits", "immediate_pwm", "seed",
                  "initial_angle_deg", "bit_rate", "telemetry_period_ms"];
 const DEFAULT_MACHINE = "saturating";
@@ -32,6 +34,9 @@ function eventOf(text) {
         const [key, value = ""] = pair.split("=");
         return [key, valueOf(decodeURIComponent(value))];
     }));
+    if (!EVENTS.includes(name)) {
+        throw new Error(`The link has no command '${name}'; there are ${EVENTS.join(", ")}.`);
+    }
     return { timeNs: nanoseconds(time), name, args: name === "set_parameters" ? { values: args } : args };
 }
 

@@ -4,7 +4,7 @@ import { decoderOf, presenceOf } from "../../view/page/decoder.js";
 import { protect } from "./e2e.js";
 
 /** To the nearest whole number, halves to the even one. */
-function rounded(value) {
+export function rounded(value) {
     const floor = Math.floor(value);
     if (value - floor !== 0.5) {
         return Math.round(value);

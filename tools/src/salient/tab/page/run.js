@@ -30,8 +30,9 @@ const QUERIES = {
     fault_log: (client) => client.faultLog(),
 };
 
-/** Commands that a run carries out. */
-export const RUN_COMMANDS = [...Object.keys(ACTIONS).filter((name) => name !== "frame"), ...Object.keys(QUERIES)];
+/** Commands of which a link can consist, and all that a run carries out. */
+export const EVENTS = Object.keys(ACTIONS).filter((name) => name !== "frame");
+export const RUN_COMMANDS = [...EVENTS, ...Object.keys(QUERIES)];
 
 export class Run {
     /** onFrame: as of the client, for frames that are new. onSame(timeNs, same): a hash that was known for this time has
