@@ -121,7 +121,7 @@ class Page {
     }
 
     mark(name, time_ns) {
-        this.charts.marks[name] = time_ns;
+        this.charts.setMark(name, time_ns);
         this.lastMark = name;
         showCursors(this.charts.marks, this.charts.list);
     }
@@ -147,7 +147,7 @@ class Page {
                           series: this.store.watch(element("trigger-signal").value),
                           level: Number(element("trigger-level").value) }, this.store.last_ns);
             timeline.held = this.isReplay;
-            this.charts.marks.T = undefined;
+            this.charts.setMark("T", undefined);
             this.showHeld();
         };
         for (const id of ["trigger-mode", "trigger-signal", "trigger-edge", "trigger-level"]) {
@@ -156,7 +156,8 @@ class Page {
         element("export").addEventListener("click", () => this.export());
         element("rotor").addEventListener("change", (event) => { this.rotor.slowed = event.target.value === "slow"; });
         element("clear-cursors").addEventListener("click", () => {
-            this.charts.marks.A = this.charts.marks.B = undefined;
+            this.charts.setMark("A", undefined);
+            this.charts.setMark("B", undefined);
             showCursors(this.charts.marks, this.charts.list);
         });
         element("world").hidden = !this.info.commands.includes("pause");
@@ -271,12 +272,17 @@ class Page {
             this.showHeld();
         }
         const end_ns = timeline.end_ns;
-        this.charts.draw(timeline.start_ns, end_ns, timeline.held || timeline.playing ? end_ns : Infinity);
+        const plots = [store.frames, timeline.start_ns, end_ns, this.charts.version, trigger.shown_ns].join();
+        if (plots !== this.drawnPlots) { // what has not changed is not drawn again
+            this.drawnPlots = plots;
+            this.charts.draw(timeline.start_ns, end_ns, timeline.held || timeline.playing ? end_ns : Infinity);
+        }
         const machine_ns = this.rotor.advance(elapsed_ms, timeline);
-        drawMachine(element("cut"), this.state, machine_ns);
-        this.showWork(drawLoops(element("loops"), this.state, machine_ns));
-        const angle = this.state.angleAt(machine_ns);
-        element("angle").textContent = Number.isFinite(angle) ? `${((angle % 360 + 360) % 360).toFixed(1)}°` : "";
+        const pictures = [machine_ns, this.charts.version, this.state.isTrue].join();
+        if (pictures !== this.drawnPictures) {
+            this.drawnPictures = pictures;
+            this.drawPictures(machine_ns);
+        }
         if (!element("scrub").hidden && document.activeElement !== element("scrub")) {
             const first_ns = this.first_ns();
             element("scrub").value = 1000 * (end_ns - first_ns) / (store.last_ns - first_ns);
@@ -286,6 +292,13 @@ class Page {
         if (now_ms - this.health.at_ms > HEALTH_PERIOD_MS) {
             this.showHealth(now_ms);
         }
+    }
+
+    drawPictures(time_ns) {
+        drawMachine(element("cut"), this.state, time_ns);
+        this.showWork(drawLoops(element("loops"), this.state, time_ns));
+        const angle = this.state.angleAt(time_ns);
+        element("angle").textContent = Number.isFinite(angle) ? `${((angle % 360 + 360) % 360).toFixed(1)}°` : "";
     }
 
     showWork({ work, samples }) {

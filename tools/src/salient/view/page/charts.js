@@ -80,7 +80,7 @@ class Plot {
         const states = list.every((series) => series.signal.choices);
         this.plot = new uPlot({
             width: 300, height: HEIGHT_MIN, legend: { show: false },
-            padding: [6, 10, 0, 0],
+            padding: [6, 28, 0, 0],
             scales: { x: { time: false }, y: { range: rangeOf(list) } },
             axes: [
                 { size: 26, values: (plot, ticks) => ticks.map((tick) => `${+tick.toFixed(6)} s`), space: 90,
@@ -145,6 +145,7 @@ export class Charts {
         this.list = [];
         this.marks = {};
         this.onDraw = () => {}; // (plot, list): more to draw into a plot
+        this.version = 0; // of what is drawn beside the signals
         new ResizeObserver(() => this.resize()).observe(root);
     }
 
@@ -171,7 +172,13 @@ export class Charts {
         return same.length > 1 ? series.name : series.signal.name;
     }
 
+    setMark(name, time_ns) {
+        this.marks[name] = time_ns;
+        this.version += 1;
+    }
+
     resize() {
+        this.version += 1;
         const width = this.root.clientWidth;
         const legends = this.plots.reduce((sum, plot) => sum + plot.legend.offsetHeight, 0);
         const free = this.root.clientHeight - legends - 4 * this.plots.length;

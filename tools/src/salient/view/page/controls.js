@@ -260,7 +260,7 @@ function showRecord(trace) {
         root.append(make("p", { className: "hint", textContent: title }));
         new uPlot({
             width, height: Math.max(100, Math.min(150, (0.94 * innerHeight - 300) / plots.length)), legend: { show: false },
-            padding: [4, 12, 0, 0],
+            padding: [4, 28, 0, 0],
             scales: { x: { time: false }, y: { range: (plot, low, high) => withMargin(low, high) } },
             axes: [{ size: 26, values: (plot, ticks) => ticks.map((tick) => `${tick} µs`.replace("-", "−")),
                      space: 80 }, { size: 52, space: 22 }],
