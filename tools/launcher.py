@@ -254,6 +254,10 @@ def needs_build(options: argparse.Namespace) -> bool:
     return options.command not in WITHOUT_BUILD and not getattr(options, "list", False)
 
 
+def _needs_wasm(options: argparse.Namespace) -> bool:
+    return options.command == "tab" or bool(getattr(options, "tab", False))
+
+
 def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, ...]:
     """Debian packages that a command needs."""
     if not needs_build(options):
@@ -263,9 +267,9 @@ def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, 
         found += TEST_DEPENDENCIES
     if getattr(options, "figures", False):  # measured on every target
         found += tuple(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group)
-    if options.command == "tab":
+    if _needs_wasm(options):
         found += WASM_DEPENDENCIES
-    if getattr(options, "page", None) is not None:
+    if getattr(options, "page", None) is not None or getattr(options, "tab", False):
         found += (BROWSER,)
     if options.command in ("test", "benchmark"):
         found += MEASUREMENT_DEPENDENCIES
@@ -298,7 +302,7 @@ def main() -> None:
             was_built = build("host", [] if options.command == "test" else targets)
             if target != "host":
                 was_built |= build(target, [])
-            if options.command == "tab":
+            if _needs_wasm(options):
                 build("wasm", [])
             # For a reader; a script waits for the JSON line.
             if options.command == "sim" and (was_built or sys.stderr.isatty()):

@@ -131,7 +131,7 @@ def _parameters(options: argparse.Namespace) -> int:
 def _benchmark(options: argparse.Namespace) -> int:
     from salient.benchmark.command import run
 
-    return run(options.runs, options.json, options.page)
+    return run(options.runs, options.json, options.page, options.tab)
 
 
 def _compare(options: argparse.Namespace) -> int:

@@ -119,6 +119,7 @@ def make_parser() -> argparse.ArgumentParser:
     benchmark.add_argument("--runs", type=_count, default=5, metavar="N", help="runs of each kind (default 5)")
     benchmark.add_argument("--page", type=_positive, nargs="?", const=20.0, metavar="SECONDS",
                            help="instead: the live page in Chromium for this wall time (default 20)")
+    benchmark.add_argument("--tab", action="store_true", help="instead: the drive in a tab, in Chromium")
 
     _add_compare_options(command("compare", "the controllers compared with each other, their targets and an earlier "
                                  "run"))
