@@ -160,7 +160,8 @@ def test_link_repeats_the_run_to_the_bit_and_the_hash_notices_another(tab):
         command("speed_reference", rpm=450), to(300), command("load_torque", Nm=1.5),
         command("fault", kind="winding_open", phase="c", duration_s=0.001), to(500)]})
     link = made["link"]
-    assert link.startswith(f"#build={build_id()}&machine=linear_cosine&controller=paper&seed=7&events=0.02:set_parameters:")
+    assert link.startswith(f"#build={build_id()}&machine=linear_cosine&controller=paper&seed=7&"
+                           "events=0.02:set_parameters:")
     same, other = run_in_tab(tab, {"link": link, "steps": [to(137), to(600)]},
                              {"link": link.replace("Nm=1.5", "Nm=1.6"), "steps": [to(600)]})
     assert same["same"] == [[500 * MS, True]]

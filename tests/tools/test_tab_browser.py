@@ -178,7 +178,8 @@ def test_nothing_is_cut_off_on_a_desk_and_on_a_phone(tab, open_page):
         wait_until(page, 0.6)
         page.screenshot(path=PICTURES / f"{name}.png", full_page=True)
         assert page.evaluate("document.documentElement.scrollWidth") <= width
-        outside = page.evaluate("""() => [...document.querySelectorAll("button, select, input, output, label, canvas")]
+        controls = "button, select, input, output, label, canvas"
+        outside = page.evaluate(f"""() => [...document.querySelectorAll("{controls}")]
             .filter((each) => each.checkVisibility() && each.getBoundingClientRect().right > innerWidth + 1)
             .map((each) => each.id || each.textContent)""")
         assert outside == []

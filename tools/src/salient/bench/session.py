@@ -73,7 +73,7 @@ class Session(KnownAttributes):
     telemetry and truth are those of the first; drives[1] and rigs[1] have their own telemetry and truth.
 
     time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. sent: likewise what the
-    session has sent, but for RIG_RUN_UNTIL, and when. telemetry, truth: signals of the drive and of the test bench by name.
+    session has sent, but for RIG_RUN_UNTIL. telemetry, truth: signals of the drive and of the test bench by name.
     """
 
     address: str

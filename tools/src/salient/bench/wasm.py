@@ -95,7 +95,7 @@ def serve(module: Module, path: str) -> None:
         while True:
             waiting = [sys.stdin, listener if client is None else client]
             readable, _, _ = select.select(waiting, [], [])
-            if sys.stdin in readable and not sys.stdin.buffer.read1():
+            if sys.stdin in readable and not os.read(sys.stdin.fileno(), 4096):
                 return
             if listener in readable:
                 client, _ = listener.accept()
@@ -109,7 +109,7 @@ def serve(module: Module, path: str) -> None:
                 elif not _send(client, module.records(request[_TIME_BYTES:])):
                     client = None
     finally:
-        os.unlink(path)
+        Path(path).unlink()
 
 
 def _send(client: socket.socket, records: bytes) -> bool:

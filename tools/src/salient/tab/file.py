@@ -1,7 +1,7 @@
 """Puts the page and everything that it needs into one HTML file that asks nobody for anything.
 
-The scripts are those of the live page and of the tab, as data: addresses in an import map; module, machines and databases
-are one packed block.
+The scripts are those of the live page and of the tab, as data: addresses in an import map; module, machines and
+databases are one packed block.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The link by which the run of a failed test happens again, to the bit, in the drive in a browser tab (page/link.js)."""
+"""The link by which the run of a failed test happens again, to the bit, in a browser tab (page/link.js)."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _ONLY_ALONE = ("drive_only", "memory", "node")
 
 
 def link_of(bench: Bench) -> str | None:
-    """The link to the run of a bench; None where a tab cannot repeat it: another build than the host's, a machine file of
-    one's own, several drives or clients, a memory from before, frames other than classic data, or too many of them."""
+    """The link to the run of a bench; None where a tab cannot repeat it: another build than the host's, a machine file
+    of one's own, several drives or clients, a memory from before, other frames than classic data, too many of them."""
     options = bench.options
     if (options.build != "host" or options.drives != 1 or not bench.address.startswith("unix:")
             or machine_path(options.machine).parent != MACHINES or machine_path(options.machine).suffix != ".toml"
