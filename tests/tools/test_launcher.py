@@ -31,7 +31,7 @@ def assert_usage_error(result, *expected_texts: str) -> None:
     ("arguments", "expected_texts"),
     [
         ([], ["COMMAND"]),
-        (["fly"], ["fly", "must be one of demo, test, sim, run, log, monitor, benchmark"]),
+        (["fly"], ["fly", "must be one of demo, test, sim, run, log, monitor, view, benchmark"]),
         (["sim", "--pcae", "free"], ["unrecognised argument --pcae"]),
         (["sim", "--pace", "fast"], ["--pace fast", "lockstep, realtime, free or xN"]),
         (["sim", "--controller", "pid"], ["--controller pid", "traditional, paper or salient"]),

@@ -10,6 +10,7 @@ import pytest
 
 from salient.experiments import demo, metrics, plots, report, results
 from salient.pages import CONTROLLER_COLOUR, Plot
+from salient.paths import ROOT
 
 CONTROLLERS = ("traditional", "paper", "salient")
 """Controllers of pages and plots; the paper has no values for the last."""
@@ -134,6 +135,15 @@ def lab(colour, eyes):
     xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ seen
     x, y, z = np.cbrt(np.maximum(xyz / (0.9505, 1.0, 1.089), 0.008856))
     return np.array([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)])
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_colours_of_the_phases_on_the_live_page_are_distinguishable_with_any_colour_vision(eyes):
+    palette = (ROOT / "tools/src/salient/view/page/palette.js").read_text()
+    colours = re.findall("#[0-9a-f]{6}", re.search(r"PHASE_COLOURS = \[(.*?)\]", palette)[1])
+    assert len(colours) == 4
+    for one, other in combinations(colours, 2):
+        assert 20.0 < np.linalg.norm(lab(one, eyes) - lab(other, eyes)) < 150.0, (one, other)
 
 
 @pytest.mark.parametrize("eyes", EYES)

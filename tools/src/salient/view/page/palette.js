@@ -1,7 +1,8 @@
-// Colours of Okabe and Ito, which the colour-blind can tell apart; the yellow is left out, too light on white.
+// Colours of Okabe and Ito, in an order in which the first ones differ most to any eye; without the yellow, too light on
+// white.
 
-export const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000"];
-export const PHASE_COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7"];
+export const COLOURS = ["#0072b2", "#d55e00", "#000000", "#56b4e9", "#009e73", "#e69f00", "#cc79a7"];
+export const PHASE_COLOURS = ["#0072b2", "#d55e00", "#000000", "#56b4e9"];
 export const PHASE_NAMES = ["A", "B", "C", "D"];
 
 /** Colour and dash of the n-th signal of a plot: the dash tells those of the same colour apart. */
