@@ -133,7 +133,7 @@ def test_rewound_and_replayed_the_run_has_the_same_bits_and_another_branch_is_be
         const stroke = CanvasRenderingContext2D.prototype.lineTo;
         charts.onDraw = (plot, list) => {
             let points = 0;
-            CanvasRenderingContext2D.prototype.lineTo = function (...at) { points += 1; return stroke.apply(this, at); };
+            CanvasRenderingContext2D.prototype.lineTo = function (x, y) { points += 1; stroke.call(this, x, y); };
             before(plot, list);
             CanvasRenderingContext2D.prototype.lineTo = stroke;
             other.push(points);
@@ -145,7 +145,7 @@ def test_rewound_and_replayed_the_run_has_the_same_bits_and_another_branch_is_be
     assert max(drawn) > 500  # the branch that was left, a second at 1 kHz
 
 
-def test_link_of_a_run_repeats_its_bits_in_another_tab_and_another_build_says_so(tab, open_page):
+def test_link_repeats_a_run_to_the_bit_in_another_tab_and_another_build_says_so(tab, open_page):
     page = open_page(f"{tab}#machine=linear_cosine&seed=4&{BITS}")
     wait_until(page, 0.2)
     page.evaluate("salient.act('load_torque', { Nm: 1.5 })")

@@ -164,8 +164,8 @@ class BenchConfig(Conditions):
     unless given. build: a CMake preset, of HOST_BUILDS or
     TARGET_BUILDS or WASM_BUILD. instructions, execution, instruction_ns: in QEMU only, the last on the Cortex-M4 only;
     instructions gets the instruction count of each control interrupt (uint32, little endian) and a file beside it those
-    of each deferred interrupt (deferred_instructions), execution what salient.target.trace reads. instruction_ns None: the
-    firmware takes no simulated time.
+    of each deferred interrupt (deferred_instructions), execution what salient.target.trace reads. instruction_ns None:
+    the firmware takes no simulated time.
     """
 
     can: str = _option("auto", BUS, "CAN bus", metavar="BUS", commands=("sim",))
