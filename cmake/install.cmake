@@ -43,7 +43,8 @@ function(salient_install)
     install(DIRECTORY ${PROJECT_BINARY_DIR}/firmware/codec/ ${PROJECT_BINARY_DIR}/emulator/codec/
                       ${PROJECT_BINARY_DIR}/emulator/host/generated/
             DESTINATION ${headers}/generated FILES_MATCHING PATTERN "*.h")
-    install(FILES ${PROJECT_SOURCE_DIR}/emulator/host/main.c DESTINATION ${config})
+    install(FILES ${PROJECT_SOURCE_DIR}/emulator/host/main.c ${PROJECT_SOURCE_DIR}/emulator/host/host_drive.c
+            DESTINATION ${config})
     install(FILES ${PROJECT_SOURCE_DIR}/firmware/comms/drive.dbc ${PROJECT_SOURCE_DIR}/emulator/rig/rig.dbc
             DESTINATION ${CMAKE_INSTALL_DATADIR}/salient)
     write_basic_package_version_file(${PROJECT_BINARY_DIR}/salientConfigVersion.cmake COMPATIBILITY SameMinorVersion)

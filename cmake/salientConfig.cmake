@@ -8,7 +8,7 @@
 # and what they need. The include folders are those of the repository: "hal.h", "drive.h", "host/simulation.h", ...
 
 include(${CMAKE_CURRENT_LIST_DIR}/salientTargets.cmake)
-set(SALIENT_MAIN ${CMAKE_CURRENT_LIST_DIR}/main.c)
+set(SALIENT_MAIN ${CMAKE_CURRENT_LIST_DIR}/main.c ${CMAKE_CURRENT_LIST_DIR}/host_drive.c)
 
 # salient_add_drive(TARGET LAW.c...): an executable of the drive on its test bench, with these files in place of those of
 # the firmware that define the same functions: a file defines all functions of the one that it replaces. Files of other

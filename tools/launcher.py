@@ -74,8 +74,18 @@ TARGET_DEPENDENCIES = {
         Dependency("qemu-system-misc", "emulated RV32", _tool("qemu-system-riscv32")),
     ),
 }
+WASM_DEPENDENCIES = (
+    Dependency("clang-19", "compiler for WebAssembly", _tool("clang-19")),
+    Dependency("lld-19", "its linker", _tool("wasm-ld-19")),
+    Dependency("llvm-19", "its archiver", _tool("llvm-ar-19")),
+    Dependency("wasi-libc", "its C library", _file("/usr/lib/wasm32-wasi/libc.a")),
+    Dependency("libclang-rt-19-dev-wasm32", "its helpers",
+               _file("/usr/lib/llvm-19/lib/clang/19/lib/wasi/libclang_rt.builtins-wasm32.a")),
+)
 BROWSER = Dependency("chromium", "browser in which the live page is tested and measured", _tool("chromium"))
 TEST_DEPENDENCIES = (
+    *WASM_DEPENDENCIES,
+    Dependency("nodejs", "runs the drive in WebAssembly", _tool("node")),
     *(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group),
     BROWSER,
     Dependency("qemu-system-x86", "VM with a kernel that has CAN", lambda: not _vm_packages()),
@@ -244,6 +254,10 @@ def needs_build(options: argparse.Namespace) -> bool:
     return options.command not in WITHOUT_BUILD and not getattr(options, "list", False)
 
 
+def _needs_wasm(options: argparse.Namespace) -> bool:
+    return options.command == "tab" or bool(getattr(options, "tab", False))
+
+
 def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, ...]:
     """Debian packages that a command needs."""
     if not needs_build(options):
@@ -253,7 +267,9 @@ def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, 
         found += TEST_DEPENDENCIES
     if getattr(options, "figures", False):  # measured on every target
         found += tuple(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group)
-    if getattr(options, "page", None) is not None:
+    if _needs_wasm(options):
+        found += WASM_DEPENDENCIES
+    if getattr(options, "page", None) is not None or getattr(options, "tab", False):
         found += (BROWSER,)
     if options.command in ("test", "benchmark"):
         found += MEASUREMENT_DEPENDENCIES
@@ -287,6 +303,8 @@ def main() -> None:
             was_built = build("host", [] if options.command == "test" else targets)
             if target != "host":
                 was_built |= build(target, [])
+            if _needs_wasm(options):
+                build("wasm", [])
             # For a reader; a script waits for the JSON line.
             if options.command == "sim" and (was_built or sys.stderr.isatty()):
                 print_status("starting the drive")

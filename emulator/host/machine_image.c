@@ -125,13 +125,18 @@ static bool read_parts(machine_image_t *image, const char *path, size_t size) {
 }
 
 bool machine_image_open(machine_image_t *image, const char *path) {
-    *image = (machine_image_t){0};
     size_t size;
-    image->file = read_file(path, &size);
-    if (image->file && !read_parts(image, path, size)) {
+    uint8_t *const bytes = read_file(path, &size);
+    return bytes && machine_image_take(image, path, bytes, size);
+}
+
+bool machine_image_take(machine_image_t *image, const char *name, uint8_t *bytes, size_t size) {
+    *image = (machine_image_t){.file = bytes};
+    const bool good = size >= HEADER_BYTES ? read_parts(image, name, size) : fail(name, "not a machine image");
+    if (!good) {
         machine_image_close(image);
     }
-    return image->file;
+    return good;
 }
 
 bool machine_image_tables(const machine_image_t *image, const machine_structure_t *structure, void *tables) {

@@ -50,6 +50,9 @@ typedef struct {
 /* Reads and checks an image. False, with nothing to be closed, after one line on stderr that names `path`. */
 bool machine_image_open(machine_image_t *image, const char *path);
 
+/* The same with an image in memory, on the heap, which becomes the machine image's. */
+bool machine_image_take(machine_image_t *image, const char *name, uint8_t *bytes, size_t size);
+
 /* Fills the firmware's tables. False, after one line on stderr, when the image has other tables. */
 bool machine_image_tables(const machine_image_t *image, const machine_structure_t *structure, void *tables);
 

@@ -18,6 +18,8 @@ static_assert(OPTIONS_BIT_RATE_MIN == CAN_BUS_BIT_RATE_MIN && OPTIONS_BIT_RATE_M
 static_assert(OPTIONS_DRIVES_MAX == CAN_BUS_DRIVES_MAX && OPTIONS_NODE_MAX == CAN_BUS_DRIVES_MAX - 1,
               "the record and the emulated bus disagree on the number of drives");
 
+#define RAD_PER_DEG (3.14159265358979323846 / 180.0)
+
 /* Return values of getopt_long: numbers of options from 1, because getopt_long returns 0 for another purpose. */
 enum { HELP = OPTION_COUNT + 1 };
 
@@ -172,4 +174,21 @@ options_result_t options_parse(options_t *options, int argc, char *argv[]) {
         return mistake("%s: unrecognised argument; --help lists the options", argv[optind]);
     }
     return check_combination(options, given);
+}
+
+rig_config_t options_rig(const options_t *options, const machine_t *machine) {
+    return (rig_config_t){
+        .machine = machine,
+        .initial_angle_rad = options->initial_angle_deg * RAD_PER_DEG,
+        .encoder_bits = options->encoder_bits,
+        .adc_bits = options->adc_bits,
+        .encoder_edges = options->encoder_edges,
+        .immediate_pwm = options->immediate_pwm,
+        .seed = options->seed,
+        .node = options->node,
+        .bit_rate = options->bit_rate,
+        .drive_only = options->drive_only,
+        .pacing = options->pacing,
+        .stop_at_ns = options->stop_at_s > 0 ? (uint64_t)(options->stop_at_s * 1e9 + 0.5) : RIG_NEVER,
+    };
 }

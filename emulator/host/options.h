@@ -7,6 +7,7 @@
 #include <stdint.h>
 
 #include "options_table.h"
+#include "rig/rig.h"
 
 typedef enum {
     OPTION_KIND_FLAG, /* bool; has no value */
@@ -41,5 +42,8 @@ typedef enum { OPTIONS_RUN, OPTIONS_HELP, OPTIONS_ERROR } options_result_t;
 /* Reads the command line. OPTIONS_HELP: the usage text was requested and written; OPTIONS_ERROR: one line on stderr
  * names the option, its value and the values allowed. */
 options_result_t options_parse(options_t *options, int argc, char *argv[]);
+
+/* The bench of the first drive, without its stop request and its transport. */
+rig_config_t options_rig(const options_t *options, const machine_t *machine);
 
 #endif

@@ -14,7 +14,6 @@
 
 #define MEMORY_OPTION "--memory"
 #define SWITCHES_OPTION "--record-switches"
-#define RAD_PER_DEG (3.14159265358979323846 / 180.0)
 
 /* Descriptors that end the program: signals, and standard input with --follow-stdin. */
 enum { STOP_SIGNAL, STOP_STDIN };
@@ -143,22 +142,9 @@ static bool open_bench(simulation_t *simulation, const options_t *options) {
         }
     }
 
-    rig_config_t config = {
-        .machine = &simulation->image.machine,
-        .initial_angle_rad = options->initial_angle_deg * RAD_PER_DEG,
-        .encoder_bits = options->encoder_bits,
-        .adc_bits = options->adc_bits,
-        .encoder_edges = options->encoder_edges,
-        .immediate_pwm = options->immediate_pwm,
-        .seed = options->seed,
-        .node = options->node,
-        .bit_rate = options->bit_rate,
-        .drive_only = options->drive_only,
-        .pacing = options->pacing,
-        .stop_at_ns = options->stop_at_s > 0 ? (uint64_t)(options->stop_at_s * 1e9 + 0.5) : RIG_NEVER,
-        .stop = simulation->stop,
-        .transport = transport,
-    };
+    rig_config_t config = options_rig(options, &simulation->image.machine);
+    config.stop = simulation->stop;
+    config.transport = transport;
     rig_init(&simulation->rigs[0], &config);
     for (unsigned i = 1; i < options->drives; ++i) {
         ++config.node;

@@ -36,7 +36,7 @@ static void append(header_t *header, const char *format, ...) {
 
 /* Format: numpy.lib.format, version 1.0. Padding to RECORDER_HEADER_BYTES makes the size of the header independent of
  * the number of rows. */
-static bool write_header(const recorder_t *recorder) {
+void recorder_header(const recorder_t *recorder, char text[RECORDER_HEADER_BYTES]) {
     header_t header = {.length = PREAMBLE_BYTES};
     append(&header, "{'descr': [('time_s', '<f8'), ('speed_rpm', '<f4'), ('torque_Nm', '<f4'), "
                     "('load_torque_Nm', '<f4'), ('rotor_angle_deg', '<f4'), ('bus_voltage_V', '<f4')");
@@ -51,7 +51,13 @@ static bool write_header(const recorder_t *recorder) {
     const uint16_t dictionary_bytes = RECORDER_HEADER_BYTES - PREAMBLE_BYTES;
     memcpy(header.text, "\x93NUMPY\x01\x00", 8);
     memcpy(header.text + 8, &dictionary_bytes, sizeof dictionary_bytes);
-    return fwrite(header.text, sizeof header.text, 1, recorder->file) == 1;
+    memcpy(text, header.text, sizeof header.text);
+}
+
+static bool write_header(const recorder_t *recorder) {
+    char text[RECORDER_HEADER_BYTES];
+    recorder_header(recorder, text);
+    return fwrite(text, sizeof text, 1, recorder->file) == 1;
 }
 
 static void format_error(const recorder_t *recorder, const char *action, int reason, char *error, size_t error_size) {

@@ -42,6 +42,9 @@ bool recorder_open(recorder_t *recorder, const char *path, unsigned phases, char
 /* Appends the state of the plant: callback for plant_observe with the recorder as context. */
 void recorder_sample(void *context, const plant_t *plant);
 
+/* The header of the file with the present number of rows. */
+void recorder_header(const recorder_t *recorder, char text[RECORDER_HEADER_BYTES]);
+
 /* Writes the number of rows and closes the file; does nothing when none is open. False, with a line in `error`, when
  * any write has failed. */
 bool recorder_close(recorder_t *recorder, char *error, size_t error_size);

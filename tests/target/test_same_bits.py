@@ -1,4 +1,4 @@
-"""The firmware is bit-identical on the host, the Cortex-M4 and RV32, in every control period.
+"""The firmware is bit-identical on the host, the Cortex-M4, RV32 and in WebAssembly, in every control period.
 
 Compared are the compare values of every control period, every CAN frame with its time, and the recorded true state.
 """
@@ -16,13 +16,14 @@ from pathlib import Path
 import pytest
 
 from salient.bench.bench import Bench
-from salient.config import CONTROLLERS, TARGET_BUILDS, TARGETS
+from salient.config import CONTROLLERS, TARGET_BUILDS, TARGETS, WASM_BUILD
 from salient.paths import BUILD, ROOT
 from salient.paths import MACHINES as MACHINE_FILES
 
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
-BUILDS = {"saturating": TARGET_BUILDS, "linear_cosine": TARGETS[1:], "linear_trapezoid": TARGETS[1:],
-          "finite_element": TARGET_BUILDS}
+ALL = (*TARGETS, WASM_BUILD)
+BUILDS = {"saturating": (*TARGET_BUILDS, WASM_BUILD), "linear_cosine": ALL[1:], "linear_trapezoid": ALL[1:],
+          "finite_element": (*TARGET_BUILDS, WASM_BUILD)}
 """Builds of a machine: every optimisation level with three and with four phases; a table changes no code but constants,
 which the linked -O2 builds fold."""
 ROW_BYTES = 16
@@ -138,8 +139,8 @@ def test_host_and_targets_agree_in_every_control_period(traces, request, name, c
 @pytest.mark.parametrize("board", [{"adc_bits": 16, "encoder_edges": True}, {"encoder_bits": 0, "immediate_pwm": True},
                                    {"control_rate_hz": 100_000, "encoder_bits": 24}])
 def test_other_board_options_agree_on_host_and_targets(traces, board):
-    made = traces(TARGETS, "load_step_150", controller="salient", **board)
-    for build in TARGETS:
+    made = traces(ALL, "load_step_150", controller="salient", **board)
+    for build in ALL:
         assert made[build] == made["host"], build
 
 
@@ -153,9 +154,9 @@ def machine_file(folder: Path, stem: str, inertia: float) -> Path:
 
 def test_machine_file_of_the_user_agrees_on_host_and_targets(traces, tmp_path):
     """The host reads the tables, in the targets they are compiled in; the file has the name of another machine."""
-    made = traces(TARGETS, "start_600", machine=str(machine_file(tmp_path, "saturating", 0.013)))
+    made = traces(ALL, "start_600", machine=str(machine_file(tmp_path, "saturating", 0.013)))
     bundled = traces(["host"], "start_600", machine="linear_cosine")["host"]
-    for build in TARGETS:
+    for build in ALL:
         assert made[build] == made["host"], build
     assert made["host"].compare_values != bundled.compare_values
 
@@ -165,9 +166,9 @@ def test_machine_file_of_the_user_agrees_on_host_and_targets(traces, tmp_path):
 def test_machine_at_the_end_of_the_range_agrees_on_host_and_targets(traces, name, controller):
     """Machines whose formats have other units, compiled in."""
     file = ROOT / "tests" / "machines" / f"{name}.toml"
-    made = traces(TARGETS, "start_of_any_machine", machine=str(file), controller=controller, seed=3)
+    made = traces(ALL, "start_of_any_machine", machine=str(file), controller=controller, seed=3)
     assert any(made["host"].compare_values)
-    for build in TARGETS:
+    for build in ALL:
         assert made[build] == made["host"], build
 
 

@@ -21,11 +21,11 @@ Graph = Mapping[str, set[str]]
 C_LAYERS = (
     "hal/", "hal/qemu/", "firmware/fixed/", "firmware/control/", "firmware/drive/", "firmware/comms/", "firmware/",
     "emulator/plant/", "emulator/plant_library/", "emulator/plant_benchmark/", "emulator/fmi/", "emulator/rig/",
-    "emulator/host/", "emulator/campaign/", "emulator/qemu/", "emulator/qemu/image/",
+    "emulator/host/", "emulator/campaign/", "emulator/wasm/", "emulator/qemu/", "emulator/qemu/image/",
 )  # fmt: skip
 INCLUDE_ROOTS = ("", "hal", "firmware", "emulator")
 FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive.h"}
-JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/main.c", "emulator/host/memory_flip.h", "emulator/campaign/main.c",
+JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/host_drive.h", "emulator/host/memory_flip.h", "emulator/campaign/main.c",
                                "emulator/qemu/image/main.c"}
 
 PYTHON_LAYERS = (
@@ -33,8 +33,8 @@ PYTHON_LAYERS = (
     "salient.dbc", "salient.toml_file",
     "salient.cli", "salient.elf", "salient.vm", "salient.machine", "salient.finite_elements",
     "salient.generate", "salient.reference.torque_speed_bound",
-    "salient.bus", "salient.bench", "salient.suite", "salient.view", "salient.experiments", "salient.test_runner", "salient.wheel",
-    "salient.cmake",
+    "salient.bus", "salient.bench", "salient.suite", "salient.view", "salient.tab", "salient.bench.pytest_plugin",
+    "salient.experiments", "salient.test_runner", "salient.wheel", "salient.cmake",
     "salient.benchmark.switching_pattern", "salient.reference", "salient.target", "salient.benchmark",
     "salient.__main__",
 )  # fmt: skip

@@ -118,6 +118,12 @@ def _view(options: argparse.Namespace) -> int:
     return run(options)
 
 
+def _tab(options: argparse.Namespace) -> int:
+    from salient.tab.file import run
+
+    return run(options.out, options.machine)
+
+
 def _parameters(options: argparse.Namespace) -> int:
     from salient.bench.parameter_file import run
 
@@ -127,7 +133,7 @@ def _parameters(options: argparse.Namespace) -> int:
 def _benchmark(options: argparse.Namespace) -> int:
     from salient.benchmark.command import run
 
-    return run(options.runs, options.json, options.page)
+    return run(options.runs, options.json, options.page, options.tab)
 
 
 def _compare(options: argparse.Namespace) -> int:
@@ -182,6 +188,7 @@ _COMMANDS = {
     "campaign": _campaign,
     "replay": _replay,
     "view": _view,
+    "tab": _tab,
     "parameters": _parameters,
     "benchmark": _benchmark,
     "compare": _compare,

@@ -113,12 +113,18 @@ def make_parser() -> argparse.ArgumentParser:
     _add_node(view)
     view.set_defaults(machine=None, node=None)  # a failed test has noted them
 
+    tab = command("tab", "the live page with a drive inside, as one file for a browser: no installation, no server")
+    tab.add_argument("--out", type=Path, default=Path("out/tab.html"), metavar="FILE",
+                     help="the file (default out/tab.html)")
+    tab.add_argument("--machine", metavar="NAME|FILE", help="one more machine than the bundled ones: a machine file")
+
     benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
                         "ngspice; effect of the network")
     benchmark.add_argument("--json", type=Path, metavar="FILE", help="also write the results to a file")
     benchmark.add_argument("--runs", type=_count, default=5, metavar="N", help="runs of each kind (default 5)")
     benchmark.add_argument("--page", type=_positive, nargs="?", const=20.0, metavar="SECONDS",
                            help="instead: the live page in Chromium for this wall time (default 20)")
+    benchmark.add_argument("--tab", action="store_true", help="instead: the drive in a tab, in Chromium")
 
     _add_compare_options(command("compare", "the controllers compared with each other, their targets and an earlier "
                                  "run"))

@@ -23,6 +23,8 @@ CONTROLLERS = ("traditional", "paper", "salient")
 HOST_BUILDS = ("host", "debug", "sanitize")
 TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os", "rv32")
 """Images for boards of QEMU: Cortex-M4 with -O2, -O0 and -Os, and RV32."""
+WASM_BUILD = "wasm"
+"""Firmware and emulator in WebAssembly, run by Node (salient.bench.wasm)."""
 TARGETS = ("host", "cortex-m4", "rv32")
 """Builds that a command offers: the process of the emulator, or QEMU."""
 PACES = ("lockstep", "realtime", "free")
@@ -160,10 +162,10 @@ class BenchConfig(Conditions):
 
     can: the bus, "auto" until a command or a fixture has chosen one. machine_image: that of `machine`, from the cache
     unless given. build: a CMake preset, of HOST_BUILDS or
-    TARGET_BUILDS. instructions, execution, instruction_ns: in QEMU only, the last on the Cortex-M4 only; instructions
-    gets the instruction count of each control interrupt (uint32, little endian) and a file beside it those of each
-    deferred interrupt (deferred_instructions), execution what salient.target.trace reads. instruction_ns None: the
-    firmware takes no simulated time.
+    TARGET_BUILDS or WASM_BUILD. instructions, execution, instruction_ns: in QEMU only, the last on the Cortex-M4 only;
+    instructions gets the instruction count of each control interrupt (uint32, little endian) and a file beside it those
+    of each deferred interrupt (deferred_instructions), execution what salient.target.trace reads. instruction_ns None:
+    the firmware takes no simulated time.
     """
 
     can: str = _option("auto", BUS, "CAN bus", metavar="BUS", commands=("sim",))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from salient.config import TARGET_BUILDS
+from salient.config import TARGET_BUILDS, WASM_BUILD
 from salient.paths import BUILD, ROOT, SCENARIOS
 
 RESULTS = BUILD / "results"
@@ -133,9 +133,11 @@ def _python_tests(names: list[str]) -> Count:
     """One run of pytest for the folders of these names, with a line of each."""
     total = Count()
     folders = []
+    built: set[str] = set()
     for name in names:
         _print(f"--- {name}: {PYTHON_TESTS[name]}")
-        builds = [_one(build_preset(preset)) for preset in TARGET_BUILDS] if name == "target" else []
+        builds = [_one(build_preset(preset)) for preset in PYTHON_TEST_BUILDS.get(name, ()) if preset not in built]
+        built.update(PYTHON_TEST_BUILDS.get(name, ()))
         for build in builds:
             total += build
         if not any(build.failed for build in builds):
@@ -168,6 +170,8 @@ PYTHON_TESTS = {
     "target": "the firmware for Cortex-M4 (compiled in three ways) and RV32: symbols and size checked, run in QEMU.",
 }
 """Folder of tests: its claim. Last the folder with the longest file, whose tests use every core themselves."""
+PYTHON_TEST_BUILDS = {"tools": (WASM_BUILD,), "target": (*TARGET_BUILDS, WASM_BUILD)}
+"""Folder of tests: the presets that it needs beside the host."""
 
 
 # --- parts of steps -------------------------------------------------------------------------------------------------

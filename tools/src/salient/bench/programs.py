@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from salient.builder import run_commands
-from salient.config import TARGET_BUILDS, BenchConfig
+from salient.config import TARGET_BUILDS, WASM_BUILD, BenchConfig
 from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.machine.cache import content_key, machine_image
@@ -33,12 +33,14 @@ class EmulatorError(Exception):
 
 
 def executable(build: str = "host") -> Path:
-    """The executable of a build (BenchConfig.build), for a target build the program that starts QEMU. UsageError: it is
-    not built."""
+    """The executable of a build (BenchConfig.build), for a target build the program that starts QEMU, for
+    WebAssembly the module. UsageError: it is not built."""
     if IS_WHEEL and build != "host":
         raise UsageError(f"--target {build}: only in a clone of the repository, where it is built; must be host")
     if build in TARGET_BUILDS:
         return _built("host", "salient_target")
+    if build == WASM_BUILD:
+        return _built(build, "salient.wasm")
     return _built(build, "salient_host")
 
 
@@ -70,6 +72,8 @@ def command_line(config: BenchConfig) -> list[str]:
     if config.build not in TARGET_BUILDS:
         if config.instruction_ns is not None:
             raise UsageError(f"--instruction-ns {config.instruction_ns}: only with --target cortex-m4")
+        if config.build == WASM_BUILD:
+            return [sys.executable, "-m", "salient.bench.wasm", start, *arguments]
         return [start, *arguments]
     if config.drives > 1:
         raise UsageError(f"--drives {config.drives}: only with --target host")

@@ -37,8 +37,9 @@ import pytest
 from salient.bench import failure
 from salient.bench.bench import Bench
 from salient.bench.session import Session
-from salient.config import CONTROLLERS, HOST_BUILDS, TARGET_BUILDS, TARGETS, BenchConfig
+from salient.config import CONTROLLERS, HOST_BUILDS, TARGET_BUILDS, TARGETS, WASM_BUILD, BenchConfig
 from salient.errors import UsageError
+from salient.tab.link import link_of
 
 _AXES = {"machine": "machine", "controller": "controller", "target": "build"}
 """What tests are parametrised by: keyword of bench_each -> option of a bench."""
@@ -68,7 +69,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--salient-can", default="local", metavar="BUS",
                     help="local (default): a local bus and an emulator for each bench; or the bus of a drive that runs "
                     "already, without a test bench: unix:PATH or socketcan:INTERFACE")
-    group.addoption("--salient-build", default="host", choices=(*HOST_BUILDS, *TARGET_BUILDS),
+    group.addoption("--salient-build", default="host", choices=(*HOST_BUILDS, *TARGET_BUILDS, WASM_BUILD),
                     help="build under test (default host)")
     group.addoption("--salient-program", type=Path, metavar="FILE",
                     help="executable under test: firmware of your own joined with the emulator")
@@ -281,6 +282,9 @@ def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
             seeds.append(str(bench.options.seed))
         lines.append(f"log, plot, seed {seeds[-1] if seeds else 'none'}: {of_bench}; at {bench.time_s:.6f} s, before:")
         lines += [f"    {change}" for change in changed[-_CHANGES_SHOWN:]] or ["    nothing changed"]
+        link = link_of(bench) if isinstance(bench, Bench) else None
+        if link is not None:
+            lines.append(f"in a browser (tools/salient tab): {link}")
     lines.append(f"replay in {item.config.rootpath}: {command}")
     properties = [("salient_folder", str(folder)), ("salient_seed", " ".join(seeds)), ("salient_replay", command)]
     item.user_properties += properties  # for the reports that follow

@@ -23,6 +23,7 @@ from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bu
 from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.dbc import database_hash
 
+RIG_RUN_UNTIL_ID = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
 _ALIVE_CHECK_S = 1.0
 """Wall time between two checks that the emulator is alive; a debugger may stop it for any time."""
 
@@ -71,13 +72,14 @@ class Session(KnownAttributes):
     node: the node number of the drive; drives: their number, with ascending node numbers from there. drive, rig,
     telemetry and truth are those of the first; drives[1] and rigs[1] have their own telemetry and truth.
 
-    time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. telemetry, truth:
-    signals of the drive and of the test bench by name.
+    time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. sent: likewise what the
+    session has sent, but for RIG_RUN_UNTIL. telemetry, truth: signals of the drive and of the test bench by name.
     """
 
     address: str
     time_ns: int
     log: list[tuple[int, can.Message]]
+    sent: list[tuple[int, can.Message]]
     telemetry: SignalTable
     truth: SignalTable
     drive_database: Database
@@ -94,6 +96,7 @@ class Session(KnownAttributes):
         self.address = address
         self.time_ns = 0
         self.log = []
+        self.sent = []
         self.drive_database, self.rig_database = drive_database(machine, node), rig_database(node)
         self.telemetry = SignalTable(self.drive_database, "DRIVE")
         self.truth = SignalTable(self.rig_database, "RIG")
@@ -235,6 +238,8 @@ class Session(KnownAttributes):
 
     def send(self, message: can.Message) -> None:
         """Sends a frame of any kind; waits while the emulator takes none."""
+        if message.arbitration_id != RIG_RUN_UNTIL_ID:
+            self.sent.append((self.time_ns, message))
         while True:
             try:
                 return self._bus.send(message, timeout=_ALIVE_CHECK_S)
@@ -263,8 +268,7 @@ class Session(KnownAttributes):
     def _request_run(self, time_ns: int) -> None:
         self._sequence = (self._sequence + 1) % 256
         data = time_ns.to_bytes(6, "little") + bytes([self._sequence])
-        identifier = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
-        self.send(can.Message(arbitration_id=identifier, is_extended_id=True, data=data))
+        self.send(can.Message(arbitration_id=RIG_RUN_UNTIL_ID, is_extended_id=True, data=data))
 
     def _receive(self) -> can.Message:
         while (timed := self._reader.receive(_ALIVE_CHECK_S)) is None:

@@ -144,6 +144,7 @@ export class Charts {
         this.plots = [];
         this.list = [];
         this.marks = {};
+        this.onDraw = () => {}; // (plot, list): more to draw into a plot
         this.version = 0; // of what is drawn beside the signals
         new ResizeObserver(() => this.resize()).observe(root);
     }
@@ -205,6 +206,7 @@ export class Charts {
 
     /** Cursors and trigger as vertical lines. */
     drawMarks(plot) {
+        this.onDraw(plot, this.plots.find((each) => each.plot === plot)?.list ?? []);
         const context = plot.ctx;
         for (const [name, time_ns] of Object.entries(this.marks)) {
             if (time_ns === undefined || time_ns / 1e9 < plot.scales.x.min || time_ns / 1e9 > plot.scales.x.max) {

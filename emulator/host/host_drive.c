@@ -1,0 +1,50 @@
+#include "host/host_drive.h"
+
+#include <assert.h>
+
+#include "host/memory_flip.h"
+
+static_assert((int)DRIVE_CONTROLLER_TRADITIONAL == OPTIONS_CONTROLLER_TRADITIONAL &&
+                  (int)DRIVE_CONTROLLER_PAPER == OPTIONS_CONTROLLER_PAPER &&
+                  (int)DRIVE_CONTROLLER_SALIENT == OPTIONS_CONTROLLER_SALIENT,
+              "the record and the drive number the controllers differently");
+
+static void control_interrupt(void *context) {
+    drive_control_interrupt(&((host_drive_t *)context)->drive);
+}
+
+static void deferred_interrupt(void *context) {
+    drive_deferred_interrupt(&((host_drive_t *)context)->drive);
+}
+
+static void background(void *context) {
+    drive_background(&((host_drive_t *)context)->drive);
+}
+
+static void restart(void *context) {
+    host_drive_t *host = context;
+    drive_init(&host->drive, &host->hal, &host->config); /* with the configuration of the start, which it accepted */
+}
+
+static void flip(void *context, memory_object_t object, uint32_t bit) {
+    memory_flip(&((host_drive_t *)context)->drive, object, bit);
+}
+
+bool host_drive_start(host_drive_t *host, board_t *board, const options_t *options, unsigned number,
+                      rig_firmware_t *firmware) {
+    host->hal.board = board;
+    host->config = (drive_config_t){
+        .control_rate_hz = options->control_rate_hz,
+        .controller = (drive_controller_t)options->controller_index,
+        .node = options->node + number,
+        .telemetry_period_ms = options->telemetry_period_ms,
+    };
+    *firmware = (rig_firmware_t){.control_interrupt = control_interrupt,
+                                 .deferred_interrupt = deferred_interrupt,
+                                 .background = background,
+                                 .restart = restart,
+                                 .flip = flip,
+                                 .flip_objects = MEMORY_FLIP_OBJECTS,
+                                 .context = host};
+    return drive_init(&host->drive, &host->hal, &host->config);
+}

@@ -1,0 +1,59 @@
+"""What the page of a tab has beside its scripts: module, machines, databases; packed by salient.tab.file, read by
+page/data.js."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from salient.bus import e2e
+from salient.bus.signals import drive_database
+from salient.dbc import attributes
+from salient.machine.path import machine_path
+from salient.paths import MACHINES
+from salient.view.description import description
+
+_MACHINE_DEPENDENT = ("factor", "offset", "minimum", "maximum")
+_FLUX_DIGITS = 5
+"""Of the picture of the machine."""
+
+
+def bundled_machines() -> list[str]:
+    """Names of the machines that every tab has."""
+    return sorted(path.stem for path in MACHINES.glob("*.toml"))
+
+
+def shared_data() -> dict[str, Any]:
+    """Faults and data IDs, which no machine changes."""
+    return {
+        "faults": description(bundled_machines()[0], 0)["faults"],
+        "data_ids": {message.name: e2e.data_id(message) for message in drive_database().messages
+                     if "E2EDataId" in attributes(message)},
+    }
+
+
+def machine_data(machines: list[str]) -> dict[str, Any]:
+    """Databases of the first machine, and for each what it has instead of that, by its name."""
+    first, *_ = found = [description(machine, 0) for machine in machines]
+    return {
+        "databases": first["databases"],
+        "machines": {
+            machine_path(name).stem: {
+                "machine": _rounded(each["machine"]), "database_hash": each["database_hash"],
+                "signals": _different(first["databases"], each["databases"]),
+            } for name, each in zip(machines, found, strict=True)
+        },
+    }
+
+
+def _different(base: list[dict[str, Any]], databases: list[dict[str, Any]]) -> list[list[Any]]:
+    """[message, signal, factor, offset, minimum, maximum] by index, where they differ."""
+    return [[at, number, *(signal[key] for key in _MACHINE_DEPENDENT)]
+            for at, (old, new) in enumerate(zip(base, databases, strict=True))
+            for number, (before, signal) in enumerate(zip(old["signals"], new["signals"], strict=True))
+            if any(before[key] != signal[key] for key in _MACHINE_DEPENDENT)]
+
+
+def _rounded(machine: dict[str, Any]) -> dict[str, Any]:
+    flux = machine["flux_map"]
+    rows = [[float(f"{value:.{_FLUX_DIGITS}g}") for value in row] for row in flux["flux_linkage_Wb"]]
+    return {**machine, "flux_map": {**flux, "flux_linkage_Wb": rows}}
