@@ -164,7 +164,7 @@ def _first_failure(test: str) -> str:
     if "::" in test:
         result = _run([str(COPY / "build/venv/bin/pytest"), "-q", "-x", "-p", "no:cacheprovider", test],
                       PYTHONPATH=str(COPY / "tools" / "src"))
-        failed = re.search(r"^(?:FAILED|ERROR) (?:.*/)?(\S+::\S+)", result.stdout, re.MULTILINE)
+        failed = re.search(r"^(?:FAILED|ERROR) (?:\S*/)?(\S+::.+?)(?: - .*)?$", result.stdout, re.MULTILINE)
     else:
         program, _, name = test.partition(":")
         result = _run([str(COPY / "build/host/bin" / program), "--gtest_brief=1", f"--gtest_filter={name or '*'}"])
