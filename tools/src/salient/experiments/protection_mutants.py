@@ -30,13 +30,13 @@ PAGE = ROOT / "tests" / "PROTECTION_MUTANTS.md"
 COPY = BUILD / "mutants"
 RESULTS = COPY / "results.json"
 COPIED = ("CMakeLists.txt", "CMakePresets.json", "cmake", "emulator", "firmware", "hal", "tests", "tools")
-KEYS = {"protection", "change", "file", "old", "new", "tests", "equivalent"}
+KEYS = {"protection", "change", "file", "old", "new", "tests", "survives"}
 
 
 @dataclass(frozen=True)
 class Mutant:
     """tests: programs of unit tests, with :SUITE.TEST for one of theirs, or node ids of pytest; the first that fails
-    ends the run. equivalent: why no test can notice it, "" when one has to."""
+    ends the run. survives: why no test notices it, "" when one has to."""
 
     protection: str
     change: str
@@ -44,7 +44,7 @@ class Mutant:
     old: str
     new: str
     tests: tuple[str, ...]
-    equivalent: str = ""
+    survives: str = ""
 
     @property
     def name(self) -> str:
@@ -61,9 +61,9 @@ def read_table(path: Path = TABLE) -> list[Mutant]:
         raise UsageError(f"{path.name}: no table of mutants: {error}") from None
     for number, entry in enumerate(entries, 1):
         keys = set(entry)
-        if keys - KEYS or (KEYS - {"equivalent"}) - keys:
+        if keys - KEYS or (KEYS - {"survives"}) - keys:
             raise UsageError(f"{path.name}: mutant {number} has the keys {', '.join(sorted(keys))}: must be "
-                             f"{', '.join(sorted(KEYS))}, of which equivalent may be missing")
+                             f"{', '.join(sorted(KEYS))}, of which survives may be missing")
         mutants.append(Mutant(**{**entry, "tests": tuple(entry["tests"])}))
     names = [mutant.name for mutant in mutants]
     for name in names:
@@ -106,7 +106,7 @@ def check_tests(mutant: Mutant, root: Path = ROOT) -> None:
             found = source is not None and name.replace(".", ", ") in source.read_text(encoding="utf-8")
         if not found:
             raise UsageError(f"{TABLE.name}: {mutant.name}: no test {test}")
-    if not mutant.tests and not mutant.equivalent:
+    if not mutant.tests and not mutant.survives:
         raise UsageError(f"{TABLE.name}: {mutant.name}: neither tests nor a reason")
 
 
@@ -164,7 +164,7 @@ def _first_failure(test: str) -> str:
     if "::" in test:
         result = _run([str(COPY / "build/venv/bin/pytest"), "-q", "-x", "-p", "no:cacheprovider", test],
                       PYTHONPATH=str(COPY / "tools" / "src"))
-        failed = re.search(r"^(?:FAILED|ERROR) (?:.*/)?(\S+::\S+)", result.stdout, re.MULTILINE)
+        failed = re.search(r"^(?:FAILED|ERROR) (?:\S*/)?(\S+::.+?)(?: - .*)?$", result.stdout, re.MULTILINE)
     else:
         program, _, name = test.partition(":")
         result = _run([str(COPY / "build/host/bin" / program), "--gtest_brief=1", f"--gtest_filter={name or '*'}"])
@@ -223,11 +223,11 @@ def page(mutants: list[Mutant], killer_of: dict[str, str], commit: str) -> str:
         "# Protections removed or weakened, and the tests that notice it", "",
         "<!-- Written by python -m salient.experiments.protection_mutants. -->", "",
         f"Each row is one build of the sources of `{commit}` with one change (`tests/protection_mutants.toml`), and",
-        f"the first test that failed: {killed} of {len(mutants)}. The others have their reason.", "",
+        f"the first test that failed: {killed} of {len(killer_of)}. The others have their reason.", "",
         "| protection | mutation | in | noticed by |", "| --- | --- | --- | --- |",
     ]
-    for mutant in mutants:
-        noticed = killer_of[mutant.name] or f"survives: {mutant.equivalent or 'no test notices it'}"
+    for mutant in (each for each in mutants if each.name in killer_of):
+        noticed = killer_of[mutant.name] or f"survives: {mutant.survives or 'no test notices it'}"
         lines.append(f"| {mutant.protection} | {mutant.change} | `{Path(mutant.file).name}` | {noticed} |")
     return "\n".join(lines) + "\n"
 
@@ -240,6 +240,7 @@ def run(mutants: list[Mutant], *, of_all: bool) -> int:
     commit, sources = _commit(), _copy_sources()
     kept: dict[str, str] = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
     waiting = [mutant for mutant in mutants if _key(mutant, sources) not in kept]
+    waiting.sort(key=lambda mutant: sum("::" in test for test in mutant.tests))  # the quick ones first
     if waiting:
         configured = _run(["cmake", "--preset", "host"])
         if configured.returncode != 0:
@@ -253,7 +254,7 @@ def run(mutants: list[Mutant], *, of_all: bool) -> int:
     killer_of = {mutant.name: kept[_key(mutant, sources)] for mutant in mutants}
     if of_all:
         PAGE.write_text(page(mutants, killer_of, commit), encoding="utf-8")
-    survivors = [mutant for mutant in mutants if not killer_of[mutant.name] and not mutant.equivalent]
+    survivors = [mutant for mutant in mutants if not killer_of[mutant.name] and not mutant.survives]
     for mutant in survivors:
         print(f"survives: {mutant.name}")
     return 1 if survivors else 0
