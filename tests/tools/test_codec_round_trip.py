@@ -353,7 +353,7 @@ def test_every_message_and_signal_of_drive_dbc_has_a_comment(telemetry: Telemetr
         ('BA_ "GenMsgCycleTime" BO_ 388 10;', 'BA_ "GenMsgCycleTime" BO_ 388 20;', True),
         ('SG_ duty : 48|16@1- (0.000030517578125,0)', 'SG_ duty : 48|16@1- (0.00006103515625,0)', False),
         ('SG_ state : 0|8@1+', 'SG_ state : 40|8@1+', False),
-        ('"watchdog";\nVAL_ 1793 controller', '"overrun";\nVAL_ 1793 controller', False),
+        ('"clock";\nVAL_ 1793 controller', '"overrun";\nVAL_ 1793 controller', False),
         ('SG_ duty :', 'SG_ output :', False),
     ],
 )  # fmt: skip
