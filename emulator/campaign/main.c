@@ -199,7 +199,16 @@ static bool parse(arguments_t *arguments, int argc, char *argv[]) {
                        {"--seeds", &arguments->seeds},
                        {"--step", &arguments->step},
                        {"--keep", &arguments->keep}};
+        const struct {
+            const char *name;
+            bool *to;
+        } flags[] = {
+            {"--healthy", &arguments->healthy}, {"--describe", &arguments->describe}, {"--serve", &arguments->serve}};
         bool known = false;
+        for (unsigned n = 0; n < sizeof flags / sizeof *flags && !known; n++) {
+            known = strcmp(option, flags[n].name) == 0;
+            *flags[n].to = *flags[n].to || known;
+        }
         for (unsigned n = 0; n < sizeof numbers / sizeof *numbers && !known; n++) {
             if (strcmp(option, numbers[n].name) == 0) {
                 known = number(value, numbers[n].to);
@@ -212,12 +221,6 @@ static bool parse(arguments_t *arguments, int argc, char *argv[]) {
         } else if (!known && strcmp(option, "--frames") == 0) {
             arguments->frames_file = argv[++i < argc ? i : 0];
             known = true;
-        } else if (!known && strcmp(option, "--healthy") == 0) {
-            arguments->healthy = known = true;
-        } else if (!known && strcmp(option, "--describe") == 0) {
-            arguments->describe = known = true;
-        } else if (!known && strcmp(option, "--serve") == 0) {
-            arguments->serve = known = true;
         } else if (!known && strcmp(option, "--branch") == 0 && i + BRANCH_ARGUMENTS < argc) {
             known = arguments->branches = branch_parse(&arguments->branch, &argv[i + 1]);
             i += BRANCH_ARGUMENTS;

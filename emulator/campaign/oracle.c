@@ -456,9 +456,8 @@ void oracle_on_bus(oracle_t *oracle, uint64_t time_ns, const sender_meaning_t *m
         oracle->run_ns = time_ns;
         oracle->commanded = true;
         oracle->off_seen = false;
-    } else if (meaning->command && meaning->request == SENDER_CLEAR) {
-        oracle->clear_seen = true;
     }
+    oracle->clear_seen = oracle->clear_seen || (meaning->command && meaning->request == SENDER_CLEAR);
     if (meaning->command && meaning->request != SENDER_RUN && !oracle->off_seen) {
         oracle->off_seen = true;
         oracle->off_ns = time_ns;

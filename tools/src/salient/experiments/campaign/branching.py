@@ -85,7 +85,7 @@ def plot(rows: Rows, path: Path) -> None:
     axes.set_xscale("log")
     axes.set_xlabel("longest time from the begin of the fault until the drive has reacted, ms")
     axes.grid(alpha=0.3)
-    figure.legend(loc="outside lower center", ncols=3, fontsize="small", frameon=False)
+    figure.legend(loc="outside lower right", ncols=3, fontsize="small", frameon=False)
     total = sum(row["branches"] for lines in rows.values() for row in lines)
     violations = sum(row["violations"] for lines in rows.values() for row in lines)
     axes.set_title(f"Emulated drive, salient, 40 kHz, machine saturating, ideal sensors of 12 and 17 bits, phase a\n"
