@@ -44,7 +44,7 @@ static uint32_t ratio_q8(const phase_balance_t *balance, unsigned index) {
     return ratio < UINT16_MAX ? (uint32_t)ratio : UINT16_MAX;
 }
 
-/* More than 6/5 of the largest of the others, or less than 5/6 of the smallest. */
+/* More than 4/3 of the largest of the others, or less than 3/4 of the smallest. */
 static bool differs(const uint32_t *ratios_q8, unsigned phases, unsigned index) {
     uint32_t least_q8 = UINT32_MAX, most_q8 = 0;
     for (unsigned other = 0; other < phases; other++) {
@@ -53,7 +53,7 @@ static bool differs(const uint32_t *ratios_q8, unsigned phases, unsigned index) 
             most_q8 = ratios_q8[other] > most_q8 ? ratios_q8[other] : most_q8;
         }
     }
-    return 5u * ratios_q8[index] > 6u * most_q8 || 6u * ratios_q8[index] < 5u * least_q8;
+    return 3u * ratios_q8[index] > 4u * most_q8 || 4u * ratios_q8[index] < 3u * least_q8;
 }
 
 /* At the end of a window. */

@@ -7,7 +7,7 @@
  * sample (drive/phase_monitor.h), and a ratio that is small in all of them an encoder that is ahead of the rotor:
  * resistance and drops of the devices, which the integral has not, make it larger only.
  *
- *   current_sensor  the ratio of a phase is more than 6/5 of those of all others, or less than 5/6
+ *   current_sensor  the ratio of a phase is more than 4/3 of those of all others, or less than 3/4
  *   encoder_angle   the ratio of every phase is below a limit, twice in succession
  *
  * Revolutions that last longer than 100 ms, and phases that have hardly conducted, do not count. Derived here.

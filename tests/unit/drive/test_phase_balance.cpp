@@ -44,8 +44,8 @@ class PhaseBalance : public testing::Test {
     double ratio[HAL_PHASES_MAX] = {1.0, 1.0, 1.0, 1.0};
 };
 
-TEST_F(PhaseBalance, a_phase_beyond_a_fifth_from_all_others_has_a_wrong_sensor) {
-    for (const double wrong : {1.22, 0.82}) {
+TEST_F(PhaseBalance, a_phase_beyond_four_thirds_or_three_quarters_of_all_others_has_a_wrong_sensor) {
+    for (const double wrong : {1.36, 0.73}) {
         ratio[1] = wrong;
         EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR)) << wrong;
         EXPECT_EQ(balance.phases, 2u);
@@ -53,8 +53,8 @@ TEST_F(PhaseBalance, a_phase_beyond_a_fifth_from_all_others_has_a_wrong_sensor) 
     }
 }
 
-TEST_F(PhaseBalance, a_phase_within_a_fifth_is_none) {
-    for (const double within : {1.18, 0.85}) {
+TEST_F(PhaseBalance, a_phase_within_four_thirds_and_three_quarters_is_none) {
+    for (const double within : {1.31, 0.77}) {
         ratio[1] = within;
         EXPECT_EQ(window(), 0u) << within;
         balance = {};
