@@ -108,7 +108,8 @@ def deviation(measured: Trajectory, reference: Trajectory) -> dict[str, float]:
 
 def record(folder: Path, duration_s: float = 0.1, controller: str = "paper",
            machine: str = "saturating") -> SwitchingPattern:
-    """Records a controller on a bundled machine at 40 kHz, 600 r/min and 8 N m, from 0.4 s after the start. The recording of the true state, one row per control period, is written to `folder`."""
+    """Records a controller on a bundled machine at 40 kHz, 600 r/min and 8 N m, from 0.4 s after the start. The
+    recording of the true state, one row per control period, is written to `folder`."""
     load_torque_Nm, control_rate_hz = 8.0, 40_000
     period_ns = 1_000_000_000 // control_rate_hz
     recording, switches = folder / "recording.npy", folder / "switches"
