@@ -309,6 +309,15 @@ void oracle_finish(oracle_t *oracle, const plant_t *plant) {
 
 /* --- Events --- */
 
+/* Not 0 when a switch of any phase is on. */
+static unsigned gates_on(const plant_t *plant) {
+    unsigned gates = 0;
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        gates |= plant->switches[phase];
+    }
+    return gates;
+}
+
 static void remember(oracle_t *oracle, const plant_t *plant) {
     if (plant->time_ns > oracle->recent_ns + RECENT_NS) {
         oracle->recent_ns = plant->time_ns;
@@ -322,7 +331,7 @@ static void remember(oracle_t *oracle, const plant_t *plant) {
 
 void oracle_look(oracle_t *oracle, const plant_t *plant) {
     remember(oracle, plant);
-    const unsigned gates = plant->switches.upper | plant->switches.lower;
+    const unsigned gates = gates_on(plant);
     since(&oracle->dark_ns, gates == 0, plant->time_ns);
     look_at_currents(oracle, plant, gates);
     look_at_limits(oracle, plant, gates);
@@ -409,9 +418,12 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     const uint8_t before = oracle->drive.state;
     oracle->drive = drive;
     oracle->interrupt_ns = plant->time_ns;
-    unsigned gates = plant->switches.upper | plant->switches.lower;
-    for (unsigned i = plant->edge_next; i < plant->pattern.count; i++) {
-        gates |= plant->pattern.edges[i].switches.upper | plant->pattern.edges[i].switches.lower;
+    unsigned gates = gates_on(plant);
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        const half_bridge_pattern_t *pattern = &plant->pattern[phase];
+        for (unsigned edge = plant->edge_next[phase]; edge < pattern->count; edge++) {
+            gates |= pattern->switches[edge];
+        }
     }
     if (gates && drive.state != STATE_RUN) {
         violate(oracle, "gate_on", plant->time_ns, 1, drive.state);

@@ -3,7 +3,6 @@
 #include <math.h>
 
 /* As in plant.c: below this a current that decays exponentially counts as zero. */
-#define CURRENT_NEGLIGIBLE_A 1e-9
 
 /* Devices that carry the current of one end of a winding. */
 typedef struct {
@@ -42,14 +41,17 @@ static double terminal_A(const plant_path_t *path, double bus_voltage_V, double 
 /* Path of a phase while current flows at its terminals. */
 static plant_path_t conducting_path(const plant_t *plant, unsigned phase) {
     const plant_faults_t *faults = &plant->faults;
-    const unsigned upper = (plant->switches.upper & ~faults->switch_open.upper) | faults->switch_shorted.upper;
-    const unsigned lower = (plant->switches.lower & ~faults->switch_open.lower) | faults->switch_shorted.lower;
+    const unsigned switches = plant->switches[phase];
+    const bool upper = ((switches & HALF_BRIDGE_UPPER) != 0 && !bit(faults->switch_open.upper, phase)) ||
+                       bit(faults->switch_shorted.upper, phase);
+    const bool lower = ((switches & HALF_BRIDGE_LOWER) != 0 && !bit(faults->switch_open.lower, phase)) ||
+                       bit(faults->switch_shorted.lower, phase);
     end_t ends[2] = {
-        end_of(plant, bit(upper, phase), bit(faults->diode_open.lower, phase)),
-        end_of(plant, bit(lower, phase), bit(faults->diode_open.upper, phase)),
+        end_of(plant, upper, bit(faults->diode_open.lower, phase)),
+        end_of(plant, lower, bit(faults->diode_open.upper, phase)),
     };
     const double earth_ohm = faults->earth_ohm[phase];
-    if (earth_ohm > 0.0 && !bit(lower, phase)) {
+    if (earth_ohm > 0.0 && !lower) {
         ends[1] = (end_t){true, 0.0, earth_ohm, 0.0};
     }
     const double shorted = faults->shorted_turns[phase], winding_ohm = plant->winding_ohm;
@@ -86,7 +88,7 @@ void faulted_find_conducting(plant_t *plant, integrator_setting_t *setting) {
         const bool driven =
             path.link_gain * plant->bus_voltage_V > path.drop_V && !bit(plant->faults.winding_open, phase);
         plant->path[phase] = (plant_path_t){0};
-        if (!driven && current_A < CURRENT_NEGLIGIBLE_A) {
+        if (!driven && current_A < PLANT_CURRENT_NEGLIGIBLE_A) {
             plant->current_A[phase] = 0.0;
             continue;
         }

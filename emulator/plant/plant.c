@@ -6,6 +6,7 @@
 #include "plant/faulted.h"
 #include "plant/integrator.h"
 #include "plant/magnetics_kernel.h"
+#include "plant/phase_steps.h"
 
 /* Limits of a step at factor 1, chosen for errors of currents, torque and speed below 1e-6 of their range (measured
  * against SciPy's DOP853 at a tolerance of 1e-12: 9e-7) at the speeds and currents of a drive. A control period at
@@ -26,8 +27,6 @@
 #define THRESHOLD_TOLERANCE_V 1e-6
 /* After an event, a slower shaft with friction stands still. */
 #define SPEED_TOLERANCE_RAD_S 1e-6
-/* A freewheeling current decays exponentially; below this it counts as zero. */
-#define CURRENT_NEGLIGIBLE_A 1e-9
 
 static const double NS_S = 1e-9;
 
@@ -60,6 +59,7 @@ void plant_set_gains(plant_t *plant, const plant_gains_t *gains) {
     plant->friction_Nm_s = gains->friction * machine->friction_Nm_s;
     magnetics_prepare(&plant->magnetics, &machine->magnetics, machine->rotor_poles);
     magnetics_scale(&plant->magnetics, gains->flux_linkage);
+    phase_steps_reset(plant);
     for (unsigned on = 0; on < 3; on++) {
         const converter_t *converter = &machine->converter;
         plant->drop_V[on] = on * converter->switch_drop_V + (2 - on) * converter->diode_drop_V;
@@ -126,16 +126,47 @@ void plant_set_faults(plant_t *plant, const plant_faults_t *faults) {
 /* --- Switches --- */
 
 void plant_set_switches(plant_t *plant, const hal_pwm_compare_t *compare, uint16_t period_ticks) {
-    half_bridge_pattern(&plant->pattern, plant->machine->phases, compare, period_ticks, plant->minimum_pulse_ns,
-                        plant->time_ns);
-    plant->switches = plant->pattern.first;
-    plant->edge_next = 0;
+    const bool other =
+        period_ticks != plant->pattern_period_ticks || !(plant->minimum_pulse_ns == plant->pattern_minimum_pulse_ns);
+    const uint32_t shortest_ticks = other ? half_bridge_shortest_ticks(plant->minimum_pulse_ns) : plant->shortest_ticks;
+    plant->pattern_ns = plant->time_ns;
+    plant->pattern_period_ticks = period_ticks;
+    plant->pattern_minimum_pulse_ns = plant->minimum_pulse_ns;
+    plant->shortest_ticks = shortest_ticks;
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        const uint16_t upper = compare->upper[phase], lower = compare->lower[phase];
+        if (other || upper != plant->pattern_compare.upper[phase] || lower != plant->pattern_compare.lower[phase]) {
+            half_bridge_pattern(&plant->pattern[phase], upper, lower, period_ticks, shortest_ticks);
+            plant->pattern_compare.upper[phase] = upper;
+            plant->pattern_compare.lower[phase] = lower;
+        }
+        plant->edge_next[phase] = 0;
+        plant->switches[phase] = plant->pattern[phase].first;
+    }
+}
+
+/* Follows the edges that have come; returns the time of the next one, at most to_ns. */
+static uint64_t follow_edges(plant_t *plant, uint64_t to_ns) {
+    uint64_t next_ns = to_ns;
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        const half_bridge_pattern_t *pattern = &plant->pattern[phase];
+        for (; plant->edge_next[phase] < pattern->count; plant->edge_next[phase]++) {
+            const uint64_t edge_ns = plant->pattern_ns + pattern->delay_ns[plant->edge_next[phase]];
+            if (edge_ns > plant->time_ns) {
+                next_ns = edge_ns < next_ns ? edge_ns : next_ns;
+                break;
+            }
+            plant->switches[phase] = pattern->switches[plant->edge_next[phase]];
+        }
+    }
+    return next_ns;
 }
 
 void plant_open_all(plant_t *plant) {
-    plant->switches = (half_bridge_switches_t){0, 0};
-    plant->pattern.count = 0;
-    plant->edge_next = 0;
+    plant->pattern_period_ticks = 0;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        plant->switches[phase] = plant->pattern[phase].count = plant->edge_next[phase] = 0;
+    }
 }
 
 void plant_set_trip(plant_t *plant, double trip_current_A) {
@@ -152,12 +183,11 @@ void plant_clear_trip(plant_t *plant) {
  * set to exactly zero. */
 MAGNETICS_INLINE void find_conducting(plant_t *plant, integrator_setting_t *setting) {
     static const double link_signs[3] = {-1.0, 0.0, 1.0};
-    const unsigned upper = plant->switches.upper, lower = plant->switches.lower;
     unsigned count = 0;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-        const unsigned on = ((upper >> phase) & 1u) + ((lower >> phase) & 1u);
+        const unsigned on = half_bridge_on(plant->switches[phase]);
         const bool driven = link_signs[on] * plant->bus_voltage_V > plant->drop_V[on];
-        if (!driven && plant->current_A[phase] < CURRENT_NEGLIGIBLE_A) {
+        if (!driven && plant->current_A[phase] < PLANT_CURRENT_NEGLIGIBLE_A) {
             plant->current_A[phase] = 0.0;
             continue;
         }
@@ -579,26 +609,20 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
 
 void plant_advance(plant_t *plant, uint64_t to_ns) {
     while (plant->time_ns < to_ns) {
-        const half_bridge_pattern_t *pattern = &plant->pattern;
         if (plant->trip_ns <= plant->time_ns) {
             plant->trip_ns = UINT64_MAX;
             plant->tripped = true;
             plant_open_all(plant);
         }
-        while (plant->edge_next < pattern->count && pattern->edges[plant->edge_next].time_ns <= plant->time_ns) {
-            plant->switches = pattern->edges[plant->edge_next++].switches;
-        }
         if (plant->sample != NULL && plant->sample_next_ns == plant->time_ns) {
             sample_now(plant);
         }
-        uint64_t until_ns = to_ns;
-        if (plant->edge_next < pattern->count && pattern->edges[plant->edge_next].time_ns < to_ns) {
-            until_ns = pattern->edges[plant->edge_next].time_ns;
+        if (phase_steps_advance(plant, to_ns)) {
+            continue;
         }
-        if (plant->trip_ns < until_ns) {
-            until_ns = plant->trip_ns;
-        }
-        integrate(plant, until_ns);
+        const uint64_t edge_ns = follow_edges(plant, to_ns);
+        integrate(plant, plant->trip_ns < edge_ns ? plant->trip_ns : edge_ns);
+        follow_edges(plant, to_ns);
     }
     if (plant->sample != NULL && plant->sample_next_ns == plant->time_ns) {
         sample_now(plant);

@@ -22,8 +22,9 @@
  * series resistance of the capacitor; elasticity of the shaft. Faults, friction at rest among them, change these
  * equations as faulted.h states.
  *
- * Integration: integrator.h, for currents, speed, angle and DC-link voltage together. Steps end at every switching edge
- * (whole nanoseconds), at the times at which a diode, the supply or the chopper starts or stops conducting or a
+ * Integration: phase_steps.h, where every phase has steps of its own; with a DC-link capacitor or faults, and where a
+ * comparator responds, integrator.h, for currents, speed, angle and DC-link voltage together. Steps end at switching
+ * edges (whole nanoseconds), at the times at which a diode, the supply or the chopper starts or stops conducting or a
  * comparator responds (located within a picosecond) and where the magnetics are not smooth; plant_set_step_factor
  * scales the other limits of their length.
  */
@@ -41,6 +42,9 @@
 
 /* Response of comparator, filter and gate driver. */
 #define PLANT_TRIP_RESPONSE_NS 1000
+
+/* A freewheeling current decays exponentially; below this it counts as zero. */
+#define PLANT_CURRENT_NEGLIGIBLE_A 1e-9
 
 struct plant;
 typedef void (*plant_sample_t)(void *context, const struct plant *plant);
@@ -72,6 +76,15 @@ typedef struct {
     double sign, device_V, device_ohm, breakdown_V; /* s; V and r without the breakdown, that of arc and avalanche */
 } plant_path_t;
 
+/* What phase_steps.h keeps of a phase from step to step. */
+typedef struct {
+    bool known; /* the magnetics at this current and angle are in `point` */
+    double current_A, angle_rad;
+    double flux_Wb, inverse_1_H; /* flux linkage; inverse of the incremental inductance */
+    magnetics_point_t point;
+    double smooth_from_rad, smooth_to_rad; /* angles of the rotor between which its magnetics are smooth */
+} plant_phase_t;
+
 typedef struct plant {
     /* State at time_ns; read only. */
     uint64_t time_ns;
@@ -79,6 +92,7 @@ typedef struct plant {
     double rotor_angle_rad;           /* unwrapped */
     double current_A[HAL_PHASES_MAX]; /* with shorted turns: plant_current_A */
     double bus_voltage_V;
+    uint8_t switches[HAL_PHASES_MAX]; /* that are on: HALF_BRIDGE_UPPER, HALF_BRIDGE_LOWER */
     bool chopper_on;
     bool tripped; /* the comparators have opened the switches since plant_clear_trip */
 
@@ -108,7 +122,7 @@ typedef struct plant {
     double phase_copper_J[HAL_PHASES_MAX], phase_converter_J[HAL_PHASES_MAX]; /* parts of energy_copper_J and
                                                                                  energy_converter_J */
 
-    /* Private to plant.c. */
+    /* Private to plant.c and phase_steps.c. */
     const machine_t *machine;
     magnetics_model_t magnetics;
     double winding_ohm, inertia_kg_m2, friction_Nm_s;
@@ -121,9 +135,14 @@ typedef struct plant {
     double held_acceleration_rad_s2;
     bool faulted; /* any of `faults` */
     plant_path_t path[HAL_PHASES_MAX];
-    half_bridge_switches_t switches;
-    half_bridge_pattern_t pattern;
-    unsigned edge_next;
+    half_bridge_pattern_t pattern[HAL_PHASES_MAX]; /* of the control period that began at pattern_ns */
+    uint64_t pattern_ns;
+    hal_pwm_compare_t pattern_compare; /* of which `pattern` is; with a period of 0 ticks: none */
+    uint16_t pattern_period_ticks;
+    double pattern_minimum_pulse_ns;
+    uint32_t shortest_ticks; /* of that pulse */
+    uint8_t edge_next[HAL_PHASES_MAX];
+    plant_phase_t phase[HAL_PHASES_MAX];
     double trip_current_A; /* plant_set_trip */
     uint64_t trip_ns;      /* time at which the switches open, after a comparator's response; UINT64_MAX: none */
     plant_sample_t sample;

@@ -195,8 +195,8 @@ def test_error_falls_with_the_fourth_power_of_the_step(library: ctypes.CDLL, for
     # Long periods, so that the step limits determine the step, not the switch edges.
     machine, run = machine_of(form), single_pulse(full=40_000, driven_ns=800_000)
     expected, _ = run_reference(machine, run)
-    # Over three halvings: the number of whole steps between two switch edges makes each of them irregular.
+    # Over four halvings: the number of whole steps between two switch edges makes each of them irregular.
     coarse, fine = (
-        max(deviation(run_plant(library, machine, run, factor)[0], expected).values()) for factor in (4, 0.5)
+        max(deviation(run_plant(library, machine, run, factor)[0], expected).values()) for factor in (8, 0.5)
     )
-    assert 3.4 < math.log(coarse / fine, 8) < 4.4, (coarse, fine)
+    assert 3.4 < math.log(coarse / fine, 16) < 4.5, (coarse, fine)

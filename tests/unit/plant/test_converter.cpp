@@ -85,33 +85,30 @@ TEST_F(Devices, DrivenCurrentFollowsTheRlStepResponse) {
 
 struct Pattern : half_bridge_pattern_t {
     Pattern(uint16_t upper, uint16_t lower, double minimum_ns) {
-        hal_pwm_compare_t compare = {};
-        compare.upper[0] = upper;
-        compare.lower[0] = lower;
-        half_bridge_pattern(this, 1, &compare, TICKS, minimum_ns, 1000);
+        half_bridge_pattern(this, upper, lower, TICKS, half_bridge_shortest_ticks(minimum_ns));
     }
 };
 
 TEST(MinimumPulse, ShorterPulseOfTheUpperSwitchIsSuppressed) {
     EXPECT_EQ(Pattern(19, 0, 200.0).count, 0u); // 190 ns
-    EXPECT_EQ(Pattern(19, 0, 200.0).first.upper, 0);
+    EXPECT_EQ(Pattern(19, 0, 200.0).first & HALF_BRIDGE_UPPER, 0u);
     const Pattern shortest(20, 0, 200.0); // 200 ns
     ASSERT_EQ(shortest.count, 2u);
-    EXPECT_EQ(shortest.edges[1].time_ns - shortest.edges[0].time_ns, 200u);
+    EXPECT_EQ(shortest.delay_ns[1] - shortest.delay_ns[0], 200u);
 }
 
 TEST(MinimumPulse, ShorterGapOfTheUpperSwitchIsSuppressed) {
     EXPECT_EQ(Pattern(TICKS - 19, 0, 200.0).count, 0u);
-    EXPECT_EQ(Pattern(TICKS - 19, 0, 200.0).first.upper, 1);
+    EXPECT_EQ(Pattern(TICKS - 19, 0, 200.0).first & HALF_BRIDGE_UPPER, HALF_BRIDGE_UPPER);
     EXPECT_EQ(Pattern(TICKS - 20, 0, 200.0).count, 2u);
 }
 
 TEST(MinimumPulse, LowerSwitchFollowsTheSameRuleWithinThePeriod) {
     EXPECT_EQ(Pattern(0, 19, 200.0).count, 0u);
-    EXPECT_EQ(Pattern(0, 19, 200.0).first.lower, 0);
+    EXPECT_EQ(Pattern(0, 19, 200.0).first & HALF_BRIDGE_LOWER, 0u);
     EXPECT_EQ(Pattern(0, 20, 200.0).count, 2u);
     EXPECT_EQ(Pattern(0, TICKS - 19, 200.0).count, 0u);
-    EXPECT_EQ(Pattern(0, TICKS - 19, 200.0).first.lower, 1);
+    EXPECT_EQ(Pattern(0, TICKS - 19, 200.0).first & HALF_BRIDGE_LOWER, HALF_BRIDGE_LOWER);
 }
 
 TEST(MinimumPulse, ZeroKeepsTheShortestPulseOfTheTimer) {

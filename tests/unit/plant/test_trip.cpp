@@ -107,7 +107,7 @@ TEST_F(Trip, the_first_of_two_phases_that_exceeds_it_opens_all) {
     plant_set_switches(&plant, &compare, TICKS);
     plant_advance(&plant, PERIOD_NS);
     EXPECT_TRUE(plant.tripped);
-    EXPECT_EQ(plant.switches.upper | plant.switches.lower, 0);
+    EXPECT_EQ(plant.switches[0] | plant.switches[1] | plant.switches[2], 0);
 }
 
 } // namespace

@@ -332,16 +332,16 @@ TEST_F(BenchVariables, TriggersThatTheProcessorDoesNotServeAreMissed) {
 TEST_F(BenchVariables, CompareValuesActInTheNextPeriodOrImmediatelyOnABoardWithoutThatDelay) {
     // The stand-in firmware has the lower switch of phase 1 on for whole periods.
     bench.run_to(*client, 49 * 1000);
-    EXPECT_EQ(bench.rig->plant.switches.lower, 0) << "written in the period that starts at 25 us";
+    EXPECT_EQ(bench.rig->plant.switches[1] & HALF_BRIDGE_LOWER, 0u) << "written in the period that starts at 25 us";
     bench.run_to(*client, 51 * 1000);
-    EXPECT_EQ(bench.rig->plant.switches.lower, 2);
+    EXPECT_EQ(bench.rig->plant.switches[1], HALF_BRIDGE_LOWER);
     bench.rig->board.immediate_pwm = true;
     bench.firmware.lower = 0;
     bench.run_to(*client, 76 * 1000);
-    EXPECT_EQ(bench.rig->plant.switches.lower, 0) << "written at 75 us";
+    EXPECT_EQ(bench.rig->plant.switches[1] & HALF_BRIDGE_LOWER, 0u) << "written at 75 us";
     bench.firmware.lower = 2500;
     bench.run_to(*client, 101 * 1000);
-    EXPECT_EQ(bench.rig->plant.switches.lower, 2);
+    EXPECT_EQ(bench.rig->plant.switches[1], HALF_BRIDGE_LOWER);
 }
 
 TEST_F(BenchVariables, EdgesAreCapturedWhileTriggersAreMissed) {

@@ -34,7 +34,7 @@ class GatePath : public testing::Test {
         }
     }
 
-    bool any_on() const { return (plant.switches.upper | plant.switches.lower) != 0; }
+    bool any_on() const { return (plant.switches[0] | plant.switches[1] | plant.switches[2]) != 0; }
 
     machine_t machine;
     plant_t plant;

@@ -208,8 +208,9 @@ def _cortex_m4() -> dict[str, Any]:
 def compare_solvers(runs: int) -> dict[str, Any]:
     """Plant alone and reference solvers on a recorded switching pattern: prints and returns one row each."""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
-        pattern = record(Path(folder))
-    per_period = callgrind.of_plant(pattern)
+        patterns = {controller: record(Path(folder), controller=controller) for controller in CONTROLLERS}
+    per_period = {controller: round(callgrind.of_plant(pattern), 1) for controller, pattern in patterns.items()}
+    pattern = patterns["paper"]
     with Progress(1 + len(solvers.PLANT) + len(solvers.REFERENCE_SOLVERS), sys.stderr) as progress:
         rows = solvers.compare(pattern, runs, progress.step)
     print(f"the plant alone and reference solvers: saturating machine, {pattern.duration_s:g} s of the"
@@ -221,8 +222,9 @@ def compare_solvers(runs: int) -> dict[str, Any]:
         deviations = "  ".join(f"{name} {value:.1e}" for name, value in row["deviation"].items())
         evaluations = f"{row['evaluations_per_period']:.0f}" if row["evaluations_per_period"] else ""
         print(f"  {row['solver']:<21}{row['simulated_s_per_s']:9.4g}{evaluations:>5}  {deviations}{_comparison(row)}")
-    print(f"  the plant takes {per_period:.0f} instructions per control period")
-    return {"duration_s": pattern.duration_s, "plant_instructions_per_period": round(per_period, 1), "solvers": rows}
+    print("  the plant takes "
+          + ", ".join(f"{count:.0f} instructions per control period of {name}" for name, count in per_period.items()))
+    return {"duration_s": pattern.duration_s, "plant_instructions_per_period": per_period, "solvers": rows}
 
 
 def _comparison(row: dict[str, Any]) -> str:

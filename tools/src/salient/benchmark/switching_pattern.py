@@ -106,15 +106,16 @@ def deviation(measured: Trajectory, reference: Trajectory) -> dict[str, float]:
     return {name: float(np.max(np.abs(difference[name])) / scale[name]) for name in scale}
 
 
-def record(folder: Path, duration_s: float = 0.1) -> SwitchingPattern:
-    """Records the paper's controller on the saturating machine at 40 kHz, 600 r/min and 8 N m, from 0.4 s after the
-    start. The recording of the true state, one row per control period, is written to `folder`."""
-    machine, load_torque_Nm, control_rate_hz = "saturating", 8.0, 40_000
+def record(folder: Path, duration_s: float = 0.1, controller: str = "paper",
+           machine: str = "saturating") -> SwitchingPattern:
+    """Records a controller on a bundled machine at 40 kHz, 600 r/min and 8 N m, from 0.4 s after the start. The
+    recording of the true state, one row per control period, is written to `folder`."""
+    load_torque_Nm, control_rate_hz = 8.0, 40_000
     period_ns = 1_000_000_000 // control_rate_hz
     recording, switches = folder / "recording.npy", folder / "switches"
     options = BenchConfig(
         machine=machine,
-        controller="paper",
+        controller=controller,
         control_rate_hz=control_rate_hz,
         record=recording,
         record_from_us=round(2 * _SETTLE_S * 1e6),

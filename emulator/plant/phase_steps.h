@@ -1,0 +1,37 @@
+/* Steps of the plant in which every phase has steps of its own: for a plant without DC-link capacitor and faults.
+ *
+ * A phase's steps end at its own switching edges instead of those of all phases, and each evaluates its magnetics once
+ * (integrator.h: all conducting phases, twice). The rotor's step reaches over all of them, as far as the limits of
+ * its angle allow; usually it is a control period:
+ *
+ * 1. The angle is predicted by a cubic, from speed, acceleration and jerk at the start.
+ * 2. Each phase is integrated along it. Its state is the flux linkage, which follows from the voltage alone:
+ *
+ *      psi1 = psi0 + v h - R q,   q = h/2 (i0 + i1) + h^2/12 (i0' - i1')            (cubic Hermite, order 4)
+ *
+ *    and i1 is the current of psi1 at the predicted angle: the magnetics are evaluated at a predicted current, from
+ *    which one step of Newton's method, with its second-order term, leads to i1. Impulse and first moment of the torque
+ *    are integrated in the same way.
+ * 3. They give speed and angle at the end. The flux linkages remain; the currents change with the angle's correction,
+ *    to first order.
+ *
+ * A current ends where its flux linkage does, which is a scalar equation. */
+#ifndef PLANT_PHASE_STEPS_H
+#define PLANT_PHASE_STEPS_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "plant/plant.h"
+
+/* Advances by one step of the rotor, to `to_ns` at most, and takes the samples within. False, and nothing changed,
+ * where it does not apply: with a DC-link capacitor, faults, or a comparator that responds, or when a phase has more
+ * than PHASE_STEPS_MAX steps. */
+bool phase_steps_advance(plant_t *plant, uint64_t to_ns);
+
+/* Discards what is kept of the magnetics' last evaluations; after a change of the machine. */
+void phase_steps_reset(plant_t *plant);
+
+#define PHASE_STEPS_MAX 64
+
+#endif
