@@ -147,19 +147,28 @@ COLD static void test_itself(drive_t *drive, uint32_t time_us) {
     hal_critical_leave(drive->hal);
 }
 
+/* Of the only bit of a mask, from 1 on. */
+COLD static uint32_t number_of(uint32_t mask) {
+    uint32_t number = 0;
+    for (; mask != 0; mask >>= 1) {
+        number++;
+    }
+    return number;
+}
+
 /* With one phase lost the drive may go on: then what has failed is no fault any more. Until the fault is cleared
  * outside a run. */
 COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
     const degraded_parameters_t *parameters = &drive->control_parameters.degraded;
     const bool run = drive->control.state_machine.state == DRIVE_STATE_RUN;
     if (degraded_accepts(parameters, &drive->degraded, run, failed, drive->phases.phases)) {
-        drive->control.lost_phases = drive->degraded.lost;
+        drive->control.lost_phase = number_of(drive->degraded.lost);
         phase_monitor_lose(&drive->phases, drive->degraded.lost);
         drive->balance = (phase_balance_t){0};
         failed = 0;
     } else if (!run && drive->degraded.lost != 0 && drive->command.request == COMMAND_CLEAR_FAULT) {
         drive->degraded.lost = 0;
-        drive->control.lost_phases = 0;
+        drive->control.lost_phase = 0;
         phase_monitor_lose(&drive->phases, 0);
     }
     degraded_step(parameters, &drive->degraded, &machine_tables);

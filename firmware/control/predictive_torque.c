@@ -269,20 +269,15 @@ static inline void extrapolate_column(predictive_torque_t *control, unsigned pha
     control->position_q13[phase] = position_q13;
 }
 
-/* Takes lost phases out of the plan, and of the phases to correct; returns the shortfall with theirs. */
-NOINLINE static int32_t drop_plans(plan_t *plan, uint32_t lost_phases, int32_t shortfall) {
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        if ((lost_phases >> phase & 1u) != 0) {
-            plan_t *p = &plan[phase];
-            shortfall = p->cell->positive ? fixed_add(shortfall, p->torque) : fixed_subtract(shortfall, p->torque);
-            p->cell->located = false;
-            p->v_q13 = 0;
-            p->flux = 0;
-            p->torque = 0;
-            p->since_on = HALF_REV;
-        }
-    }
-    return shortfall;
+/* Takes a phase out of the plan, and of the phases to correct; returns the shortfall with its torque. */
+static inline int32_t drop_plan(plan_t *p, int32_t shortfall) {
+    const int32_t torque = p->cell->positive ? p->torque : -p->torque;
+    p->cell->located = false;
+    p->v_q13 = 0;
+    p->flux = 0;
+    p->torque = 0;
+    p->since_on = HALF_REV;
+    return fixed_add(shortfall, torque);
 }
 
 void predictive_torque_reset(predictive_torque_t *control) {
@@ -331,8 +326,8 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         shortfall = positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
     }
 
-    if (!LIKELY(sample->lost_phases == 0)) {
-        shortfall = drop_plans(plan, sample->lost_phases, shortfall);
+    if (!LIKELY(sample->lost_phase == 0)) {
+        shortfall = drop_plan(&plan[sample->lost_phase - 1u], shortfall);
         reached = false;
     }
     control->torque_shortfall_q24 = 0;

@@ -78,7 +78,7 @@ typedef struct {
     int32_t bus_voltage_q6;         /* DC-link voltage, V, Q9.6 */
     int32_t torque_q24;             /* reference, N m, Q7.24 */
     bool reverse;                   /* negative direction of rotation */
-    uint32_t lost_phases;           /* bit of each phase that gets no voltage; the others make up for it */
+    uint32_t lost_phase;            /* number from 1 on of a phase without voltage, which the others replace; 0: none */
     uint32_t angle_step;            /* magnitude of the rotation per period, 2^-32 electrical rev */
 } predictive_torque_sample_t;
 

@@ -53,15 +53,6 @@ static inline void integrate_voltage(const control_parameters_t *parameters, con
                       constants->flux.resistance_period_q40);
 }
 
-/* Degraded running: the laws of hysteresis and duty know of no lost phase. */
-NOINLINE static void open_lost_phases(control_state_t *state) {
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        if ((state->lost_phases >> phase & 1u) != 0) {
-            state->duty_q15[phase] = -MODULATOR_DUTY_ONE_Q15;
-        }
-    }
-}
-
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare) {
     control_measurement_t *measured = &state->measurement;
@@ -77,8 +68,9 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     if (run) {
         state->torque_reference_q24 = speed_control_torque_q24(parameters, &state->observer, sample, deferred);
         torque_control(parameters, state, deferred, measured);
-        if (!LIKELY(state->lost_phases == 0)) {
-            open_lost_phases(state);
+        const uint32_t lost = state->lost_phase;
+        if (!LIKELY(lost == 0)) { /* the laws of hysteresis and duty know of no lost phase */
+            state->duty_q15[lost - 1u] = -MODULATOR_DUTY_ONE_Q15;
         }
         modulate(state->duty_q15, machine_tables.phases, parameters->period_ticks, parameters->interleaved_pwm,
                  compare);

@@ -167,7 +167,7 @@ typedef struct {
     /* Last measurement, for telemetry and background: the steps of the control interrupt receive the measurement as an
      * argument. */
     control_measurement_t measurement;
-    uint32_t lost_phases;     /* bit of each phase whose switches stay open, as reported_fault_mask */
+    uint32_t lost_phase; /* number from 1 on of the phase whose switches stay open, as reported_fault_mask; 0: none */
     int32_t torque_limit_q24; /* of the torque reference's magnitude, as reported_fault_mask, N m, Q7.24 */
 } control_state_t;
 

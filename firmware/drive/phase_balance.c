@@ -2,6 +2,7 @@
 
 #include "drive/fault.h"
 #include "fixed/compiler.h"
+#include "fixed/divide.h"
 
 #define REVOLUTIONS 8u
 #define SLOWEST_MS 100u
@@ -40,7 +41,7 @@ static uint32_t ratio_q8(const phase_balance_t *balance, unsigned index) {
     if (phase->conducting < balance->periods / CONDUCTING_PART || phase->table_sum_q21 == 0) {
         return 0;
     }
-    const uint64_t ratio = (phase->flux_sum_q21 << 8) / phase->table_sum_q21;
+    const int64_t ratio = fixed_divide((int64_t)phase->flux_sum_q21 << 8, (int64_t)phase->table_sum_q21);
     return ratio < UINT16_MAX ? (uint32_t)ratio : UINT16_MAX;
 }
 

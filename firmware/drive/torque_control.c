@@ -79,7 +79,7 @@ static void predictive_control(const control_parameters_t *parameters, control_s
         .misalignment = deferred->predictive.misalignment,
         .bus_voltage_q6 = measured->dc_link_voltage_q6,
         .torque_q24 = fixed_add(trimmed_q24, conduction->ripple_q24),
-        .lost_phases = state->lost_phases,
+        .lost_phase = state->lost_phase,
         .reverse = observer->speed_q22 < 0,
         .angle_step = (uint32_t)fixed_abs(step) * rotor_poles,
     };

@@ -262,6 +262,30 @@ uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_t *ta
     return 0;
 }
 
+void phase_monitor_lose(phase_monitor_t *monitor, uint32_t phases) {
+    (void)monitor, (void)phases;
+}
+
+uint32_t phase_balance_step(phase_balance_t *balance, const phase_balance_sample_t *sample) {
+    (void)balance, (void)sample;
+    return 0;
+}
+
+bool degraded_accepts(const degraded_parameters_t *parameters, degraded_t *degraded, bool run, uint64_t failed,
+                      uint32_t phases) {
+    (void)parameters, (void)degraded, (void)run, (void)failed, (void)phases;
+    return false;
+}
+
+void degraded_step(const degraded_parameters_t *parameters, degraded_t *degraded, const machine_tables_t *tables) {
+    (void)parameters, (void)degraded, (void)tables;
+}
+
+int32_t degraded_torque_limit_q24(const degraded_t *degraded) {
+    (void)degraded;
+    return INT32_MAX;
+}
+
 /* No memory. */
 void nvm_store_init(nvm_store_t *store, const hal_t *hal, parameters_t *parameters) {
     (void)store, (void)hal, (void)parameters;

@@ -1157,9 +1157,11 @@ TEST_F(Drive, random_frames_change_parameters_only_as_a_whole_checked_set_of_an_
                 }
             }
             break;
-        case 5: // commands, a run now and then
-            command(random() % 4 != 0 ? COMMAND_RUN : COMMAND_OFF);
+        case 5: { // commands, a run now and then
+            const unsigned kind = random() % 8;
+            command(kind == 0 ? COMMAND_CLEAR_FAULT : kind == 1 ? COMMAND_OFF : COMMAND_RUN);
             break;
+        }
         case 6:
             periods(random() % 8 == 0 ? 4000 : 40);
             break;

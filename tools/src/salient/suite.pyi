@@ -77,6 +77,9 @@ ParameterName = Literal[
     "winding_current_A",
     "winding_time_constant_s",
     "switch_current_A",
+    "winding_limit_C",
+    "inverter_limit_C",
+    "degraded_running",
 ]
 
 TelemetryName = Literal[
@@ -214,6 +217,12 @@ TelemetryName = Literal[
     "DRIVE_FAULT_MASK.temperature_sensor",
     "watchdog",
     "DRIVE_FAULT_MASK.watchdog",
+    "memory",
+    "DRIVE_FAULT_MASK.memory",
+    "code",
+    "DRIVE_FAULT_MASK.code",
+    "clock",
+    "DRIVE_FAULT_MASK.clock",
     "DRIVE_DEFERRED.used_us",
     "DRIVE_DEFERRED.worst_us",
     "skipped_periods",
@@ -262,6 +271,54 @@ TelemetryName = Literal[
     "DRIVE_THERMAL.switch_load",
     "torque_limit_Nm",
     "DRIVE_THERMAL.torque_limit_Nm",
+    "winding_temperature_C",
+    "DRIVE_THERMAL.winding_temperature_C",
+    "inverter_temperature_C",
+    "DRIVE_THERMAL.inverter_temperature_C",
+    "winding_sensor_a",
+    "DRIVE_SELF_TEST.winding_sensor_a",
+    "winding_sensor_b",
+    "DRIVE_SELF_TEST.winding_sensor_b",
+    "winding_sensor_c",
+    "DRIVE_SELF_TEST.winding_sensor_c",
+    "winding_sensor_d",
+    "DRIVE_SELF_TEST.winding_sensor_d",
+    "inverter_sensor_a",
+    "DRIVE_SELF_TEST.inverter_sensor_a",
+    "inverter_sensor_b",
+    "DRIVE_SELF_TEST.inverter_sensor_b",
+    "inverter_sensor_c",
+    "DRIVE_SELF_TEST.inverter_sensor_c",
+    "inverter_sensor_d",
+    "DRIVE_SELF_TEST.inverter_sensor_d",
+    "limits",
+    "DRIVE_SELF_TEST.limits",
+    "constants",
+    "DRIVE_SELF_TEST.constants",
+    "fault_latch",
+    "DRIVE_SELF_TEST.fault_latch",
+    "stack",
+    "DRIVE_SELF_TEST.stack",
+    "registers",
+    "DRIVE_SELF_TEST.registers",
+    "DRIVE_SELF_TEST.code",
+    "DRIVE_SELF_TEST.clock",
+    "degraded",
+    "DRIVE_DEGRADED.degraded",
+    "lost_phase_a",
+    "DRIVE_DEGRADED.lost_phase_a",
+    "lost_phase_b",
+    "DRIVE_DEGRADED.lost_phase_b",
+    "lost_phase_c",
+    "DRIVE_DEGRADED.lost_phase_c",
+    "lost_phase_d",
+    "DRIVE_DEGRADED.lost_phase_d",
+    "torque_mean_Nm",
+    "DRIVE_DEGRADED.torque_mean_Nm",
+    "torque_least_Nm",
+    "DRIVE_DEGRADED.torque_least_Nm",
+    "torque_here_Nm",
+    "DRIVE_DEGRADED.torque_here_Nm",
     "operation",
     "PARAMETER_RESPONSE.operation",
     "index",
@@ -330,6 +387,10 @@ TruthName = Literal[
     "RIG_TRUTH_BENCH.part",
     "rotor_angle_deg",
     "RIG_TRUTH_BENCH.rotor_angle_deg",
+    "winding_temperature_C",
+    "RIG_TRUTH_BENCH.winding_temperature_C",
+    "inverter_temperature_C",
+    "RIG_TRUTH_BENCH.inverter_temperature_C",
     "load_torque_Nm",
     "RIG_TRUTH_BENCH.load_torque_Nm",
     "bus_voltage_V",
@@ -401,6 +462,8 @@ class Rig(_Rig):
     """-200 to 200 N m. Torque of the value 1 of the load profile, which is added to load_torque_Nm by rotor angle, in steps of 20 us."""
     held_speed_rpm: float
     """-83886.1 to 80000 r/min. Speed at which a dynamometer holds the shaft, whatever the torques; it accelerates the shaft to it by 10000 r/min/s. free, which is not-a-number in Python: the shaft is free again."""
+    supply_ripple_frequency_Hz: float
+    """1 to 5000 Hz. Frequency of the fault supply_ripple; a change begins the sine again."""
     sto_1: float
     """0 to 1. First line of safe torque off. The gates of all switches need both lines energised, whatever the firmware does."""
     sto_2: float
@@ -429,6 +492,12 @@ class Rig(_Rig):
     """0 to 1e+06. The power of the drive is lost at this operation of its non-volatile memory, 1 is the next programming of a word or erasure of a page, and returns at once, as a reset; 0: no loss."""
     memory_cut_kind: float
     """0 to 2. What that operation leaves: old the content before, torn a word of which some bits are programmed or a page of random bits, half a half-programmed word or a page of erased, old and partly erased words."""
+    ambient_C: float
+    """-50 to 150 C. Temperature of the surroundings of windings and inverter."""
+    held_winding_C: float
+    """-83886.1 to 250 C. Temperature at which every winding is held, at once and whatever its losses. free, which is not-a-number in Python: the windings follow their losses again, from there on."""
+    held_inverter_C: float
+    """-83886.1 to 250 C. As held_winding_C, of the switches of every phase."""
     def at(self, time_s: float) -> Rig: ...
     def set_load_profile(self, values: LoadProfile | str | Sequence[float]) -> None: ...
     @overload
@@ -443,6 +512,8 @@ class Rig(_Rig):
     def fault(self, kind: Literal["gate_supply_lost"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
     @overload
     def fault(self, kind: Literal["winding_shorted"], *, phase: Literal["a", "b", "c", "d"], turns_percent: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["winding_to_earth"], *, phase: Literal["a", "b", "c", "d"], resistance_ohm: float, duration_s: float | None = None) -> Fault: ...
     @overload
     def fault(self, kind: Literal["current_sensor_open"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
     @overload
@@ -505,6 +576,42 @@ class Rig(_Rig):
     def fault(self, kind: Literal["interrupt_lost"], *, duration_s: float | None = None) -> Fault: ...
     @overload
     def fault(self, kind: Literal["background_hung"], *, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["interrupt_late"], *, time_us: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["interrupt_storm"], *, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["winding_temperature_sensor_open"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["winding_temperature_sensor_shorted"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["winding_temperature_sensor_stuck"], *, phase: Literal["a", "b", "c", "d"], code: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["winding_temperature_sensor_offset"], *, phase: Literal["a", "b", "c", "d"], offset_K: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["inverter_temperature_sensor_open"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["inverter_temperature_sensor_shorted"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["inverter_temperature_sensor_stuck"], *, phase: Literal["a", "b", "c", "d"], code: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["inverter_temperature_sensor_offset"], *, phase: Literal["a", "b", "c", "d"], offset_K: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["limit_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["constant_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["state_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["fault_latch_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["code_flipped"], *, byte: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["stack_guard_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["period_register_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["clock_drift"], *, drift_percent: float, duration_s: float | None = None) -> Fault: ...
     @overload
     def fault(self, kind: str, *, duration_s: float | None = None, **arguments: Any) -> Fault: ...
 
@@ -527,6 +634,8 @@ class Bench(_Bench):
     @overload
     def fault(self, kind: Literal["winding_shorted"], *, phase: Literal["a", "b", "c", "d"], turns_percent: float, duration_s: float | None = None) -> Fault: ...
     @overload
+    def fault(self, kind: Literal["winding_to_earth"], *, phase: Literal["a", "b", "c", "d"], resistance_ohm: float, duration_s: float | None = None) -> Fault: ...
+    @overload
     def fault(self, kind: Literal["current_sensor_open"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
     @overload
     def fault(self, kind: Literal["current_sensor_stuck"], *, phase: Literal["a", "b", "c", "d"], code: float, duration_s: float | None = None) -> Fault: ...
@@ -588,5 +697,41 @@ class Bench(_Bench):
     def fault(self, kind: Literal["interrupt_lost"], *, duration_s: float | None = None) -> Fault: ...
     @overload
     def fault(self, kind: Literal["background_hung"], *, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["interrupt_late"], *, time_us: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["interrupt_storm"], *, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["winding_temperature_sensor_open"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["winding_temperature_sensor_shorted"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["winding_temperature_sensor_stuck"], *, phase: Literal["a", "b", "c", "d"], code: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["winding_temperature_sensor_offset"], *, phase: Literal["a", "b", "c", "d"], offset_K: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["inverter_temperature_sensor_open"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["inverter_temperature_sensor_shorted"], *, phase: Literal["a", "b", "c", "d"], duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["inverter_temperature_sensor_stuck"], *, phase: Literal["a", "b", "c", "d"], code: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["inverter_temperature_sensor_offset"], *, phase: Literal["a", "b", "c", "d"], offset_K: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["limit_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["constant_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["state_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["fault_latch_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["code_flipped"], *, byte: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["stack_guard_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["period_register_flipped"], *, bit: float, duration_s: float | None = None) -> Fault: ...
+    @overload
+    def fault(self, kind: Literal["clock_drift"], *, drift_percent: float, duration_s: float | None = None) -> Fault: ...
     @overload
     def fault(self, kind: str, *, duration_s: float | None = None, **arguments: Any) -> Fault: ...

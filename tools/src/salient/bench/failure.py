@@ -26,7 +26,8 @@ _RECORDING_HEADER_BYTES = 1024
 
 def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchConfig | None) -> list[str]:
     """Writes log (BLF and candump text), plots around the failure and around the first fault, bench.json with the
-    notes, and a page of all that. config: of an emulator that the session has started. Returns what changed just before the failure."""
+    notes, and a page of all that. config: of an emulator that the session has started. Returns what changed just before
+    the failure."""
     folder.mkdir(parents=True, exist_ok=True)
     write_logs(session.log, folder / "can.blf", folder / "can.log")
     plot_moment(session, session.time_s, "failure", folder / "failure.png")

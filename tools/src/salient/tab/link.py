@@ -32,7 +32,8 @@ def link_of(bench: Bench) -> str | None:
     """The link to the run of a bench; None where a tab cannot repeat it: another build than the host's, a machine file
     of one's own, several drives or clients, a memory from before, other frames than classic data, too many of them."""
     options = bench.options
-    if (IS_WHEEL or options.program is not None or options.build != "host" or options.drives != 1 or not bench.address.startswith("unix:")
+    if (IS_WHEEL or options.program is not None or options.build != "host"
+            or options.drives != 1 or not bench.address.startswith("unix:")
             or machine_path(options.machine).parent != MACHINES or machine_path(options.machine).suffix != ".toml"
             or any(getattr(options, name) != DEFAULTS[name] for name in _ONLY_ALONE)
             or not all(_is_classic(message) for _, message in bench.sent) or _others_sent(bench)):

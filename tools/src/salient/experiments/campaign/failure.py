@@ -11,6 +11,7 @@ from typing import Any
 import can
 
 from salient.bench.bench import Bench
+from salient.bench.failure import save as save_bench
 from salient.bus.clock import open_bus
 from salient.config import BenchConfig
 from salient.errors import UsageError
@@ -81,7 +82,7 @@ def replay(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, folder: Pat
         with Bench(config, f"unix:{temporary}/can.sock") as bench:
             _send(bench, frames.read_text(encoding="ascii").splitlines())
             if folder is not None:
-                bench.save(folder, f"tools/salient replay {folder}")
+                save_bench(bench, folder, {"replay": f"tools/salient replay {folder}"}, config)
             return Replay(f"{_hash(bench.log):016x}", result)
 
 
