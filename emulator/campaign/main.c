@@ -114,7 +114,7 @@ static void print_result(void) {
     printf("], \"cells\": [");
     const char *separator = "";
     for (unsigned cell = 0; cell < ORACLE_CELLS; cell++) {
-        if (oracle->cell[cell / 8] >> cell % 8 & 1u) {
+        if ((unsigned)oracle->cell[cell / 8] >> cell % 8 & 1u) {
             printf("%s%u", separator, cell);
             separator = ", ";
         }
