@@ -149,8 +149,9 @@ def test_encoder_displaced_by_5_degrees_under_load_is_a_fault_within_100_ms(make
 
 @pytest.mark.parametrize(("machine", "controller"), [("saturating", "traditional"), ("finite_element", "traditional"),
                                                       ("saturating", "salient"), ("linear_cosine", "salient")])
-def test_encoder_ahead_by_5_degrees_is_a_fault_after_two_windows_of_the_balance(make_bench, machine, controller):
-    """Sixteen electrical revolutions at least, of which four or six make a turn of 600 r/min."""
+def test_encoder_ahead_by_5_degrees_is_a_fault_within_three_quarters_of_a_second(make_bench, machine, controller):
+    """When a phase contradicts the angle, or after two windows of the balance: sixteen electrical revolutions, of which
+    four or six make a turn of 600 r/min."""
     bench = make_bench(machine=machine, controller=controller, initial_angle_deg=10.0)
     bench.rig.encoder_offset_deg = 5.0
     bench.drive.speed_reference_rpm = 600
@@ -158,7 +159,7 @@ def test_encoder_ahead_by_5_degrees_is_a_fault_after_two_windows_of_the_balance(
     bench.load_torque_Nm = 8
     run_until_fault(bench, 0.9)
     assert bench.drive.fault == "encoder_angle"
-    assert 0.25 < fault_s(bench) < 0.75
+    assert 0.01 < fault_s(bench) < 0.75
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)

@@ -28,7 +28,11 @@ def arguments_of(kind: FaultKind) -> dict[str, float | str]:
     return arguments
 
 
-@pytest.mark.parametrize("kind", [name for name in fault_kinds() if name != "chopper_open"])
+UNSUPPORTED = ("chopper_open", "code_flipped", "stack_guard_flipped")
+"""By this machine, which has no chopper, and by the host."""
+
+
+@pytest.mark.parametrize("kind", [name for name in fault_kinds() if name not in UNSUPPORTED])
 def test_every_kind_begins_and_ends_at_its_microsecond(bench: Bench, kind: str) -> None:
     bench.drive.speed_reference_rpm = 300
     bench.at(BEGIN_S).fault(kind, duration_s=END_S - BEGIN_S, **arguments_of(fault_kinds()[kind]))

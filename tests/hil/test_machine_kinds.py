@@ -28,15 +28,14 @@ def test_starts_takes_a_load_step_brakes_and_reverses_near_its_bounds(machine, t
     assert 0.005 < values["ripple"] < 0.02
 
 
-# The first one is late by less than 0.05 ms.
-@pytest.mark.parametrize(("number", "late"), [(13, ["0.0 ms late"]), (15, [])])
-def test_light_rotor_starts_and_reverses_near_its_bounds_without_overshoot(number, late, tmp_path):
+@pytest.mark.parametrize("number", [13, 15])
+def test_light_rotor_starts_and_reverses_near_its_bounds_without_overshoot(number, tmp_path):
     file = tmp_path / f"random_{number}.toml"
     file.write_text(random_machine(number))
     scenario = every_machine.scenario(file, "salient")
     recording = run_scenario(scenario, tmp_path).recording
     values = every_machine.extract(scenario, recording)
-    assert every_machine.failures(values, "salient") == late
+    assert every_machine.failures(values, "salient") == []
     _, braking, reversal = scenario.speed
     start = recording["speed_rpm"][recording["time_s"] < braking.at_s]
     assert 1.0 < start.max() / scenario.speed[0].value_rpm < 1.004

@@ -197,7 +197,7 @@ def test_enters_and_leaves_voltage_limited_operation_smoothly(run_recorded):
     assert 0.0 <= bench.telemetry["torque_missing_Nm"].last < 2.5
     reference_Nm, estimate_Nm = (bench.telemetry[name].between(1.5, 1.7).value.mean()
                                  for name in ("torque_reference_Nm", "torque_estimate_Nm"))
-    assert estimate_Nm == pytest.approx(reference_Nm, abs=0.1)
+    assert estimate_Nm == pytest.approx(reference_Nm, abs=0.2)
     # Acceleration back, without overshoot.
     back_rpm = speed_rpm[time_s >= 1.2]
     assert np.diff(back_rpm[:10_000:100]).min() > 0.0

@@ -89,7 +89,8 @@ def test_every_bench_variable_may_be_set_from_the_start(tmp_path):
               "current_sensor_limit_A": 90.0, "flux_linkage_gain": 1.05, "resistance_gain": 1.2, "inertia_gain": 1.1,
               "friction_gain": 0.9, "minimum_pulse_ns": 200.0, "load_ramp_Nm_s": 4000.0, "load_sine_amplitude_Nm": 0.1,
               "load_sine_frequency_Hz": 50.0, "held_speed_rpm": math.nan, "bus_connection": 1,
-              "frame_fault_per_mille": 1.0, "frame_delay_us": 100, "babble_identifier": 0x700, "babble_length": 1}
+              "supply_ripple_frequency_Hz": 300.0, "frame_fault_per_mille": 1.0,
+              "frame_delay_us": 100, "babble_identifier": 0x700, "babble_length": 1}
     bench = {name: values.get(name, 0.0) for name in bench_variables()}
     assert values.keys() <= bench.keys()
     result = loaded(tmp_path, bench=bench)

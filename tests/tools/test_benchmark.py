@@ -76,7 +76,7 @@ ACCURACY = {
 def test_every_solver_reports_its_accuracy_and_is_compared_with_a_plant_at_least_as_accurate(
     pattern: SwitchingPattern, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(benchmark, "record", lambda folder: pattern)
+    monkeypatch.setattr(benchmark, "record", lambda folder, controller: pattern)
     content = json.loads(json.dumps(benchmark.compare_solvers(runs=1)))
     rows = {row["solver"]: row for row in content["solvers"]}
     assert list(rows) == [*PLANT, *REFERENCE_SOLVERS] == list(ACCURACY)
@@ -120,14 +120,14 @@ def test_instruction_counts_of_the_drive_are_reproducible_except_for_the_client(
 
 
 @pytest.mark.parametrize(("controller", "least", "most"), [
-    ("traditional", 2000.0, 4700.0), ("paper", 4500.0, 9500.0), ("salient", 7500.0, 15000.0)])
+    ("traditional", 2000.0, 5000.0), ("paper", 4500.0, 9500.0), ("salient", 7500.0, 15000.0)])
 def test_instructions_of_the_drive_are_grouped(controller: str, least: float, most: float) -> None:
     counts = callgrind.of_drive(controller, 0.02)
     total = sum(counts.values())
     assert least < total < most, counts
     assert 0.3 < counts["plant"] / total < 0.8, counts
     assert 0.05 < counts["control laws"] / total < 0.5, counts
-    assert 0.02 < counts["drive"] / total < 0.3, counts
+    assert 0.02 < counts["drive"] / total < 0.35, counts
     assert 0.002 < counts["CAN"] / total < 0.15, counts
     assert 0.002 < counts["rig"] / total < 0.15, counts
     assert 0.0 <= counts["other"] / total < 0.03, counts

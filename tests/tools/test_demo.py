@@ -113,7 +113,7 @@ def test_steady_torque_is_load_plus_friction(demo_metrics, controller):
     # 8 N m plus 0.02 N m s at 15.71 rad/s; the tolerance covers residual acceleration.
     assert values["torque_mean_Nm"] == pytest.approx(8.314, abs=0.02)
     assert values["torque_ripple"] == pytest.approx(
-        (values["torque_max_Nm"] - values["torque_min_Nm"]) / values["torque_mean_Nm"], rel=1e-4)
+        (values["torque_max_Nm"] - values["torque_min_Nm"]) / values["torque_mean_Nm"], rel=3e-4)  # of six digits
 
 
 @pytest.mark.parametrize("controllers", [("paper",), ("paper", "traditional")])
