@@ -81,8 +81,8 @@ def first_fault(session: Session) -> tuple[float, str] | None:
 
 def changes(session: Session, time_s: float) -> list[str]:
     """What changed around a moment, in order: signals with named values of drive and test bench, the load, and the
-    variables that were set. The torque reference only in torque mode: in speed mode it is the speed controller's, and no
-    two frames have the same."""
+    variables that were set. The torque reference in torque mode only: in speed mode the speed controller changes it all
+    the time."""
     from_s, to_s = time_s - BEFORE_S, time_s + AFTER_S
     found: list[tuple[float, str]] = []
     for table in (session.telemetry, session.truth):
