@@ -49,6 +49,13 @@ static const struct {
     {FAULT_ENCODER_LOST_COUNTS, 5000.0}, {FAULT_ENCODER_NOISE, 1.0},           {FAULT_ENCODER_SLIP, 60.0},
     {FAULT_COULOMB_FRICTION, 30.0},      {FAULT_STATIC_FRICTION, 30.0},        {FAULT_SUPPLY_SAGGED, 60.0},
     {FAULT_SUPPLY_SURGED, 50.0},         {FAULT_SUPPLY_RIPPLE, 100.0},
+    {FAULT_WINDING_TO_EARTH, 0.001},     {FAULT_INTERRUPT_LATE, 5000.0},       {FAULT_LIMIT_FLIPPED, 12.0},
+    {FAULT_CONSTANT_FLIPPED, 1000.0},    {FAULT_STATE_FLIPPED, 0.0},           {FAULT_FAULT_LATCH_FLIPPED, 0.0},
+    {FAULT_CLOCK_DRIFT, 6.0},            {FAULT_PERIOD_REGISTER_FLIPPED, 3.0},
+    {FAULT_WINDING_TEMPERATURE_SENSOR_STUCK, 2000.0},
+    {FAULT_INVERTER_TEMPERATURE_SENSOR_STUCK, 2000.0},
+    {FAULT_WINDING_TEMPERATURE_SENSOR_OFFSET, -50.0},
+    {FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET, -50.0},
 };
 
 /* Found within a few electrical periods, or by what adds up. */
@@ -78,7 +85,8 @@ static double attribute_of(unsigned kind) {
 static unsigned list_variants(variant_t variants[VARIANTS_MAX], const machine_t *machine) {
     unsigned count = 0;
     for (unsigned kind = 1; kind < FAULT_COUNT; kind++) {
-        if (!fault_kinds[kind].name || (kind == FAULT_CHOPPER_OPEN && machine->dc_link.chopper_resistance_ohm == 0.0)) {
+        const bool of_target = kind == FAULT_CODE_FLIPPED || kind == FAULT_STACK_GUARD_FLIPPED; /* not of the host */
+        if (!fault_kinds[kind].name || of_target || (kind == FAULT_CHOPPER_OPEN && machine->dc_link.chopper_resistance_ohm == 0.0)) {
             continue;
         }
         for (unsigned leg = 0; leg <= fault_kinds[kind].has_leg; leg++) {

@@ -21,6 +21,7 @@
 #include "campaign/run.h"
 #include "drive.h"
 #include "host/hal_host.h"
+#include "host/memory_flip.h"
 
 #define EXIT_USAGE 2
 
@@ -62,7 +63,12 @@ static oracle_drive_t view(void) {
                             .checks = (uint32_t)state_machine->record.fault_mask};
 }
 
-static const run_drive_t firmware = {start, control_interrupt, deferred_interrupt, background, view};
+static void flip(memory_object_t object, uint32_t bit) {
+    memory_flip(&drive, object, bit);
+}
+
+static const run_drive_t firmware = {start, control_interrupt,   deferred_interrupt, background,
+                                     flip,  MEMORY_FLIP_OBJECTS, view};
 
 /* --- Machines --- */
 

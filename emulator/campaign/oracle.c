@@ -38,13 +38,22 @@ enum {
     CAUSE_INVERTER_OVERLOAD,
     CAUSE_TEMPERATURE_SENSOR,
     CAUSE_WATCHDOG,
+    CAUSE_MEMORY,
+    CAUSE_CODE,
+    CAUSE_CLOCK,
 };
+
+_Static_assert(FAULT_COUNT <= ORACLE_KINDS, "room for every kind");
 
 #define BIT(cause) (UINT32_C(1) << (cause))
 /* A drive cannot tell apart what its current sensors show alike. */
 #define PHASE (BIT(CAUSE_CURRENT_SENSOR) | BIT(CAUSE_PHASE_OPEN) | BIT(CAUSE_PHASE_SHORTED))
 #define CURRENT (BIT(CAUSE_OVER_CURRENT) | BIT(CAUSE_HARDWARE_OVER_CURRENT))
 #define ENCODER (BIT(CAUSE_ENCODER) | BIT(CAUSE_ENCODER_ANGLE))
+#define STOPPED                                                                                                        \
+    (BIT(CAUSE_INTERRUPT_OVERRUN) | BIT(CAUSE_WATCHDOG) | BIT(CAUSE_COMMAND_TIMEOUT) | BIT(CAUSE_COMMAND_ERROR))
+#define WINDING_TEMPERATURE (BIT(CAUSE_TEMPERATURE_SENSOR) | BIT(CAUSE_WINDING_OVERLOAD) | BIT(CAUSE_STALL))
+#define INVERTER_TEMPERATURE (BIT(CAUSE_TEMPERATURE_SENSOR) | BIT(CAUSE_INVERTER_OVERLOAD) | BIT(CAUSE_STALL))
 #define MECHANICS (BIT(CAUSE_STALL) | BIT(CAUSE_WINDING_OVERLOAD) | BIT(CAUSE_INVERTER_OVERLOAD))
 
 /* First causes that a fault may have, from what it does to the quantities that a drive measures. */
@@ -55,6 +64,7 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     [FAULT_SWITCH_SHORTED] = PHASE | CURRENT,
     [FAULT_DIODE_OPEN] = PHASE | CURRENT,
     [FAULT_WINDING_SHORTED] = PHASE | CURRENT,
+    [FAULT_WINDING_TO_EARTH] = PHASE | CURRENT,
     [FAULT_CURRENT_SENSOR_OPEN] = PHASE | CURRENT | MECHANICS,
     [FAULT_CURRENT_SENSOR_STUCK] = PHASE | CURRENT | MECHANICS,
     [FAULT_CURRENT_SENSOR_LOW_RAIL] = PHASE | CURRENT | MECHANICS,
@@ -86,6 +96,26 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     [FAULT_CHOPPER_OPEN] = BIT(CAUSE_OVER_VOLTAGE),
     [FAULT_INTERRUPT_LOST] = BIT(CAUSE_INTERRUPT_OVERRUN) | BIT(CAUSE_WATCHDOG) | BIT(CAUSE_COMMAND_TIMEOUT),
     [FAULT_BACKGROUND_HUNG] = BIT(CAUSE_WATCHDOG) | BIT(CAUSE_COMMAND_TIMEOUT) | BIT(CAUSE_COMMAND_ERROR),
+    [FAULT_INTERRUPT_LATE] = STOPPED,
+    [FAULT_INTERRUPT_STORM] = STOPPED,
+    [FAULT_WINDING_TEMPERATURE_SENSOR_OPEN] = WINDING_TEMPERATURE,
+    [FAULT_WINDING_TEMPERATURE_SENSOR_SHORTED] = WINDING_TEMPERATURE,
+    [FAULT_WINDING_TEMPERATURE_SENSOR_STUCK] = WINDING_TEMPERATURE,
+    [FAULT_WINDING_TEMPERATURE_SENSOR_OFFSET] = WINDING_TEMPERATURE,
+    [FAULT_INVERTER_TEMPERATURE_SENSOR_OPEN] = INVERTER_TEMPERATURE,
+    [FAULT_INVERTER_TEMPERATURE_SENSOR_SHORTED] = INVERTER_TEMPERATURE,
+    [FAULT_INVERTER_TEMPERATURE_SENSOR_STUCK] = INVERTER_TEMPERATURE,
+    [FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET] = INVERTER_TEMPERATURE,
+    /* What is judged by a wrong limit or constant before the change is noticed may fail in any way. */
+    [FAULT_LIMIT_FLIPPED] = UINT32_MAX,
+    [FAULT_CONSTANT_FLIPPED] = UINT32_MAX,
+    [FAULT_STATE_FLIPPED] = BIT(CAUSE_MEMORY) | BIT(0),
+    [FAULT_FAULT_LATCH_FLIPPED] = UINT32_MAX, /* another name of what is latched */
+    [FAULT_CODE_FLIPPED] = BIT(CAUSE_CODE),
+    [FAULT_STACK_GUARD_FLIPPED] = BIT(CAUSE_MEMORY),
+    [FAULT_PERIOD_REGISTER_FLIPPED] = BIT(CAUSE_MEMORY) | BIT(CAUSE_CLOCK) | BIT(CAUSE_OVER_SPEED) | PHASE | CURRENT |
+                                      ENCODER | STOPPED, /* all of which it counts in periods */
+    [FAULT_CLOCK_DRIFT] = BIT(CAUSE_CLOCK),
 };
 
 #define BUS (BIT(CAUSE_COMMAND_TIMEOUT) | BIT(CAUSE_COMMAND_ERROR) | BIT(CAUSE_IDENTIFIER_CONFLICT))
@@ -117,6 +147,19 @@ static uint32_t causes_of_script(const world_event_t *event) {
 void oracle_init(oracle_t *oracle, const world_t *world, const sender_t *sender, uint64_t period_ns) {
     *oracle = (oracle_t){.world = world, .sender = sender, .period_ns = period_ns};
     oracle->voltage_recent_low_V = INFINITY;
+}
+
+static bool any_injected(const oracle_t *oracle, unsigned first, unsigned last) {
+    bool any = false;
+    for (unsigned kind = first; kind <= last; kind++) {
+        any = any || oracle->injected[kind];
+    }
+    return any;
+}
+
+/* The state of the drive, or what it takes for it, was changed from outside. */
+static bool state_changed(const oracle_t *oracle) {
+    return any_injected(oracle, FAULT_STATE_FLIPPED, FAULT_FAULT_LATCH_FLIPPED);
 }
 
 static void violate(oracle_t *oracle, const char *rule, uint64_t time_ns, unsigned number, double value) {
@@ -200,7 +243,8 @@ static bool may_be_deaf(const oracle_t *oracle, uint64_t time_us) {
             return true;
         }
     }
-    return other_sender(oracle, false, time_us) || (oracle->injected >> FAULT_BACKGROUND_HUNG & 1u);
+    return other_sender(oracle, false, time_us) ||
+           any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM);
 }
 
 static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
@@ -222,7 +266,7 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
 }
 
 static bool link_sensor_faulty(const oracle_t *oracle) {
-    return oracle->injected >> FAULT_DC_LINK_SENSOR_OPEN & 0x3Fu;
+    return any_injected(oracle, FAULT_DC_LINK_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET);
 }
 
 static void since(uint64_t *begin_ns, bool holds, uint64_t now_ns) {
@@ -274,6 +318,9 @@ static void look_at_recovery(oracle_t *oracle, const plant_t *plant) {
 
 /* True when what keeps a drive in a fault is still there: nothing to be judged. */
 static bool cause_remains(const oracle_t *oracle) {
+    if (any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_PERIOD_REGISTER_FLIPPED)) {
+        return true; /* memory that has changed: until a reset */
+    }
     const uint8_t last = oracle->causes ? oracle->cause[oracle->causes - 1] : 0;
     return last == CAUSE_WINDING_OVERLOAD || last == CAUSE_INVERTER_OVERLOAD || last == CAUSE_IDENTIFIER_CONFLICT;
 }
@@ -291,8 +338,9 @@ static bool bus_disturbed(const oracle_t *oracle) {
 
 /* A drive takes an encoder for frozen until it counts, which at rest only a hand on the shaft or a reset can end. */
 static bool held_by_encoder(const oracle_t *oracle, const plant_t *plant) {
-    const uint64_t kinds = UINT64_C(0x7F) << FAULT_ENCODER_STUCK | UINT64_C(0x7) << FAULT_SHAFT_LOCKED;
-    return (oracle->injected & kinds) && !oracle->recovered && fabs(plant->speed_rad_s) < 2.0;
+    const bool any = any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) ||
+                     any_injected(oracle, FAULT_SHAFT_LOCKED, FAULT_STATIC_FRICTION);
+    return any && !oracle->recovered && fabs(plant->speed_rad_s) < 2.0;
 }
 
 void oracle_finish(oracle_t *oracle, const plant_t *plant) {
@@ -344,7 +392,8 @@ void oracle_look(oracle_t *oracle, const plant_t *plant) {
         variable_active(oracle, BENCH_VARIABLE_STO_2, time_us)) {
         violate(oracle, "gate_on", plant->time_ns, 2, 0.0);
     }
-    if (plant->time_ns > oracle->interrupt_ns + oracle->period_ns * 5 / 2) {
+    const uint64_t longer = oracle->injected[FAULT_PERIOD_REGISTER_FLIPPED] ? 4 : 1; /* times the period, at most */
+    if (plant->time_ns > oracle->interrupt_ns + longer * oracle->period_ns * 5 / 2) {
         violate(oracle, "gate_on", plant->time_ns, 3, (double)(plant->time_ns - oracle->interrupt_ns) * 1e-3);
     }
     look_at_commands(oracle, plant);
@@ -379,7 +428,7 @@ static void judge_cause(oracle_t *oracle, const plant_t *plant) {
     uint32_t allowed = 0;
     bool any = false;
     for (unsigned kind = 1; kind < FAULT_COUNT; kind++) {
-        if (oracle->injected >> kind & 1u) {
+        if (oracle->injected[kind]) {
             allowed |= causes_of[kind];
             any = true;
         }
@@ -447,7 +496,7 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
         if (!oracle->off_seen && age_ns < 30 * MS_NS && !may_be_deaf(oracle, plant->time_ns / 1000)) {
             violate(oracle, "stopped", plant->time_ns, 0, 0.0);
         }
-    } else if (drive.state != STATE_FAULT && before == STATE_FAULT && !oracle->clear_seen &&
+    } else if (drive.state != STATE_FAULT && before == STATE_FAULT && !oracle->clear_seen && !state_changed(oracle) &&
                !may_be_deaf(oracle, plant->time_ns / 1000)) {
         violate(oracle, "no_command", plant->time_ns, 5, 0.0);
     }
@@ -480,7 +529,7 @@ void oracle_on_fault(oracle_t *oracle, const plant_t *plant, unsigned kind, bool
     if (!begins || kind >= FAULT_COUNT) {
         return;
     }
-    oracle->injected |= UINT64_C(1) << kind;
+    oracle->injected[kind] = true;
     const double pitches = plant->rotor_angle_rad * plant->machine->rotor_poles / TWO_PI;
     const unsigned sector = (unsigned)((pitches - floor(pitches)) * ORACLE_SECTORS) % ORACLE_SECTORS;
     const unsigned cell = (kind * ORACLE_STATES + oracle->drive.state % ORACLE_STATES) * ORACLE_SECTORS + sector;

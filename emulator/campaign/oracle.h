@@ -29,7 +29,8 @@
 #define ORACLE_LOOK_NS UINT64_C(20000)
 #define ORACLE_SECTORS 6
 #define ORACLE_STATES 4
-#define ORACLE_CELLS (64 * ORACLE_STATES * ORACLE_SECTORS)
+#define ORACLE_KINDS 128 /* of faults, at most */
+#define ORACLE_CELLS (ORACLE_KINDS * ORACLE_STATES * ORACLE_SECTORS)
 #define ORACLE_VIOLATIONS_MAX 4
 #define ORACLE_CAUSES_MAX 8
 
@@ -57,7 +58,7 @@ typedef struct {
     uint8_t cause[ORACLE_CAUSES_MAX]; /* first causes in their order */
     uint64_t cause_us;                /* of the first one; 0: none */
     uint64_t dark_ns;                 /* since then no gate has been on; 0: one is */
-    uint64_t injected;                /* bit: kind of fault that has begun */
+    bool injected[ORACLE_KINDS];      /* kinds of faults that have begun */
     uint8_t cell[ORACLE_CELLS / 8];
     /* Private. */
     oracle_drive_t drive;

@@ -21,6 +21,10 @@ static void background(void *context) {
     ((run_t *)context)->drive->background();
 }
 
+static void flip(void *context, memory_object_t object, uint32_t bit) {
+    ((run_t *)context)->drive->flip(object, bit);
+}
+
 static void restart(void *context) {
     run_t *run = context;
     run->drive->start(run->world, &run->rig.board); /* which has accepted this configuration */
@@ -68,6 +72,8 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
                                      .deferred_interrupt = deferred_interrupt,
                                      .background = background,
                                      .restart = restart,
+                                     .flip = flip,
+                                     .flip_objects = drive->flip_objects,
                                      .context = run};
     oracle_init(&run->oracle, world, &run->sender, 1000000000u / world->control_rate_hz);
     rig_join(&run->rig, &firmware);

@@ -22,7 +22,7 @@ enum {
 };
 
 #define FAULT_DRAWS 8   /* random numbers of a kind of fault */
-#define FAULT_SHARE 0.1 /* of the kinds, on average, that a seed has */
+#define FAULT_SHARE 0.065 /* of the kinds, on average, that a seed has */
 #define FAULTS_MAX 6
 
 static int32_t raw_of(unsigned variable, double value) {
@@ -193,6 +193,24 @@ static double attribute_of(const world_t *world, unsigned kind, double unit) {
         return 10.0 + 90.0 * unit;
     case FAULT_SUPPLY_RIPPLE:
         return fmin(500.0, machine->supply_voltage_V * 0.6 * unit);
+    case FAULT_WINDING_TO_EARTH:
+        return 0.001 * exp(log(1000.0) * unit);
+    case FAULT_WINDING_TEMPERATURE_SENSOR_STUCK:
+    case FAULT_INVERTER_TEMPERATURE_SENSOR_STUCK:
+        return floor(unit * (double)(1u << world->adc_bits));
+    case FAULT_WINDING_TEMPERATURE_SENSOR_OFFSET:
+    case FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET:
+        return (unit - 0.5) * 400.0;
+    case FAULT_INTERRUPT_LATE:
+        return exp(log(5.0) + log(1e4) * unit);
+    case FAULT_LIMIT_FLIPPED:
+    case FAULT_CONSTANT_FLIPPED:
+    case FAULT_STATE_FLIPPED:
+    case FAULT_FAULT_LATCH_FLIPPED:
+    case FAULT_PERIOD_REGISTER_FLIPPED:
+        return floor(unit * (fault_kinds[kind].raw_maximum + 1.0));
+    case FAULT_CLOCK_DRIFT:
+        return (unit - 0.5) * 200.0;
     default:
         return 0.0;
     }
@@ -200,7 +218,9 @@ static double attribute_of(const world_t *world, unsigned kind, double unit) {
 
 static bool possible(const world_t *world, unsigned kind) {
     const machine_t *machine = &world->machine->image.machine;
-    return fault_kinds[kind].name && !(kind == FAULT_CHOPPER_OPEN && (machine->dc_link.capacitance_F == 0.0 ||
+    /* The host has no program and no stack of the drive alone. */
+    const bool of_target = kind == FAULT_CODE_FLIPPED || kind == FAULT_STACK_GUARD_FLIPPED;
+    return fault_kinds[kind].name && !of_target && !(kind == FAULT_CHOPPER_OPEN && (machine->dc_link.capacitance_F == 0.0 ||
                                                                       machine->dc_link.chopper_resistance_ohm == 0.0));
 }
 

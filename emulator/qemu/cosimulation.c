@@ -42,10 +42,9 @@ static void resume_drive(void) {
     }
 }
 
-/* Back to the drive, until its next MAILBOX_NEXT. */
-static void deliver_event(mailbox_event_t event) {
+/* Registers as of now. */
+static void update_registers(void) {
     const board_t *board = &simulation.rigs[0].board;
-    mailbox->event = event;
     mailbox->time_us = hal_time_us(&host);
     mailbox->receive_waiting = board->received_pushed - board->received_popped;
     mailbox->receive_overflows = board->receive_overflows;
@@ -58,6 +57,12 @@ static void deliver_event(mailbox_event_t event) {
     mailbox->reference_us = board_reference_us(board);
     mailbox->registers_intact = board_registers_intact(board);
     memcpy(mailbox->temperature_code, board->temperature_code, sizeof mailbox->temperature_code);
+}
+
+/* Back to the drive, until its next MAILBOX_NEXT. */
+static void deliver_event(mailbox_event_t event) {
+    mailbox->event = event;
+    update_registers();
     resume_drive();
 }
 
@@ -158,6 +163,7 @@ bool cosimulation_open(mailbox_t *shared, const options_t *options, bool timed) 
     mailbox->adc_bits = hal_adc_bits(&host);
     mailbox->encoder_bits = hal_encoder_bits(&host);
     mailbox->timed = timed;
+    update_registers();
     return true;
 }
 

@@ -58,8 +58,8 @@ void self_test_configured(self_test_t *test, const control_parameters_t *paramet
 /* False when number, mask and state of the latched fault contradict each other. [background, in a critical section] */
 bool self_test_latch_intact(const state_machine_t *state_machine);
 
-/* The checks that are due. [background] */
-void self_test_step(self_test_t *test, const hal_t *hal, const control_parameters_t *parameters, uint32_t time_us);
+/* The checks that are due; masks the interrupts while it reads both clocks. [background] */
+void self_test_step(self_test_t *test, hal_t *hal, const control_parameters_t *parameters, uint32_t time_us);
 
 /* Fault mask. */
 uint32_t self_test_faults(const self_test_t *test);

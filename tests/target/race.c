@@ -236,7 +236,7 @@ bool self_test_latch_intact(const state_machine_t *state_machine) {
     return true;
 }
 
-void self_test_step(self_test_t *test, const hal_t *hal, const control_parameters_t *parameters, uint32_t time_us) {
+void self_test_step(self_test_t *test, hal_t *hal, const control_parameters_t *parameters, uint32_t time_us) {
     (void)test, (void)hal, (void)parameters, (void)time_us;
 }
 

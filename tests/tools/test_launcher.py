@@ -31,7 +31,8 @@ def assert_usage_error(result, *expected_texts: str) -> None:
     ("arguments", "expected_texts"),
     [
         ([], ["COMMAND"]),
-        (["fly"], ["fly", "must be one of demo, test, sim, run, log, monitor, view, benchmark"]),
+        (["fly"], ["fly", "must be one of demo, test, sim, run, log, monitor, view, tab, benchmark, compare, sweep, "
+                          "machine, pil, campaign, replay, wheel, parameters"]),
         (["sim", "--pcae", "free"], ["unrecognised argument --pcae"]),
         (["sim", "--pace", "fast"], ["--pace fast", "lockstep, realtime, free or xN"]),
         (["sim", "--controller", "pid"], ["--controller pid", "traditional, paper or salient"]),

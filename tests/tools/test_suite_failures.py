@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,8 @@ from xml.etree import ElementTree
 import can
 import numpy as np
 import pytest
+
+from salient.bench.failure import changes
 
 SUITE = '''
 import os, signal
@@ -121,7 +124,8 @@ def test_failure_leaves_its_folder_and_replays(suite, name):
         assert "first_fault" not in bench
     before = [text.partition(" s ")[2] for text in bench["changes_before_the_failure"]]
     if name == "test_call":
-        assert any("load_torque_Nm: 0 Nm -> 4 Nm" in change for change in before), before
+        assert any("load_torque_Nm: 0 N m -> 4 N m" in change for change in before), before
+        assert not any("torque_reference_Nm" in change for change in before), before
 
     replay = subprocess.run(["bash", "-c", values["salient_replay"]], cwd=failure["replay_in"], capture_output=True,
                             text=True)
@@ -151,3 +155,16 @@ def test_passed_test_leaves_nothing(tmp_path, bench):
 
 def test_recordings_of_passed_tests_are_removed(tmp_path_factory):
     assert list(tmp_path_factory.getbasetemp().glob("test_passed_test_leaves_nothing*/*.npy")) == []
+
+
+def test_torque_reference_is_a_change_in_torque_mode_only(make_bench):
+    bench = make_bench(machine="saturating")
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.1)
+    in_speed_mode = changes(bench, bench.time_s)
+    bench.drive.torque_reference_Nm = 2.0
+    bench.run_for(0.04)
+    assert not any("torque_reference_Nm" in change for change in in_speed_mode)
+    found = changes(bench, bench.time_s)
+    assert any("DRIVE_STATUS.mode: speed -> torque" in change for change in found)
+    assert any(re.search(r"DRIVE_TORQUE\.torque_reference_Nm: .* -> 1\.996", change) for change in found), found

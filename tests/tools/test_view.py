@@ -24,6 +24,7 @@ from playwright.sync_api import sync_playwright
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from salient.bench import failure
 from salient.bus.signals import drive_database, rig_database
 from salient.paths import BUILD, ROOT
 from salient.view.commands import COMMANDS
@@ -460,7 +461,7 @@ def test_a_failure_folder_is_replayed_with_its_machine_and_its_values(browser, m
     bench.drive.speed_reference_rpm = 600
     bench.at(0.3).load_torque_Nm = 6
     bench.run_for(0.5)
-    bench.save(tmp_path / "0", "pytest")
+    failure.save(bench, tmp_path / "0", {"replay": "pytest"}, bench.options)
     visitor = Visitor(browser, serve("--replay", tmp_path))
     visitor.wait(f"salient.store.frames >= {len(bench.log)}")
     page = visitor.page

@@ -17,7 +17,10 @@ extern "C" {
 struct hal {
     hal_memory_t memory{};
     bool registers_intact = true;
+    uint32_t time_us = 0;
     uint32_t reference_us = 77;
+    uint32_t interrupted_us = 0; // by interrupts, before the next critical section
+    bool masked = false;
 };
 
 extern "C" {
@@ -29,6 +32,19 @@ bool hal_registers_intact(const hal_t *hal) {
 }
 uint32_t hal_time_reference_us(const hal_t *hal) {
     return hal->reference_us;
+}
+uint32_t hal_time_us(const hal_t *hal) {
+    EXPECT_TRUE(hal->masked);
+    return hal->time_us;
+}
+void hal_critical_enter(hal_t *hal) {
+    hal->masked = true;
+    hal->time_us += hal->interrupted_us;
+    hal->reference_us += hal->interrupted_us;
+    hal->interrupted_us = 0;
+}
+void hal_critical_leave(hal_t *hal) {
+    hal->masked = false;
 }
 }
 
@@ -63,13 +79,18 @@ class SelfTest : public testing::Test {
         self_test_configured(&test, &constants);
     }
 
+    void step() {
+        hal.time_us = time_us;
+        self_test_step(&test, &hal, &constants, time_us);
+    }
+
     // Calls until a check fails, `limit_us` at most; the time of the last one since the first.
     uint32_t run(uint32_t limit_us, double reference_rate = 1.0) {
         const uint32_t begin_us = time_us, reference_us = hal.reference_us;
         while (test.failed == 0 && time_us - begin_us < limit_us) {
             time_us += PERIOD_US;
             hal.reference_us = reference_us + uint32_t((time_us - begin_us) * reference_rate);
-            self_test_step(&test, &hal, &constants, time_us);
+            step();
         }
         return time_us - begin_us;
     }
@@ -155,7 +176,8 @@ TEST_F(SelfTest, a_changed_register_fails_within_a_millisecond_and_stays_failed)
     EXPECT_LE(run(1000000), SELF_TEST_STEP_US);
     EXPECT_EQ(test.failed, SELF_TEST_REGISTERS);
     hal.registers_intact = true;
-    self_test_step(&test, &hal, &constants, time_us += 2000);
+    time_us += 2000;
+    step();
     EXPECT_EQ(self_test_faults(&test), FAULT_BIT(FAULT_MEMORY));
 }
 
@@ -178,9 +200,23 @@ TEST_F(SelfTest, the_clock_passes_again_when_it_is_right) {
     ASSERT_EQ(test.failed, SELF_TEST_CLOCK);
     for (unsigned k = 0; k < 1000; k++) {
         hal.reference_us += PERIOD_US;
-        self_test_step(&test, &hal, &constants, time_us += PERIOD_US);
+        time_us += PERIOD_US;
+        step();
     }
     EXPECT_EQ(test.failed, 0u);
+}
+
+TEST_F(SelfTest, the_clock_passes_when_interrupts_hold_the_background_between_the_pass_and_its_reading) {
+    begin();
+    for (unsigned k = 0; k < 10000; k++) {
+        time_us += PERIOD_US;
+        hal.reference_us += PERIOD_US;
+        hal.interrupted_us = k % 3 == 0 ? 3000 : 0;
+        const uint32_t held_us = hal.interrupted_us;
+        step();
+        time_us += held_us - hal.interrupted_us;
+        EXPECT_EQ(test.failed, 0u);
+    }
 }
 
 TEST_F(SelfTest, a_port_without_code_and_stack_passes) {

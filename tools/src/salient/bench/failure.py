@@ -81,7 +81,8 @@ def first_fault(session: Session) -> tuple[float, str] | None:
 
 def changes(session: Session, time_s: float) -> list[str]:
     """What changed around a moment, in order: signals with named values of drive and test bench, the load, and the
-    variables that were set."""
+    variables that were set. The torque reference in torque mode only: in speed mode the speed controller changes it all
+    the time."""
     from_s, to_s = time_s - BEFORE_S, time_s + AFTER_S
     found: list[tuple[float, str]] = []
     for table in (session.telemetry, session.truth):
@@ -93,12 +94,20 @@ def changes(session: Session, time_s: float) -> list[str]:
                                                                          "torque_reference_Nm"):
                 continue
             for at in np.flatnonzero(np.diff(signal.value)) + 1:
+                if name == "DRIVE_TORQUE.torque_reference_Nm" and not _in_torque_mode(session, signal.time_s[at]):
+                    continue
                 if from_s <= signal.time_s[at] <= to_s:
                     before, after = ((signal.choices or {}).get(int(value), f"{value:g}") if signal.choices
                                      else f"{value:g} {signal.unit}".rstrip() for value in signal.value[at - 1:at + 1])
                     found.append((float(signal.time_s[at]), f"{name}: {before} -> {after}"))
     found += _settings(session, from_s, to_s)
     return [f"{at_s:.6f} s {text}" for at_s, text in sorted(found)]
+
+
+def _in_torque_mode(session: Session, time_s: float) -> bool:
+    mode = session.telemetry["DRIVE_STATUS.mode"]
+    at = int(np.searchsorted(mode.time_s, time_s, side="right")) - 1
+    return at >= 0 and (mode.choices or {}).get(int(mode.value[at])) == "torque"
 
 
 def _settings(session: Session, from_s: float, to_s: float) -> list[tuple[float, str]]:

@@ -14,8 +14,11 @@ import zlib
 from pathlib import Path
 from urllib.parse import quote
 
+import numpy as np
+
 from salient.errors import UsageError
 from salient.machine.cache import machine_image
+from salient.machine.image import FLUX_MAP, HEADER
 from salient.machine.path import machine_path
 from salient.paths import BUILD, TAB_PAGE
 from salient.tab.build_id import build_id
@@ -88,10 +91,30 @@ def _module_text(path: Path) -> str:
 
 
 def _packed(machines: list[str]) -> str:
-    """Base64 of a zlib stream: size of a JSON text, the text, and the files whose sizes it has."""
+    """Base64 of a zlib stream: size of a JSON text, the text, and the files whose sizes it has; the doubles of a flux
+    map, from maps[i] of image i on, by _transposed."""
     images = [machine_image(machine).read_bytes() for machine in machines]
-    files = [MODULE.read_bytes(), *images]
+    maps = [_flux_map_at(image) for image in images]
+    files = [MODULE.read_bytes(), *map(_transposed, images, maps)]
     text = json.dumps({**shared_data(), **machine_data(machines), "build": build_id(), "version": VERSION,
-                       "files": [len(data) for data in files]}, separators=(",", ":")).encode()
+                       "files": [len(data) for data in files], "maps": maps}, separators=(",", ":")).encode()
     content = b"".join([struct.pack("<I", len(text)), text, *files])
     return base64.b64encode(zlib.compress(content, 9)).decode()
+
+
+def _flux_map_at(image: bytes) -> list[int]:
+    """Where an image has its flux map, and how many doubles, which may be 0."""
+    *_, tables, plant, flux_map, _ = HEADER.unpack_from(image)
+    if flux_map not in (0, FLUX_MAP.size):
+        raise ValueError(f"flux map of {flux_map} bytes")
+    return [HEADER.size + tables + plant, flux_map // 8]
+
+
+def _transposed(image: bytes, place: list[int]) -> bytes:
+    """The image with its doubles as differences of neighbours, taken as whole numbers modulo 2^64, the bytes of equal
+    weight together: a fifth smaller when packed, and exact (page/data.js)."""
+    start, count = place
+    end = start + 8 * count
+    numbers = np.frombuffer(image[start:end], "<u8")
+    differences = np.diff(numbers, prepend=np.zeros(1, "<u8"))
+    return image[:start] + differences.view("u1").reshape(count, 8).T.tobytes() + image[end:]
