@@ -109,7 +109,7 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     /* What is judged by a wrong limit or constant before the change is noticed may fail in any way. */
     [FAULT_LIMIT_FLIPPED] = UINT32_MAX,
     [FAULT_CONSTANT_FLIPPED] = UINT32_MAX,
-    [FAULT_STATE_FLIPPED] = BIT(CAUSE_MEMORY) | BIT(0),
+    [FAULT_STATE_FLIPPED] = UINT32_MAX,       /* another state than that of the checks, for its duration */
     [FAULT_FAULT_LATCH_FLIPPED] = UINT32_MAX, /* another name of what is latched */
     [FAULT_CODE_FLIPPED] = BIT(CAUSE_CODE),
     [FAULT_STACK_GUARD_FLIPPED] = BIT(CAUSE_MEMORY),
@@ -493,7 +493,8 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
         enter_run(oracle, plant);
     } else if (drive.state == STATE_READY && before == STATE_RUN) {
         const uint64_t age_ns = plant->time_ns > oracle->run_ns ? plant->time_ns - oracle->run_ns : 0;
-        if (!oracle->off_seen && age_ns < 30 * MS_NS && !may_be_deaf(oracle, plant->time_ns / 1000)) {
+        if (!oracle->off_seen && age_ns < 30 * MS_NS && !state_changed(oracle) &&
+            !may_be_deaf(oracle, plant->time_ns / 1000)) {
             violate(oracle, "stopped", plant->time_ns, 0, 0.0);
         }
     } else if (drive.state != STATE_FAULT && before == STATE_FAULT && !oracle->clear_seen && !state_changed(oracle) &&
