@@ -243,8 +243,7 @@ static bool may_be_deaf(const oracle_t *oracle, uint64_t time_us) {
             return true;
         }
     }
-    return other_sender(oracle, false, time_us) ||
-           any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM);
+    return other_sender(oracle, false, time_us) || any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM);
 }
 
 static void look_at_commands(oracle_t *oracle, const plant_t *plant) {

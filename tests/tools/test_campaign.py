@@ -62,7 +62,7 @@ def test_seeds_differ_in_machine_controller_and_events() -> None:
     assert min(numbers) <= 1 and 4 <= max(numbers) <= 6 and 2.0 < sum(numbers) / len(numbers) < 5.0
 
 
-@pytest.mark.parametrize("seed", [2, 819])
+@pytest.mark.parametrize("seed", [2, 235, 819])
 def test_a_seed_has_the_same_bits_on_the_usual_bench(tmp_path: Path, seed: int) -> None:
     again = replay(seed, folder=tmp_path)
     assert again.equal and again.campaign["causes"]
