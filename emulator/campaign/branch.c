@@ -43,15 +43,31 @@ static const struct {
     unsigned kind;
     double value;
 } attributes[] = {
-    {FAULT_WINDING_SHORTED, 20.0},       {FAULT_CURRENT_SENSOR_STUCK, 1500.0}, {FAULT_CURRENT_SENSOR_GAIN, 0.3},
-    {FAULT_CURRENT_SENSOR_OFFSET, 20.0}, {FAULT_CURRENT_SENSOR_SWAPPED, 1.0},  {FAULT_DC_LINK_SENSOR_STUCK, 0.0},
-    {FAULT_DC_LINK_SENSOR_GAIN, 0.5},    {FAULT_DC_LINK_SENSOR_OFFSET, 100.0}, {FAULT_ENCODER_JUMP, 5.0},
-    {FAULT_ENCODER_LOST_COUNTS, 5000.0}, {FAULT_ENCODER_NOISE, 1.0},           {FAULT_ENCODER_SLIP, 60.0},
-    {FAULT_COULOMB_FRICTION, 30.0},      {FAULT_STATIC_FRICTION, 30.0},        {FAULT_SUPPLY_SAGGED, 60.0},
-    {FAULT_SUPPLY_SURGED, 50.0},         {FAULT_SUPPLY_RIPPLE, 100.0},
-    {FAULT_WINDING_TO_EARTH, 0.001},     {FAULT_INTERRUPT_LATE, 5000.0},       {FAULT_LIMIT_FLIPPED, 12.0},
-    {FAULT_CONSTANT_FLIPPED, 1000.0},    {FAULT_STATE_FLIPPED, 0.0},           {FAULT_FAULT_LATCH_FLIPPED, 0.0},
-    {FAULT_CLOCK_DRIFT, 6.0},            {FAULT_PERIOD_REGISTER_FLIPPED, 3.0},
+    {FAULT_WINDING_SHORTED, 20.0},
+    {FAULT_CURRENT_SENSOR_STUCK, 1500.0},
+    {FAULT_CURRENT_SENSOR_GAIN, 0.3},
+    {FAULT_CURRENT_SENSOR_OFFSET, 20.0},
+    {FAULT_CURRENT_SENSOR_SWAPPED, 1.0},
+    {FAULT_DC_LINK_SENSOR_STUCK, 0.0},
+    {FAULT_DC_LINK_SENSOR_GAIN, 0.5},
+    {FAULT_DC_LINK_SENSOR_OFFSET, 100.0},
+    {FAULT_ENCODER_JUMP, 5.0},
+    {FAULT_ENCODER_LOST_COUNTS, 5000.0},
+    {FAULT_ENCODER_NOISE, 1.0},
+    {FAULT_ENCODER_SLIP, 60.0},
+    {FAULT_COULOMB_FRICTION, 30.0},
+    {FAULT_STATIC_FRICTION, 30.0},
+    {FAULT_SUPPLY_SAGGED, 60.0},
+    {FAULT_SUPPLY_SURGED, 50.0},
+    {FAULT_SUPPLY_RIPPLE, 100.0},
+    {FAULT_WINDING_TO_EARTH, 0.001},
+    {FAULT_INTERRUPT_LATE, 5000.0},
+    {FAULT_LIMIT_FLIPPED, 12.0},
+    {FAULT_CONSTANT_FLIPPED, 1000.0},
+    {FAULT_STATE_FLIPPED, 0.0},
+    {FAULT_FAULT_LATCH_FLIPPED, 0.0},
+    {FAULT_CLOCK_DRIFT, 6.0},
+    {FAULT_PERIOD_REGISTER_FLIPPED, 3.0},
     {FAULT_WINDING_TEMPERATURE_SENSOR_STUCK, 2000.0},
     {FAULT_INVERTER_TEMPERATURE_SENSOR_STUCK, 2000.0},
     {FAULT_WINDING_TEMPERATURE_SENSOR_OFFSET, -50.0},
@@ -86,7 +102,8 @@ static unsigned list_variants(variant_t variants[VARIANTS_MAX], const machine_t 
     unsigned count = 0;
     for (unsigned kind = 1; kind < FAULT_COUNT; kind++) {
         const bool of_target = kind == FAULT_CODE_FLIPPED || kind == FAULT_STACK_GUARD_FLIPPED; /* not of the host */
-        if (!fault_kinds[kind].name || of_target || (kind == FAULT_CHOPPER_OPEN && machine->dc_link.chopper_resistance_ohm == 0.0)) {
+        if (!fault_kinds[kind].name || of_target ||
+            (kind == FAULT_CHOPPER_OPEN && machine->dc_link.chopper_resistance_ohm == 0.0)) {
             continue;
         }
         for (unsigned leg = 0; leg <= fault_kinds[kind].has_leg; leg++) {

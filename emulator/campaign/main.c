@@ -67,8 +67,8 @@ static void flip(memory_object_t object, uint32_t bit) {
     memory_flip(&drive, object, bit);
 }
 
-static const run_drive_t firmware = {start, control_interrupt,   deferred_interrupt, background,
-                                     flip,  MEMORY_FLIP_OBJECTS, view};
+static const run_drive_t firmware = {
+    start, control_interrupt, deferred_interrupt, background, flip, MEMORY_FLIP_OBJECTS, view};
 
 /* --- Machines --- */
 

@@ -109,7 +109,7 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     /* What is judged by a wrong limit or constant before the change is noticed may fail in any way. */
     [FAULT_LIMIT_FLIPPED] = UINT32_MAX,
     [FAULT_CONSTANT_FLIPPED] = UINT32_MAX,
-    [FAULT_STATE_FLIPPED] = BIT(CAUSE_MEMORY) | BIT(0),
+    [FAULT_STATE_FLIPPED] = UINT32_MAX,       /* another state than that of the checks, for its duration */
     [FAULT_FAULT_LATCH_FLIPPED] = UINT32_MAX, /* another name of what is latched */
     [FAULT_CODE_FLIPPED] = BIT(CAUSE_CODE),
     [FAULT_STACK_GUARD_FLIPPED] = BIT(CAUSE_MEMORY),
@@ -243,8 +243,7 @@ static bool may_be_deaf(const oracle_t *oracle, uint64_t time_us) {
             return true;
         }
     }
-    return other_sender(oracle, false, time_us) ||
-           any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM);
+    return other_sender(oracle, false, time_us) || any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM);
 }
 
 static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
@@ -493,7 +492,8 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
         enter_run(oracle, plant);
     } else if (drive.state == STATE_READY && before == STATE_RUN) {
         const uint64_t age_ns = plant->time_ns > oracle->run_ns ? plant->time_ns - oracle->run_ns : 0;
-        if (!oracle->off_seen && age_ns < 30 * MS_NS && !may_be_deaf(oracle, plant->time_ns / 1000)) {
+        if (!oracle->off_seen && age_ns < 30 * MS_NS && !state_changed(oracle) &&
+            !may_be_deaf(oracle, plant->time_ns / 1000)) {
             violate(oracle, "stopped", plant->time_ns, 0, 0.0);
         }
     } else if (drive.state != STATE_FAULT && before == STATE_FAULT && !oracle->clear_seen && !state_changed(oracle) &&

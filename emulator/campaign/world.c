@@ -21,7 +21,7 @@ enum {
     STREAM_GATES,
 };
 
-#define FAULT_DRAWS 8   /* random numbers of a kind of fault */
+#define FAULT_DRAWS 8     /* random numbers of a kind of fault */
 #define FAULT_SHARE 0.065 /* of the kinds, on average, that a seed has */
 #define FAULTS_MAX 6
 
@@ -220,8 +220,9 @@ static bool possible(const world_t *world, unsigned kind) {
     const machine_t *machine = &world->machine->image.machine;
     /* The host has no program and no stack of the drive alone. */
     const bool of_target = kind == FAULT_CODE_FLIPPED || kind == FAULT_STACK_GUARD_FLIPPED;
-    return fault_kinds[kind].name && !of_target && !(kind == FAULT_CHOPPER_OPEN && (machine->dc_link.capacitance_F == 0.0 ||
-                                                                      machine->dc_link.chopper_resistance_ohm == 0.0));
+    return fault_kinds[kind].name && !of_target &&
+           !(kind == FAULT_CHOPPER_OPEN &&
+             (machine->dc_link.capacitance_F == 0.0 || machine->dc_link.chopper_resistance_ohm == 0.0));
 }
 
 static void draw_fault(world_t *world, unsigned kind, uint64_t last_us) {

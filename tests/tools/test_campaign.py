@@ -62,7 +62,7 @@ def test_seeds_differ_in_machine_controller_and_events() -> None:
     assert min(numbers) <= 1 and 4 <= max(numbers) <= 6 and 2.0 < sum(numbers) / len(numbers) < 5.0
 
 
-@pytest.mark.parametrize("seed", [2, 819])
+@pytest.mark.parametrize("seed", [2, 235, 819])
 def test_a_seed_has_the_same_bits_on_the_usual_bench(tmp_path: Path, seed: int) -> None:
     again = replay(seed, folder=tmp_path)
     assert again.equal and again.campaign["causes"]
@@ -86,13 +86,15 @@ def test_a_planted_bug_is_found_within_seconds_and_shrinks() -> None:
     assert 0.001 < found.processor_s < 10.0 and 1 <= len(found.events) <= 3
 
 
-SLOW_OR_SILENT = {"load_dropped", "static_friction"}
+SLOW_OR_SILENT = {"load_dropped", "static_friction", "winding_temperature_sensor_offset",
+                  "inverter_temperature_sensor_offset"}
 """Faults that change nothing which a drive should answer."""
 
 
 def test_every_fault_is_found_at_ticks_all_over_an_electrical_period() -> None:
     found = branches(2, 600, 8, 0, 500, 50)
-    assert len(found) == 39
+    assert len(found) == 56
+    assert not {"code_flipped", "stack_guard_flipped"} & {row["fault"] for row in found}  # unsupported on the host
     assert sum(row["violations"] for row in found) == 0
     for row in found:
         name = row["fault"]
