@@ -2,7 +2,6 @@
 
 #include <assert.h>
 #include <stdbool.h>
-#include <string.h>
 
 #include "drive/fault.h"
 #include "fixed/compiler.h"
@@ -18,15 +17,16 @@
 static_assert(sizeof(protection_parameters_t) % sizeof(uint32_t) == 0, "whole words");
 static_assert(sizeof(control_parameters_t) % sizeof(uint32_t) == 0, "whole words");
 
+/* A word of an object of any type. */
+typedef uint32_t MAY_ALIAS any_word_t;
+
 /* Different after a change of any one word. */
 static uint32_t add(uint32_t sum, uint32_t word) {
     return (sum << 1 | sum >> 31) + word;
 }
 
-static uint32_t word(const void *object, unsigned index) {
-    uint32_t value;
-    memcpy(&value, (const uint8_t *)object + index * sizeof value, sizeof value);
-    return value;
+static inline uint32_t word(const void *object, unsigned index) {
+    return ((const any_word_t *)object)[index];
 }
 
 COLD void self_test_init(self_test_t *test, const hal_t *hal, uint32_t time_us) {
