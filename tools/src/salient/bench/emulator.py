@@ -27,7 +27,8 @@ class EmulatorProcess:
     def __init__(self, config: BenchConfig, can: str, prefix: Sequence[str] = ()) -> None:
         self.config = replace(config, can=can)
         self.command = [*prefix, *command_line(self.config)]
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - read as long as the object exists
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - read until close()
+        self._error_text = ""
         self._process = subprocess.Popen(
             [*self.command, "--follow-stdin"],
             stdin=subprocess.PIPE,
@@ -54,8 +55,10 @@ class EmulatorProcess:
     @property
     def errors(self) -> str:
         """Its standard error so far."""
-        self._errors.seek(0)
-        return self._errors.read().decode(errors="replace").strip()
+        if not self._errors.closed:
+            self._errors.seek(0)
+            self._error_text = self._errors.read().decode(errors="replace").strip()
+        return self._error_text
 
     def close(self) -> None:
         """Ends it and waits: recording finished, socket removed. EmulatorError when its exit code is not 0."""
@@ -63,6 +66,8 @@ class EmulatorProcess:
             self._stdin.close()
             self._process.wait()
         self._stdout.close()
+        self._error_text = self.errors
+        self._errors.close()
         if self._process.returncode != 0:
             self._raise_failure(self._process.returncode)
 
