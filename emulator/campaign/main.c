@@ -19,56 +19,35 @@
 
 #include "campaign/branch.h"
 #include "campaign/run.h"
-#include "drive.h"
-#include "host/hal_host.h"
-#include "host/memory_flip.h"
+#include "host/host_drive.h"
 
 #define EXIT_USAGE 2
 
 static world_machine_t machines[WORLD_MACHINES_MAX];
 static unsigned machine_count;
-static drive_t drive;
-static hal_t hal;
+static host_drive_t host;
 static run_t run;
 static world_t world;
 machine_tables_t machine_tables;
 
 /* --- The drive --- */
 
-static bool start(const world_t *of, board_t *board) {
-    hal.board = board;
+static bool start(const world_t *of, board_t *board, rig_firmware_t *firmware) {
     const drive_config_t config = {.control_rate_hz = of->control_rate_hz,
                                    .controller = (drive_controller_t)of->controller,
                                    .telemetry_period_ms = 4};
     return machine_image_tables(&of->machine->image, &machine_tables_structure, &machine_tables) &&
-           drive_init(&drive, &hal, &config);
-}
-
-static void control_interrupt(void) {
-    drive_control_interrupt(&drive);
-}
-
-static void deferred_interrupt(void) {
-    drive_deferred_interrupt(&drive);
-}
-
-static void background(void) {
-    drive_background(&drive);
+           host_drive_start(&host, board, &config, firmware);
 }
 
 static oracle_drive_t view(void) {
-    const state_machine_t *state_machine = &drive.control.state_machine;
+    const state_machine_t *state_machine = &host.drive.control.state_machine;
     return (oracle_drive_t){.state = (uint8_t)state_machine->state,
                             .fault = (uint8_t)state_machine->record.fault,
                             .checks = (uint32_t)state_machine->record.fault_mask};
 }
 
-static void flip(memory_object_t object, uint32_t bit) {
-    memory_flip(&drive, object, bit);
-}
-
-static const run_drive_t firmware = {
-    start, control_interrupt, deferred_interrupt, background, flip, MEMORY_FLIP_OBJECTS, view};
+static const run_drive_t drive = {start, view};
 
 /* --- Machines --- */
 
@@ -148,7 +127,7 @@ static int run_seed(const arguments_t *arguments, uint64_t seed) {
         fprintf(stderr, "salient: %s: %s\n", arguments->frames_file, strerror(errno));
         return EXIT_USAGE;
     }
-    if (run_begin(&run, &world, &firmware, record)) {
+    if (run_begin(&run, &world, &drive, record)) {
         run_to_end(&run);
         print_result();
     } else {
@@ -249,7 +228,7 @@ int main(int argc, char *argv[]) {
         return EXIT_USAGE;
     }
     if (arguments.branches) {
-        return branch_all(&arguments.branch, &run, &world, machines, &firmware);
+        return branch_all(&arguments.branch, &run, &world, machines, &drive);
     }
     int code = 0;
     char line[64];

@@ -4,30 +4,20 @@ static void look(void *context, const plant_t *plant) {
     oracle_look(&((run_t *)context)->oracle, plant);
 }
 
-static void control_interrupt(void *context) {
+static void before_interrupt(void *context) {
     run_t *run = context;
     if (run->before_interrupt) {
         run->before_interrupt(run);
     }
-    run->drive->control_interrupt();
+}
+
+static void after_interrupt(void *context) {
+    run_t *run = context;
     oracle_after_interrupt(&run->oracle, &run->rig.plant, run->drive->view());
 }
 
-static void deferred_interrupt(void *context) {
-    ((run_t *)context)->drive->deferred_interrupt();
-}
-
-static void background(void *context) {
-    ((run_t *)context)->drive->background();
-}
-
-static void flip(void *context, memory_object_t object, uint32_t bit) {
-    ((run_t *)context)->drive->flip(object, bit);
-}
-
-static void restart(void *context) {
+static void after_restart(void *context) {
     run_t *run = context;
-    run->drive->start(run->world, &run->rig.board); /* which has accepted this configuration */
     oracle_reset(&run->oracle, run->drive->view());
 }
 
@@ -65,16 +55,11 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
     };
     pacing_parse(&config.pacing, "lockstep");
     rig_init(&run->rig, &config);
-    if (!drive->start(world, &run->rig.board)) {
+    rig_firmware_t firmware;
+    if (!drive->start(world, &run->rig.board, &firmware)) {
         return false;
     }
-    const rig_firmware_t firmware = {.control_interrupt = control_interrupt,
-                                     .deferred_interrupt = deferred_interrupt,
-                                     .background = background,
-                                     .restart = restart,
-                                     .flip = flip,
-                                     .flip_objects = drive->flip_objects,
-                                     .context = run};
+    run->rig.observer = (rig_observer_t){before_interrupt, after_interrupt, after_restart, run};
     oracle_init(&run->oracle, world, &run->sender, 1000000000u / world->control_rate_hz);
     rig_join(&run->rig, &firmware);
     plant_observe(&run->rig.plant, ORACLE_LOOK_NS / 2, ORACLE_LOOK_NS, look, run);

@@ -5,17 +5,11 @@
 #include "campaign/oracle.h"
 #include "campaign/sender.h"
 #include "campaign/world.h"
-#include "rig/memory_object.h"
 #include "rig/rig.h"
 
-/* The firmware. start: from reset, with the machine of the world; false when it rejects the configuration. */
+/* The drive. start: from reset, with the machine of the world; false when it rejects the configuration. */
 typedef struct {
-    bool (*start)(const world_t *world, board_t *board);
-    void (*control_interrupt)(void);
-    void (*deferred_interrupt)(void);
-    void (*background)(void);
-    void (*flip)(memory_object_t object, uint32_t bit);
-    uint32_t flip_objects; /* as of rig_firmware_t */
+    bool (*start)(const world_t *world, board_t *board, rig_firmware_t *firmware);
     oracle_drive_t (*view)(void);
 } run_drive_t;
 

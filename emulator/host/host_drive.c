@@ -30,15 +30,18 @@ static void flip(void *context, memory_object_t object, uint32_t bit) {
     memory_flip(&((host_drive_t *)context)->drive, object, bit);
 }
 
-bool host_drive_start(host_drive_t *host, board_t *board, const options_t *options, unsigned number,
-                      rig_firmware_t *firmware) {
-    host->hal.board = board;
-    host->config = (drive_config_t){
+drive_config_t host_drive_config(const options_t *options, unsigned number) {
+    return (drive_config_t){
         .control_rate_hz = options->control_rate_hz,
         .controller = (drive_controller_t)options->controller_index,
         .node = options->node + number,
         .telemetry_period_ms = options->telemetry_period_ms,
     };
+}
+
+bool host_drive_start(host_drive_t *host, board_t *board, const drive_config_t *config, rig_firmware_t *firmware) {
+    host->hal.board = board;
+    host->config = *config;
     *firmware = (rig_firmware_t){.control_interrupt = control_interrupt,
                                  .deferred_interrupt = deferred_interrupt,
                                  .background = background,

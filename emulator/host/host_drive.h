@@ -16,9 +16,11 @@ typedef struct {
     drive_config_t config;
 } host_drive_t;
 
-/* Starts the firmware of drive `number` of the bench on the board of its rig; `firmware` is then for rig_join. False
- * when the drive rejects its configuration. */
-bool host_drive_start(host_drive_t *host, board_t *board, const options_t *options, unsigned number,
-                      rig_firmware_t *firmware);
+/* The configuration of drive `number` of the bench by the options of the command line. */
+drive_config_t host_drive_config(const options_t *options, unsigned number);
+
+/* Starts the firmware of a drive on the board of its rig; `firmware` is then for rig_join. False when the drive rejects
+ * its configuration. */
+bool host_drive_start(host_drive_t *host, board_t *board, const drive_config_t *config, rig_firmware_t *firmware);
 
 #endif

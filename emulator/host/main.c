@@ -10,7 +10,8 @@ machine_tables_t machine_tables;
 /* Starts every drive; false when one rejects its configuration. */
 static bool start(const options_t *options, rig_firmware_t firmware[]) {
     for (unsigned i = 0; i < options->drives; ++i) {
-        if (!host_drive_start(&drives[i], &simulation.rigs[i].board, options, i, &firmware[i])) {
+        const drive_config_t config = host_drive_config(options, i);
+        if (!host_drive_start(&drives[i], &simulation.rigs[i].board, &config, &firmware[i])) {
             return false;
         }
     }

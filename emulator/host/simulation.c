@@ -170,44 +170,18 @@ bool simulation_open(simulation_t *simulation, const options_t *options) {
     return true;
 }
 
-static void control_interrupt(void *context) {
+static void record_switches(void *context) {
     simulation_t *simulation = context;
-    simulation->firmware.control_interrupt(simulation->firmware.context);
     const hal_pwm_compare_t *active = &simulation->rigs[0].board.active;
     fwrite(active, sizeof *active, 1, simulation->switches);
 }
 
-static void deferred_interrupt(void *context) {
-    simulation_t *simulation = context;
-    simulation->firmware.deferred_interrupt(simulation->firmware.context);
-}
-
-static void background(void *context) {
-    simulation_t *simulation = context;
-    simulation->firmware.background(simulation->firmware.context);
-}
-
-static void restart(void *context) {
-    simulation_t *simulation = context;
-    simulation->firmware.restart(simulation->firmware.context);
-}
-
-static void flip(void *context, memory_object_t object, uint32_t bit) {
-    simulation_t *simulation = context;
-    simulation->firmware.flip(simulation->firmware.context, object, bit);
-}
-
 void simulation_run(simulation_t *simulation, const rig_firmware_t firmware[]) {
-    simulation->firmware = firmware[0];
-    const rig_firmware_t recorded = {.control_interrupt = control_interrupt,
-                                     .deferred_interrupt = deferred_interrupt,
-                                     .background = background,
-                                     .restart = firmware[0].restart ? restart : NULL,
-                                     .flip = flip,
-                                     .flip_objects = firmware[0].flip_objects,
-                                     .context = simulation};
+    if (simulation->switches) {
+        simulation->rigs[0].observer = (rig_observer_t){.after_interrupt = record_switches, .context = simulation};
+    }
     for (unsigned i = 0; i < simulation->options->drives; ++i) {
-        rig_join(&simulation->rigs[i], i == 0 && simulation->switches ? &recorded : &firmware[i]);
+        rig_join(&simulation->rigs[i], &firmware[i]);
     }
     print_ready(simulation->options, simulation->image.machine.name);
     while (rig_serve(&simulation->rigs[0], -1)) {

@@ -28,7 +28,6 @@ typedef struct {
     recorder_t recorder;
     nvm_t memory; /* as read from the file of --memory; this and what is recorded is of the first drive */
     rig_stop_t stop;
-    rig_firmware_t firmware; /* of the first drive */
     /* Rows of hal_pwm_compare_t: row n acts in the control period that starts at n + 1 periods, when no trigger was
      * missed. NULL: not recorded. */
     FILE *switches;

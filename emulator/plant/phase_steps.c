@@ -3,6 +3,7 @@
 #include <math.h>
 #include <string.h>
 
+#include "plant/hermite.h"
 #include "plant/magnetics_kernel.h"
 
 /* Limit at factor 1 of the feedback from the torque through the angle to the currents, which a step neglects but for
@@ -56,9 +57,7 @@ typedef struct {
 /* --- Cubic Hermite course of a quantity --- */
 
 static inline double course_at(const course_t *f, double h, double x) {
-    const double y = 1.0 - x;
-    return y * y * (f->start * (1.0 + 2.0 * x) + h * x * f->start_1_s) +
-           x * x * (f->end * (1.0 + 2.0 * y) - h * y * f->end_1_s);
+    return hermite(x, h, f->start, f->start_1_s, f->end, f->end_1_s);
 }
 
 static inline double course_integral(const course_t *f, double h) {

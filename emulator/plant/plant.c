@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "plant/faulted.h"
+#include "plant/hermite.h"
 #include "plant/integrator.h"
 #include "plant/magnetics_kernel.h"
 #include "plant/phase_steps.h"
@@ -368,13 +369,6 @@ static void snap_to_event(const integrator_setting_t *setting, integrator_state_
 
 /* --- Observation --- */
 
-/* Cubic Hermite interpolation at fraction x of a step. */
-static double interpolate(double x, double step_s, double start, double start_slope, double end, double end_slope) {
-    const double y = 1.0 - x;
-    return y * y * (start * (1.0 + 2.0 * x) + step_s * x * start_slope) +
-           x * x * (end * (1.0 + 2.0 * y) - step_s * y * end_slope);
-}
-
 static void sample_now(plant_t *plant) {
     plant->sample(plant->sample_context, plant);
     plant->sample_next_ns += plant->sample_step_ns;
@@ -399,16 +393,16 @@ static void sample_step(plant_t *plant, const integrator_setting_t *setting, con
         const double x = (at_s - start_s) / step_s;
         plant->time_ns = plant->sample_next_ns;
         plant->rotor_angle_rad =
-            interpolate(x, step_s, start->angle_rad, start->speed_rad_s, end->angle_rad, end->speed_rad_s);
-        plant->speed_rad_s = interpolate(x, step_s, start->speed_rad_s, first->acceleration_rad_s2, end->speed_rad_s,
-                                         last.acceleration_rad_s2);
+            hermite(x, step_s, start->angle_rad, start->speed_rad_s, end->angle_rad, end->speed_rad_s);
+        plant->speed_rad_s = hermite(x, step_s, start->speed_rad_s, first->acceleration_rad_s2, end->speed_rad_s,
+                                     last.acceleration_rad_s2);
         if (setting->link) {
             plant->bus_voltage_V =
-                interpolate(x, step_s, start->bus_voltage_V, first->link_V_s, end->bus_voltage_V, last.link_V_s);
+                hermite(x, step_s, start->bus_voltage_V, first->link_V_s, end->bus_voltage_V, last.link_V_s);
         }
         for (unsigned index = 0; index < setting->count; index++) {
-            const double at_A = interpolate(x, step_s, start->current_A[index], first->current_A_s[index],
-                                            end->current_A[index], last.current_A_s[index]);
+            const double at_A = hermite(x, step_s, start->current_A[index], first->current_A_s[index],
+                                        end->current_A[index], last.current_A_s[index]);
             plant->current_A[setting->phase[index]] = at_A > 0.0 ? at_A : 0.0;
         }
         sample_now(plant);

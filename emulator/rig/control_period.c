@@ -31,6 +31,17 @@ static void call(rig_t *rig, board_context_t context, void (*function)(void *)) 
     function(rig->firmware.context);
 }
 
+static void call_control(rig_t *rig) {
+    const rig_observer_t *observer = &rig->observer;
+    if (observer->before_interrupt) {
+        observer->before_interrupt(observer->context);
+    }
+    call(rig, BOARD_INTERRUPT, rig->firmware.control_interrupt);
+    if (observer->after_interrupt) {
+        observer->after_interrupt(observer->context);
+    }
+}
+
 /* A drive that lost its power at an operation of its memory starts again. */
 static void call_background(rig_t *rig) {
     if (rig->background_hung) {
@@ -80,7 +91,7 @@ void control_period_start_event(void *context, uint64_t now_ns) {
     }
     call_deferred(rig);
     rig->board.interrupt_took_ns = at_least(rig->interrupt_time_ns, rig->interrupt_late_ns);
-    call(rig, BOARD_INTERRUPT, rig->firmware.control_interrupt);
+    call_control(rig);
     /* A target has set the time that it took. */
     rig->board.interrupt_took_ns = at_least(rig->board.interrupt_took_ns, rig->interrupt_late_ns);
     if (rig->board.interrupt_took_ns == 0) {

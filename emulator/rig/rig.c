@@ -38,6 +38,7 @@ static void init(rig_t *rig, rig_t *first, unsigned bus_drive, const rig_config_
     rig->next = NULL;
     rig->config = *config;
     rig->firmware = (rig_firmware_t){0};
+    rig->observer = (rig_observer_t){0};
     scheduler_init(&rig->scheduler, &rig->board.time_ns, handlers, rig);
     rig->period_ns = 0;
     rig->truth_period_ns = config->drive_only ? 0 : TRUTH_PERIOD_DEFAULT_NS;
@@ -85,6 +86,9 @@ bool rig_reset_drive(rig_t *rig, hal_reset_cause_t cause) {
     rig->scheduler.due_ns[EVENT_CONTROL] = rig->scheduler.due_ns[EVENT_CURRENT_HOLD] =
         rig->scheduler.due_ns[EVENT_BACKGROUND] = SCHEDULER_NEVER;
     rig->firmware.restart(rig->firmware.context);
+    if (rig->observer.after_restart) {
+        rig->observer.after_restart(rig->observer.context);
+    }
     control_period_begin(rig);
     return true;
 }

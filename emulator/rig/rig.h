@@ -50,6 +50,14 @@ typedef struct {
     uint32_t flip_objects;
 } rig_firmware_t;
 
+/* Who looks at a rig around the calls of the firmware; each function may be NULL. */
+typedef struct {
+    void (*before_interrupt)(void *context); /* the control interrupt */
+    void (*after_interrupt)(void *context);
+    void (*after_restart)(void *context);
+    void *context;
+} rig_observer_t;
+
 /* When to end: `requested` is called at least every RIG_STOP_STEP_NS, and when a descriptor becomes readable. */
 typedef struct {
     int descriptors[2]; /* negative: not used */
@@ -135,6 +143,7 @@ typedef struct rig {
     struct rig *first, *next; /* of the list of the drives on one bus */
     rig_config_t config;
     rig_firmware_t firmware;
+    rig_observer_t observer; /* set after rig_init */
     scheduler_t scheduler;
     uint64_t period_ns;                           /* control_period.c */
     uint64_t interrupt_time_ns, interrupt_end_ns; /* triggers before the end of the last interrupt are lost */

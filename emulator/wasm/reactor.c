@@ -36,7 +36,6 @@ static recorder_t recorder; /* without a file: its rows are handed over */
 static options_t options;
 machine_tables_t machine_tables;
 
-static rig_firmware_t firmware;
 static transport_frame_t received; /* from the caller; size 0: none */
 static uint8_t batch[BATCH_BYTES];
 static size_t batched;
@@ -121,11 +120,10 @@ static transport_t transport = {.descriptors = no_descriptors,
                                 .connected = always_connected,
                                 .in_use = always_in_use};
 
-/* --- Firmware, observed --- */
+/* --- Observation --- */
 
-static void control_interrupt(void *context) {
+static void after_interrupt(void *context) {
     (void)context;
-    firmware.control_interrupt(firmware.context);
     mix_number(rig.plant.rotor_angle_rad);
     mix_number(rig.plant.speed_rad_s);
     for (unsigned phase = 0; phase < rig.plant.machine->phases; ++phase) {
@@ -134,21 +132,6 @@ static void control_interrupt(void *context) {
     if (options.record_switches) {
         bench_compare_values(&rig.board.active, sizeof rig.board.active);
     }
-}
-
-static void deferred_interrupt(void *context) {
-    (void)context;
-    firmware.deferred_interrupt(firmware.context);
-}
-
-static void background(void *context) {
-    (void)context;
-    firmware.background(firmware.context);
-}
-
-static void restart(void *context) {
-    (void)context;
-    firmware.restart(firmware.context);
 }
 
 static void hand_over_row(void *context, const plant_t *plant) {
@@ -187,13 +170,13 @@ EXPORT(start) bool start(char *arguments, size_t arguments_bytes, uint8_t *machi
         recorder.phases = image.machine.phases;
         plant_observe(&rig.plant, options.record_from_us * 1000, options.record_step_ns, hand_over_row, &recorder);
     }
-    if (options.drives != 1 || !host_drive_start(&drive, &rig.board, &options, 0, &firmware)) {
+    const drive_config_t drive_config = host_drive_config(&options, 0);
+    rig_firmware_t firmware;
+    if (options.drives != 1 || !host_drive_start(&drive, &rig.board, &drive_config, &firmware)) {
         return false;
     }
-    rig_join(&rig, &(rig_firmware_t){.control_interrupt = control_interrupt,
-                                     .deferred_interrupt = deferred_interrupt,
-                                     .background = background,
-                                     .restart = restart});
+    rig.observer.after_interrupt = after_interrupt;
+    rig_join(&rig, &firmware);
     return true;
 }
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-import shutil
 
 import pytest
-from playwright.sync_api import sync_playwright
 
 from salient.paths import BUILD
 from salient.tab import file as tab_file
@@ -21,16 +19,6 @@ def tab(tmp_path_factory):
     path = tmp_path_factory.mktemp("tab") / "tab.html"
     assert tab_file.run(path, None) == 0
     return path.as_uri()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    executable = shutil.which("chromium")
-    assert executable, "chromium is missing: tools/salient test installs it"
-    with sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])  # tests run as root
-        yield launched
-        launched.close()
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import http.server
 import json
 import math
 import random
-import shutil
 import subprocess
 import sys
 import threading
@@ -20,7 +19,6 @@ import can
 import numpy as np
 import pytest
 from cantools.database.errors import DecodeError
-from playwright.sync_api import sync_playwright
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -45,16 +43,6 @@ TWENTY = [
     "RIG_TRUTH_MOTION.speed_rpm", "RIG_TRUTH_MOTION.torque_Nm", "RIG_TRUTH_CURRENTS.current_a_A",
     "RIG_TRUTH_BENCH.load_torque_Nm",
 ]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    executable = shutil.which("chromium")
-    assert executable, "chromium is missing: tools/salient test installs it"
-    with sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])  # tests run as root
-        yield launched
-        launched.close()
 
 
 @pytest.fixture
