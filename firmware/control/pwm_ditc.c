@@ -42,6 +42,12 @@ int32_t pwm_ditc_setpoint_q9(const pwm_ditc_setpoints_t *setpoints, int32_t torq
     return entry[0] + ((entry[1] - entry[0]) * fraction_q14 >> 14);
 }
 
+static void open_switches(int32_t duty_q15[HAL_PHASES_MAX]) {
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        duty_q15[phase] = -ONE_Q15;
+    }
+}
+
 /* Duty that drives the incoming phase to its current setpoint, or to the limit while the torque is below the outer
  * band. */
 static int32_t incoming_duty_q15(const pwm_ditc_parameters_t *parameters, const pwm_ditc_sample_t *sample,
@@ -57,13 +63,20 @@ static int32_t incoming_duty_q15(const pwm_ditc_parameters_t *parameters, const 
                        -ONE_Q15, ONE_Q15);
 }
 
+/* Highest duty of the regulated phase. acting_q15: its duty until the new one acts. */
+static int32_t ceiling_q15(const pwm_ditc_parameters_t *parameters, int32_t current_q9, int32_t acting_q15) {
+    if (current_q9 > parameters->current_limit_q9) {
+        return 0;
+    }
+    const int32_t room_q9 = parameters->current_ceiling_q9 - current_q9; /* >= 0 */
+    return fixed_multiply_high(room_q9 * (1 << 14), parameters->ceiling_gain_q24) - acting_q15;
+}
+
 void pwm_ditc_step(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc, const commutation_t *commutation,
                    const pwm_ditc_sample_t *sample, int32_t duty_q15[HAL_PHASES_MAX]) {
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        duty_q15[phase] = -ONE_Q15;
-    }
     const unsigned active = commutation->active;
     if (active == COMMUTATION_NONE) {
+        open_switches(duty_q15);
         return;
     }
 
@@ -71,20 +84,24 @@ void pwm_ditc_step(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc, co
         /* From standstill: a phase past its window still has torque, the one that just entered has none. */
         ditc->regulated = commutation->outgoing != COMMUTATION_NONE ? commutation->outgoing : active;
     }
+    int32_t incoming_q15 = -ONE_Q15;
     if (ditc->regulated != active) {
         /* The BP-PID regulates the outgoing phase until that phase is depleted. */
-        duty_q15[active] = incoming_duty_q15(parameters, sample, sample->current_q9[active]);
+        incoming_q15 = incoming_duty_q15(parameters, sample, sample->current_q9[active]);
         const int32_t eighth_q24 = fixed_clamp(sample->reference_q24 >> 3, 0, parameters->depleted_torque_q24);
         const int32_t threshold_q24 = eighth_q24 > DEPLETED_MIN_Q24 ? eighth_q24 : DEPLETED_MIN_Q24;
         const bool depleted =
             sample->torque[ditc->regulated] < threshold_q24 >> parameters->torque_shift && sample->error_q24 <= 0;
         if (depleted || ditc->regulated != commutation->outgoing) {
-            bp_pid_preset(&ditc->pid, duty_q15[active]);
+            bp_pid_preset(&ditc->pid, incoming_q15);
             ditc->regulated = active;
         }
     }
 
     const int32_t regulated_q15 = bp_pid_step(&parameters->pid, &ditc->pid, sample->error_q24);
-    const bool above_limit = sample->current_q9[ditc->regulated] > parameters->current_limit_q9;
-    duty_q15[ditc->regulated] = above_limit && regulated_q15 > 0 ? 0 : regulated_q15;
+    const unsigned regulated = ditc->regulated;
+    const int32_t highest_q15 = ceiling_q15(parameters, sample->current_q9[regulated], duty_q15[regulated]);
+    open_switches(duty_q15);
+    duty_q15[active] = incoming_q15;
+    duty_q15[regulated] = regulated_q15 < highest_q15 ? regulated_q15 : highest_q15;
 }

@@ -20,6 +20,12 @@
  * over increases with the sampling rate: with the 40 kHz values, the torque of a machine with steep corners steps by a
  * ninth at 1 MHz. The threshold is at most an eighth of the reference, otherwise a drive without load would release a
  * phase that a load step needs, and at least 1/16 N m.
+ *
+ * The duty of a regulated phase acts from one to two periods after the sample. Below the current limit it is at most
+ *
+ *   ceiling_gain (ceiling - current) - duty that acts until then
+ *
+ * which at a low control rate leaves it below the trip (configure.c) and at a high one is above 1; above the limit 0.
  */
 #ifndef CONTROL_PWM_DITC_H
 #define CONTROL_PWM_DITC_H
@@ -46,6 +52,8 @@ typedef struct {
     int32_t depleted_torque_q24;  /* upper limit of the depletion threshold, N m, Q7.24, >= 0 */
     int32_t band_outer_q24;       /* N m, Q7.24 */
     int32_t current_limit_q9;     /* A, Q7.9 */
+    int32_t current_ceiling_q9;   /* of the regulated phase, >= limit, A, Q7.9 */
+    int32_t ceiling_gain_q24;     /* inverse of a period's rise at full voltage below it, duty per A, Q7.24 */
     uint8_t torque_shift;         /* unit of the tables, 2^torque_shift of Q7.24 */
 } pwm_ditc_parameters_t;
 
@@ -70,8 +78,8 @@ int32_t pwm_ditc_setpoint_q9(const pwm_ditc_setpoints_t *setpoints, int32_t torq
 /* Initial weights; no phase regulated. */
 void pwm_ditc_reset(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc);
 
-/* One sample: duty of each phase, Q1.15, -32768..32768. Torque sums saturate; the duty of the incoming phase is
- * clamped, its 32-bit product rounded to nearest. A regulated phase above the current limit has duty <= 0. */
+/* One sample: duty of each phase, Q1.15, -32768..32768, from its last ones. Torque sums saturate; the duty of the
+ * incoming phase is clamped, its 32-bit product rounded to nearest. */
 void pwm_ditc_step(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc, const commutation_t *commutation,
                    const pwm_ditc_sample_t *sample, int32_t duty_q15[HAL_PHASES_MAX]);
 

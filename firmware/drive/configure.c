@@ -1,5 +1,6 @@
 #include "drive/configure.h"
 
+#include "control/phase_map.h"
 #include "drive/deferred.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
@@ -130,13 +131,44 @@ static encoder_monitor_parameters_t encoder_monitor_from(const control_parameter
     };
 }
 
-/* Hysteresis switches a phase on for whole periods, and off only two periods after its current exceeds the limit (one
- * until the sample, one until the new state acts): the limit stays 2.2 periods of current rise below the trip. The rise
- * is that of the unaligned position; a saturated phase comes close to it at any angle. */
-static int32_t hysteresis_limit_q9(const int32_t *values, int32_t current_slew_rate_A_s, uint32_t control_rate_hz) {
-    const int64_t rise_q9 = fixed_divide((int64_t)current_slew_rate_A_s << 9, control_rate_hz);
-    const int64_t limit_q9 = values[PARAMETER_CURRENT_TRIP_A] - fixed_divide(rise_q9 * 22, 10);
-    return fixed_clamp(fixed_saturate(limit_q9), 0, values[PARAMETER_CURRENT_LIMIT_A]);
+/* Largest current, A, Q7.9, from which full voltage for some tenths of a control period drives no phase above the trip,
+ * at any angle. By the flux linkage: a saturated phase has less inductance than at the unaligned position, where the
+ * flux linkage of a voltage is that of the current which it drives. */
+static int32_t highest_before_trip_q9(const int32_t *values, const machine_tables_t *tables, uint32_t control_rate_hz,
+                                      unsigned tenths) {
+    const int32_t trip_q9 = values[PARAMETER_CURRENT_TRIP_A];
+    const int64_t rise_q9 =
+        fixed_divide(((int64_t)tables->current_slew_rate_A_s << 9) * tenths, (int64_t)control_rate_hz * 10);
+    const int32_t rise_q29 = phase_map_flux_q29(tables, 0, fixed_saturate(rise_q9));
+    int32_t highest_q9 = trip_q9;
+    for (unsigned row = 0; row < MACHINE_ROWS; row++) {
+        const uint32_t distance = tables->row[row].start < HALF_REV ? tables->row[row].start : HALF_REV - 1u;
+        const int32_t room_q29 = phase_map_flux_q29(tables, distance, trip_q9) - rise_q29;
+        int32_t allowed_q9 = 0;
+        for (int32_t bit = 1 << 15; bit > 0; bit >>= 1) {
+            const int32_t trial_q9 = allowed_q9 | bit;
+            if (trial_q9 <= highest_q9 && phase_map_flux_q29(tables, distance, trial_q9) <= room_q29) {
+                allowed_q9 = trial_q9;
+            }
+        }
+        highest_q9 = allowed_q9;
+    }
+    return highest_q9;
+}
+
+/* A current that exceeds its limit rises for two periods more, one until the sample and one until the new state acts;
+ * a tenth of it is the margin for the machine's scatter. Hysteresis switches a phase on for whole periods. */
+static void limit_currents(control_parameters_t *control, const int32_t *values, const machine_tables_t *tables,
+                           uint32_t control_rate_hz) {
+    const int32_t limit_q9 = values[PARAMETER_CURRENT_LIMIT_A];
+    const int32_t two_periods_q9 = highest_before_trip_q9(values, tables, control_rate_hz, 22);
+    const int32_t one_period_q9 = highest_before_trip_q9(values, tables, control_rate_hz, 11);
+    const int32_t period_q9 = one_period_q9 > two_periods_q9 ? one_period_q9 - two_periods_q9 : 1;
+    const int32_t ceiling_q9 = one_period_q9 + period_q9;
+    control->hysteresis.current_limit_q9 = two_periods_q9 < limit_q9 ? two_periods_q9 : limit_q9;
+    control->duty.current_limit_q9 = limit_q9;
+    control->duty.current_ceiling_q9 = ceiling_q9 > limit_q9 ? ceiling_q9 : limit_q9;
+    control->duty.ceiling_gain_q24 = fixed_saturate(fixed_divide((int64_t)1 << 33, period_q9));
 }
 
 static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, bool schedules_bandwidth,
@@ -313,7 +345,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     const int32_t inertia_q30 = values[PARAMETER_INERTIA_KG_M2];
     const int32_t friction_q30 = values[PARAMETER_FRICTION_NM_S];
     const int32_t torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM];
-    const int32_t current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A];
     const unsigned encoder_shift = 32u - encoder_bits;
     const controller_t controller = controller_from(values);
     const int32_t torque_min_q24 = controller.four_quadrant ? -torque_max_q24 : 0;
@@ -360,7 +391,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             {
                 .band_inner_q24 = values[PARAMETER_TORQUE_BAND_INNER_NM],
                 .band_outer_q24 = values[PARAMETER_TORQUE_BAND_OUTER_NM],
-                .current_limit_q9 = hysteresis_limit_q9(values, tables->current_slew_rate_A_s, control_rate_hz),
             },
         .duty =
             {
@@ -374,7 +404,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                 .overshoot_margin_q32 = (int32_t)(((uint32_t)GAIN_RATE_HZ << 16) / control_rate_hz << 12),
                 .depleted_torque_q24 = (int32_t)fixed_divide((int64_t)control_rate_hz << 20, GAIN_RATE_HZ),
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
-                .current_limit_q9 = current_limit_q9,
                 .torque_shift = tables->torque_format.result_shift,
             },
         .trim = trim_from(values),
@@ -391,6 +420,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         }),
         .stroke_mean = stroke_mean_configure(tables->phases, control_rate_hz / DEFERRED_SLOW_PERIODS),
     };
+    limit_currents(&control, values, tables, control_rate_hz);
     control.degraded = degraded_from(&control, values);
     set_edge_timing(&control, tables->speed_exponent, timer_clock_hz);
     control.moving_load = moving_load_configure(&(moving_load_settings_t){

@@ -57,6 +57,8 @@ pwm_ditc_parameters_t parameters_of(bp_pid_mode_t mode) {
     parameters.depleted_torque_q24 = 1 << 20;
     parameters.band_outer_q24 = 2 << 24;
     parameters.current_limit_q9 = LIMIT_Q9;
+    parameters.current_ceiling_q9 = 74 << 9;
+    parameters.ceiling_gain_q24 = (1 << 24) / 9; // 9 A in a period
     parameters.torque_shift = machine_tables.torque_format.result_shift;
     return parameters;
 }
@@ -301,6 +303,31 @@ TEST_F(PwmDitc, a_phase_above_the_current_limit_is_never_driven) {
     }
 }
 
+TEST_F(PwmDitc, a_phase_that_lacks_torque_stays_below_the_ceiling_and_close_to_it_however_fast_its_current_rises) {
+    const roles_t commutation = commutation_of(230.0);
+    ASSERT_EQ(commutation.active, 0u);
+    const double ceiling_A = 70.0;
+    for (const double rise_A : {3.0, 9.0, 18.0, 30.0}) {
+        parameters.current_limit_q9 = to_fixed(ceiling_A, Q9);
+        parameters.current_ceiling_q9 = to_fixed(ceiling_A, Q9);
+        parameters.ceiling_gain_q24 = to_fixed(1.0 / (1.1 * rise_A), Q24);
+        pwm_ditc_reset(&parameters, &ditc);
+        std::fill(std::begin(duty_q15), std::end(duty_q15), -ONE_Q15);
+        // The duty of a sample acts from the next one on; a hundredth of the voltage is lost.
+        double current_A = 0.0, most_A = 0.0;
+        for (int k = 0; k < 200; k++) {
+            const double acting = duty_q15[0] / double(ONE_Q15);
+            current_q9[0] = to_fixed(current_A, Q9);
+            step(commutation, 100.0);
+            current_A = std::max(current_A + rise_A * (acting - 0.01), 0.0);
+            most_A = std::max(most_A, current_A);
+        }
+        EXPECT_LT(most_A, ceiling_A) << rise_A;
+        EXPECT_GT(most_A, ceiling_A - 0.2 * rise_A - 0.1) << rise_A;
+        EXPECT_GT(current_A, ceiling_A - 0.2 * rise_A - 0.1) << rise_A << ", and stays there";
+    }
+}
+
 TEST_F(PwmDitc, nothing_overflows_at_the_ends_of_all_ranges) {
     std::mt19937 random(2);
     const int32_t ends[] = {INT32_MIN, INT32_MAX, 0, 1, -1};
@@ -310,6 +337,7 @@ TEST_F(PwmDitc, nothing_overflows_at_the_ends_of_all_ranges) {
             parameters.incoming_gain_q24 = gain;
             parameters.overshoot_margin_q32 = gain;
             parameters.depleted_torque_q24 = gain;
+            parameters.ceiling_gain_q24 = gain;
             pwm_ditc_reset(&parameters, &ditc);
             for (int k = 0; k < 3000; k++) {
                 const roles_t commutation = roles_at(ANGLES, 3, 4, uint32_t(random()));

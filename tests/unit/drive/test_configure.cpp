@@ -8,8 +8,10 @@
 #include <gtest/gtest.h>
 
 extern "C" {
+#include "control/phase_map.h"
 #include "drive/configure.h"
 #include "drive/deferred.h"
+#include "fixed/formats.h"
 }
 
 #include "support/reference_models.h"
@@ -34,6 +36,45 @@ void expect_edge_timing(const control_parameters_t &c, uint32_t timer_clock_hz) 
     ASSERT_NEAR(got * std::ldexp(1.0, -int(machine_tables.speed_exponent)), exact, exact * std::ldexp(1.0, -29));
     ASSERT_LT(std::ldexp(double(c.edge_age_max_ticks), c.edge_age_shift), 2147483648.0);
     ASSERT_EQ(c.edge_age_max_ticks, timer_clock_hz / 10000) << "100 us";
+}
+
+// Flux linkage that is left below the trip, at the angle with the least of it, when full voltage has driven a phase
+// from a current on for some periods: a phase map in double precision.
+double room_below_trip(int32_t current_q9, int32_t trip_q9, double rate_hz, double periods) {
+    const double rise_A = std::min(machine_tables.current_slew_rate_A_s / rate_hz * periods, 79.99);
+    const double gained = phase_map_flux_q29(&machine_tables, 0, int32_t(rise_A * fixed_point::Q9));
+    double least = 1e12;
+    for (unsigned row = 0; row < MACHINE_ROWS; row++) {
+        const uint32_t distance = std::min(machine_tables.row[row].start, HALF_REV - 1u);
+        least = std::min(least, double(phase_map_flux_q29(&machine_tables, distance, trip_q9)) - gained -
+                                    phase_map_flux_q29(&machine_tables, distance, current_q9));
+    }
+    return least;
+}
+
+// A tenth more than two periods from the limit, and than one from where duty control ends, do not reach the trip, and
+// from a current that is 1/64 A higher they do.
+void expect_currents_below_trip(const control_parameters_t &c, const parameters_t &p, double rate_hz) {
+    const int32_t trip_q9 = p.values[PARAMETER_CURRENT_TRIP_A], limit_q9 = p.values[PARAMETER_CURRENT_LIMIT_A];
+    const auto expect_highest = [&](int32_t current_q9, double periods) {
+        const double slack = 16384.0; // 30 uWb: of a rounded rise
+        if (current_q9 > 0) {
+            ASSERT_GE(room_below_trip(current_q9, trip_q9, rate_hz, periods), -slack) << periods;
+        }
+        if (current_q9 < std::min(trip_q9, PHASE_MAP_CURRENT_MAX_Q9)) {
+            ASSERT_LT(room_below_trip(current_q9 + 8, trip_q9, rate_hz, periods), slack) << periods;
+        }
+    };
+    ASSERT_LE(c.hysteresis.current_limit_q9, limit_q9);
+    if (c.hysteresis.current_limit_q9 < limit_q9) {
+        ASSERT_NO_FATAL_FAILURE(expect_highest(c.hysteresis.current_limit_q9, 2.2));
+        if (c.duty.current_ceiling_q9 > limit_q9) { // else it is the limit
+            const int32_t period_q9 = int32_t(std::lround(std::ldexp(1.0, 33) / c.duty.ceiling_gain_q24));
+            ASSERT_NO_FATAL_FAILURE(expect_highest(c.duty.current_ceiling_q9 - period_q9, 1.1));
+            ASSERT_NEAR(c.duty.current_ceiling_q9 - 2 * period_q9, c.hysteresis.current_limit_q9, 1.0);
+        }
+    }
+    ASSERT_GE(c.duty.current_ceiling_q9, limit_q9);
 }
 
 // All the conversions, for one set of parameters.
@@ -103,11 +144,8 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
 
     near("inner", c.hysteresis.band_inner_q24, v(PARAMETER_TORQUE_BAND_INNER_NM) * fixed_point::Q24, 0.0);
     near("outer", c.hysteresis.band_outer_q24, v(PARAMETER_TORQUE_BAND_OUTER_NM) * fixed_point::Q24, 0.0);
-    const double rise_A = machine_tables.current_slew_rate_A_s / rate_hz; // a period of full voltage
-    const double below_trip_A = std::max(v(PARAMETER_CURRENT_TRIP_A) - 2.2 * rise_A, 0.0);
-    near("limit", c.hysteresis.current_limit_q9, std::min(v(PARAMETER_CURRENT_LIMIT_A), below_trip_A) * fixed_point::Q9,
-         4.0);
     near("limit", c.duty.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * fixed_point::Q9, 0.0);
+    ASSERT_NO_FATAL_FAILURE(expect_currents_below_trip(c, p, rate_hz));
     near("assist", c.duty.band_outer_q24, v(PARAMETER_BP_ASSIST_BAND_NM) * fixed_point::Q24, 0.0);
     near("incoming gain", c.duty.incoming_gain_q24,
          0.5 * rate_hz / machine_tables.current_slew_rate_A_s * fixed_point::Q24, 1.0);
