@@ -48,6 +48,7 @@ COLD static bool read_sample(const control_state_t *control, const control_param
             input->misalignment[phase] = misalignment[phase];
             input->current_q9[phase] = measured->current_q9[phase];
             input->flux_q29[phase] = control->applied_flux.at_sample_q29[phase];
+            input->next_q29[phase] = control->applied_flux.next_q29[phase];
             input->off[phase] = control->duty_q15[phase] == -MODULATOR_DUTY_ONE_Q15;
         }
         read_stall_input(control, &sample->stall);
@@ -77,9 +78,11 @@ COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *i
     return encoder;
 }
 
-/* Of the same sample: phases that conduct above the currents whose errors are those of the converter. */
-static phase_balance_sample_t balance_sample(const drive_t *drive, const encoder_monitor_input_t *encoder,
-                                             uint32_t elapsed, uint32_t step) {
+/* Of the same sample: phases that conduct above the currents whose errors are those of the converter, for so short a
+ * time that half of the resistance and 1/64 of the DC-link voltage are less than half of the flux linkage. That of the
+ * voltage less four fifths of the resistance, which is that of a cold winding. */
+static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_monitor_input_t *input,
+                                             const encoder_monitor_input_t *encoder, uint32_t elapsed, uint32_t step) {
     const uint32_t recent = 10u * drive->control_parameters.initialise_ticks;
     const bool learned = drive->control_parameters.torque_law == TORQUE_LAW_PREDICTIVE;
     phase_balance_sample_t sample = {
@@ -91,10 +94,17 @@ static phase_balance_sample_t balance_sample(const drive_t *drive, const encoder
         .step = step,
     };
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
-        sample.flux_q29[phase] = encoder->flux_q29[phase];
-        sample.table_q29[phase] = drive->phases.phase[phase].table_q29;
-        sample.known[phase] = encoder->known[phase] && encoder->period - encoder->zero_at[phase] < recent &&
-                              encoder->current_q9[phase] > machine_tables.current_range_q9 / 32;
+        const uint32_t since_zero = encoder->period - encoder->zero_at[phase];
+        const int32_t age = (int32_t)(since_zero < recent ? since_zero : recent);
+        const int32_t current_q9 = encoder->current_q9[phase];
+        const int32_t resistive_q29 = fixed_multiply_high(current_q9 << 12, input->resistance_period_q40);
+        const int32_t error_q29 = resistive_q29 / 2 + input->period_flux_q29 / 64;
+        const int32_t table_q29 = drive->phases.phase[phase].table_q29;
+        sample.flux_q29[phase] = fixed_saturate(encoder->flux_q29[phase] + fixed_product(resistive_q29 / 5, age));
+        sample.table_q29[phase] = table_q29;
+        sample.known[phase] = encoder->known[phase] && since_zero < recent &&
+                              fixed_product(error_q29, age) < table_q29 / 2 &&
+                              current_q9 > machine_tables.current_range_q9 / 32;
     }
     return sample;
 }
@@ -108,7 +118,7 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     const uint32_t elapsed = input->periods - drive->phases.periods;
     const uint32_t step = (uint32_t)fixed_abs((int32_t)(input->electrical - drive->phases.electrical));
     uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, input, correction_q29);
-    const phase_balance_sample_t balance = balance_sample(drive, &encoder, elapsed, step);
+    const phase_balance_sample_t balance = balance_sample(drive, input, &encoder, elapsed, step);
     failed |= phase_balance_step(&drive->balance, &balance);
     drive->phases.phases |= drive->balance.phases;
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {

@@ -14,7 +14,7 @@
 
 /* Once the rotor has been seen to move in a run, a larger error of the voltage is none: the currents follow the torque,
  * and pulses that are too short for the devices act in some periods and not in others. */
-#define MOVING_FACTOR 2u
+#define MOVING_FACTOR 2
 
 /* Error of the flux linkage by gains of sensors and machine: 1/8. */
 #define GAIN_SHIFT 3
@@ -91,10 +91,13 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
     return 2 * fixed_multiply_high(rise_q29, (int32_t)step);
 }
 
-/* Error of the integral in a period that is none: of the voltage, and of the resistance at a current, Wb, Q2.29. */
-static int64_t drift_of(const encoder_monitor_parameters_t *parameters, int32_t current_q9, uint32_t factor) {
-    return (int64_t)parameters->flux_error_q29 * (int32_t)factor +
-           fixed_multiply_high(current_q9 << 12, parameters->resistance_error_q40);
+/* Error of the integral in a period that is none: of the voltage, and of the resistance at a phase's current, Wb,
+ * Q2.29. moves: the rotor has been seen to move in this run. */
+static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const encoder_monitor_input_t *input,
+                        unsigned index, bool moves) {
+    const int64_t error_q29 = parameters->flux_error_q29;
+    return (moves ? MOVING_FACTOR * error_q29 + (input->flux_step_max_q29 >> PULSE_SHIFT) : error_q29) +
+           fixed_multiply_high(input->current_q9[index] << 12, parameters->resistance_error_q40);
 }
 
 /* First-order step of a value towards another, by a part in Q15. */
@@ -105,7 +108,7 @@ static int32_t leak(int32_t value, int32_t towards, int32_t part_q15) {
 /* True when integral and tables have parted since the encoder has been at its present count. */
 static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_monitor_phase_t *phase,
                       const encoder_monitor_input_t *input, uint32_t angle, unsigned index, uint32_t periods,
-                      uint32_t factor) {
+                      bool moves) {
     const int32_t current_q9 = input->current_q9[index];
     const flux_range_t range = flux_range(angle, parameters->half_count, current_q9, 0);
     const int32_t table_q29 = range.least_q29 / 2 + range.most_q29 / 2;
@@ -124,7 +127,7 @@ static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_mo
     const uint32_t leak_periods = parameters->rate_hz >> LEAK_SHIFT;
     const uint32_t age = input->period - phase->referred_at;
     const uint32_t summed = age < leak_periods ? age : leak_periods;
-    const int32_t drift_q29 = fixed_saturate(drift_of(parameters, current_q9, factor) * (int32_t)summed);
+    const int32_t drift_q29 = fixed_saturate(drift_of(parameters, input, index, moves) * (int32_t)summed);
     const int32_t change_q29 = fixed_abs(fixed_subtract(excess_q29, phase->excess_q29));
     const int32_t tolerance_q29 = drift_q29 + (range.most_q29 - range.least_q29) + (table_q29 >> SHAPE_SHIFT) +
                                   (fixed_abs(table_q29 - phase->table_q29) >> GAIN_SHIFT);
@@ -147,9 +150,7 @@ static bool contradicts(const encoder_monitor_parameters_t *parameters, encoder_
     const flux_range_t range =
         flux_range(angle, parameters->angle_max + parameters->half_count, input->current_q9[index], CURRENT_ERROR_Q9);
     const int32_t drift_q29 =
-        fixed_saturate(input->flux_step_max_q29 / 4 + (drift_of(parameters, input->current_q9[index], MOVING_FACTOR) +
-                                                       (input->flux_step_max_q29 >> PULSE_SHIFT)) *
-                                                          (int32_t)age);
+        fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, index, true) * (int32_t)age);
     const bool below = flux_q29 < range.least_q29;
     const int32_t limit_q29 = below ? range.least_q29 : range.most_q29;
     const int32_t beyond_q29 = below ? fixed_subtract(limit_q29, flux_q29) : fixed_subtract(flux_q29, limit_q29);
@@ -205,7 +206,6 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
                        const encoder_monitor_input_t *input, uint32_t periods, bool counted) {
     const uint32_t electrical =
         commutation_electrical(&parameters->commutation, input->encoder_angle + parameters->middle);
-    const uint32_t factor = monitor->counted ? MOVING_FACTOR : 1;
     unsigned contradicting = 0;
     bool alone = false;
     monitor->suspicious = false;
@@ -213,7 +213,7 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
         encoder_monitor_phase_t *phase = &monitor->phase[index];
         if (input->known[index] && input->current_q9[index] >= parameters->current_min_q9) {
             const uint32_t angle = electrical - index * parameters->commutation.stroke;
-            monitor->frozen |= !counted && has_moved(parameters, phase, input, angle, index, periods, factor);
+            monitor->frozen |= !counted && has_moved(parameters, phase, input, angle, index, periods, monitor->counted);
             monitor->suspicious |= contradicts(parameters, phase, input, angle, index, periods);
             note_agreement(parameters, phase, input->period, periods);
         } else {

@@ -51,6 +51,7 @@ typedef struct {
     int32_t misalignment[HAL_PHASES_MAX]; /* to subtract from the angle of each phase, 2^-32 electrical rev */
     int32_t current_q9[HAL_PHASES_MAX];   /* at the sample, A, Q7.9 */
     int32_t flux_q29[HAL_PHASES_MAX];     /* by the applied voltage, at the sample, Wb, Q2.29 */
+    int32_t next_q29[HAL_PHASES_MAX];     /* at the next sample, by the duties that act until then */
     bool off[HAL_PHASES_MAX];             /* both switches, in the period that begins with the sample and the next */
 } phase_monitor_input_t;
 
