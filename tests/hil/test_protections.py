@@ -373,3 +373,20 @@ def test_speed_ramp_is_followed(bench):
     assert bench.truth["speed_rpm"].last == pytest.approx(2000 * (0.2 - 0.001), abs=6)
     bench.run_for(0.2)
     assert bench.truth["speed_rpm"].last == pytest.approx(600, abs=3)
+
+
+def test_counts_faster_than_the_limit_are_over_speed_while_the_observer_still_follows(bench):
+    """A dynamometer takes the shaft from 400 r/min past a limit of 600: the counts of half a millisecond exceed it by
+    1/16 at 637 r/min, while the observer with a bandwidth of 100 rad/s still is 70 r/min behind."""
+    bench.drive.parameters.update({"observer_bandwidth_rad_s": 100, "over_speed_rpm": 600})
+    bench.rig.truth_period_us = 25
+    bench.drive.speed_reference_rpm = 400
+    bench.run_for(0.3)
+    assert bench.drive.state == "run"
+    bench.held_speed_rpm = 1000
+    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.1)
+    bench.run_for(0.002)
+    assert bench.drive.fault == "over_speed"
+    detected_s = bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last * 1e-6
+    at_fault = bench.truth["speed_rpm"].between(detected_s - 50e-6, detected_s + 50e-6)
+    assert 637 < at_fault.last < 650

@@ -418,6 +418,7 @@ TEST_F(Commands, what_disarms) {
     EXPECT_TRUE(in_run([&] { receive(command_frame(3, COMMAND_OFF), 12000); }));
     EXPECT_FALSE(in_run([&] { receive(command_frame(3, COMMAND_CLEAR_FAULT), 12000); })) << "refused, one error";
     EXPECT_TRUE(in_run([&] { supervise(DRIVE_STATE_FAULT, 12000); }));
+    EXPECT_TRUE(disarms([&] { supervise(DRIVE_STATE_FAULT, 11500); })) << "before the run has begun";
     EXPECT_TRUE(in_run([&] { supervise(DRIVE_STATE_READY, 12000); })) << "the end of a stop";
     EXPECT_TRUE(disarms([&] { receive(command_frame(3, COMMAND_OFF), 12000); }));
     EXPECT_TRUE(disarms([&] { receive(command_frame(3, COMMAND_STOP), 12000); }));

@@ -1,4 +1,6 @@
 // Plausibility of the phase currents, at the limits of its tolerances. Machine: saturating, 40 kHz, 240 V.
+#include <algorithm>
+#include <cmath>
 #include <cstdint>
 
 #include <gtest/gtest.h>
@@ -112,6 +114,39 @@ TEST_F(PhaseMonitor, constant_current_with_noise_is_the_sensor_s_after_8_ms_also
     EXPECT_EQ(failed, FAULT_BIT(FAULT_CURRENT_SENSOR));
     EXPECT_GE(periods, 320);
     EXPECT_LE(periods, 325);
+}
+
+TEST_F(PhaseMonitor, constant_current_with_noise_that_ends_after_half_a_millisecond_was_the_sensor_s) {
+    const auto pulse = [&](int periods) {
+        return periods_to_fault(100, [&](int k) { input.current_q9[1] = k < periods ? 5 * 512 + k % 7 : 0; });
+    };
+    EXPECT_EQ(pulse(18), -1) << "shorter than 20 periods and the one in which it begins";
+    EXPECT_EQ(pulse(24), 24) << "in the sample in which it has ended";
+    EXPECT_EQ(failed, FAULT_BIT(FAULT_CURRENT_SENSOR));
+    EXPECT_EQ(monitor.phases, 2u);
+}
+
+TEST_F(PhaseMonitor, currents_that_the_voltage_ends_between_samples_are_no_corrections_of_the_integral) {
+    // A current up to a period of opposite voltage, seen once while the switches are open, never at its end.
+    double most_Wb = 0.0;
+    for (int k = 0; k < 400; k++) {
+        const bool ends = k % 4 == 3;
+        set(1, ends ? 2.0 : 8.0, ends ? 5e-3 : 20e-3);
+        input.off[1] = ends;
+        input.next_q29[1] = ends ? 0 : int32_t(20e-3 * Q29);
+        ASSERT_EQ(step(), 0u) << k;
+        most_Wb = std::max(most_Wb, std::fabs(monitor.phase[1].followed_q29 / Q29));
+        ASSERT_LE(monitor.periods - monitor.phase[1].zero_at, 4u) << k;
+    }
+    EXPECT_LT(most_Wb, 1e-3);
+    // Where the voltage does not end it, what is taken away is counted.
+    set(1, 2.0, 5e-3);
+    input.off[1] = true;
+    input.next_q29[1] = int32_t(11e-3 * Q29);
+    const int32_t before_q29 = monitor.phase[1].followed_q29;
+    ASSERT_EQ(step(), 0u);
+    EXPECT_EQ(correction_q29[1], -input.flux_q29[1]);
+    EXPECT_EQ(monitor.phase[1].followed_q29 - before_q29, correction_q29[1]);
 }
 
 TEST_F(PhaseMonitor, an_offset_within_the_tolerance_is_none) {

@@ -1,0 +1,39 @@
+"""Healthy drives that are no fault: each world is a seed of `tools/salient campaign --healthy` that tripped once."""
+
+from __future__ import annotations
+
+import pytest
+
+from salient.experiments.campaign.runner import run_world, world
+
+
+def expect_no_fault(seed: int, machine: str, controller: str, rate_hz: int) -> None:
+    drawn = world(seed, healthy=True)
+    assert (drawn["machine"], drawn["controller"], drawn["control_rate_hz"]) == (machine, controller, rate_hz)
+    result = run_world(seed, healthy=True)
+    assert result["violations"] == [] and result["causes"] == []
+    assert result["virtual_us"] == pytest.approx(drawn["duration_us"], abs=1000)
+
+
+@pytest.mark.parametrize(("seed", "machine", "controller"), [
+    (323, "linear_cosine", "paper"), (655, "random_07", "paper"), (716, "random_07", "traditional"),
+    (350, "random_08", "paper"), (1625, "saturating", "paper"), (5988, "map86", "traditional")])
+def test_no_current_reaches_the_trip_at_20_khz(seed, machine, controller):
+    expect_no_fault(seed, machine, controller, 20_000)
+
+
+@pytest.mark.parametrize(("seed", "machine", "controller", "rate_hz"), [
+    (8679, "saturating", "salient", 20_000), (14057, "random_01", "traditional", 20_000)])
+def test_currents_that_end_between_two_checks_do_not_contradict_the_angle(seed, machine, controller, rate_hz):
+    expect_no_fault(seed, machine, controller, rate_hz)
+
+
+@pytest.mark.parametrize(("seed", "machine", "controller", "rate_hz"), [
+    (164, "fan12", "paper", 50_000), (2712, "spindle", "paper", 100_000), (2425, "random_01", "traditional", 20_000),
+    (10423, "spindle", "salient", 100_000), (13801, "traction", "paper", 40_000)])
+def test_drift_of_slow_strokes_is_neither_an_encoder_ahead_nor_a_sensor(seed, machine, controller, rate_hz):
+    expect_no_fault(seed, machine, controller, rate_hz)
+
+
+def test_pulses_too_short_for_the_devices_are_no_frozen_encoder():
+    expect_no_fault(7015, "traction", "paper", 40_000)
