@@ -9,6 +9,19 @@ void observe_reset(control_state_t *state, const control_measurement_t *measured
     deferred_reset_observer(state);
 }
 
+/* 1/32 rev less an LSB, at which load_observer.c limits the innovation. */
+#define FOLLOWS_MAX ((1 << 27) - 1)
+
+bool observe_follows(const control_state_t *state) {
+    return fixed_abs(state->innovation) < FOLLOWS_MAX;
+}
+
+void observe_forget_load(control_state_t *state) {
+    state->observer.load_torque_q24 = 0;
+    observer_bandwidth_reset(&state->bandwidth);
+    deferred_reset_observer(state);
+}
+
 void observe(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
              const control_measurement_t *measured) {
     const int32_t innovation = load_observer_innovation(&state->observer, measured->angle);

@@ -12,4 +12,10 @@ void observe(const control_parameters_t *parameters, control_state_t *state, con
 /* Restarts the observer at the measured angle, at standstill, with its maximum bandwidth. */
 void observe_reset(control_state_t *state, const control_measurement_t *measured);
 
+/* True when the observer follows the encoder: within 1/32 rev at the last sample. */
+bool observe_follows(const control_state_t *state);
+
+/* As observe_reset(), but angle and speed are kept. */
+void observe_forget_load(control_state_t *state);
+
 #endif

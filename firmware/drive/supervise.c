@@ -23,11 +23,13 @@ static void complete_record(fault_record_t *record, const control_state_t *state
 
 NOINLINE static void leave_state(const control_parameters_t *parameters, control_state_t *state,
                                  const control_measurement_t *measured, drive_state_t left) {
-    if (left == DRIVE_STATE_FAULT) {
-        observe_reset(state, measured); /* its estimate may stem from a faulty encoder */
-    } else if (left == DRIVE_STATE_RUN) {
+    if (left == DRIVE_STATE_RUN) {
         state->torque_reference_q24 = 0;
         control_prepare(parameters, state);
+    } else if (left != DRIVE_STATE_READY && !observe_follows(state)) {
+        observe_reset(state, measured); /* its estimate stems from a faulty encoder */
+    } else if (left == DRIVE_STATE_FAULT) {
+        observe_forget_load(state); /* angle and speed of a rotor that may be turning are kept */
     }
 }
 

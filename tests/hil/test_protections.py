@@ -390,3 +390,23 @@ def test_counts_faster_than_the_limit_are_over_speed_while_the_observer_still_fo
     detected_s = bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last * 1e-6
     at_fault = bench.truth["speed_rpm"].between(detected_s - 50e-6, detected_s + 50e-6)
     assert 637 < at_fault.last < 650
+
+
+@pytest.mark.bench_each(controller=["traditional", "paper", "salient"])
+def test_a_fault_cleared_on_a_rotor_close_below_the_speed_limit_is_not_followed_by_over_speed(bench):
+    """The observer keeps its speed: one that began at standstill would overshoot the limit, which is 3 % higher."""
+    bench.drive.parameters["over_speed_rpm"] = 620
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.3)
+    bench.held_speed_rpm = 600
+    bench.rig.supply_voltage_V = 301.0
+    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.05)
+    bench.rig.supply_voltage_V = 240.0
+    bench.run_for(0.05)
+    assert bench.drive.fault == "over_voltage"
+    bench.drive.clear_fault()
+    bench.run_until(lambda: bench.drive.state != "fault", timeout=0.1)
+    for _ in range(50):
+        bench.run_for(0.001)
+        assert (bench.drive.state, bench.drive.fault) == ("ready", "none")
+    assert bench.telemetry["DRIVE_MOTION.speed_rpm"].last == pytest.approx(600, abs=2)
