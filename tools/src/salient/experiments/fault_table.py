@@ -60,6 +60,7 @@ class Reaction:
     travel_deg: float
 
 
+_SATURATED = "within a third of the other phases: the flux linkage of a saturated phase hardly depends on its current"
 _PLAUSIBLE = "a reading in the range of the sensor is a temperature; the models of the currents remain"
 
 CASES = (
@@ -76,8 +77,9 @@ CASES = (
     FaultCase("current sensor stuck, middle", "current_sensor_stuck", {"phase": "b", "code": 800}),
     FaultCase("current sensor at its high rail", "current_sensor_high_rail", {"phase": "b"}),
     FaultCase("current sensor, gain 0.3", "current_sensor_gain", {"phase": "b", "gain": 0.3}),
-    FaultCase("current sensor, gain 0.6", "current_sensor_gain", {"phase": "b", "gain": 0.6},
-              unseen="within a third of the other phases while the phase is saturated"),
+    FaultCase("current sensor, gain 0.6", "current_sensor_gain", {"phase": "b", "gain": 0.6}, unseen=_SATURATED),
+    FaultCase("current sensor, gain 0.75", "current_sensor_gain", {"phase": "b", "gain": 0.75}, unseen=_SATURATED),
+    FaultCase("current sensor, gain 1.5", "current_sensor_gain", {"phase": "b", "gain": 1.5}, unseen=_SATURATED),
     FaultCase("current sensor, gain 3", "current_sensor_gain", {"phase": "b", "gain": 3.0}),
     FaultCase("current sensors swapped", "current_sensor_swapped", {"phase": "b", "with_phase": "c"}),
     FaultCase("current sensor open before the start", "current_sensor_open", {"phase": "b"}, at_standstill=True),
@@ -117,7 +119,7 @@ CASES = (
     FaultCase("temperature sensor of switches open", "inverter_temperature_sensor_open", {"phase": "b"}),
     FaultCase("temperature sensor of switches shorted", "inverter_temperature_sensor_shorted", {"phase": "b"}),
     FaultCase("bit of the current trip flipped", "limit_flipped", {"bit": 12}),
-    FaultCase("bit of a constant flipped", "constant_flipped", {"bit": 3000}),
+    FaultCase("bit of a constant flipped", "constant_flipped", {"bit": 3064}),
     FaultCase("bit of the state flipped", "state_flipped", {"bit": 0}),
     FaultCase("bit of the program flipped", "code_flipped", {"byte": 0},
               unsupported="the program of the host is not that of the drive alone; tests/hil/test_self_test.py flips "
