@@ -3,6 +3,7 @@
 #include <stdbool.h>
 
 #include "fixed/compiler.h"
+#include "fixed/fixed.h"
 #include "fixed/formats.h"
 
 #define ON ONE_Q15
@@ -43,9 +44,15 @@ typedef struct {
 } limit_t;
 
 /* While the rotor turns backwards, the back-EMF drives the current of a freewheeling phase further up. */
-static limit_t limit_of(const ditc_hysteresis_parameters_t *parameters, bool backwards) {
+static limit_t limit_of(const ditc_hysteresis_parameters_t *parameters, int32_t backwards_q22) {
     const int32_t limit_q9 = parameters->current_limit_q9;
-    return backwards ? (limit_t){limit_q9 - (limit_q9 >> 2), OFF} : (limit_t){limit_q9, 0};
+    if (backwards_q22 == 0) {
+        return (limit_t){limit_q9, 0};
+    }
+    const int32_t slow_q9 = limit_q9 - (limit_q9 >> 2);
+    const int32_t fast_q9 =
+        parameters->generating_limit_q9 - fixed_multiply_high(backwards_q22, parameters->generating_slope_q19);
+    return (limit_t){slow_q9 < fast_q9 ? slow_q9 : fast_q9, OFF};
 }
 
 static int32_t limit_current(limit_t limit, int32_t state, int32_t current_q9) {
@@ -53,9 +60,9 @@ static int32_t limit_current(limit_t limit, int32_t state, int32_t current_q9) {
 }
 
 void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, const commutation_t *commutation,
-                          int32_t torque_error_q24, const int32_t *current_q9, bool backwards,
+                          int32_t torque_error_q24, const int32_t *current_q9, int32_t backwards_q22,
                           int32_t duty_q15[HAL_PHASES_MAX]) {
-    const limit_t limit = limit_of(parameters, backwards);
+    const limit_t limit = limit_of(parameters, backwards_q22);
     const unsigned active = commutation->active;
     const unsigned outgoing = commutation->outgoing;
     int32_t outgoing_next = OFF;

@@ -16,8 +16,9 @@
  * kHz.
  *
  * A phase above the current limit is not switched on: 0 instead of +1. While the rotor turns backwards, the phases
- * generate: a freewheeling current rises further, and faster than the limit provides for. The limit is then 3/4, and a
- * phase above it is switched off: -1. Comparisons only, nothing overflows.
+ * generate: a freewheeling current rises further, and faster than the limit provides for. The limit is then 3/4, or
+ * less where the EMF adds as much as the DC link at the limit of the speed, and a phase above it is switched off: -1.
+ * Below 0 it lets no current begin. Nothing overflows.
  */
 #ifndef CONTROL_DITC_HYSTERESIS_H
 #define CONTROL_DITC_HYSTERESIS_H
@@ -31,15 +32,20 @@ typedef struct {
     int32_t band_inner_q24;   /* N m, Q7.24, >= 0 */
     int32_t band_outer_q24;   /* N m, Q7.24, >= inner */
     int32_t current_limit_q9; /* A, Q7.9 */
+    /* Limit while the rotor turns backwards: at standstill, A, Q7.9, and by how much it is less per rad/s, A, Q12.19.
+     */
+    int32_t generating_limit_q9;
+    int32_t generating_slope_q19;
 } ditc_hysteresis_parameters_t;
 
 /* All phases -1. */
 void ditc_hysteresis_reset(int32_t duty_q15[HAL_PHASES_MAX]);
 
 /* One sample: new states from the last ones, the torque error (N m, Q7.24, any value) and the phase currents (A, Q7.9).
- * States are duties in Q1.15: -32768, 0, 32768. backwards: the rotor turns against the order of the phases. */
+ * States are duties in Q1.15: -32768, 0, 32768. backwards_q22: speed against the order of the phases, rad/s, Q9.22,
+ * from 0. */
 void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, const commutation_t *commutation,
-                          int32_t torque_error_q24, const int32_t *current_q9, bool backwards,
+                          int32_t torque_error_q24, const int32_t *current_q9, int32_t backwards_q22,
                           int32_t duty_q15[HAL_PHASES_MAX]);
 
 #endif

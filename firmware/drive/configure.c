@@ -166,6 +166,9 @@ static void limit_currents(control_parameters_t *control, const int32_t *values,
     const int32_t period_q9 = one_period_q9 > two_periods_q9 ? one_period_q9 - two_periods_q9 : 1;
     const int32_t ceiling_q9 = one_period_q9 + period_q9;
     control->hysteresis.current_limit_q9 = two_periods_q9 < limit_q9 ? two_periods_q9 : limit_q9;
+    control->hysteresis.generating_limit_q9 = two_periods_q9;
+    control->hysteresis.generating_slope_q19 = fixed_saturate(fixed_divide(
+        (int64_t)(values[PARAMETER_CURRENT_TRIP_A] - two_periods_q9) << 32, control->protection.over_speed_q22));
     control->duty.current_limit_q9 = limit_q9;
     control->duty.current_ceiling_q9 = ceiling_q9 > limit_q9 ? ceiling_q9 : limit_q9;
     control->duty.ceiling_gain_q24 = fixed_saturate(fixed_divide((int64_t)1 << 33, period_q9));
@@ -420,6 +423,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         }),
         .stroke_mean = stroke_mean_configure(tables->phases, control_rate_hz / DEFERRED_SLOW_PERIODS),
     };
+    control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
     limit_currents(&control, values, tables, control_rate_hz);
     control.degraded = degraded_from(&control, values);
     set_edge_timing(&control, tables->speed_exponent, timer_clock_hz);
@@ -452,7 +456,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         torque_mode_configure(values[PARAMETER_TORQUE_SLEW_RATE_NM_S], control_rate_hz, torque_min_q24, torque_max_q24,
                               fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
     control.torque_offset = torque_offset_configure(control_rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
-    control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
     control.encoder_monitor = encoder_monitor_from(&control, values, control_rate_hz);
     return control;
 }

@@ -31,7 +31,7 @@ static void hysteresis_control(const control_parameters_t *parameters, control_s
                                const control_measurement_t *measured) {
     const int32_t error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24);
     ditc_hysteresis_step(&parameters->hysteresis, &measured->commutation, error_q24, measured->current_q9,
-                         turns_backwards(state), state->duty_q15);
+                         turns_backwards(state) ? fixed_subtract(0, state->observer.speed_q22) : 0, state->duty_q15);
 }
 
 /* False when hysteresis control is to act instead. */

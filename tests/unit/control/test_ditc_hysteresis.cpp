@@ -12,8 +12,11 @@ namespace {
 constexpr int32_t INNER = 1 << 20;
 constexpr int32_t OUTER = 1 << 24;
 constexpr int32_t LIMIT = 52 << 9;
-const ditc_hysteresis_parameters_t PARAMETERS = {
-    .band_inner_q24 = INNER, .band_outer_q24 = OUTER, .current_limit_q9 = LIMIT};
+const ditc_hysteresis_parameters_t PARAMETERS = {.band_inner_q24 = INNER,
+                                                 .band_outer_q24 = OUTER,
+                                                 .current_limit_q9 = LIMIT,
+                                                 .generating_limit_q9 = 56 << 9,
+                                                 .generating_slope_q19 = 1 << 16}; // an eighth of an ampere per rad/s
 
 // Just inside and outside of every boundary.
 const int32_t ERRORS[] = {INT32_MIN, -OUTER - 1, -OUTER, -OUTER + 1, -INNER - 1, -INNER, -INNER + 1, -1,       0,
@@ -56,10 +59,10 @@ scene_t scene(bool outgoing, int32_t outgoing_current_q9, int32_t active_current
 
 constexpr int32_t ONE_Q15 = 32768;
 
-int next_state(const scene_t &s, unsigned phase, int state, int32_t error, bool backwards = false) {
+int next_state(const scene_t &s, unsigned phase, int state, int32_t error, int32_t backwards_rad_s = 0) {
     int32_t duty_q15[HAL_PHASES_MAX] = {};
     duty_q15[phase] = state * ONE_Q15;
-    ditc_hysteresis_step(&PARAMETERS, &s.commutation, error, s.current_q9, backwards, duty_q15);
+    ditc_hysteresis_step(&PARAMETERS, &s.commutation, error, s.current_q9, backwards_rad_s << 22, duty_q15);
     EXPECT_EQ(duty_q15[phase] % ONE_Q15, 0);
     return duty_q15[phase] / ONE_Q15;
 }
@@ -99,19 +102,35 @@ TEST(DitcHysteresis, a_phase_above_the_current_limit_freewheels_instead_of_being
     }
 }
 
-TEST(DitcHysteresis, backwards_a_phase_above_three_quarters_of_the_limit_is_switched_off) {
+// Speeds against the order of the phases and limits: 3/4 of LIMIT up to 8 (56 A - 3/4 LIMIT) rad/s.
+void expect_backwards_limit(int32_t rad_s, int32_t limit) {
     for (const int state : {-1, 0, 1}) {
         for (const int32_t error : ERRORS) {
-            for (const int32_t current : {512, LIMIT * 3 / 4, LIMIT * 3 / 4 + 1, 79 << 9}) {
+            for (const int32_t current : {0, limit, limit + 1, 79 << 9}) {
                 for (const role_t role : {SINGLE, INCOMING, OUTGOING}) {
                     const unsigned phase = role == OUTGOING ? 0 : 1;
                     const scene_t s = role == SINGLE     ? scene(false, 0, current)
                                       : role == INCOMING ? scene(true, 512, current)
                                                          : scene(true, current, 512);
-                    const int expected = current > LIMIT * 3 / 4 ? -1 : rule(role, state, error);
-                    EXPECT_EQ(next_state(s, phase, state, error, true), expected);
+                    const int expected = current > limit ? -1 : rule(role, state, error);
+                    EXPECT_EQ(next_state(s, phase, state, error, rad_s), expected);
                 }
             }
+        }
+    }
+}
+
+TEST(DitcHysteresis, backwards_a_phase_above_three_quarters_of_the_limit_is_switched_off) {
+    expect_backwards_limit(1, LIMIT * 3 / 4);
+    expect_backwards_limit(8 * 56 - 8 * 3 * LIMIT / 4 / 512, LIMIT * 3 / 4);
+}
+
+TEST(DitcHysteresis, fast_backwards_the_limit_falls_with_the_speed_until_no_current_may_begin) {
+    expect_backwards_limit(200, 31 << 9);
+    expect_backwards_limit(400, 6 << 9);
+    for (const int32_t rad_s : {449, 511}) {
+        for (const int state : {-1, 0, 1}) {
+            EXPECT_EQ(next_state(scene(false, 0, 0), 1, state, INT32_MAX, rad_s), -1);
         }
     }
 }
@@ -128,7 +147,7 @@ TEST(DitcHysteresis, every_phase_can_have_every_role) {
             const int32_t current_q9[HAL_PHASES_MAX] = {100, 100, 100, 100};
             int32_t duty_q15[HAL_PHASES_MAX];
             ditc_hysteresis_reset(duty_q15);
-            ditc_hysteresis_step(&PARAMETERS, &commutation, INT32_MAX, current_q9, false, duty_q15);
+            ditc_hysteresis_step(&PARAMETERS, &commutation, INT32_MAX, current_q9, 0, duty_q15);
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
                 EXPECT_EQ(duty_q15[phase], phase == active || phase == outgoing ? ONE_Q15 : -ONE_Q15);
             }
@@ -146,7 +165,7 @@ TEST(DitcHysteresis, in_a_commutation_gap_and_after_reset_all_phases_are_off) {
         EXPECT_EQ(state, -ONE_Q15);
     }
     for (const int32_t error : ERRORS) {
-        ditc_hysteresis_step(&PARAMETERS, &commutation, error, current_q9, false, duty_q15);
+        ditc_hysteresis_step(&PARAMETERS, &commutation, error, current_q9, 0, duty_q15);
         for (const int32_t state : duty_q15) {
             EXPECT_EQ(state, -ONE_Q15);
         }
@@ -162,7 +181,7 @@ TEST(DitcHysteresis, extreme_bands_do_not_overflow) {
             for (const int32_t error : ERRORS) {
                 int32_t duty_q15[HAL_PHASES_MAX];
                 ditc_hysteresis_reset(duty_q15);
-                ditc_hysteresis_step(&parameters, &both.commutation, error, both.current_q9, false, duty_q15);
+                ditc_hysteresis_step(&parameters, &both.commutation, error, both.current_q9, 0, duty_q15);
                 for (unsigned phase = 0; phase < 3; phase++) {
                     ASSERT_LE(std::abs(duty_q15[phase]), ONE_Q15);
                 }
