@@ -273,11 +273,7 @@ static int32_t correction_of(const common_t *common, phase_monitor_phase_t *stat
         state->followed_q29 = 0;
         return -flux_q29;
     }
-    if (input->off[phase] && gone(input, phase)) {
-        if (input->next_q29[phase] > 0) {
-            state->followed_q29 = fixed_subtract(state->followed_q29, flux_q29);
-            return -flux_q29;
-        }
+    if (input->off[phase] && gone(input, phase) && input->next_q29[phase] == 0) {
         /* The voltage alone ends it: without the corrections, too? */
         if (fixed_subtract(flux_q29, state->followed_q29) < input->period_flux_q29) {
             state->zero_at = input->periods;

@@ -23,7 +23,8 @@ def test_no_current_reaches_the_trip_at_20_khz(seed, machine, controller):
 
 
 @pytest.mark.parametrize(("seed", "machine", "controller", "rate_hz"), [
-    (8679, "saturating", "salient", 20_000), (14057, "random_01", "traditional", 20_000)])
+    (8679, "saturating", "salient", 20_000), (46979, "finite_element", "salient", 20_000),
+    (14057, "random_01", "traditional", 20_000)])
 def test_currents_that_end_between_two_checks_do_not_contradict_the_angle(seed, machine, controller, rate_hz):
     expect_no_fault(seed, machine, controller, rate_hz)
 

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstdlib>
 
 #include <gtest/gtest.h>
 
@@ -139,14 +140,12 @@ TEST_F(PhaseMonitor, currents_that_the_voltage_ends_between_samples_are_no_corre
         ASSERT_LE(monitor.periods - monitor.phase[1].zero_at, 4u) << k;
     }
     EXPECT_LT(most_Wb, 1e-3);
-    // Where the voltage does not end it, what is taken away is counted.
+    // The duty that still acts drives it further: the integral goes on.
     set(1, 2.0, 5e-3);
     input.off[1] = true;
     input.next_q29[1] = int32_t(11e-3 * Q29);
-    const int32_t before_q29 = monitor.phase[1].followed_q29;
     ASSERT_EQ(step(), 0u);
-    EXPECT_EQ(correction_q29[1], -input.flux_q29[1]);
-    EXPECT_EQ(monitor.phase[1].followed_q29 - before_q29, correction_q29[1]);
+    EXPECT_LT(std::abs(correction_q29[1]), int32_t(0.1e-3 * Q29));
 }
 
 TEST_F(PhaseMonitor, an_offset_within_the_tolerance_is_none) {
