@@ -235,8 +235,11 @@ static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_
         return;
     }
     const uint32_t travel = (uint32_t)fixed_abs((int32_t)(input->encoder_angle - monitor->window_angle));
-    const uint64_t limit = (uint64_t)parameters->travel_max * periods + 2 * (uint64_t)parameters->middle;
-    monitor->over_speed = limit < HALF_REV / 2 && travel > limit; /* over a longer time the travel is ambiguous */
+    const uint64_t limit = (uint64_t)parameters->travel * periods;
+    const uint64_t count = 2 * (uint64_t)parameters->middle;
+    const bool above = fixed_abs(input->speed_q22) > parameters->over_speed_q22;
+    monitor->over_speed = limit < HALF_REV / 2 && /* over a longer time the travel is ambiguous */
+                          (travel > limit + limit / 16 + count || (above && travel + count > limit - limit / 32));
     monitor->window_period = input->period;
     monitor->window_angle = input->encoder_angle;
 }

@@ -34,7 +34,8 @@ class EncoderMonitor : public testing::Test {
             load_observer_acceleration(to_fixed(19.1, Q24), to_fixed(0.02, Q30)), 26 << 9, model.angle_step_q32, POLES);
         parameters.rate_hz = RATE_HZ;
         parameters.current_min_q9 = 6 << 9;
-        parameters.travel_max = int32_t(3600.0 * 17.0 / 16.0 / 60.0 * PERIOD_S * 0x1p32);
+        parameters.over_speed_q22 = to_fixed(rad_s(3600.0), Q22);
+        parameters.travel = int32_t(3600.0 / 60.0 * PERIOD_S * 0x1p32);
         input.run = true;
         std::fill_n(input.known, PHASES, true);
         input.flux_step_max_q29 = to_fixed(240.0 * PERIOD_S, Q29);
@@ -145,6 +146,29 @@ TEST_F(EncoderMonitor, counts_faster_than_the_limit_are_over_speed_within_a_mill
             }
             EXPECT_FALSE(monitor.over_speed) << "at rest again";
         }
+    }
+}
+
+TEST_F(EncoderMonitor, the_observer_shows_over_speed_when_the_counts_do_to_a_thirty_second) {
+    for (const auto &[observed_rpm, counted_rpm, fails] :
+         {std::tuple{3601.0, 3550.0, true}, std::tuple{3601.0, 3400.0, false}, std::tuple{-3601.0, 3550.0, true},
+          std::tuple{3599.0, 3599.0, false}, std::tuple{7200.0, 0.0, false}}) {
+        monitor = {};
+        input.speed_q22 = to_fixed(rad_s(observed_rpm), Q22);
+        bool failed = false;
+        for (int k = 0; k < 100; k++) {
+            step(counted_rpm * 6.0 * PERIOD_S * k, 0.0, 0.0);
+            failed = failed || monitor.over_speed;
+        }
+        EXPECT_EQ(failed, fails) << observed_rpm << " " << counted_rpm;
+    }
+}
+
+TEST_F(EncoderMonitor, a_jump_that_the_observer_follows_to_any_speed_is_no_over_speed) {
+    input.speed_q22 = to_fixed(rad_s(6000.0), Q22);
+    for (int k = 0; k < 100; k++) {
+        step(k < 50 ? 0.0 : 0.75 * 3600.0 * 6.0 * PERIOD_S * 20, 0.0, 0.0); // three quarters of a window at the limit
+        ASSERT_FALSE(monitor.over_speed) << k;
     }
 }
 
