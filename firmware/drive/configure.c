@@ -168,8 +168,9 @@ static void limit_currents(control_parameters_t *control, const int32_t *values,
     const int32_t ceiling_q9 = one_period_q9 + period_q9;
     control->hysteresis.current_limit_q9 = two_periods_q9 < limit_q9 ? two_periods_q9 : limit_q9;
     control->hysteresis.generating_limit_q9 = two_periods_q9;
-    control->hysteresis.generating_slope_q19 = fixed_saturate(fixed_divide(
-        (int64_t)(values[PARAMETER_CURRENT_TRIP_A] - two_periods_q9) << 32, control->protection.over_speed_q22));
+    control->hysteresis.generating_slope_q19 =
+        fixed_saturate(fixed_divide((int64_t)(values[PARAMETER_CURRENT_TRIP_A] - two_periods_q9) << 32,
+                                    speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
     control->duty.current_limit_q9 = limit_q9;
     control->duty.current_ceiling_q9 = ceiling_q9 > limit_q9 ? ceiling_q9 : limit_q9;
     control->duty.ceiling_gain_q24 = fixed_saturate(fixed_divide((int64_t)1 << 33, period_q9));
