@@ -11,6 +11,7 @@
 #define MS_NS UINT64_C(1000000)
 #define RECENT_NS (2 * MS_NS)
 #define MARGIN 1.02
+#define RUN_MAX_NS (502 * MS_NS) /* of a run, since the last request */
 
 enum { STATE_INITIALISE, STATE_READY, STATE_RUN, STATE_FAULT };
 
@@ -257,7 +258,7 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     }
     /* The plant may not have advanced to the frame yet. */
     const uint64_t age_ns = now_ns > oracle->run_ns ? now_ns - oracle->run_ns : 0;
-    if (!oracle->commanded || age_ns > 502 * MS_NS) {
+    if (!oracle->commanded || age_ns > RUN_MAX_NS) {
         violate(oracle, "no_command", now_ns, 3, (double)age_ns * 1e-6);
     } else if (age_ns > 170 * MS_NS && fabs(plant_torque_Nm(plant)) > 0.2 * oracle->world->machine->torque_max_Nm) {
         violate(oracle, "no_command", now_ns, 4, plant_torque_Nm(plant));
@@ -476,6 +477,9 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     if (gates && drive.state != STATE_RUN) {
         violate(oracle, "gate_on", plant->time_ns, 1, drive.state);
     }
+    if (drive.state == STATE_RUN && !state_changed(oracle) && plant->time_ns > oracle->run_ns + RUN_MAX_NS) {
+        violate(oracle, "no_command", plant->time_ns, 6, (double)(plant->time_ns - oracle->run_ns) * 1e-6);
+    }
     if (drive.state == STATE_FAULT && before != STATE_FAULT) {
         oracle->confirmed = oracle->clear_seen = false;
         if (oracle->causes < ORACLE_CAUSES_MAX) {
@@ -485,6 +489,10 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
             oracle->cause_us = plant->time_ns / 1000;
         }
         judge_cause(oracle, plant);
+        const uint32_t up_to = (BIT(drive.fault) << 1) - 1;
+        if (drive.checks != 0 && (drive.checks & up_to) != BIT(drive.fault) && !state_changed(oracle)) {
+            violate(oracle, "not_first", plant->time_ns, drive.fault, (double)drive.checks);
+        }
         if (oracle->recovered && !oracle->settled && !bus_disturbed(oracle)) {
             violate(oracle, "not_recovered", plant->time_ns, 3, drive.fault);
         }
