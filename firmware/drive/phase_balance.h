@@ -35,7 +35,7 @@ typedef struct {
     uint32_t step;                     /* rotation since then, 2^-32 electrical rev */
     int32_t flux_q29[HAL_PHASES_MAX];  /* by the voltage since the phase was without current, Wb, Q2.29 */
     int32_t table_q29[HAL_PHASES_MAX]; /* by the tables, Wb, Q2.29 */
-    bool known[HAL_PHASES_MAX];        /* conducts, and was without current so recently that drift is the smaller part */
+    bool known[HAL_PHASES_MAX];        /* conducts, and drift is the smaller part of the integral */
 } phase_balance_sample_t;
 
 typedef struct {

@@ -36,3 +36,19 @@ def test_brakes_a_rotor_that_turns_backwards_and_starts_it_forwards(make_bench, 
     assert 20 < currents_A(bench, since_s).max() < CURRENT_TRIP_A - 4
     steady = bench.truth["speed_rpm"].between(bench.time_s - 0.1, bench.time_s + 1e-9).value
     assert 295 < steady.min() < steady.max() < 310
+
+
+@pytest.mark.parametrize("machine", ["saturating", "linear_cosine", "linear_trapezoid", "finite_element"])
+@pytest.mark.parametrize("controller", ["traditional", "paper"])
+def test_at_20_khz_a_rotor_close_to_the_speed_limit_is_braked_below_the_trip(make_bench, controller, machine):
+    bench = make_bench(controller=controller, machine=machine, control_rate_hz=20_000)
+    bench.rig.truth_period_us = 50
+    bench.load_torque_Nm = 10
+    bench.run_until(lambda: bench.truth["speed_rpm"].last <= -3200, timeout=2)
+    bench.load_torque_Nm = 0
+    since_s = bench.time_s
+    bench.drive.speed_reference_rpm = 300
+    bench.run_until(lambda: bench.truth["speed_rpm"].last > 290 or bench.drive.state == "fault", timeout=8)
+    assert bench.drive.fault == "none"
+    assert 0.1 < bench.time_s - since_s < 1.0
+    assert 50 < currents_A(bench, since_s).max() < 0.97 * CURRENT_TRIP_A
