@@ -306,13 +306,26 @@ double oracle_recovery_speed_rpm(oracle_t *oracle, const plant_t *plant) {
     return fmin(fabs(oracle->recovery_rpm), machine->speed_command_max_rpm) * (oracle->recovery_rpm < 0.0 ? -1.0 : 1.0);
 }
 
+/* Part of the speed that a drive of one quadrant may have at most: it cannot take away what the torque limit adds in
+ * three periods and, as half of it on average, while the voltage removes the largest flux linkage. A light rotor has
+ * gained a quarter of the base speed by then. */
+static double most_of_one_quadrant(const oracle_t *oracle, const plant_t *plant) {
+    const machine_t *machine = plant->machine;
+    magnetics_point_t aligned;
+    magnetics_evaluate(&plant->magnetics, 0.0, oracle->world->machine->trip_current_A, &aligned);
+    const double late_s = 3e-9 * (double)oracle->period_ns + 0.5 * aligned.flux_linkage_Wb / machine->supply_voltage_V;
+    const double added_rad_s =
+        late_s * oracle->world->machine->torque_max_Nm / (machine->inertia_kg_m2 * oracle->world->inertia_gain);
+    return fmax(1.2, 1.05 + added_rad_s * RPM_PER_RAD_S / fabs(oracle->recovery_rpm));
+}
+
 static void look_at_recovery(oracle_t *oracle, const plant_t *plant) {
     if (!oracle->recovered) {
         return;
     }
     const double part = plant->speed_rad_s * RPM_PER_RAD_S / oracle->recovery_rpm;
     /* A drive of one quadrant waits for the friction to take an overshoot. */
-    const double most = oracle->world->controller == 2 ? 1.005 : 1.2;
+    const double most = oracle->world->controller == 2 ? 1.005 : most_of_one_quadrant(oracle, plant);
     since(&oracle->in_band_ns, part >= 0.995 && part <= most, plant->time_ns);
     oracle->settled = oracle->settled || (oracle->in_band_ns && plant->time_ns >= oracle->in_band_ns + 2 * MS_NS);
 }
@@ -494,7 +507,7 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
         if (drive.checks != 0 && (drive.checks & up_to) != BIT(drive.fault) && !state_changed(oracle)) {
             violate(oracle, "not_first", plant->time_ns, drive.fault, (double)drive.checks);
         }
-        if (oracle->recovered && !oracle->settled && !bus_disturbed(oracle)) {
+        if (oracle->recovered && oracle->recovery_judged && !oracle->settled && !bus_disturbed(oracle)) {
             violate(oracle, "not_recovered", plant->time_ns, 3, drive.fault);
         }
     } else if (drive.state == STATE_RUN && before != STATE_RUN) {

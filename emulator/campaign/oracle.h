@@ -20,8 +20,9 @@
  *   false_alarm     a fault of the drive without any other, which is not true of the plant, or the drive's own work
  * eventually
  *   not_recovered   faults over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of the
- *                   speed (one quadrant: at most 20 % above) 100 ms after the time that half of the torque limit needs,
- *                   or again in a fault
+ *                   speed 100 ms after the time that half of the torque limit needs, or again in a fault; judged up to
+ *                   0.9 of the base speed, above which a start is near the limit of the speed. One quadrant: at most
+ *                   20 % above, of a light rotor what it gains while a delay and the flux linkage last
  * sometimes
  *   cells           (fault, state of the drive, sector of phase a) in which a fault began */
 #ifndef CAMPAIGN_ORACLE_H
