@@ -61,10 +61,11 @@ COLD static bool read_sample(const control_state_t *control, const control_param
 
 /* Of the sample of `input`; the integrals without the corrections that the other monitor has made. */
 COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input, const phase_monitor_t *phases,
-                                                  uint32_t encoder_angle) {
+                                                  uint32_t encoder_angle, int32_t speed_q22) {
     encoder_monitor_input_t encoder = {
         .run = input->run,
         .encoder_angle = encoder_angle,
+        .speed_q22 = speed_q22,
         .flux_step_max_q29 = input->period_flux_q29,
         .period = input->periods,
     };
@@ -112,7 +113,8 @@ static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_m
 /* Checks phases and encoder, and corrects the integrals. */
 COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sample) {
     const phase_monitor_input_t *input = &sample->phases;
-    const encoder_monitor_input_t encoder = encoder_input(input, &drive->phases, sample->encoder_angle);
+    const encoder_monitor_input_t encoder =
+        encoder_input(input, &drive->phases, sample->encoder_angle, sample->stall.speed_q22);
     encoder_monitor_step(&drive->control_parameters.encoder_monitor, &drive->encoder, &encoder);
     int32_t correction_q29[HAL_PHASES_MAX];
     const uint32_t elapsed = input->periods - drive->phases.periods;

@@ -11,6 +11,7 @@
 #define MS_NS UINT64_C(1000000)
 #define RECENT_NS (2 * MS_NS)
 #define MARGIN 1.02
+#define RUN_MAX_NS (502 * MS_NS) /* of a run, since the last request */
 
 enum { STATE_INITIALISE, STATE_READY, STATE_RUN, STATE_FAULT };
 
@@ -56,6 +57,10 @@ _Static_assert(FAULT_COUNT <= ORACLE_KINDS, "room for every kind");
 #define INVERTER_TEMPERATURE (BIT(CAUSE_TEMPERATURE_SENSOR) | BIT(CAUSE_INVERTER_OVERLOAD) | BIT(CAUSE_STALL))
 #define MECHANICS (BIT(CAUSE_STALL) | BIT(CAUSE_WINDING_OVERLOAD) | BIT(CAUSE_INVERTER_OVERLOAD))
 
+/* A wrong voltage within its limits has no name of its own: it shows in the flux linkages that are integrated from it,
+ * as an error of phases or of the angle. */
+#define LINK_VOLTAGE (BIT(CAUSE_UNDER_VOLTAGE) | BIT(CAUSE_OVER_VOLTAGE) | PHASE | ENCODER)
+
 /* First causes that a fault may have, from what it does to the quantities that a drive measures. */
 static const uint32_t causes_of[FAULT_COUNT] = {
     [FAULT_WINDING_OPEN] = BIT(CAUSE_PHASE_OPEN) | BIT(CAUSE_CURRENT_SENSOR) | BIT(CAUSE_STALL),
@@ -71,13 +76,14 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     [FAULT_CURRENT_SENSOR_HIGH_RAIL] = PHASE | CURRENT | MECHANICS,
     [FAULT_CURRENT_SENSOR_GAIN] = PHASE | CURRENT | MECHANICS,
     [FAULT_CURRENT_SENSOR_OFFSET] = PHASE | CURRENT | MECHANICS,
-    [FAULT_CURRENT_SENSOR_SWAPPED] = PHASE | CURRENT | MECHANICS,
+    /* The currents of other phases are those of another angle, or of the other direction. */
+    [FAULT_CURRENT_SENSOR_SWAPPED] = PHASE | CURRENT | MECHANICS | BIT(CAUSE_ENCODER_ANGLE),
     [FAULT_DC_LINK_SENSOR_OPEN] = BIT(CAUSE_UNDER_VOLTAGE),
     [FAULT_DC_LINK_SENSOR_LOW_RAIL] = BIT(CAUSE_UNDER_VOLTAGE),
     [FAULT_DC_LINK_SENSOR_HIGH_RAIL] = BIT(CAUSE_OVER_VOLTAGE),
-    [FAULT_DC_LINK_SENSOR_STUCK] = BIT(CAUSE_UNDER_VOLTAGE) | BIT(CAUSE_OVER_VOLTAGE),
-    [FAULT_DC_LINK_SENSOR_GAIN] = BIT(CAUSE_UNDER_VOLTAGE) | BIT(CAUSE_OVER_VOLTAGE),
-    [FAULT_DC_LINK_SENSOR_OFFSET] = BIT(CAUSE_UNDER_VOLTAGE) | BIT(CAUSE_OVER_VOLTAGE),
+    [FAULT_DC_LINK_SENSOR_STUCK] = LINK_VOLTAGE,
+    [FAULT_DC_LINK_SENSOR_GAIN] = LINK_VOLTAGE,
+    [FAULT_DC_LINK_SENSOR_OFFSET] = LINK_VOLTAGE,
     [FAULT_ENCODER_STUCK] = ENCODER | BIT(CAUSE_STALL),
     [FAULT_ENCODER_JUMP] = ENCODER,
     [FAULT_ENCODER_LOST_COUNTS] = ENCODER | BIT(CAUSE_STALL),
@@ -257,7 +263,7 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     }
     /* The plant may not have advanced to the frame yet. */
     const uint64_t age_ns = now_ns > oracle->run_ns ? now_ns - oracle->run_ns : 0;
-    if (!oracle->commanded || age_ns > 502 * MS_NS) {
+    if (!oracle->commanded || age_ns > RUN_MAX_NS) {
         violate(oracle, "no_command", now_ns, 3, (double)age_ns * 1e-6);
     } else if (age_ns > 170 * MS_NS && fabs(plant_torque_Nm(plant)) > 0.2 * oracle->world->machine->torque_max_Nm) {
         violate(oracle, "no_command", now_ns, 4, plant_torque_Nm(plant));
@@ -304,13 +310,25 @@ double oracle_recovery_speed_rpm(oracle_t *oracle, const plant_t *plant) {
     return fmin(fabs(oracle->recovery_rpm), machine->speed_command_max_rpm) * (oracle->recovery_rpm < 0.0 ? -1.0 : 1.0);
 }
 
+/* Part of the speed that a drive of one quadrant may have at most: it cannot take away what the torque limit adds in
+ * three periods and while the voltage removes the largest flux linkage. */
+static double most_of_one_quadrant(const oracle_t *oracle, const plant_t *plant) {
+    const machine_t *machine = plant->machine;
+    magnetics_point_t aligned;
+    magnetics_evaluate(&plant->magnetics, 0.0, oracle->world->machine->trip_current_A, &aligned);
+    const double late_s = 3e-9 * (double)oracle->period_ns + aligned.flux_linkage_Wb / machine->supply_voltage_V;
+    const double added_rad_s =
+        late_s * oracle->world->machine->torque_max_Nm / (machine->inertia_kg_m2 * oracle->world->inertia_gain);
+    return fmax(1.2, 1.05 + added_rad_s * RPM_PER_RAD_S / fabs(oracle->recovery_rpm));
+}
+
 static void look_at_recovery(oracle_t *oracle, const plant_t *plant) {
     if (!oracle->recovered) {
         return;
     }
     const double part = plant->speed_rad_s * RPM_PER_RAD_S / oracle->recovery_rpm;
     /* A drive of one quadrant waits for the friction to take an overshoot. */
-    const double most = oracle->world->controller == 2 ? 1.005 : 1.2;
+    const double most = oracle->world->controller == 2 ? 1.005 : most_of_one_quadrant(oracle, plant);
     since(&oracle->in_band_ns, part >= 0.995 && part <= most, plant->time_ns);
     oracle->settled = oracle->settled || (oracle->in_band_ns && plant->time_ns >= oracle->in_band_ns + 2 * MS_NS);
 }
@@ -476,6 +494,9 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     if (gates && drive.state != STATE_RUN) {
         violate(oracle, "gate_on", plant->time_ns, 1, drive.state);
     }
+    if (drive.state == STATE_RUN && !state_changed(oracle) && plant->time_ns > oracle->run_ns + RUN_MAX_NS) {
+        violate(oracle, "no_command", plant->time_ns, 6, (double)(plant->time_ns - oracle->run_ns) * 1e-6);
+    }
     if (drive.state == STATE_FAULT && before != STATE_FAULT) {
         oracle->confirmed = oracle->clear_seen = false;
         if (oracle->causes < ORACLE_CAUSES_MAX) {
@@ -485,7 +506,11 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
             oracle->cause_us = plant->time_ns / 1000;
         }
         judge_cause(oracle, plant);
-        if (oracle->recovered && !oracle->settled && !bus_disturbed(oracle)) {
+        const uint32_t up_to = (BIT(drive.fault) << 1) - 1;
+        if (drive.checks != 0 && (drive.checks & up_to) != BIT(drive.fault) && !state_changed(oracle)) {
+            violate(oracle, "not_first", plant->time_ns, drive.fault, (double)drive.checks);
+        }
+        if (oracle->recovered && oracle->recovery_judged && !oracle->settled && !bus_disturbed(oracle)) {
             violate(oracle, "not_recovered", plant->time_ns, 3, drive.fault);
         }
     } else if (drive.state == STATE_RUN && before != STATE_RUN) {

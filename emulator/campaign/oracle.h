@@ -2,20 +2,29 @@
  * meant, and of the drive its state and first fault only. Shares no code with the firmware or with the emulator's own
  * checks.
  *
- *   never       over_current    a phase's true current, with a gate of it on, above the comparators' threshold by more
- *                               than a period's rise, in two looks in succession; without a gate no drive can end a
- *                               current, which the rotor or a shorted switch then drives
- *               gate_on         a gate on while the drive is not in state run, or a line of safe torque off is not
- *                               energised, or 2.5 periods after the last control interrupt
- *               no_command      a gate on without a confirmed arming since the last fault, 502 ms after the last
- * genuine request to run, or 5 ms after a genuine off; torque 170 ms after the last request over_speed      a gate on
- * for 2 ms at a speed above the limit by 2 % over_voltage    a gate on for 200 us at a link voltage above the limit by
- * 2 %, on a machine whose supply takes no energy back, unless a fault of the only sensor hides it wrong_cause     a
- * first cause that neither is true of the plant nor belongs to a fault that was there false_alarm     a fault of the
- * drive without any other, which is not true of the plant, or the drive's own work eventually  not_recovered   faults
- * over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of the speed (one quadrant: at most
- * 20 % above) 100 ms after the time that half of the torque limit needs, or again in a fault sometimes   cells (fault,
- * state of the drive, sector of phase a) in which a fault began */
+ * never
+ *   over_current    a phase's true current, with a gate of it on, above the comparators' threshold by more than a
+ *                   period's rise, in two looks in succession; without a gate no drive can end a current, which the
+ *                   rotor or a shorted switch then drives
+ *   gate_on         a gate on while the drive is not in state run, or a line of safe torque off is not energised, or
+ *                   2.5 periods after the last control interrupt
+ *   no_command      a gate on without a confirmed arming since the last fault, or 5 ms after a genuine off; a gate on,
+ *                   or the state run, 502 ms after the last genuine request to run; torque 170 ms after it; a fault
+ *                   that ends without a genuine request to clear it
+ *   stopped         state run left, without a fault, less than 30 ms after a genuine request to run
+ *   over_speed      a gate on for 2 ms at a speed above the limit by 2 %
+ *   over_voltage    a gate on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no
+ *                   energy back, unless a fault of the only sensor hides it
+ *   wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
+ *   not_first       a first cause that is not the first one, by its number, of the checks that failed in its tick
+ *   false_alarm     a fault of the drive without any other, which is not true of the plant, or the drive's own work
+ * eventually
+ *   not_recovered   faults over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of the
+ *                   speed 100 ms after the time that half of the torque limit needs, or again in a fault; judged up to
+ *                   0.9 of the base speed, above which a start is near the limit of the speed. One quadrant: at most
+ *                   20 % above, of a light rotor what it gains while a delay and the flux linkage last
+ * sometimes
+ *   cells           (fault, state of the drive, sector of phase a) in which a fault began */
 #ifndef CAMPAIGN_ORACLE_H
 #define CAMPAIGN_ORACLE_H
 

@@ -25,6 +25,11 @@ enum {
 #define FAULT_SHARE 0.065 /* of the kinds, on average, that a seed has */
 #define FAULTS_MAX 6
 
+/* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
+ * not. */
+#define SILENT_PART 0.12
+#define DESERTED_PART 0.15
+
 static int32_t raw_of(unsigned variable, double value) {
     const double raw = value / bench_variables[variable].scale;
     return (int32_t)fmin(fmax(floor(raw + 0.5), bench_variables[variable].raw_minimum),
@@ -289,9 +294,12 @@ static void draw_script(world_t *world, uint64_t last_us) {
     const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_SCRIPT, 1, 2e4, (double)last_us);
     const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_SCRIPT, 2, 5e3, 1.5e6);
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
-    if (sort < 0.12) {
+    if (sort < SILENT_PART) {
         add(world, WORLD_SILENT, begin_us, end_us < last_us ? end_us : last_us);
     } else if (sort < 0.24) {
+        if (sort < DESERTED_PART) {
+            add(world, WORLD_SILENT, begin_us, last_us);
+        }
         world_event_t *event = add(world, WORLD_HOSTILE, begin_us, end_us < last_us ? end_us : last_us);
         event->what = seeded_below(seed, STREAM_SCRIPT, 3, WORLD_HOSTILE_SORTS);
     } else if (sort < 0.32) {
@@ -308,8 +316,8 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     const double first_rpm = draw_speed_rpm(world, 0);
     uint64_t last_us = (uint64_t)(1e6 * fmin(0.1 + 1.5 * start_s(world, 0.0, first_rpm),
                                              seeded_between(seed, STREAM_SCRIPT, 9, 0.1, 0.4)));
-    const bool long_silence = seeded_unit(seed, STREAM_SCRIPT, 0) < 0.04;
-    last_us = long_silence ? 900000 : last_us;
+    const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
+    last_us = sort < 0.04 || (sort >= SILENT_PART && sort < DESERTED_PART) ? 900000 : last_us;
     world->recovery_us = last_us + 25000;
     add_speed(world, first_rpm, 0);
     if (seeded_unit(seed, STREAM_SPEED, 90) < 0.4) {

@@ -95,7 +95,6 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
         .current_trip_q9 = values[PARAMETER_CURRENT_TRIP_A],
         .dc_link_over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V],
         .dc_link_under_voltage_q6 = values[PARAMETER_BUS_UNDER_VOLTAGE_V],
-        .over_speed_q22 = over_speed_q22,
         .angle_step_max = fixed_saturate((int64_t)step + 2 * (int64_t)count),
         /* A quarter of a degree and four counts. Of a coarse encoder sixteen counts: a load step may stop the rotor
          * within a count, and the observer needs several to notice. */
@@ -115,7 +114,8 @@ static encoder_monitor_parameters_t encoder_monitor_from(const control_parameter
     const uint32_t rotor_poles = control->commutation.rotor_poles;
     const uint32_t angle_deg =
         control->torque_law == TORQUE_LAW_PREDICTIVE ? ENCODER_MONITOR_LEARNED_DEG : ENCODER_MONITOR_ANGLE_DEG;
-    const int32_t travel = fixed_multiply_high(control->protection.over_speed_q22, control->observer.angle_step_q32);
+    const int32_t over_speed_q22 = fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM]));
+    const int32_t travel = fixed_multiply_high(over_speed_q22, control->observer.angle_step_q32);
     return (encoder_monitor_parameters_t){
         .commutation = control->commutation,
         .half_count = control->encoder_middle * rotor_poles,
@@ -127,7 +127,8 @@ static encoder_monitor_parameters_t encoder_monitor_from(const control_parameter
         .resistance_error_q40 = control->predictive.flux.resistance_period_q40 / ENCODER_MONITOR_RESISTANCE_PART,
         .rate_hz = control_rate_hz,
         .current_min_q9 = values[PARAMETER_CURRENT_LIMIT_A] / 8,
-        .travel_max = travel + travel / 16,
+        .over_speed_q22 = over_speed_q22,
+        .travel = travel,
     };
 }
 
@@ -167,8 +168,9 @@ static void limit_currents(control_parameters_t *control, const int32_t *values,
     const int32_t ceiling_q9 = one_period_q9 + period_q9;
     control->hysteresis.current_limit_q9 = two_periods_q9 < limit_q9 ? two_periods_q9 : limit_q9;
     control->hysteresis.generating_limit_q9 = two_periods_q9;
-    control->hysteresis.generating_slope_q19 = fixed_saturate(fixed_divide(
-        (int64_t)(values[PARAMETER_CURRENT_TRIP_A] - two_periods_q9) << 32, control->protection.over_speed_q22));
+    control->hysteresis.generating_slope_q19 =
+        fixed_saturate(fixed_divide((int64_t)(values[PARAMETER_CURRENT_TRIP_A] - two_periods_q9) << 32,
+                                    speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
     control->duty.current_limit_q9 = limit_q9;
     control->duty.current_ceiling_q9 = ceiling_q9 > limit_q9 ? ceiling_q9 : limit_q9;
     control->duty.ceiling_gain_q24 = fixed_saturate(fixed_divide((int64_t)1 << 33, period_q9));

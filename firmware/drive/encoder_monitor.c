@@ -100,9 +100,48 @@ static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const en
            fixed_multiply_high(input->current_q9[index] << 12, parameters->resistance_error_q40);
 }
 
+/* False when no angle at all explains the integral at the measured current, by the tolerances of contradicts(): then
+ * the phase, its sensor or the voltage is at fault, not the encoder. */
+static bool fits_an_angle(const encoder_monitor_parameters_t *parameters, const encoder_monitor_input_t *input,
+                          unsigned index) {
+    const uint32_t age = input->period - input->zero_at[index];
+    if (age > parameters->rate_hz >> AGE_SHIFT) {
+        return true;
+    }
+    const int32_t flux_q29 = input->flux_q29[index];
+    const flux_range_t range = flux_range(HALF_REV, HALF_REV, input->current_q9[index], CURRENT_ERROR_Q9);
+    const int32_t drift_q29 =
+        fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, index, true) * (int32_t)age);
+    const int32_t least_q29 = range.least_q29 - (range.least_q29 >> GAIN_SHIFT);
+    const int32_t most_q29 = fixed_add(range.most_q29, range.most_q29 >> GAIN_SHIFT);
+    return flux_q29 >= fixed_subtract(least_q29, drift_q29) && flux_q29 <= fixed_add(most_q29, drift_q29);
+}
+
 /* First-order step of a value towards another, by a part in Q15. */
 static int32_t leak(int32_t value, int32_t towards, int32_t part_q15) {
     return fixed_add(value, fixed_multiply(fixed_subtract(towards, value), part_q15, 15));
+}
+
+/* Fastest parting that a rotor can cause whose motion the encoder does not show, per control period, Wb, Q2.29: its
+ * back-EMF a sixteenth of the DC-link voltage, above which a rotor that turned before is found by its travel
+ * (drive/protection.h), or that of a free rotor from rest after 32 degrees. What parts faster is a fault of the phase.
+ */
+static int32_t fastest_parting_q29(const encoder_monitor_parameters_t *parameters,
+                                   const encoder_monitor_input_t *input) {
+    const int32_t turning_q29 = input->flux_step_max_q29 / 16;
+    const int32_t from_rest_q29 = fixed_saturate(8 * (int64_t)parameters->flux_error_q29);
+    return turning_q29 > from_rest_q29 ? turning_q29 : from_rest_q29;
+}
+
+static void refer(encoder_monitor_phase_t *phase, const encoder_monitor_input_t *input, unsigned index,
+                  int32_t excess_q29, int32_t table_q29) {
+    phase->referred = true;
+    phase->current_q9 = input->current_q9[index];
+    phase->excess_q29 = excess_q29;
+    phase->table_q29 = table_q29;
+    phase->referred_at = input->period;
+    phase->zero_at = input->zero_at[index];
+    phase->moved = 0;
 }
 
 /* True when integral and tables have parted since the encoder has been at its present count. */
@@ -115,13 +154,7 @@ static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_mo
     const int32_t excess_q29 = fixed_subtract(input->flux_q29[index], table_q29);
     const bool renewed = !phase->referred || phase->zero_at != input->zero_at[index];
     if (renewed || current_q9 > phase->current_q9 + phase->current_q9 / 8) {
-        phase->referred = true;
-        phase->current_q9 = current_q9;
-        phase->excess_q29 = excess_q29;
-        phase->table_q29 = table_q29;
-        phase->referred_at = input->period;
-        phase->zero_at = input->zero_at[index];
-        phase->moved = 0;
+        refer(phase, input, index, excess_q29, table_q29);
         return false;
     }
     const uint32_t leak_periods = parameters->rate_hz >> LEAK_SHIFT;
@@ -131,7 +164,12 @@ static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_mo
     const int32_t change_q29 = fixed_abs(fixed_subtract(excess_q29, phase->excess_q29));
     const int32_t tolerance_q29 = drift_q29 + (range.most_q29 - range.least_q29) + (table_q29 >> SHAPE_SHIFT) +
                                   (fixed_abs(table_q29 - phase->table_q29) >> GAIN_SHIFT);
-    phase->moved = change_q29 > tolerance_q29 ? phase->moved + periods : 0;
+    if (change_q29 > tolerance_q29 / 2 && change_q29 > (int64_t)fastest_parting_q29(parameters, input) * age) {
+        refer(phase, input, index, excess_q29, table_q29);
+        return false;
+    }
+    const bool parted = change_q29 > tolerance_q29 && fits_an_angle(parameters, input, index);
+    phase->moved = parted ? phase->moved + periods : 0;
     const int32_t part_q15 = (int32_t)(((periods < leak_periods ? periods : leak_periods) << 15) / leak_periods);
     phase->excess_q29 = leak(phase->excess_q29, excess_q29, part_q15);
     phase->table_q29 = leak(phase->table_q29, table_q29, part_q15);
@@ -155,7 +193,7 @@ static bool contradicts(const encoder_monitor_parameters_t *parameters, encoder_
     const int32_t limit_q29 = below ? range.least_q29 : range.most_q29;
     const int32_t beyond_q29 = below ? fixed_subtract(limit_q29, flux_q29) : fixed_subtract(flux_q29, limit_q29);
     const int32_t tolerance_q29 = fixed_add(limit_q29 >> GAIN_SHIFT, drift_q29);
-    if (beyond_q29 <= tolerance_q29) {
+    if (beyond_q29 <= tolerance_q29 || !fits_an_angle(parameters, input, index)) {
         phase->contradicted = 0;
         return beyond_q29 > tolerance_q29 / 2;
     }
@@ -235,8 +273,11 @@ static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_
         return;
     }
     const uint32_t travel = (uint32_t)fixed_abs((int32_t)(input->encoder_angle - monitor->window_angle));
-    const uint64_t limit = (uint64_t)parameters->travel_max * periods + 2 * (uint64_t)parameters->middle;
-    monitor->over_speed = limit < HALF_REV / 2 && travel > limit; /* over a longer time the travel is ambiguous */
+    const uint64_t limit = (uint64_t)parameters->travel * periods;
+    const uint64_t count = 2 * (uint64_t)parameters->middle;
+    const bool above = fixed_abs(input->speed_q22) > parameters->over_speed_q22;
+    monitor->over_speed = limit < HALF_REV / 2 && /* over a longer time the travel is ambiguous */
+                          (travel > limit + limit / 16 + count || (above && travel + count > limit - limit / 32));
     monitor->window_period = input->period;
     monitor->window_angle = input->encoder_angle;
 }

@@ -6,7 +6,9 @@
  *   angle       the integrated flux linkage of two phases is outside what the tables allow around the encoder's angle:
  *               offset, slip, wrong direction, a constant reading of another angle. Of one alone unless all
  *               others have agreed a short time ago: then the phase has a fault of its own (drive/phase_monitor.h).
- *   over-speed  by the encoder's counts over half a millisecond, without the observer.
+ *   over-speed  by the encoder's counts over half a millisecond: a sixteenth above the limit; or from a thirty-second
+ *               below it when the observer's speed, which is finer, is above. Of the observer alone it is none: after
+ *               an edge that came too early, or with a rotor on which it has just begun, its speed is not the rotor's.
  *
  * Frozen and angle compare two ways to the flux linkage, voltage and time on the one side, current and angle on the
  * other. A rotor that does not move, stalled or held by friction, contradicts nothing. Derived here.
@@ -37,12 +39,14 @@ typedef struct {
     int32_t resistance_error_q40; /* of the resistance, times the control period, ohm s, Q-9.40 */
     uint32_t rate_hz;             /* of the control periods */
     int32_t current_min_q9;       /* of a phase that is checked, A, Q7.9 */
-    int32_t travel_max;           /* of a period at the limit of the speed, 2^-32 rev */
+    int32_t over_speed_q22;       /* limit of the speed's magnitude, rad/s, Q9.22 */
+    int32_t travel;               /* of a period at that speed, 2^-32 rev */
 } encoder_monitor_parameters_t;
 
 typedef struct {
     bool run;
     uint32_t encoder_angle;    /* start of the encoder count, 2^-32 rev */
+    int32_t speed_q22;         /* of the observer, rad/s, Q9.22 */
     int32_t flux_step_max_q29; /* DC-link voltage times the control period, Wb, Q2.29 */
     int32_t current_q9[HAL_PHASES_MAX];
     uint32_t period;                  /* of the sample, modulo 2^32 */

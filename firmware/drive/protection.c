@@ -117,7 +117,6 @@ uint64_t protection_check_deferred(const protection_parameters_t *parameters, pr
 
     uint32_t failed = 0;
     fail_if(&failed, input->dc_link_voltage_q6 < parameters->dc_link_under_voltage_q6, FAULT_UNDER_VOLTAGE);
-    fail_if(&failed, speed_q22 > parameters->over_speed_q22, FAULT_OVER_SPEED);
     fail_if(&failed, encoder_frozen(parameters, protection, input, speed_q22), FAULT_ENCODER);
     fail_if(&failed, input->command_age_us > parameters->command_timeout_us, FAULT_COMMAND_TIMEOUT);
     return failed;

@@ -15,7 +15,6 @@ typedef struct {
     int32_t current_trip_q9;          /* A, Q7.9 */
     int32_t dc_link_over_voltage_q6;  /* V, Q9.6 */
     int32_t dc_link_under_voltage_q6; /* V, Q9.6 */
-    int32_t over_speed_q22;           /* limit of the speed's magnitude, rad/s, Q9.22 */
     int32_t angle_step_max;           /* largest plausible rotation per period, 2^-32 rev */
     int32_t undetected_travel_max;    /* expected rotation without an encoder count, 2^-32 rev, < 2^30 */
     int32_t angle_step_q32;           /* control period: 2^-32 rev per rad/s Q9.22, in Q32 */

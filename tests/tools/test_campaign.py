@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
-
 from salient.cli import make_parser
-from salient.experiments.campaign import canaries, names
+from salient.experiments.campaign import canaries, names, same_bits
 from salient.experiments.campaign.command import run_campaign
 from salient.experiments.campaign.failure import replay
 from salient.experiments.campaign.machines import files
@@ -44,6 +45,22 @@ def test_shards_merge_to_what_one_run_has_and_nothing_runs_twice(tmp_path: Path)
     assert len(note["cells_not_reached"]) == note["cells"] - note["cells_reached"]
 
 
+def test_a_scheduler_whose_worker_is_killed_has_the_summary_of_one_computer_byte_for_byte(
+        tmp_path: Path, dask_cluster: Any) -> None:
+    one, many = tmp_path / "one", tmp_path / "many"
+    common = ["campaign", "--first", "50", "--seeds", "60", "--no-shrink", "--out"]
+    assert run_campaign(make_parser().parse_args([*common, str(one)])) in (0, 1)
+    command = [sys.executable, "-m", "salient", *common, str(many), "--scheduler", dask_cluster.address]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith("1/20 3 of 60 seeds")
+        dask_cluster.workers[0].kill()
+        process.stderr.read()
+    assert process.returncode in (0, 1) and dask_cluster.workers[0].wait() == -signal.SIGKILL
+    assert (many / "summary.json").read_bytes() == (one / "summary.json").read_bytes()
+    assert read_results(many) == read_results(one) and len(read_results(one)) == 60
+
+
 def test_leaving_an_event_out_moves_no_other() -> None:
     events = world(3)["events"]
     assert len(events) >= 4
@@ -75,6 +92,15 @@ def test_warm_windings_of_small_machines_are_no_false_alarm(seed: int) -> None:
     result = run_world(seed, healthy=True)
     assert result["violations"] == [] and result["causes"] == []
     assert 300_000 < result["virtual_us"] < 4_000_000
+
+
+def test_a_seed_has_the_same_bits_twice_on_the_bench_and_on_a_target(tmp_path: Path,
+                                                                     capsys: pytest.CaptureFixture[str]) -> None:
+    assert same_bits.main([str(tmp_path), "401", "2"]) == 0
+    assert "2 of 2 with equal bits" in capsys.readouterr().out
+    results = read_results(tmp_path)
+    assert len({result["hash"] for result in results.values()}) == 2
+    assert not same_bits.equal({**next(iter(results.values())), "on_target": "0"})
 
 
 def test_the_text_of_every_canary_is_in_its_file_once() -> None:

@@ -53,11 +53,18 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     constraints = folder / "constraints.txt"
     lock = (ROOT / "tools" / "requirements.lock").read_text().splitlines()
     constraints.write_text("".join(f"{line.split()[0]}\n" for line in lock if "==" in line and line[0].isalpha()))
-    subprocess.run([sys.executable, "-m", "venv", folder / "venv"], check=True)
-    subprocess.run([folder / "venv/bin/python", "-m", "pip", "--disable-pip-version-check", "install", "-q",
-                    "--no-compile", "-c", constraints, f"{wheel}[test]"], check=True)
+    environment = os.environ | {"PIP_CONSTRAINT": str(constraints), "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+    subprocess.run(readme_steps(wheel.parent)[0], shell=True, check=True, cwd=folder, env=environment,
+                   stdout=subprocess.DEVNULL)
     print(f"wheel built in {built_s - started_s:.1f} s, installed in {time.monotonic() - built_s:.1f} s")
     return Installed(folder / "venv", wheel, constraints)
+
+
+def readme_steps(wheels: Path) -> list[str]:
+    """The README's steps from an empty folder to the first test, with the folders of the wheel and of the clone."""
+    section = (ROOT / "README.md").read_text(encoding="utf-8").split("### In a repository of your own")[1]
+    return [line.replace("CLONE/out/wheel", str(wheels)).replace("CLONE", str(ROOT))
+            for line in section.split("```")[1].strip().splitlines()]
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +90,15 @@ def test_wheel_runs_on_any_linux(installed):
     assert "requires no external shared libraries" in " ".join(shown.stdout.split()), shown
     assert 'following platform tag: "manylinux_2_5_x86_64"' in " ".join(shown.stdout.split())
     assert "manylinux_2_17_x86_64" in installed.wheel.name
+
+
+def test_steps_of_the_readme_end_with_a_test_that_passes(installed):
+    folder = installed.folder.parent
+    install, copy, test = readme_steps(installed.wheel.parent)
+    assert install.startswith("python3 -m venv venv") and (folder / "venv") == installed.folder  # by the fixture
+    subprocess.run(copy, shell=True, check=True, cwd=folder)
+    done = installed.run("bash", "-euc", test, cwd=folder, path=SYSTEM)
+    assert (done.returncode, "1 passed" in done.stdout) == (0, True), done.stdout + done.stderr
 
 
 def test_suite_passes_without_clone_compiler_and_cmake(installed, tmp_path):

@@ -405,16 +405,18 @@ TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_observer) {
     EXPECT_EQ(results().generation, state.deferred_request.generation);
 }
 
-TEST_F(Deferred, a_late_over_speed_check_of_the_time_before_a_reset_is_no_new_fault) {
+TEST_F(Deferred, a_late_check_of_the_voltage_of_the_time_before_a_reset_is_no_new_fault) {
     start();
     sample.adc.phase_current_counts[0] = 4000;
     EXPECT_FALSE(period(COMMAND_OFF));
     sample.adc.phase_current_counts[0] = 0;
     speed_rad_s = 5.0; // a count or two a period: the encoder is not frozen
     see_the_cause_gone();
-    state.observer.speed_q22 = 400 << 22; // of a faulty encoder
-    interrupt(COMMAND_OFF);               // this step will be late
-    ASSERT_GT(state.deferred_request.input.speed_q22, 380 << 22);
+    const uint16_t healthy = sample.adc.bus_voltage_counts;
+    sample.adc.bus_voltage_counts = 0;
+    interrupt(COMMAND_OFF); // this step will be late
+    ASSERT_EQ(state.deferred_request.input.dc_link_voltage_q6, 0);
+    sample.adc.bus_voltage_counts = healthy;
     interrupt(COMMAND_CLEAR_FAULT);
     ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
     deferred_step(&parameters, &state);

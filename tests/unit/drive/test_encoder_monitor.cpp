@@ -34,7 +34,8 @@ class EncoderMonitor : public testing::Test {
             load_observer_acceleration(to_fixed(19.1, Q24), to_fixed(0.02, Q30)), 26 << 9, model.angle_step_q32, POLES);
         parameters.rate_hz = RATE_HZ;
         parameters.current_min_q9 = 6 << 9;
-        parameters.travel_max = int32_t(3600.0 * 17.0 / 16.0 / 60.0 * PERIOD_S * 0x1p32);
+        parameters.over_speed_q22 = to_fixed(rad_s(3600.0), Q22);
+        parameters.travel = int32_t(3600.0 / 60.0 * PERIOD_S * 0x1p32);
         input.run = true;
         std::fill_n(input.known, PHASES, true);
         input.flux_step_max_q29 = to_fixed(240.0 * PERIOD_S, Q29);
@@ -55,13 +56,15 @@ class EncoderMonitor : public testing::Test {
         }
         const uint32_t angle = uint32_t(int64_t(true_deg * DEGREE)) * POLES - phase * parameters.commutation.stroke;
         input.current_q9[phase] = to_fixed(current_A, Q9);
-        input.flux_q29[phase] = phase_map_results::flux_q29(machine_tables, angle, input.current_q9[phase]);
+        input.flux_q29[phase] =
+            phase_map_results::flux_q29(machine_tables, angle, input.current_q9[phase]) + flux_offset_q29;
         monitor_step();
     }
 
     encoder_monitor_parameters_t parameters{};
     encoder_monitor_t monitor{};
     encoder_monitor_input_t input{};
+    int32_t flux_offset_q29 = 0; // of the integral
 };
 
 TEST_F(EncoderMonitor, the_tolerated_error_of_the_voltage_is_half_of_the_back_emf_after_2_degrees) {
@@ -128,6 +131,35 @@ TEST_F(EncoderMonitor, an_angle_that_two_phases_contradict_is_a_fault_and_one_wi
     }
 }
 
+TEST_F(EncoderMonitor, integral_that_parts_faster_than_a_rotor_can_turn_is_no_frozen_encoder) {
+    // Of the link voltage's 6 mWb a period: of an open winding nearly all; of a rotor that turns at a twentieth of the
+    // speed of full back-EMF a twentieth.
+    for (const auto &[part, frozen] : {std::pair{0.9, false}, std::pair{0.05, true}}) {
+        monitor = {};
+        double excess_Wb = 0.0;
+        for (int k = 0; k < 400; k++) {
+            excess_Wb += k < 50 || excess_Wb > 0.1 ? 0.0 : part * 240.0 * PERIOD_S;
+            flux_offset_q29 = to_fixed(excess_Wb, Q29);
+            step(75.0, 75.0, 25.0);
+        }
+        EXPECT_EQ(monitor.frozen, frozen) << part;
+    }
+}
+
+TEST_F(EncoderMonitor, flux_linkage_that_no_angle_explains_is_no_error_of_the_encoder) {
+    // Aligned, 25 A are 0.34 Wb; the integral of two phases says far more, or less than unaligned.
+    for (const double excess_Wb : {0.35, -0.3}) {
+        monitor = {};
+        for (int k = 0; k < 1000; k++) {
+            const unsigned phase = k / 200 % 2;
+            input.zero_at[phase] = k % 200 == 0 ? input.period : input.zero_at[phase];
+            flux_offset_q29 = to_fixed(excess_Wb, Q29);
+            step(excess_Wb > 0 ? 80.0 : 48.0, excess_Wb > 0 ? 80.0 : 48.0, 25.0, phase);
+            ASSERT_FALSE(monitor.angle || monitor.frozen) << excess_Wb << " " << k;
+        }
+    }
+}
+
 TEST_F(EncoderMonitor, counts_faster_than_the_limit_are_over_speed_within_a_millisecond_in_either_direction) {
     for (const double sign : {1.0, -1.0}) {
         for (const auto &[rpm, fails] : {std::pair{3600.0, false}, std::pair{3800.0, false}, std::pair{3950.0, true}}) {
@@ -145,6 +177,29 @@ TEST_F(EncoderMonitor, counts_faster_than_the_limit_are_over_speed_within_a_mill
             }
             EXPECT_FALSE(monitor.over_speed) << "at rest again";
         }
+    }
+}
+
+TEST_F(EncoderMonitor, the_observer_shows_over_speed_when_the_counts_do_to_a_thirty_second) {
+    for (const auto &[observed_rpm, counted_rpm, fails] :
+         {std::tuple{3601.0, 3550.0, true}, std::tuple{3601.0, 3400.0, false}, std::tuple{-3601.0, 3550.0, true},
+          std::tuple{3599.0, 3599.0, false}, std::tuple{7200.0, 0.0, false}}) {
+        monitor = {};
+        input.speed_q22 = to_fixed(rad_s(observed_rpm), Q22);
+        bool failed = false;
+        for (int k = 0; k < 100; k++) {
+            step(counted_rpm * 6.0 * PERIOD_S * k, 0.0, 0.0);
+            failed = failed || monitor.over_speed;
+        }
+        EXPECT_EQ(failed, fails) << observed_rpm << " " << counted_rpm;
+    }
+}
+
+TEST_F(EncoderMonitor, a_jump_that_the_observer_follows_to_any_speed_is_no_over_speed) {
+    input.speed_q22 = to_fixed(rad_s(6000.0), Q22);
+    for (int k = 0; k < 100; k++) {
+        step(k < 50 ? 0.0 : 0.75 * 3600.0 * 6.0 * PERIOD_S * 20, 0.0, 0.0); // three quarters of a window at the limit
+        ASSERT_FALSE(monitor.over_speed) << k;
     }
 }
 

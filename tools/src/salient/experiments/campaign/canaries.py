@@ -28,7 +28,7 @@ from salient.experiments.campaign.runner import program
 from salient.paths import BUILD, ROOT
 
 FILE = ROOT / "tests" / "campaign" / "canaries.toml"
-SEEDS_MAX = 1000
+SEEDS_MAX = 3000
 _CHUNK = 20
 _TARGET = "salient_campaign"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import subprocess
 import sys
@@ -56,8 +57,10 @@ def summary(results: Iterable[Result], first: int, seeds: int, kind: str) -> dic
     """Totals of the results of a range of seeds."""
     found: dict[str, list[int]] = defaultdict(list)
     cells: set[int] = set()
+    content = hashlib.sha256()
     virtual_us = finished = recovered = held = rejected = 0
     for result in sorted(results, key=lambda result: int(result["seed"])):
+        content.update(f"{json.dumps(result, sort_keys=True)}\n".encode())
         finished += 1
         virtual_us += result.get("virtual_us", 0)
         recovered += result.get("recovered", False)
@@ -70,7 +73,8 @@ def summary(results: Iterable[Result], first: int, seeds: int, kind: str) -> dic
     by_number = sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))
     return {
         "kind": kind, "first": first, "seeds": seeds, "finished": finished, "commit": commit(),
-        "program_and_machines": digest(), "virtual_hours": round(virtual_us / 3.6e9, 4), "rejected": rejected,
+        "program_and_machines": digest(), "results_sha256": content.hexdigest(),
+        "virtual_hours": round(virtual_us / 3.6e9, 4), "rejected": rejected,
         "recovered": recovered, "held_by_the_encoder": held,
         "violations": {name: {"count": len(seeds_of), "seeds": seeds_of[:_SHOWN_MAX]} for name, seeds_of in by_number},
         "cells_reached": len(cells), "cells": 0 if kind == "healthy" else len(names.cells()),

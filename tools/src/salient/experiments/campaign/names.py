@@ -14,7 +14,7 @@ _OF_TARGETS = {"code_flipped", "stack_guard_flipped"}
 _REASONS = {
     "gate_on": {1: "outside of run", 2: "without safe torque off lines", 3: "without a control interrupt"},
     "no_command": {1: "not armed", 2: "after off", 3: "without a command", 4: "torque without a command",
-                   5: "fault cleared"},
+                   5: "fault cleared", 6: "in run without a command"},
     "not_recovered": {1: "not in run", 2: "not at the speed", 3: "fault again"},
 }
 
@@ -35,7 +35,7 @@ def kinds() -> dict[int, str]:
 def violation(of: dict[str, Any]) -> str:
     """The class of a violation: its rule, and what distinguishes it."""
     rule, number = of["rule"], of["number"]
-    if rule in ("wrong_cause", "false_alarm"):
+    if rule in ("wrong_cause", "not_first", "false_alarm"):
         return f"{rule}: {causes().get(number, number)}"
     return f"{rule}: {_REASONS[rule][number]}" if number in _REASONS.get(rule, {}) else str(rule)
 
