@@ -20,13 +20,14 @@
 #define THRESHOLD_SHIFT 8
 
 periodic_load_parameters_t periodic_load_configure(uint32_t control_rate_hz, uint32_t bandwidth_rad_s,
-                                                   int32_t torque_max_q24) {
+                                                   int32_t torque_max_q24, unsigned rotor_poles) {
     const uint32_t lag_periods = bandwidth_rad_s > 0 ? control_rate_hz * LAG_TENTHS / 10u / bandwidth_rad_s : 0;
     return (periodic_load_parameters_t){
         .lag_periods = (int32_t)lag_periods,
         .angle_step_max = (int32_t)(LAG_MAX / (lag_periods + 1)),
         .threshold_q8 = (uint32_t)(torque_max_q24 >> (16 + THRESHOLD_SHIFT)) * VALUES,
         .torque_limit_q8 = torque_max_q24 >> 16,
+        .pitch = (VALUES + rotor_poles / 2) / rotor_poles,
     };
 }
 
@@ -35,17 +36,19 @@ void periodic_load_reset(periodic_load_t *load) {
     load->engaged = false;
     load->torque_q24 = 0;
     load->updates = 0;
+    load->window = 0;
 }
 
 static void begin_turn(periodic_load_t *load) {
     load->moved = false;
     load->count = 0;
     load->total_q8 = 0;
-    load->load_q8 = load->change_q8 = load->residual_q8 = 0;
+    load->load_q8 = load->change_q8 = load->residual_q8 = load->slow_q8 = 0;
 }
 
 static periodic_load_mode_t next_mode(const periodic_load_parameters_t *parameters, const periodic_load_t *load) {
-    if (load->load_q8 < parameters->threshold_q8 || load->load_q8 < load->residual_q8 / 4) {
+    if (load->load_q8 < parameters->threshold_q8 || load->load_q8 < load->residual_q8 / 4 ||
+        load->slow_q8 < load->load_q8 / 4) {
         return PERIODIC_LOAD_CLEAR;
     }
     if (load->mode == PERIODIC_LOAD_CLEAR) {
@@ -83,6 +86,19 @@ static int32_t updated_q8(const periodic_load_t *load, uint32_t index, int32_t s
     }
 }
 
+/* Moves the mean over a pole pitch to a value, before it is stored. Returns that mean. */
+static int32_t mean_over_pitch_q8(const periodic_load_parameters_t *parameters, periodic_load_t *load,
+                                  int32_t estimate_q8, bool backwards) {
+    const uint32_t pitch = parameters->pitch;
+    load->window_q8 = load->window == 0 ? estimate_q8 : load->window_q8 + estimate_q8;
+    if (load->window < pitch) {
+        load->window++;
+    } else {
+        load->window_q8 -= load->estimate_q8[(backwards ? load->index + pitch : load->index - pitch) % VALUES];
+    }
+    return load->window_q8 / (int32_t)load->window;
+}
+
 static void end_value(const periodic_load_parameters_t *parameters, periodic_load_t *load, int32_t lag) {
     const uint32_t index = load->index;
     const int32_t residual_q8 = load->sum_q8 / load->updates;
@@ -91,6 +107,7 @@ static void end_value(const periodic_load_parameters_t *parameters, periodic_loa
     load->residual_q8 += (uint32_t)fixed_abs(residual_q8 - load->mean_q8);
     load->load_q8 += (uint32_t)fixed_abs(estimate_q8 - load->mean_q8);
     load->change_q8 += (uint32_t)fixed_abs(estimate_q8 - load->estimate_q8[index]);
+    load->slow_q8 += (uint32_t)fixed_abs(mean_over_pitch_q8(parameters, load, estimate_q8, lag < 0) - load->mean_q8);
     load->estimate_q8[index] = (int16_t)estimate_q8; /* the observer's at most 64 N m, the profile's at most 40 N m */
 
     const uint32_t ahead = (lag < 0 ? index - AHEAD : index + AHEAD) % VALUES;
@@ -129,6 +146,7 @@ void periodic_load_step(const periodic_load_parameters_t *parameters, periodic_l
         } else {
             load->mode = load->mode == PERIODIC_LOAD_CLEAR ? PERIODIC_LOAD_CLEAR : PERIODIC_LOAD_KEEP;
             load->count = VALUES;
+            load->window = 0;
         }
         if (load->count == VALUES) {
             begin_turn(load);

@@ -21,6 +21,12 @@
  *   change    mean |z - z before| below half of the residual: the load repeats better than the profile tells, learn
  *   residual  mean |y - m|        above the load: the profile makes it worse, forget half of it
  *
+ * The ripple of the machine itself, of an encoder that is displaced, repeats with every pole pitch. It is not for this
+ * law, which would hide it from what learns the misalignment: without a quarter of it in means over a pole pitch, slow
+ * below, a profile is cleared as well.
+ *
+ *   slow      mean |z over a pole pitch - m|
+ *
  * else the profile stays. A sine whose phase moves by x per turn changes by 2 sin(x / 2) of itself, so that it is
  * learned up to x = 29 degrees, where learning with 1/4 makes it neither smaller nor larger. A load step changes more
  * than it leaves as a residual, and a constant load has no residual. m is that of the turn before, so a profile whose
@@ -39,6 +45,7 @@ typedef struct {
     int32_t angle_step_max;  /* rotation per period up to which L is below 8, 2^-32 rev */
     uint32_t threshold_q8;   /* sum of magnitudes over a turn from which a load is learned, N m, Q23.8 */
     int32_t torque_limit_q8; /* of the profile, N m, Q7.8 */
+    uint32_t pitch;          /* values of a pole pitch */
 } periodic_load_parameters_t;
 
 /* What this turn does to the profile. */
@@ -64,7 +71,9 @@ typedef struct {
     /* Sums over the values of this turn, N m, Q23.8: */
     uint32_t count;
     int32_t total_q8; /* of y */
-    uint32_t load_q8, change_q8, residual_q8;
+    uint32_t load_q8, change_q8, residual_q8, slow_q8;
+    uint32_t window;   /* values in the mean over a pole pitch, up to all */
+    int32_t window_q8; /* their sum */
 } periodic_load_t;
 
 typedef struct {
@@ -74,9 +83,9 @@ typedef struct {
     bool moving;             /* the load moves, and the observer has the bandwidth w0 */
 } periodic_load_sample_t;
 
-/* Rate of the control in Hz, w0 in rad/s (0: no learning), largest torque in N m, Q7.24. */
+/* Rate of the control in Hz, w0 in rad/s (0: no learning), largest torque in N m, Q7.24; rotor poles 1..64. */
 periodic_load_parameters_t periodic_load_configure(uint32_t control_rate_hz, uint32_t bandwidth_rad_s,
-                                                   int32_t torque_max_q24);
+                                                   int32_t torque_max_q24, unsigned rotor_poles);
 
 /* Forgets the profile. */
 void periodic_load_reset(periodic_load_t *load);

@@ -17,11 +17,12 @@ static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t
     /* The sum is that of Q7.24 numbers: in units of 2^8 it fits in 32 bits for 2^8 updates, of 2^16 for 2^16. */
     const unsigned shift = mean->updates < 256 ? 8 : 16;
     const int32_t mean_q24 = (int32_t)(mean->sum_q24 >> shift) / (int32_t)mean->updates * (1 << shift);
-    const int32_t change_q24 = fixed_abs(fixed_subtract(mean_q24, mean->constant_q24));
+    int32_t *constant_q24 = &mean->constant_q24[mean->stroke % HAL_PHASES_MAX];
+    const int32_t change_q24 = fixed_abs(fixed_subtract(mean_q24, *constant_q24));
     const bool disturbed = mean->disturbed || mean->disturbed_strokes > 0;
-    const int32_t torque_share_q24 = fixed_abs(torque_q24) / (disturbed ? 8 : 64);
+    const int32_t torque_share_q24 = fixed_abs(torque_q24) / (disturbed ? 8 : 16);
     if (change_q24 > TOLERANCE_Q24 + torque_share_q24) {
-        mean->constant_q24 = mean_q24;
+        *constant_q24 = mean_q24;
         const uint32_t strokes = SETTLE_STROKES * mean->updates;
         mean->remaining = strokes > parameters->settle_updates ? strokes : parameters->settle_updates;
         mean->disturbed_strokes = 0;
@@ -30,6 +31,7 @@ static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t
     } else {
         mean->disturbed_strokes -= mean->disturbed_strokes > 0;
     }
+    mean->undisturbed_stroke = !mean->disturbed;
     mean->disturbed = false;
     mean->sum_q24 = 0;
     mean->updates = 0;
@@ -49,6 +51,6 @@ bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t 
     return mean->remaining == 0;
 }
 
-bool stroke_mean_repeats(const stroke_mean_t *mean) {
-    return mean->disturbed_strokes >= REPEATED_STROKES;
+bool stroke_mean_shows_load(const stroke_mean_t *mean) {
+    return (mean->undisturbed_stroke && !mean->disturbed) || mean->disturbed_strokes >= REPEATED_STROKES;
 }

@@ -1,13 +1,16 @@
 /* Mean load over a stroke, and whether it is constant.
  *
  * What a wrong table adds to the load estimate repeats with every stroke and has the same mean in each; a load that
- * changes has not. The mean of each stroke is compared with that of the first stroke of the present load: successive
- * strokes at a high speed differ by little even while the load changes quickly. */
+ * changes has not. The mean of each stroke is compared with that of the same phase's first stroke of the present load:
+ * phases whose misalignments differ have different means, and successive strokes at a high speed differ by little even
+ * while the load changes quickly. */
 #ifndef CONTROL_STROKE_MEAN_H
 #define CONTROL_STROKE_MEAN_H
 
 #include <stdbool.h>
 #include <stdint.h>
+
+#include "hal.h"
 
 typedef struct {
     uint32_t phases;
@@ -16,25 +19,28 @@ typedef struct {
 
 /* All zero at the start. */
 typedef struct {
-    int64_t sum_q24;            /* N m, Q24, since the stroke began */
-    uint32_t updates;           /* in the sum */
-    uint32_t stroke;            /* number of the stroke in the electrical revolution */
-    int32_t constant_q24;       /* mean of the stroke that is compared with, N m, Q7.24 */
-    uint32_t remaining;         /* updates until the load is constant */
-    uint32_t disturbed_strokes; /* of the present load, less the undisturbed ones since */
-    bool disturbed;             /* in this stroke */
+    int64_t sum_q24;                      /* N m, Q24, since the stroke began */
+    uint32_t updates;                     /* in the sum */
+    uint32_t stroke;                      /* number of the stroke in the electrical revolution */
+    int32_t constant_q24[HAL_PHASES_MAX]; /* means of the strokes that are compared with, N m, Q7.24 */
+    uint32_t remaining;                   /* updates until the load is constant */
+    uint32_t disturbed_strokes;           /* of the present load, less the undisturbed ones since */
+    bool disturbed;                       /* in this stroke */
+    bool undisturbed_stroke;              /* the last one was: its mean has shown the load */
 } stroke_mean_t;
 
 /* Rate of the updates in Hz. */
 stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_rate_hz);
 
-/* One update; true if the load is constant: within the last 150 ms, and the last four strokes, the mean changed by no
- * more than 0.1 N m and 1/64 of the torque, 1/8 while strokes are disturbed. electrical: angle of phase 0, 2^-32
- * electrical rev; load and torque in N m, Q7.24. Strokes of fewer than 8 updates are not separated. */
+/* One update; true if the load is constant: within the last 150 ms, and the last four strokes, no mean changed by
+ * more than 0.1 N m and 1/16 of the torque, by which learning itself moves it, 1/8 while strokes are disturbed.
+ * electrical: angle of phase 0, 2^-32 electrical rev; load and torque in N m, Q7.24. Strokes of fewer than 8 updates
+ * are not separated. */
 bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t electrical,
                       int32_t load_torque_q24, int32_t torque_q24, bool disturbed);
 
-/* True if strokes of equal mean load keep being disturbed: not by the load, but by the machine itself. */
-bool stroke_mean_repeats(const stroke_mean_t *mean);
+/* True if no disturbance is left of which the mean has not shown yet whether it was a change of the load: there was
+ * none in this stroke and the last, or strokes of equal mean keep being disturbed, by the machine itself. */
+bool stroke_mean_shows_load(const stroke_mean_t *mean);
 
 #endif

@@ -443,7 +443,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         values[PARAMETER_PERIODIC_LOAD] != 0 && !control.load_from_transducer && control.moving_load.stages > 0;
     control.periodic_load = periodic_load_configure(
         control_rate_hz, learns_load ? control.bandwidth.bandwidth_rad_s[control.bandwidth.moving_stage] : 0,
-        torque_max_q24);
+        torque_max_q24, tables->rotor_poles);
     control.inertia = inertia_configure(&(inertia_settings_t){
         .control_rate_hz = control_rate_hz,
         .periods_per_update = DEFERRED_COMMON_PERIODS,

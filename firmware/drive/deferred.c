@@ -140,10 +140,9 @@ static misalignment_condition_t condition(const control_parameters_t *parameters
         speed_error_q22 >= fixed_abs(input->speed_q22) / 8) {
         return MISALIGNMENT_UNSTEADY;
     }
-    if (!disturbed(parameters, input) && input->torque_shortfall_q24 == 0) {
-        return MISALIGNMENT_STEADY;
-    }
-    return stroke_mean_repeats(&deferred->stroke_mean) ? MISALIGNMENT_INTERRUPTED : MISALIGNMENT_UNSTEADY;
+    const bool steady = !disturbed(parameters, input) && input->torque_shortfall_q24 == 0 &&
+                        stroke_mean_shows_load(&deferred->stroke_mean);
+    return steady ? MISALIGNMENT_STEADY : MISALIGNMENT_INTERRUPTED;
 }
 
 static int32_t disturbance_q24(const deferred_t *deferred, const deferred_input_t *input) {

@@ -5,7 +5,9 @@
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>
+#include <deque>
 #include <functional>
+#include <numeric>
 
 #include <gtest/gtest.h>
 
@@ -20,6 +22,8 @@ namespace {
 using namespace fixed_point;
 constexpr uint32_t RATE_HZ = 40000, UPDATE_PERIODS = 4, BANDWIDTH_RAD_S = 1700;
 constexpr int VALUES = PERIODIC_LOAD_VALUES;
+constexpr unsigned ROTOR_POLES = 6;
+constexpr int PITCH = 11; // values of a pole pitch, 10.7
 constexpr double TORQUE_MAX_NM = 19.1, LEAD_PERIODS = 4.0;
 const double LAG_S = std::floor(2.2 / BANDWIDTH_RAD_S * RATE_HZ) / RATE_HZ;
 
@@ -36,6 +40,7 @@ class Reference {
                 end_value(lag);
             } else {
                 mode = mode == CLEAR ? CLEAR : KEEP;
+                window.clear();
                 begin_turn();
             }
             index = now;
@@ -59,7 +64,7 @@ class Reference {
 
     void begin_turn() {
         count = 0;
-        total = load = change = residual = 0.0;
+        total = load = change = residual = slow = 0.0;
         moved = false;
     }
 
@@ -69,6 +74,11 @@ class Reference {
         residual += std::fabs(y - mean);
         load += std::fabs(z - mean);
         change += std::fabs(z - estimate[index]);
+        window.push_back(z);
+        if (window.size() > PITCH) {
+            window.pop_front();
+        }
+        slow += std::fabs(std::accumulate(window.begin(), window.end(), 0.0) / double(window.size()) - mean);
         estimate[index] = z;
         const int ahead = wrapped(index + (lag < 0.0 ? -VALUES / 4 : VALUES / 4));
         const double smooth =
@@ -86,7 +96,7 @@ class Reference {
 
     void end_turn() {
         const double threshold = VALUES * TORQUE_MAX_NM / 256.0;
-        if (load < threshold || load < residual / 4.0) {
+        if (load < threshold || load < residual / 4.0 || slow < load / 4.0) {
             mode = CLEAR;
         } else if (mode == CLEAR) {
             mode = KEEP;
@@ -103,7 +113,8 @@ class Reference {
     mode_t mode = CLEAR;
     int index = 0, count = 0;
     unsigned updates = 0;
-    double sum = 0.0, mean = 0.0, total = 0.0, load = 0.0, change = 0.0, residual = 0.0;
+    double sum = 0.0, mean = 0.0, total = 0.0, load = 0.0, change = 0.0, residual = 0.0, slow = 0.0;
+    std::deque<double> window;
     bool moved = false;
 };
 
@@ -134,7 +145,7 @@ struct learned_t {
 
 learned_t learn(double rpm, const load_t &load_Nm, double run_s, bool moving = true) {
     const periodic_load_parameters_t parameters =
-        periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24));
+        periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24), ROTOR_POLES);
     periodic_load_t state{};
     Reference reference;
     Observer observer;
@@ -216,6 +227,21 @@ TEST(PeriodicLoad, learns_nothing_from_a_constant_load_a_step_or_a_ramp) {
     }
 }
 
+TEST(PeriodicLoad, ripple_that_repeats_with_every_pole_pitch_is_the_machine_s_own_and_is_not_learned) {
+    for (const unsigned harmonic : {1u, 2u, 4u}) {
+        const auto ripple = [=](double, double turns) {
+            return 8.0 + 2.0 * std::sin(2.0 * PI * ROTOR_POLES * harmonic * turns);
+        };
+        for (const double rpm : {150.0, -600.0}) {
+            EXPECT_EQ(learn(rpm, ripple, 20.0 * 60.0 / std::fabs(rpm)).torque_Nm, 0.0) << harmonic << " " << rpm;
+        }
+        const auto both = [=](double time_s, double turns) {
+            return ripple(time_s, turns) + 2.0 * std::sin(2.0 * PI * turns);
+        };
+        EXPECT_TRUE(learn(150.0, both, 8.0).engaged) << "beside a load that repeats with every turn";
+    }
+}
+
 TEST(PeriodicLoad, learns_nothing_while_the_load_does_not_count_as_moving) {
     EXPECT_EQ(learn(600.0, harmonics, 2.0, false).largest_q24, 0);
 }
@@ -255,8 +281,8 @@ TEST(PeriodicLoad, torque_is_bounded_by_the_largest_torque_of_the_drive) {
 
 TEST(PeriodicLoad, without_a_bandwidth_or_beyond_a_delay_of_eight_values_nothing_is_learned) {
     const int32_t torque_max_q24 = to_fixed(TORQUE_MAX_NM, Q24);
-    EXPECT_EQ(periodic_load_configure(RATE_HZ, 0, torque_max_q24).lag_periods, 0);
-    const periodic_load_parameters_t slow = periodic_load_configure(RATE_HZ, 250, torque_max_q24);
+    EXPECT_EQ(periodic_load_configure(RATE_HZ, 0, torque_max_q24, 4).lag_periods, 0);
+    const periodic_load_parameters_t slow = periodic_load_configure(RATE_HZ, 250, torque_max_q24, 4);
     EXPECT_EQ(slow.lag_periods, 352);
     EXPECT_NEAR(slow.angle_step_max * 352.0, 0x1p29, 0x1p21);
     periodic_load_t state{};
