@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -28,19 +29,35 @@ class Installed:
     folder: Path
     wheel: Path
     constraints: Path
+    first_output: str
+    """Of the steps of the README."""
 
     def run(self, *command: str | Path, cwd: Path, path: str = "") -> subprocess.CompletedProcess[str]:
         """Runs a command of the environment; path: where other programs are found."""
-        environment = {"PATH": f"{self.folder}/bin:{path}".rstrip(":"), "HOME": str(self.folder), "LANG": "C.UTF-8",
-                       "PIP_CONSTRAINT": str(self.constraints), "PIP_FIND_LINKS": str(self.wheel.parent)}
-        environment |= {name: value for name, value in os.environ.items() if name.startswith("PIP_C")}
+        environment = {"PATH": f"{self.folder}/bin:{path}".rstrip(":"), "PIP_FIND_LINKS": str(self.wheel.parent),
+                       **environment_of(self.constraints)}
         return subprocess.run([str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True,
                               stdin=subprocess.DEVNULL)
 
 
+def environment_of(constraints: Path) -> dict[str, str]:
+    """What a stranger has, the versions of the lock file, and pip's own settings."""
+    settings = {name: value for name, value in os.environ.items() if name.startswith("PIP_C")}
+    return {"HOME": str(constraints.parent), "LANG": "C.UTF-8", "PIP_NO_COMPILE": "1", **settings,
+            "PIP_CONSTRAINT": str(constraints)}
+
+
+def steps_of_the_readme() -> str:
+    """The commands from an empty folder to the first test, as the README has them."""
+    text = (ROOT / "README.md").read_text()
+    found = re.search(r"### In a repository of your own\n.*?\n```\n(.*?)```\n", text, re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """The wheel, built and installed with its dependencies as the lock file has them."""
+    """The wheel, built, and used as the README says: in an empty folder, with Python and cp in PATH, nothing else."""
     folder = tmp_path_factory.mktemp("kit")
     started_s = time.monotonic()
     sys_argv, sys.argv = sys.argv, ["salient", "wheel", "--out", str(folder / "wheel")]
@@ -53,11 +70,16 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     constraints = folder / "constraints.txt"
     lock = (ROOT / "tools" / "requirements.lock").read_text().splitlines()
     constraints.write_text("".join(f"{line.split()[0]}\n" for line in lock if "==" in line and line[0].isalpha()))
-    subprocess.run([sys.executable, "-m", "venv", folder / "venv"], check=True)
-    subprocess.run([folder / "venv/bin/python", "-m", "pip", "--disable-pip-version-check", "install", "-q",
-                    "--no-compile", "-c", constraints, f"{wheel}[test]"], check=True)
-    print(f"wheel built in {built_s - started_s:.1f} s, installed in {time.monotonic() - built_s:.1f} s")
-    return Installed(folder / "venv", wheel, constraints)
+    (folder / "bin").mkdir()
+    for program in ("python3", "cp"):
+        (folder / "bin" / program).symlink_to(shutil.which(program, path=SYSTEM))
+    (folder / "mine").mkdir()
+    steps = steps_of_the_readme().replace("CLONE/out/wheel", str(wheel.parent)).replace("CLONE", str(ROOT))
+    done = subprocess.run(["/bin/bash", "-euc", steps], cwd=folder / "mine", capture_output=True, text=True,
+                          env={"PATH": str(folder / "bin"), **environment_of(constraints)}, stdin=subprocess.DEVNULL)
+    assert done.returncode == 0, f"{steps}\n{done.stdout}\n{done.stderr}"
+    print(f"wheel built in {built_s - started_s:.1f} s, installed and first test in {time.monotonic() - built_s:.1f} s")
+    return Installed(folder / "mine" / "venv", wheel, constraints, done.stdout)
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +97,11 @@ def foreign(installed: Installed, tmp_path_factory: pytest.TempPathFactory) -> P
 def steps(root: Path) -> list[str]:
     workflow = yaml.safe_load((root / ".github/workflows/ci.yml").read_text())
     return [step["run"] for step in workflow["jobs"]["test"]["steps"] if "run" in step]
+
+
+def test_steps_of_the_readme_end_with_the_first_passing_test(installed):
+    assert len(steps_of_the_readme().splitlines()) == 3
+    assert re.fullmatch(r"=+ 1 passed in .*", installed.first_output.splitlines()[-1]), installed.first_output
 
 
 def test_wheel_runs_on_any_linux(installed):
