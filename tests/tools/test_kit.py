@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from salient.__main__ import main
+from salient.cli import CLONE_ONLY
 from salient.paths import BUILD, ROOT
 
 FOREIGN = ROOT / "tests" / "tools" / "foreign"
@@ -126,10 +127,18 @@ def test_commands_work_without_clone(installed, tmp_path):
     runs = json.loads((tmp_path / "out/start_600/results.json").read_text())["controllers"]
     assert set(runs) == {"traditional", "paper", "salient"}
     assert all(run["fault"] == "none" and 598 < run["final_speed_rpm"] < 602 for run in runs.values())
-    for arguments, error in ((("test",), "salient: no command test: must be one of demo, sim, run"),
+    for arguments in (("machine", "saturating"), ("compare", "--list"),
+                      ("sweep", "start_600", "--set", "smc_k=900", "--controller", "salient")):
+        done = installed.run("salient", *arguments, cwd=tmp_path)
+        assert (done.returncode, done.stdout != "") == (0, True), done.stderr
+
+
+def test_what_only_a_clone_has_is_refused_in_one_line(installed, tmp_path):
+    for arguments, error in (*(((name,), f"salient: no command {name}: must be one of demo, sim, run")
+                               for name in CLONE_ONLY),
                              (("sim", "--target", "rv32"), "salient: --target rv32: only in a clone")):
         done = installed.run("salient", *arguments, cwd=tmp_path)
-        assert (done.returncode, done.stderr.startswith(error)) == (2, True), done.stderr
+        assert (done.returncode, done.stderr.startswith(error), done.stderr.count("\n")) == (2, True, 1), done.stderr
 
 
 def test_program_in_the_wheel_has_the_bits_of_the_build(installed, tmp_path):
