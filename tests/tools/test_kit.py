@@ -174,7 +174,8 @@ def test_bug_in_its_law_fails_a_test_that_shows_where(installed, foreign, tmp_pa
     done = installed.run("bash", "-euc", test, cwd=root, path=SYSTEM)
     assert done.returncode == 1 and "test_load_is_compensated" in done.stdout, done.stdout
     folder = root / "build/failures/tests_test_drive.py_test_load_is_compensated/0"
-    assert {"can.blf", "can.log", "failure.png", "truth.npy", "bench.json"} <= {path.name for path in folder.iterdir()}
+    names = {path.name for path in folder.iterdir()}
+    assert {"can.blf", "can.log", "failure.html", "last_second.png", "truth.npy", "bench.json"} <= names
     code = ("import numpy, sys\ntruth = numpy.load(sys.argv[1])\n"
             "speed_rpm = [truth['speed_rpm'][numpy.searchsorted(truth['time_s'], t)] for t in (0.12, 0.39)]\n"
             "print(*speed_rpm)\n")

@@ -35,6 +35,7 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
     folder.mkdir(parents=True, exist_ok=True)
     write_logs(session.log, folder / "can.blf", folder / "can.log")
     plot_moment(session, session.time_s, "failure", folder / "failure.png")
+    plot_moment(session, session.time_s, "failure", folder / "last_second.png", TRUTH_S)
     changed = changes(session, session.time_s)
     about: dict[str, Any] = {"virtual_time_s": session.time_s, "changes_before_the_failure": changed}
     fault = first_fault(session)
@@ -57,7 +58,8 @@ def _write_page(folder: Path, about: dict[str, Any]) -> None:
     from salient.pages import Plot, write_page
 
     plots = [Plot("", title, (folder / name).read_bytes())
-             for name, title in (("failure.png", "The end"), ("first_fault.png", "The first fault"))
+             for name, title in (("failure.png", "The end"), ("first_fault.png", "The first fault"),
+                                ("last_second.png", "The last second"))
              if (folder / name).exists()]
     # The first ones of a drive that is on the bus already, the last ones of a failure outside pytest.
     unknown = dict.fromkeys(("simulator", "stderr", "machine", "seed", "test", "phase", "replay_in"), "")
@@ -129,7 +131,7 @@ def _settings(session: Session, from_s: float, to_s: float) -> list[tuple[float,
     return found
 
 
-def plot_moment(session: Session, time_s: float, title: str, path: Path) -> None:
+def plot_moment(session: Session, time_s: float, title: str, path: Path, before_s: float = BEFORE_S) -> None:
     """Speed, torque and phase currents, true and in the telemetry, around a moment."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -147,9 +149,9 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path) -> None
             signal = getattr(session, source)[name]
             if name == "current_d_A" and not signal.value.any():
                 continue  # a machine of three phases
-            signal = signal.between(time_s - BEFORE_S, time_s + AFTER_S)
-            axes.plot(signal.time_s, signal.value, label=f"{source} {signal.name}", marker=".", markersize=3,
-                      color=colour)
+            signal = signal.between(time_s - before_s, time_s + AFTER_S)
+            axes.plot(signal.time_s, signal.value, label=f"{source} {signal.name}", color=colour,
+                      marker="." if before_s <= BEFORE_S else "", markersize=3)
             axes.set_ylabel(signal.unit)
         axes.axvline(time_s, color="black", linewidth=1, linestyle="--")
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small", frameon=False)
