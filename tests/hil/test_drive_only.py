@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
 
 import can
 import pytest
 
+from salient.bench.emulator import EmulatorProcess
 from salient.bench.programs import command_line
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, open_bus
 from salient.bus.signals import drive_database, rig_database
@@ -54,3 +56,27 @@ def test_bus_of_the_drive_only_has_no_frame_of_the_bench_but_replies(request, tm
     # On SocketCAN the reader needs the first frame to find that there are no stamps.
     missing = 0 if interface == "local" else 1
     assert [bytes(message.data) for _, message in frames[:-1]] == [bytes(message.data) for message in drives[missing:]]
+
+
+SUITE = """
+def test_of_any_drive(bench):
+    bench.drive.speed_reference_rpm = 150
+    bench.run_until(lambda: abs(bench.telemetry["speed_rpm"].last - 150) < 5, timeout=5)
+    bench.drive.stop()
+
+def test_of_the_bench(bench):
+    bench.load_torque_Nm = 3
+"""
+
+
+@pytest.mark.both_transports
+def test_suite_on_the_bus_of_a_drive_alone_skips_what_needs_the_bench(request, tmp_path):
+    interface = request.config.getoption("--salient-can")
+    address = f"unix:{tmp_path}/bus" if interface == "local" else interface
+    (tmp_path / "test_some.py").write_text(SUITE)
+    # A tenth of real time: the time-out of commands leaves a wide margin for a slow computer.
+    with EmulatorProcess(BenchConfig(pace="x0.1", drive_only=True), address):
+        done = subprocess.run([sys.executable, "-m", "pytest", "-rs", "-p", "no:cacheprovider",
+                               f"--salient-can={address}", "."], cwd=tmp_path, capture_output=True, text=True)
+    assert "1 passed, 1 skipped" in done.stdout, done.stdout + done.stderr
+    assert f"needs the test bench (bench.load_torque_Nm), and on {address} there is a drive alone" in done.stdout

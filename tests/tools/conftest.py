@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,3 +59,25 @@ def dask_cluster(tmp_path: Path) -> Iterator[DaskCluster]:
         for process in processes:
             process.kill()
             process.communicate()
+
+
+@pytest.fixture
+def unreadable(browser: Browser) -> Callable[[Path, int], list[str]]:
+    """What a person cannot read of a page at a width: text that is cut off, or the numbers of a table that its first
+    column, which stays when the table is scrolled, covers."""
+
+    def find(path: Path, width: int) -> list[str]:
+        page = browser.new_page(viewport={"width": width, "height": 800})
+        try:
+            page.goto(path.as_uri())
+            return page.evaluate("""() => [
+                ...(document.documentElement.scrollWidth > innerWidth ? ["the page"] : []),
+                ...[...document.querySelectorAll("h1, h2, h3, p, li, th, td, pre, figcaption, small, b")]
+                    .filter((each) => each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0),
+                ...[...document.querySelectorAll(".wide th:first-child:not([colspan])")]
+                    .filter((each) => each.offsetWidth > 0.5 * each.closest(".wide").clientWidth),
+            ].map((each) => each.textContent || each)""")
+        finally:
+            page.close()
+
+    return find

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 import yaml
 
 from salient.__main__ import main
+from salient.cli import CLONE_ONLY
 from salient.paths import BUILD, ROOT
 
 FOREIGN = ROOT / "tests" / "tools" / "foreign"
@@ -28,19 +30,35 @@ class Installed:
     folder: Path
     wheel: Path
     constraints: Path
+    first_output: str
+    """Of the steps of the README."""
 
     def run(self, *command: str | Path, cwd: Path, path: str = "") -> subprocess.CompletedProcess[str]:
         """Runs a command of the environment; path: where other programs are found."""
-        environment = {"PATH": f"{self.folder}/bin:{path}".rstrip(":"), "HOME": str(self.folder), "LANG": "C.UTF-8",
-                       "PIP_CONSTRAINT": str(self.constraints), "PIP_FIND_LINKS": str(self.wheel.parent)}
-        environment |= {name: value for name, value in os.environ.items() if name.startswith("PIP_C")}
+        environment = {"PATH": f"{self.folder}/bin:{path}".rstrip(":"), "PIP_FIND_LINKS": str(self.wheel.parent),
+                       **environment_of(self.constraints)}
         return subprocess.run([str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True,
                               stdin=subprocess.DEVNULL)
 
 
+def environment_of(constraints: Path) -> dict[str, str]:
+    """What a stranger has, the versions of the lock file, and pip's own settings."""
+    settings = {name: value for name, value in os.environ.items() if name.startswith("PIP_C")}
+    return {"HOME": str(constraints.parent), "LANG": "C.UTF-8", "PIP_NO_COMPILE": "1", **settings,
+            "PIP_CONSTRAINT": str(constraints)}
+
+
+def steps_of_the_readme() -> str:
+    """The commands from an empty folder to the first test, as the README has them."""
+    text = (ROOT / "README.md").read_text()
+    found = re.search(r"### In a repository of your own\n.*?\n```\n(.*?)```\n", text, re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """The wheel, built and installed with its dependencies as the lock file has them."""
+    """The wheel, built, and used as the README says: in an empty folder, with Python and cp in PATH, nothing else."""
     folder = tmp_path_factory.mktemp("kit")
     started_s = time.monotonic()
     sys_argv, sys.argv = sys.argv, ["salient", "wheel", "--out", str(folder / "wheel")]
@@ -53,18 +71,16 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     constraints = folder / "constraints.txt"
     lock = (ROOT / "tools" / "requirements.lock").read_text().splitlines()
     constraints.write_text("".join(f"{line.split()[0]}\n" for line in lock if "==" in line and line[0].isalpha()))
-    environment = os.environ | {"PIP_CONSTRAINT": str(constraints), "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
-    subprocess.run(readme_steps(wheel.parent)[0], shell=True, check=True, cwd=folder, env=environment,
-                   stdout=subprocess.DEVNULL)
-    print(f"wheel built in {built_s - started_s:.1f} s, installed in {time.monotonic() - built_s:.1f} s")
-    return Installed(folder / "venv", wheel, constraints)
-
-
-def readme_steps(wheels: Path) -> list[str]:
-    """The README's steps from an empty folder to the first test, with the folders of the wheel and of the clone."""
-    section = (ROOT / "README.md").read_text(encoding="utf-8").split("### In a repository of your own")[1]
-    return [line.replace("CLONE/out/wheel", str(wheels)).replace("CLONE", str(ROOT))
-            for line in section.split("```")[1].strip().splitlines()]
+    (folder / "bin").mkdir()
+    for program in ("python3", "cp"):
+        (folder / "bin" / program).symlink_to(shutil.which(program, path=SYSTEM))
+    (folder / "mine").mkdir()
+    steps = steps_of_the_readme().replace("CLONE/out/wheel", str(wheel.parent)).replace("CLONE", str(ROOT))
+    done = subprocess.run(["/bin/bash", "-euc", steps], cwd=folder / "mine", capture_output=True, text=True,
+                          env={"PATH": str(folder / "bin"), **environment_of(constraints)}, stdin=subprocess.DEVNULL)
+    assert done.returncode == 0, f"{steps}\n{done.stdout}\n{done.stderr}"
+    print(f"wheel built in {built_s - started_s:.1f} s, installed and first test in {time.monotonic() - built_s:.1f} s")
+    return Installed(folder / "mine" / "venv", wheel, constraints, done.stdout)
 
 
 @pytest.fixture(scope="module")
@@ -84,21 +100,17 @@ def steps(root: Path) -> list[str]:
     return [step["run"] for step in workflow["jobs"]["test"]["steps"] if "run" in step]
 
 
+def test_steps_of_the_readme_end_with_the_first_passing_test(installed):
+    assert len(steps_of_the_readme().splitlines()) == 3
+    assert re.fullmatch(r"=+ 1 passed in .*", installed.first_output.splitlines()[-1]), installed.first_output
+
+
 def test_wheel_runs_on_any_linux(installed):
     shown = subprocess.run([sys.executable, "-m", "auditwheel", "show", installed.wheel], capture_output=True,
                            text=True)
     assert "requires no external shared libraries" in " ".join(shown.stdout.split()), shown
     assert 'following platform tag: "manylinux_2_5_x86_64"' in " ".join(shown.stdout.split())
     assert "manylinux_2_17_x86_64" in installed.wheel.name
-
-
-def test_steps_of_the_readme_end_with_a_test_that_passes(installed):
-    folder = installed.folder.parent
-    install, copy, test = readme_steps(installed.wheel.parent)
-    assert install.startswith("python3 -m venv venv") and (folder / "venv") == installed.folder  # by the fixture
-    subprocess.run(copy, shell=True, check=True, cwd=folder)
-    done = installed.run("bash", "-euc", test, cwd=folder, path=SYSTEM)
-    assert (done.returncode, "1 passed" in done.stdout) == (0, True), done.stdout + done.stderr
 
 
 def test_suite_passes_without_clone_compiler_and_cmake(installed, tmp_path):
@@ -115,10 +127,18 @@ def test_commands_work_without_clone(installed, tmp_path):
     runs = json.loads((tmp_path / "out/start_600/results.json").read_text())["controllers"]
     assert set(runs) == {"traditional", "paper", "salient"}
     assert all(run["fault"] == "none" and 598 < run["final_speed_rpm"] < 602 for run in runs.values())
-    for arguments, error in ((("test",), "salient: no command test: must be one of demo, sim, run"),
+    for arguments in (("machine", "saturating"), ("compare", "--list"),
+                      ("sweep", "start_600", "--set", "smc_k=900", "--controller", "salient")):
+        done = installed.run("salient", *arguments, cwd=tmp_path)
+        assert (done.returncode, done.stdout != "") == (0, True), done.stderr
+
+
+def test_what_only_a_clone_has_is_refused_in_one_line(installed, tmp_path):
+    for arguments, error in (*(((name,), f"salient: no command {name}: must be one of demo, sim, run")
+                               for name in CLONE_ONLY),
                              (("sim", "--target", "rv32"), "salient: --target rv32: only in a clone")):
         done = installed.run("salient", *arguments, cwd=tmp_path)
-        assert (done.returncode, done.stderr.startswith(error)) == (2, True), done.stderr
+        assert (done.returncode, done.stderr.startswith(error), done.stderr.count("\n")) == (2, True, 1), done.stderr
 
 
 def test_program_in_the_wheel_has_the_bits_of_the_build(installed, tmp_path):
@@ -154,7 +174,8 @@ def test_bug_in_its_law_fails_a_test_that_shows_where(installed, foreign, tmp_pa
     done = installed.run("bash", "-euc", test, cwd=root, path=SYSTEM)
     assert done.returncode == 1 and "test_load_is_compensated" in done.stdout, done.stdout
     folder = root / "build/failures/tests_test_drive.py_test_load_is_compensated/0"
-    assert {"can.blf", "can.log", "failure.png", "truth.npy", "bench.json"} <= {path.name for path in folder.iterdir()}
+    names = {path.name for path in folder.iterdir()}
+    assert {"can.blf", "can.log", "failure.html", "last_second.png", "truth.npy", "bench.json"} <= names
     code = ("import numpy, sys\ntruth = numpy.load(sys.argv[1])\n"
             "speed_rpm = [truth['speed_rpm'][numpy.searchsorted(truth['time_s'], t)] for t in (0.12, 0.39)]\n"
             "print(*speed_rpm)\n")

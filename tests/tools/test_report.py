@@ -306,3 +306,9 @@ def test_text_of_the_user_is_escaped(content, plot_files, tmp_path):
 
 def test_equal_results_give_equal_pages(content, plot_files, tmp_path):
     assert page(tmp_path / "a.html", content, plot_files) == page(tmp_path / "b.html", content, plot_files)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_nothing_of_the_page_is_cut_off_or_covered(unreadable, tmp_path, content, plot_files, width):
+    page(tmp_path / "report.html", content, plot_files, [("the figures", [("results.json", "results.json")])])
+    assert unreadable(tmp_path / "report.html", width) == []

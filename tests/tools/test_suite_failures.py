@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import subprocess
@@ -110,7 +111,9 @@ def test_failure_leaves_its_folder_and_replays(suite, name):
     assert bench["virtual_time_s"] == pytest.approx(expected_s)
     with can.LogReader(folder / "0" / "can.blf") as log:
         assert len(list(log)) == len((folder / "0" / "can.log").read_text().splitlines()) > 300
-    assert (folder / "0" / "failure.png").read_bytes().startswith(b"\x89PNG")
+    assert all((folder / "0" / name).read_bytes().startswith(b"\x89PNG") for name in ("failure.png", "last_second.png"))
+    page = html.unescape((folder / "0" / "failure.html").read_text())
+    assert f"<h1>tests/test_kinds.py::{name}</h1>" in page and error in page and values["salient_replay"] in page
     truth = np.load(folder / "0" / "truth.npy")
     # A simulator that is killed has not written the rows of its last block.
     assert bench["virtual_time_s"] - 0.06 * (name == "test_killed") <= truth["time_s"][-1] + 1e-4

@@ -98,8 +98,8 @@ def test_commands_act_on_the_drive_and_refusals_are_said(tab, open_page):
 
 
 def test_rewound_and_replayed_the_run_has_the_same_bits_and_another_branch_is_beside_it(tab, open_page):
-    page = open_page(f"{tab}#{BITS}")
-    wait_until(page, 0.35)
+    page = open_page(f"{tab}#{BITS}&until=0.35")
+    page.wait_for_function("salient.stopped")
     first = hash_at(page, 1.2)
     page.get_by_role("button", name="−1 s").click()
     assert page.evaluate("salient.source.run.timeNs") == pytest.approx(0.2e9, abs=1e6)

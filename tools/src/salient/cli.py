@@ -28,7 +28,7 @@ from salient.version import VERSION
 
 TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "plant", "tools", "socketcan")
 """The steps of `test`, in order."""
-CLONE_ONLY = ("test", "benchmark", "pil", "wheel")
+CLONE_ONLY = ("test", "benchmark", "pil", "wheel", "tab", "campaign", "replay")
 """Commands that need the sources."""
 CHANGE_PERCENT = 10.0
 """Smaller changes of a ripple, which is an extreme of one run, are within its scatter."""

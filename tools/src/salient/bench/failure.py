@@ -13,10 +13,13 @@ import numpy as np
 from salient.bench.session import Session
 from salient.bus.log import write_logs
 from salient.config import BenchConfig
+from salient.paths import COMMAND
 
 BEFORE_S, AFTER_S = 0.05, 0.01
 """Of a plot and of the list of changes, around their moment."""
 TRUTH_S = 1.0
+COLOURS = ("#0072b2", "#d55e00", "#000000", "#56b4e9")
+"""Those of the live page (view/page/palette.js)."""
 TRUTH = "truth.npy"
 RECORD_STEP_NS = 50_000
 """Of the recording that a bench of a test makes for this purpose, which takes a few percent of its time."""
@@ -24,13 +27,15 @@ _RECORDING_HEADER_BYTES = 1024
 """RECORDER_HEADER_BYTES of emulator/plant/recorder.h."""
 
 
-def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchConfig | None) -> list[str]:
+def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchConfig | None,
+         error: str = "") -> list[str]:
     """Writes log (BLF and candump text), plots around the failure and around the first fault, bench.json with the
-    notes, and a page of all that. config: of an emulator that the session has started. Returns what changed just before
-    the failure."""
+    notes, and a page of all that and of the error. config: of an emulator that the session has started. Returns what
+    changed just before the failure."""
     folder.mkdir(parents=True, exist_ok=True)
     write_logs(session.log, folder / "can.blf", folder / "can.log")
     plot_moment(session, session.time_s, "failure", folder / "failure.png")
+    plot_moment(session, session.time_s, "failure", folder / "last_second.png", TRUTH_S)
     changed = changes(session, session.time_s)
     about: dict[str, Any] = {"virtual_time_s": session.time_s, "changes_before_the_failure": changed}
     fault = first_fault(session)
@@ -43,9 +48,9 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
         about |= {"seed": config.seed, "machine": config.machine, "node": config.node}
     if simulator is not None:
         about |= {"simulator": shlex.join(simulator.command), "stderr": simulator.errors}
-    about |= {"view": f"tools/salient view --replay {shlex.quote(str(folder))}"} | notes
+    about |= {"view": f"{COMMAND} view --replay {shlex.quote(str(folder))}"} | notes
     (folder / "bench.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-    _write_page(folder, about)
+    _write_page(folder, about | {"error": error})
     return changed
 
 
@@ -53,9 +58,11 @@ def _write_page(folder: Path, about: dict[str, Any]) -> None:
     from salient.pages import Plot, write_page
 
     plots = [Plot("", title, (folder / name).read_bytes())
-             for name, title in (("failure.png", "The end"), ("first_fault.png", "The first fault"))
+             for name, title in (("failure.png", "The end"), ("first_fault.png", "The first fault"),
+                                ("last_second.png", "The last second"))
              if (folder / name).exists()]
-    unknown = {"simulator": "", "stderr": "", "machine": "", "seed": ""}  # of a drive that is on the bus already
+    # The first ones of a drive that is on the bus already, the last ones of a failure outside pytest.
+    unknown = dict.fromkeys(("simulator", "stderr", "machine", "seed", "test", "phase", "replay_in"), "")
     write_page(folder / "failure.html", "failure.html", unknown | about | {"plots": plots})
 
 
@@ -124,7 +131,7 @@ def _settings(session: Session, from_s: float, to_s: float) -> list[tuple[float,
     return found
 
 
-def plot_moment(session: Session, time_s: float, title: str, path: Path) -> None:
+def plot_moment(session: Session, time_s: float, title: str, path: Path, before_s: float = BEFORE_S) -> None:
     """Speed, torque and phase currents, true and in the telemetry, around a moment."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -135,16 +142,20 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path) -> None
          ("truth", "load_torque_Nm")],
         [("truth", f"current_{phase}_A") for phase in "abcd"],
     )  # fmt: skip
-    figure = Figure(figsize=(10, 9), layout="constrained")
+    figure = Figure(figsize=(10, 8), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, panel in zip(figure.subplots(len(panels), 1, sharex=True), panels, strict=True):
-        for source, name in panel:
-            signal = getattr(session, source)[name].between(time_s - BEFORE_S, time_s + AFTER_S)
-            axes.plot(signal.time_s, signal.value, label=f"{source} {signal.name}", marker=".", markersize=3)
+        for (source, name), colour in zip(panel, COLOURS, strict=False):
+            signal = getattr(session, source)[name]
+            if name == "current_d_A" and not signal.value.any():
+                continue  # a machine of three phases
+            signal = signal.between(time_s - before_s, time_s + AFTER_S)
+            axes.plot(signal.time_s, signal.value, label=f"{source} {signal.name}", color=colour,
+                      marker="." if before_s <= BEFORE_S else "", markersize=3)
             axes.set_ylabel(signal.unit)
-        axes.axvline(time_s, color="tab:red", linewidth=1)
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
+        axes.axvline(time_s, color="black", linewidth=1, linestyle="--")
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small", frameon=False)
         axes.grid(alpha=0.3)
     axes.set_xlabel("virtual time, s")
     figure.suptitle(f"{title} at {time_s:.6f} s")
-    figure.savefig(path, dpi=70)
+    figure.savefig(path, dpi=110)

@@ -39,6 +39,7 @@ from salient.bench.bench import Bench
 from salient.bench.session import Session
 from salient.config import CONTROLLERS, HOST_BUILDS, TARGET_BUILDS, TARGETS, WASM_BUILD, BenchConfig
 from salient.errors import UsageError
+from salient.paths import COMMAND
 from salient.tab.link import link_of
 
 _AXES = {"machine": "machine", "controller": "controller", "target": "build"}
@@ -275,7 +276,7 @@ def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
         of_bench = state.saved[number] = folder / str(number)
         if isinstance(bench, DriveOnBus):
             bench.release()
-        changed = failure.save(bench, of_bench, notes, getattr(bench, "options", None))
+        changed = failure.save(bench, of_bench, notes, getattr(bench, "options", None), report.longreprtext)
         if report.when == "teardown" and number in state.recordings:  # complete since the fixture has ended
             failure.save_truth(state.recordings[number], of_bench)
         if isinstance(bench, Bench):
@@ -284,7 +285,7 @@ def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
         lines += [f"    {change}" for change in changed[-_CHANGES_SHOWN:]] or ["    nothing changed"]
         link = link_of(bench) if isinstance(bench, Bench) else None
         if link is not None:
-            lines.append(f"in a browser (tools/salient tab): {link}")
+            lines.append(f"in a browser ({COMMAND} tab): {link}")
     lines.append(f"replay in {item.config.rootpath}: {command}")
     properties = [("salient_folder", str(folder)), ("salient_seed", " ".join(seeds)), ("salient_replay", command)]
     item.user_properties += properties  # for the reports that follow

@@ -295,6 +295,9 @@ class Page {
     }
 
     drawPictures(time_ns) {
+        if (element("cut").clientWidth === 0) {
+            return; // the page has no size, as in a window that is being made
+        }
         drawMachine(element("cut"), this.state, time_ns);
         this.showWork(drawLoops(element("loops"), this.state, time_ns));
         const angle = this.state.angleAt(time_ns);

@@ -83,7 +83,7 @@ class Plot {
             padding: [6, 28, 0, 0],
             scales: { x: { time: false }, y: { range: rangeOf(list) } },
             axes: [
-                { size: 26, values: (plot, ticks) => ticks.map((tick) => `${+tick.toFixed(6)} s`), space: 90,
+                { size: 26, values: (plot, ticks) => ticks.map((tick) => `${+tick.toFixed(6)} s`.replace("-", "−")), space: 90,
                   font: "12px system-ui, sans-serif", stroke: "#333", grid: { stroke: "#e8e8e8", width: 1 },
                   ticks: { size: 4 } },
                 { size: AXIS_WIDTH, label: unit, labelSize: 18, labelGap: 0,
@@ -110,7 +110,7 @@ class Plot {
         }, null, this.body);
         this.plot.over.addEventListener("click", (event) => {
             const time_ns = this.plot.posToVal(event.offsetX, "x") * 1e9;
-            charts.onMark(event.shiftKey ? "B" : "A", time_ns);
+            charts.onMark(charts.cursorFor(time_ns), time_ns);
         });
     }
 
@@ -170,6 +170,15 @@ export class Charts {
     shortName(series) {
         const same = this.list.filter((other) => other.signal.name === series.signal.name);
         return same.length > 1 ? series.name : series.signal.name;
+    }
+
+    /** The cursor that a click sets: first A, then B, then the nearer one. */
+    cursorFor(time_ns) {
+        const { A, B } = this.marks;
+        if (A === undefined || B === undefined) {
+            return A === undefined ? "A" : "B";
+        }
+        return Math.abs(time_ns - A) <= Math.abs(time_ns - B) ? "A" : "B";
     }
 
     setMark(name, time_ns) {

@@ -12,6 +12,11 @@ export function make(tag, properties = {}, ...children) {
     return made;
 }
 
+/** A name in a narrow column: it may break after an underscore. */
+function breakable(name) {
+    return name.split(/(?<=_)/).flatMap((part, index) => (index ? [make("wbr"), part] : [part]));
+}
+
 /** Tabs for the panels whose commands the source has; the arrow keys go from one to the next. */
 export function makeTabs(commands) {
     const panels = [...document.querySelectorAll("[role=tabpanel]")];
@@ -140,7 +145,7 @@ export function makeParameters(act) {
             input.setAttribute("aria-label", row.name);
             input.addEventListener("input", mark);
             const unit = row.unit ? ` ${row.unit}` : "";
-            const line = make("tr", {}, make("th", { scope: "row", textContent: row.name }), make("td", {}, input),
+            const line = make("tr", {}, make("th", { scope: "row" }, ...breakable(row.name)), make("td", {}, input),
                               make("td", { textContent: `${plain(row.minimum)} to ${plain(row.maximum)}${unit}` }));
             return { name: row.name, text, input, line };
         });
@@ -203,7 +208,7 @@ export function showCursors(marks, list) {
         const [a, b] = [marks.A, marks.B].map((time_ns) => (time_ns === undefined ? NaN : series.at(time_ns)));
         const difference = series.signal.choices || !Number.isFinite(b - a) ? "–"
             : (b - a).toFixed(decimalsOf(series.signal)).replace("-", "−");
-        rows.push(make("tr", {}, make("th", { scope: "row" }, series.signal.name, make("small", {
+        rows.push(make("tr", {}, make("th", { scope: "row" }, ...breakable(series.signal.name), make("small", {
             textContent: ` ${series.signal.unit}` })), cell(textOf(series.signal, a)), cell(textOf(series.signal, b)),
             cell(difference)));
     }
