@@ -66,7 +66,7 @@ void expect_currents_below_trip(const control_parameters_t &c, const parameters_
         }
     };
     ASSERT_EQ(c.hysteresis.current_limit_q9, std::min(c.hysteresis.generating_limit_q9, limit_q9));
-    const double slope_A = double(trip_q9 - c.hysteresis.generating_limit_q9) / c.protection.over_speed_q22;
+    const double slope_A = double(trip_q9 - c.hysteresis.generating_limit_q9) / c.encoder_monitor.over_speed_q22;
     ASSERT_NEAR(c.hysteresis.generating_slope_q19, held(slope_A * fixed_point::Q32), 1.0) << "two periods more";
     if (c.hysteresis.current_limit_q9 < limit_q9) {
         ASSERT_NO_FATAL_FAILURE(expect_highest(c.hysteresis.current_limit_q9, 2.2));
