@@ -139,7 +139,8 @@ class ElfImage:
                 i += 1
             else:
                 file, _, line = lines[i + 1].partition(" (")[0].rpartition(":")
-                of.append(SourceLocation(lines[i], _short(file), int(line) if line.isdigit() else 0))
+                function = lines[i].partition(".")[0]  # without the suffixes of the compiler's copies
+                of.append(SourceLocation(function, _short(file), int(line) if line.isdigit() else 0))
                 i += 2
         return locations
 
