@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from salient.cli import make_parser
 from salient.experiments.campaign import canaries, names, same_bits
 from salient.experiments.campaign.command import run_campaign
