@@ -152,13 +152,11 @@ void drive_deferred_interrupt(drive_t *drive) {
     deferred_complete(&control->deferred_request, &control->deferred.response);
 }
 
-/* Withdraws a command that must not start a run later: to run without being armed, or one older than twice the time
- * after which a run ends (the clock wraps, and its age would then appear small again). */
-static void drop_stale_command(drive_t *drive, uint32_t time_us) {
-    const bool stale = time_us - drive->command.time_us > 2u * COMMAND_LOST_US;
-    const bool unarmed = drive->command.request == COMMAND_RUN && !drive->comms.commands.arming.armed &&
-                         drive->control.state_machine.state != DRIVE_STATE_RUN;
-    if (drive->command.request != COMMAND_OFF && (stale || unarmed)) {
+/* Withdraws a command to run that must not start a run later: without being armed. Silence disarms, so that none
+ * becomes so old that the clock wraps and its age appears small again. */
+static void drop_unarmed_command(drive_t *drive) {
+    if (drive->command.request == COMMAND_RUN && !drive->comms.commands.arming.armed &&
+        drive->control.state_machine.state != DRIVE_STATE_RUN) {
         hal_critical_enter(drive->hal);
         drive->command.request = COMMAND_OFF;
         hal_critical_leave(drive->hal);
@@ -282,6 +280,6 @@ COLD void drive_background(drive_t *drive) {
     }
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_SERVED);
     ramp_down(drive, time_us);
-    drop_stale_command(drive, time_us);
+    drop_unarmed_command(drive);
     kick_watchdog(drive, time_us);
 }

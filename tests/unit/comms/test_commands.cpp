@@ -336,6 +336,17 @@ TEST_F(Commands, every_other_sequence_of_arming_is_refused) {
     refused(8, ARMING_STEP_CONFIRM_RUN, ~challenge, 1000, DRIVE_STATE_RUN);
 }
 
+TEST_F(Commands, a_response_is_too_late_after_a_whole_round_of_the_clock_as_well) {
+    take(command_frame(1), DRIVE_STATE_READY, 1000);
+    take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
+    const uint32_t challenge = commands.arming.challenge;
+    supervise(DRIVE_STATE_READY, 60000000);
+    EXPECT_EQ(commands.arming.attempt, ARMING_ATTEMPT_NONE) << "which DRIVE_ARMING reports";
+    take(command_frame(2), DRIVE_STATE_READY, 2500);
+    EXPECT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~challenge), DRIVE_STATE_READY, 3000), COMMANDS_REJECTED);
+    EXPECT_FALSE(commands.arming.armed);
+}
+
 TEST_F(Commands, arming_without_a_living_sender_of_commands_is_refused) {
     take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
     EXPECT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY, 3000),
