@@ -58,7 +58,6 @@ struct hal {
     unsigned watchdog_starts = 0, kicks = 0;
     uint32_t kicked_us = 0;
     nvm_t nvm = erased();
-    unsigned nvm_operations = 0; // in the present background call
 
     static std::array<uint16_t, HAL_ADC_TEMPERATURES> warm() {
         std::array<uint16_t, HAL_ADC_TEMPERATURES> codes{};
@@ -130,12 +129,10 @@ uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word) {
 }
 bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value) {
     EXPECT_FALSE(hal->critical);
-    hal->nvm_operations++;
     return nvm_program(&hal->nvm, page, word, value);
 }
 bool hal_nvm_erase(hal_t *hal, unsigned page) {
     EXPECT_FALSE(hal->critical);
-    hal->nvm_operations++;
     return nvm_erase(&hal->nvm, page);
 }
 uint32_t hal_pwm_clock_hz(const hal_t *hal) {
@@ -820,6 +817,22 @@ TEST_F(Drive, five_unprotected_frames_change_nothing) {
     EXPECT_EQ(std::memcmp(&before, &drive.parameters, sizeof before), 0);
     EXPECT_EQ(std::memcmp(&control_before, &drive.control_parameters, sizeof control_before), 0);
     EXPECT_EQ(drive.store.saving, NVM_STORE_IDLE);
+}
+
+TEST_F(Drive, what_waits_for_the_memory_when_a_run_begins_is_stored_after_it) {
+    periods(400);
+    command(COMMAND_RUN);
+    run(0.05);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    parameter_store_save(&drive.store);
+    const nvm_t before = hal.nvm;
+    run(0.05);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(std::memcmp(&before, &hal.nvm, sizeof before), 0);
+    EXPECT_EQ(drive.store.saving, NVM_STORE_SAVING);
+    send(COMMAND_OFF);
+    periods(4000);
+    EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED);
 }
 
 TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {

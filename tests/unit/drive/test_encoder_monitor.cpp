@@ -131,6 +131,20 @@ TEST_F(EncoderMonitor, an_angle_that_two_phases_contradict_is_a_fault_and_one_wi
     }
 }
 
+TEST_F(EncoderMonitor, one_phase_that_contradicts_the_angle_for_4_ms_is_enough_while_no_other_conducts) {
+    for (const auto &[error_deg, fails] : {std::pair{12.0, true}, std::pair{-12.0, true}, std::pair{1.0, false}}) {
+        monitor = {};
+        input.zero_at[0] = input.period + 1;
+        int periods = 0;
+        for (; periods < 250 && !monitor.angle; periods++) {
+            step(65.0 + error_deg, 65.0, 25.0);
+        }
+        EXPECT_EQ(monitor.angle, fails) << error_deg;
+        EXPECT_GT(periods, RATE_HZ / 256) << error_deg;
+        EXPECT_LT(fails ? periods : 0, RATE_HZ / 200) << error_deg;
+    }
+}
+
 TEST_F(EncoderMonitor, integral_that_parts_faster_than_a_rotor_can_turn_is_no_frozen_encoder) {
     // Of the link voltage's 6 mWb a period: of an open winding nearly all; of a rotor that turns at a twentieth of the
     // speed of full back-EMF a twentieth.

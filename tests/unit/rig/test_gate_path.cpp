@@ -56,6 +56,14 @@ TEST_F(GatePath, compare_values_act_once_more_and_then_the_switches_open) {
     EXPECT_EQ(board_pwm_break(&board), HAL_PWM_BREAK_NOT_RENEWED);
 }
 
+TEST_F(GatePath, a_reset_of_the_processor_opens_every_switch_before_its_first_instruction) {
+    period(false, true);
+    period(false, true);
+    ASSERT_TRUE(any_on());
+    board_reset(&board, HAL_RESET_WATCHDOG);
+    EXPECT_FALSE(any_on());
+}
+
 TEST_F(GatePath, an_interrupt_that_does_not_end_renews_nothing) {
     period(false, true);
     period(false, true); // begins, writes at once, and does not end
