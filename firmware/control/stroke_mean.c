@@ -3,7 +3,7 @@
 #include "fixed/fixed.h"
 
 #define SETTLE_MS 150
-#define SETTLE_STROKES 4
+#define SETTLE_STROKES 2
 #define STROKE_UPDATES_MIN 8
 #define TOLERANCE_Q24 1677722 /* 0.1 N m */
 /* Disturbed strokes of equal mean from which on the machine disturbs itself. */

@@ -32,7 +32,7 @@ typedef struct {
 /* Rate of the updates in Hz. */
 stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_rate_hz);
 
-/* One update; true if the load is constant: within the last 150 ms, and the last four strokes, no mean changed by
+/* One update; true if the load is constant: within the last 150 ms, and the last two strokes, no mean changed by
  * more than 0.1 N m and 1/16 of the torque, by which learning itself moves it, 1/8 while strokes are disturbed.
  * electrical: angle of phase 0, 2^-32 electrical rev; load and torque in N m, Q7.24. Strokes of fewer than 8 updates
  * are not separated. */
