@@ -333,10 +333,27 @@ static void look_at_recovery(oracle_t *oracle, const plant_t *plant) {
     oracle->settled = oracle->settled || (oracle->in_band_ns && plant->time_ns >= oracle->in_band_ns + 2 * MS_NS);
 }
 
+/* Lines of safe torque off that differed for 200 ms keep a drive in a fault until both have been without energy. */
+static bool sto_lines_differed(const oracle_t *oracle) {
+    const world_t *world = oracle->world;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = &world->event[i];
+        if ((world->kept >> i & 1u) && event->kind == WORLD_SET &&
+            (event->what == BENCH_VARIABLE_STO_1 || event->what == BENCH_VARIABLE_STO_2) &&
+            (event->end_us == 0 || event->end_us > event->begin_us + 195000)) {
+            return true;
+        }
+    }
+    return false;
+}
+
 /* True when what keeps a drive in a fault is still there: nothing to be judged. */
 static bool cause_remains(const oracle_t *oracle) {
     if (any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_PERIOD_REGISTER_FLIPPED)) {
         return true; /* memory that has changed: until a reset */
+    }
+    if (sto_lines_differed(oracle)) {
+        return true;
     }
     const uint8_t last = oracle->causes ? oracle->cause[oracle->causes - 1] : 0;
     return last == CAUSE_WINDING_OVERLOAD || last == CAUSE_INVERTER_OVERLOAD || last == CAUSE_IDENTIFIER_CONFLICT;
@@ -459,6 +476,10 @@ static void judge_cause(oracle_t *oracle, const plant_t *plant) {
             any = any || causes;
         }
     }
+    /* With one phase that has conducted so far a factor of its current and a wrong angle are the same. */
+    if (!oracle->turned && (oracle->injected[FAULT_DIODE_OPEN] || oracle->injected[FAULT_CURRENT_SENSOR_GAIN])) {
+        allowed |= BIT(CAUSE_ENCODER_ANGLE);
+    }
     const unsigned cause = oracle->drive.fault;
     const bool own_work = cause == CAUSE_OVER_CURRENT || cause == CAUSE_HARDWARE_OVER_CURRENT; /* of the drive */
     if ((allowed >> cause & 1u) || ((any || !own_work) && true_of_plant(oracle, cause, plant))) {
@@ -482,6 +503,8 @@ static void enter_run(oracle_t *oracle, const plant_t *plant) {
 
 void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive_t drive) {
     const uint8_t before = oracle->drive.state;
+    const double stroke_rad = TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
+    oracle->turned = oracle->turned || fabs(plant->rotor_angle_rad - oracle->run_angle_rad) > stroke_rad;
     oracle->drive = drive;
     oracle->interrupt_ns = plant->time_ns;
     unsigned gates = gates_on(plant);
@@ -514,6 +537,8 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
             violate(oracle, "not_recovered", plant->time_ns, 3, drive.fault);
         }
     } else if (drive.state == STATE_RUN && before != STATE_RUN) {
+        oracle->run_angle_rad = plant->rotor_angle_rad;
+        oracle->turned = false;
         enter_run(oracle, plant);
     } else if (drive.state == STATE_READY && before == STATE_RUN) {
         const uint64_t age_ns = plant->time_ns > oracle->run_ns ? plant->time_ns - oracle->run_ns : 0;

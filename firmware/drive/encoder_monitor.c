@@ -38,6 +38,11 @@
  * have within a quarter of a second (SHOWN_SHIFT), the contradiction of one alone is not the encoder's. */
 #define AGREES_SHIFT 10
 
+/* Part of a stroke that the rotor advances within 1/256 s when it brings the next phase within 1/4 s; and counts of the
+ * encoder that show it. */
+#define ADVANCE_STROKES 64u
+#define ADVANCE_COUNTS 2u
+
 /* Time without a zero of the current after which an integral is too old to contradict the angle: 1/128 s. */
 #define AGE_SHIFT 7
 
@@ -240,10 +245,29 @@ static bool others_agree(const encoder_monitor_parameters_t *parameters, encoder
     return all;
 }
 
+/* True while the encoder shows a rotor that turns the way the torque drives it. */
+static bool advances(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
+                     const encoder_monitor_input_t *input) {
+    const commutation_parameters_t *commutation = &parameters->commutation;
+    const int32_t least = (int32_t)(commutation->stroke / commutation->rotor_poles / ADVANCE_STROKES +
+                                    ADVANCE_COUNTS * 2u * parameters->middle);
+    const int32_t travel = (int32_t)(input->encoder_angle - monitor->waypoint);
+    const int32_t advance = input->torque_q24 < 0 ? fixed_subtract(0, travel) : travel;
+    if (advance < 0 || advance >= least) {
+        monitor->waypoint = input->encoder_angle;
+    }
+    if (advance >= least) {
+        monitor->advanced = true;
+        monitor->advanced_at = input->period;
+    }
+    return monitor->advanced && input->period - monitor->advanced_at <= parameters->rate_hz >> ALONE_SHIFT;
+}
+
 static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                        const encoder_monitor_input_t *input, uint32_t periods, bool counted) {
     const uint32_t electrical =
         commutation_electrical(&parameters->commutation, input->encoder_angle + parameters->middle);
+    const bool next_decides = advances(parameters, monitor, input);
     unsigned contradicting = 0;
     bool alone = false;
     monitor->suspicious = false;
@@ -260,7 +284,7 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
             phase->agrees = 0;
         }
         contradicting += shows(parameters, phase, input->period);
-        alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT &&
+        alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT && !next_decides &&
                  !others_agree(parameters, monitor, index, input->period);
     }
     monitor->angle |= contradicting >= CONTRADICTING_PHASES || alone;
@@ -280,6 +304,14 @@ static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_
                           (travel > limit + limit / 16 + count || (above && travel + count > limit - limit / 32));
     monitor->window_period = input->period;
     monitor->window_angle = input->encoder_angle;
+}
+
+bool encoder_monitor_contradicts_besides(const encoder_monitor_t *monitor, uint32_t phases) {
+    bool any = false;
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+        any |= monitor->phase[phase].shown && (phases >> phase & 1u) == 0;
+    }
+    return any;
 }
 
 static void start(encoder_monitor_t *monitor, const encoder_monitor_input_t *input) {
@@ -313,6 +345,8 @@ COLD void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, e
     monitor->angle = false;
     monitor->suspicious = false;
     monitor->counted = false;
+    monitor->advanced = false;
+    monitor->waypoint = input->encoder_angle;
     forget_references(monitor);
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         monitor->phase[phase].contradicted = 0;

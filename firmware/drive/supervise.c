@@ -1,5 +1,7 @@
 #include "drive/supervise.h"
 
+#include "control/machine_tables.h"
+#include "control/modulator.h"
 #include "drive/observe.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
@@ -33,6 +35,18 @@ NOINLINE static void leave_state(const control_parameters_t *parameters, control
     }
 }
 
+/* True when a phase has the duty of a run: a run has ended that this state does not know of, because memory has
+ * changed.
+ */
+static bool has_duties(const control_state_t *state) {
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+        if (state->duty_q15[phase] != -MODULATOR_DUTY_ONE_Q15) {
+            return true;
+        }
+    }
+    return false;
+}
+
 /* Out of the way of a run, which is the longer path. The time by value: a sample whose address is passed on would have
  * to be in memory as a whole. */
 NOINLINE static void stand(const control_parameters_t *parameters, control_state_t *state, uint32_t time_us,
@@ -44,6 +58,8 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
     }
     if (state_machine->state != before) {
         leave_state(parameters, state, measured, before);
+    } else if (has_duties(state)) {
+        leave_state(parameters, state, measured, DRIVE_STATE_RUN);
     }
 }
 
