@@ -100,7 +100,9 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
     const uint32_t far = distance + ANGLE_TOLERANCE;
     if (high_q29 > most_q29(common, far < HALF_REV ? far : HALF_REV - 1, current_q9, common->offset_q9)) {
         *side = 1;
-        return high_q29 > most_q29(common, HALF_REV - 1, current_q9, 0) ? BEYOND_ANGLES : WITHIN_ANGLES;
+        /* What tables of a wrong angle have added shows no more than an angle. */
+        const int32_t by_voltage_q29 = fixed_subtract(high_q29, fixed_non_negative(state->followed_q29));
+        return by_voltage_q29 > most_q29(common, HALF_REV - 1, current_q9, 0) ? BEYOND_ANGLES : WITHIN_ANGLES;
     }
     if (low_q29 < least_q29(common, distance > ANGLE_TOLERANCE ? distance - ANGLE_TOLERANCE : 0, current_q9)) {
         *side = -1;
