@@ -125,7 +125,8 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     drive->phases.phases |= drive->balance.phases;
     const uint32_t of_phases =
         (uint32_t)(FAULT_BIT(FAULT_PHASE_OPEN) | FAULT_BIT(FAULT_PHASE_SHORTED) | FAULT_BIT(FAULT_CURRENT_SENSOR));
-    if ((failed & of_phases) != 0 && encoder_monitor_contradicts_besides(&drive->encoder, drive->phases.phases)) {
+    if ((failed & of_phases) != 0 &&
+        encoder_monitor_suspects(&drive->control_parameters.encoder_monitor, &drive->encoder, drive->phases.phases)) {
         failed = (failed & ~of_phases) | (uint32_t)FAULT_BIT(FAULT_ENCODER_ANGLE);
     }
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {

@@ -52,6 +52,10 @@
 /* Window for the speed: 1/2048 s. */
 #define WINDOW_SHIFT 11
 
+/* Windows within which the encoder turns round faster than the rotor, from and to a speed of 1/64 of the limit. */
+#define REVERSAL_WINDOWS 3u
+#define REVERSAL_SHIFT 6
+
 /* Mechanical angle in which a free rotor at the torque limit reaches the speed whose back-EMF is the error of the
  * voltage that is none, twice, in rad: 4 degrees, Q20. */
 #define TWICE_ANGLE_Q20 73204
@@ -290,13 +294,29 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
     monitor->angle |= contradicting >= CONTRADICTING_PHASES || alone;
 }
 
+/* Notes when the encoder has turned round. clear: faster than its counts and the rotor's swings. */
+static void note_reversal(encoder_monitor_t *monitor, int32_t turned, bool clear, uint32_t rate_hz) {
+    const bool backwards = turned < 0;
+    if (!clear) {
+        return;
+    }
+    if (backwards != monitor->backwards &&
+        monitor->window_period - monitor->turned_at <= REVERSAL_WINDOWS * (rate_hz >> WINDOW_SHIFT)) {
+        monitor->reversed = true;
+        monitor->reversed_at = monitor->window_period;
+    }
+    monitor->backwards = backwards;
+    monitor->turned_at = monitor->window_period;
+}
+
 static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                         const encoder_monitor_input_t *input) {
     const uint32_t periods = input->period - monitor->window_period;
     if (periods < parameters->rate_hz >> WINDOW_SHIFT) {
         return;
     }
-    const uint32_t travel = (uint32_t)fixed_abs((int32_t)(input->encoder_angle - monitor->window_angle));
+    const int32_t turned = (int32_t)(input->encoder_angle - monitor->window_angle);
+    const uint32_t travel = (uint32_t)fixed_abs(turned);
     const uint64_t limit = (uint64_t)parameters->travel * periods;
     const uint64_t count = 2 * (uint64_t)parameters->middle;
     const bool above = fixed_abs(input->speed_q22) > parameters->over_speed_q22;
@@ -304,10 +324,12 @@ static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_
                           (travel > limit + limit / 16 + count || (above && travel + count > limit - limit / 32));
     monitor->window_period = input->period;
     monitor->window_angle = input->encoder_angle;
+    note_reversal(monitor, turned, travel > (limit >> REVERSAL_SHIFT) + count, parameters->rate_hz);
 }
 
-bool encoder_monitor_contradicts_besides(const encoder_monitor_t *monitor, uint32_t phases) {
-    bool any = false;
+bool encoder_monitor_suspects(const encoder_monitor_parameters_t *parameters, const encoder_monitor_t *monitor,
+                              uint32_t phases) {
+    bool any = monitor->reversed && monitor->period - monitor->reversed_at <= parameters->rate_hz >> SHOWN_SHIFT;
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         any |= monitor->phase[phase].shown && (phases >> phase & 1u) == 0;
     }

@@ -83,6 +83,10 @@ typedef struct {
     uint32_t encoder_angle;         /* then */
     uint32_t window_period;         /* of the start of the window for the speed */
     uint32_t window_angle;
+    bool backwards; /* direction of the last window with a clear travel, which ended in the period turned_at */
+    uint32_t turned_at;
+    bool reversed; /* faster than a rotor, last in the period reversed_at */
+    uint32_t reversed_at;
     bool advanced; /* the rotor, in this run, last in the period advanced_at */
     uint32_t advanced_at;
     uint32_t waypoint; /* angle from which it advances, 2^-32 rev */
@@ -101,8 +105,10 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
 void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                           const encoder_monitor_input_t *input);
 
-/* True when a phase other than those whose bits are set has contradicted the angle in the last quarter of a second:
- * what has failed in them is the angle's, too. [background] */
-bool encoder_monitor_contradicts_besides(const encoder_monitor_t *monitor, uint32_t phases);
+/* True when in the last quarter of a second a phase other than those whose bits are set has contradicted the angle, or
+ * the encoder has turned round faster than a rotor: what has failed in these phases is the angle's, too. [background]
+ */
+bool encoder_monitor_suspects(const encoder_monitor_parameters_t *parameters, const encoder_monitor_t *monitor,
+                              uint32_t phases);
 
 #endif
