@@ -456,6 +456,21 @@ static bool true_of_plant(const oracle_t *oracle, unsigned cause, const plant_t 
     }
 }
 
+/* Phases with a fault of their own in the last quarter of a second. */
+static unsigned phases_at_fault(const oracle_t *oracle, uint64_t now_us) {
+    const world_t *world = oracle->world;
+    unsigned phases = 0;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = &world->event[i];
+        const bool recent = event->begin_us <= now_us && (event->end_us == 0 || event->end_us + 250000 > now_us);
+        if ((world->kept >> i & 1u) && event->kind == WORLD_FAULT && event->what <= FAULT_CURRENT_SENSOR_SWAPPED &&
+            recent) {
+            phases |= 1u << event->phase;
+        }
+    }
+    return phases;
+}
+
 static void judge_cause(oracle_t *oracle, const plant_t *plant) {
     const world_t *world = oracle->world;
     const uint64_t now_us = plant->time_ns / 1000;
@@ -476,8 +491,13 @@ static void judge_cause(oracle_t *oracle, const plant_t *plant) {
             any = any || causes;
         }
     }
-    /* With one phase that has conducted so far a factor of its current and a wrong angle are the same. */
-    if (!oracle->turned && (oracle->injected[FAULT_DIODE_OPEN] || oracle->injected[FAULT_CURRENT_SENSOR_GAIN])) {
+    /* With one phase that has conducted so far a wrong current and a wrong angle are the same; and two phases with
+     * faults of their own are what a wrong angle looks like. */
+    const bool first_pulse =
+        !oracle->turned && (oracle->injected[FAULT_DIODE_OPEN] ||
+                            any_injected(oracle, FAULT_CURRENT_SENSOR_GAIN, FAULT_CURRENT_SENSOR_OFFSET));
+    const unsigned phases = phases_at_fault(oracle, now_us);
+    if (first_pulse || (phases & (phases - 1u)) != 0) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);
     }
     const unsigned cause = oracle->drive.fault;
