@@ -109,6 +109,12 @@ static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const en
            fixed_multiply_high(input->current_q9[index] << 12, parameters->resistance_error_q40);
 }
 
+/* Error of the integral that is none, Wb, Q2.29, age control periods after the phase was without current. */
+static int32_t drift_since_zero_q29(const encoder_monitor_parameters_t *parameters,
+                                    const encoder_monitor_input_t *input, unsigned index, uint32_t age) {
+    return fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, index, true) * (int32_t)age);
+}
+
 /* False when no angle at all explains the integral at the measured current, by the tolerances of contradicts(): then
  * the phase, its sensor or the voltage is at fault, not the encoder. */
 static bool fits_an_angle(const encoder_monitor_parameters_t *parameters, const encoder_monitor_input_t *input,
@@ -119,8 +125,7 @@ static bool fits_an_angle(const encoder_monitor_parameters_t *parameters, const 
     }
     const int32_t flux_q29 = input->flux_q29[index];
     const flux_range_t range = flux_range(HALF_REV, HALF_REV, input->current_q9[index], CURRENT_ERROR_Q9);
-    const int32_t drift_q29 =
-        fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, index, true) * (int32_t)age);
+    const int32_t drift_q29 = drift_since_zero_q29(parameters, input, index, age);
     const int32_t least_q29 = range.least_q29 - (range.least_q29 >> GAIN_SHIFT);
     const int32_t most_q29 = fixed_add(range.most_q29, range.most_q29 >> GAIN_SHIFT);
     return flux_q29 >= fixed_subtract(least_q29, drift_q29) && flux_q29 <= fixed_add(most_q29, drift_q29);
@@ -196,8 +201,7 @@ static bool contradicts(const encoder_monitor_parameters_t *parameters, encoder_
     const int32_t flux_q29 = input->flux_q29[index];
     const flux_range_t range =
         flux_range(angle, parameters->angle_max + parameters->half_count, input->current_q9[index], CURRENT_ERROR_Q9);
-    const int32_t drift_q29 =
-        fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, index, true) * (int32_t)age);
+    const int32_t drift_q29 = drift_since_zero_q29(parameters, input, index, age);
     const bool below = flux_q29 < range.least_q29;
     const int32_t limit_q29 = below ? range.least_q29 : range.most_q29;
     const int32_t beyond_q29 = below ? fixed_subtract(limit_q29, flux_q29) : fixed_subtract(flux_q29, limit_q29);
