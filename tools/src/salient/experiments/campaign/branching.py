@@ -4,18 +4,20 @@
 
 forks the campaign's program before each control interrupt (each EVERY-th, default 1) of an electrical period at
 150 r/min with load and at 1500 r/min, and at the begin of a start from 360 positions of the rotor, and lets each fault
-begin there. Slow faults have a 50th of the ticks. Writes DIR/branches-POINT.jsonl and DIR/branches.png and prints a
-table. An operating point whose results DIR has is not run again. Exit code 1 when a property is violated.
+begin there (emulator/campaign/branch.h). Writes DIR/branches-POINT.jsonl, DIR/summary.json and DIR/branches.png and
+prints a table. An operating point whose results DIR has is not run again. Exit code 1 when a property is violated.
 """
 
 from __future__ import annotations
 
 import json
+import resource
 import sys
 from pathlib import Path
 from typing import Any
 
 from salient.experiments.campaign import names
+from salient.experiments.campaign.command import commit
 from salient.experiments.campaign.runner import branches
 
 SALIENT = 2
@@ -23,20 +25,50 @@ POINTS = {"150": (SALIENT, 150, 8, 0, 2000), "1500": (SALIENT, 1500, 6, 0, 200),
 """Controller, speed in r/min (0: starts), load in N m, first tick, ticks: an electrical period at 40 kHz."""
 TITLES = {"150": "150 r/min, 8 N m", "1500": "1500 r/min, 6 N m", "start": "start to 150 r/min from 360 positions"}
 
+SUMMARY = "summary.json"
+
 Rows = dict[str, list[dict[str, Any]]]
 
 
 def run(out: Path, every: int) -> Rows:
-    """Results of each operating point."""
+    """Results of each operating point, and in summary.json where they are from and what they took."""
     out.mkdir(parents=True, exist_ok=True)
     rows: Rows = {}
+    notes = read_summary(out)
     for point, setting in POINTS.items():
         file = out / f"branches-{point}.jsonl"
         if not file.exists():
+            begin_s = _processor_s()
             lines = branches(*setting, every)
+            notes[point] = {"commit": commit(), "every": every, **totals(lines),
+                            "processor_s": round(_processor_s() - begin_s, 1)}
             file.write_text("".join(f"{json.dumps(line)}\n" for line in lines), encoding="utf-8")
-        rows[point] = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+            (out / SUMMARY).write_text(json.dumps(notes, indent=2) + "\n", encoding="utf-8")
+        rows[point] = read(file)
     return rows
+
+
+def read(file: Path) -> list[dict[str, Any]]:
+    """Results of an operating point."""
+    return [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+
+
+def read_summary(out: Path) -> dict[str, dict[str, Any]]:
+    """By operating point; empty when the folder has none."""
+    file = out / SUMMARY
+    return dict(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else {}
+
+
+def totals(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """Sums over the faults."""
+    return {"faults": len(lines), "branches": sum(line["branches"] for line in lines),
+            "virtual_s": round(sum(line["virtual_ms"] for line in lines) / 1000, 1),
+            "violations": sum(line["violations"] for line in lines)}
+
+
+def _processor_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def label(row: dict[str, Any]) -> str:
@@ -101,11 +133,11 @@ def main(arguments: list[str]) -> int:
     rows = run(out, int((arguments[1:] or ["1"])[0]))
     print("\n".join(table(rows)))
     plot(rows, out / "branches.png")
-    every_row = [row for lines in rows.values() for row in lines]
-    total, violations = (sum(row[name] for row in every_row) for name in ("branches", "violations"))
-    print(f"{total} branches, {sum(row['virtual_ms'] for row in every_row) / 1000:.0f} s of virtual time, "
-          f"{violations} with a violation")
-    return 1 if violations else 0
+    of_all = totals([row for lines in rows.values() for row in lines])
+    print(f"{of_all['branches']} branches, {of_all['virtual_s']:.0f} s of virtual time, "
+          f"{sum(note['processor_s'] for note in read_summary(out).values()):.0f} processor s, "
+          f"{of_all['violations']} with a violation")
+    return 1 if of_all["violations"] else 0
 
 
 if __name__ == "__main__":
