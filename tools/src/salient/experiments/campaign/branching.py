@@ -38,9 +38,9 @@ def run(out: Path, every: int) -> Rows:
     for point, setting in POINTS.items():
         file = out / f"branches-{point}.jsonl"
         if not file.exists():
-            begin_s = _processor_s()
+            begin_s, of = _processor_s(), commit()
             lines = branches(*setting, every)
-            notes[point] = {"commit": commit(), "every": every, **totals(lines),
+            notes[point] = {"commit": of, "every": every, **totals(lines),
                             "processor_s": round(_processor_s() - begin_s, 1)}
             file.write_text("".join(f"{json.dumps(line)}\n" for line in lines), encoding="utf-8")
             (out / SUMMARY).write_text(json.dumps(notes, indent=2) + "\n", encoding="utf-8")
