@@ -108,10 +108,21 @@ def test_the_text_of_every_canary_is_in_its_file_once() -> None:
     assert len({canary.name for canary in canaries.canaries()}) == 20
 
 
-def test_a_planted_bug_is_found_within_seconds_and_shrinks() -> None:
-    found = canaries.hunt(canaries.build(canaries.canaries()[0], 1), seeds_max=100)
-    assert found is not None and found.violation == "no_command: fault cleared"
-    assert 0.001 < found.processor_s < 10.0 and 1 <= len(found.events) <= 3
+@pytest.mark.parametrize(("number", "violation", "events"), [
+    (1, "no_command: fault cleared", 1),
+    (20, "wrong_angle", 0),
+])  # fmt: skip
+def test_a_planted_bug_is_found_within_seconds_shrinks_and_replays(tmp_path: Path, number: int, violation: str,
+                                                                   events: int) -> None:
+    found = canaries.measure(number, tmp_path)
+    assert found["violation"] == violation and found["replays"] and len(found["events"]) == events
+    assert 0.001 < found["processor_s"] < 10.0 and 0.001 < found["shrinking_s"] < 60.0
+    note = json.loads((tmp_path / str(number) / "failure.json").read_text(encoding="utf-8"))
+    assert note["replay"] == found["command"] == f"tools/salient replay {tmp_path / str(number)}"
+    without = {**note, "canary": None}
+    (tmp_path / "failure.json").write_text(json.dumps(without), encoding="utf-8")
+    done = salient("replay", tmp_path)  # the drive without the bug
+    assert done.returncode == 0 and "violation" not in done.stdout
 
 
 SLOW_OR_SILENT = {"load_dropped", "static_friction", "winding_temperature_sensor_offset",

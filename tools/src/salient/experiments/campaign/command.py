@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from salient.errors import UsageError
-from salient.experiments.campaign import names
-from salient.experiments.campaign.failure import load, replay, save
+from salient.experiments.campaign import canaries, names
+from salient.experiments.campaign.failure import Failure, load, replay, save
 from salient.experiments.campaign.runner import ALL_EVENTS, Result, digest, serve, world
 from salient.experiments.tasks import Task, run
 from salient.paths import ROOT
@@ -113,16 +113,23 @@ def run_replay(options: argparse.Namespace) -> int:
     """`replay`; returns the exit code."""
     folder = Path(options.what)
     if folder.is_dir():
-        seed, kept, healthy = load(folder)
+        failure = load(folder)
     else:
         try:
-            seed, kept, healthy = int(options.what), ALL_EVENTS, options.healthy
+            failure = Failure(int(options.what), ALL_EVENTS, options.healthy, None)
         except ValueError:
-            seed = -1
-        if not 0 <= seed < 2**63:
+            failure = Failure(-1, ALL_EVENTS, options.healthy, None)
+        if not 0 <= failure.seed < 2**63:
             raise UsageError(f"replay {options.what}: must be a seed, a whole number from 0, or the folder of a "
                              "failure")
-        folder = options.out / str(seed)
+        folder = options.out / str(failure.seed)
+    seed, kept, healthy = failure.seed, failure.kept, failure.healthy
+    programs = None
+    if failure.canary is not None:
+        if options.build != "host":
+            raise UsageError(f"--target {options.build}: {folder} has a planted bug, which the host alone can have")
+        programs = canaries.build(failure.canary)
+        print(f"with the planted bug {failure.canary}: {canaries.canaries()[failure.canary - 1].name}")
     described = world(seed, kept, healthy)
     print(f"seed {seed}: {described['machine']}, {described['controller']}, {described['control_rate_hz']} Hz, encoder "
           f"of {described['encoder_bits']} bits{' with edges' if described['encoder_edges'] else ''}")
@@ -131,7 +138,7 @@ def run_replay(options: argparse.Namespace) -> int:
         print(f"  {event['begin_us']}{until} us: {event['event']} {event['value']:g}"
               + (f", phase {'abcd'[event['phase']]}, leg {('low', 'high')[event['leg']]}"
                  if event["phase"] or event["leg"] else ""))
-    again = replay(seed, kept, healthy, folder, options.build)
+    again = replay(seed, kept, healthy, folder, options.build, programs)
     for violation in again.campaign["violations"]:
         print(f"violation: {names.violation(violation)} at {violation['at_us']} us")
     causes = ", ".join(names.causes().get(cause, str(cause)) for cause in again.campaign["causes"])
