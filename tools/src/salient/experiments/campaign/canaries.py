@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import re
-import resource
 import shlex
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from typing import Any
 
 from salient.errors import RunFailed
 from salient.experiments.campaign.failure import classes, save
-from salient.experiments.campaign.runner import Programs, run_world, run_worlds
+from salient.experiments.campaign.runner import Programs, processor_s, run_world, run_worlds
 from salient.paths import BUILD, ROOT
 
 FILE = ROOT / "tests" / "campaign" / "canaries.toml"
@@ -101,22 +100,17 @@ class Found:
 
 def hunt(programs: Programs, seeds_max: int = SEEDS_MAX) -> Found | None:
     """Runs seeds until one has a violation that it does not have without the bug; None: the canary survives."""
-    begin_s = _processor_s()
+    begin_s = processor_s()
     for first in range(1, seeds_max + 1, _CHUNK):
         for result in run_worlds(first, _CHUNK, programs):
             if not result.get("violations"):
                 continue
-            spent_s = _processor_s() - begin_s
+            spent_s = processor_s() - begin_s
             seed = int(result["seed"])
             new = set(classes(result)) - set(classes(run_world(seed)))
             if new:
                 return Found(seed, min(new), round(spent_s, 2))
     return None
-
-
-def _processor_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def _replays(folder: Path, violation: str) -> bool:
@@ -136,9 +130,9 @@ def measure(number: int, out: Path) -> dict[str, Any]:
     if found is None:
         return note
     folder = out / str(number)
-    begin_s = _processor_s()
+    begin_s = processor_s()
     saved = save(found.seed, found.violation, folder, canary=number, programs=programs)
-    return {**note, **asdict(found), "shrinking_s": round(_processor_s() - begin_s, 2),
+    return {**note, **asdict(found), "shrinking_s": round(processor_s() - begin_s, 2),
             "events": [event["event"] for event in saved["world"]["events"]],
             "replays": _replays(folder, found.violation), "command": saved["replay"]}
 

@@ -15,8 +15,8 @@ from typing import Any
 from salient.errors import UsageError
 from salient.experiments.campaign import canaries, names
 from salient.experiments.campaign.failure import Failure, load, replay, save
-from salient.experiments.campaign.runner import ALL_EVENTS, Result, digest, serve, world
-from salient.experiments.tasks import Task, run
+from salient.experiments.campaign.runner import ALL_EVENTS, Result, digest, processor_s, serve, world
+from salient.experiments.tasks import Task, read_results, run
 from salient.paths import ROOT
 from salient.progress import Progress
 
@@ -31,18 +31,28 @@ def run_campaign(options: argparse.Namespace) -> int:
     kind = "healthy" if options.healthy else "faults"
     tasks = [Task(f"{kind} {seed} {digest()}", (seed, options.healthy)) for seed in seeds]
     mine = tasks[options.shard[0] - 1::options.shard[1]]
-    results = []
+    results: list[Result] = []
+    new: list[Result] = []
+    known, begin_s = read_results(options.out).keys(), processor_s()
     with Progress(_LINES, sys.stderr) as progress:
         done = run(tasks, serve, options.out, options.shard, options.scheduler, options.jobs)
-        for number, (_, result) in enumerate(done, start=1):
+        for number, (task, result) in enumerate(done, start=1):
             results.append(result)
+            new += [] if task.key in known else [result]
             if number * _LINES // len(mine) > (number - 1) * _LINES // len(mine):
                 progress.step(f"{number} of {len(mine)} seeds")
     note = summary(results, options.first, options.seeds, kind)
+    spent_s = processor_s() - begin_s
     part = "" if options.shard == (1, 1) else "-{}-of-{}".format(*options.shard)
     (options.out / f"summary{part}.json").write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
     for line in report(note):
         print(line)
+    if new and options.scheduler is None:
+        rate = {"kind": kind, "commit": note["commit"], "worlds": len(new), "virtual_s": round(_virtual_s(new), 1),
+                "processor_s": round(spent_s, 1)}
+        (options.out / f"rate{part}.json").write_text(json.dumps(rate, indent=2) + "\n", encoding="utf-8")
+        print(f"{rate['worlds'] / spent_s:.0f} worlds, {rate['virtual_s'] / spent_s:.1f} s of virtual time a processor "
+              "second")
     for violation, entry in list(note["violations"].items())[:0 if options.no_shrink else _SHOWN_MAX]:
         seed = entry["seeds"][0]
         folder = options.out / "failures" / f"{seed}"
@@ -80,6 +90,10 @@ def summary(results: Iterable[Result], first: int, seeds: int, kind: str) -> dic
         "cells_reached": len(cells), "cells": 0 if kind == "healthy" else len(names.cells()),
         "cells_not_reached": [names.cell(cell) for cell in missing],
     }
+
+
+def _virtual_s(results: list[Result]) -> float:
+    return 1e-6 * sum(int(result.get("virtual_us", 0)) for result in results)
 
 
 def report(note: dict[str, Any]) -> list[str]:

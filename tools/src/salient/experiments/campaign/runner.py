@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import resource
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from multiprocessing import util
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +83,12 @@ def branches(*setting: object) -> list[Result]:
     return _lines(["--branch", *setting])
 
 
+def processor_s() -> float:
+    """Processor time of the processes that have ended, of this one's children and theirs."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def _mode(healthy: bool) -> list[str]:
     return ["--healthy"] if healthy else []
 
@@ -95,6 +103,7 @@ def serve(task: tuple[int, bool]) -> Result:
     if process is None or process.poll() is not None:
         process = _served[healthy] = subprocess.Popen(command("--serve", *_mode(healthy)), stdin=subprocess.PIPE,
                                                       stdout=subprocess.PIPE, text=True)
+        util.Finalize(process, process.communicate, exitpriority=0)  # its processor time becomes the worker's
     assert process.stdin is not None and process.stdout is not None  # pipes
     process.stdin.write(f"{seed}\n")
     process.stdin.flush()
