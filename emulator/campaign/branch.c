@@ -17,11 +17,11 @@
 
 enum { STATE_RUN = 2 };
 
-#define SLOW_TICKS 50                     /* a slow fault begins at every 50th tick, */
-#define SLOW_POSITIONS 10                 /* or at every tenth position */
-#define SLOW_NS UINT64_C(100000000)       /* of a reaction; the drive of a slower one runs on for many periods */
-#define UNANSWERED_NS UINT64_C(400000000) /* without a reaction until then: none */
-#define AFTER_NS UINT64_C(1000000)        /* watched after a reaction, at least */
+#define SLOW_TICKS 50                      /* a slow fault begins at every 50th tick, */
+#define SLOW_POSITIONS 10                  /* or at every tenth position */
+#define SLOW_NS UINT64_C(100000000)        /* of a reaction; the drive of a slower one runs on for many periods */
+#define UNANSWERED_NS UINT64_C(1000000000) /* without a reaction until then: none */
+#define AFTER_NS UINT64_C(1000000)         /* watched after a reaction, at least */
 #define VARIANTS_MAX 80
 
 typedef struct {

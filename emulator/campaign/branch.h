@@ -1,6 +1,6 @@
 /* Every fault at every control tick: the process is forked before a control interrupt, and the fault begins in the
  * child. A branch lasts 1.5 times the longest time that the drive has taken so far to react to that fault, and until
- * 1 ms after the reaction, or 400 ms without one. A fault to which it has once reacted after more than 100 ms, or not
+ * 1 ms after the reaction, or 1 s without one. A fault to which it has once reacted after more than 100 ms, or not
  * at all, begins from then on at the places only whose number from the first is a multiple of 50 ticks or of 10
  * positions.
  */
