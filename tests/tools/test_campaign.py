@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from salient.cli import make_parser
 from salient.experiments.campaign import canaries, names, same_bits
+from salient.experiments.campaign.cluster import compare
 from salient.experiments.campaign.command import run_campaign
 from salient.experiments.campaign.failure import replay
 from salient.experiments.campaign.machines import files
@@ -46,20 +45,14 @@ def test_shards_merge_to_what_one_run_has_and_nothing_runs_twice(tmp_path: Path)
     assert len(note["cells_not_reached"]) == note["cells"] - note["cells_reached"]
 
 
-def test_a_scheduler_whose_worker_is_killed_has_the_summary_of_one_computer_byte_for_byte(
-        tmp_path: Path, dask_cluster: Any) -> None:
+def test_a_scheduler_whose_worker_is_killed_has_the_summary_of_one_computer_byte_for_byte(tmp_path: Path) -> None:
+    note = compare(tmp_path, 50, 60)
+    assert note["killed"] and note["equal"] and 20 <= note["killed_after"] < 60
     one, many = tmp_path / "one", tmp_path / "many"
-    common = ["campaign", "--first", "50", "--seeds", "60", "--no-shrink", "--out"]
-    assert run_campaign(make_parser().parse_args([*common, str(one)])) in (0, 1)
-    command = [sys.executable, "-m", "salient", *common, str(many), "--scheduler", dask_cluster.address]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
-        assert process.stderr is not None
-        assert process.stderr.readline().startswith("1/20 3 of 60 seeds")
-        dask_cluster.workers[0].kill()
-        process.stderr.read()
-    assert process.returncode in (0, 1) and dask_cluster.workers[0].wait() == -signal.SIGKILL
     assert (many / "summary.json").read_bytes() == (one / "summary.json").read_bytes()
     assert read_results(many) == read_results(one) and len(read_results(one)) == 60
+    rate = json.loads((one / "rate.json").read_text(encoding="utf-8"))
+    assert rate["worlds"] == 60 and 0.1 < rate["processor_s"] < 60.0 and 10.0 < rate["virtual_s"] < 40.0
 
 
 def test_leaving_an_event_out_moves_no_other() -> None:
@@ -108,10 +101,21 @@ def test_the_text_of_every_canary_is_in_its_file_once() -> None:
     assert len({canary.name for canary in canaries.canaries()}) == 20
 
 
-def test_a_planted_bug_is_found_within_seconds_and_shrinks() -> None:
-    found = canaries.hunt(canaries.build(canaries.canaries()[0], 1), seeds_max=100)
-    assert found is not None and found.violation == "no_command: fault cleared"
-    assert 0.001 < found.processor_s < 10.0 and 1 <= len(found.events) <= 3
+@pytest.mark.parametrize(("number", "violation", "events"), [
+    (1, "no_command: fault cleared", 1),
+    (20, "wrong_angle", 0),
+])  # fmt: skip
+def test_a_planted_bug_is_found_within_seconds_shrinks_and_replays(tmp_path: Path, number: int, violation: str,
+                                                                   events: int) -> None:
+    found = canaries.measure(number, tmp_path)
+    assert found["violation"] == violation and found["replays"] and len(found["events"]) == events
+    assert 0.001 < found["processor_s"] < 10.0 and 0.001 < found["shrinking_s"] < 60.0
+    note = json.loads((tmp_path / str(number) / "failure.json").read_text(encoding="utf-8"))
+    assert note["replay"] == found["command"] == f"tools/salient replay {tmp_path / str(number)}"
+    without = {**note, "canary": None}
+    (tmp_path / "failure.json").write_text(json.dumps(without), encoding="utf-8")
+    done = salient("replay", tmp_path)  # the drive without the bug
+    assert done.returncode == 0 and "violation" not in done.stdout
 
 
 SLOW_OR_SILENT = {"load_dropped", "static_friction", "winding_temperature_sensor_offset",
