@@ -42,16 +42,19 @@ def _violations(note: Note) -> str:
     return f"{total:,} violations" + (f" ({listed})" if listed else "")
 
 
-def _rate(name: str) -> str:
+def _rate(name: str) -> list[str]:
+    """None of a summary whose worlds were not run in one go."""
+    if not (RESULTS / name).exists():
+        return []
     rate = _note(name)
-    return (f"{rate['worlds'] / rate['processor_s']:.0f} worlds or {rate['virtual_s'] / rate['processor_s']:.0f} s of "
-            "virtual time a processor second")
+    return [f"{rate['worlds'] / rate['processor_s']:.0f} worlds or {rate['virtual_s'] / rate['processor_s']:.0f} s of "
+            "virtual time a processor second"]
 
 
 def _worlds(name: str, what: str) -> tuple[str, str, str]:
     note = _note(f"{name}.json")
     parts = [f"seeds {_seeds(note)} at {note['commit']}", f"{note['virtual_hours']:.2f} h of virtual time",
-             _rate(f"{name}_rate.json"), f"**{_violations(note)}**"]
+             *_rate(f"{name}_rate.json"), f"**{_violations(note)}**"]
     if note["cells"]:
         parts += [f"{note['cells_reached']:,} of {note['cells']:,} cells of fault, state and sector reached, the rest "
                   f"in [{name}.json](../tests/campaign/{name}.json)",
