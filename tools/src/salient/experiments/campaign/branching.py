@@ -120,7 +120,7 @@ def draw(axes: Any, rows: Rows) -> None:
     axes.set_xscale("log")
     axes.set_xlabel("longest time from the begin of a fault until the drive has reacted, ms")
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.06), ncols=3, fontsize="small", frameon=False)
+    axes.legend(loc="upper left", fontsize="small")
 
 
 def main(arguments: list[str]) -> int:
