@@ -150,7 +150,7 @@ def test_every_fault_is_answered_wherever_it_begins(setting: tuple[int, ...], pl
     longest_us = {(row["fault"], row["leg"]): row["longest_us"] for row in found}
     assert longest_us["encoder_jump", 0] == longest_us["current_sensor_high_rail", 0] == 25  # the same interrupt
     period_us = 60e6 / (setting[1] or 150) / 8  # of eight rotor poles
-    assert 0.5 * period_us < longest_us["winding_open", 0] < 1.5 * period_us
+    assert 0.5 * period_us < longest_us["switch_open", 0] < 1.5 * period_us
 
 
 def test_a_branch_at_one_place_is_the_one_among_others() -> None:

@@ -143,7 +143,8 @@ def plot(path: Path) -> None:
     for name, what, marker in (("processor_s", "until found", "o"), ("shrinking_s", "to shrink it", "D")):
         right.plot([note[name] for note in notes], range(len(labels)), marker, linestyle="none", label=what)
     for index, note in enumerate(notes):
-        right.annotate(f"{len(note['events'])} events", (25, index), va="center", fontsize="small")
+        count = len(note["events"])
+        right.annotate(f"{count} event{'' if count == 1 else 's'}", (17, index), va="center", fontsize="small")
     right.set_yticks(range(len(labels)), [_wrapped(name) for name in labels], fontsize="small")
     right.set_ylim(len(labels) - 0.4, -0.6)
     right.set_xscale("log")
