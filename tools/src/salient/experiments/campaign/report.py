@@ -42,16 +42,19 @@ def _violations(note: Note) -> str:
     return f"{total:,} violations" + (f" ({listed})" if listed else "")
 
 
-def _rate(name: str) -> str:
+def _rate(name: str) -> list[str]:
+    """None of a summary whose worlds were not run in one go."""
+    if not (RESULTS / name).exists():
+        return []
     rate = _note(name)
-    return (f"{rate['worlds'] / rate['processor_s']:.0f} worlds or {rate['virtual_s'] / rate['processor_s']:.0f} s of "
-            "virtual time a processor second")
+    return [f"{rate['worlds'] / rate['processor_s']:.0f} worlds or {rate['virtual_s'] / rate['processor_s']:.0f} s of "
+            "virtual time a processor second"]
 
 
 def _worlds(name: str, what: str) -> tuple[str, str, str]:
     note = _note(f"{name}.json")
     parts = [f"seeds {_seeds(note)} at {note['commit']}", f"{note['virtual_hours']:.2f} h of virtual time",
-             _rate(f"{name}_rate.json"), f"**{_violations(note)}**"]
+             *_rate(f"{name}_rate.json"), f"**{_violations(note)}**"]
     if note["cells"]:
         parts += [f"{note['cells_reached']:,} of {note['cells']:,} cells of fault, state and sector reached, the rest "
                   f"in [{name}.json](../tests/campaign/{name}.json)",
@@ -137,18 +140,18 @@ def plot(path: Path) -> None:
                    "salient, machine saturating, 40 kHz, sensors of 12 and 17 bits, phase a", fontsize="medium")
     notes = [note for note in _note("canaries.json") if "seed" in note]
     labels = [note["name"] for note in notes]
-    right.barh(range(len(labels)), [note["processor_s"] for note in notes], color="#1f77b4", label="until found")
-    right.barh(range(len(labels)), [note["shrinking_s"] for note in notes], color="#ff7f0e", alpha=0.9,
-               left=[note["processor_s"] for note in notes], label="to shrink it")
+    for name, what, marker in (("processor_s", "until found", "o"), ("shrinking_s", "to shrink it", "D")):
+        right.plot([note[name] for note in notes], range(len(labels)), marker, linestyle="none", label=what)
     for index, note in enumerate(notes):
-        right.annotate(f" {len(note['events'])} events, {note['violation']}",
-                       (note["processor_s"] + note["shrinking_s"], index), va="center", fontsize="small")
+        count = len(note["events"])
+        right.annotate(f"{count} event{'' if count == 1 else 's'}", (17, index), va="center", fontsize="small")
     right.set_yticks(range(len(labels)), [_wrapped(name) for name in labels], fontsize="small")
     right.set_ylim(len(labels) - 0.4, -0.6)
-    right.set_xlim(0, 1.9 * max(note["processor_s"] + note["shrinking_s"] for note in notes))
+    right.set_xscale("log")
+    right.set_xlim(0.005, 100)
     right.set_xlabel("processor seconds")
     right.grid(alpha=0.3, axis="x")
-    right.legend(loc="lower right", fontsize="small")
+    right.legend(loc="upper left", fontsize="small")
     faults = _note("faults.json")
     violations = sum(entry["count"] for entry in faults["violations"].values())
     right.set_title(f"{len(notes)} of {len(_note('canaries.json'))} planted bugs found, by seeds from 1 on\n"
