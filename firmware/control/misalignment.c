@@ -25,6 +25,9 @@
 /* Corner of high-pass and low-pass of the sum and of y in rad per stroke, and the largest gain of both. */
 #define BAND_FACTOR 4
 #define BAND_GAIN_MAX_Q16 (1 << 15)
+/* Under a load that moves: a quarter of the rate, from 50 strokes a second on, steps of 0.2 ms. */
+#define MOVING_SHIFT 2
+#define STROKE_PART_MIN_Q16 655
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings) {
     const uint32_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
@@ -80,6 +83,9 @@ NOINLINE void misalignment_step(const misalignment_parameters_t *parameters, mis
         misalignment->steady_updates = 0;
     }
     const bool learning = steady && settled;
+    misalignment->common_rate = learning                                 ? MISALIGNMENT_RATE_FULL
+                                : sample->undisturbed && torque_suffices ? MISALIGNMENT_RATE_BEYOND_LOAD
+                                                                         : MISALIGNMENT_RATE_NONE;
     /* Means over the time since the state became steady, at most 100 ms: before, the load was another. */
     const int32_t phases = (int32_t)tables->phases;
     const int32_t growing_memory_q16 = FILTER_GAIN_MAX_Q16 / ((int32_t)misalignment->steady_updates / phases + 1);
@@ -104,19 +110,19 @@ NOINLINE void misalignment_step(const misalignment_parameters_t *parameters, mis
     const int32_t square_q24 = product_q24(alternating_q24, alternating_q24);
     low_pass_step(&misalignment->power_q24, fixed_saturate((int64_t)square_q24 * phases), mean_gain_q16 / phases + 1);
     low_pass_step(&misalignment->disturbance_mean_q24, disturbance_q24, mean_gain_q16 / phases + 1);
-    if (!learning) {
-        return;
+    if (learning) {
+        /* Mean of y since the last update of the phase: at most four updates, 32 bits each. */
+        const int32_t recent_mean_q24 =
+            4 * ((int32_t)((misalignment->disturbance_sum_q24 - sum_before_q24) >> 2) / phases);
+        const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
+        const int32_t torque_square_q24 = product_q24(sample->torque_q24, sample->torque_q24);
+        const int32_t power_q24 =
+            fixed_add(misalignment->power_q24, fixed_multiply(torque_square_q24, POWER_FLOOR_Q20, 20));
+        /* Q24 * Q24 to Q30, divided by Q20: Q10. */
+        const int32_t step_q10 =
+            limited_step_q10(fixed_multiply(error_q24, alternating_q24, 18) / ((power_q24 >> 4) + 1));
+        phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + (int64_t)step_q10 * parameters->rate_q30);
     }
-
-    const int32_t torque_square_q24 = product_q24(sample->torque_q24, sample->torque_q24);
-    const int32_t power_q24 =
-        fixed_add(misalignment->power_q24, fixed_multiply(torque_square_q24, POWER_FLOOR_Q20, 20));
-    /* Mean of y since the last update of the phase: at most four updates, 32 bits each. */
-    const int32_t recent_mean_q24 = 4 * ((int32_t)((misalignment->disturbance_sum_q24 - sum_before_q24) >> 2) / phases);
-    const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
-    /* Q24 * Q24 to Q30, divided by Q20: Q10. */
-    const int32_t step_q10 = limited_step_q10(fixed_multiply(error_q24, alternating_q24, 18) / ((power_q24 >> 4) + 1));
-    phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + (int64_t)step_q10 * parameters->rate_q30);
     /* 0.02 rad is twice the probe angle. */
     phase->offset = fixed_multiply((int32_t)fixed_shift(phase->offset_q40, 12), (int32_t)parameters->probe_angle, 27);
 }
@@ -140,7 +146,8 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     const int32_t error_q24 = band_pass_step(&misalignment->common_disturbance, disturbance_q24, gain_q16);
     const int64_t square_q40 = fixed_product(quarter_q24, quarter_q24) >> 8;
     misalignment->common_power_q40 += (square_q40 - misalignment->common_power_q40) >> COMMON_POWER_SHIFT;
-    if (misalignment->steady_updates < parameters->settle_updates) {
+    const bool learning = misalignment->common_rate == MISALIGNMENT_RATE_FULL;
+    if (!learning && (misalignment->common_rate == MISALIGNMENT_RATE_NONE || stroke_part_q16 < STROKE_PART_MIN_Q16)) {
         return;
     }
     const int32_t power_q22 = fixed_saturate(misalignment->common_power_q40 >> 18);
@@ -150,7 +157,7 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     /* y 4 q / (16 q^2), q the quarter. */
     const int32_t step_q10 =
         limited_step_q10(fixed_multiply(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));
-    const int64_t step_q40 = (int64_t)step_q10 * parameters->common_rate_q30;
+    const int64_t step_q40 = ((int64_t)step_q10 * parameters->common_rate_q30) >> (learning ? 0 : MOVING_SHIFT);
     for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
         misalignment_phase_t *phase = &misalignment->phase[i];
         phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + step_q40);

@@ -133,18 +133,23 @@ static bool disturbed(const control_parameters_t *parameters, const deferred_inp
     return input->bandwidth.stage < parameters->bandwidth.moving_stage;
 }
 
+/* Speed control in which neither a disturbance nor the voltage adds to the ripple. A misalignment of a quarter of a
+ * stroke moves the speed by more than an eighth, and learning it ends that. */
+static bool undisturbed_speed_control(const control_parameters_t *parameters, const deferred_t *deferred,
+                                      const deferred_input_t *input) {
+    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
+    return deferred->mode == DRIVE_MODE_SPEED && speed_error_q22 < fixed_abs(input->speed_q22) / 8 &&
+           !disturbed(parameters, input) && input->torque_shortfall_q24 == 0;
+}
+
 /* The misalignment is observable while speed, load and voltage are steady. In torque mode nothing keeps the speed
  * steady; a dynamometer that does hides the ripple of the torque, and what the observer then takes for a load would be
  * learned. */
-static misalignment_condition_t condition(const control_parameters_t *parameters, const deferred_t *deferred,
-                                          const deferred_input_t *input) {
-    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
+static misalignment_condition_t condition(const deferred_t *deferred, bool undisturbed) {
     if (deferred->mode != DRIVE_MODE_SPEED || !deferred->load_constant) {
         return MISALIGNMENT_UNSTEADY;
     }
-    /* A misalignment of a quarter of a stroke moves the speed, and learning it ends that. */
-    const bool steady = speed_error_q22 < fixed_abs(input->speed_q22) / 8 && !disturbed(parameters, input) &&
-                        input->torque_shortfall_q24 == 0 && stroke_mean_shows_load(&deferred->stroke_mean);
+    const bool steady = undisturbed && stroke_mean_shows_load(&deferred->stroke_mean);
     return steady ? MISALIGNMENT_STEADY : MISALIGNMENT_INTERRUPTED;
 }
 
@@ -159,6 +164,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
     const unsigned phase = deferred->misalignment.phase_index;
     const uint32_t lag =
         (uint32_t)rotation(parameters, input) * parameters->commutation.rotor_poles * SLOPE_LAG_PERIODS;
+    const bool undisturbed = undisturbed_speed_control(parameters, deferred, input);
     const misalignment_sample_t sample = {
         .current_q9 = input->current_q9,
         .angle = commutation_angle(&parameters->commutation, &commutation, phase) -
@@ -166,7 +172,8 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
         .disturbance_q24 = disturbance_q24(deferred, input),
         .torque_q24 = input->torque_reference_q24,
         .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth.stage],
-        .condition = condition(parameters, deferred, input),
+        .condition = condition(deferred, undisturbed),
+        .undisturbed = undisturbed,
     };
     misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);
 }
@@ -273,11 +280,11 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
     case 2:
         learn_common_misalignment(parameters, deferred, input);
         move_conduction(parameters, deferred, input);
-        set_speed_law(parameters, deferred);
         break;
     case 6:
         identify_inertia(parameters, deferred, input);
         move_conduction(parameters, deferred, input);
+        set_speed_law(parameters, deferred);
         break;
     default:
         learn_misalignment(parameters, deferred, input);

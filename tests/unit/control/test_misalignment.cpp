@@ -90,7 +90,8 @@ class Machine {
                                               .disturbance_q24 = to_fixed(load_Nm + lag[1], Q24),
                                               .torque_q24 = to_fixed(torque_Nm, Q24),
                                               .bandwidth_rad_s = uint32_t(BANDWIDTH_RAD_S),
-                                              .condition = condition};
+                                              .condition = condition,
+                                              .undisturbed = load_may_move};
         misalignment_step(&parameters, &state, &machine_tables, &sample);
         model.step(sample.disturbance_q24 / Q24, BANDWIDTH_RAD_S, condition == MISALIGNMENT_STEADY, torque_Nm,
                    [&](unsigned phase) { return slope[phase]; });
@@ -112,6 +113,7 @@ class Machine {
     offsets_t off;
     double rpm = 150.0;
     bool common = false; // the common angle is learned, too
+    bool load_may_move = false;
     unsigned updates = 0;
     double position = 0.0;
     std::array<double, 2> lag{};
@@ -243,6 +245,24 @@ TEST(Misalignment, at_1500_rpm_where_sampling_folds_the_steps_of_the_slopes_the_
     }
     for (unsigned phase = 0; phase < PHASES; phase++) {
         EXPECT_NEAR(machine.offset_deg(phase), 1.0, 0.05) << phase;
+    }
+}
+
+TEST(Misalignment, under_a_load_that_moves_the_common_angle_is_learned_from_50_strokes_a_second_on) {
+    for (const double off : {0.0, 0.5, -2.0}) {
+        Machine fast(8, {off, off, off}), slow(8, {off, off, off});
+        fast.common = fast.load_may_move = slow.common = slow.load_may_move = true;
+        fast.rpm = 300.0;
+        slow.rpm = 240.0; // 48 strokes a second
+        for (int k = 0; k < int(5 * RATE_HZ); k++) {
+            const double load_Nm = 8.0 + std::sin(2.0 * PI * 5.3 * k / RATE_HZ);
+            fast.step(8.0, load_Nm, MISALIGNMENT_UNSTEADY);
+            slow.step(8.0, load_Nm, MISALIGNMENT_UNSTEADY);
+        }
+        for (unsigned phase = 0; phase < PHASES; phase++) {
+            EXPECT_NEAR(fast.offset_deg(phase), off, 0.05 + 0.1 * std::fabs(off)) << off << ", phase " << phase;
+            EXPECT_EQ(slow.offset_deg(phase), 0.0);
+        }
     }
 }
 
