@@ -27,6 +27,10 @@
 #define BAND_GAIN_MAX_Q16 (1 << 15)
 /* Under a load that moves: a quarter of the rate, from 50 strokes a second on, steps of 0.2 ms. */
 #define MOVING_SHIFT 2
+/* After 1.2 s: an encoder that is displaced by more than can be learned has been found before
+ * (drive/encoder_monitor.h).
+ */
+#define MOVING_SETTLES 2
 #define STROKE_PART_MIN_Q16 655
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings) {
@@ -147,7 +151,12 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     const int64_t square_q40 = fixed_product(quarter_q24, quarter_q24) >> 8;
     misalignment->common_power_q40 += (square_q40 - misalignment->common_power_q40) >> COMMON_POWER_SHIFT;
     const bool learning = misalignment->common_rate == MISALIGNMENT_RATE_FULL;
-    if (!learning && (misalignment->common_rate == MISALIGNMENT_RATE_NONE || stroke_part_q16 < STROKE_PART_MIN_Q16)) {
+    if (learning) {
+        misalignment->beyond_load_steps = 0;
+    } else if (misalignment->common_rate == MISALIGNMENT_RATE_NONE || stroke_part_q16 < STROKE_PART_MIN_Q16) {
+        return;
+    } else if (misalignment->beyond_load_steps < MOVING_SETTLES * parameters->settle_updates) {
+        misalignment->beyond_load_steps++;
         return;
     }
     const int32_t power_q22 = fixed_saturate(misalignment->common_power_q40 >> 18);

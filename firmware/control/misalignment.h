@@ -28,7 +28,7 @@
  * the same signal instead of one per phase.
  *
  * A load that moves has little in that band from 50 strokes a second on, so that the common angle is learned under it,
- * at a quarter of the rate: within 2 s at 60 strokes a second and 4 N m at 5 Hz.
+ * after 1.2 s at a quarter of the rate.
  *
  * s_j is filtered by the observer's present bandwidth. Learning of the phases is suspended unless speed and load are
  * steady, the torque is above 1 N m and the voltage is not limited; a large misalignment itself disturbs every stroke,
@@ -81,8 +81,9 @@ typedef struct {
     uint32_t steady_updates;
     int64_t common_power_q40; /* mean of the band's (sum s_j / 4)^2, (N m per 0.02 rad)^2, Q40 */
     misalignment_band_t common_slope, common_disturbance; /* of sum s_j / 4, N m per 0.02 rad, and of y */
-    misalignment_rate_t common_rate;                      /* by the conditions of the last misalignment_step */
-    unsigned phase_index;                                 /* phase to update, in turn */
+    uint32_t beyond_load_steps;      /* of the common angle since the load was last steady, until they learn */
+    misalignment_rate_t common_rate; /* by the conditions of the last misalignment_step */
+    unsigned phase_index;            /* phase to update, in turn */
 } misalignment_t;
 
 typedef enum {

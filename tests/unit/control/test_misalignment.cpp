@@ -254,7 +254,7 @@ TEST(Misalignment, under_a_load_that_moves_the_common_angle_is_learned_from_50_s
         fast.common = fast.load_may_move = slow.common = slow.load_may_move = true;
         fast.rpm = 300.0;
         slow.rpm = 240.0; // 48 strokes a second
-        for (int k = 0; k < int(5 * RATE_HZ); k++) {
+        for (int k = 0; k < int(6 * RATE_HZ); k++) {
             const double load_Nm = 8.0 + std::sin(2.0 * PI * 5.3 * k / RATE_HZ);
             fast.step(8.0, load_Nm, MISALIGNMENT_UNSTEADY);
             slow.step(8.0, load_Nm, MISALIGNMENT_UNSTEADY);
