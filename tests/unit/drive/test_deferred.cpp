@@ -429,7 +429,9 @@ TEST_F(Deferred, a_late_check_of_the_voltage_of_the_time_before_a_reset_is_no_ne
 TEST_F(Deferred, the_misalignment_survives_every_reset_and_a_late_step) {
     start();
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        state.deferred.misalignment.phase[phase].offset = int32_t(1000 * (phase + 1));
+        misalignment_phase_t &learned = state.deferred.misalignment.phase[phase];
+        learned.offset = int32_t(1000 * (phase + 1));
+        learned.offset_q40 = std::llround(std::ldexp(learned.offset, 39) / parameters.misalignment.probe_angle);
     }
     const auto kept = [this] {
         for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
