@@ -12,6 +12,7 @@
 #define RECENT_NS (2 * MS_NS)
 #define MARGIN 1.02
 #define RUN_MAX_NS (502 * MS_NS) /* of a run, since the last request */
+#define OBSERVED_S 1e-3          /* time constant of a speed that is observed */
 #define STRETCH_COUNTS 16.0
 #define STRETCH_MIN_NS (2 * MS_NS)
 #define STRETCH_MAX_NS (32 * MS_NS)
@@ -271,6 +272,18 @@ static bool may_be_deaf(const oracle_t *oracle, uint64_t time_us) {
     return other_sender(oracle, false, time_us) || any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM);
 }
 
+/* Frames of the only sender, sent once more while it is silent, are its frames: nothing but the arming tells them. */
+static bool impersonated(const oracle_t *oracle) {
+    bool silent = false, replayed = false;
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = &oracle->world->event[i];
+        const bool kept = oracle->world->kept >> i & 1u;
+        silent = silent || (kept && event->kind == WORLD_SILENT);
+        replayed = replayed || (kept && event->kind == WORLD_HOSTILE && event->what == WORLD_HOSTILE_REPLAY);
+    }
+    return silent && replayed;
+}
+
 static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     const uint64_t now_ns = plant->time_ns;
     const bool deaf = may_be_deaf(oracle, now_ns / 1000);
@@ -367,12 +380,13 @@ double oracle_recovery_speed_rpm(oracle_t *oracle, const plant_t *plant) {
 }
 
 /* Part of the speed that a drive of one quadrant may have at most: it cannot take away what the torque limit adds in
- * three periods and while the voltage removes the largest flux linkage. */
+ * three periods, while its speed is observed and while the voltage removes the largest flux linkage. */
 static double most_of_one_quadrant(const oracle_t *oracle, const plant_t *plant) {
     const machine_t *machine = plant->machine;
     magnetics_point_t aligned;
     magnetics_evaluate(&plant->magnetics, 0.0, oracle->world->machine->trip_current_A, &aligned);
-    const double late_s = 3e-9 * (double)oracle->period_ns + aligned.flux_linkage_Wb / machine->supply_voltage_V;
+    const double late_s =
+        3e-9 * (double)oracle->period_ns + OBSERVED_S + aligned.flux_linkage_Wb / machine->supply_voltage_V;
     const double added_rad_s =
         late_s * oracle->world->machine->torque_max_Nm / (machine->inertia_kg_m2 * oracle->world->inertia_gain);
     return fmax(1.2, 1.05 + added_rad_s * RPM_PER_RAD_S / fabs(oracle->recovery_rpm));
@@ -549,11 +563,8 @@ static void judge_cause(oracle_t *oracle, const plant_t *plant) {
     }
     /* With one phase that has conducted so far a wrong current and a wrong angle are the same; and two phases with
      * faults of their own are what a wrong angle looks like. */
-    const bool first_pulse =
-        !oracle->turned && (oracle->injected[FAULT_DIODE_OPEN] ||
-                            any_injected(oracle, FAULT_CURRENT_SENSOR_GAIN, FAULT_CURRENT_SENSOR_OFFSET));
     const unsigned phases = phases_at_fault(oracle, now_us);
-    if (first_pulse || (phases & (phases - 1u)) != 0) {
+    if ((phases != 0 && !oracle->turned) || (phases & (phases - 1u)) != 0) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);
     }
     const unsigned cause = oracle->drive.fault;
@@ -624,7 +635,7 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
             violate(oracle, "stopped", plant->time_ns, 0, 0.0);
         }
     } else if (drive.state != STATE_FAULT && before == STATE_FAULT && !oracle->clear_seen && !state_changed(oracle) &&
-               !may_be_deaf(oracle, plant->time_ns / 1000)) {
+               !may_be_deaf(oracle, plant->time_ns / 1000) && !impersonated(oracle)) {
         violate(oracle, "no_command", plant->time_ns, 5, 0.0);
     }
 }

@@ -92,8 +92,8 @@ typedef struct {
     double peak_A[HAL_PHASES_MAX]; /* of the last looks, decaying not: of the last millisecond */
     double speed_recent_rad_s, voltage_recent_high_V, voltage_recent_low_V, current_recent_A;
     uint64_t recent_ns;
-    double run_angle_rad; /* of the rotor at the start of the run */
-    bool turned;          /* by a stroke since */
+    double run_angle_rad;      /* of the rotor at the start of the run */
+    bool turned;               /* by a stroke since */
     double encoder_offset_rev; /* on the shaft, in counting direction */
     oracle_stretch_t stretch;
     /* Recovery. */
