@@ -1,6 +1,8 @@
 #include "drive/supervise.h"
 
+#include "drive/deferred.h"
 #include "drive/observe.h"
+#include "drive/torque_control.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
@@ -25,7 +27,10 @@ NOINLINE static void leave_state(const control_parameters_t *parameters, control
                                  const control_measurement_t *measured, drive_state_t left) {
     if (left == DRIVE_STATE_RUN) {
         state->torque_reference_q24 = 0;
-        control_prepare(parameters, state);
+        torque_control_reset(parameters, state);
+        if (state->state_machine.state != DRIVE_STATE_FAULT) { /* else a period later */
+            deferred_reset_run(state);
+        }
     } else if (left != DRIVE_STATE_READY && !observe_follows(state)) {
         observe_reset(state, measured); /* its estimate stems from a faulty encoder */
     } else if (left == DRIVE_STATE_FAULT) {
@@ -44,6 +49,8 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
     }
     if (state_machine->state != before) {
         leave_state(parameters, state, measured, before);
+    } else if (before == DRIVE_STATE_FAULT && state_machine->fault_free_ticks == 1) {
+        deferred_reset_run(state); /* not in the period that records the fault, which would take longer than a run */
     }
 }
 
