@@ -90,27 +90,34 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     return true;
 }
 
-void drive_control_interrupt(drive_t *drive) {
-    control_sample_t sample = {
-        .missed_interrupts = hal_interrupt_missed_triggers(drive->hal),
-        .time_us = hal_time_us(drive->hal),
-    };
-    drive->break_causes = sample.break_causes = hal_pwm_break(drive->hal);
-    hal_encoder_read(drive->hal, &sample.encoder);
-    hal_adc_read(drive->hal, &sample.adc);
-    const bool run =
-        control_step(&drive->control_parameters, &drive->control, &sample, &drive->command, &drive->compare);
-    const fault_trace_values_t values = {
-        .adc = &sample.adc,
+static inline fault_trace_values_t trace_values(const drive_t *drive, const hal_adc_sample_t *adc) {
+    return (fault_trace_values_t){
+        .adc = adc,
         .compare = &drive->compare,
         .angle = drive->control.measurement.angle,
         .speed_q22 = drive->control.observer.speed_q22,
         .torque_reference_q24 = drive->control.torque_reference_q24,
     };
+}
+
+void drive_control_interrupt(drive_t *drive) {
+    hal_adc_sample_t adc;
+    control_sample_t sample = {
+        .adc = &adc,
+        .missed_interrupts = hal_interrupt_missed_triggers(drive->hal),
+        .time_us = hal_time_us(drive->hal),
+    };
+    drive->break_causes = sample.break_causes = hal_pwm_break(drive->hal);
+    hal_encoder_read(drive->hal, &sample.encoder);
+    hal_adc_read(drive->hal, &adc);
+    const bool run =
+        control_step(&drive->control_parameters, &drive->control, &sample, &drive->command, &drive->compare);
     if (run) {
         hal_pwm_write(drive->hal, &drive->compare);
+        const fault_trace_values_t values = trace_values(drive, &adc);
         fault_trace_run(&drive->trace, &values);
     } else {
+        const fault_trace_values_t values = trace_values(drive, &adc);
         hal_pwm_open_all(drive->hal);
         if (sample.break_causes != 0) {
             hal_pwm_clear_break(drive->hal);

@@ -99,7 +99,7 @@ typedef struct {
 
 /* Inputs of one control period as the HAL delivers them. */
 typedef struct {
-    hal_adc_sample_t adc;
+    const hal_adc_sample_t *adc;
     hal_encoder_sample_t encoder;
     uint32_t missed_interrupts; /* since the previous period */
     uint32_t break_causes;      /* HAL_PWM_BREAK_* */
