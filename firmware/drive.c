@@ -255,24 +255,30 @@ COLD static void collect_telemetry(drive_t *drive, uint32_t time_us, drive_telem
     hal_critical_leave(drive->hal);
 }
 
+/* What is due of the telemetry. */
+COLD NOINLINE static void send_telemetry(drive_t *drive, uint32_t time_us) {
+    if (!comms_telemetry_due(&drive->comms, time_us)) {
+        return;
+    }
+    bus_monitor_step(&drive->comms.bus, drive->hal, time_us);
+    if (drive->comms.bus.run_inhibited) {
+        commands_disarm(&drive->comms.commands);
+    }
+    if (drive->comms.bus.status.state == HAL_CAN_BUS_OFF) {
+        arming_end_configuration(&drive->comms.commands.arming);
+    }
+    drive_telemetry_t values;
+    collect_telemetry(drive, time_us, &values);
+    comms_telemetry(&drive->comms, drive->hal, &values);
+}
+
 COLD void drive_background(drive_t *drive) {
     const uint32_t time_us = hal_time_us(drive->hal);
     background_checks(drive, time_us);
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_CHECKED);
     keep_memory(drive, time_us);
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_STORED);
-    if (comms_telemetry_due(&drive->comms, time_us)) {
-        bus_monitor_step(&drive->comms.bus, drive->hal, time_us);
-        if (drive->comms.bus.run_inhibited) {
-            commands_disarm(&drive->comms.commands);
-        }
-        if (drive->comms.bus.status.state == HAL_CAN_BUS_OFF) {
-            arming_end_configuration(&drive->comms.commands.arming);
-        }
-        drive_telemetry_t values;
-        collect_telemetry(drive, time_us, &values);
-        comms_telemetry(&drive->comms, drive->hal, &values);
-    }
+    send_telemetry(drive, time_us);
     const parameters_conditions_t conditions = {
         .running = !may_configure(drive),
         .dc_link_voltage_q6 = drive->control.measurement.dc_link_voltage_q6,

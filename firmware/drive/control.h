@@ -175,7 +175,8 @@ typedef struct {
 void control_reset(const control_parameters_t *parameters, control_state_t *state);
 
 /* Resets the controllers for the next run. Required after a change of parameters, which is possible outside RUN only;
- * leaving RUN does it too. Not part of entering RUN because initialising a network takes as long as a learning step. */
+ * leaving RUN does it too, after a fault in the first period without a failed check. Not part of entering RUN because
+ * initialising a network takes as long as a learning step. */
 void control_prepare(const control_parameters_t *parameters, control_state_t *state);
 
 /* One control period. command: the last accepted one, COMMAND_OFF before the first. Returns false when every switch
