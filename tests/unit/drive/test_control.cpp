@@ -21,6 +21,7 @@ uint32_t hal_can_receive_overflows(const hal_t *) {
 
 #include "support/configured.h"
 #include "support/reference_models.h"
+#include "support/whole_sample.h"
 
 namespace {
 
@@ -58,7 +59,7 @@ class Control : public testing::Test {
         parameters = configured(controller, uint32_t(RATE_HZ), ENCODER_BITS);
         control_reset(&parameters, &state);
         diagnostics = diagnostics_t{};
-        sample = control_sample_t{};
+        sample = whole_sample_t{};
         command = command_t{};
         sample.adc.bus_voltage_counts = BUS_COUNTS;
         turns = 0.1;
@@ -135,7 +136,7 @@ class Control : public testing::Test {
     control_state_t state;
     diagnostics_t diagnostics;
     drive_t telemetry_drive{}; // as telemetry_collect reads it
-    control_sample_t sample;
+    whole_sample_t sample;
     command_t command;
     hal_pwm_compare_t compare{};
     double turns = 0.1, speed_rad_s = 0.0;
