@@ -1,6 +1,5 @@
 #include "drive/supervise.h"
 
-#include "control/machine_tables.h"
 #include "control/modulator.h"
 #include "drive/deferred.h"
 #include "drive/observe.h"
@@ -43,12 +42,12 @@ NOINLINE static void leave_state(const control_parameters_t *parameters, control
 /* True when a phase has the duty of a run: a run has ended that this state does not know of, because memory has
  * changed. */
 static bool has_duties(const control_state_t *state) {
-    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
-        if (state->duty_q15[phase] != -MODULATOR_DUTY_ONE_Q15) {
-            return true;
-        }
+    int32_t differing = 0;
+    UNROLL(4)
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        differing |= state->duty_q15[phase] ^ -MODULATOR_DUTY_ONE_Q15;
     }
-    return false;
+    return differing != 0;
 }
 
 /* Out of the way of a run, which is the longer path. The time by value: a sample whose address is passed on would have
@@ -62,10 +61,10 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
     }
     if (state_machine->state != before) {
         leave_state(parameters, state, measured, before);
-    } else if (has_duties(state)) {
-        leave_state(parameters, state, measured, DRIVE_STATE_RUN);
     } else if (before == DRIVE_STATE_FAULT && state_machine->fault_free_ticks == 1) {
         deferred_reset_run(state); /* not in the period that records the fault, which would take longer than a run */
+    } else if (has_duties(state)) {
+        leave_state(parameters, state, measured, DRIVE_STATE_RUN);
     }
 }
 
