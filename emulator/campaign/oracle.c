@@ -564,7 +564,8 @@ static void judge_cause(oracle_t *oracle, const plant_t *plant) {
     /* With one phase that has conducted so far a wrong current and a wrong angle are the same; and two phases with
      * faults of their own are what a wrong angle looks like. */
     const unsigned phases = phases_at_fault(oracle, now_us);
-    if ((phases != 0 && !oracle->turned) || (phases & (phases - 1u)) != 0) {
+    const bool of_phase = any_injected(oracle, FAULT_WINDING_OPEN, FAULT_CURRENT_SENSOR_SWAPPED);
+    if ((of_phase && !oracle->turned) || (phases & (phases - 1u)) != 0) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);
     }
     const unsigned cause = oracle->drive.fault;
