@@ -39,7 +39,7 @@ def _violations(note: Note) -> str:
     total = sum(entry["count"] for entry in note["violations"].values())
     listed = "; ".join(f"{entry['count']} `{name}`, seeds {', '.join(map(str, entry['seeds']))}"
                        for name, entry in note["violations"].items())
-    return f"{total:,} violations" + (f" ({listed})" if listed else "")
+    return f"{total:,} violation{'' if total == 1 else 's'}" + (f" ({listed})" if listed else "")
 
 
 def _rate(name: str) -> list[str]:
@@ -56,8 +56,9 @@ def _worlds(name: str, what: str) -> tuple[str, str, str]:
     parts = [f"seeds {_seeds(note)} at {note['commit']}", f"{note['virtual_hours']:.2f} h of virtual time",
              *_rate(f"{name}_rate.json"), f"**{_violations(note)}**"]
     if note["cells"]:
-        parts += [f"{note['cells_reached']:,} of {note['cells']:,} cells of fault, state and sector reached, the rest "
-                  f"in [{name}.json](../tests/campaign/{name}.json)",
+        all_reached = note["cells_reached"] == note["cells"]
+        rest = "" if all_reached else f", the rest in [{name}.json](../tests/campaign/{name}.json)"
+        parts += [f"{note['cells_reached']:,} of {note['cells']:,} cells of fault, state and sector reached{rest}",
                   f"{note['held_by_the_encoder']} drives held at rest by their encoder"]
     healthy = " --healthy" if note["kind"] == "healthy" else ""
     return what, "; ".join(parts), f"`campaign{healthy} --first {note['first']} --seeds {note['seeds']}`"
