@@ -127,8 +127,10 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
         return reject(&counters->wrong_counter);
     case E2E_WRONG_SEQUENCE:
     default:
+        commands->contested = true;
         return reject_command(commands, &counters->wrong_counter);
     }
+    commands->contested = false;
     commands->last_received_us = time_us;
     command_t requested = commands->requested;
     if (!unpack(frame, &requested) ||
@@ -147,7 +149,8 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
     return COMMANDS_COMMAND;
 }
 
-/* The drive is armed for the sender of the last command, which must not be older than the command timeout. */
+/* The drive is armed for the sender of the last command, which must not be older than the command timeout; not while a
+ * valid command of another sequence has come since, because that may be the one of who confirms. */
 static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const hal_can_frame_t *frame, uint32_t time_us,
                                        uint32_t timeout_us, command_t *command) {
     if (frame->length != DRIVE_ARM_LENGTH) {
@@ -158,7 +161,8 @@ static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const h
         return reject(&commands->counters.wrong_checksum);
     }
     const bool stopped = commands->state == DRIVE_STATE_INITIALISE || commands->state == DRIVE_STATE_READY;
-    const bool commanded = commands->receiver.synchronised && time_us - commands->last_received_us <= timeout_us;
+    const bool commanded =
+        commands->receiver.synchronised && !commands->contested && time_us - commands->last_received_us <= timeout_us;
     const bool request = frame->data[E2E_HEADER_BYTES] == ARMING_STEP_REQUEST_RUN;
     switch (arming_receive(&commands->arming, hal, frame, stopped && (commanded || request), time_us)) {
     case ARMING_ARMED:

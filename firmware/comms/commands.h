@@ -58,6 +58,7 @@ typedef struct {
     uint16_t data_id_offset;     /* of the node, added to the data IDs of drive.dbc; set by the caller after
                                     commands_init */
     uint32_t last_received_us;   /* time of the last frame that it accepted */
+    bool contested;              /* a valid command of another sequence has come since */
     e2e_receiver_t set_receiver; /* of PARAMETER_WRITE and PARAMETER_SET_CONTROL, while armed for configuration */
     arming_t arming;
     uint32_t armed_us;   /* when it was armed */

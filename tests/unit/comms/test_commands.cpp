@@ -359,6 +359,20 @@ TEST_F(Commands, arming_without_a_living_sender_of_commands_is_refused) {
     EXPECT_FALSE(commands.arming.armed);
 }
 
+TEST_F(Commands, a_recorded_command_after_a_reset_is_not_armed_by_the_living_sender_whose_own_was_refused_meanwhile) {
+    take(command_frame(20), DRIVE_STATE_READY, 1000); // recorded
+    take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
+    EXPECT_EQ(take(command_frame(28), DRIVE_STATE_READY, 3000), COMMANDS_REJECTED);
+    EXPECT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY, 4000),
+              COMMANDS_REJECTED);
+    EXPECT_FALSE(commands.arming.armed);
+    uint8_t counter = 29;
+    for (; receive(command_frame(counter), 3000 + (counter - 28u) * 10000) != COMMANDS_COMMAND; counter++) {
+        ASSERT_LT(counter, 50);
+    }
+    arm(uint8_t(counter + 1), 3000 + (counter - 26u) * 10000);
+}
+
 TEST_F(Commands, a_recording_of_a_whole_sequence_arms_nothing) {
     hal.random = 99;
     const hal_can_frame_t recorded[] = {command_frame(1), frames::arm(7, ARMING_STEP_REQUEST_RUN),
