@@ -299,16 +299,19 @@ static size_t read_clients(transport_t *transport, const transport_receiver_t *r
     return 0;
 }
 
-static bool is_latest(const sender_frame_t *frame, const struct can_frame *on_bus) {
+static bool is_same(const sender_frame_t *frame, const struct can_frame *on_bus) {
     return frame->identifier == on_bus->can_id && frame->length == on_bus->len &&
            memcmp(frame->data, on_bus->data, frame->length) == 0;
 }
 
-/* A replay is at least five frames old, and a genuine frame waits for at most some milliseconds. */
-static sender_meaning_t meaning_of(const sender_t *sender, const struct can_frame *on_bus) {
-    for (uint64_t back = 1; back <= 4 && back <= sender->sent; back++) {
-        const sender_frame_t *frame = &sender->history[(sender->sent - back) % SENDER_HISTORY];
-        if (is_latest(frame, on_bus)) {
+/* A replay is at least five frames old and has been on the bus before; a genuine frame that the bus delays may be as
+ * old.
+ */
+static sender_meaning_t meaning_of(sender_t *sender, const struct can_frame *on_bus) {
+    for (uint64_t back = 1; back <= SENDER_HISTORY && back <= sender->sent; back++) {
+        sender_frame_t *frame = &sender->history[(sender->sent - back) % SENDER_HISTORY];
+        if ((back <= 4 || !frame->seen) && is_same(frame, on_bus)) {
+            frame->seen = true;
             return (sender_meaning_t){.genuine = true,
                                       .command = frame->identifier == DRIVE_COMMAND_FRAME_ID,
                                       .confirms = frame->identifier == DRIVE_ARM_FRAME_ID && frame->data[3] == 1,

@@ -23,6 +23,7 @@ typedef struct {
     uint8_t length;
     uint16_t identifier;
     uint64_t sent_us;
+    bool seen; /* on the bus */
 } sender_frame_t;
 
 /* What a frame on the bus was to the world, by its sender's own account. */
