@@ -32,6 +32,7 @@ typedef struct {
 /* State of the deferred checks. */
 typedef struct {
     uint32_t encoder_angle;        /* of the previous check, 2^-32 rev */
+    int32_t speed_counted_q22;     /* by the observer at the last encoder count, rad/s, Q9.22 */
     int32_t speed_lower_bound_q22; /* lowest speed that the rotor can have, rad/s, Q9.22 */
     int32_t undetected_travel;     /* expected rotation since the last encoder count, 2^-32 rev; stops above 2^30 */
     bool frozen;                   /* found, and not counted since */

@@ -77,6 +77,15 @@ class Protection : public testing::Test {
 
     uint64_t check(const input_t &input) { return checks.check(input); }
 
+    // Two counts of a rotor that turns at a speed.
+    void turn(input_t &input, int32_t speed_q22) {
+        input.speed_q22 = speed_q22;
+        for (int count = 0; count < 2; count++) {
+            input.encoder_angle++;
+            ASSERT_EQ(check(input), 0);
+        }
+    }
+
     const input_t healthy = {
         .current_max_q9 = 0,
         .dc_link_voltage_q6 = 240 << 6,
@@ -123,9 +132,7 @@ TEST_F(Protection, a_frozen_encoder_is_detected_after_the_same_travel_when_perio
         for (const uint32_t periods : {1u, 2u, 5u}) {
             checks.reset(healthy.encoder_angle);
             input_t input = healthy;
-            input.encoder_angle++;
-            input.speed_q22 = speed_rad_s << 22;
-            ASSERT_EQ(check(input), 0);
+            turn(input, speed_rad_s << 22);
             input.speed_q22 = 0; // the observer follows the encoder
             input.periods = periods;
             while (detected[n] < 2000 && checks.check_deferred(input) == 0) {
@@ -141,9 +148,7 @@ TEST_F(Protection, a_frozen_encoder_is_detected_after_the_same_travel_when_perio
 
 TEST_F(Protection, any_number_of_skipped_periods_overflows_nothing) {
     input_t input = healthy;
-    input.encoder_angle++;
-    input.speed_q22 = INT32_MAX;
-    check(input);
+    turn(input, INT32_MAX);
     for (const uint32_t periods : {16u, 17u, UINT32_MAX}) {
         input.periods = periods;
         for (int k = 0; k < 100; k++) {
@@ -220,9 +225,7 @@ TEST_F(Protection, a_frozen_encoder_is_detected_although_the_observer_follows_it
         for (const auto &[speed_rad_s, fails] : {std::pair{4.1, false}, std::pair{4.5, true}, std::pair{60.0, true}}) {
             checks.reset(healthy.encoder_angle);
             input_t input = healthy;
-            input.encoder_angle++;
-            input.speed_q22 = sign * int32_t(speed_rad_s * (1 << 22));
-            ASSERT_EQ(check(input), 0);
+            turn(input, sign * int32_t(speed_rad_s * (1 << 22)));
             input.speed_q22 = 0;
             bool failed = false;
             for (int k = 0; k < 2000; k++) {
@@ -236,13 +239,28 @@ TEST_F(Protection, a_frozen_encoder_is_detected_although_the_observer_follows_it
     }
 }
 
+TEST_F(Protection, what_the_observer_makes_of_one_count_after_rest_is_no_speed_and_of_a_second_one_is) {
+    input_t input = healthy;
+    input.encoder_angle++;
+    input.speed_q22 = 60 << 22;
+    for (int k = 0; k < 2000; k++) {
+        ASSERT_EQ(check(input), 0) << k;
+    }
+    input.encoder_angle++;
+    ASSERT_EQ(check(input), 0);
+    int periods = 1;
+    while (periods < 2000 && check(input) == 0) {
+        periods++;
+    }
+    EXPECT_GT(periods, 2);
+    EXPECT_LT(periods, 1000);
+}
+
 TEST_F(Protection, an_encoder_is_frozen_when_the_travel_of_the_slowest_possible_rotor_exceeds_the_limit) {
     for (const int32_t sign : {1, -1}) {
         checks.reset(healthy.encoder_angle);
         input_t input = healthy;
-        input.encoder_angle++;
-        input.speed_q22 = sign * (10 << 22);
-        ASSERT_EQ(check(input), 0);
+        turn(input, sign * (10 << 22));
         double speed_q22 = 10 << 22, travel = 0;
         int periods = 0;
         while (travel <= UNDETECTED_TRAVEL_MAX) {
@@ -317,8 +335,7 @@ TEST_F(Protection, a_reversal_within_one_count_is_no_frozen_encoder) {
 
 TEST_F(Protection, the_undetected_travel_of_a_permanently_frozen_encoder_does_not_overflow) {
     input_t input = healthy;
-    input.speed_q22 = INT32_MAX;
-    input.encoder_angle++;
+    turn(input, INT32_MAX);
     for (int k = 0; k < 1000; k++) {
         check(input);
         ASSERT_GE(checks.deferred.undetected_travel, 0);
