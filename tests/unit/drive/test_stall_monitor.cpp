@@ -63,6 +63,13 @@ TEST_F(Stall, rotor_that_swings_without_progress_is_stalled) {
                 101000, 20000);
 }
 
+TEST_F(Stall, rotor_that_swings_faster_than_at_half_of_the_reference_is_stalled_and_one_that_runs_on_so_is_not) {
+    const auto speed_q22 = [](uint32_t us) { return us < 10000 ? 0 : us / 1000 % 20 < 10 ? 40 * RAD_S : -40 * RAD_S; };
+    EXPECT_EQ(time_to_fault_us(1000000, [&](uint32_t us) { input.speed_q22 = speed_q22(us); }), 121000u);
+    const auto once_q22 = [&](uint32_t us) { return speed_q22(us < 20000 ? us : 20000); };
+    EXPECT_EQ(time_to_fault_us(1000000, [&](uint32_t us) { input.speed_q22 = once_q22(us); }), 0u);
+}
+
 TEST_F(Stall, start_of_12_s_is_none) {
     EXPECT_EQ(time_to_fault_us(
                   12000000,
