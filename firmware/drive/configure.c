@@ -129,6 +129,8 @@ static encoder_monitor_parameters_t encoder_monitor_from(const control_parameter
         .current_min_q9 = values[PARAMETER_CURRENT_LIMIT_A] / 8,
         .over_speed_q22 = over_speed_q22,
         .travel = travel,
+        .travel_change =
+            fixed_multiply_high(control->protection.deceleration_max_q22, control->observer.angle_step_q32),
     };
 }
 

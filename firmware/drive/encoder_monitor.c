@@ -43,6 +43,9 @@
 #define ADVANCE_STROKES 64u
 #define ADVANCE_COUNTS 2u
 
+/* Time for which a contradiction waits for the next phase: 1/64 s. */
+#define WAIT_SHIFT 6
+
 /* Time without a zero of the current after which an integral is too old to contradict the angle: 1/128 s. */
 #define AGE_SHIFT 7
 
@@ -52,7 +55,8 @@
 /* Window for the speed: 1/2048 s. */
 #define WINDOW_SHIFT 11
 
-/* Windows within which the encoder turns round faster than the rotor, from and to a speed of 1/64 of the limit. */
+/* Windows within which the encoder turns round faster than the rotor, from and to a speed of 1/64 of the limit and of
+ * half the largest change of the rotor's in this time. */
 #define REVERSAL_WINDOWS 3u
 #define REVERSAL_SHIFT 6
 
@@ -223,6 +227,7 @@ static void forget_references(encoder_monitor_t *monitor) {
 /* True while a phase has shown a contradiction in the last quarter of a second. */
 static bool shows(const encoder_monitor_parameters_t *parameters, encoder_monitor_phase_t *phase, uint32_t period) {
     if (phase->contradicted >= PERSISTENT_PERIODS) {
+        phase->shown_from = phase->shown ? phase->shown_from : period;
         phase->shown = true;
         phase->shown_at = period;
     } else if (period - phase->shown_at > parameters->rate_hz >> SHOWN_SHIFT) {
@@ -292,23 +297,26 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
             phase->agrees = 0;
         }
         contradicting += shows(parameters, phase, input->period);
-        alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT && !next_decides &&
+        const bool waits = next_decides && input->period - phase->shown_from <= parameters->rate_hz >> WAIT_SHIFT;
+        alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT && !waits &&
                  !others_agree(parameters, monitor, index, input->period);
     }
     monitor->angle |= contradicting >= CONTRADICTING_PHASES || alone;
 }
 
-/* Notes when the encoder has turned round. clear: faster than its counts and the rotor's swings. */
+/* Notes when the encoder has turned round. clear: faster than its counts and the rotor's swings. The first direction
+ * since a reset of the drive, whose rotor may turn backwards, is no turn round. */
 static void note_reversal(encoder_monitor_t *monitor, int32_t turned, bool clear, uint32_t rate_hz) {
     const bool backwards = turned < 0;
     if (!clear) {
         return;
     }
-    if (backwards != monitor->backwards &&
+    if (monitor->turned && backwards != monitor->backwards &&
         monitor->window_period - monitor->turned_at <= REVERSAL_WINDOWS * (rate_hz >> WINDOW_SHIFT)) {
         monitor->reversed = true;
         monitor->reversed_at = monitor->window_period;
     }
+    monitor->turned = true;
     monitor->backwards = backwards;
     monitor->turned_at = monitor->window_period;
 }
@@ -328,7 +336,9 @@ static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_
                           (travel > limit + limit / 16 + count || (above && travel + count > limit - limit / 32));
     monitor->window_period = input->period;
     monitor->window_angle = input->encoder_angle;
-    note_reversal(monitor, turned, travel > (limit >> REVERSAL_SHIFT) + count, parameters->rate_hz);
+    const uint64_t change = (uint64_t)parameters->travel_change * periods * periods * REVERSAL_WINDOWS / 2u;
+    const uint64_t least = limit >> REVERSAL_SHIFT;
+    note_reversal(monitor, turned, travel > (least > change ? least : change) + count, parameters->rate_hz);
 }
 
 bool encoder_monitor_suspects(const encoder_monitor_parameters_t *parameters, const encoder_monitor_t *monitor,

@@ -6,7 +6,7 @@
  *   angle       the integrated flux linkage of two phases is outside what the tables allow around the encoder's angle:
  *               offset, slip, wrong direction, a constant reading of another angle. Of one alone unless all
  *               others have agreed a short time ago: then the phase has a fault of its own (drive/phase_monitor.h).
- *               Nor while the rotor advances with the torque: it brings the next phase, which decides.
+ *               Nor for 1/64 s while the rotor advances with the torque: it brings the next phase, which decides.
  *   over-speed  by the encoder's counts over half a millisecond: a sixteenth above the limit; or from a thirty-second
  *               below it when the observer's speed, which is finer, is above. Of the observer alone it is none: after
  *               an edge that came too early, or with a rotor on which it has just begun, its speed is not the rotor's.
@@ -42,6 +42,7 @@ typedef struct {
     int32_t current_min_q9;       /* of a phase that is checked, A, Q7.9 */
     int32_t over_speed_q22;       /* limit of the speed's magnitude, rad/s, Q9.22 */
     int32_t travel;               /* of a period at that speed, 2^-32 rev */
+    int32_t travel_change;        /* from period to period, the largest of a rotor, 2^-32 rev */
 } encoder_monitor_parameters_t;
 
 typedef struct {
@@ -69,8 +70,9 @@ typedef struct {
     uint32_t moved;        /* periods for which they have parted */
     uint32_t contradicted; /* periods for which the angle has been contradicted */
     uint32_t shown_at;
-    uint32_t agrees; /* periods in succession in which the angle was not contradicted */
-    bool agreed;     /* for long enough, last in the period */
+    uint32_t shown_from; /* period since which it has been shown */
+    uint32_t agrees;     /* periods in succession in which the angle was not contradicted */
+    bool agreed;         /* for long enough, last in the period */
     uint32_t agreed_at;
 } encoder_monitor_phase_t;
 
@@ -83,7 +85,8 @@ typedef struct {
     uint32_t encoder_angle;         /* then */
     uint32_t window_period;         /* of the start of the window for the speed */
     uint32_t window_angle;
-    bool backwards; /* direction of the last window with a clear travel, which ended in the period turned_at */
+    bool turned;    /* a window had a clear travel */
+    bool backwards; /* direction of the last one, which ended in the period turned_at */
     uint32_t turned_at;
     bool reversed; /* faster than a rotor, last in the period reversed_at */
     uint32_t reversed_at;

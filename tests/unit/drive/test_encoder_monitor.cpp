@@ -162,6 +162,23 @@ TEST_F(EncoderMonitor, one_phase_alone_is_no_evidence_while_the_rotor_advances_w
     }
 }
 
+TEST_F(EncoderMonitor, a_contradiction_waits_for_the_next_phase_for_a_64th_of_a_second) {
+    input.torque_q24 = 1 << 24;
+    // The rotor swings: it comes with the torque, shows 6 ms of a contradiction, and turns back.
+    int periods = 0;
+    for (; periods < RATE_HZ / 20 && !monitor.angle; periods++) {
+        const int swing = periods % (RATE_HZ / 100);
+        if (swing == 0) {
+            input.zero_at[0] = input.period + 1;
+        }
+        const bool comes = swing < RATE_HZ * 6 / 1000;
+        const double turned_deg = (comes ? swing : RATE_HZ * 6 / 1000) * 144.0 / RATE_HZ;
+        step(77.0 + turned_deg, 65.0 + turned_deg, comes ? 25.0 : 0.0);
+    }
+    EXPECT_GT(periods, RATE_HZ / 64);
+    EXPECT_LT(periods, RATE_HZ / 32);
+}
+
 TEST_F(EncoderMonitor, a_phase_has_company_while_another_has_contradicted_the_angle_within_a_quarter_of_a_second) {
     EXPECT_FALSE(encoder_monitor_suspects(&parameters, &monitor, 0));
     input.zero_at[1] = input.period + 1;
@@ -190,6 +207,30 @@ TEST_F(EncoderMonitor,
             step(angle_deg, angle_deg, 0.0);
         }
         EXPECT_EQ(encoder_monitor_suspects(&parameters, &monitor, 7), turning_ms == 0);
+    }
+}
+
+TEST_F(EncoderMonitor, the_first_direction_of_the_encoder_after_a_reset_is_no_turn_round) {
+    monitor = {};
+    input.period = 0;
+    for (int k = 0; k < 10 * RATE_HZ / 1000; k++) {
+        const double angle_deg = 90.0 - k * 1800.0 / RATE_HZ;
+        step(angle_deg, angle_deg, 0.0);
+    }
+    EXPECT_FALSE(encoder_monitor_suspects(&parameters, &monitor, 7));
+}
+
+TEST_F(EncoderMonitor, a_rotor_that_is_light_enough_to_turn_round_within_a_millisecond_is_not_suspect) {
+    // Between 300 r/min one way and the other, 1800 degrees a second: in 1.4 ms by 2.5e6 degrees/s^2.
+    for (const auto &[deg_s2, suspect] : {std::pair{2.8e6, false}, std::pair{2.2e6, true}}) {
+        monitor = {};
+        parameters.travel_change = int32_t(deg_s2 * PERIOD_S * PERIOD_S * DEGREE);
+        double angle_deg = 0.0;
+        for (int k = 0; k < 20 * RATE_HZ / 1000; k++) {
+            angle_deg += (k < 10 * RATE_HZ / 1000 ? 1800.0 : -1800.0) / RATE_HZ;
+            step(angle_deg, angle_deg, 0.0);
+        }
+        EXPECT_EQ(encoder_monitor_suspects(&parameters, &monitor, 7), suspect) << deg_s2;
     }
 }
 
