@@ -56,9 +56,11 @@ static bool state_changed(const oracle_t *oracle) {
     return oracle_any_injected(oracle, FAULT_STATE_FLIPPED, FAULT_FAULT_LATCH_FLIPPED);
 }
 
-static bool variable_active(const oracle_t *oracle, unsigned variable, uint64_t time_us) {
+/* A line of safe torque off is not energised. */
+static bool sto_demanded(const oracle_t *oracle, uint64_t time_us) {
     for (unsigned i = 0; i < oracle->world->events; i++) {
-        if (oracle->world->event[i].kind == WORLD_SET && oracle->world->event[i].what == variable &&
+        const world_event_t *event = &oracle->world->event[i];
+        if (event->kind == WORLD_SET && (event->what == BENCH_VARIABLE_STO_1 || event->what == BENCH_VARIABLE_STO_2) &&
             world_active(oracle->world, i, time_us)) {
             return true;
         }
@@ -120,11 +122,10 @@ static bool impersonated(const oracle_t *oracle) {
 
 static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     const uint64_t now_ns = plant->time_ns;
-    const bool deaf = may_be_deaf(oracle, now_ns / 1000);
-    if (!oracle->confirmed && !deaf) {
+    if (!oracle->confirmed && !may_be_deaf(oracle, now_ns / 1000)) {
         oracle_violate(oracle, "no_command", now_ns, 1, 0.0);
     }
-    if (oracle->off_seen && now_ns > oracle->off_ns + 5 * ORACLE_MS_NS && !deaf) {
+    if (oracle->off_seen && now_ns > oracle->off_ns + 5 * ORACLE_MS_NS && !may_be_deaf(oracle, now_ns / 1000)) {
         oracle_violate(oracle, "no_command", now_ns, 2, 0.0);
     }
     /* The plant may not have advanced to the frame yet. */
@@ -227,8 +228,7 @@ void oracle_look(oracle_t *oracle, const plant_t *plant) {
         return;
     }
     const uint64_t time_us = (plant->time_ns - 1) / 1000; /* a change of this instant comes after the look */
-    if (variable_active(oracle, BENCH_VARIABLE_STO_1, time_us) ||
-        variable_active(oracle, BENCH_VARIABLE_STO_2, time_us)) {
+    if (sto_demanded(oracle, time_us)) {
         oracle_violate(oracle, "gate_on", plant->time_ns, 2, 0.0);
     }
     const uint64_t longer = oracle->injected[FAULT_PERIOD_REGISTER_FLIPPED] ? 4 : 1; /* times the period, at most */
