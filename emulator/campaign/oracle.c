@@ -266,6 +266,7 @@ void oracle_on_status(oracle_t *oracle, uint64_t time_ns, unsigned state, unsign
 }
 
 void oracle_on_fault(oracle_t *oracle, const plant_t *plant, unsigned kind, bool begins) {
+    oracle->fault_ns = plant->time_ns;
     if (!begins || kind >= FAULT_COUNT) {
         return;
     }

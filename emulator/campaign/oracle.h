@@ -99,6 +99,7 @@ typedef struct {
     uint64_t recent_ns;
     double run_angle_rad;      /* of the rotor at the start of the run */
     bool turned;               /* by a stroke since */
+    uint64_t fault_ns;         /* the last fault began or ended */
     double encoder_offset_rev; /* on the shaft, in counting direction */
     oracle_stretch_t stretch;
     /* Recovery. */

@@ -90,5 +90,7 @@ static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
 
 void oracle_look_at_measurement(oracle_t *oracle, const plant_t *plant) {
     look_at_angle(oracle, plant);
-    look_at_currents_and_link(oracle, plant);
+    if (oracle->fault_ns != plant->time_ns) { /* else it may have come between the samples and this look */
+        look_at_currents_and_link(oracle, plant);
+    }
 }
