@@ -103,6 +103,11 @@ static bool impersonated(const oracle_t *oracle) {
     return silent && replayed;
 }
 
+/* A frame may wait in the drive for its background, at most for the watchdog's 18 ms. */
+static uint64_t request_max_ns(const oracle_t *oracle, uint64_t max_ns) {
+    return max_ns + (oracle_any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM) ? 18 * ORACLE_MS_NS : 0);
+}
+
 static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     const uint64_t now_ns = plant->time_ns;
     if (!oracle->confirmed && !may_be_deaf(oracle, now_ns / 1000)) {
@@ -113,9 +118,9 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     }
     /* The plant may not have advanced to the frame yet. */
     const uint64_t age_ns = now_ns > oracle->run_ns ? now_ns - oracle->run_ns : 0;
-    if (!oracle->commanded || age_ns > RUN_MAX_NS) {
+    if (!oracle->commanded || age_ns > request_max_ns(oracle, RUN_MAX_NS)) {
         oracle_violate(oracle, "no_command", now_ns, 3, (double)age_ns * 1e-6);
-    } else if (age_ns > 170 * ORACLE_MS_NS &&
+    } else if (age_ns > request_max_ns(oracle, 170 * ORACLE_MS_NS) &&
                fabs(plant_torque_Nm(plant)) > 0.2 * oracle->world->machine->torque_max_Nm) {
         oracle_violate(oracle, "no_command", now_ns, 4, plant_torque_Nm(plant));
     }
@@ -198,7 +203,8 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     if (gates && drive.state != STATE_RUN) {
         oracle_violate(oracle, "gate_on", plant->time_ns, 1, drive.state);
     }
-    if (drive.state == STATE_RUN && !state_changed(oracle) && plant->time_ns > oracle->run_ns + RUN_MAX_NS) {
+    if (drive.state == STATE_RUN && !state_changed(oracle) &&
+        plant->time_ns > oracle->run_ns + request_max_ns(oracle, RUN_MAX_NS)) {
         oracle_violate(oracle, "no_command", plant->time_ns, 6, (double)(plant->time_ns - oracle->run_ns) * 1e-6);
     }
     if (drive.state == STATE_FAULT && before != STATE_FAULT) {

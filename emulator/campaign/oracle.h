@@ -9,8 +9,9 @@
  *   gate_on         a gate on while the drive is not in state run, or a line of safe torque off is not energised, or
  *                   2.5 periods after the last control interrupt
  *   no_command      a gate on without a confirmed arming since the last fault, or 5 ms after a genuine off; a gate on,
- *                   or the state run, 502 ms after the last genuine request to run; torque 170 ms after it; a fault
- *                   that ends without a genuine request to clear it
+ *                   or the state run, 502 ms after the last genuine request to run; torque 170 ms after it; both later
+ *                   by the 18 ms for which the request waits when the background hangs and the watchdog does not reset
+ *                   the drive; a fault that ends without a genuine request to clear it
  *   stopped         state run left, without a fault, less than 30 ms after a genuine request to run
  *   over_speed      a gate on for 2 ms at a speed above the limit by 2 %
  *   over_voltage    a gate on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no

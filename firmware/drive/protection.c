@@ -51,6 +51,16 @@ static bool encoder_jumped(const protection_parameters_t *parameters, int32_t an
     return (uint32_t)angle_step + limit > 2 * limit;
 }
 
+/* The encoder has counted. Not inlined, which saves the longer path three instructions. */
+NOINLINE static void count(protection_deferred_t *protection, uint32_t encoder_angle, int32_t speed_q22) {
+    const int32_t before_q22 = protection->speed_counted_q22;
+    protection->encoder_angle = encoder_angle;
+    protection->frozen = false;
+    protection->speed_lower_bound_q22 = speed_q22 < before_q22 ? speed_q22 : before_q22;
+    protection->speed_counted_q22 = speed_q22;
+    protection->undetected_travel = 0;
+}
+
 /* True when the encoder does not count although the rotor turns: it is no slower than at the slower one of the last two
  * counts less the largest possible deceleration since; what the observer makes of a first count after rest is no speed.
  * The observer cannot tell: with a high bandwidth it follows a frozen encoder to standstill before the rotor has turned
@@ -58,14 +68,8 @@ static bool encoder_jumped(const protection_parameters_t *parameters, int32_t an
  * (encoder_monitor.h). Frozen until the encoder counts: at standstill nothing else shows whether it could. */
 static bool encoder_frozen(const protection_parameters_t *parameters, protection_deferred_t *protection,
                            const protection_deferred_input_t *input, int32_t speed_q22) {
-    const bool counted = input->encoder_angle != protection->encoder_angle;
-    protection->encoder_angle = input->encoder_angle;
-    if (counted) {
-        protection->frozen = false;
-        const int32_t before_q22 = protection->speed_counted_q22;
-        protection->speed_lower_bound_q22 = speed_q22 < before_q22 ? speed_q22 : before_q22;
-        protection->speed_counted_q22 = speed_q22;
-        protection->undetected_travel = 0;
+    if (input->encoder_angle != protection->encoder_angle) {
+        count(protection, input->encoder_angle, speed_q22);
         return false;
     }
     const int32_t periods = (int32_t)(input->periods < PERIODS_MAX ? input->periods : PERIODS_MAX);
