@@ -10,6 +10,10 @@
 /* Accuracy of event times. */
 #define EVENT_TOLERANCE_S 1e-13
 #define EVENT_ITERATIONS 60
+/* Fraction of the time to an event after which the phases begin new steps, so that the current is known better. */
+#define APPROACH 0.9
+/* A voltage that the half bridges' charge leads past a threshold by less than this has not passed it. */
+#define THRESHOLD_TOLERANCE_V 1e-6
 
 /* Determines the conduction states of source and chopper. At exactly the voltage at which the source begins to conduct,
  * the current of half bridges and chopper decides. */
@@ -56,6 +60,7 @@ void link_start(link_t *link, const plant_t *plant, link_record_t *record) {
     link->supply_V = plant->supply_voltage_V;
     link->charge_1_F = -1.0 / plant->machine->dc_link.capacitance_F;
     link->chopper_on = plant->chopper_on;
+    link->near = false;
     link->plant = plant;
     link->record = record;
     decide(link);
@@ -99,11 +104,11 @@ static double step_to_event(const link_t *link, double step_s, link_result_t *re
     return at_s;
 }
 
-void link_advance_in_steps(link_t *link, double to_s) {
+bool link_advance_in_steps(link_t *link, double to_s) {
     while (link->at_s < to_s) {
         /* The half bridges' current may have changed its sign where the source begins to conduct, and their charge may
          * have led past a threshold. */
-        if (link->voltage_V == link->supply_V || distance_V(link, link->voltage_V) < 0.0) {
+        if (link->voltage_V == link->supply_V || distance_V(link, link->voltage_V) < -THRESHOLD_TOLERANCE_V) {
             decide(link);
         }
         const double rest_s = to_s - link->at_s, from_s = link->at_s;
@@ -113,6 +118,10 @@ void link_advance_in_steps(link_t *link, double to_s) {
         const bool event = result.end_V > link->rising_V || result.end_V < link->falling_V;
         if (event) {
             step_s = step_to_event(link, step_s, &result);
+            if (!link->near) {
+                step_s *= APPROACH;
+                result = link_step(link, step_s);
+            }
         }
         link_book(link, step_s, &result);
         link->at_s = step_s < rest_s ? from_s + step_s : to_s;
@@ -128,9 +137,15 @@ void link_advance_in_steps(link_t *link, double to_s) {
             link->record->count++;
         }
         if (event) {
-            decide(link);
+            link->near = !link->near;
+            if (!link->near) {
+                decide(link);
+            }
+            return false;
         }
     }
+    link->near = false;
+    return true;
 }
 
 double link_recorded_V(const link_record_t *record, double at_s) {

@@ -38,6 +38,7 @@ typedef struct {
     double rising_V, falling_V;            /* at which source or chopper switch */
     double supply_V;
     bool source_conducts, chopper_on;
+    bool near; /* source or chopper are about to switch */
     /* Integrals of supply_V - voltage and of its square while the source conducts, of voltage^2 with the chopper on. */
     double source_Vs, source_V2s, chopper_V2s;
     double source_A; /* part of the source in drawn_A */
@@ -56,7 +57,7 @@ void link_finish(const link_t *link, plant_t *plant);
 double link_recorded_V(const link_record_t *record, double at_s);
 
 /* As link_advance, in several steps. */
-void link_advance_in_steps(link_t *link, double to_s);
+bool link_advance_in_steps(link_t *link, double to_s);
 
 static inline double link_slope_V_s(const link_t *link) {
     return link->charge_1_F * (link->drawn_A + link->conductance_S * link->voltage_V);
@@ -103,20 +104,20 @@ static inline void link_book(link_t *link, double step_s, const link_result_t *r
     link->drawn_A_s += 2.0 * step_s * link->drawn_A_s2;
 }
 
-/* Advances to `to_s`. */
-static inline void link_advance(link_t *link, double to_s) {
+/* Advances to `to_s`; false: only to at_s, where source or chopper switch. */
+static inline bool link_advance(link_t *link, double to_s) {
     const double step_s = to_s - link->at_s;
     if (step_s <= 0.0) {
-        return;
+        return true;
     }
     const link_result_t result = link_step(link, step_s);
     if (step_s <= link->step_max_s && link->voltage_V < link->rising_V && link->voltage_V > link->falling_V &&
         result.end_V <= link->rising_V && result.end_V >= link->falling_V) {
         link_book(link, step_s, &result);
         link->at_s = to_s;
-    } else {
-        link_advance_in_steps(link, to_s);
+        return true;
     }
+    return link_advance_in_steps(link, to_s);
 }
 
 #endif

@@ -247,8 +247,13 @@ MAGNETICS_INLINE bool walk_begin(const plant_t *plant, magnetics_form_t form, un
 
     double step_s = until_s - at_s;
     const double change_A = fabs(current_A_s) * step_s;
-    if (change_A > rotor->current_step_A) {
-        step_s /= ceil(change_A / rotor->current_step_A);
+    const double swing_s2_H = tied ? step_s * step_s * walk->inverse_1_H : 0.0;
+    if (change_A > rotor->current_step_A || (tied && swing_s2_H > plant->link_swing_s2_H)) {
+        double steps = change_A / rotor->current_step_A;
+        if (tied && swing_s2_H > steps * steps * plant->link_swing_s2_H) {
+            steps = sqrt(swing_s2_H / plant->link_swing_s2_H);
+        }
+        step_s /= ceil(steps);
         walk->end_s = at_s + step_s;
     }
     if (tied && on == 0 && walk->flux_Wb + voltage_V * step_s < 0.0) {
@@ -448,6 +453,14 @@ MAGNETICS_INLINE bool walk_apart(plant_t *plant, magnetics_form_t form, const ro
     return true;
 }
 
+/* Ends a phase's step earlier, where the source or the chopper switch. */
+static void cut(walk_t *walk, double end_s) {
+    walk->end_s = end_s;
+    walk->step_s = end_s - walk->at_s;
+    walk->end_A = walk->current_A + walk->step_s * (walk->current_A_s + 0.5 * walk->step_s * walk->bend_A_s2);
+    walk->corner = false;
+}
+
 static inline unsigned first_to_end(const double end_s[HAL_PHASES_MAX]) {
     const unsigned one = end_s[1] < end_s[0] ? 1 : 0, other = end_s[3] < end_s[2] ? 3 : 2;
     return end_s[other] < end_s[one] ? other : one;
@@ -473,7 +486,15 @@ MAGNETICS_INLINE bool walk_together(plant_t *plant, magnetics_form_t form, const
             break;
         }
         walk_t *walk = &walks[phase];
-        link_advance(link, end_s[phase]);
+        if (__builtin_expect(!link_advance(link, end_s[phase]), 0)) {
+            for (unsigned other = 0; other < plant->machine->phases; other++) {
+                if (end_s[other] > link->at_s && end_s[other] != INFINITY && active[other] && walks[other].on != 1) {
+                    cut(&walks[other], link->at_s);
+                    end_s[other] = link->at_s;
+                }
+            }
+            continue;
+        }
         if (active[phase] &&
             !walk_end(plant, form, rotor, link, walk, sums, records != NULL ? &records[phase] : NULL)) {
             return false;
@@ -486,7 +507,8 @@ MAGNETICS_INLINE bool walk_together(plant_t *plant, magnetics_form_t form, const
             end_s[phase] = INFINITY;
         }
     }
-    link_advance(link, rotor->length_s);
+    while (!link_advance(link, rotor->length_s)) {
+    }
     return true;
 }
 

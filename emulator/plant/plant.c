@@ -21,9 +21,9 @@
  * rotor: where resistance or friction is large, longer Runge-Kutta steps lose accuracy, and beyond 2.8 stability. */
 #define STEP_TIME_CONSTANTS 0.05
 
-/* With a DC link, where each phase has its own steps: fraction of the time constant sqrt(L C) of a winding and the
- * capacitor. */
-#define LINK_STEP 0.03
+/* With a DC link, where each phase has its own steps: fraction of the time constant sqrt(L C) of a phase that is
+ * connected to it, with its present incremental inductance, and the capacitor. */
+#define LINK_STEP 0.025
 /* And of that of the source's resistance and the capacitor. */
 #define LINK_SOURCE_STEP 1.0
 
@@ -105,9 +105,9 @@ void plant_set_step_factor(plant_t *plant, double factor) {
     plant->step_max_s = factor * fmin(STEP_MAX_S, STEP_TIME_CONSTANTS * time_constant_s);
     if (has_link(plant)) {
         const dc_link_t *link = &plant->machine->dc_link;
-        const double period_s = sqrt(plant->magnetics.inductance_min_H * link->capacitance_F);
         const double source_s = link->source_resistance_ohm * link->capacitance_F;
-        plant->step_max_s = fmin(plant->step_max_s, factor * fmin(LINK_STEP * period_s, LINK_SOURCE_STEP * source_s));
+        plant->step_max_s = fmin(plant->step_max_s, factor * LINK_SOURCE_STEP * source_s);
+        plant->link_swing_s2_H = factor * factor * LINK_STEP * LINK_STEP * link->capacitance_F;
         time_constant_s = fmin(time_constant_s, link->source_resistance_ohm * link->capacitance_F);
         if (link->chopper_resistance_ohm > 0.0) {
             time_constant_s = fmin(time_constant_s, link->chopper_resistance_ohm * link->capacitance_F);

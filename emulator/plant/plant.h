@@ -129,6 +129,7 @@ typedef struct plant {
     double phase_offset_rad;
     double drop_V[3], resistance_ohm[3]; /* of a phase, winding included, by the number of switches that are on */
     double step_factor, step_max_s, together_step_max_s, step_current_A, step_angle_rad;
+    double link_swing_s2_H; /* limit of a step of a phase on a DC link: its square by the incremental inductance */
     double smooth_from_rad, smooth_to_rad;
     double supply_voltage_V;
     bool held; /* plant_hold */
