@@ -23,6 +23,7 @@ static const double NS_S = 1e-9;
 /* A step of the rotor. */
 typedef struct {
     double angle_rad, speed_rad_s, acceleration_rad_s2, jerk_rad_s3; /* at its start */
+    double half_rad_s2, half_rad_s3;                                 /* half of the last two */
     uint32_t start_ns; /* after the start of the control period, modulo 2^32 */
     uint64_t length_ns;
     double length_s;
@@ -104,9 +105,10 @@ static inline bool conducts(const rotor_step_t *rotor, double current_A, unsigne
 
 /* Predicted angle and speed. */
 MAGNETICS_INLINE void rotor_at(const rotor_step_t *rotor, double at_s, double *angle_rad, double *speed_rad_s) {
-    const double half_rad_s2 = 0.5 * rotor->acceleration_rad_s2, half_rad_s3 = 0.5 * rotor->jerk_rad_s3 * at_s;
-    *angle_rad = rotor->angle_rad + at_s * (rotor->speed_rad_s + at_s * (half_rad_s2 + (1.0 / 3.0) * half_rad_s3));
-    *speed_rad_s = rotor->speed_rad_s + at_s * (rotor->acceleration_rad_s2 + half_rad_s3);
+    const double half_rad_s2 = rotor->half_rad_s3 * at_s;
+    *angle_rad =
+        rotor->angle_rad + at_s * (rotor->speed_rad_s + at_s * (rotor->half_rad_s2 + (1.0 / 3.0) * half_rad_s2));
+    *speed_rad_s = rotor->speed_rad_s + at_s * (rotor->acceleration_rad_s2 + half_rad_s2);
 }
 
 /* Shortens a step so that it ends where the phase's magnetics are not smooth; true if it does. */
@@ -607,6 +609,8 @@ MAGNETICS_INLINE void start_step(plant_t *plant, magnetics_form_t form, rotor_st
         rotor->acceleration_rad_s2 = plant->held_acceleration_rad_s2;
         rotor->jerk_rad_s3 = coupling_1_s2 = 0.0;
     }
+    rotor->half_rad_s2 = 0.5 * rotor->acceleration_rad_s2;
+    rotor->half_rad_s3 = 0.5 * rotor->jerk_rad_s3;
 
     double limit_s = plant->step_max_s;
     if (fabs(speed_rad_s) * limit_s > plant->step_angle_rad) {
