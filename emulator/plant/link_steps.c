@@ -15,10 +15,26 @@
 /* A voltage that the half bridges' charge leads past a threshold by less than this has not passed it. */
 #define THRESHOLD_TOLERANCE_V 1e-6
 
+/* Books the time since the last decision to source and chopper. */
+static void book_decided(link_t *link) {
+    if (link->source_conducts) {
+        link->source_s += link->at_s - link->decided_s;
+        link->source_Vs += link->area_Vs - link->decided_Vs;
+        link->source_V2s += link->square_V2s - link->decided_V2s;
+    }
+    if (link->chopper_on) {
+        link->chopper_V2s += link->square_V2s - link->decided_V2s;
+    }
+    link->decided_s = link->at_s;
+    link->decided_Vs = link->area_Vs;
+    link->decided_V2s = link->square_V2s;
+}
+
 /* Determines the conduction states of source and chopper. At exactly the voltage at which the source begins to conduct,
  * the current of half bridges and chopper decides. */
 static void decide(link_t *link) {
     const dc_link_t *machine = &link->plant->machine->dc_link;
+    book_decided(link);
     const bool chopper = machine->chopper_resistance_ohm > 0.0;
     if (chopper) {
         if (link->voltage_V >= machine->chopper_on_V) {
@@ -35,18 +51,17 @@ static void decide(link_t *link) {
     const double taken_A = link->drawn_A + link->conductance_S * link->voltage_V;
     link->source_conducts = link->voltage_V < link->supply_V || (link->voltage_V == link->supply_V && taken_A >= 0.0);
     if (link->source_conducts) {
-        const double source_S = 1.0 / machine->source_resistance_ohm;
-        link->conductance_S += source_S;
-        link->source_A = -source_S * link->supply_V;
+        link->conductance_S += link->source_S;
+        link->source_A = -link->source_S * link->supply_V;
         link->drawn_A += link->source_A;
         link->rising_V = link->supply_V;
     } else {
         link->falling_V = link->supply_V;
     }
     if (link->chopper_on) {
-        link->falling_V = fmax(link->falling_V, machine->chopper_off_V);
+        link->falling_V = link->falling_V > machine->chopper_off_V ? link->falling_V : machine->chopper_off_V;
     } else if (chopper) {
-        link->rising_V = fmin(link->rising_V, machine->chopper_on_V);
+        link->rising_V = link->rising_V < machine->chopper_on_V ? link->rising_V : machine->chopper_on_V;
     }
     link->longest_s = link->plant->step_factor * STEP_TIME_CONSTANTS / (link->conductance_S * -link->charge_1_F);
     link->step_max_s = link->record == NULL ? link->longest_s : 0.0;
@@ -55,10 +70,13 @@ static void decide(link_t *link) {
 void link_start(link_t *link, const plant_t *plant, link_record_t *record) {
     link->at_s = link->area_Vs = 0.0;
     link->drawn_A = link->drawn_A_s = link->drawn_A_s2 = link->source_A = 0.0;
-    link->source_Vs = link->source_V2s = link->chopper_V2s = 0.0;
+    link->square_V2s = link->decided_s = link->decided_Vs = link->decided_V2s = 0.0;
+    link->source_s = link->source_Vs = link->source_V2s = link->chopper_V2s = 0.0;
+    link->source_conducts = false;
     link->voltage_V = plant->bus_voltage_V;
     link->supply_V = plant->supply_voltage_V;
     link->charge_1_F = -1.0 / plant->machine->dc_link.capacitance_F;
+    link->source_S = 1.0 / plant->machine->dc_link.source_resistance_ohm;
     link->chopper_on = plant->chopper_on;
     link->near = false;
     link->plant = plant;
@@ -158,12 +176,12 @@ double link_recorded_V(const link_record_t *record, double at_s) {
                    record->steps[n].start_V_s, record->steps[n].end_V, record->steps[n].end_V_s);
 }
 
-void link_finish(const link_t *link, plant_t *plant) {
+void link_finish(link_t *link, plant_t *plant) {
     const dc_link_t *machine = &plant->machine->dc_link;
-    if (link->source_Vs != 0.0) {
-        plant->energy_supplied_J += link->supply_V * link->source_Vs / machine->source_resistance_ohm;
-        plant->energy_source_J += link->source_V2s / machine->source_resistance_ohm;
-    }
+    book_decided(link);
+    const double supply_V = link->supply_V, over_Vs = supply_V * link->source_s - link->source_Vs;
+    plant->energy_supplied_J += supply_V * over_Vs * link->source_S;
+    plant->energy_source_J += (supply_V * (over_Vs - link->source_Vs) + link->source_V2s) * link->source_S;
     if (link->chopper_V2s != 0.0) {
         plant->energy_chopper_J += link->chopper_V2s / machine->chopper_resistance_ohm;
     }

@@ -36,12 +36,14 @@ typedef struct {
     double step_max_s;                     /* 0: every step is recorded */
     double charge_1_F, conductance_S;      /* change of the voltage by a charge drawn; g */
     double rising_V, falling_V;            /* at which source or chopper switch */
-    double supply_V;
+    double supply_V, source_S;
     bool source_conducts, chopper_on;
-    bool near; /* source or chopper are about to switch */
-    /* Integrals of supply_V - voltage and of its square while the source conducts, of voltage^2 with the chopper on. */
-    double source_Vs, source_V2s, chopper_V2s;
-    double source_A; /* part of the source in drawn_A */
+    bool near;                                 /* source or chopper are about to switch */
+    double square_V2s;                         /* integral of its square */
+    double decided_s, decided_Vs, decided_V2s; /* at_s and both integrals when the conduction states last changed */
+    double source_s, source_Vs, source_V2s;    /* time and both integrals until then, while the source conducted */
+    double chopper_V2s;                        /* the last one with the chopper on */
+    double source_A;                           /* part of the source in drawn_A */
     double longest_s;
     const plant_t *plant;
     link_record_t *record; /* NULL: none */
@@ -51,7 +53,7 @@ typedef struct {
 void link_start(link_t *link, const plant_t *plant, link_record_t *record);
 
 /* Writes voltage, chopper and energies to the plant. */
-void link_finish(const link_t *link, plant_t *plant);
+void link_finish(link_t *link, plant_t *plant);
 
 /* Voltage `at_s` after the start of the rotor's step. */
 double link_recorded_V(const link_record_t *record, double at_s);
@@ -86,18 +88,10 @@ static inline link_result_t link_step(const link_t *link, double step_s) {
 /* Books a step, whose end becomes the present state. */
 static inline void link_book(link_t *link, double step_s, const link_result_t *result) {
     const double change_V = result->end_V - link->voltage_V;
+    const double middle_V = link->voltage_V + 0.5 * change_V;
     /* Of a parabola. */
-    const double spread_V2s = (1.0 / 12.0) * step_s * change_V * change_V;
-    if (link->source_conducts) {
-        const double middle_V = link->supply_V - (link->voltage_V + 0.5 * change_V);
-        const double over_Vs = link->supply_V * step_s - result->area_Vs;
-        link->source_Vs += over_Vs;
-        link->source_V2s += middle_V * (2.0 * over_Vs - middle_V * step_s) + spread_V2s;
-    }
-    if (link->chopper_on) {
-        const double middle_V = link->voltage_V + 0.5 * change_V;
-        link->chopper_V2s += middle_V * (2.0 * result->area_Vs - middle_V * step_s) + spread_V2s;
-    }
+    link->square_V2s +=
+        middle_V * (2.0 * result->area_Vs - middle_V * step_s) + (1.0 / 12.0) * step_s * (change_V * change_V);
     link->area_Vs += result->area_Vs;
     link->voltage_V = result->end_V;
     link->drawn_A += step_s * link->drawn_A_s + result->bend_A;
@@ -111,8 +105,7 @@ static inline bool link_advance(link_t *link, double to_s) {
         return true;
     }
     const link_result_t result = link_step(link, step_s);
-    if (step_s <= link->step_max_s && link->voltage_V < link->rising_V && link->voltage_V > link->falling_V &&
-        result.end_V <= link->rising_V && result.end_V >= link->falling_V) {
+    if (step_s <= link->step_max_s && result.end_V <= link->rising_V && result.end_V >= link->falling_V) {
         link_book(link, step_s, &result);
         link->at_s = to_s;
         return true;

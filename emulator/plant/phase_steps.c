@@ -171,6 +171,7 @@ typedef struct {
     double own_A2s, own_J; /* integral of the square of the current; losses */
     /* Present step: */
     double at_s, step_s, end_s;
+    bool active; /* it has current */
     bool corner; /* it ends at one */
     double voltage_V, current_A_s, torque_Nm_s;
     double end_A; /* predicted */
@@ -326,7 +327,7 @@ MAGNETICS_INLINE void settle(link_t *link, const walk_t *walk, double step_s, do
     link->drawn_A -= sign * walk->end_A;
     link->drawn_A_s -= sign * (current->start_1_s + bend_A_s);
     link->drawn_A_s2 -= 0.5 * sign * walk->bend_A_s2;
-    link->voltage_V += sign * link->charge_1_F * (charge_As - planned_As);
+    link->voltage_V += sign * (link->charge_1_F * (charge_As - planned_As));
 }
 
 /* Ends the step of a phase. False: the comparator responds, or there are too many steps. */
@@ -463,55 +464,48 @@ static void cut(walk_t *walk, double end_s) {
     walk->corner = false;
 }
 
-static inline unsigned first_to_end(const double end_s[HAL_PHASES_MAX]) {
-    const unsigned one = end_s[1] < end_s[0] ? 1 : 0, other = end_s[3] < end_s[2] ? 3 : 2;
-    return end_s[other] < end_s[one] ? other : one;
-}
-_Static_assert(HAL_PHASES_MAX == 4, "first_to_end has four");
-
 /* The same with a link: in the order of time. */
 MAGNETICS_INLINE bool walk_together(plant_t *plant, magnetics_form_t form, const rotor_step_t *rotor, link_t *link,
                                     sums_t *sums, phase_record_t *records) {
     walk_t walks[HAL_PHASES_MAX];
-    bool active[HAL_PHASES_MAX];
-    double end_s[HAL_PHASES_MAX] = {INFINITY, INFINITY, INFINITY, INFINITY};
+    unsigned phase_of[HAL_PHASES_MAX], count = 0;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         if (is_busy(plant, phase)) {
-            walk_start(plant, form, phase, rotor, &walks[phase]);
-            active[phase] = walk_begin(plant, form, phase, rotor, link, &walks[phase]);
-            end_s[phase] = walks[phase].end_s;
+            walk_start(plant, form, phase, rotor, &walks[count]);
+            walks[count].active = false;
+            phase_of[count++] = phase;
         }
     }
-    for (;;) {
-        const unsigned phase = first_to_end(end_s);
-        if (end_s[phase] == INFINITY) {
-            break;
+    for (double at_s = 0.0;;) {
+        double next_s = rotor->length_s;
+        for (unsigned n = 0; n < count; n++) {
+            walk_t *walk = &walks[n];
+            while (walk->end_s <= at_s) {
+                const unsigned phase = phase_of[n];
+                if (walk->active &&
+                    !walk_end(plant, form, rotor, link, walk, sums, records != NULL ? &records[phase] : NULL)) {
+                    return false;
+                }
+                if (walk->end_s >= rotor->length_s) {
+                    walk_finish(plant, phase, rotor, walk, sums);
+                    break;
+                }
+                walk->active = walk_begin(plant, form, phase, rotor, link, walk);
+            }
+            next_s = lesser(walk->end_s, next_s);
         }
-        walk_t *walk = &walks[phase];
-        if (__builtin_expect(!link_advance(link, end_s[phase]), 0)) {
-            for (unsigned other = 0; other < plant->machine->phases; other++) {
-                if (end_s[other] > link->at_s && end_s[other] != INFINITY && active[other] && walks[other].on != 1) {
-                    cut(&walks[other], link->at_s);
-                    end_s[other] = link->at_s;
+        if (at_s >= rotor->length_s) {
+            return true;
+        }
+        if (__builtin_expect(!link_advance(link, next_s), 0)) {
+            for (unsigned n = 0; n < count; n++) {
+                if (walks[n].active && walks[n].on != 1 && walks[n].end_s > link->at_s) {
+                    cut(&walks[n], link->at_s);
                 }
             }
-            continue;
         }
-        if (active[phase] &&
-            !walk_end(plant, form, rotor, link, walk, sums, records != NULL ? &records[phase] : NULL)) {
-            return false;
-        }
-        if (walk->end_s < rotor->length_s) {
-            active[phase] = walk_begin(plant, form, phase, rotor, link, walk);
-            end_s[phase] = walk->end_s;
-        } else {
-            walk_finish(plant, phase, rotor, walk, sums);
-            end_s[phase] = INFINITY;
-        }
+        at_s = link->at_s;
     }
-    while (!link_advance(link, rotor->length_s)) {
-    }
-    return true;
 }
 
 /* --- Samples --- */
