@@ -23,9 +23,9 @@
 
 /* With a DC link, where each phase has its own steps: fraction of the time constant sqrt(L C) of a phase that is
  * connected to it, with its present incremental inductance, and the capacitor. */
-#define LINK_STEP 0.025
+#define LINK_STEP 0.0175
 /* And of that of the source's resistance and the capacitor. */
-#define LINK_SOURCE_STEP 1.0
+#define LINK_SOURCE_STEP 0.5
 
 /* Accuracy of event times: end of conduction of a diode, switching of supply and chopper. */
 #define EVENT_TOLERANCE_S 1e-13
