@@ -65,7 +65,7 @@ static plant_path_t conducting_path(const plant_t *plant, unsigned phase) {
         path.breakdown_V += breakdown_V(plant);
     }
     path.terminal_gain = 1.0 / (1.0 - shorted);
-    path.terminal_S = shorted / (winding_ohm * (1.0 - shorted));
+    path.terminal_S = shorted > 0.0 ? shorted / (winding_ohm * (1.0 - shorted)) : 0.0;
     const double divider = 1.0 / (1.0 + path.device_ohm * path.terminal_S);
     path.link_gain = divider * path.sign;
     path.drop_V = divider * (path.device_V + path.breakdown_V);
@@ -187,7 +187,8 @@ void faulted_add_energies(plant_t *plant, const integrator_setting_t *setting, c
         }
         const plant_path_t *path = &setting->path[index];
         const double k = setting->turns[index], winding_ohm = plant->winding_ohm;
-        const double copper_J = (1.0 - k) * winding_ohm * current2_A2s + k / winding_ohm * e2;
+        const double loop_J = k > 0.0 ? k / winding_ohm * e2 : 0.0;
+        const double copper_J = (1.0 - k) * winding_ohm * current2_A2s + loop_J;
         const double converter_J = path->device_V * charge_As + path->device_ohm * current2_A2s;
         plant->energy_copper_J += copper_J;
         plant->energy_converter_J += converter_J;

@@ -38,10 +38,10 @@ typedef struct {
     double link_sign[HAL_PHASES_MAX];      /* +1 both switches on, 0 one, -1 none */
     double drop_V[HAL_PHASES_MAX];         /* of the two devices that carry the current */
     double resistance_ohm[HAL_PHASES_MAX]; /* of winding and devices */
-    bool faulted;                          /* the members below are set, see faulted.h */
-    bool shorted;                          /* a phase has shorted turns: currents of the link by terminal_* */
-    bool stuck;                            /* friction holds the shaft; the next step may be another setting */
-    double friction_sign;                  /* of the motion that Coulomb or static friction will stop; 0: none */
+    /* See faulted.h: */
+    bool shorted;         /* a phase has shorted turns: currents of the link by terminal_* */
+    bool stuck;           /* friction holds the shaft; the next step may be another setting */
+    double friction_sign; /* of the motion that Coulomb or static friction will stop; 0: none */
     double terminal_sign[HAL_PHASES_MAX], terminal_gain[HAL_PHASES_MAX], terminal_S[HAL_PHASES_MAX];
     double turns[HAL_PHASES_MAX]; /* shorted fraction */
     bool isolated[HAL_PHASES_MAX];

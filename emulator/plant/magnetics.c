@@ -37,6 +37,10 @@ void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, u
         model->initial_slope_H = model->saturating_Wb * model->saturation_1_A;
         model->decay_step_A = exp2(floor(log2(model->saturation_A / 64.0)));
         model->decay_steps_per_A = 1.0 / model->decay_step_A;
+        model->decay_shift_A = ROUNDING_SHIFT * model->decay_step_A;
+        model->cubic_1_rad = 2.0 * model->pitches_per_rad;
+        model->cubic_gradient_1_rad = 12.0 * model->pitches_per_rad;
+        model->cubic_curvature_1_rad2 = 24.0 * model->pitches_per_rad * model->pitches_per_rad;
         for (unsigned step = 0; step < MAGNETICS_DECAY_STEPS; step++) {
             model->decay[step] = exponential(-model->saturation_1_A * model->decay_step_A * step);
         }

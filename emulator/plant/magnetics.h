@@ -53,7 +53,9 @@ typedef struct {
     double saturation_1_A;                  /* b */
     double initial_slope_H;                 /* A b */
     double decay_step_A, decay_steps_per_A; /* a power of two, at most 1 / (64 b) */
-    double decay[MAGNETICS_DECAY_STEPS];    /* e^(-b i) at multiples of the step */
+    double decay_shift_A;                   /* added and subtracted: rounds to the step */
+    double cubic_1_rad, cubic_gradient_1_rad, cubic_curvature_1_rad2; /* of the cubic f and its derivatives */
+    double decay[MAGNETICS_DECAY_STEPS];                              /* e^(-b i) at multiples of the step */
     double pitch_rad, pitches_per_rad;
     double electrical_per_mechanical; /* Nr */
     double flat_rad, blend_rad, slope_1_rad, curvature_1_rad2;

@@ -16,8 +16,7 @@
 /* e^(-b i), relative error below 1e-15: the nearest entry of the table times a series of the remainder, abs <= 1/128.
  */
 MAGNETICS_INLINE double magnetics_kernel_decay(const magnetics_model_t *model, double current_A) {
-    const double shift_A = ROUNDING_SHIFT * model->decay_step_A;
-    const double nearest_A = (current_A + shift_A) - shift_A;
+    const double nearest_A = (current_A + model->decay_shift_A) - model->decay_shift_A;
     const int64_t step = (int64_t)(nearest_A * model->decay_steps_per_A);
     if (step < 0 || step >= MAGNETICS_DECAY_STEPS) {
         return exponential(-model->saturation_1_A * current_A);
@@ -92,10 +91,10 @@ MAGNETICS_INLINE void magnetics_kernel_shape(const magnetics_model_t *model, mag
     }
     const double folded_rad = fabs(wrapped_rad);
     if (form == MAGNETICS_SATURATING) {
-        const double x = folded_rad * (2.0 * model->pitches_per_rad); /* 0 aligned, 1 unaligned */
+        const double x = folded_rad * model->cubic_1_rad; /* 0 aligned, 1 unaligned */
         shape->f = 1.0 + x * x * (2.0 * x - 3.0);
-        shape->gradient_1_rad = 12.0 * model->pitches_per_rad * (x * (x - 1.0));
-        shape->curvature_1_rad2 = 24.0 * model->pitches_per_rad * model->pitches_per_rad * (2.0 * x - 1.0);
+        shape->gradient_1_rad = model->cubic_gradient_1_rad * (x * (x - 1.0));
+        shape->curvature_1_rad2 = model->cubic_curvature_1_rad2 * (2.0 * x - 1.0);
     } else {
         magnetics_kernel_trapezoid(model, folded_rad, folded_rad + copysign(ahead_rad, ahead_rad * wrapped_rad), shape);
     }

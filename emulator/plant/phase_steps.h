@@ -1,4 +1,4 @@
-/* Steps of the plant in which every phase has steps of its own: for a plant without DC-link capacitor and faults.
+/* Steps of the plant in which every phase has steps of its own: for a plant without faults.
  *
  * A phase's steps end at its own switching edges instead of those of all phases, and each evaluates its magnetics once
  * (integrator.h: all conducting phases, twice). The rotor's step reaches over all of them, as far as the limits of
@@ -15,7 +15,9 @@
  * 3. They give speed and angle at the end. The flux linkages remain; the currents change with the angle's correction,
  *    to first order.
  *
- * A current ends where its flux linkage does, which is a scalar equation. */
+ * A current ends where its flux linkage does, which is a scalar equation.
+ *
+ * With a DC-link capacitor the phases step in the order of time, and its voltage between their steps: link_steps.h. */
 #ifndef PLANT_PHASE_STEPS_H
 #define PLANT_PHASE_STEPS_H
 
@@ -25,7 +27,7 @@
 #include "plant/plant.h"
 
 /* Advances by one step of the rotor, to `to_ns` at most, and takes the samples within. False, and nothing changed,
- * where it does not apply: with a DC-link capacitor, faults, or a comparator that responds, or when a phase has more
+ * where it does not apply: with faults, a comparator that responds, or when a phase has more
  * than PHASE_STEPS_MAX steps. */
 bool phase_steps_advance(plant_t *plant, uint64_t to_ns);
 

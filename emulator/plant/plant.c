@@ -21,6 +21,12 @@
  * rotor: where resistance or friction is large, longer Runge-Kutta steps lose accuracy, and beyond 2.8 stability. */
 #define STEP_TIME_CONSTANTS 0.05
 
+/* With a DC link, where each phase has its own steps: fraction of the time constant sqrt(L C) of a phase that is
+ * connected to it, with its present incremental inductance, and the capacitor. */
+#define LINK_STEP 0.0175
+/* And of that of the source's resistance and the capacitor. */
+#define LINK_SOURCE_STEP 0.5
+
 /* Accuracy of event times: end of conduction of a diode, switching of supply and chopper. */
 #define EVENT_TOLERANCE_S 1e-13
 #define EVENT_ITERATIONS 60
@@ -96,8 +102,12 @@ void plant_set_step_factor(plant_t *plant, double factor) {
     double time_constant_s =
         fmin(plant->magnetics.inductance_min_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
              plant->inertia_kg_m2 / plant->friction_Nm_s);
+    plant->step_max_s = factor * fmin(STEP_MAX_S, STEP_TIME_CONSTANTS * time_constant_s);
     if (has_link(plant)) {
         const dc_link_t *link = &plant->machine->dc_link;
+        const double source_s = link->source_resistance_ohm * link->capacitance_F;
+        plant->step_max_s = fmin(plant->step_max_s, factor * LINK_SOURCE_STEP * source_s);
+        plant->link_swing_s2_H = factor * factor * LINK_STEP * LINK_STEP * link->capacitance_F;
         time_constant_s = fmin(time_constant_s, link->source_resistance_ohm * link->capacitance_F);
         if (link->chopper_resistance_ohm > 0.0) {
             time_constant_s = fmin(time_constant_s, link->chopper_resistance_ohm * link->capacitance_F);
@@ -107,7 +117,7 @@ void plant_set_step_factor(plant_t *plant, double factor) {
         time_constant_s = fmin(time_constant_s, faulted_time_constant_s(plant));
     }
     plant->step_factor = factor;
-    plant->step_max_s = factor * fmin(STEP_MAX_S, STEP_TIME_CONSTANTS * time_constant_s);
+    plant->together_step_max_s = factor * fmin(STEP_MAX_S, STEP_TIME_CONSTANTS * time_constant_s);
     plant->step_angle_rad = factor * STEP_ANGLE_PITCHES * plant->magnetics.pitch_rad;
     plant->step_current_A = factor * STEP_CURRENT_FRACTION * plant->magnetics.saturation_A;
 }
@@ -180,37 +190,12 @@ void plant_clear_trip(plant_t *plant) {
 
 /* --- One step --- */
 
-/* Lists the conducting phases and their devices. A phase without current that is not driven is omitted; its current is
- * set to exactly zero. */
-MAGNETICS_INLINE void find_conducting(plant_t *plant, integrator_setting_t *setting) {
-    static const double link_signs[3] = {-1.0, 0.0, 1.0};
-    unsigned count = 0;
-    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-        const unsigned on = half_bridge_on(plant->switches[phase]);
-        const bool driven = link_signs[on] * plant->bus_voltage_V > plant->drop_V[on];
-        if (!driven && plant->current_A[phase] < PLANT_CURRENT_NEGLIGIBLE_A) {
-            plant->current_A[phase] = 0.0;
-            continue;
-        }
-        setting->phase[count] = phase;
-        setting->driven[count] = driven;
-        setting->angle_offset_rad[count] = phase * plant->phase_offset_rad;
-        setting->link_sign[count] = link_signs[on];
-        setting->drop_V[count] = plant->drop_V[on];
-        setting->resistance_ohm[count] = plant->resistance_ohm[on];
-        count++;
-    }
-    setting->count = count;
-}
-
 /* Determines the conduction states of supply and chopper. At exactly the voltage at which the supply's rectifier begins
  * to conduct, the current of half bridges and chopper decides. */
-MAGNETICS_INLINE void find_link(plant_t *plant, integrator_setting_t *setting, bool faulted) {
+static void find_link(plant_t *plant, integrator_setting_t *setting) {
     double drawn_A = 0.0;
     for (unsigned index = 0; index < setting->count; index++) {
-        const unsigned phase = setting->phase[index];
-        drawn_A += faulted ? setting->terminal_sign[index] * plant_current_A(plant, phase)
-                           : setting->link_sign[index] * plant->current_A[phase];
+        drawn_A += setting->terminal_sign[index] * plant_current_A(plant, setting->phase[index]);
     }
     const dc_link_t *link = &plant->machine->dc_link;
     const double link_V = plant->bus_voltage_V, supply_V = plant->supply_voltage_V;
@@ -227,7 +212,7 @@ MAGNETICS_INLINE void find_link(plant_t *plant, integrator_setting_t *setting, b
     setting->source_conducts = link_V < supply_V || (link_V == supply_V && drawn_A >= 0.0);
 }
 
-MAGNETICS_INLINE void find_setting(plant_t *plant, integrator_setting_t *setting, bool faulted) {
+static void find_setting(plant_t *plant, integrator_setting_t *setting) {
     setting->machine = plant->machine;
     setting->magnetics = &plant->magnetics;
     setting->inertia_kg_m2 = plant->inertia_kg_m2;
@@ -238,18 +223,12 @@ MAGNETICS_INLINE void find_setting(plant_t *plant, integrator_setting_t *setting
     setting->held_acceleration_rad_s2 = plant->held_acceleration_rad_s2;
     setting->supply_voltage_V = plant->supply_voltage_V;
     setting->ahead_rad = copysign(2.0 * MAGNETICS_SMOOTH_TOLERANCE_RAD, plant->speed_rad_s);
-    setting->faulted = faulted;
-    setting->shorted = false;
-    if (faulted) {
-        faulted_find_conducting(plant, setting);
-        faulted_find_friction(plant, setting);
-    } else {
-        find_conducting(plant, setting);
-    }
+    faulted_find_conducting(plant, setting);
+    faulted_find_friction(plant, setting);
     setting->link = has_link(plant);
     setting->source_conducts = setting->chopper_on = setting->chopper = false;
     if (setting->link) {
-        find_link(plant, setting, faulted);
+        find_link(plant, setting);
     }
 }
 
@@ -276,7 +255,7 @@ static thresholds_t thresholds_of(const integrator_setting_t *setting) {
 
 /* Distance of a state from a comparator's response; negative: past it. */
 static double distance_to_trip(const integrator_setting_t *setting, const integrator_state_t *state) {
-    if (setting->faulted && setting->shorted) {
+    if (setting->shorted) {
         return faulted_distance_to_trip(setting, state);
     }
     double nearest_A = INFINITY;
@@ -292,8 +271,8 @@ static double distance_to_trip(const integrator_setting_t *setting, const integr
 /* Distance of a state from the next event: minimum of the currents that are not driven and of the distances between
  * DC-link voltage and thresholds, and between currents and comparators (V and A with equal weight). Negative: past the
  * event. */
-MAGNETICS_INLINE double distance_to_event(const integrator_setting_t *setting, const integrator_state_t *state) {
-    double nearest = distance_to_trip(setting, state);
+static double distance_to_event(const integrator_setting_t *setting, const integrator_state_t *state) {
+    double nearest = fmin(distance_to_trip(setting, state), faulted_distance_to_event(setting, state));
     for (unsigned index = 0; index < setting->count; index++) {
         if (!setting->driven[index] && state->current_A[index] < nearest) {
             nearest = state->current_A[index];
@@ -307,20 +286,14 @@ MAGNETICS_INLINE double distance_to_event(const integrator_setting_t *setting, c
     return nearest;
 }
 
-/* The same with the events that only faults have. */
-static double distance_to_any_event(const integrator_setting_t *setting, const integrator_state_t *state) {
-    const double distance = distance_to_event(setting, state);
-    return setting->faulted ? fmin(distance, faulted_distance_to_event(setting, state)) : distance;
-}
-
 /* Shortens a step that contains an event to the time of the event; returns the length. Illinois variant of the false
  * position method on the result of the step: the distance is nearly linear in time, so few iterations suffice. The
  * length is never zero, so that time advances. */
 static double step_to_event(const integrator_setting_t *setting, const integrator_state_t *start,
                             const integrator_derivative_t *first, double step_s, integrator_state_t *end,
                             integrator_integrals_t *integrals) {
-    double before_s = 0.0, before = fmax(distance_to_any_event(setting, start), 0.0);
-    double after_s = step_s, after = distance_to_any_event(setting, end);
+    double before_s = 0.0, before = fmax(distance_to_event(setting, start), 0.0);
+    double after_s = step_s, after = distance_to_event(setting, end);
     int last_side = 0;
     double at_s = step_s;
     for (unsigned iteration = 0; iteration < EVENT_ITERATIONS; iteration++) {
@@ -329,7 +302,7 @@ static double step_to_event(const integrator_setting_t *setting, const integrato
         const double fraction = before > 0.0 ? before / (before - after) : 0.5;
         at_s = fmax(before_s + (after_s - before_s) * fraction, EVENT_TOLERANCE_S);
         integrator_step(setting, start, first, at_s, end, integrals);
-        const double at = distance_to_any_event(setting, end);
+        const double at = distance_to_event(setting, end);
         if (at == 0.0 || fabs(at_s - previous_s) < EVENT_TOLERANCE_S) {
             break;
         }
@@ -354,7 +327,7 @@ static void snap_to_event(const integrator_setting_t *setting, integrator_state_
     for (unsigned index = 0; index < setting->count; index++) {
         end->current_A[index] = fmax(end->current_A[index], 0.0);
     }
-    if (setting->faulted && setting->friction_sign != 0.0 && fabs(end->speed_rad_s) < SPEED_TOLERANCE_RAD_S) {
+    if (setting->friction_sign != 0.0 && fabs(end->speed_rad_s) < SPEED_TOLERANCE_RAD_S) {
         end->speed_rad_s = 0.0;
     }
     if (setting->link) {
@@ -443,7 +416,7 @@ static void find_smooth_range(plant_t *plant) {
 MAGNETICS_INLINE double step_length_s(plant_t *plant, const integrator_setting_t *setting,
                                       const integrator_derivative_t *first, double remaining_s) {
     const double speed_rad_s = fabs(plant->speed_rad_s);
-    double limit_s = plant->step_max_s;
+    double limit_s = plant->together_step_max_s;
     if (speed_rad_s * limit_s > plant->step_angle_rad) {
         limit_s = plant->step_angle_rad / speed_rad_s;
     }
@@ -485,28 +458,6 @@ static double dynamometer_J(const plant_t *plant, const integrator_integrals_t *
            plant->friction_Nm_s * integrals->speed2_rad2_s - plant->inertia_kg_m2 * speed_change_rad_s * mean_rad_s;
 }
 
-MAGNETICS_INLINE void add_bridge_energies(plant_t *plant, const integrator_setting_t *setting,
-                                          const integrator_integrals_t *integrals) {
-    const double winding_ohm = plant->winding_ohm;
-    for (unsigned index = 0; index < setting->count; index++) {
-        const double charge_As = integrals->charge_As[index], current2_A2s = integrals->current2_A2s[index];
-        const double link_J = setting->link ? integrals->link_J[index] : plant->bus_voltage_V * charge_As;
-        const double energy_J = setting->link_sign[index] * link_J;
-        if (energy_J > 0.0) {
-            plant->energy_drawn_J += energy_J;
-        } else {
-            plant->energy_returned_J -= energy_J;
-        }
-        const double copper_J = winding_ohm * current2_A2s;
-        const double converter_J =
-            setting->drop_V[index] * charge_As + (setting->resistance_ohm[index] - winding_ohm) * current2_A2s;
-        plant->energy_copper_J += copper_J;
-        plant->energy_converter_J += converter_J;
-        plant->phase_copper_J[setting->phase[index]] += copper_J;
-        plant->phase_converter_J[setting->phase[index]] += converter_J;
-    }
-}
-
 MAGNETICS_INLINE void add_shaft_energies(plant_t *plant, const integrator_integrals_t *integrals,
                                          double speed_change_rad_s) {
     plant->energy_load_J += plant->load_torque_Nm * integrals->angle_rad;
@@ -534,9 +485,8 @@ MAGNETICS_INLINE void add_link_energies(plant_t *plant, const integrator_setting
 /* Within this distance of its threshold a comparator responds. */
 #define TRIP_TOLERANCE_A 1e-6
 
-/* Integrates from time_ns to `to_ns` with constant switch states, or to the time at which a comparator opens them;
- * inlined for a plant with and without faults, so that the latter has no instruction of the former. */
-MAGNETICS_INLINE void integrate_of(plant_t *plant, uint64_t to_ns, bool faulted) {
+/* Integrates from time_ns to `to_ns` with constant switch states, or to the time at which a comparator opens them. */
+static void integrate(plant_t *plant, uint64_t to_ns) {
     double length_s = (double)(to_ns - plant->time_ns) * NS_S;
     integrator_setting_t setting;
     integrator_state_t start, end;
@@ -545,7 +495,7 @@ MAGNETICS_INLINE void integrate_of(plant_t *plant, uint64_t to_ns, bool faulted)
         integrator_derivative_t first;
         integrator_integrals_t integrals;
         if (find) {
-            find_setting(plant, &setting, faulted);
+            find_setting(plant, &setting);
             start.angle_rad = plant->rotor_angle_rad;
             start.speed_rad_s = plant->speed_rad_s;
             start.bus_voltage_V = plant->bus_voltage_V;
@@ -556,7 +506,7 @@ MAGNETICS_INLINE void integrate_of(plant_t *plant, uint64_t to_ns, bool faulted)
         integrator_differentiate(&setting, &start, &first);
         double step_s = step_length_s(plant, &setting, &first, length_s - at_s);
         integrator_step(&setting, &start, &first, step_s, &end, &integrals);
-        const bool event = (faulted ? distance_to_any_event(&setting, &end) : distance_to_event(&setting, &end)) < 0.0;
+        const bool event = distance_to_event(&setting, &end) < 0.0;
         if (event) {
             step_s = step_to_event(&setting, &start, &first, step_s, &end, &integrals);
             snap_to_event(&setting, &end);
@@ -564,11 +514,7 @@ MAGNETICS_INLINE void integrate_of(plant_t *plant, uint64_t to_ns, bool faulted)
         if (plant->sample != NULL) {
             sample_step(plant, &setting, &start, &first, &end, at_s, step_s, to_ns);
         }
-        if (faulted) {
-            faulted_add_energies(plant, &setting, &integrals, step_s);
-        } else {
-            add_bridge_energies(plant, &setting, &integrals);
-        }
+        faulted_add_energies(plant, &setting, &integrals, step_s);
         add_shaft_energies(plant, &integrals, end.speed_rad_s - start.speed_rad_s);
         if (setting.link) {
             add_link_energies(plant, &setting, &integrals, step_s);
@@ -588,17 +534,9 @@ MAGNETICS_INLINE void integrate_of(plant_t *plant, uint64_t to_ns, bool faulted)
             }
         }
         start = end;
-        find = event || (faulted && setting.stuck);
+        find = event || setting.stuck;
     }
     plant->time_ns = to_ns;
-}
-
-static void integrate(plant_t *plant, uint64_t to_ns) {
-    if (plant->faulted) {
-        integrate_of(plant, to_ns, true);
-    } else {
-        integrate_of(plant, to_ns, false);
-    }
 }
 
 void plant_advance(plant_t *plant, uint64_t to_ns) {

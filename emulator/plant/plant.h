@@ -22,7 +22,7 @@
  * series resistance of the capacitor; elasticity of the shaft. Faults, friction at rest among them, change these
  * equations as faulted.h states.
  *
- * Integration: phase_steps.h, where every phase has steps of its own; with a DC-link capacitor or faults, and where a
+ * Integration: phase_steps.h, where every phase has steps of its own; with faults, and where a
  * comparator responds, integrator.h, for currents, speed, angle and DC-link voltage together. Steps end at switching
  * edges (whole nanoseconds), at the times at which a diode, the supply or the chopper starts or stops conducting or a
  * comparator responds (located within a picosecond) and where the magnetics are not smooth; plant_set_step_factor
@@ -128,7 +128,8 @@ typedef struct plant {
     double winding_ohm, inertia_kg_m2, friction_Nm_s;
     double phase_offset_rad;
     double drop_V[3], resistance_ohm[3]; /* of a phase, winding included, by the number of switches that are on */
-    double step_factor, step_max_s, step_current_A, step_angle_rad;
+    double step_factor, step_max_s, together_step_max_s, step_current_A, step_angle_rad;
+    double link_swing_s2_H; /* limit of a step of a phase on a DC link: its square by the incremental inductance */
     double smooth_from_rad, smooth_to_rad;
     double supply_voltage_V;
     bool held; /* plant_hold */

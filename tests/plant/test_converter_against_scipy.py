@@ -9,25 +9,21 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
+from link_reference import LinkReference
 from reference_plant import (
     Compares,
     Converter,
     DcLink,
     Machine,
-    Reference,
     Run,
     State,
     load_library,
-    pattern,
     plant_of,
     set_switches,
-    stop_at,
 )
-from scipy.integrate import solve_ivp
 from test_plant_against_scipy import machine_of
 
 PHASES = 3
@@ -77,80 +73,6 @@ def run_plant(library: ctypes.CDLL, machine: Machine) -> tuple[Run, np.ndarray, 
     return run, np.array(rows), state
 
 
-class LinkReference:
-    """State: flux linkages, speed, angle, DC-link voltage."""
-
-    def __init__(self, machine: Machine, run: Run) -> None:
-        self.magnetics, self.machine, self.run = Reference(machine), machine, run
-        self.chopper_on = False
-        self.y = np.array([0.0] * PHASES + [run.speed_rad_s, math.radians(run.angle_deg), machine.supply_voltage_V])
-        self.chopped_s = self.sourced_s = 0.0
-
-    def currents(self, y: np.ndarray) -> list[float]:
-        shapes = [self.magnetics.shape(self.magnetics.phase_angle(y[-2], phase))[0] for phase in range(PHASES)]
-        return [self.magnetics.current(f, flux) for f, flux in zip(shapes, y[:PHASES], strict=True)]
-
-    def right_side(self, on: list[int], conducts: list[bool], source: bool) -> Callable[[float, np.ndarray], list]:
-        machine, link, converter = self.machine, self.machine.dc_link, self.machine.converter
-        chopper_S = 1.0 / link.chopper_resistance_ohm if self.chopper_on else 0.0
-
-        def rates(_: float, y: np.ndarray) -> list[float]:
-            fluxes, torque_Nm = [0.0] * PHASES, 0.0
-            drawn_A = chopper_S * y[-1]
-            for phase in range(PHASES):
-                if not conducts[phase]:
-                    continue
-                f, slope = self.magnetics.shape(self.magnetics.phase_angle(y[-2], phase))
-                i = self.magnetics.current(f, y[phase])
-                switches = on[phase] * (converter.switch_drop_V + converter.switch_resistance_ohm * i)
-                diodes = (2 - on[phase]) * (converter.diode_drop_V + converter.diode_resistance_ohm * i)
-                fluxes[phase] = (on[phase] - 1) * y[-1] - switches - diodes - machine.resistance_ohm * i
-                drawn_A += (on[phase] - 1) * i
-                torque_Nm += self.magnetics.torque(slope, i)
-            sourced_A = (machine.supply_voltage_V - y[-1]) / link.source_resistance_ohm if source else 0.0
-            drag_Nm = machine.friction_Nm_s * y[-3] + self.run.load_torque_Nm
-            return [*fluxes, (torque_Nm - drag_Nm) / machine.inertia_kg_m2, y[-3],
-                    (sourced_A - drawn_A) / link.capacitance_F]
-
-        return rates
-
-    def advance(self, on: list[int], length_s: float) -> None:
-        link, supply_V = self.machine.dc_link, self.machine.supply_voltage_V
-        at_s = 0.0
-        while at_s < length_s:
-            y = self.y
-            if y[-1] >= link.chopper_on_V - 1e-9:
-                self.chopper_on = True
-            elif y[-1] <= link.chopper_off_V + 1e-9:
-                self.chopper_on = False
-            conducts = [y[phase] > 0.0 or on[phase] == 2 for phase in range(PHASES)]
-            currents = self.currents(y)
-            drawn_A = sum((on[phase] - 1) * currents[phase] for phase in range(PHASES))
-            drawn_A += y[-1] / link.chopper_resistance_ohm if self.chopper_on else 0.0
-            source = y[-1] < supply_V - 1e-9 or (y[-1] <= supply_V + 1e-9 and drawn_A >= 0.0)
-            stops = [stop_at(PHASES + 1, self.magnetics.next_corner(y[PHASES + 1], 1))]
-            ends = [phase for phase in range(PHASES) if conducts[phase] and on[phase] < 2]
-            stops += [stop_at(phase, 0.0) for phase in ends]
-            voltages = [link.chopper_off_V if self.chopper_on else link.chopper_on_V, supply_V]
-            for voltage_V, falling in zip(voltages, (self.chopper_on, not source), strict=True):
-                stop = stop_at(PHASES + 2, voltage_V)
-                stop.direction = -1.0 if falling else 1.0  # type: ignore[attr-defined]
-                stops.append(stop)
-            solution = solve_ivp(self.right_side(on, conducts, source), (at_s, length_s), y, "DOP853", rtol=1e-11,
-                                 atol=1e-12, events=stops)
-            self.y = solution.y[:, -1]
-            for phase, times in zip(ends, solution.t_events[1:], strict=False):
-                if len(times) > 0:
-                    self.y[phase] = 0.0
-            step_s = solution.t[-1] - at_s
-            self.chopped_s += step_s if self.chopper_on else 0.0
-            self.sourced_s += step_s if source else 0.0
-            at_s = solution.t[-1]
-
-    def row(self) -> list[float]:
-        return [*self.y[PHASES:], *self.currents(self.y)]
-
-
 @pytest.fixture(scope="module")
 def library() -> ctypes.CDLL:
     return load_library()
@@ -162,9 +84,8 @@ def test_motoring_and_braking_on_a_dc_link_agree(library: ctypes.CDLL, form: str
     run, measured, state = run_plant(library, machine)
     reference = LinkReference(machine, run)
     expected = [reference.row()]
-    for upper, lower in run.compares:
-        for start_ns, end_ns, on in pattern(run, upper, lower):
-            reference.advance(on, (end_ns - start_ns) * 1e-9)
+    for period in range(PERIODS):
+        reference.advance_period(period)
         expected.append(reference.row())
     expected_rows = np.array(expected)
 
