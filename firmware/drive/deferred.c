@@ -15,6 +15,7 @@ void deferred_reset_run(control_state_t *state) {
     const uint32_t generation = request->generation;
     request->initial.fault_mask = kept->fault_mask;
     request->initial.bandwidth = kept->bandwidth;
+    request->initial.slow_counts.slow = false; /* until the next step, a period later */
     request->initial.predictive = kept->predictive;
     request->initial.observer = kept->observer;
     request->initial.predictive.conduction = CONDUCTION_INITIAL;
@@ -30,6 +31,7 @@ void deferred_reset_observer(control_state_t *state) {
     request->initial.predictive = kept->predictive;
     request->initial.observer = kept->observer;
     request->initial.bandwidth = (observer_bandwidth_limits_t){0, 0, 0, 0};
+    request->initial.slow_counts.slow = false;
     request->generation += OBSERVER_STEP;
 }
 
@@ -126,6 +128,18 @@ static observer_bandwidth_limits_t bandwidth_limits(const control_parameters_t *
     return observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld);
 }
 
+/* Between slow counts there is nothing of which statistics could be made. */
+static void follow_innovation(const control_parameters_t *parameters, deferred_t *deferred,
+                              const deferred_input_t *input, deferred_results_t *results) {
+    if (slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->periods,
+                         &results->slow_counts)) {
+        results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.retrigger_holdoff_ticks, 0,
+                                                           parameters->bandwidth.trigger_stage_count};
+    } else {
+        results->bandwidth = bandwidth_limits(parameters, deferred, input);
+    }
+}
+
 static bool disturbed(const control_parameters_t *parameters, const deferred_input_t *input) {
     return input->bandwidth.stage < parameters->bandwidth.moving_stage;
 }
@@ -140,8 +154,8 @@ static misalignment_condition_t condition(const control_parameters_t *parameters
         speed_error_q22 >= fixed_abs(input->speed_q22) / 8) {
         return MISALIGNMENT_UNSTEADY;
     }
-    const bool steady = !disturbed(parameters, input) && input->torque_shortfall_q24 == 0 &&
-                        stroke_mean_shows_load(&deferred->stroke_mean);
+    const bool steady = !deferred->slow_counts.slow && !disturbed(parameters, input) &&
+                        input->torque_shortfall_q24 == 0 && stroke_mean_shows_load(&deferred->stroke_mean);
     return steady ? MISALIGNMENT_STEADY : MISALIGNMENT_INTERRUPTED;
 }
 
@@ -287,7 +301,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     results->generation = input->generation;
     results->fault_mask = (uint32_t)protect(parameters, deferred, input) | state->reported_fault_mask;
     if (parameters->bandwidth.adaptive) {
-        results->bandwidth = bandwidth_limits(parameters, deferred, input);
+        follow_innovation(parameters, deferred, input, results);
     }
     speed_control_deferred(parameters, deferred, input, state->torque_limit_q24, results);
     deferred->run = input->run;
