@@ -18,8 +18,8 @@ STEP_S = 0.4
     ("finite_element", 10, False, 20.0, 4.0, (20.0, 80.0)),
     ("finite_element", 12, True, 5.0, 8.5, (10.0, 50.0)),
 ])  # fmt: skip
-def test_a_load_step_between_slow_counts_is_never_answered_by_torque_against_it(tmp_path, machine, bits, edges, speed_rpm,
-                                                                                angle_deg, dip_rpm):
+def test_a_load_step_between_slow_counts_is_not_answered_by_torque_against_it(tmp_path, machine, bits, edges, speed_rpm,
+                                                                              angle_deg, dip_rpm):
     scenario = Scenario(name="", machine=machine, controller="salient", duration_s=STEP_S + 0.2, encoder_bits=bits,
                         encoder_edges=edges, initial_angle_deg=angle_deg, speed=(SpeedStep(0.0, speed_rpm),),
                         load=(LoadStep(STEP_S, 8.0),), record=Record(5.0, STEP_S - 0.05))
