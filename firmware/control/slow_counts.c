@@ -46,26 +46,29 @@ static void set_deadbeat(const slow_counts_parameters_t *parameters, uint32_t pe
 }
 
 bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t *counts, uint32_t encoder_angle,
-                      uint32_t periods, slow_counts_results_t *results) {
+                      uint32_t periods) {
     const uint32_t passed = counts->periods + periods;
-    const bool changed = encoder_angle != counts->encoder_angle;
-    counts->encoder_angle = encoder_angle;
-    const bool remain = !changed || passed >= parameters->slow_periods / 2;
-    counts->slow = passed >= parameters->slow_periods || (remain && counts->slow);
-    counts->periods = changed ? 0 : passed < PERIODS_MAX ? passed : PERIODS_MAX;
-    results->encoder_angle = encoder_angle;
-    results->slow = counts->slow;
-    if (!counts->slow) {
-        return false;
+    counts->periods = passed < PERIODS_MAX ? passed : PERIODS_MAX;
+    bool slow = counts->slow;
+    if (encoder_angle != counts->encoder_angle) {
+        counts->encoder_angle = encoder_angle;
+        counts->periods = 0;
+        slow = slow && passed >= parameters->slow_periods / 2;
     }
+    counts->slow = slow || passed >= parameters->slow_periods;
+    return counts->slow;
+}
+
+void slow_counts_set(const slow_counts_parameters_t *parameters, const slow_counts_t *counts,
+                     slow_counts_results_t *results) {
     const uint32_t coming = counts->periods + 1u;
+    results->encoder_angle = counts->encoder_angle;
     results->edge.load_factor_q4 = parameters->deadbeat.load_factor_q4;
     if (coming <= parameters->deadbeat_periods) {
         set_narrow(parameters, coming, &results->edge);
     } else {
         set_deadbeat(parameters, coming, &results->edge);
     }
-    return true;
 }
 
 NOINLINE uint32_t slow_counts_angle(const slow_counts_results_t *results, const load_observer_t *observer,

@@ -38,7 +38,7 @@ typedef struct {
     bool slow;
 } slow_counts_t;
 
-/* What the coming sample needs; all zero: counts are not slow. */
+/* What the coming sample needs; the rest has a meaning while counts are slow. */
 typedef struct {
     bool slow;
     uint32_t encoder_angle;     /* of the last sample */
@@ -47,10 +47,14 @@ typedef struct {
 
 slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, int32_t inertia_q30);
 
-/* After a sample: encoder_angle is the start of its count, 2^-32 rev; periods: since the sample before. Products of 64
- * bits, rounded down; a 32-bit division when no count changed for 5 ms. True when counts are slow. */
+/* After a sample: encoder_angle is the start of its count, 2^-32 rev; periods: since the sample before. True when
+ * counts are slow. */
 bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t *counts, uint32_t encoder_angle,
-                      uint32_t periods, slow_counts_results_t *results);
+                      uint32_t periods);
+
+/* All results but `slow`. Products of 64 bits, rounded down; a 32-bit division when no count changed for 5 ms. */
+void slow_counts_set(const slow_counts_parameters_t *parameters, const slow_counts_t *counts,
+                     slow_counts_results_t *results);
 
 /* Angle of a sample with slow counts: the edge where the count has changed, else what in the count is nearest to the
  * prediction. All in 2^-32 rev. */

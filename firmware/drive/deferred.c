@@ -132,12 +132,23 @@ static observer_bandwidth_limits_t bandwidth_limits(const control_parameters_t *
 }
 
 /* Between slow counts there is nothing of which statistics could be made. */
+NOINLINE static void follow_slow_counts(const control_parameters_t *parameters, const deferred_t *deferred,
+                                        const deferred_input_t *input, deferred_results_t *results) {
+    slow_counts_set(&parameters->slow_counts, &deferred->slow_counts, &results->slow_counts);
+    results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.retrigger_holdoff_ticks, 0,
+                                                       parameters->bandwidth.trigger_stage_count};
+    if (deferred->mode == DRIVE_MODE_SPEED) {
+        speed_control_limit_uncertain(parameters, input->load_torque_q24, &results->speed);
+    }
+}
+
 static void follow_innovation(const control_parameters_t *parameters, deferred_t *deferred,
                               const deferred_input_t *input, deferred_results_t *results) {
-    if (slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->periods,
-                         &results->slow_counts)) {
-        results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.retrigger_holdoff_ticks, 0,
-                                                           parameters->bandwidth.trigger_stage_count};
+    const bool slow =
+        slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->periods);
+    results->slow_counts.slow = slow;
+    if (slow) {
+        follow_slow_counts(parameters, deferred, input, results);
     } else {
         results->bandwidth = bandwidth_limits(parameters, deferred, input);
     }
@@ -317,10 +328,10 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     results->generation = input->generation;
     results->fault_mask = (uint32_t)protect(parameters, deferred, input) | state->reported_fault_mask;
+    speed_control_deferred(parameters, deferred, input, state->torque_limit_q24, results);
     if (parameters->bandwidth.adaptive) {
         follow_innovation(parameters, deferred, input, results);
     }
-    speed_control_deferred(parameters, deferred, input, state->torque_limit_q24, results);
     deferred->run = input->run;
     if (!input->run) {
         inertia_restart(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical);

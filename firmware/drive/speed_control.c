@@ -2,6 +2,9 @@
 
 #include "fixed/fixed.h"
 
+/* Part of the largest torque from which on a load is not braked against. */
+#define UNCERTAIN_LOAD 8
+
 static int32_t ramp_step(int32_t reference_q22, int32_t target_q22, int32_t step_max_q22) {
     const int32_t difference_q22 = fixed_subtract(target_q22, reference_q22);
     return fixed_add(reference_q22, fixed_clamp(difference_q22, -step_max_q22, step_max_q22));
@@ -51,29 +54,6 @@ static int32_t torque_law_q24(const control_parameters_t *parameters, deferred_t
     return fixed_add(torque_q24, offset_q24);
 }
 
-/* Part of the largest torque from which on a load is not braked against. */
-#define UNCERTAIN_LOAD 8
-
-/* While counts are slow, a speed above the reference may be one of the estimate alone. A load brakes by itself: the
- * more of it, the less torque against it, none from an eighth of the largest torque on. */
-static void limit_uncertain(const control_parameters_t *parameters, const deferred_input_t *input, int32_t *min_q24,
-                            int32_t *max_q24) {
-    const int32_t rotation = fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32);
-    if ((uint32_t)fixed_abs(rotation) * (parameters->slow_counts.slow_periods / 2) >= 1u << parameters->encoder_shift) {
-        return;
-    }
-    const int32_t load_q24 = input->load_torque_q24;
-    const int32_t most_q24 = parameters->conduction.torque_max_q24;
-    const int32_t magnitude_q24 = fixed_abs(load_q24);
-    const int32_t against_q24 =
-        magnitude_q24 < most_q24 / UNCERTAIN_LOAD ? most_q24 - UNCERTAIN_LOAD * magnitude_q24 : 0;
-    if (load_q24 > 0) {
-        *min_q24 = *min_q24 > -against_q24 ? *min_q24 : -against_q24;
-    } else {
-        *max_q24 = *max_q24 < against_q24 ? *max_q24 : against_q24;
-    }
-}
-
 void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
                             int32_t limit_q24, deferred_results_t *results) {
     const int32_t offset_q24 = torque_offset_q24(&deferred->torque_offset);
@@ -103,14 +83,24 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
         torque_q24 = fixed_add(fixed_add(speed_law_q24(parameters, deferred, input, limit_q24), offset_q24),
                                results->speed.periodic_load_q24);
         results->speed.speed_reference_q22 = deferred->speed_reference_q22;
-        if (parameters->bandwidth.adaptive) {
-            limit_uncertain(parameters, input, &min_q24, &max_q24);
-        }
     }
     deferred->mode = mode;
     results->speed.speed_law_torque_q24 = torque_q24;
     results->speed.torque_min_q24 = min_q24;
     results->speed.torque_max_q24 = max_q24;
+}
+
+void speed_control_limit_uncertain(const control_parameters_t *parameters, int32_t load_q24,
+                                   deferred_speed_results_t *results) {
+    const int32_t most_q24 = parameters->conduction.torque_max_q24;
+    const int32_t magnitude_q24 = fixed_abs(load_q24);
+    const int32_t against_q24 =
+        magnitude_q24 < most_q24 / UNCERTAIN_LOAD ? most_q24 - UNCERTAIN_LOAD * magnitude_q24 : 0;
+    if (load_q24 > 0) {
+        results->torque_min_q24 = results->torque_min_q24 > -against_q24 ? results->torque_min_q24 : -against_q24;
+    } else {
+        results->torque_max_q24 = results->torque_max_q24 < against_q24 ? results->torque_max_q24 : against_q24;
+    }
 }
 
 /* The transducer is offset binary, +-64 N m full scale: 2^31 of Q7.24 over all counts. */

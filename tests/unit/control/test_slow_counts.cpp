@@ -25,10 +25,17 @@ struct SlowCounts : testing::Test {
     slow_counts_t counts = {};
     slow_counts_results_t results = {};
 
+    bool step(uint32_t angle, uint32_t periods) {
+        results.slow = slow_counts_step(&parameters, &counts, angle, periods);
+        if (results.slow) {
+            slow_counts_set(&parameters, &counts, &results);
+        }
+        return results.slow;
+    }
     bool wait(uint32_t periods, uint32_t angle = 0) {
         bool slow = false;
         for (uint32_t k = 0; k < periods; k++) {
-            slow = slow_counts_step(&parameters, &counts, angle, 1, &results);
+            slow = step(angle, 1);
         }
         return slow;
     }
@@ -56,7 +63,7 @@ TEST_F(SlowCounts, are_those_of_a_millisecond_and_remain_so_down_to_half_of_it) 
 
 TEST_F(SlowCounts, skipped_periods_count) {
     EXPECT_FALSE(wait(1));
-    EXPECT_TRUE(slow_counts_step(&parameters, &counts, 0, 39, &results));
+    EXPECT_TRUE(step(0, 39));
 }
 
 TEST_F(SlowCounts, have_the_gains_of_samples_that_far_apart) {
@@ -107,7 +114,7 @@ TEST_F(SlowCounts, leave_a_rotor_at_constant_speed_no_error) {
         const load_observer_gains_t *gains = slow_counts_gains(&parameters, &results, angle);
         load_observer_step(&model, results.slow ? gains : &parameters.outside, &inertia, &observer,
                            load_observer_innovation(&observer, measured), to_fixed(load, Q24));
-        slow_counts_step(&parameters, &counts, angle, 1, &results);
+        step(angle, 1);
         if (k > RATE_HZ / 2) {
             error = std::fmax(error, std::fabs(observer.speed_q22 / Q22 - speed));
             load_error = std::fmax(load_error, std::fabs(observer.load_torque_q24 / Q24 - load));
