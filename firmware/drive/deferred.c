@@ -132,23 +132,25 @@ static observer_bandwidth_limits_t bandwidth_limits(const control_parameters_t *
 }
 
 /* Between slow counts there is nothing of which statistics could be made. */
-NOINLINE static void follow_slow_counts(const control_parameters_t *parameters, const deferred_t *deferred,
+NOINLINE static bool follow_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
                                         const deferred_input_t *input, deferred_results_t *results) {
-    slow_counts_set(&parameters->slow_counts, &deferred->slow_counts, &results->slow_counts);
     results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.retrigger_holdoff_ticks, 0,
                                                        parameters->bandwidth.trigger_stage_count};
+    if (!slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->periods)) {
+        return false;
+    }
+    slow_counts_set(&parameters->slow_counts, &deferred->slow_counts, &results->slow_counts);
     if (deferred->mode == DRIVE_MODE_SPEED) {
         speed_control_limit_uncertain(parameters, input->load_torque_q24, &results->speed);
     }
+    return true;
 }
 
 static void follow_innovation(const control_parameters_t *parameters, deferred_t *deferred,
                               const deferred_input_t *input, deferred_results_t *results) {
-    const bool slow =
-        slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->periods);
-    results->slow_counts.slow = slow;
-    if (slow) {
-        follow_slow_counts(parameters, deferred, input, results);
+    results->slow_counts.slow = false;
+    if (deferred->slow_counts.slow) {
+        results->slow_counts.slow = follow_slow_counts(parameters, deferred, input, results);
     } else {
         results->bandwidth = bandwidth_limits(parameters, deferred, input);
     }
@@ -285,6 +287,14 @@ static void step_torque_offset(const control_parameters_t *parameters, deferred_
                        single_pulse ? input->torque_reference_q24 : input->torque_sum_q24, limited);
 }
 
+/* periods: since the previous call. */
+NOINLINE static void await_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
+                                       const deferred_input_t *input, uint32_t periods) {
+    if (parameters->bandwidth.adaptive && !deferred->slow_counts.slow) {
+        slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, periods);
+    }
+}
+
 /* What is not urgent, in eight turns: no step takes the time of all. The learning of the phases has half of them,
  * because at a high bandwidth of the observer it follows within a millisecond. */
 NOINLINE static void take_turns(const control_parameters_t *parameters, deferred_t *deferred,
@@ -313,6 +323,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         break;
     default:
         learn_misalignment(parameters, deferred, input);
+        await_slow_counts(parameters, deferred, input, input->periods + DEFERRED_LEARNING_PERIODS - 1u);
         break;
     }
 }
@@ -335,7 +346,10 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     deferred->run = input->run;
     if (!input->run) {
         inertia_restart(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical);
-    } else if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && !reset) { /* a step that resets has done enough */
+        await_slow_counts(parameters, deferred, input, input->periods);
+    } else if (parameters->torque_law != TORQUE_LAW_PREDICTIVE) {
+        await_slow_counts(parameters, deferred, input, input->periods);
+    } else if (!reset) { /* a step that resets has done enough */
         take_turns(parameters, deferred, input);
     }
     results->observer = deferred->inertia.laws.observer;
