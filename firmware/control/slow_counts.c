@@ -4,7 +4,7 @@
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
-#define SLOW_HZ 1000u
+#define SLOW_HZ 2000u
 #define DEADBEAT_HZ 200u
 #define OUTSIDE_HZ 250u
 #define PERIODS_MAX (UINT32_C(1) << 20)
@@ -49,13 +49,14 @@ bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t 
                       uint32_t periods) {
     const uint32_t passed = counts->periods + periods;
     counts->periods = passed < PERIODS_MAX ? passed : PERIODS_MAX;
-    bool slow = counts->slow;
+    const bool long_since = passed >= parameters->slow_periods;
     if (encoder_angle != counts->encoder_angle) {
         counts->encoder_angle = encoder_angle;
         counts->periods = 0;
-        slow = slow && passed >= parameters->slow_periods / 2;
+        counts->slow = long_since;
+    } else if (long_since) {
+        counts->slow = true;
     }
-    counts->slow = slow || passed >= parameters->slow_periods;
     return counts->slow;
 }
 

@@ -1,4 +1,4 @@
-/* Slow counts: correction of the load observer while the encoder counts less often than about once in a millisecond.
+/* Slow counts: correction of the load observer while the encoder counts less often than twice in a millisecond.
  *
  * Most samples then tell only that the rotor is within a count. Its middle, which is right for counts that pass within
  * a few periods, would draw speed and load towards a rotor at rest, and let them swing with each count. Instead:
@@ -12,8 +12,7 @@
  *
  * The gains are those of load_observer.h for edges a time t apart, with q = 1 - t / 5 ms, from 5 ms on q = 0, with
  * which three edges determine the estimate; l3 is half of that: a load that changed since the last edge has had less
- * time than t. Slow counts begin with one of 1 ms and end with one of less than 0.5 ms. Found by trial with 8 to 14
- * bits at 5 to 600 r/min.
+ * time than t. Found by trial with 8 to 14 bits at 5 to 600 r/min.
  */
 #ifndef CONTROL_SLOW_COUNTS_H
 #define CONTROL_SLOW_COUNTS_H
@@ -24,7 +23,7 @@
 #include "control/load_observer.h"
 
 typedef struct {
-    uint32_t slow_periods;          /* 1 ms */
+    uint32_t slow_periods;          /* 0.5 ms */
     uint32_t deadbeat_periods;      /* 5 ms */
     uint32_t step_q31;              /* 1 / deadbeat_periods */
     load_observer_gains_t deadbeat; /* of edges that far apart */
