@@ -50,20 +50,13 @@ static normal_t normal_product(normal_t a, normal_t b) {
     return normal((int64_t)a.value * b.value, a.fraction_bits + b.fraction_bits);
 }
 
-load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t control_rate_hz, int32_t inertia_q30) {
-    /* Widths are those at the ends of the ranges: p = 1 - q <= 0.4, p rate <= 10000. */
-    const int64_t rate = control_rate_hz; /* 20 bits */
-    const int64_t one_q31 = (int64_t)1 << 31;
-    const int64_t p_q31 = decay_complement_q31(fixed_divide((int64_t)bandwidth_rad_s << 31, rate));
-    const int64_t q_q31 = one_q31 - p_q31;
-    const int64_t p2_q46 = fixed_shift(p_q31 * p_q31, 16);
-    const int64_t p3_q46 = fixed_shift(fixed_shift(p2_q46, 12) * p_q31, 19); /* Q34, 31 bits, * Q31 */
-    const int64_t q3_q31 = (((q_q31 * q_q31) >> 31) * q_q31) >> 31;
-
-    load_observer_gains_t gains = {.angle_gain_q28 = (int32_t)((one_q31 - q3_q31) >> 3)};
+/* Gains by 1 - q^3, (1 - q)^2 (1 + q) and (1 - q)^3. */
+static load_observer_gains_t gains_of_poles(int64_t l1_q31, int64_t p2_1q_q46, int64_t p3_q46, int64_t rate,
+                                            int32_t inertia_q30) {
+    load_observer_gains_t gains = {.angle_gain_q28 = (int32_t)(l1_q31 >> 3)};
 
     /* l2 2 pi 2^14: from 2 pi 2^-32 rad to 2^-22 rad/s, in Q24. */
-    const int64_t l2_q46 = ((p2_q46 * ((one_q31 + q_q31) >> 16)) >> 15) * 3 / 2 * rate; /* 46 + 16 bits */
+    const int64_t l2_q46 = p2_1q_q46 * 3 / 2 * rate; /* 46 + 16 bits */
     gains.speed_gain_q24 =
         fixed_saturate(fixed_shift((l2_q46 >> 24) * (TWO_PI_Q28 >> 4), 32u + machine_tables.speed_exponent));
 
@@ -76,6 +69,22 @@ load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t con
     gains.load_gain_q28 = -(exponent >= 0 ? load.value : exponent > -31 ? load.value >> -exponent : 0);
     gains.load_factor_q4 = 16 << fixed_clamp(exponent, 0, 26);
     return gains;
+}
+
+load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t control_rate_hz, int32_t inertia_q30) {
+    /* Widths are those at the ends of the ranges: p = 1 - q <= 0.4, p rate <= 10000. */
+    const int64_t rate = control_rate_hz; /* 20 bits */
+    const int64_t one_q31 = (int64_t)1 << 31;
+    const int64_t p_q31 = decay_complement_q31(fixed_divide((int64_t)bandwidth_rad_s << 31, rate));
+    const int64_t q_q31 = one_q31 - p_q31;
+    const int64_t p2_q46 = fixed_shift(p_q31 * p_q31, 16);
+    const int64_t p3_q46 = fixed_shift(fixed_shift(p2_q46, 12) * p_q31, 19); /* Q34, 31 bits, * Q31 */
+    const int64_t q3_q31 = (((q_q31 * q_q31) >> 31) * q_q31) >> 31;
+    return gains_of_poles(one_q31 - q3_q31, (p2_q46 * ((one_q31 + q_q31) >> 16)) >> 15, p3_q46, rate, inertia_q30);
+}
+
+load_observer_gains_t load_observer_deadbeat_gains(uint32_t sample_rate_hz, int32_t inertia_q30) {
+    return gains_of_poles((int64_t)1 << 31, (int64_t)1 << 46, (int64_t)1 << 46, sample_rate_hz, inertia_q30);
 }
 
 load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t inertia_q30, int32_t friction_q30) {

@@ -52,6 +52,9 @@ typedef struct {
  * rate / 10000. 64-bit integer arithmetic. */
 load_observer_gains_t load_observer_gains(uint32_t bandwidth_rad_s, uint32_t control_rate_hz, int32_t inertia_q30);
 
+/* Gains for q = 0 at a rate of 100 to 1000 samples a second: three samples determine the estimate. */
+load_observer_gains_t load_observer_deadbeat_gains(uint32_t sample_rate_hz, int32_t inertia_q30);
+
 /* Model for a control rate in Hz, an inertia in kg m^2, Q1.30, and a viscous friction in N m s, Q1.30. */
 load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t inertia_q30, int32_t friction_q30);
 

@@ -56,7 +56,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
                   const command_t *command, hal_pwm_compare_t *compare) {
     control_measurement_t *measured = &state->measurement;
     const deferred_results_t *deferred = deferred_in_effect(state);
-    measure(parameters, &state->observer, deferred->predictive.misalignment, &state->predictive, sample, measured);
+    measure(parameters, &state->observer, deferred, &state->predictive, sample, measured);
     integrate_voltage(parameters, state, measured);
     if (!state->started) {
         start(state, measured);

@@ -93,6 +93,7 @@ typedef struct {
     periodic_load_parameters_t periodic_load;
     torque_mode_parameters_t torque_mode;
     inertia_parameters_t inertia;
+    slow_counts_parameters_t slow_counts;
     encoder_monitor_parameters_t encoder_monitor; /* this and the next: background */
     degraded_parameters_t degraded;
 } control_parameters_t;
@@ -144,6 +145,7 @@ typedef struct {
     speed_smc_parameters_t speed_smc; /* in effect: gain by the identified inertia, above base speed smaller */
     misalignment_t misalignment;      /* a property of the machine: survives the end of a run */
     inertia_t inertia;                /* its shift likewise */
+    slow_counts_t slow_counts;
 } deferred_t;
 
 /* State of the control; the control interrupt alone writes the members other than `deferred`, the first and the last.

@@ -18,6 +18,7 @@ void deferred_reset_run(control_state_t *state) {
     const uint32_t generation = request->generation;
     request->initial.fault_mask = kept->fault_mask;
     request->initial.bandwidth = kept->bandwidth;
+    request->initial.slow_counts.slow = false; /* until the next step, a period later */
     request->initial.predictive = kept->predictive;
     request->initial.observer = kept->observer;
     request->initial.predictive.conduction = CONDUCTION_INITIAL;
@@ -33,6 +34,7 @@ void deferred_reset_observer(control_state_t *state) {
     request->initial.predictive = kept->predictive;
     request->initial.observer = kept->observer;
     request->initial.bandwidth = (observer_bandwidth_limits_t){0, 0, 0, 0};
+    request->initial.slow_counts.slow = false;
     request->generation += OBSERVER_STEP;
 }
 
@@ -129,6 +131,31 @@ static void limit_bandwidth(const control_parameters_t *parameters, deferred_t *
     observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld, limits);
 }
 
+/* Between slow counts there is nothing of which statistics could be made. */
+NOINLINE static bool follow_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
+                                        const deferred_input_t *input, deferred_results_t *results) {
+    results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.retrigger_holdoff_ticks, 0,
+                                                       parameters->bandwidth.trigger_stage_count};
+    if (!slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->periods)) {
+        return false;
+    }
+    slow_counts_set(&parameters->slow_counts, &deferred->slow_counts, &results->slow_counts);
+    if (deferred->mode == DRIVE_MODE_SPEED) {
+        speed_control_limit_uncertain(parameters, input->load_torque_q24, &results->speed);
+    }
+    return true;
+}
+
+static void follow_innovation(const control_parameters_t *parameters, deferred_t *deferred,
+                              const deferred_input_t *input, deferred_results_t *results) {
+    results->slow_counts.slow = false;
+    if (deferred->slow_counts.slow) {
+        results->slow_counts.slow = follow_slow_counts(parameters, deferred, input, results);
+    } else {
+        limit_bandwidth(parameters, deferred, input, &results->bandwidth);
+    }
+}
+
 static bool disturbed(const control_parameters_t *parameters, const deferred_input_t *input) {
     return input->bandwidth.stage < parameters->bandwidth.moving_stage;
 }
@@ -149,7 +176,7 @@ static misalignment_condition_t condition(const deferred_t *deferred, bool undis
     if (deferred->mode != DRIVE_MODE_SPEED || !deferred->load_constant) {
         return MISALIGNMENT_UNSTEADY;
     }
-    const bool steady = undisturbed && stroke_mean_shows_load(&deferred->stroke_mean);
+    const bool steady = undisturbed && !deferred->slow_counts.slow && stroke_mean_shows_load(&deferred->stroke_mean);
     return steady ? MISALIGNMENT_STEADY : MISALIGNMENT_INTERRUPTED;
 }
 
@@ -261,6 +288,14 @@ static void step_torque_offset(const control_parameters_t *parameters, deferred_
                        single_pulse ? input->torque_reference_q24 : input->torque_sum_q24, limited);
 }
 
+/* periods: since the previous call. */
+NOINLINE static void await_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
+                                       const deferred_input_t *input, uint32_t periods) {
+    if (parameters->bandwidth.adaptive && !deferred->slow_counts.slow) {
+        slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, periods);
+    }
+}
+
 /* What is not urgent, in eight turns: no step takes the time of all. The learning of the phases has half of them,
  * because at a high bandwidth of the observer it follows within a millisecond. */
 NOINLINE static void take_turns(const control_parameters_t *parameters, deferred_t *deferred,
@@ -291,6 +326,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         break;
     default:
         learn_misalignment(parameters, deferred, input);
+        await_slow_counts(parameters, deferred, input, input->periods + DEFERRED_LEARNING_PERIODS - 1u);
         break;
     }
 }
@@ -306,14 +342,17 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     results->generation = input->generation;
     results->fault_mask = (uint32_t)protect(parameters, deferred, input) | state->reported_fault_mask;
-    if (parameters->bandwidth.adaptive) {
-        limit_bandwidth(parameters, deferred, input, &results->bandwidth);
-    }
     speed_control_deferred(parameters, deferred, input, state->torque_limit_q24, results);
+    if (parameters->bandwidth.adaptive) {
+        follow_innovation(parameters, deferred, input, results);
+    }
     deferred->run = input->run;
     if (!input->run) {
         inertia_restart(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical);
-    } else if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && !reset) { /* a step that resets has done enough */
+        await_slow_counts(parameters, deferred, input, input->periods);
+    } else if (parameters->torque_law != TORQUE_LAW_PREDICTIVE) {
+        await_slow_counts(parameters, deferred, input, input->periods);
+    } else if (!reset) { /* a step that resets has done enough */
         take_turns(parameters, deferred, input);
     }
     results->observer = deferred->inertia.laws.observer;

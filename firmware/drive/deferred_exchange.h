@@ -21,6 +21,7 @@
 #include "control/conduction.h"
 #include "control/load_observer.h"
 #include "control/observer_bandwidth.h"
+#include "control/slow_counts.h"
 #include "drive/command.h"
 #include "fixed/compiler.h"
 #include "hal.h"
@@ -71,7 +72,8 @@ typedef struct {
     deferred_speed_results_t speed;
     observer_bandwidth_limits_t bandwidth; /* of the trigger */
     deferred_predictive_results_t predictive;
-    load_observer_inertia_t observer; /* identified, inertia.h */
+    load_observer_inertia_t observer;  /* identified, inertia.h */
+    slow_counts_results_t slow_counts; /* with an adaptive bandwidth only */
 } deferred_results_t;
 
 typedef struct {

@@ -19,13 +19,16 @@ static uint32_t nearest_in_count(const control_parameters_t *parameters, const l
 }
 
 static void measure_angle(const control_parameters_t *parameters, const load_observer_t *observer,
-                          const hal_encoder_sample_t *encoder, control_measurement_t *measured) {
+                          const slow_counts_results_t *slow_counts, const hal_encoder_sample_t *encoder,
+                          control_measurement_t *measured) {
     const uint32_t count_start = encoder->counts << parameters->encoder_shift;
     measured->encoder_angle = count_start;
     measured->predicted_speed_q22 = observer->speed_q22;
     if (!encoder->edge_known) {
         measured->angle_from_edge = false;
-        measured->angle = count_start + parameters->encoder_middle; /* its mean error is zero */
+        measured->angle = slow_counts->slow
+                              ? slow_counts_angle(slow_counts, observer, count_start, parameters->encoder_shift)
+                              : count_start + parameters->encoder_middle; /* its mean error is zero */
         return;
     }
     if (encoder->edge_age_ticks > parameters->edge_age_max_ticks) {
@@ -98,9 +101,9 @@ static sums_t measure_by_plan(const control_parameters_t *parameters, const pred
 }
 
 void measure(const control_parameters_t *parameters, const load_observer_t *observer,
-             const int32_t misalignment[HAL_PHASES_MAX], const predictive_torque_t *predictive,
-             const control_sample_t *sample, control_measurement_t *measured) {
-    measure_angle(parameters, observer, &sample->encoder, measured);
+             const deferred_results_t *deferred, const predictive_torque_t *predictive, const control_sample_t *sample,
+             control_measurement_t *measured) {
+    measure_angle(parameters, observer, &deferred->slow_counts, &sample->encoder, measured);
     measured->dc_link_voltage_q6 = scale_counts(sample->adc->bus_voltage_counts, parameters->voltage_scale_q18);
     sums_t sums;
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
@@ -108,7 +111,7 @@ void measure(const control_parameters_t *parameters, const load_observer_t *obse
         sums = measure_by_plan(parameters, predictive, sample, measured);
     } else {
         commutation_find(&parameters->commutation, measured->angle, &measured->commutation);
-        sums = measure_by_map(parameters, misalignment, sample, measured);
+        sums = measure_by_map(parameters, deferred->predictive.misalignment, sample, measured);
     }
     measured->current_max_q9 = sums.current_max_q9;
     measured->torque_sum_q24 = phase_map_scale(&machine_tables.torque_format, sums.torque);

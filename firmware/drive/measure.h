@@ -10,7 +10,7 @@
  * predictive torque control at the planned one. Currents and voltage are rounded to nearest; a count of 0 is exactly 0
  * A. */
 void measure(const control_parameters_t *parameters, const load_observer_t *observer,
-             const int32_t misalignment[HAL_PHASES_MAX], const predictive_torque_t *predictive,
-             const control_sample_t *sample, control_measurement_t *measured);
+             const deferred_results_t *deferred, const predictive_torque_t *predictive, const control_sample_t *sample,
+             control_measurement_t *measured);
 
 #endif

@@ -1,6 +1,7 @@
 #include "drive/observe.h"
 
 #include "drive/deferred.h"
+#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
 void observe_reset(control_state_t *state, const control_measurement_t *measured) {
@@ -22,11 +23,22 @@ void observe_forget_load(control_state_t *state) {
     deferred_reset_observer(state);
 }
 
+/* Counts that become fast again are followed at the steady bandwidth, until one triggers. */
+NOINLINE static const load_observer_gains_t *slow_gains(const control_parameters_t *parameters, control_state_t *state,
+                                                        const slow_counts_results_t *slow_counts,
+                                                        const control_measurement_t *measured) {
+    state->bandwidth.stage = OBSERVER_BANDWIDTH_STAGES - 1u;
+    return slow_counts_gains(&parameters->slow_counts, slow_counts, measured->encoder_angle);
+}
+
 void observe(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
              const control_measurement_t *measured) {
     const int32_t innovation = load_observer_innovation(&state->observer, measured->angle);
-    const load_observer_gains_t *gains = observer_bandwidth_step(
-        &parameters->bandwidth, &state->bandwidth, &deferred->bandwidth, innovation, &measured->angle_from_edge);
+    const load_observer_gains_t *gains =
+        parameters->bandwidth.adaptive && deferred->slow_counts.slow
+            ? slow_gains(parameters, state, &deferred->slow_counts, measured)
+            : observer_bandwidth_step(&parameters->bandwidth, &state->bandwidth, &deferred->bandwidth, innovation,
+                                      &measured->angle_from_edge);
     state->innovation = innovation;
     const int32_t torque_q24 = fixed_subtract(measured->torque_sum_q24, deferred->speed.periodic_load_q24);
     load_observer_step(&parameters->observer, gains, &deferred->observer, &state->observer, innovation, torque_q24);

@@ -2,6 +2,9 @@
 
 #include "fixed/fixed.h"
 
+/* Part of the largest torque from which on a load is not braked against. */
+#define UNCERTAIN_LOAD 8
+
 static int32_t ramp_step(int32_t reference_q22, int32_t target_q22, int32_t step_max_q22) {
     const int32_t difference_q22 = fixed_subtract(target_q22, reference_q22);
     return fixed_add(reference_q22, fixed_clamp(difference_q22, -step_max_q22, step_max_q22));
@@ -86,6 +89,19 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
     results->speed.speed_law_torque_q24 = torque_q24;
     results->speed.torque_min_q24 = min_q24;
     results->speed.torque_max_q24 = max_q24;
+}
+
+void speed_control_limit_uncertain(const control_parameters_t *parameters, int32_t load_q24,
+                                   deferred_speed_results_t *results) {
+    const int32_t most_q24 = parameters->conduction.torque_max_q24;
+    const int32_t magnitude_q24 = fixed_abs(load_q24);
+    const int32_t against_q24 =
+        magnitude_q24 < most_q24 / UNCERTAIN_LOAD ? most_q24 - UNCERTAIN_LOAD * magnitude_q24 : 0;
+    if (load_q24 > 0) {
+        results->torque_min_q24 = results->torque_min_q24 > -against_q24 ? results->torque_min_q24 : -against_q24;
+    } else {
+        results->torque_max_q24 = results->torque_max_q24 < against_q24 ? results->torque_max_q24 : against_q24;
+    }
 }
 
 /* The transducer is offset binary, +-64 N m full scale: 2^31 of Q7.24 over all counts. */

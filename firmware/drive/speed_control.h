@@ -17,6 +17,12 @@
 void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
                             int32_t limit_q24, deferred_results_t *results);
 
+/* While counts are slow, a speed above the reference may be one of the estimate alone. A load brakes by itself: the
+ * more of it, the less torque against it, none from an eighth of the largest torque on. load_q24: estimated load
+ * torque, N m, Q7.24. For limits of speed mode. [deferred] */
+void speed_control_limit_uncertain(const control_parameters_t *parameters, int32_t load_q24,
+                                   deferred_speed_results_t *results);
+
 /* Torque reference: that of the law, and with sliding mode the feed-forward of load and friction, limited. [interrupt]
  */
 int32_t speed_control_torque_q24(const control_parameters_t *parameters, const load_observer_t *observer,

@@ -8,6 +8,7 @@
 extern "C" {
 #include "drive/deferred.h"
 #include "drive/fault.h"
+#include "drive/observe.h"
 }
 
 #include "support/configured.h"
@@ -226,13 +227,15 @@ TEST_F(Deferred, the_torque_of_the_speed_law_acts_one_period_later_with_the_feed
         const int32_t torque_offset_before_q24 = torque_offset_q24(&state.deferred.torque_offset);
         deferred_step(&parameters, &state);
         const int32_t error_q22 = results().speed.speed_reference_q22 - input.speed_q22;
-        const int32_t law_q24 = results().speed.speed_law_torque_q24;
+        const deferred_speed_results_t law = results().speed;
+        const int32_t law_q24 = law.speed_law_torque_q24;
         ASSERT_EQ(law_q24, speed_smc_reaching_torque_q24(&parameters.speed_smc, error_q22) + torque_offset_before_q24);
         interrupt(COMMAND_RUN, 30.0);
         ASSERT_EQ(state.torque_reference_q24,
                   speed_smc_torque_q24(&parameters.speed_smc, law_q24, state.observer.speed_q22,
-                                       state.observer.load_torque_q24, parameters.torque_mode.torque_min_q24,
-                                       parameters.torque_mode.torque_max_q24));
+                                       state.observer.load_torque_q24, law.torque_min_q24, law.torque_max_q24));
+        ASSERT_TRUE(input.speed_q22 < 10000000 || law.torque_max_q24 == parameters.torque_mode.torque_max_q24)
+            << "from 2.4 rad/s on counts are not slow";
         deferred_step(&parameters, &state);
     }
 }
@@ -386,6 +389,7 @@ TEST_F(Deferred, a_stop_in_torque_mode_ramps_the_speed_to_zero) {
 }
 
 TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_observer) {
+    speed_rad_s = 20.0; // without slow counts
     start();
     state.deferred.bandwidth.mean_innovation_q32 = int64_t(3 * COUNT) << 32;
     period(COMMAND_RUN);
@@ -493,8 +497,25 @@ TEST_F(Deferred, the_misalignment_survives_every_reset_and_a_late_step) {
     kept();
 }
 
+TEST_F(Deferred, slow_counts_end_with_the_first_fast_one_and_with_a_reset_of_the_observer) {
+    start();
+    for (unsigned k = 0; k < RATE_HZ / 500; k++) {
+        period(COMMAND_RUN);
+    }
+    ASSERT_TRUE(results().slow_counts.slow);
+    EXPECT_EQ(state.innovation, 0) << "at rest within a count";
+    observe_forget_load(&state);
+    EXPECT_FALSE(deferred_in_effect(&state)->slow_counts.slow);
+    speed_rad_s = 5.0;
+    for (int k = 0; k < 3; k++) {
+        period(COMMAND_RUN);
+    }
+    EXPECT_FALSE(results().slow_counts.slow);
+}
+
 TEST_F(Deferred, a_trigger_in_a_skipped_period_lengthens_the_holdoff) {
-    for (int k = 0; k < 4000; k++) {
+    speed_rad_s = 5.0; // without slow counts
+    for (int k = 0; k < 60000; k++) {
         period(COMMAND_OFF);
     }
     ASSERT_EQ(state.bandwidth.stage, OBSERVER_BANDWIDTH_STAGES - 1u);

@@ -1,0 +1,128 @@
+// Corrections of the load observer by slow counts: gains against their formulas in double precision, a rotor under
+// load.
+#include <cmath>
+#include <cstdint>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/slow_counts.h"
+}
+
+#include "support/reference_builders.h"
+
+namespace {
+
+using namespace fixed_point;
+constexpr uint32_t RATE_HZ = 40000;
+constexpr unsigned BITS = 10, SHIFT = 32 - BITS;
+constexpr uint32_t COUNT = 1u << SHIFT;
+constexpr double INERTIA = 0.02, COUNT_RAD = 2.0 * PI / (1 << BITS);
+const int32_t INERTIA_Q30 = to_fixed(INERTIA, Q30);
+
+struct SlowCounts : testing::Test {
+    slow_counts_parameters_t parameters = slow_counts_configure(RATE_HZ, INERTIA_Q30);
+    slow_counts_t counts = {};
+    slow_counts_results_t results = {};
+
+    bool step(uint32_t angle, uint32_t periods) {
+        results.slow = slow_counts_step(&parameters, &counts, angle, periods);
+        if (results.slow) {
+            slow_counts_set(&parameters, &counts, &results);
+        }
+        return results.slow;
+    }
+    bool wait(uint32_t periods, uint32_t angle = 0) {
+        bool slow = false;
+        for (uint32_t k = 0; k < periods; k++) {
+            slow = step(angle, 1);
+        }
+        return slow;
+    }
+};
+
+// In 1/s and N m / rad, from 2^-32 rev.
+double speed_gain(const load_observer_gains_t &gains) {
+    return gains.speed_gain_q24 / Q24 / Q22 * REV / (2.0 * PI);
+}
+double load_gain(const load_observer_gains_t &gains) {
+    return -double(gains.load_gain_q28) / Q28 * (gains.load_factor_q4 / 16.0) / Q24 * REV / (2.0 * PI);
+}
+
+TEST_F(SlowCounts, are_those_of_half_a_millisecond) {
+    EXPECT_FALSE(wait(19));
+    EXPECT_TRUE(wait(1));
+    EXPECT_TRUE(wait(1, COUNT)) << "the next one";
+    EXPECT_TRUE(wait(19, COUNT));
+    EXPECT_TRUE(wait(1, 2 * COUNT)) << "after 20 periods";
+    EXPECT_TRUE(wait(18, 2 * COUNT));
+    EXPECT_FALSE(wait(1, 3 * COUNT)) << "after 19";
+    EXPECT_FALSE(wait(19, 3 * COUNT));
+    EXPECT_TRUE(wait(1, 3 * COUNT));
+}
+
+TEST_F(SlowCounts, skipped_periods_count) {
+    EXPECT_FALSE(wait(1));
+    EXPECT_TRUE(step(0, 19));
+}
+
+TEST_F(SlowCounts, have_the_gains_of_samples_that_far_apart) {
+    uint32_t passed = 0;
+    for (const uint32_t periods : {21u, 41u, 60u, 100u, 199u, 200u, 201u, 400u, 1000u, 10000u}) {
+        wait(periods - 1 - passed);
+        passed = periods - 1;
+        const double seconds = double(periods) / RATE_HZ, q = std::fmax(0.0, 1.0 - seconds * 200.0);
+        EXPECT_NEAR(results.edge.angle_gain_q28 / Q28, 1.0 - q * q * q, 1e-5) << periods;
+        const double l2 = 1.5 * (1.0 - q) * (1.0 - q) * (1.0 + q) / seconds;
+        EXPECT_NEAR(speed_gain(results.edge), l2, 1e-3 * l2) << periods;
+        const double l3 = std::pow(1.0 - q, 3) / seconds / seconds * INERTIA / 2.0; // half of it, see slow_counts.h
+        EXPECT_NEAR(load_gain(results.edge), l3, 2e-3 * l3) << periods;
+    }
+    EXPECT_TRUE(wait(3000000)) << "the time saturates";
+    EXPECT_GT(speed_gain(results.edge), 0.0);
+}
+
+TEST_F(SlowCounts, tell_the_edge_when_they_change_and_an_interval_when_not) {
+    wait(100, 5 * COUNT);
+    load_observer_t observer = {};
+    const auto angle = [&](double counts_predicted, uint32_t encoder_angle) {
+        observer.angle_q64 = uint64_t(std::llround(counts_predicted * COUNT)) << 32;
+        return slow_counts_angle(&results, &observer, encoder_angle, SHIFT);
+    };
+    EXPECT_EQ(angle(5.25, 5 * COUNT), 5 * COUNT + COUNT / 4) << "no innovation";
+    EXPECT_EQ(angle(7.5, 5 * COUNT), 6 * COUNT - 1) << "not beyond the count";
+    EXPECT_EQ(angle(4.5, 5 * COUNT), 5 * COUNT);
+    EXPECT_EQ(angle(5.25, 6 * COUNT), 6 * COUNT) << "forwards";
+    EXPECT_EQ(angle(5.25, 4 * COUNT), 5 * COUNT - 1) << "backwards";
+    EXPECT_EQ(slow_counts_gains(&parameters, &results, 5 * COUNT), &parameters.outside);
+    EXPECT_EQ(slow_counts_gains(&parameters, &results, 6 * COUNT), &results.edge);
+}
+
+// A rotor at constant speed and torque: the middle of a count would leave the estimates swinging by 0.3 rad/s.
+TEST_F(SlowCounts, leave_a_rotor_at_constant_speed_no_error) {
+    const load_observer_model_t model = load_observer_model(RATE_HZ, INERTIA_Q30, 0);
+    const load_observer_inertia_t inertia = load_observer_inertia(&model, 0);
+    load_observer_t observer;
+    load_observer_reset(&observer, COUNT / 2);
+    const double speed = 1.0, load = 3.0; // 6.1 ms a count
+    double error = 0.0, load_error = 0.0;
+    for (uint32_t k = 0; k < RATE_HZ; k++) {
+        const double rad = speed * k / RATE_HZ;
+        const uint32_t angle = uint32_t(uint64_t(std::floor(rad / COUNT_RAD)) << SHIFT);
+        const uint32_t measured =
+            results.slow ? slow_counts_angle(&results, &observer, angle, SHIFT) : angle + COUNT / 2;
+        const load_observer_gains_t *gains = slow_counts_gains(&parameters, &results, angle);
+        load_observer_step(&model, results.slow ? gains : &parameters.outside, &inertia, &observer,
+                           load_observer_innovation(&observer, measured), to_fixed(load, Q24));
+        step(angle, 1);
+        if (k > RATE_HZ / 2) {
+            error = std::fmax(error, std::fabs(observer.speed_q22 / Q22 - speed));
+            load_error = std::fmax(load_error, std::fabs(observer.load_torque_q24 / Q24 - load));
+        }
+    }
+    EXPECT_GT(error, 0.0);
+    EXPECT_LT(error, 0.02);
+    EXPECT_LT(load_error, 0.1);
+}
+
+} // namespace
