@@ -6,8 +6,9 @@
 /* Torque shortfall that counts as voltage limitation: 0.05 N m and 1/64 of the reference. Less may be rounding. */
 #define SHORTFALL_MIN_Q24 ((1 << 24) / 20)
 
-/* 2^-32 electrical rev to Q1.30 in Q8, and a half. */
-#define TRIM_SHIFT 11
+/* 2^-32 electrical rev to Q1.30 in Q12, and a half. */
+#define TRIM_SHIFT 15
+#define ONE_Q12 (1 << 12)
 
 #define ONE_Q8 (1 << 8)
 
@@ -92,6 +93,11 @@ static int32_t feed_forward_q15(const conduction_pulse_t *pulse, int32_t torque)
     return excess_q8 >= range_q8 ? ONE_Q15 : (excess_q8 << 15) / range_q8;
 }
 
+static int32_t part_of_largest_q15(const conduction_pulse_t *pulse, int32_t torque) {
+    const int32_t torque_q8 = torque >> 16, largest_q8 = pulse->mean_q24 >> 16;
+    return torque_q8 >= largest_q8 ? ONE_Q15 : (torque_q8 << 15) / largest_q8;
+}
+
 /* From 0 at the base speed to 1, Q1.15, at 1 / range of it above. */
 static int32_t above_base_q15(const machine_tables_t *tables, conduction_place_t place, int32_t range) {
     const int32_t base_q8 = tables->pulse_base_index;
@@ -112,7 +118,7 @@ static int32_t smoothed_q24(const conduction_state_t *state, uint32_t phases, co
     const int32_t torque = fixed_abs(sample->torque_q24);
     const uint64_t strokes_q31 = (uint64_t)sample->angle_step * phases >> 1;
     const int32_t part_q31 = strokes_q31 > INT32_MAX ? INT32_MAX : (int32_t)strokes_q31;
-    if (state->sharing_q15 == 0 || state->latest == CONDUCTION_INITIAL) {
+    if (state->partial_q15 == 0 || state->latest == CONDUCTION_INITIAL) {
         return torque;
     }
     return state->torque_q24 + 2 * fixed_multiply_high(torque - state->torque_q24, part_q31);
@@ -122,8 +128,8 @@ static int32_t smoothed_q24(const conduction_state_t *state, uint32_t phases, co
 static int32_t trim_step_q30(const conduction_pulse_t *pulse, const conduction_sample_t *sample) {
     const int32_t error_q24 = fixed_subtract(sample->torque_q24, sample->torque_sum_q24);
     const int32_t missing_q24 = sample->torque_q24 < 0 ? fixed_subtract(0, error_q24) : error_q24;
-    const int32_t part_q8 = fixed_clamp((missing_q24 >> 8) / ((pulse->mean_q24 >> 16) + 1), -ONE_Q8, ONE_Q8);
-    return (int32_t)(sample->angle_step >> TRIM_SHIFT) * part_q8;
+    const int32_t part_q12 = fixed_clamp((missing_q24 >> 4) / ((pulse->mean_q24 >> 16) + 1), -ONE_Q12, ONE_Q12);
+    return (int32_t)(sample->angle_step >> TRIM_SHIFT) * part_q12;
 }
 
 /* Advance of the windows and level of the single pulse. */
@@ -133,11 +139,13 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
     const bool voltage_limited = fixed_abs(sample->torque_shortfall_q24) > SHORTFALL_MIN_Q24 + torque / 64;
     int32_t retract_q30 = voltage_limited ? 0 : parameters->retract_step_q30;
     if (parameters->single_pulse) {
-        state->sharing_q15 = above_base_q15(tables, state->place, LEAST_CURRENT_RANGE);
-        retract_q30 >>= state->sharing_q15 > 0 ? ABOVE_BASE_SHIFT : 0;
+        state->partial_q15 = above_base_q15(tables, state->place, LEAST_CURRENT_RANGE);
+        retract_q30 >>= state->partial_q15 > 0 ? ABOVE_BASE_SHIFT : 0;
         state->torque_q24 = smoothed_q24(state, tables->phases, sample);
         const int32_t forward_q15 = feed_forward_q15(&state->pulse, state->torque_q24);
-        const int32_t forward_q30 = forward_q15 * (1 << 15);
+        /* Of the part of the largest torque, and of the level below it. */
+        const int32_t forward_q30 =
+            (state->partial_q15 > 0 ? part_of_largest_q15(&state->pulse, state->torque_q24) : forward_q15) * (1 << 15);
         if (forward_q15 > 0) {
             /* With the level that is still the one before: from the trim alone, windows do not jump. */
             const int32_t advanced_q30 = state->advance_q30 + parameters->advance_step_q30;
@@ -145,13 +153,18 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
         }
         if (forward_q15 == ONE_Q15) {
             state->trim_q30 = 0; /* the largest torque is that of the tables */
-        } else if ((state->advance_q30 == ONE_Q30 || state->sharing_q15 > 0) &&
-                   (voltage_limited || state->level_q15 > 0)) {
+        } else if (state->partial_q15 > 0) {
+            state->trim_q30 +=
+                voltage_limited || state->single_pulse
+                    ? trim_step_q30(&state->pulse, sample)
+                    : -fixed_clamp(state->trim_q30, -parameters->advance_step_q30, parameters->advance_step_q30);
+        } else if (state->advance_q30 == ONE_Q30 && (voltage_limited || state->level_q15 > 0)) {
             /* Sharing follows the reference at any level that is too high: without a shortfall it returns. */
             state->trim_q30 += trim_step_q30(&state->pulse, sample) - (forward_q15 == 0 ? retract_q30 : 0);
         }
         state->trim_q30 = fixed_clamp(state->trim_q30, -forward_q30, ONE_Q30 - forward_q30);
-        state->level_q15 = forward_q15 + (state->trim_q30 >> 15);
+        state->part_q15 = (forward_q30 + state->trim_q30) >> 15;
+        state->level_q15 = fixed_clamp(forward_q15 + (state->trim_q30 >> 15), 0, ONE_Q15);
     }
     if (state->level_q15 == 0) {
         const int32_t step_q30 = voltage_limited ? parameters->advance_step_q30 : -retract_q30;
@@ -178,22 +191,52 @@ static conduction_interval_t sharing_interval(const conduction_parameters_t *par
     };
 }
 
-/* With a part of the window with the least current; the advance of a motoring phase takes it back. */
-static conduction_interval_t towards_least_current(const machine_tables_t *tables, const conduction_state_t *state,
-                                                   conduction_interval_t interval) {
-    const uint32_t on = (uint32_t)tables->sharing_on << 16, off = (uint32_t)tables->sharing_off << 16;
-    const int32_t kept_q15 = state->braking ? ONE_Q15 : ONE_Q15 - (state->advance_q30 >> 15);
-    const int32_t part_q15 = (state->sharing_q15 * kept_q15) >> 15;
-    return (conduction_interval_t){
-        .enter = blend(interval.enter, state->braking ? HALF_REV - off : on, part_q15),
-        .leave = blend(interval.leave, state->braking ? HALF_REV - on : off, part_q15),
+/* Of the pulse for a part of the largest mean torque. */
+typedef struct {
+    uint32_t on, end; /* past the begin of the half, 2^-32 electrical rev */
+    int32_t ripple_q24;
+} partial_pulse_t;
+
+/* Between two speeds. */
+static partial_pulse_t partial_pulse(const machine_partial_pulse_t *low, const conduction_state_t *state) {
+    const machine_partial_pulse_t *high = low + 1;
+    const int32_t fraction_q8 = state->place.fraction_q8;
+    const int32_t ripple_q15 = low->ripple * ONE_Q8 + (high->ripple - low->ripple) * fraction_q8;
+    return (partial_pulse_t){
+        .on = (uint32_t)(low->on * ONE_Q8 + (high->on - low->on) * fraction_q8) << 16,
+        .end = (uint32_t)(low->end * ONE_Q8 + (high->end - low->end) * fraction_q8) << 16,
+        .ripple_q24 = fixed_saturate_bits(fixed_multiply_high(state->pulse.mean_q24, ripple_q15 << 15), 30) * 4,
+    };
+}
+
+/* Between two parts of the largest torque; below the least of them its angles, and less ripple. */
+static partial_pulse_t pulse_for(const machine_tables_t *tables, const conduction_state_t *state, int32_t part_q15) {
+    const unsigned index = (unsigned)part_q15 >> 13;
+    const unsigned knot = index < MACHINE_PULSE_PARTS ? index : MACHINE_PULSE_PARTS;
+    const machine_partial_pulse_t(*parts)[MACHINE_PULSE_POINTS] = tables->partial_pulse[state->braking];
+    const int32_t fraction_q15 = (part_q15 - (int32_t)(knot << 13)) * 4;
+    partial_pulse_t low = partial_pulse(&parts[knot > 0 ? knot - 1 : 0][state->place.k], state);
+    partial_pulse_t high = {
+        .on = -state->pulse.lead, .end = state->pulse.end, .ripple_q24 = state->pulse.peak_q24 - state->pulse.mean_q24};
+    if (knot == 0) {
+        high = low;
+        low.ripple_q24 = 0;
+    } else if (knot < MACHINE_PULSE_PARTS) {
+        high = partial_pulse(&parts[knot][state->place.k], state);
+    }
+    return (partial_pulse_t){
+        .on = blend(low.on, high.on, fraction_q15),
+        .end = blend(low.end, high.end, fraction_q15),
+        .ripple_q24 = (int32_t)blend((uint32_t)low.ripple_q24, (uint32_t)high.ripple_q24, fraction_q15),
     };
 }
 
 static void set_window(const conduction_parameters_t *parameters, conduction_interval_t interval, bool braking,
-                       torque_sharing_window_t *window) {
-    const uint32_t stroke = parameters->sharing.stroke;
+                       bool partial, torque_sharing_window_t *window) {
     const uint32_t width = interval.leave - interval.enter;
+    const bool narrow = partial && width < parameters->sharing.stroke + OVERLAP_MIN;
+    const uint32_t stroke =
+        narrow ? (width > 2 * OVERLAP_MIN ? width - OVERLAP_MIN : OVERLAP_MIN) : parameters->sharing.stroke;
     const uint32_t overlap = width > stroke + OVERLAP_MIN ? width - stroke : OVERLAP_MIN;
     window->stroke = stroke;
     window->overlap = parameters->sharing.overlapping ? overlap : 0;
@@ -223,21 +266,41 @@ static void limit_torque(const conduction_parameters_t *parameters, conduction_s
     state->torque_max_q24 = fixed_clamp(parameters->torque_max_q24, 0, positive_q24);
 }
 
-/* Positions between those of torque sharing and of the single pulse. */
+/* Positions and ripple between those of torque sharing and of the single pulse, and above base speed those of the
+ * pulse for the part of the largest torque. */
 static void set_interval(const conduction_parameters_t *parameters, conduction_state_t *state,
                          const machine_tables_t *tables) {
-    conduction_interval_t interval = towards_least_current(tables, state, sharing_interval(parameters, state));
-    const int32_t level_q15 = state->level_q15;
+    const int32_t level_q15 = state->level_q15, partial_q15 = state->partial_q15;
+    conduction_interval_t interval = sharing_interval(parameters, state);
+    int32_t ripple_q24 = 0;
+    bool single_pulse = level_q15 > 0;
     interval.on = 0;
     if (level_q15 > 0) {
         interval.on = blend(interval.enter < HALF_REV ? interval.enter : 0, -state->pulse.lead, level_q15);
         interval.leave = blend(interval.leave, state->pulse.end, level_q15);
+        ripple_q24 = (int32_t)blend(0, (uint32_t)(state->pulse.peak_q24 - state->pulse.mean_q24), level_q15);
+    }
+    if (partial_q15 > 0) {
+        const partial_pulse_t pulse = pulse_for(tables, state, state->part_q15);
+        const int32_t trim_q24 = fixed_multiply_high(state->pulse.mean_q24, state->trim_q30) * 4;
+        const int32_t trimmed_q24 = fixed_clamp(fixed_add(pulse.ripple_q24, trim_q24), 0, INT32_MAX);
+        interval.on = blend(level_q15 > 0 ? interval.on : interval.enter, pulse.on, partial_q15);
+        interval.leave = blend(interval.leave, pulse.end, partial_q15);
+        ripple_q24 = (int32_t)blend((uint32_t)ripple_q24, (uint32_t)trimmed_q24, partial_q15);
+        interval.enter = interval.on;
+        single_pulse = state->torque_q24 > state->pulse.smooth_q24 || (int32_t)pulse.on < 0 ||
+                       pulse.ripple_q24 > state->pulse.mean_q24 >> 6;
+    }
+    if (level_q15 > 0 || partial_q15 > 0) {
         /* Less than half a revolution before the end: beyond, a phase would make up for no shortfall. */
         const int32_t earliest = (int32_t)(interval.leave - HALF_REV + 1);
-        const int32_t enter = fixed_clamp((int32_t)interval.on, -SHARE_LEAD_MAX, (int32_t)interval.enter);
+        const int32_t latest = (int32_t)interval.enter > -SHARE_LEAD_MAX ? (int32_t)interval.enter : -SHARE_LEAD_MAX;
+        const int32_t enter = fixed_clamp((int32_t)interval.on, -SHARE_LEAD_MAX, latest);
         interval.enter = (uint32_t)(enter > earliest ? enter : earliest);
     }
     state->interval = interval;
+    state->ripple_q24 = ripple_q24;
+    state->single_pulse = single_pulse;
 }
 
 static void set_angles(const conduction_parameters_t *parameters, conduction_state_t *state,
@@ -247,9 +310,8 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     conduction_t *angles = &state->angles[next];
     conduction_half_t *half = &angles->half[state->braking];
     conduction_half_t *before = &angles->half[!state->braking];
-    const int32_t ripple_q24 = (int32_t)blend(0, (uint32_t)(state->pulse.peak_q24 - state->pulse.mean_q24), level_q15);
     const uint32_t on = state->interval.on;
-    angles->ripple_q24 = negative ? -ripple_q24 : ripple_q24;
+    angles->ripple_q24 = negative ? -state->ripple_q24 : state->ripple_q24;
     before->window = parameters->initial.half[0].window;
     before->width = half->width = HALF_REV;
     before->lead = on >= HALF_REV ? -on : 0;
@@ -257,10 +319,11 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     angles->half[CONDUCTION_BRAKING].end = HALF_REV;
     before->flux = half->flux = 0;
     half->lead = 0;
-    set_window(parameters, state->interval, state->braking, &half->window);
-    if (level_q15 > 0 && state->braking) {
+    set_window(parameters, state->interval, state->braking, state->partial_q15 > 0, &half->window);
+    if (state->braking && (level_q15 > 0 || state->partial_q15 > 0)) {
         set_envelope(tables, state, half);
-    } else if (level_q15 > 0) {
+    }
+    if (state->partial_q15 > 0 || (level_q15 > 0 && !state->braking)) {
         half->width = half->window.stroke + half->window.overlap;
     }
     state->latest = next;

@@ -113,11 +113,14 @@ typedef struct {
     int32_t torque_max_q24;
     int32_t gain_excess_q31;        /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
     int32_t torque_q24;             /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
-    int32_t sharing_q15;            /* part of the window with the least current, Q1.15, 0..1 */
+    int32_t partial_q15;            /* part of the pulses for parts of the largest torque, Q1.15, 0..1 */
     int32_t advance_q30;            /* of the windows, Q1.30, 0..1 */
     int32_t trim_q30;               /* of the level, Q1.30, -1..1 */
     int32_t level_q15;              /* Q1.15, 0..1 */
+    int32_t part_q15;               /* of the largest mean torque, Q1.15, 0..1 */
+    bool single_pulse;              /* the torque pulsates, or a phase turns on before its half */
     conduction_interval_t interval; /* of the half with the torque */
+    int32_t ripple_q24;             /* to add to the magnitude of the torque reference, N m, Q7.24 */
     conduction_t angles[2];         /* of the last two updates */
     unsigned latest;                /* index of the last, or CONDUCTION_INITIAL */
 } conduction_state_t;
@@ -152,6 +155,7 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->advance_q30 = 0;
     state->trim_q30 = 0;
     state->level_q15 = 0;
+    state->single_pulse = false;
     state->gain_excess_q31 = 0;
     state->latest = CONDUCTION_INITIAL;
 }

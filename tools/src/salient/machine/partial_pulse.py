@@ -1,0 +1,232 @@
+"""Conduction angles for parts of the largest mean torque at a speed (firmware/control/conduction.h).
+
+The least RMS current of a torque is that of a single pulse that is shorter than the one of the largest torque. Its
+torque pulsates. Torque sharing, whose torque is smooth, takes as little on machines that saturate, and up to a fifth more
+on machines whose torque rises and falls with the angle. So a part of the torque is made by torque sharing, by the pulse,
+or by what lies between both: the smoothest that takes at most _MORE_CURRENT of the pulse's current.
+
+Between both, a phase follows the torque reference, raised by a ripple, from the turn-on to the turn-off angle as far as
+the voltage permits; with the ripple of the pulse the voltage decides alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from salient.machine.definition import Machine
+from salient.machine.drive_data import DriveData
+from salient.machine.single_pulse import LANE_DEG, STEP_DEG, TURN, Pairs, Phase, SinglePulse, parabola, vertex
+
+PARTS = (0.25, 0.5, 0.75)
+"""Of the largest mean torque, as MACHINE_PULSE_PARTS."""
+
+_MORE_CURRENT = 1.06
+_TOWARDS_PULSE = (0.0, 0.33, 0.67)
+"""Ways from torque sharing to the pulse that are tried."""
+_NARROW_WEIGHT = 0.1
+"""Square of the current that a pulse may take more which is as wide as a stroke rather than of no width."""
+_FIRST_DEG = -162
+"""Past the begin of the half of the wanted torque, before which no phase is turned on."""
+_SHARE_LEAD_DEG = 20.0
+"""As SHARE_LEAD_MAX."""
+_JUMP_COST = 0.06
+"""Square of the current, relatively, that half a revolution between the angles of two speeds is worth."""
+_ROUNDS = 3
+"""Until the mean torque is the wanted one within _TORQUE_ERROR."""
+_TORQUE_ERROR = 0.02
+_HIGHER_MAX = 1.6
+"""Factor by which a reference may have to be higher for it."""
+_BEYOND = 1e3
+"""Times the wanted torque: a reference that no phase reaches."""
+_RIPPLE_MARGIN = 1.03
+"""Over the largest torque of the pulse, so that the voltage decides."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartialPulse:
+    """By half, motoring and braking, part of the largest mean torque, and speed."""
+
+    on_deg: np.ndarray
+    """Turn-on past the begin of the half; negative: before it."""
+    off_deg: np.ndarray
+    """Turn-off past it."""
+    ripple: np.ndarray
+    """By which the torque reference is raised, as part of the largest mean torque."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Operation:
+    """By lane."""
+
+    mean_Nm: np.ndarray
+    """Of all phases."""
+    peak_Nm: np.ndarray
+    ripple: np.ndarray
+    """Of the torque, relatively."""
+    rms_A: np.ndarray
+    flux_Wb: np.ndarray
+    """Of each phase, to go on with."""
+
+
+def partial_pulse(machine: Machine, data: DriveData, of: SinglePulse) -> PartialPulse:
+    """From the last of its speeds below the base speed on; before it the same."""
+    first = max(int(np.searchsorted(of.speed_per_voltage, of.base_speed_per_voltage)) - 1, 1)
+    speed_rad_s = of.speed_per_voltage[first:] * machine.supply_voltage_V
+    mean_Nm = of.mean_Nm[:, first:]
+    phase = Phase(machine, data.parameters["current_limit_A"])
+    window_deg = np.array(of.sharing_deg) - 180.0
+    found = []
+    for half, pairs in enumerate(phase.pairs(speed_rad_s)):
+        part = np.repeat(PARTS, len(speed_rad_s))
+        wanted_Nm = part * np.tile(mean_Nm[half], len(PARTS))
+        pulse_deg = np.concatenate([_least_current_deg(pairs, share * mean_Nm[half] / machine.phases,
+                                                       360.0 / machine.phases)
+                                    for share in PARTS], axis=1) - (180.0 + 180.0 * half)
+        follower = _Follower(phase, machine.phases, half, np.tile(speed_rad_s, len(PARTS)))
+        on_deg, off_deg, reference_Nm = follower.smoothest(
+            wanted_Nm, pulse_deg, window_deg if half == 0 else 180.0 - window_deg[::-1])
+        found.append([np.pad(values.reshape(len(PARTS), -1), ((0, 0), (first, 0)), mode="edge") for values in (
+            on_deg, off_deg, part * np.maximum(reference_Nm / wanted_Nm - 1.0, 0.0))])
+    return PartialPulse(*(np.array(values) for values in zip(*found, strict=True)))
+
+
+def _least_current_deg(pairs: Pairs, wanted_Nm: np.ndarray, stroke_deg: float) -> np.ndarray:
+    """Turn-on and turn-off of the least current with which a phase makes a mean torque, by speed: (2, speeds)."""
+    torque_Nm, wanted = pairs.torque_Nm, wanted_Nm[:, None]
+    made = torque_Nm >= wanted
+    last = made.shape[-1] - 1
+    # The latest turn-on of each turn-off, between two of them.
+    at = last - made[..., ::-1].argmax(axis=-1)
+
+    def beside(of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        low, high = (np.take_along_axis(of, np.minimum(index, last)[..., None], axis=-1)[..., 0]
+                     for index in (at, at + 1))
+        return low, high
+
+    low_Nm, high_Nm = beside(torque_Nm)
+    shift = np.clip((low_Nm - wanted_Nm) / np.maximum(low_Nm - high_Nm, 1e-12), 0.0, 1.0)
+
+    def between(of: np.ndarray) -> np.ndarray:
+        low, high = beside(of)
+        result: np.ndarray = low + shift * (high - low)
+        return result
+
+    on_deg = pairs.on_deg[at] + LANE_DEG * shift
+    narrow = np.clip(1.0 - (pairs.off_deg[:, None] - on_deg) / stroke_deg, 0.0, 1.0)
+    met = made.any(axis=-1) & (between(pairs.margin) >= 0.0)
+    cost = np.where(met, between(pairs.square_A2) * (1.0 + _NARROW_WEIGHT * narrow), np.inf).T
+    score = -cost / cost.min(axis=1, keepdims=True)
+    best = _followed(-score, pairs.off_deg)
+    place = vertex(score, best)
+    off_deg = np.minimum(pairs.off_deg[best] + LANE_DEG * place, pairs.off_deg[-1])
+    return np.array([parabola(on_deg.T, best, place), off_deg])
+
+
+def _followed(cost: np.ndarray, off_deg: np.ndarray) -> np.ndarray:
+    """Index of the turn-off of each row, so that the sum of the costs, and of the ways from row to row, is least: there
+    may be two minima, and angles between two speeds are interpolated."""
+    way = _JUMP_COST * np.abs(off_deg[:, None] - off_deg) / 180.0
+    total, before = cost[0], []
+    for row in cost[1:]:
+        reached = total[:, None] + way
+        before.append(reached.argmin(axis=0))
+        total = reached.min(axis=0) + row
+    found = [int(total.argmin())]
+    for from_ in reversed(before):
+        found.append(int(from_[found[-1]]))
+    return np.array(found[::-1])
+
+
+class _Follower:
+    """Phases that follow a torque reference within their window, by lane; all do the same, one stroke apart."""
+
+    def __init__(self, phase: Phase, phases: int, half: int, speed_rad_s: np.ndarray) -> None:
+        self.phase, self.phases, self.speed_rad_s = phase, phases, speed_rad_s
+        self.begin_deg = 180 + 180 * half
+        self.sign = 1.0 - 2.0 * half
+        self.stroke_deg = 360.0 / phases
+        self.cap_Wb = phase.cap_Wb(speed_rad_s, (self.begin_deg + _FIRST_DEG + 360) // STEP_DEG)
+        self.lane = np.arange(len(speed_rad_s))
+
+    def smoothest(self, wanted_Nm: np.ndarray, pulse_deg: np.ndarray, sharing_deg: np.ndarray
+                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Turn-on, turn-off and torque reference."""
+        pulse = self.run(pulse_deg, _BEYOND * wanted_Nm)
+        crest = np.maximum(pulse.peak_Nm / wanted_Nm, 1.0)
+        # Of a slightly different torque.
+        allowed_A = _MORE_CURRENT * pulse.rms_A * np.sqrt(wanted_Nm / pulse.mean_Nm)
+        way = np.array(_TOWARDS_PULSE)[:, None]
+        sharing_deg = sharing_deg[:, None, None]
+        angles_deg = sharing_deg + way * (pulse_deg[:, None] - sharing_deg)
+        reference_Nm = wanted_Nm * (1.0 + way * (crest - 1.0))
+        highest_Nm = _HIGHER_MAX * reference_Nm
+        ripple = np.full(reference_Nm.shape, np.inf)
+        flux_Wb = None
+        for _ in range(_ROUNDS):
+            made = self.run(angles_deg, reference_Nm, flux_Wb)
+            flux_Wb = made.flux_Wb
+            reached = np.abs(made.mean_Nm / wanted_Nm - 1.0) < _TORQUE_ERROR
+            ripple = np.where(reached & (made.rms_A <= allowed_A), made.ripple, ripple)
+            higher = wanted_Nm / np.maximum(made.mean_Nm, 0.5 * wanted_Nm)
+            reference_Nm = np.where(reached, reference_Nm, np.minimum(reference_Nm * higher, highest_Nm))
+        best, lane = ripple.argmin(axis=0), np.arange(len(wanted_Nm))
+        smoother = ripple[best, lane] < pulse.ripple
+        chosen_deg = np.where(smoother, angles_deg[:, best, lane], pulse_deg)
+        chosen_Nm = np.where(smoother, reference_Nm[best, lane], _RIPPLE_MARGIN * crest * wanted_Nm)
+        return chosen_deg[0], chosen_deg[1], chosen_Nm
+
+    def run(self, angles_deg: np.ndarray, reference_Nm: np.ndarray, flux_Wb: np.ndarray | None = None) -> _Operation:
+        """Turn-on and turn-off past the begin of the half, (2, ...), from flux linkages of the phases."""
+        phase, phases, stroke_deg = self.phase, self.phases, self.stroke_deg
+        on_deg, off_deg = angles_deg
+        enter_deg = np.maximum(on_deg, -_SHARE_LEAD_DEG)
+        overlap_deg = np.maximum(off_deg - enter_deg - stroke_deg, STEP_DEG)
+        # Without an overlap the parts of a step with the voltage and with the opposite one are enough.
+        within = overlap_deg > STEP_DEG
+        rise_deg = np.where(within, enter_deg, enter_deg - STEP_DEG)
+        fall_deg = np.where(within, off_deg - overlap_deg, off_deg + STEP_DEG)
+        step_s = phase.step_s(self.speed_rad_s)[:, 0]
+        rise_Wb, fall_Wb = phase.rise_V * step_s, phase.fall_V * step_s
+        rise_ohm_s, fall_ohm_s = phase.rise_ohm * step_s, phase.fall_ohm * step_s
+        stroke_steps = round(stroke_deg) // STEP_DEG
+        strokes = 2
+        if flux_Wb is None:
+            flux_Wb, strokes = np.zeros((phases, *on_deg.shape)), phases + 1
+        first = _FIRST_DEG // STEP_DEG + stroke_steps * np.arange(phases).reshape(-1, *[1] * on_deg.ndim)
+        current_A, _ = phase.state(self.begin_deg // STEP_DEG + first, flux_Wb)
+        total_Nm, square_A2 = np.zeros((stroke_steps, *on_deg.shape)), np.zeros(flux_Wb.shape)
+        for step in range(strokes * stroke_steps):
+            # Within a revolution from _FIRST_DEG on.
+            past_deg = _FIRST_DEG + (first * STEP_DEG - _FIRST_DEG + (step + 1) * STEP_DEG) % 360
+            index = (self.begin_deg + past_deg) // STEP_DEG
+            share = np.where(past_deg > 0, _cubic((past_deg - rise_deg) / overlap_deg)
+                             - _cubic((past_deg - fall_deg) / overlap_deg), 0.0)
+            on = np.clip((past_deg - on_deg) / STEP_DEG, 0.0, 1.0) - np.clip((past_deg - off_deg) / STEP_DEG, 0.0, 1.0)
+            least_Wb = flux_Wb - fall_Wb - fall_ohm_s * current_A
+            most_Wb = least_Wb + on * (rise_Wb + fall_Wb + (rise_ohm_s + fall_ohm_s) * current_A)
+            most_Wb = np.minimum(most_Wb, np.maximum(self.cap_Wb[index, self.lane], least_Wb))
+            held_Wb = np.where((past_deg > 0) & (on > 0.0),
+                               np.minimum(most_Wb, np.maximum(phase.flux_Wb(index, share * reference_Nm), least_Wb)),
+                               most_Wb)
+            _, torque_Nm = phase.state(index, np.maximum(held_Wb, 0.0))
+            # What is missing is left to the phase that entered first.
+            missing_Nm = np.maximum(reference_Nm - self.sign * torque_Nm.sum(axis=0), 0.0)
+            inside = (past_deg > 0) & (on > 0.0)
+            oldest = inside & (past_deg == np.where(inside, past_deg, -1000).max(axis=0))
+            more_Wb = phase.flux_Wb(index, np.abs(torque_Nm) + missing_Nm)
+            flux_Wb = np.maximum(np.where(oldest, np.minimum(most_Wb, np.maximum(more_Wb, least_Wb)), held_Wb), 0.0)
+            current_A, torque_Nm = phase.state(index, flux_Wb)
+            if step >= (strokes - 1) * stroke_steps:
+                total_Nm[step % stroke_steps] = self.sign * torque_Nm.sum(axis=0)
+                square_A2 += current_A * current_A
+        mean_Nm = np.maximum(total_Nm.mean(axis=0), 1e-12)
+        return _Operation(mean_Nm, total_Nm.max(axis=0), np.ptp(total_Nm, axis=0) / mean_Nm,
+                          np.sqrt(square_A2.sum(axis=0) / TURN), np.roll(flux_Wb, strokes, axis=0))
+
+
+def _cubic(part: np.ndarray) -> np.ndarray:
+    x = np.clip(part, 0.0, 1.0)
+    result: np.ndarray = x * x * (3.0 - 2.0 * x)
+    return result
