@@ -1,5 +1,6 @@
 #include "control/conduction.h"
 
+#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "fixed/formats.h"
 
@@ -15,13 +16,16 @@
 /* Above base speed windows return within 8 s: each trial of a smaller advance is a torque shortfall. */
 #define ABOVE_BASE_SHIFT 3
 
-/* Base speed over the range of speeds above it in which the window with the least current takes effect, and the reduced
+/* Base speed over the range of speeds above it in which the pulses for parts of the torque take effect, and the reduced
  * gain of the speed law: the speed error that belongs to an acceleration changes with it. */
-#define LEAST_CURRENT_RANGE 8
-#define SLOWER_RANGE 2
+#define PARTIAL_RANGE 8
+#define SLOWER_RANGE 4
 
 /* Least overlap of windows, 2^-32 electrical rev: 2 degrees. */
 #define OVERLAP_MIN 0x016C16C1u
+
+/* Of a pulse, 8 degrees. */
+#define PULSE_OVERLAP_MIN (4 * OVERLAP_MIN)
 
 /* Past any angle: the flux linkage of a motoring phase does not end with its half. */
 #define NO_END UINT32_MAX
@@ -139,7 +143,7 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
     const bool voltage_limited = fixed_abs(sample->torque_shortfall_q24) > SHORTFALL_MIN_Q24 + torque / 64;
     int32_t retract_q30 = voltage_limited ? 0 : parameters->retract_step_q30;
     if (parameters->single_pulse) {
-        state->partial_q15 = above_base_q15(tables, state->place, LEAST_CURRENT_RANGE);
+        state->partial_q15 = above_base_q15(tables, state->place, PARTIAL_RANGE);
         retract_q30 >>= state->partial_q15 > 0 ? ABOVE_BASE_SHIFT : 0;
         state->torque_q24 = smoothed_q24(state, tables->phases, sample);
         const int32_t forward_q15 = feed_forward_q15(&state->pulse, state->torque_q24);
@@ -156,7 +160,7 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
         } else if (state->partial_q15 > 0) {
             state->trim_q30 +=
                 voltage_limited || state->single_pulse
-                    ? trim_step_q30(&state->pulse, sample)
+                    ? trim_step_q30(&state->pulse, sample) >> 2
                     : -fixed_clamp(state->trim_q30, -parameters->advance_step_q30, parameters->advance_step_q30);
         } else if (state->advance_q30 == ONE_Q30 && (voltage_limited || state->level_q15 > 0)) {
             /* Sharing follows the reference at any level that is too high: without a shortfall it returns. */
@@ -172,7 +176,7 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
     }
 }
 
-static uint32_t blend(uint32_t from, uint32_t to, int32_t level_q15) {
+static inline uint32_t blend(uint32_t from, uint32_t to, int32_t level_q15) {
     const int32_t way = (int32_t)(to - from);
     return from + (uint32_t)(((int64_t)way * level_q15) >> 15);
 }
@@ -197,47 +201,49 @@ typedef struct {
     int32_t ripple_q24;
 } partial_pulse_t;
 
-/* Between two speeds. */
-static partial_pulse_t partial_pulse(const machine_partial_pulse_t *low, const conduction_state_t *state) {
-    const machine_partial_pulse_t *high = low + 1;
-    const int32_t fraction_q8 = state->place.fraction_q8;
-    const int32_t ripple_q15 = low->ripple * ONE_Q8 + (high->ripple - low->ripple) * fraction_q8;
-    return (partial_pulse_t){
-        .on = (uint32_t)(low->on * ONE_Q8 + (high->on - low->on) * fraction_q8) << 16,
-        .end = (uint32_t)(low->end * ONE_Q8 + (high->end - low->end) * fraction_q8) << 16,
-        .ripple_q24 = fixed_saturate_bits(fixed_multiply_high(state->pulse.mean_q24, ripple_q15 << 15), 30) * 4,
-    };
+/* Between four values, in Q16 of their unit: two speeds, for a part and for the next. */
+static int32_t between_four_q16(const int32_t value[4], int32_t fraction_q8, int32_t part_q8) {
+    const int32_t low_q8 = value[0] * ONE_Q8 + (value[1] - value[0]) * fraction_q8;
+    const int32_t high_q8 = value[2] * ONE_Q8 + (value[3] - value[2]) * fraction_q8;
+    return low_q8 * ONE_Q8 + (high_q8 - low_q8) * part_q8;
 }
 
-/* Between two parts of the largest torque; below the least of them its angles, and less ripple. */
-static partial_pulse_t pulse_for(const machine_tables_t *tables, const conduction_state_t *state, int32_t part_q15) {
-    const unsigned index = (unsigned)part_q15 >> 13;
-    const unsigned knot = index < MACHINE_PULSE_PARTS ? index : MACHINE_PULSE_PARTS;
+/* Below the least part of the tables with its angles, and less ripple. */
+static partial_pulse_t pulse_for_torque(const machine_tables_t *tables, const conduction_state_t *state) {
+    const unsigned index = (unsigned)state->part_q15 >> 13;
+    const unsigned above = index < MACHINE_PULSE_PARTS ? index : MACHINE_PULSE_PARTS - 1;
+    const int32_t part_q8 = (state->part_q15 - (int32_t)(above << 13)) >> 5, fraction_q8 = state->place.fraction_q8;
     const machine_partial_pulse_t(*parts)[MACHINE_PULSE_POINTS] = tables->partial_pulse[state->braking];
-    const int32_t fraction_q15 = (part_q15 - (int32_t)(knot << 13)) * 4;
-    partial_pulse_t low = partial_pulse(&parts[knot > 0 ? knot - 1 : 0][state->place.k], state);
-    partial_pulse_t high = {
-        .on = -state->pulse.lead, .end = state->pulse.end, .ripple_q24 = state->pulse.peak_q24 - state->pulse.mean_q24};
-    if (knot == 0) {
-        high = low;
-        low.ripple_q24 = 0;
-    } else if (knot < MACHINE_PULSE_PARTS) {
-        high = partial_pulse(&parts[knot][state->place.k], state);
-    }
+    const machine_partial_pulse_t *low = &parts[above > 0 ? above - 1 : 0][state->place.k];
+    const machine_partial_pulse_t *high = &parts[above][state->place.k];
+    const int32_t on[4] = {low[0].on, low[1].on, high[0].on, high[1].on};
+    const int32_t end[4] = {low[0].end, low[1].end, high[0].end, high[1].end};
+    const int32_t some = above > 0 ? INT32_MAX : 0;
+    const int32_t ripple[4] = {low[0].ripple & some, low[1].ripple & some, high[0].ripple, high[1].ripple};
+    const int32_t ripple_q22 = between_four_q16(ripple, fraction_q8, part_q8) >> 1;
+    const int32_t ripple_q24 = fixed_multiply_high(state->pulse.mean_q24, ripple_q22 << 8);
     return (partial_pulse_t){
-        .on = blend(low.on, high.on, fraction_q15),
-        .end = blend(low.end, high.end, fraction_q15),
-        .ripple_q24 = (int32_t)blend((uint32_t)low.ripple_q24, (uint32_t)high.ripple_q24, fraction_q15),
+        .on = (uint32_t)between_four_q16(on, fraction_q8, part_q8) << 8,
+        .end = (uint32_t)between_four_q16(end, fraction_q8, part_q8) << 8,
+        .ripple_q24 = fixed_saturate_bits(ripple_q24, 30) * 4,
     };
 }
 
+/* Of a motoring pulse that is narrower than a stroke, the share falls over some control periods: turn-off would be at
+ * one of them, and the torque of the strokes would differ. */
 static void set_window(const conduction_parameters_t *parameters, conduction_interval_t interval, bool braking,
                        bool partial, torque_sharing_window_t *window) {
+    uint32_t stroke = parameters->sharing.stroke, overlap = OVERLAP_MIN;
     const uint32_t width = interval.leave - interval.enter;
-    const bool narrow = partial && width < parameters->sharing.stroke + OVERLAP_MIN;
-    const uint32_t stroke =
-        narrow ? (width > 2 * OVERLAP_MIN ? width - OVERLAP_MIN : OVERLAP_MIN) : parameters->sharing.stroke;
-    const uint32_t overlap = width > stroke + OVERLAP_MIN ? width - stroke : OVERLAP_MIN;
+    if (width > stroke + OVERLAP_MIN) {
+        overlap = width - stroke;
+    }
+    const uint32_t least = braking ? OVERLAP_MIN : PULSE_OVERLAP_MIN;
+    if (partial && overlap <= least) {
+        overlap = least;
+        stroke = width > least ? width - least / 2 : least / 2;
+        interval.leave += least / 2;
+    }
     window->stroke = stroke;
     window->overlap = parameters->sharing.overlapping ? overlap : 0;
     window->reciprocal = UINT32_MAX / (overlap >> 15);
@@ -281,7 +287,7 @@ static void set_interval(const conduction_parameters_t *parameters, conduction_s
         ripple_q24 = (int32_t)blend(0, (uint32_t)(state->pulse.peak_q24 - state->pulse.mean_q24), level_q15);
     }
     if (partial_q15 > 0) {
-        const partial_pulse_t pulse = pulse_for(tables, state, state->part_q15);
+        const partial_pulse_t pulse = pulse_for_torque(tables, state);
         const int32_t trim_q24 = fixed_multiply_high(state->pulse.mean_q24, state->trim_q30) * 4;
         const int32_t trimmed_q24 = fixed_clamp(fixed_add(pulse.ripple_q24, trim_q24), 0, INT32_MAX);
         interval.on = blend(level_q15 > 0 ? interval.on : interval.enter, pulse.on, partial_q15);
@@ -291,16 +297,18 @@ static void set_interval(const conduction_parameters_t *parameters, conduction_s
         single_pulse = state->torque_q24 > state->pulse.smooth_q24 || (int32_t)pulse.on < 0 ||
                        pulse.ripple_q24 > state->pulse.mean_q24 >> 6;
     }
-    if (level_q15 > 0 || partial_q15 > 0) {
-        /* Less than half a revolution before the end: beyond, a phase would make up for no shortfall. */
-        const int32_t earliest = (int32_t)(interval.leave - HALF_REV + 1);
-        const int32_t latest = (int32_t)interval.enter > -SHARE_LEAD_MAX ? (int32_t)interval.enter : -SHARE_LEAD_MAX;
-        const int32_t enter = fixed_clamp((int32_t)interval.on, -SHARE_LEAD_MAX, latest);
-        interval.enter = (uint32_t)(enter > earliest ? enter : earliest);
-    }
     state->interval = interval;
     state->ripple_q24 = ripple_q24;
     state->single_pulse = single_pulse;
+}
+
+/* Of a pulse: its window begins at most SHARE_LEAD_MAX before the half, and less than half a revolution before its end:
+ * beyond, a phase would make up for no shortfall. */
+static void set_enter(conduction_interval_t *interval) {
+    const int32_t earliest = (int32_t)(interval->leave - HALF_REV + 1);
+    const int32_t latest = (int32_t)interval->enter > -SHARE_LEAD_MAX ? (int32_t)interval->enter : -SHARE_LEAD_MAX;
+    const int32_t enter = fixed_clamp((int32_t)interval->on, -SHARE_LEAD_MAX, latest);
+    interval->enter = (uint32_t)(enter > earliest ? enter : earliest);
 }
 
 static void set_angles(const conduction_parameters_t *parameters, conduction_state_t *state,
@@ -311,6 +319,9 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     conduction_half_t *half = &angles->half[state->braking];
     conduction_half_t *before = &angles->half[!state->braking];
     const uint32_t on = state->interval.on;
+    if (level_q15 > 0 || state->partial_q15 > 0) {
+        set_enter(&state->interval);
+    }
     angles->ripple_q24 = negative ? -state->ripple_q24 : state->ripple_q24;
     before->window = parameters->initial.half[0].window;
     before->width = half->width = HALF_REV;
@@ -336,14 +347,14 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
     switch (step) {
     case 0:
         look_up(state, tables, sample);
+        limit_torque(parameters, state, sample);
+        state->gain_excess_q31 =
+            gain_excess_q31(parameters, sample, above_base_q15(tables, state->place, SLOWER_RANGE));
         break;
     case 1:
         move(parameters, state, tables, sample);
         break;
     case 2:
-        limit_torque(parameters, state, sample);
-        state->gain_excess_q31 =
-            gain_excess_q31(parameters, sample, above_base_q15(tables, state->place, SLOWER_RANGE));
         set_interval(parameters, state, tables);
         break;
     default:

@@ -3,7 +3,7 @@
  *
  * Window advance: a torque shortfall moves the conduction windows to earlier angles (torque_sharing.h), fully within
  * 100 ms; without shortfall they return within 1 s, above base speed within 8 s. From base speed on they begin at the
- * window with the least RMS current, which is also in the tables; the advance of a motoring phase takes it back.
+ * angles of the tables for parts of the largest torque.
  *
  * Single pulse: above base speed the voltage has no time to build up the flux linkage of the torque after the unaligned
  * position. Turn-on then leads the half in which the phase makes the wanted torque, and turn-off is early enough that
@@ -20,6 +20,14 @@
  * the way by their advance is longer and leaves up to 5 % of the torque missing. With single pulses the torque
  * pulsates, and the reference of the instantaneous torque is raised by level * (T_peak - T_mean).
  *
+ * From base speed on, fully at 1.125 of it, the angles are instead those for the part of the largest mean torque,
+ *
+ *   part = T / T_mean + trim,   reference += ripple(part) + trim T_mean
+ *
+ * from tables over part and speed / voltage (tools/src/salient/machine/partial_pulse.py): torque sharing, a single
+ * pulse or what lies between, the smoothest that takes hardly more RMS current than the best pulse. Their windows may
+ * be narrower than a stroke.
+ *
  * Braking: with full -Vdc from an angle theta on, the current stays within its limit while the flux linkage is below
  * psi_t + Vdc / omega (theta_t - theta), the tangent to the flux linkage of the current limit. With torque sharing the
  * flux linkage ends at the unaligned position instead.
@@ -29,7 +37,7 @@
  *
  * The torque follows the reference once in a stroke. A speed law with a gain k of the order of the stroke rate f makes
  * every second pulse larger: the error is multiplied by 1 - k / f from stroke to stroke. From base speed on its gain is
- * reduced, at half above it to f / 4.
+ * reduced, at a quarter above it to f / 4.
  *
  * J. M. Stephenson, S. R. MacMinn, J. R. Hendershot, "Switched reluctance drives", tutorial, IEEE IAS 1990; the blend
  * and the trim derived here.
@@ -160,8 +168,8 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->latest = CONDUCTION_INITIAL;
 }
 
-/* One of the steps of an update, in turn: tables, level, positions, angles. Products are rounded down; the level to
- * 2^-15, angles of the tables to 2^-24. */
+/* One of the steps of an update, in turn: tables and limits, level, positions, angles. Products are rounded down; the
+ * level to 2^-15, angles of the tables to 2^-24. */
 void conduction_step(const conduction_parameters_t *parameters, conduction_state_t *state,
                      const machine_tables_t *tables, const conduction_sample_t *sample);
 

@@ -71,8 +71,8 @@ typedef struct {
     uint16_t peak_torque;   /* largest instantaneous sum of all phases with that pulse, N m, Q7.8 */
 } machine_pulse_t;
 
-/* For 1/4, 1/2 and 3/4 of the largest mean torque. */
-#define MACHINE_PULSE_PARTS 3
+/* For 1/4, 1/2, 3/4 and all of the largest mean torque. */
+#define MACHINE_PULSE_PARTS 4
 
 typedef struct {
     int8_t on;      /* turn-on past the begin of the half of the wanted torque, 2^-8 electrical rev; negative: before */

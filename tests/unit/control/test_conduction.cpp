@@ -114,18 +114,15 @@ struct model_t {
         return at(index, [&](unsigned k) { return tables.pulse[of_braking][k].mean_torque / 256.0; });
     }
 
-    // Turn-on, turn-off and ripple over the part of the largest torque: those of the tables, and of the largest torque.
+    // Turn-on, turn-off and ripple over the part of the largest torque.
     std::array<double, 3> pulse_for(double index) const {
         const auto table = [&](unsigned knot) -> std::array<double, 3> {
-            if (knot == MACHINE_PULSE_PARTS) {
-                return {-lead, end, peak - mean};
-            }
             const machine_partial_pulse_t *of = tables.partial_pulse[braking][knot];
             return {at(index, [&](unsigned k) { return of[k].on / 256.0; }),
                     at(index, [&](unsigned k) { return of[k].end / 256.0; }),
                     at(index, [&](unsigned k) { return of[k].ripple / 128.0; }) * mean};
         };
-        const unsigned knot = std::min(unsigned(part * 4.0), MACHINE_PULSE_PARTS + 0u);
+        const unsigned knot = std::min(unsigned(part * 4.0), MACHINE_PULSE_PARTS - 1u);
         std::array<double, 3> low = table(knot == 0 ? 0 : knot - 1), high = table(knot);
         if (knot == 0) {
             low[2] = 0.0;
@@ -164,7 +161,7 @@ struct model_t {
         if (forward == 1.0) {
             trim = 0.0;
         } else if (partial > 0.0) {
-            trim += limited || single_pulse ? step : -std::clamp(trim, -1.0 / 50.0, 1.0 / 50.0);
+            trim += limited || single_pulse ? step / 4.0 : -std::clamp(trim, -1.0 / 50.0, 1.0 / 50.0);
         } else if (advance == 1.0 && (limited || level > 0.0)) {
             trim += step;
         }
@@ -175,7 +172,7 @@ struct model_t {
             const double retract = 1.0 / 400.0 / (partial > 0.0 ? 8.0 : 1.0);
             advance = std::clamp(advance + (limited ? 1.0 / 50.0 : -retract), 0.0, 1.0);
         }
-        gain_excess = above(2.0) * (1.0 - std::min(1.0, s.step * GAIN_PER_STEP));
+        gain_excess = above(4.0) * (1.0 - std::min(1.0, s.step * GAIN_PER_STEP));
 
         const double room = std::clamp((OVER_VOLTAGE_V - s.voltage) / FOLD_BACK_V, 0.0, 1.0);
         const double motoring_max = std::min(largest(false, index), TORQUE_MAX_NM);
@@ -220,10 +217,13 @@ struct model_t {
         envelope_flux_Wb = at(index, [&](unsigned k) { return tables.braking_flux[k] / 8192.0; });
     }
 
-    double overlap() const { return std::max(leave - enter - 1.0 / PHASES, 2.0 / 360.0); }
+    double least() const { return (braking ? 2.0 : 8.0) / 360.0; }
 
-    // Of the window: a pulse may be narrower.
-    double stroke() const { return partial > 0.0 ? std::min(leave - enter - overlap(), 1.0 / PHASES) : 1.0 / PHASES; }
+    // Of the window: a pulse may be narrower than a stroke, and then its share falls over 8 degrees around its end.
+    bool narrow() const { return partial > 0.0 && leave - enter - 1.0 / PHASES < least(); }
+    double overlap() const { return narrow() ? least() : std::max(leave - enter - 1.0 / PHASES, 2.0 / 360.0); }
+    double stroke() const { return narrow() ? leave - enter - least() / 2.0 : 1.0 / PHASES; }
+    double window_end() const { return narrow() ? leave + least() / 2.0 : leave; }
 };
 
 class Conduction : public testing::Test {
@@ -254,7 +254,8 @@ class Conduction : public testing::Test {
         EXPECT_EQ(half.lead, 0u) << of;
         EXPECT_NEAR(signed_rev(half.window.overlap), model.overlap(), 2.0 * ANGLE) << of;
         EXPECT_NEAR(signed_rev(half.window.stroke), model.stroke(), 2.0 * ANGLE) << of;
-        const double turn_on = model.braking ? 1.0 - model.leave : 0.5 + model.leave - model.stroke() - model.overlap();
+        const double end = model.window_end();
+        const double turn_on = model.braking ? 1.0 - end : 0.5 + end - model.stroke() - model.overlap();
         EXPECT_NEAR(half.window.turn_on / REV, turn_on, 2.0 * ANGLE) << of;
         EXPECT_EQ(angles().half[CONDUCTION_MOTORING].end, UINT32_MAX) << of;
         EXPECT_NEAR(state.part_q15 / Q15, model.part, LEVEL) << of;

@@ -1,9 +1,9 @@
 """Conduction angles for parts of the largest mean torque at a speed (firmware/control/conduction.h).
 
 The least RMS current of a torque is that of a single pulse that is shorter than the one of the largest torque. Its
-torque pulsates. Torque sharing, whose torque is smooth, takes as little on machines that saturate, and up to a fifth more
-on machines whose torque rises and falls with the angle. So a part of the torque is made by torque sharing, by the pulse,
-or by what lies between both: the smoothest that takes at most _MORE_CURRENT of the pulse's current.
+torque pulsates. Torque sharing, whose torque is smooth, takes as little on machines that saturate, and up to a fifth
+more on machines whose torque rises and falls with the angle. So a part of the torque is made by torque sharing, by the
+pulse, or by what lies between both: the smoothest that takes at most _MORE_CURRENT of the pulse's current.
 
 Between both, a phase follows the torque reference, raised by a ripple, from the turn-on to the turn-off angle as far as
 the voltage permits; with the ripple of the pulse the voltage decides alone.
@@ -19,12 +19,15 @@ from salient.machine.definition import Machine
 from salient.machine.drive_data import DriveData
 from salient.machine.single_pulse import LANE_DEG, STEP_DEG, TURN, Pairs, Phase, SinglePulse, parabola, vertex
 
-PARTS = (0.25, 0.5, 0.75)
+PARTS = (0.25, 0.5, 0.75, 1.0)
 """Of the largest mean torque, as MACHINE_PULSE_PARTS."""
+_FOUND = PARTS[:-1]
+"""The pulse of the whole is the one of the largest torque."""
 
 _MORE_CURRENT = 1.06
-_TOWARDS_PULSE = (0.0, 0.33, 0.67)
-"""Ways from torque sharing to the pulse that are tried."""
+_TOWARDS_PULSE = np.array([[0.0, 0.0, 0.0, 0.33, 0.67], [0.0, 12.0, 24.0, 0.0, 0.0]])
+"""Ways from torque sharing to the pulse that are tried, and degrees by which the window of sharing is earlier,
+motoring."""
 _NARROW_WEIGHT = 0.1
 """Square of the current that a pulse may take more which is as wide as a stroke rather than of no width."""
 _FIRST_DEG = -162
@@ -79,16 +82,19 @@ def partial_pulse(machine: Machine, data: DriveData, of: SinglePulse) -> Partial
     window_deg = np.array(of.sharing_deg) - 180.0
     found = []
     for half, pairs in enumerate(phase.pairs(speed_rad_s)):
-        part = np.repeat(PARTS, len(speed_rad_s))
-        wanted_Nm = part * np.tile(mean_Nm[half], len(PARTS))
+        part = np.repeat(_FOUND, len(speed_rad_s))
+        wanted_Nm = part * np.tile(mean_Nm[half], len(_FOUND))
         pulse_deg = np.concatenate([_least_current_deg(pairs, share * mean_Nm[half] / machine.phases,
                                                        360.0 / machine.phases)
-                                    for share in PARTS], axis=1) - (180.0 + 180.0 * half)
-        follower = _Follower(phase, machine.phases, half, np.tile(speed_rad_s, len(PARTS)))
+                                    for share in _FOUND], axis=1) - (180.0 + 180.0 * half)
+        follower = _Follower(phase, machine.phases, half, np.tile(speed_rad_s, len(_FOUND)))
         on_deg, off_deg, reference_Nm = follower.smoothest(
             wanted_Nm, pulse_deg, window_deg if half == 0 else 180.0 - window_deg[::-1])
-        found.append([np.pad(values.reshape(len(PARTS), -1), ((0, 0), (first, 0)), mode="edge") for values in (
-            on_deg, off_deg, part * np.maximum(reference_Nm / wanted_Nm - 1.0, 0.0))])
+        whole = -of.lead_deg[half], of.end_deg[half], of.peak_Nm[half] / of.mean_Nm[half] - 1.0
+        found.append([
+            np.vstack([np.pad(values.reshape(len(_FOUND), -1), ((0, 0), (first, 0)), mode="edge"), of_whole])
+            for values, of_whole in zip((
+                on_deg, off_deg, part * np.maximum(reference_Nm / wanted_Nm - 1.0, 0.0)), whole, strict=True)])
     return PartialPulse(*(np.array(values) for values in zip(*found, strict=True)))
 
 
@@ -157,8 +163,8 @@ class _Follower:
         crest = np.maximum(pulse.peak_Nm / wanted_Nm, 1.0)
         # Of a slightly different torque.
         allowed_A = _MORE_CURRENT * pulse.rms_A * np.sqrt(wanted_Nm / pulse.mean_Nm)
-        way = np.array(_TOWARDS_PULSE)[:, None]
-        sharing_deg = sharing_deg[:, None, None]
+        way, earlier_deg = _TOWARDS_PULSE[..., None]
+        sharing_deg = sharing_deg[:, None, None] - (earlier_deg if self.sign > 0.0 else 0.0)
         angles_deg = sharing_deg + way * (pulse_deg[:, None] - sharing_deg)
         reference_Nm = wanted_Nm * (1.0 + way * (crest - 1.0))
         highest_Nm = _HIGHER_MAX * reference_Nm
