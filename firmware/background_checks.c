@@ -61,11 +61,12 @@ COLD static bool read_sample(const control_state_t *control, const control_param
 
 /* Of the sample of `input`; the integrals without the corrections that the other monitor has made. */
 COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input, const phase_monitor_t *phases,
-                                                  uint32_t encoder_angle, int32_t speed_q22) {
+                                                  uint32_t encoder_angle, const stall_input_t *motion) {
     encoder_monitor_input_t encoder = {
         .run = input->run,
         .encoder_angle = encoder_angle,
-        .speed_q22 = speed_q22,
+        .speed_q22 = motion->speed_q22,
+        .torque_q24 = motion->torque_reference_q24,
         .flux_step_max_q29 = input->period_flux_q29,
         .period = input->periods,
     };
@@ -113,8 +114,7 @@ static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_m
 /* Checks phases and encoder, and corrects the integrals. */
 COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sample) {
     const phase_monitor_input_t *input = &sample->phases;
-    const encoder_monitor_input_t encoder =
-        encoder_input(input, &drive->phases, sample->encoder_angle, sample->stall.speed_q22);
+    const encoder_monitor_input_t encoder = encoder_input(input, &drive->phases, sample->encoder_angle, &sample->stall);
     encoder_monitor_step(&drive->control_parameters.encoder_monitor, &drive->encoder, &encoder);
     int32_t correction_q29[HAL_PHASES_MAX];
     const uint32_t elapsed = input->periods - drive->phases.periods;
@@ -123,6 +123,12 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     const phase_balance_sample_t balance = balance_sample(drive, input, &encoder, elapsed, step);
     failed |= phase_balance_step(&drive->balance, &balance);
     drive->phases.phases |= drive->balance.phases;
+    const uint32_t of_phases =
+        (uint32_t)(FAULT_BIT(FAULT_PHASE_OPEN) | FAULT_BIT(FAULT_PHASE_SHORTED) | FAULT_BIT(FAULT_CURRENT_SENSOR));
+    if ((failed & of_phases) != 0 &&
+        encoder_monitor_suspects(&drive->control_parameters.encoder_monitor, &drive->encoder, drive->phases.phases)) {
+        failed = (failed & ~of_phases) | (uint32_t)FAULT_BIT(FAULT_ENCODER_ANGLE);
+    }
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         int32_t *next_q29 = &drive->control.applied_flux.next_q29[phase];
         hal_critical_enter(drive->hal);

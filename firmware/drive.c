@@ -90,27 +90,34 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     return true;
 }
 
-void drive_control_interrupt(drive_t *drive) {
-    control_sample_t sample = {
-        .missed_interrupts = hal_interrupt_missed_triggers(drive->hal),
-        .time_us = hal_time_us(drive->hal),
-    };
-    drive->break_causes = sample.break_causes = hal_pwm_break(drive->hal);
-    hal_encoder_read(drive->hal, &sample.encoder);
-    hal_adc_read(drive->hal, &sample.adc);
-    const bool run =
-        control_step(&drive->control_parameters, &drive->control, &sample, &drive->command, &drive->compare);
-    const fault_trace_values_t values = {
-        .adc = &sample.adc,
+static inline fault_trace_values_t trace_values(const drive_t *drive, const hal_adc_sample_t *adc) {
+    return (fault_trace_values_t){
+        .adc = adc,
         .compare = &drive->compare,
         .angle = drive->control.measurement.angle,
         .speed_q22 = drive->control.observer.speed_q22,
         .torque_reference_q24 = drive->control.torque_reference_q24,
     };
+}
+
+void drive_control_interrupt(drive_t *drive) {
+    hal_adc_sample_t adc;
+    control_sample_t sample = {
+        .adc = &adc,
+        .missed_interrupts = hal_interrupt_missed_triggers(drive->hal),
+        .time_us = hal_time_us(drive->hal),
+    };
+    drive->break_causes = sample.break_causes = hal_pwm_break(drive->hal);
+    hal_encoder_read(drive->hal, &sample.encoder);
+    hal_adc_read(drive->hal, &adc);
+    const bool run =
+        control_step(&drive->control_parameters, &drive->control, &sample, &drive->command, &drive->compare);
     if (run) {
         hal_pwm_write(drive->hal, &drive->compare);
+        const fault_trace_values_t values = trace_values(drive, &adc);
         fault_trace_run(&drive->trace, &values);
     } else {
+        const fault_trace_values_t values = trace_values(drive, &adc);
         hal_pwm_open_all(drive->hal);
         if (sample.break_causes != 0) {
             hal_pwm_clear_break(drive->hal);
@@ -248,24 +255,30 @@ COLD static void collect_telemetry(drive_t *drive, uint32_t time_us, drive_telem
     hal_critical_leave(drive->hal);
 }
 
+/* What is due of the telemetry. */
+COLD NOINLINE static void send_telemetry(drive_t *drive, uint32_t time_us) {
+    if (!comms_telemetry_due(&drive->comms, time_us)) {
+        return;
+    }
+    bus_monitor_step(&drive->comms.bus, drive->hal, time_us);
+    if (drive->comms.bus.run_inhibited) {
+        commands_disarm(&drive->comms.commands);
+    }
+    if (drive->comms.bus.status.state == HAL_CAN_BUS_OFF) {
+        arming_end_configuration(&drive->comms.commands.arming);
+    }
+    drive_telemetry_t values;
+    collect_telemetry(drive, time_us, &values);
+    comms_telemetry(&drive->comms, drive->hal, &values);
+}
+
 COLD void drive_background(drive_t *drive) {
     const uint32_t time_us = hal_time_us(drive->hal);
     background_checks(drive, time_us);
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_CHECKED);
     keep_memory(drive, time_us);
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_STORED);
-    if (comms_telemetry_due(&drive->comms, time_us)) {
-        bus_monitor_step(&drive->comms.bus, drive->hal, time_us);
-        if (drive->comms.bus.run_inhibited) {
-            commands_disarm(&drive->comms.commands);
-        }
-        if (drive->comms.bus.status.state == HAL_CAN_BUS_OFF) {
-            arming_end_configuration(&drive->comms.commands.arming);
-        }
-        drive_telemetry_t values;
-        collect_telemetry(drive, time_us, &values);
-        comms_telemetry(&drive->comms, drive->hal, &values);
-    }
+    send_telemetry(drive, time_us);
     const parameters_conditions_t conditions = {
         .running = !may_configure(drive),
         .dc_link_voltage_q6 = drive->control.measurement.dc_link_voltage_q6,

@@ -17,16 +17,16 @@
 
 enum { STATE_RUN = 2 };
 
-#define SLOW_EVERY 50
-#define FAST_NS UINT64_C(150000000)
-#define SLOW_NS UINT64_C(400000000)
-#define AFTER_NS UINT64_C(1000000) /* watched after the reaction */
+#define SLOW_TICKS 50                      /* a slow fault begins at every 50th tick, */
+#define SLOW_POSITIONS 10                  /* or at every tenth position */
+#define SLOW_NS UINT64_C(100000000)        /* of a reaction; the drive of a slower one runs on for many periods */
+#define UNANSWERED_NS UINT64_C(1000000000) /* without a reaction until then: none */
+#define AFTER_NS UINT64_C(1000000)         /* watched after a reaction, at least */
 #define VARIANTS_MAX 80
 
 typedef struct {
     unsigned kind, phase, leg;
     double value; /* of its attribute */
-    bool slow;
 } variant_t;
 
 /* Shared with the children. */
@@ -74,21 +74,6 @@ static const struct {
     {FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET, -50.0},
 };
 
-/* Found within a few electrical periods, or by what adds up. */
-static bool is_slow(unsigned kind) {
-    static const unsigned slow[] = {
-        FAULT_ENCODER_LOST_COUNTS,   FAULT_ENCODER_SLIP,  FAULT_ENCODER_REVERSED, FAULT_COULOMB_FRICTION,
-        FAULT_STATIC_FRICTION,       FAULT_LOAD_DROPPED,  FAULT_DIODE_OPEN,       FAULT_CURRENT_SENSOR_GAIN,
-        FAULT_SHAFT_LOCKED,          FAULT_SUPPLY_RIPPLE, FAULT_BACKGROUND_HUNG,  FAULT_CURRENT_SENSOR_OFFSET,
-        FAULT_CURRENT_SENSOR_SWAPPED};
-    for (unsigned i = 0; i < sizeof slow / sizeof *slow; i++) {
-        if (slow[i] == kind) {
-            return true;
-        }
-    }
-    return false;
-}
-
 static double attribute_of(unsigned kind) {
     for (unsigned i = 0; i < sizeof attributes / sizeof *attributes; i++) {
         if (attributes[i].kind == kind) {
@@ -107,8 +92,7 @@ static unsigned list_variants(variant_t variants[VARIANTS_MAX], const machine_t 
             continue;
         }
         for (unsigned leg = 0; leg <= fault_kinds[kind].has_leg; leg++) {
-            variants[count++] =
-                (variant_t){.kind = kind, .leg = leg, .value = attribute_of(kind), .slow = is_slow(kind)};
+            variants[count++] = (variant_t){.kind = kind, .leg = leg, .value = attribute_of(kind)};
         }
     }
     return count;
@@ -139,7 +123,7 @@ static struct {
     unsigned count;
     tally_t *tallies;
     bool child;
-    uint64_t settled_ns, tick, begin_ns, reaction_ns;
+    uint64_t settled_ns, tick, begin_ns, reaction_ns, watched_until_ns;
     tally_t *tally;
 } branching;
 
@@ -175,15 +159,22 @@ static void before_interrupt_of_child(run_t *run) {
     if (!branching.reaction_ns && run->oracle.causes) {
         branching.reaction_ns = run->oracle.cause_us * 1000;
     }
-    if ((branching.reaction_ns && now_ns > branching.reaction_ns + AFTER_NS) || now_ns >= run->end_ns) {
+    const bool watched = now_ns > branching.reaction_ns + AFTER_NS && now_ns >= branching.watched_until_ns;
+    if ((branching.reaction_ns && watched) || now_ns >= run->end_ns) {
         finish_child(run);
     }
 }
 
+/* By the places where it has begun so far. */
+static bool is_slow(const tally_t *tally) {
+    return tally->longest_ns > SLOW_NS || tally->detected < tally->branches;
+}
+
 static void branch_here(run_t *run) {
+    const branch_setting_t *setting = branching.setting;
+    const unsigned slow_every = setting->speed_rpm > 0.0 ? SLOW_TICKS : SLOW_POSITIONS;
     for (unsigned i = 0; i < branching.count; i++) {
-        const variant_t *variant = &branching.variants[i];
-        if (variant->slow && branching.tick / branching.setting->every % SLOW_EVERY != 0) {
+        if (is_slow(&branching.tallies[i]) && (branching.tick - setting->first) % slow_every != 0) {
             continue;
         }
         const pid_t child = fork();
@@ -191,9 +182,10 @@ static void branch_here(run_t *run) {
             branching.child = true;
             branching.tally = &branching.tallies[i];
             branching.begin_ns = run->rig.board.time_ns;
-            run->end_ns = branching.begin_ns + (variant->slow ? SLOW_NS : FAST_NS);
+            branching.watched_until_ns = branching.begin_ns + branching.tally->longest_ns * 3 / 2;
+            run->end_ns = branching.begin_ns + UNANSWERED_NS;
             run->before_interrupt = before_interrupt_of_child;
-            begin_fault(run, variant);
+            begin_fault(run, &branching.variants[i]);
             return;
         }
         int status;

@@ -1,5 +1,9 @@
 /* Every fault at every control tick: the process is forked before a control interrupt, and the fault begins in the
- * child. */
+ * child. A branch lasts 1.5 times the longest time that the drive has taken so far to react to that fault, and until
+ * 1 ms after the reaction, or 1 s without one. A fault to which it has once reacted after more than 100 ms, or not
+ * at all, begins from then on at the places only whose number from the first is a multiple of 50 ticks or of 10
+ * positions.
+ */
 #ifndef CAMPAIGN_BRANCH_H
 #define CAMPAIGN_BRANCH_H
 
@@ -12,7 +16,7 @@ typedef struct {
     double
         speed_rpm; /* 0: starts to 150 r/min from `ticks` positions a degree apart; the fault begins with state run */
     double load_Nm;
-    unsigned first, ticks, every; /* every `every`-th tick of `ticks`, from the first on; slow faults a 50th of them */
+    unsigned first, ticks, every; /* every `every`-th tick of `ticks`, from the first on */
 } branch_setting_t;
 
 /* Reads BRANCH_ARGUMENTS words. */

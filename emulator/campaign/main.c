@@ -44,7 +44,8 @@ static oracle_drive_t view(void) {
     const state_machine_t *state_machine = &host.drive.control.state_machine;
     return (oracle_drive_t){.state = (uint8_t)state_machine->state,
                             .fault = (uint8_t)state_machine->record.fault,
-                            .checks = (uint32_t)state_machine->record.fault_mask};
+                            .checks = (uint32_t)state_machine->record.fault_mask,
+                            .angle = host.drive.control.measurement.angle};
 }
 
 static const run_drive_t drive = {start, view};

@@ -12,6 +12,13 @@
 #define RECENT_NS (2 * MS_NS)
 #define MARGIN 1.02
 #define RUN_MAX_NS (502 * MS_NS) /* of a run, since the last request */
+#define OBSERVED_S 1e-3          /* time constant of a speed that is observed */
+#define STRETCH_COUNTS 16.0
+#define STRETCH_MIN_NS (2 * MS_NS)
+#define STRETCH_MAX_NS (32 * MS_NS)
+#define STRETCH_SPEED 0.1 /* change of the speed, at most */
+#define ANGLE_ERROR_MAX_COUNTS 0.75
+#define TIMER_TICK_S 5e-9
 
 enum { STATE_INITIALISE, STATE_READY, STATE_RUN, STATE_FAULT };
 
@@ -150,9 +157,22 @@ static uint32_t causes_of_script(const world_event_t *event) {
                                                                          : 0;
 }
 
+/* Of the encoder on the shaft, in revolutions. */
+static double encoder_offset_rev(const world_t *world) {
+    double offset_deg = 0.0;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = &world->event[i];
+        if (event->kind == WORLD_SET && event->what == BENCH_VARIABLE_ENCODER_OFFSET_DEG && world_active(world, i, 0)) {
+            offset_deg = event->raw * bench_variables[event->what].scale;
+        }
+    }
+    return offset_deg / 360.0;
+}
+
 void oracle_init(oracle_t *oracle, const world_t *world, const sender_t *sender, uint64_t period_ns) {
     *oracle = (oracle_t){.world = world, .sender = sender, .period_ns = period_ns};
     oracle->voltage_recent_low_V = INFINITY;
+    oracle->encoder_offset_rev = encoder_offset_rev(world);
 }
 
 static bool any_injected(const oracle_t *oracle, unsigned first, unsigned last) {
@@ -252,6 +272,18 @@ static bool may_be_deaf(const oracle_t *oracle, uint64_t time_us) {
     return other_sender(oracle, false, time_us) || any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM);
 }
 
+/* Frames of the only sender, sent once more while it is silent, are its frames: nothing but the arming tells them. */
+static bool impersonated(const oracle_t *oracle) {
+    bool silent = false, replayed = false;
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = &oracle->world->event[i];
+        const bool kept = oracle->world->kept >> i & 1u;
+        silent = silent || (kept && event->kind == WORLD_SILENT);
+        replayed = replayed || (kept && event->kind == WORLD_HOSTILE && event->what == WORLD_HOSTILE_REPLAY);
+    }
+    return silent && replayed;
+}
+
 static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     const uint64_t now_ns = plant->time_ns;
     const bool deaf = may_be_deaf(oracle, now_ns / 1000);
@@ -294,6 +326,43 @@ static void look_at_limits(oracle_t *oracle, const plant_t *plant, unsigned gate
     }
 }
 
+/* What the encoder reads, or when, is not the rotor's motion alone, or memory of the drive was changed. */
+static bool angle_disturbed(const oracle_t *oracle, uint64_t time_us) {
+    return any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) ||
+           any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
+           any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) ||
+           variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_us);
+}
+
+/* At the instant of the measurement. */
+static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
+    oracle_stretch_t *stretch = &oracle->stretch;
+    if (oracle->drive.state != STATE_RUN) {
+        stretch->samples = 0;
+        return;
+    }
+    const double counts_per_rev = ldexp(1.0, (int)oracle->world->encoder_bits);
+    const double true_rev = plant->rotor_angle_rad / TWO_PI + oracle->encoder_offset_rev;
+    const double counts = true_rev * counts_per_rev;
+    const bool steady = fabs(plant->speed_rad_s - stretch->speed_rad_s) <= STRETCH_SPEED * fabs(stretch->speed_rad_s);
+    if (stretch->samples == 0 || !steady || plant->time_ns > stretch->begin_ns + STRETCH_MAX_NS) {
+        *stretch =
+            (oracle_stretch_t){.begin_ns = plant->time_ns, .begin_counts = counts, .speed_rad_s = plant->speed_rad_s};
+    }
+    const double error_rev = ldexp((double)oracle->drive.angle, -32) - true_rev;
+    stretch->error_counts += (error_rev - floor(error_rev + 0.5)) * counts_per_rev;
+    stretch->samples++;
+    if (fabs(counts - stretch->begin_counts) < STRETCH_COUNTS || plant->time_ns < stretch->begin_ns + STRETCH_MIN_NS) {
+        return;
+    }
+    const double mean_counts = stretch->error_counts / stretch->samples;
+    const double tick_counts = fabs(plant->speed_rad_s) / TWO_PI * TIMER_TICK_S * counts_per_rev;
+    if (fabs(mean_counts) > ANGLE_ERROR_MAX_COUNTS + tick_counts && !angle_disturbed(oracle, plant->time_ns / 1000)) {
+        violate(oracle, "wrong_angle", plant->time_ns, 0, mean_counts);
+    }
+    stretch->samples = 0;
+}
+
 /* --- Eventually --- */
 
 double oracle_recovery_speed_rpm(oracle_t *oracle, const plant_t *plant) {
@@ -311,12 +380,13 @@ double oracle_recovery_speed_rpm(oracle_t *oracle, const plant_t *plant) {
 }
 
 /* Part of the speed that a drive of one quadrant may have at most: it cannot take away what the torque limit adds in
- * three periods and while the voltage removes the largest flux linkage. */
+ * three periods, while its speed is observed and while the voltage removes the largest flux linkage. */
 static double most_of_one_quadrant(const oracle_t *oracle, const plant_t *plant) {
     const machine_t *machine = plant->machine;
     magnetics_point_t aligned;
     magnetics_evaluate(&plant->magnetics, 0.0, oracle->world->machine->trip_current_A, &aligned);
-    const double late_s = 3e-9 * (double)oracle->period_ns + aligned.flux_linkage_Wb / machine->supply_voltage_V;
+    const double late_s =
+        3e-9 * (double)oracle->period_ns + OBSERVED_S + aligned.flux_linkage_Wb / machine->supply_voltage_V;
     const double added_rad_s =
         late_s * oracle->world->machine->torque_max_Nm / (machine->inertia_kg_m2 * oracle->world->inertia_gain);
     return fmax(1.2, 1.05 + added_rad_s * RPM_PER_RAD_S / fabs(oracle->recovery_rpm));
@@ -333,10 +403,27 @@ static void look_at_recovery(oracle_t *oracle, const plant_t *plant) {
     oracle->settled = oracle->settled || (oracle->in_band_ns && plant->time_ns >= oracle->in_band_ns + 2 * MS_NS);
 }
 
+/* Lines of safe torque off that differed for 200 ms keep a drive in a fault until both have been without energy. */
+static bool sto_lines_differed(const oracle_t *oracle) {
+    const world_t *world = oracle->world;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = &world->event[i];
+        if ((world->kept >> i & 1u) && event->kind == WORLD_SET &&
+            (event->what == BENCH_VARIABLE_STO_1 || event->what == BENCH_VARIABLE_STO_2) &&
+            (event->end_us == 0 || event->end_us > event->begin_us + 195000)) {
+            return true;
+        }
+    }
+    return false;
+}
+
 /* True when what keeps a drive in a fault is still there: nothing to be judged. */
 static bool cause_remains(const oracle_t *oracle) {
     if (any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_PERIOD_REGISTER_FLIPPED)) {
         return true; /* memory that has changed: until a reset */
+    }
+    if (sto_lines_differed(oracle)) {
+        return true;
     }
     const uint8_t last = oracle->causes ? oracle->cause[oracle->causes - 1] : 0;
     return last == CAUSE_WINDING_OVERLOAD || last == CAUSE_INVERTER_OVERLOAD || last == CAUSE_IDENTIFIER_CONFLICT;
@@ -439,6 +526,21 @@ static bool true_of_plant(const oracle_t *oracle, unsigned cause, const plant_t 
     }
 }
 
+/* Phases with a fault of their own in the last quarter of a second. */
+static unsigned phases_at_fault(const oracle_t *oracle, uint64_t now_us) {
+    const world_t *world = oracle->world;
+    unsigned phases = 0;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = &world->event[i];
+        const bool recent = event->begin_us <= now_us && (event->end_us == 0 || event->end_us + 250000 > now_us);
+        if ((world->kept >> i & 1u) && event->kind == WORLD_FAULT && event->what <= FAULT_CURRENT_SENSOR_SWAPPED &&
+            recent) {
+            phases |= 1u << event->phase;
+        }
+    }
+    return phases;
+}
+
 static void judge_cause(oracle_t *oracle, const plant_t *plant) {
     const world_t *world = oracle->world;
     const uint64_t now_us = plant->time_ns / 1000;
@@ -458,6 +560,13 @@ static void judge_cause(oracle_t *oracle, const plant_t *plant) {
             allowed |= causes;
             any = any || causes;
         }
+    }
+    /* With one phase that has conducted so far a wrong current and a wrong angle are the same; and two phases with
+     * faults of their own are what a wrong angle looks like. */
+    const unsigned phases = phases_at_fault(oracle, now_us);
+    const bool of_phase = any_injected(oracle, FAULT_WINDING_OPEN, FAULT_CURRENT_SENSOR_SWAPPED);
+    if ((of_phase && !oracle->turned) || (phases & (phases - 1u)) != 0) {
+        allowed |= BIT(CAUSE_ENCODER_ANGLE);
     }
     const unsigned cause = oracle->drive.fault;
     const bool own_work = cause == CAUSE_OVER_CURRENT || cause == CAUSE_HARDWARE_OVER_CURRENT; /* of the drive */
@@ -482,8 +591,11 @@ static void enter_run(oracle_t *oracle, const plant_t *plant) {
 
 void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive_t drive) {
     const uint8_t before = oracle->drive.state;
+    const double stroke_rad = TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
+    oracle->turned = oracle->turned || fabs(plant->rotor_angle_rad - oracle->run_angle_rad) > stroke_rad;
     oracle->drive = drive;
     oracle->interrupt_ns = plant->time_ns;
+    look_at_angle(oracle, plant);
     unsigned gates = gates_on(plant);
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         const half_bridge_pattern_t *pattern = &plant->pattern[phase];
@@ -514,6 +626,8 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
             violate(oracle, "not_recovered", plant->time_ns, 3, drive.fault);
         }
     } else if (drive.state == STATE_RUN && before != STATE_RUN) {
+        oracle->run_angle_rad = plant->rotor_angle_rad;
+        oracle->turned = false;
         enter_run(oracle, plant);
     } else if (drive.state == STATE_READY && before == STATE_RUN) {
         const uint64_t age_ns = plant->time_ns > oracle->run_ns ? plant->time_ns - oracle->run_ns : 0;
@@ -522,7 +636,7 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
             violate(oracle, "stopped", plant->time_ns, 0, 0.0);
         }
     } else if (drive.state != STATE_FAULT && before == STATE_FAULT && !oracle->clear_seen && !state_changed(oracle) &&
-               !may_be_deaf(oracle, plant->time_ns / 1000)) {
+               !may_be_deaf(oracle, plant->time_ns / 1000) && !impersonated(oracle)) {
         violate(oracle, "no_command", plant->time_ns, 5, 0.0);
     }
 }

@@ -1,6 +1,6 @@
 /* Judges a run in terms of the plant: true currents, speed, voltage and gate signals, the frames that its senders
- * meant, and of the drive its state and first fault only. Shares no code with the firmware or with the emulator's own
- * checks.
+ * meant, and of the drive its state, its first fault and the angle that it has measured only. Shares no code with the
+ * firmware or with the emulator's own checks.
  *
  * never
  *   over_current    a phase's true current, with a gate of it on, above the comparators' threshold by more than a
@@ -15,6 +15,10 @@
  *   over_speed      a gate on for 2 ms at a speed above the limit by 2 %
  *   over_voltage    a gate on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no
  *                   energy back, unless a fault of the only sensor hides it
+ *   wrong_angle     in state run, encoder and processor healthy, at a speed that is steady within 10 % for 2 ms and 16
+ *                   counts of the encoder: the measured angle off the encoder's by more than three quarters of a count
+ *                   and the motion in a tick of the timer, on average. The middle of a count is off by half of one at
+ *                   most, when sampling is in step with the counts, the time of an edge by a tick
  *   wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
  *   not_first       a first cause that is not the first one, by its number, of the checks that failed in its tick
  *   false_alarm     a fault of the drive without any other, which is not true of the plant, or the drive's own work
@@ -48,7 +52,17 @@ typedef struct {
     uint8_t state;   /* initialise, ready, run, fault */
     uint8_t fault;   /* first cause, number of drive.dbc */
     uint32_t checks; /* failed ones of the tick that latched it */
+    uint32_t angle;  /* of the encoder by the last measurement, 2^-32 rev */
 } oracle_drive_t;
+
+/* Motion at a steady speed, over which the error of the measured angle is averaged. */
+typedef struct {
+    unsigned samples; /* 0: begins with the next one */
+    uint64_t begin_ns;
+    double begin_counts; /* of the encoder, continued over revolutions */
+    double speed_rad_s;  /* at the begin */
+    double error_counts; /* sum, positive: ahead in the direction of counting */
+} oracle_stretch_t;
 
 typedef struct {
     const char *rule;
@@ -78,6 +92,10 @@ typedef struct {
     double peak_A[HAL_PHASES_MAX]; /* of the last looks, decaying not: of the last millisecond */
     double speed_recent_rad_s, voltage_recent_high_V, voltage_recent_low_V, current_recent_A;
     uint64_t recent_ns;
+    double run_angle_rad;      /* of the rotor at the start of the run */
+    bool turned;               /* by a stroke since */
+    double encoder_offset_rev; /* on the shaft, in counting direction */
+    oracle_stretch_t stretch;
     /* Recovery. */
     double recovery_rpm;
     uint64_t recovered_run_ns, settle_by_ns, in_band_ns;

@@ -21,7 +21,6 @@ void commands_init(commands_t *commands) {
 
 COLD void commands_disarm(commands_t *commands) {
     arming_disarm(&commands->arming);
-    commands->receiver.locked = false;
     commands->used = commands->ran = false;
     commands->errors = 0;
 }
@@ -117,6 +116,8 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
         return reject_command(commands, &counters->wrong_length);
     }
     const uint16_t data_id_of_node = (uint16_t)(data_id + commands->data_id_offset);
+    commands->receiver.locked =
+        commands->arming.armed || time_us - commands->last_received_us < COMMANDS_SENDER_LOST_US;
     switch (e2e_check(&commands->receiver, data_id_of_node, frame->data, frame->length)) {
     case E2E_ACCEPTED:
         break;
@@ -161,7 +162,6 @@ static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const h
     const bool request = frame->data[E2E_HEADER_BYTES] == ARMING_STEP_REQUEST_RUN;
     switch (arming_receive(&commands->arming, hal, frame, stopped && (commanded || request), time_us)) {
     case ARMING_ARMED:
-        commands->receiver.locked = true;
         commands->armed_us = time_us;
         publish(commands, command);
         return COMMANDS_COMMAND;

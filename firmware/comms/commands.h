@@ -13,7 +13,8 @@
  * or among fewer than COMMANDS_ERROR_STEP valid ones, are the fault command_error. Up to two frames lost in
  * succession are no error; nor is the last accepted frame once more, same counter and same checksum, as a gateway or
  * a disturbed acknowledgement duplicates it: it is dropped and counted. After more lost ones the sender is out of
- * sequence: the drive ends in a fault, and has to be armed again. A second sender slower than one frame in
+ * sequence: the drive ends in a fault, and has to be armed again. While the drive is not armed another sender is
+ * followed once the present one has been silent for COMMANDS_SENDER_LOST_US. A second sender slower than one frame in
  * COMMANDS_ERROR_STEP of the first (2.56 s at 100 frames per second) has no effect but to be counted.
  *
  * PARAMETER_WRITE and PARAMETER_SET_CONTROL pass while the drive is armed for configuration. Their sequence counter
@@ -35,6 +36,10 @@
 
 /* Longest time from the arming to a request to run. */
 #define COMMANDS_ARMED_UNUSED_US 500000u
+
+/* Silence of the present sender before another one is followed: three frames at 100 per second, more than may be lost.
+ * Frames of the past, sent once more in their order, do not take its place meanwhile. */
+#define COMMANDS_SENDER_LOST_US 30000u
 
 /* Numbers of frames since start; each counter saturates at 65535. */
 typedef struct {

@@ -1,11 +1,16 @@
 #include "control/bp_network.h"
 
 #include <assert.h>
+#include <stddef.h>
 
 #include "fixed/compiler.h"
 #include "fixed/sigmoid.h"
 
 static_assert(BP_INPUTS == 3 && BP_OUTPUTS == 3, "inputs and outputs are processed as vectors of three");
+
+static_assert(offsetof(bp_neuron_t, input) == offsetof(bp_neuron_t, output) + sizeof(vec3_momentum_t) &&
+                  sizeof(bp_neuron_t) == offsetof(bp_neuron_t, input) + sizeof(vec3_momentum_t),
+              "bp_network_learn goes on after each vector");
 
 static int32_t next_weight(uint32_t *generator) {
     *generator = *generator * 1664525u + 1013904223u; /* W. H. Press et al., "Numerical Recipes", ranqd1; modulo 2^32 */
@@ -57,13 +62,15 @@ void bp_network_learn(const bp_network_parameters_t *parameters, bp_network_t *n
                                            sigmoid_logistic_slope_q33(network->output_q27[l])) *
                        2;
     }
+    bp_neuron_t *neuron = network->hidden;
     for (unsigned i = 0; i < BP_HIDDEN; i++) {
-        bp_neuron_t *neuron = &network->hidden[i];
         const int32_t activation_q27 = neuron->activation_q27;
         /* The hidden layer learns through the output weights before their update. */
-        const int32_t back_q28 = vec3_dot_and_momentum_step(&neuron->output, delta_q32, activation_q27, momentum_q32);
+        int32_t back_q28;
+        vec3_momentum_t *input =
+            vec3_dot_and_momentum_step(&neuron->output, delta_q32, activation_q27, momentum_q32, &back_q28);
         const int32_t rate_q28 =
             fixed_multiply_high(back_q28, sigmoid_symmetric_slope_q32(activation_q27)); /* eta d2 */
-        vec3_momentum_step(&neuron->input, input_q31, rate_q28, momentum_q32);
+        neuron = vec3_momentum_step(input, input_q31, rate_q28, momentum_q32);
     }
 }

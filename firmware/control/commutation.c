@@ -27,15 +27,16 @@ commutation_parameters_t commutation_configure(const commutation_angles_t *angle
 void commutation_find(const commutation_parameters_t *parameters, uint32_t rotor_angle, commutation_t *commutation) {
     const uint32_t electrical = commutation_electrical(parameters, rotor_angle);
     commutation->electrical = electrical;
-    /* Complete strokes since turn-on of phase 0: the phase turned on last, and its angle past turn-on. */
+    /* Complete strokes since turn-on of phase 0: the phase turned on last, and its angle past turn-on. A number of
+     * phases that has changed in memory is no index beyond the phases. */
     const uint32_t since_phase_0_on = electrical - parameters->turn_on;
-    const unsigned newest = (unsigned)(((uint64_t)since_phase_0_on * parameters->phases) >> 32);
+    const unsigned newest = (unsigned)(((uint64_t)since_phase_0_on * parameters->phases) >> 32) % HAL_PHASES_MAX;
     const uint32_t since_on = since_phase_0_on - newest * parameters->stroke;
     unsigned active = COMMUTATION_NONE;
     unsigned outgoing = COMMUTATION_NONE;
     if (since_on < parameters->active_width) {
         active = newest;
-        const unsigned previous = LIKELY(newest > 0) ? newest - 1 : parameters->phases - 1;
+        const unsigned previous = LIKELY(newest > 0) ? newest - 1 : (parameters->phases - 1) % HAL_PHASES_MAX;
         if (since_on + parameters->stroke < parameters->available_width) { /* at most two strokes: no overflow */
             outgoing = previous;
         }

@@ -18,12 +18,20 @@
 /* Error that a step corrects, 0.08 rad: a load step teaches little before the end of its stroke, where learning stops.
  */
 #define STEP_MAX_Q10 (4 << 10)
-/* At a wide bandwidth of the observer the signal is stronger against the noise, and the ripple is large meanwhile. */
-#define WIDE_FASTER 4
 /* The mean of the square of the sum: 25 ms at 40 kHz, updates every 8 periods. */
 #define COMMON_POWER_SHIFT 8
-/* Its rate is an eighth: the sum is smaller than its parts, and the noise is not. */
-#define COMMON_SLOWER 8
+/* Its rate is half of the phases': the sum is smaller than its parts, and the noise is not. */
+#define COMMON_SLOWER 2
+/* Corner of high-pass and low-pass of the sum and of y in rad per stroke, and the largest gain of both. */
+#define BAND_FACTOR 4
+#define BAND_GAIN_MAX_Q16 (1 << 15)
+/* Under a load that moves: a quarter of the rate, from 50 strokes a second on, steps of 0.2 ms. */
+#define MOVING_SHIFT 2
+/* After 1.2 s: an encoder that is displaced by more than can be learned has been found before
+ * (drive/encoder_monitor.h).
+ */
+#define MOVING_SETTLES 2
+#define STROKE_PART_MIN_Q16 655
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings) {
     const uint32_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
@@ -75,10 +83,13 @@ NOINLINE void misalignment_step(const misalignment_parameters_t *parameters, mis
     const bool settled = misalignment->steady_updates >= parameters->settle_updates;
     if (steady) {
         misalignment->steady_updates += !settled;
-    } else if (sample->condition == MISALIGNMENT_UNSTEADY || !torque_suffices) {
+    } else if (sample->condition == MISALIGNMENT_UNSTEADY) {
         misalignment->steady_updates = 0;
     }
     const bool learning = steady && settled;
+    misalignment->common_rate = learning                                 ? MISALIGNMENT_RATE_FULL
+                                : sample->undisturbed && torque_suffices ? MISALIGNMENT_RATE_BEYOND_LOAD
+                                                                         : MISALIGNMENT_RATE_NONE;
     /* Means over the time since the state became steady, at most 100 ms: before, the load was another. */
     const int32_t phases = (int32_t)tables->phases;
     const int32_t growing_memory_q16 = FILTER_GAIN_MAX_Q16 / ((int32_t)misalignment->steady_updates / phases + 1);
@@ -103,47 +114,59 @@ NOINLINE void misalignment_step(const misalignment_parameters_t *parameters, mis
     const int32_t square_q24 = product_q24(alternating_q24, alternating_q24);
     low_pass_step(&misalignment->power_q24, fixed_saturate((int64_t)square_q24 * phases), mean_gain_q16 / phases + 1);
     low_pass_step(&misalignment->disturbance_mean_q24, disturbance_q24, mean_gain_q16 / phases + 1);
-    if (!learning) {
-        return;
+    if (learning) {
+        /* Mean of y since the last update of the phase: at most four updates, 32 bits each. */
+        const int32_t recent_mean_q24 =
+            4 * ((int32_t)((misalignment->disturbance_sum_q24 - sum_before_q24) >> 2) / phases);
+        const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
+        const int32_t torque_square_q24 = product_q24(sample->torque_q24, sample->torque_q24);
+        const int32_t power_q24 =
+            fixed_add(misalignment->power_q24, fixed_multiply(torque_square_q24, POWER_FLOOR_Q20, 20));
+        /* Q24 * Q24 to Q30, divided by Q20: Q10. */
+        const int32_t step_q10 =
+            limited_step_q10(fixed_multiply(error_q24, alternating_q24, 18) / ((power_q24 >> 4) + 1));
+        phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + (int64_t)step_q10 * parameters->rate_q30);
     }
-
-    const int32_t torque_square_q24 = product_q24(sample->torque_q24, sample->torque_q24);
-    const int32_t power_q24 =
-        fixed_add(misalignment->power_q24, fixed_multiply(torque_square_q24, POWER_FLOOR_Q20, 20));
-    /* Mean of y since the last update of the phase: at most four updates, 32 bits each. */
-    const int32_t recent_mean_q24 = 4 * ((int32_t)((misalignment->disturbance_sum_q24 - sum_before_q24) >> 2) / phases);
-    const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
-    /* Q24 * Q24 to Q30, divided by Q20: Q10. */
-    const int32_t step_q10 = limited_step_q10(fixed_multiply(error_q24, alternating_q24, 18) / ((power_q24 >> 4) + 1));
-    const int64_t offset_q40 =
-        phase->offset_q40 + (int64_t)step_q10 * parameters->rate_q30 * (sample->wide ? WIDE_FASTER : 1);
-    phase->offset_q40 = clamped_offset_q40(offset_q40);
     /* 0.02 rad is twice the probe angle. */
     phase->offset = fixed_multiply((int32_t)fixed_shift(phase->offset_q40, 12), (int32_t)parameters->probe_angle, 27);
 }
 
+/* Part of a value around the frequency of the strokes. */
+static int32_t band_pass_step(misalignment_band_t *band, int32_t value_q24, int32_t gain_q16) {
+    low_pass_step(&band->mean_q24, value_q24, gain_q16);
+    low_pass_step(&band->value_q24, fixed_subtract(value_q24, band->mean_q24), gain_q16);
+    return band->value_q24;
+}
+
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                              int32_t disturbance_q24, int32_t torque_q24) {
+                              int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16) {
     /* A quarter of the sum over the phases, which fits; those that the machine has not have slope 0. */
-    int32_t quarter_q24 = 0;
+    int32_t sum_q24 = 0;
     for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
-        const misalignment_phase_t *phase = &misalignment->phase[i];
-        quarter_q24 += fixed_subtract(phase->slope_lag2_q24, phase->slope_mean_q24) / 4;
+        sum_q24 += misalignment->phase[i].slope_lag2_q24 / 4;
     }
+    const int32_t gain_q16 = fixed_clamp(stroke_part_q16, 0, BAND_GAIN_MAX_Q16 / BAND_FACTOR) * BAND_FACTOR;
+    const int32_t quarter_q24 = band_pass_step(&misalignment->common_slope, sum_q24, gain_q16);
+    const int32_t error_q24 = band_pass_step(&misalignment->common_disturbance, disturbance_q24, gain_q16);
     const int64_t square_q40 = fixed_product(quarter_q24, quarter_q24) >> 8;
     misalignment->common_power_q40 += (square_q40 - misalignment->common_power_q40) >> COMMON_POWER_SHIFT;
-    if (misalignment->steady_updates < parameters->settle_updates) {
+    const bool learning = misalignment->common_rate == MISALIGNMENT_RATE_FULL;
+    if (learning) {
+        misalignment->beyond_load_steps = 0;
+    } else if (misalignment->common_rate == MISALIGNMENT_RATE_NONE || stroke_part_q16 < STROKE_PART_MIN_Q16) {
+        return;
+    } else if (misalignment->beyond_load_steps < MOVING_SETTLES * parameters->settle_updates) {
+        misalignment->beyond_load_steps++;
         return;
     }
     const int32_t power_q22 = fixed_saturate(misalignment->common_power_q40 >> 18);
-    /* T^2 2^-22 of the square of a quarter: 0.0012 T^2 / rad^2. */
+    /* T^2 2^-26 of the square of a quarter: 0.00007 T^2 / rad^2. */
     const int32_t torque_q10 = torque_q24 >> 14;
-    const int32_t floor_q22 = (torque_q10 * torque_q10 >> 23) + 1;
-    const int32_t error_q24 = fixed_subtract(disturbance_q24, misalignment->disturbance_mean_q24);
+    const int32_t floor_q22 = (torque_q10 * torque_q10 >> 27) + 1;
     /* y 4 q / (16 q^2), q the quarter. */
     const int32_t step_q10 =
         limited_step_q10(fixed_multiply(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));
-    const int64_t step_q40 = (int64_t)step_q10 * parameters->common_rate_q30;
+    const int64_t step_q40 = ((int64_t)step_q10 * parameters->common_rate_q30) >> (learning ? 0 : MOVING_SHIFT);
     for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
         misalignment_phase_t *phase = &misalignment->phase[i];
         phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + step_q40);

@@ -16,18 +16,23 @@
  * slopes of two overlapping phases nearly cancel, and at high speeds much smaller after the observer than those of the
  * phases, which alternate more slowly. So the same law learns that angle once more, normalised by itself:
  *
- *   d delta / dt = rate / 8 y S / (mean of S^2 + 0.0012 T^2 / rad^2),   S = sum s_j
+ *   d delta / dt = rate / 2 y S / (mean of S^2 + 0.00007 T^2 / rad^2),   S = sum s_j
  *
- * At 600 r/min it takes 2 s instead of 10.
+ * Both alternate with the strokes, so y and S pass through the same band-pass around their frequency: the slopes jump
+ * where phases are turned on and off, and sampling them folds the harmonics of these jumps to frequencies far below,
+ * where the observer's lag does not suppress them; the quantisation of the encoder likewise, to far above.
  *
  * y is the load estimate plus the torque that the speed correction stands for, -(J / Ts) l2 e, which responds within
  * 1 / w0; s_j passes through two first-order filters of 1 / (1.6 w0), about the same delay. A correction indexed by the
  * rotor angle in bins could cancel any error, not only a misalignment, but would have dozens of values to learn from
  * the same signal instead of one per phase.
  *
- * s_j is filtered by the observer's present bandwidth; where that is wider than in steady state, the phases learn four
- * times as fast. Learning is suspended unless speed and load are steady, the torque is above 1 N m and the voltage is
- * not limited; a large misalignment itself disturbs every stroke, and is learned between these disturbances.
+ * A load that moves has little in that band from 50 strokes a second on, so that the common angle is learned under it,
+ * after 1.2 s at a quarter of the rate.
+ *
+ * s_j is filtered by the observer's present bandwidth. Learning of the phases is suspended unless speed and load are
+ * steady, the torque is above 1 N m and the voltage is not limited; a large misalignment itself disturbs every stroke,
+ * and is learned between these disturbances.
  */
 #ifndef CONTROL_MISALIGNMENT_H
 #define CONTROL_MISALIGNMENT_H
@@ -41,7 +46,7 @@
 typedef struct {
     uint32_t probe_angle;    /* 0.01 rad mechanical, 2^-32 electrical rev; s_j is the torque change over twice that */
     int32_t rate_q30;        /* rate times the update interval of a phase, Q1.30; 0: no learning */
-    int32_t common_rate_q30; /* the same for the common angle, an eighth of that rate, Q1.30 */
+    int32_t common_rate_q30; /* the same for the common angle, half of that rate, Q1.30 */
     int32_t filter_q32;      /* 1.6 times the update interval, s, Q0.32 */
     int32_t mean_q16;        /* 10 / s times the update interval, Q0.16 */
     int32_t inertia_rate_q8; /* J / Ts: N m per rad/s, Q23.8 */
@@ -56,14 +61,29 @@ typedef struct {
     int32_t offset;       /* delta_j, 2^-32 electrical rev, to subtract from the phase's angle */
 } misalignment_phase_t;
 
+/* Of the common angle. */
+typedef enum {
+    MISALIGNMENT_RATE_NONE,
+    MISALIGNMENT_RATE_BEYOND_LOAD, /* a quarter, where the strokes are faster than a load moves */
+    MISALIGNMENT_RATE_FULL,
+} misalignment_rate_t;
+
+/* Band-pass around the frequency of the strokes, N m, Q7.24. */
+typedef struct {
+    int32_t mean_q24, value_q24; /* low-pass of its input; and of the rest */
+} misalignment_band_t;
+
 typedef struct {
     misalignment_phase_t phase[HAL_PHASES_MAX];
     int64_t disturbance_sum_q24;  /* sum of y over all updates, N m, Q24; 2^37 updates fit */
     int32_t disturbance_mean_q24; /* mean of y, N m, Q7.24 */
     int32_t power_q24;            /* mean of sum s_j^2, Q7.24 */
     uint32_t steady_updates;
-    int64_t common_power_q40; /* mean of (sum s_j / 4)^2, (N m per 0.02 rad)^2, Q40 */
-    unsigned phase_index;     /* phase to update, in turn */
+    int64_t common_power_q40; /* mean of the band's (sum s_j / 4)^2, (N m per 0.02 rad)^2, Q40 */
+    misalignment_band_t common_slope, common_disturbance; /* of sum s_j / 4, N m per 0.02 rad, and of y */
+    uint32_t beyond_load_steps;      /* of the common angle since the load was last steady, until they learn */
+    misalignment_rate_t common_rate; /* by the conditions of the last misalignment_step */
+    unsigned phase_index;            /* phase to update, in turn */
 } misalignment_t;
 
 typedef enum {
@@ -78,8 +98,8 @@ typedef struct {
     int32_t disturbance_q24;  /* y, N m, Q7.24 */
     int32_t torque_q24;       /* reference, N m, Q7.24 */
     uint32_t bandwidth_rad_s; /* of the load observer */
-    bool wide;                /* wider than in steady state */
     misalignment_condition_t condition;
+    bool undisturbed; /* all but the load is steady */
 } misalignment_sample_t;
 
 typedef struct {
@@ -106,8 +126,9 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
                        const machine_tables_t *tables, const misalignment_sample_t *sample);
 
 /* One sample: updates the offset that the phases have in common, from the slopes of the last misalignment_step of each,
- * while those learn. Disturbance and torque reference in N m, Q7.24; rounding as there. */
+ * while those learn, or more slowly while only the load may move. Disturbance and torque reference in N m, Q7.24;
+ * stroke_part_q16: part of a stroke since the last step, from 0; rounding as there. */
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                              int32_t disturbance_q24, int32_t torque_q24);
+                              int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16);
 
 #endif

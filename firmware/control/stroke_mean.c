@@ -13,16 +13,30 @@ stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_
     return (stroke_mean_parameters_t){.phases = phases, .settle_updates = update_rate_hz * SETTLE_MS / 1000u};
 }
 
+/* Part by which the mean that is compared with follows that of a stroke: time constant twice the settling time. */
+static int32_t following_q16(const stroke_mean_parameters_t *parameters, uint32_t updates) {
+    const uint32_t since_last = updates * parameters->phases; /* of the phase, below 2^18 */
+    const uint32_t settle = parameters->settle_updates;
+    return since_last < settle ? (int32_t)((since_last << 13) / settle << 2) : 1 << 15;
+}
+
+static bool differs(int32_t mean_q24, int32_t other_q24, int32_t tolerance_q24) {
+    return fixed_abs(fixed_subtract(mean_q24, other_q24)) > tolerance_q24;
+}
+
 static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, int32_t torque_q24) {
     /* The sum is that of Q7.24 numbers: in units of 2^8 it fits in 32 bits for 2^8 updates, of 2^16 for 2^16. */
     const unsigned shift = mean->updates < 256 ? 8 : 16;
     const int32_t mean_q24 = (int32_t)(mean->sum_q24 >> shift) / (int32_t)mean->updates * (1 << shift);
     int32_t *constant_q24 = &mean->constant_q24[mean->stroke % HAL_PHASES_MAX];
-    const int32_t change_q24 = fixed_abs(fixed_subtract(mean_q24, *constant_q24));
     const bool disturbed = mean->disturbed || mean->disturbed_strokes > 0;
-    const int32_t torque_share_q24 = fixed_abs(torque_q24) / (disturbed ? 8 : 16);
-    if (change_q24 > TOLERANCE_Q24 + torque_share_q24) {
-        *constant_q24 = mean_q24;
+    const int32_t tolerance_q24 = TOLERANCE_Q24 + fixed_abs(torque_q24) / (disturbed ? 8 : 16);
+    const bool own_differs = differs(mean_q24, *constant_q24, tolerance_q24);
+    const int32_t change_q24 = fixed_subtract(mean_q24, *constant_q24);
+    *constant_q24 +=
+        own_differs ? change_q24 : fixed_multiply(change_q24, following_q16(parameters, mean->updates), 16);
+    if (own_differs && differs(mean_q24, mean->changed_q24, tolerance_q24)) {
+        mean->changed_q24 = mean_q24;
         const uint32_t strokes = SETTLE_STROKES * mean->updates;
         mean->remaining = strokes > parameters->settle_updates ? strokes : parameters->settle_updates;
         mean->disturbed_strokes = 0;

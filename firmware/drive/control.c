@@ -8,7 +8,6 @@
 #include "drive/speed_control.h"
 #include "drive/supervise.h"
 #include "drive/torque_control.h"
-#include "fixed/compiler.h"
 
 void control_reset(const control_parameters_t *parameters, control_state_t *state) {
     *state = (control_state_t){0};
@@ -68,10 +67,6 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     if (run) {
         state->torque_reference_q24 = speed_control_torque_q24(parameters, &state->observer, sample, deferred);
         torque_control(parameters, state, deferred, measured);
-        const uint32_t lost = state->lost_phase;
-        if (!LIKELY(lost == 0)) { /* the laws of hysteresis and duty know of no lost phase */
-            state->duty_q15[lost - 1u] = -MODULATOR_DUTY_ONE_Q15;
-        }
         modulate(state->duty_q15, machine_tables.phases, parameters->period_ticks, parameters->interleaved_pwm,
                  compare);
     } else {

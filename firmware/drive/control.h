@@ -99,7 +99,7 @@ typedef struct {
 
 /* Inputs of one control period as the HAL delivers them. */
 typedef struct {
-    hal_adc_sample_t adc;
+    const hal_adc_sample_t *adc;
     hal_encoder_sample_t encoder;
     uint32_t missed_interrupts; /* since the previous period */
     uint32_t break_causes;      /* HAL_PWM_BREAK_* */
@@ -175,7 +175,8 @@ typedef struct {
 void control_reset(const control_parameters_t *parameters, control_state_t *state);
 
 /* Resets the controllers for the next run. Required after a change of parameters, which is possible outside RUN only;
- * leaving RUN does it too. Not part of entering RUN because initialising a network takes as long as a learning step. */
+ * leaving RUN does it too, after a fault in the first period without a failed check. Not part of entering RUN because
+ * initialising a network takes as long as a learning step. */
 void control_prepare(const control_parameters_t *parameters, control_state_t *state);
 
 /* One control period. command: the last accepted one, COMMAND_OFF before the first. Returns false when every switch

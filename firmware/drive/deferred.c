@@ -8,6 +8,9 @@
 #define OBSERVER_MASK UINT32_C(0xFFFF0000)
 #define OBSERVER_STEP UINT32_C(0x00010000)
 
+/* From the slopes of a sample to their effect on the load observer, periods. */
+#define SLOPE_LAG_PERIODS 5
+
 /* From here on the results of earlier inputs are without effect, but for those that are kept. */
 void deferred_reset_run(control_state_t *state) {
     deferred_request_t *request = &state->deferred_request;
@@ -130,18 +133,23 @@ static bool disturbed(const control_parameters_t *parameters, const deferred_inp
     return input->bandwidth.stage < parameters->bandwidth.moving_stage;
 }
 
+/* Speed control in which neither a disturbance nor the voltage adds to the ripple. A misalignment of a quarter of a
+ * stroke moves the speed by more than an eighth, and learning it ends that. */
+static bool undisturbed_speed_control(const control_parameters_t *parameters, const deferred_t *deferred,
+                                      const deferred_input_t *input) {
+    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
+    return deferred->mode == DRIVE_MODE_SPEED && speed_error_q22 < fixed_abs(input->speed_q22) / 8 &&
+           !disturbed(parameters, input) && input->torque_shortfall_q24 == 0;
+}
+
 /* The misalignment is observable while speed, load and voltage are steady. In torque mode nothing keeps the speed
  * steady; a dynamometer that does hides the ripple of the torque, and what the observer then takes for a load would be
  * learned. */
-static misalignment_condition_t condition(const control_parameters_t *parameters, const deferred_t *deferred,
-                                          const deferred_input_t *input) {
-    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
-    if (deferred->mode != DRIVE_MODE_SPEED || !deferred->load_constant ||
-        speed_error_q22 >= fixed_abs(input->speed_q22) / 8) {
+static misalignment_condition_t condition(const deferred_t *deferred, bool undisturbed) {
+    if (deferred->mode != DRIVE_MODE_SPEED || !deferred->load_constant) {
         return MISALIGNMENT_UNSTEADY;
     }
-    const bool steady = !disturbed(parameters, input) && input->torque_shortfall_q24 == 0 &&
-                        stroke_mean_shows_load(&deferred->stroke_mean);
+    const bool steady = undisturbed && stroke_mean_shows_load(&deferred->stroke_mean);
     return steady ? MISALIGNMENT_STEADY : MISALIGNMENT_INTERRUPTED;
 }
 
@@ -154,23 +162,32 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
                                const deferred_input_t *input) {
     const commutation_t commutation = {.electrical = input->electrical};
     const unsigned phase = deferred->misalignment.phase_index;
+    const uint32_t lag =
+        (uint32_t)rotation(parameters, input) * parameters->commutation.rotor_poles * SLOPE_LAG_PERIODS;
+    const bool undisturbed = undisturbed_speed_control(parameters, deferred, input);
     const misalignment_sample_t sample = {
         .current_q9 = input->current_q9,
         .angle = commutation_angle(&parameters->commutation, &commutation, phase) -
-                 (uint32_t)deferred->misalignment.phase[phase].offset,
+                 (uint32_t)deferred->misalignment.phase[phase].offset - lag,
         .disturbance_q24 = disturbance_q24(deferred, input),
         .torque_q24 = input->torque_reference_q24,
         .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth.stage],
-        .wide = input->bandwidth.stage < parameters->bandwidth.steady_stage_edge,
-        .condition = condition(parameters, deferred, input),
+        .condition = condition(deferred, undisturbed),
+        .undisturbed = undisturbed,
     };
     misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);
+}
+
+/* Part of a stroke that passes between two steps of the common misalignment, Q16. */
+static int32_t stroke_part_q16(const control_parameters_t *parameters, const deferred_input_t *input) {
+    const uint32_t strokes = parameters->commutation.rotor_poles * machine_tables.phases;
+    return fixed_saturate((int64_t)fixed_abs(rotation(parameters, input)) * strokes * DEFERRED_COMMON_PERIODS >> 16);
 }
 
 static void learn_common_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                       const deferred_input_t *input) {
     misalignment_common_step(&parameters->misalignment, &deferred->misalignment, disturbance_q24(deferred, input),
-                             input->torque_reference_q24);
+                             input->torque_reference_q24, stroke_part_q16(parameters, input));
 }
 
 static void learn_periodic_load(const control_parameters_t *parameters, deferred_t *deferred,
@@ -263,11 +280,11 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
     case 2:
         learn_common_misalignment(parameters, deferred, input);
         move_conduction(parameters, deferred, input);
-        set_speed_law(parameters, deferred);
         break;
     case 6:
         identify_inertia(parameters, deferred, input);
         move_conduction(parameters, deferred, input);
+        set_speed_law(parameters, deferred);
         break;
     default:
         learn_misalignment(parameters, deferred, input);

@@ -38,6 +38,11 @@
  * have within a quarter of a second (SHOWN_SHIFT), the contradiction of one alone is not the encoder's. */
 #define AGREES_SHIFT 10
 
+/* Part of a stroke that the rotor advances within 1/256 s when it brings the next phase within 1/4 s; and counts of the
+ * encoder that show it. */
+#define ADVANCE_STROKES 64u
+#define ADVANCE_COUNTS 2u
+
 /* Time without a zero of the current after which an integral is too old to contradict the angle: 1/128 s. */
 #define AGE_SHIFT 7
 
@@ -46,6 +51,10 @@
 
 /* Window for the speed: 1/2048 s. */
 #define WINDOW_SHIFT 11
+
+/* Windows within which the encoder turns round faster than the rotor, from and to a speed of 1/64 of the limit. */
+#define REVERSAL_WINDOWS 3u
+#define REVERSAL_SHIFT 6
 
 /* Mechanical angle in which a free rotor at the torque limit reaches the speed whose back-EMF is the error of the
  * voltage that is none, twice, in rad: 4 degrees, Q20. */
@@ -100,6 +109,12 @@ static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const en
            fixed_multiply_high(input->current_q9[index] << 12, parameters->resistance_error_q40);
 }
 
+/* Error of the integral that is none, Wb, Q2.29, age control periods after the phase was without current. */
+static int32_t drift_since_zero_q29(const encoder_monitor_parameters_t *parameters,
+                                    const encoder_monitor_input_t *input, unsigned index, uint32_t age) {
+    return fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, index, true) * (int32_t)age);
+}
+
 /* False when no angle at all explains the integral at the measured current, by the tolerances of contradicts(): then
  * the phase, its sensor or the voltage is at fault, not the encoder. */
 static bool fits_an_angle(const encoder_monitor_parameters_t *parameters, const encoder_monitor_input_t *input,
@@ -110,8 +125,7 @@ static bool fits_an_angle(const encoder_monitor_parameters_t *parameters, const 
     }
     const int32_t flux_q29 = input->flux_q29[index];
     const flux_range_t range = flux_range(HALF_REV, HALF_REV, input->current_q9[index], CURRENT_ERROR_Q9);
-    const int32_t drift_q29 =
-        fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, index, true) * (int32_t)age);
+    const int32_t drift_q29 = drift_since_zero_q29(parameters, input, index, age);
     const int32_t least_q29 = range.least_q29 - (range.least_q29 >> GAIN_SHIFT);
     const int32_t most_q29 = fixed_add(range.most_q29, range.most_q29 >> GAIN_SHIFT);
     return flux_q29 >= fixed_subtract(least_q29, drift_q29) && flux_q29 <= fixed_add(most_q29, drift_q29);
@@ -187,8 +201,7 @@ static bool contradicts(const encoder_monitor_parameters_t *parameters, encoder_
     const int32_t flux_q29 = input->flux_q29[index];
     const flux_range_t range =
         flux_range(angle, parameters->angle_max + parameters->half_count, input->current_q9[index], CURRENT_ERROR_Q9);
-    const int32_t drift_q29 =
-        fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, index, true) * (int32_t)age);
+    const int32_t drift_q29 = drift_since_zero_q29(parameters, input, index, age);
     const bool below = flux_q29 < range.least_q29;
     const int32_t limit_q29 = below ? range.least_q29 : range.most_q29;
     const int32_t beyond_q29 = below ? fixed_subtract(limit_q29, flux_q29) : fixed_subtract(flux_q29, limit_q29);
@@ -240,10 +253,29 @@ static bool others_agree(const encoder_monitor_parameters_t *parameters, encoder
     return all;
 }
 
+/* True while the encoder shows a rotor that turns the way the torque drives it. */
+static bool advances(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
+                     const encoder_monitor_input_t *input) {
+    const commutation_parameters_t *commutation = &parameters->commutation;
+    const int32_t least = (int32_t)(commutation->stroke / commutation->rotor_poles / ADVANCE_STROKES +
+                                    ADVANCE_COUNTS * 2u * parameters->middle);
+    const int32_t travel = (int32_t)(input->encoder_angle - monitor->waypoint);
+    const int32_t advance = input->torque_q24 < 0 ? fixed_subtract(0, travel) : travel;
+    if (advance < 0 || advance >= least) {
+        monitor->waypoint = input->encoder_angle;
+    }
+    if (advance >= least) {
+        monitor->advanced = true;
+        monitor->advanced_at = input->period;
+    }
+    return monitor->advanced && input->period - monitor->advanced_at <= parameters->rate_hz >> ALONE_SHIFT;
+}
+
 static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                        const encoder_monitor_input_t *input, uint32_t periods, bool counted) {
     const uint32_t electrical =
         commutation_electrical(&parameters->commutation, input->encoder_angle + parameters->middle);
+    const bool next_decides = advances(parameters, monitor, input);
     unsigned contradicting = 0;
     bool alone = false;
     monitor->suspicious = false;
@@ -260,10 +292,25 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
             phase->agrees = 0;
         }
         contradicting += shows(parameters, phase, input->period);
-        alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT &&
+        alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT && !next_decides &&
                  !others_agree(parameters, monitor, index, input->period);
     }
     monitor->angle |= contradicting >= CONTRADICTING_PHASES || alone;
+}
+
+/* Notes when the encoder has turned round. clear: faster than its counts and the rotor's swings. */
+static void note_reversal(encoder_monitor_t *monitor, int32_t turned, bool clear, uint32_t rate_hz) {
+    const bool backwards = turned < 0;
+    if (!clear) {
+        return;
+    }
+    if (backwards != monitor->backwards &&
+        monitor->window_period - monitor->turned_at <= REVERSAL_WINDOWS * (rate_hz >> WINDOW_SHIFT)) {
+        monitor->reversed = true;
+        monitor->reversed_at = monitor->window_period;
+    }
+    monitor->backwards = backwards;
+    monitor->turned_at = monitor->window_period;
 }
 
 static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
@@ -272,7 +319,8 @@ static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_
     if (periods < parameters->rate_hz >> WINDOW_SHIFT) {
         return;
     }
-    const uint32_t travel = (uint32_t)fixed_abs((int32_t)(input->encoder_angle - monitor->window_angle));
+    const int32_t turned = (int32_t)(input->encoder_angle - monitor->window_angle);
+    const uint32_t travel = (uint32_t)fixed_abs(turned);
     const uint64_t limit = (uint64_t)parameters->travel * periods;
     const uint64_t count = 2 * (uint64_t)parameters->middle;
     const bool above = fixed_abs(input->speed_q22) > parameters->over_speed_q22;
@@ -280,6 +328,16 @@ static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_
                           (travel > limit + limit / 16 + count || (above && travel + count > limit - limit / 32));
     monitor->window_period = input->period;
     monitor->window_angle = input->encoder_angle;
+    note_reversal(monitor, turned, travel > (limit >> REVERSAL_SHIFT) + count, parameters->rate_hz);
+}
+
+bool encoder_monitor_suspects(const encoder_monitor_parameters_t *parameters, const encoder_monitor_t *monitor,
+                              uint32_t phases) {
+    bool any = monitor->reversed && monitor->period - monitor->reversed_at <= parameters->rate_hz >> SHOWN_SHIFT;
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+        any |= monitor->phase[phase].shown && (phases >> phase & 1u) == 0;
+    }
+    return any;
 }
 
 static void start(encoder_monitor_t *monitor, const encoder_monitor_input_t *input) {
@@ -313,6 +371,8 @@ COLD void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, e
     monitor->angle = false;
     monitor->suspicious = false;
     monitor->counted = false;
+    monitor->advanced = false;
+    monitor->waypoint = input->encoder_angle;
     forget_references(monitor);
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         monitor->phase[phase].contradicted = 0;

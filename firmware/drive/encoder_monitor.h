@@ -6,6 +6,7 @@
  *   angle       the integrated flux linkage of two phases is outside what the tables allow around the encoder's angle:
  *               offset, slip, wrong direction, a constant reading of another angle. Of one alone unless all
  *               others have agreed a short time ago: then the phase has a fault of its own (drive/phase_monitor.h).
+ *               Nor while the rotor advances with the torque: it brings the next phase, which decides.
  *   over-speed  by the encoder's counts over half a millisecond: a sixteenth above the limit; or from a thirty-second
  *               below it when the observer's speed, which is finer, is above. Of the observer alone it is none: after
  *               an edge that came too early, or with a rotor on which it has just begun, its speed is not the rotor's.
@@ -47,6 +48,7 @@ typedef struct {
     bool run;
     uint32_t encoder_angle;    /* start of the encoder count, 2^-32 rev */
     int32_t speed_q22;         /* of the observer, rad/s, Q9.22 */
+    int32_t torque_q24;        /* of the speed law, N m, Q7.24 */
     int32_t flux_step_max_q29; /* DC-link voltage times the control period, Wb, Q2.29 */
     int32_t current_q9[HAL_PHASES_MAX];
     uint32_t period;                  /* of the sample, modulo 2^32 */
@@ -81,6 +83,13 @@ typedef struct {
     uint32_t encoder_angle;         /* then */
     uint32_t window_period;         /* of the start of the window for the speed */
     uint32_t window_angle;
+    bool backwards; /* direction of the last window with a clear travel, which ended in the period turned_at */
+    uint32_t turned_at;
+    bool reversed; /* faster than a rotor, last in the period reversed_at */
+    uint32_t reversed_at;
+    bool advanced; /* the rotor, in this run, last in the period advanced_at */
+    uint32_t advanced_at;
+    uint32_t waypoint; /* angle from which it advances, 2^-32 rev */
     encoder_monitor_phase_t phase[HAL_PHASES_MAX];
 } encoder_monitor_t;
 
@@ -95,5 +104,11 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
  * [background] */
 void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                           const encoder_monitor_input_t *input);
+
+/* True when in the last quarter of a second a phase other than those whose bits are set has contradicted the angle, or
+ * the encoder has turned round faster than a rotor: what has failed in these phases is the angle's, too. [background]
+ */
+bool encoder_monitor_suspects(const encoder_monitor_parameters_t *parameters, const encoder_monitor_t *monitor,
+                              uint32_t phases);
 
 #endif

@@ -8,6 +8,7 @@
 
 #include "drive_enumerations.h"
 #include "fixed/compiler.h"
+#include "fixed/dual16.h"
 #include "hal_adc.h"
 #include "hal_pwm.h"
 
@@ -22,9 +23,14 @@ typedef struct {
 
 typedef struct {
     fault_trace_period_t period[FAULT_TRACE_PERIODS]; /* zeros: before the start */
-    uint32_t next;                                    /* place of the next one, the oldest */
-    bool kept;
+    uint32_t next; /* modulo FAULT_TRACE_PERIODS: place of the next period, the oldest; and FAULT_TRACE_KEPT or 0 */
 } fault_trace_t;
+
+#define FAULT_TRACE_KEPT (2u * FAULT_TRACE_PERIODS)
+
+static inline bool fault_trace_kept(const fault_trace_t *trace) {
+    return (trace->next & FAULT_TRACE_KEPT) != 0;
+}
 
 /* Values of a period, in the formats of the control laws. */
 typedef struct {
@@ -37,14 +43,14 @@ typedef struct {
 
 /* Records a period in RUN. [interrupt] */
 ALWAYS_INLINE void fault_trace_run(fault_trace_t *trace, const fault_trace_values_t *values) {
-    fault_trace_period_t *period = &trace->period[trace->next];
+    const uint32_t place = trace->next % FAULT_TRACE_PERIODS;
+    fault_trace_period_t *period = &trace->period[place];
     IN_REGISTER(period);
     period->adc = *values->adc;
     period->adc.load_torque_counts = (uint16_t)(values->angle >> 16);
-    period->motion = ((uint32_t)values->torque_reference_q24 & 0xFFFF0000u) | (uint32_t)values->speed_q22 >> 16;
+    period->motion = dual16_pack_upper(values->speed_q22, values->torque_reference_q24);
     period->compare = *values->compare;
-    trace->next = (trace->next + 1u) % FAULT_TRACE_PERIODS;
-    trace->kept = false;
+    trace->next = place + 1u;
 }
 
 /* Records a period in another state, unless the trace is kept. [interrupt] */

@@ -42,7 +42,7 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
 
 static inline int32_t measure_current_q9(int32_t scale_q18, const control_sample_t *sample, unsigned phase,
                                          control_measurement_t *measured) {
-    const int32_t current_q9 = scale_counts(sample->adc.phase_current_counts[phase], scale_q18);
+    const int32_t current_q9 = scale_counts(sample->adc->phase_current_counts[phase], scale_q18);
     measured->current_q9[phase] = current_q9;
     return current_q9;
 }
@@ -101,7 +101,7 @@ void measure(const control_parameters_t *parameters, const load_observer_t *obse
              const int32_t misalignment[HAL_PHASES_MAX], const predictive_torque_t *predictive,
              const control_sample_t *sample, control_measurement_t *measured) {
     measure_angle(parameters, observer, &sample->encoder, measured);
-    measured->dc_link_voltage_q6 = scale_counts(sample->adc.bus_voltage_counts, parameters->voltage_scale_q18);
+    measured->dc_link_voltage_q6 = scale_counts(sample->adc->bus_voltage_counts, parameters->voltage_scale_q18);
     sums_t sums;
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
         measured->commutation.electrical = commutation_electrical(&parameters->commutation, measured->angle);

@@ -37,7 +37,7 @@ typedef struct {
     const phase_monitor_input_t *input;
     bool lost;         /* triggers were lost since the previous input: the integral is wrong */
     uint32_t elapsed;  /* control periods since the previous input */
-    uint32_t step;     /* rotation since then, 2^-32 electrical rev */
+    int32_t step;      /* rotation since then, 2^-32 electrical rev */
     int32_t offset_q9; /* tolerance of a current, A, Q7.9 */
     int32_t delay_q29; /* tolerance of a flux linkage, Wb, Q2.29 */
 } common_t;
@@ -100,7 +100,9 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
     const uint32_t far = distance + ANGLE_TOLERANCE;
     if (high_q29 > most_q29(common, far < HALF_REV ? far : HALF_REV - 1, current_q9, common->offset_q9)) {
         *side = 1;
-        return high_q29 > most_q29(common, HALF_REV - 1, current_q9, 0) ? BEYOND_ANGLES : WITHIN_ANGLES;
+        /* What tables of a wrong angle have added shows no more than an angle. */
+        const int32_t by_voltage_q29 = fixed_subtract(high_q29, fixed_non_negative(state->followed_q29));
+        return by_voltage_q29 > most_q29(common, HALF_REV - 1, current_q9, 0) ? BEYOND_ANGLES : WITHIN_ANGLES;
     }
     if (low_q29 < least_q29(common, distance > ANGLE_TOLERANCE ? distance - ANGLE_TOLERANCE : 0, current_q9)) {
         *side = -1;
@@ -202,10 +204,13 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     const bool off = (monitor->lost >> phase & 1u) != 0;
     if (common->input->run && !common->lost && !off) {
         difference = compare(common, state, phase, &side);
+        const bool conducts = common->input->current_q9[phase] > SMALL_CURRENT * common->offset_q9;
+        monitor->agreed |= (uint32_t)(difference == AGREES && conducts) << phase;
     }
     monitor->suspicious |= difference != AGREES;
     const bool beyond = difference == BEYOND_ANGLES;
-    state->turned = side == 0 || side != state->side ? 0 : fixed_saturate((int64_t)state->turned + common->step);
+    state->turned =
+        side == 0 || side != state->side ? 0 : fixed_saturate((int64_t)state->turned + fixed_abs(common->step));
     state->side = (int8_t)side;
     if (state->turned >= TURN_MIN) {
         monitor->doubted |= 1u << phase;
@@ -220,21 +225,24 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     return failed;
 }
 
-/* Differences that an angle may explain: the encoder's, when more than one phase has them within an electrical
- * revolution. */
-static uint32_t judge_doubts(phase_monitor_t *monitor, uint32_t step) {
+/* Differences that an angle may explain: the phase's, when it alone has them within an electrical revolution in which
+ * all others have conducted without; else they decide nothing here, and may be the encoder's. */
+static uint32_t judge_doubts(phase_monitor_t *monitor, unsigned phases, int32_t step) {
     if (monitor->doubted == 0) {
-        monitor->doubt_turned = 0;
+        monitor->doubt_turned_q24 = 0;
+        monitor->agreed = 0;
         return 0;
     }
-    const uint32_t before = monitor->doubt_turned;
-    monitor->doubt_turned += step;
-    if (monitor->doubt_turned >= before) {
+    monitor->doubt_turned_q24 = fixed_add(monitor->doubt_turned_q24, step / 256);
+    if (fixed_abs(monitor->doubt_turned_q24) < 1 << 24) {
         return 0;
     }
     const uint32_t doubted = monitor->doubted;
     monitor->doubted = 0;
-    if ((doubted & (doubted - 1u)) != 0) {
+    const uint32_t agreed = monitor->agreed;
+    monitor->agreed = 0;
+    const uint32_t all = (1u << phases) - 1u;
+    if ((doubted & (doubted - 1u)) != 0 || ((doubted | agreed | monitor->lost) & all) != all) {
         return 0;
     }
     monitor->phases |= doubted;
@@ -298,7 +306,7 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
         .input = input,
         .lost = input->late_interrupts != monitor->late_interrupts,
         .elapsed = elapsed,
-        .step = (uint32_t)fixed_abs((int32_t)(input->electrical - monitor->electrical)),
+        .step = (int32_t)(input->electrical - monitor->electrical),
         .offset_q9 = tables->current_range_q9 / 128,
         .delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)input->periods_per_ms),
     };
@@ -348,7 +356,7 @@ COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_
     }
     monitor->suspicious |= in_excess != 0;
     if (input->run) {
-        failed |= judge_doubts(monitor, common.step);
+        failed |= judge_doubts(monitor, tables->phases, common.step);
     }
     /* The current that one phase lacks is read in another. */
     const uint32_t lacking = failed != 0 && input->run ? phases_that_lack(&common, monitor) : 0;

@@ -82,13 +82,14 @@ typedef struct {
     uint32_t late_interrupts;
     uint32_t periods;
     uint32_t electrical;
-    uint32_t lost_at;      /* period of the last input with lost triggers */
-    uint32_t failed;       /* FAULT_BITs, of a run until its end */
-    uint32_t phases;       /* bit of each phase of which a check has failed since the last run began */
-    uint32_t doubted;      /* bit of each phase with a difference that an angle may explain */
-    int doubted_side;      /* of the last one */
-    uint32_t doubt_turned; /* rotation since the first one, 2^-32 electrical rev */
-    uint32_t lost;         /* bit of each phase that stays off, phase_monitor_lose() */
+    uint32_t lost_at;         /* period of the last input with lost triggers */
+    uint32_t failed;          /* FAULT_BITs, of a run until its end */
+    uint32_t phases;          /* bit of each phase of which a check has failed since the last run began */
+    uint32_t doubted;         /* bit of each phase with a difference that an angle may explain */
+    int doubted_side;         /* of the last one */
+    uint32_t agreed;          /* bit of each phase that has conducted without a difference since */
+    int32_t doubt_turned_q24; /* rotation since the first one, electrical rev, Q7.24 */
+    uint32_t lost;            /* bit of each phase that stays off, phase_monitor_lose() */
     phase_monitor_phase_t phase[HAL_PHASES_MAX];
 } phase_monitor_t;
 

@@ -95,7 +95,7 @@ static int32_t transducer_torque_q24(const control_parameters_t *parameters, uin
 static int32_t sliding_mode_torque_q24(const control_parameters_t *parameters, const load_observer_t *observer,
                                        const control_sample_t *sample, const deferred_speed_results_t *law) {
     const int32_t load_q24 = parameters->load_from_transducer
-                                 ? transducer_torque_q24(parameters, sample->adc.load_torque_counts)
+                                 ? transducer_torque_q24(parameters, sample->adc->load_torque_counts)
                                  : observer->load_torque_q24;
     return speed_smc_torque_q24(&parameters->speed_smc, law->speed_law_torque_q24, observer->speed_q22, load_q24,
                                 law->torque_min_q24, law->torque_max_q24);

@@ -30,8 +30,10 @@ COLD void state_machine_start_in_fault(state_machine_t *state_machine, uint64_t 
     latch_fault(state_machine, fault_mask);
 }
 
-/* By members, because a call of memset takes 44 instructions. */
-static void clear(fault_record_t *record) {
+/* The record by members, because a call of memset takes 44 instructions. */
+static void end_fault(state_machine_t *state_machine) {
+    fault_record_t *record = &state_machine->record;
+    state_machine->state = DRIVE_STATE_READY;
     record->fault = FAULT_NONE;
     record->time_us = 0;
     record->fault_mask = 0;
@@ -76,8 +78,7 @@ bool state_machine_stands(state_machine_t *state_machine, uint64_t fault_mask, c
             all_but_timeout == 0 && request == COMMAND_CLEAR_FAULT && (request_changed || state_machine->clearing);
         if (state_machine->clearing &&
             state_machine->fault_free_ticks > STATE_MACHINE_CAUSE_GONE_MS * initialise_ticks) {
-            state_machine->state = DRIVE_STATE_READY;
-            clear(&state_machine->record);
+            end_fault(state_machine);
         }
         break;
     }

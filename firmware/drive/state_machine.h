@@ -51,6 +51,11 @@ void state_machine_reset(state_machine_t *state_machine);
 /* State FAULT, with these faults found at the start, after state_machine_reset. */
 void state_machine_start_in_fault(state_machine_t *state_machine, uint64_t fault_mask);
 
+static inline bool begin_run(state_machine_t *state_machine) {
+    state_machine->state = DRIVE_STATE_RUN;
+    return true;
+}
+
 /* First part of a tick: true when a run goes on, or begins, in which case nothing else is to be done. */
 static inline bool state_machine_runs(state_machine_t *state_machine, const state_machine_input_t *input) {
     if (input->fault_mask != 0) {
@@ -60,8 +65,7 @@ static inline bool state_machine_runs(state_machine_t *state_machine, const stat
         return input->request != COMMAND_OFF && !(input->request == COMMAND_STOP && input->at_standstill);
     }
     if (state_machine->state == DRIVE_STATE_READY && input->request == COMMAND_RUN && state_machine->rearmed) {
-        state_machine->state = DRIVE_STATE_RUN;
-        return true;
+        return begin_run(state_machine);
     }
     return false;
 }

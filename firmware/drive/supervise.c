@@ -1,6 +1,9 @@
 #include "drive/supervise.h"
 
+#include "control/modulator.h"
+#include "drive/deferred.h"
 #include "drive/observe.h"
+#include "drive/torque_control.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
@@ -25,12 +28,26 @@ NOINLINE static void leave_state(const control_parameters_t *parameters, control
                                  const control_measurement_t *measured, drive_state_t left) {
     if (left == DRIVE_STATE_RUN) {
         state->torque_reference_q24 = 0;
-        control_prepare(parameters, state);
+        torque_control_reset(parameters, state);
+        if (state->state_machine.state != DRIVE_STATE_FAULT) { /* else a period later */
+            deferred_reset_run(state);
+        }
     } else if (left != DRIVE_STATE_READY && !observe_follows(state)) {
         observe_reset(state, measured); /* its estimate stems from a faulty encoder */
     } else if (left == DRIVE_STATE_FAULT) {
         observe_forget_load(state); /* angle and speed of a rotor that may be turning are kept */
     }
+}
+
+/* True when a phase has the duty of a run: a run has ended that this state does not know of, because memory has
+ * changed. */
+static bool has_duties(const control_state_t *state) {
+    int32_t differing = 0;
+    UNROLL(4)
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        differing |= state->duty_q15[phase] ^ -MODULATOR_DUTY_ONE_Q15;
+    }
+    return differing != 0;
 }
 
 /* Out of the way of a run, which is the longer path. The time by value: a sample whose address is passed on would have
@@ -44,6 +61,10 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
     }
     if (state_machine->state != before) {
         leave_state(parameters, state, measured, before);
+    } else if (before == DRIVE_STATE_FAULT && state_machine->fault_free_ticks == 1) {
+        deferred_reset_run(state); /* not in the period that records the fault, which would take longer than a run */
+    } else if (has_duties(state)) {
+        leave_state(parameters, state, measured, DRIVE_STATE_RUN);
     }
 }
 

@@ -90,8 +90,14 @@ void torque_control(const control_parameters_t *parameters, control_state_t *sta
                     const control_measurement_t *measured) {
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
         predictive_control(parameters, state, deferred, measured);
-    } else if (parameters->torque_law == TORQUE_LAW_HYSTERESIS || !duty_control(parameters, state, measured)) {
+        return;
+    }
+    if (parameters->torque_law == TORQUE_LAW_HYSTERESIS || !duty_control(parameters, state, measured)) {
         hysteresis_control(parameters, state, measured); /* in one place, so that it is inlined */
+    }
+    const uint32_t lost = state->lost_phase;
+    if (!LIKELY(lost == 0)) { /* the laws of hysteresis and duty know of no lost phase */
+        state->duty_q15[lost - 1u] = -MODULATOR_DUTY_ONE_Q15;
     }
 }
 

@@ -42,6 +42,13 @@ static inline int32_t arm_smmlar(int32_t sum, int32_t a, int32_t b) {
     return result;
 }
 
+/* Upper half of `high`, and that of `low` below it. */
+static inline uint32_t arm_pkhtb(int32_t high, int32_t low) {
+    uint32_t packed;
+    __asm__("pkhtb %0, %1, %2, asr #16" : "=r"(packed) : "r"(high), "r"(low));
+    return packed;
+}
+
 /* value, or 0 when it is negative. */
 static inline int32_t arm_usat31(int32_t value) {
     int32_t saturated;
@@ -112,32 +119,34 @@ static inline void arm_vec3_add_scaled(int32_t sum[3], const int32_t a[3], int32
             : "r1", "r2", "r3");
 }
 
-/* vec3_momentum_step(); vector: three values, then their three increments. */
-static inline void arm_vec3_momentum_step(void *vector, const int32_t direction[3], int32_t scale,
-                                          int32_t momentum_q32) {
+/* vec3_momentum_step(); vector: three values, then their three increments. Returns what follows it. */
+static inline void *arm_vec3_momentum_step(void *vector, const int32_t direction[3], int32_t scale,
+                                           int32_t momentum_q32) {
     register const int32_t *first __asm__("r8") = direction;
     __asm__ volatile(
         "ldm r8, {r8, r9, r10}\n\t"
-        "ldm %1, {r1, r2, r3, r4, r5, r6}\n\t" ARM_VEC3_MOMENTUM_STEP("%2", "%3") "stm %1, {r1, r2, r3, r4, r5, r6}"
-        : "+r"(first)
-        : "r"(vector), "r"(scale), "r"(momentum_q32)
+        "ldm %1, {r1, r2, r3, r4, r5, r6}\n\t" ARM_VEC3_MOMENTUM_STEP("%2", "%3") "stm %1!, {r1, r2, r3, r4, r5, r6}"
+        : "+r"(first), "+r"(vector)
+        : "r"(scale), "r"(momentum_q32)
         : "r1", "r2", "r3", "r4", "r5", "r6", "r9", "r10", "memory");
+    return vector;
 }
 
 /* vec3_dot_and_momentum_step(). */
-static inline int32_t arm_vec3_dot_and_momentum_step(void *vector, const int32_t direction[3], int32_t scale,
-                                                     int32_t momentum_q32) {
+static inline void *arm_vec3_dot_and_momentum_step(void *vector, const int32_t direction[3], int32_t scale,
+                                                   int32_t momentum_q32, int32_t *dot) {
     int32_t sum;
     register const int32_t *first __asm__("r8") = direction;
     __asm__ volatile("ldm r8, {r8, r9, r10}\n\t"
-                     "ldm %2, {r1, r2, r3, r4, r5, r6}\n\t"
+                     "ldm %1, {r1, r2, r3, r4, r5, r6}\n\t"
                      "smmulr %0, r8, r1\n\t"
                      "smmlar %0, r9, r2, %0\n\t"
-                     "smmlar %0, r10, r3, %0\n\t" ARM_VEC3_MOMENTUM_STEP("%3", "%4") "stm %2, {r1, r2, r3, r4, r5, r6}"
-                     : "=&r"(sum), "+r"(first)
-                     : "r"(vector), "r"(scale), "r"(momentum_q32)
+                     "smmlar %0, r10, r3, %0\n\t" ARM_VEC3_MOMENTUM_STEP("%3", "%4") "stm %1!, {r1, r2, r3, r4, r5, r6}"
+                     : "=&r"(sum), "+r"(vector), "+r"(first)
+                     : "r"(scale), "r"(momentum_q32)
                      : "r1", "r2", "r3", "r4", "r5", "r6", "r9", "r10", "memory");
-    return sum;
+    *dot = sum;
+    return vector;
 }
 
 #endif

@@ -11,6 +11,15 @@ static inline uint32_t dual16_pack(int32_t low, int32_t high) {
     return ((uint32_t)low & 0xFFFFu) | (uint32_t)high << 16;
 }
 
+/* Upper halves of two words: that of `low` in bits 0..15, that of `high` in bits 16..31. */
+static inline uint32_t dual16_pack_upper(int32_t low, int32_t high) {
+#ifdef __ARM_FEATURE_DSP
+    return arm_pkhtb(high, low);
+#else
+    return ((uint32_t)high & 0xFFFF0000u) | (uint32_t)low >> 16;
+#endif
+}
+
 /* sum + value[0] low + value[1] high, exact; the caller ensures that it fits. `value` needs no 32-bit alignment. */
 static inline int32_t dual16_multiply_add(const int16_t value[2], uint32_t packed, int32_t sum) {
 #ifdef __ARM_FEATURE_DSP

@@ -38,29 +38,30 @@ static inline void vec3_add_scaled(int32_t sum[3], const int32_t a[3], int32_t s
  *   increment_k = momentum increment_k + scale direction_k / 2^32     each product rounded; the caller ensures it fits
  *   value_k     = value_k + 2 increment_k                             saturates
  *
- * Momentum in Q32, -1/2..1/2 - 2^-32, so that with scale 0 an increment decays to exactly 0. */
-static inline void vec3_momentum_step(vec3_momentum_t *vector, const int32_t direction[3], int32_t scale,
-                                      int32_t momentum_q32) {
+ * Momentum in Q32, -1/2..1/2 - 2^-32, so that with scale 0 an increment decays to exactly 0. Returns the address after
+ * the vector, where a loop goes on: 12 of the computed bound of paper. */
+static inline void *vec3_momentum_step(vec3_momentum_t *vector, const int32_t direction[3], int32_t scale,
+                                       int32_t momentum_q32) {
 #if ARM_DSP_VEC3
-    arm_vec3_momentum_step(vector, direction, scale, momentum_q32);
+    return arm_vec3_momentum_step(vector, direction, scale, momentum_q32);
 #else
     for (unsigned k = 0; k < 3; k++) {
         vector->increment[k] =
             fixed_multiply_high_add(fixed_multiply_high(vector->increment[k], momentum_q32), scale, direction[k]);
         vector->value[k] = fixed_add_twice(vector->value[k], vector->increment[k]);
     }
+    return vector + 1;
 #endif
 }
 
-/* vec3_momentum_step(); returns the vec3_dot() of the direction and the values before the step. */
-static inline int32_t vec3_dot_and_momentum_step(vec3_momentum_t *vector, const int32_t direction[3], int32_t scale,
-                                                 int32_t momentum_q32) {
+/* vec3_momentum_step(); *dot becomes the vec3_dot() of the direction and the values before the step. */
+static inline void *vec3_dot_and_momentum_step(vec3_momentum_t *vector, const int32_t direction[3], int32_t scale,
+                                               int32_t momentum_q32, int32_t *dot) {
 #if ARM_DSP_VEC3
-    return arm_vec3_dot_and_momentum_step(vector, direction, scale, momentum_q32);
+    return arm_vec3_dot_and_momentum_step(vector, direction, scale, momentum_q32, dot);
 #else
-    const int32_t sum = vec3_dot(vector->value, direction[0], direction[1], direction[2]);
-    vec3_momentum_step(vector, direction, scale, momentum_q32);
-    return sum;
+    *dot = vec3_dot(vector->value, direction[0], direction[1], direction[2]);
+    return vec3_momentum_step(vector, direction, scale, momentum_q32);
 #endif
 }
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, sync_playwright
+
+from salient.experiments.local_cluster import Cluster, cluster
 
 
 @pytest.fixture(scope="module")
@@ -25,40 +22,11 @@ def browser() -> Iterator[Browser]:
         launched.close()
 
 
-@dataclass(frozen=True)
-class DaskCluster:
-    """A scheduler and its worker processes."""
-
-    address: str
-    workers: list[subprocess.Popen[str]]
-
-
 @pytest.fixture
-def dask_cluster(tmp_path: Path) -> Iterator[DaskCluster]:
+def dask_cluster(tmp_path: Path) -> Iterator[Cluster]:
     """A Dask scheduler and two workers of one thread on the loopback, which import modules of this folder."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    processes = []
-
-    def start(module: str, *options: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", f"distributed.cli.{module}", *options, "--no-dashboard"]
-        processes.append(subprocess.Popen(command, cwd=tmp_path, env=environment, text=True, stderr=subprocess.PIPE))
-        return processes[-1]
-
-    try:
-        scheduler = start("dask_scheduler", "--host", "tcp://127.0.0.1", "--port", "0")
-        assert scheduler.stderr is not None
-        address = next(match[1] for line in scheduler.stderr if (match := re.search(r"Scheduler at: +(tcp:\S+)", line)))
-        workers = [start("dask_worker", address, "--host", "127.0.0.1", "--no-nanny", "--nthreads", "1",
-                         "--local-directory", str(tmp_path / f"worker{number}")) for number in range(2)]
-        from distributed import Client
-
-        with Client(address, set_as_default=False) as client:
-            client.wait_for_workers(2)
-        yield DaskCluster(address, workers)
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
+    with cluster(tmp_path, {"PYTHONPATH": str(Path(__file__).parent)}) as started:
+        yield started
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ extern "C" {
 #include "drive/deferred.h"
 }
 #include "support/equal_parameters.h"
+#include "support/whole_sample.h"
 
 namespace {
 
@@ -72,7 +73,7 @@ machine_tables_t four_phases() {
 struct bench_t {
     uint32_t angle = 0;
     int32_t step = 0; // 2^-32 turn a period
-    control_sample_t sample{};
+    whole_sample_t sample{};
     command_t command{};
 
     void advance(std::mt19937_64 &random, const control_parameters_t &parameters, uint32_t period_us) {
@@ -186,7 +187,7 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
             control_state_t state;
             control_reset(&parameters, &state);
             for (int period = 0; period < 20000; period++) {
-                control_sample_t sample{};
+                whole_sample_t sample{};
                 for (uint16_t &counts : sample.adc.phase_current_counts) {
                     counts = uint16_t(random() % 4096);
                 }

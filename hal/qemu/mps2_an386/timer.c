@@ -18,13 +18,13 @@ typedef struct {
 #define CONTROL_INTERRUPT 8u
 #define TICKS_PER_COUNT (MAILBOX_PWM_CLOCK_HZ / COUNTER_CLOCK_HZ)
 
-static uint32_t period;       /* counts */
-static uint32_t trigger_time; /* time of the trigger served last, counts */
-static uint32_t passed;       /* triggers after that one and before the control interrupt's end */
+static uint32_t period;        /* counts */
+static uint32_t trigger_value; /* of the counter, at the trigger served last */
+static uint32_t passed;        /* triggers after that one and before the control interrupt's end */
 
-/* Present time in counts, modulo 2^32. */
-static uint32_t now(void) {
-    return ~COUNTER->value;
+/* Counts since the trigger served last, modulo 2^32. */
+static uint32_t elapsed(void) {
+    return trigger_value - COUNTER->value;
 }
 
 void timer_start(uint32_t period_ticks) {
@@ -32,23 +32,24 @@ void timer_start(uint32_t period_ticks) {
     TRIGGER->reload = TRIGGER->value = period - 1u; /* the timer also counts 0 */
     COUNTER->reload = COUNTER->value = UINT32_MAX;
     COUNTER->control = CONTROL_ENABLE;
-    /* Read before the other timer starts, so that no trigger is later than its multiple of the period on now(). */
-    trigger_time = now();
+    /* Read before the other timer starts, so that no trigger is later than its multiple of the period on the
+     * counter. */
+    trigger_value = COUNTER->value;
     TRIGGER->control = CONTROL_ENABLE | CONTROL_INTERRUPT;
 }
 
 uint32_t timer_elapsed_ticks(void) {
-    return (now() - trigger_time) * TICKS_PER_COUNT;
+    return elapsed() * TICKS_PER_COUNT;
 }
 
 /* The counter identifies the trigger: one that occurs while interrupts are masked hides earlier pending ones. */
 void timer_handler(void) {
     TRIGGER->interrupt_clear = 1;
-    const uint32_t periods = (now() - trigger_time) / period;
+    const uint32_t periods = elapsed() / period;
     if (periods <= passed) {
         return;
     }
-    trigger_time += periods * period;
+    trigger_value -= periods * period;
     board.mailbox.trigger += periods;
     passed = 0;
     doorbell_ring(MAILBOX_TRIGGER);

@@ -562,6 +562,29 @@ TEST_F(Commands, three_recorded_frames_beside_the_living_sender_end_the_run) {
     EXPECT_EQ(taken_over, 0);
 }
 
+TEST_F(Commands, recorded_frames_in_their_order_do_not_replace_a_sender_that_lives_nor_clear_a_fault) {
+    uint8_t counter = 100;
+    for (uint32_t time_us = 20000; time_us < 1000000; time_us += 10000) {
+        ASSERT_EQ(take(command_frame(++counter, COMMAND_OFF, 0), DRIVE_STATE_FAULT, time_us), COMMANDS_COMMAND);
+        for (uint8_t recorded = 20; recorded < 29; recorded++) {
+            ASSERT_EQ(take(command_frame(recorded, COMMAND_CLEAR_FAULT, 0), DRIVE_STATE_FAULT,
+                           time_us + 1000u * (recorded - 19u)),
+                      COMMANDS_REJECTED);
+        }
+    }
+}
+
+TEST_F(Commands, another_sender_is_followed_after_30_ms_of_silence_with_its_third_frame) {
+    take(command_frame(100, COMMAND_OFF, 0), DRIVE_STATE_READY, 20000);
+    uint8_t counter = 20;
+    uint32_t time_us = 30000;
+    while (take(command_frame(++counter, COMMAND_OFF, 0), DRIVE_STATE_READY, time_us) != COMMANDS_COMMAND) {
+        ASSERT_LT(time_us, 100000u);
+        time_us += 10000;
+    }
+    EXPECT_EQ(time_us, 20000u + COMMANDS_SENDER_LOST_US + 2 * 10000u);
+}
+
 TEST_F(Commands, ordinary_loss_is_no_error) {
     std::mt19937 random(3);
     arm(0, 10000);

@@ -66,12 +66,23 @@ TEST(StrokeMean, a_load_that_moves_by_little_from_stroke_to_stroke_is_not_consta
     EXPECT_LT(constant_share(1500.0, sine, 8.0, 1.0, 3.0), 0.2);
 }
 
-TEST(StrokeMean, a_load_step_counts_for_150_ms) {
-    const auto step = [](double t, double) { return t < 1.0 ? 0.0 : 8.0; };
-    // The step is seen at the end of its stroke, 33 ms long at 150 r/min, and of the first stroke of each other phase.
+TEST(StrokeMean, a_load_step_counts_for_150_ms_after_the_first_whole_stroke) {
+    const auto step = [](double t, double) { return t < 1.013 ? 0.0 : 8.0; };
+    // Seen at the end of its stroke, 33 ms long at 150 r/min, and of the next one; phases that come later do not count.
     const double not_constant_s = 1.0 - constant_share(150.0, step, 8.0, 1.0, 2.0);
-    EXPECT_GT(not_constant_s, 0.20);
-    EXPECT_LT(not_constant_s, 0.27);
+    EXPECT_GT(not_constant_s, 0.175);
+    EXPECT_LT(not_constant_s, 0.19);
+}
+
+TEST(StrokeMean, of_a_load_that_moves_by_a_tenth_in_a_second_as_learning_moves_it_is_constant) {
+    const auto ramp = [](double t, double) { return 8.0 - 0.8 * t; };
+    for (const double rpm : {60.0, 150.0, 1500.0}) {
+        EXPECT_EQ(constant_share(rpm, ramp, 8.0, 1.5, 4.0), 1.0) << rpm;
+    }
+    const auto faster = [](double t, double) { return 8.0 - 8.0 * t; };
+    for (const double rpm : {60.0, 150.0, 1500.0}) {
+        EXPECT_LT(constant_share(rpm, faster, 8.0, 0.5, 2.0), 0.2) << rpm;
+    }
 }
 
 TEST(StrokeMean, a_change_below_0_1_Nm_and_a_16th_of_the_torque_is_constant) {

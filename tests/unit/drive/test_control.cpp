@@ -21,6 +21,7 @@ uint32_t hal_can_receive_overflows(const hal_t *) {
 
 #include "support/configured.h"
 #include "support/reference_models.h"
+#include "support/whole_sample.h"
 
 namespace {
 
@@ -58,7 +59,7 @@ class Control : public testing::Test {
         parameters = configured(controller, uint32_t(RATE_HZ), ENCODER_BITS);
         control_reset(&parameters, &state);
         diagnostics = diagnostics_t{};
-        sample = control_sample_t{};
+        sample = whole_sample_t{};
         command = command_t{};
         sample.adc.bus_voltage_counts = BUS_COUNTS;
         turns = 0.1;
@@ -135,7 +136,7 @@ class Control : public testing::Test {
     control_state_t state;
     diagnostics_t diagnostics;
     drive_t telemetry_drive{}; // as telemetry_collect reads it
-    control_sample_t sample;
+    whole_sample_t sample;
     command_t command;
     hal_pwm_compare_t compare{};
     double turns = 0.1, speed_rad_s = 0.0;
@@ -256,6 +257,30 @@ TEST_F(Control, the_largest_current_that_is_no_trip_keeps_running) {
     EXPECT_TRUE(step(COMMAND_RUN));
     sample.adc.phase_current_counts[1] = 3841;
     EXPECT_FALSE(step(COMMAND_RUN));
+}
+
+TEST_F(Control, a_run_that_a_changed_state_ends_leaves_neither_duties_nor_a_torque_behind) {
+    for (const drive_controller_t controller :
+         {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        for (const drive_state_t changed : {DRIVE_STATE_INITIALISE, DRIVE_STATE_READY, DRIVE_STATE_FAULT}) {
+            configure(controller);
+            start();
+            for (int k = 0; k < 20; k++) {
+                step(COMMAND_RUN);
+            }
+            ASSERT_GT(state.torque_reference_q24, 0);
+            state.state_machine.state = changed;
+            state.state_machine.rearmed = false;
+            for (int k = 0; k < 400; k++) { // 10 ms
+                step(COMMAND_OFF);
+            }
+            EXPECT_EQ(state.torque_reference_q24, 0) << controller << ", " << changed;
+            for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+                EXPECT_EQ(state.duty_q15[phase], -32768) << controller << ", " << changed;
+                EXPECT_EQ(state.applied_flux.next_q29[phase], 0) << controller << ", " << changed;
+            }
+        }
+    }
 }
 
 TEST_F(Control, an_encoder_that_freezes_at_speed_is_detected_within_a_millisecond) {

@@ -12,6 +12,7 @@ extern "C" {
 
 #include "support/configured.h"
 #include "support/fixed_point.h"
+#include "support/whole_sample.h"
 
 namespace {
 
@@ -86,7 +87,7 @@ class Deferred : public testing::Test {
 
     control_parameters_t parameters;
     control_state_t state;
-    control_sample_t sample{};
+    whole_sample_t sample{};
     command_t command{};
     hal_pwm_compare_t compare{};
     double turns = 0.1, speed_rad_s = 0.0;
@@ -405,6 +406,38 @@ TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_observer) {
     EXPECT_EQ(results().generation, state.deferred_request.generation);
 }
 
+TEST_F(Deferred, a_fault_resets_the_step_once_in_the_first_period_without_a_failed_check) {
+    for (const auto controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        configure(controller);
+        sample.adc.phase_current_counts[0] = 0;
+        start();
+        period(COMMAND_RUN);
+        const uint32_t before = state.deferred_request.generation;
+        sample.adc.phase_current_counts[0] = 4000;
+        for (int k = 0; k < 3; k++) {
+            EXPECT_FALSE(period(COMMAND_RUN));
+            ASSERT_EQ(state.state_machine.state, DRIVE_STATE_FAULT);
+            EXPECT_EQ(state.torque_reference_q24, 0);
+            EXPECT_EQ(state.duty_q15[0], -32768);
+            EXPECT_EQ(state.deferred_request.generation, before);
+        }
+        sample.adc.phase_current_counts[0] = 0;
+        period(COMMAND_RUN);
+        EXPECT_EQ(state.deferred_request.generation, before + 1);
+        see_the_cause_gone();
+        period(COMMAND_CLEAR_FAULT);
+        ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+        EXPECT_EQ(state.deferred_request.generation & 0xFFFF, (before + 1) & 0xFFFF);
+    }
+}
+
+TEST_F(Deferred, a_run_that_is_switched_off_resets_the_step_at_once) {
+    start();
+    const uint32_t before = state.deferred_request.generation;
+    period(COMMAND_OFF);
+    EXPECT_EQ(state.deferred_request.generation, before + 1);
+}
+
 TEST_F(Deferred, a_late_check_of_the_voltage_of_the_time_before_a_reset_is_no_new_fault) {
     start();
     sample.adc.phase_current_counts[0] = 4000;
@@ -429,7 +462,9 @@ TEST_F(Deferred, a_late_check_of_the_voltage_of_the_time_before_a_reset_is_no_ne
 TEST_F(Deferred, the_misalignment_survives_every_reset_and_a_late_step) {
     start();
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        state.deferred.misalignment.phase[phase].offset = int32_t(1000 * (phase + 1));
+        misalignment_phase_t &learned = state.deferred.misalignment.phase[phase];
+        learned.offset = int32_t(1000 * (phase + 1));
+        learned.offset_q40 = std::llround(std::ldexp(learned.offset, 39) / parameters.misalignment.probe_angle);
     }
     const auto kept = [this] {
         for (unsigned phase = 0; phase < machine_tables.phases; phase++) {

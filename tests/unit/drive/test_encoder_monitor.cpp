@@ -145,6 +145,54 @@ TEST_F(EncoderMonitor, one_phase_that_contradicts_the_angle_for_4_ms_is_enough_w
     }
 }
 
+TEST_F(EncoderMonitor, one_phase_alone_is_no_evidence_while_the_rotor_advances_with_the_torque_and_brings_the_next) {
+    for (const double torque : {1.0, -1.0}) {
+        for (const double rotor : {1.0, -1.0}) { // 24 r/min
+            monitor = {};
+            input.run = false;
+            monitor_step();
+            input.run = true;
+            input.torque_q24 = int32_t(torque * (1 << 24));
+            input.zero_at[0] = input.period + 1;
+            for (int k = 0; k < 250; k++) {
+                step(77.0 + rotor * k * 144.0 / RATE_HZ, 65.0 + rotor * k * 144.0 / RATE_HZ, 25.0);
+            }
+            EXPECT_EQ(monitor.angle, torque != rotor) << torque << ", " << rotor;
+        }
+    }
+}
+
+TEST_F(EncoderMonitor, a_phase_has_company_while_another_has_contradicted_the_angle_within_a_quarter_of_a_second) {
+    EXPECT_FALSE(encoder_monitor_suspects(&parameters, &monitor, 0));
+    input.zero_at[1] = input.period + 1;
+    for (int k = 0; k < 10; k++) {
+        step(65.0 + 30.0, 65.0 + 30.0 - 12.0, 25.0, 1);
+    }
+    EXPECT_TRUE(encoder_monitor_suspects(&parameters, &monitor, 1));
+    EXPECT_FALSE(encoder_monitor_suspects(&parameters, &monitor, 2));
+    for (int k = 0; k < RATE_HZ / 4 + 10; k++) {
+        step(65.0, 65.0, 0.0, 0);
+    }
+    EXPECT_FALSE(encoder_monitor_suspects(&parameters, &monitor, 1));
+}
+
+TEST_F(EncoderMonitor,
+       an_encoder_that_turns_round_within_a_millisecond_is_suspect_and_a_rotor_that_does_so_in_ten_is_not) {
+    for (const int turning_ms : {0, 10}) { // between 300 r/min one way and the other
+        monitor = {};
+        double angle_deg = 0.0, speed_deg_s = 1800.0;
+        for (int k = 0; k < 30 * RATE_HZ / 1000; k++) {
+            const bool after = k >= 10 * RATE_HZ / 1000;
+            speed_deg_s = !after            ? 1800.0
+                          : turning_ms == 0 ? -1800.0
+                                            : std::max(-1800.0, speed_deg_s - 3600.0 / (turning_ms * RATE_HZ / 1000));
+            angle_deg += speed_deg_s / RATE_HZ;
+            step(angle_deg, angle_deg, 0.0);
+        }
+        EXPECT_EQ(encoder_monitor_suspects(&parameters, &monitor, 7), turning_ms == 0);
+    }
+}
+
 TEST_F(EncoderMonitor, integral_that_parts_faster_than_a_rotor_can_turn_is_no_frozen_encoder) {
     // Of the link voltage's 6 mWb a period: of an open winding nearly all; of a rotor that turns at a twentieth of the
     // speed of full back-EMF a twentieth.

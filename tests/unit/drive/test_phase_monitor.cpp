@@ -170,29 +170,40 @@ TEST_F(PhaseMonitor, current_of_a_phase_that_is_read_in_another_is_the_sensors) 
     EXPECT_EQ(monitor.phases, 3u);
 }
 
-// Differences that an angle explains.
-TEST_F(PhaseMonitor, one_phase_that_differs_at_its_angle_is_a_fault_within_two_electrical_revolutions_and_two_are_not) {
-    for (const unsigned phases : {1u, 2u}) {
-        monitor = {};
-        input.electrical = 0;
-        const int periods = periods_to_fault(600, [&](int) {
-            input.electrical += 1u << 24; // 256 periods in a revolution
-            for (unsigned phase = 0; phase < phases; phase++) {
+// Differences that an angle explains: `differ` of three phases, of which `conduct` conduct in turn, over more than four
+// electrical revolutions.
+class PhaseMonitorInTurn : public PhaseMonitor {
+  protected:
+    int periods_with(unsigned differ, unsigned conduct, int step_of_revolution) {
+        return periods_to_fault(1100, [&](int) {
+            input.electrical += uint32_t(step_of_revolution * (1 << 24)); // 256 periods in a revolution
+            for (unsigned phase = 0; phase < conduct; phase++) {
                 const uint32_t angle = input.electrical - phase * input.stroke;
                 const bool conducts = angle >= MIDDLE - (1u << 29) && angle < MIDDLE;
                 const double flux_Wb = phase_map_results::flux_q29(machine_tables, angle, 10 * 512) / Q29;
-                set(phase, conducts ? 10.0 : 0.0, conducts ? 1.8 * flux_Wb : 0.0);
+                set(phase, conducts ? 10.0 : 0.0, conducts ? (phase < differ ? 1.8 : 1.0) * flux_Wb : 0.0);
                 input.off[phase] = !conducts;
             }
         });
-        if (phases == 1) {
-            EXPECT_GT(periods, 256);
-            EXPECT_LT(periods, 512);
-            EXPECT_EQ(failed, FAULT_BIT(FAULT_PHASE_OPEN));
-        } else {
-            EXPECT_EQ(periods, -1);
-        }
     }
+};
+
+TEST_F(PhaseMonitorInTurn, one_phase_that_differs_at_its_angle_is_a_fault_within_two_electrical_revolutions) {
+    for (const int direction : {1, -1}) {
+        monitor = {};
+        const int periods = periods_with(1, 3, direction);
+        EXPECT_GT(periods, 256) << direction;
+        EXPECT_LT(periods, 512) << direction;
+        EXPECT_EQ(failed, FAULT_BIT(FAULT_PHASE_OPEN)) << direction;
+    }
+}
+
+TEST_F(PhaseMonitorInTurn, two_phases_that_differ_at_their_angles_are_none) {
+    EXPECT_EQ(periods_with(2, 3, 1), -1);
+}
+
+TEST_F(PhaseMonitorInTurn, one_phase_that_differs_while_another_does_not_conduct_is_none) {
+    EXPECT_EQ(periods_with(1, 2, 1), -1);
 }
 
 TEST_F(PhaseMonitor, after_a_lost_trigger_the_integral_is_that_of_the_tables_and_no_fault) {

@@ -91,9 +91,10 @@ TEST(Vec3, a_momentum_step_adds_momentum_and_gradient_and_returns_the_dot_produc
         }
         const int32_t scale = any(random), momentum_q32 = any(random);
         vec3_momentum_t moved = start, with_dot = start;
-        vec3_momentum_step(&moved, direction, scale, momentum_q32);
-        ASSERT_EQ(vec3_dot_and_momentum_step(&with_dot, direction, scale, momentum_q32),
-                  vec3_dot(start.value, direction[0], direction[1], direction[2]));
+        ASSERT_EQ(vec3_momentum_step(&moved, direction, scale, momentum_q32), &moved + 1);
+        int32_t dot = 0;
+        ASSERT_EQ(vec3_dot_and_momentum_step(&with_dot, direction, scale, momentum_q32, &dot), &with_dot + 1);
+        ASSERT_EQ(dot, vec3_dot(start.value, direction[0], direction[1], direction[2]));
         for (unsigned k = 0; k < 3; k++) {
             const auto increment =
                 rounded_product(start.increment[k], momentum_q32) + rounded_product(scale, direction[k]);

@@ -21,6 +21,7 @@ extern "C" {
 }
 
 #include "support/salient_reference.h"
+#include "support/whole_sample.h"
 
 namespace closed_loop {
 
@@ -166,7 +167,7 @@ template <typename drive_t> class Bench {
         const auto to_ns = uint64_t(std::llround(time_s * 1e9));
         while (plant.time_ns + period_ns <= to_ns) {
             plant_advance(&plant, plant.time_ns + period_ns);
-            control_sample_t sample{};
+            whole_sample_t sample{};
             sensors_sample_encoder(&sensors, &plant, &sample.encoder);
             sensors_sample_adc(&sensors, &plant, &sample.adc);
             sample.time_us = uint32_t(plant.time_ns / 1000);

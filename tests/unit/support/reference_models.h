@@ -333,8 +333,13 @@ struct misalignment_t {
     void step(double disturbance, double bandwidth_rad_s, bool steady, double torque, const slope_t &slope) {
         const double update_s = phases / rate_hz;
         const bool settled = steady_ticks >= std::floor(settle_s * rate_hz);
-        steady_ticks = !steady || std::fabs(torque) <= 1.0 ? 0.0 : settled ? steady_ticks : steady_ticks + 1.0;
-        const bool learning = steady_ticks > 0.0 && settled;
+        const bool torque_suffices = std::fabs(torque) > 1.0;
+        if (!steady) {
+            steady_ticks = 0.0;
+        } else if (torque_suffices && !settled) {
+            steady_ticks += 1.0;
+        }
+        const bool learning = steady && torque_suffices && settled;
         const double mean_gain = std::max(mean_1_s * update_s, 1.0 / (std::floor(steady_ticks / phases) + 1.0));
         const unsigned phase = phase_index;
         phase_index = (phase_index + 1) % phases;

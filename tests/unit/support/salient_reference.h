@@ -144,7 +144,7 @@ class salient_t {
         double torque = 0.0;
         for (unsigned phase = 0; phase < phases; phase++) {
             angle[phase] = (measured - misalignment.offset_rad[phase] / (2.0 * PI)) * poles - double(phase) / phases;
-            const double current = sample.adc.phase_current_counts[phase] * current_count;
+            const double current = sample.adc->phase_current_counts[phase] * current_count;
             seen.current_A[phase] = current;
             seen.table_Wb[phase] = machine.flux(angle[phase], current);
             torque += machine.torque(angle[phase], current);
@@ -186,7 +186,7 @@ class salient_t {
             misalignment.step(disturbance, now_rad_s, steady, reference, torque_slope);
         }
 
-        seen.bus_V = sample.adc.bus_voltage_counts * voltage_count;
+        seen.bus_V = sample.adc->bus_voltage_counts * voltage_count;
         seen.torque_Nm = reference;
         seen.reverse = observer.speed < 0.0;
         const double step_rev = observer.speed * observer.angle_step;

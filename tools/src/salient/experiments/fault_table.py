@@ -2,8 +2,8 @@
 
     python -m salient.experiments.fault_table [--jobs N]
 
-runs every cell and writes the page firmware/FAULTS.md. In each run the drive starts, carries a load, and has the fault
-then, or had it before the start.
+runs every cell and writes the page firmware/FAULTS.md, with the longest times of campaign.branching. In each run the
+drive starts, carries a load, and has the fault then, or had it before the start.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from salient.config import CONTROLLERS
+from salient.experiments.campaign import branching
 from salient.experiments.scaled import scale_of_name
 from salient.experiments.scenario import FaultStep, LoadStep, Record, Scenario, SpeedStep, run_scenario
 from salient.machine.drive_data import derive
@@ -26,6 +27,7 @@ from salient.machine.file import load_machine, machine_path
 from salient.paths import ROOT
 
 PAGE = ROOT / "firmware" / "FAULTS.md"
+BRANCHES = ROOT / "tests" / "campaign" / "branching"
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
 SPEED_RPM, LOAD_NM = 600.0, 12.0
 AFTER_S = 0.35
@@ -219,7 +221,13 @@ def page(cells_of: dict[tuple[str, str, str], str]) -> str:
     parts += [f"| {case.name} | {case.unseen} |\n" for case in CASES if case.unseen]
     parts.append("\n## What the host cannot have\n\n| fault | reason |\n| --- | --- |\n")
     parts += [f"| {case.name} | {case.unsupported} |\n" for case in CASES if case.unsupported]
-    return "".join(parts)
+    return with_branches("".join(parts))
+
+
+def with_branches(text: str) -> str:
+    """A page with the section of the committed results of branching, its last one, anew."""
+    head = text.partition(f"## {branching.HEADING}\n")[0].rstrip()
+    return f"{head}\n\n{branching.section(branching.read(BRANCHES))}"
 
 
 def main() -> int:

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from salient.errors import UsageError
-from salient.experiments.campaign import names
-from salient.experiments.campaign.failure import load, replay, save
-from salient.experiments.campaign.runner import ALL_EVENTS, Result, digest, serve, world
-from salient.experiments.tasks import Task, run
+from salient.experiments.campaign import canaries, names
+from salient.experiments.campaign.failure import Failure, load, replay, save
+from salient.experiments.campaign.runner import ALL_EVENTS, Result, digest, processor_s, serve, world
+from salient.experiments.tasks import Task, read_results, run
 from salient.paths import ROOT
 from salient.progress import Progress
 
@@ -31,18 +31,28 @@ def run_campaign(options: argparse.Namespace) -> int:
     kind = "healthy" if options.healthy else "faults"
     tasks = [Task(f"{kind} {seed} {digest()}", (seed, options.healthy)) for seed in seeds]
     mine = tasks[options.shard[0] - 1::options.shard[1]]
-    results = []
+    results: list[Result] = []
+    new: list[Result] = []
+    known, begin_s = read_results(options.out).keys(), processor_s()
     with Progress(_LINES, sys.stderr) as progress:
         done = run(tasks, serve, options.out, options.shard, options.scheduler, options.jobs)
-        for number, (_, result) in enumerate(done, start=1):
+        for number, (task, result) in enumerate(done, start=1):
             results.append(result)
+            new += [] if task.key in known else [result]
             if number * _LINES // len(mine) > (number - 1) * _LINES // len(mine):
                 progress.step(f"{number} of {len(mine)} seeds")
     note = summary(results, options.first, options.seeds, kind)
+    spent_s = processor_s() - begin_s
     part = "" if options.shard == (1, 1) else "-{}-of-{}".format(*options.shard)
     (options.out / f"summary{part}.json").write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
     for line in report(note):
         print(line)
+    if new and options.scheduler is None:
+        rate = {"kind": kind, "commit": note["commit"], "worlds": len(new), "virtual_s": round(_virtual_s(new), 1),
+                "processor_s": round(spent_s, 1)}
+        (options.out / f"rate{part}.json").write_text(json.dumps(rate, indent=2) + "\n", encoding="utf-8")
+        print(f"{rate['worlds'] / spent_s:.0f} worlds, {rate['virtual_s'] / spent_s:.1f} s of virtual time a processor "
+              "second")
     for violation, entry in list(note["violations"].items())[:0 if options.no_shrink else _SHOWN_MAX]:
         seed = entry["seeds"][0]
         folder = options.out / "failures" / f"{seed}"
@@ -82,6 +92,10 @@ def summary(results: Iterable[Result], first: int, seeds: int, kind: str) -> dic
     }
 
 
+def _virtual_s(results: list[Result]) -> float:
+    return 1e-6 * sum(int(result.get("virtual_us", 0)) for result in results)
+
+
 def report(note: dict[str, Any]) -> list[str]:
     """A summary to be read."""
     number = sum(entry["count"] for entry in note["violations"].values())
@@ -113,16 +127,23 @@ def run_replay(options: argparse.Namespace) -> int:
     """`replay`; returns the exit code."""
     folder = Path(options.what)
     if folder.is_dir():
-        seed, kept, healthy = load(folder)
+        failure = load(folder)
     else:
         try:
-            seed, kept, healthy = int(options.what), ALL_EVENTS, options.healthy
+            failure = Failure(int(options.what), ALL_EVENTS, options.healthy, None)
         except ValueError:
-            seed = -1
-        if not 0 <= seed < 2**63:
+            failure = Failure(-1, ALL_EVENTS, options.healthy, None)
+        if not 0 <= failure.seed < 2**63:
             raise UsageError(f"replay {options.what}: must be a seed, a whole number from 0, or the folder of a "
                              "failure")
-        folder = options.out / str(seed)
+        folder = options.out / str(failure.seed)
+    seed, kept, healthy = failure.seed, failure.kept, failure.healthy
+    programs = None
+    if failure.canary is not None:
+        if options.build != "host":
+            raise UsageError(f"--target {options.build}: {folder} has a planted bug, which the host alone can have")
+        programs = canaries.build(failure.canary)
+        print(f"with the planted bug {failure.canary}: {canaries.canaries()[failure.canary - 1].name}")
     described = world(seed, kept, healthy)
     print(f"seed {seed}: {described['machine']}, {described['controller']}, {described['control_rate_hz']} Hz, encoder "
           f"of {described['encoder_bits']} bits{' with edges' if described['encoder_edges'] else ''}")
@@ -131,7 +152,7 @@ def run_replay(options: argparse.Namespace) -> int:
         print(f"  {event['begin_us']}{until} us: {event['event']} {event['value']:g}"
               + (f", phase {'abcd'[event['phase']]}, leg {('low', 'high')[event['leg']]}"
                  if event["phase"] or event["leg"] else ""))
-    again = replay(seed, kept, healthy, folder, options.build)
+    again = replay(seed, kept, healthy, folder, options.build, programs)
     for violation in again.campaign["violations"]:
         print(f"violation: {names.violation(violation)} at {violation['at_us']} us")
     causes = ", ".join(names.causes().get(cause, str(cause)) for cause in again.campaign["causes"])

@@ -17,7 +17,7 @@ from salient.config import BenchConfig
 from salient.errors import UsageError
 from salient.experiments.campaign import names
 from salient.experiments.campaign.machines import files
-from salient.experiments.campaign.runner import ALL_EVENTS, Result, run_world, world
+from salient.experiments.campaign.runner import ALL_EVENTS, Programs, Result, run_world, world
 
 _STEP_NS = 1_000_000
 _HASH_START, _HASH_PRIME, _HASH_MASK = 14695981039346656037, 1099511628211, 2**64 - 1
@@ -30,14 +30,14 @@ def classes(result: Result) -> list[str]:
     return [names.violation(violation) for violation in result["violations"]]
 
 
-def shrink(seed: int, violation: str, healthy: bool = False) -> int:
+def shrink(seed: int, violation: str, healthy: bool = False, programs: Programs | None = None) -> int:
     """The events, as bits, of the shortest list that still has a violation of this class: no event of it can be left
     out. Leaves out halves, quarters, ... first (A. Zeller, R. Hildebrandt, "Simplifying and isolating failure-inducing
     input", 2002)."""
     events = [event["index"] for event in world(seed, healthy=healthy)["events"]]
 
     def fails(kept: list[int]) -> bool:
-        return violation in classes(run_world(seed, sum(1 << index for index in kept), healthy))
+        return violation in classes(run_world(seed, sum(1 << index for index in kept), healthy, programs=programs))
 
     part = len(events)
     while part >= 1:
@@ -66,19 +66,19 @@ class Replay:
 
 
 def replay(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, folder: Path | None = None,
-           build: str = "host") -> Replay:
+           build: str = "host", programs: Programs | None = None) -> Replay:
     """Runs a world again, and its frames once more on a test bench of salient_host, or of a target's build. folder: for
     log and plot of the bench."""
     described = world(seed, kept, healthy)
     with tempfile.TemporaryDirectory(prefix="salient-") as temporary:
         frames = Path(temporary) / "frames"
-        result = run_world(seed, kept, healthy, frames)
+        result = run_world(seed, kept, healthy, frames, programs)
         path = next(path for path in files() if path.stem == described["machine"])
         config = BenchConfig(machine=str(path), controller=described["controller"], seed=seed, build=build,
                              control_rate_hz=described["control_rate_hz"], encoder_bits=described["encoder_bits"],
                              adc_bits=described["adc_bits"], encoder_edges=described["encoder_edges"],
                              initial_angle_deg=described["initial_angle_deg"],
-                             telemetry_period_ms=TELEMETRY_PERIOD_MS)
+                             telemetry_period_ms=TELEMETRY_PERIOD_MS, program=programs.host if programs else None)
         with Bench(config, f"unix:{temporary}/can.sock") as bench:
             _send(bench, frames.read_text(encoding="ascii").splitlines())
             if folder is not None:
@@ -123,24 +123,38 @@ def _hash(log: list[tuple[int, can.Message]]) -> int:
     return value
 
 
-def save(seed: int, violation: str, folder: Path, healthy: bool = False) -> dict[str, Any]:
-    """Shrinks a failing seed and writes its folder: failure.json with the events that are left, log and plot."""
+def save(seed: int, violation: str, folder: Path, healthy: bool = False, canary: int | None = None,
+         programs: Programs | None = None) -> dict[str, Any]:
+    """Shrinks a failing seed and writes its folder: failure.json with the events that are left, log and plot. canary:
+    number of the planted bug that the programs have."""
     folder.mkdir(parents=True, exist_ok=True)
-    kept = shrink(seed, violation, healthy)
-    again = replay(seed, kept, healthy, folder)
-    note = {"seed": seed, "healthy": healthy, "kept": f"{kept:#x}", "violation": violation, "hash": again.hash,
-            "equal": again.equal, "world": world(seed, kept, healthy), "result": again.campaign,
+    kept = shrink(seed, violation, healthy, programs)
+    again = replay(seed, kept, healthy, folder, programs=programs)
+    note = {"seed": seed, "healthy": healthy, "canary": canary, "kept": f"{kept:#x}", "violation": violation,
+            "hash": again.hash, "equal": again.equal, "world": world(seed, kept, healthy), "result": again.campaign,
             "replay": f"tools/salient replay {folder}"}
     (folder / "failure.json").write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
     return note
 
 
-def load(folder: Path) -> tuple[int, int, bool]:
-    """Seed, events and kind of world of a failure's folder; UsageError."""
+@dataclass(frozen=True)
+class Failure:
+    """What a failure's folder asks to be run. canary: number of the planted bug that its programs had."""
+
+    seed: int
+    kept: int
+    healthy: bool
+    canary: int | None
+
+
+def load(folder: Path) -> Failure:
+    """The failure of a folder; UsageError."""
     path = folder / "failure.json"
     try:
         note = json.loads(path.read_text(encoding="utf-8"))
-        return int(note["seed"]), int(note["kept"], 16), bool(note["healthy"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        canary = note.get("canary")
+        return Failure(int(note["seed"]), int(note["kept"], 16), bool(note["healthy"]),
+                       None if canary is None else int(canary))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(f"{path}: not the note of a failure ({error}); give a seed or the folder of a failure that a "
                          "campaign has left") from None

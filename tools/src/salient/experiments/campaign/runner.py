@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import resource
 import subprocess
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
+from multiprocessing import util
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,14 @@ from salient.paths import BUILD, ROOT
 Result = dict[str, Any]
 """seed, hash, machine, controller, virtual_us, causes, recovered, held, violations, cells."""
 ALL_EVENTS = 2**64 - 1
+
+
+@dataclass(frozen=True)
+class Programs:
+    """Other programs than those of the build: the campaign's, and drive and test bench (salient_host)."""
+
+    campaign: Path
+    host: Path
 
 
 def program() -> Path:
@@ -36,13 +47,14 @@ def digest() -> str:
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()[:16]
 
 
-def command(*options: object) -> list[str]:
+def command(*options: object, programs: Programs | None = None) -> list[str]:
     """A command line of the program."""
-    return [str(program()), "--machines", str(pool_file()), *map(str, options)]
+    executable = programs.campaign if programs else program()
+    return [str(executable), "--machines", str(pool_file()), *map(str, options)]
 
 
-def _lines(options: Sequence[object]) -> list[Result]:
-    done = subprocess.run(command(*options), capture_output=True, text=True, check=False)
+def _lines(options: Sequence[object], programs: Programs | None = None) -> list[Result]:
+    done = subprocess.run(command(*options, programs=programs), capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise EmulatorError(f"salient_campaign ended with {done.returncode}: {done.stderr.strip()}")
     return [json.loads(line) for line in done.stdout.splitlines()]
@@ -53,15 +65,28 @@ def world(seed: int, kept: int = ALL_EVENTS, healthy: bool = False) -> Result:
     return _lines(["--first", seed, "--keep", kept, "--describe", *_mode(healthy)])[0]
 
 
-def run_world(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, frames: Path | None = None) -> Result:
+def run_world(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, frames: Path | None = None,
+              programs: Programs | None = None) -> Result:
     """Runs a world, with those of its events whose bits are set. frames: a file for the frames that its clients sent, a
     line each: time in ns, number of the client, identifier with flags and data in hexadecimal."""
-    return _lines(["--first", seed, "--keep", kept, *_mode(healthy), *(["--frames", frames] if frames else [])])[0]
+    options = ["--first", seed, "--keep", kept, *_mode(healthy), *(["--frames", frames] if frames else [])]
+    return _lines(options, programs)[0]
+
+
+def run_worlds(first: int, seeds: int, programs: Programs | None = None) -> list[Result]:
+    """Runs a range of seeds in one process."""
+    return _lines(["--first", first, "--seeds", seeds], programs)
 
 
 def branches(*setting: object) -> list[Result]:
     """Every fault at every control tick, a result for each fault and place (emulator/campaign/branch.h)."""
     return _lines(["--branch", *setting])
+
+
+def processor_s() -> float:
+    """Processor time of the processes that have ended, of this one's children and theirs."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _mode(healthy: bool) -> list[str]:
@@ -78,6 +103,7 @@ def serve(task: tuple[int, bool]) -> Result:
     if process is None or process.poll() is not None:
         process = _served[healthy] = subprocess.Popen(command("--serve", *_mode(healthy)), stdin=subprocess.PIPE,
                                                       stdout=subprocess.PIPE, text=True)
+        util.Finalize(process, process.communicate, exitpriority=0)  # its processor time becomes the worker's
     assert process.stdin is not None and process.stdout is not None  # pipes
     process.stdin.write(f"{seed}\n")
     process.stdin.flush()

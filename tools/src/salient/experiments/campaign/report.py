@@ -1,0 +1,180 @@
+"""The campaign's table in tools/README.md, its picture, and the longest reaction times in firmware/FAULTS.md.
+
+    python -m salient.experiments.campaign.report
+
+writes them anew from the results in tests/campaign, which the commands of the table have left.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from salient.experiments import fault_table
+from salient.experiments.campaign import branching, same_bits
+from salient.experiments.tasks import read_results
+from salient.paths import ROOT
+
+PAGE = ROOT / "tools" / "README.md"
+PICTURE = ROOT / "tools" / "images" / "campaign.png"
+RESULTS = ROOT / "tests" / "campaign"
+_BEGIN = "<!-- campaign: python -m salient.experiments.campaign.report -->\n"
+_END = "<!-- end of campaign -->\n"
+_MODULE = "build/venv/bin/python -m salient.experiments.campaign"
+
+Note = dict[str, Any]
+
+
+def _note(name: str) -> Any:
+    return json.loads((RESULTS / name).read_text(encoding="utf-8"))
+
+
+def _seeds(note: Note) -> str:
+    return f"{note['first']} to {note['first'] + note['seeds'] - 1}"
+
+
+def _violations(note: Note) -> str:
+    total = sum(entry["count"] for entry in note["violations"].values())
+    listed = "; ".join(f"{entry['count']} `{name}`, seeds {', '.join(map(str, entry['seeds']))}"
+                       for name, entry in note["violations"].items())
+    return f"{total:,} violation{'' if total == 1 else 's'}" + (f" ({listed})" if listed else "")
+
+
+def _rate(name: str) -> list[str]:
+    """None of a summary whose worlds were not run in one go."""
+    if not (RESULTS / name).exists():
+        return []
+    rate = _note(name)
+    return [f"{rate['worlds'] / rate['processor_s']:.0f} worlds or {rate['virtual_s'] / rate['processor_s']:.0f} s of "
+            "virtual time a processor second"]
+
+
+def _worlds(name: str, what: str) -> tuple[str, str, str]:
+    note = _note(f"{name}.json")
+    parts = [f"seeds {_seeds(note)} at {note['commit']}", f"{note['virtual_hours']:.2f} h of virtual time",
+             *_rate(f"{name}_rate.json"), f"**{_violations(note)}**"]
+    if note["cells"]:
+        all_reached = note["cells_reached"] == note["cells"]
+        rest = "" if all_reached else f", the rest in [{name}.json](../tests/campaign/{name}.json)"
+        parts += [f"{note['cells_reached']:,} of {note['cells']:,} cells of fault, state and sector reached{rest}",
+                  f"{note['held_by_the_encoder']} drives held at rest by their encoder"]
+    healthy = " --healthy" if note["kind"] == "healthy" else ""
+    return what, "; ".join(parts), f"`campaign{healthy} --first {note['first']} --seeds {note['seeds']}`"
+
+
+def _branches() -> tuple[str, str, str]:
+    rows, notes = branching.read(RESULTS / "branching"), branching.read_summary(RESULTS / "branching")
+    of_all = branching.totals([row for lines in rows.values() for row in lines])
+    processor_s = sum(note["processor_s"] for note in notes.values())
+    longest = max((row for lines in rows.values() for row in lines), key=lambda row: int(row["longest_us"]))
+    unanswered = sorted({branching.label(row) for lines in rows.values() for row in lines
+                         if row["detected"] < row["branches"]})
+    commits = ", ".join(sorted({note["commit"] for note in notes.values()}))
+    found = [row for lines in rows.values() for row in lines if row["violations"]]
+    listed = "; ".join(sorted({f"`{branching.label(row)}`" for row in found}))
+    return ("every fault at every control tick of an electrical period at 150 r/min with 8 N m and at 1500 r/min with "
+            "6 N m, and at the begin of a start from 360 positions",
+            f"{of_all['branches']:,} branches at {commits}; {of_all['virtual_s'] / 3600:.2f} h of virtual time; "
+            f"{of_all['branches'] / processor_s:.0f} branches a processor second; longest reaction "
+            f"{longest['longest_us'] / 1000:.0f} ms (`{branching.label(longest)}`), each in "
+            f"[FAULTS.md](../firmware/FAULTS.md#{branching.ANCHOR}); not always answered: "
+            f"{', '.join(f'`{label}`' for label in unanswered)}; **{of_all['violations']:,} violations**"
+            + (f" ({listed})" if listed else ""), f"`{_MODULE}.branching DIR`")
+
+
+def _canaries() -> tuple[str, str, str]:
+    notes = _note("canaries.json")
+    found = [note for note in notes if "seed" in note]
+    seconds = sorted(note["processor_s"] for note in found)
+    return ("planted bugs",
+            f"**{len(found)} of {len(notes)} found** in {seconds[0]:.1f} to {seconds[-1]:.1f} processor seconds each, "
+            f"{seconds[len(seconds) // 2]:.1f} in the middle; shrunk to at most "
+            f"{max(len(note['events']) for note in found)} events in at most "
+            f"{max(note['shrinking_s'] for note in found):.1f} processor seconds; "
+            f"{sum(note['replays'] for note in found)} replayed with equal bits, log and plots; each in "
+            "[canaries.json](../tests/campaign/canaries.json)", f"`{_MODULE}.canaries DIR`")
+
+
+def _cluster() -> tuple[str, str, str]:
+    note = _note("cluster.json")
+    return ("a Dask scheduler with two workers, one of them killed",
+            f"seeds {_seeds(note)} at {note['commit']}, a worker killed after {note['killed_after']:,} results; the "
+            "summary, with the digest of all results, " + ("equals" if note["equal"] else "**differs from**")
+            + " that of one computer byte for byte", f"`{_MODULE}.cluster DIR`")
+
+
+def _bits() -> tuple[str, str, str]:
+    results = list(read_results(RESULTS / "same_bits").values())
+    good = sum(map(same_bits.equal, results))
+    targets = ", ".join(sorted({result["target"] for result in results}))
+    return ("equal bits", f"{good} of {len(results)} seeds: twice on the host, on the bench and on {targets} in QEMU",
+            f"`{_MODULE}.same_bits DIR`")
+
+
+def table() -> str:
+    """Markdown."""
+    rows = [_worlds("faults", "worlds with faults"), _worlds("healthy", "healthy worlds"), _branches(), _canaries(),
+            _cluster(), _bits()]
+    return "".join(f"| {' | '.join(row)} |\n" for row in [("", "measured", "command"), ("---",) * 3, *rows])
+
+
+def page() -> str:
+    """The README with the table of the committed results."""
+    head, _, rest = PAGE.read_text(encoding="utf-8").partition(_BEGIN)
+    return f"{head}{_BEGIN}\n{table()}\n{_END}{rest.partition(_END)[2]}"
+
+
+def plot(path: Path) -> None:
+    """Reaction times of the branches, and processor seconds until the planted bugs were found."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 10), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, width_ratios=(1.2, 1))
+    rows = branching.read(RESULTS / "branching")
+    branching.draw(left, rows)
+    of_all = branching.totals([row for lines in rows.values() for row in lines])
+    left.set_title(f"{of_all['branches']:,} branches, {of_all['violations']:,} with a violation\n"
+                   "salient, machine saturating, 40 kHz, sensors of 12 and 17 bits, phase a", fontsize="medium")
+    notes = [note for note in _note("canaries.json") if "seed" in note]
+    labels = [note["name"] for note in notes]
+    for name, what, marker in (("processor_s", "until found", "o"), ("shrinking_s", "to shrink it", "D")):
+        right.plot([note[name] for note in notes], range(len(labels)), marker, linestyle="none", label=what)
+    for index, note in enumerate(notes):
+        count = len(note["events"])
+        right.annotate(f"{count} event{'' if count == 1 else 's'}", (17, index), va="center", fontsize="small")
+    right.set_yticks(range(len(labels)), [_wrapped(name) for name in labels], fontsize="small")
+    right.set_ylim(len(labels) - 0.4, -0.6)
+    right.set_xscale("log")
+    right.set_xlim(0.005, 100)
+    right.set_xlabel("processor seconds")
+    right.grid(alpha=0.3, axis="x")
+    right.legend(loc="upper left", fontsize="small")
+    faults = _note("faults.json")
+    violations = sum(entry["count"] for entry in faults["violations"].values())
+    right.set_title(f"{len(notes)} of {len(_note('canaries.json'))} planted bugs found, by seeds from 1 on\n"
+                    f"{faults['seeds']:,} seeds without them: {violations} violations", fontsize="medium")
+    figure.suptitle("Campaigns by seed: an emulated drive, default parameters")
+    figure.savefig(path, dpi=80)
+
+
+def _wrapped(name: str) -> str:
+    import textwrap
+
+    return "\n".join(textwrap.wrap(name, 34))
+
+
+def main() -> int:
+    """Writes pages and picture; returns the exit code."""
+    PAGE.write_text(page(), encoding="utf-8")
+    fault_table.PAGE.write_text(fault_table.with_branches(fault_table.PAGE.read_text(encoding="utf-8")),
+                                encoding="utf-8")
+    plot(PICTURE)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
