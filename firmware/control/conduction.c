@@ -27,6 +27,12 @@
 /* Of a pulse, 8 degrees. */
 #define PULSE_OVERLAP_MIN (4 * OVERLAP_MIN)
 
+/* Rate of the braking limit's slow part, from that of the advance, Q1.30 to Q1.15: 5/8 in a second by each fold-back
+ * range that the DC link has free, of which LINK_RANGES count; and by which it is faster where the link is full. */
+#define LINK_SHIFT 19
+#define LINK_RANGES 8
+#define LINK_FULL_RATE 32
+
 /* Past any angle: the flux linkage of a motoring phase does not end with its half. */
 #define NO_END UINT32_MAX
 
@@ -259,12 +265,23 @@ static void set_envelope(const machine_tables_t *tables, const conduction_state_
     braking->flux = (int32_t)(flux_q29 >> tables->flux_format.result_shift);
 }
 
+/* Braking torque for which the DC link has room, part of the largest, Q1.15. The voltage follows the torque later, by
+ * the fields of the phases: the part alone by which it is too high would let both oscillate. */
+static int32_t room_q15(const conduction_parameters_t *parameters, conduction_state_t *state, int32_t voltage_q6) {
+    const int32_t range_q6 = parameters->fold_back_range_q6;
+    const int32_t room_q6 = fixed_clamp(parameters->braking_end_q6 - voltage_q6, 0, LINK_RANGES * range_q6);
+    const int32_t free_q15 = ((room_q6 - range_q6) << 15) / range_q6;
+    const int32_t part_q15 = free_q15 < 0 ? LINK_FULL_RATE * free_q15 : free_q15;
+    state->link_q30 =
+        fixed_clamp(state->link_q30 + (parameters->advance_step_q30 >> LINK_SHIFT) * part_q15, 0, ONE_Q30);
+    return (fixed_clamp(free_q15 + ONE_Q15, 0, ONE_Q15) * (state->link_q30 >> 15)) >> 15;
+}
+
 /* Limits by what the voltage can make and by the braking torque whose energy the DC link can take. */
 static void limit_torque(const conduction_parameters_t *parameters, conduction_state_t *state,
                          const conduction_sample_t *sample) {
-    const int32_t range_q6 = parameters->fold_back_range_q6;
-    const int32_t room_q6 = fixed_clamp(parameters->braking_end_q6 - sample->dc_link_voltage_q6, 0, range_q6);
-    const int32_t braking_q24 = 4 * fixed_multiply_high(state->braking_max_q24, (room_q6 << 15) / range_q6 << 15);
+    const int32_t part_q15 = room_q15(parameters, state, sample->dc_link_voltage_q6);
+    const int32_t braking_q24 = 4 * fixed_multiply_high(state->braking_max_q24, part_q15 << 15);
     const bool reverse = sample->speed_q22 < 0;
     const int32_t negative_q24 = reverse ? state->motoring_max_q24 : braking_q24;
     const int32_t positive_q24 = reverse ? braking_q24 : state->motoring_max_q24;
@@ -289,7 +306,7 @@ static void set_interval(const conduction_parameters_t *parameters, conduction_s
     if (partial_q15 > 0) {
         const partial_pulse_t pulse = pulse_for_torque(tables, state);
         const int32_t trim_q24 = fixed_multiply_high(state->pulse.mean_q24, state->trim_q30) * 4;
-        const int32_t trimmed_q24 = fixed_clamp(fixed_add(pulse.ripple_q24, trim_q24), 0, INT32_MAX);
+        const int32_t trimmed_q24 = fixed_add(pulse.ripple_q24, trim_q24);
         interval.on = blend(level_q15 > 0 ? interval.on : interval.enter, pulse.on, partial_q15);
         interval.leave = blend(interval.leave, pulse.end, partial_q15);
         ripple_q24 = (int32_t)blend((uint32_t)ripple_q24, (uint32_t)trimmed_q24, partial_q15);

@@ -33,7 +33,8 @@
  * flux linkage ends at the unaligned position instead.
  *
  * The torque is limited to T_mean. Braking torque, whose energy goes into the DC link, is reduced linearly where the
- * voltage approaches the over-voltage threshold: a chopper that cannot take more, or none, does not end in a fault.
+ * voltage approaches the over-voltage threshold: a chopper that cannot take more, or none, does not end in a fault. The
+ * integral of the voltage's excess over the begin of that range reduces it, too, until the voltage stays there.
  *
  * The torque follows the reference once in a stroke. A speed law with a gain k of the order of the stroke rate f makes
  * every second pulse larger: the error is multiplied by 1 - k / f from stroke to stroke. From base speed on its gain is
@@ -117,6 +118,7 @@ typedef struct {
     bool braking;             /* torque against the rotation */
     int32_t motoring_max_q24; /* largest mean torque, by magnitude, N m, Q7.24 */
     int32_t braking_max_q24;
+    int32_t link_q30;       /* slow part of the braking limit, Q1.30, 0..1 */
     int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
     int32_t torque_max_q24;
     int32_t gain_excess_q31;        /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
@@ -160,6 +162,7 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->step = 0;
     state->torque_min_q24 = parameters->torque_min_q24;
     state->torque_max_q24 = parameters->torque_max_q24;
+    state->link_q30 = 1 << 30;
     state->advance_q30 = 0;
     state->trim_q30 = 0;
     state->level_q15 = 0;

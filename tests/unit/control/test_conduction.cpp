@@ -102,6 +102,7 @@ struct model_t {
     bool braking = false, first = true, single_pulse = false, at_threshold = false;
     double lead = 0.0, end = 0.0, smooth = 0.0, mean = 0.0, peak = 0.0;
     double torque_min = 0.0, torque_max = 0.0, gain_excess = 0.0, ripple = 0.0;
+    double link = 1.0;
     double turn_on_lead = 0.0, enter = 0.0, leave = 0.0, envelope_end = 0.0, envelope_flux_Wb = 0.0;
 
     template <typename value_of_t> double at(double index, value_of_t value_of) const {
@@ -174,7 +175,9 @@ struct model_t {
         }
         gain_excess = above(4.0) * (1.0 - std::min(1.0, s.step * GAIN_PER_STEP));
 
-        const double room = std::clamp((OVER_VOLTAGE_V - s.voltage) / FOLD_BACK_V, 0.0, 1.0);
+        const double free = std::clamp((OVER_VOLTAGE_V - s.voltage) / FOLD_BACK_V, 0.0, 8.0) - 1.0;
+        link = std::clamp(link + 1.0 / 50.0 / 16.0 * (free < 0.0 ? 32.0 * free : free), 0.0, 1.0);
+        const double room = std::min(free + 1.0, 1.0) * link;
         const double motoring_max = std::min(largest(false, index), TORQUE_MAX_NM);
         const double braking_max = std::min(largest(true, index) * room, TORQUE_MAX_NM);
         torque_max = s.speed < 0.0 ? braking_max : motoring_max;
@@ -201,7 +204,7 @@ struct model_t {
             const auto [pulse_on, pulse_end, pulse_ripple] = pulse_for(index);
             on = blend(on, pulse_on, partial);
             leave = blend(leave, pulse_end, partial);
-            ripple = blend(ripple, std::max(pulse_ripple + trim * mean, 0.0), partial);
+            ripple = blend(ripple, pulse_ripple + trim * mean, partial);
             single_pulse = torque > smooth || pulse_on < 0.0 || pulse_ripple > mean / 64.0;
             at_threshold = std::fabs(torque - smooth) < 0.05 || std::fabs(pulse_ripple - mean / 64.0) < 0.02;
         }
@@ -355,6 +358,27 @@ TEST_F(Conduction, no_braking_torque_is_permitted_from_the_over_voltage_on) {
     }
 }
 
+TEST_F(Conduction, braking_torque_settles_at_what_a_dc_link_takes_whose_voltage_follows_late) {
+    constexpr double CAPACITANCE_F = 2.2e-3, CHOPPER_OHM = 20.0, UPDATE_S = 4e-4, SPEED = 200.0;
+    parameters.advance_step_q30 = to_fixed(10.0 * UPDATE_S, Q30);
+    std::array<double, 6> power_W{}; // a delay by the fields of the phases
+    double voltage = 240.0, least_V = 1e3, largest_V = 0.0;
+    for (unsigned k = 0; k < 1500; k++) {
+        const double torque = state.torque_min_q24 / Q24;
+        update({torque, torque, 0.0, SPEED, voltage, 0.06});
+        std::rotate(power_W.begin(), power_W.begin() + 1, power_W.end());
+        power_W.back() = -torque * SPEED;
+        voltage += (power_W.front() / voltage - voltage / CHOPPER_OHM) * UPDATE_S / CAPACITANCE_F;
+        ASSERT_LT(voltage, OVER_VOLTAGE_V + 5.0) << k;
+        if (k >= 500) {
+            least_V = std::min(least_V, voltage);
+            largest_V = std::max(largest_V, voltage);
+        }
+    }
+    EXPECT_GT(least_V, OVER_VOLTAGE_V - FOLD_BACK_V - 1.0);
+    EXPECT_LT(largest_V, OVER_VOLTAGE_V - FOLD_BACK_V + 1.0);
+}
+
 TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
     std::mt19937 random(15);
     const auto any = [&] { return int32_t(random()) >> (random() % 32); };
@@ -385,6 +409,8 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
         ASSERT_LE(state.level_q15, 32768);
         ASSERT_GE(state.advance_q30, 0);
         ASSERT_LE(state.advance_q30, 1 << 30);
+        ASSERT_GE(state.link_q30, 0);
+        ASSERT_LE(state.link_q30, 1 << 30);
         ASSERT_GE(state.gain_excess_q31, 0);
         ASSERT_LE(state.torque_min_q24, 0);
         ASSERT_GE(state.torque_min_q24, parameters.torque_min_q24);

@@ -2,10 +2,12 @@
 
 The least RMS current of a torque is that of a single pulse that is shorter than the one of the largest torque. Its
 torque pulsates. Torque sharing, whose torque is smooth, takes as little on machines that saturate, and up to a fifth
-more on machines whose torque rises and falls with the angle. So a part of the torque is made by torque sharing, by the
-pulse, or by what lies between both: the smoothest that takes at most _MORE_CURRENT of the pulse's current.
+more on machines whose torque rises and falls with the angle; the window between its own and that of the pulse of the
+largest torque is often smoother still where the voltage has not time enough. So a part of the torque is made by torque
+sharing, by the pulse of the least current, or by what lies between them and the pulse of the largest torque: the
+smoothest that takes at most _MORE_CURRENT of the least current.
 
-Between both, a phase follows the torque reference, raised by a ripple, from the turn-on to the turn-off angle as far as
+Between them, a phase follows the torque reference, raised by a ripple, from the turn-on to the turn-off angle as far as
 the voltage permits; with the ripple of the pulse the voltage decides alone.
 """
 
@@ -24,10 +26,23 @@ PARTS = (0.25, 0.5, 0.75, 1.0)
 _FOUND = PARTS[:-1]
 """The pulse of the whole is the one of the largest torque."""
 
-_MORE_CURRENT = 1.06
-_TOWARDS_PULSE = np.array([[0.0, 0.0, 0.0, 0.33, 0.67], [0.0, 12.0, 24.0, 0.0, 0.0]])
-"""Ways from torque sharing to the pulse that are tried, and degrees by which the window of sharing is earlier,
-motoring."""
+_MORE_CURRENT = 1.08
+_WAYS = np.array([
+    (0.0, 0.0, 0.0), (12.0, 0.0, 0.0), (12.0, 0.3, 0.0), (12.0, 0.6, 0.0), (12.0, 0.0, 0.5),
+    (0.0, 0.15, 0.0), (0.0, 0.3, 0.0), (0.0, 0.45, 0.0), (0.0, 0.6, 0.0), (0.0, 0.8, 0.0),
+    (0.0, 0.0, 0.33), (0.0, 0.0, 0.5), (0.0, 0.0, 0.67), (0.0, 0.45, 0.33), (0.0, 0.45, 0.67),
+])
+"""Windows that are tried: degrees by which that of torque sharing is earlier, motoring; way from there to the pulse of
+the largest torque; way from there to the pulse of the least current."""
+_CURRENT_WEIGHT = 2.0
+"""Ripple, relatively, that a relative current is worth."""
+_EARLIER_COST = 0.05
+"""Of a window that is earlier, motoring: where nothing else is better."""
+_LOWER_WEIGHT = 2.0
+"""Of a reference that has to be lower than the torque, because the fall of the current adds to it."""
+_FAR_DEG = 100.0
+"""Sum of both angles, between neighbours in the tables, that is worth as much as a ripple of 1; half of it a quarter."""
+_REFUSED = 1e3
 _NARROW_WEIGHT = 0.1
 """Square of the current that a pulse may take more which is as wide as a stroke rather than of no width."""
 _FIRST_DEG = -162
@@ -36,10 +51,10 @@ _SHARE_LEAD_DEG = 20.0
 """As SHARE_LEAD_MAX."""
 _JUMP_COST = 0.06
 """Square of the current, relatively, that half a revolution between the angles of two speeds is worth."""
-_ROUNDS = 3
+_ROUNDS = 4
 """Until the mean torque is the wanted one within _TORQUE_ERROR."""
 _TORQUE_ERROR = 0.02
-_HIGHER_MAX = 1.6
+_HIGHER_MAX = 2.0
 """Factor by which a reference may have to be higher for it."""
 _BEYOND = 1e3
 """Times the wanted torque: a reference that no phase reaches."""
@@ -57,6 +72,16 @@ class PartialPulse:
     """Turn-off past it."""
     ripple: np.ndarray
     """By which the torque reference is raised, as part of the largest mean torque."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Choices:
+    """By way and lane."""
+
+    angles_deg: np.ndarray
+    """Turn-on and turn-off past the begin of the half, (2, ...)."""
+    reference_Nm: np.ndarray
+    cost: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +112,16 @@ def partial_pulse(machine: Machine, data: DriveData, of: SinglePulse) -> Partial
         pulse_deg = np.concatenate([_least_current_deg(pairs, share * mean_Nm[half] / machine.phases,
                                                        360.0 / machine.phases)
                                     for share in _FOUND], axis=1) - (180.0 + 180.0 * half)
+        largest_deg = np.array([-of.lead_deg[half, first:], of.end_deg[half, first:]])
         follower = _Follower(phase, machine.phases, half, np.tile(speed_rad_s, len(_FOUND)))
-        on_deg, off_deg, reference_Nm = follower.smoothest(
-            wanted_Nm, pulse_deg, window_deg if half == 0 else 180.0 - window_deg[::-1])
+        choices = follower.operations(wanted_Nm, pulse_deg, np.tile(largest_deg, len(_FOUND)),
+                                      window_deg if half == 0 else 180.0 - window_deg[::-1])
+        angles_deg, reference_Nm = _chosen(choices, largest_deg)
+        ripple = np.maximum(reference_Nm.ravel() / wanted_Nm - 1.0, 0.0) * part
         whole = -of.lead_deg[half], of.end_deg[half], of.peak_Nm[half] / of.mean_Nm[half] - 1.0
         found.append([
             np.vstack([np.pad(values.reshape(len(_FOUND), -1), ((0, 0), (first, 0)), mode="edge"), of_whole])
-            for values, of_whole in zip((
-                on_deg, off_deg, part * np.maximum(reference_Nm / wanted_Nm - 1.0, 0.0)), whole, strict=True)])
+            for values, of_whole in zip((*angles_deg, ripple), whole, strict=True)])
     return PartialPulse(*(np.array(values) for values in zip(*found, strict=True)))
 
 
@@ -145,6 +172,34 @@ def _followed(cost: np.ndarray, off_deg: np.ndarray) -> np.ndarray:
     return np.array(found[::-1])
 
 
+def _chosen(choices: _Choices, largest_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angles and reference by part and speed, so that the sum of the costs, and of the ways from speed to speed and to
+    the part above, is least: what lies between two of the tables is interpolated."""
+    angles_deg, reference_Nm, cost = (
+        np.moveaxis(of.reshape(*of.shape[:-1], len(_FOUND), -1), -2, 0)
+        for of in (choices.angles_deg, choices.reference_Nm, choices.cost))
+    above_deg, found = largest_deg, []
+    for of_deg, of_Nm, of_cost in zip(angles_deg[::-1], reference_Nm[::-1], cost[::-1], strict=True):
+        own = of_cost + 0.1 * _way(of_deg, above_deg[:, None])
+        total, before = own[:, 0], []
+        for at in range(1, own.shape[1]):
+            reached = total[:, None] + _way(of_deg[:, :, None, at - 1], of_deg[:, None, :, at])
+            before.append(reached.argmin(axis=0))
+            total = reached.min(axis=0) + own[:, at]
+        best = [int(total.argmin())]
+        for from_ in reversed(before):
+            best.append(int(from_[best[-1]]))
+        lanes = best[::-1], np.arange(own.shape[1])
+        above_deg = of_deg[:, *lanes]
+        found.append((above_deg, of_Nm[lanes]))
+    return np.stack([of for of, _ in found[::-1]], axis=1), np.stack([of for _, of in found[::-1]])
+
+
+def _way(from_deg: np.ndarray, to_deg: np.ndarray) -> np.ndarray:
+    result: np.ndarray = (np.abs(to_deg - from_deg).sum(axis=0) / _FAR_DEG) ** 2
+    return result
+
+
 class _Follower:
     """Phases that follow a torque reference within their window, by lane; all do the same, one stroke apart."""
 
@@ -156,32 +211,32 @@ class _Follower:
         self.cap_Wb = phase.cap_Wb(speed_rad_s, (self.begin_deg + _FIRST_DEG + 360) // STEP_DEG)
         self.lane = np.arange(len(speed_rad_s))
 
-    def smoothest(self, wanted_Nm: np.ndarray, pulse_deg: np.ndarray, sharing_deg: np.ndarray
-                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Turn-on, turn-off and torque reference."""
+    def operations(self, wanted_Nm: np.ndarray, pulse_deg: np.ndarray, largest_deg: np.ndarray,
+                   sharing_deg: np.ndarray) -> _Choices:
+        """Of each lane, those that make the wanted torque: the pulse last."""
         pulse = self.run(pulse_deg, _BEYOND * wanted_Nm)
         crest = np.maximum(pulse.peak_Nm / wanted_Nm, 1.0)
         # Of a slightly different torque.
-        allowed_A = _MORE_CURRENT * pulse.rms_A * np.sqrt(wanted_Nm / pulse.mean_Nm)
-        way, earlier_deg = _TOWARDS_PULSE[..., None]
-        sharing_deg = sharing_deg[:, None, None] - (earlier_deg if self.sign > 0.0 else 0.0)
-        angles_deg = sharing_deg + way * (pulse_deg[:, None] - sharing_deg)
-        reference_Nm = wanted_Nm * (1.0 + way * (crest - 1.0))
+        least_A = pulse.rms_A * np.sqrt(wanted_Nm / pulse.mean_Nm)
+        earlier_deg, to_largest, to_pulse = _WAYS.T[..., None]
+        angles_deg = sharing_deg[:, None, None] - (earlier_deg if self.sign > 0.0 else 0.0)
+        angles_deg = angles_deg + to_largest * (largest_deg[:, None] - angles_deg)
+        angles_deg = angles_deg + to_pulse * (pulse_deg[:, None] - angles_deg)
+        reference_Nm = wanted_Nm * (1.0 + to_pulse * (crest - 1.0))
         highest_Nm = _HIGHER_MAX * reference_Nm
-        ripple = np.full(reference_Nm.shape, np.inf)
         flux_Wb = None
         for _ in range(_ROUNDS):
             made = self.run(angles_deg, reference_Nm, flux_Wb)
-            flux_Wb = made.flux_Wb
-            reached = np.abs(made.mean_Nm / wanted_Nm - 1.0) < _TORQUE_ERROR
-            ripple = np.where(reached & (made.rms_A <= allowed_A), made.ripple, ripple)
+            flux_Wb, last_Nm = made.flux_Wb, reference_Nm
             higher = wanted_Nm / np.maximum(made.mean_Nm, 0.5 * wanted_Nm)
-            reference_Nm = np.where(reached, reference_Nm, np.minimum(reference_Nm * higher, highest_Nm))
-        best, lane = ripple.argmin(axis=0), np.arange(len(wanted_Nm))
-        smoother = ripple[best, lane] < pulse.ripple
-        chosen_deg = np.where(smoother, angles_deg[:, best, lane], pulse_deg)
-        chosen_Nm = np.where(smoother, reference_Nm[best, lane], _RIPPLE_MARGIN * crest * wanted_Nm)
-        return chosen_deg[0], chosen_deg[1], chosen_Nm
+            reference_Nm = np.minimum(reference_Nm * higher, highest_Nm)
+        reached = np.abs(made.mean_Nm / wanted_Nm - 1.0) < _TORQUE_ERROR
+        permitted = reached & (made.rms_A <= _MORE_CURRENT * least_A)
+        cost = made.ripple + _CURRENT_WEIGHT * (made.rms_A / least_A - 1.0) + _EARLIER_COST * (earlier_deg > 0.0)
+        cost = cost + _LOWER_WEIGHT * np.maximum(1.0 - last_Nm / wanted_Nm, 0.0)
+        cost = np.where(permitted, cost, _REFUSED)
+        return _Choices(np.concatenate([angles_deg, pulse_deg[:, None]], axis=1),
+                        np.vstack([last_Nm, _RIPPLE_MARGIN * crest * wanted_Nm]), np.vstack([cost, pulse.ripple]))
 
     def run(self, angles_deg: np.ndarray, reference_Nm: np.ndarray, flux_Wb: np.ndarray | None = None) -> _Operation:
         """Turn-on and turn-off past the begin of the half, (2, ...), from flux linkages of the phases."""
