@@ -59,8 +59,8 @@ static conduction_place_t place_of(const machine_tables_t *tables, const conduct
 
 /* Between two values of a table, Q8 of their unit: angles in 2^-24 electrical rev, torques in Q16, flux linkage in Q21.
  */
-static int32_t between_q8(uint16_t low, uint16_t high, int32_t fraction_q8) {
-    return low * (1 << 8) + (high - low) * fraction_q8;
+static int32_t between_q8(int32_t low, int32_t high, int32_t fraction_q8) {
+    return low * ONE_Q8 + (high - low) * fraction_q8;
 }
 
 static uint32_t angle(uint16_t low, uint16_t high, int32_t fraction_q8) {
@@ -207,31 +207,36 @@ typedef struct {
     int32_t ripple_q24;
 } partial_pulse_t;
 
-/* Between four values, in Q16 of their unit: two speeds, for a part and for the next. */
-static int32_t between_four_q16(const int32_t value[4], int32_t fraction_q8, int32_t part_q8) {
-    const int32_t low_q8 = value[0] * ONE_Q8 + (value[1] - value[0]) * fraction_q8;
-    const int32_t high_q8 = value[2] * ONE_Q8 + (value[3] - value[2]) * fraction_q8;
-    return low_q8 * ONE_Q8 + (high_q8 - low_q8) * part_q8;
+/* For an index of the tables, or above them for the largest mean torque. */
+static partial_pulse_t pulse_at(const machine_tables_t *tables, const conduction_state_t *state, unsigned index) {
+    const conduction_pulse_t *largest = &state->pulse;
+    if (index == MACHINE_PULSE_PARTS) {
+        return (partial_pulse_t){-largest->lead, largest->end, largest->peak_q24 - largest->mean_q24};
+    }
+    const machine_partial_pulse_t *low = &tables->partial_pulse[state->braking][index][state->place.k], *high = low + 1;
+    const int32_t fraction_q8 = state->place.fraction_q8;
+    const int32_t ripple_q15 = between_q8(low->ripple, high->ripple, fraction_q8) - MACHINE_RIPPLE_OFFSET * ONE_Q8;
+    return (partial_pulse_t){
+        .on = (uint32_t)between_q8(low->on, high->on, fraction_q8) << 16,
+        .end = (uint32_t)between_q8(low->end, high->end, fraction_q8) << 16,
+        .ripple_q24 = fixed_saturate_bits(fixed_multiply_high(largest->mean_q24, ripple_q15 * ONE_Q15), 30) * 4,
+    };
 }
 
 /* Below the least part of the tables with its angles, and less ripple. */
 static partial_pulse_t pulse_for_torque(const machine_tables_t *tables, const conduction_state_t *state) {
-    const unsigned index = (unsigned)state->part_q15 >> 13;
-    const unsigned above = index < MACHINE_PULSE_PARTS ? index : MACHINE_PULSE_PARTS - 1;
-    const int32_t part_q8 = (state->part_q15 - (int32_t)(above << 13)) >> 5, fraction_q8 = state->place.fraction_q8;
-    const machine_partial_pulse_t(*parts)[MACHINE_PULSE_POINTS] = tables->partial_pulse[state->braking];
-    const machine_partial_pulse_t *low = &parts[above > 0 ? above - 1 : 0][state->place.k];
-    const machine_partial_pulse_t *high = &parts[above][state->place.k];
-    const int32_t on[4] = {low[0].on, low[1].on, high[0].on, high[1].on};
-    const int32_t end[4] = {low[0].end, low[1].end, high[0].end, high[1].end};
-    const int32_t some = above > 0 ? INT32_MAX : 0;
-    const int32_t ripple[4] = {low[0].ripple & some, low[1].ripple & some, high[0].ripple, high[1].ripple};
-    const int32_t ripple_q22 = between_four_q16(ripple, fraction_q8, part_q8) >> 1;
-    const int32_t ripple_q24 = fixed_multiply_high(state->pulse.mean_q24, ripple_q22 << 8);
+    const unsigned quarter = (unsigned)state->part_q15 >> 13;
+    const unsigned above = quarter < MACHINE_PULSE_PARTS ? quarter : MACHINE_PULSE_PARTS;
+    partial_pulse_t low = pulse_at(tables, state, above > 0 ? above - 1 : 0);
+    if (above == 0) {
+        low.ripple_q24 = 0;
+    }
+    const partial_pulse_t high = pulse_at(tables, state, above);
+    const int32_t way_q15 = (state->part_q15 - (int32_t)(above << 13)) * 4;
     return (partial_pulse_t){
-        .on = (uint32_t)between_four_q16(on, fraction_q8, part_q8) << 8,
-        .end = (uint32_t)between_four_q16(end, fraction_q8, part_q8) << 8,
-        .ripple_q24 = fixed_saturate_bits(ripple_q24, 30) * 4,
+        .on = blend(low.on, high.on, way_q15),
+        .end = blend(low.end, high.end, way_q15),
+        .ripple_q24 = (int32_t)blend((uint32_t)low.ripple_q24, (uint32_t)high.ripple_q24, way_q15),
     };
 }
 
@@ -312,7 +317,7 @@ static void set_interval(const conduction_parameters_t *parameters, conduction_s
         ripple_q24 = (int32_t)blend((uint32_t)ripple_q24, (uint32_t)trimmed_q24, partial_q15);
         interval.enter = interval.on;
         single_pulse = state->torque_q24 > state->pulse.smooth_q24 || (int32_t)pulse.on < 0 ||
-                       pulse.ripple_q24 > state->pulse.mean_q24 >> 6;
+                       fixed_abs(pulse.ripple_q24) > state->pulse.mean_q24 >> 6;
     }
     state->interval = interval;
     state->ripple_q24 = ripple_q24;

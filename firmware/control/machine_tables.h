@@ -71,13 +71,15 @@ typedef struct {
     uint16_t peak_torque;   /* largest instantaneous sum of all phases with that pulse, N m, Q7.8 */
 } machine_pulse_t;
 
-/* For 1/4, 1/2, 3/4 and all of the largest mean torque. */
-#define MACHINE_PULSE_PARTS 4
+/* For 1/4, 1/2 and 3/4 of the largest mean torque. */
+#define MACHINE_PULSE_PARTS 3
+#define MACHINE_RIPPLE_OFFSET 32
 
 typedef struct {
-    int8_t on;      /* turn-on past the begin of the half of the wanted torque, 2^-8 electrical rev; negative: before */
-    uint8_t end;    /* turn-off past it, 2^-8 electrical rev, 0..128 */
-    uint8_t ripple; /* by which the torque reference is raised, part of the largest mean torque, Q1.7 */
+    int8_t on;   /* turn-on past the begin of the half of the wanted torque, 2^-8 electrical rev; negative: before */
+    uint8_t end; /* turn-off past it, 2^-8 electrical rev, 0..128 */
+    /* By which the torque reference is raised, part of the largest mean torque, Q1.7, and MACHINE_RIPPLE_OFFSET. */
+    uint8_t ripple;
 } machine_partial_pulse_t;
 
 #define MACHINE_PARAMETERS_MAX 64

@@ -53,7 +53,7 @@ machine_tables_t tables_of() {
             for (unsigned part = 0; part < MACHINE_PULSE_PARTS; part++) {
                 tables.partial_pulse[braking][part][k] = {.on = int8_t(30 - k - 8 * int(part)),
                                                           .end = uint8_t(84 + k + 4 * part - 2 * braking),
-                                                          .ripple = uint8_t(4 * part + k)};
+                                                          .ripple = uint8_t(20 + 8 * part + k)};
             }
         }
         tables.braking_end[k] = uint16_t(3000 + 500 * k);
@@ -118,12 +118,15 @@ struct model_t {
     // Turn-on, turn-off and ripple over the part of the largest torque.
     std::array<double, 3> pulse_for(double index) const {
         const auto table = [&](unsigned knot) -> std::array<double, 3> {
+            if (knot == MACHINE_PULSE_PARTS) {
+                return {-lead, end, peak - mean};
+            }
             const machine_partial_pulse_t *of = tables.partial_pulse[braking][knot];
             return {at(index, [&](unsigned k) { return of[k].on / 256.0; }),
                     at(index, [&](unsigned k) { return of[k].end / 256.0; }),
-                    at(index, [&](unsigned k) { return of[k].ripple / 128.0; }) * mean};
+                    at(index, [&](unsigned k) { return of[k].ripple / 128.0 - 0.25; }) * mean};
         };
-        const unsigned knot = std::min(unsigned(part * 4.0), MACHINE_PULSE_PARTS - 1u);
+        const unsigned knot = std::min(unsigned(part * 4.0), MACHINE_PULSE_PARTS + 0u);
         std::array<double, 3> low = table(knot == 0 ? 0 : knot - 1), high = table(knot);
         if (knot == 0) {
             low[2] = 0.0;
@@ -205,8 +208,8 @@ struct model_t {
             on = blend(on, pulse_on, partial);
             leave = blend(leave, pulse_end, partial);
             ripple = blend(ripple, pulse_ripple + trim * mean, partial);
-            single_pulse = torque > smooth || pulse_on < 0.0 || pulse_ripple > mean / 64.0;
-            at_threshold = std::fabs(torque - smooth) < 0.05 || std::fabs(pulse_ripple - mean / 64.0) < 0.02;
+            single_pulse = torque > smooth || pulse_on < 0.0 || std::fabs(pulse_ripple) > mean / 64.0;
+            at_threshold = std::fabs(torque - smooth) < 0.05 || std::fabs(std::fabs(pulse_ripple) - mean / 64.0) < 0.02;
         }
         if (level > 0.0 || partial > 0.0) {
             const double latest = partial > 0.0 ? 1.0 : enter;

@@ -21,19 +21,20 @@ from salient.machine.definition import Machine
 from salient.machine.drive_data import DriveData
 from salient.machine.single_pulse import LANE_DEG, STEP_DEG, TURN, Pairs, Phase, SinglePulse, parabola, vertex
 
-PARTS = (0.25, 0.5, 0.75, 1.0)
+PARTS = (0.25, 0.5, 0.75)
 """Of the largest mean torque, as MACHINE_PULSE_PARTS."""
-_FOUND = PARTS[:-1]
-"""The pulse of the whole is the one of the largest torque."""
 
 _MORE_CURRENT = 1.08
-_WAYS = np.array([
-    (0.0, 0.0, 0.0), (12.0, 0.0, 0.0), (12.0, 0.3, 0.0), (12.0, 0.6, 0.0), (12.0, 0.0, 0.5),
-    (0.0, 0.15, 0.0), (0.0, 0.3, 0.0), (0.0, 0.45, 0.0), (0.0, 0.6, 0.0), (0.0, 0.8, 0.0),
+_BOTH_WAYS = [
+    (0.0, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, 0.3, 0.0), (0.0, 0.45, 0.0), (0.0, 0.6, 0.0), (0.0, 0.8, 0.0),
     (0.0, 0.0, 0.33), (0.0, 0.0, 0.5), (0.0, 0.0, 0.67), (0.0, 0.45, 0.33), (0.0, 0.45, 0.67),
-])
-"""Windows that are tried: degrees by which that of torque sharing is earlier, motoring; way from there to the pulse of
-the largest torque; way from there to the pulse of the least current."""
+]
+_WAYS = (
+    np.array([*_BOTH_WAYS, (12.0, 0.0, 0.0), (12.0, 0.3, 0.0), (12.0, 0.6, 0.0), (12.0, 0.0, 0.5)]),
+    np.array(_BOTH_WAYS),
+)
+"""Windows that are tried, motoring and braking: degrees by which that of torque sharing is earlier; way from there to
+the pulse of the largest torque; way from there to the pulse of the least current."""
 _CURRENT_WEIGHT = 2.0
 """Ripple, relatively, that a relative current is worth."""
 _EARLIER_COST = 0.05
@@ -51,9 +52,11 @@ _SHARE_LEAD_DEG = 20.0
 """As SHARE_LEAD_MAX."""
 _JUMP_COST = 0.06
 """Square of the current, relatively, that half a revolution between the angles of two speeds is worth."""
-_ROUNDS = 4
+_ROUNDS = 3
 """Until the mean torque is the wanted one within _TORQUE_ERROR."""
 _TORQUE_ERROR = 0.02
+_SLOPES = (0.5, 3.0)
+"""Of the logarithm of the mean torque over that of the reference."""
 _HIGHER_MAX = 2.0
 """Factor by which a reference may have to be higher for it."""
 _BEYOND = 1e3
@@ -71,7 +74,7 @@ class PartialPulse:
     off_deg: np.ndarray
     """Turn-off past it."""
     ripple: np.ndarray
-    """By which the torque reference is raised, as part of the largest mean torque."""
+    """By which the torque reference is raised, as part of the largest mean torque; negative: lowered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,21 +110,19 @@ def partial_pulse(machine: Machine, data: DriveData, of: SinglePulse) -> Partial
     window_deg = np.array(of.sharing_deg) - 180.0
     found = []
     for half, pairs in enumerate(phase.pairs(speed_rad_s)):
-        part = np.repeat(_FOUND, len(speed_rad_s))
-        wanted_Nm = part * np.tile(mean_Nm[half], len(_FOUND))
+        part = np.repeat(PARTS, len(speed_rad_s))
+        wanted_Nm = part * np.tile(mean_Nm[half], len(PARTS))
         pulse_deg = np.concatenate([_least_current_deg(pairs, share * mean_Nm[half] / machine.phases,
                                                        360.0 / machine.phases)
-                                    for share in _FOUND], axis=1) - (180.0 + 180.0 * half)
+                                    for share in PARTS], axis=1) - (180.0 + 180.0 * half)
         largest_deg = np.array([-of.lead_deg[half, first:], of.end_deg[half, first:]])
-        follower = _Follower(phase, machine.phases, half, np.tile(speed_rad_s, len(_FOUND)))
-        choices = follower.operations(wanted_Nm, pulse_deg, np.tile(largest_deg, len(_FOUND)),
+        follower = _Follower(phase, machine.phases, half, np.tile(speed_rad_s, len(PARTS)))
+        choices = follower.operations(wanted_Nm, pulse_deg, np.tile(largest_deg, len(PARTS)),
                                       window_deg if half == 0 else 180.0 - window_deg[::-1])
         angles_deg, reference_Nm = _chosen(choices, largest_deg)
-        ripple = np.maximum(reference_Nm.ravel() / wanted_Nm - 1.0, 0.0) * part
-        whole = -of.lead_deg[half], of.end_deg[half], of.peak_Nm[half] / of.mean_Nm[half] - 1.0
-        found.append([
-            np.vstack([np.pad(values.reshape(len(_FOUND), -1), ((0, 0), (first, 0)), mode="edge"), of_whole])
-            for values, of_whole in zip((*angles_deg, ripple), whole, strict=True)])
+        ripple = (reference_Nm.ravel() / wanted_Nm - 1.0) * part
+        found.append([np.pad(values.reshape(len(PARTS), -1), ((0, 0), (first, 0)), mode="edge")
+                      for values in (*angles_deg, ripple)])
     return PartialPulse(*(np.array(values) for values in zip(*found, strict=True)))
 
 
@@ -176,7 +177,7 @@ def _chosen(choices: _Choices, largest_deg: np.ndarray) -> tuple[np.ndarray, np.
     """Angles and reference by part and speed, so that the sum of the costs, and of the ways from speed to speed and to
     the part above, is least: what lies between two of the tables is interpolated."""
     angles_deg, reference_Nm, cost = (
-        np.moveaxis(of.reshape(*of.shape[:-1], len(_FOUND), -1), -2, 0)
+        np.moveaxis(of.reshape(*of.shape[:-1], len(PARTS), -1), -2, 0)
         for of in (choices.angles_deg, choices.reference_Nm, choices.cost))
     above_deg, found = largest_deg, []
     for of_deg, of_Nm, of_cost in zip(angles_deg[::-1], reference_Nm[::-1], cost[::-1], strict=True):
@@ -205,6 +206,7 @@ class _Follower:
 
     def __init__(self, phase: Phase, phases: int, half: int, speed_rad_s: np.ndarray) -> None:
         self.phase, self.phases, self.speed_rad_s = phase, phases, speed_rad_s
+        self.half = half
         self.begin_deg = 180 + 180 * half
         self.sign = 1.0 - 2.0 * half
         self.stroke_deg = 360.0 / phases
@@ -218,25 +220,29 @@ class _Follower:
         crest = np.maximum(pulse.peak_Nm / wanted_Nm, 1.0)
         # Of a slightly different torque.
         least_A = pulse.rms_A * np.sqrt(wanted_Nm / pulse.mean_Nm)
-        earlier_deg, to_largest, to_pulse = _WAYS.T[..., None]
-        angles_deg = sharing_deg[:, None, None] - (earlier_deg if self.sign > 0.0 else 0.0)
+        earlier_deg, to_largest, to_pulse = _WAYS[self.half].T[..., None]
+        angles_deg = sharing_deg[:, None, None] - earlier_deg
         angles_deg = angles_deg + to_largest * (largest_deg[:, None] - angles_deg)
         angles_deg = angles_deg + to_pulse * (pulse_deg[:, None] - angles_deg)
         reference_Nm = wanted_Nm * (1.0 + to_pulse * (crest - 1.0))
         highest_Nm = _HIGHER_MAX * reference_Nm
-        flux_Wb = None
+        made = self.run(angles_deg, reference_Nm)
+        slope = np.ones(reference_Nm.shape)
         for _ in range(_ROUNDS):
-            made = self.run(angles_deg, reference_Nm, flux_Wb)
-            flux_Wb, last_Nm = made.flux_Wb, reference_Nm
-            higher = wanted_Nm / np.maximum(made.mean_Nm, 0.5 * wanted_Nm)
-            reference_Nm = np.minimum(reference_Nm * higher, highest_Nm)
+            last_Nm, mean_Nm = reference_Nm, np.maximum(made.mean_Nm, 0.5 * wanted_Nm)
+            reference_Nm = np.minimum(reference_Nm * (wanted_Nm / mean_Nm) ** (1.0 / slope), highest_Nm)
+            made = self.run(angles_deg, reference_Nm, made.flux_Wb)
+            changed = np.log(reference_Nm / last_Nm)
+            known = np.abs(changed) > _TORQUE_ERROR
+            of_mean = np.log(made.mean_Nm / mean_Nm) / np.where(known, changed, 1.0)
+            slope = np.where(known, np.clip(of_mean, *_SLOPES), slope)
         reached = np.abs(made.mean_Nm / wanted_Nm - 1.0) < _TORQUE_ERROR
         permitted = reached & (made.rms_A <= _MORE_CURRENT * least_A)
         cost = made.ripple + _CURRENT_WEIGHT * (made.rms_A / least_A - 1.0) + _EARLIER_COST * (earlier_deg > 0.0)
-        cost = cost + _LOWER_WEIGHT * np.maximum(1.0 - last_Nm / wanted_Nm, 0.0)
+        cost = cost + _LOWER_WEIGHT * np.maximum(1.0 - reference_Nm / wanted_Nm, 0.0)
         cost = np.where(permitted, cost, _REFUSED)
         return _Choices(np.concatenate([angles_deg, pulse_deg[:, None]], axis=1),
-                        np.vstack([last_Nm, _RIPPLE_MARGIN * crest * wanted_Nm]), np.vstack([cost, pulse.ripple]))
+                        np.vstack([reference_Nm, _RIPPLE_MARGIN * crest * wanted_Nm]), np.vstack([cost, pulse.ripple]))
 
     def run(self, angles_deg: np.ndarray, reference_Nm: np.ndarray, flux_Wb: np.ndarray | None = None) -> _Operation:
         """Turn-on and turn-off past the begin of the half, (2, ...), from flux linkages of the phases."""

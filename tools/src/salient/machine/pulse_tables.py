@@ -19,6 +19,8 @@ _INDEX_BITS = 12 + 32 - 22 + 6
 """Fraction bits of the index at the last speed, less those of a speed and a voltage: the index is
 ((speed_q22 * scale) >> 32) / voltage_q6, 2^12 at the last one."""
 _SCALE_BITS = 31
+_RIPPLE_OFFSET = 0.25
+"""As MACHINE_RIPPLE_OFFSET."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ def in_units(pulse: SinglePulse, partial: PartialPulse, exponents: Exponents) ->
         braking_flux=_rounded(pulse.braking_flux_Wb, 13 - exponents.voltage),
         base_index=int(_rounded(pulse.base_speed_per_voltage / float(pulse.speed_per_voltage[-1]), 12)),
         partial=np.stack([_rounded(partial.on_deg / 360.0, 8, 127, -128), _rounded(partial.off_deg / 360.0, 8, 128),
-                          _rounded(partial.ripple, 7, 255)], axis=-1),
+                          _rounded(partial.ripple + _RIPPLE_OFFSET, 7, 255)], axis=-1),
     )
 
 
