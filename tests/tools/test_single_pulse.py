@@ -216,40 +216,42 @@ def parts(name: str) -> PartialPulse:
     return partial_pulse(machine, derive(machine), pulses(name))
 
 
-@pytest.mark.parametrize("name", [*COMPARED, "linear_cosine"])
-@pytest.mark.parametrize("half", [0, 1], ids=["motoring", "braking"])
-def test_voltage_makes_each_pulsating_part_of_the_torque_between_its_angles(name: str, half: int):
-    """The reference takes away what is too much. Where the torque does not pulsate, it shapes the current instead."""
-    of, largest_Nm = parts(name), pulses(name).mean_Nm[half]
-    base = int(np.searchsorted(pulses(name).speed_per_voltage, pulses(name).base_speed_per_voltage))
+def test_voltage_makes_each_part_of_the_torque_between_its_angles_whose_reference_is_raised():
+    """The reference takes away what is too much. Where it is not raised, it shapes the current instead."""
     compared = 0
-    for point in range(base, POINTS, 2):
-        pulsating = of.ripple[half, :, point] > 0.05
-        found = simulation(name).run(speeds(name)[point], BEGIN_DEG[half] + of.on_deg[half, :, point],
-                                     BEGIN_DEG[half] + of.off_deg[half, :, point])
-        made = np.abs(found.mean_Nm) / largest_Nm[point] / PARTS
-        assert np.all(made[pulsating] > 0.94), (point, made)
-        assert np.all(found.largest_A[pulsating] < 1.05 * simulation(name).limit_A), point
-        compared += int(pulsating.sum())
-    assert compared >= 5
+    for name in (*COMPARED, "linear_cosine"):
+        of = parts(name)
+        base = int(np.searchsorted(pulses(name).speed_per_voltage, pulses(name).base_speed_per_voltage))
+        for half in (0, 1):
+            for point in range(base, POINTS, 2):
+                raised = of.ripple[half, :, point] > 0.1
+                found = simulation(name).run(speeds(name)[point], BEGIN_DEG[half] + of.on_deg[half, :, point],
+                                             BEGIN_DEG[half] + of.off_deg[half, :, point])
+                made = np.abs(found.mean_Nm) / pulses(name).mean_Nm[half, point] / PARTS
+                assert np.all(made[raised] > 0.94), (name, half, point, made)
+                assert np.all(found.largest_A[raised] < 1.05 * simulation(name).limit_A), (name, half, point)
+                compared += int(raised.sum())
+    assert compared >= 15
 
 
-def test_a_saturating_machine_makes_parts_by_torque_sharing_and_one_with_a_sine_of_the_angle_by_pulses():
-    for name, pulsating in (("saturating", False), ("linear_cosine", True)):
+def test_a_saturating_machine_makes_parts_by_smooth_torque_and_one_with_a_sine_of_the_angle_by_narrower_pulses():
+    for name, narrow, raised in (("saturating", False, 0.01), ("linear_cosine", True, 0.2)):
         of = pulses(name)
         at = np.searchsorted(of.speed_per_voltage, 1.3 * of.base_speed_per_voltage)
-        motoring = parts(name)
-        assert np.all((motoring.ripple[0, :2, at] > 0.03) == pulsating), name
-        width_deg = motoring.off_deg[0, :2, at] - motoring.on_deg[0, :2, at]
-        assert np.all((width_deg < 120.0) == pulsating), name
+        part = parts(name)
+        assert np.all(np.abs(part.ripple[:, :, at]) < raised), name
+        width_deg = part.off_deg[0, :, at] - part.on_deg[0, :, at]
+        assert np.all((width_deg < 130.0) == narrow), name
+    assert np.all(parts("linear_cosine").ripple[0, :, at] > 0.02)
 
 
 # --- every machine --------------------------------------------------------------------------------------------------
 
 def every_machine(folder: Path) -> list[Path]:
     """The bundled ones, the examples, the extremes and random ones."""
-    files = [folder / f"random_{number:02}.toml" for number in range(COUNT)]
-    for number, file in enumerate(files):
+    numbers = range(0, COUNT, 3)
+    files = [folder / f"random_{number:02}.toml" for number in numbers]
+    for number, file in zip(numbers, files, strict=True):
         file.write_text(random_machine(number))
     return [*FILES, *files]
 
@@ -277,9 +279,9 @@ def test_pulses_of_every_machine_are_in_order_and_good_between_the_points(tmp_pa
         assert np.all((part.on_deg > -160.0) & (part.on_deg < 80.0)), context
         assert np.all((part.off_deg > 30.0) & (part.off_deg <= 180.0)), context
         assert np.all(part.off_deg - part.on_deg > 20.0), context
-        assert np.all(part.ripple >= 0.0), context
+        assert np.all((part.ripple > -0.25) & (part.ripple < 2.0)), context
 
-        for point in (0, 2, 5, 8, 11, 13, 15):
+        for point in (0, 5, 8, 11, 15):
             middle = [0.5 * (values[..., point] + values[..., point + 1]) for values in (
                 of.speed_per_voltage * machine.supply_voltage_V, of.lead_deg, of.end_deg, of.mean_Nm)]
             speed_rad_s, lead_deg, end_deg, mean_Nm = middle
@@ -309,7 +311,7 @@ def test_machine_of_odd_proportions_has_pulses_in_order(change: dict):
     part = partial_pulse(machine, derive(machine), of)
     for values in vars(part).values():
         assert values.shape == (2, len(PARTS), POINTS) and np.all(np.isfinite(values))
-    assert np.all((part.off_deg > part.on_deg) & (part.off_deg <= 180.0) & (part.ripple >= 0.0))
+    assert np.all((part.off_deg > part.on_deg) & (part.off_deg <= 180.0) & (part.ripple > -1.0))
 
 
 # --- units ----------------------------------------------------------------------------------------------------------
@@ -325,7 +327,9 @@ def index_q8(tables: PulseTables, exponents: Exponents, speed_rad_s: float, volt
 def test_tables_are_the_pulses_in_the_units_of_the_machine(path: Path):
     machine = load_machine(path)
     scaling = scaling_of(path, machine)
-    of, tables, exponents = single_pulse(machine, scaling.data), pulse_tables(machine, scaling), scaling.exponents
+    of, exponents = single_pulse(machine, scaling.data), scaling.exponents
+    part = partial_pulse(machine, scaling.data, of)
+    tables = in_units(of, part, exponents)
     assert 1 << 20 < tables.index_scale < 1 << 31
     for share in (0.7, 1.0, 1.1):
         voltage_V = share * machine.supply_voltage_V
@@ -339,9 +343,8 @@ def test_tables_are_the_pulses_in_the_units_of_the_machine(path: Path):
         assert tables.pulse[..., column] * lsb_Nm == pytest.approx(torque_Nm, abs=0.501 * lsb_Nm)
         assert lsb_Nm < 1e-3 * scaling.data.torque_peak_Nm
     assert tables.braking_end * 360.0 / 65536.0 == pytest.approx(of.braking_end_deg, abs=0.003)
-    part = partial_pulse(machine, scaling.data, of)
     for column, values, lsb in ((0, part.on_deg, 360.0 / 256.0), (1, part.off_deg, 360.0 / 256.0),
-                                (2, np.minimum(part.ripple, 255.0 / 128.0), 1.0 / 128.0)):
+                                (2, np.clip(part.ripple, -0.25, 223.0 / 128.0) + 0.25, 1.0 / 128.0)):
         assert tables.partial[..., column] * lsb == pytest.approx(values, abs=0.501 * lsb)
     lsb_Wb = math.ldexp(1.0, exponents.voltage - 13)
     assert tables.braking_flux * lsb_Wb == pytest.approx(of.braking_flux_Wb, abs=0.501 * lsb_Wb)
