@@ -142,16 +142,14 @@ static int32_t trim_step_q30(const conduction_pulse_t *pulse, const conduction_s
     return (int32_t)(sample->angle_step >> TRIM_SHIFT) * part_q12;
 }
 
-/* Advance of the windows and level of the single pulse. */
-static void move(const conduction_parameters_t *parameters, conduction_state_t *state, const machine_tables_t *tables,
+/* Advance of the windows, level of the single pulse, and part of the largest torque. */
+static void move(const conduction_parameters_t *parameters, conduction_state_t *state,
                  const conduction_sample_t *sample) {
     const int32_t torque = fixed_abs(sample->torque_q24);
     const bool voltage_limited = fixed_abs(sample->torque_shortfall_q24) > SHORTFALL_MIN_Q24 + torque / 64;
     int32_t retract_q30 = voltage_limited ? 0 : parameters->retract_step_q30;
     if (parameters->single_pulse) {
-        state->partial_q15 = above_base_q15(tables, state->place, PARTIAL_RANGE);
         retract_q30 >>= state->partial_q15 > 0 ? ABOVE_BASE_SHIFT : 0;
-        state->torque_q24 = smoothed_q24(state, tables->phases, sample);
         const int32_t forward_q15 = feed_forward_q15(&state->pulse, state->torque_q24);
         /* Of the part of the largest torque, and of the level below it. */
         const int32_t forward_q30 =
@@ -163,14 +161,14 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
         }
         if (forward_q15 == ONE_Q15) {
             state->trim_q30 = 0; /* the largest torque is that of the tables */
-        } else if (state->partial_q15 > 0) {
-            state->trim_q30 +=
-                voltage_limited || state->single_pulse
-                    ? trim_step_q30(&state->pulse, sample) >> 2
-                    : -fixed_clamp(state->trim_q30, -parameters->advance_step_q30, parameters->advance_step_q30);
-        } else if (state->advance_q30 == ONE_Q30 && (voltage_limited || state->level_q15 > 0)) {
+        } else if (state->partial_q15 > 0 && !voltage_limited && !state->single_pulse) {
+            state->trim_q30 -=
+                fixed_clamp(state->trim_q30, -parameters->advance_step_q30, parameters->advance_step_q30);
+        } else if (state->partial_q15 > 0 ||
+                   (state->advance_q30 == ONE_Q30 && (voltage_limited || state->level_q15 > 0))) {
+            const int32_t step_q30 = trim_step_q30(&state->pulse, sample);
             /* Sharing follows the reference at any level that is too high: without a shortfall it returns. */
-            state->trim_q30 += trim_step_q30(&state->pulse, sample) - (forward_q15 == 0 ? retract_q30 : 0);
+            state->trim_q30 += state->partial_q15 > 0 ? step_q30 >> 2 : step_q30 - (forward_q15 == 0 ? retract_q30 : 0);
         }
         state->trim_q30 = fixed_clamp(state->trim_q30, -forward_q30, ONE_Q30 - forward_q30);
         state->part_q15 = (forward_q30 + state->trim_q30) >> 15;
@@ -182,9 +180,9 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
     }
 }
 
-static inline uint32_t blend(uint32_t from, uint32_t to, int32_t level_q15) {
-    const int32_t way = (int32_t)(to - from);
-    return from + (uint32_t)(((int64_t)way * level_q15) >> 15);
+/* At the level 0 and 1 within 2 LSB of from and to. */
+static uint32_t blend(uint32_t from, uint32_t to, int32_t level_q15) {
+    return from + 4 * (uint32_t)fixed_multiply_high((int32_t)(to - from), level_q15 << 15);
 }
 
 static conduction_interval_t sharing_interval(const conduction_parameters_t *parameters,
@@ -201,22 +199,16 @@ static conduction_interval_t sharing_interval(const conduction_parameters_t *par
     };
 }
 
-/* Of the pulse for a part of the largest mean torque. */
-typedef struct {
-    uint32_t on, end; /* past the begin of the half, 2^-32 electrical rev */
-    int32_t ripple_q24;
-} partial_pulse_t;
-
 /* For an index of the tables, or above them for the largest mean torque. */
-static partial_pulse_t pulse_at(const machine_tables_t *tables, const conduction_state_t *state, unsigned index) {
+static conduction_part_t pulse_at(const machine_tables_t *tables, const conduction_state_t *state, unsigned index) {
     const conduction_pulse_t *largest = &state->pulse;
     if (index == MACHINE_PULSE_PARTS) {
-        return (partial_pulse_t){-largest->lead, largest->end, largest->peak_q24 - largest->mean_q24};
+        return (conduction_part_t){-largest->lead, largest->end, largest->peak_q24 - largest->mean_q24};
     }
     const machine_partial_pulse_t *low = &tables->partial_pulse[state->braking][index][state->place.k], *high = low + 1;
     const int32_t fraction_q8 = state->place.fraction_q8;
     const int32_t ripple_q15 = between_q8(low->ripple, high->ripple, fraction_q8) - MACHINE_RIPPLE_OFFSET * ONE_Q8;
-    return (partial_pulse_t){
+    return (conduction_part_t){
         .on = (uint32_t)between_q8(low->on, high->on, fraction_q8) << 16,
         .end = (uint32_t)between_q8(low->end, high->end, fraction_q8) << 16,
         .ripple_q24 = fixed_saturate_bits(fixed_multiply_high(largest->mean_q24, ripple_q15 * ONE_Q15), 30) * 4,
@@ -224,16 +216,16 @@ static partial_pulse_t pulse_at(const machine_tables_t *tables, const conduction
 }
 
 /* Below the least part of the tables with its angles, and less ripple. */
-static partial_pulse_t pulse_for_torque(const machine_tables_t *tables, const conduction_state_t *state) {
+static conduction_part_t pulse_for_torque(const machine_tables_t *tables, const conduction_state_t *state) {
     const unsigned quarter = (unsigned)state->part_q15 >> 13;
     const unsigned above = quarter < MACHINE_PULSE_PARTS ? quarter : MACHINE_PULSE_PARTS;
-    partial_pulse_t low = pulse_at(tables, state, above > 0 ? above - 1 : 0);
+    conduction_part_t low = pulse_at(tables, state, above > 0 ? above - 1 : 0);
     if (above == 0) {
         low.ripple_q24 = 0;
     }
-    const partial_pulse_t high = pulse_at(tables, state, above);
+    const conduction_part_t high = pulse_at(tables, state, above);
     const int32_t way_q15 = (state->part_q15 - (int32_t)(above << 13)) * 4;
-    return (partial_pulse_t){
+    return (conduction_part_t){
         .on = blend(low.on, high.on, way_q15),
         .end = blend(low.end, high.end, way_q15),
         .ripple_q24 = (int32_t)blend((uint32_t)low.ripple_q24, (uint32_t)high.ripple_q24, way_q15),
@@ -296,8 +288,7 @@ static void limit_torque(const conduction_parameters_t *parameters, conduction_s
 
 /* Positions and ripple between those of torque sharing and of the single pulse, and above base speed those of the
  * pulse for the part of the largest torque. */
-static void set_interval(const conduction_parameters_t *parameters, conduction_state_t *state,
-                         const machine_tables_t *tables) {
+static void set_interval(const conduction_parameters_t *parameters, conduction_state_t *state) {
     const int32_t level_q15 = state->level_q15, partial_q15 = state->partial_q15;
     conduction_interval_t interval = sharing_interval(parameters, state);
     int32_t ripple_q24 = 0;
@@ -309,7 +300,7 @@ static void set_interval(const conduction_parameters_t *parameters, conduction_s
         ripple_q24 = (int32_t)blend(0, (uint32_t)(state->pulse.peak_q24 - state->pulse.mean_q24), level_q15);
     }
     if (partial_q15 > 0) {
-        const partial_pulse_t pulse = pulse_for_torque(tables, state);
+        const conduction_part_t pulse = state->part;
         const int32_t trim_q24 = fixed_multiply_high(state->pulse.mean_q24, state->trim_q30) * 4;
         const int32_t trimmed_q24 = fixed_add(pulse.ripple_q24, trim_q24);
         interval.on = blend(level_q15 > 0 ? interval.on : interval.enter, pulse.on, partial_q15);
@@ -369,15 +360,22 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
     switch (step) {
     case 0:
         look_up(state, tables, sample);
-        limit_torque(parameters, state, sample);
+        state->partial_q15 = parameters->single_pulse ? above_base_q15(tables, state->place, PARTIAL_RANGE) : 0;
+        state->torque_q24 = smoothed_q24(state, tables->phases, sample);
+        break;
+    case 1:
+        move(parameters, state, sample);
+        break;
+    case 2:
+        if (state->partial_q15 > 0) {
+            state->part = pulse_for_torque(tables, state);
+        }
         state->gain_excess_q31 =
             gain_excess_q31(parameters, sample, above_base_q15(tables, state->place, SLOWER_RANGE));
         break;
-    case 1:
-        move(parameters, state, tables, sample);
-        break;
-    case 2:
-        set_interval(parameters, state, tables);
+    case 3:
+        limit_torque(parameters, state, sample);
+        set_interval(parameters, state);
         break;
     default:
         set_angles(parameters, state, tables, sample->torque_q24 < 0);

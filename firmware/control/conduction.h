@@ -108,7 +108,13 @@ typedef struct {
     uint32_t on;           /* turn-on */
 } conduction_interval_t;
 
-#define CONDUCTION_STEPS 4   /* of an update */
+/* Of the pulse for a part of the largest mean torque. */
+typedef struct {
+    uint32_t on, end;   /* past the begin of the half, 2^-32 electrical rev */
+    int32_t ripple_q24; /* to add to the torque reference, N m, Q7.24 */
+} conduction_part_t;
+
+#define CONDUCTION_STEPS 5   /* of an update */
 #define CONDUCTION_INITIAL 2 /* index of no update yet */
 
 typedef struct {
@@ -121,14 +127,15 @@ typedef struct {
     int32_t link_q30;       /* slow part of the braking limit, Q1.30, 0..1 */
     int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
     int32_t torque_max_q24;
-    int32_t gain_excess_q31;        /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
-    int32_t torque_q24;             /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
-    int32_t partial_q15;            /* part of the pulses for parts of the largest torque, Q1.15, 0..1 */
-    int32_t advance_q30;            /* of the windows, Q1.30, 0..1 */
-    int32_t trim_q30;               /* of the level, Q1.30, -1..1 */
-    int32_t level_q15;              /* Q1.15, 0..1 */
-    int32_t part_q15;               /* of the largest mean torque, Q1.15, 0..1 */
-    bool single_pulse;              /* the torque pulsates, or a phase turns on before its half */
+    int32_t gain_excess_q31; /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
+    int32_t torque_q24;      /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
+    int32_t partial_q15;     /* part of the pulses for parts of the largest torque, Q1.15, 0..1 */
+    int32_t advance_q30;     /* of the windows, Q1.30, 0..1 */
+    int32_t trim_q30;        /* of the level, Q1.30, -1..1 */
+    int32_t level_q15;       /* Q1.15, 0..1 */
+    int32_t part_q15;        /* of the largest mean torque, Q1.15, 0..1 */
+    bool single_pulse;       /* the torque pulsates, or a phase turns on before its half */
+    conduction_part_t part;
     conduction_interval_t interval; /* of the half with the torque */
     int32_t ripple_q24;             /* to add to the magnitude of the torque reference, N m, Q7.24 */
     conduction_t angles[2];         /* of the last two updates */
@@ -171,8 +178,8 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->latest = CONDUCTION_INITIAL;
 }
 
-/* One of the steps of an update, in turn: tables and limits, level, positions, angles. Products are rounded down; the
- * level to 2^-15, angles of the tables to 2^-24. */
+/* One of the steps of an update, in turn: tables, level, pulse for a part of the torque, limits and positions, angles.
+ * Products are rounded down; the level to 2^-15, angles of the tables to 2^-24. */
 void conduction_step(const conduction_parameters_t *parameters, conduction_state_t *state,
                      const machine_tables_t *tables, const conduction_sample_t *sample);
 
