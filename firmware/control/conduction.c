@@ -18,8 +18,7 @@
 
 /* Base speed over the range of speeds above it in which the pulses for parts of the torque take effect, and the reduced
  * gain of the speed law: the speed error that belongs to an acceleration changes with it. */
-#define PARTIAL_RANGE 8
-#define SLOWER_RANGE 4
+#define ABOVE_BASE_RANGE 8
 
 /* Least overlap of windows, 2^-32 electrical rev: 2 degrees. */
 #define OVERLAP_MIN 0x016C16C1u
@@ -108,10 +107,10 @@ static int32_t part_of_largest_q15(const conduction_pulse_t *pulse, int32_t torq
     return torque_q8 >= largest_q8 ? ONE_Q15 : (torque_q8 << 15) / largest_q8;
 }
 
-/* From 0 at the base speed to 1, Q1.15, at 1 / range of it above. */
-static int32_t above_base_q15(const machine_tables_t *tables, conduction_place_t place, int32_t range) {
+/* From 0 at the base speed to 1, Q1.15, at 1 / ABOVE_BASE_RANGE of it above. */
+static int32_t above_base_q15(const machine_tables_t *tables, conduction_place_t place) {
     const int32_t base_q8 = tables->pulse_base_index;
-    const int32_t excess_q8 = range * ((int32_t)(place.k << 8) + place.fraction_q8 - base_q8);
+    const int32_t excess_q8 = ABOVE_BASE_RANGE * ((int32_t)(place.k << 8) + place.fraction_q8 - base_q8);
     return excess_q8 >= base_q8 ? ONE_Q15 : (fixed_clamp(excess_q8, 0, base_q8) << 15) / base_q8;
 }
 
@@ -286,6 +285,15 @@ static void limit_torque(const conduction_parameters_t *parameters, conduction_s
     state->torque_max_q24 = fixed_clamp(parameters->torque_max_q24, 0, positive_q24);
 }
 
+/* Of a pulse: its window begins at most SHARE_LEAD_MAX before the half, and less than half a revolution before its end:
+ * beyond, a phase would make up for no shortfall. */
+static void set_enter(conduction_interval_t *interval) {
+    const int32_t earliest = (int32_t)(interval->leave - HALF_REV + 1);
+    const int32_t latest = (int32_t)interval->enter > -SHARE_LEAD_MAX ? (int32_t)interval->enter : -SHARE_LEAD_MAX;
+    const int32_t enter = fixed_clamp((int32_t)interval->on, -SHARE_LEAD_MAX, latest);
+    interval->enter = (uint32_t)(enter > earliest ? enter : earliest);
+}
+
 /* Positions and ripple between those of torque sharing and of the single pulse, and above base speed those of the
  * pulse for the part of the largest torque. */
 static void set_interval(const conduction_parameters_t *parameters, conduction_state_t *state) {
@@ -310,18 +318,12 @@ static void set_interval(const conduction_parameters_t *parameters, conduction_s
         single_pulse = state->torque_q24 > state->pulse.smooth_q24 || (int32_t)pulse.on < 0 ||
                        fixed_abs(pulse.ripple_q24) > state->pulse.mean_q24 >> 6;
     }
+    if (level_q15 > 0 || partial_q15 > 0) {
+        set_enter(&interval);
+    }
     state->interval = interval;
     state->ripple_q24 = ripple_q24;
     state->single_pulse = single_pulse;
-}
-
-/* Of a pulse: its window begins at most SHARE_LEAD_MAX before the half, and less than half a revolution before its end:
- * beyond, a phase would make up for no shortfall. */
-static void set_enter(conduction_interval_t *interval) {
-    const int32_t earliest = (int32_t)(interval->leave - HALF_REV + 1);
-    const int32_t latest = (int32_t)interval->enter > -SHARE_LEAD_MAX ? (int32_t)interval->enter : -SHARE_LEAD_MAX;
-    const int32_t enter = fixed_clamp((int32_t)interval->on, -SHARE_LEAD_MAX, latest);
-    interval->enter = (uint32_t)(enter > earliest ? enter : earliest);
 }
 
 static void set_angles(const conduction_parameters_t *parameters, conduction_state_t *state,
@@ -332,9 +334,6 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     conduction_half_t *half = &angles->half[state->braking];
     conduction_half_t *before = &angles->half[!state->braking];
     const uint32_t on = state->interval.on;
-    if (level_q15 > 0 || state->partial_q15 > 0) {
-        set_enter(&state->interval);
-    }
     angles->ripple_q24 = negative ? -state->ripple_q24 : state->ripple_q24;
     before->window = parameters->initial.half[0].window;
     before->width = half->width = HALF_REV;
@@ -360,18 +359,18 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
     switch (step) {
     case 0:
         look_up(state, tables, sample);
-        state->partial_q15 = parameters->single_pulse ? above_base_q15(tables, state->place, PARTIAL_RANGE) : 0;
         state->torque_q24 = smoothed_q24(state, tables->phases, sample);
         break;
     case 1:
         move(parameters, state, sample);
+        state->gain_excess_q31 = gain_excess_q31(parameters, sample, state->above_base_q15);
         break;
     case 2:
+        state->above_base_q15 = above_base_q15(tables, state->place);
+        state->partial_q15 = parameters->single_pulse ? state->above_base_q15 : 0;
         if (state->partial_q15 > 0) {
             state->part = pulse_for_torque(tables, state);
         }
-        state->gain_excess_q31 =
-            gain_excess_q31(parameters, sample, above_base_q15(tables, state->place, SLOWER_RANGE));
         break;
     case 3:
         limit_torque(parameters, state, sample);

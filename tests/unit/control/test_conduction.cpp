@@ -153,7 +153,6 @@ struct model_t {
             return std::clamp(range * (std::min(index, 16.0) / BASE_INDEX - 1.0), 0.0, 1.0);
         };
         const double magnitude = std::fabs(s.torque);
-        partial = above(8.0);
         const bool limited = std::fabs(s.shortfall) > 0.05 + magnitude / 64.0;
         torque = partial > 0.0 && !first ? torque + (magnitude - torque) * std::min(1.0, s.step * PHASES) : magnitude;
         first = false;
@@ -176,7 +175,8 @@ struct model_t {
             const double retract = 1.0 / 400.0 / (partial > 0.0 ? 8.0 : 1.0);
             advance = std::clamp(advance + (limited ? 1.0 / 50.0 : -retract), 0.0, 1.0);
         }
-        gain_excess = above(4.0) * (1.0 - std::min(1.0, s.step * GAIN_PER_STEP));
+        gain_excess = partial * (1.0 - std::min(1.0, s.step * GAIN_PER_STEP));
+        partial = above(8.0); // from the level on
 
         const double free = std::clamp((OVER_VOLTAGE_V - s.voltage) / FOLD_BACK_V, 0.0, 8.0) - 1.0;
         link = std::clamp(link + 1.0 / 50.0 / 16.0 * (free < 0.0 ? 32.0 * free : free), 0.0, 1.0);
