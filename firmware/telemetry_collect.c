@@ -69,7 +69,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->status.voltage_saturated = run && torque_control_voltage_saturated(parameters, control);
     telemetry->status.mode = control->deferred.mode;
     telemetry->status.start_inhibited_by = state_machine_first_fault(control->state_machine.start_inhibit_mask);
-    telemetry->status.single_pulse = control->deferred.conduction.level_q15 > 0;
+    telemetry->status.single_pulse = control->deferred.conduction.single_pulse;
     telemetry->status.cycle = drive->comms.telemetry.cycle;
 
     telemetry->motion.speed_rpm = units_milli_rpm(control->observer.speed_q22);

@@ -1,26 +1,36 @@
 #include "control/conduction.h"
 
+#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "fixed/formats.h"
 
 /* Torque shortfall that counts as voltage limitation: 0.05 N m and 1/64 of the reference. Less may be rounding. */
 #define SHORTFALL_MIN_Q24 ((1u << 24) / 20)
 
-/* 2^-32 electrical rev to Q1.30 in Q8, and a half. */
-#define TRIM_SHIFT 11
+/* 2^-32 electrical rev to Q1.30 in Q12, and a half. */
+#define TRIM_SHIFT 15
+#define ONE_Q12 (1 << 12)
 
 #define ONE_Q8 (1 << 8)
 
 /* Above base speed windows return within 8 s: each trial of a smaller advance is a torque shortfall. */
 #define ABOVE_BASE_SHIFT 3
 
-/* Base speed over the range of speeds above it in which the window with the least current takes effect, and the reduced
+/* Base speed over the range of speeds above it in which the pulses for parts of the torque take effect, and the reduced
  * gain of the speed law: the speed error that belongs to an acceleration changes with it. */
-#define LEAST_CURRENT_RANGE 8
-#define SLOWER_RANGE 2
+#define ABOVE_BASE_RANGE 8
 
 /* Least overlap of windows, 2^-32 electrical rev: 2 degrees. */
 #define OVERLAP_MIN 0x016C16C1u
+
+/* Of a pulse, 8 degrees. */
+#define PULSE_OVERLAP_MIN (4 * OVERLAP_MIN)
+
+/* Rate of the braking limit's slow part, from that of the advance, Q1.30 to Q1.15: 5/8 in a second by each fold-back
+ * range that the DC link has free, of which LINK_RANGES count; and by which it is faster where the link is full. */
+#define LINK_SHIFT 19
+#define LINK_RANGES 8
+#define LINK_FULL_RATE 32
 
 /* Past any angle: the flux linkage of a motoring phase does not end with its half. */
 #define NO_END UINT32_MAX
@@ -48,8 +58,8 @@ static conduction_place_t place_of(const machine_tables_t *tables, const conduct
 
 /* Between two values of a table, Q8 of their unit: angles in 2^-24 electrical rev, torques in Q16, flux linkage in Q21.
  */
-static int32_t between_q8(uint16_t low, uint16_t high, int32_t fraction_q8) {
-    return low * (1 << 8) + (high - low) * fraction_q8;
+static int32_t between_q8(int32_t low, int32_t high, int32_t fraction_q8) {
+    return low * ONE_Q8 + (high - low) * fraction_q8;
 }
 
 static uint32_t angle(uint16_t low, uint16_t high, int32_t fraction_q8) {
@@ -92,10 +102,15 @@ static int32_t feed_forward_q15(const conduction_pulse_t *pulse, int32_t torque)
     return excess_q8 >= range_q8 ? ONE_Q15 : (excess_q8 << 15) / range_q8;
 }
 
-/* From 0 at the base speed to 1, Q1.15, at 1 / range of it above. */
-static int32_t above_base_q15(const machine_tables_t *tables, conduction_place_t place, int32_t range) {
+static int32_t part_of_largest_q15(const conduction_pulse_t *pulse, int32_t torque) {
+    const int32_t torque_q8 = torque >> 16, largest_q8 = pulse->mean_q24 >> 16;
+    return torque_q8 >= largest_q8 ? ONE_Q15 : (torque_q8 << 15) / largest_q8;
+}
+
+/* From 0 at the base speed to 1, Q1.15, at 1 / ABOVE_BASE_RANGE of it above. */
+static int32_t above_base_q15(const machine_tables_t *tables, conduction_place_t place) {
     const int32_t base_q8 = tables->pulse_base_index;
-    const int32_t excess_q8 = range * ((int32_t)(place.k << 8) + place.fraction_q8 - base_q8);
+    const int32_t excess_q8 = ABOVE_BASE_RANGE * ((int32_t)(place.k << 8) + place.fraction_q8 - base_q8);
     return excess_q8 >= base_q8 ? ONE_Q15 : (fixed_clamp(excess_q8, 0, base_q8) << 15) / base_q8;
 }
 
@@ -112,7 +127,7 @@ static int32_t smoothed_q24(const conduction_state_t *state, uint32_t phases, co
     const int32_t torque = fixed_abs(sample->torque_q24);
     const uint64_t strokes_q31 = (uint64_t)sample->angle_step * phases >> 1;
     const int32_t part_q31 = strokes_q31 > INT32_MAX ? INT32_MAX : (int32_t)strokes_q31;
-    if (state->sharing_q15 == 0 || state->latest == CONDUCTION_INITIAL) {
+    if (state->partial_q15 == 0 || state->latest == CONDUCTION_INITIAL) {
         return torque;
     }
     return state->torque_q24 + 2 * fixed_multiply_high(torque - state->torque_q24, part_q31);
@@ -122,22 +137,22 @@ static int32_t smoothed_q24(const conduction_state_t *state, uint32_t phases, co
 static int32_t trim_step_q30(const conduction_pulse_t *pulse, const conduction_sample_t *sample) {
     const int32_t error_q24 = fixed_subtract(sample->torque_q24, sample->torque_sum_q24);
     const int32_t missing_q24 = sample->torque_q24 < 0 ? fixed_subtract(0, error_q24) : error_q24;
-    const int32_t part_q8 = fixed_clamp((missing_q24 >> 8) / ((pulse->mean_q24 >> 16) + 1), -ONE_Q8, ONE_Q8);
-    return (int32_t)(sample->angle_step >> TRIM_SHIFT) * part_q8;
+    const int32_t part_q12 = fixed_clamp((missing_q24 >> 4) / ((pulse->mean_q24 >> 16) + 1), -ONE_Q12, ONE_Q12);
+    return (int32_t)(sample->angle_step >> TRIM_SHIFT) * part_q12;
 }
 
-/* Advance of the windows and level of the single pulse. */
-static void move(const conduction_parameters_t *parameters, conduction_state_t *state, const machine_tables_t *tables,
+/* Advance of the windows, level of the single pulse, and part of the largest torque. */
+static void move(const conduction_parameters_t *parameters, conduction_state_t *state,
                  const conduction_sample_t *sample) {
     const bool voltage_limited =
         fixed_magnitude(sample->torque_shortfall_q24) > SHORTFALL_MIN_Q24 + fixed_magnitude(sample->torque_q24) / 64;
     int32_t retract_q30 = voltage_limited ? 0 : parameters->retract_step_q30;
     if (parameters->single_pulse) {
-        state->sharing_q15 = above_base_q15(tables, state->place, LEAST_CURRENT_RANGE);
-        retract_q30 >>= state->sharing_q15 > 0 ? ABOVE_BASE_SHIFT : 0;
-        state->torque_q24 = smoothed_q24(state, tables->phases, sample);
+        retract_q30 >>= state->partial_q15 > 0 ? ABOVE_BASE_SHIFT : 0;
         const int32_t forward_q15 = feed_forward_q15(&state->pulse, state->torque_q24);
-        const int32_t forward_q30 = forward_q15 * (1 << 15);
+        /* Of the part of the largest torque, and of the level below it. */
+        const int32_t forward_q30 =
+            (state->partial_q15 > 0 ? part_of_largest_q15(&state->pulse, state->torque_q24) : forward_q15) * (1 << 15);
         if (forward_q15 > 0) {
             /* With the level that is still the one before: from the trim alone, windows do not jump. */
             const int32_t advanced_q30 = state->advance_q30 + parameters->advance_step_q30;
@@ -145,13 +160,18 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
         }
         if (forward_q15 == ONE_Q15) {
             state->trim_q30 = 0; /* the largest torque is that of the tables */
-        } else if ((state->advance_q30 == ONE_Q30 || state->sharing_q15 > 0) &&
-                   (voltage_limited || state->level_q15 > 0)) {
+        } else if (state->partial_q15 > 0 && !voltage_limited && !state->single_pulse) {
+            state->trim_q30 -=
+                fixed_clamp(state->trim_q30, -parameters->advance_step_q30, parameters->advance_step_q30);
+        } else if (state->partial_q15 > 0 ||
+                   (state->advance_q30 == ONE_Q30 && (voltage_limited || state->level_q15 > 0))) {
+            const int32_t step_q30 = trim_step_q30(&state->pulse, sample);
             /* Sharing follows the reference at any level that is too high: without a shortfall it returns. */
-            state->trim_q30 += trim_step_q30(&state->pulse, sample) - (forward_q15 == 0 ? retract_q30 : 0);
+            state->trim_q30 += state->partial_q15 > 0 ? step_q30 >> 2 : step_q30 - (forward_q15 == 0 ? retract_q30 : 0);
         }
         state->trim_q30 = fixed_clamp(state->trim_q30, -forward_q30, ONE_Q30 - forward_q30);
-        state->level_q15 = forward_q15 + (state->trim_q30 >> 15);
+        state->part_q15 = (forward_q30 + state->trim_q30) >> 15;
+        state->level_q15 = fixed_clamp(forward_q15 + (state->trim_q30 >> 15), 0, ONE_Q15);
     }
     if (state->level_q15 == 0) {
         const int32_t step_q30 = voltage_limited ? parameters->advance_step_q30 : -retract_q30;
@@ -159,9 +179,9 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
     }
 }
 
+/* At the level 0 and 1 within 2 LSB of from and to. */
 static uint32_t blend(uint32_t from, uint32_t to, int32_t level_q15) {
-    const int32_t way = (int32_t)(to - from);
-    return from + (uint32_t)(((int64_t)way * level_q15) >> 15);
+    return from + 4 * (uint32_t)fixed_multiply_high((int32_t)(to - from), level_q15 << 15);
 }
 
 static conduction_interval_t sharing_interval(const conduction_parameters_t *parameters,
@@ -178,23 +198,54 @@ static conduction_interval_t sharing_interval(const conduction_parameters_t *par
     };
 }
 
-/* With a part of the window with the least current; the advance of a motoring phase takes it back. */
-static conduction_interval_t towards_least_current(const machine_tables_t *tables, const conduction_state_t *state,
-                                                   conduction_interval_t interval) {
-    const uint32_t on = (uint32_t)tables->sharing_on << 16, off = (uint32_t)tables->sharing_off << 16;
-    const int32_t kept_q15 = state->braking ? ONE_Q15 : ONE_Q15 - (state->advance_q30 >> 15);
-    const int32_t part_q15 = (state->sharing_q15 * kept_q15) >> 15;
-    return (conduction_interval_t){
-        .enter = blend(interval.enter, state->braking ? HALF_REV - off : on, part_q15),
-        .leave = blend(interval.leave, state->braking ? HALF_REV - on : off, part_q15),
+/* For an index of the tables, or above them for the largest mean torque. */
+static conduction_part_t pulse_at(const machine_tables_t *tables, const conduction_state_t *state, unsigned index) {
+    const conduction_pulse_t *largest = &state->pulse;
+    if (index == MACHINE_PULSE_PARTS) {
+        return (conduction_part_t){-largest->lead, largest->end, largest->peak_q24 - largest->mean_q24};
+    }
+    const machine_partial_pulse_t *low = &tables->partial_pulse[state->braking][index][state->place.k], *high = low + 1;
+    const int32_t fraction_q8 = state->place.fraction_q8;
+    const int32_t ripple_q15 = between_q8(low->ripple, high->ripple, fraction_q8) - MACHINE_RIPPLE_OFFSET * ONE_Q8;
+    return (conduction_part_t){
+        .on = (uint32_t)between_q8(low->on, high->on, fraction_q8) << 16,
+        .end = (uint32_t)between_q8(low->end, high->end, fraction_q8) << 16,
+        .ripple_q24 = fixed_saturate_bits(fixed_multiply_high(largest->mean_q24, ripple_q15 * ONE_Q15), 30) * 4,
     };
 }
 
+/* Below the least part of the tables with its angles, and less ripple. */
+static conduction_part_t pulse_for_torque(const machine_tables_t *tables, const conduction_state_t *state) {
+    const unsigned quarter = (unsigned)state->part_q15 >> 13;
+    const unsigned above = quarter < MACHINE_PULSE_PARTS ? quarter : MACHINE_PULSE_PARTS;
+    conduction_part_t low = pulse_at(tables, state, above > 0 ? above - 1 : 0);
+    if (above == 0) {
+        low.ripple_q24 = 0;
+    }
+    const conduction_part_t high = pulse_at(tables, state, above);
+    const int32_t way_q15 = (state->part_q15 - (int32_t)(above << 13)) * 4;
+    return (conduction_part_t){
+        .on = blend(low.on, high.on, way_q15),
+        .end = blend(low.end, high.end, way_q15),
+        .ripple_q24 = (int32_t)blend((uint32_t)low.ripple_q24, (uint32_t)high.ripple_q24, way_q15),
+    };
+}
+
+/* Of a motoring pulse that is narrower than a stroke, the share falls over some control periods: turn-off would be at
+ * one of them, and the torque of the strokes would differ. */
 static void set_window(const conduction_parameters_t *parameters, conduction_interval_t interval, bool braking,
-                       torque_sharing_window_t *window) {
-    const uint32_t stroke = parameters->sharing.stroke;
+                       bool partial, torque_sharing_window_t *window) {
+    uint32_t stroke = parameters->sharing.stroke, overlap = OVERLAP_MIN;
     const uint32_t width = interval.leave - interval.enter;
-    const uint32_t overlap = width > stroke + OVERLAP_MIN ? width - stroke : OVERLAP_MIN;
+    if (width > stroke + OVERLAP_MIN) {
+        overlap = width - stroke;
+    }
+    const uint32_t least = braking ? OVERLAP_MIN : PULSE_OVERLAP_MIN;
+    if (partial && overlap <= least) {
+        overlap = least;
+        stroke = width > least ? width - least / 2 : least / 2;
+        interval.leave += least / 2;
+    }
     window->stroke = stroke;
     window->overlap = parameters->sharing.overlapping ? overlap : 0;
     window->reciprocal = UINT32_MAX / (overlap >> 15);
@@ -210,12 +261,23 @@ static void set_envelope(const machine_tables_t *tables, const conduction_state_
     braking->flux = (int32_t)(flux_q29 >> tables->flux_format.result_shift);
 }
 
+/* Braking torque for which the DC link has room, part of the largest, Q1.15. The voltage follows the torque later, by
+ * the fields of the phases: the part alone by which it is too high would let both oscillate. */
+static int32_t room_q15(const conduction_parameters_t *parameters, conduction_state_t *state, int32_t voltage_q6) {
+    const int32_t range_q6 = parameters->fold_back_range_q6;
+    const int32_t room_q6 = fixed_clamp(parameters->braking_end_q6 - voltage_q6, 0, LINK_RANGES * range_q6);
+    const int32_t free_q15 = ((room_q6 - range_q6) << 15) / range_q6;
+    const int32_t part_q15 = free_q15 < 0 ? LINK_FULL_RATE * free_q15 : free_q15;
+    state->link_q30 =
+        fixed_clamp(state->link_q30 + (parameters->advance_step_q30 >> LINK_SHIFT) * part_q15, 0, ONE_Q30);
+    return (fixed_clamp(free_q15 + ONE_Q15, 0, ONE_Q15) * (state->link_q30 >> 15)) >> 15;
+}
+
 /* Limits by what the voltage can make and by the braking torque whose energy the DC link can take. */
 static void limit_torque(const conduction_parameters_t *parameters, conduction_state_t *state,
                          const conduction_sample_t *sample) {
-    const int32_t range_q6 = parameters->fold_back_range_q6;
-    const int32_t room_q6 = fixed_clamp(parameters->braking_end_q6 - sample->dc_link_voltage_q6, 0, range_q6);
-    const int32_t braking_q24 = 4 * fixed_multiply_high(state->braking_max_q24, (room_q6 << 15) / range_q6 << 15);
+    const int32_t part_q15 = room_q15(parameters, state, sample->dc_link_voltage_q6);
+    const int32_t braking_q24 = 4 * fixed_multiply_high(state->braking_max_q24, part_q15 << 15);
     const bool reverse = sample->speed_q22 < 0;
     const int32_t negative_q24 = reverse ? state->motoring_max_q24 : braking_q24;
     const int32_t positive_q24 = reverse ? braking_q24 : state->motoring_max_q24;
@@ -223,21 +285,45 @@ static void limit_torque(const conduction_parameters_t *parameters, conduction_s
     state->torque_max_q24 = fixed_clamp(parameters->torque_max_q24, 0, positive_q24);
 }
 
-/* Positions between those of torque sharing and of the single pulse. */
-static void set_interval(const conduction_parameters_t *parameters, conduction_state_t *state,
-                         const machine_tables_t *tables) {
-    conduction_interval_t interval = towards_least_current(tables, state, sharing_interval(parameters, state));
-    const int32_t level_q15 = state->level_q15;
+/* Of a pulse: its window begins at most SHARE_LEAD_MAX before the half, and less than half a revolution before its end:
+ * beyond, a phase would make up for no shortfall. */
+static void set_enter(conduction_interval_t *interval) {
+    const int32_t earliest = (int32_t)(interval->leave - HALF_REV + 1);
+    const int32_t latest = (int32_t)interval->enter > -SHARE_LEAD_MAX ? (int32_t)interval->enter : -SHARE_LEAD_MAX;
+    const int32_t enter = fixed_clamp((int32_t)interval->on, -SHARE_LEAD_MAX, latest);
+    interval->enter = (uint32_t)(enter > earliest ? enter : earliest);
+}
+
+/* Positions and ripple between those of torque sharing and of the single pulse, and above base speed those of the
+ * pulse for the part of the largest torque. */
+static void set_interval(const conduction_parameters_t *parameters, conduction_state_t *state) {
+    const int32_t level_q15 = state->level_q15, partial_q15 = state->partial_q15;
+    conduction_interval_t interval = sharing_interval(parameters, state);
+    int32_t ripple_q24 = 0;
+    bool single_pulse = level_q15 > 0;
     interval.on = 0;
     if (level_q15 > 0) {
         interval.on = blend(interval.enter < HALF_REV ? interval.enter : 0, -state->pulse.lead, level_q15);
         interval.leave = blend(interval.leave, state->pulse.end, level_q15);
-        /* Less than half a revolution before the end: beyond, a phase would make up for no shortfall. */
-        const int32_t earliest = (int32_t)(interval.leave - HALF_REV + 1);
-        const int32_t enter = fixed_clamp((int32_t)interval.on, -SHARE_LEAD_MAX, (int32_t)interval.enter);
-        interval.enter = (uint32_t)(enter > earliest ? enter : earliest);
+        ripple_q24 = (int32_t)blend(0, (uint32_t)(state->pulse.peak_q24 - state->pulse.mean_q24), level_q15);
+    }
+    if (partial_q15 > 0) {
+        const conduction_part_t pulse = state->part;
+        const int32_t trim_q24 = fixed_multiply_high(state->pulse.mean_q24, state->trim_q30) * 4;
+        const int32_t trimmed_q24 = fixed_add(pulse.ripple_q24, trim_q24);
+        interval.on = blend(level_q15 > 0 ? interval.on : interval.enter, pulse.on, partial_q15);
+        interval.leave = blend(interval.leave, pulse.end, partial_q15);
+        ripple_q24 = (int32_t)blend((uint32_t)ripple_q24, (uint32_t)trimmed_q24, partial_q15);
+        interval.enter = interval.on;
+        single_pulse = state->torque_q24 > state->pulse.smooth_q24 || (int32_t)pulse.on < 0 ||
+                       fixed_abs(pulse.ripple_q24) > state->pulse.mean_q24 >> 6;
+    }
+    if (level_q15 > 0 || partial_q15 > 0) {
+        set_enter(&interval);
     }
     state->interval = interval;
+    state->ripple_q24 = ripple_q24;
+    state->single_pulse = single_pulse;
 }
 
 static void set_angles(const conduction_parameters_t *parameters, conduction_state_t *state,
@@ -247,9 +333,8 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     conduction_t *angles = &state->angles[next];
     conduction_half_t *half = &angles->half[state->braking];
     conduction_half_t *before = &angles->half[!state->braking];
-    const int32_t ripple_q24 = (int32_t)blend(0, (uint32_t)(state->pulse.peak_q24 - state->pulse.mean_q24), level_q15);
     const uint32_t on = state->interval.on;
-    angles->ripple_q24 = negative ? -ripple_q24 : ripple_q24;
+    angles->ripple_q24 = negative ? -state->ripple_q24 : state->ripple_q24;
     before->window = parameters->initial.half[0].window;
     before->width = half->width = HALF_REV;
     before->lead = on >= HALF_REV ? -on : 0;
@@ -257,10 +342,11 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     angles->half[CONDUCTION_BRAKING].end = HALF_REV;
     before->flux = half->flux = 0;
     half->lead = 0;
-    set_window(parameters, state->interval, state->braking, &half->window);
-    if (level_q15 > 0 && state->braking) {
+    set_window(parameters, state->interval, state->braking, state->partial_q15 > 0, &half->window);
+    if (state->braking && (level_q15 > 0 || state->partial_q15 > 0)) {
         set_envelope(tables, state, half);
-    } else if (level_q15 > 0) {
+    }
+    if (state->partial_q15 > 0 || (level_q15 > 0 && !state->braking)) {
         half->width = half->window.stroke + half->window.overlap;
     }
     state->latest = next;
@@ -273,15 +359,22 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
     switch (step) {
     case 0:
         look_up(state, tables, sample);
+        state->torque_q24 = smoothed_q24(state, tables->phases, sample);
         break;
     case 1:
-        move(parameters, state, tables, sample);
+        move(parameters, state, sample);
+        state->gain_excess_q31 = gain_excess_q31(parameters, sample, state->above_base_q15);
         break;
     case 2:
+        state->above_base_q15 = above_base_q15(tables, state->place);
+        state->partial_q15 = parameters->single_pulse ? state->above_base_q15 : 0;
+        if (state->partial_q15 > 0) {
+            state->part = pulse_for_torque(tables, state);
+        }
+        break;
+    case 3:
         limit_torque(parameters, state, sample);
-        state->gain_excess_q31 =
-            gain_excess_q31(parameters, sample, above_base_q15(tables, state->place, SLOWER_RANGE));
-        set_interval(parameters, state, tables);
+        set_interval(parameters, state);
         break;
     default:
         set_angles(parameters, state, tables, sample->torque_q24 < 0);

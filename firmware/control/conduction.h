@@ -3,7 +3,7 @@
  *
  * Window advance: a torque shortfall moves the conduction windows to earlier angles (torque_sharing.h), fully within
  * 100 ms; without shortfall they return within 1 s, above base speed within 8 s. From base speed on they begin at the
- * window with the least RMS current, which is also in the tables; the advance of a motoring phase takes it back.
+ * angles of the tables for parts of the largest torque.
  *
  * Single pulse: above base speed the voltage has no time to build up the flux linkage of the torque after the unaligned
  * position. Turn-on then leads the half in which the phase makes the wanted torque, and turn-off is early enough that
@@ -20,16 +20,25 @@
  * the way by their advance is longer and leaves up to 5 % of the torque missing. With single pulses the torque
  * pulsates, and the reference of the instantaneous torque is raised by level * (T_peak - T_mean).
  *
+ * From base speed on, fully at 1.125 of it, the angles are instead those for the part of the largest mean torque,
+ *
+ *   part = T / T_mean + trim,   reference += ripple(part) + trim T_mean
+ *
+ * from tables over part and speed / voltage (tools/src/salient/machine/partial_pulse.py): torque sharing, a single
+ * pulse or what lies between, the smoothest that takes hardly more RMS current than the best pulse. Their windows may
+ * be narrower than a stroke.
+ *
  * Braking: with full -Vdc from an angle theta on, the current stays within its limit while the flux linkage is below
  * psi_t + Vdc / omega (theta_t - theta), the tangent to the flux linkage of the current limit. With torque sharing the
  * flux linkage ends at the unaligned position instead.
  *
  * The torque is limited to T_mean. Braking torque, whose energy goes into the DC link, is reduced linearly where the
- * voltage approaches the over-voltage threshold: a chopper that cannot take more, or none, does not end in a fault.
+ * voltage approaches the over-voltage threshold: a chopper that cannot take more, or none, does not end in a fault. The
+ * integral of the voltage's excess over the begin of that range reduces it, too, until the voltage stays there.
  *
  * The torque follows the reference once in a stroke. A speed law with a gain k of the order of the stroke rate f makes
  * every second pulse larger: the error is multiplied by 1 - k / f from stroke to stroke. From base speed on its gain is
- * reduced, at half above it to f / 4.
+ * reduced, at an eighth above it to f / 4.
  *
  * J. M. Stephenson, S. R. MacMinn, J. R. Hendershot, "Switched reluctance drives", tutorial, IEEE IAS 1990; the blend
  * and the trim derived here.
@@ -99,7 +108,13 @@ typedef struct {
     uint32_t on;           /* turn-on */
 } conduction_interval_t;
 
-#define CONDUCTION_STEPS 4   /* of an update */
+/* Of the pulse for a part of the largest mean torque. */
+typedef struct {
+    uint32_t on, end;   /* past the begin of the half, 2^-32 electrical rev */
+    int32_t ripple_q24; /* to add to the torque reference, N m, Q7.24 */
+} conduction_part_t;
+
+#define CONDUCTION_STEPS 5   /* of an update */
 #define CONDUCTION_INITIAL 2 /* index of no update yet */
 
 typedef struct {
@@ -109,15 +124,21 @@ typedef struct {
     bool braking;             /* torque against the rotation */
     int32_t motoring_max_q24; /* largest mean torque, by magnitude, N m, Q7.24 */
     int32_t braking_max_q24;
+    int32_t link_q30;       /* slow part of the braking limit, Q1.30, 0..1 */
     int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
     int32_t torque_max_q24;
-    int32_t gain_excess_q31;        /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
-    int32_t torque_q24;             /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
-    int32_t sharing_q15;            /* part of the window with the least current, Q1.15, 0..1 */
-    int32_t advance_q30;            /* of the windows, Q1.30, 0..1 */
-    int32_t trim_q30;               /* of the level, Q1.30, -1..1 */
-    int32_t level_q15;              /* Q1.15, 0..1 */
+    int32_t gain_excess_q31; /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
+    int32_t torque_q24;      /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
+    int32_t above_base_q15;  /* from the base speed to 1.125 of it, Q1.15, 0..1 */
+    int32_t partial_q15;     /* part of the pulses for parts of the largest torque, Q1.15, 0..1 */
+    int32_t advance_q30;     /* of the windows, Q1.30, 0..1 */
+    int32_t trim_q30;        /* of the level, Q1.30, -1..1 */
+    int32_t level_q15;       /* Q1.15, 0..1 */
+    int32_t part_q15;        /* of the largest mean torque, Q1.15, 0..1 */
+    bool single_pulse;       /* the torque pulsates, or a phase turns on before its half */
+    conduction_part_t part;
     conduction_interval_t interval; /* of the half with the torque */
+    int32_t ripple_q24;             /* to add to the magnitude of the torque reference, N m, Q7.24 */
     conduction_t angles[2];         /* of the last two updates */
     unsigned latest;                /* index of the last, or CONDUCTION_INITIAL */
 } conduction_state_t;
@@ -149,15 +170,18 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->step = 0;
     state->torque_min_q24 = parameters->torque_min_q24;
     state->torque_max_q24 = parameters->torque_max_q24;
+    state->link_q30 = 1 << 30;
     state->advance_q30 = 0;
     state->trim_q30 = 0;
     state->level_q15 = 0;
+    state->partial_q15 = 0;
+    state->single_pulse = false;
     state->gain_excess_q31 = 0;
     state->latest = CONDUCTION_INITIAL;
 }
 
-/* One of the steps of an update, in turn: tables, level, positions, angles. Products are rounded down; the level to
- * 2^-15, angles of the tables to 2^-24. */
+/* One of the steps of an update, in turn: tables, level, pulse for a part of the torque, limits and positions, angles.
+ * Products are rounded down; the level to 2^-15, angles of the tables to 2^-24. */
 void conduction_step(const conduction_parameters_t *parameters, conduction_state_t *state,
                      const machine_tables_t *tables, const conduction_sample_t *sample);
 

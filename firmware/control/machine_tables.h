@@ -71,6 +71,17 @@ typedef struct {
     uint16_t peak_torque;   /* largest instantaneous sum of all phases with that pulse, N m, Q7.8 */
 } machine_pulse_t;
 
+/* For 1/4, 1/2 and 3/4 of the largest mean torque. */
+#define MACHINE_PULSE_PARTS 3
+#define MACHINE_RIPPLE_OFFSET 32
+
+typedef struct {
+    int8_t on;   /* turn-on past the begin of the half of the wanted torque, 2^-8 electrical rev; negative: before */
+    uint8_t end; /* turn-off past it, 2^-8 electrical rev, 0..128 */
+    /* By which the torque reference is raised, part of the largest mean torque, Q1.7, and MACHINE_RIPPLE_OFFSET. */
+    uint8_t ripple;
+} machine_partial_pulse_t;
+
 #define MACHINE_PARAMETERS_MAX 64
 
 typedef struct {
@@ -90,10 +101,8 @@ typedef struct {
     int16_t node[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
     uint32_t pulse_index_scale;                     /* index in Q8 = ((|speed_q22| * scale) >> 32) / voltage_q6 */
     machine_pulse_t pulse[2][MACHINE_PULSE_POINTS]; /* motoring, braking */
-    uint16_t pulse_base_index;                      /* of the base speed at the nominal voltage, Q8 */
-    /* Window of torque sharing with the least RMS current, past the unaligned position, 2^-16 electrical rev. */
-    uint16_t sharing_on;
-    uint16_t sharing_off;
+    machine_partial_pulse_t partial_pulse[2][MACHINE_PULSE_PARTS][MACHINE_PULSE_POINTS];
+    uint16_t pulse_base_index; /* of the base speed at the nominal voltage, Q8 */
     /* A braking current stays within its limit under full opposite voltage up to the angle theta_t at which it is
      * psi_t, when psi <= psi_t + V / omega (theta_t - theta); past theta_t, when it is within its limit. Where no angle
      * needs that, theta_t is where psi at the limit falls fastest. */

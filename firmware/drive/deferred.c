@@ -282,8 +282,8 @@ COLD void deferred_tune(const control_parameters_t *parameters, control_state_t 
 static void step_torque_offset(const control_parameters_t *parameters, deferred_t *deferred,
                                const deferred_input_t *input) {
     const conduction_state_t *conduction = &deferred->conduction;
-    const bool single_pulse = conduction->level_q15 > 0;
-    const bool limited = !single_pulse && input->torque_shortfall_q24 != 0 && conduction->sharing_q15 == 0;
+    const bool single_pulse = conduction->single_pulse;
+    const bool limited = !single_pulse && input->torque_shortfall_q24 != 0 && conduction->partial_q15 == 0;
     torque_offset_step(&parameters->torque_offset, &deferred->torque_offset, input->torque_reference_q24,
                        single_pulse ? input->torque_reference_q24 : input->torque_sum_q24, limited);
 }

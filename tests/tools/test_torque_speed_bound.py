@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from salient.machine.file import load_machine, machine_path
 from salient.reference import torque_speed_bound
 from salient.reference.torque_speed_bound import (
@@ -144,6 +143,13 @@ def test_pulse_of_least_current_makes_its_torque_and_no_other_pulse_makes_it_wit
                            pulse.off_deg + generator.uniform(-40.0, 40.0))
             if abs(near.torque_Nm) >= abs(torque_Nm) and near.torque_Nm * torque_Nm > 0.0:
                 assert near.rms_A > 0.99 * pulse.rms_A
+
+
+def test_pulse_of_least_current_is_found_where_few_angles_are_permitted():
+    """Braking, the current of a linear machine rises against the full voltage for most pairs of angles."""
+    (pulse,) = least_current(machine_of("linear_cosine"), 2250.0, OF_SUPPLY, [-19.4])
+    assert pulse.torque_Nm == pytest.approx(-19.4, rel=0.011)
+    assert 18.0 < pulse.rms_A < 20.0
 
 
 def test_torque_beyond_the_largest_has_no_pulse():

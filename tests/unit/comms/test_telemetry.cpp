@@ -198,7 +198,7 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
         control.deferred.misalignment.phase[phase].offset = (1 << 20) * machine_tables.rotor_poles;
     }
     control.predictive.torque_shortfall_q24 = INT32_MAX;
-    control.deferred.conduction.level_q15 = 1;
+    control.deferred.conduction.single_pulse = true;
     p.bandwidth.bandwidth_rad_s[control.bandwidth.stage] = 8000;
     drive.used_ticks = 3000;
     drive.worst_ticks = 4999;

@@ -1,6 +1,7 @@
 // Conduction angles against a model in double precision, written from the equations of conduction.h in electrical
 // revolutions, N m and volts; over both directions, both signs of the torque, sagging and high DC-link voltages.
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <random>
@@ -38,8 +39,6 @@ machine_tables_t tables_of() {
     tables.phases = PHASES;
     tables.flux_format.result_shift = 3;
     tables.pulse_base_index = uint16_t(BASE_INDEX * Q8);
-    tables.sharing_on = uint16_t(0.06 * 65536);
-    tables.sharing_off = uint16_t(0.47 * 65536);
     // index = |w| / w_max * 16 * V_supply / V, in Q8.
     tables.pulse_index_scale = uint32_t(16 * Q8 / (SPEED_MAX_RAD_S * Q22) * (SUPPLY_V * Q6) * Q32);
     for (unsigned k = 0; k < MACHINE_PULSE_POINTS; k++) {
@@ -49,6 +48,13 @@ machine_tables_t tables_of() {
                                         .smooth_torque = uint16_t((30 - 1.4 * k + braking) * Q8),
                                         .mean_torque = uint16_t((36 - 1.2 * k + braking) * Q8),
                                         .peak_torque = uint16_t((50 - 1.5 * k) * Q8)};
+        }
+        for (unsigned braking = 0; braking < 2; braking++) {
+            for (unsigned part = 0; part < MACHINE_PULSE_PARTS; part++) {
+                tables.partial_pulse[braking][part][k] = {.on = int8_t(30 - k - 8 * int(part)),
+                                                          .end = uint8_t(84 + k + 4 * part - 2 * braking),
+                                                          .ripple = uint8_t(20 + 8 * part + k)};
+            }
         }
         tables.braking_end[k] = uint16_t(3000 + 500 * k);
         tables.braking_flux[k] = uint16_t(2000 - 50 * k);
@@ -92,10 +98,11 @@ conduction_sample_t fixed(const sample_t &s) {
 struct model_t {
     const machine_tables_t &tables;
     double sharing_on = 4.0 / 360.0, sharing_off = 176.0 / 360.0; // past the unaligned position
-    double advance = 0.0, trim = 0.0, level = 0.0, torque = 0.0;
-    bool braking = false, first = true;
+    double advance = 0.0, trim = 0.0, level = 0.0, torque = 0.0, part = 0.0, partial = 0.0;
+    bool braking = false, first = true, single_pulse = false, at_threshold = false;
     double lead = 0.0, end = 0.0, smooth = 0.0, mean = 0.0, peak = 0.0;
     double torque_min = 0.0, torque_max = 0.0, gain_excess = 0.0, ripple = 0.0;
+    double link = 1.0;
     double turn_on_lead = 0.0, enter = 0.0, leave = 0.0, envelope_end = 0.0, envelope_flux_Wb = 0.0;
 
     template <typename value_of_t> double at(double index, value_of_t value_of) const {
@@ -106,6 +113,28 @@ struct model_t {
 
     double largest(bool of_braking, double index) const {
         return at(index, [&](unsigned k) { return tables.pulse[of_braking][k].mean_torque / 256.0; });
+    }
+
+    // Turn-on, turn-off and ripple over the part of the largest torque.
+    std::array<double, 3> pulse_for(double index) const {
+        const auto table = [&](unsigned knot) -> std::array<double, 3> {
+            if (knot == MACHINE_PULSE_PARTS) {
+                return {-lead, end, peak - mean};
+            }
+            const machine_partial_pulse_t *of = tables.partial_pulse[braking][knot];
+            return {at(index, [&](unsigned k) { return of[k].on / 256.0; }),
+                    at(index, [&](unsigned k) { return of[k].end / 256.0; }),
+                    at(index, [&](unsigned k) { return of[k].ripple / 128.0 - 0.25; }) * mean};
+        };
+        const unsigned knot = std::min(unsigned(part * 4.0), MACHINE_PULSE_PARTS + 0u);
+        std::array<double, 3> low = table(knot == 0 ? 0 : knot - 1), high = table(knot);
+        if (knot == 0) {
+            low[2] = 0.0;
+        }
+        for (unsigned k = 0; k < 3; k++) {
+            low[k] += (4.0 * part - knot) * (high[k] - low[k]);
+        }
+        return low;
     }
 
     void update(const sample_t &s) {
@@ -123,55 +152,84 @@ struct model_t {
         const auto above = [&](double range) {
             return std::clamp(range * (std::min(index, 16.0) / BASE_INDEX - 1.0), 0.0, 1.0);
         };
-        const double magnitude = std::fabs(s.torque), least_current = above(8.0);
+        const double magnitude = std::fabs(s.torque);
         const bool limited = std::fabs(s.shortfall) > 0.05 + magnitude / 64.0;
-        torque =
-            least_current > 0.0 && !first ? torque + (magnitude - torque) * std::min(1.0, s.step * PHASES) : magnitude;
+        torque = partial > 0.0 && !first ? torque + (magnitude - torque) * std::min(1.0, s.step * PHASES) : magnitude;
         first = false;
         const double forward = std::clamp((torque - smooth) / (mean - smooth), 0.0, 1.0);
         advance = forward == 0.0 ? advance : level == 0.0 ? 1.0 : std::min(1.0, advance + 1.0 / 50.0);
+        const double fed = partial > 0.0 ? std::min(torque / mean, 1.0) : forward;
+        const double missing = (s.torque < 0.0 ? -1.0 : 1.0) * (s.torque - s.estimate);
+        const double step = 0.5 * s.step * std::clamp(missing / mean, -1.0, 1.0);
         if (forward == 1.0) {
             trim = 0.0;
-        } else if ((advance == 1.0 || least_current > 0.0) && (limited || level > 0.0)) {
-            const double missing = (s.torque < 0.0 ? -1.0 : 1.0) * (s.torque - s.estimate);
-            trim += 0.5 * s.step * std::clamp(missing / mean, -1.0, 1.0);
+        } else if (partial > 0.0) {
+            trim += limited || single_pulse ? step / 4.0 : -std::clamp(trim, -1.0 / 50.0, 1.0 / 50.0);
+        } else if (advance == 1.0 && (limited || level > 0.0)) {
+            trim += step;
         }
-        trim = std::clamp(trim, -forward, 1.0 - forward);
-        level = std::floor((forward + trim) * 32768.0) / 32768.0;
+        trim = std::clamp(trim, -fed, 1.0 - fed);
+        part = std::floor((fed + trim) * 32768.0) / 32768.0;
+        level = std::clamp(std::floor((forward + trim) * 32768.0) / 32768.0, 0.0, 1.0);
         if (level == 0.0) {
-            const double retract = 1.0 / 400.0 / (least_current > 0.0 ? 8.0 : 1.0);
+            const double retract = 1.0 / 400.0 / (partial > 0.0 ? 8.0 : 1.0);
             advance = std::clamp(advance + (limited ? 1.0 / 50.0 : -retract), 0.0, 1.0);
         }
-        gain_excess = above(2.0) * (1.0 - std::min(1.0, s.step * GAIN_PER_STEP));
+        gain_excess = partial * (1.0 - std::min(1.0, s.step * GAIN_PER_STEP));
+        partial = above(8.0); // from the level on
 
-        const double room = std::clamp((OVER_VOLTAGE_V - s.voltage) / FOLD_BACK_V, 0.0, 1.0);
+        const double free = std::clamp((OVER_VOLTAGE_V - s.voltage) / FOLD_BACK_V, 0.0, 8.0) - 1.0;
+        link = std::clamp(link + 1.0 / 50.0 / 16.0 * (free < 0.0 ? 32.0 * free : free), 0.0, 1.0);
+        const double room = std::min(free + 1.0, 1.0) * link;
         const double motoring_max = std::min(largest(false, index), TORQUE_MAX_NM);
         const double braking_max = std::min(largest(true, index) * room, TORQUE_MAX_NM);
         torque_max = s.speed < 0.0 ? braking_max : motoring_max;
         torque_min = -(s.speed < 0.0 ? motoring_max : braking_max);
 
         const auto blend = [](double from, double to, double part) { return from + part * (to - from); };
-        const double share_on = tables.sharing_on / 65536.0, share_off = tables.sharing_off / 65536.0;
         if (braking) {
-            enter = blend(0.5 - sharing_off, 0.5 - share_off, least_current);
-            leave = blend(0.5 - sharing_on, 0.5 - share_on, least_current);
+            enter = 0.5 - sharing_off;
+            leave = 0.5 - sharing_on;
         } else {
-            enter = blend(sharing_on - advance * 24.0 / 360.0, share_on, least_current * (1.0 - advance));
-            leave = blend(sharing_off - advance * 16.0 / 360.0, share_off, least_current * (1.0 - advance));
+            enter = sharing_on - advance * 24.0 / 360.0;
+            leave = sharing_off - advance * 16.0 / 360.0;
         }
-        double on = 0.0;
+        double on = enter;
+        ripple = 0.0;
         if (level > 0.0) {
             on = blend(std::max(enter, 0.0), -lead, level);
             leave = blend(leave, end, level);
-            enter = std::max(std::clamp(on, -20.0 / 360.0, enter), leave - 0.5);
+            ripple = level * (peak - mean);
+        }
+        single_pulse = level > 0.0;
+        at_threshold = level < 0.001;
+        if (partial > 0.0) {
+            const auto [pulse_on, pulse_end, pulse_ripple] = pulse_for(index);
+            on = blend(on, pulse_on, partial);
+            leave = blend(leave, pulse_end, partial);
+            ripple = blend(ripple, pulse_ripple + trim * mean, partial);
+            single_pulse = torque > smooth || pulse_on < 0.0 || std::fabs(pulse_ripple) > mean / 64.0;
+            at_threshold = std::fabs(torque - smooth) < 0.05 || std::fabs(std::fabs(pulse_ripple) - mean / 64.0) < 0.02;
+        }
+        if (level > 0.0 || partial > 0.0) {
+            const double latest = partial > 0.0 ? 1.0 : enter;
+            enter = std::max(std::clamp(on, -20.0 / 360.0, latest), leave - 0.5);
+        } else {
+            on = 0.0;
         }
         turn_on_lead = std::max(-on, 0.0);
-        ripple = (s.torque < 0.0 ? -1.0 : 1.0) * level * (peak - mean);
+        ripple *= s.torque < 0.0 ? -1.0 : 1.0;
         envelope_end = at(index, [&](unsigned k) { return tables.braking_end[k] / 65536.0; });
         envelope_flux_Wb = at(index, [&](unsigned k) { return tables.braking_flux[k] / 8192.0; });
     }
 
-    double overlap() const { return std::max(leave - enter - 1.0 / PHASES, 2.0 / 360.0); }
+    double least() const { return (braking ? 2.0 : 8.0) / 360.0; }
+
+    // Of the window: a pulse may be narrower than a stroke, and then its share falls over 8 degrees around its end.
+    bool narrow() const { return partial > 0.0 && leave - enter - 1.0 / PHASES < least(); }
+    double overlap() const { return narrow() ? least() : std::max(leave - enter - 1.0 / PHASES, 2.0 / 360.0); }
+    double stroke() const { return narrow() ? leave - enter - least() / 2.0 : 1.0 / PHASES; }
+    double window_end() const { return narrow() ? leave + least() / 2.0 : leave; }
 };
 
 class Conduction : public testing::Test {
@@ -201,10 +259,16 @@ class Conduction : public testing::Test {
         EXPECT_NEAR(signed_rev(other.lead), model.turn_on_lead, ANGLE) << of;
         EXPECT_EQ(half.lead, 0u) << of;
         EXPECT_NEAR(signed_rev(half.window.overlap), model.overlap(), 2.0 * ANGLE) << of;
-        const double turn_on = model.braking ? 1.0 - model.leave : 0.5 + model.leave - 1.0 / PHASES - model.overlap();
+        EXPECT_NEAR(signed_rev(half.window.stroke), model.stroke(), 2.0 * ANGLE) << of;
+        const double end = model.window_end();
+        const double turn_on = model.braking ? 1.0 - end : 0.5 + end - model.stroke() - model.overlap();
         EXPECT_NEAR(half.window.turn_on / REV, turn_on, 2.0 * ANGLE) << of;
         EXPECT_EQ(angles().half[CONDUCTION_MOTORING].end, UINT32_MAX) << of;
-        const bool envelope = state.level_q15 > 0 && model.braking;
+        EXPECT_NEAR(state.part_q15 / Q15, model.part, LEVEL) << of;
+        EXPECT_TRUE(state.single_pulse == model.single_pulse || model.at_threshold) << of;
+        const bool bounded = model.partial > 0.0 || (state.level_q15 > 0 && !model.braking);
+        EXPECT_EQ(half.width, bounded ? half.window.stroke + half.window.overlap : 1u << 31) << of;
+        const bool envelope = (state.level_q15 > 0 || model.partial > 0.0) && model.braking;
         EXPECT_NEAR(1.0 - angles().half[CONDUCTION_BRAKING].end / REV, envelope ? model.envelope_end : 0.5, 1e-4) << of;
         EXPECT_NEAR(half.flux * 8 / Q29, envelope ? model.envelope_flux_Wb : 0.0, 1e-4) << of;
     }
@@ -297,6 +361,27 @@ TEST_F(Conduction, no_braking_torque_is_permitted_from_the_over_voltage_on) {
     }
 }
 
+TEST_F(Conduction, braking_torque_settles_at_what_a_dc_link_takes_whose_voltage_follows_late) {
+    constexpr double CAPACITANCE_F = 2.2e-3, CHOPPER_OHM = 20.0, UPDATE_S = 4e-4, SPEED = 200.0;
+    parameters.advance_step_q30 = to_fixed(10.0 * UPDATE_S, Q30);
+    std::array<double, 6> power_W{}; // a delay by the fields of the phases
+    double voltage = 240.0, least_V = 1e3, largest_V = 0.0;
+    for (unsigned k = 0; k < 1500; k++) {
+        const double torque = state.torque_min_q24 / Q24;
+        update({torque, torque, 0.0, SPEED, voltage, 0.06});
+        std::rotate(power_W.begin(), power_W.begin() + 1, power_W.end());
+        power_W.back() = -torque * SPEED;
+        voltage += (power_W.front() / voltage - voltage / CHOPPER_OHM) * UPDATE_S / CAPACITANCE_F;
+        ASSERT_LT(voltage, OVER_VOLTAGE_V + 5.0) << k;
+        if (k >= 500) {
+            least_V = std::min(least_V, voltage);
+            largest_V = std::max(largest_V, voltage);
+        }
+    }
+    EXPECT_GT(least_V, OVER_VOLTAGE_V - FOLD_BACK_V - 1.0);
+    EXPECT_LT(largest_V, OVER_VOLTAGE_V - FOLD_BACK_V + 1.0);
+}
+
 TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
     std::mt19937 random(15);
     const auto any = [&] { return int32_t(random()) >> (random() % 32); };
@@ -306,6 +391,13 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
                 for (machine_pulse_t &pulse : half) {
                     pulse = {uint16_t(random()), uint16_t(random() % 32769), uint16_t(random()), uint16_t(random()),
                              uint16_t(random())};
+                }
+            }
+            for (auto &half : tables.partial_pulse) {
+                for (auto &part : half) {
+                    for (machine_partial_pulse_t &pulse : part) {
+                        pulse = {int8_t(random()), uint8_t(random() % 129), uint8_t(random())};
+                    }
                 }
             }
             tables.pulse_base_index = uint16_t(1 + random() % 4096);
@@ -320,6 +412,8 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
         ASSERT_LE(state.level_q15, 32768);
         ASSERT_GE(state.advance_q30, 0);
         ASSERT_LE(state.advance_q30, 1 << 30);
+        ASSERT_GE(state.link_q30, 0);
+        ASSERT_LE(state.link_q30, 1 << 30);
         ASSERT_GE(state.gain_excess_q31, 0);
         ASSERT_LE(state.torque_min_q24, 0);
         ASSERT_GE(state.torque_min_q24, parameters.torque_min_q24);

@@ -32,8 +32,10 @@ from salient.machine.firmware_tables import (
 from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS, FluxMap
 from salient.machine.heat import thermal_constants
 from salient.machine.magnetics import FORMULA_KEYS
+from salient.machine.partial_pulse import PARTS
+from salient.machine.pulse_tables import PulseTables, pulse_tables
 from salient.machine.scaling import Scaling, database_of, scaling_of
-from salient.machine.single_pulse import POINTS, PulseTables, pulse_tables
+from salient.machine.single_pulse import POINTS
 
 MAGIC = b"SALIENTM"
 HEADER = struct.Struct("<8sII4I")
@@ -45,6 +47,7 @@ _TYPES: dict[str, Any] = {
     "unsigned": "<u4", "double": "<f8", "magnetics_form_t": "<u4",
     "machine_row_t": [("start", "<u4"), ("reciprocal", "<i4")],
     "machine_pulse_t": [(name, "<u2") for name in ("lead", "end", "smooth_torque", "mean_torque", "peak_torque")],
+    "machine_partial_pulse_t": [("on", "<i1"), ("end", "<u1"), ("ripple", "<u1")],
 }  # fmt: skip
 
 
@@ -166,9 +169,9 @@ TABLES = Structure("machine_tables_t", (
         tables.phase_map.flux_per_ampere.node - NODE_OFFSET), _CELLS),
     Member("pulse_index_scale", "uint32_t", lambda machine, scaling, tables: tables.pulse.index_scale),
     Member("pulse", "machine_pulse_t", lambda machine, scaling, tables: tables.pulse.pulses(), (2, POINTS)),
+    Member("partial_pulse", "machine_partial_pulse_t", lambda machine, scaling, tables: tables.pulse.partial_pulses(),
+           (2, len(PARTS), POINTS)),
     Member("pulse_base_index", "uint16_t", lambda machine, scaling, tables: tables.pulse.base_index),
-    Member("sharing_on", "uint16_t", lambda machine, scaling, tables: tables.pulse.sharing_on),
-    Member("sharing_off", "uint16_t", lambda machine, scaling, tables: tables.pulse.sharing_off),
     Member("braking_end", "uint16_t", lambda machine, scaling, tables: tables.pulse.braking_end, (POINTS,)),
     Member("braking_flux", "uint16_t", lambda machine, scaling, tables: tables.pulse.braking_flux, (POINTS,)),
     Member("parameter_default", "int32_t", lambda machine, scaling, tables: _padded(scaling.raw_parameters()),

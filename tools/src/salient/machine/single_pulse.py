@@ -21,7 +21,6 @@ import numpy as np
 
 from salient.machine.definition import Machine
 from salient.machine.drive_data import DriveData
-from salient.machine.scaling import Exponents, Scaling
 from salient.machine.sharing_window import least_current_window_deg
 
 POINTS = 17
@@ -29,24 +28,20 @@ POINTS = 17
 SPEED_PER_BASE = (3.0, 5.0)
 """Range of the last speed, as a multiple of the base speed: twice the base speed at 70 % of the voltage is below it."""
 
-_UINT16_MAX, _HALF_TURN = (1 << 16) - 1, 1 << 15
-_INDEX_BITS = 12 + 32 - 22 + 6
-"""Fraction bits of the index at the last speed, less those of a speed and a voltage: the index is
-((speed_q22 * scale) >> 32) / voltage_q6, 2^12 at the last one."""
-_SCALE_BITS = 31
-
 # Steps divide a stroke and a lane; between lanes the search interpolates. Its ranges are those of the angles and a lane
 # more where a maximum may be at their end.
-_STEP_DEG = 3
-_TURN = 360 // _STEP_DEG
-_LANE_DEG = 6
+STEP_DEG = 3
+TURN = 360 // STEP_DEG
+LANE_DEG = 6
 """Between turn-on angles, turn-off angles and ends of the flux linkage."""
-_LANE_STEPS = _LANE_DEG // _STEP_DEG
+_LANE_STEPS = LANE_DEG // STEP_DEG
 _FALL_LANES = 32
 _NEAR_LANES = 3
 """Within which a maximum is followed from speed to speed."""
 _MOTORING_ON_DEG, _MOTORING_OFF_DEG = (60, 186), (192, 354)
 _BRAKING_ON_DEG, _BRAKING_OFF_DEG = (198, 366), (372, 546)
+_LATER_ON_DEG = 60
+"""Turn-on angles after these, of parts of the largest torque."""
 _MOTORING_OFF_MAX_DEG = 353.0
 _SMOOTH_OFF_DEG = np.arange(240.0, 353.0, 8.0)
 _FINE_DEG = 0.25
@@ -93,64 +88,17 @@ class SinglePulse:
     """(POINTS,), at the current limit at that angle."""
 
 
-@dataclass(frozen=True, eq=False)
-class PulseTables:
-    """In the units of a machine and the formats of firmware/control/machine_tables.h, rounded and saturated."""
-
-    index_scale: int
-    pulse: np.ndarray
-    """(2, POINTS, 5): the members of machine_pulse_t."""
-    braking_end: np.ndarray
-    braking_flux: np.ndarray
-    base_index: int
-    sharing_on: int
-    sharing_off: int
-
-    def pulses(self) -> list[list[tuple[int, ...]]]:
-        """The values of machine_pulse_t."""
-        return [[tuple(row) for row in half] for half in self.pulse.tolist()]
-
-
-def pulse_tables(machine: Machine, scaling: Scaling) -> PulseTables:
-    """The tables of a machine."""
-    exponents = scaling.exponents
-    least = math.ldexp(1.0, _INDEX_BITS - _SCALE_BITS + exponents.speed - exponents.voltage)
-    return in_units(single_pulse(machine, scaling.data, least), exponents)
-
-
-def in_units(pulse: SinglePulse, exponents: Exponents) -> PulseTables:
-    """The tables in units."""
-    angles = [_rounded(angle_deg / 360.0, 16, limit) for angle_deg, limit in (
-        (pulse.lead_deg, _UINT16_MAX), (pulse.end_deg, _HALF_TURN))]
-    torques = [_rounded(torque_Nm, 8 - exponents.torque) for torque_Nm in (
-        pulse.smooth_Nm, pulse.mean_Nm, pulse.peak_Nm)]
-    last = math.ldexp(float(pulse.speed_per_voltage[-1]), exponents.voltage - exponents.speed)
-    return PulseTables(
-        index_scale=int(_rounded(1.0 / last, _INDEX_BITS, (1 << _SCALE_BITS) - 1)),
-        pulse=np.stack([*angles, *torques], axis=-1),
-        braking_end=_rounded(pulse.braking_end_deg / 360.0, 16, _HALF_TURN),
-        braking_flux=_rounded(pulse.braking_flux_Wb, 13 - exponents.voltage),
-        base_index=int(_rounded(pulse.base_speed_per_voltage / float(pulse.speed_per_voltage[-1]), 12)),
-        sharing_on=int(_rounded((pulse.sharing_deg[0] - 180.0) / 360.0, 16)),
-        sharing_off=int(_rounded((pulse.sharing_deg[1] - 180.0) / 360.0, 16)),
-    )
-
-
-def _rounded(value: Any, fraction_bits: int, limit: int = _UINT16_MAX) -> np.ndarray:
-    result: np.ndarray = np.clip(np.floor(np.ldexp(value, fraction_bits) + 0.5), 0, limit).astype(np.int64)
-    return result
-
-
 def single_pulse(machine: Machine, data: DriveData, speed_per_voltage_least: float = 0.0) -> SinglePulse:
     """The pulses of a machine with the nominal voltage and the limit current_limit_A. speed_per_voltage_least: of the
     last speed, rad/s/V."""
-    phase = _Phase(machine, data.parameters["current_limit_A"])
+    phase = Phase(machine, data.parameters["current_limit_A"])
     base_rad_s = data.speed_base_rpm * math.pi / 30.0
     low, high = SPEED_PER_BASE
     last_rad_s = min(max(data.speed_max_rpm * math.pi / 30.0, low * base_rad_s), high * base_rad_s)
     last_rad_s = max(last_rad_s, speed_per_voltage_least * machine.supply_voltage_V)
     speed_rad_s = np.arange(POINTS) * last_rad_s / (POINTS - 1)
-    on_deg, off_deg = phase.best_angles(speed_rad_s[1:])
+    pairs = phase.pairs(speed_rad_s[1:])
+    on_deg, off_deg = phase.best_angles(pairs)
     on_deg = _smoothed(np.insert(on_deg, 0, [180.0, 360.0], axis=1))
     off_deg = _smoothed(np.insert(off_deg, 0, [_MOTORING_OFF_MAX_DEG, 540.0], axis=1))
 
@@ -161,7 +109,7 @@ def single_pulse(machine: Machine, data: DriveData, speed_per_voltage_least: flo
     smooth_off_deg = np.broadcast_to((begin_deg - 180.0 + _SMOOTH_OFF_DEG).reshape(-1, 1), (2 * ends, POINTS))
     torque_Nm = phase.torque_Nm(seen_rad_s, np.concatenate([on_deg, smooth_on_deg]).T,
                                 np.concatenate([off_deg, smooth_off_deg]).T)
-    total_Nm = torque_Nm.reshape(-1, _TURN // machine.phases, *torque_Nm.shape[1:]).sum(axis=0)
+    total_Nm = torque_Nm.reshape(-1, TURN // machine.phases, *torque_Nm.shape[1:]).sum(axis=0)
     pulse_Nm = total_Nm[..., :2]
     smooth_Nm = [(sign * total_Nm[..., lanes]).min(axis=0).max(axis=1)
                  for sign, lanes in ((1.0, slice(2, 2 + ends)), (-1.0, slice(2 + ends, None)))]
@@ -195,7 +143,27 @@ class _Sweep:
     """Largest flux linkage, as a fraction of that of _CURRENT_OVER times the current limit."""
 
 
-class _Phase:
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Of turn-on and turn-off angles; arrays by turn-off, speed and turn-on."""
+
+    on_deg: np.ndarray
+    off_deg: np.ndarray
+    torque_Nm: np.ndarray
+    """Mean of a phase over a revolution, in the direction that is wanted."""
+    square_A2: np.ndarray
+    """Mean square of the current."""
+    margin: np.ndarray
+    """Both limits are met by turning on later; not negative: met."""
+
+    def turned_on_until(self, last_deg: float) -> Pairs:
+        """Those that turn on up to an angle."""
+        lanes = self.on_deg <= last_deg
+        return Pairs(self.on_deg[lanes], self.off_deg, self.torque_Nm[..., lanes], self.square_A2[..., lanes],
+                     self.margin[..., lanes])
+
+
+class Phase:
     """A phase between full voltages."""
 
     def __init__(self, machine: Machine, current_limit_A: float) -> None:
@@ -210,7 +178,7 @@ class _Phase:
         self.limit_A = min(current_limit_A, _VOLTAGE_SHARE_MAX * self.rise_V / self.rise_ohm)
         self.voltage_V = machine.supply_voltage_V
 
-        half_deg = np.arange(180.0, 361.0, _STEP_DEG)[:, None]
+        half_deg = np.arange(180.0, 361.0, STEP_DEG)[:, None]
         angle_rad = half_deg / 360.0 * self.pitch_rad
         grid_A = np.linspace(0.0, _CURRENT_TOP * self.limit_A, _FLUX_POINTS)
         grid_Wb = magnetics.flux_linkage_Wb(angle_rad, grid_A)
@@ -223,36 +191,61 @@ class _Phase:
         table = np.concatenate([half, braking])  # from 180 degrees, a turn
         self.slope = np.diff(table, axis=1, append=table[:, -1:])
         self.begin = table - self.slope * np.arange(_FLUX_POINTS)[:, None]
+        rows = np.abs(table[..., 1])
+        self.torque_top_Nm = np.maximum(rows.max(axis=1), 1e-9 * rows.max())
+        self.flux_top_Wb = _whole(grid_Wb[:, -1])
+        self.flux_of_torque_Wb = np.array([
+            np.interp(fraction * torque_top_Nm, np.maximum.accumulate(row), fraction * flux_top_Wb)
+            for row, torque_top_Nm, flux_top_Wb in zip(rows, self.torque_top_Nm, self.flux_top_Wb, strict=True)])
         self.place_1_Wb = (_FLUX_POINTS - 1) / _whole(grid_Wb[:, -1])
         self.limit_Wb = _whole(magnetics.flux_linkage_Wb(angle_rad[:, 0], self.limit_A))
         self.over_Wb = _whole(magnetics.flux_linkage_Wb(angle_rad[:, 0], _CURRENT_OVER * self.limit_A))
         fine_rad = np.arange(0.0, 180.0 + _FINE_DEG, _FINE_DEG) / 360.0 * self.pitch_rad
         self.fine_limit_Wb = magnetics.flux_linkage_Wb(fine_rad, self.limit_A)
 
-    def state(self, index: int, flux_Wb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Current and torque at a multiple of _STEP_DEG."""
+    def state(self, index: Any, flux_Wb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Current and torque at a multiple of STEP_DEG, or at one for each phase."""
         row = _row(index)
         place = np.minimum(flux_Wb * self.place_1_Wb[row], _FLUX_POINTS - 1.0)
         low = place.astype(np.intp)
-        value = self.begin[row].take(low, axis=0) + self.slope[row].take(low, axis=0) * place[..., None]
+        if np.ndim(row) == 0:
+            value = self.begin[row].take(low, axis=0) + self.slope[row].take(low, axis=0) * place[..., None]
+        else:
+            value = self.begin[row, low] + self.slope[row, low] * place[..., None]
         return value[..., 0], value[..., 1]
+
+    def flux_Wb(self, index: Any, torque_Nm: np.ndarray) -> np.ndarray:
+        """Flux linkage of a torque by magnitude; the largest where no current makes it."""
+        row = _row(index)
+        place = np.minimum(torque_Nm / self.torque_top_Nm[row], 1.0) * (_FLUX_POINTS - 1)
+        low = np.minimum(place.astype(np.intp), _FLUX_POINTS - 2)
+        below = self.flux_of_torque_Wb[row, low]
+        flux_Wb: np.ndarray = below + (place - low) * (self.flux_of_torque_Wb[row, low + 1] - below)
+        return flux_Wb
 
     def step_s(self, speed_rad_s: np.ndarray) -> np.ndarray:
         """By speed, as a column."""
-        step_s: np.ndarray = _STEP_DEG / 360.0 * self.pitch_rad / speed_rad_s[:, None]
+        step_s: np.ndarray = STEP_DEG / 360.0 * self.pitch_rad / speed_rad_s[:, None]
         return step_s
 
-    def best_angles(self, speed_rad_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Turn-on and turn-off angles of the largest mean torque: motoring and braking, by speed."""
+    def pairs(self, speed_rad_s: np.ndarray) -> list[Pairs]:
+        """Motoring and braking."""
         falls = self._falls(speed_rad_s, _MOTORING_OFF_DEG[0], _BRAKING_OFF_DEG[1])
         found = []
         for sign, on_range_deg, off_range_deg in (
             (1.0, _MOTORING_ON_DEG, _MOTORING_OFF_DEG), (-1.0, _BRAKING_ON_DEG, _BRAKING_OFF_DEG),
         ):
-            on_deg, off_deg = (np.arange(first, last + 1, _LANE_DEG) for first, last in (on_range_deg, off_range_deg))
-            row = (off_deg[0] - _MOTORING_OFF_DEG[0]) // _LANE_DEG
+            on_deg = np.arange(on_range_deg[0], on_range_deg[1] + _LATER_ON_DEG + 1, LANE_DEG)
+            off_deg = np.arange(off_range_deg[0], off_range_deg[1] + 1, LANE_DEG)
+            row = (off_deg[0] - _MOTORING_OFF_DEG[0]) // LANE_DEG
             fall = _Sweep(*(of[row : row + len(off_deg)] for of in vars(falls).values()))
-            found.append(_best(self._rises(speed_rad_s, on_deg, off_deg), fall, sign, on_deg, off_deg))
+            found.append(_pairs(self._rises(speed_rad_s, on_deg, off_deg), fall, sign, on_deg, off_deg))
+        return found
+
+    def best_angles(self, pairs: list[Pairs]) -> tuple[np.ndarray, np.ndarray]:
+        """Turn-on and turn-off angles of the largest mean torque: motoring and braking, by speed."""
+        found = [_best(of.turned_on_until(last_deg)) for of, last_deg in zip(
+            pairs, (_MOTORING_ON_DEG[1], _BRAKING_ON_DEG[1]), strict=True)]
         on_deg, off_deg = (np.array(angle_deg) for angle_deg in zip(*found, strict=True))
         return (np.minimum(on_deg, [[180.0], [360.0]]), np.minimum(off_deg, [[_MOTORING_OFF_MAX_DEG], [540.0]]))
 
@@ -261,11 +254,11 @@ class _Phase:
         step_s = self.step_s(speed_rad_s)
         rise_Wb, fall_Wb = self.rise_V * step_s, self.fall_V * step_s
         rise_ohm_s, fall_ohm_s = self.rise_ohm * step_s, self.fall_ohm * step_s
-        cap_Wb = self.cap_Wb(speed_rad_s, int(off_deg[-1]) // _STEP_DEG)[..., None]
+        cap_Wb = self.cap_Wb(speed_rad_s, int(off_deg[-1]) // STEP_DEG)[..., None]
         flux_Wb, current_A, torque_Nm, torque, square, over = np.zeros((6, len(speed_rad_s), len(on_deg)))
         rows = []
-        for index in range(on_deg[0] // _STEP_DEG + 1, off_deg[-1] // _STEP_DEG + 1):
-            lanes = np.s_[:, : (index * _STEP_DEG - on_deg[0] - 1) // _LANE_DEG + 1]
+        for index in range(on_deg[0] // STEP_DEG + 1, off_deg[-1] // STEP_DEG + 1):
+            lanes = np.s_[:, : (index * STEP_DEG - on_deg[0] - 1) // LANE_DEG + 1]
             before_Wb, before_A, before_Nm = flux_Wb[lanes], current_A[lanes], torque_Nm[lanes]
             # Chopping takes at most what the opposite voltage does.
             least_Wb = np.maximum(before_Wb - (fall_Wb + fall_ohm_s * before_A), cap_Wb[index])
@@ -275,20 +268,20 @@ class _Phase:
             square[lanes] += 0.5 * (before_A * before_A + after_A * after_A)
             over[lanes] = np.maximum(over[lanes], after_Wb / self.over_Wb[_row(index)])
             flux_Wb[lanes], current_A[lanes], torque_Nm[lanes] = after_Wb, after_A, after_Nm
-            if index * _STEP_DEG >= off_deg[0] and (index * _STEP_DEG - off_deg[0]) % _LANE_DEG == 0:
+            if index * STEP_DEG >= off_deg[0] and (index * STEP_DEG - off_deg[0]) % LANE_DEG == 0:
                 rows.append(np.stack([flux_Wb, torque, square, over]))
         return _Sweep(*np.stack(rows, axis=1))
 
     def _falls(self, speed_rad_s: np.ndarray, first_deg: int, last_deg: int) -> _Sweep:
         """Full opposite voltage from turn-off angles until the flux linkage is zero, backwards; the last axis is the
-        angle between both in multiples of _LANE_DEG."""
+        angle between both in multiples of LANE_DEG."""
         step_s = self.step_s(speed_rad_s)
         fall_Wb, fall_ohm_s = self.fall_V * step_s, self.fall_ohm * step_s
         # Ends beyond those that are searched: more than any flux linkage.
         flux_Wb, current_A, torque_Nm, torque, square, over = np.zeros((6, len(speed_rad_s), _FALL_LANES))
         flux_Wb[:, 1:] = 1e3 * self.limit_Wb.max()
         rows = []
-        for index in range((_BRAKING_ON_DEG[1] + 360) // _STEP_DEG - 1, first_deg // _STEP_DEG - 1, -1):
+        for index in range((_BRAKING_ON_DEG[1] + 360) // STEP_DEG - 1, first_deg // STEP_DEG - 1, -1):
             flux_Wb = flux_Wb + (fall_Wb + fall_ohm_s * current_A)
             after_A, after_Nm = self.state(index, flux_Wb)
             torque = torque + 0.5 * (torque_Nm + after_Nm)
@@ -299,7 +292,7 @@ class _Phase:
                 moved = np.zeros((6, *flux_Wb.shape))
                 moved[..., 1:] = np.stack([flux_Wb, current_A, torque_Nm, torque, square, over])[..., :-1]
                 flux_Wb, current_A, torque_Nm, torque, square, over = moved
-                if index * _STEP_DEG <= last_deg:
+                if index * STEP_DEG <= last_deg:
                     rows.append(moved[[0, 3, 4, 5]])
         return _Sweep(*np.stack(rows[::-1], axis=1))
 
@@ -308,12 +301,12 @@ class _Phase:
         step_s = self.step_s(speed_rad_s)
         rise_Wb, fall_Wb = self.rise_V * step_s, self.fall_V * step_s
         rise_ohm_s, fall_ohm_s = self.rise_ohm * step_s, self.fall_ohm * step_s
-        first = _MOTORING_ON_DEG[0] // _STEP_DEG
-        indices = np.arange(first, first + 2 * _TURN)
+        first = _MOTORING_ON_DEG[0] // STEP_DEG
+        indices = np.arange(first, first + 2 * TURN)
         cap_Wb = self.cap_Wb(speed_rad_s, int(indices[-1]))[..., None]
         # Parts of a step with the voltage and with the opposite one.
-        off = np.clip(indices[:, None, None] - off_deg / _STEP_DEG, 0.0, 1.0)
-        on = np.clip(indices[:, None, None] - on_deg / _STEP_DEG, 0.0, 1.0) - off
+        off = np.clip(indices[:, None, None] - off_deg / STEP_DEG, 0.0, 1.0)
+        on = np.clip(indices[:, None, None] - on_deg / STEP_DEG, 0.0, 1.0) - off
         torque_Nm = np.zeros((len(indices), *on_deg.shape))
         flux_Wb, current_A = np.zeros((2, *on_deg.shape))
         for at in range(1, len(indices)):
@@ -331,7 +324,7 @@ class _Phase:
         limit_Wb = self.fine_limit_Wb
         fall_Wb = -np.diff(limit_Wb)
         steepest = int(np.flatnonzero(fall_Wb >= 0.999 * fall_Wb.max())[-1])
-        taken_Wb = self.voltage_V * self.step_s(speed_rad_s)[:, 0] * (_FINE_DEG / _STEP_DEG)
+        taken_Wb = self.voltage_V * self.step_s(speed_rad_s)[:, 0] * (_FINE_DEG / STEP_DEG)
         above_Wb = limit_Wb + taken_Wb[:, None] * np.arange(len(limit_Wb))
         at = steepest + above_Wb[:, steepest:].argmin(axis=1)
         return at * _FINE_DEG, limit_Wb[at]
@@ -342,15 +335,15 @@ class _Phase:
         index = np.arange(last + 1)
         limit_Wb = self.limit_Wb[_row(index)][:, None]
         end_deg, flux_Wb = self.envelope(speed_rad_s)
-        left_deg = end_deg + 360.0 - _STEP_DEG * index[:, None]
-        line_Wb = flux_Wb + self.voltage_V * self.step_s(speed_rad_s)[:, 0] / _STEP_DEG * left_deg
+        left_deg = end_deg + 360.0 - STEP_DEG * index[:, None]
+        line_Wb = flux_Wb + self.voltage_V * self.step_s(speed_rad_s)[:, 0] / STEP_DEG * left_deg
         cap_Wb: np.ndarray = np.where(left_deg > 0.0, np.minimum(limit_Wb, line_Wb), limit_Wb)
         return cap_Wb
 
 
 def _row(index: Any) -> Any:
     """Of the tables of a turn, by the angle in steps."""
-    return (index - 180 // _STEP_DEG) % _TURN
+    return (index - 180 // STEP_DEG) % TURN
 
 
 def _whole(half: np.ndarray) -> np.ndarray:
@@ -360,9 +353,8 @@ def _whole(half: np.ndarray) -> np.ndarray:
 
 # --- search ---------------------------------------------------------------------------------------------------------
 
-def _best(rise: _Sweep, fall: _Sweep, sign: float, on_deg: np.ndarray, off_deg: np.ndarray
-          ) -> tuple[np.ndarray, np.ndarray]:
-    """Turn-on and turn-off angles of the largest mean torque of a sign, by speed."""
+def _pairs(rise: _Sweep, fall: _Sweep, sign: float, on_deg: np.ndarray, off_deg: np.ndarray) -> Pairs:
+    """Of a rise and the fall that meets it."""
     below = (fall.flux_Wb[..., None, :] <= rise.flux_Wb[..., None]).sum(axis=-1) - 1
     below = np.clip(below, 0, fall.flux_Wb.shape[-1] - 2)
 
@@ -377,12 +369,17 @@ def _best(rise: _Sweep, fall: _Sweep, sign: float, on_deg: np.ndarray, off_deg: 
         result: np.ndarray = low + part * (high - low)
         return result
 
-    torque = sign * (rise.torque + in_fall(fall.torque))
-    square = rise.square + in_fall(fall.square)
-    end_deg = off_deg[:, None, None] + _LANE_DEG * (below + part)
-    # Both limits are met by turning on later; positive: met.
+    end_deg = off_deg[:, None, None] + LANE_DEG * (below + part)
     margin = np.minimum(on_deg + 360.0 - _REST_DEG - end_deg,
                         100.0 * (1.0 - np.maximum(rise.over, in_fall(fall.over))))
+    return Pairs(on_deg, off_deg, sign * (rise.torque + in_fall(fall.torque)) / TURN,
+                 (rise.square + in_fall(fall.square)) / TURN, margin)
+
+
+def _best(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
+    """Turn-on and turn-off angles of the largest mean torque, by speed."""
+    on_deg, off_deg, torque, square, margin = (
+        pairs.on_deg, pairs.off_deg, pairs.torque_Nm, pairs.square_A2, pairs.margin)
     met = margin >= 0.0
 
     by_speed = np.where(met, torque, -np.inf).transpose(1, 0, 2).reshape(torque.shape[1], -1)
@@ -395,15 +392,15 @@ def _best(rise: _Sweep, fall: _Sweep, sign: float, on_deg: np.ndarray, off_deg: 
     best = np.where(met, score, -np.inf).argmax(axis=-1)
     before, here, _ = _three(margin, best)
     room = np.where(before < 0.0, np.maximum(here, 0.0) / np.maximum(here - before, 1e-12), 1.0)
-    shift = np.clip(_vertex(score, best), -room, 1.0)
+    shift = np.clip(vertex(score, best), -room, 1.0)
     any_met = met.any(axis=-1)
-    on_by_off = np.where(any_met, on_deg[best] + shift * _LANE_DEG, np.nan).T
-    score_by_off = np.where(any_met, _parabola(score, best, shift), -np.inf).T
+    on_by_off = np.where(any_met, on_deg[best] + shift * LANE_DEG, np.nan).T
+    score_by_off = np.where(any_met, parabola(score, best, shift), -np.inf).T
 
     best = _followed(score_by_off)
-    shift = _vertex(score_by_off, best)
-    off = np.minimum(off_deg[best] + shift * _LANE_DEG, off_deg[-1])
-    return np.clip(_parabola(on_by_off, best, shift), on_deg[0], on_deg[-1]), off
+    shift = vertex(score_by_off, best)
+    off = np.minimum(off_deg[best] + shift * LANE_DEG, off_deg[-1])
+    return np.clip(parabola(on_by_off, best, shift), on_deg[0], on_deg[-1]), off
 
 
 def _followed(score: np.ndarray) -> np.ndarray:
@@ -436,7 +433,7 @@ def _three(values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     return before, here, after
 
 
-def _vertex(values: np.ndarray, at: np.ndarray) -> np.ndarray:
+def vertex(values: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Place of the maximum of the parabola through the values at an index of the last axis and beside it, -1..1."""
     before, here, after = _three(values, at)
     curvature = before - 2.0 * here + after
@@ -445,7 +442,7 @@ def _vertex(values: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(place), np.clip(place, -1.0, 1.0), 0.0)
 
 
-def _parabola(values: np.ndarray, at: np.ndarray, place: np.ndarray) -> np.ndarray:
+def parabola(values: np.ndarray, at: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Value of that parabola."""
     before, here, after = _three(values, at)
     result: np.ndarray = here + 0.5 * place * (after - before) + 0.5 * place**2 * (before - 2.0 * here + after)
