@@ -42,10 +42,16 @@ static bool start(const world_t *of, board_t *board, rig_firmware_t *firmware) {
 
 static oracle_drive_t view(void) {
     const state_machine_t *state_machine = &host.drive.control.state_machine;
-    return (oracle_drive_t){.state = (uint8_t)state_machine->state,
-                            .fault = (uint8_t)state_machine->record.fault,
-                            .checks = (uint32_t)state_machine->record.fault_mask,
-                            .angle = host.drive.control.measurement.angle};
+    const control_measurement_t *measured = &host.drive.control.measurement;
+    oracle_drive_t seen = {.state = (uint8_t)state_machine->state,
+                           .fault = (uint8_t)state_machine->record.fault,
+                           .checks = (uint32_t)state_machine->record.fault_mask,
+                           .angle = measured->angle,
+                           .link_voltage = (double)measured->dc_link_voltage_q6 / machine_tables.voltage_range_q6};
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        seen.current[phase] = (double)measured->current_q9[phase] / machine_tables.current_range_q9;
+    }
+    return seen;
 }
 
 static const run_drive_t drive = {start, view};

@@ -9,30 +9,13 @@
 
 #define RECENT_NS (2 * ORACLE_MS_NS)
 #define MARGIN 1.02
+#define STATUS_AGE_MAX_NS (30 * ORACLE_MS_NS)
 #define RUN_MAX_NS (502 * ORACLE_MS_NS) /* of a run, since the last request */
-#define STRETCH_COUNTS 16.0
-#define STRETCH_MIN_NS (2 * ORACLE_MS_NS)
-#define STRETCH_MAX_NS (32 * ORACLE_MS_NS)
-#define STRETCH_SPEED 0.1 /* change of the speed, at most */
-#define ANGLE_ERROR_MAX_COUNTS 0.75
-#define TIMER_TICK_S 5e-9
-
-/* Of the encoder on the shaft, in revolutions. */
-static double encoder_offset_rev(const world_t *world) {
-    double offset_deg = 0.0;
-    for (unsigned i = 0; i < world->events; i++) {
-        const world_event_t *event = &world->event[i];
-        if (event->kind == WORLD_SET && event->what == BENCH_VARIABLE_ENCODER_OFFSET_DEG && world_active(world, i, 0)) {
-            offset_deg = event->raw * bench_variables[event->what].scale;
-        }
-    }
-    return offset_deg / 360.0;
-}
 
 void oracle_init(oracle_t *oracle, const world_t *world, uint64_t period_ns) {
     *oracle = (oracle_t){.world = world, .period_ns = period_ns};
     oracle->voltage_recent_low_V = INFINITY;
-    oracle->encoder_offset_rev = encoder_offset_rev(world);
+    oracle->encoder_offset_rev = oracle_encoder_offset_rev(world);
 }
 
 void oracle_violate(oracle_t *oracle, const char *rule, uint64_t time_ns, unsigned number, double value) {
@@ -143,10 +126,6 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     }
 }
 
-static bool link_sensor_faulty(const oracle_t *oracle) {
-    return oracle_any_injected(oracle, FAULT_DC_LINK_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET);
-}
-
 static void look_at_limits(oracle_t *oracle, const plant_t *plant, unsigned gates) {
     const world_machine_t *machine = oracle->world->machine;
     const double speed_rpm = fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S;
@@ -155,49 +134,12 @@ static void look_at_limits(oracle_t *oracle, const plant_t *plant, unsigned gate
         oracle_violate(oracle, "over_speed", plant->time_ns, 0, speed_rpm / machine->over_speed_rpm);
     }
     oracle_since(&oracle->voltage_ns,
-                 gates && plant->machine->dc_link.capacitance_F > 0.0 && !link_sensor_faulty(oracle) &&
+                 gates && plant->machine->dc_link.capacitance_F > 0.0 && !oracle_link_sensor_faulty(oracle) &&
                      plant->bus_voltage_V > MARGIN * machine->over_voltage_V,
                  plant->time_ns);
     if (oracle->voltage_ns && plant->time_ns > oracle->voltage_ns + ORACLE_MS_NS / 5) {
         oracle_violate(oracle, "over_voltage", plant->time_ns, 0, plant->bus_voltage_V / machine->over_voltage_V);
     }
-}
-
-/* What the encoder reads, or when, is not the rotor's motion alone, or memory of the drive was changed. */
-static bool angle_disturbed(const oracle_t *oracle, uint64_t time_us) {
-    return oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) ||
-           oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
-           oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) ||
-           oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_us);
-}
-
-/* At the instant of the measurement. */
-static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
-    oracle_stretch_t *stretch = &oracle->stretch;
-    if (oracle->drive.state != STATE_RUN) {
-        stretch->samples = 0;
-        return;
-    }
-    const double counts_per_rev = ldexp(1.0, (int)oracle->world->encoder_bits);
-    const double true_rev = plant->rotor_angle_rad / ORACLE_TWO_PI + oracle->encoder_offset_rev;
-    const double counts = true_rev * counts_per_rev;
-    const bool steady = fabs(plant->speed_rad_s - stretch->speed_rad_s) <= STRETCH_SPEED * fabs(stretch->speed_rad_s);
-    if (stretch->samples == 0 || !steady || plant->time_ns > stretch->begin_ns + STRETCH_MAX_NS) {
-        *stretch =
-            (oracle_stretch_t){.begin_ns = plant->time_ns, .begin_counts = counts, .speed_rad_s = plant->speed_rad_s};
-    }
-    const double error_rev = ldexp((double)oracle->drive.angle, -32) - true_rev;
-    stretch->error_counts += (error_rev - floor(error_rev + 0.5)) * counts_per_rev;
-    stretch->samples++;
-    if (fabs(counts - stretch->begin_counts) < STRETCH_COUNTS || plant->time_ns < stretch->begin_ns + STRETCH_MIN_NS) {
-        return;
-    }
-    const double mean_counts = stretch->error_counts / stretch->samples;
-    const double tick_counts = fabs(plant->speed_rad_s) / ORACLE_TWO_PI * TIMER_TICK_S * counts_per_rev;
-    if (fabs(mean_counts) > ANGLE_ERROR_MAX_COUNTS + tick_counts && !angle_disturbed(oracle, plant->time_ns / 1000)) {
-        oracle_violate(oracle, "wrong_angle", plant->time_ns, 0, mean_counts);
-    }
-    stretch->samples = 0;
 }
 
 /* --- Events --- */
@@ -248,8 +190,9 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
     oracle->turned = oracle->turned || fabs(plant->rotor_angle_rad - oracle->run_angle_rad) > stroke_rad;
     oracle->drive = drive;
+    oracle->state_ns = drive.state == before ? oracle->state_ns : plant->time_ns;
     oracle->interrupt_ns = plant->time_ns;
-    look_at_angle(oracle, plant);
+    oracle_look_at_measurement(oracle, plant);
     unsigned gates = gates_on(plant);
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         const half_bridge_pattern_t *pattern = &plant->pattern[phase];
@@ -296,8 +239,9 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     }
 }
 
-void oracle_reset(oracle_t *oracle, oracle_drive_t drive) {
+void oracle_reset(oracle_t *oracle, uint64_t time_ns, oracle_drive_t drive) {
     oracle->drive = drive;
+    oracle->state_ns = time_ns;
     oracle->confirmed = false;
 }
 
@@ -319,7 +263,16 @@ void oracle_on_bus(oracle_t *oracle, uint64_t time_ns, const sender_meaning_t *m
     }
 }
 
+void oracle_on_status(oracle_t *oracle, uint64_t time_ns, unsigned state, unsigned fault) {
+    const bool differs = state != oracle->drive.state || fault != oracle->drive.fault;
+    if (differs && time_ns > oracle->state_ns + STATUS_AGE_MAX_NS && !state_changed(oracle) &&
+        !oracle_bus_disturbed(oracle)) {
+        oracle_violate(oracle, "wrong_status", time_ns, state, fault);
+    }
+}
+
 void oracle_on_fault(oracle_t *oracle, const plant_t *plant, unsigned kind, bool begins) {
+    oracle->fault_ns = plant->time_ns;
     if (!begins || kind >= FAULT_COUNT) {
         return;
     }

@@ -20,6 +20,11 @@
  *                   counts of the encoder: the measured angle off the encoder's by more than three quarters of a count
  *                   and the motion in a tick of the timer, on average. The middle of a count is off by half of one at
  *                   most, when sampling is in step with the counts, the time of an edge by a tick
+ *   wrong_current, wrong_voltage
+ *                   a measured phase current or link voltage off the true one by more than 0.8 % of the sensor's full
+ *                   scale, sensor and processor healthy
+ *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
+ *                   and memory undisturbed
  *   wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
  *   not_first       a first cause that is not the first one, by its number, of the checks that failed in its tick
  *   false_alarm     a fault of the drive without any other, which is not true of the plant, or the drive's own work
@@ -50,10 +55,11 @@
 
 /* What is read of the drive. */
 typedef struct {
-    uint8_t state;   /* initialise, ready, run, fault */
-    uint8_t fault;   /* first cause, number of drive.dbc */
-    uint32_t checks; /* failed ones of the tick that latched it */
-    uint32_t angle;  /* of the encoder by the last measurement, 2^-32 rev */
+    uint8_t state;                                /* initialise, ready, run, fault */
+    uint8_t fault;                                /* first cause, number of drive.dbc */
+    uint32_t checks;                              /* failed ones of the tick that latched it */
+    uint32_t angle;                               /* of the encoder by the last measurement, 2^-32 rev */
+    double current[HAL_PHASES_MAX], link_voltage; /* then, of the full scales of their sensors */
 } oracle_drive_t;
 
 /* Motion at a steady speed, over which the error of the measured angle is averaged. */
@@ -85,6 +91,7 @@ typedef struct {
     uint8_t cell[ORACLE_CELLS / 8];
     /* Private. */
     oracle_drive_t drive;
+    uint64_t state_ns; /* since when the drive has its state */
     uint64_t interrupt_ns;
     bool confirmed, commanded, off_seen, clear_seen;
     uint64_t run_ns, off_ns, speed_ns, voltage_ns;
@@ -93,6 +100,7 @@ typedef struct {
     uint64_t recent_ns;
     double run_angle_rad;      /* of the rotor at the start of the run */
     bool turned;               /* by a stroke since */
+    uint64_t fault_ns;         /* the last fault began or ended */
     double encoder_offset_rev; /* on the shaft, in counting direction */
     oracle_stretch_t stretch;
     /* Recovery. */
@@ -111,10 +119,11 @@ void oracle_look(oracle_t *oracle, const plant_t *plant);
 void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive_t drive);
 
 /* The drive was reset. */
-void oracle_reset(oracle_t *oracle, oracle_drive_t drive);
+void oracle_reset(oracle_t *oracle, uint64_t time_ns, oracle_drive_t drive);
 
 /* Events of the sender. */
 void oracle_on_bus(oracle_t *oracle, uint64_t time_ns, const sender_meaning_t *meaning);
+void oracle_on_status(oracle_t *oracle, uint64_t time_ns, unsigned state, unsigned fault); /* DRIVE_STATUS */
 void oracle_on_fault(oracle_t *oracle, const plant_t *plant, unsigned kind, bool begins);
 
 /* At the begin of the recovery: the speed to be commanded, r/min. */

@@ -1,6 +1,7 @@
 #include "campaign/oracle_parts.h"
 
 #include "bench_variables.h"
+#include "fault_kinds.h"
 
 bool oracle_any_injected(const oracle_t *oracle, unsigned first, unsigned last) {
     bool any = false;
@@ -39,4 +40,8 @@ bool oracle_bus_disturbed(const oracle_t *oracle) {
         }
     }
     return oracle_other_sender(oracle, true, UINT64_MAX);
+}
+
+bool oracle_link_sensor_faulty(const oracle_t *oracle) {
+    return oracle_any_injected(oracle, FAULT_DC_LINK_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET);
 }

@@ -61,6 +61,17 @@ bool oracle_other_sender(const oracle_t *oracle, bool hostile, uint64_t time_us)
 /* The bus was loaded, cut or shared with another sender at any time. */
 bool oracle_bus_disturbed(const oracle_t *oracle);
 
+/* The only sensor of the link voltage was faulty at any time. */
+bool oracle_link_sensor_faulty(const oracle_t *oracle);
+
+/* --- Measurement --- */
+
+/* Of the encoder on the shaft. */
+double oracle_encoder_offset_rev(const world_t *world);
+
+/* At the instant of the samples of a control interrupt, after it. */
+void oracle_look_at_measurement(oracle_t *oracle, const plant_t *plant);
+
 /* --- First causes --- */
 
 /* The drive has latched a fault: wrong_cause or false_alarm. */

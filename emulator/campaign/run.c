@@ -18,11 +18,15 @@ static void after_interrupt(void *context) {
 
 static void after_restart(void *context) {
     run_t *run = context;
-    oracle_reset(&run->oracle, run->drive->view());
+    oracle_reset(&run->oracle, run->rig.board.time_ns, run->drive->view());
 }
 
 static void on_bus(void *context, uint64_t time_ns, const sender_meaning_t *meaning) {
     oracle_on_bus(&((run_t *)context)->oracle, time_ns, meaning);
+}
+
+static void on_status(void *context, uint64_t time_ns, unsigned state, unsigned fault) {
+    oracle_on_status(&((run_t *)context)->oracle, time_ns, state, fault);
 }
 
 static void on_fault(void *context, uint64_t time_ns, unsigned kind, bool begins) {
@@ -39,6 +43,7 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
     sender_init(&run->sender, world);
     run->sender.record = record;
     run->sender.on_bus = on_bus;
+    run->sender.on_status = on_status;
     run->sender.on_fault = on_fault;
     run->sender.context = run;
     rig_config_t config = {

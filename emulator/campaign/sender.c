@@ -13,6 +13,7 @@
 #define HASH_PRIME UINT64_C(1099511628211)
 #define COMMAND_PERIOD_US 10000
 #define ARM_RETRY_US 20000
+#define DUPLICATE_MAX_NS UINT64_C(20000000) /* of a frame, by a disturbed acknowledgement */
 #define STREAM_HOSTILE 200
 
 /* E2EDataId of drive.dbc. */
@@ -193,7 +194,8 @@ static void step_honest(sender_t *sender, const transport_receiver_t *receiver) 
         put_command(sender, receiver, HONEST, sender->counter++, request,
                     request == SENDER_RUN ? sender->reference : 0);
     }
-    if (request != SENDER_RUN || sender->armed || sender->state == STATE_FAULT || sender->state == STATE_INITIALISE) {
+    if (request != SENDER_RUN || has(sender, WORLD_UNARMED) || sender->armed || sender->state == STATE_FAULT ||
+        sender->state == STATE_INITIALISE) {
         return;
     }
     if (sender->challenge) {
@@ -226,6 +228,13 @@ static void put_replay(sender_t *sender, const transport_receiver_t *receiver) {
     }
 }
 
+static void put_repeated(sender_t *sender, const transport_receiver_t *receiver) {
+    if (sender->sent > 0) {
+        const sender_frame_t *last = &sender->history[(sender->sent - 1) % SENDER_HISTORY];
+        put(sender, receiver, OTHER, last->identifier, last->data, last->length);
+    }
+}
+
 /* A command of any kind with the next counter, its checksum off by a bit. */
 static void put_forged(sender_t *sender, const transport_receiver_t *receiver) {
     uint8_t data[7] = {[3] = (uint8_t)(draw(sender) % 4)};
@@ -250,6 +259,9 @@ static void step_hostile(sender_t *sender, const transport_receiver_t *receiver,
         break;
     case WORLD_HOSTILE_FORGED:
         put_forged(sender, receiver);
+        break;
+    case WORLD_HOSTILE_REPEAT:
+        put_repeated(sender, receiver);
         break;
     case WORLD_HOSTILE_FLOOD:
         for (unsigned i = 0; i < 5; i++) {
@@ -304,14 +316,12 @@ static bool is_same(const sender_frame_t *frame, const struct can_frame *on_bus)
            memcmp(frame->data, on_bus->data, frame->length) == 0;
 }
 
-/* A replay is at least five frames old and has been on the bus before; a genuine frame that the bus delays may be as
- * old.
- */
-static sender_meaning_t meaning_of(sender_t *sender, const struct can_frame *on_bus) {
+/* A frame that has been on the bus before is no request once more. */
+static sender_meaning_t meaning_of(sender_t *sender, const struct can_frame *on_bus, uint64_t time_ns) {
     for (uint64_t back = 1; back <= SENDER_HISTORY && back <= sender->sent; back++) {
         sender_frame_t *frame = &sender->history[(sender->sent - back) % SENDER_HISTORY];
-        if ((back <= 4 || !frame->seen) && is_same(frame, on_bus)) {
-            frame->seen = true;
+        if (is_same(frame, on_bus) && (frame->seen_ns == 0 || time_ns <= frame->seen_ns + DUPLICATE_MAX_NS)) {
+            frame->seen_ns = frame->seen_ns ? frame->seen_ns : time_ns;
             return (sender_meaning_t){.genuine = true,
                                       .command = frame->identifier == DRIVE_COMMAND_FRAME_ID,
                                       .confirms = frame->identifier == DRIVE_ARM_FRAME_ID && frame->data[3] == 1,
@@ -321,9 +331,10 @@ static sender_meaning_t meaning_of(sender_t *sender, const struct can_frame *on_
     return (sender_meaning_t){.genuine = false};
 }
 
-static void listen(sender_t *sender, const struct can_frame *frame) {
+static void listen(sender_t *sender, const struct can_frame *frame, uint64_t time_ns) {
     if (frame->can_id == DRIVE_STATUS_FRAME_ID && frame->len == 8) {
         sender->state = frame->data[4] & 0x0F;
+        sender->on_status(sender->context, time_ns, sender->state, frame->data[5]);
     } else if (frame->can_id == DRIVE_ARMING_FRAME_ID && frame->len == 8) {
         uint32_t challenge;
         memcpy(&challenge, frame->data, sizeof challenge);
@@ -354,13 +365,13 @@ static void send_clients(transport_t *transport, uint64_t time_ns, transport_ori
     mix(sender, &frame->classic.len, 1);
     mix(sender, frame->classic.data, frame->classic.len);
     if (origin == TRANSPORT_FROM_CLIENT_ON_BUS) {
-        const sender_meaning_t meaning = meaning_of(sender, &frame->classic);
+        const sender_meaning_t meaning = meaning_of(sender, &frame->classic, time_ns);
         sender->on_bus(sender->context, time_ns, &meaning);
     } else if (origin == TRANSPORT_FROM_EMULATOR) {
         if (frame->classic.can_id == (RIG_TRUTH_FAULT_FRAME_ID | CAN_EFF_FLAG)) {
             sender->on_fault(sender->context, time_ns, frame->classic.data[0], frame->classic.data[2] & 1u);
         } else {
-            listen(sender, &frame->classic);
+            listen(sender, &frame->classic, time_ns);
         }
     }
 }

@@ -23,7 +23,7 @@ typedef struct {
     uint8_t length;
     uint16_t identifier;
     uint64_t sent_us;
-    bool seen; /* on the bus */
+    uint64_t seen_ns; /* first on the bus; 0: not yet */
 } sender_frame_t;
 
 /* What a frame on the bus was to the world, by its sender's own account. */
@@ -58,6 +58,7 @@ typedef struct sender {
     uint64_t frames;
     FILE *record; /* every frame that is sent, a line each; NULL: not wanted */
     void (*on_bus)(void *context, uint64_t time_ns, const sender_meaning_t *meaning);
+    void (*on_status)(void *context, uint64_t time_ns, unsigned state, unsigned fault);
     void (*on_fault)(void *context, uint64_t time_ns, unsigned kind, bool begins);
     void *context;
 } sender_t;

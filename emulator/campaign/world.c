@@ -308,6 +308,9 @@ static void draw_script(world_t *world, uint64_t last_us) {
     if (seeded_unit(seed, STREAM_SCRIPT, 4) < 0.3) {
         add(world, WORLD_EAGER, 0, 0);
     }
+    if (seeded_unit(seed, STREAM_SCRIPT, 5) < 0.05) {
+        add(world, WORLD_UNARMED, (uint64_t)seeded_between(seed, STREAM_SCRIPT, 6, 0.0, (double)last_us), last_us);
+    }
 }
 
 void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
@@ -367,7 +370,7 @@ bool world_active(const world_t *world, unsigned event, uint64_t time_us) {
 const char *world_event_name(const world_event_t *event) {
     static const char *const names[] = {
         [WORLD_SPEED] = "speed_reference", [WORLD_SILENT] = "silent", [WORLD_HOSTILE] = "hostile",
-        [WORLD_SECOND] = "second_sender",  [WORLD_EAGER] = "eager",
+        [WORLD_SECOND] = "second_sender",  [WORLD_EAGER] = "eager",   [WORLD_UNARMED] = "unarmed",
     };
     return event->kind == WORLD_SET     ? bench_variables[event->what].name
            : event->kind == WORLD_FAULT ? fault_kinds[event->what].name

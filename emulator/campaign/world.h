@@ -31,6 +31,7 @@ typedef enum {
     WORLD_HOSTILE, /* a second client sends frames of sort `what` from begin to end */
     WORLD_SECOND,  /* a second client sends protected commands of its own from begin to end */
     WORLD_EAGER,   /* the client clears, arms and runs again after each fault, whatever its cause does */
+    WORLD_UNARMED, /* the client requests to run without arming the drive, from begin to end */
 } world_kind_t;
 
 typedef enum {
@@ -40,6 +41,7 @@ typedef enum {
     WORLD_HOSTILE_FLOOD,    /* any identifier, five frames per millisecond */
     WORLD_HOSTILE_IDENTITY, /* identifiers of the drive's telemetry */
     WORLD_HOSTILE_FORGED,   /* commands in sequence, with a wrong checksum */
+    WORLD_HOSTILE_REPEAT,   /* the latest genuine frame once more, each millisecond, as a gateway that hangs */
     WORLD_HOSTILE_SORTS
 } world_hostile_t;
 

@@ -99,7 +99,7 @@ def test_a_seed_has_the_same_bits_twice_on_the_bench_and_on_a_target(tmp_path: P
 
 
 def test_the_text_of_every_canary_is_in_its_file_once() -> None:
-    assert len({canary.name for canary in canaries.canaries()}) == 20
+    assert len({canary.name for canary in canaries.canaries()}) == 23
 
 
 def test_a_planted_bug_is_found_within_seconds_shrinks_and_replays(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_the_pages_show_the_committed_results() -> None:
     assert report.page() == report.PAGE.read_text(encoding="utf-8")
     page = fault_table.PAGE.read_text(encoding="utf-8")
     assert fault_table.with_branches(page) == page
-    assert report.table().count("\n") == 8 and "20 of 20 found" in report.table()
+    assert report.table().count("\n") == 8 and "23 of 23 found" in report.table()
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
