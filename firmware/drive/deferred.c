@@ -234,7 +234,7 @@ static void learn_periodic_load(const control_parameters_t *parameters, deferred
 
 /* A torque at its limit follows no load. */
 static void identify_inertia(const control_parameters_t *parameters, deferred_t *deferred,
-                             const deferred_input_t *input) {
+                                      const deferred_input_t *input) {
     const int32_t torque_q24 = input->torque_reference_q24;
     inertia_step(
         &parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical, input->torque_sum_q24,
