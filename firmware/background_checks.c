@@ -151,14 +151,17 @@ COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
     }
 }
 
-/* A latch that has changed is not to be trusted: the drive is in fault from here on. */
+/* A latch that has changed is not to be trusted: the drive is in fault from here on, and of a run that this has ended
+ * nothing is left. */
 COLD static void test_itself(drive_t *drive, uint32_t time_us) {
     self_test_t *test = &drive->self_test;
     state_machine_t *state_machine = &drive->control.state_machine;
     self_test_step(test, drive->hal, &drive->control_parameters, time_us);
     hal_critical_enter(drive->hal);
-    if (!self_test_latch_intact(state_machine)) {
+    if (!self_test_latch_intact(&drive->control)) {
         test->failed |= SELF_TEST_FAULT_LATCH;
+        drive->control.torque_reference_q24 = 0;
+        control_prepare(&drive->control_parameters, &drive->control);
         state_machine_start_in_fault(state_machine, FAULT_BIT(FAULT_MEMORY));
         state_machine->record.time_us = time_us;
     }

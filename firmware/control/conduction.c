@@ -4,7 +4,7 @@
 #include "fixed/formats.h"
 
 /* Torque shortfall that counts as voltage limitation: 0.05 N m and 1/64 of the reference. Less may be rounding. */
-#define SHORTFALL_MIN_Q24 ((1 << 24) / 20)
+#define SHORTFALL_MIN_Q24 ((1u << 24) / 20)
 
 /* 2^-32 electrical rev to Q1.30 in Q8, and a half. */
 #define TRIM_SHIFT 11
@@ -129,8 +129,8 @@ static int32_t trim_step_q30(const conduction_pulse_t *pulse, const conduction_s
 /* Advance of the windows and level of the single pulse. */
 static void move(const conduction_parameters_t *parameters, conduction_state_t *state, const machine_tables_t *tables,
                  const conduction_sample_t *sample) {
-    const int32_t torque = fixed_abs(sample->torque_q24);
-    const bool voltage_limited = fixed_abs(sample->torque_shortfall_q24) > SHORTFALL_MIN_Q24 + torque / 64;
+    const bool voltage_limited =
+        fixed_magnitude(sample->torque_shortfall_q24) > SHORTFALL_MIN_Q24 + fixed_magnitude(sample->torque_q24) / 64;
     int32_t retract_q30 = voltage_limited ? 0 : parameters->retract_step_q30;
     if (parameters->single_pulse) {
         state->sharing_q15 = above_base_q15(tables, state->place, LEAST_CURRENT_RANGE);

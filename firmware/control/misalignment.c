@@ -11,9 +11,9 @@
 #define MEAN_1_S 10
 #define FILTER_GAIN_MAX_Q16 65535 /* largest below one */
 #define SETTLE_MS 150
-#define TORQUE_MIN_Q24 (1 << 24)
-/* 0.05 * 0.02^2 of T^2, Q20: keeps the denominator above the noise of s_j. */
-#define POWER_FLOOR_Q20 21
+#define TORQUE_MIN_Q24 (1u << 24)
+/* 0.05 * 0.02^2 of T^2, Q32: keeps the denominator above the noise of s_j. */
+#define POWER_FLOOR_Q32 (21 << 12)
 #define OFFSET_LIMIT_Q40 (((int64_t)7 << 40) / 2)
 /* Error that a step corrects, 0.08 rad: a load step teaches little before the end of its stroke, where learning stops.
  */
@@ -59,12 +59,12 @@ static inline void low_pass_step(int32_t *value, int32_t target, int32_t gain_q1
     *value = fixed_add(fixed_add(*value, half), half);
 }
 
-static int32_t product_q24(int32_t a_q24, int32_t b_q24) {
-    return fixed_multiply(a_q24, b_q24, 24);
+static int32_t square_q24(int32_t value_q24) {
+    return fixed_multiply_shift(value_q24, value_q24, 24);
 }
 
 int32_t misalignment_disturbance_q24(int32_t inertia_rate_q8, int32_t load_torque_q24, int32_t speed_correction_q22) {
-    return fixed_subtract(load_torque_q24, fixed_multiply(speed_correction_q22, inertia_rate_q8, 6));
+    return fixed_subtract(load_torque_q24, fixed_multiply_shift(speed_correction_q22, inertia_rate_q8, 6));
 }
 
 static int32_t limited_step_q10(int32_t step_q10) {
@@ -75,9 +75,25 @@ static int64_t clamped_offset_q40(int64_t offset_q40) {
     return fixed_clamp_64(offset_q40, -OFFSET_LIMIT_Q40, OFFSET_LIMIT_Q40);
 }
 
-NOINLINE void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                                const machine_tables_t *tables, const misalignment_sample_t *sample) {
-    const bool torque_suffices = fixed_abs(sample->torque_q24) > TORQUE_MIN_Q24;
+/* Gain of means over the time since the state became steady, at most 100 ms: before, the load was another. */
+static inline int32_t growing_mean_q16(const misalignment_parameters_t *parameters, uint32_t steady_updates,
+                                       int32_t phases) {
+    const int32_t gain_q16 = FILTER_GAIN_MAX_Q16 / ((int32_t)steady_updates / phases + 1);
+    return gain_q16 > parameters->mean_q16 ? gain_q16 : parameters->mean_q16;
+}
+
+/* Step of a phase by the errors since its last one. */
+static inline int32_t phase_step_q10(const misalignment_t *misalignment, int32_t error_q24, int32_t alternating_q24,
+                                     int32_t torque_q24) {
+    const int32_t floor_q24 = fixed_multiply_high(square_q24(torque_q24), POWER_FLOOR_Q32);
+    const int32_t denominator_q20 = (fixed_add(misalignment->power_q24, floor_q24) >> 4) + 1;
+    /* Q24 * Q24 to Q30, divided by Q20: Q10. */
+    return limited_step_q10(fixed_multiply_shift(error_q24, alternating_q24, 18) / denominator_q20);
+}
+
+void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                       const machine_tables_t *tables, const misalignment_sample_t *sample) {
+    const bool torque_suffices = fixed_magnitude(sample->torque_q24) > TORQUE_MIN_Q24;
     const bool steady = sample->condition == MISALIGNMENT_STEADY && torque_suffices;
     const int32_t disturbance_q24 = sample->disturbance_q24;
     const bool settled = misalignment->steady_updates >= parameters->settle_updates;
@@ -90,14 +106,14 @@ NOINLINE void misalignment_step(const misalignment_parameters_t *parameters, mis
     misalignment->common_rate = learning                                 ? MISALIGNMENT_RATE_FULL
                                 : sample->undisturbed && torque_suffices ? MISALIGNMENT_RATE_BEYOND_LOAD
                                                                          : MISALIGNMENT_RATE_NONE;
-    /* Means over the time since the state became steady, at most 100 ms: before, the load was another. */
     const int32_t phases = (int32_t)tables->phases;
-    const int32_t growing_memory_q16 = FILTER_GAIN_MAX_Q16 / ((int32_t)misalignment->steady_updates / phases + 1);
-    const int32_t mean_gain_q16 = growing_memory_q16 > parameters->mean_q16 ? growing_memory_q16 : parameters->mean_q16;
+    const int32_t mean_gain_q16 =
+        settled ? parameters->mean_q16 : growing_mean_q16(parameters, misalignment->steady_updates, phases);
 
     const unsigned index = misalignment->phase_index;
     misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;
     misalignment_phase_t *phase = &misalignment->phase[index];
+    IN_REGISTER(phase);
     misalignment->disturbance_sum_q24 += disturbance_q24;
     const int64_t sum_before_q24 = phase->last_sum_q24;
     phase->last_sum_q24 = misalignment->disturbance_sum_q24;
@@ -111,24 +127,27 @@ NOINLINE void misalignment_step(const misalignment_parameters_t *parameters, mis
     low_pass_step(&phase->slope_mean_q24, phase->slope_lag2_q24, mean_gain_q16);
     const int32_t alternating_q24 = fixed_subtract(phase->slope_lag2_q24, phase->slope_mean_q24);
     /* One phase per update stands for all: the sum over the phases. */
-    const int32_t square_q24 = product_q24(alternating_q24, alternating_q24);
-    low_pass_step(&misalignment->power_q24, fixed_saturate((int64_t)square_q24 * phases), mean_gain_q16 / phases + 1);
+    const int32_t phase_power_q24 = square_q24(alternating_q24);
+    int32_t power_q24 = phase_power_q24;
+    for (unsigned i = 1; i < tables->phases; i++) {
+        power_q24 = fixed_add(power_q24, phase_power_q24);
+    }
+    low_pass_step(&misalignment->power_q24, power_q24, mean_gain_q16 / phases + 1);
     low_pass_step(&misalignment->disturbance_mean_q24, disturbance_q24, mean_gain_q16 / phases + 1);
+    int64_t step_q40 = misalignment->common_sum_q40 - phase->common_sum_q40;
+    phase->common_sum_q40 = misalignment->common_sum_q40;
     if (learning) {
         /* Mean of y since the last update of the phase: at most four updates, 32 bits each. */
         const int32_t recent_mean_q24 =
             4 * ((int32_t)((misalignment->disturbance_sum_q24 - sum_before_q24) >> 2) / phases);
         const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
-        const int32_t torque_square_q24 = product_q24(sample->torque_q24, sample->torque_q24);
-        const int32_t power_q24 =
-            fixed_add(misalignment->power_q24, fixed_multiply(torque_square_q24, POWER_FLOOR_Q20, 20));
-        /* Q24 * Q24 to Q30, divided by Q20: Q10. */
-        const int32_t step_q10 =
-            limited_step_q10(fixed_multiply(error_q24, alternating_q24, 18) / ((power_q24 >> 4) + 1));
-        phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + (int64_t)step_q10 * parameters->rate_q30);
+        const int32_t step_q10 = phase_step_q10(misalignment, error_q24, alternating_q24, sample->torque_q24);
+        step_q40 = fixed_accumulate(step_q40, step_q10, parameters->rate_q30);
     }
+    phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + step_q40);
     /* 0.02 rad is twice the probe angle. */
-    phase->offset = fixed_multiply((int32_t)fixed_shift(phase->offset_q40, 12), (int32_t)parameters->probe_angle, 27);
+    phase->offset =
+        fixed_multiply_shift((int32_t)fixed_shift(phase->offset_q40, 12), (int32_t)parameters->probe_angle, 27);
 }
 
 /* Part of a value around the frequency of the strokes. */
@@ -139,10 +158,12 @@ static int32_t band_pass_step(misalignment_band_t *band, int32_t value_q24, int3
 }
 
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                              int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16) {
-    /* A quarter of the sum over the phases, which fits; those that the machine has not have slope 0. */
+                              unsigned phases, int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16) {
+    /* A quarter of the sum over the phases, which fits. */
     int32_t sum_q24 = 0;
-    for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
+    const unsigned count = phases < HAL_PHASES_MAX ? phases : HAL_PHASES_MAX;
+    UNROLL(4)
+    for (unsigned i = 0; i < count; i++) {
         sum_q24 += misalignment->phase[i].slope_lag2_q24 / 4;
     }
     const int32_t gain_q16 = fixed_clamp(stroke_part_q16, 0, BAND_GAIN_MAX_Q16 / BAND_FACTOR) * BAND_FACTOR;
@@ -165,10 +186,7 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     const int32_t floor_q22 = (torque_q10 * torque_q10 >> 27) + 1;
     /* y 4 q / (16 q^2), q the quarter. */
     const int32_t step_q10 =
-        limited_step_q10(fixed_multiply(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));
-    const int64_t step_q40 = ((int64_t)step_q10 * parameters->common_rate_q30) >> (learning ? 0 : MOVING_SHIFT);
-    for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
-        misalignment_phase_t *phase = &misalignment->phase[i];
-        phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + step_q40);
-    }
+        limited_step_q10(fixed_multiply_shift(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));
+    const int64_t step_q40 = fixed_product(step_q10, parameters->common_rate_q30);
+    misalignment->common_sum_q40 += learning ? step_q40 : step_q40 >> MOVING_SHIFT;
 }

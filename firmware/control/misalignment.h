@@ -55,10 +55,11 @@ typedef struct {
 
 typedef struct {
     int32_t slope_lag1_q24, slope_lag2_q24,
-        slope_mean_q24;   /* s_j after one filter, two, and mean: N m per 0.02 rad, Q7.24 */
-    int64_t last_sum_q24; /* disturbance_sum_q24 at the last update of the phase */
-    int64_t offset_q40;   /* delta_j in 0.02 rad, within +-3.5 (4 degrees) */
-    int32_t offset;       /* delta_j, 2^-32 electrical rev, to subtract from the phase's angle */
+        slope_mean_q24;     /* s_j after one filter, two, and mean: N m per 0.02 rad, Q7.24 */
+    int64_t last_sum_q24;   /* disturbance_sum_q24 at the last update of the phase */
+    int64_t offset_q40;     /* delta_j in 0.02 rad, within +-3.5 (4 degrees) */
+    int64_t common_sum_q40; /* of misalignment_t, at the last update of the phase */
+    int32_t offset;         /* delta_j, 2^-32 electrical rev, to subtract from the phase's angle */
 } misalignment_phase_t;
 
 /* Of the common angle. */
@@ -80,6 +81,7 @@ typedef struct {
     int32_t power_q24;            /* mean of sum s_j^2, Q7.24 */
     uint32_t steady_updates;
     int64_t common_power_q40; /* mean of the band's (sum s_j / 4)^2, (N m per 0.02 rad)^2, Q40 */
+    int64_t common_sum_q40;   /* of the steps of the common angle, which each phase takes with its next update */
     misalignment_band_t common_slope, common_disturbance; /* of sum s_j / 4, N m per 0.02 rad, and of y */
     uint32_t beyond_load_steps;      /* of the common angle since the load was last steady, until they learn */
     misalignment_rate_t common_rate; /* by the conditions of the last misalignment_step */
@@ -126,9 +128,9 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
                        const machine_tables_t *tables, const misalignment_sample_t *sample);
 
 /* One sample: updates the offset that the phases have in common, from the slopes of the last misalignment_step of each,
- * while those learn, or more slowly while only the load may move. Disturbance and torque reference in N m, Q7.24;
- * stroke_part_q16: part of a stroke since the last step, from 0; rounding as there. */
+ * while those learn, or more slowly while only the load may move; each takes it with its next step. Disturbance and
+ * torque reference in N m, Q7.24; stroke_part_q16: part of a stroke since the last step, from 0; rounding as there. */
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                              int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16);
+                              unsigned phases, int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16);
 
 #endif

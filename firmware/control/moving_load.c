@@ -106,7 +106,7 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
     const uint32_t base_q4 =
         from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4(parameters, angle_step);
     const uint32_t threshold_q4 = moving->own_ripple ? base_q4 * 5 / 2 : base_q4;
-    const uint32_t magnitude_q4 = (uint32_t)fixed_abs(trend_q4);
+    const uint32_t magnitude_q4 = fixed_magnitude(trend_q4);
     moving->settling -= moving->settling > 0;
     if (magnitude_q4 > parameters->implausible_q4 && moving->withheld > 0 && moving->settling == 0) {
         moving->withheld = 0;

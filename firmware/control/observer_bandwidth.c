@@ -130,14 +130,15 @@ static uint32_t threshold_of_mean(const observer_bandwidth_statistics_t *statist
 }
 
 static unsigned adaptive_stage(const observer_bandwidth_parameters_t *parameters, observer_bandwidth_t *bandwidth,
-                               const observer_bandwidth_limits_t *limits, int32_t innovation, bool from_edge) {
+                               const observer_bandwidth_limits_t *limits, int32_t innovation, const bool *edge) {
+    const bool from_edge = *edge;
     bandwidth->ticks = (uint32_t)fixed_add((int32_t)bandwidth->ticks, 1);
     /* One stage a sample: the ends of stages are further apart, but for those that already have the steady bandwidth.
      */
     const unsigned next = bandwidth->stage + (bandwidth->ticks >= parameters->end_ticks[bandwidth->stage]);
     const unsigned last = LAST_STAGE - limits->withheld_stages;
     bandwidth->stage = next < last ? next : last;
-    if ((uint32_t)fixed_abs(innovation) > threshold_of(parameters, limits->threshold_mean, from_edge) &&
+    if (fixed_magnitude(innovation) > threshold_of(parameters, limits->threshold_mean, from_edge) &&
         bandwidth->ticks >= limits->holdoff_ticks) {
         bandwidth->trigger = bandwidth->stage >= parameters->steady_stage_edge ? OBSERVER_TRIGGER_IN_STEADY_STATE
                                                                                : OBSERVER_TRIGGER_IN_DECAY;
@@ -150,24 +151,22 @@ static unsigned adaptive_stage(const observer_bandwidth_parameters_t *parameters
 const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_parameters_t *parameters,
                                                      observer_bandwidth_t *bandwidth,
                                                      const observer_bandwidth_limits_t *limits, int32_t innovation,
-                                                     bool from_edge) {
+                                                     const bool *from_edge) {
     const unsigned stage =
         parameters->adaptive ? adaptive_stage(parameters, bandwidth, limits, innovation, from_edge) : LAST_STAGE;
     return &parameters->gains[stage];
 }
 
-observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
-                                                      observer_bandwidth_statistics_t *statistics,
-                                                      const observer_bandwidth_sample_t *sample, uint32_t angle_step,
-                                                      uint32_t withheld_stages) {
+void observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
+                               observer_bandwidth_statistics_t *statistics, const observer_bandwidth_sample_t *sample,
+                               uint32_t angle_step, uint32_t withheld_stages, observer_bandwidth_limits_t *limits) {
     const bool triggered_steady = sample->trigger == OBSERVER_TRIGGER_IN_STEADY_STATE;
-    const bool was_steady = sample->trigger == OBSERVER_TRIGGER_NONE
-                                ? observer_bandwidth_steady(parameters, sample->stage)
-                                : triggered_steady;
+    const bool was_steady =
+        sample->trigger == OBSERVER_TRIGGER_NONE ? sample->stage >= parameters->steady_stage_edge : triggered_steady;
     if (was_steady) {
         /* Innovations are clipped at the threshold, so that a load step does not raise it. */
         const uint32_t threshold = threshold_of(parameters, threshold_of_mean(statistics), sample->from_edge);
-        const uint32_t magnitude = (uint32_t)fixed_abs(sample->innovation);
+        const uint32_t magnitude = fixed_magnitude(sample->innovation);
         const int32_t clipped = (int32_t)(magnitude < threshold ? magnitude : threshold);
         const int32_t mean = (int32_t)(statistics->mean_innovation_q32 >> 32);
         statistics->mean_innovation_q32 =
@@ -184,14 +183,12 @@ observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_p
         (uint32_t)(((uint64_t)statistics->holdoff_extension_q16 * parameters->holdoff_decay_q32) >> 32);
     const bool frequent_edges = sample->from_edge && angle_step >= parameters->edge_step_min;
     const uint32_t withheld_min = frequent_edges ? LAST_STAGE - parameters->steady_stage_edge : 0;
-    return (observer_bandwidth_limits_t){
-        .threshold_mean = threshold_of(parameters, threshold_of_mean(statistics), frequent_edges),
-        .withheld_stages = (uint8_t)(withheld_stages > withheld_min ? withheld_stages : withheld_min),
-        .trigger_stage_edge = frequent_edges ? 0 : parameters->trigger_stage_count,
-        .holdoff_ticks =
-            parameters->retrigger_holdoff_ticks +
-            (uint32_t)(((uint64_t)parameters->retrigger_holdoff_ticks * statistics->holdoff_extension_q16) >> 16),
-    };
+    limits->threshold_mean = threshold_of(parameters, threshold_of_mean(statistics), frequent_edges);
+    limits->withheld_stages = (uint8_t)(withheld_stages > withheld_min ? withheld_stages : withheld_min);
+    limits->trigger_stage_edge = frequent_edges ? 0 : parameters->trigger_stage_count;
+    limits->holdoff_ticks =
+        parameters->retrigger_holdoff_ticks +
+        (uint32_t)(((uint64_t)(parameters->retrigger_holdoff_ticks << 16) * statistics->holdoff_extension_q16) >> 32);
 }
 
 bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters, unsigned stage) {

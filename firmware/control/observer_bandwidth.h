@@ -106,20 +106,20 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_band
 void observer_bandwidth_reset(observer_bandwidth_t *bandwidth);
 
 /* One sample: returns its gains. `innovation` in 2^-32 rev, -2^27..2^27 - 1; from_edge: the angle was measured from the
- * time of an edge. */
+ * time of an edge; it matters for an adaptive bandwidth, and is read then. */
 const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_parameters_t *parameters,
                                                      observer_bandwidth_t *bandwidth,
                                                      const observer_bandwidth_limits_t *limits, int32_t innovation,
-                                                     bool from_edge);
+                                                     const bool *from_edge);
 
-/* Updates the statistics with a sample after its observer_bandwidth_step, and returns the limits of the next one.
+/* Of an adaptive bandwidth: updates the statistics with a sample after its observer_bandwidth_step, and sets the limits
+ * of the next one.
  * angle_step: rotation per period, magnitude, 2^-32 rev; withheld_stages: of moving_load_step.
  * 64-bit products, rounded down. A sample that is left out does not change the statistics; its trigger counts in the
  * next. */
-observer_bandwidth_limits_t observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
-                                                      observer_bandwidth_statistics_t *statistics,
-                                                      const observer_bandwidth_sample_t *sample, uint32_t angle_step,
-                                                      uint32_t withheld_stages);
+void observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
+                               observer_bandwidth_statistics_t *statistics, const observer_bandwidth_sample_t *sample,
+                               uint32_t angle_step, uint32_t withheld_stages, observer_bandwidth_limits_t *limits);
 
 /* True at the steady bandwidth, always without scheduling. */
 bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters, unsigned stage);

@@ -16,6 +16,9 @@
 #define LAG_TENTHS 22
 #define LAG_MAX (UINT32_C(8) << VALUE_SHIFT)
 
+/* After a step that was left out, at the end of a stroke (drive/deferred.c), a value is ended late. */
+#define BEHIND_MAX 2u
+
 /* 1/256 of the largest torque in the mean. */
 #define THRESHOLD_SHIFT 8
 
@@ -60,10 +63,12 @@ static periodic_load_mode_t next_mode(const periodic_load_parameters_t *paramete
     return load->load_q8 < load->residual_q8 ? PERIODIC_LOAD_FORGET : PERIODIC_LOAD_KEEP;
 }
 
+/* In the step after that of the last value: neither takes the time of both. */
 static void end_turn(const periodic_load_parameters_t *parameters, periodic_load_t *load) {
     load->mode = (uint8_t)next_mode(parameters, load);
     load->engaged = load->mode == PERIODIC_LOAD_LEARN || (load->engaged && load->mode != PERIODIC_LOAD_CLEAR);
     load->mean_q8 = load->total_q8 >> VALUES_LOG2;
+    begin_turn(load);
 }
 
 static int32_t updated_q8(const periodic_load_t *load, uint32_t index, int32_t smoothing_q8) {
@@ -104,21 +109,18 @@ static void end_value(const periodic_load_parameters_t *parameters, periodic_loa
     const int32_t residual_q8 = load->sum_q8 / load->updates;
     const int32_t estimate_q8 = residual_q8 + (load->mode == PERIODIC_LOAD_CLEAR ? 0 : load->profile_q8[index]);
     load->total_q8 += residual_q8;
-    load->residual_q8 += (uint32_t)fixed_abs(residual_q8 - load->mean_q8);
-    load->load_q8 += (uint32_t)fixed_abs(estimate_q8 - load->mean_q8);
-    load->change_q8 += (uint32_t)fixed_abs(estimate_q8 - load->estimate_q8[index]);
-    load->slow_q8 += (uint32_t)fixed_abs(mean_over_pitch_q8(parameters, load, estimate_q8, lag < 0) - load->mean_q8);
+    load->residual_q8 += fixed_magnitude(residual_q8 - load->mean_q8);
+    load->load_q8 += fixed_magnitude(estimate_q8 - load->mean_q8);
+    load->change_q8 += fixed_magnitude(estimate_q8 - load->estimate_q8[index]);
+    load->slow_q8 += fixed_magnitude(mean_over_pitch_q8(parameters, load, estimate_q8, lag < 0) - load->mean_q8);
     load->estimate_q8[index] = (int16_t)estimate_q8; /* the observer's at most 64 N m, the profile's at most 40 N m */
 
     const uint32_t ahead = (lag < 0 ? index - AHEAD : index + AHEAD) % VALUES;
     /* L / 64 in Q8. */
-    const int32_t smoothing_q8 = fixed_abs(lag) >> (VALUE_SHIFT - 2);
+    const int32_t smoothing_q8 = (int32_t)(fixed_magnitude(lag) >> (VALUE_SHIFT - 2));
     const int32_t limit_q8 = parameters->torque_limit_q8;
     load->profile_q8[ahead] = (int16_t)fixed_clamp(updated_q8(load, ahead, smoothing_q8), -limit_q8, limit_q8);
     load->count++;
-    if (load->count == VALUES) {
-        end_turn(parameters, load);
-    }
 }
 
 static int32_t profile_at_q24(const periodic_load_t *load, uint32_t angle) {
@@ -133,25 +135,26 @@ static int32_t profile_at_q24(const periodic_load_t *load, uint32_t angle) {
 void periodic_load_step(const periodic_load_parameters_t *parameters, periodic_load_t *load,
                         const periodic_load_sample_t *sample) {
     const int32_t angle_step = sample->angle_step;
-    if (parameters->lag_periods == 0 || fixed_abs(angle_step) > parameters->angle_step_max) {
+    if (parameters->lag_periods == 0 || fixed_magnitude(angle_step) > (uint32_t)parameters->angle_step_max) {
         periodic_load_reset(load);
         return;
     }
     const int32_t lag = angle_step * parameters->lag_periods;
     const uint32_t index = (sample->angle - (uint32_t)lag) >> VALUE_SHIFT;
-    if (index != load->index) {
-        const uint32_t next = (angle_step < 0 ? load->index - 1 : load->index + 1) % VALUES;
-        if (load->updates > 0 && index == next) {
+    if (load->count == VALUES) {
+        end_turn(parameters, load);
+    } else if (index != load->index) {
+        const uint32_t direction = angle_step < 0 ? UINT32_MAX : 1u;
+        const uint32_t behind = (index - load->index) * direction % VALUES;
+        if (load->updates > 0 && behind <= BEHIND_MAX) {
             end_value(parameters, load, lag);
+            load->index = (load->index + direction) % VALUES;
         } else {
             load->mode = load->mode == PERIODIC_LOAD_CLEAR ? PERIODIC_LOAD_CLEAR : PERIODIC_LOAD_KEEP;
-            load->count = VALUES;
             load->window = 0;
-        }
-        if (load->count == VALUES) {
             begin_turn(load);
+            load->index = index;
         }
-        load->index = index;
         load->updates = 0;
         load->sum_q8 = 0;
     }

@@ -5,7 +5,7 @@
 #define SETTLE_MS 150
 #define SETTLE_STROKES 2
 #define STROKE_UPDATES_MIN 8
-#define TOLERANCE_Q24 1677722 /* 0.1 N m */
+#define TOLERANCE_Q24 1677722u /* 0.1 N m */
 /* Disturbed strokes of equal mean from which on the machine disturbs itself. */
 #define REPEATED_STROKES 8u
 
@@ -20,8 +20,8 @@ static int32_t following_q16(const stroke_mean_parameters_t *parameters, uint32_
     return since_last < settle ? (int32_t)((since_last << 13) / settle << 2) : 1 << 15;
 }
 
-static bool differs(int32_t mean_q24, int32_t other_q24, int32_t tolerance_q24) {
-    return fixed_abs(fixed_subtract(mean_q24, other_q24)) > tolerance_q24;
+static bool differs(int32_t mean_q24, int32_t other_q24, uint32_t tolerance_q24) {
+    return fixed_magnitude(fixed_subtract(mean_q24, other_q24)) > tolerance_q24;
 }
 
 static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, int32_t torque_q24) {
@@ -30,7 +30,7 @@ static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t
     const int32_t mean_q24 = (int32_t)(mean->sum_q24 >> shift) / (int32_t)mean->updates * (1 << shift);
     int32_t *constant_q24 = &mean->constant_q24[mean->stroke % HAL_PHASES_MAX];
     const bool disturbed = mean->disturbed || mean->disturbed_strokes > 0;
-    const int32_t tolerance_q24 = TOLERANCE_Q24 + fixed_abs(torque_q24) / (disturbed ? 8 : 16);
+    const uint32_t tolerance_q24 = TOLERANCE_Q24 + (fixed_magnitude(torque_q24) >> (disturbed ? 3 : 4));
     const bool own_differs = differs(mean_q24, *constant_q24, tolerance_q24);
     const int32_t change_q24 = fixed_subtract(mean_q24, *constant_q24);
     *constant_q24 +=

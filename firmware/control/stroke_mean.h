@@ -43,6 +43,11 @@ stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_
 bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t electrical,
                       int32_t load_torque_q24, int32_t torque_q24, bool disturbed);
 
+/* True if a stroke has ended in the last update. */
+static inline bool stroke_mean_ended(const stroke_mean_t *mean) {
+    return mean->updates == 1;
+}
+
 /* True if no disturbance is left of which the mean has not shown yet whether it was a change of the load: there was
  * none in this stroke and the last, or strokes of equal mean keep being disturbed, by the machine itself. */
 bool stroke_mean_shows_load(const stroke_mean_t *mean);

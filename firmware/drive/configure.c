@@ -101,8 +101,10 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
         .undetected_travel_max = (int32_t)(quarter_deg > 12u * count ? quarter_deg + 4u * count : 16u * count),
         .angle_step_q32 = angle_step_q32,
         .command_timeout_us = COMMAND_LOST_US,
-        .deceleration_max_q22 = fixed_saturate(fixed_divide(
-            fixed_divide((int64_t)BRAKING_TORQUE_MAX_NM << 52, values[PARAMETER_INERTIA_KG_M2]), control_rate_hz)),
+        .deceleration_max_q22 = fixed_clamp(
+            fixed_saturate(fixed_divide(
+                fixed_divide((int64_t)BRAKING_TORQUE_MAX_NM << 52, values[PARAMETER_INERTIA_KG_M2]), control_rate_hz)),
+            0, PROTECTION_DECELERATION_MAX_Q22),
     };
 }
 

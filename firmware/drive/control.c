@@ -22,10 +22,10 @@ void control_prepare(const control_parameters_t *parameters, control_state_t *st
     deferred_reset_run(state);
 }
 
-/* The first sample initialises what compares successive samples. */
+/* The first sample initialises what compares successive samples; all else is that of control_reset. */
 static void start(control_state_t *state, const control_measurement_t *measured) {
     state->started = true;
-    observe_reset(state, measured);
+    load_observer_reset(&state->observer, measured->angle);
     protection_reset(&state->protection, measured->encoder_angle);
 }
 

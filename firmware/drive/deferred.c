@@ -122,13 +122,13 @@ static int32_t rotation(const control_parameters_t *parameters, const deferred_i
     return fixed_multiply_high(input->speed_q22, parameters->observer.angle_step_q32);
 }
 
-static observer_bandwidth_limits_t bandwidth_limits(const control_parameters_t *parameters, deferred_t *deferred,
-                                                    const deferred_input_t *input) {
+static void limit_bandwidth(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
+                            observer_bandwidth_limits_t *limits) {
     const observer_bandwidth_sample_t *sample = &input->bandwidth;
-    const uint32_t angle_step = (uint32_t)fixed_abs(rotation(parameters, input));
+    const uint32_t angle_step = fixed_magnitude(rotation(parameters, input));
     const uint32_t withheld = moving_load_step(&parameters->moving_load, &deferred->moving_load, sample->innovation,
                                                angle_step, sample->from_edge, deferred->periodic_load.engaged);
-    return observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld);
+    observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld, limits);
 }
 
 /* Between slow counts there is nothing of which statistics could be made. */
@@ -152,7 +152,7 @@ static void follow_innovation(const control_parameters_t *parameters, deferred_t
     if (deferred->slow_counts.slow) {
         results->slow_counts.slow = follow_slow_counts(parameters, deferred, input, results);
     } else {
-        results->bandwidth = bandwidth_limits(parameters, deferred, input);
+        limit_bandwidth(parameters, deferred, input, &results->bandwidth);
     }
 }
 
@@ -164,8 +164,8 @@ static bool disturbed(const control_parameters_t *parameters, const deferred_inp
  * stroke moves the speed by more than an eighth, and learning it ends that. */
 static bool undisturbed_speed_control(const control_parameters_t *parameters, const deferred_t *deferred,
                                       const deferred_input_t *input) {
-    const int32_t speed_error_q22 = fixed_abs(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
-    return deferred->mode == DRIVE_MODE_SPEED && speed_error_q22 < fixed_abs(input->speed_q22) / 8 &&
+    const uint32_t speed_error_q22 = fixed_magnitude(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
+    return deferred->mode == DRIVE_MODE_SPEED && speed_error_q22 < fixed_magnitude(input->speed_q22) / 8 &&
            !disturbed(parameters, input) && input->torque_shortfall_q24 == 0;
 }
 
@@ -205,16 +205,17 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
     misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);
 }
 
-/* Part of a stroke that passes between two steps of the common misalignment, Q16. */
+/* Part of a stroke that passes between two steps of the common misalignment, Q16: 2^15 strokes fit. */
 static int32_t stroke_part_q16(const control_parameters_t *parameters, const deferred_input_t *input) {
     const uint32_t strokes = parameters->commutation.rotor_poles * machine_tables.phases;
-    return fixed_saturate((int64_t)fixed_abs(rotation(parameters, input)) * strokes * DEFERRED_COMMON_PERIODS >> 16);
+    return (int32_t)((uint64_t)fixed_magnitude(rotation(parameters, input)) * strokes * DEFERRED_COMMON_PERIODS >> 16);
 }
 
 static void learn_common_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                       const deferred_input_t *input) {
-    misalignment_common_step(&parameters->misalignment, &deferred->misalignment, disturbance_q24(deferred, input),
-                             input->torque_reference_q24, stroke_part_q16(parameters, input));
+    misalignment_common_step(&parameters->misalignment, &deferred->misalignment, machine_tables.phases,
+                             disturbance_q24(deferred, input), input->torque_reference_q24,
+                             stroke_part_q16(parameters, input));
 }
 
 static void learn_periodic_load(const control_parameters_t *parameters, deferred_t *deferred,
@@ -234,7 +235,7 @@ static void learn_periodic_load(const control_parameters_t *parameters, deferred
 
 /* A torque at its limit follows no load. */
 static void identify_inertia(const control_parameters_t *parameters, deferred_t *deferred,
-                                      const deferred_input_t *input) {
+                             const deferred_input_t *input) {
     const int32_t torque_q24 = input->torque_reference_q24;
     inertia_step(
         &parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical, input->torque_sum_q24,
@@ -248,7 +249,7 @@ static void move_conduction(const control_parameters_t *parameters, deferred_t *
         .torque_sum_q24 = input->torque_sum_q24,
         .torque_shortfall_q24 = input->torque_shortfall_q24,
         .speed_q22 = input->speed_q22,
-        .angle_step = (uint32_t)fixed_abs(rotation(parameters, input)) * parameters->commutation.rotor_poles *
+        .angle_step = fixed_magnitude(rotation(parameters, input)) * parameters->commutation.rotor_poles *
                       DEFERRED_CONDUCTION_PERIODS,
         .dc_link_voltage_q6 = input->dc_link_voltage_q6,
     };
@@ -310,7 +311,9 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         step_torque_offset(parameters, deferred, input);
         moving_load_review(&parameters->moving_load, &deferred->moving_load, input->load_torque_q24,
                            deferred->periodic_load.engaged);
-        learn_periodic_load(parameters, deferred, input);
+        if (!stroke_mean_ended(&deferred->stroke_mean)) { /* the end of a stroke has taken its time */
+            learn_periodic_load(parameters, deferred, input);
+        }
         break;
     case 2:
         learn_common_misalignment(parameters, deferred, input);

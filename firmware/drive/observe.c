@@ -38,7 +38,7 @@ void observe(const control_parameters_t *parameters, control_state_t *state, con
         parameters->bandwidth.adaptive && deferred->slow_counts.slow
             ? slow_gains(parameters, state, &deferred->slow_counts, measured)
             : observer_bandwidth_step(&parameters->bandwidth, &state->bandwidth, &deferred->bandwidth, innovation,
-                                      measured->angle_from_edge);
+                                      &measured->angle_from_edge);
     state->innovation = innovation;
     const int32_t torque_q24 = fixed_subtract(measured->torque_sum_q24, deferred->speed.periodic_load_q24);
     load_observer_step(&parameters->observer, gains, &deferred->observer, &state->observer, innovation, torque_q24);

@@ -16,6 +16,7 @@
  * less than 2^28, and a step stands for PERIODS_MAX periods at most. */
 #define UNDETECTED_TRAVEL_STOP (1 << 29)
 #define PERIODS_MAX PROTECTION_SKIPPED_DEFERRED_MAX
+static_assert((int64_t)PROTECTION_DECELERATION_MAX_Q22 * PERIODS_MAX <= INT32_MAX, "a product of 32 bits");
 
 void protection_reset(protection_t *protection, uint32_t encoder_angle) {
     *protection = (protection_t){.encoder_angle = encoder_angle};
@@ -57,18 +58,18 @@ static bool encoder_jumped(const protection_parameters_t *parameters, int32_t an
  * meanwhile is found by its flux linkage (encoder_monitor.h). Frozen until the encoder counts: at standstill nothing
  * else shows whether it could. */
 static bool encoder_frozen(const protection_parameters_t *parameters, protection_deferred_t *protection,
-                           const protection_deferred_input_t *input, int32_t speed_q22) {
+                           const protection_deferred_input_t *input) {
     const bool counted = input->encoder_angle != protection->encoder_angle;
     protection->encoder_angle = input->encoder_angle;
     if (counted) {
         protection->frozen = false;
-        protection->speed_lower_bound_q22 = speed_q22;
+        protection->speed_lower_bound_q22 = fixed_abs(input->speed_q22);
         protection->undetected_travel = 0;
         return false;
     }
     const int32_t periods = (int32_t)(input->periods < PERIODS_MAX ? input->periods : PERIODS_MAX);
-    const int32_t deceleration_q22 = fixed_saturate((int64_t)parameters->deceleration_max_q22 * periods);
-    const int32_t bound_q22 = fixed_subtract(protection->speed_lower_bound_q22, deceleration_q22);
+    const int32_t bound_q22 =
+        fixed_subtract(protection->speed_lower_bound_q22, parameters->deceleration_max_q22 * periods);
     protection->speed_lower_bound_q22 = bound_q22;
     if (bound_q22 < STANDSTILL_Q22) {
         protection->undetected_travel = 0;
@@ -113,11 +114,9 @@ uint64_t protection_check(const protection_parameters_t *parameters, protection_
 
 uint64_t protection_check_deferred(const protection_parameters_t *parameters, protection_deferred_t *protection,
                                    const protection_deferred_input_t *input) {
-    const int32_t speed_q22 = fixed_abs(input->speed_q22);
-
     uint32_t failed = 0;
     fail_if(&failed, input->dc_link_voltage_q6 < parameters->dc_link_under_voltage_q6, FAULT_UNDER_VOLTAGE);
-    fail_if(&failed, encoder_frozen(parameters, protection, input, speed_q22), FAULT_ENCODER);
+    fail_if(&failed, encoder_frozen(parameters, protection, input), FAULT_ENCODER);
     fail_if(&failed, input->command_age_us > parameters->command_timeout_us, FAULT_COMMAND_TIMEOUT);
     return failed;
 }

@@ -18,9 +18,12 @@ typedef struct {
     int32_t angle_step_max;           /* largest plausible rotation per period, 2^-32 rev */
     int32_t undetected_travel_max;    /* expected rotation without an encoder count, 2^-32 rev, < 2^30 */
     int32_t angle_step_q32;           /* control period: 2^-32 rev per rad/s Q9.22, in Q32 */
-    int32_t deceleration_max_q22;     /* largest speed drop per period, rad/s, Q9.22 */
+    int32_t deceleration_max_q22;     /* largest speed drop per period, at most as below, rad/s, Q9.22 */
     uint32_t command_timeout_us;      /* age of the last valid command that ends a run */
 } protection_parameters_t;
+
+/* 64 rad/s, within a period, which no load nor torque comes near to. */
+#define PROTECTION_DECELERATION_MAX_Q22 ((1 << 28) - 1)
 
 /* State of the immediate checks. */
 typedef struct {

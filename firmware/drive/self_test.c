@@ -3,6 +3,7 @@
 #include <assert.h>
 #include <stdbool.h>
 
+#include "control/modulator.h"
 #include "drive/fault.h"
 #include "fixed/compiler.h"
 #include "fixed/crc32.h"
@@ -54,10 +55,22 @@ COLD void self_test_configured(self_test_t *test, const control_parameters_t *pa
     }
 }
 
-COLD bool self_test_latch_intact(const state_machine_t *state_machine) {
-    const fault_record_t *record = &state_machine->record;
+/* A run that ends takes its duties back in the same interrupt. */
+static bool has_duties(const control_state_t *control) {
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        if (control->duty_q15[phase] != -MODULATOR_DUTY_ONE_Q15) {
+            return true;
+        }
+    }
+    return false;
+}
+
+COLD bool self_test_latch_intact(const control_state_t *control) {
+    const drive_state_t state = control->state_machine.state;
+    const fault_record_t *record = &control->state_machine.record;
     return record->fault == state_machine_first_fault(record->fault_mask) &&
-           (record->fault != FAULT_NONE) == (state_machine->state == DRIVE_STATE_FAULT);
+           (record->fault != FAULT_NONE) == (state == DRIVE_STATE_FAULT) &&
+           (state == DRIVE_STATE_RUN || !has_duties(control));
 }
 
 static void check_constants(self_test_t *test, const control_parameters_t *parameters) {

@@ -2,8 +2,9 @@
  *
  *   limits       each limit of protection.h against its complement, in every call
  *   constants    all constants of the control laws against the sum that they had when they were configured, in 20 calls
- *   fault latch  number, mask and state of the latched fault, which contradict each other when one has changed, in
- * every call stack        the guard word at its end, in every call; how much of it has never been used, in a second
+ *   fault latch  number, mask and state of the latched fault, which contradict each other when one has changed, and
+ *                duties outside of a run, which a changed state has ended, in every call
+ *   stack        the guard word at its end, in every call; how much of it has never been used, in a second
  *   registers    those of the port, each SELF_TEST_STEP_US
  *   code         the CRC of the program, as a whole at the start and then four words each SELF_TEST_STEP_US
  *   clock        time against the second clock over SELF_TEST_CLOCK_US, within 5 %
@@ -55,8 +56,9 @@ void self_test_init(self_test_t *test, const hal_t *hal, uint32_t time_us);
 /* Takes the copies of new constants. [background] */
 void self_test_configured(self_test_t *test, const control_parameters_t *parameters);
 
-/* False when number, mask and state of the latched fault contradict each other. [background, in a critical section] */
-bool self_test_latch_intact(const state_machine_t *state_machine);
+/* False when number, mask and state of the latched fault contradict each other, or a state other than run the duties.
+ * [background, in a critical section] */
+bool self_test_latch_intact(const control_state_t *control);
 
 /* The checks that are due; masks the interrupts while it reads both clocks. [background] */
 void self_test_step(self_test_t *test, hal_t *hal, const control_parameters_t *parameters, uint32_t time_us);

@@ -70,8 +70,7 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
     }
     int32_t torque_q24 = 0;
     drive_mode_t mode = DRIVE_MODE_SPEED;
-    results->speed.speed_reference_q22 = 0;
-    results->speed.periodic_load_q24 = 0;
+    int32_t reference_q22 = 0, periodic_load_q24 = 0;
     if (!input->run) {
         min_q24 = max_q24 = 0;
     } else if (input->command->mode == DRIVE_MODE_TORQUE && input->command->request == COMMAND_RUN) {
@@ -79,12 +78,14 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
         torque_q24 = fixed_clamp(torque_law_q24(parameters, deferred, input, offset_q24), min_q24, max_q24);
         min_q24 = max_q24 = torque_q24;
     } else {
-        results->speed.periodic_load_q24 = deferred->periodic_load.torque_q24;
-        torque_q24 = fixed_add(fixed_add(speed_law_q24(parameters, deferred, input, limit_q24), offset_q24),
-                               results->speed.periodic_load_q24);
-        results->speed.speed_reference_q22 = deferred->speed_reference_q22;
+        periodic_load_q24 = deferred->periodic_load.torque_q24;
+        torque_q24 =
+            fixed_add(fixed_add(speed_law_q24(parameters, deferred, input, limit_q24), offset_q24), periodic_load_q24);
+        reference_q22 = deferred->speed_reference_q22;
     }
     deferred->mode = mode;
+    results->speed.speed_reference_q22 = reference_q22;
+    results->speed.periodic_load_q24 = periodic_load_q24;
     results->speed.speed_law_torque_q24 = torque_q24;
     results->speed.torque_min_q24 = min_q24;
     results->speed.torque_max_q24 = max_q24;

@@ -1,6 +1,5 @@
 #include "drive/supervise.h"
 
-#include "control/modulator.h"
 #include "drive/deferred.h"
 #include "drive/observe.h"
 #include "drive/torque_control.h"
@@ -8,7 +7,7 @@
 #include "fixed/fixed.h"
 
 /* A stop ends below this speed: 0.5 rad/s, 5 r/min. */
-#define STANDSTILL_Q22 (1 << 21)
+#define STANDSTILL_Q22 (1u << 21)
 
 static void complete_record(fault_record_t *record, const control_state_t *state, uint32_t time_us,
                             const control_measurement_t *measured) {
@@ -24,30 +23,21 @@ static void complete_record(fault_record_t *record, const control_state_t *state
     record->dc_link_voltage_q6 = (uint16_t)measured->dc_link_voltage_q6;
 }
 
-NOINLINE static void leave_state(const control_parameters_t *parameters, control_state_t *state,
-                                 const control_measurement_t *measured, drive_state_t left) {
-    if (left == DRIVE_STATE_RUN) {
-        state->torque_reference_q24 = 0;
-        torque_control_reset(parameters, state);
-        if (state->state_machine.state != DRIVE_STATE_FAULT) { /* else a period later */
-            deferred_reset_run(state);
-        }
-    } else if (left != DRIVE_STATE_READY && !observe_follows(state)) {
+NOINLINE static void end_run(const control_parameters_t *parameters, control_state_t *state) {
+    state->torque_reference_q24 = 0;
+    torque_control_reset(parameters, state);
+    if (state->state_machine.state != DRIVE_STATE_FAULT) { /* else a period later */
+        deferred_reset_run(state);
+    }
+}
+
+/* From INITIALISE or FAULT, in a period without a failed check. */
+NOINLINE static void enter_ready(control_state_t *state, const control_measurement_t *measured, drive_state_t left) {
+    if (!observe_follows(state)) {
         observe_reset(state, measured); /* its estimate stems from a faulty encoder */
     } else if (left == DRIVE_STATE_FAULT) {
         observe_forget_load(state); /* angle and speed of a rotor that may be turning are kept */
     }
-}
-
-/* True when a phase has the duty of a run: a run has ended that this state does not know of, because memory has
- * changed. */
-static bool has_duties(const control_state_t *state) {
-    int32_t differing = 0;
-    UNROLL(4)
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        differing |= state->duty_q15[phase] ^ -MODULATOR_DUTY_ONE_Q15;
-    }
-    return differing != 0;
 }
 
 /* Out of the way of a run, which is the longer path. The time by value: a sample whose address is passed on would have
@@ -59,12 +49,14 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
     if (state_machine_stands(state_machine, fault_mask, request, parameters->initialise_ticks)) {
         complete_record(&state_machine->record, state, time_us, measured);
     }
-    if (state_machine->state != before) {
-        leave_state(parameters, state, measured, before);
+    if (before == DRIVE_STATE_RUN) {
+        end_run(parameters, state);
+    } else if (state_machine->state != before) {
+        if (state_machine->state == DRIVE_STATE_READY) {
+            enter_ready(state, measured, before);
+        }
     } else if (before == DRIVE_STATE_FAULT && state_machine->fault_free_ticks == 1) {
         deferred_reset_run(state); /* not in the period that records the fault, which would take longer than a run */
-    } else if (has_duties(state)) {
-        leave_state(parameters, state, measured, DRIVE_STATE_RUN);
     }
 }
 
@@ -74,7 +66,8 @@ bool supervise(const control_parameters_t *parameters, control_state_t *state, c
     const state_machine_input_t input = {
         .fault_mask = fault_mask,
         .request = command->request,
-        .at_standstill = command->request == COMMAND_STOP && fixed_abs(state->observer.speed_q22) < STANDSTILL_Q22,
+        .at_standstill =
+            command->request == COMMAND_STOP && fixed_magnitude(state->observer.speed_q22) < STANDSTILL_Q22,
     };
     if (state_machine_runs(state_machine, &input)) { /* entered from READY, which leaves nothing to reset */
         return true;

@@ -77,6 +77,12 @@ static inline int32_t fixed_abs(int32_t value) {
     return fixed_subtract(value ^ sign, sign);
 }
 
+/* Magnitude of any value, unsigned: an instruction less than fixed_abs(). */
+static inline uint32_t fixed_magnitude(int32_t value) {
+    const uint32_t sign = (uint32_t)(value >> 31);
+    return ((uint32_t)value ^ sign) - sign;
+}
+
 /* Value, or 0 when it is negative. */
 static inline int32_t fixed_non_negative(int32_t value) {
 #ifdef __ARM_FEATURE_DSP
@@ -176,6 +182,12 @@ ALWAYS_INLINE int32_t fixed_product_shift_saturate(int32_t a, int32_t b, unsigne
 #else
     return fixed_shift_saturate(fixed_product(a, b), shift);
 #endif
+}
+
+/* a * b / 2^shift, rounded to nearest; saturates as fixed_shift_saturate(); shift 1..31, a constant: half of the
+ * instructions of fixed_multiply(). */
+ALWAYS_INLINE int32_t fixed_multiply_shift(int32_t a, int32_t b, unsigned shift) {
+    return fixed_shift_saturate(fixed_accumulate((int64_t)1 << (shift - 1), a, b), shift);
 }
 
 #endif

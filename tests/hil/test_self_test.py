@@ -16,6 +16,7 @@ CASES = {
     "over-voltage, lowest bit": ("limit_flipped", {"bit": 32}, "memory", LIMITS, 5 * PERIOD_S),
     "a constant": ("constant_flipped", {"bit": 3000}, "memory", {"constants"}, 2e-3),
     "state, run to fault": ("state_flipped", {"bit": 0}, "memory", {"fault_latch"}, 2 * PERIOD_S),
+    "state, run to initialise": ("state_flipped", {"bit": 1}, "memory", {"fault_latch"}, 2 * PERIOD_S),
     "number of the fault": ("fault_latch_flipped", {"bit": 3}, "memory", {"fault_latch"}, 2 * PERIOD_S),
     "period of the timer": ("period_register_flipped", {"bit": 3}, "memory", {"registers"}, 10e-3),
     "clock 6 % fast": ("clock_drift", {"drift_percent": 6.0}, "clock", {"clock"}, 22e-3),

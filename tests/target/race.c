@@ -231,8 +231,8 @@ void self_test_configured(self_test_t *test, const control_parameters_t *paramet
     (void)test, (void)parameters;
 }
 
-bool self_test_latch_intact(const state_machine_t *state_machine) {
-    (void)state_machine;
+bool self_test_latch_intact(const control_state_t *control) {
+    (void)control;
     return true;
 }
 

@@ -443,6 +443,27 @@ TEST_F(Drive, a_changed_latch_is_the_fault_memory_from_the_next_background_on) {
     EXPECT_EQ(drive.self_test.failed, SELF_TEST_FAULT_LATCH);
 }
 
+TEST_F(Drive, of_a_run_that_a_changed_state_ends_the_next_background_leaves_neither_duties_nor_a_torque) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(20);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    ASSERT_GT(drive.control.torque_reference_q24, 0);
+    for (const drive_state_t changed : {DRIVE_STATE_INITIALISE, DRIVE_STATE_READY, DRIVE_STATE_FAULT}) {
+        drive_t ended = drive;
+        ended.control.state_machine.state = changed; // as by a flipped bit
+        ended.control.state_machine.rearmed = false;
+        drive_control_interrupt(&ended);
+        EXPECT_TRUE(hal.open) << changed;
+        drive_background(&ended);
+        EXPECT_EQ(ended.control.state_machine.record.fault, FAULT_MEMORY) << changed;
+        EXPECT_EQ(ended.control.torque_reference_q24, 0) << changed;
+        for (const int32_t duty_q15 : ended.control.duty_q15) {
+            EXPECT_EQ(duty_q15, -32768) << changed;
+        }
+    }
+}
+
 TEST_F(Drive, opens_the_switches_every_period_until_it_runs) {
     periods(100);
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);

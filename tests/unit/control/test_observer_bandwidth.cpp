@@ -47,7 +47,7 @@ class Bandwidth {
     // One sample of both; true when the firmware triggered.
     bool step(int32_t innovation, bool from_edge = false) {
         const load_observer_gains_t *gains =
-            observer_bandwidth_step(&parameters, &state, &limits, innovation, from_edge);
+            observer_bandwidth_step(&parameters, &state, &limits, innovation, &from_edge);
         EXPECT_EQ(gains, &parameters.gains[parameters.adaptive ? state.stage : LAST_STAGE]);
         const bool triggered = parameters.adaptive && state.ticks == 0;
         EXPECT_TRUE(!triggered || state.trigger != OBSERVER_TRIGGER_NONE);
@@ -62,7 +62,7 @@ class Bandwidth {
     void update(int32_t innovation, bool from_edge) {
         const observer_bandwidth_sample_t sample = {
             .innovation = innovation, .from_edge = from_edge, .stage = state.stage, .trigger = state.trigger};
-        limits = observer_bandwidth_update(&parameters, &statistics, &sample, angle_step, 0);
+        observer_bandwidth_update(&parameters, &statistics, &sample, angle_step, 0, &limits);
         state.trigger = OBSERVER_TRIGGER_NONE;
     }
 

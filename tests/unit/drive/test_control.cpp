@@ -259,30 +259,6 @@ TEST_F(Control, the_largest_current_that_is_no_trip_keeps_running) {
     EXPECT_FALSE(step(COMMAND_RUN));
 }
 
-TEST_F(Control, a_run_that_a_changed_state_ends_leaves_neither_duties_nor_a_torque_behind) {
-    for (const drive_controller_t controller :
-         {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
-        for (const drive_state_t changed : {DRIVE_STATE_INITIALISE, DRIVE_STATE_READY, DRIVE_STATE_FAULT}) {
-            configure(controller);
-            start();
-            for (int k = 0; k < 20; k++) {
-                step(COMMAND_RUN);
-            }
-            ASSERT_GT(state.torque_reference_q24, 0);
-            state.state_machine.state = changed;
-            state.state_machine.rearmed = false;
-            for (int k = 0; k < 400; k++) { // 10 ms
-                step(COMMAND_OFF);
-            }
-            EXPECT_EQ(state.torque_reference_q24, 0) << controller << ", " << changed;
-            for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
-                EXPECT_EQ(state.duty_q15[phase], -32768) << controller << ", " << changed;
-                EXPECT_EQ(state.applied_flux.next_q29[phase], 0) << controller << ", " << changed;
-            }
-        }
-    }
-}
-
 TEST_F(Control, an_encoder_that_freezes_at_speed_is_detected_within_a_millisecond) {
     start();
     speed_rad_s = 15.7; // 150 r/min

@@ -1,4 +1,5 @@
 // Checks that the drive makes of itself: every one passes, and every change of what it looks at makes it fail in time.
+#include <algorithm>
 #include <array>
 #include <cstring>
 #include <numeric>
@@ -228,26 +229,47 @@ TEST_F(SelfTest, a_port_without_code_and_stack_passes) {
 }
 
 TEST_F(SelfTest, a_latch_is_intact_only_when_number_mask_and_state_agree) {
-    state_machine_t machine;
+    control_state_t control{};
+    state_machine_t &machine = control.state_machine;
     state_machine_reset(&machine);
-    EXPECT_TRUE(self_test_latch_intact(&machine));
+    std::fill_n(control.duty_q15, HAL_PHASES_MAX, -32768);
+    EXPECT_TRUE(self_test_latch_intact(&control));
     for (const drive_state_t state : {DRIVE_STATE_READY, DRIVE_STATE_RUN}) {
         machine.state = state;
-        EXPECT_TRUE(self_test_latch_intact(&machine));
+        EXPECT_TRUE(self_test_latch_intact(&control));
     }
     machine.state = DRIVE_STATE_FAULT;
-    EXPECT_FALSE(self_test_latch_intact(&machine));
+    EXPECT_FALSE(self_test_latch_intact(&control));
     machine.state = DRIVE_STATE_READY;
     state_machine_start_in_fault(&machine, FAULT_BIT(FAULT_ENCODER) | FAULT_BIT(FAULT_STALL));
-    EXPECT_TRUE(self_test_latch_intact(&machine));
+    EXPECT_TRUE(self_test_latch_intact(&control));
     for (unsigned bit = 0; bit < 5; bit++) {
         machine.record.fault = fault_t(unsigned(machine.record.fault) ^ 1u << bit);
-        EXPECT_FALSE(self_test_latch_intact(&machine)) << bit;
+        EXPECT_FALSE(self_test_latch_intact(&control)) << bit;
         machine.record.fault = FAULT_ENCODER;
     }
     for (const drive_state_t state : {DRIVE_STATE_INITIALISE, DRIVE_STATE_READY, DRIVE_STATE_RUN}) {
         machine.state = state;
-        EXPECT_FALSE(self_test_latch_intact(&machine));
+        EXPECT_FALSE(self_test_latch_intact(&control));
+    }
+}
+
+TEST_F(SelfTest, duties_outside_of_a_run_are_those_of_a_changed_state) {
+    control_state_t control{};
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        for (const int32_t duty_q15 : {-32767, 0, 32768}) {
+            state_machine_reset(&control.state_machine);
+            std::fill_n(control.duty_q15, HAL_PHASES_MAX, -32768);
+            control.duty_q15[phase] = duty_q15;
+            for (const drive_state_t state : {DRIVE_STATE_INITIALISE, DRIVE_STATE_READY}) {
+                control.state_machine.state = state;
+                EXPECT_FALSE(self_test_latch_intact(&control)) << phase;
+            }
+            control.state_machine.state = DRIVE_STATE_RUN;
+            EXPECT_TRUE(self_test_latch_intact(&control)) << phase;
+            state_machine_start_in_fault(&control.state_machine, FAULT_BIT(FAULT_ENCODER));
+            EXPECT_FALSE(self_test_latch_intact(&control)) << phase;
+        }
     }
 }
 
