@@ -5,21 +5,17 @@
 #include "fixed/fixed.h"
 
 #define SLOW_HZ 2000u
-#define DEADBEAT_HZ 200u
-#define OUTSIDE_HZ 250u
+#define DEADBEAT_HZ 250u
 #define PERIODS_MAX (UINT32_C(1) << 20)
 #define ONE_Q28 (1 << 28)
 
 slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, int32_t inertia_q30) {
     const uint32_t deadbeat_periods = control_rate_hz / DEADBEAT_HZ; /* below 2^13 */
-    load_observer_gains_t deadbeat = load_observer_deadbeat_gains(DEADBEAT_HZ, inertia_q30);
-    deadbeat.load_gain_q28 /= 2;
     return (slow_counts_parameters_t){
         .slow_periods = control_rate_hz / SLOW_HZ,
         .deadbeat_periods = deadbeat_periods,
         .step_q31 = (uint32_t)INT32_MAX / deadbeat_periods,
-        .deadbeat = deadbeat,
-        .outside = load_observer_deadbeat_gains(OUTSIDE_HZ, inertia_q30),
+        .deadbeat = load_observer_deadbeat_gains(DEADBEAT_HZ, inertia_q30),
     };
 }
 
@@ -27,14 +23,14 @@ static int32_t product_q31(int32_t a_q31, int32_t b_q31) {
     return 2 * fixed_multiply_high(a_q31, b_q31);
 }
 
-/* With x = 1 - q: l1 = 1 - (1 - x)^3, and l2 = x (2 - x), l3 = x relative to those of x = 1 at 5 ms. */
+/* With x = 1 - q: l1 = 1 - (1 - x)^3, and l2 = x (2 - x), l3 = x relative to those of x = 1 at 4 ms. */
 static void set_narrow(const slow_counts_parameters_t *parameters, uint32_t periods, load_observer_gains_t *gains) {
     const int32_t x_q31 = (int32_t)(periods * parameters->step_q31);
     const int32_t q_q31 = INT32_MAX - x_q31;
     const int32_t q2_q31 = product_q31(q_q31, q_q31);
     gains->angle_gain_q28 = ONE_Q28 - (product_q31(q2_q31, q_q31) >> 3);
     gains->speed_gain_q24 = product_q31(parameters->deadbeat.speed_gain_q24, INT32_MAX - q2_q31);
-    gains->load_gain_q28 = product_q31(parameters->deadbeat.load_gain_q28, x_q31);
+    gains->load_gain_q28 = product_q31(parameters->deadbeat.load_gain_q28, x_q31 / 2);
 }
 
 /* q = 0: l2 and l3 by the time between the edges. */
@@ -42,11 +38,11 @@ static void set_deadbeat(const slow_counts_parameters_t *parameters, uint32_t pe
     const int32_t y_q31 = (int32_t)(((parameters->deadbeat_periods << 16) / periods) << 15);
     gains->angle_gain_q28 = ONE_Q28;
     gains->speed_gain_q24 = product_q31(parameters->deadbeat.speed_gain_q24, y_q31);
-    gains->load_gain_q28 = product_q31(product_q31(parameters->deadbeat.load_gain_q28, y_q31), y_q31);
+    gains->load_gain_q28 = product_q31(product_q31(parameters->deadbeat.load_gain_q28, y_q31), y_q31 / 2);
 }
 
-bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t *counts, uint32_t encoder_angle,
-                      uint32_t periods) {
+NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t *counts,
+                               uint32_t encoder_angle, uint32_t periods) {
     const uint32_t passed = counts->periods + periods;
     counts->periods = passed < PERIODS_MAX ? passed : PERIODS_MAX;
     const bool long_since = passed >= parameters->slow_periods;
@@ -60,8 +56,8 @@ bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t 
     return counts->slow;
 }
 
-void slow_counts_set(const slow_counts_parameters_t *parameters, const slow_counts_t *counts,
-                     slow_counts_results_t *results) {
+NOINLINE void slow_counts_set(const slow_counts_parameters_t *parameters, const slow_counts_t *counts,
+                              slow_counts_results_t *results) {
     const uint32_t coming = counts->periods + 1u;
     results->encoder_angle = counts->encoder_angle;
     results->edge.load_factor_q4 = parameters->deadbeat.load_factor_q4;
@@ -83,5 +79,5 @@ NOINLINE uint32_t slow_counts_angle(const slow_counts_results_t *results, const 
 
 const load_observer_gains_t *slow_counts_gains(const slow_counts_parameters_t *parameters,
                                                const slow_counts_results_t *results, uint32_t encoder_angle) {
-    return encoder_angle != results->encoder_angle ? &results->edge : &parameters->outside;
+    return encoder_angle != results->encoder_angle ? &results->edge : &parameters->deadbeat;
 }

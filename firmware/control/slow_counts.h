@@ -10,7 +10,7 @@
  *   the prediction has       distance to it, with l1 = 1, so that the estimate remains at the edge until the rotor
  *   left it                  arrives there, and l2, l3 for edges each 4 ms
  *
- * The gains are those of load_observer.h for edges a time t apart, with q = 1 - t / 5 ms, from 5 ms on q = 0, with
+ * The gains are those of load_observer.h for edges a time t apart, with q = 1 - t / 4 ms, from 4 ms on q = 0, with
  * which three edges determine the estimate; l3 is half of that: a load that changed since the last edge has had less
  * time than t. Found by trial with 8 to 14 bits at 5 to 600 r/min.
  */
@@ -24,10 +24,9 @@
 
 typedef struct {
     uint32_t slow_periods;          /* 0.5 ms */
-    uint32_t deadbeat_periods;      /* 5 ms */
+    uint32_t deadbeat_periods;      /* 4 ms */
     uint32_t step_q31;              /* 1 / deadbeat_periods */
-    load_observer_gains_t deadbeat; /* of edges that far apart */
-    load_observer_gains_t outside;  /* of a prediction outside the count */
+    load_observer_gains_t deadbeat; /* of edges that far apart, and of a prediction outside the count */
 } slow_counts_parameters_t;
 
 /* All zero at the start. */
@@ -51,7 +50,7 @@ slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, int32_t
 bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t *counts, uint32_t encoder_angle,
                       uint32_t periods);
 
-/* All results but `slow`. Products of 64 bits, rounded down; a 32-bit division when no count changed for 5 ms. */
+/* All results but `slow`. Products of 64 bits, rounded down; a 32-bit division when no count changed for 4 ms. */
 void slow_counts_set(const slow_counts_parameters_t *parameters, const slow_counts_t *counts,
                      slow_counts_results_t *results);
 

@@ -3,7 +3,7 @@
 #include "fixed/fixed.h"
 
 /* Part of the largest torque from which on a load is not braked against. */
-#define UNCERTAIN_LOAD 8
+#define UNCERTAIN_LOAD 16
 
 static int32_t ramp_step(int32_t reference_q22, int32_t target_q22, int32_t step_max_q22) {
     const int32_t difference_q22 = fixed_subtract(target_q22, reference_q22);
