@@ -15,6 +15,24 @@ from reference_plant import Machine, Reference, Run, pattern, stop_at
 from scipy.integrate import solve_ivp
 
 THRESHOLD_TOLERANCE_V = 1e-9
+SUPPLY_TOLERANCE_V = 1e-7
+"""Nearer to the supply's voltage, the DC link is at it, and the current of half bridges and chopper decides."""
+EVENTS_MAX = 1000
+"""In an interval between two switch edges."""
+
+
+def passing(index: int, value: float, falling: bool, begin_s: float | None) -> Callable[[float, np.ndarray], float]:
+    """As stop_at, in one direction. From a start at begin_s on the value itself (None: not on it) it counts as not yet
+    reached, so that only a later passage ends the integration, not the start again and again."""
+
+    def stop(t: float, y: np.ndarray) -> float:
+        if begin_s is not None and t <= begin_s:
+            return 1.0 if falling else -1.0
+        return y[index] - value
+
+    stop.terminal = True  # type: ignore[attr-defined]
+    stop.direction = -1.0 if falling else 1.0  # type: ignore[attr-defined]
+    return stop
 
 
 class LinkReference:
@@ -62,9 +80,11 @@ class LinkReference:
     def advance(self, on: list[int], length_s: float) -> None:
         link, phases = self.machine.dc_link, range(self.phases)
         chopper = link.chopper_resistance_ohm > 0.0
-        at_s = 0.0
+        at_s, events = 0.0, 0
         while at_s < length_s:
             y = self.y
+            events += 1
+            assert events < EVENTS_MAX, f"more than {EVENTS_MAX} events in {length_s} s, at {at_s} s"
             if chopper and y[-1] >= link.chopper_on_V - THRESHOLD_TOLERANCE_V:
                 self.chopper_on = True
             elif chopper and y[-1] <= link.chopper_off_V + THRESHOLD_TOLERANCE_V:
@@ -73,8 +93,9 @@ class LinkReference:
             currents = self.currents(y)
             drawn_A = sum((on[phase] - 1) * currents[phase] for phase in phases)
             drawn_A += y[-1] / link.chopper_resistance_ohm if self.chopper_on else 0.0
-            source = y[-1] < self.supply_V - THRESHOLD_TOLERANCE_V
-            source |= y[-1] <= self.supply_V + THRESHOLD_TOLERANCE_V and drawn_A >= 0.0
+            if abs(y[-1] - self.supply_V) <= SUPPLY_TOLERANCE_V:
+                y[-1] = self.supply_V
+            source = y[-1] < self.supply_V or (y[-1] == self.supply_V and drawn_A >= 0.0)
             stops = [stop_at(self.phases + 1, self.magnetics.next_corner(y[-2], side)) for side in (1, -1)]
             ends = [phase for phase in phases if conducts[phase] and on[phase] < 2]
             stops += [stop_at(phase, 0.0) for phase in ends]
@@ -84,9 +105,8 @@ class LinkReference:
             if chopper:
                 thresholds.append((link.chopper_off_V if self.chopper_on else link.chopper_on_V, self.chopper_on))
             for voltage_V, falling in thresholds:
-                stop = stop_at(self.phases + 2, voltage_V)
-                stop.direction = -1.0 if falling else 1.0  # type: ignore[attr-defined]
-                stops.append(stop)
+                begin_s = at_s if abs(y[-1] - voltage_V) <= THRESHOLD_TOLERANCE_V else None
+                stops.append(passing(self.phases + 2, voltage_V, falling, begin_s))
             rates = self.right_side(on, conducts, source)
             solution = solve_ivp(rates, (at_s, length_s), y, "DOP853", rtol=1e-11, atol=1e-12, events=stops)
             if any(len(times) for times in solution.t_events[:2]):
