@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from salient.experiments.compare.random_machines import COUNT, random_machine
 from salient.machine.definition import Machine
 from salient.machine.drive_data import derive

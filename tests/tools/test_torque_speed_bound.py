@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from salient.machine.file import load_machine, machine_path
 from salient.reference import torque_speed_bound
 from salient.reference.torque_speed_bound import (

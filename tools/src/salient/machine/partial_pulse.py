@@ -42,7 +42,7 @@ _EARLIER_COST = 0.05
 _LOWER_WEIGHT = 2.0
 """Of a reference that has to be lower than the torque, because the fall of the current adds to it."""
 _FAR_DEG = 100.0
-"""Sum of both angles, between neighbours in the tables, that is worth as much as a ripple of 1; half of it a quarter."""
+"""Sum of both angles between neighbours in the tables that is worth as much as a ripple of 1; half of it a quarter."""
 _REFUSED = 1e3
 _NARROW_WEIGHT = 0.1
 """Square of the current that a pulse may take more which is as wide as a stroke rather than of no width."""
