@@ -316,11 +316,13 @@ static bool is_same(const sender_frame_t *frame, const struct can_frame *on_bus)
            memcmp(frame->data, on_bus->data, frame->length) == 0;
 }
 
-/* A frame that has been on the bus before is no request once more. */
+/* A frame that has been on the bus before is no request once more, unless it is so young that its own sender may have
+ * sent it again; a replay is at least five frames old. */
 static sender_meaning_t meaning_of(sender_t *sender, const struct can_frame *on_bus, uint64_t time_ns) {
     for (uint64_t back = 1; back <= SENDER_HISTORY && back <= sender->sent; back++) {
         sender_frame_t *frame = &sender->history[(sender->sent - back) % SENDER_HISTORY];
-        if (is_same(frame, on_bus) && (frame->seen_ns == 0 || time_ns <= frame->seen_ns + DUPLICATE_MAX_NS)) {
+        const bool young = back <= 4 && time_ns <= frame->seen_ns + DUPLICATE_MAX_NS;
+        if (is_same(frame, on_bus) && (frame->seen_ns == 0 || young)) {
             frame->seen_ns = frame->seen_ns ? frame->seen_ns : time_ns;
             return (sender_meaning_t){.genuine = true,
                                       .command = frame->identifier == DRIVE_COMMAND_FRAME_ID,
