@@ -6,9 +6,11 @@
  *   C dVdc/dt = -(i + g Vdc)
  *
  * i is a parabola between two instants at which a phase begins or ends a step. A step of the link leads from one to the
- * next, by the Taylor series of this equation, and ends earlier where the source or the chopper starts or stops
- * conducting. The phases take the integral of the voltage from it; what their charge was more than that of the parabola
- * is taken from the capacitor at the end of their steps. */
+ * next, by the Taylor series of this equation. The phases take the integral of the voltage from it; what their charge
+ * was more than that of the parabola is taken from the capacitor at the end of their steps.
+ *
+ * Where the source or the chopper starts or stops conducting, the steps of all phases connected to the link end, and
+ * once before, shortly ahead of it: from there the parabola leads to the instant exactly. */
 #ifndef PLANT_LINK_STEPS_H
 #define PLANT_LINK_STEPS_H
 

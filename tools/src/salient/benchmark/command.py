@@ -28,6 +28,8 @@ _SETTLE_S = 0.2
 _CONTROL_RATE_HZ = 40_000
 _COUNTED_S = 0.1
 _MODULES_SHOWN = 6
+_LINKED = "finite_element"
+"""A machine with a DC-link capacitor."""
 _COMMAND_TIMEOUT_MS = 400.0
 _ALONE_S = 0.35
 """Virtual time without a client, less than the command timeout; scaled to SIMULATED_S."""
@@ -209,7 +211,9 @@ def compare_solvers(runs: int) -> dict[str, Any]:
     """Plant alone and reference solvers on a recorded switching pattern: prints and returns one row each."""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         patterns = {controller: record(Path(folder), controller=controller) for controller in CONTROLLERS}
-    per_period = {controller: round(callgrind.of_plant(pattern), 1) for controller, pattern in patterns.items()}
+        patterns |= {f"{controller} on {_LINKED}": record(Path(folder), controller=controller, machine=_LINKED)
+                     for controller in CONTROLLERS}
+    per_period = {name: round(callgrind.of_plant(pattern), 1) for name, pattern in patterns.items()}
     pattern = patterns["paper"]
     with Progress(1 + len(solvers.PLANT) + len(solvers.REFERENCE_SOLVERS), sys.stderr) as progress:
         rows = solvers.compare(pattern, runs, progress.step)
