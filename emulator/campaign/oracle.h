@@ -73,7 +73,6 @@ typedef struct {
 
 typedef struct {
     const world_t *world;
-    const sender_t *sender;
     uint64_t period_ns;
     unsigned violations;
     oracle_violation_t violation[ORACLE_VIOLATIONS_MAX];
@@ -89,7 +88,6 @@ typedef struct {
     bool confirmed, commanded, off_seen, clear_seen;
     uint64_t run_ns, off_ns, speed_ns, voltage_ns;
     unsigned over_current_looks;
-    double peak_A[HAL_PHASES_MAX]; /* of the last looks, decaying not: of the last millisecond */
     double speed_recent_rad_s, voltage_recent_high_V, voltage_recent_low_V, current_recent_A;
     uint64_t recent_ns;
     double run_angle_rad;      /* of the rotor at the start of the run */
@@ -98,12 +96,12 @@ typedef struct {
     oracle_stretch_t stretch;
     /* Recovery. */
     double recovery_rpm;
-    uint64_t recovered_run_ns, settle_by_ns, in_band_ns;
+    uint64_t settle_by_ns, in_band_ns;
     bool recovery_judged, recovered, settled;
     bool held; /* at rest by an encoder that does not count: not judged, but counted */
 } oracle_t;
 
-void oracle_init(oracle_t *oracle, const world_t *world, const sender_t *sender, uint64_t period_ns);
+void oracle_init(oracle_t *oracle, const world_t *world, uint64_t period_ns);
 
 /* At each ORACLE_LOOK_NS of virtual time, from plant_observe. */
 void oracle_look(oracle_t *oracle, const plant_t *plant);

@@ -60,7 +60,7 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
         return false;
     }
     run->rig.observer = (rig_observer_t){before_interrupt, after_interrupt, after_restart, run};
-    oracle_init(&run->oracle, world, &run->sender, 1000000000u / world->control_rate_hz);
+    oracle_init(&run->oracle, world, 1000000000u / world->control_rate_hz);
     rig_join(&run->rig, &firmware);
     plant_observe(&run->rig.plant, ORACLE_LOOK_NS / 2, ORACLE_LOOK_NS, look, run);
     return true;

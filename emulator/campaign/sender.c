@@ -112,8 +112,8 @@ static bool in_step(const sender_t *sender, uint64_t at_us) {
 static void put_events(sender_t *sender, const transport_receiver_t *receiver) {
     const world_t *world = sender->world;
     for (unsigned i = 0; i < world->events; i++) {
-        const world_event_t *event = &world->event[i];
-        if (!(world->kept >> i & 1u) || event->kind > WORLD_FAULT) {
+        const world_event_t *event = world_begun(world, i, UINT64_MAX);
+        if (event == NULL || event->kind > WORLD_FAULT) {
             continue;
         }
         for (unsigned end = 0; end < 2; end++) {
@@ -174,8 +174,8 @@ static sender_request_t wanted(sender_t *sender) {
 static void step_honest(sender_t *sender, const transport_receiver_t *receiver) {
     const world_t *world = sender->world;
     for (unsigned i = 0; i < world->events; i++) {
-        const world_event_t *event = &world->event[i];
-        if (event->kind == WORLD_SPEED && (world->kept >> i & 1u) && in_step(sender, event->begin_us)) {
+        const world_event_t *event = world_begun(world, i, UINT64_MAX);
+        if (event != NULL && event->kind == WORLD_SPEED && in_step(sender, event->begin_us)) {
             sender->reference = reference_of(world, event->value);
             sender->due_us = sender->time_us;
         }

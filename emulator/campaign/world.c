@@ -354,9 +354,14 @@ void world_draw_healthy(world_t *world, const world_machine_t *machines, unsigne
     world->duration_us = (uint64_t)((at_s + seeded_between(seed, STREAM_LOAD, 8, 0.3, 1.0)) * 1e6);
 }
 
-bool world_active(const world_t *world, unsigned event, uint64_t time_us) {
+const world_event_t *world_begun(const world_t *world, unsigned event, uint64_t time_us) {
     const world_event_t *each = &world->event[event];
-    return (world->kept >> event & 1u) && each->begin_us <= time_us && (each->end_us == 0 || time_us < each->end_us);
+    return (world->kept >> event & 1u) && each->begin_us <= time_us ? each : NULL;
+}
+
+bool world_active(const world_t *world, unsigned event, uint64_t time_us) {
+    const world_event_t *each = world_begun(world, event, time_us);
+    return each != NULL && (each->end_us == 0 || time_us < each->end_us);
 }
 
 const char *world_event_name(const world_event_t *event) {
@@ -379,8 +384,8 @@ void world_print(const world_t *world) {
            world->duration_us, world->recovery_us);
     const char *separator = "";
     for (unsigned i = 0; i < world->events; i++) {
-        const world_event_t *event = &world->event[i];
-        if (!(world->kept >> i & 1u)) {
+        const world_event_t *event = world_begun(world, i, UINT64_MAX);
+        if (event == NULL) {
             continue;
         }
         double value = event->value;

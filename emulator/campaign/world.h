@@ -70,6 +70,9 @@ typedef struct {
 void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
 void world_draw_healthy(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
 
+/* The event when it is kept and has begun at a time, UINT64_MAX: ever; otherwise NULL. */
+const world_event_t *world_begun(const world_t *world, unsigned event, uint64_t time_us);
+
 /* True when the event is kept and active at a time. */
 bool world_active(const world_t *world, unsigned event, uint64_t time_us);
 

@@ -487,7 +487,7 @@ static void count_reception(can_bus_t *bus, const can_line_t *line, bool disturb
 static void end_error_frame(can_bus_t *bus, can_line_t *line, uint64_t now_ns) {
     for (unsigned i = 0; i < line->transmitters; ++i) {
         can_node_t *node = line->transmitter[i].node;
-        /* An error-passive node that nobody acknowledges does not count: it would else be bus-off when alone. */
+        /* An error-passive node alone on its line does not count: it would else be bus-off when alone. */
         if (line->acknowledge_error && can_node_is_passive(node)) {
             suspend(bus, line, node);
         } else {

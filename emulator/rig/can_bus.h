@@ -6,7 +6,7 @@
  * same one, the first bit that differs is a bit error of those that sent it recessive; frames that are equal in every
  * bit are one frame. The counters change at the end of a frame or of an error frame.
  *
- * A drive can be disconnected: it is then alone on a line of its own, and nobody acknowledges its frames.
+ * A drive can be disconnected: it is then alone on a line of its own, and no other node acknowledges its frames.
  *
  * A drive leaves bus-off on request (can_bus_rejoin); clients and babbling node do so by themselves. An error flag is
  * as long as with a receiver that is error active. Changes of a drive's counter and connection act when the frame

@@ -9,7 +9,7 @@
  * A set is loaded at start when it is whole, from this list of parameters and these machine tables, and each value is
  * within its limits. When the newest set is damaged the one before is loaded. When there are sets and none of them can
  * be used, the drive has its defaults and stays in state initialise, inhibited by parameter_memory, until a set is
- * stored: it does not run with a trip that nobody chose. An erased memory is no such case.
+ * stored: it does not run with trip limits that were never set. An erased memory is no such case.
  */
 #ifndef DRIVE_NVM_STORE_H
 #define DRIVE_NVM_STORE_H

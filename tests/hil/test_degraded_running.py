@@ -98,7 +98,7 @@ def test_loss_of_a_second_phase_is_a_fault(make_bench, controller):
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize(("kind", "attributes", "fault"), [
     ("switch_shorted", {"leg": "low"}, "phase_shorted"),  # cannot be switched off
-    ("current_sensor_stuck", {"code": 1000.0}, "current_sensor"),  # nobody sees that the current has ended
+    ("current_sensor_stuck", {"code": 1000.0}, "current_sensor"),  # the end of the current does not show
     ("current_sensor_swapped", {"with_phase": "c"}, "current_sensor"),  # two phases
 ])
 def test_what_cannot_be_run_on_with_is_a_fault(make_bench, controller, kind, attributes, fault):

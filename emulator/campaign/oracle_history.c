@@ -1,0 +1,42 @@
+#include "campaign/oracle_parts.h"
+
+#include "bench_variables.h"
+
+bool oracle_any_injected(const oracle_t *oracle, unsigned first, unsigned last) {
+    bool any = false;
+    for (unsigned kind = first; kind <= last; kind++) {
+        any = any || oracle->injected[kind];
+    }
+    return any;
+}
+
+bool oracle_variable_begun(const oracle_t *oracle, unsigned variable, uint64_t time_us) {
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, time_us);
+        if (event != NULL && event->kind == WORLD_SET && event->what == variable) {
+            return true;
+        }
+    }
+    return false;
+}
+
+bool oracle_other_sender(const oracle_t *oracle, bool hostile, uint64_t time_us) {
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, time_us);
+        if (event != NULL && (event->kind == WORLD_SECOND || (hostile && event->kind == WORLD_HOSTILE))) {
+            return true;
+        }
+    }
+    return false;
+}
+
+bool oracle_bus_disturbed(const oracle_t *oracle) {
+    static const unsigned variables[] = {BENCH_VARIABLE_BABBLE_LOAD_PERCENT, BENCH_VARIABLE_BUS_CONNECTION,
+                                         BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER, BENCH_VARIABLE_FRAME_FAULT};
+    for (unsigned i = 0; i < sizeof variables / sizeof *variables; i++) {
+        if (oracle_variable_begun(oracle, variables[i], UINT64_MAX)) {
+            return true;
+        }
+    }
+    return oracle_other_sender(oracle, true, UINT64_MAX);
+}

@@ -1,0 +1,76 @@
+/* What the parts of the oracle share: what has happened in the world so far, and their doors to each other. */
+#ifndef CAMPAIGN_ORACLE_PARTS_H
+#define CAMPAIGN_ORACLE_PARTS_H
+
+#include "campaign/oracle.h"
+
+#define ORACLE_RPM_PER_RAD_S (30.0 / 3.14159265358979323846)
+#define ORACLE_TWO_PI (2.0 * 3.14159265358979323846)
+#define ORACLE_MS_NS UINT64_C(1000000)
+
+/* Numbers of drive.dbc. */
+enum { STATE_INITIALISE, STATE_READY, STATE_RUN, STATE_FAULT };
+
+enum {
+    CAUSE_OVER_CURRENT = 1,
+    CAUSE_OVER_VOLTAGE,
+    CAUSE_UNDER_VOLTAGE,
+    CAUSE_OVER_SPEED,
+    CAUSE_ENCODER,
+    CAUSE_COMMAND_TIMEOUT,
+    CAUSE_INTERRUPT_OVERRUN,
+    CAUSE_COMMAND_ERROR,
+    CAUSE_IDENTIFIER_CONFLICT,
+    CAUSE_PARAMETER_MEMORY,
+    CAUSE_HARDWARE_OVER_CURRENT,
+    CAUSE_STO,
+    CAUSE_STO_DISCREPANCY,
+    CAUSE_STALL,
+    CAUSE_CURRENT_SENSOR,
+    CAUSE_PHASE_OPEN,
+    CAUSE_PHASE_SHORTED,
+    CAUSE_ENCODER_ANGLE,
+    CAUSE_WINDING_OVERLOAD,
+    CAUSE_INVERTER_OVERLOAD,
+    CAUSE_TEMPERATURE_SENSOR,
+    CAUSE_WATCHDOG,
+    CAUSE_MEMORY,
+    CAUSE_CODE,
+    CAUSE_CLOCK,
+};
+
+#define BIT(cause) (UINT32_C(1) << (cause))
+
+/* Remembers a violation, once for each rule and number. */
+void oracle_violate(oracle_t *oracle, const char *rule, uint64_t time_ns, unsigned number, double value);
+
+/* Sets the begin of a condition: the time now when it begins to hold, 0 when it does not hold. */
+void oracle_since(uint64_t *begin_ns, bool holds, uint64_t now_ns);
+
+/* --- History --- */
+
+/* A fault of a kind between first and last, both included, has begun. */
+bool oracle_any_injected(const oracle_t *oracle, unsigned first, unsigned last);
+
+/* An event that sets the bench variable has begun, whether or not it is over. */
+bool oracle_variable_begun(const oracle_t *oracle, unsigned variable, uint64_t time_us);
+
+/* A second sender of valid frames; with a hostile one as well when its frames may be in the way of others. */
+bool oracle_other_sender(const oracle_t *oracle, bool hostile, uint64_t time_us);
+
+/* The bus was loaded, cut or shared with another sender at any time. */
+bool oracle_bus_disturbed(const oracle_t *oracle);
+
+/* --- First causes --- */
+
+/* The drive has latched a fault: wrong_cause or false_alarm. */
+void oracle_judge_cause(oracle_t *oracle, const plant_t *plant);
+
+/* --- Recovery --- */
+
+void oracle_look_at_recovery(oracle_t *oracle, const plant_t *plant);
+
+/* The drive has begun to run. */
+void oracle_enter_run(oracle_t *oracle, const plant_t *plant);
+
+#endif
