@@ -134,10 +134,10 @@ static int32_t smoothed_q24(const conduction_state_t *state, uint32_t phases, co
 }
 
 /* Half of the missing torque, as part of the largest, in an electrical revolution. */
-static int32_t trim_step_q30(const conduction_pulse_t *pulse, const conduction_sample_t *sample) {
-    const int32_t error_q24 = fixed_subtract(sample->torque_q24, sample->torque_sum_q24);
-    const int32_t missing_q24 = sample->torque_q24 < 0 ? fixed_subtract(0, error_q24) : error_q24;
-    const int32_t part_q12 = fixed_clamp((missing_q24 >> 4) / ((pulse->mean_q24 >> 16) + 1), -ONE_Q12, ONE_Q12);
+static int32_t trim_step_q30(const conduction_state_t *state, const conduction_sample_t *sample) {
+    const int32_t sum_q21 = sample->torque_q24 < 0 ? -state->missing_sum_q21 : state->missing_sum_q21;
+    const int32_t missing_q20 = sum_q21 / (2 * CONDUCTION_STEPS);
+    const int32_t part_q12 = fixed_clamp(missing_q20 / ((state->pulse.mean_q24 >> 16) + 1), -ONE_Q12, ONE_Q12);
     return (int32_t)(sample->angle_step >> TRIM_SHIFT) * part_q12;
 }
 
@@ -165,7 +165,7 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
                 fixed_clamp(state->trim_q30, -parameters->advance_step_q30, parameters->advance_step_q30);
         } else if (state->partial_q15 > 0 ||
                    (state->advance_q30 == ONE_Q30 && (voltage_limited || state->level_q15 > 0))) {
-            const int32_t step_q30 = trim_step_q30(&state->pulse, sample);
+            const int32_t step_q30 = trim_step_q30(state, sample);
             /* Sharing follows the reference at any level that is too high: without a shortfall it returns. */
             state->trim_q30 += state->partial_q15 > 0 ? step_q30 >> 2 : step_q30 - (forward_q15 == 0 ? retract_q30 : 0);
         }
@@ -356,6 +356,7 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
                      const machine_tables_t *tables, const conduction_sample_t *sample) {
     const unsigned step = state->step;
     state->step = (step + 1) % CONDUCTION_STEPS;
+    state->missing_sum_q21 += fixed_subtract(sample->torque_q24, sample->torque_sum_q24) >> 3;
     switch (step) {
     case 0:
         look_up(state, tables, sample);
@@ -363,6 +364,7 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
         break;
     case 1:
         move(parameters, state, sample);
+        state->missing_sum_q21 = 0;
         state->gain_excess_q31 = gain_excess_q31(parameters, sample, state->above_base_q15);
         break;
     case 2:

@@ -129,6 +129,7 @@ typedef struct {
     int32_t torque_max_q24;
     int32_t gain_excess_q31; /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
     int32_t torque_q24;      /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
+    int32_t missing_sum_q21; /* reference less estimated torque, of all steps of an update, N m, Q10.21 */
     int32_t above_base_q15;  /* from the base speed to 1.125 of it, Q1.15, 0..1 */
     int32_t partial_q15;     /* part of the pulses for parts of the largest torque, Q1.15, 0..1 */
     int32_t advance_q30;     /* of the windows, Q1.30, 0..1 */
@@ -175,6 +176,7 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->trim_q30 = 0;
     state->level_q15 = 0;
     state->partial_q15 = 0;
+    state->missing_sum_q21 = 0;
     state->single_pulse = false;
     state->gain_excess_q31 = 0;
     state->latest = CONDUCTION_INITIAL;

@@ -41,6 +41,8 @@ _EARLIER_COST = 0.05
 """Of a window that is earlier, motoring: where nothing else is better."""
 _LOWER_WEIGHT = 2.0
 """Of a reference that has to be lower than the torque, because the fall of the current adds to it."""
+_LOWERED_LEAST = 0.06
+"""Of the largest mean torque: less is within the error of these steps, and the firmware trims it."""
 _FAR_DEG = 100.0
 """Sum of both angles between neighbours in the tables that is worth as much as a ripple of 1; half of it a quarter."""
 _REFUSED = 1e3
@@ -121,6 +123,7 @@ def partial_pulse(machine: Machine, data: DriveData, of: SinglePulse) -> Partial
                                       window_deg if half == 0 else 180.0 - window_deg[::-1])
         angles_deg, reference_Nm = _chosen(choices, largest_deg)
         ripple = (reference_Nm.ravel() / wanted_Nm - 1.0) * part
+        ripple = np.where(ripple > -_LOWERED_LEAST, np.maximum(ripple, 0.0), ripple)
         found.append([np.pad(values.reshape(len(PARTS), -1), ((0, 0), (first, 0)), mode="edge")
                       for values in (*angles_deg, ripple)])
     return PartialPulse(*(np.array(values) for values in zip(*found, strict=True)))
