@@ -68,6 +68,7 @@ static void end_turn(const periodic_load_parameters_t *parameters, periodic_load
     load->mode = (uint8_t)next_mode(parameters, load);
     load->engaged = load->mode == PERIODIC_LOAD_LEARN || (load->engaged && load->mode != PERIODIC_LOAD_CLEAR);
     load->mean_q8 = load->total_q8 >> VALUES_LOG2;
+    load->swing_q8 = (int32_t)(load->load_q8 >> VALUES_LOG2);
     begin_turn(load);
 }
 
@@ -166,4 +167,38 @@ void periodic_load_step(const periodic_load_parameters_t *parameters, periodic_l
     load->torque_q24 = load->mode == PERIODIC_LOAD_CLEAR
                            ? 0
                            : profile_at_q24(load, sample->angle + (uint32_t)(angle_step * LEAD_PERIODS));
+}
+
+static int32_t extended_q8(periodic_load_range_t *range, int32_t value_q8) {
+    range->least_q8 = value_q8 < range->least_q8 ? value_q8 : range->least_q8;
+    range->most_q8 = value_q8 > range->most_q8 ? value_q8 : range->most_q8;
+    return range->most_q8 - range->least_q8;
+}
+
+void periodic_load_review(periodic_load_t *load) {
+    const uint32_t ended = load->reviewed_index;
+    load->reviewed_index = load->index;
+    if (!load->engaged) {
+        load->reviewed = false;
+        return;
+    }
+    if (load->index == ended) {
+        return;
+    }
+    /* The value that was the present one has ended, and still has the profile of then. */
+    const int32_t estimate_q8 = load->estimate_q8[ended];
+    const int32_t residual_q8 = estimate_q8 - load->profile_q8[ended];
+    if (!load->reviewed) {
+        load->estimate = (periodic_load_range_t){estimate_q8, estimate_q8};
+        load->residual = (periodic_load_range_t){residual_q8, residual_q8};
+    }
+    const int32_t swing_q8 = extended_q8(&load->estimate, estimate_q8);
+    const int32_t moved_q8 = extended_q8(&load->residual, residual_q8);
+    load->reviewed = moved_q8 < load->swing_q8;
+    if (!load->reviewed && swing_q8 < moved_q8 >> 2) {
+        load->mode = PERIODIC_LOAD_CLEAR;
+        load->engaged = false;
+        load->mean_q8 = estimate_q8;
+        begin_turn(load);
+    }
 }

@@ -29,9 +29,11 @@
  *
  * else the profile stays. A sine whose phase moves by x per turn changes by 2 sin(x / 2) of itself, so that it is
  * learned up to x = 29 degrees, where learning with 1/4 makes it neither smaller nor larger. A load step changes more
- * than it leaves as a residual, and a constant load has no residual. m is that of the turn before, so a profile whose
- * load has stopped is cleared after two to three turns. Values are learned a quarter of a turn before the angle comes,
- * from the last turn's estimate, so that a turn has one profile. */
+ * than it leaves as a residual, and a constant load has no residual. Values are learned a quarter of a turn before the
+ * angle comes, from the last turn's estimate, so that a turn has one profile.
+ *
+ * A profile whose load has stopped is all of the residual. It is cleared within the turn: when y has changed by as much
+ * as z did in the mean of the last turn, and z by less than a quarter of that. */
 #ifndef CONTROL_PERIODIC_LOAD_H
 #define CONTROL_PERIODIC_LOAD_H
 
@@ -56,6 +58,11 @@ typedef enum {
     PERIODIC_LOAD_FORGET
 } periodic_load_mode_t;
 
+/* N m, Q23.8. */
+typedef struct {
+    int32_t least_q8, most_q8;
+} periodic_load_range_t;
+
 /* All zero at the start. */
 typedef struct {
     int16_t profile_q8[PERIODIC_LOAD_VALUES];  /* p, N m, Q7.8; of the middle of its interval of angles */
@@ -74,6 +81,11 @@ typedef struct {
     uint32_t load_q8, change_q8, residual_q8, slow_q8;
     uint32_t window;   /* values in the mean over a pole pitch, up to all */
     int32_t window_q8; /* their sum */
+    /* Since the ranges began anew: */
+    uint32_t reviewed_index;
+    bool reviewed;                            /* they have a value */
+    periodic_load_range_t estimate, residual; /* of z and y */
+    int32_t swing_q8;                         /* from which y is judged: mean |z - m| of the last turn */
 } periodic_load_t;
 
 typedef struct {
@@ -96,5 +108,8 @@ void periodic_load_reset(periodic_load_t *load);
  * limit. */
 void periodic_load_step(const periodic_load_parameters_t *parameters, periodic_load_t *load,
                         const periodic_load_sample_t *sample);
+
+/* Between steps, at least once for most of the values: clears a profile whose load has stopped. */
+void periodic_load_review(periodic_load_t *load);
 
 #endif

@@ -423,6 +423,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             .control_rate_hz = control_rate_hz,
             .periods_per_update = DEFERRED_LEARNING_PERIODS,
             .periods_per_common_update = DEFERRED_COMMON_PERIODS,
+            .periods_per_review = DEFERRED_REVIEW_PERIODS,
             .inertia_q30 = inertia_q30,
             .phases = tables->phases,
             .rotor_poles = tables->rotor_poles,
