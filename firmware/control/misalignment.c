@@ -128,8 +128,9 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const int32_t alternating_q24 = fixed_subtract(phase->slope_lag2_q24, phase->slope_mean_q24);
     /* One phase per update stands for all: the sum over the phases. */
     const int32_t phase_power_q24 = square_q24(alternating_q24);
-    int32_t power_q24 = phase_power_q24;
-    for (unsigned i = 1; i < tables->phases; i++) {
+    int32_t power_q24 = 0;
+    UNROLL(4)
+    for (unsigned i = 0; i < tables->phases; i++) {
         power_q24 = fixed_add(power_q24, phase_power_q24);
     }
     low_pass_step(&misalignment->power_q24, power_q24, mean_gain_q16 / phases + 1);

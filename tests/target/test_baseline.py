@@ -35,10 +35,10 @@ LIMITED_BUILDS = ("cortex-m4", "cortex-m4-Os")
 FLASH_TOLERANCE_BYTES = 64
 RAM_TOLERANCE_BYTES = 32
 COUNT_TOLERANCE = 0.01
-BOUND_LIMITS = {"traditional": 740, "paper": 1190, "salient": 1950, "salient_network": 2430,
+BOUND_LIMITS = {"traditional": 710, "paper": 1190, "salient": 1950, "salient_network": 2430,
                 "salient_four_phases": 2350}
 """Of the control interrupt on the Cortex-M4."""
-BOTH_BOUND_LIMITS = {"salient": 2850, "salient_four_phases": 3250}
+BOTH_BOUND_LIMITS = {"salient": 2800, "salient_four_phases": 3200}
 """Of both interrupts together."""
 
 measure_once = lru_cache(measure)
