@@ -22,34 +22,21 @@
 #define COMMON_POWER_SHIFT 8
 /* Its rate is half of the phases': the sum is smaller than its parts, and the noise is not. */
 #define COMMON_SLOWER 2
-/* Of the torque, 0.1 s at 40 kHz. */
-#define TORQUE_MEAN_SHIFT 9
-#define TORQUE_RATIO_MAX_Q12 ((4 << 12) - 1)
 /* Corner of high-pass and low-pass of the sum and of y in rad per stroke, and the largest gain of both. */
 #define BAND_FACTOR 4
 #define BAND_GAIN_MAX_Q16 (1 << 15)
-/* 50 strokes a second, steps of 0.2 ms. */
+/* Under a load that moves: a quarter of the rate, from 50 strokes a second on, steps of 0.2 ms. */
+#define MOVING_SHIFT 2
+/* After 1.2 s: an encoder that is displaced by more than can be learned has been found before
+ * (drive/encoder_monitor.h).
+ */
+#define MOVING_SETTLES 2
 #define STROKE_PART_MIN_Q16 655
-/* Before the common angle is learned under a load that moves: an encoder that is displaced by more than can be learned
- * has been found before (drive/encoder_monitor.h). */
-#define MOVING_SETTLE_MS 1200
-/* From 300 strokes a second on the sampled sum has noise that makes its power larger and the steps smaller: the rate is
- * up to four times as large, as far as the steps are no noise. */
-#define STROKE_PART_FASTER_Q16 2048
-#define FASTER_MAX 4
-/* Of reviewed steps: means over at least six strokes and 0.3 s, from 50 strokes a second on 1 s; what is too small to
- * matter, 0.1 degrees in 0.02 rad; magnitude when nothing is known, 0.25 degrees. */
-#define REVIEW_STROKES 6
-#define REVIEW_PART_MAX_Q16 6000
-#define REVIEW_SLOW_FACTOR 3
-#define STEP_SMALL_Q26 ((uint32_t)(0.0873 * (1 << 26)))
-#define STEP_UNKNOWN_Q26 ((int32_t)(0.218 * (1 << 26)))
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings) {
     const uint32_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
     const uint32_t phase_rate_hz = update_rate_hz / settings->phases;
     const uint32_t common_rate_hz = settings->control_rate_hz / settings->periods_per_common_update;
-    const uint32_t review_rate_hz = settings->control_rate_hz / settings->periods_per_review / (settings->phases + 1);
     return (misalignment_parameters_t){
         .probe_angle = PROBE_ANGLE * settings->rotor_poles,
         .rate_q30 = (int32_t)fixed_divide((int64_t)settings->rate_1_s << 30, phase_rate_hz),
@@ -58,10 +45,6 @@ misalignment_parameters_t misalignment_configure(const misalignment_settings_t *
         .mean_q16 = (int32_t)fixed_divide((int64_t)MEAN_1_S << 16, phase_rate_hz) + 1,
         .inertia_rate_q8 = fixed_saturate(((int64_t)settings->inertia_q30 * settings->control_rate_hz) >> 22),
         .settle_updates = update_rate_hz * SETTLE_MS / 1000u,
-        .review_gain_q32 = (int32_t)(UINT32_MAX / review_rate_hz), /* 1 s */
-        .review_strokes_q16 = (int32_t)(65536u * common_rate_hz / review_rate_hz / REVIEW_STROKES),
-        .moving_settle_reviews = review_rate_hz * MOVING_SETTLE_MS / 1000u,
-        .phases = settings->phases,
     };
 }
 
@@ -160,9 +143,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
             4 * ((int32_t)((misalignment->disturbance_sum_q24 - sum_before_q24) >> 2) / phases);
         const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
         const int32_t step_q10 = phase_step_q10(misalignment, error_q24, alternating_q24, sample->torque_q24);
-        misalignment_steps_t *steps = &misalignment->steps[index + 1];
-        steps->latest_q10 = step_q10;
-        step_q40 = fixed_accumulate(step_q40, step_q10, steps->rate_q30);
+        step_q40 = fixed_accumulate(step_q40, step_q10, parameters->rate_q30);
     }
     phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + step_q40);
     /* 0.02 rad is twice the probe angle. */
@@ -177,12 +158,8 @@ static int32_t band_pass_step(misalignment_band_t *band, int32_t value_q24, int3
     return band->value_q24;
 }
 
-void misalignment_common_step(misalignment_t *misalignment, unsigned phases, int32_t disturbance_q24,
-                              int32_t torque_q24, int32_t stroke_part_q16) {
-    /* Of the mean torque: the frequency of a load that moves is then none of the slopes, only of y. */
-    misalignment->torque_mean_q24 += (torque_q24 - misalignment->torque_mean_q24) >> TORQUE_MEAN_SHIFT;
-    const int32_t ratio_q12 =
-        fixed_clamp(misalignment->torque_mean_q24 / ((torque_q24 >> 12) | 1), 0, TORQUE_RATIO_MAX_Q12);
+void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                              unsigned phases, int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16) {
     /* A quarter of the sum over the phases, which fits. */
     int32_t sum_q24 = 0;
     const unsigned count = phases < HAL_PHASES_MAX ? phases : HAL_PHASES_MAX;
@@ -191,16 +168,19 @@ void misalignment_common_step(misalignment_t *misalignment, unsigned phases, int
         sum_q24 += misalignment->phase[i].slope_lag2_q24 / 4;
     }
     const int32_t gain_q16 = fixed_clamp(stroke_part_q16, 0, BAND_GAIN_MAX_Q16 / BAND_FACTOR) * BAND_FACTOR;
-    const int32_t mean_sum_q24 = fixed_multiply_high(sum_q24, ratio_q12 << 16) * 16;
-    const int32_t quarter_q24 = band_pass_step(&misalignment->common_slope, mean_sum_q24, gain_q16);
+    const int32_t quarter_q24 = band_pass_step(&misalignment->common_slope, sum_q24, gain_q16);
     const int32_t error_q24 = band_pass_step(&misalignment->common_disturbance, disturbance_q24, gain_q16);
     const int64_t square_q40 = fixed_product(quarter_q24, quarter_q24) >> 8;
     misalignment->common_power_q40 += (square_q40 - misalignment->common_power_q40) >> COMMON_POWER_SHIFT;
-    misalignment->stroke_part_q16 = stroke_part_q16;
-    if (misalignment->common_rate == MISALIGNMENT_RATE_NONE) {
+    const bool learning = misalignment->common_rate == MISALIGNMENT_RATE_FULL;
+    if (learning) {
+        misalignment->beyond_load_steps = 0;
+    } else if (misalignment->common_rate == MISALIGNMENT_RATE_NONE || stroke_part_q16 < STROKE_PART_MIN_Q16) {
+        return;
+    } else if (misalignment->beyond_load_steps < MOVING_SETTLES * parameters->settle_updates) {
+        misalignment->beyond_load_steps++;
         return;
     }
-    misalignment_steps_t *steps = &misalignment->steps[MISALIGNMENT_COMMON];
     const int32_t power_q22 = fixed_saturate(misalignment->common_power_q40 >> 18);
     /* T^2 2^-26 of the square of a quarter: 0.00007 T^2 / rad^2. */
     const int32_t torque_q10 = torque_q24 >> 14;
@@ -208,58 +188,6 @@ void misalignment_common_step(misalignment_t *misalignment, unsigned phases, int
     /* y 4 q / (16 q^2), q the quarter. */
     const int32_t step_q10 =
         limited_step_q10(fixed_multiply_shift(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));
-    steps->latest_q10 = step_q10;
-    misalignment->common_sum_q40 += fixed_product(step_q10, steps->rate_q30);
-}
-
-void misalignment_review(const misalignment_parameters_t *parameters, misalignment_t *misalignment) {
-    const unsigned index = misalignment->review_index < parameters->phases ? misalignment->review_index + 1 : 0;
-    misalignment->review_index = index;
-    misalignment_steps_t *steps = &misalignment->steps[index];
-    const int32_t part_q16 = misalignment->stroke_part_q16;
-    const bool fast = part_q16 >= STROKE_PART_MIN_Q16;
-    const bool beyond_load = index == MISALIGNMENT_COMMON && fast;
-    if (misalignment->steady_updates == 0 && !beyond_load) {
-        steps->mean_q26 = 0;
-        steps->magnitude_q26 = STEP_UNKNOWN_Q26;
-        return;
-    }
-    if (misalignment->common_rate < (beyond_load ? MISALIGNMENT_RATE_BEYOND_LOAD : MISALIGNMENT_RATE_FULL)) {
-        return;
-    }
-    const int32_t limited_q16 = part_q16 < REVIEW_PART_MAX_Q16 ? part_q16 : REVIEW_PART_MAX_Q16;
-    const int32_t strokes_q32 = limited_q16 * parameters->review_strokes_q16; /* below 2^30 */
-    const int32_t most_q32 = parameters->review_gain_q32 * (fast ? 1 : REVIEW_SLOW_FACTOR);
-    const int32_t gain_q32 = strokes_q32 < most_q32 ? strokes_q32 : most_q32;
-    const int32_t change_q26 = steps->latest_q10 * 65536 - steps->recent_q26;
-    steps->recent_q26 += beyond_load ? fixed_multiply_high(change_q26, 2 * strokes_q32) : change_q26;
-    steps->mean_q26 += fixed_multiply_high(steps->recent_q26 - steps->mean_q26, gain_q32);
-    steps->magnitude_q26 +=
-        fixed_multiply_high((int32_t)fixed_magnitude(steps->recent_q26) - steps->magnitude_q26, gain_q32);
-}
-
-static int32_t common_rate_q30(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                               bool is_noise) {
-    const int32_t part_q16 = misalignment->stroke_part_q16;
-    const bool settled = misalignment->moving_reviews >= parameters->moving_settle_reviews;
-    const bool full = misalignment->common_rate == MISALIGNMENT_RATE_FULL;
-    misalignment->moving_reviews = full ? 0 : misalignment->moving_reviews + !settled;
-    if (!full && (!settled || part_q16 < STROKE_PART_MIN_Q16)) {
-        return 0;
-    }
-    return parameters->common_rate_q30 * (is_noise ? 1 : fixed_clamp(part_q16 / STROKE_PART_FASTER_Q16, 1, FASTER_MAX));
-}
-
-void misalignment_set_rate(const misalignment_parameters_t *parameters, misalignment_t *misalignment, bool moving) {
-    const unsigned index = misalignment->review_index;
-    misalignment_steps_t *steps = &misalignment->steps[index];
-    const uint32_t magnitude_q26 = (uint32_t)steps->magnitude_q26;
-    const uint32_t mean_q26 = fixed_magnitude(steps->mean_q26);
-    const unsigned shift = misalignment->stroke_part_q16 < STROKE_PART_MIN_Q16 ? 3 : 2;
-    const bool consistent =
-        magnitude_q26 < STEP_SMALL_Q26 || mean_q26 > (magnitude_q26 >> 2) + (magnitude_q26 >> shift);
-    const int32_t rate_q30 = index == MISALIGNMENT_COMMON
-                                 ? common_rate_q30(parameters, misalignment, mean_q26 <= magnitude_q26 >> 2)
-                                 : parameters->rate_q30;
-    steps->rate_q30 = !moving || consistent ? rate_q30 : 0;
+    const int64_t step_q40 = fixed_product(step_q10, parameters->common_rate_q30);
+    misalignment->common_sum_q40 += learning ? step_q40 : step_q40 >> MOVING_SHIFT;
 }

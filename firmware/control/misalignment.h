@@ -27,13 +27,8 @@
  * rotor angle in bins could cancel any error, not only a misalignment, but would have dozens of values to learn from
  * the same signal instead of one per phase.
  *
- * A load that moves slowly has little in that band from 50 strokes a second on, so that the common angle is learned
- * under it, after 1.2 s at a quarter of the rate.
- *
- * The steps of a misalignment have one sign, those of a load that moves with another frequency than the strokes
- * alternate. While the load moves, steps count only where their mean is more than half of their mean magnitude (3/8
- * below 50 strokes a second), or both are below 0.1 degrees. The slopes S are those of the mean torque: those of the
- * present one would have the frequency of the load as well.
+ * A load that moves has little in that band from 50 strokes a second on, so that the common angle is learned under it,
+ * after 1.2 s at a quarter of the rate.
  *
  * s_j is filtered by the observer's present bandwidth. Learning of the phases is suspended unless speed and load are
  * steady, the torque is above 1 N m and the voltage is not limited; a large misalignment itself disturbs every stroke,
@@ -56,21 +51,7 @@ typedef struct {
     int32_t mean_q16;        /* 10 / s times the update interval, Q0.16 */
     int32_t inertia_rate_q8; /* J / Ts: N m per rad/s, Q23.8 */
     uint32_t settle_updates; /* steady updates before learning */
-    int32_t review_gain_q32; /* 1 / s times the interval of two reviews of the same steps, Q0.32 */
-    int32_t review_strokes_q16;     /* that interval in common updates, per six strokes, Q16 */
-    uint32_t moving_settle_reviews; /* of the same steps in 1.2 s */
-    unsigned phases;
 } misalignment_parameters_t;
-
-#define MISALIGNMENT_COMMON 0 /* of misalignment_t.steps */
-
-/* Steps of an offset, in 0.02 rad. */
-typedef struct {
-    int32_t latest_q10;              /* within +-4, Q21.10 */
-    int32_t recent_q26;              /* mean over three strokes, Q5.26 */
-    int32_t mean_q26, magnitude_q26; /* longer means of that and of its magnitude, Q5.26 */
-    int32_t rate_q30;                /* by which they count until the next review, Q1.30 */
-} misalignment_steps_t;
 
 typedef struct {
     int32_t slope_lag1_q24, slope_lag2_q24,
@@ -84,7 +65,7 @@ typedef struct {
 /* Of the common angle. */
 typedef enum {
     MISALIGNMENT_RATE_NONE,
-    MISALIGNMENT_RATE_BEYOND_LOAD, /* where the strokes are faster than a load moves */
+    MISALIGNMENT_RATE_BEYOND_LOAD, /* a quarter, where the strokes are faster than a load moves */
     MISALIGNMENT_RATE_FULL,
 } misalignment_rate_t;
 
@@ -99,16 +80,12 @@ typedef struct {
     int32_t disturbance_mean_q24; /* mean of y, N m, Q7.24 */
     int32_t power_q24;            /* mean of sum s_j^2, Q7.24 */
     uint32_t steady_updates;
-    int32_t torque_mean_q24;  /* N m, Q7.24 */
     int64_t common_power_q40; /* mean of the band's (sum s_j / 4)^2, (N m per 0.02 rad)^2, Q40 */
     int64_t common_sum_q40;   /* of the steps of the common angle, which each phase takes with its next update */
     misalignment_band_t common_slope, common_disturbance; /* of sum s_j / 4, N m per 0.02 rad, and of y */
-    uint32_t moving_reviews;         /* of the common steps since the load was last steady, until they count */
+    uint32_t beyond_load_steps;      /* of the common angle since the load was last steady, until they learn */
     misalignment_rate_t common_rate; /* by the conditions of the last misalignment_step */
-    misalignment_steps_t steps[HAL_PHASES_MAX + 1]; /* common ones, then those of the phases */
-    int32_t stroke_part_q16;                        /* of the last misalignment_common_step */
-    unsigned review_index;                          /* in steps, of the last review */
-    unsigned phase_index;                           /* phase to update, in turn */
+    unsigned phase_index;            /* phase to update, in turn */
 } misalignment_t;
 
 typedef enum {
@@ -132,7 +109,6 @@ typedef struct {
     uint32_t control_rate_hz;
     unsigned periods_per_update;        /* control periods, misalignment_step */
     unsigned periods_per_common_update; /* misalignment_common_step */
-    unsigned periods_per_review;        /* misalignment_review */
     int32_t inertia_q30;                /* kg m^2, Q1.30 */
     unsigned phases, rotor_poles;
 } misalignment_settings_t;
@@ -154,13 +130,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
 /* One sample: updates the offset that the phases have in common, from the slopes of the last misalignment_step of each,
  * while those learn, or more slowly while only the load may move; each takes it with its next step. Disturbance and
  * torque reference in N m, Q7.24; stroke_part_q16: part of a stroke since the last step, from 0; rounding as there. */
-void misalignment_common_step(misalignment_t *misalignment, unsigned phases, int32_t disturbance_q24,
-                              int32_t torque_q24, int32_t stroke_part_q16);
-
-/* One review: of the steps of one phase or of the common ones, in turn. */
-void misalignment_review(const misalignment_parameters_t *parameters, misalignment_t *misalignment);
-
-/* After a review, the rate of the steps that it was of. moving: the observer follows a load that moves. */
-void misalignment_set_rate(const misalignment_parameters_t *parameters, misalignment_t *misalignment, bool moving);
+void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                              unsigned phases, int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16);
 
 #endif

@@ -5,14 +5,15 @@
 #include "fixed/fixed.h"
 
 #define SLOW_HZ 2000u
+#define SLOW_BITS_MAX 12u
 #define DEADBEAT_HZ 250u
 #define PERIODS_MAX (UINT32_C(1) << 20)
 #define ONE_Q28 (1 << 28)
 
-slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, int32_t inertia_q30) {
+slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, unsigned encoder_bits, int32_t inertia_q30) {
     const uint32_t deadbeat_periods = control_rate_hz / DEADBEAT_HZ; /* below 2^13 */
     return (slow_counts_parameters_t){
-        .slow_periods = control_rate_hz / SLOW_HZ,
+        .slow_periods = encoder_bits <= SLOW_BITS_MAX ? control_rate_hz / SLOW_HZ : UINT32_MAX,
         .deadbeat_periods = deadbeat_periods,
         .step_q31 = (uint32_t)INT32_MAX / deadbeat_periods,
         .deadbeat = load_observer_deadbeat_gains(DEADBEAT_HZ, inertia_q30),

@@ -423,7 +423,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             .control_rate_hz = control_rate_hz,
             .periods_per_update = DEFERRED_LEARNING_PERIODS,
             .periods_per_common_update = DEFERRED_COMMON_PERIODS,
-            .periods_per_review = DEFERRED_REVIEW_PERIODS,
             .inertia_q30 = inertia_q30,
             .phases = tables->phases,
             .rotor_poles = tables->rotor_poles,
@@ -443,7 +442,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .inertia_q30 = inertia_q30,
         .torque_max_q24 = torque_max_q24,
     });
-    control.slow_counts = slow_counts_configure(control_rate_hz, inertia_q30);
+    control.slow_counts = slow_counts_configure(control_rate_hz, encoder_bits, inertia_q30);
     /* With a transducer the whole load is fed forward already. */
     const bool learns_load =
         values[PARAMETER_PERIODIC_LOAD] != 0 && !control.load_from_transducer && control.moving_load.stages > 0;

@@ -138,8 +138,7 @@ typedef struct {
     speed_pi_t speed_pi;
     drive_mode_t mode; /* of the last input */
     torque_mode_t torque_mode;
-    unsigned turn;   /* of the last step, below DEFERRED_COMMON_PERIODS */
-    unsigned review; /* the last one, below DEFERRED_REVIEWS */
+    unsigned turn; /* of the last step, below DEFERRED_COMMON_PERIODS */
     conduction_state_t conduction;
     stroke_mean_t stroke_mean;
     bool load_constant;               /* in the last stroke_mean_step */

@@ -213,8 +213,9 @@ static int32_t stroke_part_q16(const control_parameters_t *parameters, const def
 
 static void learn_common_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                       const deferred_input_t *input) {
-    misalignment_common_step(&deferred->misalignment, machine_tables.phases, disturbance_q24(deferred, input),
-                             input->torque_reference_q24, stroke_part_q16(parameters, input));
+    misalignment_common_step(&parameters->misalignment, &deferred->misalignment, machine_tables.phases,
+                             disturbance_q24(deferred, input), input->torque_reference_q24,
+                             stroke_part_q16(parameters, input));
 }
 
 static void learn_periodic_load(const control_parameters_t *parameters, deferred_t *deferred,
@@ -295,18 +296,6 @@ NOINLINE static void await_slow_counts(const control_parameters_t *parameters, d
     }
 }
 
-/* What only watches the learning, in three turns of its own. */
-static void review_learning(const control_parameters_t *parameters, deferred_t *deferred) {
-    deferred->review = deferred->review < DEFERRED_REVIEWS - 1 ? deferred->review + 1 : 0;
-    if (deferred->review == 0) {
-        misalignment_review(&parameters->misalignment, &deferred->misalignment);
-    } else if (deferred->review == 1) {
-        misalignment_set_rate(&parameters->misalignment, &deferred->misalignment, deferred->moving_load.withheld > 0);
-    } else {
-        periodic_load_review(&deferred->periodic_load);
-    }
-}
-
 /* What is not urgent, in eight turns: no step takes the time of all. The learning of the phases has half of them,
  * because at a high bandwidth of the observer it follows within a millisecond. */
 NOINLINE static void take_turns(const control_parameters_t *parameters, deferred_t *deferred,
@@ -331,7 +320,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         move_conduction(parameters, deferred, input);
         break;
     case 6:
-        review_learning(parameters, deferred);
+        periodic_load_review(&deferred->periodic_load);
         identify_inertia(parameters, deferred, input);
         move_conduction(parameters, deferred, input);
         set_speed_law(parameters, deferred);

@@ -28,9 +28,6 @@
 #define DEFERRED_LEARNING_PERIODS 2
 #define DEFERRED_SLOW_PERIODS 4
 #define DEFERRED_COMMON_PERIODS 8
-/* Of misalignment_review, misalignment_set_rate, periodic_load_review. */
-#define DEFERRED_REVIEWS 3
-#define DEFERRED_REVIEW_PERIODS (DEFERRED_REVIEWS * DEFERRED_COMMON_PERIODS)
 #define DEFERRED_CONDUCTION_PERIODS (CONDUCTION_STEPS * DEFERRED_SLOW_PERIODS)
 
 /* Results in effect. [interrupt, or background in a critical section] */

@@ -21,7 +21,7 @@ constexpr double INERTIA = 0.02, COUNT_RAD = 2.0 * PI / (1 << BITS);
 const int32_t INERTIA_Q30 = to_fixed(INERTIA, Q30);
 
 struct SlowCounts : testing::Test {
-    slow_counts_parameters_t parameters = slow_counts_configure(RATE_HZ, INERTIA_Q30);
+    slow_counts_parameters_t parameters = slow_counts_configure(RATE_HZ, BITS, INERTIA_Q30);
     slow_counts_t counts = {};
     slow_counts_results_t results = {};
 

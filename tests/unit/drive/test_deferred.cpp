@@ -497,7 +497,20 @@ TEST_F(Deferred, the_misalignment_survives_every_reset_and_a_late_step) {
     kept();
 }
 
+TEST_F(Deferred, counts_of_an_encoder_of_13_bits_are_never_slow) {
+    for (const auto &[bits, slow] : {std::pair{12u, true}, std::pair{13u, false}}) {
+        configure(DRIVE_CONTROLLER_SALIENT);
+        parameters.slow_counts = configured(DRIVE_CONTROLLER_SALIENT, uint32_t(RATE_HZ), bits).slow_counts;
+        start();
+        for (unsigned k = 0; k < RATE_HZ / 10; k++) {
+            period(COMMAND_RUN);
+        }
+        EXPECT_EQ(results().slow_counts.slow, slow) << bits;
+    }
+}
+
 TEST_F(Deferred, slow_counts_end_with_the_first_fast_one_and_with_a_reset_of_the_observer) {
+    parameters.slow_counts = configured(DRIVE_CONTROLLER_SALIENT, uint32_t(RATE_HZ), 12).slow_counts;
     start();
     for (unsigned k = 0; k < RATE_HZ / 500; k++) {
         period(COMMAND_RUN);
