@@ -266,7 +266,7 @@ static void set_envelope(const machine_tables_t *tables, const conduction_state_
 static int32_t room_q15(const conduction_parameters_t *parameters, conduction_state_t *state, int32_t voltage_q6) {
     const int32_t range_q6 = parameters->fold_back_range_q6;
     const int32_t room_q6 = fixed_clamp(parameters->braking_end_q6 - voltage_q6, 0, LINK_RANGES * range_q6);
-    const int32_t free_q15 = ((room_q6 - range_q6) << 15) / range_q6;
+    const int32_t free_q15 = (room_q6 - range_q6) * ONE_Q15 / range_q6;
     const int32_t part_q15 = free_q15 < 0 ? LINK_FULL_RATE * free_q15 : free_q15;
     state->link_q30 =
         fixed_clamp(state->link_q30 + (parameters->advance_step_q30 >> LINK_SHIFT) * part_q15, 0, ONE_Q30);
@@ -334,7 +334,7 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     conduction_half_t *half = &angles->half[state->braking];
     conduction_half_t *before = &angles->half[!state->braking];
     const uint32_t on = state->interval.on;
-    angles->ripple_q24 = negative ? -state->ripple_q24 : state->ripple_q24;
+    angles->ripple_q24 = negative ? fixed_subtract(0, state->ripple_q24) : state->ripple_q24;
     before->window = parameters->initial.half[0].window;
     before->width = half->width = HALF_REV;
     before->lead = on >= HALF_REV ? -on : 0;
