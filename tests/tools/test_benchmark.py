@@ -76,7 +76,7 @@ ACCURACY = {
 def test_every_solver_reports_its_accuracy_and_is_compared_with_a_plant_at_least_as_accurate(
     pattern: SwitchingPattern, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(benchmark, "record", lambda folder, controller: pattern)
+    monkeypatch.setattr(benchmark, "record", lambda folder, **_: pattern)
     content = json.loads(json.dumps(benchmark.compare_solvers(runs=1)))
     rows = {row["solver"]: row for row in content["solvers"]}
     assert list(rows) == [*PLANT, *REFERENCE_SOLVERS] == list(ACCURACY)

@@ -477,7 +477,7 @@ class Rig(_Rig):
     frame_delay_us: float
     """0 to 8e+06 us. Delay of frame_fault delayed."""
     bus_connection: float
-    """0 to 1. Connection of the drive to the bus; disconnected, it is alone: nobody acknowledges its frames. Acts at the end of the present frame, as the next variable does."""
+    """0 to 1. Connection of the drive to the bus; disconnected, it is alone: no other node acknowledges its frames. Acts at the end of the present frame, as the next variable does."""
     transmit_error_counter: float
     """0 to 256. Sets the transmit error counter of the drive's CAN controller, once; 256 is bus-off."""
     babble_load_percent: float

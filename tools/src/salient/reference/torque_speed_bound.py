@@ -9,10 +9,9 @@ the same, one stroke apart.
 
 The DC link has the voltage of the supply behind its source resistance, with the capacitor between: it sags by the
 current that the phases draw, over the angle of a stroke. A supply absorbs nothing: returned energy ends in the chopper,
-at the mean of its thresholds. Where its resistance then takes too little it stays on, and the voltage follows the
-returned current over the angle of a stroke, as high as the resistance requires. A pair of angles that lifts the link to
-over_voltage_V at any angle, or returns energy to a link without a chopper, is refused. Without a table [dc_link] the
-voltage is constant and the supply takes everything.
+at the mean of its thresholds, or at the voltage at which its resistance takes all of it where that is higher. A pair of
+angles that lifts the link to over_voltage_V, or returns energy to a link without a chopper, is refused. Without a table
+[dc_link] the voltage is constant and the supply takes everything.
 
 Nothing of this is in the firmware, nor in what computes its tables: only the magnetics are shared with the plant.
 Angles of a phase are electrical degrees: 180 is the unaligned, 360 the aligned position; speeds are positive, and a
@@ -304,28 +303,11 @@ class _Revolution:
         taken_V: np.ndarray | float = math.inf
         if "chopper_resistance_ohm" in link:
             held_V = 0.5 * (link["chopper_on_V"] + link["chopper_off_V"])
-            lifted_V = self._lifted_V(link["chopper_resistance_ohm"], link["capacitance_F"])
-            # Half way: the current that a power returns falls with the voltage.
-            taken_V = np.where(lifted_V.mean(axis=0) > held_V, 0.5 * (lifted_V + before_V), held_V)
+            taken_V = np.maximum(held_V, np.sqrt(np.maximum(returned_W, 0.0) * link["chopper_resistance_ohm"]))
         self.link_V = np.where(returned_W > 0.0, np.minimum(taken_V, _OVER_FULL * self._limits.over_voltage_V),
                                self._sagging_V(link["source_resistance_ohm"], link["capacitance_F"]))
         change_V: np.ndarray = np.abs(self.link_V - before_V).max(axis=0)
         return change_V
-
-    def _lifted_V(self, chopper_ohm: float, capacitance_F: float) -> np.ndarray:
-        """Chopper that stays on, and capacitor, periodic; each step with a constant current."""
-        decay = np.exp(-self._step_s / (chopper_ohm * capacitance_F))
-        voltage_V = np.zeros_like(self._step_s)
-        profile_V = np.empty_like(self._drawn_A)
-        # From zero, what a stroke adds; then from the voltage that it adds itself to.
-        for _ in range(2):
-            for step, drawn_A in enumerate(self._drawn_A):
-                steady_V = -chopper_ohm * drawn_A
-                next_V = steady_V + (voltage_V - steady_V) * decay
-                profile_V[step] = 0.5 * (voltage_V + next_V)
-                voltage_V = next_V
-            voltage_V = voltage_V / (1.0 - decay ** len(self._drawn_A))
-        return profile_V
 
     def _sagging_V(self, source_ohm: float, capacitance_F: float) -> np.ndarray:
         """Source with resistance, which absorbs nothing, and capacitor; each step with a constant current."""
