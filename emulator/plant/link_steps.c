@@ -3,13 +3,11 @@
 #include <math.h>
 #include <stddef.h>
 
+#include "plant/event_bracket.h"
 #include "plant/hermite.h"
 
 /* Longest step, in time constants of the link. */
 #define STEP_TIME_CONSTANTS 0.1
-/* Accuracy of event times. */
-#define EVENT_TOLERANCE_S 1e-13
-#define EVENT_ITERATIONS 60
 /* Fraction of the time to an event after which the phases begin new steps, so that the current is known better. */
 #define APPROACH 0.9
 /* A voltage that the half bridges' charge leads past a threshold by less than this has not passed it. */
@@ -91,31 +89,18 @@ static double distance_V(const link_t *link, double voltage_V) {
 /* Shortens a step that passes a threshold to the time at which it reaches it, by the Illinois variant of the false
  * position method. */
 static double step_to_event(const link_t *link, double step_s, link_result_t *result) {
-    double before_s = 0.0, before = fmax(distance_V(link, link->voltage_V), 0.0);
-    double after_s = step_s, after = distance_V(link, result->end_V);
-    int last_side = 0;
+    event_bracket_t bracket = {0.0, fmax(distance_V(link, link->voltage_V), 0.0), step_s,
+                               distance_V(link, result->end_V), 0};
     double at_s = step_s;
     for (unsigned iteration = 0; iteration < EVENT_ITERATIONS; iteration++) {
         const double previous_s = at_s;
-        /* False position makes no progress from a start exactly on a threshold, as after the previous event. */
-        const double fraction = before > 0.0 ? before / (before - after) : 0.5;
-        at_s = fmax(before_s + (after_s - before_s) * fraction, EVENT_TOLERANCE_S);
+        at_s = event_bracket_time_s(&bracket);
         *result = link_step(link, at_s);
         const double at = distance_V(link, result->end_V);
         if (at == 0.0 || fabs(at_s - previous_s) < EVENT_TOLERANCE_S) {
             break;
         }
-        if (at > 0.0) {
-            before_s = at_s;
-            before = at;
-            after *= last_side > 0 ? 0.5 : 1.0;
-            last_side = 1;
-        } else {
-            after_s = at_s;
-            after = at;
-            before *= last_side < 0 ? 0.5 : 1.0;
-            last_side = -1;
-        }
+        event_bracket_narrow(&bracket, at_s, at);
     }
     const bool rises = link->rising_V - result->end_V < result->end_V - link->falling_V;
     result->end_V = rises ? link->rising_V : link->falling_V;

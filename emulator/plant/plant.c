@@ -3,6 +3,7 @@
 #include <math.h>
 #include <string.h>
 
+#include "plant/event_bracket.h"
 #include "plant/faulted.h"
 #include "plant/hermite.h"
 #include "plant/integrator.h"
@@ -28,8 +29,6 @@
 #define LINK_SOURCE_STEP 0.5
 
 /* Accuracy of event times: end of conduction of a diode, switching of supply and chopper. */
-#define EVENT_TOLERANCE_S 1e-13
-#define EVENT_ITERATIONS 60
 /* After an event, a DC-link voltage within this tolerance of its threshold is set to it. */
 #define THRESHOLD_TOLERANCE_V 1e-6
 /* After an event, a slower shaft with friction stands still. */
@@ -292,31 +291,18 @@ static double distance_to_event(const integrator_setting_t *setting, const integ
 static double step_to_event(const integrator_setting_t *setting, const integrator_state_t *start,
                             const integrator_derivative_t *first, double step_s, integrator_state_t *end,
                             integrator_integrals_t *integrals) {
-    double before_s = 0.0, before = fmax(distance_to_event(setting, start), 0.0);
-    double after_s = step_s, after = distance_to_event(setting, end);
-    int last_side = 0;
+    event_bracket_t bracket = {0.0, fmax(distance_to_event(setting, start), 0.0), step_s,
+                               distance_to_event(setting, end), 0};
     double at_s = step_s;
     for (unsigned iteration = 0; iteration < EVENT_ITERATIONS; iteration++) {
         const double previous_s = at_s;
-        /* False position makes no progress from a start exactly on a threshold, as after the previous event. */
-        const double fraction = before > 0.0 ? before / (before - after) : 0.5;
-        at_s = fmax(before_s + (after_s - before_s) * fraction, EVENT_TOLERANCE_S);
+        at_s = event_bracket_time_s(&bracket);
         integrator_step(setting, start, first, at_s, end, integrals);
         const double at = distance_to_event(setting, end);
         if (at == 0.0 || fabs(at_s - previous_s) < EVENT_TOLERANCE_S) {
             break;
         }
-        if (at > 0.0) {
-            before_s = at_s;
-            before = at;
-            after *= last_side > 0 ? 0.5 : 1.0;
-            last_side = 1;
-        } else {
-            after_s = at_s;
-            after = at;
-            before *= last_side < 0 ? 0.5 : 1.0;
-            last_side = -1;
-        }
+        event_bracket_narrow(&bracket, at_s, at);
     }
     return at_s;
 }
