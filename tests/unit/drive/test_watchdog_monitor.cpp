@@ -52,7 +52,7 @@ TEST_F(Watchdog, is_not_kicked_while_a_step_beyond_the_pending_one_is_missing) {
     EXPECT_TRUE(call());
     pending = 2;
     EXPECT_FALSE(call());
-    pending = UINT32_MAX; // a completed step that nobody requested
+    pending = UINT32_MAX; // a completed step without a request
     EXPECT_FALSE(call());
 }
 

@@ -1,4 +1,4 @@
-"""Puts the page and everything that it needs into one HTML file that asks nobody for anything.
+"""Puts the page and everything that it needs into one HTML file that makes no request.
 
 The scripts are those of the live page and of the tab, as data: addresses in an import map; module, machines and
 databases are one packed block.

@@ -66,7 +66,7 @@ class _Page:
 
 
 class Server:
-    """Serves the pages of one feed. token: part of the link, without which nobody is served."""
+    """Serves the pages of one feed. token: part of the link, without which a request is refused."""
 
     def __init__(self, feed: Feed) -> None:
         self.feed = feed
@@ -78,7 +78,7 @@ class Server:
         self._tasks: set[asyncio.Task[None]] = set()
         self._socket = socket.socket()
         self._socket.bind(("127.0.0.1", 0))
-        self._socket.listen()  # whoever is told the link may use it at once
+        self._socket.listen()  # the link is valid as soon as it is printed
         self._port = self._socket.getsockname()[1]
         self.application = Starlette(routes=[WebSocketRoute("/frames", self._serve), Route("/", self._index),
                                              Route("/{path:path}", self._file)])
