@@ -25,6 +25,8 @@ enum {
 #define FAULT_SHARE 0.065 /* of the kinds, on average, that a seed has */
 #define FAULTS_MAX 6
 
+#define FASTEST_SHARE 0.1 /* of the seeds, at the highest control rate */
+
 /* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
  * not. */
 #define SILENT_PART 0.12
@@ -75,6 +77,9 @@ static void draw_board(world_t *world, const world_machine_t *machines, unsigned
     world->control_rate_hz = rates_hz[seeded_below(seed, STREAM_BOARD, 1, 4)];
     if (world->control_rate_hz < world->machine->rate_min_hz) {
         world->control_rate_hz = world->machine->rate_min_hz > 50000 ? 100000 : 50000;
+    }
+    if (seeded_unit(seed, STREAM_BOARD, 7) < FASTEST_SHARE) {
+        world->control_rate_hz = 100000;
     }
     world->controller = seeded_below(seed, STREAM_BOARD, 2, 3);
     world->encoder_bits = 10 + seeded_below(seed, STREAM_BOARD, 3, 11);
