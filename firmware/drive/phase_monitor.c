@@ -25,8 +25,6 @@
  * once when not even the last bit changes, and when it ends after 1/2 ms. */
 #define STILL_MS 8u
 
-#define TAKEN_MS 50u
-
 /* Time for which a current that has ended too soon may explain one that is read in another phase. */
 #define VANISHED_MS 2u
 
@@ -178,12 +176,11 @@ static bool does_not_fall(const common_t *common, phase_monitor_phase_t *state, 
            fixed_product(fallen_q29, state->off_all_q29) < fixed_product(removed_q29, state->off_table_q29) / 4;
 }
 
-/* True when the integral has gone only because the tables have taken most of it away: by voltage and time alone the
- * current may flow, and it is the angle of the tables that is wrong. Over a longer time drops of the devices and the
- * resistance add up to as much. */
+/* True when the integral has gone only because the tables have taken most of it away, more than the error of the
+ * voltage explains: by voltage and time alone the current may flow, and it is the angle of the tables that is wrong. */
 static bool taken_away(const common_t *common, const phase_monitor_phase_t *state) {
-    return state->followed_q29 < -(state->peak_q29 / 2) &&
-           common->input->periods - state->zero_at < TAKEN_MS * common->input->periods_per_ms;
+    const uint32_t age = common->input->periods - state->zero_at;
+    return -(int64_t)state->followed_q29 > state->peak_q29 / 2 + (int64_t)common->error_q29 * age;
 }
 
 /* A current that should not be: does it move? */
