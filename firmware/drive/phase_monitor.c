@@ -19,6 +19,9 @@
  * then make the error of the voltage twice as large. */
 #define SMALL_CURRENT 4
 
+/* Time for which a phase has to differ alone at high speed: a slipping encoder shows in the others soon. */
+#define DOUBT_MS 20u
+
 #define OPEN_SAMPLES 2u
 
 /* A current that should not be is judged after 1/4 ms. One that does not move is its sensor's error after this time; at
@@ -237,16 +240,19 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     return failed;
 }
 
-/* Differences that an angle may explain: the phase's, when it alone has them within an electrical revolution in which
- * all others have conducted without; else they decide nothing here, and may be the encoder's. */
-static uint32_t judge_doubts(phase_monitor_t *monitor, unsigned phases, int32_t step) {
+/* Differences that an angle may explain: the phase's, when it alone has them within an electrical revolution and
+ * DOUBT_MS, in which all others have conducted without; else they decide nothing here, and may be the encoder's. */
+static uint32_t judge_doubts(const common_t *common, phase_monitor_t *monitor) {
+    const unsigned phases = common->tables->phases;
     if (monitor->doubted == 0) {
+        monitor->doubted_at = common->input->periods;
         monitor->doubt_turned_q24 = 0;
         monitor->agreed = 0;
         return 0;
     }
-    monitor->doubt_turned_q24 = fixed_add(monitor->doubt_turned_q24, step / 256);
-    if (fixed_abs(monitor->doubt_turned_q24) < 1 << 24) {
+    monitor->doubt_turned_q24 = fixed_add(monitor->doubt_turned_q24, common->step / 256);
+    if (fixed_abs(monitor->doubt_turned_q24) < 1 << 24 ||
+        common->input->periods - monitor->doubted_at < DOUBT_MS * common->input->periods_per_ms) {
         return 0;
     }
     const uint32_t doubted = monitor->doubted;
@@ -369,7 +375,7 @@ COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_
     }
     monitor->suspicious |= in_excess != 0;
     if (input->run) {
-        failed |= judge_doubts(monitor, tables->phases, common.step);
+        failed |= judge_doubts(&common, monitor);
     }
     /* The current that one phase lacks is read in another. */
     const uint32_t lacking = failed != 0 && input->run ? phases_that_lack(&common, monitor) : 0;

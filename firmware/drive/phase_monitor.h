@@ -21,7 +21,7 @@
  * An error of the angle explains any psi between those of the unaligned and of the aligned position. Beyond these a
  * difference is phase_open in its second sample, or an excess of current. Between them it counts once the rotor has
  * turned by 1/32 electrical revolution, by its encoder, and is a fault unless a second phase has one within an
- * electrical revolution: then it is the encoder's, or what all sensors have in common.
+ * electrical revolution and 20 ms: then it is the encoder's, or what all sensors have in common.
  *
  * What a phase without current cannot tell apart: an open winding, an open switch, the gate supply, a dead sensor. What
  * shows nothing at all: a negative offset in a phase that stands without current, because the converter reads 0; an
@@ -89,6 +89,7 @@ typedef struct {
     uint32_t doubted;         /* bit of each phase with a difference that an angle may explain */
     int doubted_side;         /* of the last one */
     uint32_t agreed;          /* bit of each phase that has conducted without a difference since */
+    uint32_t doubted_at;      /* period of the first one */
     int32_t doubt_turned_q24; /* rotation since the first one, electrical rev, Q7.24 */
     uint32_t lost;            /* bit of each phase that stays off, phase_monitor_lose() */
     phase_monitor_phase_t phase[HAL_PHASES_MAX];
