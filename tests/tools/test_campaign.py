@@ -89,6 +89,26 @@ def test_warm_windings_of_small_machines_are_no_false_alarm(seed: int) -> None:
     assert 300_000 < result["virtual_us"] < 4_000_000
 
 
+@pytest.mark.parametrize(("seed", "event", "cause"), [
+    (301469, "switch_shorted", 17),  # phase_shorted
+    (412370, "encoder_slip", 18)])   # encoder_angle
+def test_first_causes_that_were_wrong_once(seed: int, event: str, cause: int) -> None:
+    assert event in [drawn["event"] for drawn in world(seed)["events"]]
+    result = run_world(seed)
+    assert result["causes"][0] == cause and result["violations"] == []
+
+
+def test_a_part_of_the_clients_commands_a_torque_for_some_time() -> None:
+    torque_mode = [drawn for drawn in map(world, range(1, 31))
+                   if any(event["event"] == "torque_reference" for event in drawn["events"])]
+    assert 2 <= len(torque_mode) <= 10
+    results = [run_world(drawn["seed"]) for drawn in torque_mode]
+    assert all(result["violations"] == [] for result in results)
+    without = [run_world(drawn["seed"], sum(1 << event["index"] for event in drawn["events"]
+                                            if event["event"] != "torque_reference")) for drawn in torque_mode]
+    assert sum(one["hash"] != other["hash"] for one, other in zip(results, without, strict=True)) > len(results) // 2
+
+
 def test_a_seed_has_the_same_bits_twice_on_the_bench_and_on_a_target(tmp_path: Path,
                                                                      capsys: pytest.CaptureFixture[str]) -> None:
     assert same_bits.main([str(tmp_path), "401", "2"]) == 0
