@@ -124,6 +124,19 @@ def test_braking_is_limited_by_what_the_chopper_takes_below_the_over_voltage():
     assert without.torque_Nm < 1.05 * pulse.torque_Nm
 
 
+def test_braking_with_the_link_at_its_limit_is_found_whatever_the_limit():
+    """Angles that are permitted are few, and a higher voltage returns less energy."""
+    machine = machine_of("finite_element")
+    ohm = machine.dc_link["chopper_resistance_ohm"]
+    torques_Nm = []
+    for limit_V in (291.0, 295.0, 300.0):
+        (pulse,) = largest_torque(machine, [3000.0], replace(OF_SUPPLY, over_voltage_V=limit_V), BRAKING)
+        assert 0.995 * limit_V < pulse.link_V <= limit_V
+        assert -pulse.link_W == pytest.approx(pulse.link_V**2 / ohm, rel=2e-3)
+        torques_Nm.append(-pulse.torque_Nm)
+    assert 24.5 < torques_Nm[0] < torques_Nm[1] < torques_Nm[2] < 27.5
+
+
 def test_link_without_a_chopper_lets_braking_dissipate_only():
     machine = machine_of("finite_element")
     link = {key: value for key, value in machine.dc_link.items() if not key.startswith("chopper")}

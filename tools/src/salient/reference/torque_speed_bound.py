@@ -38,11 +38,16 @@ _FIRST_ON_DEG = {MOTORING: np.arange(30.0, 241.0, 10.0), BRAKING: np.arange(150.
 _FIRST_DWELL_DEG = np.arange(10.0, 341.0, 10.0)
 _STARTS = 3
 _ROUNDS = 9
-_CYCLES_MAX = 24
+_LAST_ROUNDS = 2
+_LINK_EXPONENT = 20
+"""By which the search values the torque of a pair less whose DC link is above its limit: it ends at that limit."""
+_CYCLES_MAX = 36
 _PERIODIC = 1e-4
 """Of the flux linkage's limit: change from a revolution to the next at which it counts as periodic."""
 _LINK_PERIODIC = 1e-3
 """Of the supply's voltage: change of the DC link's, likewise."""
+_CHOPPER_STEP = 0.25
+"""Part of the way to the voltage at which the chopper takes what the last revolution returned."""
 _OVER_FULL = 1.1
 """Multiple of the threshold above which it does not matter how much higher the DC link's voltage is."""
 _FLUX_POINTS = 256
@@ -111,24 +116,26 @@ def largest_torque(machine: Machine, speeds_rpm: Sequence[float], limits: Limits
     on_deg, dwell_deg = (grid.ravel() for grid in np.meshgrid(_FIRST_ON_DEG[quadrant], _FIRST_DWELL_DEG, indexing="ij"))
     first = _Run(machine, limits, np.repeat(speeds_rpm, on_deg.size), np.tile(on_deg, count), np.tile(dwell_deg, count),
                  _STEP_COARSE_DEG)
-    made_Nm = (quadrant * first.allowed_torque_Nm).reshape(count, -1)
+    made_Nm = (quadrant * first.sought_torque_Nm).reshape(count, -1)
     # The best pair and the best ones at least two steps from it: the torque may have several maxima.
     best = np.stack([_apart(row, on_deg, dwell_deg) for row in made_Nm])
     on_deg, dwell_deg = on_deg[best].ravel(), dwell_deg[best].ravel()
     speeds = np.repeat(speeds_rpm, _STARTS)
     offsets = np.array([(a, b) for a in range(-2, 3) for b in range(-2, 3)], dtype=float)
     distance_deg = np.full(len(speeds), 5.0)
-    for _ in range(_ROUNDS):
+    for left in range(_ROUNDS + _LAST_ROUNDS - 1, -1, -1):
+        last = left < _LAST_ROUNDS
         around_on = (on_deg[:, None] + distance_deg[:, None] * offsets[:, 0]).ravel()
         around_dwell = np.clip(dwell_deg[:, None] + distance_deg[:, None] * offsets[:, 1], 0.5, 355.0).ravel()
-        run = _Run(machine, limits, np.repeat(speeds, len(offsets)), around_on, around_dwell, _STEP_FINE_DEG)
-        at = (quadrant * run.allowed_torque_Nm).reshape(len(speeds), -1).argmax(axis=1)
+        run = _Run(machine, limits, np.repeat(speeds, len(offsets)), around_on, around_dwell,
+                   0.5 * _STEP_FINE_DEG if last else _STEP_FINE_DEG)
+        made_Nm = quadrant * (run.allowed_torque_Nm if last else run.sought_torque_Nm)
+        at = made_Nm.reshape(len(speeds), -1).argmax(axis=1)
         distance_deg = np.where(np.abs(offsets[at]).max(axis=1) < 2.0, 0.5 * distance_deg, distance_deg)
         at += np.arange(len(speeds)) * len(offsets)
         on_deg, dwell_deg = around_on[at], around_dwell[at]
-    last = _Run(machine, limits, speeds, on_deg, dwell_deg, _STEP_FINE_DEG / 2.0)
-    made_Nm = (quadrant * last.allowed_torque_Nm).reshape(count, _STARTS)
-    return [last.pulse(row * _STARTS + int(at)) for row, at in enumerate(made_Nm.argmax(axis=1))]
+    made_Nm = made_Nm.reshape(count, -1)
+    return [run.pulse(row * made_Nm.shape[1] + int(at)) for row, at in enumerate(made_Nm.argmax(axis=1))]
 
 
 def least_current(machine: Machine, speed_rpm: float, limits: Limits, torques_Nm: Sequence[float]) -> list[Pulse]:
@@ -217,8 +224,10 @@ class _Run:
         self.device_W = machine.phases * device_J / period_s
         self.link_W = machine.phases * link_J / period_s
         self.refused = ~periodic | (self.peak_A > CURRENT_OVER * limits.current_A)
+        self.sought_torque_Nm = np.where(self.refused, 0.0, self.torque_Nm)
         if machine.dc_link is not None:
             self.refused |= link_highest_V > limits.over_voltage_V
+            self.sought_torque_Nm *= np.minimum(1.0, limits.over_voltage_V / link_highest_V) ** _LINK_EXPONENT
         self.allowed_torque_Nm = np.where(self.refused, 0.0, self.torque_Nm)
 
     def pulse(self, at: int) -> Pulse:
@@ -304,9 +313,11 @@ class _Revolution:
         if "chopper_resistance_ohm" in link:
             held_V = 0.5 * (link["chopper_on_V"] + link["chopper_off_V"])
             taken_V = np.maximum(held_V, np.sqrt(np.maximum(returned_W, 0.0) * link["chopper_resistance_ohm"]))
-        self.link_V = np.where(returned_W > 0.0, np.minimum(taken_V, _OVER_FULL * self._limits.over_voltage_V),
-                               self._sagging_V(link["source_resistance_ohm"], link["capacitance_F"]))
-        change_V: np.ndarray = np.abs(self.link_V - before_V).max(axis=0)
+        target_V = np.where(returned_W > 0.0, np.minimum(taken_V, _OVER_FULL * self._limits.over_voltage_V),
+                            self._sagging_V(link["source_resistance_ohm"], link["capacitance_F"]))
+        # A higher voltage returns less energy: whole steps could alternate between two voltages.
+        self.link_V = before_V + np.where(returned_W > 0.0, _CHOPPER_STEP, 1.0) * (target_V - before_V)
+        change_V: np.ndarray = np.abs(target_V - before_V).max(axis=0)
         return change_V
 
     def _sagging_V(self, source_ohm: float, capacitance_F: float) -> np.ndarray:

@@ -261,7 +261,8 @@ def held_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
     mean_Nm = float(torque_Nm.mean())
     name = "motoring_short_percent" if quadrant == MOTORING else "braking_short_percent"
     peak_A = max(float(np.max(current)) for current in _currents(recording))
-    return {"torque_mean_Nm": mean_Nm, "torque_bound_Nm": bound_Nm, name: 100.0 * (1.0 - mean_Nm / bound_Nm),
+    short_percent = 100.0 * (1.0 - mean_Nm / bound_Nm) if bound_Nm else None  # a link without chopper
+    return {"torque_mean_Nm": mean_Nm, "torque_bound_Nm": bound_Nm, name: short_percent,
             "ripple": float(np.ptp(torque_Nm)) / abs(mean_Nm) if mean_Nm else None, "peak_current_A": peak_A,
             "peak_to_limit": peak_A / _limits(scenario).current_A}
 
