@@ -213,3 +213,10 @@ void misalignment_end_stroke(const misalignment_parameters_t *parameters, misali
         phase->before_q40 = phase->offset_q40;
     }
 }
+
+void misalignment_keep(misalignment_t *misalignment) {
+    for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
+        misalignment_phase_t *phase = &misalignment->phase[i];
+        phase->before_last_q40 = phase->before_q40 = phase->offset_q40;
+    }
+}

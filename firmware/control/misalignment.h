@@ -144,4 +144,7 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
 void misalignment_end_stroke(const misalignment_parameters_t *parameters, misalignment_t *misalignment, bool changed,
                              bool rougher);
 
+/* At the end of a run: what has been learned is not forgotten. */
+void misalignment_keep(misalignment_t *misalignment);
+
 #endif

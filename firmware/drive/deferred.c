@@ -95,6 +95,7 @@ NOINLINE static void follow_resets(const control_parameters_t *parameters, defer
         speed_pi_reset(&deferred->speed_pi);
         deferred->torque_offset = (torque_offset_t){0};
         periodic_load_reset(&deferred->periodic_load);
+        misalignment_keep(&deferred->misalignment);
     }
     if ((changed & OBSERVER_MASK) != 0) {
         deferred->bandwidth = (observer_bandwidth_statistics_t){0, 0};
