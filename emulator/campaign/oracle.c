@@ -120,7 +120,7 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     const uint64_t age_ns = now_ns > oracle->run_ns ? now_ns - oracle->run_ns : 0;
     if (!oracle->commanded || age_ns > request_max_ns(oracle, RUN_MAX_NS)) {
         oracle_violate(oracle, "no_command", now_ns, 3, (double)age_ns * 1e-6);
-    } else if (age_ns > request_max_ns(oracle, 170 * ORACLE_MS_NS) &&
+    } else if (age_ns > request_max_ns(oracle, 170 * ORACLE_MS_NS) && !oracle_phases_at_fault(oracle, now_ns / 1000) &&
                fabs(plant_torque_Nm(plant)) > 0.2 * oracle->world->machine->torque_max_Nm) {
         oracle_violate(oracle, "no_command", now_ns, 4, plant_torque_Nm(plant));
     }

@@ -133,8 +133,7 @@ static bool true_of_plant(const oracle_t *oracle, unsigned cause, const plant_t 
     }
 }
 
-/* Phases with a fault of their own in the last quarter of a second. */
-static unsigned phases_at_fault(const oracle_t *oracle, uint64_t now_us) {
+unsigned oracle_phases_at_fault(const oracle_t *oracle, uint64_t now_us) {
     const world_t *world = oracle->world;
     unsigned phases = 0;
     for (unsigned i = 0; i < world->events; i++) {
@@ -169,7 +168,7 @@ void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
     }
     /* With one phase that has conducted so far a wrong current and a wrong angle are the same; and two phases with
      * faults of their own are what a wrong angle looks like. */
-    const unsigned phases = phases_at_fault(oracle, now_us);
+    const unsigned phases = oracle_phases_at_fault(oracle, now_us);
     const bool of_phase = oracle_any_injected(oracle, FAULT_WINDING_OPEN, FAULT_CURRENT_SENSOR_SWAPPED);
     if ((of_phase && !oracle->turned) || (phases & (phases - 1u)) != 0) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);

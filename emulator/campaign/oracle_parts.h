@@ -74,6 +74,9 @@ void oracle_look_at_measurement(oracle_t *oracle, const plant_t *plant);
 
 /* --- First causes --- */
 
+/* Bit of each phase with a fault of its own in the last quarter of a second: its current is not the drive's alone. */
+unsigned oracle_phases_at_fault(const oracle_t *oracle, uint64_t now_us);
+
 /* The drive has latched a fault: wrong_cause or false_alarm. */
 void oracle_judge_cause(oracle_t *oracle, const plant_t *plant);
 

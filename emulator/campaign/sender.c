@@ -17,7 +17,7 @@
 #define STREAM_HOSTILE 200
 
 /* E2EDataId of drive.dbc. */
-enum { DATA_ID_COMMAND = 23070, DATA_ID_ARM = 23072 };
+enum { DATA_ID_COMMAND = 23070, DATA_ID_TORQUE_COMMAND = 23071, DATA_ID_ARM = 23072 };
 enum { STATE_INITIALISE, STATE_READY, STATE_RUN, STATE_FAULT };
 enum { HONEST = 1, OTHER = 2 };
 
@@ -76,14 +76,20 @@ static void put_genuine(sender_t *sender, const transport_receiver_t *receiver, 
     put(sender, receiver, client, identifier, data, length);
 }
 
+static bool is_motion_command(unsigned identifier) {
+    return identifier == DRIVE_COMMAND_FRAME_ID || identifier == DRIVE_TORQUE_COMMAND_FRAME_ID;
+}
+
+/* reference: LSBs of the speed or, in torque mode, of the torque. */
 static void put_command(sender_t *sender, const transport_receiver_t *receiver, unsigned client, uint8_t counter,
-                        sender_request_t request, int32_t reference) {
+                        bool torque_mode, sender_request_t request, int32_t reference) {
     uint8_t data[7] = {[3] = (uint8_t)request};
     for (unsigned i = 0; i < 3; i++) {
         data[4 + i] = (uint8_t)((uint32_t)reference >> 8 * i);
     }
-    protect(data, sizeof data, DATA_ID_COMMAND, counter);
-    put_genuine(sender, receiver, client, DRIVE_COMMAND_FRAME_ID, data, sizeof data);
+    protect(data, sizeof data, torque_mode ? DATA_ID_TORQUE_COMMAND : DATA_ID_COMMAND, counter);
+    put_genuine(sender, receiver, client, torque_mode ? DRIVE_TORQUE_COMMAND_FRAME_ID : DRIVE_COMMAND_FRAME_ID, data,
+                sizeof data);
 }
 
 static void put_arm(sender_t *sender, const transport_receiver_t *receiver, unsigned step, uint32_t response) {
@@ -136,13 +142,18 @@ static void put_events(sender_t *sender, const transport_receiver_t *receiver) {
 
 /* --- The honest client --- */
 
-static bool has(const sender_t *sender, world_kind_t kind) {
+static const world_event_t *active(const sender_t *sender, world_kind_t kind) {
     for (unsigned i = 0; i < sender->world->events; i++) {
-        if (sender->world->event[i].kind == kind && world_active(sender->world, i, sender->time_us)) {
-            return true;
+        const world_event_t *event = &sender->world->event[i];
+        if (event->kind == kind && world_active(sender->world, i, sender->time_us)) {
+            return event;
         }
     }
-    return false;
+    return NULL;
+}
+
+static bool has(const sender_t *sender, world_kind_t kind) {
+    return active(sender, kind) != NULL;
 }
 
 static int32_t reference_of(const world_t *world, double rpm) {
@@ -191,8 +202,11 @@ static void step_honest(sender_t *sender, const transport_receiver_t *receiver) 
     if (request != sender->request || sender->time_us >= sender->due_us) {
         sender->request = request;
         sender->due_us = sender->time_us + COMMAND_PERIOD_US;
-        put_command(sender, receiver, HONEST, sender->counter++, request,
-                    request == SENDER_RUN ? sender->reference : 0);
+        const world_event_t *torque = active(sender, WORLD_TORQUE);
+        const int32_t reference =
+            torque ? (int32_t)floor(torque->value / world->machine->command_lsb_Nm + 0.5) : sender->reference;
+        put_command(sender, receiver, HONEST, sender->counter++, torque != NULL, request,
+                    request == SENDER_RUN ? reference : 0);
     }
     if (request != SENDER_RUN || has(sender, WORLD_UNARMED) || sender->armed || sender->state == STATE_FAULT ||
         sender->state == STATE_INITIALISE) {
@@ -284,7 +298,7 @@ static void step_other(sender_t *sender, const transport_receiver_t *receiver) {
         if (event->kind == WORLD_SECOND && world_active(world, i, sender->time_us) &&
             sender->time_us >= sender->second_due_us) {
             sender->second_due_us = sender->time_us + COMMAND_PERIOD_US;
-            put_command(sender, receiver, OTHER, sender->second_counter++, SENDER_RUN, -sender->reference / 2);
+            put_command(sender, receiver, OTHER, sender->second_counter++, false, SENDER_RUN, -sender->reference / 2);
         }
     }
 }
@@ -325,7 +339,7 @@ static sender_meaning_t meaning_of(sender_t *sender, const struct can_frame *on_
         if (is_same(frame, on_bus) && (frame->seen_ns == 0 || young)) {
             frame->seen_ns = frame->seen_ns ? frame->seen_ns : time_ns;
             return (sender_meaning_t){.genuine = true,
-                                      .command = frame->identifier == DRIVE_COMMAND_FRAME_ID,
+                                      .command = is_motion_command(frame->identifier),
                                       .confirms = frame->identifier == DRIVE_ARM_FRAME_ID && frame->data[3] == 1,
                                       .request = (sender_request_t)frame->data[3]};
         }

@@ -19,11 +19,16 @@ enum {
     STREAM_FAULT,
     STREAM_BUS,
     STREAM_GATES,
+    STREAM_TORQUE,
 };
 
 #define FAULT_DRAWS 8     /* random numbers of a kind of fault */
 #define FAULT_SHARE 0.065 /* of the kinds, on average, that a seed has */
 #define FAULTS_MAX 6
+
+/* Of the seeds. */
+#define FASTEST_SHARE 0.1 /* at the highest control rate */
+#define TORQUE_SHARE 0.15 /* in torque mode for some time */
 
 /* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
  * not. */
@@ -75,6 +80,9 @@ static void draw_board(world_t *world, const world_machine_t *machines, unsigned
     world->control_rate_hz = rates_hz[seeded_below(seed, STREAM_BOARD, 1, 4)];
     if (world->control_rate_hz < world->machine->rate_min_hz) {
         world->control_rate_hz = world->machine->rate_min_hz > 50000 ? 100000 : 50000;
+    }
+    if (seeded_unit(seed, STREAM_BOARD, 7) < FASTEST_SHARE) {
+        world->control_rate_hz = 100000;
     }
     world->controller = seeded_below(seed, STREAM_BOARD, 2, 3);
     world->encoder_bits = 10 + seeded_below(seed, STREAM_BOARD, 3, 11);
@@ -152,6 +160,19 @@ static void draw_load(world_t *world, double rpm, uint64_t begin_us) {
         add_set(world, step, sign * 0.7 * torque_Nm, 0.0, begin_us, world->recovery_us);
         break;
     }
+}
+
+/* In a part of the worlds the client commands a torque for some time. */
+static void draw_torque(world_t *world, uint64_t last_us) {
+    const uint64_t seed = world->seed;
+    if (seeded_unit(seed, STREAM_TORQUE, 0) >= TORQUE_SHARE) {
+        return;
+    }
+    const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_TORQUE, 1, 0.0, (double)last_us);
+    const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_TORQUE, 2, 5e3, 3e5);
+    world_event_t *event = add(world, WORLD_TORQUE, begin_us, end_us < last_us ? end_us : last_us);
+    const double part = seeded_between(seed, STREAM_TORQUE, 3, world->controller == 2 ? -0.5 : 0.0, 1.0);
+    event->value = part * world->machine->torque_rated_Nm;
 }
 
 static double start_s(const world_t *world, double from_rpm, double to_rpm) {
@@ -329,6 +350,7 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     }
     draw_load(world, first_rpm, (uint64_t)seeded_between(seed, STREAM_LOAD, 9, 1e4, (double)last_us));
     draw_script(world, last_us);
+    draw_torque(world, last_us);
     unsigned faults = 0;
     for (unsigned i = 1; i < FAULT_COUNT && faults < FAULTS_MAX; i++) {
         const unsigned kind = 1 + (i + (unsigned)(seed % (FAULT_COUNT - 1))) % (FAULT_COUNT - 1);
@@ -354,6 +376,7 @@ void world_draw_healthy(world_t *world, const world_machine_t *machines, unsigne
         rpm = next_rpm;
     }
     draw_load(world, rpm, (uint64_t)(at_s * 1e6));
+    draw_torque(world, (uint64_t)(at_s * 1e6));
     world->duration_us = (uint64_t)((at_s + seeded_between(seed, STREAM_LOAD, 8, 0.3, 1.0)) * 1e6);
 }
 
@@ -369,8 +392,9 @@ bool world_active(const world_t *world, unsigned event, uint64_t time_us) {
 
 const char *world_event_name(const world_event_t *event) {
     static const char *const names[] = {
-        [WORLD_SPEED] = "speed_reference", [WORLD_SILENT] = "silent", [WORLD_HOSTILE] = "hostile",
-        [WORLD_SECOND] = "second_sender",  [WORLD_EAGER] = "eager",   [WORLD_UNARMED] = "unarmed",
+        [WORLD_SPEED] = "speed_reference", [WORLD_TORQUE] = "torque_reference", [WORLD_SILENT] = "silent",
+        [WORLD_HOSTILE] = "hostile",       [WORLD_SECOND] = "second_sender",    [WORLD_EAGER] = "eager",
+        [WORLD_UNARMED] = "unarmed",
     };
     return event->kind == WORLD_SET     ? bench_variables[event->what].name
            : event->kind == WORLD_FAULT ? fault_kinds[event->what].name

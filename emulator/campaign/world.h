@@ -18,6 +18,7 @@ typedef struct {
     double speed_base_rpm, torque_rated_Nm, torque_max_Nm;
     double over_speed_rpm, over_voltage_V, under_voltage_V, trip_current_A;
     double command_lsb_rpm; /* of DRIVE_COMMAND.speed_reference_rpm */
+    double command_lsb_Nm;  /* of DRIVE_TORQUE_COMMAND.torque_reference_Nm */
     double speed_command_max_rpm;
     unsigned rate_min_hz;
     char name[64];
@@ -27,6 +28,7 @@ typedef enum {
     WORLD_SET,     /* bench variable `what` has `raw` from begin to end, then `raw_end` */
     WORLD_FAULT,   /* fault of kind `what` from begin to end */
     WORLD_SPEED,   /* the client's speed reference is `value` r/min from begin on */
+    WORLD_TORQUE,  /* the client commands a torque of `value` N m instead, from begin to end */
     WORLD_SILENT,  /* the client sends nothing from begin to end */
     WORLD_HOSTILE, /* a second client sends frames of sort `what` from begin to end */
     WORLD_SECOND,  /* a second client sends protected commands of its own from begin to end */

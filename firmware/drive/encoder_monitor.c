@@ -1,5 +1,6 @@
 #include "drive/encoder_monitor.h"
 
+#include "control/applied_flux.h"
 #include "control/machine_tables.h"
 #include "control/phase_map.h"
 #include "fixed/compiler.h"
@@ -108,7 +109,8 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
  * Q2.29. moves: the rotor has been seen to move in this run. */
 static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const encoder_monitor_input_t *input,
                         unsigned index, bool moves) {
-    const int64_t error_q29 = parameters->flux_error_q29;
+    const int32_t pulse_q29 = applied_flux_short_pulse_q29(input->flux_step_max_q29, parameters->rate_hz);
+    const int64_t error_q29 = (int64_t)parameters->flux_error_q29 + pulse_q29;
     return (moves ? MOVING_FACTOR * error_q29 + (input->flux_step_max_q29 >> PULSE_SHIFT) : error_q29) +
            fixed_multiply_high(input->current_q9[index] << 12, parameters->resistance_error_q40);
 }

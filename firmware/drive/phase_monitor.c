@@ -15,18 +15,18 @@
 /* Time constant with which the integral follows the tables, ms. */
 #define FOLLOW_MS 10u
 
-/* Currents up to this multiple of the offset, and the part of the DC-link voltage that drives no more of them, because
- * of the drops of the devices and pulses that are too short. */
+/* Currents up to this multiple of the offset are small. Drops of the devices, and pulses that are too short to act,
+ * then make the error of the voltage twice as large. */
 #define SMALL_CURRENT 4
-#define SMALL_VOLTAGE 32
+
+/* Time for which a phase has to differ alone at high speed: a slipping encoder shows in the others soon. */
+#define DOUBT_MS 20u
 
 #define OPEN_SAMPLES 2u
 
 /* A current that should not be is judged after 1/4 ms. One that does not move is its sensor's error after this time; at
  * once when not even the last bit changes, and when it ends after 1/2 ms. */
 #define STILL_MS 8u
-
-#define TAKEN_MS 50u
 
 /* Time for which a current that has ended too soon may explain one that is read in another phase. */
 #define VANISHED_MS 2u
@@ -40,6 +40,7 @@ typedef struct {
     int32_t step;      /* rotation since then, 2^-32 electrical rev */
     int32_t offset_q9; /* tolerance of a current, A, Q7.9 */
     int32_t delay_q29; /* tolerance of a flux linkage, Wb, Q2.29 */
+    int32_t error_q29; /* of a period's voltage, Wb, Q2.29 */
 } common_t;
 
 /* Largest and smallest flux linkage at a measured current, at a distance. */
@@ -61,10 +62,14 @@ NOINLINE static uint32_t distance_of(const phase_monitor_input_t *input, unsigne
 static int32_t slack_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase) {
     const phase_monitor_input_t *input = common->input;
     const int32_t resistive_q29 = fixed_multiply_high(input->current_q9[phase] << 12, input->resistance_period_q40);
-    const int32_t error_q29 = resistive_q29 / 2 + input->period_flux_q29 / 64;
+    const int32_t error_q29 = resistive_q29 / 2 + common->error_q29;
     /* An error at the largest flux linkage remains while it falls. */
     const int32_t fallen_q29 = state->peak_q29 - input->flux_q29[phase];
     return fixed_saturate((int64_t)error_q29 * (int32_t)state->conducting + common->delay_q29 + fallen_q29 / 4);
+}
+
+static bool small(const common_t *common, unsigned phase) {
+    return common->input->current_q9[phase] <= SMALL_CURRENT * common->offset_q9;
 }
 
 /* Side and extent of a difference between voltage and current. */
@@ -83,14 +88,14 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
     const int32_t slack = slack_q29(common, state, phase);
     int32_t high_q29 = fixed_subtract(flux_q29, slack);
     const int32_t low_q29 = fixed_add(flux_q29, slack);
-    const bool small = current_q9 <= SMALL_CURRENT * common->offset_q9;
-    if (!small || flux_q29 < state->base_q29 || common->elapsed > common->input->periods_per_ms / 2u) {
+    const bool is_small = small(common, phase);
+    if (!is_small || flux_q29 < state->base_q29 || common->elapsed > common->input->periods_per_ms / 2u) {
         state->base_q29 = flux_q29;
     }
-    if (small) { /* errors of the past do not count: only what has been built up since */
+    if (is_small) { /* errors of the past do not count: only what has been built up since */
         high_q29 = fixed_subtract(flux_q29, fixed_add(state->base_q29, common->delay_q29));
-        state->base_q29 = fixed_saturate(state->base_q29 + (int64_t)common->input->period_flux_q29 / SMALL_VOLTAGE *
-                                                               (int32_t)(common->elapsed & 0xffffu));
+        state->base_q29 =
+            fixed_saturate(state->base_q29 + 2 * (int64_t)common->error_q29 * (int32_t)(common->elapsed & 0xffffu));
     }
     *side = 0;
     if (high_q29 <= table_q29 && low_q29 >= table_q29) {
@@ -108,7 +113,7 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
         *side = -1;
         return low_q29 < least_q29(common, 0, current_q9) ? BEYOND_ANGLES : WITHIN_ANGLES;
     }
-    return small && high_q29 > table_q29 ? DOUBTFUL : AGREES;
+    return is_small && high_q29 > table_q29 ? DOUBTFUL : AGREES;
 }
 
 /* Flux linkage that the opposite voltage removes within a period. */
@@ -116,14 +121,27 @@ static bool gone(const phase_monitor_input_t *input, unsigned phase) {
     return input->flux_q29[phase] < input->period_flux_q29;
 }
 
+/* Periods since the phase was at rest, those of a small current twice; what lies further back than FOLLOW_MS has been
+ * corrected. */
+static uint32_t conducting(const common_t *common, const phase_monitor_phase_t *state, unsigned phase) {
+    const uint32_t follow = FOLLOW_MS * common->input->periods_per_ms;
+    const uint32_t step = 2 * (common->elapsed < follow ? common->elapsed : follow);
+    const uint32_t now = state->conducting;
+    if (small(common, phase)) {
+        return now + step < 2 * follow ? now + step : 2 * follow;
+    }
+    if (now > follow) {
+        return now - follow > step ? now - step : follow;
+    }
+    return now + step / 2 < follow ? now + step / 2 : follow;
+}
+
 /* True when the voltage has left the phase without flux linkage, errors of the integral included. */
 static bool at_rest(const common_t *common, phase_monitor_t *monitor, unsigned phase) {
     phase_monitor_phase_t *state = &monitor->phase[phase];
     const phase_monitor_input_t *input = common->input;
     const int32_t flux_q29 = input->flux_q29[phase];
-    const uint32_t conducting = state->conducting + common->elapsed;
-    const uint32_t follow = FOLLOW_MS * input->periods_per_ms;
-    state->conducting = conducting < follow ? conducting : follow;
+    state->conducting = conducting(common, state, phase);
     state->peak_q29 = flux_q29 > state->peak_q29 ? flux_q29 : state->peak_q29;
     if (!input->off[phase] || flux_q29 > 0) {
         state->rest_q29 = 0;
@@ -157,17 +175,15 @@ static bool does_not_fall(const common_t *common, phase_monitor_phase_t *state, 
     state->was_off = common->input->off[phase];
     const int32_t removed_q29 = fixed_subtract(fixed_subtract(state->off_flux_q29, flux_q29), 2 * common->delay_q29);
     const int32_t fallen_q29 = fixed_subtract(state->off_table_q29, state->table_q29);
-    return common->input->current_q9[phase] > SMALL_CURRENT * common->offset_q9 &&
-           removed_q29 > state->off_all_q29 / 4 &&
+    return !small(common, phase) && removed_q29 > state->off_all_q29 / 4 &&
            fixed_product(fallen_q29, state->off_all_q29) < fixed_product(removed_q29, state->off_table_q29) / 4;
 }
 
-/* True when the integral has gone only because the tables have taken most of it away: by voltage and time alone the
- * current may flow, and it is the angle of the tables that is wrong. Over a longer time drops of the devices and the
- * resistance add up to as much. */
+/* True when the integral has gone only because the tables have taken most of it away, more than the error of the
+ * voltage explains: by voltage and time alone the current may flow, and it is the angle of the tables that is wrong. */
 static bool taken_away(const common_t *common, const phase_monitor_phase_t *state) {
-    return state->followed_q29 < -(state->peak_q29 / 2) &&
-           common->input->periods - state->zero_at < TAKEN_MS * common->input->periods_per_ms;
+    const uint32_t age = common->input->periods - state->zero_at;
+    return -(int64_t)state->followed_q29 > state->peak_q29 / 2 + (int64_t)common->error_q29 * age;
 }
 
 /* A current that should not be: does it move? */
@@ -204,8 +220,7 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     const bool off = (monitor->lost >> phase & 1u) != 0;
     if (common->input->run && !common->lost && !off) {
         difference = compare(common, state, phase, &side);
-        const bool conducts = common->input->current_q9[phase] > SMALL_CURRENT * common->offset_q9;
-        monitor->agreed |= (uint32_t)(difference == AGREES && conducts) << phase;
+        monitor->agreed |= (uint32_t)(difference == AGREES && !small(common, phase)) << phase;
     }
     monitor->suspicious |= difference != AGREES;
     const bool beyond = difference == BEYOND_ANGLES;
@@ -225,16 +240,19 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     return failed;
 }
 
-/* Differences that an angle may explain: the phase's, when it alone has them within an electrical revolution in which
- * all others have conducted without; else they decide nothing here, and may be the encoder's. */
-static uint32_t judge_doubts(phase_monitor_t *monitor, unsigned phases, int32_t step) {
+/* Differences that an angle may explain: the phase's, when it alone has them within an electrical revolution and
+ * DOUBT_MS, in which all others have conducted without; else they decide nothing here, and may be the encoder's. */
+static uint32_t judge_doubts(const common_t *common, phase_monitor_t *monitor) {
+    const unsigned phases = common->tables->phases;
     if (monitor->doubted == 0) {
+        monitor->doubted_at = common->input->periods;
         monitor->doubt_turned_q24 = 0;
         monitor->agreed = 0;
         return 0;
     }
-    monitor->doubt_turned_q24 = fixed_add(monitor->doubt_turned_q24, step / 256);
-    if (fixed_abs(monitor->doubt_turned_q24) < 1 << 24) {
+    monitor->doubt_turned_q24 = fixed_add(monitor->doubt_turned_q24, common->step / 256);
+    if (fixed_abs(monitor->doubt_turned_q24) < 1 << 24 ||
+        common->input->periods - monitor->doubted_at < DOUBT_MS * common->input->periods_per_ms) {
         return 0;
     }
     const uint32_t doubted = monitor->doubted;
@@ -309,6 +327,7 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
         .step = (int32_t)(input->electrical - monitor->electrical),
         .offset_q9 = tables->current_range_q9 / 128,
         .delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)input->periods_per_ms),
+        .error_q29 = period_q29 / 64 + applied_flux_short_pulse_q29(period_q29, input->periods_per_ms * 1000u),
     };
 }
 
@@ -356,7 +375,7 @@ COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_
     }
     monitor->suspicious |= in_excess != 0;
     if (input->run) {
-        failed |= judge_doubts(monitor, tables->phases, common.step);
+        failed |= judge_doubts(&common, monitor);
     }
     /* The current that one phase lacks is read in another. */
     const uint32_t lacking = failed != 0 && input->run ? phases_that_lack(&common, monitor) : 0;

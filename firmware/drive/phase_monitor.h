@@ -9,9 +9,10 @@
  *   encoder_angle   a current that is only too large because the tables, at a wrong angle, have emptied the integral
  *
  * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical; resistance 50 % and
- * voltage 1/64 since the phase was at rest, at most over 10 ms; a quarter of psi that has been removed since; and psi
- * of a period and 20 us at the DC-link voltage, for the delays of sensor and switches. At a current of up to 4/128 of
- * its range, phase_open counts only what more than 1/32 of the DC-link voltage has built up since the current was
+ * voltage 1/64 since the phase was at rest, at most over 10 ms, twice that at small currents; from 50 kHz on also what
+ * pulses too short for the devices do not make; a quarter of psi that has been removed since; and psi of a period and
+ * 20 us at the DC-link voltage, for the delays of sensor and switches. At a current of up to 4/128 of its range, a
+ * small one, phase_open counts only what more than this tolerance of the voltage has built up since the current was
  * larger.
  *
  * A current also is one that should not be when both switches are open and the voltage has removed a quarter of psi of
@@ -20,7 +21,7 @@
  * An error of the angle explains any psi between those of the unaligned and of the aligned position. Beyond these a
  * difference is phase_open in its second sample, or an excess of current. Between them it counts once the rotor has
  * turned by 1/32 electrical revolution, by its encoder, and is a fault unless a second phase has one within an
- * electrical revolution: then it is the encoder's, or what all sensors have in common.
+ * electrical revolution and 20 ms: then it is the encoder's, or what all sensors have in common.
  *
  * What a phase without current cannot tell apart: an open winding, an open switch, the gate supply, a dead sensor. What
  * shows nothing at all: a negative offset in a phase that stands without current, because the converter reads 0; an
@@ -88,6 +89,7 @@ typedef struct {
     uint32_t doubted;         /* bit of each phase with a difference that an angle may explain */
     int doubted_side;         /* of the last one */
     uint32_t agreed;          /* bit of each phase that has conducted without a difference since */
+    uint32_t doubted_at;      /* period of the first one */
     int32_t doubt_turned_q24; /* rotation since the first one, electrical rev, Q7.24 */
     uint32_t lost;            /* bit of each phase that stays off, phase_monitor_lose() */
     phase_monitor_phase_t phase[HAL_PHASES_MAX];

@@ -13,7 +13,7 @@ static bool pushes_in_vain(const stall_input_t *input, bool swings) {
 }
 
 COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us) {
-    const int32_t error_q22 = fixed_abs(fixed_subtract(input->speed_reference_q22, input->speed_q22));
+    const int32_t speed_q22 = input->speed_reference_q22 < 0 ? fixed_subtract(0, input->speed_q22) : input->speed_q22;
     const int32_t change_q22 = fixed_abs(input->speed_reference_q22) / 128;
     const bool before = monitor->vain;
     if ((input->speed_q22 ^ input->speed_reference_q22) < 0) {
@@ -21,11 +21,11 @@ COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *in
     }
     monitor->vain = pushes_in_vain(input, before && time_us - monitor->backwards_us <= STALL_TIME_US);
     if (!monitor->vain || !before) {
-        monitor->error_least_q22 = monitor->error_most_q22 = error_q22;
-    } else if (error_q22 < monitor->error_least_q22 - change_q22) {
-        monitor->error_least_q22 = error_q22;
-    } else if (error_q22 > fixed_add(monitor->error_most_q22, change_q22)) {
-        monitor->error_most_q22 = error_q22;
+        monitor->lowest_q22 = monitor->highest_q22 = speed_q22;
+    } else if (speed_q22 < fixed_subtract(monitor->lowest_q22, change_q22)) {
+        monitor->lowest_q22 = speed_q22;
+    } else if (speed_q22 > fixed_add(monitor->highest_q22, change_q22)) {
+        monitor->highest_q22 = speed_q22;
     } else {
         return time_us - monitor->changed_us > STALL_TIME_US;
     }

@@ -2,7 +2,7 @@
  *
  * The rotor turns slower than at half of the reference, in either direction, or has begun so and turned backwards
  * within STALL_TIME_US, the torque reference is within a sixteenth of its limit in the direction of the speed
- * reference, and in STALL_TIME_US the speed error has become neither smaller nor larger than before by a 128th of the
+ * reference, and in STALL_TIME_US the speed has become neither higher nor lower than before by a 128th of the
  * reference: a rotor that swings about a point is stalled, one that a larger load drives backwards faster and faster
  * leads to over-speed instead. A start that takes up to 12 s from standstill to the reference is none. A reference of 0
  * is held as long as the currents can be.
@@ -25,10 +25,10 @@ typedef struct {
 } stall_input_t;
 
 typedef struct {
-    uint32_t changed_us;                     /* when the error last left its range, or there was none */
-    int32_t error_least_q22, error_most_q22; /* range of the speed error's magnitude, rad/s, Q9.22 */
-    uint32_t backwards_us;                   /* when the rotor last turned against the reference */
-    bool vain;                               /* torque and speed of a stall at the last call */
+    uint32_t changed_us;             /* when the speed last left its range, or there was none */
+    int32_t lowest_q22, highest_q22; /* range of the speed in the direction of its reference, rad/s, Q9.22 */
+    uint32_t backwards_us;           /* when the rotor last turned against the reference */
+    bool vain;                       /* torque and speed of a stall at the last call */
 } stall_monitor_t;
 
 /* True when the rotor has been stalled for STALL_TIME_US at time_us. [background] */

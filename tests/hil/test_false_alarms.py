@@ -1,10 +1,11 @@
-"""Healthy drives that are no fault: each world is a seed of `tools/salient campaign --healthy` that tripped once."""
+"""Healthy drives that are no fault: most are a seed of `tools/salient campaign --healthy` that tripped once."""
 
 from __future__ import annotations
 
 import pytest
 
 from salient.experiments.campaign.runner import run_world, world
+from salient.experiments.compare.every_machine import EXAMPLES
 
 
 def expect_no_fault(seed: int, machine: str, controller: str, rate_hz: int) -> None:
@@ -38,3 +39,35 @@ def test_drift_of_slow_strokes_is_neither_an_encoder_ahead_nor_a_sensor(seed, ma
 
 def test_pulses_too_short_for_the_devices_are_no_frozen_encoder():
     expect_no_fault(7015, "traction", "paper", 40_000)
+
+
+def test_pulses_too_short_for_the_devices_at_100_khz_are_no_open_phase(make_bench):
+    bench = make_bench(machine="finite_element", controller="salient", control_rate_hz=100_000)
+    bench.drive.parameters["pulses_per_period"] = 1
+    bench.drive.speed_reference_rpm = 150
+    bench.run_for(0.13)
+    bench.load_torque_Nm = 8.0
+    bench.run_for(0.1)
+    assert bench.drive.state == "run"
+    assert 149 < bench.truth["speed_rpm"].last < 151
+
+
+@pytest.mark.parametrize("angle_deg", [12.0, 84.0, 204.0])
+def test_a_heavy_rotor_before_its_first_count_at_100_khz_is_no_frozen_encoder(make_bench, angle_deg):
+    bench = make_bench(machine=EXAMPLES / "traction.toml", controller="paper", control_rate_hz=100_000,
+                       encoder_bits=11, initial_angle_deg=angle_deg)
+    bench.rig.inertia_gain = 1.7
+    bench.drive.speed_reference_rpm = 60
+    bench.run_for(0.05)
+    assert bench.drive.state == "run"
+    assert 50 < bench.truth["speed_rpm"].last < 70
+
+
+def test_a_start_along_a_ramp_at_the_torque_limit_is_no_stall(make_bench):
+    bench = make_bench(machine="saturating", controller="traditional")
+    bench.rig.inertia_gain = 3.0
+    bench.drive.parameters["speed_ramp_rpm_s"] = 17_000
+    bench.drive.speed_reference_rpm = 3000
+    bench.run_for(0.4)
+    assert bench.drive.state == "run"
+    assert 800 < bench.truth["speed_rpm"].last < 2000

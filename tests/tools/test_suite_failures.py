@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from salient.bench.failure import changes
+from salient.experiments.compare.every_machine import EXAMPLES
 
 SUITE = '''
 import os, signal
@@ -139,9 +140,11 @@ def test_failure_leaves_its_folder_and_replays(suite, name):
 
 
 def test_teardown_that_fails_after_the_call_has_a_folder_of_its_own(tmp_path):
+    machine = EXAMPLES / "fan12.toml"
     (tmp_path / "test_two.py").write_text(
-        "import pytest\n"
-        "@pytest.fixture\ndef broken(bench):\n    yield bench\n    raise RuntimeError('second')\n"
+        "import pathlib, pytest\n"
+        "@pytest.fixture\ndef broken(make_bench):\n"
+        f"    yield make_bench(machine=pathlib.Path({str(machine)!r}))\n    raise RuntimeError('second')\n"
         "def test_both(broken):\n    broken.run_for(0.01)\n    assert False, 'first'\n")
     subprocess.run([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", tmp_path], cwd=tmp_path,
                    capture_output=True, text=True)
@@ -149,6 +152,8 @@ def test_teardown_that_fails_after_the_call_has_a_folder_of_its_own(tmp_path):
               for path in (tmp_path / "build" / "failures").rglob("failure.json")}
     assert set(errors) == {"test_two.py_test_both", "test_two.py_test_both_teardown"}
     assert "first" in errors["test_two.py_test_both"] and "second" in errors["test_two.py_test_both_teardown"]
+    note = json.loads((tmp_path / "build" / "failures" / "test_two.py_test_both" / "0" / "bench.json").read_text())
+    assert note["machine"] == str(machine)
 
 
 def test_passed_test_leaves_nothing(tmp_path, bench):

@@ -188,12 +188,12 @@ class PhaseMonitorInTurn : public PhaseMonitor {
     }
 };
 
-TEST_F(PhaseMonitorInTurn, one_phase_that_differs_at_its_angle_is_a_fault_within_two_electrical_revolutions) {
+TEST_F(PhaseMonitorInTurn, one_phase_that_differs_at_its_angle_for_20_ms_is_a_fault) {
     for (const int direction : {1, -1}) {
         monitor = {};
         const int periods = periods_with(1, 3, direction);
-        EXPECT_GT(periods, 256) << direction;
-        EXPECT_LT(periods, 512) << direction;
+        EXPECT_GT(periods, 20 * 40) << direction;
+        EXPECT_LT(periods, 22 * 40) << direction;
         EXPECT_EQ(failed, FAULT_BIT(FAULT_PHASE_OPEN)) << direction;
     }
 }

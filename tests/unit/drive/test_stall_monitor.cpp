@@ -70,6 +70,23 @@ TEST_F(Stall, rotor_that_swings_faster_than_at_half_of_the_reference_is_stalled_
     EXPECT_EQ(time_to_fault_us(1000000, [&](uint32_t us) { input.speed_q22 = once_q22(us); }), 0u);
 }
 
+TEST_F(Stall, rotor_that_follows_a_reference_which_rises_as_fast_is_not_stalled_and_one_that_stands_is) {
+    const auto rising_q22 = [](uint32_t us) { return static_cast<int32_t>(int64_t{300} * RAD_S * us / 300000); };
+    const auto both_rise = [&](uint32_t us) {
+        input.speed_reference_q22 = 60 * RAD_S + rising_q22(us);
+        input.speed_q22 = rising_q22(us) / 4;
+    };
+    EXPECT_EQ(time_to_fault_us(300000, both_rise), 0u);
+    const auto lags_behind = [&](uint32_t us) {
+        input.speed_reference_q22 = 200 * RAD_S + rising_q22(us) / 8;
+        input.speed_q22 = rising_q22(us) / 8;
+    };
+    EXPECT_EQ(time_to_fault_us(300000, lags_behind), 0u);
+    const auto stands = [&](uint32_t us) { input.speed_reference_q22 = 60 * RAD_S + rising_q22(us); };
+    input.speed_q22 = 0;
+    EXPECT_EQ(time_to_fault_us(300000, stands), 101000u);
+}
+
 TEST_F(Stall, start_of_12_s_is_none) {
     EXPECT_EQ(time_to_fault_us(
                   12000000,

@@ -45,7 +45,7 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
         about["first_fault"] = {"fault": name, "time_s": time_s, "changes": changes(session, time_s)}
     simulator = getattr(session, "simulator", None)
     if config is not None:
-        about |= {"seed": config.seed, "machine": config.machine, "node": config.node}
+        about |= {"seed": config.seed, "machine": str(config.machine), "node": config.node}
     if simulator is not None:
         about |= {"simulator": shlex.join(simulator.command), "stderr": simulator.errors}
     about |= {"view": f"{COMMAND} view --replay {shlex.quote(str(folder))}"} | notes

@@ -37,6 +37,10 @@ def pool_file() -> Path:
     return path
 
 
+TORQUE_COMMAND_FRACTION_BITS = 16
+"""Of DRIVE_TORQUE_COMMAND.torque_reference_Nm, where the unit is 1 N m."""
+
+
 def _line(path: Path) -> str:
     machine = load_machine(path)
     scaling = scaling_of(path, machine)
@@ -44,7 +48,7 @@ def _line(path: Path) -> str:
     lsb_rpm = float(SPEED_LSB_RPM) * 2.0**scaling.exponents.speed
     values = (data.speed_base_rpm, data.torque_rated_Nm, data.parameters["torque_max_Nm"], data.over_speed_rpm,
               data.bus_over_voltage_V, data.bus_under_voltage_V, data.current_trip_A, lsb_rpm,
-              scaling.speed_reference_max * lsb_rpm)
+              scaling.speed_reference_max * lsb_rpm, 2.0**(scaling.exponents.torque - TORQUE_COMMAND_FRACTION_BITS))
     rate_min_hz = max(scaling.control_rate_min_hz(machine), data.control_rate_hz if data.control_rate_hz > 50000 else 0)
     return " ".join([str(machine_image(str(path))), *(f"{value:.17g}" for value in values), str(rate_min_hz),
                      machine.name])
