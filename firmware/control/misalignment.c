@@ -158,6 +158,10 @@ static int32_t band_pass_step(misalignment_band_t *band, int32_t value_q24, int3
     return band->value_q24;
 }
 
+static bool learns_beyond_load(const misalignment_parameters_t *parameters, const misalignment_t *misalignment) {
+    return misalignment->beyond_load_steps >= MOVING_SETTLES * parameters->settle_updates;
+}
+
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                               unsigned phases, int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16) {
     /* A quarter of the sum over the phases, which fits. */
@@ -177,7 +181,7 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
         misalignment->beyond_load_steps = 0;
     } else if (misalignment->common_rate == MISALIGNMENT_RATE_NONE || stroke_part_q16 < STROKE_PART_MIN_Q16) {
         return;
-    } else if (misalignment->beyond_load_steps < MOVING_SETTLES * parameters->settle_updates) {
+    } else if (!learns_beyond_load(parameters, misalignment)) {
         misalignment->beyond_load_steps++;
         return;
     }
@@ -190,4 +194,29 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
         limited_step_q10(fixed_multiply_shift(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));
     const int64_t step_q40 = fixed_product(step_q10, parameters->common_rate_q30);
     misalignment->common_sum_q40 += learning ? step_q40 : step_q40 >> MOVING_SHIFT;
+}
+
+void misalignment_end_stroke(const misalignment_parameters_t *parameters, misalignment_t *misalignment, bool changed,
+                             bool rougher) {
+    const bool forget = changed && (rougher || learns_beyond_load(parameters, misalignment));
+    if (forget) {
+        for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
+            misalignment_phase_t *phase = &misalignment->phase[i];
+            phase->offset_q40 = phase->before_q40 = phase->before_last_q40;
+            phase->common_sum_q40 = misalignment->common_sum_q40;
+        }
+        return;
+    }
+    for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
+        misalignment_phase_t *phase = &misalignment->phase[i];
+        phase->before_last_q40 = phase->before_q40;
+        phase->before_q40 = phase->offset_q40;
+    }
+}
+
+void misalignment_keep(misalignment_t *misalignment) {
+    for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
+        misalignment_phase_t *phase = &misalignment->phase[i];
+        phase->before_last_q40 = phase->before_q40 = phase->offset_q40;
+    }
 }

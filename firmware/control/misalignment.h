@@ -30,6 +30,11 @@
  * A load that moves has little in that band from 50 strokes a second on, so that the common angle is learned under it,
  * after 1.2 s at a quarter of the rate.
  *
+ * A load that changes within a stroke teaches until the end of that stroke shows it (stroke_mean.h). What was learned
+ * in that stroke and the one before it is then forgotten: any change of the load forgets what was learned under a load
+ * that moves, and what was learned under a constant one only if the load's course within the stroke has grown, because
+ * learning makes that flatter, and itself changes the mean.
+ *
  * s_j is filtered by the observer's present bandwidth. Learning of the phases is suspended unless speed and load are
  * steady, the torque is above 1 N m and the voltage is not limited; a large misalignment itself disturbs every stroke,
  * and is learned between these disturbances.
@@ -55,11 +60,12 @@ typedef struct {
 
 typedef struct {
     int32_t slope_lag1_q24, slope_lag2_q24,
-        slope_mean_q24;     /* s_j after one filter, two, and mean: N m per 0.02 rad, Q7.24 */
-    int64_t last_sum_q24;   /* disturbance_sum_q24 at the last update of the phase */
-    int64_t offset_q40;     /* delta_j in 0.02 rad, within +-3.5 (4 degrees) */
-    int64_t common_sum_q40; /* of misalignment_t, at the last update of the phase */
-    int32_t offset;         /* delta_j, 2^-32 electrical rev, to subtract from the phase's angle */
+        slope_mean_q24;                  /* s_j after one filter, two, and mean: N m per 0.02 rad, Q7.24 */
+    int64_t last_sum_q24;                /* disturbance_sum_q24 at the last update of the phase */
+    int64_t offset_q40;                  /* delta_j in 0.02 rad, within +-3.5 (4 degrees) */
+    int64_t common_sum_q40;              /* of misalignment_t, at the last update of the phase */
+    int64_t before_last_q40, before_q40; /* delta_j at the begin of the last stroke, and of this one */
+    int32_t offset;                      /* delta_j, 2^-32 electrical rev, to subtract from the phase's angle */
 } misalignment_phase_t;
 
 /* Of the common angle. */
@@ -132,5 +138,13 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
  * torque reference in N m, Q7.24; stroke_part_q16: part of a stroke since the last step, from 0; rounding as there. */
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                               unsigned phases, int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16);
+
+/* At the end of a stroke: forgets what was learned in it and in the one before, if it was of a load that has changed.
+ * changed, rougher: of stroke_mean_t. */
+void misalignment_end_stroke(const misalignment_parameters_t *parameters, misalignment_t *misalignment, bool changed,
+                             bool rougher);
+
+/* At the end of a run: what has been learned is not forgotten. */
+void misalignment_keep(misalignment_t *misalignment);
 
 #endif

@@ -8,6 +8,11 @@
 #define TOLERANCE_Q24 1677722u /* 0.1 N m */
 /* Disturbed strokes of equal mean from which on the machine disturbs itself. */
 #define REPEATED_STROKES 8u
+/* A stroke of at least 1/8 of the settling time is slow: the noise of its course is below the tolerance. */
+#define SLOW_PARTS 8u
+
+/* Of the number of strokes in Q32. */
+#define HALF_STROKE (UINT32_C(1) << 31)
 
 stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_rate_hz) {
     return (stroke_mean_parameters_t){.phases = phases, .settle_updates = update_rate_hz * SETTLE_MS / 1000u};
@@ -24,6 +29,11 @@ static bool differs(int32_t mean_q24, int32_t other_q24, uint32_t tolerance_q24)
     return fixed_magnitude(fixed_subtract(mean_q24, other_q24)) > tolerance_q24;
 }
 
+static void await_settling(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t updates) {
+    const uint32_t strokes = SETTLE_STROKES * updates;
+    mean->remaining = strokes > parameters->settle_updates ? strokes : parameters->settle_updates;
+}
+
 static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, int32_t torque_q24) {
     /* The sum is that of Q7.24 numbers: in units of 2^8 it fits in 32 bits for 2^8 updates, of 2^16 for 2^16. */
     const unsigned shift = mean->updates < 256 ? 8 : 16;
@@ -35,10 +45,18 @@ static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t
     const int32_t change_q24 = fixed_subtract(mean_q24, *constant_q24);
     *constant_q24 +=
         own_differs ? change_q24 : fixed_multiply(change_q24, following_q16(parameters, mean->updates), 16);
-    if (own_differs && differs(mean_q24, mean->changed_q24, tolerance_q24)) {
+    mean->changed = own_differs && differs(mean_q24, mean->changed_q24, tolerance_q24);
+    mean->ended = (stroke_mean_ended_t){
+        .half = fixed_magnitude((int32_t)(mean->half_sum_q24 >> shift)),
+        .quarter = fixed_magnitude((int32_t)(mean->quarter_sum_q24 >> shift)),
+        .shift = shift,
+        .updates = mean->updates,
+        .tolerance_q24 = tolerance_q24 / 2,
+        .phase = mean->stroke % HAL_PHASES_MAX,
+    };
+    if (mean->changed) {
         mean->changed_q24 = mean_q24;
-        const uint32_t strokes = SETTLE_STROKES * mean->updates;
-        mean->remaining = strokes > parameters->settle_updates ? strokes : parameters->settle_updates;
+        await_settling(parameters, mean, mean->updates);
         mean->disturbed_strokes = 0;
     } else if (mean->disturbed) {
         mean->disturbed_strokes += mean->disturbed_strokes < 3 * REPEATED_STROKES ? 2 : 0;
@@ -47,22 +65,47 @@ static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t
     }
     mean->undisturbed_stroke = !mean->disturbed;
     mean->disturbed = false;
-    mean->sum_q24 = 0;
+    mean->sum_q24 = mean->half_sum_q24 = mean->quarter_sum_q24 = 0;
     mean->updates = 0;
 }
 
 bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t electrical,
                       int32_t load_torque_q24, int32_t torque_q24, bool disturbed) {
-    const uint32_t stroke = (uint32_t)(((uint64_t)electrical * parameters->phases) >> 32);
+    const uint64_t strokes_q32 = (uint64_t)electrical * parameters->phases;
+    const uint32_t stroke = (uint32_t)(strokes_q32 >> 32);
     mean->remaining -= mean->remaining > 0;
     if ((stroke != mean->stroke && mean->updates >= STROKE_UPDATES_MIN) || mean->updates == UINT16_MAX) {
         end_stroke(parameters, mean, torque_q24);
     }
     mean->stroke = stroke;
     mean->sum_q24 += load_torque_q24;
+    mean->half_sum_q24 += (strokes_q32 & HALF_STROKE) == 0 ? load_torque_q24 : -(int64_t)load_torque_q24;
+    mean->quarter_sum_q24 += (strokes_q32 & HALF_STROKE / 2) == 0 ? load_torque_q24 : -(int64_t)load_torque_q24;
     mean->updates++;
     mean->disturbed |= disturbed;
     return mean->remaining == 0;
+}
+
+void stroke_mean_review(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean) {
+    const stroke_mean_ended_t *ended = &mean->ended;
+    const uint32_t course_q24 = (ended->half / 2 + ended->quarter / 2) / ended->updates << ended->shift;
+    uint32_t *flattest_q24 = &mean->flattest_q24[ended->phase];
+    const bool slow = ended->updates >= parameters->settle_updates / SLOW_PARTS;
+    const bool drifted = slow && course_q24 > *flattest_q24 && course_q24 - *flattest_q24 > ended->tolerance_q24;
+    *flattest_q24 = drifted || course_q24 < *flattest_q24 ? course_q24 : *flattest_q24;
+    const bool rougher = slow && course_q24 > mean->course_q24 + ended->tolerance_q24 / 2;
+    mean->rougher = drifted || rougher || mean->last_rougher;
+    mean->last_rougher = rougher;
+    mean->course_q24 = course_q24;
+    if (mean->changed) {
+        for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
+            mean->flattest_q24[i] = UINT32_MAX;
+        }
+    } else if (drifted) {
+        mean->changed = true;
+        mean->disturbed_strokes = 0;
+        await_settling(parameters, mean, ended->updates);
+    }
 }
 
 bool stroke_mean_shows_load(const stroke_mean_t *mean) {

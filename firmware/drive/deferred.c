@@ -95,6 +95,7 @@ NOINLINE static void follow_resets(const control_parameters_t *parameters, defer
         speed_pi_reset(&deferred->speed_pi);
         deferred->torque_offset = (torque_offset_t){0};
         periodic_load_reset(&deferred->periodic_load);
+        misalignment_keep(&deferred->misalignment);
     }
     if ((changed & OBSERVER_MASK) != 0) {
         deferred->bandwidth = (observer_bandwidth_statistics_t){0, 0};
@@ -311,7 +312,11 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         step_torque_offset(parameters, deferred, input);
         moving_load_review(&parameters->moving_load, &deferred->moving_load, input->load_torque_q24,
                            deferred->periodic_load.engaged);
-        if (!stroke_mean_ended(&deferred->stroke_mean)) { /* the end of a stroke has taken its time */
+        if (stroke_mean_to_review(&deferred->stroke_mean)) {
+            stroke_mean_review(&parameters->stroke_mean, &deferred->stroke_mean);
+            misalignment_end_stroke(&parameters->misalignment, &deferred->misalignment, deferred->stroke_mean.changed,
+                                    deferred->stroke_mean.rougher);
+        } else if (!stroke_mean_ended(&deferred->stroke_mean)) { /* both have taken their time */
             learn_periodic_load(parameters, deferred, input);
         }
         break;

@@ -28,6 +28,9 @@ double constant_share(double rpm, const std::function<double(double time_s, doub
         const double stroke = electrical_rev * PHASES;
         const bool now = stroke_mean_step(&parameters, &mean, angle_from_rev(electrical_rev),
                                           to_fixed(load_Nm(time_s, stroke), Q24), to_fixed(torque_Nm, Q24), false);
+        if (stroke_mean_to_review(&mean)) {
+            stroke_mean_review(&parameters, &mean);
+        }
         if (time_s >= from_s) {
             constant += now;
             updates++;
@@ -64,6 +67,33 @@ TEST(StrokeMean, a_load_that_moves_more_slowly_than_the_strokes_is_not_constant)
 TEST(StrokeMean, a_load_that_moves_by_little_from_stroke_to_stroke_is_not_constant) {
     const auto sine = [](double t, double) { return 8.0 + 4.0 * std::sin(2.0 * PI * t); };
     EXPECT_LT(constant_share(1500.0, sine, 8.0, 1.0, 3.0), 0.2);
+}
+
+TEST(
+    StrokeMean,
+    a_load_that_moves_with_nearly_the_frequency_of_slow_strokes_or_twice_that_is_constant_only_while_its_course_gets_flatter) {
+    const double strokes_hz = 50.0 / 60.0 * ROTOR_POLES * PHASES;
+    const auto sine = [](double frequency_hz) {
+        return [=](double t, double) { return 8.0 + 3.0 * std::sin(2.0 * PI * frequency_hz * t); };
+    };
+    for (const double ratio : {0.9, 1.06, 1.9, 2.1}) {
+        const double share = constant_share(50.0, sine(ratio * strokes_hz), 8.0, 1.0, 6.0);
+        EXPECT_GT(share, 0.3) << ratio;
+        EXPECT_LT(share, 0.6) << ratio;
+    }
+    EXPECT_EQ(constant_share(50.0, sine(strokes_hz), 8.0, 1.0, 6.0), 1.0);
+}
+
+TEST(StrokeMean, a_course_within_the_stroke_that_learning_makes_flatter_is_that_of_a_constant_load) {
+    const auto course = [](double amplitude_Nm, double decay_1_s) {
+        return [=](double t, double stroke) {
+            return 8.0 + amplitude_Nm * std::exp(-decay_1_s * t) * std::sin(2.0 * PI * stroke);
+        };
+    };
+    for (const double rpm : {20.0, 50.0}) {
+        EXPECT_EQ(constant_share(rpm, course(3.0, 1.0), 8.0, 2.0, 6.0), 1.0) << rpm;
+        EXPECT_LT(constant_share(rpm, course(0.3, -0.7), 8.0, 2.0, 6.0), 0.9) << rpm;
+    }
 }
 
 TEST(StrokeMean, a_load_step_counts_for_150_ms_after_the_first_whole_stroke) {
