@@ -118,10 +118,10 @@ def draw(axes: Any, rows: Rows) -> None:
     axes.set_yticks(range(len(labels)), labels, fontsize="small")
     axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.set_xscale("log")
-    axes.set_xlim(left=0.0003)  # room for the legend
+    axes.set_xlim(left=0.0001)  # room for the legend
     axes.set_xlabel("longest time from the begin of a fault until the drive has reacted, ms")
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper left", fontsize="small")
+    axes.legend(loc="upper left", fontsize="x-small")
 
 
 def main(arguments: list[str]) -> int:

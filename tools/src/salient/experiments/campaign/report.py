@@ -145,7 +145,8 @@ def plot(path: Path) -> None:
         right.plot([note[name] for note in notes], range(len(labels)), marker, linestyle="none", label=what)
     for index, note in enumerate(notes):
         count = len(note["events"])
-        right.annotate(f"{count} event{'' if count == 1 else 's'}", (17, index), va="center", fontsize="small")
+        right.annotate(f"{count} event{'' if count == 1 else 's'}", (1.01, index), xycoords=("axes fraction", "data"),
+                       va="center", fontsize="small")
     right.set_yticks(range(len(labels)), [_wrapped(name) for name in labels], fontsize="small")
     right.set_ylim(len(labels) - 0.4, -0.6)
     right.set_xscale("log")
