@@ -197,8 +197,8 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
 }
 
 void misalignment_end_stroke(const misalignment_parameters_t *parameters, misalignment_t *misalignment, bool changed,
-                             bool rougher) {
-    const bool forget = changed && (rougher || learns_beyond_load(parameters, misalignment));
+                             bool grown) {
+    const bool forget = changed && (grown || learns_beyond_load(parameters, misalignment));
     if (forget) {
         for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
             misalignment_phase_t *phase = &misalignment->phase[i];

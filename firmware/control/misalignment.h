@@ -32,8 +32,8 @@
  *
  * A load that changes within a stroke teaches until the end of that stroke shows it (stroke_mean.h). What was learned
  * in that stroke and the one before it is then forgotten: any change of the load forgets what was learned under a load
- * that moves, and what was learned under a constant one only if the load's course within the stroke has grown, because
- * learning makes that flatter, and itself changes the mean.
+ * that moves, and what was learned under a constant one only if the load's amplitude within the stroke has grown,
+ * because learning reduces that, and itself changes the mean.
  *
  * s_j is filtered by the observer's present bandwidth. Learning of the phases is suspended unless speed and load are
  * steady, the torque is above 1 N m and the voltage is not limited; a large misalignment itself disturbs every stroke,
@@ -140,9 +140,9 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
                               unsigned phases, int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16);
 
 /* At the end of a stroke: forgets what was learned in it and in the one before, if it was of a load that has changed.
- * changed, rougher: of stroke_mean_t. */
+ * changed, grown: of stroke_mean_t. */
 void misalignment_end_stroke(const misalignment_parameters_t *parameters, misalignment_t *misalignment, bool changed,
-                             bool rougher);
+                             bool grown);
 
 /* At the end of a run: what has been learned is not forgotten. */
 void misalignment_keep(misalignment_t *misalignment);

@@ -8,7 +8,7 @@
 #define TOLERANCE_Q24 1677722u /* 0.1 N m */
 /* Disturbed strokes of equal mean from which on the machine disturbs itself. */
 #define REPEATED_STROKES 8u
-/* A stroke of at least 1/8 of the settling time is slow: the noise of its course is below the tolerance. */
+/* A stroke of at least 1/8 of the settling time is slow: the noise of its amplitude is below the tolerance. */
 #define SLOW_PARTS 8u
 
 /* Of the number of strokes in Q32. */
@@ -88,18 +88,19 @@ bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t 
 
 void stroke_mean_review(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean) {
     const stroke_mean_ended_t *ended = &mean->ended;
-    const uint32_t course_q24 = (ended->half / 2 + ended->quarter / 2) / ended->updates << ended->shift;
-    uint32_t *flattest_q24 = &mean->flattest_q24[ended->phase];
+    const uint32_t amplitude_q24 = (ended->half / 2 + ended->quarter / 2) / ended->updates << ended->shift;
+    uint32_t *least_amplitude_q24 = &mean->least_amplitude_q24[ended->phase];
     const bool slow = ended->updates >= parameters->settle_updates / SLOW_PARTS;
-    const bool drifted = slow && course_q24 > *flattest_q24 && course_q24 - *flattest_q24 > ended->tolerance_q24;
-    *flattest_q24 = drifted || course_q24 < *flattest_q24 ? course_q24 : *flattest_q24;
-    const bool rougher = slow && course_q24 > mean->course_q24 + ended->tolerance_q24 / 2;
-    mean->rougher = drifted || rougher || mean->last_rougher;
-    mean->last_rougher = rougher;
-    mean->course_q24 = course_q24;
+    const bool drifted =
+        slow && amplitude_q24 > *least_amplitude_q24 && amplitude_q24 - *least_amplitude_q24 > ended->tolerance_q24;
+    *least_amplitude_q24 = drifted || amplitude_q24 < *least_amplitude_q24 ? amplitude_q24 : *least_amplitude_q24;
+    const bool grown = slow && amplitude_q24 > mean->amplitude_q24 + ended->tolerance_q24 / 2;
+    mean->grown = drifted || grown || mean->last_grown;
+    mean->last_grown = grown;
+    mean->amplitude_q24 = amplitude_q24;
     if (mean->changed) {
         for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
-            mean->flattest_q24[i] = UINT32_MAX;
+            mean->least_amplitude_q24[i] = UINT32_MAX;
         }
     } else if (drifted) {
         mean->changed = true;

@@ -8,10 +8,10 @@
  * of the stroke after which the load counts as changed: the misalignment of the encoder is that of all phases, and at
  * 10 r/min each takes a second to come.
  *
- * A load that moves with nearly the frequency of the strokes, or twice that, has the same mean in each, but its course
- * within them drifts. Learning makes the course of a misalignment flatter. So below 53 strokes a second the load has
- * changed also when the course of a phase is rougher than the flattest that it has had under the present load. The
- * course is what the halves of the stroke differ by, and its quarters. */
+ * A load that moves with nearly the frequency of the strokes, or twice that, has the same mean in each, but its
+ * amplitude within them changes. Learning reduces the amplitude of a misalignment. So below 53 strokes a second the
+ * load has changed also when the amplitude in a phase's stroke is larger than the least that it has had under the
+ * present load. The amplitude is what the halves of the stroke differ by, and its quarters. */
 #ifndef CONTROL_STROKE_MEAN_H
 #define CONTROL_STROKE_MEAN_H
 
@@ -30,24 +30,24 @@ typedef struct {
     uint32_t half, quarter; /* magnitudes of the sums, N m, 2^shift of Q24 */
     unsigned shift;
     uint32_t updates;       /* in the sums; 0: no stroke has ended */
-    uint32_t tolerance_q24; /* of the course, N m, Q7.24 */
+    uint32_t tolerance_q24; /* of the amplitude, N m, Q7.24 */
     uint32_t phase;
 } stroke_mean_ended_t;
 
 /* All zero at the start. */
 typedef struct {
-    int64_t sum_q24;                       /* N m, Q24, since the stroke began */
-    int64_t half_sum_q24;                  /* the same of the halves of the stroke, the second one negative */
-    int64_t quarter_sum_q24;               /* of its quarters, the second and the last one negative */
-    uint32_t updates;                      /* in the sums */
-    uint32_t stroke;                       /* number of the stroke in the electrical revolution */
-    int32_t constant_q24[HAL_PHASES_MAX];  /* means that are compared with, N m, Q7.24 */
-    int32_t changed_q24;                   /* mean of the stroke that showed the last change, N m, Q7.24 */
-    uint32_t course_q24;                   /* of the last stroke: (|half| + |quarter|) / 2 in the mean, N m, Q7.24 */
-    uint32_t flattest_q24[HAL_PHASES_MAX]; /* course of the same phase under the present load */
-    bool changed;                          /* the load, in the stroke that ended last */
-    bool rougher;                          /* the course of that stroke or the one before has grown */
-    bool last_rougher;                     /* that of the stroke itself */
+    int64_t sum_q24;                      /* N m, Q24, since the stroke began */
+    int64_t half_sum_q24;                 /* the same of the halves of the stroke, the second one negative */
+    int64_t quarter_sum_q24;              /* of its quarters, the second and the last one negative */
+    uint32_t updates;                     /* in the sums */
+    uint32_t stroke;                      /* number of the stroke in the electrical revolution */
+    int32_t constant_q24[HAL_PHASES_MAX]; /* means that are compared with, N m, Q7.24 */
+    int32_t changed_q24;                  /* mean of the stroke that showed the last change, N m, Q7.24 */
+    uint32_t amplitude_q24;               /* of the last stroke: (|half| + |quarter|) / 2 in the mean, N m, Q7.24 */
+    uint32_t least_amplitude_q24[HAL_PHASES_MAX]; /* of each phase under the present load */
+    bool changed;                                 /* the load, in the stroke that ended last */
+    bool grown;                                   /* the amplitude, in that stroke or the one before */
+    bool last_grown;                              /* in that stroke itself */
     stroke_mean_ended_t ended;
     uint32_t remaining;         /* updates until the load is constant */
     uint32_t disturbed_strokes; /* of the present load, less the undisturbed ones since */
@@ -65,8 +65,8 @@ stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_
 bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t electrical,
                       int32_t load_torque_q24, int32_t torque_q24, bool disturbed);
 
-/* After an update for which stroke_mean_to_review: whether the course of the stroke that has ended shows another load,
- * which is then not constant for the same time. */
+/* After an update for which stroke_mean_to_review: whether the amplitude in the stroke that has ended shows another
+ * load, which is then not constant for the same time. */
 void stroke_mean_review(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean);
 
 /* True if a stroke has ended in the last update. */

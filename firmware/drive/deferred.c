@@ -315,7 +315,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         if (stroke_mean_to_review(&deferred->stroke_mean)) {
             stroke_mean_review(&parameters->stroke_mean, &deferred->stroke_mean);
             misalignment_end_stroke(&parameters->misalignment, &deferred->misalignment, deferred->stroke_mean.changed,
-                                    deferred->stroke_mean.rougher);
+                                    deferred->stroke_mean.grown);
         } else if (!stroke_mean_ended(&deferred->stroke_mean)) { /* both have taken their time */
             learn_periodic_load(parameters, deferred, input);
         }

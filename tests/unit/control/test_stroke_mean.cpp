@@ -71,7 +71,7 @@ TEST(StrokeMean, a_load_that_moves_by_little_from_stroke_to_stroke_is_not_consta
 
 TEST(
     StrokeMean,
-    a_load_that_moves_with_nearly_the_frequency_of_slow_strokes_or_twice_that_is_constant_only_while_its_course_gets_flatter) {
+    a_load_that_moves_with_nearly_the_frequency_of_slow_strokes_or_twice_that_is_constant_only_while_its_amplitude_decreases) {
     const double strokes_hz = 50.0 / 60.0 * ROTOR_POLES * PHASES;
     const auto sine = [](double frequency_hz) {
         return [=](double t, double) { return 8.0 + 3.0 * std::sin(2.0 * PI * frequency_hz * t); };
@@ -84,15 +84,15 @@ TEST(
     EXPECT_EQ(constant_share(50.0, sine(strokes_hz), 8.0, 1.0, 6.0), 1.0);
 }
 
-TEST(StrokeMean, a_course_within_the_stroke_that_learning_makes_flatter_is_that_of_a_constant_load) {
-    const auto course = [](double amplitude_Nm, double decay_1_s) {
+TEST(StrokeMean, an_amplitude_within_the_stroke_that_learning_reduces_is_that_of_a_constant_load) {
+    const auto decaying = [](double amplitude_Nm, double decay_1_s) {
         return [=](double t, double stroke) {
             return 8.0 + amplitude_Nm * std::exp(-decay_1_s * t) * std::sin(2.0 * PI * stroke);
         };
     };
     for (const double rpm : {20.0, 50.0}) {
-        EXPECT_EQ(constant_share(rpm, course(3.0, 1.0), 8.0, 2.0, 6.0), 1.0) << rpm;
-        EXPECT_LT(constant_share(rpm, course(0.3, -0.7), 8.0, 2.0, 6.0), 0.9) << rpm;
+        EXPECT_EQ(constant_share(rpm, decaying(3.0, 1.0), 8.0, 2.0, 6.0), 1.0) << rpm;
+        EXPECT_LT(constant_share(rpm, decaying(0.3, -0.7), 8.0, 2.0, 6.0), 0.9) << rpm;
     }
 }
 
