@@ -25,12 +25,6 @@ ALWAYS_INLINE int32_t applied_flux_period_q29(int32_t dc_link_voltage_q6, int32_
     return fixed_multiply_high(dc_link_voltage_q6 << 15, period_q40);
 }
 
-/* Vdc times the part of the devices' shortest pulse by which the applied voltage differs from the duty unnoticed: that
- * of 0.3 us in full multiples of 50 kHz, Wb, Q2.29; below, other errors are larger. */
-ALWAYS_INLINE int32_t applied_flux_short_pulse_q29(int32_t period_flux_q29, uint32_t rate_hz) {
-    return period_flux_q29 / 64 * (int32_t)(rate_hz / 50000u);
-}
-
 /* One period, which begins with the sample. duty_q15: acts in this period, -32768..32768; current_q9: A, Q7.9, below
  * 2^16; period_flux_q29: Vdc Ts, below 2^27; resistance_period_q40: R Ts, ohm s, Q-9.40. Both products are rounded to 1
  * LSB, the sum saturates. */

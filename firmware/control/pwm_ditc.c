@@ -34,7 +34,7 @@ pwm_ditc_setpoints_t pwm_ditc_setpoints(const machine_tables_t *tables, uint32_t
 }
 
 int32_t pwm_ditc_setpoint_q9(const pwm_ditc_setpoints_t *setpoints, int32_t torque_q24) {
-    const uint32_t shifted_q24 = (uint32_t)torque_q24 + (1u << SETPOINT_UNIT_BITS);
+    const uint32_t shifted_q24 = (uint32_t)fixed_non_negative(torque_q24) + (1u << SETPOINT_UNIT_BITS);
     const unsigned zeros = (unsigned)__builtin_clz(shifted_q24); /* 0..11 */
     const uint32_t mantissa = shifted_q24 << zeros << 1;         /* without the leading one */
     const uint16_t *entry = &setpoints->current_q9[4u * (31u - SETPOINT_UNIT_BITS - zeros) + (mantissa >> 30)];

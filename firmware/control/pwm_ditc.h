@@ -72,7 +72,8 @@ typedef struct {
 /* Current setpoints of a machine for a crossover angle of 2^31..2^32 - 1, 2^-32 electrical rev. */
 pwm_ditc_setpoints_t pwm_ditc_setpoints(const machine_tables_t *tables, uint32_t crossover_angle);
 
-/* Current setpoint in A, Q7.9, for a torque >= 0 in N m, Q7.24; interpolated linearly, rounded down. */
+/* Current setpoint in A, Q7.9, for a torque in N m, Q7.24; interpolated linearly, rounded down. A negative torque, as
+ * only a constant in a faulty memory makes it, is 0. */
 int32_t pwm_ditc_setpoint_q9(const pwm_ditc_setpoints_t *setpoints, int32_t torque_q24);
 
 /* Initial weights; no phase regulated. */

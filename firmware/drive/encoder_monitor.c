@@ -1,6 +1,5 @@
 #include "drive/encoder_monitor.h"
 
-#include "control/applied_flux.h"
 #include "control/machine_tables.h"
 #include "control/phase_map.h"
 #include "fixed/compiler.h"
@@ -50,8 +49,10 @@
 /* Time without a zero of the current after which an integral is too old to contradict the angle: 1/128 s. */
 #define AGE_SHIFT 7
 
-/* Part of the DC-link voltage that pulses too short for the devices do not make: 1/64. */
+/* Part of the DC-link voltage that pulses too short for the devices do not make: 1/64; before the rotor moves, the same
+ * at each multiple of a control rate. */
 #define PULSE_SHIFT 6
+#define PULSE_RATE_HZ 50000u
 
 /* Window for the speed: 1/2048 s. */
 #define WINDOW_SHIFT 11
@@ -109,9 +110,9 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
  * Q2.29. moves: the rotor has been seen to move in this run. */
 static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const encoder_monitor_input_t *input,
                         unsigned index, bool moves) {
-    const int32_t pulse_q29 = applied_flux_short_pulse_q29(input->flux_step_max_q29, parameters->rate_hz);
-    const int64_t error_q29 = (int64_t)parameters->flux_error_q29 + pulse_q29;
-    return (moves ? MOVING_FACTOR * error_q29 + (input->flux_step_max_q29 >> PULSE_SHIFT) : error_q29) +
+    const int64_t part_q29 = input->flux_step_max_q29 >> PULSE_SHIFT;
+    const int64_t error_q29 = parameters->flux_error_q29 + part_q29 * (parameters->rate_hz / PULSE_RATE_HZ);
+    return (moves ? MOVING_FACTOR * error_q29 + part_q29 : error_q29) +
            fixed_multiply_high(input->current_q9[index] << 12, parameters->resistance_error_q40);
 }
 

@@ -22,6 +22,10 @@
 /* Time for which a phase has to differ alone at high speed: a slipping encoder shows in the others soon. */
 #define DOUBT_MS 20u
 
+/* Control rate, in 1/ms, from which on pulses that are too short for the devices make the error of the voltage larger,
+ * and at each multiple of it again. */
+#define SHORT_PULSES_PER_MS 50u
+
 #define OPEN_SAMPLES 2u
 
 /* A current that should not be is judged after 1/4 ms. One that does not move is its sensor's error after this time; at
@@ -329,7 +333,7 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
         .step = (int32_t)(input->electrical - monitor->electrical),
         .offset_q9 = tables->current_range_q9 / 128,
         .delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)input->periods_per_ms),
-        .error_q29 = period_q29 / 64 + applied_flux_short_pulse_q29(period_q29, input->periods_per_ms * 1000u),
+        .error_q29 = period_q29 / 64 * (int32_t)(1 + input->periods_per_ms / SHORT_PULSES_PER_MS),
     };
 }
 

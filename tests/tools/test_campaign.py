@@ -98,6 +98,11 @@ def test_first_causes_that_were_wrong_once(seed: int, event: str, cause: int) ->
     assert result["causes"][0] == cause and result["violations"] == []
 
 
+def test_a_constant_in_a_faulty_memory_is_no_index_beyond_a_table() -> None:
+    result = run_world(85011)
+    assert result["violations"] == [] and result["causes"] == [23]  # memory
+
+
 def test_a_part_of_the_clients_commands_a_torque_for_some_time() -> None:
     torque_mode = [drawn for drawn in map(world, range(1, 31))
                    if any(event["event"] == "torque_reference" for event in drawn["events"])]

@@ -196,6 +196,14 @@ TEST_F(PwmDitc, the_pid_switches_over_when_the_outgoing_phase_is_depleted_and_st
     EXPECT_EQ(ditc.regulated, 1u);
 }
 
+TEST(PwmDitcSetpoints, of_a_negative_torque_is_that_of_none) {
+    const pwm_ditc_setpoints_t setpoints = pwm_ditc_setpoints(&machine_tables, electrical_angle(210.0));
+    for (const int32_t torque_q24 : {-1, -(1 << 24), INT32_MIN}) {
+        EXPECT_EQ(pwm_ditc_setpoint_q9(&setpoints, torque_q24), 0) << torque_q24;
+    }
+    EXPECT_GT(pwm_ditc_setpoint_q9(&setpoints, 1 << 24), 0);
+}
+
 TEST(PwmDitcSetpoints, are_the_currents_of_the_phase_map_within_2_percent_and_small_ones_within_a_third_of_an_ampere) {
     for (const double angle_deg : {180.0, 210.0, 255.0, 300.0}) {
         const pwm_ditc_setpoints_t setpoints = pwm_ditc_setpoints(&machine_tables, electrical_angle(angle_deg));
