@@ -135,6 +135,9 @@ static int run_seed(const arguments_t *arguments, uint64_t seed) {
         fprintf(stderr, "salient: %s: %s\n", arguments->frames_file, strerror(errno));
         return EXIT_USAGE;
     }
+    if (record) {
+        setvbuf(record, NULL, _IOLBF, 0); /* what was sent before a crash */
+    }
     if (run_begin(&run, &world, &drive, record)) {
         run_to_end(&run);
         print_result();

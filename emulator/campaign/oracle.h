@@ -16,7 +16,7 @@
  *   over_speed      a gate on for 2 ms at a speed above the limit by 2 %
  *   over_voltage    a gate on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no
  *                   energy back, unless a fault of the only sensor hides it
- *   wrong_angle     in state run, encoder and processor healthy, at a speed that is steady within 10 % for 2 ms and 16
+ *   wrong_angle     in state run, encoder and processor healthy, at a speed that is steady within 10 % for 12 ms and 16
  *                   counts of the encoder: the measured angle off the encoder's by more than three quarters of a count
  *                   and the motion in a tick of the timer, on average. The middle of a count is off by half of one at
  *                   most, when sampling is in step with the counts, the time of an edge by a tick
@@ -64,7 +64,8 @@ typedef struct {
 
 /* Motion at a steady speed, over which the error of the measured angle is averaged. */
 typedef struct {
-    unsigned samples; /* 0: begins with the next one */
+    uint64_t settled_ns; /* not before, after the speed has changed */
+    unsigned samples;    /* 0: begins with the next one */
     uint64_t begin_ns;
     double begin_counts; /* of the encoder, continued over revolutions */
     double speed_rad_s;  /* at the begin */
@@ -129,7 +130,7 @@ void oracle_on_fault(oracle_t *oracle, const plant_t *plant, unsigned kind, bool
 /* At the begin of the recovery: the speed to be commanded, r/min. */
 double oracle_recovery_speed_rpm(oracle_t *oracle, const plant_t *plant);
 
-/* At the end. */
-void oracle_finish(oracle_t *oracle, const plant_t *plant);
+/* At the end. switch_C: temperature of the hottest switch. */
+void oracle_finish(oracle_t *oracle, const plant_t *plant, double switch_C);
 
 #endif

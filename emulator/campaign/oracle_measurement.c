@@ -8,7 +8,8 @@
 #define STRETCH_COUNTS 16.0
 #define STRETCH_MIN_NS (2 * ORACLE_MS_NS)
 #define STRETCH_MAX_NS (32 * ORACLE_MS_NS)
-#define STRETCH_SPEED 0.1 /* change of the speed, at most */
+#define STRETCH_SPEED 0.1                      /* change of the speed, at most */
+#define STRETCH_SETTLED_NS (10 * ORACLE_MS_NS) /* after a larger one the drive still has to observe the speed */
 #define ANGLE_ERROR_MAX_COUNTS 0.75
 #define TIMER_TICK_S 5e-9
 #define MEASUREMENT_ERROR_MAX 0.008 /* of the full scale: sixteen times the largest noise */
@@ -69,9 +70,16 @@ static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
     const double true_rev = plant->rotor_angle_rad / ORACLE_TWO_PI + oracle->encoder_offset_rev;
     const double counts = true_rev * counts_per_rev;
     const bool steady = fabs(plant->speed_rad_s - stretch->speed_rad_s) <= STRETCH_SPEED * fabs(stretch->speed_rad_s);
-    if (stretch->samples == 0 || !steady || plant->time_ns > stretch->begin_ns + STRETCH_MAX_NS) {
-        *stretch =
-            (oracle_stretch_t){.begin_ns = plant->time_ns, .begin_counts = counts, .speed_rad_s = plant->speed_rad_s};
+    const bool ended = stretch->samples == 0 || plant->time_ns > stretch->begin_ns + STRETCH_MAX_NS;
+    if (!steady || (ended && plant->time_ns >= stretch->settled_ns)) {
+        stretch->settled_ns = steady ? stretch->settled_ns : plant->time_ns + STRETCH_SETTLED_NS;
+        *stretch = (oracle_stretch_t){.settled_ns = stretch->settled_ns,
+                                      .begin_ns = plant->time_ns,
+                                      .begin_counts = counts,
+                                      .speed_rad_s = plant->speed_rad_s};
+    }
+    if (plant->time_ns < stretch->settled_ns) {
+        return;
     }
     const double error_rev = ldexp((double)oracle->drive.angle, -32) - true_rev;
     stretch->error_counts += (error_rev - floor(error_rev + 0.5)) * counts_per_rev;

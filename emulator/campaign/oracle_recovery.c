@@ -7,6 +7,10 @@
 
 #define OBSERVED_S 1e-3 /* time constant of a speed that is observed */
 
+/* A switch that a short circuit has heated further takes away torque, from the limit of 100 C on the run, until it has
+ * cooled. */
+#define SWITCH_COOL_C 80.0
+
 double oracle_recovery_speed_rpm(oracle_t *oracle, const plant_t *plant) {
     const world_machine_t *machine = oracle->world->machine;
     const double now_rpm = plant->speed_rad_s * ORACLE_RPM_PER_RAD_S;
@@ -92,9 +96,10 @@ void oracle_enter_run(oracle_t *oracle, const plant_t *plant) {
     oracle->settle_by_ns = plant->time_ns + (uint64_t)((0.1 + needed_s) * 1e9);
 }
 
-void oracle_finish(oracle_t *oracle, const plant_t *plant) {
+void oracle_finish(oracle_t *oracle, const plant_t *plant, double switch_C) {
     oracle->held = held_by_encoder(oracle, plant);
-    if (oracle->held || !oracle->recovery_judged || cause_remains(oracle) || oracle_bus_disturbed(oracle)) {
+    if (oracle->held || !oracle->recovery_judged || cause_remains(oracle) || oracle_bus_disturbed(oracle) ||
+        switch_C > SWITCH_COOL_C) {
         return;
     }
     if (!oracle->recovered) {

@@ -1,5 +1,7 @@
 #include "campaign/run.h"
 
+#include <math.h>
+
 static void look(void *context, const plant_t *plant) {
     oracle_look(&((run_t *)context)->oracle, plant);
 }
@@ -71,6 +73,14 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
     return true;
 }
 
+static double hottest_C(const heat_bodies_t *bodies) {
+    double temperature_C = bodies->temperature_C[0];
+    for (unsigned phase = 1; phase < HAL_PHASES_MAX; phase++) {
+        temperature_C = fmax(temperature_C, bodies->temperature_C[phase]);
+    }
+    return temperature_C;
+}
+
 void run_to_end(run_t *run) {
     const uint64_t recovery_ns = run->world->recovery_us * 1000;
     bool recovers = recovery_ns > 0;
@@ -87,6 +97,6 @@ void run_to_end(run_t *run) {
         }
     }
     rig_finish(&run->rig);
-    oracle_finish(&run->oracle, &run->rig.plant);
+    oracle_finish(&run->oracle, &run->rig.plant, hottest_C(&run->rig.heat.inverter));
     rig_close(&run->rig);
 }

@@ -9,16 +9,21 @@
 #include "rig/memory_object.h"
 
 /* Bit of the objects in drive_t, counted from the lowest of the first byte on: the same one on every target, which are
- * all little endian. Without effect on another object. */
+ * all little endian, and lay the objects out alike. Without effect on another object, and beyond its end. */
 static inline void memory_flip(drive_t *drive, memory_object_t object, uint32_t bit) {
-    void *const objects[MEMORY_OBJECTS] = {
-        [MEMORY_LIMITS] = &drive->control_parameters.protection,
-        [MEMORY_CONSTANTS] = &drive->control_parameters,
-        [MEMORY_STATE] = &drive->control.state_machine.state,
-        [MEMORY_FAULT_LATCH] = &drive->control.state_machine.record.fault,
+    control_parameters_t *const constants = &drive->control_parameters;
+    state_machine_t *const state_machine = &drive->control.state_machine;
+    const struct {
+        void *begin;
+        size_t bytes;
+    } objects[MEMORY_OBJECTS] = {
+        [MEMORY_LIMITS] = {&constants->protection, sizeof constants->protection},
+        [MEMORY_CONSTANTS] = {constants, sizeof *constants},
+        [MEMORY_STATE] = {&state_machine->state, sizeof state_machine->state},
+        [MEMORY_FAULT_LATCH] = {&state_machine->record.fault, sizeof state_machine->record.fault},
     };
-    if (objects[object]) {
-        ((uint8_t *)objects[object])[bit / 8u] ^= (uint8_t)(1u << bit % 8u);
+    if (bit / 8u < objects[object].bytes) {
+        ((uint8_t *)objects[object].begin)[bit / 8u] ^= (uint8_t)(1u << bit % 8u);
     }
 }
 

@@ -90,6 +90,7 @@ typedef struct {
     uint8_t speed_exponent;        /* w, 0..3 */
     uint16_t current_range_q9;     /* full scale of the current sensors, A, unsigned Q7.9 */
     uint16_t voltage_range_q6;     /* full scale of the DC-link voltage divider, V, unsigned Q10.6 */
+    uint16_t minimum_pulse_ns;     /* of the converter; shorter pulses and gaps of a switch do not act, 0..2000 */
     int32_t current_slew_rate_A_s; /* di/dt at the unaligned position: supply voltage / inductance */
     /* The last row twice: the look-up compares two. */
     machine_row_t row[MACHINE_ROWS + 1];

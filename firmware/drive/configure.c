@@ -122,6 +122,8 @@ static encoder_monitor_parameters_t encoder_monitor_from(const control_parameter
         .commutation = control->commutation,
         .half_count = control->encoder_middle * rotor_poles,
         .middle = control->encoder_middle,
+        .advance_min = (int32_t)(control->commutation.stroke / rotor_poles / ENCODER_MONITOR_ADVANCE_STROKES +
+                                 ENCODER_MONITOR_ADVANCE_COUNTS * 2u * control->encoder_middle),
         .angle_max = DEGREE * angle_deg * rotor_poles,
         .flux_error_q29 = encoder_monitor_flux_error_q29(
             load_observer_acceleration(values[PARAMETER_TORQUE_MAX_NM], values[PARAMETER_INERTIA_KG_M2]),

@@ -56,11 +56,12 @@ typedef enum {
     TORQUE_LAW_PREDICTIVE  /* torque sharing, predictive flux control, BP-PID trim */
 } torque_law_t;
 
-/* Constant while the drive runs; derived from the user's parameters by configure_control. */
+/* Constant while the drive runs; derived from the user's parameters by configure_control. Enumerations have 8 bits: the
+ * same layout with every ABI, so that a check of it finds the same error at the same time on every target. */
 typedef struct {
-    drive_controller_t controller; /* for telemetry; the laws below are its parts */
-    speed_law_t speed_law;
-    torque_law_t torque_law;
+    drive_controller_t controller : 8; /* for telemetry; the laws below are its parts */
+    speed_law_t speed_law : 8;
+    torque_law_t torque_law : 8;
     uint8_t edge_age_shift;          /* of an encoder edge's age: 13, on a fast machine or with a slow clock more */
     int32_t speed_reference_min_q22; /* rad/s, Q9.22: 0 for a single-quadrant controller, else INT32_MIN */
     bool interleaved_pwm;            /* two voltage pulses per period */

@@ -1,5 +1,6 @@
 #include "drive/encoder_monitor.h"
 
+#include "control/applied_flux.h"
 #include "control/machine_tables.h"
 #include "control/phase_map.h"
 #include "fixed/compiler.h"
@@ -12,9 +13,10 @@
 /* Error of the flux linkage by the shape of the tables: 1/64. */
 #define SHAPE_SHIFT 6
 
-/* Once the rotor has been seen to move in a run, a larger error of the voltage is none: the currents follow the torque,
- * and pulses that are too short for the devices act in some periods and not in others. */
+/* Once the rotor has been seen to move in a run, a larger error of the voltage is none, twice that and 1/64 of the
+ * DC-link voltage: the currents follow the torque, and their pulses change. */
 #define MOVING_FACTOR 2
+#define MOVING_SHIFT 6
 
 /* Error of the flux linkage by gains of sensors and machine: 1/8. */
 #define GAIN_SHIFT 3
@@ -38,21 +40,11 @@
  * have within a quarter of a second (SHOWN_SHIFT), the contradiction of one alone is not the encoder's. */
 #define AGREES_SHIFT 10
 
-/* Part of a stroke that the rotor advances within 1/256 s when it brings the next phase within 1/4 s; and counts of the
- * encoder that show it. */
-#define ADVANCE_STROKES 64u
-#define ADVANCE_COUNTS 2u
-
 /* Time for which a contradiction waits for the next phase: 1/64 s. */
 #define WAIT_SHIFT 6
 
 /* Time without a zero of the current after which an integral is too old to contradict the angle: 1/128 s. */
 #define AGE_SHIFT 7
-
-/* Part of the DC-link voltage that pulses too short for the devices do not make: 1/64; before the rotor moves, the same
- * at each multiple of a control rate. */
-#define PULSE_SHIFT 6
-#define PULSE_RATE_HZ 50000u
 
 /* Window for the speed: 1/2048 s. */
 #define WINDOW_SHIFT 11
@@ -110,9 +102,10 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
  * Q2.29. moves: the rotor has been seen to move in this run. */
 static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const encoder_monitor_input_t *input,
                         unsigned index, bool moves) {
-    const int64_t part_q29 = input->flux_step_max_q29 >> PULSE_SHIFT;
-    const int64_t error_q29 = parameters->flux_error_q29 + part_q29 * (parameters->rate_hz / PULSE_RATE_HZ);
-    return (moves ? MOVING_FACTOR * error_q29 + part_q29 : error_q29) +
+    const int64_t error_q29 = (int64_t)parameters->flux_error_q29 +
+                              applied_flux_missing_q29(input->flux_step_max_q29, machine_tables.minimum_pulse_ns,
+                                                       parameters->rate_hz / 1000u);
+    return (moves ? MOVING_FACTOR * error_q29 + (input->flux_step_max_q29 >> MOVING_SHIFT) : error_q29) +
            fixed_multiply_high(input->current_q9[index] << 12, parameters->resistance_error_q40);
 }
 
@@ -158,8 +151,8 @@ static void refer(encoder_monitor_phase_t *phase, const encoder_monitor_input_t 
                   int32_t excess_q29, int32_t table_q29) {
     phase->referred = true;
     phase->current_q9 = input->current_q9[index];
-    phase->excess_q29 = excess_q29;
-    phase->table_q29 = table_q29;
+    phase->excess_q29 = phase->last_excess_q29 = excess_q29;
+    phase->table_q29 = phase->last_table_q29 = table_q29;
     phase->referred_at = input->period;
     phase->zero_at = input->zero_at[index];
     phase->moved = 0;
@@ -185,7 +178,14 @@ static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_mo
     const int32_t change_q29 = fixed_abs(fixed_subtract(excess_q29, phase->excess_q29));
     const int32_t tolerance_q29 = drift_q29 + (range.most_q29 - range.least_q29) + (table_q29 >> SHAPE_SHIFT) +
                                   (fixed_abs(table_q29 - phase->table_q29) >> GAIN_SHIFT);
-    if (change_q29 > tolerance_q29 / 2 && change_q29 > (int64_t)fastest_parting_q29(parameters, input) * age) {
+    /* At another angle the tables err by a part of what the current has changed. */
+    const int32_t jump_q29 = fixed_abs(fixed_subtract(excess_q29, phase->last_excess_q29)) -
+                             fixed_abs(table_q29 - phase->last_table_q29) / 2;
+    phase->last_excess_q29 = excess_q29;
+    phase->last_table_q29 = table_q29;
+    const int64_t fastest_q29 = fastest_parting_q29(parameters, input);
+    if ((change_q29 > tolerance_q29 / 2 && change_q29 > fastest_q29 * age) ||
+        (jump_q29 > tolerance_q29 / 2 && jump_q29 > fastest_q29 * periods)) {
         refer(phase, input, index, excess_q29, table_q29);
         return false;
     }
@@ -264,9 +264,7 @@ static bool others_agree(const encoder_monitor_parameters_t *parameters, encoder
 /* True while the encoder shows a rotor that turns the way the torque drives it. */
 static bool advances(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                      const encoder_monitor_input_t *input) {
-    const commutation_parameters_t *commutation = &parameters->commutation;
-    const int32_t least = (int32_t)(commutation->stroke / commutation->rotor_poles / ADVANCE_STROKES +
-                                    ADVANCE_COUNTS * 2u * parameters->middle);
+    const int32_t least = parameters->advance_min;
     const int32_t travel = (int32_t)(input->encoder_angle - monitor->waypoint);
     const int32_t advance = input->torque_q24 < 0 ? fixed_subtract(0, travel) : travel;
     if (advance < 0 || advance >= least) {

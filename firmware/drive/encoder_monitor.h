@@ -28,6 +28,11 @@
 #define ENCODER_MONITOR_ANGLE_DEG 2u
 #define ENCODER_MONITOR_LEARNED_DEG 4u
 
+/* Part of a stroke that the rotor advances within 1/256 s when it brings the next phase within 1/4 s; and counts of the
+ * encoder that show it. */
+#define ENCODER_MONITOR_ADVANCE_STROKES 64u
+#define ENCODER_MONITOR_ADVANCE_COUNTS 2u
+
 /* Error of the resistance that is none, a part of it: a winding 120 K warmer than its parameter has 47 % more. */
 #define ENCODER_MONITOR_RESISTANCE_PART 2
 
@@ -35,6 +40,7 @@ typedef struct {
     commutation_parameters_t commutation;
     uint32_t half_count;          /* of the encoder, 2^-32 electrical rev */
     uint32_t middle;              /* of a count, 2^-32 rev */
+    int32_t advance_min;          /* of a rotor that soon brings the next phase, 2^-32 rev */
     uint32_t angle_max;           /* error of the angle that is none, 2^-32 electrical rev */
     int32_t flux_error_q29;       /* of the integral in a period, encoder_monitor_flux_error_q29() */
     int32_t resistance_error_q40; /* of the resistance, times the control period, ohm s, Q-9.40 */
@@ -60,11 +66,13 @@ typedef struct {
 
 /* Of a phase. */
 typedef struct {
-    bool referred;         /* current to zero_at are set */
-    bool shown;            /* the angle was contradicted for long enough, last in the period shown_at */
-    int32_t current_q9;    /* at the reference, the largest since the count, A, Q7.9 */
-    int32_t excess_q29;    /* of the integral over the tables at the reference, with a leak, Wb, Q2.29 */
-    int32_t table_q29;     /* flux linkage by the tables, likewise */
+    bool referred;           /* current to zero_at are set */
+    bool shown;              /* the angle was contradicted for long enough, last in the period shown_at */
+    int32_t current_q9;      /* at the reference, the largest since the count, A, Q7.9 */
+    int32_t excess_q29;      /* of the integral over the tables at the reference, with a leak, Wb, Q2.29 */
+    int32_t table_q29;       /* flux linkage by the tables, likewise */
+    int32_t last_excess_q29; /* of the last sample, Wb, Q2.29 */
+    int32_t last_table_q29;
     uint32_t referred_at;  /* period of the reference */
     uint32_t zero_at;      /* of the integral then */
     uint32_t moved;        /* periods for which they have parted */

@@ -22,10 +22,6 @@
 /* Time for which a phase has to differ alone at high speed: a slipping encoder shows in the others soon. */
 #define DOUBT_MS 20u
 
-/* Control rate, in 1/ms, from which on pulses that are too short for the devices make the error of the voltage larger,
- * and at each multiple of it again. */
-#define SHORT_PULSES_PER_MS 50u
-
 #define OPEN_SAMPLES 2u
 
 /* A current that should not be is judged after 1/4 ms. One that does not move is its sensor's error after this time; at
@@ -80,6 +76,7 @@ static bool small(const common_t *common, unsigned phase) {
 typedef enum {
     AGREES,
     DOUBTFUL,      /* agrees within the tolerances, with hardly a current */
+    NEARLY,        /* agrees within them, but not within half of them */
     WITHIN_ANGLES, /* differs at the measured angle */
     BEYOND_ANGLES  /* differs at any */
 } difference_t;
@@ -107,17 +104,23 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
     }
     const uint32_t distance = distance_of(common->input, phase);
     const uint32_t far = distance + ANGLE_TOLERANCE;
-    if (high_q29 > most_q29(common, far < HALF_REV ? far : HALF_REV - 1, current_q9, common->offset_q9)) {
+    const int32_t highest_q29 = most_q29(common, far < HALF_REV ? far : HALF_REV - 1, current_q9, common->offset_q9);
+    if (high_q29 > highest_q29) {
         *side = 1;
         /* What tables of a wrong angle have added shows no more than an angle. */
         const int32_t by_voltage_q29 = fixed_subtract(high_q29, fixed_non_negative(state->followed_q29));
         return by_voltage_q29 > most_q29(common, HALF_REV - 1, current_q9, 0) ? BEYOND_ANGLES : WITHIN_ANGLES;
     }
-    if (low_q29 < least_q29(common, distance > ANGLE_TOLERANCE ? distance - ANGLE_TOLERANCE : 0, current_q9)) {
+    const int32_t lowest_q29 =
+        least_q29(common, distance > ANGLE_TOLERANCE ? distance - ANGLE_TOLERANCE : 0, current_q9);
+    if (low_q29 < lowest_q29) {
         *side = -1;
         return low_q29 < least_q29(common, 0, current_q9) ? BEYOND_ANGLES : WITHIN_ANGLES;
     }
-    return is_small && high_q29 > table_q29 ? DOUBTFUL : AGREES;
+    if (is_small) {
+        return high_q29 > table_q29 ? DOUBTFUL : AGREES;
+    }
+    return high_q29 > table_q29 / 2 + highest_q29 / 2 || low_q29 < table_q29 / 2 + lowest_q29 / 2 ? NEARLY : AGREES;
 }
 
 /* Flux linkage that the opposite voltage removes within a period. */
@@ -227,8 +230,9 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     if (common->input->run && !common->lost && !off) {
         difference = compare(common, state, phase, &side);
         monitor->agreed |= (uint32_t)(difference == AGREES && !small(common, phase)) << phase;
+        monitor->nearly |= (uint32_t)(difference == NEARLY) << phase;
     }
-    monitor->suspicious |= difference != AGREES;
+    monitor->suspicious |= difference != AGREES && difference != NEARLY;
     const bool beyond = difference == BEYOND_ANGLES;
     state->turned =
         side == 0 || side != state->side ? 0 : fixed_saturate((int64_t)state->turned + fixed_abs(common->step));
@@ -247,13 +251,14 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
 }
 
 /* Differences that an angle may explain: the phase's, when it alone has them within an electrical revolution and
- * DOUBT_MS, in which all others have conducted without; else they decide nothing here, and may be the encoder's. */
+ * DOUBT_MS, in which all others have conducted within half of the tolerances; else they decide nothing here, and may be
+ * the encoder's. */
 static uint32_t judge_doubts(const common_t *common, phase_monitor_t *monitor) {
     const unsigned phases = common->tables->phases;
     if (monitor->doubted == 0) {
         monitor->doubted_at = common->input->periods;
         monitor->doubt_turned_q24 = 0;
-        monitor->agreed = 0;
+        monitor->agreed = monitor->nearly = 0;
         return 0;
     }
     monitor->doubt_turned_q24 = fixed_add(monitor->doubt_turned_q24, common->step / 256);
@@ -263,8 +268,8 @@ static uint32_t judge_doubts(const common_t *common, phase_monitor_t *monitor) {
     }
     const uint32_t doubted = monitor->doubted;
     monitor->doubted = 0;
-    const uint32_t agreed = monitor->agreed;
-    monitor->agreed = 0;
+    const uint32_t agreed = monitor->agreed & ~monitor->nearly;
+    monitor->agreed = monitor->nearly = 0;
     const uint32_t all = (1u << phases) - 1u;
     if ((doubted & (doubted - 1u)) != 0 || ((doubted | agreed | monitor->lost) & all) != all) {
         return 0;
@@ -333,7 +338,8 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
         .step = (int32_t)(input->electrical - monitor->electrical),
         .offset_q9 = tables->current_range_q9 / 128,
         .delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)input->periods_per_ms),
-        .error_q29 = period_q29 / 64 * (int32_t)(1 + input->periods_per_ms / SHORT_PULSES_PER_MS),
+        .error_q29 =
+            period_q29 / 64 + applied_flux_missing_q29(period_q29, tables->minimum_pulse_ns, input->periods_per_ms),
     };
 }
 

@@ -9,8 +9,8 @@
  *   encoder_angle   a current that is only too large because the tables, at a wrong angle, have emptied the integral
  *
  * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical; resistance 50 % and
- * voltage 1/64 since the phase was at rest, at most over 10 ms, twice that at small currents; from 50 kHz on also what
- * pulses too short for the devices do not make; a quarter of psi that has been removed since; and psi of a period and
+ * voltage 1/64 since the phase was at rest, at most over 10 ms, twice that at small currents; what pulses too
+ * short for the devices do not make; a quarter of psi that has been removed since; and psi of a period and
  * 20 us at the DC-link voltage, for the delays of sensor and switches. At a current of up to 4/128 of its range, a
  * small one, phase_open counts only what more than this tolerance of the voltage has built up since the current was
  * larger.
@@ -89,6 +89,7 @@ typedef struct {
     uint32_t doubted;         /* bit of each phase with a difference that an angle may explain */
     int doubted_side;         /* of the last one */
     uint32_t agreed;          /* bit of each phase that has conducted without a difference since */
+    uint32_t nearly;          /* of each phase that was beyond half of the tolerances since */
     uint32_t doubted_at;      /* period of the first one */
     int32_t doubt_turned_q24; /* rotation since the first one, electrical rev, Q7.24 */
     uint32_t lost;            /* bit of each phase that stays off, phase_monitor_lose() */

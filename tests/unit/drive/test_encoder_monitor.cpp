@@ -29,6 +29,8 @@ class EncoderMonitor : public testing::Test {
         parameters.commutation = commutation_configure(&angles, PHASES, POLES);
         parameters.half_count = (1u << 14) * POLES;
         parameters.middle = 1u << 14;
+        parameters.advance_min = int32_t(0x1p32 / PHASES / POLES / ENCODER_MONITOR_ADVANCE_STROKES) +
+                                 int32_t(ENCODER_MONITOR_ADVANCE_COUNTS * 2 * parameters.middle);
         parameters.angle_max = uint32_t(2 * DEGREE) * POLES;
         parameters.flux_error_q29 = encoder_monitor_flux_error_q29(
             load_observer_acceleration(to_fixed(19.1, Q24), to_fixed(0.02, Q30)), 26 << 9, model.angle_step_q32, POLES);

@@ -155,6 +155,8 @@ TABLES = Structure("machine_tables_t", (
         scaling.data.adc_current_A, 9 - scaling.exponents.current, 17)),
     Member("voltage_range_q6", "uint16_t", lambda machine, scaling, tables: quantise(
         scaling.data.adc_voltage_V, 6 - scaling.exponents.voltage, 17)),
+    Member("minimum_pulse_ns", "uint16_t", lambda machine, scaling, tables: quantise(
+        machine.converter["minimum_pulse_ns"], 0, 17)),
     Member("current_slew_rate_A_s", "int32_t", lambda machine, scaling, tables: quantise(
         machine.current_rise_A_s, -scaling.exponents.current, 32)),
     Member("row", "machine_row_t", lambda machine, scaling, tables: tables.phase_map.rows(), (ROWS + 1,)),

@@ -155,8 +155,9 @@ def run_replay(options: argparse.Namespace) -> int:
     again = replay(seed, kept, healthy, folder, options.build, programs)
     for violation in again.campaign["violations"]:
         print(f"violation: {names.violation(violation)} at {violation['at_us']} us")
-    causes = ", ".join(names.causes().get(cause, str(cause)) for cause in again.campaign["causes"])
+    causes = ", ".join(names.causes().get(cause, str(cause)) for cause in again.campaign.get("causes", []))
     print(f"first causes: {causes or 'none'}")
-    print(f"hash {again.hash}, {'equal to' if again.equal else 'NOT that of'} the campaign's; log and plot: {folder}")
+    result = f"hash {again.hash}" if again.hash else "the emulator crashed"
+    print(f"{result}, {'equal to' if again.equal else 'NOT that of'} the campaign's; log and plot: {folder}")
     return 0 if again.equal and not again.campaign["violations"] else 1
 

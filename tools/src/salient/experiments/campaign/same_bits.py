@@ -20,9 +20,10 @@ from salient.experiments.tasks import Task, run
 def hashes(task: tuple[int, str]) -> dict[str, Any]:
     """Of a seed, one for each run; task: seed, target. For workers."""
     seed, target = task
-    first = str(run_world(seed)["hash"])
+    first = str(run_world(seed).get("hash", "crash"))
     bench, on_target = replay(seed), replay(seed, build=target)
-    return {"seed": seed, "target": target, "hash": first, "again": str(bench.campaign["hash"]), "bench": bench.hash,
+    again = str(bench.campaign.get("hash", "crash"))
+    return {"seed": seed, "target": target, "hash": first, "again": again, "bench": bench.hash,
             "on_target": on_target.hash}
 
 
