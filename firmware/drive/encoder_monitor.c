@@ -221,6 +221,25 @@ static bool contradicts(const encoder_monitor_parameters_t *parameters, encoder_
     return true;
 }
 
+/* True from a current that moves without a voltage, at the smallest inductance and beyond what the rotor's motion does,
+ * until the phase is without current again: a connection or sensor that fails for a moment leaves the integral wrong.
+ */
+static bool interrupted(encoder_monitor_phase_t *phase, const encoder_monitor_input_t *input, unsigned index,
+                        uint32_t periods) {
+    const int32_t moved_q9 = fixed_abs(input->current_q9[index] - phase->last_current_q9);
+    const int64_t moved_q29 = fixed_abs(fixed_subtract(input->flux_q29[index], phase->last_flux_q29));
+    if (phase->conducts &&
+        phase_map_flux_q29(&machine_tables, 0, moved_q9) > moved_q29 + (int64_t)input->flux_step_max_q29 * periods) {
+        phase->interrupted = true;
+        phase->interrupted_zero_at = input->zero_at[index];
+    }
+    phase->conducts = true;
+    phase->last_current_q9 = input->current_q9[index];
+    phase->last_flux_q29 = input->flux_q29[index];
+    phase->interrupted = phase->interrupted && phase->interrupted_zero_at == input->zero_at[index];
+    return phase->interrupted;
+}
+
 static void forget_references(encoder_monitor_t *monitor) {
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         monitor->phase[phase].referred = false;
@@ -287,7 +306,11 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
     monitor->suspicious = false;
     for (unsigned index = 0; index < machine_tables.phases; index++) {
         encoder_monitor_phase_t *phase = &monitor->phase[index];
-        if (input->known[index] && input->current_q9[index] >= parameters->current_min_q9) {
+        const bool conducts = input->current_q9[index] >= parameters->current_min_q9;
+        if (!conducts) {
+            phase->conducts = false;
+        }
+        if (conducts && input->known[index] && !interrupted(phase, input, index, periods)) {
             const uint32_t angle = electrical - index * parameters->commutation.stroke;
             monitor->frozen |= !counted && has_moved(parameters, phase, input, angle, index, periods, monitor->counted);
             monitor->suspicious |= contradicts(parameters, phase, input, angle, index, periods);

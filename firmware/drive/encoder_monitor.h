@@ -73,9 +73,13 @@ typedef struct {
     int32_t table_q29;       /* flux linkage by the tables, likewise */
     int32_t last_excess_q29; /* of the last sample, Wb, Q2.29 */
     int32_t last_table_q29;
-    uint32_t referred_at;  /* period of the reference */
-    uint32_t zero_at;      /* of the integral then */
-    uint32_t moved;        /* periods for which they have parted */
+    uint32_t referred_at; /* period of the reference */
+    uint32_t zero_at;     /* of the integral then */
+    uint32_t moved;       /* periods for which they have parted */
+    bool conducts;        /* in the last call; then: */
+    int32_t last_current_q9, last_flux_q29;
+    bool interrupted; /* by a current that moved without a voltage, when this zero was the last one: */
+    uint32_t interrupted_zero_at;
     uint32_t contradicted; /* periods for which the angle has been contradicted */
     uint32_t shown_at;
     uint32_t shown_from; /* period since which it has been shown */
