@@ -16,7 +16,11 @@
 /* Once the rotor has been seen to move in a run, a larger error of the voltage is none, twice that and 1/64 of the
  * DC-link voltage: the currents follow the torque, and their pulses change. */
 #define MOVING_FACTOR 2
-#define MOVING_SHIFT 6
+#define PART_SHIFT 6
+
+/* In short periods the other parts of the tolerances, which are of a period's flux linkage, are small: another 1/64 of
+ * the DC-link voltage at each multiple of this rate. */
+#define SHORT_PERIOD_HZ 50000u
 
 /* Error of the flux linkage by gains of sensors and machine: 1/8. */
 #define GAIN_SHIFT 3
@@ -102,10 +106,12 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
  * Q2.29. moves: the rotor has been seen to move in this run. */
 static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const encoder_monitor_input_t *input,
                         unsigned index, bool moves) {
-    const int64_t error_q29 = (int64_t)parameters->flux_error_q29 +
-                              applied_flux_missing_q29(input->flux_step_max_q29, machine_tables.minimum_pulse_ns,
-                                                       parameters->rate_hz / 1000u);
-    return (moves ? MOVING_FACTOR * error_q29 + (input->flux_step_max_q29 >> MOVING_SHIFT) : error_q29) +
+    const int32_t part_q29 = input->flux_step_max_q29 >> PART_SHIFT;
+    const int32_t missing_q29 = applied_flux_missing_q29(input->flux_step_max_q29, machine_tables.minimum_pulse_ns,
+                                                         parameters->rate_hz / 1000u);
+    const int32_t short_q29 = part_q29 * (int32_t)(parameters->rate_hz / SHORT_PERIOD_HZ);
+    const int64_t error_q29 = (int64_t)parameters->flux_error_q29 + (missing_q29 > short_q29 ? missing_q29 : short_q29);
+    return (moves ? MOVING_FACTOR * error_q29 + part_q29 : error_q29) +
            fixed_multiply_high(input->current_q9[index] << 12, parameters->resistance_error_q40);
 }
 

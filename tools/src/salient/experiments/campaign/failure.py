@@ -115,7 +115,7 @@ def _send(bench: Bench, lines: list[str]) -> None:
                 bench.send(message)
             else:
                 other.send(message)
-    except (SessionError, EmulatorError):
+    except (SessionError, can.CanError):
         pass
     finally:
         other.shutdown()
