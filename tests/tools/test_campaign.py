@@ -14,10 +14,11 @@ from salient.experiments import fault_table
 from salient.experiments.campaign import canaries, names, report, same_bits
 from salient.experiments.campaign.cluster import compare
 from salient.experiments.campaign.command import run_campaign
-from salient.experiments.campaign.failure import replay
+from salient.experiments.campaign.failure import classes, replay
 from salient.experiments.campaign.machines import files
-from salient.experiments.campaign.runner import branches, run_world, world
+from salient.experiments.campaign.runner import Programs, branches, program, run_world, world
 from salient.experiments.tasks import read_results
+from salient.paths import BUILD
 
 
 def salient(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -91,7 +92,10 @@ def test_warm_windings_of_small_machines_are_no_false_alarm(seed: int) -> None:
 
 @pytest.mark.parametrize(("seed", "event", "cause"), [
     (301469, "switch_shorted", 17),  # phase_shorted
-    (412370, "encoder_slip", 18)])   # encoder_angle
+    (412370, "encoder_slip", 18),    # encoder_angle
+    (129150, "encoder_lost_counts", 18),
+    (1003288, "current_sensor_offset", 16),  # phase_open
+    (1045084, "winding_open", 17)])  # fmt: skip
 def test_first_causes_that_were_wrong_once(seed: int, event: str, cause: int) -> None:
     assert event in [drawn["event"] for drawn in world(seed)["events"]]
     result = run_world(seed)
@@ -101,6 +105,24 @@ def test_first_causes_that_were_wrong_once(seed: int, event: str, cause: int) ->
 def test_a_constant_in_a_faulty_memory_is_no_index_beyond_a_table() -> None:
     result = run_world(85011)
     assert result["violations"] == [] and result["causes"] == [23]  # memory
+
+
+def test_torque_of_a_heavy_rotor_before_the_first_count_is_no_frozen_encoder() -> None:
+    result = run_world(96986)  # pulses of a large machine at 40 kHz, shorter than its devices act on
+    assert result["violations"] == [] and result["causes"] == [23]
+
+
+def test_a_crash_is_replayed_as_one(tmp_path: Path) -> None:
+    campaign, host = tmp_path / "salient_campaign", tmp_path / "salient_host"
+    crash = json.dumps({"seed": 5, "violations": [{"rule": "crash", "number": 11, "at_us": 0, "value": 0}]})
+    campaign.write_text(f"#!/bin/sh\n{program()} \"$@\" > {tmp_path}/result\necho '{crash}'\n", encoding="utf-8")
+    host.write_text("#!/bin/sh\nkill -SEGV $$\n", encoding="utf-8")
+    for script in (campaign, host):
+        script.chmod(0o755)
+    again = replay(5, programs=Programs(campaign, host))
+    assert again.hash == "" and again.equal and classes(again.campaign) == ["crash"]
+    only_there = replay(5, programs=Programs(campaign, BUILD / "host" / "bin" / "salient_host"))
+    assert len(only_there.hash) == 16 and not only_there.equal
 
 
 def test_a_part_of_the_clients_commands_a_torque_for_some_time() -> None:

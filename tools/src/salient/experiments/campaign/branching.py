@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from salient.experiments.campaign import names
+from salient.experiments.campaign.arguments import count
+from salient.experiments.campaign.arguments import parser as parser_of
 from salient.experiments.campaign.command import commit
 from salient.experiments.campaign.runner import branches, processor_s
 
@@ -125,11 +127,11 @@ def draw(axes: Any, rows: Rows) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    if len(arguments) not in (1, 2) or not (arguments[1:] or ["1"])[0].isdigit():
-        print("usage: python -m salient.experiments.campaign.branching DIR [EVERY]", file=sys.stderr)
-        return 2
-    out = Path(arguments[0])
-    rows = run(out, int((arguments[1:] or ["1"])[0]))
+    parser = parser_of("branching", __doc__)
+    parser.add_argument("every", type=count, nargs="?", default=1, metavar="EVERY", help="interrupts (default 1)")
+    options = parser.parse_args(arguments)
+    out: Path = options.out
+    rows = run(out, options.every)
     print("\n".join(table(rows)))
     of_all = totals([row for lines in rows.values() for row in lines])
     print(f"{of_all['branches']} branches, {of_all['virtual_s']:.0f} s of virtual time, "

@@ -22,6 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from salient.errors import RunFailed
+from salient.experiments.campaign.arguments import count
+from salient.experiments.campaign.arguments import parser as parser_of
 from salient.experiments.campaign.failure import classes, save
 from salient.experiments.campaign.runner import Programs, processor_s, run_world, run_worlds
 from salient.paths import BUILD, ROOT
@@ -147,14 +149,17 @@ def line(note: dict[str, Any]) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    if not arguments or not all(argument.isdigit() for argument in arguments[1:]):
-        print("usage: python -m salient.experiments.campaign.canaries DIR [NUMBER ...]", file=sys.stderr)
-        return 2
-    out = Path(arguments[0])
+    parser = parser_of("canaries", __doc__)
+    parser.add_argument("numbers", type=count, nargs="*", metavar="NUMBER", help="of canaries (default all)")
+    options = parser.parse_args(arguments)
+    unknown = [number for number in options.numbers if number > len(canaries())]
+    if unknown:
+        parser.error(f"{unknown[0]}: the canaries are 1 to {len(canaries())}")
+    out: Path = options.out
     out.mkdir(parents=True, exist_ok=True)
     file = out / RESULTS
     notes = {note["number"]: note for note in json.loads(file.read_text(encoding="utf-8"))} if file.exists() else {}
-    chosen = [int(argument) for argument in arguments[1:]] or range(1, len(canaries()) + 1)
+    chosen = options.numbers or range(1, len(canaries()) + 1)
     for number in chosen:
         notes[number] = measure(number, out)
         print(line(notes[number]), flush=True)

@@ -18,6 +18,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from salient.experiments.campaign.arguments import count
+from salient.experiments.campaign.arguments import parser as parser_of
 from salient.experiments.campaign.command import commit
 from salient.experiments.local_cluster import cluster
 
@@ -56,11 +58,12 @@ def compare(out: Path, first: int, seeds: int) -> dict[str, Any]:
 
 
 def main(arguments: list[str]) -> int:
-    if not 1 <= len(arguments) <= 3 or not all(number.isdigit() for number in arguments[1:]):
-        print("usage: python -m salient.experiments.campaign.cluster DIR [FIRST [SEEDS]]", file=sys.stderr)
-        return 2
-    out = Path(arguments[0])
-    first, seeds = (*map(int, arguments[1:]), *(1, 10000)[len(arguments) - 1:])
+    parser = parser_of("cluster", __doc__)
+    parser.add_argument("first", type=count, nargs="?", default=1, metavar="FIRST", help="seed (default 1)")
+    parser.add_argument("seeds", type=count, nargs="?", default=10000, metavar="SEEDS", help="number (default 10000)")
+    options = parser.parse_args(arguments)
+    out: Path = options.out
+    first, seeds = options.first, options.seeds
     note = compare(out, first, seeds)
     (out / "cluster.json").write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
     print(f"seeds {first} to {first + seeds - 1}: one of two workers killed after {note.get('killed_after')} results, "

@@ -97,8 +97,8 @@ def replay(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, folder: Pat
 
 
 def _send(bench: Bench, lines: list[str]) -> None:
-    """Sends the frames of both clients, each at its time, as long as the emulator runs: how it ended shows when the bench
-    is closed."""
+    """Sends the frames of both clients, each at its time, as long as the emulator runs: how it ended shows when the
+    bench is closed."""
     other = open_bus(bench.address)
     try:
         for line in lines:

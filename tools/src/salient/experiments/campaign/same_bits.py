@@ -9,9 +9,10 @@ true state. Results are JSON lines in DIR; those that it has are not run again. 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Any
 
+from salient.experiments.campaign.arguments import count
+from salient.experiments.campaign.arguments import parser as parser_of
 from salient.experiments.campaign.failure import replay
 from salient.experiments.campaign.runner import digest, run_world
 from salient.experiments.tasks import Task, run
@@ -33,14 +34,15 @@ def equal(result: dict[str, Any]) -> bool:
 
 
 def main(arguments: list[str]) -> int:
-    numbers = arguments[1:3]
-    if not 1 <= len(arguments) <= 4 or not all(number.isdigit() for number in numbers):
-        print("usage: python -m salient.experiments.campaign.same_bits DIR [FIRST [SEEDS [TARGET]]]", file=sys.stderr)
-        return 2
-    first, seeds = (*map(int, numbers), *(1, 100)[len(numbers):])
-    target = arguments[3] if len(arguments) == 4 else "cortex-m4"
+    parser = parser_of("same_bits", __doc__)
+    parser.add_argument("first", type=count, nargs="?", default=1, metavar="FIRST", help="seed (default 1)")
+    parser.add_argument("seeds", type=count, nargs="?", default=100, metavar="SEEDS", help="number (default 100)")
+    parser.add_argument("target", nargs="?", default="cortex-m4", choices=("cortex-m4", "rv32"), metavar="TARGET",
+                        help="cortex-m4 or rv32 (default cortex-m4)")
+    options = parser.parse_args(arguments)
+    first, seeds, target = options.first, options.seeds, options.target
     tasks = [Task(f"{target} {seed} {digest()}", (seed, target)) for seed in range(first, first + seeds)]
-    results = [result for _, result in run(tasks, hashes, Path(arguments[0]))]
+    results = [result for _, result in run(tasks, hashes, options.out)]
     different = [result["seed"] for result in results if not equal(result)]
     print(f"seeds {first} to {first + seeds - 1}: run twice on the host, on the bench and on {target}: "
           f"{len(results) - len(different)} of {len(results)} with equal bits")
