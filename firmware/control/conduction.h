@@ -34,7 +34,9 @@
  *
  * The torque is limited to T_mean. Braking torque, whose energy goes into the DC link, is reduced linearly where the
  * voltage approaches the over-voltage threshold: a chopper that cannot take more, or none, does not end in a fault. The
- * integral of the voltage's excess over the begin of that range reduces it, too, until the voltage stays there.
+ * range has room for the fields of the phases, which return to the link as the torque is taken away
+ * (tools/src/salient/machine/fold_back.py). The integral of the voltage's excess over the begin of that range, or over
+ * the chopper's where that is higher, reduces it, too, until the voltage stays there.
  *
  * The torque follows the reference once in a stroke. A speed law with a gain k of the order of the stroke rate f makes
  * every second pulse larger: the error is multiplied by 1 - k / f from stroke to stroke. From base speed on its gain is

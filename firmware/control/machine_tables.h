@@ -92,6 +92,10 @@ typedef struct {
     uint16_t voltage_range_q6;     /* full scale of the DC-link voltage divider, V, unsigned Q10.6 */
     uint16_t minimum_pulse_ns;     /* of the converter; shorter pulses and gaps of a switch do not act, 0..2000 */
     int32_t current_slew_rate_A_s; /* di/dt at the unaligned position: supply voltage / inductance */
+    /* Below the over-voltage threshold, in which braking torque decreases so that the DC link has room for the fields
+     * of the phases: by the voltage of each period, and by its mean. V, Q10.6; 0 for an ideal link. */
+    uint16_t fold_back_q6;
+    uint16_t mean_fold_back_q6;
     /* The last row twice: the look-up compares two. */
     machine_row_t row[MACHINE_ROWS + 1];
     uint8_t angle_bin_row[MACHINE_ANGLE_BINS]; /* row in which each angle bin begins */

@@ -254,11 +254,21 @@ static torque_sharing_parameters_t sharing_from(const int32_t *values, unsigned 
     };
 }
 
-static conduction_parameters_t conduction_from(const int32_t *values, unsigned phases, uint32_t control_rate_hz,
-                                               int32_t torque_min_q24) {
+/* The fields of the phases hardly raise a large DC link: a 32nd of the over-voltage threshold is the least range. */
+static int32_t fold_back_range_q6(int32_t over_voltage_q6, int32_t range_q6) {
+    return range_q6 > over_voltage_q6 / 32 ? range_q6 : over_voltage_q6 / 32;
+}
+
+static conduction_parameters_t conduction_from(const int32_t *values, const machine_tables_t *tables,
+                                               uint32_t control_rate_hz, int32_t torque_min_q24) {
+    const unsigned phases = tables->phases;
     const torque_sharing_parameters_t sharing = sharing_from(values, phases);
     const torque_sharing_window_t base_window = torque_sharing_window(&sharing, 0);
     const int32_t over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V];
+    const int32_t range_q6 = fold_back_range_q6(over_voltage_q6, tables->fold_back_q6);
+    const int32_t mean_range_q6 = fold_back_range_q6(over_voltage_q6, tables->mean_fold_back_q6);
+    /* A chopper is to have something left to take. */
+    const int32_t end_q6 = range_q6 / 2 < mean_range_q6 * 3 / 4 ? range_q6 / 2 : mean_range_q6 * 3 / 4;
     return (conduction_parameters_t){
         .sharing = sharing,
         .initial = conduction_initial(&base_window),
@@ -273,11 +283,11 @@ static conduction_parameters_t conduction_from(const int32_t *values, unsigned p
         .gain_per_step_q16 = (uint32_t)fixed_saturate(
             fixed_divide((int64_t)phases * control_rate_hz << 30,
                          (int64_t)DEFERRED_CONDUCTION_PERIODS * (values[PARAMETER_SMC_K] + 1))),
-        .braking_end_q6 = over_voltage_q6 - over_voltage_q6 / 128,
-        .fold_back_range_q6 = over_voltage_q6 / 32 - over_voltage_q6 / 128 + 1,
-        .full_link_q6 = over_voltage_q6 - over_voltage_q6 / 64,
-        .full_link_range_q6 = over_voltage_q6 / 64 + 1,
-        .full_link_slope_q18 = values[PARAMETER_TORQUE_MAX_NM] / (over_voltage_q6 / 64 + 1),
+        .braking_end_q6 = over_voltage_q6 - mean_range_q6 / 4,
+        .fold_back_range_q6 = mean_range_q6 - mean_range_q6 / 4 + 1,
+        .full_link_q6 = over_voltage_q6 - end_q6,
+        .full_link_range_q6 = range_q6 - end_q6 + 1,
+        .full_link_slope_q18 = values[PARAMETER_TORQUE_MAX_NM] / (range_q6 - end_q6 + 1),
     };
 }
 
@@ -419,7 +429,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             },
         .trim = trim_from(values),
         .predictive = predictive_from(values, tables->phases, control_rate_hz),
-        .conduction = conduction_from(values, tables->phases, control_rate_hz, torque_min_q24),
+        .conduction = conduction_from(values, tables, control_rate_hz, torque_min_q24),
         .misalignment = misalignment_configure(&(misalignment_settings_t){
             .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
             .control_rate_hz = control_rate_hz,

@@ -15,10 +15,12 @@ static bool pushes_in_vain(const stall_input_t *input, bool swings) {
 COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us) {
     const int32_t speed_q22 = input->speed_reference_q22 < 0 ? fixed_subtract(0, input->speed_q22) : input->speed_q22;
     const int32_t change_q22 = fixed_abs(input->speed_reference_q22) / 128;
-    const bool before = monitor->vain;
+    const bool forward = input->speed_reference_q22 > 0;
+    const bool before = monitor->vain && monitor->forward == forward;
     if ((input->speed_q22 ^ input->speed_reference_q22) < 0) {
         monitor->backwards_us = time_us;
     }
+    monitor->forward = forward;
     monitor->vain = pushes_in_vain(input, before && time_us - monitor->backwards_us <= STALL_TIME_US);
     if (!monitor->vain || !before) {
         monitor->lowest_q22 = monitor->highest_q22 = speed_q22;

@@ -5,7 +5,7 @@
  * reference, and in STALL_TIME_US the speed has become neither higher nor lower than before by a 128th of the
  * reference: a rotor that swings about a point is stalled, one that a larger load drives backwards faster and faster
  * leads to over-speed instead. A start that takes up to 12 s from standstill to the reference is none. A reference of 0
- * is held as long as the currents can be.
+ * is held as long as the currents can be. A reference that changes its sign begins anew.
  */
 #ifndef DRIVE_STALL_MONITOR_H
 #define DRIVE_STALL_MONITOR_H
@@ -28,6 +28,7 @@ typedef struct {
     uint32_t changed_us;             /* when the speed last left its range, or there was none */
     int32_t lowest_q22, highest_q22; /* range of the speed in the direction of its reference, rad/s, Q9.22 */
     uint32_t backwards_us;           /* when the rotor last turned against the reference */
+    bool forward;                    /* the speed reference at the last call */
     bool vain;                       /* torque and speed of a stall at the last call */
 } stall_monitor_t;
 

@@ -313,6 +313,38 @@ TEST(Configure, a_machine_whose_current_hardly_rises_gets_the_largest_gain_and_n
               INT32_MAX);
 }
 
+// V, at the default trip: begin and end of both ranges of the DC-link voltage in which braking torque decreases.
+TEST(Configure, braking_torque_decreases_over_the_last_32nd_of_the_voltage_or_over_the_ranges_of_the_machine) {
+    static machine_tables_t tables = machine_tables;
+    parameters_t parameters;
+    parameters_init(&parameters);
+    const double trip_V = parameters.values[PARAMETER_BUS_OVER_VOLTAGE_V] / 64.0;
+    struct {
+        double range_V, mean_V, begin_V, end_V, mean_begin_V, mean_end_V;
+    } const rows[] = {
+        {0.0, 0.0, 1.0 / 32, 1.0 / 64, 1.0 / 32, 1.0 / 128},
+        {0.01, 0.005, 1.0 / 32, 1.0 / 64, 1.0 / 32, 1.0 / 128},
+        {0.08, 0.08, 0.08, 0.04, 0.08, 0.02},
+        {0.12, 0.10, 0.12, 0.06, 0.10, 0.025},
+        {0.12, 0.06, 0.12, 0.045, 0.06, 0.015}, // a chopper above the middle
+    };
+    for (const auto &row : rows) {
+        tables.fold_back_q6 = uint16_t(row.range_V * trip_V * 64.0);
+        tables.mean_fold_back_q6 = uint16_t(row.mean_V * trip_V * 64.0);
+        const conduction_parameters_t c =
+            configure_control(&parameters, &tables, 40000, 17, 12, fixed_point::TIMER_CLOCK_HZ).conduction;
+        const auto below_trip = [&](int32_t voltage_q6) { return 1.0 - voltage_q6 / 64.0 / trip_V; };
+        EXPECT_NEAR(below_trip(c.full_link_q6 - c.full_link_range_q6), row.begin_V, 3e-4);
+        EXPECT_NEAR(below_trip(c.full_link_q6), row.end_V, 3e-4);
+        EXPECT_NEAR(below_trip(c.braking_end_q6 - c.fold_back_range_q6), row.mean_begin_V, 3e-4);
+        EXPECT_NEAR(below_trip(c.braking_end_q6), row.mean_end_V, 3e-4);
+        const int32_t begin_q6 = c.full_link_q6 - c.full_link_range_q6;
+        EXPECT_EQ(conduction_braking_q24(&c, c.full_link_q6), 0);
+        EXPECT_EQ(conduction_braking_q24(&c, begin_q6 - 1), INT32_MAX);
+        EXPECT_NEAR(conduction_braking_q24(&c, begin_q6), parameters.values[PARAMETER_TORQUE_MAX_NM], 2e-3 * (1 << 24));
+    }
+}
+
 TEST(Configure, the_rotation_since_an_edge_is_right_for_every_clock_and_on_the_fastest_machine) {
     const machine_tables_t bundled = machine_tables;
     parameters_t parameters;

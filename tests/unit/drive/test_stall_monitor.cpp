@@ -57,6 +57,20 @@ TEST_F(Stall, rotor_that_the_load_drives_backwards_faster_and_faster_is_not_stal
               0u);
 }
 
+// Before the reversal it accelerates at the limit: the range of the speeds, in the direction of the reference, is then
+// that on the other side of standstill.
+TEST_F(Stall, rotor_that_reverses_while_it_accelerates_is_not_stalled_and_one_that_then_stands_is) {
+    const auto reverses = [this](uint32_t us, uint32_t stops_us) {
+        const bool back = us >= 100000;
+        input.speed_reference_q22 = back ? -60 * RAD_S : 60 * RAD_S;
+        input.torque_reference_q24 = back ? -19 * NM : 19 * NM;
+        const int64_t way_us = us < stops_us ? us : stops_us;
+        input.speed_q22 = static_cast<int32_t>((back ? 200000 - way_us : way_us) * 29 / 100 * RAD_S / 1000);
+    };
+    EXPECT_EQ(time_to_fault_us(380000, [&](uint32_t us) { reverses(us, UINT32_MAX); }), 0u);
+    EXPECT_NEAR(time_to_fault_us(380000, [&](uint32_t us) { reverses(us, 150000); }), 250000, 3000);
+}
+
 TEST_F(Stall, rotor_that_swings_without_progress_is_stalled) {
     EXPECT_NEAR(time_to_fault_us(
                     1000000, [this](uint32_t us) { input.speed_q22 = us / 1000 % 20 < 10 ? 3 * RAD_S : -3 * RAD_S; }),

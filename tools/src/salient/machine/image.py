@@ -30,6 +30,7 @@ from salient.machine.firmware_tables import (
     machine_phase_map,
 )
 from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS, FluxMap
+from salient.machine.fold_back import fold_back_V, mean_fold_back_V
 from salient.machine.heat import thermal_constants
 from salient.machine.magnetics import FORMULA_KEYS
 from salient.machine.partial_pulse import PARTS
@@ -159,6 +160,10 @@ TABLES = Structure("machine_tables_t", (
         machine.converter["minimum_pulse_ns"], 0, 17)),
     Member("current_slew_rate_A_s", "int32_t", lambda machine, scaling, tables: quantise(
         machine.current_rise_A_s, -scaling.exponents.current, 32)),
+    Member("fold_back_q6", "uint16_t", lambda machine, scaling, tables: quantise(
+        fold_back_V(machine, scaling.data), 6 - scaling.exponents.voltage, 17)),
+    Member("mean_fold_back_q6", "uint16_t", lambda machine, scaling, tables: quantise(
+        mean_fold_back_V(machine, scaling.data), 6 - scaling.exponents.voltage, 17)),
     Member("row", "machine_row_t", lambda machine, scaling, tables: tables.phase_map.rows(), (ROWS + 1,)),
     Member("angle_bin_row", "uint8_t", lambda machine, scaling, tables: tables.phase_map.angle_bin_row(),
            (ANGLE_BINS,)),

@@ -1,0 +1,46 @@
+"""Voltage ranges of the DC link in which braking torque decreases: the fields of the phases return to it as well.
+
+A phase that carries the current limit in the aligned position holds the field W. From V on it raises the capacitor to
+sqrt(V^2 + 2 W / C), near the over-voltage threshold V_max by about
+
+    rise = W / (C V_max)
+
+Torque and field of a phase decrease together, whether it is saturated or not. Without a chopper braking torque
+decreases from 2 rise below V_max on, and there is none within the last rise; a chopper takes a part in the meantime,
+and 3/4 of both suffice. The range is no more than the room above the supply: a link that is not fuller takes the whole
+torque. Where the field of a phase exceeds that room, even a machine that only motors may raise the link to V_max.
+"""
+
+from __future__ import annotations
+
+from salient.machine.definition import Machine
+from salient.machine.drive_data import DriveData
+
+_RISES = 2.0
+_RISES_WITH_CHOPPER = 1.5
+
+
+def fold_back_V(machine: Machine, data: DriveData) -> float:
+    """Range below bus_over_voltage_V in which the voltage of each control period reduces the braking torque. There is
+    none from its middle on, or from a quarter of the way from the chopper's voltage to bus_over_voltage_V on if that is
+    higher. 0 for a supply that takes energy back."""
+    link = machine.dc_link
+    if link is None:
+        return 0.0
+    rise_V = field_J(machine, data.parameters["current_limit_A"]) / (link["capacitance_F"] * data.bus_over_voltage_V)
+    rises = _RISES_WITH_CHOPPER if "chopper_on_V" in link else _RISES
+    return min(rises * rise_V, data.bus_over_voltage_V - data.supply_max_V)
+
+
+def mean_fold_back_V(machine: Machine, data: DriveData) -> float:
+    """Range below bus_over_voltage_V from whose begin on a lasting excess reduces the braking torque, too: above the
+    voltage at which the chopper begins, which would otherwise take little."""
+    chopper_on_V = (machine.dc_link or {}).get("chopper_on_V", 0.0)
+    return min(fold_back_V(machine, data), data.bus_over_voltage_V - chopper_on_V)
+
+
+def field_J(machine: Machine, current_A: float) -> float:
+    """Energy in the field of a phase in the aligned position."""
+    magnetics = machine.magnetics
+    flux_Wb = float(magnetics.flux_linkage_Wb(0.0, current_A))
+    return current_A * flux_Wb - float(magnetics.coenergy_J(0.0, current_A))
