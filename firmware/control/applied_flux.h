@@ -25,11 +25,12 @@ ALWAYS_INLINE int32_t applied_flux_period_q29(int32_t dc_link_voltage_q6, int32_
     return fixed_multiply_high(dc_link_voltage_q6 << 15, period_q40);
 }
 
-/* Flux linkage of a period that is missing on average while its pulses are too short to act: half of the shortest pulse
- * at the DC-link voltage, Wb, Q2.29. minimum_pulse_ns: 0..2000, rate_kHz: up to 1000. */
-static inline int32_t applied_flux_missing_q29(int32_t period_flux_q29, uint32_t minimum_pulse_ns, uint32_t rate_kHz) {
-    const uint32_t half_q15 = minimum_pulse_ns * rate_kHz / 61u; /* 10^6 / 2^14 = 61 */
-    return fixed_multiply(period_flux_q29, (int32_t)half_q15, 15);
+/* Flux linkage that the shortest pulse makes at the DC-link voltage, Wb, Q2.29: what a period lacks at most in which
+ * the devices suppress a shorter one. minimum_pulse_ns: 0..2000, rate_kHz: up to 1000. */
+static inline int32_t applied_flux_shortest_pulse_q29(int32_t period_flux_q29, uint32_t minimum_pulse_ns,
+                                                      uint32_t rate_kHz) {
+    const uint32_t part_q14 = minimum_pulse_ns * rate_kHz / 61u; /* 10^6 / 2^14 = 61 */
+    return fixed_multiply(period_flux_q29, (int32_t)part_q14, 14);
 }
 
 /* One period, which begins with the sample. duty_q15: acts in this period, -32768..32768; current_q9: A, Q7.9, below

@@ -107,11 +107,14 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
 static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const encoder_monitor_input_t *input,
                         unsigned index, bool moves) {
     const int32_t part_q29 = input->flux_step_max_q29 >> PART_SHIFT;
-    const int32_t missing_q29 = applied_flux_missing_q29(input->flux_step_max_q29, machine_tables.minimum_pulse_ns,
-                                                         parameters->rate_hz / 1000u);
     const int32_t short_q29 = part_q29 * (int32_t)(parameters->rate_hz / SHORT_PERIOD_HZ);
-    const int64_t error_q29 = (int64_t)parameters->flux_error_q29 + (missing_q29 > short_q29 ? missing_q29 : short_q29);
-    return (moves ? MOVING_FACTOR * error_q29 + part_q29 : error_q29) +
+    const int32_t suppressed_q29 =
+        applied_flux_shortest_pulse_q29(input->flux_step_max_q29, machine_tables.minimum_pulse_ns,
+                                        parameters->rate_hz / 1000u) /
+        2; /* on average */
+    const int64_t error_q29 = parameters->flux_error_q29;
+    return (moves ? MOVING_FACTOR * (error_q29 + short_q29) + part_q29
+                  : error_q29 + (suppressed_q29 > short_q29 ? suppressed_q29 : short_q29)) +
            fixed_multiply_high(input->current_q9[index] << 12, parameters->resistance_error_q40);
 }
 

@@ -330,6 +330,8 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
                           const phase_monitor_input_t *input) {
     const int32_t period_q29 = input->period_flux_q29;
     const uint32_t elapsed = input->periods - monitor->periods;
+    const int32_t shortest_q29 =
+        applied_flux_shortest_pulse_q29(period_q29, tables->minimum_pulse_ns, input->periods_per_ms);
     return (common_t){
         .tables = tables,
         .input = input,
@@ -338,8 +340,7 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
         .step = (int32_t)(input->electrical - monitor->electrical),
         .offset_q9 = tables->current_range_q9 / 128,
         .delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)input->periods_per_ms),
-        .error_q29 =
-            period_q29 / 64 + applied_flux_missing_q29(period_q29, tables->minimum_pulse_ns, input->periods_per_ms),
+        .error_q29 = shortest_q29 > period_q29 / 64 ? shortest_q29 : period_q29 / 64,
     };
 }
 

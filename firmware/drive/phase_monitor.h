@@ -9,11 +9,10 @@
  *   encoder_angle   a current that is only too large because the tables, at a wrong angle, have emptied the integral
  *
  * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical; resistance 50 % and
- * voltage 1/64 since the phase was at rest, at most over 10 ms, twice that at small currents; what pulses too
- * short for the devices do not make; a quarter of psi that has been removed since; and psi of a period and
- * 20 us at the DC-link voltage, for the delays of sensor and switches. At a current of up to 4/128 of its range, a
- * small one, phase_open counts only what more than this tolerance of the voltage has built up since the current was
- * larger.
+ * voltage 1/64, or the converter's shortest pulse if that is more, since the phase was at rest, at most over 10 ms,
+ * twice that at small currents; a quarter of psi that has been removed since; and psi of a period and 20 us at the
+ * DC-link voltage, for the delays of sensor and switches. At a current of up to 4/128 of its range, a small one,
+ * phase_open counts only what more than this tolerance of the voltage has built up since the current was larger.
  *
  * A current also is one that should not be when both switches are open and the voltage has removed a quarter of psi of
  * which the tables saw less than a quarter disappear: freewheeling by a shorted switch.
