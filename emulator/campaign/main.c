@@ -15,6 +15,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/resource.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -23,6 +24,7 @@
 #include "host/host_drive.h"
 
 #define EXIT_USAGE 2
+#define PROCESSOR_MAX_S 30 /* of a seed, which takes some hundredths of a second */
 
 static world_machine_t machines[WORLD_MACHINES_MAX];
 static unsigned machine_count;
@@ -150,11 +152,12 @@ static int run_seed(const arguments_t *arguments, uint64_t seed) {
     return 0;
 }
 
-/* In a process of its own: a seed starts from the same memory, and one that crashes ends no other. */
+/* In a process of its own: a seed starts from the same memory, and one that crashes, or does not end, ends no other. */
 static int run_apart(const arguments_t *arguments, uint64_t seed) {
     fflush(stdout);
     const pid_t child = fork();
     if (child == 0) {
+        setrlimit(RLIMIT_CPU, &(struct rlimit){PROCESSOR_MAX_S, PROCESSOR_MAX_S});
         const int code = run_seed(arguments, seed);
         fflush(stdout);
         _exit(code);

@@ -199,14 +199,12 @@ static void find_link(plant_t *plant, integrator_setting_t *setting) {
     const dc_link_t *link = &plant->machine->dc_link;
     const double link_V = plant->bus_voltage_V, supply_V = plant->supply_voltage_V;
     setting->chopper = link->chopper_resistance_ohm > 0.0 && !plant->faults.chopper_open;
-    if (setting->chopper) {
-        if (link_V >= link->chopper_on_V) {
-            plant->chopper_on = true;
-        } else if (link_V <= link->chopper_off_V) {
-            plant->chopper_on = false;
-        }
-        drawn_A += plant->chopper_on ? link_V / link->chopper_resistance_ohm : 0.0;
+    if (!setting->chopper || link_V <= link->chopper_off_V) {
+        plant->chopper_on = false;
+    } else if (link_V >= link->chopper_on_V) {
+        plant->chopper_on = true;
     }
+    drawn_A += plant->chopper_on ? link_V / link->chopper_resistance_ohm : 0.0;
     setting->chopper_on = plant->chopper_on;
     setting->source_conducts = link_V < supply_V || (link_V == supply_V && drawn_A >= 0.0);
 }

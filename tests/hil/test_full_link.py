@@ -71,3 +71,18 @@ def test_single_quadrant_controllers_regenerate_only_what_their_fields_hold(make
     bench.run_for(0.4)
     assert bench.drive.fault == "none"
     assert 239 < max(bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].value) < 250
+
+
+def test_a_chopper_that_opens_while_it_conducts_takes_no_more(make_bench):
+    bench = make_bench(machine="finite_element", controller="traditional")
+    bench.rig.truth_period_us = 250
+    bench.rig.supply_voltage_V = 292
+    bench.run_for(0.1)
+    bench.rig.supply_voltage_V = 240
+    bench.run_for(0.001)  # the chopper conducts, down to 270 V
+    conducting_V = bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].last
+    bench.fault("chopper_open")
+    bench.run_for(0.1)
+    voltage_V = bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].last
+    assert 275 < conducting_V < 292
+    assert voltage_V == pytest.approx(conducting_V, abs=0.1)

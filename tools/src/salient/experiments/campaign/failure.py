@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ from salient.experiments.campaign.machines import files
 from salient.experiments.campaign.runner import ALL_EVENTS, Programs, Result, run_world, world
 
 _STEP_NS = 1_000_000
+_CRASH_MAX_S = 60
+"""Processor time of a bench that is to crash: it may do so by not ending."""
 _HASH_START, _HASH_PRIME, _HASH_MASK = 14695981039346656037, 1099511628211, 2**64 - 1
 _TRUTH = range(0x1F000010, 0x1F000014)
 TELEMETRY_PERIOD_MS = 4
@@ -85,6 +88,8 @@ def replay(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, folder: Pat
         lines = frames.read_text(encoding="ascii").rpartition("\n")[0].splitlines()
         try:
             with Bench(config, f"unix:{temporary}/can.sock") as bench:
+                if "hash" not in result:
+                    resource.prlimit(bench.simulator.pid, resource.RLIMIT_CPU, (_CRASH_MAX_S, _CRASH_MAX_S))
                 _send(bench, lines)
                 if folder is not None:
                     save_bench(bench, folder, {"replay": f"tools/salient replay {folder}"}, config)
