@@ -203,6 +203,14 @@ static void keep_memory(drive_t *drive, uint32_t time_us) {
     nvm_store_step(&drive->store, drive->hal, &drive->parameters, time_us, writable);
 }
 
+/* The torque would carry the speed on, beyond the last reference. */
+COLD static bool runs_away(const drive_t *drive, int32_t torque_q24) {
+    const int32_t reference_q22 = drive->command.speed_reference_q22;
+    const int32_t above_q22 = fixed_subtract(drive->control.observer.speed_q22, reference_q22);
+    const int32_t beyond_q22 = torque_q24 < 0 ? fixed_subtract(0, above_q22) : above_q22;
+    return drive->ramp_of_speed && beyond_q22 > fixed_abs(reference_q22) / 16;
+}
+
 /* In a run whose commands are overdue: ramps the torque from its present value to zero, by commands of the torque mode
  * with the time of the last valid command, so that the interrupts need nothing for it. */
 static void ramp_down(drive_t *drive, uint32_t time_us) {
@@ -214,17 +222,19 @@ static void ramp_down(drive_t *drive, uint32_t time_us) {
     }
     if (!drive->ramping) {
         drive->ramping = true;
+        drive->ramp_of_speed = drive->command.mode == DRIVE_MODE_SPEED;
         drive->ramp_from_q24 = drive->control.torque_reference_q24;
     }
     drive->ramp_us = time_us;
     const uint32_t elapsed_us = age_us - timeout_us;
     const uint32_t rest_us = elapsed_us < DRIVE_RAMP_US ? DRIVE_RAMP_US - elapsed_us : 0;
     const int64_t torque_q39 = (int64_t)drive->ramp_from_q24 * (int32_t)((rest_us << 15) / DRIVE_RAMP_US);
+    const int32_t torque_q24 = (int32_t)fixed_shift(torque_q39, 15);
     hal_critical_enter(drive->hal);
     if (drive->control.state_machine.state == DRIVE_STATE_RUN) { /* it leaves RUN in an interrupt, never enters it */
         drive->command.request = COMMAND_RUN;
         drive->command.mode = DRIVE_MODE_TORQUE;
-        drive->command.torque_reference_q24 = (int32_t)fixed_shift(torque_q39, 15);
+        drive->command.torque_reference_q24 = runs_away(drive, torque_q24) ? 0 : torque_q24;
     }
     hal_critical_leave(drive->hal);
 }

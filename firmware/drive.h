@@ -25,7 +25,8 @@
 /* Without commands a run's torque ramps to zero in this time after the parameter command_timeout_ms, in steps of a
  * hundredth; after COMMAND_LOST_US it ends in the fault command_timeout, in the control interrupt, whatever the
  * background does. Commands of the same sender, in sequence, that come back before then continue the run without
- * arming: the torque rises again from where it is, by the slew rates of the parameters. */
+ * arming: the torque rises again from where it is, by the slew rates of the parameters. In speed mode the ramp carries
+ * the speed beyond the last reference by no more than a sixteenth: silence may come during an acceleration. */
 #define DRIVE_RAMP_US 100000u
 #define DRIVE_RAMP_STEP_US 1000u
 
@@ -64,7 +65,8 @@ typedef struct {
     temperature_t temperature;
     self_test_t self_test;
     watchdog_monitor_t watchdog;
-    bool ramping;          /* the torque ramps to zero, without commands; the next two are for this */
+    bool ramping;          /* the torque ramps to zero, without commands; the next three are for this */
+    bool ramp_of_speed;    /* the last command was one of speed */
     int32_t ramp_from_q24; /* torque reference at its begin, N m, Q7.24 */
     uint32_t ramp_us;      /* time of the last step */
     comms_t comms;

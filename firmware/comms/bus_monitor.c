@@ -20,16 +20,16 @@ COLD void bus_monitor_init(bus_monitor_t *monitor, uint32_t time_us) {
 COLD static void enter_bus_off(bus_monitor_t *monitor, uint32_t time_us) {
     counter_add(&monitor->bus_off_count, 1);
     monitor->since_us = time_us;
-    monitor->rejoining = false;
     monitor->run_inhibited = true;
 }
 
+/* An attempt that has not succeeded when the next wait is over has failed: bus-off again before it was seen to end. */
 COLD static void wait_in_bus_off(bus_monitor_t *monitor, hal_t *hal, uint32_t time_us) {
-    if (monitor->rejoining || time_us - monitor->since_us < monitor->wait_us) {
+    if (time_us - monitor->since_us < monitor->wait_us) {
         return;
     }
     hal_can_rejoin(hal);
-    monitor->rejoining = true;
+    monitor->since_us = time_us;
     const uint32_t doubled_us = 2 * monitor->wait_us;
     monitor->wait_us = doubled_us < BUS_MONITOR_WAIT_MAX_US ? doubled_us : BUS_MONITOR_WAIT_MAX_US;
 }

@@ -1,7 +1,7 @@
 /* Supervision of the CAN bus: leaves bus-off with a back-off, and recognises foreign use of the drive's identifiers.
  *
- * Bus-off: the first attempt to rejoin comes BUS_MONITOR_WAIT_MIN_US after bus-off is seen; each further bus-off
- * doubles the wait, up to BUS_MONITOR_WAIT_MAX_US. Once the controller has been error active for
+ * Bus-off: the first attempt to rejoin comes BUS_MONITOR_WAIT_MIN_US after bus-off is seen; each further one, after
+ * another bus-off or one that has not ended, doubles the wait, up to BUS_MONITOR_WAIT_MAX_US. Once the controller has been error active for
  * BUS_MONITOR_ERROR_FREE_US without interruption, the wait is the first one again.
  */
 #ifndef COMMS_BUS_MONITOR_H
@@ -21,9 +21,8 @@ typedef struct {
     hal_can_status_t status; /* of the last step */
     uint16_t bus_off_count;  /* since start; saturates at 65535 */
     uint16_t foreign_count;  /* frames of others with an identifier of the drive, likewise */
-    uint32_t wait_us;        /* of the next bus-off */
-    uint32_t since_us;       /* bus-off: when it was seen; else the last time that was not error active */
-    bool rejoining;          /* the controller has been requested to leave bus-off */
+    uint32_t wait_us;        /* before the next attempt */
+    uint32_t since_us;       /* bus-off: when it was seen, or the last attempt; else last not error active */
     bool conflict;           /* a foreign frame within BUS_MONITOR_CONFLICT_US */
     uint32_t foreign_us;     /* time of the last one */
     bool run_inhibited;      /* bus-off since the last command other than run */

@@ -4,9 +4,10 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
-/* Product of counts and scale, rounded to nearest, halves upwards; below 2^16. */
+/* Product of counts and scale, rounded to nearest, halves upwards. Saturated to 16 bits, which only a scale that has
+ * changed in memory exceeds: the look-ups stay within the tables until the self-test finds it. */
 static int32_t scale_counts(uint16_t counts, int32_t scale_q18) {
-    return fixed_multiply_high(counts << 14, scale_q18);
+    return fixed_saturate_u16(fixed_multiply_high(counts << 14, scale_q18));
 }
 
 /* The angle of the count that is nearest to the predicted one. The last edge was exact, and since then the count is

@@ -56,6 +56,13 @@ static inline int32_t arm_usat31(int32_t value) {
     return saturated;
 }
 
+/* value saturated to 0..2^16 - 1. */
+static inline int32_t arm_usat16(int32_t value) {
+    int32_t saturated;
+    __asm__("usat %0, #16, %1" : "=r"(saturated) : "r"(value));
+    return saturated;
+}
+
 /* value saturated to `bits` bits with sign; bits is a constant. */
 #define ARM_SSAT(value, bits)                                                                                          \
     __extension__({                                                                                                    \

@@ -92,6 +92,15 @@ static inline int32_t fixed_non_negative(int32_t value) {
 #endif
 }
 
+/* Value saturated to 0..2^16 - 1. */
+static inline int32_t fixed_saturate_u16(int32_t value) {
+#ifdef __ARM_FEATURE_DSP
+    return arm_usat16(value);
+#else
+    return fixed_clamp(value, 0, UINT16_MAX);
+#endif
+}
+
 /* a * b, exact. Written as an instruction because the compiler otherwise sign-extends a factor of several products once
  * and multiplies 64-bit words. */
 static inline int64_t fixed_product(int32_t a, int32_t b) {

@@ -187,6 +187,17 @@ def test_torque_ramps_to_zero_without_commands_and_the_gates_open_after_half_a_s
     assert bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last / 1e6 - last_s == pytest.approx(0.5, abs=0.0005)
 
 
+@pytest.mark.parametrize("reference_rpm", [450, -450])
+def test_silence_during_an_acceleration_does_not_carry_the_speed_beyond_its_reference(make_bench, reference_rpm):
+    bench = make_bench(controller="salient")
+    bench.rig.inertia_gain = 2.0  # still at the torque limit when the ramp begins
+    bench.drive.speed_reference_rpm = reference_rpm
+    bench.run_for(0.03)
+    bench.drive.silence()
+    bench.run_for(0.4)
+    assert 1.0 < abs(bench.truth["speed_rpm"].value).max() / abs(reference_rpm) < 1.15
+
+
 @pytest.mark.parametrize(("pause_s", "fault"),
                          [(0.04, "none"), (0.2, "none"), (0.45, "none"), (0.52, "command_timeout")])
 def test_run_goes_on_when_commands_come_back_within_half_a_second(bench, pause_s, fault):

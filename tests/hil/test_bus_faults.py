@@ -136,6 +136,19 @@ def test_first_bus_off_is_left_after_10_ms_and_128_times_11_bits(bench):
     assert bench.telemetry["bus_off_count"].last in (0, 1)  # sent each 100 ms
 
 
+def test_bus_off_again_as_soon_as_the_controller_has_rejoined_is_left_by_the_next_attempt(bench):
+    running(bench)
+    for again_ms in range(20):  # within the steps of 1 ms in which the drive reads the state of the controller
+        bench.rig.transmit_error_counter = 256
+        bench.run_for(0.0119 + again_ms * 1e-4)
+        bench.rig.transmit_error_counter = 256
+        bench.run_for(0.7)  # the longest wait, twice
+        begin_ns = bench.time_ns
+        bench.run_for(1.01)  # error free: the next wait is the first one again
+        heard = [time_ns for time_ns, m in bench.log if m.arbitration_id in DRIVE_IDS and not m.is_extended_id]
+        assert heard[-1] > begin_ns + 990_000_000
+
+
 def test_run_request_that_continues_through_bus_off_is_not_taken_up_again(bench):
     running(bench)
     bench.rig.transmit_error_counter = 256

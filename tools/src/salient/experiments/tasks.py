@@ -21,6 +21,7 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, TextIO
 from urllib.parse import urlsplit
@@ -163,9 +164,37 @@ def _on_a_cluster(tasks: Sequence[Task], function: Callable[[Any], Any], address
     except (OSError, ValueError) as error:
         raise UsageError(f"--scheduler {address}: no Dask scheduler answers ({error})") from None
     with client:
-        cores = sum(client.ncores().values())
-        with client.get_executor(pure=False) as workers:
-            yield from _executed(workers, tasks, function, max(1, cores))
+        yield from _executed_by(client, distributed, tasks, function)
+
+
+def _executed_by(client: Any, distributed: Any, tasks: Sequence[Task], function: Callable[[Any], Any]
+                 ) -> Generator[tuple[Task, Any], None, None]:
+    """As _executed, of a Dask client. Not by its executor, which takes a result that was lost with its worker, between
+    the end of the task and its transport, for an exception of the function."""
+    waiting = iter(tasks)
+    futures: dict[Any, Task] = {}
+    ended = distributed.as_completed(loop=client.loop)
+
+    def submit(task: Task) -> None:
+        future = client.submit(function, task.arguments, pure=False)
+        futures[future] = task
+        ended.add(future)
+
+    try:
+        for task in islice(waiting, _WAITING_PER_WORKER * max(1, sum(client.ncores().values()))):
+            submit(task)
+        for future in ended:
+            task = futures.pop(future)
+            try:
+                result = future.result()
+            except distributed.CancelledError:  # by the scheduler, which has lost it
+                submit(task)
+                continue
+            yield task, result
+            for following in islice(waiting, 1):
+                submit(following)
+    finally:
+        client.cancel(list(futures))
 
 
 def _executed(workers: Executor, tasks: Iterable[Task], function: Callable[[Any], Any], count: int
