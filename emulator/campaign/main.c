@@ -50,6 +50,8 @@ static oracle_drive_t view(void) {
                            .fault = (uint8_t)state_machine->record.fault,
                            .checks = (uint32_t)state_machine->record.fault_mask,
                            .angle = measured->angle,
+                           .heat = {temperature_C(&host.drive.temperature, TEMPERATURE_WINDING),
+                                    temperature_C(&host.drive.temperature, TEMPERATURE_INVERTER)},
                            .link_voltage = (double)measured->dc_link_voltage_q6 / machine_tables.voltage_range_q6};
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         seen.current[phase] = (double)measured->current_q9[phase] / machine_tables.current_range_q9;
@@ -57,7 +59,13 @@ static oracle_drive_t view(void) {
     return seen;
 }
 
-static const run_drive_t drive = {start, view};
+static const run_drive_t drive = {
+    .start = start,
+    .view = view,
+    .degraded_parameter = PARAMETER_DEGRADED_RUNNING,
+    .limit_bits = 8 * sizeof host.drive.control_parameters.protection,
+    .constant_bits = 8 * sizeof host.drive.control_parameters,
+};
 
 /* --- Machines --- */
 

@@ -12,9 +12,12 @@
 #define STATUS_AGE_MAX_NS (30 * ORACLE_MS_NS)
 #define RUN_MAX_NS (502 * ORACLE_MS_NS) /* of a run, since the last request */
 
-void oracle_init(oracle_t *oracle, const world_t *world, uint64_t period_ns) {
+void oracle_init(oracle_t *oracle, const world_t *world, const plant_t *plant, uint64_t period_ns) {
     *oracle = (oracle_t){.world = world, .period_ns = period_ns};
     oracle->voltage_recent_low_V = INFINITY;
+    magnetics_point_t aligned;
+    magnetics_evaluate(&plant->magnetics, 0.0, world->machine->trip_current_A, &aligned);
+    oracle->detection.largest_flux_Wb = aligned.flux_linkage_Wb;
     oracle->encoder_offset_rev = oracle_encoder_offset_rev(world);
 }
 
@@ -32,11 +35,6 @@ void oracle_violate(oracle_t *oracle, const char *rule, uint64_t time_ns, unsign
 
 void oracle_since(uint64_t *begin_ns, bool holds, uint64_t now_ns) {
     *begin_ns = !holds ? 0 : *begin_ns ? *begin_ns : now_ns;
-}
-
-/* The state of the drive, or what it takes for it, was changed from outside. */
-static bool state_changed(const oracle_t *oracle) {
-    return oracle_any_injected(oracle, FAULT_STATE_FLIPPED, FAULT_FAULT_LATCH_FLIPPED);
 }
 
 /* A line of safe torque off is not energised. */
@@ -142,6 +140,19 @@ static void look_at_limits(oracle_t *oracle, const plant_t *plant, unsigned gate
     }
 }
 
+/* Remembers when the plant last had a reason to keep a drive in a fault. */
+static void look_at_causes(oracle_t *oracle, const plant_t *plant) {
+    const world_machine_t *machine = oracle->world->machine;
+    const bool voltage =
+        !oracle_link_sensor_faulty(oracle) && (plant->bus_voltage_V > MARGIN * machine->over_voltage_V ||
+                                               plant->bus_voltage_V * MARGIN < machine->under_voltage_V);
+    const bool speed = !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
+                       fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > MARGIN * machine->over_speed_rpm;
+    if (voltage || speed || sto_demanded(oracle, (plant->time_ns - 1) / 1000)) {
+        oracle->cause_ns = plant->time_ns;
+    }
+}
+
 /* --- Events --- */
 
 /* Not 0 when a switch of any phase is on. */
@@ -170,6 +181,8 @@ void oracle_look(oracle_t *oracle, const plant_t *plant) {
     oracle_since(&oracle->dark_ns, gates == 0, plant->time_ns);
     look_at_currents(oracle, plant, gates);
     look_at_limits(oracle, plant, gates);
+    look_at_causes(oracle, plant);
+    oracle_look_at_detection(oracle, plant);
     oracle_look_at_recovery(oracle, plant);
     if (gates == 0) {
         return;
@@ -185,6 +198,29 @@ void oracle_look(oracle_t *oracle, const plant_t *plant) {
     look_at_commands(oracle, plant);
 }
 
+/* After bus-off a request to run has to be withdrawn before it starts the drive again. */
+static void look_at_start(oracle_t *oracle, uint64_t now_ns) {
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, now_ns / 1000);
+        if (event == NULL || event->kind != WORLD_SET || event->what != BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER) {
+            continue;
+        }
+        const uint64_t begin_ns = event->begin_us * 1000 + ORACLE_MS_NS;
+        if (oracle->withdrawn_ns < begin_ns && oracle->reset_ns < begin_ns && now_ns > begin_ns + ORACLE_MS_NS) {
+            oracle_violate(oracle, "resumed", now_ns, 0, (double)(now_ns - begin_ns) * 1e-6);
+        }
+    }
+}
+
+/* A cause that has ended a moment ago may come again. */
+static void look_at_end_of_fault(oracle_t *oracle, uint64_t now_ns, uint8_t before) {
+    const uint64_t gone_ns = before == STATE_FAULT ? 8 * ORACLE_MS_NS : ORACLE_MS_NS / 2;
+    if (oracle->cause_ns && now_ns < oracle->cause_ns + gone_ns && !oracle_state_changed(oracle) &&
+        !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
+        oracle_violate(oracle, "cleared", now_ns, before, (double)(now_ns - oracle->cause_ns) * 1e-6);
+    }
+}
+
 void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive_t drive) {
     const uint8_t before = oracle->drive.state;
     const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
@@ -193,6 +229,10 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     oracle->state_ns = drive.state == before ? oracle->state_ns : plant->time_ns;
     oracle->interrupt_ns = plant->time_ns;
     oracle_look_at_measurement(oracle, plant);
+    oracle_look_at_motion(oracle, plant);
+    if (before != drive.state && drive.state == STATE_READY && before != STATE_RUN) {
+        look_at_end_of_fault(oracle, plant->time_ns, before);
+    }
     unsigned gates = gates_on(plant);
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         const half_bridge_pattern_t *pattern = &plant->pattern[phase];
@@ -203,7 +243,7 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     if (gates && drive.state != STATE_RUN) {
         oracle_violate(oracle, "gate_on", plant->time_ns, 1, drive.state);
     }
-    if (drive.state == STATE_RUN && !state_changed(oracle) &&
+    if (drive.state == STATE_RUN && !oracle_state_changed(oracle) &&
         plant->time_ns > oracle->run_ns + request_max_ns(oracle, RUN_MAX_NS)) {
         oracle_violate(oracle, "no_command", plant->time_ns, 6, (double)(plant->time_ns - oracle->run_ns) * 1e-6);
     }
@@ -217,55 +257,79 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
         }
         oracle_judge_cause(oracle, plant);
         const uint32_t up_to = (BIT(drive.fault) << 1) - 1;
-        if (drive.checks != 0 && (drive.checks & up_to) != BIT(drive.fault) && !state_changed(oracle)) {
+        if (drive.checks != 0 && (drive.checks & up_to) != BIT(drive.fault) && !oracle_state_changed(oracle)) {
             oracle_violate(oracle, "not_first", plant->time_ns, drive.fault, (double)drive.checks);
         }
         if (oracle->recovered && oracle->recovery_judged && !oracle->settled && !oracle_bus_disturbed(oracle)) {
             oracle_violate(oracle, "not_recovered", plant->time_ns, 3, drive.fault);
         }
     } else if (drive.state == STATE_RUN && before != STATE_RUN) {
+        look_at_start(oracle, plant->time_ns);
         oracle->run_angle_rad = plant->rotor_angle_rad;
         oracle->turned = false;
         oracle_enter_run(oracle, plant);
     } else if (drive.state == STATE_READY && before == STATE_RUN) {
+        oracle->confirmed = false;
         const uint64_t age_ns = plant->time_ns > oracle->run_ns ? plant->time_ns - oracle->run_ns : 0;
-        if (!oracle->off_seen && age_ns < 30 * ORACLE_MS_NS && !state_changed(oracle) &&
+        const bool rests =
+            oracle->meant.request == SENDER_STOP &&
+            (oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) ||
+             fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S < 20.0 + 0.05 * oracle->world->machine->speed_base_rpm);
+        if (!oracle->off_seen && !rests && age_ns < 30 * ORACLE_MS_NS && !oracle_state_changed(oracle) &&
             !may_be_deaf(oracle, plant->time_ns / 1000)) {
-            oracle_violate(oracle, "stopped", plant->time_ns, 0, 0.0);
+            oracle_violate(oracle, "stopped", plant->time_ns, oracle->meant.request, plant->speed_rad_s);
         }
-    } else if (drive.state != STATE_FAULT && before == STATE_FAULT && !oracle->clear_seen && !state_changed(oracle) &&
-               !may_be_deaf(oracle, plant->time_ns / 1000) && !impersonated(oracle)) {
+    } else if (drive.state != STATE_FAULT && before == STATE_FAULT && !oracle->clear_seen &&
+               !oracle_state_changed(oracle) && !may_be_deaf(oracle, plant->time_ns / 1000) && !impersonated(oracle)) {
         oracle_violate(oracle, "no_command", plant->time_ns, 5, 0.0);
     }
 }
 
 void oracle_reset(oracle_t *oracle, uint64_t time_ns, oracle_drive_t drive) {
     oracle->drive = drive;
-    oracle->state_ns = time_ns;
+    oracle->state_ns = oracle->reset_ns = time_ns;
     oracle->confirmed = false;
 }
 
-void oracle_on_bus(oracle_t *oracle, uint64_t time_ns, const sender_meaning_t *meaning) {
+void oracle_on_bus(oracle_t *oracle, const plant_t *plant, uint64_t time_ns, const sender_meaning_t *meaning) {
     if (!meaning->genuine) {
         return;
     }
+    oracle->succeeded = oracle->succeeded || meaning->other;
     if (meaning->confirms) {
         oracle->confirmed = true;
-    } else if (meaning->command && meaning->request == SENDER_RUN) {
-        oracle->run_ns = time_ns;
-        oracle->commanded = true;
-        oracle->off_seen = false;
     }
-    oracle->clear_seen = oracle->clear_seen || (meaning->command && meaning->request == SENDER_CLEAR);
-    if (meaning->command && meaning->request != SENDER_RUN && !oracle->off_seen) {
+    if (!meaning->command) {
+        return;
+    }
+    const bool runs = meaning->request == SENDER_RUN || meaning->request == SENDER_STOP;
+    if (runs) { /* a stop is a run to rest */
+        oracle->run_ns = time_ns;
+        oracle->commanded = oracle->commanded || meaning->request == SENDER_RUN;
+    }
+    oracle->off_seen = meaning->request == SENDER_RUN ? false : oracle->off_seen;
+    if (!runs && !oracle->off_seen) {
         oracle->off_seen = true;
         oracle->off_ns = time_ns;
     }
+    oracle->clear_seen = oracle->clear_seen || meaning->request == SENDER_CLEAR;
+    if (meaning->request == SENDER_STOP && oracle->meant.request != SENDER_STOP) {
+        oracle->stop_ns = time_ns;
+        oracle->stop_speed_rad_s = plant->speed_rad_s;
+    }
+    oracle->withdrawn_ns = meaning->request != SENDER_RUN ? time_ns : oracle->withdrawn_ns;
+    if (meaning->torque != oracle->meant.torque || meaning->reference != oracle->meant.reference ||
+        meaning->request != oracle->meant.request) {
+        oracle->constant_ns = time_ns;
+        oracle->begin_speed_rad_s = plant->speed_rad_s;
+    }
+    oracle->meant = *meaning;
 }
 
 void oracle_on_status(oracle_t *oracle, uint64_t time_ns, unsigned state, unsigned fault) {
+    oracle->detection.status_ns = time_ns;
     const bool differs = state != oracle->drive.state || fault != oracle->drive.fault;
-    if (differs && time_ns > oracle->state_ns + STATUS_AGE_MAX_NS && !state_changed(oracle) &&
+    if (differs && time_ns > oracle->state_ns + STATUS_AGE_MAX_NS && !oracle_state_changed(oracle) &&
         !oracle_bus_disturbed(oracle)) {
         oracle_violate(oracle, "wrong_status", time_ns, state, fault);
     }

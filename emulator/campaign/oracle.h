@@ -12,7 +12,12 @@
  *                   or the state run, 502 ms after the last genuine request to run; torque 170 ms after it; both later
  *                   by the 18 ms for which the request waits when the background hangs and the watchdog does not reset
  *                   the drive; a fault that ends without a genuine request to clear it
- *   stopped         state run left, without a fault, less than 30 ms after a genuine request to run
+ *   stopped         state run left, without a fault, less than 30 ms after a genuine request to run; or after one to
+ *                   stop while the rotor turns
+ *   not_stopped     four quadrants, no fault: still turning 100 ms after the time that half of the torque limit needs
+ *   resumed         a run after bus-off, with no other request than run since
+ *   cleared         a fault ended less than 8 ms after the plant's last reason for one: a line of safe torque off not
+ *                   energised, a link voltage or a speed beyond its limits
  *   over_speed      a gate on for 2 ms at a speed above the limit by 2 %
  *   over_voltage    a gate on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no
  *                   energy back, unless a fault of the only sensor hides it
@@ -23,14 +28,31 @@
  *   wrong_current, wrong_voltage
  *                   a measured phase current or link voltage off the true one by more than 0.8 % of the sensor's full
  *                   scale, sensor and processor healthy
+ *   wrong_temperature
+ *                   at the end, the hottest winding or switch measured off the true one by more than 5 K, sensors and
+ *                   processor healthy
+ *   wrong_torque    no fault, torque mode, below half of the base speed: the mean torque of electrical periods off the
+ *                   commanded one by more than a quarter and 5 % of the rated one
+ *   overshoot       no fault, the speed above a reference that it has approached from below by more than a fifth and
+ *                   5 % of the base speed; one quadrant: and what a light rotor gains
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
  *                   and memory undisturbed
  *   wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
  *   not_first       a first cause that is not the first one, by its number, of the checks that failed in its tick
- *   false_alarm     a fault of the drive without any other, which is not true of the plant, or the drive's own work
+ *   false_alarm     a fault of the drive without any other, which is not true of the plant, or the drive's own work:
+ *                   too large a current, and without a load that drives the machine too high a speed or voltage
+ *   undetected      in state run for longer than a reaction takes with a fault that shows at any time: changed memory,
+ *                   sensors at a rail, a wrong clock, a background that hangs (oracle_detection.c)
+ *   no_current      voltage on a phase for twenty times its largest flux linkage, and no current at all
+ *   blocked         a speed commanded, and the rotor within a stroke for 300 ms
+ *   misled          for 200 ms a measured angle off by more than a sixth of a rotor pitch
+ *   contested       for 150 ms in state run while another client sends commands
+ *   not_reset       no control interrupt for 60 ms, and no reset
+ *   mute            no status on an undisturbed bus for 100 ms
  * eventually
  *   not_recovered   faults over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of the
- *                   speed 100 ms after the time that half of the torque limit needs, or again in a fault; judged up to
+ *                   speed 100 ms after the time that half of the torque limit needs, or again in a fault, or with a
+ *                   phase that is not used; judged up to
  *                   0.9 of the base speed, above which a start is near the limit of the speed. One quadrant: at most
  *                   20 % above, of a light rotor what it gains while a delay and the flux linkage last
  * sometimes
@@ -53,6 +75,11 @@
 #define ORACLE_VIOLATIONS_MAX 4
 #define ORACLE_CAUSES_MAX 8
 
+/* Temperatures of the hottest winding and of the hottest switch. */
+typedef struct {
+    double winding_C, switch_C;
+} oracle_heat_t;
+
 /* What is read of the drive. */
 typedef struct {
     uint8_t state;                                /* initialise, ready, run, fault */
@@ -60,6 +87,7 @@ typedef struct {
     uint32_t checks;                              /* failed ones of the tick that latched it */
     uint32_t angle;                               /* of the encoder by the last measurement, 2^-32 rev */
     double current[HAL_PHASES_MAX], link_voltage; /* then, of the full scales of their sensors */
+    oracle_heat_t heat;                           /* measured */
 } oracle_drive_t;
 
 /* Motion at a steady speed, over which the error of the measured angle is averaged. */
@@ -72,6 +100,21 @@ typedef struct {
     double error_counts; /* sum, positive: ahead in the direction of counting */
 } oracle_stretch_t;
 
+/* Of what has to be noticed. */
+typedef struct {
+    uint64_t looked_ns, misled_ns, blocked_ns, status_ns;
+    double blocked_angle_rad;
+    double largest_flux_Wb;         /* aligned, at the trip current */
+    double flux_Wb[HAL_PHASES_MAX]; /* applied to a phase without any current, V s */
+} oracle_detection_t;
+
+/* Torque in torque mode, over at least an electrical period. */
+typedef struct {
+    unsigned samples; /* 0: begins with the next one */
+    uint64_t begin_ns;
+    double begin_angle_rad, sum_Nm;
+} oracle_torque_t;
+
 typedef struct {
     const char *rule;
     uint64_t time_us;
@@ -82,6 +125,7 @@ typedef struct {
 typedef struct {
     const world_t *world;
     uint64_t period_ns;
+    uint32_t limit_bits, constant_bits; /* of the drive's memory: a change of a higher one has no effect */
     unsigned violations;
     oracle_violation_t violation[ORACLE_VIOLATIONS_MAX];
     unsigned causes;
@@ -95,7 +139,16 @@ typedef struct {
     uint64_t state_ns; /* since when the drive has its state */
     uint64_t interrupt_ns;
     bool confirmed, commanded, off_seen, clear_seen;
+    bool succeeded; /* the first sender by the second one, whose counter is in sequence by chance */
     uint64_t run_ns, off_ns, speed_ns, voltage_ns;
+    sender_meaning_t meant;          /* by the last genuine motion command */
+    uint64_t withdrawn_ns, reset_ns; /* last genuine request other than run, last reset */
+    uint64_t cause_ns;               /* last time at which the plant had a reason to keep the drive in a fault */
+    uint64_t stop_ns, constant_ns;   /* since then stopping, since then one command */
+    double begin_speed_rad_s;        /* then */
+    double stop_speed_rad_s;         /* when the stop began */
+    oracle_detection_t detection;
+    oracle_torque_t torque;
     unsigned over_current_looks;
     double speed_recent_rad_s, voltage_recent_high_V, voltage_recent_low_V, current_recent_A;
     uint64_t recent_ns;
@@ -108,10 +161,12 @@ typedef struct {
     double recovery_rpm;
     uint64_t settle_by_ns, in_band_ns;
     bool recovery_judged, recovered, settled;
-    bool held; /* at rest by an encoder that does not count: not judged, but counted */
+    double recovery_angle_rad; /* of the rotor, when it began to run again */
+    unsigned used;             /* bit of each phase with a gate on since */
+    bool held;                 /* at rest by an encoder that does not count: not judged, but counted */
 } oracle_t;
 
-void oracle_init(oracle_t *oracle, const world_t *world, uint64_t period_ns);
+void oracle_init(oracle_t *oracle, const world_t *world, const plant_t *plant, uint64_t period_ns);
 
 /* At each ORACLE_LOOK_NS of virtual time, from plant_observe. */
 void oracle_look(oracle_t *oracle, const plant_t *plant);
@@ -123,14 +178,14 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
 void oracle_reset(oracle_t *oracle, uint64_t time_ns, oracle_drive_t drive);
 
 /* Events of the sender. */
-void oracle_on_bus(oracle_t *oracle, uint64_t time_ns, const sender_meaning_t *meaning);
+void oracle_on_bus(oracle_t *oracle, const plant_t *plant, uint64_t time_ns, const sender_meaning_t *meaning);
 void oracle_on_status(oracle_t *oracle, uint64_t time_ns, unsigned state, unsigned fault); /* DRIVE_STATUS */
 void oracle_on_fault(oracle_t *oracle, const plant_t *plant, unsigned kind, bool begins);
 
 /* At the begin of the recovery: the speed to be commanded, r/min. */
 double oracle_recovery_speed_rpm(oracle_t *oracle, const plant_t *plant);
 
-/* At the end. switch_C: temperature of the hottest switch. */
-void oracle_finish(oracle_t *oracle, const plant_t *plant, double switch_C);
+/* At the end. */
+void oracle_finish(oracle_t *oracle, const plant_t *plant, oracle_heat_t heat);
 
 #endif

@@ -174,7 +174,10 @@ void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);
     }
     const unsigned cause = oracle->drive.fault;
-    const bool own_work = cause == CAUSE_OVER_CURRENT || cause == CAUSE_HARDWARE_OVER_CURRENT; /* of the drive */
+    /* Of the drive; only a load can drive it above its speed or regenerate more than it asks for. */
+    const bool overhauled = oracle_overhauled(oracle, plant->speed_rad_s);
+    const bool own_work = cause == CAUSE_OVER_CURRENT || cause == CAUSE_HARDWARE_OVER_CURRENT ||
+                          ((cause == CAUSE_OVER_SPEED || cause == CAUSE_OVER_VOLTAGE) && !overhauled);
     if ((allowed >> cause & 1u) || ((any || !own_work) && true_of_plant(oracle, cause, plant))) {
         return;
     }

@@ -42,6 +42,22 @@ bool oracle_bus_disturbed(const oracle_t *oracle) {
     return oracle_other_sender(oracle, true, UINT64_MAX);
 }
 
+bool oracle_overhauled(const oracle_t *oracle, double speed) {
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);
+        if (event != NULL && event->kind == WORLD_SET &&
+            (event->what == BENCH_VARIABLE_LOAD_TORQUE_NM || event->what == BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM) &&
+            event->raw * speed < 0.0) {
+            return true;
+        }
+    }
+    return false;
+}
+
+bool oracle_state_changed(const oracle_t *oracle) {
+    return oracle_any_injected(oracle, FAULT_STATE_FLIPPED, FAULT_FAULT_LATCH_FLIPPED);
+}
+
 bool oracle_link_sensor_faulty(const oracle_t *oracle) {
     return oracle_any_injected(oracle, FAULT_DC_LINK_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET);
 }

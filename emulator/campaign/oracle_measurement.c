@@ -12,6 +12,7 @@
 #define STRETCH_SETTLED_NS (10 * ORACLE_MS_NS) /* after a larger one the drive still has to observe the speed */
 #define ANGLE_ERROR_MAX_COUNTS 0.75
 #define TIMER_TICK_S 5e-9
+#define TEMPERATURE_ERROR_MAX_K 5.0
 #define MEASUREMENT_ERROR_MAX 0.008 /* of the full scale: sixteen times the largest noise */
 
 /* Of the encoder on the shaft, in revolutions. */
@@ -94,6 +95,19 @@ static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
         oracle_violate(oracle, "wrong_angle", plant->time_ns, 0, mean_counts);
     }
     stretch->samples = 0;
+}
+
+void oracle_judge_temperature(oracle_t *oracle, const plant_t *plant, oracle_heat_t heat) {
+    const oracle_heat_t measured = oracle->drive.heat;
+    const bool disturbed =
+        drive_disturbed(oracle, UINT64_MAX) ||
+        oracle_any_injected(oracle, FAULT_WINDING_TEMPERATURE_SENSOR_OPEN, FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET);
+    if (!disturbed && fabs(measured.winding_C - heat.winding_C) > TEMPERATURE_ERROR_MAX_K) {
+        oracle_violate(oracle, "wrong_temperature", plant->time_ns, 0, measured.winding_C - heat.winding_C);
+    }
+    if (!disturbed && fabs(measured.switch_C - heat.switch_C) > TEMPERATURE_ERROR_MAX_K) {
+        oracle_violate(oracle, "wrong_temperature", plant->time_ns, 1, measured.switch_C - heat.switch_C);
+    }
 }
 
 void oracle_look_at_measurement(oracle_t *oracle, const plant_t *plant) {

@@ -61,6 +61,12 @@ bool oracle_other_sender(const oracle_t *oracle, bool hostile, uint64_t time_us)
 /* The bus was loaded, cut or shared with another sender at any time. */
 bool oracle_bus_disturbed(const oracle_t *oracle);
 
+/* A load drives the machine in the direction of a speed at any time. */
+bool oracle_overhauled(const oracle_t *oracle, double speed);
+
+/* The state of the drive, or what it takes for it, was changed from outside. */
+bool oracle_state_changed(const oracle_t *oracle);
+
 /* The only sensor of the link voltage was faulty at any time. */
 bool oracle_link_sensor_faulty(const oracle_t *oracle);
 
@@ -71,6 +77,19 @@ double oracle_encoder_offset_rev(const world_t *world);
 
 /* At the instant of the samples of a control interrupt, after it. */
 void oracle_look_at_measurement(oracle_t *oracle, const plant_t *plant);
+
+/* At the end. */
+void oracle_judge_temperature(oracle_t *oracle, const plant_t *plant, oracle_heat_t heat);
+
+/* --- Detection --- */
+
+/* At each look. */
+void oracle_look_at_detection(oracle_t *oracle, const plant_t *plant);
+
+/* --- Motion --- */
+
+/* After each control interrupt. */
+void oracle_look_at_motion(oracle_t *oracle, const plant_t *plant);
 
 /* --- First causes --- */
 
@@ -83,6 +102,10 @@ void oracle_judge_cause(oracle_t *oracle, const plant_t *plant);
 /* --- Recovery --- */
 
 void oracle_look_at_recovery(oracle_t *oracle, const plant_t *plant);
+
+/* Speed that a drive of one quadrant cannot take away: what the torque limit adds in three periods, while the speed is
+ * observed and while the voltage removes the largest flux linkage. */
+double oracle_added_rad_s(const oracle_t *oracle, const plant_t *plant);
 
 /* The drive has begun to run. */
 void oracle_enter_run(oracle_t *oracle, const plant_t *plant);

@@ -25,22 +25,24 @@ double oracle_recovery_speed_rpm(oracle_t *oracle, const plant_t *plant) {
     return fmin(fabs(oracle->recovery_rpm), machine->speed_command_max_rpm) * (oracle->recovery_rpm < 0.0 ? -1.0 : 1.0);
 }
 
-/* Part of the speed that a drive of one quadrant may have at most: it cannot take away what the torque limit adds in
- * three periods, while its speed is observed and while the voltage removes the largest flux linkage. */
-static double most_of_one_quadrant(const oracle_t *oracle, const plant_t *plant) {
+double oracle_added_rad_s(const oracle_t *oracle, const plant_t *plant) {
     const machine_t *machine = plant->machine;
-    magnetics_point_t aligned;
-    magnetics_evaluate(&plant->magnetics, 0.0, oracle->world->machine->trip_current_A, &aligned);
     const double late_s =
-        3e-9 * (double)oracle->period_ns + OBSERVED_S + aligned.flux_linkage_Wb / machine->supply_voltage_V;
-    const double added_rad_s =
-        late_s * oracle->world->machine->torque_max_Nm / (machine->inertia_kg_m2 * oracle->world->inertia_gain);
-    return fmax(1.2, 1.05 + added_rad_s * ORACLE_RPM_PER_RAD_S / fabs(oracle->recovery_rpm));
+        3e-9 * (double)oracle->period_ns + OBSERVED_S + oracle->detection.largest_flux_Wb / machine->supply_voltage_V;
+    return late_s * oracle->world->machine->torque_max_Nm / (machine->inertia_kg_m2 * oracle->world->inertia_gain);
+}
+
+/* Part of the speed that a drive of one quadrant may have at most. */
+static double most_of_one_quadrant(const oracle_t *oracle, const plant_t *plant) {
+    return fmax(1.2, 1.05 + oracle_added_rad_s(oracle, plant) * ORACLE_RPM_PER_RAD_S / fabs(oracle->recovery_rpm));
 }
 
 void oracle_look_at_recovery(oracle_t *oracle, const plant_t *plant) {
     if (!oracle->recovered) {
         return;
+    }
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        oracle->used |= (plant->switches[phase] != 0 ? 1u : 0u) << phase;
     }
     const double part = plant->speed_rad_s * ORACLE_RPM_PER_RAD_S / oracle->recovery_rpm;
     /* A drive of one quadrant waits for the friction to take an overshoot. */
@@ -93,13 +95,15 @@ void oracle_enter_run(oracle_t *oracle, const plant_t *plant) {
     const double needed_s = machine->inertia_kg_m2 * oracle->world->inertia_gain * change_rad_s /
                             (0.5 * oracle->world->machine->torque_max_Nm);
     oracle->recovered = true;
+    oracle->recovery_angle_rad = plant->rotor_angle_rad;
     oracle->settle_by_ns = plant->time_ns + (uint64_t)((0.1 + needed_s) * 1e9);
 }
 
-void oracle_finish(oracle_t *oracle, const plant_t *plant, double switch_C) {
+void oracle_finish(oracle_t *oracle, const plant_t *plant, oracle_heat_t heat) {
+    oracle_judge_temperature(oracle, plant, heat);
     oracle->held = held_by_encoder(oracle, plant);
     if (oracle->held || !oracle->recovery_judged || cause_remains(oracle) || oracle_bus_disturbed(oracle) ||
-        switch_C > SWITCH_COOL_C) {
+        heat.switch_C > SWITCH_COOL_C) {
         return;
     }
     if (!oracle->recovered) {
@@ -107,5 +111,11 @@ void oracle_finish(oracle_t *oracle, const plant_t *plant, double switch_C) {
     } else if (!oracle->settled && plant->time_ns > oracle->settle_by_ns) {
         oracle_violate(oracle, "not_recovered", plant->time_ns, 2,
                        plant->speed_rad_s * ORACLE_RPM_PER_RAD_S / oracle->recovery_rpm);
+    }
+    const bool turned =
+        fabs(plant->rotor_angle_rad - oracle->recovery_angle_rad) > 2.0 * ORACLE_TWO_PI / plant->machine->rotor_poles;
+    if (oracle->recovered && oracle->world->controller == 2 && turned &&
+        oracle->used + 1u != 1u << plant->machine->phases) {
+        oracle_violate(oracle, "not_recovered", plant->time_ns, 4, oracle->used);
     }
 }

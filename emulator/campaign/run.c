@@ -1,6 +1,6 @@
 #include "campaign/run.h"
 
-#include <math.h>
+#include "rig/heat.h"
 
 static void look(void *context, const plant_t *plant) {
     oracle_look(&((run_t *)context)->oracle, plant);
@@ -24,7 +24,8 @@ static void after_restart(void *context) {
 }
 
 static void on_bus(void *context, uint64_t time_ns, const sender_meaning_t *meaning) {
-    oracle_on_bus(&((run_t *)context)->oracle, time_ns, meaning);
+    run_t *run = context;
+    oracle_on_bus(&run->oracle, &run->rig.plant, time_ns, meaning);
 }
 
 static void on_status(void *context, uint64_t time_ns, unsigned state, unsigned fault) {
@@ -42,7 +43,7 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
     run->drive = drive;
     run->before_interrupt = NULL;
     run->end_ns = world->duration_us * 1000;
-    sender_init(&run->sender, world);
+    sender_init(&run->sender, world, drive->degraded_parameter);
     run->sender.record = record;
     run->sender.on_bus = on_bus;
     run->sender.on_status = on_status;
@@ -67,18 +68,12 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
         return false;
     }
     run->rig.observer = (rig_observer_t){before_interrupt, after_interrupt, after_restart, run};
-    oracle_init(&run->oracle, world, 1000000000u / world->control_rate_hz);
+    oracle_init(&run->oracle, world, &run->rig.plant, 1000000000u / world->control_rate_hz);
+    run->oracle.limit_bits = drive->limit_bits;
+    run->oracle.constant_bits = drive->constant_bits;
     rig_join(&run->rig, &firmware);
     plant_observe(&run->rig.plant, ORACLE_LOOK_NS / 2, ORACLE_LOOK_NS, look, run);
     return true;
-}
-
-static double hottest_C(const heat_bodies_t *bodies) {
-    double temperature_C = bodies->temperature_C[0];
-    for (unsigned phase = 1; phase < HAL_PHASES_MAX; phase++) {
-        temperature_C = fmax(temperature_C, bodies->temperature_C[phase]);
-    }
-    return temperature_C;
 }
 
 void run_to_end(run_t *run) {
@@ -97,6 +92,7 @@ void run_to_end(run_t *run) {
         }
     }
     rig_finish(&run->rig);
-    oracle_finish(&run->oracle, &run->rig.plant, hottest_C(&run->rig.heat.inverter));
+    oracle_finish(&run->oracle, &run->rig.plant,
+                  (oracle_heat_t){heat_winding_C(&run->rig), heat_inverter_C(&run->rig)});
     rig_close(&run->rig);
 }

@@ -13,11 +13,22 @@
 #define HASH_PRIME UINT64_C(1099511628211)
 #define COMMAND_PERIOD_US 10000
 #define ARM_RETRY_US 20000
+#define CONFIGURED_US 60000                 /* then the client runs the drive, configured or not */
+#define SEQUENCE_STEP_MAX 8                 /* of the counter: frames that a receiver may take for lost ones */
 #define DUPLICATE_MAX_NS UINT64_C(20000000) /* of a frame, by a disturbed acknowledgement */
 #define STREAM_HOSTILE 200
 
 /* E2EDataId of drive.dbc. */
-enum { DATA_ID_COMMAND = 23070, DATA_ID_TORQUE_COMMAND = 23071, DATA_ID_ARM = 23072 };
+enum {
+    DATA_ID_COMMAND = 23070,
+    DATA_ID_TORQUE_COMMAND,
+    DATA_ID_ARM,
+    DATA_ID_PARAMETER_WRITE,
+    DATA_ID_PARAMETER_SET_CONTROL
+};
+enum { ARM_REQUEST_RUN, ARM_CONFIRM_RUN, ARM_REQUEST_CONFIGURATION, ARM_CONFIRM_CONFIGURATION };
+enum { ATTEMPT_RUN = 1, ATTEMPT_CONFIGURATION };
+enum { SET_BEGIN = 0, SET_APPLY = 2 };
 enum { STATE_INITIALISE, STATE_READY, STATE_RUN, STATE_FAULT };
 enum { HONEST = 1, OTHER = 2 };
 
@@ -68,16 +79,24 @@ static void put(sender_t *sender, const transport_receiver_t *receiver, unsigned
     receiver->take(receiver->context, client, &frame);
 }
 
+static bool is_motion_command(unsigned identifier) {
+    return identifier == DRIVE_COMMAND_FRAME_ID || identifier == DRIVE_TORQUE_COMMAND_FRAME_ID;
+}
+
 static void put_genuine(sender_t *sender, const transport_receiver_t *receiver, unsigned client, unsigned identifier,
                         const uint8_t *data, unsigned length) {
     sender_frame_t *kept = &sender->history[sender->sent++ % SENDER_HISTORY];
-    *kept = (sender_frame_t){.length = (uint8_t)length, .identifier = (uint16_t)identifier, .sent_us = sender->time_us};
+    const bool motion = is_motion_command(identifier);
+    const bool in_sequence = client == HONEST || (uint8_t)(data[2] - sender->followed - 1u) < SEQUENCE_STEP_MAX;
+    sender->followed = motion && in_sequence ? data[2] : sender->followed;
+    *kept = (sender_frame_t){.length = (uint8_t)length,
+                             .identifier = (uint16_t)identifier,
+                             .sent_us = sender->time_us,
+
+                             .other = client == OTHER,
+                             .in_sequence = in_sequence};
     memcpy(kept->data, data, length);
     put(sender, receiver, client, identifier, data, length);
-}
-
-static bool is_motion_command(unsigned identifier) {
-    return identifier == DRIVE_COMMAND_FRAME_ID || identifier == DRIVE_TORQUE_COMMAND_FRAME_ID;
 }
 
 /* reference: LSBs of the speed or, in torque mode, of the torque. */
@@ -99,6 +118,29 @@ static void put_arm(sender_t *sender, const transport_receiver_t *receiver, unsi
     }
     protect(data, sizeof data, DATA_ID_ARM, sender->arm_counter++);
     put_genuine(sender, receiver, HONEST, DRIVE_ARM_FRAME_ID, data, sizeof data);
+}
+
+/* One byte and four: PARAMETER_WRITE, PARAMETER_SET_CONTROL. */
+static void put_set(sender_t *sender, const transport_receiver_t *receiver, unsigned identifier, uint16_t data_id,
+                    uint8_t head, uint32_t value) {
+    uint8_t data[8] = {[3] = head};
+    for (unsigned i = 0; i < 4; i++) {
+        data[4 + i] = (uint8_t)(value >> 8 * i);
+    }
+    protect(data, sizeof data, data_id, sender->arm_counter++);
+    put_genuine(sender, receiver, HONEST, identifier, data, sizeof data);
+}
+
+/* CRC-32 of IEEE 802.3 over index and value of a PARAMETER_WRITE. */
+static uint32_t check_of_set(uint8_t index, uint32_t value) {
+    uint32_t crc = UINT32_MAX;
+    for (unsigned i = 0; i < 5; i++) {
+        crc ^= i == 0 ? index : value >> 8 * (i - 1) & 0xFFu;
+        for (unsigned bit = 0; bit < 8; bit++) {
+            crc = crc >> 1 ^ (crc & 1u ? UINT32_C(0xEDB88320) : 0);
+        }
+    }
+    return ~crc;
 }
 
 /* --- The bench --- */
@@ -180,7 +222,32 @@ static sender_request_t wanted(sender_t *sender) {
     if (recovers && sender->time_us < world->recovery_us + 25000) {
         return SENDER_OFF;
     }
+    const world_event_t *request = active(sender, WORLD_REQUEST);
+    if (request && !recovers) {
+        return (sender_request_t)request->what;
+    }
     return clears && sender->state == STATE_FAULT ? clearing(sender) : SENDER_RUN;
+}
+
+/* Before it runs the drive the client allows it degraded running. */
+static bool configures(const sender_t *sender) {
+    return has(sender, WORLD_DEGRADED) && !sender->configured && sender->time_us < CONFIGURED_US;
+}
+
+static void configure(sender_t *sender, const transport_receiver_t *receiver) {
+    if (sender->challenge && sender->challenge_for == ATTEMPT_CONFIGURATION) {
+        const uint8_t index = (uint8_t)sender->degraded_parameter;
+        put_arm(sender, receiver, ARM_CONFIRM_CONFIGURATION, ~sender->challenge);
+        put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_BEGIN, 0);
+        put_set(sender, receiver, DRIVE_PARAMETER_WRITE_FRAME_ID, DATA_ID_PARAMETER_WRITE, index, 1);
+        put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_APPLY,
+                check_of_set(index, 1));
+        sender->challenge = 0;
+        sender->configured = true;
+    } else if (sender->state == STATE_READY && sender->time_us >= sender->requested_us + ARM_RETRY_US) {
+        sender->requested_us = sender->time_us;
+        put_arm(sender, receiver, ARM_REQUEST_CONFIGURATION, 0);
+    }
 }
 
 static void step_honest(sender_t *sender, const transport_receiver_t *receiver) {
@@ -199,6 +266,10 @@ static void step_honest(sender_t *sender, const transport_receiver_t *receiver) 
     if (has(sender, WORLD_SILENT) || sender->time_us < 2000) {
         return;
     }
+    if (configures(sender)) {
+        configure(sender, receiver);
+        return;
+    }
     if (request != sender->request || sender->time_us >= sender->due_us) {
         sender->request = request;
         sender->due_us = sender->time_us + COMMAND_PERIOD_US;
@@ -212,12 +283,12 @@ static void step_honest(sender_t *sender, const transport_receiver_t *receiver) 
         sender->state == STATE_INITIALISE) {
         return;
     }
-    if (sender->challenge) {
-        put_arm(sender, receiver, 1, ~sender->challenge);
+    if (sender->challenge && sender->challenge_for == ATTEMPT_RUN) {
+        put_arm(sender, receiver, ARM_CONFIRM_RUN, ~sender->challenge);
         sender->challenge = 0;
     } else if (sender->time_us >= sender->requested_us + ARM_RETRY_US) {
         sender->requested_us = sender->time_us;
-        put_arm(sender, receiver, 0, 0);
+        put_arm(sender, receiver, ARM_REQUEST_RUN, 0);
     }
 }
 
@@ -330,6 +401,20 @@ static bool is_same(const sender_frame_t *frame, const struct can_frame *on_bus)
            memcmp(frame->data, on_bus->data, frame->length) == 0;
 }
 
+static sender_meaning_t meaning_of_genuine(const sender_t *sender, const sender_frame_t *frame) {
+    const bool torque = frame->identifier == DRIVE_TORQUE_COMMAND_FRAME_ID;
+    const world_machine_t *machine = sender->world->machine;
+    const uint32_t raw = frame->data[4] | (uint32_t)frame->data[5] << 8 | (uint32_t)frame->data[6] << 16;
+    const double lsb = torque ? machine->command_lsb_Nm : machine->command_lsb_rpm;
+    return (sender_meaning_t){.genuine = frame->in_sequence,
+                              .other = frame->other,
+                              .command = is_motion_command(frame->identifier),
+                              .confirms = frame->identifier == DRIVE_ARM_FRAME_ID && frame->data[3] == ARM_CONFIRM_RUN,
+                              .torque = torque,
+                              .request = (sender_request_t)frame->data[3],
+                              .reference = (double)((int32_t)(raw ^ 0x800000u) - 0x800000) * lsb};
+}
+
 /* A frame that has been on the bus before is no request once more, unless it is so young that its own sender may have
  * sent it again; a replay is at least five frames old. */
 static sender_meaning_t meaning_of(sender_t *sender, const struct can_frame *on_bus, uint64_t time_ns) {
@@ -338,10 +423,7 @@ static sender_meaning_t meaning_of(sender_t *sender, const struct can_frame *on_
         const bool young = back <= 4 && time_ns <= frame->seen_ns + DUPLICATE_MAX_NS;
         if (is_same(frame, on_bus) && (frame->seen_ns == 0 || young)) {
             frame->seen_ns = frame->seen_ns ? frame->seen_ns : time_ns;
-            return (sender_meaning_t){.genuine = true,
-                                      .command = is_motion_command(frame->identifier),
-                                      .confirms = frame->identifier == DRIVE_ARM_FRAME_ID && frame->data[3] == 1,
-                                      .request = (sender_request_t)frame->data[3]};
+            return meaning_of_genuine(sender, frame);
         }
     }
     return (sender_meaning_t){.genuine = false};
@@ -355,7 +437,8 @@ static void listen(sender_t *sender, const struct can_frame *frame, uint64_t tim
         uint32_t challenge;
         memcpy(&challenge, frame->data, sizeof challenge);
         sender->armed = frame->data[4] >> 2 & 1u;
-        sender->challenge = (frame->data[4] & 3u) == 1u ? challenge : 0;
+        sender->challenge_for = frame->data[4] & 3u;
+        sender->challenge = challenge;
     }
 }
 
@@ -407,7 +490,7 @@ static bool in_use(transport_t *transport) {
     return true;
 }
 
-void sender_init(sender_t *sender, const world_t *world) {
+void sender_init(sender_t *sender, const world_t *world, unsigned degraded_parameter) {
     *sender = (sender_t){
         .transport = {.descriptors = descriptors,
                       .read = read_clients,
@@ -417,6 +500,7 @@ void sender_init(sender_t *sender, const world_t *world) {
                       .connected = connected,
                       .in_use = in_use},
         .world = world,
+        .degraded_parameter = degraded_parameter,
         .counter = (uint8_t)seeded_bits(world->seed, STREAM_HOSTILE, UINT64_MAX),
         .second_counter = (uint8_t)seeded_bits(world->seed, STREAM_HOSTILE, UINT64_MAX - 1),
         .arm_counter = (uint8_t)seeded_bits(world->seed, STREAM_HOSTILE, UINT64_MAX - 2),

@@ -24,14 +24,19 @@ typedef struct {
     uint16_t identifier;
     uint64_t sent_us;
     uint64_t seen_ns; /* first on the bus; 0: not yet */
+    bool other;       /* of the second sender */
+    bool in_sequence; /* of the honest client, or by chance as if it were */
 } sender_frame_t;
 
 /* What a frame on the bus was to the world, by its sender's own account. */
 typedef struct {
-    bool genuine;  /* of the honest or the second sender, not a replay of it */
+    bool genuine;  /* of the client that arms the drive, or in its sequence by chance; not a replay of it */
+    bool other;    /* of the second sender */
     bool command;  /* a motion command */
     bool confirms; /* an arming confirmed */
+    bool torque;   /* the command is one of the torque mode */
     sender_request_t request;
+    double reference; /* r/min or, in torque mode, N m */
 } sender_meaning_t;
 
 typedef struct sender {
@@ -40,9 +45,12 @@ typedef struct sender {
     uint64_t time_us;
     /* Honest client. */
     uint8_t counter, arm_counter;
+    uint8_t followed;          /* counter of the last motion command that a receiver may follow */
     uint8_t state, last_state; /* of the drive, by DRIVE_STATUS */
-    bool armed;
+    bool armed, configured;
+    unsigned challenge_for; /* arming_attempt_t */
     uint32_t challenge;
+    unsigned degraded_parameter; /* index of degraded_running */
     uint64_t requested_us, due_us, phase_us;
     sender_request_t request;
     int32_t reference; /* LSBs */
@@ -63,7 +71,8 @@ typedef struct sender {
     void *context;
 } sender_t;
 
-void sender_init(sender_t *sender, const world_t *world);
+/* degraded_parameter: index of the parameter degraded_running. */
+void sender_init(sender_t *sender, const world_t *world, unsigned degraded_parameter);
 
 /* The speed that is commanded after the faults, r/min; set it before world->recovery_us. */
 void sender_set_recovery_speed(sender_t *sender, double rpm);

@@ -20,6 +20,7 @@ enum {
     STREAM_BUS,
     STREAM_GATES,
     STREAM_TORQUE,
+    STREAM_REQUEST,
 };
 
 #define FAULT_DRAWS 8     /* random numbers of a kind of fault */
@@ -29,11 +30,18 @@ enum {
 /* Of the seeds. */
 #define FASTEST_SHARE 0.1 /* at the highest control rate */
 #define TORQUE_SHARE 0.15 /* in torque mode for some time */
+#define STOP_SHARE 0.1    /* stopped for some time, or off */
+#define DEGRADED_SHARE 0.1
+#define OVERHAULING_SHARE 0.1
+#define REVERSE_SHARE 0.4 /* of the speeds, with a controller of four quadrants */
 
 /* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
  * not. */
 #define SILENT_PART 0.12
 #define DESERTED_PART 0.15
+#define HOSTILE_PART 0.24
+#define DESERTED_SECOND_PART 0.26 /* likewise, a second one is not */
+#define SECOND_PART 0.32
 
 static int32_t raw_of(unsigned variable, double value) {
     const double raw = value / bench_variables[variable].scale;
@@ -129,14 +137,15 @@ static double load_max_Nm(const world_t *world, double rpm) {
 
 static double draw_speed_rpm(const world_t *world, unsigned index) {
     const double rpm = world->machine->speed_base_rpm * logarithmic(world->seed, STREAM_SPEED, index, 0.02, 1.0);
-    const bool reverse = world->controller == 2 && seeded_unit(world->seed, STREAM_SPEED, 50 + index) < 0.3;
+    const bool reverse = world->controller == 2 && seeded_unit(world->seed, STREAM_SPEED, 50 + index) < REVERSE_SHARE;
     return reverse ? -rpm : rpm;
 }
 
-/* Load of one of five sorts from begin_us on. */
+/* Load of one of five sorts from begin_us on; an overhauling one drives the machine. */
 static void draw_load(world_t *world, double rpm, uint64_t begin_us) {
     const uint64_t seed = world->seed;
-    const double sign = rpm < 0.0 ? -1.0 : 1.0;
+    const bool overhauling = !world->healthy && seeded_unit(seed, STREAM_LOAD, 4) < OVERHAULING_SHARE;
+    const double sign = (rpm < 0.0) != overhauling ? -1.0 : 1.0;
     const double torque_Nm = load_max_Nm(world, rpm) * seeded_unit(seed, STREAM_LOAD, 1);
     const bool coarse = world->machine->torque_max_Nm > 150.0;
     const unsigned step = coarse ? BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM : BENCH_VARIABLE_LOAD_TORQUE_NM;
@@ -171,7 +180,7 @@ static void draw_torque(world_t *world, uint64_t last_us) {
     const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_TORQUE, 1, 0.0, (double)last_us);
     const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_TORQUE, 2, 5e3, 3e5);
     world_event_t *event = add(world, WORLD_TORQUE, begin_us, end_us < last_us ? end_us : last_us);
-    const double part = seeded_between(seed, STREAM_TORQUE, 3, world->controller == 2 ? -0.5 : 0.0, 1.0);
+    const double part = seeded_between(seed, STREAM_TORQUE, 3, world->controller == 2 ? -1.0 : 0.0, 1.0);
     event->value = part * world->machine->torque_rated_Nm;
 }
 
@@ -307,6 +316,9 @@ static void draw_other_faults(world_t *world, uint64_t last_us) {
         const bool once =
             all[i].variable == BENCH_VARIABLE_DRIVE_RESET || all[i].variable == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER;
         add_set(world, all[i].variable, all[i].value, all[i].after, begin_us, once ? 0 : end_us);
+        if (all[i].variable == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER && seeded_unit(seed, STREAM_BUS, 94) < 0.5) {
+            add_set(world, all[i].variable, all[i].value, all[i].after, end_us, 0); /* once more */
+        }
     }
 }
 
@@ -317,13 +329,16 @@ static void draw_script(world_t *world, uint64_t last_us) {
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
     if (sort < SILENT_PART) {
         add(world, WORLD_SILENT, begin_us, end_us < last_us ? end_us : last_us);
-    } else if (sort < 0.24) {
+    } else if (sort < HOSTILE_PART) {
         if (sort < DESERTED_PART) {
             add(world, WORLD_SILENT, begin_us, last_us);
         }
         world_event_t *event = add(world, WORLD_HOSTILE, begin_us, end_us < last_us ? end_us : last_us);
         event->what = seeded_below(seed, STREAM_SCRIPT, 3, WORLD_HOSTILE_SORTS);
-    } else if (sort < 0.32) {
+    } else if (sort < SECOND_PART) {
+        if (sort < DESERTED_SECOND_PART) { /* the second client alone */
+            add(world, WORLD_SILENT, begin_us, last_us);
+        }
         add(world, WORLD_SECOND, begin_us, end_us < last_us ? end_us : last_us);
     }
     if (seeded_unit(seed, STREAM_SCRIPT, 4) < 0.3) {
@@ -334,6 +349,20 @@ static void draw_script(world_t *world, uint64_t last_us) {
     }
 }
 
+/* In a part of the worlds the client stops the drive for some time, or switches it off. */
+static void draw_request(world_t *world, uint64_t last_us) {
+    const uint64_t seed = world->seed;
+    if (seeded_unit(seed, STREAM_REQUEST, 0) < STOP_SHARE) {
+        const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_REQUEST, 1, 1e4, (double)last_us);
+        const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_REQUEST, 2, 2e3, 1e6);
+        world_event_t *event = add(world, WORLD_REQUEST, begin_us, end_us < last_us ? end_us : last_us);
+        event->what = seeded_unit(seed, STREAM_REQUEST, 3) < 0.7 ? WORLD_REQUEST_STOP : WORLD_REQUEST_OFF;
+    }
+    if (seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE) {
+        add(world, WORLD_DEGRADED, 0, 0);
+    }
+}
+
 void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
     draw_board(world, machines, count, seed);
     draw_imperfections(world);
@@ -341,7 +370,9 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     uint64_t last_us = (uint64_t)(1e6 * fmin(0.1 + 1.5 * start_s(world, 0.0, first_rpm),
                                              seeded_between(seed, STREAM_SCRIPT, 9, 0.1, 0.4)));
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
-    last_us = sort < 0.04 || (sort >= SILENT_PART && sort < DESERTED_PART) ? 900000 : last_us;
+    const bool deserted =
+        (sort >= SILENT_PART && sort < DESERTED_PART) || (sort >= HOSTILE_PART && sort < DESERTED_SECOND_PART);
+    last_us = sort < 0.04 || deserted ? 900000 : last_us;
     world->recovery_us = last_us + 25000;
     add_speed(world, first_rpm, 0);
     if (seeded_unit(seed, STREAM_SPEED, 90) < 0.4) {
@@ -351,6 +382,7 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     draw_load(world, first_rpm, (uint64_t)seeded_between(seed, STREAM_LOAD, 9, 1e4, (double)last_us));
     draw_script(world, last_us);
     draw_torque(world, last_us);
+    draw_request(world, last_us);
     unsigned faults = 0;
     for (unsigned i = 1; i < FAULT_COUNT && faults < FAULTS_MAX; i++) {
         const unsigned kind = 1 + (i + (unsigned)(seed % (FAULT_COUNT - 1))) % (FAULT_COUNT - 1);
@@ -394,7 +426,7 @@ const char *world_event_name(const world_event_t *event) {
     static const char *const names[] = {
         [WORLD_SPEED] = "speed_reference", [WORLD_TORQUE] = "torque_reference", [WORLD_SILENT] = "silent",
         [WORLD_HOSTILE] = "hostile",       [WORLD_SECOND] = "second_sender",    [WORLD_EAGER] = "eager",
-        [WORLD_UNARMED] = "unarmed",
+        [WORLD_UNARMED] = "unarmed",       [WORLD_REQUEST] = "request",         [WORLD_DEGRADED] = "degraded_running",
     };
     return event->kind == WORLD_SET     ? bench_variables[event->what].name
            : event->kind == WORLD_FAULT ? fault_kinds[event->what].name
@@ -420,7 +452,7 @@ void world_print(const world_t *world) {
             value = event->raw * bench_variables[event->what].scale;
         } else if (event->kind == WORLD_FAULT) {
             value = event->raw * fault_kinds[event->what].scale;
-        } else if (event->kind == WORLD_HOSTILE) {
+        } else if (event->kind == WORLD_HOSTILE || event->kind == WORLD_REQUEST) {
             value = event->what;
         }
         printf("%s{\"index\": %u, \"event\": \"%s\", \"begin_us\": %" PRIu64 ", \"end_us\": %" PRIu64

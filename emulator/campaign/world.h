@@ -25,15 +25,17 @@ typedef struct {
 } world_machine_t;
 
 typedef enum {
-    WORLD_SET,     /* bench variable `what` has `raw` from begin to end, then `raw_end` */
-    WORLD_FAULT,   /* fault of kind `what` from begin to end */
-    WORLD_SPEED,   /* the client's speed reference is `value` r/min from begin on */
-    WORLD_TORQUE,  /* the client commands a torque of `value` N m instead, from begin to end */
-    WORLD_SILENT,  /* the client sends nothing from begin to end */
-    WORLD_HOSTILE, /* a second client sends frames of sort `what` from begin to end */
-    WORLD_SECOND,  /* a second client sends protected commands of its own from begin to end */
-    WORLD_EAGER,   /* the client clears, arms and runs again after each fault, whatever its cause does */
-    WORLD_UNARMED, /* the client requests to run without arming the drive, from begin to end */
+    WORLD_SET,      /* bench variable `what` has `raw` from begin to end, then `raw_end` */
+    WORLD_FAULT,    /* fault of kind `what` from begin to end */
+    WORLD_SPEED,    /* the client's speed reference is `value` r/min from begin on */
+    WORLD_TORQUE,   /* the client commands a torque of `value` N m instead, from begin to end */
+    WORLD_SILENT,   /* the client sends nothing from begin to end */
+    WORLD_HOSTILE,  /* a second client sends frames of sort `what` from begin to end */
+    WORLD_SECOND,   /* a second client sends protected commands of its own from begin to end */
+    WORLD_EAGER,    /* the client clears, arms and runs again after each fault, whatever its cause does */
+    WORLD_UNARMED,  /* the client requests to run without arming the drive, from begin to end */
+    WORLD_REQUEST,  /* the client sends request `what` instead of run, from begin to end */
+    WORLD_DEGRADED, /* the client sets the parameter degraded_running before it runs the drive */
 } world_kind_t;
 
 typedef enum {
@@ -46,6 +48,9 @@ typedef enum {
     WORLD_HOSTILE_REPEAT,   /* the latest genuine frame once more, each millisecond, as a gateway that hangs */
     WORLD_HOSTILE_SORTS
 } world_hostile_t;
+
+/* As DRIVE_COMMAND.request. */
+enum { WORLD_REQUEST_OFF, WORLD_REQUEST_STOP = 2 };
 
 typedef struct {
     world_kind_t kind;

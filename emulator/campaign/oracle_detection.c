@@ -1,0 +1,183 @@
+#include "campaign/oracle_parts.h"
+
+#include <math.h>
+
+#include "bench_variables.h"
+#include "fault_kinds.h"
+
+#define STEP_NS ORACLE_MS_NS
+#define CLOCK_DRIFT_PERCENT 8.0
+#define FLUX_LINKAGES 20.0 /* of the aligned position at the trip current, applied to a phase without any effect */
+#define NO_CURRENT_A 1e-3
+#define MISLED_PITCH (1.0 / 6.0) /* error of the angle at which a phase makes torque in the other direction */
+#define MISLED_NS (200 * ORACLE_MS_NS)
+#define BLOCKED_NS (300 * ORACLE_MS_NS)
+#define BLOCKED_SPEED 0.05           /* of the base speed, commanded */
+#define MUTE_NS (100 * ORACLE_MS_NS) /* bus-off for the second time included */
+#define RESET_NS (60 * ORACLE_MS_NS)
+#define CONTESTED_NS (150 * ORACLE_MS_NS)
+
+/* Milliseconds after which a drive in a run has to have noticed what it can see at any time; 0: not of this sort. */
+static unsigned noticed_within_ms(const oracle_t *oracle, const world_event_t *event) {
+    switch (event->what) {
+    case FAULT_LIMIT_FLIPPED:
+        return event->raw < (int32_t)oracle->limit_bits ? 10 : 0;
+    case FAULT_CONSTANT_FLIPPED:
+        return event->raw < (int32_t)oracle->constant_bits ? 10 : 0;
+    case FAULT_FAULT_LATCH_FLIPPED:
+    case FAULT_PERIOD_REGISTER_FLIPPED:
+        return 10;
+    case FAULT_CURRENT_SENSOR_HIGH_RAIL:
+    case FAULT_DC_LINK_SENSOR_OPEN:
+    case FAULT_DC_LINK_SENSOR_LOW_RAIL:
+    case FAULT_DC_LINK_SENSOR_HIGH_RAIL:
+        return 2;
+    case FAULT_WINDING_TEMPERATURE_SENSOR_OPEN:
+    case FAULT_WINDING_TEMPERATURE_SENSOR_SHORTED:
+    case FAULT_INVERTER_TEMPERATURE_SENSOR_OPEN:
+    case FAULT_INVERTER_TEMPERATURE_SENSOR_SHORTED:
+        return 60;
+    case FAULT_CLOCK_DRIFT:
+        return fabs(event->value) > CLOCK_DRIFT_PERCENT ? 60 : 0;
+    case FAULT_BACKGROUND_HUNG:
+    case FAULT_INTERRUPT_STORM:
+        return 40;
+    default:
+        return 0;
+    }
+}
+
+/* Late or lost interrupts and a background without time: what is checked is checked late. */
+static bool checks_late(const oracle_t *oracle, uint64_t time_us) {
+    return oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
+           oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_us);
+}
+
+/* A reset writes anew what has changed in memory and registers. */
+static bool mended_by_reset(const oracle_t *oracle, const world_event_t *event) {
+    return event->what >= FAULT_LIMIT_FLIPPED && event->what <= FAULT_PERIOD_REGISTER_FLIPPED &&
+           oracle->reset_ns >= event->begin_us * 1000;
+}
+
+static void look_at_kinds(oracle_t *oracle, uint64_t now_ns) {
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = &oracle->world->event[i];
+        if (event->kind != WORLD_FAULT || !world_active(oracle->world, i, now_ns / 1000) ||
+            mended_by_reset(oracle, event)) {
+            continue;
+        }
+        const uint64_t within_ns = noticed_within_ms(oracle, event) * ORACLE_MS_NS;
+        const uint64_t begin_ns = event->begin_us * 1000;
+        const uint64_t since_ns = begin_ns > oracle->state_ns ? begin_ns : oracle->state_ns;
+        const bool of_processor = event->what == FAULT_BACKGROUND_HUNG || event->what == FAULT_INTERRUPT_STORM;
+        if (within_ns && now_ns > since_ns + within_ns && (of_processor || !checks_late(oracle, now_ns / 1000))) {
+            oracle_violate(oracle, "undetected", now_ns, event->what, event->value);
+        }
+    }
+}
+
+/* Commands of a client that is not the one which has armed the drive, or that are forged. */
+static void look_at_senders(oracle_t *oracle, uint64_t now_ns) {
+    if (oracle_variable_begun(oracle, BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER, now_ns / 1000) ||
+        oracle_variable_begun(oracle, BENCH_VARIABLE_BUS_CONNECTION, now_ns / 1000)) {
+        return; /* the drive listens to nobody: its last command ages */
+    }
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = &oracle->world->event[i];
+        const bool foreign =
+            event->kind == WORLD_SECOND || (event->kind == WORLD_HOSTILE && event->what == WORLD_HOSTILE_FORGED);
+        if (!foreign || !world_active(oracle->world, i, now_ns / 1000)) {
+            continue;
+        }
+        const uint64_t begin_ns = event->begin_us * 1000;
+        const uint64_t since_ns = begin_ns > oracle->state_ns ? begin_ns : oracle->state_ns;
+        if (now_ns > since_ns + CONTESTED_NS && !oracle->succeeded) {
+            oracle_violate(oracle, "contested", now_ns, event->what, (double)(now_ns - since_ns) * 1e-6);
+        }
+    }
+}
+
+/* A drive that is no longer heard although the bus carries frames. */
+static void look_at_status(oracle_t *oracle, uint64_t now_ns) {
+    static const unsigned variables[] = {BENCH_VARIABLE_BABBLE_LOAD_PERCENT, BENCH_VARIABLE_BUS_CONNECTION,
+                                         BENCH_VARIABLE_FRAME_FAULT};
+    for (unsigned i = 0; i < sizeof variables / sizeof *variables; i++) {
+        if (oracle_variable_begun(oracle, variables[i], now_ns / 1000)) {
+            return;
+        }
+    }
+    const uint64_t heard_ns =
+        oracle->detection.status_ns > oracle->reset_ns ? oracle->detection.status_ns : oracle->reset_ns;
+    if (now_ns > heard_ns + MUTE_NS && !checks_late(oracle, now_ns / 1000) &&
+        !oracle_other_sender(oracle, true, now_ns / 1000)) {
+        oracle_violate(oracle, "mute", now_ns, 0, (double)(now_ns - heard_ns) * 1e-6);
+    }
+}
+
+/* Voltage on a phase that is followed by no current at all. */
+static void look_at_phases(oracle_t *oracle, const plant_t *plant) {
+    const bool hidden = oracle_any_injected(oracle, FAULT_CURRENT_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET) ||
+                        checks_late(oracle, plant->time_ns / 1000);
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        double *flux_Wb = &oracle->detection.flux_Wb[phase];
+        if (oracle->drive.state != STATE_RUN || plant_current_A(plant, phase) > NO_CURRENT_A) {
+            *flux_Wb = 0.0;
+        } else if (plant->switches[phase] == 3) {
+            *flux_Wb += plant->bus_voltage_V * (double)ORACLE_LOOK_NS * 1e-9;
+            if (*flux_Wb > FLUX_LINKAGES * oracle->detection.largest_flux_Wb && !hidden) {
+                oracle_violate(oracle, "no_current", plant->time_ns, phase, *flux_Wb);
+            }
+        }
+    }
+}
+
+/* The rotor stays within a stroke although a speed is commanded. */
+static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
+    oracle_detection_t *detection = &oracle->detection;
+    const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
+    const bool pushes = oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
+                        !oracle->meant.torque &&
+                        fabs(oracle->meant.reference) > BLOCKED_SPEED * oracle->world->machine->speed_base_rpm;
+    if (!pushes || detection->blocked_ns == 0 ||
+        fabs(plant->rotor_angle_rad - detection->blocked_angle_rad) > stroke_rad) {
+        detection->blocked_ns = pushes ? plant->time_ns : 0;
+        detection->blocked_angle_rad = plant->rotor_angle_rad;
+    } else if (plant->time_ns > detection->blocked_ns + BLOCKED_NS && !checks_late(oracle, plant->time_ns / 1000)) {
+        oracle_violate(oracle, "blocked", plant->time_ns, 0, (double)(plant->time_ns - detection->blocked_ns) * 1e-6);
+    }
+}
+
+/* A measured angle with which the torque is not what the drive takes it for. */
+static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
+    const double pitches = (ldexp((double)oracle->drive.angle, -32) - plant->rotor_angle_rad / ORACLE_TWO_PI -
+                            oracle->encoder_offset_rev) *
+                           plant->machine->rotor_poles;
+    const bool turns = fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > 0.05 * oracle->world->machine->speed_base_rpm;
+    oracle_since(&oracle->detection.misled_ns,
+                 oracle->drive.state == STATE_RUN && turns && fabs(pitches - floor(pitches + 0.5)) > MISLED_PITCH,
+                 plant->time_ns);
+    if (oracle->detection.misled_ns && plant->time_ns > oracle->detection.misled_ns + MISLED_NS &&
+        !checks_late(oracle, plant->time_ns / 1000)) {
+        oracle_violate(oracle, "misled", plant->time_ns, 0, pitches - floor(pitches + 0.5));
+    }
+}
+
+void oracle_look_at_detection(oracle_t *oracle, const plant_t *plant) {
+    oracle_detection_t *detection = &oracle->detection;
+    look_at_phases(oracle, plant);
+    if (plant->time_ns < detection->looked_ns + STEP_NS) {
+        return;
+    }
+    detection->looked_ns = plant->time_ns;
+    const uint64_t alive_ns = oracle->interrupt_ns > oracle->reset_ns ? oracle->interrupt_ns : oracle->reset_ns;
+    if (plant->time_ns > alive_ns + RESET_NS) {
+        oracle_violate(oracle, "not_reset", plant->time_ns, 0, (double)(plant->time_ns - alive_ns) * 1e-6);
+    }
+    if (oracle->drive.state == STATE_RUN && !oracle_state_changed(oracle)) {
+        look_at_kinds(oracle, plant->time_ns);
+        look_at_senders(oracle, plant->time_ns);
+    }
+    look_at_status(oracle, plant->time_ns);
+    look_at_rotor(oracle, plant);
+    look_at_angle(oracle, plant);
+}
