@@ -33,7 +33,7 @@ enum {
 #define STOP_SHARE 0.1    /* stopped for some time, or off */
 #define DEGRADED_SHARE 0.1
 #define OVERHAULING_SHARE 0.1
-#define REVERSE_SHARE 0.4 /* of the speeds, with a controller of four quadrants */
+#define REVERSE_SHARE 0.3 /* of the speeds, with a controller of four quadrants */
 
 /* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
  * not. */
