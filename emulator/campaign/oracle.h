@@ -32,9 +32,9 @@
  *                   at the end, the hottest winding or switch measured off the true one by more than 5 K, sensors and
  *                   processor healthy
  *   wrong_torque    no fault, torque mode, below half of the base speed: the mean torque of electrical periods off the
- *                   commanded one by more than a quarter and 5 % of the rated one
- *   overshoot       no fault, the speed above a reference that it has approached from below by more than a fifth and
- *                   5 % of the base speed; one quadrant: and what a light rotor gains
+ *                   commanded one by more than 10 % and 2 % of the rated one
+ *   overshoot       no fault, the speed above a reference that it has approached from below by more than 12 % and 3 %
+ *                   of the base speed; one quadrant: and what a light rotor gains
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
  *                   and memory undisturbed
  *   wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
@@ -44,7 +44,7 @@
  *   undetected      in state run for longer than a reaction takes with a fault that shows at any time: changed memory,
  *                   sensors at a rail, a wrong clock, a background that hangs (oracle_detection.c)
  *   no_current      voltage on a phase for twenty times its largest flux linkage, and no current at all
- *   blocked         a speed commanded, and the rotor within a stroke for 300 ms
+ *   blocked         a speed commanded, and the rotor within a stroke for 300 ms and three strokes
  *   misled          for 200 ms a measured angle off by more than a sixth of a rotor pitch
  *   contested       for 150 ms in state run while another client sends commands
  *   not_reset       no control interrupt for 60 ms, and no reset

@@ -12,6 +12,7 @@
 #define MISLED_PITCH (1.0 / 6.0) /* error of the angle at which a phase makes torque in the other direction */
 #define MISLED_NS (200 * ORACLE_MS_NS)
 #define BLOCKED_NS (300 * ORACLE_MS_NS)
+#define BLOCKED_STROKES 3.0          /* at the commanded speed, besides */
 #define BLOCKED_SPEED 0.05           /* of the base speed, commanded */
 #define MUTE_NS (100 * ORACLE_MS_NS) /* bus-off for the second time included */
 #define RESET_NS (60 * ORACLE_MS_NS)
@@ -142,7 +143,12 @@ static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
         fabs(plant->rotor_angle_rad - detection->blocked_angle_rad) > stroke_rad) {
         detection->blocked_ns = pushes ? plant->time_ns : 0;
         detection->blocked_angle_rad = plant->rotor_angle_rad;
-    } else if (plant->time_ns > detection->blocked_ns + BLOCKED_NS && !checks_late(oracle, plant->time_ns / 1000)) {
+        return;
+    }
+    const double stroke_s = stroke_rad * ORACLE_RPM_PER_RAD_S / fabs(oracle->meant.reference);
+    const uint64_t since_ns = detection->blocked_ns > oracle->constant_ns ? detection->blocked_ns : oracle->constant_ns;
+    if (plant->time_ns > since_ns + BLOCKED_NS + (uint64_t)(BLOCKED_STROKES * stroke_s * 1e9) &&
+        !checks_late(oracle, plant->time_ns / 1000)) {
         oracle_violate(oracle, "blocked", plant->time_ns, 0, (double)(plant->time_ns - detection->blocked_ns) * 1e-6);
     }
 }

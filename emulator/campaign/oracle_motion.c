@@ -8,10 +8,10 @@
 #define TORQUE_SETTLED_NS (50 * ORACLE_MS_NS) /* after another command */
 #define TORQUE_MIN_NS (5 * ORACLE_MS_NS)
 #define TORQUE_SPEED 0.5      /* of the base speed, at most: above, the voltage limits the torque */
-#define TORQUE_ERROR_MAX 0.25 /* of the torque: flux linkages of a machine scatter by 5 % */
-#define TORQUE_ERROR_MAX_RATED 0.05
-#define OVERSHOOT_MAX 0.2       /* of the speed reference */
-#define OVERSHOOT_MAX_BASE 0.05 /* of the base speed */
+#define TORQUE_ERROR_MAX 0.10 /* of the torque: flux linkages of a machine scatter by 5 % */
+#define TORQUE_ERROR_MAX_RATED 0.02
+#define OVERSHOOT_MAX 0.12      /* of the speed reference */
+#define OVERSHOOT_MAX_BASE 0.03 /* of the base speed */
 #define STOP_ERROR_MAX_BASE 0.05
 #define STOP_ERROR_MAX_RAD_S 2.0
 #define STOP_SETTLED_S 0.1

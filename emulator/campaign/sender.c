@@ -13,8 +13,9 @@
 #define HASH_PRIME UINT64_C(1099511628211)
 #define COMMAND_PERIOD_US 10000
 #define ARM_RETRY_US 20000
-#define CONFIGURED_US 60000                 /* then the client runs the drive, configured or not */
-#define SEQUENCE_STEP_MAX 8                 /* of the counter: frames that a receiver may take for lost ones */
+#define CONFIGURED_US 60000 /* then the client runs the drive, configured or not */
+#define SEQUENCE_STEP_MAX 8 /* of the counter: frames that a receiver may take for lost ones */
+#define RECOVERY_OFF_US 25000
 #define DUPLICATE_MAX_NS UINT64_C(20000000) /* of a frame, by a disturbed acknowledgement */
 #define STREAM_HOSTILE 200
 
@@ -219,8 +220,10 @@ static sender_request_t wanted(sender_t *sender) {
         sender->phase_us = sender->time_us;
     }
     sender->last_state = sender->state;
-    if (recovers && sender->time_us < world->recovery_us + 25000) {
-        return SENDER_OFF;
+    if (recovers && sender->time_us < world->recovery_us + RECOVERY_OFF_US) {
+        /* A lost phase is used again after clear_fault, even where its loss was no fault. */
+        const bool later = sender->time_us >= world->recovery_us + RECOVERY_OFF_US / 2;
+        return later && has(sender, WORLD_DEGRADED) ? SENDER_CLEAR : SENDER_OFF;
     }
     const world_event_t *request = active(sender, WORLD_REQUEST);
     if (request && !recovers) {

@@ -329,6 +329,10 @@ static void draw_script(world_t *world, uint64_t last_us) {
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
     if (sort < SILENT_PART) {
         add(world, WORLD_SILENT, begin_us, end_us < last_us ? end_us : last_us);
+        const uint64_t again_us = end_us + (uint64_t)logarithmic(seed, STREAM_SCRIPT, 7, 1e4, 1e5);
+        if (again_us < last_us) {
+            add(world, WORLD_SILENT, again_us, last_us);
+        }
     } else if (sort < HOSTILE_PART) {
         if (sort < DESERTED_PART) {
             add(world, WORLD_SILENT, begin_us, last_us);
