@@ -45,8 +45,8 @@
  *                   sensors at a rail, a wrong clock, a background that hangs (oracle_detection.c)
  *   no_current      voltage on a phase for twenty times its largest flux linkage, and no current at all
  *   blocked         a speed commanded, and the rotor within a stroke for 300 ms and three strokes
- *   misled          for 200 ms a measured angle off by more than a sixth of a rotor pitch
- *   contested       for 150 ms in state run while another client sends commands
+ *   misled          for 200 ms, above a fifth of the base speed and a tenth of the trip current, a measured angle off
+ * by more than a sixth of a rotor pitch contested       for 150 ms in state run while another client sends commands
  *   not_reset       no control interrupt for 60 ms, and no reset
  *   mute            no status on an undisturbed bus for 100 ms
  * eventually

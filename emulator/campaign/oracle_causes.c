@@ -146,6 +146,29 @@ unsigned oracle_phases_at_fault(const oracle_t *oracle, uint64_t now_us) {
     return phases;
 }
 
+/* What the plant shows is not the drive's own work. Without a load that drives it, a drive with healthy sensors and
+ * phases exceeds neither its speed nor the voltage of a link that is fed as it should be. */
+static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *plant, bool any) {
+    const uint64_t now_us = plant->time_ns / 1000;
+    const bool unsound = oracle_any_injected(oracle, FAULT_WINDING_OPEN, FAULT_LOAD_DROPPED) ||
+                         oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
+                         oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, now_us) ||
+                         oracle_overhauled(oracle, plant->speed_rad_s);
+    const bool near_limit = !oracle->meant.torque && oracle->world->controller != 2 &&
+                            fabs(oracle->meant.reference) > 0.8 * oracle->world->machine->over_speed_rpm;
+    switch (cause) {
+    case CAUSE_OVER_CURRENT:
+    case CAUSE_HARDWARE_OVER_CURRENT:
+        return any;
+    case CAUSE_OVER_SPEED:
+        return unsound || near_limit; /* which an overshoot of one quadrant may exceed */
+    case CAUSE_OVER_VOLTAGE:
+        return unsound || oracle_any_injected(oracle, FAULT_SUPPLY_LOST, FAULT_CHOPPER_OPEN);
+    default:
+        return true;
+    }
+}
+
 void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
     const world_t *world = oracle->world;
     const uint64_t now_us = plant->time_ns / 1000;
@@ -174,11 +197,7 @@ void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);
     }
     const unsigned cause = oracle->drive.fault;
-    /* Of the drive; only a load can drive it above its speed or regenerate more than it asks for. */
-    const bool overhauled = oracle_overhauled(oracle, plant->speed_rad_s);
-    const bool own_work = cause == CAUSE_OVER_CURRENT || cause == CAUSE_HARDWARE_OVER_CURRENT ||
-                          ((cause == CAUSE_OVER_SPEED || cause == CAUSE_OVER_VOLTAGE) && !overhauled);
-    if ((allowed >> cause & 1u) || ((any || !own_work) && true_of_plant(oracle, cause, plant))) {
+    if ((allowed >> cause & 1u) || (true_of_plant(oracle, cause, plant) && has_reason(oracle, cause, plant, any))) {
         return;
     }
     oracle_violate(oracle, any ? "wrong_cause" : "false_alarm", plant->time_ns, cause, (double)oracle->drive.checks);

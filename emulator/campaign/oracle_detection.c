@@ -10,7 +10,10 @@
 #define FLUX_LINKAGES 20.0 /* of the aligned position at the trip current, applied to a phase without any effect */
 #define NO_CURRENT_A 1e-3
 #define MISLED_PITCH (1.0 / 6.0) /* error of the angle at which a phase makes torque in the other direction */
+#define MISLED_SPEED 0.2         /* of the base speed, above which a wrong angle shows soon, */
+#define MISLED_CURRENT 0.1       /* of the trip, */
 #define MISLED_NS (200 * ORACLE_MS_NS)
+#define HEARD_NS (50 * ORACLE_MS_NS) /* since the last command: then the torque ramps to zero */
 #define BLOCKED_NS (300 * ORACLE_MS_NS)
 #define BLOCKED_STROKES 3.0          /* at the commanded speed, besides */
 #define BLOCKED_SPEED 0.05           /* of the base speed, commanded */
@@ -136,7 +139,8 @@ static void look_at_phases(oracle_t *oracle, const plant_t *plant) {
 static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
     oracle_detection_t *detection = &oracle->detection;
     const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
-    const bool pushes = oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
+    const bool heard = plant->time_ns < oracle->run_ns + HEARD_NS;
+    const bool pushes = heard && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
                         !oracle->meant.torque &&
                         fabs(oracle->meant.reference) > BLOCKED_SPEED * oracle->world->machine->speed_base_rpm;
     if (!pushes || detection->blocked_ns == 0 ||
@@ -158,9 +162,15 @@ static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
     const double pitches = (ldexp((double)oracle->drive.angle, -32) - plant->rotor_angle_rad / ORACLE_TWO_PI -
                             oracle->encoder_offset_rev) *
                            plant->machine->rotor_poles;
-    const bool turns = fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > 0.05 * oracle->world->machine->speed_base_rpm;
+    const world_machine_t *machine = oracle->world->machine;
+    const bool turns = fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > MISLED_SPEED * machine->speed_base_rpm;
+    double current_A = 0.0;
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        current_A = fmax(current_A, plant_current_A(plant, phase));
+    }
     oracle_since(&oracle->detection.misled_ns,
-                 oracle->drive.state == STATE_RUN && turns && fabs(pitches - floor(pitches + 0.5)) > MISLED_PITCH,
+                 oracle->drive.state == STATE_RUN && turns && current_A > MISLED_CURRENT * machine->trip_current_A &&
+                     fabs(pitches - floor(pitches + 0.5)) > MISLED_PITCH,
                  plant->time_ns);
     if (oracle->detection.misled_ns && plant->time_ns > oracle->detection.misled_ns + MISLED_NS &&
         !checks_late(oracle, plant->time_ns / 1000)) {

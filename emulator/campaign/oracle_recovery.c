@@ -66,12 +66,25 @@ static bool sto_lines_differed(const oracle_t *oracle) {
     return false;
 }
 
+/* A drive takes a current that its sensor has shown for so long for heat, which has to go before it runs. */
+static bool heated_by_sensor(const oracle_t *oracle) {
+    const world_t *world = oracle->world;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = world_begun(world, i, UINT64_MAX);
+        if (event != NULL && event->kind == WORLD_FAULT && event->what >= FAULT_CURRENT_SENSOR_STUCK &&
+            event->what <= FAULT_CURRENT_SENSOR_OFFSET && event->end_us > event->begin_us + 100000) {
+            return true;
+        }
+    }
+    return false;
+}
+
 /* True when what keeps a drive in a fault is still there: nothing to be judged. */
 static bool cause_remains(const oracle_t *oracle) {
     if (oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_PERIOD_REGISTER_FLIPPED)) {
         return true; /* memory that has changed: until a reset */
     }
-    if (sto_lines_differed(oracle)) {
+    if (sto_lines_differed(oracle) || heated_by_sensor(oracle)) {
         return true;
     }
     const uint8_t last = oracle->causes ? oracle->cause[oracle->causes - 1] : 0;

@@ -33,7 +33,10 @@ enum {
 #define STOP_SHARE 0.1    /* stopped for some time, or off */
 #define DEGRADED_SHARE 0.1
 #define OVERHAULING_SHARE 0.1
-#define REVERSE_SHARE 0.3 /* of the speeds, with a controller of four quadrants */
+#define RUNAWAY_SHARE 0.3   /* of the torque mode: the largest torque, to the end */
+#define REMAINING_SHARE 0.3 /* of the faults: until all are over */
+#define LONG_SHARE 0.08     /* long enough for what takes long to be noticed */
+#define REVERSE_SHARE 0.3   /* of the speeds, with a controller of four quadrants */
 
 /* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
  * not. */
@@ -179,9 +182,10 @@ static void draw_torque(world_t *world, uint64_t last_us) {
     }
     const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_TORQUE, 1, 0.0, (double)last_us);
     const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_TORQUE, 2, 5e3, 3e5);
-    world_event_t *event = add(world, WORLD_TORQUE, begin_us, end_us < last_us ? end_us : last_us);
+    const bool runaway = seeded_unit(seed, STREAM_TORQUE, 4) < RUNAWAY_SHARE;
+    world_event_t *event = add(world, WORLD_TORQUE, begin_us, end_us < last_us && !runaway ? end_us : last_us);
     const double part = seeded_between(seed, STREAM_TORQUE, 3, world->controller == 2 ? -1.0 : 0.0, 1.0);
-    event->value = part * world->machine->torque_rated_Nm;
+    event->value = runaway ? copysign(world->machine->torque_max_Nm, part) : part * world->machine->torque_rated_Nm;
 }
 
 static double start_s(const world_t *world, double from_rpm, double to_rpm) {
@@ -266,7 +270,8 @@ static void draw_fault(world_t *world, unsigned kind, uint64_t last_us) {
     const bool early = seeded_unit(seed, STREAM_FAULT, base) < 0.2;
     const uint64_t begin_us = early ? 0 : (uint64_t)seeded_between(seed, STREAM_FAULT, base + 1, 5e3, (double)last_us);
     uint64_t end_us = begin_us + 20 + (uint64_t)logarithmic(seed, STREAM_FAULT, base + 2, 30.0, 2e5);
-    end_us = end_us < last_us ? end_us : last_us;
+    const bool remains = seeded_unit(seed, STREAM_FAULT, base + 6) < REMAINING_SHARE;
+    end_us = end_us < last_us && !remains ? end_us : last_us;
     world_event_t *event = end_us > begin_us ? add(world, WORLD_FAULT, begin_us, end_us) : NULL;
     if (!event) {
         return;
@@ -376,12 +381,12 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
     const bool deserted =
         (sort >= SILENT_PART && sort < DESERTED_PART) || (sort >= HOSTILE_PART && sort < DESERTED_SECOND_PART);
-    last_us = sort < 0.04 || deserted ? 900000 : last_us;
+    last_us = sort < 0.04 || deserted || seeded_unit(seed, STREAM_SCRIPT, 8) < LONG_SHARE ? 900000 : last_us;
     world->recovery_us = last_us + 25000;
     add_speed(world, first_rpm, 0);
     if (seeded_unit(seed, STREAM_SPEED, 90) < 0.4) {
         add_speed(world, draw_speed_rpm(world, 1),
-                  (uint64_t)seeded_between(seed, STREAM_SPEED, 91, 0.3, 1.0) * last_us);
+                  (uint64_t)(seeded_between(seed, STREAM_SPEED, 91, 0.3, 1.0) * (double)last_us));
     }
     draw_load(world, first_rpm, (uint64_t)seeded_between(seed, STREAM_LOAD, 9, 1e4, (double)last_us));
     draw_script(world, last_us);
