@@ -33,7 +33,7 @@
  *                   processor healthy
  *   wrong_torque    no fault, torque mode, below half of the base speed: the mean torque of electrical periods off the
  *                   commanded one by more than 10 % and 2 % of the rated one
- *   overshoot       no fault, the speed above a reference that it has approached from below by more than 12 % and 3 %
+ *   overshoot       no fault, the speed above a reference that it has approached from below by more than 12 % and 5 %
  *                   of the base speed; one quadrant: and what a light rotor gains
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
  *                   and memory undisturbed

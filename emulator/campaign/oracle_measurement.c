@@ -13,6 +13,7 @@
 #define ANGLE_ERROR_MAX_COUNTS 0.75
 #define TIMER_TICK_S 5e-9
 #define TEMPERATURE_ERROR_MAX_K 5.0
+#define TEMPERATURE_MAX_C 120.0     /* within the range of every sensor */
 #define MEASUREMENT_ERROR_MAX 0.008 /* of the full scale: sixteen times the largest noise */
 
 /* Of the encoder on the shaft, in revolutions. */
@@ -102,10 +103,12 @@ void oracle_judge_temperature(oracle_t *oracle, const plant_t *plant, oracle_hea
     const bool disturbed =
         drive_disturbed(oracle, UINT64_MAX) ||
         oracle_any_injected(oracle, FAULT_WINDING_TEMPERATURE_SENSOR_OPEN, FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET);
-    if (!disturbed && fabs(measured.winding_C - heat.winding_C) > TEMPERATURE_ERROR_MAX_K) {
+    if (!disturbed && heat.winding_C < TEMPERATURE_MAX_C &&
+        fabs(measured.winding_C - heat.winding_C) > TEMPERATURE_ERROR_MAX_K) {
         oracle_violate(oracle, "wrong_temperature", plant->time_ns, 0, measured.winding_C - heat.winding_C);
     }
-    if (!disturbed && fabs(measured.switch_C - heat.switch_C) > TEMPERATURE_ERROR_MAX_K) {
+    if (!disturbed && heat.switch_C < TEMPERATURE_MAX_C &&
+        fabs(measured.switch_C - heat.switch_C) > TEMPERATURE_ERROR_MAX_K) {
         oracle_violate(oracle, "wrong_temperature", plant->time_ns, 1, measured.switch_C - heat.switch_C);
     }
 }

@@ -11,7 +11,7 @@
 #define TORQUE_ERROR_MAX 0.10 /* of the torque: flux linkages of a machine scatter by 5 % */
 #define TORQUE_ERROR_MAX_RATED 0.02
 #define OVERSHOOT_MAX 0.12      /* of the speed reference */
-#define OVERSHOOT_MAX_BASE 0.03 /* of the base speed */
+#define OVERSHOOT_MAX_BASE 0.05 /* of the base speed */
 #define STOP_ERROR_MAX_BASE 0.05
 #define STOP_ERROR_MAX_RAD_S 2.0
 #define STOP_SETTLED_S 0.1
