@@ -372,6 +372,25 @@ static void draw_request(world_t *world, uint64_t last_us) {
     }
 }
 
+/* Some of the kinds; in half of the worlds with degraded running one that such a drive runs on with, alone. */
+static void draw_faults(world_t *world, uint64_t last_us) {
+    static const unsigned endured[] = {FAULT_WINDING_OPEN, FAULT_SWITCH_OPEN, FAULT_GATE_SUPPLY_LOST,
+                                       FAULT_CURRENT_SENSOR_OPEN};
+    const uint64_t seed = world->seed;
+    if (seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE / 2.0) {
+        draw_fault(world, endured[seeded_below(seed, STREAM_REQUEST, 5, 4)], last_us);
+        return;
+    }
+    unsigned faults = 0;
+    for (unsigned i = 1; i < FAULT_COUNT && faults < FAULTS_MAX; i++) {
+        const unsigned kind = 1 + (i + (unsigned)(seed % (FAULT_COUNT - 1))) % (FAULT_COUNT - 1);
+        if (possible(world, kind) && seeded_unit(seed, STREAM_FAULT_ON, kind) < FAULT_SHARE) {
+            draw_fault(world, kind, last_us);
+            faults++;
+        }
+    }
+}
+
 void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
     draw_board(world, machines, count, seed);
     draw_imperfections(world);
@@ -392,14 +411,7 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     draw_script(world, last_us);
     draw_torque(world, last_us);
     draw_request(world, last_us);
-    unsigned faults = 0;
-    for (unsigned i = 1; i < FAULT_COUNT && faults < FAULTS_MAX; i++) {
-        const unsigned kind = 1 + (i + (unsigned)(seed % (FAULT_COUNT - 1))) % (FAULT_COUNT - 1);
-        if (possible(world, kind) && seeded_unit(seed, STREAM_FAULT_ON, kind) < FAULT_SHARE) {
-            draw_fault(world, kind, last_us);
-            faults++;
-        }
-    }
+    draw_faults(world, last_us);
     draw_other_faults(world, last_us);
     world->duration_us = world->recovery_us + 320000;
 }
