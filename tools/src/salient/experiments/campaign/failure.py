@@ -6,6 +6,7 @@ import json
 import resource
 import tempfile
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from salient.experiments.campaign.machines import files
 from salient.experiments.campaign.runner import ALL_EVENTS, Programs, Result, run_world, world
 
 _STEP_NS = 1_000_000
+_FEW = 3
 _CRASH_MAX_S = 60
 """Processor time of a bench that is to crash: it may do so by not ending."""
 _HASH_START, _HASH_PRIME, _HASH_MASK = 14695981039346656037, 1099511628211, 2**64 - 1
@@ -36,10 +38,11 @@ def classes(result: Result) -> list[str]:
 
 
 def shrink(seed: int, violation: str, healthy: bool = False, programs: Programs | None = None) -> int:
-    """The events, as bits, of the shortest list that still has a violation of this class: no event of it can be left
-    out. Leaves out halves, quarters, ... first (A. Zeller, R. Hildebrandt, "Simplifying and isolating failure-inducing
-    input", 2002)."""
-    events = [event["index"] for event in world(seed, healthy=healthy)["events"]]
+    """The events, as bits, of a short list that still has a violation of this class: no event of it can be left out.
+    Leaves out halves, quarters, ... first (A. Zeller, R. Hildebrandt, "Simplifying and isolating failure-inducing
+    input", 2002). Of what is left with more than _FEW events every list of at most so many is tried."""
+    every = [event["index"] for event in world(seed, healthy=healthy)["events"]]
+    events = every
 
     def fails(kept: list[int]) -> bool:
         return violation in classes(run_world(seed, sum(1 << index for index in kept), healthy, programs=programs))
@@ -54,6 +57,9 @@ def shrink(seed: int, violation: str, healthy: bool = False, programs: Programs 
             else:
                 at += part
         part //= 2
+    if len(events) > _FEW:
+        lists = (list(few) for count in range(_FEW + 1) for few in combinations(every, count))
+        events = next((few for few in lists if fails(few)), events)
     return sum(1 << index for index in events)
 
 
