@@ -1,8 +1,8 @@
 /* Supervision of the CAN bus: leaves bus-off with a back-off, and recognises foreign use of the drive's identifiers.
  *
  * Bus-off: the first attempt to rejoin comes BUS_MONITOR_WAIT_MIN_US after bus-off is seen; each further one, after
- * another bus-off or one that has not ended, doubles the wait, up to BUS_MONITOR_WAIT_MAX_US. Once the controller has been error active for
- * BUS_MONITOR_ERROR_FREE_US without interruption, the wait is the first one again.
+ * another bus-off or one that has not ended, doubles the wait, up to BUS_MONITOR_WAIT_MAX_US. Once the controller has
+ * been error active for BUS_MONITOR_ERROR_FREE_US without interruption, the wait is the first one again.
  */
 #ifndef COMMS_BUS_MONITOR_H
 #define COMMS_BUS_MONITOR_H

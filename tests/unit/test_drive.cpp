@@ -1352,8 +1352,8 @@ TEST_F(Drive, rejoins_the_bus_with_a_back_off_that_doubles_up_to_320_ms_and_an_e
         for (; hal.rejoins == rejoins && waited < 40000; waited++) {
             periods(1);
         }
-        periods(1000);
-        EXPECT_EQ(hal.rejoins, rejoins + 1) << "one request for each bus-off";
+        periods(700);
+        EXPECT_EQ(hal.rejoins, rejoins + 1) << "one request, until the next wait is over";
         hal.can_status = {.state = HAL_CAN_ERROR_ACTIVE, .transmit_errors = 0, .receive_errors = 0};
         periods(40);
         return (waited - 1) * 25;
@@ -1372,6 +1372,19 @@ TEST_F(Drive, rejoins_the_bus_with_a_back_off_that_doubles_up_to_320_ms_and_an_e
     const auto state = only_frame(DRIVE_BUS_STATE_FRAME_ID, drive_bus_state_unpack);
     EXPECT_EQ(state.bus_off_count, 10);
     EXPECT_EQ(state.bus_state, BUS_STATE_ERROR_ACTIVE);
+}
+
+// The controller has gone off the bus again before the drive has seen that it had rejoined.
+TEST_F(Drive, requests_to_rejoin_again_when_bus_off_has_not_ended) {
+    hal.can_status.state = HAL_CAN_BUS_OFF;
+    periods(440); // 11 ms
+    EXPECT_EQ(hal.rejoins, 1u);
+    periods(720); // 29 ms
+    EXPECT_EQ(hal.rejoins, 1u);
+    periods(120); // 32 ms
+    EXPECT_EQ(hal.rejoins, 2u);
+    periods(40000);
+    EXPECT_EQ(hal.rejoins, 7u); // 40, 80, 160, 320, 320 ms later
 }
 
 TEST_F(Drive, after_bus_off_a_run_request_counts_only_once_it_has_been_withdrawn) {
