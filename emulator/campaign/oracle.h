@@ -32,7 +32,7 @@
  *                   at the end, the hottest winding or switch measured off the true one by more than 5 K, sensors and
  *                   processor healthy
  *   wrong_torque    no fault, torque mode, below half of the base speed: the mean torque of electrical periods off the
- *                   commanded one by more than 10 % and 2 % of the rated one
+ *                   commanded one by more than 10 %, without torque sharing 25 %, and 2 % of the rated one
  *   overshoot       no fault, the speed above a reference that it has approached from below by more than 12 % and 5 %
  *                   of the base speed; one quadrant: and what a light rotor gains
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus

@@ -9,6 +9,7 @@
 #define TORQUE_MIN_NS (5 * ORACLE_MS_NS)
 #define TORQUE_SPEED 0.5      /* of the base speed, at most: above, the voltage limits the torque */
 #define TORQUE_ERROR_MAX 0.10 /* of the torque: flux linkages of a machine scatter by 5 % */
+#define TORQUE_ERROR_MAX_HYSTERESIS 0.25
 #define TORQUE_ERROR_MAX_RATED 0.02
 #define OVERSHOOT_MAX 0.12      /* of the speed reference */
 #define OVERSHOOT_MAX_BASE 0.05 /* of the base speed */
@@ -49,8 +50,9 @@ static void look_at_torque(oracle_t *oracle, const plant_t *plant) {
     const double mean_Nm = torque->sum_Nm / torque->samples;
     const double wanted_Nm =
         oracle->world->controller == 2 ? oracle->meant.reference : fmax(oracle->meant.reference, 0.0);
+    const double part = oracle->world->controller == 2 ? TORQUE_ERROR_MAX : TORQUE_ERROR_MAX_HYSTERESIS;
     if (fabs(mean_Nm - wanted_Nm) >
-        TORQUE_ERROR_MAX * fabs(wanted_Nm) + TORQUE_ERROR_MAX_RATED * oracle->world->machine->torque_rated_Nm) {
+        part * fabs(wanted_Nm) + TORQUE_ERROR_MAX_RATED * oracle->world->machine->torque_rated_Nm) {
         oracle_violate(oracle, "wrong_torque", plant->time_ns, oracle->world->controller, mean_Nm / wanted_Nm);
     }
     torque->samples = 0;
