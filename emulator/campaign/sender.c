@@ -93,7 +93,6 @@ static void put_genuine(sender_t *sender, const transport_receiver_t *receiver, 
     *kept = (sender_frame_t){.length = (uint8_t)length,
                              .identifier = (uint16_t)identifier,
                              .sent_us = sender->time_us,
-
                              .other = client == OTHER,
                              .in_sequence = in_sequence};
     memcpy(kept->data, data, length);

@@ -131,7 +131,7 @@ def plot(path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 10), layout="constrained")
+    figure = Figure(figsize=(15, 10), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=(1.2, 1))
     rows = branching.read(RESULTS / "branching")
@@ -147,7 +147,7 @@ def plot(path: Path) -> None:
         count = len(note["events"])
         right.annotate(f"{count} event{'' if count == 1 else 's'}", (1.01, index), xycoords=("axes fraction", "data"),
                        va="center", fontsize="small")
-    right.set_yticks(range(len(labels)), [_wrapped(name) for name in labels], fontsize="small")
+    right.set_yticks(range(len(labels)), labels, fontsize="small")
     right.set_ylim(len(labels) - 0.4, -0.6)
     right.set_xscale("log")
     right.set_xlim(0.005, 100)
@@ -157,15 +157,9 @@ def plot(path: Path) -> None:
     faults = _note("faults.json")
     violations = sum(entry["count"] for entry in faults["violations"].values())
     right.set_title(f"{len(notes)} of {len(_note('canaries.json'))} planted bugs found, by seeds from 1 on\n"
-                    f"{faults['seeds']:,} seeds without them: {violations} violations", fontsize="medium")
+                    f"{faults['seeds']:,} seeds at {faults['commit']} without them: {violations} violations", fontsize="medium")
     figure.suptitle("Campaigns by seed: an emulated drive, default parameters")
     figure.savefig(path, dpi=80)
-
-
-def _wrapped(name: str) -> str:
-    import textwrap
-
-    return "\n".join(textwrap.wrap(name, 34))
 
 
 def main() -> int:
