@@ -156,8 +156,9 @@ def plot(path: Path) -> None:
     right.legend(loc="upper left", fontsize="small")
     faults = _note("faults.json")
     violations = sum(entry["count"] for entry in faults["violations"].values())
-    right.set_title(f"{len(notes)} of {len(_note('canaries.json'))} planted bugs found, by seeds from 1 on\n"
-                    f"{faults['seeds']:,} seeds at {faults['commit']} without them: {violations} violations", fontsize="medium")
+    without = f"{faults['seeds']:,} seeds at {faults['commit']} without them: {violations} violations"
+    right.set_title(f"{len(notes)} of {len(_note('canaries.json'))} planted bugs found, by seeds from 1 on\n{without}",
+                    fontsize="medium")
     figure.suptitle("Campaigns by seed: an emulated drive, default parameters")
     figure.savefig(path, dpi=80)
 
