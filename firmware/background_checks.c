@@ -21,6 +21,7 @@ COLD static void read_stall_input(const control_state_t *control, stall_input_t 
         .torque_reference_q24 = control->torque_reference_q24,
         .torque_min_q24 = speed->torque_min_q24,
         .torque_max_q24 = speed->torque_max_q24,
+        .electrical = control->measurement.commutation.electrical,
     };
 }
 

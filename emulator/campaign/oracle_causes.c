@@ -189,11 +189,15 @@ void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
             any = any || causes;
         }
     }
-    /* With one phase that has conducted so far a wrong current and a wrong angle are the same; and two phases with
-     * faults of their own are what a wrong angle looks like. */
+    /* With one phase that has conducted so far a wrong current and a wrong angle, or one that does not move, are the
+     * same; and two phases with faults of their own are what a wrong angle looks like. */
     const unsigned phases = oracle_phases_at_fault(oracle, now_us);
     const bool of_phase = oracle_any_injected(oracle, FAULT_WINDING_OPEN, FAULT_CURRENT_SENSOR_SWAPPED);
-    if ((of_phase && !oracle->turned) || (phases & (phases - 1u)) != 0) {
+    const bool of_encoder = oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_SLIP);
+    if (!oracle->turned) {
+        allowed |= (of_phase ? ENCODER : 0) | (of_encoder ? PHASE : 0);
+    }
+    if ((phases & (phases - 1u)) != 0) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);
     }
     const unsigned cause = oracle->drive.fault;

@@ -1,7 +1,14 @@
 #include "drive/stall_monitor.h"
 
+#include "control/machine_tables.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
+
+/* Strokes of the reference after which a rotor has to have made one, times the strokes of a revolution: 3 * 2 pi rad, in
+ * us and 2^-22 rad/s, without the unit of speed. */
+#define THREE_REVOLUTIONS UINT64_C(79060767799934)
+
+#define ONE_REV_Q24 (1 << 24)
 
 /* Torque and speed of a stall. swings: the rotor has turned backwards a short time ago. */
 static bool pushes_in_vain(const stall_input_t *input, bool swings) {
@@ -12,6 +19,41 @@ static bool pushes_in_vain(const stall_input_t *input, bool swings) {
     return input->speed_mode && (slow || swings) && limit_q24 > 0 && torque_q24 >= limit_q24 - limit_q24 / 16;
 }
 
+/* Widens the range of the angles that the rotor has been at, of the last revolution, by at least half a stroke. */
+static bool widens_range(stall_monitor_t *monitor) {
+    const int32_t half_stroke_q24 = ONE_REV_Q24 / 2 / machine_tables.phases;
+    if (monitor->ahead_q24 > half_stroke_q24) {
+        monitor->lowest_ahead_q24 = fixed_clamp(monitor->lowest_ahead_q24 - monitor->ahead_q24, -ONE_REV_Q24, 0);
+        monitor->ahead_q24 = 0;
+        return true;
+    }
+    if (monitor->ahead_q24 < monitor->lowest_ahead_q24 - half_stroke_q24) {
+        monitor->ahead_q24 = monitor->lowest_ahead_q24 = fixed_clamp(monitor->ahead_q24, -ONE_REV_Q24, 0);
+        return true;
+    }
+    return false;
+}
+
+/* The rotor has come no further in either direction while the reference has turned by three strokes, of which it makes
+ * at most those of STALL_SWING_US in this time, however fast it is. Products below 2^62. */
+static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *input, bool begins, uint32_t time_us) {
+    const uint64_t limit = THREE_REVOLUTIONS >> machine_tables.speed_exponent;
+    const uint32_t strokes = (uint32_t)machine_tables.rotor_poles * machine_tables.phases;
+    const uint64_t asked = (uint64_t)fixed_magnitude(input->speed_reference_q22) * strokes;
+    const uint64_t fastest = limit / STALL_SWING_US;
+    monitor->ahead_q24 += (int32_t)(input->electrical - monitor->electrical) / 256;
+    monitor->travel += (asked < fastest ? asked : fastest) * (time_us - monitor->looked_us);
+    monitor->electrical = input->electrical;
+    monitor->looked_us = time_us;
+    if (begins) {
+        monitor->ahead_q24 = monitor->lowest_ahead_q24 = 0;
+    }
+    if (widens_range(monitor) || begins) {
+        monitor->travel = 0;
+    }
+    return monitor->travel > limit;
+}
+
 COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us) {
     const int32_t speed_q22 = input->speed_reference_q22 < 0 ? fixed_subtract(0, input->speed_q22) : input->speed_q22;
     const int32_t change_q22 = fixed_abs(input->speed_reference_q22) / 128;
@@ -20,8 +62,13 @@ COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *in
     if ((input->speed_q22 ^ input->speed_reference_q22) < 0) {
         monitor->backwards_us = time_us;
     }
+    const bool backwards = time_us - monitor->backwards_us <= STALL_TIME_US;
+    const bool begins = !input->speed_mode || monitor->forward != forward;
+    if (makes_no_progress(monitor, input, begins, time_us) && backwards) {
+        return true;
+    }
     monitor->forward = forward;
-    monitor->vain = pushes_in_vain(input, before && time_us - monitor->backwards_us <= STALL_TIME_US);
+    monitor->vain = pushes_in_vain(input, before && backwards);
     if (!monitor->vain || !before) {
         monitor->lowest_q22 = monitor->highest_q22 = speed_q22;
     } else if (speed_q22 < fixed_subtract(monitor->lowest_q22, change_q22)) {

@@ -1,4 +1,5 @@
-/* Stalled rotor: in speed mode, no change of the speed with the torque at its limit.
+/* Stalled rotor: in speed mode, no change of the speed with the torque at its limit, or no progress of a rotor that
+ * swings.
  *
  * The rotor turns slower than at half of the reference, in either direction, or has begun so and turned backwards
  * within STALL_TIME_US, the torque reference is within a sixteenth of its limit in the direction of the speed
@@ -6,6 +7,10 @@
  * reference: a rotor that swings about a point is stalled, one that a larger load drives backwards faster and faster
  * leads to over-speed instead. A start that takes up to 12 s from standstill to the reference is none. A reference of 0
  * is held as long as the currents can be. A reference that changes its sign begins anew.
+ *
+ * Or, whatever the torque: for STALL_SWING_US, and for the time in which the reference turns by three strokes, the rotor
+ * has come no further than it had been, by half a stroke in either direction, and has turned backwards within
+ * STALL_TIME_US. With a phase lost it may swing between two angles for ever, at times faster than the reference.
  */
 #ifndef DRIVE_STALL_MONITOR_H
 #define DRIVE_STALL_MONITOR_H
@@ -14,6 +19,7 @@
 #include <stdint.h>
 
 #define STALL_TIME_US 100000u
+#define STALL_SWING_US 250000u
 
 typedef struct {
     bool speed_mode;              /* state RUN, speed mode */
@@ -22,6 +28,7 @@ typedef struct {
     int32_t torque_reference_q24; /* N m, Q7.24 */
     int32_t torque_min_q24;       /* limits of the torque reference, N m, Q7.24 */
     int32_t torque_max_q24;
+    uint32_t electrical; /* 2^-32 electrical rev */
 } stall_input_t;
 
 typedef struct {
@@ -30,6 +37,11 @@ typedef struct {
     uint32_t backwards_us;           /* when the rotor last turned against the reference */
     bool forward;                    /* the speed reference at the last call */
     bool vain;                       /* torque and speed of a stall at the last call */
+    uint32_t electrical;             /* at the last call, 2^-32 electrical rev */
+    uint32_t looked_us;              /* of the last call */
+    int32_t ahead_q24;               /* of the highest angle so far, electrical rev, Q8.24 */
+    int32_t lowest_ahead_q24;        /* the lowest one, -1 at least */
+    uint64_t travel;                 /* of the reference since the rotor was last at a higher or lower one */
 } stall_monitor_t;
 
 /* True when the rotor has been stalled for STALL_TIME_US at time_us. [background] */

@@ -40,6 +40,13 @@ NOINLINE static void enter_ready(control_state_t *state, const control_measureme
     }
 }
 
+/* As wide as after its reset, the observer takes the first coarse counts of a turning rotor for a load. */
+static void await_load(const control_parameters_t *parameters, control_state_t *state) {
+    if (parameters->bandwidth.adaptive && state->bandwidth.stage < parameters->bandwidth.trigger_stage_count) {
+        state->observer.load_torque_q24 = 0;
+    }
+}
+
 /* Out of the way of a run, which is the longer path. The time by value: a sample whose address is passed on would have
  * to be in memory as a whole. */
 NOINLINE static void stand(const control_parameters_t *parameters, control_state_t *state, uint32_t time_us,
@@ -55,7 +62,9 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
         if (state_machine->state == DRIVE_STATE_READY) {
             enter_ready(state, measured, before);
         }
-    } else if (before == DRIVE_STATE_FAULT && state_machine->fault_free_ticks == 1) {
+    } else if (before != DRIVE_STATE_FAULT) {
+        await_load(parameters, state);
+    } else if (state_machine->fault_free_ticks == 1) {
         deferred_reset_run(state); /* not in the period that records the fault, which would take longer than a run */
     }
 }

@@ -1,6 +1,9 @@
+#include <cmath>
+
 #include <gtest/gtest.h>
 
 extern "C" {
+#include "control/machine_tables.h"
 #include "drive/stall_monitor.h"
 }
 
@@ -18,11 +21,17 @@ class Stall : public testing::Test {
         EXPECT_FALSE(stall_monitor_failed(&monitor, &off, START_US - 1000));
         for (uint32_t us = 0; us <= length_us; us += 1000) {
             change(us);
+            input.electrical += turned_in_1_ms(input.speed_q22);
             if (stall_monitor_failed(&monitor, &input, START_US + us)) {
                 return us;
             }
         }
         return 0;
+    }
+    // 2^-32 electrical rev.
+    static uint32_t turned_in_1_ms(int32_t speed_q22) {
+        const double turned = speed_q22 * 0.001 / RAD_S * machine_tables.rotor_poles / (2 * M_PI);
+        return static_cast<uint32_t>(static_cast<int64_t>(turned * 4294967296.0));
     }
     uint32_t time_to_fault_us() {
         return time_to_fault_us(1000000, [](uint32_t) {});
@@ -82,6 +91,42 @@ TEST_F(Stall, rotor_that_swings_faster_than_at_half_of_the_reference_is_stalled_
     EXPECT_EQ(time_to_fault_us(1000000, [&](uint32_t us) { input.speed_q22 = speed_q22(us); }), 121000u);
     const auto once_q22 = [&](uint32_t us) { return speed_q22(us < 20000 ? us : 20000); };
     EXPECT_EQ(time_to_fault_us(1000000, [&](uint32_t us) { input.speed_q22 = once_q22(us); }), 0u);
+}
+
+// The amplitude of the swing is in electrical revolutions; the torque is at its limit only at times, as when the speed is
+// above the reference within each swing.
+TEST_F(Stall, rotor_that_swings_between_two_angles_is_stalled_whatever_the_torque_and_one_that_advances_meanwhile_is_not) {
+    const auto swings = [this](double amplitude, double advance_per_s) {
+        return [=, this](uint32_t us) {
+            const double angle_rad = 2 * M_PI / machine_tables.rotor_poles, rate = 2 * M_PI * 20.0, s = us * 1e-6;
+            const double speed = angle_rad * (amplitude * rate * std::cos(rate * s) + advance_per_s);
+            input.speed_q22 = static_cast<int32_t>(speed * RAD_S);
+            input.torque_reference_q24 = us / 1000 % 20 < 5 ? 0 : 19 * NM;
+        };
+    };
+    for (const int direction : {1, -1}) {
+        input.speed_reference_q22 = direction * 30 * RAD_S;
+        EXPECT_NEAR(time_to_fault_us(1000000, swings(0.3, 0)), 285000, 35000);
+        EXPECT_NEAR(time_to_fault_us(1000000, swings(0.45, 0)), 285000, 35000);
+        EXPECT_EQ(time_to_fault_us(1000000, swings(0.3, direction * 1.0)), 0u);
+        EXPECT_EQ(time_to_fault_us(1000000, swings(0.3, direction * -6.0)), 0u);
+    }
+    // A slow reference has the time of three strokes: 4 rad/s turn by three of 30 degrees in 393 ms.
+    input.speed_reference_q22 = 4 * RAD_S;
+    ASSERT_EQ(machine_tables.rotor_poles * machine_tables.phases, 12);
+    EXPECT_NEAR(time_to_fault_us(1000000, swings(0.05, 0)), 410000, 25000);
+    input.speed_reference_q22 = 0;
+    EXPECT_EQ(time_to_fault_us(1000000, swings(0.3, 0)), 0u);
+}
+
+TEST_F(Stall, rotor_held_within_a_swing_for_long_may_take_its_time_to_follow_a_reference) {
+    EXPECT_EQ(time_to_fault_us(5200000,
+                               [this](uint32_t us) {
+                                   input.speed_reference_q22 = us < 5000000 ? 0 : 60 * RAD_S;
+                                   input.torque_reference_q24 = 0;
+                                   input.speed_q22 = us / 1000 % 2 == 0 ? RAD_S / 8 : -RAD_S / 8;
+                               }),
+              0u);
 }
 
 TEST_F(Stall, rotor_that_follows_a_reference_which_rises_as_fast_is_not_stalled_and_one_that_stands_is) {
