@@ -169,6 +169,15 @@ static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *pl
     }
 }
 
+/* One of the causes has been an earlier one. */
+static bool named(const oracle_t *oracle, uint32_t causes) {
+    bool any = false;
+    for (unsigned i = 0; i + 1 < oracle->causes; i++) {
+        any = any || (causes >> oracle->cause[i] & 1u);
+    }
+    return any;
+}
+
 void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
     const world_t *world = oracle->world;
     const uint64_t now_us = plant->time_ns / 1000;
@@ -196,6 +205,10 @@ void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
     const bool of_encoder = oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_SLIP);
     if (!oracle->turned) {
         allowed |= (of_phase ? ENCODER : 0) | (of_encoder ? PHASE : 0);
+    }
+    /* An encoder that has been named, and is run with again, is wrong from the start. */
+    if (of_encoder && named(oracle, ENCODER)) {
+        allowed |= PHASE;
     }
     if ((phases & (phases - 1u)) != 0) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);

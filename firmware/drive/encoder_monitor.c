@@ -335,7 +335,6 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
                  !others_agree(parameters, monitor, index, input->period);
     }
     monitor->angle |= contradicting >= CONTRADICTING_PHASES || alone;
-    monitor->distrusted |= monitor->angle;
 }
 
 /* Notes when the encoder has turned round. clear: faster than its counts and the rotor's swings. The first direction
@@ -379,8 +378,7 @@ bool encoder_monitor_suspects(const encoder_monitor_parameters_t *parameters, co
                               uint32_t phases) {
     bool any = monitor->reversed && monitor->period - monitor->reversed_at <= parameters->rate_hz >> SHOWN_SHIFT;
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
-        const bool other = (phases >> phase & 1u) == 0;
-        any |= other && (monitor->phase[phase].shown || (monitor->distrusted && !monitor->phase[phase].agreed));
+        any |= monitor->phase[phase].shown && (phases >> phase & 1u) == 0;
     }
     return any;
 }

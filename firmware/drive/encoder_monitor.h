@@ -93,7 +93,6 @@ typedef struct {
     bool counted;                   /* in this run */
     bool suspicious;                /* a phase contradicted the angle, or nearly: samples without delay decide */
     bool frozen, angle, over_speed; /* failed checks */
-    bool distrusted;                /* its angle has been contradicted in this run or an earlier one */
     uint32_t period;                /* of the last call */
     uint32_t encoder_angle;         /* then */
     uint32_t window_period;         /* of the start of the window for the speed */
@@ -122,8 +121,8 @@ void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, encode
                           const encoder_monitor_input_t *input);
 
 /* True when in the last quarter of a second a phase other than those whose bits are set has contradicted the angle, or
- * the encoder has turned round faster than a rotor; or, once the angle has been at fault, while another phase has not
- * been consistent with it in this run: what has failed in these phases is the angle's, too. [background] */
+ * the encoder has turned round faster than a rotor: what has failed in these phases is the angle's, too. [background]
+ */
 bool encoder_monitor_suspects(const encoder_monitor_parameters_t *parameters, const encoder_monitor_t *monitor,
                               uint32_t phases);
 
