@@ -6,8 +6,8 @@
  * --serve reads the seeds from standard input, a line each.
  *
  * FILE has a line for each machine: image, speed_base_rpm, torque_rated_Nm, torque_max_Nm, over_speed_rpm,
- * over_voltage_V, under_voltage_V, trip_current_A, command_lsb_rpm, speed_command_max_rpm, command_lsb_Nm, rate_min_hz,
- * name. */
+ * over_voltage_V, under_voltage_V, trip_current_A, command_lsb_rpm, speed_command_max_rpm, command_lsb_Nm,
+ * current_lsb_A, voltage_lsb_V, rate_min_hz, name. */
 #define _POSIX_C_SOURCE 200809L
 
 #include <errno.h>
@@ -78,10 +78,11 @@ static bool read_machines(const char *path) {
     char image[1024];
     world_machine_t *each = machines;
     while (machine_count < WORLD_MACHINES_MAX &&
-           fscanf(file, "%1023s %lf %lf %lf %lf %lf %lf %lf %lf %lf %lf %u %63s", image, &each->speed_base_rpm,
+           fscanf(file, "%1023s %lf %lf %lf %lf %lf %lf %lf %lf %lf %lf %lf %lf %u %63s", image, &each->speed_base_rpm,
                   &each->torque_rated_Nm, &each->torque_max_Nm, &each->over_speed_rpm, &each->over_voltage_V,
                   &each->under_voltage_V, &each->trip_current_A, &each->command_lsb_rpm, &each->speed_command_max_rpm,
-                  &each->command_lsb_Nm, &each->rate_min_hz, each->name) == 13) {
+                  &each->command_lsb_Nm, &each->current_lsb_A, &each->voltage_lsb_V, &each->rate_min_hz,
+                  each->name) == 15) {
         if (!machine_image_open(&each->image, image)) {
             fclose(file);
             return false;

@@ -9,6 +9,8 @@
 
 #define RECENT_NS (2 * ORACLE_MS_NS)
 #define MARGIN 1.02
+#define UNDER_VOLTAGE_PART 0.94
+#define STO_DIFFERED_US 215000 /* lines of safe torque off: then both have to be off once */
 #define STATUS_AGE_MAX_NS (30 * ORACLE_MS_NS)
 #define RUN_MAX_NS (502 * ORACLE_MS_NS) /* of a run, since the last request */
 
@@ -124,6 +126,22 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     }
 }
 
+/* A link voltage below the threshold, in a run. */
+static void look_at_under_voltage(oracle_t *oracle, const plant_t *plant) {
+    const uint64_t time_us = plant->time_ns / 1000;
+    oracle_since(&oracle->low_ns,
+                 oracle->drive.state == STATE_RUN && !oracle_link_sensor_faulty(oracle) &&
+                     plant->bus_voltage_V < UNDER_VOLTAGE_PART * oracle->world->machine->under_voltage_V,
+                 plant->time_ns);
+    if (oracle->low_ns && plant->time_ns > oracle->low_ns + 3 * ORACLE_MS_NS && !oracle_state_changed(oracle) &&
+        !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) &&
+        !oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) &&
+        !oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_us)) {
+        oracle_violate(oracle, "under_voltage", plant->time_ns, 0,
+                       plant->bus_voltage_V / oracle->world->machine->under_voltage_V);
+    }
+}
+
 static void look_at_limits(oracle_t *oracle, const plant_t *plant, unsigned gates) {
     const world_machine_t *machine = oracle->world->machine;
     const double speed_rpm = fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S;
@@ -181,6 +199,7 @@ void oracle_look(oracle_t *oracle, const plant_t *plant) {
     oracle_since(&oracle->dark_ns, gates == 0, plant->time_ns);
     look_at_currents(oracle, plant, gates);
     look_at_limits(oracle, plant, gates);
+    look_at_under_voltage(oracle, plant);
     look_at_causes(oracle, plant);
     oracle_look_at_detection(oracle, plant);
     oracle_look_at_recovery(oracle, plant);
@@ -212,8 +231,32 @@ static void look_at_start(oracle_t *oracle, uint64_t now_ns) {
     }
 }
 
-/* A cause that has ended a moment ago may come again. */
+/* Lines of safe torque off that have differed for long, and have not been off together since. */
+static bool sto_discrepancy_remains(const oracle_t *oracle, uint64_t now_us) {
+    uint64_t begin_us = 0, end_us = 0;
+    unsigned changes = 0;
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, now_us);
+        if (event != NULL && event->kind == WORLD_SET &&
+            (event->what == BENCH_VARIABLE_STO_1 || event->what == BENCH_VARIABLE_STO_2)) {
+            begin_us = event->begin_us;
+            end_us = event->end_us != 0 && event->end_us < now_us ? event->end_us : now_us;
+            changes++;
+        }
+    }
+    return changes == 1 && end_us > begin_us + STO_DIFFERED_US && oracle->reset_ns < begin_us * 1000;
+}
+
+/* A cause that has ended a moment ago may come again; and a request to clear that was there before the fault is none.
+ */
 static void look_at_end_of_fault(oracle_t *oracle, uint64_t now_ns, uint8_t before) {
+    if (before == STATE_FAULT && sto_discrepancy_remains(oracle, now_ns / 1000) && !oracle_state_changed(oracle)) {
+        oracle_violate(oracle, "cleared", now_ns, CAUSE_STO_DISCREPANCY, 0.0);
+    }
+    if (before == STATE_FAULT && oracle->clear_ns != 0 && oracle->clear_ns + 5 * ORACLE_MS_NS < oracle->latched_ns &&
+        oracle->reset_ns < oracle->latched_ns && !oracle_state_changed(oracle) && !may_be_deaf(oracle, now_ns / 1000)) {
+        oracle_violate(oracle, "cleared", now_ns, 0, (double)(oracle->latched_ns - oracle->clear_ns) * 1e-6);
+    }
     const uint64_t gone_ns = before == STATE_FAULT ? 8 * ORACLE_MS_NS : ORACLE_MS_NS / 2;
     if (oracle->cause_ns && now_ns < oracle->cause_ns + gone_ns && !oracle_state_changed(oracle) &&
         !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
@@ -226,9 +269,13 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
     oracle->turned = oracle->turned || fabs(plant->rotor_angle_rad - oracle->run_angle_rad) > stroke_rad;
     oracle->drive = drive;
-    oracle->state_ns = drive.state == before ? oracle->state_ns : plant->time_ns;
+    if (drive.state != before) {
+        oracle->telemetry.ran = before == STATE_RUN && plant->time_ns > oracle->state_ns + 100 * ORACLE_MS_NS;
+        oracle->state_ns = plant->time_ns;
+    }
     oracle->interrupt_ns = plant->time_ns;
     oracle_look_at_measurement(oracle, plant);
+    oracle_remember_measurement(oracle, plant);
     oracle_look_at_motion(oracle, plant);
     if (before != drive.state && drive.state == STATE_READY && before != STATE_RUN) {
         look_at_end_of_fault(oracle, plant->time_ns, before);
@@ -249,6 +296,8 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     }
     if (drive.state == STATE_FAULT && before != STATE_FAULT) {
         oracle->confirmed = oracle->clear_seen = false;
+        oracle->latched_ns = plant->time_ns;
+        oracle_remember_fault(oracle, plant);
         if (oracle->causes < ORACLE_CAUSES_MAX) {
             oracle->cause[oracle->causes++] = drive.fault;
         }
@@ -313,6 +362,10 @@ void oracle_on_bus(oracle_t *oracle, const plant_t *plant, uint64_t time_ns, con
         oracle->off_ns = time_ns;
     }
     oracle->clear_seen = oracle->clear_seen || meaning->request == SENDER_CLEAR;
+    if (meaning->request == SENDER_CLEAR &&
+        (oracle->meant.request != SENDER_CLEAR || oracle->drive.state == STATE_RUN)) {
+        oracle->clear_ns = time_ns; /* in a run it is refused, and so begins after it */
+    }
     if (meaning->request == SENDER_STOP && oracle->meant.request != SENDER_STOP) {
         oracle->stop_ns = time_ns;
         oracle->stop_speed_rad_s = plant->speed_rad_s;

@@ -17,7 +17,9 @@
  *   not_stopped     four quadrants, no fault: still turning 100 ms after the time that half of the torque limit needs
  *   resumed         a run after bus-off, with no other request than run since
  *   cleared         a fault ended less than 8 ms after the plant's last reason for one: a line of safe torque off not
- *                   energised, a link voltage or a speed beyond its limits
+ *                   energised, a link voltage or a speed beyond its limits; by a request to clear that was there before
+ *                   it; or after lines of safe torque off had differed, without both having been off
+ *   under_voltage   in state run, the link voltage below its threshold by 6 % for 3 ms
  *   over_speed      a gate on for 2 ms at a speed above the limit by 2 %
  *   over_voltage    a gate on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no
  *                   energy back, unless a fault of the only sensor hides it
@@ -37,10 +39,13 @@
  *                   of the base speed; one quadrant: and what a light rotor gains
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
  *                   and memory undisturbed
+ *   wrong_telemetry a measured current or voltage on the bus that the drive has not measured in the last 20 ms, a speed
+ *                   off the true one by 10 % and 5 % of the base speed; in the snapshot of a fault those of its instant
  *   wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
  *   not_first       a first cause that is not the first one, by its number, of the checks that failed in its tick
  *   false_alarm     a fault of the drive without any other, which is not true of the plant, or the drive's own work:
- *                   too large a current, and without a load that drives the machine too high a speed or voltage
+ *                   too large a current, and without a load that drives the machine too high a speed or voltage; beside
+ *                   faults that do not explain it, it is a wrong_cause
  *   undetected      in state run for longer than a reaction takes with a fault that shows at any time: changed memory,
  *                   sensors at a rail, a wrong clock, a background that hangs (oracle_detection.c)
  *   no_current      voltage on a phase for twenty times its largest flux linkage, and no current at all
@@ -115,6 +120,20 @@ typedef struct {
     double begin_angle_rad, sum_Nm;
 } oracle_torque_t;
 
+/* Least and largest value in the present and in the previous window of time. */
+typedef struct {
+    double low[2], high[2];
+} oracle_range_t;
+
+/* Of what telemetry is compared with. */
+typedef struct {
+    uint64_t window_ns;                                          /* the present one began */
+    oracle_range_t current[HAL_PHASES_MAX], link_voltage;        /* measured, of the full scales */
+    oracle_range_t speed_rad_s;                                  /* true */
+    double fault_speed_rad_s, fault_link_voltage, fault_current; /* when the last fault was latched */
+    bool ran;                                                    /* for long when it was */
+} oracle_telemetry_t;
+
 typedef struct {
     const char *rule;
     uint64_t time_us;
@@ -140,7 +159,8 @@ typedef struct {
     uint64_t interrupt_ns;
     bool confirmed, commanded, off_seen, clear_seen;
     bool succeeded; /* the first sender by the second one, whose counter is in sequence by chance */
-    uint64_t run_ns, off_ns, speed_ns, voltage_ns;
+    uint64_t run_ns, off_ns, speed_ns, voltage_ns, low_ns;
+    uint64_t clear_ns, latched_ns;   /* a request to clear began, the last fault */
     sender_meaning_t meant;          /* by the last genuine motion command */
     uint64_t withdrawn_ns, reset_ns; /* last genuine request other than run, last reset */
     uint64_t cause_ns;               /* last time at which the plant had a reason to keep the drive in a fault */
@@ -149,6 +169,7 @@ typedef struct {
     double stop_speed_rad_s;         /* when the stop began */
     oracle_detection_t detection;
     oracle_torque_t torque;
+    oracle_telemetry_t telemetry;
     unsigned over_current_looks;
     double speed_recent_rad_s, voltage_recent_high_V, voltage_recent_low_V, current_recent_A;
     uint64_t recent_ns;
@@ -180,6 +201,7 @@ void oracle_reset(oracle_t *oracle, uint64_t time_ns, oracle_drive_t drive);
 /* Events of the sender. */
 void oracle_on_bus(oracle_t *oracle, const plant_t *plant, uint64_t time_ns, const sender_meaning_t *meaning);
 void oracle_on_status(oracle_t *oracle, uint64_t time_ns, unsigned state, unsigned fault); /* DRIVE_STATUS */
+void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier, const uint8_t data[8]);
 void oracle_on_fault(oracle_t *oracle, const plant_t *plant, unsigned kind, bool begins);
 
 /* At the begin of the recovery: the speed to be commanded, r/min. */

@@ -105,7 +105,9 @@ static uint32_t causes_of_variable(unsigned variable) {
 }
 
 static uint32_t causes_of_script(const world_event_t *event) {
-    return event->kind == WORLD_SILENT ? BIT(CAUSE_COMMAND_TIMEOUT) | BIT(CAUSE_COMMAND_ERROR)
+    const bool refused = event->kind == WORLD_BEYOND ||
+                         (event->kind == WORLD_REQUEST && event->what == WORLD_REQUEST_CLEAR); /* in a run */
+    return event->kind == WORLD_SILENT || refused ? BIT(CAUSE_COMMAND_TIMEOUT) | BIT(CAUSE_COMMAND_ERROR)
            : event->kind == WORLD_HOSTILE || event->kind == WORLD_SECOND ? BUS
                                                                          : 0;
 }
@@ -146,9 +148,10 @@ unsigned oracle_phases_at_fault(const oracle_t *oracle, uint64_t now_us) {
     return phases;
 }
 
-/* What the plant shows is not the drive's own work. Without a load that drives it, a drive with healthy sensors and
- * phases exceeds neither its speed nor the voltage of a link that is fed as it should be. */
-static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *plant, bool any) {
+/* What the plant shows is not the drive's own work. A drive with healthy sensors, phases, supply and processor does not
+ * exceed its current; without a load that drives it neither its speed, nor the voltage of a link that is fed as it
+ * should be, even when the link takes no energy. */
+static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *plant) {
     const uint64_t now_us = plant->time_ns / 1000;
     const bool unsound = oracle_any_injected(oracle, FAULT_WINDING_OPEN, FAULT_LOAD_DROPPED) ||
                          oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
@@ -159,11 +162,16 @@ static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *pl
     switch (cause) {
     case CAUSE_OVER_CURRENT:
     case CAUSE_HARDWARE_OVER_CURRENT:
-        return any;
+        return oracle_any_injected(oracle, FAULT_WINDING_OPEN, FAULT_ENCODER_NO_ANSWER) ||
+               oracle_any_injected(oracle, FAULT_SUPPLY_LOST, FAULT_SUPPLY_RIPPLE) ||
+               oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
+               oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) ||
+               oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, now_us);
     case CAUSE_OVER_SPEED:
         return unsound || near_limit; /* which an overshoot of one quadrant may exceed */
     case CAUSE_OVER_VOLTAGE:
-        return unsound || oracle_any_injected(oracle, FAULT_SUPPLY_LOST, FAULT_CHOPPER_OPEN);
+        return unsound || oracle_any_injected(oracle, FAULT_SUPPLY_LOST, FAULT_SUPPLY_RIPPLE) ||
+               oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT);
     default:
         return true;
     }
@@ -214,7 +222,7 @@ void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);
     }
     const unsigned cause = oracle->drive.fault;
-    if ((allowed >> cause & 1u) || (true_of_plant(oracle, cause, plant) && has_reason(oracle, cause, plant, any))) {
+    if ((allowed >> cause & 1u) || (true_of_plant(oracle, cause, plant) && has_reason(oracle, cause, plant))) {
         return;
     }
     oracle_violate(oracle, any ? "wrong_cause" : "false_alarm", plant->time_ns, cause, (double)oracle->drive.checks);

@@ -81,6 +81,14 @@ void oracle_look_at_measurement(oracle_t *oracle, const plant_t *plant);
 /* At the end. */
 void oracle_judge_temperature(oracle_t *oracle, const plant_t *plant, oracle_heat_t heat);
 
+/* --- Telemetry --- */
+
+/* After each control interrupt. */
+void oracle_remember_measurement(oracle_t *oracle, const plant_t *plant);
+
+/* In that which has latched a fault. */
+void oracle_remember_fault(oracle_t *oracle, const plant_t *plant);
+
 /* --- Detection --- */
 
 /* At each look. */

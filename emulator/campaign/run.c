@@ -32,6 +32,10 @@ static void on_status(void *context, uint64_t time_ns, unsigned state, unsigned 
     oracle_on_status(&((run_t *)context)->oracle, time_ns, state, fault);
 }
 
+static void on_telemetry(void *context, uint64_t time_ns, unsigned identifier, const uint8_t data[8]) {
+    oracle_on_telemetry(&((run_t *)context)->oracle, time_ns, identifier, data);
+}
+
 static void on_fault(void *context, uint64_t time_ns, unsigned kind, bool begins) {
     run_t *run = context;
     (void)time_ns;
@@ -47,6 +51,7 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
     run->sender.record = record;
     run->sender.on_bus = on_bus;
     run->sender.on_status = on_status;
+    run->sender.on_telemetry = on_telemetry;
     run->sender.on_fault = on_fault;
     run->sender.context = run;
     rig_config_t config = {

@@ -2,6 +2,7 @@
 
 #include <inttypes.h>
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "bench_variables.h"
@@ -202,6 +203,13 @@ static int32_t reference_of(const world_t *world, double rpm) {
     return (int32_t)floor(rpm / world->machine->command_lsb_rpm + 0.5);
 }
 
+/* Of 24 bits; at least an LSB beyond the range. */
+static int32_t reference_beyond(const world_t *world, double part) {
+    const int32_t largest = reference_of(world, world->machine->speed_command_max_rpm);
+    const int32_t beyond = (int32_t)fmin(fmax(floor(fabs(part) * largest), largest + 1.0), 8388607.0);
+    return part < 0.0 ? -beyond : beyond;
+}
+
 /* off for 20 ms, clear_fault for 20 ms, until the drive has left the state fault. */
 static sender_request_t clearing(const sender_t *sender) {
     const uint64_t since_us = sender->time_us - sender->phase_us;
@@ -276,9 +284,11 @@ static void step_honest(sender_t *sender, const transport_receiver_t *receiver) 
         sender->request = request;
         sender->due_us = sender->time_us + COMMAND_PERIOD_US;
         const world_event_t *torque = active(sender, WORLD_TORQUE);
-        const int32_t reference =
-            torque ? (int32_t)floor(torque->value / world->machine->command_lsb_Nm + 0.5) : sender->reference;
-        put_command(sender, receiver, HONEST, sender->counter++, torque != NULL, request,
+        const world_event_t *beyond = active(sender, WORLD_BEYOND);
+        const int32_t reference = beyond   ? reference_beyond(world, beyond->value)
+                                  : torque ? (int32_t)floor(torque->value / world->machine->command_lsb_Nm + 0.5)
+                                           : sender->reference;
+        put_command(sender, receiver, HONEST, sender->counter++, torque != NULL && beyond == NULL, request,
                     request == SENDER_RUN ? reference : 0);
     }
     if (request != SENDER_RUN || has(sender, WORLD_UNARMED) || sender->armed || sender->state == STATE_FAULT ||
@@ -408,7 +418,10 @@ static sender_meaning_t meaning_of_genuine(const sender_t *sender, const sender_
     const world_machine_t *machine = sender->world->machine;
     const uint32_t raw = frame->data[4] | (uint32_t)frame->data[5] << 8 | (uint32_t)frame->data[6] << 16;
     const double lsb = torque ? machine->command_lsb_Nm : machine->command_lsb_rpm;
-    return (sender_meaning_t){.genuine = frame->in_sequence,
+    const int32_t largest = reference_of(sender->world, machine->speed_command_max_rpm);
+    const bool beyond =
+        frame->identifier == DRIVE_COMMAND_FRAME_ID && abs((int32_t)(raw ^ 0x800000u) - 0x800000) > largest;
+    return (sender_meaning_t){.genuine = frame->in_sequence && !beyond,
                               .other = frame->other,
                               .command = is_motion_command(frame->identifier),
                               .confirms = frame->identifier == DRIVE_ARM_FRAME_ID && frame->data[3] == ARM_CONFIRM_RUN,
@@ -441,6 +454,8 @@ static void listen(sender_t *sender, const struct can_frame *frame, uint64_t tim
         sender->armed = frame->data[4] >> 2 & 1u;
         sender->challenge_for = frame->data[4] & 3u;
         sender->challenge = challenge;
+    } else if (frame->len == 8) {
+        sender->on_telemetry(sender->context, time_ns, frame->can_id, frame->data);
     }
 }
 

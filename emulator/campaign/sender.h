@@ -67,6 +67,7 @@ typedef struct sender {
     FILE *record; /* every frame that is sent, a line each; NULL: not wanted */
     void (*on_bus)(void *context, uint64_t time_ns, const sender_meaning_t *meaning);
     void (*on_status)(void *context, uint64_t time_ns, unsigned state, unsigned fault);
+    void (*on_telemetry)(void *context, uint64_t time_ns, unsigned identifier, const uint8_t data[8]);
     void (*on_fault)(void *context, uint64_t time_ns, unsigned kind, bool begins);
     void *context;
 } sender_t;

@@ -33,10 +33,16 @@ enum {
 #define STOP_SHARE 0.1    /* stopped for some time, or off */
 #define DEGRADED_SHARE 0.1
 #define OVERHAULING_SHARE 0.1
-#define RUNAWAY_SHARE 0.3   /* of the torque mode: the largest torque, to the end */
-#define REMAINING_SHARE 0.3 /* of the faults: until all are over */
-#define LONG_SHARE 0.08     /* long enough for what takes long to be noticed */
-#define REVERSE_SHARE 0.3   /* of the speeds, with a controller of four quadrants */
+#define RUNAWAY_SHARE 0.3     /* of the torque mode: the largest torque, to the end */
+#define TORQUE_STOP_SHARE 0.3 /* of the torque mode: ends with a stop */
+#define REMAINING_SHARE 0.3   /* of the faults: until all are over */
+#define LONG_SHARE 0.08       /* long enough for what takes long to be noticed */
+#define LASTING_SHARE 0.04    /* one fault alone, to the end of a long world */
+#define FAULTLESS_SHARE 0.1   /* no fault of the bench */
+#define BEYOND_SHARE 0.04     /* a speed beyond the largest one is commanded for some time */
+#define CLEARING_SHARE 0.03   /* the client sends nothing but clear_fault until all is over */
+#define SECOND_LOSS_SHARE 0.4 /* of the worlds with one lost phase */
+#define REVERSE_SHARE 0.3     /* of the speeds, with a controller of four quadrants */
 
 /* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
  * not. */
@@ -186,6 +192,10 @@ static void draw_torque(world_t *world, uint64_t last_us) {
     world_event_t *event = add(world, WORLD_TORQUE, begin_us, end_us < last_us && !runaway ? end_us : last_us);
     const double part = seeded_between(seed, STREAM_TORQUE, 3, world->controller == 2 ? -1.0 : 0.0, 1.0);
     event->value = runaway ? copysign(world->machine->torque_max_Nm, part) : part * world->machine->torque_rated_Nm;
+    if (!world->healthy && seeded_unit(seed, STREAM_TORQUE, 5) < TORQUE_STOP_SHARE) {
+        world_event_t *stop = add(world, WORLD_REQUEST, begin_us + (event->end_us - begin_us) / 3, event->end_us);
+        stop->what = WORLD_REQUEST_STOP;
+    }
 }
 
 static double start_s(const world_t *world, double from_rpm, double to_rpm) {
@@ -370,6 +380,20 @@ static void draw_request(world_t *world, uint64_t last_us) {
     if (seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE) {
         add(world, WORLD_DEGRADED, 0, 0);
     }
+    if (seeded_unit(seed, STREAM_REQUEST, 6) < BEYOND_SHARE) {
+        const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_REQUEST, 7, 1e4, (double)last_us);
+        world_event_t *event = add(world, WORLD_BEYOND, begin_us, last_us);
+        const double part = seeded_between(seed, STREAM_REQUEST, 8, 1.01, 2.0);
+        event->value = seeded_unit(seed, STREAM_REQUEST, 9) < 0.5 ? -part : part;
+    }
+    if (seeded_unit(seed, STREAM_REQUEST, 10) < CLEARING_SHARE) {
+        world_event_t *event = add(world, WORLD_REQUEST, 0, last_us);
+        event->what = WORLD_REQUEST_CLEAR;
+    }
+}
+
+static bool lasting(uint64_t seed) {
+    return seeded_unit(seed, STREAM_REQUEST, 11) < LASTING_SHARE;
 }
 
 /* Some of the kinds; in half of the worlds with degraded running one that such a drive runs on with, alone. */
@@ -378,7 +402,24 @@ static void draw_faults(world_t *world, uint64_t last_us) {
                                        FAULT_CURRENT_SENSOR_OPEN};
     const uint64_t seed = world->seed;
     if (seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE / 2.0) {
-        draw_fault(world, endured[seeded_below(seed, STREAM_REQUEST, 5, 4)], last_us);
+        const unsigned first = seeded_below(seed, STREAM_REQUEST, 5, 4);
+        draw_fault(world, endured[first], last_us);
+        if (seeded_unit(seed, STREAM_REQUEST, 12) < SECOND_LOSS_SHARE) {
+            draw_fault(world, endured[(first + 1) % 4], last_us);
+        }
+        return;
+    }
+    if (lasting(seed)) {
+        const unsigned kind = 1 + seeded_below(seed, STREAM_REQUEST, 13, FAULT_COUNT - 1);
+        if (possible(world, kind)) {
+            draw_fault(world, kind, last_us);
+        }
+        if (world->events > 0 && world->event[world->events - 1].kind == WORLD_FAULT) {
+            world->event[world->events - 1].end_us = last_us;
+        }
+        return;
+    }
+    if (seeded_unit(seed, STREAM_REQUEST, 14) < FAULTLESS_SHARE) {
         return;
     }
     unsigned faults = 0;
@@ -400,7 +441,8 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
     const bool deserted =
         (sort >= SILENT_PART && sort < DESERTED_PART) || (sort >= HOSTILE_PART && sort < DESERTED_SECOND_PART);
-    last_us = sort < 0.04 || deserted || seeded_unit(seed, STREAM_SCRIPT, 8) < LONG_SHARE ? 900000 : last_us;
+    const bool is_long = sort < 0.04 || deserted || lasting(seed) || seeded_unit(seed, STREAM_SCRIPT, 8) < LONG_SHARE;
+    last_us = is_long ? 900000 : last_us;
     world->recovery_us = last_us + 25000;
     add_speed(world, first_rpm, 0);
     if (seeded_unit(seed, STREAM_SPEED, 90) < 0.4) {
@@ -445,9 +487,16 @@ bool world_active(const world_t *world, unsigned event, uint64_t time_us) {
 
 const char *world_event_name(const world_event_t *event) {
     static const char *const names[] = {
-        [WORLD_SPEED] = "speed_reference", [WORLD_TORQUE] = "torque_reference", [WORLD_SILENT] = "silent",
-        [WORLD_HOSTILE] = "hostile",       [WORLD_SECOND] = "second_sender",    [WORLD_EAGER] = "eager",
-        [WORLD_UNARMED] = "unarmed",       [WORLD_REQUEST] = "request",         [WORLD_DEGRADED] = "degraded_running",
+        [WORLD_SPEED] = "speed_reference",
+        [WORLD_TORQUE] = "torque_reference",
+        [WORLD_SILENT] = "silent",
+        [WORLD_HOSTILE] = "hostile",
+        [WORLD_SECOND] = "second_sender",
+        [WORLD_EAGER] = "eager",
+        [WORLD_UNARMED] = "unarmed",
+        [WORLD_REQUEST] = "request",
+        [WORLD_BEYOND] = "speed_beyond_range",
+        [WORLD_DEGRADED] = "degraded_running",
     };
     return event->kind == WORLD_SET     ? bench_variables[event->what].name
            : event->kind == WORLD_FAULT ? fault_kinds[event->what].name

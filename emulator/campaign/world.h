@@ -20,6 +20,7 @@ typedef struct {
     double command_lsb_rpm; /* of DRIVE_COMMAND.speed_reference_rpm */
     double command_lsb_Nm;  /* of DRIVE_TORQUE_COMMAND.torque_reference_Nm */
     double speed_command_max_rpm;
+    double current_lsb_A, voltage_lsb_V; /* of telemetry */
     unsigned rate_min_hz;
     char name[64];
 } world_machine_t;
@@ -35,6 +36,7 @@ typedef enum {
     WORLD_EAGER,    /* the client clears, arms and runs again after each fault, whatever its cause does */
     WORLD_UNARMED,  /* the client requests to run without arming the drive, from begin to end */
     WORLD_REQUEST,  /* the client sends request `what` instead of run, from begin to end */
+    WORLD_BEYOND,   /* the client commands a speed of `value` times the largest one, from begin to end */
     WORLD_DEGRADED, /* the client sets the parameter degraded_running before it runs the drive */
 } world_kind_t;
 
@@ -50,7 +52,7 @@ typedef enum {
 } world_hostile_t;
 
 /* As DRIVE_COMMAND.request. */
-enum { WORLD_REQUEST_OFF, WORLD_REQUEST_STOP = 2 };
+enum { WORLD_REQUEST_OFF, WORLD_REQUEST_STOP = 2, WORLD_REQUEST_CLEAR };
 
 typedef struct {
     world_kind_t kind;

@@ -188,8 +188,8 @@ static bool does_not_fall(const common_t *common, phase_monitor_phase_t *state, 
 
 /* True when the integral has gone only because the tables have taken most of it away, more than the drops of the
  * devices explain, a seventh of the error of the voltage, twice that after a small current: by voltage and time alone
- * the current may flow, and it is the angle of the tables that is wrong. At most all of it: what is more has added up in
- * a long stroke. */
+ * the current may flow, and it is the angle of the tables that is wrong. At most all of it: what is more has added up
+ * in a long stroke. */
 static bool taken_away(const common_t *common, const phase_monitor_phase_t *state) {
     const uint32_t age = common->input->periods - state->zero_at;
     const bool was_small = state->conducting > FOLLOW_MS * common->input->periods_per_ms;

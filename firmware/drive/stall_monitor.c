@@ -4,8 +4,8 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
-/* Strokes of the reference after which a rotor has to have made one, times the strokes of a revolution: 3 * 2 pi rad, in
- * us and 2^-22 rad/s, without the unit of speed. */
+/* Strokes of the reference after which a rotor has to have made one, times the strokes of a revolution: 3 * 2 pi rad,
+ * in us and 2^-22 rad/s, without the unit of speed. */
 #define THREE_REVOLUTIONS UINT64_C(79060767799934)
 
 #define ONE_REV_Q24 (1 << 24)

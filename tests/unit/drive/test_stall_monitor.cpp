@@ -93,9 +93,10 @@ TEST_F(Stall, rotor_that_swings_faster_than_at_half_of_the_reference_is_stalled_
     EXPECT_EQ(time_to_fault_us(1000000, [&](uint32_t us) { input.speed_q22 = once_q22(us); }), 0u);
 }
 
-// The amplitude of the swing is in electrical revolutions; the torque is at its limit only at times, as when the speed is
-// above the reference within each swing.
-TEST_F(Stall, rotor_that_swings_between_two_angles_is_stalled_whatever_the_torque_and_one_that_advances_meanwhile_is_not) {
+// The amplitude of the swing is in electrical revolutions; the torque is at its limit only at times, as when the speed
+// is above the reference within each swing.
+TEST_F(Stall,
+       rotor_that_swings_between_two_angles_is_stalled_whatever_the_torque_and_one_that_advances_meanwhile_is_not) {
     const auto swings = [this](double amplitude, double advance_per_s) {
         return [=, this](uint32_t us) {
             const double angle_rad = 2 * M_PI / machine_tables.rotor_poles, rate = 2 * M_PI * 20.0, s = us * 1e-6;

@@ -39,6 +39,10 @@ def pool_file() -> Path:
 
 TORQUE_COMMAND_FRACTION_BITS = 16
 """Of DRIVE_TORQUE_COMMAND.torque_reference_Nm, where the unit is 1 N m."""
+CURRENT_FRACTION_BITS = 9
+"""Of currents in telemetry, where the unit is 1 A."""
+VOLTAGE_FRACTION_BITS = 6
+"""Of voltages in telemetry, where the unit is 1 V."""
 
 
 def _line(path: Path) -> str:
@@ -48,7 +52,9 @@ def _line(path: Path) -> str:
     lsb_rpm = float(SPEED_LSB_RPM) * 2.0**scaling.exponents.speed
     values = (data.speed_base_rpm, data.torque_rated_Nm, data.parameters["torque_max_Nm"], data.over_speed_rpm,
               data.bus_over_voltage_V, data.bus_under_voltage_V, data.current_trip_A, lsb_rpm,
-              scaling.speed_reference_max * lsb_rpm, 2.0**(scaling.exponents.torque - TORQUE_COMMAND_FRACTION_BITS))
+              scaling.speed_reference_max * lsb_rpm, 2.0**(scaling.exponents.torque - TORQUE_COMMAND_FRACTION_BITS),
+              2.0**(scaling.exponents.current - CURRENT_FRACTION_BITS),
+              2.0**(scaling.exponents.voltage - VOLTAGE_FRACTION_BITS))
     rate_min_hz = max(scaling.control_rate_min_hz(machine), data.control_rate_hz if data.control_rate_hz > 50000 else 0)
     return " ".join([str(machine_image(str(path))), *(f"{value:.17g}" for value in values), str(rate_min_hz),
                      machine.name])

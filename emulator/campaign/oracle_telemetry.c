@@ -1,0 +1,132 @@
+/* Measurements on the bus against what the drive has measured, and against the plant. */
+#include "campaign/oracle_parts.h"
+
+#include <math.h>
+
+#include "bench_variables.h"
+#include "drive_codec.h"
+#include "fault_kinds.h"
+
+#define WINDOW_NS (10 * ORACLE_MS_NS) /* a frame is younger than that: a cycle of 4 ms, and the queue */
+#define SETTLED_NS (100 * ORACLE_MS_NS)
+#define SNAPSHOT_NS (30 * ORACLE_MS_NS) /* until the first snapshot after a fault may be an earlier one's */
+#define ERROR_MAX 0.001                 /* of the full scale */
+#define SPEED_ERROR_MAX 0.1             /* of the speed, which the drive observes, */
+#define SPEED_ERROR_MAX_BASE 0.05       /* and of the base speed */
+
+static void widen(oracle_range_t *range, double value, bool renew) {
+    if (renew) {
+        range->low[1] = range->low[0];
+        range->high[1] = range->high[0];
+        range->low[0] = range->high[0] = value;
+    }
+    range->low[0] = fmin(range->low[0], value);
+    range->high[0] = fmax(range->high[0], value);
+}
+
+static bool is_within(const oracle_range_t *range, double value, double error) {
+    return value >= fmin(range->low[0], range->low[1]) - error && value <= fmax(range->high[0], range->high[1]) + error;
+}
+
+void oracle_remember_measurement(oracle_t *oracle, const plant_t *plant) {
+    oracle_telemetry_t *telemetry = &oracle->telemetry;
+    const bool renew = plant->time_ns >= telemetry->window_ns + WINDOW_NS;
+    telemetry->window_ns = renew ? plant->time_ns : telemetry->window_ns;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        widen(&telemetry->current[phase], oracle->drive.current[phase], renew);
+    }
+    widen(&telemetry->link_voltage, oracle->drive.link_voltage, renew);
+    widen(&telemetry->speed_rad_s, plant->speed_rad_s, renew);
+}
+
+void oracle_remember_fault(oracle_t *oracle, const plant_t *plant) {
+    oracle_telemetry_t *telemetry = &oracle->telemetry;
+    telemetry->fault_speed_rad_s = plant->speed_rad_s;
+    telemetry->fault_link_voltage = oracle->drive.link_voltage;
+    telemetry->fault_current = 0.0;
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        telemetry->fault_current = fmax(telemetry->fault_current, oracle->drive.current[phase]);
+    }
+}
+
+static double unsigned_16(const uint8_t *data) {
+    return data[0] | data[1] << 8;
+}
+
+static double signed_16(const uint8_t *data) {
+    return (int16_t)(uint16_t)(data[0] | data[1] << 8);
+}
+
+static double signed_24(const uint8_t *data) {
+    return (int32_t)((uint32_t)(data[0] | data[1] << 8 | data[2] << 16) ^ 0x800000u) - 0x800000;
+}
+
+static void judge(oracle_t *oracle, bool holds, uint64_t time_ns, unsigned number, double value) {
+    if (!holds) {
+        oracle_violate(oracle, "wrong_telemetry", time_ns, number, value);
+    }
+}
+
+static bool observes_speed(const oracle_t *oracle) {
+    return !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
+           !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT);
+}
+
+static void judge_snapshot(oracle_t *oracle, uint64_t time_ns, const uint8_t data[8]) {
+    const oracle_telemetry_t *telemetry = &oracle->telemetry;
+    const world_machine_t *machine = oracle->world->machine;
+    const sensor_ranges_t *ranges = &machine->image.machine.ranges;
+    if (oracle->drive.state != STATE_FAULT || time_ns < oracle->latched_ns + SNAPSHOT_NS ||
+        oracle->reset_ns > oracle->latched_ns || oracle_state_changed(oracle)) {
+        return;
+    }
+    const double true_rpm = telemetry->fault_speed_rad_s * ORACLE_RPM_PER_RAD_S;
+    const double rpm = signed_16(data) * 250.0 * machine->command_lsb_rpm;
+    const double error_rpm = 2.0 * (SPEED_ERROR_MAX * fabs(true_rpm) + SPEED_ERROR_MAX_BASE * machine->speed_base_rpm);
+    judge(oracle, !observes_speed(oracle) || !telemetry->ran || fabs(rpm - true_rpm) <= error_rpm, time_ns, 16, rpm);
+    const double link = unsigned_16(data + 2) * machine->voltage_lsb_V / ranges->dc_link_V;
+    judge(oracle, fabs(link - telemetry->fault_link_voltage) <= ERROR_MAX, time_ns, 17, link);
+    const double current = unsigned_16(data + 4) * machine->current_lsb_A / ranges->current_A;
+    judge(oracle, fabs(current - telemetry->fault_current) <= ERROR_MAX, time_ns, 18, current);
+}
+
+void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier, const uint8_t data[8]) {
+    const oracle_telemetry_t *telemetry = &oracle->telemetry;
+    const world_machine_t *machine = oracle->world->machine;
+    const sensor_ranges_t *ranges = &machine->image.machine.ranges;
+    if (oracle_bus_disturbed(oracle) || oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
+        oracle_any_injected(oracle, FAULT_CLOCK_DRIFT, FAULT_CLOCK_DRIFT) ||
+        oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_ns / 1000) ||
+        time_ns < oracle->reset_ns + 3 * WINDOW_NS) {
+        return; /* frames may be older */
+    }
+    switch (identifier) {
+    case DRIVE_CURRENTS_FRAME_ID:
+        for (unsigned phase = 0; phase < machine->image.machine.phases; phase++) {
+            const double current = unsigned_16(data + (size_t)2 * phase) * machine->current_lsb_A / ranges->current_A;
+            judge(oracle, is_within(&telemetry->current[phase], current, ERROR_MAX), time_ns, phase, current);
+        }
+        break;
+    case DRIVE_TORQUE_FRAME_ID: {
+        const double link = unsigned_16(data + 6) * machine->voltage_lsb_V / ranges->dc_link_V;
+        judge(oracle, is_within(&telemetry->link_voltage, link, ERROR_MAX), time_ns, 8, link);
+        break;
+    }
+    case DRIVE_MOTION_FRAME_ID: {
+        const double rad_s = signed_24(data) * machine->command_lsb_rpm / ORACLE_RPM_PER_RAD_S;
+        const double base_rad_s = machine->speed_base_rpm / ORACLE_RPM_PER_RAD_S;
+        const bool settled = oracle->drive.state == STATE_RUN && time_ns > oracle->state_ns + SETTLED_NS;
+        judge(oracle,
+              !settled || !observes_speed(oracle) ||
+                  is_within(&telemetry->speed_rad_s, rad_s,
+                            SPEED_ERROR_MAX * fabs(rad_s) + SPEED_ERROR_MAX_BASE * base_rad_s),
+              time_ns, 9, rad_s);
+        break;
+    }
+    case DRIVE_FAULT_SNAPSHOT_FRAME_ID:
+        judge_snapshot(oracle, time_ns, data);
+        break;
+    default:
+        break;
+    }
+}
