@@ -165,6 +165,7 @@ static void look_at_causes(oracle_t *oracle, const plant_t *plant) {
         !oracle_link_sensor_faulty(oracle) && (plant->bus_voltage_V > MARGIN * machine->over_voltage_V ||
                                                plant->bus_voltage_V * MARGIN < machine->under_voltage_V);
     const bool speed = !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
+                       plant->time_ns > oracle->reset_ns + 10 * ORACLE_MS_NS && /* else it is not observed yet */
                        fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > MARGIN * machine->over_speed_rpm;
     if (voltage || speed || sto_demanded(oracle, (plant->time_ns - 1) / 1000)) {
         oracle->cause_ns = plant->time_ns;
