@@ -9,6 +9,7 @@
 
 #define RECENT_NS (2 * ORACLE_MS_NS)
 #define MARGIN 1.02
+#define HALF_TURN (UINT32_C(1) << 31)
 #define UNDER_VOLTAGE_PART 0.94
 #define STO_DIFFERED_US 215000 /* lines of safe torque off: then both have to be off once */
 #define STATUS_AGE_MAX_NS (30 * ORACLE_MS_NS)
@@ -120,6 +121,14 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     const uint64_t age_ns = now_ns > oracle->run_ns ? now_ns - oracle->run_ns : 0;
     if (!oracle->commanded || age_ns > request_max_ns(oracle, RUN_MAX_NS)) {
         oracle_violate(oracle, "no_command", now_ns, 3, (double)age_ns * 1e-6);
+    } else if (age_ns < 40 * ORACLE_MS_NS) {
+        const double before_Nm = age_ns < 10 * ORACLE_MS_NS ? 0.0 : oracle->silence_torque_Nm;
+        oracle->silence_torque_Nm = fmax(fabs(plant_torque_Nm(plant)), before_Nm);
+    } else if (age_ns > request_max_ns(oracle, 60 * ORACLE_MS_NS) && !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) &&
+               !oracle_bus_disturbed(oracle) &&
+               fabs(plant_torque_Nm(plant)) >
+                   1.5 * oracle->silence_torque_Nm + 0.2 * oracle->world->machine->torque_max_Nm) {
+        oracle_violate(oracle, "no_command", now_ns, 7, plant_torque_Nm(plant));
     } else if (age_ns > request_max_ns(oracle, 170 * ORACLE_MS_NS) && !oracle_phases_at_fault(oracle, now_ns / 1000) &&
                fabs(plant_torque_Nm(plant)) > 0.2 * oracle->world->machine->torque_max_Nm) {
         oracle_violate(oracle, "no_command", now_ns, 4, plant_torque_Nm(plant));
@@ -232,6 +241,18 @@ static void look_at_start(oracle_t *oracle, uint64_t now_ns) {
     }
 }
 
+/* The encoder repeats a count, and nothing else is wrong with it. */
+static bool encoder_stands(const oracle_t *oracle, uint64_t now_us) {
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = &oracle->world->event[i];
+        if (event->kind == WORLD_FAULT && event->what == FAULT_ENCODER_STUCK &&
+            world_active(oracle->world, i, now_us)) {
+            return !oracle_any_injected(oracle, FAULT_ENCODER_JUMP, FAULT_ENCODER_NO_ANSWER);
+        }
+    }
+    return false;
+}
+
 /* Lines of safe torque off that have differed for long, and have not been off together since. */
 static bool sto_discrepancy_remains(const oracle_t *oracle, uint64_t now_us) {
     uint64_t begin_us = 0, end_us = 0;
@@ -254,6 +275,11 @@ static void look_at_end_of_fault(oracle_t *oracle, uint64_t now_ns, uint8_t befo
     if (before == STATE_FAULT && sto_discrepancy_remains(oracle, now_ns / 1000) && !oracle_state_changed(oracle)) {
         oracle_violate(oracle, "cleared", now_ns, CAUSE_STO_DISCREPANCY, 0.0);
     }
+    if (before == STATE_FAULT && oracle->causes > 0 && oracle->causes < ORACLE_CAUSES_MAX &&
+        oracle->cause[oracle->causes - 1] == CAUSE_ENCODER && !oracle->counted &&
+        oracle->reset_ns < oracle->latched_ns && !oracle_state_changed(oracle)) {
+        oracle_violate(oracle, "cleared", now_ns, CAUSE_ENCODER, 0.0);
+    }
     if (before == STATE_FAULT && oracle->clear_ns != 0 && oracle->clear_ns + 5 * ORACLE_MS_NS < oracle->latched_ns &&
         oracle->reset_ns < oracle->latched_ns && !oracle_state_changed(oracle) && !may_be_deaf(oracle, now_ns / 1000)) {
         oracle_violate(oracle, "cleared", now_ns, 0, (double)(oracle->latched_ns - oracle->clear_ns) * 1e-6);
@@ -275,6 +301,9 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
         oracle->state_ns = plant->time_ns;
     }
     oracle->interrupt_ns = plant->time_ns;
+    const uint32_t moved = drive.angle - oracle->latched_angle;
+    const uint32_t distance = moved < HALF_TURN ? moved : 0u - moved;
+    oracle->counted = oracle->counted || distance >> (31 - oracle->world->encoder_bits) != 0;
     oracle_look_at_measurement(oracle, plant);
     oracle_remember_measurement(oracle, plant);
     oracle_look_at_motion(oracle, plant);
@@ -298,6 +327,8 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     if (drive.state == STATE_FAULT && before != STATE_FAULT) {
         oracle->confirmed = oracle->clear_seen = false;
         oracle->latched_ns = plant->time_ns;
+        oracle->latched_angle = drive.angle;
+        oracle->counted = !encoder_stands(oracle, plant->time_ns / 1000);
         oracle_remember_fault(oracle, plant);
         if (oracle->causes < ORACLE_CAUSES_MAX) {
             oracle->cause[oracle->causes++] = drive.fault;

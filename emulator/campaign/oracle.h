@@ -9,7 +9,8 @@
  *   gate_on         a gate on while the drive is not in state run, or a line of safe torque off is not energised, or
  *                   2.5 periods after the last control interrupt
  *   no_command      a gate on without a confirmed arming since the last fault, or 5 ms after a genuine off; a gate on,
- *                   or the state run, 502 ms after the last genuine request to run; torque 170 ms after it; both later
+ *                   or the state run, 502 ms after the last genuine request to run; torque 170 ms after it, or
+ *                   from 60 ms on a larger one than before, by half and a fifth of the largest; both later
  *                   by the 18 ms for which the request waits when the background hangs and the watchdog does not reset
  *                   the drive; a fault that ends without a genuine request to clear it
  *   stopped         state run left, without a fault, less than 30 ms after a genuine request to run; or after one to
@@ -18,7 +19,8 @@
  *   resumed         a run after bus-off, with no other request than run since
  *   cleared         a fault ended less than 8 ms after the plant's last reason for one: a line of safe torque off not
  *                   energised, a link voltage or a speed beyond its limits; by a request to clear that was there before
- *                   it; or after lines of safe torque off had differed, without both having been off
+ *                   it; after lines of safe torque off had differed, without both having been off; or that of an
+ *                   encoder which stood still, and has not counted since
  *   under_voltage   in state run, the link voltage below its threshold by 6 % for 3 ms
  *   over_speed      a gate on for 2 ms at a speed above the limit by 2 %
  *   over_voltage    a gate on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no
@@ -39,8 +41,11 @@
  *                   of the base speed; one quadrant: and what a light rotor gains
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
  *                   and memory undisturbed
- *   wrong_telemetry a measured current or voltage on the bus that the drive has not measured in the last 20 ms, a speed
+ *   wrong_telemetry a measured current or voltage on the bus that the drive has not measured in the last 4 ms, a speed
  *                   off the true one by 10 % and 5 % of the base speed; in the snapshot of a fault those of its instant
+ *   not_derated     a torque limit in telemetry above what loads and temperatures beside it leave, by 12 % of the
+ *                   largest torque
+ *   applied         a set of parameters with a wrong check was applied
  *   wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
  *   not_first       a first cause that is not the first one, by its number, of the checks that failed in its tick
  *   false_alarm     a fault of the drive without any other, which is not true of the plant, or the drive's own work:
@@ -161,6 +166,9 @@ typedef struct {
     bool succeeded; /* the first sender by the second one, whose counter is in sequence by chance */
     uint64_t run_ns, off_ns, speed_ns, voltage_ns, low_ns;
     uint64_t clear_ns, latched_ns;   /* a request to clear began, the last fault */
+    uint32_t latched_angle;          /* measured then */
+    bool counted;                    /* it has changed since */
+    double silence_torque_Nm;        /* largest torque before the client has been silent for 40 ms */
     sender_meaning_t meant;          /* by the last genuine motion command */
     uint64_t withdrawn_ns, reset_ns; /* last genuine request other than run, last reset */
     uint64_t cause_ns;               /* last time at which the plant had a reason to keep the drive in a fault */

@@ -7,12 +7,20 @@
 #include "drive_codec.h"
 #include "fault_kinds.h"
 
-#define WINDOW_NS (10 * ORACLE_MS_NS) /* a frame is younger than that: a cycle of 4 ms, and the queue */
+#define WINDOW_NS (2 * ORACLE_MS_NS) /* a frame is younger than that */
 #define SETTLED_NS (100 * ORACLE_MS_NS)
 #define SNAPSHOT_NS (30 * ORACLE_MS_NS) /* until the first snapshot after a fault may be an earlier one's */
 #define ERROR_MAX 0.001                 /* of the full scale */
 #define SPEED_ERROR_MAX 0.1             /* of the speed, which the drive observes, */
 #define SPEED_ERROR_MAX_BASE 0.05       /* and of the base speed */
+
+/* Default parameters, and the error of a torque limit: heat changes between two readings of it. */
+#define WINDING_LIMIT_C 155.0
+#define INVERTER_LIMIT_C 100.0
+#define DERATING_ERROR_MAX 0.12
+
+/* Of drive.dbc. */
+enum { OPERATION_SET_CONTROL = 12, STATUS_DONE = 0, STEP_APPLY = 2 };
 
 static void widen(oracle_range_t *range, double value, bool renew) {
     if (renew) {
@@ -93,6 +101,29 @@ static void judge_snapshot(oracle_t *oracle, uint64_t time_ns, const uint8_t dat
     judge(oracle, fabs(current - telemetry->fault_current) <= ERROR_MAX, time_ns, 18, current);
 }
 
+/* The torque that heat leaves, by what the drive says of itself. */
+static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data[8]) {
+    const double most_Nm = oracle->world->machine->torque_max_Nm;
+    const double load_percent = 0.01 * fmax(unsigned_16(data), unsigned_16(data + 2));
+    const double room = fmin(fmin((100.0 - load_percent) / 10.0, (WINDING_LIMIT_C - data[6]) / 20.0),
+                             (INVERTER_LIMIT_C - data[7]) / 20.0);
+    const double limit_Nm = signed_16(data + 4) * 256.0 * oracle->world->machine->command_lsb_Nm;
+    if (limit_Nm > most_Nm * (fmin(fmax(room, 0.0), 1.0) + DERATING_ERROR_MAX) && observes_speed(oracle)) {
+        oracle_violate(oracle, "not_derated", time_ns, 0, limit_Nm / most_Nm);
+    }
+}
+
+/* A set of parameters whose check is wrong. */
+static void judge_set(oracle_t *oracle, uint64_t time_ns, const uint8_t data[8]) {
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);
+        if (event != NULL && event->kind == WORLD_DEGRADED && event->what == WORLD_DEGRADED_WRONG_CHECK &&
+            data[0] == OPERATION_SET_CONTROL && data[3] == STATUS_DONE && data[4] == STEP_APPLY) {
+            oracle_violate(oracle, "applied", time_ns, 0, 0.0);
+        }
+    }
+}
+
 void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier, const uint8_t data[8]) {
     const oracle_telemetry_t *telemetry = &oracle->telemetry;
     const world_machine_t *machine = oracle->world->machine;
@@ -100,7 +131,7 @@ void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier
     if (oracle_bus_disturbed(oracle) || oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
         oracle_any_injected(oracle, FAULT_CLOCK_DRIFT, FAULT_CLOCK_DRIFT) ||
         oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_ns / 1000) ||
-        time_ns < oracle->reset_ns + 3 * WINDOW_NS) {
+        time_ns < oracle->reset_ns + SNAPSHOT_NS) {
         return; /* frames may be older */
     }
     switch (identifier) {
@@ -128,6 +159,12 @@ void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier
     }
     case DRIVE_FAULT_SNAPSHOT_FRAME_ID:
         judge_snapshot(oracle, time_ns, data);
+        break;
+    case DRIVE_THERMAL_FRAME_ID:
+        judge_thermal(oracle, time_ns, data);
+        break;
+    case DRIVE_PARAMETER_RESPONSE_FRAME_ID:
+        judge_set(oracle, time_ns, data);
         break;
     default:
         break;

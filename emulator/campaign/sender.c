@@ -250,8 +250,9 @@ static void configure(sender_t *sender, const transport_receiver_t *receiver) {
         put_arm(sender, receiver, ARM_CONFIRM_CONFIGURATION, ~sender->challenge);
         put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_BEGIN, 0);
         put_set(sender, receiver, DRIVE_PARAMETER_WRITE_FRAME_ID, DATA_ID_PARAMETER_WRITE, index, 1);
+        const bool wrong = active(sender, WORLD_DEGRADED)->what == WORLD_DEGRADED_WRONG_CHECK;
         put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_APPLY,
-                check_of_set(index, 1));
+                check_of_set(index, 1) ^ (wrong ? 1u : 0u));
         sender->challenge = 0;
         sender->configured = true;
     } else if (sender->state == STATE_READY && sender->time_us >= sender->requested_us + ARM_RETRY_US) {

@@ -33,16 +33,18 @@ enum {
 #define STOP_SHARE 0.1    /* stopped for some time, or off */
 #define DEGRADED_SHARE 0.1
 #define OVERHAULING_SHARE 0.1
-#define RUNAWAY_SHARE 0.3     /* of the torque mode: the largest torque, to the end */
-#define TORQUE_STOP_SHARE 0.3 /* of the torque mode: ends with a stop */
-#define REMAINING_SHARE 0.3   /* of the faults: until all are over */
-#define LONG_SHARE 0.08       /* long enough for what takes long to be noticed */
-#define LASTING_SHARE 0.04    /* one fault alone, to the end of a long world */
-#define FAULTLESS_SHARE 0.1   /* no fault of the bench */
-#define BEYOND_SHARE 0.04     /* a speed beyond the largest one is commanded for some time */
-#define CLEARING_SHARE 0.03   /* the client sends nothing but clear_fault until all is over */
-#define SECOND_LOSS_SHARE 0.4 /* of the worlds with one lost phase */
-#define REVERSE_SHARE 0.3     /* of the speeds, with a controller of four quadrants */
+#define RUNAWAY_SHARE 0.3      /* of the torque mode: the largest torque, to the end */
+#define TORQUE_STOP_SHARE 0.3  /* of the torque mode: ends with a stop */
+#define REMAINING_SHARE 0.3    /* of the faults: until all are over */
+#define LONG_SHARE 0.08        /* long enough for what takes long to be noticed */
+#define LASTING_SHARE 0.04     /* one fault alone, to the end of a long world */
+#define WRONG_CHECK_SHARE 0.15 /* of the sets of parameters */
+#define SLOW_SHARE 0.5         /* of them: of a kind that takes long to be noticed */
+#define FAULTLESS_SHARE 0.1    /* no fault of the bench */
+#define BEYOND_SHARE 0.04      /* a speed beyond the largest one is commanded for some time */
+#define CLEARING_SHARE 0.03    /* the client sends nothing but clear_fault until all is over */
+#define SECOND_LOSS_SHARE 0.4  /* of the worlds with one lost phase */
+#define REVERSE_SHARE 0.4      /* of the speeds, with a controller of four quadrants */
 
 /* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
  * not. */
@@ -378,7 +380,9 @@ static void draw_request(world_t *world, uint64_t last_us) {
         event->what = seeded_unit(seed, STREAM_REQUEST, 3) < 0.7 ? WORLD_REQUEST_STOP : WORLD_REQUEST_OFF;
     }
     if (seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE) {
-        add(world, WORLD_DEGRADED, 0, 0);
+        world_event_t *event = add(world, WORLD_DEGRADED, 0, 0);
+        event->what = seeded_unit(seed, STREAM_REQUEST, 16) < WRONG_CHECK_SHARE ? WORLD_DEGRADED_WRONG_CHECK
+                                                                                : WORLD_DEGRADED_RIGHT_CHECK;
     }
     if (seeded_unit(seed, STREAM_REQUEST, 6) < BEYOND_SHARE) {
         const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_REQUEST, 7, 1e4, (double)last_us);
@@ -400,6 +404,16 @@ static bool lasting(uint64_t seed) {
 static void draw_faults(world_t *world, uint64_t last_us) {
     static const unsigned endured[] = {FAULT_WINDING_OPEN, FAULT_SWITCH_OPEN, FAULT_GATE_SUPPLY_LOST,
                                        FAULT_CURRENT_SENSOR_OPEN};
+    static const unsigned slow[] = {FAULT_SHAFT_LOCKED,
+                                    FAULT_COULOMB_FRICTION,
+                                    FAULT_STATIC_FRICTION,
+                                    FAULT_CURRENT_SENSOR_GAIN,
+                                    FAULT_ENCODER_STUCK,
+                                    FAULT_ENCODER_SLIP,
+                                    FAULT_ENCODER_LOST_COUNTS,
+                                    FAULT_CHOPPER_OPEN,
+                                    FAULT_WINDING_TEMPERATURE_SENSOR_OFFSET,
+                                    FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET};
     const uint64_t seed = world->seed;
     if (seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE / 2.0) {
         const unsigned first = seeded_below(seed, STREAM_REQUEST, 5, 4);
@@ -410,7 +424,9 @@ static void draw_faults(world_t *world, uint64_t last_us) {
         return;
     }
     if (lasting(seed)) {
-        const unsigned kind = 1 + seeded_below(seed, STREAM_REQUEST, 13, FAULT_COUNT - 1);
+        const bool slow_one = seeded_unit(seed, STREAM_REQUEST, 15) < SLOW_SHARE;
+        const unsigned kind = slow_one ? slow[seeded_below(seed, STREAM_REQUEST, 13, sizeof slow / sizeof *slow)]
+                                       : 1 + seeded_below(seed, STREAM_REQUEST, 13, FAULT_COUNT - 1);
         if (possible(world, kind)) {
             draw_fault(world, kind, last_us);
         }
@@ -522,7 +538,7 @@ void world_print(const world_t *world) {
             value = event->raw * bench_variables[event->what].scale;
         } else if (event->kind == WORLD_FAULT) {
             value = event->raw * fault_kinds[event->what].scale;
-        } else if (event->kind == WORLD_HOSTILE || event->kind == WORLD_REQUEST) {
+        } else if (event->kind == WORLD_HOSTILE || event->kind == WORLD_REQUEST || event->kind == WORLD_DEGRADED) {
             value = event->what;
         }
         printf("%s{\"index\": %u, \"event\": \"%s\", \"begin_us\": %" PRIu64 ", \"end_us\": %" PRIu64

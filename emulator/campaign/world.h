@@ -37,7 +37,7 @@ typedef enum {
     WORLD_UNARMED,  /* the client requests to run without arming the drive, from begin to end */
     WORLD_REQUEST,  /* the client sends request `what` instead of run, from begin to end */
     WORLD_BEYOND,   /* the client commands a speed of `value` times the largest one, from begin to end */
-    WORLD_DEGRADED, /* the client sets the parameter degraded_running before it runs the drive */
+    WORLD_DEGRADED, /* the client sets the parameter degraded_running before it runs the drive; what: a check */
 } world_kind_t;
 
 typedef enum {
@@ -50,6 +50,9 @@ typedef enum {
     WORLD_HOSTILE_REPEAT,   /* the latest genuine frame once more, each millisecond, as a gateway that hangs */
     WORLD_HOSTILE_SORTS
 } world_hostile_t;
+
+/* Of the frames of the set. */
+enum { WORLD_DEGRADED_RIGHT_CHECK, WORLD_DEGRADED_WRONG_CHECK };
 
 /* As DRIVE_COMMAND.request. */
 enum { WORLD_REQUEST_OFF, WORLD_REQUEST_STOP = 2, WORLD_REQUEST_CLEAR };
