@@ -70,6 +70,7 @@ COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *i
         .torque_q24 = motion->torque_reference_q24,
         .flux_step_max_q29 = input->period_flux_q29,
         .period = input->periods,
+        .lost = input->late_interrupts != phases->late_interrupts,
     };
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         const phase_monitor_phase_t *state = &phases->phase[phase];

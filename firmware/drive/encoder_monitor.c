@@ -357,6 +357,12 @@ static void note_reversal(encoder_monitor_t *monitor, int32_t turned, bool clear
 static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                         const encoder_monitor_input_t *input) {
     const uint32_t periods = input->period - monitor->window_period;
+    if (input->lost) { /* the window was longer than its periods */
+        monitor->window_period = input->period;
+        monitor->window_angle = input->encoder_angle;
+        monitor->turned = false;
+        return;
+    }
     if (periods < parameters->rate_hz >> WINDOW_SHIFT) {
         return;
     }

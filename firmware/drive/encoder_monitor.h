@@ -62,6 +62,7 @@ typedef struct {
     int32_t flux_q29[HAL_PHASES_MAX]; /* by the applied voltage since the phase was last without current, Wb, Q2.29 */
     uint32_t zero_at[HAL_PHASES_MAX]; /* period in which it was */
     bool known[HAL_PHASES_MAX];       /* no trigger was lost since */
+    bool lost;                        /* triggers were lost since the previous input */
 } encoder_monitor_input_t;
 
 /* Of a phase. */

@@ -212,6 +212,21 @@ TEST_F(EncoderMonitor,
     }
 }
 
+TEST_F(EncoderMonitor,
+       a_rotor_that_turns_by_more_than_half_a_turn_while_triggers_are_lost_is_no_encoder_that_turns_round) {
+    for (const bool lost : {true, false}) {
+        monitor = {};
+        double angle_deg = 0.0; // 300 r/min
+        for (int k = 0; k < 20 * RATE_HZ / 1000; k++) {
+            const bool gap = k == 10 * RATE_HZ / 1000;
+            angle_deg += 1800.0 / RATE_HZ + (gap ? 270.0 : 0.0);
+            input.lost = gap && lost;
+            step(angle_deg, angle_deg, 0.0);
+        }
+        EXPECT_EQ(encoder_monitor_suspects(&parameters, &monitor, 7), !lost);
+    }
+}
+
 TEST_F(EncoderMonitor, the_first_direction_of_the_encoder_after_a_reset_is_no_turn_round) {
     monitor = {};
     input.period = 0;
