@@ -52,6 +52,9 @@ static bool sto_demanded(const oracle_t *oracle, uint64_t time_us) {
     return false;
 }
 
+/* Numbers of the rule `cleared`, besides those of the states initialise and fault: the cause was there a moment ago. */
+enum { CLEARED_BEFORE = 4, CLEARED_UNCOUNTED, CLEARED_LINES };
+
 /* --- Never --- */
 
 static void look_at_currents(oracle_t *oracle, const plant_t *plant, unsigned gates) {
@@ -273,16 +276,17 @@ static bool sto_discrepancy_remains(const oracle_t *oracle, uint64_t now_us) {
  */
 static void look_at_end_of_fault(oracle_t *oracle, uint64_t now_ns, uint8_t before) {
     if (before == STATE_FAULT && sto_discrepancy_remains(oracle, now_ns / 1000) && !oracle_state_changed(oracle)) {
-        oracle_violate(oracle, "cleared", now_ns, CAUSE_STO_DISCREPANCY, 0.0);
+        oracle_violate(oracle, "cleared", now_ns, CLEARED_LINES, 0.0);
     }
     if (before == STATE_FAULT && oracle->causes > 0 && oracle->causes < ORACLE_CAUSES_MAX &&
         oracle->cause[oracle->causes - 1] == CAUSE_ENCODER && !oracle->counted &&
         oracle->reset_ns < oracle->latched_ns && !oracle_state_changed(oracle)) {
-        oracle_violate(oracle, "cleared", now_ns, CAUSE_ENCODER, 0.0);
+        oracle_violate(oracle, "cleared", now_ns, CLEARED_UNCOUNTED, 0.0);
     }
     if (before == STATE_FAULT && oracle->clear_ns != 0 && oracle->clear_ns + 5 * ORACLE_MS_NS < oracle->latched_ns &&
         oracle->reset_ns < oracle->latched_ns && !oracle_state_changed(oracle) && !may_be_deaf(oracle, now_ns / 1000)) {
-        oracle_violate(oracle, "cleared", now_ns, 0, (double)(oracle->latched_ns - oracle->clear_ns) * 1e-6);
+        oracle_violate(oracle, "cleared", now_ns, CLEARED_BEFORE,
+                       (double)(oracle->latched_ns - oracle->clear_ns) * 1e-6);
     }
     const uint64_t gone_ns = before == STATE_FAULT ? 8 * ORACLE_MS_NS : ORACLE_MS_NS / 2;
     if (oracle->cause_ns && now_ns < oracle->cause_ns + gone_ns && !oracle_state_changed(oracle) &&
