@@ -284,7 +284,8 @@ static void look_at_end_of_fault(oracle_t *oracle, uint64_t now_ns, uint8_t befo
         oracle_violate(oracle, "cleared", now_ns, CLEARED_UNCOUNTED, 0.0);
     }
     if (before == STATE_FAULT && oracle->clear_ns != 0 && oracle->clear_ns + 5 * ORACLE_MS_NS < oracle->latched_ns &&
-        oracle->reset_ns < oracle->latched_ns && !oracle_state_changed(oracle) && !may_be_deaf(oracle, now_ns / 1000)) {
+        oracle->reset_ns < oracle->latched_ns && !oracle_state_changed(oracle) && !may_be_deaf(oracle, now_ns / 1000) &&
+        !impersonated(oracle)) {
         oracle_violate(oracle, "cleared", now_ns, CLEARED_BEFORE,
                        (double)(oracle->latched_ns - oracle->clear_ns) * 1e-6);
     }
