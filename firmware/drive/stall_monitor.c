@@ -4,9 +4,9 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
-/* Strokes of the reference after which a rotor has to have made one, times the strokes of a revolution: 3 * 2 pi rad,
- * in us and 2^-22 rad/s, without the unit of speed. */
-#define THREE_REVOLUTIONS UINT64_C(79060767799934)
+/* Speed of three strokes in STALL_SWING_US, in 2^-22 rad/s, times the strokes of a revolution, without the unit of
+ * speed: 3 * 2 pi rad / 0.25 s. */
+#define THREE_STROKES_Q22 UINT32_C(316243071)
 
 #define ONE_REV_Q24 (1 << 24)
 
@@ -22,27 +22,30 @@ static bool pushes_in_vain(const stall_input_t *input, bool swings) {
 /* Widens the range of the angles that the rotor has been at, of the last revolution, by at least half a stroke. */
 static bool widens_range(stall_monitor_t *monitor) {
     const int32_t half_stroke_q24 = ONE_REV_Q24 / 2 / machine_tables.phases;
-    if (monitor->ahead_q24 > half_stroke_q24) {
-        monitor->lowest_ahead_q24 = fixed_clamp(monitor->lowest_ahead_q24 - monitor->ahead_q24, -ONE_REV_Q24, 0);
-        monitor->ahead_q24 = 0;
-        return true;
+    int32_t ahead_q24 = monitor->ahead_q24, lowest_q24 = monitor->lowest_ahead_q24;
+    if (ahead_q24 > half_stroke_q24) {
+        lowest_q24 -= ahead_q24;
+        ahead_q24 = 0;
+    } else if (ahead_q24 < lowest_q24 - half_stroke_q24) {
+        ahead_q24 = ahead_q24 < -ONE_REV_Q24 ? -ONE_REV_Q24 : ahead_q24;
+        lowest_q24 = ahead_q24;
+    } else {
+        return false;
     }
-    if (monitor->ahead_q24 < monitor->lowest_ahead_q24 - half_stroke_q24) {
-        monitor->ahead_q24 = monitor->lowest_ahead_q24 = fixed_clamp(monitor->ahead_q24, -ONE_REV_Q24, 0);
-        return true;
-    }
-    return false;
+    monitor->ahead_q24 = ahead_q24;
+    monitor->lowest_ahead_q24 = lowest_q24 < -ONE_REV_Q24 ? -ONE_REV_Q24 : lowest_q24;
+    return true;
 }
 
-/* The rotor has come no further in either direction while the reference has turned by three strokes, of which it makes
- * at most those of STALL_SWING_US in this time, however fast it is. Products below 2^62. */
+/* The rotor has come no further in either direction while the reference has turned by three strokes, which takes it
+ * STALL_SWING_US at least, however fast it is. */
 static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *input, bool begins, uint32_t time_us) {
-    const uint64_t limit = THREE_REVOLUTIONS >> machine_tables.speed_exponent;
     const uint32_t strokes = (uint32_t)machine_tables.rotor_poles * machine_tables.phases;
-    const uint64_t asked = (uint64_t)fixed_magnitude(input->speed_reference_q22) * strokes;
-    const uint64_t fastest = limit / STALL_SWING_US;
+    const uint32_t fastest_q22 = (THREE_STROKES_Q22 >> machine_tables.speed_exponent) / strokes;
+    const uint32_t reference_q22 = fixed_magnitude(input->speed_reference_q22);
     monitor->ahead_q24 += (int32_t)(input->electrical - monitor->electrical) / 256;
-    monitor->travel += (asked < fastest ? asked : fastest) * (time_us - monitor->looked_us);
+    monitor->travel += (uint64_t)(reference_q22 < fastest_q22 ? reference_q22 : fastest_q22) *
+                       (time_us - monitor->looked_us); /* below 2^59 */
     monitor->electrical = input->electrical;
     monitor->looked_us = time_us;
     if (begins) {
@@ -51,7 +54,7 @@ static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *inp
     if (widens_range(monitor) || begins) {
         monitor->travel = 0;
     }
-    return monitor->travel > limit;
+    return monitor->travel > (uint64_t)fastest_q22 * STALL_SWING_US;
 }
 
 COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us) {
