@@ -124,10 +124,10 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     const uint64_t age_ns = now_ns > oracle->run_ns ? now_ns - oracle->run_ns : 0;
     if (!oracle->commanded || age_ns > request_max_ns(oracle, RUN_MAX_NS)) {
         oracle_violate(oracle, "no_command", now_ns, 3, (double)age_ns * 1e-6);
-    } else if (age_ns < 40 * ORACLE_MS_NS) {
+    } else if (age_ns < 55 * ORACLE_MS_NS) {
         const double before_Nm = age_ns < 10 * ORACLE_MS_NS ? 0.0 : oracle->silence_torque_Nm;
         oracle->silence_torque_Nm = fmax(fabs(plant_torque_Nm(plant)), before_Nm);
-    } else if (age_ns > request_max_ns(oracle, 60 * ORACLE_MS_NS) && !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) &&
+    } else if (age_ns > request_max_ns(oracle, 65 * ORACLE_MS_NS) && !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) &&
                !oracle_bus_disturbed(oracle) &&
                fabs(plant_torque_Nm(plant)) >
                    1.5 * oracle->silence_torque_Nm + 0.2 * oracle->world->machine->torque_max_Nm) {

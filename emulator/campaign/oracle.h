@@ -10,7 +10,7 @@
  *                   2.5 periods after the last control interrupt
  *   no_command      a gate on without a confirmed arming since the last fault, or 5 ms after a genuine off; a gate on,
  *                   or the state run, 502 ms after the last genuine request to run; torque 170 ms after it, or
- *                   from 60 ms on a larger one than before, by half and a fifth of the largest; both later
+ *                   from 65 ms on a larger one than before, by half and a fifth of the largest; both later
  *                   by the 18 ms for which the request waits when the background hangs and the watchdog does not reset
  *                   the drive; a fault that ends without a genuine request to clear it
  *   stopped         state run left, without a fault, less than 30 ms after a genuine request to run; or after one to
@@ -168,7 +168,7 @@ typedef struct {
     uint64_t clear_ns, latched_ns;   /* a request to clear began, the last fault */
     uint32_t latched_angle;          /* measured then */
     bool counted;                    /* it has changed since */
-    double silence_torque_Nm;        /* largest torque before the client has been silent for 40 ms */
+    double silence_torque_Nm;        /* largest torque before the client has been silent for 55 ms */
     sender_meaning_t meant;          /* by the last genuine motion command */
     uint64_t withdrawn_ns, reset_ns; /* last genuine request other than run, last reset */
     uint64_t cause_ns;               /* last time at which the plant had a reason to keep the drive in a fault */

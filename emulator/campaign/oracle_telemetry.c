@@ -75,8 +75,10 @@ static void judge(oracle_t *oracle, bool holds, uint64_t time_ns, unsigned numbe
     }
 }
 
+/* A shaft that is stopped at once stands before the drive observes it. */
 static bool observes_speed(const oracle_t *oracle) {
     return !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
+           !oracle_any_injected(oracle, FAULT_SHAFT_LOCKED, FAULT_LOAD_DROPPED) &&
            !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT);
 }
 
@@ -91,10 +93,7 @@ static void judge_snapshot(oracle_t *oracle, uint64_t time_ns, const uint8_t dat
     const double true_rpm = telemetry->fault_speed_rad_s * ORACLE_RPM_PER_RAD_S;
     const double rpm = signed_16(data) * 250.0 * machine->command_lsb_rpm;
     const double error_rpm = 2.0 * (SPEED_ERROR_MAX * fabs(true_rpm) + SPEED_ERROR_MAX_BASE * machine->speed_base_rpm);
-    /* A shaft that is stopped at once stands before the drive observes it. */
-    const bool stopped = oracle_any_injected(oracle, FAULT_SHAFT_LOCKED, FAULT_LOAD_DROPPED);
-    judge(oracle, stopped || !observes_speed(oracle) || !telemetry->ran || fabs(rpm - true_rpm) <= error_rpm, time_ns,
-          16, rpm);
+    judge(oracle, !observes_speed(oracle) || !telemetry->ran || fabs(rpm - true_rpm) <= error_rpm, time_ns, 16, rpm);
     const double link = unsigned_16(data + 2) * machine->voltage_lsb_V / ranges->dc_link_V;
     judge(oracle, fabs(link - telemetry->fault_link_voltage) <= ERROR_MAX, time_ns, 17, link);
     const double current = unsigned_16(data + 4) * machine->current_lsb_A / ranges->current_A;
@@ -108,7 +107,8 @@ static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data
     const double room = fmin(fmin((100.0 - load_percent) / 10.0, (WINDING_LIMIT_C - data[6]) / 20.0),
                              (INVERTER_LIMIT_C - data[7]) / 20.0);
     const double limit_Nm = signed_16(data + 4) * 256.0 * oracle->world->machine->command_lsb_Nm;
-    if (limit_Nm > most_Nm * (fmin(fmax(room, 0.0), 1.0) + DERATING_ERROR_MAX) && observes_speed(oracle)) {
+    if (limit_Nm > most_Nm * (fmin(fmax(room, 0.0), 1.0) + DERATING_ERROR_MAX) &&
+        !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
         oracle_violate(oracle, "not_derated", time_ns, 0, limit_Nm / most_Nm);
     }
 }
