@@ -595,6 +595,22 @@ TEST_F(SalientControl, the_angle_after_an_edge_is_extrapolated_at_the_observed_s
     }
 }
 
+TEST_F(SalientControl, a_rotor_that_turns_at_the_start_is_no_load_although_its_counts_are_coarse) {
+    constexpr unsigned BITS = 10; // 0.94 counts a millisecond
+    parameters = configured(DRIVE_CONTROLLER_SALIENT, uint32_t(RATE_HZ), BITS);
+    speed_rad_s = fixed_point::rad_s(55.0);
+    turns = 102.8 / (1 << BITS); // the first count comes after 0.2 ms
+    for (int k = 0; k < RATE_HZ / 100; k++) {
+        sample.time_us += PERIOD_US;
+        turns += speed_rad_s / (2.0 * fixed_point::PI * RATE_HZ);
+        sample.encoder.counts = uint32_t(std::floor((turns - std::floor(turns)) * (1 << BITS)));
+        step_as_sampled();
+        ASSERT_LT(fixed_abs(state.observer.load_torque_q24), 12 << 24) << k;
+    }
+    EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_NEAR(state.observer.speed_q22 / 4194304.0, speed_rad_s, 0.5 * speed_rad_s);
+}
+
 TEST_F(SalientControl, without_edges_the_angle_is_the_middle_of_the_count_and_long_after_one_the_prediction_within_it) {
     speed_rad_s = 15.0;
     for (int k = 0; k < 400; k++) {
