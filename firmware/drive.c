@@ -151,7 +151,7 @@ void drive_deferred_interrupt(drive_t *drive) {
     if (!deferred_pending(&control->deferred_request, &control->deferred.response)) {
         return;
     }
-    deferred_compute(&drive->control_parameters, control);
+    deferred_compute(&drive->control_parameters, control, &drive->command);
     drive->deferred_used_ticks = deferred_elapsed_ticks(drive);
     if (drive->deferred_used_ticks > drive->deferred_worst_ticks) {
         drive->deferred_worst_ticks = drive->deferred_used_ticks;

@@ -72,7 +72,6 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->command_age_us = sample->time_us - command->time_us;
     input->speed_q22 = state->observer.speed_q22;
     input->run = run;
-    input->command = command;
     input->torque_reference_q24 = state->torque_reference_q24;
     if (parameters->bandwidth.adaptive) {
         hand_over_bandwidth(state, measured, input);
@@ -337,7 +336,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
     }
 }
 
-void deferred_compute(const control_parameters_t *parameters, control_state_t *state) {
+void deferred_compute(const control_parameters_t *parameters, control_state_t *state, const command_t *command) {
     const deferred_input_t *input = &state->deferred_request.input;
     deferred_t *deferred = &state->deferred;
     deferred_results_t *results = deferred_buffer(&deferred->response);
@@ -348,7 +347,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     results->generation = input->generation;
     results->fault_mask = (uint32_t)protect(parameters, deferred, input) | state->reported_fault_mask;
-    speed_control_deferred(parameters, deferred, input, state->torque_limit_q24, results);
+    speed_control_deferred(parameters, deferred, input, command, state->torque_limit_q24, results);
     if (parameters->bandwidth.adaptive) {
         follow_innovation(parameters, deferred, input, results);
     }
@@ -368,12 +367,12 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
 }
 
-bool deferred_step(const control_parameters_t *parameters, control_state_t *state) {
+bool deferred_step(const control_parameters_t *parameters, control_state_t *state, const command_t *command) {
     const deferred_request_t *request = &state->deferred_request;
     if (!deferred_pending(request, &state->deferred.response)) {
         return false;
     }
-    deferred_compute(parameters, state);
+    deferred_compute(parameters, state, command);
     deferred_complete(request, &state->deferred.response);
     return true;
 }
