@@ -17,6 +17,7 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
 }
 
 void control_prepare(const control_parameters_t *parameters, control_state_t *state) {
+    bp_pid_clear_telemetry(&state->duty.pid); /* of a law that the parameters have changed */
     torque_control_reset(parameters, state);
     deferred_reset_run(state);
 }

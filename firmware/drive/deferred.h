@@ -4,6 +4,7 @@
  *   bandwidth    statistics of the innovation -> limits of the observer's trigger           observer_bandwidth.h
  *   moving load  trend of the innovation -> least bandwidth                                 moving_load.h
  *   speed law    speed error -> torque, without feed-forward                               speed_pi.h, speed_smc.h
+ *   limit        speed -> limit of the currents of hysteresis control                      ditc_hysteresis.h
  *   torque mode  commanded torque -> torque                                                torque_mode.h
  *   conduction   torque, its shortfall, speed, voltage -> angles, largest torque            conduction.h
  *   offset       mean torque error -> torque reference                                     torque_offset.h

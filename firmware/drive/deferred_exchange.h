@@ -19,6 +19,7 @@
 #include <stdint.h>
 
 #include "control/conduction.h"
+#include "control/ditc_hysteresis.h"
 #include "control/load_observer.h"
 #include "control/observer_bandwidth.h"
 #include "control/slow_counts.h"
@@ -72,6 +73,7 @@ typedef struct {
     deferred_predictive_results_t predictive;
     load_observer_inertia_t observer;  /* identified, inertia.h */
     slow_counts_results_t slow_counts; /* with an adaptive bandwidth only */
+    ditc_hysteresis_limit_t limit;     /* without predictive torque control only */
 } deferred_results_t;
 
 typedef struct {
