@@ -122,7 +122,9 @@ void drive_control_interrupt(drive_t *drive) {
         if (sample.break_causes != 0) {
             hal_pwm_clear_break(drive->hal);
         }
-        fault_trace_stand(&drive->trace, &values, drive->control.state_machine.state);
+        if (!fault_trace_kept(&drive->trace)) {
+            fault_trace_stand(&drive->trace, &values, drive->control.state_machine.state);
+        }
     }
     if (drive->control.deferred_request.skipped == 0) {
         hal_interrupt_request_deferred(drive->hal);
@@ -151,7 +153,7 @@ void drive_deferred_interrupt(drive_t *drive) {
     if (!deferred_pending(&control->deferred_request, &control->deferred.response)) {
         return;
     }
-    deferred_compute(&drive->control_parameters, control);
+    deferred_compute(&drive->control_parameters, control, &drive->command);
     drive->deferred_used_ticks = deferred_elapsed_ticks(drive);
     if (drive->deferred_used_ticks > drive->deferred_worst_ticks) {
         drive->deferred_worst_ticks = drive->deferred_used_ticks;

@@ -33,25 +33,28 @@ static inline int32_t applied_flux_shortest_pulse_q29(int32_t period_flux_q29, u
     return fixed_multiply(period_flux_q29, (int32_t)part_q14, 14);
 }
 
-/* One period, which begins with the sample. duty_q15: acts in this period, -32768..32768; current_q9: A, Q7.9, below
- * 2^16; period_flux_q29: Vdc Ts, below 2^27; resistance_period_q40: R Ts, ohm s, Q-9.40. Both products are rounded to 1
- * LSB, the sum saturates. */
-ALWAYS_INLINE void applied_flux_step(applied_flux_t *flux, unsigned phases, const int32_t *duty_q15,
-                                     const int32_t *current_q9, int32_t period_flux_q29,
-                                     int32_t resistance_period_q40) {
-    const int32_t full_q32 = period_flux_q29 * 8;
-    const int32_t against_q40 = -resistance_period_q40;
-    /* The compiler needs to see the bound where it unrolls the loop without knowing the tables. */
-    const unsigned count = phases < HAL_PHASES_MAX ? phases : HAL_PHASES_MAX;
-    UNROLL(4)
-    for (unsigned phase = 0; phase < count; phase++) {
-        const int32_t now_q29 = flux->next_q29[phase];
-        const int32_t gained_q29 = fixed_multiply_high(duty_q15[phase] * (1 << 14), full_q32); /* Q15 Q29 to Q29 */
-        const int32_t change_q29 = fixed_multiply_high_add(gained_q29, current_q9[phase] << 12, against_q40);
-        const int32_t then_q29 = fixed_add(now_q29, change_q29);
-        flux->at_sample_q29[phase] = now_q29;
-        flux->next_q29[phase] = fixed_non_negative(then_q29);
-    }
+/* Constants of a period for all phases. */
+typedef struct {
+    int32_t full_q32;    /* Vdc Ts, Wb */
+    int32_t against_q40; /* -R Ts, ohm s */
+} applied_flux_period_t;
+
+/* dc_link_voltage_q6, period_q40: as above; the product below 2^27. resistance_period_q40: R Ts, ohm s, Q-9.40. */
+ALWAYS_INLINE applied_flux_period_t applied_flux_period(int32_t dc_link_voltage_q6, int32_t period_q40,
+                                                        int32_t resistance_period_q40) {
+    return (applied_flux_period_t){applied_flux_period_q29(dc_link_voltage_q6, period_q40) * 8, -resistance_period_q40};
+}
+
+/* One period of a phase, which begins with the sample. duty_q15: acts in this period, -32768..32768; current_q9: A,
+ * Q7.9, below 2^16. Both products are rounded to 1 LSB, the sum saturates. */
+ALWAYS_INLINE void applied_flux_step(applied_flux_t *flux, const applied_flux_period_t *period, unsigned phase,
+                                     int32_t duty_q15, int32_t current_q9) {
+    const int32_t now_q29 = flux->next_q29[phase];
+    const int32_t gained_q29 = fixed_multiply_high(duty_q15 * (1 << 14), period->full_q32); /* Q15 Q29 to Q29 */
+    const int32_t change_q29 = fixed_multiply_high_add(gained_q29, current_q9 << 12, period->against_q40);
+    const int32_t then_q29 = fixed_add(now_q29, change_q29);
+    flux->at_sample_q29[phase] = now_q29;
+    flux->next_q29[phase] = fixed_non_negative(then_q29);
 }
 
 #endif

@@ -24,12 +24,10 @@ commutation_parameters_t commutation_configure(const commutation_angles_t *angle
     };
 }
 
-void commutation_find(const commutation_parameters_t *parameters, uint32_t rotor_angle, commutation_t *commutation) {
-    const uint32_t electrical = commutation_electrical(parameters, rotor_angle);
-    commutation->electrical = electrical;
+void commutation_find(const commutation_parameters_t *parameters, commutation_t *commutation) {
     /* Complete strokes since turn-on of phase 0: the phase turned on last, and its angle past turn-on. A number of
      * phases that has changed in memory is no index beyond the phases. */
-    const uint32_t since_phase_0_on = electrical - parameters->turn_on;
+    const uint32_t since_phase_0_on = commutation->electrical - parameters->turn_on;
     const unsigned newest = (unsigned)(((uint64_t)since_phase_0_on * parameters->phases) >> 32) % HAL_PHASES_MAX;
     const uint32_t since_on = since_phase_0_on - newest * parameters->stroke;
     unsigned active = COMMUTATION_NONE;

@@ -49,8 +49,8 @@ uint32_t commutation_stroke(unsigned phases);
 commutation_parameters_t commutation_configure(const commutation_angles_t *angles, unsigned phases,
                                                unsigned rotor_poles);
 
-/* Roles of the phases for a rotor angle in 2^-32 mechanical rev. */
-void commutation_find(const commutation_parameters_t *parameters, uint32_t rotor_angle, commutation_t *commutation);
+/* Roles of the phases at the angle `electrical` of phase 0. */
+void commutation_find(const commutation_parameters_t *parameters, commutation_t *commutation);
 
 /* Angle of phase 0, 2^-32 electrical rev, for a rotor angle in 2^-32 mechanical rev; wraps. */
 static inline uint32_t commutation_electrical(const commutation_parameters_t *parameters, uint32_t rotor_angle) {

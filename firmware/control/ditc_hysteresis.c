@@ -38,31 +38,25 @@ static int32_t outgoing_state(const ditc_hysteresis_parameters_t *parameters, in
     return (state ^ error_q24) < 0 || error_q24 == 0 ? 0 : state; /* 0: the error has returned through zero */
 }
 
-typedef struct {
-    int32_t current_q9; /* A, Q7.9 */
-    int32_t state;      /* highest one above it */
-} limit_t;
-
 /* While the rotor turns backwards, the back-EMF drives the current of a freewheeling phase further up. */
-static limit_t limit_of(const ditc_hysteresis_parameters_t *parameters, int32_t backwards_q22) {
+ditc_hysteresis_limit_t ditc_hysteresis_limit(const ditc_hysteresis_parameters_t *parameters, int32_t backwards_q22) {
     const int32_t limit_q9 = parameters->current_limit_q9;
     if (backwards_q22 == 0) {
-        return (limit_t){limit_q9, 0};
+        return (ditc_hysteresis_limit_t){limit_q9, 0};
     }
     const int32_t slow_q9 = limit_q9 - (limit_q9 >> 2);
     const int32_t fast_q9 =
         parameters->generating_limit_q9 - fixed_multiply_high(backwards_q22, parameters->generating_slope_q19);
-    return (limit_t){slow_q9 < fast_q9 ? slow_q9 : fast_q9, OFF};
+    return (ditc_hysteresis_limit_t){slow_q9 < fast_q9 ? slow_q9 : fast_q9, OFF};
 }
 
-static int32_t limit_current(limit_t limit, int32_t state, int32_t current_q9) {
+static int32_t limit_current(ditc_hysteresis_limit_t limit, int32_t state, int32_t current_q9) {
     return state > limit.state && current_q9 > limit.current_q9 ? limit.state : state;
 }
 
 void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, const commutation_t *commutation,
-                          int32_t torque_error_q24, const int32_t *current_q9, int32_t backwards_q22,
+                          int32_t torque_error_q24, const int32_t *current_q9, ditc_hysteresis_limit_t limit,
                           int32_t duty_q15[HAL_PHASES_MAX]) {
-    const limit_t limit = limit_of(parameters, backwards_q22);
     const unsigned active = commutation->active;
     const unsigned outgoing = commutation->outgoing;
     int32_t outgoing_next = OFF;

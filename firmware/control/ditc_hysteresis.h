@@ -38,14 +38,22 @@ typedef struct {
     int32_t generating_slope_q19;
 } ditc_hysteresis_parameters_t;
 
+/* Limit of the currents in effect. */
+typedef struct {
+    int32_t current_q9; /* A, Q7.9 */
+    int32_t state;      /* highest state above it, a duty in Q1.15 */
+} ditc_hysteresis_limit_t;
+
+/* Limit at a speed against the order of the phases, rad/s, Q9.22, from 0. */
+ditc_hysteresis_limit_t ditc_hysteresis_limit(const ditc_hysteresis_parameters_t *parameters, int32_t backwards_q22);
+
 /* All phases -1. */
 void ditc_hysteresis_reset(int32_t duty_q15[HAL_PHASES_MAX]);
 
 /* One sample: new states from the last ones, the torque error (N m, Q7.24, any value) and the phase currents (A, Q7.9).
- * States are duties in Q1.15: -32768, 0, 32768. backwards_q22: speed against the order of the phases, rad/s, Q9.22,
- * from 0. */
+ * States are duties in Q1.15: -32768, 0, 32768. */
 void ditc_hysteresis_step(const ditc_hysteresis_parameters_t *parameters, const commutation_t *commutation,
-                          int32_t torque_error_q24, const int32_t *current_q9, int32_t backwards_q22,
+                          int32_t torque_error_q24, const int32_t *current_q9, ditc_hysteresis_limit_t limit,
                           int32_t duty_q15[HAL_PHASES_MAX]);
 
 #endif

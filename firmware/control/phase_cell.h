@@ -47,8 +47,8 @@ typedef struct {
     phase_cell_curve_t flux;   /* over u */
     int32_t curvature;         /* c of the torque over v */
     int32_t column;
-    bool located;  /* the cell is known */
-    bool positive; /* the phase is in the half of positive torque */
+    bool located; /* the cell is known */
+    int8_t sign;  /* of the torque: 1 in the half of positive torque, -1 in the other one */
 } phase_cell_t;
 
 /* Dividend and divisor of quotients in Q2.13 by a rise. The dividend, y - middle or a curvature, is saturated to 2^25

@@ -132,6 +132,7 @@ NOINLINE static void replan_torque(const machine_tables_t *tables, plan_t *p, in
 static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *plan, bool positive, bool reverse,
                                      int32_t current_limit_q9, int32_t shortfall) {
     const bool increase = (shortfall > 0) == positive;
+    const int8_t sign = positive ? 1 : -1;
     const int32_t limit = increase ? 1 : -1;
     /* In forward rotation a phase enters the positive half at turn-on, the other half at turn-off. The order of entry
      * is that of since_on or the reverse; phases before turn-on stay last. */
@@ -144,7 +145,7 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
         const uint32_t order = p->since_on ^ reversal;
-        if (p->cell->positive != positive) {
+        if (p->cell->sign != sign) {
             opposed = p->limit >= 0 && p->torque > 0 ? p : opposed;
         } else if (order < first && p->limit != limit) {
             first = order;
@@ -158,7 +159,7 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
         corrected = opposed;
     }
     const int32_t before = corrected->torque;
-    const bool adds = corrected->cell->positive;
+    const bool adds = corrected->cell->sign > 0;
     replan_torque(tables, corrected, adds ? fixed_add(before, shortfall) : fixed_subtract(before, shortfall),
                   current_limit_q9);
     const int32_t gained = corrected->torque - before;
@@ -271,7 +272,7 @@ static inline void extrapolate_column(predictive_torque_t *control, unsigned pha
 
 /* Takes a phase out of the plan, and of the phases to correct; returns the shortfall with its torque. */
 static inline int32_t drop_plan(plan_t *p, int32_t shortfall) {
-    const int32_t torque = p->cell->positive ? p->torque : -p->torque;
+    const int32_t torque = p->cell->sign * p->torque;
     p->cell->located = false;
     p->v_q13 = 0;
     p->flux = 0;
@@ -318,12 +319,12 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         p->angle = positive ? angle : ~angle; /* mirrored, to 1 LSB */
         p->column = control->column[phase];
         p->cell = &cells[phase];
-        p->cell->positive = positive;
+        p->cell->sign = (int8_t)(2 * (int)positive - 1);
         const bool outgoing = positive == sample->reverse;
         const conduction_half_t *half = &sample->conduction->half[outgoing];
         IN_REGISTER(half);
         reached &= plan_phase(parameters, tables, &period, half, torque[positive], outgoing, p);
-        shortfall = positive ? fixed_subtract(shortfall, p->torque) : fixed_add(shortfall, p->torque);
+        shortfall = fixed_subtract(shortfall, p->cell->sign * p->torque);
     }
 
     if (!LIKELY(sample->lost_phase == 0)) {

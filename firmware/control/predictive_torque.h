@@ -100,8 +100,7 @@ ALWAYS_INLINE int32_t predictive_torque_estimate(const phase_cell_t *cell, int32
     }
     const int32_t u_q13 = phase_cell_u_q13(cell, current_q9);
     *flux = phase_cell_curve_at(&cell->flux, u_q13);
-    const int32_t torque = phase_cell_curve_at(&cell->torque, u_q13);
-    return cell->positive ? torque : -torque;
+    return cell->sign * phase_cell_curve_at(&cell->torque, u_q13);
 }
 
 /* One sample: duty of each phase, Q1.15, -32768..32767. All sums saturate; 32-bit products are rounded to nearest, the

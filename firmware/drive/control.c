@@ -1,6 +1,5 @@
 #include "drive/control.h"
 
-#include "control/applied_flux.h"
 #include "control/modulator.h"
 #include "drive/deferred.h"
 #include "drive/measure.h"
@@ -18,6 +17,7 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
 }
 
 void control_prepare(const control_parameters_t *parameters, control_state_t *state) {
+    bp_pid_clear_telemetry(&state->duty.pid); /* of a law that the parameters have changed */
     torque_control_reset(parameters, state);
     deferred_reset_run(state);
 }
@@ -42,26 +42,16 @@ static uint64_t protect(const control_parameters_t *parameters, control_state_t 
     return protection_check(&parameters->protection, &state->protection, &input);
 }
 
-/* For the background's monitor of the phases, with the duties of the period that now begins. One in which the run ends
- * counts as a period of the run. */
-static inline void integrate_voltage(const control_parameters_t *parameters, control_state_t *state,
-                                     const control_measurement_t *measured) {
-    const predictive_torque_parameters_t *constants = &parameters->predictive;
-    applied_flux_step(&state->applied_flux, machine_tables.phases, state->duty_q15, measured->current_q9,
-                      applied_flux_period_q29(measured->dc_link_voltage_q6, constants->period_q40),
-                      constants->flux.resistance_period_q40);
-}
-
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare) {
     control_measurement_t *measured = &state->measurement;
     const deferred_results_t *deferred = deferred_in_effect(state);
-    measure(parameters, &state->observer, deferred, &state->predictive, sample, measured);
-    integrate_voltage(parameters, state, measured);
+    measure(parameters, state, deferred, sample);
     if (!state->started) {
         start(state, measured);
     }
     const uint64_t fault_mask = protect(parameters, state, sample, measured) | deferred->fault_mask;
+    measure_torque(parameters, &state->predictive, deferred->predictive.misalignment, fault_mask != 0, measured);
     observe(parameters, state, deferred, measured);
     const bool run = supervise(parameters, state, sample, command, measured, fault_mask);
     if (run) {

@@ -1,8 +1,9 @@
 /* The control interrupt as one function of parameters, state, sample and command: unit tests, the host port and the
  * interrupt handler of a target call the same function. control_step in control.c lists its steps:
  *
- *   measure         counts -> currents, DC-link voltage, rotor angle, phase torques, flux linkages    measure.h
+ *   measure         counts -> currents, DC-link voltage, rotor angle                                  measure.h
  *   protect         fault mask of the failed checks                                                   protection.h
+ *   measure torque  currents -> phase torques, flux linkages                                          measure.h
  *   observe         rotor angle, speed and load torque                                                observe.h
  *   supervise       drive state, fault record; every switch is open outside RUN                       supervise.h
  *   speed control   speed reference -> torque reference                                               speed_control.h

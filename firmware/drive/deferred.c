@@ -1,6 +1,7 @@
 #include "drive/deferred.h"
 
 #include "drive/speed_control.h"
+#include "drive/torque_control.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
@@ -21,6 +22,7 @@ void deferred_reset_run(control_state_t *state) {
     request->initial.slow_counts.slow = false; /* until the next step, a period later */
     request->initial.predictive = kept->predictive;
     request->initial.observer = kept->observer;
+    request->initial.limit = kept->limit;
     request->initial.predictive.conduction = CONDUCTION_INITIAL;
     request->initial.speed = (deferred_speed_results_t){0, 0, 0, 0, 0};
     request->generation = (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK);
@@ -33,6 +35,7 @@ void deferred_reset_observer(control_state_t *state) {
     request->initial.speed = kept->speed;
     request->initial.predictive = kept->predictive;
     request->initial.observer = kept->observer;
+    request->initial.limit = kept->limit;
     request->initial.bandwidth = (observer_bandwidth_limits_t){0, 0, 0, 0};
     request->initial.slow_counts.slow = false;
     request->generation += OBSERVER_STEP;
@@ -72,7 +75,6 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->command_age_us = sample->time_us - command->time_us;
     input->speed_q22 = state->observer.speed_q22;
     input->run = run;
-    input->command = command;
     input->torque_reference_q24 = state->torque_reference_q24;
     if (parameters->bandwidth.adaptive) {
         hand_over_bandwidth(state, measured, input);
@@ -297,6 +299,15 @@ NOINLINE static void await_slow_counts(const control_parameters_t *parameters, d
     }
 }
 
+/* Limit of hysteresis control. A step that resets has done enough: the buffer then has the limit of the last but one.
+ */
+static void limit_currents(const control_parameters_t *parameters, const deferred_input_t *input, bool reset,
+                           deferred_results_t *results) {
+    if (!reset) {
+        results->limit = torque_control_limit(parameters, input->speed_q22);
+    }
+}
+
 /* What is not urgent, in eight turns: no step takes the time of all. The learning of the phases has half of them,
  * because at a high bandwidth of the observer it follows within a millisecond. */
 NOINLINE static void take_turns(const control_parameters_t *parameters, deferred_t *deferred,
@@ -337,7 +348,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
     }
 }
 
-void deferred_compute(const control_parameters_t *parameters, control_state_t *state) {
+void deferred_compute(const control_parameters_t *parameters, control_state_t *state, const command_t *command) {
     const deferred_input_t *input = &state->deferred_request.input;
     deferred_t *deferred = &state->deferred;
     deferred_results_t *results = deferred_buffer(&deferred->response);
@@ -348,7 +359,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     results->generation = input->generation;
     results->fault_mask = (uint32_t)protect(parameters, deferred, input) | state->reported_fault_mask;
-    speed_control_deferred(parameters, deferred, input, state->torque_limit_q24, results);
+    speed_control_deferred(parameters, deferred, input, command, state->torque_limit_q24, results);
     if (parameters->bandwidth.adaptive) {
         follow_innovation(parameters, deferred, input, results);
     }
@@ -356,8 +367,10 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     if (!input->run) {
         inertia_restart(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical);
         await_slow_counts(parameters, deferred, input, input->periods);
+        limit_currents(parameters, input, reset, results);
     } else if (parameters->torque_law != TORQUE_LAW_PREDICTIVE) {
         await_slow_counts(parameters, deferred, input, input->periods);
+        limit_currents(parameters, input, reset, results);
     } else if (!reset) { /* a step that resets has done enough */
         take_turns(parameters, deferred, input);
     }
@@ -368,12 +381,12 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
 }
 
-bool deferred_step(const control_parameters_t *parameters, control_state_t *state) {
+bool deferred_step(const control_parameters_t *parameters, control_state_t *state, const command_t *command) {
     const deferred_request_t *request = &state->deferred_request;
     if (!deferred_pending(request, &state->deferred.response)) {
         return false;
     }
-    deferred_compute(parameters, state);
+    deferred_compute(parameters, state, command);
     deferred_complete(request, &state->deferred.response);
     return true;
 }

@@ -4,6 +4,7 @@
  *   bandwidth    statistics of the innovation -> limits of the observer's trigger           observer_bandwidth.h
  *   moving load  trend of the innovation -> least bandwidth                                 moving_load.h
  *   speed law    speed error -> torque, without feed-forward                               speed_pi.h, speed_smc.h
+ *   limit        speed -> limit of the currents of hysteresis control                      ditc_hysteresis.h
  *   torque mode  commanded torque -> torque                                                torque_mode.h
  *   conduction   torque, its shortfall, speed, voltage -> angles, largest torque            conduction.h
  *   offset       mean torque error -> torque reference                                     torque_offset.h
@@ -40,11 +41,12 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
                         const command_t *command, const control_measurement_t *measured, bool run);
 
 /* Computes the results of the pending step; deferred_complete() then puts them into effect. The control interrupt may
- * pre-empt both. [deferred] */
-void deferred_compute(const control_parameters_t *parameters, control_state_t *state);
+ * pre-empt both. command: the last accepted one; the background, which alone changes it, waits for the step. [deferred]
+ */
+void deferred_compute(const control_parameters_t *parameters, control_state_t *state, const command_t *command);
 
 /* Both of them, when a step is pending; else returns false. [deferred] */
-bool deferred_step(const control_parameters_t *parameters, control_state_t *state);
+bool deferred_step(const control_parameters_t *parameters, control_state_t *state, const command_t *command);
 
 /* Resets for the next run: conduction angles of torque sharing. [both] */
 void deferred_reset_run(control_state_t *state);

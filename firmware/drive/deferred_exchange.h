@@ -19,10 +19,10 @@
 #include <stdint.h>
 
 #include "control/conduction.h"
+#include "control/ditc_hysteresis.h"
 #include "control/load_observer.h"
 #include "control/observer_bandwidth.h"
 #include "control/slow_counts.h"
-#include "drive/command.h"
 #include "fixed/compiler.h"
 #include "hal.h"
 
@@ -36,8 +36,7 @@ typedef struct {
     int32_t speed_q22;          /* observer, for the coming sample, rad/s, Q9.22 */
     /* With an adaptive bandwidth only. */
     observer_bandwidth_sample_t bandwidth;
-    bool run;                 /* state RUN */
-    const command_t *command; /* the last accepted one; the background, which alone changes it, waits for the step */
+    bool run;                     /* state RUN */
     int32_t torque_reference_q24; /* of this period, N m, Q7.24; 0 outside RUN */
     /* With predictive torque control only. */
     int32_t load_torque_q24;      /* observer, N m, Q7.24 */
@@ -74,6 +73,7 @@ typedef struct {
     deferred_predictive_results_t predictive;
     load_observer_inertia_t observer;  /* identified, inertia.h */
     slow_counts_results_t slow_counts; /* with an adaptive bandwidth only */
+    ditc_hysteresis_limit_t limit;     /* without predictive torque control only */
 } deferred_results_t;
 
 typedef struct {

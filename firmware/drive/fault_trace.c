@@ -5,11 +5,9 @@
 #include "fixed/compiler.h"
 
 NOINLINE void fault_trace_stand(fault_trace_t *trace, const fault_trace_values_t *values, drive_state_t state) {
-    if (!fault_trace_kept(trace)) {
-        fault_trace_run(trace, values);
-        if (state == DRIVE_STATE_FAULT) {
-            trace->next |= FAULT_TRACE_KEPT;
-        }
+    fault_trace_run(trace, values);
+    if (state == DRIVE_STATE_FAULT) {
+        trace->next |= FAULT_TRACE_KEPT;
     }
 }
 

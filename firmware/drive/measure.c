@@ -1,5 +1,6 @@
 #include "drive/measure.h"
 
+#include "control/applied_flux.h"
 #include "control/phase_map.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
@@ -44,76 +45,81 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
                                  angle_per_tick_q19, (int32_t)(encoder->edge_age_ticks << parameters->edge_age_shift));
 }
 
-static inline int32_t measure_current_q9(int32_t scale_q18, const control_sample_t *sample, unsigned phase,
-                                         control_measurement_t *measured) {
-    const int32_t current_q9 = scale_counts(sample->adc->phase_current_counts[phase], scale_q18);
-    measured->current_q9[phase] = current_q9;
-    return current_q9;
-}
-
-/* Sums over the phases. */
-typedef struct {
-    int32_t current_max_q9;
-    int32_t torque; /* in units of the tables */
-} sums_t;
-
-static inline void add_phase(sums_t *sums, int32_t current_q9, int32_t torque) {
-    sums->torque = fixed_add(sums->torque, torque);
-    sums->current_max_q9 = current_q9 > sums->current_max_q9 ? current_q9 : sums->current_max_q9;
-}
-
-/* Torque of each phase by the machine's tables, at the measured angle. */
-static sums_t measure_by_map(const control_parameters_t *parameters, const int32_t misalignment[HAL_PHASES_MAX],
-                             const control_sample_t *sample, control_measurement_t *measured) {
-    sums_t sums = {0, 0};
+/* Currents of the phases, the largest one, and the flux linkage that the voltage builds up in the period that now
+ * begins, for the background's monitor of the phases; a period in which the run ends counts as one of the run. In one
+ * loop, which saves a load for each phase. */
+static void measure_phases(const control_parameters_t *parameters, const control_sample_t *sample,
+                           control_state_t *state) {
+    control_measurement_t *measured = &state->measurement;
+    const applied_flux_period_t period =
+        applied_flux_period(measured->dc_link_voltage_q6, parameters->predictive.period_q40,
+                            parameters->predictive.flux.resistance_period_q40);
     const int32_t scale_q18 = parameters->current_scale_q18;
+    const unsigned phases = machine_tables.phases;
+    int32_t max_q9 = 0;
+    UNROLL(4)
+    for (unsigned phase = 0; phase < phases; phase++) {
+        const int32_t current_q9 = scale_counts(sample->adc->phase_current_counts[phase], scale_q18);
+        measured->current_q9[phase] = current_q9;
+        max_q9 = current_q9 > max_q9 ? current_q9 : max_q9;
+        applied_flux_step(&state->applied_flux, &period, phase, state->duty_q15[phase], current_q9);
+    }
+    measured->current_max_q9 = max_q9;
+}
+
+void measure(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
+             const control_sample_t *sample) {
+    control_measurement_t *measured = &state->measurement;
+    measure_angle(parameters, &state->observer, &deferred->slow_counts, &sample->encoder, measured);
+    measured->commutation.electrical = commutation_electrical(&parameters->commutation, measured->angle);
+    measured->dc_link_voltage_q6 = scale_counts(sample->adc->bus_voltage_counts, parameters->voltage_scale_q18);
+    measure_phases(parameters, sample, state);
+}
+
+/* Sum of the torques of the phases by the machine's tables, in their units. */
+static int32_t torque_by_map(const control_parameters_t *parameters, const int32_t misalignment[HAL_PHASES_MAX],
+                             control_measurement_t *measured) {
+    int32_t sum = 0;
     const unsigned phases = machine_tables.phases;
     UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
-        const int32_t current_q9 = measure_current_q9(scale_q18, sample, phase, measured);
+        const int32_t current_q9 = measured->current_q9[phase];
         int32_t torque = 0;
         if (LIKELY(current_q9 > 0)) { /* though false for most phases at any time */
             const uint32_t angle = commutation_angle(&parameters->commutation, &measured->commutation, phase);
             torque = phase_map_torque(&machine_tables, angle - (uint32_t)misalignment[phase], current_q9);
-            add_phase(&sums, current_q9, torque);
+            sum = fixed_add(sum, torque);
         }
         measured->torque[phase] = torque;
     }
-    return sums;
+    return sum;
 }
 
-/* Torque and flux linkage of each phase at the planned angle. */
-static sums_t measure_by_plan(const control_parameters_t *parameters, const predictive_torque_t *predictive,
-                              const control_sample_t *sample, control_measurement_t *measured) {
-    sums_t sums = {0, 0};
+/* The same of the planned cells, and the flux linkage of each phase. */
+static int32_t torque_by_plan(const predictive_torque_t *predictive, control_measurement_t *measured) {
+    int32_t sum = 0;
     const phase_cell_t *cells = predictive_torque_cells(predictive);
-    const int32_t scale_q18 = parameters->current_scale_q18;
     const unsigned phases = machine_tables.phases;
     UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
-        const int32_t current_q9 = measure_current_q9(scale_q18, sample, phase, measured);
+        const int32_t current_q9 = measured->current_q9[phase];
         int32_t flux = 0;
         if (current_q9 > 0) { /* false for most phases at any time */
-            add_phase(&sums, current_q9, predictive_torque_estimate(&cells[phase], current_q9, &flux));
+            sum = fixed_add(sum, predictive_torque_estimate(&cells[phase], current_q9, &flux));
         }
         measured->flux_linkage[phase] = flux;
     }
-    return sums;
+    return sum;
 }
 
-void measure(const control_parameters_t *parameters, const load_observer_t *observer,
-             const deferred_results_t *deferred, const predictive_torque_t *predictive, const control_sample_t *sample,
-             control_measurement_t *measured) {
-    measure_angle(parameters, observer, &deferred->slow_counts, &sample->encoder, measured);
-    measured->dc_link_voltage_q6 = scale_counts(sample->adc->bus_voltage_counts, parameters->voltage_scale_q18);
-    sums_t sums;
+void measure_torque(const control_parameters_t *parameters, const predictive_torque_t *predictive,
+                    const int32_t misalignment[HAL_PHASES_MAX], bool failed, control_measurement_t *measured) {
+    int32_t sum = 0;
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
-        measured->commutation.electrical = commutation_electrical(&parameters->commutation, measured->angle);
-        sums = measure_by_plan(parameters, predictive, sample, measured);
-    } else {
-        commutation_find(&parameters->commutation, measured->angle, &measured->commutation);
-        sums = measure_by_map(parameters, deferred->predictive.misalignment, sample, measured);
+        sum = torque_by_plan(predictive, measured);
+    } else if (!failed) {
+        commutation_find(&parameters->commutation, &measured->commutation);
+        sum = torque_by_map(parameters, misalignment, measured);
     }
-    measured->current_max_q9 = sums.current_max_q9;
-    measured->torque_sum_q24 = phase_map_scale(&machine_tables.torque_format, sums.torque);
+    measured->torque_sum_q24 = phase_map_scale(&machine_tables.torque_format, sum);
 }

@@ -5,12 +5,16 @@
 #include "control/commutation.h"
 #include "drive/control.h"
 
-/* Converts a sample. The angle of an encoder edge is extrapolated at the observer's speed; torque and flux linkage are
- * those of the machine's tables at the angle of each phase, corrected by its misalignment (2^-32 electrical rev), with
- * predictive torque control at the planned one. Currents and voltage are rounded to nearest; a count of 0 is exactly 0
- * A. */
-void measure(const control_parameters_t *parameters, const load_observer_t *observer,
-             const deferred_results_t *deferred, const predictive_torque_t *predictive, const control_sample_t *sample,
-             control_measurement_t *measured);
+/* Converts a sample. The angle of an encoder edge is extrapolated at the observer's speed. Currents and voltage are
+ * rounded to nearest; a count of 0 is exactly 0 A. Integrates the applied voltage over the period that now begins. */
+void measure(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
+             const control_sample_t *sample);
+
+/* What the currents imply, by the machine's tables: torque at the angle of each phase, corrected by its misalignment
+ * (2^-32 electrical rev), with the roles of the phases; with predictive torque control torque and flux linkage at the
+ * planned angle. failed: a check has, which opens the switches; the torque is not looked up then, but 0, and the period
+ * that records a fault is no longer than a period of the run: 34 of the computed bound of traditional. */
+void measure_torque(const control_parameters_t *parameters, const predictive_torque_t *predictive,
+                    const int32_t misalignment[HAL_PHASES_MAX], bool failed, control_measurement_t *measured);
 
 #endif

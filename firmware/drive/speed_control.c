@@ -22,8 +22,7 @@ static int32_t limited_pi_q24(const control_parameters_t *parameters, deferred_t
 }
 
 static int32_t speed_law_q24(const control_parameters_t *parameters, deferred_t *deferred,
-                             const deferred_input_t *input, int32_t limit_q24) {
-    const command_t *command = input->command;
+                             const deferred_input_t *input, const command_t *command, int32_t limit_q24) {
     const int32_t commanded_q22 = command->request == COMMAND_RUN ? command->speed_reference_q22 : 0;
     const int32_t min_q22 = parameters->speed_reference_min_q22;
     const int32_t before_q22 =
@@ -43,19 +42,19 @@ static int32_t speed_law_q24(const control_parameters_t *parameters, deferred_t 
 
 /* Torque mode begins with the present torque; the laws of the speed follow it. */
 static int32_t torque_law_q24(const control_parameters_t *parameters, deferred_t *deferred,
-                              const deferred_input_t *input, int32_t offset_q24) {
+                              const deferred_input_t *input, const command_t *command, int32_t offset_q24) {
     if (deferred->mode != DRIVE_MODE_TORQUE) {
         deferred->torque_mode.torque_q24 = fixed_subtract(input->torque_reference_q24, offset_q24);
     }
     const int32_t torque_q24 = torque_mode_step(&parameters->torque_mode, &deferred->torque_mode,
-                                                input->command->torque_reference_q24, input->speed_q22);
+                                                command->torque_reference_q24, input->speed_q22);
     deferred->speed_reference_q22 = fixed_clamp(input->speed_q22, parameters->speed_reference_min_q22, INT32_MAX);
     speed_pi_follow(&deferred->speed_pi, torque_q24);
     return fixed_add(torque_q24, offset_q24);
 }
 
 void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
-                            int32_t limit_q24, deferred_results_t *results) {
+                            const command_t *command, int32_t limit_q24, deferred_results_t *results) {
     const int32_t offset_q24 = torque_offset_q24(&deferred->torque_offset);
     int32_t min_q24 = deferred->conduction.torque_min_q24, max_q24 = deferred->conduction.torque_max_q24;
     min_q24 = min_q24 > -limit_q24 ? min_q24 : -limit_q24;
@@ -73,14 +72,14 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
     int32_t reference_q22 = 0, periodic_load_q24 = 0;
     if (!input->run) {
         min_q24 = max_q24 = 0;
-    } else if (input->command->mode == DRIVE_MODE_TORQUE && input->command->request == COMMAND_RUN) {
+    } else if (command->mode == DRIVE_MODE_TORQUE && command->request == COMMAND_RUN) {
         mode = DRIVE_MODE_TORQUE;
-        torque_q24 = fixed_clamp(torque_law_q24(parameters, deferred, input, offset_q24), min_q24, max_q24);
+        torque_q24 = fixed_clamp(torque_law_q24(parameters, deferred, input, command, offset_q24), min_q24, max_q24);
         min_q24 = max_q24 = torque_q24;
     } else {
         periodic_load_q24 = deferred->periodic_load.torque_q24;
-        torque_q24 =
-            fixed_add(fixed_add(speed_law_q24(parameters, deferred, input, limit_q24), offset_q24), periodic_load_q24);
+        torque_q24 = fixed_add(fixed_add(speed_law_q24(parameters, deferred, input, command, limit_q24), offset_q24),
+                               periodic_load_q24);
         reference_q22 = deferred->speed_reference_q22;
     }
     deferred->mode = mode;

@@ -15,7 +15,7 @@
  * and the integral of the PI with the present torque. limit_q24: of the torque's magnitude, N m, Q7.24, >= 0; what the
  * interrupt adds is within it too. [deferred] */
 void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
-                            int32_t limit_q24, deferred_results_t *results);
+                            const command_t *command, int32_t limit_q24, deferred_results_t *results);
 
 /* While counts are slow, a speed above the reference may be one of the estimate alone. A load brakes by itself: the
  * more of it, the less torque against it, none from a sixteenth of the largest torque on. load_q24: estimated load

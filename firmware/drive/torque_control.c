@@ -5,7 +5,6 @@
 #include "fixed/fixed.h"
 
 void torque_control_reset(const control_parameters_t *parameters, control_state_t *state) {
-    bp_pid_clear_telemetry(&state->duty.pid);
     ditc_hysteresis_reset(state->duty_q15);
     switch (parameters->torque_law) {
     case TORQUE_LAW_HYSTERESIS:
@@ -23,15 +22,20 @@ void torque_control_reset(const control_parameters_t *parameters, control_state_
 /* Threshold of a rotor that turns backwards: 8 rad/s, above the noise of the speed estimate at standstill. */
 #define BACKWARDS_Q22 (1 << 25)
 
-static bool turns_backwards(const control_state_t *state) {
-    return state->observer.speed_q22 < -BACKWARDS_Q22;
+static bool turns_backwards(int32_t speed_q22) {
+    return speed_q22 < -BACKWARDS_Q22;
+}
+
+ditc_hysteresis_limit_t torque_control_limit(const control_parameters_t *parameters, int32_t speed_q22) {
+    return ditc_hysteresis_limit(&parameters->hysteresis,
+                                 turns_backwards(speed_q22) ? fixed_subtract(0, speed_q22) : 0);
 }
 
 static void hysteresis_control(const control_parameters_t *parameters, control_state_t *state,
-                               const control_measurement_t *measured) {
+                               const deferred_results_t *deferred, const control_measurement_t *measured) {
     const int32_t error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24);
     ditc_hysteresis_step(&parameters->hysteresis, &measured->commutation, error_q24, measured->current_q9,
-                         turns_backwards(state) ? fixed_subtract(0, state->observer.speed_q22) : 0, state->duty_q15);
+                         deferred->limit, state->duty_q15);
 }
 
 /* False when hysteresis control is to act instead. */
@@ -44,7 +48,7 @@ static bool duty_control(const control_parameters_t *parameters, control_state_t
         }
         return true;
     }
-    if (turns_backwards(state)) {
+    if (turns_backwards(state->observer.speed_q22)) {
         /* The BP-PID assumes the order of the phases of forward motion. It begins again, as from standstill. */
         state->duty.regulated = COMMUTATION_NONE;
         return false;
@@ -93,7 +97,7 @@ void torque_control(const control_parameters_t *parameters, control_state_t *sta
         return;
     }
     if (parameters->torque_law == TORQUE_LAW_HYSTERESIS || !duty_control(parameters, state, measured)) {
-        hysteresis_control(parameters, state, measured); /* in one place, so that it is inlined */
+        hysteresis_control(parameters, state, deferred, measured); /* in one place, so that it is inlined */
     }
     const uint32_t lost = state->lost_phase;
     if (!LIKELY(lost == 0)) { /* the laws of hysteresis and duty know of no lost phase */

@@ -143,8 +143,8 @@ static_assert(sizeof(uint32_t) + sizeof(drive_telemetry_t) <= offsetof(control_s
               "a snapshot reads only members of control_state_t that nothing else here uses");
 
 /* A step of up to several control periods. */
-void deferred_compute(const control_parameters_t *parameters, control_state_t *state) {
-    (void)parameters;
+void deferred_compute(const control_parameters_t *parameters, control_state_t *state, const command_t *command) {
+    (void)parameters, (void)command;
     static uint32_t sequence;
     const deferred_input_t *input = &state->deferred_request.input;
 #ifdef NO_EXCHANGE

@@ -147,7 +147,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
             hal_pwm_compare_t compare;
             const bool closed = control_step(&parameters, &state, &bench.sample, &bench.command, &compare);
             if ((period / 4 + sequence) % 5 != 0) { // four periods are skipped in a row
-                deferred_step(&parameters, &state);
+                deferred_step(&parameters, &state, &bench.command);
             }
             ASSERT_EQ(closed, state.state_machine.state == DRIVE_STATE_RUN) << "sequence " << sequence;
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
@@ -203,7 +203,7 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
                 hal_pwm_compare_t compare;
                 const bool closed = control_step(&parameters, &state, &sample, &command, &compare);
                 if (random() % 4 != 0) {
-                    deferred_step(&parameters, &state);
+                    deferred_step(&parameters, &state, &command);
                 }
                 ASSERT_EQ(closed, state.state_machine.state == DRIVE_STATE_RUN);
             }

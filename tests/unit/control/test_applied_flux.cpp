@@ -31,8 +31,10 @@ TEST(AppliedFlux, follows_the_sum_of_voltage_less_resistive_drop_within_2_LSB_a_
             duty_q15[phase] = int32_t(random() % 65537) - 32768;
             current_q9[phase] = int32_t(random() % (60 * 512));
         }
-        applied_flux_step(&flux, 3, duty_q15, current_q9, period_q29, resistance_q40);
+        const applied_flux_period_t period =
+            applied_flux_period(to_fixed(voltage, 64.0), to_fixed(PERIOD_S, Q40), resistance_q40);
         for (int phase = 0; phase < 3; phase++) {
+            applied_flux_step(&flux, &period, unsigned(phase), duty_q15[phase], current_q9[phase]);
             EXPECT_NEAR(flux.at_sample_q29[phase] / Q29, model[phase], 1e-5);
             const double drop = current_q9[phase] / 512.0 * resistance_q40 / Q40;
             model[phase] = std::max(0.0, model[phase] + duty_q15[phase] / 32768.0 * period_q29 / Q29 - drop);
@@ -47,16 +49,18 @@ TEST(AppliedFlux, follows_the_sum_of_voltage_less_resistive_drop_within_2_LSB_a_
 
 TEST(AppliedFlux, saturates_and_ends_at_0) {
     applied_flux_t flux{};
-    const int32_t on[4] = {32768, 32768, 32768, 32768}, off[4] = {-32768, -32768, -32768, -32768}, none[4] = {};
+    const applied_flux_period_t period = {.full_q32 = ((1 << 27) - 1) * 8, .against_q40 = 0};
+    constexpr int32_t ON = 32768, OFF = -32768;
     for (int k = 0; k < 40; k++) {
-        applied_flux_step(&flux, 4, on, none, (1 << 27) - 1, 0);
+        applied_flux_step(&flux, &period, 3, ON, 0);
     }
     EXPECT_EQ(flux.next_q29[3], INT32_MAX);
     for (int k = 0; k < 16; k++) {
-        EXPECT_GT(flux.next_q29[0], 0);
-        applied_flux_step(&flux, 4, off, none, (1 << 27) - 1, 0);
+        EXPECT_GT(flux.next_q29[3], 0);
+        applied_flux_step(&flux, &period, 3, OFF, 0);
     }
-    applied_flux_step(&flux, 4, off, none, (1 << 27) - 1, 0);
+    applied_flux_step(&flux, &period, 3, OFF, 0);
+    EXPECT_EQ(flux.next_q29[3], 0);
     EXPECT_EQ(flux.next_q29[0], 0);
 }
 

@@ -62,7 +62,8 @@ constexpr int32_t ONE_Q15 = 32768;
 int next_state(const scene_t &s, unsigned phase, int state, int32_t error, int32_t backwards_rad_s = 0) {
     int32_t duty_q15[HAL_PHASES_MAX] = {};
     duty_q15[phase] = state * ONE_Q15;
-    ditc_hysteresis_step(&PARAMETERS, &s.commutation, error, s.current_q9, backwards_rad_s << 22, duty_q15);
+    ditc_hysteresis_step(&PARAMETERS, &s.commutation, error, s.current_q9,
+                         ditc_hysteresis_limit(&PARAMETERS, backwards_rad_s << 22), duty_q15);
     EXPECT_EQ(duty_q15[phase] % ONE_Q15, 0);
     return duty_q15[phase] / ONE_Q15;
 }
@@ -147,7 +148,8 @@ TEST(DitcHysteresis, every_phase_can_have_every_role) {
             const int32_t current_q9[HAL_PHASES_MAX] = {100, 100, 100, 100};
             int32_t duty_q15[HAL_PHASES_MAX];
             ditc_hysteresis_reset(duty_q15);
-            ditc_hysteresis_step(&PARAMETERS, &commutation, INT32_MAX, current_q9, 0, duty_q15);
+            ditc_hysteresis_step(&PARAMETERS, &commutation, INT32_MAX, current_q9,
+                                 ditc_hysteresis_limit(&PARAMETERS, 0), duty_q15);
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
                 EXPECT_EQ(duty_q15[phase], phase == active || phase == outgoing ? ONE_Q15 : -ONE_Q15);
             }
@@ -165,7 +167,8 @@ TEST(DitcHysteresis, in_a_commutation_gap_and_after_reset_all_phases_are_off) {
         EXPECT_EQ(state, -ONE_Q15);
     }
     for (const int32_t error : ERRORS) {
-        ditc_hysteresis_step(&PARAMETERS, &commutation, error, current_q9, 0, duty_q15);
+        ditc_hysteresis_step(&PARAMETERS, &commutation, error, current_q9, ditc_hysteresis_limit(&PARAMETERS, 0),
+                             duty_q15);
         for (const int32_t state : duty_q15) {
             EXPECT_EQ(state, -ONE_Q15);
         }
@@ -181,7 +184,8 @@ TEST(DitcHysteresis, extreme_bands_do_not_overflow) {
             for (const int32_t error : ERRORS) {
                 int32_t duty_q15[HAL_PHASES_MAX];
                 ditc_hysteresis_reset(duty_q15);
-                ditc_hysteresis_step(&parameters, &both.commutation, error, both.current_q9, 0, duty_q15);
+                ditc_hysteresis_step(&parameters, &both.commutation, error, both.current_q9,
+                                     ditc_hysteresis_limit(&parameters, 0), duty_q15);
                 for (unsigned phase = 0; phase < 3; phase++) {
                     ASSERT_LE(std::abs(duty_q15[phase]), ONE_Q15);
                 }

@@ -87,7 +87,7 @@ class Control : public testing::Test {
 
     bool step_as_sampled() {
         const bool closed = control_step(&parameters, &state, &sample, &command, &compare);
-        deferred_step(&parameters, &state);
+        deferred_step(&parameters, &state, &command);
         diagnostics = diagnose();
         // No switch is ever closed outside RUN.
         EXPECT_EQ(closed, state.state_machine.state == DRIVE_STATE_RUN);
@@ -194,7 +194,7 @@ TEST_F(Control, the_same_state_and_sample_give_the_same_bits) {
             step(COMMAND_RUN, 150.0);
             hal_pwm_compare_t replayed{};
             control_step(&parameters, &before, &sample, &command, &replayed);
-            deferred_step(&parameters, &before);
+            deferred_step(&parameters, &before, &command);
             ASSERT_EQ(std::memcmp(&before, &state, sizeof state), 0) << k;
             ASSERT_EQ(std::memcmp(&replayed, &compare, sizeof compare), 0) << k;
         }

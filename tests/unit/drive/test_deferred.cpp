@@ -55,7 +55,7 @@ class Deferred : public testing::Test {
     // A period with a deferred step in time.
     bool period(command_request_t request, double reference_rpm = 600.0) {
         const bool run = interrupt(request, reference_rpm);
-        EXPECT_TRUE(deferred_step(&parameters, &state));
+        EXPECT_TRUE(deferred_step(&parameters, &state, &command));
         return run;
     }
 
@@ -98,9 +98,9 @@ TEST_F(Deferred, every_control_interrupt_requests_one_step) {
     for (int k = 0; k < 100; k++) {
         interrupt(COMMAND_OFF);
         ASSERT_TRUE(pending());
-        EXPECT_TRUE(deferred_step(&parameters, &state));
+        EXPECT_TRUE(deferred_step(&parameters, &state, &command));
         EXPECT_FALSE(pending());
-        EXPECT_FALSE(deferred_step(&parameters, &state)) << "nothing is pending";
+        EXPECT_FALSE(deferred_step(&parameters, &state, &command)) << "nothing is pending";
     }
     EXPECT_EQ(state.deferred_request.requests, 100u);
     EXPECT_EQ(state.deferred_request.skipped_total, 0u);
@@ -117,13 +117,13 @@ TEST_F(Deferred, a_pending_step_keeps_its_input_and_the_next_input_counts_the_sk
         EXPECT_EQ(std::memcmp(&before, &state.deferred_request.input, sizeof before), 0);
         EXPECT_EQ(state.deferred_request.skipped, skipped);
     }
-    EXPECT_TRUE(deferred_step(&parameters, &state));
+    EXPECT_TRUE(deferred_step(&parameters, &state, &command));
     interrupt(COMMAND_RUN);
     EXPECT_EQ(state.deferred_request.input.periods, 6u);
     EXPECT_EQ(state.deferred_request.input.encoder_angle, sample.encoder.counts << 15);
     EXPECT_EQ(state.deferred_request.skipped, 0u);
     EXPECT_EQ(state.deferred_request.skipped_total, 5u);
-    EXPECT_TRUE(deferred_step(&parameters, &state));
+    EXPECT_TRUE(deferred_step(&parameters, &state, &command));
     interrupt(COMMAND_RUN);
     EXPECT_EQ(state.deferred_request.input.periods, 1u);
 }
@@ -141,7 +141,7 @@ TEST_F(Deferred, results_take_effect_together_at_the_end_of_the_step) {
     deferred_results_t before;
     std::memcpy(&before, &results(), sizeof before);
     const torque_sharing_window_t window_before = window();
-    deferred_compute(&parameters, &state);
+    deferred_compute(&parameters, &state, &command);
     EXPECT_EQ(std::memcmp(&before, &results(), sizeof before), 0) << "while the step computes";
     ASSERT_TRUE(interrupt(COMMAND_RUN, 3000.0)) << "pre-empts it";
     EXPECT_EQ(std::memcmp(&before, &results(), sizeof before), 0);
@@ -160,10 +160,10 @@ TEST_F(Deferred, checks_act_one_period_later_or_when_the_late_step_ends) {
         for (int k = 0; k < late; k++) {
             EXPECT_TRUE(interrupt(COMMAND_RUN));
         }
-        EXPECT_TRUE(deferred_step(&parameters, &state));
+        EXPECT_TRUE(deferred_step(&parameters, &state, &command));
         EXPECT_FALSE(interrupt(COMMAND_RUN));
         EXPECT_EQ(state.state_machine.record.fault, FAULT_UNDER_VOLTAGE);
-        deferred_step(&parameters, &state);
+        deferred_step(&parameters, &state, &command);
     }
 }
 
@@ -181,7 +181,7 @@ TEST_F(Deferred, a_step_that_is_late_for_eight_periods_is_an_overrun) {
         interrupt(COMMAND_OFF);
         EXPECT_EQ(state.state_machine.state, DRIVE_STATE_FAULT) << "no clearing while its cause lasts";
     }
-    deferred_step(&parameters, &state);
+    deferred_step(&parameters, &state, &command);
     see_the_cause_gone();
     period(COMMAND_CLEAR_FAULT);
     EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY);
@@ -192,7 +192,7 @@ TEST_F(Deferred, steps_that_are_late_by_up_to_seven_periods_are_no_fault) {
     for (int k = 0; k < 1000; k++) {
         ASSERT_TRUE(interrupt(COMMAND_RUN)) << k;
         if (k % 8 == 7) {
-            deferred_step(&parameters, &state);
+            deferred_step(&parameters, &state, &command);
         }
     }
     EXPECT_GT(state.deferred_request.skipped_total, 800u);
@@ -207,12 +207,12 @@ TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_windows_at_the_end_o
     interrupt(COMMAND_RUN, 3000.0); // this step will be late
     EXPECT_FALSE(interrupt(COMMAND_OFF));
     EXPECT_FALSE(advanced()) << "in effect without a step";
-    EXPECT_TRUE(deferred_step(&parameters, &state)) << "computed with the windows of the run";
+    EXPECT_TRUE(deferred_step(&parameters, &state, &command)) << "computed with the windows of the run";
     EXPECT_FALSE(advanced());
     EXPECT_GT(state.deferred.conduction.advance_q30, 0);
     EXPECT_TRUE(interrupt(COMMAND_RUN, 0.0)) << "the next run, without a period between";
     EXPECT_FALSE(advanced());
-    EXPECT_TRUE(deferred_step(&parameters, &state));
+    EXPECT_TRUE(deferred_step(&parameters, &state, &command));
     EXPECT_EQ(state.deferred.conduction.advance_q30, 0) << "the windows start again";
     EXPECT_FALSE(advanced());
 }
@@ -225,7 +225,7 @@ TEST_F(Deferred, the_torque_of_the_speed_law_acts_one_period_later_with_the_feed
         const deferred_input_t &input = state.deferred_request.input;
         EXPECT_EQ(input.speed_q22, state.observer.speed_q22) << "the speed after this sample";
         const int32_t torque_offset_before_q24 = torque_offset_q24(&state.deferred.torque_offset);
-        deferred_step(&parameters, &state);
+        deferred_step(&parameters, &state, &command);
         const int32_t error_q22 = results().speed.speed_reference_q22 - input.speed_q22;
         const deferred_speed_results_t law = results().speed;
         const int32_t law_q24 = law.speed_law_torque_q24;
@@ -236,7 +236,7 @@ TEST_F(Deferred, the_torque_of_the_speed_law_acts_one_period_later_with_the_feed
                                        state.observer.load_torque_q24, law.torque_min_q24, law.torque_max_q24));
         ASSERT_TRUE(input.speed_q22 < 10000000 || law.torque_max_q24 == parameters.torque_mode.torque_max_q24)
             << "from 2.4 rad/s on counts are not slow";
-        deferred_step(&parameters, &state);
+        deferred_step(&parameters, &state, &command);
     }
 }
 
@@ -252,7 +252,7 @@ TEST_F(Deferred, the_speed_law_keeps_its_torque_while_its_step_is_late) {
             interrupt(COMMAND_RUN, 20.0);
             ASSERT_EQ(results().speed.speed_law_torque_q24, law_q24);
         }
-        deferred_step(&parameters, &state);
+        deferred_step(&parameters, &state, &command);
         period(COMMAND_RUN, 20.0);
         EXPECT_GT(results().speed.speed_law_torque_q24, law_q24);
     }
@@ -271,11 +271,11 @@ TEST_F(Deferred, a_run_begins_without_torque_and_integral_of_the_speed_law_also_
     interrupt(COMMAND_RUN, 2.0); // this step will be late
     EXPECT_FALSE(interrupt(COMMAND_OFF));
     EXPECT_EQ(results().speed.speed_law_torque_q24, 0) << "in effect without a step";
-    EXPECT_TRUE(deferred_step(&parameters, &state)) << "with the integral of the run";
+    EXPECT_TRUE(deferred_step(&parameters, &state, &command)) << "with the integral of the run";
     EXPECT_EQ(results().speed.speed_law_torque_q24, 0);
     EXPECT_TRUE(interrupt(COMMAND_RUN, 2.0)) << "the next run, without a period between";
     EXPECT_EQ(state.torque_reference_q24, 0);
-    EXPECT_TRUE(deferred_step(&parameters, &state));
+    EXPECT_TRUE(deferred_step(&parameters, &state, &command));
     EXPECT_GT(state.deferred.speed_pi.integral_q54, 0);
     EXPECT_LT(state.deferred.speed_pi.integral_q54, integral_q54 / 100) << "of one step";
     period(COMMAND_OFF);
@@ -403,7 +403,7 @@ TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_observer) {
     interrupt(COMMAND_CLEAR_FAULT);
     ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
     EXPECT_EQ(results().bandwidth.threshold_mean, 0u);
-    deferred_step(&parameters, &state);
+    deferred_step(&parameters, &state, &command);
     EXPECT_EQ(results().bandwidth.threshold_mean, 0u) << "the late step is without effect";
     period(COMMAND_OFF);
     EXPECT_LT(results().bandwidth.threshold_mean, 4u * COUNT);
@@ -456,7 +456,7 @@ TEST_F(Deferred, a_late_check_of_the_voltage_of_the_time_before_a_reset_is_no_ne
     sample.adc.bus_voltage_counts = healthy;
     interrupt(COMMAND_CLEAR_FAULT);
     ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
-    deferred_step(&parameters, &state);
+    deferred_step(&parameters, &state, &command);
     for (int k = 0; k < 10; k++) {
         period(COMMAND_OFF);
         EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY) << k;
@@ -480,7 +480,7 @@ TEST_F(Deferred, the_misalignment_survives_every_reset_and_a_late_step) {
     interrupt(COMMAND_RUN);
     interrupt(COMMAND_OFF);
     kept();
-    deferred_step(&parameters, &state);
+    deferred_step(&parameters, &state, &command);
     kept();
     period(COMMAND_OFF);
     kept();
@@ -491,7 +491,7 @@ TEST_F(Deferred, the_misalignment_survives_every_reset_and_a_late_step) {
     interrupt(COMMAND_CLEAR_FAULT);
     ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
     kept();
-    deferred_step(&parameters, &state);
+    deferred_step(&parameters, &state, &command);
     kept();
     control_prepare(&parameters, &state); // new parameters
     kept();
@@ -537,7 +537,7 @@ TEST_F(Deferred, a_trigger_in_a_skipped_period_lengthens_the_holdoff) {
     interrupt(COMMAND_OFF); // skipped
     ASSERT_LT(state.bandwidth.stage, OBSERVER_BANDWIDTH_STAGES - 1u);
     EXPECT_EQ(results().bandwidth.holdoff_ticks, RATE_HZ / 1000);
-    deferred_step(&parameters, &state);
+    deferred_step(&parameters, &state, &command);
     EXPECT_EQ(results().bandwidth.holdoff_ticks, RATE_HZ / 1000) << "the input is that of the period before";
     period(COMMAND_OFF);
     EXPECT_NEAR(results().bandwidth.holdoff_ticks, RATE_HZ / 1000.0 * 1.25, 1.0);

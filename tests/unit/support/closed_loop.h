@@ -59,7 +59,7 @@ struct fixed_drive_t {
 
     bool step(const control_sample_t &sample, const command_t &command, hal_pwm_compare_t *compare) {
         const bool run = control_step(&parameters, &state, &sample, &command, compare);
-        deferred_step(&parameters, &state);
+        deferred_step(&parameters, &state, &command);
         return run;
     }
 };

@@ -16,7 +16,8 @@ inline roles_t roles_at(const commutation_angles_t &angles, unsigned phases, uns
                         uint32_t rotor_angle) {
     const commutation_parameters_t parameters = commutation_configure(&angles, phases, rotor_poles);
     roles_t roles{};
-    commutation_find(&parameters, rotor_angle, &roles);
+    roles.electrical = commutation_electrical(&parameters, rotor_angle);
+    commutation_find(&parameters, &roles);
     for (unsigned phase = 0; phase < phases; phase++) {
         roles.angle[phase] = commutation_angle(&parameters, &roles, phase);
     }
