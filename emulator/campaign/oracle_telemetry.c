@@ -128,6 +128,10 @@ void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier
     const oracle_telemetry_t *telemetry = &oracle->telemetry;
     const world_machine_t *machine = oracle->world->machine;
     const sensor_ranges_t *ranges = &machine->image.machine.ranges;
+    if (identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID) {
+        judge_set(oracle, time_ns, data);
+        return;
+    }
     if (oracle_bus_disturbed(oracle) || oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
         oracle_any_injected(oracle, FAULT_CLOCK_DRIFT, FAULT_CLOCK_DRIFT) ||
         oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_ns / 1000) ||
@@ -162,9 +166,6 @@ void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier
         break;
     case DRIVE_THERMAL_FRAME_ID:
         judge_thermal(oracle, time_ns, data);
-        break;
-    case DRIVE_PARAMETER_RESPONSE_FRAME_ID:
-        judge_set(oracle, time_ns, data);
         break;
     default:
         break;
