@@ -11,6 +11,9 @@
 /* A stroke of at least 1/8 of the settling time is slow: the noise of its amplitude is below the tolerance. */
 #define SLOW_PARTS 8u
 
+/* h of a phase that has not been seen since the load has changed. */
+#define HALF_UNKNOWN INT32_MIN
+
 /* Of the number of strokes in Q32. */
 #define HALF_STROKE (UINT32_C(1) << 31)
 
@@ -34,9 +37,13 @@ static void await_settling(const stroke_mean_parameters_t *parameters, stroke_me
     mean->remaining = strokes > parameters->settle_updates ? strokes : parameters->settle_updates;
 }
 
+/* The sums are those of Q7.24 numbers: in units of 2^8 they fit in 32 bits for 2^8 updates, of 2^16 for 2^16. */
+static unsigned sum_shift(uint32_t updates) {
+    return updates < 256 ? 8 : 16;
+}
+
 static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, int32_t torque_q24) {
-    /* The sum is that of Q7.24 numbers: in units of 2^8 it fits in 32 bits for 2^8 updates, of 2^16 for 2^16. */
-    const unsigned shift = mean->updates < 256 ? 8 : 16;
+    const unsigned shift = sum_shift(mean->updates);
     const int32_t mean_q24 = (int32_t)(mean->sum_q24 >> shift) / (int32_t)mean->updates * (1 << shift);
     int32_t *constant_q24 = &mean->constant_q24[mean->stroke % HAL_PHASES_MAX];
     const bool disturbed = mean->disturbed || mean->disturbed_strokes > 0;
@@ -47,9 +54,8 @@ static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t
         own_differs ? change_q24 : fixed_multiply(change_q24, following_q16(parameters, mean->updates), 16);
     mean->changed = own_differs && differs(mean_q24, mean->changed_q24, tolerance_q24);
     mean->ended = (stroke_mean_ended_t){
-        .half = fixed_magnitude((int32_t)(mean->half_sum_q24 >> shift)),
-        .quarter = fixed_magnitude((int32_t)(mean->quarter_sum_q24 >> shift)),
-        .shift = shift,
+        .half = (int32_t)(mean->half_sum_q24 >> shift),
+        .deviation = (uint32_t)(mean->deviation_sum_q24 >> shift),
         .updates = mean->updates,
         .tolerance_q24 = tolerance_q24 / 2,
         .phase = mean->stroke % HAL_PHASES_MAX,
@@ -65,7 +71,8 @@ static void end_stroke(const stroke_mean_parameters_t *parameters, stroke_mean_t
     }
     mean->undisturbed_stroke = !mean->disturbed;
     mean->disturbed = false;
-    mean->sum_q24 = mean->half_sum_q24 = mean->quarter_sum_q24 = 0;
+    mean->sum_q24 = mean->half_sum_q24 = 0;
+    mean->deviation_sum_q24 = 0;
     mean->updates = 0;
 }
 
@@ -80,27 +87,40 @@ bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t 
     mean->stroke = stroke;
     mean->sum_q24 += load_torque_q24;
     mean->half_sum_q24 += (strokes_q32 & HALF_STROKE) == 0 ? load_torque_q24 : -(int64_t)load_torque_q24;
-    mean->quarter_sum_q24 += (strokes_q32 & HALF_STROKE / 2) == 0 ? load_torque_q24 : -(int64_t)load_torque_q24;
+    const unsigned phase = stroke % HAL_PHASES_MAX;
+    const int32_t expected_q24 = mean->half_q24[phase] == HALF_UNKNOWN ? mean->changed_q24 : mean->constant_q24[phase];
+    mean->deviation_sum_q24 += fixed_magnitude(fixed_subtract(load_torque_q24, expected_q24));
     mean->updates++;
     mean->disturbed |= disturbed;
     return mean->remaining == 0;
 }
 
+/* False for the first h under a load. */
+static bool beyond_last(int32_t half_q24, int32_t last_q24, uint32_t tolerance_q24) {
+    const uint32_t last_magnitude_q24 = fixed_magnitude(last_q24);
+    const uint32_t limit_q24 = (half_q24 < 0) != (last_q24 < 0) ? last_magnitude_q24 / 2 : last_magnitude_q24;
+    return last_q24 != HALF_UNKNOWN && fixed_magnitude(half_q24) > limit_q24 + tolerance_q24;
+}
+
 void stroke_mean_review(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean) {
     const stroke_mean_ended_t *ended = &mean->ended;
-    const uint32_t amplitude_q24 = (ended->half / 2 + ended->quarter / 2) / ended->updates << ended->shift;
-    uint32_t *least_amplitude_q24 = &mean->least_amplitude_q24[ended->phase];
+    const unsigned shift = sum_shift(ended->updates);
+    const uint32_t tolerance_q24 = ended->tolerance_q24;
+    const int32_t half_q24 = (int32_t)((uint32_t)(ended->half / (int32_t)ended->updates) << shift);
+    const uint32_t deviation_q24 = ended->deviation / ended->updates << shift;
+    const uint32_t amplitude_q24 = fixed_magnitude(half_q24);
+    int32_t *last_q24 = &mean->half_q24[ended->phase];
     const bool slow = ended->updates >= parameters->settle_updates / SLOW_PARTS;
-    const bool drifted =
-        slow && amplitude_q24 > *least_amplitude_q24 && amplitude_q24 - *least_amplitude_q24 > ended->tolerance_q24;
-    *least_amplitude_q24 = drifted || amplitude_q24 < *least_amplitude_q24 ? amplitude_q24 : *least_amplitude_q24;
-    const bool grown = slow && amplitude_q24 > mean->amplitude_q24 + ended->tolerance_q24 / 2;
+    const bool drifted = slow && (beyond_last(half_q24, *last_q24, tolerance_q24) ||
+                                  deviation_q24 / 2 > amplitude_q24 + tolerance_q24 + tolerance_q24 / 4);
+    *last_q24 = half_q24;
+    const bool grown = slow && amplitude_q24 > mean->amplitude_q24 + tolerance_q24 / 2;
     mean->grown = drifted || grown || mean->last_grown;
     mean->last_grown = grown;
     mean->amplitude_q24 = amplitude_q24;
     if (mean->changed) {
         for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
-            mean->least_amplitude_q24[i] = UINT32_MAX;
+            mean->half_q24[i] = HALF_UNKNOWN;
         }
     } else if (drifted) {
         mean->changed = true;

@@ -8,10 +8,16 @@
  * of the stroke after which the load counts as changed: the misalignment of the encoder is that of all phases, and at
  * 10 r/min each takes a second to come.
  *
- * A load that moves with nearly the frequency of the strokes, or twice that, has the same mean in each, but its
- * amplitude within them changes. Learning reduces the amplitude of a misalignment. So below 53 strokes a second the
- * load has changed also when the amplitude in a phase's stroke is larger than the least that it has had under the
- * present load. The amplitude is what the halves of the stroke differ by, and its quarters. */
+ * A load that moves with nearly the frequency of the strokes, or faster, has the same mean in each. Below 53 strokes a
+ * second it is found by its course within them:
+ *
+ *   h = (mean of the first half - mean of the second half) / 2,   d = mean |load - mean that is compared with|
+ *
+ * The h of a misalignment repeats with each stroke of its phase, and learning takes it towards 0; that of a load has
+ * any size and sign. So the load has changed also when h is larger than that of the same phase's last stroke, or than
+ * half of it in the other direction. A load with several periods in a stroke has hardly any h, but d. A misalignment
+ * has both: of 4 degrees, d is about 1.5 |h|. So the load has changed also when d is more than 2 |h|. Tolerances: half
+ * of that of the mean for h, 5/4 of it for d. */
 #ifndef CONTROL_STROKE_MEAN_H
 #define CONTROL_STROKE_MEAN_H
 
@@ -27,10 +33,10 @@ typedef struct {
 
 /* Stroke that has ended, for stroke_mean_review. */
 typedef struct {
-    uint32_t half, quarter; /* magnitudes of the sums, N m, 2^shift of Q24 */
-    unsigned shift;
+    int32_t half;           /* sum of h, N m, 2^8 of Q24, from 256 updates on 2^16 */
+    uint32_t deviation;     /* of d, likewise */
     uint32_t updates;       /* in the sums; 0: no stroke has ended */
-    uint32_t tolerance_q24; /* of the amplitude, N m, Q7.24 */
+    uint32_t tolerance_q24; /* of h, N m, Q7.24 */
     uint32_t phase;
 } stroke_mean_ended_t;
 
@@ -38,16 +44,16 @@ typedef struct {
 typedef struct {
     int64_t sum_q24;                      /* N m, Q24, since the stroke began */
     int64_t half_sum_q24;                 /* the same of the halves of the stroke, the second one negative */
-    int64_t quarter_sum_q24;              /* of its quarters, the second and the last one negative */
+    uint64_t deviation_sum_q24;           /* of the magnitude of the load less the mean that is compared with */
     uint32_t updates;                     /* in the sums */
     uint32_t stroke;                      /* number of the stroke in the electrical revolution */
     int32_t constant_q24[HAL_PHASES_MAX]; /* means that are compared with, N m, Q7.24 */
     int32_t changed_q24;                  /* mean of the stroke that showed the last change, N m, Q7.24 */
-    uint32_t amplitude_q24;               /* of the last stroke: (|half| + |quarter|) / 2 in the mean, N m, Q7.24 */
-    uint32_t least_amplitude_q24[HAL_PHASES_MAX]; /* of each phase under the present load */
-    bool changed;                                 /* the load, in the stroke that ended last */
-    bool grown;                                   /* the amplitude, in that stroke or the one before */
-    bool last_grown;                              /* in that stroke itself */
+    uint32_t amplitude_q24;               /* |h| of the last stroke, N m, Q7.24 */
+    int32_t half_q24[HAL_PHASES_MAX];     /* h of the last stroke of each phase, N m, Q7.24; INT32_MIN: unknown */
+    bool changed;                         /* the load, in the stroke that ended last */
+    bool grown;                           /* the amplitude, in that stroke or the one before */
+    bool last_grown;                      /* in that stroke itself */
     stroke_mean_ended_t ended;
     uint32_t remaining;         /* updates until the load is constant */
     uint32_t disturbed_strokes; /* of the present load, less the undisturbed ones since */
@@ -65,8 +71,8 @@ stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_
 bool stroke_mean_step(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t electrical,
                       int32_t load_torque_q24, int32_t torque_q24, bool disturbed);
 
-/* After an update for which stroke_mean_to_review: whether the amplitude in the stroke that has ended shows another
- * load, which is then not constant for the same time. */
+/* After an update for which stroke_mean_to_review: whether the course of the load in the stroke that has ended shows
+ * another load, which is then not constant for the same time. */
 void stroke_mean_review(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean);
 
 /* True if a stroke has ended in the last update. */
