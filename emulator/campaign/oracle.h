@@ -54,6 +54,7 @@
  *   undetected      in state run for longer than a reaction takes with a fault that shows at any time: changed memory,
  *                   sensors at a rail, a wrong clock, a background that hangs (oracle_detection.c)
  *   no_current      voltage on a phase for twenty times its largest flux linkage, and no current at all
+ *   two_lost        in state run, a fifth of the base speed commanded, for 300 ms with two phases lost
  *   blocked         a speed commanded, and the rotor within a stroke for 300 ms and three strokes
  *   misled          for 200 ms, above a fifth of the base speed and a tenth of the trip current, a measured angle off
  * by more than a sixth of a rotor pitch contested       for 150 ms in state run while another client sends commands
@@ -112,7 +113,7 @@ typedef struct {
 
 /* Of what has to be noticed. */
 typedef struct {
-    uint64_t looked_ns, misled_ns, blocked_ns, status_ns;
+    uint64_t looked_ns, misled_ns, blocked_ns, lost_ns, status_ns;
     double blocked_angle_rad;
     double largest_flux_Wb;         /* aligned, at the trip current */
     double flux_Wb[HAL_PHASES_MAX]; /* applied to a phase without any current, V s */

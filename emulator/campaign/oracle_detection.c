@@ -15,8 +15,9 @@
 #define MISLED_NS (200 * ORACLE_MS_NS)
 #define HEARD_NS (50 * ORACLE_MS_NS) /* since the last command: then the torque ramps to zero */
 #define BLOCKED_NS (300 * ORACLE_MS_NS)
-#define BLOCKED_STROKES 3.0          /* at the commanded speed, besides */
-#define BLOCKED_SPEED 0.05           /* of the base speed, commanded */
+#define BLOCKED_STROKES 3.0 /* at the commanded speed, besides */
+#define BLOCKED_SPEED 0.05  /* of the base speed, commanded */
+#define LOST_US 100000
 #define MUTE_NS (100 * ORACLE_MS_NS) /* bus-off for the second time included */
 #define RESET_NS (60 * ORACLE_MS_NS)
 #define CONTESTED_NS (150 * ORACLE_MS_NS)
@@ -77,6 +78,35 @@ static void look_at_kinds(oracle_t *oracle, uint64_t now_ns) {
         if (within_ns && now_ns > since_ns + within_ns && (of_processor || !checks_late(oracle, now_ns / 1000))) {
             oracle_violate(oracle, "undetected", now_ns, event->what, event->value);
         }
+    }
+}
+
+/* Phases that have been without their switches or winding for long. */
+static unsigned lost_phases(const oracle_t *oracle, uint64_t now_us) {
+    unsigned phases = 0, count = 0;
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = &oracle->world->event[i];
+        const bool open =
+            event->kind == WORLD_FAULT && (event->what == FAULT_WINDING_OPEN || event->what == FAULT_SWITCH_OPEN ||
+                                           event->what == FAULT_GATE_SUPPLY_LOST);
+        if (open && world_active(oracle->world, i, now_us) && now_us > event->begin_us + LOST_US &&
+            !(phases >> event->phase & 1u)) {
+            phases |= 1u << event->phase;
+            count++;
+        }
+    }
+    return count;
+}
+
+/* A drive that turns its rotor with one phase lost does not with two. */
+static void look_at_lost_phases(oracle_t *oracle, const plant_t *plant) {
+    const bool drives = oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
+                        !oracle->meant.torque &&
+                        fabs(oracle->meant.reference) > MISLED_SPEED * oracle->world->machine->speed_base_rpm;
+    oracle_since(&oracle->detection.lost_ns, drives && lost_phases(oracle, plant->time_ns / 1000) > 1, plant->time_ns);
+    if (oracle->detection.lost_ns && plant->time_ns > oracle->detection.lost_ns + BLOCKED_NS &&
+        plant->time_ns > oracle->constant_ns + BLOCKED_NS && !checks_late(oracle, plant->time_ns / 1000)) {
+        oracle_violate(oracle, "two_lost", plant->time_ns, 0, plant->speed_rad_s);
     }
 }
 
@@ -195,5 +225,6 @@ void oracle_look_at_detection(oracle_t *oracle, const plant_t *plant) {
     }
     look_at_status(oracle, plant->time_ns);
     look_at_rotor(oracle, plant);
+    look_at_lost_phases(oracle, plant);
     look_at_angle(oracle, plant);
 }

@@ -37,9 +37,9 @@ enum {
 #define TORQUE_STOP_SHARE 0.3  /* of the torque mode: ends with a stop */
 #define REMAINING_SHARE 0.3    /* of the faults: until all are over */
 #define LONG_SHARE 0.08        /* long enough for what takes long to be noticed */
-#define LASTING_SHARE 0.04     /* one fault alone, to the end of a long world */
+#define LASTING_SHARE 0.06     /* one fault alone, to the end of a long world */
 #define WRONG_CHECK_SHARE 0.15 /* of the sets of parameters */
-#define SLOW_SHARE 0.5         /* of them: of a kind that takes long to be noticed */
+#define SLOW_SHARE 0.6         /* of them: of a kind that takes long to be noticed */
 #define FAULTLESS_SHARE 0.1    /* no fault of the bench */
 #define BEYOND_SHARE 0.04      /* a speed beyond the largest one is commanded for some time */
 #define CLEARING_SHARE 0.03    /* the client sends nothing but clear_fault until all is over */
@@ -195,8 +195,9 @@ static void draw_torque(world_t *world, uint64_t last_us) {
     const double part = seeded_between(seed, STREAM_TORQUE, 3, world->controller == 2 ? -1.0 : 0.0, 1.0);
     event->value = runaway ? copysign(world->machine->torque_max_Nm, part) : part * world->machine->torque_rated_Nm;
     if (!world->healthy && seeded_unit(seed, STREAM_TORQUE, 5) < TORQUE_STOP_SHARE) {
-        world_event_t *stop = add(world, WORLD_REQUEST, begin_us + (event->end_us - begin_us) / 3, event->end_us);
+        world_event_t *stop = add(world, WORLD_REQUEST, begin_us + (event->end_us - begin_us) / 3, last_us);
         stop->what = WORLD_REQUEST_STOP;
+        event->end_us = last_us;
     }
 }
 
@@ -405,6 +406,7 @@ static void draw_faults(world_t *world, uint64_t last_us) {
     static const unsigned endured[] = {FAULT_WINDING_OPEN, FAULT_SWITCH_OPEN, FAULT_GATE_SUPPLY_LOST,
                                        FAULT_CURRENT_SENSOR_OPEN};
     static const unsigned slow[] = {FAULT_SHAFT_LOCKED,
+                                    FAULT_SHAFT_LOCKED,
                                     FAULT_COULOMB_FRICTION,
                                     FAULT_STATIC_FRICTION,
                                     FAULT_CURRENT_SENSOR_GAIN,
@@ -416,10 +418,13 @@ static void draw_faults(world_t *world, uint64_t last_us) {
                                     FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET};
     const uint64_t seed = world->seed;
     if (seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE / 2.0) {
-        const unsigned first = seeded_below(seed, STREAM_REQUEST, 5, 4);
+        const unsigned first = seeded_below(seed, STREAM_REQUEST, 5, 4), from = world->events;
         draw_fault(world, endured[first], last_us);
         if (seeded_unit(seed, STREAM_REQUEST, 12) < SECOND_LOSS_SHARE) {
             draw_fault(world, endured[(first + 1) % 4], last_us);
+            for (unsigned i = from; i < world->events; i++) {
+                world->event[i].end_us = last_us;
+            }
         }
         return;
     }
