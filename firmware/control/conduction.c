@@ -270,19 +270,35 @@ static int32_t room_q15(const conduction_parameters_t *parameters, conduction_st
     const int32_t part_q15 = free_q15 < 0 ? LINK_FULL_RATE * free_q15 : free_q15;
     state->link_q30 =
         fixed_clamp(state->link_q30 + (parameters->advance_step_q30 >> LINK_SHIFT) * part_q15, 0, ONE_Q30);
-    return (fixed_clamp(free_q15 + ONE_Q15, 0, ONE_Q15) * (state->link_q30 >> 15)) >> 15;
+    return ((free_q15 < 0 ? free_q15 + ONE_Q15 : ONE_Q15) * (state->link_q30 >> 15)) >> 15;
+}
+
+/* By which a braking pulse begins earlier, whose energy the DC link would not take, 2^-32 electrical rev. */
+static uint32_t longer(const conduction_state_t *state) {
+    const bool possible = state->braking && state->pulse.end > state->pulse.lead;
+    return possible ? blend(0, state->pulse.end - state->pulse.lead, state->way_q15) : 0;
+}
+
+/* Part of the way from a braking pulse to one without a torque, Q1.15. */
+static uint16_t way_q15(const conduction_parameters_t *parameters, const conduction_state_t *state) {
+    const int32_t taken_q15 = ONE_Q15 - ((state->room_q15 * state->room_q15) >> 15);
+    return parameters->longer_pulses > 0 ? (uint16_t)(taken_q15 * state->part_q15 >> 15) : 0;
 }
 
 /* Limits by what the voltage can make and by the braking torque whose energy the DC link can take. */
 static void limit_torque(const conduction_parameters_t *parameters, conduction_state_t *state,
                          const conduction_sample_t *sample) {
-    const int32_t part_q15 = room_q15(parameters, state, sample->dc_link_voltage_q6);
+    const int32_t room = room_q15(parameters, state, sample->dc_link_voltage_q6);
+    const int32_t more = (state->partial_q15 >> 2) * room >> 13;
+    const int32_t kept_q15 = room + parameters->longer_pulses * more;
+    const int32_t part_q15 = kept_q15 < ONE_Q15 ? kept_q15 : ONE_Q15;
+    state->room_q15 = (uint16_t)room;
     const int32_t braking_q24 = 4 * fixed_multiply_high(state->braking_max_q24, part_q15 << 15);
     const bool reverse = sample->speed_q22 < 0;
-    const int32_t negative_q24 = reverse ? state->motoring_max_q24 : braking_q24;
-    const int32_t positive_q24 = reverse ? braking_q24 : state->motoring_max_q24;
-    state->torque_min_q24 = fixed_clamp(parameters->torque_min_q24, -negative_q24, 0);
-    state->torque_max_q24 = fixed_clamp(parameters->torque_max_q24, 0, positive_q24);
+    const int32_t min_q24 = reverse ? -state->motoring_max_q24 : -braking_q24;
+    const int32_t max_q24 = reverse ? braking_q24 : state->motoring_max_q24;
+    state->torque_min_q24 = parameters->torque_min_q24 > min_q24 ? parameters->torque_min_q24 : min_q24;
+    state->torque_max_q24 = parameters->torque_max_q24 < max_q24 ? parameters->torque_max_q24 : max_q24;
 }
 
 /* Of a pulse: its window begins at most SHARE_LEAD_MAX before the half, and less than half a revolution before its end:
@@ -308,7 +324,8 @@ static void set_interval(const conduction_parameters_t *parameters, conduction_s
         ripple_q24 = (int32_t)blend(0, (uint32_t)(state->pulse.peak_q24 - state->pulse.mean_q24), level_q15);
     }
     if (partial_q15 > 0) {
-        const conduction_part_t pulse = state->part;
+        conduction_part_t pulse = state->part;
+        pulse.on -= state->longer;
         const int32_t trim_q24 = fixed_multiply_high(state->pulse.mean_q24, state->trim_q30) * 4;
         const int32_t trimmed_q24 = fixed_add(pulse.ripple_q24, trim_q24);
         interval.on = blend(level_q15 > 0 ? interval.on : interval.enter, pulse.on, partial_q15);
@@ -361,10 +378,12 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
     case 0:
         look_up(state, tables, sample);
         state->torque_q24 = smoothed_q24(state, tables->phases, sample);
+        state->way_q15 = way_q15(parameters, state);
         break;
     case 1:
         move(parameters, state, sample);
         state->missing_sum_q21 = 0;
+        state->longer = longer(state);
         state->gain_excess_q31 = gain_excess_q31(parameters, sample, state->above_base_q15);
         break;
     case 2:

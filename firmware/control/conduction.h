@@ -38,6 +38,15 @@
  * (tools/src/salient/machine/fold_back.py). The integral of the voltage's excess over the begin of that range, or over
  * the chopper's where that is higher, reduces it, too, until the voltage stays there.
  *
+ * Of the room k, 0..1, that both leave for the braking torque, from base speed on a link takes less from longer pulses:
+ *
+ *   on -= (1 - k^2) part (end_max - lead_max),   |T| <= min(1, 4 k) T_mean
+ *
+ * At k = 0 a pulse of the largest torque would begin as far before the aligned position as it ends after it, without a
+ * torque. Its current stays that of the largest one: the windings dissipate what a chopper does not take. Where the
+ * fields of a phase would fill the link at the voltage that it is held at, |T| <= k T_mean instead, as below base
+ * speed.
+ *
  * The torque follows the reference once in a stroke. A speed law with a gain k of the order of the stroke rate f makes
  * every second pulse larger: the error is multiplied by 1 - k / f from stroke to stroke. From base speed on its gain is
  * reduced, at an eighth above it to f / 4.
@@ -78,6 +87,7 @@ typedef struct {
     torque_sharing_parameters_t sharing;
     conduction_t initial;   /* torque sharing without advance */
     bool single_pulse;      /* false: torque sharing only */
+    uint8_t longer_pulses;  /* 3: where the DC link limits the braking torque, from base speed on; 0: never */
     int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
     int32_t torque_max_q24;
     int32_t advance_step_q30; /* per update with torque shortfall, Q1.30 */
@@ -124,6 +134,7 @@ typedef struct {
     conduction_place_t place;
     conduction_pulse_t pulse;
     bool braking;             /* torque against the rotation */
+    uint16_t room_q15;        /* of the DC link for braking torque, part of the largest, Q1.15, 0..1 */
     int32_t motoring_max_q24; /* largest mean torque, by magnitude, N m, Q7.24 */
     int32_t braking_max_q24;
     int32_t link_q30;       /* slow part of the braking limit, Q1.30, 0..1 */
@@ -139,11 +150,13 @@ typedef struct {
     int32_t level_q15;       /* Q1.15, 0..1 */
     int32_t part_q15;        /* of the largest mean torque, Q1.15, 0..1 */
     bool single_pulse;       /* the torque pulsates, or a phase turns on before its half */
+    uint16_t way_q15;        /* from a braking pulse to one without a torque, Q1.15, 0..1 */
     conduction_part_t part;
     conduction_interval_t interval; /* of the half with the torque */
     int32_t ripple_q24;             /* to add to the magnitude of the torque reference, N m, Q7.24 */
     conduction_t angles[2];         /* of the last two updates */
     unsigned latest;                /* index of the last, or CONDUCTION_INITIAL */
+    uint32_t longer;                /* by which a braking pulse begins earlier, 2^-32 electrical rev */
 } conduction_state_t;
 
 typedef struct {
@@ -174,6 +187,8 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->torque_min_q24 = parameters->torque_min_q24;
     state->torque_max_q24 = parameters->torque_max_q24;
     state->link_q30 = 1 << 30;
+    state->room_q15 = 1 << 15;
+    state->longer = 0;
     state->advance_q30 = 0;
     state->trim_q30 = 0;
     state->level_q15 = 0;

@@ -269,11 +269,17 @@ static conduction_parameters_t conduction_from(const int32_t *values, const mach
     const int32_t mean_range_q6 = fold_back_range_q6(over_voltage_q6, tables->mean_fold_back_q6);
     /* A chopper is to have something left to take. */
     const int32_t end_q6 = range_q6 / 2 < mean_range_q6 * 3 / 4 ? range_q6 / 2 : mean_range_q6 * 3 / 4;
+    /* Twice the largest braking torque: a larger one would hardly leave a range. */
+    const int32_t link_torque_q24 =
+        fixed_clamp(values[PARAMETER_TORQUE_MAX_NM], 0,
+                    fixed_shift_up_saturate_bits(tables->pulse[CONDUCTION_BRAKING][0].mean_torque, 17, 32));
     return (conduction_parameters_t){
         .sharing = sharing,
         .initial = conduction_initial(&base_window),
         /* A reserve loads both halves against each other: turn-on of one leads into the other. */
         .single_pulse = sharing.overlapping && values[PARAMETER_TORQUE_RESERVE_NM] == 0,
+        /* Not where the limit of each period reduces the torque at the voltage that their feedback holds. */
+        .longer_pulses = range_q6 + end_q6 < mean_range_q6 * 7 / 4 ? 3 : 0,
         .torque_min_q24 = torque_min_q24,
         .torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM],
         .advance_step_q30 =
@@ -287,7 +293,7 @@ static conduction_parameters_t conduction_from(const int32_t *values, const mach
         .fold_back_range_q6 = mean_range_q6 - mean_range_q6 / 4 + 1,
         .full_link_q6 = over_voltage_q6 - end_q6,
         .full_link_range_q6 = range_q6 - end_q6 + 1,
-        .full_link_slope_q18 = values[PARAMETER_TORQUE_MAX_NM] / (range_q6 - end_q6 + 1),
+        .full_link_slope_q18 = link_torque_q24 / (range_q6 - end_q6 + 1),
     };
 }
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from salient.bench.bench import Bench
+from salient.paths import MACHINES
 
 OVER_VOLTAGE_V = 300.0
 CAPACITANCE_F = 2.2e-3
@@ -86,3 +87,43 @@ def test_a_chopper_that_opens_while_it_conducts_takes_no_more(make_bench):
     voltage_V = bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].last
     assert 275 < conducting_V < 292
     assert voltage_V == pytest.approx(conducting_V, abs=0.1)
+
+
+@pytest.mark.parametrize("chopper_ohm", [12.0, 16.0, 24.0, None])
+@pytest.mark.parametrize("speed_rpm", [2250, 3000])
+def test_the_largest_braking_torque_of_the_current_limit_at_once_is_no_trip(
+        make_bench, tmp_path, chopper_ohm, speed_rpm):
+    """Three times the torque that the fields are reckoned with by default, above base speed, at a held speed."""
+    text = (MACHINES / "finite_element.toml").read_text()
+    if chopper_ohm is None:
+        text = "\n".join(line for line in text.splitlines() if not line.startswith("chopper_"))
+    (tmp_path / "finite_element.csv").write_bytes((MACHINES / "finite_element.csv").read_bytes())
+    file = tmp_path / "finite_element.toml"
+    file.write_text(text.replace("chopper_resistance_ohm = 12.0", f"chopper_resistance_ohm = {chopper_ohm}"))
+    bench = make_bench(machine=str(file), controller="salient")
+    bench.drive.parameters["torque_max_Nm"] = 100
+    bench.rig.truth_period_us = 200
+    bench.rig.held_speed_rpm = speed_rpm
+    bench.run_for(0.4)
+    bench.drive.torque_reference_Nm = -100
+    bench.run_for(0.4)
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+    assert 0.96 * OVER_VOLTAGE_V < max(bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].value) < OVER_VOLTAGE_V
+
+
+def test_windings_dissipate_what_the_chopper_does_not_take(make_bench):
+    """At twice the base speed; 290 V at 12 ohm are 22.3 N m, and pulses of the least current lose 1.5 N m."""
+    bench = make_bench(machine="finite_element", controller="salient")
+    bench.drive.parameters["torque_max_Nm"] = 100
+    bench.rig.truth_period_us = 50
+    bench.rig.held_speed_rpm = 3000
+    bench.run_for(0.4)
+    bench.drive.torque_reference_Nm = -100
+    bench.run_for(0.1)
+    begin_s = bench.time_s
+    bench.run_for(0.1)
+    assert bench.drive.fault == "none"
+    torque_Nm = bench.truth["RIG_TRUTH_MOTION.torque_Nm"].between(begin_s, bench.time_s).value
+    assert 24.95 < -np.mean(torque_Nm) < 27.12, "0.92 of the bound of torque_speed, and the bound"
+    voltage_V = bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].between(begin_s, bench.time_s).value
+    assert 288 < np.min(voltage_V) < np.max(voltage_V) < 293, "it is steady"

@@ -103,6 +103,7 @@ struct model_t {
     double lead = 0.0, end = 0.0, smooth = 0.0, mean = 0.0, peak = 0.0;
     double torque_min = 0.0, torque_max = 0.0, gain_excess = 0.0, ripple = 0.0;
     double link = 1.0;
+    bool longer = false; // pulses where the link limits
     double turn_on_lead = 0.0, enter = 0.0, leave = 0.0, envelope_end = 0.0, envelope_flux_Wb = 0.0;
 
     template <typename value_of_t> double at(double index, value_of_t value_of) const {
@@ -182,7 +183,8 @@ struct model_t {
         link = std::clamp(link + 1.0 / 50.0 / 16.0 * (free < 0.0 ? 32.0 * free : free), 0.0, 1.0);
         const double room = std::min(free + 1.0, 1.0) * link;
         const double motoring_max = std::min(largest(false, index), TORQUE_MAX_NM);
-        const double braking_max = std::min(largest(true, index) * room, TORQUE_MAX_NM);
+        const double kept = longer ? std::min(room * (1.0 + 3.0 * partial), 1.0) : room;
+        const double braking_max = std::min(largest(true, index) * kept, TORQUE_MAX_NM);
         torque_max = s.speed < 0.0 ? braking_max : motoring_max;
         torque_min = -(s.speed < 0.0 ? motoring_max : braking_max);
 
@@ -204,7 +206,8 @@ struct model_t {
         single_pulse = level > 0.0;
         at_threshold = level < 0.001;
         if (partial > 0.0) {
-            const auto [pulse_on, pulse_end, pulse_ripple] = pulse_for(index);
+            auto [pulse_on, pulse_end, pulse_ripple] = pulse_for(index);
+            pulse_on -= longer && braking ? std::max(end - lead, 0.0) * (1.0 - room * room) * part : 0.0;
             on = blend(on, pulse_on, partial);
             leave = blend(leave, pulse_end, partial);
             ripple = blend(ripple, pulse_ripple + trim * mean, partial);
@@ -279,15 +282,17 @@ class Conduction : public testing::Test {
 };
 
 TEST_F(Conduction, equals_its_model_in_every_quadrant_at_all_speeds_and_voltages) {
-    unsigned sharing = 0, blended = 0, full = 0;
-    for (const double direction : {1.0, -1.0}) {
+    unsigned sharing = 0, blended = 0, full = 0, longer = 0;
+    for (const double direction : {1.0, -1.0, 2.0, -2.0}) {
+        parameters.longer_pulses = std::fabs(direction) > 1.0 ? 3 : 0;
         for (const double sign : {1.0, -1.0}) {
             for (const double of_last : {0.0, 0.2, 0.41, 0.5, 0.75, 1.0, 1.4}) {
                 for (const double voltage : {160.0, 240.0, 288.0, 296.0, 310.0}) {
                     for (const double torque : {0.0, 5.0, 14.0, 18.0, 22.0, 38.0}) {
                         conduction_reset(&parameters, &state);
                         model_t model{tables};
-                        const double speed = direction * of_last * SPEED_MAX_RAD_S;
+                        model.longer = parameters.longer_pulses > 0;
+                        const double speed = std::copysign(of_last * SPEED_MAX_RAD_S, direction);
                         const sample_t s{sign * torque, sign * 0.9 * torque, sign * 0.1 * torque, speed,
                                          voltage,       of_last * 0.1};
                         for (unsigned k = 0; k < 60; k++) {
@@ -297,6 +302,7 @@ TEST_F(Conduction, equals_its_model_in_every_quadrant_at_all_speeds_and_voltages
                         compare(model, std::to_string(sign * torque) + " N m, " + std::to_string(speed) + " rad/s, " +
                                            std::to_string(voltage) + " V");
                         ++(state.level_q15 == 0 ? sharing : state.level_q15 < 32768 ? blended : full);
+                        longer += model.braking && model.partial > 0.0 && state.longer > 0;
                     }
                 }
             }
@@ -305,6 +311,7 @@ TEST_F(Conduction, equals_its_model_in_every_quadrant_at_all_speeds_and_voltages
     EXPECT_GT(sharing, 100u);
     EXPECT_GT(blended, 50u);
     EXPECT_GT(full, 50u);
+    EXPECT_GT(longer, 50u);
 }
 
 TEST_F(Conduction, follows_its_model_through_the_transition_on_a_sagging_dc_link) {
@@ -402,6 +409,7 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
             }
             tables.pulse_base_index = uint16_t(1 + random() % 4096);
             tables.pulse_index_scale = random() >> 1;
+            parameters.longer_pulses = k % 200 == 0 ? 3 : 0;
             conduction_reset(&parameters, &state);
         }
         const conduction_sample_t sample{any(), any(), any(), any(), uint32_t(random()), any() >> 15};
@@ -414,6 +422,9 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
         ASSERT_LE(state.advance_q30, 1 << 30);
         ASSERT_GE(state.link_q30, 0);
         ASSERT_LE(state.link_q30, 1 << 30);
+        ASSERT_LE(state.room_q15, 32768);
+        ASSERT_LE(state.way_q15, parameters.longer_pulses > 0 ? 32768 : 0);
+        ASSERT_LT(state.longer, 1u << 31);
         ASSERT_GE(state.gain_excess_q31, 0);
         ASSERT_LE(state.torque_min_q24, 0);
         ASSERT_GE(state.torque_min_q24, parameters.torque_min_q24);

@@ -321,12 +321,13 @@ TEST(Configure, braking_torque_decreases_over_the_last_32nd_of_the_voltage_or_ov
     const double trip_V = parameters.values[PARAMETER_BUS_OVER_VOLTAGE_V] / 64.0;
     struct {
         double range_V, mean_V, begin_V, end_V, mean_begin_V, mean_end_V;
+        bool longer_pulses;
     } const rows[] = {
-        {0.0, 0.0, 1.0 / 32, 1.0 / 64, 1.0 / 32, 1.0 / 128},
-        {0.01, 0.005, 1.0 / 32, 1.0 / 64, 1.0 / 32, 1.0 / 128},
-        {0.08, 0.08, 0.08, 0.04, 0.08, 0.02},
-        {0.12, 0.10, 0.12, 0.06, 0.10, 0.025},
-        {0.12, 0.06, 0.12, 0.045, 0.06, 0.015}, // a chopper above the middle
+        {0.0, 0.0, 1.0 / 32, 1.0 / 64, 1.0 / 32, 1.0 / 128, true},
+        {0.01, 0.005, 1.0 / 32, 1.0 / 64, 1.0 / 32, 1.0 / 128, true},
+        {0.08, 0.08, 0.08, 0.04, 0.08, 0.02, true},
+        {0.12, 0.10, 0.12, 0.06, 0.10, 0.025, false},
+        {0.12, 0.06, 0.12, 0.045, 0.06, 0.015, false}, // a chopper above the middle
     };
     for (const auto &row : rows) {
         tables.fold_back_q6 = uint16_t(row.range_V * trip_V * 64.0);
@@ -342,6 +343,16 @@ TEST(Configure, braking_torque_decreases_over_the_last_32nd_of_the_voltage_or_ov
         EXPECT_EQ(conduction_braking_q24(&c, c.full_link_q6), 0);
         EXPECT_EQ(conduction_braking_q24(&c, begin_q6 - 1), INT32_MAX);
         EXPECT_NEAR(conduction_braking_q24(&c, begin_q6), parameters.values[PARAMETER_TORQUE_MAX_NM], 2e-3 * (1 << 24));
+        EXPECT_EQ(c.longer_pulses, row.longer_pulses ? 3 : 0);
+    }
+    // A larger limit of the torque than the machine brakes with leaves the range for what it brakes with.
+    parameters.values[PARAMETER_TORQUE_MAX_NM] = 100 << 24;
+    for (const unsigned largest_Nm : {20u, 40u, 60u}) {
+        tables.pulse[CONDUCTION_BRAKING][0].mean_torque = uint16_t(largest_Nm << 8);
+        const conduction_parameters_t c =
+            configure_control(&parameters, &tables, 40000, 17, 12, fixed_point::TIMER_CLOCK_HZ).conduction;
+        EXPECT_NEAR(conduction_braking_q24(&c, c.full_link_q6 - c.full_link_range_q6) / double(1 << 24),
+                    std::min(2.0 * largest_Nm, 100.0), 0.03);
     }
 }
 

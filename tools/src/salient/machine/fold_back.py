@@ -6,18 +6,24 @@ sqrt(V^2 + 2 W / C), near the over-voltage threshold V_max by about
     rise = W / (C V_max)
 
 Torque and field of a phase decrease together, whether it is saturated or not. Without a chopper braking torque
-decreases from 2 rise below V_max on, and there is none within the last rise; a chopper takes a part in the meantime,
-and 3/4 of both suffice. The range is no more than the room above the supply: a link that is not fuller takes the whole
-torque. Where the field of a phase exceeds that room, even a machine that only motors may raise the link to V_max.
+decreases from 4 rise below V_max on, and there is none within the last 2: more than one phase carries current when the
+torque is taken away, and they brake until it has ended. A chopper that takes half of the current limit or more at V_max
+leaves 3/8 of both. A weaker one leaves more, but no more than leaves a torque at the voltage at which it begins. The
+range is no more than the room above the supply: a link that is not fuller takes the whole torque. Where the field of a
+phase exceeds that room, even a machine that only motors may raise the link to V_max.
 """
 
 from __future__ import annotations
 
+import math
+
 from salient.machine.definition import Machine
 from salient.machine.drive_data import DriveData
 
-_RISES = 2.0
-_RISES_WITH_CHOPPER = 1.5
+_RISES, _RISES_LEAST = 4.0, 1.5
+_STRONG_CHOPPER = 0.5
+"""Its current, of the current limit."""
+_ROOM_ABOVE_CHOPPER = 1.75
 
 
 def fold_back_V(machine: Machine, data: DriveData) -> float:
@@ -28,8 +34,12 @@ def fold_back_V(machine: Machine, data: DriveData) -> float:
     if link is None:
         return 0.0
     rise_V = field_J(machine, data.parameters["current_limit_A"]) / (link["capacitance_F"] * data.bus_over_voltage_V)
-    rises = _RISES_WITH_CHOPPER if "chopper_on_V" in link else _RISES
-    return min(rises * rise_V, data.bus_over_voltage_V - data.supply_max_V)
+    taken_A = data.bus_over_voltage_V / link.get("chopper_resistance_ohm", math.inf)
+    strength = taken_A / (_STRONG_CHOPPER * data.parameters["current_limit_A"])
+    rises = max(_RISES_LEAST, _RISES - (_RISES - _RISES_LEAST) * strength)
+    above_chopper_V = _ROOM_ABOVE_CHOPPER * (data.bus_over_voltage_V - link.get("chopper_on_V", 0.0))
+    range_V = max(_RISES_LEAST * rise_V, min(rises * rise_V, above_chopper_V))
+    return min(range_V, data.bus_over_voltage_V - data.supply_max_V)
 
 
 def mean_fold_back_V(machine: Machine, data: DriveData) -> float:
