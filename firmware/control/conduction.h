@@ -40,7 +40,7 @@
  *
  * Of the room k, 0..1, that both leave for the braking torque, from base speed on a link takes less from longer pulses:
  *
- *   on -= (1 - k^2) part (end_max - lead_max),   |T| <= min(1, 4 k) T_mean
+ *   on -= (1 - k^2) part (end_max - lead_max),   |T| <= min(1, (1 + 3 part) k) T_mean
  *
  * At k = 0 a pulse of the largest torque would begin as far before the aligned position as it ends after it, without a
  * torque. Its current stays that of the largest one: the windings dissipate what a chopper does not take. Where the
