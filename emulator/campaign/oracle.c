@@ -9,6 +9,7 @@
 
 #define RECENT_NS (2 * ORACLE_MS_NS)
 #define MARGIN 1.02
+#define CONDUCTING 0.05 /* of the trip current */
 #define HALF_TURN (UINT32_C(1) << 31)
 #define UNDER_VOLTAGE_PART 0.94
 #define STO_DIFFERED_US 215000 /* lines of safe torque off: then both have to be off once */
@@ -63,6 +64,9 @@ static void look_at_currents(oracle_t *oracle, const plant_t *plant, unsigned ga
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         const double current_A = plant_current_A(plant, phase);
         oracle->current_recent_A = fmax(oracle->current_recent_A, current_A);
+        if (current_A > CONDUCTING * oracle->world->machine->trip_current_A) {
+            oracle->conducted_ns[phase] = plant->time_ns;
+        }
         if (!(gates >> phase & 1u) || current_A <= threshold_A || threshold_A == 0.0) {
             continue;
         }

@@ -28,8 +28,8 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     [FAULT_GATE_SUPPLY_LOST] = BIT(CAUSE_PHASE_OPEN) | BIT(CAUSE_CURRENT_SENSOR) | BIT(CAUSE_STALL),
     [FAULT_SWITCH_SHORTED] = PHASE | CURRENT,
     [FAULT_DIODE_OPEN] = PHASE | CURRENT,
-    [FAULT_WINDING_SHORTED] = PHASE | CURRENT,
-    [FAULT_WINDING_TO_EARTH] = PHASE | CURRENT,
+    [FAULT_WINDING_SHORTED] = PHASE | CURRENT | BIT(CAUSE_STALL), /* without a torque of its own */
+    [FAULT_WINDING_TO_EARTH] = PHASE | CURRENT | BIT(CAUSE_STALL),
     [FAULT_CURRENT_SENSOR_OPEN] = PHASE | CURRENT | MECHANICS,
     [FAULT_CURRENT_SENSOR_STUCK] = PHASE | CURRENT | MECHANICS,
     [FAULT_CURRENT_SENSOR_LOW_RAIL] = PHASE | CURRENT | MECHANICS,
@@ -178,6 +178,16 @@ static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *pl
     }
 }
 
+/* No two phases have had a current to speak of in the last quarter of a second. */
+static bool conducts_alone(const oracle_t *oracle, const plant_t *plant) {
+    unsigned conducting = 0;
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        const uint64_t last_ns = oracle->conducted_ns[phase];
+        conducting += last_ns != 0 && plant->time_ns < last_ns + 250 * ORACLE_MS_NS;
+    }
+    return conducting < 2;
+}
+
 /* One of the causes has been an earlier one. */
 static bool named(const oracle_t *oracle, uint32_t causes) {
     bool any = false;
@@ -207,12 +217,12 @@ void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
             any = any || causes;
         }
     }
-    /* With one phase that has conducted so far a wrong current and a wrong angle, or one that does not move, are the
+    /* With one phase that has conducted lately a wrong current and a wrong angle, or one that does not move, are the
      * same; and two phases with faults of their own are what a wrong angle looks like. */
     const unsigned phases = oracle_phases_at_fault(oracle, now_us);
     const bool of_phase = oracle_any_injected(oracle, FAULT_WINDING_OPEN, FAULT_CURRENT_SENSOR_SWAPPED);
     const bool of_encoder = oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_SLIP);
-    if (!oracle->turned) {
+    if (!oracle->turned || conducts_alone(oracle, plant)) {
         allowed |= (of_phase ? ENCODER : 0) | (of_encoder ? PHASE : 0);
     }
     /* An encoder that has been named, and is run with again, is wrong from the start. */
