@@ -182,11 +182,11 @@ typedef struct {
     unsigned over_current_looks;
     double speed_recent_rad_s, voltage_recent_high_V, voltage_recent_low_V, current_recent_A;
     uint64_t recent_ns;
-    double run_angle_rad;                  /* of the rotor at the start of the run */
-    bool turned;                           /* by a stroke since */
-    uint64_t conducted_ns[HAL_PHASES_MAX]; /* when a phase last had a current to speak of */
-    uint64_t fault_ns;                     /* the last fault began or ended */
-    double encoder_offset_rev;             /* on the shaft, in counting direction */
+    double run_angle_rad;                                                 /* of the rotor at the start of the run */
+    bool turned;                                                          /* by a stroke since */
+    uint64_t conducting_ns[HAL_PHASES_MAX], conducted_ns[HAL_PHASES_MAX]; /* since when, last for a millisecond */
+    uint64_t fault_ns;                                                    /* the last fault began or ended */
+    double encoder_offset_rev;                                            /* on the shaft, in counting direction */
     oracle_stretch_t stretch;
     /* Recovery. */
     double recovery_rpm;
