@@ -397,6 +397,12 @@ static void draw_request(world_t *world, uint64_t last_us) {
     }
 }
 
+/* Of two phases, one after the other. */
+static bool loses_two(uint64_t seed) {
+    return seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE / 2.0 &&
+           seeded_unit(seed, STREAM_REQUEST, 12) < SECOND_LOSS_SHARE;
+}
+
 static bool lasting(uint64_t seed) {
     return seeded_unit(seed, STREAM_REQUEST, 11) < LASTING_SHARE;
 }
@@ -420,7 +426,7 @@ static void draw_faults(world_t *world, uint64_t last_us) {
     if (seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE / 2.0) {
         const unsigned first = seeded_below(seed, STREAM_REQUEST, 5, 4), from = world->events;
         draw_fault(world, endured[first], last_us);
-        if (seeded_unit(seed, STREAM_REQUEST, 12) < SECOND_LOSS_SHARE) {
+        if (loses_two(seed)) {
             draw_fault(world, endured[(first + 1) % 4], last_us);
             for (unsigned i = from; i < world->events; i++) {
                 world->event[i].end_us = last_us;
@@ -462,7 +468,8 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
     const bool deserted =
         (sort >= SILENT_PART && sort < DESERTED_PART) || (sort >= HOSTILE_PART && sort < DESERTED_SECOND_PART);
-    const bool is_long = sort < 0.04 || deserted || lasting(seed) || seeded_unit(seed, STREAM_SCRIPT, 8) < LONG_SHARE;
+    const bool is_long =
+        sort < 0.04 || deserted || lasting(seed) || loses_two(seed) || seeded_unit(seed, STREAM_SCRIPT, 8) < LONG_SHARE;
     last_us = is_long ? 900000 : last_us;
     world->recovery_us = last_us + 25000;
     add_speed(world, first_rpm, 0);

@@ -30,7 +30,7 @@ from salient.paths import BUILD, ROOT
 
 FILE = ROOT / "tests" / "campaign" / "canaries.toml"
 RESULTS = "canaries.json"
-SEEDS_MAX = 3000
+SEEDS_MAX = 6000
 _CHUNK = 20
 _TARGETS = ("salient_campaign", "salient_host")
 
