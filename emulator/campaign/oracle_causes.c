@@ -49,7 +49,8 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     [FAULT_ENCODER_LOST_COUNTS] =
         ENCODER | BIT(CAUSE_STALL) | BIT(CAUSE_OVER_SPEED), /* of the counts, where they jump */
     [FAULT_ENCODER_NOISE] = ENCODER,
-    [FAULT_ENCODER_REVERSED] = ENCODER | BIT(CAUSE_STALL),
+    /* About the angle of the reversal one phase looks as before, and two as if their currents were exchanged. */
+    [FAULT_ENCODER_REVERSED] = ENCODER | PHASE | BIT(CAUSE_STALL),
     [FAULT_ENCODER_SLIP] = ENCODER | BIT(CAUSE_STALL),
     [FAULT_ENCODER_NO_ANSWER] = ENCODER | BIT(CAUSE_STALL),
     [FAULT_SHAFT_LOCKED] = ENCODER | MECHANICS,
@@ -158,8 +159,9 @@ static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *pl
                          oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
                          oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, now_us) ||
                          oracle_overhauled(oracle, plant->speed_rad_s);
-    const bool near_limit = !oracle->meant.torque && oracle->world->controller != 2 &&
-                            fabs(oracle->meant.reference) > 0.8 * oracle->world->machine->over_speed_rpm;
+    const double near = oracle->world->controller == 2 ? 0.97 : 0.8; /* an overshoot of one quadrant stays */
+    const bool near_limit =
+        !oracle->meant.torque && fabs(oracle->meant.reference) > near * oracle->world->machine->over_speed_rpm;
     switch (cause) {
     case CAUSE_OVER_CURRENT:
     case CAUSE_HARDWARE_OVER_CURRENT:
@@ -169,7 +171,7 @@ static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *pl
                oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) ||
                oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, now_us);
     case CAUSE_OVER_SPEED:
-        return unsound || near_limit; /* which an overshoot of one quadrant may exceed */
+        return unsound || near_limit;
     case CAUSE_OVER_VOLTAGE:
         return unsound || oracle_any_injected(oracle, FAULT_SUPPLY_LOST, FAULT_SUPPLY_RIPPLE) ||
                oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT);
@@ -225,9 +227,12 @@ void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
     if (!oracle->turned || conducts_alone(oracle, plant)) {
         allowed |= (of_phase ? ENCODER : 0) | (of_encoder ? PHASE : 0);
     }
-    /* An encoder that has been named, and is run with again, is wrong from the start. */
+    /* What has been named, and is run with again, is wrong from the start. */
     if (of_encoder && named(oracle, ENCODER)) {
         allowed |= PHASE;
+    }
+    if (of_phase && named(oracle, PHASE | CURRENT)) {
+        allowed |= ENCODER;
     }
     if ((phases & (phases - 1u)) != 0) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);

@@ -28,6 +28,8 @@ static bool torque_follows(const oracle_t *oracle, const plant_t *plant) {
            plant->time_ns > oracle->state_ns + TORQUE_SETTLED_NS &&
            plant->time_ns < oracle->run_ns + TORQUE_SETTLED_NS &&
            fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S < TORQUE_SPEED * oracle->world->machine->speed_base_rpm &&
+           (oracle->world->controller == 2 ||
+            plant->speed_rad_s > 0.0) && /* one quadrant brakes a rotor that turns back */
            undisturbed(oracle);
 }
 

@@ -469,12 +469,20 @@ MAGNETICS_INLINE void add_link_energies(plant_t *plant, const integrator_setting
 /* Within this distance of its threshold a comparator responds. */
 #define TRIP_TOLERANCE_A 1e-6
 
+/* Events in succession after steps as short as that are those of a current that either side of zero drives back: an
+ * earthed winding's, when the voltages of the others hold it there. A step of PASS_S then passes them, and leaves it at
+ * zero or above. */
+#define CHATTER_EVENTS 8u
+#define CHATTER_STEP_S 1e-12
+#define PASS_S 1e-7
+
 /* Integrates from time_ns to `to_ns` with constant switch states, or to the time at which a comparator opens them. */
 static void integrate(plant_t *plant, uint64_t to_ns) {
     double length_s = (double)(to_ns - plant->time_ns) * NS_S;
     integrator_setting_t setting;
     integrator_state_t start, end;
     bool find = true;
+    unsigned chatter = 0;
     for (double at_s = 0.0; at_s < length_s;) {
         integrator_derivative_t first;
         integrator_integrals_t integrals;
@@ -489,11 +497,18 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
         }
         integrator_differentiate(&setting, &start, &first);
         double step_s = step_length_s(plant, &setting, &first, length_s - at_s);
+        const bool passes = chatter >= CHATTER_EVENTS;
+        step_s = passes && step_s > PASS_S ? PASS_S : step_s;
         integrator_step(&setting, &start, &first, step_s, &end, &integrals);
-        const bool event = distance_to_event(&setting, &end) < 0.0;
+        const bool event = !passes && distance_to_event(&setting, &end) < 0.0;
+        if (passes) {
+            snap_to_event(&setting, &end);
+        }
+        chatter = event ? chatter : 0;
         if (event) {
             step_s = step_to_event(&setting, &start, &first, step_s, &end, &integrals);
             snap_to_event(&setting, &end);
+            chatter = step_s < CHATTER_STEP_S ? chatter + 1u : 0;
         }
         if (plant->sample != NULL) {
             sample_step(plant, &setting, &start, &first, &end, at_s, step_s, to_ns);
@@ -518,7 +533,7 @@ static void integrate(plant_t *plant, uint64_t to_ns) {
             }
         }
         start = end;
-        find = event || setting.stuck;
+        find = event || passes || setting.stuck;
     }
     plant->time_ns = to_ns;
 }
