@@ -100,7 +100,8 @@ static unsigned lost_phases(const oracle_t *oracle, uint64_t now_us) {
 
 /* A drive that turns its rotor with one phase lost does not with two. */
 static void look_at_lost_phases(oracle_t *oracle, const plant_t *plant) {
-    const bool drives = oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
+    const bool heard = plant->time_ns < oracle->run_ns + HEARD_NS && !oracle_bus_disturbed(oracle);
+    const bool drives = heard && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
                         !oracle->meant.torque &&
                         fabs(oracle->meant.reference) > MISLED_SPEED * oracle->world->machine->speed_base_rpm;
     oracle_since(&oracle->detection.lost_ns, drives && lost_phases(oracle, plant->time_ns / 1000) > 1, plant->time_ns);
