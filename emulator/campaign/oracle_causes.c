@@ -86,6 +86,8 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     [FAULT_CLOCK_DRIFT] = BIT(CAUSE_CLOCK),
 };
 
+#define STALLED_NS (200 * ORACLE_MS_NS)
+
 #define BUS (BIT(CAUSE_COMMAND_TIMEOUT) | BIT(CAUSE_COMMAND_ERROR) | BIT(CAUSE_IDENTIFIER_CONFLICT))
 
 static uint32_t causes_of_variable(unsigned variable) {
@@ -132,6 +134,8 @@ static bool true_of_plant(const oracle_t *oracle, unsigned cause, const plant_t 
     case CAUSE_OVER_SPEED:
         return fmax(oracle->speed_recent_rad_s, fabs(plant->speed_rad_s)) * ORACLE_RPM_PER_RAD_S >
                0.95 * machine->over_speed_rpm;
+    case CAUSE_STALL: /* within a stroke, although a speed is commanded */
+        return oracle->detection.blocked_ns && plant->time_ns > oracle->detection.blocked_ns + STALLED_NS;
     default:
         return false;
     }

@@ -5,8 +5,8 @@
 #include "fixed/fixed.h"
 
 /* Speed of three strokes in STALL_SWING_US, in 2^-22 rad/s, times the strokes of a revolution, without the unit of
- * speed: 3 * 2 pi rad / 0.25 s. */
-#define THREE_STROKES_Q22 UINT32_C(316243071)
+ * speed: 3 * 2 pi rad / 0.225 s. */
+#define THREE_STROKES_Q22 UINT32_C(351381190)
 
 #define ONE_REV_Q24 (1 << 24)
 
@@ -37,15 +37,17 @@ static bool widens_range(stall_monitor_t *monitor) {
     return true;
 }
 
-/* The rotor has come no further in either direction while the reference has turned by three strokes, which takes it
- * STALL_SWING_US at least, however fast it is. */
+/* The rotor has come no further in either direction for STALL_SWING_US and the time in which the reference turns by
+ * three strokes: r, of at most 4 f, and f have r f / (r + f), the speed of three strokes in the sum of their times.
+ * Factors below 2^16. */
 static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *input, bool begins, uint32_t time_us) {
     const uint32_t strokes = (uint32_t)machine_tables.rotor_poles * machine_tables.phases;
-    const uint32_t fastest_q22 = (THREE_STROKES_Q22 >> machine_tables.speed_exponent) / strokes;
-    const uint32_t reference_q22 = fixed_magnitude(input->speed_reference_q22);
+    const uint32_t swing_q10 = (THREE_STROKES_Q22 >> machine_tables.speed_exponent) / strokes >> 12;
+    uint32_t reference_q10 = fixed_magnitude(input->speed_reference_q22) >> 12;
+    reference_q10 = reference_q10 < 4 * swing_q10 ? reference_q10 : 4 * swing_q10;
     monitor->ahead_q24 += (int32_t)(input->electrical - monitor->electrical) / 256;
-    monitor->travel += (uint64_t)(reference_q22 < fastest_q22 ? reference_q22 : fastest_q22) *
-                       (time_us - monitor->looked_us); /* below 2^59 */
+    monitor->travel +=
+        (uint64_t)(reference_q10 * swing_q10 / (reference_q10 + swing_q10)) * (time_us - monitor->looked_us);
     monitor->electrical = input->electrical;
     monitor->looked_us = time_us;
     if (begins) {
@@ -54,7 +56,7 @@ static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *inp
     if (widens_range(monitor) || begins) {
         monitor->travel = 0;
     }
-    return monitor->travel > (uint64_t)fastest_q22 * STALL_SWING_US;
+    return monitor->travel > (uint64_t)swing_q10 * STALL_SWING_US;
 }
 
 COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us) {

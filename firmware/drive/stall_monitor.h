@@ -8,9 +8,10 @@
  * leads to over-speed instead. A start that takes up to 12 s from standstill to the reference is none. A reference of 0
  * is held as long as the currents can be. A reference that changes its sign begins anew.
  *
- * Or, whatever the torque: for STALL_SWING_US, and for the time in which the reference turns by three strokes, the rotor
- * has come no further than it had been, by half a stroke in either direction, and has turned backwards within
- * STALL_TIME_US. With a phase lost it may swing between two angles for ever, at times faster than the reference.
+ * Or, whatever the torque: for STALL_SWING_US and the time in which the reference turns by three strokes, at most 12 of
+ * them a STALL_SWING_US, the rotor has come no further than it had been, by half a stroke in either direction, and has
+ * turned backwards within STALL_TIME_US. With a phase lost it may swing between two angles for ever, at times faster
+ * than the reference.
  */
 #ifndef DRIVE_STALL_MONITOR_H
 #define DRIVE_STALL_MONITOR_H
@@ -19,7 +20,7 @@
 #include <stdint.h>
 
 #define STALL_TIME_US 100000u
-#define STALL_SWING_US 250000u
+#define STALL_SWING_US 225000u
 
 typedef struct {
     bool speed_mode;              /* state RUN, speed mode */
