@@ -115,6 +115,8 @@ typedef struct {
 typedef struct {
     uint64_t looked_ns, misled_ns, blocked_ns, lost_ns, status_ns;
     double blocked_angle_rad;
+    uint64_t stroke_ns;             /* the rotor was last a stroke from where it had been, */
+    double stroke_rad;              /* here */
     double largest_flux_Wb;         /* aligned, at the trip current */
     double flux_Wb[HAL_PHASES_MAX]; /* applied to a phase without any current, V s */
 } oracle_detection_t;

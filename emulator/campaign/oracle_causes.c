@@ -134,8 +134,8 @@ static bool true_of_plant(const oracle_t *oracle, unsigned cause, const plant_t 
     case CAUSE_OVER_SPEED:
         return fmax(oracle->speed_recent_rad_s, fabs(plant->speed_rad_s)) * ORACLE_RPM_PER_RAD_S >
                0.95 * machine->over_speed_rpm;
-    case CAUSE_STALL: /* within a stroke, although a speed is commanded */
-        return oracle->detection.blocked_ns && plant->time_ns > oracle->detection.blocked_ns + STALLED_NS;
+    case CAUSE_STALL:
+        return plant->time_ns > oracle->detection.stroke_ns + STALLED_NS;
     default:
         return false;
     }

@@ -170,6 +170,10 @@ static void look_at_phases(oracle_t *oracle, const plant_t *plant) {
 static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
     oracle_detection_t *detection = &oracle->detection;
     const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
+    if (fabs(plant->rotor_angle_rad - detection->stroke_rad) > stroke_rad) {
+        detection->stroke_ns = plant->time_ns;
+        detection->stroke_rad = plant->rotor_angle_rad;
+    }
     const bool heard = plant->time_ns < oracle->run_ns + HEARD_NS && !oracle_bus_disturbed(oracle);
     const bool pushes = heard && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
                         !oracle->meant.torque &&
