@@ -64,6 +64,7 @@ static void look_at_currents(oracle_t *oracle, const plant_t *plant, unsigned ga
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         const double current_A = plant_current_A(plant, phase);
         oracle->current_recent_A = fmax(oracle->current_recent_A, current_A);
+        oracle->surged = oracle->surged || (threshold_A > 0.0 && current_A > 2.0 * threshold_A);
         uint64_t *since_ns = &oracle->conducting_ns[phase];
         oracle_since(since_ns, current_A > CONDUCTING * oracle->world->machine->trip_current_A, plant->time_ns);
         if (*since_ns && plant->time_ns > *since_ns + ORACLE_MS_NS) {

@@ -98,12 +98,14 @@ static unsigned lost_phases(const oracle_t *oracle, uint64_t now_us) {
     return count;
 }
 
-/* A drive that turns its rotor with one phase lost does not with two. */
+/* With two phases lost a drive that does not follow its reference does not run on, as it does with one. */
 static void look_at_lost_phases(oracle_t *oracle, const plant_t *plant) {
     const bool heard = plant->time_ns < oracle->run_ns + HEARD_NS && !oracle_bus_disturbed(oracle);
-    const bool drives = heard && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
-                        !oracle->meant.torque &&
-                        fabs(oracle->meant.reference) > MISLED_SPEED * oracle->world->machine->speed_base_rpm;
+    const double reference_rad_s = fabs(oracle->meant.reference) / ORACLE_RPM_PER_RAD_S;
+    const bool drives =
+        heard && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN && !oracle->meant.torque &&
+        reference_rad_s * ORACLE_RPM_PER_RAD_S > MISLED_SPEED * oracle->world->machine->speed_base_rpm &&
+        fabs(plant->speed_rad_s) < 0.5 * reference_rad_s;
     oracle_since(&oracle->detection.lost_ns, drives && lost_phases(oracle, plant->time_ns / 1000) > 1, plant->time_ns);
     if (oracle->detection.lost_ns && plant->time_ns > oracle->detection.lost_ns + BLOCKED_NS &&
         plant->time_ns > oracle->constant_ns + BLOCKED_NS && !checks_late(oracle, plant->time_ns / 1000)) {

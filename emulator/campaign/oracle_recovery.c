@@ -84,7 +84,7 @@ static bool cause_remains(const oracle_t *oracle) {
     if (oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_PERIOD_REGISTER_FLIPPED)) {
         return true; /* memory that has changed: until a reset */
     }
-    if (sto_lines_differed(oracle) || heated_by_sensor(oracle)) {
+    if (sto_lines_differed(oracle) || heated_by_sensor(oracle) || oracle->surged) {
         return true;
     }
     const uint8_t last = oracle->causes ? oracle->cause[oracle->causes - 1] : 0;
