@@ -381,6 +381,7 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
 void oracle_reset(oracle_t *oracle, uint64_t time_ns, oracle_drive_t drive) {
     oracle->drive = drive;
     oracle->state_ns = oracle->reset_ns = time_ns;
+    oracle->clear_ns = 0; /* a request that goes on begins anew, when the drive listens again */
     oracle->confirmed = false;
 }
 
