@@ -54,16 +54,21 @@
  *   undetected      in state run for longer than a reaction takes with a fault that shows at any time: changed memory,
  *                   sensors at a rail, a wrong clock, a background that hangs (oracle_detection.c)
  *   no_current      voltage on a phase for twenty times its largest flux linkage, and no current at all
- *   two_lost        in state run, a fifth of the base speed commanded, for 300 ms with two phases lost and at less than
- * half of it blocked         a speed commanded, and the rotor within a stroke for 300 ms and three strokes misled for
- * 200 ms, above a fifth of the base speed and a tenth of the trip current, a measured angle off by more than a sixth of
- * a rotor pitch contested       for 150 ms in state run while another client sends commands not_reset       no control
- * interrupt for 60 ms, and no reset mute            no status on an undisturbed bus for 100 ms eventually not_recovered
- * faults over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of the speed 100 ms after the
- * time that half of the torque limit needs, or again in a fault, or with a phase that is not used; judged up to 0.9 of
- * the base speed, above which a start is near the limit of the speed. One quadrant: at most 20 % above, of a light
- * rotor what it gains while a delay and the flux linkage last sometimes cells           (fault, state of the drive,
- * sector of phase a) in which a fault began */
+ *   two_lost        in state run for 300 ms at less than half of the commanded speed, with two phases lost
+ *   blocked         a speed commanded, and the rotor within a stroke for 300 ms and three strokes
+ *   misled          for 200 ms, above a fifth of the base speed and a tenth of the trip current, a measured angle off
+ *                   by more than a sixth of a rotor pitch
+ *   contested       for 150 ms in state run while another client sends commands
+ *   not_reset       no control interrupt for 60 ms, and no reset
+ *   mute            no status on an undisturbed bus for 100 ms
+ * eventually
+ *   not_recovered   faults over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of the
+ *                   speed 100 ms after the time that half of the torque limit needs, or again in a fault, or with a
+ *                   phase that is not used; judged up to 0.9 of the base speed, above which a start is near the limit
+ *                   of the speed. One quadrant: at most 20 % above, of a light rotor what it gains while a delay and
+ *                   the flux linkage last
+ * sometimes
+ *   cells           (fault, state of the drive, sector of phase a) in which a fault began */
 #ifndef CAMPAIGN_ORACLE_H
 #define CAMPAIGN_ORACLE_H
 
