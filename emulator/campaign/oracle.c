@@ -147,15 +147,12 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
 
 /* A link voltage below the threshold, in a run. */
 static void look_at_under_voltage(oracle_t *oracle, const plant_t *plant) {
-    const uint64_t time_us = plant->time_ns / 1000;
     oracle_since(&oracle->low_ns,
                  oracle->drive.state == STATE_RUN && !oracle_link_sensor_faulty(oracle) &&
                      plant->bus_voltage_V < UNDER_VOLTAGE_PART * oracle->world->machine->under_voltage_V,
                  plant->time_ns);
-    if (oracle->low_ns && plant->time_ns > oracle->low_ns + 3 * ORACLE_MS_NS && !oracle_state_changed(oracle) &&
-        !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) &&
-        !oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) &&
-        !oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_us)) {
+    if (oracle->low_ns && plant->time_ns > oracle->low_ns + 3 * ORACLE_MS_NS &&
+        !oracle_drive_disturbed(oracle, plant->time_ns / 1000)) {
         oracle_violate(oracle, "under_voltage", plant->time_ns, 0,
                        plant->bus_voltage_V / oracle->world->machine->under_voltage_V);
     }

@@ -172,9 +172,7 @@ static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *pl
     case CAUSE_HARDWARE_OVER_CURRENT:
         return oracle_any_injected(oracle, FAULT_WINDING_OPEN, FAULT_ENCODER_NO_ANSWER) ||
                oracle_any_injected(oracle, FAULT_SUPPLY_LOST, FAULT_SUPPLY_RIPPLE) ||
-               oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
-               oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) ||
-               oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, now_us);
+               oracle_drive_disturbed(oracle, now_us);
     case CAUSE_OVER_SPEED:
         return unsound || near_limit;
     case CAUSE_OVER_VOLTAGE:

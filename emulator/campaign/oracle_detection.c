@@ -117,7 +117,7 @@ static void look_at_lost_phases(oracle_t *oracle, const plant_t *plant) {
 static void look_at_senders(oracle_t *oracle, uint64_t now_ns) {
     if (oracle_variable_begun(oracle, BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER, now_ns / 1000) ||
         oracle_variable_begun(oracle, BENCH_VARIABLE_BUS_CONNECTION, now_ns / 1000)) {
-        return; /* the drive listens to nobody: its last command ages */
+        return; /* the drive receives no command */
     }
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = &oracle->world->event[i];

@@ -61,3 +61,9 @@ bool oracle_state_changed(const oracle_t *oracle) {
 bool oracle_link_sensor_faulty(const oracle_t *oracle) {
     return oracle_any_injected(oracle, FAULT_DC_LINK_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET);
 }
+
+bool oracle_drive_disturbed(const oracle_t *oracle, uint64_t time_us) {
+    return oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
+           oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) ||
+           oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_us);
+}

@@ -28,13 +28,6 @@ double oracle_encoder_offset_rev(const world_t *world) {
     return offset_deg / 360.0;
 }
 
-/* Interrupts come late, or memory of the drive was changed. */
-static bool drive_disturbed(const oracle_t *oracle, uint64_t time_us) {
-    return oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
-           oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) ||
-           oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_us);
-}
-
 static bool encoder_disturbed(const oracle_t *oracle) {
     return oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER);
 }
@@ -51,13 +44,13 @@ static void look_at_currents_and_link(oracle_t *oracle, const plant_t *plant) {
         const double measured = oracle->drive.current[phase];
         if (is_off(measured, plant_current_A(plant, phase) / ranges->current_A) &&
             !oracle_any_injected(oracle, FAULT_WINDING_SHORTED, FAULT_CURRENT_SENSOR_SWAPPED) &&
-            !drive_disturbed(oracle, time_us)) {
+            !oracle_drive_disturbed(oracle, time_us)) {
             oracle_violate(oracle, "wrong_current", plant->time_ns, phase, measured * ranges->current_A);
         }
     }
     const double measured = oracle->drive.link_voltage;
     if (is_off(measured, plant->bus_voltage_V / ranges->dc_link_V) && !oracle_link_sensor_faulty(oracle) &&
-        !drive_disturbed(oracle, time_us)) {
+        !oracle_drive_disturbed(oracle, time_us)) {
         oracle_violate(oracle, "wrong_voltage", plant->time_ns, 0, measured * ranges->dc_link_V);
     }
 }
@@ -92,7 +85,7 @@ static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
     const double mean_counts = stretch->error_counts / stretch->samples;
     const double tick_counts = fabs(plant->speed_rad_s) / ORACLE_TWO_PI * TIMER_TICK_S * counts_per_rev;
     if (fabs(mean_counts) > ANGLE_ERROR_MAX_COUNTS + tick_counts && !encoder_disturbed(oracle) &&
-        !drive_disturbed(oracle, plant->time_ns / 1000)) {
+        !oracle_drive_disturbed(oracle, plant->time_ns / 1000)) {
         oracle_violate(oracle, "wrong_angle", plant->time_ns, 0, mean_counts);
     }
     stretch->samples = 0;
@@ -101,7 +94,7 @@ static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
 void oracle_judge_temperature(oracle_t *oracle, const plant_t *plant, oracle_heat_t heat) {
     const oracle_heat_t measured = oracle->drive.heat;
     const bool disturbed =
-        drive_disturbed(oracle, UINT64_MAX) ||
+        oracle_drive_disturbed(oracle, UINT64_MAX) ||
         oracle_any_injected(oracle, FAULT_WINDING_TEMPERATURE_SENSOR_OPEN, FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET);
     if (!disturbed && heat.winding_C < TEMPERATURE_MAX_C &&
         fabs(measured.winding_C - heat.winding_C) > TEMPERATURE_ERROR_MAX_K) {

@@ -67,6 +67,9 @@ bool oracle_overhauled(const oracle_t *oracle, double speed);
 /* The state of the drive, or what it takes for it, was changed from outside. */
 bool oracle_state_changed(const oracle_t *oracle);
 
+/* Interrupts come late, or memory or clock of the drive was changed. */
+bool oracle_drive_disturbed(const oracle_t *oracle, uint64_t time_us);
+
 /* The only sensor of the link voltage was faulty at any time. */
 bool oracle_link_sensor_faulty(const oracle_t *oracle);
 
