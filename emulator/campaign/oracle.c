@@ -9,11 +9,14 @@
 
 #define RECENT_NS (2 * ORACLE_MS_NS)
 #define MARGIN 1.02
-#define CONDUCTING 0.05 /* of the trip current */
+#define CONDUCTING 0.1 /* of the trip current, */
+#define CONDUCTED_NS (4 * ORACLE_MS_NS)
 #define HALF_TURN (UINT32_C(1) << 31)
 #define UNDER_VOLTAGE_PART 0.94
 #define STO_DIFFERED_US 215000 /* lines of safe torque off: then both have to be off once */
 #define STATUS_AGE_MAX_NS (30 * ORACLE_MS_NS)
+#define LOAD_ANSWERED_NS (200 * ORACLE_MS_NS)
+#define CROSSED_NS (15 * ORACLE_MS_NS)
 #define RUN_MAX_NS (502 * ORACLE_MS_NS) /* of a run, since the last request */
 
 void oracle_init(oracle_t *oracle, const world_t *world, const plant_t *plant, uint64_t period_ns) {
@@ -67,7 +70,7 @@ static void look_at_currents(oracle_t *oracle, const plant_t *plant, unsigned ga
         oracle->surged = oracle->surged || (threshold_A > 0.0 && current_A > 2.0 * threshold_A);
         uint64_t *since_ns = &oracle->conducting_ns[phase];
         oracle_since(since_ns, current_A > CONDUCTING * oracle->world->machine->trip_current_A, plant->time_ns);
-        if (*since_ns && plant->time_ns > *since_ns + ORACLE_MS_NS) {
+        if (*since_ns && plant->time_ns > *since_ns + CONDUCTED_NS) {
             oracle->conducted_ns[phase] = plant->time_ns;
         }
         if (!(gates >> phase & 1u) || current_A <= threshold_A || threshold_A == 0.0) {
@@ -119,6 +122,23 @@ static uint64_t request_max_ns(const oracle_t *oracle, uint64_t max_ns) {
     return max_ns + (oracle_any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM) ? 18 * ORACLE_MS_NS : 0);
 }
 
+/* A load that has begun shortly before the last request, or since, or that moves: the speed controller answers it. */
+static bool answers_load(const oracle_t *oracle, uint64_t now_us) {
+    bool answers = false;
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, now_us);
+        if (event == NULL || event->kind != WORLD_SET) {
+            continue;
+        }
+        const bool steps =
+            event->what == BENCH_VARIABLE_LOAD_TORQUE_NM || event->what == BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM;
+        const bool moves = event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_NM ||
+                           event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM;
+        answers = answers || moves || (steps && event->begin_us * 1000 + LOAD_ANSWERED_NS > oracle->run_ns);
+    }
+    return answers;
+}
+
 static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
     const uint64_t now_ns = plant->time_ns;
     if (!oracle->confirmed && !may_be_deaf(oracle, now_ns / 1000)) {
@@ -135,11 +155,12 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
         const double before_Nm = age_ns < 10 * ORACLE_MS_NS ? 0.0 : oracle->silence_torque_Nm;
         oracle->silence_torque_Nm = fmax(fabs(plant_torque_Nm(plant)), before_Nm);
     } else if (age_ns > request_max_ns(oracle, 65 * ORACLE_MS_NS) && !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) &&
-               !oracle_bus_disturbed(oracle) &&
+               !oracle_bus_disturbed(oracle) && !answers_load(oracle, now_ns / 1000) &&
                fabs(plant_torque_Nm(plant)) >
                    1.5 * oracle->silence_torque_Nm + 0.2 * oracle->world->machine->torque_max_Nm) {
         oracle_violate(oracle, "no_command", now_ns, 7, plant_torque_Nm(plant));
     } else if (age_ns > request_max_ns(oracle, 170 * ORACLE_MS_NS) && !oracle_phases_at_fault(oracle, now_ns / 1000) &&
+               !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
                fabs(plant_torque_Nm(plant)) > 0.2 * oracle->world->machine->torque_max_Nm) {
         oracle_violate(oracle, "no_command", now_ns, 4, plant_torque_Nm(plant));
     }
@@ -158,10 +179,27 @@ static void look_at_under_voltage(oracle_t *oracle, const plant_t *plant) {
     }
 }
 
+/* Part of the speed that an encoder shows which loses counts in each revolution, at least. */
+static double shown_speed(const world_t *world) {
+    double shown = 1.0;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = world_begun(world, i, UINT64_MAX);
+        if (event != NULL && event->kind == WORLD_FAULT && event->what == FAULT_ENCODER_LOST_COUNTS) {
+            shown = fmin(shown, 1.0 - ldexp(event->value, -(int)world->encoder_bits));
+        }
+    }
+    return shown;
+}
+
 static void look_at_limits(oracle_t *oracle, const plant_t *plant, unsigned gates) {
     const world_machine_t *machine = oracle->world->machine;
     const double speed_rpm = fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S;
-    oracle_since(&oracle->speed_ns, gates && speed_rpm > MARGIN * machine->over_speed_rpm, plant->time_ns);
+    /* A frozen encoder shows nothing while the load turns a rotor without current. */
+    const bool unseen = oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_STUCK) &&
+                        oracle_overhauled(oracle, plant->speed_rad_s);
+    oracle_since(&oracle->speed_ns,
+                 gates && !unseen && speed_rpm * shown_speed(oracle->world) > MARGIN * machine->over_speed_rpm,
+                 plant->time_ns);
     if (oracle->speed_ns && plant->time_ns > oracle->speed_ns + 2 * ORACLE_MS_NS) {
         oracle_violate(oracle, "over_speed", plant->time_ns, 0, speed_rpm / machine->over_speed_rpm);
     }
@@ -180,9 +218,10 @@ static void look_at_causes(oracle_t *oracle, const plant_t *plant) {
     const bool voltage =
         !oracle_link_sensor_faulty(oracle) && (plant->bus_voltage_V > MARGIN * machine->over_voltage_V ||
                                                plant->bus_voltage_V * MARGIN < machine->under_voltage_V);
-    const bool speed = !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
-                       plant->time_ns > oracle->reset_ns + 10 * ORACLE_MS_NS && /* else it is not observed yet */
-                       fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > MARGIN * machine->over_speed_rpm;
+    const bool observed = !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
+                          !oracle_any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM) &&
+                          plant->time_ns > oracle->reset_ns + 10 * ORACLE_MS_NS;
+    const bool speed = observed && fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > MARGIN * machine->over_speed_rpm;
     if (voltage || speed || sto_demanded(oracle, (plant->time_ns - 1) / 1000)) {
         oracle->cause_ns = plant->time_ns;
     }
@@ -294,7 +333,9 @@ static void look_at_end_of_fault(oracle_t *oracle, uint64_t now_ns, uint8_t befo
                        (double)(oracle->latched_ns - oracle->clear_ns) * 1e-6);
     }
     const uint64_t gone_ns = before == STATE_FAULT ? 8 * ORACLE_MS_NS : ORACLE_MS_NS / 2;
-    if (oracle->cause_ns && now_ns < oracle->cause_ns + gone_ns && !oracle_state_changed(oracle) &&
+    const bool begins =
+        before == STATE_INITIALISE && oracle_any_injected(oracle, FAULT_SUPPLY_RIPPLE, FAULT_SUPPLY_RIPPLE);
+    if (oracle->cause_ns && now_ns < oracle->cause_ns + gone_ns && !oracle_state_changed(oracle) && !begins &&
         !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
         oracle_violate(oracle, "cleared", now_ns, before, (double)(now_ns - oracle->cause_ns) * 1e-6);
     }
@@ -361,10 +402,11 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     } else if (drive.state == STATE_READY && before == STATE_RUN) {
         oracle->confirmed = false;
         const uint64_t age_ns = plant->time_ns > oracle->run_ns ? plant->time_ns - oracle->run_ns : 0;
-        const bool rests =
-            oracle->meant.request == SENDER_STOP &&
-            (oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) ||
-             fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S < 20.0 + 0.05 * oracle->world->machine->speed_base_rpm);
+        /* A stop may end when the request to run is already on the bus. */
+        const bool stops = oracle->meant.request == SENDER_STOP || plant->time_ns < oracle->withdrawn_ns + CROSSED_NS;
+        const bool rests = stops && (oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) ||
+                                     fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S <
+                                         20.0 + 0.05 * oracle->world->machine->speed_base_rpm);
         if (!oracle->off_seen && !rests && age_ns < 30 * ORACLE_MS_NS && !oracle_state_changed(oracle) &&
             !may_be_deaf(oracle, plant->time_ns / 1000)) {
             oracle_violate(oracle, "stopped", plant->time_ns, oracle->meant.request, plant->speed_rad_s);

@@ -53,9 +53,11 @@
  *                   faults that do not explain it, it is a wrong_cause
  *   undetected      in state run for longer than a reaction takes with a fault that shows at any time: changed memory,
  *                   sensors at a rail, a wrong clock, a background that hangs (oracle_detection.c)
- *   no_current      voltage on a phase for twenty times its largest flux linkage, and no current at all
+ *   no_current      voltage on a phase for twenty times its largest flux linkage, in pulses of more than three
+ *                   periods, and no current at all
  *   two_lost        in state run for 300 ms at less than half of the commanded speed, with two phases lost
- *   blocked         a speed commanded, and the rotor within a stroke for 300 ms and three strokes
+ *   blocked         a speed commanded, and the rotor within a quarter of a stroke for 300 ms and three strokes, or
+ *                   within a stroke for 500 ms and six: a swing that grows is no standstill
  *   misled          for 200 ms, above a fifth of the base speed and a tenth of the trip current, a measured angle off
  *                   by more than a sixth of a rotor pitch
  *   contested       for 150 ms in state run while another client sends commands
@@ -79,7 +81,7 @@
 #include "campaign/world.h"
 #include "plant/plant.h"
 
-#define ORACLE_LOOK_NS UINT64_C(20000)
+#define ORACLE_LOOK_NS UINT64_C(19000) /* no whole part of a control period: else it would meet the same pulses */
 #define ORACLE_SECTORS 6
 #define ORACLE_STATES 4
 #define ORACLE_KINDS 128 /* of faults, at most */
@@ -112,14 +114,21 @@ typedef struct {
     double error_counts; /* sum, positive: ahead in the direction of counting */
 } oracle_stretch_t;
 
+/* A rotor that stays within a range of angles. */
+typedef struct {
+    uint64_t since_ns; /* 0: no speed is commanded */
+    double low_rad, high_rad;
+} oracle_stay_t;
+
 /* Of what has to be noticed. */
 typedef struct {
-    uint64_t looked_ns, misled_ns, blocked_ns, lost_ns, status_ns;
-    double blocked_angle_rad;
-    uint64_t stroke_ns;             /* the rotor was last a stroke from where it had been, */
-    double stroke_rad;              /* here */
-    double largest_flux_Wb;         /* aligned, at the trip current */
-    double flux_Wb[HAL_PHASES_MAX]; /* applied to a phase without any current, V s */
+    uint64_t looked_ns, misled_ns, lost_ns, status_ns;
+    oracle_stay_t held, swinging;
+    uint64_t stroke_ns;              /* the rotor was last a stroke from where it had been, */
+    double stroke_rad;               /* here */
+    double largest_flux_Wb;          /* aligned, at the trip current */
+    double flux_Wb[HAL_PHASES_MAX];  /* applied to a phase without any current, V s, */
+    double pulse_Wb[HAL_PHASES_MAX]; /* by the present pulse, which the opposite voltage ends */
 } oracle_detection_t;
 
 /* Torque in torque mode, over at least an electrical period. */
@@ -187,7 +196,7 @@ typedef struct {
     uint64_t recent_ns;
     double run_angle_rad;                                                 /* of the rotor at the start of the run */
     bool turned;                                                          /* by a stroke since */
-    uint64_t conducting_ns[HAL_PHASES_MAX], conducted_ns[HAL_PHASES_MAX]; /* since when, last for a millisecond */
+    uint64_t conducting_ns[HAL_PHASES_MAX], conducted_ns[HAL_PHASES_MAX]; /* since when, last for long enough */
     uint64_t fault_ns;                                                    /* the last fault began or ended */
     double encoder_offset_rev;                                            /* on the shaft, in counting direction */
     oracle_stretch_t stretch;

@@ -51,7 +51,8 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     [FAULT_ENCODER_NOISE] = ENCODER,
     /* About the angle of the reversal one phase looks as before, and two as if their currents were exchanged. */
     [FAULT_ENCODER_REVERSED] = ENCODER | PHASE | BIT(CAUSE_STALL),
-    [FAULT_ENCODER_SLIP] = ENCODER | BIT(CAUSE_STALL),
+    /* Its angle is that of one phase's tolerance after the other, and then that of a current in another phase. */
+    [FAULT_ENCODER_SLIP] = ENCODER | PHASE | BIT(CAUSE_STALL),
     [FAULT_ENCODER_NO_ANSWER] = ENCODER | BIT(CAUSE_STALL),
     [FAULT_SHAFT_LOCKED] = ENCODER | MECHANICS,
     [FAULT_COULOMB_FRICTION] = ENCODER | MECHANICS,
@@ -165,8 +166,9 @@ static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *pl
                          oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, now_us) ||
                          oracle_overhauled(oracle, plant->speed_rad_s);
     const double near = oracle->world->controller == 2 ? 0.97 : 0.8; /* an overshoot of one quadrant stays */
-    const bool near_limit =
-        !oracle->meant.torque && fabs(oracle->meant.reference) > near * oracle->world->machine->over_speed_rpm;
+    const bool coasts = oracle->dark_ns != 0 && plant->time_ns > oracle->dark_ns + ORACLE_MS_NS;
+    const bool near_limit = coasts || (!oracle->meant.torque &&
+                                       fabs(oracle->meant.reference) > near * oracle->world->machine->over_speed_rpm);
     switch (cause) {
     case CAUSE_OVER_CURRENT:
     case CAUSE_HARDWARE_OVER_CURRENT:
@@ -183,12 +185,26 @@ static bool has_reason(const oracle_t *oracle, unsigned cause, const plant_t *pl
     }
 }
 
-/* No two phases have had a current to speak of in the last quarter of a second. */
+/* Begin of the latest fault of a phase or of the encoder. */
+static uint64_t latest_fault_ns(const oracle_t *oracle, uint64_t now_us) {
+    uint64_t latest_us = 0;
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, now_us);
+        const bool shows = event != NULL && event->kind == WORLD_FAULT && event->what <= FAULT_ENCODER_NO_ANSWER;
+        latest_us = shows && event->begin_us > latest_us ? event->begin_us : latest_us;
+    }
+    return latest_us * 1000;
+}
+
+/* No two phases without a fault have had a current to speak of since the latest one and in the last quarter of a
+ * second: one for the encoder's angle and one against it tell nothing. */
 static bool conducts_alone(const oracle_t *oracle, const plant_t *plant) {
+    const unsigned faulty = oracle_phases_at_fault(oracle, plant->time_ns / 1000);
+    const uint64_t since_ns = latest_fault_ns(oracle, plant->time_ns / 1000);
     unsigned conducting = 0;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         const uint64_t last_ns = oracle->conducted_ns[phase];
-        conducting += last_ns != 0 && plant->time_ns < last_ns + 250 * ORACLE_MS_NS;
+        conducting += !(faulty >> phase & 1u) && last_ns > since_ns && plant->time_ns < last_ns + 250 * ORACLE_MS_NS;
     }
     return conducting < 2;
 }

@@ -9,14 +9,14 @@
 #define CLOCK_DRIFT_PERCENT 8.0
 #define FLUX_LINKAGES 20.0 /* of the aligned position at the trip current, applied to a phase without any effect */
 #define NO_CURRENT_A 1e-3
-#define MISLED_PITCH (1.0 / 6.0) /* error of the angle at which a phase makes torque in the other direction */
-#define MISLED_SPEED 0.2         /* of the base speed, above which a wrong angle shows soon, */
-#define MISLED_CURRENT 0.1       /* of the trip, */
+#define PULSE_PERIODS 3.0
+#define MISLED_SPEED 0.2   /* of the base speed, above which a wrong angle shows soon, */
+#define MISLED_CURRENT 0.1 /* of the trip, */
 #define MISLED_NS (200 * ORACLE_MS_NS)
 #define HEARD_NS (50 * ORACLE_MS_NS) /* since the last command: then the torque ramps to zero */
 #define BLOCKED_NS (300 * ORACLE_MS_NS)
-#define BLOCKED_STROKES 3.0 /* at the commanded speed, besides */
-#define BLOCKED_SPEED 0.05  /* of the base speed, commanded */
+#define SWINGING_NS (500 * ORACLE_MS_NS)
+#define BLOCKED_SPEED 0.05 /* of the base speed, commanded */
 #define LOST_US 100000
 #define MUTE_NS (100 * ORACLE_MS_NS) /* bus-off for the second time included */
 #define RESET_NS (60 * ORACLE_MS_NS)
@@ -116,8 +116,9 @@ static void look_at_lost_phases(oracle_t *oracle, const plant_t *plant) {
 /* Commands of a client that is not the one which has armed the drive, or that are forged. */
 static void look_at_senders(oracle_t *oracle, uint64_t now_ns) {
     if (oracle_variable_begun(oracle, BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER, now_ns / 1000) ||
+        oracle_variable_begun(oracle, BENCH_VARIABLE_FRAME_FAULT, now_ns / 1000) ||
         oracle_variable_begun(oracle, BENCH_VARIABLE_BUS_CONNECTION, now_ns / 1000)) {
-        return; /* the drive receives no command */
+        return; /* the drive receives no command, or late */
     }
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = &oracle->world->event[i];
@@ -151,16 +152,24 @@ static void look_at_status(oracle_t *oracle, uint64_t now_ns) {
     }
 }
 
-/* Voltage on a phase that is followed by no current at all. */
+/* Voltage on a phase that is followed by no current at all, in pulses of more than PULSE_PERIODS: a shorter one the
+ * opposite voltage may have ended before a sample. A current that an open diode ends is gone at once. */
 static void look_at_phases(oracle_t *oracle, const plant_t *plant) {
     const bool hidden = oracle_any_injected(oracle, FAULT_CURRENT_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET) ||
+                        oracle_any_injected(oracle, FAULT_DIODE_OPEN, FAULT_DIODE_OPEN) ||
                         checks_late(oracle, plant->time_ns / 1000);
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         double *flux_Wb = &oracle->detection.flux_Wb[phase];
+        double *pulse_Wb = &oracle->detection.pulse_Wb[phase];
+        const double step_Wb = plant->bus_voltage_V * (double)ORACLE_LOOK_NS * 1e-9;
+        const double short_Wb = PULSE_PERIODS * plant->bus_voltage_V * (double)oracle->period_ns * 1e-9;
         if (oracle->drive.state != STATE_RUN || plant_current_A(plant, phase) > NO_CURRENT_A) {
-            *flux_Wb = 0.0;
+            *flux_Wb = *pulse_Wb = 0.0;
+        } else if (plant->switches[phase] == 0) {
+            *pulse_Wb = fmax(0.0, fmin(*pulse_Wb, short_Wb) - step_Wb);
         } else if (plant->switches[phase] == 3) {
-            *flux_Wb += plant->bus_voltage_V * (double)ORACLE_LOOK_NS * 1e-9;
+            *pulse_Wb += step_Wb;
+            *flux_Wb += *pulse_Wb > short_Wb ? step_Wb : 0.0;
             if (*flux_Wb > FLUX_LINKAGES * oracle->detection.largest_flux_Wb && !hidden) {
                 oracle_violate(oracle, "no_current", plant->time_ns, phase, *flux_Wb);
             }
@@ -168,7 +177,21 @@ static void look_at_phases(oracle_t *oracle, const plant_t *plant) {
     }
 }
 
-/* The rotor stays within a stroke although a speed is commanded. */
+/* Time for which the rotor has stayed within a range of angles while a constant speed is commanded. */
+static uint64_t stays_ns(const oracle_t *oracle, oracle_stay_t *stay, const plant_t *plant, bool commanded,
+                         double range_rad) {
+    const double angle_rad = plant->rotor_angle_rad;
+    const double low_rad = fmin(stay->low_rad, angle_rad), high_rad = fmax(stay->high_rad, angle_rad);
+    if (!commanded || stay->since_ns < oracle->constant_ns || high_rad - low_rad > range_rad) {
+        *stay = (oracle_stay_t){commanded ? plant->time_ns : 0, angle_rad, angle_rad};
+        return 0;
+    }
+    stay->low_rad = low_rad;
+    stay->high_rad = high_rad;
+    return plant->time_ns - stay->since_ns;
+}
+
+/* The rotor does not turn although a speed is commanded. */
 static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
     oracle_detection_t *detection = &oracle->detection;
     const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
@@ -180,25 +203,20 @@ static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
     const bool pushes = heard && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
                         !oracle->meant.torque &&
                         fabs(oracle->meant.reference) > BLOCKED_SPEED * oracle->world->machine->speed_base_rpm;
-    if (!pushes || detection->blocked_ns == 0 ||
-        fabs(plant->rotor_angle_rad - detection->blocked_angle_rad) > stroke_rad) {
-        detection->blocked_ns = pushes ? plant->time_ns : 0;
-        detection->blocked_angle_rad = plant->rotor_angle_rad;
-        return;
-    }
-    const double stroke_s = stroke_rad * ORACLE_RPM_PER_RAD_S / fabs(oracle->meant.reference);
-    const uint64_t since_ns = detection->blocked_ns > oracle->constant_ns ? detection->blocked_ns : oracle->constant_ns;
-    if (plant->time_ns > since_ns + BLOCKED_NS + (uint64_t)(BLOCKED_STROKES * stroke_s * 1e9) &&
-        !checks_late(oracle, plant->time_ns / 1000)) {
-        oracle_violate(oracle, "blocked", plant->time_ns, 0, (double)(plant->time_ns - detection->blocked_ns) * 1e-6);
+    const uint64_t held_ns = stays_ns(oracle, &detection->held, plant, pushes, 0.25 * stroke_rad);
+    const uint64_t swinging_ns = stays_ns(oracle, &detection->swinging, plant, pushes, stroke_rad);
+    const double three_strokes_s = 3.0 * stroke_rad * ORACLE_RPM_PER_RAD_S / fabs(oracle->meant.reference);
+    const uint64_t strokes_ns = pushes ? (uint64_t)(three_strokes_s * 1e9) : 0;
+    const bool hidden = checks_late(oracle, plant->time_ns / 1000) || /* or the encoder shows a rotor that turns */
+                        oracle_any_injected(oracle, FAULT_ENCODER_JUMP, FAULT_ENCODER_SLIP);
+    if ((held_ns > BLOCKED_NS + strokes_ns || swinging_ns > SWINGING_NS + 2 * strokes_ns) && !hidden) {
+        oracle_violate(oracle, "blocked", plant->time_ns, 0, (double)swinging_ns * 1e-6);
     }
 }
 
 /* A measured angle with which the torque is not what the drive takes it for. */
 static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
-    const double pitches = (ldexp((double)oracle->drive.angle, -32) - plant->rotor_angle_rad / ORACLE_TWO_PI -
-                            oracle->encoder_offset_rev) *
-                           plant->machine->rotor_poles;
+    const double error_pitches = oracle_angle_error_pitches(oracle, plant);
     const world_machine_t *machine = oracle->world->machine;
     const bool turns = fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > MISLED_SPEED * machine->speed_base_rpm;
     double current_A = 0.0;
@@ -207,11 +225,11 @@ static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
     }
     oracle_since(&oracle->detection.misled_ns,
                  oracle->drive.state == STATE_RUN && turns && current_A > MISLED_CURRENT * machine->trip_current_A &&
-                     fabs(pitches - floor(pitches + 0.5)) > MISLED_PITCH,
+                     fabs(error_pitches) > ORACLE_MISLED_PITCH,
                  plant->time_ns);
     if (oracle->detection.misled_ns && plant->time_ns > oracle->detection.misled_ns + MISLED_NS &&
         !checks_late(oracle, plant->time_ns / 1000)) {
-        oracle_violate(oracle, "misled", plant->time_ns, 0, pitches - floor(pitches + 0.5));
+        oracle_violate(oracle, "misled", plant->time_ns, 0, error_pitches);
     }
 }
 

@@ -32,6 +32,13 @@ static bool encoder_disturbed(const oracle_t *oracle) {
     return oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER);
 }
 
+double oracle_angle_error_pitches(const oracle_t *oracle, const plant_t *plant) {
+    const double pitches = (ldexp((double)oracle->drive.angle, -32) - plant->rotor_angle_rad / ORACLE_TWO_PI -
+                            oracle->encoder_offset_rev) *
+                           plant->machine->rotor_poles;
+    return pitches - floor(pitches + 0.5);
+}
+
 /* Both of the sensor's full scale. */
 static bool is_off(double measured, double truth) {
     return fabs(measured - fmin(fmax(truth, 0.0), 1.0)) > MEASUREMENT_ERROR_MAX;

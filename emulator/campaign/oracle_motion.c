@@ -11,8 +11,9 @@
 #define TORQUE_ERROR_MAX 0.10 /* of the torque: flux linkages of a machine scatter by 5 % */
 #define TORQUE_ERROR_MAX_HYSTERESIS 0.25
 #define TORQUE_ERROR_MAX_RATED 0.02
-#define OVERSHOOT_MAX 0.12      /* of the speed reference */
-#define OVERSHOOT_MAX_BASE 0.05 /* of the base speed */
+#define TORQUE_ERROR_MAX_RATED_HYSTERESIS 0.1 /* of a light winding, whose current changes by much in a period */
+#define OVERSHOOT_MAX 0.12                    /* of the speed reference */
+#define OVERSHOOT_MAX_BASE 0.05               /* of the base speed */
 #define STOP_ERROR_MAX_BASE 0.05
 #define STOP_ERROR_MAX_RAD_S 2.0
 #define STOP_SETTLED_S 0.1
@@ -52,9 +53,10 @@ static void look_at_torque(oracle_t *oracle, const plant_t *plant) {
     const double mean_Nm = torque->sum_Nm / torque->samples;
     const double wanted_Nm =
         oracle->world->controller == 2 ? oracle->meant.reference : fmax(oracle->meant.reference, 0.0);
-    const double part = oracle->world->controller == 2 ? TORQUE_ERROR_MAX : TORQUE_ERROR_MAX_HYSTERESIS;
-    if (fabs(mean_Nm - wanted_Nm) >
-        part * fabs(wanted_Nm) + TORQUE_ERROR_MAX_RATED * oracle->world->machine->torque_rated_Nm) {
+    const bool shares = oracle->world->controller == 2;
+    const double part = shares ? TORQUE_ERROR_MAX : TORQUE_ERROR_MAX_HYSTERESIS;
+    const double part_rated = shares ? TORQUE_ERROR_MAX_RATED : TORQUE_ERROR_MAX_RATED_HYSTERESIS;
+    if (fabs(mean_Nm - wanted_Nm) > part * fabs(wanted_Nm) + part_rated * oracle->world->machine->torque_rated_Nm) {
         oracle_violate(oracle, "wrong_torque", plant->time_ns, oracle->world->controller, mean_Nm / wanted_Nm);
     }
     torque->samples = 0;

@@ -39,6 +39,9 @@ enum {
     CAUSE_CLOCK,
 };
 
+/* Error of the angle, in rotor pitches, at which a phase makes torque in the other direction. */
+#define ORACLE_MISLED_PITCH (1.0 / 6.0)
+
 #define BIT(cause) (UINT32_C(1) << (cause))
 
 /* Remembers a violation, once for each rule and number. */
@@ -80,6 +83,9 @@ double oracle_encoder_offset_rev(const world_t *world);
 
 /* At the instant of the samples of a control interrupt, after it. */
 void oracle_look_at_measurement(oracle_t *oracle, const plant_t *plant);
+
+/* Error of the measured angle, in rotor pitches, -0.5..0.5. */
+double oracle_angle_error_pitches(const oracle_t *oracle, const plant_t *plant);
 
 /* At the end. */
 void oracle_judge_temperature(oracle_t *oracle, const plant_t *plant, oracle_heat_t heat);

@@ -149,12 +149,14 @@ static void judge(const inertia_parameters_t *parameters, inertia_t *inertia, ui
 }
 
 void inertia_step(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
-                  uint32_t angle, int32_t torque_q24, bool limited) {
+                  uint32_t angle, int32_t torque_q24, bool limited, bool approaching) {
     /* In this order the sums, weighted by the updates since, are those of the trapezoidal rule. */
     inertia->sum_of_sums_q23 += inertia->sum_q23;
     inertia->sum_q23 += (uint32_t)(torque_q24 >> (2 * parameters->window_shift + 1));
     inertia->updates++;
-    if (limited) {
+    if (!approaching) {
+        inertia->transient_windows = 0;
+    } else if (limited) {
         inertia->transient_windows = TRANSIENT_WINDOWS;
     }
     const uint32_t windows = inertia->updates >> parameters->window_shift;

@@ -7,9 +7,9 @@
  *   cov(T, A) / var(T) = J0 / J,
  *
  * is free of a load that stays the same, whatever it is. It counts when T varies enough and A follows it, cov(T, A)^2 >
- * 7/8 var(T) var(A), while T is at its limit or has been within the last 8 windows: in a start, a braking or a
- * reversal, and above all at their ends. A torque that follows a load is not in proportion to A, and seldom at its
- * limit.
+ * 7/8 var(T) var(A), while the speed approaches a changed reference and T is at its limit or has been within the last 8
+ * windows: in a start, a braking or a reversal, and above all at their ends. A torque that follows a load is not in
+ * proportion to A, but at the limit, in the few milliseconds of a steep ramp, it may seem so.
  *
  * Means are exponential, over 4 windows. A window is at least 0.8 ms, so that they last longer than the torque needs to
  * fall from its limit, and as long as the encoder needs: an error of one count in the angle is 1/24 of the largest
@@ -80,8 +80,8 @@ void inertia_restart(const inertia_parameters_t *parameters, const load_observer
 void inertia_tune(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia);
 
 /* One update of a run: rotor angle in 2^-32 electrical rev, machine torque in N m, Q7.24. limited: its reference is at
- * a limit. */
+ * a limit. approaching: the speed approaches a changed reference. */
 void inertia_step(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
-                  uint32_t angle, int32_t torque_q24, bool limited);
+                  uint32_t angle, int32_t torque_q24, bool limited, bool approaching);
 
 #endif
