@@ -42,7 +42,8 @@
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
  *                   and memory undisturbed
  *   wrong_telemetry a measured current or voltage on the bus that the drive has not measured in the last 4 ms, a speed
- *                   off the true one by 10 % and 5 % of the base speed; in the snapshot of a fault those of its instant
+ *                   off the true one by 10 %, 5 % of the base speed and half a count in a millisecond; in the snapshot
+ *                   of a fault those of its instant
  *   not_derated     a torque limit in telemetry above what loads and temperatures beside it leave, by 12 % of the
  *                   largest torque
  *   applied         a set of parameters with a wrong check was applied

@@ -12,7 +12,8 @@
 #define SNAPSHOT_NS (30 * ORACLE_MS_NS) /* until the first snapshot after a fault may be an earlier one's */
 #define ERROR_MAX 0.001                 /* of the full scale */
 #define SPEED_ERROR_MAX 0.1             /* of the speed, which the drive observes, */
-#define SPEED_ERROR_MAX_BASE 0.05       /* and of the base speed */
+#define SPEED_ERROR_MAX_BASE 0.05       /* and of the base speed, */
+#define COUNT_RATE_1_S 500.0            /* and half a count in a millisecond */
 
 /* Default parameters, and the error of a torque limit: heat changes between two readings of it. */
 #define WINDING_LIMIT_C 155.0
@@ -75,9 +76,11 @@ static void judge(oracle_t *oracle, bool holds, uint64_t time_ns, unsigned numbe
     }
 }
 
-/* A shaft that is stopped at once stands before the drive observes it. */
+/* A shaft that is stopped at once stands before the drive observes it; and the observer goes by the torque of the
+ * measured currents. */
 static bool observes_speed(const oracle_t *oracle) {
     return !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
+           !oracle_any_injected(oracle, FAULT_CURRENT_SENSOR_OPEN, FAULT_CURRENT_SENSOR_SWAPPED) &&
            !oracle_any_injected(oracle, FAULT_SHAFT_LOCKED, FAULT_LOAD_DROPPED) &&
            !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT);
 }
@@ -153,11 +156,12 @@ void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier
     case DRIVE_MOTION_FRAME_ID: {
         const double rad_s = signed_24(data) * machine->command_lsb_rpm / ORACLE_RPM_PER_RAD_S;
         const double base_rad_s = machine->speed_base_rpm / ORACLE_RPM_PER_RAD_S;
+        const double count_rad_s = ldexp(ORACLE_TWO_PI, -(int)oracle->world->encoder_bits) * COUNT_RATE_1_S;
         const bool settled = oracle->drive.state == STATE_RUN && time_ns > oracle->state_ns + SETTLED_NS;
         judge(oracle,
               !settled || !observes_speed(oracle) ||
                   is_within(&telemetry->speed_rad_s, rad_s,
-                            SPEED_ERROR_MAX * fabs(rad_s) + SPEED_ERROR_MAX_BASE * base_rad_s),
+                            SPEED_ERROR_MAX * fabs(rad_s) + SPEED_ERROR_MAX_BASE * base_rad_s + count_rad_s),
               time_ns, 9, rad_s);
         break;
     }

@@ -169,7 +169,11 @@ static void move(const conduction_parameters_t *parameters, conduction_state_t *
             /* Sharing follows the reference at any level that is too high: without a shortfall it returns. */
             state->trim_q30 += state->partial_q15 > 0 ? step_q30 >> 2 : step_q30 - (forward_q15 == 0 ? retract_q30 : 0);
         }
-        state->trim_q30 = fixed_clamp(state->trim_q30, -forward_q30, ONE_Q30 - forward_q30);
+        int32_t trim_max_q30 = ONE_Q30 - forward_q30;
+        if (state->partial_q15 > 0 && trim_max_q30 > forward_q30) {
+            trim_max_q30 = forward_q30; /* what a lost phase leaves missing goes with the reference */
+        }
+        state->trim_q30 = fixed_clamp(state->trim_q30, -forward_q30, trim_max_q30);
         state->part_q15 = (forward_q30 + state->trim_q30) >> 15;
         state->level_q15 = fixed_clamp(forward_q15 + (state->trim_q30 >> 15), 0, ONE_Q15);
     }

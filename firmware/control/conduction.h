@@ -26,7 +26,8 @@
  *
  * from tables over part and speed / voltage (tools/src/salient/machine/partial_pulse.py): torque sharing, a single
  * pulse or what lies between, the smoothest that takes hardly more RMS current than the best pulse. Their windows may
- * be narrower than a stroke.
+ * be narrower than a stroke. There the trim is at most T / T_mean, so that it ends with the reference: with a phase
+ * lost the others make up for half of the torque at most.
  *
  * Braking: with full -Vdc from an angle theta on, the current stays within its limit while the flux linkage is below
  * psi_t + Vdc / omega (theta_t - theta), the tangent to the flux linkage of the current limit. With torque sharing the

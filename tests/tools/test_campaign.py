@@ -114,6 +114,18 @@ def test_a_current_that_the_other_phases_hold_at_zero_does_not_stop_time() -> No
     assert result["violations"] == [] and 900_000 < result["virtual_us"] < 1_000_000
 
 
+@pytest.mark.parametrize(("seed", "event"), [(137892, "load_ramp_Nm_s"), (252587, "shaft_locked")])
+def test_a_load_soon_after_a_start_is_no_other_inertia_with_which_the_speed_hunts(seed: int, event: str) -> None:
+    assert event in [drawn["event"] for drawn in world(seed)["events"]]
+    result = run_world(seed)
+    assert result["violations"] == [] and result["recovered"]
+
+
+def test_torque_of_a_drive_with_a_lost_phase_ends_with_its_reference() -> None:
+    assert {"degraded_running", "silent"} <= {drawn["event"] for drawn in world(436414)["events"]}
+    assert run_world(436414)["violations"] == []
+
+
 def test_a_constant_in_a_faulty_memory_is_no_index_beyond_a_table() -> None:
     result = run_world(85011)
     assert result["violations"] == [] and result["causes"] == [23]  # memory

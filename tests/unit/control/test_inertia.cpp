@@ -37,9 +37,9 @@ inertia_settings_t settings(unsigned encoder_bits = 17, uint32_t rate_hz = 40000
 // Torque and load in N m over time in s.
 using torque_t = std::function<double(double)>;
 
-// Shift after half a second of a shaft of `gain` times the inertia J0.
+// Shift after half a second of a shaft of `gain` times the inertia J0, whose speed has settled after settled_s.
 int32_t shift_after(const inertia_settings_t &of, double gain, const torque_t &torque, const torque_t &load,
-                    inertia_t *last = nullptr) {
+                    inertia_t *last = nullptr, double settled_s = 1.0) {
     const inertia_parameters_t parameters = inertia_configure(&of);
     inertia_t inertia{};
     const double step_s = double(of.periods_per_update) / of.control_rate_hz;
@@ -48,7 +48,8 @@ int32_t shift_after(const inertia_settings_t &of, double gain, const torque_t &t
     inertia_restart(&parameters, &MODEL, &inertia, angle_from_rev(rev) * POLES);
     for (double t = 0.0; t < 0.5; t += step_s) {
         const uint32_t angle = angle_from_rev(std::floor(rev * counts) / counts) * POLES;
-        inertia_step(&parameters, &MODEL, &inertia, angle, to_fixed(torque(t), Q24), torque(t) >= TORQUE_MAX);
+        inertia_step(&parameters, &MODEL, &inertia, angle, to_fixed(torque(t), Q24), torque(t) >= TORQUE_MAX,
+                     t < settled_s);
         const double mean_Nm = 0.5 * (torque(t) - load(t) + torque(t + step_s) - load(t + step_s));
         const double change = mean_Nm / (gain * J0 * 2.0 * PI) * step_s;
         rev += (rev_s + 0.5 * change) * step_s;
@@ -95,6 +96,17 @@ TEST(Inertia, a_torque_that_follows_a_load_identifies_nothing) {
         const torque_t sine = [=](double t) { return limited(11.0 + 9.0 * std::sin(2.0 * PI * frequency_hz * t)); };
         const torque_t after = [=](double t) { return sine(t - 0.001); };
         EXPECT_EQ(shift_after(settings(), 1.0, after, sine), 0) << frequency_hz << " Hz";
+    }
+}
+
+TEST(Inertia, a_torque_at_its_limit_identifies_nothing_after_the_speed_has_settled) {
+    // The load of a ramp, as steep as a change of the inertia would look.
+    const torque_t ramp = [](double t) { return std::clamp((t - 0.13) * 4000.0, 0.0, 16.0); };
+    const torque_t answer = [&](double t) { return t < 0.12 ? start(t) - 8.0 : t > 0.131 ? TORQUE_MAX : 0.0; };
+    EXPECT_LT(shift_after(settings(), 1.0, answer, ramp), 0);
+    EXPECT_EQ(shift_after(settings(), 1.0, answer, ramp, nullptr, 0.125), 0);
+    for (const double gain : {0.2, 5.0}) {
+        EXPECT_EQ(shift_after(settings(), gain, start, constant_8, nullptr, 0.1), 0) << gain;
     }
 }
 
