@@ -9,6 +9,9 @@
 #define OBSERVER_MASK UINT32_C(0xFFFF0000)
 #define OBSERVER_STEP UINT32_C(0x00010000)
 
+/* 3 ms at 40 kHz. */
+#define SETTLING_UPDATES 16u
+
 /* Error of a speed that has settled at a reference of 0: 0.5 rad/s times the unit of the speed. */
 #define NEAR_MIN_Q22 (1 << 21)
 
@@ -240,13 +243,14 @@ static void learn_periodic_load(const control_parameters_t *parameters, deferred
 }
 
 /* True from a change of the speed reference on, until the speed has been within a sixteenth of it for two windows of
- * inertia.h: a speed that swings about it has not settled. */
-static bool approaches_reference(const inertia_parameters_t *parameters, deferred_t *deferred, int32_t speed_q22) {
-    const uint32_t settling = 2u << parameters->window_shift;
+ * inertia.h and SETTLING_UPDATES, with a torque below its limit: a speed that swings about it has not settled. */
+static bool approaches_reference(const inertia_parameters_t *parameters, deferred_t *deferred, int32_t speed_q22,
+                                 bool limited) {
+    const uint32_t settling = (2u << parameters->window_shift) + SETTLING_UPDATES;
     const int32_t reference_q22 = deferred->speed_reference_q22;
     const int32_t near_q22 = fixed_abs(reference_q22) / 16 + NEAR_MIN_Q22;
     const bool is_near = fixed_abs(fixed_subtract(reference_q22, speed_q22)) <= near_q22;
-    deferred->near_updates = !is_near ? 0 : deferred->near_updates + (deferred->near_updates < settling);
+    deferred->near_updates = !is_near || limited ? 0 : deferred->near_updates + (deferred->near_updates < settling);
     if (deferred->near_updates >= settling) {
         deferred->settled_reference_q22 = reference_q22;
     }
@@ -261,7 +265,7 @@ static void identify_inertia(const control_parameters_t *parameters, deferred_t 
         torque_q24 >= deferred->conduction.torque_max_q24 || torque_q24 <= deferred->conduction.torque_min_q24;
     inertia_step(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical,
                  input->torque_sum_q24, limited,
-                 approaches_reference(&parameters->inertia, deferred, input->speed_q22));
+                 approaches_reference(&parameters->inertia, deferred, input->speed_q22, limited));
 }
 
 static void move_conduction(const control_parameters_t *parameters, deferred_t *deferred,
