@@ -113,13 +113,15 @@ static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_m
     return sample;
 }
 
-/* Between two samples; after more the integrals of flux_angle.h are wrong, until the phase begins again. */
-#define FLUX_ANGLE_PERIODS_MAX 256
+/* 0.5 rad/s: at a lower speed the errors of the voltage are many times the flux linkage. */
+#define FLUX_ANGLE_SPEED_MIN_Q22 (1u << 21)
 
 /* Misalignment of the phases by their flux linkage. */
 static void follow_misalignment(drive_t *drive, const phase_monitor_input_t *input,
                                 const encoder_monitor_input_t *encoder, uint32_t elapsed) {
-    const int32_t periods = elapsed < FLUX_ANGLE_PERIODS_MAX ? (int32_t)elapsed : FLUX_ANGLE_PERIODS_MAX;
+    const bool turns = fixed_magnitude(encoder->speed_q22) > FLUX_ANGLE_SPEED_MIN_Q22;
+    const int32_t periods =
+        (int32_t)(elapsed & 0xffu); /* after more the integrals are wrong until the phase begins again */
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         flux_angle_t *flux_angle = &drive->flux_angle[phase];
         const int32_t current_q9 = input->current_q9[phase];
@@ -131,8 +133,9 @@ static void follow_misalignment(drive_t *drive, const phase_monitor_input_t *inp
             .flux_q29 = encoder->flux_q29[phase],
             .table_q29 = drive->phases.phase[phase].table_q29,
             .resistive_q29 = fixed_multiply_high(current_q9 << 12, input->resistance_period_q40) * periods,
-            .time_q29 = input->period_flux_q29 / 256 * periods,
-            .counts = encoder->known[phase] && !input->off[phase] && current_q9 > machine_tables.current_range_q9 / 64,
+            .time_q29 = (input->period_flux_q29 >> 8) * periods,
+            .counts = turns && encoder->known[phase] && !input->off[phase] &&
+                      current_q9 > machine_tables.current_range_q9 / 64,
         };
         if (!input->run) {
             *flux_angle = (flux_angle_t){0};

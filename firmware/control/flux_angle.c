@@ -20,13 +20,11 @@
 #define COARSER 10
 #define SLOPE_COARSER 6
 
-/* Sums are scaled below 2^SCALED_BITS. Of the squares of D at least 2^-UNLIKE_BITS is unlike the other courses, and
- * RESOLVED. */
+/* Sums are scaled below 2^SCALED_BITS. Of the squares of D at least RESOLVED is unlike the other courses. */
 #define SCALED_BITS 30
-#define UNLIKE_BITS 12
-#define RESOLVED 64
+#define RESOLVED 1024
 
-#define DELTA (FLUX_ANGLE_UNKNOWNS - 1)
+#define DELTA (FLUX_ANGLE_COURSES - 2)
 
 static int32_t flux_at(const machine_tables_t *tables, uint32_t angle, int32_t current_q9) {
     return phase_map_flux_q29(tables, phase_map_distance(angle), current_q9);
@@ -45,15 +43,16 @@ COLD bool flux_angle_add(flux_angle_t *flux_angle, const machine_tables_t *table
     const int32_t slope_q29 = flux_at(tables, sample->angle + HALF_STEP, sample->current_q9) -
                               flux_at(tables, sample->angle - HALF_STEP, sample->current_q9);
     const int32_t excess_q29 = fixed_subtract(sample->table_q29, sample->flux_q29);
-    const int32_t course[FLUX_ANGLE_UNKNOWNS + 1] = {
+    const int32_t course[FLUX_ANGLE_COURSES] = {
         flux_angle->time_q29 >> COARSER,
         flux_angle->resistive_q29 >> COARSER,
         sample->table_q29 >> COARSER,
         slope_q29 >> SLOPE_COARSER,
-        fixed_add(excess_q29, fixed_multiply(slope_q29, sample->misalignment, STEP_BITS)) >> COARSER,
+        fixed_add(excess_q29, (1 << (32 - STEP_BITS)) * fixed_multiply_high(slope_q29, sample->misalignment)) >>
+            COARSER,
     };
-    for (unsigned row = 0; row < FLUX_ANGLE_UNKNOWNS; row++) {
-        for (unsigned column = row; column <= FLUX_ANGLE_UNKNOWNS; column++) {
+    for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {
+        for (unsigned column = row; column < FLUX_ANGLE_COURSES; column++) {
             int64_t *sum = &flux_angle->sum[row][column];
             *sum += fixed_product(course[row], course[column]) - (*sum >> FORGET_BITS);
         }
@@ -64,29 +63,30 @@ COLD bool flux_angle_add(flux_angle_t *flux_angle, const machine_tables_t *table
 
 COLD int32_t flux_angle_solve(const flux_angle_t *flux_angle) {
     unsigned shift = 0;
-    for (unsigned row = 0; row < FLUX_ANGLE_UNKNOWNS; row++) {
+    for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {
         while (flux_angle->sum[row][row] >> shift >> SCALED_BITS != 0) {
             shift++;
         }
     }
-    int32_t scaled[FLUX_ANGLE_UNKNOWNS][FLUX_ANGLE_UNKNOWNS + 1];
-    for (unsigned row = 0; row < FLUX_ANGLE_UNKNOWNS; row++) {
-        for (unsigned column = row; column <= FLUX_ANGLE_UNKNOWNS; column++) {
-            scaled[row][column] = fixed_saturate(flux_angle->sum[row][column] >> shift);
+    int32_t scaled[FLUX_ANGLE_COURSES][FLUX_ANGLE_COURSES];
+    for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {
+        for (unsigned column = row; column < FLUX_ANGLE_COURSES; column++) {
+            scaled[row][column] = (int32_t)(flux_angle->sum[row][column] >> shift);
         }
     }
-    const int32_t all = scaled[DELTA][DELTA];
     for (unsigned pivot = 0; pivot < DELTA; pivot++) {
         const int32_t *by = scaled[pivot];
-        for (unsigned row = pivot + 1; row < FLUX_ANGLE_UNKNOWNS && by[pivot] > 0; row++) {
-            for (unsigned column = row; column <= FLUX_ANGLE_UNKNOWNS; column++) {
-                const int64_t explained = fixed_divide(fixed_product(by[row], by[column]), by[pivot]);
-                scaled[row][column] = fixed_saturate(scaled[row][column] - explained);
+        if (by[pivot] <= 0) {
+            return 0;
+        }
+        for (unsigned row = pivot + 1; row < FLUX_ANGLE_COURSES; row++) {
+            for (unsigned column = row; column < FLUX_ANGLE_COURSES; column++) {
+                scaled[row][column] -= (int32_t)fixed_divide(fixed_product(by[row], by[column]), by[pivot]);
             }
         }
     }
     const int32_t unlike = scaled[DELTA][DELTA];
-    if (unlike < (all >> UNLIKE_BITS) + RESOLVED) {
+    if (unlike < RESOLVED) {
         return 0;
     }
     const int64_t left = (int64_t)scaled[DELTA][DELTA + 1] * (INT64_C(1) << (STEP_BITS + COARSER - SLOPE_COARSER));

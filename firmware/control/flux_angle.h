@@ -22,15 +22,15 @@
 #include "control/machine_tables.h"
 #include "hal.h"
 
-/* Unknowns: c, b, a and delta, in the order of elimination. */
-#define FLUX_ANGLE_UNKNOWNS 4
+/* Of c, b, a and delta, in the order of elimination, and of the left side. */
+#define FLUX_ANGLE_COURSES 5
 
 /* Of a phase; all zero at the start. */
 typedef struct {
-    int64_t sum[FLUX_ANGLE_UNKNOWNS][FLUX_ANGLE_UNKNOWNS + 1]; /* of products, upper triangle; last, of the left side */
-    uint32_t samples;                                          /* modulo 2^32 */
-    int32_t resistive_q29; /* integral of R i since the phase has conducted, Wb, Q2.29 */
-    int32_t time_q29;      /* 1/256 of the DC-link voltage times that time, Wb, Q2.29 */
+    int64_t sum[FLUX_ANGLE_COURSES][FLUX_ANGLE_COURSES]; /* of products, upper triangle */
+    uint32_t samples;                                    /* modulo 2^32 */
+    int32_t resistive_q29;                               /* integral of R i since the phase has conducted, Wb, Q2.29 */
+    int32_t time_q29;                                    /* 1/256 of the DC-link voltage times that time, Wb, Q2.29 */
 } flux_angle_t;
 
 typedef struct {
