@@ -113,6 +113,39 @@ static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_m
     return sample;
 }
 
+/* 0.5 rad/s: at a lower speed the errors of the voltage are many times the flux linkage. */
+#define FLUX_ANGLE_SPEED_MIN_Q22 (1u << 21)
+
+/* Misalignment of the phases by their flux linkage. */
+static void follow_misalignment(drive_t *drive, const phase_monitor_input_t *input,
+                                const encoder_monitor_input_t *encoder, uint32_t elapsed) {
+    const bool turns = fixed_magnitude(encoder->speed_q22) > FLUX_ANGLE_SPEED_MIN_Q22;
+    const int32_t periods =
+        (int32_t)(elapsed & 0xffu); /* after more the integrals are wrong until the phase begins again */
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+        flux_angle_t *flux_angle = &drive->flux_angle[phase];
+        const int32_t current_q9 = input->current_q9[phase];
+        const int32_t misalignment = input->misalignment[phase];
+        const flux_angle_sample_t sample = {
+            .angle = input->electrical - phase * input->stroke - (uint32_t)misalignment,
+            .misalignment = misalignment,
+            .current_q9 = current_q9,
+            .flux_q29 = encoder->flux_q29[phase],
+            .table_q29 = drive->phases.phase[phase].table_q29,
+            .resistive_q29 = fixed_multiply_high(current_q9 << 12, input->resistance_period_q40) * periods,
+            .time_q29 = (input->period_flux_q29 >> 8) * periods,
+            .counts = turns && encoder->known[phase] && !input->off[phase] &&
+                      current_q9 > machine_tables.current_range_q9 / 64,
+        };
+        if (!input->run) {
+            *flux_angle = (flux_angle_t){0};
+            drive->control.flux_misalignment[phase] = 0;
+        } else if (flux_angle_add(flux_angle, &machine_tables, &sample)) {
+            drive->control.flux_misalignment[phase] = flux_angle_solve(flux_angle);
+        }
+    }
+}
+
 /* Checks phases and encoder, and corrects the integrals. */
 COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sample) {
     const phase_monitor_input_t *input = &sample->phases;
@@ -125,6 +158,7 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     const phase_balance_sample_t balance = balance_sample(drive, input, &encoder, elapsed, step);
     failed |= phase_balance_step(&drive->balance, &balance);
     drive->phases.phases |= drive->balance.phases;
+    follow_misalignment(drive, input, &encoder, elapsed);
     const uint32_t of_phases =
         (uint32_t)(FAULT_BIT(FAULT_PHASE_OPEN) | FAULT_BIT(FAULT_PHASE_SHORTED) | FAULT_BIT(FAULT_CURRENT_SENSOR));
     if ((failed & of_phases) != 0 &&

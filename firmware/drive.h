@@ -6,6 +6,7 @@
 #include <stdint.h>
 
 #include "comms/comms.h"
+#include "control/flux_angle.h"
 #include "drive/configure.h"
 #include "drive/control.h"
 #include "drive/encoder_monitor.h"
@@ -57,6 +58,7 @@ typedef struct {
     stall_monitor_t stall;
     phase_monitor_t phases;
     phase_balance_t balance;
+    flux_angle_t flux_angle[HAL_PHASES_MAX];
     degraded_t degraded;
     encoder_monitor_t encoder;
     thermal_parameters_t thermal_parameters;

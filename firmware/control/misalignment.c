@@ -11,6 +11,8 @@
 #define MEAN_1_S 10
 #define FILTER_GAIN_MAX_Q16 65535 /* largest below one */
 #define SETTLE_MS 150
+/* 1.2 s. */
+#define DISTRUST_SHIFT 3
 #define TORQUE_MIN_Q24 (1u << 24)
 /* 0.05 * 0.02^2 of T^2, Q32: keeps the denominator above the noise of s_j. */
 #define POWER_FLOOR_Q32 (21 << 12)
@@ -25,22 +27,16 @@
 /* Corner of high-pass and low-pass of the sum and of y in rad per stroke, and the largest gain of both. */
 #define BAND_FACTOR 4
 #define BAND_GAIN_MAX_Q16 (1 << 15)
-/* Under a load that moves: a quarter of the rate, from 50 strokes a second on, steps of 0.2 ms. */
-#define MOVING_SHIFT 2
-/* After 1.2 s: an encoder that is displaced by more than can be learned has been found before
- * (drive/encoder_monitor.h).
- */
-#define MOVING_SETTLES 2
-#define STROKE_PART_MIN_Q16 655
-
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings) {
     const uint32_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
     const uint32_t phase_rate_hz = update_rate_hz / settings->phases;
     const uint32_t common_rate_hz = settings->control_rate_hz / settings->periods_per_common_update;
+    const uint32_t probe_angle = PROBE_ANGLE * settings->rotor_poles;
     return (misalignment_parameters_t){
-        .probe_angle = PROBE_ANGLE * settings->rotor_poles,
+        .probe_angle = probe_angle,
         .rate_q30 = (int32_t)fixed_divide((int64_t)settings->rate_1_s << 30, phase_rate_hz),
         .common_rate_q30 = (int32_t)fixed_divide((int64_t)settings->rate_1_s << 30, COMMON_SLOWER * common_rate_hz),
+        .flux_rate_q8 = (int32_t)fixed_divide((int64_t)settings->rate_1_s << 46, (int64_t)probe_angle * phase_rate_hz),
         .filter_q32 = (int32_t)fixed_divide(((int64_t)8 << 32) / 5, phase_rate_hz),
         .mean_q16 = (int32_t)fixed_divide((int64_t)MEAN_1_S << 16, phase_rate_hz) + 1,
         .inertia_rate_q8 = fixed_saturate(((int64_t)settings->inertia_q30 * settings->control_rate_hz) >> 22),
@@ -96,24 +92,30 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const bool torque_suffices = fixed_magnitude(sample->torque_q24) > TORQUE_MIN_Q24;
     const bool steady = sample->condition == MISALIGNMENT_STEADY && torque_suffices;
     const int32_t disturbance_q24 = sample->disturbance_q24;
-    const bool settled = misalignment->steady_updates >= parameters->settle_updates;
+    const unsigned index = misalignment->phase_index;
+    misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;
+    misalignment_phase_t *phase = &misalignment->phase[index];
+    IN_REGISTER(phase);
+    const int32_t flux_error =
+        sample->flux_misalignment != 0 ? fixed_subtract(sample->flux_misalignment, phase->offset) : 0;
+    const bool contradicted = fixed_magnitude(flux_error) > parameters->probe_angle / 2;
+    const bool settled = misalignment->steady_updates >= parameters->settle_updates
+                                                             << (misalignment->distrusted ? DISTRUST_SHIFT : 0);
     if (steady) {
         misalignment->steady_updates += !settled;
     } else if (sample->condition == MISALIGNMENT_UNSTEADY) {
         misalignment->steady_updates = 0;
     }
-    const bool learning = steady && settled;
-    misalignment->common_rate = learning                                 ? MISALIGNMENT_RATE_FULL
-                                : sample->undisturbed && torque_suffices ? MISALIGNMENT_RATE_BEYOND_LOAD
-                                                                         : MISALIGNMENT_RATE_NONE;
+    if (settled) {
+        misalignment->distrusted = contradicted;
+        misalignment->steady_updates = contradicted ? 0 : misalignment->steady_updates;
+    }
+    const bool learning = steady && settled && !contradicted;
+    misalignment->learning = learning;
     const int32_t phases = (int32_t)tables->phases;
     const int32_t mean_gain_q16 =
         settled ? parameters->mean_q16 : growing_mean_q16(parameters, misalignment->steady_updates, phases);
 
-    const unsigned index = misalignment->phase_index;
-    misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;
-    misalignment_phase_t *phase = &misalignment->phase[index];
-    IN_REGISTER(phase);
     misalignment->disturbance_sum_q24 += disturbance_q24;
     const int64_t sum_before_q24 = phase->last_sum_q24;
     phase->last_sum_q24 = misalignment->disturbance_sum_q24;
@@ -144,6 +146,10 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
         const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
         const int32_t step_q10 = phase_step_q10(misalignment, error_q24, alternating_q24, sample->torque_q24);
         step_q40 = fixed_accumulate(step_q40, step_q10, parameters->rate_q30);
+    } else {
+        step_q40 = fixed_product(flux_error, parameters->flux_rate_q8) >> 8;
+        phase->before_last_q40 += step_q40;
+        phase->before_q40 += step_q40;
     }
     phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + step_q40);
     /* 0.02 rad is twice the probe angle. */
@@ -156,10 +162,6 @@ static int32_t band_pass_step(misalignment_band_t *band, int32_t value_q24, int3
     low_pass_step(&band->mean_q24, value_q24, gain_q16);
     low_pass_step(&band->value_q24, fixed_subtract(value_q24, band->mean_q24), gain_q16);
     return band->value_q24;
-}
-
-static bool learns_beyond_load(const misalignment_parameters_t *parameters, const misalignment_t *misalignment) {
-    return misalignment->beyond_load_steps >= MOVING_SETTLES * parameters->settle_updates;
 }
 
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
@@ -176,13 +178,7 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     const int32_t error_q24 = band_pass_step(&misalignment->common_disturbance, disturbance_q24, gain_q16);
     const int64_t square_q40 = fixed_product(quarter_q24, quarter_q24) >> 8;
     misalignment->common_power_q40 += (square_q40 - misalignment->common_power_q40) >> COMMON_POWER_SHIFT;
-    const bool learning = misalignment->common_rate == MISALIGNMENT_RATE_FULL;
-    if (learning) {
-        misalignment->beyond_load_steps = 0;
-    } else if (misalignment->common_rate == MISALIGNMENT_RATE_NONE || stroke_part_q16 < STROKE_PART_MIN_Q16) {
-        return;
-    } else if (!learns_beyond_load(parameters, misalignment)) {
-        misalignment->beyond_load_steps++;
+    if (!misalignment->learning) {
         return;
     }
     const int32_t power_q22 = fixed_saturate(misalignment->common_power_q40 >> 18);
@@ -192,14 +188,11 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     /* y 4 q / (16 q^2), q the quarter. */
     const int32_t step_q10 =
         limited_step_q10(fixed_multiply_shift(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));
-    const int64_t step_q40 = fixed_product(step_q10, parameters->common_rate_q30);
-    misalignment->common_sum_q40 += learning ? step_q40 : step_q40 >> MOVING_SHIFT;
+    misalignment->common_sum_q40 += fixed_product(step_q10, parameters->common_rate_q30);
 }
 
-void misalignment_end_stroke(const misalignment_parameters_t *parameters, misalignment_t *misalignment, bool changed,
-                             bool grown) {
-    const bool forget = changed && (grown || learns_beyond_load(parameters, misalignment));
-    if (forget) {
+void misalignment_end_stroke(misalignment_t *misalignment, bool changed, bool grown) {
+    if (changed && grown) {
         for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
             misalignment_phase_t *phase = &misalignment->phase[i];
             phase->offset_q40 = phase->before_q40 = phase->before_last_q40;

@@ -27,13 +27,14 @@
  * rotor angle in bins could cancel any error, not only a misalignment, but would have dozens of values to learn from
  * the same signal instead of one per phase.
  *
- * A load that moves has little in that band from 50 strokes a second on, so that the common angle is learned under it,
- * after 1.2 s at a quarter of the rate.
+ * A load that moves hides that ripple. While it does, each phase follows the angle that its flux linkage shows
+ * (flux_angle.h), at half of the rate. That angle knows nothing of the load, but errs with the shape of the tables, so
+ * that under a constant load the ripple has the last word, within 0.29 degrees. What it teaches beyond that is a load
+ * that seems constant: then the flux linkage takes over until the state has been steady for 1.2 s.
  *
  * A load that changes within a stroke teaches until the end of that stroke shows it (stroke_mean.h). What was learned
- * in that stroke and the one before it is then forgotten: any change of the load forgets what was learned under a load
- * that moves, and what was learned under a constant one only if the load's amplitude within the stroke has grown,
- * because learning reduces that, and itself changes the mean.
+ * from the ripple in that stroke and the one before it is then forgotten if the load's amplitude within the stroke has
+ * grown, because learning reduces that, and itself changes the mean.
  *
  * s_j is filtered by the observer's present bandwidth. Learning of the phases is suspended unless speed and load are
  * steady, the torque is above 1 N m and the voltage is not limited; a large misalignment itself disturbs every stroke,
@@ -52,6 +53,7 @@ typedef struct {
     uint32_t probe_angle;    /* 0.01 rad mechanical, 2^-32 electrical rev; s_j is the torque change over twice that */
     int32_t rate_q30;        /* rate times the update interval of a phase, Q1.30; 0: no learning */
     int32_t common_rate_q30; /* the same for the common angle, half of that rate, Q1.30 */
+    int32_t flux_rate_q8;    /* half of that rate, 2^-40 of 0.02 rad per 2^-32 electrical rev, Q23.8 */
     int32_t filter_q32;      /* 1.6 times the update interval, s, Q0.32 */
     int32_t mean_q16;        /* 10 / s times the update interval, Q0.16 */
     int32_t inertia_rate_q8; /* J / Ts: N m per rad/s, Q23.8 */
@@ -68,13 +70,6 @@ typedef struct {
     int32_t offset;                      /* delta_j, 2^-32 electrical rev, to subtract from the phase's angle */
 } misalignment_phase_t;
 
-/* Of the common angle. */
-typedef enum {
-    MISALIGNMENT_RATE_NONE,
-    MISALIGNMENT_RATE_BEYOND_LOAD, /* a quarter, where the strokes are faster than a load moves */
-    MISALIGNMENT_RATE_FULL,
-} misalignment_rate_t;
-
 /* Band-pass around the frequency of the strokes, N m, Q7.24. */
 typedef struct {
     int32_t mean_q24, value_q24; /* low-pass of its input; and of the rest */
@@ -89,9 +84,9 @@ typedef struct {
     int64_t common_power_q40; /* mean of the band's (sum s_j / 4)^2, (N m per 0.02 rad)^2, Q40 */
     int64_t common_sum_q40;   /* of the steps of the common angle, which each phase takes with its next update */
     misalignment_band_t common_slope, common_disturbance; /* of sum s_j / 4, N m per 0.02 rad, and of y */
-    uint32_t beyond_load_steps;      /* of the common angle since the load was last steady, until they learn */
-    misalignment_rate_t common_rate; /* by the conditions of the last misalignment_step */
-    unsigned phase_index;            /* phase to update, in turn */
+    bool distrusted;      /* the ripple has taught what the flux linkage contradicts: learning waits for longer */
+    bool learning;        /* from the ripple, by the conditions of the last misalignment_step */
+    unsigned phase_index; /* phase to update, in turn */
 } misalignment_t;
 
 typedef enum {
@@ -107,7 +102,7 @@ typedef struct {
     int32_t torque_q24;       /* reference, N m, Q7.24 */
     uint32_t bandwidth_rad_s; /* of the load observer */
     misalignment_condition_t condition;
-    bool undisturbed; /* all but the load is steady */
+    int32_t flux_misalignment; /* of that phase by flux_angle.h, 2^-32 electrical rev; 0: unknown */
 } misalignment_sample_t;
 
 typedef struct {
@@ -134,15 +129,14 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
                        const machine_tables_t *tables, const misalignment_sample_t *sample);
 
 /* One sample: updates the offset that the phases have in common, from the slopes of the last misalignment_step of each,
- * while those learn, or more slowly while only the load may move; each takes it with its next step. Disturbance and
+ * while those learn from the ripple; each takes it with its next step. Disturbance and
  * torque reference in N m, Q7.24; stroke_part_q16: part of a stroke since the last step, from 0; rounding as there. */
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                               unsigned phases, int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16);
 
 /* At the end of a stroke: forgets what was learned in it and in the one before, if it was of a load that has changed.
  * changed, grown: of stroke_mean_t. */
-void misalignment_end_stroke(const misalignment_parameters_t *parameters, misalignment_t *misalignment, bool changed,
-                             bool grown);
+void misalignment_end_stroke(misalignment_t *misalignment, bool changed, bool grown);
 
 /* At the end of a run: what has been learned is not forgotten. */
 void misalignment_keep(misalignment_t *misalignment);

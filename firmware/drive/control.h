@@ -174,6 +174,8 @@ typedef struct {
      * argument. */
     control_measurement_t measurement;
     uint32_t lost_phase; /* number from 1 on of the phase whose switches stay open, as reported_fault_mask; 0: none */
+    int32_t flux_misalignment[HAL_PHASES_MAX]; /* by the flux linkage, as reported_fault_mask, 2^-32 electrical rev; 0:
+                                                  unknown */
     int32_t torque_limit_q24; /* of the torque reference's magnitude, as reported_fault_mask, N m, Q7.24 */
 } control_state_t;
 

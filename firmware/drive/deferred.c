@@ -195,12 +195,11 @@ static int32_t disturbance_q24(const deferred_t *deferred, const deferred_input_
 }
 
 static void learn_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
-                               const deferred_input_t *input) {
+                               const deferred_input_t *input, const int32_t flux_misalignment[HAL_PHASES_MAX]) {
     const commutation_t commutation = {.electrical = input->electrical};
     const unsigned phase = deferred->misalignment.phase_index;
     const uint32_t lag =
         (uint32_t)rotation(parameters, input) * parameters->commutation.rotor_poles * SLOPE_LAG_PERIODS;
-    const bool undisturbed = undisturbed_speed_control(parameters, deferred, input);
     const misalignment_sample_t sample = {
         .current_q9 = input->current_q9,
         .angle = commutation_angle(&parameters->commutation, &commutation, phase) -
@@ -208,8 +207,8 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
         .disturbance_q24 = disturbance_q24(deferred, input),
         .torque_q24 = input->torque_reference_q24,
         .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth.stage],
-        .condition = condition(deferred, undisturbed),
-        .undisturbed = undisturbed,
+        .condition = condition(deferred, undisturbed_speed_control(parameters, deferred, input)),
+        .flux_misalignment = flux_misalignment[phase],
     };
     misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);
 }
@@ -334,7 +333,7 @@ static void limit_currents(const control_parameters_t *parameters, const deferre
 /* What is not urgent, in eight turns: no step takes the time of all. The learning of the phases has half of them,
  * because at a high bandwidth of the observer it follows within a millisecond. */
 NOINLINE static void take_turns(const control_parameters_t *parameters, deferred_t *deferred,
-                                const deferred_input_t *input) {
+                                const deferred_input_t *input, const int32_t flux_misalignment[HAL_PHASES_MAX]) {
     deferred->turn = (deferred->turn + 1) % DEFERRED_COMMON_PERIODS;
     switch (deferred->turn) {
     case 0:
@@ -348,7 +347,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
                            deferred->periodic_load.engaged);
         if (stroke_mean_to_review(&deferred->stroke_mean)) {
             stroke_mean_review(&parameters->stroke_mean, &deferred->stroke_mean);
-            misalignment_end_stroke(&parameters->misalignment, &deferred->misalignment, deferred->stroke_mean.changed,
+            misalignment_end_stroke(&deferred->misalignment, deferred->stroke_mean.changed,
                                     deferred->stroke_mean.grown);
         } else if (!stroke_mean_ended(&deferred->stroke_mean)) { /* both have taken their time */
             learn_periodic_load(parameters, deferred, input);
@@ -365,7 +364,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         set_speed_law(parameters, deferred);
         break;
     default:
-        learn_misalignment(parameters, deferred, input);
+        learn_misalignment(parameters, deferred, input, flux_misalignment);
         await_slow_counts(parameters, deferred, input, input->periods + DEFERRED_LEARNING_PERIODS - 1u);
         break;
     }
@@ -395,7 +394,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
         await_slow_counts(parameters, deferred, input, input->periods);
         limit_currents(parameters, input, reset, results);
     } else if (!reset) { /* a step that resets has done enough */
-        take_turns(parameters, deferred, input);
+        take_turns(parameters, deferred, input, state->flux_misalignment);
     }
     results->observer = deferred->inertia.laws.observer;
     results->predictive.conduction = deferred->conduction.latest;

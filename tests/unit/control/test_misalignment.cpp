@@ -91,7 +91,7 @@ class Machine {
                                               .torque_q24 = to_fixed(torque_Nm, Q24),
                                               .bandwidth_rad_s = uint32_t(BANDWIDTH_RAD_S),
                                               .condition = condition,
-                                              .undisturbed = load_may_move};
+                                              .flux_misalignment = by_flux[learned]};
         misalignment_step(&parameters, &state, &machine_tables, &sample);
         model.step(sample.disturbance_q24 / Q24, BANDWIDTH_RAD_S, condition == MISALIGNMENT_STEADY, torque_Nm,
                    [&](unsigned phase) { return slope[phase]; });
@@ -112,8 +112,8 @@ class Machine {
     reference_model::misalignment_t model{};
     offsets_t off;
     double rpm = 150.0;
-    bool common = false; // the common angle is learned, too
-    bool load_may_move = false;
+    bool common = false;                   // the common angle is learned, too
+    std::array<int32_t, PHASES> by_flux{}; // 2^-32 electrical rev
     unsigned updates = 0;
     double position = 0.0;
     std::array<double, 2> lag{};
@@ -248,21 +248,52 @@ TEST(Misalignment, at_1500_rpm_where_sampling_folds_the_steps_of_the_slopes_the_
     }
 }
 
-TEST(Misalignment, under_a_load_that_moves_the_common_angle_is_learned_from_50_strokes_a_second_on) {
-    for (const double off : {0.0, 0.5, -2.0}) {
-        Machine fast(8, {off, off, off}), slow(8, {off, off, off});
-        fast.common = fast.load_may_move = slow.common = slow.load_may_move = true;
-        fast.rpm = 300.0;
-        slow.rpm = 240.0; // 48 strokes a second
-        for (int k = 0; k < int(6 * RATE_HZ); k++) {
-            const double load_Nm = 8.0 + std::sin(2.0 * PI * 5.3 * k / RATE_HZ);
-            fast.step(8.0, load_Nm, MISALIGNMENT_UNSTEADY);
-            slow.step(8.0, load_Nm, MISALIGNMENT_UNSTEADY);
+TEST(Misalignment, under_a_load_that_moves_each_phase_takes_that_of_the_flux_linkage_within_1_s) {
+    const offsets_t off{0.5, -2.0, 1.0};
+    Machine machine(12, {0.0, 0.0, 0.0}), unknown(12, off);
+    for (unsigned phase = 0; phase < PHASES; phase++) {
+        machine.by_flux[phase] = to_fixed(electrical_rev_of(off[phase] / 180.0 * PI), REV);
+    }
+    for (int k = 0; k < int(RATE_HZ); k++) {
+        const double load_Nm = 8.0 + 4.0 * std::sin(2.0 * PI * 30.0 * k / RATE_HZ);
+        machine.step(8.0, load_Nm, false);
+        unknown.step(8.0, load_Nm, false);
+        if (k % 100 == 0) {
+            misalignment_end_stroke(&machine.state, true, true);
         }
-        for (unsigned phase = 0; phase < PHASES; phase++) {
-            EXPECT_NEAR(fast.offset_deg(phase), off, 0.05 + 0.1 * std::fabs(off)) << off << ", phase " << phase;
-            EXPECT_EQ(slow.offset_deg(phase), 0.0);
+    }
+    for (unsigned phase = 0; phase < PHASES; phase++) {
+        EXPECT_NEAR(machine.offset_deg(phase), off[phase], 0.02 * std::fabs(off[phase])) << phase;
+        EXPECT_EQ(unknown.offset_deg(phase), 0.0) << phase;
+    }
+}
+
+TEST(Misalignment, a_load_that_moves_with_the_strokes_teaches_little_more_than_what_the_flux_linkage_contradicts) {
+    const auto worst_deg = [](bool by_flux) {
+        Machine machine(12, {0.0, 0.0, 0.0});
+        machine.by_flux.fill(by_flux ? 1 : 0);
+        double worst = 0.0;
+        for (int k = 0; k < int(3 * RATE_HZ); k++) {
+            const double strokes = 150.0 / 60.0 * machine_tables.rotor_poles * PHASES * k / RATE_HZ;
+            machine.step(8.0, 8.0 + 2.0 * std::sin(2.0 * PI * strokes / PHASES), true);
+            for (unsigned phase = 0; phase < PHASES; phase++) {
+                worst = std::max(worst, std::fabs(machine.offset_deg(phase)));
+            }
         }
+        return worst;
+    };
+    EXPECT_LT(worst_deg(true), 0.35);
+    EXPECT_GT(worst_deg(false), 1.0);
+}
+
+TEST(Misalignment, what_the_ripple_shows_within_0_29_degrees_of_the_flux_linkage_is_learned) {
+    Machine machine(12, {0.2, 0.2, 0.2});
+    machine.by_flux.fill(1);
+    for (int k = 0; k < int(1.5 * RATE_HZ); k++) {
+        machine.step(8.0, 8.0, true);
+    }
+    for (unsigned phase = 0; phase < PHASES; phase++) {
+        EXPECT_NEAR(machine.offset_deg(phase), 0.2, 0.02) << phase;
     }
 }
 
@@ -291,7 +322,7 @@ TEST(Misalignment,
             for (int k = 0; k < int(RATE_HZ / 30.0); k++) {
                 machine.step(8.0, 8.0, steady);
             }
-            misalignment_end_stroke(&machine.parameters, &machine.state, at_end, grown);
+            misalignment_end_stroke(&machine.state, at_end, grown);
         };
         for (unsigned k = 0; k < 8; k++) {
             stroke(true, false);

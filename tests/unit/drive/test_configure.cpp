@@ -228,6 +228,8 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("misalignment rate", c.misalignment.rate_q30, learn_1_s / turn_rate_hz * fixed_point::Q30, 1.0);
     near("common misalignment rate", c.misalignment.common_rate_q30,
          learn_1_s / 2.0 / (rate_hz / DEFERRED_COMMON_PERIODS) * fixed_point::Q30, 1.0);
+    near("misalignment rate by the flux linkage", c.misalignment.flux_rate_q8,
+         learn_1_s / 2.0 / turn_rate_hz * std::ldexp(1.0, 48) / (2.0 * c.misalignment.probe_angle), 1.0);
     near("inertia rate", c.misalignment.inertia_rate_q8, v(PARAMETER_INERTIA_KG_M2) * rate_hz * 256.0, 1.0);
     ASSERT_LE(std::fabs(c.misalignment.probe_angle -
                         0.01 / (2.0 * fixed_point::PI) * fixed_point::REV * machine_tables.rotor_poles),

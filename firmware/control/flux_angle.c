@@ -1,0 +1,94 @@
+#include "control/flux_angle.h"
+
+#include "control/phase_map.h"
+#include "fixed/compiler.h"
+#include "fixed/divide.h"
+#include "fixed/fixed.h"
+
+/* s: 2^26 of 2^-32 electrical rev. */
+#define STEP_BITS 26
+#define HALF_STEP (UINT32_C(1) << (STEP_BITS - 1))
+
+/* Of the sums: 2^11 samples, 0.45 s of a phase that conducts for nearly half of the time and has ten a millisecond.
+ * They are solved after each 256, from 1.1 s on: an encoder that is displaced by more than can be learned has been
+ * found before (drive/phase_balance.h). */
+#define FORGET_BITS 11
+#define SAMPLES_MIN 5120u
+#define SAMPLES_EACH 256u
+
+/* Flux linkages in the sums, Wb: Q19, so that 2^13 squares of 4 Wb fit; D, which is smaller, Q23. */
+#define COARSER 10
+#define SLOPE_COARSER 6
+
+/* Sums are scaled below 2^SCALED_BITS. Of the squares of D at least RESOLVED is unlike the other courses. */
+#define SCALED_BITS 30
+#define RESOLVED 1024
+
+#define DELTA (FLUX_ANGLE_COURSES - 2)
+
+static int32_t flux_at(const machine_tables_t *tables, uint32_t angle, int32_t current_q9) {
+    return phase_map_flux_q29(tables, phase_map_distance(angle), current_q9);
+}
+
+COLD bool flux_angle_add(flux_angle_t *flux_angle, const machine_tables_t *tables, const flux_angle_sample_t *sample) {
+    if (sample->flux_q29 <= 0) {
+        flux_angle->resistive_q29 = flux_angle->time_q29 = 0;
+        return false;
+    }
+    flux_angle->resistive_q29 = fixed_add(flux_angle->resistive_q29, sample->resistive_q29);
+    flux_angle->time_q29 = fixed_add(flux_angle->time_q29, sample->time_q29);
+    if (!sample->counts) {
+        return false;
+    }
+    const int32_t slope_q29 = flux_at(tables, sample->angle + HALF_STEP, sample->current_q9) -
+                              flux_at(tables, sample->angle - HALF_STEP, sample->current_q9);
+    const int32_t excess_q29 = fixed_subtract(sample->table_q29, sample->flux_q29);
+    const int32_t course[FLUX_ANGLE_COURSES] = {
+        flux_angle->time_q29 >> COARSER,
+        flux_angle->resistive_q29 >> COARSER,
+        sample->table_q29 >> COARSER,
+        slope_q29 >> SLOPE_COARSER,
+        fixed_add(excess_q29, (1 << (32 - STEP_BITS)) * fixed_multiply_high(slope_q29, sample->misalignment)) >>
+            COARSER,
+    };
+    for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {
+        for (unsigned column = row; column < FLUX_ANGLE_COURSES; column++) {
+            int64_t *sum = &flux_angle->sum[row][column];
+            *sum += fixed_product(course[row], course[column]) - (*sum >> FORGET_BITS);
+        }
+    }
+    flux_angle->samples++;
+    return flux_angle->samples >= SAMPLES_MIN && flux_angle->samples % SAMPLES_EACH == 0;
+}
+
+COLD int32_t flux_angle_solve(const flux_angle_t *flux_angle) {
+    unsigned shift = 0;
+    for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {
+        while (flux_angle->sum[row][row] >> shift >> SCALED_BITS != 0) {
+            shift++;
+        }
+    }
+    int32_t scaled[FLUX_ANGLE_COURSES][FLUX_ANGLE_COURSES];
+    for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {
+        for (unsigned column = row; column < FLUX_ANGLE_COURSES; column++) {
+            scaled[row][column] = (int32_t)(flux_angle->sum[row][column] >> shift);
+        }
+    }
+    for (unsigned pivot = 0; pivot < DELTA; pivot++) {
+        const int32_t *by = scaled[pivot];
+        if (by[pivot] <= 0) {
+            return 0;
+        }
+        for (unsigned row = pivot + 1; row < FLUX_ANGLE_COURSES; row++) {
+            for (unsigned column = row; column < FLUX_ANGLE_COURSES; column++) {
+                scaled[row][column] -= (int32_t)fixed_divide(fixed_product(by[row], by[column]), by[pivot]);
+            }
+        }
+    }
+    const int32_t unlike = scaled[DELTA][DELTA];
+    if (unlike < RESOLVED) {
+        return 0;
+    }
+    const int64_t left = (int64_t)scaled[DELTA][DELTA + 1] * (INT64_C(1) << (STEP_BITS + COARSER - SLOPE_COARSER));
+    return fixed_saturate(fixed_divide(left, unlike));
+}

@@ -1,0 +1,150 @@
+// Misalignment by flux linkage, on strokes of a machine whose flux linkage, resistance and voltage are not those of the
+// tables.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/flux_angle.h"
+#include "control/phase_map.h"
+}
+
+#include "support/fixed_point.h"
+
+namespace {
+
+using namespace fixed_point;
+
+constexpr double SAMPLE_S = 1e-4;
+constexpr double RESISTANCE_OHM = 0.05, VOLTAGE_V = 240.0;
+
+double psi_Wb(double rev, double current_A) {
+    return phase_map_flux_q29(&machine_tables, phase_map_distance(uint32_t(int64_t(std::floor(rev * REV)))),
+                              to_fixed(current_A, 512.0)) /
+           Q29;
+}
+
+// One phase, in strokes from the unaligned to the aligned position.
+class FluxAngle : public testing::Test {
+  protected:
+    // Time in s. The voltage is what the flux linkage of the machine needs, and the integral what the drive makes of
+    // it.
+    void run(double seconds) {
+        double since_s = 0.0, drift_Wb = 0.0;
+        for (int k = 0; k < int(seconds / SAMPLE_S); k++) {
+            const double measured = 0.52 + rpm / 60.0 * machine_tables.rotor_poles * since_s;
+            if (measured > 0.9) {
+                since_s = drift_Wb = 0.0;
+                flux_angle_sample_t off = {};
+                flux_angle_add(&state, &machine_tables, &off);
+                continue;
+            }
+            since_s += SAMPLE_S;
+            const double current_A = 4.0 + load_Nm(k * SAMPLE_S) * (1.0 + 4.0 * std::pow(measured - 0.7, 2.0));
+            const double true_rev = measured - misalignment_deg / 360.0 * machine_tables.rotor_poles;
+            drift_Wb += (RESISTANCE_OHM * (resistance_gain - 1.0) * current_A + drop_V) * SAMPLE_S;
+            const double corrected = measured - learned_deg / 360.0 * machine_tables.rotor_poles;
+            const flux_angle_sample_t sample = {
+                .angle = uint32_t(int64_t(std::floor(corrected * REV))),
+                .misalignment = to_fixed(learned_deg / 360.0 * machine_tables.rotor_poles, REV),
+                .current_q9 = to_fixed(current_A, 512.0),
+                .flux_q29 = to_fixed(flux_gain * psi_Wb(true_rev, current_A) + drift_Wb, Q29),
+                .table_q29 = to_fixed(psi_Wb(corrected, current_A), Q29),
+                .resistive_q29 = to_fixed(RESISTANCE_OHM * current_A * SAMPLE_S, Q29),
+                .time_q29 = to_fixed(VOLTAGE_V / 256.0 * SAMPLE_S, Q29),
+                .counts = true,
+            };
+            if (flux_angle_add(&state, &machine_tables, &sample)) {
+                solved_deg = flux_angle_solve(&state) / REV / machine_tables.rotor_poles * 360.0;
+                solutions++;
+            }
+        }
+    }
+
+    double load_Nm(double time_s) const { return 12.0 + moving_A * std::sin(2.0 * PI * 37.0 * time_s); }
+
+    flux_angle_t state{};
+    double rpm = 150.0;
+    double misalignment_deg = 0.0, learned_deg = 0.0;
+    double flux_gain = 1.0, resistance_gain = 1.0, drop_V = 0.0, moving_A = 0.0;
+    double solved_deg = 0.0;
+    int solutions = 0;
+};
+
+TEST_F(FluxAngle, is_that_of_the_encoder_to_0_05_degrees_whatever_gain_resistance_drops_and_load_are) {
+    for (const double speed_rpm : {20.0, 150.0, 1500.0}) {
+        for (const double gain : {0.9, 1.1}) {
+            for (const double off_deg : {-2.0, -0.3, 0.0, 0.3, 2.0}) {
+                state = {};
+                rpm = speed_rpm;
+                flux_gain = gain;
+                resistance_gain = gain > 1.0 ? 1.5 : 0.8;
+                drop_V = gain > 1.0 ? 1.7 : 0.0;
+                moving_A = 4.0;
+                misalignment_deg = off_deg;
+                learned_deg = off_deg - 0.1;
+                run(3.0);
+                EXPECT_NEAR(solved_deg, off_deg, 0.05) << rpm << " r/min, gain " << gain;
+            }
+        }
+    }
+}
+
+TEST_F(FluxAngle, of_a_large_misalignment_is_found_in_steps) {
+    misalignment_deg = moving_A = 4.0;
+    for (int k = 0; k < 4; k++) {
+        run(2.0);
+        learned_deg = solved_deg;
+    }
+    EXPECT_NEAR(solved_deg, 4.0, 0.05);
+}
+
+TEST_F(FluxAngle, is_not_solved_in_the_first_half_second) {
+    run(0.5);
+    EXPECT_EQ(solutions, 0);
+    run(1.0);
+    EXPECT_GT(solutions, 0);
+}
+
+TEST_F(FluxAngle, is_unknown_without_a_course_of_its_own) {
+    for (int k = 0; k < 4096; k++) {
+        const flux_angle_sample_t constant = {
+            .angle = 0xb0000000u,
+            .misalignment = 0,
+            .current_q9 = 10 * 512,
+            .flux_q29 = 1 << 26,
+            .table_q29 = 1 << 25,
+            .resistive_q29 = 0,
+            .time_q29 = 0,
+            .counts = true,
+        };
+        flux_angle_add(&state, &machine_tables, &constant);
+    }
+    EXPECT_EQ(flux_angle_solve(&state), 0);
+}
+
+TEST_F(FluxAngle, overflows_nothing) {
+    for (const int32_t sign : {1, -1}) {
+        state = {};
+        for (uint32_t k = 0; k < 20000; k++) {
+            const bool end = k % 100 == 0;
+            const flux_angle_sample_t sample = {
+                .angle = 0x80000000u + k * 0x01234567u,
+                .misalignment = sign * (1 << 29),
+                .current_q9 = 79 * 512,
+                .flux_q29 = end ? 0 : INT32_MAX,
+                .table_q29 = k % 2 == 0 ? INT32_MAX : 0,
+                .resistive_q29 = INT32_MAX / 2,
+                .time_q29 = INT32_MAX,
+                .counts = true,
+            };
+            if (flux_angle_add(&state, &machine_tables, &sample)) {
+                flux_angle_solve(&state);
+            }
+        }
+    }
+}
+
+} // namespace
