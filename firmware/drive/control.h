@@ -149,6 +149,7 @@ typedef struct {
     inertia_t inertia;                /* its shift likewise */
     int32_t settled_reference_q22;    /* the last speed reference at which the speed has settled, rad/s, Q9.22 */
     uint32_t near_updates;            /* successive ones near the reference */
+    bool approaches_reference;        /* it has changed since */
     slow_counts_t slow_counts;
 } deferred_t;
 

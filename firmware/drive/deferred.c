@@ -241,30 +241,33 @@ static void learn_periodic_load(const control_parameters_t *parameters, deferred
     periodic_load_step(&parameters->periodic_load, &deferred->periodic_load, &sample);
 }
 
-/* True from a change of the speed reference on, until the speed has been within a sixteenth of it for two windows of
- * inertia.h and SETTLING_UPDATES, with a torque below its limit: a speed that swings about it has not settled. */
-static bool approaches_reference(const inertia_parameters_t *parameters, deferred_t *deferred, int32_t speed_q22,
-                                 bool limited) {
-    const uint32_t settling = (2u << parameters->window_shift) + SETTLING_UPDATES;
+static bool at_torque_limit(const deferred_t *deferred, int32_t torque_q24) {
+    return torque_q24 >= deferred->conduction.torque_max_q24 || torque_q24 <= deferred->conduction.torque_min_q24;
+}
+
+/* From a change of the speed reference on it is approached, until the speed has been within a sixteenth of it for two
+ * windows of inertia.h and SETTLING_UPDATES, with a torque below its limit: a speed that swings about it has not
+ * settled. */
+static void approach_reference(const control_parameters_t *parameters, deferred_t *deferred,
+                               const deferred_input_t *input) {
+    const uint32_t settling = (2u << parameters->inertia.window_shift) + SETTLING_UPDATES;
     const int32_t reference_q22 = deferred->speed_reference_q22;
     const int32_t near_q22 = fixed_abs(reference_q22) / 16 + NEAR_MIN_Q22;
-    const bool is_near = fixed_abs(fixed_subtract(reference_q22, speed_q22)) <= near_q22;
+    const bool is_near = fixed_abs(fixed_subtract(reference_q22, input->speed_q22)) <= near_q22;
+    const bool limited = at_torque_limit(deferred, input->torque_reference_q24);
     deferred->near_updates = !is_near || limited ? 0 : deferred->near_updates + (deferred->near_updates < settling);
     if (deferred->near_updates >= settling) {
         deferred->settled_reference_q22 = reference_q22;
     }
-    return reference_q22 != deferred->settled_reference_q22;
+    deferred->approaches_reference = reference_q22 != deferred->settled_reference_q22;
 }
 
 /* A torque that is at its limit in order to change the speed follows no load. */
 static void identify_inertia(const control_parameters_t *parameters, deferred_t *deferred,
                              const deferred_input_t *input) {
-    const int32_t torque_q24 = input->torque_reference_q24;
-    const bool limited =
-        torque_q24 >= deferred->conduction.torque_max_q24 || torque_q24 <= deferred->conduction.torque_min_q24;
     inertia_step(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical,
-                 input->torque_sum_q24, limited,
-                 approaches_reference(&parameters->inertia, deferred, input->speed_q22, limited));
+                 input->torque_sum_q24, at_torque_limit(deferred, input->torque_reference_q24),
+                 deferred->approaches_reference);
 }
 
 static void move_conduction(const control_parameters_t *parameters, deferred_t *deferred,
@@ -355,6 +358,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         break;
     case 2:
         learn_common_misalignment(parameters, deferred, input);
+        approach_reference(parameters, deferred, input);
         move_conduction(parameters, deferred, input);
         break;
     case 6:
