@@ -147,9 +147,9 @@ typedef struct {
     speed_smc_parameters_t speed_smc; /* in effect: gain by the identified inertia, above base speed smaller */
     misalignment_t misalignment;      /* a property of the machine: survives the end of a run */
     inertia_t inertia;                /* its shift likewise */
-    int32_t settled_reference_q22;    /* the last speed reference at which the speed has settled, rad/s, Q9.22 */
-    uint32_t near_updates;            /* successive ones near the reference */
-    bool approaches_reference;        /* it has changed since */
+    int32_t approached_q22;           /* speed reference, rad/s, Q9.22 */
+    uint32_t updates_since_near;      /* since the speed was first near it */
+    bool approaches_reference;        /* until then, and for some more */
     slow_counts_t slow_counts;
 } deferred_t;
 

@@ -245,9 +245,8 @@ static bool at_torque_limit(const deferred_t *deferred, int32_t torque_q24) {
     return torque_q24 >= deferred->conduction.torque_max_q24 || torque_q24 <= deferred->conduction.torque_min_q24;
 }
 
-/* From a change of the speed reference on it is approached, until the speed has been within a sixteenth of it for two
- * windows of inertia.h and SETTLING_UPDATES, with a torque below its limit: a speed that swings about it has not
- * settled. */
+/* From a change of the speed reference on it is approached, until two windows of inertia.h and SETTLING_UPDATES after
+ * the speed was first within a sixteenth of it with a torque below its limit: what comes later may be a load's. */
 static void approach_reference(const control_parameters_t *parameters, deferred_t *deferred,
                                const deferred_input_t *input) {
     const uint32_t settling = (2u << parameters->inertia.window_shift) + SETTLING_UPDATES;
@@ -255,11 +254,13 @@ static void approach_reference(const control_parameters_t *parameters, deferred_
     const int32_t near_q22 = fixed_abs(reference_q22) / 16 + NEAR_MIN_Q22;
     const bool is_near = fixed_abs(fixed_subtract(reference_q22, input->speed_q22)) <= near_q22;
     const bool limited = at_torque_limit(deferred, input->torque_reference_q24);
-    deferred->near_updates = !is_near || limited ? 0 : deferred->near_updates + (deferred->near_updates < settling);
-    if (deferred->near_updates >= settling) {
-        deferred->settled_reference_q22 = reference_q22;
+    if (reference_q22 != deferred->approached_q22) {
+        deferred->approached_q22 = reference_q22;
+        deferred->updates_since_near = 0;
     }
-    deferred->approaches_reference = reference_q22 != deferred->settled_reference_q22;
+    deferred->updates_since_near +=
+        deferred->updates_since_near > 0 ? deferred->updates_since_near < settling : is_near && !limited;
+    deferred->approaches_reference = deferred->updates_since_near < settling;
 }
 
 /* A torque that is at its limit in order to change the speed follows no load. */
@@ -391,6 +392,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     deferred->run = input->run;
     if (!input->run) {
+        deferred->updates_since_near = 0;
         inertia_restart(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical);
         await_slow_counts(parameters, deferred, input, input->periods);
         limit_currents(parameters, input, reset, results);

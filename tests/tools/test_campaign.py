@@ -114,7 +114,8 @@ def test_a_current_that_the_other_phases_hold_at_zero_does_not_stop_time() -> No
     assert result["violations"] == [] and 900_000 < result["virtual_us"] < 1_000_000
 
 
-@pytest.mark.parametrize(("seed", "event"), [(137892, "load_ramp_Nm_s"), (252587, "shaft_locked")])
+@pytest.mark.parametrize(("seed", "event"), [
+    (137892, "load_ramp_Nm_s"), (252587, "shaft_locked"), (23025, "load_sine_amplitude_Nm")])  # fmt: skip
 def test_a_load_soon_after_a_start_is_no_other_inertia_with_which_the_speed_hunts(seed: int, event: str) -> None:
     assert event in [drawn["event"] for drawn in world(seed)["events"]]
     result = run_world(seed)
