@@ -48,8 +48,7 @@ COLD bool flux_angle_add(flux_angle_t *flux_angle, const machine_tables_t *table
         flux_angle->resistive_q29 >> COARSER,
         sample->table_q29 >> COARSER,
         slope_q29 >> SLOPE_COARSER,
-        fixed_add(excess_q29, (1 << (32 - STEP_BITS)) * fixed_multiply_high(slope_q29, sample->misalignment)) >>
-            COARSER,
+        fixed_add(excess_q29, fixed_multiply_shift(slope_q29, sample->misalignment, STEP_BITS)) >> COARSER,
     };
     for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {
         for (unsigned column = row; column < FLUX_ANGLE_COURSES; column++) {
@@ -81,7 +80,8 @@ COLD int32_t flux_angle_solve(const flux_angle_t *flux_angle) {
         }
         for (unsigned row = pivot + 1; row < FLUX_ANGLE_COURSES; row++) {
             for (unsigned column = row; column < FLUX_ANGLE_COURSES; column++) {
-                scaled[row][column] -= (int32_t)fixed_divide(fixed_product(by[row], by[column]), by[pivot]);
+                const int32_t part = fixed_saturate(fixed_divide(fixed_product(by[row], by[column]), by[pivot]));
+                scaled[row][column] = fixed_subtract(scaled[row][column], part);
             }
         }
     }
