@@ -158,7 +158,9 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     const phase_balance_sample_t balance = balance_sample(drive, input, &encoder, elapsed, step);
     failed |= phase_balance_step(&drive->balance, &balance);
     drive->phases.phases |= drive->balance.phases;
-    follow_misalignment(drive, input, &encoder, elapsed);
+    if (drive->control_parameters.torque_law == TORQUE_LAW_PREDICTIVE) {
+        follow_misalignment(drive, input, &encoder, elapsed);
+    }
     const uint32_t of_phases =
         (uint32_t)(FAULT_BIT(FAULT_PHASE_OPEN) | FAULT_BIT(FAULT_PHASE_SHORTED) | FAULT_BIT(FAULT_CURRENT_SENSOR));
     if ((failed & of_phases) != 0 &&

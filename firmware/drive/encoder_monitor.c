@@ -289,16 +289,6 @@ static bool others_agree(const encoder_monitor_parameters_t *parameters, encoder
     return all;
 }
 
-/* True while another phase conducts and is consistent with the angle. */
-static bool another_agrees(const encoder_monitor_parameters_t *parameters, const encoder_monitor_t *monitor,
-                           unsigned index) {
-    bool any = false;
-    for (unsigned other = 0; other < machine_tables.phases; other++) {
-        any |= other != index && monitor->phase[other].agrees > parameters->rate_hz >> AGREES_SHIFT;
-    }
-    return any;
-}
-
 /* True while the encoder shows a rotor that turns the way the torque drives it. */
 static bool advances(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                      const encoder_monitor_input_t *input) {
@@ -340,8 +330,7 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
             phase->agrees = 0;
         }
         contradicting += shows(parameters, phase, input->period);
-        const bool doubtful = next_decides || another_agrees(parameters, monitor, index);
-        const bool waits = doubtful && input->period - phase->shown_from <= parameters->rate_hz >> WAIT_SHIFT;
+        const bool waits = next_decides && input->period - phase->shown_from <= parameters->rate_hz >> WAIT_SHIFT;
         alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT && !waits &&
                  !others_agree(parameters, monitor, index, input->period);
     }

@@ -6,8 +6,7 @@
  *   angle       the integrated flux linkage of two phases is outside what the tables allow around the encoder's angle:
  *               offset, slip, wrong direction, a constant reading of another angle. Of one alone unless all
  *               others have agreed a short time ago: then the phase has a fault of its own (drive/phase_monitor.h).
- *               Nor for 1/64 s while the rotor advances with the torque, and so brings the next phase, which
- *               decides, or while another phase that conducts agrees.
+ *               Nor for 1/64 s while the rotor advances with the torque: it brings the next phase, which decides.
  *   over-speed  by the encoder's counts over half a millisecond: a sixteenth above the limit; or from a thirty-second
  *               below it when the observer's speed, which is finer, is above. Of the observer alone it is none: after
  *               an edge that came too early, or with a rotor on which it has just begun, its speed is not the rotor's.
