@@ -160,7 +160,7 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
                    1.5 * oracle->silence_torque_Nm + 0.2 * oracle->world->machine->torque_max_Nm) {
         oracle_violate(oracle, "no_command", now_ns, 7, plant_torque_Nm(plant));
     } else if (age_ns > request_max_ns(oracle, 170 * ORACLE_MS_NS) && !oracle_phases_at_fault(oracle, now_ns / 1000) &&
-               !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
+               !oracle_encoder_faulty(oracle) &&
                fabs(plant_torque_Nm(plant)) > 0.2 * oracle->world->machine->torque_max_Nm) {
         oracle_violate(oracle, "no_command", now_ns, 4, plant_torque_Nm(plant));
     }
@@ -191,14 +191,18 @@ static double shown_speed(const world_t *world) {
     return shown;
 }
 
+/* A frozen encoder shows nothing while the load turns a rotor without current. */
+static bool turns_unseen(const oracle_t *oracle, const plant_t *plant) {
+    return oracle->injected[FAULT_ENCODER_STUCK] && oracle_overhauled(oracle, plant->speed_rad_s);
+}
+
 static void look_at_limits(oracle_t *oracle, const plant_t *plant, unsigned gates) {
     const world_machine_t *machine = oracle->world->machine;
     const double speed_rpm = fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S;
-    /* A frozen encoder shows nothing while the load turns a rotor without current. */
-    const bool unseen = oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_STUCK) &&
-                        oracle_overhauled(oracle, plant->speed_rad_s);
+    const double limit_rpm = MARGIN * machine->over_speed_rpm;
     oracle_since(&oracle->speed_ns,
-                 gates && !unseen && speed_rpm * shown_speed(oracle->world) > MARGIN * machine->over_speed_rpm,
+                 gates && speed_rpm > limit_rpm && speed_rpm * shown_speed(oracle->world) > limit_rpm &&
+                     !turns_unseen(oracle, plant),
                  plant->time_ns);
     if (oracle->speed_ns && plant->time_ns > oracle->speed_ns + 2 * ORACLE_MS_NS) {
         oracle_violate(oracle, "over_speed", plant->time_ns, 0, speed_rpm / machine->over_speed_rpm);
@@ -218,7 +222,7 @@ static void look_at_causes(oracle_t *oracle, const plant_t *plant) {
     const bool voltage =
         !oracle_link_sensor_faulty(oracle) && (plant->bus_voltage_V > MARGIN * machine->over_voltage_V ||
                                                plant->bus_voltage_V * MARGIN < machine->under_voltage_V);
-    const bool observed = !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
+    const bool observed = !oracle_encoder_faulty(oracle) &&
                           !oracle_any_injected(oracle, FAULT_BACKGROUND_HUNG, FAULT_INTERRUPT_STORM) &&
                           plant->time_ns > oracle->reset_ns + 10 * ORACLE_MS_NS;
     const bool speed = observed && fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > MARGIN * machine->over_speed_rpm;
@@ -333,8 +337,7 @@ static void look_at_end_of_fault(oracle_t *oracle, uint64_t now_ns, uint8_t befo
                        (double)(oracle->latched_ns - oracle->clear_ns) * 1e-6);
     }
     const uint64_t gone_ns = before == STATE_FAULT ? 8 * ORACLE_MS_NS : ORACLE_MS_NS / 2;
-    const bool begins =
-        before == STATE_INITIALISE && oracle_any_injected(oracle, FAULT_SUPPLY_RIPPLE, FAULT_SUPPLY_RIPPLE);
+    const bool begins = before == STATE_INITIALISE && oracle->injected[FAULT_SUPPLY_RIPPLE];
     if (oracle->cause_ns && now_ns < oracle->cause_ns + gone_ns && !oracle_state_changed(oracle) && !begins &&
         !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
         oracle_violate(oracle, "cleared", now_ns, before, (double)(now_ns - oracle->cause_ns) * 1e-6);
@@ -404,9 +407,9 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
         const uint64_t age_ns = plant->time_ns > oracle->run_ns ? plant->time_ns - oracle->run_ns : 0;
         /* A stop may end when the request to run is already on the bus. */
         const bool stops = oracle->meant.request == SENDER_STOP || plant->time_ns < oracle->withdrawn_ns + CROSSED_NS;
-        const bool rests = stops && (oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) ||
-                                     fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S <
-                                         20.0 + 0.05 * oracle->world->machine->speed_base_rpm);
+        const bool rests =
+            stops && (oracle_encoder_faulty(oracle) || fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S <
+                                                           20.0 + 0.05 * oracle->world->machine->speed_base_rpm);
         if (!oracle->off_seen && !rests && age_ns < 30 * ORACLE_MS_NS && !oracle_state_changed(oracle) &&
             !may_be_deaf(oracle, plant->time_ns / 1000)) {
             oracle_violate(oracle, "stopped", plant->time_ns, oracle->meant.request, plant->speed_rad_s);

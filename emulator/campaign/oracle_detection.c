@@ -10,8 +10,9 @@
 #define FLUX_LINKAGES 20.0 /* of the aligned position at the trip current, applied to a phase without any effect */
 #define NO_CURRENT_A 1e-3
 #define PULSE_PERIODS 3.0
-#define MISLED_SPEED 0.2   /* of the base speed, above which a wrong angle shows soon, */
-#define MISLED_CURRENT 0.1 /* of the trip, */
+#define MISLED_PITCH (1.0 / 6.0) /* error of the angle at which a phase makes torque in the other direction */
+#define MISLED_SPEED 0.2         /* of the base speed, above which a wrong angle shows soon, */
+#define MISLED_CURRENT 0.1       /* of the trip, */
 #define MISLED_NS (200 * ORACLE_MS_NS)
 #define HEARD_NS (50 * ORACLE_MS_NS) /* since the last command: then the torque ramps to zero */
 #define BLOCKED_NS (300 * ORACLE_MS_NS)
@@ -156,8 +157,7 @@ static void look_at_status(oracle_t *oracle, uint64_t now_ns) {
  * opposite voltage may have ended before a sample. A current that an open diode ends is gone at once. */
 static void look_at_phases(oracle_t *oracle, const plant_t *plant) {
     const bool hidden = oracle_any_injected(oracle, FAULT_CURRENT_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET) ||
-                        oracle_any_injected(oracle, FAULT_DIODE_OPEN, FAULT_DIODE_OPEN) ||
-                        checks_late(oracle, plant->time_ns / 1000);
+                        oracle->injected[FAULT_DIODE_OPEN] || checks_late(oracle, plant->time_ns / 1000);
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         double *flux_Wb = &oracle->detection.flux_Wb[phase];
         double *pulse_Wb = &oracle->detection.pulse_Wb[phase];
@@ -216,7 +216,10 @@ static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
 
 /* A measured angle with which the torque is not what the drive takes it for. */
 static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
-    const double error_pitches = oracle_angle_error_pitches(oracle, plant);
+    const double pitches = (ldexp((double)oracle->drive.angle, -32) - plant->rotor_angle_rad / ORACLE_TWO_PI -
+                            oracle->encoder_offset_rev) *
+                           plant->machine->rotor_poles;
+    const double error_pitches = pitches - floor(pitches + 0.5);
     const world_machine_t *machine = oracle->world->machine;
     const bool turns = fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > MISLED_SPEED * machine->speed_base_rpm;
     double current_A = 0.0;
@@ -225,7 +228,7 @@ static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
     }
     oracle_since(&oracle->detection.misled_ns,
                  oracle->drive.state == STATE_RUN && turns && current_A > MISLED_CURRENT * machine->trip_current_A &&
-                     fabs(error_pitches) > ORACLE_MISLED_PITCH,
+                     fabs(error_pitches) > MISLED_PITCH,
                  plant->time_ns);
     if (oracle->detection.misled_ns && plant->time_ns > oracle->detection.misled_ns + MISLED_NS &&
         !checks_late(oracle, plant->time_ns / 1000)) {

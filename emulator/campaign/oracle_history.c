@@ -58,6 +58,10 @@ bool oracle_state_changed(const oracle_t *oracle) {
     return oracle_any_injected(oracle, FAULT_STATE_FLIPPED, FAULT_FAULT_LATCH_FLIPPED);
 }
 
+bool oracle_encoder_faulty(const oracle_t *oracle) {
+    return oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER);
+}
+
 bool oracle_link_sensor_faulty(const oracle_t *oracle) {
     return oracle_any_injected(oracle, FAULT_DC_LINK_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET);
 }

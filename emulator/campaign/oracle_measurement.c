@@ -28,17 +28,6 @@ double oracle_encoder_offset_rev(const world_t *world) {
     return offset_deg / 360.0;
 }
 
-static bool encoder_disturbed(const oracle_t *oracle) {
-    return oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER);
-}
-
-double oracle_angle_error_pitches(const oracle_t *oracle, const plant_t *plant) {
-    const double pitches = (ldexp((double)oracle->drive.angle, -32) - plant->rotor_angle_rad / ORACLE_TWO_PI -
-                            oracle->encoder_offset_rev) *
-                           plant->machine->rotor_poles;
-    return pitches - floor(pitches + 0.5);
-}
-
 /* Both of the sensor's full scale. */
 static bool is_off(double measured, double truth) {
     return fabs(measured - fmin(fmax(truth, 0.0), 1.0)) > MEASUREMENT_ERROR_MAX;
@@ -91,7 +80,7 @@ static void look_at_angle(oracle_t *oracle, const plant_t *plant) {
     }
     const double mean_counts = stretch->error_counts / stretch->samples;
     const double tick_counts = fabs(plant->speed_rad_s) / ORACLE_TWO_PI * TIMER_TICK_S * counts_per_rev;
-    if (fabs(mean_counts) > ANGLE_ERROR_MAX_COUNTS + tick_counts && !encoder_disturbed(oracle) &&
+    if (fabs(mean_counts) > ANGLE_ERROR_MAX_COUNTS + tick_counts && !oracle_encoder_faulty(oracle) &&
         !oracle_drive_disturbed(oracle, plant->time_ns / 1000)) {
         oracle_violate(oracle, "wrong_angle", plant->time_ns, 0, mean_counts);
     }

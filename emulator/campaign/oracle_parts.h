@@ -39,9 +39,6 @@ enum {
     CAUSE_CLOCK,
 };
 
-/* Error of the angle, in rotor pitches, at which a phase makes torque in the other direction. */
-#define ORACLE_MISLED_PITCH (1.0 / 6.0)
-
 #define BIT(cause) (UINT32_C(1) << (cause))
 
 /* Remembers a violation, once for each rule and number. */
@@ -73,6 +70,9 @@ bool oracle_state_changed(const oracle_t *oracle);
 /* Interrupts come late, or memory or clock of the drive was changed. */
 bool oracle_drive_disturbed(const oracle_t *oracle, uint64_t time_us);
 
+/* The encoder was faulty at any time. */
+bool oracle_encoder_faulty(const oracle_t *oracle);
+
 /* The only sensor of the link voltage was faulty at any time. */
 bool oracle_link_sensor_faulty(const oracle_t *oracle);
 
@@ -83,9 +83,6 @@ double oracle_encoder_offset_rev(const world_t *world);
 
 /* At the instant of the samples of a control interrupt, after it. */
 void oracle_look_at_measurement(oracle_t *oracle, const plant_t *plant);
-
-/* Error of the measured angle, in rotor pitches, -0.5..0.5. */
-double oracle_angle_error_pitches(const oracle_t *oracle, const plant_t *plant);
 
 /* At the end. */
 void oracle_judge_temperature(oracle_t *oracle, const plant_t *plant, oracle_heat_t heat);

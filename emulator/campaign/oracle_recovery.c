@@ -93,8 +93,8 @@ static bool cause_remains(const oracle_t *oracle) {
 
 /* A drive takes an encoder for frozen until it counts, which at rest only a hand on the shaft or a reset can end. */
 static bool held_by_encoder(const oracle_t *oracle, const plant_t *plant) {
-    const bool any = oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) ||
-                     oracle_any_injected(oracle, FAULT_SHAFT_LOCKED, FAULT_STATIC_FRICTION);
+    const bool any =
+        oracle_encoder_faulty(oracle) || oracle_any_injected(oracle, FAULT_SHAFT_LOCKED, FAULT_STATIC_FRICTION);
     return any && !oracle->recovered && fabs(plant->speed_rad_s) < 2.0;
 }
 

@@ -79,7 +79,7 @@ static void judge(oracle_t *oracle, bool holds, uint64_t time_ns, unsigned numbe
 /* A shaft that is stopped at once stands before the drive observes it; and the observer goes by the torque of the
  * measured currents. */
 static bool observes_speed(const oracle_t *oracle) {
-    return !oracle_any_injected(oracle, FAULT_ENCODER_STUCK, FAULT_ENCODER_NO_ANSWER) &&
+    return !oracle_encoder_faulty(oracle) &&
            !oracle_any_injected(oracle, FAULT_CURRENT_SENSOR_OPEN, FAULT_CURRENT_SENSOR_SWAPPED) &&
            !oracle_any_injected(oracle, FAULT_SHAFT_LOCKED, FAULT_LOAD_DROPPED) &&
            !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT);
