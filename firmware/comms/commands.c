@@ -120,6 +120,10 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
         commands->arming.armed || time_us - commands->last_received_us < COMMANDS_SENDER_LOST_US;
     switch (e2e_check(&commands->receiver, data_id_of_node, frame->data, frame->length)) {
     case E2E_ACCEPTED:
+        commands->contested = commands->contested && time_us - commands->contested_us < COMMANDS_SENDER_LOST_US;
+        break;
+    case E2E_RESYNCHRONISED:
+        commands->contested = false;
         break;
     case E2E_WRONG_CHECKSUM:
         return reject_command(commands, &counters->wrong_checksum);
@@ -128,9 +132,9 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
     case E2E_WRONG_SEQUENCE:
     default:
         commands->contested = true;
+        commands->contested_us = time_us;
         return reject_command(commands, &counters->wrong_counter);
     }
-    commands->contested = false;
     commands->last_received_us = time_us;
     command_t requested = commands->requested;
     if (!unpack(frame, &requested) ||
@@ -149,8 +153,8 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
     return COMMANDS_COMMAND;
 }
 
-/* The drive is armed for the sender of the last command, which must not be older than the command timeout; not while a
- * valid command of another sequence has come since, because that may be the one of who confirms. */
+/* The drive is armed for the sender of the last command, which must not be older than the command timeout; not while
+ * valid commands of another sequence come as well, because that may be the one of who confirms. */
 static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const hal_can_frame_t *frame, uint32_t time_us,
                                        uint32_t timeout_us, command_t *command) {
     if (frame->length != DRIVE_ARM_LENGTH) {

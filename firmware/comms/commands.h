@@ -14,8 +14,10 @@
  * succession are no error; nor is the last accepted frame once more, same counter and same checksum, as a gateway or
  * a disturbed acknowledgement duplicates it: it is dropped and counted. After more lost ones the sender is out of
  * sequence: the drive ends in a fault, and has to be armed again. While the drive is not armed another sender is
- * followed once the present one has been silent for COMMANDS_SENDER_LOST_US. A second sender slower than one frame in
- * COMMANDS_ERROR_STEP of the first (2.56 s at 100 frames per second) has no effect but to be counted.
+ * followed once the present one has been silent for COMMANDS_SENDER_LOST_US, and it is not armed for either until the
+ * frames of one of them have not come for so long: after a reset the one that it follows may be a recording. A second
+ * sender slower than one frame in COMMANDS_ERROR_STEP of the first (2.56 s at 100 frames per second) has no effect but
+ * to be counted.
  *
  * PARAMETER_WRITE and PARAMETER_SET_CONTROL pass while the drive is armed for configuration. Their sequence counter
  * continues that of confirm_configuration, whose sender the receiver stays with. They are no commands: invalid ones are
@@ -58,7 +60,8 @@ typedef struct {
     uint16_t data_id_offset;     /* of the node, added to the data IDs of drive.dbc; set by the caller after
                                     commands_init */
     uint32_t last_received_us;   /* time of the last frame that it accepted */
-    bool contested;              /* a valid command of another sequence has come since */
+    bool contested;              /* valid commands of another sequence come as well */
+    uint32_t contested_us;       /* time of the last one */
     e2e_receiver_t set_receiver; /* of PARAMETER_WRITE and PARAMETER_SET_CONTROL, while armed for configuration */
     arming_t arming;
     uint32_t armed_us;   /* when it was armed */

@@ -45,12 +45,11 @@ static uint16_t checksum_of(const uint8_t *bytes) {
     return (uint16_t)(bytes[0] | bytes[1] << 8);
 }
 
-static e2e_result_t accept(e2e_receiver_t *receiver, const uint8_t *bytes) {
+static void accept(e2e_receiver_t *receiver, const uint8_t *bytes) {
     receiver->synchronised = true;
     receiver->counter = bytes[2];
     receiver->checksum = checksum_of(bytes);
     receiver->candidate_frames = 0;
-    return E2E_ACCEPTED;
 }
 
 bool e2e_checksum_matches(uint16_t data_id, const uint8_t *bytes, size_t length) {
@@ -63,7 +62,8 @@ e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t
     }
     const uint8_t counter = bytes[2];
     if (!receiver->synchronised || in_sequence(receiver->counter, counter)) {
-        return accept(receiver, bytes);
+        accept(receiver, bytes);
+        return E2E_ACCEPTED;
     }
     if (counter == receiver->counter) {
         return checksum_of(bytes) == receiver->checksum ? E2E_REPEATED : E2E_WRONG_SEQUENCE;
@@ -77,5 +77,6 @@ e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t
     if (receiver->candidate_frames < E2E_RESYNCHRONISE_FRAMES) {
         return E2E_WRONG_SEQUENCE;
     }
-    return accept(receiver, bytes);
+    accept(receiver, bytes);
+    return E2E_RESYNCHRONISED;
 }

@@ -22,6 +22,7 @@
 
 typedef enum {
     E2E_ACCEPTED,
+    E2E_RESYNCHRONISED, /* accepted: with it another sequence has taken the place of the present one */
     E2E_WRONG_CHECKSUM, /* or shorter than the header */
     E2E_REPEATED,       /* counter and checksum of the last accepted frame: the same frame once more */
     E2E_WRONG_SEQUENCE, /* any other increment than 1 to E2E_COUNTER_STEP_MAX, 0 with another checksum included */
@@ -53,8 +54,8 @@ void e2e_receiver_restart(e2e_receiver_t *receiver);
 bool e2e_checksum_matches(uint16_t data_id, const uint8_t *bytes, size_t length);
 
 /* Checks a received frame of a message; messages with one sequence counter share a receiver. Its data may be used only
- * after E2E_ACCEPTED. A frame with a wrong checksum changes nothing; one out of sequence can only count towards a
- * resynchronisation, which an accepted frame of the present sender resets.
+ * after E2E_ACCEPTED or E2E_RESYNCHRONISED. A frame with a wrong checksum changes nothing; one out of sequence can only
+ * count towards a resynchronisation, which an accepted frame of the present sender resets.
  */
 e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t *bytes, size_t length);
 

@@ -19,6 +19,9 @@
 /* Windows from the start of a run until its torque acts on a turning rotor. */
 #define START_WINDOWS 4
 
+/* Windows of a regression that has begun anew: with fewer any change of torque and acceleration is on one line. */
+#define REGRESSION_WINDOWS 3
+
 /* Windows after a torque at its limit that still belong to the transient. */
 #define TRANSIENT_WINDOWS 8
 
@@ -83,6 +86,7 @@ void inertia_restart(const inertia_parameters_t *parameters, const load_observer
     inertia->sum_of_sums_q23 = 0;
     inertia->angle = angle;
     inertia->torque_mean_q23 = inertia->acceleration_mean_q23 = 0;
+    inertia->torque_variance_q14 = inertia->acceleration_variance_q14 = inertia->covariance_q14 = 0;
     set_laws(parameters, model, inertia);
 }
 
@@ -133,6 +137,9 @@ static void judge(const inertia_parameters_t *parameters, inertia_t *inertia, ui
         return;
     }
     inertia->transient_windows--;
+    if (windows >= START_WINDOWS && windows < START_WINDOWS + REGRESSION_WINDOWS) {
+        return;
+    }
     const int32_t variance = inertia->torque_variance_q14;
     const int32_t covariance = inertia->covariance_q14;
     const int64_t product = fixed_product(variance, inertia->acceleration_variance_q14);

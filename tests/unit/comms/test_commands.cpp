@@ -373,6 +373,21 @@ TEST_F(Commands, a_recorded_command_after_a_reset_is_not_armed_by_the_living_sen
     arm(uint8_t(counter + 1), 3000 + (counter - 26u) * 10000);
 }
 
+TEST_F(Commands, a_recording_that_goes_on_after_a_reset_is_not_armed_by_the_living_sender_until_one_of_them_is_silent) {
+    for (uint32_t silence_us : {COMMANDS_SENDER_LOST_US - 1, COMMANDS_SENDER_LOST_US}) {
+        commands_init(&commands);
+        take(command_frame(20), DRIVE_STATE_READY, 1000); // recorded
+        EXPECT_EQ(take(command_frame(29), DRIVE_STATE_READY, 2000), COMMANDS_REJECTED);
+        take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
+        take(command_frame(21), DRIVE_STATE_READY, 2000 + silence_us); // recorded
+        const bool silent = silence_us == COMMANDS_SENDER_LOST_US;
+        EXPECT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY,
+                       2000 + silence_us),
+                  silent ? COMMANDS_COMMAND : COMMANDS_REJECTED);
+        EXPECT_EQ(commands.arming.armed, silent);
+    }
+}
+
 TEST_F(Commands, a_recording_of_a_whole_sequence_arms_nothing) {
     hal.random = 99;
     const hal_can_frame_t recorded[] = {command_frame(1), frames::arm(7, ARMING_STEP_REQUEST_RUN),
