@@ -17,10 +17,10 @@
 #define MEAN_SHIFT 2
 
 /* Windows from the start of a run until its torque acts on a turning rotor. */
-#define START_WINDOWS 4
+#define START_WINDOWS 4u
 
 /* Windows of a regression that has begun anew: with fewer any change of torque and acceleration is on one line. */
-#define REGRESSION_WINDOWS 3
+#define REGRESSION_WINDOWS 3u
 
 /* Windows after a torque at its limit that still belong to the transient. */
 #define TRANSIENT_WINDOWS 8
@@ -137,7 +137,7 @@ static void judge(const inertia_parameters_t *parameters, inertia_t *inertia, ui
         return;
     }
     inertia->transient_windows--;
-    if (windows >= START_WINDOWS && windows < START_WINDOWS + REGRESSION_WINDOWS) {
+    if (windows - START_WINDOWS < REGRESSION_WINDOWS) { /* unsigned: not before it begins anew */
         return;
     }
     const int32_t variance = inertia->torque_variance_q14;

@@ -38,7 +38,7 @@ COUNT_TOLERANCE = 0.01
 BOUND_LIMITS = {"traditional": 670, "paper": 1185, "salient": 1940, "salient_network": 2425,
                 "salient_four_phases": 2340}
 """Of the control interrupt on the Cortex-M4."""
-BOTH_BOUND_LIMITS = {"salient": 2790, "salient_four_phases": 3200}
+BOTH_BOUND_LIMITS = {"salient": 2800, "salient_four_phases": 3200}
 """Of both interrupts together."""
 
 measure_once = lru_cache(measure)
