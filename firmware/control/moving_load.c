@@ -141,8 +141,10 @@ void moving_load_review(const moving_load_parameters_t *parameters, moving_load_
     if (!still(parameters, moving) || hold) {
         return;
     }
-    if (moving->withheld == parameters->stages && moving->hold_ticks - moving->ticks >= parameters->hold_ticks_min) {
+    const uint32_t held_ticks = moving->hold_ticks - moving->ticks;
+    if (moving->withheld == parameters->stages && held_ticks >= parameters->hold_ticks_min && moving->ticks > 0) {
         moving->ticks = 0;
+        moving->own_ripple = moving->own_ripple || !moving->more_than_ripple;
     } else if (moving->withheld == 0 && moving->hold_ticks > parameters->hold_ticks_min) {
         moving->hold_ticks = moving->ticks = parameters->hold_ticks_min;
     }

@@ -18,11 +18,12 @@
  * The ripple of the drive itself has a trend as well, which a light rotor or a slow one shows. The wide bandwidth then
  * only adds noise, of J w0^2 count / 4 to the estimate, and ripple. The load has moved when the range of the estimate
  * since the last movement, after a low-pass of 6 ms, exceeds 1/8 of that noise and 1/64 of the largest torque together.
- * While it has not for 156 ms, longer than the crest of a sine of 1 Hz takes, a hold ends after 25 ms, and a trend soon
- * after a release is ripple, with 2.5 times the threshold until the load moves. A larger trend is more than ripple,
- * such as that of a misalignment which is still to be learned: then the base threshold and the long holds return until
- * the load has not moved for 0.5 s. More than that factor would let the innovation reach the count at which
- * observer_bandwidth.h takes it for a load step.
+ * While it has not for 156 ms, longer than the crest of a sine of 1 Hz takes, a longer hold than 25 ms is cut
+ * short. A trend after that or soon after a release is ripple, with 2.5 times the threshold until the load moves: what
+ * has been learned while it moved is less exact than what will be while it does not. A larger trend is more than
+ * ripple, such as that of a misalignment which is still to be learned: then the base threshold and the long holds
+ * return until the load has not moved for 0.5 s. More than that factor would let the innovation reach the count at
+ * which observer_bandwidth.h takes it for a load step.
  *
  * Rounding to counts leaves up to 1/40 of a count of it as noise. A trend of 1/8 count withholds the last stages of the
  * bandwidth's decay, so that the observer follows the load. They are released 25 ms after the last such trend, one each

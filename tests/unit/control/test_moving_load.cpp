@@ -192,6 +192,16 @@ TEST(MovingLoad, ripple_after_a_load_step_is_not_followed_any_more_within_300_ms
     EXPECT_EQ(withheld_part(&detector, 1.0, COUNT / 4), 0.0);
 }
 
+TEST(MovingLoad, after_a_movement_the_threshold_is_that_of_ripple_until_the_next_one) {
+    Detector detector;
+    withheld_part(&detector, 0.5, COUNT / 4);
+    detector.range_q24 = 0;
+    detector.run(RATE_HZ / 4, 0);
+    EXPECT_EQ(detector.run(RATE_HZ, COUNT / 4), 0u);
+    detector.range_q24 = to_fixed(10.0, Q24);
+    EXPECT_GT(detector.run(RATE_HZ / 10, COUNT / 4), RATE_HZ / 20);
+}
+
 TEST(MovingLoad, more_than_ripple_of_a_constant_load_keeps_the_base_threshold_and_the_long_hold_for_half_a_second) {
     Detector detector;
     detector.range_q24 = 0;
