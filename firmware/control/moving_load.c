@@ -83,8 +83,9 @@ static void withhold(const moving_load_parameters_t *parameters, moving_load_t *
     if (moving->withheld < parameters->stages) {
         hold_ticks *= 2;
         if (still(parameters, moving) && hold_ticks > parameters->hold_ticks_min) {
+            moving->still = moving->own_ripple ? 0 : moving->still;
             moving->more_than_ripple = moving->own_ripple;
-            moving->own_ripple = !moving->own_ripple || moving->still >= parameters->still_reviews;
+            moving->own_ripple = !moving->own_ripple;
         }
         moving->settling = parameters->release_ticks;
     }
@@ -144,7 +145,8 @@ void moving_load_review(const moving_load_parameters_t *parameters, moving_load_
     const uint32_t held_ticks = moving->hold_ticks - moving->ticks;
     if (moving->withheld == parameters->stages && held_ticks >= parameters->hold_ticks_min && moving->ticks > 0) {
         moving->ticks = 0;
-        moving->own_ripple = moving->own_ripple || !moving->more_than_ripple;
+        moving->more_than_ripple = false;
+        moving->own_ripple = true;
     } else if (moving->withheld == 0 && moving->hold_ticks > parameters->hold_ticks_min) {
         moving->hold_ticks = moving->ticks = parameters->hold_ticks_min;
     }

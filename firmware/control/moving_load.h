@@ -22,7 +22,7 @@
  * short. A trend after that or soon after a release is ripple, with 2.5 times the threshold until the load moves: what
  * has been learned while it moved is less exact than what will be while it does not. A larger trend is more than
  * ripple, such as that of a misalignment which is still to be learned: then the base threshold and the long holds
- * return until the load has not moved for 0.5 s. More than that factor would let the innovation reach the count at
+ * return for 0.5 s, as often as that happens. More than that factor would let the innovation reach the count at
  * which observer_bandwidth.h takes it for a load step.
  *
  * Rounding to counts leaves up to 1/40 of a count of it as noise. A trend of 1/8 count withholds the last stages of the
@@ -60,8 +60,8 @@ typedef struct {
     uint32_t settling;                  /* periods in which the trend may be that of a narrower bandwidth */
     uint32_t withheld;                  /* stages */
     bool own_ripple;                    /* the threshold is 2.5 times its base value */
-    bool more_than_ripple;              /* a trend exceeded that too */
-    uint32_t still;                     /* reviews since the last movement, up to still_reviews */
+    bool more_than_ripple;              /* a trend exceeded that too; then it has its base value again */
+    uint32_t still;                     /* reviews since the last movement or more than ripple, up to still_reviews */
     int32_t load_q24;                   /* low-pass of the estimate, N m, Q7.24 */
     int32_t load_min_q24, load_max_q24; /* its range since the last movement */
 } moving_load_t;
