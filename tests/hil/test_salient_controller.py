@@ -225,7 +225,7 @@ def test_encoder_misalignment_is_learned_and_the_ripple_falls(run_recorded, offs
 
     early, _ = ripple(0.16, 0.2)
     after_a_second, bench = ripple(0.9, 1.0)
-    assert within((0.24, 0.31), misalignment_deg(bench) * np.sign(offset_deg))
+    assert within((0.24, 0.33), misalignment_deg(bench) * np.sign(offset_deg))  # on its way
     late, bench = ripple(3.9, 4.0)
     assert within((0.27, 0.305), misalignment_deg(bench) * np.sign(offset_deg))
     assert within((0.03, 0.11), early)  # takes the ripple for a load that moves, with a wide bandwidth
@@ -254,7 +254,7 @@ def test_misalignment_is_kept_over_stop_and_run(make_bench):
     bench.drive.stop()
     bench.run_until(lambda: bench.drive.state == "ready", timeout=0.2)
     learned_deg = misalignment_deg(bench)
-    assert 0.25 < learned_deg < 0.31
+    assert 0.25 < learned_deg < 0.33
     bench.run_for(0.2)
     assert misalignment_deg(bench) == learned_deg
     bench.drive.speed_reference_rpm = 150
