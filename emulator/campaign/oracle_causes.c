@@ -46,13 +46,13 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     [FAULT_DC_LINK_SENSOR_OFFSET] = LINK_VOLTAGE,
     [FAULT_ENCODER_STUCK] = ENCODER | BIT(CAUSE_STALL),
     [FAULT_ENCODER_JUMP] = ENCODER | BIT(CAUSE_STALL), /* one that stays is a wrong position of the sensor */
-    [FAULT_ENCODER_LOST_COUNTS] =
-        ENCODER | BIT(CAUSE_STALL) | BIT(CAUSE_OVER_SPEED), /* of the counts, where they jump */
     [FAULT_ENCODER_NOISE] = ENCODER,
     /* About the angle of the reversal one phase looks as before, and two as if their currents were exchanged. */
     [FAULT_ENCODER_REVERSED] = ENCODER | PHASE | BIT(CAUSE_STALL),
-    /* Its angle is that of one phase's tolerance after the other, and then that of a current in another phase. */
+    /* The angle is that of one phase's tolerance after the other, and then that of a current in another phase. */
     [FAULT_ENCODER_SLIP] = ENCODER | PHASE | BIT(CAUSE_STALL),
+    [FAULT_ENCODER_LOST_COUNTS] =
+        ENCODER | PHASE | BIT(CAUSE_STALL) | BIT(CAUSE_OVER_SPEED), /* of the counts, where they jump */
     [FAULT_ENCODER_NO_ANSWER] = ENCODER | BIT(CAUSE_STALL),
     [FAULT_SHAFT_LOCKED] = ENCODER | MECHANICS,
     [FAULT_COULOMB_FRICTION] = ENCODER | MECHANICS,
