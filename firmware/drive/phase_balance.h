@@ -22,9 +22,9 @@
 #include "hal.h"
 
 /* Smallest common ratio, Q8: by the tolerances of currents, flux linkage and resistance together it is 0.87, and 2
- * degrees of angle take a tenth of it. With learned misalignment, of which 4 degrees take a quarter. */
-#define PHASE_BALANCE_LEAST_Q8 205
-#define PHASE_BALANCE_LEAST_LEARNED_Q8 195
+ * degrees of angle take an eighth of it. With learned misalignment, of which 4 degrees take a quarter. */
+#define PHASE_BALANCE_LEAST_Q8 194
+#define PHASE_BALANCE_LEAST_LEARNED_Q8 166
 
 typedef struct {
     bool run;

@@ -68,7 +68,7 @@ TEST_F(PhaseBalance, a_large_error_of_one_phase_accuses_no_other) {
 }
 
 TEST_F(PhaseBalance, ratios_that_all_phases_have_are_no_sensor_s) {
-    for (const double common : {0.85, 1.3, 1.7}) {
+    for (const double common : {0.77, 1.3, 1.7}) {
         ratio[0] = ratio[1] = ratio[2] = common;
         EXPECT_EQ(window(), 0u) << common;
         EXPECT_EQ(window(), 0u) << common;
@@ -77,7 +77,7 @@ TEST_F(PhaseBalance, ratios_that_all_phases_have_are_no_sensor_s) {
 }
 
 TEST_F(PhaseBalance, a_small_ratio_of_all_is_the_encoder_s_after_two_windows) {
-    ratio[0] = ratio[1] = ratio[2] = 0.78;
+    ratio[0] = ratio[1] = ratio[2] = 0.74;
     EXPECT_EQ(window(), 0u);
     EXPECT_EQ(window(), FAULT_BIT(FAULT_ENCODER_ANGLE));
     EXPECT_EQ(balance.phases, 0u);
