@@ -74,7 +74,7 @@ static uint32_t rounding_q4(const moving_load_parameters_t *parameters, uint32_t
 /* A load that has been still long enough for a trend to be ripple: 156 ms or 0.5 s. */
 static bool still(const moving_load_parameters_t *parameters, const moving_load_t *moving) {
     const uint32_t reviews = parameters->still_reviews;
-    return moving->still >= (moving->more_than_ripple ? reviews : reviews * 5 / 16);
+    return moving->still >= (moving->source == MOVING_LOAD_SOURCE_MORE ? reviews : reviews * 5 / 16);
 }
 
 /* A trend soon after the release of the first stage doubles the hold. */
@@ -83,9 +83,12 @@ static void withhold(const moving_load_parameters_t *parameters, moving_load_t *
     if (moving->withheld < parameters->stages) {
         hold_ticks *= 2;
         if (still(parameters, moving) && hold_ticks > parameters->hold_ticks_min) {
-            moving->still = moving->own_ripple ? 0 : moving->still;
-            moving->more_than_ripple = moving->own_ripple;
-            moving->own_ripple = !moving->own_ripple;
+            if (moving->source == MOVING_LOAD_SOURCE_RIPPLE) {
+                moving->source = MOVING_LOAD_SOURCE_MORE;
+                moving->still = 0;
+            } else {
+                moving->source = MOVING_LOAD_SOURCE_RIPPLE;
+            }
         }
         moving->settling = parameters->release_ticks;
     }
@@ -106,7 +109,7 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
     }
     const uint32_t base_q4 =
         from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4(parameters, angle_step);
-    const uint32_t threshold_q4 = moving->own_ripple ? base_q4 * 5 / 2 : base_q4;
+    const uint32_t threshold_q4 = moving->source == MOVING_LOAD_SOURCE_RIPPLE ? base_q4 * 5 / 2 : base_q4;
     const uint32_t magnitude_q4 = fixed_magnitude(trend_q4);
     moving->settling -= moving->settling > 0;
     if (magnitude_q4 > parameters->implausible_q4 && moving->withheld > 0 && moving->settling == 0) {
@@ -135,7 +138,7 @@ void moving_load_review(const moving_load_parameters_t *parameters, moving_load_
     if (fixed_subtract(moving->load_max_q24, moving->load_min_q24) >= parameters->movement_min_q24) {
         moving->load_min_q24 = moving->load_max_q24 = load_q24;
         moving->still = 0;
-        moving->own_ripple = moving->more_than_ripple = false;
+        moving->source = MOVING_LOAD_SOURCE_LOAD;
         return;
     }
     moving->still += moving->still < parameters->still_reviews;
@@ -145,8 +148,7 @@ void moving_load_review(const moving_load_parameters_t *parameters, moving_load_
     const uint32_t held_ticks = moving->hold_ticks - moving->ticks;
     if (moving->withheld == parameters->stages && held_ticks >= parameters->hold_ticks_min && moving->ticks > 0) {
         moving->ticks = 0;
-        moving->more_than_ripple = false;
-        moving->own_ripple = true;
+        moving->source = MOVING_LOAD_SOURCE_RIPPLE;
     } else if (moving->withheld == 0 && moving->hold_ticks > parameters->hold_ticks_min) {
         moving->hold_ticks = moving->ticks = parameters->hold_ticks_min;
     }

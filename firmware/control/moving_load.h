@@ -51,18 +51,24 @@ typedef struct {
     uint32_t stages;             /* to withhold; 0: no detection */
 } moving_load_parameters_t;
 
+/* What a trend is taken for. */
+typedef enum {
+    MOVING_LOAD_SOURCE_LOAD,   /* a load that has moved lately */
+    MOVING_LOAD_SOURCE_RIPPLE, /* the drive's own: the threshold is 2.5 times its base value */
+    MOVING_LOAD_SOURCE_MORE,   /* than ripple, it has exceeded that too: the base value again */
+} moving_load_source_t;
+
 /* All zero at the start. */
 typedef struct {
-    int64_t trend_q36;                  /* low-pass of the innovation, 2^-32 rev, Q27.36 */
-    uint32_t hold_ticks;                /* next hold, periods; 0: the shortest */
-    uint32_t ticks;                     /* until the next release */
-    uint32_t blocked;                   /* periods in which nothing is withheld */
-    uint32_t settling;                  /* periods in which the trend may be that of a narrower bandwidth */
-    uint32_t withheld;                  /* stages */
-    bool own_ripple;                    /* the threshold is 2.5 times its base value */
-    bool more_than_ripple;              /* a trend exceeded that too; then it has its base value again */
-    uint32_t still;                     /* reviews since the last movement or more than ripple, up to still_reviews */
-    int32_t load_q24;                   /* low-pass of the estimate, N m, Q7.24 */
+    int64_t trend_q36;   /* low-pass of the innovation, 2^-32 rev, Q27.36 */
+    uint32_t hold_ticks; /* next hold, periods; 0: the shortest */
+    uint32_t ticks;      /* until the next release */
+    uint32_t blocked;    /* periods in which nothing is withheld */
+    uint32_t settling;   /* periods in which the trend may be that of a narrower bandwidth */
+    uint32_t withheld;   /* stages */
+    moving_load_source_t source;
+    uint32_t still;   /* reviews since the last movement, or since it is more than ripple, up to still_reviews */
+    int32_t load_q24; /* low-pass of the estimate, N m, Q7.24 */
     int32_t load_min_q24, load_max_q24; /* its range since the last movement */
 } moving_load_t;
 
