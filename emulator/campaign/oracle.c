@@ -17,6 +17,7 @@
 #define STATUS_AGE_MAX_NS (30 * ORACLE_MS_NS)
 #define LOAD_ANSWERED_NS (200 * ORACLE_MS_NS)
 #define CROSSED_NS (15 * ORACLE_MS_NS)
+#define UNSEEN_PERIODS 3                /* from a cause to the state that follows the sample which shows it */
 #define RUN_MAX_NS (502 * ORACLE_MS_NS) /* of a run, since the last request */
 
 void oracle_init(oracle_t *oracle, const world_t *world, const plant_t *plant, uint64_t period_ns) {
@@ -227,6 +228,8 @@ static void look_at_causes(oracle_t *oracle, const plant_t *plant) {
                           plant->time_ns > oracle->reset_ns + 10 * ORACLE_MS_NS;
     const bool speed = observed && fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > MARGIN * machine->over_speed_rpm;
     if (voltage || speed || sto_demanded(oracle, (plant->time_ns - 1) / 1000)) {
+        const bool begins = oracle->cause_ns == 0 || plant->time_ns > oracle->cause_ns + 2 * ORACLE_LOOK_NS;
+        oracle->cause_begin_ns = begins ? plant->time_ns : oracle->cause_begin_ns;
         oracle->cause_ns = plant->time_ns;
     }
 }
@@ -337,7 +340,8 @@ static void look_at_end_of_fault(oracle_t *oracle, uint64_t now_ns, uint8_t befo
                        (double)(oracle->latched_ns - oracle->clear_ns) * 1e-6);
     }
     const uint64_t gone_ns = before == STATE_FAULT ? 8 * ORACLE_MS_NS : ORACLE_MS_NS / 2;
-    const bool begins = before == STATE_INITIALISE && oracle->injected[FAULT_SUPPLY_RIPPLE];
+    const bool begins = now_ns < oracle->cause_begin_ns + UNSEEN_PERIODS * oracle->period_ns ||
+                        (before == STATE_INITIALISE && oracle->injected[FAULT_SUPPLY_RIPPLE]);
     if (oracle->cause_ns && now_ns < oracle->cause_ns + gone_ns && !oracle_state_changed(oracle) && !begins &&
         !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
         oracle_violate(oracle, "cleared", now_ns, before, (double)(now_ns - oracle->cause_ns) * 1e-6);

@@ -17,17 +17,15 @@
  *                   stop while the rotor turns
  *   not_stopped     four quadrants, no fault: still turning 100 ms after the time that half of the torque limit needs
  *   resumed         a run after bus-off, with no other request than run since
- *   cleared         a fault ended less than 8 ms after the plant's last reason for one: a line of safe torque off not
- *                   energised, a link voltage or a speed beyond its limits; by a request to clear that was there before
- *                   it; after lines of safe torque off had differed, without both having been off; or that of an
- *                   encoder which stood still, and has not counted since
- *   under_voltage   in state run, the link voltage below its threshold by 6 % for 3 ms
- *   over_speed      a gate on for 2 ms at a speed above the limit by 2 %
- *   over_voltage    a gate on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no
- *                   energy back, unless a fault of the only sensor hides it
- *   wrong_angle     in state run, encoder and processor healthy, at a speed that is steady within 10 % for 12 ms and 16
- *                   counts of the encoder: the measured angle off the encoder's by more than three quarters of a count
- *                   and the motion in a tick of the timer, on average. The middle of a count is off by half of one at
+ *   cleared         a fault ended less than 8 ms after the plant's last reason for one, unless that has just begun: a
+ *                   line of safe torque off not energised, a link voltage or a speed beyond its limits; by a request to
+ * clear that was there before it; after lines of safe torque off had differed, without both having been off; or that of
+ * an encoder which stood still, and has not counted since under_voltage   in state run, the link voltage below its
+ * threshold by 6 % for 3 ms over_speed      a gate on for 2 ms at a speed above the limit by 2 % over_voltage    a gate
+ * on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no energy back, unless a
+ * fault of the only sensor hides it wrong_angle     in state run, encoder and processor healthy, at a speed that is
+ * steady within 10 % for 12 ms and 16 counts of the encoder: the measured angle off the encoder's by more than three
+ * quarters of a count and the motion in a tick of the timer, on average. The middle of a count is off by half of one at
  *                   most, when sampling is in step with the counts, the time of an edge by a tick
  *   wrong_current, wrong_voltage
  *                   a measured phase current or link voltage off the true one by more than 0.8 % of the sensor's full
@@ -185,7 +183,8 @@ typedef struct {
     double silence_torque_Nm;        /* largest torque before the client has been silent for 55 ms */
     sender_meaning_t meant;          /* by the last genuine motion command */
     uint64_t withdrawn_ns, reset_ns; /* last genuine request other than run, last reset */
-    uint64_t cause_ns;               /* last time at which the plant had a reason to keep the drive in a fault */
+    uint64_t cause_ns;               /* last time at which the plant had a reason to keep the drive in a fault, */
+    uint64_t cause_begin_ns;         /* which it has had since */
     uint64_t stop_ns, constant_ns;   /* since then stopping, since then one command */
     double begin_speed_rad_s;        /* then */
     double stop_speed_rad_s;         /* when the stop began */

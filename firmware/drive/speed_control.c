@@ -96,9 +96,9 @@ void speed_control_limit_uncertain(const control_parameters_t *parameters, int32
     const int32_t magnitude_q24 = fixed_abs(load_q24);
     const int32_t against_q24 =
         magnitude_q24 < most_q24 / UNCERTAIN_LOAD ? most_q24 - UNCERTAIN_LOAD * magnitude_q24 : 0;
-    if (load_q24 > 0) {
+    if (load_q24 > 0 && results->speed_reference_q22 >= 0) {
         results->torque_min_q24 = results->torque_min_q24 > -against_q24 ? results->torque_min_q24 : -against_q24;
-    } else {
+    } else if (load_q24 < 0 && results->speed_reference_q22 <= 0) {
         results->torque_max_q24 = results->torque_max_q24 < against_q24 ? results->torque_max_q24 : against_q24;
     }
 }

@@ -17,9 +17,9 @@
 void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
                             const command_t *command, int32_t limit_q24, deferred_results_t *results);
 
-/* While counts are slow, a speed above the reference may be one of the estimate alone. A load brakes by itself: the
- * more of it, the less torque against it, none from a sixteenth of the largest torque on. load_q24: estimated load
- * torque, N m, Q7.24. For limits of speed mode. [deferred] */
+/* While counts are slow, a speed above the reference may be one of the estimate alone. A load against the reference
+ * brakes by itself: the more of it, the less braking torque, none from a sixteenth of the largest torque on. A load
+ * that drives limits nothing. load_q24: estimated load torque, N m, Q7.24. For limits of speed mode. [deferred] */
 void speed_control_limit_uncertain(const control_parameters_t *parameters, int32_t load_q24,
                                    deferred_speed_results_t *results);
 

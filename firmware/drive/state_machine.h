@@ -6,8 +6,8 @@
  * A command timeout is a fault only in RUN. After a fault the drive runs again only once the run request has been
  * withdrawn: a run request that persists through the fault does not restart it. Likewise `clear_fault` counts
  * from the tick in which the request changes to it, and only if every check passes in that tick and until the 10 ms are
- * over: a request that persists clears neither a later fault nor one whose cause disappears later. It has no reference:
- * the demand is zero.
+ * over: a request that persists clears neither a later fault nor one whose cause disappears later. In RUN it is refused
+ * (comms/commands.h): a drive that finds both has got there without a request to run, and leaves it.
  *
  * The states are independent of the direction of rotation. RUN passes through zero speed when the reference changes its
  * sign. A stop remains in RUN with a reference that ramps to zero, from either side, until the rotor is at standstill:
@@ -62,7 +62,7 @@ static inline bool state_machine_runs(state_machine_t *state_machine, const stat
         return false;
     }
     if (state_machine->state == DRIVE_STATE_RUN) { /* rearmed; the last request matters in FAULT only */
-        return input->request != COMMAND_OFF && !(input->request == COMMAND_STOP && input->at_standstill);
+        return input->request == COMMAND_RUN || (input->request == COMMAND_STOP && !input->at_standstill);
     }
     if (state_machine->state == DRIVE_STATE_READY && input->request == COMMAND_RUN && state_machine->rearmed) {
         return begin_run(state_machine);

@@ -299,6 +299,24 @@ def test_estimate_of_the_load_holds_in_an_acceleration_of_an_identified_inertia(
 # --- controllers ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("encoder_bits", "load_Nm", "from_rpm", "to_rpm", "time_s"), [
+    (10, -2.0, 30, 100, (0.006, 0.012)),
+    (10, 2.0, -30, -100, (0.006, 0.012)),
+    (8, -2.0, 90, 300, (0.015, 0.035)),
+])
+def test_load_that_drives_leaves_the_torque_to_accelerate_with_a_coarse_encoder(make_bench, encoder_bits, load_Nm,
+                                                                                from_rpm, to_rpm, time_s):
+    bench = make_bench(controller="salient", encoder_bits=encoder_bits)
+    bench.drive.speed_reference_rpm = from_rpm
+    bench.run_for(0.2)
+    bench.load_torque_Nm = load_Nm
+    bench.run_for(0.2)
+    begin_s = bench.time_s
+    bench.drive.speed_reference_rpm = to_rpm
+    bench.run_until(lambda: abs(bench.truth["speed_rpm"].last - to_rpm) < 0.03 * abs(to_rpm), timeout=0.1)
+    assert time_s[0] < bench.time_s - begin_s < time_s[1]
+
+
 def test_controller_is_changed_over_can_between_runs(bench):
     # Standard deviation of the true torque under a steady load, N m.
     unevenness_Nm = {"traditional": (0.4, 1.2), "paper": (0.03, 0.15), "salient": (0.001, 0.015)}

@@ -44,7 +44,7 @@ expected_t expected(drive_state_t state, uint64_t fault_mask, command_request_t 
         if (fault_mask != 0) {
             return {DRIVE_STATE_FAULT, true};
         }
-        if (request == COMMAND_OFF || (request == COMMAND_STOP && at_standstill)) {
+        if (request == COMMAND_OFF || request == COMMAND_CLEAR_FAULT || (request == COMMAND_STOP && at_standstill)) {
             return {DRIVE_STATE_READY, false};
         }
         return {DRIVE_STATE_RUN, false};
@@ -287,9 +287,9 @@ TEST_F(StateMachine, a_stop_runs_until_standstill_and_off_does_not_wait) {
     EXPECT_EQ(step(COMMAND_OFF), DRIVE_STATE_READY);
 }
 
-TEST_F(StateMachine, clear_fault_does_not_leave_run) {
+TEST_F(StateMachine, a_run_that_finds_a_request_to_clear_has_begun_by_itself_and_ends) {
     run();
-    EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_RUN);
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
 }
 
 } // namespace
