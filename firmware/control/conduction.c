@@ -295,7 +295,7 @@ static void limit_torque(const conduction_parameters_t *parameters, conduction_s
     const int32_t room = room_q15(parameters, state, sample->dc_link_voltage_q6);
     const int32_t more = (state->partial_q15 >> 2) * room >> 13;
     const int32_t kept_q15 = room + parameters->longer_pulses * more;
-    const int32_t part_q15 = kept_q15 < ONE_Q15 ? kept_q15 : ONE_Q15;
+    const int32_t part_q15 = kept_q15 < ONE_Q15 && !conduction_at_rest(sample->speed_q22) ? kept_q15 : ONE_Q15;
     state->room_q15 = (uint16_t)room;
     const int32_t braking_q24 = 4 * fixed_multiply_high(state->braking_max_q24, part_q15 << 15);
     const bool reverse = sample->speed_q22 < 0;

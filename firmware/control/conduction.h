@@ -63,6 +63,7 @@
 
 #include "control/machine_tables.h"
 #include "control/torque_sharing.h"
+#include "fixed/fixed.h"
 
 /* Of the phases in one half of the electrical revolution: those that move towards the aligned position, and those that
  * move away from it. */
@@ -168,6 +169,12 @@ typedef struct {
     uint32_t angle_step;          /* magnitude of the rotation during an update, 2^-32 electrical rev */
     int32_t dc_link_voltage_q6;   /* V, Q9.6 */
 } conduction_sample_t;
+
+/* A rotor that returns no energy, whatever the torque: below 2 rad/s, or that times the unit of speed, the windings
+ * dissipate more. A full DC link leaves it the torque to start in either direction. */
+static inline bool conduction_at_rest(int32_t speed_q22) {
+    return fixed_magnitude(speed_q22) < 2u << 22;
+}
 
 /* Limit of the braking torque's magnitude by what the DC link can take, from the voltage of the present period: N m,
  * Q7.24, INT32_MAX where it is none. Faster than the limits of an update, in which the fields of the phases alone could

@@ -34,19 +34,20 @@ periodic_load_parameters_t periodic_load_configure(uint32_t control_rate_hz, uin
     };
 }
 
+static void begin_turn(periodic_load_t *load) {
+    load->moved = false;
+    load->count = 0;
+    load->total_q8 = 0;
+    load->load_q8 = load->change_q8 = load->residual_q8 = load->slow_q8 = 0;
+}
+
 void periodic_load_reset(periodic_load_t *load) {
     load->mode = PERIODIC_LOAD_CLEAR;
     load->engaged = false;
     load->torque_q24 = 0;
     load->updates = 0;
     load->window = 0;
-}
-
-static void begin_turn(periodic_load_t *load) {
-    load->moved = false;
-    load->count = 0;
-    load->total_q8 = 0;
-    load->load_q8 = load->change_q8 = load->residual_q8 = load->slow_q8 = 0;
+    begin_turn(load);
 }
 
 static periodic_load_mode_t next_mode(const periodic_load_parameters_t *parameters, const periodic_load_t *load) {
@@ -141,6 +142,10 @@ void periodic_load_step(const periodic_load_parameters_t *parameters, periodic_l
         return;
     }
     const int32_t lag = angle_step * parameters->lag_periods;
+    if (load->backwards != (lag < 0)) {
+        load->backwards = lag < 0;
+        load->window = 0;
+    }
     const uint32_t index = (sample->angle - (uint32_t)lag) >> VALUE_SHIFT;
     if (load->count == VALUES) {
         end_turn(parameters, load);

@@ -272,7 +272,7 @@ static conduction_parameters_t conduction_from(const int32_t *values, const mach
     /* Twice the largest braking torque: a larger one would hardly leave a range. */
     const int32_t link_torque_q24 =
         fixed_clamp(values[PARAMETER_TORQUE_MAX_NM], 0,
-                    fixed_shift_up_saturate_bits(tables->pulse[CONDUCTION_BRAKING][0].mean_torque, 17, 32));
+                    fixed_saturate((int64_t)tables->pulse[CONDUCTION_BRAKING][0].mean_torque << 17));
     return (conduction_parameters_t){
         .sharing = sharing,
         .initial = conduction_initial(&base_window),

@@ -166,7 +166,7 @@ static void follow_innovation(const control_parameters_t *parameters, deferred_t
 }
 
 static bool disturbed(const control_parameters_t *parameters, const deferred_input_t *input) {
-    return input->bandwidth.stage < parameters->bandwidth.moving_stage;
+    return parameters->bandwidth.adaptive && input->bandwidth.stage < parameters->bandwidth.moving_stage;
 }
 
 /* Speed control in which neither a disturbance nor the voltage adds to the ripple. A misalignment of a quarter of a

@@ -59,7 +59,7 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
     int32_t min_q24 = deferred->conduction.torque_min_q24, max_q24 = deferred->conduction.torque_max_q24;
     min_q24 = min_q24 > -limit_q24 ? min_q24 : -limit_q24;
     max_q24 = max_q24 < limit_q24 ? max_q24 : limit_q24;
-    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
+    if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && !conduction_at_rest(input->speed_q22)) {
         const int32_t braking_q24 = conduction_braking_q24(&parameters->conduction, input->dc_link_voltage_q6);
         if (input->speed_q22 < 0) {
             max_q24 = max_q24 < braking_q24 ? max_q24 : braking_q24;

@@ -127,3 +127,14 @@ def test_windings_dissipate_what_the_chopper_does_not_take(make_bench):
     assert 24.95 < -np.mean(torque_Nm) < 27.12, "0.92 of the bound of torque_speed, and the bound"
     voltage_V = bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].between(begin_s, bench.time_s).value
     assert 288 < np.min(voltage_V) < np.max(voltage_V) < 293, "it is steady"
+
+
+@pytest.mark.parametrize("references_rpm", [(-300,), (300, 0, -300), (-300, 0, 300)])
+def test_a_full_link_leaves_a_drive_at_rest_the_torque_to_start_in_either_direction(make_bench, references_rpm):
+    bench = make_bench(controller="salient")
+    bench.rig.supply_voltage_V = 0.99 * OVER_VOLTAGE_V
+    for reference_rpm in references_rpm:
+        bench.drive.speed_reference_rpm = reference_rpm
+        bench.run_for(3.0 if reference_rpm == 0 else 0.3)  # it coasts to rest
+    assert bench.drive.state == "run"
+    assert bench.truth["speed_rpm"].last == pytest.approx(references_rpm[-1], rel=0.01)

@@ -183,7 +183,8 @@ struct model_t {
         link = std::clamp(link + 1.0 / 50.0 / 16.0 * (free < 0.0 ? 32.0 * free : free), 0.0, 1.0);
         const double room = std::min(free + 1.0, 1.0) * link;
         const double motoring_max = std::min(largest(false, index), TORQUE_MAX_NM);
-        const double kept = longer ? std::min(room * (1.0 + 3.0 * partial), 1.0) : room;
+        const bool at_rest = std::fabs(s.speed) < 2.0;
+        const double kept = at_rest ? 1.0 : longer ? std::min(room * (1.0 + 3.0 * partial), 1.0) : room;
         const double braking_max = std::min(largest(true, index) * kept, TORQUE_MAX_NM);
         torque_max = s.speed < 0.0 ? braking_max : motoring_max;
         torque_min = -(s.speed < 0.0 ? motoring_max : braking_max);

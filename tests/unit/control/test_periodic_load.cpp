@@ -259,6 +259,45 @@ TEST(PeriodicLoad, ripple_that_repeats_with_every_pole_pitch_is_the_machine_s_ow
     }
 }
 
+// Turns with an observer that sees the load less the torque at once; from turn to turn, by the value.
+double turn(periodic_load_t &state, double from, double to, const std::function<double(double)> &load_Nm) {
+    const periodic_load_parameters_t parameters =
+        periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24), ROTOR_POLES);
+    const double step = (to < from ? -5.0 : 5.0) / RATE_HZ; // 300 r/min
+    double largest_Nm = 0.0;
+    for (double turns = from; (to - turns) * step > 0.0; turns += step * UPDATE_PERIODS) {
+        const periodic_load_sample_t sample = {.angle = angle_from_rev(turns),
+                                               .angle_step = int32_t(std::lround(step * 0x1p32)),
+                                               .load_torque_q24 =
+                                                   to_fixed(load_Nm(turns) - (state.torque_q24 / Q24), Q24),
+                                               .moving = true};
+        periodic_load_step(&parameters, &state, &sample);
+        largest_Nm = std::max(largest_Nm, std::fabs(state.torque_q24 / Q24));
+    }
+    return largest_Nm;
+}
+
+double one_cylinder(double turns) {
+    return 8.0 + 3.0 * std::sin(2.0 * PI * turns);
+}
+
+TEST(PeriodicLoad, nothing_of_a_run_acts_in_the_next_one_which_begins_within_the_same_value) {
+    for (const double end : {10.1, 10.5, 10.9}) {
+        periodic_load_t state{};
+        ASSERT_GT(turn(state, 0.0, end, one_cylinder), 1.0);
+        periodic_load_reset(&state);
+        EXPECT_EQ(turn(state, end, end + 3.0, [](double) { return 8.0; }), 0.0) << end;
+    }
+}
+
+TEST(PeriodicLoad, ripple_of_the_pole_pitch_after_a_reversal_is_not_learned) {
+    periodic_load_t state{};
+    turn(state, 0.0, 10.3, one_cylinder);
+    const auto ripple = [](double turns) { return 8.0 + 2.0 * std::sin(2.0 * PI * ROTOR_POLES * turns); };
+    turn(state, 10.3, 4.0, ripple);
+    EXPECT_EQ(turn(state, 4.0, -6.0, ripple), 0.0);
+}
+
 TEST(PeriodicLoad, learns_nothing_while_the_load_does_not_count_as_moving) {
     EXPECT_EQ(learn(600.0, harmonics, 2.0, false).largest_q24, 0);
 }

@@ -349,7 +349,7 @@ TEST(Configure, braking_torque_decreases_over_the_last_32nd_of_the_voltage_or_ov
     }
     // A larger limit of the torque than the machine brakes with leaves the range for what it brakes with.
     parameters.values[PARAMETER_TORQUE_MAX_NM] = 100 << 24;
-    for (const unsigned largest_Nm : {20u, 40u, 60u}) {
+    for (const unsigned largest_Nm : {20u, 40u, 60u, 70u, 255u}) {
         tables.pulse[CONDUCTION_BRAKING][0].mean_torque = uint16_t(largest_Nm << 8);
         const conduction_parameters_t c =
             configure_control(&parameters, &tables, 40000, 17, 12, fixed_point::TIMER_CLOCK_HZ).conduction;
