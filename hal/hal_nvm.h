@@ -2,7 +2,14 @@
  *
  * A page is erased as a whole, which sets all its bits; a word is programmed once after that. Both block the caller. On
  * a microcontroller whose program runs from the same flash they also stall the interrupts (STM32G431: 22 ms and 85 us),
- * so that the drive has neither in RUN.
+ * so that the drive begins neither in RUN nor after a command that starts a run: hal_pwm_open_all has opened all
+ * switches, and no compare values are written before the operation has ended.
+ *
+ * A port whose operations stall the interrupts hides that from the next control interrupt: it discards the triggers
+ * that came meanwhile, the pending one too, and the break `not renewed` that they caused, which in READY the drive
+ * would take for the fault interrupt_overrun. Other causes of a break remain, and triggers that were missed before.
+ * What the rotor turned meanwhile cannot be hidden: more than in one period at 1.5 times the speed limit, and two
+ * counts, is the fault encoder in READY.
  *
  * Power may be lost during an operation. Of a word that was being programmed any of the bits to be cleared may be
  * cleared; a page that was being erased may have any content, different in each word. Other words and pages are

@@ -47,7 +47,9 @@ static bool erased(const nvm_ring_t *ring, const hal_t *hal, unsigned page, unsi
     return true;
 }
 
-/* The first erased place from the present one on, else the start of the other page. */
+/* The first erased place from the present one on, else the start of the page that does not have the newest record: of
+ * the present page again, when every place of it was passed over before a record was committed. Without a record page 0
+ * is kept, because what is damaged there tells the caller that there was one. */
 static void find_place(nvm_ring_t *ring, const hal_t *hal) {
     ring->word = 0;
     ring->crc = 0;
@@ -55,7 +57,7 @@ static void find_place(nvm_ring_t *ring, const hal_t *hal) {
         ring->slot++;
     }
     if (ring->slot == slots(ring)) {
-        ring->page ^= 1;
+        ring->page = ring->newest_page ^ 1u;
         ring->slot = 0;
         ring->erase = true;
     }
@@ -73,7 +75,7 @@ COLD void nvm_ring_init(nvm_ring_t *ring, const hal_t *hal, unsigned first_page,
             if (sequence > ring->sequence && valid(ring, hal, page, slot, sequence)) {
                 ring->sequence = sequence;
                 ring->torn_commit = commit != COMMIT;
-                ring->page = (uint8_t)page;
+                ring->page = ring->newest_page = (uint8_t)page;
                 ring->slot = (uint8_t)(slot + 1);
             }
         }
@@ -130,6 +132,7 @@ COLD nvm_ring_result_t nvm_ring_step(nvm_ring_t *ring, hal_t *hal, uint64_t payl
         return NVM_RING_BUSY;
     }
     ring->sequence++;
+    ring->newest_page = ring->page;
     ring->attempts = 0;
     ring->damaged = ring->torn_commit = false;
     ring->slot++;

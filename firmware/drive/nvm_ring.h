@@ -6,11 +6,12 @@
  *   word n - 1          commit word, written last
  *
  * The newest record is the valid one with the highest sequence number. A record is written into erased words behind it;
- * when its page is full the other page, which has older records only, is erased and written. So the newest record
- * remains untouched until the next one is committed, whatever the power does: a cut leaves the old record the newest,
- * or the new one. A record whose commit word is erased is unfinished and ignored, as if it were not there; one that is
- * committed but does not have the checksum is damaged. A commit word that was torn is as good as a whole one, because
- * the checksum before it was complete.
+ * when its page is full the other page, which has older records only, is erased and written. When no place of that page
+ * takes the record it is erased again, and never the page of the newest record. So the newest record remains untouched
+ * until the next one is committed, whatever power and memory do: a cut leaves the old record the newest, or the new
+ * one. A record whose commit word is erased is unfinished and ignored, as if it were not there; one that is committed
+ * but does not have the checksum is damaged. A commit word that was torn is as good as a whole one, because the
+ * checksum before it was complete.
  *
  * Wear: one erasure for each page of records instead of one for each record. At 10,000 erasures of a page, those of an
  * STM32G4, 20,000 pages of records.
@@ -28,7 +29,7 @@
 /* Words of a record beside its payload. */
 #define NVM_RING_OVERHEAD 3
 
-/* Faulty places that the writing of one record passes over before it fails. */
+/* Faulty places, and erasures that fail, which the writing of one record passes over before it fails. */
 #define NVM_RING_ATTEMPTS 4
 
 typedef enum { NVM_RING_BUSY, NVM_RING_WRITTEN, NVM_RING_FAILED } nvm_ring_result_t;
@@ -39,6 +40,7 @@ typedef struct {
     uint32_t sequence;    /* of the newest record, from 1; 0: there is none. No wear-out reaches 2^32. */
     bool damaged;         /* at start: there is no valid record, but a damaged one */
     bool torn_commit;     /* at start: the newest record is valid, its commit word is not what was written */
+    uint8_t newest_page;  /* of the newest record, 0 or 1: not erased before the next one; 0 when there is none */
     uint8_t page;         /* place of the next record: 0 or 1, and its record number there */
     uint8_t slot;
     bool erase;       /* its page has to be erased first */

@@ -53,6 +53,68 @@ TEST(PowerCuts, at_every_operation_of_log_entries_lose_and_mix_nothing) {
     EXPECT_GT(result.pairs, 4u * 9 * FAULT_WORDS * FAULT_WORDS);
 }
 
+// Full pages, of which the next record needs the other one: page 1 that is erased, and both with older records.
+constexpr unsigned FULL_PAGES = 3;
+
+struct Ring {
+    write_t write;
+    unsigned first_page, records_per_page;
+};
+
+class MemoryErrors : public testing::TestWithParam<Ring> {
+  protected:
+    // Writes records until the page that has the newest one is full.
+    void fill(unsigned pages) {
+        std::memset(&work.memory, 0, sizeof work.memory);
+        nvm_init(&work.memory.hal.nvm);
+        work.memory.hal.nvm.random = 1;
+        for (unsigned i = 0; i < pages * GetParam().records_per_page; i++) {
+            complete(&result, &work.drive, &work.memory, GetParam().write);
+        }
+    }
+
+    unsigned other_page(unsigned full_pages) const { return GetParam().first_page + full_pages % 2; }
+
+    power_cuts_t result{};
+};
+
+INSTANTIATE_TEST_SUITE_P(Rings, MemoryErrors,
+                         testing::Values(Ring{WRITE_SET, PARAMETER_PAGE, SETS_PER_PAGE},
+                                         Ring{WRITE_FAULT, FAULT_PAGE, FAULTS_PER_PAGE}),
+                         [](const auto &ring) { return ring.param.write == WRITE_SET ? "sets" : "faults"; });
+
+TEST_P(MemoryErrors, an_erasure_that_fails_and_a_power_cut_at_every_later_operation_lose_nothing) {
+    for (unsigned pages = 1; pages <= FULL_PAGES; pages++) {
+        for (uint32_t errors = 1; errors < NVM_RING_ATTEMPTS; errors++) {
+            fill(pages);
+            work.memory.hal.erase_errors = errors;
+            cut_write(&result, &work, GetParam().write, false);
+            complete(&result, &work.drive, &work.memory, GetParam().write);
+        }
+    }
+    expect_nothing_lost("an erasure that fails", result);
+    EXPECT_GT(result.cuts, FULL_PAGES * 3 * 3 * NVM_RING_OVERHEAD);
+}
+
+// The record is not written and says so; each further one fails likewise.
+TEST_P(MemoryErrors, a_page_of_bad_words_costs_no_record_of_the_other_page) {
+    for (const bool zero : {false, true}) {
+        for (unsigned pages = 1; pages <= FULL_PAGES; pages += 2) {
+            fill(pages);
+            ASSERT_EQ(result.failures, 0u);
+            hal_t &hal = work.memory.hal;
+            hal.worn_page = other_page(pages);
+            hal.worn_zero = zero;
+            cut_write(&result, &work, GetParam().write, false);
+            EXPECT_GT(result.cuts, 0u);
+            EXPECT_EQ(result.failures, result.cuts);
+            EXPECT_EQ(result.losses, 0u);
+            EXPECT_EQ(result.mixed, 0u);
+            result = {};
+        }
+    }
+}
+
 class NvmStore : public testing::Test {
   protected:
     void SetUp() override {
@@ -206,6 +268,80 @@ TEST_F(NvmStore, a_word_that_cannot_be_programmed_is_passed_over) {
     memory.hal.nvm.word[PARAMETER_PAGE][SET_WORDS + 5] = 0;
     write(WRITE_SET);
     EXPECT_TRUE(has_set(&drive, 1));
+}
+
+// What a power cut at the present instant leaves.
+bool starts_with_set(const memory_t &memory, uint32_t set) {
+    static memory_t copy;
+    started_t drive;
+    copy = memory;
+    start_drive(&drive, &copy);
+    return has_set(&drive, set);
+}
+
+TEST_F(NvmStore, saves_that_a_page_of_bad_words_does_not_take_fail_and_cost_no_set_of_the_other_page) {
+    for (unsigned i = 0; i < SETS_PER_PAGE; i++) {
+        write(WRITE_SET);
+    }
+    for (const bool zero : {false, true}) {
+        memory.hal.worn_page = PARAMETER_PAGE + 1;
+        memory.hal.worn_zero = zero;
+        for (unsigned save = 0; save < 2 * SETS_PER_PAGE; save++) {
+            parameter_store_save(&drive.store);
+            while (drive.store.saving == NVM_STORE_SAVING) {
+                nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 1, true);
+                ASSERT_TRUE(starts_with_set(memory, SETS_PER_PAGE)) << save;
+            }
+            ASSERT_EQ(drive.store.saving, NVM_STORE_FAILED);
+        }
+    }
+    EXPECT_EQ(memory.hal.nvm.erasures[PARAMETER_PAGE], 0u);
+}
+
+// Damaged sets are kept like a valid one: without them the drive would start with its defaults.
+TEST_F(NvmStore, saves_that_a_page_of_bad_words_does_not_take_leave_the_start_inhibited_by_damaged_sets) {
+    for (unsigned i = 0; i < SETS_PER_PAGE; i++) {
+        write(WRITE_SET);
+        *set_word(i, 4) ^= 1;
+    }
+    memory.hal.worn_page = PARAMETER_PAGE + 1;
+    start_drive(&drive, &memory);
+    ASSERT_TRUE(drive.store.inhibited);
+    for (unsigned save = 0; save < 2 * SETS_PER_PAGE; save++) {
+        parameter_store_save(&drive.store);
+        while (drive.store.saving == NVM_STORE_SAVING) {
+            nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 1, true);
+        }
+        ASSERT_EQ(drive.store.saving, NVM_STORE_FAILED);
+    }
+    start_drive(&drive, &memory);
+    EXPECT_TRUE(drive.store.inhibited);
+}
+
+TEST_F(NvmStore, sets_that_change_while_they_are_written_cost_no_set_of_the_other_page) {
+    for (unsigned i = 0; i < SETS_PER_PAGE; i++) {
+        write(WRITE_SET);
+    }
+    parameter_store_save(&drive.store);
+    const int32_t before = drive.parameters.values[0];
+    const int32_t step = before == parameters_row(0)->minimum ? 1 : -1;
+    for (unsigned change = 1; change <= 2 * SETS_PER_PAGE + 1; change++) {
+        parameters_t set = drive.parameters;
+        set.values[0] = before + (change % 2 != 0 ? step : 0);
+        parameters_apply(&drive.parameters, set.values);
+        for (unsigned i = 0; i < 3; i++) { // the erasure, and words of a record
+            nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 1, true);
+            ASSERT_TRUE(starts_with_set(memory, SETS_PER_PAGE)) << change;
+        }
+    }
+    EXPECT_EQ(memory.hal.nvm.erasures[PARAMETER_PAGE], 0u);
+    while (drive.store.saving == NVM_STORE_SAVING) {
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 1, true);
+    }
+    EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED);
+    start_drive(&drive, &memory);
+    EXPECT_TRUE(drive.store.loaded);
+    EXPECT_EQ(drive.parameters.values[0], before + step);
 }
 
 TEST_F(NvmStore, a_fault_is_logged_once_and_the_same_fault_after_a_clearing_again) {

@@ -17,8 +17,12 @@
 #include "drive/parameters.h"
 #include "rig/nvm.h"
 
+/* With errors of the memory while there is power, which are no operations of nvm_t. */
 struct hal {
     nvm_t nvm;
+    uint32_t erase_errors; /* next erasures that fail and leave the page as it was */
+    uint32_t worn_page;    /* page whose words cannot be programmed; 0: none */
+    bool worn_zero;        /* and read as 0 even after an erasure */
 };
 
 uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word) {
@@ -26,11 +30,20 @@ uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word) {
 }
 
 bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value) {
-    return nvm_program(&hal->nvm, page, word, value);
+    const bool worn = hal->worn_page != 0 && page == hal->worn_page;
+    return nvm_program(&hal->nvm, page, word, worn ? HAL_NVM_ERASED : value) && !worn;
 }
 
 bool hal_nvm_erase(hal_t *hal, unsigned page) {
-    return nvm_erase(&hal->nvm, page);
+    if (hal->erase_errors > 0 && !hal->nvm.power_lost) {
+        hal->erase_errors--;
+        return false;
+    }
+    const bool erased = nvm_erase(&hal->nvm, page);
+    if (page == hal->worn_page && hal->worn_zero) {
+        memset(hal->nvm.word[page], 0, sizeof hal->nvm.word[page]);
+    }
+    return erased;
 }
 
 typedef enum { WRITE_SET, WRITE_FAULT } write_t;
