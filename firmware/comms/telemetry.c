@@ -132,11 +132,12 @@ void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
     telemetry->cycle = (uint8_t)(telemetry->cycle + cycles);
 }
 
+bool telemetry_pauses(const telemetry_t *telemetry, uint32_t time_us) {
+    return telemetry->backlog && telemetry->background_in_mailbox &&
+           time_us - telemetry->background_us - TELEMETRY_PATIENCE_US < TELEMETRY_PAUSE_US;
+}
+
 void telemetry_flush(telemetry_t *telemetry, hal_t *hal, uint32_t time_us) {
-    if (telemetry->backlog && telemetry->background_in_mailbox &&
-        time_us - telemetry->background_us - TELEMETRY_PATIENCE_US < TELEMETRY_PAUSE_US) {
-        return;
-    }
     const hal_can_frame_t *frame;
     while ((frame = frame_queue_peek(&telemetry->queue)) != NULL && hal_can_transmit(hal, frame)) {
         if (frame->identifier >= BACKGROUND_IDENTIFIERS) {

@@ -66,7 +66,10 @@ static inline bool telemetry_due(const telemetry_t *telemetry, uint32_t time_us)
  * the groups of this cycle that precede the counters. [background] */
 void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values);
 
-/* Moves waiting frames to the mailboxes until all of them are occupied, unless it pauses. [background] */
+/* True while the mailboxes are to run empty, so that the heartbeat leaves. [background] */
+bool telemetry_pauses(const telemetry_t *telemetry, uint32_t time_us);
+
+/* Moves waiting frames to the mailboxes until all of them are occupied. [background] */
 void telemetry_flush(telemetry_t *telemetry, hal_t *hal, uint32_t time_us);
 
 #endif
