@@ -132,9 +132,16 @@ void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
     telemetry->cycle = (uint8_t)(telemetry->cycle + cycles);
 }
 
-bool telemetry_pauses(const telemetry_t *telemetry, uint32_t time_us) {
-    return telemetry->backlog && telemetry->background_in_mailbox &&
-           time_us - telemetry->background_us - TELEMETRY_PATIENCE_US < TELEMETRY_PAUSE_US;
+bool telemetry_pauses(telemetry_t *telemetry, uint32_t time_us) {
+    const uint32_t age_us = time_us - telemetry->background_us;
+    if (!telemetry->backlog || !telemetry->background_in_mailbox || age_us < TELEMETRY_PATIENCE_US) {
+        return false;
+    }
+    const bool pauses = age_us < TELEMETRY_PATIENCE_US + TELEMETRY_PAUSE_US;
+    if (!pauses) { /* other nodes have filled the bus meanwhile */
+        telemetry->background_us = time_us;
+    }
+    return pauses;
 }
 
 void telemetry_flush(telemetry_t *telemetry, hal_t *hal, uint32_t time_us) {

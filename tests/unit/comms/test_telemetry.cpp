@@ -366,6 +366,18 @@ TEST_F(Comms, own_telemetry_that_the_bus_does_not_take_lets_the_heartbeat_pass) 
     EXPECT_GT(bus.count(DRIVE_STATUS_FRAME_ID), 800u);
 }
 
+TEST_F(Comms, the_heartbeat_survives_a_pause_of_telemetry_in_which_other_nodes_fill_the_bus) {
+    frame_us = 500;
+    run(12000);
+    ASSERT_TRUE(comms.telemetry.background_in_mailbox);
+    const uint32_t entered_us = comms.telemetry.background_us;
+    run(entered_us + TELEMETRY_PATIENCE_US);
+    ASSERT_EQ(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 0u);
+    run(entered_us + TELEMETRY_PATIENCE_US + TELEMETRY_PAUSE_US + 1000, 0);
+    run(2000500);
+    EXPECT_NEAR(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 20, 1);
+}
+
 TEST_F(Comms, periods_follow_the_parameters_from_the_last_frame_on) {
     parameters.values[PARAMETER_TELEMETRY_PERIOD_MS] = 4;
     run(20500);
