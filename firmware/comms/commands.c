@@ -149,6 +149,9 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
     if (commands->used && commands->requested.request != COMMAND_RUN && !stopping) {
         commands_disarm(commands);
     }
+    if (commands->failed && commands->state == DRIVE_STATE_RUN) { /* it would end the run before the fault does */
+        return COMMANDS_ACCEPTED;
+    }
     publish(commands, command);
     return COMMANDS_COMMAND;
 }

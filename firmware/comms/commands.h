@@ -67,7 +67,7 @@ typedef struct {
     uint32_t armed_us;   /* when it was armed */
     bool used;           /* a request to run has taken effect since */
     bool ran;            /* the drive has been in state RUN since */
-    bool failed;         /* invalid frames are a fault; the caller clears it */
+    bool failed;         /* invalid frames are a fault, and no command ends the run before; the caller clears it */
     uint16_t errors;     /* count of invalid command frames while armed, above */
     drive_state_t state; /* of the last commands_supervise */
     command_t requested; /* last valid command; the published one has off instead of run while not armed */
@@ -95,7 +95,7 @@ void commands_disarm(commands_t *commands);
 /* Checks a received frame. COMMANDS_COMMAND: *command is written. COMMANDS_PARAMETER_REQUEST: a request of the right
  * length, its contents not checked. COMMANDS_PARAMETER_SET: a PARAMETER_WRITE within the DBC's range, or a
  * PARAMETER_SET_CONTROL likewise, which comes while the drive is not armed for configuration, too, for the response.
- * COMMANDS_ACCEPTED: a frame that is no command and needs no response.
+ * COMMANDS_ACCEPTED: a frame that is no command and needs no response, or a command while failed in RUN.
  * COMMANDS_REJECTED: counted, *command unchanged. hal: its random number generator. [background] */
 commands_frame_t commands_receive(commands_t *commands, hal_t *hal, const hal_can_frame_t *frame, uint32_t time_us,
                                   uint32_t timeout_us, command_t *command);

@@ -1,5 +1,6 @@
 #include "comms/comms.h"
 
+#include "comms/counter.h"
 #include "comms/memory_protocol.h"
 #include "comms/node.h"
 #include "comms/parameter_protocol.h"
@@ -26,6 +27,15 @@ static void report_arming(comms_t *comms, hal_t *hal, uint32_t time_us) {
     comms->arming_sent_us = time_us;
 }
 
+static bool send_response(comms_t *comms, hal_t *hal) {
+    const hal_can_frame_t *frame = frame_queue_peek(&comms->responses);
+    if (frame == NULL || !hal_can_transmit(hal, frame)) {
+        return false;
+    }
+    frame_queue_pop(&comms->responses);
+    return true;
+}
+
 static void flush(comms_t *comms, hal_t *hal, uint32_t time_us) {
     const arming_t *arming = &comms->commands.arming;
     if (arming->attempt != ARMING_ATTEMPT_NONE) {
@@ -36,28 +46,40 @@ static void flush(comms_t *comms, hal_t *hal, uint32_t time_us) {
             return;
         }
     }
+    if (telemetry_pauses(&comms->telemetry, time_us)) {
+        return;
+    }
+    comms->response_first = comms->response_first && !send_response(comms, hal);
     telemetry_flush(&comms->telemetry, hal, time_us);
-    const hal_can_frame_t *frame;
     if (frame_queue_peek(&comms->telemetry.queue) == NULL && arming->changed) {
         report_arming(comms, hal, time_us);
     }
-    while (frame_queue_peek(&comms->telemetry.queue) == NULL && (frame = frame_queue_peek(&comms->responses)) != NULL &&
-           hal_can_transmit(hal, frame)) {
-        frame_queue_pop(&comms->responses);
+    while (frame_queue_peek(&comms->telemetry.queue) == NULL && send_response(comms, hal)) {
     }
 }
 
-static void receive_set(comms_t *comms, parameters_t *parameters, const parameters_conditions_t *conditions,
-                        const hal_can_frame_t *frame) {
+/* Handles a parameter request or a frame of a set. Without room for its response a frame is dropped: commands behind it
+ * must not wait. */
+static void receive_parameters(comms_t *comms, hal_t *hal, parameters_t *parameters,
+                               const parameters_conditions_t *conditions, const hal_can_frame_t *frame) {
     arming_t *arming = &comms->commands.arming;
-    if (frame->identifier == DRIVE_PARAMETER_WRITE_FRAME_ID) {
+    if (frame->identifier == DRIVE_PARAMETER_WRITE_FRAME_ID) { /* has none */
         parameter_set_write(&comms->set, frame);
         return;
     }
+    if (frame_queue_free(&comms->responses) == 0) {
+        counter_add(&comms->telemetry.dropped, 1);
+        return;
+    }
     hal_can_frame_t response;
-    if (parameter_set_control(&comms->set, arming->configuring, parameters, comms->store, conditions, frame,
-                              &response)) {
-        arming_end_configuration(arming);
+    if (frame->identifier == DRIVE_PARAMETER_SET_CONTROL_FRAME_ID) {
+        if (parameter_set_control(&comms->set, arming->configuring, parameters, comms->store, conditions, frame,
+                                  &response)) {
+            arming_end_configuration(arming);
+        }
+    } else if (!memory_protocol_respond(comms->store, comms->self_test, hal, frame, &response) &&
+               !trace_protocol_respond(comms->trace, comms->control_parameters, frame, &response)) {
+        parameter_protocol_respond(parameters, frame, &response);
     }
     response.identifier += comms->telemetry.identifier_offset;
     frame_queue_push(&comms->responses, &response);
@@ -67,7 +89,7 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const 
                     uint32_t timeout_us, uint32_t time_us) {
     hal_can_frame_t frame;
     for (int i = 0; i < COMMS_FRAMES_PER_CALL; i++) {
-        if (frame_queue_free(&comms->responses) == 0 || !hal_can_receive(hal, &frame)) {
+        if (!hal_can_receive(hal, &frame)) {
             return false;
         }
         if (node_is_other(&frame, comms->telemetry.identifier_offset)) {
@@ -80,18 +102,9 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const 
         switch (commands_receive(&comms->commands, hal, &frame, time_us, timeout_us, &comms->command)) {
         case COMMANDS_COMMAND:
             return true;
-        case COMMANDS_PARAMETER_REQUEST: {
-            hal_can_frame_t response;
-            if (!memory_protocol_respond(comms->store, comms->self_test, hal, &frame, &response) &&
-                !trace_protocol_respond(comms->trace, comms->control_parameters, &frame, &response)) {
-                parameter_protocol_respond(parameters, &frame, &response);
-            }
-            response.identifier += comms->telemetry.identifier_offset;
-            frame_queue_push(&comms->responses, &response);
-            break;
-        }
+        case COMMANDS_PARAMETER_REQUEST:
         case COMMANDS_PARAMETER_SET:
-            receive_set(comms, parameters, conditions, &frame);
+            receive_parameters(comms, hal, parameters, conditions, &frame);
             break;
         case COMMANDS_ACCEPTED:
         case COMMANDS_REJECTED:
@@ -121,5 +134,6 @@ bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, cons
 void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values) {
     comms->telemetry.background_in_mailbox &= comms->bus.status.transmitting;
     telemetry_cycle(&comms->telemetry, values);
+    comms->response_first = comms->telemetry.backlog;
     flush(comms, hal, values->status.time_us);
 }

@@ -44,6 +44,7 @@ typedef struct {
     commands_t commands;
     telemetry_t telemetry;
     frame_queue_t responses; /* to parameter requests and steps of a set */
+    bool response_first;     /* one may pass ahead of telemetry in this cycle */
     parameter_set_t set;     /* staged */
     command_t command;       /* last accepted command */
     nvm_store_t *store;      /* this and the next three are set by the caller after comms_init */
@@ -61,9 +62,9 @@ void comms_init(comms_t *comms, unsigned node, uint32_t time_us);
  * drive.
  *
  * A challenge is sent first, then telemetry; when none waits, other changes of DRIVE_ARMING, then parameter responses.
- * No response is ever dropped: while the queue of responses is full nothing is received. That state cannot block
- * commands, because PARAMETER_REQUEST loses arbitration to all frames of the drive but those of the group `background`:
- * responses leave before more requests arrive.
+ * When the bus does not take the telemetry of a cycle, one response passes ahead of it in each cycle. While the queue
+ * of responses is full a frame that needs one has no effect, is dropped and counted (telemetry.dropped): it must not
+ * hold up the commands behind it, and PARAMETER_SET_CONTROL wins arbitration over all that the drive sends.
  *
  * Of a frame that is neither command nor request, the identifier may be one of the drive's own (comms->bus). Frames of
  * the traffic of other nodes are ignored (comms/node.h).

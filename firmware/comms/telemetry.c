@@ -132,11 +132,19 @@ void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
     telemetry->cycle = (uint8_t)(telemetry->cycle + cycles);
 }
 
-void telemetry_flush(telemetry_t *telemetry, hal_t *hal, uint32_t time_us) {
-    if (telemetry->backlog && telemetry->background_in_mailbox &&
-        time_us - telemetry->background_us - TELEMETRY_PATIENCE_US < TELEMETRY_PAUSE_US) {
-        return;
+bool telemetry_pauses(telemetry_t *telemetry, uint32_t time_us) {
+    const uint32_t age_us = time_us - telemetry->background_us;
+    if (!telemetry->backlog || !telemetry->background_in_mailbox || age_us < TELEMETRY_PATIENCE_US) {
+        return false;
     }
+    const bool pauses = age_us < TELEMETRY_PATIENCE_US + TELEMETRY_PAUSE_US;
+    if (!pauses) { /* other nodes have filled the bus meanwhile */
+        telemetry->background_us = time_us;
+    }
+    return pauses;
+}
+
+void telemetry_flush(telemetry_t *telemetry, hal_t *hal, uint32_t time_us) {
     const hal_can_frame_t *frame;
     while ((frame = frame_queue_peek(&telemetry->queue)) != NULL && hal_can_transmit(hal, frame)) {
         if (frame->identifier >= BACKGROUND_IDENTIFIERS) {

@@ -18,7 +18,8 @@
  * back it keeps a mailbox, so there is never more than one: others are dropped and counted until it is known to have
  * left. A frame of `idle` is dropped, too, in a cycle that begins with frames of an earlier one in the queue. In such a
  * cycle the drive's own telemetry may be what holds the heartbeat back: TELEMETRY_PATIENCE_US after it has entered a
- * mailbox telemetry pauses for TELEMETRY_PAUSE_US, once.
+ * mailbox telemetry pauses for TELEMETRY_PAUSE_US. When other nodes fill the bus meanwhile, it pauses again after as
+ * long, until the heartbeat is known to have left.
  */
 #ifndef COMMS_TELEMETRY_H
 #define COMMS_TELEMETRY_H
@@ -45,7 +46,7 @@ typedef struct {
     bool background_queued;     /* a frame of `background` or `idle` is in the queue */
     bool background_in_mailbox; /* one may be in a mailbox; cleared by the caller when none is taken */
     bool backlog;               /* the present cycle began with frames of an earlier one in the queue */
-    uint32_t background_us;     /* when one entered a mailbox last */
+    uint32_t background_us;     /* when one entered a mailbox last, or the end of the last pause without success */
     uint16_t dropped;           /* frames, since start; saturates at 65535 */
     frame_queue_t queue;
 } telemetry_t;
@@ -66,7 +67,10 @@ static inline bool telemetry_due(const telemetry_t *telemetry, uint32_t time_us)
  * the groups of this cycle that precede the counters. [background] */
 void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values);
 
-/* Moves waiting frames to the mailboxes until all of them are occupied, unless it pauses. [background] */
+/* True while the mailboxes are to run empty, so that the heartbeat leaves. [background] */
+bool telemetry_pauses(telemetry_t *telemetry, uint32_t time_us);
+
+/* Moves waiting frames to the mailboxes until all of them are occupied. [background] */
 void telemetry_flush(telemetry_t *telemetry, hal_t *hal, uint32_t time_us);
 
 #endif

@@ -606,6 +606,31 @@ TEST_F(Drive, four_bad_commands_end_the_run_with_the_record_of_the_moment) {
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
 }
 
+TEST_F(Drive, a_valid_command_in_the_pass_of_the_fourth_bad_one_does_not_end_the_run_without_the_fault) {
+    for (const command_request_t request : {COMMAND_RUN, COMMAND_OFF}) {
+        SetUp();
+        periods(100);
+        command(COMMAND_RUN);
+        run(0.05);
+        const auto bad = frames::command(uint8_t(counter + 100), COMMAND_RUN, -600000);
+        for (int i = 0; i < 3; i++) {
+            hal.to_drive.push_back(bad);
+            periods(1);
+        }
+        const uint16_t accepted = drive.comms.commands.counters.accepted;
+        hal.to_drive.push_back(bad);
+        send(request);
+        periods(5);
+        EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+        EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_COMMAND_ERROR);
+        EXPECT_EQ(drive.comms.commands.counters.accepted, accepted + 1);
+        send(COMMAND_OFF);
+        periods(2);
+        EXPECT_EQ(drive.command.request, COMMAND_OFF) << "commands count again";
+        hal = {};
+    }
+}
+
 TEST_F(Drive, reports_that_it_is_not_armed_with_its_first_telemetry) {
     periods(100);
     const auto report = only_frame(DRIVE_ARMING_FRAME_ID, drive_arming_unpack);

@@ -511,6 +511,20 @@ TEST_F(Commands, four_bad_frames_in_succession_are_a_fault_and_three_are_none) {
     EXPECT_TRUE(commands.failed);
 }
 
+TEST_F(Commands, a_valid_command_behind_the_last_bad_one_is_only_counted_until_the_run_has_ended) {
+    arm(1, 10000);
+    for (int i = 0; i < 4; i++) {
+        take(command_frame(99), DRIVE_STATE_RUN, 11000);
+    }
+    ASSERT_TRUE(commands.failed);
+    const command_t before = command;
+    EXPECT_EQ(take(command_frame(2, COMMAND_OFF), DRIVE_STATE_RUN, 11000), COMMANDS_ACCEPTED);
+    EXPECT_EQ(std::memcmp(&before, &command, sizeof command), 0);
+    EXPECT_EQ(commands.counters.accepted, 2);
+    EXPECT_EQ(take(command_frame(3, COMMAND_OFF), DRIVE_STATE_FAULT, 12000), COMMANDS_COMMAND);
+    EXPECT_EQ(command.request, COMMAND_OFF);
+}
+
 TEST_F(Commands, duplicated_frames_are_dropped_and_counted_but_are_no_second_sender) {
     arm(0, 10000);
     uint32_t time_us = 10000;

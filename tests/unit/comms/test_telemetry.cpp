@@ -366,6 +366,18 @@ TEST_F(Comms, own_telemetry_that_the_bus_does_not_take_lets_the_heartbeat_pass) 
     EXPECT_GT(bus.count(DRIVE_STATUS_FRAME_ID), 800u);
 }
 
+TEST_F(Comms, the_heartbeat_survives_a_pause_of_telemetry_in_which_other_nodes_fill_the_bus) {
+    frame_us = 500;
+    run(12000);
+    ASSERT_TRUE(comms.telemetry.background_in_mailbox);
+    const uint32_t entered_us = comms.telemetry.background_us;
+    run(entered_us + TELEMETRY_PATIENCE_US);
+    ASSERT_EQ(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 0u);
+    run(entered_us + TELEMETRY_PATIENCE_US + TELEMETRY_PAUSE_US + 1000, 0);
+    run(2000500);
+    EXPECT_NEAR(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 20, 1);
+}
+
 TEST_F(Comms, periods_follow_the_parameters_from_the_last_frame_on) {
     parameters.values[PARAMETER_TELEMETRY_PERIOD_MS] = 4;
     run(20500);
@@ -518,14 +530,16 @@ TEST_F(Comms, one_call_processes_a_bounded_number_of_frames) {
     EXPECT_EQ(comms.commands.counters.unknown_frame, COMMS_FRAMES_PER_CALL);
 }
 
-TEST_F(Comms, no_parameter_response_is_lost_when_the_bus_is_blocked) {
+TEST_F(Comms, requests_without_room_for_a_response_are_dropped_and_counted_and_the_others_are_answered_in_order) {
     for (unsigned i = 0; i < 60; i++) {
         bus.received.push_back(request(DRIVE_PARAMETER_REQUEST_OPERATION_READ_CHOICE, i % PARAMETER_COUNT));
     }
-    run(20000, 0);
-    EXPECT_EQ(bus.received.size(), size_t(60 - FRAME_QUEUE_CAPACITY)) << "requests without room for an answer wait";
-    run(100000);
+    bus.received.push_back(command(1, COMMAND_STOP));
+    run(900, 0); // one cycle
     EXPECT_TRUE(bus.received.empty());
+    EXPECT_EQ(accepted.size(), 1u) << "a command waits for no response";
+    EXPECT_EQ(comms.telemetry.dropped, 60 - FRAME_QUEUE_CAPACITY);
+    run(100000);
     unsigned answered = 0;
     for (const auto &frame : bus.sent) {
         if (frame.identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID) {
@@ -533,7 +547,39 @@ TEST_F(Comms, no_parameter_response_is_lost_when_the_bus_is_blocked) {
             answered++;
         }
     }
-    EXPECT_EQ(answered, 60u);
+    EXPECT_EQ(answered, unsigned(FRAME_QUEUE_CAPACITY));
+}
+
+TEST_F(Comms, steps_of_a_set_do_not_make_the_drive_deaf_while_its_telemetry_is_more_than_the_bus_takes) {
+    frame_us = 500;
+    run(20000);
+    for (unsigned i = 0; i < 40; i++) {
+        bus.received.push_back(frames::parameter_set_control(uint8_t(i), PARAMETER_SET_STEP_ABANDON));
+    }
+    bus.received.push_back(command(1, COMMAND_OFF));
+    run(21000);
+    EXPECT_EQ(accepted.size(), 1u);
+    EXPECT_TRUE(bus.received.empty());
+    run(225000);
+    EXPECT_NEAR(bus.count(DRIVE_PARAMETER_RESPONSE_FRAME_ID), FRAME_QUEUE_CAPACITY + 1, 1)
+        << "the last ones in the pause for a heartbeat";
+}
+
+TEST_F(Comms, steps_of_a_set_that_keep_coming_starve_neither_commands_nor_telemetry_nor_the_heartbeat) {
+    frame_us = 500;
+    for (uint32_t ms = 0; ms < 2000; ms++) {
+        bus.received.push_back(frames::parameter_set_control(uint8_t(ms), PARAMETER_SET_STEP_ABANDON));
+        bus.received.push_back(frames::parameter_set_control(uint8_t(ms), PARAMETER_SET_STEP_ABANDON));
+        if (ms % 10 == 0) {
+            bus.received.push_back(command(uint8_t(ms / 10), COMMAND_OFF));
+        }
+        run((ms + 1) * 1000);
+    }
+    EXPECT_EQ(accepted.size(), 200u);
+    EXPECT_NEAR(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 20, 1);
+    EXPECT_GT(bus.count(DRIVE_STATUS_FRAME_ID), 400u);
+    EXPECT_GT(bus.count(DRIVE_PARAMETER_RESPONSE_FRAME_ID), 1000u);
+    EXPECT_LE(bus.count(DRIVE_PARAMETER_RESPONSE_FRAME_ID), 2000u) << "one in each cycle";
 }
 
 TEST_F(Comms, parameters_can_be_written_over_the_bus) {
