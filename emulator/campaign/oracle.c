@@ -273,6 +273,10 @@ void oracle_look(oracle_t *oracle, const plant_t *plant) {
     if (sto_demanded(oracle, time_us)) {
         oracle_violate(oracle, "gate_on", plant->time_ns, 2, 0.0);
     }
+    if (oracle->unacknowledged && !oracle_state_changed(oracle) && !impersonated(oracle) &&
+        !oracle_other_sender(oracle, true, time_us)) {
+        oracle_violate(oracle, "no_command", plant->time_ns, 8, (double)(plant->time_ns - oracle->reset_ns) * 1e-6);
+    }
     const uint64_t longer = oracle->injected[FAULT_PERIOD_REGISTER_FLIPPED] ? 4 : 1; /* times the period, at most */
     if (plant->time_ns > oracle->interrupt_ns + longer * oracle->period_ns * 5 / 2) {
         oracle_violate(oracle, "gate_on", plant->time_ns, 3, (double)(plant->time_ns - oracle->interrupt_ns) * 1e-3);
@@ -424,7 +428,20 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     }
 }
 
+/* By the bench, not by the watchdog. */
+static bool reset_by_bench(const oracle_t *oracle, uint64_t now_us) {
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, now_us);
+        if (event != NULL && event->kind == WORLD_SET && event->what == BENCH_VARIABLE_DRIVE_RESET &&
+            now_us < event->begin_us + 1000) {
+            return true;
+        }
+    }
+    return false;
+}
+
 void oracle_reset(oracle_t *oracle, uint64_t time_ns, oracle_drive_t drive) {
+    oracle->unacknowledged = !reset_by_bench(oracle, time_ns / 1000);
     oracle->drive = drive;
     oracle->state_ns = oracle->reset_ns = time_ns;
     oracle->clear_ns = 0; /* a request that goes on begins anew, when the drive listens again */
@@ -453,6 +470,7 @@ void oracle_on_bus(oracle_t *oracle, const plant_t *plant, uint64_t time_ns, con
         oracle->off_ns = time_ns;
     }
     oracle->clear_seen = oracle->clear_seen || meaning->request == SENDER_CLEAR;
+    oracle->unacknowledged = oracle->unacknowledged && meaning->request != SENDER_CLEAR;
     if (meaning->request == SENDER_CLEAR &&
         (oracle->meant.request != SENDER_CLEAR || oracle->drive.state == STATE_RUN)) {
         oracle->clear_ns = time_ns; /* in a run it is refused, and so begins after it */

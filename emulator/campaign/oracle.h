@@ -12,7 +12,8 @@
  *                   or the state run, 502 ms after the last genuine request to run; torque 170 ms after it, or
  *                   from 65 ms on a larger one than before, by half and a fifth of the largest; both later
  *                   by the 18 ms for which the request waits when the background hangs and the watchdog does not reset
- *                   the drive; a fault that ends without a genuine request to clear it
+ *                   the drive; a fault that ends without a genuine request to clear it; a gate on after a reset by
+ *                   the watchdog without one
  *   stopped         state run left, without a fault, less than 30 ms after a genuine request to run; or after one to
  *                   stop while the rotor turns
  *   not_stopped     four quadrants, no fault: still turning 100 ms after the time that half of the torque limit needs
@@ -35,39 +36,34 @@
  *                   processor healthy
  *   wrong_torque    no fault, torque mode, below half of the base speed: the mean torque of electrical periods off the
  *                   commanded one by more than 10 %, without torque sharing 25 %, and 2 % of the rated one
- *   overshoot       no fault, the speed above a reference that it has approached from below by more than 12 % and 5 %
- *                   of the base speed; one quadrant: and what a light rotor gains
- *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
- *                   and memory undisturbed
+ *   not_following   no fault, a speed commanded and a load that has been constant for long: the mean speed over 50 ms
+ * and a revolution off by more than 1 %, with one quadrant below by 2 %, 0.2 % of the base speed and a count wrong_way
+ * one quadrant: for 50 ms a torque forwards, at a speed, while a speed backwards is commanded above_limit     the mean
+ * torque of electrical periods of 20 ms above the limit in telemetry, by 15 % and 5 % of the rated one, without torque
+ * sharing 30 % and 10 % overshoot       no fault, the speed above a reference that it has approached from below by more
+ * than 12 % and 5 % of the base speed; one quadrant: and what a light rotor gains wrong_status    a state or a first
+ * cause on the bus that is not the drive's, which has had its state for 30 ms, bus and memory undisturbed
  *   wrong_telemetry a measured current or voltage on the bus that the drive has not measured in the last 4 ms, a speed
  *                   off the true one by 10 %, 5 % of the base speed and half a count in a millisecond; in the snapshot
- *                   of a fault those of its instant
- *   not_derated     a torque limit in telemetry above what loads and temperatures beside it leave, by 12 % of the
- *                   largest torque
- *   applied         a set of parameters with a wrong check was applied
- *   wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
- *   not_first       a first cause that is not the first one, by its number, of the checks that failed in its tick
- *   false_alarm     a fault of the drive without any other, which is not true of the plant, or the drive's own work:
- *                   too large a current, and without a load that drives the machine too high a speed or voltage; beside
- *                   faults that do not explain it, it is a wrong_cause
- *   undetected      in state run for longer than a reaction takes with a fault that shows at any time: changed memory,
- *                   sensors at a rail, a wrong clock, a background that hangs (oracle_detection.c)
- *   no_current      voltage on a phase for twenty times its largest flux linkage, in pulses of more than three
- *                   periods, and no current at all
- *   two_lost        in state run for 300 ms at less than half of the commanded speed, with two phases lost
- *   blocked         a speed commanded, and the rotor within a quarter of a stroke for 300 ms and three strokes, or
- *                   within a stroke for 500 ms and six: a swing that grows is no standstill
- *   misled          for 200 ms, above a fifth of the base speed and a tenth of the trip current, a measured angle off
- *                   by more than a sixth of a rotor pitch
- *   contested       for 150 ms in state run while another client sends commands
- *   not_reset       no control interrupt for 60 ms, and no reset
- *   mute            no status on an undisturbed bus for 100 ms
- * eventually
- *   not_recovered   faults over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of the
- *                   speed 100 ms after the time that half of the torque limit needs, or again in a fault, or with a
- *                   phase that is not used; judged up to 0.9 of the base speed, above which a start is near the limit
- *                   of the speed. One quadrant: at most 20 % above, of a light rotor what it gains while a delay and
- *                   the flux linkage last
+ *                   of a fault those of its instant; no fault: a mean torque of 100 ms off the true one by 30 % and 15
+ * % of the rated one not_derated     a torque limit in telemetry above what loads and temperatures beside it leave, by
+ * 12 % of the largest torque applied         a set of parameters with a wrong check was applied wrong_cause     a first
+ * cause that neither is true of the plant nor belongs to a fault that was there not_first       a first cause that is
+ * not the first one, by its number, of the checks that failed in its tick false_alarm     a fault of the drive without
+ * any other, which is not true of the plant, or the drive's own work: too large a current, and without a load that
+ * drives the machine too high a speed or voltage; beside faults that do not explain it, it is a wrong_cause undetected
+ * in state run for longer than a reaction takes with a fault that shows at any time: changed memory, sensors at a rail,
+ * a wrong clock, a background that hangs (oracle_detection.c) no_current      voltage on a phase for twenty times its
+ * largest flux linkage, in pulses of more than three periods, and no current at all two_lost        in state run for
+ * 300 ms at less than half of the commanded speed, with two phases lost blocked         a speed commanded, and the
+ * rotor within a quarter of a stroke for 300 ms and three strokes, or within a stroke for 500 ms and six: a swing that
+ * grows is no standstill misled          for 200 ms, above a fifth of the base speed and a tenth of the trip current, a
+ * measured angle off by more than a sixth of a rotor pitch contested       for 150 ms in state run while another client
+ * sends commands not_reset       no control interrupt for 60 ms, and no reset mute            no status on an
+ * undisturbed bus for 100 ms eventually not_recovered   faults over, cleared, armed and commanded: not in run after 150
+ * ms, or not within 0.5 % of the speed 100 ms after the time that half of the torque limit needs, or again in a fault,
+ * or with a phase that is not used; judged up to 0.9 of the base speed, above which a start is near the limit of the
+ * speed. One quadrant: at most 20 % above, of a light rotor what it gains while a delay and the flux linkage last
  * sometimes
  *   cells           (fault, state of the drive, sector of phase a) in which a fault began */
 #ifndef CAMPAIGN_ORACLE_H
@@ -137,6 +133,18 @@ typedef struct {
     double begin_angle_rad, sum_Nm;
 } oracle_torque_t;
 
+/* Speed over 50 ms and a revolution. */
+typedef struct {
+    uint64_t begin_ns; /* 0: begins with the next sample */
+    double begin_angle_rad;
+} oracle_speed_t;
+
+/* Torque in telemetry and the true one, over at least two electrical periods. */
+typedef struct {
+    unsigned frames, samples;
+    double estimate_sum_Nm, true_sum_Nm, begin_angle_rad;
+} oracle_torque_telemetry_t;
+
 /* Least and largest value in the present and in the previous window of time. */
 typedef struct {
     double low[2], high[2];
@@ -149,6 +157,10 @@ typedef struct {
     oracle_range_t speed_rad_s;                                  /* true */
     double fault_speed_rad_s, fault_link_voltage, fault_current; /* when the last fault was latched */
     bool ran;                                                    /* for long when it was */
+    double angle_rad;                                            /* of the rotor */
+    oracle_torque_telemetry_t torque;
+    uint64_t limit_window_ns, limit_ns; /* the present window began, the last limit of the torque came */
+    oracle_range_t limit_Nm;
 } oracle_telemetry_t;
 
 typedef struct {
@@ -175,7 +187,8 @@ typedef struct {
     uint64_t state_ns; /* since when the drive has its state */
     uint64_t interrupt_ns;
     bool confirmed, commanded, off_seen, clear_seen;
-    bool succeeded; /* the first sender by the second one, whose counter is in sequence by chance */
+    bool unacknowledged; /* a reset by the watchdog, without a genuine request to clear since */
+    bool succeeded;      /* the first sender by the second one, whose counter is in sequence by chance */
     uint64_t run_ns, off_ns, speed_ns, voltage_ns, low_ns;
     uint64_t clear_ns, latched_ns;   /* a request to clear began, the last fault */
     uint32_t latched_angle;          /* measured then */
@@ -189,7 +202,9 @@ typedef struct {
     double begin_speed_rad_s;        /* then */
     double stop_speed_rad_s;         /* when the stop began */
     oracle_detection_t detection;
-    oracle_torque_t torque;
+    oracle_torque_t torque, any_torque; /* in torque mode; in any, over 20 ms */
+    oracle_speed_t speed;
+    uint64_t forwards_ns; /* since then a torque forwards against a reference backwards */
     oracle_telemetry_t telemetry;
     unsigned over_current_looks;
     double speed_recent_rad_s, voltage_recent_high_V, voltage_recent_low_V, current_recent_A;

@@ -105,6 +105,7 @@ static void look_at_lost_phases(oracle_t *oracle, const plant_t *plant) {
     const double reference_rad_s = fabs(oracle->meant.reference) / ORACLE_RPM_PER_RAD_S;
     const bool drives =
         heard && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN && !oracle->meant.torque &&
+        oracle_can_turn(oracle) &&
         reference_rad_s * ORACLE_RPM_PER_RAD_S > MISLED_SPEED * oracle->world->machine->speed_base_rpm &&
         fabs(plant->speed_rad_s) < 0.5 * reference_rad_s;
     oracle_since(&oracle->detection.lost_ns, drives && lost_phases(oracle, plant->time_ns / 1000) > 1, plant->time_ns);
@@ -114,7 +115,8 @@ static void look_at_lost_phases(oracle_t *oracle, const plant_t *plant) {
     }
 }
 
-/* Commands of a client that is not the one which has armed the drive, or that are forged. */
+/* Commands of a client that is not the one which has armed the drive, or that are forged; or frames that are the
+ * drive's. */
 static void look_at_senders(oracle_t *oracle, uint64_t now_ns) {
     if (oracle_variable_begun(oracle, BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER, now_ns / 1000) ||
         oracle_variable_begun(oracle, BENCH_VARIABLE_FRAME_FAULT, now_ns / 1000) ||
@@ -123,8 +125,9 @@ static void look_at_senders(oracle_t *oracle, uint64_t now_ns) {
     }
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = &oracle->world->event[i];
-        const bool foreign =
-            event->kind == WORLD_SECOND || (event->kind == WORLD_HOSTILE && event->what == WORLD_HOSTILE_FORGED);
+        const bool foreign = event->kind == WORLD_SECOND ||
+                             (event->kind == WORLD_HOSTILE &&
+                              (event->what == WORLD_HOSTILE_FORGED || event->what == WORLD_HOSTILE_IDENTITY));
         if (!foreign || !world_active(oracle->world, i, now_ns / 1000)) {
             continue;
         }
@@ -201,7 +204,7 @@ static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
     }
     const bool heard = plant->time_ns < oracle->run_ns + HEARD_NS && !oracle_bus_disturbed(oracle);
     const bool pushes = heard && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
-                        !oracle->meant.torque &&
+                        !oracle->meant.torque && oracle_can_turn(oracle) &&
                         fabs(oracle->meant.reference) > BLOCKED_SPEED * oracle->world->machine->speed_base_rpm;
     const uint64_t held_ns = stays_ns(oracle, &detection->held, plant, pushes, 0.25 * stroke_rad);
     const uint64_t swinging_ns = stays_ns(oracle, &detection->swinging, plant, pushes, stroke_rad);

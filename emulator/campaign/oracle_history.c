@@ -71,3 +71,7 @@ bool oracle_drive_disturbed(const oracle_t *oracle, uint64_t time_us) {
            oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) ||
            oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_us);
 }
+
+bool oracle_can_turn(const oracle_t *oracle) {
+    return oracle->world->controller == 2 || oracle->meant.reference > 0.0;
+}

@@ -3,6 +3,7 @@
 
 #include <math.h>
 
+#include "bench_variables.h"
 #include "fault_kinds.h"
 
 #define TORQUE_SETTLED_NS (50 * ORACLE_MS_NS) /* after another command */
@@ -17,6 +18,17 @@
 #define STOP_ERROR_MAX_BASE 0.05
 #define STOP_ERROR_MAX_RAD_S 2.0
 #define STOP_SETTLED_S 0.1
+#define FOLLOWING_SETTLED_S 0.3 /* after the time that half of the torque limit needs */
+#define FOLLOWING_MIN_S 0.05
+#define FOLLOWING_SPEED 0.9 /* of the base speed, at most */
+#define FOLLOWING_LIMIT 0.8 /* of the largest torque, at least */
+#define LOAD_SETTLED_US 500000
+#define COARSE_BITS 12
+#define COARSE_SPEED 0.05 /* of the base speed */
+#define WRONG_WAY_SPEED 0.05
+#define WRONG_WAY_TORQUE 0.1 /* of the rated one */
+#define LIMIT_MIN_NS (20 * ORACLE_MS_NS)
+#define LIMIT_AGE_MAX_NS (50 * ORACLE_MS_NS)
 
 static bool undisturbed(const oracle_t *oracle) {
     return !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) && !oracle_bus_disturbed(oracle);
@@ -69,7 +81,8 @@ static void look_at_overshoot(oracle_t *oracle, const plant_t *plant) {
     const bool from_below = oracle->begin_speed_rad_s * reference_rad_s < reference_rad_s * reference_rad_s;
     const bool recovers = oracle->world->recovery_us && plant->time_ns >= oracle->world->recovery_us * 1000;
     if (oracle->drive.state != STATE_RUN || oracle->meant.request != SENDER_RUN || oracle->meant.torque ||
-        !from_below || recovers || !undisturbed(oracle) || oracle_overhauled(oracle, plant->speed_rad_s)) {
+        !oracle_can_turn(oracle) || !from_below || recovers || !undisturbed(oracle) ||
+        oracle_overhauled(oracle, plant->speed_rad_s)) {
         return;
     }
     const double base_rad_s = machine->speed_base_rpm / ORACLE_RPM_PER_RAD_S;
@@ -95,7 +108,125 @@ static void look_at_stop(oracle_t *oracle, const plant_t *plant) {
     }
 }
 
+/* No sine, and no step or ramp a short time ago. */
+static bool load_is_constant(const oracle_t *oracle, uint64_t now_us) {
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, now_us);
+        if (event == NULL || event->kind != WORLD_SET) {
+            continue;
+        }
+        const bool moves = event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_NM ||
+                           event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM;
+        const bool steps =
+            event->what == BENCH_VARIABLE_LOAD_TORQUE_NM || event->what == BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM;
+        const uint64_t last_us = event->end_us != 0 && event->end_us <= now_us ? event->end_us : event->begin_us;
+        if (moves || (steps && now_us < last_us + LOAD_SETTLED_US)) {
+            return false;
+        }
+    }
+    return true;
+}
+
+/* A constant speed that nothing keeps the drive from. */
+static bool speed_follows(const oracle_t *oracle, const plant_t *plant) {
+    const world_machine_t *machine = oracle->world->machine;
+    const double reference_rpm = fabs(oracle->meant.reference), base_rpm = machine->speed_base_rpm;
+    const double change_rad_s = reference_rpm / ORACLE_RPM_PER_RAD_S + fabs(oracle->begin_speed_rad_s);
+    const double needed_s =
+        plant->machine->inertia_kg_m2 * oracle->world->inertia_gain * change_rad_s / (0.5 * machine->torque_max_Nm);
+    const uint64_t since_ns = oracle->constant_ns > oracle->state_ns ? oracle->constant_ns : oracle->state_ns;
+    const bool coarse = oracle->world->encoder_bits < COARSE_BITS && reference_rpm < COARSE_SPEED * base_rpm;
+    const bool derated =
+        oracle->telemetry.limit_ns != 0 && oracle->telemetry.limit_Nm.low[0] < FOLLOWING_LIMIT * machine->torque_max_Nm;
+    return oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN && !oracle->meant.torque &&
+           oracle_can_turn(oracle) && undisturbed(oracle) && !coarse && !derated &&
+           plant->time_ns < oracle->run_ns + TORQUE_SETTLED_NS &&
+           plant->time_ns > since_ns + (uint64_t)((FOLLOWING_SETTLED_S + needed_s) * 1e9) &&
+           reference_rpm <= FOLLOWING_SPEED * base_rpm && !oracle_overhauled(oracle, plant->speed_rad_s) &&
+           load_is_constant(oracle, plant->time_ns / 1000);
+}
+
+static void look_at_speed(oracle_t *oracle, const plant_t *plant) {
+    oracle_speed_t *speed = &oracle->speed;
+    if (!speed_follows(oracle, plant)) {
+        speed->begin_ns = 0;
+        return;
+    }
+    if (speed->begin_ns == 0) {
+        *speed = (oracle_speed_t){plant->time_ns, plant->rotor_angle_rad};
+    }
+    const double time_s = (double)(plant->time_ns - speed->begin_ns) * 1e-9;
+    const double turned_rad = plant->rotor_angle_rad - speed->begin_angle_rad;
+    const double reference_rad_s = oracle->meant.reference / ORACLE_RPM_PER_RAD_S;
+    if (time_s < FOLLOWING_MIN_S || time_s * fabs(reference_rad_s) < ORACLE_TWO_PI) {
+        return;
+    }
+    const bool quadrants = oracle->world->controller == 2;
+    const double base_rad_s = oracle->world->machine->speed_base_rpm / ORACLE_RPM_PER_RAD_S;
+    const double count_rad_s = ldexp(ORACLE_TWO_PI, -(int)oracle->world->encoder_bits) / time_s;
+    const double most_rad_s = (quadrants ? 0.01 : 0.02) * fabs(reference_rad_s) + 0.002 * base_rad_s + count_rad_s;
+    const double error_rad_s = turned_rad / time_s - reference_rad_s;
+    if (quadrants ? fabs(error_rad_s) > most_rad_s : error_rad_s < -most_rad_s) {
+        oracle_violate(oracle, "not_following", plant->time_ns, oracle->world->controller,
+                       turned_rad / time_s / reference_rad_s);
+    }
+    speed->begin_ns = 0;
+}
+
+/* A drive of one quadrant does not drive forwards because a speed backwards is commanded. */
+static void look_at_direction(oracle_t *oracle, const plant_t *plant) {
+    const world_machine_t *machine = oracle->world->machine;
+    const bool forwards = plant->speed_rad_s * ORACLE_RPM_PER_RAD_S > WRONG_WAY_SPEED * machine->speed_base_rpm &&
+                          plant_torque_Nm(plant) > WRONG_WAY_TORQUE * machine->torque_rated_Nm;
+    oracle_since(&oracle->forwards_ns,
+                 forwards && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
+                     !oracle->meant.torque && !oracle_can_turn(oracle) && undisturbed(oracle) &&
+                     plant->time_ns > oracle->constant_ns + TORQUE_SETTLED_NS,
+                 plant->time_ns);
+    if (oracle->forwards_ns != 0 && plant->time_ns > oracle->forwards_ns + TORQUE_SETTLED_NS) {
+        oracle_violate(oracle, "wrong_way", plant->time_ns, oracle->world->controller, plant_torque_Nm(plant));
+    }
+}
+
+/* Measured by healthy sensors, with a healthy memory. */
+static bool torque_is_known(const oracle_t *oracle) {
+    return !oracle_any_injected(oracle, FAULT_WINDING_OPEN, FAULT_ENCODER_NO_ANSWER) &&
+           !oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) &&
+           !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) && !oracle_bus_disturbed(oracle);
+}
+
+/* The torque keeps to the limit that telemetry announces. */
+static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
+    oracle_torque_t *torque = &oracle->any_torque;
+    const oracle_telemetry_t *telemetry = &oracle->telemetry;
+    if (oracle->drive.state != STATE_RUN || !torque_is_known(oracle) || telemetry->limit_ns == 0 ||
+        plant->time_ns > telemetry->limit_ns + LIMIT_AGE_MAX_NS ||
+        plant->time_ns < oracle->reset_ns + LIMIT_AGE_MAX_NS) {
+        torque->samples = 0;
+        return;
+    }
+    if (torque->samples == 0) {
+        *torque = (oracle_torque_t){.begin_ns = plant->time_ns, .begin_angle_rad = plant->rotor_angle_rad};
+    }
+    torque->sum_Nm += plant_torque_Nm(plant);
+    torque->samples++;
+    const double turned_rad = fabs(plant->rotor_angle_rad - torque->begin_angle_rad);
+    if (turned_rad < ORACLE_TWO_PI / plant->machine->rotor_poles || plant->time_ns < torque->begin_ns + LIMIT_MIN_NS) {
+        return;
+    }
+    const bool shares = oracle->world->controller == 2;
+    const double limit_Nm = fmax(telemetry->limit_Nm.high[0], telemetry->limit_Nm.high[1]);
+    const double mean_Nm = fabs(torque->sum_Nm / torque->samples);
+    if (mean_Nm > (shares ? 1.15 : 1.3) * limit_Nm + (shares ? 0.05 : 0.1) * oracle->world->machine->torque_rated_Nm) {
+        oracle_violate(oracle, "above_limit", plant->time_ns, oracle->world->controller, mean_Nm / limit_Nm);
+    }
+    torque->samples = 0;
+}
+
 void oracle_look_at_motion(oracle_t *oracle, const plant_t *plant) {
+    look_at_speed(oracle, plant);
+    look_at_direction(oracle, plant);
+    look_at_torque_limit(oracle, plant);
     look_at_torque(oracle, plant);
     look_at_overshoot(oracle, plant);
     look_at_stop(oracle, plant);

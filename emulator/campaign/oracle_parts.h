@@ -64,6 +64,9 @@ bool oracle_bus_disturbed(const oracle_t *oracle);
 /* A load drives the machine in the direction of a speed at any time. */
 bool oracle_overhauled(const oracle_t *oracle, double speed);
 
+/* The commanded speed is one that the drive turns at. */
+bool oracle_can_turn(const oracle_t *oracle);
+
 /* The state of the drive, or what it takes for it, was changed from outside. */
 bool oracle_state_changed(const oracle_t *oracle);
 

@@ -19,6 +19,14 @@
 #define WINDING_LIMIT_C 155.0
 #define INVERTER_LIMIT_C 100.0
 #define DERATING_ERROR_MAX 0.12
+#define LIMIT_WINDOW_NS (50 * ORACLE_MS_NS)
+
+/* Means of the torque in frames, which meet its ripple anywhere. */
+#define TORQUE_FRAMES 25
+#define TORQUE_PERIODS 2.0
+#define TORQUE_SPEED 0.5 /* of the base speed, at most */
+#define TORQUE_ERROR_MAX 0.3
+#define TORQUE_ERROR_MAX_RATED 0.15
 
 /* Of drive.dbc. */
 enum { OPERATION_SET_CONTROL = 12, STATUS_DONE = 0, STEP_APPLY = 2 };
@@ -37,6 +45,23 @@ static bool is_within(const oracle_range_t *range, double value, double error) {
     return value >= fmin(range->low[0], range->low[1]) - error && value <= fmax(range->high[0], range->high[1]) + error;
 }
 
+/* Only in a run that nothing disturbs. */
+static void follow_torque(oracle_t *oracle, const plant_t *plant) {
+    oracle_torque_telemetry_t *torque = &oracle->telemetry.torque;
+    oracle->telemetry.angle_rad = plant->rotor_angle_rad;
+    const bool known =
+        oracle->drive.state == STATE_RUN && plant->time_ns > oracle->state_ns + SETTLED_NS &&
+        !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) && !oracle_bus_disturbed(oracle) &&
+        fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S < TORQUE_SPEED * oracle->world->machine->speed_base_rpm;
+    if (!known || torque->frames == 0) {
+        *torque = (oracle_torque_telemetry_t){.begin_angle_rad = plant->rotor_angle_rad};
+    }
+    if (known) {
+        torque->true_sum_Nm += plant_torque_Nm(plant);
+        torque->samples++;
+    }
+}
+
 void oracle_remember_measurement(oracle_t *oracle, const plant_t *plant) {
     oracle_telemetry_t *telemetry = &oracle->telemetry;
     const bool renew = plant->time_ns >= telemetry->window_ns + WINDOW_NS;
@@ -46,6 +71,7 @@ void oracle_remember_measurement(oracle_t *oracle, const plant_t *plant) {
     }
     widen(&telemetry->link_voltage, oracle->drive.link_voltage, renew);
     widen(&telemetry->speed_rad_s, plant->speed_rad_s, renew);
+    follow_torque(oracle, plant);
 }
 
 void oracle_remember_fault(oracle_t *oracle, const plant_t *plant) {
@@ -110,6 +136,11 @@ static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data
     const double room = fmin(fmin((100.0 - load_percent) / 10.0, (WINDING_LIMIT_C - data[6]) / 20.0),
                              (INVERTER_LIMIT_C - data[7]) / 20.0);
     const double limit_Nm = signed_16(data + 4) * 256.0 * oracle->world->machine->command_lsb_Nm;
+    oracle_telemetry_t *telemetry = &oracle->telemetry;
+    const bool renew = time_ns >= telemetry->limit_window_ns + LIMIT_WINDOW_NS;
+    telemetry->limit_window_ns = renew ? time_ns : telemetry->limit_window_ns;
+    telemetry->limit_ns = time_ns;
+    widen(&telemetry->limit_Nm, limit_Nm, renew);
     if (limit_Nm > most_Nm * (fmin(fmax(room, 0.0), 1.0) + DERATING_ERROR_MAX) &&
         !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
         oracle_violate(oracle, "not_derated", time_ns, 0, limit_Nm / most_Nm);
@@ -125,6 +156,24 @@ static void judge_set(oracle_t *oracle, uint64_t time_ns, const uint8_t data[8])
             oracle_violate(oracle, "applied", time_ns, 0, 0.0);
         }
     }
+}
+
+/* A frame of the torque; and each interrupt the true one. */
+static void judge_torque(oracle_t *oracle, uint64_t time_ns, double estimate_Nm) {
+    oracle_torque_telemetry_t *torque = &oracle->telemetry.torque;
+    torque->estimate_sum_Nm += estimate_Nm;
+    torque->frames++;
+    const double turned_rad = fabs(oracle->telemetry.angle_rad - torque->begin_angle_rad);
+    const double pitch_rad = ORACLE_TWO_PI / oracle->world->machine->image.machine.rotor_poles;
+    if (torque->frames < TORQUE_FRAMES || torque->samples == 0 || turned_rad < TORQUE_PERIODS * pitch_rad) {
+        return;
+    }
+    const double mean_Nm = torque->estimate_sum_Nm / torque->frames, true_Nm = torque->true_sum_Nm / torque->samples;
+    judge(oracle,
+          fabs(mean_Nm - true_Nm) <=
+              TORQUE_ERROR_MAX * fabs(true_Nm) + TORQUE_ERROR_MAX_RATED * oracle->world->machine->torque_rated_Nm,
+          time_ns, 10, mean_Nm / true_Nm);
+    torque->frames = 0;
 }
 
 void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier, const uint8_t data[8]) {
@@ -151,6 +200,7 @@ void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier
     case DRIVE_TORQUE_FRAME_ID: {
         const double link = unsigned_16(data + 6) * machine->voltage_lsb_V / ranges->dc_link_V;
         judge(oracle, is_within(&telemetry->link_voltage, link, ERROR_MAX), time_ns, 8, link);
+        judge_torque(oracle, time_ns, signed_16(data + 2) * 256.0 * machine->command_lsb_Nm);
         break;
     }
     case DRIVE_MOTION_FRAME_ID: {

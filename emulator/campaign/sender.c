@@ -289,8 +289,9 @@ static void step_honest(sender_t *sender, const transport_receiver_t *receiver) 
         const int32_t reference = beyond   ? reference_beyond(world, beyond->value)
                                   : torque ? (int32_t)floor(torque->value / world->machine->command_lsb_Nm + 0.5)
                                            : sender->reference;
+        const bool refers = request == SENDER_RUN || (world->keeps_reference && request != SENDER_CLEAR);
         put_command(sender, receiver, HONEST, sender->counter++, torque != NULL && beyond == NULL, request,
-                    request == SENDER_RUN ? reference : 0);
+                    refers ? reference : 0);
     }
     if (request != SENDER_RUN || has(sender, WORLD_UNARMED) || sender->armed || sender->state == STATE_FAULT ||
         sender->state == STATE_INITIALISE) {

@@ -44,7 +44,9 @@ enum {
 #define BEYOND_SHARE 0.04      /* a speed beyond the largest one is commanded for some time */
 #define CLEARING_SHARE 0.03    /* the client sends nothing but clear_fault until all is over */
 #define SECOND_LOSS_SHARE 0.4  /* of the worlds with one lost phase */
-#define REVERSE_SHARE 0.4      /* of the speeds, with a controller of four quadrants */
+#define REVERSE_SHARE 0.4      /* of the speeds, with a controller of four quadrants, */
+#define REFUSED_SHARE 0.05     /* and of one, which does not turn then */
+#define KEEPING_SHARE 0.5      /* the reference stays in the frames of stop and off */
 
 /* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
  * not. */
@@ -148,7 +150,8 @@ static double load_max_Nm(const world_t *world, double rpm) {
 
 static double draw_speed_rpm(const world_t *world, unsigned index) {
     const double rpm = world->machine->speed_base_rpm * logarithmic(world->seed, STREAM_SPEED, index, 0.02, 1.0);
-    const bool reverse = world->controller == 2 && seeded_unit(world->seed, STREAM_SPEED, 50 + index) < REVERSE_SHARE;
+    const double share = world->controller == 2 ? REVERSE_SHARE : REFUSED_SHARE;
+    const bool reverse = seeded_unit(world->seed, STREAM_SPEED, 50 + index) < share;
     return reverse ? -rpm : rpm;
 }
 
@@ -156,7 +159,8 @@ static double draw_speed_rpm(const world_t *world, unsigned index) {
 static void draw_load(world_t *world, double rpm, uint64_t begin_us) {
     const uint64_t seed = world->seed;
     const bool overhauling = !world->healthy && seeded_unit(seed, STREAM_LOAD, 4) < OVERHAULING_SHARE;
-    const double sign = (rpm < 0.0) != overhauling ? -1.0 : 1.0;
+    const bool backwards = rpm < 0.0 && world->controller == 2;
+    const double sign = backwards != overhauling ? -1.0 : 1.0;
     const double torque_Nm = load_max_Nm(world, rpm) * seeded_unit(seed, STREAM_LOAD, 1);
     const bool coarse = world->machine->torque_max_Nm > 150.0;
     const unsigned step = coarse ? BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM : BENCH_VARIABLE_LOAD_TORQUE_NM;
@@ -461,6 +465,7 @@ static void draw_faults(world_t *world, uint64_t last_us) {
 
 void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
     draw_board(world, machines, count, seed);
+    world->keeps_reference = seeded_unit(seed, STREAM_REQUEST, 17) < KEEPING_SHARE;
     draw_imperfections(world);
     const double first_rpm = draw_speed_rpm(world, 0);
     uint64_t last_us = (uint64_t)(1e6 * fmin(0.1 + 1.5 * start_s(world, 0.0, first_rpm),
@@ -535,10 +540,10 @@ void world_print(const world_t *world) {
     static const char *const controllers[] = {"traditional", "paper", "salient"};
     printf("{\"seed\": %" PRIu64 ", \"machine\": \"%s\", \"controller\": \"%s\", \"control_rate_hz\": %u, "
            "\"encoder_bits\": %u, \"adc_bits\": %u, \"encoder_edges\": %s, \"initial_angle_deg\": %.17g, "
-           "\"duration_us\": %" PRIu64 ", \"recovery_us\": %" PRIu64 ", \"events\": [",
+           "\"keeps_reference\": %s, \"duration_us\": %" PRIu64 ", \"recovery_us\": %" PRIu64 ", \"events\": [",
            world->seed, world->machine->name, controllers[world->controller], world->control_rate_hz,
            world->encoder_bits, world->adc_bits, world->encoder_edges ? "true" : "false", world->initial_angle_deg,
-           world->duration_us, world->recovery_us);
+           world->keeps_reference ? "true" : "false", world->duration_us, world->recovery_us);
     const char *separator = "";
     for (unsigned i = 0; i < world->events; i++) {
         const world_event_t *event = world_begun(world, i, UINT64_MAX);

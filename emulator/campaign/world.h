@@ -75,6 +75,7 @@ typedef struct {
     uint64_t duration_us;
     uint64_t recovery_us; /* all faults are over: the client clears, arms and commands a speed; 0: never */
     double supply_V, inertia_gain;
+    bool keeps_reference; /* the client's stop and off have the reference of its run */
     unsigned events;
     world_event_t event[WORLD_EVENTS_MAX];
     uint64_t kept; /* bit n: event n happens */
