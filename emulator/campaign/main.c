@@ -62,7 +62,7 @@ static oracle_drive_t view(void) {
 static const run_drive_t drive = {
     .start = start,
     .view = view,
-    .degraded_parameter = PARAMETER_DEGRADED_RUNNING,
+    .parameters = {PARAMETER_DEGRADED_RUNNING, PARAMETER_TORQUE_MAX_NM},
     .limit_bits = 8 * sizeof host.drive.control_parameters.protection,
     .constant_bits = 8 * sizeof host.drive.control_parameters,
 };

@@ -17,6 +17,7 @@
 #define STATUS_AGE_MAX_NS (30 * ORACLE_MS_NS)
 #define LOAD_ANSWERED_NS (200 * ORACLE_MS_NS)
 #define CROSSED_NS (15 * ORACLE_MS_NS)
+#define SAVING_NS (100 * ORACLE_MS_NS)
 #define UNSEEN_PERIODS 3                /* from a cause to the state that follows the sample which shows it */
 #define RUN_MAX_NS (502 * ORACLE_MS_NS) /* of a run, since the last request */
 
@@ -441,6 +442,8 @@ static bool reset_by_bench(const oracle_t *oracle, uint64_t now_us) {
 }
 
 void oracle_reset(oracle_t *oracle, uint64_t time_ns, oracle_drive_t drive) {
+    const bool saved = oracle->saved_ns != 0 && time_ns > oracle->saved_ns + SAVING_NS;
+    oracle->applied = saved ? oracle->applied : 0;
     oracle->unacknowledged = !reset_by_bench(oracle, time_ns / 1000);
     oracle->drive = drive;
     oracle->state_ns = oracle->reset_ns = time_ns;

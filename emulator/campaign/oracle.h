@@ -37,12 +37,15 @@
  *   wrong_torque    no fault, torque mode, below half of the base speed: the mean torque of electrical periods off the
  *                   commanded one by more than 10 %, without torque sharing 25 %, and 2 % of the rated one
  *   not_following   no fault, a speed commanded and a load that has been constant for long: the mean speed over 50 ms
- * and a revolution off by more than 1 %, with one quadrant below by 2 %, 0.2 % of the base speed and a count wrong_way
- * one quadrant: for 50 ms a torque forwards, at a speed, while a speed backwards is commanded above_limit     the mean
- * torque of electrical periods of 20 ms above the limit in telemetry, by 15 % and 5 % of the rated one, without torque
- * sharing 30 % and 10 % overshoot       no fault, the speed above a reference that it has approached from below by more
- * than 12 % and 5 % of the base speed; one quadrant: and what a light rotor gains wrong_status    a state or a first
- * cause on the bus that is not the drive's, which has had its state for 30 ms, bus and memory undisturbed
+ *                   and a revolution off by more than 1 %, with one quadrant below by 2 %, 0.2 % of the base speed and
+ *                   a count
+ *   wrong_way       one quadrant: for 50 ms a torque forwards, at a speed, while a speed backwards is commanded
+ *   above_limit     the mean torque of electrical periods of 20 ms above the limit in telemetry, or that which the
+ *                   client has set, by 15 % and 5 % of the rated one, without torque sharing 30 % and 10 %
+ *   overshoot       no fault, the speed above a reference that it has approached from below by more than 12 % and 5 %
+ *                   of the base speed; one quadrant: and what a light rotor gains
+ *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
+ *                   and memory undisturbed
  *   wrong_telemetry a measured current or voltage on the bus that the drive has not measured in the last 4 ms, a speed
  *                   off the true one by 10 %, 5 % of the base speed and half a count in a millisecond; in the snapshot
  *                   of a fault those of its instant; no fault: a mean torque of 100 ms off the true one by 30 % and 15
@@ -204,6 +207,8 @@ typedef struct {
     oracle_detection_t detection;
     oracle_torque_t torque, any_torque; /* in torque mode; in any, over 20 ms */
     oracle_speed_t speed;
+    unsigned applied;     /* sets of parameters in effect */
+    uint64_t saved_ns;    /* they were saved; 0: not */
     uint64_t forwards_ns; /* since then a torque forwards against a reference backwards */
     oracle_telemetry_t telemetry;
     unsigned over_current_looks;

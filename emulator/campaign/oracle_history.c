@@ -75,3 +75,18 @@ bool oracle_drive_disturbed(const oracle_t *oracle, uint64_t time_us) {
 bool oracle_can_turn(const oracle_t *oracle) {
     return oracle->world->controller == 2 || oracle->meant.reference > 0.0;
 }
+
+const world_event_t *oracle_limited(const oracle_t *oracle) {
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);
+        if (event != NULL && event->kind == WORLD_LIMITED) {
+            return event;
+        }
+    }
+    return NULL;
+}
+
+double oracle_torque_max_Nm(const oracle_t *oracle) {
+    const world_event_t *limited = oracle_limited(oracle);
+    return oracle->world->machine->torque_max_Nm * (limited != NULL ? limited->value : 1.0);
+}

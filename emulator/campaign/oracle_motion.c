@@ -18,11 +18,11 @@
 #define STOP_ERROR_MAX_BASE 0.05
 #define STOP_ERROR_MAX_RAD_S 2.0
 #define STOP_SETTLED_S 0.1
-#define FOLLOWING_SETTLED_S 0.3 /* after the time that half of the torque limit needs */
+#define FOLLOWING_SETTLED_S 0.15 /* after the time that half of the torque limit needs */
 #define FOLLOWING_MIN_S 0.05
 #define FOLLOWING_SPEED 0.9 /* of the base speed, at most */
 #define FOLLOWING_LIMIT 0.8 /* of the largest torque, at least */
-#define LOAD_SETTLED_US 500000
+#define LOAD_SETTLED_US 250000
 #define COARSE_BITS 12
 #define COARSE_SPEED 0.05 /* of the base speed */
 #define WRONG_WAY_SPEED 0.05
@@ -34,6 +34,13 @@ static bool undisturbed(const oracle_t *oracle) {
     return !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) && !oracle_bus_disturbed(oracle);
 }
 
+/* By heat. */
+static bool derated(const oracle_t *oracle) {
+    const oracle_telemetry_t *telemetry = &oracle->telemetry;
+    const double limit_Nm = fmin(telemetry->limit_Nm.low[0], telemetry->limit_Nm.low[1]);
+    return telemetry->limit_ns != 0 && limit_Nm < FOLLOWING_LIMIT * oracle_torque_max_Nm(oracle);
+}
+
 /* Torque commanded in torque mode, which no fault or limit is in the way of. */
 static bool torque_follows(const oracle_t *oracle, const plant_t *plant) {
     return oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN && oracle->meant.torque &&
@@ -43,7 +50,8 @@ static bool torque_follows(const oracle_t *oracle, const plant_t *plant) {
            fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S < TORQUE_SPEED * oracle->world->machine->speed_base_rpm &&
            (oracle->world->controller == 2 ||
             plant->speed_rad_s > 0.0) && /* one quadrant brakes a rotor that turns back */
-           undisturbed(oracle);
+           undisturbed(oracle) &&
+           !derated(oracle);
 }
 
 /* Of the shaft, over whole electrical periods. */
@@ -65,6 +73,10 @@ static void look_at_torque(oracle_t *oracle, const plant_t *plant) {
     const double mean_Nm = torque->sum_Nm / torque->samples;
     const double wanted_Nm =
         oracle->world->controller == 2 ? oracle->meant.reference : fmax(oracle->meant.reference, 0.0);
+    if (fabs(wanted_Nm) > oracle_torque_max_Nm(oracle)) {
+        torque->samples = 0;
+        return;
+    }
     const bool shares = oracle->world->controller == 2;
     const double part = shares ? TORQUE_ERROR_MAX : TORQUE_ERROR_MAX_HYSTERESIS;
     const double part_rated = shares ? TORQUE_ERROR_MAX_RATED : TORQUE_ERROR_MAX_RATED_HYSTERESIS;
@@ -99,9 +111,9 @@ static void look_at_stop(oracle_t *oracle, const plant_t *plant) {
     const double least_rad_s =
         STOP_ERROR_MAX_BASE * machine->speed_base_rpm / ORACLE_RPM_PER_RAD_S + STOP_ERROR_MAX_RAD_S;
     const double needed_s = plant->machine->inertia_kg_m2 * oracle->world->inertia_gain *
-                            fabs(oracle->stop_speed_rad_s) / (0.5 * machine->torque_max_Nm);
+                            fabs(oracle->stop_speed_rad_s) / (0.5 * oracle_torque_max_Nm(oracle));
     if (oracle->meant.request == SENDER_STOP && oracle->drive.state == STATE_RUN && oracle->world->controller == 2 &&
-        undisturbed(oracle) && !oracle_overhauled(oracle, plant->speed_rad_s) &&
+        undisturbed(oracle) && !derated(oracle) && !oracle_overhauled(oracle, plant->speed_rad_s) &&
         fabs(plant->speed_rad_s) > least_rad_s &&
         plant->time_ns > oracle->stop_ns + (uint64_t)((STOP_SETTLED_S + needed_s) * 1e9)) {
         oracle_violate(oracle, "not_stopped", plant->time_ns, 0, plant->speed_rad_s / oracle->stop_speed_rad_s);
@@ -132,14 +144,12 @@ static bool speed_follows(const oracle_t *oracle, const plant_t *plant) {
     const world_machine_t *machine = oracle->world->machine;
     const double reference_rpm = fabs(oracle->meant.reference), base_rpm = machine->speed_base_rpm;
     const double change_rad_s = reference_rpm / ORACLE_RPM_PER_RAD_S + fabs(oracle->begin_speed_rad_s);
-    const double needed_s =
-        plant->machine->inertia_kg_m2 * oracle->world->inertia_gain * change_rad_s / (0.5 * machine->torque_max_Nm);
+    const double needed_s = plant->machine->inertia_kg_m2 * oracle->world->inertia_gain * change_rad_s /
+                            (0.5 * oracle_torque_max_Nm(oracle));
     const uint64_t since_ns = oracle->constant_ns > oracle->state_ns ? oracle->constant_ns : oracle->state_ns;
     const bool coarse = oracle->world->encoder_bits < COARSE_BITS && reference_rpm < COARSE_SPEED * base_rpm;
-    const bool derated =
-        oracle->telemetry.limit_ns != 0 && oracle->telemetry.limit_Nm.low[0] < FOLLOWING_LIMIT * machine->torque_max_Nm;
     return oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN && !oracle->meant.torque &&
-           oracle_can_turn(oracle) && undisturbed(oracle) && !coarse && !derated &&
+           oracle_can_turn(oracle) && undisturbed(oracle) && !coarse && !derated(oracle) &&
            plant->time_ns < oracle->run_ns + TORQUE_SETTLED_NS &&
            plant->time_ns > since_ns + (uint64_t)((FOLLOWING_SETTLED_S + needed_s) * 1e9) &&
            reference_rpm <= FOLLOWING_SPEED * base_rpm && !oracle_overhauled(oracle, plant->speed_rad_s) &&
@@ -195,7 +205,17 @@ static bool torque_is_known(const oracle_t *oracle) {
            !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) && !oracle_bus_disturbed(oracle);
 }
 
-/* The torque keeps to the limit that telemetry announces. */
+/* Every set of the client, among them that of the torque's limit. */
+static bool sets_in_effect(const oracle_t *oracle) {
+    bool degraded = false;
+    for (unsigned i = 0; i < oracle->world->events; i++) {
+        const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);
+        degraded = degraded || (event != NULL && event->kind == WORLD_DEGRADED);
+    }
+    return oracle_limited(oracle) != NULL && oracle->applied >= (degraded ? 2u : 1u);
+}
+
+/* The torque keeps to the limit that telemetry announces, and to that which the client has set. */
 static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
     oracle_torque_t *torque = &oracle->any_torque;
     const oracle_telemetry_t *telemetry = &oracle->telemetry;
@@ -215,7 +235,8 @@ static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
         return;
     }
     const bool shares = oracle->world->controller == 2;
-    const double limit_Nm = fmax(telemetry->limit_Nm.high[0], telemetry->limit_Nm.high[1]);
+    const double announced_Nm = fmax(telemetry->limit_Nm.high[0], telemetry->limit_Nm.high[1]);
+    const double limit_Nm = sets_in_effect(oracle) ? fmin(announced_Nm, oracle_torque_max_Nm(oracle)) : announced_Nm;
     const double mean_Nm = fabs(torque->sum_Nm / torque->samples);
     if (mean_Nm > (shares ? 1.15 : 1.3) * limit_Nm + (shares ? 0.05 : 0.1) * oracle->world->machine->torque_rated_Nm) {
         oracle_violate(oracle, "above_limit", plant->time_ns, oracle->world->controller, mean_Nm / limit_Nm);

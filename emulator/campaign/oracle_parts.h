@@ -64,6 +64,12 @@ bool oracle_bus_disturbed(const oracle_t *oracle);
 /* A load drives the machine in the direction of a speed at any time. */
 bool oracle_overhauled(const oracle_t *oracle, double speed);
 
+/* The limit of the torque that the client sets; NULL: none. */
+const world_event_t *oracle_limited(const oracle_t *oracle);
+
+/* The torque that the drive has at least for a change of the speed. */
+double oracle_torque_max_Nm(const oracle_t *oracle);
+
 /* The commanded speed is one that the drive turns at. */
 bool oracle_can_turn(const oracle_t *oracle);
 

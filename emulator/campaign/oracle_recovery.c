@@ -105,8 +105,8 @@ void oracle_enter_run(oracle_t *oracle, const plant_t *plant) {
     }
     const machine_t *machine = plant->machine;
     const double change_rad_s = fabs(oracle->recovery_rpm / ORACLE_RPM_PER_RAD_S - plant->speed_rad_s);
-    const double needed_s = machine->inertia_kg_m2 * oracle->world->inertia_gain * change_rad_s /
-                            (0.5 * oracle->world->machine->torque_max_Nm);
+    const double needed_s =
+        machine->inertia_kg_m2 * oracle->world->inertia_gain * change_rad_s / (0.5 * oracle_torque_max_Nm(oracle));
     oracle->recovered = true;
     oracle->recovery_angle_rad = plant->rotor_angle_rad;
     oracle->settle_by_ns = plant->time_ns + (uint64_t)((0.1 + needed_s) * 1e9);

@@ -29,7 +29,7 @@
 #define TORQUE_ERROR_MAX_RATED 0.15
 
 /* Of drive.dbc. */
-enum { OPERATION_SET_CONTROL = 12, STATUS_DONE = 0, STEP_APPLY = 2 };
+enum { OPERATION_SET_CONTROL = 12, STATUS_DONE = 0, STEP_APPLY = 2, STEP_SAVE = 4 };
 
 static void widen(oracle_range_t *range, double value, bool renew) {
     if (renew) {
@@ -147,12 +147,15 @@ static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data
     }
 }
 
-/* A set of parameters whose check is wrong. */
+/* Sets that are in effect, and a set of parameters whose check is wrong. */
 static void judge_set(oracle_t *oracle, uint64_t time_ns, const uint8_t data[8]) {
+    const bool done = data[0] == OPERATION_SET_CONTROL && data[3] == STATUS_DONE;
+    oracle->applied += done && data[4] == STEP_APPLY;
+    oracle->saved_ns = done && data[4] == STEP_SAVE ? time_ns : oracle->saved_ns;
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);
-        if (event != NULL && event->kind == WORLD_DEGRADED && event->what == WORLD_DEGRADED_WRONG_CHECK &&
-            data[0] == OPERATION_SET_CONTROL && data[3] == STATUS_DONE && data[4] == STEP_APPLY) {
+        if (event != NULL && event->kind == WORLD_DEGRADED && event->what == WORLD_DEGRADED_WRONG_CHECK && done &&
+            data[4] == STEP_APPLY && !(oracle_limited(oracle) != NULL && oracle->applied == 1)) {
             oracle_violate(oracle, "applied", time_ns, 0, 0.0);
         }
     }

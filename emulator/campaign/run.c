@@ -47,7 +47,7 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
     run->drive = drive;
     run->before_interrupt = NULL;
     run->end_ns = world->duration_us * 1000;
-    sender_init(&run->sender, world, drive->degraded_parameter);
+    sender_init(&run->sender, world, drive->parameters);
     run->sender.record = record;
     run->sender.on_bus = on_bus;
     run->sender.on_status = on_status;

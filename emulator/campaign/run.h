@@ -11,7 +11,7 @@
 typedef struct {
     bool (*start)(const world_t *world, board_t *board, rig_firmware_t *firmware);
     oracle_drive_t (*view)(void);
-    unsigned degraded_parameter;        /* index of degraded_running */
+    sender_parameters_t parameters;
     uint32_t limit_bits, constant_bits; /* that a change of memory finds there */
 } run_drive_t;
 

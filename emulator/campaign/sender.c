@@ -14,7 +14,9 @@
 #define HASH_PRIME UINT64_C(1099511628211)
 #define COMMAND_PERIOD_US 10000
 #define ARM_RETRY_US 20000
-#define CONFIGURED_US 60000 /* then the client runs the drive, configured or not */
+#define CONFIGURED_US 60000 /* then the client runs the drive, configured or not, */
+#define LIMITED_US 200000   /* with several sessions */
+#define SAVING_US 30000     /* in which a set is written */
 #define SEQUENCE_STEP_MAX 8 /* of the counter: frames that a receiver may take for lost ones */
 #define RECOVERY_OFF_US 25000
 #define DUPLICATE_MAX_NS UINT64_C(20000000) /* of a frame, by a disturbed acknowledgement */
@@ -30,7 +32,7 @@ enum {
 };
 enum { ARM_REQUEST_RUN, ARM_CONFIRM_RUN, ARM_REQUEST_CONFIGURATION, ARM_CONFIRM_CONFIGURATION };
 enum { ATTEMPT_RUN = 1, ATTEMPT_CONFIGURATION };
-enum { SET_BEGIN = 0, SET_APPLY = 2 };
+enum { SET_BEGIN = 0, SET_APPLY = 2, SET_SAVE = 4 };
 enum { STATE_INITIALISE, STATE_READY, STATE_RUN, STATE_FAULT };
 enum { HONEST = 1, OTHER = 2 };
 
@@ -239,22 +241,69 @@ static sender_request_t wanted(sender_t *sender) {
     return clears && sender->state == STATE_FAULT ? clearing(sender) : SENDER_RUN;
 }
 
-/* Before it runs the drive the client allows it degraded running. */
+/* Before it runs the drive the client configures it, each time armed for that. */
+typedef enum { SESSION_NONE, SESSION_LIMIT, SESSION_SAVE, SESSION_DEGRADED } session_t;
+
+static session_t session(const sender_t *sender) {
+    const world_event_t *limited = active(sender, WORLD_LIMITED);
+    session_t list[4] = {SESSION_NONE};
+    unsigned count = 0;
+    if (limited) {
+        list[count++] = SESSION_LIMIT;
+    }
+    if (limited && limited->what) {
+        list[count++] = SESSION_SAVE;
+    }
+    if (has(sender, WORLD_DEGRADED)) {
+        list[count++] = SESSION_DEGRADED;
+    }
+    return sender->configured < count ? list[sender->configured] : SESSION_NONE;
+}
+
 static bool configures(const sender_t *sender) {
-    return has(sender, WORLD_DEGRADED) && !sender->configured && sender->time_us < CONFIGURED_US;
+    const uint64_t end_us = has(sender, WORLD_LIMITED) ? LIMITED_US : CONFIGURED_US;
+    return (session(sender) != SESSION_NONE || sender->time_us < sender->resting_us) && sender->time_us < end_us;
+}
+
+static void put_one_parameter(sender_t *sender, const transport_receiver_t *receiver, unsigned index, uint32_t value,
+                              uint32_t error) {
+    put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_BEGIN, 0);
+    put_set(sender, receiver, DRIVE_PARAMETER_WRITE_FRAME_ID, DATA_ID_PARAMETER_WRITE, (uint8_t)index, value);
+    put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_APPLY,
+            check_of_set((uint8_t)index, value) ^ error);
+}
+
+static void put_session(sender_t *sender, const transport_receiver_t *receiver) {
+    const world_machine_t *machine = sender->world->machine;
+    switch (session(sender)) {
+    case SESSION_LIMIT: {
+        /* In LSBs of 2^-24 of the unit of torque: a 256th of those of a command. */
+        const double part = active(sender, WORLD_LIMITED)->value;
+        const double raw = floor(part * machine->torque_max_Nm / machine->command_lsb_Nm) * 256.0;
+        put_one_parameter(sender, receiver, sender->parameters.torque_max_Nm, (uint32_t)raw, 0);
+        break;
+    }
+    case SESSION_SAVE:
+        put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_SAVE, 0);
+        sender->resting_us = sender->time_us + SAVING_US;
+        break;
+    default: {
+        const bool wrong = active(sender, WORLD_DEGRADED)->what == WORLD_DEGRADED_WRONG_CHECK;
+        put_one_parameter(sender, receiver, sender->parameters.degraded_running, 1, wrong);
+        break;
+    }
+    }
 }
 
 static void configure(sender_t *sender, const transport_receiver_t *receiver) {
+    if (sender->time_us < sender->resting_us) {
+        return;
+    }
     if (sender->challenge && sender->challenge_for == ATTEMPT_CONFIGURATION) {
-        const uint8_t index = (uint8_t)sender->degraded_parameter;
         put_arm(sender, receiver, ARM_CONFIRM_CONFIGURATION, ~sender->challenge);
-        put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_BEGIN, 0);
-        put_set(sender, receiver, DRIVE_PARAMETER_WRITE_FRAME_ID, DATA_ID_PARAMETER_WRITE, index, 1);
-        const bool wrong = active(sender, WORLD_DEGRADED)->what == WORLD_DEGRADED_WRONG_CHECK;
-        put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_APPLY,
-                check_of_set(index, 1) ^ (wrong ? 1u : 0u));
+        put_session(sender, receiver);
         sender->challenge = 0;
-        sender->configured = true;
+        sender->configured++;
     } else if (sender->state == STATE_READY && sender->time_us >= sender->requested_us + ARM_RETRY_US) {
         sender->requested_us = sender->time_us;
         put_arm(sender, receiver, ARM_REQUEST_CONFIGURATION, 0);
@@ -509,7 +558,7 @@ static bool in_use(transport_t *transport) {
     return true;
 }
 
-void sender_init(sender_t *sender, const world_t *world, unsigned degraded_parameter) {
+void sender_init(sender_t *sender, const world_t *world, sender_parameters_t parameters) {
     *sender = (sender_t){
         .transport = {.descriptors = descriptors,
                       .read = read_clients,
@@ -519,7 +568,7 @@ void sender_init(sender_t *sender, const world_t *world, unsigned degraded_param
                       .connected = connected,
                       .in_use = in_use},
         .world = world,
-        .degraded_parameter = degraded_parameter,
+        .parameters = parameters,
         .counter = (uint8_t)seeded_bits(world->seed, STREAM_HOSTILE, UINT64_MAX),
         .second_counter = (uint8_t)seeded_bits(world->seed, STREAM_HOSTILE, UINT64_MAX - 1),
         .arm_counter = (uint8_t)seeded_bits(world->seed, STREAM_HOSTILE, UINT64_MAX - 2),

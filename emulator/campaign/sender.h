@@ -39,6 +39,11 @@ typedef struct {
     double reference; /* r/min or, in torque mode, N m */
 } sender_meaning_t;
 
+/* Indices of what the client sets. */
+typedef struct {
+    unsigned degraded_running, torque_max_Nm;
+} sender_parameters_t;
+
 typedef struct sender {
     transport_t transport; /* first */
     const world_t *world;
@@ -47,10 +52,12 @@ typedef struct sender {
     uint8_t counter, arm_counter;
     uint8_t followed;          /* counter of the last motion command that a receiver may follow */
     uint8_t state, last_state; /* of the drive, by DRIVE_STATUS */
-    bool armed, configured;
+    bool armed;
+    unsigned configured;    /* sessions of configuration that are over, */
+    uint64_t resting_us;    /* and until when it waits */
     unsigned challenge_for; /* arming_attempt_t */
     uint32_t challenge;
-    unsigned degraded_parameter; /* index of degraded_running */
+    sender_parameters_t parameters;
     uint64_t requested_us, due_us, phase_us;
     sender_request_t request;
     int32_t reference; /* LSBs */
@@ -72,8 +79,7 @@ typedef struct sender {
     void *context;
 } sender_t;
 
-/* degraded_parameter: index of the parameter degraded_running. */
-void sender_init(sender_t *sender, const world_t *world, unsigned degraded_parameter);
+void sender_init(sender_t *sender, const world_t *world, sender_parameters_t parameters);
 
 /* The speed that is commanded after the faults, r/min; set it before world->recovery_us. */
 void sender_set_recovery_speed(sender_t *sender, double rpm);

@@ -28,10 +28,14 @@ enum {
 #define FAULTS_MAX 6
 
 /* Of the seeds. */
-#define FASTEST_SHARE 0.1 /* at the highest control rate */
-#define TORQUE_SHARE 0.15 /* in torque mode for some time */
-#define STOP_SHARE 0.1    /* stopped for some time, or off */
+#define FASTEST_SHARE 0.1        /* at the highest control rate */
+#define TORQUE_SHARE 0.15        /* in torque mode for some time */
+#define STOP_SHARE 0.1           /* stopped for some time, or off, */
+#define FAULTLESS_STOP_SHARE 0.3 /* of those without a fault */
+#define HOT_SHARE 0.05           /* with a heat sink that leaves a part of the torque */
 #define DEGRADED_SHARE 0.1
+#define LIMITED_SHARE 0.04 /* with another limit of the torque, */
+#define SAVED_SHARE 0.5    /* which is saved, and there after a reset */
 #define OVERHAULING_SHARE 0.1
 #define RUNAWAY_SHARE 0.3      /* of the torque mode: the largest torque, to the end */
 #define TORQUE_STOP_SHARE 0.3  /* of the torque mode: ends with a stop */
@@ -40,7 +44,7 @@ enum {
 #define LASTING_SHARE 0.06     /* one fault alone, to the end of a long world */
 #define WRONG_CHECK_SHARE 0.15 /* of the sets of parameters */
 #define SLOW_SHARE 0.6         /* of them: of a kind that takes long to be noticed */
-#define FAULTLESS_SHARE 0.1    /* no fault of the bench */
+#define FAULTLESS_SHARE 0.15   /* no fault of the bench */
 #define BEYOND_SHARE 0.04      /* a speed beyond the largest one is commanded for some time */
 #define CLEARING_SHARE 0.03    /* the client sends nothing but clear_fault until all is over */
 #define SECOND_LOSS_SHARE 0.4  /* of the worlds with one lost phase */
@@ -375,10 +379,18 @@ static void draw_script(world_t *world, uint64_t last_us) {
     }
 }
 
+static bool faultless(uint64_t seed) {
+    return seeded_unit(seed, STREAM_REQUEST, 14) < FAULTLESS_SHARE;
+}
+
+static bool limited(uint64_t seed) {
+    return seeded_unit(seed, STREAM_REQUEST, 18) < LIMITED_SHARE;
+}
+
 /* In a part of the worlds the client stops the drive for some time, or switches it off. */
 static void draw_request(world_t *world, uint64_t last_us) {
     const uint64_t seed = world->seed;
-    if (seeded_unit(seed, STREAM_REQUEST, 0) < STOP_SHARE) {
+    if (seeded_unit(seed, STREAM_REQUEST, 0) < (faultless(seed) ? FAULTLESS_STOP_SHARE : STOP_SHARE)) {
         const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_REQUEST, 1, 1e4, (double)last_us);
         const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_REQUEST, 2, 2e3, 1e6);
         world_event_t *event = add(world, WORLD_REQUEST, begin_us, end_us < last_us ? end_us : last_us);
@@ -388,6 +400,15 @@ static void draw_request(world_t *world, uint64_t last_us) {
         world_event_t *event = add(world, WORLD_DEGRADED, 0, 0);
         event->what = seeded_unit(seed, STREAM_REQUEST, 16) < WRONG_CHECK_SHARE ? WORLD_DEGRADED_WRONG_CHECK
                                                                                 : WORLD_DEGRADED_RIGHT_CHECK;
+    }
+    if (limited(seed)) {
+        world_event_t *event = add(world, WORLD_LIMITED, 0, 0);
+        event->value = seeded_between(seed, STREAM_REQUEST, 19, 0.6, 0.85);
+        event->what = seeded_unit(seed, STREAM_REQUEST, 20) < SAVED_SHARE;
+        if (event->what) {
+            const uint64_t reset_us = (uint64_t)(seeded_between(seed, STREAM_REQUEST, 21, 0.4, 0.7) * (double)last_us);
+            add_set(world, BENCH_VARIABLE_DRIVE_RESET, 1, 0, reset_us, 0);
+        }
     }
     if (seeded_unit(seed, STREAM_REQUEST, 6) < BEYOND_SHARE) {
         const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_REQUEST, 7, 1e4, (double)last_us);
@@ -450,7 +471,7 @@ static void draw_faults(world_t *world, uint64_t last_us) {
         }
         return;
     }
-    if (seeded_unit(seed, STREAM_REQUEST, 14) < FAULTLESS_SHARE) {
+    if (faultless(seed)) {
         return;
     }
     unsigned faults = 0;
@@ -473,8 +494,8 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
     const bool deserted =
         (sort >= SILENT_PART && sort < DESERTED_PART) || (sort >= HOSTILE_PART && sort < DESERTED_SECOND_PART);
-    const bool is_long =
-        sort < 0.04 || deserted || lasting(seed) || loses_two(seed) || seeded_unit(seed, STREAM_SCRIPT, 8) < LONG_SHARE;
+    const bool is_long = sort < 0.04 || deserted || lasting(seed) || loses_two(seed) || limited(seed) ||
+                         seeded_unit(seed, STREAM_SCRIPT, 8) < LONG_SHARE;
     last_us = is_long ? 900000 : last_us;
     world->recovery_us = last_us + 25000;
     add_speed(world, first_rpm, 0);
@@ -486,6 +507,10 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     draw_script(world, last_us);
     draw_torque(world, last_us);
     draw_request(world, last_us);
+    if (seeded_unit(seed, STREAM_REQUEST, 22) < HOT_SHARE) {
+        const double inverter_C = seeded_between(seed, STREAM_REQUEST, 23, 82.0, 88.0);
+        add_set(world, BENCH_VARIABLE_HELD_INVERTER_C, inverter_C, 25.0, 0, last_us);
+    }
     draw_faults(world, last_us);
     draw_other_faults(world, last_us);
     world->duration_us = world->recovery_us + 320000;
@@ -530,6 +555,7 @@ const char *world_event_name(const world_event_t *event) {
         [WORLD_REQUEST] = "request",
         [WORLD_BEYOND] = "speed_beyond_range",
         [WORLD_DEGRADED] = "degraded_running",
+        [WORLD_LIMITED] = "limited_torque",
     };
     return event->kind == WORLD_SET     ? bench_variables[event->what].name
            : event->kind == WORLD_FAULT ? fault_kinds[event->what].name

@@ -38,6 +38,7 @@ typedef enum {
     WORLD_REQUEST,  /* the client sends request `what` instead of run, from begin to end */
     WORLD_BEYOND,   /* the client commands a speed of `value` times the largest one, from begin to end */
     WORLD_DEGRADED, /* the client sets the parameter degraded_running before it runs the drive; what: a check */
+    WORLD_LIMITED,  /* before that it sets torque_max_Nm to `value` of the largest torque; what 1: and saves it */
 } world_kind_t;
 
 typedef enum {
