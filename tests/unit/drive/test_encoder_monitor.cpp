@@ -300,6 +300,30 @@ TEST_F(EncoderMonitor, counts_faster_than_the_limit_are_over_speed_within_a_mill
     }
 }
 
+// A check in each period or in each tenth: windows of 48 and 50 periods. At the first speeds beyond the limit, and at
+// those at which a window nearly has a turn less the travel at the limit.
+TEST_F(EncoderMonitor, over_speed_of_the_fastest_machine_is_found_at_100_khz_and_its_highest_speed_is_none) {
+    constexpr double LIMIT_RPM = 38400.0, FAST_PERIOD_S = 1e-5;
+    parameters.rate_hz = 100000;
+    parameters.travel = int32_t(LIMIT_RPM / 60.0 * FAST_PERIOD_S * 0x1p32);
+    for (const double sign : {1.0, -1.0}) {
+        for (const int spacing : {1, 10}) {
+            for (const auto &[part, fails] :
+                 {std::pair{0.9, false}, std::pair{1.0, false}, std::pair{1.05, false}, std::pair{1.08, true},
+                  std::pair{1.3, true}, std::pair{1.5, true}, std::pair{1.9, true}}) {
+                monitor = {};
+                bool failed = false;
+                for (int k = 0; k < 200; k += spacing) {
+                    step(sign * part * LIMIT_RPM * 6.0 * FAST_PERIOD_S * k, 0.0, 0.0);
+                    input.period += uint32_t(spacing) - 1u;
+                    failed = failed || monitor.over_speed;
+                }
+                EXPECT_EQ(failed, fails) << sign * part << " " << spacing;
+            }
+        }
+    }
+}
+
 TEST_F(EncoderMonitor, the_observer_shows_over_speed_when_the_counts_do_to_a_thirty_second) {
     for (const auto &[observed_rpm, counted_rpm, fails] :
          {std::tuple{3601.0, 3550.0, true}, std::tuple{3601.0, 3400.0, false}, std::tuple{-3601.0, 3550.0, true},
