@@ -71,6 +71,7 @@ COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *i
         .flux_step_max_q29 = input->period_flux_q29,
         .period = input->periods,
         .lost = input->late_interrupts != phases->late_interrupts,
+        .lost_phases = phases->lost,
     };
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         const phase_monitor_phase_t *state = &phases->phase[phase];
@@ -92,6 +93,7 @@ static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_m
     phase_balance_sample_t sample = {
         .run = encoder->run,
         .phases = machine_tables.phases,
+        .lost = encoder->lost_phases,
         .least_q8 = learned ? PHASE_BALANCE_LEAST_LEARNED_Q8 : PHASE_BALANCE_LEAST_Q8,
         .elapsed = elapsed,
         .periods_per_ms = drive->control_parameters.initialise_ticks,

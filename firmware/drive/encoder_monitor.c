@@ -282,14 +282,15 @@ static void note_agreement(const encoder_monitor_parameters_t *parameters, encod
     }
 }
 
-/* True when all other phases have been consistent with the angle in the last quarter of a second. */
+/* True when all other phases that are not lost have been consistent with the angle in the last quarter of a second. One
+ * that is left is enough: what it has shown, it contradicts when it conducts the next time, if the encoder is wrong. */
 static bool others_agree(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor, unsigned index,
-                         uint32_t period) {
+                         const encoder_monitor_input_t *input) {
     bool all = true;
     for (unsigned other = 0; other < machine_tables.phases; other++) {
         encoder_monitor_phase_t *phase = &monitor->phase[other];
-        phase->agreed = phase->agreed && period - phase->agreed_at <= parameters->rate_hz >> SHOWN_SHIFT;
-        all &= other == index || phase->agreed;
+        phase->agreed = phase->agreed && input->period - phase->agreed_at <= parameters->rate_hz >> SHOWN_SHIFT;
+        all &= other == index || phase->agreed || (input->lost_phases >> other & 1u) != 0;
     }
     return all;
 }
@@ -337,7 +338,7 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
         contradicting += shows(parameters, phase, input->period);
         const bool waits = next_decides && input->period - phase->shown_from <= parameters->rate_hz >> WAIT_SHIFT;
         alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT && !waits &&
-                 !others_agree(parameters, monitor, index, input->period);
+                 !others_agree(parameters, monitor, index, input);
     }
     monitor->angle |= contradicting >= CONTRADICTING_PHASES || alone;
 }

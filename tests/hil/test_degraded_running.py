@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 
 from salient.bench.bench import Bench
+from salient.paths import ROOT
 
 CONTROLLERS = ["traditional", "paper", "salient"]
 MACHINES = ["saturating", "finite_element", "linear_cosine", "linear_trapezoid"]
+FOUR_PHASES = ROOT / "tools" / "examples" / "machines" / "map86.toml"
 STROKES_S = 0.025
 """An electrical revolution of a rotor with four poles at 600 r/min."""
 DEAD_ZONE_DEG = 6.0
@@ -106,6 +108,17 @@ def test_what_cannot_be_run_on_with_is_a_fault(make_bench, controller, kind, att
     bench.fault(kind, phase="b", **attributes)
     bench.run_for(0.06)
     assert (bench.drive.state, bench.drive.fault) == ("fault", fault)
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_of_four_phases_the_three_that_remain_show_a_sensor_with_a_wrong_gain(make_bench, controller):
+    bench = loaded(make_bench, machine=str(FOUR_PHASES), controller=controller, load_Nm=4.0)
+    bench.fault("winding_open", phase="b")
+    bench.run_for(0.3)
+    assert bench.drive.state == "run" and degraded(bench) == 1
+    bench.fault("current_sensor_gain", phase="c", gain=0.7)
+    bench.run_for(0.4)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "current_sensor")
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)

@@ -181,6 +181,23 @@ TEST_F(EncoderMonitor, a_contradiction_waits_for_the_next_phase_for_a_64th_of_a_
     EXPECT_LT(periods, RATE_HZ / 32);
 }
 
+// Phase 1 is lost; phase 2 agrees, as its turn comes, and phase 0 alone contradicts for longer than 1/256 s.
+TEST_F(EncoderMonitor, one_phase_alone_is_no_evidence_when_all_others_but_a_lost_one_have_agreed) {
+    for (const bool lost : {true, false}) {
+        monitor = {};
+        input.lost_phases = lost ? 2u : 0u;
+        input.zero_at[2] = input.period + 1;
+        for (int k = 0; k < RATE_HZ / 500; k++) {
+            step(125.0, 125.0, 25.0, 2);
+        }
+        input.zero_at[0] = input.period + 1;
+        for (int k = 0; k < RATE_HZ / 150; k++) {
+            step(77.0, 65.0, 25.0);
+        }
+        EXPECT_EQ(monitor.angle, !lost);
+    }
+}
+
 TEST_F(EncoderMonitor, a_phase_has_company_while_another_has_contradicted_the_angle_within_a_quarter_of_a_second) {
     EXPECT_FALSE(encoder_monitor_suspects(&parameters, &monitor, 0));
     input.zero_at[1] = input.period + 1;
