@@ -218,7 +218,7 @@ COLD static uint32_t number_of(uint32_t mask) {
 }
 
 /* With one phase lost the drive may go on: then what has failed is no fault any more. Until the fault is cleared
- * outside a run. */
+ * outside a run, or the parameter no longer allows it, which changes there only. */
 COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
     const degraded_parameters_t *parameters = &drive->control_parameters.degraded;
     const bool run = drive->control.state_machine.state == DRIVE_STATE_RUN;
@@ -227,7 +227,8 @@ COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
         phase_monitor_lose(&drive->phases, drive->degraded.lost);
         drive->balance = (phase_balance_t){0};
         failed = 0;
-    } else if (!run && drive->degraded.lost != 0 && drive->command.request == COMMAND_CLEAR_FAULT) {
+    } else if (!run && drive->degraded.lost != 0 &&
+               (drive->command.request == COMMAND_CLEAR_FAULT || !parameters->allowed)) {
         drive->degraded.lost = 0;
         drive->control.lost_phase = 0;
         phase_monitor_lose(&drive->phases, 0);

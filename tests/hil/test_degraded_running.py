@@ -160,6 +160,24 @@ def test_clear_fault_gives_a_whole_phase_back_and_a_new_run_alone_does_not(make_
     assert speed_rpm.min() > 594 and speed_rpm.max() < 606
 
 
+def test_phase_is_given_back_outside_a_run_when_the_parameter_no_longer_allows_it_and_its_loss_is_a_fault(make_bench):
+    bench = loaded(make_bench, load_Nm=0.0)
+    bench.fault("winding_open", phase="b")
+    bench.load_torque_Nm = 4.0
+    bench.run_for(0.2)
+    assert (bench.drive.state, degraded(bench)) == ("run", 1)
+    bench.load_torque_Nm = 0.0
+    bench.drive.off()
+    bench.run_for(0.15)
+    assert degraded(bench) == 1
+    bench.drive.parameters["degraded_running"] = 0
+    bench.run_for(0.15)
+    assert degraded(bench) == 0
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.2)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "phase_open")
+
+
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_start_where_only_the_lost_phase_has_torque_is_a_stall_and_stated_before(make_bench, controller):
     bench = make_bench(controller=controller, initial_angle_deg=DEAD_ZONE_DEG)
