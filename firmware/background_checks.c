@@ -180,10 +180,11 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
 
 /* Each current is one word: a control interrupt in between changes none while it is read. */
 COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
+    const control_parameters_t *parameters = &drive->control_parameters;
     const temperature_t *temperature = &drive->temperature;
-    temperature_step(&drive->temperature_parameters, &drive->temperature, drive->hal, machine_tables.phases, time_us);
-    if (thermal_sample(&drive->thermal_parameters, &drive->thermal, drive->control.measurement.current_q9, time_us)) {
-        const int32_t thermal_q24 = thermal_torque_limit_q24(&drive->thermal_parameters, &drive->thermal);
+    temperature_step(&parameters->temperature, &drive->temperature, drive->hal, machine_tables.phases, time_us);
+    if (thermal_sample(&parameters->thermal, &drive->thermal, drive->control.measurement.current_q9, time_us)) {
+        const int32_t thermal_q24 = thermal_torque_limit_q24(&parameters->thermal, &drive->thermal);
         const int32_t degraded_q24 = degraded_torque_limit_q24(&drive->degraded);
         const int32_t limit_q24 = thermal_q24 < degraded_q24 ? thermal_q24 : degraded_q24;
         drive->control.torque_limit_q24 =
