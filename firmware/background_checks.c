@@ -71,6 +71,7 @@ COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *i
         .flux_step_max_q29 = input->period_flux_q29,
         .period = input->periods,
         .lost = input->late_interrupts != phases->late_interrupts,
+        .lost_phases = phases->lost,
     };
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         const phase_monitor_phase_t *state = &phases->phase[phase];
@@ -92,6 +93,7 @@ static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_m
     phase_balance_sample_t sample = {
         .run = encoder->run,
         .phases = machine_tables.phases,
+        .lost = encoder->lost_phases,
         .least_q8 = learned ? PHASE_BALANCE_LEAST_LEARNED_Q8 : PHASE_BALANCE_LEAST_Q8,
         .elapsed = elapsed,
         .periods_per_ms = drive->control_parameters.initialise_ticks,
@@ -178,10 +180,11 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
 
 /* Each current is one word: a control interrupt in between changes none while it is read. */
 COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
+    const control_parameters_t *parameters = &drive->control_parameters;
     const temperature_t *temperature = &drive->temperature;
-    temperature_step(&drive->temperature_parameters, &drive->temperature, drive->hal, machine_tables.phases, time_us);
-    if (thermal_sample(&drive->thermal_parameters, &drive->thermal, drive->control.measurement.current_q9, time_us)) {
-        const int32_t thermal_q24 = thermal_torque_limit_q24(&drive->thermal_parameters, &drive->thermal);
+    temperature_step(&parameters->temperature, &drive->temperature, drive->hal, machine_tables.phases, time_us);
+    if (thermal_sample(&parameters->thermal, &drive->thermal, drive->control.measurement.current_q9, time_us)) {
+        const int32_t thermal_q24 = thermal_torque_limit_q24(&parameters->thermal, &drive->thermal);
         const int32_t degraded_q24 = degraded_torque_limit_q24(&drive->degraded);
         const int32_t limit_q24 = thermal_q24 < degraded_q24 ? thermal_q24 : degraded_q24;
         drive->control.torque_limit_q24 =
@@ -216,7 +219,7 @@ COLD static uint32_t number_of(uint32_t mask) {
 }
 
 /* With one phase lost the drive may go on: then what has failed is no fault any more. Until the fault is cleared
- * outside a run. */
+ * outside a run, or the parameter no longer allows it, which changes there only. */
 COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
     const degraded_parameters_t *parameters = &drive->control_parameters.degraded;
     const bool run = drive->control.state_machine.state == DRIVE_STATE_RUN;
@@ -225,7 +228,8 @@ COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
         phase_monitor_lose(&drive->phases, drive->degraded.lost);
         drive->balance = (phase_balance_t){0};
         failed = 0;
-    } else if (!run && drive->degraded.lost != 0 && drive->command.request == COMMAND_CLEAR_FAULT) {
+    } else if (!run && drive->degraded.lost != 0 &&
+               (drive->command.request == COMMAND_CLEAR_FAULT || !parameters->allowed)) {
         drive->degraded.lost = 0;
         drive->control.lost_phase = 0;
         phase_monitor_lose(&drive->phases, 0);

@@ -25,11 +25,11 @@ static bool may_configure(const drive_t *drive) {
 /* Applies the parameters in one piece between two control periods; in a run or beside the command that starts one, in
  * parts, those that may then be changed, which are all that differ. */
 COLD static void configure(drive_t *drive) {
-    const control_parameters_t control_parameters =
+    control_parameters_t control_parameters =
         configure_control(&drive->parameters, &machine_tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
                           hal_adc_bits(drive->hal), hal_pwm_clock_hz(drive->hal));
-    drive->thermal_parameters = thermal_configure(drive->parameters.values);
-    drive->temperature_parameters = temperature_configure(drive->parameters.values);
+    control_parameters.thermal = thermal_configure(drive->parameters.values);
+    control_parameters.temperature = temperature_configure(drive->parameters.values);
     hal_critical_enter(drive->hal);
     if (may_configure(drive)) {
         drive->control_parameters = control_parameters;

@@ -61,9 +61,7 @@ typedef struct {
     flux_angle_t flux_angle[HAL_PHASES_MAX];
     degraded_t degraded;
     encoder_monitor_t encoder;
-    thermal_parameters_t thermal_parameters;
     thermal_t thermal;
-    temperature_parameters_t temperature_parameters;
     temperature_t temperature;
     self_test_t self_test;
     watchdog_monitor_t watchdog;

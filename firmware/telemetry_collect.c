@@ -154,8 +154,6 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
 
     collect_degraded(drive, telemetry);
 
-    telemetry->gates = drive->break_causes; /* the DBC has the bits of HAL_PWM_BREAK_* */
-
     telemetry->identity.firmware_major = SALIENT_VERSION_MAJOR;
     telemetry->identity.firmware_minor = SALIENT_VERSION_MINOR;
     telemetry->identity.firmware_patch = SALIENT_VERSION_PATCH;

@@ -42,6 +42,8 @@
 #include "drive/encoder_monitor.h"
 #include "drive/protection.h"
 #include "drive/state_machine.h"
+#include "drive/temperature.h"
+#include "drive/thermal.h"
 #include "hal_adc.h"
 #include "hal_encoder.h"
 #include "hal_pwm.h"
@@ -96,8 +98,10 @@ typedef struct {
     torque_mode_parameters_t torque_mode;
     inertia_parameters_t inertia;
     slow_counts_parameters_t slow_counts;
-    encoder_monitor_parameters_t encoder_monitor; /* this and the next: background */
+    encoder_monitor_parameters_t encoder_monitor; /* this and the next three: background */
     degraded_parameters_t degraded;
+    thermal_parameters_t thermal; /* this and the next: by drive.c, which alone needs them */
+    temperature_parameters_t temperature;
 } control_parameters_t;
 
 /* Inputs of one control period as the HAL delivers them. */

@@ -50,8 +50,13 @@
 /* Time without a zero of the current after which an integral is too old to contradict the angle: 1/128 s. */
 #define AGE_SHIFT 7
 
-/* Window for the speed: 1/2048 s. */
+/* Window for the speed: 1/2048 s, and until the next check. */
 #define WINDOW_SHIFT 11
+
+/* Travel in a window at the limit of the speed up to which a larger one is seen: 7/16 of a turn. A sixteenth more, and
+ * a count, are below the half turn beyond which travel appears smaller than it is: never as over-speed that is none.
+ * The highest limit, 38400 r/min, has windows of up to 0.68 ms. */
+#define TRAVEL_SEEN (HALF_REV / 8u * 7u)
 
 /* Windows within which the encoder turns round faster than the rotor, from and to a speed of 1/64 of the limit and of
  * half the largest change of the rotor's in this time. */
@@ -277,14 +282,15 @@ static void note_agreement(const encoder_monitor_parameters_t *parameters, encod
     }
 }
 
-/* True when all other phases have been consistent with the angle in the last quarter of a second. */
+/* True when all other phases that are not lost have been consistent with the angle in the last quarter of a second. One
+ * that is left is enough: what it has shown, it contradicts when it conducts the next time, if the encoder is wrong. */
 static bool others_agree(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor, unsigned index,
-                         uint32_t period) {
+                         const encoder_monitor_input_t *input) {
     bool all = true;
     for (unsigned other = 0; other < machine_tables.phases; other++) {
         encoder_monitor_phase_t *phase = &monitor->phase[other];
-        phase->agreed = phase->agreed && period - phase->agreed_at <= parameters->rate_hz >> SHOWN_SHIFT;
-        all &= other == index || phase->agreed;
+        phase->agreed = phase->agreed && input->period - phase->agreed_at <= parameters->rate_hz >> SHOWN_SHIFT;
+        all &= other == index || phase->agreed || (input->lost_phases >> other & 1u) != 0;
     }
     return all;
 }
@@ -332,7 +338,7 @@ static void check_flux(const encoder_monitor_parameters_t *parameters, encoder_m
         contradicting += shows(parameters, phase, input->period);
         const bool waits = next_decides && input->period - phase->shown_from <= parameters->rate_hz >> WAIT_SHIFT;
         alone |= phase->contradicted > parameters->rate_hz >> ALONE_SHIFT && !waits &&
-                 !others_agree(parameters, monitor, index, input->period);
+                 !others_agree(parameters, monitor, index, input);
     }
     monitor->angle |= contradicting >= CONTRADICTING_PHASES || alone;
 }
@@ -371,8 +377,8 @@ static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_
     const uint64_t limit = (uint64_t)parameters->travel * periods;
     const uint64_t count = 2 * (uint64_t)parameters->middle;
     const bool above = fixed_abs(input->speed_q22) > parameters->over_speed_q22;
-    monitor->over_speed = limit < HALF_REV / 2 && /* over a longer time the travel is ambiguous */
-                          (travel > limit + limit / 16 + count || (above && travel + count > limit - limit / 32));
+    monitor->over_speed =
+        limit < TRAVEL_SEEN && (travel > limit + limit / 16 + count || (above && travel + count > limit - limit / 32));
     monitor->window_period = input->period;
     monitor->window_angle = input->encoder_angle;
     const uint64_t change = (uint64_t)parameters->travel_change * periods * periods * REVERSAL_WINDOWS / 2u;

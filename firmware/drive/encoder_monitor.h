@@ -63,6 +63,7 @@ typedef struct {
     uint32_t zero_at[HAL_PHASES_MAX]; /* period in which it was */
     bool known[HAL_PHASES_MAX];       /* no trigger was lost since */
     bool lost;                        /* triggers were lost since the previous input */
+    uint32_t lost_phases;             /* bit of each phase that stays off (drive/degraded.h) */
 } encoder_monitor_input_t;
 
 /* Of a phase. */

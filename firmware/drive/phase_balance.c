@@ -13,6 +13,9 @@
 /* Part of a window for which a phase has to conduct: 1/10. */
 #define CONDUCTING_PART 10u
 
+/* Phases of which one that differs from all others is the wrong one. */
+#define COMPARED_MIN 3u
+
 static void add(phase_balance_t *balance, const phase_balance_sample_t *sample) {
     for (unsigned index = 0; index < sample->phases; index++) {
         phase_balance_phase_t *phase = &balance->phase[index];
@@ -45,31 +48,34 @@ static uint32_t ratio_q8(const phase_balance_t *balance, unsigned index) {
     return ratio < UINT16_MAX ? (uint32_t)ratio : UINT16_MAX;
 }
 
-/* More than 4/3 of the largest of the others, or less than 3/4 of the smallest. */
+/* More than 4/3 of the largest of the others, or less than 3/4 of the smallest. A lost phase has the ratio 0. */
 static bool differs(const uint32_t *ratios_q8, unsigned phases, unsigned index) {
     uint32_t least_q8 = UINT32_MAX, most_q8 = 0;
     for (unsigned other = 0; other < phases; other++) {
-        if (other != index) {
+        if (other != index && ratios_q8[other] > 0) {
             least_q8 = ratios_q8[other] < least_q8 ? ratios_q8[other] : least_q8;
             most_q8 = ratios_q8[other] > most_q8 ? ratios_q8[other] : most_q8;
         }
     }
-    return 3u * ratios_q8[index] > 4u * most_q8 || 4u * ratios_q8[index] < 3u * least_q8;
+    return ratios_q8[index] > 0 && (3u * ratios_q8[index] > 4u * most_q8 || 4u * ratios_q8[index] < 3u * least_q8);
 }
 
 /* At the end of a window. */
 static void judge(phase_balance_t *balance, const phase_balance_sample_t *sample) {
     const unsigned phases = sample->phases;
     uint32_t ratios_q8[HAL_PHASES_MAX] = {0};
-    bool all = true, ahead = true;
+    uint32_t judged = sample->lost;
+    bool ahead = true;
     for (unsigned index = 0; index < phases; index++) {
         ratios_q8[index] = ratio_q8(balance, index);
-        all &= ratios_q8[index] > 0;
+        judged |= (uint32_t)(ratios_q8[index] > 0) << index;
         ahead &= ratios_q8[index] < sample->least_q8;
     }
+    const bool all = judged == (1u << phases) - 1u;
+    const bool comparable = all && phases - (sample->lost != 0) >= COMPARED_MIN;
     uint32_t failed = 0;
     for (unsigned index = 0; index < phases; index++) {
-        failed |= (uint32_t)(all && differs(ratios_q8, phases, index)) << index;
+        failed |= (uint32_t)(comparable && differs(ratios_q8, phases, index)) << index;
     }
     balance->ahead_windows = all && ahead ? balance->ahead_windows + 1u : 0;
     balance->phases |= failed;

@@ -11,7 +11,9 @@
  *   current_sensor  the ratio of a phase is more than 4/3 of those of all others, or less than 3/4
  *   encoder_angle   the ratio of every phase is below a limit, twice in succession
  *
- * Revolutions that last longer than 100 ms, and phases that have hardly conducted, do not count. Derived here.
+ * Revolutions that last longer than 100 ms do not count, nor those in which a phase has hardly conducted, unless it is
+ * lost: then the others are judged without it. Of two that are left either may be the wrong one, and what they have
+ * besides is the angle only. Derived here.
  */
 #ifndef DRIVE_PHASE_BALANCE_H
 #define DRIVE_PHASE_BALANCE_H
@@ -29,6 +31,7 @@
 typedef struct {
     bool run;
     unsigned phases;
+    uint32_t lost;                     /* bit of the phase that stays off (drive/degraded.h) */
     uint32_t least_q8;                 /* limit of the common ratio */
     uint32_t elapsed;                  /* control periods since the previous sample */
     uint32_t periods_per_ms;           /* from 20 */

@@ -12,9 +12,7 @@
  * (machine_tables.h), always less than 0.4 % of the range of speeds. */
 #define STANDSTILL_Q22 (1 << 22)
 
-/* Above every limit; the sum stops growing there and so cannot overflow: with the highest speed at 20 kHz a period adds
- * less than 2^28, and a step stands for PERIODS_MAX periods at most. */
-#define UNDETECTED_TRAVEL_STOP (1 << 29)
+/* That count of a step. */
 #define PERIODS_MAX PROTECTION_SKIPPED_DEFERRED_MAX
 static_assert((int64_t)PROTECTION_DECELERATION_MAX_Q22 * PERIODS_MAX <= INT32_MAX, "a product of 32 bits");
 
@@ -77,9 +75,11 @@ static bool encoder_frozen(const protection_parameters_t *parameters, protection
     const int32_t bound_q22 =
         fixed_subtract(protection->speed_lower_bound_q22, parameters->deceleration_max_q22 * periods);
     protection->speed_lower_bound_q22 = bound_q22;
+    /* The sum cannot overflow: it is at most 16 counts of the coarsest encoder, 2^28, and a step adds less than 2^30.1:
+     * eight periods at the highest speed at 20 kHz. */
     if (bound_q22 < STANDSTILL_Q22) {
         protection->undetected_travel = 0;
-    } else if (protection->undetected_travel < UNDETECTED_TRAVEL_STOP) {
+    } else if (!protection->frozen) {
         protection->undetected_travel += periods * fixed_multiply_high(bound_q22, parameters->angle_step_q32);
     }
     protection->frozen |= protection->undetected_travel > parameters->undetected_travel_max;

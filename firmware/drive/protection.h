@@ -2,8 +2,10 @@
  * the first fault. Speed and encoder are checked alike in both directions.
  *
  *   immediate checks    in the control interrupt: over-current, over-voltage, encoder jump, overruns, break of the PWM
- *   deferred checks     in the deferred interrupt: under-voltage, over-speed, frozen encoder, command timeout. They act
- * one period later, or later still when the deferred interrupt is late; a condition that has gone by then is not seen.
+ *   deferred checks     in the deferred interrupt: under-voltage, frozen encoder, command timeout
+ *
+ * The latter act one period later, or later still when the deferred interrupt is late; a condition that has gone by
+ * then is not seen. Over-speed is a check of the background (encoder_monitor.h).
  */
 #ifndef DRIVE_PROTECTION_H
 #define DRIVE_PROTECTION_H
@@ -16,7 +18,7 @@ typedef struct {
     int32_t dc_link_over_voltage_q6;  /* V, Q9.6 */
     int32_t dc_link_under_voltage_q6; /* V, Q9.6 */
     int32_t angle_step_max;           /* largest plausible rotation per period, 2^-32 rev */
-    int32_t undetected_travel_max;    /* expected rotation without an encoder count, 2^-32 rev, < 2^30 */
+    int32_t undetected_travel_max;    /* expected rotation without an encoder count, 2^-32 rev, at most 2^28 */
     int32_t angle_step_q32;           /* control period: 2^-32 rev per rad/s Q9.22, in Q32 */
     int32_t deceleration_max_q22;     /* largest speed drop per period, at most as below, rad/s, Q9.22 */
     uint32_t command_timeout_us;      /* age of the last valid command that ends a run */
@@ -37,7 +39,7 @@ typedef struct {
     uint32_t encoder_angle;        /* of the previous check, 2^-32 rev */
     int32_t speed_counted_q22;     /* by the observer at the last encoder count, rad/s, Q9.22 */
     int32_t speed_lower_bound_q22; /* lowest speed that the rotor can have, rad/s, Q9.22 */
-    int32_t undetected_travel;     /* expected rotation since the last encoder count, 2^-32 rev; stops above 2^30 */
+    int32_t undetected_travel;     /* expected rotation since the last encoder count, 2^-32 rev, until frozen */
     bool frozen;                   /* found, and not counted since */
 } protection_deferred_t;
 
@@ -81,7 +83,7 @@ uint64_t protection_check(const protection_parameters_t *parameters, protection_
                           const protection_input_t *input);
 
 /* Deferred checks: fault mask of those that failed. The frozen encoder is detected over every period since the previous
- * check, but no more than 16 of them. */
+ * check, but no more than PROTECTION_SKIPPED_DEFERRED_MAX of them. */
 uint64_t protection_check_deferred(const protection_parameters_t *parameters, protection_deferred_t *protection,
                                    const protection_deferred_input_t *input);
 

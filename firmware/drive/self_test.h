@@ -1,7 +1,8 @@
 /* Checks of the drive itself, in slices in the background:
  *
  *   limits       each limit of protection.h against its complement, in every call
- *   constants    all constants of the control laws against the sum that they had when they were configured, in 20 calls
+ *   constants    all constants of the control laws and monitors against the sum that they had when they were
+ *                configured, in 20 calls
  *   fault latch  number, mask and state of the latched fault, which contradict each other when one has changed, and
  *                duties outside of a run, which a changed state has ended, in every call
  *   stack        the guard word at its end, in every call; how much of it has never been used, in a second

@@ -37,10 +37,11 @@ static bool widens_range(stall_monitor_t *monitor) {
     return true;
 }
 
-/* The rotor has come no further in either direction for STALL_SWING_US and the time in which the reference turns by
- * three strokes: r, of at most 4 f, and f have r f / (r + f), the speed of three strokes in the sum of their times.
- * Factors below 2^16. */
-static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *input, bool begins, uint32_t time_us) {
+/* The rotor has come no further in either direction, nor turned backwards more slowly by change_q22, for STALL_SWING_US
+ * and the time in which the reference turns by three strokes: r, of at most 4 f, and f have r f / (r + f), the speed of
+ * three strokes in the sum of their times. Factors below 2^16. speed_q22: in the direction of the reference. */
+static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *input, int32_t speed_q22,
+                              int32_t change_q22, bool begins, uint32_t time_us) {
     const uint32_t strokes = (uint32_t)machine_tables.rotor_poles * machine_tables.phases;
     const uint32_t swing_q10 = (THREE_STROKES_Q22 >> machine_tables.speed_exponent) / strokes >> 12;
     uint32_t reference_q10 = fixed_magnitude(input->speed_reference_q22) >> 12;
@@ -53,7 +54,9 @@ static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *inp
     if (begins) {
         monitor->ahead_q24 = monitor->lowest_ahead_q24 = 0;
     }
-    if (widens_range(monitor) || begins) {
+    const bool slower = speed_q22 < 0 && speed_q22 > fixed_add(monitor->slowest_q22, change_q22);
+    if (widens_range(monitor) || begins || slower) {
+        monitor->slowest_q22 = speed_q22;
         monitor->travel = 0;
     }
     return monitor->travel > (uint64_t)swing_q10 * STALL_SWING_US;
@@ -69,7 +72,7 @@ COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *in
     }
     const bool backwards = time_us - monitor->backwards_us <= STALL_TIME_US;
     const bool begins = !input->speed_mode || monitor->forward != forward;
-    if (makes_no_progress(monitor, input, begins, time_us) && backwards) {
+    if (makes_no_progress(monitor, input, speed_q22, change_q22, begins, time_us) && backwards) {
         return true;
     }
     monitor->forward = forward;

@@ -9,9 +9,11 @@
  * is held as long as the currents can be. A reference that changes its sign begins anew.
  *
  * Or, whatever the torque: for STALL_SWING_US and the time in which the reference turns by three strokes, at most 12 of
- * them a STALL_SWING_US, the rotor has come no further than it had been, by half a stroke in either direction, and has
- * turned backwards within STALL_TIME_US. With a phase lost it may swing between two angles for ever, at times faster
- * than the reference.
+ * them a STALL_SWING_US, the rotor has come no further than it had been, by half a stroke in either direction, nor has
+ * it since turned backwards more slowly than before, by a 128th of the reference, and it has turned backwards within
+ * STALL_TIME_US. With a phase lost it may swing between two angles for ever, at times faster than the reference. A
+ * heavy rotor that comes to its reference from the other side takes longer for the last half stroke before its
+ * standstill.
  */
 #ifndef DRIVE_STALL_MONITOR_H
 #define DRIVE_STALL_MONITOR_H
@@ -42,7 +44,8 @@ typedef struct {
     uint32_t looked_us;              /* of the last call */
     int32_t ahead_q24;               /* of the highest angle so far, electrical rev, Q8.24 */
     int32_t lowest_ahead_q24;        /* the lowest one, -1 at least */
-    uint64_t travel;                 /* of the reference since the rotor was last at a higher or lower one */
+    int32_t slowest_q22; /* backwards, a negative speed, since the rotor was last at a higher or lower one */
+    uint64_t travel;     /* of the reference since then, or since it last became slower */
 } stall_monitor_t;
 
 /* True when the rotor has been stalled for STALL_TIME_US at time_us. [background] */

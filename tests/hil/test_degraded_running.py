@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 
 from salient.bench.bench import Bench
+from salient.paths import ROOT
 
 CONTROLLERS = ["traditional", "paper", "salient"]
 MACHINES = ["saturating", "finite_element", "linear_cosine", "linear_trapezoid"]
+FOUR_PHASES = ROOT / "tools" / "examples" / "machines" / "map86.toml"
 STROKES_S = 0.025
 """An electrical revolution of a rotor with four poles at 600 r/min."""
 DEAD_ZONE_DEG = 6.0
@@ -109,6 +111,17 @@ def test_what_cannot_be_run_on_with_is_a_fault(make_bench, controller, kind, att
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
+def test_of_four_phases_the_three_that_remain_show_a_sensor_with_a_wrong_gain(make_bench, controller):
+    bench = loaded(make_bench, machine=str(FOUR_PHASES), controller=controller, load_Nm=4.0)
+    bench.fault("winding_open", phase="b")
+    bench.run_for(0.3)
+    assert bench.drive.state == "run" and degraded(bench) == 1
+    bench.fault("current_sensor_gain", phase="c", gain=0.7)
+    bench.run_for(0.4)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "current_sensor")
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
 def test_phase_with_a_dead_sensor_is_switched_off_within_a_stroke(make_bench, controller):
     bench = loaded(make_bench, controller=controller, load_Nm=4.0)
     begin_s = bench.time_s
@@ -145,6 +158,24 @@ def test_clear_fault_gives_a_whole_phase_back_and_a_new_run_alone_does_not(make_
     assert current_b(bench, bench.time_s - 0.1).max() > 10.0
     speed_rpm = bench.truth["RIG_TRUTH_MOTION.speed_rpm"].between(bench.time_s - 0.1, bench.time_s).value
     assert speed_rpm.min() > 594 and speed_rpm.max() < 606
+
+
+def test_phase_is_given_back_outside_a_run_when_the_parameter_no_longer_allows_it_and_its_loss_is_a_fault(make_bench):
+    bench = loaded(make_bench, load_Nm=0.0)
+    bench.fault("winding_open", phase="b")
+    bench.load_torque_Nm = 4.0
+    bench.run_for(0.2)
+    assert (bench.drive.state, degraded(bench)) == ("run", 1)
+    bench.load_torque_Nm = 0.0
+    bench.drive.off()
+    bench.run_for(0.15)
+    assert degraded(bench) == 1
+    bench.drive.parameters["degraded_running"] = 0
+    bench.run_for(0.15)
+    assert degraded(bench) == 0
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.2)
+    assert (bench.drive.state, bench.drive.fault) == ("fault", "phase_open")
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)

@@ -443,6 +443,24 @@ TEST_F(Drive, a_changed_latch_is_the_fault_memory_from_the_next_background_on) {
     EXPECT_EQ(drive.self_test.failed, SELF_TEST_FAULT_LATCH);
 }
 
+TEST_F(Drive, a_changed_constant_of_the_heat_is_a_failed_check_within_2_ms) {
+    uint32_t *const words[] = {&drive.control_parameters.thermal.winding.inverse_q48,
+                               &drive.control_parameters.thermal.switches.rate_q48,
+                               reinterpret_cast<uint32_t *>(&drive.control_parameters.temperature.limit[0]),
+                               reinterpret_cast<uint32_t *>(&drive.control_parameters.temperature.limit[1]),
+                               reinterpret_cast<uint32_t *>(&drive.control_parameters.temperature.torque_max_q24)};
+    for (uint32_t *const word : words) {
+        periods(100);
+        ASSERT_EQ(drive.self_test.failed, 0u);
+        *word ^= 1u << 15;
+        periods(80);
+        EXPECT_EQ(drive.self_test.failed, SELF_TEST_CONSTANTS);
+        *word ^= 1u << 15;
+        periods(80); // the pass that the changed word began
+        drive.self_test.failed = 0;
+    }
+}
+
 TEST_F(Drive, of_a_run_that_a_changed_state_ends_the_next_background_leaves_neither_duties_nor_a_torque) {
     periods(100);
     command(COMMAND_RUN);

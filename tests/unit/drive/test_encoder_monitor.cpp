@@ -181,6 +181,23 @@ TEST_F(EncoderMonitor, a_contradiction_waits_for_the_next_phase_for_a_64th_of_a_
     EXPECT_LT(periods, RATE_HZ / 32);
 }
 
+// Phase 1 is lost; phase 2 agrees, as its turn comes, and phase 0 alone contradicts for longer than 1/256 s.
+TEST_F(EncoderMonitor, one_phase_alone_is_no_evidence_when_all_others_but_a_lost_one_have_agreed) {
+    for (const bool lost : {true, false}) {
+        monitor = {};
+        input.lost_phases = lost ? 2u : 0u;
+        input.zero_at[2] = input.period + 1;
+        for (int k = 0; k < RATE_HZ / 500; k++) {
+            step(125.0, 125.0, 25.0, 2);
+        }
+        input.zero_at[0] = input.period + 1;
+        for (int k = 0; k < RATE_HZ / 150; k++) {
+            step(77.0, 65.0, 25.0);
+        }
+        EXPECT_EQ(monitor.angle, !lost);
+    }
+}
+
 TEST_F(EncoderMonitor, a_phase_has_company_while_another_has_contradicted_the_angle_within_a_quarter_of_a_second) {
     EXPECT_FALSE(encoder_monitor_suspects(&parameters, &monitor, 0));
     input.zero_at[1] = input.period + 1;
@@ -296,6 +313,30 @@ TEST_F(EncoderMonitor, counts_faster_than_the_limit_are_over_speed_within_a_mill
                 step(0.0, 0.0, 0.0);
             }
             EXPECT_FALSE(monitor.over_speed) << "at rest again";
+        }
+    }
+}
+
+// A check in each period or in each tenth: windows of 48 and 50 periods. At the first speeds beyond the limit, and at
+// those at which a window nearly has a turn less the travel at the limit.
+TEST_F(EncoderMonitor, over_speed_of_the_fastest_machine_is_found_at_100_khz_and_its_highest_speed_is_none) {
+    constexpr double LIMIT_RPM = 38400.0, FAST_PERIOD_S = 1e-5;
+    parameters.rate_hz = 100000;
+    parameters.travel = int32_t(LIMIT_RPM / 60.0 * FAST_PERIOD_S * 0x1p32);
+    for (const double sign : {1.0, -1.0}) {
+        for (const int spacing : {1, 10}) {
+            for (const auto &[part, fails] :
+                 {std::pair{0.9, false}, std::pair{1.0, false}, std::pair{1.05, false}, std::pair{1.08, true},
+                  std::pair{1.3, true}, std::pair{1.5, true}, std::pair{1.9, true}}) {
+                monitor = {};
+                bool failed = false;
+                for (int k = 0; k < 200; k += spacing) {
+                    step(sign * part * LIMIT_RPM * 6.0 * FAST_PERIOD_S * k, 0.0, 0.0);
+                    input.period += uint32_t(spacing) - 1u;
+                    failed = failed || monitor.over_speed;
+                }
+                EXPECT_EQ(failed, fails) << sign * part << " " << spacing;
+            }
         }
     }
 }

@@ -1,5 +1,6 @@
 // Balance of the phases: which differences of one phase from the others are its sensor's.
 #include <cstdint>
+#include <utility>
 
 #include <gtest/gtest.h>
 
@@ -93,6 +94,38 @@ TEST_F(PhaseBalance, nothing_is_judged_while_a_phase_does_not_conduct) {
     ratio[1] = 1.5;
     silent = 2;
     EXPECT_EQ(window(), 0u);
+}
+
+TEST_F(PhaseBalance, without_a_lost_phase_the_others_are_judged_if_there_are_three) {
+    sample.phases = 4;
+    for (const unsigned lost : {0u, 2u, 3u}) {
+        silent = lost;
+        sample.lost = 1u << lost;
+        for (const auto &[wrong, failed] :
+             {std::pair{1.36, FAULT_BIT(FAULT_CURRENT_SENSOR)}, std::pair{0.73, FAULT_BIT(FAULT_CURRENT_SENSOR)},
+              std::pair{1.3, uint64_t(0)}}) {
+            ratio[1] = wrong;
+            EXPECT_EQ(window(), failed) << lost << " " << wrong;
+            EXPECT_EQ(balance.phases, failed != 0 ? 2u : 0u);
+            balance = {};
+        }
+        ratio[1] = 1.0;
+    }
+}
+
+TEST_F(PhaseBalance, of_two_phases_that_are_left_neither_is_accused_of_a_difference_but_the_encoder_of_what_both_have) {
+    silent = 1;
+    sample.lost = 2u;
+    for (const double wrong : {3.0, 0.4}) {
+        ratio[2] = wrong;
+        EXPECT_EQ(window(), 0u) << wrong;
+        EXPECT_EQ(window(), 0u) << wrong;
+        balance = {};
+    }
+    ratio[0] = ratio[2] = 0.74;
+    EXPECT_EQ(window(), 0u);
+    EXPECT_EQ(window(), FAULT_BIT(FAULT_ENCODER_ANGLE));
+    EXPECT_EQ(balance.phases, 0u);
 }
 
 TEST_F(PhaseBalance, a_failed_check_remains_until_the_end_of_the_run) {

@@ -120,6 +120,25 @@ TEST_F(Stall,
     EXPECT_EQ(time_to_fault_us(1000000, swings(0.3, 0)), 0u);
 }
 
+// A reversal, or the start of a rotor that turns backwards, of a large inertia: half a stroke before it stands, and
+// after it, takes longer than a swing may. The ripple is that of the observer, 0.1 rad/s at 300 Hz.
+TEST_F(Stall, rotor_that_comes_to_its_reference_from_the_other_side_is_not_stalled_however_slowly) {
+    for (const int direction : {1, -1}) {
+        input.speed_reference_q22 = direction * 30 * RAD_S;
+        input.torque_reference_q24 = direction * 19 * NM;
+        for (const double ripple : {0.0, 0.1}) {
+            for (const double rad_s2 : {3.0, 4.0, 5.0, 6.0, 8.0}) {
+                const auto comes = [&](uint32_t us) {
+                    const double speed = rad_s2 * us * 1e-6 - 30.0 + ripple * std::sin(2 * M_PI * 300.0 * us * 1e-6);
+                    input.speed_q22 = static_cast<int32_t>(direction * speed * RAD_S);
+                };
+                EXPECT_EQ(time_to_fault_us(static_cast<uint32_t>(60e6 / rad_s2), comes), 0u)
+                    << direction * rad_s2 << " " << ripple;
+            }
+        }
+    }
+}
+
 TEST_F(Stall, rotor_held_within_a_swing_for_long_may_take_its_time_to_follow_a_reference) {
     EXPECT_EQ(time_to_fault_us(5200000,
                                [this](uint32_t us) {
