@@ -28,7 +28,7 @@
 #define WRONG_WAY_SPEED 0.05
 #define WRONG_WAY_TORQUE 0.1 /* of the rated one */
 #define LIMIT_MIN_NS (20 * ORACLE_MS_NS)
-#define LIMIT_AGE_MAX_NS (50 * ORACLE_MS_NS)
+#define LIMIT_AGE_MAX_NS (120 * ORACLE_MS_NS)
 
 static bool undisturbed(const oracle_t *oracle) {
     return !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) && !oracle_bus_disturbed(oracle);
@@ -215,7 +215,14 @@ static bool sets_in_effect(const oracle_t *oracle) {
     return oracle_limited(oracle) != NULL && oracle->applied >= (degraded ? 2u : 1u);
 }
 
-/* The torque keeps to the limit that telemetry announces, and to that which the client has set. */
+void oracle_judge_limit(oracle_t *oracle, uint64_t time_ns, double mean_Nm, double limit_Nm) {
+    const bool shares = oracle->world->controller == 2;
+    if (mean_Nm > (shares ? 1.15 : 1.3) * limit_Nm + (shares ? 0.05 : 0.1) * oracle->world->machine->torque_rated_Nm) {
+        oracle_violate(oracle, "above_limit", time_ns, oracle->world->controller, mean_Nm / limit_Nm);
+    }
+}
+
+/* The torque keeps to the limit that the client has set, and to that which telemetry announces before or after. */
 static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
     oracle_torque_t *torque = &oracle->any_torque;
     const oracle_telemetry_t *telemetry = &oracle->telemetry;
@@ -234,12 +241,10 @@ static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
     if (turned_rad < ORACLE_TWO_PI / plant->machine->rotor_poles || plant->time_ns < torque->begin_ns + LIMIT_MIN_NS) {
         return;
     }
-    const bool shares = oracle->world->controller == 2;
-    const double announced_Nm = fmax(telemetry->limit_Nm.high[0], telemetry->limit_Nm.high[1]);
-    const double limit_Nm = sets_in_effect(oracle) ? fmin(announced_Nm, oracle_torque_max_Nm(oracle)) : announced_Nm;
     const double mean_Nm = fabs(torque->sum_Nm / torque->samples);
-    if (mean_Nm > (shares ? 1.15 : 1.3) * limit_Nm + (shares ? 0.05 : 0.1) * oracle->world->machine->torque_rated_Nm) {
-        oracle_violate(oracle, "above_limit", plant->time_ns, oracle->world->controller, mean_Nm / limit_Nm);
+    oracle->mean_torque_Nm = fmax(oracle->mean_torque_Nm, mean_Nm);
+    if (sets_in_effect(oracle)) {
+        oracle_judge_limit(oracle, plant->time_ns, mean_Nm, oracle_torque_max_Nm(oracle));
     }
     torque->samples = 0;
 }

@@ -70,6 +70,9 @@ const world_event_t *oracle_limited(const oracle_t *oracle);
 /* The torque that the drive has at least for a change of the speed. */
 double oracle_torque_max_Nm(const oracle_t *oracle);
 
+/* A mean torque above a limit. */
+void oracle_judge_limit(oracle_t *oracle, uint64_t time_ns, double mean_Nm, double limit_Nm);
+
 /* The commanded speed is one that the drive turns at. */
 bool oracle_can_turn(const oracle_t *oracle);
 

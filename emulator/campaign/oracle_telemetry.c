@@ -141,6 +141,9 @@ static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data
     telemetry->limit_window_ns = renew ? time_ns : telemetry->limit_window_ns;
     telemetry->limit_ns = time_ns;
     widen(&telemetry->limit_Nm, limit_Nm, renew);
+    oracle_judge_limit(oracle, time_ns, oracle->mean_torque_Nm,
+                       fmax(telemetry->limit_Nm.high[0], telemetry->limit_Nm.high[1]));
+    oracle->mean_torque_Nm = 0.0;
     if (limit_Nm > most_Nm * (fmin(fmax(room, 0.0), 1.0) + DERATING_ERROR_MAX) &&
         !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
         oracle_violate(oracle, "not_derated", time_ns, 0, limit_Nm / most_Nm);
