@@ -104,6 +104,20 @@ def test_workers_end_with_a_runner_that_is_killed(tmp_path):
     assert len(read_results(tmp_path)) >= 4
 
 
+def test_workers_are_children_whatever_the_default_of_python_is(tmp_path):
+    """From 3.14 on it is a fork server, whose workers have another parent."""
+    code = ("import math, multiprocessing, pathlib, sys\n"
+            "from salient.experiments.tasks import Task, run\n"
+            "if __name__ == '__main__':\n"
+            "    multiprocessing.set_start_method('forkserver')\n"
+            "    print([result for _, result in run([Task('4', 4)], math.sqrt, pathlib.Path(sys.argv[1]), jobs=1)])\n")
+    script = tmp_path / "script.py"
+    script.write_text(code)
+    done = subprocess.run([sys.executable, str(script), str(tmp_path / "out")], capture_output=True, text=True,
+                          check=False)
+    assert (done.stdout, done.stderr) == ("[2.0]\n", "")
+
+
 def test_folder_in_use_is_refused(tmp_path):
     running = run(tasks(), math.sqrt, tmp_path, jobs=1)
     next(running)

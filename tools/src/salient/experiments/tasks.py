@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import json
+import multiprocessing
 import os
 import signal
 import socket
@@ -124,8 +125,9 @@ def _on_this_computer(tasks: Sequence[Task], function: Callable[[Any], Any], job
                       ) -> Generator[tuple[Task, Any], None, None]:
     left = {task.key: task for task in tasks}
     breaks = 0
+    context = multiprocessing.get_context("fork")  # workers of a fork server are not children of this process
     while left:
-        workers = ProcessPoolExecutor(jobs, initializer=_begin_worker, initargs=(os.getpid(),))
+        workers = ProcessPoolExecutor(jobs, context, _begin_worker, (os.getpid(),))
         try:
             for task, result in _executed(workers, left.values(), function, jobs):
                 del left[task.key]
