@@ -127,6 +127,21 @@ def test_folder_in_use_is_refused(tmp_path):
     assert results(tmp_path) == SQUARE_ROOTS
 
 
+def test_a_run_afresh_forgets_its_own_file_only_and_not_while_another_process_writes_it(tmp_path):
+    results(tmp_path, shard=(1, 3), jobs=1)
+    running = run(tasks(), math.sqrt, tmp_path, jobs=1)
+    for _ in range(20):
+        next(running)
+    written = (tmp_path / RESULTS).read_bytes()
+    with pytest.raises(UsageError, match="runs.jsonl: another process writes it"):
+        results(tmp_path, afresh=True)
+    assert (tmp_path / RESULTS).read_bytes() == written != b""
+    running.close()
+    assert results(tmp_path, afresh=True, jobs=1) == SQUARE_ROOTS
+    keys = [json.loads(line)["key"] for line in (tmp_path / RESULTS).read_text().splitlines()]
+    assert sorted(keys) == sorted(list(SQUARE_ROOTS)[n] for n in range(40) if n % 3)
+
+
 def test_unwritable_folder_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match=r"file/runs.jsonl: cannot write there \(.*\); choose a writable folder"):

@@ -62,14 +62,13 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     """Runs a sweep; exit code 1 when a run has failed."""
     combinations = runs_of(options)
     listed = [tasks.Task(_key(of), of) for of in combinations]
-    if not options.resume and options.shard == (1, 1):
-        tasks.remove_results(options.out)
+    afresh = not options.resume and options.shard == (1, 1)
     results: dict[str, Any] = {}
     mine = len(listed[options.shard[0] - 1::options.shard[1]])
     lines = mine if sys.stderr.isatty() else min(mine, _PROGRESS_LINES_MAX)
     with Progress(lines, sys.stderr) as progress:
-        for done, (task, result) in enumerate(tasks.run(listed, run_one, options.out, options.shard, options.scheduler,
-                                                        options.jobs), start=1):
+        finished = tasks.run(listed, run_one, options.out, options.shard, options.scheduler, options.jobs, afresh)
+        for done, (task, result) in enumerate(finished, start=1):
             results[task.key] = result
             if done * lines // mine > (done - 1) * lines // mine:
                 progress.step(", ".join(f"{name} {value}" for name, value in task.arguments.columns.items()))
@@ -111,7 +110,8 @@ def runs_of(options: argparse.Namespace) -> list[Run]:
         for profile in options.load_profile:
             read_load_profile(load_profile_path(profile))
         axes["load_profile"] = options.load_profile
-    axes["seed"] = [(options.seed or base[0].seed) + n for n in range(options.seeds)]
+    first_seed = base[0].seed if options.seed is None else options.seed
+    axes["seed"] = [first_seed + n for n in range(options.seeds)]
     program = _digest(executable())
     found = []
     for combination in itertools.product(*axes.values()):

@@ -46,18 +46,22 @@ class Task:
 
 
 def run(tasks: Sequence[Task], function: Callable[[Any], Any], out: Path, shard: tuple[int, int] = (1, 1),
-        scheduler: str | None = None, jobs: int | None = None) -> Generator[tuple[Task, Any], None, None]:
+        scheduler: str | None = None, jobs: int | None = None, afresh: bool = False
+        ) -> Generator[tuple[Task, Any], None, None]:
     """Yields each task of the shard with its result: first those that the folder has already, then the others as they
     finish.
 
     shard: (i, n), every n-th task beginning with the i-th, with a file of its own; several may share a folder.
     scheduler: address of a Dask scheduler, whose workers need this package; without it `jobs` processes of this
     computer, by default as many as it has cores. A worker that dies loses nothing: what it did not finish is done
-    again. UsageError: the folder is in use or cannot be written, no scheduler answers.
+    again. afresh: forgets what the file of this shard has, once no other process writes it. UsageError: the folder is in
+    use or cannot be written, no scheduler answers.
     """
     number, count = shard
     mine = list({task.key: task for task in tasks[number - 1::count]}.values())
     with _open_results(out, shard) as file:
+        if afresh:
+            file.truncate(0)
         finished = read_results(out)
         todo = [task for task in mine if task.key not in finished]
         for task in mine:
@@ -90,12 +94,6 @@ def read_results(out: Path) -> dict[str, Any]:
                 entry = json.loads(line)
                 results[entry["key"]] = entry["result"]
     return results
-
-
-def remove_results(out: Path) -> None:
-    """Forgets what the folder has, of all shards."""
-    for path in out.glob("runs*.jsonl"):
-        path.unlink(missing_ok=True)
 
 
 def _open_results(out: Path, shard: tuple[int, int]) -> TextIO:
