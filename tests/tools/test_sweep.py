@@ -145,6 +145,7 @@ def test_no_column_of_metrics_is_the_name_of_a_setting():
     (("--set", "torque_max_Nm=5,5"), "finite and different"),
     (("--set", "torque_max_Nm=500"), "parameters.torque_max_Nm: 500: must be a number from"),
     (("--set", "load_torque_Nm=1e9"), "load_torque_Nm=1e9: 1e.09: must be a number from"),
+    (("--load-Nm", "1,20000"), "--load-Nm 20000: must be a number from -10000 to 10000"),
     (("--machine", "nonesuch"), "nonesuch"),
     (("--load-profile", "nonesuch"), "load_profile 'nonesuch': no such file"),
 ])

@@ -51,7 +51,7 @@ _TRACE_PARTS, _TRACE_PHASES = 8, 4
 _OPERATIONS = value_numbers(drive_database(), "PARAMETER_REQUEST", "operation")
 
 
-class DriveError(Exception):
+class DriveError(RunFailed):
     """The drive rejected a request or did not respond; the message has the reason."""
 
 
@@ -59,7 +59,7 @@ class OtherDatabase(DriveError, UsageError):
     """A reference for a drive whose DBC is not that of the session: the drive would take it for another one."""
 
 
-class DriveNotReady(DriveError, RunFailed):
+class DriveNotReady(DriveError):
     """A check keeps the drive in state initialise; the message names it."""
 
 

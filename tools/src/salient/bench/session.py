@@ -22,6 +22,7 @@ from salient.bench.rig import Fault, Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
 from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.dbc import database_hash
+from salient.errors import RunFailed
 
 RIG_RUN_UNTIL_ID = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
 _ALIVE_CHECK_S = 1.0
@@ -37,7 +38,7 @@ _IDENTITY_WAIT_NS = 250_000_000
 """More than two periods of DRIVE_IDENTITY."""
 
 
-class SessionError(Exception):
+class SessionError(RunFailed):
     """The emulator has ended."""
 
 

@@ -24,6 +24,7 @@ from can import CanError
 from salient.bench.drive import DriveError
 from salient.bench.load_profile import load_profile_path, read_load_profile
 from salient.bench.programs import EmulatorError, executable
+from salient.bench.rig import variable_range
 from salient.bench.session import SessionError
 from salient.errors import RunFailed, UsageError
 from salient.experiments import metrics as run_metrics
@@ -105,6 +106,10 @@ def runs_of(options: argparse.Namespace) -> list[Run]:
     if options.load_Nm:
         if not base[0].load:
             raise UsageError(f"--load-Nm: {options.scenario} has no [[load]] to change")
+        low_Nm, high_Nm = variable_range("load_torque_Nm")
+        for load_Nm in options.load_Nm:
+            if not low_Nm <= load_Nm <= high_Nm:
+                raise UsageError(f"--load-Nm {load_Nm:g}: must be a number from {low_Nm:g} to {high_Nm:g}")
         axes["load_Nm"] = options.load_Nm
     if options.load_profile:
         for profile in options.load_profile:

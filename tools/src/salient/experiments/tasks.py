@@ -54,8 +54,8 @@ def run(tasks: Sequence[Task], function: Callable[[Any], Any], out: Path, shard:
     shard: (i, n), every n-th task beginning with the i-th, with a file of its own; several may share a folder.
     scheduler: address of a Dask scheduler, whose workers need this package; without it `jobs` processes of this
     computer, by default as many as it has cores. A worker that dies loses nothing: what it did not finish is done
-    again. afresh: forgets what the file of this shard has, once no other process writes it. UsageError: the folder is in
-    use or cannot be written, no scheduler answers.
+    again. afresh: forgets what the file of this shard has, once no other process writes it. UsageError: the folder is
+    in use or cannot be written, no scheduler answers.
     """
     number, count = shard
     mine = list({task.key: task for task in tasks[number - 1::count]}.values())

@@ -17,7 +17,7 @@ from salient.experiments.campaign import canaries, names
 from salient.experiments.campaign.failure import Failure, load, replay, save
 from salient.experiments.campaign.runner import ALL_EVENTS, Result, digest, processor_s, serve, world
 from salient.experiments.tasks import Task, read_results, run
-from salient.paths import ROOT
+from salient.paths import ROOT, make_folder
 from salient.progress import Progress
 
 _SHOWN_MAX = 8
@@ -144,6 +144,7 @@ def run_replay(options: argparse.Namespace) -> int:
             raise UsageError(f"--target {options.build}: {folder} has a planted bug, which the host alone can have")
         programs = canaries.build(failure.canary)
         print(f"with the planted bug {failure.canary}: {canaries.canaries()[failure.canary - 1].name}")
+    make_folder(folder)
     described = world(seed, kept, healthy)
     print(f"seed {seed}: {described['machine']}, {described['controller']}, {described['control_rate_hz']} Hz, encoder "
           f"of {described['encoder_bits']} bits{' with edges' if described['encoder_edges'] else ''}")
