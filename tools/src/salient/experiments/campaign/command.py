@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import re
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -53,14 +54,21 @@ def run_campaign(options: argparse.Namespace) -> int:
         (options.out / f"rate{part}.json").write_text(json.dumps(rate, indent=2) + "\n", encoding="utf-8")
         print(f"{rate['worlds'] / spent_s:.0f} worlds, {rate['virtual_s'] / spent_s:.1f} s of virtual time a processor "
               "second")
+    saved_seeds: set[int] = set()
     for violation, entry in list(note["violations"].items())[:0 if options.no_shrink else _SHOWN_MAX]:
         seed = entry["seeds"][0]
-        folder = options.out / "failures" / f"{seed}"
+        folder = options.out / "failures" / _folder_name(seed, violation, saved_seeds)
+        saved_seeds.add(seed)
         saved = save(seed, violation, folder, options.healthy)
         events = ", ".join(f"{event['event']} at {event['begin_us']} us" for event in saved["world"]["events"])
         print(f"{violation}: seed {seed} needs {len(saved['world']['events'])} events ({events or 'none'}); "
               f"{saved['replay']}")
     return 1 if note["violations"] else 0
+
+
+def _folder_name(seed: int, violation: str, saved_seeds: Collection[int]) -> str:
+    """SEED; for the further classes of a seed SEED-CLASS."""
+    return f"{seed}-{re.sub('[^a-z0-9_]+', '-', violation.lower())}" if seed in saved_seeds else f"{seed}"
 
 
 def summary(results: Iterable[Result], first: int, seeds: int, kind: str) -> dict[str, Any]:
