@@ -155,6 +155,14 @@ class Drive(KnownAttributes):
         self.command_due_ns = None
         self._end_arming()
 
+    def time_begins_anew(self) -> None:
+        """The session's time is an earlier one from here on: what is to be repeated is due now, an arming has ended."""
+        if self.command_due_ns is not None:
+            self.command_due_ns = self._session.time_ns
+        if self._disarmed_ns is not None:
+            self._disarmed_ns = self._session.time_ns
+        self._end_arming()
+
     def ask(self, request: str) -> None:
         """Request off, run, stop or clear_fault; sends it immediately."""
         if request not in REQUESTS:
