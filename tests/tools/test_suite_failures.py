@@ -160,7 +160,7 @@ def test_a_folder_that_is_used_again_has_nothing_of_the_earlier_failure(tmp_path
     for name in (*LEFT, "notes.txt"):
         (tmp_path / name).write_text("of an earlier failure")
     bench.run_for(0.001)
-    save(bench, tmp_path, {}, None)
+    save(bench, tmp_path, {"replay": "none"}, None)
     assert not (tmp_path / "first_fault.png").exists() and not (tmp_path / "truth.npy").exists()
     assert "The first fault" not in (tmp_path / "failure.html").read_text()
     assert (tmp_path / "notes.txt").exists()
