@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 
 from salient.cli import make_parser
+from salient.errors import RunFailed
 from salient.experiments import fault_table
 from salient.experiments.campaign import canaries, command, names, report, same_bits
 from salient.experiments.campaign.cluster import compare
 from salient.experiments.campaign.command import run_campaign
 from salient.experiments.campaign.failure import classes, replay
 from salient.experiments.campaign.machines import files
-from salient.experiments.campaign.runner import Programs, branches, program, run_world, world
+from salient.experiments.campaign.runner import Programs, branches, program, run_world, serve, world
 from salient.experiments.tasks import read_results
 from salient.paths import BUILD
 
@@ -74,6 +75,11 @@ def test_a_seed_that_breaks_two_rules_leaves_a_folder_of_each(tmp_path: Path, mo
     lines = capsys.readouterr().out.splitlines()[-2:]
     assert [line.split("; ")[-1] for line in lines] == [f"tools/salient replay {tmp_path}/failures/{name}"
                                                         for name in saved]
+
+
+def test_a_worker_with_another_build_ends_the_campaign() -> None:
+    with pytest.raises(RunFailed, match="a worker has another build of the drive than this computer"):
+        serve((1, False, "digest of another build"))
 
 
 def test_leaving_an_event_out_moves_no_other() -> None:

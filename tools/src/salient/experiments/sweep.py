@@ -26,7 +26,7 @@ from salient.bench.load_profile import load_profile_path, read_load_profile
 from salient.bench.programs import EmulatorError, executable
 from salient.bench.rig import variable_range
 from salient.bench.session import SessionError
-from salient.errors import RunFailed, UsageError
+from salient.errors import UsageError
 from salient.experiments import metrics as run_metrics
 from salient.experiments import tasks
 from salient.experiments.metrics import MetricsError, load_step_metrics, losses, start_metrics
@@ -163,8 +163,7 @@ def _digest(file: Path) -> str:
 
 def run_one(of: Run) -> dict[str, Any]:
     """The metrics of a combination, and why there are none or fault; executed by a worker."""
-    if _digest(executable()) != of.program:
-        raise RunFailed("a worker has another build of the drive than this computer; install the same on all")
+    tasks.check_build(_digest(executable()), of.program)
     row: dict[str, Any] = dict.fromkeys(METRICS)
     error = ""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:

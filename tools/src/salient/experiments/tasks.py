@@ -85,6 +85,12 @@ def execute(tasks: Sequence[Task], function: Callable[[Any], Any], scheduler: st
         yield from _on_a_cluster(tasks, function, scheduler)
 
 
+def check_build(present: str, wanted: str) -> None:
+    """RunFailed on a worker whose programs have another digest than those of the computer that hands out the tasks."""
+    if present != wanted:
+        raise RunFailed("a worker has another build of the drive than this computer; install the same on all")
+
+
 def read_results(out: Path) -> dict[str, Any]:
     """The results in a folder, of all shards, by key. The end of a line that was being written is left out."""
     results = {}

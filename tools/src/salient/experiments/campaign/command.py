@@ -30,7 +30,7 @@ def run_campaign(options: argparse.Namespace) -> int:
     """`campaign`; returns the exit code."""
     seeds = range(options.first, options.first + options.seeds)
     kind = "healthy" if options.healthy else "faults"
-    tasks = [Task(f"{kind} {seed} {digest()}", (seed, options.healthy)) for seed in seeds]
+    tasks = [Task(f"{kind} {seed} {digest()}", (seed, options.healthy, digest())) for seed in seeds]
     mine = tasks[options.shard[0] - 1::options.shard[1]]
     results: list[Result] = []
     new: list[Result] = []
