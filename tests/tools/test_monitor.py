@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import signal
 import socket
@@ -12,7 +13,7 @@ import threading
 import can
 import pytest
 
-from salient.bus import monitor
+from salient.bus import clock, monitor
 
 
 @pytest.fixture
@@ -161,7 +162,20 @@ def test_parameters_of_a_bus_without_a_drive_end_with_one_line(salient_without_b
         server.listen()
         done = salient_without_build("parameters", "faults", "--can", f"unix:{tmp_path}/bus.sock")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == f"salient: unix:{tmp_path}/bus.sock: no frame for 0.02 s; is there a drive?\n"
+    assert done.stderr == f"salient: unix:{tmp_path}/bus.sock: no frame of a drive for 0.02 s; is there one?\n"
+
+
+def test_reader_of_a_bus_of_other_nodes_ends_after_its_timeout(monkeypatch):
+    class Bus:
+        """A SocketCAN interface that always has a frame of another node."""
+
+        def recv(self, timeout):
+            return can.Message(timestamp=1.6e9, arbitration_id=0x7F0, is_extended_id=False, data=bytes(8))
+
+    now_s = itertools.count(100.0, 0.25)
+    monkeypatch.setattr(clock.time, "monotonic", lambda: next(now_s))
+    assert clock.VirtualTimeReader(Bus()).receive(1.0) is None
+    assert next(now_s) == 101.25
 
 
 def test_parameters_of_a_bus_that_ends_are_one_line(salient_without_build, tmp_path):

@@ -67,7 +67,7 @@ class Session(KnownAttributes):
     lockstep: this session moves time (the pace of the emulator is lockstep). Otherwise time moves by itself, and the
     session follows it by the times of received frames. is_alive: the emulator has not ended; without it the end of the
     emulator is seen on a local bus only. A session waits for the emulator for any wall time, as at a breakpoint, unless
-    silence_max_s bounds that without a frame; then SessionError.
+    silence_max_s bounds that without a frame of the drive or the emulator; then SessionError.
 
     machine: name or file of the drive's machine, whose DBC the session then uses; without it that in SI units. To a
     drive that reports another DBC no reference is sent (OtherDatabase); its frames are decoded, after a warning.
@@ -256,7 +256,7 @@ class Session(KnownAttributes):
         if not self._is_alive():
             raise SessionError(f"{self.address}: the emulator has ended")
         if silent_s >= self._silence_max_s:
-            raise SessionError(f"{self.address}: no frame for {silent_s:g} s; is there a drive?")
+            raise SessionError(f"{self.address}: no frame of a drive for {silent_s:g} s; is there one?")
 
     def _advance(self, time_ns: int) -> None:
         if self._lockstep:
