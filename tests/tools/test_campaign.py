@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 
 from salient.cli import make_parser
+from salient.errors import RunFailed
 from salient.experiments import fault_table
-from salient.experiments.campaign import canaries, names, report, same_bits
+from salient.experiments.campaign import canaries, command, names, report, same_bits
 from salient.experiments.campaign.cluster import compare
 from salient.experiments.campaign.command import run_campaign
 from salient.experiments.campaign.failure import classes, replay
 from salient.experiments.campaign.machines import files
-from salient.experiments.campaign.runner import Programs, branches, program, run_world, world
+from salient.experiments.campaign.runner import Programs, branches, program, run_world, serve, world
 from salient.experiments.tasks import read_results
 from salient.paths import BUILD
 
@@ -55,6 +56,30 @@ def test_a_scheduler_whose_worker_is_killed_has_the_summary_of_one_computer_byte
     assert read_results(many) == read_results(one) and len(read_results(one)) == 60
     rate = json.loads((one / "rate.json").read_text(encoding="utf-8"))
     assert rate["worlds"] == 60 and 0.1 < rate["processor_s"] < 60.0 and 10.0 < rate["virtual_s"] < 40.0
+
+
+def test_a_seed_that_breaks_two_rules_leaves_a_folder_of_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                                              capsys: pytest.CaptureFixture[str]) -> None:
+    violations = [{"rule": "gate_on", "number": 1, "at_us": 5}, {"rule": "no_command", "number": 2, "at_us": 7}]
+    saved = {}
+
+    def save(seed: int, violation: str, folder: Path, healthy: bool) -> dict[str, object]:
+        saved[folder.name] = violation
+        return {"world": {"events": []}, "replay": f"tools/salient replay {folder}"}
+
+    monkeypatch.setattr(command, "run", lambda tasks, *_: [(tasks[0], {"seed": 3, "violations": violations})])
+    monkeypatch.setattr(command, "save", save)
+    assert run_campaign(make_parser().parse_args(["campaign", "--first", "3", "--seeds", "1", "--out", str(tmp_path)])
+                        ) == 1
+    assert saved == {"3": "gate_on: outside of run", "3-no_command-after-off": "no_command: after off"}
+    lines = capsys.readouterr().out.splitlines()[-2:]
+    assert [line.split("; ")[-1] for line in lines] == [f"tools/salient replay {tmp_path}/failures/{name}"
+                                                        for name in saved]
+
+
+def test_a_worker_with_another_build_ends_the_campaign() -> None:
+    with pytest.raises(RunFailed, match="a worker has another build of the drive than this computer"):
+        serve((1, False, "digest of another build"))
 
 
 def test_leaving_an_event_out_moves_no_other() -> None:

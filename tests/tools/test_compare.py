@@ -11,7 +11,7 @@ import pytest
 
 from salient.cli import make_parser
 from salient.config import CONTROLLERS
-from salient.errors import UsageError
+from salient.errors import RunFailed, UsageError
 from salient.experiments.compare import (
     baseline,
     command,
@@ -28,7 +28,7 @@ from salient.experiments.compare.finished_runs import FinishedRuns
 from salient.experiments.compare.machine import cases_of, subject, targets_of
 from salient.experiments.compare.metrics import EXTRACTORS, METRICS, failures, peak_current_max_A
 from salient.experiments.compare.random_cases import random_drive, random_load
-from salient.experiments.compare.runner import RunMetrics, run_all
+from salient.experiments.compare.runner import RunMetrics, _run, run_all
 from salient.experiments.compare.targets import TARGETS, Target
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep, load_scenarios
 from salient.machine.drive_data import derive
@@ -821,3 +821,8 @@ def test_every_metric_of_a_row_has_a_label():
     for group in GROUPS.values():
         for metric, _ in group.columns:
             assert METRICS[metric].label
+
+
+def test_a_worker_with_another_build_ends_the_comparison():
+    with pytest.raises(RunFailed, match="a worker has another build of the drive than this computer"):
+        _run((ALL_CASES["dip"][0], "digest of another build"))

@@ -9,7 +9,15 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from can import CanOperationError
 
+from salient import __main__ as salient_main
+from salient.bench.drive import DriveError, OtherDatabase
+from salient.bench.faults import FaultError
+from salient.bench.programs import EmulatorError
+from salient.bench.rig import RigError
+from salient.bench.session import SessionError
+from salient.machine.path import MachineError
 from salient.paths import MACHINES, ROOT
 
 SCENARIO = """
@@ -83,6 +91,14 @@ def test_invalid_command_line_is_rejected(salient, arguments, expected_texts):
         (SCENARIO + "[parameters]\ntorque_max = 1\n", ["parameters.torque_max", "torque_max_Nm"]),
         (SCENARIO + "[parameters]\ntorque_max_Nm = 1000\n", ["parameters.torque_max_Nm", "1000", "0 to 100 N m"]),
         (SCENARIO + "[parameters]\ntorque_max_Nm = true\n", ["parameters.torque_max_Nm", "must be a number"]),
+        (SCENARIO + '[[fault]]\nkind = "winding_open"\nphase = "d"\nat_s = 0.001\n',
+         ["fault.phase", "'d'", "a, b or c", "saturating"]),
+        (SCENARIO + 65 * "[[load]]\nat_s = 0.001\ntorque_Nm = 1\n", ["load", "65 changes", "at most 64"]),
+        (SCENARIO + 33 * '[[fault]]\nkind = "winding_open"\nphase = "a"\nat_s = 0.001\nduration_s = 0.001\n',
+         ["fault", "66 changes", "at most 64"]),
+        (SCENARIO + "[record]\nfrom_s = 0.01\n", ["record.from_s", "0.01", "below duration_s"]),
+        (SCENARIO + "[bench]\ntruth_period_us = 0\n", ["bench.truth_period_us", "1 to 10000"]),
+        (SCENARIO + "[bench]\ntruth_period_us = 10001\n", ["bench.truth_period_us", "1 to 10000"]),
         (SCENARIO + "seed = \n", ["not TOML"]),
         (SCENARIO + "seed = " + 5000 * "9", ["not TOML", "too long"]),
         (SCENARIO + "seed = " + 20000 * "[", ["not TOML", "too deep"]),
@@ -92,6 +108,41 @@ def test_invalid_scenario_is_rejected(salient_without_build, tmp_path, text, exp
     path = tmp_path / "scenario.toml"
     path.write_text(text)
     assert_usage_error(salient_without_build("run", path, "--out", tmp_path / "out"), *expected_texts)
+
+
+def test_what_the_bench_can_take_is_accepted(salient_without_build, tmp_path):
+    path = tmp_path / "scenario.toml"
+    path.write_text(SCENARIO + 64 * "[[load]]\nat_s = 0.001\ntorque_Nm = 1\n" + "[[load]]\nat_s = 0\ntorque_Nm = 1\n"
+                    + 32 * '[[fault]]\nkind = "winding_open"\nphase = "a"\nat_s = 0.001\nduration_s = 0.001\n'
+                    + "[bench]\ntruth_period_us = 10000\n")
+    result = salient_without_build("run", path, "--out", tmp_path / "out")
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("arguments", [("run", "start_600"), ("replay", "1")], ids=lambda arguments: arguments[0])
+def test_a_file_in_the_place_of_the_folder_is_named(salient_without_build, tmp_path, arguments):
+    (tmp_path / "file").write_text("")
+    assert_usage_error(salient_without_build(*arguments, "--out", "file"), "--out file", "cannot write there")
+
+
+def test_unknown_machine_of_a_tab_is_named(salient_without_build):
+    assert_usage_error(salient_without_build("tab", "--machine", "nonesuch"), "nonesuch", "saturating")
+
+
+@pytest.mark.parametrize(("error", "code"), [
+    (RigError("load_torque_Nm 1: queue_full"), 2), (FaultError("winding_open d: unsupported"), 2),
+    (MachineError("mine.toml: bad"), 2), (OtherDatabase("another drive.dbc"), 2), (DriveError("no response"), 1),
+    (SessionError("the emulator has ended"), 1), (EmulatorError("salient_host ended with -9"), 1),
+    (CanOperationError("the drive has ended"), 1),
+], ids=lambda value: type(value).__name__)
+def test_errors_of_the_package_are_one_line(salient_without_build, monkeypatch, error, code):
+    def fail(_: object) -> int:
+        raise error
+
+    monkeypatch.setitem(salient_main._COMMANDS, "parameters", fail)
+    result = salient_without_build("parameters", "faults", "--can", "unix:bus")
+    of_bus = "unix:bus: " if isinstance(error, CanOperationError) else ""
+    assert (result.returncode, result.stderr) == (code, f"salient: {of_bus}{error}\n")
 
 
 def machine_file(folder: Path, name: str, old: str, new: str) -> Path:

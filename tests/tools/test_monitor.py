@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 
 import can
 import pytest
+
+from salient.bus import clock, monitor
 
 
 @pytest.fixture
@@ -116,6 +121,74 @@ def test_drive_stopped_before_the_requested_duration_is_reported(listen):
     listen.bench.simulator.close()
     assert finish(process)[1:] == (f"salient: {listen.bench.address}: the drive's bus closed before --duration-s 10 had"
                                    " passed: the drive was stopped\n", 1)
+
+
+class UnpluggedBus:
+    """A SocketCAN interface that goes away after a frame."""
+
+    def __init__(self, address):
+        self.frames = [can.Message(timestamp=1.6e9, arbitration_id=0x180, is_extended_id=False, data=bytes(8))] * 2
+
+    def recv(self, timeout):
+        if self.frames:
+            return self.frames.pop(0)
+        raise can.CanOperationError("Failed to receive: No such device [Error Code 19]")
+
+    def shutdown(self):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        pass
+
+
+@pytest.mark.parametrize(("command", "early"), [("log", ""), ("monitor", " before --duration-s 10 had passed")])
+def test_interface_that_goes_away_is_reported(salient_without_build, monkeypatch, tmp_path, command, early):
+    monkeypatch.setattr(monitor, "open_bus", UnpluggedBus)
+    monkeypatch.setattr(monitor.signal, "signal", lambda *_: None)
+    options = ["--out", tmp_path / "can.log"] if command == "log" else ["--duration-s", "10"]
+    done = salient_without_build(command, "--can", "socketcan:can0", *options)
+    assert (done.returncode, done.stderr) == (1, f"salient: socketcan:can0: the interface failed{early}: Failed to "
+                                                 "receive: No such device [Error Code 19]\n")
+
+
+def test_parameters_of_a_bus_without_a_drive_end_with_one_line(salient_without_build, monkeypatch, tmp_path):
+    monkeypatch.setattr("salient.bench.session._ALIVE_CHECK_S", 0.01)
+    monkeypatch.setattr("salient.bench.parameter_file._SILENCE_MAX_S", 0.02)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
+        server.bind(f"{tmp_path}/bus.sock")
+        server.listen()
+        done = salient_without_build("parameters", "faults", "--can", f"unix:{tmp_path}/bus.sock")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == f"salient: unix:{tmp_path}/bus.sock: no frame of a drive for 0.02 s; is there one?\n"
+
+
+def test_reader_of_a_bus_of_other_nodes_ends_after_its_timeout(monkeypatch):
+    class Bus:
+        """A SocketCAN interface that always has a frame of another node."""
+
+        def recv(self, timeout):
+            return can.Message(timestamp=1.6e9, arbitration_id=0x7F0, is_extended_id=False, data=bytes(8))
+
+    now_s = itertools.count(100.0, 0.25)
+    monkeypatch.setattr(clock.time, "monotonic", lambda: next(now_s))
+    assert clock.VirtualTimeReader(Bus()).receive(1.0) is None
+    assert next(now_s) == 101.25
+
+
+def test_parameters_of_a_bus_that_ends_are_one_line(salient_without_build, tmp_path):
+    def end() -> None:
+        server.accept()[0].close()
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
+        server.bind(f"{tmp_path}/bus.sock")
+        server.listen()
+        threading.Thread(target=end, daemon=True).start()
+        done = salient_without_build("parameters", "faults", "--can", f"unix:{tmp_path}/bus.sock")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == f"salient: unix:{tmp_path}/bus.sock: the drive has ended\n"
 
 
 def test_monitor_shows_chosen_signals_of_both_databases_with_units_and_names(listen):

@@ -14,7 +14,7 @@ import can
 import numpy as np
 import pytest
 
-from salient.bench.failure import changes
+from salient.bench.failure import LEFT, changes, save
 from salient.experiments.compare.every_machine import EXAMPLES
 
 SUITE = '''
@@ -154,6 +154,16 @@ def test_teardown_that_fails_after_the_call_has_a_folder_of_its_own(tmp_path):
     assert "first" in errors["test_two.py_test_both"] and "second" in errors["test_two.py_test_both_teardown"]
     note = json.loads((tmp_path / "build" / "failures" / "test_two.py_test_both" / "0" / "bench.json").read_text())
     assert note["machine"] == str(machine)
+
+
+def test_a_folder_that_is_used_again_has_nothing_of_the_earlier_failure(tmp_path, bench):
+    for name in (*LEFT, "notes.txt"):
+        (tmp_path / name).write_text("of an earlier failure")
+    bench.run_for(0.001)
+    save(bench, tmp_path, {"replay": "none"}, None)
+    assert not (tmp_path / "first_fault.png").exists() and not (tmp_path / "truth.npy").exists()
+    assert "The first fault" not in (tmp_path / "failure.html").read_text()
+    assert (tmp_path / "notes.txt").exists()
 
 
 def test_passed_test_leaves_nothing(tmp_path, bench):

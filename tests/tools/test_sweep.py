@@ -102,6 +102,21 @@ def test_finished_runs_are_kept_for_the_same_scenario_only(scenario, tmp_path, m
     assert len(read_results(out)) == 4
 
 
+def test_without_resume_the_runs_of_other_shards_stay(scenario, tmp_path):
+    arguments = (scenario, tmp_path / "out", "--set", "torque_max_Nm=10,12", "--jobs", "1")
+    sweep.run(options(*arguments, "--shard", "1/2"), io.StringIO())
+    shard = tmp_path / "out" / "runs-1-of-2.jsonl"
+    before = shard.read_bytes()
+    sweep.run(options(*arguments), io.StringIO())
+    assert shard.read_bytes() == before and len(rows(tmp_path / "out")) == 2
+    assert (tmp_path / "out" / "runs.jsonl").read_text().count("\n") == 1
+
+
+def test_the_first_seed_may_be_0(scenario, tmp_path):
+    found = sweep.runs_of(options(scenario, tmp_path, "--seed", "0", "--seeds", "2"))
+    assert [of.columns["seed"] for of in found] == [0, 1] == [of.scenario.seed for of in found]
+
+
 def test_loads_profiles_and_seeds_are_columns(scenario, tmp_path):
     sweep.run(options(scenario, tmp_path, "--load-Nm", "1,3", "--load-profile", "compressor_one_cylinder", "--seeds",
                       "2", "--set", "current_noise_A=0.05", "--controller", "paper"), io.StringIO())
@@ -130,6 +145,7 @@ def test_no_column_of_metrics_is_the_name_of_a_setting():
     (("--set", "torque_max_Nm=5,5"), "finite and different"),
     (("--set", "torque_max_Nm=500"), "parameters.torque_max_Nm: 500: must be a number from"),
     (("--set", "load_torque_Nm=1e9"), "load_torque_Nm=1e9: 1e.09: must be a number from"),
+    (("--load-Nm", "1,20000"), "--load-Nm 20000: must be a number from -10000 to 10000"),
     (("--machine", "nonesuch"), "nonesuch"),
     (("--load-profile", "nonesuch"), "load_profile 'nonesuch': no such file"),
 ])

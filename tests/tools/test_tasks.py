@@ -104,6 +104,20 @@ def test_workers_end_with_a_runner_that_is_killed(tmp_path):
     assert len(read_results(tmp_path)) >= 4
 
 
+def test_workers_are_children_whatever_the_default_of_python_is(tmp_path):
+    """From 3.14 on it is a fork server, whose workers have another parent."""
+    code = ("import math, multiprocessing, pathlib, sys\n"
+            "from salient.experiments.tasks import Task, run\n"
+            "if __name__ == '__main__':\n"
+            "    multiprocessing.set_start_method('forkserver')\n"
+            "    print([result for _, result in run([Task('4', 4)], math.sqrt, pathlib.Path(sys.argv[1]), jobs=1)])\n")
+    script = tmp_path / "script.py"
+    script.write_text(code)
+    done = subprocess.run([sys.executable, str(script), str(tmp_path / "out")], capture_output=True, text=True,
+                          check=False)
+    assert (done.stdout, done.stderr) == ("[2.0]\n", "")
+
+
 def test_folder_in_use_is_refused(tmp_path):
     running = run(tasks(), math.sqrt, tmp_path, jobs=1)
     next(running)
@@ -111,6 +125,21 @@ def test_folder_in_use_is_refused(tmp_path):
         results(tmp_path)
     running.close()
     assert results(tmp_path) == SQUARE_ROOTS
+
+
+def test_a_run_afresh_forgets_its_own_file_only_and_not_while_another_process_writes_it(tmp_path):
+    results(tmp_path, shard=(1, 3), jobs=1)
+    running = run(tasks(), math.sqrt, tmp_path, jobs=1)
+    for _ in range(20):
+        next(running)
+    written = (tmp_path / RESULTS).read_bytes()
+    with pytest.raises(UsageError, match="runs.jsonl: another process writes it"):
+        results(tmp_path, afresh=True)
+    assert (tmp_path / RESULTS).read_bytes() == written != b""
+    running.close()
+    assert results(tmp_path, afresh=True, jobs=1) == SQUARE_ROOTS
+    keys = [json.loads(line)["key"] for line in (tmp_path / RESULTS).read_text().splitlines()]
+    assert sorted(keys) == sorted(list(SQUARE_ROOTS)[n] for n in range(40) if n % 3)
 
 
 def test_unwritable_folder_is_named(tmp_path):

@@ -23,10 +23,13 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from salient.bench import failure
+from salient.bench.drive import DriveError
 from salient.bus.signals import drive_database, rig_database
 from salient.paths import BUILD, ROOT
+from salient.view import link as view_link
 from salient.view.commands import COMMANDS
 from salient.view.description import EXTENDED, description
+from salient.view.frames import FrameStore
 
 STEP_S = 0.04
 """Less than the time after which the drive misses the commands that the server repeats."""
@@ -578,9 +581,59 @@ def test_frames_of_a_bus_without_virtual_time_get_that_of_the_drive():
         return can.Message(arbitration_id=0x180, is_extended_id=False,
                            data=(time_us % 2**32).to_bytes(4, "little") + bytes(4))
 
-    assert clock.time_ns(7_000, other) == 7_000  # nothing is known yet
+    assert clock.time_ns(7_000, other) is None  # nothing is known yet
     before_us = 2**32 - 1_000
     assert clock.time_ns(10**18, status(before_us)) == before_us * 1000
     assert clock.time_ns(10**18 + 40_000, other) == before_us * 1000 + 40_000
     assert clock.time_ns(10**18 + 2 * 10**6, status(2**32 + 1_000)) == (2**32 + 1_000) * 1000  # a wrap
+    assert clock.starts == 0
     assert clock.time_ns(10**18 + 10**9, status(500)) == (2**32 + 500) * 1000  # another start of the drive
+    assert clock.starts == 1
+
+
+def test_time_of_a_link_without_virtual_time_is_that_of_the_drive_also_after_a_reset(monkeypatch):
+    class Bus:
+        """A SocketCAN interface, of which all frames have come at Unix times."""
+
+        def __init__(self):
+            self.frames, self.sent = [], []
+
+        def recv(self, timeout):
+            return self.frames.pop(0) if self.frames else None
+
+        def send(self, message, timeout=None):
+            self.sent.append(message)
+
+    bus = Bus()
+    monkeypatch.setattr(view_link, "open_bus", lambda address: bus)
+    link = view_link.Link("socketcan:can0", "saturating", 0, FrameStore())
+
+    def receive(time_us, unix_s):
+        """A frame without a time of the drive, and one with it."""
+        data = time_us.to_bytes(4, "little") + bytes(4)
+        bus.frames += [can.Message(timestamp=unix_s, arbitration_id=0x181, is_extended_id=False, data=bytes(8)),
+                       can.Message(timestamp=unix_s, arbitration_id=0x180, is_extended_id=False, data=data)]
+        while link._receive(0.0) is not None:
+            pass
+
+    bus.frames += [can.Message(timestamp=1.6e9, arbitration_id=0x181, is_extended_id=False, data=bytes(8))] * 3
+    while link._receive(0.0) is not None:
+        pass
+    assert link.time_ns == 0 and link.telemetry.count("DRIVE_MOTION") == 0  # not Unix time
+    receive(5_000_000, 1.6e9)
+    assert link.time_ns == 5_000_000_000
+    link.take_shown(link.time_ns)
+    link.drive.stop()
+    receive(5_020_000, 1.6e9 + 0.02)
+    assert len(bus.sent) == 2 and link.time_ns == 5_020_000_000
+    receive(1_000, 1.6e9 + 0.1)  # after a reset
+    assert link.time_ns == link.shown_ns == 1_000_000
+    receive(21_000, 1.6e9 + 0.12)
+    assert len(bus.sent) >= 4  # commands go on at once, not when the drive's time is what it was
+    link.take_shown(5_000_000_000)  # a page that has not seen the reset yet
+    receive(1_500_000, 1.6e9 + 1.6)
+    assert link.drive.command_due_ns is None  # and that sleeps from here on
+    starts = [can.Message(timestamp=1.6e9 + 2, arbitration_id=0x180, is_extended_id=False, data=bytes(8))]
+    bus.frames += starts
+    with pytest.raises(DriveError, match="the drive has started anew"):
+        link.advance_to(10**12)

@@ -10,7 +10,7 @@ from pathlib import Path
 from salient.cli import make_parser
 from salient.config import OPTIONS, BenchConfig
 from salient.errors import RunFailed, UsageError
-from salient.paths import BUILD, SCENARIOS
+from salient.paths import BUILD, SCENARIOS, make_folder
 
 
 def main() -> int:
@@ -32,6 +32,13 @@ def main() -> int:
         # The reader of the output has closed it, as head does.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except Exception as error:
+        can = sys.modules.get("can")  # most commands start faster without it
+        if can is None or not isinstance(error, can.CanError):
+            raise
+        bus = getattr(options, "can", None) or "the bus"
+        print(f"salient: {error}" if bus in str(error) else f"salient: {bus}: {error}", file=sys.stderr)
+        return 1
 
 
 def _automatic_can() -> str:
@@ -59,19 +66,15 @@ def _test(options: argparse.Namespace) -> int:
     return checks.run(options.only)
 
 
-def _sim(options: argparse.Namespace) -> int:  # noqa: RET503 - os.execv does not return
-    from salient.bench.programs import EmulatorError, command_line
+def _sim(options: argparse.Namespace) -> int:
+    from salient.bench.programs import command_line
     from salient.machine.cache import machine_image
     from salient.machine.path import machine_path, stated_conditions
 
     image = machine_image(options.machine)  # checks the file
     stated = stated_conditions(machine_path(options.machine))
     given = {name: value for name, value in vars(options).items() if name in OPTIONS and value is not None}
-    try:
-        command = command_line(BenchConfig(**{**stated, **given, "machine_image": image}))
-    except EmulatorError as error:
-        print(f"salient: {error}", file=sys.stderr)
-        return 1
+    command = command_line(BenchConfig(**{**stated, **given, "machine_image": image}))
     os.execv(command[0], command)
 
 
@@ -82,6 +85,7 @@ def _run(options: argparse.Namespace) -> int:
         options.scenario = bundled
     scenarios = load_scenarios(options.scenario)
     out = options.out or Path("out") / options.scenario.stem
+    make_folder(out)
     results = run_all(scenarios, out, build=options.build, instruction_ns=options.instruction_ns,
                       progress=lambda line: print(line, flush=True))
     print(f"results: {out / 'results.json'}")

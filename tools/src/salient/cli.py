@@ -288,7 +288,8 @@ def _add_sweep_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=_count, default=1, metavar="N", help="number of seeds (default 1)")
     parser.add_argument("--seed", type=_option_type("seed"), metavar="N", help="the first (default as the scenario)")
     parser.add_argument("--out", type=Path, default=Path("out/sweep"), metavar="DIR", help="folder (default out/sweep)")
-    parser.add_argument("--resume", action="store_true", help="keep the finished runs in the folder")
+    parser.add_argument("--resume", action="store_true",
+                        help="keep the finished runs in the folder; those of shards are always kept")
     _add_execution_options(parser)
     parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N",
                         help="only the I-th of N parts; keeps the finished runs in the folder")

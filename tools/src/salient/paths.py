@@ -2,6 +2,7 @@
 folder data/ has the files that are needed in the places that they have in the repository (tools/setup.py)."""
 
 import os
+import tempfile
 from pathlib import Path
 
 from salient.errors import UsageError, shown
@@ -26,6 +27,15 @@ RIG_DBC = ROOT / "emulator" / "rig" / "rig.dbc"
 def program(build: str, name: str) -> Path:
     """A program of a build, which may not exist; in a wheel all are for the host."""
     return ROOT / "bin" / name if IS_WHEEL else BUILD / build / "bin" / name
+
+
+def make_folder(out: Path) -> None:
+    """Makes the folder of --out, if needed; UsageError when nothing can be written there."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out).close()
+    except OSError as error:
+        raise UsageError(f"--out {out}: cannot write there ({error.strerror}); choose a writable folder") from None
 
 
 def bundled_or_path(name_or_path: str, folder: Path, suffix: str, key: str) -> Path:

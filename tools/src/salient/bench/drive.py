@@ -51,7 +51,7 @@ _TRACE_PARTS, _TRACE_PHASES = 8, 4
 _OPERATIONS = value_numbers(drive_database(), "PARAMETER_REQUEST", "operation")
 
 
-class DriveError(Exception):
+class DriveError(RunFailed):
     """The drive rejected a request or did not respond; the message has the reason."""
 
 
@@ -59,7 +59,7 @@ class OtherDatabase(DriveError, UsageError):
     """A reference for a drive whose DBC is not that of the session: the drive would take it for another one."""
 
 
-class DriveNotReady(DriveError, RunFailed):
+class DriveNotReady(DriveError):
     """A check keeps the drive in state initialise; the message names it."""
 
 
@@ -153,6 +153,14 @@ class Drive(KnownAttributes):
     def silence(self) -> None:
         """Send no more commands until the next request."""
         self.command_due_ns = None
+        self._end_arming()
+
+    def time_begins_anew(self) -> None:
+        """The session's time is an earlier one from here on: what is to be repeated is due now, an arming has ended."""
+        if self.command_due_ns is not None:
+            self.command_due_ns = self._session.time_ns
+        if self._disarmed_ns is not None:
+            self._disarmed_ns = self._session.time_ns
         self._end_arming()
 
     def ask(self, request: str) -> None:

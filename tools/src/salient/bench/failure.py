@@ -21,6 +21,8 @@ TRUTH_S = 1.0
 COLOURS = ("#0072b2", "#d55e00", "#000000", "#56b4e9")
 """Those of the live page (view/page/palette.js)."""
 TRUTH = "truth.npy"
+LEFT = ("can.blf", "can.log", "failure.png", "last_second.png", "first_fault.png", "bench.json", "failure.html", TRUTH)
+"""The files of a folder."""
 RECORD_STEP_NS = 50_000
 """Of the recording that a bench of a test makes for this purpose, which takes a few percent of its time."""
 _RECORDING_HEADER_BYTES = 1024
@@ -33,6 +35,7 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
     notes, and a page of all that and of the error. config: of an emulator that the session has started. Returns what
     changed just before the failure."""
     folder.mkdir(parents=True, exist_ok=True)
+    clear(folder)
     write_logs(session.log, folder / "can.blf", folder / "can.log")
     plot_moment(session, session.time_s, "failure", folder / "failure.png")
     plot_moment(session, session.time_s, "failure", folder / "last_second.png", TRUTH_S)
@@ -52,6 +55,12 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
     (folder / "bench.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     _write_page(folder, about | {"error": error})
     return changed
+
+
+def clear(folder: Path) -> None:
+    """Removes what an earlier failure has left: it would be taken for a part of the next one."""
+    for name in LEFT:
+        (folder / name).unlink(missing_ok=True)
 
 
 def _write_page(folder: Path, about: dict[str, Any]) -> None:

@@ -24,6 +24,7 @@ from cantools.database.can import Signal
 
 from salient.bus.signals import rig_database, signal_range
 from salient.config import either
+from salient.errors import UsageError
 from salient.paths import ROOT
 
 PAGE = ROOT / "emulator" / "FAULTS.md"
@@ -32,7 +33,7 @@ LEGS = ("high", "low")
 _MESSAGE = "RIG_FAULT"
 
 
-class FaultError(Exception):
+class FaultError(UsageError):
     """A fault that does not exist, has not this place or attribute, or that the bench rejects; the text lists what
     there is."""
 

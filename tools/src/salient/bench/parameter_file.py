@@ -15,30 +15,28 @@ import math
 import sys
 from pathlib import Path
 
-from salient.bench.drive import DriveError, ParameterRow, raw_value
+from salient.bench.drive import ParameterRow, raw_value
 from salient.bench.session import Session
-from salient.errors import RunFailed, UsageError, shown
-from salient.machine.file import MachineError
+from salient.errors import UsageError, shown
 from salient.toml_file import TextFileError, read_toml
+
+_SILENCE_MAX_S = 5.0
+"""A drive sends at least every 0.1 s of its time; an emulated one may be slow."""
 
 
 def run(options: argparse.Namespace) -> int:
     """The action of a command line; its exit code."""
-    try:
-        with Session(options.can, lockstep=False, machine=options.machine, node=options.node) as session:
-            match options.action:
-                case "save":
-                    return save(session, options.file)
-                case "compare":
-                    return compare(session, options.file)
-                case "load":
-                    return load(session, options.file, options.store)
-                case _:
-                    return faults(session)
-    except MachineError as error:
-        raise UsageError(str(error)) from None
-    except DriveError as error:
-        raise RunFailed(str(error)) from None
+    with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
+                 silence_max_s=_SILENCE_MAX_S) as session:
+        match options.action:
+            case "save":
+                return save(session, options.file)
+            case "compare":
+                return compare(session, options.file)
+            case "load":
+                return load(session, options.file, options.store)
+            case _:
+                return faults(session)
 
 
 def save(session: Session, path: Path) -> int:

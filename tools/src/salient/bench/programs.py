@@ -17,7 +17,7 @@ from pathlib import Path
 from salient.builder import run_commands
 from salient.config import TARGET_BUILDS, WASM_BUILD, BenchConfig
 from salient.elf import ElfImage
-from salient.errors import UsageError
+from salient.errors import RunFailed, UsageError
 from salient.machine.cache import content_key, machine_image
 from salient.machine.path import machine_path
 from salient.paths import BUILD, IS_WHEEL, MACHINES, ROOT, program
@@ -28,7 +28,7 @@ _TESTS = "tools/salient test"
 _REFERENCE = "salient_reference"
 
 
-class EmulatorError(Exception):
+class EmulatorError(RunFailed):
     """A program failed; the text includes its standard error."""
 
 

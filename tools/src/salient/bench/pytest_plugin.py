@@ -265,6 +265,8 @@ def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
     command = _replay(item)
     notes = {"test": item.nodeid, "phase": report.when, "replay": command, "replay_in": str(item.config.rootpath)}
     folder.mkdir(parents=True, exist_ok=True)
+    for of_earlier_bench in folder.glob("[0-9]*"):
+        failure.clear(of_earlier_bench)
     error = {"error": report.longreprtext.splitlines()}
     (folder / "failure.json").write_text(json.dumps(notes | error, indent=2) + "\n", encoding="utf-8")
     lines = [f"folder: {folder}"]

@@ -24,13 +24,16 @@ from salient.bench.load_profile import (
     read_load_profile,
 )
 from salient.bus.signals import SignalTable, rig_database, signal_range
+from salient.errors import UsageError
 
 _AT_US_MAX = 2**32 - 1
+CHANGES_MAX = 64
+"""STIMULUS_QUEUE of emulator/rig/stimulus_queue.h: changes of variables that wait for their time; as many of faults."""
 _FREE = "free"
 """Named value of a variable that imposes nothing; not-a-number in Python."""
 
 
-class RigError(Exception):
+class RigError(UsageError):
     """The bench rejected a value; the text gives the variable and the reason."""
 
 

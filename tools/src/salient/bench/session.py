@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from typing import Any, Self
@@ -22,6 +23,7 @@ from salient.bench.rig import Fault, Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
 from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.dbc import database_hash
+from salient.errors import RunFailed
 
 RIG_RUN_UNTIL_ID = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
 _ALIVE_CHECK_S = 1.0
@@ -37,8 +39,8 @@ _IDENTITY_WAIT_NS = 250_000_000
 """More than two periods of DRIVE_IDENTITY."""
 
 
-class SessionError(Exception):
-    """The emulator has ended."""
+class SessionError(RunFailed):
+    """The emulator has ended, or the bus is silent."""
 
 
 class _DriveOfSeveral:
@@ -64,7 +66,8 @@ class Session(KnownAttributes):
 
     lockstep: this session moves time (the pace of the emulator is lockstep). Otherwise time moves by itself, and the
     session follows it by the times of received frames. is_alive: the emulator has not ended; without it the end of the
-    emulator is seen on a local bus only. A session waits for the emulator for any wall time, as at a breakpoint.
+    emulator is seen on a local bus only. A session waits for the emulator for any wall time, as at a breakpoint, unless
+    silence_max_s bounds that without a frame of the drive or the emulator; then SessionError.
 
     machine: name or file of the drive's machine, whose DBC the session then uses; without it that in SI units. To a
     drive that reports another DBC no reference is sent (OtherDatabase); its frames are decoded, after a warning.
@@ -92,7 +95,7 @@ class Session(KnownAttributes):
     def __init__(self, address: str, lockstep: bool = True,
                  parameter_table: Callable[[], list[ParameterRow]] | None = None,
                  is_alive: Callable[[], bool] = lambda: True, machine: str | None = None,
-                 node: int = 0, drives: int = 1) -> None:
+                 node: int = 0, drives: int = 1, silence_max_s: float = math.inf) -> None:
         self.address = address
         self.time_ns = 0
         self.log = []
@@ -111,6 +114,7 @@ class Session(KnownAttributes):
         self._lockstep = lockstep
         self._step_max_ns = _SOCKETCAN_STEP_NS // drives if address.startswith("socketcan:") else _NO_STEP_NS
         self._is_alive = is_alive
+        self._silence_max_s = silence_max_s
         self._sequence = 0
         self._identity_checked = False
         self._other_database = ""
@@ -240,15 +244,19 @@ class Session(KnownAttributes):
         """Sends a frame of any kind; waits while the emulator takes none."""
         if message.arbitration_id != RIG_RUN_UNTIL_ID:
             self.sent.append((self.time_ns, message))
+        silent_s = 0.0
         while True:
             try:
                 return self._bus.send(message, timeout=_ALIVE_CHECK_S)
             except can.CanTimeoutError:
-                self._check_alive()
+                silent_s += _ALIVE_CHECK_S
+                self._check_alive(silent_s)
 
-    def _check_alive(self) -> None:
+    def _check_alive(self, silent_s: float) -> None:
         if not self._is_alive():
             raise SessionError(f"{self.address}: the emulator has ended")
+        if silent_s >= self._silence_max_s:
+            raise SessionError(f"{self.address}: no frame of a drive for {silent_s:g} s; is there one?")
 
     def _advance(self, time_ns: int) -> None:
         if self._lockstep:
@@ -271,8 +279,10 @@ class Session(KnownAttributes):
         self.send(can.Message(arbitration_id=RIG_RUN_UNTIL_ID, is_extended_id=True, data=data))
 
     def _receive(self) -> can.Message:
+        silent_s = 0.0
         while (timed := self._reader.receive(_ALIVE_CHECK_S)) is None:
-            self._check_alive()
+            silent_s += _ALIVE_CHECK_S
+            self._check_alive(silent_s)
         time_ns, message = timed
         if not self._lockstep:
             self.time_ns = max(self.time_ns, time_ns)

@@ -10,6 +10,8 @@ same order. On an interface without stamps (`sim --drive-only`) the time is that
 
 from __future__ import annotations
 
+import math
+import time
 from collections import deque
 from functools import lru_cache
 from typing import cast
@@ -77,7 +79,10 @@ class VirtualTimeReader:
         return self._stamped or not self._on_interface
 
     def receive(self, timeout: float | None) -> tuple[int, can.Message] | None:
-        """The next (virtual time in ns, message), or None after `timeout` seconds without one."""
+        """The next (virtual time in ns, message), or None after `timeout` seconds without one, also while frames come
+        that have no time yet, as those of other nodes where there is no drive. With a timeout of 0 all that have come
+        are read."""
+        end_s = math.inf
         while True:
             message = self._bus.recv(timeout)
             if message is None:
@@ -87,6 +92,11 @@ class VirtualTimeReader:
             timed = self._join(message)
             if timed is not None:
                 return timed
+            if timeout:
+                now_s = time.monotonic()
+                if now_s >= end_s:
+                    return None
+                end_s = min(end_s, now_s + timeout)
 
     def _join(self, message: can.Message) -> tuple[int, can.Message] | None:
         identifier = message.arbitration_id

@@ -35,7 +35,7 @@ _WIDTH = 120
 
 
 class _BusClosed(Exception):
-    """The emulator closed the bus while this command was listening."""
+    """The bus ended while this command was listening; the text is the reason of python-can."""
 
 
 def record(address: str, path: Path, duration_s: float | None, machine: str, node: int = 0) -> int:
@@ -51,19 +51,19 @@ def record(address: str, path: Path, duration_s: float | None, machine: str, nod
     except OSError as error:
         raise UsageError(f"--out {path}: {error.strerror}") from None
     log = open_log(path, machine, node)
-    count, closed = 0, False
+    count, closed = 0, None
     try:
         for timed in _frames(address, duration_s, "recording"):
             log.write(*timed)
             count += 1
     except KeyboardInterrupt:
         pass
-    except _BusClosed:
-        closed = True
+    except _BusClosed as end:
+        closed = str(end)
     finally:
         log.close()
     print(f"{count} frames: {path}", flush=True)
-    return _report_closed(address, duration_s) if closed else 0
+    return 0 if closed is None else _report_closed(address, duration_s, closed)
 
 
 def monitor(address: str, every_s: float, duration_s: float | None, machine: str,
@@ -90,8 +90,8 @@ def monitor(address: str, every_s: float, duration_s: float | None, machine: str
                 sys.stdout.write(line + "\n")
                 sys.stdout.flush()
             due_ns += round(every_s * 1e9)
-    except _BusClosed:
-        return _report_closed(address, duration_s)
+    except _BusClosed as end:
+        return _report_closed(address, duration_s, str(end))
     return 0
 
 
@@ -106,8 +106,8 @@ def _frames(address: str, duration_s: float | None, activity: str) -> Iterator[t
         while True:
             try:
                 timed = reader.receive(None)
-            except can.CanOperationError:
-                raise _BusClosed from None
+            except can.CanOperationError as error:
+                raise _BusClosed(str(error)) from None
             except KeyboardInterrupt:
                 return
             if timed is None:
@@ -119,12 +119,16 @@ def _frames(address: str, duration_s: float | None, activity: str) -> Iterator[t
             yield timed
 
 
-def _report_closed(address: str, duration_s: float | None) -> int:
+def _report_closed(address: str, duration_s: float | None, reason: str) -> int:
     """Prints in one line how the bus closed. Returns 0 when the drive was stopped in order and no duration was
-    requested, else 1: the emulator was killed or crashed, or the requested duration is incomplete."""
+    requested, else 1: the emulator was killed or crashed, an interface failed for a reason, or the requested duration
+    is incomplete."""
+    early = "" if duration_s is None else f" before --duration-s {duration_s:g} had passed"
+    if not address.startswith("unix:"):
+        print(f"salient: {address}: the interface failed{early}: {reason}", file=sys.stderr, flush=True)
+        return 1
     in_order = closed_in_order(address)
     cause = "the drive was stopped" if in_order else "the emulator was killed or crashed"
-    early = "" if duration_s is None else f" before --duration-s {duration_s:g} had passed"
     print(f"salient: {address}: the drive's bus closed{early}: {cause}", file=sys.stderr, flush=True)
     return 0 if in_order and duration_s is None else 1
 

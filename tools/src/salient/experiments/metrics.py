@@ -48,9 +48,6 @@ SPECTRUM_TO_HZ = 2000.0
 # switching.
 SPECTRUM_STEP_S = 100e-6
 _WINDOW_BINS = 3  # a line's width under a Hann window, to either side
-# Both ends coincide with ends of a control period at every control rate, where the recorded energies are exact
-# (recorder.h).
-LOSS_WINDOW_S = RIPPLE_WINDOW_S
 
 # Times are compared with this tolerance: far below any sample step, far above the rounding of a double near 1 s.
 _TIME_TOLERANCE_S = 1e-10

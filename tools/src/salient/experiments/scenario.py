@@ -57,9 +57,9 @@ from pydantic import create_model
 from salient.bench.bench import Bench
 from salient.bench.drive import READY_TIMEOUT_S
 from salient.bench.emulator import parameter_table
-from salient.bench.faults import FaultError, attribute_names, fault_signals
+from salient.bench.faults import PHASES, FaultError, attribute_names, fault_signals
 from salient.bench.load_profile import load_profile_path, read_load_profile
-from salient.bench.rig import bench_variables, variable_range
+from salient.bench.rig import CHANGES_MAX, bench_variables, variable_range
 from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database, signal_range
 from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
@@ -298,14 +298,38 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build:
 
 
 def check_parameters(scenarios: list[Scenario], build: str) -> None:
-    """UsageError before the first run: a parameter that the drive does not know or would refuse, or parameters that
-    contradict each other or the supply."""
+    """UsageError before the first run: a parameter that the drive does not know or would refuse, parameters that
+    contradict each other or the supply, or what the test bench would refuse (check_bench)."""
     for scenario in scenarios:
+        check_bench(scenario)
         config = _bench_config(scenario, None, build)
         _check_parameter_names(scenario, config)
         values = {row.name: row.default for row in parameter_table(config)} | scenario.parameters
         supply_V = load_machine(machine_path(scenario.machine)).supply_voltage_V
         check_consistency(values, scenario.parameters, scenario.bench.get("supply_voltage_V", supply_V))
+
+
+def check_bench(scenario: Scenario) -> None:
+    """UsageError, one line that begins with the key: a phase that the machine does not have, more changes than wait on
+    the test bench, or a run of which nothing would be known."""
+    phases = PHASES[:load_machine(machine_path(scenario.machine)).phases]
+    for step in scenario.fault:
+        if step.arguments.get("phase", phases[0]) not in phases:
+            raise UsageError(f"fault.phase: {step.arguments['phase']!r}: must be {either(phases)}, the phases of "
+                             f"{Path(scenario.machine).stem}")
+    later = [load for load in scenario.load if round(load.at_s * 1e6) > 0]  # the others change at once
+    waiting = {"load": len(later) + sum(load.profile_Nm is not None for load in later),
+               "fault": sum((round(step.at_s * 1e6) > 0) + (step.duration_s is not None) for step in scenario.fault)}
+    for key, changes in waiting.items():
+        if changes > CHANGES_MAX:
+            raise UsageError(f"{key}: {changes} changes after the start: must be at most {CHANGES_MAX}")
+    record, duration_us = scenario.record, round(scenario.duration_s * 1e6)
+    if record is not None and round(record.from_s * 1e6) >= duration_us:
+        raise UsageError(f"record.from_s: {record.from_s:g}: must be below duration_s, {scenario.duration_s:g}")
+    truth_us = scenario.bench.get("truth_period_us")
+    if record is None and truth_us is not None and not 1.0 <= truth_us <= duration_us:
+        raise UsageError(f"bench.truth_period_us: {truth_us:g}: without [record] must be a number from 1 to "
+                         f"{duration_us}, the duration")
 
 
 def write_summaries(scenarios: list[Scenario], results: dict[str, RunResult], out_dir: Path) -> None:
@@ -444,7 +468,12 @@ def load_scenarios(path: Path) -> list[Scenario]:
         "fault": _fault_steps(path, file.fault),
         "record": None if file.record is None else Record(**file.record.model_dump()),
     }
-    return [Scenario(controller=controller, **common) for controller in file.controllers]
+    scenarios = [Scenario(controller=controller, **common) for controller in file.controllers]
+    try:
+        check_bench(scenarios[0])
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+    return scenarios
 
 
 def _load_profile_of(path: Path, name: str) -> str:

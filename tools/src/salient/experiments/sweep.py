@@ -24,8 +24,9 @@ from can import CanError
 from salient.bench.drive import DriveError
 from salient.bench.load_profile import load_profile_path, read_load_profile
 from salient.bench.programs import EmulatorError, executable
+from salient.bench.rig import variable_range
 from salient.bench.session import SessionError
-from salient.errors import RunFailed, UsageError
+from salient.errors import UsageError
 from salient.experiments import metrics as run_metrics
 from salient.experiments import tasks
 from salient.experiments.metrics import MetricsError, load_step_metrics, losses, start_metrics
@@ -62,14 +63,13 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     """Runs a sweep; exit code 1 when a run has failed."""
     combinations = runs_of(options)
     listed = [tasks.Task(_key(of), of) for of in combinations]
-    if not options.resume and options.shard == (1, 1):
-        tasks.remove_results(options.out)
+    afresh = not options.resume and options.shard == (1, 1)
     results: dict[str, Any] = {}
     mine = len(listed[options.shard[0] - 1::options.shard[1]])
     lines = mine if sys.stderr.isatty() else min(mine, _PROGRESS_LINES_MAX)
     with Progress(lines, sys.stderr) as progress:
-        for done, (task, result) in enumerate(tasks.run(listed, run_one, options.out, options.shard, options.scheduler,
-                                                        options.jobs), start=1):
+        finished = tasks.run(listed, run_one, options.out, options.shard, options.scheduler, options.jobs, afresh)
+        for done, (task, result) in enumerate(finished, start=1):
             results[task.key] = result
             if done * lines // mine > (done - 1) * lines // mine:
                 progress.step(", ".join(f"{name} {value}" for name, value in task.arguments.columns.items()))
@@ -106,12 +106,17 @@ def runs_of(options: argparse.Namespace) -> list[Run]:
     if options.load_Nm:
         if not base[0].load:
             raise UsageError(f"--load-Nm: {options.scenario} has no [[load]] to change")
+        low_Nm, high_Nm = variable_range("load_torque_Nm")
+        for load_Nm in options.load_Nm:
+            if not low_Nm <= load_Nm <= high_Nm:
+                raise UsageError(f"--load-Nm {load_Nm:g}: must be a number from {low_Nm:g} to {high_Nm:g}")
         axes["load_Nm"] = options.load_Nm
     if options.load_profile:
         for profile in options.load_profile:
             read_load_profile(load_profile_path(profile))
         axes["load_profile"] = options.load_profile
-    axes["seed"] = [(options.seed or base[0].seed) + n for n in range(options.seeds)]
+    first_seed = base[0].seed if options.seed is None else options.seed
+    axes["seed"] = [first_seed + n for n in range(options.seeds)]
     program = _digest(executable())
     found = []
     for combination in itertools.product(*axes.values()):
@@ -158,8 +163,7 @@ def _digest(file: Path) -> str:
 
 def run_one(of: Run) -> dict[str, Any]:
     """The metrics of a combination, and why there are none or fault; executed by a worker."""
-    if _digest(executable()) != of.program:
-        raise RunFailed("a worker has another build of the drive than this computer; install the same on all")
+    tasks.check_build(_digest(executable()), of.program)
     row: dict[str, Any] = dict.fromkeys(METRICS)
     error = ""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:

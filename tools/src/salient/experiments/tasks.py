@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import json
+import multiprocessing
 import os
 import signal
 import socket
@@ -45,18 +46,22 @@ class Task:
 
 
 def run(tasks: Sequence[Task], function: Callable[[Any], Any], out: Path, shard: tuple[int, int] = (1, 1),
-        scheduler: str | None = None, jobs: int | None = None) -> Generator[tuple[Task, Any], None, None]:
+        scheduler: str | None = None, jobs: int | None = None, afresh: bool = False
+        ) -> Generator[tuple[Task, Any], None, None]:
     """Yields each task of the shard with its result: first those that the folder has already, then the others as they
     finish.
 
     shard: (i, n), every n-th task beginning with the i-th, with a file of its own; several may share a folder.
     scheduler: address of a Dask scheduler, whose workers need this package; without it `jobs` processes of this
     computer, by default as many as it has cores. A worker that dies loses nothing: what it did not finish is done
-    again. UsageError: the folder is in use or cannot be written, no scheduler answers.
+    again. afresh: forgets what the file of this shard has, once no other process writes it. UsageError: the folder is
+    in use or cannot be written, no scheduler answers.
     """
     number, count = shard
     mine = list({task.key: task for task in tasks[number - 1::count]}.values())
     with _open_results(out, shard) as file:
+        if afresh:
+            file.truncate(0)
         finished = read_results(out)
         todo = [task for task in mine if task.key not in finished]
         for task in mine:
@@ -80,6 +85,12 @@ def execute(tasks: Sequence[Task], function: Callable[[Any], Any], scheduler: st
         yield from _on_a_cluster(tasks, function, scheduler)
 
 
+def check_build(present: str, wanted: str) -> None:
+    """RunFailed on a worker whose programs have another digest than those of the computer that hands out the tasks."""
+    if present != wanted:
+        raise RunFailed("a worker has another build of the drive than this computer; install the same on all")
+
+
 def read_results(out: Path) -> dict[str, Any]:
     """The results in a folder, of all shards, by key. The end of a line that was being written is left out."""
     results = {}
@@ -89,12 +100,6 @@ def read_results(out: Path) -> dict[str, Any]:
                 entry = json.loads(line)
                 results[entry["key"]] = entry["result"]
     return results
-
-
-def remove_results(out: Path) -> None:
-    """Forgets what the folder has, of all shards."""
-    for path in out.glob("runs*.jsonl"):
-        path.unlink(missing_ok=True)
 
 
 def _open_results(out: Path, shard: tuple[int, int]) -> TextIO:
@@ -124,8 +129,9 @@ def _on_this_computer(tasks: Sequence[Task], function: Callable[[Any], Any], job
                       ) -> Generator[tuple[Task, Any], None, None]:
     left = {task.key: task for task in tasks}
     breaks = 0
+    context = multiprocessing.get_context("fork")  # workers of a fork server are not children of this process
     while left:
-        workers = ProcessPoolExecutor(jobs, initializer=_begin_worker, initargs=(os.getpid(),))
+        workers = ProcessPoolExecutor(jobs, context, _begin_worker, (os.getpid(),))
         try:
             for task, result in _executed(workers, left.values(), function, jobs):
                 del left[task.key]

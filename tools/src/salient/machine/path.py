@@ -15,7 +15,7 @@ from salient.errors import UsageError
 from salient.paths import MACHINES, bundled_or_path
 
 
-class MachineError(ValueError):
+class MachineError(UsageError, ValueError):
     """A machine file that cannot be used; the text is one line that begins with the file."""
 
 

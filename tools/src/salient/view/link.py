@@ -61,22 +61,25 @@ class LatestSignals(SignalTable):
 
 
 class DriveTime:
-    """Puts frames of a bus without virtual time on the drive's own time, by the stamps in DRIVE_STATUS."""
+    """Puts frames of a bus without virtual time on the drive's own time, by the stamps in DRIVE_STATUS. starts: the
+    times that the drive has started anew, from where its time is an earlier one."""
 
     def __init__(self, database: Database) -> None:
         self._identifier = database.get_message_by_name("DRIVE_STATUS").frame_id
         self._offset_ns: int | None = None
         self._drive_us = 0
+        self.starts = 0
 
-    def time_ns(self, interface_ns: int, message: can.Message) -> int:
-        """Time of a frame that the interface had at `interface_ns`."""
+    def time_ns(self, interface_ns: int, message: can.Message) -> int | None:
+        """Time of a frame that the interface had at `interface_ns`; None before the first DRIVE_STATUS."""
         if message.arbitration_id == self._identifier and not message.is_extended_id and len(message.data) == 8:
             stamp_us = int.from_bytes(message.data[:4], "little")
             wraps, last_us = divmod(self._drive_us, 1 << 32)
             # Back by more than half the range is a wrap; by less, another start of the drive.
             self._drive_us = stamp_us + ((wraps + (last_us - stamp_us > 1 << 31)) << 32)
+            self.starts += 0 < last_us - stamp_us <= 1 << 31
             self._offset_ns = self._drive_us * 1000 - interface_ns
-        return interface_ns if self._offset_ns is None else interface_ns + self._offset_ns
+        return None if self._offset_ns is None else interface_ns + self._offset_ns
 
 
 class Link:
@@ -85,7 +88,6 @@ class Link:
     def __init__(self, address: str, machine: str, node: int, store: FrameStore) -> None:
         self.address = address
         self.time_ns = 0
-        self.other_frames = 0
         self.ended = False
         self.shown_ns: int | None = None
         """What the commanding page has shown; None without one."""
@@ -148,18 +150,26 @@ class Link:
         raise RigError("no test bench answers on this bus")
 
     def advance_to(self, time_ns: int) -> None:
-        """Receives until that time."""
+        """Receives until that time; DriveError when the drive starts anew before."""
+        starts = self._drive_time.starts
         while self.time_ns < time_ns:
             self._receive(_TICK_S)
+            self._check_same_start(starts)
 
     def advance_until_frame(self, matches: Callable[[can.Message], bool], timeout_s: float) -> can.Message:
-        """Receives until a frame meets the condition; TimeoutError after timeout_s of the drive's time."""
-        deadline_ns = self.time_ns + round(timeout_s * 1e9)
+        """Receives until a frame meets the condition; TimeoutError after timeout_s of the drive's time, DriveError when
+        the drive starts anew before."""
+        deadline_ns, starts = self.time_ns + round(timeout_s * 1e9), self._drive_time.starts
         while self.time_ns < deadline_ns:
             message = self._receive(_TICK_S)
+            self._check_same_start(starts)
             if message is not None and matches(message):
                 return message
         raise TimeoutError(f"no matching frame within {timeout_s:g} s")
+
+    def _check_same_start(self, starts: int) -> None:
+        if self._drive_time.starts != starts:
+            raise DriveError(f"{self.address}: the drive has started anew")
 
     # --- the thread of the bus -------------------------------------------------------------------------------------
 
@@ -197,7 +207,7 @@ class Link:
 
     def _receive(self, timeout_s: float) -> can.Message | None:
         """One frame, None when there is none in time. Commands that are due by its time are sent before the pages
-        learn of it."""
+        learn of it. A frame whose time is not known yet changes nothing."""
         try:
             timed = self._reader.receive(timeout_s)
         except can.CanError:
@@ -209,14 +219,29 @@ class Link:
             return None
         time_ns, message = timed
         if not self._reader.has_virtual_time:
-            time_ns = self._drive_time.time_ns(time_ns, message)
+            starts, known_ns = self._drive_time.starts, self._drive_time.time_ns(time_ns, message)
+            if known_ns is None:
+                return message
+            time_ns = known_ns
+            if self._drive_time.starts != starts:
+                self._begin_anew(time_ns)
         self.time_ns = max(self.time_ns, time_ns)
         self.telemetry.add(time_ns, message)
-        if not self._chunk.add(time_ns, message):
-            self.other_frames += 1
+        self._chunk.add(time_ns, message)
         if (due_ns := self.drive.due_ns) is not None and due_ns <= self.time_ns:
             self._send_due()
         return message
+
+    def _begin_anew(self, time_ns: int) -> None:
+        """The drive has started anew: its time is an earlier one, and what was shown is not later than that."""
+        self.time_ns = time_ns
+        self.drive.time_begins_anew()
+        if self.shown_ns is not None:
+            self.shown_ns = min(self.shown_ns, time_ns)
+
+    def take_shown(self, shown_ns: int) -> None:
+        """What the commanding page has shown; it may be of the time before the drive has started anew."""
+        self.shown_ns = min(shown_ns, self.time_ns)
 
     def _send_due(self) -> None:
         if self.shown_ns is None or self.time_ns - self.shown_ns > SHOWN_WITHIN_NS:

@@ -175,7 +175,7 @@ class Server:
         page.shown_ns = float(shown_ns)
         page.wants_frames.set()
         if page is self._leaseholder and self.feed.link is not None:
-            self.feed.link.shown_ns = round(page.shown_ns)
+            self.feed.link.take_shown(round(page.shown_ns))
 
     def _begin(self, task: Coroutine[Any, Any, None]) -> None:
         running = asyncio.create_task(task)
@@ -210,7 +210,7 @@ class Server:
         if self._leaseholder is not None:
             return {"ok": False, "message": "another page commands this drive: release or close it there first"}
         self._leaseholder, page.has_slept = page, False
-        link.shown_ns = round(page.shown_ns)
+        link.take_shown(round(page.shown_ns))
         return {"ok": True, "message": ""}
 
     def _release(self, page: _Page) -> dict[str, Any]:
@@ -222,7 +222,7 @@ class Server:
 
     def _end_sleepers_lease(self) -> None:
         page, link = self._leaseholder, self.feed.link
-        if page is not None and link is not None and link.time_ns - page.shown_ns > SHOWN_WITHIN_NS:
+        if page is not None and link is not None and link.time_ns - (link.shown_ns or 0) > SHOWN_WITHIN_NS:
             self._release(page)
             page.has_slept = True
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import re
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from salient.experiments.campaign import canaries, names
 from salient.experiments.campaign.failure import Failure, load, replay, save
 from salient.experiments.campaign.runner import ALL_EVENTS, Result, digest, processor_s, serve, world
 from salient.experiments.tasks import Task, read_results, run
-from salient.paths import ROOT
+from salient.paths import ROOT, make_folder
 from salient.progress import Progress
 
 _SHOWN_MAX = 8
@@ -29,7 +30,7 @@ def run_campaign(options: argparse.Namespace) -> int:
     """`campaign`; returns the exit code."""
     seeds = range(options.first, options.first + options.seeds)
     kind = "healthy" if options.healthy else "faults"
-    tasks = [Task(f"{kind} {seed} {digest()}", (seed, options.healthy)) for seed in seeds]
+    tasks = [Task(f"{kind} {seed} {digest()}", (seed, options.healthy, digest())) for seed in seeds]
     mine = tasks[options.shard[0] - 1::options.shard[1]]
     results: list[Result] = []
     new: list[Result] = []
@@ -53,14 +54,21 @@ def run_campaign(options: argparse.Namespace) -> int:
         (options.out / f"rate{part}.json").write_text(json.dumps(rate, indent=2) + "\n", encoding="utf-8")
         print(f"{rate['worlds'] / spent_s:.0f} worlds, {rate['virtual_s'] / spent_s:.1f} s of virtual time a processor "
               "second")
+    saved_seeds: set[int] = set()
     for violation, entry in list(note["violations"].items())[:0 if options.no_shrink else _SHOWN_MAX]:
         seed = entry["seeds"][0]
-        folder = options.out / "failures" / f"{seed}"
+        folder = options.out / "failures" / _folder_name(seed, violation, saved_seeds)
+        saved_seeds.add(seed)
         saved = save(seed, violation, folder, options.healthy)
         events = ", ".join(f"{event['event']} at {event['begin_us']} us" for event in saved["world"]["events"])
         print(f"{violation}: seed {seed} needs {len(saved['world']['events'])} events ({events or 'none'}); "
               f"{saved['replay']}")
     return 1 if note["violations"] else 0
+
+
+def _folder_name(seed: int, violation: str, saved_seeds: Collection[int]) -> str:
+    """SEED; for the further classes of a seed SEED-CLASS."""
+    return f"{seed}-{re.sub('[^a-z0-9_]+', '-', violation.lower())}" if seed in saved_seeds else f"{seed}"
 
 
 def summary(results: Iterable[Result], first: int, seeds: int, kind: str) -> dict[str, Any]:
@@ -144,6 +152,7 @@ def run_replay(options: argparse.Namespace) -> int:
             raise UsageError(f"--target {options.build}: {folder} has a planted bug, which the host alone can have")
         programs = canaries.build(failure.canary)
         print(f"with the planted bug {failure.canary}: {canaries.canaries()[failure.canary - 1].name}")
+    make_folder(folder)
     described = world(seed, kept, healthy)
     print(f"seed {seed}: {described['machine']}, {described['controller']}, {described['control_rate_hz']} Hz, encoder "
           f"of {described['encoder_bits']} bits{' with edges' if described['encoder_edges'] else ''}")

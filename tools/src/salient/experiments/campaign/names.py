@@ -6,7 +6,6 @@ from functools import lru_cache
 from typing import Any
 
 from salient.bus.signals import drive_database, rig_database, value_numbers
-from salient.experiments.campaign.machines import files
 
 STATES = ("initialise", "ready", "run", "fault")
 SECTORS = 6
@@ -56,10 +55,3 @@ def cells() -> list[int]:
     part = len(STATES) * SECTORS
     possible = sorted(kind for kind, name in kinds().items() if name not in _OF_TARGETS)
     return [kind * part + index for kind in possible for index in range(part)]
-
-
-def machine(number: int) -> str:
-    """Name of a machine of the campaign."""
-    return files()[number].stem
-
-

@@ -16,6 +16,7 @@ from typing import Any
 from salient.bench.programs import EmulatorError
 from salient.errors import UsageError
 from salient.experiments.campaign.machines import pool_file
+from salient.experiments.tasks import check_build
 from salient.paths import BUILD, ROOT
 
 Result = dict[str, Any]
@@ -96,9 +97,11 @@ def _mode(healthy: bool) -> list[str]:
 _served: dict[bool, subprocess.Popen[str]] = {}
 
 
-def serve(task: tuple[int, bool]) -> Result:
-    """Runs a seed in a program of this process that stays; task: seed, healthy. For workers."""
-    seed, healthy = task
+def serve(task: tuple[int, bool, str]) -> Result:
+    """Runs a seed in a program of this process that stays; task: seed, healthy, and the digest() that everybody must
+    have. For workers."""
+    seed, healthy, expected = task
+    check_build(digest(), expected)
     process = _served.get(healthy)
     if process is None or process.poll() is not None:
         process = _served[healthy] = subprocess.Popen(command("--serve", *_mode(healthy)), stdin=subprocess.PIPE,

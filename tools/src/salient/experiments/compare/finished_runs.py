@@ -21,6 +21,12 @@ NAME = "runs.jsonl"
 METRICS_FILES = tuple(Path(str(module.__file__)) for module in (run_metrics, compare_metrics, every_machine, reference))
 
 
+def programs_digest(case: Case) -> str:
+    """Of the programs that the run of a case executes."""
+    files = (executable(), *((reference_executable(),) if case.extractor == "every_machine" else ()))
+    return hashlib.sha256(" ".join(map(_digest, files)).encode()).hexdigest()
+
+
 class FinishedRuns:
     """Results by run, which its description, the executable, the image of its machine, its load profile and the code of
     the metrics identify.

@@ -16,12 +16,12 @@ from salient.bench.session import SessionError
 from salient.experiments.compare import every_machine
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS
-from salient.experiments.compare.finished_runs import FinishedRuns
+from salient.experiments.compare.finished_runs import FinishedRuns, programs_digest
 from salient.experiments.compare.metrics import EXTRACTORS, Metrics, failures, peak_current_max_A
 from salient.experiments.metrics import MetricsError
 from salient.experiments.results import rounded
 from salient.experiments.scenario import run_scenario
-from salient.experiments.tasks import Task, execute
+from salient.experiments.tasks import Task, check_build, execute
 from salient.machine.file import load_machine, machine_path
 from salient.progress import Progress
 
@@ -58,7 +58,7 @@ def run_all(cases: Sequence[Case], jobs: int, stream: TextIO, finished: Finished
             results[number] = known
     numbers = sorted(number for number in first_cases.values() if number not in results)
     lines = len(numbers) if stream.isatty() else min(len(numbers), _PROGRESS_LINES_MAX)
-    listed = [Task(str(number), cases[number]) for number in numbers]
+    listed = [Task(str(number), (cases[number], programs_digest(cases[number]))) for number in numbers]
     with Progress(lines, stream) as progress:
         for done, (task, result) in enumerate(execute(listed, _run, scheduler, jobs), start=1):
             case, number = cases[int(task.key)], int(task.key)
@@ -91,7 +91,10 @@ def _ratio(value: float | None, of: float | None) -> float | None:
     return value / of if of > 0.0 else 1.0
 
 
-def _run(case: Case) -> tuple[Metrics, str, Any]:
+def _run(task: tuple[Case, str]) -> tuple[Metrics, str, Any]:
+    """Of a case, and the digest of the programs that everybody must have."""
+    case, programs = task
+    check_build(programs_digest(case), programs)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         try:
             result = run_scenario(case.scenario, Path(folder))
