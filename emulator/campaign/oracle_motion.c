@@ -205,14 +205,9 @@ static bool torque_is_known(const oracle_t *oracle) {
            !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) && !oracle_bus_disturbed(oracle);
 }
 
-/* Every set of the client, among them that of the torque's limit. */
+/* Both sets of a client that limits the torque. */
 static bool sets_in_effect(const oracle_t *oracle) {
-    bool degraded = false;
-    for (unsigned i = 0; i < oracle->world->events; i++) {
-        const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);
-        degraded = degraded || (event != NULL && event->kind == WORLD_DEGRADED);
-    }
-    return oracle_limited(oracle) != NULL && oracle->applied >= (degraded ? 2u : 1u);
+    return oracle_limited(oracle) != NULL && oracle->applied >= 2;
 }
 
 void oracle_judge_limit(oracle_t *oracle, uint64_t time_ns, double mean_Nm, double limit_Nm) {

@@ -254,7 +254,7 @@ static session_t session(const sender_t *sender) {
     if (limited && limited->what) {
         list[count++] = SESSION_SAVE;
     }
-    if (has(sender, WORLD_DEGRADED)) {
+    if (limited || has(sender, WORLD_DEGRADED)) {
         list[count++] = SESSION_DEGRADED;
     }
     return sender->configured < count ? list[sender->configured] : SESSION_NONE;
@@ -288,8 +288,9 @@ static void put_session(sender_t *sender, const transport_receiver_t *receiver) 
         sender->resting_us = sender->time_us + SAVING_US;
         break;
     default: {
-        const bool wrong = active(sender, WORLD_DEGRADED)->what == WORLD_DEGRADED_WRONG_CHECK;
-        put_one_parameter(sender, receiver, sender->parameters.degraded_running, 1, wrong);
+        const world_event_t *degraded = active(sender, WORLD_DEGRADED);
+        const bool wrong = degraded && degraded->what == WORLD_DEGRADED_WRONG_CHECK;
+        put_one_parameter(sender, receiver, sender->parameters.degraded_running, degraded != NULL, wrong);
         break;
     }
     }

@@ -63,7 +63,6 @@
 
 #include "control/machine_tables.h"
 #include "control/torque_sharing.h"
-#include "fixed/fixed.h"
 
 /* Of the phases in one half of the electrical revolution: those that move towards the aligned position, and those that
  * move away from it. */
@@ -173,7 +172,7 @@ typedef struct {
 /* A rotor that returns no energy, whatever the torque: below 2 rad/s, or that times the unit of speed, the windings
  * dissipate more. A full DC link leaves it the torque to start in either direction. */
 static inline bool conduction_at_rest(int32_t speed_q22) {
-    return fixed_magnitude(speed_q22) < 2u << 22;
+    return (uint32_t)speed_q22 + (2u << 22) < 4u << 22;
 }
 
 /* Limit of the braking torque's magnitude by what the DC link can take, from the voltage of the present period: N m,

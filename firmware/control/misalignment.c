@@ -183,8 +183,8 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     }
     const int32_t power_q22 = fixed_saturate(misalignment->common_power_q40 >> 18);
     /* T^2 2^-26 of the square of a quarter: 0.00007 T^2 / rad^2. */
-    const int32_t torque_q10 = torque_q24 >> 14;
-    const int32_t floor_q22 = (int32_t)(fixed_product(torque_q10, torque_q10) >> 27) + 1;
+    const int32_t torque_q9 = torque_q24 >> 15; /* at most 64 N m: its square is 2^30 */
+    const int32_t floor_q22 = (torque_q9 * torque_q9 >> 25) + 1;
     /* y 4 q / (16 q^2), q the quarter. */
     const int32_t step_q10 =
         limited_step_q10(fixed_multiply_shift(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));

@@ -142,10 +142,6 @@ void periodic_load_step(const periodic_load_parameters_t *parameters, periodic_l
         return;
     }
     const int32_t lag = angle_step * parameters->lag_periods;
-    if (load->backwards != (lag < 0)) {
-        load->backwards = lag < 0;
-        load->window = 0;
-    }
     const uint32_t index = (sample->angle - (uint32_t)lag) >> VALUE_SHIFT;
     if (load->count == VALUES) {
         end_turn(parameters, load);

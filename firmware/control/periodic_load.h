@@ -81,7 +81,6 @@ typedef struct {
     uint32_t load_q8, change_q8, residual_q8, slow_q8;
     uint32_t window;   /* values in the mean over a pole pitch, up to all */
     int32_t window_q8; /* their sum */
-    bool backwards;    /* direction in which they came */
     /* Since the ranges began anew: */
     uint32_t reviewed_index;
     bool reviewed;                            /* they have a value */

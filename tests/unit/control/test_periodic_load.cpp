@@ -290,14 +290,6 @@ TEST(PeriodicLoad, nothing_of_a_run_acts_in_the_next_one_which_begins_within_the
     }
 }
 
-TEST(PeriodicLoad, ripple_of_the_pole_pitch_after_a_reversal_is_not_learned) {
-    periodic_load_t state{};
-    turn(state, 0.0, 10.3, one_cylinder);
-    const auto ripple = [](double turns) { return 8.0 + 2.0 * std::sin(2.0 * PI * ROTOR_POLES * turns); };
-    turn(state, 10.3, 4.0, ripple);
-    EXPECT_EQ(turn(state, 4.0, -6.0, ripple), 0.0);
-}
-
 TEST(PeriodicLoad, learns_nothing_while_the_load_does_not_count_as_moving) {
     EXPECT_EQ(learn(600.0, harmonics, 2.0, false).largest_q24, 0);
 }
