@@ -206,7 +206,7 @@ typedef struct {
     double stop_speed_rad_s;         /* when the stop began */
     oracle_detection_t detection;
     oracle_torque_t torque, any_torque; /* in torque mode; in any, over 20 ms */
-    double mean_torque_Nm; /* largest since the last limit in telemetry */
+    double mean_torque_Nm;              /* largest since the last limit in telemetry */
     oracle_speed_t speed;
     unsigned applied;     /* sets of parameters in effect */
     uint64_t saved_ns;    /* they were saved; 0: not */

@@ -205,11 +205,11 @@ TEST(MovingLoad, after_a_movement_the_threshold_is_that_of_ripple_until_the_next
 TEST(MovingLoad, more_than_ripple_of_a_constant_load_keeps_the_base_threshold_and_the_long_hold_for_half_a_second) {
     Detector detector;
     detector.range_q24 = 0;
-    while (!detector.state.own_ripple) {
+    while (detector.state.source != MOVING_LOAD_SOURCE_RIPPLE) {
         detector.step(detector.state.withheld < STAGES ? COUNT / 4 : 0);
         ASSERT_LT(detector.state.still, detector.parameters.still_reviews / 2);
     }
-    while (detector.state.own_ripple) {
+    while (detector.state.source == MOVING_LOAD_SOURCE_RIPPLE) {
         detector.step(detector.state.withheld < STAGES ? COUNT / 2 : 0);
         ASSERT_LT(detector.state.still, detector.parameters.still_reviews * 3 / 4);
     }
@@ -217,9 +217,9 @@ TEST(MovingLoad, more_than_ripple_of_a_constant_load_keeps_the_base_threshold_an
         ASSERT_EQ(detector.step(0), STAGES);
     }
     EXPECT_LT(detector.state.still, detector.parameters.still_reviews);
-    EXPECT_FALSE(detector.state.own_ripple);
+    EXPECT_NE(detector.state.source, MOVING_LOAD_SOURCE_RIPPLE);
     withheld_part(&detector, 0.5, COUNT / 4);
-    EXPECT_TRUE(detector.state.own_ripple) << "after half a second";
+    EXPECT_EQ(detector.state.source, MOVING_LOAD_SOURCE_RIPPLE) << "after half a second";
 }
 
 TEST(MovingLoad, the_threshold_of_ripple_is_five_sixteenths_of_a_count) {
