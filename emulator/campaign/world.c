@@ -37,20 +37,21 @@ enum {
 #define LIMITED_SHARE 0.04 /* with another limit of the torque, */
 #define SAVED_SHARE 0.5    /* which is saved, and there after a reset */
 #define OVERHAULING_SHARE 0.1
-#define RUNAWAY_SHARE 0.3      /* of the torque mode: the largest torque, to the end */
-#define TORQUE_STOP_SHARE 0.3  /* of the torque mode: ends with a stop */
-#define REMAINING_SHARE 0.3    /* of the faults: until all are over */
-#define LONG_SHARE 0.08        /* long enough for what takes long to be noticed */
-#define LASTING_SHARE 0.06     /* one fault alone, to the end of a long world */
-#define WRONG_CHECK_SHARE 0.15 /* of the sets of parameters */
-#define SLOW_SHARE 0.6         /* of them: of a kind that takes long to be noticed */
-#define FAULTLESS_SHARE 0.15   /* no fault of the bench */
-#define BEYOND_SHARE 0.04      /* a speed beyond the largest one is commanded for some time */
-#define CLEARING_SHARE 0.03    /* the client sends nothing but clear_fault until all is over */
-#define SECOND_LOSS_SHARE 0.4  /* of the worlds with one lost phase */
-#define REVERSE_SHARE 0.4      /* of the speeds, with a controller of four quadrants, */
-#define REFUSED_SHARE 0.05     /* and of one, which does not turn then */
-#define KEEPING_SHARE 0.5      /* the reference stays in the frames of stop and off */
+#define RUNAWAY_SHARE 0.3        /* of the torque mode: the largest torque, to the end */
+#define TORQUE_STOP_SHARE 0.3    /* of the torque mode: ends with a stop */
+#define REMAINING_SHARE 0.3      /* of the faults: until all are over */
+#define LONG_SHARE 0.08          /* long enough for what takes long to be noticed, */
+#define FAULTLESS_LONG_SHARE 0.4 /* or to be followed */
+#define LASTING_SHARE 0.06       /* one fault alone, to the end of a long world */
+#define WRONG_CHECK_SHARE 0.15   /* of the sets of parameters */
+#define SLOW_SHARE 0.6           /* of them: of a kind that takes long to be noticed */
+#define FAULTLESS_SHARE 0.15     /* no fault of the bench */
+#define BEYOND_SHARE 0.04        /* a speed beyond the largest one is commanded for some time */
+#define CLEARING_SHARE 0.03      /* the client sends nothing but clear_fault until all is over */
+#define SECOND_LOSS_SHARE 0.4    /* of the worlds with one lost phase */
+#define REVERSE_SHARE 0.4        /* of the speeds, with a controller of four quadrants, */
+#define REFUSED_SHARE 0.05       /* and of one, which does not turn then */
+#define KEEPING_SHARE 0.5        /* the reference stays in the frames of stop and off */
 
 /* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
  * not. */
@@ -495,7 +496,7 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     const bool deserted =
         (sort >= SILENT_PART && sort < DESERTED_PART) || (sort >= HOSTILE_PART && sort < DESERTED_SECOND_PART);
     const bool is_long = sort < 0.04 || deserted || lasting(seed) || loses_two(seed) || limited(seed) ||
-                         seeded_unit(seed, STREAM_SCRIPT, 8) < LONG_SHARE;
+                         seeded_unit(seed, STREAM_SCRIPT, 8) < (faultless(seed) ? FAULTLESS_LONG_SHARE : LONG_SHARE);
     last_us = is_long ? 900000 : last_us;
     world->recovery_us = last_us + 25000;
     add_speed(world, first_rpm, 0);
@@ -508,7 +509,7 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     draw_torque(world, last_us);
     draw_request(world, last_us);
     if (seeded_unit(seed, STREAM_REQUEST, 22) < HOT_SHARE) {
-        const double inverter_C = seeded_between(seed, STREAM_REQUEST, 23, 82.0, 88.0);
+        const double inverter_C = seeded_between(seed, STREAM_REQUEST, 23, 84.0, 90.0);
         add_set(world, BENCH_VARIABLE_HELD_INVERTER_C, inverter_C, 25.0, 0, last_us);
     }
     draw_faults(world, last_us);

@@ -98,16 +98,18 @@ def test_loss_of_a_second_phase_is_a_fault(make_bench, controller):
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-@pytest.mark.parametrize(("kind", "attributes", "fault"), [
-    ("switch_shorted", {"leg": "low"}, "phase_shorted"),  # cannot be switched off
-    ("current_sensor_stuck", {"code": 1000.0}, "current_sensor"),  # the end of the current does not show
-    ("current_sensor_swapped", {"with_phase": "c"}, "current_sensor"),  # two phases
+@pytest.mark.parametrize(("kind", "attributes", "faults"), [
+    ("switch_shorted", {"leg": "low"}, {"phase_shorted"}),  # cannot be switched off
+    ("current_sensor_stuck", {"code": 1000.0}, {"current_sensor"}),  # the end of the current does not show
+    # Two phases; where the rotor is decides whether a current becomes too large before that shows.
+    ("current_sensor_swapped", {"with_phase": "c"}, {"current_sensor", "over_current"}),
 ])
-def test_what_cannot_be_run_on_with_is_a_fault(make_bench, controller, kind, attributes, fault):
+def test_what_cannot_be_run_on_with_is_a_fault(make_bench, controller, kind, attributes, faults):
     bench = loaded(make_bench, controller=controller)
     bench.fault(kind, phase="b", **attributes)
     bench.run_for(0.06)
-    assert (bench.drive.state, bench.drive.fault) == ("fault", fault)
+    assert bench.drive.state == "fault"
+    assert bench.drive.fault in faults
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)

@@ -131,7 +131,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
                   const command_t *command, hal_pwm_compare_t *compare) {
     (void)sample, (void)compare;
     interrupts++;
-    torn_parameters += torn(parameters, sizeof *parameters);
+    torn_parameters += torn(parameters, offsetof(control_parameters_t, thermal)); /* what configure_control writes */
     torn_commands += torn(command, sizeof *command);
     fill(SNAPSHOT(state), sizeof(drive_telemetry_t), interrupts * 0x10001u);
     exchange(state);
