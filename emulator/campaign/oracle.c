@@ -17,6 +17,7 @@
 #define STATUS_AGE_MAX_NS (30 * ORACLE_MS_NS)
 #define LOAD_ANSWERED_NS (200 * ORACLE_MS_NS)
 #define CROSSED_NS (15 * ORACLE_MS_NS)
+#define SILENCE_NS (40 * ORACLE_MS_NS) /* of a client that sends each 10 ms: then the torque ramps to zero */
 #define SAVING_NS (100 * ORACLE_MS_NS)
 #define UNSEEN_PERIODS 3                /* from a cause to the state that follows the sample which shows it */
 #define RUN_MAX_NS (502 * ORACLE_MS_NS) /* of a run, since the last request */
@@ -193,9 +194,11 @@ static double shown_speed(const world_t *world) {
     return shown;
 }
 
-/* A frozen encoder shows nothing while the load turns a rotor without current. */
+/* An encoder that is frozen, or does not answer from a start on, shows nothing while the load turns a rotor without
+ * current. */
 static bool turns_unseen(const oracle_t *oracle, const plant_t *plant) {
-    return oracle->injected[FAULT_ENCODER_STUCK] && oracle_overhauled(oracle, plant->speed_rad_s);
+    return (oracle->injected[FAULT_ENCODER_STUCK] || oracle->injected[FAULT_ENCODER_NO_ANSWER]) &&
+           oracle_overhauled(oracle, plant->speed_rad_s);
 }
 
 static void look_at_limits(oracle_t *oracle, const plant_t *plant, unsigned gates) {
@@ -463,6 +466,7 @@ void oracle_on_bus(oracle_t *oracle, const plant_t *plant, uint64_t time_ns, con
         return;
     }
     const bool runs = meaning->request == SENDER_RUN || meaning->request == SENDER_STOP;
+    const bool after_silence = time_ns > oracle->run_ns + SILENCE_NS;
     if (runs) { /* a stop is a run to rest */
         oracle->run_ns = time_ns;
         oracle->commanded = oracle->commanded || meaning->request == SENDER_RUN;
@@ -484,7 +488,7 @@ void oracle_on_bus(oracle_t *oracle, const plant_t *plant, uint64_t time_ns, con
     }
     oracle->withdrawn_ns = meaning->request != SENDER_RUN ? time_ns : oracle->withdrawn_ns;
     if (meaning->torque != oracle->meant.torque || meaning->reference != oracle->meant.reference ||
-        meaning->request != oracle->meant.request) {
+        meaning->request != oracle->meant.request || after_silence) {
         oracle->constant_ns = time_ns;
         oracle->begin_speed_rad_s = plant->speed_rad_s;
     }

@@ -9,24 +9,27 @@
  *   gate_on         a gate on while the drive is not in state run, or a line of safe torque off is not energised, or
  *                   2.5 periods after the last control interrupt
  *   no_command      a gate on without a confirmed arming since the last fault, or 5 ms after a genuine off; a gate on,
- *                   or the state run, 502 ms after the last genuine request to run; torque 170 ms after it, or
- *                   from 65 ms on a larger one than before, by half and a fifth of the largest; both later
- *                   by the 18 ms for which the request waits when the background hangs and the watchdog does not reset
- *                   the drive; a fault that ends without a genuine request to clear it; a gate on after a reset by
- *                   the watchdog without one
+ *                   or the state run, 502 ms after the last genuine request to run; torque 170 ms after it, or from 65
+ *                   ms on a larger one than before, by half and a fifth of the largest; both later by the 18 ms for
+ *                   which the request waits when the background hangs and the watchdog does not reset the drive; a
+ *                   fault that ends without a genuine request to clear it; a gate on after a reset by the watchdog
+ *                   without one
  *   stopped         state run left, without a fault, less than 30 ms after a genuine request to run; or after one to
  *                   stop while the rotor turns
  *   not_stopped     four quadrants, no fault: still turning 100 ms after the time that half of the torque limit needs
  *   resumed         a run after bus-off, with no other request than run since
  *   cleared         a fault ended less than 8 ms after the plant's last reason for one, unless that has just begun: a
  *                   line of safe torque off not energised, a link voltage or a speed beyond its limits; by a request to
- * clear that was there before it; after lines of safe torque off had differed, without both having been off; or that of
- * an encoder which stood still, and has not counted since under_voltage   in state run, the link voltage below its
- * threshold by 6 % for 3 ms over_speed      a gate on for 2 ms at a speed above the limit by 2 % over_voltage    a gate
- * on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no energy back, unless a
- * fault of the only sensor hides it wrong_angle     in state run, encoder and processor healthy, at a speed that is
- * steady within 10 % for 12 ms and 16 counts of the encoder: the measured angle off the encoder's by more than three
- * quarters of a count and the motion in a tick of the timer, on average. The middle of a count is off by half of one at
+ *                   clear that was there before it; after lines of safe torque off had differed, without both having
+ *                   been off; or that of an encoder which stood still, and has not counted since
+ *   under_voltage   in state run, the link voltage below its threshold by 6 % for 3 ms
+ *   over_speed      a gate on for 2 ms at a speed above the limit by 2 %, unless the load turns the rotor and the
+ *                   encoder shows nothing
+ *   over_voltage    a gate on for 200 us at a link voltage above the limit by 2 %, on a machine whose supply takes no
+ *                   energy back, unless a fault of the only sensor hides it
+ *   wrong_angle     in state run, encoder and processor healthy, at a speed that is steady within 10 % for 12 ms and 16
+ *                   counts of the encoder: the measured angle off the encoder's by more than three quarters of a count
+ *                   and the motion in a tick of the timer, on average. The middle of a count is off by half of one at
  *                   most, when sampling is in step with the counts, the time of an edge by a tick
  *   wrong_current, wrong_voltage
  *                   a measured phase current or link voltage off the true one by more than 0.8 % of the sensor's full
@@ -40,8 +43,9 @@
  *                   and a revolution off by more than 1 %, with one quadrant below by 2 %, 0.2 % of the base speed and
  *                   a count
  *   wrong_way       one quadrant: for 50 ms a torque forwards, at a speed, while a speed backwards is commanded
- *   above_limit     the mean torque of electrical periods of 20 ms above the limit in telemetry, or that which the
- *                   client has set, by 15 % and 5 % of the rated one, without torque sharing 30 % and 10 %
+ *   above_limit     up to 0.9 of the base speed: the mean torque of electrical periods of 20 ms above the limit in
+ *                   telemetry, or that which the client has set, by 15 % and 5 % of the rated one, without torque
+ *                   sharing 30 % and 10 %
  *   overshoot       no fault, the speed above a reference that it has approached from below by more than 12 % and 5 %
  *                   of the base speed; one quadrant: and what a light rotor gains
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
@@ -49,24 +53,33 @@
  *   wrong_telemetry a measured current or voltage on the bus that the drive has not measured in the last 4 ms, a speed
  *                   off the true one by 10 %, 5 % of the base speed and half a count in a millisecond; in the snapshot
  *                   of a fault those of its instant; no fault: a mean torque of 100 ms off the true one by 30 % and 15
- * % of the rated one not_derated     a torque limit in telemetry above what loads and temperatures beside it leave, by
- * 12 % of the largest torque applied         a set of parameters with a wrong check was applied wrong_cause     a first
- * cause that neither is true of the plant nor belongs to a fault that was there not_first       a first cause that is
- * not the first one, by its number, of the checks that failed in its tick false_alarm     a fault of the drive without
- * any other, which is not true of the plant, or the drive's own work: too large a current, and without a load that
- * drives the machine too high a speed or voltage; beside faults that do not explain it, it is a wrong_cause undetected
- * in state run for longer than a reaction takes with a fault that shows at any time: changed memory, sensors at a rail,
- * a wrong clock, a background that hangs (oracle_detection.c) no_current      voltage on a phase for twenty times its
- * largest flux linkage, in pulses of more than three periods, and no current at all two_lost        in state run for
- * 300 ms at less than half of the commanded speed, with two phases lost blocked         a speed commanded, and the
- * rotor within a quarter of a stroke for 300 ms and three strokes, or within a stroke for 500 ms and six: a swing that
- * grows is no standstill misled          for 200 ms, above a fifth of the base speed and a tenth of the trip current, a
- * measured angle off by more than a sixth of a rotor pitch contested       for 150 ms in state run while another client
- * sends commands not_reset       no control interrupt for 60 ms, and no reset mute            no status on an
- * undisturbed bus for 100 ms eventually not_recovered   faults over, cleared, armed and commanded: not in run after 150
- * ms, or not within 0.5 % of the speed 100 ms after the time that half of the torque limit needs, or again in a fault,
- * or with a phase that is not used; judged up to 0.9 of the base speed, above which a start is near the limit of the
- * speed. One quadrant: at most 20 % above, of a light rotor what it gains while a delay and the flux linkage last
+ *                   % of the rated one
+ *   not_derated     a torque limit in telemetry above what loads and temperatures beside it leave, by 12 % of the
+ *                   largest torque
+ *   applied         a set of parameters with a wrong check was applied
+ *   wrong_cause     a first cause that neither is true of the plant nor belongs to a fault that was there
+ *   not_first       a first cause that is not the first one, by its number, of the checks that failed in its tick
+ *   false_alarm     a fault of the drive without any other, which is not true of the plant, or the drive's own work:
+ *                   too large a current, and without a load that drives the machine too high a speed or voltage; beside
+ *                   faults that do not explain it, it is a wrong_cause
+ *   undetected      in state run for longer than a reaction takes with a fault that shows at any time: changed memory,
+ *                   sensors at a rail, a wrong clock, a background that hangs (oracle_detection.c)
+ *   no_current      voltage on a phase for twenty times its largest flux linkage, in pulses of more than three
+ *                   periods, and no current at all
+ *   two_lost        in state run for 300 ms at less than half of the commanded speed, with two phases lost
+ *   blocked         a speed commanded, and the rotor within a quarter of a stroke for 300 ms and three strokes, or
+ *                   within a stroke for 500 ms and six: a swing that grows is no standstill
+ *   misled          for 200 ms, above a fifth of the base speed and a tenth of the trip current, a measured angle off
+ *                   by more than a sixth of a rotor pitch
+ *   contested       for 150 ms in state run while another client sends commands, or frames that are the drive's
+ *   not_reset       no control interrupt for 60 ms, and no reset
+ *   mute            no status on an undisturbed bus for 100 ms
+ * eventually
+ *   not_recovered   faults over, cleared, armed and commanded: not in run after 150 ms, or not within 0.5 % of the
+ *                   speed 100 ms after the time that half of the torque limit needs, or again in a fault, or with a
+ *                   phase that is not used; judged up to 0.9 of the base speed, above which a start is near the limit
+ *                   of the speed. One quadrant: at most 20 % above, of a light rotor what it gains while a delay and
+ *                   the flux linkage last
  * sometimes
  *   cells           (fault, state of the drive, sector of phase a) in which a fault began */
 #ifndef CAMPAIGN_ORACLE_H

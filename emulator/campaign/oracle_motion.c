@@ -28,6 +28,7 @@
 #define WRONG_WAY_SPEED 0.05
 #define WRONG_WAY_TORQUE 0.1 /* of the rated one */
 #define LIMIT_MIN_NS (20 * ORACLE_MS_NS)
+#define LIMIT_SPEED 0.9 /* of the base speed, above which hysteresis brakes as well as it drives */
 #define LIMIT_AGE_MAX_NS (120 * ORACLE_MS_NS)
 
 static bool undisturbed(const oracle_t *oracle) {
@@ -223,7 +224,8 @@ static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
     const oracle_telemetry_t *telemetry = &oracle->telemetry;
     if (oracle->drive.state != STATE_RUN || !torque_is_known(oracle) || telemetry->limit_ns == 0 ||
         plant->time_ns > telemetry->limit_ns + LIMIT_AGE_MAX_NS ||
-        plant->time_ns < oracle->reset_ns + LIMIT_AGE_MAX_NS) {
+        plant->time_ns < oracle->reset_ns + LIMIT_AGE_MAX_NS ||
+        fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > LIMIT_SPEED * oracle->world->machine->speed_base_rpm) {
         torque->samples = 0;
         return;
     }
