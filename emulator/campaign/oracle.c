@@ -130,14 +130,11 @@ static bool answers_load(const oracle_t *oracle, uint64_t now_us) {
     bool answers = false;
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = world_begun(oracle->world, i, now_us);
-        if (event == NULL || event->kind != WORLD_SET) {
+        if (event == NULL) {
             continue;
         }
-        const bool steps =
-            event->what == BENCH_VARIABLE_LOAD_TORQUE_NM || event->what == BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM;
-        const bool moves = event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_NM ||
-                           event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM;
-        answers = answers || moves || (steps && event->begin_us * 1000 + LOAD_ANSWERED_NS > oracle->run_ns);
+        const bool begins = oracle_is_load(event) && event->begin_us * 1000 + LOAD_ANSWERED_NS > oracle->run_ns;
+        answers = answers || begins || oracle_is_load_sine(event);
     }
     return answers;
 }

@@ -42,12 +42,20 @@ bool oracle_bus_disturbed(const oracle_t *oracle) {
     return oracle_other_sender(oracle, true, UINT64_MAX);
 }
 
+bool oracle_is_load(const world_event_t *event) {
+    return event->kind == WORLD_SET &&
+           (event->what == BENCH_VARIABLE_LOAD_TORQUE_NM || event->what == BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM);
+}
+
+bool oracle_is_load_sine(const world_event_t *event) {
+    return event->kind == WORLD_SET && (event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_NM ||
+                                        event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM);
+}
+
 bool oracle_overhauled(const oracle_t *oracle, double speed) {
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);
-        if (event != NULL && event->kind == WORLD_SET &&
-            (event->what == BENCH_VARIABLE_LOAD_TORQUE_NM || event->what == BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM) &&
-            event->raw * speed < 0.0) {
+        if (event != NULL && oracle_is_load(event) && event->raw * speed < 0.0) {
             return true;
         }
     }

@@ -3,7 +3,6 @@
 
 #include <math.h>
 
-#include "bench_variables.h"
 #include "fault_kinds.h"
 
 #define TORQUE_SETTLED_NS (50 * ORACLE_MS_NS) /* after another command */
@@ -55,27 +54,36 @@ static bool torque_follows(const oracle_t *oracle, const plant_t *plant) {
            !derated(oracle);
 }
 
-/* Of the shaft, over whole electrical periods. */
-static void look_at_torque(oracle_t *oracle, const plant_t *plant) {
-    oracle_torque_t *torque = &oracle->torque;
-    if (!torque_follows(oracle, plant)) {
-        torque->samples = 0;
-        return;
-    }
+/* Adds the torque of the shaft. True, with the mean, at the end of an electrical period that is at least so long, after
+ * which it begins anew. */
+static bool mean_torque(oracle_torque_t *torque, const plant_t *plant, uint64_t min_ns, double *mean_Nm) {
     if (torque->samples == 0) {
         *torque = (oracle_torque_t){.begin_ns = plant->time_ns, .begin_angle_rad = plant->rotor_angle_rad};
     }
     torque->sum_Nm += plant_torque_Nm(plant);
     torque->samples++;
     const double turned_rad = fabs(plant->rotor_angle_rad - torque->begin_angle_rad);
-    if (turned_rad < ORACLE_TWO_PI / plant->machine->rotor_poles || plant->time_ns < torque->begin_ns + TORQUE_MIN_NS) {
+    if (turned_rad < ORACLE_TWO_PI / plant->machine->rotor_poles || plant->time_ns < torque->begin_ns + min_ns) {
+        return false;
+    }
+    *mean_Nm = torque->sum_Nm / torque->samples;
+    torque->samples = 0;
+    return true;
+}
+
+static void look_at_torque(oracle_t *oracle, const plant_t *plant) {
+    oracle_torque_t *torque = &oracle->torque;
+    if (!torque_follows(oracle, plant)) {
+        torque->samples = 0;
         return;
     }
-    const double mean_Nm = torque->sum_Nm / torque->samples;
+    double mean_Nm;
+    if (!mean_torque(torque, plant, TORQUE_MIN_NS, &mean_Nm)) {
+        return;
+    }
     const double wanted_Nm =
         oracle->world->controller == 2 ? oracle->meant.reference : fmax(oracle->meant.reference, 0.0);
     if (fabs(wanted_Nm) > oracle_torque_max_Nm(oracle)) {
-        torque->samples = 0;
         return;
     }
     const bool shares = oracle->world->controller == 2;
@@ -84,7 +92,6 @@ static void look_at_torque(oracle_t *oracle, const plant_t *plant) {
     if (fabs(mean_Nm - wanted_Nm) > part * fabs(wanted_Nm) + part_rated * oracle->world->machine->torque_rated_Nm) {
         oracle_violate(oracle, "wrong_torque", plant->time_ns, oracle->world->controller, mean_Nm / wanted_Nm);
     }
-    torque->samples = 0;
 }
 
 /* Of a speed that is approached from below, before loads end with the faults. */
@@ -125,15 +132,11 @@ static void look_at_stop(oracle_t *oracle, const plant_t *plant) {
 static bool load_is_constant(const oracle_t *oracle, uint64_t now_us) {
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = world_begun(oracle->world, i, now_us);
-        if (event == NULL || event->kind != WORLD_SET) {
+        if (event == NULL) {
             continue;
         }
-        const bool moves = event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_NM ||
-                           event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM;
-        const bool steps =
-            event->what == BENCH_VARIABLE_LOAD_TORQUE_NM || event->what == BENCH_VARIABLE_LOAD_TORQUE_COARSE_NM;
         const uint64_t last_us = event->end_us != 0 && event->end_us <= now_us ? event->end_us : event->begin_us;
-        if (moves || (steps && now_us < last_us + LOAD_SETTLED_US)) {
+        if (oracle_is_load_sine(event) || (oracle_is_load(event) && now_us < last_us + LOAD_SETTLED_US)) {
             return false;
         }
     }
@@ -229,21 +232,15 @@ static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
         torque->samples = 0;
         return;
     }
-    if (torque->samples == 0) {
-        *torque = (oracle_torque_t){.begin_ns = plant->time_ns, .begin_angle_rad = plant->rotor_angle_rad};
-    }
-    torque->sum_Nm += plant_torque_Nm(plant);
-    torque->samples++;
-    const double turned_rad = fabs(plant->rotor_angle_rad - torque->begin_angle_rad);
-    if (turned_rad < ORACLE_TWO_PI / plant->machine->rotor_poles || plant->time_ns < torque->begin_ns + LIMIT_MIN_NS) {
+    double mean_Nm;
+    if (!mean_torque(torque, plant, LIMIT_MIN_NS, &mean_Nm)) {
         return;
     }
-    const double mean_Nm = fabs(torque->sum_Nm / torque->samples);
+    mean_Nm = fabs(mean_Nm);
     oracle->mean_torque_Nm = fmax(oracle->mean_torque_Nm, mean_Nm);
     if (sets_in_effect(oracle)) {
         oracle_judge_limit(oracle, plant->time_ns, mean_Nm, oracle_torque_max_Nm(oracle));
     }
-    torque->samples = 0;
 }
 
 void oracle_look_at_motion(oracle_t *oracle, const plant_t *plant) {

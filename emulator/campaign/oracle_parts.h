@@ -61,6 +61,10 @@ bool oracle_other_sender(const oracle_t *oracle, bool hostile, uint64_t time_us)
 /* The bus was loaded, cut or shared with another sender at any time. */
 bool oracle_bus_disturbed(const oracle_t *oracle);
 
+/* The event is a load that steps or ramps; the amplitude of a sine. */
+bool oracle_is_load(const world_event_t *event);
+bool oracle_is_load_sine(const world_event_t *event);
+
 /* A load drives the machine in the direction of a speed at any time. */
 bool oracle_overhauled(const oracle_t *oracle, double speed);
 

@@ -9,17 +9,14 @@ import sys
 import tempfile
 from pathlib import Path
 
-from salient.errors import RunFailed, UsageError
-from salient.paths import BUILD, ROOT
+from salient.errors import RunFailed
+from salient.paths import BUILD, ROOT, make_folder
 
 
 def build(out: Path) -> int:
     """Writes the wheel to a folder and prints its path."""
     log = BUILD / "wheel.log"
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"--out {out}: cannot write there ({error.strerror}); choose a writable folder") from None
+    make_folder(out)
     with tempfile.TemporaryDirectory(prefix="salient-") as name, log.open("wb") as output:
         folder = Path(name)
         extra = folder / "setuptools.cfg"  # by default setuptools writes next to the sources

@@ -15,7 +15,6 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -117,7 +116,7 @@ def runs_of(options: argparse.Namespace) -> list[Run]:
         axes["load_profile"] = options.load_profile
     first_seed = base[0].seed if options.seed is None else options.seed
     axes["seed"] = [first_seed + n for n in range(options.seeds)]
-    program = _digest(executable())
+    program = tasks.file_digest(executable())
     found = []
     for combination in itertools.product(*axes.values()):
         columns = dict(zip(axes, combination, strict=True))
@@ -153,17 +152,12 @@ def _key(of: Run) -> str:
     files = [machine_image(of.scenario.machine), Path(__file__), Path(str(run_metrics.__file__)),
              *([load_profile_path(profile)] if profile else [])]
     scenario = replace(of.scenario, machine=Path(of.scenario.machine).stem)
-    return hashlib.sha256(" ".join([of.program, *map(_digest, files), repr(scenario)]).encode()).hexdigest()
-
-
-@lru_cache
-def _digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+    return hashlib.sha256(" ".join([of.program, *map(tasks.file_digest, files), repr(scenario)]).encode()).hexdigest()
 
 
 def run_one(of: Run) -> dict[str, Any]:
     """The metrics of a combination, and why there are none or fault; executed by a worker."""
-    tasks.check_build(_digest(executable()), of.program)
+    tasks.check_build(tasks.file_digest(executable()), of.program)
     row: dict[str, Any] = dict.fromkeys(METRICS)
     error = ""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:

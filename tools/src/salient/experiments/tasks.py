@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
+import hashlib
 import json
 import multiprocessing
 import os
@@ -22,6 +23,7 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, TextIO
@@ -83,6 +85,12 @@ def execute(tasks: Sequence[Task], function: Callable[[Any], Any], scheduler: st
         yield from _on_this_computer(tasks, function, jobs or len(os.sched_getaffinity(0)))
     else:
         yield from _on_a_cluster(tasks, function, scheduler)
+
+
+@lru_cache
+def file_digest(file: Path) -> str:
+    """SHA-256 of a file, which does not change while this process lasts."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def check_build(present: str, wanted: str) -> None:

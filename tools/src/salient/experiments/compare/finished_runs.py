@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from salient.experiments.compare import every_machine, reference
 from salient.experiments.compare import metrics as compare_metrics
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.metrics import Metrics
+from salient.experiments.tasks import file_digest
 from salient.machine.cache import machine_image
 
 NAME = "runs.jsonl"
@@ -24,7 +24,7 @@ METRICS_FILES = tuple(Path(str(module.__file__)) for module in (run_metrics, com
 def programs_digest(case: Case) -> str:
     """Of the programs that the run of a case executes."""
     files = (executable(), *((reference_executable(),) if case.extractor == "every_machine" else ()))
-    return hashlib.sha256(" ".join(map(_digest, files)).encode()).hexdigest()
+    return hashlib.sha256(" ".join(map(file_digest, files)).encode()).hexdigest()
 
 
 class FinishedRuns:
@@ -63,9 +63,4 @@ class FinishedRuns:
         files = (executable(), self._images[machine], *METRICS_FILES,
                  *((reference_executable(),) if case.extractor == "every_machine" else ()),
                  *(() if profile is None else (load_profile_path(profile),)))
-        return hashlib.sha256(" ".join([*map(_digest, files), description]).encode()).hexdigest()
-
-
-@lru_cache
-def _digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+        return hashlib.sha256(" ".join([*map(file_digest, files), description]).encode()).hexdigest()
