@@ -40,9 +40,11 @@
 #define SHOWN_SHIFT 2
 #define ALONE_SHIFT 8
 
-/* Time for which a phase has to be consistent with the angle to speak for the encoder: 1/1024 s. When all others
- * have within a quarter of a second (SHOWN_SHIFT), the contradiction of one alone is not the encoder's. */
+/* Time for which a phase has to be consistent with the angle to speak for the encoder: 1/1024 s. When two others, or
+ * all that there are, have within a quarter of a second (SHOWN_SHIFT), the contradiction of one alone is not the
+ * encoder's. */
 #define AGREES_SHIFT 10
+#define AGREEING_PHASES 2
 
 /* Time for which a contradiction waits for the next phase: 1/64 s. */
 #define WAIT_SHIFT 6
@@ -282,17 +284,22 @@ static void note_agreement(const encoder_monitor_parameters_t *parameters, encod
     }
 }
 
-/* True when all other phases that are not lost have been consistent with the angle in the last quarter of a second. One
- * that is left is enough: what it has shown, it contradicts when it conducts the next time, if the encoder is wrong. */
+/* True when two of the other phases, or all that are not lost, have been consistent with the angle in the last quarter
+ * of a second. One that is left is enough: what it has shown, it contradicts when it conducts the next time, if the
+ * encoder is wrong. */
 static bool others_agree(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor, unsigned index,
                          const encoder_monitor_input_t *input) {
     bool all = true;
+    unsigned agreeing = 0;
     for (unsigned other = 0; other < machine_tables.phases; other++) {
         encoder_monitor_phase_t *phase = &monitor->phase[other];
         phase->agreed = phase->agreed && input->period - phase->agreed_at <= parameters->rate_hz >> SHOWN_SHIFT;
-        all &= other == index || phase->agreed || (input->lost_phases >> other & 1u) != 0;
+        if (other != index && (input->lost_phases >> other & 1u) == 0) {
+            all &= phase->agreed;
+            agreeing += phase->agreed;
+        }
     }
-    return all;
+    return all || agreeing >= AGREEING_PHASES;
 }
 
 /* True while the encoder shows a rotor that turns the way the torque drives it. */
