@@ -545,6 +545,7 @@ static void take_samples(plant_t *plant, const rotor_step_t *rotor, double corre
             plant->bus_voltage_V = link_recorded_V(link, at_s);
         }
         plant->time_ns = plant->sample_next_ns;
+        plant_follow_edges(plant, end_ns);
         plant->sample_next_ns += plant->sample_step_ns;
         plant->sample(plant->sample_context, plant);
     }

@@ -155,8 +155,7 @@ void plant_set_switches(plant_t *plant, const hal_pwm_compare_t *compare, uint16
     }
 }
 
-/* Follows the edges that have come; returns the time of the next one, at most to_ns. */
-static uint64_t follow_edges(plant_t *plant, uint64_t to_ns) {
+uint64_t plant_follow_edges(plant_t *plant, uint64_t to_ns) {
     uint64_t next_ns = to_ns;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         const half_bridge_pattern_t *pattern = &plant->pattern[phase];
@@ -551,9 +550,9 @@ void plant_advance(plant_t *plant, uint64_t to_ns) {
         if (phase_steps_advance(plant, to_ns)) {
             continue;
         }
-        const uint64_t edge_ns = follow_edges(plant, to_ns);
+        const uint64_t edge_ns = plant_follow_edges(plant, to_ns);
         integrate(plant, plant->trip_ns < edge_ns ? plant->trip_ns : edge_ns);
-        follow_edges(plant, to_ns);
+        plant_follow_edges(plant, to_ns);
     }
     if (plant->sample != NULL && plant->sample_next_ns == plant->time_ns) {
         sample_now(plant);

@@ -475,6 +475,31 @@ TEST(PlantObserve, SamplesExactlyOnItsGrid) {
     }
 }
 
+void expect_switches_of_the_pattern(void *context, const plant_t *plant) {
+    ++*static_cast<unsigned *>(context);
+    const half_bridge_pattern_t &pattern = plant->pattern[0];
+    unsigned switches = pattern.first;
+    for (unsigned edge = 0; edge < pattern.count; edge++) {
+        switches = plant->time_ns >= plant->pattern_ns + pattern.delay_ns[edge] ? pattern.switches[edge] : switches;
+    }
+    EXPECT_EQ(plant->switches[0], switches) << plant->time_ns;
+}
+
+TEST(PlantObserve, SamplesHaveTheSwitchesOfTheirTime) {
+    const machine_t machine = machine_of(MAGNETICS_SATURATING);
+    plant_t plant;
+    plant_init(&plant, &machine, 0.3);
+    const hal_pwm_compare_t compare = {.upper = {2}, .lower = {1500}};
+    unsigned samples = 0;
+    plant_observe(&plant, 100, 330, expect_switches_of_the_pattern, &samples);
+    for (unsigned period = 0; period < 10; period++) {
+        plant_set_switches(&plant, &compare, TICKS);
+        ASSERT_GT(plant.pattern[0].count, 1u);
+        plant_advance(&plant, plant.time_ns + PERIOD_NS);
+    }
+    EXPECT_GT(samples, 10 * PERIOD_NS / 330 - 2);
+}
+
 TEST(PlantObserve, StartInThePastContinuesOnTheGridAndStepZeroStops) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     plant_t plant;
