@@ -156,6 +156,7 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
         oracle->silence_torque_Nm = fmax(fabs(plant_torque_Nm(plant)), before_Nm);
     } else if (age_ns > request_max_ns(oracle, 65 * ORACLE_MS_NS) && !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) &&
                !oracle_bus_disturbed(oracle) && !answers_load(oracle, now_ns / 1000) &&
+               (oracle->world->controller == 2 || plant->speed_rad_s > 0.0) && /* freewheeling, it generates */
                fabs(plant_torque_Nm(plant)) >
                    1.5 * oracle->silence_torque_Nm + 0.2 * oracle->world->machine->torque_max_Nm) {
         oracle_violate(oracle, "no_command", now_ns, 7, plant_torque_Nm(plant));

@@ -40,20 +40,20 @@
  *   wrong_torque    no fault, torque mode, below half of the base speed: the mean torque of electrical periods off the
  *                   commanded one by more than 10 %, without torque sharing 25 %, and 2 % of the rated one
  *   not_following   no fault, a speed commanded and a load that has been constant for long: the mean speed over 50 ms
- *                   and a revolution off by more than 1 %, with one quadrant below by 2 %, 0.2 % of the base speed and
- *                   a count
+ *                   and a revolution off by more than 1 %, with one quadrant below by 2 %, with sliding mode by 10 %,
+ *                   and 0.2 % of the base speed and a count
  *   wrong_way       one quadrant: for 50 ms a torque forwards, at a speed, while a speed backwards is commanded
  *   above_limit     up to 0.9 of the base speed: the mean torque of electrical periods of 20 ms above the limit in
- *                   telemetry, or that which the client has set, by 15 % and 5 % of the rated one, without torque
- *                   sharing 30 % and 10 %
+ *                   telemetry, or that which the client has set, by 30 % and 5 % of the rated one, without torque
+ *                   sharing 10 %
  *   overshoot       no fault, the speed above a reference that it has approached from below by more than 12 % and 5 %
  *                   of the base speed; one quadrant: and what a light rotor gains
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
  *                   and memory undisturbed
  *   wrong_telemetry a measured current or voltage on the bus that the drive has not measured in the last 4 ms, a speed
  *                   off the true one by 10 %, 5 % of the base speed and half a count in a millisecond; in the snapshot
- *                   of a fault those of its instant; no fault: a mean torque of 100 ms off the true one by 30 % and 15
- *                   % of the rated one
+ *                   of a fault those of its instant; no fault: a mean torque of 100 ms off the true one, without
+ *                   torque sharing beyond the least or the largest, by 30 % and 15 % of the rated one
  *   not_derated     a torque limit in telemetry above what loads and temperatures beside it leave, by 12 % of the
  *                   largest torque
  *   applied         a set of parameters with a wrong check was applied
@@ -158,7 +158,7 @@ typedef struct {
 /* Torque in telemetry and the true one, over at least two electrical periods. */
 typedef struct {
     unsigned frames, samples;
-    double estimate_sum_Nm, true_sum_Nm, begin_angle_rad;
+    double estimate_sum_Nm, true_sum_Nm, least_Nm, most_Nm, begin_angle_rad;
 } oracle_torque_telemetry_t;
 
 /* Least and largest value in the present and in the previous window of time. */
@@ -221,7 +221,8 @@ typedef struct {
     oracle_torque_t torque, any_torque; /* in torque mode; in any, over 20 ms */
     double mean_torque_Nm;              /* largest since the last limit in telemetry */
     oracle_speed_t speed;
-    unsigned applied;     /* sets of parameters in effect */
+    unsigned applied; /* sets of parameters in effect */
+    uint64_t applied_ns;
     uint64_t saved_ns;    /* they were saved; 0: not */
     uint64_t forwards_ns; /* since then a torque forwards against a reference backwards */
     oracle_telemetry_t telemetry;

@@ -118,6 +118,12 @@ static uint32_t causes_of_script(const world_event_t *event) {
                                                                          : 0;
 }
 
+/* The load is the torque that heat and the client leave. */
+static bool overloaded(const oracle_t *oracle, const plant_t *plant) {
+    const double announced_Nm = oracle->telemetry.limit_ns != 0 ? oracle->telemetry.limit_Nm.low[0] : INFINITY;
+    return fabs(plant->load_torque_Nm) > 0.9 * fmin(announced_Nm, oracle_torque_max_Nm(oracle));
+}
+
 /* What the plant itself shows. */
 static bool true_of_plant(const oracle_t *oracle, unsigned cause, const plant_t *plant) {
     const world_machine_t *machine = oracle->world->machine;
@@ -137,7 +143,7 @@ static bool true_of_plant(const oracle_t *oracle, unsigned cause, const plant_t 
         return fmax(oracle->speed_recent_rad_s, fabs(plant->speed_rad_s)) * ORACLE_RPM_PER_RAD_S >
                0.95 * machine->over_speed_rpm;
     case CAUSE_STALL:
-        return plant->time_ns > oracle->detection.stroke_ns + STALLED_NS;
+        return plant->time_ns > oracle->detection.stroke_ns + STALLED_NS || overloaded(oracle, plant);
     default:
         return false;
     }

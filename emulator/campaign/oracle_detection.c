@@ -59,17 +59,18 @@ static bool checks_late(const oracle_t *oracle, uint64_t time_us) {
            oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_us);
 }
 
-/* A reset writes anew what has changed in memory and registers. */
-static bool mended_by_reset(const oracle_t *oracle, const world_event_t *event) {
+/* A reset writes anew what has changed in memory and registers, and a set of parameters the limits and constants. */
+static bool written_anew(const oracle_t *oracle, const world_event_t *event) {
+    const bool of_set = event->what == FAULT_LIMIT_FLIPPED || event->what == FAULT_CONSTANT_FLIPPED;
     return event->what >= FAULT_LIMIT_FLIPPED && event->what <= FAULT_PERIOD_REGISTER_FLIPPED &&
-           oracle->reset_ns >= event->begin_us * 1000;
+           (oracle->reset_ns >= event->begin_us * 1000 || (of_set && oracle->applied_ns >= event->begin_us * 1000));
 }
 
 static void look_at_kinds(oracle_t *oracle, uint64_t now_ns) {
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = &oracle->world->event[i];
         if (event->kind != WORLD_FAULT || !world_active(oracle->world, i, now_ns / 1000) ||
-            mended_by_reset(oracle, event)) {
+            written_anew(oracle, event)) {
             continue;
         }
         const uint64_t within_ns = noticed_within_ms(oracle, event) * ORACLE_MS_NS;
@@ -165,7 +166,8 @@ static void look_at_phases(oracle_t *oracle, const plant_t *plant) {
         double *flux_Wb = &oracle->detection.flux_Wb[phase];
         double *pulse_Wb = &oracle->detection.pulse_Wb[phase];
         const double step_Wb = plant->bus_voltage_V * (double)ORACLE_LOOK_NS * 1e-9;
-        const double short_Wb = PULSE_PERIODS * plant->bus_voltage_V * (double)oracle->period_ns * 1e-9;
+        /* Looks meet a pulse once more than it has of their steps. */
+        const double short_Wb = step_Wb + PULSE_PERIODS * plant->bus_voltage_V * (double)oracle->period_ns * 1e-9;
         if (oracle->drive.state != STATE_RUN || plant_current_A(plant, phase) > NO_CURRENT_A) {
             *flux_Wb = *pulse_Wb = 0.0;
         } else if (plant->switches[phase] == 0) {
