@@ -94,6 +94,10 @@ const world_event_t *oracle_limited(const oracle_t *oracle) {
     return NULL;
 }
 
+bool oracle_sets_in_effect(const oracle_t *oracle) {
+    return oracle_limited(oracle) != NULL && oracle->applied >= 2;
+}
+
 double oracle_torque_max_Nm(const oracle_t *oracle) {
     const world_event_t *limited = oracle_limited(oracle);
     return oracle->world->machine->torque_max_Nm * (limited != NULL ? limited->value : 1.0);

@@ -216,11 +216,6 @@ static bool torque_is_known(const oracle_t *oracle) {
            !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) && !oracle_bus_disturbed(oracle);
 }
 
-/* Both sets of a client that limits the torque. */
-static bool sets_in_effect(const oracle_t *oracle) {
-    return oracle_limited(oracle) != NULL && oracle->applied >= 2;
-}
-
 /* Single pulses near base speed take some electrical periods until their mean is that of the reference. */
 void oracle_judge_limit(oracle_t *oracle, uint64_t time_ns, double mean_Nm, double limit_Nm) {
     const bool shares = oracle->world->controller == 2;
@@ -233,9 +228,8 @@ void oracle_judge_limit(oracle_t *oracle, uint64_t time_ns, double mean_Nm, doub
 static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
     oracle_torque_t *torque = &oracle->any_torque;
     const oracle_telemetry_t *telemetry = &oracle->telemetry;
-    if (oracle->drive.state != STATE_RUN || !torque_is_known(oracle) || telemetry->limit_ns == 0 ||
+    if (oracle->drive.state != STATE_RUN || !torque_is_known(oracle) || telemetry->limit_ns <= oracle->reset_ns ||
         plant->time_ns > telemetry->limit_ns + LIMIT_AGE_MAX_NS ||
-        plant->time_ns < oracle->reset_ns + LIMIT_AGE_MAX_NS ||
         fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > LIMIT_SPEED * oracle->world->machine->speed_base_rpm) {
         torque->samples = 0;
         return;
@@ -246,7 +240,7 @@ static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
     }
     mean_Nm = fabs(mean_Nm);
     oracle->mean_torque_Nm = fmax(oracle->mean_torque_Nm, mean_Nm);
-    if (sets_in_effect(oracle)) {
+    if (oracle_sets_in_effect(oracle)) {
         oracle_judge_limit(oracle, plant->time_ns, mean_Nm, oracle_torque_max_Nm(oracle));
     }
 }

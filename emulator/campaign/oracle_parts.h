@@ -71,6 +71,9 @@ bool oracle_overhauled(const oracle_t *oracle, double speed);
 /* The limit of the torque that the client sets; NULL: none. */
 const world_event_t *oracle_limited(const oracle_t *oracle);
 
+/* Both sets of such a client are. */
+bool oracle_sets_in_effect(const oracle_t *oracle);
+
 /* The torque that the drive has at least for a change of the speed. */
 double oracle_torque_max_Nm(const oracle_t *oracle);
 

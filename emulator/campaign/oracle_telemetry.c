@@ -19,6 +19,7 @@
 #define WINDING_LIMIT_C 155.0
 #define INVERTER_LIMIT_C 100.0
 #define DERATING_ERROR_MAX 0.12
+#define SET_LIMIT_ERROR_MAX 1.03 /* of the limit that the client has set, which a frame rounds */
 #define LIMIT_WINDOW_NS (50 * ORACLE_MS_NS)
 
 /* Means of the torque in frames, which meet its ripple anywhere. */
@@ -147,6 +148,11 @@ static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data
     oracle_judge_limit(oracle, time_ns, oracle->mean_torque_Nm,
                        fmax(telemetry->limit_Nm.high[0], telemetry->limit_Nm.high[1]));
     oracle->mean_torque_Nm = 0.0;
+    if (oracle_sets_in_effect(oracle) && time_ns > oracle->applied_ns + SETTLED_NS &&
+        limit_Nm > SET_LIMIT_ERROR_MAX * oracle_torque_max_Nm(oracle) &&
+        !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
+        oracle_violate(oracle, "above_limit", time_ns, 3, limit_Nm / oracle_torque_max_Nm(oracle));
+    }
     if (limit_Nm > most_Nm * (fmin(fmax(room, 0.0), 1.0) + DERATING_ERROR_MAX) &&
         !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
         oracle_violate(oracle, "not_derated", time_ns, 0, limit_Nm / most_Nm);

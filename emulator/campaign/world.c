@@ -384,6 +384,10 @@ static bool faultless(uint64_t seed) {
     return seeded_unit(seed, STREAM_REQUEST, 14) < FAULTLESS_SHARE;
 }
 
+static bool hot(uint64_t seed) {
+    return seeded_unit(seed, STREAM_REQUEST, 22) < HOT_SHARE;
+}
+
 static bool limited(uint64_t seed) {
     return seeded_unit(seed, STREAM_REQUEST, 18) < LIMITED_SHARE;
 }
@@ -495,7 +499,7 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
     const bool deserted =
         (sort >= SILENT_PART && sort < DESERTED_PART) || (sort >= HOSTILE_PART && sort < DESERTED_SECOND_PART);
-    const bool is_long = sort < 0.04 || deserted || lasting(seed) || loses_two(seed) || limited(seed) ||
+    const bool is_long = sort < 0.04 || deserted || lasting(seed) || loses_two(seed) || limited(seed) || hot(seed) ||
                          seeded_unit(seed, STREAM_SCRIPT, 8) < (faultless(seed) ? FAULTLESS_LONG_SHARE : LONG_SHARE);
     last_us = is_long ? 900000 : last_us;
     world->recovery_us = last_us + 25000;
@@ -508,7 +512,7 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     draw_script(world, last_us);
     draw_torque(world, last_us);
     draw_request(world, last_us);
-    if (seeded_unit(seed, STREAM_REQUEST, 22) < HOT_SHARE) {
+    if (hot(seed)) {
         const double inverter_C = seeded_between(seed, STREAM_REQUEST, 23, 84.0, 90.0);
         add_set(world, BENCH_VARIABLE_HELD_INVERTER_C, inverter_C, 25.0, 0, last_us);
     }
