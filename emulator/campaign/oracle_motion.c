@@ -17,10 +17,12 @@
 #define STOP_ERROR_MAX_BASE 0.05
 #define STOP_ERROR_MAX_RAD_S 2.0
 #define STOP_SETTLED_S 0.1
-#define FOLLOWING_ERROR_MAX 0.02 /* of the reference */
-#define FOLLOWING_ERROR_MAX_QUADRANTS 0.01
-#define FOLLOWING_ERROR_MAX_SMC 0.1 /* which hunts with a light rotor */
-#define FOLLOWING_SETTLED_S 0.15    /* after the time that half of the torque limit needs */
+#define FOLLOWING_ERROR_MAX 0.02 /* of the reference, */
+#define FOLLOWING_ERROR_MAX_QUADRANTS 0.003
+#define FOLLOWING_ERROR_MAX_SMC 0.1    /* which hunts with a light rotor, */
+#define FOLLOWING_ERROR_MAX_BASE 0.002 /* and of the base speed */
+#define FOLLOWING_ERROR_MAX_BASE_QUADRANTS 0.001
+#define FOLLOWING_SETTLED_S 0.15 /* after the time that half of the torque limit needs */
 #define FOLLOWING_MIN_S 0.05
 #define FOLLOWING_SPEED 0.9 /* of the base speed, at most */
 #define FOLLOWING_LIMIT 0.8 /* of the largest torque, at least */
@@ -183,9 +185,10 @@ static void look_at_speed(oracle_t *oracle, const plant_t *plant) {
     const double part = quadrants                        ? FOLLOWING_ERROR_MAX_QUADRANTS
                         : oracle->world->controller == 1 ? FOLLOWING_ERROR_MAX_SMC
                                                          : FOLLOWING_ERROR_MAX;
+    const double part_base = quadrants ? FOLLOWING_ERROR_MAX_BASE_QUADRANTS : FOLLOWING_ERROR_MAX_BASE;
     const double base_rad_s = oracle->world->machine->speed_base_rpm / ORACLE_RPM_PER_RAD_S;
     const double count_rad_s = ldexp(ORACLE_TWO_PI, -(int)oracle->world->encoder_bits) / time_s;
-    const double most_rad_s = part * fabs(reference_rad_s) + 0.002 * base_rad_s + count_rad_s;
+    const double most_rad_s = part * fabs(reference_rad_s) + part_base * base_rad_s + count_rad_s;
     const double error_rad_s = turned_rad / time_s - reference_rad_s;
     if (quadrants ? fabs(error_rad_s) > most_rad_s : error_rad_s < -most_rad_s) {
         oracle_violate(oracle, "not_following", plant->time_ns, oracle->world->controller,
