@@ -119,16 +119,20 @@ static void look_at_overshoot(oracle_t *oracle, const plant_t *plant) {
     }
 }
 
-/* A run ended by a request to stop ends at rest; and a drive of four quadrants brakes. */
+/* A run ended by a request to stop becomes no faster, and ends at rest; and a drive of four quadrants brakes. */
 static void look_at_stop(oracle_t *oracle, const plant_t *plant) {
     const world_machine_t *machine = oracle->world->machine;
-    const double least_rad_s =
-        STOP_ERROR_MAX_BASE * machine->speed_base_rpm / ORACLE_RPM_PER_RAD_S + STOP_ERROR_MAX_RAD_S;
+    const double base_rad_s = machine->speed_base_rpm / ORACLE_RPM_PER_RAD_S;
+    const bool stops = oracle->meant.request == SENDER_STOP && oracle->drive.state == STATE_RUN &&
+                       undisturbed(oracle) && !oracle_overhauled(oracle, plant->speed_rad_s);
+    if (stops && fabs(plant->speed_rad_s) > fabs(oracle->stop_speed_rad_s) + OVERSHOOT_MAX_BASE * base_rad_s +
+                                                oracle_added_rad_s(oracle, plant)) {
+        oracle_violate(oracle, "not_stopped", plant->time_ns, 1, plant->speed_rad_s / oracle->stop_speed_rad_s);
+    }
+    const double least_rad_s = STOP_ERROR_MAX_BASE * base_rad_s + STOP_ERROR_MAX_RAD_S;
     const double needed_s = plant->machine->inertia_kg_m2 * oracle->world->inertia_gain *
                             fabs(oracle->stop_speed_rad_s) / (0.5 * oracle_torque_max_Nm(oracle));
-    if (oracle->meant.request == SENDER_STOP && oracle->drive.state == STATE_RUN && oracle->world->controller == 2 &&
-        undisturbed(oracle) && !derated(oracle) && !oracle_overhauled(oracle, plant->speed_rad_s) &&
-        fabs(plant->speed_rad_s) > least_rad_s &&
+    if (stops && oracle->world->controller == 2 && !derated(oracle) && fabs(plant->speed_rad_s) > least_rad_s &&
         plant->time_ns > oracle->stop_ns + (uint64_t)((STOP_SETTLED_S + needed_s) * 1e9)) {
         oracle_violate(oracle, "not_stopped", plant->time_ns, 0, plant->speed_rad_s / oracle->stop_speed_rad_s);
     }
