@@ -16,8 +16,8 @@
  *                   without one
  *   stopped         state run left, without a fault, less than 30 ms after a genuine request to run; or after one to
  *                   stop while the rotor turns
- *   not_stopped     no fault: faster than at the request to stop, by 5 % of the base speed and what a light rotor gains;
- *                   four quadrants: still turning 100 ms after the time that half of the torque limit needs
+ *   not_stopped     no fault: faster than at the request to stop, by 5 % of the base speed and what a light rotor
+ *                   gains; four quadrants: still turning 100 ms after the time that half of the torque limit needs
  *   resumed         a run after bus-off, with no other request than run since
  *   cleared         a fault ended less than 8 ms after the plant's last reason for one, unless that has just begun: a
  *                   line of safe torque off not energised, a link voltage or a speed beyond its limits; by a request to
