@@ -28,6 +28,7 @@ void oracle_init(oracle_t *oracle, const world_t *world, const plant_t *plant, u
     magnetics_point_t aligned;
     magnetics_evaluate(&plant->magnetics, 0.0, world->machine->trip_current_A, &aligned);
     oracle->detection.largest_flux_Wb = aligned.flux_linkage_Wb;
+    oracle_read_world(oracle);
     oracle->encoder_offset_rev = oracle_encoder_offset_rev(world);
 }
 
@@ -155,7 +156,7 @@ static void look_at_commands(oracle_t *oracle, const plant_t *plant) {
         const double before_Nm = age_ns < 10 * ORACLE_MS_NS ? 0.0 : oracle->silence_torque_Nm;
         oracle->silence_torque_Nm = fmax(fabs(plant_torque_Nm(plant)), before_Nm);
     } else if (age_ns > request_max_ns(oracle, 65 * ORACLE_MS_NS) && !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) &&
-               !oracle_bus_disturbed(oracle) && !answers_load(oracle, now_ns / 1000) &&
+               !oracle->bus_disturbed && !answers_load(oracle, now_ns / 1000) &&
                (oracle->world->controller == 2 || plant->speed_rad_s > 0.0) && /* freewheeling, it generates */
                fabs(plant_torque_Nm(plant)) >
                    1.5 * oracle->silence_torque_Nm + 0.2 * oracle->world->machine->torque_max_Nm) {
@@ -404,7 +405,7 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
         if (drive.checks != 0 && (drive.checks & up_to) != BIT(drive.fault) && !oracle_state_changed(oracle)) {
             oracle_violate(oracle, "not_first", plant->time_ns, drive.fault, (double)drive.checks);
         }
-        if (oracle->recovered && oracle->recovery_judged && !oracle->settled && !oracle_bus_disturbed(oracle)) {
+        if (oracle->recovered && oracle->recovery_judged && !oracle->settled && !oracle->bus_disturbed) {
             oracle_violate(oracle, "not_recovered", plant->time_ns, 3, drive.fault);
         }
     } else if (drive.state == STATE_RUN && before != STATE_RUN) {
@@ -497,7 +498,7 @@ void oracle_on_status(oracle_t *oracle, uint64_t time_ns, unsigned state, unsign
     oracle->detection.status_ns = time_ns;
     const bool differs = state != oracle->drive.state || fault != oracle->drive.fault;
     if (differs && time_ns > oracle->state_ns + STATUS_AGE_MAX_NS && !oracle_state_changed(oracle) &&
-        !oracle_bus_disturbed(oracle)) {
+        !oracle->bus_disturbed) {
         oracle_violate(oracle, "wrong_status", time_ns, state, fault);
     }
 }

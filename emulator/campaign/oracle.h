@@ -190,6 +190,8 @@ typedef struct {
 typedef struct {
     const world_t *world;
     uint64_t period_ns;
+    bool bus_disturbed;                 /* loaded, cut or shared with another sender at any time */
+    const world_event_t *limited;       /* the limit of the torque that the client sets; NULL: none */
     uint32_t limit_bits, constant_bits; /* of the drive's memory: a change of a higher one has no effect */
     unsigned violations;
     oracle_violation_t violation[ORACLE_VIOLATIONS_MAX];

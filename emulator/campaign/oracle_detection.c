@@ -102,7 +102,7 @@ static unsigned lost_phases(const oracle_t *oracle, uint64_t now_us) {
 
 /* With two phases lost a drive that does not follow its reference does not run on, as it does with one. */
 static void look_at_lost_phases(oracle_t *oracle, const plant_t *plant) {
-    const bool heard = plant->time_ns < oracle->run_ns + HEARD_NS && !oracle_bus_disturbed(oracle);
+    const bool heard = plant->time_ns < oracle->run_ns + HEARD_NS && !oracle->bus_disturbed;
     const double reference_rad_s = fabs(oracle->meant.reference) / ORACLE_RPM_PER_RAD_S;
     const bool drives =
         heard && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN && !oracle->meant.torque &&
@@ -204,7 +204,7 @@ static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
         detection->stroke_ns = plant->time_ns;
         detection->stroke_rad = plant->rotor_angle_rad;
     }
-    const bool heard = plant->time_ns < oracle->run_ns + HEARD_NS && !oracle_bus_disturbed(oracle);
+    const bool heard = plant->time_ns < oracle->run_ns + HEARD_NS && !oracle->bus_disturbed;
     const bool pushes = heard && oracle->drive.state == STATE_RUN && oracle->meant.request == SENDER_RUN &&
                         !oracle->meant.torque && oracle_can_turn(oracle) &&
                         fabs(oracle->meant.reference) > BLOCKED_SPEED * oracle->world->machine->speed_base_rpm;

@@ -1,14 +1,12 @@
 #include "campaign/oracle_parts.h"
 
+#include <string.h>
+
 #include "bench_variables.h"
 #include "fault_kinds.h"
 
 bool oracle_any_injected(const oracle_t *oracle, unsigned first, unsigned last) {
-    bool any = false;
-    for (unsigned kind = first; kind <= last; kind++) {
-        any = any || oracle->injected[kind];
-    }
-    return any;
+    return memchr(&oracle->injected[first], true, last + 1 - first) != NULL;
 }
 
 bool oracle_variable_begun(const oracle_t *oracle, unsigned variable, uint64_t time_us) {
@@ -31,7 +29,7 @@ bool oracle_other_sender(const oracle_t *oracle, bool hostile, uint64_t time_us)
     return false;
 }
 
-bool oracle_bus_disturbed(const oracle_t *oracle) {
+static bool disturbs_bus(const oracle_t *oracle) {
     static const unsigned variables[] = {BENCH_VARIABLE_BABBLE_LOAD_PERCENT, BENCH_VARIABLE_BUS_CONNECTION,
                                          BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER, BENCH_VARIABLE_FRAME_FAULT};
     for (unsigned i = 0; i < sizeof variables / sizeof *variables; i++) {
@@ -84,7 +82,7 @@ bool oracle_can_turn(const oracle_t *oracle) {
     return oracle->world->controller == 2 || oracle->meant.reference > 0.0;
 }
 
-const world_event_t *oracle_limited(const oracle_t *oracle) {
+static const world_event_t *limited(const oracle_t *oracle) {
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);
         if (event != NULL && event->kind == WORLD_LIMITED) {
@@ -94,11 +92,15 @@ const world_event_t *oracle_limited(const oracle_t *oracle) {
     return NULL;
 }
 
+void oracle_read_world(oracle_t *oracle) {
+    oracle->bus_disturbed = disturbs_bus(oracle);
+    oracle->limited = limited(oracle);
+}
+
 bool oracle_sets_in_effect(const oracle_t *oracle) {
-    return oracle_limited(oracle) != NULL && oracle->applied >= 2;
+    return oracle->limited != NULL && oracle->applied >= 2;
 }
 
 double oracle_torque_max_Nm(const oracle_t *oracle) {
-    const world_event_t *limited = oracle_limited(oracle);
-    return oracle->world->machine->torque_max_Nm * (limited != NULL ? limited->value : 1.0);
+    return oracle->world->machine->torque_max_Nm * (oracle->limited != NULL ? oracle->limited->value : 1.0);
 }

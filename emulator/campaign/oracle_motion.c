@@ -37,7 +37,7 @@
 #define LIMIT_AGE_MAX_NS (120 * ORACLE_MS_NS)
 
 static bool undisturbed(const oracle_t *oracle) {
-    return !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) && !oracle_bus_disturbed(oracle);
+    return !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) && !oracle->bus_disturbed;
 }
 
 /* By heat. */
@@ -220,7 +220,7 @@ static void look_at_direction(oracle_t *oracle, const plant_t *plant) {
 static bool torque_is_known(const oracle_t *oracle) {
     return !oracle_any_injected(oracle, FAULT_WINDING_OPEN, FAULT_ENCODER_NO_ANSWER) &&
            !oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) &&
-           !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) && !oracle_bus_disturbed(oracle);
+           !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT) && !oracle->bus_disturbed;
 }
 
 /* Single pulses near base speed take some electrical periods until their mean is that of the reference. */

@@ -58,9 +58,6 @@ bool oracle_variable_begun(const oracle_t *oracle, unsigned variable, uint64_t t
 /* A second sender of valid frames; with a hostile one as well when its frames may be in the way of others. */
 bool oracle_other_sender(const oracle_t *oracle, bool hostile, uint64_t time_us);
 
-/* The bus was loaded, cut or shared with another sender at any time. */
-bool oracle_bus_disturbed(const oracle_t *oracle);
-
 /* The event is a load that steps or ramps; the amplitude of a sine. */
 bool oracle_is_load(const world_event_t *event);
 bool oracle_is_load_sine(const world_event_t *event);
@@ -68,10 +65,10 @@ bool oracle_is_load_sine(const world_event_t *event);
 /* A load drives the machine in the direction of a speed at any time. */
 bool oracle_overhauled(const oracle_t *oracle, double speed);
 
-/* The limit of the torque that the client sets; NULL: none. */
-const world_event_t *oracle_limited(const oracle_t *oracle);
+/* Reads from the world what it does not change in its course. */
+void oracle_read_world(oracle_t *oracle);
 
-/* Both sets of such a client are. */
+/* Both sets of a client that limits the torque are. */
 bool oracle_sets_in_effect(const oracle_t *oracle);
 
 /* The torque that the drive has at least for a change of the speed. */

@@ -115,7 +115,7 @@ void oracle_enter_run(oracle_t *oracle, const plant_t *plant) {
 void oracle_finish(oracle_t *oracle, const plant_t *plant, oracle_heat_t heat) {
     oracle_judge_temperature(oracle, plant, heat);
     oracle->held = held_by_encoder(oracle, plant);
-    if (oracle->held || !oracle->recovery_judged || cause_remains(oracle) || oracle_bus_disturbed(oracle) ||
+    if (oracle->held || !oracle->recovery_judged || cause_remains(oracle) || oracle->bus_disturbed ||
         heat.switch_C > SWITCH_COOL_C) {
         return;
     }

@@ -52,7 +52,7 @@ static void follow_torque(oracle_t *oracle, const plant_t *plant) {
     oracle->telemetry.angle_rad = plant->rotor_angle_rad;
     const bool known =
         oracle->drive.state == STATE_RUN && plant->time_ns > oracle->state_ns + SETTLED_NS &&
-        !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) && !oracle_bus_disturbed(oracle) &&
+        !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) && !oracle->bus_disturbed &&
         fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S < TORQUE_SPEED * oracle->world->machine->speed_base_rpm;
     if (!known || torque->frames == 0) {
         *torque = (oracle_torque_telemetry_t){.begin_angle_rad = plant->rotor_angle_rad};
@@ -168,7 +168,7 @@ static void judge_set(oracle_t *oracle, uint64_t time_ns, const uint8_t data[8])
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);
         if (event != NULL && event->kind == WORLD_DEGRADED && event->what == WORLD_DEGRADED_WRONG_CHECK && done &&
-            data[4] == STEP_APPLY && !(oracle_limited(oracle) != NULL && oracle->applied == 1)) {
+            data[4] == STEP_APPLY && !(oracle->limited != NULL && oracle->applied == 1)) {
             oracle_violate(oracle, "applied", time_ns, 0, 0.0);
         }
     }
@@ -201,7 +201,7 @@ void oracle_on_telemetry(oracle_t *oracle, uint64_t time_ns, unsigned identifier
         judge_set(oracle, time_ns, data);
         return;
     }
-    if (oracle_bus_disturbed(oracle) || oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
+    if (oracle->bus_disturbed || oracle_any_injected(oracle, FAULT_INTERRUPT_LOST, FAULT_INTERRUPT_STORM) ||
         oracle_any_injected(oracle, FAULT_CLOCK_DRIFT, FAULT_CLOCK_DRIFT) ||
         oracle_variable_begun(oracle, BENCH_VARIABLE_INTERRUPT_TIME_US, time_ns / 1000) ||
         time_ns < oracle->reset_ns + SNAPSHOT_NS) {
