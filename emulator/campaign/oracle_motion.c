@@ -33,7 +33,7 @@
 #define WRONG_WAY_TORQUE 0.1 /* of the rated one */
 #define LIMIT_PART 1.3
 #define LIMIT_MIN_NS (20 * ORACLE_MS_NS)
-#define LIMIT_SPEED 0.9 /* of the base speed, above which hysteresis brakes as well as it drives */
+#define LIMIT_SPEED 0.9 /* of the base speed, at most; with hysteresis TORQUE_SPEED */
 #define LIMIT_AGE_MAX_NS (120 * ORACLE_MS_NS)
 
 static bool undisturbed(const oracle_t *oracle) {
@@ -235,9 +235,10 @@ void oracle_judge_limit(oracle_t *oracle, uint64_t time_ns, double mean_Nm, doub
 static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
     oracle_torque_t *torque = &oracle->any_torque;
     const oracle_telemetry_t *telemetry = &oracle->telemetry;
+    const double most = oracle->world->controller == 2 ? LIMIT_SPEED : TORQUE_SPEED;
     if (oracle->drive.state != STATE_RUN || !torque_is_known(oracle) || telemetry->limit_ns <= oracle->reset_ns ||
         plant->time_ns > telemetry->limit_ns + LIMIT_AGE_MAX_NS ||
-        fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > LIMIT_SPEED * oracle->world->machine->speed_base_rpm) {
+        fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S > most * oracle->world->machine->speed_base_rpm) {
         torque->samples = 0;
         return;
     }
