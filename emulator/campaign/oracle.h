@@ -46,7 +46,8 @@
  *   wrong_way       one quadrant: for 50 ms a torque forwards, at a speed, while a speed backwards is commanded
  *   above_limit     up to 0.9 of the base speed, without torque sharing half: the mean torque of electrical periods of
  *                   20 ms above the limit in telemetry, or that which the client has set, by 30 % and 5 % of the rated
- *                   one, without torque sharing 10 %; or a limit in telemetry above that which the client has set, by 3 %
+ *                   one, without torque sharing 10 %; or a limit in telemetry above the one that the client has set, by
+ *                   3 %
  *   overshoot       no fault, the speed above a reference that it has approached from below by more than 12 % and 5 %
  *                   of the base speed; one quadrant: and what a light rotor gains
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
