@@ -225,8 +225,8 @@ typedef struct {
     oracle_torque_t torque, any_torque; /* in torque mode; in any, over 20 ms */
     double mean_torque_Nm;              /* largest since the last limit in telemetry */
     oracle_speed_t speed;
-    unsigned applied; /* sets of parameters in effect */
-    uint64_t applied_ns;
+    unsigned applied;     /* sets of parameters in effect */
+    uint64_t applied_ns;  /* the last of them was applied */
     uint64_t saved_ns;    /* they were saved; 0: not */
     uint64_t forwards_ns; /* since then a torque forwards against a reference backwards */
     oracle_telemetry_t telemetry;
