@@ -148,13 +148,14 @@ static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data
     oracle_judge_limit(oracle, time_ns, oracle->mean_torque_Nm,
                        fmax(telemetry->limit_Nm.high[0], telemetry->limit_Nm.high[1]));
     oracle->mean_torque_Nm = 0.0;
+    if (oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
+        return;
+    }
     if (oracle_sets_in_effect(oracle) && time_ns > oracle->applied_ns + SETTLED_NS &&
-        limit_Nm > SET_LIMIT_ERROR_MAX * oracle_torque_max_Nm(oracle) &&
-        !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
+        limit_Nm > SET_LIMIT_ERROR_MAX * oracle_torque_max_Nm(oracle)) {
         oracle_violate(oracle, "above_limit", time_ns, 3, limit_Nm / oracle_torque_max_Nm(oracle));
     }
-    if (limit_Nm > most_Nm * (fmin(fmax(room, 0.0), 1.0) + DERATING_ERROR_MAX) &&
-        !oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
+    if (limit_Nm > most_Nm * (fmin(fmax(room, 0.0), 1.0) + DERATING_ERROR_MAX)) {
         oracle_violate(oracle, "not_derated", time_ns, 0, limit_Nm / most_Nm);
     }
 }
@@ -162,13 +163,14 @@ static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data
 /* Sets that are in effect, and a set of parameters whose check is wrong. */
 static void judge_set(oracle_t *oracle, uint64_t time_ns, const uint8_t data[8]) {
     const bool done = data[0] == OPERATION_SET_CONTROL && data[3] == STATUS_DONE;
-    oracle->applied += done && data[4] == STEP_APPLY;
-    oracle->applied_ns = done && data[4] == STEP_APPLY ? time_ns : oracle->applied_ns;
+    const bool applies = done && data[4] == STEP_APPLY;
+    oracle->applied += applies;
+    oracle->applied_ns = applies ? time_ns : oracle->applied_ns;
     oracle->saved_ns = done && data[4] == STEP_SAVE ? time_ns : oracle->saved_ns;
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);
-        if (event != NULL && event->kind == WORLD_DEGRADED && event->what == WORLD_DEGRADED_WRONG_CHECK && done &&
-            data[4] == STEP_APPLY && !(oracle->limited != NULL && oracle->applied == 1)) {
+        if (event != NULL && event->kind == WORLD_DEGRADED && event->what == WORLD_DEGRADED_WRONG_CHECK && applies &&
+            !(oracle->limited != NULL && oracle->applied == 1)) {
             oracle_violate(oracle, "applied", time_ns, 0, 0.0);
         }
     }
