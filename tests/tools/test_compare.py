@@ -24,13 +24,13 @@ from salient.experiments.compare import (
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS, scenario_toml, start_scenario
 from salient.experiments.compare.every_machine import EXAMPLES
-from salient.experiments.compare.finished_runs import FinishedRuns
 from salient.experiments.compare.machine import cases_of, subject, targets_of
 from salient.experiments.compare.metrics import EXTRACTORS, METRICS, failures, peak_current_max_A
 from salient.experiments.compare.random_cases import random_drive, random_load
 from salient.experiments.compare.runner import RunMetrics, _run, run_all
 from salient.experiments.compare.targets import TARGETS, Target
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep, load_scenarios
+from salient.experiments.tasks import read_results
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 from salient.machine.parameter_table import read_table
@@ -373,7 +373,7 @@ def test_written_scenario_equals_the_one_that_ran(group, tmp_path):
 def test_run_that_ends_in_a_fault_is_reported_and_reproducible(tmp_path):
     scenario = replace(start_scenario(controller="paper"), duration_s=0.1, parameters={"over_speed_rpm": 300.0})
     case = Case("start", "saturating", "paper", "start", scenario)
-    (run,) = run_all([case], 1, io.StringIO())
+    (run,) = run_all([case], 1, io.StringIO(), tmp_path / "runs")
     assert (run.metrics, run.failed) == ({}, "fault over_speed")
     (row, *_) = table.make_rows([run])
     assert row.failed == {"paper": "fault over_speed"} and row.values == {}
@@ -383,13 +383,13 @@ def test_run_that_ends_in_a_fault_is_reported_and_reproducible(tmp_path):
     assert load_scenarios(path) == [replace(scenario, name=path.stem)]
 
 
-def test_ratios_are_relative_to_the_first_sample():
+def test_ratios_are_relative_to_the_first_sample(tmp_path):
     step = replace(start_scenario(controller="salient"), duration_s=0.2, speed=(SpeedStep(0.0, 150.0),),
                    load=(LoadStep(0.1, 8.0),))
     doubled = {"inertia_gain": 2.0}
     samples = (("nominal", step), ("changed", replace(step, bench=doubled)))
     runs = run_all([Case("inertia", "saturating, inertia x 2", "salient", "inertia_step", scenario, sample)
-                    for sample, scenario in samples], 1, io.StringIO())
+                    for sample, scenario in samples], 1, io.StringIO(), tmp_path)
     nominal, changed = (run.metrics for run in runs)
     assert "recovery_ratio" not in nominal
     assert changed["recovery_ratio"] == pytest.approx(changed["recovery_time_s"] / nominal["recovery_time_s"])
@@ -400,14 +400,12 @@ def test_interrupted_comparison_continues_with_the_runs_that_are_missing(tmp_pat
     path = tmp_path / "runs.jsonl"
     short = replace(start_scenario(controller="paper"), duration_s=0.01)
     first, second = (Case("start", "saturating", "paper", "start", replace(short, seed=seed)) for seed in (1, 2))
-    (before,) = run_all([first], 1, io.StringIO(), FinishedRuns(path))
-    with path.open("a") as file:
-        file.write('["cut off')
-    progress = io.StringIO()
-    after, added = run_all([first, second], 1, progress, FinishedRuns(path))
-    assert progress.getvalue().startswith("1/1 start")
+    (before,) = run_all([first], 1, io.StringIO(), tmp_path)
+    (line,) = path.read_text().splitlines()
+    path.write_text(f'{line}\n{{"cut off')
+    after, added = run_all([first, second], 1, io.StringIO(), tmp_path)
     assert after == before and added.case == second
-    assert len(path.read_text().splitlines()) == 2
+    assert len(path.read_text().splitlines()) == 2 and path.read_text().startswith(f"{line}\n")
 
 
 def test_resumed_comparison_executes_nothing_again_and_a_new_one_everything(tmp_path):
@@ -427,9 +425,9 @@ def test_finished_run_counts_for_its_machine_file_only(tmp_path):
     heavier = text.replace("inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.03")
     for content, executed in ((text, True), (text, False), (heavier, True), (text, False)):
         machine.write_text(content)
-        progress = io.StringIO()
-        run_all([case], 1, progress, FinishedRuns(tmp_path / "runs.jsonl"))
-        assert ("1/1 start" in progress.getvalue()) == executed
+        before = len(read_results(tmp_path))
+        run_all([case], 1, io.StringIO(), tmp_path)
+        assert len(read_results(tmp_path)) == before + executed
 
 
 def test_cases_of_another_machine_have_its_speeds_and_torques():
@@ -526,12 +524,12 @@ def test_samples_are_the_first_ones_of_each_condition():
     assert command._first_samples(ALL_CASES["robustness"], None) == ALL_CASES["robustness"]
 
 
-def test_identical_runs_are_executed_once():
+def test_identical_runs_are_executed_once(tmp_path):
     progress = io.StringIO()
     case = Case("start", "saturating", "paper", "start", replace(start_scenario(controller="paper"), duration_s=0.01))
-    first, second = run_all([case, replace(case, condition="again")], 2, progress)
+    first, second = run_all([case, replace(case, condition="again")], 2, progress, tmp_path)
     assert first.metrics == second.metrics and second.case.condition == "again"
-    assert progress.getvalue() == "1/1 start: saturating by paper\n"
+    assert progress.getvalue().startswith("1/1 start: ") and progress.getvalue().count("\n") == 1
 
 
 def test_each_limit_of_the_robustness_study_fails_a_drive():

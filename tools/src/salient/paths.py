@@ -3,6 +3,7 @@ folder data/ has the files that are needed in the places that they have in the r
 
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from salient.errors import UsageError, shown
@@ -29,11 +30,15 @@ def program(build: str, name: str) -> Path:
     return ROOT / "bin" / name if IS_WHEEL else BUILD / build / "bin" / name
 
 
-def make_folder(out: Path) -> None:
-    """Makes the folder of --out, if needed; UsageError when nothing can be written there."""
+def make_folder(out: Path, removed: Sequence[str] = ()) -> None:
+    """Makes the folder of --out, if needed; UsageError when nothing can be written there. removed: patterns of the
+    files of an earlier run, which could be taken for those of one that fails half-way."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
+        for pattern in removed:
+            for path in out.glob(pattern):
+                path.unlink()
     except OSError as error:
         raise UsageError(f"--out {out}: cannot write there ({error.strerror}); choose a writable folder") from None
 

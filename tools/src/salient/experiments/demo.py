@@ -44,7 +44,7 @@ from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 from salient.machine.path import stated_conditions
 from salient.pages import Plot
-from salient.paths import COMMAND, SCENARIOS
+from salient.paths import COMMAND, SCENARIOS, make_folder
 from salient.progress import Progress
 from salient.version import VERSION
 
@@ -101,7 +101,8 @@ def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.st
     """
     scenarios = _scenarios(options)
     out: Path = options.out
-    _prepare_folder(out)
+    make_folder(out, ("results.json", "report.html"))
+    make_folder(out / "figures")
     try:
         results = _run_and_report(scenarios, out, can, options.build, stream)
     except OSError as error:
@@ -166,18 +167,6 @@ def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
     for of in scenarios.values():
         check_parameters(of, options.build)
     return scenarios
-
-
-def _prepare_folder(out: Path) -> None:
-    """Creates the folder and removes earlier results, which could be taken for those of a demo that fails half-way."""
-    try:
-        (out / "figures").mkdir(parents=True, exist_ok=True)
-        for name in ("results.json", "report.html"):
-            (out / name).unlink(missing_ok=True)
-            (out / name).touch()
-            (out / name).unlink()
-    except OSError as error:
-        raise _cannot_write(out, error) from error
 
 
 def _cannot_write(out: Path, error: OSError) -> UsageError:

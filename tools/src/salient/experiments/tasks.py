@@ -69,22 +69,15 @@ def run(tasks: Sequence[Task], function: Callable[[Any], Any], out: Path, shard:
         for task in mine:
             if task.key in finished:
                 yield task, finished[task.key]
-        for task, result in execute(todo, function, scheduler, jobs):
+        if not todo:
+            return
+        ended = (_on_this_computer(todo, function, jobs or len(os.sched_getaffinity(0))) if scheduler is None else
+                 _on_a_cluster(todo, function, scheduler))
+        for task, result in ended:
             line = json.dumps({"key": task.key, "result": result}, allow_nan=False)
             file.write(line + "\n")
             file.flush()
             yield task, json.loads(line)["result"]  # as a later run reads it
-
-
-def execute(tasks: Sequence[Task], function: Callable[[Any], Any], scheduler: str | None = None,
-            jobs: int | None = None) -> Generator[tuple[Task, Any], None, None]:
-    """Yields tasks with their results as they finish, without a folder. See run()."""
-    if not tasks:
-        return
-    if scheduler is None:
-        yield from _on_this_computer(tasks, function, jobs or len(os.sched_getaffinity(0)))
-    else:
-        yield from _on_a_cluster(tasks, function, scheduler)
 
 
 @lru_cache
@@ -100,13 +93,18 @@ def check_build(present: str, wanted: str) -> None:
 
 
 def read_results(out: Path) -> dict[str, Any]:
-    """The results in a folder, of all shards, by key. The end of a line that was being written is left out."""
+    """The results in a folder, of all shards, by key. The end of a line that was being written is left out. UsageError:
+    a line is none."""
     results = {}
     for path in sorted(out.glob("runs*.jsonl")):
-        for line in path.read_text(encoding="utf-8").splitlines(keepends=True):
-            if line.endswith("\n"):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(keepends=True), start=1):
+            if not line.endswith("\n"):
+                continue
+            try:
                 entry = json.loads(line)
                 results[entry["key"]] = entry["result"]
+            except (ValueError, TypeError, KeyError):
+                raise UsageError(f"{path}, line {number}: not the result of a run; choose another folder") from None
     return results
 
 

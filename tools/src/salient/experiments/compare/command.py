@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -13,20 +12,18 @@ from typing import TextIO
 
 from salient.config import DEFAULTS
 from salient.errors import UsageError
-from salient.experiments.compare import baseline, finished_runs, results_file, summary_file, table
+from salient.experiments.compare import baseline, results_file, summary_file, table
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS, TITLES, scenario_toml
-from salient.experiments.compare.finished_runs import FinishedRuns
 from salient.experiments.compare.machine import Subject, cases_of, subject, targets_of
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS
 from salient.experiments.scenario import check_parameters
 from salient.experiments.settings import parse_values, with_setting
-from salient.machine.cache import machine_image
 from salient.machine.file import MachineError
-from salient.paths import COMMAND
+from salient.paths import COMMAND, make_folder
 
-FAILED = "failed"
+FAILED, PAGE = "failed", "compare.html"
 _FAILED_LISTED_MAX = 10
 
 
@@ -44,11 +41,8 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
         targets = TARGETS if on.is_bundled else targets_of(on)
     cases = _with_settings(_first_samples(cases, options.samples), options.set)
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
-    _prepare_folder(options.out, options.resume)
-    for machine in {case.scenario.machine for case in cases}:
-        machine_image(machine)
-    finished = FinishedRuns(options.out / finished_runs.NAME)
-    runs = run_all(cases, options.jobs or os.cpu_count() or 1, sys.stderr, finished, options.scheduler)
+    make_folder(options.out, (f"{FAILED}/*.toml", results_file.NAME, PAGE, summary_file.NAME))
+    runs = run_all(cases, options.jobs, sys.stderr, options.out, not options.resume, options.scheduler)
     rows = table.make_rows(runs, targets)
     changes: list[baseline.Change] = []
     change_summary = None
@@ -62,7 +56,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
 
     from salient.experiments.compare.html import write_page  # imports Matplotlib, which takes a second
 
-    write_page(options.out / "compare.html", rows, content, change_summary, changes, _command(options), titles)
+    write_page(options.out / PAGE, rows, content, change_summary, changes, _command(options), titles)
     stream.write(f"{table.table(rows, titles)}\n\n{table.summary(rows)}\n")
     for run, path in failed[:_FAILED_LISTED_MAX]:
         stream.write(f"{_name(run.case)}: {run.failed}; reproduce with: {COMMAND} run {path}\n")
@@ -113,23 +107,10 @@ def _with_settings(cases: Sequence[Case], settings: Sequence[str]) -> list[Case]
     return changed
 
 
-def _prepare_folder(out: Path, resume: bool) -> None:
-    """Creates the folder and removes the files of an earlier run, except for its finished runs when it is resumed."""
-    try:
-        (out / FAILED).mkdir(parents=True, exist_ok=True)
-        for path in (*(out / FAILED).glob("*.toml"), out / results_file.NAME, out / "compare.html",
-                     out / summary_file.NAME, *(() if resume else (out / finished_runs.NAME,))):
-            path.unlink(missing_ok=True)
-        (out / results_file.NAME).touch()
-        (out / results_file.NAME).unlink()
-    except OSError as error:
-        raise UsageError(f"--out {out}: cannot write there ({error.strerror}); choose a writable folder") \
-            from None
-
-
 def _write_failed(folder: Path, runs: Sequence[RunMetrics]) -> list[tuple[RunMetrics, Path]]:
     """Writes a scenario file for each failed run, which reproduces it."""
     written = []
+    folder.mkdir(exist_ok=True)
     for run in runs:
         if not run.failed:
             continue

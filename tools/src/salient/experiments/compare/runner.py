@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,22 +12,26 @@ from typing import Any, TextIO
 from can import CanError
 
 from salient.bench.drive import DriveError
-from salient.bench.programs import EmulatorError
+from salient.bench.load_profile import load_profile_path
+from salient.bench.programs import EmulatorError, executable, reference_executable
 from salient.bench.session import SessionError
-from salient.experiments.compare import every_machine
+from salient.experiments import metrics as run_metrics
+from salient.experiments import tasks
+from salient.experiments.compare import every_machine, reference
+from salient.experiments.compare import metrics as compare_metrics
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS
-from salient.experiments.compare.finished_runs import FinishedRuns, programs_digest
 from salient.experiments.compare.metrics import EXTRACTORS, Metrics, failures, peak_current_max_A
 from salient.experiments.metrics import MetricsError
 from salient.experiments.results import rounded
 from salient.experiments.scenario import run_scenario
-from salient.experiments.tasks import Task, check_build, execute
+from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
 from salient.progress import Progress
 
 _PROGRESS_LINES_MAX = 20
 """Without a terminal, which would show the progress in place."""
+_METRICS_MODULES = (run_metrics, compare_metrics, every_machine, reference)
 
 
 @dataclass(frozen=True)
@@ -40,34 +45,44 @@ class RunMetrics:
     trace: tuple[list[float], list[float]] | None = None
 
 
-def run_all(cases: Sequence[Case], jobs: int, stream: TextIO, finished: FinishedRuns | None = None,
+def run_all(cases: Sequence[Case], jobs: int | None, stream: TextIO, out: Path, afresh: bool = False,
             scheduler: str | None = None) -> list[RunMetrics]:
     """Metrics in the order of `cases`, independent of the number of jobs; prints the progress on `stream`.
 
-    A run that ends in a fault, or whose metrics cannot be computed, is marked as failed. Runs in `finished` are not
-    executed, the others are added to it. scheduler: see tasks.run. UsageError for parameters that the drive does not
-    have.
+    A run that ends in a fault, or whose metrics cannot be computed, is marked as failed. out, afresh, scheduler, jobs:
+    see tasks.run. UsageError for parameters that the drive does not have.
     """
-    descriptions = [repr((case.extractor, case.traced, case.window_s, case.scenario)) for case in cases]
-    first_cases: dict[str, int] = {}  # description of the run -> number of its first case
-    first_of = [first_cases.setdefault(description, number) for number, description in enumerate(descriptions)]
-    results: dict[int, tuple[Metrics, str, Any]] = {}
-    for description, number in first_cases.items():
-        known = finished.get(cases[number], description) if finished else None
-        if known is not None:
-            results[number] = known
-    numbers = sorted(number for number in first_cases.values() if number not in results)
-    lines = len(numbers) if stream.isatty() else min(len(numbers), _PROGRESS_LINES_MAX)
-    listed = [Task(str(number), (cases[number], programs_digest(cases[number]))) for number in numbers]
+    images = {machine: machine_image(machine) for machine in {case.scenario.machine for case in cases}}
+    keys = [_key(case, images[case.scenario.machine]) for case in cases]
+    by_key = dict(zip(keys, cases, strict=True))
+    listed = [tasks.Task(key, (case, _programs_digest(case))) for key, case in by_key.items()]
+    lines = len(listed) if stream.isatty() else min(len(listed), _PROGRESS_LINES_MAX)
+    results: dict[str, tuple[Metrics, str, Any]] = {}
     with Progress(lines, stream) as progress:
-        for done, (task, result) in enumerate(execute(listed, _run, scheduler, jobs), start=1):
-            case, number = cases[int(task.key)], int(task.key)
-            results[number] = result
-            if finished:
-                finished.add(case, descriptions[number], *result)
-            if done * lines // len(numbers) > (done - 1) * lines // len(numbers):
+        ended = tasks.run(listed, _run, out, scheduler=scheduler, jobs=jobs, afresh=afresh)
+        for done, (task, result) in enumerate(ended, start=1):
+            results[task.key] = result
+            if done * lines // len(listed) > (done - 1) * lines // len(listed):
+                case, _ = task.arguments
                 progress.step(f"{case.group}: {case.condition} by {case.controller}")
-    return _with_ratios([RunMetrics(case, *results[first]) for case, first in zip(cases, first_of, strict=True)])
+    return _with_ratios([RunMetrics(case, *results[key]) for key, case in zip(keys, cases, strict=True)])
+
+
+def _key(case: Case, image: Path) -> str:
+    """What the result of a run depends on: its description, the programs, the image of its machine, the code of the
+    metrics and its load profile."""
+    profile = case.scenario.load_profile
+    metrics = [Path(str(module.__file__)) for module in _METRICS_MODULES]
+    files = (image, *metrics, *(() if profile is None else (load_profile_path(profile),)))
+    description = repr((case.extractor, case.traced, case.window_s, case.scenario))
+    parts = [_programs_digest(case), *map(tasks.file_digest, files), description]
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()
+
+
+def _programs_digest(case: Case) -> str:
+    """Of the programs that the run of a case executes."""
+    files = (executable(), *((reference_executable(),) if case.extractor == "every_machine" else ()))
+    return hashlib.sha256(" ".join(map(tasks.file_digest, files)).encode()).hexdigest()
 
 
 def _with_ratios(runs: Sequence[RunMetrics]) -> list[RunMetrics]:
@@ -94,7 +109,7 @@ def _ratio(value: float | None, of: float | None) -> float | None:
 def _run(task: tuple[Case, str]) -> tuple[Metrics, str, Any]:
     """Of a case, and the digest of the programs that everybody must have."""
     case, programs = task
-    check_build(programs_digest(case), programs)
+    tasks.check_build(_programs_digest(case), programs)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         try:
             result = run_scenario(case.scenario, Path(folder))
