@@ -1,0 +1,360 @@
+/* One phase on its way through a step of the rotor: its own steps, from edge to edge (phase_steps.h). Inline, for the
+ * form of the magnetics and the link to be constants of the loop. */
+#ifndef PLANT_PHASE_WALK_H
+#define PLANT_PHASE_WALK_H
+
+#include <math.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "plant/hermite.h"
+#include "plant/link_steps.h"
+#include "plant/magnetics_kernel.h"
+#include "plant/phase_samples.h"
+#include "plant/phase_steps.h"
+#include "plant/plant.h"
+#include "plant/rotor_step.h"
+
+/* Shortest last step before a current ends. */
+#define STEP_MIN_S 1e-13
+#define END_ITERATIONS 4
+/* With a link, a step in which a current is expected to end is longer by this. */
+#define END_MARGIN 1.01
+
+/* Integrals of a step of the rotor over all phases. */
+typedef struct {
+    double impulse_Nms, moment_Nms2; /* of the torque: moment about the end of the step */
+    double link[3]; /* by the number of switches that are on: charge; with a link, energy at its voltage */
+    double copper_J[HAL_PHASES_MAX], converter_J[HAL_PHASES_MAX]; /* losses of each phase */
+    unsigned walked;                                              /* phases that had current or edges: bits */
+    uint8_t switches[HAL_PHASES_MAX], edge_next[HAL_PHASES_MAX];  /* theirs at the end */
+} sums_t;
+
+static inline double lesser(double a, double b) {
+    return a < b ? a : b;
+}
+
+/* Shortens a step so that it ends where the phase's magnetics are not smooth; true if it does. */
+static bool end_at_corner(const plant_t *plant, unsigned phase, const rotor_step_t *rotor, plant_phase_t *state,
+                          double at_s, double angle_rad, double speed_rad_s, double *step_s) {
+    if (angle_rad < state->smooth_from_rad + MAGNETICS_SMOOTH_TOLERANCE_RAD ||
+        angle_rad > state->smooth_to_rad - MAGNETICS_SMOOTH_TOLERANCE_RAD) {
+        const double phase_rad = angle_rad - phase * plant->phase_offset_rad;
+        state->smooth_to_rad = angle_rad + magnetics_smooth_distance_rad(&plant->magnetics, phase_rad, 1.0);
+        state->smooth_from_rad = angle_rad - magnetics_smooth_distance_rad(&plant->magnetics, phase_rad, -1.0);
+    }
+    const bool forward = speed_rad_s > 0.0 || (speed_rad_s == 0.0 && rotor->acceleration_rad_s2 > 0.0);
+    const double corner_rad = forward ? state->smooth_to_rad : state->smooth_from_rad;
+    const double distance_rad = fabs(corner_rad - angle_rad), along_rad_s = fabs(speed_rad_s);
+    const double along_rad_s2 = forward ? rotor->acceleration_rad_s2 : -rotor->acceleration_rad_s2;
+    if (*step_s * (along_rad_s + 0.5 * along_rad_s2 * *step_s) <= distance_rad) {
+        return false;
+    }
+    *step_s = 2.0 * distance_rad / (along_rad_s + sqrt(along_rad_s * along_rad_s + 2.0 * along_rad_s2 * distance_rad));
+    /* The jerk's part of the angle. */
+    double end_rad, end_rad_s;
+    rotor_at(rotor, at_s + *step_s, &end_rad, &end_rad_s);
+    const double missing_rad = corner_rad - end_rad;
+    if (fabs(end_rad_s) * *step_s > fabs(missing_rad)) {
+        *step_s += missing_rad / end_rad_s;
+    }
+    return true;
+}
+
+/* Shortens a step of a phase that is not driven to the time at which its flux linkage and current end. */
+MAGNETICS_INLINE double end_of_current_s(double voltage_V, double ohm, double flux_Wb, const course_t *current,
+                                         double step_s) {
+    if (voltage_V >= 0.0) {
+        return step_s; /* without drops a current decays to what is negligible, and stops there */
+    }
+    double end_s = fmin(flux_Wb / (0.5 * ohm * current->start - voltage_V), step_s);
+    const double bend_A_s = (1.0 / 12.0) * (current->start_1_s - current->end_1_s);
+    for (unsigned iteration = 0; iteration < END_ITERATIONS; iteration++) {
+        const double rest_Wb = flux_Wb + end_s * (voltage_V - ohm * (0.5 * current->start + end_s * bend_A_s));
+        end_s -= rest_Wb / (voltage_V - ohm * (0.5 * current->start + 2.0 * end_s * bend_A_s));
+    }
+    return fmin(fmax(end_s, STEP_MIN_S), step_s);
+}
+
+/* A phase on its way through a step of the rotor. */
+typedef struct {
+    const half_bridge_pattern_t *pattern;
+    plant_phase_t *kept;
+    double offset_rad;
+    bool corners;     /* within the rotor's step there may be angles where its magnetics are not smooth */
+    bool known;       /* as of plant_phase_t; these and the members up to `speed` are at the start of a step */
+    uint8_t switches; /* that are on */
+    unsigned on;      /* their number */
+    unsigned edge;    /* the next one */
+    unsigned count;   /* of its steps */
+    double current_A, flux_Wb, inverse_1_H;
+    magnetics_point_t point;
+    double angle_rad, speed_rad_s;
+    double impulse_Nms;    /* of its torque */
+    double own_A2s, own_J; /* integral of the square of the current; losses */
+    /* Present step: */
+    double at_s, step_s, end_s;
+    bool active; /* it has current */
+    bool corner; /* it ends at one */
+    double voltage_V, current_A_s, torque_Nm_s;
+    double end_A; /* predicted */
+    /* Present step with a link: */
+    double bend_A_s2;       /* second derivative of the current that the link takes from the capacitor */
+    double link_V, area_Vs; /* of the link at its start */
+} walk_t;
+
+static const double link_signs[3] = {-1.0, 0.0, 1.0};
+
+MAGNETICS_INLINE void walk_start(plant_t *plant, magnetics_form_t form, unsigned phase, const rotor_step_t *rotor,
+                                 walk_t *walk) {
+    plant_phase_t *kept = &plant->phase[phase];
+    walk->pattern = &plant->pattern[phase];
+    walk->kept = kept;
+    walk->offset_rad = phase * plant->phase_offset_rad;
+    walk->corners = (form == MAGNETICS_SATURATING || form == MAGNETICS_LINEAR_TRAPEZOID) &&
+                    !(rotor->least_rad > kept->smooth_from_rad + MAGNETICS_SMOOTH_TOLERANCE_RAD &&
+                      rotor->most_rad < kept->smooth_to_rad - MAGNETICS_SMOOTH_TOLERANCE_RAD);
+    walk->known = kept->known;
+    walk->switches = plant->switches[phase];
+    walk->on = half_bridge_on(walk->switches);
+    walk->edge = plant->edge_next[phase];
+    walk->count = 0;
+    walk->current_A = kept->current_A;
+    walk->flux_Wb = kept->flux_Wb;
+    walk->inverse_1_H = kept->inverse_1_H;
+    walk->point = kept->point;
+    walk->angle_rad = rotor->angle_rad;
+    walk->speed_rad_s = rotor->speed_rad_s;
+    walk->impulse_Nms = walk->own_A2s = walk->own_J = 0.0;
+    walk->end_s = 0.0;
+}
+
+/* Begins a phase's next step, which lasts to end_s. False: it has no current until then. */
+MAGNETICS_INLINE bool walk_begin(const plant_t *plant, magnetics_form_t form, unsigned phase, const rotor_step_t *rotor,
+                                 link_t *link, walk_t *walk) {
+    const half_bridge_pattern_t *pattern = walk->pattern;
+    const double at_s = walk->end_s;
+    double until_s = rotor->length_s;
+    for (; walk->edge < pattern->count; walk->edge++) {
+        const double edge_s = (double)(int32_t)(pattern->delay_ns[walk->edge] - rotor->start_ns) * NS_S;
+        if (edge_s > at_s) {
+            until_s = lesser(until_s, edge_s);
+            break;
+        }
+        walk->switches = pattern->switches[walk->edge];
+        walk->on = half_bridge_on(walk->switches);
+    }
+    const unsigned on = walk->on;
+    walk->at_s = at_s;
+    walk->end_s = until_s;
+    const double current_A = walk->current_A, ohm = plant->resistance_ohm[on];
+    const bool tied = link != NULL && on != 1; /* freewheeling, it does not notice the link */
+    const double voltage_V = tied ? link_signs[on] * link->voltage_V - plant->drop_V[on] : rotor->voltage_V[on];
+    const bool driven = tied ? voltage_V > 0.0 : on == 2 && rotor->driven;
+    if (!(current_A >= PLANT_CURRENT_NEGLIGIBLE_A || driven)) {
+        walk->current_A = walk->flux_Wb = 0.0;
+        walk->known = false;
+        return false;
+    }
+    if (__builtin_expect(!walk->known, 0)) {
+        rotor_at(rotor, at_s, &walk->angle_rad, &walk->speed_rad_s);
+        magnetics_kernel(&plant->magnetics, form, walk->angle_rad - walk->offset_rad, current_A, rotor->ahead_rad,
+                         &walk->point);
+        walk->inverse_1_H = 1.0 / walk->point.incremental_inductance_H;
+        walk->flux_Wb = walk->point.flux_linkage_Wb;
+    }
+    const magnetics_point_t *point = &walk->point;
+    const double speed_rad_s = walk->speed_rad_s;
+    const double current_A_s =
+        (voltage_V - ohm * current_A - speed_rad_s * point->flux_gradient_Wb_rad) * walk->inverse_1_H;
+    walk->voltage_V = voltage_V;
+    walk->current_A_s = current_A_s;
+    walk->torque_Nm_s = point->torque_gradient_Nm_rad * speed_rad_s + point->flux_gradient_Wb_rad * current_A_s;
+
+    double step_s = until_s - at_s;
+    const double change_A = fabs(current_A_s) * step_s;
+    const double swing_s2_H = tied ? step_s * step_s * walk->inverse_1_H : 0.0;
+    if (change_A > rotor->current_step_A || (tied && swing_s2_H > plant->link_swing_s2_H)) {
+        double steps = change_A / rotor->current_step_A;
+        if (tied && swing_s2_H > steps * steps * plant->link_swing_s2_H) {
+            steps = sqrt(swing_s2_H / plant->link_swing_s2_H);
+        }
+        step_s /= ceil(steps);
+        walk->end_s = at_s + step_s;
+    }
+    if (tied && on == 0 && walk->flux_Wb + voltage_V * step_s < 0.0) {
+        /* A little late, so that the current ends in this step. */
+        const double ends_s = END_MARGIN * walk->flux_Wb / (0.5 * ohm * current_A - voltage_V);
+        if (ends_s < step_s) {
+            step_s = ends_s;
+            walk->end_s = at_s + step_s;
+        }
+    }
+    walk->corner =
+        walk->corners && end_at_corner(plant, phase, rotor, walk->kept, at_s, walk->angle_rad, speed_rad_s, &step_s);
+    if (walk->corner) {
+        walk->end_s = at_s + step_s;
+    }
+
+    /* The predicted current, with the part of the second derivative that the current's slope causes. */
+    double bend_A_s2 =
+        -(2.0 * speed_rad_s * point->inductance_gradient_H_rad + point->inductance_slope_H_A * current_A_s) *
+        current_A_s * walk->inverse_1_H;
+    if (tied) {
+        const double sign = link_signs[on];
+        link->drawn_A += sign * current_A;
+        link->drawn_A_s += sign * current_A_s;
+        bend_A_s2 += (sign * link_slope_V_s(link) - ohm * current_A_s) * walk->inverse_1_H;
+        link->drawn_A_s2 += 0.5 * sign * bend_A_s2;
+        walk->bend_A_s2 = bend_A_s2;
+        walk->link_V = link->voltage_V;
+        walk->area_Vs = link->area_Vs;
+    }
+    walk->step_s = step_s;
+    walk->end_A = current_A + step_s * (current_A_s + 0.5 * step_s * bend_A_s2);
+    return true;
+}
+
+/* The end of a current in a step: returns the step's length, and its end and charge. */
+MAGNETICS_INLINE double end_of_step(const plant_t *plant, magnetics_form_t form, const link_t *link, double driven_Wb,
+                                    const walk_t *walk, double start_rad, double start_rad_s, magnetics_point_t *point,
+                                    course_t *current, course_t *torque) {
+    const unsigned on = walk->on;
+    const double ohm = plant->resistance_ohm[on], flux_Wb = walk->flux_Wb, step_s = walk->step_s;
+    const bool tied = link != NULL && on != 1;
+    const double voltage_V = tied ? (driven_Wb - flux_Wb) / step_s : walk->voltage_V;
+    const double near_s = voltage_V < 0.0 ? lesser(-flux_Wb / voltage_V, step_s) : step_s;
+    magnetics_kernel(&plant->magnetics, form, start_rad - walk->offset_rad + near_s * start_rad_s, 0.0, 0.0, point);
+    current->end = torque->end = torque->end_1_s = 0.0;
+    current->end_1_s = voltage_V / point->incremental_inductance_H;
+    double end_s = end_of_current_s(voltage_V, ohm, flux_Wb, current, step_s);
+    if (tied) {
+        /* Without the link's part after the end. */
+        const double rest_s = step_s - end_s;
+        const double rest_Vs = rest_s * (link->voltage_V - 0.5 * rest_s * link_slope_V_s(link));
+        const double mean_V = link_signs[on] * (link->area_Vs - walk->area_Vs - rest_Vs) / end_s - plant->drop_V[on];
+        end_s = end_of_current_s(mean_V, ohm, flux_Wb, current, step_s);
+    }
+    return end_s;
+}
+
+/* Takes the phase's step from the link: what its charge was more than planned, and the energy. */
+MAGNETICS_INLINE void settle(link_t *link, const walk_t *walk, double step_s, double area_Vs, double charge_As,
+                             const course_t *current, double *energy_J) {
+    const double sign = link_signs[walk->on], planned_s = walk->step_s;
+    const double bend_A_s = planned_s * walk->bend_A_s2;
+    const double planned_As =
+        planned_s * (current->start + planned_s * (0.5 * current->start_1_s + (1.0 / 6.0) * bend_A_s));
+    *energy_J += area_Vs / planned_s * charge_As +
+                 (1.0 / 12.0) * step_s * (current->end - current->start) * (link->voltage_V - walk->link_V);
+    link->drawn_A -= sign * walk->end_A;
+    link->drawn_A_s -= sign * (current->start_1_s + bend_A_s);
+    link->drawn_A_s2 -= 0.5 * sign * walk->bend_A_s2;
+    link->voltage_V += sign * (link->charge_1_F * (charge_As - planned_As));
+}
+
+/* Ends the step of a phase. False: the comparator responds, or there are too many steps. */
+MAGNETICS_INLINE bool walk_end(const plant_t *plant, magnetics_form_t form, const rotor_step_t *rotor, link_t *link,
+                               walk_t *walk, sums_t *sums, phase_record_t *record) {
+    const unsigned on = walk->on;
+    const bool tied = link != NULL && on != 1;
+    const double at_s = walk->at_s, ohm = plant->resistance_ohm[on], flux_Wb = walk->flux_Wb;
+    double step_s = walk->step_s, voltage_V = walk->voltage_V, area_Vs = 0.0;
+    course_t current, torque;
+    magnetics_point_t *point = &walk->point;
+    current.start = walk->current_A;
+    current.start_1_s = walk->current_A_s;
+    current.end = walk->end_A;
+    torque.start = point->torque_Nm;
+    torque.start_1_s = walk->torque_Nm_s;
+    double driven_Wb = flux_Wb + voltage_V * step_s; /* without the resistance */
+    if (tied) {
+        const double sign = link_signs[on];
+        area_Vs = link->area_Vs - walk->area_Vs;
+        voltage_V = sign * link->voltage_V - plant->drop_V[on];
+        driven_Wb = flux_Wb + (sign * area_Vs - plant->drop_V[on] * step_s);
+    }
+    const double start_rad = walk->angle_rad, start_rad_s = walk->speed_rad_s;
+    rotor_at(rotor, walk->end_s, &walk->angle_rad, &walk->speed_rad_s);
+    const double angle_rad = walk->angle_rad, speed_rad_s = walk->speed_rad_s;
+    magnetics_kernel(&plant->magnetics, form, angle_rad - walk->offset_rad, current.end, -rotor->ahead_rad, point);
+    double inverse_1_H = 1.0 / point->incremental_inductance_H;
+
+    /* Newton's step to the current of the flux linkage, and the magnetics there. */
+    current.end_1_s = (voltage_V - ohm * current.end - speed_rad_s * point->flux_gradient_Wb_rad) * inverse_1_H;
+    const double missing_Wb = driven_Wb - ohm * course_integral(&current, step_s) - point->flux_linkage_Wb;
+    const double newton_A = missing_Wb * inverse_1_H * (1.0 - 0.5 * ohm * step_s * inverse_1_H);
+    const double more_A = newton_A * (1.0 - 0.5 * point->inductance_slope_H_A * inverse_1_H * newton_A);
+    point->torque_Nm += more_A * (point->flux_gradient_Wb_rad + 0.5 * more_A * point->inductance_gradient_H_rad);
+    point->torque_gradient_Nm_rad += more_A * point->flux_curvature_Wb_rad2;
+    point->flux_gradient_Wb_rad += more_A * point->inductance_gradient_H_rad;
+    inverse_1_H -= more_A * point->inductance_slope_H_A * inverse_1_H * inverse_1_H;
+    current.end += more_A;
+    current.end_1_s = (voltage_V - ohm * current.end - speed_rad_s * point->flux_gradient_Wb_rad) * inverse_1_H;
+    torque.end = point->torque_Nm;
+    torque.end_1_s = point->torque_gradient_Nm_rad * speed_rad_s + point->flux_gradient_Wb_rad * current.end_1_s;
+    double charge_As = course_integral(&current, step_s);
+    double end_Wb = driven_Wb - ohm * charge_As;
+    walk->known = (end_Wb > 0.0 && current.end > 0.0) || (tied ? driven_Wb > flux_Wb : on == 2 && rotor->driven);
+    if (__builtin_expect(!walk->known, 0)) {
+        step_s = end_of_step(plant, form, link, driven_Wb, walk, start_rad, start_rad_s, point, &current, &torque);
+        end_Wb = 0.0;
+        charge_As = course_integral(&current, step_s);
+        if (!tied) {
+            walk->end_s = at_s + step_s;
+        }
+    }
+    if ((on > 0 && current.end > rotor->trip_current_A) || ++walk->count > PHASE_STEPS_MAX) {
+        return false;
+    }
+    if (__builtin_expect(record != NULL, 0)) {
+        record->steps[record->count++] = (phase_step_t){at_s, step_s, current, torque, walk->impulse_Nms};
+    }
+    if (link == NULL) {
+        sums->link[on] += charge_As;
+    } else if (tied) {
+        settle(link, walk, step_s, area_Vs, charge_As, &current, &sums->link[on]);
+    }
+    const double step_Nms = course_integral(&torque, step_s);
+    walk->impulse_Nms += step_Nms;
+    sums->moment_Nms2 += (rotor->length_s - at_s) * step_Nms - course_moment(&torque, step_s);
+    const double current2_A2s = course_square(&current, step_s);
+    walk->own_A2s += current2_A2s;
+    walk->own_J += plant->drop_V[on] * charge_As + ohm * current2_A2s;
+    walk->current_A = current.end;
+    walk->flux_Wb = end_Wb;
+    walk->inverse_1_H = inverse_1_H;
+    if (__builtin_expect(walk->corner, 0) && form == MAGNETICS_LINEAR_TRAPEZOID &&
+        walk->known) { /* the corner's other side */
+        magnetics_kernel(&plant->magnetics, form, angle_rad - walk->offset_rad, walk->current_A, rotor->ahead_rad,
+                         point);
+        walk->inverse_1_H = 1.0 / point->incremental_inductance_H;
+    }
+    return true;
+}
+
+/* The end of the rotor's step. */
+MAGNETICS_INLINE void walk_finish(const plant_t *plant, unsigned phase, const rotor_step_t *rotor, const walk_t *walk,
+                                  sums_t *sums) {
+    const half_bridge_pattern_t *pattern = walk->pattern;
+    plant_phase_t *kept = walk->kept;
+    unsigned edge = walk->edge;
+    uint8_t switches = walk->switches;
+    for (; edge < pattern->count && pattern->delay_ns[edge] - rotor->start_ns == rotor->length_ns; edge++) {
+        switches = pattern->switches[edge];
+    }
+    sums->impulse_Nms += walk->impulse_Nms;
+    sums->copper_J[phase] = plant->winding_ohm * walk->own_A2s;
+    sums->converter_J[phase] = walk->own_J - sums->copper_J[phase];
+    sums->walked |= 1u << phase;
+    sums->switches[phase] = switches;
+    sums->edge_next[phase] = (uint8_t)edge;
+    kept->known = walk->known;
+    kept->current_A = walk->current_A;
+    kept->flux_Wb = walk->flux_Wb;
+    kept->inverse_1_H = walk->inverse_1_H;
+    kept->point = walk->point;
+}
+
+#endif
