@@ -106,6 +106,7 @@ def test_a_seed_has_the_same_bits_on_the_usual_bench(tmp_path: Path, seed: int) 
     assert again.equal and again.campaign["causes"]
     left = {file.name for file in tmp_path.iterdir()}
     assert {"can.blf", "can.log", "failure.html", "failure.png", "bench.json"} <= left
+    assert json.loads((tmp_path / "bench.json").read_text())["replay"] == f"tools/salient replay {seed}"
 
 
 @pytest.mark.parametrize("seed", [13, 19, 39, 87, 1584])
@@ -222,6 +223,9 @@ def test_a_planted_bug_is_found_within_seconds_shrinks_and_replays(tmp_path: Pat
     assert 0.001 < found["processor_s"] < 10.0 and 0.001 < found["shrinking_s"] < 60.0
     note = json.loads((tmp_path / "1" / "failure.json").read_text(encoding="utf-8"))
     assert note["replay"] == found["command"] == f"tools/salient replay {tmp_path / '1'}"
+    page = (tmp_path / "1" / "failure.html").read_text(encoding="utf-8")
+    at_us = note["result"]["violations"][0]["at_us"]
+    assert f"no_command: fault cleared at {at_us} us" in page and "The violation" in page and note["replay"] in page
     (tmp_path / "failure.json").write_text(json.dumps({**note, "canary": None}), encoding="utf-8")
     done = salient("replay", tmp_path)  # the drive without the bug
     assert done.returncode == 0 and "violation" not in done.stdout

@@ -29,17 +29,19 @@ _RECORDING_HEADER_BYTES = 1024
 """RECORDER_HEADER_BYTES of emulator/plant/recorder.h."""
 
 
-def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchConfig | None,
-         error: str = "") -> list[str]:
+def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchConfig | None, error: str = "",
+         moment: tuple[float, str] | None = None) -> list[str]:
     """Writes log (BLF and candump text), plots around the failure and around the first fault, bench.json with the
-    notes, and a page of all that and of the error. config: of an emulator that the session has started. Returns what
-    changed just before the failure."""
+    notes, and a page of all that and of the error. config: of an emulator that the session has started. moment: virtual
+    time in s of what the plots are to show, and its name, instead of the failure, which is now. Returns what changed
+    just before."""
     folder.mkdir(parents=True, exist_ok=True)
     clear(folder)
     write_logs(session.log, folder / "can.blf", folder / "can.log")
-    plot_moment(session, session.time_s, "failure", folder / "failure.png")
-    plot_moment(session, session.time_s, "failure", folder / "last_second.png", TRUTH_S)
-    changed = changes(session, session.time_s)
+    moment_s, title = moment or (session.time_s, "failure")
+    plot_moment(session, moment_s, title, folder / "failure.png")
+    plot_moment(session, moment_s, title, folder / "last_second.png", TRUTH_S)
+    changed = changes(session, moment_s)
     about: dict[str, Any] = {"virtual_time_s": session.time_s, "changes_before_the_failure": changed}
     fault = first_fault(session)
     if fault is not None:
@@ -53,7 +55,7 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
         about |= {"simulator": shlex.join(simulator.command), "stderr": simulator.errors}
     about |= {"view": f"{COMMAND} view --replay {shlex.quote(str(folder))}"} | notes
     (folder / "bench.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-    _write_page(folder, about | {"error": error})
+    _write_page(folder, about | {"error": error}, title)
     return changed
 
 
@@ -63,15 +65,15 @@ def clear(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def _write_page(folder: Path, about: dict[str, Any]) -> None:
+def _write_page(folder: Path, about: dict[str, Any], title: str) -> None:
     from salient.pages import Plot, write_page
 
     plots = [Plot("", title, (folder / name).read_bytes())
-             for name, title in (("failure.png", "The end"), ("first_fault.png", "The first fault"),
-                                ("last_second.png", "The last second"))
+             for name, title in (("failure.png", f"The {title}"), ("first_fault.png", "The first fault"),
+                                ("last_second.png", "The second before"))
              if (folder / name).exists()]
     # The first ones of a drive that is on the bus already, the last ones of a failure outside pytest.
-    unknown = dict.fromkeys(("simulator", "stderr", "machine", "seed", "test", "phase", "replay_in"), "")
+    unknown = dict.fromkeys(("simulator", "stderr", "machine", "seed", "test", "phase", "replay_in", "world"), "")
     write_page(folder / "failure.html", "failure.html", unknown | about | {"plots": plots})
 
 
@@ -141,7 +143,7 @@ def _settings(session: Session, from_s: float, to_s: float) -> list[tuple[float,
 
 
 def plot_moment(session: Session, time_s: float, title: str, path: Path, before_s: float = BEFORE_S) -> None:
-    """Speed, torque and phase currents, true and in the telemetry, around a moment."""
+    """Speed, torque and phase currents, true and in the telemetry, and the drive's state, around a moment."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -151,9 +153,10 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path, before_
          ("truth", "load_torque_Nm")],
         [("truth", f"current_{phase}_A") for phase in "abcd"],
     )  # fmt: skip
-    figure = Figure(figsize=(10, 8), layout="constrained")
+    figure = Figure(figsize=(10, 9.5), layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, panel in zip(figure.subplots(len(panels), 1, sharex=True), panels, strict=True):
+    *rows, below = figure.subplots(len(panels) + 1, 1, sharex=True, height_ratios=(1, 1, 1, 0.6))
+    for axes, panel in zip(rows, panels, strict=True):
         for (source, name), colour in zip(panel, COLOURS, strict=False):
             signal = getattr(session, source)[name]
             if name == "current_d_A" and not signal.value.any():
@@ -162,9 +165,16 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path, before_
             axes.plot(signal.time_s, signal.value, label=f"{source} {signal.name}", color=colour,
                       marker="." if before_s <= BEFORE_S else "", markersize=3)
             axes.set_ylabel(signal.unit)
-        axes.axvline(time_s, color="black", linewidth=1, linestyle="--")
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small", frameon=False)
+    state = session.telemetry["DRIVE_STATUS.state"]
+    states = state.choices or {}
+    below.set_yticks(list(states), list(states.values()))
+    state = state.between(time_s - before_s, time_s + AFTER_S)
+    below.step(state.time_s, state.value, where="post", color=COLOURS[0])
+    for axes in (*rows, below):
+        axes.axvline(time_s, color="black", linewidth=1, linestyle="--")
         axes.grid(alpha=0.3)
-    axes.set_xlabel("virtual time, s")
+    below.set_ylabel("state")
+    below.set_xlabel("virtual time, s")
     figure.suptitle(f"{title} at {time_s:.6f} s")
     figure.savefig(path, dpi=110)

@@ -12,8 +12,8 @@ from typing import Any
 
 import can
 
+from salient.bench import failure
 from salient.bench.bench import Bench
-from salient.bench.failure import save as save_bench
 from salient.bench.programs import EmulatorError
 from salient.bench.session import SessionError
 from salient.bus.clock import open_bus
@@ -80,7 +80,7 @@ class Replay:
 def replay(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, folder: Path | None = None,
            build: str = "host", programs: Programs | None = None) -> Replay:
     """Runs a world again, and its frames once more on a test bench of salient_host, or of a target's build. folder: for
-    log and plot of the bench."""
+    log and plots of the bench, around the first violation or, without one, the end."""
     described = world(seed, kept, healthy)
     with tempfile.TemporaryDirectory(prefix="salient-") as temporary:
         frames = Path(temporary) / "frames"
@@ -98,13 +98,23 @@ def replay(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, folder: Pat
                     resource.prlimit(bench.simulator.pid, resource.RLIMIT_CPU, (_CRASH_MAX_S, _CRASH_MAX_S))
                 _send(bench, lines)
                 if folder is not None:
-                    save_bench(bench, folder, {"replay": f"tools/salient replay {folder}"}, config)
+                    again = (f"{seed}{' --healthy' if healthy else ''}" if kept == ALL_EVENTS and programs is None else
+                             folder)
+                    notes = {"replay": f"tools/salient replay {again}", "world": f"Campaign, seed {seed}"}
+                    _save_bench(bench, folder, notes, result, config)
                 computed = f"{_hash(bench.log):016x}"
         except EmulatorError:
             if "hash" in result:
                 raise
             computed = ""
         return Replay(computed, result)
+
+
+def _save_bench(bench: Bench, folder: Path, notes: dict[str, Any], result: Result, config: BenchConfig) -> None:
+    found = sorted((violation["at_us"], names.violation(violation)) for violation in result["violations"])
+    known = found and found[0][0] > 0  # not the time of a crash
+    moment = (1e-6 * found[0][0], "violation") if known else (bench.time_s, "end")
+    failure.save(bench, folder, notes, config, "\n".join(f"{name} at {at_us} us" for at_us, name in found), moment)
 
 
 def _send(bench: Bench, lines: list[str]) -> None:
