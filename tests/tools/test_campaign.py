@@ -280,7 +280,7 @@ def test_the_pages_show_the_committed_results() -> None:
     assert report.page() == report.PAGE.read_text(encoding="utf-8")
     page = fault_table.PAGE.read_text(encoding="utf-8")
     assert fault_table.with_branches(page) == page
-    assert report.table().count("\n") == 8 and "57 of 57 found" in report.table()
+    assert report.table().count("\n") == 9 and "57 of 57 found" in report.table()
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

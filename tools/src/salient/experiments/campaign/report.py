@@ -51,7 +51,7 @@ def _rate(name: str) -> list[str]:
             "virtual time a processor second"]
 
 
-def _worlds(name: str, what: str) -> tuple[str, str, str]:
+def _worlds(name: str, what: str, sharding: str = "") -> tuple[str, str, str]:
     note = _note(f"{name}.json")
     parts = [f"seeds {_seeds(note)} at {note['commit']}", f"{note['virtual_hours']:.2f} h of virtual time",
              *_rate(f"{name}_rate.json"), f"**{_violations(note)}**"]
@@ -61,7 +61,7 @@ def _worlds(name: str, what: str) -> tuple[str, str, str]:
         parts += [f"{note['cells_reached']:,} of {note['cells']:,} cells of fault, state and sector reached{rest}",
                   f"{note['held_by_the_encoder']} drives held at rest by their encoder"]
     healthy = " --healthy" if note["kind"] == "healthy" else ""
-    return what, "; ".join(parts), f"`campaign{healthy} --first {note['first']} --seeds {note['seeds']}`"
+    return what, "; ".join(parts), f"`campaign{healthy} --first {note['first']} --seeds {note['seeds']}{sharding}`"
 
 
 def _branches() -> tuple[str, str, str]:
@@ -115,8 +115,9 @@ def _bits() -> tuple[str, str, str]:
 
 def table() -> str:
     """Markdown."""
-    rows = [_worlds("faults", "worlds with faults"), _worlds("healthy", "healthy worlds"), _branches(), _canaries(),
-            _cluster(), _bits()]
+    rows = [_worlds("faults", "worlds with faults, in one go"),
+            _worlds("shards", "worlds with faults, in ten shards, interrupted and resumed", " --shard I/10"),
+            _worlds("healthy", "healthy worlds"), _branches(), _canaries(), _cluster(), _bits()]
     return "".join(f"| {' | '.join(row)} |\n" for row in [("", "measured", "command"), ("---",) * 3, *rows])
 
 
@@ -154,7 +155,7 @@ def plot(path: Path) -> None:
     right.set_xlabel("processor seconds")
     right.grid(alpha=0.3, axis="x")
     right.legend(loc="upper left", fontsize="small")
-    faults = _note("faults.json")
+    faults = _note("shards.json")
     violations = sum(entry["count"] for entry in faults["violations"].values())
     without = f"{faults['seeds']:,} seeds at {faults['commit']} without them: {violations} violations"
     right.set_title(f"{len(notes)} of {len(_note('canaries.json'))} planted bugs found, by seeds from 1 on\n{without}",
