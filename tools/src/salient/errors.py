@@ -19,3 +19,8 @@ def shown(value: object) -> str:
 
 class RunFailed(Exception):
     """The thing tested failed; one line. Exit code 1."""
+
+
+def cannot_write(where: str, error: OSError) -> UsageError:
+    """The error of a folder or file, named by an option or its path, in which nothing can be written."""
+    return UsageError(f"{where}: cannot write there ({error.strerror}); choose a writable folder")

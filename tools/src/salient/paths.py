@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from salient.errors import UsageError, shown
+from salient.errors import UsageError, cannot_write, shown
 
 _DATA = Path(__file__).resolve().parent / "data"
 IS_WHEEL = _DATA.is_dir()
@@ -40,7 +40,7 @@ def make_folder(out: Path, removed: Sequence[str] = ()) -> None:
             for path in out.glob(pattern):
                 path.unlink()
     except OSError as error:
-        raise UsageError(f"--out {out}: cannot write there ({error.strerror}); choose a writable folder") from None
+        raise cannot_write(f"--out {out}", error) from None
 
 
 def bundled_or_path(name_or_path: str, folder: Path, suffix: str, key: str) -> Path:

@@ -6,13 +6,21 @@ from typing import TextIO
 
 _BAR_WIDTH = 24
 _ERASE_LINE = "\r\x1b[K"
+_LINES_MAX = 20
+
+
+def steps_of(items: int, stream: TextIO) -> int:
+    """Number of steps for the items of a list that may be long: all of them in place, _LINES_MAX lines at most."""
+    return items if stream.isatty() else min(items, _LINES_MAX)
 
 
 class Progress:
-    """Counts `total` steps on `stream`. Use as a context manager: leaving it clears the line in place."""
+    """Counts `total` steps on `stream`. Use as a context manager: leaving it clears the line in place. items: length of
+    a list whose equal parts are the steps, for item()."""
 
-    def __init__(self, total: int, stream: TextIO) -> None:
+    def __init__(self, total: int, stream: TextIO, items: int = 0) -> None:
         self._total, self._done, self._stream = total, 0, stream
+        self._items, self._items_done = items, 0
         self._in_place = stream.isatty()
 
     def __enter__(self) -> Progress:
@@ -21,6 +29,13 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         if self._in_place:
             self._write(_ERASE_LINE)
+
+    def item(self, what: str) -> None:
+        """Counts an item, and a step when it is the last one of its part; see step."""
+        self._items_done += 1
+        done = self._items_done
+        if done * self._total // self._items > (done - 1) * self._total // self._items:
+            self.step(what)
 
     def step(self, what: str) -> None:
         """Counts a step; `what` names it in a few words."""

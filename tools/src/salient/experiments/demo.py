@@ -27,7 +27,7 @@ from salient.bench.drive import DriveError
 from salient.bench.programs import EmulatorError, command_line
 from salient.bench.session import SessionError
 from salient.config import BenchConfig
-from salient.errors import UsageError
+from salient.errors import cannot_write
 from salient.experiments import metrics, plots
 from salient.experiments.report import (
     METRIC_ROWS,
@@ -107,7 +107,7 @@ def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.st
         results = _run_and_report(scenarios, out, can, options.build, stream)
     except OSError as error:
         if error.errno in _CANNOT_WRITE:
-            raise _cannot_write(out, error) from error
+            raise cannot_write(f"--out {out}", error) from error
         raise
     stream.write(f"{summary(results)}\n\nresults: {out / 'results.json'}\nreport:  {out / 'report.html'}\n")
     return 0
@@ -167,10 +167,6 @@ def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
     for of in scenarios.values():
         check_parameters(of, options.build)
     return scenarios
-
-
-def _cannot_write(out: Path, error: OSError) -> UsageError:
-    return UsageError(f"--out {out}: cannot write there ({error.strerror}); choose a writable folder")
 
 
 def _run_all(workers: Executor, scenarios: Mapping[str, Iterable[Scenario]], out: Path, can: str,

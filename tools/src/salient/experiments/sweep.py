@@ -37,7 +37,7 @@ from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
 from salient.machine.path import stated_conditions
 from salient.paths import SCENARIOS
-from salient.progress import Progress
+from salient.progress import Progress, steps_of
 
 TABLE, PLOT = "sweep.csv", "sweep.png"
 METRICS = ("settling_time_s", "overshoot_percent", "max_speed_rpm", "final_speed_rpm", "speed_dip_rpm",
@@ -46,7 +46,6 @@ METRICS = ("settling_time_s", "overshoot_percent", "max_speed_rpm", "final_speed
 """Columns of every table, none of which is the name of a setting; empty where a run has no such metric."""
 _STEADY_S = 0.1
 """At the end of a run: window of the mean torque, its ripple and the losses."""
-_PROGRESS_LINES_MAX = 20
 
 
 @dataclass(frozen=True)
@@ -65,13 +64,11 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     afresh = not options.resume and options.shard == (1, 1)
     results: dict[str, Any] = {}
     mine = len(listed[options.shard[0] - 1::options.shard[1]])
-    lines = mine if sys.stderr.isatty() else min(mine, _PROGRESS_LINES_MAX)
-    with Progress(lines, sys.stderr) as progress:
+    with Progress(steps_of(mine, sys.stderr), sys.stderr, mine) as progress:
         finished = tasks.run(listed, run_one, options.out, options.shard, options.scheduler, options.jobs, afresh)
-        for done, (task, result) in enumerate(finished, start=1):
+        for task, result in finished:
             results[task.key] = result
-            if done * lines // mine > (done - 1) * lines // mine:
-                progress.step(", ".join(f"{name} {value}" for name, value in task.arguments.columns.items()))
+            progress.item(", ".join(f"{name} {value}" for name, value in task.arguments.columns.items()))
     results |= tasks.read_results(options.out)
     rows = [{**task.arguments.columns, **results[task.key]} for task in listed if task.key in results]
     write_table(options.out / TABLE, combinations, rows)

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any, TextIO
 from urllib.parse import urlsplit
 
-from salient.errors import RunFailed, UsageError
+from salient.errors import RunFailed, UsageError, cannot_write
 
 RESULTS = "runs.jsonl"
 _WAITING_PER_WORKER = 4
@@ -119,7 +119,7 @@ def _open_results(out: Path, shard: tuple[int, int]) -> TextIO:
     except BlockingIOError:
         raise UsageError(f"{path}: another process writes it; choose another folder or shard") from None
     except OSError as error:
-        raise UsageError(f"{path}: cannot write there ({error.strerror}); choose a writable folder") from None
+        raise cannot_write(str(path), error) from None
     return file
 
 

@@ -35,13 +35,12 @@ def run_campaign(options: argparse.Namespace) -> int:
     results: list[Result] = []
     new: list[Result] = []
     known, begin_s = read_results(options.out).keys(), processor_s()
-    with Progress(_LINES, sys.stderr) as progress:
+    with Progress(_LINES, sys.stderr, len(mine)) as progress:
         done = run(tasks, serve, options.out, options.shard, options.scheduler, options.jobs)
         for number, (task, result) in enumerate(done, start=1):
             results.append(result)
             new += [] if task.key in known else [result]
-            if number * _LINES // len(mine) > (number - 1) * _LINES // len(mine):
-                progress.step(f"{number} of {len(mine)} seeds")
+            progress.item(f"{number} of {len(mine)} seeds")
     note = summary(results, options.first, options.seeds, kind)
     spent_s = processor_s() - begin_s
     part = "" if options.shard == (1, 1) else "-{}-of-{}".format(*options.shard)

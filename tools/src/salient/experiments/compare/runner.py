@@ -27,10 +27,8 @@ from salient.experiments.results import rounded
 from salient.experiments.scenario import run_scenario
 from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
-from salient.progress import Progress
+from salient.progress import Progress, steps_of
 
-_PROGRESS_LINES_MAX = 20
-"""Without a terminal, which would show the progress in place."""
 _METRICS_MODULES = (run_metrics, compare_metrics, every_machine, reference)
 
 
@@ -56,15 +54,12 @@ def run_all(cases: Sequence[Case], jobs: int | None, stream: TextIO, out: Path, 
     keys = [_key(case, images[case.scenario.machine]) for case in cases]
     by_key = dict(zip(keys, cases, strict=True))
     listed = [tasks.Task(key, (case, _programs_digest(case))) for key, case in by_key.items()]
-    lines = len(listed) if stream.isatty() else min(len(listed), _PROGRESS_LINES_MAX)
     results: dict[str, tuple[Metrics, str, Any]] = {}
-    with Progress(lines, stream) as progress:
-        ended = tasks.run(listed, _run, out, scheduler=scheduler, jobs=jobs, afresh=afresh)
-        for done, (task, result) in enumerate(ended, start=1):
+    with Progress(steps_of(len(listed), stream), stream, len(listed)) as progress:
+        for task, result in tasks.run(listed, _run, out, scheduler=scheduler, jobs=jobs, afresh=afresh):
             results[task.key] = result
-            if done * lines // len(listed) > (done - 1) * lines // len(listed):
-                case, _ = task.arguments
-                progress.step(f"{case.group}: {case.condition} by {case.controller}")
+            case, _ = task.arguments
+            progress.item(f"{case.group}: {case.condition} by {case.controller}")
     return _with_ratios([RunMetrics(case, *results[key]) for key, case in zip(keys, cases, strict=True)])
 
 
