@@ -122,7 +122,7 @@ typedef struct plant {
     double phase_copper_J[HAL_PHASES_MAX], phase_converter_J[HAL_PHASES_MAX]; /* parts of energy_copper_J and
                                                                                  energy_converter_J */
 
-    /* Private to plant.c, phase_steps.c and phase_walk.h. */
+    /* Private to plant.c and the steps of the phases (phase_steps.h). */
     const machine_t *machine;
     magnetics_model_t magnetics;
     double winding_ohm, inertia_kg_m2, friction_Nm_s;

@@ -968,7 +968,7 @@ TEST_F(Drive, a_set_with_a_missing_a_changed_or_an_additional_frame_is_refused) 
             std::swap(set[1], set[2]);
             counted.wrong_counter++;
             break;
-        default: // another write in the place of one
+        default: // another write instead of one
             set[2] = frames::parameter_write(set[2].data[2], PARAMETER_CURRENT_LIMIT_A, 41 << 9);
             break;
         }
