@@ -63,9 +63,9 @@ static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *inp
 }
 
 COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us) {
-    const int32_t speed_q22 = input->speed_reference_q22 < 0 ? fixed_subtract(0, input->speed_q22) : input->speed_q22;
+    const bool forward = input->speed_reference_q22 > 0; /* one of 0 has no direction, but must have the same for both */
+    const int32_t speed_q22 = forward ? input->speed_q22 : fixed_subtract(0, input->speed_q22);
     const int32_t change_q22 = fixed_abs(input->speed_reference_q22) / 128;
-    const bool forward = input->speed_reference_q22 > 0;
     const bool before = monitor->vain && monitor->forward == forward;
     if ((input->speed_q22 ^ input->speed_reference_q22) < 0) {
         monitor->backwards_us = time_us;

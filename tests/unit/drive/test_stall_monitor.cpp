@@ -80,6 +80,18 @@ TEST_F(Stall, rotor_that_reverses_while_it_accelerates_is_not_stalled_and_one_th
     EXPECT_NEAR(time_to_fault_us(380000, [&](uint32_t us) { reverses(us, 150000); }), 250000, 3000);
 }
 
+// As by a stop that is withdrawn: the speed would be that of both directions.
+TEST_F(Stall, reversing_rotor_whose_reference_is_0_for_some_milliseconds_is_not_stalled) {
+    for (const int direction : {1, -1}) {
+        input.torque_reference_q24 = direction * 19 * NM;
+        const auto reverses = [&](uint32_t us) {
+            input.speed_reference_q22 = us >= 30000 && us < 35000 ? 0 : direction * 60 * RAD_S;
+            input.speed_q22 = -direction * (25 * RAD_S - static_cast<int32_t>(us / 1000) * (RAD_S / 10));
+        };
+        EXPECT_EQ(time_to_fault_us(240000, reverses), 0u) << direction;
+    }
+}
+
 TEST_F(Stall, rotor_that_swings_without_progress_is_stalled) {
     EXPECT_NEAR(time_to_fault_us(
                     1000000, [this](uint32_t us) { input.speed_q22 = us / 1000 % 20 < 10 ? 3 * RAD_S : -3 * RAD_S; }),
