@@ -54,6 +54,7 @@ inertia_parameters_t inertia_configure(const inertia_settings_t *settings) {
         .gain_q8 = fixed_saturate(gain_q8(settings, update_rate_hz >> shift)),
         .variance_min_q14 = fixed_multiply_high(deviation_q23, deviation_q23),
         .window_shift = shift,
+        .torque_shift = 2 * shift + 2,
         .reaching_gain_q24 = settings->reaching_gain_q24,
         .rate_q8 = settings->rate_q8,
     };
@@ -157,9 +158,11 @@ static void judge(const inertia_parameters_t *parameters, inertia_t *inertia, ui
 
 void inertia_step(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
                   uint32_t angle, int32_t torque_q24, bool limited, bool approaching) {
-    /* In this order the sums, weighted by the updates since, are those of the trapezoidal rule. */
+    /* The sum of sums takes the sum of the middle of the update, to which the mean torque belongs. */
+    const uint32_t half_q23 = (uint32_t)(torque_q24 >> parameters->torque_shift);
+    inertia->sum_q23 += half_q23;
     inertia->sum_of_sums_q23 += inertia->sum_q23;
-    inertia->sum_q23 += (uint32_t)(torque_q24 >> (2 * parameters->window_shift + 1));
+    inertia->sum_q23 += half_q23;
     inertia->updates++;
     if (!approaching) {
         inertia->transient_windows = 0;
@@ -167,7 +170,7 @@ void inertia_step(const inertia_parameters_t *parameters, const load_observer_mo
         inertia->transient_windows = TRANSIENT_WINDOWS;
     }
     const uint32_t windows = inertia->updates >> parameters->window_shift;
-    const uint32_t update = inertia->updates & ((1u << parameters->window_shift) - 1);
+    const uint32_t update = inertia->updates - (windows << parameters->window_shift);
     if (update == 0) {
         measure(parameters, inertia, angle);
         correlate(inertia, windows);

@@ -41,6 +41,7 @@ typedef struct {
     int32_t gain_q8;           /* J0 / window^2: N m, Q8.23, per 2^-32 electrical rev, in Q8 */
     int32_t variance_min_q14;  /* of the torque, (N m)^2, Q17.14 */
     unsigned window_shift;     /* a window is 2^window_shift updates, from 1 */
+    unsigned torque_shift;     /* from N m, Q7.24, to half of T / 4^window_shift, Q8.23 */
     int32_t reaching_gain_q24; /* of J0 */
     int32_t rate_q8;           /* of J0 */
 } inertia_parameters_t;
@@ -79,7 +80,8 @@ void inertia_restart(const inertia_parameters_t *parameters, const load_observer
 /* The laws of changed parameters, which are not those of another inertia. */
 void inertia_tune(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia);
 
-/* One update of a run: rotor angle in 2^-32 electrical rev, machine torque in N m, Q7.24. limited: its reference is at
+/* One update of a run: rotor angle in 2^-32 electrical rev, machine torque in N m, Q7.24, in the mean since the last
+ * one: a torque that swings within it would not show in a sample. limited: its reference is at
  * a limit. approaching: the speed approaches a changed reference. */
 void inertia_step(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
                   uint32_t angle, int32_t torque_q24, bool limited, bool approaching);

@@ -151,6 +151,7 @@ typedef struct {
     speed_smc_parameters_t speed_smc; /* in effect: gain by the identified inertia, above base speed smaller */
     misalignment_t misalignment;      /* a property of the machine: survives the end of a run */
     inertia_t inertia;                /* its shift likewise */
+    int32_t mean_torque_q24;          /* machine torque since its last update, N m, Q7.24 */
     int32_t approached_q22;           /* speed reference, rad/s, Q9.22 */
     uint32_t updates_since_near;      /* since the speed was first near it */
     bool approaches_reference;        /* until then, and for some more */

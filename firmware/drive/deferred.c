@@ -263,11 +263,17 @@ static void approach_reference(const control_parameters_t *parameters, deferred_
     deferred->approaches_reference = deferred->updates_since_near < settling;
 }
 
+/* Of the four samples between two updates of the inertia, which has the turn before the last; rounded down. */
+static void average_torque(deferred_t *deferred, int32_t torque_q24) {
+    const int32_t before_q24 = deferred->turn == DEFERRED_COMMON_PERIODS - 1 ? 0 : deferred->mean_torque_q24;
+    deferred->mean_torque_q24 = before_q24 + (torque_q24 >> 2);
+}
+
 /* A torque that is at its limit in order to change the speed follows no load. */
 static void identify_inertia(const control_parameters_t *parameters, deferred_t *deferred,
                              const deferred_input_t *input) {
     inertia_step(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical,
-                 input->torque_sum_q24, at_torque_limit(deferred, input->torque_reference_q24),
+                 deferred->mean_torque_q24, at_torque_limit(deferred, input->torque_reference_q24),
                  deferred->approaches_reference);
 }
 
@@ -369,6 +375,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         set_speed_law(parameters, deferred);
         break;
     default:
+        average_torque(deferred, input->torque_sum_q24);
         learn_misalignment(parameters, deferred, input, flux_misalignment);
         await_slow_counts(parameters, deferred, input, input->periods + DEFERRED_LEARNING_PERIODS - 1u);
         break;
@@ -393,6 +400,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     deferred->run = input->run;
     if (!input->run) {
         deferred->updates_since_near = 0;
+        deferred->mean_torque_q24 = 0;
         inertia_restart(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical);
         await_slow_counts(parameters, deferred, input, input->periods);
         limit_currents(parameters, input, reset, results);

@@ -497,6 +497,24 @@ TEST_F(Deferred, the_misalignment_survives_every_reset_and_a_late_step) {
     kept();
 }
 
+// Each update of the inertia would see the same value of a torque that swings in step with it.
+TEST_F(Deferred, the_inertia_is_identified_from_the_mean_torque_since_its_last_update) {
+    start();
+    while (state.deferred.inertia.updates == 0) {
+        period(COMMAND_RUN);
+    }
+    for (const bool swings : {false, true}) {
+        const uint32_t before_q23 = state.deferred.inertia.sum_q23;
+        for (int k = 0; k < 10 * DEFERRED_COMMON_PERIODS; k++) {
+            interrupt(COMMAND_RUN);
+            state.deferred_request.input.torque_sum_q24 = (swings && k % 4 < 2 ? -4 : 4) * (1 << 24);
+            EXPECT_TRUE(deferred_step(&parameters, &state, &command));
+        }
+        const int32_t part_q23 = (4 << 24) >> (2 * parameters.inertia.window_shift + 1);
+        EXPECT_EQ(int32_t(state.deferred.inertia.sum_q23 - before_q23), swings ? 0 : 10 * part_q23);
+    }
+}
+
 TEST_F(Deferred, counts_of_an_encoder_of_13_bits_are_never_slow) {
     for (const auto &[bits, slow] : {std::pair{12u, true}, std::pair{13u, false}}) {
         configure(DRIVE_CONTROLLER_SALIENT);
