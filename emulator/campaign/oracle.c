@@ -411,6 +411,7 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
     } else if (drive.state == STATE_RUN && before != STATE_RUN) {
         look_at_start(oracle, plant->time_ns);
         oracle->run_angle_rad = plant->rotor_angle_rad;
+        oracle->begin_speed_rad_s = plant->speed_rad_s;
         oracle->turned = false;
         oracle_enter_run(oracle, plant);
     } else if (drive.state == STATE_READY && before == STATE_RUN) {
@@ -418,9 +419,10 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
         const uint64_t age_ns = plant->time_ns > oracle->run_ns ? plant->time_ns - oracle->run_ns : 0;
         /* A stop may end when the request to run is already on the bus. */
         const bool stops = oracle->meant.request == SENDER_STOP || plant->time_ns < oracle->withdrawn_ns + CROSSED_NS;
-        const bool rests =
-            stops && (oracle_encoder_faulty(oracle) || fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S <
-                                                           20.0 + 0.05 * oracle->world->machine->speed_base_rpm);
+        const double rest_rpm = 20.0 + 0.05 * oracle->world->machine->speed_base_rpm +
+                                oracle_added_rad_s(oracle, plant) * ORACLE_RPM_PER_RAD_S;
+        const bool rests = stops && (oracle_encoder_faulty(oracle) ||
+                                     fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S < rest_rpm);
         if (!oracle->off_seen && !rests && age_ns < 30 * ORACLE_MS_NS && !oracle_state_changed(oracle) &&
             !may_be_deaf(oracle, plant->time_ns / 1000)) {
             oracle_violate(oracle, "stopped", plant->time_ns, oracle->meant.request, plant->speed_rad_s);

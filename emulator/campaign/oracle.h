@@ -15,7 +15,8 @@
  *                   fault that ends without a genuine request to clear it; a gate on after a reset by the watchdog
  *                   without one
  *   stopped         state run left, without a fault, less than 30 ms after a genuine request to run; or after one to
- *                   stop while the rotor turns
+ *                   stop while the rotor turns, faster than at 5 % of the base speed and what a light rotor loses
+ *                   before its speed is known
  *   not_stopped     no fault: faster than at the request to stop, by 5 % of the base speed and what a light rotor
  *                   gains; four quadrants: still turning 100 ms after the time that half of the torque limit needs
  *   resumed         a run after bus-off, with no other request than run since
@@ -219,7 +220,7 @@ typedef struct {
     uint64_t cause_ns;               /* last time at which the plant had a reason to keep the drive in a fault, */
     uint64_t cause_begin_ns;         /* which it has had since */
     uint64_t stop_ns, constant_ns;   /* since then stopping, since then one command */
-    double begin_speed_rad_s;        /* then */
+    double begin_speed_rad_s;        /* then, or at the start of a run since */
     double stop_speed_rad_s;         /* when the stop began */
     oracle_detection_t detection;
     oracle_torque_t torque, any_torque; /* in torque mode; in any, over 20 ms */
