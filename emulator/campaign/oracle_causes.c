@@ -15,7 +15,8 @@ _Static_assert(FAULT_COUNT <= ORACLE_KINDS, "room for every kind");
     (BIT(CAUSE_INTERRUPT_OVERRUN) | BIT(CAUSE_WATCHDOG) | BIT(CAUSE_COMMAND_TIMEOUT) | BIT(CAUSE_COMMAND_ERROR))
 #define WINDING_TEMPERATURE (BIT(CAUSE_TEMPERATURE_SENSOR) | BIT(CAUSE_WINDING_OVERLOAD) | BIT(CAUSE_STALL))
 #define INVERTER_TEMPERATURE (BIT(CAUSE_TEMPERATURE_SENSOR) | BIT(CAUSE_INVERTER_OVERLOAD) | BIT(CAUSE_STALL))
-#define MECHANICS (BIT(CAUSE_STALL) | BIT(CAUSE_WINDING_OVERLOAD) | BIT(CAUSE_INVERTER_OVERLOAD))
+#define OVERLOAD (BIT(CAUSE_WINDING_OVERLOAD) | BIT(CAUSE_INVERTER_OVERLOAD))
+#define MECHANICS (BIT(CAUSE_STALL) | OVERLOAD)
 
 /* A wrong voltage within its limits has no name of its own: it shows in the flux linkages that are integrated from it,
  * as an error of phases or of the angle. */
@@ -261,6 +262,10 @@ void oracle_judge_cause(oracle_t *oracle, const plant_t *plant) {
     }
     if ((phases & (phases - 1u)) != 0) {
         allowed |= BIT(CAUSE_ENCODER_ANGLE);
+    }
+    /* From a shorted switch through the earth flows a current that no drive can end, also before the first run. */
+    if (oracle->injected[FAULT_SWITCH_SHORTED] && oracle->injected[FAULT_WINDING_TO_EARTH]) {
+        allowed |= OVERLOAD;
     }
     const unsigned cause = oracle->drive.fault;
     if ((allowed >> cause & 1u) || (true_of_plant(oracle, cause, plant) && has_reason(oracle, cause, plant))) {
