@@ -137,7 +137,8 @@ typedef struct {
 /* Of what has to be noticed. */
 typedef struct {
     uint64_t looked_ns, misled_ns, lost_ns, status_ns;
-    oracle_stay_t held, swinging;
+    oracle_stay_t held, swinging, within_pitch;
+    bool swings;                     /* within a rotor pitch for as long as a rotor that is stalled */
     uint64_t stroke_ns;              /* the rotor was last a stroke from where it had been, */
     double stroke_rad;               /* here */
     double largest_flux_Wb;          /* aligned, at the trip current */

@@ -89,8 +89,6 @@ static const uint32_t causes_of[FAULT_COUNT] = {
     [FAULT_CLOCK_DRIFT] = BIT(CAUSE_CLOCK),
 };
 
-#define STALLED_NS (200 * ORACLE_MS_NS)
-
 #define BUS (BIT(CAUSE_COMMAND_TIMEOUT) | BIT(CAUSE_COMMAND_ERROR) | BIT(CAUSE_IDENTIFIER_CONFLICT))
 
 static uint32_t causes_of_variable(unsigned variable) {
@@ -119,10 +117,20 @@ static uint32_t causes_of_script(const world_event_t *event) {
                                                                          : 0;
 }
 
-/* The load is the torque that heat and the client leave. */
-static bool overloaded(const oracle_t *oracle, const plant_t *plant) {
+/* Torque that heat and the client leave. Telemetry that may be disturbed is not looked at: then the temperatures tell
+ * that the drive has measured. */
+static double torque_left_Nm(const oracle_t *oracle) {
+    const oracle_heat_t heat = oracle->drive.heat;
     const double announced_Nm = oracle->telemetry.limit_ns != 0 ? oracle->telemetry.limit_Nm.low[0] : INFINITY;
-    return fabs(plant->load_torque_Nm) > 0.9 * fmin(announced_Nm, oracle_torque_max_Nm(oracle));
+    return fmin(announced_Nm, oracle_cool_part(heat.winding_C, heat.switch_C) * oracle_torque_max_Nm(oracle));
+}
+
+/* The load is the torque that is left. A rotor that a load turns backwards has less of it in the mean: one quadrant
+ * takes the phases in the order of forward motion, and backwards each of them ends its part where its torque, at the
+ * limit of the current, is small. */
+static bool overloaded(const oracle_t *oracle, const plant_t *plant) {
+    const bool driven_back = oracle->world->controller != 2 && plant->speed_rad_s < 0.0 && plant->load_torque_Nm > 0.0;
+    return fabs(plant->load_torque_Nm) > (driven_back ? 0.7 : 0.9) * torque_left_Nm(oracle);
 }
 
 /* What the plant itself shows. */
@@ -144,7 +152,8 @@ static bool true_of_plant(const oracle_t *oracle, unsigned cause, const plant_t 
         return fmax(oracle->speed_recent_rad_s, fabs(plant->speed_rad_s)) * ORACLE_RPM_PER_RAD_S >
                0.95 * machine->over_speed_rpm;
     case CAUSE_STALL:
-        return plant->time_ns > oracle->detection.stroke_ns + STALLED_NS || overloaded(oracle, plant);
+        return plant->time_ns > oracle->detection.stroke_ns + ORACLE_STALLED_NS || oracle->detection.swings ||
+               overloaded(oracle, plant);
     default:
         return false;
     }

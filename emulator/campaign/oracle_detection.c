@@ -212,6 +212,9 @@ static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
     const uint64_t swinging_ns = stays_ns(oracle, &detection->swinging, plant, pushes, stroke_rad);
     const double three_strokes_s = 3.0 * stroke_rad * ORACLE_RPM_PER_RAD_S / fabs(oracle->meant.reference);
     const uint64_t strokes_ns = pushes ? (uint64_t)(three_strokes_s * 1e9) : 0;
+    const double pitch_rad = stroke_rad * plant->machine->phases;
+    const uint64_t within_pitch_ns = stays_ns(oracle, &detection->within_pitch, plant, pushes, pitch_rad);
+    detection->swings = within_pitch_ns > ORACLE_STALLED_NS + strokes_ns;
     const bool hidden = checks_late(oracle, plant->time_ns / 1000) || /* or the encoder shows a rotor that turns */
                         oracle_any_injected(oracle, FAULT_ENCODER_JUMP, FAULT_ENCODER_SLIP);
     if ((held_ns > BLOCKED_NS + strokes_ns || swinging_ns > SWINGING_NS + 2 * strokes_ns) && !hidden) {

@@ -7,6 +7,7 @@
 #define ORACLE_RPM_PER_RAD_S (30.0 / 3.14159265358979323846)
 #define ORACLE_TWO_PI (2.0 * 3.14159265358979323846)
 #define ORACLE_MS_NS UINT64_C(1000000)
+#define ORACLE_STALLED_NS (200 * ORACLE_MS_NS)
 
 /* Numbers of drive.dbc. */
 enum { STATE_INITIALISE, STATE_READY, STATE_RUN, STATE_FAULT };
@@ -104,6 +105,9 @@ void oracle_look_at_measurement(oracle_t *oracle, const plant_t *plant);
 void oracle_judge_temperature(oracle_t *oracle, const plant_t *plant, oracle_heat_t heat);
 
 /* --- Telemetry --- */
+
+/* Part of the largest torque that temperatures of the hottest winding and of the hottest switch leave, 0..1. */
+double oracle_cool_part(double winding_C, double switch_C);
 
 /* After each control interrupt. */
 void oracle_remember_measurement(oracle_t *oracle, const plant_t *plant);

@@ -18,6 +18,7 @@
 /* Default parameters, and the error of a torque limit: heat changes between two readings of it. */
 #define WINDING_LIMIT_C 155.0
 #define INVERTER_LIMIT_C 100.0
+#define DERATING_K 20.0
 #define DERATING_ERROR_MAX 0.12
 #define SET_LIMIT_ERROR_MAX 1.03 /* of the limit that the client has set, which a frame rounds */
 #define LIMIT_WINDOW_NS (50 * ORACLE_MS_NS)
@@ -133,12 +134,16 @@ static void judge_snapshot(oracle_t *oracle, uint64_t time_ns, const uint8_t dat
     judge(oracle, fabs(current - telemetry->fault_current) <= ERROR_MAX, time_ns, 18, current);
 }
 
+double oracle_cool_part(double winding_C, double switch_C) {
+    const double room = fmin(WINDING_LIMIT_C - winding_C, INVERTER_LIMIT_C - switch_C) / DERATING_K;
+    return fmin(fmax(room, 0.0), 1.0);
+}
+
 /* The torque that heat leaves, by what the drive says of itself. */
 static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data[8]) {
     const double most_Nm = oracle->world->machine->torque_max_Nm;
     const double load_percent = 0.01 * fmax(unsigned_16(data), unsigned_16(data + 2));
-    const double room = fmin(fmin((100.0 - load_percent) / 10.0, (WINDING_LIMIT_C - data[6]) / 20.0),
-                             (INVERTER_LIMIT_C - data[7]) / 20.0);
+    const double room = fmin(fmax((100.0 - load_percent) / 10.0, 0.0), oracle_cool_part(data[6], data[7]));
     const double limit_Nm = signed_16(data + 4) * 256.0 * oracle->world->machine->command_lsb_Nm;
     oracle_telemetry_t *telemetry = &oracle->telemetry;
     const bool renew = time_ns >= telemetry->limit_window_ns + LIMIT_WINDOW_NS;
@@ -155,7 +160,7 @@ static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data
         limit_Nm > SET_LIMIT_ERROR_MAX * oracle_torque_max_Nm(oracle)) {
         oracle_violate(oracle, "above_limit", time_ns, 3, limit_Nm / oracle_torque_max_Nm(oracle));
     }
-    if (limit_Nm > most_Nm * (fmin(fmax(room, 0.0), 1.0) + DERATING_ERROR_MAX)) {
+    if (limit_Nm > most_Nm * (room + DERATING_ERROR_MAX)) {
         oracle_violate(oracle, "not_derated", time_ns, 0, limit_Nm / most_Nm);
     }
 }
