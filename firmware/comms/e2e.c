@@ -61,12 +61,15 @@ e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t
         return E2E_WRONG_CHECKSUM;
     }
     const uint8_t counter = bytes[2];
+    if (counter == receiver->counter && checksum_of(bytes) == receiver->checksum) {
+        return E2E_REPEATED; /* of a sender that starts again by chance with this one, the next frame is accepted */
+    }
     if (!receiver->synchronised || in_sequence(receiver->counter, counter)) {
         accept(receiver, bytes);
         return E2E_ACCEPTED;
     }
     if (counter == receiver->counter) {
-        return checksum_of(bytes) == receiver->checksum ? E2E_REPEATED : E2E_WRONG_SEQUENCE;
+        return E2E_WRONG_SEQUENCE;
     }
     if (receiver->locked) {
         return E2E_WRONG_SEQUENCE;

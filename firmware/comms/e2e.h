@@ -30,7 +30,8 @@ typedef enum {
 
 typedef struct {
     bool locked;               /* set by the caller: no resynchronisation */
-    bool synchronised;         /* false: the next frame with a valid checksum is accepted with any counter */
+    bool synchronised;         /* false: the next frame with a valid checksum is accepted with any counter, but not the
+                                  last accepted one once more */
     uint8_t counter;           /* of the last accepted frame */
     uint16_t checksum;         /* likewise */
     uint8_t candidate_frames;  /* consecutive frames of another sequence, none of the accepted sequence between */
@@ -47,7 +48,8 @@ void e2e_protect(uint16_t data_id, uint8_t counter, uint8_t *bytes, size_t lengt
 /* Initialises a receiver that accepts the next valid frame with any counter. */
 void e2e_receiver_init(e2e_receiver_t *receiver);
 
-/* Forgets the sequence: call it after a timeout, so that a sender that starts again is accepted. */
+/* Forgets the sequence: call it after a timeout, so that a sender that starts again is accepted. Not the last frame: a
+ * gateway that hangs, and sends it for ever, is no sender that starts again. */
 void e2e_receiver_restart(e2e_receiver_t *receiver);
 
 /* True when a frame's checksum is that of its data and data ID; false for one shorter than the header. */

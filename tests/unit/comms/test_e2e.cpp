@@ -139,6 +139,16 @@ TEST(E2e, only_an_exact_repetition_of_the_last_accepted_frame_is_a_repeated_one)
     }
 }
 
+TEST(E2e, the_last_frame_once_more_is_no_sender_that_starts_again) {
+    receiver_t receiver;
+    receiver.take(10);
+    e2e_receiver_restart(&receiver);
+    for (int i = 0; i < 100; i++) {
+        ASSERT_EQ(receiver.take(10), E2E_REPEATED) << i;
+    }
+    EXPECT_EQ(receiver.take(200), E2E_ACCEPTED);
+}
+
 TEST(E2e, a_wrong_checksum_leaves_the_receiver_alone) {
     receiver_t receiver;
     receiver.take(10);
