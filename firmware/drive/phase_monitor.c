@@ -22,6 +22,11 @@
 /* Time for which a phase has to differ alone at high speed: a slipping encoder shows in the others soon. */
 #define DOUBT_MS 20u
 
+/* Rotation since the phase last differed: of less it differs now; after more it differs no longer. Electrical rev,
+ * Q7.24: 1/2 and 3/2. */
+#define AGAIN_Q24 (1 << 23)
+#define GONE_Q24 (3 << 23)
+
 #define OPEN_SAMPLES 2u
 
 /* A current that should not be is judged after 1/4 ms. One that does not move is its sensor's error after this time; at
@@ -243,6 +248,7 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
     if (state->turned >= TURN_MIN) {
         monitor->doubted |= 1u << phase;
         monitor->doubted_side = side;
+        monitor->quiet_turned_q24 = 0;
     }
     state->open_samples =
         beyond && side > 0 ? (uint8_t)(state->open_samples + (state->open_samples < OPEN_SAMPLES)) : 0;
@@ -254,8 +260,10 @@ static uint32_t check_phase(const common_t *common, phase_monitor_t *monitor, un
 }
 
 /* Differences that an angle may explain: the phase's, when it alone has them within an electrical revolution and
- * DOUBT_MS, in which all others have conducted within half of the tolerances; else they decide nothing here, and may be
- * the encoder's. */
+ * DOUBT_MS, in which all others have conducted within half of the tolerances, and then has one again; else they decide
+ * nothing here, and may be the encoder's. A wrong angle shows most in a stroke that begins in its middle, as the first
+ * one of a run, and may be within the tolerances in complete ones; a fault of the phase shows in the next stroke, too.
+ */
 static uint32_t judge_doubts(const common_t *common, phase_monitor_t *monitor) {
     const unsigned phases = common->tables->phases;
     if (monitor->doubted == 0) {
@@ -265,16 +273,20 @@ static uint32_t judge_doubts(const common_t *common, phase_monitor_t *monitor) {
         return 0;
     }
     monitor->doubt_turned_q24 = fixed_add(monitor->doubt_turned_q24, common->step / 256);
+    monitor->quiet_turned_q24 = fixed_add(monitor->quiet_turned_q24, common->step / 256);
+    const uint32_t doubted = monitor->doubted;
+    const bool alone = (doubted & (doubted - 1u)) == 0;
+    const int32_t quiet_q24 = fixed_abs(monitor->quiet_turned_q24);
     if (fixed_abs(monitor->doubt_turned_q24) < 1 << 24 ||
-        common->input->periods - monitor->doubted_at < DOUBT_MS * common->input->periods_per_ms) {
+        common->input->periods - monitor->doubted_at < DOUBT_MS * common->input->periods_per_ms ||
+        (alone && quiet_q24 > AGAIN_Q24 && quiet_q24 < GONE_Q24)) {
         return 0;
     }
-    const uint32_t doubted = monitor->doubted;
     monitor->doubted = 0;
     const uint32_t agreed = monitor->agreed & ~monitor->nearly;
     monitor->agreed = monitor->nearly = 0;
     const uint32_t all = (1u << phases) - 1u;
-    if ((doubted & (doubted - 1u)) != 0 || ((doubted | agreed | monitor->lost) & all) != all) {
+    if (!alone || quiet_q24 >= GONE_Q24 || ((doubted | agreed | monitor->lost) & all) != all) {
         return 0;
     }
     monitor->phases |= doubted;

@@ -19,8 +19,8 @@
  *
  * An error of the angle explains any psi between those of the unaligned and of the aligned position. Beyond these a
  * difference is phase_open in its second sample, or an excess of current. Between them it counts once the rotor has
- * turned by 1/32 electrical revolution, by its encoder, and is a fault unless a second phase has one within an
- * electrical revolution and 20 ms: then it is the encoder's, or what all sensors have in common.
+ * turned by 1/32 electrical revolution, by its encoder, and is a fault when it comes again, unless a second phase has
+ * one within an electrical revolution and 20 ms: then it is the encoder's, or what all sensors have in common.
  *
  * What a phase without current cannot tell apart: an open winding, an open switch, the gate supply, a dead sensor. What
  * shows nothing at all: a negative offset in a phase that stands without current, because the converter reads 0; an
@@ -91,6 +91,7 @@ typedef struct {
     uint32_t nearly;          /* of each phase that was beyond half of the tolerances since */
     uint32_t doubted_at;      /* period of the first one */
     int32_t doubt_turned_q24; /* rotation since the first one, electrical rev, Q7.24 */
+    int32_t quiet_turned_q24; /* since the last one, likewise */
     uint32_t lost;            /* bit of each phase that stays off, phase_monitor_lose() */
     phase_monitor_phase_t phase[HAL_PHASES_MAX];
 } phase_monitor_t;

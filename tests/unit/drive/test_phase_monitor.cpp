@@ -174,14 +174,14 @@ TEST_F(PhaseMonitor, current_of_a_phase_that_is_read_in_another_is_the_sensors) 
 // electrical revolutions.
 class PhaseMonitorInTurn : public PhaseMonitor {
   protected:
-    int periods_with(unsigned differ, unsigned conduct, int step_of_revolution) {
-        return periods_to_fault(1100, [&](int) {
+    int periods_with(unsigned differ, unsigned conduct, int step_of_revolution, int until = 1100) {
+        return periods_to_fault(1100, [&](int k) {
             input.electrical += uint32_t(step_of_revolution * (1 << 24)); // 256 periods in a revolution
             for (unsigned phase = 0; phase < conduct; phase++) {
                 const uint32_t angle = input.electrical - phase * input.stroke;
                 const bool conducts = angle >= MIDDLE - (1u << 29) && angle < MIDDLE;
                 const double flux_Wb = phase_map_results::flux_q29(machine_tables, angle, 10 * 512) / Q29;
-                set(phase, conducts ? 10.0 : 0.0, conducts ? (phase < differ ? 1.8 : 1.0) * flux_Wb : 0.0);
+                set(phase, conducts ? 10.0 : 0.0, conducts ? (phase < differ && k < until ? 1.8 : 1.0) * flux_Wb : 0.0);
                 input.off[phase] = !conducts;
             }
         });
@@ -195,6 +195,14 @@ TEST_F(PhaseMonitorInTurn, one_phase_that_differs_at_its_angle_for_20_ms_is_a_fa
         EXPECT_GT(periods, 20 * 40) << direction;
         EXPECT_LT(periods, 22 * 40) << direction;
         EXPECT_EQ(failed, FAULT_BIT(FAULT_PHASE_OPEN)) << direction;
+    }
+}
+
+TEST_F(PhaseMonitorInTurn, one_phase_that_differs_in_its_first_stroke_only_is_none) {
+    for (const int direction : {1, -1}) {
+        monitor = {};
+        EXPECT_EQ(periods_with(1, 3, direction, 256), -1) << direction;
+        EXPECT_EQ(monitor.doubted, 0u) << direction;
     }
 }
 
