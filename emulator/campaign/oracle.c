@@ -484,8 +484,10 @@ void oracle_on_bus(oracle_t *oracle, const plant_t *plant, uint64_t time_ns, con
         oracle->clear_ns = time_ns; /* in a run it is refused, and so begins after it */
     }
     if (meaning->request == SENDER_STOP && oracle->meant.request != SENDER_STOP) {
-        oracle->stop_ns = time_ns;
         oracle->stop_speed_rad_s = plant->speed_rad_s;
+    }
+    if (meaning->request == SENDER_STOP && (oracle->meant.request != SENDER_STOP || after_silence)) {
+        oracle->stop_ns = time_ns;
     }
     oracle->withdrawn_ns = meaning->request != SENDER_RUN ? time_ns : oracle->withdrawn_ns;
     if (meaning->torque != oracle->meant.torque || meaning->reference != oracle->meant.reference ||

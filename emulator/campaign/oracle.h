@@ -18,7 +18,8 @@
  *                   stop while the rotor turns, faster than at 5 % of the base speed and what a light rotor loses
  *                   before its speed is known
  *   not_stopped     no fault: faster than at the request to stop, by 5 % of the base speed and what a light rotor
- *                   gains; four quadrants: still turning 100 ms after the time that half of the torque limit needs
+ *                   gains; four quadrants: still turning 100 ms after the time that half of the torque limit needs,
+ *                   while the request is heard: after a silence the time begins anew
  *   resumed         a run after bus-off, with no other request than run since
  *   cleared         a fault ended less than 8 ms after the plant's last reason for one, unless that has just begun: a
  *                   line of safe torque off not energised, a link voltage or a speed beyond its limits; by a request to
@@ -47,8 +48,8 @@
  *   wrong_way       one quadrant: for 50 ms a torque forwards, at a speed, while a speed backwards is commanded
  *   above_limit     up to 0.9 of the base speed, without torque sharing half: the mean torque of electrical periods of
  *                   20 ms above the limit in telemetry, or that which the client has set, by 30 % and 5 % of the rated
- *                   one, without torque sharing 10 %; or a limit in telemetry above the one that the client has set, by
- *                   3 %
+ *                   one, without torque sharing 10 %, with the BP-PID in strokes of less than 128 periods half of the
+ *                   torque; or a limit in telemetry above the one that the client has set, by 3 %
  *   overshoot       no fault, the speed above a reference that it has approached from below by more than 12 % and 5 %
  *                   of the base speed; one quadrant: and what a light rotor gains
  *   wrong_status    a state or a first cause on the bus that is not the drive's, which has had its state for 30 ms, bus
@@ -68,7 +69,7 @@
  *   undetected      in state run for longer than a reaction takes with a fault that shows at any time: changed memory,
  *                   sensors at a rail, a wrong clock, a background that hangs (oracle_detection.c)
  *   no_current      voltage on a phase for twenty times its largest flux linkage, in pulses of more than three
- *                   periods, and no current at all
+ *                   periods and of more than a 64th of one each, and no current at all
  *   two_lost        in state run for 300 ms at less than half of the commanded speed, with two phases lost
  *   blocked         a speed commanded, and the rotor within a quarter of a stroke for 300 ms and three strokes, or
  *                   within a stroke for 500 ms and six: a swing that grows is no standstill

@@ -10,6 +10,7 @@
 #define FLUX_LINKAGES 20.0 /* of the aligned position at the trip current, applied to a phase without any effect */
 #define NO_CURRENT_A 1e-3
 #define PULSE_PERIODS 3.0
+#define PULSE_MIN_PART 64        /* of the period, an error that the voltage of any converter has */
 #define MISLED_PITCH (1.0 / 6.0) /* error of the angle at which a phase makes torque in the other direction */
 #define MISLED_SPEED 0.2         /* of the base speed, above which a wrong angle shows soon, */
 #define MISLED_CURRENT 0.1       /* of the trip, */
@@ -157,8 +158,17 @@ static void look_at_status(oracle_t *oracle, uint64_t now_ns) {
     }
 }
 
+/* Length of the present part of a period, between two edges of the phase. */
+static uint64_t part_ns(const oracle_t *oracle, const plant_t *plant, unsigned phase) {
+    const half_bridge_pattern_t *pattern = &plant->pattern[phase];
+    const unsigned next = plant->edge_next[phase];
+    const uint64_t begin_ns = next > 0 ? pattern->delay_ns[next - 1] : 0;
+    return (next < pattern->count ? pattern->delay_ns[next] : oracle->period_ns) - begin_ns;
+}
+
 /* Voltage on a phase that is followed by no current at all, in pulses of more than PULSE_PERIODS: a shorter one the
- * opposite voltage may have ended before a sample. A current that an open diode ends is gone at once. */
+ * opposite voltage may have ended before a sample. A current that an open diode ends is gone at once. Pulses
+ * of a duty near zero do not count: a look in 25 or 50 may meet each of them, and would take 10 ns for 19 us. */
 static void look_at_phases(oracle_t *oracle, const plant_t *plant) {
     const bool hidden = oracle_any_injected(oracle, FAULT_CURRENT_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET) ||
                         oracle->injected[FAULT_DIODE_OPEN] || checks_late(oracle, plant->time_ns / 1000);
@@ -172,7 +182,7 @@ static void look_at_phases(oracle_t *oracle, const plant_t *plant) {
             *flux_Wb = *pulse_Wb = 0.0;
         } else if (plant->switches[phase] == 0) {
             *pulse_Wb = fmax(0.0, fmin(*pulse_Wb, short_Wb) - step_Wb);
-        } else if (plant->switches[phase] == 3) {
+        } else if (plant->switches[phase] == 3 && part_ns(oracle, plant, phase) > oracle->period_ns / PULSE_MIN_PART) {
             *pulse_Wb += step_Wb;
             *flux_Wb += *pulse_Wb > short_Wb ? step_Wb : 0.0;
             if (*flux_Wb > FLUX_LINKAGES * oracle->detection.largest_flux_Wb && !hidden) {

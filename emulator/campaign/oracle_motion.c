@@ -35,6 +35,8 @@
 #define LIMIT_MIN_NS (20 * ORACLE_MS_NS)
 #define LIMIT_SPEED 0.9 /* of the base speed, at most; with hysteresis TORQUE_SPEED */
 #define LIMIT_AGE_MAX_NS (120 * ORACLE_MS_NS)
+#define HAND_OVER_PERIODS 128.0 /* of a stroke: with fewer, the BP-PID's hand-over takes most of it, */
+#define HAND_OVER_PART 0.5      /* and this part of the torque is judged */
 
 static bool undisturbed(const oracle_t *oracle) {
     return !oracle_any_injected(oracle, 1, FAULT_COUNT - 1) && !oracle->bus_disturbed;
@@ -119,7 +121,8 @@ static void look_at_overshoot(oracle_t *oracle, const plant_t *plant) {
     }
 }
 
-/* A run ended by a request to stop becomes no faster, and ends at rest; and a drive of four quadrants brakes. */
+/* A run ended by a request to stop becomes no faster, and ends at rest; and a drive of four quadrants brakes, while it
+ * hears that request: without it the torque ramps to zero and the rotor coasts. */
 static void look_at_stop(oracle_t *oracle, const plant_t *plant) {
     const world_machine_t *machine = oracle->world->machine;
     const double base_rad_s = machine->speed_base_rpm / ORACLE_RPM_PER_RAD_S;
@@ -133,6 +136,7 @@ static void look_at_stop(oracle_t *oracle, const plant_t *plant) {
     const double needed_s = plant->machine->inertia_kg_m2 * oracle->world->inertia_gain *
                             fabs(oracle->stop_speed_rad_s) / (0.5 * oracle_torque_max_Nm(oracle));
     if (stops && oracle->world->controller == 2 && !derated(oracle) && fabs(plant->speed_rad_s) > least_rad_s &&
+        plant->time_ns < oracle->run_ns + TORQUE_SETTLED_NS &&
         plant->time_ns > oracle->stop_ns + (uint64_t)((STOP_SETTLED_S + needed_s) * 1e9)) {
         oracle_violate(oracle, "not_stopped", plant->time_ns, 0, plant->speed_rad_s / oracle->stop_speed_rad_s);
     }
@@ -231,6 +235,14 @@ void oracle_judge_limit(oracle_t *oracle, uint64_t time_ns, double mean_Nm, doub
     }
 }
 
+/* The BP-PID of `paper` takes tens of periods to open the outgoing phase. Meanwhile the incoming one keeps the current
+ * for the hand-over angle, which further on may alone make more than the reference. */
+static bool hands_over_long(const oracle_t *oracle, const plant_t *plant) {
+    const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
+    const double period_rad = fabs(plant->speed_rad_s) * (double)oracle->period_ns * 1e-9;
+    return oracle->world->controller == 1 && HAND_OVER_PERIODS * period_rad > stroke_rad;
+}
+
 /* The torque keeps to the limit that the client has set, and to that which telemetry announces before or after. */
 static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
     oracle_torque_t *torque = &oracle->any_torque;
@@ -246,7 +258,7 @@ static void look_at_torque_limit(oracle_t *oracle, const plant_t *plant) {
     if (!mean_torque(torque, plant, LIMIT_MIN_NS, &mean_Nm)) {
         return;
     }
-    mean_Nm = fabs(mean_Nm);
+    mean_Nm = (hands_over_long(oracle, plant) ? HAND_OVER_PART : 1.0) * fabs(mean_Nm);
     oracle->mean_torque_Nm = fmax(oracle->mean_torque_Nm, mean_Nm);
     if (oracle_sets_in_effect(oracle)) {
         oracle_judge_limit(oracle, plant->time_ns, mean_Nm, oracle_torque_max_Nm(oracle));
