@@ -60,6 +60,11 @@ COLD static bool read_sample(const control_state_t *control, const control_param
     return false;
 }
 
+/* An integral that saturates, as that of a phase which holds a load for half a second at another resistance. */
+static bool saturated(int32_t flux_q29) {
+    return fixed_magnitude(flux_q29) >= INT32_MAX;
+}
+
 /* Of the sample of `input`; the integrals without the corrections that the other monitor has made. */
 COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input, const phase_monitor_t *phases,
                                                   uint32_t encoder_angle, const stall_input_t *motion) {
@@ -78,7 +83,8 @@ COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *i
         encoder.current_q9[phase] = input->current_q9[phase];
         encoder.flux_q29[phase] = fixed_subtract(input->flux_q29[phase], state->followed_q29);
         encoder.zero_at[phase] = state->zero_at;
-        encoder.known[phase] = input->periods - state->zero_at < input->periods - phases->lost_at;
+        encoder.known[phase] = input->periods - state->zero_at < input->periods - phases->lost_at &&
+                               !saturated(state->followed_q29) && !saturated(encoder.flux_q29[phase]);
     }
     return encoder;
 }

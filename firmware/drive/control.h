@@ -158,6 +158,12 @@ typedef struct {
     slow_counts_t slow_counts;
 } deferred_t;
 
+/* Half a millisecond in which the observer may slip. */
+typedef struct {
+    uint32_t periods; /* since it began; 0: none has */
+    uint32_t angle;   /* then, 2^-32 rev */
+} observer_slip_t;
+
 /* State of the control; the control interrupt alone writes the members other than `deferred`, the first and the last.
  */
 typedef struct {
@@ -166,6 +172,7 @@ typedef struct {
     int32_t innovation;           /* of the last sample, 2^-32 rev */
     load_observer_t observer;
     observer_bandwidth_t bandwidth;
+    observer_slip_t slip;
     protection_t protection;
     state_machine_t state_machine;
     int32_t torque_reference_q24;     /* 0 outside RUN */

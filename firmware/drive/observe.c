@@ -1,5 +1,6 @@
 #include "drive/observe.h"
 
+#include "control/machine_tables.h"
 #include "drive/deferred.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
@@ -15,6 +16,30 @@ void observe_reset(control_state_t *state, const control_measurement_t *measured
 
 bool observe_follows(const control_state_t *state) {
     return fixed_abs(state->innovation) < FOLLOWS_MAX;
+}
+
+/* 2 pi 2000 1/s: from 2^-32 rev in half a millisecond to 2^-22 rad/s, Q24. */
+#define HALF_MS_SPEED_Q24 205887416
+
+NOINLINE void observe_recover(control_state_t *state, const control_measurement_t *measured, uint32_t periods_per_ms) {
+    observer_slip_t *slip = &state->slip;
+    const bool follows = observe_follows(state);
+    if (slip->periods == 0) {
+        slip->angle = measured->angle;
+        slip->periods = !follows;
+        return;
+    }
+    if (slip->periods < periods_per_ms / 2) {
+        slip->periods++;
+        return;
+    }
+    slip->periods = 0;
+    if (!follows) {
+        const int32_t rotation = (int32_t)(measured->angle - slip->angle);
+        observe_reset(state, measured);
+        state->observer.speed_q22 =
+            fixed_product_shift_saturate(rotation, HALF_MS_SPEED_Q24, 24u + machine_tables.speed_exponent);
+    }
 }
 
 void observe_forget_load(control_state_t *state) {

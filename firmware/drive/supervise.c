@@ -25,6 +25,7 @@ static void complete_record(fault_record_t *record, const control_state_t *state
 
 NOINLINE static void end_run(const control_parameters_t *parameters, control_state_t *state) {
     state->torque_reference_q24 = 0;
+    state->slip.periods = 0;
     torque_control_reset(parameters, state);
     if (state->state_machine.state != DRIVE_STATE_FAULT) { /* else a period later */
         deferred_reset_run(state);
@@ -58,7 +59,10 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
     }
     if (before == DRIVE_STATE_RUN) {
         end_run(parameters, state);
-    } else if (state_machine->state != before) {
+        return;
+    }
+    observe_recover(state, measured, parameters->initialise_ticks);
+    if (state_machine->state != before) {
         if (state_machine->state == DRIVE_STATE_READY) {
             enter_ready(state, measured, before);
         }

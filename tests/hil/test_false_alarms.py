@@ -52,6 +52,16 @@ def test_pulses_too_short_for_the_devices_at_100_khz_are_no_open_phase(make_benc
     assert 149 < bench.truth["speed_rpm"].last < 151
 
 
+def test_a_load_held_for_longer_than_a_second_by_warm_windings_is_no_frozen_encoder(make_bench):
+    bench = make_bench(machine=EXAMPLES / "servo86.toml", controller="traditional", encoder_bits=13)
+    bench.rig.resistance_gain = 1.28
+    bench.drive.speed_reference_rpm = 0
+    bench.load_torque_Nm = 17.8
+    bench.run_for(1.2)
+    assert bench.drive.state == "run"
+    assert bench.truth["speed_rpm"].last == pytest.approx(0, abs=30)
+
+
 @pytest.mark.parametrize("angle_deg", [12.0, 84.0, 204.0])
 def test_a_heavy_rotor_before_its_first_count_at_100_khz_is_no_frozen_encoder(make_bench, angle_deg):
     bench = make_bench(machine=EXAMPLES / "traction.toml", controller="paper", control_rate_hz=100_000,

@@ -160,6 +160,30 @@ def test_a_light_rotor_that_restarts_at_speed_is_not_twice_as_heavy() -> None:
     assert result["violations"] == [] and result["recovered"]
 
 
+def test_a_torque_that_swings_at_the_start_of_a_light_rotor_is_no_fivefold_inertia() -> None:
+    drawn = world(917278)
+    assert (drawn["machine"], drawn["controller"], drawn["control_rate_hz"]) == ("random_01", "salient", 20_000)
+    assert run_world(917278)["violations"] == []
+
+
+@pytest.mark.parametrize(("seed", "event"), [(1033581, "interrupt_late"), (1040244, "encoder_stuck")])
+def test_an_observer_that_slips_after_a_fault_does_not_keep_the_drive_from_clearing_it(seed: int, event: str) -> None:
+    assert event in [drawn["event"] for drawn in world(seed)["events"]]
+    result = run_world(seed)
+    assert result["violations"] == [] and result["recovered"]
+
+
+def test_an_encoder_that_jumps_before_the_first_stroke_is_no_short_circuit_of_a_phase() -> None:
+    assert "encoder_jump" in [drawn["event"] for drawn in world(662347)["events"]]
+    result = run_world(662347)
+    assert result["violations"] == [] and 17 not in result["causes"]
+
+
+def test_a_hung_gateway_does_not_withdraw_a_request_to_run_after_bus_off() -> None:
+    assert {"hostile", "transmit_error_counter"} <= {drawn["event"] for drawn in world(860958)["events"]}
+    assert run_world(860958)["violations"] == []
+
+
 def test_a_recording_after_a_reset_is_not_armed_by_the_living_sender() -> None:
     assert {"drive_reset", "hostile"} <= {drawn["event"] for drawn in world(951921)["events"]}
     assert run_world(951921)["violations"] == []
