@@ -172,7 +172,6 @@ typedef struct {
     int32_t innovation;           /* of the last sample, 2^-32 rev */
     load_observer_t observer;
     observer_bandwidth_t bandwidth;
-    observer_slip_t slip;
     protection_t protection;
     state_machine_t state_machine;
     int32_t torque_reference_q24;     /* 0 outside RUN */
@@ -186,6 +185,7 @@ typedef struct {
     /* Last measurement, for telemetry and background: the steps of the control interrupt receive the measurement as an
      * argument. */
     control_measurement_t measurement;
+    observer_slip_t slip;
     uint32_t lost_phase; /* number from 1 on of the phase whose switches stay open, as reported_fault_mask; 0: none */
     int32_t flux_misalignment[HAL_PHASES_MAX]; /* by the flux linkage, as reported_fault_mask, 2^-32 electrical rev; 0:
                                                   unknown */

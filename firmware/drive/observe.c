@@ -5,8 +5,8 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
-void observe_reset(control_state_t *state, const control_measurement_t *measured) {
-    load_observer_reset(&state->observer, measured->angle);
+void observe_forget_load(control_state_t *state) {
+    state->observer.load_torque_q24 = 0;
     observer_bandwidth_reset(&state->bandwidth);
     deferred_reset_observer(state);
 }
@@ -14,16 +14,12 @@ void observe_reset(control_state_t *state, const control_measurement_t *measured
 /* 1/32 rev less an LSB, at which load_observer.c limits the innovation. */
 #define FOLLOWS_MAX ((1 << 27) - 1)
 
-bool observe_follows(const control_state_t *state) {
-    return fixed_abs(state->innovation) < FOLLOWS_MAX;
-}
-
 /* 2 pi 2000 1/s: from 2^-32 rev in half a millisecond to 2^-22 rad/s, Q24. */
 #define HALF_MS_SPEED_Q24 205887416
 
 NOINLINE void observe_recover(control_state_t *state, const control_measurement_t *measured, uint32_t periods_per_ms) {
     observer_slip_t *slip = &state->slip;
-    const bool follows = observe_follows(state);
+    const bool follows = fixed_abs(state->innovation) < FOLLOWS_MAX;
     if (slip->periods == 0) {
         slip->angle = measured->angle;
         slip->periods = !follows;
@@ -36,16 +32,10 @@ NOINLINE void observe_recover(control_state_t *state, const control_measurement_
     slip->periods = 0;
     if (!follows) {
         const int32_t rotation = (int32_t)(measured->angle - slip->angle);
-        observe_reset(state, measured);
-        state->observer.speed_q22 =
-            fixed_product_shift_saturate(rotation, HALF_MS_SPEED_Q24, 24u + machine_tables.speed_exponent);
+        load_observer_reset(&state->observer, measured->angle);
+        state->observer.speed_q22 = fixed_multiply(rotation, HALF_MS_SPEED_Q24, 24u + machine_tables.speed_exponent);
+        observe_forget_load(state);
     }
-}
-
-void observe_forget_load(control_state_t *state) {
-    state->observer.load_torque_q24 = 0;
-    observer_bandwidth_reset(&state->bandwidth);
-    deferred_reset_observer(state);
 }
 
 /* Counts that become fast again are followed at the steady bandwidth, until one triggers. */

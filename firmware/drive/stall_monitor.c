@@ -63,7 +63,7 @@ static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *inp
 }
 
 COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us) {
-    const bool forward = input->speed_reference_q22 > 0; /* one of 0 has no direction, but must have the same for both */
+    const bool forward = input->speed_reference_q22 > 0; /* for a reference of 0 it has to be the same everywhere */
     const int32_t speed_q22 = forward ? input->speed_q22 : fixed_subtract(0, input->speed_q22);
     const int32_t change_q22 = fixed_abs(input->speed_reference_q22) / 128;
     const bool before = monitor->vain && monitor->forward == forward;

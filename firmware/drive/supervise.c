@@ -32,15 +32,6 @@ NOINLINE static void end_run(const control_parameters_t *parameters, control_sta
     }
 }
 
-/* From INITIALISE or FAULT, in a period without a failed check. */
-NOINLINE static void enter_ready(control_state_t *state, const control_measurement_t *measured, drive_state_t left) {
-    if (!observe_follows(state)) {
-        observe_reset(state, measured); /* its estimate stems from a faulty encoder */
-    } else if (left == DRIVE_STATE_FAULT) {
-        observe_forget_load(state); /* angle and speed of a rotor that may be turning are kept */
-    }
-}
-
 /* As wide as after its reset, the observer takes the first coarse counts of a turning rotor for a load. */
 static void await_load(const control_parameters_t *parameters, control_state_t *state) {
     if (parameters->bandwidth.adaptive && state->bandwidth.stage < parameters->bandwidth.trigger_stage_count) {
@@ -59,17 +50,17 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
     }
     if (before == DRIVE_STATE_RUN) {
         end_run(parameters, state);
-        return;
-    }
-    observe_recover(state, measured, parameters->initialise_ticks);
-    if (state_machine->state != before) {
-        if (state_machine->state == DRIVE_STATE_READY) {
-            enter_ready(state, measured, before);
+    } else if (state_machine->state != before) {
+        if (state_machine->state == DRIVE_STATE_READY && before == DRIVE_STATE_FAULT) {
+            observe_forget_load(state); /* angle and speed of a rotor that may be turning are kept */
         }
-    } else if (before != DRIVE_STATE_FAULT) {
-        await_load(parameters, state);
-    } else if (state_machine->fault_free_ticks == 1) {
+    } else if (before == DRIVE_STATE_FAULT && state_machine->fault_free_ticks == 1) {
         deferred_reset_run(state); /* not in the period that records the fault, which would take longer than a run */
+    } else {
+        observe_recover(state, measured, parameters->initialise_ticks);
+        if (before != DRIVE_STATE_FAULT) {
+            await_load(parameters, state);
+        }
     }
 }
 
