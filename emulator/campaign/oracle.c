@@ -421,8 +421,8 @@ void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive
         const bool stops = oracle->meant.request == SENDER_STOP || plant->time_ns < oracle->withdrawn_ns + CROSSED_NS;
         const double rest_rpm = 20.0 + 0.05 * oracle->world->machine->speed_base_rpm +
                                 oracle_added_rad_s(oracle, plant) * ORACLE_RPM_PER_RAD_S;
-        const bool rests = stops && (oracle_encoder_faulty(oracle) ||
-                                     fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S < rest_rpm);
+        const bool rests =
+            stops && (oracle_encoder_faulty(oracle) || fabs(plant->speed_rad_s) * ORACLE_RPM_PER_RAD_S < rest_rpm);
         if (!oracle->off_seen && !rests && age_ns < 30 * ORACLE_MS_NS && !oracle_state_changed(oracle) &&
             !may_be_deaf(oracle, plant->time_ns / 1000)) {
             oracle_violate(oracle, "stopped", plant->time_ns, oracle->meant.request, plant->speed_rad_s);

@@ -48,8 +48,8 @@ int32_t shift_after(const inertia_settings_t &of, double gain, const torque_t &t
     inertia_restart(&parameters, &MODEL, &inertia, angle_from_rev(rev) * POLES);
     for (double t = 0.0; t < 0.5; t += step_s) {
         const uint32_t angle = angle_from_rev(std::floor(rev * counts) / counts) * POLES;
-        inertia_step(&parameters, &MODEL, &inertia, angle, to_fixed(0.5 * (torque(t - step_s) + torque(t)), Q24), torque(t) >= TORQUE_MAX,
-                     t < settled_s);
+        inertia_step(&parameters, &MODEL, &inertia, angle, to_fixed(0.5 * (torque(t - step_s) + torque(t)), Q24),
+                     torque(t) >= TORQUE_MAX, t < settled_s);
         const double mean_Nm = 0.5 * (torque(t) - load(t) + torque(t + step_s) - load(t + step_s));
         const double change = mean_Nm / (gain * J0 * 2.0 * PI) * step_s;
         rev += (rev_s + 0.5 * change) * step_s;
