@@ -34,7 +34,7 @@ NOINLINE void observe_recover(control_state_t *state, const control_measurement_
         const int32_t rotation = (int32_t)(measured->angle - slip->angle);
         load_observer_reset(&state->observer, measured->angle);
         state->observer.speed_q22 = fixed_multiply(rotation, HALF_MS_SPEED_Q24, 24u + machine_tables.speed_exponent);
-        observe_forget_load(state);
+        observer_bandwidth_reset(&state->bandwidth);
     }
 }
 
