@@ -150,12 +150,12 @@ static void judge_thermal(oracle_t *oracle, uint64_t time_ns, const uint8_t data
     telemetry->limit_window_ns = renew ? time_ns : telemetry->limit_window_ns;
     telemetry->limit_ns = time_ns;
     widen(&telemetry->limit_Nm, limit_Nm, renew);
-    oracle_judge_limit(oracle, time_ns, oracle->mean_torque_Nm,
-                       fmax(telemetry->limit_Nm.high[0], telemetry->limit_Nm.high[1]));
+    const double mean_Nm = oracle->mean_torque_Nm;
     oracle->mean_torque_Nm = 0.0;
     if (oracle_any_injected(oracle, FAULT_LIMIT_FLIPPED, FAULT_CLOCK_DRIFT)) {
-        return;
+        return; /* by a constant that has changed the limit may be any, also a negative one */
     }
+    oracle_judge_limit(oracle, time_ns, mean_Nm, fmax(telemetry->limit_Nm.high[0], telemetry->limit_Nm.high[1]));
     if (oracle_sets_in_effect(oracle) && time_ns > oracle->applied_ns + SETTLED_NS &&
         limit_Nm > SET_LIMIT_ERROR_MAX * oracle_torque_max_Nm(oracle)) {
         oracle_violate(oracle, "above_limit", time_ns, 3, limit_Nm / oracle_torque_max_Nm(oracle));

@@ -263,7 +263,9 @@ static void approach_reference(const control_parameters_t *parameters, deferred_
     deferred->approaches_reference = deferred->updates_since_near < settling;
 }
 
-/* Of the four samples between two updates of the inertia, which has the turn before the last; rounded down. */
+_Static_assert(DEFERRED_COMMON_PERIODS / DEFERRED_LEARNING_PERIODS == 4, "four samples in the mean torque");
+
+/* Of the samples since the last update of the inertia, which is in the turn before the first; rounded down. */
 static void average_torque(deferred_t *deferred, int32_t torque_q24) {
     const int32_t before_q24 = deferred->turn == DEFERRED_COMMON_PERIODS - 1 ? 0 : deferred->mean_torque_q24;
     deferred->mean_torque_q24 = before_q24 + (torque_q24 >> 2);
