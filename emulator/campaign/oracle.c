@@ -357,7 +357,7 @@ static void look_at_end_of_fault(oracle_t *oracle, uint64_t now_ns, uint8_t befo
 
 void oracle_after_interrupt(oracle_t *oracle, const plant_t *plant, oracle_drive_t drive) {
     const uint8_t before = oracle->drive.state;
-    const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
+    const double stroke_rad = oracle_stroke_rad(plant);
     oracle->turned = oracle->turned || fabs(plant->rotor_angle_rad - oracle->run_angle_rad) > stroke_rad;
     oracle->drive = drive;
     if (drive.state != before) {
@@ -483,12 +483,9 @@ void oracle_on_bus(oracle_t *oracle, const plant_t *plant, uint64_t time_ns, con
         (oracle->meant.request != SENDER_CLEAR || oracle->drive.state == STATE_RUN)) {
         oracle->clear_ns = time_ns; /* in a run it is refused, and so begins after it */
     }
-    if (meaning->request == SENDER_STOP && oracle->meant.request != SENDER_STOP) {
-        oracle->stop_speed_rad_s = plant->speed_rad_s;
-    }
-    if (meaning->request == SENDER_STOP && (oracle->meant.request != SENDER_STOP || after_silence)) {
-        oracle->stop_ns = time_ns;
-    }
+    const bool stop_begins = meaning->request == SENDER_STOP && oracle->meant.request != SENDER_STOP;
+    oracle->stop_speed_rad_s = stop_begins ? plant->speed_rad_s : oracle->stop_speed_rad_s;
+    oracle->stop_ns = stop_begins || after_silence ? time_ns : oracle->stop_ns;
     oracle->withdrawn_ns = meaning->request != SENDER_RUN ? time_ns : oracle->withdrawn_ns;
     if (meaning->torque != oracle->meant.torque || meaning->reference != oracle->meant.reference ||
         meaning->request != oracle->meant.request || after_silence) {

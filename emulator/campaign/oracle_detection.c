@@ -167,8 +167,8 @@ static uint64_t part_ns(const oracle_t *oracle, const plant_t *plant, unsigned p
 }
 
 /* Voltage on a phase that is followed by no current at all, in pulses of more than PULSE_PERIODS: a shorter one the
- * opposite voltage may have ended before a sample. A current that an open diode ends is gone at once. Pulses
- * of a duty near zero do not count: a look in 25 or 50 may meet each of them, and would take 10 ns for 19 us. */
+ * opposite voltage may have ended before a sample. A current that an open diode ends is gone at once. Pulses of
+ * a duty near zero do not count: a look in 25 or 50 may meet each of them, and would take 10 ns for 19 us. */
 static void look_at_phases(oracle_t *oracle, const plant_t *plant) {
     const bool hidden = oracle_any_injected(oracle, FAULT_CURRENT_SENSOR_OPEN, FAULT_DC_LINK_SENSOR_OFFSET) ||
                         oracle->injected[FAULT_DIODE_OPEN] || checks_late(oracle, plant->time_ns / 1000);
@@ -209,7 +209,7 @@ static uint64_t stays_ns(const oracle_t *oracle, oracle_stay_t *stay, const plan
 /* The rotor does not turn although a speed is commanded. */
 static void look_at_rotor(oracle_t *oracle, const plant_t *plant) {
     oracle_detection_t *detection = &oracle->detection;
-    const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
+    const double stroke_rad = oracle_stroke_rad(plant);
     if (fabs(plant->rotor_angle_rad - detection->stroke_rad) > stroke_rad) {
         detection->stroke_ns = plant->time_ns;
         detection->stroke_rad = plant->rotor_angle_rad;

@@ -50,6 +50,10 @@ bool oracle_is_load_sine(const world_event_t *event) {
                                         event->what == BENCH_VARIABLE_LOAD_SINE_AMPLITUDE_COARSE_NM);
 }
 
+double oracle_stroke_rad(const plant_t *plant) {
+    return ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
+}
+
 bool oracle_overhauled(const oracle_t *oracle, double speed) {
     for (unsigned i = 0; i < oracle->world->events; i++) {
         const world_event_t *event = world_begun(oracle->world, i, UINT64_MAX);

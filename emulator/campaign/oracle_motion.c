@@ -238,7 +238,7 @@ void oracle_judge_limit(oracle_t *oracle, uint64_t time_ns, double mean_Nm, doub
 /* The BP-PID of `paper` takes tens of periods to open the outgoing phase. Meanwhile the incoming one keeps the current
  * for the hand-over angle, which further on may alone make more than the reference. */
 static bool hands_over_long(const oracle_t *oracle, const plant_t *plant) {
-    const double stroke_rad = ORACLE_TWO_PI / (plant->machine->rotor_poles * plant->machine->phases);
+    const double stroke_rad = oracle_stroke_rad(plant);
     const double period_rad = fabs(plant->speed_rad_s) * (double)oracle->period_ns * 1e-9;
     return oracle->world->controller == 1 && HAND_OVER_PERIODS * period_rad > stroke_rad;
 }

@@ -63,6 +63,9 @@ bool oracle_other_sender(const oracle_t *oracle, bool hostile, uint64_t time_us)
 bool oracle_is_load(const world_event_t *event);
 bool oracle_is_load_sine(const world_event_t *event);
 
+/* Rotation from a phase to the next one. */
+double oracle_stroke_rad(const plant_t *plant);
+
 /* A load drives the machine in the direction of a speed at any time. */
 bool oracle_overhauled(const oracle_t *oracle, double speed);
 

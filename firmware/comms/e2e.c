@@ -68,10 +68,7 @@ e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t
         accept(receiver, bytes);
         return E2E_ACCEPTED;
     }
-    if (counter == receiver->counter) {
-        return E2E_WRONG_SEQUENCE;
-    }
-    if (receiver->locked) {
+    if (counter == receiver->counter || receiver->locked) {
         return E2E_WRONG_SEQUENCE;
     }
     const bool continues = receiver->candidate_frames > 0 && in_sequence(receiver->candidate_counter, counter);

@@ -51,7 +51,7 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
     if (before == DRIVE_STATE_RUN) {
         end_run(parameters, state);
     } else if (state_machine->state != before) {
-        if (state_machine->state == DRIVE_STATE_READY && before == DRIVE_STATE_FAULT) {
+        if (before == DRIVE_STATE_FAULT) {
             observe_forget_load(state); /* angle and speed of a rotor that may be turning are kept */
         }
     } else if (before == DRIVE_STATE_FAULT && state_machine->fault_free_ticks == 1) {
