@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from salient import paths
+from salient.bench.programs import executable
 from salient.cli import make_parser
-from salient.errors import RunFailed
+from salient.errors import RunFailed, UsageError, exit_code
 from salient.experiments import fault_table
 from salient.experiments.campaign import canaries, command, names, report, same_bits
 from salient.experiments.campaign.cluster import compare
@@ -235,6 +237,19 @@ def test_a_seed_has_the_same_bits_twice_on_the_bench_and_on_a_target(tmp_path: P
     results = read_results(tmp_path)
     assert len({result["hash"] for result in results.values()}) == 2
     assert not same_bits.equal({**next(iter(results.values())), "on_target": "0"})
+    note = json.loads((tmp_path / same_bits.SUMMARY).read_text(encoding="utf-8"))
+    assert (note["first"], note["seeds"], note["target"], note["different"]) == (401, 2, "cortex-m4", [])
+
+
+def test_a_measurement_names_the_command_that_builds_what_it_misses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                                                    capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(paths, "BUILD", BUILD / "none")
+    assert exit_code(lambda: same_bits.main([str(tmp_path), "1", "1"])) == 2
+    assert capsys.readouterr().err == ("salient: build/none/host/bin/salient_host is not built; any tools/salient "
+                                       "command builds it\n")
+    for build in ("cortex-m4", "rv32"):
+        with pytest.raises(UsageError, match=f"is not built; any .* command with --target {build} builds it"):
+            executable(build)
 
 
 def test_the_text_of_every_canary_is_in_its_file_once() -> None:
@@ -301,6 +316,9 @@ def test_a_branch_at_one_place_is_the_one_among_others() -> None:
 
 
 def test_the_pages_show_the_committed_results() -> None:
+    results = read_results(report.RESULTS / "same_bits").values()
+    note = json.loads((report.RESULTS / "same_bits" / same_bits.SUMMARY).read_text(encoding="utf-8"))
+    assert note["seeds"] == len(results) == sum(map(same_bits.equal, results)) + len(note["different"])
     assert report.page() == report.PAGE.read_text(encoding="utf-8")
     page = fault_table.PAGE.read_text(encoding="utf-8")
     assert fault_table.with_branches(page) == page

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from salient.cli import make_parser
 from salient.config import OPTIONS, BenchConfig
-from salient.errors import RunFailed, UsageError
+from salient.errors import UsageError, exit_code
 from salient.paths import BUILD, SCENARIOS, make_folder
 
 
@@ -19,15 +19,7 @@ def main() -> int:
     if getattr(options, "can", None) == "auto":
         options.can = _automatic_can()
     try:
-        return _COMMANDS[options.command](options)
-    except UsageError as error:
-        print(f"salient: {error}", file=sys.stderr)
-        return 2
-    except RunFailed as error:
-        print(f"salient: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
+        return exit_code(lambda: _COMMANDS[options.command](options))
     except BrokenPipeError:
         # The reader of the output has closed it, as head does.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,5 +1,8 @@
 """Mistakes of the user, as opposed to failures."""
 
+import sys
+from collections.abc import Callable
+
 
 class UsageError(Exception):
     """A mistake of the caller; the text is one line that names the mistake and the values allowed. Exit code 2."""
@@ -19,6 +22,21 @@ def shown(value: object) -> str:
 
 class RunFailed(Exception):
     """The thing tested failed; one line. Exit code 1."""
+
+
+def exit_code(command: Callable[[], int]) -> int:
+    """Runs a command; returns its exit code, and after one line for what it raises 1 (RunFailed), 2 (UsageError) or 130
+    (Ctrl-C)."""
+    try:
+        return command()
+    except UsageError as error:
+        print(f"salient: {error}", file=sys.stderr)
+        return 2
+    except RunFailed as error:
+        print(f"salient: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
 
 
 def cannot_write(where: str, error: OSError) -> UsageError:

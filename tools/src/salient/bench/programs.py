@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from salient.builder import run_commands
-from salient.config import TARGET_BUILDS, WASM_BUILD, BenchConfig
+from salient.config import TARGET_BUILDS, TARGETS, WASM_BUILD, BenchConfig
 from salient.elf import ElfImage
 from salient.errors import RunFailed, UsageError
 from salient.machine.cache import content_key, machine_image
@@ -23,9 +23,8 @@ from salient.machine.path import machine_path
 from salient.paths import BUILD, IS_WHEEL, MACHINES, ROOT, program
 
 _BUILDERS = {"host": "any tools/salient command",
-             "debug": "cmake --preset debug && cmake --build --preset debug"}
-_TESTS = "tools/salient test"
-_REFERENCE = "salient_reference"
+             "debug": "cmake --preset debug && cmake --build --preset debug",
+             **{build: f"any tools/salient command with --target {build}" for build in TARGETS[1:]}}
 
 
 class EmulatorError(RunFailed):
@@ -38,15 +37,15 @@ def executable(build: str = "host") -> Path:
     if IS_WHEEL and build != "host":
         raise UsageError(f"--target {build}: only in a clone of the repository, where it is built; must be host")
     if build in TARGET_BUILDS:
-        return _built("host", "salient_target")
+        return _built("host", "salient_target", _builder(build))
     if build == WASM_BUILD:
-        return _built(build, "salient.wasm")
-    return _built(build, "salient_host")
+        return _built(build, "salient.wasm", _builder(build))
+    return _built(build, "salient_host", _builder(build))
 
 
 def reference_executable() -> Path:
     """The program that runs a machine with the reference model of the controller. UsageError: it is not built."""
-    return _built("host", _REFERENCE)
+    return _built("host", "salient_reference", "tools/salient compare")
 
 
 def image(machine: str, build: str) -> Path:
@@ -55,7 +54,7 @@ def image(machine: str, build: str) -> Path:
     machine_image(machine)  # checks the file
     path = machine_path(machine)
     if path.parent == MACHINES:
-        return _built(build, f"salient_{path.stem}.elf")
+        return _built(build, f"salient_{path.stem}.elf", _builder(build))
     return _build_custom(path, content_key(path), build)
 
 
@@ -90,10 +89,13 @@ def command_line(config: BenchConfig) -> list[str]:
     return [*line, *arguments]
 
 
-def _built(build: str, name: str) -> Path:
+def _builder(build: str) -> str:
+    return _BUILDERS.get(build, "tools/salient test")
+
+
+def _built(build: str, name: str, builder: str) -> Path:
     path = program(build, name)
     if not path.exists():
-        builder = "tools/salient compare" if name == _REFERENCE else _BUILDERS.get(build, _TESTS)
         raise UsageError(f"{path.relative_to(ROOT)} is not built; {builder} builds it")
     return path
 

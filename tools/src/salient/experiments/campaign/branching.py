@@ -15,11 +15,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from salient.errors import exit_code
 from salient.experiments.campaign import names
 from salient.experiments.campaign.arguments import count
 from salient.experiments.campaign.arguments import parser as parser_of
-from salient.experiments.campaign.command import commit
-from salient.experiments.campaign.runner import branches, processor_s
+from salient.experiments.campaign.runner import branches, commit, processor_s
 
 SALIENT = 2
 POINTS = {"150": (SALIENT, 150, 8, 0, 2000), "1500": (SALIENT, 1500, 6, 0, 200), "start": (SALIENT, 0, 0, 0, 360)}
@@ -141,4 +141,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

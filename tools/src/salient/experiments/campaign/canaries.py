@@ -21,11 +21,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from salient.errors import RunFailed
+from salient.errors import RunFailed, exit_code
 from salient.experiments.campaign.arguments import count
 from salient.experiments.campaign.arguments import parser as parser_of
 from salient.experiments.campaign.failure import classes, save
-from salient.experiments.campaign.runner import Programs, processor_s, run_world, run_worlds
+from salient.experiments.campaign.runner import Programs, commit, processor_s, program, run_world, run_worlds
 from salient.paths import BUILD, ROOT
 
 FILE = ROOT / "tests" / "campaign" / "canaries.toml"
@@ -62,6 +62,7 @@ def build(number: int) -> Programs:
     """The programs with a bug: its file compiled, and they linked, as the build does it."""
     if not 1 <= number <= len(canaries()):
         raise RunFailed(f"{FILE.relative_to(ROOT)}: no canary {number}; has 1 to {len(canaries())}")
+    program()  # whose objects are linked
     canary = canaries()[number - 1]
     folder = BUILD / "campaign" / "canaries" / str(number)
     folder.mkdir(parents=True, exist_ok=True)
@@ -126,7 +127,7 @@ def _replays(folder: Path, violation: str) -> bool:
 
 def measure(number: int, out: Path) -> dict[str, Any]:
     """Hunts a canary, shrinks and replays it; out: parent of its folder."""
-    note: dict[str, Any] = {"number": number, "name": canaries()[number - 1].name}
+    note: dict[str, Any] = {"number": number, "name": canaries()[number - 1].name, "commit": commit()}
     programs = build(number)
     found = hunt(programs)
     if found is None:
@@ -171,4 +172,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -18,9 +18,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from salient.errors import exit_code
 from salient.experiments.campaign.arguments import count
 from salient.experiments.campaign.arguments import parser as parser_of
-from salient.experiments.campaign.command import commit
+from salient.experiments.campaign.runner import commit
 from salient.experiments.local_cluster import cluster
 
 _PARTS = 20
@@ -72,4 +73,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

@@ -6,7 +6,6 @@ import argparse
 import hashlib
 import json
 import re
-import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Collection, Iterable
@@ -16,9 +15,9 @@ from typing import Any
 from salient.errors import UsageError
 from salient.experiments.campaign import canaries, names
 from salient.experiments.campaign.failure import Failure, load, replay, save
-from salient.experiments.campaign.runner import ALL_EVENTS, Result, digest, processor_s, serve, world
+from salient.experiments.campaign.runner import ALL_EVENTS, Result, commit, digest, processor_s, serve, world
 from salient.experiments.tasks import Task, read_results, run
-from salient.paths import ROOT, make_folder
+from salient.paths import make_folder
 from salient.progress import Progress
 
 _SHOWN_MAX = 8
@@ -118,16 +117,6 @@ def report(note: dict[str, Any]) -> list[str]:
         if len(left) > _SHOWN_MAX:
             lines.append(f"  and {len(left) - _SHOWN_MAX} more, in summary.json")
     return lines
-
-
-def commit() -> str:
-    """That of the sources, with a plus when they differ from it."""
-    def git(*arguments: str) -> str:
-        done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
-        return done.stdout.strip() if done.returncode == 0 else ""
-
-    known = git("rev-parse", "--short=10", "HEAD")
-    return f"{known}{'+' if git('status', '--porcelain', '--untracked-files=no') else ''}" if known else "unknown"
 
 
 def run_replay(options: argparse.Namespace) -> int:

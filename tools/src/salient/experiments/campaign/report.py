@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from salient.experiments import fault_table
 from salient.experiments.campaign import branching, same_bits
-from salient.experiments.tasks import read_results
 from salient.paths import ROOT
 
 PAGE = ROOT / "tools" / "README.md"
@@ -33,6 +33,10 @@ def _note(name: str) -> Any:
 
 def _seeds(note: Note) -> str:
     return f"{note['first']} to {note['first'] + note['seeds'] - 1}"
+
+
+def _commits(notes: Iterable[Note]) -> str:
+    return ", ".join(sorted({note["commit"] for note in notes}))
 
 
 def _violations(note: Note) -> str:
@@ -71,13 +75,12 @@ def _branches() -> tuple[str, str, str]:
     longest = max((row for lines in rows.values() for row in lines), key=lambda row: int(row["longest_us"]))
     unanswered = sorted({branching.label(row) for lines in rows.values() for row in lines
                          if row["detected"] < row["branches"]})
-    commits = ", ".join(sorted({note["commit"] for note in notes.values()}))
     found = [row for lines in rows.values() for row in lines if row["violations"]]
     listed = "; ".join(sorted({f"`{branching.label(row)}`" for row in found}))
     return ("every fault at every control tick of an electrical period at 150 r/min with 8 N m and at 1500 r/min with "
             "6 N m, and at the begin of a start from 360 positions",
-            f"{of_all['branches']:,} branches at {commits}; {of_all['virtual_s'] / 3600:.2f} h of virtual time; "
-            f"{of_all['branches'] / processor_s:.0f} branches a processor second; longest reaction "
+            f"{of_all['branches']:,} branches at {_commits(notes.values())}; {of_all['virtual_s'] / 3600:.2f} h of "
+            f"virtual time; {of_all['branches'] / processor_s:.0f} branches a processor second; longest reaction "
             f"{longest['longest_us'] / 1000:.0f} ms (`{branching.label(longest)}`), each in "
             f"[FAULTS.md](../firmware/FAULTS.md#{branching.ANCHOR}); not always answered: "
             f"{', '.join(f'`{label}`' for label in unanswered)}; **{of_all['violations']:,} violations**"
@@ -89,8 +92,8 @@ def _canaries() -> tuple[str, str, str]:
     found = [note for note in notes if "seed" in note]
     seconds = sorted(note["processor_s"] for note in found)
     return ("planted bugs",
-            f"**{len(found)} of {len(notes)} found** in {seconds[0]:.1f} to {seconds[-1]:.1f} processor seconds each, "
-            f"{seconds[len(seconds) // 2]:.1f} in the middle; shrunk to at most "
+            f"**{len(found)} of {len(notes)} found** at {_commits(notes)} in {seconds[0]:.1f} to {seconds[-1]:.1f} "
+            f"processor seconds each, {seconds[len(seconds) // 2]:.1f} in the middle; shrunk to at most "
             f"{max(len(note['events']) for note in found)} events in at most "
             f"{max(note['shrinking_s'] for note in found):.1f} processor seconds; "
             f"{sum(note['replays'] for note in found)} replayed with equal bits, log and plots; each in "
@@ -106,11 +109,10 @@ def _cluster() -> tuple[str, str, str]:
 
 
 def _bits() -> tuple[str, str, str]:
-    results = list(read_results(RESULTS / "same_bits").values())
-    good = sum(map(same_bits.equal, results))
-    targets = ", ".join(sorted({result["target"] for result in results}))
-    return ("equal bits", f"{good} of {len(results)} seeds: twice on the host, on the bench and on {targets} in QEMU",
-            f"`{_MODULE}.same_bits DIR`")
+    note = _note(f"same_bits/{same_bits.SUMMARY}")
+    good = note["seeds"] - len(note["different"])
+    return ("equal bits", f"{good} of {note['seeds']} seeds at {note['commit']}: twice on the host, on the bench and "
+            f"on {note['target']} in QEMU", f"`{_MODULE}.same_bits DIR`")
 
 
 def table() -> str:
@@ -158,8 +160,8 @@ def plot(path: Path) -> None:
     faults = _note("shards.json")
     violations = sum(entry["count"] for entry in faults["violations"].values())
     without = f"{faults['seeds']:,} seeds at {faults['commit']} without them: {violations} violations"
-    right.set_title(f"{len(notes)} of {len(_note('canaries.json'))} planted bugs found, by seeds from 1 on\n{without}",
-                    fontsize="medium")
+    right.set_title(f"{len(notes)} of {len(_note('canaries.json'))} planted bugs found at {_commits(notes)}, by seeds "
+                    f"from 1 on\n{without}", fontsize="medium")
     figure.suptitle("Campaigns by seed: an emulated drive, default parameters")
     figure.savefig(path, dpi=80)
 

@@ -48,6 +48,16 @@ def digest() -> str:
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()[:16]
 
 
+def commit() -> str:
+    """That of the sources, with a plus when they differ from it."""
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    known = git("rev-parse", "--short=10", "HEAD")
+    return f"{known}{'+' if git('status', '--porcelain', '--untracked-files=no') else ''}" if known else "unknown"
+
+
 def command(*options: object, programs: Programs | None = None) -> list[str]:
     """A command line of the program."""
     executable = programs.campaign if programs else program()

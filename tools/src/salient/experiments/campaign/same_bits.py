@@ -3,19 +3,25 @@
     python -m salient.experiments.campaign.same_bits DIR [FIRST [SEEDS [TARGET]]]
 
 from seed FIRST (1), SEEDS (100) of them, on TARGET (cortex-m4): compares the hashes over all frames on the bus and the
-true state. Results are JSON lines in DIR; those that it has are not run again. Exit code 1 when any differ.
+true state. Results are JSON lines in DIR; those that it has are not run again. Writes DIR/summary.json. Exit code 1
+when any differ.
 """
 
 from __future__ import annotations
 
+import json
 import sys
+from pathlib import Path
 from typing import Any
 
+from salient.errors import exit_code
 from salient.experiments.campaign.arguments import count
 from salient.experiments.campaign.arguments import parser as parser_of
 from salient.experiments.campaign.failure import replay
-from salient.experiments.campaign.runner import digest, run_world
+from salient.experiments.campaign.runner import commit, digest, run_world
 from salient.experiments.tasks import Task, run
+
+SUMMARY = "summary.json"
 
 
 def hashes(task: tuple[int, str]) -> dict[str, Any]:
@@ -43,13 +49,17 @@ def main(arguments: list[str]) -> int:
     first, seeds, target = options.first, options.seeds, options.target
     tasks = [Task(f"{target} {seed} {digest()}", (seed, target)) for seed in range(first, first + seeds)]
     results = [result for _, result in run(tasks, hashes, options.out)]
-    different = [result["seed"] for result in results if not equal(result)]
+    different = sorted(result["seed"] for result in results if not equal(result))
+    note = {"first": first, "seeds": seeds, "target": target, "commit": commit(), "program_and_machines": digest(),
+            "different": different}
+    out: Path = options.out
+    (out / SUMMARY).write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
     print(f"seeds {first} to {first + seeds - 1}: run twice on the host, on the bench and on {target}: "
-          f"{len(results) - len(different)} of {len(results)} with equal bits")
+          f"{seeds - len(different)} of {seeds} with equal bits")
     if different:
         print(f"different: {', '.join(map(str, different))}")
     return 1 if different else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))
