@@ -21,7 +21,7 @@ from salient.experiments.campaign.failure import classes, replay
 from salient.experiments.campaign.machines import files
 from salient.experiments.campaign.runner import Programs, branches, program, run_world, serve, world
 from salient.experiments.tasks import read_results
-from salient.paths import BUILD
+from salient.paths import BUILD, ROOT
 
 
 def salient(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -82,6 +82,11 @@ def test_a_seed_that_breaks_two_rules_leaves_a_folder_of_each(tmp_path: Path, mo
 def test_a_worker_with_another_build_ends_the_campaign() -> None:
     with pytest.raises(RunFailed, match="a worker has another build of the drive than this computer"):
         serve((1, False, "digest of another build"))
+
+
+def test_the_programs_are_the_same_bytes_wherever_the_clone_is() -> None:
+    for path in (program(), executable()):
+        assert b"emulator/rig" in path.read_bytes() and str(ROOT).encode() not in path.read_bytes()
 
 
 def test_leaving_an_event_out_moves_no_other() -> None:
