@@ -22,7 +22,7 @@ def running(bench: Bench, speed_rpm: float) -> None:
 
 
 @pytest.mark.parametrize("inertia", [0.3, 1.0, 4.0])
-@pytest.mark.parametrize("speed_rpm", [600, 1500, 2500])
+@pytest.mark.parametrize("speed_rpm", [600, 1500, 2500, -1500])
 @pytest.mark.parametrize("target", ["standstill", "reverse"])
 def test_braking_without_a_chopper_stays_below_the_trip(make_bench, inertia, speed_rpm, target):
     bench = make_bench(machine="finite_element", controller="salient")
@@ -35,14 +35,14 @@ def test_braking_without_a_chopper_stays_below_the_trip(make_bench, inertia, spe
     voltage = bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].between(before_s, bench.time_s + 1e-9).value
     assert np.max(voltage) < 0.999 * OVER_VOLTAGE_V
     assert np.max(voltage) > 241
-    assert bench.truth["speed_rpm"].last < 0.995 * speed_rpm, "friction and losses brake"
+    assert bench.truth["speed_rpm"].last / speed_rpm < 0.995, "friction and losses brake"
 
 
-@pytest.mark.parametrize("torque_Nm", [-4, -16])
-def test_a_commanded_braking_torque_falls_as_the_link_fills(make_bench, torque_Nm):
+@pytest.mark.parametrize(("speed_rpm", "torque_Nm"), [(1500, -4), (1500, -16), (-1500, 16)])
+def test_a_commanded_braking_torque_falls_as_the_link_fills(make_bench, speed_rpm, torque_Nm):
     """The dynamometer holds the speed, so that the energy does not end."""
     bench = make_bench(machine="finite_element", controller="salient")
-    bench.rig.held_speed_rpm = 1500
+    bench.rig.held_speed_rpm = speed_rpm
     bench.run_for(0.25)
     bench.fault("chopper_open")
     bench.drive.torque_reference_Nm = torque_Nm
@@ -50,7 +50,7 @@ def test_a_commanded_braking_torque_falls_as_the_link_fills(make_bench, torque_N
     assert (bench.drive.state, bench.drive.fault) == ("run", "none")
     voltage = bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"]
     assert 0.97 * OVER_VOLTAGE_V < max(voltage.value) < 0.999 * OVER_VOLTAGE_V
-    assert bench.telemetry["torque_reference_Nm"].last > 0.75 * torque_Nm
+    assert bench.telemetry["torque_reference_Nm"].last / torque_Nm < 0.75
 
 
 @pytest.mark.parametrize("supply_V", [265, 290])

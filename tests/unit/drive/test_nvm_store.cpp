@@ -263,6 +263,25 @@ TEST_F(NvmStore, a_parameter_that_changes_while_the_set_is_written_gives_the_new
     }
 }
 
+TEST_F(NvmStore, each_save_of_one_start_is_stored) {
+    for (uint32_t number = 1; number <= 3; number++) {
+        parameters_t set = drive.parameters;
+        for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+            set.values[i] = set_value(&drive.parameters, number, i);
+        }
+        parameters_apply(&drive.parameters, set.values);
+        parameter_store_save(&drive.store);
+        for (unsigned i = 0; i < 2 * SET_WORDS; i++) {
+            nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 1, true);
+        }
+        EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED);
+        memory_t copy = memory;
+        started_t next;
+        start_drive(&next, &copy);
+        EXPECT_TRUE(has_set(&next, number)) << number;
+    }
+}
+
 TEST_F(NvmStore, a_word_that_cannot_be_programmed_is_passed_over) {
     memory.hal.nvm.word[PARAMETER_PAGE][5] = 0; // in the middle of the first place
     memory.hal.nvm.word[PARAMETER_PAGE][SET_WORDS + 5] = 0;
