@@ -37,11 +37,12 @@ inertia_settings_t settings(unsigned encoder_bits = 17, uint32_t rate_hz = 40000
 // Torque and load in N m over time in s.
 using torque_t = std::function<double(double)>;
 
-// Shift after half a second of a shaft of `gain` times the inertia J0, whose speed has settled after settled_s.
+// Shift after half a second of a shaft of `gain` times the inertia J0, whose speed has settled after settled_s. last:
+// state of an earlier run, and after this one.
 int32_t shift_after(const inertia_settings_t &of, double gain, const torque_t &torque, const torque_t &load,
                     inertia_t *last = nullptr, double settled_s = 1.0) {
     const inertia_parameters_t parameters = inertia_configure(&of);
-    inertia_t inertia{};
+    inertia_t inertia = last != nullptr ? *last : inertia_t{};
     const double step_s = double(of.periods_per_update) / of.control_rate_hz;
     const double counts = std::ldexp(1.0, int(of.encoder_bits));
     double rev = 0.1, rev_s = 0.0;
@@ -168,6 +169,19 @@ TEST(Inertia, a_restart_keeps_the_shift_unless_the_parameters_have_another_inert
     EXPECT_EQ(inertia.shift, -2);
     inertia_restart(&others, &MODEL, &inertia, 5);
     EXPECT_EQ(inertia.shift, 0);
+}
+
+TEST(Inertia, a_run_identifies_the_same_whatever_turned_before) {
+    const torque_t at_once = [](double t) { return t < 0.02 ? TORQUE_MAX : 8.0; };
+    for (const double gain : {0.2, 0.7, 1.0, 1.4, 5.0}) {
+        inertia_t before{};
+        shift_after(
+            settings(), 3.0, constant_8, [](double) { return 0.0; }, &before);
+        ASSERT_EQ(before.shift, 0);
+        EXPECT_EQ(shift_after(settings(), gain, at_once, constant_8, &before),
+                  shift_after(settings(), gain, at_once, constant_8))
+            << gain;
+    }
 }
 
 TEST(Inertia, the_laws_follow_the_shift_and_saturate) {

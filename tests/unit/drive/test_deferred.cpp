@@ -515,6 +515,19 @@ TEST_F(Deferred, the_inertia_is_identified_from_the_mean_torque_since_its_last_u
     }
 }
 
+TEST_F(Deferred, tuned_parameters_are_in_effect_at_once_with_the_identified_inertia) {
+    start();
+    state.deferred.inertia.shift = -1;
+    deferred_tune(&parameters, &state);
+    const int32_t gain_q24 = state.deferred.speed_smc.gain_q24, rate_q8 = state.deferred.inertia.laws.rate_q8;
+    EXPECT_NEAR(double(gain_q24) / parameters.inertia.reaching_gain_q24, 2.0, 1e-6);
+    parameters.inertia.reaching_gain_q24 /= 2;
+    parameters.inertia.rate_q8 /= 4;
+    deferred_tune(&parameters, &state);
+    EXPECT_NEAR(double(gain_q24) / state.deferred.speed_smc.gain_q24, 2.0, 1e-6);
+    EXPECT_NEAR(double(rate_q8) / state.deferred.inertia.laws.rate_q8, 4.0, 1e-2);
+}
+
 TEST_F(Deferred, counts_of_an_encoder_of_13_bits_are_never_slow) {
     for (const auto &[bits, slow] : {std::pair{12u, true}, std::pair{13u, false}}) {
         configure(DRIVE_CONTROLLER_SALIENT);

@@ -30,7 +30,8 @@ class PhaseBalance : public testing::Test {
         uint32_t failed = 0;
         for (uint32_t k = 0; k < 8 * periods; k++) {
             for (unsigned phase = 0; phase < sample.phases; phase++) {
-                sample.known[phase] = k % periods * sample.phases / periods == phase && phase != silent;
+                const bool conducts = k % periods * sample.phases / periods == phase && phase != silent;
+                sample.known[phase] = conducts && (phase != brief || k % periods % 16 == 0);
                 sample.table_q29[phase] = TABLE_Q29;
                 sample.flux_q29[phase] = int32_t(TABLE_Q29 * ratio[phase]);
             }
@@ -42,6 +43,7 @@ class PhaseBalance : public testing::Test {
     phase_balance_t balance{};
     phase_balance_sample_t sample{};
     unsigned silent = HAL_PHASES_MAX; // phase without current
+    unsigned brief = HAL_PHASES_MAX;  // phase that conducts for a sixteenth of its third
     double ratio[HAL_PHASES_MAX] = {1.0, 1.0, 1.0, 1.0};
 };
 
@@ -94,6 +96,16 @@ TEST_F(PhaseBalance, nothing_is_judged_while_a_phase_does_not_conduct) {
     ratio[1] = 1.5;
     silent = 2;
     EXPECT_EQ(window(), 0u);
+}
+
+TEST_F(PhaseBalance, a_phase_that_has_hardly_conducted_is_not_judged_whatever_it_did_in_the_window_before) {
+    EXPECT_EQ(window(), 0u);
+    ratio[1] = 1.5;
+    brief = 1;
+    EXPECT_EQ(window(), 0u);
+    EXPECT_EQ(window(), 0u);
+    brief = HAL_PHASES_MAX;
+    EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
 }
 
 TEST_F(PhaseBalance, without_a_lost_phase_the_others_are_judged_if_there_are_three) {
