@@ -95,7 +95,7 @@ MEASUREMENT_DEPENDENCIES = (
     Dependency("valgrind", "instruction counts", _tool("valgrind")),
 )
 
-WITHOUT_BUILD = ("log", "monitor", "view", "machine")
+WITHOUT_BUILD = ("log", "monitor", "view", "scope", "machine")
 """Commands that need no drive."""
 
 

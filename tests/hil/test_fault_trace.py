@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from salient.bench import scope
 from salient.bench.bench import Bench
 from salient.bench.drive import DriveError
+from salient.bench.emulator import EmulatorProcess
+from salient.bench.session import Session
+from salient.cli import make_parser
+from salient.config import BenchConfig
+from salient.errors import RunFailed
 
 
 def fault_at(bench: Bench, after_s: float = 0.1) -> float:
@@ -99,3 +105,27 @@ def test_a_fault_right_after_the_start_has_rows_of_zeros_before_the_start(bench)
     assert known.sum() == pytest.approx(52, abs=1), "1.3 ms"
     assert known[12:].sum() == known.sum()
     assert not trace.upper_duty.any()
+
+
+def test_scope_writes_the_buffer_as_table_and_plot_and_says_when_there_is_none(tmp_path, capsys):
+    can, out = f"unix:{tmp_path}/bus.sock", tmp_path / "out"
+    arguments = make_parser().parse_args(["scope", "--can", can, "--out", str(out)])
+    with EmulatorProcess(BenchConfig(pace="x0.2"), can):
+        with pytest.raises(RunFailed, match="keeps no record"):
+            scope.run(arguments)
+        assert not list(out.iterdir())
+        with Session(can, lockstep=False) as session:
+            session.drive.speed_reference_rpm = 300
+            session.run_for(0.05)
+            session.rig.sto_1 = 1
+            session.run_for(0.01)
+            trace = session.drive.fault_trace()
+        assert scope.run(arguments) == 0
+    assert capsys.readouterr().out.startswith("sto in state run: 64 control periods: ")
+    table = np.genfromtxt(out / scope.TABLE, delimiter=",", names=True)
+    assert table.dtype.names == tuple(scope.columns(trace))
+    assert {"time_s", "current_a_A", "rotor_angle_deg", "upper_duty_c"} <= set(table.dtype.names)
+    for name, values in scope.columns(trace).items():
+        assert table[name] == pytest.approx(values)
+    assert np.max(table["current_a_A"]) > 1 or np.max(table["current_b_A"]) > 1
+    assert (out / scope.PLOT).stat().st_size > 10_000

@@ -40,7 +40,7 @@ def assert_usage_error(result, *expected_texts: str) -> None:
     [
         ([], ["COMMAND"]),
         (["fly"], ["fly", "must be one of demo, test, sim, run, log, monitor, view, tab, benchmark, compare, sweep, "
-                          "machine, pil, campaign, replay, wheel, parameters"]),
+                          "machine, pil, campaign, replay, wheel, scope, parameters"]),
         (["sim", "--pcae", "free"], ["unrecognised argument --pcae"]),
         (["sim", "--pace", "fast"], ["--pace fast", "lockstep, realtime, free or xN"]),
         (["sim", "--controller", "pid"], ["--controller pid", "traditional, paper or salient"]),

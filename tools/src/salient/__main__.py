@@ -120,6 +120,12 @@ def _tab(options: argparse.Namespace) -> int:
     return run(options.out, options.machine)
 
 
+def _scope(options: argparse.Namespace) -> int:
+    from salient.bench.scope import run
+
+    return run(options)
+
+
 def _parameters(options: argparse.Namespace) -> int:
     from salient.bench.parameter_file import run
 
@@ -185,6 +191,7 @@ _COMMANDS = {
     "replay": _replay,
     "view": _view,
     "tab": _tab,
+    "scope": _scope,
     "parameters": _parameters,
     "benchmark": _benchmark,
     "compare": _compare,

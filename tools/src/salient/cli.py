@@ -186,6 +186,14 @@ def make_parser() -> argparse.ArgumentParser:
     wheel.add_argument("--out", type=Path, default=Path("out/wheel"), metavar="DIR",
                        help="folder (default out/wheel)")
 
+    scope = command("scope", "the control periods before the last fault of a running drive, from its buffer: table and "
+                    "plot")
+    _add_can(scope)
+    scope.add_argument("--out", type=Path, default=Path("out/scope"), metavar="DIR",
+                       help="folder (default out/scope)")
+    _add_machine(scope)
+    _add_node(scope)
+
     parameters = command("parameters", "parameters and fault log of a running drive")
     actions = parameters.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
     for name, text in (("save", "write the parameters to a file"),

@@ -20,14 +20,14 @@ from salient.bench.session import Session
 from salient.errors import UsageError, shown
 from salient.toml_file import TextFileError, read_toml
 
-_SILENCE_MAX_S = 5.0
+SILENCE_MAX_S = 5.0
 """A drive sends at least every 0.1 s of its time; an emulated one may be slow."""
 
 
 def run(options: argparse.Namespace) -> int:
     """The action of a command line; its exit code."""
     with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
-                 silence_max_s=_SILENCE_MAX_S) as session:
+                 silence_max_s=SILENCE_MAX_S) as session:
         match options.action:
             case "save":
                 return save(session, options.file)

@@ -1,0 +1,100 @@
+"""The drive's triggered buffer, the control periods up to the one that latched a fault, as table and plot:
+`tools/salient scope`. The drive keeps them from the fault to the next run."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from salient.bench.drive import DriveError, FaultTrace
+from salient.bench.failure import COLOURS
+from salient.bench.parameter_file import SILENCE_MAX_S
+from salient.bench.session import Session
+from salient.errors import RunFailed
+from salient.paths import make_folder
+
+TABLE, PLOT = "scope.csv", "scope.png"
+_MS_PER_S, _PERCENT = 1000.0, 100.0
+
+
+def run(options: argparse.Namespace) -> int:
+    """Reads the buffer of a running drive into a folder; returns the exit code."""
+    make_folder(options.out, [TABLE, PLOT])
+    with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
+                 silence_max_s=SILENCE_MAX_S) as session:
+        try:
+            trace = session.drive.fault_trace()
+        except DriveError as error:
+            if "no_such_entry" not in str(error):
+                raise
+            raise RunFailed("the drive keeps no record: it has had no fault, or has run since; the log of faults is "
+                            "read by parameters faults") from None
+        log = session.drive.fault_log.read()
+    title = f"{log[-1].fault} in state {log[-1].state}" if log else "fault"
+    write_table(trace, options.out / TABLE)
+    plot(trace, options.out / PLOT, title)
+    print(f"{title}: {len(trace.time_s)} control periods: {options.out / TABLE}, {options.out / PLOT}")
+    return 0
+
+
+def columns(trace: FaultTrace) -> dict[str, np.ndarray]:
+    """A column for each quantity, of phases one for each, by names with their units."""
+    found: dict[str, np.ndarray] = {}
+    for name, values in vars(trace).items():
+        if values.ndim == 1:
+            found[name] = values
+            continue
+        quantity, _, unit = name.partition("_")
+        for phase, of_phase in zip("abcd", values.T, strict=False):
+            found[f"{quantity}_{phase}_A" if unit == "A" else f"{name}_{phase}"] = of_phase
+    return found
+
+
+def write_table(trace: FaultTrace, path: Path) -> None:
+    """Comma-separated values, the last row that of the fault."""
+    of = columns(trace)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(of)
+        writer.writerows([f"{value:.9g}" for value in row] for row in zip(*of.values(), strict=True))
+
+
+def plot(trace: FaultTrace, path: Path, title: str) -> None:
+    """Currents, torque reference and speed, voltage and the duties of both switches of each phase over the time."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    phases = trace.current_A.shape[1]
+    axes = figure.subplots(4 + phases, 1, sharex=True, height_ratios=[2.5, 1.5, 1.5, 1.5, *[1] * phases])
+    time_ms = trace.time_s * _MS_PER_S
+    for phase in range(phases):
+        label = f"phase {'abcd'[phase]}"
+        axes[0].plot(time_ms, trace.current_A[:, phase], color=COLOURS[phase], label=label)
+        duties = axes[4 + phase]
+        duties.step(time_ms, _PERCENT * trace.upper_duty[:, phase], where="post", color=COLOURS[phase], label="upper")
+        duties.step(time_ms, _PERCENT * trace.lower_duty[:, phase], where="post", color=COLOURS[phase],
+                    linestyle="dotted", label="lower")
+        _label(duties, f"duty {'abcd'[phase]}, %")
+        duties.set_ylim(-5, 105)
+        duties.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
+    axes[0].legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
+    for place, name, values in ((0, "current, A", None), (1, "torque\nreference, N m", trace.torque_reference_Nm),
+                                (2, "speed, r/min", trace.speed_rpm), (3, "DC link, V", trace.bus_voltage_V)):
+        if values is not None:
+            axes[place].plot(time_ms, values, color=COLOURS[2])
+        _label(axes[place], name)
+    axes[-1].set_xlim(time_ms[0], time_ms[-1] - time_ms[0] * 0.02)
+    axes[-1].set_xlabel("time before the control interrupt that latched the fault, ms")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=90, metadata={"Software": None})
+
+
+def _label(axes: Any, name: str) -> None:
+    axes.set_ylabel(name, fontsize="small")
+    axes.grid(alpha=0.3)
