@@ -156,7 +156,7 @@ def test_interface_that_goes_away_is_reported(salient_without_build, monkeypatch
 
 def test_parameters_of_a_bus_without_a_drive_end_with_one_line(salient_without_build, monkeypatch, tmp_path):
     monkeypatch.setattr("salient.bench.session._ALIVE_CHECK_S", 0.01)
-    monkeypatch.setattr("salient.bench.parameter_file._SILENCE_MAX_S", 0.02)
+    monkeypatch.setattr("salient.bench.parameter_file.SILENCE_MAX_S", 0.02)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
         server.bind(f"{tmp_path}/bus.sock")
         server.listen()
