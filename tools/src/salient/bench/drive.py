@@ -482,7 +482,8 @@ def read_fault_trace(session: Client) -> FaultTrace:
         for part in range(_TRACE_PARTS):
             status, value = _access(session, "fault_trace", period, part)
             if status != "done":
-                raise DriveError(f"fault trace: {status}")
+                reason = ": the drive keeps no record; it has had no fault, or has run since"
+                raise DriveError(f"fault trace: {status}{reason if status == 'no_such_entry' else ''}")
             raw[period, 2 * part : 2 * part + 2] = np.frombuffer(value.to_bytes(4, "little", signed=True), dtype="<i2")
     snapshot = session.drive_database.get_message_by_name("DRIVE_FAULT_SNAPSHOT")
     scale = {signal.name: float(signal.scale) for signal in snapshot.signals}

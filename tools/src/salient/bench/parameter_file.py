@@ -16,12 +16,9 @@ import sys
 from pathlib import Path
 
 from salient.bench.drive import ParameterRow, raw_value
-from salient.bench.session import Session
+from salient.bench.session import SILENCE_MAX_S, Session
 from salient.errors import UsageError, shown
 from salient.toml_file import TextFileError, read_toml
-
-SILENCE_MAX_S = 5.0
-"""A drive sends at least every 0.1 s of its time; an emulated one may be slow."""
 
 
 def run(options: argparse.Namespace) -> int:

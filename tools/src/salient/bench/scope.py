@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from salient.bench.drive import DriveError, FaultTrace
+from salient.bench.drive import FaultTrace
 from salient.bench.failure import COLOURS
-from salient.bench.parameter_file import SILENCE_MAX_S
-from salient.bench.session import Session
-from salient.errors import RunFailed
+from salient.bench.session import SILENCE_MAX_S, Session
 from salient.paths import make_folder
 
 TABLE, PLOT = "scope.csv", "scope.png"
@@ -26,13 +24,7 @@ def run(options: argparse.Namespace) -> int:
     make_folder(options.out, [TABLE, PLOT])
     with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
                  silence_max_s=SILENCE_MAX_S) as session:
-        try:
-            trace = session.drive.fault_trace()
-        except DriveError as error:
-            if "no_such_entry" not in str(error):
-                raise
-            raise RunFailed("the drive keeps no record: it has had no fault, or has run since; the log of faults is "
-                            "read by parameters faults") from None
+        trace = session.drive.fault_trace()
         log = session.drive.fault_log.read()
     title = f"{log[-1].fault} in state {log[-1].state}" if log else "fault"
     write_table(trace, options.out / TABLE)
@@ -71,26 +63,25 @@ def plot(trace: FaultTrace, path: Path, title: str) -> None:
     figure = Figure(figsize=(10, 9), layout="constrained")
     FigureCanvasAgg(figure)
     phases = trace.current_A.shape[1]
-    axes = figure.subplots(4 + phases, 1, sharex=True, height_ratios=[2.5, 1.5, 1.5, 1.5, *[1] * phases])
+    currents, torque, speed, voltage, *of_phases = figure.subplots(
+        4 + phases, 1, sharex=True, height_ratios=[2.5, 1.5, 1.5, 1.5, *[1] * phases])
     time_ms = trace.time_s * _MS_PER_S
-    for phase in range(phases):
-        label = f"phase {'abcd'[phase]}"
-        axes[0].plot(time_ms, trace.current_A[:, phase], color=COLOURS[phase], label=label)
-        duties = axes[4 + phase]
+    for phase, duties in enumerate(of_phases):
+        currents.plot(time_ms, trace.current_A[:, phase], color=COLOURS[phase], label=f"phase {'abcd'[phase]}")
         duties.step(time_ms, _PERCENT * trace.upper_duty[:, phase], where="post", color=COLOURS[phase], label="upper")
         duties.step(time_ms, _PERCENT * trace.lower_duty[:, phase], where="post", color=COLOURS[phase],
                     linestyle="dotted", label="lower")
         _label(duties, f"duty {'abcd'[phase]}, %")
         duties.set_ylim(-5, 105)
         duties.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
-    axes[0].legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
-    for place, name, values in ((0, "current, A", None), (1, "torque\nreference, N m", trace.torque_reference_Nm),
-                                (2, "speed, r/min", trace.speed_rpm), (3, "DC link, V", trace.bus_voltage_V)):
-        if values is not None:
-            axes[place].plot(time_ms, values, color=COLOURS[2])
-        _label(axes[place], name)
-    axes[-1].set_xlim(time_ms[0], time_ms[-1] - time_ms[0] * 0.02)
-    axes[-1].set_xlabel("time before the control interrupt that latched the fault, ms")
+    _label(currents, "current, A")
+    currents.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
+    for axes, name, values in ((torque, "torque\nreference, N m", trace.torque_reference_Nm),
+                               (speed, "speed, r/min", trace.speed_rpm), (voltage, "DC link, V", trace.bus_voltage_V)):
+        axes.plot(time_ms, values, color=COLOURS[2])
+        _label(axes, name)
+    of_phases[-1].set_xlim(time_ms[0], time_ms[-1] - time_ms[0] * 0.02)
+    of_phases[-1].set_xlabel("time before the control interrupt that latched the fault, ms")
     figure.suptitle(title)
     figure.savefig(path, dpi=90, metadata={"Software": None})
 

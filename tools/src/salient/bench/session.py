@@ -26,6 +26,8 @@ from salient.dbc import database_hash
 from salient.errors import RunFailed
 
 RIG_RUN_UNTIL_ID = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
+SILENCE_MAX_S = 5.0
+"""For commands that read a drive: it sends at least every 0.1 s of its time; an emulated one may be slow."""
 _ALIVE_CHECK_S = 1.0
 """Wall time between two checks that the emulator is alive; a debugger may stop it for any time."""
 

@@ -22,7 +22,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from salient.errors import UsageError
+from salient.errors import UsageError, exit_code
 from salient.paths import BUILD, ROOT
 
 TABLE = ROOT / "tests" / "protection_mutants.toml"
@@ -267,19 +267,15 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="only name the mutants")
     parser.add_argument("--only", metavar="PART", help="mutants whose name has this part; the page is not written")
     options = parser.parse_args()
-    try:
-        every = read_table()
-        mutants = [mutant for mutant in every if options.only is None or options.only in mutant.name]
-        if not mutants:
-            raise UsageError(f"--only {options.only}: no mutant has this in its name; --list shows them")
-        if options.list:
-            print("\n".join(mutant.name for mutant in mutants))
-            return 0
-        return run(mutants, of_all=options.only is None)
-    except UsageError as error:
-        print(f"salient: {error}", file=sys.stderr)
-        return 2
+    every = read_table()
+    mutants = [mutant for mutant in every if options.only is None or options.only in mutant.name]
+    if not mutants:
+        raise UsageError(f"--only {options.only}: no mutant has this in its name; --list shows them")
+    if options.list:
+        print("\n".join(mutant.name for mutant in mutants))
+        return 0
+    return run(mutants, of_all=options.only is None)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))
