@@ -173,6 +173,11 @@ def test_readme_shows_the_metrics_of_the_demo(demo_metrics):
         assert_shown(table[row], values)
 
 
+def test_picture_of_the_readme_is_that_of_the_demo(demo_folder):
+    shown = ROOT / "tools" / "images" / "torque.png"
+    assert shown.read_bytes() == (demo_folder / "figures" / "figure_7.png").read_bytes(), f"copy it to {shown}"
+
+
 # Settling times of the paper's controller follow from T_max over inertia, which is small in the finite-element machine:
 # 62.8 rad/s * 0.00401 kg m^2 / 19.1 N m is 0.0132 s.
 @pytest.mark.parametrize(("machine", "settles_s"), [("linear_cosine", (0.0673, 0.072)),

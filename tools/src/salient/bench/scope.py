@@ -88,4 +88,5 @@ def plot(trace: FaultTrace, path: Path, title: str) -> None:
 
 def _label(axes: Any, name: str) -> None:
     axes.set_ylabel(name, fontsize="small")
+    axes.ticklabel_format(useOffset=False)
     axes.grid(alpha=0.3)
