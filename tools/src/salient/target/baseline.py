@@ -23,9 +23,9 @@ from salient.target.static_checks import deepest_stack, size
 FILE = ROOT / "tests" / "target" / "baseline.toml"
 MACHINE = "saturating"
 README = ROOT / "firmware" / "README.md"
-FLASH_MAX_BYTES = 60 * 1024
+FLASH_MAX_BYTES = 80 * 1024
 """Limit of the firmware with the tables of one machine; cmake/check_size.cmake enforces it."""
-RAM_MAX_BYTES = 15 * 1024
+RAM_MAX_BYTES = 20 * 1024
 """Limit of variables and stack, with the 2 KiB of the fault trace."""
 
 BOUND_KEYS = {"cortex-m4": "computed_bound", "rv32": "computed_bound_rv32"}
