@@ -3,6 +3,7 @@
 #include "background_checks.h"
 #include "comms/node.h"
 #include "drive/deferred.h"
+#include "drive/speed_control.h"
 #include "drive/unmasked_read.h"
 #include "fixed/compiler.h"
 #include "fixed/divide.h"
@@ -207,7 +208,8 @@ static void keep_memory(drive_t *drive, uint32_t time_us) {
 
 /* The torque would carry the speed on, beyond the last reference. */
 COLD static bool runs_away(const drive_t *drive, int32_t torque_q24) {
-    const int32_t reference_q22 = drive->command.speed_reference_q22;
+    const int32_t reference_q22 =
+        speed_control_limited_q22(&drive->control_parameters, drive->command.speed_reference_q22);
     const int32_t above_q22 = fixed_subtract(drive->control.observer.speed_q22, reference_q22);
     const int32_t beyond_q22 = torque_q24 < 0 ? fixed_subtract(0, above_q22) : above_q22;
     return drive->ramp_of_speed && beyond_q22 > fixed_abs(reference_q22) / 16;

@@ -2,6 +2,7 @@
 
 #include "comms/units.h"
 #include "drive/deferred.h"
+#include "drive/speed_control.h"
 #include "drive/torque_control.h"
 #include "drive_codec.h"
 #include "fixed/fixed.h"
@@ -36,6 +37,14 @@ uint16_t telemetry_self_test(const drive_t *drive) {
     return (uint16_t)(drive->temperature.failed_sensors | drive->self_test.failed << SELF_TEST_TELEMETRY_BIT);
 }
 
+static bool is_speed_limited(const drive_t *drive) {
+    const command_t *command = &drive->command;
+    return drive->control.state_machine.state == DRIVE_STATE_RUN && command->request == COMMAND_RUN &&
+           command->mode == DRIVE_MODE_SPEED &&
+           speed_control_limited_q22(&drive->control_parameters, command->speed_reference_q22) !=
+               command->speed_reference_q22;
+}
+
 /* The torque at the present angle only while it is of interest: it takes a look at the tables for each phase. */
 static void collect_degraded(const drive_t *drive, drive_telemetry_t *telemetry) {
     const degraded_t *state = &drive->degraded;
@@ -65,6 +74,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->status.time_us = time_us;
     telemetry->status.state = control->state_machine.state;
     telemetry->status.controller = parameters->controller;
+    telemetry->status.speed_limited = is_speed_limited(drive);
     telemetry->status.fault = record->fault;
     telemetry->status.voltage_saturated = run && torque_control_voltage_saturated(parameters, control);
     telemetry->status.mode = control->deferred.mode;

@@ -118,6 +118,7 @@ typedef struct {
     int8_t parameter_fraction_bits[MACHINE_PARAMETERS_MAX];
     uint32_t control_rate_min_hz; /* 25 periods in an electrical revolution at a highest speed that the file states */
     int32_t speed_reference_max;  /* magnitude of a command, LSBs of DRIVE_COMMAND.speed_reference_rpm */
+    int32_t speed_max_q22;        /* highest speed of the machine, to which references are limited, rad/s, Q9.22 */
     uint32_t dbc_hash;            /* of the machine's CAN database, comms/drive.dbc with its factors and ranges */
 } machine_tables_t;
 

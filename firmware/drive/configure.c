@@ -75,6 +75,14 @@ static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
     return fixed_clamp(fixed_saturate(step_q22), 1, INT32_MAX);
 }
 
+/* Largest speed reference: the highest speed of the machine, but not above the speed from which on torque mode reduces
+ * the driving torque, 7/8 of over_speed_rpm, rad/s, Q9.22. Two LSB more than that, so that the largest command in the
+ * DBC, which has a resolution of its own, is within. */
+static int32_t speed_reference_max_q22(const torque_mode_parameters_t *torque_mode, const machine_tables_t *tables) {
+    const int32_t fold_back_q22 = torque_mode->speed_end_q22 - torque_mode->fold_back_range_q22 + 2;
+    return fold_back_q22 < tables->speed_max_q22 ? fold_back_q22 : tables->speed_max_q22;
+}
+
 /* Duty per scaled error from duty per N m at GAIN_RATE_HZ, both Q15. */
 static int32_t pid_scale_q15(int32_t per_Nm_q15, int32_t error_scale_q24, uint32_t control_rate_hz) {
     const int64_t scaled_q15 = fixed_shift((int64_t)per_Nm_q15 * error_scale_q24, 24);
@@ -480,6 +488,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     control.torque_mode =
         torque_mode_configure(values[PARAMETER_TORQUE_SLEW_RATE_NM_S], control_rate_hz, torque_min_q24, torque_max_q24,
                               fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
+    control.speed_reference_max_q22 = speed_reference_max_q22(&control.torque_mode, tables);
     control.torque_offset = torque_offset_configure(control_rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
     control.encoder_monitor = encoder_monitor_from(&control, values, control_rate_hz);
     return control;

@@ -67,6 +67,7 @@ typedef struct {
     torque_law_t torque_law : 8;
     uint8_t edge_age_shift;          /* of an encoder edge's age: 13, on a fast machine or with a slow clock more */
     int32_t speed_reference_min_q22; /* rad/s, Q9.22: 0 for a single-quadrant controller, else INT32_MIN */
+    int32_t speed_reference_max_q22; /* magnitude to which commands are limited, rad/s, Q9.22 */
     bool interleaved_pwm;            /* two voltage pulses per period */
     bool load_from_transducer;       /* load torque of the sliding mode: measured; false: of the observer */
     uint16_t period_ticks;           /* half a control period */

@@ -10,6 +10,12 @@ static int32_t ramp_step(int32_t reference_q22, int32_t target_q22, int32_t step
     return fixed_add(reference_q22, fixed_clamp(difference_q22, -step_max_q22, step_max_q22));
 }
 
+int32_t speed_control_limited_q22(const control_parameters_t *parameters, int32_t commanded_q22) {
+    const int32_t max_q22 = parameters->speed_reference_max_q22;
+    const int32_t lowest_q22 = parameters->speed_reference_min_q22 < 0 ? -max_q22 : 0;
+    return fixed_clamp(commanded_q22, lowest_q22, max_q22);
+}
+
 /* The PI within a limit below its own. */
 static int32_t limited_pi_q24(const control_parameters_t *parameters, deferred_t *deferred, int32_t error_q22,
                               int32_t limit_q24) {
@@ -27,7 +33,7 @@ static int32_t speed_law_q24(const control_parameters_t *parameters, deferred_t 
     const int32_t min_q22 = parameters->speed_reference_min_q22;
     const int32_t before_q22 =
         deferred->run ? deferred->speed_reference_q22 : fixed_clamp(input->speed_q22, min_q22, INT32_MAX);
-    const int32_t target_q22 = fixed_clamp(commanded_q22, min_q22, INT32_MAX);
+    const int32_t target_q22 = speed_control_limited_q22(parameters, commanded_q22);
     const int32_t reference_q22 = ramp_step(before_q22, target_q22, parameters->speed_ramp_q22);
     deferred->speed_reference_q22 = reference_q22;
     const int32_t error_q22 = fixed_subtract(reference_q22, input->speed_q22);

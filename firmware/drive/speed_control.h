@@ -7,6 +7,11 @@
 
 #include "drive/control.h"
 
+/* Commanded speed within the range of the drive, rad/s, Q9.22: the highest speed of the machine, 7/8 of over_speed_rpm
+ * where that is less, so that an overshoot has room, and 0 for a negative one with a single-quadrant controller. [both]
+ */
+int32_t speed_control_limited_q22(const control_parameters_t *parameters, int32_t commanded_q22);
+
 /* Computes law torque, limits of the torque reference and speed reference of the results, and the mode.
  *
  * Speed mode: moves the speed reference by at most the ramp towards the commanded speed, from the present speed at the

@@ -396,9 +396,10 @@ def test_counts_faster_than_the_limit_are_over_speed_while_the_observer_still_fo
 def test_a_fault_cleared_on_a_rotor_close_below_the_speed_limit_is_not_followed_by_over_speed(bench):
     """The observer keeps its speed: one that began at standstill would overshoot the limit, which is 3 % higher."""
     bench.drive.parameters["over_speed_rpm"] = 620
-    bench.drive.speed_reference_rpm = 600
+    bench.drive.speed_reference_rpm = 540
     bench.run_for(0.3)
     bench.held_speed_rpm = 600
+    bench.run_for(0.1)
     bench.rig.supply_voltage_V = 301.0
     bench.run_until(lambda: bench.drive.state == "fault", timeout=0.05)
     bench.rig.supply_voltage_V = 240.0

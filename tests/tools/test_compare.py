@@ -371,7 +371,8 @@ def test_written_scenario_equals_the_one_that_ran(group, tmp_path):
 
 
 def test_run_that_ends_in_a_fault_is_reported_and_reproducible(tmp_path):
-    scenario = replace(start_scenario(controller="paper"), duration_s=0.1, parameters={"over_speed_rpm": 300.0})
+    scenario = replace(start_scenario(controller="paper"), duration_s=0.1, parameters={"over_speed_rpm": 300.0},
+                       load=(LoadStep(0.05, -20.0),))  # single-quadrant: it cannot hold a load that drives
     case = Case("start", "saturating", "paper", "start", scenario)
     (run,) = run_all([case], 1, io.StringIO(), tmp_path / "runs")
     assert (run.metrics, run.failed) == ({}, "fault over_speed")

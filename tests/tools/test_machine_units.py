@@ -173,17 +173,21 @@ def test_values_survive_the_round_trip_within_half_an_lsb(exponents):
                 assert abs(decoded[signal.name] - values[signal.name]) <= 0.500001 * signal.scale, signal.name
 
 
-@pytest.mark.parametrize(("speed_exponent", "speed_max_rpm", "limit_rpm", "raw"), [
-    (0, 1200.0, 3000, 3_000_000), (0, 4000.5, 4000.5, 4_000_500), (3, 20_000.003, 20_000, 2_500_000),
+@pytest.mark.parametrize(("speed_exponent", "speed_max_rpm", "over_speed_rpm", "limit_rpm", "raw"), [
+    (0, 1200.0, 1440.0, 1200, 3_000_000), (0, 1200.0, 1300.0, 1137.5, 3_000_000),
+    (0, 4000.5, 4800.0, 4000.5, 4_000_500), (3, 20_000.003, 24_000.0, 20_000, 2_500_000),
 ])
-def test_commands_reach_the_largest_speed_of_the_machine_and_3000_rpm_at_least(speed_exponent, speed_max_rpm, limit_rpm,
-                                                                              raw):
+def test_commands_reach_the_largest_speed_of_the_machine_and_frames_3000_rpm_at_least(
+        speed_exponent, speed_max_rpm, over_speed_rpm, limit_rpm, raw):
     path = MACHINES / "saturating.toml"
-    data = replace(scaling_of_file(path).data, speed_max_rpm=speed_max_rpm)
+    data = scaling_of_file(path).data
+    data = replace(data, speed_max_rpm=speed_max_rpm, parameters=data.parameters | {"over_speed_rpm": over_speed_rpm})
     scaling = Scaling(data, Exponents(speed=speed_exponent))
     signal = database_of(scaling.dbc()).get_message_by_name("DRIVE_COMMAND").get_signal_by_name("speed_reference_rpm")
     assert (signal.minimum, signal.maximum) == (-limit_rpm, limit_rpm)
+    assert scaling.speed_range_rpm == limit_rpm
     assert scaling.speed_reference_max == raw
+    assert 0.0 < scaling.speed_max_q22 - math.ldexp(math.radians(6.0 * speed_max_rpm), 22 - speed_exponent) <= 2.0
 
 
 # --- resolutions ----------------------------------------------------------------------------------------------------

@@ -181,6 +181,8 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const double slew = v(PARAMETER_TORQUE_SLEW_RATE_NM_S) / rate_hz * fixed_point::Q24;
     near("torque slew", c.torque_mode.slew_q24, slew == 0.0 ? INT32_MAX : std::max(slew, 1.0), 1.0);
     near("fold-back", c.torque_mode.speed_end_q22, c.encoder_monitor.over_speed_q22 * 15.0 / 16.0, 1.0);
+    near("speed range", c.speed_reference_max_q22,
+         std::min<double>(machine_tables.speed_max_q22, c.encoder_monitor.over_speed_q22 * 7.0 / 8.0 + 2.0), 2.0);
     near("timeout", c.protection.command_timeout_us, 500000.0, 0.0);
 
     const auto &share = c.conduction.sharing;

@@ -25,6 +25,7 @@ inline const char *difference(const control_parameters_t &a, const control_param
     COMPARE(torque_law)
     COMPARE(edge_age_shift)
     COMPARE(speed_reference_min_q22)
+    COMPARE(speed_reference_max_q22)
     COMPARE(interleaved_pwm)
     COMPARE(load_from_transducer)
     COMPARE(period_ticks)

@@ -89,6 +89,8 @@ TelemetryName = Literal[
     "DRIVE_STATUS.state",
     "controller",
     "DRIVE_STATUS.controller",
+    "speed_limited",
+    "DRIVE_STATUS.speed_limited",
     "fault",
     "DRIVE_STATUS.fault",
     "voltage_saturated",

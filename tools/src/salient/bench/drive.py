@@ -115,8 +115,8 @@ class Drive(KnownAttributes):
 
     @property
     def speed_reference_rpm(self) -> float:
-        """Last requested value, in the range of the drive's DBC, at least -3000..3000; negative is reverse, and 0 to a
-        controller that drives forward only."""
+        """Last requested value, in the range of the drive's DBC, which is that of the machine; negative is reverse, and
+        0 to a controller that drives forward only. The drive limits it to 7/8 of over_speed_rpm."""
         return self._speed_reference_rpm
 
     @speed_reference_rpm.setter

@@ -187,6 +187,7 @@ TABLES = Structure("machine_tables_t", (
            (_PARAMETERS_MAX,)),
     Member("control_rate_min_hz", "uint32_t", lambda machine, scaling, tables: scaling.control_rate_min_hz(machine)),
     Member("speed_reference_max", "int32_t", lambda machine, scaling, tables: scaling.speed_reference_max),
+    Member("speed_max_q22", "int32_t", lambda machine, scaling, tables: scaling.speed_max_q22),
     Member("dbc_hash", "uint32_t", lambda machine, scaling, tables: database_hash(database_of(scaling.dbc()))),
 ))  # fmt: skip
 """Of a Machine, its Scaling and its FirmwareTables: firmware/control/machine_tables.h."""

@@ -42,7 +42,10 @@ FLUX_LINKAGE_RANGE_WB, TORQUE_RANGE_NM, SPEED_RANGE_RPM = 4.0, 40.0, 4800.0
 FLUX_LINKAGE_MORE = 2
 SPEED_EXPONENT_MAX = 3
 SPEED_COMMAND_RPM = 3000.0
-"""Every drive takes commands up to this speed, a faster machine up to its own."""
+"""A frame of every drive may command up to this speed, of a faster machine up to its own; the drive limits it to the
+machine's."""
+SPEED_REFERENCE_PART = 7.0 / 8.0
+"""Part of over_speed_rpm to which the firmware limits a speed reference (firmware/drive/configure.c)."""
 SPEED_LSB_RPM = Fraction(1, 1000)
 """Factor of the speeds in the DBC with SI units."""
 _COMMAND, _COMMAND_SIGNAL = "DRIVE_COMMAND", "speed_reference_rpm"
@@ -116,14 +119,35 @@ class Scaling:
         return math.ceil(SAMPLES_PER_TURN_MIN * turns_1_s * (1.0 - 1e-9)) if "speed_max_rpm" in machine.drive else 0
 
     @property
+    def speed_range_rpm(self) -> float:
+        """Largest speed reference of the machine with its default parameters, in whole LSBs of the bus."""
+        return float(self._bus_speed(self._limit_rpm) * self._bus_lsb_rpm)
+
+    @property
+    def _limit_rpm(self) -> float:
+        return min(self.data.speed_max_rpm, SPEED_REFERENCE_PART * self.data.over_speed_rpm)
+
+    @property
+    def speed_max_q22(self) -> int:
+        """The machine's highest speed as the firmware has it, with an LSB more for the conversion of a command."""
+        return math.ceil(math.ldexp(self.data.speed_max_rpm * math.pi / 30.0, 22 - self.exponents.speed)) + 1
+
+    @property
     def speed_reference_max(self) -> int:
-        """Magnitude of the largest command, in LSBs of the bus."""
-        limit_rpm = max(SPEED_COMMAND_RPM, self.data.speed_max_rpm)
-        return math.floor(Fraction(limit_rpm) / (SPEED_LSB_RPM * Fraction(2) ** self.exponents.speed))
+        """Magnitude of the largest command that a frame may have, in LSBs of the bus."""
+        return self._bus_speed(max(SPEED_COMMAND_RPM, self.data.speed_max_rpm))
+
+    def _bus_speed(self, speed_rpm: float) -> int:
+        """In LSBs of the bus, rounded down."""
+        return math.floor(Fraction(speed_rpm) / self._bus_lsb_rpm)
+
+    @property
+    def _bus_lsb_rpm(self) -> Fraction:
+        return SPEED_LSB_RPM * Fraction(2) ** self.exponents.speed
 
     def dbc(self) -> str:
         """Text of the drive's CAN database: firmware/comms/drive.dbc with the factors and ranges of this machine."""
-        return drive_dbc(self.exponents, self.speed_reference_max)
+        return drive_dbc(self.exponents, self._bus_speed(self._limit_rpm))
 
 
 def scaling_of(path: object, machine: Machine) -> Scaling:
@@ -181,7 +205,7 @@ _MESSAGE_LINE = re.compile(r"BO_ \d+ (\w+):")
 _SIGNAL_LINE = re.compile(r'( SG_ (\w+) [^(]*)\(([^,]+),([^)]+)\) \[([^|]+)\|([^]]+)\] ("([^"]*)".*)')
 
 
-def drive_dbc(exponents: Exponents, speed_reference_max: int) -> str:
+def drive_dbc(exponents: Exponents, speed_range: int) -> str:
     """Text of firmware/comms/drive.dbc for these units: factors and ranges times powers of two, and the range of the
     commands in LSBs. With SI units and 3000 r/min it is that file."""
     lines, message = [], ""
@@ -189,18 +213,18 @@ def drive_dbc(exponents: Exponents, speed_reference_max: int) -> str:
         if found := _MESSAGE_LINE.match(line):
             message = found[1]
         found = _SIGNAL_LINE.match(line)
-        lines.append(_signal_line(message, found, exponents, speed_reference_max) if found else line)
+        lines.append(_signal_line(message, found, exponents, speed_range) if found else line)
     return "".join(lines)
 
 
-def _signal_line(message: str, line: re.Match[str], exponents: Exponents, speed_reference_max: int) -> str:
+def _signal_line(message: str, line: re.Match[str], exponents: Exponents, speed_range: int) -> str:
     """The line of a signal of a message, with its factor, offset and range in the units."""
     head, name, *numbers, tail, unit = line.groups()
     exponent = exponents.of_unit(unit)
     factor, offset, low, high = (_plain(Fraction(number) * Fraction(2) ** exponent) if exponent else number
                                  for number in numbers)
     if (message, name) == (_COMMAND, _COMMAND_SIGNAL):
-        high = _plain(Fraction(factor) * speed_reference_max)
+        high = _plain(Fraction(factor) * speed_range)
         low = f"-{high}"
     return f"{head}({factor},{offset}) [{low}|{high}] {tail}\n"
 

@@ -30,7 +30,7 @@ from salient.machine.drive_data import DriveData, derive
 from salient.machine.file import load_machine, machine_path
 from salient.machine.parameter_table import read_table
 from salient.machine.path import stated_conditions
-from salient.machine.scaling import choose
+from salient.machine.scaling import Scaling, choose
 from salient.reference.torque_speed_bound import (
     BRAKING,
     MOTORING,
@@ -148,8 +148,9 @@ class _Subject:
         self.label = name_or_path if name_or_path in MACHINES else self.machine.name
         self._conditions = stated_conditions(path)
         (row,) = (row for row in read_table() if row.name == "torque_max_Nm")
-        fraction_bits = choose(self.data, self.machine).fraction_bits(row)
-        self.torque_max_Nm = min(math.ldexp(row.maximum, -fraction_bits), _REQUEST_MAX_NM)
+        exponents = choose(self.data, self.machine)
+        self.torque_max_Nm = min(math.ldexp(row.maximum, -exponents.fraction_bits(row)), _REQUEST_MAX_NM)
+        self.speed_range_rpm = Scaling(self.data, exponents).speed_range_rpm
 
     def speeds_rpm(self, of_base: Sequence[float]) -> list[float]:
         """Multiples of the base speed up to the largest speed, four digits."""
@@ -209,7 +210,7 @@ class _Subject:
             parameters={"speed_ramp_rpm_s": rate_rpm_s})
 
     def _speeds_in_speed_mode(self, of_base: Sequence[float]) -> list[float]:
-        return [_four_digits(min(factor * self.data.speed_base_rpm, self.data.speed_max_rpm)) for factor in of_base]
+        return [min(_four_digits(factor * self.data.speed_base_rpm), self.speed_range_rpm) for factor in of_base]
 
     def _loads_Nm(self, part: float, speeds_rpm: Sequence[float]) -> list[float]:
         """Loads on the shaft that require a part of the largest torque, which also overcomes the friction."""
