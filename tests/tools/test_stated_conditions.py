@@ -1,4 +1,4 @@
-"""The control rate and the sensors that [drive] of a machine file states, in `sim` and in scenarios."""
+"""The control rate and the sensors that [drive] of a machine file states, in `sim`, in scenarios and in the fixture."""
 
 from __future__ import annotations
 
@@ -68,3 +68,27 @@ def test_a_scenario_takes_what_it_does_not_state_from_the_machine_file(machine: 
     (scenario,) = load_scenarios(path)
     assert (scenario.control_rate_hz, scenario.encoder_bits, scenario.adc_bits) == (100_000, 14, 12)
     assert scenario.encoder_edges
+
+
+def test_a_bench_of_the_fixture_has_those_of_the_machine_file_unless_the_test_states_them(make_bench, machine) -> None:
+    bench = make_bench(machine=str(machine), adc_bits=12)
+    options = bench.options
+    assert (options.control_rate_hz, options.encoder_bits, options.encoder_edges, options.adc_bits) == (
+        100_000, 14, True, 12)
+    bench.run_for(0.15)
+    assert bench.telemetry["DRIVE_HEARTBEAT.control_rate_hz"].last == 100_000
+    options = make_bench().options
+    assert (options.control_rate_hz, options.encoder_bits, options.encoder_edges, options.adc_bits) == (
+        40_000, 17, False, 12)
+
+
+@pytest.mark.parametrize(("noise_A", "differs"), [(0.0, False), (0.05, True)])
+def test_a_seed_changes_the_motion_through_noise_alone(make_bench, noise_A: float, differs: bool) -> None:
+    speeds = []
+    for seed in (1, 2):
+        bench = make_bench(seed=seed)
+        bench.rig.current_noise_A = noise_A
+        bench.drive.speed_reference_rpm = 150
+        bench.run_for(0.1)
+        speeds.append(list(bench.truth["speed_rpm"].value))
+    assert (speeds[0] != speeds[1]) == differs

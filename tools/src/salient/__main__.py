@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from salient.cli import make_parser
-from salient.config import OPTIONS, BenchConfig
+from salient.config import OPTIONS
 from salient.errors import UsageError, exit_code
 from salient.paths import BUILD, SCENARIOS, make_folder
 
@@ -60,13 +60,10 @@ def _test(options: argparse.Namespace) -> int:
 
 def _sim(options: argparse.Namespace) -> int:
     from salient.bench.programs import command_line
-    from salient.machine.cache import machine_image
-    from salient.machine.path import machine_path, stated_conditions
+    from salient.machine.cache import bench_config
 
-    image = machine_image(options.machine)  # checks the file
-    stated = stated_conditions(machine_path(options.machine))
     given = {name: value for name, value in vars(options).items() if name in OPTIONS and value is not None}
-    command = command_line(BenchConfig(**{**stated, **given, "machine_image": image}))
+    command = command_line(bench_config(given))
     os.execv(command[0], command)
 
 

@@ -151,7 +151,8 @@ class Conditions:
                             choices=(12, 13, 14, 15, 16), commands=("sim",))
     immediate_pwm: bool = _option(False, FLAG, "compare values act in the period that writes them, as in simulations "
                                   "and no converter", commands=("sim",))
-    seed: int = _option(1, INTEGER, "seed of all noise", metavar="N", maximum=2**64 - 1, commands=_CONDITION)
+    seed: int = _option(1, INTEGER, "seed of noise, of frame faults and of the challenges; without noise and such "
+                        "faults it changes no motion", metavar="N", maximum=2**64 - 1, commands=_CONDITION)
     initial_angle_deg: float = _option(0.0, NUMBER, "rotor angle at the start", metavar="X", minimum=-360.0,
                                        maximum=360.0, commands=("sim",))
 

@@ -6,8 +6,9 @@
         bench.run_for(0.1)
 
 `bench` is one drive with its test bench; `make_bench(**options)` starts any number of them, one after the other or (on
-local buses) simultaneously. The options are the fields of BenchConfig. A test that fails, in its set-up, its call or
-its teardown, leaves a folder that the failure message names: logs, plots, true state, seed and replay command.
+local buses) simultaneously. The options are the fields of BenchConfig; control rate and sensors that a test does not
+state are those of [drive] of the machine file, as with `sim`. A test that fails, in its set-up, its call or its
+teardown, leaves a folder that the failure message names: logs, plots, true state, seed and replay command.
 
 Marks: `bench_each(machine=[...], controller=[...], target=[...])`, the test runs once for each combination, as with
 --salient-machine, --salient-controller and --salient-target do all tests that do not state these; `both_transports`,
@@ -37,8 +38,9 @@ import pytest
 from salient.bench import failure
 from salient.bench.bench import Bench
 from salient.bench.session import Session
-from salient.config import CONTROLLERS, HOST_BUILDS, TARGET_BUILDS, TARGETS, WASM_BUILD, BenchConfig
+from salient.config import CONTROLLERS, HOST_BUILDS, TARGET_BUILDS, TARGETS, WASM_BUILD
 from salient.errors import UsageError
+from salient.machine.cache import bench_config
 from salient.paths import COMMAND
 from salient.tab.link import link_of
 
@@ -211,7 +213,7 @@ def make_bench(request: pytest.FixtureRequest, tmp_path: Path, bench_choice: dic
             options |= {"record": recording, "record_step_ns": failure.RECORD_STEP_NS}
         if can is None:
             can = f"unix:{tmp_path}/can{number}.sock" if bus == "local" else bus
-        made = Bench(BenchConfig(**(defaults | options)), can)
+        made = Bench(bench_config(defaults | options), can)
         state.benches.append(made)
         if recording:
             state.recordings[number] = recording

@@ -9,11 +9,14 @@ from __future__ import annotations
 import hashlib
 import os
 import tomllib
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
+from salient.config import DEFAULTS, BenchConfig
 from salient.errors import UsageError
-from salient.machine.path import MachineError, machine_path
+from salient.machine.path import MachineError, machine_path, stated_conditions
 from salient.paths import BUILD, DRIVE_DBC, IS_WHEEL, PARAMETERS, PYTHON_PACKAGES
 
 FOLDER = BUILD / "machines"
@@ -37,6 +40,14 @@ def machine_image(name_or_path: str) -> Path:
                 _write(cached, image)
     except MachineError as error:
         raise UsageError(str(error)) from None
+
+
+def bench_config(given: Mapping[str, Any]) -> BenchConfig:
+    """The options of a bench: those given, control rate and sensors that [drive] of the machine file states otherwise,
+    else the defaults. UsageError: as machine_image."""
+    machine = given.get("machine", DEFAULTS["machine"])
+    image = given.get("machine_image") or machine_image(machine)  # checks the file
+    return BenchConfig(**{**stated_conditions(machine_path(machine)), **given, "machine_image": image})
 
 
 def content_key(path: Path) -> str:
