@@ -54,7 +54,7 @@ static plant_path_t conducting_path(const plant_t *plant, unsigned phase) {
     if (earth_ohm > 0.0 && !lower) {
         ends[1] = (end_t){true, 0.0, earth_ohm, 0.0};
     }
-    const double shorted = faults->shorted_turns[phase], winding_ohm = plant->winding_ohm;
+    const double shorted = faults->shorted_turns[phase], winding_ohm = plant->winding_ohm[phase];
     plant_path_t path = {
         .sign = (double)ends[0].rail + (double)ends[1].rail - 1.0,
         .device_V = ends[0].drop_V + ends[1].drop_V,
@@ -75,7 +75,7 @@ static plant_path_t conducting_path(const plant_t *plant, unsigned phase) {
 
 /* The loop of shorted turns alone. */
 static plant_path_t isolated_path(const plant_t *plant, unsigned phase) {
-    return (plant_path_t){.resistance_ohm = plant->winding_ohm / plant->faults.shorted_turns[phase]};
+    return (plant_path_t){.resistance_ohm = plant->winding_ohm[phase] / plant->faults.shorted_turns[phase]};
 }
 
 void faulted_find_conducting(plant_t *plant, integrator_setting_t *setting) {
@@ -186,7 +186,7 @@ void faulted_add_energies(plant_t *plant, const integrator_setting_t *setting, c
             plant->energy_returned_J -= energy_J;
         }
         const plant_path_t *path = &setting->path[index];
-        const double k = setting->turns[index], winding_ohm = plant->winding_ohm;
+        const double k = setting->turns[index], winding_ohm = plant->winding_ohm[setting->phase[index]];
         const double loop_J = k > 0.0 ? k / winding_ohm * e2 : 0.0;
         const double copper_J = (1.0 - k) * winding_ohm * current2_A2s + loop_J;
         const double converter_J = path->device_V * charge_As + path->device_ohm * current2_A2s;
@@ -207,9 +207,9 @@ double faulted_time_constant_s(const plant_t *plant) {
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         const double k = plant->faults.shorted_turns[phase];
         if (k > 0.0) {
-            time_constant_s = fmin(time_constant_s, plant->magnetics.inductance_min_H * k / plant->winding_ohm);
+            time_constant_s = fmin(time_constant_s, plant->magnetics.inductance_min_H * k / plant->winding_ohm[phase]);
             if (capacitance_F > 0.0) {
-                time_constant_s = fmin(time_constant_s, capacitance_F * plant->winding_ohm * (1.0 - k) / k);
+                time_constant_s = fmin(time_constant_s, capacitance_F * plant->winding_ohm[phase] * (1.0 - k) / k);
             }
         }
     }

@@ -38,7 +38,7 @@ MAGNETICS_INLINE bool walk_apart(plant_t *plant, magnetics_form_t form, const ro
             walk_start(plant, form, phase, rotor, &walk);
             while (walk.end_s < rotor->length_s) {
                 if (walk_begin(plant, form, phase, rotor, NULL, &walk) &&
-                    !walk_end(plant, form, rotor, NULL, &walk, sums, records != NULL ? &records[phase] : NULL)) {
+                    !walk_end(plant, form, phase, rotor, NULL, &walk, sums, records != NULL ? &records[phase] : NULL)) {
                     return false;
                 }
             }
@@ -75,7 +75,7 @@ MAGNETICS_INLINE bool walk_together(plant_t *plant, magnetics_form_t form, const
             while (walk->end_s <= at_s) {
                 const unsigned phase = phase_of[n];
                 if (walk->active &&
-                    !walk_end(plant, form, rotor, link, walk, sums, records != NULL ? &records[phase] : NULL)) {
+                    !walk_end(plant, form, phase, rotor, link, walk, sums, records != NULL ? &records[phase] : NULL)) {
                     return false;
                 }
                 if (walk->end_s >= rotor->length_s) {
@@ -136,7 +136,7 @@ MAGNETICS_INLINE void start_step(plant_t *plant, magnetics_form_t form, rotor_st
         }
         const double gradient_Wb_rad = state->point.flux_gradient_Wb_rad;
         const double current_A_s =
-            (rotor->voltage_V[on] - plant->resistance_ohm[on] * current_A - speed_rad_s * gradient_Wb_rad) *
+            (rotor->voltage_V[on] - plant->resistance_ohm[phase][on] * current_A - speed_rad_s * gradient_Wb_rad) *
             state->inverse_1_H;
         torque_Nm += state->point.torque_Nm;
         torque_Nm_s += state->point.torque_gradient_Nm_rad * speed_rad_s + gradient_Wb_rad * current_A_s;

@@ -148,7 +148,7 @@ MAGNETICS_INLINE bool walk_begin(const plant_t *plant, magnetics_form_t form, un
     const unsigned on = walk->on;
     walk->at_s = at_s;
     walk->end_s = until_s;
-    const double current_A = walk->current_A, ohm = plant->resistance_ohm[on];
+    const double current_A = walk->current_A, ohm = plant->resistance_ohm[phase][on];
     const bool tied = link != NULL && on != 1; /* freewheeling, it does not notice the link */
     const double voltage_V = tied ? link_signs[on] * link->voltage_V - plant->drop_V[on] : rotor->voltage_V[on];
     const bool driven = tied ? voltage_V > 0.0 : on == 2 && rotor->driven;
@@ -217,11 +217,11 @@ MAGNETICS_INLINE bool walk_begin(const plant_t *plant, magnetics_form_t form, un
 }
 
 /* The end of a current in a step: returns the step's length, and its end and charge. */
-MAGNETICS_INLINE double end_of_step(const plant_t *plant, magnetics_form_t form, const link_t *link, double driven_Wb,
-                                    const walk_t *walk, double start_rad, double start_rad_s, magnetics_point_t *point,
-                                    course_t *current, course_t *torque) {
+MAGNETICS_INLINE double end_of_step(const plant_t *plant, magnetics_form_t form, unsigned phase, const link_t *link,
+                                    double driven_Wb, const walk_t *walk, double start_rad, double start_rad_s,
+                                    magnetics_point_t *point, course_t *current, course_t *torque) {
     const unsigned on = walk->on;
-    const double ohm = plant->resistance_ohm[on], flux_Wb = walk->flux_Wb, step_s = walk->step_s;
+    const double ohm = plant->resistance_ohm[phase][on], flux_Wb = walk->flux_Wb, step_s = walk->step_s;
     const bool tied = link != NULL && on != 1;
     const double voltage_V = tied ? (driven_Wb - flux_Wb) / step_s : walk->voltage_V;
     const double near_s = voltage_V < 0.0 ? lesser(-flux_Wb / voltage_V, step_s) : step_s;
@@ -255,11 +255,11 @@ MAGNETICS_INLINE void settle(link_t *link, const walk_t *walk, double step_s, do
 }
 
 /* Ends the step of a phase. False: the comparator responds, or there are too many steps. */
-MAGNETICS_INLINE bool walk_end(const plant_t *plant, magnetics_form_t form, const rotor_step_t *rotor, link_t *link,
-                               walk_t *walk, sums_t *sums, phase_record_t *record) {
+MAGNETICS_INLINE bool walk_end(const plant_t *plant, magnetics_form_t form, unsigned phase, const rotor_step_t *rotor,
+                               link_t *link, walk_t *walk, sums_t *sums, phase_record_t *record) {
     const unsigned on = walk->on;
     const bool tied = link != NULL && on != 1;
-    const double at_s = walk->at_s, ohm = plant->resistance_ohm[on], flux_Wb = walk->flux_Wb;
+    const double at_s = walk->at_s, ohm = plant->resistance_ohm[phase][on], flux_Wb = walk->flux_Wb;
     double step_s = walk->step_s, voltage_V = walk->voltage_V, area_Vs = 0.0;
     course_t current, torque;
     magnetics_point_t *point = &walk->point;
@@ -298,7 +298,8 @@ MAGNETICS_INLINE bool walk_end(const plant_t *plant, magnetics_form_t form, cons
     double end_Wb = driven_Wb - ohm * charge_As;
     walk->known = (end_Wb > 0.0 && current.end > 0.0) || (tied ? driven_Wb > flux_Wb : on == 2 && rotor->driven);
     if (__builtin_expect(!walk->known, 0)) {
-        step_s = end_of_step(plant, form, link, driven_Wb, walk, start_rad, start_rad_s, point, &current, &torque);
+        step_s =
+            end_of_step(plant, form, phase, link, driven_Wb, walk, start_rad, start_rad_s, point, &current, &torque);
         end_Wb = 0.0;
         charge_As = course_integral(&current, step_s);
         if (!tied) {
@@ -345,7 +346,7 @@ MAGNETICS_INLINE void walk_finish(const plant_t *plant, unsigned phase, const ro
         switches = pattern->switches[edge];
     }
     sums->impulse_Nms += walk->impulse_Nms;
-    sums->copper_J[phase] = plant->winding_ohm * walk->own_A2s;
+    sums->copper_J[phase] = plant->winding_ohm[phase] * walk->own_A2s;
     sums->converter_J[phase] = walk->own_J - sums->copper_J[phase];
     sums->walked |= 1u << phase;
     sums->switches[phase] = switches;

@@ -34,6 +34,9 @@
 /* After an event, a slower shaft with friction stands still. */
 #define SPEED_TOLERANCE_RAD_S 1e-6
 
+/* Below 0 C: where the resistance of copper, extrapolated, is 0. */
+#define COPPER_ZERO_C 235.0
+
 static const double NS_S = 1e-9;
 
 static bool has_link(const plant_t *plant) {
@@ -50,6 +53,9 @@ void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_r
     plant->step_factor = 1.0;
     plant->trip_current_A = INFINITY;
     plant->trip_ns = UINT64_MAX;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        plant->winding_gain[phase] = 1.0;
+    }
     plant_set_gains(plant, &(plant_gains_t){1.0, 1.0, 1.0, 1.0});
     plant->phase_offset_rad = plant->magnetics.pitch_rad / machine->phases;
     /* Empty range: the first step computes it. */
@@ -57,10 +63,23 @@ void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_r
     plant->smooth_to_rad = -INFINITY;
 }
 
+/* The resistances by gain and temperature, and the limits of the steps that depend on them. */
+static void set_resistances(plant_t *plant) {
+    const machine_t *machine = plant->machine;
+    const converter_t *converter = &machine->converter;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        plant->winding_ohm[phase] = plant->gains.resistance * machine->resistance_ohm * plant->winding_gain[phase];
+        for (unsigned on = 0; on < 3; on++) {
+            plant->resistance_ohm[phase][on] = plant->winding_ohm[phase] + on * converter->switch_resistance_ohm +
+                                               (2 - on) * converter->diode_resistance_ohm;
+        }
+    }
+    plant_set_step_factor(plant, plant->step_factor);
+}
+
 void plant_set_gains(plant_t *plant, const plant_gains_t *gains) {
     const machine_t *machine = plant->machine;
     plant->gains = *gains;
-    plant->winding_ohm = gains->resistance * machine->resistance_ohm;
     plant->inertia_kg_m2 = gains->inertia * machine->inertia_kg_m2;
     plant->friction_Nm_s = gains->friction * machine->friction_Nm_s;
     magnetics_prepare(&plant->magnetics, &machine->magnetics, machine->rotor_poles);
@@ -69,10 +88,15 @@ void plant_set_gains(plant_t *plant, const plant_gains_t *gains) {
     for (unsigned on = 0; on < 3; on++) {
         const converter_t *converter = &machine->converter;
         plant->drop_V[on] = on * converter->switch_drop_V + (2 - on) * converter->diode_drop_V;
-        plant->resistance_ohm[on] =
-            plant->winding_ohm + on * converter->switch_resistance_ohm + (2 - on) * converter->diode_resistance_ohm;
     }
-    plant_set_step_factor(plant, plant->step_factor);
+    set_resistances(plant);
+}
+
+void plant_set_winding_temperatures(plant_t *plant, const double temperature_C[HAL_PHASES_MAX]) {
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        plant->winding_gain[phase] = (COPPER_ZERO_C + temperature_C[phase]) / (COPPER_ZERO_C + PLANT_RESISTANCE_C);
+    }
+    set_resistances(plant);
 }
 
 void plant_set_supply_voltage(plant_t *plant, double voltage_V) {
@@ -98,9 +122,13 @@ void plant_release(plant_t *plant) {
 }
 
 void plant_set_step_factor(plant_t *plant, double factor) {
+    double resistance_ohm = 0.0;
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        const double *of_phase_ohm = plant->resistance_ohm[phase];
+        resistance_ohm = fmax(resistance_ohm, fmax(of_phase_ohm[0], of_phase_ohm[2]));
+    }
     double time_constant_s =
-        fmin(plant->magnetics.inductance_min_H / fmax(plant->resistance_ohm[0], plant->resistance_ohm[2]),
-             plant->inertia_kg_m2 / plant->friction_Nm_s);
+        fmin(plant->magnetics.inductance_min_H / resistance_ohm, plant->inertia_kg_m2 / plant->friction_Nm_s);
     plant->step_max_s = factor * fmin(STEP_MAX_S, STEP_TIME_CONSTANTS * time_constant_s);
     if (has_link(plant)) {
         const dc_link_t *link = &plant->machine->dc_link;

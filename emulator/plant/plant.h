@@ -46,13 +46,16 @@
 /* A freewheeling current decays exponentially; below this it counts as zero. */
 #define PLANT_CURRENT_NEGLIGIBLE_A 1e-9
 
+/* Temperature of the winding that the resistance of a machine file is for. */
+#define PLANT_RESISTANCE_C 25.0
+
 struct plant;
 typedef void (*plant_sample_t)(void *context, const struct plant *plant);
 
 /* Factors on the values of the machine file. */
 typedef struct {
     double flux_linkage; /* > 0: flux linkage and torque of every phase at the same angle and current */
-    double resistance;   /* > 0: windings */
+    double resistance;   /* > 0: windings, at any temperature */
     double inertia;      /* > 0 */
     double friction;     /* >= 0 */
 } plant_gains_t;
@@ -125,9 +128,11 @@ typedef struct plant {
     /* Private to plant.c and the steps of the phases (phase_steps.h). */
     const machine_t *machine;
     magnetics_model_t magnetics;
-    double winding_ohm, inertia_kg_m2, friction_Nm_s;
+    double winding_gain[HAL_PHASES_MAX], winding_ohm[HAL_PHASES_MAX]; /* gain: by temperature */
+    double inertia_kg_m2, friction_Nm_s;
     double phase_offset_rad;
-    double drop_V[3], resistance_ohm[3]; /* of a phase, winding included, by the number of switches that are on */
+    double drop_V[3];                         /* of the devices, by the number of switches that are on */
+    double resistance_ohm[HAL_PHASES_MAX][3]; /* of winding and devices, likewise */
     double step_factor, step_max_s, together_step_max_s, step_current_A, step_angle_rad;
     double link_swing_s2_H; /* limit of a step of a phase on a DC link: its square by the incremental inductance */
     double smooth_from_rad, smooth_to_rad;
@@ -171,6 +176,11 @@ void plant_release(plant_t *plant);
 /* Changes the machine from time_ns on. Angle, speed and currents continue unchanged, so the energies of fields and
  * rotor jump, without a counterpart in the energy balance, which holds over intervals without such a change. */
 void plant_set_gains(plant_t *plant, const plant_gains_t *gains);
+
+/* Sets the temperatures of the windings from time_ns on: the resistance of copper at T is that of the machine file, at
+ * PLANT_RESISTANCE_C, times (235 C + T) / (235 C + PLANT_RESISTANCE_C) (IEC 60034-1, 8.6.2.3.3). T > -235 C; plant_init
+ * sets PLANT_RESISTANCE_C. */
+void plant_set_winding_temperatures(plant_t *plant, const double temperature_C[HAL_PHASES_MAX]);
 
 /* Changes the faults from time_ns on. Currents (with shorted turns: magnetomotive forces) continue unchanged. */
 void plant_set_faults(plant_t *plant, const plant_faults_t *faults);

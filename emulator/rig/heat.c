@@ -6,6 +6,8 @@
 #include "rig_codec.h"
 
 #define AMBIENT_C 25.0
+/* Change of a winding's temperature that its resistance follows. */
+#define FOLLOWED_K 1.0
 #define STEP_NS UINT64_C(1000000)
 #define S_PER_NS 1e-9
 #define CODES 65536.0
@@ -38,6 +40,7 @@ void heat_init(rig_t *rig) {
     rig->heat.winding.held_C = rig->heat.inverter.held_C = free_C();
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         rig->heat.winding.temperature_C[phase] = rig->heat.inverter.temperature_C[phase] = AMBIENT_C;
+        rig->heat.resistance_C[phase] = PLANT_RESISTANCE_C;
     }
     convert(rig);
 }
@@ -55,6 +58,21 @@ static void step(heat_bodies_t *bodies, const double *loss_J, double capacity_J_
     }
 }
 
+static void follow_resistances(rig_t *rig) {
+    heat_t *heat = &rig->heat;
+    bool changed = false;
+    for (unsigned phase = 0; phase < rig->plant.machine->phases; phase++) {
+        const double temperature_C = heat->winding.temperature_C[phase];
+        if (fabs(temperature_C - heat->resistance_C[phase]) >= FOLLOWED_K) {
+            heat->resistance_C[phase] = temperature_C;
+            changed = true;
+        }
+    }
+    if (changed) {
+        plant_set_winding_temperatures(&rig->plant, heat->resistance_C);
+    }
+}
+
 void heat_step(rig_t *rig) {
     heat_t *heat = &rig->heat;
     const plant_t *plant = &rig->plant;
@@ -68,6 +86,7 @@ void heat_step(rig_t *rig) {
     step(&heat->inverter, plant->phase_converter_J, data->inverter_capacity_J_K, data->inverter_resistance_K_W,
          heat->ambient_C, step_s);
     heat->time_ns = plant->time_ns;
+    follow_resistances(rig);
     convert(rig);
 }
 

@@ -122,6 +122,7 @@ typedef struct {
     uint64_t time_ns; /* of the last step */
     double ambient_C;
     heat_bodies_t winding, inverter;
+    double resistance_C[HAL_PHASES_MAX]; /* temperatures of the windings that the plant's resistances are for */
 } heat_t;
 
 #define RIG_FAULT_KINDS_MAX 128
