@@ -82,6 +82,7 @@ COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *i
         const phase_monitor_phase_t *state = &phases->phase[phase];
         encoder.current_q9[phase] = input->current_q9[phase];
         encoder.flux_q29[phase] = fixed_subtract(input->flux_q29[phase], state->followed_q29);
+        encoder.drop_q29[phase] = phase_monitor_drop_q29(phases, input, phase);
         encoder.zero_at[phase] = state->zero_at;
         encoder.known[phase] = input->periods - state->zero_at < input->periods - phases->lost_at &&
                                !saturated(state->followed_q29) && !saturated(encoder.flux_q29[phase]);
@@ -90,8 +91,8 @@ COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *i
 }
 
 /* Of the same sample: phases that conduct above the currents whose errors are those of the converter, for so short a
- * time that half of the resistance and 1/64 of the DC-link voltage are less than half of the flux linkage. That of the
- * voltage less four fifths of the resistance, which is that of a cold winding. */
+ * time that a warm winding and 1/64 of the DC-link voltage are less than half of the flux linkage. That of the voltage
+ * is that of a cold winding. */
 static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_monitor_input_t *input,
                                              const encoder_monitor_input_t *encoder, uint32_t elapsed, uint32_t step) {
     const uint32_t recent = 10u * drive->control_parameters.initialise_ticks;
@@ -109,13 +110,12 @@ static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_m
         const uint32_t since_zero = encoder->period - encoder->zero_at[phase];
         const int32_t age = (int32_t)(since_zero < recent ? since_zero : recent);
         const int32_t current_q9 = encoder->current_q9[phase];
-        const int32_t resistive_q29 = fixed_multiply_high(current_q9 << 12, input->resistance_period_q40);
-        const int32_t error_q29 = resistive_q29 / 2 + input->period_flux_q29 / 64;
+        const int32_t drop_q29 = encoder->drop_q29[phase];
+        const int64_t error_q29 = applied_flux_warm_q29(drop_q29) + fixed_product(input->period_flux_q29 / 64, age);
         const int32_t table_q29 = drive->phases.phase[phase].table_q29;
-        sample.flux_q29[phase] = fixed_saturate(encoder->flux_q29[phase] + fixed_product(resistive_q29 / 5, age));
+        sample.flux_q29[phase] = fixed_add(encoder->flux_q29[phase], applied_flux_cold_q29(drop_q29));
         sample.table_q29[phase] = table_q29;
-        sample.known[phase] = encoder->known[phase] && since_zero < recent &&
-                              fixed_product(error_q29, age) < table_q29 / 2 &&
+        sample.known[phase] = encoder->known[phase] && since_zero < recent && error_q29 < table_q29 / 2 &&
                               current_q9 > machine_tables.current_range_q9 / 32;
     }
     return sample;

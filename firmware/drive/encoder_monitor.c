@@ -109,10 +109,9 @@ int32_t encoder_monitor_flux_error_q29(int64_t acceleration, int32_t current_q9,
     return 2 * fixed_multiply_high(rise_q29, (int32_t)step);
 }
 
-/* Error of the integral in a period that is none: of the voltage, and of the resistance at a phase's current, Wb,
- * Q2.29. moves: the rotor has been seen to move in this run. */
+/* Error of the voltage in a period that is none, Wb, Q2.29. moves: the rotor has been seen to move in this run. */
 static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const encoder_monitor_input_t *input,
-                        unsigned index, bool moves) {
+                        bool moves) {
     const int32_t part_q29 = input->flux_step_max_q29 >> PART_SHIFT;
     const int32_t short_q29 = part_q29 * (int32_t)(parameters->rate_hz / SHORT_PERIOD_HZ);
     const int32_t suppressed_q29 =
@@ -120,15 +119,18 @@ static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const en
                                         parameters->rate_hz / 1000u) /
         2; /* on average */
     const int64_t error_q29 = parameters->flux_error_q29;
-    return (moves ? MOVING_FACTOR * (error_q29 + short_q29) + part_q29
-                  : error_q29 + (suppressed_q29 > short_q29 ? suppressed_q29 : short_q29)) +
-           fixed_multiply_high(input->current_q9[index] << 12, parameters->resistance_error_q40);
+    return moves ? MOVING_FACTOR * (error_q29 + short_q29) + part_q29
+                 : error_q29 + (suppressed_q29 > short_q29 ? suppressed_q29 : short_q29);
 }
 
-/* Error of the integral that is none, Wb, Q2.29, age control periods after the phase was without current. */
+/* Error that is none of an integral that is too small, by a cold winding, or too large, by a warm one, Wb, Q2.29, age
+ * control periods after the phase was without current. */
 static int32_t drift_since_zero_q29(const encoder_monitor_parameters_t *parameters,
-                                    const encoder_monitor_input_t *input, unsigned index, uint32_t age) {
-    return fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, index, true) * (int32_t)age);
+                                    const encoder_monitor_input_t *input, unsigned index, uint32_t age, bool small) {
+    const int32_t drop_q29 = input->drop_q29[index];
+    const int32_t resistive_q29 = small ? applied_flux_cold_q29(drop_q29) : applied_flux_warm_q29(drop_q29);
+    return fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, true) * (int32_t)age +
+                          resistive_q29);
 }
 
 /* False when no angle at all explains the integral at the measured current, by the tolerances of contradicts(): then
@@ -141,10 +143,10 @@ static bool fits_an_angle(const encoder_monitor_parameters_t *parameters, const 
     }
     const int32_t flux_q29 = input->flux_q29[index];
     const flux_range_t range = flux_range(HALF_REV, HALF_REV, input->current_q9[index], CURRENT_ERROR_Q9);
-    const int32_t drift_q29 = drift_since_zero_q29(parameters, input, index, age);
     const int32_t least_q29 = range.least_q29 - (range.least_q29 >> GAIN_SHIFT);
     const int32_t most_q29 = fixed_add(range.most_q29, range.most_q29 >> GAIN_SHIFT);
-    return flux_q29 >= fixed_subtract(least_q29, drift_q29) && flux_q29 <= fixed_add(most_q29, drift_q29);
+    return flux_q29 >= fixed_subtract(least_q29, drift_since_zero_q29(parameters, input, index, age, true)) &&
+           flux_q29 <= fixed_add(most_q29, drift_since_zero_q29(parameters, input, index, age, false));
 }
 
 /* First-order step of a value towards another, by a part in Q15. */
@@ -171,6 +173,7 @@ static void refer(encoder_monitor_phase_t *phase, const encoder_monitor_input_t 
     phase->table_q29 = phase->last_table_q29 = table_q29;
     phase->referred_at = input->period;
     phase->zero_at = input->zero_at[index];
+    phase->drop_q29 = 0;
     phase->moved = 0;
 }
 
@@ -190,7 +193,12 @@ static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_mo
     const uint32_t leak_periods = parameters->rate_hz >> LEAK_SHIFT;
     const uint32_t age = input->period - phase->referred_at;
     const uint32_t summed = age < leak_periods ? age : leak_periods;
-    const int32_t drift_q29 = fixed_saturate(drift_of(parameters, input, index, moves) * (int32_t)summed);
+    const int32_t drop_q29 = fixed_multiply_high(current_q9 << 12, parameters->resistance_period_q40);
+    phase->drop_q29 = fixed_saturate(phase->drop_q29 + (int64_t)drop_q29 * (int32_t)(periods & 0xffffu));
+    const bool falls = excess_q29 < phase->excess_q29;
+    const int32_t drift_q29 =
+        fixed_saturate(drift_of(parameters, input, moves) * (int32_t)summed +
+                       (falls ? applied_flux_cold_q29(phase->drop_q29) : applied_flux_warm_q29(phase->drop_q29)));
     const int32_t change_q29 = fixed_abs(fixed_subtract(excess_q29, phase->excess_q29));
     const int32_t tolerance_q29 = drift_q29 + (range.most_q29 - range.least_q29) + (table_q29 >> SHAPE_SHIFT) +
                                   (fixed_abs(table_q29 - phase->table_q29) >> GAIN_SHIFT);
@@ -210,6 +218,7 @@ static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_mo
     const int32_t part_q15 = (int32_t)(((periods < leak_periods ? periods : leak_periods) << 15) / leak_periods);
     phase->excess_q29 = leak(phase->excess_q29, excess_q29, part_q15);
     phase->table_q29 = leak(phase->table_q29, table_q29, part_q15);
+    phase->drop_q29 = leak(phase->drop_q29, 0, part_q15);
     return phase->moved > parameters->rate_hz >> FROZEN_SHIFT;
 }
 
@@ -224,8 +233,8 @@ static bool contradicts(const encoder_monitor_parameters_t *parameters, encoder_
     const int32_t flux_q29 = input->flux_q29[index];
     const flux_range_t range =
         flux_range(angle, parameters->angle_max + parameters->half_count, input->current_q9[index], CURRENT_ERROR_Q9);
-    const int32_t drift_q29 = drift_since_zero_q29(parameters, input, index, age);
     const bool below = flux_q29 < range.least_q29;
+    const int32_t drift_q29 = drift_since_zero_q29(parameters, input, index, age, below);
     const int32_t limit_q29 = below ? range.least_q29 : range.most_q29;
     const int32_t beyond_q29 = below ? fixed_subtract(limit_q29, flux_q29) : fixed_subtract(flux_q29, limit_q29);
     const int32_t tolerance_q29 = fixed_add(limit_q29 >> GAIN_SHIFT, drift_q29);

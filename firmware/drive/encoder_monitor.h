@@ -12,7 +12,8 @@
  *               an edge that came too early, or with a rotor on which it has just begun, its speed is not the rotor's.
  *
  * Frozen and angle compare two ways to the flux linkage, voltage and time on the one side, current and angle on the
- * other. A rotor that does not move, stalled or held by friction, contradicts nothing. Derived here.
+ * other, and count when no resistance that a winding may have explains the difference (control/applied_flux.h). A rotor
+ * that does not move, stalled or held by friction, contradicts nothing. Derived here.
  */
 #ifndef DRIVE_ENCODER_MONITOR_H
 #define DRIVE_ENCODER_MONITOR_H
@@ -33,22 +34,19 @@
 #define ENCODER_MONITOR_ADVANCE_STROKES 64u
 #define ENCODER_MONITOR_ADVANCE_COUNTS 2u
 
-/* Error of the resistance that is none, a part of it: a winding 120 K warmer than its parameter has 47 % more. */
-#define ENCODER_MONITOR_RESISTANCE_PART 2
-
 typedef struct {
     commutation_parameters_t commutation;
-    uint32_t half_count;          /* of the encoder, 2^-32 electrical rev */
-    uint32_t middle;              /* of a count, 2^-32 rev */
-    int32_t advance_min;          /* of a rotor that soon brings the next phase, 2^-32 rev */
-    uint32_t angle_max;           /* error of the angle that is none, 2^-32 electrical rev */
-    int32_t flux_error_q29;       /* of the integral in a period, encoder_monitor_flux_error_q29() */
-    int32_t resistance_error_q40; /* of the resistance, times the control period, ohm s, Q-9.40 */
-    uint32_t rate_hz;             /* of the control periods */
-    int32_t current_min_q9;       /* of a phase that is checked, A, Q7.9 */
-    int32_t over_speed_q22;       /* limit of the speed's magnitude, rad/s, Q9.22 */
-    int32_t travel;               /* of a period at that speed, 2^-32 rev */
-    int32_t travel_change;        /* from period to period, the largest of a rotor, 2^-32 rev */
+    uint32_t half_count;           /* of the encoder, 2^-32 electrical rev */
+    uint32_t middle;               /* of a count, 2^-32 rev */
+    int32_t advance_min;           /* of a rotor that soon brings the next phase, 2^-32 rev */
+    uint32_t angle_max;            /* error of the angle that is none, 2^-32 electrical rev */
+    int32_t flux_error_q29;        /* of the integral in a period, encoder_monitor_flux_error_q29() */
+    int32_t resistance_period_q40; /* R Ts, ohm s, Q-9.40 */
+    uint32_t rate_hz;              /* of the control periods */
+    int32_t current_min_q9;        /* of a phase that is checked, A, Q7.9 */
+    int32_t over_speed_q22;        /* limit of the speed's magnitude, rad/s, Q9.22 */
+    int32_t travel;                /* of a period at that speed, 2^-32 rev */
+    int32_t travel_change;         /* from period to period, the largest of a rotor, 2^-32 rev */
 } encoder_monitor_parameters_t;
 
 typedef struct {
@@ -60,6 +58,7 @@ typedef struct {
     int32_t current_q9[HAL_PHASES_MAX];
     uint32_t period;                  /* of the sample, modulo 2^32 */
     int32_t flux_q29[HAL_PHASES_MAX]; /* by the applied voltage since the phase was last without current, Wb, Q2.29 */
+    int32_t drop_q29[HAL_PHASES_MAX]; /* what the resistive drop has taken from it, Wb, Q2.29, >= 0 */
     uint32_t zero_at[HAL_PHASES_MAX]; /* period in which it was */
     bool known[HAL_PHASES_MAX];       /* no trigger was lost since */
     bool lost;                        /* triggers were lost since the previous input */
@@ -73,6 +72,7 @@ typedef struct {
     int32_t current_q9;      /* at the reference, the largest since the count, A, Q7.9 */
     int32_t excess_q29;      /* of the integral over the tables at the reference, with a leak, Wb, Q2.29 */
     int32_t table_q29;       /* flux linkage by the tables, likewise */
+    int32_t drop_q29;        /* what the resistive drop has taken from the integral since, likewise, >= 0 */
     int32_t last_excess_q29; /* of the last sample, Wb, Q2.29 */
     int32_t last_table_q29;
     uint32_t referred_at; /* period of the reference */

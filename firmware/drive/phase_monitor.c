@@ -63,14 +63,29 @@ NOINLINE static uint32_t distance_of(const phase_monitor_input_t *input, unsigne
     return phase_map_distance(input->electrical - phase * input->stroke - (uint32_t)input->misalignment[phase]);
 }
 
-/* Tolerance of the integral, Wb, Q2.29: what has accumulated since the phase was at rest, or in FOLLOW_MS. */
+/* Tolerance of the integral but for the resistance, Wb, Q2.29: what has accumulated since the phase was at rest, or in
+ * FOLLOW_MS. */
 static int32_t slack_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase) {
-    const phase_monitor_input_t *input = common->input;
-    const int32_t resistive_q29 = fixed_multiply_high(input->current_q9[phase] << 12, input->resistance_period_q40);
-    const int32_t error_q29 = resistive_q29 / 2 + common->error_q29;
     /* An error at the largest flux linkage remains while it falls. */
-    const int32_t fallen_q29 = state->peak_q29 - input->flux_q29[phase];
-    return fixed_saturate((int64_t)error_q29 * (int32_t)state->conducting + common->delay_q29 + fallen_q29 / 4);
+    const int32_t fallen_q29 = state->peak_q29 - common->input->flux_q29[phase];
+    return fixed_saturate((int64_t)common->error_q29 * (int32_t)state->conducting + common->delay_q29 + fallen_q29 / 4);
+}
+
+/* Least and largest flux linkage that the voltage may have built up, Wb, Q2.29. */
+static int32_t least_applied_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase) {
+    const int32_t warm_q29 = applied_flux_warm_q29(state->followed_drop_q29);
+    return fixed_subtract(common->input->flux_q29[phase], fixed_add(slack_q29(common, state, phase), warm_q29));
+}
+
+static int32_t most_applied_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase) {
+    const int32_t cold_q29 = applied_flux_cold_q29(state->followed_drop_q29);
+    return fixed_add(common->input->flux_q29[phase], fixed_add(slack_q29(common, state, phase), cold_q29));
+}
+
+/* R i over the periods between two inputs, Wb, Q2.29. */
+static int32_t drop_step_q29(const phase_monitor_input_t *input, unsigned phase, uint32_t elapsed) {
+    const int32_t period_q29 = fixed_multiply_high(input->current_q9[phase] << 12, input->resistance_period_q40);
+    return fixed_non_negative(fixed_saturate((int64_t)period_q29 * (int32_t)(elapsed & 0xffffu)));
 }
 
 static bool small(const common_t *common, unsigned phase) {
@@ -91,9 +106,8 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
     const int32_t table_q29 = state->table_q29;
     const int32_t current_q9 = common->input->current_q9[phase];
     const int32_t flux_q29 = common->input->flux_q29[phase];
-    const int32_t slack = slack_q29(common, state, phase);
-    int32_t high_q29 = fixed_subtract(flux_q29, slack);
-    const int32_t low_q29 = fixed_add(flux_q29, slack);
+    int32_t high_q29 = least_applied_q29(common, state, phase);
+    const int32_t low_q29 = most_applied_q29(common, state, phase);
     const bool is_small = small(common, phase);
     if (!is_small || flux_q29 < state->base_q29 || common->elapsed > common->input->periods_per_ms / 2u) {
         state->base_q29 = flux_q29;
@@ -101,7 +115,8 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
     if (is_small) { /* errors of the past do not count: only what has been built up since */
         high_q29 = fixed_subtract(flux_q29, fixed_add(state->base_q29, common->delay_q29));
         state->base_q29 =
-            fixed_saturate(state->base_q29 + 2 * (int64_t)common->error_q29 * (int32_t)(common->elapsed & 0xffffu));
+            fixed_saturate(state->base_q29 + 2 * (int64_t)common->error_q29 * (int32_t)(common->elapsed & 0xffffu) +
+                           applied_flux_warm_q29(drop_step_q29(common->input, phase, common->elapsed)));
     }
     *side = 0;
     if (high_q29 <= table_q29 && low_q29 >= table_q29) {
@@ -163,7 +178,9 @@ static bool at_rest(const common_t *common, phase_monitor_t *monitor, unsigned p
     const uint32_t periods = state->rest_q29 == 0 ? 1 : common->elapsed & 0xffffu;
     monitor->suspicious |= input->current_q9[phase] > 2 * common->offset_q9;
     state->rest_q29 = fixed_saturate(state->rest_q29 + (int64_t)input->period_flux_q29 * (int32_t)periods);
-    if (state->rest_q29 < fixed_add(state->peak_q29 / 4, common->delay_q29)) {
+    /* Of a cold winding the integral is 0 before the flux linkage is. */
+    const int32_t remains_q29 = applied_flux_cold_q29(state->followed_drop_q29);
+    if (state->rest_q29 < fixed_add(fixed_add(state->peak_q29 / 4, common->delay_q29), remains_q29)) {
         return false;
     }
     if (input->current_q9[phase] <= 2 * common->offset_q9) {
@@ -181,7 +198,8 @@ static bool does_not_fall(const common_t *common, phase_monitor_phase_t *state, 
     const int32_t flux_q29 = common->input->flux_q29[phase];
     if (!common->input->off[phase] || !state->was_off || common->lost) {
         state->off_flux_q29 = flux_q29;
-        state->off_all_q29 = fixed_add(flux_q29, fixed_clamp(-state->followed_q29, 0, INT32_MAX));
+        state->off_all_q29 = fixed_add(fixed_add(flux_q29, fixed_clamp(-state->followed_q29, 0, INT32_MAX)),
+                                       applied_flux_cold_q29(state->drop_q29));
         state->off_table_q29 = state->table_q29;
     }
     state->was_off = common->input->off[phase];
@@ -191,8 +209,9 @@ static bool does_not_fall(const common_t *common, phase_monitor_phase_t *state, 
            fixed_product(fallen_q29, state->off_all_q29) < fixed_product(removed_q29, state->off_table_q29) / 4;
 }
 
-/* True when the integral has gone only because the tables have taken most of it away, more than the drops of the
- * devices explain, a seventh of the error of the voltage, twice that after a small current: by voltage and time alone
+/* True when the integral has gone only because the tables have taken most of it away, more than a warm winding and the
+ * drops of the devices explain, a seventh of the error of the voltage, twice that after a small current: by voltage and
+ * time alone
  * the current may flow, and it is the angle of the tables that is wrong. At most all of it: what is more has added up
  * in a long stroke. */
 static bool taken_away(const common_t *common, const phase_monitor_phase_t *state) {
@@ -200,7 +219,8 @@ static bool taken_away(const common_t *common, const phase_monitor_phase_t *stat
     const bool was_small = state->conducting > FOLLOW_MS * common->input->periods_per_ms;
     const int64_t drops_q29 = (int64_t)(common->error_q29 / 7 * (was_small ? 2 : 1)) * age;
     const int64_t taken_q29 = -(int64_t)state->followed_q29;
-    return taken_q29 > state->peak_q29 / 2 + drops_q29 && taken_q29 < 2 * (int64_t)state->peak_q29;
+    const int32_t warm_q29 = applied_flux_warm_q29(state->drop_q29);
+    return taken_q29 > state->peak_q29 / 2 + drops_q29 + warm_q29 && taken_q29 < 2 * (int64_t)state->peak_q29;
 }
 
 /* A current that should not be: does it move? */
@@ -304,7 +324,7 @@ static uint32_t phases_that_lack(const common_t *common, const phase_monitor_t *
         const bool vanished =
             state->vanished && input->periods - state->vanished_at < VANISHED_MS * input->periods_per_ms;
         const int32_t table_q29 = fixed_add(state->table_q29, state->table_q29 / 4);
-        const bool less = fixed_subtract(input->flux_q29[phase], slack_q29(common, state, phase)) > table_q29;
+        const bool less = least_applied_q29(common, state, phase) > table_q29;
         const bool none = !input->off[phase] && input->current_q9[phase] <= common->offset_q9 &&
                           input->flux_q29[phase] > common->delay_q29 / 2;
         lacking |= (uint32_t)(vanished || less || none) << phase;
@@ -322,7 +342,7 @@ static int32_t correction_of(const common_t *common, phase_monitor_phase_t *stat
             state->vanished_at = input->periods;
         }
         state->zero_at = input->periods;
-        state->followed_q29 = 0;
+        state->followed_q29 = state->drop_q29 = state->followed_drop_q29 = 0;
         return -flux_q29;
     }
     if (input->off[phase] && gone(input, phase) && input->next_q29[phase] == 0) {
@@ -337,8 +357,23 @@ static int32_t correction_of(const common_t *common, phase_monitor_phase_t *stat
     const uint32_t follow = FOLLOW_MS * input->periods_per_ms;
     const bool set = common->lost || common->elapsed >= follow;
     const int32_t correction_q29 = set ? error_q29 : error_q29 / (int32_t)follow * (int32_t)common->elapsed;
+    const int32_t drop_q29 = state->followed_drop_q29;
+    state->followed_drop_q29 = set ? 0 : drop_q29 - drop_q29 / (int32_t)follow * (int32_t)common->elapsed;
     state->followed_q29 = fixed_add(state->followed_q29, correction_q29);
     return correction_q29;
+}
+
+int32_t phase_monitor_drop_q29(const phase_monitor_t *monitor, const phase_monitor_input_t *input, unsigned phase) {
+    return fixed_add(monitor->phase[phase].drop_q29, drop_step_q29(input, phase, input->periods - monitor->periods));
+}
+
+/* An integral that is held at 0 has no error of the resistance more than before. */
+static void add_drop(const common_t *common, phase_monitor_phase_t *state, unsigned phase) {
+    if (!common->input->off[phase] || common->input->flux_q29[phase] > 0) {
+        const int32_t step_q29 = drop_step_q29(common->input, phase, common->elapsed);
+        state->drop_q29 = fixed_add(state->drop_q29, step_q29);
+        state->followed_drop_q29 = fixed_add(state->followed_drop_q29, step_q29);
+    }
 }
 
 static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t *tables,
@@ -395,6 +430,7 @@ COLD uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_
         const int32_t current_q9 = input->current_q9[phase];
         const bool zero = input->off[phase] && current_q9 <= common.offset_q9;
         monitor->phase[phase].table_q29 = zero ? 0 : phase_map_flux_q29(tables, distance_of(input, phase), current_q9);
+        add_drop(&common, &monitor->phase[phase], phase);
         const uint32_t failed_of_phase = check_phase(&common, monitor, phase);
         in_excess |= (uint32_t)(monitor->phase[phase].excess_periods > 0) << phase;
         monitor->phases |= (uint32_t)(failed_of_phase != 0) << phase;

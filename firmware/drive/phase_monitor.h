@@ -8,11 +8,13 @@
  *                   the one that lacks it
  *   encoder_angle   a current that is only too large because the tables, at a wrong angle, have emptied the integral
  *
- * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical; resistance 50 % and
- * voltage 1/64, or the converter's shortest pulse if that is more, since the phase was at rest, at most over 10 ms,
- * twice that at small currents; a quarter of psi that has been removed since; and psi of a period and 20 us at the
- * DC-link voltage, for the delays of sensor and switches. At a current of up to 4/128 of its range, a small one,
- * phase_open counts only what more than this tolerance of the voltage has built up since the current was larger.
+ * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical; any resistance that
+ * a winding may have, of the integral of R i (control/applied_flux.h); voltage 1/64, or the converter's shortest pulse
+ * if that is more, since the phase was at rest, at most over 10 ms, twice that at small currents; a quarter of psi that
+ * has been removed since; and psi of a period and 20 us at the DC-link voltage, for the delays of sensor and switches.
+ * psi is affine in the resistance: what differs at both of its limits, the same way, differs at every resistance. At a
+ * current of up to 4/128 of its range, a small one, phase_open counts only what more than this tolerance of voltage
+ * and resistance has built up since the current was larger.
  *
  * A current also is one that should not be when both switches are open and the voltage has removed a quarter of psi of
  * which the tables saw less than a quarter disappear: freewheeling by a shorted switch.
@@ -67,6 +69,8 @@ typedef struct {
     uint8_t open_samples;      /* in succession with less current than at any angle */
     uint32_t zero_at;          /* period in which the phase was last without current */
     int32_t followed_q29;      /* sum of the corrections since, Wb, Q2.29 */
+    int32_t drop_q29;          /* integral of R i since the phase was without current, Wb, Q2.29, >= 0 */
+    int32_t followed_drop_q29; /* the same with the corrections that the flux linkage has had, likewise */
     int32_t table_q29;         /* flux linkage by the tables at the last input, Wb, Q2.29; 0 without current */
     int32_t off_flux_q29;      /* flux linkage by the voltage when the switches opened, Wb, Q2.29 */
     int32_t off_all_q29;       /* the same with what the tables had taken away from it */
@@ -100,6 +104,10 @@ typedef struct {
  * each phase's integral. [background] */
 uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_t *tables,
                             const phase_monitor_input_t *input, int32_t correction_q29[HAL_PHASES_MAX]);
+
+/* Integral of R i since a phase was without current, at the sample of an input that has not been checked yet, Wb,
+ * Q2.29. [background] */
+int32_t phase_monitor_drop_q29(const phase_monitor_t *monitor, const phase_monitor_input_t *input, unsigned phase);
 
 /* Forgets the failed checks of a run that goes on without these phases, a bit each: their switches stay open, and from
  * now on only a current in them fails, once the voltage has removed their flux linkage. 0: none are lost.
