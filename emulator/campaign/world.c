@@ -53,6 +53,10 @@ enum {
 #define REFUSED_SHARE 0.05       /* and of one, which does not turn then */
 #define KEEPING_SHARE 0.5        /* the reference stays in the frames of stop and off */
 
+/* Resistance of copper at -40 and at 155 C, of that at 25 C. Temperatures that the drive measures limit its torque. */
+#define COLD_GAIN 0.75
+#define WARM_GAIN 1.5
+
 /* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
  * not. */
 #define SILENT_PART 0.12
@@ -130,14 +134,16 @@ static void draw_imperfections(world_t *world) {
         double value;
     } all[] = {
         {BENCH_VARIABLE_FLUX_LINKAGE_GAIN, seeded_between(seed, STREAM_IMPERFECTION, 0, 0.95, 1.05)},
-        {BENCH_VARIABLE_RESISTANCE_GAIN, seeded_between(seed, STREAM_IMPERFECTION, 1, 0.8, 1.4)},
+        {BENCH_VARIABLE_RESISTANCE_GAIN, seeded_between(seed, STREAM_IMPERFECTION, 1, world->healthy ? COLD_GAIN : 0.8,
+                                                        world->healthy ? WARM_GAIN : 1.4)},
         {BENCH_VARIABLE_INERTIA_GAIN, world->inertia_gain},
         {BENCH_VARIABLE_FRICTION_GAIN, seeded_between(seed, STREAM_IMPERFECTION, 3, 0.0, 3.0)},
         {BENCH_VARIABLE_ENCODER_OFFSET_DEG, seeded_between(seed, STREAM_IMPERFECTION, 4, -0.1, 0.1)},
         {BENCH_VARIABLE_CURRENT_NOISE_A, seeded_between(seed, STREAM_IMPERFECTION, 5, 0.0, 0.0005 * range_A)},
     };
     for (unsigned i = 0; i < sizeof all / sizeof *all; i++) {
-        if (seeded_unit(seed, STREAM_IMPERFECTION, 100 + i) < 0.5) {
+        const bool always = world->healthy && all[i].variable == BENCH_VARIABLE_RESISTANCE_GAIN;
+        if (seeded_unit(seed, STREAM_IMPERFECTION, 100 + i) < 0.5 || always) {
             add_set(world, all[i].variable, all[i].value, all[i].value, 0, 0);
         } else if (all[i].variable == BENCH_VARIABLE_INERTIA_GAIN) {
             world->inertia_gain = 1.0;

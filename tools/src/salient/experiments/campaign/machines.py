@@ -26,7 +26,7 @@ def files() -> tuple[Path, ...]:
 
 def pool_file() -> Path:
     """The machines as salient_campaign reads them (emulator/campaign/main.c)."""
-    lines = [_line(path) for path in files()]
+    lines = [pool_line(path) for path in files()]
     path = BUILD / "campaign" / "machines.txt"
     path.parent.mkdir(parents=True, exist_ok=True)
     text = "".join(f"{line}\n" for line in lines)
@@ -45,7 +45,8 @@ VOLTAGE_FRACTION_BITS = 6
 """Of voltages in telemetry, where the unit is 1 V."""
 
 
-def _line(path: Path) -> str:
+def pool_line(path: Path) -> str:
+    """The line of a machine in a file of machines."""
     machine = load_machine(path)
     scaling = scaling_of(path, machine)
     data = scaling.data
