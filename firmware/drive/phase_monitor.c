@@ -367,13 +367,10 @@ int32_t phase_monitor_drop_q29(const phase_monitor_t *monitor, const phase_monit
     return fixed_add(monitor->phase[phase].drop_q29, drop_step_q29(input, phase, input->periods - monitor->periods));
 }
 
-/* An integral that is held at 0 has no error of the resistance more than before. */
 static void add_drop(const common_t *common, phase_monitor_phase_t *state, unsigned phase) {
-    if (!common->input->off[phase] || common->input->flux_q29[phase] > 0) {
-        const int32_t step_q29 = drop_step_q29(common->input, phase, common->elapsed);
-        state->drop_q29 = fixed_add(state->drop_q29, step_q29);
-        state->followed_drop_q29 = fixed_add(state->followed_drop_q29, step_q29);
-    }
+    const int32_t step_q29 = drop_step_q29(common->input, phase, common->elapsed);
+    state->drop_q29 = fixed_add(state->drop_q29, step_q29);
+    state->followed_drop_q29 = fixed_add(state->followed_drop_q29, step_q29);
 }
 
 static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t *tables,

@@ -286,6 +286,37 @@ TEST_F(EncoderMonitor, integral_that_parts_faster_than_a_rotor_can_turn_is_no_fr
     }
 }
 
+TEST_F(EncoderMonitor, flux_linkage_that_a_warm_or_a_cold_winding_explains_does_not_contradict_the_angle) {
+    const struct {
+        double excess_Wb, drop_Wb;
+        bool fails;
+    } cases[] = {{0.1, 0.0, true},  {0.1, 0.05, true}, {0.1, 0.2, false},
+                 {-0.1, 0.0, true}, {-0.1, 0.1, true}, {-0.1, 0.4, false}};
+    for (const auto &one : cases) {
+        monitor = {};
+        flux_offset_q29 = to_fixed(one.excess_Wb, Q29);
+        for (int k = 0; k < 400; k++) {
+            const unsigned phase = k / 100 % 2;
+            input.zero_at[phase] = k % 100 == 0 ? input.period : input.zero_at[phase];
+            std::fill_n(input.drop_q29, PHASES, to_fixed(one.drop_Wb, Q29));
+            step(65.0 + 30.0 * phase, 65.0 + 30.0 * phase, 25.0, phase);
+        }
+        EXPECT_EQ(monitor.angle, one.fails) << one.excess_Wb << " " << one.drop_Wb;
+    }
+}
+
+TEST_F(EncoderMonitor, an_integral_that_drifts_by_a_warm_or_a_cold_winding_is_no_frozen_encoder) {
+    parameters.resistance_period_q40 = int32_t(0.4 * PERIOD_S * 0x1p40); // 10 V at 25 A
+    for (const auto &[factor, frozen] : {std::pair{0.4, true}, {0.72, false}, {1.55, false}, {2.3, true}}) {
+        monitor = {};
+        for (int k = 0; k < 2000; k++) {
+            flux_offset_q29 = to_fixed((factor - 1.0) * 10.0 * PERIOD_S * std::min(k, 400), Q29);
+            step(75.0, 75.0, 25.0);
+        }
+        EXPECT_EQ(monitor.frozen, frozen) << factor;
+    }
+}
+
 TEST_F(EncoderMonitor, flux_linkage_that_no_angle_explains_is_no_error_of_the_encoder) {
     // Aligned, 25 A are 0.34 Wb; the integral of two phases says far more, or less than unaligned.
     for (const double excess_Wb : {0.35, -0.3}) {

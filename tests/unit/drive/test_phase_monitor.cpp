@@ -101,6 +101,49 @@ TEST_F(PhaseMonitor, current_and_flux_linkage_within_the_tolerances_agree) {
     }
 }
 
+// R i is up to 0.8 of the DC-link voltage. The current rises and falls; the integral with the parameter's resistance
+// errs by what the winding's has taken more or less than that, and follows the tables.
+TEST_F(PhaseMonitor, a_winding_from_minus_40_to_155_C_is_no_fault_while_its_current_falls_and_one_far_beyond_is) {
+    constexpr double OHM = 10.0, PERIOD_S = 25e-6;
+    input.resistance_period_q40 = int32_t(OHM * PERIOD_S * 0x1p40);
+    input.electrical = 0; // aligned: no other angle explains more
+    const struct {
+        double factor;
+        uint32_t failed;
+    } windings[] = {{0.72, 0}, {1.0, 0}, {1.55, 0}, {1.9, FAULT_BIT(FAULT_PHASE_OPEN)}};
+    for (const auto &winding : windings) {
+        monitor = {};
+        double error_Wb = 0.0;
+        const int periods = periods_to_fault(330, [&](int k) {
+            const double current_A = k < 200 ? 0.1 * k : 20.0 - 0.13 * (k - 200);
+            error_Wb += correction_q29[0] / Q29;
+            set(0, current_A, std::max(0.0, table_Wb(current_A) + error_Wb));
+            error_Wb += (winding.factor - 1.0) * OHM * current_A * PERIOD_S;
+        });
+        EXPECT_EQ(failed, winding.failed) << winding.factor;
+        EXPECT_EQ(periods > 0, winding.failed != 0) << winding.factor << " " << periods;
+    }
+}
+
+TEST_F(PhaseMonitor, the_resistive_drop_is_summed_from_zero_to_zero_current) {
+    input.resistance_period_q40 = int32_t(2.0 * 25e-6 * 0x1p40);
+    input.electrical = MIDDLE;
+    for (int k = 0; k < 40; k++) {
+        set(0, 10.0, table_Wb(10.0));
+        step();
+    }
+    EXPECT_NEAR(monitor.phase[0].drop_q29 / Q29, 40 * 20.0 * 25e-6, 1e-6);
+    EXPECT_LT(monitor.phase[0].followed_drop_q29, monitor.phase[0].drop_q29);
+    EXPECT_GT(monitor.phase[0].followed_drop_q29, monitor.phase[0].drop_q29 / 10 * 9) << "a tenth of 10 ms";
+    input.periods += 3;
+    EXPECT_NEAR(phase_monitor_drop_q29(&monitor, &input, 0) / Q29, 43 * 20.0 * 25e-6, 1e-6);
+    input.current_q9[0] = 0;
+    input.off[0] = true;
+    step();
+    EXPECT_EQ(monitor.phase[0].drop_q29, 0);
+    EXPECT_EQ(monitor.phase[0].followed_drop_q29, 0);
+}
+
 TEST_F(PhaseMonitor, constant_current_at_rest_is_the_sensor_s_after_a_quarter_of_a_millisecond) {
     const int periods = periods_to_fault(100, [&](int) { input.current_q9[1] = 5 * 512; });
     EXPECT_EQ(failed, FAULT_BIT(FAULT_CURRENT_SENSOR));

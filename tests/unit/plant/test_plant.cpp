@@ -150,6 +150,26 @@ TEST(Plant, AlignedLinearPhaseHasTheRlStepResponse) {
     EXPECT_EQ(plant.speed_rad_s, 0.0);
 }
 
+TEST(Plant, ResistanceOfEachWindingIsThatOfCopperAtItsTemperature) {
+    machine_t machine = machine_of(MAGNETICS_LINEAR_COSINE);
+    machine.resistance_ohm = 2.0;
+    for (const auto &[temperature_C, factor] : {std::pair{-40.0, 0.75}, {25.0, 1.0}, {155.0, 1.5}}) {
+        plant_t plant;
+        plant_init(&plant, &machine, 0.0);
+        const double temperatures_C[HAL_PHASES_MAX] = {temperature_C, 300.0, -100.0, 25.0};
+        plant_set_winding_temperatures(&plant, temperatures_C);
+        const plant_gains_t gains = {1.0, 1.1, 1.0, 1.0};
+        plant_set_gains(&plant, &gains); // both hold
+        const hal_pwm_compare_t compare = compare_of({TICKS}, {TICKS});
+        plant_set_switches(&plant, &compare, TICKS);
+        plant_advance(&plant, 20000000u);
+        const double ohm = 1.1 * 2.0 * factor;
+        EXPECT_NEAR(plant.current_A[0], 240.0 / ohm * -std::expm1(-ohm / 23.6e-3 * 20e-3), 1e-8) << temperature_C;
+        const double drawn_J = plant.energy_drawn_J - plant_field_energy_J(&plant);
+        EXPECT_NEAR(plant.energy_copper_J, drawn_J, 1e-6 * drawn_J) << temperature_C;
+    }
+}
+
 TEST(Plant, CoastsUnderFrictionAndLoad) {
     const machine_t machine = machine_of(MAGNETICS_SATURATING);
     plant_t plant;

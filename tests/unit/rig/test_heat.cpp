@@ -61,6 +61,22 @@ TEST_F(Heat, AWindingHasTheHeatOfItsLossesLessWhatItGaveAway) {
     EXPECT_NEAR(heat().winding.temperature_C[2], 25.0, 1e-3);
 }
 
+TEST_F(Heat, ResistanceOfAWindingFollowsItsTemperatureInStepsOf1K) {
+    const plant_t &plant = bench.rig->plant;
+    const double file_ohm = machine_plant.resistance_ohm;
+    run_to(500 * MS);
+    ASSERT_GT(heat().winding.temperature_C[1], 25.01);
+    ASSERT_LT(heat().winding.temperature_C[1], 26.0);
+    EXPECT_EQ(plant.winding_ohm[1], file_ohm) << "less than 1 K";
+    for (const auto &[held_C, factor] : {std::pair{155.0, 1.5}, {-40.0, 0.75}, {51.0, 1.1}, {51.9, 1.1}}) {
+        set(HELD_WINDING, held_C);
+        run_to(bench.rig->board.time_ns + 3 * MS);
+        for (unsigned phase = 0; phase < machine_plant.phases; phase++) {
+            EXPECT_NEAR(plant.winding_ohm[phase], factor * file_ohm, 1e-12) << held_C;
+        }
+    }
+}
+
 TEST_F(Heat, CoolsWithItsTimeConstantToTheAmbientTemperature) {
     bench.firmware.lower = 0;
     set(HELD_WINDING, 125.0);
