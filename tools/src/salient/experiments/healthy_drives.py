@@ -37,7 +37,7 @@ def run_drive(number: int) -> tuple[Result, Result] | MachineError:
         pool.write_text(f"{pool_line(machine)}\n", encoding="utf-8")
     except MachineError as refusal:
         return refusal
-    command = [program(), "--machines", pool, "--healthy", "--first", str(number)]
+    command = [str(program()), "--machines", str(pool), "--healthy", "--first", str(number)]
     described, result = (json.loads(subprocess.run([*command, *options], capture_output=True, text=True, check=True)
                                     .stdout) for options in (["--describe"], []))
     return described, result
@@ -47,8 +47,9 @@ def description(described: Result, result: Result) -> str:
     """A line: what a drive is, and its faults."""
     sets = ", ".join(f"{event['event']} {event['value']:.4g} at {1e-6 * event['begin_us']:.3g} s"
                      for event in described["events"])
-    return (f"drive {described['seed']}: {', '.join(names.causes()[cause] for cause in result['causes'])} with {described['controller']}, "
-            f"{described['control_rate_hz']} Hz, {described['encoder_bits']} bits; {sets}")
+    causes = ", ".join(names.causes()[cause] for cause in result["causes"])
+    return (f"drive {described['seed']}: {causes} with {described['controller']}, {described['control_rate_hz']} Hz, "
+            f"{described['encoder_bits']} bits; {sets}")
 
 
 def is_false(result: Result) -> bool:
