@@ -91,7 +91,7 @@ COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *i
 }
 
 /* Of the same sample: phases that conduct above the currents whose errors are those of the converter, for so short a
- * time that a warm winding and 1/64 of the DC-link voltage are less than half of the flux linkage. That of the voltage
+ * time that a warm winding and the error of the voltage are less than half of the flux linkage. That of the voltage
  * is that of a cold winding. */
 static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_monitor_input_t *input,
                                              const encoder_monitor_input_t *encoder, uint32_t elapsed, uint32_t step) {
@@ -106,12 +106,14 @@ static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_m
         .periods_per_ms = drive->control_parameters.initialise_ticks,
         .step = step,
     };
+    const int32_t voltage_q29 =
+        applied_flux_voltage_error_q29(&machine_tables, input->period_flux_q29, input->period_q40);
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         const uint32_t since_zero = encoder->period - encoder->zero_at[phase];
         const int32_t age = (int32_t)(since_zero < recent ? since_zero : recent);
         const int32_t current_q9 = encoder->current_q9[phase];
         const int32_t drop_q29 = encoder->drop_q29[phase];
-        const int64_t error_q29 = applied_flux_warm_q29(drop_q29) + fixed_product(input->period_flux_q29 / 64, age);
+        const int64_t error_q29 = applied_flux_warm_q29(&machine_tables, drop_q29) + fixed_product(voltage_q29, age);
         const int32_t table_q29 = drive->phases.phase[phase].table_q29;
         sample.flux_q29[phase] = fixed_add(encoder->flux_q29[phase], applied_flux_cold_q29(drop_q29));
         sample.table_q29[phase] = table_q29;
@@ -249,6 +251,7 @@ COLD static void check(drive_t *drive, uint32_t time_us) {
     const control_parameters_t *parameters = &drive->control_parameters;
     sample_t sample = {.phases = {.periods_per_ms = parameters->initialise_ticks,
                                   .stroke = parameters->commutation.stroke,
+                                  .period_q40 = parameters->predictive.period_q40,
                                   .resistance_period_q40 = parameters->predictive.flux.resistance_period_q40}};
     if (!read_sample(&drive->control, parameters, &sample)) {
         return;

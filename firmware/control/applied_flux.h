@@ -11,6 +11,7 @@
 
 #include <stdint.h>
 
+#include "control/machine_tables.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "hal.h"
@@ -35,14 +36,27 @@ static inline int32_t applied_flux_shortest_pulse_q29(int32_t period_flux_q29, u
 
 /* Resistance of a winding, of which the drive knows neither temperature nor tolerance: copper is 0.75 of its value at
  * 25 C at -40 C, and 1.5 times it at 155 C ((235 C + T) / 260 K, IEC 60034-1), and 6 % remain for the winding itself:
- * 0.7 to 1.6 times the parameter. So the integral is too small by at most 0.3, and too large by at most 0.6 of what the
- * resistive drop has taken from it. drop_q29: integral of R i, Wb, Q2.29, >= 0. */
+ * 0.7 to 1.6 times the parameter, and the resistance of the devices. So the integral is too small by at most 0.3, and
+ * too large by at most 0.6 of what the resistive drop has taken from it, and what the devices take. drop_q29: integral
+ * of R i, Wb, Q2.29, >= 0; saturates. */
 static inline int32_t applied_flux_cold_q29(int32_t drop_q29) {
     return drop_q29 / 10 * 3;
 }
 
-static inline int32_t applied_flux_warm_q29(int32_t drop_q29) {
-    return drop_q29 / 10 * 6;
+static inline int32_t applied_flux_warm_q29(const machine_tables_t *tables, int32_t drop_q29) {
+    return fixed_multiply(drop_q29, 154 + tables->device_resistance_q8, 8);
+}
+
+/* Threshold voltage of the devices in a period, Wb, Q2.29. */
+static inline int32_t applied_flux_device_q29(const machine_tables_t *tables, int32_t period_q40) {
+    return applied_flux_period_q29(tables->device_drop_most_q6, period_q40);
+}
+
+/* Error of the voltage in a period, Wb, Q2.29: 1/64, or the threshold of the devices if that is more. */
+static inline int32_t applied_flux_voltage_error_q29(const machine_tables_t *tables, int32_t period_flux_q29,
+                                                     int32_t period_q40) {
+    const int32_t device_q29 = applied_flux_device_q29(tables, period_q40);
+    return device_q29 > period_flux_q29 / 64 ? device_q29 : period_flux_q29 / 64;
 }
 
 /* Constants of a period for all phases. */

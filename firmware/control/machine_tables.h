@@ -85,11 +85,14 @@ typedef struct {
 #define MACHINE_PARAMETERS_MAX 64
 
 typedef struct {
-    uint8_t phases;                /* 3 or 4 */
-    uint8_t rotor_poles;           /* electrical revolutions per mechanical revolution */
-    uint8_t speed_exponent;        /* w, 0..3 */
-    uint16_t current_range_q9;     /* full scale of the current sensors, A, unsigned Q7.9 */
-    uint16_t voltage_range_q6;     /* full scale of the DC-link voltage divider, V, unsigned Q10.6 */
+    uint8_t phases;            /* 3 or 4 */
+    uint8_t rotor_poles;       /* electrical revolutions per mechanical revolution */
+    uint8_t speed_exponent;    /* w, 0..3 */
+    uint16_t current_range_q9; /* full scale of the current sensors, A, unsigned Q7.9 */
+    uint16_t voltage_range_q6; /* full scale of the DC-link voltage divider, V, unsigned Q10.6 */
+    /* Of the two devices that a phase's current flows through, the worse kind of switches and diodes. */
+    uint16_t device_drop_most_q6;  /* threshold, V, Q10.6 */
+    uint16_t device_resistance_q8; /* slope, parts of the resistance of the winding, Q8.8, up to 64 */
     uint16_t minimum_pulse_ns;     /* of the converter; shorter pulses and gaps of a switch do not act, 0..2000 */
     int32_t current_slew_rate_A_s; /* di/dt at the unaligned position: supply voltage / inductance */
     /* Below the over-voltage threshold, in which braking torque decreases so that the DC link has room for the fields

@@ -137,6 +137,7 @@ static encoder_monitor_parameters_t encoder_monitor_from(const control_parameter
             load_observer_acceleration(values[PARAMETER_TORQUE_MAX_NM], values[PARAMETER_INERTIA_KG_M2]),
             values[PARAMETER_CURRENT_LIMIT_A] / 2, control->observer.angle_step_q32, rotor_poles),
         .resistance_period_q40 = control->predictive.flux.resistance_period_q40,
+        .period_q40 = control->predictive.period_q40,
         .rate_hz = control_rate_hz,
         .current_min_q9 = values[PARAMETER_CURRENT_LIMIT_A] / 8,
         .over_speed_q22 = over_speed_q22,

@@ -119,8 +119,13 @@ static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const en
                                         parameters->rate_hz / 1000u) /
         2; /* on average */
     const int64_t error_q29 = parameters->flux_error_q29;
-    return moves ? MOVING_FACTOR * (error_q29 + short_q29) + part_q29
-                 : error_q29 + (suppressed_q29 > short_q29 ? suppressed_q29 : short_q29);
+    if (moves) {
+        return MOVING_FACTOR * (error_q29 + short_q29) +
+               applied_flux_voltage_error_q29(&machine_tables, input->flux_step_max_q29, parameters->period_q40);
+    }
+    const int32_t device_q29 = applied_flux_device_q29(&machine_tables, parameters->period_q40);
+    const int32_t pulse_q29 = suppressed_q29 > short_q29 ? suppressed_q29 : short_q29;
+    return error_q29 + (pulse_q29 > device_q29 ? pulse_q29 : device_q29);
 }
 
 /* Error that is none of an integral that is too small, by a cold winding, or too large, by a warm one, Wb, Q2.29, age
@@ -128,7 +133,8 @@ static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const en
 static int32_t drift_since_zero_q29(const encoder_monitor_parameters_t *parameters,
                                     const encoder_monitor_input_t *input, unsigned index, uint32_t age, bool small) {
     const int32_t drop_q29 = input->drop_q29[index];
-    const int32_t resistive_q29 = small ? applied_flux_cold_q29(drop_q29) : applied_flux_warm_q29(drop_q29);
+    const int32_t resistive_q29 =
+        small ? applied_flux_cold_q29(drop_q29) : applied_flux_warm_q29(&machine_tables, drop_q29);
     return fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, true) * (int32_t)age +
                           resistive_q29);
 }
@@ -196,9 +202,9 @@ static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_mo
     const int32_t drop_q29 = fixed_multiply_high(current_q9 << 12, parameters->resistance_period_q40);
     phase->drop_q29 = fixed_saturate(phase->drop_q29 + (int64_t)drop_q29 * (int32_t)(periods & 0xffffu));
     const bool falls = excess_q29 < phase->excess_q29;
-    const int32_t drift_q29 =
-        fixed_saturate(drift_of(parameters, input, moves) * (int32_t)summed +
-                       (falls ? applied_flux_cold_q29(phase->drop_q29) : applied_flux_warm_q29(phase->drop_q29)));
+    const int32_t drift_q29 = fixed_saturate(
+        drift_of(parameters, input, moves) * (int32_t)summed +
+        (falls ? applied_flux_cold_q29(phase->drop_q29) : applied_flux_warm_q29(&machine_tables, phase->drop_q29)));
     const int32_t change_q29 = fixed_abs(fixed_subtract(excess_q29, phase->excess_q29));
     const int32_t tolerance_q29 = drift_q29 + (range.most_q29 - range.least_q29) + (table_q29 >> SHAPE_SHIFT) +
                                   (fixed_abs(table_q29 - phase->table_q29) >> GAIN_SHIFT);

@@ -42,6 +42,7 @@ typedef struct {
     uint32_t angle_max;            /* error of the angle that is none, 2^-32 electrical rev */
     int32_t flux_error_q29;        /* of the integral in a period, encoder_monitor_flux_error_q29() */
     int32_t resistance_period_q40; /* R Ts, ohm s, Q-9.40 */
+    int32_t period_q40;            /* Ts, s, Q-9.40 */
     uint32_t rate_hz;              /* of the control periods */
     int32_t current_min_q9;        /* of a phase that is checked, A, Q7.9 */
     int32_t over_speed_q22;        /* limit of the speed's magnitude, rad/s, Q9.22 */

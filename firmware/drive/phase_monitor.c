@@ -73,7 +73,7 @@ static int32_t slack_q29(const common_t *common, const phase_monitor_phase_t *st
 
 /* Least and largest flux linkage that the voltage may have built up, Wb, Q2.29. */
 static int32_t least_applied_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase) {
-    const int32_t warm_q29 = applied_flux_warm_q29(state->followed_drop_q29);
+    const int32_t warm_q29 = applied_flux_warm_q29(common->tables, state->followed_drop_q29);
     return fixed_subtract(common->input->flux_q29[phase], fixed_add(slack_q29(common, state, phase), warm_q29));
 }
 
@@ -116,7 +116,7 @@ static difference_t compare(const common_t *common, phase_monitor_phase_t *state
         high_q29 = fixed_subtract(flux_q29, fixed_add(state->base_q29, common->delay_q29));
         state->base_q29 =
             fixed_saturate(state->base_q29 + 2 * (int64_t)common->error_q29 * (int32_t)(common->elapsed & 0xffffu) +
-                           applied_flux_warm_q29(drop_step_q29(common->input, phase, common->elapsed)));
+                           applied_flux_warm_q29(common->tables, drop_step_q29(common->input, phase, common->elapsed)));
     }
     *side = 0;
     if (high_q29 <= table_q29 && low_q29 >= table_q29) {
@@ -219,7 +219,7 @@ static bool taken_away(const common_t *common, const phase_monitor_phase_t *stat
     const bool was_small = state->conducting > FOLLOW_MS * common->input->periods_per_ms;
     const int64_t drops_q29 = (int64_t)(common->error_q29 / 7 * (was_small ? 2 : 1)) * age;
     const int64_t taken_q29 = -(int64_t)state->followed_q29;
-    const int32_t warm_q29 = applied_flux_warm_q29(state->drop_q29);
+    const int32_t warm_q29 = applied_flux_warm_q29(common->tables, state->drop_q29);
     return taken_q29 > state->peak_q29 / 2 + drops_q29 + warm_q29 && taken_q29 < 2 * (int64_t)state->peak_q29;
 }
 
@@ -379,6 +379,7 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
     const uint32_t elapsed = input->periods - monitor->periods;
     const int32_t shortest_q29 =
         applied_flux_shortest_pulse_q29(period_q29, tables->minimum_pulse_ns, input->periods_per_ms);
+    const int32_t voltage_q29 = applied_flux_voltage_error_q29(tables, period_q29, input->period_q40);
     return (common_t){
         .tables = tables,
         .input = input,
@@ -387,7 +388,7 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
         .step = (int32_t)(input->electrical - monitor->electrical),
         .offset_q9 = tables->current_range_q9 / 128,
         .delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)input->periods_per_ms),
-        .error_q29 = shortest_q29 > period_q29 / 64 ? shortest_q29 : period_q29 / 64,
+        .error_q29 = shortest_q29 > voltage_q29 ? shortest_q29 : voltage_q29,
     };
 }
 

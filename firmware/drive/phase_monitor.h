@@ -9,12 +9,12 @@
  *   encoder_angle   a current that is only too large because the tables, at a wrong angle, have emptied the integral
  *
  * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical; any resistance that
- * a winding may have, of the integral of R i (control/applied_flux.h); voltage 1/64, or the converter's shortest pulse
- * if that is more, since the phase was at rest, at most over 10 ms, twice that at small currents; a quarter of psi that
- * has been removed since; and psi of a period and 20 us at the DC-link voltage, for the delays of sensor and switches.
- * psi is affine in the resistance: what differs at both of its limits, the same way, differs at every resistance. At a
- * current of up to 4/128 of its range, a small one, phase_open counts only what more than this tolerance of voltage
- * and resistance has built up since the current was larger.
+ * a winding may have, of the integral of R i (control/applied_flux.h); voltage 1/64, or the thresholds of the devices
+ * or the converter's shortest pulse if that is more, since the phase was at rest, at most over 10 ms, twice that at
+ * small currents; a quarter of psi that has been removed since; and psi of a period and 20 us at the DC-link voltage,
+ * for the delays of sensor and switches. psi is affine in the resistance: what differs at both of its limits, the same
+ * way, differs at every resistance. At a current of up to 4/128 of its range, a small one, phase_open counts only what
+ * more than this tolerance of voltage and resistance has built up since the current was larger.
  *
  * A current also is one that should not be when both switches are open and the voltage has removed a quarter of psi of
  * which the tables saw less than a quarter disappear: freewheeling by a shorted switch.
@@ -48,6 +48,7 @@ typedef struct {
     uint32_t periods_per_ms;              /* from 20 */
     uint32_t electrical;                  /* angle of phase 0 at the sample, 2^-32 electrical rev */
     uint32_t stroke;                      /* 2^32 / phases */
+    int32_t period_q40;                   /* Ts, s, Q-9.40 */
     int32_t period_flux_q29;              /* Vdc Ts, Wb, Q2.29 */
     int32_t resistance_period_q40;        /* R Ts, ohm s, Q-9.40 */
     int32_t misalignment[HAL_PHASES_MAX]; /* to subtract from the angle of each phase, 2^-32 electrical rev */

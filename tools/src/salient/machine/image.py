@@ -147,6 +147,7 @@ def _padded(values: list[int]) -> list[int]:
 
 _PARAMETERS_MAX = 64
 _CELLS = (2 * ROWS * len(CURRENT_A),)
+_RATIO_MAX = 64.0
 
 TABLES = Structure("machine_tables_t", (
     Member("phases", "uint8_t", lambda machine, scaling, tables: machine.phases),
@@ -156,6 +157,12 @@ TABLES = Structure("machine_tables_t", (
         scaling.data.adc_current_A, 9 - scaling.exponents.current, 17)),
     Member("voltage_range_q6", "uint16_t", lambda machine, scaling, tables: quantise(
         scaling.data.adc_voltage_V, 6 - scaling.exponents.voltage, 17)),
+    Member("device_drop_most_q6", "uint16_t", lambda machine, scaling, tables: quantise(
+        2.0 * max(machine.converter["switch_drop_V"], machine.converter["diode_drop_V"]),
+        6 - scaling.exponents.voltage, 17)),
+    Member("device_resistance_q8", "uint16_t", lambda machine, scaling, tables: quantise(
+        min(_RATIO_MAX, 2.0 * max(machine.converter["switch_resistance_ohm"],
+                                  machine.converter["diode_resistance_ohm"]) / machine.resistance_ohm), 8, 17)),
     Member("minimum_pulse_ns", "uint16_t", lambda machine, scaling, tables: quantise(
         machine.converter["minimum_pulse_ns"], 0, 17)),
     Member("current_slew_rate_A_s", "int32_t", lambda machine, scaling, tables: quantise(

@@ -100,14 +100,15 @@ supply_voltage_V = {supply_V:g}
 
 
 def _imperfections(between: Callable[[float, float], float], supply_V: float, current_A: float) -> str:
-    """Devices with up to 1.5 V, at low voltages 1/64 of the supply, and as much at the current for the torque, and
-    current sensors with a gain of up to 2 % and an offset of up to 0.3 % of that current."""
-    drop_V = min(1.5, supply_V / 64.0)
+    """Below 100 V MOSFETs and their diodes, above IGBTs; slopes that take up to 1/64 of the supply at the current for
+    the torque. Current sensors with a gain of up to 2 % and an offset of up to 0.3 % of that current."""
+    threshold_V = 0.0 if supply_V < 100.0 else between(0.6, 1.2)
+    slope_ohm = min(1.0, supply_V / 128.0 / current_A)
     return f"""\
-switch_drop_V = {between(0.0, drop_V / 2.0):.4g}
-switch_resistance_ohm = {between(0.0, drop_V / 2.0) / current_A:.4g}
-diode_drop_V = {between(0.0, drop_V / 2.0):.4g}
-diode_resistance_ohm = {between(0.0, drop_V / 2.0) / current_A:.4g}
+switch_drop_V = {threshold_V:.4g}
+switch_resistance_ohm = {between(0.0, slope_ohm):.4g}
+diode_drop_V = {between(0.3, 1.2):.4g}
+diode_resistance_ohm = {between(0.0, slope_ohm):.4g}
 [sensors]
 current_gain = {between(0.98, 1.02):.4g}
 current_offset_A = {between(-0.003, 0.003) * current_A:.4g}
